@@ -1,0 +1,1 @@
+"""Drivers: carry samples to a device, a file or a plant model, and back."""

@@ -1,0 +1,47 @@
+"""The one place that knows how kernels are compiled and cached.
+
+numba's disk cache looks only at the file of the kernel itself, so an edit to
+a helper in another file would bring back stale results.  Here every cache
+entry also carries the hash of all the package's kernel files.  Where no cache
+folder is writable, kernels compile in memory.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from pathlib import Path
+from typing import Any
+
+import numba
+from numba.core.caching import FunctionCache, IndexDataCacheFile
+
+_KERNEL_FILES = ("control/kernels.py", "plants/kernels.py", "_jit.py")
+
+
+def _source_stamp() -> str:
+    here = Path(__file__).parent
+    return hashlib.sha256(b"".join((here / name).read_bytes() for name in _KERNEL_FILES)).hexdigest()
+
+
+_STAMP = _source_stamp()
+
+
+class _StampedCache(FunctionCache):
+    """A function cache that is stale as soon as any kernel file has changed."""
+
+    def __init__(self, function: Any) -> None:
+        super().__init__(function)
+        stamp = (self._impl.locator.get_source_stamp(), _STAMP)
+        self._cache_file = IndexDataCacheFile(
+            cache_path=self._cache_path, filename_base=self._impl.filename_base, source_stamp=stamp
+        )
+
+
+def kernel(function: Any) -> Any:
+    """Compile `function` for the tick: no bounds checks, numpy error model, contracted arithmetic, cached on disk."""
+    compiled = numba.njit(error_model="numpy", fastmath={"contract"}, nogil=True)(function)
+    try:
+        compiled._cache = _StampedCache(function)
+    except RuntimeError:  # numba: no writable cache location
+        pass
+    return compiled

@@ -1,0 +1,57 @@
+"""Bands: carriers with their phases, and the complex envelopes that ride on them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from hapticrender.protocols import Array
+
+
+def hold_last(position: Array) -> Array:
+    """Position (m, shape (n,)) with every NaN replaced by the last finite value before it (0 where there is none)."""
+    finite = np.isfinite(position)
+    index = np.maximum.accumulate(np.where(finite, np.arange(position.size), -1))
+    return np.where(index >= 0, position[np.maximum(index, 0)], 0.0)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Bands:
+    """Carriers of a texture, one entry a band, and what is wanted on each.
+
+    The wanted displacement is ``Re sum_k envelope_k exp(j phi_k)`` with
+    ``phi_k = 2 pi (frequency_k t + wavenumber_k x) + phase_k``: a fixed carrier
+    has wavenumber 0, a carrier locked to the finger has frequency 0.
+
+    Parameters
+    ----------
+    frequency : ndarray, shape (n,), Hz
+        Fixed part of each carrier, >= 0.
+    wavenumber : ndarray, shape (n,), 1/m
+        Finger-locked part, 1/wavelength, >= 0.
+    phase : ndarray, shape (n,), rad
+        Carrier phase at t = 0, x = 0.
+    envelope : ndarray of complex, shape (n,), m, or None
+        Constant wanted envelopes; None where the wanted waveform has to be
+        analysed by the bank that listens to the device (recordings).
+    """
+
+    frequency: Array
+    wavenumber: Array
+    phase: Array
+    envelope: Array | None = None
+
+    def __len__(self) -> int:
+        return len(self.frequency)
+
+    def carrier_phase(self, time: Array, position: Array) -> Array:
+        """Phase of every carrier (rad, in [0, 2 pi), shape (n_samples, n_bands)); `position` NaN holds the phase."""
+        turns = np.multiply.outer(np.asarray(time, float), self.frequency)
+        turns += np.multiply.outer(hold_last(np.asarray(position, float)), self.wavenumber)
+        turns += self.phase / (2 * np.pi)
+        return 2 * np.pi * (turns - np.floor(turns))
+
+    def instantaneous_frequency(self, velocity: Array) -> Array:
+        """Signed frequency of every carrier (Hz, shape (n_samples, n_bands)) at finger `velocity` (m/s)."""
+        return self.frequency + np.multiply.outer(np.asarray(velocity, float), self.wavenumber)

@@ -1,0 +1,1 @@
+"""How every band is made to follow its target."""

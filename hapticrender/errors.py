@@ -1,0 +1,37 @@
+"""Every error that the library raises on its own account.
+
+Bad arguments are plain ``ValueError`` and ``TypeError``; the classes here add
+what a caller may want to catch by kind.
+"""
+
+
+class HapticError(Exception):
+    """Root of the library's own errors."""
+
+
+class SceneError(HapticError, ValueError):
+    """A scene, or a file that it names, is malformed: says file, key, value, bound and unit."""
+
+
+class DesignError(HapticError):
+    """A design cannot be made stable or accurate enough: says which margin and which parameter."""
+
+
+class DriverError(HapticError):
+    """A driver could not do its work: says device and operation."""
+
+
+class DeviceNotFound(DriverError):
+    """No such device, port or file."""
+
+
+class DeviceTimeout(DriverError):
+    """The device did not answer in time."""
+
+
+class DeviceLost(DriverError):
+    """The device went away while it played."""
+
+
+class ProtocolError(DriverError):
+    """The device sent something that its protocol does not allow."""

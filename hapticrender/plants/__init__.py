@@ -1,0 +1,1 @@
+"""Models of devices, exact in discrete time."""
