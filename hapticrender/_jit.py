@@ -2,7 +2,7 @@
 
 numba's disk cache looks only at the file of the kernel itself, so an edit to
 a helper in another file would bring back stale results.  Here every cache
-entry also carries the hash of all the package's kernel files.  Where no cache
+entry also carries the hash of every file of the package that holds kernels.  Where no cache
 folder is writable, kernels compile in memory.
 """
 
@@ -15,12 +15,10 @@ from typing import Any
 import numba
 from numba.core.caching import FunctionCache, IndexDataCacheFile
 
-_KERNEL_FILES = ("control/kernels.py", "plants/kernels.py", "_jit.py")
-
 
 def _source_stamp() -> str:
-    here = Path(__file__).parent
-    return hashlib.sha256(b"".join((here / name).read_bytes() for name in _KERNEL_FILES)).hexdigest()
+    sources = (path.read_bytes() for path in sorted(Path(__file__).parent.rglob("*.py")))
+    return hashlib.sha256(b"".join(source for source in sources if b"@kernel" in source)).hexdigest()
 
 
 _STAMP = _source_stamp()
