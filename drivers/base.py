@@ -1,0 +1,257 @@
+"""What a driver is, in a page, and the duties that every driver shares.
+
+A driver carries samples to a device, a file or a plant model, and back.  Any
+object is one that has
+
+``rate``
+    sampling rate, Hz
+``drive_channels``, ``sensed_channels``
+    how many columns it takes and gives; no sensed channel means that the device is driven open loop
+``block``
+    samples a call of `play`, >= 1
+``delay``
+    samples from the moment that a sample is sensed to the moment that the drive computed from it acts, >= `block`
+``play(drive)``
+    plays a block, float64 of shape (block, drive_channels), in A, and returns `Sensed` of as many samples
+``__enter__``, ``__exit__``
+    makes the device ready, and leaves it at rest with zero drive whatever has happened
+
+Sample i of the drive is held during interval i; sample i of what `play`
+returns was taken at the *start* of interval i, before that drive could act.
+With ``block = 1`` a loop computes its next drive from the sample just
+returned, so it acts one interval after the sensing: ``delay = 1``.  A device
+that buffers further says so by a larger `delay`, and the controller turns its
+phases by it.  Where the device knows the finger's position (m from the middle,
+NaN while lifted) or load (N), it gives them with the block.
+
+Trouble is of two kinds.  What the caller did wrong (a shape, a NaN) is a
+``ValueError`` before anything is played; a device that is absent, late or gone
+is a `DriverError` that names device and operation.  Samples lost while playing
+are neither: they are `Flag.OVERRUN` in the optional attribute ``flags``, the
+status of the block just played.
+
+Nothing has to be inherited.  Here is a whole driver, a plate on two coils with
+a sensor at each end of its glass, and a grating that is felt on it:
+
+>>> import numpy as np
+>>> from scipy.linalg import expm
+>>> import hapticrender as hr
+>>> class MyPlate:
+...     rate, block, delay = 5000.0, 1, 1
+...     drive_channels, sensed_channels = 2, 2
+...
+...     def __init__(self):
+...         mass = np.array([[0.032], [4e-5 / 0.0275**2]])  # kg: heave and rocking, seen at the coils
+...         stiffness = np.array([[45.3e3, 0.5e3], [0.5e3, 45.3e3]])  # N/m
+...         damping = np.array([[1.7, 0.0], [0.0, 1.7]])  # N s/m
+...         coils = 7.4 * np.array([[1.0, 1.0], [-1.0, 1.0]])  # N/A
+...         generator = np.zeros((6, 6))
+...         generator[:2, 2:4] = np.eye(2)
+...         generator[2:4] = np.hstack([-stiffness, -damping, coils]) / mass
+...         self.advance = expm(generator / self.rate)  # exact while the drive is held
+...         self.state = np.zeros(6)  # heave, rocking, their rates, the two currents
+...
+...     def __enter__(self):
+...         return self
+...
+...     def __exit__(self, *exc):
+...         self.play(np.zeros((1, 2)))
+...
+...     def play(self, drive):
+...         heave, rocking = self.state[:2]
+...         sensed = [heave - 2 * rocking, heave + 2 * rocking]  # glass ends lie twice as far out as the coils
+...         self.state[4:] = drive[0]
+...         self.state = self.advance @ self.state
+...         return hr.Sensed(np.array([sensed]))
+>>> scene = hr.Scene(texture=hr.Grating(frequency=47.0, amplitude=10e-6), duration=3.0)
+>>> recording = hr.render(scene, driver=MyPlate())
+>>> print(f"{1e6 * recording.summary()['bands'][0]['achieved']:.1f} um")
+10.0 um
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from types import TracebackType
+from typing import Any, Self
+
+import numpy as np
+
+from hapticrender.errors import DriverError
+from hapticrender.protocols import Array, Flag, Sensed
+
+_MEMBERS = ("rate", "drive_channels", "sensed_channels", "block", "delay", "play", "__enter__", "__exit__")
+_LEAST = {"drive_channels": 1, "sensed_channels": 0, "block": 1}
+
+
+def check_driver(driver: Any) -> None:
+    """Refuse an object that is no driver, naming what it lacks or which number is out of its bound.
+
+    Parameters
+    ----------
+    driver : object
+        What should follow the page above.
+
+    Raises
+    ------
+    TypeError
+        A member is missing.
+    ValueError
+        A count or the rate is out of its bound.
+    """
+    kind = type(driver).__name__
+    missing = [name for name in _MEMBERS if not hasattr(driver, name)]
+    if missing:
+        raise TypeError(f"{kind} is no driver: it lacks {', '.join(missing)}")
+    if not (math.isfinite(driver.rate) and driver.rate > 0):
+        raise ValueError(f"{kind}: rate={driver.rate!r} must be finite and > 0 Hz")
+    for name, least in (_LEAST | {"delay": driver.block}).items():
+        value = getattr(driver, name)
+        if value != int(value) or value < least:
+            raise ValueError(f"{kind}: {name}={value!r} must be a whole number >= {least}")
+
+
+def checked_drive(drive: Array, block: int, drive_channels: int) -> Array:
+    """Return a block of drive as float64 in C order, or refuse it before any of it is played.
+
+    Parameters
+    ----------
+    drive : array_like, shape (block, drive_channels), A
+        The block.
+    block : int
+        Samples that the driver takes a call.
+    drive_channels : int
+        Columns that the driver takes.
+
+    Returns
+    -------
+    ndarray of float64, shape (block, drive_channels), A
+        The same numbers.
+
+    Raises
+    ------
+    ValueError
+        The shape differs, or a sample is NaN or infinite.
+    """
+    checked = np.ascontiguousarray(drive, dtype=np.float64)
+    if checked.shape != (block, drive_channels):
+        raise ValueError(f"drive has shape {checked.shape}, must be {(block, drive_channels)} (block, drive_channels)")
+    finite = np.isfinite(checked)
+    if not finite.all():
+        sample, channel = np.argwhere(~finite)[0]
+        raise ValueError(f"drive[{sample}, {channel}]={checked[sample, channel]} must be finite (A)")
+    return checked
+
+
+class BaseDriver:
+    """A driver whose kinds differ only in how they open, play and close.
+
+    A subclass sets the five numbers of the page above and fills in `_play`,
+    and `_open` and `_close` where it has something to acquire.  It is used once:
+    opened (again and again, if need be, to no effect), played, closed for good.
+    """
+
+    rate: float
+    drive_channels: int
+    sensed_channels: int
+    block: int
+    delay: int
+    flags: Flag = Flag(0)
+    _state = "new"
+
+    def _open(self) -> None:
+        """Acquire what playing needs."""
+
+    def _play(self, drive: Array) -> Sensed:
+        """Play a block that has been checked."""
+        raise NotImplementedError
+
+    def _close(self) -> None:
+        """Release what `_open` acquired."""
+
+    def open(self) -> Self:
+        """Make the device ready; does nothing where it is open already.
+
+        Raises
+        ------
+        DriverError
+            It has been closed, or cannot be opened.
+        """
+        if self._state == "closed":
+            raise DriverError(f"{self}: open: it has been closed; make a new one")
+        if self._state == "new":
+            check_driver(self)
+            self._open()
+            self._state = "open"
+        return self
+
+    def play(self, drive: Array) -> Sensed:
+        """Play a block and return what was sensed while it played.
+
+        Parameters
+        ----------
+        drive : ndarray of float64, shape (block, drive_channels), A
+            Sample i is held during interval i.
+
+        Returns
+        -------
+        Sensed
+            Sample i was taken at the start of interval i.
+
+        Raises
+        ------
+        ValueError
+            The shape is wrong or a sample is not finite; nothing has been played.
+        DriverError
+            The driver is not open, or the device failed.
+        """
+        if self._state != "open":
+            raise DriverError(f"{self}: play: it is {self._state}, not open; use it in a with statement")
+        return self._play(checked_drive(drive, self.block, self.drive_channels))
+
+    def close(self) -> None:
+        """Play one block of zeros and release the device, as far as either works; then raise the first failure."""
+        if self._state != "open":
+            self._state = "closed"
+            return
+        self._state = "closed"
+        rest = np.zeros((self.block, self.drive_channels))
+        carry_through(lambda: self._play(rest), self._close)
+
+    def __enter__(self) -> Self:
+        return self.open()
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        """Close; where the body has failed already, a failure to close is noted on the body's error."""
+        try:
+            self.close()
+        except Exception as late:
+            if error is None:
+                raise
+            error.add_note(f"and while closing: {late}")
+
+    def __str__(self) -> str:
+        return type(self).__name__
+
+
+def carry_through(*steps: Callable[[], object]) -> None:
+    """Call every step, whatever the others do; then raise the first failure, with the later ones noted on it.
+
+    Parameters
+    ----------
+    *steps : callable
+        What has to be tried, in this order.
+    """
+    failures: list[Exception] = []
+    for step in steps:
+        try:
+            step()
+        except Exception as error:
+            failures.append(error)
+    if failures:
+        for late in failures[1:]:
+            failures[0].add_note(f"and then: {late}")
+        raise failures[0]

@@ -1,0 +1,220 @@
+"""Drive as a sound file: written while it plays, alone or beside a device, and read back in amperes.
+
+A file is a device without sensors (the controller then drives open loop), or
+with `through` a tee: another driver plays and senses, and the file keeps what
+it was given, down to the block at which it failed.  A sample of 1.0 in the
+file is `full_scale`.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import soundfile
+
+from hapticrender.drivers.base import BaseDriver, carry_through, check_driver
+from hapticrender.errors import DeviceLost, DeviceNotFound, DriverError
+from hapticrender.protocols import Array, Driver, Flag, Sensed
+
+FORMATS = {".wav": "WAV", ".w64": "W64", ".rf64": "RF64", ".aiff": "AIFF", ".aif": "AIFF", ".flac": "FLAC"}
+SUBTYPES = {"PCM_16": 16, "PCM_24": 24, "PCM_32": 32, "FLOAT": None, "DOUBLE": None}  # bits of the integers
+_WORD = 32  # soundfile takes integers of any width left-justified in 32 bits
+
+
+def read_back(path: str | Path, *, full_scale: float = 3.0) -> Array:
+    """Drive as a file holds it: integers and floats are scaled, never dithered or rounded.
+
+    Parameters
+    ----------
+    path : str or Path
+        A file that `WaveFileDriver` wrote, or any that soundfile reads.
+    full_scale : float, A, > 0
+        Drive that stands in the file as 1.0; files do not say it themselves.
+
+    Returns
+    -------
+    ndarray of float64, shape (n, channels), A
+        Every sample of the file.
+
+    Raises
+    ------
+    DeviceNotFound
+        There is no such file.
+    DriverError
+        It is no sound file.
+    """
+    if not Path(path).is_file():
+        raise DeviceNotFound(f"{path}: read: no such file")
+    try:
+        samples, _ = soundfile.read(path, dtype="float64", always_2d=True)
+    except soundfile.SoundFileError as error:
+        raise DriverError(f"{path}: read: {_reason(error)}") from error
+    return samples * full_scale
+
+
+class WaveFileDriver(BaseDriver):
+    """Writes every block of drive to a WAV, FLAC, W64, RF64 or AIFF file while it plays.
+
+    A NaN or an infinity is refused with everything else that `BaseDriver`
+    refuses.  Drive beyond `full_scale` is held exactly by FLOAT and DOUBLE;
+    integers cut it to their range, `clipped` counts the samples, and `flags`
+    says `Flag.SATURATED` for the block; what `through` plays is not cut.
+
+    Parameters
+    ----------
+    path : str or Path
+        File to write, anew; its ending chooses the format: .wav, .flac, .w64, .rf64, .aiff, .aif.
+        W64 and RF64 hold more than 4 GB.
+    rate : float, Hz, > 0, optional
+        Sampling rate, 48 kHz unless given; comes from `through` where there is one.
+        The file's header holds the nearest whole number of Hz.
+    through : Driver, optional
+        A device that plays and senses; rate, channels, block and delay are its own.
+        It is opened and closed together with the file.
+    full_scale : float, A, > 0
+        Drive that stands in the file as 1.0.  An integer format ends one step short of it upwards.
+    subtype : {"PCM_16", "PCM_24", "PCM_32", "FLOAT", "DOUBLE"}, optional
+        Form of a sample; FLOAT unless given, for FLAC PCM_24 (it knows integers of 16 and 24 bits only).
+    drive_channels : int, >= 1, optional
+        Columns of drive, 2 unless given; comes from `through` where there is one.
+    block : int, >= 1, optional
+        Samples a call, 1024 unless given; comes from `through` where there is one.
+
+    Raises
+    ------
+    ValueError
+        An ending, a subtype or a number that does not fit.
+    """
+
+    def __init__(
+        self,
+        path: str | Path,
+        *,
+        rate: float | None = None,
+        through: Driver | None = None,
+        full_scale: float = 3.0,
+        subtype: str | None = None,
+        drive_channels: int | None = None,
+        block: int | None = None,
+    ) -> None:
+        self.path = Path(path)
+        self.full_scale = full_scale
+        self.clipped = 0  # samples that the file holds cut to its range
+        self._through = through
+        self._format, self._subtype = _file_form(self.path, subtype)
+        if not (np.isfinite(full_scale) and full_scale > 0):
+            raise ValueError(f"{full_scale=} must be finite and > 0 A")
+        own = {"rate": rate, "drive_channels": drive_channels, "block": block}
+        if through is None:
+            self._stand_alone(own)
+        else:
+            self._stand_beside(through, own)
+        check_driver(self)
+
+    def _stand_alone(self, own: dict[str, float | None]) -> None:
+        numbers = {"rate": 48000.0, "drive_channels": 2, "block": 1024}
+        numbers |= {name: value for name, value in own.items() if value is not None}
+        self._take(SimpleNamespace(**numbers, sensed_channels=0, delay=numbers["block"]))
+
+    def _stand_beside(self, through: Driver, own: dict[str, float | None]) -> None:
+        check_driver(through)
+        for name, value in own.items():
+            if value is not None:
+                raise ValueError(f"{name}={value!r} cannot be given beside through=, which has its own")
+        self._take(through)
+
+    def _take(self, source: Any) -> None:
+        for name in ("rate", "drive_channels", "sensed_channels", "block", "delay"):
+            setattr(self, name, getattr(source, name))
+
+    def _open(self) -> None:
+        if not self.path.parent.is_dir():
+            raise DeviceNotFound(f"{self.path}: open: no folder {self.path.parent}")
+        try:
+            self._file = soundfile.SoundFile(
+                self.path, "w", round(self.rate), self.drive_channels, self._subtype, format=self._format
+            )
+        except (OSError, soundfile.SoundFileError) as error:
+            raise DriverError(
+                f"{self.path}: open: {_reason(error)} ({self._format} {self._subtype}, {self.drive_channels} channels, "
+                f"{self.rate:g} Hz)"
+            ) from error
+        if self._through is not None:
+            try:
+                self._through.__enter__()
+            except Exception:
+                self._file.close()
+                raise
+
+    def _play(self, drive: Array) -> Sensed:
+        self.flags = Flag(0)
+        answer: list[Sensed] = []
+        carry_through(lambda: answer.append(self._sense(drive)), lambda: self._write(drive))
+        return answer[0]
+
+    def _sense(self, drive: Array) -> Sensed:
+        if self._through is None:
+            return Sensed(np.empty((len(drive), 0)))
+        sensed = self._through.play(drive)
+        self.flags |= getattr(self._through, "flags", Flag(0))
+        return sensed
+
+    def _write(self, drive: Array) -> None:
+        try:
+            self._file.write(self._form(drive / self.full_scale))
+        except (OSError, AssertionError, soundfile.SoundFileError) as error:  # soundfile asserts that all was written
+            raise DeviceLost(f"{self.path}: write: {_reason(error)}") from error
+
+    def _form(self, samples: Array) -> Array:
+        """Shape samples so that soundfile writes them unchanged: integers are rounded to nearest and cut."""
+        bits = SUBTYPES[self._subtype]
+        if bits is None:
+            return samples
+        top = 2.0 ** (bits - 1)
+        steps = np.rint(samples * top)
+        beyond = int(np.count_nonzero(np.abs(samples) > 1))
+        if beyond:
+            self.clipped += beyond
+            self.flags |= Flag.SATURATED
+        return (np.clip(steps, -top, top - 1).astype(np.int64) << (_WORD - bits)).astype(np.int32)
+
+    def _close(self) -> None:
+        through = self._through
+        leave = [] if through is None else [lambda: through.__exit__(None, None, None)]
+        carry_through(*leave, self._file.close)
+
+    def read_back(self) -> Array:
+        """Drive as the closed file holds it (A, shape (n, drive_channels)), the closing block of zeros included.
+
+        Raises
+        ------
+        DriverError
+            The driver is not closed yet, or has written nothing.
+        """
+        if self._state != "closed":
+            raise DriverError(f"{self}: read: it is {self._state}; close it first")
+        return read_back(self.path, full_scale=self.full_scale)
+
+    def __str__(self) -> str:
+        return str(self.path)
+
+
+def _file_form(path: Path, subtype: str | None) -> tuple[str, str]:
+    """Format by the path's ending, and the subtype if that format holds it."""
+    kind = FORMATS.get(path.suffix.lower())
+    if kind is None:
+        raise ValueError(f"{path}: the ending {path.suffix!r} must be one of {', '.join(FORMATS)}")
+    if subtype is None:
+        subtype = "PCM_24" if kind == "FLAC" else "FLOAT"
+    known = [name for name in SUBTYPES if soundfile.check_format(kind, name)]
+    if subtype not in known:
+        raise ValueError(f"{path}: {subtype=} must be one of {', '.join(known)} for {kind}")
+    return kind, subtype
+
+
+def _reason(error: Exception) -> object:
+    """Say what libsndfile says, without the path that it repeats."""
+    return getattr(error, "error_string", str(error)) or "not every sample was written"

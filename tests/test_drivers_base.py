@@ -1,0 +1,166 @@
+"""The duties every driver shares: order, checks, and rest whatever happens."""
+
+import numpy as np
+import pytest
+
+from hapticrender.drivers.base import BaseDriver, carry_through, check_driver, checked_drive
+from hapticrender.errors import DeviceLost, DriverError
+from hapticrender.protocols import Driver, Sensed
+
+
+class Diary(BaseDriver):
+    """Writes down all that it is asked to do; fails at what it is told to fail at."""
+
+    rate, block, delay = 5000.0, 4, 5
+    drive_channels, sensed_channels = 2, 1
+
+    def __init__(self, fails_at=()):
+        self.fails_at = fails_at
+        self.entries = []
+
+    def _note(self, entry):
+        self.entries.append(entry)
+        if entry in self.fails_at:
+            raise DeviceLost(f"{self}: {entry}: gone")
+
+    def _open(self):
+        self._note("open")
+
+    def _play(self, drive):
+        self._note("play" if drive.any() else "rest")
+        return Sensed(np.full((len(drive), 1), drive.sum()))
+
+    def _close(self):
+        self._note("close")
+
+
+ONES = np.ones((4, 2))
+
+
+def test_a_base_driver_follows_the_protocol():
+    assert isinstance(Diary(), Driver)
+
+
+def test_with_opens_plays_rests_and_closes_in_this_order():
+    with Diary() as driver:
+        assert driver.play(ONES).sensed.tolist() == [[8.0]] * 4
+    assert driver.entries == ["open", "play", "rest", "close"]
+
+
+def test_a_nested_with_neither_opens_twice_nor_closes_twice():
+    with Diary() as driver, driver:
+        driver.play(ONES)
+    assert driver.entries == ["open", "play", "rest", "close"]
+
+
+def test_an_error_in_the_body_still_brings_the_device_to_rest():
+    driver = Diary()
+    with pytest.raises(ZeroDivisionError), driver:
+        raise ZeroDivisionError
+    assert driver.entries == ["open", "rest", "close"]
+
+
+def test_close_carries_on_past_a_failure_and_raises_the_first():
+    driver = Diary(fails_at=("rest", "close")).open()
+    with pytest.raises(DeviceLost, match="Diary: rest: gone") as caught:
+        driver.close()
+    assert driver.entries == ["open", "rest", "close"]
+    assert caught.value.__notes__ == ["and then: Diary: close: gone"]
+
+
+def test_a_failure_to_close_does_not_hide_the_error_of_the_body():
+    with pytest.raises(ZeroDivisionError) as caught, Diary(fails_at=("rest",)):
+        raise ZeroDivisionError
+    assert caught.value.__notes__ == ["and while closing: Diary: rest: gone"]
+
+
+def test_a_driver_that_failed_to_open_can_be_tried_again_and_is_not_played():
+    driver = Diary(fails_at=("open",))
+    with pytest.raises(DeviceLost, match="open: gone"):
+        driver.open()
+    driver.close()
+    assert driver.entries == ["open"]
+
+
+@pytest.mark.parametrize(("steps", "state"), [([], "new"), (["open", "close"], "closed")])
+def test_playing_needs_an_open_driver(steps, state):
+    driver = Diary()
+    for step in steps:
+        getattr(driver, step)()
+    with pytest.raises(DriverError, match=f"Diary: play: it is {state}"):
+        driver.play(ONES)
+
+
+def test_a_closed_driver_stays_closed():
+    driver = Diary().open()
+    driver.close()
+    with pytest.raises(DriverError, match="Diary: open: it has been closed"):
+        driver.open()
+
+
+@pytest.mark.parametrize("shape", [(3, 2), (5, 2), (4, 1), (8,), (4, 2, 1)])
+def test_a_block_of_another_shape_is_refused_unplayed(shape):
+    with Diary() as driver:
+        with pytest.raises(ValueError, match=r"must be \(4, 2\)"):
+            driver.play(np.ones(shape))
+        assert driver.entries == ["open"]
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+def test_a_drive_that_is_not_finite_is_refused_and_pointed_at(value):
+    drive = np.zeros((4, 2))
+    drive[2, 1] = value
+    with pytest.raises(ValueError, match=rf"drive\[2, 1\]={value} must be finite"):
+        checked_drive(drive, 4, 2)
+
+
+def test_a_checked_block_is_float64_in_c_order_and_keeps_its_numbers():
+    drive = np.asfortranarray(np.arange(8, dtype=np.float32).reshape(4, 2))
+    checked = checked_drive(drive, 4, 2)
+    assert checked.dtype == np.float64
+    assert checked.flags.c_contiguous
+    assert checked.tolist() == drive.tolist()
+
+
+def test_a_subclass_without_play_says_so():
+    class Empty(BaseDriver):
+        rate, block, delay, drive_channels, sensed_channels = 1.0, 1, 1, 1, 0
+
+    with pytest.raises(NotImplementedError), Empty() as driver:
+        driver.play(np.ones((1, 1)))
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"rate": 0.0}, r"rate=0.0 must be finite and > 0 Hz"),
+        ({"rate": np.nan}, r"rate=nan must be finite and > 0 Hz"),
+        ({"block": 0}, r"block=0 must be a whole number >= 1"),
+        ({"block": 1.5, "delay": 2}, r"block=1.5 must be a whole number >= 1"),
+        ({"drive_channels": 0}, r"drive_channels=0 must be a whole number >= 1"),
+        ({"sensed_channels": -1}, r"sensed_channels=-1 must be a whole number >= 0"),
+        ({"delay": 3}, r"delay=3 must be a whole number >= 4"),
+    ],
+)
+def test_numbers_out_of_bound_are_named(change, message):
+    driver = Diary()
+    check_driver(driver)
+    for name, value in change.items():
+        setattr(driver, name, value)
+    with pytest.raises(ValueError, match=message):
+        check_driver(driver)
+
+
+def test_an_object_that_is_no_driver_hears_what_it_lacks():
+    class Half:
+        rate, drive_channels, sensed_channels, block = 5000.0, 2, 2, 1
+
+    with pytest.raises(TypeError, match="Half is no driver: it lacks delay, play, __enter__, __exit__"):
+        check_driver(Half())
+
+
+def test_carry_through_calls_every_step():
+    done = []
+    with pytest.raises(ZeroDivisionError):
+        carry_through(lambda: done.append(1), lambda: 1 // 0, lambda: done.append(3))
+    assert done == [1, 3]

@@ -1,0 +1,303 @@
+"""The file driver: what is played is what the file holds, whatever interrupts it."""
+
+import signal
+import subprocess
+import sys
+import textwrap
+
+import numpy as np
+import pytest
+import soundfile
+
+from hapticrender.drivers.base import BaseDriver
+from hapticrender.drivers.wavefile import FORMATS, SUBTYPES, WaveFileDriver, read_back
+from hapticrender.errors import DeviceLost, DeviceNotFound, DriverError
+from hapticrender.protocols import Driver, Flag, Sensed
+
+FULL_SCALE = 2.5  # A
+FORMS = [
+    (ending, subtype)
+    for ending, kind in FORMATS.items()
+    for subtype in SUBTYPES
+    if soundfile.check_format(kind, subtype)
+]
+STEP = {"PCM_16": 2.0**-15, "PCM_24": 2.0**-23, "PCM_32": 2.0**-31, "FLOAT": 2.0**-24, "DOUBLE": 0.0}
+
+
+class Mirror(BaseDriver):
+    """Senses what it is driven with, in metres; goes away at block `lost_at`."""
+
+    rate, block, delay = 4009.8, 5, 7
+    drive_channels, sensed_channels = 3, 3
+
+    def __init__(self, lost_at=None):
+        self.lost_at = lost_at
+        self.played = []
+
+    def _play(self, drive):
+        if len(self.played) == self.lost_at:
+            raise DeviceLost("mirror: play: gone")
+        self.played.append(drive.copy())
+        return Sensed(1e-6 * drive, position=np.full(len(drive), 0.01))
+
+    def _close(self):
+        self.played.append("closed")
+
+
+def played(driver, blocks):
+    """Play all `blocks`, close, and return what the file holds without the closing block of zeros."""
+    with driver:
+        for block in blocks:
+            driver.play(block)
+    held = driver.read_back()
+    assert not held[len(held) - driver.block :].any()
+    return held[: len(held) - driver.block]
+
+
+def run_script(script, **options):
+    return subprocess.run([sys.executable, "-c", textwrap.dedent(script)], timeout=120, **options)
+
+
+def largest_error(subtype):
+    """Half a step: of the integers, of float32 between half and full scale; nothing for float64."""
+    return 0.5 * FULL_SCALE * STEP[subtype]
+
+
+@pytest.mark.parametrize(("ending", "subtype"), FORMS)
+@pytest.mark.parametrize("channels", [1, 2, 8])
+def test_a_file_holds_the_drive_within_half_a_step(tmp_path, rng, ending, subtype, channels):
+    blocks = rng.uniform(-FULL_SCALE, FULL_SCALE * (1 - 2.0**-15), (3, 16, channels))
+    driver = WaveFileDriver(
+        tmp_path / f"drive{ending}", full_scale=FULL_SCALE, subtype=subtype, drive_channels=channels, block=16
+    )
+    held = played(driver, blocks)
+    error = np.abs(held - blocks.reshape(-1, channels)).max()
+    rounding = 4 * np.finfo(float).eps * FULL_SCALE  # of scaling there and back
+    assert error <= largest_error(subtype) + rounding
+    assert subtype == "DOUBLE" or error > 0.5 * largest_error(subtype)  # the form asked for, not a finer one
+    assert driver.clipped == 0
+
+
+@pytest.mark.parametrize(("ending", "subtype"), [(".wav", "PCM_16"), (".flac", "PCM_24"), (".w64", "PCM_32")])
+def test_drive_that_fits_the_steps_comes_back_exactly(tmp_path, rng, ending, subtype):
+    full_scale = 2.0  # a power of two, so that scaling is exact
+    blocks = rng.integers(-(2**15), 2**15, (2, 64, 2)) * (full_scale / 2**15)
+    held = played(WaveFileDriver(tmp_path / f"a{ending}", full_scale=full_scale, subtype=subtype, block=64), blocks)
+    np.testing.assert_array_equal(held, blocks.reshape(-1, 2))
+
+
+def test_other_tools_read_full_scale_as_one(tmp_path):
+    played(WaveFileDriver(tmp_path / "a.wav", full_scale=FULL_SCALE, block=2), np.full((1, 2, 2), 0.5 * FULL_SCALE))
+    samples, rate = soundfile.read(tmp_path / "a.wav")
+    assert rate == 48000
+    assert samples.tolist() == [[0.5, 0.5], [0.5, 0.5], [0.0, 0.0], [0.0, 0.0]]
+
+
+def test_unless_told_otherwise_the_file_loses_nothing_that_matters(tmp_path):
+    for name, subtype in {"a.wav": "FLOAT", "a.W64": "FLOAT", "a.flac": "PCM_24"}.items():
+        with WaveFileDriver(tmp_path / name):
+            pass
+        assert soundfile.info(tmp_path / name).subtype == subtype
+
+
+def test_alone_it_is_a_driver_without_sensors(tmp_path):
+    driver = WaveFileDriver(tmp_path / "a.wav", rate=5000, drive_channels=2, block=4)
+    assert isinstance(driver, Driver)
+    assert (driver.rate, driver.sensed_channels, driver.delay) == (5000, 0, 4)
+    with driver:
+        sensed = driver.play(np.ones((4, 2)))
+    assert sensed.sensed.shape == (4, 0)
+    assert sensed.position is None
+
+
+def test_integers_cut_what_is_beyond_full_scale_and_say_so(tmp_path):
+    blocks = np.array([[[1.0, -1.0]], [[1.5, -4.0]], [[0.25, 0.5]]])
+    driver = WaveFileDriver(tmp_path / "a.flac", full_scale=1.0, subtype="PCM_16", block=1)
+    flags = []
+    with driver:
+        for block in blocks:
+            driver.play(block)
+            flags.append(driver.flags)
+    assert flags == [Flag(0), Flag.SATURATED, Flag(0)]
+    assert driver.clipped == 2
+    top = 1 - 2.0**-15
+    assert driver.read_back().tolist() == [[top, -1.0], [top, -1.0], [0.25, 0.5], [0.0, 0.0]]
+
+
+def test_floats_hold_what_is_beyond_full_scale(tmp_path):
+    driver = WaveFileDriver(tmp_path / "a.wav", full_scale=1.0, block=1)
+    assert played(driver, np.array([[[1.5, -4.0]]])).tolist() == [[1.5, -4.0]]
+    assert driver.clipped == 0
+
+
+def test_a_nan_is_refused_and_the_file_goes_on(tmp_path):
+    driver = WaveFileDriver(tmp_path / "a.wav", full_scale=1.0, block=1)
+    with driver:
+        driver.play(np.ones((1, 2)))
+        with pytest.raises(ValueError, match=r"drive\[0, 1\]=nan must be finite"):
+            driver.play(np.array([[0.0, np.nan]]))
+    assert driver.read_back().tolist() == [[1.0, 1.0], [0.0, 0.0]]
+
+
+def test_a_file_is_whole_after_an_exception_in_mid_run(tmp_path, rng):
+    blocks = rng.uniform(-1, 1, (3, 8, 2))
+    driver = WaveFileDriver(tmp_path / "a.wav", subtype="DOUBLE", full_scale=1.0, block=8)
+
+    def interrupted():
+        with driver:
+            for block in blocks:
+                driver.play(block)
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        interrupted()
+    np.testing.assert_array_equal(driver.read_back(), np.vstack([*blocks, np.zeros((8, 2))]))
+
+
+@pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="no SIGKILL on this system")
+@pytest.mark.parametrize("ending", [".wav", ".w64"])
+def test_a_killed_process_leaves_what_it_played(tmp_path, ending):
+    path = tmp_path / f"a{ending}"
+    script = f"""
+        import os, signal
+        import numpy as np
+        from hapticrender.drivers.wavefile import WaveFileDriver
+        with WaveFileDriver({str(path)!r}, subtype="DOUBLE", full_scale=1.0, block=8) as driver:
+            for number in range(100):
+                driver.play(np.full((8, 2), number / 100))
+            os.kill(os.getpid(), signal.SIGKILL)
+    """
+    done = run_script(script)
+    assert done.returncode == -signal.SIGKILL
+    np.testing.assert_array_equal(
+        read_back(path, full_scale=1.0), np.repeat(np.arange(100) / 100, 8)[:, None] * np.ones(2)
+    )
+
+
+def test_a_tee_passes_numbers_sensing_and_drive_on(tmp_path, rng):
+    mirror = Mirror()
+    driver = WaveFileDriver(tmp_path / "a.wav", through=mirror, subtype="DOUBLE", full_scale=1.0)
+    assert (driver.rate, driver.block, driver.delay) == (4009.8, 5, 7)
+    assert (driver.drive_channels, driver.sensed_channels) == (3, 3)
+    block = rng.uniform(-1, 1, (5, 3))
+    with driver:
+        answer = driver.play(block)
+    np.testing.assert_array_equal(answer.sensed, 1e-6 * block)
+    assert answer.position.tolist() == [0.01] * 5
+    assert mirror.played[-1] == "closed"
+    device = np.vstack(mirror.played[:-1])
+    assert not device[5:].any()  # the tee's block of rest, then the device's own
+    np.testing.assert_array_equal(driver.read_back(), device[: len(device) - 5])
+    assert soundfile.info(tmp_path / "a.wav").samplerate == 4010
+
+
+def test_a_tee_passes_flags_on(tmp_path):
+    mirror = Mirror()
+    mirror.flags = Flag.OVERRUN
+    with WaveFileDriver(tmp_path / "a.flac", through=mirror, full_scale=1.0) as driver:
+        driver.play(np.full((5, 3), 2.0))
+        assert driver.flags == Flag.OVERRUN | Flag.SATURATED
+
+
+def test_a_lost_device_ends_the_run_and_the_file_is_whole(tmp_path):
+    driver = WaveFileDriver(tmp_path / "a.wav", through=Mirror(lost_at=1), full_scale=1.0)
+    blocks = np.full((2, 5, 3), [[[0.25]], [[0.5]]])
+
+    def lost():
+        with driver:
+            for block in blocks:
+                driver.play(block)
+
+    with pytest.raises(DeviceLost, match="mirror: play: gone"):
+        lost()
+    np.testing.assert_array_equal(driver.read_back(), np.vstack([*blocks, np.zeros((5, 3))]))
+
+
+def test_a_device_comes_to_rest_though_the_disk_is_full(tmp_path):
+    mirror = Mirror()
+    driver = WaveFileDriver(tmp_path / "a.wav", through=mirror).open()
+    driver.play(np.ones((5, 3)))
+    driver._file.close()  # what a write then raises stands for a full disk
+    with pytest.raises(DeviceLost, match=r"a\.wav: write: "):
+        driver.close()
+    assert not mirror.played[1].any()
+    assert mirror.played[-1] == "closed"
+
+
+@pytest.mark.skipif(not hasattr(signal, "SIGXFSZ"), reason="no limit on file sizes on this system")
+@pytest.mark.parametrize("ending", [".wav", ".flac"])
+def test_a_full_disk_is_a_lost_device(tmp_path, ending):
+    script = f"""
+        import resource, signal
+        import numpy as np
+        from hapticrender.drivers.wavefile import WaveFileDriver
+        from hapticrender.errors import DeviceLost
+        signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (4096, 4096))
+        rng = np.random.default_rng(1)
+        try:
+            with WaveFileDriver({str(tmp_path / "a")!r} + {ending!r}) as driver:
+                for _ in range(10):
+                    driver.play(rng.uniform(-1, 1, (1024, 2)))
+        except DeviceLost as error:
+            print(error, *error.__notes__, sep="\\n")
+    """
+    done = run_script(script, stdout=subprocess.PIPE, text=True)
+    assert done.returncode == 0
+    first, note = done.stdout.splitlines()
+    assert f"a{ending}: write: " in first
+    assert f"a{ending}: write: " in note
+
+
+def test_nothing_is_written_before_it_is_opened(tmp_path):
+    driver = WaveFileDriver(tmp_path / "a.wav")
+    assert not list(tmp_path.iterdir())
+    with pytest.raises(DriverError, match=r"a\.wav: read: it is new; close it first"):
+        driver.read_back()
+
+
+def test_a_device_that_does_not_open_leaves_no_open_file(tmp_path):
+    mirror = Mirror()
+    mirror.close()
+    driver = WaveFileDriver(tmp_path / "a.wav", through=mirror)
+    with pytest.raises(DriverError, match="Mirror: open: it has been closed"):
+        driver.open()
+    assert driver._file.closed
+
+
+@pytest.mark.parametrize(
+    ("name", "options", "message"),
+    [
+        ("a.mp3", {}, r"a\.mp3: the ending '\.mp3' must be one of \.wav, "),
+        ("a", {}, r"a: the ending '' must be one of"),
+        ("a.flac", {"subtype": "FLOAT"}, r"a\.flac: subtype='FLOAT' must be one of PCM_16, PCM_24 for FLAC"),
+        ("a.wav", {"subtype": "ULAW"}, r"a\.wav: subtype='ULAW' must be one of"),
+        ("a.wav", {"full_scale": 0.0}, r"full_scale=0.0 must be finite and > 0 A"),
+        ("a.wav", {"full_scale": np.inf}, r"full_scale=inf must be finite and > 0 A"),
+        ("a.wav", {"rate": -1.0}, r"rate=-1.0 must be finite and > 0 Hz"),
+        ("a.wav", {"block": 0}, r"block=0 must be a whole number >= 1"),
+        ("a.wav", {"drive_channels": 0}, r"drive_channels=0 must be a whole number >= 1"),
+        ("a.wav", {"through": Mirror(), "rate": 5000.0}, r"rate=5000.0 cannot be given beside through="),
+    ],
+)
+def test_what_does_not_fit_is_refused_with_its_value(name, options, message):
+    with pytest.raises(ValueError, match=message):
+        WaveFileDriver(name, **options)
+
+
+def test_a_folder_that_is_not_there_is_named(tmp_path):
+    with pytest.raises(DeviceNotFound, match=r"a\.wav: open: no folder .*absent"):
+        WaveFileDriver(tmp_path / "absent" / "a.wav").open()
+
+
+def test_what_the_format_cannot_hold_is_a_driver_error(tmp_path):
+    with pytest.raises(DriverError, match=r"a\.flac: open: .*9 channels"):
+        WaveFileDriver(tmp_path / "a.flac", drive_channels=9).open()
+
+
+def test_reading_back_what_is_no_sound_names_the_file(tmp_path):
+    with pytest.raises(DeviceNotFound, match=r"none\.wav: read: no such file"):
+        read_back(tmp_path / "none.wav")
+    (tmp_path / "text.wav").write_text("not a sound")
+    with pytest.raises(DriverError, match=r"text\.wav: read: "):
+        read_back(tmp_path / "text.wav")
