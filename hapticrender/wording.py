@@ -1,0 +1,126 @@
+"""Numbers and verdicts in words, the same on the command line, in a report and on a page."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+PLACES = ("centre", "end_1", "end_2")
+_PREFIXES = ((1.0, ""), (1e-3, "m"), (1e-6, "µ"), (1e-9, "n"))
+
+
+def quantity(value: float | None, unit: str) -> str:
+    """`value` (SI) with an SI prefix and three digits: ``quantity(1.02e-5, "m")`` is ``"10.2 µm"``; a dash for none."""
+    if value is None or not math.isfinite(value):
+        return "–"
+    scale, prefix = next((p for p in _PREFIXES if abs(value) >= 0.9995 * p[0]), _PREFIXES[-1])
+    return f"{_digits(value / scale)} {prefix}{unit}" if value else f"0 {unit}"
+
+
+def percent(ratio: float | None) -> str:
+    """Write a relative error (1) in percent with three digits; a dash for none."""
+    return "–" if ratio is None or not math.isfinite(ratio) else f"{_digits(100 * ratio)} %"
+
+
+def band_label(band: Mapping[str, Any]) -> str:
+    """Name a band: its frequency, its wavelength, or both."""
+    parts = [quantity(band[key], unit) for key, unit in (("frequency", "Hz"), ("wavelength", "m")) if band.get(key)]
+    return " + ".join(parts) or "0 Hz"
+
+
+def bands_label(bands: Sequence[Mapping[str, Any]]) -> str:
+    """One band's name, or how many there are and from where to where."""
+    labels = [band_label(band) for band in bands]
+    return labels[0] if len(labels) == 1 else f"{len(labels)} bands, {labels[0]} to {labels[-1]}"
+
+
+def worst_at(bands: Sequence[Mapping[str, Any]], place: str) -> float | None:
+    """Find the largest abs(rms error) (1) of all bands at "centre", "end_1" or "end_2"; None without figures."""
+    errors = [band.get(f"rms_error_{place}") for band in bands]
+    known = [abs(error) for error in errors if error is not None and math.isfinite(error)]
+    return max(known, default=None)
+
+
+def total(bands: Sequence[Mapping[str, Any]], key: str) -> float | None:
+    """Amplitude (m) of a sine with the power of all bands together: the root of the sum of squares of `key`."""
+    values = [band[key] for band in bands]
+    return None if any(value is None for value in values) else math.hypot(*values)
+
+
+def verdict(summary: Mapping[str, Any]) -> str:
+    """One plain sentence: within its tolerance or not, and by which figure.
+
+    Parameters
+    ----------
+    summary : mapping
+        What ``Recording.summary()`` returns.
+    """
+    start = "within its tolerance" if summary["passed"] else "misses its tolerance"
+    return f"{start}: worst figure {worst_figure(summary)}, tolerance {percent(summary['tolerance'])}"
+
+
+def worst_figure(summary: Mapping[str, Any]) -> str:
+    """Say which figure decides the verdict: its name, band, place and value."""
+    worst = summary["worst"]
+    place = str(worst["place"]).replace("_", " ")
+    name = str(worst["figure"]).removesuffix("_" + place.replace(" ", "_")).replace("_", " ")
+    return f"{name} of the {worst['band']} band at {place} = {percent(worst['value'])}"
+
+
+def overview(summaries: Sequence[Mapping[str, Any]]) -> str:
+    """Tabulate scenes, a line each: amplitudes, the largest rms error at each place, the verdict."""
+    rows = [["scene", "target", "achieved", "centre", "end 1", "end 2", "verdict"]]
+    for summary in summaries:
+        bands = summary["bands"]
+        amplitudes = [quantity(total(bands, key), "m") for key in ("target", "achieved")]
+        errors = [percent(worst_at(bands, place)) for place in PLACES]
+        rows.append([summary["scene"], *amplitudes, *errors, verdict(summary)])
+    return table(rows)
+
+
+def details(summary: Mapping[str, Any]) -> str:
+    """Tabulate one scene: a line a band, then what concerns all of them, then the verdict."""
+    rows = [["band", "target", "achieved", "centre", "end 1", "end 2", "phase error", "settles in"]]
+    for band in summary["bands"]:
+        amplitudes = [quantity(band[key], "m") for key in ("target", "achieved")]
+        errors = [percent(band[f"rms_error_{place}"]) for place in PLACES]
+        rows.append([band_label(band), *amplitudes, *errors, degrees(band["phase_error"])])
+        rows[-1].append(quantity(band["settling_time"], "s"))
+    head = (
+        f"{summary['scene']} on {summary['device']}, method {summary['method']}, seed {summary['seed']}: "
+        f"{quantity(summary['duration'], 's')}, judged from {quantity(summary['judged_from'], 's')}"
+    )
+    whole = (
+        f"wobble {quantity(summary['wobble'], 'm')}, drive at its limit {percent(summary['saturated_share'])} "
+        f"of the time, flagged samples: {flags(summary)}"
+    )
+    return "\n".join([head, table(rows), whole, *summary["notes"], verdict(summary)])
+
+
+def flags(summary: Mapping[str, Any]) -> str:
+    """Say how many samples each status flag was up."""
+    return ", ".join(f"{name.lower()} {count}" for name, count in summary["flags"].items() if count) or "none"
+
+
+def degrees(angle: float | None) -> str:
+    """Write an angle (rad) in degrees; a dash for none."""
+    return "–" if angle is None or not math.isfinite(angle) else f"{math.degrees(angle):.1f}°"
+
+
+def table(rows: Sequence[Sequence[str]]) -> str:
+    """Lay out `rows` in columns, the first and the last to the left and figures to the right."""
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    last = len(widths) - 1
+    lines = (
+        "  ".join(cell if i == last else f"{cell:{'>' if i else '<'}{widths[i]}}" for i, cell in enumerate(row))
+        for row in rows
+    )
+    return "\n".join(line.rstrip() for line in lines)
+
+
+def _digits(value: float) -> str:
+    """Three significant digits, never in exponent form below a million."""
+    if abs(value) >= 99.95:
+        return f"{value:.0f}" if abs(value) < 1e6 else f"{value:.1e}"
+    return f"{value:.3g}" if abs(value) < 1e-3 else f"{value:.{2 - math.floor(math.log10(abs(value) * 1.0005))}f}"
