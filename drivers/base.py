@@ -24,11 +24,10 @@ that buffers further says so by a larger `delay`, and the controller turns its
 phases by it.  Where the device knows the finger's position (m from the middle,
 NaN while lifted) or load (N), it gives them with the block.
 
-Trouble is of two kinds.  What the caller did wrong (a shape, a NaN) is a
+Trouble is of three kinds.  What the caller did wrong (a shape, a NaN) is a
 ``ValueError`` before anything is played; a device that is absent, late or gone
-is a `DriverError` that names device and operation.  Samples lost while playing
-are neither: they are `Flag.OVERRUN` in the optional attribute ``flags``, the
-status of the block just played.
+is a `DriverError` that names device and operation; samples lost or cut while
+playing are data, `Flag` bits in ``Sensed.flags``.
 
 Nothing has to be inherited.  Here is a whole driver, a plate on two coils with
 a sensor at each end of its glass, and a grating that is felt on it:
@@ -79,7 +78,7 @@ from typing import Any, Self
 import numpy as np
 
 from hapticrender.errors import DriverError
-from hapticrender.protocols import Array, Flag, Sensed
+from hapticrender.protocols import Array, Sensed
 
 _MEMBERS = ("rate", "drive_channels", "sensed_channels", "block", "delay", "play", "__enter__", "__exit__")
 _LEAST = {"drive_channels": 1, "sensed_channels": 0, "block": 1}
@@ -147,18 +146,39 @@ def checked_drive(drive: Array, block: int, drive_channels: int) -> Array:
 class BaseDriver:
     """A driver whose kinds differ only in how they open, play and close.
 
-    A subclass sets the five numbers of the page above and fills in `_play`,
-    and `_open` and `_close` where it has something to acquire.  It is used once:
-    opened (again and again, if need be, to no effect), played, closed for good.
+    A subclass fills in `_play`, and `_open` and `_close` where it has something
+    to acquire.  It is used once: opened (again and again, if need be, to no
+    effect), played, closed for good.
+
+    Parameters
+    ----------
+    rate : float, Hz, > 0
+        Sampling rate.
+    drive_channels : int, >= 1
+        Columns of drive.
+    sensed_channels : int, >= 0
+        Columns of what is sensed.
+    block : int, >= 1
+        Samples a call of `play`.
+    delay : int, >= block, optional
+        Samples from sensing to the drive computed from it; `block` unless given.
+
+    Raises
+    ------
+    ValueError
+        A number is out of its bound.
     """
 
-    rate: float
-    drive_channels: int
-    sensed_channels: int
-    block: int
-    delay: int
-    flags: Flag = Flag(0)
-    _state = "new"
+    def __init__(
+        self, *, rate: float, drive_channels: int, sensed_channels: int, block: int = 1, delay: int | None = None
+    ) -> None:
+        self.rate = rate
+        self.drive_channels = drive_channels
+        self.sensed_channels = sensed_channels
+        self.block = block
+        self.delay = block if delay is None else delay
+        self._state = "new"
+        check_driver(self)
 
     def _open(self) -> None:
         """Acquire what playing needs."""
@@ -181,7 +201,6 @@ class BaseDriver:
         if self._state == "closed":
             raise DriverError(f"{self}: open: it has been closed; make a new one")
         if self._state == "new":
-            check_driver(self)
             self._open()
             self._state = "open"
         return self

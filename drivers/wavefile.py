@@ -9,7 +9,6 @@ file is `full_scale`.
 from __future__ import annotations
 
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -60,8 +59,8 @@ class WaveFileDriver(BaseDriver):
 
     A NaN or an infinity is refused with everything else that `BaseDriver`
     refuses.  Drive beyond `full_scale` is held exactly by FLOAT and DOUBLE;
-    integers cut it to their range, `clipped` counts the samples, and `flags`
-    says `Flag.SATURATED` for the block; what `through` plays is not cut.
+    integers cut it to their range, `clipped` counts the samples, and
+    ``Sensed.flags`` says `Flag.SATURATED`; what `through` plays is not cut.
 
     Parameters
     ----------
@@ -108,27 +107,7 @@ class WaveFileDriver(BaseDriver):
         if not (np.isfinite(full_scale) and full_scale > 0):
             raise ValueError(f"{full_scale=} must be finite and > 0 A")
         own = {"rate": rate, "drive_channels": drive_channels, "block": block}
-        if through is None:
-            self._stand_alone(own)
-        else:
-            self._stand_beside(through, own)
-        check_driver(self)
-
-    def _stand_alone(self, own: dict[str, float | None]) -> None:
-        numbers = {"rate": 48000.0, "drive_channels": 2, "block": 1024}
-        numbers |= {name: value for name, value in own.items() if value is not None}
-        self._take(SimpleNamespace(**numbers, sensed_channels=0, delay=numbers["block"]))
-
-    def _stand_beside(self, through: Driver, own: dict[str, float | None]) -> None:
-        check_driver(through)
-        for name, value in own.items():
-            if value is not None:
-                raise ValueError(f"{name}={value!r} cannot be given beside through=, which has its own")
-        self._take(through)
-
-    def _take(self, source: Any) -> None:
-        for name in ("rate", "drive_channels", "sensed_channels", "block", "delay"):
-            setattr(self, name, getattr(source, name))
+        super().__init__(**(_alone(own) if through is None else _beside(through, own)))
 
     def _open(self) -> None:
         if not self.path.parent.is_dir():
@@ -150,21 +129,17 @@ class WaveFileDriver(BaseDriver):
                 raise
 
     def _play(self, drive: Array) -> Sensed:
-        self.flags = Flag(0)
+        samples = drive / self.full_scale
         answer: list[Sensed] = []
-        carry_through(lambda: answer.append(self._sense(drive)), lambda: self._write(drive))
-        return answer[0]
+        carry_through(lambda: answer.append(self._sense(drive)), lambda: self._write(samples))
+        return self._flagged(answer[0], samples)
 
     def _sense(self, drive: Array) -> Sensed:
-        if self._through is None:
-            return Sensed(np.empty((len(drive), 0)))
-        sensed = self._through.play(drive)
-        self.flags |= getattr(self._through, "flags", Flag(0))
-        return sensed
+        return Sensed(np.empty((len(drive), 0))) if self._through is None else self._through.play(drive)
 
-    def _write(self, drive: Array) -> None:
+    def _write(self, samples: Array) -> None:
         try:
-            self._file.write(self._form(drive / self.full_scale))
+            self._file.write(self._form(samples))
         except (OSError, AssertionError, soundfile.SoundFileError) as error:  # soundfile asserts that all was written
             raise DeviceLost(f"{self.path}: write: {_reason(error)}") from error
 
@@ -174,12 +149,17 @@ class WaveFileDriver(BaseDriver):
         if bits is None:
             return samples
         top = 2.0 ** (bits - 1)
-        steps = np.rint(samples * top)
-        beyond = int(np.count_nonzero(np.abs(samples) > 1))
-        if beyond:
-            self.clipped += beyond
-            self.flags |= Flag.SATURATED
-        return (np.clip(steps, -top, top - 1).astype(np.int64) << (_WORD - bits)).astype(np.int32)
+        steps = np.clip(np.rint(samples * top), -top, top - 1)
+        return (steps.astype(np.int64) << (_WORD - bits)).astype(np.int32)
+
+    def _flagged(self, sensed: Sensed, samples: Array) -> Sensed:
+        """Count and flag what integers cannot hold."""
+        beyond = np.abs(samples) > 1
+        if SUBTYPES[self._subtype] is None or not beyond.any():
+            return sensed
+        self.clipped += int(np.count_nonzero(beyond))
+        flags = np.where(beyond.any(axis=1), int(Flag.SATURATED), 0)
+        return sensed._replace(flags=flags if sensed.flags is None else flags | sensed.flags)
 
     def _close(self) -> None:
         through = self._through
@@ -200,6 +180,21 @@ class WaveFileDriver(BaseDriver):
 
     def __str__(self) -> str:
         return str(self.path)
+
+
+def _alone(own: dict[str, Any]) -> dict[str, Any]:
+    """Numbers of a file on its own: what was given, and defaults."""
+    given = {name: value for name, value in own.items() if value is not None}
+    return {"rate": 48000.0, "drive_channels": 2, "block": 1024, "sensed_channels": 0} | given
+
+
+def _beside(through: Driver, own: dict[str, Any]) -> dict[str, Any]:
+    """Numbers of a tee: those of the device, none of its own."""
+    check_driver(through)
+    for name, value in own.items():
+        if value is not None:
+            raise ValueError(f"{name}={value!r} cannot be given beside through=, which has its own")
+    return {name: getattr(through, name) for name in ("rate", "drive_channels", "sensed_channels", "block", "delay")}
 
 
 def _file_form(path: Path, subtype: str | None) -> tuple[str, str]:

@@ -11,10 +11,8 @@ from hapticrender.protocols import Driver, Sensed
 class Diary(BaseDriver):
     """Writes down all that it is asked to do; fails at what it is told to fail at."""
 
-    rate, block, delay = 5000.0, 4, 5
-    drive_channels, sensed_channels = 2, 1
-
-    def __init__(self, fails_at=()):
+    def __init__(self, fails_at=(), **numbers):
+        super().__init__(**{"rate": 5000.0, "drive_channels": 2, "sensed_channels": 1, "block": 4} | numbers)
         self.fails_at = fails_at
         self.entries = []
 
@@ -123,10 +121,7 @@ def test_a_checked_block_is_float64_in_c_order_and_keeps_its_numbers():
 
 
 def test_a_subclass_without_play_says_so():
-    class Empty(BaseDriver):
-        rate, block, delay, drive_channels, sensed_channels = 1.0, 1, 1, 1, 0
-
-    with pytest.raises(NotImplementedError), Empty() as driver:
+    with pytest.raises(NotImplementedError), BaseDriver(rate=1.0, drive_channels=1, sensed_channels=0) as driver:
         driver.play(np.ones((1, 1)))
 
 
@@ -136,19 +131,21 @@ def test_a_subclass_without_play_says_so():
         ({"rate": 0.0}, r"rate=0.0 must be finite and > 0 Hz"),
         ({"rate": np.nan}, r"rate=nan must be finite and > 0 Hz"),
         ({"block": 0}, r"block=0 must be a whole number >= 1"),
-        ({"block": 1.5, "delay": 2}, r"block=1.5 must be a whole number >= 1"),
+        ({"block": 1.5}, r"block=1.5 must be a whole number >= 1"),
         ({"drive_channels": 0}, r"drive_channels=0 must be a whole number >= 1"),
         ({"sensed_channels": -1}, r"sensed_channels=-1 must be a whole number >= 0"),
         ({"delay": 3}, r"delay=3 must be a whole number >= 4"),
     ],
 )
 def test_numbers_out_of_bound_are_named(change, message):
-    driver = Diary()
-    check_driver(driver)
-    for name, value in change.items():
-        setattr(driver, name, value)
-    with pytest.raises(ValueError, match=message):
-        check_driver(driver)
+    with pytest.raises(ValueError, match=f"Diary: {message}"):
+        Diary(**change)
+
+
+@pytest.mark.parametrize("delay", [4, 9])
+def test_the_least_delay_is_a_block(delay):
+    assert Diary().delay == 4
+    assert Diary(delay=delay).delay == delay
 
 
 def test_an_object_that_is_no_driver_hears_what_it_lacks():

@@ -27,18 +27,17 @@ STEP = {"PCM_16": 2.0**-15, "PCM_24": 2.0**-23, "PCM_32": 2.0**-31, "FLOAT": 2.0
 class Mirror(BaseDriver):
     """Senses what it is driven with, in metres; goes away at block `lost_at`."""
 
-    rate, block, delay = 4009.8, 5, 7
-    drive_channels, sensed_channels = 3, 3
-
-    def __init__(self, lost_at=None):
+    def __init__(self, lost_at=None, flags=None):
+        super().__init__(rate=4009.8, drive_channels=3, sensed_channels=3, block=5, delay=7)
         self.lost_at = lost_at
+        self.flags = flags
         self.played = []
 
     def _play(self, drive):
         if len(self.played) == self.lost_at:
             raise DeviceLost("mirror: play: gone")
         self.played.append(drive.copy())
-        return Sensed(1e-6 * drive, position=np.full(len(drive), 0.01))
+        return Sensed(1e-6 * drive, position=np.full(len(drive), 0.01), flags=self.flags)
 
     def _close(self):
         self.played.append("closed")
@@ -111,17 +110,13 @@ def test_alone_it_is_a_driver_without_sensors(tmp_path):
 
 
 def test_integers_cut_what_is_beyond_full_scale_and_say_so(tmp_path):
-    blocks = np.array([[[1.0, -1.0]], [[1.5, -4.0]], [[0.25, 0.5]]])
-    driver = WaveFileDriver(tmp_path / "a.flac", full_scale=1.0, subtype="PCM_16", block=1)
-    flags = []
+    driver = WaveFileDriver(tmp_path / "a.flac", full_scale=1.0, subtype="PCM_16", block=2)
     with driver:
-        for block in blocks:
-            driver.play(block)
-            flags.append(driver.flags)
-    assert flags == [Flag(0), Flag.SATURATED, Flag(0)]
+        assert driver.play(np.array([[1.0, -1.0], [0.5, 0.0]])).flags is None
+        assert driver.play(np.array([[0.25, 0.5], [1.5, -4.0]])).flags.tolist() == [0, Flag.SATURATED]
     assert driver.clipped == 2
     top = 1 - 2.0**-15
-    assert driver.read_back().tolist() == [[top, -1.0], [top, -1.0], [0.25, 0.5], [0.0, 0.0]]
+    assert driver.read_back().tolist() == [[top, -1.0], [0.5, 0.0], [0.25, 0.5], [top, -1.0], [0.0, 0.0], [0.0, 0.0]]
 
 
 def test_floats_hold_what_is_beyond_full_scale(tmp_path):
@@ -191,12 +186,13 @@ def test_a_tee_passes_numbers_sensing_and_drive_on(tmp_path, rng):
     assert soundfile.info(tmp_path / "a.wav").samplerate == 4010
 
 
-def test_a_tee_passes_flags_on(tmp_path):
-    mirror = Mirror()
-    mirror.flags = Flag.OVERRUN
+def test_a_tee_adds_its_flags_to_those_of_the_device(tmp_path):
+    mirror = Mirror(flags=np.array([Flag.OVERRUN, 0, Flag.OVERRUN, 0, 0]))
     with WaveFileDriver(tmp_path / "a.flac", through=mirror, full_scale=1.0) as driver:
-        driver.play(np.full((5, 3), 2.0))
-        assert driver.flags == Flag.OVERRUN | Flag.SATURATED
+        flags = driver.play(np.array([[2.0], [2.0], [0.5], [0.5], [-1.5]]) * np.ones(3)).flags
+    both = Flag.OVERRUN | Flag.SATURATED
+    assert flags.tolist() == [both, Flag.SATURATED, Flag.OVERRUN, 0, Flag.SATURATED]
+    assert driver.clipped == 9
 
 
 def test_a_lost_device_ends_the_run_and_the_file_is_whole(tmp_path):
