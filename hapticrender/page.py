@@ -39,7 +39,7 @@ tbody tr:hover { background: var(--wash); }
 .note { color: var(--soft); font-size: 0.9rem; }
 svg { display: block; }
 section { border-top: 2px solid var(--ink); margin-top: 3.5rem; padding-top: 1.2rem; }
-section > p { margin: 0.3rem 0 1.2rem; }
+section > p { margin: 0.3rem 0 1.2rem; max-width: none; }
 section img { display: block; width: 100%; height: auto; }
 .halves { display: grid; grid-template-columns: repeat(auto-fit, minmax(22rem, 1fr)); gap: 0.5rem 3rem; }
 dl { display: grid; grid-template-columns: max-content 1fr; gap: 0.35rem 1.2rem; margin: 1rem 0; font-size: 0.9rem; }
@@ -47,7 +47,7 @@ dt { color: var(--soft); }
 dd { margin: 0; }
 audio { width: 100%; height: 2.2rem; display: block; margin-top: 0.25rem; }
 pre { margin: 1rem 0; padding: 1rem 1.2rem; background: var(--wash); border-radius: 4px; overflow: auto;
-  max-height: 26rem; font: 0.8rem/1.5 ui-monospace, "DejaVu Sans Mono", monospace; }
+  max-height: 26rem; align-self: start; font: 0.8rem/1.5 ui-monospace, "DejaVu Sans Mono", monospace; }
 summary { cursor: pointer; color: var(--good); font-size: 0.9rem; }
 footer { margin-top: 4rem; }
 """
@@ -138,8 +138,13 @@ def _row(scene: Outputs) -> str:
 def _verdict_cell(summary: Mapping[str, Any]) -> str:
     """Short where all is well, the whole sentence where it is not."""
     if summary["passed"]:
-        return f'<td class="text wide good">within {wording.percent(summary["tolerance"])}</td>'
-    return f'<td class="text wide bad">{escape(wording.verdict(summary))}</td>'
+        return f'<td class="text wide good">within {100 * summary["tolerance"]:.4g} %</td>'
+    return f'<td class="text wide bad">{_sentence(summary)}</td>'
+
+
+def _sentence(summary: Mapping[str, Any]) -> str:
+    """Put the verdict into HTML, with values and their units kept together."""
+    return escape(wording.verdict(summary)).replace(" %", "&nbsp;%").replace(" Hz", "&nbsp;Hz")
 
 
 def _error_cell(error: float | None, tolerance: float) -> str:
@@ -199,7 +204,7 @@ def _section(scene: Outputs, folder: str) -> str:
     )
     return f"""<section id="{name}">
 <h2>{name}</h2>
-<p class="{"good" if summary["passed"] else "bad"}">{escape(_capital(wording.verdict(summary)))}.</p>
+<p class="{"good" if summary["passed"] else "bad"}">{_capital(_sentence(summary))}.</p>
 {picture}
 {_bands(summary)}
 <div class="halves">
@@ -247,9 +252,9 @@ def _band_row(band: Mapping[str, Any], tolerance: float) -> str:
 def _figures(summary: Mapping[str, Any]) -> str:
     """List what concerns the whole scene."""
     entries = {
-        "Duration": wording.quantity(summary["duration"], "s"),
-        "Judged from": wording.quantity(summary["judged_from"], "s"),
-        "Sampling rate": wording.quantity(summary["rate"], "Hz"),
+        "Duration": wording.short(summary["duration"], "s"),
+        "Judged from": wording.short(summary["judged_from"], "s"),
+        "Sampling rate": wording.short(summary["rate"], "Hz"),
         "Method": f"{summary['method']}, seed {summary['seed']}",
         "Wobble": wording.quantity(summary["wobble"], "m"),
         "Drive at its limit": f"{wording.percent(summary['saturated_share'])} of the time",
@@ -264,7 +269,7 @@ def _sounds(summary: Mapping[str, Any], folder: str) -> str:
     """Make a player for each WAV, with what its full scale stands for."""
     return "".join(
         f'<p class="note">{name.removesuffix(".wav").capitalize()}, '
-        f"full scale {wording.quantity(sound['full_scale'], sound['unit'])}"
+        f"full scale {wording.short(sound['full_scale'], sound['unit'])}"
         f'<audio controls preload="none" src="{folder}/{name}"></audio></p>'
         for name, sound in summary["sound"].items()
     )

@@ -37,8 +37,8 @@ class Verdict:
         Bound on the figure (relative error, 1).
     figure, band, place : str
         The worst figure: its name, the band and the place on the surface where it stood.
-    value : float
-        The worst figure (relative error, 1).
+    value : float or None
+        The worst figure (relative error, 1); None where nothing could be judged.
     elapsed : float
         Time that the rendering took (s).
     summary : dict
@@ -52,7 +52,7 @@ class Verdict:
     passed: bool
     tolerance: float
     figure: str
-    value: float
+    value: float | None
     band: str
     place: str
     elapsed: float

@@ -11,11 +11,29 @@ _PREFIXES = ((1.0, ""), (1e-3, "m"), (1e-6, "µ"), (1e-9, "n"))
 
 
 def quantity(value: float | None, unit: str) -> str:
-    """`value` (SI) with an SI prefix and three digits: ``quantity(1.02e-5, "m")`` is ``"10.2 µm"``; a dash for none."""
+    """Write a measured `value` (SI) with a prefix and three digits, a dash for none.
+
+    Examples
+    --------
+    >>> quantity(1.0016e-5, "m"), quantity(None, "s")
+    ('10.0 µm', '–')
+    """
     if value is None or not math.isfinite(value):
         return "–"
-    scale, prefix = next((p for p in _PREFIXES if abs(value) >= 0.9995 * p[0]), _PREFIXES[-1])
+    scale, prefix = _prefix(value)
     return f"{_digits(value / scale)} {prefix}{unit}" if value else f"0 {unit}"
+
+
+def short(value: float, unit: str) -> str:
+    """Write a chosen `value` (SI) with a prefix and no more digits than it needs, four at most.
+
+    Examples
+    --------
+    >>> short(1e-3, "m"), short(62.5, "Hz")
+    ('1 mm', '62.5 Hz')
+    """
+    scale, prefix = _prefix(value)
+    return f"{value / scale:.4g} {prefix}{unit}"
 
 
 def percent(ratio: float | None) -> str:
@@ -25,7 +43,7 @@ def percent(ratio: float | None) -> str:
 
 def band_label(band: Mapping[str, Any]) -> str:
     """Name a band: its frequency, its wavelength, or both."""
-    parts = [quantity(band[key], unit) for key, unit in (("frequency", "Hz"), ("wavelength", "m")) if band.get(key)]
+    parts = [short(band[key], unit) for key, unit in (("frequency", "Hz"), ("wavelength", "m")) if band.get(key)]
     return " + ".join(parts) or "0 Hz"
 
 
@@ -56,15 +74,17 @@ def verdict(summary: Mapping[str, Any]) -> str:
     summary : mapping
         What ``Recording.summary()`` returns.
     """
+    if summary["worst"]["value"] is None:
+        return "misses its tolerance: it cannot be judged, there is no figure"
     start = "within its tolerance" if summary["passed"] else "misses its tolerance"
-    return f"{start}: worst figure {worst_figure(summary)}, tolerance {percent(summary['tolerance'])}"
+    return f"{start}: worst figure {worst_figure(summary)}, tolerance {100 * summary['tolerance']:.4g} %"
 
 
 def worst_figure(summary: Mapping[str, Any]) -> str:
     """Say which figure decides the verdict: its name, band, place and value."""
     worst = summary["worst"]
-    place = str(worst["place"]).replace("_", " ")
-    name = str(worst["figure"]).removesuffix("_" + place.replace(" ", "_")).replace("_", " ")
+    place, figure = (str(worst[key]).replace("_", " ") for key in ("place", "figure"))
+    name = figure.removesuffix(f" {place}")
     return f"{name} of the {worst['band']} band at {place} = {percent(worst['value'])}"
 
 
@@ -89,7 +109,7 @@ def details(summary: Mapping[str, Any]) -> str:
         rows[-1].append(quantity(band["settling_time"], "s"))
     head = (
         f"{summary['scene']} on {summary['device']}, method {summary['method']}, seed {summary['seed']}: "
-        f"{quantity(summary['duration'], 's')}, judged from {quantity(summary['judged_from'], 's')}"
+        f"{short(summary['duration'], 's')}, judged from {short(summary['judged_from'], 's')}"
     )
     whole = (
         f"wobble {quantity(summary['wobble'], 'm')}, drive at its limit {percent(summary['saturated_share'])} "
@@ -117,6 +137,11 @@ def table(rows: Sequence[Sequence[str]]) -> str:
         for row in rows
     )
     return "\n".join(line.rstrip() for line in lines)
+
+
+def _prefix(value: float) -> tuple[float, str]:
+    """Choose the SI prefix with which `value` has one to three digits before the point; none above 1."""
+    return next((entry for entry in _PREFIXES if abs(value) >= 0.9995 * entry[0]), _PREFIXES[-1])
 
 
 def _digits(value: float) -> str:
