@@ -1,6 +1,20 @@
-"""hapticrender: makes a bare finger feel a texture on a surface, in closed loop."""
+"""hapticrender: makes a bare finger feel a texture on a surface, in closed loop.
 
+>>> import hapticrender as hr
+>>> scene = hr.Scene(texture=hr.Grating(frequency=72.0, amplitude=10e-6), duration=2.0)
+>>> recording = hr.render(scene)
+>>> f"{1e6 * recording.summary()['bands'][0]['target']:.1f} um"
+'10.0 um'
+
+The public names are loaded when they are first used, so that importing the
+package costs next to nothing.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module as _import_module
 from pathlib import Path as _Path
+from typing import TYPE_CHECKING, Any
 
 # A wheel holds renderers/ and drivers/ inside this package; in a source checkout they lie beside it, so look there too.
 _here = _Path(__file__).parent
@@ -8,3 +22,71 @@ if not (_here / "renderers").is_dir():
     __path__.append(str(_here.parent))
 
 __version__ = "0.1.0"
+
+_HOMES = {
+    "bands": ("Bands",),
+    "errors": (
+        "DesignError",
+        "DeviceLost",
+        "DeviceNotFound",
+        "DeviceTimeout",
+        "DriverError",
+        "HapticError",
+        "ProtocolError",
+        "SceneError",
+    ),
+    "loop": ("Session", "prepare", "render", "run"),
+    "protocols": ("Controller", "Driver", "Flag", "Method", "Motion", "Plant", "Renderer", "Sensed", "Texture"),
+    "recording": ("Recorder", "Recording"),
+    "touch.builtin": ("builtin_scenes",),
+    "touch.finger": ("Finger", "FingerMechanics"),
+    "touch.grating": ("Grating",),
+    "touch.motion": ("Sampled", "Sliding", "Still", "Swiping"),
+    "touch.recorded": ("Recorded", "Synthetic"),
+    "touch.scene": ("Scene",),
+}
+_HOME_OF = {name: home for home, names in _HOMES.items() for name in names}
+
+__all__ = sorted(_HOME_OF)
+
+if TYPE_CHECKING:
+    from hapticrender.bands import Bands as Bands
+    from hapticrender.errors import DesignError as DesignError
+    from hapticrender.errors import DeviceLost as DeviceLost
+    from hapticrender.errors import DeviceNotFound as DeviceNotFound
+    from hapticrender.errors import DeviceTimeout as DeviceTimeout
+    from hapticrender.errors import DriverError as DriverError
+    from hapticrender.errors import HapticError as HapticError
+    from hapticrender.errors import ProtocolError as ProtocolError
+    from hapticrender.errors import SceneError as SceneError
+    from hapticrender.loop import Session as Session
+    from hapticrender.loop import prepare as prepare
+    from hapticrender.loop import render as render
+    from hapticrender.loop import run as run
+    from hapticrender.protocols import Flag as Flag
+    from hapticrender.protocols import Sensed as Sensed
+    from hapticrender.recording import Recorder as Recorder
+    from hapticrender.recording import Recording as Recording
+    from hapticrender.touch.builtin import builtin_scenes as builtin_scenes
+    from hapticrender.touch.finger import Finger as Finger
+    from hapticrender.touch.finger import FingerMechanics as FingerMechanics
+    from hapticrender.touch.grating import Grating as Grating
+    from hapticrender.touch.motion import Sampled as Sampled
+    from hapticrender.touch.motion import Sliding as Sliding
+    from hapticrender.touch.motion import Still as Still
+    from hapticrender.touch.motion import Swiping as Swiping
+    from hapticrender.touch.recorded import Recorded as Recorded
+    from hapticrender.touch.recorded import Synthetic as Synthetic
+    from hapticrender.touch.scene import Scene as Scene
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOME_OF:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    value = getattr(_import_module(f"{__name__}.{_HOME_OF[name]}"), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

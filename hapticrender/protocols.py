@@ -13,7 +13,6 @@ the band (or channel) last.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from enum import IntFlag
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, runtime_checkable
 
@@ -43,12 +42,14 @@ class Sensed(NamedTuple):
     `position` (n,), m from the middle of the surface, NaN while no finger is seen; None where the device cannot tell.
     `motion` (n, places), m: the true motion at the judged places; only simulated devices know it.
     `normal_load` (n,), N; None where the device cannot tell.
+    `flags` (n,), `Flag` bits raised by the device; None where it raises none.
     """
 
     sensed: Array
     position: Array | None = None
     motion: Array | None = None
     normal_load: Array | None = None
+    flags: Array | None = None
 
 
 @runtime_checkable
@@ -56,7 +57,7 @@ class Texture(Protocol):
     """What the surface says: a function of time (s) or of position (m)."""
 
     def bands(self, rate: float) -> Bands:
-        """Carriers, and constant envelopes where the texture has them, at sampling `rate` (Hz)."""
+        """Carriers, and constant envelopes where the texture has them, for sampling at `rate` (Hz)."""
         ...
 
     def waveform(self, time: Array, position: Array) -> Array:
@@ -109,10 +110,23 @@ class Plant(Protocol):
         """Advance plant and controller together, sample by sample; returns drive, target, flags, sensed."""
         ...
 
+    def finger_position(self, n: int) -> Array:
+        """Finger positions (m, shape (n,)) of the next n samples, NaN while lifted."""
+        ...
+
 
 @runtime_checkable
 class Controller(Protocol):
-    """Makes every band follow its target: estimator, law and synthesis over preallocated state."""
+    """Makes every band follow its target: estimator, law and synthesis over preallocated state.
+
+    `tables` and `state` are the named tuples that its compiled step reads and writes; a plant hands them to the
+    kernel in which the two are closed sample by sample.
+    """
+
+    method: str
+    n_bands: int
+    tables: Any
+    state: Any
 
     def run(self, sensed: Array, position: Array, wanted: Array) -> tuple[Array, Array, Array]:
         """Digest n samples; return drive (n, channels), target envelopes (n, bands) and flags (n,).
@@ -128,12 +142,12 @@ class Renderer(Protocol):
 
     name: str
 
-    def bands(self, scene: Scene, rate: float) -> Bands:
-        """Carriers and targets of a scene; refuses what the device cannot do."""
+    def band_model(self, scene: Scene, driver: Driver) -> BandModel:
+        """All that the controller ever knows of the device behind `driver`."""
         ...
 
-    def band_model(self, scene: Scene, rate: float, delay: int) -> BandModel:
-        """All that the controller ever knows of the device."""
+    def bands(self, scene: Scene, model: BandModel) -> Bands:
+        """Carriers and targets of a scene; refuses with a ValueError what the device cannot do."""
         ...
 
     def plant(self, scene: Scene, seed: int) -> Plant:
@@ -149,6 +163,3 @@ class Method(Protocol):
     def design(self, model: BandModel, bands: Bands, **options: Any) -> Controller:
         """Validate, choose bandwidths, build tables; may raise `DesignError`."""
         ...
-
-
-Registry = Mapping[str, Any]

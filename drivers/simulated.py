@@ -1,0 +1,33 @@
+"""The embedded default: a plant model behind the driver protocol."""
+
+from __future__ import annotations
+
+from hapticrender.drivers.base import BaseDriver
+from hapticrender.protocols import Array, Plant, Sensed
+
+
+class SimulatedDriver(BaseDriver):
+    """Plays on a plant model instead of hardware.
+
+    Where the plant can be closed with a controller inside compiled code, the
+    loop does so (`plant.closed_loop`); `play` gives the same samples one block
+    at a time.
+
+    Parameters
+    ----------
+    plant : Plant
+        A device model with a finger on it.
+    """
+
+    def __init__(self, plant: Plant) -> None:
+        self.plant = plant
+        super().__init__(
+            rate=plant.rate,
+            drive_channels=plant.drive_channels,
+            sensed_channels=plant.sensed_channels,
+            block=plant.block,
+            delay=plant.delay,
+        )
+
+    def _play(self, drive: Array) -> Sensed:
+        return self.plant.run(drive)

@@ -1,0 +1,77 @@
+"""What a device is to the controller: a second-order matrix and the maps around it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from hapticrender.protocols import Array
+
+
+@dataclass(frozen=True, kw_only=True)
+class BandModel:
+    """All that the controller ever knows of a device.
+
+    In the controlled coordinates q the device obeys ``D(s) q = force_from_drive @ drive``
+    with the dynamic stiffness ``D(s) = mass s^2 + damping s + stiffness`` (N/m).
+
+    Parameters
+    ----------
+    rate : float, Hz
+        Sampling rate of the loop.
+    delay : int, samples
+        From a sensed sample to the moment the drive computed from it acts.
+    mass, damping, stiffness : ndarray, shape (c, c), kg, N s/m, N/m
+        The free device in its coordinates.
+    force_from_drive : ndarray, shape (c, d), N per drive unit
+        Generalised forces of the drive channels.
+    coordinate_from_sensed : ndarray, shape (c, s)
+        Coordinates from sensors.
+    side_from_coordinate : ndarray, shape (d, c)
+        Displacement at each transducer from the coordinates.
+    place_from_coordinate : ndarray, shape (p, c)
+        Displacement at each judged place from the coordinates.
+    places : tuple of str
+        Names of the judged places.
+    drive_limit : float, drive unit
+        Largest magnitude of each drive channel, > 0.
+    lowest_frequency, highest_frequency : float, Hz
+        Finger-locked carriers fade out beyond these.
+
+    Notes
+    -----
+    Equations of motion: Grigorii et al. 2021, corrected in coordinates q = [x_c, a theta].
+    """
+
+    rate: float
+    delay: int
+    mass: Array
+    damping: Array
+    stiffness: Array
+    force_from_drive: Array
+    coordinate_from_sensed: Array
+    side_from_coordinate: Array
+    place_from_coordinate: Array
+    places: tuple[str, ...]
+    drive_limit: float
+    lowest_frequency: float = 20.0
+    highest_frequency: float = 1000.0
+
+    def dynamic_stiffness(self, frequency: Array) -> Array:
+        """D(j w), N/m, complex, shape (..., c, c), at `frequency` (Hz, shape (...))."""
+        s = 2j * np.pi * np.asarray(frequency, float)[..., None, None]
+        return self.mass * s**2 + self.damping * s + self.stiffness
+
+    def response(self, frequency: Array) -> Array:
+        """Coordinates per drive, m per drive unit, complex, shape (..., c, d): D^-1 times the drive's forces.
+
+        Hold and delay are not in it; see `hold_and_delay`.
+        """
+        stiffness = self.dynamic_stiffness(frequency)
+        return np.linalg.solve(stiffness, np.broadcast_to(self.force_from_drive, (*stiffness.shape[:-2], *self.force_from_drive.shape)))
+
+    def hold_and_delay(self, frequency: Array) -> Array:
+        """Response of the zero-order hold and the known delay, complex, shape (...)."""
+        turns = np.asarray(frequency, float) / self.rate
+        return np.sinc(turns) * np.exp(-2j * np.pi * turns * (self.delay + 0.5))

@@ -1,0 +1,136 @@
+"""The controller of Grigorii et al. 2021: amplitude and phase loops on the STDFT*, per transducer or in common mode.
+
+A look-up table of the free plate over frequency turns the commanded amplitude
+into a current; the phase loop needs none.  The command amplitude never goes
+negative, and the phase is cut at -270/90 degrees.  It is the baseline that the
+other methods are measured against: two sides controlled apart are unstable on
+this very plate between 129 and 189 Hz.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from hapticrender.bands import Bands
+from hapticrender.control.bandmodel import BandModel
+from hapticrender.control.kernels import PolarState, PolarTables, polar_run
+from hapticrender.control.loopshape import design
+from hapticrender.protocols import Array
+
+TABLE_STEP = 0.5  # Hz, resolution of the look-up table
+
+
+class PolarController:
+    """Polar controller of any number of coordinates and bands behind the `Controller` protocol.
+
+    Parameters
+    ----------
+    method : str
+        Name of the method that designed it.
+    tables : PolarTables
+        Parameters of the compiled step.
+    """
+
+    def __init__(self, method: str, tables: PolarTables) -> None:
+        coordinates, bands = tables.coordinate_from_sensed.shape[0], len(tables.frequency)
+        self.method = method
+        self.n_bands = bands
+        self.tables = tables
+        self.state = PolarState(
+            turns=np.zeros(bands),
+            forward=np.ones(bands),
+            motion=np.zeros(4),
+            estimate=np.zeros((4, coordinates, bands)),
+            reference=np.zeros((4, bands)),
+            heading=np.vstack([np.ones(bands), np.zeros(bands)]),
+            amplitude=np.zeros((2, coordinates, bands)),
+            angle=np.zeros((2, coordinates, bands)),
+            coordinate=np.zeros(coordinates),
+            command=np.zeros(coordinates),
+        )
+
+    def run(self, sensed: Array, position: Array, wanted: Array) -> tuple[Array, Array, Array]:
+        """Digest n samples; see `Controller`."""
+        n = len(sensed)
+        drive = np.zeros((n, self.tables.drive_from_coordinate.shape[0]))
+        target = np.zeros((n, self.n_bands), complex)
+        flags = np.zeros(n, np.int64)
+        polar_run(self.tables, self.state, np.ascontiguousarray(sensed, float), position, wanted, drive, target, flags)
+        return drive, target, flags
+
+
+class PerSide:
+    """The paper's controller: each transducer with its own amplitude and phase loops."""
+
+    name = "paper"
+
+    def design(self, model: BandModel, bands: Bands, **options: Any) -> PolarController:
+        """Loops on the displacements at the transducers, interpolated from the sensors at the ends."""
+        sides = model.side_from_coordinate
+        return _design(self.name, model, bands, sides, np.eye(len(sides)), **options)
+
+
+class CommonMode:
+    """The same loops on the mean displacement only; all transducers get the same drive."""
+
+    name = "paper-common"
+
+    def design(self, model: BandModel, bands: Bands, **options: Any) -> PolarController:
+        """One pair of loops on heave."""
+        sides = model.side_from_coordinate
+        return _design(self.name, model, bands, sides.mean(axis=0, keepdims=True), np.ones((len(sides), 1)), **options)
+
+
+def _design(
+    name: str,
+    model: BandModel,
+    bands: Bands,
+    watched: Array,
+    spread: Array,
+    *,
+    feedback: bool = True,
+) -> PolarController:
+    """Tables of the compiled step: `watched` rows are the controlled displacements, `spread` their drive channels."""
+    fixed = bands.frequency[bands.wavenumber == 0.0]
+    lowest = min(model.lowest_frequency, fixed.min(initial=np.inf))
+    loop = design(
+        loop_bandwidth=lowest / 4,
+        filter_bandwidth=lowest / 2,
+        form="reduced",
+        lowest_frequency=lowest,
+        delay=model.delay / model.rate,
+    )
+    frequency = np.arange(0.0, model.rate / 2 + TABLE_STEP, TABLE_STEP)
+    common = model.response(frequency) @ np.ones(model.force_from_drive.shape[1])
+    table = (common @ watched.T).T
+    lag = np.angle(table * model.hold_and_delay(frequency))
+    return PolarController(
+        name,
+        PolarTables(
+            rate=model.rate,
+            feedback=feedback,
+            analysed=bands.envelope is None,
+            drive_limit=model.drive_limit,
+            lowest=model.lowest_frequency,
+            highest=min(model.highest_frequency, 0.4 * model.rate),
+            frequency=bands.frequency.astype(float),
+            wavenumber=bands.wavenumber.astype(float),
+            phase=bands.phase / (2 * np.pi),
+            envelope=np.zeros(len(bands), complex) if bands.envelope is None else bands.envelope.astype(complex),
+            coordinate_from_sensed=np.ascontiguousarray(watched @ model.coordinate_from_sensed),
+            drive_from_coordinate=spread,
+            filter=_section(loop.low_pass.tustin(model.rate)),
+            law=_section(loop.controller.tustin(model.rate)),
+            gain=np.ascontiguousarray(abs(table)),
+            lag=np.ascontiguousarray(np.unwrap(lag, axis=1)),
+            table_step=TABLE_STEP,
+        ),
+    )
+
+
+def _section(coefficients: tuple[Array, Array]) -> Array:
+    """b0 b1 b2 a1 a2 of a second-order section with a0 = 1."""
+    b, a = coefficients
+    return np.array([*b, *a[1:]], float)

@@ -1,0 +1,334 @@
+"""The vibrotactile plate of Grigorii et al. 2021: two coils, a sheet of glass, Hall sensors at its ends, a finger.
+
+Equations, with q = [x_c, a theta], a = coil_spacing/2, side 1 at -a, finger at p::
+
+    (M s^2 + C s + K) q = force_constant [[1, 1], [-1, 1]] i - F_f [1, p/a]
+    M = diag(m, I/a^2), K = [[k1+k2, k2-k1], [k2-k1, k1+k2]], C alike
+    F_f = W + Z_f(s) s (x_c + p theta)
+
+The paper's own force equations carry (m/2) x_i'' -+ (I/2) theta'', which is
+dimensionally wrong; the form above is (m/2) x_c'' -+ (I/d) theta''.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from hapticrender.control.bandmodel import BandModel
+from hapticrender.plants.kernels import PlateState, PlateTables, plate_run, plate_system, polar_plate_run
+from hapticrender.protocols import Array, Controller, Sensed
+
+if TYPE_CHECKING:
+    from hapticrender.touch.finger import Finger, FingerMechanics
+
+PLACES = ("centre", "end 1", "end 2")
+TAYLOR_ROUNDING = 1e-17  # the first term left out of the series, relative to the state
+
+
+@dataclass(frozen=True, kw_only=True)
+class PlateParameters:
+    """Everything that describes the plate, its electronics and how finely it is modelled.
+
+    Parameters
+    ----------
+    mass, inertia : float, kg, kg m2
+        Moving mass and its inertia about the middle, > 0.
+    stiffness_1, stiffness_2 : float, N/m
+        Coil suspensions, > 0.
+    damping_1, damping_2 : float, N s/m
+        Coil dampings, >= 0.
+    force_constant : float, N/A
+        Of each coil, > 0.
+    coil_spacing, glass_length : float, m
+        Distance between the coils; length of the glass, the sensors sit at its ends.
+    amplifier_r1, amplifier_r2, amplifier_rp : float, ohm
+        Transconductance amplifier, i = V/R1 (1 - R2/Rp).
+    current_limit : float, A
+        Of each coil, > 0 (engineering default).
+    current_bits : int
+        Resolution of the command over +- current_limit; 0 is ideal.
+    sensor_range : float, m
+        Full range of a sensor.
+    sensor_bits : int
+        Resolution over sensor_range; 0 is ideal.
+    sensor_noise : float, m rms
+        White noise of each sensor, >= 0.
+    rate : float, Hz
+        Sampling rate of the embedded loop.
+    delay : int, samples
+        Loop delay, >= 1: from a sensed sample to the drive computed from it.
+    degrees_of_freedom : int
+        2: heave and rocking; 1: heave only.
+    finger_dynamics : int
+        1: the finger's mechanics as the scene gives them; 0: only its static load.
+
+    Notes
+    -----
+    Defaults are the paper's printed values; current and sensor ranges are engineering defaults (FACTS section 1).
+    """
+
+    mass: float = 32e-3
+    inertia: float = 4e-5
+    stiffness_1: float = 22.4e3
+    stiffness_2: float = 22.9e3
+    damping_1: float = 0.85
+    damping_2: float = 0.85
+    force_constant: float = 7.4
+    coil_spacing: float = 55e-3
+    glass_length: float = 110e-3
+    amplifier_r1: float = 10e3
+    amplifier_r2: float = 2e3
+    amplifier_rp: float = 1.0
+    current_limit: float = 3.0
+    current_bits: int = 12
+    sensor_range: float = 2e-3
+    sensor_bits: int = 14
+    sensor_noise: float = 1e-6
+    rate: float = 5000.0
+    delay: int = 1
+    degrees_of_freedom: int = 2
+    finger_dynamics: int = 1
+
+    def __post_init__(self) -> None:
+        for field in fields(self):
+            value = getattr(self, field.name)
+            whole = field.type == "int"
+            if isinstance(value, bool) or not isinstance(value, int if whole else (int, float)):
+                raise TypeError(f"{field.name} = {value!r}: must be {'an integer' if whole else 'a number'}")
+            floor, strict = _BOUNDS.get(field.name, (0.0, True))
+            if not math.isfinite(value) or value < floor or (strict and value == floor):
+                raise ValueError(f"{field.name} = {value!r}: must be {'>' if strict else '>='} {floor:g} {_UNITS[field.name]}".rstrip())
+            ceiling = _CEILINGS.get(field.name, math.inf)
+            if value > ceiling:
+                raise ValueError(f"{field.name} = {value!r}: must be <= {ceiling:g} {_UNITS[field.name]}".rstrip())
+
+    @classmethod
+    def with_overrides(cls, overrides: Mapping[str, Any]) -> PlateParameters:
+        """Defaults with some parameters replaced; an unknown name is a ValueError that lists the known ones."""
+        known = {field.name for field in fields(cls)}
+        for name in overrides:
+            if name not in known:
+                raise ValueError(f"plant.{name}: no such parameter; known: {', '.join(sorted(known))}")
+        try:
+            return cls(**overrides)
+        except (ValueError, TypeError) as error:
+            raise type(error)(f"plant.{error}") from None
+
+    @property
+    def half_spacing(self) -> float:
+        """Half the coil spacing a (m)."""
+        return self.coil_spacing / 2
+
+    @property
+    def amplifier_gain(self) -> float:
+        """Coil current per command voltage (A/V): (1 - R2/Rp)/R1, about -1/5."""
+        return (1 - self.amplifier_r2 / self.amplifier_rp) / self.amplifier_r1
+
+    @property
+    def current_step(self) -> float:
+        """Resolution of the coil current (A); 0 is ideal."""
+        return 2 * self.current_limit / 2**self.current_bits if self.current_bits else 0.0
+
+    @property
+    def sensor_step(self) -> float:
+        """Resolution of a sensor (m); 0 is ideal."""
+        return self.sensor_range / 2**self.sensor_bits if self.sensor_bits else 0.0
+
+    @property
+    def mass_matrix(self) -> Array:
+        """M (kg, shape (2, 2)) in heave and rocking."""
+        return np.diag([self.mass, self.inertia / self.half_spacing**2])
+
+    @property
+    def damping_matrix(self) -> Array:
+        """C (N s/m, shape (2, 2))."""
+        return _pair(self.damping_1, self.damping_2)
+
+    @property
+    def stiffness_matrix(self) -> Array:
+        """K (N/m, shape (2, 2))."""
+        return _pair(self.stiffness_1, self.stiffness_2)
+
+    @property
+    def force_from_drive(self) -> Array:
+        """Generalised forces per coil current (N/A, shape (2, 2))."""
+        return self.force_constant * np.array([[1.0, 1.0], [-1.0, 1.0]])
+
+    def modes(self) -> tuple[Array, Array]:
+        """Undamped-equivalent frequencies (Hz, ascending) and damping ratios of the free plate's two modes."""
+        inverse = np.linalg.inv(self.mass_matrix)
+        system = np.block(
+            [[np.zeros((2, 2)), np.eye(2)], [-inverse @ self.stiffness_matrix, -inverse @ self.damping_matrix]]
+        )
+        poles = np.linalg.eigvals(system)
+        poles = poles[poles.imag > 0]
+        poles = poles[np.argsort(abs(poles))]
+        return abs(poles) / (2 * np.pi), -poles.real / abs(poles)
+
+    def dynamic_stiffness(self, frequency: Array, finger: Array | complex = 0.0, position: float = 0.0) -> Array:
+        """D(j w) in heave and rocking (N/m, shape (..., 2, 2)) under a finger impedance (N s/m) at `position` (m)."""
+        s = 2j * np.pi * np.asarray(frequency, float)[..., None, None]
+        lever = np.array([1.0, position / self.half_spacing])
+        load = np.asarray(finger, complex)[..., None, None] * s * np.outer(lever, lever)
+        return self.mass_matrix * s**2 + self.damping_matrix * s + self.stiffness_matrix + load
+
+    def band_model(self, rate: float, delay: int) -> BandModel:
+        """What the controller may know of this plate, in a loop of `rate` (Hz) and `delay` (samples)."""
+        reach = self.glass_length / self.coil_spacing
+        return BandModel(
+            rate=rate,
+            delay=delay,
+            mass=self.mass_matrix,
+            damping=self.damping_matrix,
+            stiffness=self.stiffness_matrix,
+            force_from_drive=self.force_from_drive,
+            coordinate_from_sensed=np.linalg.inv(np.array([[1.0, -reach], [1.0, reach]])),
+            side_from_coordinate=np.array([[1.0, -1.0], [1.0, 1.0]]),
+            place_from_coordinate=np.array([[1.0, 0.0], [1.0, -reach], [1.0, reach]]),
+            places=PLACES,
+            drive_limit=self.current_limit,
+        )
+
+
+_BOUNDS = {
+    **dict.fromkeys(("damping_1", "damping_2", "sensor_noise", "current_bits", "sensor_bits", "finger_dynamics"), (0.0, False)),
+    **dict.fromkeys(("delay", "degrees_of_freedom"), (1.0, False)),
+    "rate": (500.0, False),
+}
+_CEILINGS = {"current_bits": 24, "sensor_bits": 24, "delay": 100_000, "degrees_of_freedom": 2, "finger_dynamics": 1, "rate": 1e6}
+_UNITS = {
+    **dict.fromkeys((field.name for field in fields(PlateParameters)), ""),
+    **dict.fromkeys(("coil_spacing", "glass_length", "sensor_range", "sensor_noise"), "m"),
+    **dict.fromkeys(("stiffness_1", "stiffness_2"), "N/m"),
+    **dict.fromkeys(("damping_1", "damping_2"), "N s/m"),
+    **dict.fromkeys(("amplifier_r1", "amplifier_r2", "amplifier_rp"), "ohm"),
+    "mass": "kg",
+    "inertia": "kg m2",
+    "force_constant": "N/A",
+    "current_limit": "A",
+    "rate": "Hz",
+    "delay": "samples",
+}
+
+
+def _pair(side_1: float, side_2: float) -> Array:
+    """Two equal-kind elements at the coils, in heave and rocking."""
+    return np.array([[side_1 + side_2, side_2 - side_1], [side_2 - side_1, side_1 + side_2]])
+
+
+class Plate:
+    """The plate in discrete time, behind the `Plant` protocol.
+
+    Parameters
+    ----------
+    parameters : PlateParameters
+        The plate and its levels of modelling.
+    finger : Finger
+        Where the finger is, how hard it presses, and its mechanics.
+    seed : int
+        Of the sensor noise.
+    block : int
+        Samples a `run` call plays before the controller can answer; the rest of the delay is queued inside.
+    """
+
+    def __init__(self, parameters: PlateParameters, finger: Finger, seed: int = 0, block: int = 1) -> None:
+        if not 1 <= block <= parameters.delay:
+            raise ValueError(f"block = {block}: must be between 1 and the loop's delay of {parameters.delay} samples")
+        self.parameters = parameters
+        self.finger = finger
+        self.rate = float(parameters.rate)
+        self.delay = parameters.delay
+        self.block = block
+        self.drive_channels = self.sensed_channels = 2
+        self._rng = np.random.default_rng(seed)
+        self._samples = 0
+        self._tables = _tables(parameters, finger.mechanics)
+        self._state = PlateState(
+            z=np.zeros(6),
+            term=np.zeros((2, 6)),
+            frozen=np.full(2, np.nan),
+            system=np.zeros((6, 6)),
+            push=np.zeros((6, 2)),
+            pending=np.zeros((parameters.delay - block, 2)),
+            cursor=np.zeros(1, np.int64),
+            current=np.zeros(2),
+        )
+        self._last = np.zeros(2)
+
+    def _next(self, n: int) -> tuple[Array, Array, Array]:
+        """Finger rows, noise and sample flags of the next n samples."""
+        time = (self._samples + np.arange(n)) / self.rate
+        self._samples += n
+        finger = np.column_stack([self.finger.position(time), self.finger.load(time), self.finger.strength(time)])
+        return finger, self._rng.standard_normal((n, 2)), np.zeros(n, np.int64)
+
+    def finger_position(self, n: int) -> Array:
+        """Finger positions (m, shape (n,)) of the next n samples, NaN while lifted; the plant does not advance."""
+        return self.finger.position((self._samples + np.arange(n)) / self.rate)
+
+    def run(self, drive: Array) -> Sensed:
+        """Advance by n samples under `drive` (A, shape (n, 2)); row i acts from sample i on, sensed at its start."""
+        n = len(drive)
+        finger, noise, flags = self._next(n)
+        sensed, motion = np.zeros((n, 2)), np.zeros((n, 3))
+        plate_run(self._tables, self._state, np.ascontiguousarray(drive, float), finger, noise, sensed, motion, flags)
+        return Sensed(sensed, finger[:, 0], motion, finger[:, 1], flags)
+
+    def closed_loop(self, controller: Controller, wanted: Array) -> tuple[Array, Array, Array, Sensed]:
+        """Advance plate and controller together over `wanted` (m, shape (n,)), controller and plate sample by sample."""
+        n = len(wanted)
+        finger, noise, flags = self._next(n)
+        sensed, motion, drive = np.zeros((n, 2)), np.zeros((n, 3)), np.zeros((n, 2))
+        target = np.zeros((n, controller.n_bands), complex)
+        polar_plate_run(
+            self._tables, self._state, controller.tables, controller.state, self._last, finger, noise,
+            wanted, sensed, motion, drive, target, flags,
+        )
+        return drive, target, flags, Sensed(sensed, finger[:, 0], motion, finger[:, 1], flags)
+
+
+def _tables(parameters: PlateParameters, mechanics: FingerMechanics) -> PlateTables:
+    """Arrays of the compiled plate."""
+    order = mechanics.order if parameters.finger_dynamics else 0
+    rocking = parameters.degrees_of_freedom == 2
+    mass = parameters.mass_matrix.diagonal()
+    stiffness, damping = parameters.stiffness_matrix, parameters.damping_matrix
+    if not rocking:
+        stiffness, damping = np.diag(stiffness.diagonal()), np.diag(damping.diagonal())
+    skin = np.array([mechanics.mass, mechanics.damping, mechanics.stiffness]) if order else np.zeros(3)
+    phalanx = np.array([mechanics.phalanx_mass, mechanics.phalanx_damping, mechanics.phalanx_stiffness])
+    tables = PlateTables(
+        period=1.0 / parameters.rate,
+        terms=0,
+        inverse_mass=np.array([1.0 / mass[0], 1.0 / mass[1] if rocking else 0.0]),
+        stiffness=np.array([stiffness[0, 0], stiffness[0, 1], stiffness[1, 1]]),
+        damping=np.array([damping[0, 0], damping[0, 1], damping[1, 1]]),
+        force_constant=parameters.force_constant,
+        lever=1.0 / parameters.half_spacing,
+        reach=parameters.glass_length / parameters.coil_spacing,
+        skin=skin,
+        phalanx=phalanx,
+        coupled=order == 4,
+        current_limit=parameters.current_limit,
+        current_step=parameters.current_step,
+        sensor_limit=parameters.sensor_range / 2,
+        sensor_step=parameters.sensor_step,
+        sensor_noise=parameters.sensor_noise,
+    )
+    return tables._replace(terms=_taylor_terms(tables))
+
+
+def _taylor_terms(tables: PlateTables) -> int:
+    """Number of terms after which the exponential series has converged to rounding, at the glass end and pressed hard."""
+    system = np.zeros((6, 6))
+    plate_system(tables, tables.reach, 3.0, system, np.zeros((6, 2)))
+    term, n = system, 1
+    while abs(term).max() > TAYLOR_ROUNDING:
+        n += 1
+        term = system @ term / n
+    return n
