@@ -1,0 +1,262 @@
+"""House rules: what is shipped, who may import whom, and that what is written down is so."""
+
+import ast
+import dataclasses
+import doctest
+import importlib
+import inspect
+import re
+import tomllib
+from importlib.metadata import entry_points
+from pathlib import Path
+
+import pytest
+
+import hapticrender
+
+ROOT = Path(__file__).resolve().parent.parent
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
+ROOMS = ("hapticrender", "renderers", "drivers")
+
+
+def shipped_files():
+    return sorted(path for room in ROOMS for path in (ROOT / room).rglob("*.py"))
+
+
+def module_name(path):
+    parts = path.relative_to(ROOT).with_suffix("").parts
+    parts = parts if parts[0] == "hapticrender" else ("hapticrender", *parts)
+    return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+
+
+MODULES = {module_name(path): path for path in shipped_files() if path.name != "__main__.py"}
+
+
+def tree_of(path):
+    return ast.parse(path.read_text(encoding="utf-8"), filename=str(path))
+
+
+def test_packages_on_disk_are_the_packages_shipped():
+    on_disk = {module_name(path) for path in shipped_files() if path.name == "__init__.py"}
+    assert sorted(on_disk) == sorted(PROJECT["tool"]["setuptools"]["packages"])
+
+
+def test_every_folder_with_modules_is_a_package():
+    bare = {path.parent for path in shipped_files()} - {p.parent for p in shipped_files() if p.name == "__init__.py"}
+    assert not bare
+
+
+def test_every_package_comes_from_where_the_map_says():
+    beside = PROJECT["tool"]["setuptools"]["package-dir"]
+    assert beside == {f"hapticrender.{room}": room for room in ROOMS[1:]}
+    for name, path in MODULES.items():
+        assert Path(importlib.import_module(name).__file__).resolve() == path
+
+
+def test_the_version_is_said_once():
+    assert hapticrender.__version__ == PROJECT["project"]["version"]
+    first = re.search(r"^## (\S+)", (ROOT / "CHANGELOG.md").read_text(encoding="utf-8"), re.MULTILINE)
+    assert first.group(1) == PROJECT["project"]["version"]
+
+
+def test_the_all_extra_holds_every_optional_part():
+    extras = PROJECT["project"]["optional-dependencies"]
+    named = re.fullmatch(r"hapticrender\[(.*)\]", extras["all"][0]).group(1)
+    assert set(named.split(",")) == set(extras) - {"all", "test"}
+
+
+def test_entry_points_resolve():
+    declared = PROJECT["project"]["entry-points"] | {"console_scripts": PROJECT["project"]["scripts"]}
+    for group, points in declared.items():
+        installed = {point.name: point for point in entry_points(group=group)}
+        for name, target in points.items():
+            assert installed[name].value == target, f"{group}: {name}: install the package anew"
+            assert callable(installed[name].load())
+
+
+GROUND = {f"hapticrender.{name}" for name in ("protocols", "errors", "bands", "_jit")}
+MAY_IMPORT = {  # room: the other rooms that it may look into
+    "ground": set(),
+    "touch": set(),
+    "control": set(),
+    "plants": {"control"},
+    "core": {"touch", "control", "plants"},
+    "renderers": {"touch", "control", "plants"},
+    "drivers": {"plants"},
+    "cli": {"touch", "control", "plants", "core"},
+}
+
+
+def room_of(name):
+    if name in GROUND:
+        return "ground"
+    parts = name.split(".")
+    return parts[1] if len(parts) > 1 and parts[1] in MAY_IMPORT else "core"
+
+
+def absolute(node, package):
+    if not node.level:
+        return node.module
+    base = package.split(".")[: len(package.split(".")) - node.level + 1]
+    return ".".join([*base, *([node.module] if node.module else [])])
+
+
+def is_for_types_only(node):
+    return isinstance(node, ast.If) and ast.unparse(node.test) in ("TYPE_CHECKING", "typing.TYPE_CHECKING")
+
+
+def imports(node, package):
+    """Names of modules of ours that a tree imports anywhere at run time."""
+    for child in ast.iter_child_nodes(node):
+        if is_for_types_only(child):
+            continue
+        if isinstance(child, ast.Import):
+            yield from (alias.name for alias in child.names)
+        elif isinstance(child, ast.ImportFrom):
+            base = absolute(child, package)
+            for alias in child.names:
+                deeper = f"{base}.{alias.name}"
+                yield deeper if deeper in MODULES else base
+        else:
+            yield from imports(child, package)
+
+
+def our_imports(name, path):
+    package = name if path.name == "__init__.py" else name.rpartition(".")[0]
+    return {found for found in imports(tree_of(path), package) if found.split(".")[0] in ROOMS}
+
+
+@pytest.mark.parametrize("name", MODULES)
+def test_imports_run_downwards(name):
+    if name == "hapticrender":
+        pytest.skip("the flat face of the package names what all rooms hold")
+    room = room_of(name)
+    for found in our_imports(name, MODULES[name]):
+        assert found.startswith("hapticrender"), f"{name} imports {found} by its short name: a second module object"
+        assert room_of(found) in MAY_IMPORT[room] | {room, "ground"}, f"{name} ({room}) imports {found}"
+
+
+def test_the_layers_would_notice_an_upward_import(tmp_path):
+    path = tmp_path / "stray.py"
+    path.write_text(
+        "from typing import TYPE_CHECKING\n"
+        "if TYPE_CHECKING:\n    import hapticrender.cli\n"
+        "def late():\n    from ..drivers import base\n    from . import bank\n    import hapticrender.touch.scene\n"
+    )
+    assert our_imports("hapticrender.control.stray", path) == {
+        "hapticrender.drivers.base",
+        "hapticrender.control",
+        "hapticrender.touch.scene",
+    }
+
+
+@pytest.mark.parametrize("name", MODULES)
+def test_shipped_code_does_not_assert(name):
+    assert not [node.lineno for node in ast.walk(tree_of(MODULES[name])) if isinstance(node, ast.Assert)]
+
+
+def members(owner, module):
+    """Public functions and classes that `module` defines, and the public methods of those classes."""
+    for name, value in vars(owner).items():
+        value = getattr(value, "py_func", value)  # a kernel's own function
+        value = getattr(value, "__func__", value)
+        if name.startswith("_") or getattr(value, "__module__", None) != module.__name__:
+            continue
+        if inspect.isfunction(value):
+            yield value
+        elif inspect.isclass(value):
+            yield value
+            yield from members(value, module)
+
+
+def documented(value):
+    """Names in the numpydoc section Parameters, None where there is no such section."""
+    section = re.search(r"^Parameters\n-+\n(.*?)(?=^\S[^\n]*\n-{3,}|\Z)", inspect.getdoc(value) or "", re.M | re.S)
+    if section is None:
+        return None
+    heads = re.findall(r"^(\*{0,2}\w.*?)(?: : .*)?$", section.group(1), re.M)
+    return [name.strip() for head in heads for name in head.split(",")]
+
+
+def signature(value):
+    if dataclasses.is_dataclass(value):
+        return [field.name for field in dataclasses.fields(value) if field.init and not field.name.startswith("_")]
+    stars = {inspect.Parameter.VAR_POSITIONAL: "*", inspect.Parameter.VAR_KEYWORD: "**"}
+    parameters = inspect.signature(value).parameters.values()
+    return [stars.get(p.kind, "") + p.name for p in parameters if p.name not in ("self", "cls")]
+
+
+@pytest.mark.parametrize("name", MODULES)
+def test_documented_parameters_are_the_signatures(name):
+    module = importlib.import_module(name)
+    for value in members(module, module):
+        names = documented(value)
+        assert names is None or names == signature(value), f"{name}.{value.__qualname__}"
+
+
+def test_the_parameter_check_reads_numpydoc():
+    def example(first, second, *rest, third=None):
+        """Do it.
+
+        Parameters
+        ----------
+        first, second : float, m
+            Two lengths: of this and that.
+        *rest : float
+            More.
+        third : int, optional
+            Last.
+
+        Returns
+        -------
+        float
+            Nothing.
+        """
+
+    assert documented(example) == signature(example) == ["first", "second", "*rest", "third"]
+
+
+@pytest.mark.parametrize("name", MODULES)
+def test_doctests_run(name, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    module = importlib.import_module(name)
+    runner = doctest.DocTestRunner(optionflags=doctest.ELLIPSIS)
+    complaints = []
+    for test in doctest.DocTestFinder(exclude_empty=True).find(module, name):
+        runner.run(test, out=complaints.append)
+    assert not runner.failures, "".join(complaints)
+
+
+README = (ROOT / "README.md").read_text(encoding="utf-8")
+
+
+def blocks(language):
+    return re.findall(rf"^```{language}\n(.*?)^```", README, re.MULTILINE | re.DOTALL)
+
+
+def test_python_in_the_readme_runs(tmp_path, monkeypatch):
+    pytest.importorskip("matplotlib")
+    monkeypatch.chdir(tmp_path)
+    names = {"__name__": "readme"}
+    assert blocks("python")
+    for number, block in enumerate(blocks("python")):
+        exec(compile(block, f"README.md, Python block {number}", "exec"), names)
+
+
+def test_commands_in_the_readme_are_in_the_makefile():
+    verbs = set(re.findall(r"^([a-z]+):.*## ", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE))
+    told = set(re.findall(r"^make (\w+)", "".join(blocks("sh")), re.MULTILINE))
+    assert {"demo", "test"} <= told <= verbs
+
+
+def test_links_in_the_readme_lead_somewhere():
+    targets = re.findall(r"\]\(([^)#]+)\)", README)
+    assert targets
+    missing = [target for target in targets if "://" not in target and not (ROOT / target).exists()]
+    assert not missing
+
+
+def test_the_tree_in_the_readme_names_every_room():
+    rooms = {name for name, path in MODULES.items() if path.name == "__init__.py" and name != "hapticrender"}
+    for name in rooms:
+        assert f"{name.rpartition('.')[2]}/" in README, name
