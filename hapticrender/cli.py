@@ -176,13 +176,12 @@ def _write_page(arguments: argparse.Namespace, scenes: list[Outputs]) -> Path:
 
 def _render(arguments: argparse.Namespace) -> int:
     from hapticrender.outputs import run_into
-    from hapticrender.wording import details
 
     _check_folder(arguments.out)
     sessions = _prepare({arguments.scene: _scene(arguments.scene)}, arguments)
     with _progress(sessions).scene(arguments.scene) as tick:
         outputs = run_into(arguments.out, sessions[0], progress=tick)
-    print(details(outputs.summary))
+    _print_figures(outputs.summary)
     _hint_at_pictures([outputs])
     return 0
 
@@ -203,14 +202,14 @@ def _scenes(arguments: argparse.Namespace) -> int:
 
 def _validate(arguments: argparse.Namespace) -> int:
     from hapticrender.touch.builtin import builtin_scenes
-    from hapticrender.validate import judge, write_json, write_junit
+    from hapticrender.validate import run_and_judge, write_json, write_junit
 
     reports = [(path, write) for path, write in ((arguments.json, write_json), (arguments.junit, write_junit)) if path]
     for path, _ in reports:
         _check_file(path)
     scenes = {reference: _scene(reference) for reference in arguments.scenes or builtin_scenes()}
     sessions = _prepare(scenes, arguments)
-    verdicts = judge(sessions, _progress(sessions))
+    verdicts = run_and_judge(sessions, _progress(sessions))
     for path, write in reports:
         path.parent.mkdir(parents=True, exist_ok=True)
         write(path, verdicts)
@@ -220,11 +219,11 @@ def _validate(arguments: argparse.Namespace) -> int:
 
 def _show(arguments: argparse.Namespace) -> int:
     from hapticrender.recording import Recording
-    from hapticrender.wording import details
 
     path = arguments.path / "recording.au" if arguments.path.is_dir() else arguments.path
     with _blaming(str(path)):
-        print(details(Recording.load(path).summary()))
+        summary = Recording.load(path).summary()
+    _print_figures(summary)
     return 0
 
 
@@ -258,6 +257,14 @@ def _overview(summaries: list[Any]) -> str:
     from hapticrender.wording import overview
 
     return overview(summaries)
+
+
+def _print_figures(summary: Any) -> None:
+    from hapticrender.judge import text
+    from hapticrender.wording import conditions
+
+    print(conditions(summary))
+    print(text(summary))
 
 
 def _hint_at_pictures(scenes: list[Outputs]) -> None:

@@ -241,8 +241,8 @@ def _bands(summary: Mapping[str, Any]) -> str:
 
 def _band_row(band: Mapping[str, Any], tolerance: float) -> str:
     """One band of a scene."""
-    means = "".join(f"<td>{wording.percent(band[f'error_{place}'])}</td>" for place in wording.PLACES)
-    spreads = "".join(_error_cell(band[f"rms_error_{place}"], tolerance) for place in wording.PLACES)
+    means = "".join(f"<td>{wording.percent(band.get(f'error_{place}'))}</td>" for place in wording.PLACES)
+    spreads = "".join(_error_cell(band.get(f"rms_error_{place}"), tolerance) for place in wording.PLACES)
     return f"""<tr><td class="text">{wording.band_label(band)}</td><td>{wording.quantity(band["target"], "m")}</td>
 <td>{wording.quantity(band["achieved"], "m")}</td>{means}{spreads}
 <td>{wording.degrees(band["phase_error"])}</td>

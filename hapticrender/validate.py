@@ -52,9 +52,9 @@ class Verdict:
     passed: bool
     tolerance: float
     figure: str
-    value: float | None
     band: str
     place: str
+    value: float | None
     elapsed: float
     summary: Mapping[str, Any] = field(repr=False)
 
@@ -106,10 +106,10 @@ def validate(
     >>> verdict.passed
     True
     """
-    return judge([prepare(scene, method=method, seed=seed) for scene in scenes], progress)
+    return run_and_judge([prepare(scene, method=method, seed=seed) for scene in scenes], progress)
 
 
-def judge(sessions: Iterable[Session], progress: Progress | None = None) -> list[Verdict]:
+def run_and_judge(sessions: Iterable[Session], progress: Progress | None = None) -> list[Verdict]:
     """Run prepared sessions to their ends and judge each."""
     verdicts = []
     for session in sessions:

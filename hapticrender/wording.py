@@ -61,9 +61,9 @@ def worst_at(bands: Sequence[Mapping[str, Any]], place: str) -> float | None:
 
 
 def total(bands: Sequence[Mapping[str, Any]], key: str) -> float | None:
-    """Amplitude (m) of a sine with the power of all bands together: the root of the sum of squares of `key`."""
-    values = [band[key] for band in bands]
-    return None if any(value is None for value in values) else math.hypot(*values)
+    """Add up `key` ("target" or "achieved", m) over the judged bands: the root of the sum of squares."""
+    values = [band[key] for band in bands if band["target"] is not None and band["achieved"] is not None]
+    return math.hypot(*values) if values else None
 
 
 def verdict(summary: Mapping[str, Any]) -> str:
@@ -99,23 +99,13 @@ def overview(summaries: Sequence[Mapping[str, Any]]) -> str:
     return table(rows)
 
 
-def details(summary: Mapping[str, Any]) -> str:
-    """Tabulate one scene: a line a band, then what concerns all of them, then the verdict."""
-    rows = [["band", "target", "achieved", "centre", "end 1", "end 2", "phase error", "settles in"]]
-    for band in summary["bands"]:
-        amplitudes = [quantity(band[key], "m") for key in ("target", "achieved")]
-        errors = [percent(band[f"rms_error_{place}"]) for place in PLACES]
-        rows.append([band_label(band), *amplitudes, *errors, degrees(band["phase_error"])])
-        rows[-1].append(quantity(band["settling_time"], "s"))
-    head = (
+def conditions(summary: Mapping[str, Any]) -> str:
+    """Say in a line what was rendered, how, for how long, and which flags were up."""
+    return (
         f"{summary['scene']} on {summary['device']}, method {summary['method']}, seed {summary['seed']}: "
-        f"{short(summary['duration'], 's')}, judged from {short(summary['judged_from'], 's')}"
+        f"{short(summary['duration'], 's')}, judged from {short(summary['judged_from'], 's')}, "
+        f"flagged samples: {flags(summary)}"
     )
-    whole = (
-        f"wobble {quantity(summary['wobble'], 'm')}, drive at its limit {percent(summary['saturated_share'])} "
-        f"of the time, flagged samples: {flags(summary)}"
-    )
-    return "\n".join([head, table(rows), whole, *summary["notes"], verdict(summary)])
 
 
 def flags(summary: Mapping[str, Any]) -> str:
