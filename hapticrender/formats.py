@@ -37,6 +37,10 @@ FLAC_CHANNELS = 8
 CHUNK = 65536  # frames
 
 
+class MissingExtra(HapticError, ImportError):
+    """An optional part is not installed: says which extra brings it."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class Header:
     """What the columns of a recording mean, and where they come from.
@@ -219,7 +223,7 @@ def write(path: str | os.PathLike[str], header: Header, frames: Array) -> None:
     """
     path = Path(path)
     writer = _known(path, WRITERS, "written")
-    with _replacing(path) as scratch:
+    with replacing(path) as scratch:
         writer(scratch, header, frames)
 
 
@@ -295,7 +299,7 @@ def write_sound(
     if not 0 < full_scale < np.inf:
         raise ValueError(f"{full_scale=} {unit} must be finite and > 0")
     comment = f"full scale = {full_scale:.6g} {unit}".rstrip()
-    with _replacing(path) as scratch:
+    with replacing(path) as scratch:
         _write_audio(scratch, container, f"PCM_{bits}", np.clip(signal / full_scale, -1, 1), rate, comment)
     return full_scale
 
@@ -308,7 +312,7 @@ def _known(path: Path, table: dict[str, Any], verb: str) -> Any:
 
 
 @contextmanager
-def _replacing(path: Path) -> Iterator[Path]:
+def replacing(path: Path) -> Iterator[Path]:
     """Give a scratch file beside `path` that takes its place only if the block succeeds."""
     handle, name = tempfile.mkstemp(path.suffix.lower(), f".{path.stem}-", path.parent)
     os.close(handle)
@@ -358,7 +362,7 @@ def _h5py() -> Any:
     try:
         import h5py
     except ImportError as error:
-        raise HapticError("HDF5 files need h5py: pip install 'hapticrender[hdf5]'") from error
+        raise MissingExtra("HDF5 files need h5py: pip install 'hapticrender[hdf5]'") from error
     return h5py
 
 

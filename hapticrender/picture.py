@@ -1,0 +1,266 @@
+"""One picture of a recording: wanted and achieved, the waveform near by, the drive, the finger, the verdict."""
+
+from __future__ import annotations
+
+import os
+import textwrap
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from hapticrender import wording
+from hapticrender.formats import MissingExtra, replacing
+from hapticrender.protocols import Array, Flag
+
+if TYPE_CHECKING:
+    from hapticrender.recording import Recording
+
+# Okabe and Ito's colours: told apart by every kind of colour vision, and of different lightness.
+BLUE, ORANGE, GREEN, RED, INK, PALE = "#0072B2", "#E69F00", "#009E73", "#D55E00", "#222222", "#8A8A8A"
+PLACES = ((BLUE, "o"), (ORANGE, "<"), (GREEN, ">"))
+COILS = (BLUE, ORANGE, GREEN, RED)
+COLUMNS = 1400  # points that a full-width panel can show
+PERIODS = 4  # of the strongest carrier in the close-up
+MOST_LABELS = 10
+FLOOR = 1e-5  # relative error below which a dot stands at the foot of its panel
+STYLE = {
+    "font.size": 9,
+    "axes.titlesize": 9.5,
+    "axes.titlelocation": "left",
+    "axes.titleweight": "bold",
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.edgecolor": PALE,
+    "axes.grid": True,
+    "grid.color": "#E4E4E4",
+    "grid.linewidth": 0.6,
+    "legend.frameon": False,
+    "legend.fontsize": 8,
+}
+
+
+def plot(recording: Recording, path: str | os.PathLike[str]) -> None:
+    """Draw a recording into one PNG.
+
+    Parameters
+    ----------
+    recording : Recording
+    path : path-like
+        File to write; an older one is replaced when the new one is whole.
+
+    Raises
+    ------
+    MissingExtra
+        matplotlib is not installed.
+    """
+    try:
+        import matplotlib
+        from matplotlib.backends.backend_agg import FigureCanvasAgg
+        from matplotlib.figure import Figure
+    except ImportError as error:
+        raise MissingExtra("pictures need matplotlib: pip install 'hapticrender[plot]'") from error
+    with matplotlib.rc_context(STYLE), np.errstate(all="ignore"), replacing(Path(path)) as scratch:
+        touched = bool(np.isfinite(recording.position).any())
+        figure = Figure(figsize=(11, 9.6 if touched else 8.0), layout="constrained")
+        FigureCanvasAgg(figure)
+        _draw(figure, recording, touched)
+        figure.savefig(scratch, dpi=110, format="png")
+
+
+def _draw(figure: Any, recording: Recording, touched: bool) -> None:
+    heights = [0.42, 2.2, 2.2, 1.7] + ([0.9, 0.9] if touched else [])
+    grid = figure.add_gridspec(len(heights), 2, height_ratios=heights, width_ratios=[1.35, 1])
+    summary = recording.summary()
+    _head(figure.add_subplot(grid[0, :]), recording, summary, touched)
+    amplitude = figure.add_subplot(grid[1, :])
+    _amplitude(amplitude, recording, summary)
+    _close_up(figure.add_subplot(grid[2, 0]), recording)
+    _errors(figure.add_subplot(grid[2, 1]), recording, summary)
+    rows = [amplitude, figure.add_subplot(grid[3, :], sharex=amplitude)]
+    _drive(rows[-1], recording)
+    if touched:
+        rows += [figure.add_subplot(grid[row, :], sharex=amplitude) for row in (4, 5)]
+        _finger(rows[-2], rows[-1], recording)
+    for axes in rows[1:-1]:
+        axes.tick_params(labelbottom=False)
+    rows[-1].set_xlabel("time (s)")
+    amplitude.set_xlim(0, max(len(recording), 1) / recording.rate)
+
+
+def _head(axes: Any, recording: Recording, summary: dict[str, Any], touched: bool) -> None:
+    """Name of the scene, how it was made, and the verdict in words."""
+    axes.axis("off")
+    passed, finger = summary["passed"], "" if touched else " · no finger"
+    axes.text(0, 1.0, summary["scene"] or "(no name)", fontsize=15, fontweight="bold", va="top")
+    how = f"{summary['device']} · method {summary['method']} · seed {summary['seed']} · {summary['rate']:g} Hz{finger}"
+    axes.text(1, 0.92, how, color="#555555", ha="right", va="top")
+    sentence = textwrap.shorten(wording.verdict(summary), 150, placeholder=" …")
+    mark = "✓ " if passed else "✗ "
+    axes.text(0, 0.02, mark + sentence, color="#00694E" if passed else "#A84300", fontweight="bold", va="bottom")
+    axes.set(xlim=(0, 1), ylim=(0, 1))
+
+
+def _amplitude(axes: Any, recording: Recording, summary: dict[str, Any]) -> None:
+    """Target and achieved amplitude over time, all bands together."""
+    envelopes = recording.envelopes
+    shown = envelopes.readable.any(axis=0)
+    readable = envelopes.readable[:, shown].all(axis=1)
+    achieved = _together(envelopes.achieved[:, :, shown])
+    achieved[~readable] = np.nan
+    time, wanted = _target(recording, shown)
+    tolerance = recording.header.tolerance
+    axes.fill_between(
+        time, (1 - tolerance) * wanted, (1 + tolerance) * wanted, color=PALE, alpha=0.2, lw=0, label="tolerance"
+    )
+    names = recording.header.places
+    for i in reversed(range(len(names))):
+        colour = PLACES[i % len(PLACES)][0]
+        axes.plot(envelopes.time, 1e6 * achieved[:, i], color=colour, lw=1.8 if i == 0 else 1.1, label=names[i])
+    axes.plot(time, wanted, color=INK, lw=1.1, ls=(0, (4, 2)), label="target")
+    axes.axvline(summary["judged_from"], color=PALE, lw=0.9, ls=":", label="judged from here")
+    several = "" if shown.sum() <= 1 else f" ({int(shown.sum())} bands: root of the sum of squares)"
+    axes.set(title=f"Peak amplitude{several}", ylabel="amplitude (µm)")
+    axes.set_ylim(0, 1.12 * max(np.nanmax(1e6 * achieved, initial=0), (1 + tolerance) * wanted.max(initial=0)) or 1)
+    handles, labels = axes.get_legend_handles_labels()
+    order = sorted(
+        range(len(labels)), key=lambda i: [*names, "target", "tolerance", "judged from here"].index(labels[i])
+    )
+    _legend(axes, [handles[i] for i in order], [labels[i] for i in order])
+
+
+def _target(recording: Recording, shown: Array) -> tuple[Array, Array]:
+    """Time (s) and wanted amplitude (µm), all shown bands together, thinned to what the panel can show."""
+    step = max(1, len(recording) // COLUMNS)
+    target = np.concatenate(
+        [
+            recording.read("target", start, start + step * COLUMNS)[::step, shown]
+            for start in range(0, len(recording), step * COLUMNS)
+        ]
+        or [np.empty((0, int(shown.sum())), complex)]
+    )
+    return np.arange(len(target)) * step / recording.rate, 1e6 * _together(target)
+
+
+def _together(envelope: Array) -> Array:
+    return np.sqrt((np.abs(envelope) ** 2).sum(axis=-1))
+
+
+def _close_up(axes: Any, recording: Recording) -> None:
+    """Show a few periods of the wanted and the true waveform at the centre, late in the judged time."""
+    start, stop = _close_span(recording)
+    time = np.arange(start, stop) / recording.rate
+    phase = recording.bands.carrier_phase(time, recording.read("position", start, stop))
+    wanted = 1e6 * (recording.read("target", start, stop) * np.exp(1j * phase)).real.sum(axis=1)
+    motion = 1e6 * recording.read("motion", start, stop)[:, 0]
+    offset = np.mean(motion) if motion.size else 0.0
+    milliseconds = 1e3 * (time - time[:1])
+    axes.plot(milliseconds, motion - offset, color=BLUE, lw=1.8, label="centre")
+    axes.plot(milliseconds, wanted, color=INK, lw=1.1, ls=(0, (4, 2)), label="target")
+    begin = f"{time[0]:.2f} s" if time.size else "the start"
+    level = f", offset of {offset:.3g} µm removed" if abs(offset) > 0.05 * np.abs(wanted).max(initial=0) else ""
+    axes.set(title=f"Waveform from {begin}{level}", xlabel="time (ms)", ylabel="displacement (µm)")
+    axes.margins(x=0, y=0.12)
+    _legend(axes)
+
+
+def _close_span(recording: Recording) -> tuple[int, int]:
+    """First and last sample of a few periods in the last judged window, or at the end where nothing is judged."""
+    envelopes, rate = recording.envelopes, recording.rate
+    judged = np.flatnonzero(envelopes.judged.any(axis=1))
+    if not judged.size:
+        return max(0, len(recording) - round(0.1 * rate)), len(recording)
+    last = judged[-1]
+    first = round(envelopes.start[last] * rate)
+    size = round(envelopes.window * rate)
+    position = recording.read("position", first, first + size)
+    velocity = (position[-1] - position[0]) * rate / (size - 1)
+    frequency = np.abs(recording.bands.instantaneous_frequency(np.nan_to_num(velocity)))
+    strength = np.where(envelopes.judged[last], np.abs(envelopes.wanted[last]), 0)
+    slowest = frequency[strength >= 0.1 * strength.max()].min()
+    seconds = max(PERIODS / frequency[strength.argmax()], 1.5 / slowest)
+    stop = min(len(recording), first + size)
+    return max(0, stop - round(seconds * rate)), stop
+
+
+def _errors(axes: Any, recording: Recording, summary: dict[str, Any]) -> None:
+    """Rms error of every band at every place, against the tolerance."""
+    bands, names = summary["bands"], recording.header.places
+    for i, name in enumerate(names):
+        values = [band[f"rms_error_{name.replace(' ', '_')}"] for band in bands]
+        shift = 0.0 if len(bands) > MOST_LABELS else 0.18 * (i - (len(names) - 1) / 2)
+        colour, marker = PLACES[i % len(PLACES)]
+        known = [(k + shift, 100 * max(value, FLOOR)) for k, value in enumerate(values) if value is not None]
+        if known:
+            axes.plot(*zip(*known, strict=True), marker, color=colour, ms=6 if len(bands) <= 10 else 3.5, label=name)
+    axes.axhline(100 * recording.header.tolerance, color=INK, lw=1, ls=(0, (4, 2)), label="tolerance")
+    axes.set_yscale("log")
+    low, high = axes.get_ylim()
+    axes.set_ylim(
+        min(low, 100 * recording.header.tolerance / 30) / 1.5, max(high, 100 * recording.header.tolerance) * 4
+    )
+    axes.yaxis.set_major_formatter(lambda value, _: f"{value:g}")
+    axes.minorticks_off()
+    every = -(-len(bands) // MOST_LABELS)
+    shown = range(0, len(bands), every)
+    axes.set_xticks(list(shown), [wording.band_label(bands[k]) for k in shown], rotation=30 if len(shown) > 5 else 0)
+    axes.set_xlim(-0.6, len(bands) - 0.4)
+    axes.grid(axis="x", visible=False)
+    axes.set(title="Rms error of the judged amplitude", ylabel="error (%)")
+    _legend(axes, columns=4)
+
+
+def _drive(axes: Any, recording: Recording) -> None:
+    """Drive of every coil; a long run as the range that each column of pixels covers."""
+    drive, limit = recording.drive, recording.header.drive_limit
+    for i in range(drive.shape[1]):
+        time, low, high = outline(drive[:, i], recording.rate)
+        colour = COILS[i % len(COILS)]
+        axes.fill_between(time, low, high, color=colour, alpha=0.5, lw=0.4, label=f"coil {i + 1}")
+    saturated = (recording.flags & Flag.SATURATED) != 0
+    peak = np.nanmax(np.abs(drive), initial=0.0) or 1e-3
+    if limit is not None and peak > 0.4 * limit:
+        for sign in (-1, 1):
+            axes.axhline(sign * limit, color=RED, lw=1, ls=(0, (4, 2)), label="limit" if sign > 0 else None)
+        peak = max(peak, limit)
+    stated = "" if limit is None else f", limit ±{limit:g} A"
+    if saturated.any():
+        stated += f", saturated in {wording.percent(float(saturated.mean()))} of the samples"
+    axes.set(title=f"Drive{stated}", ylabel="current (A)", ylim=(-1.1 * peak, 1.45 * peak))
+    _legend(axes)
+
+
+def _finger(upper: Any, lower: Any, recording: Recording) -> None:
+    """Position and load of the finger; a lifted finger is a gap."""
+    time, low, high = outline(1e3 * recording.position, recording.rate)
+    upper.plot(time, (low + high) / 2, color=INK, lw=1.3)
+    upper.set(title="Finger", ylabel="position (mm)")
+    time, low, high = outline(recording.normal_load, recording.rate)
+    lower.fill_between(time, 0, (low + high) / 2, color=GREEN, alpha=0.25, lw=0)
+    lower.plot(time, (low + high) / 2, color=GREEN, lw=1.3)
+    lower.set(ylabel="load (N)", ylim=(0, 1.15 * np.nanmax(high, initial=0.0) or 1))
+
+
+def outline(values: Array, rate: float) -> tuple[Array, Array, Array]:
+    """Time (s), least and greatest value in each of at most `COLUMNS` stretches of a signal sampled at `rate` (Hz).
+
+    Parameters
+    ----------
+    values : ndarray, shape (n,)
+        A stretch that holds a NaN is NaN.
+    rate : float
+
+    Returns
+    -------
+    time, low, high : ndarray
+        `time` is the middle of each stretch.
+    """
+    if not values.size:
+        return np.empty(0), np.empty(0), np.empty(0)
+    starts = np.linspace(0, values.size, min(COLUMNS, values.size), endpoint=False).astype(int)
+    time = (starts + np.append(starts[1:], values.size) - 1) / (2 * rate)
+    return time, np.minimum.reduceat(values, starts), np.maximum.reduceat(values, starts)
+
+
+def _legend(axes: Any, *entries: Any, columns: int = 6) -> None:
+    axes.legend(*entries, loc="upper right", ncols=columns, borderaxespad=0.1, handlelength=1.6, columnspacing=1.2)
