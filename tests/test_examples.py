@@ -1,0 +1,62 @@
+"""Every example runs in a process of its own, and the number on its last line is what it says it is."""
+
+import ast
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+EXAMPLES = Path(__file__).resolve().parent.parent / "examples"
+
+# (number, tolerance): where the number comes from, and what may move it.
+EXPECTED = {
+    # The paper's loop holds an amplitude to 0.3 % over at least 4 s [FACTS 3, "paper" off 129-189 Hz].
+    "temporal_grating": (10e-6, 0.003 * 10e-6),
+    # 30 mm hold 30 ridges of 1 mm; at either end the target fades with the velocity's 40 Hz pole, where up to one
+    # period of 12.5 ms each may be lost or be made by the plate's own decay.
+    "spatial_grating_swipe": (30.0, 2.0),
+    # Twice the speed is twice the frequency; the spectrum of 2 s under a Hann window resolves 1/2 Hz in 100 Hz.
+    "recorded_texture": (2.0, 0.5 / 50),
+    # Two judged seconds of a settled loop: as above, with half the averaging time of its 0.3 %.
+    "your_own_driver": (10e-6, 0.006 * 10e-6),
+    # Mean squares of heights that grow from 2 to 12 um over the path: thirds 5.33 to 2 and 12 to 8.67 um.
+    "your_own_texture": (2.75, 0.275),
+}
+
+
+def mean_square(low, high):
+    """Mean of the square of what grows evenly from `low` to `high`."""
+    return (low**2 + low * high + high**2) / 3
+
+
+def test_the_expected_slope_is_that_of_its_thirds():
+    third = (12 - 2) / 3
+    ratio = (mean_square(12 - third, 12) / mean_square(2, 2 + third)) ** 0.5
+    assert ratio == pytest.approx(EXPECTED["your_own_texture"][0], abs=0.01)
+
+
+def test_every_example_is_listed():
+    assert {path.stem for path in EXAMPLES.glob("*.py")} == set(EXPECTED)
+
+
+@pytest.mark.parametrize("name", EXPECTED)
+def test_an_example_is_short_and_says_what_its_figure_is(name):
+    text = (EXAMPLES / f"{name}.py").read_text(encoding="utf-8")
+    assert len(text.splitlines()) < 60
+    assert "The figure is" in ast.get_docstring(ast.parse(text))
+
+
+@pytest.mark.parametrize("name", EXPECTED)
+def test_an_example_returns_its_figure(name, tmp_path):
+    done = subprocess.run(
+        [sys.executable, "-W", "error", EXAMPLES / f"{name}.py"],
+        capture_output=True,
+        text=True,
+        timeout=120,
+        cwd=tmp_path,
+    )
+    assert done.returncode == 0, done.stderr
+    number, tolerance = EXPECTED[name]
+    assert float(done.stdout.splitlines()[-1]) == pytest.approx(number, abs=tolerance)
+    assert not list(tmp_path.iterdir())
