@@ -1,0 +1,188 @@
+"""The finger: where it is, how hard it presses, when it touches, and what it is made of."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from hapticrender.protocols import Array, Motion
+from hapticrender.touch import checks
+from hapticrender.touch.mechanics import NONE, FingerMechanics, read_mechanics
+from hapticrender.touch.motion import LONGEST_TIME, Nowhere, Sampled, Sliding, Still, Swiping, Tracked
+
+MOST_LOAD = 20.0  # N
+
+Touches = tuple[tuple[float, float], ...]
+LoadCurve = tuple[tuple[float, ...], tuple[float, ...]]
+
+
+@dataclass(frozen=True)
+class Finger:
+    """A finger on the surface.
+
+    Parameters
+    ----------
+    motion : Motion
+        `Still`, `Sliding`, `Swiping`, `Sampled`, `Tracked`, `Nowhere`, or any
+        object with ``position(time)``; NaN means lifted.
+    normal_load : float, N, or (times in s, loads in N), or None
+        >= 0 and <= 20; a curve is joined by straight lines and held at both
+        ends.  None: as recorded, for a motion that knows its load (`Tracked`).
+    touches : sequence of (on, off), s, or None
+        The finger touches while on <= t < off; None: whenever its motion says.
+    mechanics : FingerMechanics, or a name, or a table of its numbers
+        "none", "light", "heavy" (4th order, Table 1), "light-2nd-order",
+        "heavy-2nd-order"; "auto" is light below a mean load of 0.5 N, else heavy.
+    load_scaling : bool
+        Impedance grows with (W / reference load)**(1/3).
+
+    Examples
+    --------
+    >>> finger = Finger.sliding(speed=0.1, normal_load=0.8, touches=[(0.0, 1.0)], mechanics="heavy")
+    >>> finger.position(np.array([0.2, 1.0])).round(6).tolist(), finger.load(np.array([0.2, 1.0])).tolist()
+    ([0.02, nan], [0.8, 0.0])
+    """
+
+    motion: Motion
+    normal_load: float | LoadCurve | None = 0.0
+    touches: Touches | None = None
+    mechanics: FingerMechanics = NONE
+    load_scaling: bool = False
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.motion, Motion):
+            checks.refuse("motion", self.motion, "a motion with position(time)", TypeError)
+        checks.keep(self, normal_load=_read_load(self.normal_load, self.motion))
+        checks.keep(self, touches=None if self.touches is None else _read_touches(self.touches))
+        checks.keep(self, mechanics=read_mechanics(self.mechanics, self._typical_load(self.mechanics)))
+        checks.keep(self, load_scaling=checks.flag("load_scaling", self.load_scaling))
+
+    @classmethod
+    def absent(cls) -> Finger:
+        """No finger: never touches."""
+        return cls(Nowhere())
+
+    @classmethod
+    def still(cls, position: float = 0.0, normal_load: Any = 0.4, **touch: Any) -> Finger:
+        """Return a finger that rests at `position` (m); `touch` holds touches, mechanics, load_scaling."""
+        return cls(Still(position), normal_load, **touch)
+
+    @classmethod
+    def sliding(
+        cls, speed: float, normal_load: Any = 0.4, span: float = 0.05, centre: float = 0.0, **touch: Any
+    ) -> Finger:
+        """Return a finger that moves at `speed` (m/s), back and forth over `span` (m) around `centre` (m)."""
+        return cls(Sliding(speed, span, centre), normal_load, **touch)
+
+    @classmethod
+    def swiping(
+        cls,
+        frequency: float,
+        speed: float | None = None,
+        stroke: float | None = None,
+        normal_load: Any = 0.4,
+        centre: float = 0.0,
+        **touch: Any,
+    ) -> Finger:
+        """Return a finger that swipes sinusoidally, by peak `speed` (m/s) or by `stroke` (m)."""
+        return cls(Swiping(frequency, speed, stroke, centre), normal_load, **touch)
+
+    @classmethod
+    def sampled(
+        cls, positions: Any, rate: float | None = None, times: Any = None, normal_load: Any = 0.4, **touch: Any
+    ) -> Finger:
+        """Return a finger at given `positions` (m), at `rate` (Hz) or at `times` (s)."""
+        return cls(Sampled(positions, rate, times), normal_load, **touch)
+
+    @classmethod
+    def recorded(
+        cls, file: str | os.PathLike[str], start: float = 0.0, normal_load: Any = None, **touch: Any
+    ) -> Finger:
+        """Return the finger of a tribometer recording, from `start` (s) on, with its own load unless given."""
+        return cls(Tracked(file, start), normal_load, **touch)
+
+    def position(self, time: Array) -> Array:
+        """Position (m from the middle of the surface, shape (n,)), NaN while lifted."""
+        time = np.asarray(time, float)
+        position = np.asarray(self.motion.position(time), float)
+        return position if self.touches is None else np.where(self._in_touch(time), position, np.nan)
+
+    def load(self, time: Array) -> Array:
+        """Return the normal load (N, shape (n,)), 0 while lifted."""
+        time = np.asarray(time, float)
+        return np.where(np.isfinite(self.position(time)), self._pressed(time), 0.0)
+
+    def strength(self, time: Array) -> Array:
+        """Factor on the finger's impedance (shape (n,)): 0 while lifted, 1 nominal, (W/W_ref)**(1/3) with scaling."""
+        time = np.asarray(time, float)
+        factor = self.mechanics.load_factor(self._pressed(time)) if self.load_scaling else np.ones(time.shape)
+        return np.where(np.isfinite(self.position(time)), factor, 0.0)
+
+    def _pressed(self, time: Array) -> Array:
+        if self.normal_load is None:
+            return self.motion.load(time)  # type: ignore[attr-defined]
+        if isinstance(self.normal_load, tuple):
+            return np.interp(time, *self._load_curve)
+        return np.full(time.shape, self.normal_load)
+
+    @cached_property
+    def _load_curve(self) -> tuple[Array, Array]:
+        times, loads = self.normal_load  # type: ignore[misc]
+        return np.array(times), np.array(loads)
+
+    @cached_property
+    def _edges(self) -> Array:
+        return np.array(self.touches, float).ravel()
+
+    def _in_touch(self, time: Array) -> Array:
+        return np.searchsorted(self._edges, time, side="right") % 2 == 1
+
+    def _typical_load(self, mechanics: Any) -> float:
+        """Mean load (N) while something presses; looked up only where "auto" asks for it."""
+        if not (isinstance(mechanics, str) and mechanics == "auto"):
+            return 0.0
+        if self.normal_load is None:
+            loads = self.motion.load(np.arange(0.0, 60.0, 0.01))  # type: ignore[attr-defined]
+        else:
+            loads = np.atleast_1d(self.normal_load[1] if isinstance(self.normal_load, tuple) else self.normal_load)
+        pressing = np.asarray(loads)[np.asarray(loads) > 0]
+        return float(pressing.mean()) if pressing.size else 0.0
+
+
+def _read_load(value: Any, motion: Motion) -> float | LoadCurve | None:
+    if value is None:
+        if not callable(getattr(motion, "load", None)):
+            checks.refuse("normal_load", None, "a finite number >= 0 and <= 20 N, as this motion records none")
+        return None
+    if not isinstance(value, list | tuple):
+        return checks.number("normal_load", value, "N", least=0, most=MOST_LOAD)
+    if len(value) != 2:
+        checks.refuse("normal_load", value, "two lists: times in s, loads in N")
+    loads = checks.numbers("normal_load[1]", value[1], "N", least=0, most=MOST_LOAD)
+    return checks.rising("normal_load[0]", value[0], len(loads)), loads
+
+
+def _read_touches(value: Any) -> Touches:
+    bound = "pairs of on < off in s, each after the one before"
+    if not isinstance(value, list | tuple):
+        checks.refuse("touches", value, bound, TypeError)
+    last = 0.0
+    touches = []
+    for index, pair in enumerate(value):
+        on, off = _read_pair(f"touches[{index}]", pair)
+        if not last <= on < off:
+            checks.refuse(f"touches[{index}]", pair, bound)
+        touches.append((on, off))
+        last = off
+    return tuple(touches)
+
+
+def _read_pair(key: str, pair: Any) -> tuple[float, float]:
+    pair = checks.numbers(key, pair, "s", least=0, most=LONGEST_TIME, count=2)
+    if len(pair) != 2:
+        checks.refuse(key, pair, "on and off in s")
+    return pair

@@ -1,0 +1,146 @@
+"""Gratings: textures of a few partials, in time or in space."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+
+from hapticrender.bands import Bands
+from hapticrender.protocols import Array
+from hapticrender.touch import checks
+
+MOST_AMPLITUDE = 0.01  # m: ten times the travel of any plate, so it catches a wrong unit
+MOST_PARTIALS = 4096
+
+Partial = tuple[float, float, float]
+
+
+def _sine(count: int) -> tuple[Partial, ...]:
+    return ((1.0, 1.0, 0.0),)
+
+
+def _square(count: int) -> tuple[Partial, ...]:
+    """Fourier series of a square wave of height 1 that is +1 at phase 0: (4/pi) (cos p - cos 3p/3 + ...)."""
+    return tuple((2.0 * n + 1, 4 / (np.pi * (2 * n + 1)), np.pi * (n % 2)) for n in range(count))
+
+
+def _triangle(count: int) -> tuple[Partial, ...]:
+    """Fourier series of a triangle wave of height 1 that is +1 at phase 0: (8/pi^2) (cos p + cos 3p/9 + ...)."""
+    return tuple((2.0 * n + 1, 8 / (np.pi * (2 * n + 1)) ** 2, 0.0) for n in range(count))
+
+
+SHAPES: dict[str, Callable[[int], tuple[Partial, ...]]] = {"sine": _sine, "square": _square, "triangle": _triangle}
+
+
+@dataclass(frozen=True)
+class Grating:
+    """A periodic texture, ``amplitude * sum_n a_n cos(n p + phase_n)``.
+
+    In time ``p = 2 pi frequency t + phase``; in space ``p = 2 pi x / wavelength
+    + phase`` with x the finger's position, so that the felt frequency follows
+    the finger's speed by itself and a reversal costs nothing.
+
+    Parameters
+    ----------
+    amplitude : float, m
+        Peak of a sine, height of a square or triangle; > 0 and <= 0.01 m.
+    frequency : float, Hz, or None
+        Of the fundamental, > 0 and <= 1e6; exactly one of `frequency` and
+        `wavelength` is given.
+    wavelength : float, m, or None
+        Of the fundamental, >= 1e-6 and <= 0.5.
+    shape : {"sine", "square", "triangle"}
+        Square and triangle are made of their odd Fourier partials.
+    harmonics : int
+        How many partials a square or triangle has, 1 to 4096.  What a device
+        does with those above its range is the renderer's business.
+    partials : sequence of (order, relative amplitude, phase in rad), or None
+        The partials themselves instead of a shape; also mappings with the
+        keys ``order``, ``amplitude``, ``phase``.  Orders need not be whole.
+    phase : float, rad
+        Of the fundamental at t = 0, x = 0.
+
+    Examples
+    --------
+    >>> tone = Grating(amplitude=10e-6, frequency=100.0)
+    >>> float(tone.waveform(np.array([0.0]), np.array([np.nan]))[0])
+    1e-05
+    >>> ridges = Grating(amplitude=10e-6, wavelength=1e-3, shape="square", harmonics=2)
+    >>> ridges.bands(rate=5000.0).wavenumber.round(6).tolist()
+    [1000.0, 3000.0]
+    """
+
+    kind: ClassVar[str] = "grating"
+
+    amplitude: float
+    frequency: float | None = None
+    wavelength: float | None = None
+    shape: str = "sine"
+    harmonics: int = 5
+    partials: tuple[Partial, ...] | None = None
+    phase: float = 0.0
+
+    def __post_init__(self) -> None:
+        amplitude = checks.number("amplitude", self.amplitude, "m", above=0, most=MOST_AMPLITUDE)
+        checks.one_of_two("frequency", self.frequency, "wavelength", self.wavelength)
+        if self.frequency is not None:
+            checks.keep(self, frequency=checks.number("frequency", self.frequency, "Hz", above=0, most=1e6))
+        else:
+            checks.keep(self, wavelength=checks.number("wavelength", self.wavelength, "m", least=1e-6, most=0.5))
+        checks.choice("shape", self.shape, SHAPES)
+        harmonics = checks.integer("harmonics", self.harmonics, least=1, most=MOST_PARTIALS)
+        phase = checks.number("phase", self.phase, "rad", least=-1e6, most=1e6)
+        partials = None if self.partials is None else _read_partials(self.partials)
+        checks.keep(self, amplitude=amplitude, harmonics=harmonics, phase=phase, partials=partials)
+
+    def spectrum(self) -> tuple[Array, Array]:
+        """Order (1) and complex amplitude (m) of every partial, the fundamental's phase included."""
+        table = np.array(self.partials or SHAPES[self.shape](self.harmonics))
+        order, relative, own_phase = table.T
+        return order, self.amplitude * relative * np.exp(1j * (own_phase + order * self.phase))
+
+    def bands(self, rate: float) -> Bands:
+        """One band a partial, with a constant envelope (`rate` in Hz is not needed)."""
+        order, envelope = self.spectrum()
+        none = np.zeros(order.size)
+        frequency = none if self.frequency is None else order * self.frequency
+        wavenumber = none if self.wavelength is None else order / self.wavelength
+        return Bands(frequency=frequency, wavenumber=wavenumber, phase=none.copy(), envelope=envelope)
+
+    def waveform(self, time: Array, position: Array) -> Array:
+        """Wanted displacement (m, shape (n,)); a spatial grating is still where `position` (m) is NaN."""
+        if self.frequency is not None:
+            turns = np.asarray(time, float) * self.frequency
+        else:
+            turns = np.asarray(position, float) / self.wavelength
+        total = np.zeros(turns.shape)
+        for order, envelope in zip(*self.spectrum(), strict=True):
+            total += (envelope * np.exp(2j * np.pi * (order * turns % 1.0))).real
+        return np.where(np.isfinite(turns), total, 0.0)
+
+
+def _read_partials(partials: Any) -> tuple[Partial, ...]:
+    bound = f"1 to {MOST_PARTIALS} entries of order, amplitude, phase"
+    if not isinstance(partials, list | tuple | np.ndarray):
+        checks.refuse("partials", partials, bound, TypeError)
+    if not 1 <= len(partials) <= MOST_PARTIALS:
+        checks.refuse("partials", partials, bound)
+    return tuple(_read_partial(f"partials[{index}]", entry) for index, entry in enumerate(partials))
+
+
+def _read_partial(key: str, entry: Any) -> Partial:
+    if isinstance(entry, Mapping):
+        unknown = set(entry) - {"order", "amplitude", "phase"}
+        if unknown:
+            checks.refuse(f"{key}.{min(unknown, key=str)}", entry, "one of the keys order, amplitude, phase")
+        entry = (entry.get("order"), entry.get("amplitude"), entry.get("phase", 0.0))
+    if not isinstance(entry, list | tuple | np.ndarray) or len(entry) != 3:
+        checks.refuse(key, entry, "order, amplitude, phase", TypeError)
+    return (
+        checks.number(f"{key}.order", entry[0], "", above=0, most=1e4),
+        checks.number(f"{key}.amplitude", entry[1], "times the grating's", least=-100, most=100),
+        checks.number(f"{key}.phase", entry[2], "rad", least=-1e6, most=1e6),
+    )

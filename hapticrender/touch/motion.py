@@ -1,0 +1,222 @@
+"""Where the finger is: a pure function of time."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import ClassVar
+
+import numpy as np
+
+from hapticrender.protocols import Array
+from hapticrender.touch import checks
+from hapticrender.touch.tribometer import SwipeRecording, load_swipe
+
+FARTHEST = 1.0  # m from the middle; each renderer knows its own surface
+MOST_SPEED = 10.0  # m/s
+LONGEST_TIME = 360_000.0  # s: 100 h
+
+
+@dataclass(frozen=True)
+class Nowhere:
+    """No finger at all: the position is NaN at all times."""
+
+    kind: ClassVar[str] = "none"
+
+    def position(self, time: Array) -> Array:
+        """NaN, shape (n,)."""
+        return np.full(np.shape(time), np.nan)
+
+
+@dataclass(frozen=True)
+class Still:
+    """A finger that rests.
+
+    Parameters
+    ----------
+    at : float, m
+        From the middle of the surface.
+    """
+
+    kind: ClassVar[str] = "still"
+
+    at: float = 0.0
+
+    def __post_init__(self) -> None:
+        checks.keep(self, at=checks.number("at", self.at, "m", least=-FARTHEST, most=FARTHEST))
+
+    def position(self, time: Array) -> Array:
+        """Position (m, shape (n,))."""
+        return np.full(np.shape(time), self.at)
+
+
+@dataclass(frozen=True)
+class Sliding:
+    """Constant speed, back and forth between two ends; starts at the centre, towards the positive end.
+
+    Parameters
+    ----------
+    speed : float, m/s
+        > 0 and <= 10.
+    span : float, m
+        Between the ends, >= 1e-4 and <= 1; default 0.05.
+    centre : float, m
+        Between the ends, from the middle of the surface.
+
+    Examples
+    --------
+    >>> Sliding(speed=0.1, span=0.05).position(np.array([0.0, 0.25, 0.5, 0.75])).round(9).tolist()
+    [0.0, 0.025, 0.0, -0.025]
+    """
+
+    kind: ClassVar[str] = "sliding"
+
+    speed: float
+    span: float = 0.05
+    centre: float = 0.0
+
+    def __post_init__(self) -> None:
+        speed = checks.number("speed", self.speed, "m/s", above=0, most=MOST_SPEED)
+        span = checks.number("span", self.span, "m", least=1e-4, most=FARTHEST)
+        centre = checks.number("centre", self.centre, "m", least=-FARTHEST, most=FARTHEST)
+        checks.keep(self, speed=speed, span=span, centre=centre)
+
+    def position(self, time: Array) -> Array:
+        """Position (m, shape (n,)): a triangle wave."""
+        turns = np.mod(np.asarray(time, float) * self.speed / (2 * self.span) + 0.25, 1.0)
+        return self.centre + self.span * (0.5 - np.abs(2 * turns - 1))
+
+
+@dataclass(frozen=True)
+class Swiping:
+    """Sinusoidal swipes, ``centre + stroke/2 sin(2 pi frequency t)``.
+
+    Parameters
+    ----------
+    frequency : float, Hz
+        Of whole back-and-forth swipes, > 0 and <= 100.
+    speed : float, m/s, or None
+        Peak speed, ``pi frequency stroke``; exactly one of `speed` and `stroke`.
+    stroke : float, m, or None
+        From end to end, > 0 and <= 1.
+    centre : float, m
+        From the middle of the surface.
+    """
+
+    kind: ClassVar[str] = "swiping"
+
+    frequency: float
+    speed: float | None = None
+    stroke: float | None = None
+    centre: float = 0.0
+
+    def __post_init__(self) -> None:
+        checks.keep(self, frequency=checks.number("frequency", self.frequency, "Hz", least=1e-3, most=100))
+        checks.one_of_two("speed", self.speed, "stroke", self.stroke)
+        if self.speed is not None:
+            checks.keep(self, speed=checks.number("speed", self.speed, "m/s", above=0, most=MOST_SPEED))
+        else:
+            checks.keep(self, stroke=checks.number("stroke", self.stroke, "m", above=0, most=FARTHEST))
+        checks.keep(self, centre=checks.number("centre", self.centre, "m", least=-FARTHEST, most=FARTHEST))
+
+    def position(self, time: Array) -> Array:
+        """Position (m, shape (n,))."""
+        stroke = self.stroke if self.stroke is not None else self.speed / (np.pi * self.frequency)
+        turns = np.mod(np.asarray(time, float) * self.frequency, 1.0)
+        return self.centre + stroke / 2 * np.sin(2 * np.pi * turns)
+
+
+@dataclass(frozen=True)
+class Sampled:
+    """Positions measured or made elsewhere, joined by straight lines and held at both ends.
+
+    Parameters
+    ----------
+    positions : sequence of float, m
+        From the middle of the surface.
+    rate : float, Hz, or None
+        Of the samples, the first at t = 0; exactly one of `rate` and `times`.
+    times : sequence of float, s, or None
+        Of each sample, rising, >= 0.
+
+    Examples
+    --------
+    >>> Sampled(positions=[0.0, 0.01], times=[1.0, 2.0]).position(np.array([0.0, 1.5, 9.0])).tolist()
+    [0.0, 0.005, 0.01]
+    """
+
+    kind: ClassVar[str] = "sampled"
+
+    positions: tuple[float, ...]
+    rate: float | None = None
+    times: tuple[float, ...] | None = None
+
+    def __post_init__(self) -> None:
+        positions = checks.numbers("positions", self.positions, "m", least=-FARTHEST, most=FARTHEST)
+        checks.keep(self, positions=positions)
+        checks.one_of_two("rate", self.rate, "times", self.times)
+        if self.rate is not None:
+            checks.keep(self, rate=checks.number("rate", self.rate, "Hz", least=1e-3, most=1e7))
+        else:
+            checks.keep(self, times=checks.rising("times", self.times, len(positions)))
+
+    @cached_property
+    def _curve(self) -> tuple[Array, Array]:
+        times = np.arange(len(self.positions)) / self.rate if self.times is None else np.array(self.times)
+        return times, np.array(self.positions)
+
+    def position(self, time: Array) -> Array:
+        """Position (m, shape (n,))."""
+        return np.interp(np.asarray(time, float), *self._curve)
+
+
+@dataclass(frozen=True)
+class Tracked:
+    """A finger recorded by a tribometer: unwrapped encoder, NaN while lifted, with its normal load.
+
+    Parameters
+    ----------
+    file : str or Path
+        ``.npz`` as for `Swipe`.
+    start : float, s
+        Where in the recording t = 0 lies, >= 0.
+    """
+
+    kind: ClassVar[str] = "swipe"
+
+    file: str
+    start: float = 0.0
+
+    def __post_init__(self) -> None:
+        checks.keep(self, file=checks.file_name("file", self.file))
+        checks.keep(self, start=checks.number("start", self.start, "s", least=0, most=LONGEST_TIME))
+
+    @property
+    def recording(self) -> SwipeRecording:
+        """What was recorded; read at the first use."""
+        return load_swipe(self.file)
+
+    def check(self) -> None:
+        """Read the file, so that a bad one is refused before anything plays."""
+        if self.start > self.recording.duration:
+            checks.refuse("start", self.start, f"<= {self.recording.duration:g} s, the end of the recording")
+
+    def position(self, time: Array) -> Array:
+        """Position (m, shape (n,)), NaN while lifted and outside the recording."""
+        return np.where(self._touching(time), self._at(time, self.recording.position), np.nan)
+
+    def load(self, time: Array) -> Array:
+        """Return the normal load (N, shape (n,)), 0 while lifted."""
+        return np.where(self._touching(time), self._at(time, self.recording.normal_load), 0.0)
+
+    def _place(self, time: Array) -> Array:
+        return (np.asarray(time, float) + self.start) * self.recording.rate
+
+    def _at(self, time: Array, curve: Array) -> Array:
+        return np.interp(self._place(time), np.arange(curve.size), curve)
+
+    def _touching(self, time: Array) -> Array:
+        touching = self.recording.touching
+        nearest = np.rint(self._place(time)).astype(np.int64)
+        inside = (nearest >= 0) & (nearest < touching.size)
+        return inside & touching[np.clip(nearest, 0, touching.size - 1)]

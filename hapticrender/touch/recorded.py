@@ -1,0 +1,305 @@
+"""Recorded textures: a sound file, the lateral force of a real swipe, and a synthetic one that needs no file."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+from pathlib import Path
+from typing import ClassVar
+
+import numpy as np
+
+from hapticrender.bands import Bands
+from hapticrender.errors import SceneError
+from hapticrender.protocols import Array
+from hapticrender.touch import checks
+from hapticrender.touch.grating import MOST_AMPLITUDE
+from hapticrender.touch.profile import Profile
+from hapticrender.touch.tribometer import load_swipe
+
+MOST_SPEED = 10.0  # m/s
+MOST_FRAMES = 1 << 24
+MOST_CARRIERS = 512
+GRID = 10e-6  # m: cells of a force profile; a wavelength of 0.1 mm loses 1.6 % in them
+
+Passband = tuple[float, float]
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Playback:
+    """What every recording shares: scale, carriers, and how it is read.
+
+    Its profile lives in recorded seconds; a spatial one is read at (position - start) / speed.
+    """
+
+    amplitude: float | None = None
+    gain: float | None = None
+    carriers: int = 8
+    spacing: float = 40.0
+    passband: Passband = (20.0, 400.0)
+
+    def __post_init__(self) -> None:
+        checks.one_of_two("amplitude", self.amplitude, "gain", self.gain)
+        if self.amplitude is not None:
+            checks.keep(self, amplitude=checks.number("amplitude", self.amplitude, "m", above=0, most=MOST_AMPLITUDE))
+        else:
+            checks.keep(self, gain=checks.number("gain", self.gain, "m per unit of the file", above=0, most=1e3))
+        checks.keep(self, carriers=checks.integer("carriers", self.carriers, least=1, most=MOST_CARRIERS))
+        checks.keep(self, spacing=checks.number("spacing", self.spacing, "Hz", least=0.1, most=1e5))
+        passband = checks.numbers("passband", self.passband, "Hz", least=1.0, most=1e5, count=2)
+        if len(passband) != 2 or not passband[0] < passband[1]:
+            checks.refuse("passband", self.passband, "two rising frequencies in Hz")
+        checks.keep(self, passband=passband)
+
+    @cached_property
+    def profile(self) -> Profile:
+        """The recording inside its passband, in m over recorded seconds; reads the file at the first use."""
+        values, step = self._recorded()
+        low, high = self.passband
+        profile = Profile.band_limited(values, step, low, min(high, 0.5 / step))
+        scale = self.gain
+        if scale is None:
+            peak = np.abs(profile.values).max()
+            if peak <= 1e-9 * max(np.abs(values).max(), 1e-300):
+                raise SceneError(f"amplitude = {self.amplitude} m: nothing to scale between {low:g} and {high:g} Hz")
+            scale = self.amplitude / peak
+        return Profile(profile.values * scale, profile.step)
+
+    def _recorded(self) -> tuple[Array, float]:
+        raise NotImplementedError
+
+    def _speed(self) -> float | None:
+        raise NotImplementedError
+
+    def _start(self) -> float:
+        """Position (m) of the first value; the middle of the recording lies at the surface's by default."""
+        return -self.profile.length * (self._speed() or 0.0) / 2
+
+    def check(self) -> None:
+        """Read what has to be read, so that a bad file is refused before anything plays."""
+        self.bands(rate=np.inf)
+
+    def bands(self, rate: float) -> Bands:
+        """Carriers at the strongest peaks of the spectrum below rate/2 (`rate` in Hz); envelopes are to be analysed."""
+        low, high = self.passband
+        found = self.profile.strongest(self.carriers, self.spacing, low, high)
+        return _carriers(found, self._speed(), rate)
+
+    def waveform(self, time: Array, position: Array) -> Array:
+        """Wanted displacement (m, shape (n,)); a spatial recording is still where `position` (m) is NaN."""
+        speed = self._speed()
+        if speed is None:
+            return self.profile.at(time)
+        touching = np.isfinite(position)
+        recorded = (np.where(touching, position, 0.0) - self._start()) / speed
+        return np.where(touching, self.profile.at(recorded), 0.0)
+
+
+def _carriers(frequency: Array, speed: float | None, rate: float) -> Bands:
+    none = np.zeros(frequency.size)
+    if speed is None:
+        frequency = frequency[frequency < rate / 2]
+        none = none[: frequency.size]
+        return Bands(frequency=frequency, wavenumber=none, phase=none.copy())
+    return Bands(frequency=none, wavenumber=frequency / speed, phase=none.copy())
+
+
+def _speed_or_time(speed: object) -> float | None:
+    return None if speed is None else checks.number("speed", speed, "m/s", above=1e-6, most=MOST_SPEED)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Recorded(_Playback):
+    """A sound file as a texture, in time or in space.
+
+    The part inside `passband` is played; beyond its ends the recording runs
+    back and forth (reflection), so that it never jumps.
+
+    Parameters
+    ----------
+    file : str or Path
+        Whatever soundfile reads: WAV, FLAC, W64, ...; at most 2**24 frames.
+    amplitude : float, m, or None
+        Wanted peak; > 0 and <= 0.01.  Exactly one of `amplitude` and `gain`.
+    gain : float, m per unit of the file (full scale is 1), or None
+        Exact playback is often felt too weak: a gain of its own for every
+        texture is usual, about 3 for fine and 5 for coarse ones.
+    channel : int
+        Counted from 0.
+    speed : float, m/s, or None
+        At which a finger recorded it: then it is read at the finger's position,
+        its middle at the middle of the surface.  None: played in time.
+    carriers : int
+        How many of the strongest peaks of its spectrum are followed, 1 to 512.
+    spacing : float, Hz
+        Least distance of the carriers (at the recorded speed), default 40.
+    passband : (float, float), Hz
+        Kept range (at the recorded speed), default (20, 400).
+
+    Examples
+    --------
+    >>> denim = Recorded(file="denim.wav", amplitude=20e-6, speed=0.1)
+    >>> denim.speed
+    0.1
+    """
+
+    kind: ClassVar[str] = "recorded"
+
+    file: str
+    channel: int = 0
+    speed: float | None = None
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        checks.keep(self, file=checks.file_name("file", self.file), speed=_speed_or_time(self.speed))
+        checks.keep(self, channel=checks.integer("channel", self.channel, least=0, most=1023))
+
+    def _speed(self) -> float | None:
+        return self.speed
+
+    def _recorded(self) -> tuple[Array, float]:
+        return _read_sound(self.file, self.channel)
+
+
+def _read_sound(file: str, channel: int) -> tuple[Array, float]:
+    """One channel of a sound file, and its step (s); raises `SceneError`."""
+    import soundfile
+
+    name = f"file = {checks.show(file)}"
+    if not Path(file).is_file():
+        raise SceneError(f"{name}: must be an existing sound file")
+    try:
+        with soundfile.SoundFile(file) as sound:
+            if not 2 <= sound.frames <= MOST_FRAMES:
+                raise SceneError(f"{name}: has {sound.frames} samples: must be >= 2 and <= {MOST_FRAMES} samples")
+            if channel >= sound.channels:
+                raise SceneError(
+                    f"channel = {channel}: must be < {sound.channels}, the channels of {checks.show(file)}"
+                )
+            values, rate = sound.read(dtype="float64", always_2d=True)[:, channel], sound.samplerate
+    except (soundfile.SoundFileError, OSError, ValueError, TypeError) as problem:
+        if isinstance(problem, SceneError):
+            raise
+        raise SceneError(f"{name}: must be a readable sound file ({checks.show(str(problem))})") from problem
+    bad = np.flatnonzero(~np.isfinite(values))
+    if bad.size:
+        raise SceneError(f"{name}: sample {bad[0]} of channel {channel} = {values[bad[0]]}: must be a finite number")
+    if values.size < 2:
+        raise SceneError(f"{name}: has {values.size} readable samples: must be >= 2 samples")
+    return values, 1 / rate
+
+
+@dataclass(frozen=True, kw_only=True)
+class Swipe(_Playback):
+    """The lateral force of a recorded swipe as a texture over position.
+
+    Taken from a tribometer recording (see ``tribometer.load_swipe``): only
+    samples in contact, sliding in the main direction, averaged in cells of 10
+    micrometres; replayed at the finger's position at whatever speed it moves.
+
+    Parameters
+    ----------
+    file : str or Path
+        ``.npz`` with encoder, metre_per_count, lateral_force, normal_force, rate.
+    amplitude : float, m, or None
+        Wanted peak; > 0 and <= 0.01.  Exactly one of `amplitude` and `gain`.
+    gain : float, m/N, or None
+    carriers, spacing, passband
+        As for `Recorded`, in Hz at the recorded speed.
+    """
+
+    kind: ClassVar[str] = "swipe"
+
+    file: str
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        checks.keep(self, file=checks.file_name("file", self.file))
+
+    def _speed(self) -> float:
+        speed = load_swipe(self.file).speed
+        if speed == 0.0:
+            raise SceneError(
+                f"file = {checks.show(self.file)}: the finger never slides in contact: must be > 0.001 m/s"
+            )
+        return speed
+
+    def _start(self) -> float:
+        return load_swipe(self.file).force_profile(GRID)[1]
+
+    def _recorded(self) -> tuple[Array, float]:
+        speed = self._speed()
+        values, _ = load_swipe(self.file).force_profile(GRID)
+        if values.size < 2:
+            raise SceneError(f"file = {checks.show(self.file)}: slides over {values.size * GRID} m: must be > {GRID} m")
+        return values, GRID / speed
+
+
+@dataclass(frozen=True, kw_only=True)
+class Synthetic:
+    """A texture that sounds recorded but needs no file: a few components, each waxing and waning slowly.
+
+    Parameters
+    ----------
+    amplitude : float, m
+        Bound of the sum of all components, never exceeded; > 0 and <= 0.01.
+    speed : float, m/s, or None
+        At which the components lie at 30 to 400 Hz, for a texture over
+        position; None for one over time.
+    components : int
+        1 to 8, at least 40 Hz apart.
+    seed : int
+        The same seed is the same texture, >= 0.
+
+    Examples
+    --------
+    >>> Synthetic(amplitude=10e-6, components=3).bands(rate=5000.0).frequency.round(1).tolist()
+    [42.7, 210.4, 380.8]
+    """
+
+    kind: ClassVar[str] = "synthetic"
+
+    amplitude: float
+    speed: float | None = None
+    components: int = 6
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        checks.keep(self, amplitude=checks.number("amplitude", self.amplitude, "m", above=0, most=MOST_AMPLITUDE))
+        checks.keep(self, speed=_speed_or_time(self.speed))
+        checks.keep(self, components=checks.integer("components", self.components, least=1, most=8))
+        checks.keep(self, seed=checks.integer("seed", self.seed, least=0, most=2**32 - 1))
+
+    @cached_property
+    def _drawn(self) -> Array:
+        """Per component: frequency (Hz), weight (1), swell (Hz), and two phases (turns)."""
+        return _draw(self.components, self.seed)
+
+    def bands(self, rate: float) -> Bands:
+        """Carriers at the components (below rate/2, `rate` in Hz); envelopes are to be analysed."""
+        return _carriers(self._drawn[0], self.speed, rate)
+
+    def waveform(self, time: Array, position: Array) -> Array:
+        """Wanted displacement (m, shape (n,)); a spatial texture is still where `position` (m) is NaN."""
+        recorded = np.asarray(time, float) if self.speed is None else np.asarray(position, float) / self.speed
+        total = np.zeros(recorded.shape)
+        for frequency, weight, swell, phase, start in self._drawn.T:
+            envelope = weight * (1 + DEPTH * np.cos(2 * np.pi * (swell * recorded + start)))
+            total += envelope * np.cos(2 * np.pi * (frequency * recorded + phase))
+        return np.where(np.isfinite(recorded), self.amplitude * total, 0.0)
+
+
+DEPTH = 0.5  # of the slow modulation
+LEAST_GAP = 40.0  # Hz
+
+
+@lru_cache(maxsize=16)
+def _draw(components: int, seed: int) -> Array:
+    rng = np.random.default_rng(seed)
+    middle = np.linspace(40.0, 390.0, components) if components > 1 else np.array([200.0])
+    gap = 350.0 / max(components - 1, 1)
+    jitter = min(10.0, (gap - LEAST_GAP) / 2)
+    frequency = middle + rng.uniform(-jitter, jitter, components)
+    weight = rng.uniform(0.4, 1.0, components)
+    weight /= weight.sum() * (1 + DEPTH)
+    return np.stack([frequency, weight, rng.uniform(0.2, 0.8, components), *rng.uniform(0, 1, (2, components))])

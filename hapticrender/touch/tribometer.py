@@ -1,0 +1,201 @@
+"""A finger slid over a real surface: the recording of a tribometer, and what can be read from it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hapticrender.errors import SceneError
+from hapticrender.protocols import Array
+from hapticrender.touch import checks
+
+KEYS = ("encoder", "metre_per_count", "lateral_force", "normal_force", "rate")
+MOST_SAMPLES = 1 << 24
+SMOOTHING = 0.02  # s, of force and velocity before a threshold is applied
+UNLOADED = 0.5  # s at the beginning during which nothing touches
+TOUCH, RELEASE = 0.2, 0.1  # N of normal load
+SHORTEST_TOUCH = 0.05  # s
+LEAST_FRICTION = 0.02  # N of lateral force that a sliding finger makes, at least
+LEAST_SPEED = 1e-3  # m/s
+
+
+@dataclass(frozen=True, eq=False)
+class SwipeRecording:
+    """A finger's motion and forces, in SI, offsets removed.
+
+    Parameters
+    ----------
+    rate : float, Hz
+    position : ndarray, shape (n,), m
+        Unwrapped, with 0 in the middle of what was travelled in contact.
+    normal_load : ndarray, shape (n,), N
+        Above the unloaded level, smoothed over 20 ms, 0 while lifted.
+    lateral_force : ndarray, shape (n,), N
+        As measured, above its unloaded level.
+    touching : ndarray of bool, shape (n,)
+    sliding : ndarray of bool, shape (n,)
+        Touching, moving in the main direction at more than half the main speed, and rubbing.
+    speed : float, m/s
+        Median speed while sliding; 0 where the finger never slides.
+
+    Notes
+    -----
+    Contact is read from the normal force: more than 0.2 N away from the median
+    of the first 0.5 s, until less than 0.1 N.  Presses may count up or down.
+    A carriage that homes without a finger moves but is not touching; a finger
+    that rests touches but does not slide.
+    """
+
+    rate: float
+    position: Array
+    normal_load: Array
+    lateral_force: Array
+    touching: Array
+    sliding: Array
+    speed: float
+
+    @property
+    def duration(self) -> float:
+        """Time of the last sample, s."""
+        return (self.position.size - 1) / self.rate
+
+    def force_profile(self, spacing: float) -> tuple[Array, float]:
+        """Lateral force (N) on a uniform grid of positions `spacing` (m) apart, and the first position (m)."""
+        where, force = self.position[self.sliding], self.lateral_force[self.sliding]
+        start = where.min()
+        cell = np.floor((where - start) / spacing).astype(np.intp)
+        hits = np.bincount(cell)
+        filled = np.flatnonzero(hits)
+        mean = np.bincount(cell, weights=force)[filled] / hits[filled]
+        return np.interp(np.arange(hits.size), filled, mean), float(start + spacing / 2)
+
+
+def unwrap_counts(counts: Array) -> Array:
+    """Positions (int64 counts from the first) of a 32-bit counter that wraps through 2**32 both ways."""
+    steps = np.diff(counts.astype(np.uint32)).view(np.int32)
+    return np.concatenate([[0], np.cumsum(steps, dtype=np.int64)])
+
+
+def load_swipe(file: str) -> SwipeRecording:
+    """Read a tribometer recording: an ``.npz`` with the arrays named in `KEYS`; raises `SceneError`."""
+    if not Path(file).is_file():
+        raise SceneError(f"file = {checks.show(file)}: must be an existing .npz file")
+    return _load_swipe(file, Path(file).stat().st_mtime_ns)
+
+
+@lru_cache(maxsize=4)
+def _load_swipe(file: str, changed: int) -> SwipeRecording:
+    """As `load_swipe`, remembered until the file changes."""
+    raw = _read(file)
+    rate = _scalar(file, raw, "rate", "Hz", 1e6)
+    metre_per_count = _scalar(file, raw, "metre_per_count", "m", 1e-3)
+    lateral, normal = (_curve(file, raw, key, "N") for key in ("lateral_force", "normal_force"))
+    position = unwrap_counts(_counts(file, raw["encoder"])) * metre_per_count
+    if not position.size == lateral.size == normal.size > UNLOADED * rate + 1:
+        sizes = f"{position.size}, {lateral.size}, {normal.size}"
+        raise SceneError(
+            f"file = {checks.show(file)}: encoder, lateral_force, normal_force have {sizes} samples: "
+            f"must be equal and more than {UNLOADED} s at {rate:g} Hz"
+        )
+    load = _load(normal, rate)
+    touching = _touching(load, rate)
+    if not touching.any():
+        raise SceneError(
+            f"file = {checks.show(file)}: normal_force departs by {np.abs(load).max():.3g} N from its level before: "
+            f"must be > {TOUCH} N for {SHORTEST_TOUCH} s to be a touch"
+        )
+    position = position - (position[touching].min() + position[touching].max()) / 2
+    lateral = lateral - np.median(lateral[~touching])
+    sliding, speed = _sliding(position, lateral, touching, rate)
+    return SwipeRecording(rate, position, np.where(touching, load, 0.0), lateral, touching, sliding, speed)
+
+
+def _read(file: str) -> dict[str, Array]:
+    """Load every array that is needed; a file of unknown making may fail in any way numpy and zipfile know."""
+    try:
+        with np.load(file, allow_pickle=False) as archive:
+            missing = [key for key in KEYS if key not in archive]
+            raw = {} if missing else {key: np.asarray(archive[key]) for key in KEYS}
+    except Exception as problem:
+        raise SceneError(
+            f"file = {checks.show(file)}: must be a readable .npz file ({checks.show(problem)})"
+        ) from problem
+    if missing:
+        raise SceneError(f"file = {checks.show(file)}: {missing[0]} is missing: must hold {', '.join(KEYS)}")
+    return raw
+
+
+def _scalar(file: str, raw: dict[str, Array], key: str, unit: str, most: float) -> float:
+    value: Any = raw[key].item() if raw[key].size == 1 else raw[key]
+    try:
+        return checks.number(key, value, unit, above=0, most=most)
+    except (TypeError, ValueError) as problem:
+        raise SceneError(f"file = {checks.show(file)}: {problem}") from problem
+
+
+def _curve(file: str, raw: dict[str, Array], key: str, unit: str) -> Array:
+    curve = raw[key]
+    if curve.ndim != 1 or curve.dtype.kind not in "iuf" or not 2 <= curve.size <= MOST_SAMPLES:
+        raise SceneError(
+            f"file = {checks.show(file)}: {key} has shape {curve.shape} and type {curve.dtype}: "
+            f"must be a row of 2 to {MOST_SAMPLES} numbers in {unit}"
+        )
+    curve = curve.astype(float)
+    bad = np.flatnonzero(~np.isfinite(curve))
+    if bad.size:
+        raise SceneError(
+            f"file = {checks.show(file)}: {key}[{bad[0]}] = {curve[bad[0]]}: must be a finite number of {unit}"
+        )
+    return curve
+
+
+def _counts(file: str, counts: Array) -> Array:
+    if counts.ndim != 1 or counts.dtype.kind not in "iu" or not 2 <= counts.size <= MOST_SAMPLES:
+        raise SceneError(
+            f"file = {checks.show(file)}: encoder has shape {counts.shape} and type {counts.dtype}: "
+            f"must be a row of 2 to {MOST_SAMPLES} integer counts"
+        )
+    return counts
+
+
+def _smooth(values: Array, rate: float) -> Array:
+    """Mean over `SMOOTHING` seconds around each sample, the ends held."""
+    half = max(round(SMOOTHING * rate / 2), 1)
+    total = np.cumsum(np.concatenate([[0.0], np.pad(values, half, mode="edge")]))
+    width = 2 * half + 1
+    return (total[width:] - total[:-width]) / width
+
+
+def _load(normal_force: Array, rate: float) -> Array:
+    """Return the load (N), positive for a press: signed by the larger part of what departs from the unloaded level."""
+    departure = _smooth(normal_force - np.median(normal_force[: int(UNLOADED * rate)]), rate)
+    large = np.abs(departure) > np.abs(departure).max() / 2
+    return departure * (-1.0 if departure[large].sum() < 0 else 1.0)
+
+
+def _runs(mask: Array) -> Array:
+    """First and one past the last index of every run of True, shape (runs, 2)."""
+    edges = np.diff(np.concatenate([[0], mask.astype(np.int8), [0]]))
+    return np.stack([np.flatnonzero(edges == 1), np.flatnonzero(edges == -1)], axis=1)
+
+
+def _touching(load: Array, rate: float) -> Array:
+    touching = np.zeros(load.size, bool)
+    for start, stop in _runs(load > RELEASE):
+        if load[start:stop].max() > TOUCH and stop - start >= SHORTEST_TOUCH * rate:
+            touching[start:stop] = True
+    return touching
+
+
+def _sliding(position: Array, lateral: Array, touching: Array, rate: float) -> tuple[Array, float]:
+    velocity = np.gradient(_smooth(position, rate)) * rate
+    rubbing = touching & (np.abs(velocity) > LEAST_SPEED) & (np.abs(_smooth(lateral, rate)) > LEAST_FRICTION)
+    if not rubbing.any():
+        return rubbing, 0.0
+    along = velocity * (1.0 if velocity[rubbing].sum() >= 0 else -1.0)
+    speed = float(np.median(along[rubbing & (along > 0)]))
+    return rubbing & (along > speed / 2), speed
