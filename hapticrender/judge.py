@@ -28,6 +28,7 @@ SETTLED = 0.05  # of the target
 QUARTERS = 4  # parts of a window in each of which a carrier must be fast enough
 CHUNK_VALUES = 2**21  # numbers in one batch of regressors
 RIDGE = 1e-12  # keeps the normal equations of a standing carrier solvable; such windows are not read
+UNJUDGED = {"figure": "rms_error", "value": None, "band": "any", "place": "any"}
 
 
 @dataclass(frozen=True)
@@ -229,9 +230,8 @@ def summary(recording: Recording) -> dict[str, Any]:
     late = (envelopes.start >= begin * (1 - 1e-9))[:, None]
     judged = envelopes.judged & late
     bands = [_band(recording, k, judged[:, k], places) for k in range(len(recording.bands))]
-    worst = _worst(bands, places, header.tolerance)
+    worst = dict(UNJUDGED) if _diverges(envelopes) else _worst(bands, places, header.tolerance)
     flags = recording.flags
-    finite = bool(envelopes.finite[late[:, 0]].all())
     return {
         "scene": header.name,
         "device": header.device,
@@ -241,7 +241,7 @@ def summary(recording: Recording) -> dict[str, Any]:
         "duration": len(recording) / recording.rate,
         "judged_from": begin,
         "tolerance": header.tolerance,
-        "passed": finite and worst["value"] is not None and worst["value"] <= header.tolerance,
+        "passed": worst["value"] is not None and worst["value"] <= header.tolerance,
         "worst": worst,
         "bands": bands,
         "wobble": _wobble(envelopes, judged),
@@ -276,9 +276,10 @@ def _band(recording: Recording, k: int, judged: Array, places: list[str]) -> dic
 
 def _settling_time(envelopes: Envelopes, k: int) -> float | None:
     """Middle (s) of the first window after which the centre stays within 5 % of the target; None if it never does."""
-    compared = envelopes.judged[:, k]
+    compared = envelopes.readable[:, k] & envelopes.asked[:, k]
     wanted = envelopes.wanted[compared, k]
-    outside = np.abs(envelopes.achieved[compared, 0, k] - wanted) > SETTLED * np.abs(wanted)
+    with np.errstate(invalid="ignore"):
+        outside = ~(np.abs(envelopes.achieved[compared, 0, k] - wanted) <= SETTLED * np.abs(wanted))
     time = envelopes.time[compared]
     first = int(np.flatnonzero(outside)[-1]) + 1 if outside.any() else 0
     return float(time[first]) if first < len(time) else None
@@ -296,10 +297,15 @@ def _wobble(envelopes: Envelopes, judged: Array) -> float | None:
     return math.sqrt(power)
 
 
+def _diverges(envelopes: Envelopes) -> bool:
+    """Whether the motion is no number somewhere: then no figure of the rest may pass for a verdict."""
+    return not envelopes.finite.all()
+
+
 def _worst(bands: list[dict[str, Any]], places: list[str], tolerance: float) -> dict[str, Any]:
     """Find the largest rms error of all bands that decide, at all places."""
     strongest = max((band["target"] for band in bands if band["target"] is not None), default=0.0)
-    worst: dict[str, Any] = {"figure": "rms error", "value": None, "band": "judged", "place": "any place"}
+    worst: dict[str, Any] = dict(UNJUDGED)
     for band in bands:
         for place in places:
             value = band[f"rms_error_{place}"]
@@ -323,13 +329,14 @@ def _notes(recording: Recording, bands: list[dict[str, Any]], late: Array) -> li
         notes.append("the motion is not known")
     elif not envelopes.finite.all():
         notes.append(f"the motion is not finite in {int((~envelopes.finite).sum())} of {len(envelopes.start)} windows")
-    for band in bands:
-        if band["judged_windows"] < late.sum():
-            share = band["judged_windows"] / late.sum()
-            notes.append(
-                f"{wording.band_label(band)}: {100 * share:.0f} % of the windows judged; in the others nothing is "
-                "wanted, the finger is up, or the carrier is slower than 20 Hz or too close to another"
-            )
+    partly = [band for band in bands if band["judged_windows"] < late.sum()]
+    if partly:
+        shares = sorted(100 * band["judged_windows"] / late.sum() for band in partly)
+        share = f"{shares[0]:.0f} %" if shares[-1] - shares[0] < 1 else f"{shares[0]:.0f} to {shares[-1]:.0f} %"
+        notes.append(
+            f"{wording.bands_label(partly)}: {share} of the windows judged; in the others nothing is wanted, "
+            "the finger is up, or the carrier is slower than 20 Hz or too close to another"
+        )
     return notes
 
 
@@ -346,7 +353,7 @@ def text(summary: Mapping[str, Any]) -> str:
                 wording.quantity(band["target"], "m"),
                 wording.quantity(band["achieved"], "m"),
                 *(wording.percent(band[f"rms_error_{place}"]) for place in places),
-                "–" if phase is None else f"{math.degrees(phase):.1f}°",
+                "–" if phase is None else f"{round(math.degrees(phase), 1) + 0.0:.1f}°",
                 wording.quantity(band["settling_time"], "s"),
             ]
         )

@@ -23,6 +23,7 @@ COILS = (BLUE, ORANGE, GREEN, RED)
 COLUMNS = 1400  # points that a full-width panel can show
 PERIODS = 4  # of the strongest carrier in the close-up
 MOST_LABELS = 10
+MOST_NOTES = 3  # lines
 FLOOR = 1e-5  # relative error below which a dot stands at the foot of its panel
 STYLE = {
     "font.size": 9,
@@ -62,33 +63,41 @@ def plot(recording: Recording, path: str | os.PathLike[str]) -> None:
         raise MissingExtra("pictures need matplotlib: pip install 'hapticrender[plot]'") from error
     with matplotlib.rc_context(STYLE), np.errstate(all="ignore"), replacing(Path(path)) as scratch:
         touched = bool(np.isfinite(recording.position).any())
-        figure = Figure(figsize=(11, 9.6 if touched else 8.0), layout="constrained")
+        figure = Figure(figsize=(11, 10.2 if touched else 8.6), layout="constrained")
         FigureCanvasAgg(figure)
+        figure.get_layout_engine().set(w_pad=0.12, h_pad=0.07)
         _draw(figure, recording, touched)
         figure.savefig(scratch, dpi=110, format="png")
 
 
 def _draw(figure: Any, recording: Recording, touched: bool) -> None:
-    heights = [0.42, 2.2, 2.2, 1.7] + ([0.9, 0.9] if touched else [])
-    grid = figure.add_gridspec(len(heights), 2, height_ratios=heights, width_ratios=[1.35, 1])
     summary = recording.summary()
-    _head(figure.add_subplot(grid[0, :]), recording, summary, touched)
+    notes = [line for note in summary["notes"] for line in textwrap.wrap(note, 170)][:MOST_NOTES]
+    coils = recording.header.drive_channels
+    heights = [0.5, 2.3, 2.2, 0.95 * coils, *([0.9, 0.9] if touched else []), *([0.17 * len(notes)] if notes else [])]
+    grid = figure.add_gridspec(len(heights), 2, height_ratios=heights, width_ratios=[1.35, 1])
+    _head(figure.add_subplot(grid[0, :]), summary, touched)
     amplitude = figure.add_subplot(grid[1, :])
     _amplitude(amplitude, recording, summary)
     _close_up(figure.add_subplot(grid[2, 0]), recording)
     _errors(figure.add_subplot(grid[2, 1]), recording, summary)
-    rows = [amplitude, figure.add_subplot(grid[3, :], sharex=amplitude)]
-    _drive(rows[-1], recording)
+    lanes = grid[3, :].subgridspec(max(coils, 1), 1)
+    below = [figure.add_subplot(lane, sharex=amplitude) for lane in lanes]
+    _drive(below, recording)
     if touched:
-        rows += [figure.add_subplot(grid[row, :], sharex=amplitude) for row in (4, 5)]
-        _finger(rows[-2], rows[-1], recording)
-    for axes in rows[1:-1]:
+        below += [figure.add_subplot(grid[row, :], sharex=amplitude) for row in (4, 5)]
+        _finger(below[-2], below[-1], recording)
+    for axes in below[:-1]:
         axes.tick_params(labelbottom=False)
-    rows[-1].set_xlabel("time (s)")
+    below[-1].set_xlabel("time (s)")
     amplitude.set_xlim(0, max(len(recording), 1) / recording.rate)
+    if notes:
+        foot = figure.add_subplot(grid[-1, :])
+        foot.axis("off")
+        foot.text(0, 1, "\n".join(notes), color="#555555", fontsize=8, va="top", transform=foot.transAxes)
 
 
-def _head(axes: Any, recording: Recording, summary: dict[str, Any], touched: bool) -> None:
+def _head(axes: Any, summary: dict[str, Any], touched: bool) -> None:
     """Name of the scene, how it was made, and the verdict in words."""
     axes.axis("off")
     passed, finger = summary["passed"], "" if touched else " · no finger"
@@ -121,7 +130,7 @@ def _amplitude(axes: Any, recording: Recording, summary: dict[str, Any]) -> None
     axes.axvline(summary["judged_from"], color=PALE, lw=0.9, ls=":", label="judged from here")
     several = "" if shown.sum() <= 1 else f" ({int(shown.sum())} bands: root of the sum of squares)"
     axes.set(title=f"Peak amplitude{several}", ylabel="amplitude (µm)")
-    axes.set_ylim(0, 1.12 * max(np.nanmax(1e6 * achieved, initial=0), (1 + tolerance) * wanted.max(initial=0)) or 1)
+    axes.set_ylim(0, 1.25 * max(np.nanmax(1e6 * achieved, initial=0), (1 + tolerance) * wanted.max(initial=0)) or 1)
     handles, labels = axes.get_legend_handles_labels()
     order = sorted(
         range(len(labels)), key=lambda i: [*names, "target", "tolerance", "judged from here"].index(labels[i])
@@ -165,18 +174,18 @@ def _close_up(axes: Any, recording: Recording) -> None:
 
 
 def _close_span(recording: Recording) -> tuple[int, int]:
-    """First and last sample of a few periods in the last judged window, or at the end where nothing is judged."""
+    """First and last sample of a few periods in a late judged window, or at the end where nothing is judged."""
     envelopes, rate = recording.envelopes, recording.rate
     judged = np.flatnonzero(envelopes.judged.any(axis=1))
     if not judged.size:
         return max(0, len(recording) - round(0.1 * rate)), len(recording)
-    last = judged[-1]
-    first = round(envelopes.start[last] * rate)
+    chosen = judged[int(0.8 * judged.size)]
+    first = round(envelopes.start[chosen] * rate)
     size = round(envelopes.window * rate)
     position = recording.read("position", first, first + size)
     velocity = (position[-1] - position[0]) * rate / (size - 1)
     frequency = np.abs(recording.bands.instantaneous_frequency(np.nan_to_num(velocity)))
-    strength = np.where(envelopes.judged[last], np.abs(envelopes.wanted[last]), 0)
+    strength = np.where(envelopes.judged[chosen], np.abs(envelopes.wanted[chosen]), 0)
     slowest = frequency[strength >= 0.1 * strength.max()].min()
     seconds = max(PERIODS / frequency[strength.argmax()], 1.5 / slowest)
     stop = min(len(recording), first + size)
@@ -204,30 +213,32 @@ def _errors(axes: Any, recording: Recording, summary: dict[str, Any]) -> None:
     every = -(-len(bands) // MOST_LABELS)
     shown = range(0, len(bands), every)
     axes.set_xticks(list(shown), [wording.band_label(bands[k]) for k in shown], rotation=30 if len(shown) > 5 else 0)
+    if len(shown) > 5:
+        for label in axes.get_xticklabels():
+            label.set(ha="right", rotation_mode="anchor")
     axes.set_xlim(-0.6, len(bands) - 0.4)
     axes.grid(axis="x", visible=False)
     axes.set(title="Rms error of the judged amplitude", ylabel="error (%)")
     _legend(axes, columns=4)
 
 
-def _drive(axes: Any, recording: Recording) -> None:
-    """Drive of every coil; a long run as the range that each column of pixels covers."""
+def _drive(lanes: list[Any], recording: Recording) -> None:
+    """Drive of every coil in its lane; a long run as the range that each column of pixels covers."""
     drive, limit = recording.drive, recording.header.drive_limit
-    for i in range(drive.shape[1]):
-        time, low, high = outline(drive[:, i], recording.rate)
-        colour = COILS[i % len(COILS)]
-        axes.fill_between(time, low, high, color=colour, alpha=0.5, lw=0.4, label=f"coil {i + 1}")
-    saturated = (recording.flags & Flag.SATURATED) != 0
     peak = np.nanmax(np.abs(drive), initial=0.0) or 1e-3
-    if limit is not None and peak > 0.4 * limit:
-        for sign in (-1, 1):
-            axes.axhline(sign * limit, color=RED, lw=1, ls=(0, (4, 2)), label="limit" if sign > 0 else None)
-        peak = max(peak, limit)
-    stated = "" if limit is None else f", limit ±{limit:g} A"
-    if saturated.any():
-        stated += f", saturated in {wording.percent(float(saturated.mean()))} of the samples"
-    axes.set(title=f"Drive{stated}", ylabel="current (A)", ylim=(-1.1 * peak, 1.45 * peak))
-    _legend(axes)
+    near = limit is not None and peak > 0.4 * limit
+    reach = 1.12 * (max(peak, limit) if near else peak)
+    for i, axes in enumerate(lanes[: drive.shape[1]]):
+        time, low, high = outline(drive[:, i], recording.rate)
+        axes.fill_between(time, low, high, color=COILS[i % len(COILS)], lw=0.5)
+        for sign in (-1, 1) if near else ():
+            axes.axhline(sign * limit, color=INK, lw=1, ls=(0, (4, 2)))
+        axes.set(ylabel=f"coil {i + 1} (A)", ylim=(-reach, reach))
+    stated = "" if limit is None else f", limit ±{limit:g} A" + (" (dashed)" if near else "")
+    saturated = float(np.mean((recording.flags & Flag.SATURATED) != 0)) if len(recording) else 0.0
+    if saturated:
+        stated += f", saturated in {wording.percent(saturated)} of the samples"
+    lanes[0].set_title(f"Drive{stated}")
 
 
 def _finger(upper: Any, lower: Any, recording: Recording) -> None:
