@@ -21,7 +21,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from hapticrender._jit import kernel
-from hapticrender.control.loopshape import butterworth
+from hapticrender.control.transfer import butterworth, require_positive
 from hapticrender.protocols import Array
 
 
@@ -190,7 +190,7 @@ class BoxcarSTDFT(_STDFT):
     def __post_init__(self) -> None:
         if self.length != int(self.length) or self.length < 1:
             raise ValueError(f"length={self.length!r} must be a whole number of samples >= 1")
-        _check_rate(self.rate)
+        require_positive(rate=self.rate)
 
     @property
     def delay(self) -> float:
@@ -239,7 +239,7 @@ class StarSTDFT(_STDFT):
     rate: float
 
     def __post_init__(self) -> None:
-        _check_rate(self.rate)
+        require_positive(rate=self.rate)
         if not 0 < self.bandwidth < self.rate / 2:
             raise ValueError(
                 f"bandwidth={self.bandwidth!r} Hz must lie between 0 and half the rate, {self.rate / 2:g} Hz"
@@ -266,11 +266,6 @@ class StarSTDFT(_STDFT):
         b, a = self.coefficients
         arrays = (tuple(np.append(b, a[1:]).tolist()), np.zeros((channels, 4, bands)))
         return Estimator(_star_run, channels, bands, arrays)
-
-
-def _check_rate(rate: float) -> None:
-    if not (np.isfinite(rate) and rate > 0):
-        raise ValueError(f"{rate=} Hz must be positive and finite")
 
 
 def phase(envelope: Any, *, cut: float = pi) -> Any:
