@@ -34,6 +34,7 @@ STYLE = {
     "axes.spines.right": False,
     "axes.edgecolor": PALE,
     "axes.grid": True,
+    "axes.axisbelow": True,
     "grid.color": "#E4E4E4",
     "grid.linewidth": 0.6,
     "legend.frameon": False,
@@ -74,18 +75,17 @@ def _draw(figure: Any, recording: Recording, touched: bool) -> None:
     summary = recording.summary()
     notes = [line for note in summary["notes"] for line in textwrap.wrap(note, 170)][:MOST_NOTES]
     coils = recording.header.drive_channels
-    heights = [0.5, 2.3, 2.2, 0.95 * coils, *([0.9, 0.9] if touched else []), *([0.17 * len(notes)] if notes else [])]
+    lanes = [0.8] * coils + ([0.9, 0.9] if touched else [])
+    heights = [0.5, 2.3, 2.2, *lanes, *([0.17 * len(notes)] if notes else [])]
     grid = figure.add_gridspec(len(heights), 2, height_ratios=heights, width_ratios=[1.35, 1])
     _head(figure.add_subplot(grid[0, :]), summary, touched)
     amplitude = figure.add_subplot(grid[1, :])
     _amplitude(amplitude, recording, summary)
     _close_up(figure.add_subplot(grid[2, 0]), recording)
     _errors(figure.add_subplot(grid[2, 1]), recording, summary)
-    lanes = grid[3, :].subgridspec(max(coils, 1), 1)
-    below = [figure.add_subplot(lane, sharex=amplitude) for lane in lanes]
-    _drive(below, recording)
+    below = [figure.add_subplot(grid[3 + i, :], sharex=amplitude) for i in range(len(lanes))]
+    _drive(below[:coils], recording)
     if touched:
-        below += [figure.add_subplot(grid[row, :], sharex=amplitude) for row in (4, 5)]
         _finger(below[-2], below[-1], recording)
     for axes in below[:-1]:
         axes.tick_params(labelbottom=False)
@@ -205,9 +205,11 @@ def _errors(axes: Any, recording: Recording, summary: dict[str, Any]) -> None:
     axes.axhline(100 * recording.header.tolerance, color=INK, lw=1, ls=(0, (4, 2)), label="tolerance")
     axes.set_yscale("log")
     low, high = axes.get_ylim()
-    axes.set_ylim(
-        min(low, 100 * recording.header.tolerance / 30) / 1.5, max(high, 100 * recording.header.tolerance) * 4
-    )
+    allowed = 100 * recording.header.tolerance
+    low, high = min(low, allowed / 30) / 1.5, max(high, allowed)
+    high *= (high / low) ** 0.22  # room for the legend
+    axes.axhspan(allowed, high, color=RED, alpha=0.08, lw=0)
+    axes.set_ylim(low, high)
     axes.yaxis.set_major_formatter(lambda value, _: f"{value:g}")
     axes.minorticks_off()
     every = -(-len(bands) // MOST_LABELS)
@@ -234,6 +236,8 @@ def _drive(lanes: list[Any], recording: Recording) -> None:
         for sign in (-1, 1) if near else ():
             axes.axhline(sign * limit, color=INK, lw=1, ls=(0, (4, 2)))
         axes.set(ylabel=f"coil {i + 1} (A)", ylim=(-reach, reach))
+        if near:
+            axes.set_yticks([-limit, 0, limit])
     stated = "" if limit is None else f", limit ±{limit:g} A" + (" (dashed)" if near else "")
     saturated = float(np.mean((recording.flags & Flag.SATURATED) != 0)) if len(recording) else 0.0
     if saturated:
