@@ -31,7 +31,7 @@ _EXAMPLES = """\
 start here:
   hapticrender demo                               all built-in scenes; then open out/demo/index.html
   hapticrender scenes                             what is built in
-  hapticrender scenes grating-47hz > mine.toml    a scene of your own: edit it ...
+  hapticrender scenes grating-47 >   mine.toml    a scene of your own: edit it ...
   hapticrender render mine.toml --out mine        ... and render it
 
 `hapticrender VERB --help` says more about each verb.
@@ -188,11 +188,11 @@ def _render(arguments: argparse.Namespace) -> int:
 
 def _scenes(arguments: argparse.Namespace) -> int:
     from hapticrender.touch.builtin import builtin_scenes
-    from hapticrender.wording import table
+    from hapticrender.wording import describe, table
 
     scenes = builtin_scenes()
     if arguments.scene is None:
-        print(table([[name, _describe(scene)] for name, scene in scenes.items()]))
+        print(table([[name, describe(scene)] for name, scene in scenes.items()]))
     elif arguments.scene in scenes:
         print(scenes[arguments.scene].to_toml(), end="")
     else:
@@ -247,10 +247,6 @@ def _first_line(entry: Any) -> str:
         return f"cannot be loaded from {entry.value}: {type(error).__name__}: {error}"
     text = (loaded.__doc__ or "").strip().partition("\n")[0]
     return f"{text}  ({entry.value})"
-
-
-def _describe(scene: Scene) -> str:
-    raise NotImplementedError
 
 
 def _overview(summaries: list[Any]) -> str:

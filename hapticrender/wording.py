@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from hapticrender.touch.scene import Scene
 
 PLACES = ("centre", "end_1", "end_2")
-_PREFIXES = ((1.0, ""), (1e-3, "m"), (1e-6, "µ"), (1e-9, "n"))
+_PREFIXES = ((1.0, ""), (1e-3, "m"), (1e-6, "µ"), (1e-9, "n"), (1e-12, "p"))
 
 
 def quantity(value: float | None, unit: str) -> str:
@@ -20,8 +23,10 @@ def quantity(value: float | None, unit: str) -> str:
     """
     if value is None or not math.isfinite(value):
         return "–"
+    if abs(value) < _PREFIXES[-1][0]:
+        return f"0 {unit}"
     scale, prefix = _prefix(value)
-    return f"{_digits(value / scale)} {prefix}{unit}" if value else f"0 {unit}"
+    return f"{_digits(value / scale)} {prefix}{unit}"
 
 
 def short(value: float, unit: str) -> str:
@@ -95,7 +100,8 @@ def overview(summaries: Sequence[Mapping[str, Any]]) -> str:
         bands = summary["bands"]
         amplitudes = [quantity(total(bands, key), "m") for key in ("target", "achieved")]
         errors = [percent(worst_at(bands, place)) for place in PLACES]
-        rows.append([summary["scene"], *amplitudes, *errors, verdict(summary)])
+        within = f"within {100 * summary['tolerance']:.4g} %"
+        rows.append([summary["scene"], *amplitudes, *errors, within if summary["passed"] else verdict(summary)])
     return table(rows)
 
 
@@ -106,6 +112,25 @@ def conditions(summary: Mapping[str, Any]) -> str:
         f"{short(summary['duration'], 's')}, judged from {short(summary['judged_from'], 's')}, "
         f"flagged samples: {flags(summary)}"
     )
+
+
+def describe(scene: Scene) -> str:
+    """Describe a scene in a few words: its texture, its finger, its length."""
+    texture, motion = scene.texture, scene.finger.motion
+    sizes = [
+        short(size, unit)
+        for key, unit in (("amplitude", "m"), ("wavelength", "m"), ("frequency", "Hz"))
+        if (size := getattr(texture, key, None)) is not None
+    ]
+    speed = getattr(motion, "speed", None)
+    finger = [f"{_kind(motion)} finger", *([] if speed is None else [short(speed, "m/s")])]
+    return f"{_kind(texture)} {' '.join(sizes)}; {' '.join(finger)}; {short(scene.duration, 's')}"
+
+
+def _kind(thing: Any) -> str:
+    """Call a texture or a motion by its kind, or by its class where it is of the user's own."""
+    kind = str(getattr(thing, "kind", type(thing).__name__))
+    return "no" if kind == "none" else kind
 
 
 def flags(summary: Mapping[str, Any]) -> str:

@@ -1,0 +1,7 @@
+"""``python -m hapticrender`` is the command line."""
+
+import sys
+
+from hapticrender.cli import main
+
+sys.exit(main())

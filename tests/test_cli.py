@@ -1,0 +1,412 @@
+"""The command line as a user meets it: the verbs, one line for each trouble, and nothing written where it said no."""
+
+import json
+import os
+import resource
+import signal
+import subprocess
+import sys
+import time
+import tomllib
+from xml.etree import ElementTree
+
+import hypothesis
+import numpy as np
+import pytest
+import soundfile
+from hypothesis import strategies as st
+
+from hapticrender import __version__, cli
+from hapticrender.recording import Recording
+from hapticrender.touch.builtin import builtin_scenes
+from hapticrender.touch.scene import Scene
+
+TINY = """\
+name = "tiny"
+duration = 0.1
+device = "vt-plate"
+
+[texture]
+kind = "grating"
+amplitude = 10e-6
+frequency = 47.0
+"""
+SCENE_FILES = {"scene.toml", "recording.au", "drive.wav", "sensed.wav", "summary.json"}
+
+
+@pytest.fixture
+def run(capsys):
+    """Run the command line; returns its status, standard output and the lines of standard error."""
+
+    def run(*arguments):
+        status = cli.main([str(argument) for argument in arguments])
+        captured = capsys.readouterr()
+        return status, captured.out, captured.err.splitlines()
+
+    return run
+
+
+@pytest.fixture
+def tiny(tmp_path):
+    path = tmp_path / "tiny.toml"
+    path.write_text(TINY)
+    return path
+
+
+@pytest.fixture
+def two_tiny_scenes(monkeypatch):
+    """A demo of two short scenes."""
+    scenes = {name: Scene.from_toml_text(TINY.replace("tiny", name), where=name) for name in ("one", "two")}
+    monkeypatch.setattr("hapticrender.touch.builtin.builtin_scenes", lambda: scenes)
+    return scenes
+
+
+@pytest.fixture
+def no_matplotlib(monkeypatch):
+    for name in [name for name in sys.modules if name.partition(".")[0] == "matplotlib"]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.delitem(sys.modules, "hapticrender.picture", raising=False)
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
+
+
+def process(*arguments, **options):
+    """A command line of its own, for what must not happen to this process."""
+    command = [sys.executable, "-m", "hapticrender", *map(str, arguments)]
+    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, **options)
+
+
+def complaint(result):
+    """The one line of a refused command."""
+    status, out, errors = result
+    assert (status, out, len(errors)) == (2, "", 1), errors
+    assert errors[0].startswith("hapticrender: ")
+    return errors[0]
+
+
+def test_the_demo_leaves_one_page_and_all_its_parts(run, tmp_path):
+    status, out, errors = run("demo", "--out", tmp_path / "out")
+    names = list(builtin_scenes())
+    assert status == 0
+    assert errors == [f"{i + 1}/{len(names)} {name}" for i, name in enumerate(names)]
+    assert out.endswith(f"page: {tmp_path / 'out' / 'index.html'}\n")
+    report = json.loads((tmp_path / "out" / "summary.json").read_text(encoding="utf-8"), parse_constant=pytest.fail)
+    assert [scene["scene"] for scene in report["scenes"]] == names
+    html = (tmp_path / "out" / "index.html").read_text(encoding="utf-8")
+    for name in names:
+        folder = tmp_path / "out" / name
+        assert {path.name for path in folder.iterdir()} == SCENE_FILES | {"picture.png"}
+        assert f'src="{name}/picture.png"' in html
+        assert Scene.from_toml(folder / "scene.toml") == builtin_scenes()[name]
+
+
+def test_the_demo_holds_the_papers_eight_gratings_and_more():
+    scenes = builtin_scenes()
+    frequencies = [getattr(scene.texture, "frequency", None) for scene in scenes.values()]
+    for frequency in (20, 31, 47, 72, 111, 170, 261, 400):
+        scene = list(scenes.values())[frequencies.index(frequency)]
+        assert scene.texture.amplitude == 10e-6
+    assert {"spatial-grating", "recorded-texture"} <= set(scenes)
+
+
+def test_without_matplotlib_all_else_is_there_and_one_line_says_how(run, two_tiny_scenes, no_matplotlib, tmp_path):
+    status, out, _ = run("demo", "--out", tmp_path / "out")
+    assert status == 0
+    assert out.count('pip install "hapticrender[plot]"') == 1
+    for name in two_tiny_scenes:
+        assert {path.name for path in (tmp_path / "out" / name).iterdir()} == SCENE_FILES
+    assert "picture.png" not in (tmp_path / "out" / "index.html").read_text(encoding="utf-8")
+
+
+def test_sound_carries_its_scale(run, tiny, tmp_path):
+    assert run("render", tiny, "--out", tmp_path / "out")[0] == 0
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text(encoding="utf-8"))
+    recording = Recording.load(tmp_path / "out" / "recording.au")
+    for name, played in (("drive.wav", recording.drive), ("sensed.wav", recording.sensed)):
+        samples, rate = soundfile.read(tmp_path / "out" / name)
+        full_scale = summary["sound"][name]["full_scale"]
+        assert rate == recording.rate
+        assert 0.4 <= np.abs(samples).max() <= 1  # full scales go in steps of 1, 2, 5
+        np.testing.assert_allclose(samples * full_scale, played, rtol=0, atol=full_scale * 2**-23)  # 24 bits
+
+
+def test_render_prints_figures_and_the_recording_shows_the_same(run, tiny, tmp_path):
+    status, out, errors = run("render", tiny, "--out", tmp_path / "out", "--seed", 3, "--method", "paper-common")
+    assert (status, errors) == (0, [f"1/1 {tiny}"])
+    assert out.startswith("tiny on vt-plate, method paper-common, seed 3: 100 ms, judged from 50 ms")
+    assert run("show", tmp_path / "out") == (0, out, [])
+    assert run("show", tmp_path / "out" / "recording.au") == (0, out, [])
+
+
+def test_a_recording_that_was_cut_off_can_be_shown(run, tiny, tmp_path):
+    run("render", tiny, "--out", tmp_path / "out")
+    path = tmp_path / "out" / "recording.au"
+    os.truncate(path, path.stat().st_size // 2 + 3)
+    status, out, errors = run("show", path)
+    assert (status, errors) == (0, [])
+    assert "the run ended after 0.0" in out
+
+
+def test_what_an_earlier_run_left_is_gone(run, tiny, tmp_path, no_matplotlib):
+    (tmp_path / "out").mkdir()
+    for name in ("picture.png", "my-notes.txt"):
+        (tmp_path / "out" / name).touch()
+    run("render", tiny, "--out", tmp_path / "out")
+    assert {path.name for path in (tmp_path / "out").iterdir()} == SCENE_FILES | {"my-notes.txt"}
+
+
+def test_scenes_are_listed_and_printed(run):
+    status, out, errors = run("scenes")
+    assert (status, errors) == (0, [])
+    assert [line.split()[0] for line in out.splitlines()] == list(builtin_scenes())
+    assert all(len(line.split()) > 3 for line in out.splitlines())
+    for name, scene in builtin_scenes().items():
+        _, out, _ = run("scenes", name)
+        assert Scene.from_toml_text(out, where=name) == scene
+        assert tomllib.loads(out)["duration"] == scene.duration
+
+
+def test_validate_says_which_figure_missed_and_exits_1(run, tmp_path):
+    reports = tmp_path / "reports"
+    status, out, _ = run(
+        "validate", "grating-47", "grating-170", "--json", reports / "r.json", "--junit", reports / "r.xml"
+    )
+    assert status == 1
+    good, bad = out.splitlines()[1:]
+    assert "within its tolerance" in good
+    assert "misses its tolerance: worst figure rms error of the 170 Hz band at " in bad
+    assert json.loads((reports / "r.json").read_text(encoding="utf-8"))["passed"] is False
+    assert ElementTree.parse(reports / "r.xml").find("testsuite").get("failures") == "1"
+
+
+def test_validate_exits_0_where_all_is_well(run):
+    assert run("validate", "grating-47")[0] == 0
+
+
+def test_devices_are_listed(run):
+    status, out, errors = run("devices")
+    assert (status, errors) == (0, [])
+    assert "cannot be loaded" not in out
+    for name in ("vt-plate", "simulated", "wavefile"):
+        assert sum(line.split()[0] == name for line in out.splitlines()) == 1
+
+
+def test_a_broken_driver_does_not_hide_the_others(run, monkeypatch):
+    from importlib.metadata import EntryPoint
+
+    broken = EntryPoint("broken", "no_such_package:Driver", "hapticrender.drivers")
+    monkeypatch.setattr("importlib.metadata.entry_points", lambda group: [broken])
+    _, out, _ = run("devices")
+    assert "broken  cannot be loaded from no_such_package:Driver: ModuleNotFoundError" in out
+
+
+def test_help_and_version(capsys):
+    assert cli.main([]) == 0
+    assert "start here:" in capsys.readouterr().out
+    for argument in ("--help", "--version"):
+        with pytest.raises(SystemExit) as exit_:
+            cli.main([argument])
+        assert exit_.value.code == 0
+    assert capsys.readouterr().out.endswith(f"hapticrender {__version__}\n")
+
+
+def test_help_waits_for_no_heavy_import():
+    script = (
+        "import sys; from hapticrender import cli; cli._parser(); print({'numba', 'scipy', 'numpy'} & set(sys.modules))"
+    )
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
+    assert done.stdout == "set()\n"
+
+
+EDITS = [  # what is changed in the tiny scene, what the complaint must name
+    ("amplitude = 10e-6", "amplitude = 0.0", ["texture.amplitude = 0.0", "m"]),
+    ("amplitude = 10e-6", "amplitude = -1e-6", ["texture.amplitude = -1e-06", "m"]),
+    ("amplitude = 10e-6", "amplitude = 10", ["texture.amplitude = 10", "m"]),
+    ("amplitude = 10e-6", 'amplitude = "10 um"', ["texture.amplitude = '10 um'", "m"]),
+    ("amplitude = 10e-6", "amplitude = 9e-3", ["A"]),
+    ("frequency = 47.0", "wavelength = 0.0", ["texture.wavelength = 0.0", "> 0 m"]),
+    ("frequency = 47.0", "wavelength = nan", ["texture.wavelength = nan", "m"]),
+    ("frequency = 47.0", "frequency = 2600.0", ["2600", "Hz"]),
+    ("frequency = 47.0", "frequncy = 47.0", ["frequncy"]),
+    ("frequency = 47.0", "", ["frequency"]),
+    ('kind = "grating"', 'kind = "carpet"', ["texture.kind = 'carpet'", "grating"]),
+    ('kind = "grating"', "", ["texture.kind"]),
+    ("duration = 0.1", "duration = -1.0", ["duration = -1.0", "s"]),
+    ("duration = 0.1", "duration = 1e300", ["duration = 1e+300", "s"]),
+    ("duration = 0.1", "duration = 0.1\ncolour = 1", ["colour"]),
+    ('device = "vt-plate"', 'device = "tea-tray"', ["tea-tray", "vt-plate"]),
+    ("duration = 0.1", "duration = = 0.1", ["line 2"]),
+    ("[texture]", "[[texture]]", ["texture"]),
+]
+
+
+@pytest.mark.parametrize(("old", "new", "words"), EDITS, ids=[new or f"no {old}" for old, new, _ in EDITS])
+def test_a_bad_scene_gets_one_line_and_nothing_is_written(run, tiny, tmp_path, old, new, words):
+    tiny.write_text(TINY.replace(old, new))
+    line = complaint(run("render", tiny, "--out", tmp_path / "out"))
+    assert line.startswith(f"hapticrender: {tiny}: ")
+    for word in words:
+        assert word in line
+    assert not (tmp_path / "out").exists()
+    complaint(run("validate", tiny, "--json", tmp_path / "out" / "r.json"))
+    assert not (tmp_path / "out").exists()
+
+
+BAD_ARGUMENTS = [
+    (["render", "{tiny}"], "--out"),
+    (["render", "{tiny}", "--out", "{out}", "--method", "magic"], "--method = 'magic': must be one of paper, "),
+    (["render", "{tiny}", "--out", "{out}", "--seed", "-1"], "--seed: '-1': must be a whole number"),
+    (["render", "{tiny}", "--out", "{out}", "--seed", "1.5"], "--seed: '1.5': must be a whole number"),
+    (["render", "{tiny}", "--out", "{tiny}"], "is a file, must be a folder"),
+    (["render", "{tiny}", "--out", "{tiny}/below"], "is a file, must be a folder"),
+    (["render", "no-such-scene", "--out", "{out}"], "no-such-scene: no such file, nor a built-in scene"),
+    (["render", "{folder}", "--out", "{out}"], "{folder}: "),
+    (["render", "{binary}", "--out", "{out}"], "{binary}: "),
+    (["demo", "--out", "{tiny}"], "is a file, must be a folder"),
+    (["demo", "--out", "{out}", "--method", "magic"], "--method = 'magic': must be one of paper, "),
+    (["scenes", "no-such-scene"], "no-such-scene: no such built-in scene; there are "),
+    (["validate", "{tiny}", "--json", "{folder}"], "is a folder, must be a file"),
+    (["validate", "{tiny}", "--junit", "{tiny}/r.xml"], "is a file, must be a folder"),
+    (["show", "{missing}"], "{missing}: "),
+    (["show", "{binary}"], "{binary}: "),
+    (["show", "{folder}"], "{folder}/recording.au: "),
+    (["dance"], "dance"),
+    (["demo", "--loud"], "--loud"),
+]
+
+
+@pytest.mark.parametrize(("arguments", "words"), BAD_ARGUMENTS, ids=lambda value: "-".join(value)[:50])
+def test_bad_arguments_get_one_line_and_nothing_is_written(run, tiny, tmp_path, arguments, words):
+    places = {name: tmp_path / name for name in ("out", "folder", "missing", "binary")} | {"tiny": tiny}
+    places["folder"].mkdir()
+    places["binary"].write_bytes(bytes(range(256)))
+    before = sorted(tmp_path.rglob("*"))
+    assert words.format(**places) in complaint(run(*(argument.format(**places) for argument in arguments)))
+    assert sorted(tmp_path.rglob("*")) == before
+    assert tiny.read_text() == TINY
+
+
+def test_a_folder_that_is_there_is_left_as_it_was(run, tiny, tmp_path):
+    out = tmp_path / "out"
+    run("render", tiny, "--out", out)
+    before = {path: (path.stat().st_mtime_ns, path.read_bytes()) for path in out.iterdir()}
+    tiny.write_text(TINY.replace("47.0", "-47.0"))
+    complaint(run("render", tiny, "--out", out))
+    assert {path: (path.stat().st_mtime_ns, path.read_bytes()) for path in out.iterdir()} == before
+
+
+def test_one_bad_scene_stops_all(run, two_tiny_scenes, tmp_path, monkeypatch):
+    two_tiny_scenes["two"] = Scene.from_toml_text(TINY.replace("47.0", "2600.0"), where="two")
+    assert "two: " in complaint(run("demo", "--out", tmp_path / "out"))
+    assert not (tmp_path / "out").exists()
+
+
+def test_sound_with_nan_or_nothing_in_it_is_refused(run, tiny, tmp_path):
+    texture = '[texture]\nkind = "recorded"\nfile = "bad.wav"\namplitude = 10e-6\n'
+    tiny.write_text(TINY.partition("[texture]")[0] + texture)
+    for samples in (np.array([0.1, np.nan, 0.2] * 1000), np.zeros(0)):
+        soundfile.write(tmp_path / "bad.wav", samples, 8000, subtype="DOUBLE")
+        assert "bad.wav" in complaint(run("render", tiny, "--out", tmp_path / "out"))
+        assert not (tmp_path / "out").exists()
+
+
+def test_an_interrupted_demo_keeps_what_it_has(run, two_tiny_scenes, tmp_path, monkeypatch):
+    def interrupted(folder, session, **options):
+        if session.scene.name == "two":
+            raise KeyboardInterrupt
+        return run_into(folder, session, **options)
+
+    from hapticrender.outputs import run_into
+
+    monkeypatch.setattr("hapticrender.outputs.run_into", interrupted)
+    status, out, errors = run("demo", "--out", tmp_path / "out")
+    assert (status, out) == (130, "")
+    assert errors == ["1/2 one", "hapticrender: interrupted; what is written so far can be read"]
+    assert 'id="one"' in (tmp_path / "out" / "index.html").read_text(encoding="utf-8")
+
+
+def test_an_interrupted_run_leaves_its_journal(tmp_path, tiny):
+    tiny.write_text(TINY.replace("duration = 0.1", "duration = 3000.0"))
+    journal = tmp_path / "out" / "recording.au"
+    with process("render", tiny, "--out", tmp_path / "out") as child:
+        wait_until(lambda: journal.exists() and journal.stat().st_size > 2e6, child)
+        child.send_signal(signal.SIGINT)
+        _, errors = child.communicate(timeout=60)
+    assert child.returncode == 130
+    assert errors == "hapticrender: interrupted; what is written so far can be read\n"
+    recording = Recording.load(journal)
+    assert len(recording) > recording.rate  # more than a second
+    assert np.isfinite(recording.sensed).all()
+    assert Scene.from_toml(tmp_path / "out" / "scene.toml") == Scene.from_toml(tiny)
+
+
+def wait_until(condition, child):
+    end = time.monotonic() + 60
+    while not condition():
+        assert child.poll() is None, child.communicate()
+        assert time.monotonic() < end
+        time.sleep(0.02)
+
+
+def test_a_full_disk_gets_one_line(tmp_path, tiny):
+    tiny.write_text(TINY.replace("duration = 0.1", "duration = 60.0"))
+    limit = 500_000  # bytes a file may have
+    limited = {"preexec_fn": lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))}
+    with process("render", tiny, "--out", tmp_path / "out", **limited) as child:
+        _, errors = child.communicate(timeout=60)
+    assert child.returncode == 2
+    assert errors.startswith("hapticrender: ")
+    assert "File too large" in errors
+    assert errors.count("\n") == 1
+    assert 0 < len(Recording.load(tmp_path / "out" / "recording.au"))
+
+
+def test_who_has_read_enough_is_not_told_off():
+    with process("scenes") as child:
+        child.stdout.close()
+        assert child.stderr.read() == ""
+    assert child.returncode == 0
+
+
+values = st.one_of(
+    st.floats().map(repr),
+    st.integers().map(str),
+    st.sampled_from(["true", "[]", "{}", "[1.0]", '""', '"x"', "1e-6", "0.05", "1e9", "-1", "2000-01-01", "[[]]", "="]),
+    st.text(max_size=8).map(json.dumps),
+)
+scene_texts = st.sampled_from([TINY, *(scene.to_toml() for scene in builtin_scenes().values())])
+
+
+@st.composite
+def mangled(draw):
+    """A scene's TOML with some of its lines changed, doubled, moved or lost."""
+    lines = draw(scene_texts).splitlines()
+    for _ in range(draw(st.integers(1, 3))):
+        i = draw(st.integers(0, len(lines) - 1))
+        key = lines[i].partition("=")[0].strip()
+        new = draw(st.one_of(values.map(lambda value, key=key: f"{key} = {value}"), st.sampled_from(["", *lines])))
+        lines[i] = new
+    return "\n".join(shortened(line) for line in lines)
+
+
+def shortened(line):
+    """The same line, with a duration that does not keep a test waiting where it is a sensible one."""
+    key, _, value = line.partition("=")
+    try:
+        long = key.strip() == "duration" and 0.05 < float(value) < 1e5
+    except ValueError:
+        return line
+    return "duration = 0.05" if long else line
+
+
+@hypothesis.settings(max_examples=60, suppress_health_check=[hypothesis.HealthCheck.function_scoped_fixture])
+@hypothesis.given(text=st.one_of(mangled(), st.text(), st.binary()))
+def test_no_scene_file_ever_makes_a_traceback(run, tmp_path_factory, text):
+    folder = tmp_path_factory.mktemp("fuzz")
+    path = folder / "scene.toml"
+    path.write_bytes(text if isinstance(text, bytes) else text.encode("utf-8", "surrogatepass"))
+    result = run("render", path, "--out", folder / "out")
+    if result[0] == 0:
+        assert {entry.name for entry in (folder / "out").iterdir()} >= SCENE_FILES
+    else:
+        assert complaint(result).startswith(f"hapticrender: {path}: ")
+        assert not (folder / "out").exists()
