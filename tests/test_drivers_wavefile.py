@@ -9,10 +9,13 @@ import numpy as np
 import pytest
 import soundfile
 
+import hapticrender as hr
 from hapticrender.drivers.base import BaseDriver
+from hapticrender.drivers.simulated import SimulatedDriver
 from hapticrender.drivers.wavefile import FORMATS, SUBTYPES, WaveFileDriver, read_back
 from hapticrender.errors import DeviceLost, DeviceNotFound, DriverError
 from hapticrender.protocols import Driver, Flag, Sensed
+from hapticrender.renderers.vibrotactile import VibrotactileRenderer
 
 FULL_SCALE = 2.5  # A
 FORMS = [
@@ -297,3 +300,34 @@ def test_reading_back_what_is_no_sound_names_the_file(tmp_path):
     (tmp_path / "text.wav").write_text("not a sound")
     with pytest.raises(DriverError, match=r"text\.wav: read: "):
         read_back(tmp_path / "text.wav")
+
+
+SCENE = hr.Scene(texture=hr.Grating(frequency=47.0, amplitude=10e-6), duration=0.5)
+
+
+def test_a_run_through_a_tee_is_the_run_without_it(tmp_path):
+    plain = hr.render(SCENE, seed=3)
+    plant = VibrotactileRenderer().plant(SCENE, 3)
+    driver = WaveFileDriver(tmp_path / "a.w64", through=SimulatedDriver(plant), subtype="DOUBLE", full_scale=1.0)
+    through = hr.render(SCENE, driver=driver)
+    for name in ("drive", "sensed", "motion"):
+        np.testing.assert_array_equal(getattr(through, name), getattr(plain, name))
+    held = driver.read_back()
+    assert len(held) == len(plain.drive) + 1  # and a sample of rest
+    np.testing.assert_array_equal(held[1:-1], plain.drive[:-1])  # what is computed from a sample acts one later
+
+
+def test_alone_it_is_driven_from_the_look_up_table(tmp_path):
+    driver = WaveFileDriver(tmp_path / "a.wav", rate=5000, block=5, subtype="DOUBLE", full_scale=1.0)
+    recording = hr.render(SCENE, driver=driver)
+    np.testing.assert_array_equal(driver.read_back()[5:-5], recording.drive[:-5])
+    s = 2j * np.pi * 47.0
+    stiffness = np.array([[45.3e3, 0.5e3], [0.5e3, 45.3e3]])  # heave and rocking [FACTS 1], N/m
+    plate = np.diag([32e-3, 4e-5 / 27.5e-3**2]) * s**2 + 1.7 * np.eye(2) * s + stiffness
+    heave, rocking = np.linalg.solve(plate, [2 * 7.4, 0.0])  # m per A in both coils
+    current = 10e-6 / np.abs([heave - rocking, heave + rocking])
+    time = np.arange(2000, 2500) / 5000  # 0.1 s holds 4.7 periods: fit cosine and sine rather than average
+    basis = np.column_stack([np.cos(2 * np.pi * 47 * time), np.sin(2 * np.pi * 47 * time)])
+    parts, *_ = np.linalg.lstsq(basis, recording.drive[2000:2500], rcond=None)
+    # The table's steps of 0.5 Hz hold 47 Hz itself, so the drive is the table's to rounding.
+    np.testing.assert_allclose(np.hypot(*parts), current, rtol=1e-9)

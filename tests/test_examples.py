@@ -11,17 +11,19 @@ EXAMPLES = Path(__file__).resolve().parent.parent / "examples"
 
 # (number, tolerance): where the number comes from, and what may move it.
 EXPECTED = {
-    # The paper's loop holds an amplitude to 0.3 % over at least 4 s [FACTS 3, "paper" off 129-189 Hz].
+    # The paper's loop holds an amplitude to 0.3 % over at least 4 s [the baseline's own test].
     "temporal_grating": (10e-6, 0.003 * 10e-6),
     # 30 mm hold 30 ridges of 1 mm; at either end the target fades with the velocity's 40 Hz pole, where up to one
     # period of 12.5 ms each may be lost or be made by the plate's own decay.
     "spatial_grating_swipe": (30.0, 2.0),
-    # Twice the speed is twice the frequency; the spectrum of 2 s under a Hann window resolves 1/2 Hz in 100 Hz.
-    "recorded_texture": (2.0, 0.5 / 50),
+    # Twice the speed is twice the frequency; the ridges' uneven height (8 Hz as felt, a third of it) and the loop's
+    # changing lag move the peak of a 0.7 s stroke by a small part of the window's width of 4/0.7 Hz.
+    "recorded_texture": (2.0, 0.1 * 4 / 0.7 / 50),
     # Two judged seconds of a settled loop: as above, with half the averaging time of its 0.3 %.
     "your_own_driver": (10e-6, 0.006 * 10e-6),
-    # Mean squares of heights that grow from 2 to 12 um over the path: thirds 5.33 to 2 and 12 to 8.67 um.
-    "your_own_texture": (2.75, 0.275),
+    # Root mean squares of a height that grows from 2 to 12 um: 8.67 to 12 um against 2 to 5.33 um; the loop's lag
+    # of some 0.1 s rounds it off where the finger turns, by less than the 10 % that nobody feels [FACTS 7].
+    "your_own_texture": (2.738, 0.274),
 }
 
 
@@ -33,7 +35,7 @@ def mean_square(low, high):
 def test_the_expected_slope_is_that_of_its_thirds():
     third = (12 - 2) / 3
     ratio = (mean_square(12 - third, 12) / mean_square(2, 2 + third)) ** 0.5
-    assert ratio == pytest.approx(EXPECTED["your_own_texture"][0], abs=0.01)
+    assert ratio == pytest.approx(EXPECTED["your_own_texture"][0], abs=0.0005)
 
 
 def test_every_example_is_listed():
