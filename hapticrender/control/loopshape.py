@@ -84,7 +84,7 @@ def reduced_controller(loop_bandwidth: float, filter_bandwidth: float) -> Transf
 
 
 def integrator(gain: float) -> TransferFunction:
-    """``C = gain/s`` with `gain` in 1/s."""
+    """Make the plainest controller, ``C = gain/s`` with `gain` in 1/s."""
     require_positive(gain=gain)
     return TransferFunction((gain,), (1.0, 0.0))
 
@@ -172,7 +172,8 @@ def margins(
     Notes
     -----
     Everything is read off one logarithmic grid of 20001 frequencies; linear
-    interpolation between them errs by less than 1e-6.
+    interpolation between them errs by less than 1e-6.  The step is summed
+    from harmonics: exact to 5e-5 where T falls off with one pole only.
     """
     require_positive(lowest_frequency=lowest_frequency)
     if not (np.isfinite(delay) and delay >= 0):
@@ -260,7 +261,7 @@ def _step_figures(closed: Callable[[Array], Array], duration: float) -> tuple[fl
     outside = np.abs(response - 1) - 0.02
     if outside[-samples // 8 :].max() > 0:
         return inf, inf
-    return float(max(0.0, response.max() - 1)), float(_crossings(outside)[-1] * 2 * duration / samples)
+    return float(max(0.0, response.max() - 1)), float(np.max(_crossings(outside), initial=0.0) * 2 * duration / samples)
 
 
 @dataclass(frozen=True, kw_only=True)
