@@ -260,6 +260,12 @@ def test_links_in_the_readme_lead_somewhere():
     assert not missing
 
 
+def test_scenes_in_the_readme_are_built_in():
+    told = re.findall(r"^hapticrender scenes ([\w-]+) >|^\| `([\w-]+)` \|", README, re.MULTILINE)
+    assert len(told) > 1
+    assert {first or second for first, second in told} <= set(hapticrender.builtin_scenes())
+
+
 def test_the_tree_in_the_readme_names_every_room():
     rooms = {name for name, path in MODULES.items() if path.name == "__init__.py" and name != "hapticrender"}
     for name in rooms:
