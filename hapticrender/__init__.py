@@ -39,8 +39,9 @@ _HOMES = {
     "protocols": ("Controller", "Driver", "Flag", "Method", "Motion", "Plant", "Renderer", "Sensed", "Texture"),
     "recording": ("Recorder", "Recording"),
     "touch.builtin": ("builtin_scenes",),
-    "touch.finger": ("Finger", "FingerMechanics"),
+    "touch.finger": ("Finger",),
     "touch.grating": ("Grating",),
+    "touch.mechanics": ("FingerMechanics",),
     "touch.motion": ("Sampled", "Sliding", "Still", "Swiping"),
     "touch.recorded": ("Recorded", "Synthetic"),
     "touch.scene": ("Scene",),
@@ -69,8 +70,8 @@ if TYPE_CHECKING:
     from hapticrender.recording import Recording as Recording
     from hapticrender.touch.builtin import builtin_scenes as builtin_scenes
     from hapticrender.touch.finger import Finger as Finger
-    from hapticrender.touch.finger import FingerMechanics as FingerMechanics
     from hapticrender.touch.grating import Grating as Grating
+    from hapticrender.touch.mechanics import FingerMechanics as FingerMechanics
     from hapticrender.touch.motion import Sampled as Sampled
     from hapticrender.touch.motion import Sliding as Sliding
     from hapticrender.touch.motion import Still as Still

@@ -44,7 +44,9 @@ def registered(group: str, name: str) -> Any:
     """Load what the entry-point `group` (renderers, drivers) registers under `name`."""
     found = {point.name: point for point in entry_points(group=f"hapticrender.{group}")}
     if name not in found:
-        raise ValueError(f"{group[:-1]} {name!r} is not installed: must be one of {', '.join(sorted(found)) or '(none)'}")
+        raise ValueError(
+            f"{group[:-1]} {name!r} is not installed: must be one of {', '.join(sorted(found)) or '(none)'}"
+        )
     return found[name].load()
 
 

@@ -30,7 +30,7 @@ class Flag(IntFlag):
     """Trouble at run time is data: one status word a sample."""
 
     SATURATED = 1  # a drive channel was cut to its limit
-    NONFINITE = 2  # a NaN or infinite input was replaced by zero
+    NONFINITE = 2  # a sensed value that no sensor can show (NaN, infinite, out of all range) was replaced by zero
     SENSOR_CLIPPED = 4  # a sensor stood at the end of its range
     OVERRUN = 8  # the driver lost samples
 

@@ -35,7 +35,9 @@ class VibrotactileRenderer:
         if driver.drive_channels != 2:
             raise ValueError(f"driver.drive_channels = {driver.drive_channels}: must be 2 (one a coil)")
         if driver.sensed_channels not in (0, 2):
-            raise ValueError(f"driver.sensed_channels = {driver.sensed_channels}: must be 2 (one an end) or 0 (open loop)")
+            raise ValueError(
+                f"driver.sensed_channels = {driver.sensed_channels}: must be 2 (one an end) or 0 (open loop)"
+            )
         return PlateParameters.with_overrides(scene.plant).band_model(driver.rate, driver.delay)
 
     def bands(self, scene: Scene, model: BandModel) -> Bands:
@@ -44,7 +46,9 @@ class VibrotactileRenderer:
         highest = NYQUIST_MARGIN * model.rate
         for frequency in bands.frequency:
             if not 0.0 <= frequency <= highest:
-                raise ValueError(f"texture.frequency = {frequency:g}: must be <= {highest:g} Hz ({NYQUIST_MARGIN} of the rate, {model.rate:g} Hz)")
+                raise ValueError(
+                    f"texture.frequency = {frequency:g}: must be <= {highest:g} Hz ({NYQUIST_MARGIN} of the rate, {model.rate:g} Hz)"
+                )
         if bands.envelope is not None:
             _check_current(scene, model, bands)
         return bands

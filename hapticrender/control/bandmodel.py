@@ -36,6 +36,8 @@ class BandModel:
         Names of the judged places.
     drive_limit : float, drive unit
         Largest magnitude of each drive channel, > 0.
+    sensed_limit : float, sensor unit
+        Largest magnitude that a sensor can show, > 0; beyond it a sample is not believed.
     lowest_frequency, highest_frequency : float, Hz
         Finger-locked carriers fade out beyond these.
 
@@ -55,6 +57,7 @@ class BandModel:
     place_from_coordinate: Array
     places: tuple[str, ...]
     drive_limit: float
+    sensed_limit: float
     lowest_frequency: float = 20.0
     highest_frequency: float = 1000.0
 
@@ -69,7 +72,9 @@ class BandModel:
         Hold and delay are not in it; see `hold_and_delay`.
         """
         stiffness = self.dynamic_stiffness(frequency)
-        return np.linalg.solve(stiffness, np.broadcast_to(self.force_from_drive, (*stiffness.shape[:-2], *self.force_from_drive.shape)))
+        return np.linalg.solve(
+            stiffness, np.broadcast_to(self.force_from_drive, (*stiffness.shape[:-2], *self.force_from_drive.shape))
+        )
 
     def hold_and_delay(self, frequency: Array) -> Array:
         """Response of the zero-order hold and the known delay, complex, shape (...)."""

@@ -29,6 +29,7 @@ class PolarTables(NamedTuple):
     feedback: bool  # False: nothing is sensed, drive straight from the look-up table
     analysed: bool  # True: targets come from the wanted waveform
     drive_limit: float
+    sensed_limit: float  # beyond it a sensor is not believed
     lowest: float  # Hz
     highest: float  # Hz
     frequency: Array
@@ -202,7 +203,7 @@ def polar_step(tables, state, sensed, position, wanted, drive, target):
         total = 0.0
         for s in range(sensed.shape[0]):
             value = sensed[s]
-            if not math.isfinite(value):
+            if not abs(value) <= tables.sensed_limit:  # NaN included
                 value = 0.0
                 flags |= 2
             total += tables.coordinate_from_sensed[c, s] * value

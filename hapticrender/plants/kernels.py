@@ -75,7 +75,9 @@ def plate_system(tables, lever, strength, system, push):
         contact = push[i + 3, 0] + push[i + 3, 1] * lever
         for j in range(2):
             k, c = tables.stiffness, tables.damping
-            system[i + 3, j] = -(push[i + 3, 0] * k[j] + push[i + 3, 1] * k[1 + j] + contact * strength * skin[2] * h[j])
+            system[i + 3, j] = -(
+                push[i + 3, 0] * k[j] + push[i + 3, 1] * k[1 + j] + contact * strength * skin[2] * h[j]
+            )
             system[i + 3, j + 3] = (
                 -(push[i + 3, 0] * c[j] + push[i + 3, 1] * c[1 + j] + contact * strength * skin[1] * h[j]) / period
             )
@@ -166,7 +168,9 @@ def plate_run(tables, state, drive, finger, noise, sensed, motion, flags):
 
 
 @kernel
-def polar_plate_run(tables, state, polar, polar_state, last, finger, noise, wanted, sensed, motion, drive, target, flags):
+def polar_plate_run(
+    tables, state, polar, polar_state, last, finger, noise, wanted, sensed, motion, drive, target, flags
+):
     """Plate and polar controller closed sample by sample; `last` (2,) is the drive computed one sample ago."""
     for n in range(sensed.shape[0]):
         flags[n] = plate_sense(tables, state, noise[n], sensed[n], motion[n])

@@ -96,16 +96,19 @@ class PlateParameters:
 
     def __post_init__(self) -> None:
         for field in fields(self):
+            unit = _UNITS[field.name]
             value = getattr(self, field.name)
             whole = field.type == "int"
             if isinstance(value, bool) or not isinstance(value, int if whole else (int, float)):
                 raise TypeError(f"{field.name} = {value!r}: must be {'an integer' if whole else 'a number'}")
             floor, strict = _BOUNDS.get(field.name, (0.0, True))
             if not math.isfinite(value) or value < floor or (strict and value == floor):
-                raise ValueError(f"{field.name} = {value!r}: must be {'>' if strict else '>='} {floor:g} {_UNITS[field.name]}".rstrip())
+                raise ValueError(
+                    f"{field.name} = {value!r}: must be {'>' if strict else '>='} {floor:g} {unit}".rstrip()
+                )
             ceiling = _CEILINGS.get(field.name, math.inf)
             if value > ceiling:
-                raise ValueError(f"{field.name} = {value!r}: must be <= {ceiling:g} {_UNITS[field.name]}".rstrip())
+                raise ValueError(f"{field.name} = {value!r}: must be <= {ceiling:g} {unit}".rstrip())
 
     @classmethod
     def with_overrides(cls, overrides: Mapping[str, Any]) -> PlateParameters:
@@ -170,6 +173,18 @@ class PlateParameters:
         poles = poles[np.argsort(abs(poles))]
         return abs(poles) / (2 * np.pi), -poles.real / abs(poles)
 
+    def static_load(self, side_1: float, side_2: float) -> tuple[float, float]:
+        """Normal load (N) and finger position (m from the middle, towards side 2) from the slow sag of the sides (m).
+
+        W = -(k1 x1 + k2 x2); the distance from transducer 2 towards 1 is d k1 x1/(k1 x1 + k2 x2), which the
+        paper prints as d (k2 x2/(k1 x1) + 1)^-1 and so divides by zero where side 1 does not sag.
+        """
+        carried_1, carried_2 = self.stiffness_1 * side_1, self.stiffness_2 * side_2
+        load = -(carried_1 + carried_2)
+        if load == 0.0:
+            raise ValueError(f"{side_1=}, {side_2=}: the sides carry no net load, so it has no position")
+        return load, self.half_spacing + self.coil_spacing * carried_1 / load
+
     def dynamic_stiffness(self, frequency: Array, finger: Array | complex = 0.0, position: float = 0.0) -> Array:
         """D(j w) in heave and rocking (N/m, shape (..., 2, 2)) under a finger impedance (N s/m) at `position` (m)."""
         s = 2j * np.pi * np.asarray(frequency, float)[..., None, None]
@@ -192,15 +207,25 @@ class PlateParameters:
             place_from_coordinate=np.array([[1.0, 0.0], [1.0, -reach], [1.0, reach]]),
             places=PLACES,
             drive_limit=self.current_limit,
+            sensed_limit=self.sensor_range,
         )
 
 
 _BOUNDS = {
-    **dict.fromkeys(("damping_1", "damping_2", "sensor_noise", "current_bits", "sensor_bits", "finger_dynamics"), (0.0, False)),
+    **dict.fromkeys(
+        ("damping_1", "damping_2", "sensor_noise", "current_bits", "sensor_bits", "finger_dynamics"), (0.0, False)
+    ),
     **dict.fromkeys(("delay", "degrees_of_freedom"), (1.0, False)),
     "rate": (500.0, False),
 }
-_CEILINGS = {"current_bits": 24, "sensor_bits": 24, "delay": 100_000, "degrees_of_freedom": 2, "finger_dynamics": 1, "rate": 1e6}
+_CEILINGS = {
+    "current_bits": 24,
+    "sensor_bits": 24,
+    "delay": 100_000,
+    "degrees_of_freedom": 2,
+    "finger_dynamics": 1,
+    "rate": 1e6,
+}
 _UNITS = {
     **dict.fromkeys((field.name for field in fields(PlateParameters)), ""),
     **dict.fromkeys(("coil_spacing", "glass_length", "sensor_range", "sensor_noise"), "m"),
@@ -280,14 +305,25 @@ class Plate:
         return Sensed(sensed, finger[:, 0], motion, finger[:, 1], flags)
 
     def closed_loop(self, controller: Controller, wanted: Array) -> tuple[Array, Array, Array, Sensed]:
-        """Advance plate and controller together over `wanted` (m, shape (n,)), controller and plate sample by sample."""
+        """Advance plate and controller together, sample by sample, over `wanted` (m, shape (n,))."""
         n = len(wanted)
         finger, noise, flags = self._next(n)
         sensed, motion, drive = np.zeros((n, 2)), np.zeros((n, 3)), np.zeros((n, 2))
         target = np.zeros((n, controller.n_bands), complex)
         polar_plate_run(
-            self._tables, self._state, controller.tables, controller.state, self._last, finger, noise,
-            wanted, sensed, motion, drive, target, flags,
+            self._tables,
+            self._state,
+            controller.tables,
+            controller.state,
+            self._last,
+            finger,
+            noise,
+            wanted,
+            sensed,
+            motion,
+            drive,
+            target,
+            flags,
         )
         return drive, target, flags, Sensed(sensed, finger[:, 0], motion, finger[:, 1], flags)
 

@@ -104,8 +104,7 @@ def _design(
     )
     frequency = np.arange(0.0, model.rate / 2 + TABLE_STEP, TABLE_STEP)
     common = model.response(frequency) @ np.ones(model.force_from_drive.shape[1])
-    table = (common @ watched.T).T
-    lag = np.angle(table * model.hold_and_delay(frequency))
+    table = (common @ watched.T).T * model.hold_and_delay(frequency)
     return PolarController(
         name,
         PolarTables(
@@ -113,6 +112,7 @@ def _design(
             feedback=feedback,
             analysed=bands.envelope is None,
             drive_limit=model.drive_limit,
+            sensed_limit=model.sensed_limit,
             lowest=model.lowest_frequency,
             highest=min(model.highest_frequency, 0.4 * model.rate),
             frequency=bands.frequency.astype(float),
@@ -121,10 +121,10 @@ def _design(
             envelope=np.zeros(len(bands), complex) if bands.envelope is None else bands.envelope.astype(complex),
             coordinate_from_sensed=np.ascontiguousarray(watched @ model.coordinate_from_sensed),
             drive_from_coordinate=spread,
-            filter=_section(loop.low_pass.tustin(model.rate)),
+            filter=_section(loop.low_pass.tustin(model.rate, prewarp=lowest / 2)),
             law=_section(loop.controller.tustin(model.rate)),
             gain=np.ascontiguousarray(abs(table)),
-            lag=np.ascontiguousarray(np.unwrap(lag, axis=1)),
+            lag=np.ascontiguousarray(np.unwrap(np.angle(table), axis=1)),
             table_step=TABLE_STEP,
         ),
     )

@@ -1,0 +1,233 @@
+"""The plate: modes, exact discretisation, electronics, and the paper's misprints beside the right forms."""
+
+import numpy as np
+import pytest
+from naive_plate import continuous, simulate
+
+import hapticrender as hr
+from hapticrender.plants.vibrotactile import Plate, PlateParameters
+from hapticrender.touch.mechanics import HEAVY, HEAVY_SECOND, LIGHT, LIGHT_SECOND, NONE
+
+IDEAL = {"sensor_noise": 0.0, "sensor_bits": 0, "current_bits": 0}
+
+
+def modes_of(mass, stiffness):
+    """Undamped frequencies (Hz), ascending."""
+    return np.sqrt(np.sort(np.linalg.eigvals(np.linalg.solve(mass, stiffness)).real)) / (2 * np.pi)
+
+
+def loaded_gain(plate, frequency, mechanics, position=0.0):
+    """Heave per common current (m/A) with a finger on the plate."""
+    stiffness = plate.dynamic_stiffness(frequency, mechanics.impedance(frequency), position)
+    return np.linalg.solve(stiffness, np.array([2 * plate.force_constant, 0.0]))[..., 0]
+
+
+def test_modes_are_those_of_the_facts():
+    frequency, damping = PlateParameters().modes()
+    np.testing.assert_allclose(frequency, [147.27, 189.38], atol=0.005)
+    np.testing.assert_allclose(damping, [0.01737, 0.02232], atol=5e-6)
+
+
+@pytest.mark.parametrize(
+    ("finger", "expected"), [(LIGHT, (147.6, 189.2)), (HEAVY, (142.5, 180.0))], ids=["light", "heavy"]
+)
+def test_finger_at_the_coil_moves_the_modes(finger, expected):
+    """FACTS 1: with a 4th-order finger at 27.5 mm, from the poles of the 6-state system."""
+    a, _ = continuous(
+        position=27.5e-3,
+        skin=(finger.mass, finger.damping, finger.stiffness),
+        phalanx=(finger.phalanx_mass, finger.phalanx_damping, finger.phalanx_stiffness),
+    )
+    poles = np.linalg.eigvals(a)
+    modes = np.sort(abs(poles[(poles.imag > 0) & (abs(poles) > 2 * np.pi * 120)])) / (2 * np.pi)
+    np.testing.assert_allclose(modes[:2], expected, atol=0.05)
+
+
+@pytest.mark.parametrize("finger", [NONE, HEAVY_SECOND, HEAVY], ids=["none", "2nd order", "4th order"])
+@pytest.mark.parametrize("position", [0.0, 15e-3, -55e-3])
+def test_the_plate_is_integrated_exactly(rng, finger, position):
+    """Zero-order hold against scipy's matrix exponential: equal to the rounding of 3000 steps."""
+    touch = hr.Finger.still(position=position, normal_load=0.5, mechanics=finger)
+    plate = Plate(PlateParameters(**IDEAL), touch)
+    drive = rng.standard_normal((3000, 2))
+    skin = (finger.mass, finger.damping, finger.stiffness)
+    phalanx = (finger.phalanx_mass, finger.phalanx_damping, finger.phalanx_stiffness) if finger.order == 4 else None
+    expected = simulate(
+        np.clip(drive, -3, 3), 0.5, 5000.0, position=position, skin=skin if finger.order else (0, 0, 0), phalanx=phalanx
+    )
+    motion = plate.run(drive).motion
+    assert abs(motion).max() > 1e-5
+    np.testing.assert_allclose(motion, expected, rtol=0, atol=3000 * 2**-52 * abs(expected).max())
+
+
+def test_a_run_equals_its_pieces(rng):
+    finger = hr.Finger.sliding(speed=0.1, normal_load=0.8, mechanics=HEAVY)
+    drive = rng.standard_normal((1000, 2))
+    whole = Plate(PlateParameters(), finger, seed=3).run(drive)
+    pieces = Plate(PlateParameters(), finger, seed=3)
+    parts = [pieces.run(part) for part in np.split(drive, [1, 7, 500, 501])]
+    for name in ("sensed", "motion", "flags"):
+        assert np.array_equal(getattr(whole, name), np.concatenate([getattr(part, name) for part in parts]))
+
+
+@pytest.mark.parametrize("frequency", [20.0, 147.0, 189.0, 400.0])
+def test_measured_response_is_the_predicted_one(frequency):
+    """Hold, its half-sample delay and its images k rate + f included.
+
+    The transient has decayed by exp(-2 pi 2.56 * 6); images past the 50th hold less than (f/rate)^3/(2 50^2) < 1e-6.
+    """
+    parameters = PlateParameters(**IDEAL)
+    model = parameters.band_model(5000.0, 1)
+    n = np.arange(40_000)
+    carrier = np.exp(2j * np.pi * frequency * n / 5000.0)
+    plate = Plate(parameters, hr.Finger.absent())
+    motion = plate.run(0.01 * np.stack([carrier.real, 0.5 * carrier.real], axis=1)).motion
+    late = slice(30_000, 40_000)
+    measured = 2 * (motion[late] * carrier[late, None].conj()).mean(axis=0) / 0.01
+    images = frequency + 5000.0 * np.arange(-50, 51)
+    hold = np.sinc(images / 5000.0) * np.exp(-1j * np.pi * images / 5000.0)
+    predicted = model.place_from_coordinate @ (hold[:, None] * (model.response(images) @ [1.0, 0.5])).sum(axis=0)
+    np.testing.assert_allclose(measured, predicted, rtol=1e-6)
+
+
+def test_a_locked_rocking_mode_leaves_heave_alone():
+    drive = np.zeros((2000, 2))
+    drive[:, 0] = np.sin(np.arange(2000) * 0.1)
+    motion = Plate(PlateParameters(degrees_of_freedom=1, **IDEAL), hr.Finger.absent()).run(drive).motion
+    assert abs(motion[:, 0]).max() > 1e-6
+    np.testing.assert_array_equal(motion[:, 1], motion[:, 0])
+    two = Plate(PlateParameters(**IDEAL), hr.Finger.absent()).run(drive).motion
+    assert abs(two[:, 1] - two[:, 0]).max() > 1e-6
+
+
+def test_electronics_quantise_clip_and_flag():
+    """FACTS 1, swapped in the paper: 12 bits command the current, 14 bits sense the motion."""
+    parameters = PlateParameters(sensor_noise=0.0)
+    assert parameters.current_step == pytest.approx(1.46e-3, abs=5e-6)
+    assert parameters.sensor_step == pytest.approx(2e-3 / 2**14)
+    slow = np.repeat(np.linspace(0, 4 * parameters.current_step, 9), 2000)[:, None] * np.ones(2)
+    plate = Plate(parameters, hr.Finger.absent())
+    sensed = plate.run(slow)
+    settled = sensed.motion[1999::2000, 0]  # to exp(-2 pi 2.56 * 0.4)
+    steps = np.unique(np.round(settled / settled[-1], 2))
+    assert len(steps) == 5  # nine commands, five currents
+    counts = sensed.sensed / parameters.sensor_step
+    np.testing.assert_allclose(counts, np.round(counts), atol=1e-9)
+    loud = Plate(parameters, hr.Finger.absent()).run(np.full((4000, 2), 300.0))
+    limit = Plate(parameters, hr.Finger.absent()).run(np.full((4000, 2), 3.0))
+    np.testing.assert_array_equal(loud.motion, limit.motion)
+    small = PlateParameters(sensor_noise=0.0, sensor_range=2e-4)
+    pressed = Plate(small, hr.Finger.still(normal_load=10.0)).run(np.zeros((4000, 2)))  # sags 220 um
+    assert abs(pressed.sensed).max() <= 1e-4
+    assert pressed.flags.max() == hr.Flag.SENSOR_CLIPPED
+
+
+def test_sensor_noise_is_white_and_as_strong_as_stated():
+    """1 um rms; the standard error of an rms over N samples is 1/sqrt(2N)."""
+    sensed = Plate(PlateParameters(sensor_bits=0), hr.Finger.absent(), seed=1).run(np.zeros((50_000, 2))).sensed
+    np.testing.assert_allclose(sensed.std(axis=0), 1e-6, rtol=4 / np.sqrt(2 * 50_000))
+    correlation = (sensed[1:] * sensed[:-1]).mean(axis=0) / 1e-12
+    assert np.all(abs(correlation) < 4 / np.sqrt(50_000))
+
+
+def test_loop_delay_is_the_stated_number_of_samples():
+    for delay, block in ((1, 1), (5, 1), (5, 5), (8, 4)):
+        plate = Plate(PlateParameters(delay=delay, **IDEAL), hr.Finger.absent(), block=block)
+        drive = np.zeros((40, 2))
+        drive[10] = 1.0
+        first = int(np.flatnonzero(plate.run(drive).motion[:, 0])[0])
+        assert first == 10 + (delay - block) + 1  # held during its interval, seen at the end of it
+    with pytest.raises(ValueError, match=r"block = 3: must be between 1 and the loop's delay of 2"):
+        Plate(PlateParameters(delay=2), hr.Finger.absent(), block=3)
+
+
+def test_static_load_and_position_from_the_sag():
+    """FACTS 1: the printed P divides by zero where side 1 does not sag; the right form gives the position."""
+    parameters = PlateParameters(**IDEAL)
+    for position in (0.0, 10e-3, -20e-3):
+        finger = hr.Finger.still(position=position, normal_load=0.5, mechanics=NONE)
+        centre, end_1, end_2 = Plate(parameters, finger).run(np.zeros((50_000, 2))).motion[-1]
+        tilt = (end_2 - end_1) / 4  # a theta
+        load, found = parameters.static_load(centre - tilt, centre + tilt)
+        assert load == pytest.approx(0.5, rel=1e-6)
+        assert found == pytest.approx(position, abs=1e-8)
+    assert centre == pytest.approx(-11e-6, rel=0.05)  # FACTS 1: 0.5 N sags 11 um
+    with pytest.raises(ZeroDivisionError):
+        parameters.coil_spacing * (22.9e3 * -1e-5 / (22.4e3 * 0.0) + 1) ** -1
+    load, found = parameters.static_load(0.0, -1e-5)
+    assert found == pytest.approx(parameters.half_spacing)
+    with pytest.raises(ValueError, match="no net load"):
+        parameters.static_load(0.0, 0.0)
+
+
+def test_printed_force_equations_put_the_rocking_mode_at_185_hz():
+    """As printed, (m/2) x_i'' -+ (I/2) theta''; with I/d but x_i'' kept; and right, (m/2) x_c'' -+ (I/d) theta''."""
+    p = PlateParameters()
+    d, stiffness = p.coil_spacing, np.diag([p.stiffness_1, p.stiffness_2])
+    twist = np.array([[1.0, -1.0], [-1.0, 1.0]]) / d  # -+ theta'' from x_i''
+    own = p.mass / 2 * np.eye(2)
+    mean = p.mass / 4 * np.ones((2, 2))
+    assert modes_of(own + p.inertia / 2 * twist, stiffness).min() == pytest.approx(185.0, abs=0.05)
+    assert modes_of(own + p.inertia / d * twist, stiffness).min() == pytest.approx(116.2, abs=0.05)
+    right = modes_of(mean + p.inertia / d * twist, stiffness)
+    np.testing.assert_allclose(right, modes_of(p.mass_matrix, p.stiffness_matrix), rtol=1e-12)
+    assert right.min() == pytest.approx(147.27, abs=0.005)
+    same = own + (p.inertia / d - p.mass * d / 4) * twist  # the other way to write it
+    np.testing.assert_allclose(same, mean + p.inertia / d * twist, atol=1e-15)
+    coefficient = p.inertia / d - p.mass * d / 4  # N s2/rad
+    assert coefficient == pytest.approx(2.873e-4, abs=5e-8)
+    for wrong in (own + p.inertia / 2 * twist, mean + p.inertia / d * twist):
+        np.testing.assert_allclose(wrong.sum(axis=0), p.mass / 2, rtol=1e-12)  # F1 + F2 is unaffected
+
+
+def test_a_finger_does_not_always_lower_the_gain():
+    """FACTS 1, against the paper's "the finger always adds impedance"."""
+    plate = PlateParameters()
+    frequency = np.arange(20.0, 401.0)
+    free = abs(loaded_gain(plate, frequency, NONE))
+    light = abs(loaded_gain(plate, frequency, LIGHT_SECOND)) / free
+    raised = frequency[light > 1.0]
+    assert (raised.min(), raised.max()) == (pytest.approx(36, abs=1), pytest.approx(182, abs=1))
+    assert light.max() == pytest.approx(1.94, abs=0.01)
+    assert frequency[light.argmax()] == pytest.approx(176, abs=1)
+    heavy = abs(loaded_gain(plate, np.array([189.0]), HEAVY))
+    assert heavy[0] / free[frequency == 189][0] == pytest.approx(0.26, abs=0.01)
+
+
+def test_amplifier_inverts_and_the_phase_cut_needs_the_sign_taken_out():
+    """-V/5: voltage to displacement lies in 0..+180 deg, current to displacement in -180..0."""
+    plate = PlateParameters()
+    assert plate.amplifier_gain == pytest.approx(-0.1999, abs=5e-5)
+    current = np.angle(loaded_gain(plate, np.linspace(20, 400, 500), NONE), deg=True)
+    voltage = np.angle(-np.exp(1j * np.radians(current)), deg=True)
+    assert current.max() < 0.0
+    assert current.min() > -180.0
+    assert voltage.min() > 0.0
+    assert voltage.max() < 180.0
+
+
+def test_noise_floor_of_the_paper_is_a_record_length_artefact(rng):
+    """0.0102 um is the mean line of a 1 s, 30 kHz spectrum of 1 um white noise: sqrt(pi/N) sigma."""
+    noise = 1e-6 * rng.standard_normal(30_000)
+    lines = 2 * abs(np.fft.rfft(noise))[1:-1] / noise.size
+    assert lines.mean() == pytest.approx(0.0102e-6, abs=0.0002e-6)
+    assert np.sqrt(np.pi / 30_000) == pytest.approx(0.01023, abs=5e-6)
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        ({"mass": 0.0}, r"mass = 0.0: must be > 0 kg"),
+        ({"mass": True}, r"mass = True: must be a number"),
+        ({"delay": 0}, r"delay = 0: must be >= 1 samples"),
+        ({"delay": 1.5}, r"delay = 1.5: must be an integer"),
+        ({"sensor_noise": -1e-6}, r"sensor_noise = -1e-06: must be >= 0 m"),
+        ({"rate": 10.0}, r"rate = 10.0: must be >= 500 Hz"),
+        ({"degrees_of_freedom": 3}, r"degrees_of_freedom = 3: must be <= 2"),
+        ({"masss": 1.0}, r"plant.masss: no such parameter; known: .*mass"),
+        ({"stiffness_1": float("nan")}, r"stiffness_1 = nan: must be > 0 N/m"),
+    ],
+)
+def test_bad_parameters_are_refused_with_value_bound_and_unit(overrides, message):
+    with pytest.raises((ValueError, TypeError), match=message):
+        PlateParameters.with_overrides(overrides)
