@@ -47,7 +47,7 @@ dt { color: var(--soft); }
 dd { margin: 0; }
 audio { width: 100%; height: 2.2rem; display: block; margin-top: 0.25rem; }
 pre { margin: 1rem 0; padding: 1rem 1.2rem; background: var(--wash); border-radius: 4px; overflow: auto;
-  max-height: 26rem; align-self: start; font: 0.8rem/1.5 ui-monospace, "DejaVu Sans Mono", monospace; }
+  max-height: 34rem; align-self: start; font: 0.8rem/1.5 ui-monospace, "DejaVu Sans Mono", monospace; }
 summary { cursor: pointer; color: var(--good); font-size: 0.9rem; }
 footer { margin-top: 4rem; }
 """
@@ -97,7 +97,7 @@ def _introduction(scenes: Sequence[Outputs]) -> str:
 plate moves, and corrects the drive until the motion is the wanted one. Below, {_scenes(len(scenes))} ran in closed
 loop on a model of the plate with the method {escape(methods)}; each shows what was wanted, what the plate did at its
 centre and at both ends, and the current that it took. A scene misses its tolerance where the worst rms error of any
-band, at any of the three places, is larger: {count}</p>"""
+band, at any of the three places, is larger; {count}</p>"""
 
 
 def _scenes(count: int) -> str:
@@ -197,7 +197,7 @@ def _section(scene: Outputs, folder: str) -> str:
     summary = scene.summary
     name = escape(scene.name)
     picture = (
-        f'<a href="{folder}/picture.png"><img src="{folder}/picture.png" loading="lazy" '
+        f'<a href="{folder}/picture.png"><img src="{folder}/picture.png" '
         f'alt="Target, achieved motion, drive and finger over time: {name}"></a>'
         if scene.picture
         else '<p class="note">No picture: matplotlib is not installed.</p>'

@@ -140,7 +140,7 @@ def flags(summary: Mapping[str, Any]) -> str:
 
 def degrees(angle: float | None) -> str:
     """Write an angle (rad) in degrees; a dash for none."""
-    return "–" if angle is None or not math.isfinite(angle) else f"{math.degrees(angle):.1f}°"
+    return "–" if angle is None or not math.isfinite(angle) else f"{round(math.degrees(angle), 1) + 0.0:.1f}°"
 
 
 def table(rows: Sequence[Sequence[str]]) -> str:

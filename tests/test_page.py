@@ -165,6 +165,11 @@ def test_errors_have_three_digits(ratio, written):
     assert wording.percent(ratio) == written
 
 
+def test_angles_are_in_degrees():
+    assert wording.degrees(-0.00001) == "0.0°"
+    assert wording.degrees(-1.0) == "-57.3°"
+
+
 def test_bands_are_called_by_what_they_hold_fast():
     assert wording.band_label({"frequency": 62.5, "wavelength": None}) == "62.5 Hz"
     assert wording.band_label({"frequency": None, "wavelength": 1e-3}) == "1 mm"

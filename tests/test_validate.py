@@ -77,7 +77,7 @@ def test_junit_is_what_ci_reads(verdicts, tmp_path):
     assert re.fullmatch(r"\d+\.\d{3}", good.get("time"))
     message = bad.find("failure").get("message")
     assert re.fullmatch(
-        r"misses its tolerance: worst figure rms error of the 170 Hz band at .* = \d+ %, .* 10 %", message
+        r"misses its tolerance: worst figure rms error of the 170 Hz band at .* = \d+ %, tolerance 2 %", message
     )
     assert json.loads(bad.find("failure").text)[0]["frequency"] == 170.0
 
