@@ -39,7 +39,7 @@ def kernel(function: Any) -> Any:
     """Compile `function` for the tick: no bounds checks, numpy error model, contracted arithmetic, cached on disk."""
     compiled = numba.njit(error_model="numpy", fastmath={"contract"}, nogil=True)(function)
     try:
-        compiled._cache = _StampedCache(function)
+        compiled._cache = _StampedCache(function)  # type: ignore[attr-defined]
     except RuntimeError:  # numba: no writable cache location
         pass
     return compiled

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from importlib.metadata import entry_points
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -127,44 +127,53 @@ def run(session: Session, *, journal: str | Path | None = None, progress: Progre
     )
     with recorder, driver:
         done = 0
-        for drive, target, flags, sensed in _chunks(session, total):
-            done += len(drive)
-            recorder.append(
-                drive=drive,
-                sensed=sensed.sensed,
-                motion=sensed.motion,
-                position=sensed.position,
-                normal_load=sensed.normal_load,
-                target=target,
-                flags=flags,
-            )
+        for block in _blocks(session, total):
+            recorder.append(**block._asdict())
+            done += len(block.drive)
             if progress is not None:
                 progress(done / driver.rate, total / driver.rate)
     return recorder.finish()
 
 
-def _chunks(session: Session, total: int) -> Iterator[tuple[Array, Array, Array, Sensed]]:
-    """Drive, target, flags and sensed of a run, about `CHUNK` seconds at a time."""
+class _Block(NamedTuple):
+    """What happened over some samples, complete: the columns of a recording."""
+
+    drive: Array
+    sensed: Array
+    motion: Array
+    position: Array
+    normal_load: Array
+    target: Array
+    flags: Array
+
+
+def _blocks(session: Session, total: int) -> Iterator[_Block]:
+    """Everything that happens in a run, about `CHUNK` seconds at a time."""
     block = session.driver.block
     size = block * max(int(CHUNK * session.driver.rate / block), 1)
     plant = getattr(session.driver, "plant", None)
-    advance = _advance_compiled if plant is not None and plant.block == 1 else _Ring(session).advance
+    advance = _advance_compiled if plant is not None and block == 1 else _Ring(session).advance
     for start in range(0, total, size):
         yield advance(session, start, min(size, total - start))
 
 
 def _wanted(session: Session, start: int, position: Array) -> Array:
-    """The texture's waveform over a block, where the controller has to analyse it."""
+    """Waveform of the texture over a block, where the controller has to analyse it."""
     if session.bands.envelope is not None:
         return np.zeros(len(position))
-    time = (start + np.arange(len(position))) / session.driver.rate
-    return np.ascontiguousarray(session.scene.texture.waveform(time, position), float)
+    return np.ascontiguousarray(session.scene.texture.waveform(_time(session, start, len(position)), position), float)
 
 
-def _advance_compiled(session: Session, start: int, count: int) -> tuple[Array, Array, Array, Sensed]:
+def _time(session: Session, start: int, count: int) -> Array:
+    return (start + np.arange(count)) / session.driver.rate
+
+
+def _advance_compiled(session: Session, start: int, count: int) -> _Block:
     """Plant and controller closed in compiled code, sample by sample."""
     plant = session.driver.plant  # type: ignore[attr-defined]
-    return plant.closed_loop(session.controller, _wanted(session, start, plant.finger_position(count)))
+    wanted = _wanted(session, start, plant.finger_position(count))
+    drive, target, flags, sensed = plant.closed_loop(session.controller, wanted)
+    return _complete(session, start, sensed)._replace(drive=drive, target=target, flags=flags)
 
 
 class _Ring:
@@ -174,32 +183,39 @@ class _Ring:
         driver = session.driver
         self.drive = np.zeros((driver.block, driver.drive_channels))
 
-    def advance(self, session: Session, start: int, count: int) -> tuple[Array, Array, Array, Sensed]:
+    def advance(self, session: Session, start: int, count: int) -> _Block:
         """Play as many blocks as `count` samples need; the last one is cut in the record, not on the device."""
-        blocks = []
-        block = session.driver.block
-        for at in range(start, start + count, block):
-            sensed = self._complete(session, at, session.driver.play(self.drive))
-            wanted = _wanted(session, at, sensed.position)
-            self.drive, target, flags = session.controller.run(sensed.sensed, sensed.position, wanted)
-            blocks.append((self.drive, target, flags | sensed.flags, *sensed[:4]))
-        drive, target, flags, *sensed = (np.concatenate(part)[:count] for part in zip(*blocks, strict=True))
-        return drive, target, flags, Sensed(*sensed)
+        step = session.driver.block
+        blocks = [self._turn(session, at) for at in range(start, start + count, step)]
+        return _Block(*(np.concatenate(column)[:count] for column in zip(*blocks, strict=True)))
 
-    @staticmethod
-    def _complete(session: Session, at: int, sensed: Sensed) -> Sensed:
-        """Fill in what the device cannot tell: the scene's finger, and motion as the sensors see it."""
-        finger, model, rate = session.scene.finger, session.model, session.driver.rate
-        time = (at + np.arange(session.driver.block)) / rate
-        motion = sensed.motion
-        if motion is None and session.driver.sensed_channels:
-            motion = sensed.sensed @ (model.place_from_coordinate @ model.coordinate_from_sensed).T
-        elif motion is None:
-            motion = np.full((len(time), len(model.places)), np.nan)
-        return Sensed(
-            sensed=sensed.sensed,
-            position=finger.position(time) if sensed.position is None else np.asarray(sensed.position, float),
-            motion=motion,
-            normal_load=finger.load(time) if sensed.normal_load is None else np.asarray(sensed.normal_load, float),
-            flags=np.zeros(len(time), np.int64) if sensed.flags is None else sensed.flags,
-        )
+    def _turn(self, session: Session, at: int) -> _Block:
+        """One block round the ring."""
+        block = _complete(session, at, session.driver.play(self.drive))
+        wanted = _wanted(session, at, block.position)
+        self.drive, target, flags = session.controller.run(block.sensed, block.position, wanted)
+        return block._replace(drive=self.drive, target=target, flags=flags | block.flags)
+
+
+def _complete(session: Session, at: int, sensed: Sensed) -> _Block:
+    """Fill in what the device cannot tell: the scene's finger, and motion as the sensors see it."""
+    finger, model = session.scene.finger, session.model
+    values = np.ascontiguousarray(sensed.sensed, float)
+    time = _time(session, at, len(values))
+    motion = sensed.motion
+    if motion is None and session.driver.sensed_channels:
+        with np.errstate(invalid="ignore"):  # a sensor gone mad is the controller's to judge
+            motion = values @ (model.place_from_coordinate @ model.coordinate_from_sensed).T
+    elif motion is None:
+        motion = np.full((len(time), len(model.places)), np.nan)
+    return _Block(
+        drive=values[:, :0],
+        sensed=values,
+        motion=motion,
+        position=finger.position(time) if sensed.position is None else np.ascontiguousarray(sensed.position, float),
+        normal_load=finger.load(time)
+        if sensed.normal_load is None
+        else np.ascontiguousarray(sensed.normal_load, float),
+        target=values[:, :0],
+        flags=np.zeros(len(time), np.int64) if sensed.flags is None else np.asarray(sensed.flags, np.int64),
+    )

@@ -47,7 +47,8 @@ class VibrotactileRenderer:
         for frequency in bands.frequency:
             if not 0.0 <= frequency <= highest:
                 raise ValueError(
-                    f"texture.frequency = {frequency:g}: must be <= {highest:g} Hz ({NYQUIST_MARGIN} of the rate, {model.rate:g} Hz)"
+                    f"texture.frequency = {frequency:g}: must be <= {highest:g} Hz, "
+                    f"{NYQUIST_MARGIN} of the rate of {model.rate:g} Hz"
                 )
         if bands.envelope is not None:
             _check_current(scene, model, bands)
@@ -78,8 +79,8 @@ def _check_current(scene: Scene, model: BandModel, bands: Bands) -> None:
     if current.sum() > model.drive_limit:
         worst = int(current.argmax())
         raise ValueError(
-            f"texture.amplitude = {abs(bands.envelope[worst]):g} m at {frequency[worst]:g} Hz needs {current.sum():.3g} A: "
-            f"must be <= {model.drive_limit:g} A in each coil"
+            f"texture.amplitude = {abs(bands.envelope[worst]):g} m at {frequency[worst]:g} Hz "
+            f"needs {current.sum():.3g} A: must be <= {model.drive_limit:g} A in each coil"
         )
 
 

@@ -360,7 +360,7 @@ def _tables(parameters: PlateParameters, mechanics: FingerMechanics) -> PlateTab
 
 
 def _taylor_terms(tables: PlateTables) -> int:
-    """Number of terms after which the exponential series has converged to rounding, at the glass end and pressed hard."""
+    """Terms after which the exponential series has converged to rounding, at the glass end and pressed hard."""
     system = np.zeros((6, 6))
     plate_system(tables, tables.reach, 3.0, system, np.zeros((6, 2)))
     term, n = system, 1

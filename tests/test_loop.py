@@ -1,0 +1,173 @@
+"""The ring: block by block equals sample by sample, refusals come before anything is played, crashes end at rest."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+import hapticrender as hr
+from hapticrender import loop
+from hapticrender.drivers.simulated import SimulatedDriver
+from hapticrender.plants.vibrotactile import Plate, PlateParameters
+
+SPATIAL = hr.Scene(
+    texture=hr.Grating(wavelength=1e-3, amplitude=10e-6),
+    finger=hr.Finger.sliding(speed=0.08, normal_load=0.8, mechanics="heavy", touches=((0.05, 0.7), (0.9, 2.0))),
+    duration=1.2,
+)
+RECORDED = hr.builtin_scenes()["recorded-texture"]
+TONE = hr.Scene(texture=hr.Grating(frequency=47.0, amplitude=10e-6), duration=0.5)
+COLUMNS = ("drive", "sensed", "motion", "position", "normal_load", "target", "flags")
+
+
+class Blocks:
+    """A driver that shows the loop nothing of the plant behind it but its blocks."""
+
+    def __init__(self, driver):
+        self._driver = driver
+        for name in ("rate", "drive_channels", "sensed_channels", "block", "delay"):
+            setattr(self, name, getattr(driver, name))
+        self.played = []
+
+    def __enter__(self):
+        self._driver.__enter__()
+        return self
+
+    def __exit__(self, *exc):
+        self._driver.__exit__(*exc)
+
+    def play(self, drive):
+        self.played.append(drive.copy())
+        return self._driver.play(drive)
+
+
+def simulated(scene, seed=0, block=1, **overrides):
+    return SimulatedDriver(Plate(PlateParameters(**overrides), scene.finger, seed, block))
+
+
+def equal(one, other):
+    for name in COLUMNS:
+        np.testing.assert_array_equal(getattr(one, name), getattr(other, name), err_msg=name)
+
+
+@pytest.mark.parametrize("method", ["paper", "paper-common"])
+@pytest.mark.parametrize("scene", [SPATIAL, RECORDED, TONE], ids=["spatial", "recorded", "temporal"])
+def test_compiled_loop_equals_the_ring_of_blocks(scene, method):
+    scene = dataclasses.replace(scene, duration=0.4)
+    equal(
+        hr.render(scene, method=method, seed=5),
+        hr.render(scene, method=method, seed=5, driver=Blocks(simulated(scene, 5))),
+    )
+
+
+def test_blocks_of_any_size_give_the_same_samples_for_the_same_delay():
+    """With a delay of 6 samples, blocks of 1, 2, 3 and 6 leave 5, 4, 3 and 0 of them inside the device."""
+    expected = hr.render(SPATIAL, driver=simulated(SPATIAL, delay=6))
+    for block in (2, 3, 6):
+        equal(expected, hr.render(SPATIAL, driver=simulated(SPATIAL, block=block, delay=6)))
+
+
+def test_journal_chunks_change_nothing(monkeypatch):
+    expected = hr.render(RECORDED)
+    monkeypatch.setattr(loop, "CHUNK", 0.0317)
+    equal(expected, hr.render(RECORDED))
+
+
+def test_the_seed_is_the_noise():
+    equal(hr.render(TONE, seed=1), hr.render(TONE, seed=1))
+    assert not np.array_equal(hr.render(TONE, seed=1).sensed, hr.render(TONE, seed=2).sensed)
+
+
+def test_progress_reaches_the_end_in_seconds():
+    seen = []
+    hr.render(TONE, progress=lambda done, total: seen.append((done, total)))
+    assert seen == sorted(seen)
+    assert seen[-1] == (0.5, 0.5)
+
+
+def test_an_odd_duration_is_rounded_to_samples_whatever_the_block():
+    scene = dataclasses.replace(TONE, duration=0.1003)
+    assert hr.render(scene).drive.shape == (502, 2)  # 501.5 rounds to even
+    assert hr.render(scene, driver=simulated(scene, block=7, delay=7)).drive.shape == (502, 2)
+
+
+def test_a_texture_of_ones_own_needs_no_base_class():
+    class Beat:
+        def bands(self, rate):
+            two = np.array([100.0, 110.0])
+            return hr.Bands(frequency=two, wavenumber=0 * two, phase=0 * two, envelope=np.array([1e-5, 1e-5j]))
+
+        def waveform(self, time, position):
+            return np.zeros_like(time)
+
+    recording = hr.render(hr.Scene(texture=Beat(), duration=0.2))
+    np.testing.assert_array_equal(recording.target, np.broadcast_to([1e-5, 1e-5j], (1000, 2)))
+
+
+class Faulty(Blocks):
+    """Fails in block `at`, by an exception or by what it returns."""
+
+    def __init__(self, driver, at, fault):
+        super().__init__(driver)
+        self.at, self.fault = at, fault
+
+    def play(self, drive):
+        sensed = super().play(drive)
+        return self.fault(sensed) if len(self.played) > self.at else sensed
+
+
+def test_a_lost_device_ends_at_rest_and_keeps_what_happened(tmp_path):
+    def lose(_):
+        raise hr.DeviceLost("plate: play: unplugged")
+
+    inner = simulated(TONE)
+    driver = Faulty(inner, 2000, lose)
+    with pytest.raises(hr.DeviceLost, match="unplugged"):
+        hr.render(TONE, driver=driver, journal=tmp_path / "run.au")
+    assert len(hr.Recording.load(tmp_path / "run.au").time) == 1250  # whole chunks of 0.25 s
+    assert not inner.plant._state.current.any()
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, 1e30])
+def test_a_sensor_gone_mad_leaves_the_drive_finite_limited_and_flagged(bad):
+    def spoil(sensed):
+        return sensed._replace(sensed=np.full_like(sensed.sensed, bad), motion=None)
+
+    recording = hr.render(TONE, driver=Faulty(simulated(TONE), 1000, spoil))
+    assert np.isfinite(recording.drive).all()
+    assert abs(recording.drive).max() <= 3.0
+    assert np.all(recording.flags[1001:] & hr.Flag.NONFINITE)
+    assert not recording.flags[:1000].any()
+
+
+def scene_with(**changes):
+    return dataclasses.replace(TONE, **changes)
+
+
+@pytest.mark.parametrize(
+    ("scene", "message"),
+    [
+        (scene_with(texture=hr.Grating(frequency=2500.0, amplitude=1e-6)), r"2500.*must be <= 2250 Hz"),
+        (scene_with(texture=hr.Grating(frequency=400.0, amplitude=1e-3)), r"0.001 m at 400 Hz needs 10.6 A.*<= 3 A"),
+        (scene_with(finger=hr.Finger.still(position=0.06)), r"finger.position reaches 0.06 m.*0.055 m"),
+        (scene_with(device="vt-plat"), r"renderer 'vt-plat' is not installed: must be one of .*vt-plate"),
+        (scene_with(plant={"mas": 1.0}), r"plant.mas: no such parameter"),
+    ],
+    ids=["nyquist", "current", "glass", "device", "plant"],
+)
+def test_what_the_device_cannot_do_is_refused_before_anything_is_written(scene, message, tmp_path):
+    with pytest.raises(ValueError, match=message):
+        hr.render(scene, journal=tmp_path / "run.au")
+    assert not list(tmp_path.iterdir())
+
+
+def test_bad_arguments_are_refused():
+    with pytest.raises(ValueError, match=r"method = 'pid': must be one of paper, paper-common"):
+        hr.render(TONE, method="pid")
+    with pytest.raises(ValueError, match=r"seed = -1: must be an integer >= 0"):
+        hr.render(TONE, seed=-1)
+
+    mono = Blocks(simulated(TONE))
+    mono.drive_channels = 1
+    with pytest.raises(ValueError, match=r"driver.drive_channels = 1: must be 2"):
+        hr.render(TONE, driver=mono)
