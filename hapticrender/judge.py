@@ -26,6 +26,7 @@ LOWEST_FREQUENCY = 20.0  # Hz: below it the window does not tell a carrier from 
 LARGEST_INFLATION = 4.0  # of an envelope's variance, by the neighbours that the window hardly tells apart from it
 SETTLED = 0.05  # of the target
 QUARTERS = 4  # parts of a window in each of which a carrier must be fast enough
+RUNAWAY = 1e3  # m: no plate moves so far, and squares still fit into a float
 CHUNK_VALUES = 2**21  # numbers in one batch of regressors
 RIDGE = 1e-12  # keeps the normal equations of a standing carrier solvable; such windows are not read
 UNJUDGED = {"figure": "rms_error", "value": None, "band": "any", "place": "any"}
@@ -65,8 +66,9 @@ class Envelopes:
 
     @property
     def finite(self) -> Array:
-        """Windows in which the motion is a number everywhere, shape (w,)."""
-        return np.isfinite(self.achieved).all(axis=(1, 2))
+        """Windows in which the motion at every place is a number, and no run-away, shape (w,)."""
+        with np.errstate(invalid="ignore", over="ignore"):
+            return (np.abs(self.achieved) < RUNAWAY).all(axis=(1, 2))
 
     @property
     def judged(self) -> Array:
@@ -298,7 +300,7 @@ def _wobble(envelopes: Envelopes, judged: Array) -> float | None:
 
 
 def _diverges(envelopes: Envelopes) -> bool:
-    """Whether the motion is no number somewhere: then no figure of the rest may pass for a verdict."""
+    """Whether the motion is no number somewhere, or runs away: then no figure of the rest may pass for a verdict."""
     return not envelopes.finite.all()
 
 

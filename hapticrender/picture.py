@@ -11,6 +11,7 @@ import numpy as np
 
 from hapticrender import wording
 from hapticrender.formats import MissingExtra, replacing
+from hapticrender.judge import RUNAWAY
 from hapticrender.protocols import Array, Flag
 
 if TYPE_CHECKING:
@@ -56,19 +57,25 @@ def plot(recording: Recording, path: str | os.PathLike[str]) -> None:
     MissingExtra
         matplotlib is not installed.
     """
+    with np.errstate(all="ignore"), replacing(Path(path)) as scratch:
+        draw(recording).savefig(scratch, dpi=110, format="png")
+
+
+def draw(recording: Recording) -> Any:
+    """Draw a recording into a new ``matplotlib.figure.Figure``, apart from pyplot and its global state; see `plot`."""
     try:
         import matplotlib
         from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.figure import Figure
     except ImportError as error:
         raise MissingExtra("pictures need matplotlib: pip install 'hapticrender[plot]'") from error
-    with matplotlib.rc_context(STYLE), np.errstate(all="ignore"), replacing(Path(path)) as scratch:
+    with matplotlib.rc_context(STYLE), np.errstate(all="ignore"):
         touched = bool(np.isfinite(recording.position).any())
         figure = Figure(figsize=(11, 10.2 if touched else 8.6), layout="constrained")
         FigureCanvasAgg(figure)
         figure.get_layout_engine().set(w_pad=0.12, h_pad=0.07)
         _draw(figure, recording, touched)
-        figure.savefig(scratch, dpi=110, format="png")
+    return figure
 
 
 def _draw(figure: Any, recording: Recording, touched: bool) -> None:
@@ -90,6 +97,7 @@ def _draw(figure: Any, recording: Recording, touched: bool) -> None:
     for axes in below[:-1]:
         axes.tick_params(labelbottom=False)
     below[-1].set_xlabel("time (s)")
+    figure.align_ylabels([amplitude, *below])
     amplitude.set_xlim(0, max(len(recording), 1) / recording.rate)
     if notes:
         foot = figure.add_subplot(grid[-1, :])
@@ -114,7 +122,7 @@ def _amplitude(axes: Any, recording: Recording, summary: dict[str, Any]) -> None
     """Target and achieved amplitude over time, all bands together."""
     envelopes = recording.envelopes
     shown = envelopes.readable.any(axis=0)
-    readable = envelopes.readable[:, shown].all(axis=1)
+    readable = envelopes.readable[:, shown].all(axis=1) & envelopes.finite
     achieved = _together(envelopes.achieved[:, :, shown])
     achieved[~readable] = np.nan
     time, wanted = _target(recording, shown)
@@ -136,6 +144,11 @@ def _amplitude(axes: Any, recording: Recording, summary: dict[str, Any]) -> None
         range(len(labels)), key=lambda i: [*names, "target", "tolerance", "judged from here"].index(labels[i])
     )
     _legend(axes, [handles[i] for i in order], [labels[i] for i in order])
+
+
+def _bounded(values: Array) -> Array:
+    """Values (SI) with a gap where they are no numbers, or so large that they ran away."""
+    return np.where(np.abs(values) < RUNAWAY, values, np.nan)
 
 
 def _target(recording: Recording, shown: Array) -> tuple[Array, Array]:
@@ -161,8 +174,8 @@ def _close_up(axes: Any, recording: Recording) -> None:
     time = np.arange(start, stop) / recording.rate
     phase = recording.bands.carrier_phase(time, recording.read("position", start, stop))
     wanted = 1e6 * (recording.read("target", start, stop) * np.exp(1j * phase)).real.sum(axis=1)
-    motion = 1e6 * recording.read("motion", start, stop)[:, 0]
-    offset = np.mean(motion) if motion.size else 0.0
+    motion = 1e6 * _bounded(recording.read("motion", start, stop)[:, 0])
+    offset = np.nan_to_num(np.mean(motion)) if motion.size else 0.0
     milliseconds = 1e3 * (time - time[:1])
     axes.plot(milliseconds, motion - offset, color=BLUE, lw=1.8, label="centre")
     axes.plot(milliseconds, wanted, color=INK, lw=1.1, ls=(0, (4, 2)), label="target")
@@ -226,7 +239,7 @@ def _errors(axes: Any, recording: Recording, summary: dict[str, Any]) -> None:
 
 def _drive(lanes: list[Any], recording: Recording) -> None:
     """Drive of every coil in its lane; a long run as the range that each column of pixels covers."""
-    drive, limit = recording.drive, recording.header.drive_limit
+    drive, limit = _bounded(recording.drive), recording.header.drive_limit
     peak = np.nanmax(np.abs(drive), initial=0.0) or 1e-3
     near = limit is not None and peak > 0.4 * limit
     reach = 1.12 * (max(peak, limit) if near else peak)

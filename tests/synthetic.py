@@ -1,0 +1,69 @@
+"""Recordings of motions that are known in closed form."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hapticrender.bands import Bands
+from hapticrender.recording import Recorder, Recording
+from hapticrender.touch.grating import Grating
+from hapticrender.touch.scene import Scene
+
+RATE = 5000.0  # Hz
+PLACES = ("centre", "end 1", "end 2")
+
+
+def make_scene(**fields: Any) -> Scene:
+    return Scene(**({"texture": Grating(amplitude=1e-5, frequency=100.0), "duration": 4.0, "name": "known"} | fields))
+
+
+def make_bands(frequency: Any, envelope: Any, wavenumber: Any = 0.0, phase: Any = 0.0) -> Bands:
+    frequency, wavenumber, phase = np.broadcast_arrays(np.atleast_1d(frequency).astype(float), wavenumber, phase)
+    constant = np.broadcast_to(np.asarray(envelope, complex), frequency.shape)
+    return Bands(frequency=frequency, wavenumber=wavenumber * 1.0, phase=phase * 1.0, envelope=constant)
+
+
+def make_recorder(path: Path | None, bands: Bands, *, rate: float = RATE, **fields: Any) -> Recorder:
+    scene = make_scene(**fields)
+    return Recorder(path, scene=scene, method="paper", seed=7, rate=rate, bands=bands, drive_limit=3.0)
+
+
+def times(duration: float, rate: float = RATE) -> Any:
+    return np.arange(round(duration * rate)) / rate
+
+
+def make_signals(
+    bands: Bands,
+    motion_envelope: Any,
+    *,
+    duration: float = 4.0,
+    rate: float = RATE,
+    position: Any = np.nan,
+    target: Any = None,
+    extra: Any = 0.0,
+) -> dict[str, Any]:
+    """Signals whose motion is `extra` (n, places) plus the given envelopes (broadcast to (n, places, n_bands))."""
+    time = times(duration, rate)
+    n, k = len(time), len(bands)
+    position = np.broadcast_to(np.asarray(position, float), n)
+    carrier = np.exp(1j * bands.carrier_phase(time, position))
+    envelope = np.broadcast_to(np.asarray(motion_envelope, complex), (n, len(PLACES), k))
+    motion = np.einsum("npk,nk->np", envelope, carrier).real + extra
+    return {
+        "drive": np.outer(np.sin(time), [1.0, 0.5]),
+        "sensed": motion[:, 1:],
+        "motion": motion,
+        "position": position,
+        "normal_load": np.where(np.isfinite(position), 0.4, 0.0),
+        "target": np.broadcast_to(np.asarray(bands.envelope if target is None else target, complex), (n, k)),
+        "flags": np.zeros(n, np.int64),
+    }
+
+
+def make_recording(
+    bands: Bands, motion_envelope: Any, *, scene: dict[str, Any] | None = None, **rest: Any
+) -> Recording:
+    recorder = make_recorder(None, bands, **({"duration": rest.get("duration", 4.0)} | (scene or {})))
+    recorder.append(**make_signals(bands, motion_envelope, **rest))
+    return recorder.finish()
