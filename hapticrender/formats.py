@@ -2,8 +2,9 @@
 
 The journal is an append-only Sun AU file: 64-bit big-endian floats, one column
 a signal, data size "unknown, read to the end", so that every audio tool opens
-it even if the process that wrote it was killed.  All that the columns mean
-stands as JSON in the annotation field.
+it even if the process that wrote it was killed (libsndfile up to 1024 columns,
+507 bands on a plate).  All that the columns mean stands as JSON in the
+annotation field.
 """
 
 from __future__ import annotations
@@ -404,7 +405,7 @@ def _write_doubles(path: Path, header: Header, frames: Array) -> None:
     container = SOUND_CONTAINERS[path.suffix]
     comment = header.to_json()
     if len(comment) > COMMENT_LIMIT:
-        comment = json.dumps({"rate": header.rate, "channels": [f"{name} ({unit})" for name, unit in header.channels]})
+        comment = json.dumps({"rate": header.rate, "columns": header.widths})
     _write_audio(path, container, "DOUBLE", frames, header.rate, comment)
 
 

@@ -1,0 +1,388 @@
+"""What happened is kept while it happens, and leaves in formats that other tools open."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import soundfile
+from synthetic import RATE, make_bands, make_recorder, make_recording, make_scene, make_signals, times
+
+from hapticrender import formats
+from hapticrender.formats import Header, MissingExtra
+from hapticrender.recording import Recording
+
+UM = 1e-6
+SIGNALS = ("drive", "sensed", "motion", "position", "normal_load", "target", "flags")
+
+
+@pytest.fixture
+def bands():
+    return make_bands([170.0, 0.0], [10 * UM, 3e-6 * np.exp(1j / 3)], wavenumber=[0.0, 1 / 3e-4], phase=[0.1, 2 / 3])
+
+
+@pytest.fixture
+def signals(bands, rng):
+    """Half a second of everything, with a lifted finger and numbers that use all their digits."""
+    time = times(0.5)
+    position = np.where(time < 0.3, 0.02 * np.sin(7 * time), np.nan)
+    noise = UM * rng.standard_normal((len(time), 3))
+    made = make_signals(bands, bands.envelope, duration=0.5, position=position, extra=noise)
+    made["flags"][100:200] = 5
+    return made
+
+
+@pytest.fixture
+def recording(bands, signals):
+    recorder = make_recorder(None, bands)
+    recorder.append(**signals)
+    return recorder.finish()
+
+
+def assert_same(one, other, names=SIGNALS):
+    for name in names:
+        np.testing.assert_array_equal(getattr(one, name), getattr(other, name), err_msg=name)
+    assert one.header.to_json() == other.header.to_json()
+
+
+def test_signals_come_back_as_they_went_in(recording, signals):
+    for name in SIGNALS:
+        np.testing.assert_array_equal(getattr(recording, name), signals[name], err_msg=name)
+        assert getattr(recording, name).dtype.isnative
+    np.testing.assert_array_equal(recording.time, np.arange(2500) / RATE)
+    assert recording.flags.dtype.kind == "i"
+    np.testing.assert_array_equal(recording.read("drive", 10, 20), signals["drive"][10:20])
+
+
+@pytest.mark.parametrize("journal", [None, "run.au"])
+def test_any_split_into_blocks_gives_the_same_recording(recording, bands, signals, tmp_path, rng, journal):
+    with make_recorder(journal and tmp_path / journal, bands) as recorder:
+        edges = [0, *np.sort(rng.integers(0, 2500, 20)).tolist(), 2500]
+        for start, stop in zip(edges[:-1], edges[1:], strict=True):
+            recorder.append(**{name: values[start:stop] for name, values in signals.items()})
+        assert_same(recorder.finish(), recording)
+
+
+def test_a_journal_is_mapped_not_held(bands, signals, tmp_path):
+    with make_recorder(tmp_path / "run.au", bands) as recorder:
+        recorder.append(**signals)
+    finished = recorder.finish()
+    assert isinstance(finished.frames, np.memmap)
+    assert recorder._blocks == []
+
+
+def test_the_header_survives_to_the_last_bit(bands, tmp_path):
+    rate = 4009.8 + 1 / 3  # FACTS 1: the authors' loop ran at 4009.8 Hz
+    scene = make_scene(name="Grüße ☃", tolerance=0.1 + 0.2, settle=1 / 3)
+    with make_recorder(
+        tmp_path / "run.au", bands, rate=rate, name="Grüße ☃", tolerance=0.1 + 0.2, settle=1 / 3
+    ) as made:
+        made.append(**make_signals(bands, bands.envelope, duration=0.1))
+    loaded = Recording.load(tmp_path / "run.au")
+    assert loaded.rate == rate
+    assert loaded.header.scene == scene.to_toml()
+    assert loaded.scene == scene
+    for name in ("frequency", "wavenumber", "phase", "envelope"):
+        np.testing.assert_array_equal(getattr(loaded.bands, name), getattr(bands, name))
+    again = Header.from_json(loaded.header.to_json())
+    assert again.to_json() == made.header.to_json()
+
+
+def test_the_annotation_is_json_that_names_every_column(bands, signals, tmp_path):
+    with make_recorder(tmp_path / "run.au", bands) as recorder:
+        recorder.append(**signals)
+    data = (tmp_path / "run.au").read_bytes()
+    assert data[:4] == b".snd"
+    offset, size, encoding, rate, columns = (int.from_bytes(data[i : i + 4], "big") for i in range(4, 24, 4))
+    assert (size, encoding, rate, columns) == (0xFFFFFFFF, 7, 5000, 14)
+    assert offset % 8 == 0
+    note = json.loads(data[24:offset].rstrip(b"\0"))
+    names = [channel["name"] for channel in note["channels"]]
+    assert names == [
+        *("drive 1", "drive 2", "sensed 1", "sensed 2", "motion centre", "motion end 1", "motion end 2"),
+        *("position", "normal load", "flags", "target 1 re", "target 1 im", "target 2 re", "target 2 im"),
+    ]
+    units = dict.fromkeys(names, "m") | {"drive 1": "A", "drive 2": "A", "normal load": "N", "flags": "1"}
+    assert [channel["unit"] for channel in note["channels"]] == list(units.values())
+    assert (note["method"], note["seed"], note["drive_limit"]) == ("paper", 7, 3.0)
+
+
+def test_bands_without_constant_envelopes_survive(tmp_path):
+    bands = make_bands(100.0, 1 * UM)
+    object.__setattr__(bands, "envelope", None)
+    recorder = make_recorder(tmp_path / "run.au", bands)
+    recorder.append(**make_signals(bands, 0.0, target=1 * UM, duration=0.1))
+    assert recorder.finish().bands.envelope is None
+
+
+def test_soundfile_reads_a_journal(bands, signals, tmp_path):
+    with make_recorder(tmp_path / "run.au", bands) as recorder:
+        recorder.append(**signals)
+    frames, rate = soundfile.read(tmp_path / "run.au")
+    assert rate == 5000
+    np.testing.assert_array_equal(frames[:, :2], signals["drive"])
+    np.testing.assert_array_equal(frames[:, 7], signals["position"])  # NaN stays NaN
+
+
+@pytest.mark.parametrize("cut", [1, 8, 111, 112, 113])
+def test_a_frame_cut_short_is_left_out(bands, signals, tmp_path, cut):
+    path = tmp_path / "run.au"
+    with make_recorder(path, bands) as recorder:
+        recorder.append(**signals)
+    os.truncate(path, path.stat().st_size - cut)  # a frame has 14 columns, 112 bytes
+    kept = 2500 - -(-cut // 112)
+    loaded = Recording.load(path)
+    assert len(loaded) == kept
+    np.testing.assert_array_equal(loaded.drive, signals["drive"][:kept])
+    assert len(soundfile.read(path)[0]) == kept
+
+
+CHILD = """
+import sys
+sys.path.insert(0, sys.argv[2])
+from synthetic import make_bands, make_recorder, make_signals
+bands = make_bands(170.0, 1e-5)
+signals = make_signals(bands, bands.envelope, duration=0.01)
+recorder = make_recorder(sys.argv[1], bands, duration=1000.0)
+done = 0
+while True:
+    signals["drive"][:, 0] = range(done, done + 50)
+    done += 50
+    recorder.append(**signals)
+    print(done, flush=True)
+"""
+
+
+@pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="this system has no SIGKILL")
+def test_a_killed_process_leaves_all_but_its_last_second(tmp_path):
+    path = tmp_path / "run.au"
+    command = [sys.executable, "-c", CHILD, str(path), str(Path(__file__).parent)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as child:
+        appended = 0
+        while appended < 3 * RATE:
+            line = child.stdout.readline()
+            assert line, "the child died before it was killed"
+            appended = int(line)
+        child.kill()
+    loaded = Recording.load(path)
+    assert len(loaded) >= appended - RATE
+    np.testing.assert_array_equal(loaded.drive[:, 0], np.arange(len(loaded)))
+    heard, _ = soundfile.read(path)
+    np.testing.assert_array_equal(heard[:, 0], np.arange(len(heard)))
+    assert len(heard) == len(loaded)
+    assert loaded.summary()["bands"][0]["target"] == pytest.approx(1e-5)
+    assert loaded.summary()["notes"][0].startswith("the run ended after ")
+
+
+def test_all_that_was_appended_is_readable_at_once(bands, signals, tmp_path):
+    recorder = make_recorder(tmp_path / "run.au", bands)
+    with recorder:
+        recorder.append(**signals)
+        assert len(Recording.load(tmp_path / "run.au")) == 2500
+
+
+def test_an_older_journal_stays_until_a_run_has_begun(bands, signals, tmp_path):
+    path = tmp_path / "run.au"
+    path.write_bytes(b"older")
+    with pytest.raises(RuntimeError, match="bad input"), make_recorder(path, bands):
+        raise RuntimeError("bad input")
+    assert path.read_bytes() == b"older"
+    with make_recorder(path, bands) as recorder:
+        with pytest.raises(ValueError, match=r"drive has shape \(2500, 1\), expected 2500 samples, 2 columns"):
+            recorder.append(**signals | {"drive": signals["drive"][:, :1]})
+        assert path.read_bytes() == b"older"
+        recorder.append(**signals)
+    assert len(Recording.load(path)) == 2500
+
+
+def test_a_new_run_leaves_an_open_recording_of_the_old_one_alone(bands, signals, tmp_path):
+    def run(count):
+        with make_recorder(tmp_path / "run.au", bands) as recorder:
+            recorder.append(**{name: values[:count] for name, values in signals.items()})
+        return recorder.finish()
+
+    old = run(2500)
+    new = run(5)
+    assert (len(old), len(new)) == (2500, 5)
+    np.testing.assert_array_equal(old.drive, signals["drive"])
+
+
+@pytest.mark.parametrize("name", SIGNALS)
+def test_a_signal_of_the_wrong_length_is_refused(bands, signals, name):
+    recorder = make_recorder(None, bands)
+    cut = signals[name][:-1] if name != "drive" else signals[name][:1]
+    with pytest.raises(ValueError, match="has shape"):
+        recorder.append(**signals | {name: cut})
+
+
+@pytest.mark.parametrize("journal", [None, "run.au"])
+def test_a_run_without_a_sample_is_a_recording_of_none(bands, tmp_path, journal):
+    recorder = make_recorder(journal and tmp_path / journal, bands)
+    empty = recorder.finish()
+    assert len(empty) == 0
+    assert empty.target.shape == (0, 2)
+
+
+def test_a_journal_is_named_au_and_a_rate_is_positive(bands, tmp_path):
+    with pytest.raises(ValueError, match=r"run\.wav: a journal .* must end in \.au"):
+        make_recorder(tmp_path / "run.wav", bands)
+    with pytest.raises(ValueError, match=r"rate=0\.0 Hz must be finite and > 0"):
+        make_recorder(None, bands, rate=0.0)
+
+
+@pytest.mark.parametrize("suffix", [".au", ".npz", ".h5", ".AU"])
+def test_what_is_saved_loads_the_same(recording, tmp_path, suffix):
+    if suffix == ".h5":
+        pytest.importorskip("h5py", reason="HDF5 is an extra")
+    recording.save(tmp_path / f"run{suffix}")
+    loaded = Recording.load(tmp_path / f"run{suffix}")
+    assert_same(loaded, recording)
+    assert loaded.summary() == recording.summary()
+
+
+def test_a_recording_saves_over_the_file_that_it_maps(recording, tmp_path):
+    path = tmp_path / "run.au"
+    recording.save(path)
+    loaded = Recording.load(path)
+    loaded.save(path)
+    assert_same(loaded, recording)
+    assert_same(Recording.load(path), recording)
+
+
+@pytest.mark.parametrize("suffix", [".wav", ".w64", ".rf64"])
+def test_sound_files_hold_every_column_as_doubles(recording, tmp_path, suffix):
+    path = tmp_path / f"run{suffix}"
+    recording.save(path)
+    frames, rate = soundfile.read(path)
+    assert rate == 5000
+    np.testing.assert_array_equal(frames, recording.frames)
+    assert soundfile.info(path).subtype == "DOUBLE"
+    if suffix != ".w64":  # has no room for text
+        with soundfile.SoundFile(path) as file:
+            assert Header.from_json(file.comment).to_json() == recording.header.to_json()
+
+
+def test_a_header_too_long_for_a_wav_leaves_rate_and_columns(tmp_path):
+    bands = make_bands(20.0 + np.arange(100), 1 * UM)
+    make_recording(bands, bands.envelope, duration=0.01).save(tmp_path / "run.wav")
+    with soundfile.SoundFile(tmp_path / "run.wav") as file:
+        note = json.loads(file.comment)
+    assert note["rate"] == RATE
+    assert note["columns"]["target"] == 200
+
+
+def test_flac_states_its_scales(recording, tmp_path):
+    recording.save(tmp_path / "run.flac")
+    with soundfile.SoundFile(tmp_path / "run.flac") as file:
+        comment, frames = file.comment, file.read()
+    peak = np.abs(recording.motion).max()
+    assert f"motion {peak:.6g} m" in comment
+    assert "rate = 5000.0 Hz" in comment
+    np.testing.assert_allclose(frames[:, 4:] * peak, recording.motion, atol=peak * 2.0**-23)  # 24 bit
+
+
+def test_flac_refuses_more_channels_than_it_holds_and_keeps_the_older_file(tmp_path, recording):
+    wide = Header(
+        **{name: getattr(recording.header, name) for name in Header.__dataclass_fields__} | {"drive_channels": 4}
+    )
+    path = tmp_path / "run.flac"
+    path.write_bytes(b"older")
+    with pytest.raises(ValueError, match=r"9 channels, but FLAC holds at most 8: choose \.w64 or \.au"):
+        formats.write(path, wide, np.zeros((10, len(wide.channels))))
+    assert path.read_bytes() == b"older"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_mat_files_hold_every_signal_by_name(recording, tmp_path):
+    from scipy.io import loadmat
+
+    recording.save(tmp_path / "run.mat")
+    loaded = loadmat(tmp_path / "run.mat")
+    for name in SIGNALS:
+        np.testing.assert_array_equal(np.squeeze(loaded[name]), np.squeeze(getattr(recording, name)))
+    assert loaded["rate"].item() == RATE
+    assert Header.from_json(str(loaded["header"][0])).to_json() == recording.header.to_json()
+
+
+def test_csv_has_names_units_and_every_number(recording, tmp_path, monkeypatch):
+    monkeypatch.setattr(formats, "CHUNK", 999)
+    recording.save(tmp_path / "run.csv")
+    with (tmp_path / "run.csv").open(encoding="utf-8") as file:
+        titles = file.readline().rstrip("\n").split(",")
+    assert titles[:3] == ["time (s)", "drive 1 (A)", "drive 2 (A)"]
+    assert titles[9] == "normal load (N)"
+    numbers = np.loadtxt(tmp_path / "run.csv", delimiter=",", skiprows=1)
+    np.testing.assert_allclose(numbers[:, 1:], recording.frames, rtol=1e-9)  # ten digits
+    np.testing.assert_allclose(numbers[:, 0], recording.time, rtol=1e-9)
+
+
+@pytest.mark.parametrize("verb", ["save", "load"])
+def test_an_unknown_suffix_lists_the_known_ones(recording, tmp_path, verb):
+    with pytest.raises(ValueError, match=r"'\.mp3' cannot be .*, known are \.au,.* \.npz"):
+        getattr(recording, verb)(tmp_path / "run.mp3")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_hdf5_without_h5py_names_the_extra(recording, tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "h5py", None)
+    for deed in (recording.save, Recording.load):
+        with pytest.raises(MissingExtra, match=r"pip install 'hapticrender\[hdf5\]'"):
+            deed(tmp_path / "run.h5")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_files_of_others_are_refused_by_name(tmp_path):
+    (tmp_path / "a.au").write_bytes(b"RIFFxxxxxxxx")
+    soundfile.write(tmp_path / "b.au", np.zeros((10, 2)), 5000, subtype="DOUBLE")
+    np.savez(tmp_path / "c.npz", x=np.zeros(3))
+    for name in ("a.au", "b.au", "c.npz"):
+        with pytest.raises(ValueError, match=name.replace(".", r"\.")):
+            Recording.load(tmp_path / name)
+    with pytest.raises(FileNotFoundError):
+        Recording.load(tmp_path / "none.au")
+
+
+def test_a_header_of_another_version_is_refused(recording):
+    text = recording.header.to_json().replace('"version": 1', '"version": 99')
+    with pytest.raises(ValueError, match="version=99 of the header is unknown"):
+        Header.from_json(text)
+
+
+@pytest.mark.parametrize("bits", [16, 24])
+@pytest.mark.parametrize("suffix", [".wav", ".flac"])
+def test_sound_for_listening_states_its_scale(tmp_path, bits, suffix):
+    wave = 0.3 * np.sin(0.1 * np.arange(1000))
+    path = tmp_path / f"drive{suffix}"
+    assert formats.write_sound(path, wave, 4009.8, 0.5, unit="A", bits=bits) == 0.5
+    with soundfile.SoundFile(path) as file:
+        assert file.comment == "full scale = 0.5 A"
+        assert file.samplerate == 4010
+        assert file.subtype == f"PCM_{bits}"
+        np.testing.assert_allclose(0.5 * file.read(), wave, atol=0.5 * 2.0 ** (1 - bits))
+
+
+def test_sound_is_cut_at_full_scale_and_silent_where_it_is_no_number(tmp_path):
+    wave = np.array([0.5, -3.0, 3.0, np.nan, np.inf, -np.inf])
+    assert formats.write_sound(tmp_path / "x.wav", wave, 5000.0, 1.0, bits=24) == 1.0
+    heard, _ = soundfile.read(tmp_path / "x.wav")
+    np.testing.assert_allclose(heard, [0.5, -1, 1, 0, 0, 0], atol=2.0**-23)
+
+
+@pytest.mark.parametrize(("wave", "expected"), [([0.0, -0.25], 0.25), ([0.0, 0.0], 1.0), ([], 1.0), ([np.nan], 1.0)])
+def test_the_scale_of_a_sound_defaults_to_its_peak(tmp_path, wave, expected):
+    assert formats.write_sound(tmp_path / "x.wav", np.array(wave), 5000.0) == expected
+
+
+def test_bad_wishes_for_a_sound_leave_the_older_file(tmp_path):
+    path = tmp_path / "x.wav"
+    path.write_bytes(b"older")
+    for wish in ({"full_scale": 0.0}, {"full_scale": np.nan}, {"bits": 8}):
+        with pytest.raises(ValueError, match=next(iter(wish))):
+            formats.write_sound(path, np.zeros(5), 5000.0, **wish)
+    with pytest.raises(ValueError, match=r"known are \.flac, \.rf64, \.w64, \.wav"):
+        formats.write_sound(tmp_path / "x.mp3", np.zeros(5), 5000.0)
+    assert path.read_bytes() == b"older"
