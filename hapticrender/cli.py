@@ -31,7 +31,7 @@ _EXAMPLES = """\
 start here:
   hapticrender demo                               all built-in scenes; then open out/demo/index.html
   hapticrender scenes                             what is built in
-  hapticrender scenes grating-47 >   mine.toml    a scene of your own: edit it ...
+  hapticrender scenes grating-47 > mine.toml      a scene of your own: edit it ...
   hapticrender render mine.toml --out mine        ... and render it
 
 `hapticrender VERB --help` says more about each verb.
@@ -83,7 +83,7 @@ def _parser() -> argparse.ArgumentParser:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("--version", action="version", version=f"hapticrender {__version__}")
-    parser.set_defaults(run=lambda arguments: parser.print_help() or 0)
+    parser.set_defaults(run=lambda _: _help(parser))
     verbs = parser.add_subparsers(title="verbs", metavar="VERB")
 
     demo = _add_verb(verbs, "demo", _demo, "render the built-in scenes and make a page of sounds, pictures and figures")
@@ -111,6 +111,12 @@ def _parser() -> argparse.ArgumentParser:
 
     _add_verb(verbs, "devices", _devices, "list the renderers and drivers that are installed")
     return parser
+
+
+def _help(parser: argparse.ArgumentParser) -> int:
+    """Help whoever came without a verb."""
+    parser.print_help()
+    return 0
 
 
 def _add_verb(verbs: Any, name: str, run: Any, text: str) -> argparse.ArgumentParser:

@@ -31,6 +31,31 @@ kind = "grating"
 amplitude = 10e-6
 frequency = 47.0
 """
+RICH = """\
+name = "rich"
+duration = 0.05
+tolerance = 0.2
+settle = 0.01
+
+[texture]
+kind = "grating"
+amplitude = 2e-6
+wavelength = 1e-3
+partials = [[1.0, 1.0, 0.0], [2.5, 0.5, 1.0]]
+phase = 0.5
+
+[finger]
+motion = "sampled"
+positions = [0.0, 0.01, -0.01, 0.02]
+times = [0.0, 0.01, 0.02, 0.03]
+normal_load = [[0.0, 0.04], [0.2, 0.9]]
+touches = [[0.0, 0.02], [0.03, 0.05]]
+mechanics = "light"
+load_scaling = true
+
+[plant]
+sensor_noise = 0.0
+"""
 SCENE_FILES = {"scene.toml", "recording.au", "drive.wav", "sensed.wav", "summary.json"}
 
 
@@ -154,6 +179,12 @@ def test_what_an_earlier_run_left_is_gone(run, tiny, tmp_path, no_matplotlib):
     assert {path.name for path in (tmp_path / "out").iterdir()} == SCENE_FILES | {"my-notes.txt"}
 
 
+def test_a_scene_of_every_kind_of_key_runs(run, tmp_path):
+    (tmp_path / "rich.toml").write_text(RICH)
+    assert run("render", tmp_path / "rich.toml", "--out", tmp_path / "out")[0] == 0
+    assert Scene.from_toml(tmp_path / "out" / "scene.toml") == Scene.from_toml_text(RICH)
+
+
 def test_scenes_are_listed_and_printed(run):
     status, out, errors = run("scenes")
     assert (status, errors) == (0, [])
@@ -222,10 +253,10 @@ EDITS = [  # what is changed in the tiny scene, what the complaint must name
     ("amplitude = 10e-6", "amplitude = -1e-6", ["texture.amplitude = -1e-06", "m"]),
     ("amplitude = 10e-6", "amplitude = 10", ["texture.amplitude = 10", "m"]),
     ("amplitude = 10e-6", 'amplitude = "10 um"', ["texture.amplitude = '10 um'", "m"]),
-    ("amplitude = 10e-6", "amplitude = 9e-3", ["A"]),
+    ("amplitude = 10e-6", "amplitude = 9e-3", ["texture.amplitude = 0.009 m", "<= 3 A"]),
     ("frequency = 47.0", "wavelength = 0.0", ["texture.wavelength = 0.0", ">= 1e-06", " m"]),
     ("frequency = 47.0", "wavelength = nan", ["texture.wavelength = nan", "m"]),
-    ("frequency = 47.0", "frequency = 2600.0", ["2600", "Hz"]),
+    ("frequency = 47.0", "frequency = 2600.0", ["texture.frequency = 2600", "<= 2250 Hz"]),
     ("frequency = 47.0", "frequncy = 47.0", ["frequncy"]),
     ("frequency = 47.0", "", ["frequency"]),
     ('kind = "grating"', 'kind = "carpet"', ["texture.kind = 'carpet'", "grating"]),
@@ -373,7 +404,7 @@ values = st.one_of(
     st.sampled_from(["true", "[]", "{}", "[1.0]", '""', '"x"', "1e-6", "0.05", "1e9", "-1", "2000-01-01", "[[]]", "="]),
     st.text(max_size=8).map(json.dumps),
 )
-scene_texts = st.sampled_from([TINY, *(scene.to_toml() for scene in builtin_scenes().values())])
+scene_texts = st.sampled_from([TINY, RICH, *(scene.to_toml() for scene in builtin_scenes().values())])
 
 
 @st.composite
