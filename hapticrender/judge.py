@@ -29,7 +29,7 @@ QUARTERS = 4  # parts of a window in each of which a carrier must be fast enough
 RUNAWAY = 1e3  # m: no plate moves so far, and squares still fit into a float
 CHUNK_VALUES = 2**21  # numbers in one batch of regressors
 RIDGE = 1e-12  # keeps the normal equations of a standing carrier solvable; such windows are not read
-UNJUDGED = {"figure": "rms_error", "value": None, "band": "any", "place": "any"}
+UNJUDGED: dict[str, Any] = {"figure": "rms_error", "value": None, "band": "any", "place": "any"}
 
 
 @dataclass(frozen=True)
@@ -68,7 +68,7 @@ class Envelopes:
     def finite(self) -> Array:
         """Windows in which the motion at every place is a number, and no run-away, shape (w,)."""
         with np.errstate(invalid="ignore", over="ignore"):
-            return (np.abs(self.achieved) < RUNAWAY).all(axis=(1, 2))
+            return np.all(np.abs(self.achieved) < RUNAWAY, axis=(1, 2))
 
     @property
     def judged(self) -> Array:
@@ -133,7 +133,7 @@ def analyse(recording: Recording) -> Envelopes:
     places, n_bands = len(recording.header.places), len(bands)
     shapes = [(0, n_bands), (0, places, n_bands), (0, n_bands), (0, n_bands)]
     kinds = [complex, complex, bool, bool]
-    empty = [np.empty(shape, kind) for shape, kind in zip(shapes, kinds, strict=True)]
+    empty: list[Array] = [np.empty(shape, kind) for shape, kind in zip(shapes, kinds, strict=True)]
     wanted, achieved, readable, asked = (np.concatenate(part) for part in zip(empty, *parts, strict=True))
     return Envelopes(first / rate, size / rate, wanted, achieved, readable, asked)
 
@@ -196,7 +196,7 @@ def fit(phase: Array, signals: Array) -> tuple[Array, Array]:
 def _fast_enough(bands: Bands, rate: float, finger: Array) -> Array:
     """Whether each carrier runs at 20 Hz or more in every quarter of a window, and the finger that it needs is down."""
     edges = np.linspace(0, finger.shape[1] - 1, QUARTERS + 1).round().astype(int)
-    down = np.isfinite(finger).all(axis=1)
+    down = np.all(np.isfinite(finger), axis=1)
     velocity = np.diff(np.where(down[:, None], finger[:, edges], 0.0), axis=1) * rate / np.diff(edges)
     frequency = np.abs(bands.instantaneous_frequency(velocity)).min(axis=1)
     return (frequency >= LOWEST_FREQUENCY * (1 - 1e-6)) & (down[:, None] | (bands.wavenumber == 0))

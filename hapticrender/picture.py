@@ -26,7 +26,7 @@ PERIODS = 4  # of the strongest carrier in the close-up
 MOST_LABELS = 10
 MOST_NOTES = 3  # lines
 FLOOR = 1e-5  # relative error below which a dot stands at the foot of its panel
-STYLE = {
+STYLE: Any = {
     "font.size": 9,
     "axes.titlesize": 9.5,
     "axes.titlelocation": "left",
@@ -71,7 +71,7 @@ def draw(recording: Recording) -> Any:
         raise MissingExtra("pictures need matplotlib: pip install 'hapticrender[plot]'") from error
     with matplotlib.rc_context(STYLE), np.errstate(all="ignore"):
         touched = bool(np.isfinite(recording.position).any())
-        figure = Figure(figsize=(11, 10.2 if touched else 8.6), layout="constrained")
+        figure: Any = Figure(figsize=(11, 10.2 if touched else 8.6), layout="constrained")
         FigureCanvasAgg(figure)
         figure.get_layout_engine().set(w_pad=0.12, h_pad=0.07)
         _draw(figure, recording, touched)
@@ -121,7 +121,7 @@ def _head(axes: Any, summary: dict[str, Any], touched: bool) -> None:
 def _amplitude(axes: Any, recording: Recording, summary: dict[str, Any]) -> None:
     """Target and achieved amplitude over time, all bands together."""
     envelopes = recording.envelopes
-    shown = envelopes.readable.any(axis=0)
+    shown = np.any(envelopes.readable, axis=0)
     readable = envelopes.readable[:, shown].all(axis=1) & envelopes.finite
     achieved = _together(envelopes.achieved[:, :, shown])
     achieved[~readable] = np.nan
@@ -239,7 +239,8 @@ def _errors(axes: Any, recording: Recording, summary: dict[str, Any]) -> None:
 
 def _drive(lanes: list[Any], recording: Recording) -> None:
     """Drive of every coil in its lane; a long run as the range that each column of pixels covers."""
-    drive, limit = _bounded(recording.drive), recording.header.drive_limit
+    drive = _bounded(recording.drive)
+    limit: Any = recording.header.drive_limit
     peak = np.nanmax(np.abs(drive), initial=0.0) or 1e-3
     near = limit is not None and peak > 0.4 * limit
     reach = 1.12 * (max(peak, limit) if near else peak)

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Any, BinaryIO
 
 import numpy as np
 
-from hapticrender import formats, judge
+from hapticrender import formats, journal, judge
 from hapticrender.bands import Bands
-from hapticrender.formats import Header
+from hapticrender.journal import Header
 from hapticrender.protocols import Array
 
 if TYPE_CHECKING:
@@ -130,9 +130,9 @@ class Recorder:
             "flags": flags,
         }
         if self.path is None:
-            self._blocks.append(formats.join(self.header, signals))
+            self._blocks.append(journal.join(self.header, signals))
             return
-        frames = formats.join(self.header, signals, formats.JOURNAL_DTYPE)
+        frames = journal.join(self.header, signals, journal.JOURNAL_DTYPE)
         if self._file is None:
             self._file = self._create(self.path)
         self._file.write(frames.data)
@@ -152,12 +152,12 @@ class Recorder:
         if self._file is None:
             self._file = self._create(self.path)
         self.close()
-        return Recording(*formats.read_journal(self.path), self._scene)
+        return Recording(*journal.read_journal(self.path), self._scene)
 
     def _create(self, path: Path) -> BinaryIO:
         path.unlink(missing_ok=True)  # a recording may still map the old file: replace it, never write into it
         file = path.open("xb")
-        file.write(formats.journal_head(self.header))
+        file.write(journal.journal_head(self.header))
         return file
 
 
@@ -270,7 +270,7 @@ class Recording:
 
     def read(self, name: str, start: int = 0, stop: int | None = None) -> Array:
         """Read samples `start` to `stop` of one signal, so that a long run need not fit into memory."""
-        return formats.column(self.header, self.frames[start:stop], name)
+        return journal.column(self.header, self.frames[start:stop], name)
 
     @cached_property
     def envelopes(self) -> judge.Envelopes:

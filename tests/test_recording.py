@@ -12,8 +12,9 @@ import pytest
 import soundfile
 from synthetic import RATE, make_bands, make_recorder, make_recording, make_scene, make_signals, times
 
-from hapticrender import formats
-from hapticrender.formats import Header, MissingExtra
+from hapticrender import formats, journal
+from hapticrender.formats import MissingExtra
+from hapticrender.journal import Header
 from hapticrender.recording import Recording
 
 UM = 1e-6
@@ -309,7 +310,7 @@ def test_mat_files_hold_every_signal_by_name(recording, tmp_path):
 
 
 def test_csv_has_names_units_and_every_number(recording, tmp_path, monkeypatch):
-    monkeypatch.setattr(formats, "CHUNK", 999)
+    monkeypatch.setattr(journal, "CHUNK", 999)
     recording.save(tmp_path / "run.csv")
     with (tmp_path / "run.csv").open(encoding="utf-8") as file:
         titles = file.readline().rstrip("\n").split(",")
