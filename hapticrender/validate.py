@@ -102,7 +102,7 @@ def validate(
     Examples
     --------
     >>> from hapticrender.touch.builtin import builtin_scenes
-    >>> [verdict] = validate([builtin_scenes()["grating-20hz"]], seed=1)
+    >>> [verdict] = validate([builtin_scenes()["grating-20"]], seed=1)
     >>> verdict.passed
     True
     """
