@@ -22,6 +22,8 @@ if TYPE_CHECKING:
 
 SHORTEST_WINDOW = 20e-3  # s [FACTS 3, standard conditions: max(20 ms, 2/f)]
 PERIODS = 2.0  # of the lowest carrier and of the smallest spacing in a window
+HOPS = 2  # window starts in a window's length
+HOPS_LOCKED = 8  # the same where carriers are locked to the finger, which is seldom fast enough for long
 LOWEST_FREQUENCY = 20.0  # Hz: below it the window does not tell a carrier from an offset
 LARGEST_INFLATION = 4.0  # of an envelope's variance, by the neighbours that the window hardly tells apart from it
 SETTLED = 0.05  # of the target
@@ -107,10 +109,11 @@ def window_length(bands: Bands, rate: float, position: Array, longest: float) ->
 
 
 def analyse(recording: Recording) -> Envelopes:
-    """Envelopes of every band at every place, by joint least squares over windows that overlap by half.
+    """Envelopes of every band at every place, by joint least squares over overlapping windows.
 
     Each window fits all carriers of the scene, an offset and a slope to the
-    motion, and the same to the waveform that is wanted.
+    motion, and the same to the waveform that is wanted.  Windows start half a
+    window apart, an eighth where a carrier is locked to the finger.
 
     Parameters
     ----------
@@ -125,7 +128,7 @@ def analyse(recording: Recording) -> Envelopes:
     position = recording.position
     size = round(window_length(bands, rate, position, longest) * rate)
     size = max(2, size + size % 2)
-    hop = size // 2
+    hop = max(1, size // (HOPS_LOCKED if bands.wavenumber.any() else HOPS))
     first = np.arange(0, count - size + 1, hop)
     parts = [
         _analyse_chunk(recording, position, starts, size) for starts in _batches(first, size * (2 * len(bands) + 2))

@@ -133,7 +133,8 @@ def _amplitude(axes: Any, recording: Recording, summary: dict[str, Any]) -> None
     names = recording.header.places
     for i in reversed(range(len(names))):
         colour = PLACES[i % len(PLACES)][0]
-        axes.plot(envelopes.time, 1e6 * achieved[:, i], color=colour, lw=1.8 if i == 0 else 1.1, label=names[i])
+        style = {"color": colour, "lw": 1.8 if i == 0 else 1.1, "marker": "." if len(achieved) < 500 else "", "ms": 3}
+        axes.plot(envelopes.time, 1e6 * achieved[:, i], label=names[i], **style)
     axes.plot(time, wanted, color=INK, lw=1.1, ls=(0, (4, 2)), label="target")
     axes.axvline(summary["judged_from"], color=PALE, lw=0.9, ls=":", label="judged from here")
     several = "" if shown.sum() <= 1 else f" ({int(shown.sum())} bands: root of the sum of squares)"
