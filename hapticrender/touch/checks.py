@@ -19,7 +19,7 @@ _short.maxlong = 30
 
 def show(value: object) -> str:
     """One short line for any value."""
-    if isinstance(value, Integral) and not isinstance(value, bool) and abs(value) >= 10**30:
+    if isinstance(value, int) and abs(value) >= 10**30:
         return "an integer beyond 1e30"
     if isinstance(value, Mapping | list | tuple | np.ndarray) and len(value) > 4:
         return f"{type(value).__name__} of {len(value)} entries"
@@ -75,7 +75,7 @@ def integer(key: str, value: Any, *, least: int, most: int) -> int:
     bound = f"an integer >= {least} and <= {most}"
     if not isinstance(value, Integral) or isinstance(value, bool):
         refuse(key, value, bound, TypeError)
-    if not least <= value <= most:
+    if not least <= int(value) <= most:
         refuse(key, value, bound)
     return int(value)
 

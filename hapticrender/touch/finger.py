@@ -103,7 +103,7 @@ class Finger:
         cls, file: str | os.PathLike[str], start: float = 0.0, normal_load: Any = None, **touch: Any
     ) -> Finger:
         """Return the finger of a tribometer recording, from `start` (s) on, with its own load unless given."""
-        return cls(Tracked(file, start), normal_load, **touch)
+        return cls(Tracked(os.fspath(file), start), normal_load, **touch)
 
     def position(self, time: Array) -> Array:
         """Position (m from the middle of the surface, shape (n,)), NaN while lifted."""

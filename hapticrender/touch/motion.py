@@ -119,11 +119,14 @@ class Swiping:
             checks.keep(self, stroke=checks.number("stroke", self.stroke, "m", above=0, most=FARTHEST))
         checks.keep(self, centre=checks.number("centre", self.centre, "m", least=-FARTHEST, most=FARTHEST))
 
+    @property
+    def _stroke(self) -> float:
+        return self.stroke if self.speed is None else self.speed / (np.pi * self.frequency)  # type: ignore[return-value]
+
     def position(self, time: Array) -> Array:
         """Position (m, shape (n,))."""
-        stroke = self.stroke if self.stroke is not None else self.speed / (np.pi * self.frequency)
         turns = np.mod(np.asarray(time, float) * self.frequency, 1.0)
-        return self.centre + stroke / 2 * np.sin(2 * np.pi * turns)
+        return self.centre + self._stroke / 2 * np.sin(2 * np.pi * turns)
 
 
 @dataclass(frozen=True)
@@ -162,8 +165,9 @@ class Sampled:
 
     @cached_property
     def _curve(self) -> tuple[Array, Array]:
-        times = np.arange(len(self.positions)) / self.rate if self.times is None else np.array(self.times)
-        return times, np.array(self.positions)
+        positions = np.array(self.positions)
+        times = np.array(self.times) if self.rate is None else np.arange(positions.size) / self.rate
+        return times, positions
 
     def position(self, time: Array) -> Array:
         """Position (m, shape (n,))."""

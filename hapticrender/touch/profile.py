@@ -79,7 +79,7 @@ class Profile:
         candidates = candidates[np.argsort(-power[candidates], kind="stable")]
         chosen: list[float] = []
         for index in candidates:
-            middle = min(max(_refined(frequency, power, index), low), high)
+            middle = min(max(_refined(frequency, power, int(index)), low), high)
             clear = all(abs(middle - other) >= spacing for other in chosen)
             if clear and power[index] >= FAINTEST * power[candidates[0]]:
                 chosen.append(middle)

@@ -56,6 +56,8 @@ class _Playback:
         """The recording inside its passband, in m over recorded seconds; reads the file at the first use."""
         values, step = self._recorded()
         low, high = self.passband
+        if 0.5 / step <= low:
+            raise SceneError(f"passband = {self.passband} Hz: must start < {0.5 / step:g} Hz, half the file's rate")
         profile = Profile.band_limited(values, step, low, min(high, 0.5 / step))
         scale = self.gain
         if scale is None:

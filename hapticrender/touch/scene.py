@@ -128,7 +128,7 @@ class Scene:
     def to_toml(self) -> str:
         """TOML text that `from_toml_text` reads back to an equal scene (textures of your own: by description only)."""
         head = {key: getattr(self, key) for key in ("name", "device", "duration", "tolerance", "settle")}
-        texture = self.texture if type(self.texture) in TEXTURES.values() else ForeignTexture(repr(self.texture))
+        texture: Any = self.texture if type(self.texture) in TEXTURES.values() else ForeignTexture(repr(self.texture))
         return toml.dumps(
             head
             | {"texture": {"kind": texture.kind} | _write_fields(texture), "finger": _write_finger(self.finger)}
@@ -222,7 +222,7 @@ def _write_fields(part: Any) -> dict[str, Any]:
 
 
 def _write_finger(finger: Finger) -> dict[str, Any]:
-    motion = finger.motion if type(finger.motion) in MOTIONS.values() else ForeignMotion(repr(finger.motion))
+    motion: Any = finger.motion if type(finger.motion) in MOTIONS.values() else ForeignMotion(repr(finger.motion))
     own = _write_fields(finger)
     own["mechanics"] = _write_mechanics(finger.mechanics)
     del own["motion"]

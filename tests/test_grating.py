@@ -1,0 +1,112 @@
+"""Gratings: waveform, bands and refusals."""
+
+import numpy as np
+import pytest
+
+from hapticrender.touch.grating import SHAPES, Grating
+
+TIME = np.linspace(0.0, 0.1, 501)
+NOWHERE = np.full(TIME.size, np.nan)
+
+GRATINGS = {
+    "sine in time": Grating(amplitude=10e-6, frequency=111.0, phase=0.7),
+    "sine in space": Grating(amplitude=10e-6, wavelength=1e-3, phase=-2.0),
+    "square in time": Grating(amplitude=1e-6, frequency=31.0, shape="square", phase=0.3),
+    "triangle in space": Grating(amplitude=1e-6, wavelength=2e-3, shape="triangle", harmonics=3, phase=1.0),
+    "inharmonic": Grating(amplitude=5e-6, frequency=20.0, partials=((1, 1.0, 0.0), (2.7, -0.5, 1.2))),
+}
+
+
+def test_a_tone_is_a_cosine_of_its_peak():
+    tone = Grating(amplitude=10e-6, frequency=72.0, phase=0.4)
+    expected = 10e-6 * np.cos(2 * np.pi * 72.0 * TIME + 0.4)
+    np.testing.assert_allclose(tone.waveform(TIME, NOWHERE), expected, atol=1e-6 * 1e-9)
+
+
+def test_a_spatial_grating_is_read_at_the_position_only():
+    ridges = Grating(amplitude=10e-6, wavelength=1e-3)
+    position = np.concatenate([np.linspace(-0.02, 0.03, 700), np.linspace(0.03, -0.02, 300)])
+    expected = 10e-6 * np.cos(2 * np.pi * position / 1e-3)
+    for time in (np.arange(1000) / 5000, np.full(1000, 7.0)):
+        np.testing.assert_allclose(ridges.waveform(time, position), expected, atol=1e-6 * 1e-9)
+
+
+def test_a_spatial_grating_is_still_while_lifted_and_a_tone_is_not():
+    position = np.array([0.0, np.nan, 0.0005, np.nan])
+    time = np.zeros(4)
+    assert Grating(amplitude=1e-6, wavelength=1e-3).waveform(time, position).tolist() == [1e-6, 0.0, -1e-6, 0.0]
+    assert Grating(amplitude=1e-6, frequency=50.0).waveform(time, position).tolist() == [1e-6] * 4
+
+
+@pytest.mark.parametrize("name", GRATINGS)
+def test_bands_carry_the_waveform(name):
+    grating = GRATINGS[name]
+    position = 0.02 * np.sin(2 * np.pi * 3 * TIME)
+    bands = grating.bands(rate=5000.0)
+    summed = (bands.envelope * np.exp(1j * bands.carrier_phase(TIME, position))).real.sum(axis=1)
+    np.testing.assert_allclose(grating.waveform(TIME, position), summed, atol=1e-9 * grating.amplitude)
+
+
+def test_the_felt_frequency_is_speed_over_wavelength():
+    bands = Grating(amplitude=1e-6, wavelength=1e-3).bands(5000.0)
+    assert bands.instantaneous_frequency(np.array([0.08, -0.05]))[:, 0] == pytest.approx([80.0, -50.0], rel=1e-12)
+
+
+@pytest.mark.parametrize(("shape", "order"), [("square", 1), ("triangle", 3)])
+def test_partials_converge_to_the_shape_at_the_order_of_their_series(shape, order):
+    """Coefficients fall as 1/n (square) or 1/n^2 (triangle): the power left out falls as N^-1 or N^-3."""
+    turns = (np.arange(1 << 14) + 0.5) / (1 << 14)
+    ideal = {"square": np.sign(np.cos(2 * np.pi * turns)), "triangle": np.abs(4 * turns - 2) - 1}[shape]
+    left_out = []
+    for harmonics in (8, 16):
+        grating = Grating(amplitude=1e-3, frequency=1.0, shape=shape, harmonics=harmonics)
+        left_out.append(np.mean((grating.waveform(turns, turns) / 1e-3 - ideal) ** 2))
+    assert np.log2(left_out[0] / left_out[1]) == pytest.approx(order, abs=0.02)
+
+
+def test_square_partials_are_the_textbook_ones():
+    order, amplitude, phase = np.array(SHAPES["square"](3)).T
+    assert order.tolist() == [1, 3, 5]
+    np.testing.assert_allclose(amplitude * np.exp(1j * phase), 4 / np.pi * np.array([1, -1 / 3, 1 / 5]), atol=1e-15)
+
+
+def test_tables_and_tuples_are_the_same_partials():
+    tables = Grating(amplitude=1e-6, frequency=20.0, partials=[{"order": 2, "amplitude": 0.5}])
+    assert tables == Grating(amplitude=1e-6, frequency=20.0, partials=((2.0, 0.5, 0.0),))
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"amplitude": -1e-6}, r"amplitude = -1e-06: must be a finite number > 0 and <= 0.01 m"),
+        ({"amplitude": 10.0}, r"amplitude = 10.0: must be .* <= 0.01 m"),
+        ({"amplitude": float("nan")}, r"amplitude = nan: must be a finite number"),
+        ({"amplitude": None}, r"amplitude is missing: must be .* m"),
+        ({"frequency": 0.0}, r"frequency = 0.0: must be .* > 0 .* Hz"),
+        ({"frequency": float("inf")}, r"frequency = inf: must be a finite number"),
+        ({"frequency": None}, r"frequency, wavelength: exactly one must be given; neither"),
+        ({"wavelength": 1e-3}, r"frequency, wavelength: exactly one must be given; frequency = 20.0"),
+        ({"frequency": None, "wavelength": 0.0}, r"wavelength = 0.0: must be .* m"),
+        ({"frequency": None, "wavelength": 1.0}, r"wavelength = 1.0: must be .* <= 0.5 m"),
+        ({"shape": "sawtooth"}, r"shape = 'sawtooth': must be one of sine, square, triangle"),
+        ({"harmonics": 0}, r"harmonics = 0: must be an integer >= 1"),
+        ({"partials": []}, r"partials = \[\]: must be 1 to 4096 entries"),
+        ({"partials": [(0, 1, 0)]}, r"partials\[0\].order = 0: must be .* > 0"),
+        ({"partials": [{"order": 1, "amplitude": 1, "phse": 0}]}, r"partials\[0\].phse"),
+        ({"phase": 10**400}, r"phase = an integer beyond 1e30: must be .* rad"),
+    ],
+)
+def test_wrong_values_are_refused_with_bound_and_unit(wrong, message):
+    with pytest.raises((ValueError, TypeError), match=message):
+        Grating(**({"amplitude": 1e-6, "frequency": 20.0} | wrong))
+
+
+@pytest.mark.parametrize("wrong", [True, "10 um", [1e-6], np.array([1e-6, 2e-6])])
+def test_only_numbers_are_numbers(wrong):
+    with pytest.raises(TypeError, match=r"^amplitude = .*: must be a finite number > 0 and <= 0.01 m$"):
+        Grating(amplitude=wrong, frequency=20.0)
+
+
+def test_the_bounds_themselves_are_accepted():
+    assert Grating(amplitude=0.01, wavelength=0.5).wavelength == 0.5
+    assert Grating(amplitude=0.01, wavelength=1e-6).amplitude == 0.01

@@ -1,0 +1,318 @@
+"""Recorded textures: sound files, the swipe of a tribometer, and the synthetic one."""
+
+import numpy as np
+import pytest
+import soundfile
+
+from hapticrender.errors import SceneError
+from hapticrender.touch.finger import Finger
+from hapticrender.touch.recorded import Recorded, Swipe, Synthetic
+from hapticrender.touch.tribometer import load_swipe, unwrap_counts
+
+INSIDE = slice(500, -500)  # away from the ends, where reflection bends a tone
+
+
+def tone(frequency, rate, seconds=2.0):
+    return np.cos(2 * np.pi * frequency * np.arange(round(seconds * rate)) / rate)
+
+
+@pytest.fixture
+def write(tmp_path):
+    def write(samples, rate=8000, name="texture.wav", subtype="DOUBLE"):
+        soundfile.write(tmp_path / name, samples, rate, subtype=subtype)
+        return tmp_path / name
+
+    return write
+
+
+@pytest.mark.parametrize("rate", [1000, 8000, 44100])
+def test_a_tone_in_time_comes_back_at_any_file_rate(write, rate):
+    texture = Recorded(file=write(0.25 * tone(140.0, rate), rate), gain=4e-6)
+    time = np.arange(0.3, 1.7, 1 / 5000)
+    played = texture.waveform(time, np.full(time.size, np.nan))
+    np.testing.assert_allclose(played, 1e-6 * np.cos(2 * np.pi * 140.0 * time), atol=2e-3 * 1e-6)
+
+
+@pytest.mark.parametrize(("name", "subtype"), [("a.wav", "FLOAT"), ("a.flac", "PCM_24"), ("a.w64", "PCM_32")])
+def test_any_channel_of_any_format(write, name, subtype):
+    channels = np.stack([tone(60.0, 8000), tone(90.0, 8000), tone(150.0, 8000)], axis=1) / 2
+    file = write(channels, name=name, subtype=subtype)
+    for channel, frequency in enumerate((60.0, 90.0, 150.0)):
+        bands = Recorded(file=file, amplitude=1e-6, channel=channel).bands(5000.0)
+        assert bands.frequency == pytest.approx([frequency], abs=0.1)
+        assert bands.envelope is None
+
+
+def test_amplitude_is_the_peak_without_the_mean(write):
+    texture = Recorded(file=write(0.5 + 0.01 * tone(100.0, 8000)), amplitude=10e-6)
+    time = np.arange(0, 2, 1 / 20000)
+    assert np.abs(texture.waveform(time, time)).max() == pytest.approx(10e-6, rel=2e-3)
+
+
+def test_what_lies_outside_the_passband_is_left_out(write):
+    samples = tone(100.0, 8000) + tone(5.0, 8000) + tone(1000.0, 8000)
+    time = np.arange(0.5, 1.5, 1 / 5000)
+    played = Recorded(file=write(samples / 4), gain=4e-6).waveform(time, time)
+    np.testing.assert_allclose(played, 1e-6 * np.cos(2 * np.pi * 100.0 * time), atol=2e-3 * 1e-6)
+
+
+@pytest.mark.parametrize("speed", [0.02, 0.11])
+def test_a_spatial_recording_is_read_at_the_position_at_any_speed(write, speed):
+    """Recorded at 50 mm/s a tone of 100 Hz is a wavelength of 0.5 mm."""
+    texture = Recorded(file=write(tone(100.0, 8000)), gain=10e-6, speed=0.05)
+    time = np.arange(0, 0.3, 1 / 5000)
+    position = -0.01 + speed * time
+    expected = 10e-6 * np.cos(2 * np.pi * (position + 0.05 * (2.0 - 1 / 8000) / 2) / 0.5e-3)
+    np.testing.assert_allclose(texture.waveform(time, position), expected, atol=2e-3 * 10e-6)
+    bands = texture.bands(5000.0)
+    assert bands.wavenumber == pytest.approx([2000.0], rel=1e-3)
+    assert bands.instantaneous_frequency(np.array([speed]))[0] == pytest.approx([speed / 0.5e-3], rel=1e-3)
+
+
+def test_a_spatial_recording_is_still_while_lifted(write):
+    texture = Recorded(file=write(tone(100.0, 8000)), amplitude=10e-6, speed=0.05)
+    played = texture.waveform(np.zeros(3), np.array([np.nan, 0.0, np.nan]))
+    assert played[0] == played[2] == 0.0
+    assert played[1] != 0.0
+
+
+def test_beyond_its_ends_a_recording_runs_back_without_a_jump(write, rng):
+    texture = Recorded(file=write(rng.uniform(-1, 1, 4001)), amplitude=10e-6)
+    length = texture.profile.length
+    assert length == pytest.approx(0.5, rel=1e-12)
+    time = np.arange(0, 0.4, 1e-4)
+    for end in (0.0, length):
+        before, after = (texture.waveform(end + sign * time, time) for sign in (-1, 1))
+        np.testing.assert_allclose(before, after, atol=1e-9 * 10e-6)
+    np.testing.assert_allclose(texture.waveform(time + 2 * length, time), texture.waveform(time, time), atol=1e-15)
+
+
+def test_carriers_are_the_strongest_peaks_apart(write, rng):
+    rate, wanted = 8000, {47.0: 0.5, 60.0: 0.3, 143.0: 1.0, 305.0: 0.2, 390.0: 0.7}
+    samples = sum(weight * tone(frequency, rate, 4.0) for frequency, weight in wanted.items()) / 4
+    samples += 1e-4 * rng.standard_normal(samples.size)
+    file = write(samples)
+    all_clear = Recorded(file=file, amplitude=1e-6).bands(5000.0)
+    assert all_clear.frequency == pytest.approx([47.0, 143.0, 305.0, 390.0], abs=0.2)  # 60 Hz is within 40 of 47
+    assert Recorded(file=file, amplitude=1e-6, carriers=2).bands(5000.0).frequency == pytest.approx(
+        [143.0, 390.0], abs=0.2
+    )
+    closer = Recorded(file=file, amplitude=1e-6, spacing=12.0).bands(5000.0)
+    assert closer.frequency == pytest.approx(sorted(wanted), abs=0.2)
+    assert Recorded(file=file, amplitude=1e-6).bands(500.0).frequency.max() < 250.0
+
+
+def test_noise_fills_the_band_with_carriers_apart(write, rng):
+    bands = Recorded(file=write(rng.uniform(-1, 1, 16000)), amplitude=1e-6).bands(5000.0)
+    assert 6 <= len(bands) <= 8
+    assert np.diff(bands.frequency).min() >= 40.0
+    assert bands.frequency.min() >= 20.0
+    assert bands.frequency.max() <= 400.0
+
+
+@pytest.mark.parametrize(
+    ("samples", "options", "message"),
+    [
+        (np.array([0.0, np.nan, 0.0]), {}, r"file = .*texture.wav.*: sample 1 of channel 0 = nan: must be a finite"),
+        (np.array([0.0, 0.1, np.inf]), {}, r"sample 2 of channel 0 = inf: must be a finite number"),
+        (np.zeros(0), {}, r"has 0 samples: must be >= 2"),
+        (np.zeros(1), {}, r"has 1 samples: must be >= 2"),
+        (np.zeros(4000), {}, r"amplitude = 1e-06 m: nothing to scale between 20 and 400 Hz"),
+        (np.full(4000, 0.5), {}, r"nothing to scale"),
+        (np.zeros((10, 2)), {"channel": 2}, r"channel = 2: must be < 2, the channels of .*texture.wav"),
+        (np.ones(400), {"passband": (5000.0, 6000.0)}, r"passband = .* Hz: must start < 4000 Hz"),
+    ],
+)
+def test_bad_recordings_are_refused(write, samples, options, message):
+    texture = Recorded(file=write(samples), amplitude=1e-6, **options)
+    with pytest.raises(SceneError, match=message):
+        texture.check()
+
+
+def test_what_is_no_sound_file_is_refused(tmp_path):
+    (tmp_path / "text.wav").write_text("no sound at all")
+    for name, message in [("text.wav", "readable"), ("absent.wav", "existing"), (".", "existing")]:
+        with pytest.raises(SceneError, match=f"^file = .*: must be an? {message} sound file"):
+            Recorded(file=tmp_path / name, amplitude=1e-6).check()
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"gain": 1.0}, r"amplitude, gain: exactly one"),
+        ({"amplitude": -1e-6}, r"amplitude = -1e-06: must be .* m"),
+        ({"speed": 0.0}, r"speed = 0.0: must be .* m/s"),
+        ({"channel": -1}, r"channel = -1: must be an integer >= 0"),
+        ({"carriers": 0}, r"carriers = 0: must be an integer >= 1"),
+        ({"passband": (400.0, 20.0)}, r"passband = .*: must be two rising frequencies in Hz"),
+        ({"file": ""}, r"file = '': must be the name of a file"),
+        ({"file": "a\0b"}, r"file = .*: must be the name of a file"),
+        ({"file": 3}, r"file = 3: must be the name of a file"),
+    ],
+)
+def test_wrong_parameters_are_refused(wrong, message):
+    with pytest.raises((ValueError, TypeError), match=message):
+        Recorded(**({"file": "a.wav", "amplitude": 1e-6} | wrong))
+
+
+def swipe(rate=10000.0, wavelength=0.5e-3, start=2**32 - 20000):
+    """Homing without contact, a press, a slide of 60 mm at 40 mm/s over a sinusoid, a release; the counter wraps."""
+    time = np.arange(0, 5.0, 1 / rate)
+    corners = [0, 0.6, 1.6, 2.5, 4.0, 5.0]
+    position = np.interp(time, corners, [0, 0, -0.04, -0.04, 0.02, 0.02])
+    touching = (time >= 2.0) & (time < 4.5)
+    sliding = (time >= 2.5) & (time < 4.0)
+    lateral = -0.18 + 0.2 * sliding + 0.03 * sliding * np.cos(2 * np.pi * position / wavelength)
+    counts = np.rint(position / 0.5e-6).astype(np.int64) + start
+    return {
+        "encoder": (counts % 2**32).astype(np.uint32),
+        "metre_per_count": 0.5e-6,
+        "lateral_force": lateral.astype(np.float32),
+        "normal_force": (1.67 - 0.5 * touching).astype(np.float32),
+        "rate": rate,
+    }
+
+
+@pytest.fixture
+def save(tmp_path):
+    def save(**changes):
+        arrays = {key: value for key, value in (swipe() | changes).items() if value is not None}
+        np.savez(tmp_path / "swipe.npz", **arrays)
+        return tmp_path / "swipe.npz"
+
+    return save
+
+
+def test_a_counter_unwraps_both_ways(rng):
+    true = np.cumsum(rng.integers(-(2**30), 2**30, 2000))
+    true = np.concatenate([true, true[::-1]])
+    assert unwrap_counts((true % 2**32).astype(np.uint32)).tolist() == (true - true[0]).tolist()
+
+
+def test_contact_and_slide_are_told_from_homing(save):
+    """Edges to within the 20 ms over which force and velocity are smoothed."""
+    recording = load_swipe(str(save()))
+    touching, sliding = (np.flatnonzero(mask)[[0, -1]] / 1e4 for mask in (recording.touching, recording.sliding))
+    assert touching == pytest.approx([2.0, 4.5], abs=0.02)
+    assert sliding == pytest.approx([2.5, 4.0], abs=0.02)
+    assert recording.speed == pytest.approx(0.04, rel=1e-3)
+    assert recording.normal_load[30000] == pytest.approx(0.5, abs=1e-5)
+    assert recording.position[recording.touching].max() == pytest.approx(0.03, abs=1e-6)
+    assert recording.position[recording.touching].min() == pytest.approx(-0.03, abs=1e-6)
+
+
+def test_the_recorded_finger_moves_presses_and_lifts(save):
+    finger = Finger.recorded(save(), start=1.0, mechanics="auto")
+    time = np.array([0.5, 1.2, 2.25, 3.2, 3.9, 50.0])
+    assert finger.position(time) == pytest.approx([np.nan, -0.03, 0.0, 0.03, np.nan, np.nan], abs=1e-6, nan_ok=True)
+    assert finger.load(time) == pytest.approx([0, 0.5, 0.5, 0.5, 0, 0], abs=1e-5)
+    assert finger.strength(time).tolist() == [0, 1, 1, 1, 0, 0]
+
+
+@pytest.mark.parametrize("speed", [0.025, 0.07])
+def test_force_is_a_function_of_position_at_other_speeds(save, speed):
+    """A 0.5 mm sinusoid of force comes back at its place; cells of 10 um weaken it by sinc(10/500)."""
+    texture = Swipe(file=save(), gain=1e-4)
+    time = np.arange(0, 0.5, 1 / 5000)
+    position = -0.015 + speed * time
+    cells = np.sinc(10e-6 / 0.5e-3)
+    middle = 0.01  # of the travel in contact: the recording's own 0 lies 10 mm higher
+    expected = 3e-6 * cells * np.cos(2 * np.pi * (position - middle) / 0.5e-3)
+    np.testing.assert_allclose(texture.waveform(time, position), expected, atol=0.02 * 3e-6)
+    assert texture.bands(5000.0).wavenumber == pytest.approx([2000.0], rel=2e-3)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"encoder": None}, r"file = .*swipe.npz.*: encoder is missing"),
+        ({"rate": -1.0}, r"rate = -1.0: must be .* Hz"),
+        ({"rate": np.array([1.0, 2.0])}, r"rate = .*: must be a finite number .* Hz"),
+        ({"metre_per_count": np.nan}, r"metre_per_count = nan: must be .* m"),
+        ({"lateral_force": np.full(50000, np.nan)}, r"lateral_force\[0\] = nan: must be a finite number of N"),
+        ({"normal_force": np.full(50000, 1.67)}, r"normal_force departs by .* N .*: must be > 0.2 N"),
+        ({"normal_force": np.full(70, 1.67)}, r"have 50000, 50000, 70 samples: must be equal"),
+        ({"encoder": np.linspace(0, 1, 50000)}, r"encoder has .* float64: must be a row of .* integer counts"),
+        ({"encoder": np.array(["a"] * 50000)}, r"encoder has .*: must be a row"),
+    ],
+)
+def test_bad_swipes_are_refused(save, changes, message):
+    with pytest.raises(SceneError, match=message):
+        Swipe(file=save(**changes), amplitude=1e-6).check()
+
+
+def test_a_press_without_a_slide_is_no_texture(save):
+    file = save(lateral_force=np.full(50000, -0.18))
+    with pytest.raises(SceneError, match=r"the finger never slides in contact"):
+        Swipe(file=file, amplitude=1e-6).check()
+    assert np.isfinite(Finger.recorded(file).position(np.array([3.0])))
+
+
+def test_what_is_no_swipe_is_refused(tmp_path):
+    (tmp_path / "text.npz").write_text("nothing of the kind")
+    np.save(tmp_path / "plain.npy", np.zeros(3))
+    objects = tmp_path / "objects.npz"
+    np.savez(objects, **(swipe() | {"encoder": np.array([{}, {}], object)}))
+    for name in ("text.npz", "plain.npy", "objects.npz", "absent.npz"):
+        with pytest.raises(SceneError, match=f"^file = .*{name}.*: must be an? (readable|existing) .npz file"):
+            load_swipe(str(tmp_path / name))
+
+
+def test_a_changed_file_is_read_again(save):
+    assert load_swipe(str(save())).speed == pytest.approx(0.04, rel=1e-3)
+    assert load_swipe(str(save(metre_per_count=1e-6))).speed == pytest.approx(0.08, rel=1e-3)
+
+
+def test_the_real_swipe_slides_from_4_6_to_6_9_seconds(shared_data):
+    """FACTS section 9: contact and slide from about 4.6 s to 6.9 s at 40 mm/s, after homing without contact."""
+    file = shared_data / "swipe_40mm_s.npz"
+    recording = load_swipe(str(file))
+    sliding = np.flatnonzero(recording.sliding)[[0, -1]] / recording.rate
+    assert sliding == pytest.approx([4.6, 6.9], abs=0.05)
+    assert not recording.touching[: round(3.0 * recording.rate)].any()
+    assert recording.speed == pytest.approx(0.04, rel=0.005)
+    assert np.abs(recording.position[recording.touching]).max() <= 0.055
+    assert 0.4 < recording.normal_load[recording.sliding].mean() < 0.7
+
+    texture = Swipe(file=file, amplitude=20e-6)
+    bands = texture.bands(5000.0)
+    assert 4 <= len(bands) <= 8
+    assert np.diff(bands.wavenumber).min() * recording.speed >= 40.0 * (1 - 1e-12)
+    finger = Finger.recorded(file, start=4.0)
+    time = np.arange(0, 3.5, 1 / 5000)
+    felt = texture.waveform(time, finger.position(time))
+    assert np.abs(felt).max() == pytest.approx(20e-6, rel=0.02)
+    assert not felt[np.isnan(finger.position(time))].any()
+
+
+def test_a_synthetic_texture_is_the_same_everywhere():
+    texture = Synthetic(amplitude=10e-6, components=3)
+    assert texture.bands(5000.0).frequency == pytest.approx([42.7392, 210.3957, 380.8195], abs=1e-4)
+
+
+@pytest.mark.parametrize("components", range(1, 9))
+@pytest.mark.parametrize("seed", [0, 1, 2**32 - 1])
+def test_synthetic_components_keep_apart_and_within_their_bounds(components, seed):
+    texture = Synthetic(amplitude=10e-6, components=components, seed=seed)
+    frequency = texture.bands(5000.0).frequency
+    assert len(frequency) == components
+    assert np.diff(frequency, prepend=-10.0).min() >= 40.0 - 1e-9
+    assert frequency.max() <= 400.0
+    time = np.arange(0, 5, 1 / 5000)
+    assert np.abs(texture.waveform(time, time)).max() <= 10e-6
+
+
+def test_a_synthetic_texture_over_position_is_the_one_over_time_at_its_speed():
+    in_time, in_space = Synthetic(amplitude=1e-6), Synthetic(amplitude=1e-6, speed=0.08)
+    time = np.arange(0, 1, 1 / 5000)
+    np.testing.assert_allclose(
+        in_space.waveform(np.zeros_like(time), 0.08 * time), in_time.waveform(time, time), atol=1e-6 * 1e-9
+    )
+    np.testing.assert_allclose(in_space.bands(5e3).wavenumber, in_time.bands(5e3).frequency / 0.08, rtol=1e-12)
+    assert not in_space.waveform(time, np.full(time.size, np.nan)).any()
+
+
+def test_synthetic_components_wax_and_wane():
+    texture = Synthetic(amplitude=1e-6, components=1)
+    loudness = np.abs(texture.waveform(np.arange(0, 6, 1e-4), np.zeros(60000))).reshape(60, 1000).max(axis=1)
+    assert loudness.max() / loudness.min() == pytest.approx(3.0, rel=0.05)  # (1 + 1/2)/(1 - 1/2)

@@ -1,0 +1,353 @@
+"""Scenes: TOML in and out without loss, and one clear line for whatever is wrong."""
+
+import pickle
+
+import numpy as np
+import pytest
+import soundfile
+from hypothesis import example, given
+from hypothesis import strategies as st
+
+from hapticrender.bands import Bands
+from hapticrender.errors import SceneError
+from hapticrender.touch import toml
+from hapticrender.touch.builtin import builtin_scenes
+from hapticrender.touch.finger import Finger
+from hapticrender.touch.grating import Grating
+from hapticrender.touch.mechanics import FingerMechanics
+from hapticrender.touch.recorded import Recorded, Synthetic
+from hapticrender.touch.scene import MOTIONS, TEXTURES, Scene
+
+GOOD = """
+duration = 2.0
+[texture]
+kind = "grating"
+amplitude = 1e-5
+wavelength = 1e-3
+[finger]
+motion = "sliding"
+speed = 0.08
+normal_load = 0.4
+[plant]
+sensor_noise = 0.0
+"""
+
+TONE = Grating(amplitude=1 / 3 * 1e-5, frequency=np.pi * 20)
+FINGERS = {
+    "absent": Finger.absent(),
+    "still": Finger.still(0.01, mechanics="heavy-2nd-order", touches=[]),
+    "sliding": Finger.sliding(0.08, normal_load=[[0, 1.5], [0.2, 1 / 7]], mechanics="heavy", load_scaling=True),
+    "swiping": Finger.swiping(3, stroke=0.02, touches=[(0, 1), (1, 2.5)], mechanics="auto"),
+    "sampled": Finger.sampled([0.1 / 3, -0.01], times=[0, 2], mechanics=FingerMechanics(order=2, damping=1 / 3)),
+}
+TEXTURE_CASES = {
+    "tone": TONE,
+    "partials": Grating(amplitude=1e-6, wavelength=1e-3, partials=[(1, 1, 0), (2.5, -1 / 3, 0.1)]),
+    "square": Grating(amplitude=1e-6, frequency=20.0, shape="square", harmonics=7, phase=-0.3),
+    "synthetic": Synthetic(amplitude=1e-6, speed=0.08, seed=5),
+}
+
+
+@pytest.mark.parametrize("name", builtin_scenes())
+def test_built_in_scenes_survive_toml(name):
+    scene = builtin_scenes()[name]
+    assert scene.name == name
+    assert Scene.from_toml_text(scene.to_toml()) == scene
+
+
+def test_the_built_in_scenes_are_those_of_the_demo():
+    assert list(builtin_scenes()) == [
+        *(f"grating-{frequency}" for frequency in (20, 31, 47, 72, 111, 170, 261, 400)),
+        *("spatial-grating", "recorded-texture", "sliding", "pressing", "swiping"),
+    ]
+
+
+def test_built_in_fingers_stay_on_the_glass():
+    """The glass reaches from -55 to 55 mm (FACTS section 1)."""
+    for scene in builtin_scenes().values():
+        position = scene.finger.position(np.arange(0, scene.duration, 1e-3))
+        assert not (np.abs(position[np.isfinite(position)]) > 0.055).any()
+
+
+@pytest.mark.parametrize("finger", FINGERS)
+@pytest.mark.parametrize("texture", TEXTURE_CASES)
+def test_every_scene_survives_toml_to_the_last_bit(texture, finger):
+    scene = Scene(
+        texture=TEXTURE_CASES[texture],
+        finger=FINGERS[finger],
+        device="vt-plate",
+        duration=1 / 3,
+        tolerance=0.1 + 0.2,
+        settle=0.0,
+        name='π "quoted" \x20name',
+        plant={"sensor_noise": 1e-300, "shaped": True, "count": 3, "level of\x7f\n": 'a "b"\x7f\n\\'},
+    )
+    again = Scene.from_toml_text(scene.to_toml())
+    assert again == scene
+    assert again.to_toml() == scene.to_toml()
+    assert pickle.loads(pickle.dumps(scene)) == scene
+    assert hash(again) == hash(scene)
+
+
+def test_a_scene_file_has_its_stem_for_a_name_and_finds_files_beside_it(tmp_path):
+    soundfile.write(tmp_path / "denim.wav", np.sin(np.arange(4000.0)), 8000)
+    path = tmp_path / "my scene.toml"
+    path.write_text('duration = 1\n[texture]\nkind = "recorded"\nfile = "denim.wav"\namplitude = 1e-5\n')
+    scene = Scene.from_toml(path)
+    assert scene.name == "my scene"
+    assert scene.texture == Recorded(file=tmp_path / "denim.wav", amplitude=1e-5)
+    assert Scene.from_toml_text(scene.to_toml()) == scene
+
+
+def test_the_real_finger_survives_toml(shared_data):
+    file = shared_data / "swipe_40mm_s.npz"
+    scene = Scene(texture=TONE, finger=Finger.recorded(file, start=4.0, mechanics="auto"), duration=3.0)
+    assert Scene.from_toml_text(scene.to_toml()) == scene
+
+
+class Own:
+    """A texture of the user's own."""
+
+    def bands(self, rate):
+        return Bands(frequency=np.array([50.0]), wavenumber=np.zeros(1), phase=np.zeros(1))
+
+    def waveform(self, time, position):
+        return np.zeros(np.shape(time))
+
+    def __repr__(self):
+        return "Own\n(3)"
+
+
+def test_a_texture_of_ones_own_is_described_but_not_played_again():
+    again = Scene.from_toml_text(Scene(texture=Own(), duration=1.0).to_toml())
+    assert again.texture.description == "Own (3)"
+    with pytest.raises(SceneError, match=r"description = 'Own \(3\)': a texture made in Python cannot be played"):
+        again.texture.bands(5000.0)
+
+
+REFUSED = {
+    "duration": [
+        ("duration = 2.0", "", r"duration is missing: must be a finite number > 0 and <= 360000 s"),
+        ("duration = 2.0", "duration = 0", r"duration = 0: must be .* > 0 .* s"),
+        ("duration = 2.0", "duration = -1.0", r"duration = -1.0: must be .* > 0 .* s"),
+        ("duration = 2.0", "duration = inf", r"duration = inf: must be a finite number"),
+        ("duration = 2.0", "duration = 1e9", r"duration = 1000000000.0: must be .* <= 360000 s"),
+        ("duration = 2.0", 'duration = "2 s"', r"duration = '2 s': must be a finite number .* s"),
+        ("duration = 2.0", "duration = true", r"duration = True: must be a finite number .* s"),
+        ("duration = 2.0", "duration = 1979-05-27", r"duration = datetime.date\(1979, 5, 27\): must be"),
+        ("duration = 2.0", "duration = 0x" + "f" * 6000, r"duration = an integer beyond 1e30: must be"),
+        ("duration = 2.0", "duration = " + "9" * 6000, r"must be TOML"),
+        ("duration = 2.0", "duration = 2.0\ntolerance = nan", r"tolerance = nan: must be a finite number > 0"),
+        ("duration = 2.0", "duration = 2.0\nsettle = -1", r"settle = -1: must be .* >= 0 .* s"),
+        ("duration = 2.0", "duration = 2.0\nlength = 1", r"length = 1: unknown key; known: texture, finger, device"),
+        ("duration = 2.0", 'duration = 2.0\nname = "../up"', r"name = '../up': must be 1 to 100 printable"),
+        ("duration = 2.0", 'duration = 2.0\n"\\n" = 1', r"'\\n' = 1: unknown key"),
+    ],
+    "texture": [
+        ("[texture]", "[texture_]", r"texture_ = .*: unknown key"),
+        ('kind = "grating"', "", r"texture.kind is missing: must be one of grating, recorded, swipe"),
+        ('kind = "grating"', 'kind = "gratin"', r"texture.kind = 'gratin': must be one of grating"),
+        ('kind = "grating"', "kind = [1]", r"texture.kind = \[1\]: must be one of grating"),
+        ("amplitude = 1e-5", "", r"texture.amplitude is missing: must be .* m"),
+        ("amplitude = 1e-5", "amplitude = 10", r"texture.amplitude = 10: must be .* > 0 and <= 0.01 m"),
+        ("wavelength = 1e-3", "wavelength = 0.0", r"texture.wavelength = 0.0: must be .* m"),
+        ("wavelength = 1e-3", "wavelenght = 1e-3", r"texture.wavelenght = 0.001: unknown key; known: kind, amplitude"),
+        ("wavelength = 1e-3", "wavelength = 1e-3\nfrequency = 20", r"texture.frequency, wavelength: exactly one"),
+        (
+            "wavelength = 1e-3",
+            "wavelength = 1e-3\npartials = [{order = 1}]",
+            r"texture.partials\[0\].amplitude is miss",
+        ),
+    ],
+    "finger": [
+        ('motion = "sliding"', "", r"finger.motion is missing: must be one of none, still"),
+        ("speed = 0.08", "", r"finger.speed is missing: must be .* m/s"),
+        ("speed = 0.08", "speed = -0.08", r"finger.speed = -0.08: must be .* > 0 .* m/s"),
+        ("speed = 0.08", "speed = 80", r"finger.speed = 80: must be .* <= 10 m/s"),
+        ("speed = 0.08", "speed = 0.08\nfrequency = 3", r"finger.frequency = 3: unknown key; known: motion, speed"),
+        ("normal_load = 0.4", "normal_load = -0.4", r"finger.normal_load = -0.4: must be .* >= 0 and <= 20 N"),
+        ("normal_load = 0.4", "touches = [[1.0, 0.5]]", r"finger.touches\[0\] = \[1.0, 0.5\]: must be pairs .* s"),
+        ("normal_load = 0.4", "mechanics = {order = 2, mas = 1}", r"finger.mechanics.'mas': unknown key"),
+        ("normal_load = 0.4", "mechanics = {order = 2, mass = 4}", r"finger.mechanics.mass = 4: must be .* kg"),
+    ],
+    "plant": [
+        ("sensor_noise = 0.0", "sensor_noise = nan", r"plant.sensor_noise = nan: must be a finite number"),
+        ("sensor_noise = 0.0", "sensor_noise = [1]", r"plant.sensor_noise = \[1\]: must be a finite number"),
+        ("[plant]\nsensor_noise = 0.0", "plant = 3", r"finger.plant = 3: unknown key"),
+    ],
+}
+CASES = [case for cases in REFUSED.values() for case in cases]
+
+
+@pytest.mark.parametrize(("good", "bad", "message"), CASES, ids=[f"{i}" for i in range(len(CASES))])
+def test_a_malformed_scene_is_refused_in_one_line(good, bad, message):
+    assert good in GOOD
+    with pytest.raises(SceneError, match=f"^scene.toml: ({message})") as refused:
+        Scene.from_toml_text(GOOD.replace(good, bad), "scene.toml")
+    assert len(str(refused.value).splitlines()) == 1
+
+
+def test_the_text_that_the_cases_spoil_is_good():
+    scene = Scene.from_toml_text(GOOD)
+    assert scene.plant == {"sensor_noise": 0.0}
+    assert scene.finger == Finger.sliding(0.08, normal_load=0.4)
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (b"duration = \n", r"must be TOML \(Invalid value \(at line 1"),
+        (b"\xff\xfe\x00", r"byte 0: must be UTF-8 text"),
+        (b"", r"texture is missing: must be a table with kind = one of"),
+        (b"a = " + b"[" * 5000, r"must be TOML \("),
+        (b'[texture]\nkind = "recorded"\nfile = "none.wav"\namplitude = 1e-6', r"duration is missing"),
+        (
+            b'duration = 1\n[texture]\nkind = "recorded"\nfile = "none.wav"\namplitude = 1e-6',
+            r"texture.file = '.*none.wav': must be an existing sound file",
+        ),
+        (
+            b'duration = 1\n[texture]\nkind = "grating"\namplitude = 1e-6\nfrequency = 9\n'
+            b'[finger]\nmotion = "swipe"\nfile = "none.npz"',
+            r"finger.file = '.*none.npz': must be an existing .npz file",
+        ),
+    ],
+)
+def test_a_bad_file_is_refused_in_one_line(tmp_path, content, message):
+    path = tmp_path / "scene.toml"
+    path.write_bytes(content)
+    with pytest.raises(SceneError, match=f"scene.toml: {message}") as refused:
+        Scene.from_toml(path)
+    assert len(str(refused.value).splitlines()) == 1
+
+
+@pytest.mark.parametrize("name", ["absent.toml", ".", "a\0b", "x" * 5000])
+def test_what_is_no_file_is_refused(tmp_path, name):
+    with pytest.raises(SceneError, match=r"must be a readable file"):
+        Scene.from_toml(f"{tmp_path}/{name}")
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"texture": 3}, r"texture = 3: must be a texture"),
+        ({"finger": None}, r"finger is missing: must be a Finger"),
+        ({"duration": None}, r"duration is missing"),
+        ({"plant": [1]}, r"plant = \[1\]: must be a table"),
+        ({"plant": {1: 2}}, r"plant = 1: must be a table with texts as keys"),
+        ({"device": ""}, r"device = '': must be 1 to 100"),
+    ],
+)
+def test_wrong_python_arguments_are_refused_alike(wrong, message):
+    with pytest.raises((ValueError, TypeError), match=f"^{message}"):
+        Scene(**({"texture": TONE, "duration": 1.0} | wrong))
+
+
+NUMBERS = st.one_of(
+    st.floats(), st.integers(), st.floats(0, 1), st.sampled_from([0.0, -0.0, 5e-324, 1e308, 1e-9, 0.5, 2, 2**70])
+)
+NAMES = st.sampled_from([*TEXTURES, *MOTIONS, "light", "heavy", "auto", "sine", "square", "vt-plate", ".", "/", "a\0"])
+LEAVES = st.one_of(NUMBERS, NAMES, st.booleans(), st.text(st.characters(exclude_categories=["Cs"]), max_size=5))
+KEYS = st.sampled_from(
+    "kind amplitude gain frequency wavelength shape harmonics partials phase file channel speed carriers spacing "
+    "passband components seed motion at span centre stroke positions rate times start normal_load touches mechanics "
+    "load_scaling description order mass damping".split()
+)
+VALUES = st.recursive(LEAVES, lambda inner: st.lists(inner, max_size=4) | st.dictionaries(KEYS, inner, max_size=3))
+SCENES = st.fixed_dictionaries(
+    {"texture": st.dictionaries(KEYS, VALUES, max_size=5) | VALUES},
+    optional={
+        "duration": NUMBERS | VALUES,
+        "finger": st.dictionaries(KEYS, VALUES, max_size=6) | VALUES,
+        "plant": st.dictionaries(st.text(st.characters(exclude_categories=["Cs"])), VALUES, max_size=2) | VALUES,
+        **{key: VALUES for key in ("tolerance", "settle", "name", "device", "other")},
+    },
+)
+
+
+def accept_or_refuse(text):
+    """A scene that survives TOML, or a SceneError of one line; anything else is a traceback for the user."""
+    refused = ""
+    try:
+        scene = Scene.from_toml_text(text)
+    except SceneError as problem:
+        refused = str(problem)
+    if refused:
+        assert refused.isprintable() or "must be TOML" in refused
+        assert len(refused.splitlines()) == 1
+    else:
+        assert Scene.from_toml_text(scene.to_toml()) == scene
+        play(scene)
+
+
+def play(scene):
+    """Whatever was accepted gives finite numbers, tiny ones included."""
+    time = np.array([0.0, 0.3, 1.0, 3.6e5])
+    with np.errstate(under="ignore"):
+        try:
+            position = scene.finger.position(time)
+            curves = [scene.finger.load(time), scene.finger.strength(time), scene.texture.waveform(time, position)]
+        except SceneError as refused:
+            curves = [0.0 if "made in Python" in str(refused) else np.nan]
+    assert np.isfinite(curves).all()
+
+
+@given(SCENES)
+def test_no_random_scene_is_a_traceback(table):
+    accept_or_refuse(toml.dumps(table))
+
+
+POSITIVE = st.floats(0, 1e-2) | st.floats(0, 10) | NUMBERS
+GOOD_TEXTURES = [
+    {"kind": "grating", "amplitude": 1e-6, "frequency": 20.0},
+    {"kind": "grating", "amplitude": 1e-6, "wavelength": 1e-3, "shape": "square"},
+    {"kind": "synthetic", "amplitude": 1e-6, "speed": 0.1},
+    {"kind": "foreign", "description": "own"},
+    {"kind": "recorded", "amplitude": 1e-6, "file": "absent.wav"},
+]
+GOOD_FINGERS = [
+    {"motion": "none"},
+    {"motion": "still", "normal_load": 0.4},
+    {"motion": "sliding", "speed": 0.1, "mechanics": "heavy"},
+    {"motion": "swiping", "frequency": 3.0, "stroke": 0.05, "load_scaling": True, "mechanics": "light"},
+    {"motion": "sampled", "positions": [0.0, 0.1], "times": [0.0, 1.0], "mechanics": "auto"},
+    {"motion": "swipe", "file": "absent.npz"},
+]
+
+
+def spoiled(tables):
+    """One of the good tables with one of its entries made another number, or anything."""
+
+    def spoil(table):
+        return st.tuples(st.sampled_from(list(table)), POSITIVE | POSITIVE | VALUES).map(
+            lambda new: table | dict([new])
+        )
+
+    return st.sampled_from(tables).flatmap(spoil) | st.sampled_from(tables)
+
+
+@given(spoiled(GOOD_TEXTURES), spoiled(GOOD_FINGERS))
+def test_no_nearly_good_scene_is_a_traceback(texture, finger):
+    accept_or_refuse(toml.dumps({"duration": 1.0, "texture": texture, "finger": finger}))
+
+
+@given(st.text(max_size=60) | st.text(alphabet="=[]{}\"'.,#\n ae0-", max_size=60))
+@example("\ufeffduration = 1")
+@example('a = "\\uD800"')
+def test_no_random_text_is_a_traceback(text):
+    accept_or_refuse(text)
+
+
+@given(st.binary(max_size=60))
+def test_no_random_file_is_a_traceback(tmp_path_factory, content):
+    path = tmp_path_factory.getbasetemp() / "random.toml"
+    path.write_bytes(content)
+    with pytest.raises(SceneError, match=r"random.toml: "):
+        Scene.from_toml(path)
+
+
+@given(st.dictionaries(st.text(st.characters(exclude_categories=["Cs"])), LEAVES | st.lists(LEAVES)))
+def test_what_is_written_is_read_back(table):
+    import tomllib
+
+    again = tomllib.loads(toml.dumps(table))
+    np.testing.assert_equal(again, table)
