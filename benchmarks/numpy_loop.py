@@ -13,36 +13,38 @@ class NumpyPolar:
     """Paper's controller, one numpy expression a line; arrays are (coordinates, bands)."""
 
     def __init__(self, tables):
-        self.t = tables
-        coordinates, bands = tables.gain.shape[0], len(tables.frequency)
-        self.turns = tables.phase.copy()
+        self.listen, self.speak, self.numbers = tables.listen, tables.speak, tables.numbers
+        self.frequency, _, phase, re, im = tables.tone
+        wanted = re + 1j * im
+        coordinates, bands = len(tables.gain), len(wanted)
+        self.turns = phase.copy()
         self.s = np.zeros((2, coordinates, bands), complex)
         self.amplitude = np.zeros((2, coordinates, bands))
         self.angle = np.zeros((2, coordinates, bands))
-        at = tables.frequency / tables.table_step
+        at = self.frequency / self.numbers.table_step
         self.gain = np.array([np.interp(at, np.arange(row.size), row) for row in tables.gain])
-        self.unit = np.exp(1j * np.angle(tables.envelope))
-        self.wanted = abs(tables.envelope)
+        self.unit = np.exp(1j * np.angle(wanted))
+        self.wanted = abs(wanted)
 
     def step(self, sensed):
-        t = self.t
         carrier = np.exp(2j * np.pi * self.turns)
-        self.turns = np.mod(self.turns + t.frequency / t.rate, 1.0)
-        y = (t.coordinate_from_sensed @ sensed)[:, None]
-        b0, b1, b2, a1, a2 = t.filter
+        self.turns = np.mod(self.turns + self.frequency / self.numbers.rate, 1.0)
+        y = (self.listen @ sensed)[:, None]
+        b0, b1, b2, a1, a2 = self.numbers.filter
         u = 2.0 * y * carrier.conj()
         x = b0 * u + self.s[0]
         self.s = np.stack([b1 * u - a1 * x + self.s[1], b2 * u - a2 * x])
         lag = np.angle(x * self.unit.conj())
         lag = np.where(lag > np.pi / 2, lag - 2 * np.pi, lag)
-        b0, b1, b2, a1, a2 = t.law
+        b0, b1, b2, a1, a2 = self.numbers.law
         theta = b0 * -lag + self.angle[0]
         self.angle = np.stack([b1 * -lag - a1 * theta + self.angle[1], b2 * -lag - a2 * theta])
         error = self.wanted - abs(x)
         command = np.maximum(b0 * error + self.amplitude[0], 0.0)
         self.amplitude = np.stack([b1 * error - a1 * command + self.amplitude[1], b2 * error - a2 * command])
         force = (command / self.gain * (self.unit * carrier * np.exp(1j * theta)).real).sum(axis=1)
-        return np.clip(t.drive_from_coordinate @ force, -t.drive_limit, t.drive_limit)
+        limit = self.numbers.drive_limit
+        return np.clip(self.speak @ force, -limit, limit)
 
 
 class NumpyPlate:
@@ -76,5 +78,6 @@ def run(controller, plate, samples, noise):
     for n in range(samples):
         sensed[n] = plate.sense() + noise[n]
         plate.advance(last)
-        drive[n] = last = controller.step(sensed[n])
+        drive[n] = last
+        last = controller.step(sensed[n])
     return drive, sensed

@@ -42,8 +42,8 @@ _HOMES = {
     "touch.finger": ("Finger",),
     "touch.grating": ("Grating",),
     "touch.mechanics": ("FingerMechanics",),
-    "touch.motion": ("Sampled", "Sliding", "Still", "Swiping"),
-    "touch.recorded": ("Recorded", "Synthetic"),
+    "touch.motion": ("Sampled", "Sliding", "Still", "Swiping", "Tracked"),
+    "touch.recorded": ("Recorded", "Swipe", "Synthetic"),
     "touch.scene": ("Scene",),
 }
 _HOME_OF = {name: home for home, names in _HOMES.items() for name in names}
@@ -76,7 +76,9 @@ if TYPE_CHECKING:
     from hapticrender.touch.motion import Sliding as Sliding
     from hapticrender.touch.motion import Still as Still
     from hapticrender.touch.motion import Swiping as Swiping
+    from hapticrender.touch.motion import Tracked as Tracked
     from hapticrender.touch.recorded import Recorded as Recorded
+    from hapticrender.touch.recorded import Swipe as Swipe
     from hapticrender.touch.recorded import Synthetic as Synthetic
     from hapticrender.touch.scene import Scene as Scene
 

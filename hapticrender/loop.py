@@ -136,7 +136,7 @@ def run(session: Session, *, journal: str | Path | None = None, progress: Progre
 
 
 class _Block(NamedTuple):
-    """What happened over some samples, complete: the columns of a recording."""
+    """What happened over some samples, complete: the columns of a recording; `drive` as handed to the device."""
 
     drive: Array
     sensed: Array
@@ -193,8 +193,9 @@ class _Ring:
         """One block round the ring."""
         block = _complete(session, at, session.driver.play(self.drive))
         wanted = _wanted(session, at, block.position)
+        played = self.drive
         self.drive, target, flags = session.controller.run(block.sensed, block.position, wanted)
-        return block._replace(drive=self.drive, target=target, flags=flags | block.flags)
+        return block._replace(drive=played, target=target, flags=flags | block.flags)
 
 
 def _complete(session: Session, at: int, sensed: Sensed) -> _Block:

@@ -107,7 +107,7 @@ class Plant(Protocol):
         ...
 
     def closed_loop(self, controller: Controller, wanted: Array) -> tuple[Array, Array, Array, Sensed]:
-        """Advance plant and controller together, sample by sample; returns drive, target, flags, sensed."""
+        """Advance plant and controller together, sample by sample; returns drive (as played), target, flags, sensed."""
         ...
 
     def finger_position(self, n: int) -> Array:

@@ -109,6 +109,7 @@ class Recorder:
         Parameters
         ----------
         drive : ndarray, shape (n, drive_channels), A
+            What the device was handed for each interval.
         sensed : ndarray, shape (n, sensed_channels), m
         motion : ndarray, shape (n, places), m
             True motion, or what comes nearest where the device knows no truth.

@@ -6,6 +6,10 @@ A and Theta commanded amplitude and phase.  A carrier that runs backwards (the
 finger reverses) is followed as its mirror image: x = Re X e^{j phi} =
 Re conj(X) e^{-j phi}, so that psi always runs forward and every complex state
 is conjugated at the reversal.
+
+Everything a band owns is a column of a 2-D array, the band index innermost;
+rows are named below.  Numbers shared by all bands travel in a tuple without
+arrays, which costs nothing to pass.
 """
 
 from __future__ import annotations
@@ -21,9 +25,25 @@ QUIET = 1e-12  # m: below this a target counts as silence and its phase means no
 VELOCITY_POLE = 40.0  # Hz: smoothing of the finger's velocity, used only to look up gains and to fade
 GATE_TIME = 0.02  # s: finger-locked targets fade in and out with contact
 
+# rows of PolarTables.tone
+FREQUENCY, WAVENUMBER, PHASE, WANTED_RE, WANTED_IM = range(5)
+TONE_ROWS = 5
+# rows of PolarState.band: fixed part of the carrier (turns), its direction (+1, -1), unit vector of the last target
+# that was not silence, low-pass states of the wanted waveform; then what this sample's carrier and target are
+TURNS, FORWARD, HEADING_RE, HEADING_IM, REF_RE1, REF_RE2, REF_IM1, REF_IM2 = range(8)
+COS, SIN, TARGET_RE, TARGET_IM, NOW = range(8, 13)
+BAND_ROWS = 13
+# rows of PolarState.loop, LOOP_ROWS for each coordinate: low-pass states, states of amplitude and phase loop
+RE1, RE2, IM1, IM2, AMPLITUDE1, AMPLITUDE2, THETA1, THETA2 = range(8)
+LOOP_ROWS = 8
+# entries of PolarState.finger
+HELD, VELOCITY, GATE, SEEN = range(4)
 
-class PolarTables(NamedTuple):
-    """Parameters of the polar controller; arrays are (coordinates, bands) or (bands,) unless said."""
+Section = tuple[float, float, float, float, float]  # b0 b1 b2 a1 a2, a0 = 1
+
+
+class PolarNumbers(NamedTuple):
+    """What all bands share."""
 
     rate: float
     feedback: bool  # False: nothing is sensed, drive straight from the look-up table
@@ -32,39 +52,42 @@ class PolarTables(NamedTuple):
     sensed_limit: float  # beyond it a sensor is not believed
     lowest: float  # Hz
     highest: float  # Hz
-    frequency: Array
-    wavenumber: Array
-    phase: Array  # turns
-    envelope: Array  # complex
-    coordinate_from_sensed: Array  # (coordinates, sensors)
-    drive_from_coordinate: Array  # (channels, coordinates)
-    filter: Array  # b0 b1 b2 a1 a2 of the STDFT* low pass
-    law: Array  # the same of the loop controller
+    filter: Section  # low pass of the STDFT*
+    law: Section  # loop controller
+    table_step: float  # Hz
+
+
+class PolarTables(NamedTuple):
+    """Parameters of the polar controller."""
+
+    numbers: PolarNumbers
+    tone: Array  # (TONE_ROWS, bands)
+    listen: Array  # (coordinates, sensors)
+    speak: Array  # (channels, coordinates)
     gain: Array  # (coordinates, table), m per drive unit
     lag: Array  # (coordinates, table), rad: phase of the free device, hold and delay included
-    table_step: float  # Hz
 
 
 class PolarState(NamedTuple):
     """State of the polar controller; changed in place."""
 
-    turns: Array  # (bands,) fixed part of the carrier, turns, in [0, 1)
-    forward: Array  # (bands,) +1 or -1: direction of each carrier
-    motion: Array  # held position (m), velocity (m/s), gate 0..1, finger seen before (0/1)
-    estimate: Array  # (4, coordinates, bands): low-pass states re1 re2 im1 im2
-    reference: Array  # (4, bands): the same for the wanted waveform
-    heading: Array  # (2, bands): unit vector of the last target that was not silence
-    amplitude: Array  # (2, coordinates, bands): states of the amplitude loop
-    angle: Array  # (2, coordinates, bands): states of the phase loop
+    band: Array  # (BAND_ROWS, bands)
+    loop: Array  # (coordinates * LOOP_ROWS, bands)
+    finger: Array  # (4,) held position (m), velocity (m/s), gate 0..1, seen before (0 or 1)
     coordinate: Array  # (coordinates,) scratch
-    command: Array  # (coordinates,) scratch
 
 
 @kernel
-def biquad_step(coefficients, state1, state2, x):
+def biquad_step(section, state1, state2, x):
     """Second-order section, transposed direct form II; returns output and new states."""
-    y = coefficients[0] * x + state1
-    return y, coefficients[1] * x - coefficients[3] * y + state2, coefficients[2] * x - coefficients[4] * y
+    y = section[0] * x + state1
+    return y, section[1] * x - section[3] * y + state2, section[2] * x - section[4] * y
+
+
+@kernel
+def size(re, im):
+    """Magnitude of a complex number; the amplitudes here neither overflow nor underflow."""
+    return math.sqrt(re * re + im * im)
 
 
 @kernel
@@ -91,132 +114,139 @@ def lookup(table, row, step, frequency):
 
 
 @kernel
-def follow_finger(state, rate, position):
+def follow_finger(finger, rate, position):
     """Hold the position while the finger is away, smooth its velocity, open the gate with contact."""
-    motion = state.motion
     seen = math.isfinite(position)
     velocity = 0.0
     if seen:
-        if motion[3] > 0.0:
-            velocity = (position - motion[0]) * rate
-        motion[0] = position
-    motion[3] = 1.0 if seen else 0.0
-    motion[1] += (1.0 - math.exp(-TURN * VELOCITY_POLE / rate)) * (velocity - motion[1])
+        if finger[SEEN] > 0.0:
+            velocity = (position - finger[HELD]) * rate
+        finger[HELD] = position
+    finger[SEEN] = 1.0 if seen else 0.0
+    finger[VELOCITY] += (1.0 - math.exp(-TURN * VELOCITY_POLE / rate)) * (velocity - finger[VELOCITY])
     ramp = 1.0 / (GATE_TIME * rate)
-    motion[2] = min(motion[2] + ramp, 1.0) if seen else max(motion[2] - ramp, 0.0)
+    finger[GATE] = min(finger[GATE] + ramp, 1.0) if seen else max(finger[GATE] - ramp, 0.0)
 
 
 @kernel
-def mirror(state, k):
+def mirror(band, loop, k):
     """Conjugate every complex state of band k: its carrier has turned round."""
-    state.forward[k] = -state.forward[k]
-    state.reference[2, k] = -state.reference[2, k]
-    state.reference[3, k] = -state.reference[3, k]
-    state.heading[1, k] = -state.heading[1, k]
-    for c in range(state.estimate.shape[1]):
-        state.estimate[2, c, k] = -state.estimate[2, c, k]
-        state.estimate[3, c, k] = -state.estimate[3, c, k]
-        state.angle[0, c, k] = -state.angle[0, c, k]
-        state.angle[1, c, k] = -state.angle[1, c, k]
+    for row in (FORWARD, HEADING_IM, REF_IM1, REF_IM2):
+        band[row, k] = -band[row, k]
+    for base in range(0, loop.shape[0], LOOP_ROWS):
+        for row in (IM1, IM2, THETA1, THETA2):
+            loop[base + row, k] = -loop[base + row, k]
 
 
 @kernel
-def reference_step(tables, state, k, wanted, cos, sin, weight):
-    """Wanted envelope of band k: constant, or the wanted waveform through the same STDFT*."""
-    if tables.analysed:
-        reference = state.reference
-        re, reference[0, k], reference[1, k] = biquad_step(
-            tables.filter, reference[0, k], reference[1, k], 2.0 * wanted * cos
-        )
-        im, reference[2, k], reference[3, k] = biquad_step(
-            tables.filter, reference[2, k], reference[3, k], -2.0 * wanted * sin
-        )
-    else:
-        re = tables.envelope[k].real
-        im = tables.envelope[k].imag * state.forward[k]
-    return weight * re, weight * im
-
-
-@kernel
-def polar_law(tables, state, c, k, x_re, x_im, r_re, r_im):
-    """Amplitude and phase loop of one coordinate and band; returns commanded amplitude (m) and phase (rad)."""
-    wanted = math.hypot(r_re, r_im)
-    lag = 0.0
-    if wanted > QUIET:  # phase of X against R, eq. 5 with the cut moved
-        lag = angle_cut_at_90(x_im * r_re - x_re * r_im, x_re * r_re + x_im * r_im)
-    theta, state.angle[0, c, k], state.angle[1, c, k] = biquad_step(
-        tables.law, state.angle[0, c, k], state.angle[1, c, k], -lag
-    )
-    error = wanted - math.hypot(x_re, x_im)  # eq. 3
-    command = max(tables.law[0] * error + state.amplitude[0, c, k], 0.0)  # never negative: feedback would turn positive
-    state.amplitude[0, c, k] = tables.law[1] * error - tables.law[3] * command + state.amplitude[1, c, k]
-    state.amplitude[1, c, k] = tables.law[2] * error - tables.law[4] * command
-    return command, theta
-
-
-@kernel
-def polar_band(tables, state, k, wanted, target):
-    """One band of one sample: estimate, law, synthesis into `state.command`."""
-    locked = tables.wavenumber[k] > 0.0
-    frequency = tables.frequency[k] + tables.wavenumber[k] * state.motion[1]
-    if frequency * state.forward[k] < 0.0:
-        mirror(state, k)
-    forward = state.forward[k]
-    frequency = abs(frequency)
-    turns = state.turns[k] + tables.wavenumber[k] * state.motion[0] + tables.phase[k]
-    psi = forward * TURN * (turns - math.floor(turns))
-    cos = math.cos(psi)
-    sin = math.sin(psi)
-    weight = state.motion[2] * fade(frequency, tables.lowest, tables.highest) if locked else 1.0
-    r_re, r_im = reference_step(tables, state, k, wanted, cos, sin, weight)
-    target[k] = complex(r_re, forward * r_im)
-    size = math.hypot(r_re, r_im)
-    if size > QUIET:
-        state.heading[0, k] = r_re / size
-        state.heading[1, k] = r_im / size
-    for c in range(state.coordinate.shape[0]):
-        gain = lookup(tables.gain, c, tables.table_step, frequency)
-        if tables.feedback:
-            y = 2.0 * state.coordinate[c]
-            x_re, state.estimate[0, c, k], state.estimate[1, c, k] = biquad_step(
-                tables.filter, state.estimate[0, c, k], state.estimate[1, c, k], y * cos
+def carrier_pass(numbers, tone, band, loop, finger, wanted, target):
+    """Carrier and wanted envelope of every band: constant, or the wanted waveform through the same STDFT*."""
+    for k in range(tone.shape[1]):
+        wavenumber = tone[WAVENUMBER, k]
+        frequency = tone[FREQUENCY, k] + wavenumber * finger[VELOCITY]
+        if frequency * band[FORWARD, k] < 0.0:
+            mirror(band, loop, k)
+        forward = band[FORWARD, k]
+        band[NOW, k] = abs(frequency)
+        turns = band[TURNS, k] + wavenumber * finger[HELD] + tone[PHASE, k]
+        psi = forward * TURN * (turns - math.floor(turns))
+        cos, sin = math.cos(psi), math.sin(psi)
+        if numbers.analysed:
+            re, band[REF_RE1, k], band[REF_RE2, k] = biquad_step(
+                numbers.filter, band[REF_RE1, k], band[REF_RE2, k], 2.0 * wanted * cos
             )
-            x_im, state.estimate[2, c, k], state.estimate[3, c, k] = biquad_step(
-                tables.filter, state.estimate[2, c, k], state.estimate[3, c, k], -y * sin
+            im, band[REF_IM1, k], band[REF_IM2, k] = biquad_step(
+                numbers.filter, band[REF_IM1, k], band[REF_IM2, k], -2.0 * wanted * sin
             )
-            amplitude, theta = polar_law(tables, state, c, k, x_re, x_im, r_re, r_im)
         else:
-            amplitude = size
-            theta = -lookup(tables.lag, c, tables.table_step, frequency)
-        unit_re = state.heading[0, k] * math.cos(theta) - state.heading[1, k] * math.sin(theta)
-        unit_im = state.heading[0, k] * math.sin(theta) + state.heading[1, k] * math.cos(theta)
-        state.command[c] += amplitude / gain * (unit_re * cos - unit_im * sin)
-    turns = state.turns[k] + tables.frequency[k] / tables.rate
-    state.turns[k] = turns - math.floor(turns)
+            re, im = tone[WANTED_RE, k], forward * tone[WANTED_IM, k]
+        if wavenumber > 0.0:
+            weight = finger[GATE] * fade(abs(frequency), numbers.lowest, numbers.highest)
+            re, im = weight * re, weight * im
+        band[COS, k], band[SIN, k], band[TARGET_RE, k], band[TARGET_IM, k] = cos, sin, re, im
+        target[k] = complex(re, forward * im)
+        amplitude = size(re, im)
+        if amplitude > QUIET:
+            band[HEADING_RE, k], band[HEADING_IM, k] = re / amplitude, im / amplitude
+        turns = band[TURNS, k] + tone[FREQUENCY, k] / numbers.rate
+        band[TURNS, k] = turns - math.floor(turns)
+
+
+@kernel
+def polar_pass(numbers, gain, band, loop, c, y):
+    """Amplitude and phase loops of coordinate c over all bands; returns its drive."""
+    base = c * LOOP_ROWS
+    total = 0.0
+    for k in range(band.shape[1]):
+        cos, sin, r_re, r_im = band[COS, k], band[SIN, k], band[TARGET_RE, k], band[TARGET_IM, k]
+        x_re, loop[base + RE1, k], loop[base + RE2, k] = biquad_step(
+            numbers.filter, loop[base + RE1, k], loop[base + RE2, k], 2.0 * y * cos
+        )
+        x_im, loop[base + IM1, k], loop[base + IM2, k] = biquad_step(
+            numbers.filter, loop[base + IM1, k], loop[base + IM2, k], -2.0 * y * sin
+        )
+        wanted = size(r_re, r_im)
+        lag = 0.0
+        if wanted > QUIET:  # phase of X against R, eq. 5 with the cut moved
+            lag = angle_cut_at_90(x_im * r_re - x_re * r_im, x_re * r_re + x_im * r_im)
+        theta, loop[base + THETA1, k], loop[base + THETA2, k] = biquad_step(
+            numbers.law, loop[base + THETA1, k], loop[base + THETA2, k], -lag
+        )
+        law = numbers.law
+        error = wanted - size(x_re, x_im)  # eq. 3
+        command = max(law[0] * error + loop[base + AMPLITUDE1, k], 0.0)  # negative, feedback would turn positive
+        loop[base + AMPLITUDE1, k] = law[1] * error - law[3] * command + loop[base + AMPLITUDE2, k]
+        loop[base + AMPLITUDE2, k] = law[2] * error - law[4] * command
+        total += command / lookup(gain, c, numbers.table_step, band[NOW, k]) * synthesise(band, k, theta)
+    return total
+
+
+@kernel
+def open_pass(numbers, gain, lag, band, c):
+    """Drive of coordinate c straight from the look-up table."""
+    total = 0.0
+    for k in range(band.shape[1]):
+        now = band[NOW, k]
+        wanted = size(band[TARGET_RE, k], band[TARGET_IM, k])
+        unit = synthesise(band, k, -lookup(lag, c, numbers.table_step, now))
+        total += wanted / lookup(gain, c, numbers.table_step, now) * unit
+    return total
+
+
+@kernel
+def synthesise(band, k, theta):
+    """Carrier of band k, of unit amplitude, `theta` (rad) ahead of the direction of its target."""
+    cos, sin = math.cos(theta), math.sin(theta)
+    re = band[HEADING_RE, k] * cos - band[HEADING_IM, k] * sin
+    im = band[HEADING_RE, k] * sin + band[HEADING_IM, k] * cos
+    return re * band[COS, k] - im * band[SIN, k]
 
 
 @kernel
 def polar_step(tables, state, sensed, position, wanted, drive, target):
     """One sample of the whole controller: fills `drive` (channels,) and `target` (bands,), returns flags."""
+    numbers, listen, speak, gain = tables.numbers, tables.listen, tables.speak, tables.gain
+    band, loop, coordinate = state.band, state.loop, state.coordinate
     flags = 0
-    for c in range(state.coordinate.shape[0]):
-        total = 0.0
+    for c in range(coordinate.shape[0]):
+        coordinate[c] = 0.0
         for s in range(sensed.shape[0]):
-            value = sensed[s]
-            if not abs(value) <= tables.sensed_limit:  # NaN included
-                value = 0.0
+            if abs(sensed[s]) <= numbers.sensed_limit:
+                coordinate[c] += listen[c, s] * sensed[s]
+            else:  # NaN included
                 flags |= 2
-            total += tables.coordinate_from_sensed[c, s] * value
-        state.coordinate[c] = total
-        state.command[c] = 0.0
-    follow_finger(state, tables.rate, position)
-    for k in range(state.turns.shape[0]):
-        polar_band(tables, state, k, wanted, target)
+    follow_finger(state.finger, numbers.rate, position)
+    carrier_pass(numbers, tables.tone, band, loop, state.finger, wanted, target)
+    for c in range(coordinate.shape[0]):
+        if numbers.feedback:
+            coordinate[c] = polar_pass(numbers, gain, band, loop, c, coordinate[c])
+        else:
+            coordinate[c] = open_pass(numbers, gain, tables.lag, band, c)
     for i in range(drive.shape[0]):
         total = 0.0
-        for c in range(state.command.shape[0]):
-            total += tables.drive_from_coordinate[i, c] * state.command[c]
-        drive[i] = min(max(total, -tables.drive_limit), tables.drive_limit)
+        for c in range(coordinate.shape[0]):
+            total += speak[i, c] * coordinate[c]
+        drive[i] = min(max(total, -numbers.drive_limit), numbers.drive_limit)
         if drive[i] != total:
             flags |= 1
     return flags

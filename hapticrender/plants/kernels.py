@@ -1,8 +1,9 @@
 """Compiled plate with a finger on it, alone and closed with a controller.
 
 The plate is frozen over one sample (finger position, load and current held)
-and integrated exactly: z+ = exp(A) z + ..., by the Taylor series of the
-exponential's action on the state, with as many terms as rounding asks for.
+and integrated exactly: with z' = A z + b over one period, z grows by the terms
+t_1 = A z + b, t_n = A t_(n-1)/n of the exponential series, as many as rounding
+asks for.  A is renewed whenever the finger has moved or changed its grip.
 Velocities are scaled by the sample period, so that A has no units.
 """
 
@@ -15,20 +16,22 @@ from hapticrender._jit import kernel
 from hapticrender.control.kernels import polar_step
 from hapticrender.protocols import Array
 
+Three = tuple[float, float, float]
+
 
 class PlateTables(NamedTuple):
-    """Parameters of the plate and of the finger on it."""
+    """Parameters of the plate and of the finger on it: numbers only, so that passing them costs nothing."""
 
     period: float
     terms: int
-    inverse_mass: Array  # (2,) heave and rocking, 1/kg; 0: that coordinate is locked
-    stiffness: Array  # k11 k12 k22, N/m: row i of the matrix starts at i
-    damping: Array  # c11 c12 c22, N s/m
+    inverse_mass: tuple[float, float]  # heave and rocking, 1/kg; 0: that coordinate is locked
+    stiffness: Three  # k11 k12 k22, N/m: row i of the matrix starts at i
+    damping: Three  # c11 c12 c22, N s/m
     force_constant: float  # N/A
     lever: float  # 1/a, 1/m: rocking per metre of position
     reach: float  # l/a: sensor distance over a
-    skin: Array  # m b k of the part of the finger that moves with the plate
-    phalanx: Array  # m b k behind it
+    skin: Three  # m b k of the part of the finger that moves with the plate
+    phalanx: Three  # m b k behind it
     coupled: bool  # the phalanx moves (4th order)
     current_limit: float  # A
     current_step: float  # A, 0: not quantised
@@ -41,10 +44,9 @@ class PlateState(NamedTuple):
     """State of the plate; changed in place."""
 
     z: Array  # (6,) heave, rocking, phalanx (m), and the same differentiated, times the period (m)
-    term: Array  # (2, 6) scratch
     frozen: Array  # (2,) lever and strength for which `system` and `push` hold
-    system: Array  # (6, 6)
-    push: Array  # (6, 2)
+    system: Array  # (6, 6) A
+    push: Array  # (3,) heave, cross and rocking of the inverse mass, times the period squared, 1/kg s2
     pending: Array  # (latency, 2) drive on its way
     cursor: Array  # (1,) integer: oldest row of `pending`
     current: Array  # (2,) scratch
@@ -59,123 +61,120 @@ def quantise(value, step, limit):
 
 @kernel
 def plate_system(tables, lever, strength, system, push):
-    """Fill z' = system z + push (F0, F1): `system` (6, 6), `push` (6, 2); `lever` is p/a, time in sample periods."""
-    period = tables.period
-    h = (1.0, lever)
-    skin = tables.skin
-    inverse = tables.inverse_mass
+    """Fill A and the inverse mass for a finger at `lever` (p/a) of `strength` times its nominal impedance."""
+    period, skin, phalanx, inverse = tables.period, tables.skin, tables.phalanx, tables.inverse_mass
     shared = strength * skin[0] / (1.0 + strength * skin[0] * (inverse[0] + lever * lever * inverse[1]))
+    scale = period * period  # inverse of M + m_skin h h^T, h = [1, p/a]: Sherman-Morrison
+    push[0] = scale * (inverse[0] - shared * inverse[0] * inverse[0])
+    push[1] = -scale * shared * inverse[0] * inverse[1] * lever
+    push[2] = scale * (inverse[1] - shared * inverse[1] * inverse[1] * lever * lever)
+    k, c = tables.stiffness, tables.damping
+    hold, drag = strength * skin[2], strength * skin[1]
     for i in range(2):
+        heave, rock = push[i], push[i + 1]  # row i of the inverse mass
+        contact = heave + rock * lever
         system[i, i + 3] = 1.0
-        for j in range(2):
-            # inverse of M + m_skin h h^T (Sherman-Morrison), times the period squared
-            own = inverse[i] if i == j else 0.0
-            push[i + 3, j] = period * period * (own - shared * inverse[i] * h[i] * inverse[j] * h[j])
-    for i in range(2):
-        contact = push[i + 3, 0] + push[i + 3, 1] * lever
-        for j in range(2):
-            k, c = tables.stiffness, tables.damping
-            system[i + 3, j] = -(
-                push[i + 3, 0] * k[j] + push[i + 3, 1] * k[1 + j] + contact * strength * skin[2] * h[j]
-            )
-            system[i + 3, j + 3] = (
-                -(push[i + 3, 0] * c[j] + push[i + 3, 1] * c[1 + j] + contact * strength * skin[1] * h[j]) / period
-            )
-        system[i + 3, 2] = contact * strength * skin[2] if tables.coupled else 0.0
-        system[i + 3, 5] = contact * strength * skin[1] / period if tables.coupled else 0.0
-    if tables.coupled and strength > 0.0:
-        p = tables.phalanx
-        system[2, 5] = 1.0
-        for j in range(2):
-            system[5, j] = period * period * skin[2] * h[j] / p[0]
-            system[5, j + 3] = period * skin[1] * h[j] / p[0]
-        system[5, 2] = -period * period * (skin[2] + p[2]) / p[0]
-        system[5, 5] = -period * (skin[1] + p[1]) / p[0]
-    else:
-        system[2, 5] = 0.0
+        system[i + 3, 0] = -(heave * k[0] + rock * k[1] + contact * hold)
+        system[i + 3, 1] = -(heave * k[1] + rock * k[2] + contact * hold * lever)
+        system[i + 3, 3] = -(heave * c[0] + rock * c[1] + contact * drag) / period
+        system[i + 3, 4] = -(heave * c[1] + rock * c[2] + contact * drag * lever) / period
+        system[i + 3, 2] = contact * hold if tables.coupled else 0.0
+        system[i + 3, 5] = contact * drag / period if tables.coupled else 0.0
+    free = tables.coupled and strength > 0.0
+    system[2, 5] = 1.0 if free else 0.0
+    share = scale / phalanx[0] if free else 0.0
+    system[5, 0] = share * skin[2]
+    system[5, 1] = share * skin[2] * lever
+    system[5, 2] = -share * (skin[2] + phalanx[2])
+    system[5, 3] = share * skin[1] / period
+    system[5, 4] = share * skin[1] * lever / period
+    system[5, 5] = -share * (skin[1] + phalanx[1]) / period
 
 
 @kernel
-def plate_advance(tables, state, position, load, strength):
-    """One sample of motion under `state.current`, exact for the frozen plate."""
-    z = state.z
+def plate_advance(tables, z, frozen, system, push, current, position, load, strength):
+    """One sample of motion under `current` (A), exact for the frozen plate."""
     touching = strength > 0.0
     lever = position * tables.lever if touching else 0.0
-    if not touching:
-        strength = 0.0
-        z[2] = 0.0
-        z[5] = 0.0
-    if lever != state.frozen[0] or strength != state.frozen[1]:
-        plate_system(tables, lever, strength, state.system, state.push)
-        state.frozen[0] = lever
-        state.frozen[1] = strength
-    force = tables.force_constant
     weight = load if touching else 0.0
-    push0 = force * (state.current[0] + state.current[1]) - weight
-    push1 = force * (state.current[1] - state.current[0]) - weight * lever
-    term, other = state.term[0], state.term[1]
-    for i in range(6):
-        term[i] = state.push[i, 0] * push0 + state.push[i, 1] * push1
-        for j in range(6):
-            term[i] += state.system[i, j] * z[j]
-    for n in range(2, tables.terms + 2):
-        for i in range(6):
-            z[i] += term[i]
-            total = 0.0
-            for j in range(6):
-                total += state.system[i, j] * term[j]
-            other[i] = total / n
-        term, other = other, term
+    if not touching:
+        strength = z[2] = z[5] = 0.0
+    if lever != frozen[0] or strength != frozen[1]:
+        plate_system(tables, lever, strength, system, push)
+        frozen[0], frozen[1] = lever, strength
+    force0 = tables.force_constant * (current[0] + current[1]) - weight
+    force1 = tables.force_constant * (current[1] - current[0]) - weight * lever
+    a = system
+    t0, t1, t2, t3, t4, t5 = z[0], z[1], z[2], z[3], z[4], z[5]
+    for n in range(1, tables.terms + 1):
+        s = 1.0 / n
+        f = (a[3, 0] * t0 + a[3, 1] * t1) + (a[3, 2] * t2 + a[3, 3] * t3) + (a[3, 4] * t4 + a[3, 5] * t5)
+        g = (a[4, 0] * t0 + a[4, 1] * t1) + (a[4, 2] * t2 + a[4, 3] * t3) + (a[4, 4] * t4 + a[4, 5] * t5)
+        h = (a[5, 0] * t0 + a[5, 1] * t1) + (a[5, 2] * t2 + a[5, 3] * t3) + (a[5, 4] * t4 + a[5, 5] * t5)
+        if n == 1:
+            f += push[0] * force0 + push[1] * force1
+            g += push[1] * force0 + push[2] * force1
+        t0, t1, t2, t3, t4, t5 = s * t3, s * t4, s * a[2, 5] * t5, s * f, s * g, s * h
+        z[0] += t0
+        z[1] += t1
+        z[2] += t2
+        z[3] += t3
+        z[4] += t4
+        z[5] += t5
 
 
 @kernel
-def plate_sense(tables, state, noise, sensed, motion):
+def plate_sense(tables, z, noise, sensed, motion):
     """Hall sensors at the glass ends and the true motion at centre, end 1, end 2; returns flags."""
     flags = 0
     for i in range(2):
         side = -tables.reach if i == 0 else tables.reach
-        motion[1 + i] = state.z[0] + side * state.z[1]
+        motion[1 + i] = z[0] + side * z[1]
         value = motion[1 + i] + tables.sensor_noise * noise[i]
         if abs(value) > tables.sensor_limit:
             flags |= 4
         sensed[i] = quantise(value, tables.sensor_step, tables.sensor_limit)
-    motion[0] = state.z[0]
+    motion[0] = z[0]
     return flags
 
 
 @kernel
-def plate_drive(tables, state, drive):
+def plate_drive(tables, pending, cursor, current, drive):
     """Queue a drive sample and put the one now due on the coils, quantised and limited."""
-    latency = state.pending.shape[0]
-    row = state.cursor[0]
+    latency = pending.shape[0]
+    row = cursor[0]
     for i in range(2):
         due = drive[i]
         if latency > 0:
-            due = state.pending[row, i]
-            state.pending[row, i] = drive[i]
-        state.current[i] = quantise(due, tables.current_step, tables.current_limit) if math.isfinite(due) else 0.0
+            due = pending[row, i]
+            pending[row, i] = drive[i]
+        current[i] = quantise(due, tables.current_step, tables.current_limit) if math.isfinite(due) else 0.0
     if latency > 0:
-        state.cursor[0] = (row + 1) % latency
+        cursor[0] = (row + 1) % latency
 
 
 @kernel
 def plate_run(tables, state, drive, finger, noise, sensed, motion, flags):
     """A block of the plate alone; `finger` rows are position, load, strength."""
+    z, frozen, system, push, pending, cursor, current = state
     for n in range(drive.shape[0]):
-        flags[n] = plate_sense(tables, state, noise[n], sensed[n], motion[n])
-        plate_drive(tables, state, drive[n])
-        plate_advance(tables, state, finger[n, 0], finger[n, 1], finger[n, 2])
+        flags[n] = plate_sense(tables, z, noise[n], sensed[n], motion[n])
+        plate_drive(tables, pending, cursor, current, drive[n])
+        plate_advance(tables, z, frozen, system, push, current, finger[n, 0], finger[n, 1], finger[n, 2])
 
 
 @kernel
 def polar_plate_run(
     tables, state, polar, polar_state, last, finger, noise, wanted, sensed, motion, drive, target, flags
 ):
-    """Plate and polar controller closed sample by sample; `last` (2,) is the drive computed one sample ago."""
+    """Plate and polar controller closed sample by sample; `last` (2,) is the drive computed one sample ago.
+
+    Row n of `drive` is what the plate was handed for interval n, so it is computed from sample n - 1.
+    """
+    z, frozen, system, push, pending, cursor, current = state
     for n in range(sensed.shape[0]):
-        flags[n] = plate_sense(tables, state, noise[n], sensed[n], motion[n])
-        plate_drive(tables, state, last)
-        plate_advance(tables, state, finger[n, 0], finger[n, 1], finger[n, 2])
-        flags[n] |= polar_step(polar, polar_state, sensed[n], finger[n, 0], wanted[n], drive[n], target[n])
-        for i in range(2):
-            last[i] = drive[n, i]
+        flags[n] = plate_sense(tables, z, noise[n], sensed[n], motion[n])
+        plate_drive(tables, pending, cursor, current, last)
+        plate_advance(tables, z, frozen, system, push, current, finger[n, 0], finger[n, 1], finger[n, 2])
+        drive[n, 0], drive[n, 1] = last[0], last[1]
+        flags[n] |= polar_step(polar, polar_state, sensed[n], finger[n, 0], wanted[n], last, target[n])

@@ -275,10 +275,9 @@ class Plate:
         self._tables = _tables(parameters, finger.mechanics)
         self._state = PlateState(
             z=np.zeros(6),
-            term=np.zeros((2, 6)),
             frozen=np.full(2, np.nan),
             system=np.zeros((6, 6)),
-            push=np.zeros((6, 2)),
+            push=np.zeros(3),
             pending=np.zeros((parameters.delay - block, 2)),
             cursor=np.zeros(1, np.int64),
             current=np.zeros(2),
@@ -329,26 +328,24 @@ class Plate:
 
 
 def _tables(parameters: PlateParameters, mechanics: FingerMechanics) -> PlateTables:
-    """Arrays of the compiled plate."""
+    """Numbers of the compiled plate."""
     order = mechanics.order if parameters.finger_dynamics else 0
     rocking = parameters.degrees_of_freedom == 2
     mass = parameters.mass_matrix.diagonal()
     stiffness, damping = parameters.stiffness_matrix, parameters.damping_matrix
     if not rocking:
         stiffness, damping = np.diag(stiffness.diagonal()), np.diag(damping.diagonal())
-    skin = np.array([mechanics.mass, mechanics.damping, mechanics.stiffness]) if order else np.zeros(3)
-    phalanx = np.array([mechanics.phalanx_mass, mechanics.phalanx_damping, mechanics.phalanx_stiffness])
     tables = PlateTables(
         period=1.0 / parameters.rate,
         terms=0,
-        inverse_mass=np.array([1.0 / mass[0], 1.0 / mass[1] if rocking else 0.0]),
-        stiffness=np.array([stiffness[0, 0], stiffness[0, 1], stiffness[1, 1]]),
-        damping=np.array([damping[0, 0], damping[0, 1], damping[1, 1]]),
+        inverse_mass=(float(1.0 / mass[0]), float(1.0 / mass[1]) if rocking else 0.0),
+        stiffness=_upper(stiffness),
+        damping=_upper(damping),
         force_constant=parameters.force_constant,
         lever=1.0 / parameters.half_spacing,
         reach=parameters.glass_length / parameters.coil_spacing,
-        skin=skin,
-        phalanx=phalanx,
+        skin=(mechanics.mass, mechanics.damping, mechanics.stiffness) if order else (0.0, 0.0, 0.0),
+        phalanx=(mechanics.phalanx_mass, mechanics.phalanx_damping, mechanics.phalanx_stiffness),
         coupled=order == 4,
         current_limit=parameters.current_limit,
         current_step=parameters.current_step,
@@ -359,10 +356,15 @@ def _tables(parameters: PlateParameters, mechanics: FingerMechanics) -> PlateTab
     return tables._replace(terms=_taylor_terms(tables))
 
 
+def _upper(matrix: Array) -> tuple[float, float, float]:
+    """Upper triangle of a symmetric 2 x 2 matrix."""
+    return float(matrix[0, 0]), float(matrix[0, 1]), float(matrix[1, 1])
+
+
 def _taylor_terms(tables: PlateTables) -> int:
     """Terms after which the exponential series has converged to rounding, at the glass end and pressed hard."""
     system = np.zeros((6, 6))
-    plate_system(tables, tables.reach, 3.0, system, np.zeros((6, 2)))
+    plate_system(tables, tables.reach, 3.0, system, np.zeros(3))
     term, n = system, 1
     while abs(term).max() > TAYLOR_ROUNDING:
         n += 1

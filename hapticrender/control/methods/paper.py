@@ -15,7 +15,17 @@ import numpy as np
 
 from hapticrender.bands import Bands
 from hapticrender.control.bandmodel import BandModel
-from hapticrender.control.kernels import PolarState, PolarTables, polar_run
+from hapticrender.control.kernels import (
+    BAND_ROWS,
+    FORWARD,
+    HEADING_RE,
+    LOOP_ROWS,
+    PolarNumbers,
+    PolarState,
+    PolarTables,
+    Section,
+    polar_run,
+)
 from hapticrender.control.loopshape import design
 from hapticrender.protocols import Array
 
@@ -34,27 +44,23 @@ class PolarController:
     """
 
     def __init__(self, method: str, tables: PolarTables) -> None:
-        coordinates, bands = tables.coordinate_from_sensed.shape[0], len(tables.frequency)
+        coordinates, bands = len(tables.listen), tables.tone.shape[1]
         self.method = method
         self.n_bands = bands
         self.tables = tables
+        band = np.zeros((BAND_ROWS, bands))
+        band[[FORWARD, HEADING_RE]] = 1.0
         self.state = PolarState(
-            turns=np.zeros(bands),
-            forward=np.ones(bands),
-            motion=np.zeros(4),
-            estimate=np.zeros((4, coordinates, bands)),
-            reference=np.zeros((4, bands)),
-            heading=np.vstack([np.ones(bands), np.zeros(bands)]),
-            amplitude=np.zeros((2, coordinates, bands)),
-            angle=np.zeros((2, coordinates, bands)),
+            band=band,
+            loop=np.zeros((coordinates * LOOP_ROWS, bands)),
+            finger=np.zeros(4),
             coordinate=np.zeros(coordinates),
-            command=np.zeros(coordinates),
         )
 
     def run(self, sensed: Array, position: Array, wanted: Array) -> tuple[Array, Array, Array]:
         """Digest n samples; see `Controller`."""
         n = len(sensed)
-        drive = np.zeros((n, self.tables.drive_from_coordinate.shape[0]))
+        drive = np.zeros((n, len(self.tables.speak)))
         target = np.zeros((n, self.n_bands), complex)
         flags = np.zeros(n, np.int64)
         polar_run(self.tables, self.state, np.ascontiguousarray(sensed, float), position, wanted, drive, target, flags)
@@ -100,37 +106,42 @@ def _design(
         filter_bandwidth=lowest / 2,
         form="reduced",
         lowest_frequency=lowest,
-        delay=model.delay / model.rate,
+        delay=model.delay / model.rate if feedback else 0.0,
     )
     frequency = np.arange(0.0, model.rate / 2 + TABLE_STEP, TABLE_STEP)
     common = model.response(frequency) @ np.ones(model.force_from_drive.shape[1])
     table = (common @ watched.T).T * model.hold_and_delay(frequency)
-    return PolarController(
-        name,
-        PolarTables(
-            rate=model.rate,
-            feedback=feedback,
-            analysed=bands.envelope is None,
-            drive_limit=model.drive_limit,
-            sensed_limit=model.sensed_limit,
-            lowest=model.lowest_frequency,
-            highest=min(model.highest_frequency, 0.4 * model.rate),
-            frequency=bands.frequency.astype(float),
-            wavenumber=bands.wavenumber.astype(float),
-            phase=bands.phase / (2 * np.pi),
-            envelope=np.zeros(len(bands), complex) if bands.envelope is None else bands.envelope.astype(complex),
-            coordinate_from_sensed=np.ascontiguousarray(watched @ model.coordinate_from_sensed),
-            drive_from_coordinate=spread,
-            filter=_section(loop.low_pass.tustin(model.rate, prewarp=lowest / 2)),
-            law=_section(loop.controller.tustin(model.rate)),
-            gain=np.ascontiguousarray(abs(table)),
-            lag=np.ascontiguousarray(np.unwrap(np.angle(table), axis=1)),
-            table_step=TABLE_STEP,
-        ),
+    numbers = PolarNumbers(
+        rate=float(model.rate),
+        feedback=feedback,
+        analysed=bands.envelope is None,
+        drive_limit=float(model.drive_limit),
+        sensed_limit=float(model.sensed_limit),
+        lowest=float(model.lowest_frequency),
+        highest=min(model.highest_frequency, 0.4 * model.rate),
+        filter=_section(loop.low_pass.tustin(model.rate, prewarp=lowest / 2)),
+        law=_section(loop.controller.tustin(model.rate)),
+        table_step=TABLE_STEP,
     )
+    tables = PolarTables(
+        numbers=numbers,
+        tone=_tone(bands),
+        listen=np.ascontiguousarray(watched @ model.coordinate_from_sensed),
+        speak=spread,
+        gain=np.ascontiguousarray(abs(table)),
+        lag=np.ascontiguousarray(np.unwrap(np.angle(table), axis=1)),
+    )
+    return PolarController(name, tables)
 
 
-def _section(coefficients: tuple[Array, Array]) -> Array:
-    """b0 b1 b2 a1 a2 of a second-order section with a0 = 1."""
+def _tone(bands: Bands) -> Array:
+    """Rows of the carriers and constant targets."""
+    wanted = np.zeros(len(bands), complex) if bands.envelope is None else bands.envelope
+    return np.array([bands.frequency, bands.wavenumber, bands.phase / (2 * np.pi), wanted.real, wanted.imag], float)
+
+
+def _section(coefficients: tuple[Array, Array]) -> Section:
+    """Second-order section with a0 = 1 as five numbers."""
     b, a = coefficients
-    return np.array([*b, *a[1:]], float)
+    b0, b1, b2, a1, a2 = (float(value) for value in (*b, *a[1:]))
+    return b0, b1, b2, a1, a2
