@@ -47,8 +47,8 @@ class FingerMechanics:
 
     References
     ----------
-    Grigorii, Klatzky, Colgate: closed-loop vibrotactile and friction-modulated
-    textures, 2021, Table 1 and the equations of its section on finger models.
+    Grigorii, Li, Peshkin, Colgate: Comparison of wide-band vibrotactile and
+    friction modulation surface gratings, 2021, Table 1 and its equations of the finger.
 
     Examples
     --------
