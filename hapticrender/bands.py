@@ -45,6 +45,11 @@ class Bands:
     def __len__(self) -> int:
         return len(self.frequency)
 
+    def tone(self) -> Array:
+        """Rows of a compiled controller: frequency, wavenumber, phase (turns), wanted real and imaginary part (m)."""
+        wanted = np.zeros(len(self), complex) if self.envelope is None else self.envelope
+        return np.array([self.frequency, self.wavenumber, self.phase / (2 * np.pi), wanted.real, wanted.imag], float)
+
     def carrier_phase(self, time: Array, position: Array) -> Array:
         """Phase of every carrier (rad, in [0, 2 pi), shape (n_samples, n_bands)); `position` NaN holds the phase."""
         turns = np.multiply.outer(np.asarray(time, float), self.frequency)

@@ -160,6 +160,9 @@ class Method(Protocol):
 
     name: str
 
-    def design(self, model: BandModel, bands: Bands, **options: Any) -> Controller:
-        """Validate, choose bandwidths, build tables; may raise `DesignError`."""
+    def design(self, model: BandModel, bands: Bands, *, feedback: bool = True) -> Controller:
+        """Validate, choose bandwidths, build tables; may raise `DesignError`.
+
+        Without `feedback` nothing is sensed: the controller drives from what it knows of the device.
+        """
         ...

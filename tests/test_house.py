@@ -140,7 +140,7 @@ def test_the_layers_would_notice_an_upward_import(tmp_path):
     path.write_text(
         "from typing import TYPE_CHECKING\n"
         "if TYPE_CHECKING:\n    import hapticrender.cli\n"
-        "def late():\n    from ..drivers import base\n    from . import bank\n    import hapticrender.touch.scene\n"
+        "def late():\n    from ..drivers import base\n    from . import nothing\n    import hapticrender.touch.scene\n"
     )
     assert our_imports("hapticrender.control.stray", path) == {
         "hapticrender.drivers.base",

@@ -38,6 +38,10 @@ class BandModel:
         Largest magnitude of each drive channel, > 0.
     sensed_limit : float, sensor unit
         Largest magnitude that a sensor can show, > 0; beyond it a sample is not believed.
+    drive_step : float, drive unit
+        Resolution of the command; 0 is ideal.
+    sensed_noise : float, sensor unit rms
+        White noise of each sensor.
     lowest_frequency, highest_frequency : float, Hz
         Finger-locked carriers fade out beyond these.
 
@@ -58,6 +62,8 @@ class BandModel:
     places: tuple[str, ...]
     drive_limit: float
     sensed_limit: float
+    drive_step: float = 0.0
+    sensed_noise: float = 0.0
     lowest_frequency: float = 20.0
     highest_frequency: float = 1000.0
 

@@ -20,7 +20,16 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from hapticrender.control.bandmodel import BandModel
-from hapticrender.plants.kernels import PlateState, PlateTables, plate_run, plate_system, polar_plate_run
+from hapticrender.control.bank_kernels import BankTables
+from hapticrender.control.kernels import PolarTables
+from hapticrender.plants.kernels import (
+    PlateState,
+    PlateTables,
+    bank_plate_run,
+    plate_run,
+    plate_system,
+    polar_plate_run,
+)
 from hapticrender.protocols import Array, Controller, Sensed
 
 if TYPE_CHECKING:
@@ -208,6 +217,8 @@ class PlateParameters:
             places=PLACES,
             drive_limit=self.current_limit,
             sensed_limit=self.sensor_range,
+            drive_step=self.current_step,
+            sensed_noise=self.sensor_noise,
         )
 
 
@@ -309,7 +320,7 @@ class Plate:
         finger, noise, flags = self._next(n)
         sensed, motion, drive = np.zeros((n, 2)), np.zeros((n, 3)), np.zeros((n, 2))
         target = np.zeros((n, controller.n_bands), complex)
-        polar_plate_run(
+        _CLOSED[type(controller.tables)](
             self._tables,
             self._state,
             controller.tables,
@@ -325,6 +336,9 @@ class Plate:
             flags,
         )
         return drive, target, flags, Sensed(sensed, finger[:, 0], motion, finger[:, 1], flags)
+
+
+_CLOSED = {PolarTables: polar_plate_run, BankTables: bank_plate_run}
 
 
 def _tables(parameters: PlateParameters, mechanics: FingerMechanics) -> PlateTables:

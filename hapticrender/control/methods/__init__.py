@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from hapticrender.control.methods.paper import CommonMode, PerSide
+from hapticrender.control.methods.stiffness import ErrorObserver, SignalObserver
 from hapticrender.protocols import Method
 
-METHODS: dict[str, Method] = {method.name: method for method in (PerSide(), CommonMode())}
+_ALL: tuple[Method, ...] = (PerSide(), CommonMode(), SignalObserver(), ErrorObserver())
+METHODS = {method.name: method for method in _ALL}
 
 
 def method_named(name: str) -> Method:

@@ -9,8 +9,6 @@ this very plate between 129 and 189 Hz.
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
 from hapticrender.bands import Bands
@@ -72,10 +70,10 @@ class PerSide:
 
     name = "paper"
 
-    def design(self, model: BandModel, bands: Bands, **options: Any) -> PolarController:
+    def design(self, model: BandModel, bands: Bands, *, feedback: bool = True) -> PolarController:
         """Loops on the displacements at the transducers, interpolated from the sensors at the ends."""
         sides = model.side_from_coordinate
-        return _design(self.name, model, bands, sides, np.eye(len(sides)), **options)
+        return _design(self.name, model, bands, sides, np.eye(len(sides)), feedback)
 
 
 class CommonMode:
@@ -83,10 +81,10 @@ class CommonMode:
 
     name = "paper-common"
 
-    def design(self, model: BandModel, bands: Bands, **options: Any) -> PolarController:
+    def design(self, model: BandModel, bands: Bands, *, feedback: bool = True) -> PolarController:
         """One pair of loops on heave."""
         sides = model.side_from_coordinate
-        return _design(self.name, model, bands, sides.mean(axis=0, keepdims=True), np.ones((len(sides), 1)), **options)
+        return _design(self.name, model, bands, sides.mean(axis=0, keepdims=True), np.ones((len(sides), 1)), feedback)
 
 
 def _design(
@@ -95,8 +93,7 @@ def _design(
     bands: Bands,
     watched: Array,
     spread: Array,
-    *,
-    feedback: bool = True,
+    feedback: bool,
 ) -> PolarController:
     """Tables of the compiled step: `watched` rows are the controlled displacements, `spread` their drive channels."""
     fixed = bands.frequency[bands.wavenumber == 0.0]
@@ -125,19 +122,13 @@ def _design(
     )
     tables = PolarTables(
         numbers=numbers,
-        tone=_tone(bands),
+        tone=bands.tone(),
         listen=np.ascontiguousarray(watched @ model.coordinate_from_sensed),
         speak=spread,
         gain=np.ascontiguousarray(abs(table)),
         lag=np.ascontiguousarray(np.unwrap(np.angle(table), axis=1)),
     )
     return PolarController(name, tables)
-
-
-def _tone(bands: Bands) -> Array:
-    """Rows of the carriers and constant targets."""
-    wanted = np.zeros(len(bands), complex) if bands.envelope is None else bands.envelope
-    return np.array([bands.frequency, bands.wavenumber, bands.phase / (2 * np.pi), wanted.real, wanted.imag], float)
 
 
 def _section(coefficients: tuple[Array, Array]) -> Section:

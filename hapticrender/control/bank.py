@@ -1,0 +1,175 @@
+"""The band bank as a controller: from a band model and a few rules to the numbers of its compiled step."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from hapticrender.bands import Bands
+from hapticrender.control.bandmodel import BandModel
+from hapticrender.control.bank_kernels import (
+    BAND_ROWS,
+    LOOP_ROWS,
+    SCALE,
+    TOUCH_ROWS,
+    TRACK_ROWS,
+    BankNumbers,
+    BankState,
+    BankTables,
+    bank_run,
+)
+from hapticrender.control.damping import TAPS, damping_taps
+from hapticrender.protocols import Array
+
+CONTACT = (0.05, 0.03)  # N: on, off
+RAMP_TIME = 0.05  # s: a target grows this long, so that it does not strike the modes
+FAST_POLE, FAST_SIGMAS = 30.0, 5.5  # Hz, of the sensor noise behind that pole
+SLOW_POLE, SLOW_SIGMAS = 4.0, 5.0
+BACK_TIME = 2e-3  # s: back-calculation at the limit
+LEAST_NOISE = 1e-9  # m: thresholds never fall to nothing
+
+
+@dataclass(frozen=True, kw_only=True)
+class BankRules:
+    """How a method sets up the bank; rates in 1/s, bandwidths in Hz, times in s.
+
+    Each pair is (in quiet, awake): a detector of the deviation, or contact, wakes the loop for `awake_time`.
+    `integral` has a third number between them, for the slow detector.
+    """
+
+    error_observer: bool
+    observer: tuple[float, float]
+    integral: tuple[float, float, float]
+    adapt: tuple[float, float]
+    rest: tuple[float, float] = (0.0, 0.0)
+    inner: tuple[float, float] = (0.0, 0.0)
+    quality: float = 1.4
+    detect: bool = True
+    awake_time: float = 0.15
+    stirred_time: float = 0.4
+    release: float = 0.05
+
+
+class BankController:
+    """The bank behind the `Controller` protocol.
+
+    Parameters
+    ----------
+    method : str
+        Name of the method that designed it.
+    tables : BankTables
+        Parameters of the compiled step.
+    """
+
+    def __init__(self, method: str, tables: BankTables) -> None:
+        coordinates, bands = len(tables.listen), tables.tone.shape[1]
+        self.method = method
+        self.n_bands = bands
+        self.tables = tables
+        touch = np.zeros(TOUCH_ROWS)
+        touch[SCALE] = 1.0
+        self.state = BankState(
+            band=np.zeros((BAND_ROWS, bands)),
+            loop=np.zeros((coordinates * LOOP_ROWS, bands)),
+            track=np.zeros(TRACK_ROWS),
+            touch=touch,
+            level=np.zeros((2, coordinates)),
+            past=np.zeros((coordinates, tables.taps.shape[1])),
+            residual=np.zeros((2, coordinates)),
+            shaper=np.zeros((2, len(tables.speak))),
+            sample=np.zeros(1, np.int64),
+        )
+
+    def run(self, sensed: Array, position: Array, wanted: Array) -> tuple[Array, Array, Array]:
+        """Digest n samples; see `Controller`."""
+        n = len(sensed)
+        drive = np.zeros((n, len(self.tables.speak)))
+        target = np.zeros((n, self.n_bands), complex)
+        flags = np.zeros(n, np.int64)
+        bank_run(self.tables, self.state, np.ascontiguousarray(sensed, float), position, wanted, drive, target, flags)
+        return drive, target, flags
+
+
+def spacing(bands: Bands, lowest: float) -> float:
+    """Least distance between two carriers (Hz); finger-locked ones with the slowest of them at `lowest` (Hz)."""
+    speed = lowest / bands.wavenumber[bands.wavenumber > 0].min(initial=np.inf)
+    frequency = np.sort(bands.frequency + speed * bands.wavenumber)
+    return float(np.diff(frequency).min(initial=np.inf))
+
+
+def design_bank(
+    method: str, model: BandModel, bands: Bands, rules: BankRules, *, feedback: bool = True
+) -> BankController:
+    """Apply the rules of FACTS section 3 (C, F): observer <= f0/2 and spacing/2 pi, loop <= f0/4, DC band <= f0/8."""
+    if not feedback:
+        rules = replace(rules, observer=(0.0, 0.0), integral=(0.0, 0.0, 0.0), inner=(0.0, 0.0), adapt=(-1.0, -1.0))
+    fixed = bands.frequency[bands.wavenumber == 0.0]
+    lowest = float(fixed.min(initial=model.lowest_frequency if (bands.wavenumber > 0).any() else np.inf))
+    apart = spacing(bands, model.lowest_frequency)
+    period = 1.0 / model.rate
+    pole = [2 * math.pi * min(width, lowest / 2, apart / (2 * math.pi)) for width in rules.observer]
+    fastest = 2 * math.pi * lowest / 4
+    quiet, stirred, awake = (min(rate, fastest) for rate in rules.integral)
+    level = 2 * math.pi * min(6.0, lowest / 8) * period if feedback else 0.0
+    noise = np.sqrt((model.coordinate_from_sensed**2).sum(axis=1).max()) * max(model.sensed_noise, LEAST_NOISE)
+    taps, grip = damping_taps(model, rules.quality) if any(rules.inner) else _no_taps(len(model.mass))
+    numbers = BankNumbers(
+        rate=float(model.rate),
+        analysed=bands.envelope is None,
+        error_observer=rules.error_observer,
+        lead=(model.delay + 0.5) * period,
+        observer=2 * pole[0] * period,
+        observer_awake=2 * pole[1] * period,
+        dc=1.6 * level,
+        dc_drift=level**2,
+        integral=quiet,
+        integral_stirred=stirred,
+        integral_awake=awake,
+        adapt=rules.adapt[0],
+        adapt_awake=rules.adapt[1],
+        rest=rules.rest[0],
+        rest_awake=rules.rest[1],
+        inner=rules.inner[0],
+        inner_awake=rules.inner[1],
+        fast_pole=-math.expm1(-2 * math.pi * FAST_POLE * period),
+        slow_pole=-math.expm1(-2 * math.pi * SLOW_POLE * period),
+        fast_level=_threshold(FAST_SIGMAS, noise, FAST_POLE, period) if rules.detect else math.inf,
+        slow_level=_threshold(SLOW_SIGMAS, noise, SLOW_POLE, period) if rules.detect else math.inf,
+        fast_time=rules.awake_time * model.rate,
+        slow_time=rules.stirred_time * model.rate,
+        release=period / rules.release,
+        ramp=period / RAMP_TIME,
+        lowest=model.lowest_frequency,
+        highest=min(model.highest_frequency, 0.4 * model.rate),
+        contact_on=CONTACT[0],
+        contact_off=CONTACT[1],
+        drive_limit=float(model.drive_limit),
+        drive_step=float(model.drive_step),
+        peak_decay=math.exp(-period * lowest),
+        back=1.0 / BACK_TIME,
+        sensed_limit=float(model.sensed_limit),
+    )
+    tables = BankTables(
+        numbers=numbers,
+        tone=bands.tone(),
+        listen=np.ascontiguousarray(model.coordinate_from_sensed),
+        speak=np.linalg.pinv(model.force_from_drive),
+        mass=model.mass,
+        damping=model.damping,
+        stiffness=model.stiffness,
+        shape=np.eye(len(model.mass))[0],
+        taps=taps,
+        grip=grip,
+    )
+    return BankController(method, tables)
+
+
+def _threshold(sigmas: float, noise: float, pole: float, period: float) -> float:
+    """Square (m2) of so many sigmas of 2 eps e^(-j phi) behind a pole (Hz), eps white of rms `noise` (m)."""
+    return (sigmas * noise * math.sqrt(2 * math.pi * pole * period)) ** 2
+
+
+def _no_taps(coordinates: int) -> tuple[Array, Array]:
+    return np.zeros((coordinates, TAPS)), np.zeros(coordinates)
