@@ -1,4 +1,4 @@
-"""Compiled plate with a finger on it, alone and closed with a controller.
+"""Compiled plate with a finger on it.
 
 The plate is frozen over one sample (finger position, load and current held)
 and integrated exactly: with z' = A z + b over one period, z grows by the terms
@@ -13,8 +13,6 @@ import math
 from typing import NamedTuple
 
 from hapticrender._jit import kernel
-from hapticrender.control.bank_kernels import bank_step
-from hapticrender.control.kernels import polar_step
 from hapticrender.protocols import Array
 
 Three = tuple[float, float, float]
@@ -162,35 +160,3 @@ def plate_run(tables, state, drive, finger, noise, sensed, motion, flags):
         flags[n] = plate_sense(tables, z, noise[n], sensed[n], motion[n])
         plate_drive(tables, pending, cursor, current, drive[n])
         plate_advance(tables, z, frozen, system, push, current, finger[n, 0], finger[n, 1], finger[n, 2])
-
-
-@kernel
-def polar_plate_run(
-    tables, state, polar, polar_state, last, finger, noise, wanted, sensed, motion, drive, target, flags
-):
-    """Plate and polar controller closed sample by sample; `last` (2,) is the drive computed one sample ago.
-
-    Row n of `drive` is what the plate was handed for interval n, so it is computed from sample n - 1.
-    """
-    z, frozen, system, push, pending, cursor, current = state
-    for n in range(sensed.shape[0]):
-        flags[n] = plate_sense(tables, z, noise[n], sensed[n], motion[n])
-        plate_drive(tables, pending, cursor, current, last)
-        plate_advance(tables, z, frozen, system, push, current, finger[n, 0], finger[n, 1], finger[n, 2])
-        drive[n, 0], drive[n, 1] = last[0], last[1]
-        flags[n] |= polar_step(polar, polar_state, sensed[n], finger[n, 0], wanted[n], last, target[n])
-
-
-@kernel
-def bank_plate_run(tables, state, bank, bank_state, last, finger, noise, wanted, sensed, motion, drive, target, flags):
-    """Plate and band bank closed sample by sample; `last` (2,) is the drive computed one sample ago.
-
-    Row n of `drive` is what the plate was handed for interval n, so it is computed from sample n - 1.
-    """
-    z, frozen, system, push, pending, cursor, current = state
-    for n in range(sensed.shape[0]):
-        flags[n] = plate_sense(tables, z, noise[n], sensed[n], motion[n])
-        plate_drive(tables, pending, cursor, current, last)
-        plate_advance(tables, z, frozen, system, push, current, finger[n, 0], finger[n, 1], finger[n, 2])
-        drive[n, 0], drive[n, 1] = last[0], last[1]
-        flags[n] |= bank_step(bank, bank_state, sensed[n], finger[n, 0], wanted[n], last, target[n])

@@ -20,16 +20,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from hapticrender.control.bandmodel import BandModel
-from hapticrender.control.bank_kernels import BankTables
-from hapticrender.control.kernels import PolarTables
-from hapticrender.plants.kernels import (
-    PlateState,
-    PlateTables,
-    bank_plate_run,
-    plate_run,
-    plate_system,
-    polar_plate_run,
-)
+from hapticrender.plants.closed import CLOSED
+from hapticrender.plants.kernels import PlateState, PlateTables, plate_run, plate_system
 from hapticrender.protocols import Array, Controller, Sensed
 
 if TYPE_CHECKING:
@@ -320,7 +312,7 @@ class Plate:
         finger, noise, flags = self._next(n)
         sensed, motion, drive = np.zeros((n, 2)), np.zeros((n, 3)), np.zeros((n, 2))
         target = np.zeros((n, controller.n_bands), complex)
-        _CLOSED[type(controller.tables)](
+        CLOSED[type(controller.tables)](
             self._tables,
             self._state,
             controller.tables,
@@ -336,9 +328,6 @@ class Plate:
             flags,
         )
         return drive, target, flags, Sensed(sensed, finger[:, 0], motion, finger[:, 1], flags)
-
-
-_CLOSED = {PolarTables: polar_plate_run, BankTables: bank_plate_run}
 
 
 def _tables(parameters: PlateParameters, mechanics: FingerMechanics) -> PlateTables:
