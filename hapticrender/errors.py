@@ -35,3 +35,7 @@ class DeviceLost(DriverError):
 
 class ProtocolError(DriverError):
     """The device sent something that its protocol does not allow."""
+
+
+class PlateMismatch(UserWarning):
+    """The plate that was met is not the one that a controller was designed for: says which numbers, and by how much."""
