@@ -5,6 +5,10 @@ and integrated exactly: with z' = A z + b over one period, z grows by the terms
 t_1 = A z + b, t_n = A t_(n-1)/n of the exponential series, as many as rounding
 asks for.  A is renewed whenever the finger has moved or changed its grip.
 Velocities are scaled by the sample period, so that A has no units.
+
+States: 0 heave, 1 rocking, 2 phalanx, 3-5 their rates, 6 bending of the glass
+(its displacement at the sensors, m), 7 its rate.  A rigid plate leaves 6 and 7
+at zero and never reads them.
 """
 
 from __future__ import annotations
@@ -23,7 +27,7 @@ class PlateTables(NamedTuple):
 
     period: float
     terms: int
-    inverse_mass: tuple[float, float]  # heave and rocking, 1/kg; 0: that coordinate is locked
+    inverse_mass: Three  # heave, rocking, bending, 1/kg; 0: that coordinate is locked
     stiffness: Three  # k11 k12 k22, N/m: row i of the matrix starts at i
     damping: Three  # c11 c12 c22, N s/m
     force_constant: float  # N/A
@@ -32,6 +36,10 @@ class PlateTables(NamedTuple):
     skin: Three  # m b k of the part of the finger that moves with the plate
     phalanx: Three  # m b k behind it
     coupled: bool  # the phalanx moves (4th order)
+    flexible: bool  # the glass bends
+    flexure: tuple[float, float]  # stiffness and damping of the bending mode, N/m, N s/m
+    coil_shape: float  # of the bending mode at the coils, 1 at the sensors
+    shape: Three  # wavenumber times a, and the weights of cosh and cos: shape of the bending mode at p/a
     current_limit: float  # A
     current_step: float  # A, 0: not quantised
     sensor_limit: float  # m
@@ -42,10 +50,10 @@ class PlateTables(NamedTuple):
 class PlateState(NamedTuple):
     """State of the plate; changed in place."""
 
-    z: Array  # (6,) heave, rocking, phalanx (m), and the same differentiated, times the period (m)
+    z: Array  # (8,) displacements (m) and rates, times the period (m)
     frozen: Array  # (2,) lever and strength for which `system` and `push` hold
-    system: Array  # (6, 6) A
-    push: Array  # (3,) heave, cross and rocking of the inverse mass, times the period squared, 1/kg s2
+    system: Array  # (8, 8) A
+    push: Array  # (3, 3) inverse mass in heave, rocking and bending, times the period squared, s2/kg
     pending: Array  # (latency, 2) drive on its way
     cursor: Array  # (1,) integer: oldest row of `pending`
     current: Array  # (2,) scratch
@@ -59,26 +67,52 @@ def quantise(value, step, limit):
 
 
 @kernel
+def bent(tables, lever):
+    """Shape of the bending mode at `lever` (p/a): 1 at the sensors, 0 where the glass is rigid."""
+    if not tables.flexible:
+        return 0.0
+    angle = tables.shape[0] * lever
+    return tables.shape[1] * math.cosh(angle) + tables.shape[2] * math.cos(angle)
+
+
+@kernel
+def surface_row(tables, i, row, at, hold, drag, system, push):
+    """Row of A for the rate of heave (0), rocking (1) or bending (2) of the glass."""
+    period, k, c = tables.period, tables.stiffness, tables.damping
+    heave, rock, bend = push[i, 0], push[i, 1], push[i, 2]
+    contact = heave + rock * at[1] + bend * at[2]
+    system[row, 0] = -(heave * k[0] + rock * k[1] + contact * hold)
+    system[row, 1] = -(heave * k[1] + rock * k[2] + contact * hold * at[1])
+    system[row, 3] = -(heave * c[0] + rock * c[1] + contact * drag) / period
+    system[row, 4] = -(heave * c[1] + rock * c[2] + contact * drag * at[1]) / period
+    system[row, 2] = contact * hold if tables.coupled else 0.0
+    system[row, 5] = contact * drag / period if tables.coupled else 0.0
+    if tables.flexible:
+        system[row, 6] = -(bend * tables.flexure[0] + contact * hold * at[2])
+        system[row, 7] = -(bend * tables.flexure[1] + contact * drag * at[2]) / period
+
+
+@kernel
 def plate_system(tables, lever, strength, system, push):
     """Fill A and the inverse mass for a finger at `lever` (p/a) of `strength` times its nominal impedance."""
     period, skin, phalanx, inverse = tables.period, tables.skin, tables.phalanx, tables.inverse_mass
-    shared = strength * skin[0] / (1.0 + strength * skin[0] * (inverse[0] + lever * lever * inverse[1]))
-    scale = period * period  # inverse of M + m_skin h h^T, h = [1, p/a]: Sherman-Morrison
-    push[0] = scale * (inverse[0] - shared * inverse[0] * inverse[0])
-    push[1] = -scale * shared * inverse[0] * inverse[1] * lever
-    push[2] = scale * (inverse[1] - shared * inverse[1] * inverse[1] * lever * lever)
-    k, c = tables.stiffness, tables.damping
+    at = (1.0, lever, bent(tables, lever))  # how heave, rocking and bending move the contact
+    give = inverse[0] + lever * lever * inverse[1] + at[2] * at[2] * inverse[2]
+    shared = strength * skin[0] / (1.0 + strength * skin[0] * give)
+    scale = period * period  # inverse of M + m_skin h h^T, h = `at`: Sherman-Morrison
+    push[0, 0] = scale * (inverse[0] - shared * inverse[0] * inverse[0])
+    push[0, 1] = push[1, 0] = -scale * shared * inverse[0] * inverse[1] * lever
+    push[1, 1] = scale * (inverse[1] - shared * inverse[1] * inverse[1] * lever * lever)
     hold, drag = strength * skin[2], strength * skin[1]
+    if tables.flexible:
+        push[0, 2] = push[2, 0] = -scale * shared * inverse[0] * inverse[2] * at[2]
+        push[1, 2] = push[2, 1] = -scale * shared * inverse[1] * inverse[2] * lever * at[2]
+        push[2, 2] = scale * (inverse[2] - shared * inverse[2] * inverse[2] * at[2] * at[2])
+        system[6, 7] = 1.0
+        surface_row(tables, 2, 7, at, hold, drag, system, push)
     for i in range(2):
-        heave, rock = push[i], push[i + 1]  # row i of the inverse mass
-        contact = heave + rock * lever
         system[i, i + 3] = 1.0
-        system[i + 3, 0] = -(heave * k[0] + rock * k[1] + contact * hold)
-        system[i + 3, 1] = -(heave * k[1] + rock * k[2] + contact * hold * lever)
-        system[i + 3, 3] = -(heave * c[0] + rock * c[1] + contact * drag) / period
-        system[i + 3, 4] = -(heave * c[1] + rock * c[2] + contact * drag * lever) / period
-        system[i + 3, 2] = contact * hold if tables.coupled else 0.0
-        system[i + 3, 5] = contact * drag / period if tables.coupled else 0.0
+        surface_row(tables, i, i + 3, at, hold, drag, system, push)
     free = tables.coupled and strength > 0.0
     system[2, 5] = 1.0 if free else 0.0
     share = scale / phalanx[0] if free else 0.0
@@ -88,6 +122,55 @@ def plate_system(tables, lever, strength, system, push):
     system[5, 3] = share * skin[1] / period
     system[5, 4] = share * skin[1] * lever / period
     system[5, 5] = -share * (skin[1] + phalanx[1]) / period
+    system[5, 6] = share * skin[2] * at[2]
+    system[5, 7] = share * skin[1] * at[2] / period
+
+
+@kernel
+def rigid_series(terms, z, a, push, force0, force1):
+    """Add the series of one sample to z, forces (N) on heave and rocking held."""
+    t0, t1, t2, t3, t4, t5 = z[0], z[1], z[2], z[3], z[4], z[5]
+    for n in range(1, terms + 1):
+        s = 1.0 / n
+        f = (a[3, 0] * t0 + a[3, 1] * t1) + (a[3, 2] * t2 + a[3, 3] * t3) + (a[3, 4] * t4 + a[3, 5] * t5)
+        g = (a[4, 0] * t0 + a[4, 1] * t1) + (a[4, 2] * t2 + a[4, 3] * t3) + (a[4, 4] * t4 + a[4, 5] * t5)
+        h = (a[5, 0] * t0 + a[5, 1] * t1) + (a[5, 2] * t2 + a[5, 3] * t3) + (a[5, 4] * t4 + a[5, 5] * t5)
+        if n == 1:
+            f += push[0, 0] * force0 + push[0, 1] * force1
+            g += push[1, 0] * force0 + push[1, 1] * force1
+        t0, t1, t2, t3, t4, t5 = s * t3, s * t4, s * a[2, 5] * t5, s * f, s * g, s * h
+        z[0] += t0
+        z[1] += t1
+        z[2] += t2
+        z[3] += t3
+        z[4] += t4
+        z[5] += t5
+
+
+@kernel
+def row_times(a, row, t):
+    """Row of A times the eight states."""
+    return (
+        (a[row, 0] * t[0] + a[row, 1] * t[1] + a[row, 2] * t[2])
+        + (a[row, 3] * t[3] + a[row, 4] * t[4] + a[row, 5] * t[5])
+        + (a[row, 6] * t[6] + a[row, 7] * t[7])
+    )
+
+
+@kernel
+def flexible_series(terms, z, a, push, force0, force1, force2):
+    """Add the series of one sample to z, forces (N) on heave, rocking and bending held."""
+    t = (z[0], z[1], z[2], z[3], z[4], z[5], z[6], z[7])
+    for n in range(1, terms + 1):
+        s = 1.0 / n
+        f, g, h, e = row_times(a, 3, t), row_times(a, 4, t), row_times(a, 5, t), row_times(a, 7, t)
+        if n == 1:
+            f += push[0, 0] * force0 + push[0, 1] * force1 + push[0, 2] * force2
+            g += push[1, 0] * force0 + push[1, 1] * force1 + push[1, 2] * force2
+            e += push[2, 0] * force0 + push[2, 1] * force1 + push[2, 2] * force2
+        t = (s * t[3], s * t[4], s * a[2, 5] * t[5], s * f, s * g, s * h, s * t[7], s * e)
+        for i in range(8):
+            z[i] += t[i]
 
 
 @kernel
@@ -101,25 +184,14 @@ def plate_advance(tables, z, frozen, system, push, current, position, load, stre
     if lever != frozen[0] or strength != frozen[1]:
         plate_system(tables, lever, strength, system, push)
         frozen[0], frozen[1] = lever, strength
-    force0 = tables.force_constant * (current[0] + current[1]) - weight
+    common = tables.force_constant * (current[0] + current[1])
+    force0 = common - weight
     force1 = tables.force_constant * (current[1] - current[0]) - weight * lever
-    a = system
-    t0, t1, t2, t3, t4, t5 = z[0], z[1], z[2], z[3], z[4], z[5]
-    for n in range(1, tables.terms + 1):
-        s = 1.0 / n
-        f = (a[3, 0] * t0 + a[3, 1] * t1) + (a[3, 2] * t2 + a[3, 3] * t3) + (a[3, 4] * t4 + a[3, 5] * t5)
-        g = (a[4, 0] * t0 + a[4, 1] * t1) + (a[4, 2] * t2 + a[4, 3] * t3) + (a[4, 4] * t4 + a[4, 5] * t5)
-        h = (a[5, 0] * t0 + a[5, 1] * t1) + (a[5, 2] * t2 + a[5, 3] * t3) + (a[5, 4] * t4 + a[5, 5] * t5)
-        if n == 1:
-            f += push[0] * force0 + push[1] * force1
-            g += push[1] * force0 + push[2] * force1
-        t0, t1, t2, t3, t4, t5 = s * t3, s * t4, s * a[2, 5] * t5, s * f, s * g, s * h
-        z[0] += t0
-        z[1] += t1
-        z[2] += t2
-        z[3] += t3
-        z[4] += t4
-        z[5] += t5
+    if tables.flexible:
+        force2 = tables.coil_shape * common - weight * bent(tables, lever)
+        flexible_series(tables.terms, z, system, push, force0, force1, force2)
+    else:
+        rigid_series(tables.terms, z, system, push, force0, force1)
 
 
 @kernel
@@ -128,12 +200,12 @@ def plate_sense(tables, z, noise, sensed, motion):
     flags = 0
     for i in range(2):
         side = -tables.reach if i == 0 else tables.reach
-        motion[1 + i] = z[0] + side * z[1]
+        motion[1 + i] = z[0] + side * z[1] + z[6]
         value = motion[1 + i] + tables.sensor_noise * noise[i]
         if abs(value) > tables.sensor_limit:
             flags |= 4
         sensed[i] = quantise(value, tables.sensor_step, tables.sensor_limit)
-    motion[0] = z[0]
+    motion[0] = z[0] + bent(tables, 0.0) * z[6]
     return flags
 
 

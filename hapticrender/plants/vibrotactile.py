@@ -8,6 +8,16 @@ Equations, with q = [x_c, a theta], a = coil_spacing/2, side 1 at -a, finger at 
 
 The paper's own force equations carry (m/2) x_i'' -+ (I/2) theta'', which is
 dimensionally wrong; the form above is (m/2) x_c'' -+ (I/d) theta''.
+
+As a further level the glass bends: a displacement e of the sensors in the
+first free-free bending mode, of shape phi (1 at the sensors), adds phi(x) e at
+x and obeys, with the damping ratio zeta and m_b its modal mass::
+
+    m_b (e'' + 2 zeta w_b e' + w_b^2 e) = phi_coil force_constant (i_1 + i_2) - phi(p) F_f
+
+and the finger feels x_c + p theta + phi(p) e.  Frequency and damping are those
+measured on the free plate, its suspension included, so nothing but the finger
+couples the mode to heave and rocking.
 """
 
 from __future__ import annotations
@@ -20,6 +30,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from hapticrender.control.bandmodel import BandModel
+from hapticrender.control.damping import BendingMode
 from hapticrender.plants.closed import CLOSED
 from hapticrender.plants.kernels import PlateState, PlateTables, plate_run, plate_system
 from hapticrender.protocols import Array, Controller, Sensed
@@ -29,6 +40,7 @@ if TYPE_CHECKING:
 
 PLACES = ("centre", "end 1", "end 2")
 TAYLOR_ROUNDING = 1e-17  # the first term left out of the series, relative to the state
+FREE_FREE = 2.365020372431352  # half of the first root of cos(x) cosh(x) = 1: the first even mode of a free bar
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -67,10 +79,19 @@ class PlateParameters:
         2: heave and rocking; 1: heave only.
     finger_dynamics : int
         1: the finger's mechanics as the scene gives them; 0: only its static load.
+    bending_frequency : float, Hz
+        First bending mode of the glass, at most `rate`; 0: the glass is rigid.
+    bending_damping : float
+        Damping ratio of that mode, >= 0.
+    bending_mass : float, kg
+        Its modal mass, the shape being 1 at the sensors; > 0.
+    bending_coil : float
+        Its shape at the coils, -1 to 1.  The coils sit near its nodes, so the sign has to be measured.
 
     Notes
     -----
-    Defaults are the paper's printed values; current and sensor ranges are engineering defaults (FACTS section 1).
+    Defaults are the paper's printed values; current and sensor ranges are engineering defaults (FACTS section 1), so
+    are the numbers of the bending mode (FACTS section 3 A: 1.1-1.4 kHz, 9.5 g, 0.01, about +-0.1).
     """
 
     mass: float = 32e-3
@@ -94,6 +115,10 @@ class PlateParameters:
     delay: int = 1
     degrees_of_freedom: int = 2
     finger_dynamics: int = 1
+    bending_frequency: float = 0.0
+    bending_damping: float = 0.01
+    bending_mass: float = 9.5e-3
+    bending_coil: float = -0.1
 
     def __post_init__(self) -> None:
         for field in fields(self):
@@ -110,6 +135,8 @@ class PlateParameters:
             ceiling = _CEILINGS.get(field.name, math.inf)
             if value > ceiling:
                 raise ValueError(f"{field.name} = {value!r}: must be <= {ceiling:g} {unit}".rstrip())
+        if self.bending_frequency > self.rate:
+            raise ValueError(f"bending_frequency = {self.bending_frequency!r}: must be <= rate = {self.rate:g} Hz")
 
     @classmethod
     def with_overrides(cls, overrides: Mapping[str, Any]) -> PlateParameters:
@@ -163,8 +190,32 @@ class PlateParameters:
         """Generalised forces per coil current (N/A, shape (2, 2))."""
         return self.force_constant * np.array([[1.0, 1.0], [-1.0, 1.0]])
 
+    @property
+    def bending(self) -> BendingMode | None:
+        """The bending mode as the sensors and coils see it, in heave and rocking; None where the glass is rigid."""
+        if self.bending_frequency == 0.0:
+            return None
+        return BendingMode(
+            frequency=self.bending_frequency,
+            damping=self.bending_damping,
+            coupling=(self.bending_coil / self.bending_mass, 0.0),
+        )
+
+    def bending_shape(self, position: Array | float) -> Array:
+        """Shape of the bending mode at `position` (m from the middle), that of a free bar: 1 at the ends, -0.61 there.
+
+        The coils have a number of their own, `bending_coil`: a free bar would give -0.099 at the quarter points.
+        """
+        wavenumber, grow, wave = self._bar()
+        angle = wavenumber * np.asarray(position, float)
+        return grow * np.cosh(angle) + wave * np.cos(angle)
+
+    def _bar(self) -> tuple[float, float, float]:
+        """Wavenumber (rad/m) of the bending mode and the weights of its cosh and cos."""
+        return 2 * FREE_FREE / self.glass_length, 0.5 / math.cosh(FREE_FREE), 0.5 / math.cos(FREE_FREE)
+
     def modes(self) -> tuple[Array, Array]:
-        """Undamped-equivalent frequencies (Hz, ascending) and damping ratios of the free plate's two modes."""
+        """Undamped-equivalent frequencies (Hz, ascending) and damping ratios of the free, rigid plate's two modes."""
         inverse = np.linalg.inv(self.mass_matrix)
         system = np.block(
             [[np.zeros((2, 2)), np.eye(2)], [-inverse @ self.stiffness_matrix, -inverse @ self.damping_matrix]]
@@ -187,7 +238,10 @@ class PlateParameters:
         return load, self.half_spacing + self.coil_spacing * carried_1 / load
 
     def dynamic_stiffness(self, frequency: Array, finger: Array | complex = 0.0, position: float = 0.0) -> Array:
-        """D(j w) in heave and rocking (N/m, shape (..., 2, 2)) under a finger impedance (N s/m) at `position` (m)."""
+        """D(j w) in heave and rocking (N/m, shape (..., 2, 2)) under a finger impedance (N s/m) at `position` (m).
+
+        The glass counts as rigid, also where it bends: near and above `bending_frequency` this is no longer the plate.
+        """
         s = 2j * np.pi * np.asarray(frequency, float)[..., None, None]
         lever = np.array([1.0, position / self.half_spacing])
         load = np.asarray(finger, complex)[..., None, None] * s * np.outer(lever, lever)
@@ -216,10 +270,21 @@ class PlateParameters:
 
 _BOUNDS = {
     **dict.fromkeys(
-        ("damping_1", "damping_2", "sensor_noise", "current_bits", "sensor_bits", "finger_dynamics"), (0.0, False)
+        (
+            "damping_1",
+            "damping_2",
+            "sensor_noise",
+            "current_bits",
+            "sensor_bits",
+            "finger_dynamics",
+            "bending_frequency",
+            "bending_damping",
+        ),
+        (0.0, False),
     ),
     **dict.fromkeys(("delay", "degrees_of_freedom"), (1.0, False)),
     "rate": (500.0, False),
+    "bending_coil": (-1.0, False),
 }
 _CEILINGS = {
     "current_bits": 24,
@@ -228,6 +293,7 @@ _CEILINGS = {
     "degrees_of_freedom": 2,
     "finger_dynamics": 1,
     "rate": 1e6,
+    "bending_coil": 1.0,
 }
 _UNITS = {
     **dict.fromkeys((field.name for field in fields(PlateParameters)), ""),
@@ -235,11 +301,11 @@ _UNITS = {
     **dict.fromkeys(("stiffness_1", "stiffness_2"), "N/m"),
     **dict.fromkeys(("damping_1", "damping_2"), "N s/m"),
     **dict.fromkeys(("amplifier_r1", "amplifier_r2", "amplifier_rp"), "ohm"),
-    "mass": "kg",
+    **dict.fromkeys(("mass", "bending_mass"), "kg"),
     "inertia": "kg m2",
     "force_constant": "N/A",
     "current_limit": "A",
-    "rate": "Hz",
+    **dict.fromkeys(("rate", "bending_frequency"), "Hz"),
     "delay": "samples",
 }
 
@@ -277,10 +343,10 @@ class Plate:
         self._samples = 0
         self._tables = _tables(parameters, finger.mechanics)
         self._state = PlateState(
-            z=np.zeros(6),
+            z=np.zeros(8),
             frozen=np.full(2, np.nan),
-            system=np.zeros((6, 6)),
-            push=np.zeros(3),
+            system=np.zeros((8, 8)),
+            push=np.zeros((3, 3)),
             pending=np.zeros((parameters.delay - block, 2)),
             cursor=np.zeros(1, np.int64),
             current=np.zeros(2),
@@ -334,6 +400,9 @@ def _tables(parameters: PlateParameters, mechanics: FingerMechanics) -> PlateTab
     """Numbers of the compiled plate."""
     order = mechanics.order if parameters.finger_dynamics else 0
     rocking = parameters.degrees_of_freedom == 2
+    flexible = parameters.bending_frequency > 0.0
+    omega = 2 * math.pi * parameters.bending_frequency
+    wavenumber, grow, wave = parameters._bar()
     mass = parameters.mass_matrix.diagonal()
     stiffness, damping = parameters.stiffness_matrix, parameters.damping_matrix
     if not rocking:
@@ -341,7 +410,11 @@ def _tables(parameters: PlateParameters, mechanics: FingerMechanics) -> PlateTab
     tables = PlateTables(
         period=1.0 / parameters.rate,
         terms=0,
-        inverse_mass=(float(1.0 / mass[0]), float(1.0 / mass[1]) if rocking else 0.0),
+        inverse_mass=(
+            float(1.0 / mass[0]),
+            float(1.0 / mass[1]) if rocking else 0.0,
+            1.0 / parameters.bending_mass if flexible else 0.0,
+        ),
         stiffness=_upper(stiffness),
         damping=_upper(damping),
         force_constant=parameters.force_constant,
@@ -350,6 +423,10 @@ def _tables(parameters: PlateParameters, mechanics: FingerMechanics) -> PlateTab
         skin=(mechanics.mass, mechanics.damping, mechanics.stiffness) if order else (0.0, 0.0, 0.0),
         phalanx=(mechanics.phalanx_mass, mechanics.phalanx_damping, mechanics.phalanx_stiffness),
         coupled=order == 4,
+        flexible=flexible,
+        flexure=(omega**2 * parameters.bending_mass, 2 * parameters.bending_damping * omega * parameters.bending_mass),
+        coil_shape=parameters.bending_coil,
+        shape=(wavenumber * parameters.half_spacing, grow, wave),
         current_limit=parameters.current_limit,
         current_step=parameters.current_step,
         sensor_limit=parameters.sensor_range / 2,
@@ -366,8 +443,8 @@ def _upper(matrix: Array) -> tuple[float, float, float]:
 
 def _taylor_terms(tables: PlateTables) -> int:
     """Terms after which the exponential series has converged to rounding, at the glass end and pressed hard."""
-    system = np.zeros((6, 6))
-    plate_system(tables, tables.reach, 3.0, system, np.zeros(3))
+    system = np.zeros((8, 8))
+    plate_system(tables, tables.reach, 3.0, system, np.zeros((3, 3)))
     term, n = system, 1
     while abs(term).max() > TAYLOR_ROUNDING:
         n += 1
