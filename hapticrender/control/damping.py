@@ -417,12 +417,12 @@ def _complaint(
     for found in margins:
         if complaint := bounds.complaint(found, model.rate):
             return complaint
-    for difference in (-bending.spread, bending.spread) if bending is not None and bending.spread else ():
+    if bending is None:
+        return ""
+    for difference in (-bending.spread, bending.spread):
         for found in damping_margins(model, taps, bending=bending.shifted(difference)):
             if not found.stable or found.peak_sensitivity > bounds.astray:
-                return (
-                    f"the bending mode loose {abs(difference):g} Hz {'below' if difference < 0 else 'above'} its place"
-                )
+                return f"the bending mode loose {difference:+g} Hz off its place"
     return ""
 
 

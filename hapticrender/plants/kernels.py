@@ -39,6 +39,7 @@ class PlateTables(NamedTuple):
     flexible: bool  # the glass bends
     flexure: tuple[float, float]  # stiffness and damping of the bending mode, N/m, N s/m
     coil_shape: float  # of the bending mode at the coils, 1 at the sensors
+    centre_shape: float
     shape: Three  # wavenumber times a, and the weights of cosh and cos: shape of the bending mode at p/a
     current_limit: float  # A
     current_step: float  # A, 0: not quantised
@@ -205,7 +206,7 @@ def plate_sense(tables, z, noise, sensed, motion):
         if abs(value) > tables.sensor_limit:
             flags |= 4
         sensed[i] = quantise(value, tables.sensor_step, tables.sensor_limit)
-    motion[0] = z[0] + bent(tables, 0.0) * z[6]
+    motion[0] = z[0] + tables.centre_shape * z[6]
     return flags
 
 

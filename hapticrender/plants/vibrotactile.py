@@ -360,6 +360,10 @@ class Plate:
         finger = np.column_stack([self.finger.position(time), self.finger.load(time), self.finger.strength(time)])
         return finger, self._rng.standard_normal((n, 2)), np.zeros(n, np.int64)
 
+    def closes(self, controller: Controller) -> bool:
+        """Whether `closed_loop` has compiled code for this controller."""
+        return type(getattr(controller, "tables", None)) in CLOSED
+
     def finger_position(self, n: int) -> Array:
         """Finger positions (m, shape (n,)) of the next n samples, NaN while lifted; the plant does not advance."""
         return self.finger.position((self._samples + np.arange(n)) / self.rate)
@@ -426,6 +430,7 @@ def _tables(parameters: PlateParameters, mechanics: FingerMechanics) -> PlateTab
         flexible=flexible,
         flexure=(omega**2 * parameters.bending_mass, 2 * parameters.bending_damping * omega * parameters.bending_mass),
         coil_shape=parameters.bending_coil,
+        centre_shape=float(parameters.bending_shape(0.0)),
         shape=(wavenumber * parameters.half_spacing, grow, wave),
         current_limit=parameters.current_limit,
         current_step=parameters.current_step,
