@@ -1,0 +1,243 @@
+"""A slow, obvious twin of the band bank's whole step: complex arrays of (coordinates, bands), one line an equation.
+
+Written from FACTS section 3 and reports/damping.md; of the library it is given
+only the numbers in its tables.  Equation marks below: O observer, L law,
+F finger, D damping, S saturation, as in those pages.
+"""
+
+import math
+
+import numpy as np
+
+SATURATED, NONFINITE = 1, 2
+LEAST_LOAD = 0.03  # N
+FINGER_M, FINGER_K = 4e-3, 300.0  # kg, N/m
+
+
+def smooth(x):
+    """Third-order step from 0 to 1 over 0..1."""
+    x = min(max(x, 0.0), 1.0)
+    return x * x * (3 - 2 * x)
+
+
+def move(start, end, share):
+    return start + share * (end - start)
+
+
+class NaiveBank:
+    """Takes one sample a call; everything it remembers is an attribute."""
+
+    def __init__(self, tables):
+        self.p, self.t = tables.numbers, tables
+        frequency, wavenumber, phase, real, imaginary = tables.tone
+        self.frequency, self.wavenumber, self.phase = frequency, wavenumber, phase
+        self.constant = real + 1j * imaginary
+        K, C = len(frequency), len(tables.listen)
+        self.turns, self.ramp, self.weight = np.zeros(K), np.zeros(K), np.zeros(K)
+        self.raw, self.R, self.dR, self.rest = (np.zeros(K, complex) for _ in range(4))
+        self.E, self.v, self.dv, self.v_slow, self.apart, self.fast, self.slow = (
+            np.zeros((C, K), complex) for _ in range(7)
+        )
+        self.held = self.place_of_finger = self.velocity = self.acceleration = 0.0
+        self.seen = False
+        self.dc, self.drift = np.zeros(C), np.zeros(C)
+        self.eps = np.zeros(tables.taps.shape[::-1])  # newest first
+        self.contact, self.g = False, 0.0
+        self.m = self.b = self.k = 0.0
+        self.timers, self.open = [0.0, 0.0], [0.0, 0.0]  # fast, slow
+        self.peak, self.scale = 0.0, 1.0
+        self.round_1, self.round_2 = np.zeros(len(tables.speak)), np.zeros(len(tables.speak))
+        self.samples = 0
+
+    def step(self, sensed, position, wanted):
+        """Drive, target and flags of one sample."""
+        p, t = self.p, self.t
+        T = 1 / p.rate
+        flags = 0
+        self.follow(position)
+        carrier = self.carriers()
+        calm = min(abs(self.velocity) / p.crowd_speed, 1.0) if p.crowd_speed > 0 else 1.0
+        target = self.reference(carrier, wanted, calm * p.observer)
+        self.feel()
+        fast, slow = self.open
+        ki = move(move(p.integral, p.integral_stirred, slow), p.integral_awake, fast)
+        inner, gain = move(p.inner, p.inner_awake, fast), calm * move(p.observer, p.observer_awake, fast)
+
+        believed = np.abs(sensed) <= p.sensed_limit
+        if not believed.all():
+            flags |= NONFINITE
+        y = t.listen @ np.where(believed, sensed, 0.0)
+
+        R = np.outer(t.shape, self.R)
+        dR = np.outer(t.shape, self.dR)
+        e = y - self.dc - ((R + self.E) * carrier).real.sum(axis=1)  # O, on the error
+        eps = y - ((R + self.v) * carrier).real.sum(axis=1)  # D
+        deviation = eps - self.dc
+        self.eps = np.vstack([eps, self.eps[:-1]])
+        F = -inner * (t.taps.T * self.eps).sum(axis=0)
+        self.dc = self.dc + p.dc * e + self.drift  # type 2
+        self.drift = self.drift + p.dc_drift * e
+
+        w = np.minimum(self.weight / np.maximum(self.ramp, 1e-9), 1.0)
+        fading = 50.0 * (1 - w)
+        self.E = (1 - fading * T) * self.E + w * gain * e[:, None] * carrier.conj()
+        if not p.error_observer:
+            self.E = self.E - T * dR
+        spill = p.back * (1 - self.scale)
+        self.dv = -ki * self.E - spill * (self.v + R) - fading * self.v
+        self.v = self.v + T * self.dv
+        self.v_slow = self.v_slow + gain / 2 * (self.v - self.v_slow)
+        heard = 2 * deviation[:, None] * carrier.conj()
+        self.fast = self.fast + p.fast_pole * (heard - self.fast)
+        self.slow = self.slow + p.slow_pole * (heard - self.slow)
+        self.wake((abs(self.fast) ** 2 > p.fast_level).any(), (abs(self.slow) ** 2 > p.slow_level).any())
+
+        self.samples += 1
+        if self.contact and p.adapt >= 0 and self.samples % 4 == 0:
+            lively = max(fast, slow)
+            self.adapt(R, inner, move(p.adapt, p.adapt_awake, lively), move(p.rest, p.rest_awake, lively))
+        F = F + (self.force(R, dR) * self.ahead() * carrier).real.sum(axis=1)
+        drive, cut = self.speak(F)
+        return drive, target, flags | cut
+
+    def follow(self, position):
+        """Finger tracker: three equal poles at 30 Hz."""
+        if not math.isfinite(position):
+            self.seen, self.velocity, self.acceleration = False, 0.0, 0.0
+            return
+        if not self.seen:
+            self.place_of_finger = position
+        self.seen, self.held = True, position
+        T, a = 1 / self.p.rate, 2 * math.pi * 30
+        self.place_of_finger += T * self.velocity
+        miss = position - self.place_of_finger
+        self.place_of_finger += 3 * a * T * miss
+        self.velocity += T * self.acceleration + 3 * a**2 * T * miss
+        self.acceleration += a**3 * T * miss
+
+    def carriers(self):
+        """e^{j phi}, and beside it omega, its slope, ramps and weights."""
+        p = self.p
+        self.omega = 2 * np.pi * (self.frequency + self.wavenumber * self.velocity)
+        self.sweep = 2 * np.pi * self.wavenumber * self.acceleration
+        carrier = np.exp(2j * np.pi * ((self.turns + self.wavenumber * self.held + self.phase) % 1.0))
+        for k in range(len(self.turns)):
+            present = self.wavenumber[k] == 0 or self.seen
+            self.ramp[k] = min(self.ramp[k] + p.ramp, 1.0) if present else max(self.ramp[k] - p.ramp, 0.0)
+            self.weight[k] = smooth(self.ramp[k])
+            if self.wavenumber[k] > 0:
+                f = abs(self.omega[k]) / (2 * np.pi)
+                self.weight[k] *= smooth(2 * f / p.lowest - 1) * smooth(5 - 4 * f / p.highest)
+        self.turns = (self.turns + self.frequency / p.rate) % 1.0
+        return carrier
+
+    def reference(self, carrier, wanted, gain):
+        """R and dR/dt; returns the target."""
+        p = self.p
+        if p.analysed:
+            e = wanted - (self.raw * carrier).real.sum()
+            self.raw = self.raw + gain * e * carrier.conj()
+            target = self.R + gain / 2 * (self.weight * self.raw - self.R)
+        else:
+            target = self.weight * self.constant
+        R = target if p.error_observer else self.R + p.observer / 2 * (target - self.R)
+        self.dR = (R - self.R) * p.rate
+        self.R = R
+        return target
+
+    def feel(self):
+        """Load, place and contact from the sag: W [1, g] = -K dc; what was learnt of a finger goes with it."""
+        carried = -self.t.stiffness @ self.dc
+        load, moment = carried[0], carried[1] if len(carried) > 1 else 0.0
+        before = self.contact
+        self.contact = load > (self.p.contact_off if before else self.p.contact_on)
+        if self.contact:
+            self.g = min(max(moment / max(load, LEAST_LOAD), -2.0), 2.0)
+        if self.contact != before:
+            self.timers[0] = self.p.fast_time
+            if not self.contact:
+                self.m = self.b = self.k = 0.0
+                self.rest = np.zeros_like(self.rest)
+
+    def wake(self, *trips):
+        """Timers of the two detectors (fast, slow), and how far each has opened the loop."""
+        for i, (trip, time) in enumerate(zip(trips, (self.p.fast_time, self.p.slow_time), strict=True)):
+            if trip:
+                self.timers[i] = time
+            self.open[i] = 1.0 if self.timers[i] > 0 else max(self.open[i] - self.p.release, 0.0)
+            self.timers[i] -= 1
+
+    def lever(self):
+        """h = [1, g]: where the finger stands in the device's coordinates."""
+        return np.array([1.0, self.g])[: len(self.dc)]
+
+    def stiffness_of(self, k):
+        """D, D' and j dw/dt M of the bare device at band k."""
+        w, t = self.omega[k], self.t
+        D = t.stiffness - w**2 * t.mass + 1j * w * t.damping
+        return D, t.damping + 2j * w * t.mass, 1j * self.sweep[k] * t.mass
+
+    def finger_at(self, k):
+        """Finger's z at band k: three numbers and what each band has left over."""
+        w = self.omega[k]
+        return self.k - w**2 * self.m + 1j * w * self.b + self.rest[k]
+
+    def force(self, R, dR):
+        """L: F = D V + D' dV/dt + j dw/dt M V in a matrix a band, finger included."""
+        V, dV = R + self.v, dR + self.dv
+        F = np.zeros_like(V)
+        for k, w in enumerate(self.omega):
+            D, slope, chirp = self.stiffness_of(k)
+            if self.contact and self.p.adapt >= 0:
+                structure = np.outer(self.lever(), self.lever())
+                D = D + self.finger_at(k) * structure
+                slope = slope + (self.b + 2j * w * self.m) * structure
+                chirp = chirp + 1j * self.sweep[k] * self.m * structure
+            F[:, k] = (D + chirp) @ V[:, k] + slope @ dV[:, k]
+        return F
+
+    def ahead(self):
+        """Phase of delay and half the hold, chirp included, and 1/sinc of the hold."""
+        lead, turns = self.p.lead, self.omega / (2 * np.pi * self.p.rate)
+        return np.exp(1j * lead * (self.omega + self.sweep * lead / 2)) / np.sinc(turns)
+
+    def adapt(self, R, inner, mu, mu_rest):
+        """F: three numbers pooled over bands, weights |y_p|^2/|D|^2, and one stiffness a band."""
+        step = 4 / self.p.rate
+        apart, before = self.E - self.v_slow, self.apart
+        self.apart = apart
+        h = self.lever()
+        y_p, commanded = h @ (R + self.E), h @ (R + self.v_slow)
+        sums, total = np.zeros(3), 0.0
+        for k, w in enumerate(self.omega):
+            if abs(y_p[k]) < 5e-8 or w == 0:
+                continue
+            D, slope, _ = self.stiffness_of(k)
+            away = D[0] @ apart[:, k] + slope[0] @ (apart[:, k] - before[:, k]) / step
+            away += 1j * w * inner * self.t.grip[0] * apart[0, k]
+            z = (self.finger_at(k) * commanded[k] - away) / y_p[k]
+            miss = z.real - (self.k - w**2 * self.m)
+            drag = z.imag - w * self.b
+            weight = abs(y_p[k]) ** 2 / abs(D[0, 0]) ** 2
+            den = FINGER_K**2 + w**4 * FINGER_M**2
+            sums += weight * np.array([FINGER_K**2 * miss / den, w**2 * FINGER_M**2 * miss / den, drag / w])
+            total += weight
+            self.rest[k] += step * mu_rest * (miss + 1j * drag - self.rest[k])
+        if total > 0:
+            by_k, by_m, by_b = step * mu * sums / total
+            self.k = max(self.k + by_k, -500.0)
+            self.m = min(max(self.m - by_m, -2e-3), 12e-3)
+            self.b = min(max(self.b + by_b, 0.0), 12.0)
+
+    def speak(self, F):
+        """S: the whole envelope scaled to the limit, rounding shaped by (1 - z^-1)^2."""
+        p = self.p
+        drive = self.t.speak @ F
+        self.peak = max(abs(drive).max() / p.drive_limit, self.peak * p.peak_decay)
+        self.scale = min(1.0, 1 / self.peak) if self.peak > 0 else 1.0
+        drive = self.scale * drive
+        if p.drive_step > 0:
+            shaped = drive + 2 * self.round_1 - self.round_2
+            drive = p.drive_step * np.floor(shaped / p.drive_step + 0.5)
+            self.round_1, self.round_2 = np.clip(shaped - drive, -p.drive_step, p.drive_step), self.round_1
+        return np.clip(drive, -p.drive_limit, p.drive_limit), SATURATED if self.scale < 1 else 0
