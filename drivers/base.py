@@ -70,45 +70,15 @@ a sensor at each end of its glass, and a grating that is felt on it:
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from types import TracebackType
-from typing import Any, Self
+from typing import Self
 
 import numpy as np
 
+from hapticrender.contract import check_driver as check_driver
 from hapticrender.errors import DriverError
 from hapticrender.protocols import Array, Sensed
-
-_MEMBERS = ("rate", "drive_channels", "sensed_channels", "block", "delay", "play", "__enter__", "__exit__")
-_LEAST = {"drive_channels": 1, "sensed_channels": 0, "block": 1}
-
-
-def check_driver(driver: Any) -> None:
-    """Refuse an object that is no driver, naming what it lacks or which number is out of its bound.
-
-    Parameters
-    ----------
-    driver : object
-        What should follow the page above.
-
-    Raises
-    ------
-    TypeError
-        A member is missing.
-    ValueError
-        A count or the rate is out of its bound.
-    """
-    kind = type(driver).__name__
-    missing = [name for name in _MEMBERS if not hasattr(driver, name)]
-    if missing:
-        raise TypeError(f"{kind} is no driver: it lacks {', '.join(missing)}")
-    if not (math.isfinite(driver.rate) and driver.rate > 0):
-        raise ValueError(f"{kind}: rate={driver.rate!r} must be finite and > 0 Hz")
-    for name, least in (_LEAST | {"delay": driver.block}).items():
-        value = getattr(driver, name)
-        if value != int(value) or value < least:
-            raise ValueError(f"{kind}: {name}={value!r} must be a whole number >= {least}")
 
 
 def checked_drive(drive: Array, block: int, drive_channels: int) -> Array:
@@ -230,13 +200,14 @@ class BaseDriver:
         return self._play(checked_drive(drive, self.block, self.drive_channels))
 
     def close(self) -> None:
-        """Play one block of zeros and release the device, as far as either works; then raise the first failure."""
+        """Play zeros until they have come through, release the device, as far as either works; raise the first failure."""
         if self._state != "open":
             self._state = "closed"
             return
         self._state = "closed"
         rest = np.zeros((self.block, self.drive_channels))
-        carry_through(lambda: self._play(rest), self._close)
+        blocks = -(-self.delay // self.block)  # until zeros have come through to the device
+        carry_through(lambda: [self._play(rest) for _ in range(blocks)], self._close)
 
     def __enter__(self) -> Self:
         return self.open()

@@ -11,9 +11,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from hapticrender.bands import Bands
+from hapticrender.contract import check_driver, check_sensed
 from hapticrender.control.bandmodel import BandModel
 from hapticrender.control.methods import method_named
-from hapticrender.protocols import Array, Controller, Driver, Renderer, Sensed
+from hapticrender.errors import HapticError
+from hapticrender.protocols import Array, Controller, Driver, Plant, Renderer, Sensed
 from hapticrender.recording import Recorder, Recording
 from hapticrender.touch.scene import Scene
 
@@ -32,7 +34,11 @@ class Session:
     driver: Driver
     model: BandModel
     bands: Bands
-    controller: Controller
+    design: Callable[..., Controller]
+
+    def controller(self) -> Controller:
+        """Return a controller at rest, designed for this session."""
+        return self.design(self.model, self.bands, feedback=self.driver.sensed_channels > 0)
 
     @property
     def samples(self) -> int:
@@ -47,23 +53,28 @@ def registered(group: str, name: str) -> Any:
         raise ValueError(
             f"{group[:-1]} {name!r} is not installed: must be one of {', '.join(sorted(found)) or '(none)'}"
         )
-    return found[name].load()
+    try:
+        return found[name].load()
+    except Exception as error:
+        raise HapticError(f"{group[:-1]} {name!r} cannot be loaded: {type(error).__name__}: {error}") from error
 
 
 def prepare(scene: Scene, *, driver: Driver | None = None, method: str = "paper", seed: int = 0) -> Session:
     """Do all the design-time work of a run and check it; see `render` for the parameters and errors."""
-    if isinstance(seed, bool) or not isinstance(seed, int) or seed < 0:
+    if isinstance(seed, bool) or not isinstance(seed, (int, np.integer)) or seed < 0:
         raise ValueError(f"seed = {seed!r}: must be an integer >= 0")
     chosen = method_named(method)
     renderer: Renderer = registered("renderers", scene.device)()
     if driver is None:
         driver = registered("drivers", "simulated")(renderer.plant(scene, seed))
+    check_driver(driver)
     model = renderer.band_model(scene, driver)
     bands = renderer.bands(scene, model)
-    controller = chosen.design(model, bands, feedback=driver.sensed_channels > 0)
-    return Session(
-        scene=scene, method=method, seed=seed, driver=driver, model=model, bands=bands, controller=controller
+    session = Session(
+        scene=scene, method=method, seed=int(seed), driver=driver, model=model, bands=bands, design=chosen.design
     )
+    _warm_up(session)
+    return session
 
 
 def render(
@@ -135,6 +146,13 @@ def run(session: Session, *, journal: str | Path | None = None, progress: Progre
     return recorder.finish()
 
 
+def _warm_up(session: Session) -> None:
+    """Compile before the device is live: a block through a controller that is thrown away."""
+    block = session.driver.block
+    nothing = np.zeros(block)
+    session.controller().run(np.zeros((block, session.driver.sensed_channels)), nothing, nothing)
+
+
 class _Block(NamedTuple):
     """What happened over some samples, complete: the columns of a recording; `drive` as handed to the device."""
 
@@ -151,57 +169,69 @@ def _blocks(session: Session, total: int) -> Iterator[_Block]:
     """Everything that happens in a run, about `CHUNK` seconds at a time."""
     block = session.driver.block
     size = block * max(int(CHUNK * session.driver.rate / block), 1)
-    plant = getattr(session.driver, "plant", None)
-    advance = _advance_compiled if plant is not None and block == 1 else _Ring(session).advance
+    controller = session.controller()
+    compiled_with = getattr(session.driver, "compiled_with", None)
+    plant = compiled_with(controller) if compiled_with is not None else None
+    ring = _Ring(session, controller) if plant is None else _CompiledRing(session, controller, plant)
     for start in range(0, total, size):
-        yield advance(session, start, min(size, total - start))
+        yield ring.advance(start, min(size, total - start))
 
 
 def _wanted(session: Session, start: int, position: Array) -> Array:
     """Waveform of the texture over a block, where the controller has to analyse it."""
     if session.bands.envelope is not None:
         return np.zeros(len(position))
-    return np.ascontiguousarray(session.scene.texture.waveform(_time(session, start, len(position)), position), float)
+    wanted = np.asarray(session.scene.texture.waveform(_time(session, start, len(position)), position), float)
+    if wanted.shape != position.shape:
+        kind = type(session.scene.texture).__name__
+        raise ValueError(f"{kind}.waveform returned shape {wanted.shape}: must be {position.shape}, one a sample")
+    return np.where(np.isnan(wanted) & np.isnan(position), 0.0, wanted)  # nothing is wanted of a finger that is away
 
 
 def _time(session: Session, start: int, count: int) -> Array:
     return (start + np.arange(count)) / session.driver.rate
 
 
-def _advance_compiled(session: Session, start: int, count: int) -> _Block:
+class _CompiledRing:
     """Plant and controller closed in compiled code, sample by sample."""
-    plant = session.driver.plant  # type: ignore[attr-defined]
-    wanted = _wanted(session, start, plant.finger_position(count))
-    drive, target, flags, sensed = plant.closed_loop(session.controller, wanted)
-    return _complete(session, start, sensed)._replace(drive=drive, target=target, flags=flags)
+
+    def __init__(self, session: Session, controller: Controller, plant: Plant) -> None:
+        self.session, self.controller, self.plant = session, controller, plant
+
+    def advance(self, start: int, count: int) -> _Block:
+        """Play `count` samples."""
+        wanted = _wanted(self.session, start, self.plant.finger_position(count))
+        drive, target, flags, sensed = self.plant.closed_loop(self.controller, wanted)
+        return _complete(self.session, start, sensed)._replace(drive=drive, target=target, flags=flags)
 
 
 class _Ring:
     """Driver and controller handing blocks to each other."""
 
-    def __init__(self, session: Session) -> None:
-        driver = session.driver
-        self.drive = np.zeros((driver.block, driver.drive_channels))
+    def __init__(self, session: Session, controller: Controller) -> None:
+        self.session, self.controller = session, controller
+        self.drive = np.zeros((session.driver.block, session.driver.drive_channels))
 
-    def advance(self, session: Session, start: int, count: int) -> _Block:
+    def advance(self, start: int, count: int) -> _Block:
         """Play as many blocks as `count` samples need; the last one is cut in the record, not on the device."""
-        step = session.driver.block
-        blocks = [self._turn(session, at) for at in range(start, start + count, step)]
+        step = self.session.driver.block
+        blocks = [self._turn(at) for at in range(start, start + count, step)]
         return _Block(*(np.concatenate(column)[:count] for column in zip(*blocks, strict=True)))
 
-    def _turn(self, session: Session, at: int) -> _Block:
+    def _turn(self, at: int) -> _Block:
         """One block round the ring."""
-        block = _complete(session, at, session.driver.play(self.drive))
+        session, played = self.session, self.drive
+        sensed = check_sensed(session.driver, session.driver.play(played), len(session.model.places))
+        block = _complete(session, at, sensed)
         wanted = _wanted(session, at, block.position)
-        played = self.drive
-        self.drive, target, flags = session.controller.run(block.sensed, block.position, wanted)
+        self.drive, target, flags = self.controller.run(block.sensed, block.position, wanted)
         return block._replace(drive=played, target=target, flags=flags | block.flags)
 
 
 def _complete(session: Session, at: int, sensed: Sensed) -> _Block:
     """Fill in what the device cannot tell: the scene's finger, and motion as the sensors see it."""
     finger, model = session.scene.finger, session.model
-    values = np.ascontiguousarray(sensed.sensed, float)
+    values = sensed.sensed
     time = _time(session, at, len(values))
     motion = sensed.motion
     if motion is None and session.driver.sensed_channels:
@@ -213,10 +243,8 @@ def _complete(session: Session, at: int, sensed: Sensed) -> _Block:
         drive=values[:, :0],
         sensed=values,
         motion=motion,
-        position=finger.position(time) if sensed.position is None else np.ascontiguousarray(sensed.position, float),
-        normal_load=finger.load(time)
-        if sensed.normal_load is None
-        else np.ascontiguousarray(sensed.normal_load, float),
+        position=finger.position(time) if sensed.position is None else sensed.position,
+        normal_load=finger.load(time) if sensed.normal_load is None else sensed.normal_load,
         target=values[:, :0],
-        flags=np.zeros(len(time), np.int64) if sensed.flags is None else np.asarray(sensed.flags, np.int64),
+        flags=np.zeros(len(time), np.int64) if sensed.flags is None else sensed.flags,
     )

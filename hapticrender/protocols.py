@@ -100,10 +100,15 @@ class Plant(Protocol):
     rate: float
     drive_channels: int
     sensed_channels: int
+    block: int
     delay: int
 
     def run(self, drive: Array) -> Sensed:
         """Advance by n samples under `drive` (n, drive_channels)."""
+        ...
+
+    def closes(self, controller: Controller) -> bool:
+        """Whether `closed_loop` can take this controller."""
         ...
 
     def closed_loop(self, controller: Controller, wanted: Array) -> tuple[Array, Array, Array, Sensed]:

@@ -16,6 +16,7 @@ from hapticrender.touch.scene import Scene
 
 NYQUIST_MARGIN = 0.45  # of the rate: above this the hold's image cannot be told from the carrier
 CHECK_STEP = 1e-3  # s: resolution at which the finger's path is checked against the glass
+LOOK_AHEAD = 30.0  # s of a scene that are looked at for the finger's speed and the current that a waveform needs
 
 
 class VibrotactileRenderer:
@@ -50,8 +51,16 @@ class VibrotactileRenderer:
                     f"texture.frequency = {frequency:g}: must be <= {highest:g} Hz, "
                     f"{NYQUIST_MARGIN} of the rate of {model.rate:g} Hz"
                 )
-        if bands.envelope is not None:
-            _check_current(scene, model, bands)
+        fastest = _top_speed(scene) * bands.wavenumber.max(initial=0.0)
+        if fastest > highest:
+            raise ValueError(
+                f"texture.wavelength = {1 / bands.wavenumber.max():g} m passes at {fastest:g} Hz under the finger's top "
+                f"speed of {_top_speed(scene):g} m/s: must be <= {highest:g} Hz"
+            )
+        if bands.envelope is None:
+            _check_waveform(scene, model)
+        else:
+            _check_envelopes(scene, model, bands)
         return bands
 
 
@@ -64,24 +73,56 @@ def _check_path(scene: Scene, half: float) -> None:
         raise ValueError(f"finger.position reaches {reach:g} m: must stay within {half:g} m of the glass's middle")
 
 
-def _speed_range(scene: Scene) -> float:
-    """Largest speed of the finger (m/s), away from jumps."""
-    time = np.arange(0.0, min(scene.duration, 60.0), CHECK_STEP)
+def _top_speed(scene: Scene) -> float:
+    """Largest speed of the finger (m/s)."""
+    time = np.arange(0.0, min(scene.duration, LOOK_AHEAD), CHECK_STEP)
     speed = abs(np.diff(scene.finger.position(time))) / CHECK_STEP
     return float(np.nanmax(speed, initial=0.0))
 
 
-def _check_current(scene: Scene, model: BandModel, bands: Bands) -> None:
-    """Refuse targets that the free plate cannot reach within the current limit."""
-    speed = _speed_range(scene)
-    frequency = np.minimum(bands.frequency + speed * bands.wavenumber, model.highest_frequency)
-    current = abs(bands.envelope) / common_gain(model, frequency)
+def _check_envelopes(scene: Scene, model: BandModel, bands: Bands) -> None:
+    """Refuse constant targets that the free plate cannot reach within the current limit.
+
+    A finger-locked carrier passes every frequency up to that of the finger's top speed; the worst of them counts.
+    """
+    _check_range(float(abs(bands.envelope).sum()), model)
+    sweep = np.minimum(_top_speed(scene) * bands.wavenumber, 1.25 * model.highest_frequency)  # faded out beyond
+    top = bands.frequency + sweep
+    low = np.where(bands.wavenumber > 0.0, np.minimum(model.lowest_frequency, top), top)
+    passed = low + np.linspace(0.0, 1.0, 400)[:, None] * (top - low)
+    need = 1.0 / common_gain(model, passed)
+    current = abs(bands.envelope) * need.max(axis=0)
     if current.sum() > model.drive_limit:
         worst = int(current.argmax())
+        _refuse(abs(bands.envelope[worst]), float(passed[need[:, worst].argmax(), worst]), current.sum(), model)
+
+
+def _check_waveform(scene: Scene, model: BandModel) -> None:
+    """Refuse a wanted waveform that the free plate cannot follow within the current limit, in the device's range."""
+    time = np.arange(int(min(scene.duration, LOOK_AHEAD) * model.rate) + 2) / model.rate
+    wanted = np.nan_to_num(scene.texture.waveform(time, scene.finger.position(time)))
+    _check_range(float(abs(wanted).max()), model)
+    frequency = np.fft.rfftfreq(len(time), 1.0 / model.rate)
+    felt = (frequency >= model.lowest_frequency / 2) & (frequency <= min(model.highest_frequency, 0.4 * model.rate))
+    spectrum = np.where(felt, np.fft.rfft(wanted), 0.0)
+    current = abs(np.fft.irfft(spectrum / model.response(frequency).sum(axis=-1)[:, 0], len(time))).max()
+    if current > model.drive_limit:
+        _refuse(abs(wanted).max(), float(frequency[abs(spectrum).argmax()]), current, model)
+
+
+def _check_range(amplitude: float, model: BandModel) -> None:
+    """Refuse motion that the sensors cannot follow."""
+    if amplitude > model.sensed_limit:
         raise ValueError(
-            f"texture.amplitude = {abs(bands.envelope[worst]):g} m at {frequency[worst]:g} Hz "
-            f"needs {current.sum():.3g} A: must be <= {model.drive_limit:g} A in each coil"
+            f"texture.amplitude = {amplitude:.3g} m: must be <= {model.sensed_limit:g} m, what the sensors show"
         )
+
+
+def _refuse(amplitude: float, frequency: float, current: float, model: BandModel) -> None:
+    raise ValueError(
+        f"texture.amplitude = {amplitude:.3g} m at {frequency:.3g} Hz needs {current:.3g} A: "
+        f"must be <= {model.drive_limit:g} A in each coil"
+    )
 
 
 def common_gain(model: BandModel, frequency: Array) -> Array:

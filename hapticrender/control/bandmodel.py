@@ -37,7 +37,7 @@ class BandModel:
     drive_limit : float, drive unit
         Largest magnitude of each drive channel, > 0.
     sensed_limit : float, sensor unit
-        Largest magnitude that a sensor can show, > 0; beyond it a sample is not believed.
+        Largest magnitude that a sensor can show, > 0; beyond it a sample is not believed, and no target is accepted.
     drive_step : float, drive unit
         Resolution of the command; 0 is ideal.
     sensed_noise : float, sensor unit rms

@@ -15,6 +15,7 @@ from hapticrender.control.bank_kernels import (
     SCALE,
     TOUCH_ROWS,
     TRACK_ROWS,
+    TRUST,
     BankNumbers,
     BankState,
     BankTables,
@@ -36,7 +37,8 @@ class BankRules:
     """How a method sets up the bank; rates in 1/s, bandwidths in Hz, times in s.
 
     Each pair is (in quiet, awake): a detector of the deviation, or contact, wakes the loop for `awake_time`.
-    `integral` has a third number between them, for the slow detector.
+    `integral` has a third number between them, for the slow detector; `level` is the least ratio of the lowest carrier
+    to the bandwidth of the DC band.
     """
 
     error_observer: bool
@@ -46,6 +48,7 @@ class BankRules:
     rest: tuple[float, float] = (0.0, 0.0)
     inner: tuple[float, float] = (0.0, 0.0)
     quality: float = 1.4
+    level: float = 8.0
     detect: bool = True
     awake_time: float = 0.15
     stirred_time: float = 0.4
@@ -69,7 +72,7 @@ class BankController:
         self.n_bands = bands
         self.tables = tables
         touch = np.zeros(TOUCH_ROWS)
-        touch[SCALE] = 1.0
+        touch[SCALE] = touch[TRUST] = 1.0
         self.state = BankState(
             band=np.zeros((BAND_ROWS, bands)),
             loop=np.zeros((coordinates * LOOP_ROWS, bands)),
@@ -92,11 +95,15 @@ class BankController:
         return drive, target, flags
 
 
-def spacing(bands: Bands, lowest: float) -> float:
-    """Least distance between two carriers (Hz); finger-locked ones with the slowest of them at `lowest` (Hz)."""
-    speed = lowest / bands.wavenumber[bands.wavenumber > 0].min(initial=np.inf)
-    frequency = np.sort(bands.frequency + speed * bands.wavenumber)
-    return float(np.diff(frequency).min(initial=np.inf))
+def spacing(bands: Bands) -> float:
+    """Least distance between two fixed carriers (Hz); infinite where there is one or none."""
+    return float(np.diff(np.sort(bands.frequency[bands.wavenumber == 0.0])).min(initial=np.inf))
+
+
+def crowd_speed(bands: Bands, pole: float) -> float:
+    """Speed (m/s) at which finger-locked carriers are so far apart that an observer's `pole` (1/s) is deadbeat; or 0."""
+    apart = np.diff(np.sort(bands.wavenumber[bands.wavenumber > 0.0])).min(initial=np.inf)
+    return float(pole / apart) if np.isfinite(apart) else 0.0
 
 
 def design_bank(
@@ -105,14 +112,16 @@ def design_bank(
     """Apply the rules of FACTS section 3 (C, F): observer <= f0/2 and spacing/2 pi, loop <= f0/4, DC band <= f0/8."""
     if not feedback:
         rules = replace(rules, observer=(0.0, 0.0), integral=(0.0, 0.0, 0.0), inner=(0.0, 0.0), adapt=(-1.0, -1.0))
+    if (bands.wavenumber > 0.0).any():  # what is left over at one frequency is wrong at the next
+        rules = replace(rules, rest=(0.0, 0.0))
     fixed = bands.frequency[bands.wavenumber == 0.0]
     lowest = float(fixed.min(initial=model.lowest_frequency if (bands.wavenumber > 0).any() else np.inf))
-    apart = spacing(bands, model.lowest_frequency)
+    apart = spacing(bands)
     period = 1.0 / model.rate
     pole = [2 * math.pi * min(width, lowest / 2, apart / (2 * math.pi)) for width in rules.observer]
     fastest = 2 * math.pi * lowest / 4
     quiet, stirred, awake = (min(rate, fastest) for rate in rules.integral)
-    level = 2 * math.pi * min(6.0, lowest / 8) * period if feedback else 0.0
+    level = 2 * math.pi * min(6.0, lowest / rules.level) * period if feedback else 0.0
     noise = np.sqrt((model.coordinate_from_sensed**2).sum(axis=1).max()) * max(model.sensed_noise, LEAST_NOISE)
     taps, grip = damping_taps(model, rules.quality) if any(rules.inner) else _no_taps(len(model.mass))
     numbers = BankNumbers(
@@ -122,6 +131,7 @@ def design_bank(
         lead=(model.delay + 0.5) * period,
         observer=2 * pole[0] * period,
         observer_awake=2 * pole[1] * period,
+        crowd_speed=crowd_speed(bands, max(pole)),
         dc=1.6 * level,
         dc_drift=level**2,
         integral=quiet,

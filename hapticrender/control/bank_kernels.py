@@ -30,10 +30,14 @@ LOOP_ROWS = 14
 HELD, SMOOTH, VELOCITY, ACCELERATION, SEEN = range(5)
 TRACK_ROWS = 5
 # entries of BankState.touch: the finger's load (N), place g, contact, its three numbers; timers and openings of the two
-# detectors; limiter
-LOAD, PLACE, CONTACT, MASS, DAMPING, STIFFNESS, FAST_TIME, SLOW_TIME, FAST_OPEN, SLOW_OPEN, PEAK, SCALE = range(12)
-TOUCH_ROWS = 12
+# detectors; limiter; trust in the sensors
+LOAD, PLACE, CONTACT, MASS, DAMPING, STIFFNESS, FAST_TIME, SLOW_TIME, FAST_OPEN, SLOW_OPEN, PEAK, SCALE, TRUST = range(
+    13
+)
+TOUCH_ROWS = 13
 ADAPTATION = 4  # samples between two adaptations of the finger
+FAR, FASTEST = 1e3, 10.0  # m, m/s: no finger is farther away or faster, and no texture wants more
+TRUST_TIME = 0.02  # s: within this the drive fades where a sensor cannot be believed
 TRACKER_POLE = TURN * 30.0  # rad/s: triple pole of the finger's tracker; no lag under constant acceleration
 CROWDED_MASS, CROWDED_STIFFNESS = 4e-3, 300.0  # kg, N/m: how far the finger's numbers may be expected to lie from zero
 LEAST_MOTION, LEAST_LOAD = 5e-8, 0.03  # m, N: below these the finger is not adapted
@@ -48,6 +52,7 @@ class BankNumbers(NamedTuple):
     lead: float  # s: delay and half the hold
     observer: float  # g of the observer in quiet, per sample
     observer_awake: float
+    crowd_speed: float  # m/s: below it finger-locked carriers crowd, and the observer slows down with the finger
     dc: float  # 1.6 w h of the DC band (type 2)
     dc_drift: float  # (w h)^2
     integral: float  # 1/s in quiet
@@ -110,8 +115,8 @@ class BankState(NamedTuple):
 @kernel
 def track_finger(track, rate, position):
     """Velocity and acceleration of the finger by a tracker with a triple pole; a new touch starts it at rest."""
-    if not math.isfinite(position):
-        track[SEEN] = track[VELOCITY] = track[ACCELERATION] = 0.0
+    if not abs(position) <= FAR or (track[SEEN] > 0.0 and abs(position - track[HELD]) * rate > FASTEST):
+        track[SEEN] = track[VELOCITY] = track[ACCELERATION] = 0.0  # lifted, or put down elsewhere
         return
     if track[SEEN] == 0.0:
         track[SMOOTH] = position
@@ -147,7 +152,7 @@ def carrier_pass(numbers, tone, band, track):
 
 
 @kernel
-def target_pass(numbers, tone, band, wanted, target):
+def target_pass(numbers, tone, band, g, wanted, target):
     """Wanted envelope R and its slope: constant, or the wanted waveform through the bank and one more pole."""
     bands = band.shape[1]
     residual = wanted
@@ -157,9 +162,9 @@ def target_pass(numbers, tone, band, wanted, target):
     for k in range(bands):
         weight = band[WEIGHT, k]
         if numbers.analysed:
-            band[RAW_RE, k] += numbers.observer * residual * band[COS, k]
-            band[RAW_IM, k] -= numbers.observer * residual * band[SIN, k]
-            follow = 0.5 * numbers.observer
+            band[RAW_RE, k] += g * residual * band[COS, k]
+            band[RAW_IM, k] -= g * residual * band[SIN, k]
+            follow = 0.5 * g
             re = band[R_RE, k] + follow * (weight * band[RAW_RE, k] - band[R_RE, k])
             im = band[R_IM, k] + follow * (weight * band[RAW_IM, k] - band[R_IM, k])
         else:
@@ -199,6 +204,17 @@ def wake(numbers, touch, fast, slow):
         open_ = touch[timer] > 0.0
         touch[opening] = 1.0 if open_ else max(touch[opening] - numbers.release, 0.0)
         touch[timer] -= 1.0
+
+
+@kernel
+def believe(numbers, touch, loop, level, past, flags):
+    """Trust in the sensors: falls to 0 within 20 ms where a sample cannot be believed; then the loop starts anew."""
+    step = 1.0 / (TRUST_TIME * numbers.rate)
+    touch[TRUST] = max(touch[TRUST] - step, 0.0) if flags & 2 else min(touch[TRUST] + step, 1.0)
+    if touch[TRUST] == 0.0:
+        loop[:] = 0.0
+        level[:] = 0.0
+        past[:] = 0.0
 
 
 @kernel
@@ -372,6 +388,7 @@ def speak_pass(numbers, speak, force, shaper, touch, drive):
         total = 0.0
         for c in range(force.shape[0]):
             total += speak[i, c] * force[c]
+        total *= touch[TRUST]
         drive[i] = total
         peak = max(peak, abs(total) / numbers.drive_limit)
     touch[PEAK] = max(peak, touch[PEAK] * numbers.peak_decay)
@@ -397,9 +414,18 @@ def bank_step(tables, state, sensed, position, wanted, drive, target):
     past, residual, listen = state.past, state.residual, tables.listen
     mass, damping, stiffness = tables.mass, tables.damping, tables.stiffness
     flags = 0
+    doubt = 0
+    if not abs(wanted) <= FAR:
+        wanted = 0.0
+        doubt = 2
+    if abs(position) > FAR:
+        doubt = 2
     track_finger(state.track, numbers.rate, position)
     carrier_pass(numbers, tables.tone, band, state.track)
-    target_pass(numbers, tables.tone, band, wanted, target)
+    calm = 1.0
+    if numbers.crowd_speed > 0.0:
+        calm = min(abs(state.track[VELOCITY]) / numbers.crowd_speed, 1.0)
+    target_pass(numbers, tables.tone, band, calm * numbers.observer, wanted, target)
     if feel(numbers, stiffness, level, touch):
         touch[FAST_TIME] = numbers.fast_time
         if touch[CONTACT] == 0.0:
@@ -408,7 +434,7 @@ def bank_step(tables, state, sensed, position, wanted, drive, target):
     integral = numbers.integral + slow * (numbers.integral_stirred - numbers.integral)
     integral += fast * (numbers.integral_awake - integral)
     inner = numbers.inner + fast * (numbers.inner_awake - numbers.inner)
-    g = numbers.observer + fast * (numbers.observer_awake - numbers.observer)
+    g = calm * (numbers.observer + fast * (numbers.observer_awake - numbers.observer))
     trips = 0
     for c in range(shape.shape[0]):
         y = 0.0
@@ -425,6 +451,7 @@ def bank_step(tables, state, sensed, position, wanted, drive, target):
         level[0, c] += numbers.dc * error + level[1, c]
         level[1, c] += numbers.dc_drift * error
         trips |= observer_pass(numbers, shape, band, loop, c, error, deviation, g, integral, 1.0 - touch[SCALE])
+    believe(numbers, touch, loop, level, past, flags)
     wake(numbers, touch, trips & 1, trips & 2)
     state.sample[0] += 1
     if touch[CONTACT] > 0.0 and numbers.adapt >= 0.0 and state.sample[0] % ADAPTATION == 0:
@@ -433,7 +460,7 @@ def bank_step(tables, state, sensed, position, wanted, drive, target):
         rest = numbers.rest + lively * (numbers.rest_awake - numbers.rest)
         adapt_pass(numbers, mass, damping, stiffness, shape, tables.grip, band, loop, touch, inner, gain, rest)
     law_pass(numbers, mass, damping, stiffness, shape, band, loop, touch, residual[1])
-    return flags | speak_pass(numbers, tables.speak, residual[1], state.shaper, touch, drive)
+    return flags | doubt | speak_pass(numbers, tables.speak, residual[1], state.shaper, touch, drive)
 
 
 @kernel

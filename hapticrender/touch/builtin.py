@@ -29,8 +29,8 @@ def _spatial() -> Scene:
 
 
 def _recorded() -> Scene:
-    """Return a texture as if recorded at 80 mm/s, under a light sliding finger."""
-    finger = Finger.sliding(speed=0.08, normal_load=0.3, span=0.08, mechanics="light")
+    """Return a texture as if recorded at 80 mm/s, under a light finger that sweeps to and fro at up to that speed."""
+    finger = Finger.swiping(frequency=0.5, speed=0.08, normal_load=0.3, mechanics="light")
     texture = Synthetic(amplitude=20e-6, speed=0.08)
     return Scene(texture=texture, finger=finger, duration=5.0, name="recorded-texture")
 

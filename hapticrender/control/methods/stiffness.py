@@ -34,6 +34,7 @@ ERROR_CROWDED = BankRules(
     adapt=(2.0, 40.0),
     rest=(0.05, 5.0),
     inner=(0.2, 1.0),
+    level=3.5,
     detect=False,
     awake_time=0.4,
     release=0.3,
@@ -56,6 +57,6 @@ class ErrorObserver:
     name = "h2"
 
     def design(self, model: BandModel, bands: Bands, *, feedback: bool = True) -> BankController:
-        """Bank on the error; carriers nearer than 40 Hz are watched without detectors."""
-        crowded = spacing(bands, model.lowest_frequency) < CROWDED
+        """Bank on the error; carriers nearer than 40 Hz, or that may come so near, are watched without detectors."""
+        crowded = spacing(bands) < CROWDED or (bands.wavenumber > 0.0).sum() > 1
         return design_bank(self.name, model, bands, ERROR_CROWDED if crowded else ERROR, feedback=feedback)
