@@ -54,8 +54,8 @@ class VibrotactileRenderer:
         fastest = _top_speed(scene) * bands.wavenumber.max(initial=0.0)
         if fastest > highest:
             raise ValueError(
-                f"texture.wavelength = {1 / bands.wavenumber.max():g} m passes at {fastest:g} Hz under the finger's top "
-                f"speed of {_top_speed(scene):g} m/s: must be <= {highest:g} Hz"
+                f"texture.wavelength = {1 / bands.wavenumber.max():g} m passes at {fastest:g} Hz at the finger's "
+                f"{_top_speed(scene):g} m/s: must be <= {highest:g} Hz"
             )
         if bands.envelope is None:
             _check_waveform(scene, model)
@@ -114,7 +114,7 @@ def _check_range(amplitude: float, model: BandModel) -> None:
     """Refuse motion that the sensors cannot follow."""
     if amplitude > model.sensed_limit:
         raise ValueError(
-            f"texture.amplitude = {amplitude:.3g} m: must be <= {model.sensed_limit:g} m, what the sensors show"
+            f"texture.amplitude = {amplitude:.3g} m: must be <= {model.sensed_limit:g} m, the sensors' range"
         )
 
 

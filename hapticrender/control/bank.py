@@ -101,7 +101,7 @@ def spacing(bands: Bands) -> float:
 
 
 def crowd_speed(bands: Bands, pole: float) -> float:
-    """Speed (m/s) at which finger-locked carriers are so far apart that an observer's `pole` (1/s) is deadbeat; or 0."""
+    """Speed (m/s) from which finger-locked carriers lie a deadbeat observer's `pole` (1/s) apart; 0 for one or none."""
     apart = np.diff(np.sort(bands.wavenumber[bands.wavenumber > 0.0])).min(initial=np.inf)
     return float(pole / apart) if np.isfinite(apart) else 0.0
 
