@@ -32,7 +32,7 @@ class BendingMode:
     Parameters
     ----------
     frequency : float, Hz
-        Where it was measured, > 0.
+        Where it lies, > 0.
     damping : float
         Its damping ratio, >= 0.
     coupling : tuple of float, 1/kg
@@ -41,12 +41,15 @@ class BendingMode:
         over modal mass.  Negative where sensors and drive move apart.
     spread : float, Hz
         How far off `frequency` it may lie, >= 0.
+    measured : bool
+        False for an estimate: then the coupling may have either sign, and Q stays at 2 or above.
     """
 
     frequency: float
     damping: float
     coupling: tuple[float, ...]
     spread: float = 100.0
+    measured: bool = True
 
     def __post_init__(self) -> None:
         if not (math.isfinite(self.frequency) and self.frequency > 0):
@@ -56,9 +59,13 @@ class BendingMode:
         if not 0 <= self.spread < self.frequency:
             raise ValueError(f"spread = {self.spread!r}: must be between 0 and {self.frequency:g} Hz")
 
-    def shifted(self, difference: float) -> BendingMode:
-        """The same mode `difference` (Hz) higher."""
-        return replace(self, frequency=self.frequency + difference)
+    def corners(self) -> tuple[BendingMode, ...]:
+        """Return the mode at either end of its spread, and with either sign where it is an estimate."""
+        return tuple(
+            replace(self, frequency=self.frequency + shift, coupling=tuple(sign * each for each in self.coupling))
+            for sign in ((1,) if self.measured else (1, -1))
+            for shift in (-self.spread, self.spread)
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -357,8 +364,8 @@ def choose_damping(
     model : BandModel
         The free device with its rate and delay.
     bending : BendingMode, optional
-        The bending mode of the surface, once it is measured: the taps then spare it, and Q may go down to 1.4.
-        Without it Q stays at 2 or above.
+        The bending mode of the surface, which the taps then spare; once it is measured Q may go down to 1.4.
+        Without it Q stays at 2 or above, and nothing is known of the surface's own modes.
     bounds : DampingBounds, optional
         What margins to insist on.
 
@@ -374,14 +381,14 @@ def choose_damping(
     """
     bounds = bounds or DampingBounds()
     mode, ratio = modes_of(model)
-    least = QUALITY_UNMEASURED if bending is None else QUALITY
+    least = QUALITY if bending is not None and bending.measured else QUALITY_UNMEASURED
     largest = 1 / (2 * WORTH * max(float(ratio.max()), LEAST_RATIO))
     lag = f"a delay of {model.delay} sample{'s' * (model.delay != 1)} at {model.rate:g} Hz"
     if largest < least:
         return _off(model, f"off: the modes damp themselves (Q {WORTH * largest:.1f})")
     if (model.delay + 0.5) / model.rate * mode.max() > 2 * np.pi:
         return _off(model, f"off: {lag} is longer than a period of the mode at {mode.max() / (2 * np.pi):.0f} Hz")
-    complaint = ""
+    complaint = raised = ""
     for step in range(int((largest - least) / QUALITY_STEP) + 1):
         quality = round(least + step * QUALITY_STEP, 1)
         kept = []
@@ -393,9 +400,9 @@ def choose_damping(
                 kept.append((max(each.noise for each in margins), count, taps, grip, margins))
         if kept:
             _, count, taps, grip, margins = min(kept, key=lambda each: each[:2])
-            return Damping(
-                taps=taps, grip=grip, quality=quality, margins=margins, note=_note(quality, least, count, lag, bending)
-            )
+            note = f"on: Q {quality:g}{raised}; {_spared(count, bending)}"
+            return Damping(taps=taps, grip=grip, quality=quality, margins=margins, note=note)
+        raised = f" (at Q {quality:g} {lag} leaves {complaint})"
     return _off(model, f"off: {lag} leaves {complaint} even at Q {quality:g}")
 
 
@@ -419,22 +426,19 @@ def _complaint(
             return complaint
     if bending is None:
         return ""
-    for difference in (-bending.spread, bending.spread):
-        for found in damping_margins(model, taps, bending=bending.shifted(difference)):
+    for corner in bending.corners():
+        for found in damping_margins(model, taps, bending=corner):
             if not found.stable or found.peak_sensitivity > bounds.astray:
-                return f"the bending mode loose {difference:+g} Hz off its place"
+                return f"the bending mode loose at {corner.frequency:g} Hz"
     return ""
 
 
-def _note(quality: float, least: float, count: int, lag: str, bending: BendingMode | None) -> str:
-    """Say what was chosen and why."""
-    spared = (
-        "the bending mode is not measured"
-        if bending is None
-        else f"{count} taps spare the bending mode at {bending.frequency:.0f} +-{bending.spread:.0f} Hz"
-    )
-    raised = f", Q raised from {least:g} for {lag}" if quality > least else ""
-    return f"on: Q {quality:g}, {spared}{raised}"
+def _spared(count: int, bending: BendingMode | None) -> str:
+    """Say what the taps know of the bending mode."""
+    if bending is None:
+        return "no bending mode is known"
+    known = "measured" if bending.measured else "estimated"
+    return f"{count} taps spare the bending mode {known} at {bending.frequency:.0f} +-{bending.spread:.0f} Hz"
 
 
 def _off(model: BandModel, note: str) -> Damping:
