@@ -11,6 +11,7 @@ import numpy as np
 
 SATURATED, NONFINITE = 1, 2
 LEAST_LOAD = 0.03  # N
+FAR, FASTEST, TRUST_TIME = 1e3, 10.0, 0.02  # m, m/s, s
 FINGER_M, FINGER_K = 4e-3, 300.0  # kg, N/m
 
 
@@ -45,7 +46,7 @@ class NaiveBank:
         self.contact, self.g = False, 0.0
         self.m = self.b = self.k = 0.0
         self.timers, self.open = [0.0, 0.0], [0.0, 0.0]  # fast, slow
-        self.peak, self.scale = 0.0, 1.0
+        self.peak, self.scale, self.trust = 0.0, 1.0, 1.0
         self.round_1, self.round_2 = np.zeros(len(tables.speak)), np.zeros(len(tables.speak))
         self.samples = 0
 
@@ -54,6 +55,9 @@ class NaiveBank:
         p, t = self.p, self.t
         T = 1 / p.rate
         flags = 0
+        far = abs(position) > FAR
+        if not abs(wanted) <= FAR:
+            wanted, far = 0.0, True
         self.follow(position)
         carrier = self.carriers()
         calm = min(abs(self.velocity) / p.crowd_speed, 1.0) if p.crowd_speed > 0 else 1.0
@@ -90,6 +94,7 @@ class NaiveBank:
         heard = 2 * deviation[:, None] * carrier.conj()
         self.fast = self.fast + p.fast_pole * (heard - self.fast)
         self.slow = self.slow + p.slow_pole * (heard - self.slow)
+        self.believe(believed.all())
         self.wake((abs(self.fast) ** 2 > p.fast_level).any(), (abs(self.slow) ** 2 > p.slow_level).any())
 
         self.samples += 1
@@ -98,11 +103,12 @@ class NaiveBank:
             self.adapt(R, inner, move(p.adapt, p.adapt_awake, lively), move(p.rest, p.rest_awake, lively))
         F = F + (self.force(R, dR) * self.ahead() * carrier).real.sum(axis=1)
         drive, cut = self.speak(F)
-        return drive, target, flags | cut
+        return drive, target, flags | cut | (NONFINITE if far else 0)
 
     def follow(self, position):
         """Finger tracker: three equal poles at 30 Hz."""
-        if not math.isfinite(position):
+        leapt = self.seen and abs(position - self.held) * self.p.rate > FASTEST
+        if leapt or not abs(position) <= FAR:
             self.seen, self.velocity, self.acceleration = False, 0.0, 0.0
             return
         if not self.seen:
@@ -158,6 +164,15 @@ class NaiveBank:
             if not self.contact:
                 self.m = self.b = self.k = 0.0
                 self.rest = np.zeros_like(self.rest)
+
+    def believe(self, heard):
+        """S: fade out while a sensor cannot be believed; once silent, forget what it said."""
+        change = 1 / (TRUST_TIME * self.p.rate)
+        self.trust = min(self.trust + change, 1.0) if heard else max(self.trust - change, 0.0)
+        if self.trust == 0:
+            for state in (self.E, self.v, self.dv, self.v_slow, self.apart, self.fast, self.slow, self.dc, self.drift):
+                state[:] = 0
+            self.eps[:] = 0
 
     def wake(self, *trips):
         """Timers of the two detectors (fast, slow), and how far each has opened the loop."""
@@ -232,7 +247,7 @@ class NaiveBank:
     def speak(self, F):
         """S: the whole envelope scaled to the limit, rounding shaped by (1 - z^-1)^2."""
         p = self.p
-        drive = self.t.speak @ F
+        drive = self.trust * (self.t.speak @ F)
         self.peak = max(abs(drive).max() / p.drive_limit, self.peak * p.peak_decay)
         self.scale = min(1.0, 1 / self.peak) if self.peak > 0 else 1.0
         drive = self.scale * drive
