@@ -22,6 +22,7 @@ from hapticrender.protocols import Array
 
 TURN = 2.0 * math.pi
 QUIET = 1e-12  # m: below this a target counts as silence and its phase means nothing
+FAR = 1e3  # m: no finger is farther away and no texture wants more; beyond it a value is not believed
 VELOCITY_POLE = 40.0  # Hz: smoothing of the finger's velocity, used only to look up gains and to fade
 GATE_TIME = 0.02  # s: finger-locked targets fade in and out with contact
 
@@ -34,8 +35,8 @@ TURNS, FORWARD, HEADING_RE, HEADING_IM, REF_RE1, REF_RE2, REF_IM1, REF_IM2 = ran
 COS, SIN, TARGET_RE, TARGET_IM, NOW = range(8, 13)
 BAND_ROWS = 13
 # rows of PolarState.loop, LOOP_ROWS for each coordinate: low-pass states, states of amplitude and phase loop
-RE1, RE2, IM1, IM2, AMPLITUDE1, AMPLITUDE2, THETA1, THETA2 = range(8)
-LOOP_ROWS = 8
+RE1, RE2, IM1, IM2, AMPLITUDE1, AMPLITUDE2, THETA1, THETA2, X_RE, X_IM = range(10)
+LOOP_ROWS = 10
 # entries of PolarState.finger
 HELD, VELOCITY, GATE, SEEN = range(4)
 
@@ -52,6 +53,8 @@ class PolarNumbers(NamedTuple):
     sensed_limit: float  # beyond it a sensor is not believed
     lowest: float  # Hz
     highest: float  # Hz
+    floor: float  # m: least command amplitude, 0; naive: -inf
+    subtract: bool  # naive: phase of X minus phase of R, each with its own seam
     filter: Section  # low pass of the STDFT*
     law: Section  # loop controller
     table_step: float  # Hz
@@ -173,28 +176,38 @@ def carrier_pass(numbers, tone, band, loop, finger, wanted, target):
 
 
 @kernel
-def polar_pass(numbers, gain, band, loop, c, y):
+def star_pass(numbers, band, loop, c, y):
+    """STDFT* (eq. 1, 3, 4): envelopes X of coordinate c."""
+    base = c * LOOP_ROWS
+    for k in range(band.shape[1]):
+        loop[base + X_RE, k], loop[base + RE1, k], loop[base + RE2, k] = biquad_step(
+            numbers.filter, loop[base + RE1, k], loop[base + RE2, k], 2.0 * y * band[COS, k]
+        )
+        loop[base + X_IM, k], loop[base + IM1, k], loop[base + IM2, k] = biquad_step(
+            numbers.filter, loop[base + IM1, k], loop[base + IM2, k], -2.0 * y * band[SIN, k]
+        )
+
+
+@kernel
+def polar_pass(numbers, gain, band, loop, c):
     """Amplitude and phase loops of coordinate c over all bands; returns its drive."""
     base = c * LOOP_ROWS
     total = 0.0
     for k in range(band.shape[1]):
-        cos, sin, r_re, r_im = band[COS, k], band[SIN, k], band[TARGET_RE, k], band[TARGET_IM, k]
-        x_re, loop[base + RE1, k], loop[base + RE2, k] = biquad_step(
-            numbers.filter, loop[base + RE1, k], loop[base + RE2, k], 2.0 * y * cos
-        )
-        x_im, loop[base + IM1, k], loop[base + IM2, k] = biquad_step(
-            numbers.filter, loop[base + IM1, k], loop[base + IM2, k], -2.0 * y * sin
-        )
+        r_re, r_im, x_re, x_im = band[TARGET_RE, k], band[TARGET_IM, k], loop[base + X_RE, k], loop[base + X_IM, k]
         wanted = size(r_re, r_im)
         lag = 0.0
-        if wanted > QUIET:  # phase of X against R, eq. 5 with the cut moved
-            lag = angle_cut_at_90(x_im * r_re - x_re * r_im, x_re * r_re + x_im * r_im)
+        if wanted > QUIET:
+            if numbers.subtract:
+                lag = angle_cut_at_90(x_im, x_re) - angle_cut_at_90(r_im, r_re)
+            else:  # phase of X against R, eq. 5 with the cut moved
+                lag = angle_cut_at_90(x_im * r_re - x_re * r_im, x_re * r_re + x_im * r_im)
         theta, loop[base + THETA1, k], loop[base + THETA2, k] = biquad_step(
             numbers.law, loop[base + THETA1, k], loop[base + THETA2, k], -lag
         )
         law = numbers.law
         error = wanted - size(x_re, x_im)  # eq. 3
-        command = max(law[0] * error + loop[base + AMPLITUDE1, k], 0.0)  # negative, feedback would turn positive
+        command = max(law[0] * error + loop[base + AMPLITUDE1, k], numbers.floor)  # negative: positive feedback
         loop[base + AMPLITUDE1, k] = law[1] * error - law[3] * command + loop[base + AMPLITUDE2, k]
         loop[base + AMPLITUDE2, k] = law[2] * error - law[4] * command
         total += command / lookup(gain, c, numbers.table_step, band[NOW, k]) * synthesise(band, k, theta)
@@ -223,10 +236,8 @@ def synthesise(band, k, theta):
 
 
 @kernel
-def polar_step(tables, state, sensed, position, wanted, drive, target):
-    """One sample of the whole controller: fills `drive` (channels,) and `target` (bands,), returns flags."""
-    numbers, listen, speak, gain = tables.numbers, tables.listen, tables.speak, tables.gain
-    band, loop, coordinate = state.band, state.loop, state.coordinate
+def listen_pass(numbers, listen, sensed, coordinate):
+    """Coordinates from sensors; what no sensor can show counts as zero.  Returns flags."""
     flags = 0
     for c in range(coordinate.shape[0]):
         coordinate[c] = 0.0
@@ -235,13 +246,13 @@ def polar_step(tables, state, sensed, position, wanted, drive, target):
                 coordinate[c] += listen[c, s] * sensed[s]
             else:  # NaN included
                 flags |= 2
-    follow_finger(state.finger, numbers.rate, position)
-    carrier_pass(numbers, tables.tone, band, loop, state.finger, wanted, target)
-    for c in range(coordinate.shape[0]):
-        if numbers.feedback:
-            coordinate[c] = polar_pass(numbers, gain, band, loop, c, coordinate[c])
-        else:
-            coordinate[c] = open_pass(numbers, gain, tables.lag, band, c)
+    return flags
+
+
+@kernel
+def speak_pass(numbers, speak, coordinate, drive):
+    """Drive of the channels from that of the coordinates, each cut to its limit.  Returns flags."""
+    flags = 0
     for i in range(drive.shape[0]):
         total = 0.0
         for c in range(coordinate.shape[0]):
@@ -250,6 +261,28 @@ def polar_step(tables, state, sensed, position, wanted, drive, target):
         if drive[i] != total:
             flags |= 1
     return flags
+
+
+@kernel
+def polar_step(tables, state, sensed, position, wanted, drive, target):
+    """One sample of the whole controller: fills `drive` (channels,) and `target` (bands,), returns flags."""
+    numbers, gain, band, loop, coordinate = tables.numbers, tables.gain, state.band, state.loop, state.coordinate
+    flags = listen_pass(numbers, tables.listen, sensed, coordinate)
+    if not abs(wanted) <= FAR:
+        wanted = 0.0
+        flags |= 2
+    if abs(position) > FAR:
+        position = math.nan
+        flags |= 2
+    follow_finger(state.finger, numbers.rate, position)
+    carrier_pass(numbers, tables.tone, band, loop, state.finger, wanted, target)
+    for c in range(coordinate.shape[0]):
+        if numbers.feedback:
+            star_pass(numbers, band, loop, c, coordinate[c])
+            coordinate[c] = polar_pass(numbers, gain, band, loop, c)
+        else:
+            coordinate[c] = open_pass(numbers, gain, tables.lag, band, c)
+    return flags | speak_pass(numbers, tables.speak, coordinate, drive)
 
 
 @kernel

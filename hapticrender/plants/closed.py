@@ -1,22 +1,42 @@
-"""Plate and controller closed in one compiled loop, sample by sample: one kernel a family of methods.
+"""Plate and controller closed in one compiled loop, sample by sample, for every family of methods.
 
-Each does the same as the plate's `plate_run` and the controller's own run
+The loop does the same as the plate's `plate_run` and the controller's own run
 handing single samples to each other, without leaving compiled code.
 """
 
 from __future__ import annotations
 
+from numba.extending import overload
+
 from hapticrender._jit import kernel
 from hapticrender.control.bank_kernels import BankTables, bank_step
+from hapticrender.control.boxcar_kernels import BoxcarTables, boxcar_step
+from hapticrender.control.complex_kernels import ComplexTables, complex_step
 from hapticrender.control.kernels import PolarTables, polar_step
 from hapticrender.plants.kernels import plate_advance, plate_drive, plate_sense
 
+STEPS = {PolarTables: polar_step, BoxcarTables: boxcar_step, ComplexTables: complex_step, BankTables: bank_step}
+
+
+def controller_step(tables, state, sensed, position, wanted, drive, target):
+    """One sample of the controller that `tables` belong to."""
+    return STEPS[type(tables)](tables, state, sensed, position, wanted, drive, target)
+
+
+@overload(controller_step)
+def _chosen(tables, state, sensed, position, wanted, drive, target):
+    """Inside a kernel the type of `tables` chooses the step when the kernel is compiled."""
+    step = STEPS[tables.instance_class]
+    return lambda tables, state, sensed, position, wanted, drive, target: step(
+        tables, state, sensed, position, wanted, drive, target
+    )
+
 
 @kernel
-def polar_plate_run(
-    tables, state, polar, polar_state, last, finger, noise, wanted, sensed, motion, drive, target, flags
+def closed_plate_run(
+    tables, state, control, control_state, last, finger, noise, wanted, sensed, motion, drive, target, flags
 ):
-    """Plate and polar controller closed sample by sample; `last` (2,) is the drive computed one sample ago.
+    """Plate and controller closed sample by sample; `last` (2,) is the drive computed one sample ago.
 
     Row n of `drive` is what the plate was handed for interval n, so it is computed from sample n - 1.
     """
@@ -26,22 +46,7 @@ def polar_plate_run(
         plate_drive(tables, pending, cursor, current, last)
         plate_advance(tables, z, frozen, system, push, current, finger[n, 0], finger[n, 1], finger[n, 2])
         drive[n, 0], drive[n, 1] = last[0], last[1]
-        flags[n] |= polar_step(polar, polar_state, sensed[n], finger[n, 0], wanted[n], last, target[n])
+        flags[n] |= controller_step(control, control_state, sensed[n], finger[n, 0], wanted[n], last, target[n])
 
 
-@kernel
-def bank_plate_run(tables, state, bank, bank_state, last, finger, noise, wanted, sensed, motion, drive, target, flags):
-    """Plate and band bank closed sample by sample; `last` (2,) is the drive computed one sample ago.
-
-    Row n of `drive` is what the plate was handed for interval n, so it is computed from sample n - 1.
-    """
-    z, frozen, system, push, pending, cursor, current = state
-    for n in range(sensed.shape[0]):
-        flags[n] = plate_sense(tables, z, noise[n], sensed[n], motion[n])
-        plate_drive(tables, pending, cursor, current, last)
-        plate_advance(tables, z, frozen, system, push, current, finger[n, 0], finger[n, 1], finger[n, 2])
-        drive[n, 0], drive[n, 1] = last[0], last[1]
-        flags[n] |= bank_step(bank, bank_state, sensed[n], finger[n, 0], wanted[n], last, target[n])
-
-
-CLOSED = {PolarTables: polar_plate_run, BankTables: bank_plate_run}
+CLOSED = dict.fromkeys(STEPS, closed_plate_run)

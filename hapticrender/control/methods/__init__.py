@@ -2,11 +2,23 @@
 
 from __future__ import annotations
 
+from hapticrender.control.methods.boxcar import Boxcar
+from hapticrender.control.methods.inverse import DynamicStiffness, StaticInverse
 from hapticrender.control.methods.paper import CommonMode, PerSide
+from hapticrender.control.methods.resonant import Resonant
 from hapticrender.control.methods.stiffness import ErrorObserver, SignalObserver
 from hapticrender.protocols import Method
 
-_ALL: tuple[Method, ...] = (PerSide(), CommonMode(), SignalObserver(), ErrorObserver())
+_ALL: tuple[Method, ...] = (
+    PerSide(),
+    CommonMode(),
+    Boxcar(),
+    StaticInverse(),
+    DynamicStiffness(),
+    Resonant(),
+    SignalObserver(),
+    ErrorObserver(),
+)
 METHODS = {method.name: method for method in _ALL}
 
 

@@ -9,10 +9,14 @@ this very plate between 129 and 189 Hz.
 
 from __future__ import annotations
 
+import math
+from dataclasses import dataclass
+
 import numpy as np
 
 from hapticrender.bands import Bands
 from hapticrender.control.bandmodel import BandModel
+from hapticrender.control.envelope_loop import Bandwidths, EnvelopeLoop, envelope_loop
 from hapticrender.control.kernels import (
     BAND_ROWS,
     FORWARD,
@@ -21,10 +25,8 @@ from hapticrender.control.kernels import (
     PolarNumbers,
     PolarState,
     PolarTables,
-    Section,
     polar_run,
 )
-from hapticrender.control.loopshape import design
 from hapticrender.protocols import Array
 
 TABLE_STEP = 0.5  # Hz, resolution of the look-up table
@@ -65,18 +67,43 @@ class PolarController:
         return drive, target, flags
 
 
-class PerSide:
+@dataclass(frozen=True, kw_only=True)
+class Polar:
+    """Options of the polar methods; they show what each precaution is good for.
+
+    Parameters
+    ----------
+    clamp : bool
+        Keep the command amplitude from going negative.
+    subtract : bool
+        Naive phase error arg X - arg R, with a seam at -270/90 degrees in each, instead of arg(X conj R).
+    bandwidths : (float, float), Hz, optional
+        Of loop and low pass, unchecked; by default the paper's rule.
+    """
+
+    clamp: bool = True
+    subtract: bool = False
+    bandwidths: Bandwidths | None = None
+
+    def _star(
+        self, name: str, model: BandModel, bands: Bands, watched: Array, spread: Array, feedback: bool
+    ) -> PolarController:
+        """Loops on the STDFT*."""
+        loop = envelope_loop(model, bands, bandwidths=self.bandwidths, feedback=feedback)
+        return PolarController(name, polar_tables(self, model, bands, watched, spread, loop, feedback))
+
+
+class PerSide(Polar):
     """The paper's controller: each transducer with its own amplitude and phase loops."""
 
     name = "paper"
 
     def design(self, model: BandModel, bands: Bands, *, feedback: bool = True) -> PolarController:
         """Loops on the displacements at the transducers, interpolated from the sensors at the ends."""
-        sides = model.side_from_coordinate
-        return _design(self.name, model, bands, sides, np.eye(len(sides)), feedback)
+        return self._star(self.name, model, bands, *per_side(model), feedback)
 
 
-class CommonMode:
+class CommonMode(Polar):
     """The same loops on the mean displacement only; all transducers get the same drive."""
 
     name = "paper-common"
@@ -84,27 +111,27 @@ class CommonMode:
     def design(self, model: BandModel, bands: Bands, *, feedback: bool = True) -> PolarController:
         """One pair of loops on heave."""
         sides = model.side_from_coordinate
-        return _design(self.name, model, bands, sides.mean(axis=0, keepdims=True), np.ones((len(sides), 1)), feedback)
+        return self._star(
+            self.name, model, bands, sides.mean(axis=0, keepdims=True), np.ones((len(sides), 1)), feedback
+        )
 
 
-def _design(
-    name: str,
+def per_side(model: BandModel) -> tuple[Array, Array]:
+    """Watched displacements and drive channels of loops at each transducer, in coordinates."""
+    sides = model.side_from_coordinate
+    return sides, np.eye(len(sides))
+
+
+def polar_tables(
+    options: Polar,
     model: BandModel,
     bands: Bands,
     watched: Array,
     spread: Array,
+    loop: EnvelopeLoop,
     feedback: bool,
-) -> PolarController:
+) -> PolarTables:
     """Tables of the compiled step: `watched` rows are the controlled displacements, `spread` their drive channels."""
-    fixed = bands.frequency[bands.wavenumber == 0.0]
-    lowest = min(model.lowest_frequency, fixed.min(initial=np.inf))
-    loop = design(
-        loop_bandwidth=lowest / 4,
-        filter_bandwidth=lowest / 2,
-        form="reduced",
-        lowest_frequency=lowest,
-        delay=model.delay / model.rate if feedback else 0.0,
-    )
     frequency = np.arange(0.0, model.rate / 2 + TABLE_STEP, TABLE_STEP)
     common = model.response(frequency) @ np.ones(model.force_from_drive.shape[1])
     table = (common @ watched.T).T * model.hold_and_delay(frequency)
@@ -116,11 +143,13 @@ def _design(
         sensed_limit=float(model.sensed_limit),
         lowest=float(model.lowest_frequency),
         highest=min(model.highest_frequency, 0.4 * model.rate),
-        filter=_section(loop.low_pass.tustin(model.rate, prewarp=lowest / 2)),
-        law=_section(loop.controller.tustin(model.rate)),
+        floor=0.0 if options.clamp else -math.inf,
+        subtract=options.subtract,
+        filter=loop.filter,
+        law=loop.law,
         table_step=TABLE_STEP,
     )
-    tables = PolarTables(
+    return PolarTables(
         numbers=numbers,
         tone=bands.tone(),
         listen=np.ascontiguousarray(watched @ model.coordinate_from_sensed),
@@ -128,11 +157,3 @@ def _design(
         gain=np.ascontiguousarray(abs(table)),
         lag=np.ascontiguousarray(np.unwrap(np.angle(table), axis=1)),
     )
-    return PolarController(name, tables)
-
-
-def _section(coefficients: tuple[Array, Array]) -> Section:
-    """Second-order section with a0 = 1 as five numbers."""
-    b, a = coefficients
-    b0, b1, b2, a1, a2 = (float(value) for value in (*b, *a[1:]))
-    return b0, b1, b2, a1, a2
