@@ -28,6 +28,8 @@ CONTACT = (0.05, 0.03)  # N: on, off
 RAMP_TIME = 0.05  # s: a target grows this long, so that it does not strike the modes
 FAST_POLE, FAST_SIGMAS = 30.0, 5.5  # Hz, of the sensor noise behind that pole
 SLOW_POLE, SLOW_SIGMAS = 4.0, 5.0
+PHASE_MARGIN = math.pi / 4  # rad: 90 deg less integral gain times (delay + 1/observer pole)
+LEARNING_TIME = 1 / 60  # s: fastest adaptation of the finger; a delay counts twice
 BACK_TIME = 2e-3  # s: back-calculation at the limit
 LEAST_NOISE = 1e-9  # m: thresholds never fall to nothing
 
@@ -119,8 +121,11 @@ def design_bank(
     apart = spacing(bands)
     period = 1.0 / model.rate
     pole = [2 * math.pi * min(width, lowest / 2, apart / (2 * math.pi)) for width in rules.observer]
-    fastest = 2 * math.pi * lowest / 4
-    quiet, stirred, awake = (min(rate, fastest) for rate in rules.integral)
+    wait = model.delay * period  # integrator, observer and delay leave at least PHASE_MARGIN
+    fastest = [min(2 * math.pi * lowest / 4, PHASE_MARGIN / (wait + 1 / max(each, 1e-9))) for each in pole]
+    quiet, stirred = (min(rate, fastest[0]) for rate in rules.integral[:2])
+    awake = min(rules.integral[2], fastest[1])
+    learning = 1 / (2 * wait + LEARNING_TIME)
     level = 2 * math.pi * min(6.0, lowest / rules.level) * period if feedback else 0.0
     noise = np.sqrt((model.coordinate_from_sensed**2).sum(axis=1).max()) * max(model.sensed_noise, LEAST_NOISE)
     taps, grip = damping_taps(model, rules.quality) if any(rules.inner) else _no_taps(len(model.mass))
@@ -137,8 +142,8 @@ def design_bank(
         integral=quiet,
         integral_stirred=stirred,
         integral_awake=awake,
-        adapt=rules.adapt[0],
-        adapt_awake=rules.adapt[1],
+        adapt=min(rules.adapt[0], learning),
+        adapt_awake=min(rules.adapt[1], learning),
         rest=rules.rest[0],
         rest_awake=rules.rest[1],
         inner=rules.inner[0],

@@ -38,7 +38,7 @@ TOUCH_ROWS = 13
 ADAPTATION = 4  # samples between two adaptations of the finger
 FAR, FASTEST = 1e3, 10.0  # m, m/s: no finger is farther away or faster, and no texture wants more
 TRUST_TIME = 0.02  # s: within this the drive fades where a sensor cannot be believed
-TRACKER_POLE = TURN * 30.0  # rad/s: triple pole of the finger's tracker; no lag under constant acceleration
+TRACKER_POLE = TURN * 60.0  # rad/s: triple pole of the finger's tracker; no lag under constant acceleration
 CROWDED_MASS, CROWDED_STIFFNESS = 4e-3, 300.0  # kg, N/m: how far the finger's numbers may be expected to lie from zero
 LEAST_MOTION, LEAST_LOAD = 5e-8, 0.03  # m, N: below these the finger is not adapted
 
