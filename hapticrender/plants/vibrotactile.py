@@ -30,7 +30,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from hapticrender.control.bandmodel import BandModel
-from hapticrender.control.damping import BendingMode
+from hapticrender.control.damping_margins import BendingMode
 from hapticrender.plants.closed import CLOSED
 from hapticrender.plants.kernels import PlateState, PlateTables, plate_run, plate_system
 from hapticrender.protocols import Array, Controller, Sensed
