@@ -14,7 +14,7 @@ inside its step; here they stand alone, to be measured, drawn and reused.
 
 References
 ----------
-Peceli, IEEE Transactions on Circuits and Systems, 1986 (resonator-based digital filters).
+Peceli, A common structure for recursive discrete transforms, IEEE Transactions on Circuits and Systems 33, 1986.
 """
 
 from __future__ import annotations
