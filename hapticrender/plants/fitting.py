@@ -128,30 +128,25 @@ def _generator(plate: PlateParameters, period: float) -> Array:
     Positions are heave, rocking and, where the glass bends, the bending that the sensors show, which no free plate
     couples to the others.
     """
-    mass, damping, stiffness, force = (
-        plate.mass_matrix,
-        plate.damping_matrix,
-        plate.stiffness_matrix,
-        plate.force_from_drive,
+    inverse = np.linalg.inv(plate.mass_matrix)
+    hold, drag, push = (
+        inverse @ each for each in (plate.stiffness_matrix, plate.damping_matrix, plate.force_from_drive)
     )
-    inverse = np.linalg.inv(mass)
-    blocks = [(inverse @ stiffness, inverse @ damping, inverse @ force)]
     if plate.bending_frequency:
         turning = 2 * np.pi * plate.bending_frequency
-        push = plate.bending_coil / plate.bending_mass * plate.force_constant
-        blocks.append((np.eye(1) * turning**2, np.eye(1) * 2 * plate.bending_damping * turning, np.full((1, 2), push)))
-    count = sum(len(block[0]) for block in blocks)
-    generator = np.zeros((2 * count, 2 * count + 2))
-    generator[:count, count : 2 * count] = np.eye(count)
-    row = 0
-    for hold, drag, push in blocks:
-        own = slice(row, row + len(hold))
-        moved = slice(count + row, count + row + len(hold))
-        generator[moved, own] = -(period**2) * hold
-        generator[moved, moved] = -period * drag
-        generator[moved, 2 * count :] = period**2 * push
-        row += len(hold)
-    return generator
+        hold = _beside(hold, turning**2)
+        drag = _beside(drag, 2 * plate.bending_damping * turning)
+        push = np.vstack([push, np.full(2, plate.bending_coil / plate.bending_mass * plate.force_constant)])
+    none, one = np.zeros_like(hold), np.eye(len(hold))
+    return np.block([[none, one, np.zeros_like(push)], [-(period**2) * hold, -period * drag, period**2 * push]])
+
+
+def _beside(matrix: Array, value: float) -> Array:
+    """Block-diagonal matrix of `matrix` and one number more."""
+    grown = np.zeros(np.array(matrix.shape) + 1)
+    grown[:-1, :-1] = matrix
+    grown[-1, -1] = value
+    return grown
 
 
 def _held(generator: Array, share: float) -> tuple[Array, Array]:
@@ -290,13 +285,13 @@ def output_error(plate: PlateParameters, late: float, record: Record, *, find_ga
         step[searched] = np.linalg.solve(jacobian.T @ jacobian, jacobian.T @ here) * scale[searched]
         step *= LONGEST_STEP / max(abs(step[:FREE]).max(), LONGEST_STEP)
         there = error(unknown + step)
-        while there @ there > here @ here and abs(step).max() > NUDGE:
+        while there @ there > here @ here and abs(step[:FREE]).max() > NUDGE:
             step /= 2
             there = error(unknown + step)
         gained = here @ here - there @ there
         if gained > 0:
             unknown, here = unknown + step, there
-        if gained <= DONE * (here @ here):
+        if not gained > DONE * (here @ here):
             break
     jacobian = slopes(unknown, here)
     covariance = np.zeros((len(scale), len(scale)))

@@ -75,9 +75,9 @@ def design_multisine(parameters: PlateParameters, rate: float, samples: int, amp
     _check(parameters, rate, samples, amplitude, modes, ratios)
     bins = _lines(modes, rate, samples)
     coordinate = np.arange(len(bins)) % 2
-    motion = np.exp(1j * _phases(bins, coordinate, samples))
-    motion *= amplitude / abs(_ends(bins, coordinate, motion, samples)).max()
-    drive = _drive(parameters, rate, samples, bins, coordinate, motion)
+    drive, ends = _played(parameters, rate, samples, bins, coordinate)
+    motion = amplitude / float(abs(ends).max())
+    drive *= motion
     step = parameters.current_step
     if step:
         drive = step * np.round(drive / step)
@@ -87,7 +87,7 @@ def design_multisine(parameters: PlateParameters, rate: float, samples: int, amp
             f"amplitude = {amplitude:g} m: needs {peak:.3g} A, must be <= {parameters.current_limit:g} A; "
             f"the drive allows {amplitude * parameters.current_limit / peak:.3g} m"
         )
-    return Multisine(bins=bins, coordinate=coordinate, drive=drive, motion=float(abs(motion[0])))
+    return Multisine(bins=bins, coordinate=coordinate, drive=drive, motion=motion)
 
 
 def _check(
@@ -119,35 +119,40 @@ def _lines(modes: Array, rate: float, samples: int) -> Array:
     return np.unique(np.concatenate([grid[apart >= DENSE], dense]))
 
 
-def _ends(bins: Array, coordinate: Array, motion: Array, samples: int) -> Array:
-    """Displacement of both ends over a period, shape (2, samples), from the lines' motion there."""
-    spectrum = np.zeros((2, samples // 2 + 1), complex)
-    spectrum[0, bins] = motion * np.where(coordinate == 0, 1.0, -1.0)
-    spectrum[1, bins] = motion
-    return np.fft.irfft(spectrum * (samples / 2), samples, axis=1)
-
-
 def _phases(bins: Array, coordinate: Array, samples: int) -> Array:
     """Phases (rad) of low crest at both ends: Schroeder's, then clipped and given their amplitudes back in turn."""
     count = np.arange(len(bins))
     phase = -math.pi * count * (count - 1) / len(bins)
     for _ in range(CREST_ROUNDS):
-        ends = _ends(bins, coordinate, np.exp(1j * phase), samples)
+        line = np.exp(1j * phase)
+        ends = _period(bins, np.stack([np.where(coordinate == 0, line, -line), line], axis=1), samples)
         bound = CREST_CLIP * abs(ends).max()
-        first, second = np.fft.rfft(np.clip(ends, -bound, bound), axis=1)[:, bins]
+        first, second = np.fft.rfft(np.clip(ends, -bound, bound), axis=0)[bins].T
         phase = np.angle(np.where(coordinate == 0, second + first, second - first))
     return phase
 
 
-def _drive(
-    parameters: PlateParameters, rate: float, samples: int, bins: Array, coordinate: Array, motion: Array
-) -> Array:
-    """Drive (A, shape (samples, 2)) that moves the ends so on the plate as it is believed to be."""
+def _period(bins: Array, lines: Array, samples: int) -> Array:
+    """One period, shape (samples, 2), of `lines` (n, 2)."""
+    spectrum = np.zeros((samples // 2 + 1, 2), complex)
+    spectrum[bins] = lines
+    return np.fft.irfft(spectrum * (samples / 2), samples, axis=0)
+
+
+def _played(
+    parameters: PlateParameters, rate: float, samples: int, bins: Array, coordinate: Array
+) -> tuple[Array, Array]:
+    """Drive (A) that gives every line an amplitude of 1 m at the ends, and how both ends then move (m).
+
+    Lines of heave rock the plate a little, and the other way round, where its two sides differ.
+    """
     model = parameters.band_model(rate, parameters.delay)
     frequency = bins * (rate / samples)
-    moved = model.response(frequency) @ PATTERNS  # (n, coordinate, pattern)
+    moved = model.response(frequency) * model.hold_and_delay(frequency)[:, None, None]
     reach = parameters.glass_length / parameters.coil_spacing
-    at_end = np.where(coordinate == 0, moved[:, 0, 0], reach * moved[:, 1, 1])
-    spectrum = np.zeros((samples // 2 + 1, 2), complex)
-    spectrum[bins] = (motion / (at_end * model.hold_and_delay(frequency)))[:, None] * PATTERNS.T[coordinate]
-    return np.fft.irfft(spectrum * (samples / 2), samples, axis=0)
+    of_pattern = moved @ PATTERNS
+    at_end = np.where(coordinate == 0, of_pattern[:, 0, 0], reach * of_pattern[:, 1, 1])
+    current = (np.exp(1j * _phases(bins, coordinate, samples)) / at_end)[:, None] * PATTERNS.T[coordinate]
+    heave, rocking = (moved @ current[:, :, None])[..., 0].T
+    ends = np.stack([heave - reach * rocking, heave + reach * rocking], axis=1)
+    return _period(bins, current, samples), _period(bins, ends, samples)
