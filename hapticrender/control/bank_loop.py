@@ -14,9 +14,9 @@ three numbers frozen, drive inside its limits, no rounding.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -31,42 +31,59 @@ from hapticrender.control.margins import (
 )
 from hapticrender.protocols import Array
 
+LEAST_POLE = 1e-300  # stands for a pole at z = 0, whose logarithm is not finite
+
 
 @dataclass(frozen=True, kw_only=True)
 class Structure:
-    """What stands behind the loop: M q'' + C q' + K q = f, f acting on the first coordinates only.
+    """What stands behind the loop: M x'' + C x' + K x = push f, of which the controller sees q = watch x.
 
     Parameters
     ----------
     mass, damping, stiffness : ndarray, shape (n, n), kg, N s/m, N/m
-        Of the device's coordinates, then of whatever moves on it (a finger's phalanx); mass must be regular.
-    controlled : int
-        How many coordinates the controller senses and drives, 1 <= controlled <= n.
+        Of the device's coordinates and of whatever else moves (a finger's phalanx, glass that bends); mass regular.
+    push : ndarray, shape (n, c)
+        Where the forces of the c controlled coordinates act.
+    watch : ndarray, shape (c, n)
+        What the sensors show as the controlled coordinates.
     """
 
     mass: Array
     damping: Array
     stiffness: Array
-    controlled: int
+    push: Array
+    watch: Array
+
+    @classmethod
+    def free(cls, mass: Array, damping: Array, stiffness: Array) -> Structure:
+        """Return a device without anything else on it."""
+        same = np.eye(len(mass))
+        return cls(mass=mass, damping=damping, stiffness=stiffness, push=same, watch=same)
 
     @classmethod
     def of(cls, model: BandModel) -> Structure:
         """Return the free device that the controller was designed for."""
-        return cls(mass=model.mass, damping=model.damping, stiffness=model.stiffness, controlled=len(model.mass))
+        return cls.free(model.mass, model.damping, model.stiffness)
+
+    def stronger(self, gain: float) -> Structure:
+        """Return the same structure with `gain` times the force."""
+        return replace(self, push=gain * self.push)
 
     def sampled(self, rate: float) -> Sampled:
         """Exact discretisation with the force held over each sample."""
         from scipy.linalg import expm
 
-        n, c = len(self.mass), self.controlled
+        n, c = self.push.shape
         inverse = np.linalg.inv(self.mass)
         system = np.zeros((2 * n + c, 2 * n + c))
         system[:n, n : 2 * n] = np.eye(n)
         system[n : 2 * n, :n] = -inverse @ self.stiffness
         system[n : 2 * n, n : 2 * n] = -inverse @ self.damping
-        system[n : 2 * n, 2 * n :] = inverse[:, :c]
+        system[n : 2 * n, 2 * n :] = inverse @ self.push
         held = expm(system / rate)[: 2 * n]
-        return Sampled(rate=rate, advance=held[:, : 2 * n], push=held[:, 2 * n :], watch=np.eye(c, 2 * n))
+        return Sampled(
+            rate=rate, advance=held[:, : 2 * n], push=held[:, 2 * n :], watch=np.pad(self.watch, ((0, 0), (0, n)))
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -95,11 +112,11 @@ class Sampled:
 
 
 class KnownFinger(NamedTuple):
-    """What the law knows of the finger: kg, N s/m, N/m, and its place p/a."""
+    """What the law knows of the finger: kg, N s/m, N/m, numbers or arrays (B, 1, 1, 1), and its place p/a."""
 
-    mass: float
-    damping: float
-    stiffness: float
+    mass: Any
+    damping: Any
+    stiffness: Any
     place: float
 
 
@@ -161,7 +178,7 @@ class BankLoop:
         law = known.mass * jw**2 + known.damping * jw + known.stiffness
         slope = known.damping + 2 * jw * known.mass
         if finger is not None:
-            place = np.array([1.0, finger.place])[: known.controlled]
+            place = np.array([1.0, finger.place])[: len(known.mass)]
             touched = np.outer(place, place)
             law = law + (finger.mass * jw**2 + finger.damping * jw + finger.stiffness) * touched
             slope = slope + (finger.damping + 2 * jw * finger.mass) * touched
@@ -265,10 +282,14 @@ class BankLoop:
         after = [x, line[:, :-1], level, drift, held[:, : past.shape[1]], eps.real, eps.imag, nu.real, nu.imag]
         return np.concatenate([part.reshape(len(state), -1, state.shape[-1]) for part in after], axis=1)
 
+    def poles(self) -> Array:
+        """Closed-loop poles (1/s, complex, shape (B, s)): growth, and angular frequency."""
+        z = np.linalg.eigvals(self.matrix()).astype(complex)
+        return self.plant.rate * np.log(np.where(z == 0, LEAST_POLE, z))
+
     def growth(self) -> Array:
         """Growth of the slowest-decaying pole (1/s, shape (B,)), < 0 for a stable loop."""
-        size = np.abs(np.linalg.eigvals(self.matrix())).max(axis=-1)
-        return self.plant.rate * np.log(np.maximum(size, 1e-12))
+        return self.poles().real.max(axis=-1)
 
     def margins(self) -> Margins:
         """Every margin of a single bank (B = 1), of all its bands and coordinates together."""

@@ -20,7 +20,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from hapticrender.control.bandmodel import BandModel
-from hapticrender.control.bank_loop import Sampled
+from hapticrender.control.bank_loop import LEAST_POLE, Sampled
 from hapticrender.control.loopshape import reduced_controller
 from hapticrender.control.margins import Margins, borne_errors, halved_within, sensitivity
 from hapticrender.control.transfer import butterworth
@@ -92,8 +92,9 @@ class PolarLoop:
         spread = np.ones((len(sides), 1)) if common else np.eye(len(sides))
         answer = model.response(frequency) @ np.ones(len(sides)) @ watched.T
         table = np.abs(answer * model.hold_and_delay(frequency)[:, None])
-        filters = [butterworth(2 * b).tustin(model.rate, prewarp=2 * b) for b in bandwidth]
-        laws = [reduced_controller(b, 2 * b).tustin(model.rate) for b in bandwidth]
+        widths, which = np.unique(bandwidth, return_inverse=True)
+        filters = [butterworth(2 * b).tustin(model.rate, prewarp=2 * b) for b in widths]
+        laws = [reduced_controller(b, 2 * b).tustin(model.rate) for b in widths]
         return cls(
             plant=plant,
             delay=model.delay if delay is None else delay,
@@ -101,8 +102,8 @@ class PolarLoop:
             watched=watched,
             force=model.force_from_drive @ spread,
             table=table,
-            low_pass=np.array([[*b, *a[1:]] for b, a in filters]),
-            law=np.array([[*b, *a[1:]] for b, a in laws]),
+            low_pass=np.array([[*b, *a[1:]] for b, a in filters])[which],
+            law=np.array([[*b, *a[1:]] for b, a in laws])[which],
         )
 
     def _answer(self, offset: Array) -> Array:
@@ -118,10 +119,10 @@ class PolarLoop:
         return drive / np.abs(drive), np.abs(drive) * self.table
 
     def loop(self, offset: Array) -> Array:
-        """L (B, N, 2 c, 2 c) at `offset` (Hz, > 0, shape (N,)), in real and imaginary parts of the deviation."""
+        """L (B, N, 2 c, 2 c) at `offset` (Hz, > 0, (N,) or (B, N)), in real and imaginary parts."""
         turn, ratio = self.steady()
         scale = (turn / self.table)[:, None, None, :]
-        offset = np.broadcast_to(offset, (len(self.frequency), np.size(offset)))
+        offset = np.broadcast_to(offset, (len(self.frequency), np.shape(offset)[-1]))
         above = self._answer(offset) * scale
         below = (self._answer(-offset) * scale).conj()
         mean, half = 0.5 * (above + below), 0.5j * (above - below)
@@ -161,10 +162,14 @@ class PolarLoop:
         parts = [x.real, x.imag, line.real, line.imag, filtered.real, filtered.imag, amplitude, phase]
         return np.concatenate([part.reshape(batch, -1, columns) for part in parts], axis=1)
 
+    def poles(self) -> Array:
+        """Closed-loop poles in the frame of the carrier (1/s, complex, shape (B, s))."""
+        z = np.linalg.eigvals(self.matrix()).astype(complex)
+        return self.plant.rate * np.log(np.where(z == 0, LEAST_POLE, z))
+
     def growth(self) -> Array:
         """Growth of the slowest-decaying pole (1/s, shape (B,)), < 0 for a stable loop."""
-        size = np.abs(np.linalg.eigvals(self.matrix())).max(axis=-1)
-        return self.plant.rate * np.log(np.maximum(size, 1e-12))
+        return self.poles().real.max(axis=-1)
 
     def margins(self) -> Margins:
         """Margins of a single carrier (B = 1).

@@ -86,6 +86,7 @@ def bank_loop(
     speed: float = 0.0,
     bands: slice = slice(None),
     plant: Structure | None = None,
+    delay: int | None = None,
     finger: KnownFinger | None = None,
 ) -> BankLoop:
     """Linear loop of a designed bank.
@@ -101,13 +102,15 @@ def bank_loop(
         Which of its bands, by ascending frequency at this speed.
     plant : Structure, optional
         What it meets; by default the device that it was designed for.
+    delay : int, optional
+        Samples that the loop really has; by default what it was designed for.
     finger : KnownFinger, optional
         What it has learnt of the finger.
     """
     numbers = tables.numbers
     if state not in STATES:
         raise ValueError(f"{state=} must be one of {', '.join(STATES)}")
-    known = Structure(mass=tables.mass, damping=tables.damping, stiffness=tables.stiffness, controlled=len(tables.mass))
+    known = Structure.free(tables.mass, tables.damping, tables.stiffness)
     observer, integral, inner = _opened(numbers, *STATES[state])
     calm = min(abs(speed) / numbers.crowd_speed, 1.0) if numbers.crowd_speed > 0 else 1.0
     frequency = np.sort(np.abs(tables.tone[FREQUENCY] + speed * tables.tone[WAVENUMBER]))[bands]
@@ -115,7 +118,7 @@ def bank_loop(
         (plant or known).sampled(numbers.rate),
         known,
         frequency[None],
-        delay=round(numbers.lead * numbers.rate - 0.5),
+        delay=round(numbers.lead * numbers.rate - 0.5) if delay is None else delay,
         lead=numbers.lead,
         observer=np.array([calm * observer]),
         integral=np.array([integral]),

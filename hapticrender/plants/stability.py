@@ -1,12 +1,33 @@
-"""Where each method is stable: a finger on the plate as a structure, and the map over frequency and bandwidth."""
+"""Where each method is stable: a finger on the plate as a structure, growth by simulation, and the map of both."""
 
 from __future__ import annotations
 
+import json
+import math
+import os
+from collections.abc import Callable
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import NamedTuple
+
 import numpy as np
 
-from hapticrender.control.bank_loop import Structure
-from hapticrender.plants.vibrotactile import PlateParameters
-from hapticrender.touch.mechanics import NONE, FingerMechanics
+from hapticrender.control.bank_kernels import CROWDED_MASS, CROWDED_STIFFNESS
+from hapticrender.control.bank_loop import BankLoop, KnownFinger, Structure
+from hapticrender.control.damping import damping_taps
+from hapticrender.control.margins import sensitivity
+from hapticrender.control.polar_loop import PolarLoop
+from hapticrender.plants.vibrotactile import Plate, PlateParameters
+from hapticrender.protocols import Array, Controller
+from hapticrender.touch.mechanics import HEAVY_LOAD, LIGHT_LOAD, NAMED, NONE, FingerMechanics
+
+KICK = 1e-3  # A, in one sample, half of it on the second coil
+WINDOW = 0.02  # s
+LEAST_MOTION, MOST_MOTION = 1e-200, 1e-3  # m: what a growth is fitted to
+OFFSETS = 60  # frequencies around a carrier at which a map looks for the peak of S
+MODE_OFFSETS = np.linspace(-6.0, 6.0, 9)  # Hz: and around each mode of the plant
+INTEGRAL = 3.4  # 1/s per Hz of bandwidth: 17 1/s at 5 Hz
+QUALITY = 1.4  # of the modes under the inner loop
 
 
 def loaded_plate(
@@ -16,7 +37,7 @@ def loaded_plate(
     position: float = 0.0,
     strength: float = 1.0,
 ) -> Structure:
-    """Structure of the plate with a finger resting on it.
+    """Structure of the plate, both its coordinates and its bending mode, with a finger resting on it.
 
     Parameters
     ----------
@@ -28,22 +49,312 @@ def loaded_plate(
     strength : float
         Factor on the finger's impedance, >= 0; 0 is no finger.
     """
-    mass, damping, stiffness = (
-        matrix.copy() for matrix in (parameters.mass_matrix, parameters.damping_matrix, parameters.stiffness_matrix)
-    )
+    place = np.array([1.0, position / parameters.half_spacing])
+    mass, damping, stiffness = parameters.mass_matrix, parameters.damping_matrix, parameters.stiffness_matrix
+    push = watch = np.eye(2)
+    if parameters.bending_frequency > 0:
+        omega, modal = 2 * math.pi * parameters.bending_frequency, parameters.bending_mass
+        place = np.append(place, parameters.bending_shape(position))
+        mass = _joined(mass, modal)
+        damping = _joined(damping, 2 * parameters.bending_damping * omega * modal)
+        stiffness = _joined(stiffness, omega**2 * modal)
+        push, watch = np.vstack([push, [parameters.bending_coil, 0.0]]), np.column_stack([watch, [1.0, 0.0]])
     if mechanics.order and strength > 0:
-        place = np.array([1.0, position / parameters.half_spacing])
-        mass += strength * mechanics.mass * np.outer(place, place)
+        felt = place
         if mechanics.order == 4:
             if not mechanics.phalanx_mass > 0:
                 raise ValueError(f"phalanx_mass = {mechanics.phalanx_mass!r} kg: must be > 0")
-            relative = np.append(place, -1.0)
-            mass, damping, stiffness = (np.pad(matrix, (0, 1)) for matrix in (mass, damping, stiffness))
-            mass[2, 2] = strength * mechanics.phalanx_mass
-            damping[2, 2] = strength * mechanics.phalanx_damping
-            stiffness[2, 2] = strength * mechanics.phalanx_stiffness
+            mass = _joined(mass, strength * mechanics.phalanx_mass)
+            damping = _joined(damping, strength * mechanics.phalanx_damping)
+            stiffness = _joined(stiffness, strength * mechanics.phalanx_stiffness)
+            place, felt = np.append(place, 0.0), np.append(place, -1.0)
+            push, watch = np.pad(push, ((0, 1), (0, 0))), np.pad(watch, ((0, 0), (0, 1)))
+        mass = mass + strength * mechanics.mass * np.outer(place, place)
+        damping = damping + strength * mechanics.damping * np.outer(felt, felt)
+        stiffness = stiffness + strength * mechanics.stiffness * np.outer(felt, felt)
+    return Structure(mass=mass, damping=damping, stiffness=stiffness, push=push, watch=watch)
+
+
+def _joined(matrix: Array, value: float) -> Array:
+    """Matrix with one more, independent coordinate."""
+    larger = np.pad(matrix, (0, 1))
+    larger[-1, -1] = value
+    return larger
+
+
+def simulated_growth(plate: Plate, controller: Controller, seconds: float) -> float:
+    """Growth (1/s) of a kicked plate under a controller that wants silence: the boundary by simulation.
+
+    Parameters
+    ----------
+    plate : Plate
+        Just made, without noise, of ideal resolution and with wide limits.
+    controller : Controller
+        Of constant envelopes that are all 0.
+    seconds : float
+        The last two thirds of what is neither rounding nor run away are fitted.
+    """
+    plate.run(np.array([[KICK, 0.5 * KICK]]))
+    motion = plate.closed_loop(controller, np.zeros(round(seconds * plate.rate)))[3].motion
+    if motion is None:
+        raise TypeError("the plate tells no motion")
+    return fitted_growth(np.abs(motion).max(axis=1), plate.rate)
+
+
+def fitted_growth(size: Array, rate: float, least: float = LEAST_MOTION) -> float:
+    """Growth (1/s) of `size` (m, shape (n,)) sampled at `rate` (Hz), from its peaks in windows of 20 ms."""
+    width = round(WINDOW * rate)
+    peaks = size[: len(size) // width * width].reshape(-1, width).max(axis=1)
+    used = np.cumprod((peaks > least) & (peaks < MOST_MOTION)).astype(bool)
+    used[: used.sum() // 3] = False
+    if used.sum() < 2:
+        raise ValueError(f"{used.sum()} windows of {WINDOW} s between {least} and {MOST_MOTION} m: must be at least 2")
+    slope, _ = np.polyfit(np.flatnonzero(used) * WINDOW, np.log(peaks[used]), 1)
+    return float(slope)
+
+
+@dataclass(frozen=True, kw_only=True)
+class StabilityMap:
+    """Growth and modulus margin of one method over finger, load, position, frequency and bandwidth.
+
+    Parameters
+    ----------
+    method : str
+    fingers : tuple of str
+        Names of Table 1.
+    loads, positions, frequencies, bandwidths : ndarray, N, m, Hz, Hz
+    adapted : bool
+        Whether the law has learnt the finger.
+    growth : ndarray, shape (fingers, loads, positions, frequencies, bandwidths), 1/s
+        Of the slowest-decaying pole; >= 0 is unstable.
+    modulus : ndarray, same shape
+        Modulus margin, 0 where unstable.
+    """
+
+    method: str
+    fingers: tuple[str, ...]
+    loads: Array
+    positions: Array
+    frequencies: Array
+    bandwidths: Array
+    adapted: bool
+    growth: Array
+    modulus: Array
+
+    def boundary(self, least: float = 0.0) -> Array:
+        """Bandwidth (Hz, shape (fingers, loads, positions, frequencies)) up to which every one tried holds.
+
+        Stable, and with a modulus margin of at least `least`; 0 where the lowest does not hold, inf where all do.
+        """
+        held = (self.growth < 0) & (self.modulus >= least)
+        count = np.cumprod(held, axis=-1).sum(axis=-1)
+        return np.concatenate([[0.0], self.bandwidths[:-1], [np.inf]])[count]
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write as .npz (all arrays) or .json (the same as lists)."""
+        path = Path(path)
+        values = {field.name: np.asarray(getattr(self, field.name)) for field in fields(self)}
+        if path.suffix == ".npz":
+            np.savez(path, **values)  # type: ignore[arg-type]
+        elif path.suffix == ".json":
+            path.write_text(json.dumps({name: value.tolist() for name, value in values.items()}), encoding="utf-8")
         else:
-            relative = place
-        damping += strength * mechanics.damping * np.outer(relative, relative)
-        stiffness += strength * mechanics.stiffness * np.outer(relative, relative)
-    return Structure(mass=mass, damping=damping, stiffness=stiffness, controlled=2)
+            raise ValueError(f"{path}: suffix {path.suffix!r} must be .npz or .json")
+
+
+class _Touch(NamedTuple):
+    """One finger resting on a plate."""
+
+    parameters: PlateParameters
+    mechanics: FingerMechanics
+    position: float
+    strength: float
+    adapted: bool
+
+    def structure(self) -> Structure:
+        return loaded_plate(self.parameters, self.mechanics, position=self.position, strength=self.strength)
+
+
+def stability_map(
+    method: str,
+    frequencies: Array,
+    *,
+    bandwidths: Array,
+    fingers: tuple[str, ...] = tuple(NAMED),
+    loads: tuple[float, ...] = (LIGHT_LOAD, HEAVY_LOAD),
+    positions: tuple[float, ...] = (0.0, 15e-3, 27.5e-3),
+    parameters: PlateParameters | None = None,
+    adapted: bool = False,
+) -> StabilityMap:
+    """Evaluate one method's loop, one carrier at a time, from the model.
+
+    Parameters
+    ----------
+    method : {"paper", "paper-common", "h", "h2"}
+        The paper's polar loops, per side or in common mode; the bank without and with its inner loop.
+    frequencies, bandwidths : ndarray, Hz
+        Carriers, and loop bandwidths b: the paper's fT with fL = 2 b; for the bank an observer pole at 2 b and an
+        integral of 3.4 b 1/s, so that b = 5 Hz is H.  No rule lowers them here.
+    fingers : tuple of str
+        Of ``touch.mechanics.NAMED``.
+    loads : tuple of float, N
+        Normal loads; the impedance grows with (W/reference load)**(1/3).
+    positions : tuple of float, m
+        Of the finger.
+    parameters : PlateParameters, optional
+    adapted : bool
+        The bank's law knows the finger's three numbers as its adaptation would leave them; otherwise none.
+
+    Returns
+    -------
+    StabilityMap
+    """
+    if method not in LOOPS:
+        raise ValueError(f"{method=} must be one of {', '.join(LOOPS)}")
+    parameters = parameters or PlateParameters()
+    frequencies, bandwidths = np.asarray(frequencies, float), np.asarray(bandwidths, float)
+    shape = (len(fingers), len(loads), len(positions), len(frequencies), len(bandwidths))
+    growth, modulus = np.empty(shape), np.empty(shape)
+    carrier, width = (grid.ravel() for grid in np.meshgrid(frequencies, bandwidths, indexing="ij"))
+    for at in np.ndindex(shape[:3]):
+        mechanics = NAMED[fingers[at[0]]]
+        if not mechanics.order and at[1:] != (0, 0):  # without mechanics neither load nor place matter
+            growth[at], modulus[at] = growth[at[0], 0, 0], modulus[at[0], 0, 0]
+            continue
+        strength = float(mechanics.load_factor(np.asarray(loads[at[1]])))
+        touch = _Touch(parameters, mechanics, positions[at[2]], strength, adapted)
+        rates, least = LOOPS[method](touch, carrier, width)
+        growth[at], modulus[at] = rates.reshape(shape[3:]), least.reshape(shape[3:])
+    return StabilityMap(
+        method=method,
+        fingers=tuple(fingers),
+        loads=np.asarray(loads, float),
+        positions=np.asarray(positions, float),
+        frequencies=frequencies,
+        bandwidths=bandwidths,
+        adapted=adapted,
+        growth=growth,
+        modulus=modulus,
+    )
+
+
+def _polar(touch: _Touch, carrier: Array, width: Array, common: bool) -> tuple[Array, Array]:
+    """Growth and modulus margin of the paper's loop for every carrier and bandwidth."""
+    parameters = touch.parameters
+    model = parameters.band_model(parameters.rate, parameters.delay)
+    loop = PolarLoop.on(touch.structure().sampled(parameters.rate), model, carrier, width, common=common)
+    poles = loop.poles()
+    near = width[:, None] * np.geomspace(0.02, 50.0, OFFSETS)
+    offset = np.concatenate([near, np.abs(poles.imag) / (2 * np.pi)], axis=1)
+    peak = sensitivity(loop.loop(np.clip(offset, 1e-3, 0.49 * parameters.rate))).max(axis=1)
+    growth = poles.real.max(axis=1)
+    return growth, np.where(growth < 0, 1 / peak, 0.0)
+
+
+def _bank(touch: _Touch, carrier: Array, width: Array, inner: float) -> tuple[Array, Array]:
+    """Growth and modulus margin of the bank for every carrier and bandwidth."""
+    loop = scaled_bank(
+        touch.parameters,
+        touch.structure(),
+        carrier,
+        width,
+        inner=inner,
+        finger=learnt_finger(touch.parameters, touch.mechanics, carrier, touch.position, touch.strength)
+        if touch.adapted
+        else None,
+    )
+    rate, poles = touch.parameters.rate, loop.poles()
+    near = np.geomspace(0.02, 20.0, OFFSETS // 2)
+    beside = np.concatenate([-near[::-1], near]) * width[:, None] + carrier[:, None]
+    modes = (loop.plant.modes()[:, None] + MODE_OFFSETS).ravel()
+    afar = np.append(np.linspace(1.0, 0.499 * rate, OFFSETS), modes) * np.ones((len(carrier), 1))
+    peak = np.zeros(len(carrier))
+    for grid in (beside, afar, np.abs(poles.imag) / (2 * np.pi)):
+        z = np.exp(2j * np.pi * np.clip(grid, 0.1, 0.499 * rate) / rate)
+        peak = np.maximum(peak, sensitivity(loop.loop(z)).max(axis=1))
+    growth = poles.real.max(axis=1)
+    return growth, np.where(growth < 0, 1 / peak, 0.0)
+
+
+def scaled_bank(
+    parameters: PlateParameters,
+    plant: Structure,
+    carrier: Array,
+    width: Array,
+    *,
+    inner: float,
+    finger: KnownFinger | None = None,
+) -> BankLoop:
+    """Stack of banks of one band each on one plant, scaled by bandwidth as `stability_map` says.
+
+    Parameters
+    ----------
+    parameters : PlateParameters
+        The free plate that the law knows.
+    plant : Structure
+        What it meets.
+    carrier, width : ndarray, shape (B,), Hz
+        Carriers and bandwidths.
+    inner : float
+        Share of the inner loop, 0..1.
+    finger : KnownFinger, optional
+        What the law knows of the finger.
+    """
+    model = parameters.band_model(parameters.rate, parameters.delay)
+    level = 2 * math.pi * np.minimum(6.0, carrier / 8) / model.rate
+    return BankLoop.on(
+        plant.sampled(model.rate),
+        Structure.of(model),
+        carrier[:, None],
+        delay=model.delay,
+        lead=(model.delay + 0.5) / model.rate,
+        observer=2 * 2 * math.pi * 2 * width / model.rate,
+        integral=INTEGRAL * width,
+        dc=1.6 * level,
+        dc_drift=level**2,
+        inner=np.full(len(width), inner),
+        taps=damping_taps(model, QUALITY)[0],
+        finger=finger,
+    )
+
+
+def learnt_finger(
+    parameters: PlateParameters, mechanics: FingerMechanics, frequency: Array, position: float, strength: float = 1.0
+) -> KnownFinger | None:
+    """The three numbers at which the bank's adaptation comes to rest on a single carrier; None without a finger.
+
+    Parameters
+    ----------
+    parameters : PlateParameters
+    mechanics : FingerMechanics
+    frequency : ndarray, shape (B,), Hz
+    position : float, m
+    strength : float
+        Factor on the finger's impedance.
+
+    Notes
+    -----
+    With z = j w Z_f(j w): Re z is shared between stiffness and mass by how far each may be expected from zero, which
+    is where the update of FACTS section 3.5 settles from zero; the imaginary part is damping.
+    """
+    if not mechanics.order or strength == 0.0:
+        return None
+    omega = 2 * np.pi * frequency
+    z = 1j * omega * mechanics.impedance(frequency) * strength
+    heavy = omega**2 * CROWDED_MASS**2
+    share = z.real / (CROWDED_STIFFNESS**2 + omega**2 * heavy)
+    numbers = (
+        np.clip(-heavy * share, -2e-3, 12e-3),
+        np.clip(z.imag / omega, 0.0, 12.0),
+        np.maximum(CROWDED_STIFFNESS**2 * share, -500.0),
+    )
+    mass, damping, stiffness = (number[:, None, None, None] for number in numbers)
+    return KnownFinger(mass, damping, stiffness, position / parameters.half_spacing)
+
+
+LOOPS: dict[str, Callable[[_Touch, Array, Array], tuple[Array, Array]]] = {
+    "paper": lambda touch, carrier, width: _polar(touch, carrier, width, False),
+    "paper-common": lambda touch, carrier, width: _polar(touch, carrier, width, True),
+    "h": lambda touch, carrier, width: _bank(touch, carrier, width, 0.0),
+    "h2": lambda touch, carrier, width: _bank(touch, carrier, width, 1.0),
+}
