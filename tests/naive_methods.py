@@ -284,6 +284,7 @@ def complex_plate_run(plate, moving, tables, state, last, finger, noise, wanted,
         complex_step(tables, state, sensed[n], last)
 
 
+# Loops of their own, as the library's one loop is cached on disk under a stamp that does not know of this file.
 CLOSED[PolarTables] = polar_plate_run
 CLOSED[ComplexTables] = complex_plate_run
 

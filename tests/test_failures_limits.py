@@ -1,0 +1,201 @@
+"""FACTS 3, "Fails": where H and H2 end, from both sides."""
+
+import numpy as np
+import pytest
+import scipy.signal
+from naive_methods import amplitude_error, complex_inverse, envelopes, fixed, hold, play, tones
+
+import hapticrender as hr
+from hapticrender.control.bank_kernels import FAST_OPEN, SLOW_OPEN
+from hapticrender.control.methods import METHODS
+from hapticrender.plants.vibrotactile import Plate, PlateParameters
+from hapticrender.touch.mechanics import HEAVY, LIGHT_SECOND
+
+RATE = 5000.0
+IDEAL = PlateParameters(sensor_noise=0.0, sensor_bits=0, current_bits=0)
+TURN = 2 * np.pi
+
+
+def comb():
+    """20 bands from 20 to 400 Hz, 10 um each, random phases."""
+    phase = np.random.default_rng(1).uniform(0, TURN, 20)
+    return fixed(*((20.0 * (k + 1), 1e-5 * np.exp(1j * phase[k])) for k in range(20)))
+
+
+def comb_error(controller, seconds, plate, finger=None):
+    """Error of the centre within 10-420 Hz over the last 3 s, in dB of what is wanted."""
+    motion = play(controller, seconds, plate, finger)[1][:, 0]
+    bands = comb()
+    time = np.arange(len(motion)) / RATE
+    wanted = (bands.envelope * np.exp(1j * TURN * np.outer(time, bands.frequency))).real.sum(axis=1)
+    keep = scipy.signal.butter(4, [10, 420], "band", fs=RATE, output="sos")
+    error = scipy.signal.sosfiltfilt(keep, motion - wanted)
+    late = slice(-15_000, -500)
+    return 20 * np.log10(error[late].std() / wanted[late].std())
+
+
+@pytest.mark.parametrize(("bandwidth", "holds"), [(2.5, True), (3.5, True), (4.0, False), (5.0, False)])
+def test_h_on_a_comb_needs_a_bandwidth_below_a_5th_of_the_spacing(bandwidth, holds):
+    """FACTS: fails for fT > spacing/5.7, 3.5 Hz of 20: 3.5 still works (-40 dB), 4 (spacing/5) diverges.
+
+    Observer at 2 fT, integrator 3.4 fT, free plate.  Its rules keep H and H2 below: -110 dB and less.
+    """
+    model = IDEAL.band_model(RATE, 1)
+    controller = METHODS["h"].design(model, comb())
+    g, rate = 2 * TURN * 2 * bandwidth / RATE, 3.4 * bandwidth
+    numbers = controller.tables.numbers._replace(
+        observer=g, observer_awake=g, integral=rate, integral_stirred=rate, integral_awake=rate
+    )
+    controller.tables = controller.tables._replace(numbers=numbers)
+    error = comb_error(controller, 6.0, IDEAL)
+    assert error < -35 if holds else error > 0
+    if bandwidth == 2.5:
+        assert comb_error(METHODS["h"].design(model, comb()), 6.0, IDEAL) < -100
+        assert comb_error(METHODS["h2"].design(model, comb()), 6.0, IDEAL) < -100
+
+
+def test_h_and_h2_on_a_comb_under_a_sliding_heavy_finger():
+    """FACTS: H -45 dB without noise, H2 -48 to -51 dB with it."""
+    finger = hr.Finger.sliding(speed=0.1, normal_load=0.8, mechanics=HEAVY, touches=((0.5, 100.0),))
+    quiet, noisy = (plate.band_model(RATE, 1) for plate in (IDEAL, PlateParameters()))
+    assert -47 < comb_error(METHODS["h"].design(quiet, comb()), 6.0, IDEAL, finger) < -42
+    assert comb_error(METHODS["h2"].design(noisy, comb()), 9.0, PlateParameters(), finger) < -48
+
+
+def touch(method, frequency, wanted, mechanics, position):
+    """Largest relative error of the centre after a touch in 1 ms at 1 s, and after lift-off in one sample at 2 s."""
+    load = 0.3 if mechanics is LIGHT_SECOND else 0.8
+    curve = ((0.0, 1.0, 1.001), (1e-4, 1e-4, load))
+    finger = hr.Finger(hr.Still(position), normal_load=curve, touches=((1.0, 2.0),), mechanics=mechanics)
+    motion = hold(method, fixed((frequency, wanted)), 3.0, finger=finger)[1][:, :1]
+    phase = TURN * frequency * np.arange(len(motion)) / RATE
+    time, found = envelopes(motion, phase, RATE, max(0.02, 2 / frequency))
+    error = abs(abs(found[:, 0]) / wanted - 1)
+    return error[(time > 0.985) & (time < 1.9)].max(), error[(time > 1.985) & (time < 2.9)].max()
+
+
+@pytest.mark.parametrize("frequency", [185.0, 189.0])
+@pytest.mark.parametrize("position", [0.0, 15e-3, 27.5e-3])
+def test_an_instant_touch_shakes_h_but_not_h2(frequency, position):
+    """FACTS: 40-70 % with H at 185-189 Hz.  In 1 ms and off in one sample: heavy 37-74 %, light 36-88 %; H2 <= 13 %."""
+    for mechanics in (HEAVY, LIGHT_SECOND):
+        assert 0.35 < max(touch("h", frequency, 5e-5, mechanics, position)) < 0.90
+        assert max(touch("h2", frequency, 5e-5, mechanics, position)) < 0.13
+
+
+@pytest.mark.parametrize(
+    ("wanted", "least", "most"), [(5e-5, 0.0, 0.13), (2e-5, 0.1, 0.2), (1e-5, 0.2, 0.4), (3e-6, 0.6, 1.0)]
+)
+@pytest.mark.parametrize("frequency", [143.0, 170.0, 189.0])
+def test_h2_lets_a_sudden_release_ring_below_10_um(frequency, wanted, least, most):
+    """FACTS: 24-92 % below ~10 um, 0.8 N: 24-33 % at 10 um, 76-90 at 3 um.  The 18 um of the sag ring out themselves.
+
+    Found: 25-35 % at 10 um, 79-82 % at 3 um; H 117-243 % there.
+    """
+    _, release = touch("h2", frequency, wanted, HEAVY, 0.0)
+    assert least <= release < most
+    if wanted == 3e-6:
+        assert touch("h", frequency, wanted, HEAVY, 0.0)[1] > 1.1
+
+
+def wrong(stiffness=1.0, mass=1.0, **other):
+    """The plate that the controller believes in."""
+    right = PlateParameters()
+    return PlateParameters(
+        stiffness_1=stiffness * right.stiffness_1,
+        stiffness_2=stiffness * right.stiffness_2,
+        mass=mass * right.mass,
+        inertia=mass * right.inertia,
+        **other,
+    )
+
+
+IDEAL_SENSORS = {"sensor_noise": 0.0, "sensor_bits": 0, "current_bits": 0}
+
+
+def settled(motion, frequency):
+    """Seconds until centre and ends stay within 5 % of 50 um."""
+    phase = TURN * frequency * np.arange(len(motion)) / RATE
+    time, found = envelopes(motion, phase, RATE, 0.02)
+    return time[abs(abs(found) / 5e-5 - 1).max(axis=1) > 0.05].max()
+
+
+def test_a_wrong_stiffness_slows_the_law_alone_and_breaks_it():
+    """FACTS: k +-5 % at 143 and 189 Hz.  The D-law behind low-passes diverges at 143 (+5 %), takes > 5 s at 189.
+
+    H, whose integrator follows an observer, settles in all three: 0.16 s at 143 Hz, 0.8-0.9 s at 189 Hz; H2 in 0.05.
+    """
+    for stiffness, frequency, breaks in ((1.05, 143.0, True), (1.05, 189.0, False), (0.95, 189.0, False)):
+        known = wrong(stiffness, **IDEAL_SENSORS)
+        controller = complex_inverse(known.band_model(RATE, 1), tones(RATE, 30_000, frequency, 5e-5))
+        motion = play(controller, plate=IDEAL)[1]
+        if breaks:
+            assert abs(amplitude_error(motion, frequency, 5e-5)).max() > 1.0
+        else:
+            assert settled(motion, frequency) > 4.0
+        late = settled(hold("h", fixed((frequency, 5e-5)), 4.0, IDEAL, known)[1], frequency)
+        assert 0.1 < late < (0.3 if frequency == 143.0 else 1.2)
+        assert settled(hold("h2", fixed((frequency, 5e-5)), 4.0, IDEAL, known)[1], frequency) < 0.08
+
+
+@pytest.mark.parametrize("frequency", [143.0, 189.0])
+@pytest.mark.parametrize(("stiffness", "mass"), [(1.05, 0.95), (0.95, 1.05), (1.1, 1.0), (0.9, 1.0)])
+def test_h_diverges_on_a_plate_off_by_10_percent_and_h2_does_not(frequency, stiffness, mass):
+    """k and m 5 % apart, or k 10 %, shift the mode by 5 %: H diverges; the inner loop adds j w b_a to D."""
+    known = wrong(stiffness, mass, **IDEAL_SENSORS)
+    motion = hold("h", fixed((frequency, 5e-5)), 6.0, IDEAL, known)[1]
+    assert abs(amplitude_error(motion, frequency, 5e-5)).max() > 1.0
+    motion = hold("h2", fixed((frequency, 5e-5)), 3.0, IDEAL, known)[1]
+    assert settled(motion, frequency) < 0.2
+    assert abs(amplitude_error(motion, frequency, 5e-5)).max() < 1e-3
+
+
+def held(known, inner=0.0, seconds=12.0):
+    """Wobble in phase (m rms, within 20 Hz) at 1 um, 189 Hz, and the share of time for which H2 is not quiet."""
+    plate = PlateParameters()
+    controller = METHODS["h2"].design(known.band_model(RATE, 1), fixed((189.0, 1e-6)))
+    numbers = controller.tables.numbers._replace(inner=inner)
+    controller.tables = controller.tables._replace(numbers=numbers)
+    device = Plate(plate, hr.Finger.absent(), seed=1)
+    pieces, open_ = [], []
+    for _ in range(round(seconds * 50)):
+        pieces.append(device.closed_loop(controller, np.zeros(100))[3].motion[:, 0])
+        open_.append(max(controller.state.touch[[FAST_OPEN, SLOW_OPEN]]))
+    motion = np.concatenate(pieces)
+    turned = 2 * motion * np.exp(-1j * TURN * 189.0 * np.arange(len(motion)) / RATE)
+    near = scipy.signal.sosfiltfilt(scipy.signal.butter(2, 20, fs=RATE, output="sos"), turned.real)
+    return near[10_000:-2500].std(), np.mean(np.array(open_)[100:] > 0)
+
+
+def test_h2_holds_quietly_at_189_hz_only_on_the_plate_it_knows():
+    """FACTS: k off by 1-2 % re-opens it.  Wobble 0.012-0.017 um and never open; 1 %: 0.043, always; 2 %: 0.08.
+
+    Already 0.5 % opens it a tenth to a third of the time.  Ten percent of the inner gain kept on: 0.041 um (FACTS
+    0.036), and quiet at 1 %.
+    """
+    wobble, open_ = held(wrong())
+    assert wobble < 0.020e-6
+    assert open_ == 0.0
+    wobble, open_ = held(wrong(1.01))
+    assert 0.03e-6 < wobble < 0.06e-6
+    assert open_ > 0.9
+    wobble, open_ = held(wrong(1.02))
+    assert 0.06e-6 < wobble < 0.11e-6
+    assert open_ > 0.9
+    wobble, open_ = held(wrong(1.01), inner=0.1)
+    assert wobble < 0.05e-6
+    assert open_ < 0.05
+
+
+@pytest.mark.parametrize("method", ["h", "h2"])
+@pytest.mark.parametrize("frequency", [170.0, 178.0, 189.0])
+def test_plain_rounding_shakes_a_small_amplitude_near_the_modes(method, frequency):
+    """FACTS: 0.13-0.46 um at 170-189 Hz from 12 bits alone, 1 um wanted; the shaped command leaves 0.01.
+
+    Against the same run (same noise) with an ideal drive, over 5 s, all frequencies.
+    """
+    plate, smooth = PlateParameters(), PlateParameters(current_bits=0)
+    ideal = hold(method, fixed((frequency, 1e-6)), 8.0, smooth)[1][-25_000:, 0]
+    for known, least, most in ((smooth, 0.13e-6, 0.46e-6), (plate, 0.0, 0.02e-6)):
+        motion = hold(method, fixed((frequency, 1e-6)), 8.0, plate, known)[1][-25_000:, 0]
+        assert least < (motion - ideal).std() < most
