@@ -1,11 +1,9 @@
 """A slow, obvious twin of the band bank's whole step: complex arrays of (coordinates, bands), one line an equation.
 
 Written from FACTS section 3 and reports/damping.md; of the library it is given
-only the numbers in its tables.  Equation marks below: O observer, L law,
+only the numbers in its tables and the pole of the finger's tracker.  Equation marks below: O observer, L law,
 F finger, D damping, S saturation, as in those pages.
 """
-
-import math
 
 import numpy as np
 
@@ -28,7 +26,8 @@ def move(start, end, share):
 class NaiveBank:
     """Takes one sample a call; everything it remembers is an attribute."""
 
-    def __init__(self, tables):
+    def __init__(self, tables, tracker_pole):
+        self.tracker_pole = tracker_pole  # rad/s
         self.p, self.t = tables.numbers, tables
         frequency, wavenumber, phase, real, imaginary = tables.tone
         self.frequency, self.wavenumber, self.phase = frequency, wavenumber, phase
@@ -106,7 +105,7 @@ class NaiveBank:
         return drive, target, flags | cut | (NONFINITE if far else 0)
 
     def follow(self, position):
-        """Finger tracker: three equal poles at 30 Hz."""
+        """Finger tracker: three equal poles."""
         leapt = self.seen and abs(position - self.held) * self.p.rate > FASTEST
         if leapt or not abs(position) <= FAR:
             self.seen, self.velocity, self.acceleration = False, 0.0, 0.0
@@ -114,7 +113,7 @@ class NaiveBank:
         if not self.seen:
             self.place_of_finger = position
         self.seen, self.held = True, position
-        T, a = 1 / self.p.rate, 2 * math.pi * 30
+        T, a = 1 / self.p.rate, self.tracker_pole
         self.place_of_finger += T * self.velocity
         miss = position - self.place_of_finger
         self.place_of_finger += 3 * a * T * miss

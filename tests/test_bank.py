@@ -8,6 +8,7 @@ from naive_bank import NaiveBank
 
 import hapticrender as hr
 from hapticrender.bands import Bands
+from hapticrender.control.bank_kernels import TRACKER_POLE
 from hapticrender.control.methods import METHODS
 from hapticrender.plants.vibrotactile import Plate, PlateParameters
 from hapticrender.protocols import Flag
@@ -53,7 +54,7 @@ def waveform(bands):
 
 def twin_run(tables, sensed, position, wanted):
     """Drive, target and flags by the twin, and what it went through."""
-    twin = NaiveBank(tables)
+    twin = NaiveBank(tables, TRACKER_POLE)
     rows, events = [], set()
     for n in range(len(sensed)):
         rows.append(twin.step(sensed[n], position[n], wanted[n]))
