@@ -27,9 +27,12 @@ HOPS_LOCKED = 8  # the same where carriers are locked to the finger, which is se
 LOWEST_FREQUENCY = 20.0  # Hz: below it the window does not tell a carrier from an offset
 LARGEST_INFLATION = 4.0  # of an envelope's variance, by the neighbours that the window hardly tells apart from it
 SETTLED = 0.05  # of the target
+SETTLED_FOR = 0.5  # s, or
+SETTLED_SHARE = 0.1  # of the judged time where that is shorter: inside for so long at the end, a band has settled
 QUARTERS = 4  # parts of a window in each of which a carrier must be fast enough
 RUNAWAY = 1e3  # m: no plate moves so far, and squares still fit into a float
 CHUNK_VALUES = 2**21  # numbers in one batch of regressors
+SILENT = 1e-6  # of the strongest wanted envelope: what is left of nothing by the fit beside other bands
 RIDGE = 1e-12  # keeps the normal equations of a standing carrier solvable; such windows are not read
 UNJUDGED: dict[str, Any] = {"figure": "rms_error", "value": None, "band": "any", "place": "any"}
 
@@ -52,6 +55,10 @@ class Envelopes:
         The window tells the band's carrier from its neighbours and from the offset.
     asked : ndarray of bool, shape (w, n_bands)
         Something is wanted of the band all through the window.
+    frequency : ndarray, shape (w, n_bands), Hz
+        Mean magnitude of the carrier's frequency; 0 for a finger-locked one while the finger is up.
+    residual : ndarray, shape (w,), m^2
+        Mean square of the motion at the first place that neither the carriers nor an offset and a slope explain.
     """
 
     start: Array
@@ -60,6 +67,8 @@ class Envelopes:
     achieved: Array
     readable: Array
     asked: Array
+    frequency: Array
+    residual: Array
 
     @property
     def time(self) -> Array:
@@ -83,6 +92,12 @@ def judged_from(recording: Recording) -> float:
     duration = len(recording) / recording.rate
     settle = recording.header.settle
     return settle if duration >= 2 * settle else duration / 2
+
+
+def shortest_run(recording: Recording) -> float:
+    """Length (s) from which a run like this can be judged: what follows its settling time holds a window and a hop."""
+    needed = (1 + 1 / HOPS) * window_length(recording.bands, recording.rate, recording.position, math.inf)
+    return needed + min(needed, recording.header.settle)
 
 
 def window_length(bands: Bands, rate: float, position: Array, longest: float) -> float:
@@ -134,11 +149,10 @@ def analyse(recording: Recording) -> Envelopes:
         _analyse_chunk(recording, position, starts, size) for starts in _batches(first, size * (2 * len(bands) + 2))
     ]
     places, n_bands = len(recording.header.places), len(bands)
-    shapes = [(0, n_bands), (0, places, n_bands), (0, n_bands), (0, n_bands)]
-    kinds = [complex, complex, bool, bool]
+    shapes = [(0, n_bands), (0, places, n_bands), (0, n_bands), (0, n_bands), (0, n_bands), (0,)]
+    kinds = [complex, complex, bool, bool, float, float]
     empty: list[Array] = [np.empty(shape, kind) for shape, kind in zip(shapes, kinds, strict=True)]
-    wanted, achieved, readable, asked = (np.concatenate(part) for part in zip(empty, *parts, strict=True))
-    return Envelopes(first / rate, size / rate, wanted, achieved, readable, asked)
+    return Envelopes(first / rate, size / rate, *(np.concatenate(part) for part in zip(empty, *parts, strict=True)))
 
 
 def _batches(first: Array, values: int) -> Iterator[Array]:
@@ -157,13 +171,21 @@ def _analyse_chunk(recording: Recording, position: Array, first: Array, size: in
     target = recording.read("target", start, stop)
     waveform = (target.real * np.cos(phase) - target.imag * np.sin(phase)).sum(axis=1)
     signals = np.column_stack([waveform, recording.read("motion", start, stop)])[index]
-    envelope, inflation = fit(phase[index], signals)
-    readable = (inflation <= LARGEST_INFLATION) & _fast_enough(bands, rate, finger[index])
+    envelope, inflation, rest = fit(phase[index], signals)
+    frequency = _quarterly(bands, rate, finger[index])
+    fast = np.all(frequency >= LOWEST_FREQUENCY * (1 - 1e-6), axis=1)
     asked = (target != 0)[index].all(axis=1)
-    return envelope[:, 0], envelope[:, 1:], readable, asked
+    return (
+        envelope[:, 0],
+        envelope[:, 1:],
+        fast & (inflation <= LARGEST_INFLATION),
+        asked,
+        frequency.mean(axis=1),
+        _unexplained(rest[..., 1], rest[..., 0], signals[..., 0]),
+    )
 
 
-def fit(phase: Array, signals: Array) -> tuple[Array, Array]:
+def fit(phase: Array, signals: Array) -> tuple[Array, Array, Array]:
     """Least-squares envelopes of all carriers at once, with an offset and a slope.
 
     Parameters
@@ -178,6 +200,8 @@ def fit(phase: Array, signals: Array) -> tuple[Array, Array]:
         In the unit of the signals.
     inflation : ndarray, shape (w, n_bands)
         Variance of an envelope's worse part relative to that of a lone carrier, >= 1 or nearly so.
+    rest : ndarray, shape (w, m, s)
+        What is left of the signals.
     """
     windows, size, n_bands = phase.shape
     regressors = np.empty((windows, size, 2 * n_bands + 2))
@@ -190,19 +214,32 @@ def fit(phase: Array, signals: Array) -> tuple[Array, Array]:
     normal += RIDGE * size * np.eye(2 * n_bands + 2)
     inverse = np.linalg.inv(normal)
     with np.errstate(invalid="ignore", over="ignore", under="ignore"):  # a motion that is no number is told by `finite`
-        parts = (inverse @ (transposed @ signals)).transpose(0, 2, 1)
+        solution = inverse @ (transposed @ signals)
+        rest = signals - regressors @ solution
+    parts = solution.transpose(0, 2, 1)
     envelope = parts[..., :n_bands] + 1j * parts[..., n_bands:-2]
     variance = np.diagonal(inverse, axis1=1, axis2=2)[:, :-2].reshape(windows, 2, n_bands).max(axis=1)
-    return envelope, variance * (size / 2)
+    return envelope, variance * (size / 2), rest
 
 
-def _fast_enough(bands: Bands, rate: float, finger: Array) -> Array:
-    """Whether each carrier runs at 20 Hz or more in every quarter of a window, and the finger that it needs is down."""
+def _unexplained(rest: Array, wanted_rest: Array, wanted: Array) -> Array:
+    """Mean square (shape (w,)) of what is left of a motion, less the multiple of what is left of the wanted waveform.
+
+    A window in which the target fades holds wanted motion that no constant envelope explains.
+    """
+    with np.errstate(invalid="ignore", over="ignore", under="ignore"):
+        floor = RIDGE * np.mean(wanted**2, axis=1) + np.finfo(float).tiny
+        shared = np.mean(rest * wanted_rest, axis=1) ** 2 / (np.mean(wanted_rest**2, axis=1) + floor)
+        return np.maximum(np.mean(rest**2, axis=1) - shared, 0.0)
+
+
+def _quarterly(bands: Bands, rate: float, finger: Array) -> Array:
+    """Frequency (Hz, shape (w, quarters, n_bands)) in every quarter of a window; 0 where the finger it needs is up."""
     edges = np.linspace(0, finger.shape[1] - 1, QUARTERS + 1).round().astype(int)
-    down = np.all(np.isfinite(finger), axis=1)
-    velocity = np.diff(np.where(down[:, None], finger[:, edges], 0.0), axis=1) * rate / np.diff(edges)
-    frequency = np.abs(bands.instantaneous_frequency(velocity)).min(axis=1)
-    return (frequency >= LOWEST_FREQUENCY * (1 - 1e-6)) & (down[:, None] | (bands.wavenumber == 0))
+    down = np.all(np.isfinite(finger), axis=1)[:, None]
+    velocity = np.diff(np.where(down, finger[:, edges], 0.0), axis=1) * rate / np.diff(edges)
+    free = bands.wavenumber == 0
+    return np.where(down[:, :, None] | free, np.abs(bands.instantaneous_frequency(velocity)), 0.0)
 
 
 def summary(recording: Recording) -> dict[str, Any]:
@@ -219,7 +256,16 @@ def summary(recording: Recording) -> dict[str, Any]:
     from its mean: the root of sum_k mean |X_k - c_k target_k|^2 / 2, with c_k
     the least-squares multiple of the target over the judged windows (for a
     constant target, the mean of X_k).  A window of 2 periods passes
-    variations up to about 0.44/window, 4.4 Hz at 20 Hz.
+    variations up to about 0.44/window, 4.4 Hz at 20 Hz.  `residual_rms` is
+    the rms (m) of all other true motion at the centre in the judged time:
+    what is neither a band's envelope as fitted in each window, nor a multiple
+    of what that fit leaves of the wanted waveform where a target fades, nor
+    the window's offset and slope.
+
+    `frequency` of a band that is locked to the finger is the median while it
+    is judged.  `settling_time` is None unless the band stays within 5 % of
+    its target, in amplitude and phase, for the last 0.5 s, or for the last
+    10 % of the judged time where that is shorter.
 
     Parameters
     ----------
@@ -250,6 +296,7 @@ def summary(recording: Recording) -> dict[str, Any]:
         "worst": worst,
         "bands": bands,
         "wobble": _wobble(envelopes, judged),
+        "residual_rms": _residual(envelopes, late[:, 0]),
         "saturated_share": float(np.mean((flags & Flag.SATURATED) != 0)) if len(flags) else 0.0,
         "flags": {str(flag.name): int(np.count_nonzero(flags & flag)) for flag in Flag if (flags & flag).any()},
         "notes": _notes(recording, bands, late[:, 0]),
@@ -259,11 +306,11 @@ def summary(recording: Recording) -> dict[str, Any]:
 def _band(recording: Recording, k: int, judged: Array, places: list[str]) -> dict[str, Any]:
     """All figures of one band over its judged windows."""
     bands, envelopes = recording.bands, recording.envelopes
-    frequency, wavenumber = float(bands.frequency[k]), float(bands.wavenumber[k])
+    wavenumber = float(bands.wavenumber[k])
     wanted = envelopes.wanted[judged, k]
     achieved = envelopes.achieved[judged, :, k]
     figures: dict[str, Any] = {
-        "frequency": frequency if frequency or not wavenumber else None,
+        "frequency": _median(envelopes.frequency[judged, k]) if wavenumber else float(bands.frequency[k]),
         "wavelength": 1 / wavenumber if wavenumber else None,
         "target": _mean(np.abs(wanted)),
         "achieved": _mean(np.abs(achieved[:, 0])),
@@ -274,20 +321,23 @@ def _band(recording: Recording, k: int, judged: Array, places: list[str]) -> dic
         figures[f"rms_error_{place}"] = _ratio(_rms(amplitude - np.abs(wanted)), _rms(wanted))
     product = achieved[:, 0] * wanted.conj()
     figures["phase_error"] = float(np.angle(product.mean())) if product.size else None
-    figures["settling_time"] = _settling_time(envelopes, k)
+    judged_time = len(recording) / recording.rate - judged_from(recording)
+    figures["settling_time"] = _settling_time(envelopes, k, min(SETTLED_FOR, SETTLED_SHARE * judged_time))
     figures["judged_windows"] = int(judged.sum())
     return figures
 
 
-def _settling_time(envelopes: Envelopes, k: int) -> float | None:
-    """Middle (s) of the first window after which the centre stays within 5 % of the target; None if it never does."""
+def _settling_time(envelopes: Envelopes, k: int, least: float) -> float | None:
+    """Middle (s) of the first window after which the centre stays within 5 % of the target, for `least` (s) or more."""
     compared = envelopes.readable[:, k] & envelopes.asked[:, k]
     wanted = envelopes.wanted[compared, k]
     with np.errstate(invalid="ignore"):
         outside = ~(np.abs(envelopes.achieved[compared, 0, k] - wanted) <= SETTLED * np.abs(wanted))
     time = envelopes.time[compared]
     first = int(np.flatnonzero(outside)[-1]) + 1 if outside.any() else 0
-    return float(time[first]) if first < len(time) else None
+    if first == len(time) or time[-1] - time[first] + envelopes.window < least * (1 - 1e-9):
+        return None
+    return float(time[first])
 
 
 def _wobble(envelopes: Envelopes, judged: Array) -> float | None:
@@ -300,6 +350,13 @@ def _wobble(envelopes: Envelopes, judged: Array) -> float | None:
         scale = np.vdot(wanted, achieved) / np.vdot(wanted, wanted).real
         power += np.mean(np.abs(achieved - scale * wanted) ** 2) / 2
     return math.sqrt(power)
+
+
+def _residual(envelopes: Envelopes, late: Array) -> float | None:
+    """Rms (m) at the centre of what is neither a band nor slow, see `summary`."""
+    with np.errstate(over="ignore"):
+        mean_square = _mean(envelopes.residual[late & envelopes.finite])
+    return math.sqrt(mean_square) if mean_square is not None and math.isfinite(mean_square) else None
 
 
 def _diverges(envelopes: Envelopes) -> bool:
@@ -330,19 +387,34 @@ def _notes(recording: Recording, bands: list[dict[str, Any]], late: Array) -> li
         notes.append(f"the run ended after {seconds:.3f} s of {header.duration:.3f} s")
     if seconds < 2 * header.settle:
         notes.append("the run is shorter than twice the settling time: its second half is judged")
-    if not envelopes.finite.any():
-        notes.append("the motion is not known")
-    elif not envelopes.finite.all():
-        notes.append(f"the motion is not finite in {int((~envelopes.finite).sum())} of {len(envelopes.start)} windows")
-    partly = [band for band in bands if band["judged_windows"] < late.sum()]
+    finite = envelopes.finite if len(envelopes.start) else np.isfinite(recording.motion)
+    if finite.size and not finite.any():
+        return [*notes, "the motion is not known"]
+    if not finite.all():
+        notes.append(f"the motion is not finite in {int((~finite).sum())} of {len(finite)} windows")
+    needed = shortest_run(recording)
+    if seconds < needed < math.inf and not any(band["judged_windows"] for band in bands):
+        return [*notes, f"too short to judge: needs >= {math.ceil(1e3 * needed - 1e-6) / 1e3:g} s"]
+    late = late & envelopes.finite
+    partly = [k for k, band in enumerate(bands) if band["judged_windows"] < late.sum()]
     if partly:
-        shares = sorted(100 * band["judged_windows"] / late.sum() for band in partly)
+        shares = sorted(100 * bands[k]["judged_windows"] / late.sum() for k in partly)
         share = f"{shares[0]:.0f} %" if shares[-1] - shares[0] < 1 else f"{shares[0]:.0f} to {shares[-1]:.0f} %"
+        beyond = ", faster than the device's range" if _beyond_range(envelopes, recording.bands, late, partly) else ""
         notes.append(
-            f"{wording.bands_label(partly)}: {share} of the windows judged; in the others nothing is wanted, "
-            "the finger is up, or the carrier is slower than 20 Hz or too close to another"
+            f"{wording.bands_label([bands[k] for k in partly])}: {share} of the windows judged; in the others nothing "
+            f"is wanted, the finger is up, or the carrier is slower than 20 Hz{beyond} or too close to another"
         )
     return notes
+
+
+def _beyond_range(envelopes: Envelopes, bands: Bands, late: Array, partly: list[int]) -> bool:
+    """Whether a finger-locked carrier is silent in a window where it runs faster than wherever it is wanted."""
+    meant = bands.wavenumber != 0 if bands.envelope is None else (bands.wavenumber != 0) & (bands.envelope != 0)
+    strength = np.abs(envelopes.wanted)
+    silent = strength <= SILENT * strength.max(initial=0.0)
+    fastest = np.where(envelopes.asked, envelopes.frequency, LOWEST_FREQUENCY).max(axis=0, initial=LOWEST_FREQUENCY)
+    return bool((meant & silent & (envelopes.frequency > fastest))[late][:, partly].any())
 
 
 def text(summary: Mapping[str, Any]) -> str:
@@ -364,8 +436,9 @@ def text(summary: Mapping[str, Any]) -> str:
         )
     widths = [max(len(row[i]) for row in rows) for i in range(len(titles))]
     lines = ["  ".join(cell.rjust(width) for cell, width in zip(row, widths, strict=True)) for row in rows]
-    wobble, saturated = wording.quantity(summary["wobble"], "m"), wording.percent(summary["saturated_share"])
-    lines.append(f"rms errors at centre and ends; wobble {wobble}, saturated {saturated}")
+    wobble, residual = (wording.quantity(summary[key], "m") for key in ("wobble", "residual_rms"))
+    saturated = wording.percent(summary["saturated_share"])
+    lines.append(f"rms errors at centre and ends; wobble {wobble}, beside the bands {residual}, saturated {saturated}")
     lines.extend(summary["notes"])
     return "\n".join([*lines, f"{summary['scene']} {wording.verdict(summary)}"])
 
@@ -376,6 +449,10 @@ def _mean(values: Array) -> float | None:
 
 def _rms(values: Array) -> float | None:
     return float(np.sqrt(np.mean(np.abs(values) ** 2))) if values.size else None
+
+
+def _median(values: Array) -> float | None:
+    return float(np.median(values)) if values.size else None
 
 
 def _ratio(value: float | None, reference: float | None, less: float = 0.0) -> float | None:

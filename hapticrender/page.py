@@ -256,7 +256,8 @@ def _figures(summary: Mapping[str, Any]) -> str:
         "Judged from": wording.short(summary["judged_from"], "s"),
         "Sampling rate": wording.short(summary["rate"], "Hz"),
         "Method": f"{summary['method']}, seed {summary['seed']}",
-        "Wobble": wording.quantity(summary["wobble"], "m"),
+        "Wobble of the bands": wording.quantity(summary["wobble"], "m"),
+        "Beside the bands": f"{wording.quantity(summary['residual_rms'], 'm')} rms",
         "Drive at its limit": f"{wording.percent(summary['saturated_share'])} of the time",
         "Flagged samples": wording.flags(summary),
     }

@@ -47,9 +47,17 @@ def percent(ratio: float | None) -> str:
 
 
 def band_label(band: Mapping[str, Any]) -> str:
-    """Name a band: its frequency, its wavelength, or both."""
-    parts = [short(band[key], unit) for key, unit in (("frequency", "Hz"), ("wavelength", "m")) if band.get(key)]
-    return " + ".join(parts) or "0 Hz"
+    """Name a band: its frequency, or its wavelength and the median frequency at which it was judged.
+
+    Examples
+    --------
+    >>> band_label({"frequency": 62.5, "wavelength": None}), band_label({"frequency": 171.2, "wavelength": 468.3e-6})
+    ('62.5 Hz', '468.3 µm (171 Hz)')
+    """
+    frequency, wavelength = band.get("frequency"), band.get("wavelength")
+    if not wavelength:
+        return short(frequency, "Hz") if frequency else "0 Hz"
+    return short(wavelength, "m") + (f" ({short(float(f'{frequency:.3g}'), 'Hz')})" if frequency else "")
 
 
 def bands_label(bands: Sequence[Mapping[str, Any]]) -> str:

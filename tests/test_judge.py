@@ -68,7 +68,8 @@ def test_a_chirped_finger_locked_carrier_is_followed():
     recording = make_recording(bands, 1.1 * bands.envelope, position=position, duration=2.0, scene={"settle": 0.0})
     assert recording.envelopes.judged.all()
     for band in recording.summary()["bands"]:
-        assert band["frequency"] is None
+        middle = 30.0 + 60.0 * np.median(recording.envelopes.time)  # Hz; a sample is 60 Hz/s / RATE of it
+        assert band["frequency"] * band["wavelength"] * 1e3 == pytest.approx(middle, abs=60.0 / RATE)
         assert band["error_centre"] == pytest.approx(0.1, abs=EXACT)
         assert band["phase_error"] == pytest.approx(0.0, abs=EXACT)
 
@@ -88,6 +89,59 @@ def test_a_run_that_leaves_its_target_at_the_end_never_settles():
     bands = make_bands(200.0, 10 * UM)
     leaves = np.where(times(4.0) > 3.9, 0.94, 1.0)[:, None, None]
     assert only(make_recording(bands, leaves * bands.envelope))["settling_time"] is None
+
+
+@pytest.mark.parametrize(
+    ("duration", "inside_for", "settled"),
+    [(4.0, 0.34, True), (4.0, 0.26, False), (16.0, 0.56, True), (16.0, 0.44, False)],
+)
+def test_a_band_settles_only_if_it_stays_for_half_a_second_or_a_tenth(duration, inside_for, settled):
+    """Judged from 1 s: the last 0.3 s of 4 s, the last 0.5 s of 16 s; a window is 20 ms, a hop 10 ms."""
+    bands = make_bands(200.0, 10 * UM)
+    enters = np.where(times(duration) > duration - inside_for, 1.0, 0.9)[:, None, None]
+    recording = make_recording(bands, enters * bands.envelope, duration=duration)
+    time = only(recording)["settling_time"]
+    assert time == (pytest.approx(duration - inside_for, abs=recording.envelopes.window) if settled else None)
+
+
+def test_what_is_neither_a_band_nor_slow_is_told_apart():
+    """A line at 190 Hz has 19 periods in the window of 0.1 s, so it is orthogonal to all but the slope."""
+    bands, time = make_bands(20.0, 10 * UM), times(4.0)
+    slow = (-11 * UM + 3 * UM * time)[:, None]
+    clean = make_recording(bands, 1.3 * bands.envelope, extra=slow).summary()
+    assert clean["residual_rms"] < EXACT * 30 * UM
+    line = (0.158 * UM * math.sqrt(2) * np.cos(2 * np.pi * 190 * time))[:, None]
+    spurious = make_recording(bands, 1.3 * bands.envelope, extra=slow + line).summary()
+    assert spurious["residual_rms"] == pytest.approx(0.158 * UM, rel=1e-3)  # the slope takes 1e-4 of it at most
+    assert spurious["wobble"] < 0.01 * 0.158 * UM
+
+
+def test_a_target_that_fades_leaves_nothing_beside_the_bands():
+    bands, time = make_bands(20.0, 10 * UM), times(4.0)
+    fading = np.clip(10 * (2 - time), 0, 1)[:, None]  # within a window
+    same = {"target": fading * bands.envelope, "scene": {"settle": 0.0}}
+    exact = make_recording(bands, 0.7 * fading[:, None] * bands.envelope, **same).summary()
+    assert exact["residual_rms"] < 1e-5 * UM
+    constant = make_recording(bands, 0.7 * bands.envelope, **same).summary()
+    assert constant["residual_rms"] == pytest.approx(0.0, abs=1e-5 * UM)
+    late = make_recording(bands, 0.7 * np.roll(fading, 400)[:, None] * bands.envelope, **same).summary()
+    assert late["residual_rms"] > 0.1 * UM
+
+
+def test_a_coarse_command_shows_beside_the_bands():
+    """FACTS 2, row 14: a 12-bit command makes lines at 180 to 220 Hz; the bands' wobble does not hold them."""
+    scene = builtin_scenes()["grating-20"]
+    coarse = render(scene, seed=1)
+    fine = render(replace(scene, plant={"current_bits": 0}), seed=1).summary()
+    late = coarse.motion[coarse.time >= 1.0, 0]
+    power = np.abs(np.fft.rfft(late * np.hanning(late.size))) ** 2
+    frequency = np.fft.rfftfreq(late.size, 1 / coarse.rate)
+    lines = math.sqrt(2 * power[(frequency > 150) & (frequency < 250)].sum() / late.size**2 / 0.375)  # of a Hann window
+    summary = coarse.summary()
+    assert 0.1 * UM < lines < 0.25 * UM
+    assert lines < summary["residual_rms"] < 1.1 * lines
+    assert summary["residual_rms"] > 5 * fine["residual_rms"]
+    assert "beside the bands 1" in coarse.text()
 
 
 @pytest.mark.parametrize("turn", [1, 1j], ids=["amplitude", "phase"])
@@ -121,7 +175,7 @@ def test_wobble_of_the_papers_controller(frequency):
 def test_fit_equals_least_squares_window_by_window(rng):
     phase = 2 * np.pi * np.multiply.outer(np.arange(300) / RATE, [60.0, 95.0]).reshape(3, 100, 2)
     signals = rng.standard_normal((3, 100, 2))
-    envelope, inflation = judge.fit(phase, signals)
+    envelope, inflation, rest = judge.fit(phase, signals)
     for w in range(3):
         ones = np.ones(100)
         columns = [np.cos(phase[w]), -np.sin(phase[w]), ones[:, None], np.arange(100.0)[:, None]]
@@ -129,6 +183,8 @@ def test_fit_equals_least_squares_window_by_window(rng):
         parts = np.linalg.lstsq(regressors, signals[w], rcond=None)[0]
         expected = (parts[:2] + 1j * parts[2:4]).T
         np.testing.assert_allclose(envelope[w], expected, rtol=1e-8)
+        left = signals[w] - regressors @ np.linalg.lstsq(regressors, signals[w], rcond=None)[0]
+        np.testing.assert_allclose(rest[w], left, atol=1e-8)
         variance = np.diag(np.linalg.inv(regressors.T @ regressors))[:4].reshape(2, 2).max(axis=0)
         np.testing.assert_allclose(inflation[w], variance * 50, rtol=1e-8)
 
@@ -170,7 +226,22 @@ def test_windows_with_a_slow_a_lifted_or_an_idle_finger_are_left_out():
     assert envelopes.judged[free].all()
     assert not envelopes.judged[blocked].any()
     (note,) = recording.summary()["notes"]
-    assert note.startswith("1 mm: ")
+    assert note.startswith("1 mm (60 Hz): ")
+    assert "faster" not in note
+
+
+def test_what_is_too_fast_for_the_device_is_said_to_be():
+    time = times(4.0)
+    position = np.cumsum(np.where(time < 2.0, 0.06, 1.6)) / RATE - 0.1  # 60 Hz, then 1600 Hz
+    bands = make_bands(0.0, 10 * UM, wavenumber=1000.0)
+    for begin in (2.0, 0.0):  # fades beyond its range; is never in it
+        target = np.where(time < begin, 10 * UM, 0.0)[:, None]
+        recording = make_recording(bands, 0.0, position=position if begin else position * 20, target=target)
+        (note,) = recording.summary()["notes"]
+        assert "or the carrier is slower than 20 Hz, faster than the device's range or too close" in note
+    silent = make_bands(0.0, 0.0, wavenumber=1000.0)
+    (note,) = make_recording(silent, 0.0, position=position).summary()["notes"]
+    assert "faster" not in note
 
 
 def test_carriers_too_close_to_be_told_apart_are_not_judged():
@@ -223,7 +294,7 @@ def test_a_motion_that_is_no_number_never_passes(value):
 def test_a_device_that_tells_nothing_is_not_judged():
     bands = make_bands(100.0, 10 * UM)
     summary = make_recording(bands, bands.envelope, extra=np.nan).summary()
-    assert "the motion is not known" in summary["notes"]
+    assert summary["notes"] == ["the motion is not known"]
     assert summary["worst"]["value"] is None
     assert not summary["passed"]
 
@@ -234,13 +305,27 @@ def test_a_run_cut_short_says_so():
     assert summary["notes"] == ["the run ended after 3.000 s of 4.000 s"]
 
 
-@pytest.mark.parametrize("samples", [0, 1, 50])
+@pytest.mark.parametrize("samples", [0, 1, 5, 50])
 def test_runs_shorter_than_a_window_have_no_figures(samples):
     bands = make_bands(100.0, 10 * UM)
     summary = make_recording(bands, bands.envelope, duration=samples / RATE, scene={"duration": 1.0}).summary()
     assert summary["bands"][0]["achieved"] is None
+    assert summary["notes"][-1] == "too short to judge: needs >= 0.06 s"  # twice a window of 20 ms and half of it
+    assert not any("motion" in note for note in summary["notes"])
     assert not summary["passed"]
     json.dumps(summary, allow_nan=False)
+
+
+@pytest.mark.parametrize("frequency", [20.0, 47.0, 400.0])
+@pytest.mark.parametrize("settle", [0.0, 0.013, 1.0])
+def test_a_run_of_the_length_that_is_asked_for_is_judged(frequency, settle):
+    bands = make_bands(frequency, 10 * UM)
+    fields = {"scene": {"settle": settle, "duration": 4.0}}
+    (note,) = make_recording(bands, bands.envelope, duration=0.01, **fields).summary()["notes"][-1:]
+    needed = float(note.removeprefix("too short to judge: needs >= ").removesuffix(" s"))
+    judged = make_recording(bands, bands.envelope, duration=needed, **fields).summary()
+    assert judged["bands"][0]["judged_windows"] > 0
+    assert not any("too short" in note for note in judged["notes"])
 
 
 def test_flags_are_counted():

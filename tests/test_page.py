@@ -68,6 +68,7 @@ def summary(bands, name="grating", notes=()):
         "worst": {"figure": f"rms_error_{place}", "value": value, "band": label, "place": place},
         "bands": bands,
         "wobble": 4.1e-8,
+        "residual_rms": 1.58e-7,
         "saturated_share": 0.25,
         "flags": {"SATURATED": 5000},
         "notes": list(notes),
@@ -107,6 +108,7 @@ def test_a_miss_is_said_with_its_figure(tmp_path):
     assert text.replace("\xa0", " ").lower().count(sentence.lower()) == 2  # in the table and in its section
     assert "1 of 2 here does." in text
     assert "within 10 %" in text
+    assert "158 nm rms" in text
 
 
 def test_nothing_in_a_scene_becomes_markup(tmp_path):
@@ -173,6 +175,9 @@ def test_angles_are_in_degrees():
 def test_bands_are_called_by_what_they_hold_fast():
     assert wording.band_label({"frequency": 62.5, "wavelength": None}) == "62.5 Hz"
     assert wording.band_label({"frequency": None, "wavelength": 1e-3}) == "1 mm"
+    assert wording.band_label({"frequency": 171.3, "wavelength": 468.3e-6}) == "468.3 µm (171 Hz)"
+    assert wording.band_label({"frequency": 1234.0, "wavelength": 1e-3}) == "1 mm (1230 Hz)"
+    assert wording.band_label({"frequency": 0.0, "wavelength": None}) == "0 Hz"
 
 
 @pytest.mark.parametrize("peak", [1e-9, 1.0, 1.01, 2.0, 4.99, 9.99, 3.7e-5])
