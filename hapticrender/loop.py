@@ -185,7 +185,8 @@ def _wanted(session: Session, start: int, position: Array) -> Array:
     if wanted.shape != position.shape:
         kind = type(session.scene.texture).__name__
         raise ValueError(f"{kind}.waveform returned shape {wanted.shape}: must be {position.shape}, one a sample")
-    return np.where(np.isnan(wanted) & np.isnan(position), 0.0, wanted)  # nothing is wanted of a finger that is away
+    away = np.isnan(position) if (session.bands.wavenumber > 0.0).all() else False
+    return np.where(away, 0.0, wanted)  # nothing is wanted of a finger that is away
 
 
 def _time(session: Session, start: int, count: int) -> Array:

@@ -145,7 +145,7 @@ class NaiveBank:
             target = self.R + gain / 2 * (self.weight * self.raw - self.R)
         else:
             target = self.weight * self.constant
-        R = target if p.error_observer else self.R + p.observer / 2 * (target - self.R)
+        R = target if p.error_observer or p.analysed else self.R + p.observer / 2 * (target - self.R)
         self.dR = (R - self.R) * p.rate
         self.R = R
         return target

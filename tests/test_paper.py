@@ -10,6 +10,7 @@ from benchmarks.numpy_loop import NumpyPlate, NumpyPolar, run
 from hapticrender.bands import Bands
 from hapticrender.control.loopshape import TransferFunction, design, margins
 from hapticrender.control.methods import METHODS, method_named
+from hapticrender.control.methods.paper import CommonMode
 from hapticrender.plants.vibrotactile import Plate, PlateParameters
 from hapticrender.touch.mechanics import HEAVY_SECOND
 
@@ -271,11 +272,18 @@ def test_drive_stays_finite_and_inside_its_limit_whatever_is_sensed(method, bad,
     assert np.all(flags[100:110] != 0)
 
 
-def test_too_long_a_delay_is_refused():
-    """FACTS 2 row 7: the known delay that polar loops bear is 30-42 ms."""
-    parameters = PlateParameters(delay=250)
-    with pytest.raises(hr.DesignError, match="phase_margin|margin"):
-        METHODS["paper"].design(parameters.band_model(RATE, 250), tones((111.0, 1e-5)))
+def test_a_long_delay_slows_the_loop_down_until_its_margins_hold():
+    """FACTS 2 row 7: at 5 Hz polar loops bear 30-42 ms; slowed down they hold at 60 ms, and 5 s are refused."""
+    _, sensed, _ = close(tones((111.0, 1e-5)), 12.0, overrides=dict(IDEAL, delay=300), method="paper-common")
+    assert amplitude(sensed.motion, 111.0, 2.0)[0] == pytest.approx(1e-5, rel=2e-3)
+    naive = CommonMode(bandwidths=(5.0, 10.0))
+    parameters = PlateParameters(delay=300, **IDEAL)
+    plate = Plate(parameters, hr.Finger.absent())
+    controller = naive.design(parameters.band_model(RATE, 300), tones((111.0, 1e-5)))
+    sensed = plate.closed_loop(controller, np.zeros(60_000))[3]
+    assert abs(amplitude(sensed.motion, 111.0, 2.0)[0] / 1e-5 - 1) > 0.05
+    with pytest.raises(hr.DesignError, match="unstable|margin|sensitivity"):
+        METHODS["paper"].design(parameters.band_model(RATE, 25_000), tones((111.0, 1e-5)))
 
 
 def test_an_unknown_method_is_refused_with_the_known_ones():

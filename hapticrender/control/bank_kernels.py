@@ -16,7 +16,18 @@ import math
 from typing import NamedTuple
 
 from hapticrender._jit import kernel
-from hapticrender.control.kernels import FREQUENCY, PHASE, TURN, WANTED_IM, WANTED_RE, WAVENUMBER, fade
+from hapticrender.control.kernels import (
+    DOUBT_TIME,
+    FAR,
+    FASTEST,
+    FREQUENCY,
+    PHASE,
+    TURN,
+    WANTED_IM,
+    WANTED_RE,
+    WAVENUMBER,
+    fade,
+)
 from hapticrender.protocols import Array
 
 # rows of BankState.band: carrier, target (R and its slope), and what the finger adds to it beyond its three numbers
@@ -36,8 +47,6 @@ LOAD, PLACE, CONTACT, MASS, DAMPING, STIFFNESS, FAST_TIME, SLOW_TIME, FAST_OPEN,
 )
 TOUCH_ROWS = 13
 ADAPTATION = 4  # samples between two adaptations of the finger
-FAR, FASTEST = 1e3, 10.0  # m, m/s: no finger is farther away or faster, and no texture wants more
-TRUST_TIME = 0.02  # s: within this the drive fades where a sensor cannot be believed
 TRACKER_POLE = TURN * 60.0  # rad/s: triple pole of the finger's tracker; no lag under constant acceleration
 CROWDED_MASS, CROWDED_STIFFNESS = 4e-3, 300.0  # kg, N/m: how far the finger's numbers may be expected to lie from zero
 LEAST_MOTION, LEAST_LOAD = 5e-8, 0.03  # m, N: below these the finger is not adapted
@@ -170,7 +179,7 @@ def target_pass(numbers, tone, band, g, wanted, target):
         else:
             re, im = weight * tone[WANTED_RE, k], weight * tone[WANTED_IM, k]
         target[k] = complex(re, im)
-        if not numbers.error_observer:  # the reference passes the pole of the observer first
+        if not (numbers.error_observer or numbers.analysed):  # the reference passes the pole of the observer first
             re = band[R_RE, k] + 0.5 * numbers.observer * (re - band[R_RE, k])
             im = band[R_IM, k] + 0.5 * numbers.observer * (im - band[R_IM, k])
         band[DR_RE, k], band[DR_IM, k] = (re - band[R_RE, k]) * numbers.rate, (im - band[R_IM, k]) * numbers.rate
@@ -209,7 +218,7 @@ def wake(numbers, touch, fast, slow):
 @kernel
 def believe(numbers, touch, loop, level, past, flags):
     """Trust in the sensors: falls to 0 within 20 ms where a sample cannot be believed; then the loop starts anew."""
-    step = 1.0 / (TRUST_TIME * numbers.rate)
+    step = 1.0 / (DOUBT_TIME * numbers.rate)
     touch[TRUST] = max(touch[TRUST] - step, 0.0) if flags & 2 else min(touch[TRUST] + step, 1.0)
     if touch[TRUST] == 0.0:
         loop[:] = 0.0
@@ -397,7 +406,9 @@ def speak_pass(numbers, speak, force, shaper, touch, drive):
     for i in range(drive.shape[0]):
         exact = touch[SCALE] * drive[i]
         drive[i] = exact
-        if step > 0.0:
+        if touch[TRUST] == 0.0:
+            shaper[0, i] = shaper[1, i] = 0.0
+        elif step > 0.0:
             shaped = exact + 2.0 * shaper[0, i] - shaper[1, i]
             drive[i] = step * math.floor(shaped / step + 0.5)
             shaper[1, i] = shaper[0, i]
@@ -414,12 +425,12 @@ def bank_step(tables, state, sensed, position, wanted, drive, target):
     past, residual, listen = state.past, state.residual, tables.listen
     mass, damping, stiffness = tables.mass, tables.damping, tables.stiffness
     flags = 0
-    doubt = 0
+    odd = 0
     if not abs(wanted) <= FAR:
         wanted = 0.0
-        doubt = 2
+        odd = 2
     if abs(position) > FAR:
-        doubt = 2
+        odd = 2
     track_finger(state.track, numbers.rate, position)
     carrier_pass(numbers, tables.tone, band, state.track)
     calm = 1.0
@@ -460,7 +471,7 @@ def bank_step(tables, state, sensed, position, wanted, drive, target):
         rest = numbers.rest + lively * (numbers.rest_awake - numbers.rest)
         adapt_pass(numbers, mass, damping, stiffness, shape, tables.grip, band, loop, touch, inner, gain, rest)
     law_pass(numbers, mass, damping, stiffness, shape, band, loop, touch, residual[1])
-    return flags | doubt | speak_pass(numbers, tables.speak, residual[1], state.shaper, touch, drive)
+    return flags | odd | speak_pass(numbers, tables.speak, residual[1], state.shaper, touch, drive)
 
 
 @kernel

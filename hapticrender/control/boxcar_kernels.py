@@ -22,6 +22,7 @@ from hapticrender.control.kernels import (
     PolarState,
     PolarTables,
     carrier_pass,
+    doubt_pass,
     follow_finger,
     listen_pass,
     open_pass,
@@ -74,6 +75,7 @@ def boxcar_step(tables, state, sensed, position, wanted, drive, target):
     numbers, gain, band, loop, coordinate = polar.numbers, polar.gain, own.band, own.loop, own.coordinate
     at = state.oldest[0]
     flags = listen_pass(numbers, polar.listen, sensed, coordinate)
+    trust = doubt_pass(numbers, own.doubt, loop, flags)
     if not abs(wanted) <= FAR:
         wanted = 0.0
         flags |= 2
@@ -89,7 +91,7 @@ def boxcar_step(tables, state, sensed, position, wanted, drive, target):
         else:
             coordinate[c] = open_pass(numbers, gain, polar.lag, band, c)
     state.oldest[0] = (at + 1) % state.window.shape[0]
-    return flags | speak_pass(numbers, polar.speak, coordinate, drive)
+    return flags | speak_pass(numbers, polar.speak, coordinate, trust, drive)
 
 
 @kernel

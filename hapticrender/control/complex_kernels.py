@@ -16,7 +16,16 @@ from typing import NamedTuple
 
 from hapticrender._jit import kernel
 from hapticrender.control.bank_kernels import COS, OMEGA, SIN, SWEEP, WEIGHT, carrier_pass, track_finger
-from hapticrender.control.kernels import FAR, WANTED_IM, WANTED_RE, Section, biquad_step, listen_pass, speak_pass
+from hapticrender.control.kernels import (
+    FAR,
+    WANTED_IM,
+    WANTED_RE,
+    Section,
+    biquad_step,
+    doubt_pass,
+    listen_pass,
+    speak_pass,
+)
 from hapticrender.protocols import Array
 
 CARRIER_ROWS = SWEEP + 1  # of ComplexState.band, filled by the band bank's carrier_pass
@@ -70,6 +79,7 @@ class ComplexState(NamedTuple):
     loop: Array  # (coordinates * LOOP_ROWS, bands), complex
     track: Array  # the finger's motion
     coordinate: Array  # (2, coordinates) scratch: displacement, force
+    doubt: Array  # (1,) 0: the sensors are believed, 1: they are not
 
 
 @kernel
@@ -141,6 +151,7 @@ def complex_step(tables, state, sensed, position, wanted, drive, target):
     numbers, shape, band, loop = tables.numbers, tables.shape, state.band, state.loop
     heard, force = state.coordinate[0], state.coordinate[1]
     flags = listen_pass(numbers, tables.listen, sensed, heard)
+    trust = doubt_pass(numbers, state.doubt, loop, flags)
     if not abs(wanted) <= FAR:
         wanted = 0.0
         flags |= 2
@@ -156,7 +167,7 @@ def complex_step(tables, state, sensed, position, wanted, drive, target):
         loop_pass(numbers, band, state.wanted, loop, c, shape[c], heard[c])
         force[c] = 0.0
     force_pass(numbers, tables.mass, tables.damping, tables.stiffness, band, loop, force)
-    return flags | speak_pass(numbers, tables.speak, force, drive)
+    return flags | speak_pass(numbers, tables.speak, force, trust, drive)
 
 
 @kernel

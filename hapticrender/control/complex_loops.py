@@ -66,6 +66,7 @@ class ComplexController:
             loop=np.zeros((coordinates * LOOP_ROWS, bands), complex),
             track=np.zeros(TRACK_ROWS),
             coordinate=np.zeros((2, coordinates)),
+            doubt=np.zeros(1),
         )
 
     def run(self, sensed: Array, position: Array, wanted: Array) -> tuple[Array, Array, Array]:

@@ -9,19 +9,26 @@ import numpy as np
 from hapticrender.bands import Bands
 from hapticrender.control.bandmodel import BandModel
 from hapticrender.control.kernels import Section
-from hapticrender.control.loopshape import design, integrator, reduced_controller
+from hapticrender.control.loopshape import TransferFunction, design, integrator, reduced_controller
 from hapticrender.control.stdft import StarSTDFT
+from hapticrender.errors import DesignError
 from hapticrender.protocols import Array
 
 Bandwidths = tuple[float, float]
+NARROWER, SLOWEST = 0.9, 0.05  # steps in which a loop is slowed down for its delay, and how far
 
 
 class EnvelopeLoop(NamedTuple):
-    """Estimator's low pass and loop controller as second-order sections; boxcar length in samples, 0 for none."""
+    """Estimator's low pass and loop controller as second-order sections.
+
+    `boxcar` is its length in samples, 0 for none; `bandwidth` (Hz) that of the closed loop, lowered where the delay
+    asks for it.
+    """
 
     filter: Section
     law: Section
     boxcar: int
+    bandwidth: float
 
 
 def envelope_loop(
@@ -59,25 +66,37 @@ def envelope_loop(
     Raises
     ------
     DesignError
-        A margin is too small, most often because the delay is too long.
+        Even a loop twenty times slower has too small a margin.
     """
     fixed = bands.frequency[bands.wavenumber == 0.0]
     lowest = float(min(model.lowest_frequency, fixed.min(initial=np.inf)))
     length = round(model.rate / lowest) if boxcar else 0
-    width = bandwidths[1] if bandwidths else lowest / 2
-    listener = StarSTDFT(bandwidth=width, rate=model.rate)
     if bandwidths:
-        law = integrator(3.4 * bandwidths[0]) if form == "integrator" else reduced_controller(*bandwidths)
+        width = bandwidths[0]
+        listener = StarSTDFT(bandwidth=bandwidths[1], rate=model.rate)
+        law = integrator(3.4 * width) if form == "integrator" else reduced_controller(*bandwidths)
     else:
+        listener = StarSTDFT(bandwidth=lowest / 2, rate=model.rate)
         late = max((length - 1) / (2 * model.rate) - listener.delay, 0.0) if boxcar else 0.0
-        law = design(
-            loop_bandwidth=lowest / 4,
-            filter_bandwidth=width,
-            form=form,
-            lowest_frequency=lowest,
-            delay=model.delay / model.rate + late if feedback else 0.0,
-        ).controller
-    return EnvelopeLoop(filter=section(listener.coefficients), law=section(law.tustin(model.rate)), boxcar=length)
+        delay = model.delay / model.rate + late if feedback else 0.0
+        width, listener, law = _within_margins(model, lowest, form, delay)
+    return EnvelopeLoop(section(listener.coefficients), section(law.tustin(model.rate)), length, width)
+
+
+def _within_margins(
+    model: BandModel, lowest: float, form: Literal["reduced", "integrator"], delay: float
+) -> tuple[float, StarSTDFT, TransferFunction]:
+    """Widest loop, from a quarter of the lowest carrier down, whose margins bear the delay (s)."""
+    width = lowest / 4
+    while True:
+        try:
+            law = design(width, 2 * width, form, lowest, delay=delay).controller
+        except DesignError:
+            width *= NARROWER
+            if width < SLOWEST * lowest / 4:
+                raise
+        else:
+            return width, StarSTDFT(bandwidth=2 * width, rate=model.rate), law
 
 
 def section(coefficients: tuple[Array, Array]) -> Section:

@@ -23,6 +23,8 @@ from hapticrender.protocols import Array
 TURN = 2.0 * math.pi
 QUIET = 1e-12  # m: below this a target counts as silence and its phase means nothing
 FAR = 1e3  # m: no finger is farther away and no texture wants more; beyond it a value is not believed
+FASTEST = 10.0  # m/s: no finger is faster; a longer way within a sample is a new touch elsewhere
+DOUBT_TIME = 0.02  # s: within this the drive fades out where a sensor cannot be believed
 VELOCITY_POLE = 40.0  # Hz: smoothing of the finger's velocity, used only to look up gains and to fade
 GATE_TIME = 0.02  # s: finger-locked targets fade in and out with contact
 
@@ -58,6 +60,7 @@ class PolarNumbers(NamedTuple):
     filter: Section  # low pass of the STDFT*
     law: Section  # loop controller
     table_step: float  # Hz
+    lead: float  # s: known delay and half the hold
 
 
 class PolarTables(NamedTuple):
@@ -68,7 +71,7 @@ class PolarTables(NamedTuple):
     listen: Array  # (coordinates, sensors)
     speak: Array  # (channels, coordinates)
     gain: Array  # (coordinates, table), m per drive unit
-    lag: Array  # (coordinates, table), rad: phase of the free device, hold and delay included
+    lag: Array  # (coordinates, table), rad: phase of the free device
 
 
 class PolarState(NamedTuple):
@@ -78,6 +81,7 @@ class PolarState(NamedTuple):
     loop: Array  # (coordinates * LOOP_ROWS, bands)
     finger: Array  # (4,) held position (m), velocity (m/s), gate 0..1, seen before (0 or 1)
     coordinate: Array  # (coordinates,) scratch
+    doubt: Array  # (1,) 0: the sensors are believed, 1: they are not
 
 
 @kernel
@@ -119,7 +123,7 @@ def lookup(table, row, step, frequency):
 @kernel
 def follow_finger(finger, rate, position):
     """Hold the position while the finger is away, smooth its velocity, open the gate with contact."""
-    seen = math.isfinite(position)
+    seen = abs(position) <= FAR and not (finger[SEEN] > 0.0 and abs(position - finger[HELD]) * rate > FASTEST)
     velocity = 0.0
     if seen:
         if finger[SEEN] > 0.0:
@@ -133,11 +137,14 @@ def follow_finger(finger, rate, position):
 
 @kernel
 def mirror(band, loop, k):
-    """Conjugate every complex state of band k: its carrier has turned round."""
+    """Conjugate every complex state of band k: its carrier has turned round.
+
+    The commanded phase stays: it makes up for the plant's lag at |f|, which does not care about the direction.
+    """
     for row in (FORWARD, HEADING_IM, REF_IM1, REF_IM2):
         band[row, k] = -band[row, k]
     for base in range(0, loop.shape[0], LOOP_ROWS):
-        for row in (IM1, IM2, THETA1, THETA2):
+        for row in (IM1, IM2):
             loop[base + row, k] = -loop[base + row, k]
 
 
@@ -216,12 +223,12 @@ def polar_pass(numbers, gain, band, loop, c):
 
 @kernel
 def open_pass(numbers, gain, lag, band, c):
-    """Drive of coordinate c straight from the look-up table."""
+    """Drive of coordinate c straight from the look-up table, turned ahead by delay and hold."""
     total = 0.0
     for k in range(band.shape[1]):
         now = band[NOW, k]
         wanted = size(band[TARGET_RE, k], band[TARGET_IM, k])
-        unit = synthesise(band, k, -lookup(lag, c, numbers.table_step, now))
+        unit = synthesise(band, k, TURN * now * numbers.lead - lookup(lag, c, numbers.table_step, now))
         total += wanted / lookup(gain, c, numbers.table_step, now) * unit
     return total
 
@@ -250,13 +257,23 @@ def listen_pass(numbers, listen, sensed, coordinate):
 
 
 @kernel
-def speak_pass(numbers, speak, coordinate, drive):
+def doubt_pass(numbers, doubt, loop, flags):
+    """Trust in the sensors: falls to 0 within 20 ms while one cannot be believed; then the loops start anew."""
+    step = 1.0 / (DOUBT_TIME * numbers.rate)
+    doubt[0] = min(doubt[0] + step, 1.0) if flags & 2 else max(doubt[0] - step, 0.0)
+    if doubt[0] == 1.0:
+        loop[:] = 0.0
+    return 1.0 - doubt[0]
+
+
+@kernel
+def speak_pass(numbers, speak, coordinate, trust, drive):
     """Drive of the channels from that of the coordinates, each cut to its limit.  Returns flags."""
     flags = 0
     for i in range(drive.shape[0]):
         total = 0.0
         for c in range(coordinate.shape[0]):
-            total += speak[i, c] * coordinate[c]
+            total += trust * speak[i, c] * coordinate[c]
         drive[i] = min(max(total, -numbers.drive_limit), numbers.drive_limit)
         if drive[i] != total:
             flags |= 1
@@ -268,6 +285,7 @@ def polar_step(tables, state, sensed, position, wanted, drive, target):
     """One sample of the whole controller: fills `drive` (channels,) and `target` (bands,), returns flags."""
     numbers, gain, band, loop, coordinate = tables.numbers, tables.gain, state.band, state.loop, state.coordinate
     flags = listen_pass(numbers, tables.listen, sensed, coordinate)
+    trust = doubt_pass(numbers, state.doubt, loop, flags)
     if not abs(wanted) <= FAR:
         wanted = 0.0
         flags |= 2
@@ -282,7 +300,7 @@ def polar_step(tables, state, sensed, position, wanted, drive, target):
             coordinate[c] = polar_pass(numbers, gain, band, loop, c)
         else:
             coordinate[c] = open_pass(numbers, gain, tables.lag, band, c)
-    return flags | speak_pass(numbers, tables.speak, coordinate, drive)
+    return flags | speak_pass(numbers, tables.speak, coordinate, trust, drive)
 
 
 @kernel

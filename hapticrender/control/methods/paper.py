@@ -55,6 +55,7 @@ class PolarController:
             loop=np.zeros((coordinates * LOOP_ROWS, bands)),
             finger=np.zeros(4),
             coordinate=np.zeros(coordinates),
+            doubt=np.zeros(1),
         )
 
     def run(self, sensed: Array, position: Array, wanted: Array) -> tuple[Array, Array, Array]:
@@ -133,8 +134,13 @@ def polar_tables(
 ) -> PolarTables:
     """Tables of the compiled step: `watched` rows are the controlled displacements, `spread` their drive channels."""
     frequency = np.arange(0.0, model.rate / 2 + TABLE_STEP, TABLE_STEP)
-    common = model.response(frequency) @ np.ones(model.force_from_drive.shape[1])
-    table = (common @ watched.T).T * model.hold_and_delay(frequency)
+    response = watched @ model.response(frequency) @ spread  # (table, coordinates, coordinates)
+    alike = np.ones(len(watched))
+    if feedback:  # what each coordinate does while all are driven alike, as a sweep of the plate would show it
+        table = response @ alike
+    else:  # what makes all of them do the same
+        table = 1.0 / np.linalg.solve(response, alike[:, None])[..., 0]
+    table = table.T * np.sinc(frequency / model.rate)
     numbers = PolarNumbers(
         rate=float(model.rate),
         feedback=feedback,
@@ -148,6 +154,7 @@ def polar_tables(
         filter=loop.filter,
         law=loop.law,
         table_step=TABLE_STEP,
+        lead=(model.delay + 0.5) / model.rate,
     )
     return PolarTables(
         numbers=numbers,

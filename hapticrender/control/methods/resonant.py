@@ -63,7 +63,7 @@ class Resonant:
             found = margins(controller, TransferFunction((1.0,), (1.0,)), delay=model.delay / model.rate)
             Bounds(ripple=math.inf).check(found, f"lower gain={self.gain:g} 1/s or the loop's delay")
         rules = ComplexRules(dynamic=True, feed_forward=self.feed_forward, deviation=True)
-        loop = EnvelopeLoop(ALL_PASS, section(controller.tustin(model.rate)), 0)
+        loop = EnvelopeLoop(ALL_PASS, section(controller.tustin(model.rate)), 0, self.gain / (2 * math.pi))
         return design_complex(self.name, model, bands, rules, loop, feedback=feedback)
 
 
