@@ -10,11 +10,9 @@ The public names are loaded when they are first used, so that importing the
 package costs next to nothing.
 """
 
-from __future__ import annotations
-
+import typing as _typing
 from importlib import import_module as _import_module
 from pathlib import Path as _Path
-from typing import TYPE_CHECKING, Any
 
 # A wheel holds renderers/ and drivers/ inside this package; in a source checkout they lie beside it, so look there too.
 _here = _Path(__file__).parent
@@ -50,7 +48,7 @@ _HOME_OF = {name: home for home, names in _HOMES.items() for name in names}
 
 __all__ = sorted(_HOME_OF)
 
-if TYPE_CHECKING:
+if _typing.TYPE_CHECKING:
     from hapticrender.bands import Bands as Bands
     from hapticrender.errors import DesignError as DesignError
     from hapticrender.errors import DeviceLost as DeviceLost
@@ -64,8 +62,15 @@ if TYPE_CHECKING:
     from hapticrender.loop import prepare as prepare
     from hapticrender.loop import render as render
     from hapticrender.loop import run as run
+    from hapticrender.protocols import Controller as Controller
+    from hapticrender.protocols import Driver as Driver
     from hapticrender.protocols import Flag as Flag
+    from hapticrender.protocols import Method as Method
+    from hapticrender.protocols import Motion as Motion
+    from hapticrender.protocols import Plant as Plant
+    from hapticrender.protocols import Renderer as Renderer
     from hapticrender.protocols import Sensed as Sensed
+    from hapticrender.protocols import Texture as Texture
     from hapticrender.recording import Recorder as Recorder
     from hapticrender.recording import Recording as Recording
     from hapticrender.touch.builtin import builtin_scenes as builtin_scenes
@@ -83,7 +88,7 @@ if TYPE_CHECKING:
     from hapticrender.touch.scene import Scene as Scene
 
 
-def __getattr__(name: str) -> Any:
+def __getattr__(name: str) -> _typing.Any:
     if name not in _HOME_OF:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     value = getattr(_import_module(f"{__name__}.{_HOME_OF[name]}"), name)

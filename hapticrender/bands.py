@@ -16,6 +16,24 @@ def hold_last(position: Array) -> Array:
     return np.where(index >= 0, position[np.maximum(index, 0)], 0.0)
 
 
+_COLUMNS: dict[str, tuple[str, type, float | None]] = {  # unit, type, least value
+    "frequency": ("Hz", float, 0.0),
+    "wavenumber": ("1/m", float, 0.0),
+    "phase": ("rad", float, None),
+    "envelope": ("m", complex, None),
+}
+
+
+def _check(name: str, column: Array, shape: tuple[int, ...], unit: str, least: float | None) -> None:
+    if column.ndim != 1 or column.shape != shape:
+        raise ValueError(f"{name} has shape {column.shape}: must be one number a band, as many as frequency has")
+    good = np.isfinite(column) if least is None else np.isfinite(column) & (column >= least)
+    if not good.all():
+        first = int(np.argmin(good))
+        bound = "finite" if least is None else f"finite and >= {least:g}"
+        raise ValueError(f"{name}[{first}] = {column[first]}: must be {bound} ({unit})")
+
+
 @dataclass(frozen=True, kw_only=True)
 class Bands:
     """Carriers of a texture, one entry a band, and what is wanted on each.
@@ -27,20 +45,38 @@ class Bands:
     Parameters
     ----------
     frequency : ndarray, shape (n,), Hz
-        Fixed part of each carrier, >= 0.
+        Fixed part of each carrier, finite and >= 0.
     wavenumber : ndarray, shape (n,), 1/m
-        Finger-locked part, 1/wavelength, >= 0.
+        Finger-locked part, 1/wavelength, finite and >= 0.
     phase : ndarray, shape (n,), rad
-        Carrier phase at t = 0, x = 0.
+        Carrier phase at t = 0, x = 0; finite.
     envelope : ndarray of complex, shape (n,), m, or None
-        Constant wanted envelopes; None where the wanted waveform has to be
-        analysed by the bank that listens to the device (recordings).
+        Constant wanted envelopes, finite; None where the wanted waveform has
+        to be analysed by the bank that listens to the device (recordings).
+
+    Raises
+    ------
+    ValueError
+        A number is out of its bound, or a length differs from that of `frequency`.
+
+    Examples
+    --------
+    >>> Bands(frequency=[50.0], wavenumber=[0.0], phase=[np.nan])
+    Traceback (most recent call last):
+    ValueError: phase[0] = nan: must be finite (rad)
     """
 
     frequency: Array
     wavenumber: Array
     phase: Array
     envelope: Array | None = None
+
+    def __post_init__(self) -> None:
+        for name, (unit, kind, least) in _COLUMNS.items():
+            if getattr(self, name) is not None:
+                column: Array = np.asarray(getattr(self, name), kind)
+                object.__setattr__(self, name, column)
+                _check(name, column, self.frequency.shape, unit, least)
 
     def __len__(self) -> int:
         return len(self.frequency)

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from hapticrender.bands import Bands
 from hapticrender.touch.grating import SHAPES, Grating
 
 TIME = np.linspace(0.0, 0.1, 501)
@@ -110,3 +111,31 @@ def test_only_numbers_are_numbers(wrong):
 def test_the_bounds_themselves_are_accepted():
     assert Grating(amplitude=0.01, wavelength=0.5).wavelength == 0.5
     assert Grating(amplitude=0.01, wavelength=1e-6).amplitude == 0.01
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"frequency": [np.nan, 1.0]}, r"frequency\[0\] = nan: must be finite and >= 0 \(Hz\)"),
+        ({"frequency": [1.0, -20.0]}, r"frequency\[1\] = -20.0: must be finite and >= 0 \(Hz\)"),
+        ({"frequency": 20.0}, r"frequency has shape \(\): must be one number a band"),
+        ({"wavenumber": [np.inf, 1.0]}, r"wavenumber\[0\] = inf: must be finite and >= 0 \(1/m\)"),
+        ({"wavenumber": [0.0, -1.0]}, r"wavenumber\[1\] = -1.0: must be finite and >= 0 \(1/m\)"),
+        ({"wavenumber": [0.0]}, r"wavenumber has shape \(1,\): must be .* as many as frequency has"),
+        ({"phase": [0.0, -np.inf]}, r"phase\[1\] = -inf: must be finite \(rad\)"),
+        ({"phase": [[0.0, 0.0]]}, r"phase has shape \(1, 2\): must be one number a band"),
+        ({"envelope": [np.nan, 0.0]}, r"envelope\[0\] = \(nan\+0j\): must be finite \(m\)"),
+        ({"envelope": [0.0, complex(0, np.inf)]}, r"envelope\[1\] = infj: must be finite \(m\)"),
+        ({"envelope": [1e-6] * 3}, r"envelope has shape \(3,\): must be .* as many as frequency has"),
+    ],
+)
+def test_bands_that_cannot_be_are_refused_with_value_and_bound(wrong, message):
+    good = {"frequency": [20.0, 0.0], "wavenumber": [0.0, 1e3], "phase": [-1.0, 9.0], "envelope": [1e-6, -1e-6j]}
+    assert len(Bands(**good)) == len(Bands(**good | {"envelope": None})) == 2
+    with pytest.raises(ValueError, match=f"^{message}"):
+        Bands(**good | wrong)
+
+
+def test_no_bands_at_all_are_bands():
+    none = np.zeros(0)
+    assert len(Bands(frequency=none, wavenumber=none, phase=none)) == 0

@@ -73,7 +73,19 @@ def test_entry_points_resolve():
             assert callable(installed[name].load())
 
 
-GROUND = {f"hapticrender.{name}" for name in ("protocols", "errors", "bands", "_jit")}
+def test_the_package_shows_its_public_names_and_nothing_else():
+    rooms = {name.split(".")[1] for name in MODULES if "." in name}
+    public = {name for name in dir(hapticrender) if not name.startswith("_")}
+    assert set(hapticrender.__all__) <= public <= set(hapticrender.__all__) | rooms
+    assert not [name for name in ("Any", "TYPE_CHECKING", "annotations") if hasattr(hapticrender, name)]
+
+
+def test_type_checkers_are_told_of_every_public_name():
+    (told,) = [node for node in tree_of(MODULES["hapticrender"]).body if is_for_types_only(node)]
+    assert sorted(alias.asname for node in told.body for alias in node.names) == hapticrender.__all__
+
+
+GROUND = {f"hapticrender.{name}" for name in ("protocols", "errors", "bands", "contract", "_jit")}
 MAY_IMPORT = {  # room: the other rooms that it may look into
     "ground": set(),
     "touch": set(),
@@ -101,7 +113,7 @@ def absolute(node, package):
 
 
 def is_for_types_only(node):
-    return isinstance(node, ast.If) and ast.unparse(node.test) in ("TYPE_CHECKING", "typing.TYPE_CHECKING")
+    return isinstance(node, ast.If) and ast.unparse(node.test) in ("TYPE_CHECKING", "_typing.TYPE_CHECKING")
 
 
 def imports(node, package):
