@@ -14,6 +14,7 @@ from hapticrender.picture import INK, ORANGE, PALE, STYLE
 from hapticrender.plants.stability import LOOPS, StabilityMap, stability_map
 from hapticrender.plants.vibrotactile import PlateParameters
 from hapticrender.protocols import Array
+from hapticrender.touch.mechanics import NAMED
 
 TITLES = {
     "paper": "paper, each side apart",
@@ -31,7 +32,7 @@ USUAL = 5.0  # Hz: the paper's bandwidth
 class Case(NamedTuple):
     """One column of a chart: what rests on the plate."""
 
-    finger: str
+    finger: str  # of Table 1: a name in ``touch.mechanics.NAMED``
     load: float  # N
     position: float  # m
 
@@ -103,7 +104,7 @@ def stability(
                     method,
                     frequencies,
                     bandwidths=bandwidths,
-                    fingers=(case.finger,),
+                    fingers={case.finger: NAMED[case.finger]},
                     loads=(case.load,),
                     positions=(case.position,),
                     parameters=parameters,

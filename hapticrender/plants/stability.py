@@ -5,10 +5,10 @@ from __future__ import annotations
 import json
 import math
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -19,9 +19,11 @@ from hapticrender.control.margins import sensitivity
 from hapticrender.control.polar_loop import PolarLoop
 from hapticrender.plants.vibrotactile import Plate, PlateParameters
 from hapticrender.protocols import Array, Controller
-from hapticrender.touch.mechanics import HEAVY_LOAD, LIGHT_LOAD, NAMED, NONE, FingerMechanics
 
-KICK = 1e-3  # A, in one sample, half of it on the second coil
+if TYPE_CHECKING:
+    from hapticrender.touch.mechanics import FingerMechanics
+
+KICK = 1e-20  # A, in one sample, half of it on the second coil: small, so that growth has room
 WINDOW = 0.02  # s
 LEAST_MOTION, MOST_MOTION = 1e-200, 1e-3  # m: what a growth is fitted to
 OFFSETS = 60  # frequencies around a carrier at which a map looks for the peak of S
@@ -32,7 +34,7 @@ QUALITY = 1.4  # of the modes under the inner loop
 
 def loaded_plate(
     parameters: PlateParameters,
-    mechanics: FingerMechanics = NONE,
+    mechanics: FingerMechanics | None = None,
     *,
     position: float = 0.0,
     strength: float = 1.0,
@@ -42,8 +44,8 @@ def loaded_plate(
     Parameters
     ----------
     parameters : PlateParameters
-    mechanics : FingerMechanics
-        Order 0, 2 or 4; a phalanx becomes a coordinate of its own and needs a mass.
+    mechanics : FingerMechanics, optional
+        Order 0, 2 or 4; none is order 0.  A phalanx becomes a coordinate of its own and needs a mass.
     position : float, m
         Of the finger, from the middle.
     strength : float
@@ -59,7 +61,7 @@ def loaded_plate(
         damping = _joined(damping, 2 * parameters.bending_damping * omega * modal)
         stiffness = _joined(stiffness, omega**2 * modal)
         push, watch = np.vstack([push, [parameters.bending_coil, 0.0]]), np.column_stack([watch, [1.0, 0.0]])
-    if mechanics.order and strength > 0:
+    if mechanics is not None and mechanics.order and strength > 0:
         felt = place
         if mechanics.order == 4:
             if not mechanics.phalanx_mass > 0:
@@ -121,7 +123,7 @@ class StabilityMap:
     ----------
     method : str
     fingers : tuple of str
-        Names of Table 1.
+        Their names.
     loads, positions, frequencies, bandwidths : ndarray, N, m, Hz, Hz
     adapted : bool
         Whether the law has learnt the finger.
@@ -180,8 +182,8 @@ def stability_map(
     frequencies: Array,
     *,
     bandwidths: Array,
-    fingers: tuple[str, ...] = tuple(NAMED),
-    loads: tuple[float, ...] = (LIGHT_LOAD, HEAVY_LOAD),
+    fingers: Mapping[str, FingerMechanics],
+    loads: tuple[float, ...] = (0.3, 0.8),
     positions: tuple[float, ...] = (0.0, 15e-3, 27.5e-3),
     parameters: PlateParameters | None = None,
     adapted: bool = False,
@@ -195,8 +197,8 @@ def stability_map(
     frequencies, bandwidths : ndarray, Hz
         Carriers, and loop bandwidths b: the paper's fT with fL = 2 b; for the bank an observer pole at 2 b and an
         integral of 3.4 b 1/s, so that b = 5 Hz is H.  No rule lowers them here.
-    fingers : tuple of str
-        Of ``touch.mechanics.NAMED``.
+    fingers : mapping of str to FingerMechanics
+        Such as ``touch.mechanics.NAMED``, Table 1 and no finger.
     loads : tuple of float, N
         Normal loads; the impedance grows with (W/reference load)**(1/3).
     positions : tuple of float, m
@@ -216,8 +218,9 @@ def stability_map(
     shape = (len(fingers), len(loads), len(positions), len(frequencies), len(bandwidths))
     growth, modulus = np.empty(shape), np.empty(shape)
     carrier, width = (grid.ravel() for grid in np.meshgrid(frequencies, bandwidths, indexing="ij"))
+    known = list(fingers.values())
     for at in np.ndindex(shape[:3]):
-        mechanics = NAMED[fingers[at[0]]]
+        mechanics = known[at[0]]
         if not mechanics.order and at[1:] != (0, 0):  # without mechanics neither load nor place matter
             growth[at], modulus[at] = growth[at[0], 0, 0], modulus[at[0], 0, 0]
             continue
