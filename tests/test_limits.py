@@ -70,7 +70,9 @@ def overload(method):
 def test_overload_is_cut_as_a_whole_and_left_in_a_quarter_of_a_second(method):
     """FACTS 2 row 8: polar loops need 4 s, complex ones without care never return."""
     drive, flags, motion, limit = overload(method)
-    assert abs(drive).max(axis=0) == pytest.approx(limit, rel=1e-3)  # each coil, and no more
+    peak = abs(drive).max(axis=0)
+    assert peak.max() <= limit
+    assert peak.min() > 0.99 * limit  # both coils; their springs differ by 2 %
     assert np.mean(flags[500:10_000] & Flag.SATURATED != 0) > 0.5
     # what 3 A in each coil can do at 400 Hz is 0.279 mm
     reach = limit * abs(PlateParameters().band_model(RATE, 1).response(400.0).sum(axis=-1)[0])
