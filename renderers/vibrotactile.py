@@ -6,11 +6,13 @@ along it; drive is the current of each coil (A).
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from hapticrender.bands import Bands
 from hapticrender.control.bandmodel import BandModel
-from hapticrender.plants.vibrotactile import Plate, PlateParameters
+from hapticrender.plants.vibrotactile import EXPECTED_BENDING, Plate, PlateParameters
 from hapticrender.protocols import Array, Driver
 from hapticrender.touch.scene import Scene
 
@@ -39,7 +41,10 @@ class VibrotactileRenderer:
             raise ValueError(
                 f"driver.sensed_channels = {driver.sensed_channels}: must be 2 (one an end) or 0 (open loop)"
             )
-        return PlateParameters.with_overrides(scene.plant).band_model(driver.rate, driver.delay)
+        model = PlateParameters.with_overrides(scene.plant).band_model(driver.rate, driver.delay)
+        if model.rigid and not isinstance(getattr(driver, "plant", None), Plate):
+            return replace(model, bending=EXPECTED_BENDING, rigid=False)  # only a model of a plate is rigid
+        return model
 
     def bands(self, scene: Scene, model: BandModel) -> Bands:
         """Carriers and targets of a scene, refused where they pass Nyquist or the current limit."""

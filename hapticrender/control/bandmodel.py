@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from hapticrender.protocols import Array
+
+if TYPE_CHECKING:
+    from hapticrender.control.damping_margins import BendingMode
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,6 +46,10 @@ class BandModel:
         Resolution of the command; 0 is ideal.
     sensed_noise : float, sensor unit rms
         White noise of each sensor.
+    bending : BendingMode or None
+        What is known of the surface's own first mode, which the inner loop has to spare; None: nothing.
+    rigid : bool
+        The surface is known to have no mode of its own in reach.
     lowest_frequency, highest_frequency : float, Hz
         Finger-locked carriers fade out beyond these.
 
@@ -64,6 +72,8 @@ class BandModel:
     sensed_limit: float
     drive_step: float = 0.0
     sensed_noise: float = 0.0
+    bending: BendingMode | None = None
+    rigid: bool = False
     lowest_frequency: float = 20.0
     highest_frequency: float = 1000.0
 

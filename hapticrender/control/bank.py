@@ -21,7 +21,7 @@ from hapticrender.control.bank_kernels import (
     BankTables,
     bank_run,
 )
-from hapticrender.control.damping import TAPS, damping_taps
+from hapticrender.control.damping import choose_damping
 from hapticrender.protocols import Array
 
 CONTACT = (0.05, 0.03)  # N: on, off
@@ -49,7 +49,6 @@ class BankRules:
     adapt: tuple[float, float]
     rest: tuple[float, float] = (0.0, 0.0)
     inner: tuple[float, float] = (0.0, 0.0)
-    quality: float = 1.4
     level: float = 8.0
     detect: bool = True
     awake_time: float = 0.15
@@ -66,13 +65,16 @@ class BankController:
         Name of the method that designed it.
     tables : BankTables
         Parameters of the compiled step.
+    note : str
+        What the design chose and why: the inner loop and its margins.
     """
 
-    def __init__(self, method: str, tables: BankTables) -> None:
+    def __init__(self, method: str, tables: BankTables, note: str = "") -> None:
         coordinates, bands = len(tables.listen), tables.tone.shape[1]
         self.method = method
         self.n_bands = bands
         self.tables = tables
+        self.note = note
         touch = np.zeros(TOUCH_ROWS)
         touch[SCALE] = touch[TRUST] = 1.0
         self.state = BankState(
@@ -128,7 +130,9 @@ def design_bank(
     learning = 1 / (2 * wait + LEARNING_TIME)
     level = 2 * math.pi * min(6.0, lowest / rules.level) * period if feedback else 0.0
     noise = np.sqrt((model.coordinate_from_sensed**2).sum(axis=1).max()) * max(model.sensed_noise, LEAST_NOISE)
-    taps, grip = damping_taps(model, rules.quality) if any(rules.inner) else _no_taps(len(model.mass))
+    damping = choose_damping(model, bending=model.bending) if any(rules.inner) else None
+    if damping is None or not damping.margins:
+        rules = replace(rules, inner=(0.0, 0.0))
     numbers = BankNumbers(
         rate=float(model.rate),
         analysed=bands.envelope is None,
@@ -175,16 +179,12 @@ def design_bank(
         damping=model.damping,
         stiffness=model.stiffness,
         shape=np.eye(len(model.mass))[0],
-        taps=taps,
-        grip=grip,
+        taps=damping.taps if damping else np.zeros((len(model.mass), 1)),
+        grip=damping.grip if damping else np.zeros(len(model.mass)),
     )
-    return BankController(method, tables)
+    return BankController(method, tables, damping.text() if damping else "inner loop off: the method has none")
 
 
 def _threshold(sigmas: float, noise: float, pole: float, period: float) -> float:
     """Square (m2) of so many sigmas of 2 eps e^(-j phi) behind a pole (Hz), eps white of rms `noise` (m)."""
     return (sigmas * noise * math.sqrt(2 * math.pi * pole * period)) ** 2
-
-
-def _no_taps(coordinates: int) -> tuple[Array, Array]:
-    return np.zeros((coordinates, TAPS)), np.zeros(coordinates)

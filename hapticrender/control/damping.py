@@ -180,7 +180,7 @@ def choose_damping(
         The free device with its rate and delay.
     bending : BendingMode, optional
         The bending mode of the surface, which the taps then spare; once it is measured Q may go down to 1.4.
-        Without it Q stays at 2 or above, and nothing is known of the surface's own modes.
+        Without it Q stays at 2 or above, unless the model is known to be rigid.
     bounds : DampingBounds, optional
         What margins to insist on.
 
@@ -196,7 +196,8 @@ def choose_damping(
     """
     bounds = bounds or DampingBounds()
     mode, ratio = modes_of(model)
-    least = QUALITY if bending is not None and bending.measured else QUALITY_UNMEASURED
+    known = model.rigid if bending is None else bending.measured
+    least = QUALITY if known else QUALITY_UNMEASURED
     largest = 1 / (2 * WORTH * max(float(ratio.max()), LEAST_RATIO))
     lag = f"a delay of {model.delay} sample{'s' * (model.delay != 1)} at {model.rate:g} Hz"
     if largest < least:

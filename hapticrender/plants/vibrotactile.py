@@ -268,6 +268,8 @@ class PlateParameters:
             sensed_limit=self.sensor_range / 2,
             drive_step=self.current_step,
             sensed_noise=self.sensor_noise,
+            bending=self.bending,
+            rigid=self.bending is None,
         )
 
 
