@@ -30,17 +30,27 @@ def read(path: str | os.PathLike[str]) -> tuple[Header, Array]:
     Parameters
     ----------
     path : path-like
-        A file whose name ends in .au, .npz or .h5.
+        A file whose name ends in .au, .npz, .h5 or .hdf5.
 
     Returns
     -------
     header : Header
     frames : ndarray, shape (n, columns)
         Mapped from the file where it is a journal.
+
+    Raises
+    ------
+    OSError
+        The file is not there or may not be read.
+    ValueError
+        It is damaged, or no recording of this library.
+    MissingExtra
+        Reading it takes an optional part that is not installed.
     """
     path = Path(path)
     reader = _known(path, READERS, "read")
-    return reader(path)
+    with path.open("rb"):  # what is not there is told in the same words for every format
+        return reader(path)
 
 
 def write(path: str | os.PathLike[str], header: Header, frames: Array) -> None:
@@ -49,7 +59,7 @@ def write(path: str | os.PathLike[str], header: Header, frames: Array) -> None:
     Parameters
     ----------
     path : path-like
-        Suffix .au (journal), .npz, .h5, .mat, .csv, .wav, .w64, .rf64 or .flac.
+        Suffix .au (journal), .npz, .h5 or .hdf5, .mat, .csv, .wav, .w64, .rf64 or .flac.
     header : Header
     frames : ndarray, shape (n, columns)
     """
@@ -138,13 +148,28 @@ def _write_npz(path: Path, header: Header, frames: Array) -> None:
 
 
 def _read_npz(path: Path) -> tuple[Header, Array]:
-    try:
-        with np.load(path) as file:
-            signals = dict(file)
-        header = Header.from_json(str(signals.pop("header")), str(path))
+    with path.open("rb") as raw, _blaming(path), np.load(raw) as file:
+        header = str(file["header"])
+        signals = {name: file[name] for name in file if name != "header"}
+    return _assembled(path, header, signals)
+
+
+def _assembled(path: Path, text: str, signals: dict[str, Any]) -> tuple[Header, Array]:
+    header = Header.from_json(text, str(path))
+    with _blaming(path):
         return header, join(header, signals)
-    except (KeyError, AttributeError, TypeError) as error:
-        raise ValueError(f"{path}: not a recording of this library ({error})") from error
+
+
+@contextmanager
+def _blaming(path: Path) -> Iterator[None]:
+    """Name the file, whatever a damaged one makes numpy, zipfile or h5py raise."""
+    try:
+        yield
+    except (MemoryError, HapticError):
+        raise
+    except Exception as error:
+        reason = " ".join(str(error).split()) or type(error).__name__
+        raise ValueError(f"{path}: not a recording ({reason})") from error
 
 
 def _h5py() -> Any:
@@ -165,12 +190,11 @@ def _write_h5(path: Path, header: Header, frames: Array) -> None:
 
 
 def _read_h5(path: Path) -> tuple[Header, Array]:
-    with _h5py().File(path, "r") as file:
-        try:
-            header = Header.from_json(file["header"].asstr()[()], str(path))
-            return header, join(header, {name: file[name][()] for name in header.slices})
-        except (KeyError, AttributeError, TypeError) as error:
-            raise ValueError(f"{path}: not a recording of this library ({error})") from error
+    h5py = _h5py()
+    with _blaming(path), h5py.File(path, "r") as file:
+        header = file["header"].asstr()[()]
+        signals = {name: entry[()] for name, entry in file.items() if name != "header"}
+    return _assembled(path, header, signals)
 
 
 def _write_mat(path: Path, header: Header, frames: Array) -> None:
@@ -226,11 +250,17 @@ def _write_audio(path: Path, container: str, subtype: str, frames: Array, rate: 
 
 
 SOUND_CONTAINERS = {".wav": "WAV", ".w64": "W64", ".rf64": "RF64", ".flac": "FLAC"}
-READERS: dict[str, Callable[[Path], tuple[Header, Array]]] = {".au": read_journal, ".npz": _read_npz, ".h5": _read_h5}
+READERS: dict[str, Callable[[Path], tuple[Header, Array]]] = {
+    ".au": read_journal,
+    ".npz": _read_npz,
+    ".h5": _read_h5,
+    ".hdf5": _read_h5,
+}
 WRITERS: dict[str, Callable[[Path, Header, Array], None]] = {
     ".au": write_journal,
     ".npz": _write_npz,
     ".h5": _write_h5,
+    ".hdf5": _write_h5,
     ".mat": _write_mat,
     ".csv": _write_csv,
     ".wav": _write_doubles,

@@ -79,10 +79,10 @@ class Recorder:
             seed=int(seed),
             rate=float(rate),
             bands=bands,
-            drive_channels=drive_channels,
-            sensed_channels=sensed_channels,
+            drive_channels=int(drive_channels),
+            sensed_channels=int(sensed_channels),
             places=tuple(places),
-            drive_limit=drive_limit,
+            drive_limit=None if drive_limit is None else float(drive_limit),
         )
         self._scene = scene
         self._file: BinaryIO | None = None
@@ -293,10 +293,10 @@ class Recording:
         picture.plot(self, path)
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write to .au, .npz, .h5 (these can be loaded again), .mat, .csv, .wav, .w64, .rf64 or .flac."""
+        """Write to .au, .npz, .h5 or .hdf5 (these can be loaded again), .mat, .csv, .wav, .w64, .rf64 or .flac."""
         formats.write(path, self.header, self.frames)
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Recording:
-        """Open a recording (.au, .npz or .h5); a journal is mapped, also while or after another process writes it."""
+        """Open a recording (.au, .npz, .h5, .hdf5); a journal is mapped, also while another process writes it."""
         return cls(*formats.read(path))

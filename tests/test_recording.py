@@ -15,7 +15,7 @@ from synthetic import RATE, make_bands, make_recorder, make_recording, make_scen
 from hapticrender import formats, journal
 from hapticrender.formats import MissingExtra
 from hapticrender.journal import Header
-from hapticrender.recording import Recording
+from hapticrender.recording import Recorder, Recording
 
 UM = 1e-6
 SIGNALS = ("drive", "sensed", "motion", "position", "normal_load", "target", "flags")
@@ -235,9 +235,9 @@ def test_a_journal_is_named_au_and_a_rate_is_positive(bands, tmp_path):
         make_recorder(None, bands, rate=0.0)
 
 
-@pytest.mark.parametrize("suffix", [".au", ".npz", ".h5", ".AU"])
+@pytest.mark.parametrize("suffix", [".au", ".npz", ".h5", ".hdf5", ".AU", ".HDF5"])
 def test_what_is_saved_loads_the_same(recording, tmp_path, suffix):
-    if suffix == ".h5":
+    if suffix.lower() in (".h5", ".hdf5"):
         pytest.importorskip("h5py", reason="HDF5 is an extra")
     recording.save(tmp_path / f"run{suffix}")
     loaded = Recording.load(tmp_path / f"run{suffix}")
@@ -330,10 +330,51 @@ def test_an_unknown_suffix_lists_the_known_ones(recording, tmp_path, verb):
 
 def test_hdf5_without_h5py_names_the_extra(recording, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "h5py", None)
-    for deed in (recording.save, Recording.load):
+    (tmp_path / "old.h5").touch()
+    for deed, name in ((recording.save, "run.h5"), (Recording.load, "old.h5")):
         with pytest.raises(MissingExtra, match=r"pip install 'hapticrender\[hdf5\]'"):
-            deed(tmp_path / "run.h5")
-    assert list(tmp_path.iterdir()) == []
+            deed(tmp_path / name)
+    assert [path.name for path in tmp_path.iterdir()] == ["old.h5"]
+
+
+@pytest.mark.parametrize("suffix", [".npz", ".h5"])
+@pytest.mark.parametrize("left", [0.0, 0.01, 0.5, 0.999])
+def test_a_truncated_file_is_refused_by_name(recording, tmp_path, suffix, left):
+    if suffix == ".h5":
+        pytest.importorskip("h5py", reason="HDF5 is an extra")
+    path = tmp_path / f"run{suffix}"
+    recording.save(path)
+    os.truncate(path, int(left * path.stat().st_size))
+    with pytest.raises(ValueError, match=rf"run\{suffix}: not a recording \(\S") as refused:
+        Recording.load(path)
+    assert len(str(refused.value).splitlines()) == 1
+
+
+@pytest.mark.parametrize(
+    ("changed", "message"),
+    [
+        ({"motion": np.zeros((5, 3))}, r"run\.npz: not a recording \(motion has shape"),
+        ({"drive": None}, r"run\.npz: not a recording \('drive'"),
+        ({"drive": np.array(1.0)}, r"run\.npz: not a recording \("),
+        ({"flags": np.array(["a"] * 2500)}, r"run\.npz: not a recording \("),
+        ({"header": None}, r"run\.npz: not a recording \('header"),
+        ({"header": np.array("{}")}, r"run\.npz: not a recording of this library \('format'"),
+    ],
+)
+def test_signals_that_do_not_fit_their_header_are_refused_by_name(recording, tmp_path, changed, message):
+    signals = journal.split(recording.header, recording.frames) | {"header": np.array(recording.header.to_json())}
+    np.savez(tmp_path / "run.npz", **{name: value for name, value in (signals | changed).items() if value is not None})
+    with pytest.raises(ValueError, match=message):
+        Recording.load(tmp_path / "run.npz")
+
+
+def test_a_header_takes_the_numbers_of_numpy(bands):
+    scene, rest = make_scene(), {"method": "paper", "rate": np.float32(5000), "bands": bands}
+    recorder = Recorder(
+        None, scene=scene, seed=np.int64(3), drive_channels=np.int32(2), drive_limit=np.float64(3), **rest
+    )
+    again = Header.from_json(recorder.header.to_json())
+    assert (again.seed, again.rate, again.drive_channels, again.drive_limit) == (3, 5000.0, 2, 3.0)
 
 
 def test_files_of_others_are_refused_by_name(tmp_path):
@@ -343,8 +384,10 @@ def test_files_of_others_are_refused_by_name(tmp_path):
     for name in ("a.au", "b.au", "c.npz"):
         with pytest.raises(ValueError, match=name.replace(".", r"\.")):
             Recording.load(tmp_path / name)
-    with pytest.raises(FileNotFoundError):
-        Recording.load(tmp_path / "none.au")
+    for suffix in formats.READERS:
+        with pytest.raises(FileNotFoundError) as absent:
+            Recording.load(tmp_path / f"none{suffix}")
+        assert Path(absent.value.filename) == tmp_path / f"none{suffix}"
 
 
 def test_a_header_of_another_version_is_refused(recording):
