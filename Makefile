@@ -43,7 +43,7 @@ clean: ## remove the environment and everything that was built or written
 
 .venv/demo.stamp: .venv/made.stamp pyproject.toml
 	@echo "installing hapticrender into .venv"
-	@$(RUN) -m pip install --quiet --disable-pip-version-check --editable '.[plot]'
+	@$(RUN) -m pip install --quiet --disable-pip-version-check --editable '.[all]'
 	@touch $@
 
 .venv/test.stamp: .venv/made.stamp pyproject.toml

@@ -8,7 +8,9 @@ file is `full_scale`.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
+from types import TracebackType
 from typing import Any
 
 import numpy as np
@@ -19,7 +21,11 @@ from hapticrender.errors import DeviceLost, DeviceNotFound, DriverError
 from hapticrender.protocols import Array, Driver, Flag, Sensed
 
 FORMATS = {".wav": "WAV", ".w64": "W64", ".rf64": "RF64", ".aiff": "AIFF", ".aif": "AIFF", ".flac": "FLAC"}
+UNKNOWN = 2**63 - 1  # frames, as libsndfile says of a FLAC file that was never closed
+BLOCK = 65536  # frames read at once
 SUBTYPES = {"PCM_16": 16, "PCM_24": 24, "PCM_32": 32, "FLOAT": None, "DOUBLE": None}  # bits of the integers
+_Leaving = tuple[type[BaseException] | None, BaseException | None, TracebackType | None]
+_CALM: _Leaving = (None, None, None)
 _WORD = 32  # soundfile takes integers of any width left-justified in 32 bits
 
 
@@ -36,7 +42,7 @@ def read_back(path: str | Path, *, full_scale: float = 3.0) -> Array:
     Returns
     -------
     ndarray of float64, shape (n, channels), A
-        Every sample of the file.
+        Every sample that the file gives; what a killed process leaves is said at `WaveFileDriver`.
 
     Raises
     ------
@@ -48,17 +54,33 @@ def read_back(path: str | Path, *, full_scale: float = 3.0) -> Array:
     if not Path(path).is_file():
         raise DeviceNotFound(f"{path}: read: no such file")
     try:
-        samples, _ = soundfile.read(path, dtype="float64", always_2d=True)
+        with soundfile.SoundFile(path) as file:
+            return np.concatenate(list(_blocks(file))) * full_scale
     except soundfile.SoundFileError as error:
         raise DriverError(f"{path}: read: {_reason(error)}") from error
-    return samples * full_scale
+
+
+def _blocks(file: soundfile.SoundFile) -> Iterator[Array]:
+    """Samples of a file that need not know how many it holds, in blocks; the last one is short."""
+    count = BLOCK
+    while count == BLOCK:
+        block = np.full((BLOCK, file.channels), np.nan)
+        try:
+            count = len(file.read(out=block))
+        except soundfile.SoundFileError:
+            if file.frames != UNKNOWN:
+                raise
+            count = int(np.isfinite(block[:, 0]).sum())  # it filled the block, then failed to seek beyond the end
+        yield block[:count]
 
 
 class WaveFileDriver(BaseDriver):
     """Writes every block of drive to a WAV, FLAC, W64, RF64 or AIFF file while it plays.
 
     A NaN or an infinity is refused with everything else that `BaseDriver`
-    refuses.  Drive beyond `full_scale` is held exactly by FLOAT and DOUBLE;
+    refuses.  A killed process leaves all that was played in WAV and W64, and
+    all but the last 4096 samples at most in FLAC, whose encoder works in
+    blocks of them; RF64 and AIFF then report 0 frames.  Drive beyond `full_scale` is held exactly by FLOAT and DOUBLE;
     integers cut it to their range, `clipped` counts the samples, and
     ``Sensed.flags`` says `Flag.SATURATED`; what `through` plays is not cut.
 
@@ -103,6 +125,7 @@ class WaveFileDriver(BaseDriver):
         self.full_scale = full_scale
         self.clipped = 0  # samples that the file holds cut to its range
         self._through = through
+        self._leaving: _Leaving = _CALM
         self._format, self._subtype = _file_form(self.path, subtype)
         if not (np.isfinite(full_scale) and full_scale > 0):
             raise ValueError(f"{full_scale=} must be finite and > 0 A")
@@ -163,8 +186,18 @@ class WaveFileDriver(BaseDriver):
 
     def _close(self) -> None:
         through = self._through
-        leave = [] if through is None else [lambda: through.__exit__(None, None, None)]
+        leave = [] if through is None else [lambda: through.__exit__(*self._leaving)]
         carry_through(*leave, self._file.close)
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        """Close; the device behind hears of the error with which the body failed."""
+        self._leaving = kind, error, traceback
+        try:
+            super().__exit__(kind, error, traceback)
+        finally:
+            self._leaving = _CALM
 
     def read_back(self) -> Array:
         """Drive as the closed file holds it (A, shape (n, drive_channels)), the closing block of zeros included.

@@ -5,6 +5,8 @@ import doctest
 import importlib
 import inspect
 import re
+import shutil
+import subprocess
 import tomllib
 from importlib.metadata import entry_points
 from pathlib import Path
@@ -263,6 +265,14 @@ def test_commands_in_the_readme_are_in_the_makefile():
     verbs = set(re.findall(r"^([a-z]+):.*## ", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE))
     told = set(re.findall(r"^make (\w+)", "".join(blocks("sh")), re.MULTILINE))
     assert {"demo", "test"} <= told <= verbs
+
+
+@pytest.mark.skipif(not shutil.which("make"), reason="no make on this system")
+def test_make_demo_installs_all_that_the_readme_uses():
+    recipe = subprocess.run(
+        ["make", "--dry-run", "--always-make", "demo"], cwd=ROOT, capture_output=True, text=True, check=True
+    ).stdout
+    assert re.search(r"pip install .*--editable '\.\[all\]'", recipe)
 
 
 def test_links_in_the_readme_lead_somewhere():
