@@ -102,12 +102,12 @@ def _parser() -> argparse.ArgumentParser:
 
     validate = _add_verb(verbs, "validate", _validate, "render scenes and exit 1 when one misses its tolerance")
     validate.add_argument("scenes", metavar="SCENE", nargs="*", help="TOML files or built-in names (default: all)")
-    validate.add_argument("--json", metavar="FILE", type=Path, help="write all figures as JSON")
-    validate.add_argument("--junit", metavar="FILE", type=Path, help="write the JUnit XML that CI systems read")
+    validate.add_argument("--json", metavar="FILE", type=_path, help="write all figures as JSON")
+    validate.add_argument("--junit", metavar="FILE", type=_path, help="write the JUnit XML that CI systems read")
     _add_method(validate)
 
     show = _add_verb(verbs, "show", _show, "print the figures of a recording, finished or cut off by a crash")
-    show.add_argument("path", metavar="PATH", type=Path, help="a recording, or the folder of a rendered scene")
+    show.add_argument("path", metavar="PATH", type=_path, help="a recording, or the folder of a rendered scene")
 
     _add_verb(verbs, "devices", _devices, "list the renderers and drivers that are installed")
     return parser
@@ -127,12 +127,19 @@ def _add_verb(verbs: Any, name: str, run: Any, text: str) -> argparse.ArgumentPa
 
 def _add_out(verb: argparse.ArgumentParser, default: Path | None) -> None:
     text = "folder to write into; made if it is not there" + (f" (default: {default})" if default else "")
-    verb.add_argument("--out", "-o", metavar="DIR", type=Path, default=default, required=default is None, help=text)
+    verb.add_argument("--out", "-o", metavar="DIR", type=_path, default=default, required=default is None, help=text)
 
 
 def _add_method(verb: argparse.ArgumentParser) -> None:
     verb.add_argument("--method", metavar="NAME", default="paper", help="control method (default: %(default)s)")
     verb.add_argument("--seed", metavar="N", type=_seed, default=0, help="seed of the noise (default: %(default)s)")
+
+
+def _path(text: str) -> Path:
+    """Read the name of a file or folder; an empty one would silently mean the folder that one stands in."""
+    if not text:
+        raise argparse.ArgumentTypeError("'': must be a name (a dot is the folder that you are in)")
+    return Path(text)
 
 
 def _seed(text: str) -> int:
@@ -148,7 +155,7 @@ def _demo(arguments: argparse.Namespace) -> int:
 
     scenes = builtin_scenes()
     for name in scenes:
-        _check_folder(arguments.out / name)
+        _check_folder("--out", arguments.out / name)
     sessions = _prepare(scenes, arguments)
     progress = _progress(sessions)
     finished: list[Outputs] = []
@@ -183,7 +190,7 @@ def _write_page(arguments: argparse.Namespace, scenes: list[Outputs]) -> Path:
 def _render(arguments: argparse.Namespace) -> int:
     from hapticrender.outputs import run_into
 
-    _check_folder(arguments.out)
+    _check_folder("--out", arguments.out)
     sessions = _prepare({arguments.scene: _scene(arguments.scene)}, arguments)
     with _progress(sessions).scene(arguments.scene) as tick:
         outputs = run_into(arguments.out, sessions[0], progress=tick)
@@ -210,9 +217,11 @@ def _validate(arguments: argparse.Namespace) -> int:
     from hapticrender.touch.builtin import builtin_scenes
     from hapticrender.validate import run_and_judge, write_json, write_junit
 
-    reports = [(path, write) for path, write in ((arguments.json, write_json), (arguments.junit, write_junit)) if path]
-    for path, _ in reports:
-        _check_file(path)
+    wishes = (("--json", arguments.json, write_json), ("--junit", arguments.junit, write_junit))
+    reports = [(path, write) for _, path, write in wishes if path]
+    for option, path, _ in wishes:
+        if path:
+            _check_file(option, path)
     scenes = {reference: _scene(reference) for reference in arguments.scenes or builtin_scenes()}
     sessions = _prepare(scenes, arguments)
     verdicts = run_and_judge(sessions, _progress(sessions))
@@ -249,9 +258,10 @@ def _first_line(entry: Any) -> str:
     """Say what an entry point is, or why it cannot be used."""
     try:
         loaded = entry.load()
-    except Exception as error:  # a third party's module may fail in any way; the list must go on
-        return f"cannot be loaded from {entry.value}: {type(error).__name__}: {error}"
-    text = (loaded.__doc__ or "").strip().partition("\n")[0]
+    except (Exception, SystemExit) as error:  # a third party's module may fail in any way; the list must go on
+        reason = " ".join(f"{type(error).__name__}: {error}".split())
+        return f"broken: cannot be loaded from {entry.value} ({reason})"
+    text = str(loaded.__doc__ or "").strip().partition("\n")[0]
     return f"{text}  ({entry.value})"
 
 
@@ -319,17 +329,20 @@ def _blaming(where: str) -> Iterator[None]:
         raise SceneError(message if message.startswith(where) else f"{where}: {message}") from error
 
 
-def _check_folder(folder: Path) -> None:
-    """Refuse a folder that could not be made or written into, without making it."""
+def _check_folder(option: str, folder: Path, told: Path | None = None) -> None:
+    """Refuse a folder that could not be made or written into, without making it; `told` is what `option` was given."""
     nearest = next(path for path in (folder, *folder.absolute().parents) if path.exists() or path.is_symlink())
+    given = f"{option} = {str(told or folder)!r}"
     if not nearest.is_dir():
-        raise ValueError(f"--out = {str(folder)!r}: {str(nearest)!r} is a file, must be a folder")
+        raise ValueError(f"{given}: {str(nearest)!r} is a file, must be a folder")
     if not os.access(nearest, os.W_OK | os.X_OK):
-        raise ValueError(f"--out = {str(folder)!r}: no permission to write into {str(nearest)!r}")
+        raise ValueError(f"{given}: no permission to write into {str(nearest)!r}")
 
 
-def _check_file(path: Path) -> None:
+def _check_file(option: str, path: Path) -> None:
     """Refuse a report file that could not be written."""
     if path.is_dir():
-        raise ValueError(f"{path}: is a folder, must be a file")
-    _check_folder(path.parent)
+        raise ValueError(f"{option} = {str(path)!r}: is a folder, must be a file")
+    if path.exists() and not os.access(path, os.W_OK):
+        raise ValueError(f"{option} = {str(path)!r}: no permission to write it")
+    _check_folder(option, path.parent, told=path)

@@ -46,7 +46,7 @@ phase = 0.5
 
 [finger]
 motion = "sampled"
-positions = [0.0, 0.01, -0.01, 0.02]
+positions = [0.0, 0.001, -0.001, 0.002]
 times = [0.0, 0.01, 0.02, 0.03]
 normal_load = [[0.0, 0.04], [0.2, 0.9]]
 touches = [[0.0, 0.02], [0.03, 0.05]]
@@ -216,18 +216,31 @@ def test_validate_exits_0_where_all_is_well(run):
 def test_devices_are_listed(run):
     status, out, errors = run("devices")
     assert (status, errors) == (0, [])
-    assert "cannot be loaded" not in out
-    for name in ("vt-plate", "simulated", "wavefile"):
-        assert sum(line.split()[0] == name for line in out.splitlines()) == 1
+    for value in ("vibrotactile:VibrotactileRenderer", "simulated:SimulatedDriver", "wavefile:WaveFileDriver"):
+        (line,) = [line for line in out.splitlines() if line.endswith(f".{value})")]
+        assert "broken" not in line
+        assert len(line.split()) > 4
 
 
-def test_a_broken_driver_does_not_hide_the_others(run, monkeypatch):
-    from importlib.metadata import EntryPoint
-
-    broken = EntryPoint("broken", "no_such_package:Driver", "hapticrender.drivers")
-    monkeypatch.setattr("importlib.metadata.entry_points", lambda group: [broken])
+@pytest.mark.parametrize(
+    ("source", "reason"),
+    [
+        ("import no_such_package", "ModuleNotFoundError: No module named 'no_such_package'"),
+        ("raise RuntimeError('two\\nlines')", "RuntimeError: two lines"),
+        ("raise SystemExit('no licence')", "SystemExit: no licence"),
+    ],
+)
+def test_a_broken_package_is_shown_as_broken_and_hides_no_other(run, tmp_path, monkeypatch, source, reason):
+    (tmp_path / "third_party.py").write_text(source)
+    (tmp_path / "third_party-1.dist-info").mkdir()
+    (tmp_path / "third_party-1.dist-info" / "METADATA").write_text("Name: third_party\nVersion: 1\n")
+    entry = "[hapticrender.drivers]\ntheirs = third_party:Driver\n"
+    (tmp_path / "third_party-1.dist-info" / "entry_points.txt").write_text(entry)
+    monkeypatch.syspath_prepend(tmp_path)
+    test_devices_are_listed(run)
     _, out, _ = run("devices")
-    assert "broken  cannot be loaded from no_such_package:Driver: ModuleNotFoundError" in out
+    (line,) = [line for line in out.splitlines() if line.split()[0] == "theirs"]
+    assert line.split(maxsplit=1)[1] == f"broken: cannot be loaded from third_party:Driver ({reason})"
 
 
 def test_help_and_version(capsys):
@@ -253,7 +266,8 @@ EDITS = [  # what is changed in the tiny scene, what the complaint must name
     ("amplitude = 10e-6", "amplitude = -1e-6", ["texture.amplitude = -1e-06", "m"]),
     ("amplitude = 10e-6", "amplitude = 10", ["texture.amplitude = 10", "m"]),
     ("amplitude = 10e-6", 'amplitude = "10 um"', ["texture.amplitude = '10 um'", "m"]),
-    ("amplitude = 10e-6", "amplitude = 9e-3", ["texture.amplitude = 0.009 m", "<= 3 A"]),
+    ("amplitude = 10e-6", "amplitude = 9e-3", ["texture.amplitude = 0.009 m", "<= 0.001 m"]),
+    ("frequency = 47.0", "frequency = 2000.0", ["texture.amplitude = 1e-05 m", "<= 3 A"]),
     ("frequency = 47.0", "wavelength = 0.0", ["texture.wavelength = 0.0", ">= 1e-06", " m"]),
     ("frequency = 47.0", "wavelength = nan", ["texture.wavelength = nan", "m"]),
     ("frequency = 47.0", "frequency = 2600.0", ["texture.frequency = 2600", "<= 2250 Hz"]),
@@ -295,10 +309,16 @@ BAD_ARGUMENTS = [
     (["demo", "--out", "{tiny}"], "is a file, must be a folder"),
     (["demo", "--out", "{out}", "--method", "magic"], "--method = 'magic': must be one of paper, "),
     (["scenes", "no-such-scene"], "no-such-scene: no such built-in scene; there are "),
-    (["validate", "{tiny}", "--json", "{folder}"], "is a folder, must be a file"),
-    (["validate", "{tiny}", "--junit", "{tiny}/r.xml"], "is a file, must be a folder"),
+    (["validate", "{tiny}", "--json", "{folder}"], "--json = '{folder}': is a folder, must be a file"),
+    (["validate", "{tiny}", "--junit", "{tiny}/r.xml"], "--junit = '{tiny}/r.xml': '{tiny}' is a file, must be a fol"),
+    (["validate", "{tiny}", "--json", ""], "--json: '': must be a name"),
+    (["render", "{tiny}", "--out", ""], "--out/-o: '': must be a name"),
+    (["demo", "-o", ""], "--out/-o: '': must be a name"),
+    (["show", ""], "PATH: '': must be a name"),
     (["show", "{missing}"], "{missing}: "),
     (["show", "{binary}"], "{binary}: "),
+    (["show", "{cut}"], "{cut}: not a recording (File is not a zip file)"),
+    (["show", "{missing}.h5"], "{missing}.h5: No such file or directory"),
     (["show", "{folder}"], "{folder}/recording.au: "),
     (["dance"], "dance"),
     (["demo", "--loud"], "--loud"),
@@ -307,13 +327,27 @@ BAD_ARGUMENTS = [
 
 @pytest.mark.parametrize(("arguments", "words"), BAD_ARGUMENTS, ids=lambda value: "-".join(value)[:50])
 def test_bad_arguments_get_one_line_and_nothing_is_written(run, tiny, tmp_path, arguments, words):
-    places = {name: tmp_path / name for name in ("out", "folder", "missing", "binary")} | {"tiny": tiny}
+    places = {name: tmp_path / name for name in ("out", "folder", "missing", "binary", "cut.npz")} | {"tiny": tiny}
+    places["cut"] = places.pop("cut.npz")
+    np.savez(places["cut"], header=np.zeros(100))
+    os.truncate(places["cut"], 300)
     places["folder"].mkdir()
     places["binary"].write_bytes(bytes(range(256)))
     before = sorted(tmp_path.rglob("*"))
     assert words.format(**places) in complaint(run(*(argument.format(**places) for argument in arguments)))
     assert sorted(tmp_path.rglob("*")) == before
     assert tiny.read_text() == TINY
+
+
+@pytest.mark.parametrize("option", ["--json", "--junit"])
+@pytest.mark.parametrize("path", ["r.out", "new/r.out"])
+def test_a_report_that_cannot_be_written_names_its_own_option(run, tiny, tmp_path, monkeypatch, option, path):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(os, "access", lambda *_: False)  # a read-only folder, for root as well
+    line = complaint(run("validate", tiny, option, path))
+    assert line.startswith(f"hapticrender: {option} = '{path}': no permission to write into ")
+    (tmp_path / "r.out").touch()
+    assert complaint(run("validate", tiny, option, "r.out")).endswith(f"{option} = 'r.out': no permission to write it")
 
 
 def test_a_folder_that_is_there_is_left_as_it_was(run, tiny, tmp_path):
