@@ -1,5 +1,7 @@
 """Recorded textures: sound files, the swipe of a tribometer, and the synthetic one."""
 
+import os
+
 import numpy as np
 import pytest
 import soundfile
@@ -127,6 +129,62 @@ def test_bad_recordings_are_refused(write, samples, options, message):
     texture = Recorded(file=write(samples), amplitude=1e-6, **options)
     with pytest.raises(SceneError, match=message):
         texture.check()
+
+
+def test_a_gain_is_metres_per_full_scale_not_a_factor(write):
+    """A tone of half scale: 0.02 m per full scale make 0.01 m, the most; a factor of 3 would be 1.5 m."""
+    file = write(0.5 * tone(100.0, 8000))
+    with pytest.raises(
+        SceneError, match=r"gain = 3 m per unit of the file makes a peak of 1\.5\d? m: must be <= 0.01 m"
+    ):
+        Recorded(file=file, gain=3.0).check()
+    Recorded(file=file, gain=0.019).check()
+    with pytest.raises(SceneError, match=r"gain = 0.021 m per unit"):
+        Recorded(file=file, gain=0.021).check()
+
+
+SOUNDS = {
+    "a.wav": "PCM_16",
+    "b.wav": "DOUBLE",
+    "a.w64": "PCM_24",
+    "a.rf64": "FLOAT",
+    "a.aiff": "PCM_16",
+    "a.au": "FLOAT",
+    "a.flac": "PCM_16",
+    "a.ogg": "VORBIS",
+}
+
+
+@pytest.mark.parametrize("name", SOUNDS)
+def test_a_sound_file_cut_off_in_the_middle_is_refused(tmp_path, rng, name):
+    file = tmp_path / name
+    kind = {".rf64": "RF64"}.get(file.suffix)
+    soundfile.write(file, rng.uniform(-0.5, 0.5, 20000), 8000, subtype=SOUNDS[name], format=kind)
+    Recorded(file=file, amplitude=1e-6).check()
+    os.truncate(file, file.stat().st_size // 2)
+    with pytest.raises(
+        SceneError, match=rf"^file = .*{name}.*: (ends after \S+ % of what .*: must be whole|must be|has 0)"
+    ):
+        Recorded(file=file, amplitude=1e-6).check()
+
+
+def test_fewer_frames_than_the_header_counts_are_refused(write, monkeypatch):
+    """As libsndfile gives of a cut MP3, which not every build of it can write."""
+    file = write(tone(100.0, 8000))
+    monkeypatch.setattr(soundfile.SoundFile, "frames", 20000)
+    with pytest.raises(SceneError, match=r"ends after 80 % of what its header says: must be whole"):
+        Recorded(file=file, amplitude=1e-6).check()
+
+
+def test_a_sound_file_of_a_killed_recorder_or_of_a_stream_is_read(write):
+    """Its header was written before the length was known: 0, or as much as fits."""
+    file = write(tone(100.0, 8000))
+    whole = file.read_bytes()
+    at = whole.index(b"data") + 4
+    for unknown in (b"\0\0\0\0", b"\xff\xff\xff\xff", b"\xff\xff\xff\x7f"):
+        riff = b"\x08\0\0\0" if unknown[0] == 0 else unknown
+        file.write_bytes(whole[:4] + riff + whole[8:at] + unknown + whole[at + 4 :])
+        assert Recorded(file=file, amplitude=1e-6).profile.length == pytest.approx(2.0, abs=1e-3)
 
 
 def test_what_is_no_sound_file_is_refused(tmp_path):

@@ -15,7 +15,7 @@ from hapticrender.touch.builtin import builtin_scenes
 from hapticrender.touch.finger import Finger
 from hapticrender.touch.grating import Grating
 from hapticrender.touch.mechanics import FingerMechanics
-from hapticrender.touch.recorded import Recorded, Synthetic
+from hapticrender.touch.recorded import Recorded, Swipe, Synthetic
 from hapticrender.touch.scene import MOTIONS, TEXTURES, Scene
 
 GOOD = """
@@ -69,8 +69,15 @@ def test_built_in_fingers_stay_on_the_glass():
         assert not (np.abs(position[np.isfinite(position)]) > 0.055).any()
 
 
-@pytest.mark.parametrize("finger", FINGERS)
-@pytest.mark.parametrize("texture", TEXTURE_CASES)
+@pytest.mark.parametrize(
+    ("texture", "finger"),
+    [
+        (texture, finger)
+        for texture in TEXTURE_CASES
+        for finger in FINGERS
+        if finger != "absent" or not TEXTURE_CASES[texture].spatial
+    ],
+)
 def test_every_scene_survives_toml_to_the_last_bit(texture, finger):
     scene = Scene(
         texture=TEXTURE_CASES[texture],
@@ -125,6 +132,33 @@ def test_a_texture_of_ones_own_is_described_but_not_played_again():
         again.texture.bands(5000.0)
 
 
+@pytest.mark.parametrize(
+    "texture",
+    [
+        Grating(amplitude=1e-6, wavelength=1e-3),
+        Synthetic(amplitude=1e-6, speed=0.08),
+        Recorded(file="a.wav", amplitude=1e-6, speed=0.05),
+        Swipe(file="a.npz", amplitude=1e-6),
+    ],
+)
+def test_a_texture_over_position_needs_a_finger(texture):
+    message = "^finger.motion = 'none': a texture over position needs a finger$"
+    with pytest.raises(ValueError, match=message):
+        Scene(texture=texture, duration=1.0)
+    with pytest.raises(ValueError, match=message):
+        Scene(texture=texture, finger=Finger.absent(), duration=1.0)
+    assert Scene(texture=texture, finger=Finger.still(), duration=1.0).texture.spatial
+
+
+def test_numbers_of_numpy_are_numbers():
+    texture = Grating(amplitude=np.float64(1e-6), frequency=np.float32(20), shape="square", harmonics=np.int64(3))
+    plant = {"current_bits": np.int64(14), "sensor_noise": np.float64(0), "on": np.bool_(True)}
+    scene = Scene(texture=texture, duration=np.int32(2), plant=plant)
+    assert [type(value) for value in scene.plant.values()] == [int, float, bool]
+    assert Scene.from_toml_text(scene.to_toml()) == scene
+    assert Synthetic(amplitude=1e-6, seed=np.uint8(3)) == Synthetic(amplitude=1e-6, seed=3)
+
+
 REFUSED = {
     "duration": [
         ("duration = 2.0", "", r"duration is missing: must be a finite number > 0 and <= 360000 s"),
@@ -165,6 +199,11 @@ REFUSED = {
         ("speed = 0.08", "speed = -0.08", r"finger.speed = -0.08: must be .* > 0 .* m/s"),
         ("speed = 0.08", "speed = 80", r"finger.speed = 80: must be .* <= 10 m/s"),
         ("speed = 0.08", "speed = 0.08\nfrequency = 3", r"finger.frequency = 3: unknown key; known: motion, speed"),
+        (
+            'motion = "sliding"\nspeed = 0.08',
+            'motion = "none"',
+            r"finger.motion = 'none': a texture over position needs",
+        ),
         ("normal_load = 0.4", "normal_load = -0.4", r"finger.normal_load = -0.4: must be .* >= 0 and <= 20 N"),
         ("normal_load = 0.4", "touches = [[1.0, 0.5]]", r"finger.touches\[0\] = \[1.0, 0.5\]: must be pairs .* s"),
         ("normal_load = 0.4", "mechanics = {order = 2, mas = 1}", r"finger.mechanics.'mas': unknown key"),

@@ -96,6 +96,11 @@ class Grating:
         partials = None if self.partials is None else _read_partials(self.partials)
         checks.keep(self, amplitude=amplitude, harmonics=harmonics, phase=phase, partials=partials)
 
+    @property
+    def spatial(self) -> bool:
+        """Whether it is read at the finger's position."""
+        return self.wavelength is not None
+
     def spectrum(self) -> tuple[Array, Array]:
         """Order (1) and complex amplitude (m) of every partial, the fundamental's phase included."""
         table = np.array(self.partials or SHAPES[self.shape](self.harmonics))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from pathlib import Path
@@ -20,6 +21,9 @@ from hapticrender.touch.tribometer import load_swipe
 MOST_SPEED = 10.0  # m/s
 MOST_FRAMES = 1 << 24
 MOST_CARRIERS = 512
+WHOLE = 0.99  # of a sound file: the length that a header gives for compressed sound may be an estimate
+STREAMED = 2**31 - 2**16  # bytes: a length from here on was not known when the header was written
+_PART = re.compile(r"^ *(?:RIFF|riff|Riff size|data|FORM|SSND|Data Size) *: (\d+) \(should be (\d+)\)", re.MULTILINE)
 GRID = 10e-6  # m: cells of a force profile; a wavelength of 0.1 mm loses 1.6 % in them
 
 Passband = tuple[float, float]
@@ -59,13 +63,22 @@ class _Playback:
         if 0.5 / step <= low:
             raise SceneError(f"passband = {self.passband} Hz: must start < {0.5 / step:g} Hz, half the file's rate")
         profile = Profile.band_limited(values, step, low, min(high, 0.5 / step))
-        scale = self.gain
-        if scale is None:
-            peak = np.abs(profile.values).max()
-            if peak <= 1e-9 * max(np.abs(values).max(), 1e-300):
-                raise SceneError(f"amplitude = {self.amplitude} m: nothing to scale between {low:g} and {high:g} Hz")
-            scale = self.amplitude / peak
-        return Profile(profile.values * scale, profile.step)
+        return Profile(profile.values * self._scale(np.abs(profile.values).max(), np.abs(values).max()), profile.step)
+
+    def _scale(self, peak: float, whole: float) -> float:
+        """Metres per unit of the file, given the peak inside the passband and that of the whole recording."""
+        if self.amplitude is None:
+            scale = float(self.gain or 0.0)
+            if scale * peak > MOST_AMPLITUDE:
+                raise SceneError(
+                    f"gain = {scale:g} m per unit of the file makes a peak of {scale * peak:.3g} m: "
+                    f"must be <= {MOST_AMPLITUDE} m"
+                )
+            return scale
+        if peak <= 1e-9 * max(whole, 1e-300):
+            low, high = self.passband
+            raise SceneError(f"amplitude = {self.amplitude} m: nothing to scale between {low:g} and {high:g} Hz")
+        return self.amplitude / float(peak)
 
     def _recorded(self) -> tuple[Array, float]:
         raise NotImplementedError
@@ -76,6 +89,11 @@ class _Playback:
     def _start(self) -> float:
         """Position (m) of the first value; the middle of the recording lies at the surface's by default."""
         return -self.profile.length * (self._speed() or 0.0) / 2
+
+    @property
+    def spatial(self) -> bool:
+        """Whether it is read at the finger's position."""
+        return self._speed() is not None
 
     def check(self) -> None:
         """Read what has to be read, so that a bad file is refused before anything plays."""
@@ -123,9 +141,10 @@ class Recorded(_Playback):
         Whatever soundfile reads: WAV, FLAC, W64, ...; at most 2**24 frames.
     amplitude : float, m, or None
         Wanted peak; > 0 and <= 0.01.  Exactly one of `amplitude` and `gain`.
-    gain : float, m per unit of the file (full scale is 1), or None
-        Exact playback is often felt too weak: a gain of its own for every
-        texture is usual, about 3 for fine and 5 for coarse ones.
+    gain : float, m per full scale of the file, or None
+        Displacement that full scale stands for, > 0; the peak that it makes
+        must be <= 0.01 m.  The gain that plays a recording exactly is often
+        felt too weak: about 3 times as much suits fine textures, 5 times coarse ones.
     channel : int
         Counted from 0.
     speed : float, m/s, or None
@@ -179,6 +198,13 @@ def _read_sound(file: str, channel: int) -> tuple[Array, float]:
                     f"channel = {channel}: must be < {sound.channels}, the channels of {checks.show(file)}"
                 )
             values, rate = sound.read(dtype="float64", always_2d=True)[:, channel], sound.samplerate
+            held, promised = min(
+                [(len(values), sound.frames), *_sizes(sound.extra_info)], key=lambda pair: pair[0] / pair[1]
+            )
+            if held < WHOLE * promised:
+                raise SceneError(
+                    f"{name}: ends after {100 * held / promised:.3g} % of what its header says: must be whole"
+                )
     except (soundfile.SoundFileError, OSError, ValueError, TypeError) as problem:
         if isinstance(problem, SceneError):
             raise
@@ -189,6 +215,12 @@ def _read_sound(file: str, channel: int) -> tuple[Array, float]:
     if values.size < 2:
         raise SceneError(f"{name}: has {values.size} readable samples: must be >= 2 samples")
     return values, 1 / rate
+
+
+def _sizes(log: str) -> list[tuple[int, int]]:
+    """Bytes that a file holds and that its header says, for every part where libsndfile's log shows them to differ."""
+    differ = [(int(held), int(said)) for said, held in _PART.findall(log)]
+    return [(held, said) for held, said in differ if 0 < said < STREAMED]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -206,6 +238,7 @@ class Swipe(_Playback):
     amplitude : float, m, or None
         Wanted peak; > 0 and <= 0.01.  Exactly one of `amplitude` and `gain`.
     gain : float, m/N, or None
+        > 0; the peak that it makes must be <= 0.01 m.
     carriers, spacing, passband
         As for `Recorded`, in Hz at the recorded speed.
     """
@@ -217,6 +250,11 @@ class Swipe(_Playback):
     def __post_init__(self) -> None:
         super().__post_init__()
         checks.keep(self, file=checks.file_name("file", self.file))
+
+    @property
+    def spatial(self) -> bool:
+        """Always read at the finger's position."""
+        return True
 
     def _speed(self) -> float:
         speed = load_swipe(self.file).speed
@@ -271,6 +309,11 @@ class Synthetic:
         checks.keep(self, speed=_speed_or_time(self.speed))
         checks.keep(self, components=checks.integer("components", self.components, least=1, most=8))
         checks.keep(self, seed=checks.integer("seed", self.seed, least=0, most=2**32 - 1))
+
+    @property
+    def spatial(self) -> bool:
+        """Whether it is read at the finger's position."""
+        return self.speed is not None
 
     @cached_property
     def _drawn(self) -> Array:

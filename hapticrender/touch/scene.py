@@ -6,8 +6,11 @@ import os
 import tomllib
 from collections.abc import Mapping
 from dataclasses import MISSING, dataclass, field, fields
+from numbers import Integral
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from hapticrender.errors import SceneError
 from hapticrender.protocols import Texture
@@ -36,7 +39,7 @@ class Scene:
     texture : Texture
         `Grating`, `Recorded`, `Swipe`, `Synthetic`, or any object that follows ``protocols.Texture``.
     finger : Finger
-        Default: none.
+        Default: none; a texture that is read at the finger's position needs one.
     device : str
         Name of a renderer.
     duration : float, s
@@ -80,6 +83,8 @@ class Scene:
             checks.refuse("texture", self.texture, "a texture with bands(rate) and waveform(time, position)", TypeError)
         if not isinstance(self.finger, Finger):
             checks.refuse("finger", self.finger, "a Finger", TypeError)
+        if isinstance(self.finger.motion, Nowhere) and getattr(self.texture, "spatial", False):
+            raise ValueError("finger.motion = 'none': a texture over position needs a finger")
 
     @classmethod
     def from_toml(cls, path: str | os.PathLike[str]) -> Scene:
@@ -147,9 +152,18 @@ def _read_plant(plant: Any) -> dict[str, PlantValue]:
     for key, value in plant.items():
         if not isinstance(key, str):
             checks.refuse("plant", key, "a table with texts as keys", TypeError)
-        if not isinstance(value, str | bool):
+        if not isinstance(value, str | bool | np.bool_):
             checks.number(f"plant.{_plain(key)}", value)
-    return {key: value if isinstance(value, str | bool | int) else float(value) for key, value in plant.items()}
+    return {key: _simple(value) for key, value in plant.items()}
+
+
+def _simple(value: Any) -> PlantValue:
+    """Return a number or a word in Python's own type, so that TOML can hold it."""
+    if isinstance(value, bool | np.bool_):
+        return bool(value)
+    if isinstance(value, str):
+        return value
+    return int(value) if isinstance(value, Integral) else float(value)
 
 
 def _plain(key: str) -> str:
