@@ -48,6 +48,7 @@ def test_row_05_static_inverse_near_a_mode_of_the_free_plate(frequency, holds):
         assert error < 1e-3 if holds else error > 1.0
     assert naive(frequency, 12.0) < 1e-3
     assert ours(frequency, 12.0, "stiffness", plate=IDEAL) < 1e-3
+    assert ours(frequency, 5.0, "h", plate=IDEAL) < 1e-3
     assert ours(frequency, 3.0, plate=IDEAL) < 1e-4
 
 
@@ -74,6 +75,7 @@ def test_row_05_static_inverse_near_a_mode_under_a_finger(mechanics, frequency, 
         )
         for error in errors:
             assert error < 0.01 if holds else error > 1.0
+    assert ours(frequency, 5.0, "h", plate=IDEAL, finger=finger) < 1e-3
     assert ours(frequency, 3.0, plate=IDEAL, finger=finger) < 1e-4
 
 
