@@ -254,6 +254,7 @@ def blocks(language):
 
 def test_python_in_the_readme_runs(tmp_path, monkeypatch):
     pytest.importorskip("matplotlib")
+    pytest.importorskip("h5py")
     monkeypatch.chdir(tmp_path)
     names = {"__name__": "readme"}
     assert blocks("python")

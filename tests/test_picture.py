@@ -65,6 +65,15 @@ def test_the_panels_show_what_was_recorded():
     assert "±3 A" in panel(figure, "Drive").get_title(loc="left")
 
 
+def test_bands_over_position_are_labelled_with_their_frequency_too():
+    recording = swiped()
+    labels = [label.get_text() for label in panel(picture.draw(recording), "Rms error").get_xticklabels()]
+    bands = recording.summary()["bands"]
+    assert labels == [
+        f"{size} ({band['frequency']:.3g} Hz)" for size, band in zip(("1 mm", "500 µm"), bands, strict=True)
+    ]
+
+
 def test_windows_that_cannot_be_read_are_gaps():
     amplitude = panel(picture.draw(swiped()), "Peak amplitude")
     time, achieved = line(amplitude, "centre")
