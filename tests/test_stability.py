@@ -179,12 +179,12 @@ def test_the_inner_loop_has_the_margins_of_the_facts():
 
 
 def test_the_margin_of_a_loop_is_that_of_a_brute_force_search():
-    """Grid of 0.01 Hz over the whole spectrum: the margins' own, coarser grid finds the same peak within 1 %."""
+    """Grid of 0.01 Hz over the whole spectrum: the margins' own search finds the same peak within 0.1 %."""
     loop = bank_loop(frozen("h", "awake", 143.0, 160.0), plant=loaded_plate(PLATE, HEAVY, position=15e-3))
     fine = np.arange(0.005, RATE / 2, 0.01)
     values = np.linalg.inv(np.eye(2) + loop.loop(np.exp(2j * np.pi * fine / RATE))[0])
     peak = np.linalg.norm(values, 2, axis=(1, 2)).max()
-    assert 1 / loop.margins().modulus == pytest.approx(peak, rel=0.01)
+    assert 1 / loop.margins().modulus == pytest.approx(peak, rel=1e-3)
 
 
 def test_borne_errors_of_a_loop_known_in_closed_form():
@@ -332,11 +332,35 @@ def test_a_bandwidth_too_wide_is_lowered_and_says_why():
     assert simulated(frozen("h", "awake", 20.0, **rates), PLATE) < 0
 
 
-def test_a_design_that_no_bandwidth_saves_is_refused():
-    """Inner loop for one sample of delay met by a limit of gain that it cannot keep: 2.7 is below 4."""
+def test_an_inner_loop_too_strong_is_softened_and_says_why():
+    """Gain 2.7 at full strength, at any bandwidth, where 4 is asked for; softened by quarter octaves to 59 %."""
     tables = METHODS["h2"].design(MODEL, silent(170.0)).tables
-    with pytest.raises(DesignError, match=r"gain margin 2\.7\d is below 4\.00 \(awake\)"):
-        checked_bandwidth(tables, Limits(gain=4.0))
+    checked = checked_bandwidth(tables, Limits(gain=4.0))
+    assert "inner loop (awake) softened to" in checked.notes[0]
+    assert "gain margin 2.7" in checked.notes[0]
+    assert checked.margins["awake"].gain >= 4.0
+    assert checked.tables.numbers.inner_awake > 0.5
+    assert checked.tables.numbers.observer_awake == tables.numbers.observer_awake
+
+
+def test_a_design_that_no_bandwidth_saves_is_refused():
+    """An observer and an integral in that ratio peak by 1.16 at any speed: modulus 0.86, where 0.9 is asked for."""
+    tables = METHODS["h"].design(MODEL, silent(170.0)).tables
+    with pytest.raises(DesignError, match=r"modulus margin 0\.8\d at 1\d\d(\.\d)? Hz is below 0\.90 \(quiet"):
+        checked_bandwidth(tables, Limits(modulus=0.9))
+
+
+def test_carriers_locked_to_the_finger_are_checked_at_its_speeds():
+    """A grating and its third: their loops at a fifth of the speeds, by hand."""
+    wavenumber = np.array([1000.0, 3000.0])
+    zero = np.zeros(2)
+    bands = Bands(frequency=zero, wavenumber=wavenumber, phase=zero, envelope=zero + 0j)
+    tables = METHODS["h"].design(MODEL, bands).tables
+    checked = checked_bandwidth(tables, Limits(modulus=0.1))
+    slowest, fastest = 20.0 / 1000.0, MODEL.highest_frequency / 3000.0
+    moduli = [bank_loop(tables, speed=speed).margins().modulus for speed in np.geomspace(slowest, fastest, 5)]
+    assert checked.margins["awake"].modulus == pytest.approx(min(moduli), rel=1e-9)
+    assert bank_loop(tables, speed=slowest).frequency.tolist() == [[20.0, 60.0]]
 
 
 def test_a_design_is_checked_on_every_plant_that_is_given():
@@ -351,7 +375,7 @@ def test_a_design_is_checked_on_every_plant_that_is_given():
 def test_limits_name_the_margin_that_falls_short():
     good = Margins(stable=True, modulus=0.6, worst_frequency=90.0, delay=1e-3, phase=1.0, gain=3.0, bandwidth=4.0)
     limits = Limits()
-    assert limits.complaint(good, RATE) == ""
+    assert limits.complaint(good, RATE, 200.0) == ""
     for change, words in (
         ({"stable": False}, "unstable"),
         ({"modulus": 0.4}, "modulus margin 0.40 at 90 Hz is below 0.50"),
@@ -359,7 +383,14 @@ def test_limits_name_the_margin_that_falls_short():
         ({"phase": 0.5}, "phase margin 28.6 deg is below 30.0 deg"),
         ({"gain": 1.5}, "gain margin 1.50 is below 2.00"),
     ):
-        assert words in limits.complaint(replace(good, **change), RATE)
+        assert words in limits.complaint(replace(good, **change), RATE, 200.0)
+
+
+def test_no_more_delay_is_asked_than_the_highest_carrier_bears():
+    """30 deg at 1 kHz is 0.42 samples at 5 kHz."""
+    fast = Margins(stable=True, modulus=0.6, worst_frequency=9.0, delay=1e-4, phase=1.0, gain=3.0, bandwidth=4.0)
+    assert Limits().complaint(fast, RATE, 1000.0) == ""
+    assert "below 0.42" in Limits().complaint(replace(fast, delay=8e-5), RATE, 1000.0)
 
 
 def small_map(method, **options):

@@ -26,6 +26,7 @@ from hapticrender.control.margins import (
     borne_errors,
     carrier_grid,
     halved_within,
+    highest_peak,
     sensitivity,
     unstable_poles,
 )
@@ -297,18 +298,20 @@ class BankLoop:
         rates = np.array([self.observer[0] * rate / 2, self.integral[0]]) / (2 * np.pi)
         widths = np.unique(rates[rates > 1e-3]) * np.array([[0.5], [1.0], [2.0]])
         grid = carrier_grid(np.concatenate([carriers, self.plant.modes(), [0.0]]), widths.ravel(), rate)
-        grid = grid[(np.abs(grid[:, None] - carriers) > 1e-9).all(axis=1) & (grid > 0)]
-        if unstable_poles(lambda z: self.difference(z)[0], grid, rate):
+        if unstable_poles(lambda z: self.difference(z)[0], grid, carriers, rate):
             return Margins(
                 stable=False, modulus=0.0, worst_frequency=math.nan, delay=0.0, phase=0.0, gain=1.0, bandwidth=0.0
             )
         loop = self.loop(np.exp(2j * np.pi * grid / rate))[0]
         peak = sensitivity(loop)
+        highest, where = highest_peak(
+            lambda grid: sensitivity(self.loop(np.exp(2j * np.pi * grid / rate))[0]), grid, peak
+        )
         delay, phase, gain = borne_errors(grid, loop)
         return Margins(
             stable=True,
-            modulus=float(1.0 / peak.max()),
-            worst_frequency=float(grid[peak.argmax()]),
+            modulus=1.0 / highest,
+            worst_frequency=where,
             delay=delay,
             phase=phase,
             gain=gain,

@@ -13,9 +13,11 @@ import numpy as np
 from hapticrender.protocols import Array
 
 SLOWEST = 0.02  # 1/s: a loop that grows more slowly than this counts as stable in Nyquist's count
-NARROWEST = 1e-4  # Hz: closest that a grid comes to a carrier
-PER_DECADE = 16  # points of a grid on either side of a carrier
+NARROWEST = 2e-3  # Hz: closest that a grid comes to a carrier
+PER_DECADE = 12  # points of a grid on either side of a carrier
 UNIFORM = 400  # points of a grid over the whole spectrum
+ZOOMS, NEARLY = 3, 0.7  # how often peaks are looked at closer, and which: those above so much of the highest
+CONTINUOUS = 2.0  # rad: a locus that turns by more between two points has passed through infinity, at a carrier
 ROUNDS = 24  # bisections of a grid where the return difference turns too fast
 
 
@@ -57,7 +59,7 @@ def carrier_grid(carriers: Array, widths: Array, rate: float, narrowest: float =
     Parameters
     ----------
     carriers : ndarray, shape (n,), Hz
-        Where the loop, or the plant, changes fast.
+        Where the loop, or the plant, changes fast; at least one.
     widths : ndarray, shape (m,), Hz
         Widths that the loop is known to have; points crowd around carriers plus and minus these.
     rate : float, Hz
@@ -65,18 +67,21 @@ def carrier_grid(carriers: Array, widths: Array, rate: float, narrowest: float =
     narrowest : float, Hz
         Distance of the closest point.
     """
-    decades = math.log10(rate / narrowest)
-    away = np.concatenate([np.geomspace(narrowest, rate / 2, math.ceil(PER_DECADE * decades)), widths])
-    offsets = np.concatenate([-away, away])
-    grid = np.concatenate(
-        [np.linspace(0.0, rate / 2, UNIFORM), (np.asarray(carriers)[:, None] + offsets).ravel()], dtype=float
-    )
-    grid = np.unique(grid[(grid >= 0.0) & (grid <= rate / 2)])
-    apart = np.abs(grid[:, None] - np.asarray(carriers)).min(axis=1, initial=np.inf)
+    carriers = np.unique(carriers)
+    count = math.ceil(PER_DECADE * math.log10(rate / narrowest))
+    away = np.concatenate([np.geomspace(narrowest, rate / 2, count), widths])
+    points = [np.linspace(0.0, rate / 2, UNIFORM)]
+    middles = 0.5 * (carriers[1:] + carriers[:-1])
+    for carrier, below, above in zip(carriers, [0.0, *middles], [*middles, rate / 2], strict=True):
+        beside = np.concatenate([carrier - away, carrier + away])
+        points.append(beside[(beside >= below) & (beside <= above)])
+    grid = np.unique(np.concatenate(points))
+    at = np.clip(np.searchsorted(carriers, grid), 1, max(len(carriers) - 1, 1))
+    apart = np.minimum(np.abs(grid - carriers[at - 1]), np.abs(grid - carriers[np.minimum(at, len(carriers) - 1)]))
     return grid[apart > 0.5 * narrowest]
 
 
-def unstable_poles(difference: Callable[[Array], Array], grid: Array, rate: float) -> int:
+def unstable_poles(difference: Callable[[Array], Array], grid: Array, carriers: Array, rate: float) -> int:
     """Closed-loop poles that grow, by Nyquist's count on a circle just outside the unit circle.
 
     Parameters
@@ -86,6 +91,8 @@ def unstable_poles(difference: Callable[[Array], Array], grid: Array, rate: floa
         poles on or inside the unit circle.
     grid : ndarray, Hz
         Where to begin; halved wherever the difference turns by more than one radian.
+    carriers : ndarray, shape (n,), Hz
+        Where it turns within less than the grid resolves.
     rate : float, Hz
         Sampling rate.
 
@@ -95,6 +102,9 @@ def unstable_poles(difference: Callable[[Array], Array], grid: Array, rate: floa
     indentation is needed: the difference winds minus once for each closed-loop pole outside.
     """
     radius = math.exp(SLOWEST / rate)
+    close = np.append(carriers, 0.0)[:, None] + np.linspace(-NARROWEST, NARROWEST, 9)
+    grid = np.unique(np.concatenate([grid, close.ravel(), [0.0, rate / 2]]))
+    grid = grid[(grid >= 0.0) & (grid <= rate / 2)]
     values = difference(radius * np.exp(2j * np.pi * grid / rate))
     for _ in range(ROUNDS):
         turn = np.angle(values[1:] / values[:-1])
@@ -109,7 +119,23 @@ def unstable_poles(difference: Callable[[Array], Array], grid: Array, rate: floa
 
 def sensitivity(loop: Array) -> Array:
     """Largest singular value of S = (I + L)^-1, shape (...), of `loop` (..., c, c)."""
-    return 1.0 / np.linalg.svd(np.eye(loop.shape[-1]) + loop, compute_uv=False)[..., -1]
+    difference = np.eye(loop.shape[-1]) + loop
+    if loop.shape[-1] != 2:
+        return 1.0 / np.linalg.svd(difference, compute_uv=False)[..., -1]
+    size = (np.abs(difference) ** 2).sum(axis=(-2, -1))
+    volume = np.abs(np.linalg.det(difference))
+    return np.sqrt(0.5 * (size + np.sqrt(np.maximum(size**2 - 4 * volume**2, 0.0)))) / volume
+
+
+def highest_peak(height: Callable[[Array], Array], grid: Array, values: Array) -> tuple[float, float]:
+    """Highest value of `height` (at Hz, shape (n,)), and where, looked for ever closer around what `grid` shows."""
+    for _ in range(ZOOMS):
+        inner = np.flatnonzero((values[1:-1] >= values[:-2]) & (values[1:-1] >= values[2:])) + 1
+        inner = np.append(inner[values[inner] > NEARLY * values.max()], values.argmax())
+        low, high = grid[np.maximum(inner - 1, 0)], grid[np.minimum(inner + 1, len(grid) - 1)]
+        grid = np.unique(np.concatenate([grid[inner], *np.linspace(low, high, 9)]))
+        values = height(grid)
+    return float(values.max()), float(grid[values.argmax()])
 
 
 def eigenloci(loop: Array) -> Array:
@@ -155,7 +181,8 @@ def borne_errors(frequency: Array, loop: Array) -> tuple[float, float, float]:
         phase = min(phase, np.abs(_wrapped(lag)).min(initial=np.inf))
         delay = min(delay, (np.mod(lag, 2 * np.pi) / (2 * np.pi * where)).min(initial=np.inf))
         at = crossings(np.sin(angle))
-        at = at[np.cos(np.interp(at, index, angle)) > 0]
+        jump = np.abs(np.diff(angle, append=angle[-1]))[at.astype(int)]
+        at = at[(np.cos(np.interp(at, index, angle)) > 0) & (jump < CONTINUOUS)]
         factor = np.exp(-np.interp(at, index, size))
         more = min(more, factor[factor >= 1].min(initial=np.inf))
         less = max(less, factor[factor < 1].max(initial=0.0))

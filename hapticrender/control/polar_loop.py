@@ -22,7 +22,7 @@ import numpy as np
 from hapticrender.control.bandmodel import BandModel
 from hapticrender.control.bank_loop import LEAST_POLE, Sampled
 from hapticrender.control.loopshape import reduced_controller
-from hapticrender.control.margins import Margins, borne_errors, halved_within, sensitivity
+from hapticrender.control.margins import Margins, borne_errors, halved_within, highest_peak, sensitivity
 from hapticrender.control.transfer import butterworth
 from hapticrender.protocols import Array
 
@@ -184,10 +184,11 @@ class PolarLoop:
         offset = np.geomspace(1e-3, self.plant.rate / 2, 2000)
         loop = self.loop(offset)[0]
         peak = sensitivity(loop)
+        highest, where = highest_peak(lambda offset: sensitivity(self.loop(offset)[0]), offset, peak)
         return Margins(
             stable=True,
-            modulus=float(1.0 / peak.max()),
-            worst_frequency=float(self.frequency[0] + offset[peak.argmax()]),
+            modulus=1.0 / highest,
+            worst_frequency=float(self.frequency[0] + where),
             delay=borne_errors(offset, loop)[0],
             phase=math.pi,
             gain=min(self._borne(1.0), self._borne(-1.0)),

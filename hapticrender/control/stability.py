@@ -3,21 +3,28 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from hapticrender.control.bank_kernels import BankNumbers, BankTables
-from hapticrender.control.bank_loop import BankLoop, KnownFinger, Structure
+from hapticrender.control.bank_loop import BankLoop, KnownFinger, Sampled, Structure
 from hapticrender.control.kernels import FREQUENCY, WAVENUMBER
 from hapticrender.control.margins import Margins
 from hapticrender.errors import DesignError
 from hapticrender.protocols import Array
 
 SPEEDS = 5  # of the finger, at which carriers locked to it are checked
-TOGETHER = 12  # neighbouring bands that are checked as one loop; the residual's coupling falls with their distance
 STEPS = 2.0 ** (-np.arange(25) / 4)  # of the bandwidth tried, in turn: each a quarter octave lower, down to 1/64
+SOFTER = (*STEPS[1:9].tolist(), 0.0)  # of the inner loop: down to a quarter, then off
+ROOM = 0.25  # of the wanted bandwidth: the inner loop is softened until this much holds
 STATES = {"quiet": (0.0, 0.0), "stirred": (0.0, 1.0), "awake": (1.0, 1.0)}  # openings of the fast and slow detector
+SMALLEST = ("delay", "phase", "gain", "bandwidth")  # margins of which the smallest counts, each for itself
+GROUPS = (  # states that share an observer, and what is lowered for them
+    (("quiet", "stirred"), ("observer", "integral", "integral_stirred"), "inner"),
+    (("awake",), ("observer_awake", "integral_awake"), "inner_awake"),
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -29,6 +36,8 @@ class Limits:
     modulus : float
         1/Ms, 0..1; 0.5 is Ms = 2.
     delay : float, samples
+        No more is asked than the time in which the highest carrier turns by `phase`: above 400 Hz a sample at 5 kHz
+        is a larger angle than any loop that follows a carrier bears.
     phase : float, rad
     gain : float
         Factor, >= 1.
@@ -39,8 +48,12 @@ class Limits:
     phase: float = math.radians(30.0)
     gain: float = 2.0
 
-    def complaint(self, found: Margins, rate: float) -> str:
-        """Say which margin falls short, with value, bound and unit; empty where all hold."""
+    def complaint(self, found: Margins, rate: float, highest: float) -> str:
+        """Say which margin falls short, with value, bound and unit; empty where all hold.
+
+        `rate` and the `highest` carrier are in Hz.
+        """
+        delay = min(self.delay, self.phase * rate / (2 * math.pi * max(highest, 1.0)))
         checks = (
             (found.stable, "the loop is unstable"),
             (
@@ -48,8 +61,8 @@ class Limits:
                 f"modulus margin {found.modulus:.2f} at {found.worst_frequency:.4g} Hz is below {self.modulus:.2f}",
             ),
             (
-                found.delay * rate >= self.delay,
-                f"delay margin {found.delay * rate:.2f} samples is below {self.delay:.2f}",
+                found.delay * rate >= delay,
+                f"delay margin {found.delay * rate:.2f} samples is below {delay:.2f}",
             ),
             (
                 found.phase >= self.phase,
@@ -84,8 +97,7 @@ def bank_loop(
     state: str = "awake",
     *,
     speed: float = 0.0,
-    bands: slice = slice(None),
-    plant: Structure | None = None,
+    plant: Structure | Sampled | None = None,
     delay: int | None = None,
     finger: KnownFinger | None = None,
 ) -> BankLoop:
@@ -98,9 +110,7 @@ def bank_loop(
         Which of its detectors stand open.
     speed : float, m/s
         Of the finger, for carriers that are locked to it.
-    bands : slice
-        Which of its bands, by ascending frequency at this speed.
-    plant : Structure, optional
+    plant : Structure or Sampled, optional
         What it meets; by default the device that it was designed for.
     delay : int, optional
         Samples that the loop really has; by default what it was designed for.
@@ -113,9 +123,9 @@ def bank_loop(
     known = Structure.free(tables.mass, tables.damping, tables.stiffness)
     observer, integral, inner = _opened(numbers, *STATES[state])
     calm = min(abs(speed) / numbers.crowd_speed, 1.0) if numbers.crowd_speed > 0 else 1.0
-    frequency = np.sort(np.abs(tables.tone[FREQUENCY] + speed * tables.tone[WAVENUMBER]))[bands]
+    frequency = np.sort(np.abs(tables.tone[FREQUENCY] + speed * tables.tone[WAVENUMBER]))
     return BankLoop.on(
-        (plant or known).sampled(numbers.rate),
+        plant if isinstance(plant, Sampled) else (plant or known).sampled(numbers.rate),
         known,
         frequency[None],
         delay=round(numbers.lead * numbers.rate - 0.5) if delay is None else delay,
@@ -166,49 +176,107 @@ def checked_bandwidth(
     Notes
     -----
     Observer and integral are lowered together, a quarter octave at a time; quiet and stirred share their observer
-    and go down together.  Carriers locked to the finger are checked at five of its speeds, frozen; more than twelve
-    bands a dozen neighbours at a time.
+    and go down together.  Where not even a quarter of the bandwidth would hold, the inner loop is softened first.
+    Carriers locked to the finger are checked at five of its speeds, frozen.
     """
-    limits = limits or Limits()
+    free = Structure.free(tables.mass, tables.damping, tables.stiffness)
+    trials = _Trials(
+        limits=limits or Limits(),
+        plants=[plant.sampled(tables.numbers.rate) for plant in plants or (free,)],
+        speeds=_speeds(tables),
+        highest=_highest(tables),
+    )
     notes: list[str] = []
-    for states, fields in (
-        (("quiet", "stirred"), ("observer", "integral", "integral_stirred")),
-        (("awake",), ("observer_awake", "integral_awake")),
-    ):
-        first = ""
-        for step in STEPS:
-            tried = tables._replace(numbers=_scaled(tables.numbers, fields, float(step)))
-            complaint = _complaint(tried, states, limits, plants)
-            first = first or complaint
-            if not complaint:
-                break
-        else:
-            raise DesignError(
-                f"{complaint} ({states[-1]}) even at 1/64 of the wanted bandwidth: soften the inner loop (raise its "
-                "quality) or lower the delay"
+    for states, fields, inner in GROUPS:
+        tables, said = _lowered(trials, tables, states, fields, inner)
+        notes += said
+    return Checked(tables=tables, margins={state: trials.worst(tables, state) for state in STATES}, notes=tuple(notes))
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Trials:
+    """Margins of everything that was tried, each computed once."""
+
+    limits: Limits
+    plants: list[Sampled]
+    speeds: Array
+    highest: float
+    known: dict[tuple[float, float, float], Margins] = field(default_factory=dict)
+
+    def worst(self, tables: BankTables, state: str) -> Margins:
+        """Smallest of every margin of a state over all plants and speeds of the finger."""
+        key = _opened(tables.numbers, *STATES[state])
+        if key not in self.known:
+            found = [
+                bank_loop(tables, state, speed=speed, plant=plant).margins()
+                for plant in self.plants
+                for speed in self.speeds
+            ]
+            self.known[key] = replace(
+                min(found, key=lambda margins: margins.modulus),
+                stable=all(margins.stable for margins in found),
+                **{name: min(getattr(margins, name) for margins in found) for name in SMALLEST},
             )
-        if step < 1.0:
-            notes.append(f"bandwidth ({' and '.join(states)}) lowered to {step:.0%} of the rule: at the rule {first}")
-        tables = tried
-    return Checked(
-        tables=tables, margins={state: _worst(tables, state, plants) for state in STATES}, notes=tuple(notes)
+        return self.known[key]
+
+    def complaint(self, tables: BankTables, states: tuple[str, ...]) -> str:
+        """First complaint about these states; empty where all hold."""
+        rate = tables.numbers.rate
+        found = (self.limits.complaint(self.worst(tables, state), rate, self.highest) for state in states)
+        return next((text for text in found if text), "")
+
+
+def _lowered(
+    trials: _Trials, tables: BankTables, states: tuple[str, ...], rates: tuple[str, ...], inner: str
+) -> tuple[BankTables, list[str]]:
+    """Tables of a group of states whose margins hold, and what was lowered for them."""
+    first = trials.complaint(tables, states)
+    if not first:
+        return tables, []
+    name, notes = " and ".join(states), []
+    cramped = trials.complaint(_scaled(tables, rates, ROOM), states)
+    if cramped and getattr(tables.numbers, inner) > 0.0:
+        soft, softer = next(
+            (
+                (soft, each)
+                for soft, each in _softer(tables, inner)
+                if not trials.complaint(_scaled(each, rates, ROOM), states)
+            ),
+            (1.0, tables),
+        )
+        if soft < 1.0:
+            tables = softer
+            notes.append(f"inner loop ({name}) softened to {soft:.0%}: even at {ROOM:.0%} of the bandwidth {cramped}")
+    for step in STEPS:
+        tried = _scaled(tables, rates, float(step))
+        complaint = trials.complaint(tried, states)
+        if not complaint:
+            lowered = (
+                [f"bandwidth ({name}) lowered to {step:.0%} of the rule: at the rule {first}"] if step < 1.0 else []
+            )
+            return tried, notes + lowered
+    raise DesignError(
+        f"{complaint} ({name}) even at 1/64 of the wanted bandwidth: lower the delay, leave the highest or closest "
+        "carriers out, or allow a smaller margin"
     )
 
 
-def _scaled(numbers: BankNumbers, fields: tuple[str, ...], step: float) -> BankNumbers:
-    return numbers._replace(**{field: step * getattr(numbers, field) for field in fields})
+def _softer(tables: BankTables, inner: str) -> Iterator[tuple[float, BankTables]]:
+    """Ever softer inner loops."""
+    for soft in SOFTER:
+        yield soft, _scaled(tables, (inner,), soft)
 
 
-def _loops(tables: BankTables, state: str, plants: tuple[Structure, ...]) -> list[BankLoop]:
-    """Every loop that has to hold: plants, speeds of the finger, groups of neighbours."""
-    count = tables.tone.shape[1]
-    starts = range(0, max(count - TOGETHER // 2, 1), TOGETHER // 2)
-    return [
-        bank_loop(tables, state, speed=speed, bands=slice(start, start + TOGETHER), plant=plant)
-        for plant in plants or (None,)
-        for speed in _speeds(tables)
-        for start in starts
-    ]
+def _scaled(tables: BankTables, names: tuple[str, ...], factor: float) -> BankTables:
+    """Tables with some of their numbers times `factor`."""
+    numbers = tables.numbers
+    return tables._replace(numbers=numbers._replace(**{name: factor * getattr(numbers, name) for name in names}))
+
+
+def _highest(tables: BankTables) -> float:
+    """Highest frequency (Hz) that a carrier may have."""
+    fixed = tables.tone[FREQUENCY].max()
+    return float(max(fixed, tables.numbers.highest) if (tables.tone[WAVENUMBER] > 0).any() else fixed)
 
 
 def _speeds(tables: BankTables) -> Array:
@@ -218,28 +286,3 @@ def _speeds(tables: BankTables) -> Array:
     if not locked.size:
         return np.zeros(1)
     return np.geomspace(tables.numbers.lowest / locked.min(), tables.numbers.highest / locked.max(), SPEEDS)
-
-
-def _complaint(tables: BankTables, states: tuple[str, ...], limits: Limits, plants: tuple[Structure, ...]) -> str:
-    """First complaint about any loop of these states; empty where all hold."""
-    for state in states:
-        for loop in _loops(tables, state, plants):
-            text = limits.complaint(loop.margins(), tables.numbers.rate)
-            if text:
-                return text
-    return ""
-
-
-def _worst(tables: BankTables, state: str, plants: tuple[Structure, ...]) -> Margins:
-    """Smallest of every margin over all loops of a state."""
-    found = [loop.margins() for loop in _loops(tables, state, plants)]
-    peak = min(found, key=lambda margins: margins.modulus)
-    return Margins(
-        stable=all(margins.stable for margins in found),
-        modulus=peak.modulus,
-        worst_frequency=peak.worst_frequency,
-        delay=min(margins.delay for margins in found),
-        phase=min(margins.phase for margins in found),
-        gain=min(margins.gain for margins in found),
-        bandwidth=min(margins.bandwidth for margins in found),
-    )
