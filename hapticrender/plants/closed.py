@@ -18,18 +18,16 @@ from hapticrender.plants.kernels import plate_advance, plate_drive, plate_sense
 STEPS = {PolarTables: polar_step, BoxcarTables: boxcar_step, ComplexTables: complex_step, BankTables: bank_step}
 
 
-def controller_step(tables, state, sensed, position, wanted, drive, target):
-    """One sample of the controller that `tables` belong to."""
-    return STEPS[type(tables)](tables, state, sensed, position, wanted, drive, target)
+def step_of(tables):
+    """Step of the controller that `tables` belong to."""
+    return STEPS[type(tables)]
 
 
-@overload(controller_step)
-def _chosen(tables, state, sensed, position, wanted, drive, target):
-    """Inside a kernel the type of `tables` chooses the step when the kernel is compiled."""
+@overload(step_of)
+def _compiled_step_of(tables):
+    """Inside a kernel the type of `tables` decides, while the kernel is compiled: the call costs nothing."""
     step = STEPS[tables.instance_class]
-    return lambda tables, state, sensed, position, wanted, drive, target: step(
-        tables, state, sensed, position, wanted, drive, target
-    )
+    return lambda tables: step
 
 
 @kernel
@@ -41,12 +39,13 @@ def closed_plate_run(
     Row n of `drive` is what the plate was handed for interval n, so it is computed from sample n - 1.
     """
     z, frozen, system, push, pending, cursor, current = state
+    step = step_of(control)
     for n in range(sensed.shape[0]):
         flags[n] = plate_sense(tables, z, noise[n], sensed[n], motion[n])
         plate_drive(tables, pending, cursor, current, last)
         plate_advance(tables, z, frozen, system, push, current, finger[n, 0], finger[n, 1], finger[n, 2])
         drive[n, 0], drive[n, 1] = last[0], last[1]
-        flags[n] |= controller_step(control, control_state, sensed[n], finger[n, 0], wanted[n], last, target[n])
+        flags[n] |= step(control, control_state, sensed[n], finger[n, 0], wanted[n], last, target[n])
 
 
 CLOSED = dict.fromkeys(STEPS, closed_plate_run)
