@@ -147,16 +147,17 @@ def test_row_07_what_unknown_delay_the_inner_damping_bears():
         (20.0, 5, False),
     ):
         error = ours(frequency, 4.0, plate=late(1 + extra), known=IDEAL)
-        assert error < 0.01 if holds else error > 0.1
+        assert error < 1e-3 if holds else error > 0.02
 
 
 @pytest.mark.parametrize(("milliseconds", "holds"), [(60, True), (66, True), (80, False)])
 def test_row_07_long_known_delay(milliseconds, holds):
-    """A loop of 5 Hz holds up to its delay margin, 73.6 ms (FACTS 60-72); H lowers its gain with the delay it knows."""
+    """A loop of 5 Hz holds up to its delay margin, 73.6 ms (FACTS 60-72); H and H2 lower their gain with it."""
     plate = late(5 * milliseconds)
     error = naive(111.0, 8.0, plate, plate.band_model(RATE, plate.delay))
     assert error < 0.01 if holds else error > 0.1
-    assert ours(111.0, 8.0, "h", plate=plate) < 0.01
+    for method in ("h", "h2"):
+        assert ours(111.0, 8.0, method, plate=plate) < 0.01
 
 
 def test_row_09_close_bands_on_independent_low_passes():

@@ -123,7 +123,7 @@ def settled(motion, frequency):
 def test_a_wrong_stiffness_slows_the_law_alone_and_breaks_it():
     """FACTS: k +-5 % at 143 and 189 Hz.  The D-law behind low-passes diverges at 143 (+5 %), takes > 5 s at 189.
 
-    H, whose integrator follows an observer, settles in all three: 0.16 s at 143 Hz, 0.8-0.9 s at 189 Hz; H2 in 0.05.
+    H, whose integrator follows an observer, settles in all three: 0.1-0.2 s at 143 Hz, 0.8-0.9 s at 189 Hz; H2 in 0.05.
     """
     for stiffness, frequency, breaks in ((1.05, 143.0, True), (1.05, 189.0, False), (0.95, 189.0, False)):
         known = wrong(stiffness, **IDEAL_SENSORS)
@@ -134,7 +134,7 @@ def test_a_wrong_stiffness_slows_the_law_alone_and_breaks_it():
         else:
             assert settled(motion, frequency) > 4.0
         late = settled(hold("h", fixed((frequency, 5e-5)), 4.0, IDEAL, known)[1], frequency)
-        assert 0.1 < late < (0.3 if frequency == 143.0 else 1.2)
+        assert late < 0.3 if frequency == 143.0 else 0.5 < late < 1.2
         assert settled(hold("h2", fixed((frequency, 5e-5)), 4.0, IDEAL, known)[1], frequency) < 0.08
 
 
