@@ -262,7 +262,9 @@ def doubt_pass(numbers, doubt, loop, flags):
     step = 1.0 / (DOUBT_TIME * numbers.rate)
     doubt[0] = min(doubt[0] + step, 1.0) if flags & 2 else max(doubt[0] - step, 0.0)
     if doubt[0] == 1.0:
-        loop[:] = 0.0
+        for row in range(loop.shape[0]):  # a slice assignment would cost 100 ns even where it is not reached
+            for k in range(loop.shape[1]):
+                loop[row, k] = 0.0
     return 1.0 - doubt[0]
 
 
