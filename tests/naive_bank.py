@@ -34,7 +34,7 @@ class NaiveBank:
         self.constant = real + 1j * imaginary
         K, C = len(frequency), len(tables.listen)
         self.turns, self.ramp, self.weight = np.zeros(K), np.zeros(K), np.zeros(K)
-        self.raw, self.R, self.dR, self.rest = (np.zeros(K, complex) for _ in range(4))
+        self.raw, self.R, self.dR, self.rest, self.seen_R, self.saw_R = (np.zeros(K, complex) for _ in range(6))
         self.E, self.v, self.dv, self.v_slow, self.apart, self.fast, self.slow = (
             np.zeros((C, K), complex) for _ in range(7)
         )
@@ -60,11 +60,12 @@ class NaiveBank:
         self.follow(position)
         carrier = self.carriers()
         calm = min(abs(self.velocity) / p.crowd_speed, 1.0) if p.crowd_speed > 0 else 1.0
-        target = self.reference(carrier, wanted, calm * p.observer)
+        target = self.reference(carrier, wanted, calm * p.reference)
         self.feel()
         fast, slow = self.open
         ki = move(move(p.integral, p.integral_stirred, slow), p.integral_awake, fast)
-        inner, gain = move(p.inner, p.inner_awake, fast), calm * move(p.observer, p.observer_awake, fast)
+        inner = move(p.inner, p.inner_awake, fast) if self.scale == 1 else 0.0
+        gain = calm * move(p.observer, p.observer_awake, fast)
 
         believed = np.abs(sensed) <= p.sensed_limit
         if not believed.all():
@@ -73,8 +74,9 @@ class NaiveBank:
 
         R = np.outer(t.shape, self.R)
         dR = np.outer(t.shape, self.dR)
-        e = y - self.dc - ((R + self.E) * carrier).real.sum(axis=1)  # O, on the error
-        eps = y - ((R + self.v) * carrier).real.sum(axis=1)  # D
+        seen = np.outer(t.shape, self.seen_R)
+        e = y - self.dc - ((seen + self.E) * carrier).real.sum(axis=1)  # O, on the error
+        eps = y - self.scale * ((R + self.v) * carrier).real.sum(axis=1)  # D
         deviation = eps - self.dc
         self.eps = np.vstack([eps, self.eps[:-1]])
         F = -inner * (t.taps.T * self.eps).sum(axis=0)
@@ -85,7 +87,7 @@ class NaiveBank:
         fading = 50.0 * (1 - w)
         self.E = (1 - fading * T) * self.E + w * gain * e[:, None] * carrier.conj()
         if not p.error_observer:
-            self.E = self.E - T * dR
+            self.E = self.E - np.outer(t.shape, self.seen_R - self.saw_R)
         spill = p.back * (1 - self.scale)
         self.dv = -ki * self.E - spill * (self.v + R) - fading * self.v
         self.v = self.v + T * self.dv
@@ -100,8 +102,8 @@ class NaiveBank:
         if self.contact and p.adapt >= 0 and self.samples % 4 == 0:
             lively = max(fast, slow)
             self.adapt(R, inner, move(p.adapt, p.adapt_awake, lively), move(p.rest, p.rest_awake, lively))
-        F = F + (self.force(R, dR) * self.ahead() * carrier).real.sum(axis=1)
-        drive, cut = self.speak(F)
+        turning = (self.force(R, dR) * self.ahead() * carrier).sum(axis=1)
+        drive, cut = self.speak(F + turning)
         return drive, target, flags | cut | (NONFINITE if far else 0)
 
     def follow(self, position):
@@ -145,9 +147,10 @@ class NaiveBank:
             target = self.R + gain / 2 * (self.weight * self.raw - self.R)
         else:
             target = self.weight * self.constant
-        R = target if p.error_observer or p.analysed else self.R + p.observer / 2 * (target - self.R)
-        self.dR = (R - self.R) * p.rate
-        self.R = R
+        self.dR = (target - self.R) * p.rate
+        self.R = target
+        self.saw_R = self.seen_R
+        self.seen_R = target if p.error_observer else self.seen_R + p.reference / 2 * (target - self.seen_R)
         return target
 
     def feel(self):
@@ -160,9 +163,9 @@ class NaiveBank:
             self.g = min(max(moment / max(load, LEAST_LOAD), -2.0), 2.0)
         if self.contact != before:
             self.timers[0] = self.p.fast_time
-            if not self.contact:
-                self.m = self.b = self.k = 0.0
-                self.rest = np.zeros_like(self.rest)
+            self.m = self.b = self.k = 0.0
+            self.rest = np.zeros_like(self.rest)
+            self.apart = self.E - self.v_slow
 
     def believe(self, heard):
         """S: fade out while a sensor cannot be believed; once silent, forget what it said."""
@@ -221,10 +224,11 @@ class NaiveBank:
         apart, before = self.E - self.v_slow, self.apart
         self.apart = apart
         h = self.lever()
-        y_p, commanded = h @ (R + self.E), h @ (R + self.v_slow)
+        seen = np.outer(self.t.shape, self.seen_R)
+        y_p, commanded = h @ (seen + self.E), h @ (seen + self.v_slow)
         sums, total = np.zeros(3), 0.0
         for k, w in enumerate(self.omega):
-            if abs(y_p[k]) < 5e-8 or w == 0:
+            if abs(y_p[k]) < 5e-8 or self.weight[k] < 1:
                 continue
             D, slope, _ = self.stiffness_of(k)
             away = D[0] @ apart[:, k] + slope[0] @ (apart[:, k] - before[:, k]) / step
@@ -239,18 +243,20 @@ class NaiveBank:
             self.rest[k] += step * mu_rest * (miss + 1j * drag - self.rest[k])
         if total > 0:
             by_k, by_m, by_b = step * mu * sums / total
-            self.k = max(self.k + by_k, -500.0)
+            self.k = min(max(self.k + by_k, -500.0), 15e3)
             self.m = min(max(self.m - by_m, -2e-3), 12e-3)
             self.b = min(max(self.b + by_b, 0.0), 12.0)
 
     def speak(self, F):
-        """S: the whole envelope scaled to the limit, rounding shaped by (1 - z^-1)^2."""
+        """S: the whole envelope (of the analytic signal F) scaled to the limit, rounding shaped by (1 - z^-1)^2."""
         p = self.p
         drive = self.trust * (self.t.speak @ F)
         self.peak = max(abs(drive).max() / p.drive_limit, self.peak * p.peak_decay)
         self.scale = min(1.0, 1 / self.peak) if self.peak > 0 else 1.0
-        drive = self.scale * drive
-        if p.drive_step > 0:
+        drive = self.scale * drive.real
+        if self.trust == 0:
+            self.round_1, self.round_2 = np.zeros_like(drive), np.zeros_like(drive)
+        elif p.drive_step > 0:
             shaped = drive + 2 * self.round_1 - self.round_2
             drive = p.drive_step * np.floor(shaped / p.drive_step + 0.5)
             self.round_1, self.round_2 = np.clip(shaped - drive, -p.drive_step, p.drive_step), self.round_1

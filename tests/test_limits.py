@@ -85,7 +85,6 @@ def test_overload_is_cut_as_a_whole_and_left_in_a_quarter_of_a_second(method):
     assert not (flags[-5000:] & Flag.SATURATED).any()
 
 
-@pytest.mark.xfail(strict=True, reason="the peak of the samples sags between crests, and the scale with it: 1.3-2.3 um")
 @OURS
 def test_overload_does_not_distort(method):
     """Third harmonic of the true motion <= 0.01 um while 3 A are reached (9.3 um where each sample is clipped)."""
@@ -113,10 +112,7 @@ def test_a_shaped_command_leaves_no_spurs(method, noise):
     assert 0.2e-6 < found["plain"] < 0.4e-6
 
 
-FOUGHT = "the reference is fed forward filtered, so that the integral makes up for it: x1.13; unfiltered it is x1.02"
-
-
-@pytest.mark.parametrize("method", ["h2", pytest.param("h", marks=pytest.mark.xfail(strict=True, reason=FOUGHT))])
+@pytest.mark.parametrize("method", ["h2", "h"])
 def test_a_target_grows_over_its_ramp_and_does_not_strike_the_modes(method):
     """FACTS 3, report "reference steps": 50 ms leave a peak of x1.02 near the modes, where a step leaves x1.5-1.75."""
     for frequency in (143.0, 170.0):
@@ -336,16 +332,13 @@ def test_h2_holds_at_the_edges_of_its_range(extreme):
     assert abs(drive).max() < parameters.current_limit
 
 
-SILENT = "a bandwidth of zero also stops the reference filter and the analysis of the wanted waveform"
-
-
 @pytest.mark.parametrize(
     ("method", "analysed"),
     [
         ("h2", False),
-        pytest.param("h", False, marks=pytest.mark.xfail(strict=True, reason=SILENT)),
-        pytest.param("h", True, marks=pytest.mark.xfail(strict=True, reason=SILENT)),
-        pytest.param("h2", True, marks=pytest.mark.xfail(strict=True, reason=SILENT)),
+        ("h", False),
+        ("h", True),
+        ("h2", True),
     ],
 )
 def test_without_sensors_it_drives_from_what_it_knows(method, analysed):

@@ -30,7 +30,7 @@ FAST_POLE, FAST_SIGMAS = 30.0, 5.5  # Hz, of the sensor noise behind that pole
 SLOW_POLE, SLOW_SIGMAS = 4.0, 5.0
 PHASE_MARGIN = math.pi / 4  # rad: 90 deg less integral gain times (delay + 1/observer pole)
 LEARNING_TIME = 1 / 60  # s: fastest adaptation of the finger; a delay counts twice
-BACK_TIME = 2e-3  # s: back-calculation at the limit
+BACK_TIME = 0.02  # s: back-calculation at the limit
 LEAST_NOISE = 1e-9  # m: thresholds never fall to nothing
 
 
@@ -84,7 +84,7 @@ class BankController:
             touch=touch,
             level=np.zeros((2, coordinates)),
             past=np.zeros((coordinates, tables.taps.shape[1])),
-            residual=np.zeros((2, coordinates)),
+            residual=np.zeros((3, coordinates)),
             shaper=np.zeros((2, len(tables.speak))),
             sample=np.zeros(1, np.int64),
         )
@@ -114,6 +114,7 @@ def design_bank(
     method: str, model: BandModel, bands: Bands, rules: BankRules, *, feedback: bool = True
 ) -> BankController:
     """Apply the rules of FACTS section 3 (C, F): observer <= f0/2 and spacing/2 pi, loop <= f0/4, DC band <= f0/8."""
+    heard = rules.observer[0]
     if not feedback:
         rules = replace(rules, observer=(0.0, 0.0), integral=(0.0, 0.0, 0.0), inner=(0.0, 0.0), adapt=(-1.0, -1.0))
     if (bands.wavenumber > 0.0).any():  # what is left over at one frequency is wrong at the next
@@ -121,7 +122,13 @@ def design_bank(
     fixed = bands.frequency[bands.wavenumber == 0.0]
     lowest = float(fixed.min(initial=model.lowest_frequency if (bands.wavenumber > 0).any() else np.inf))
     apart = spacing(bands)
+    if apart == 0.0:
+        twice = np.sort(bands.frequency[bands.wavenumber == 0.0])
+        raise ValueError(
+            f"texture has two carriers at {twice[:-1][np.diff(twice) == 0.0][0]:g} Hz: must differ; add them up"
+        )
     period = 1.0 / model.rate
+    heard = 2 * math.pi * min(heard, lowest / 2, apart / (2 * math.pi))
     pole = [2 * math.pi * min(width, lowest / 2, apart / (2 * math.pi)) for width in rules.observer]
     wait = model.delay * period  # integrator, observer and delay leave at least PHASE_MARGIN
     fastest = [min(2 * math.pi * lowest / 4, PHASE_MARGIN / (wait + 1 / max(each, 1e-9))) for each in pole]
@@ -138,9 +145,10 @@ def design_bank(
         analysed=bands.envelope is None,
         error_observer=rules.error_observer,
         lead=(model.delay + 0.5) * period,
+        reference=2 * heard * period,
         observer=2 * pole[0] * period,
         observer_awake=2 * pole[1] * period,
-        crowd_speed=crowd_speed(bands, max(pole)),
+        crowd_speed=crowd_speed(bands, max(heard, *pole)),
         dc=1.6 * level,
         dc_drift=level**2,
         integral=quiet,

@@ -27,12 +27,15 @@ from hapticrender.control.kernels import (
     WANTED_RE,
     WAVENUMBER,
     fade,
+    size,
 )
 from hapticrender.protocols import Array
 
 # rows of BankState.band: carrier, target (R and its slope), and what the finger adds to it beyond its three numbers
 TURNS, RAMP, WEIGHT, COS, SIN, OMEGA, SWEEP, R_RE, R_IM, DR_RE, DR_IM, RAW_RE, RAW_IM, REST_RE, REST_IM = range(15)
-BAND_ROWS = 15
+# the target as the observer sees it: R itself (error observer), or R behind the observer's pole
+SEEN_RE, SEEN_IM = range(15, 17)
+BAND_ROWS = 17
 # rows of BankState.loop, LOOP_ROWS a coordinate: error; integral part, its slope; low-passed like the error; error and
 # low-passed integral part at the last adaptation; fast and slow detector of the deviation
 E_RE, E_IM, V_RE, V_IM, DV_RE, DV_IM, L_RE, L_IM, LAST_RE, LAST_IM, FAST_RE, FAST_IM, SLOW_RE, SLOW_IM = range(14)
@@ -59,7 +62,8 @@ class BankNumbers(NamedTuple):
     analysed: bool
     error_observer: bool
     lead: float  # s: delay and half the hold
-    observer: float  # g of the observer in quiet, per sample
+    reference: float  # g of the bank that analyses and filters the target, per sample
+    observer: float  # g of the observer in quiet, per sample; 0 without feedback
     observer_awake: float
     crowd_speed: float  # m/s: below it finger-locked carriers crowd, and the observer slows down with the finger
     dc: float  # 1.6 w h of the DC band (type 2)
@@ -116,7 +120,7 @@ class BankState(NamedTuple):
     touch: Array  # (TOUCH_ROWS,)
     level: Array  # (2, coordinates) DC band and its drift
     past: Array  # (coordinates, taps) last deviations, newest first
-    residual: Array  # (2, coordinates) scratch: residual of the observer, force
+    residual: Array  # (3, coordinates) scratch: residual of the observer, force, force a quarter turn ahead
     shaper: Array  # (2, channels) last two errors of the command's rounding
     sample: Array  # (1,) integer: samples so far
 
@@ -179,9 +183,9 @@ def target_pass(numbers, tone, band, g, wanted, target):
         else:
             re, im = weight * tone[WANTED_RE, k], weight * tone[WANTED_IM, k]
         target[k] = complex(re, im)
-        if not (numbers.error_observer or numbers.analysed):  # the reference passes the pole of the observer first
-            re = band[R_RE, k] + 0.5 * numbers.observer * (re - band[R_RE, k])
-            im = band[R_IM, k] + 0.5 * numbers.observer * (im - band[R_IM, k])
+        pole = 1.0 if numbers.error_observer else 0.5 * numbers.reference
+        band[SEEN_RE, k] += pole * (re - band[SEEN_RE, k])
+        band[SEEN_IM, k] += pole * (im - band[SEEN_IM, k])
         band[DR_RE, k], band[DR_IM, k] = (re - band[R_RE, k]) * numbers.rate, (im - band[R_IM, k]) * numbers.rate
         band[R_RE, k], band[R_IM, k] = re, im
 
@@ -227,15 +231,18 @@ def believe(numbers, touch, loop, level, past, flags):
 
 
 @kernel
-def residual_pass(shape, band, loop, level, residual, past, y, c):
-    """Residual of the observer and deviation from the command in coordinate c."""
+def residual_pass(shape, band, loop, level, residual, past, y, scale, c):
+    """Residual of the observer and deviation from the command, as the limiter has scaled it, in coordinate c."""
     base = c * LOOP_ROWS
     observed = commanded = y
     for k in range(band.shape[1]):
         cos, sin = band[COS, k], band[SIN, k]
-        r_re, r_im = shape[c] * band[R_RE, k], shape[c] * band[R_IM, k]
-        observed -= (r_re + loop[base + E_RE, k]) * cos - (r_im + loop[base + E_IM, k]) * sin
-        commanded -= (r_re + loop[base + V_RE, k]) * cos - (r_im + loop[base + V_IM, k]) * sin
+        x_re = shape[c] * band[SEEN_RE, k] + loop[base + E_RE, k]
+        x_im = shape[c] * band[SEEN_IM, k] + loop[base + E_IM, k]
+        observed -= x_re * cos - x_im * sin
+        v_re = shape[c] * band[R_RE, k] + loop[base + V_RE, k]
+        v_im = shape[c] * band[R_IM, k] + loop[base + V_IM, k]
+        commanded -= scale * (v_re * cos - v_im * sin)
     residual[0, c] = observed - level[0, c]
     for i in range(past.shape[1] - 1, 0, -1):
         past[c, i] = past[c, i - 1]
@@ -255,9 +262,10 @@ def observer_pass(numbers, shape, band, loop, c, error, deviation, g, integral, 
         keep = 1.0 - 50.0 * period * (1.0 - weight)  # a carrier near 0 Hz is forgotten, not followed
         e_re = keep * loop[base + E_RE, k] + weight * g * error * cos
         e_im = keep * loop[base + E_IM, k] - weight * g * error * sin
-        if not numbers.error_observer:  # E = X - R with R filtered
-            e_re -= shape[c] * band[DR_RE, k] * period
-            e_im -= shape[c] * band[DR_IM, k] * period
+        if not numbers.error_observer:  # X goes on by itself; E is its distance to a target that has moved
+            moved = 0.5 * numbers.reference / (1.0 - 0.5 * numbers.reference)
+            e_re -= shape[c] * moved * (band[R_RE, k] - band[SEEN_RE, k])
+            e_im -= shape[c] * moved * (band[R_IM, k] - band[SEEN_IM, k])
         loop[base + E_RE, k], loop[base + E_IM, k] = e_re, e_im
         v_re, v_im = loop[base + V_RE, k], loop[base + V_IM, k]
         back = numbers.back * spill
@@ -302,9 +310,11 @@ def finger_stiffness(touch, band, k):
 
 
 @kernel
-def law_pass(numbers, mass, damping, stiffness, shape, band, loop, touch, force):
+def law_pass(numbers, mass, damping, stiffness, shape, band, loop, touch, force, quadrature):
     """F = D V + D' dV/dt + j dw/dt M V, finger included, turned ahead by delay and hold; adds to `force`."""
     coordinates = shape.shape[0]
+    for c in range(coordinates):
+        quadrature[c] = 0.0
     with_finger = touch[CONTACT] > 0.0 and numbers.adapt >= 0.0
     for k in range(band.shape[1]):
         omega, sweep = band[OMEGA, k], band[SWEEP, k]
@@ -331,7 +341,9 @@ def law_pass(numbers, mass, damping, stiffness, shape, band, loop, touch, force)
                 )
             if with_finger:
                 total += (1.0 if c == 0 else touch[PLACE]) * pull
-            force[c] += (total * ahead).real
+            total *= ahead
+            force[c] += total.real
+            quadrature[c] += total.imag
 
 
 @kernel
@@ -349,7 +361,7 @@ def adapt_pass(numbers, mass, damping, stiffness, shape, grip, band, loop, touch
             place = 1.0 if c == 0 else touch[PLACE]
             error = complex(loop[base + E_RE, k], loop[base + E_IM, k])
             own = complex(loop[base + L_RE, k], loop[base + L_IM, k])
-            wanted = complex(shape[c] * band[R_RE, k], shape[c] * band[R_IM, k])
+            wanted = complex(shape[c] * band[SEEN_RE, k], shape[c] * band[SEEN_IM, k])
             felt += place * (wanted + error)
             commanded += place * (wanted + own)
             apart = error - own
@@ -360,7 +372,7 @@ def adapt_pass(numbers, mass, damping, stiffness, shape, grip, band, loop, touch
             if c == 0:
                 away += complex(0.0, inner * omega * grip[0]) * apart
         size2 = felt.real * felt.real + felt.imag * felt.imag
-        if size2 < LEAST_MOTION * LEAST_MOTION or omega == 0.0:
+        if size2 < LEAST_MOTION * LEAST_MOTION or band[WEIGHT, k] < 1.0:  # too small, or a carrier near 0 Hz
             continue
         found = (finger_stiffness(touch, band, k) * commanded - away) * felt.conjugate() / size2
         own_re = stiffness[0, 0] - omega * omega * mass[0, 0]
@@ -376,30 +388,37 @@ def adapt_pass(numbers, mass, damping, stiffness, shape, grip, band, loop, touch
         band[REST_IM, k] += step * rest * (drag - band[REST_IM, k])
     if total > 0.0:
         step *= gain / total
-        touch[STIFFNESS] = max(touch[STIFFNESS] + step * sum_k, -500.0)
+        touch[STIFFNESS] = min(max(touch[STIFFNESS] + step * sum_k, -500.0), 15e3)
         touch[MASS] = min(max(touch[MASS] - step * sum_m, -2e-3), 12e-3)
         touch[DAMPING] = min(max(touch[DAMPING] + step * sum_b, 0.0), 12.0)
 
 
 @kernel
-def forget_finger(touch, band):
-    """Lift-off: what was learnt of this finger does not hold for the next."""
+def forget_finger(touch, band, loop):
+    """Touch or lift-off: what was learnt of one finger does not hold for the next."""
     touch[MASS] = touch[DAMPING] = touch[STIFFNESS] = 0.0
     for k in range(band.shape[1]):
         band[REST_RE, k] = band[REST_IM, k] = 0.0
+        for base in range(0, loop.shape[0], LOOP_ROWS):
+            loop[base + LAST_RE, k] = loop[base + E_RE, k] - loop[base + L_RE, k]
+            loop[base + LAST_IM, k] = loop[base + E_IM, k] - loop[base + L_IM, k]
 
 
 @kernel
-def speak_pass(numbers, speak, force, shaper, touch, drive):
-    """Drive from force: the whole envelope scaled to the limit, the rounding's noise shaped (2nd order)."""
+def speak_pass(numbers, speak, force, quadrature, shaper, touch, drive):
+    """Drive from force: the whole envelope scaled to the limit, the rounding's noise shaped (2nd order).
+
+    The envelope is that of the analytic signal, force and its quadrature: steady for a steady tone, so that scaling it
+    distorts nothing.
+    """
     peak = 0.0
     for i in range(drive.shape[0]):
-        total = 0.0
+        total = across = 0.0
         for c in range(force.shape[0]):
             total += speak[i, c] * force[c]
-        total *= touch[TRUST]
-        drive[i] = total
-        peak = max(peak, abs(total) / numbers.drive_limit)
+            across += speak[i, c] * quadrature[c]
+        drive[i] = touch[TRUST] * total
+        peak = max(peak, touch[TRUST] * size(total, across) / numbers.drive_limit)
     touch[PEAK] = max(peak, touch[PEAK] * numbers.peak_decay)
     touch[SCALE] = 1.0 / touch[PEAK] if touch[PEAK] > 1.0 else 1.0
     limit, step = numbers.drive_limit, numbers.drive_step
@@ -436,15 +455,16 @@ def bank_step(tables, state, sensed, position, wanted, drive, target):
     calm = 1.0
     if numbers.crowd_speed > 0.0:
         calm = min(abs(state.track[VELOCITY]) / numbers.crowd_speed, 1.0)
-    target_pass(numbers, tables.tone, band, calm * numbers.observer, wanted, target)
+    target_pass(numbers, tables.tone, band, calm * numbers.reference, wanted, target)
     if feel(numbers, stiffness, level, touch):
         touch[FAST_TIME] = numbers.fast_time
-        if touch[CONTACT] == 0.0:
-            forget_finger(touch, band)
+        forget_finger(touch, band, loop)
     fast, slow = touch[FAST_OPEN], touch[SLOW_OPEN]
     integral = numbers.integral + slow * (numbers.integral_stirred - numbers.integral)
     integral += fast * (numbers.integral_awake - integral)
     inner = numbers.inner + fast * (numbers.inner_awake - numbers.inner)
+    if touch[SCALE] < 1.0:
+        inner = 0.0  # no room for it
     g = calm * (numbers.observer + fast * (numbers.observer_awake - numbers.observer))
     trips = 0
     for c in range(shape.shape[0]):
@@ -454,7 +474,7 @@ def bank_step(tables, state, sensed, position, wanted, drive, target):
                 y += listen[c, s] * sensed[s]
             else:  # NaN included
                 flags |= 2
-        deviation = residual_pass(shape, band, loop, level, residual, past, y, c)
+        deviation = residual_pass(shape, band, loop, level, residual, past, y, touch[SCALE], c)
         residual[1, c] = 0.0
         for i in range(taps.shape[1]):
             residual[1, c] -= inner * taps[c, i] * past[c, i]
@@ -470,8 +490,8 @@ def bank_step(tables, state, sensed, position, wanted, drive, target):
         gain = numbers.adapt + lively * (numbers.adapt_awake - numbers.adapt)
         rest = numbers.rest + lively * (numbers.rest_awake - numbers.rest)
         adapt_pass(numbers, mass, damping, stiffness, shape, tables.grip, band, loop, touch, inner, gain, rest)
-    law_pass(numbers, mass, damping, stiffness, shape, band, loop, touch, residual[1])
-    return flags | odd | speak_pass(numbers, tables.speak, residual[1], state.shaper, touch, drive)
+    law_pass(numbers, mass, damping, stiffness, shape, band, loop, touch, residual[1], residual[2])
+    return flags | odd | speak_pass(numbers, tables.speak, residual[1], residual[2], state.shaper, touch, drive)
 
 
 @kernel

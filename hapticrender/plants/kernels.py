@@ -46,6 +46,7 @@ class PlateTables(NamedTuple):
     sensor_limit: float  # m
     sensor_step: float  # m, 0: not quantised
     sensor_noise: float  # m rms
+    sensor_gain: tuple[float, float]
 
 
 class PlateState(NamedTuple):
@@ -202,7 +203,7 @@ def plate_sense(tables, z, noise, sensed, motion):
     for i in range(2):
         side = -tables.reach if i == 0 else tables.reach
         motion[1 + i] = z[0] + side * z[1] + z[6]
-        value = motion[1 + i] + tables.sensor_noise * noise[i]
+        value = motion[1 + i] * tables.sensor_gain[i] + tables.sensor_noise * noise[i]
         if abs(value) > tables.sensor_limit:
             flags |= 4
         sensed[i] = quantise(value, tables.sensor_step, tables.sensor_limit)

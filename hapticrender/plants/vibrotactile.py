@@ -74,6 +74,8 @@ class PlateParameters:
         Resolution over sensor_range; 0 is ideal.
     sensor_noise : float, m rms
         White noise of each sensor, >= 0.
+    sensor_gain_1, sensor_gain_2 : float
+        Reading per displacement of each sensor, 1 when calibrated, > 0; the controller takes them for calibrated.
     rate : float, Hz
         Sampling rate of the embedded loop.
     delay : int, samples
@@ -114,6 +116,8 @@ class PlateParameters:
     sensor_range: float = 2e-3
     sensor_bits: int = 14
     sensor_noise: float = 1e-6
+    sensor_gain_1: float = 1.0
+    sensor_gain_2: float = 1.0
     rate: float = 5000.0
     delay: int = 1
     degrees_of_freedom: int = 2
@@ -442,6 +446,7 @@ def _tables(parameters: PlateParameters, mechanics: FingerMechanics) -> PlateTab
         sensor_limit=parameters.sensor_range / 2,
         sensor_step=parameters.sensor_step,
         sensor_noise=parameters.sensor_noise,
+        sensor_gain=(float(parameters.sensor_gain_1), float(parameters.sensor_gain_2)),
     )
     return tables._replace(terms=_taylor_terms(tables))
 
