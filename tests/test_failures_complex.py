@@ -65,7 +65,7 @@ def test_row_05_static_inverse_near_a_mode_of_the_free_plate(frequency, holds):
     ids=lambda value: "heavy" if value is HEAVY else "light" if value is LIGHT_SECOND else None,
 )
 def test_row_05_static_inverse_near_a_mode_under_a_finger(mechanics, frequency, static, slope):
-    """FACTS: 167-187 Hz.  With D' too the heavy finger is held, the light one only by adapting to it."""
+    """FACTS: 167-187 Hz.  With D' too the heavy finger is held; H holds both, by adapting and by its observer."""
     finger = hr.Finger.still(15e-3, normal_load=0.5, mechanics=mechanics)
     for with_slope, holds in ((False, static), (True, slope)):
         method = "stiffness" if with_slope else "static"
