@@ -22,12 +22,16 @@ from hapticrender.control.bank_kernels import (
     bank_run,
 )
 from hapticrender.control.damping import choose_damping
+from hapticrender.control.stability import Checked, Limits, checked_bandwidth
 from hapticrender.protocols import Array
 
 CONTACT = (0.05, 0.03)  # N: on, off
 RAMP_TIME = 0.05  # s: a target grows this long, so that it does not strike the modes
 FAST_POLE, FAST_SIGMAS = 30.0, 5.5  # Hz, of the sensor noise behind that pole
 SLOW_POLE, SLOW_SIGMAS = 4.0, 5.0
+LIMITS = Limits(modulus=0.29, gain=1.4)  # crowded bands share one residual: 20 Hz apart they leave 0.30 and 1.42
+REMEMBERED = 256  # designs
+_KNOWN: dict[tuple[object, ...], Checked] = {}
 PHASE_MARGIN = math.pi / 4  # rad: 90 deg less integral gain times (delay + 1/observer pole)
 LEARNING_TIME = 1 / 60  # s: fastest adaptation of the finger; a delay counts twice
 BACK_TIME = 0.02  # s: back-calculation at the limit
@@ -190,7 +194,22 @@ def design_bank(
         taps=damping.taps if damping else np.zeros((len(model.mass), 1)),
         grip=damping.grip if damping else np.zeros(len(model.mass)),
     )
-    return BankController(method, tables, damping.text() if damping else "inner loop off: the method has none")
+    notes = [damping.text() if damping else "inner loop off: the method has none"]
+    if feedback:
+        checked = _checked(tables)
+        tables = tables._replace(numbers=checked.tables.numbers)
+        notes += [*checked.notes, *(f"{state}: {margins}" for state, margins in checked.margins.items())]
+    return BankController(method, tables, "\n".join(notes))
+
+
+def _checked(tables: BankTables) -> Checked:
+    """Check the bandwidth; a design that was checked before, as a run repeats its own, is remembered."""
+    key = (tables.numbers, *(array.tobytes() for array in tables[1:]))
+    if key not in _KNOWN:
+        if len(_KNOWN) >= REMEMBERED:
+            _KNOWN.clear()
+        _KNOWN[key] = checked_bandwidth(tables, LIMITS)
+    return _KNOWN[key]
 
 
 def _threshold(sigmas: float, noise: float, pole: float, period: float) -> float:

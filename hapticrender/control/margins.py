@@ -52,6 +52,12 @@ class Margins:
     gain: float
     bandwidth: float
 
+    def __str__(self) -> str:
+        return (
+            f"modulus margin {self.modulus:.2f} at {self.worst_frequency:.0f} Hz, gain margin {self.gain:.3g}, phase margin "
+            f"{math.degrees(self.phase):.0f} deg, delay margin {1e3 * self.delay:.2f} ms, bandwidth {self.bandwidth:.2f} Hz"
+        )
+
 
 def carrier_grid(carriers: Array, widths: Array, rate: float, narrowest: float = NARROWEST) -> Array:
     """Frequencies (Hz) from 0 to half the rate, ever denser towards the carriers, none of them on one.
