@@ -54,8 +54,9 @@ class Margins:
 
     def __str__(self) -> str:
         return (
-            f"modulus margin {self.modulus:.2f} at {self.worst_frequency:.0f} Hz, gain margin {self.gain:.3g}, phase margin "
-            f"{math.degrees(self.phase):.0f} deg, delay margin {1e3 * self.delay:.2f} ms, bandwidth {self.bandwidth:.2f} Hz"
+            f"modulus margin {self.modulus:.2f} at {self.worst_frequency:.0f} Hz, gain margin {self.gain:.3g}, "
+            f"phase margin {math.degrees(self.phase):.0f} deg, delay margin {1e3 * self.delay:.2f} ms, "
+            f"bandwidth {self.bandwidth:.2f} Hz"
         )
 
 
