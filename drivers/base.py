@@ -200,7 +200,7 @@ class BaseDriver:
         return self._play(checked_drive(drive, self.block, self.drive_channels))
 
     def close(self) -> None:
-        """Play zeros until they have come through, release the device, as far as either works; raise the first failure."""
+        """Play zeros until they have come through and release the device; raise the first failure after both."""
         if self._state != "open":
             self._state = "closed"
             return

@@ -30,10 +30,12 @@ _HOMES = {
         "DeviceTimeout",
         "DriverError",
         "HapticError",
+        "PlateMismatch",
         "ProtocolError",
         "SceneError",
     ),
     "loop": ("Session", "prepare", "render", "run"),
+    "plants.identify": ("Identified", "compare", "identify"),
     "protocols": ("Controller", "Driver", "Flag", "Method", "Motion", "Plant", "Renderer", "Sensed", "Texture"),
     "recording": ("Recorder", "Recording"),
     "touch.builtin": ("builtin_scenes",),
@@ -56,12 +58,16 @@ if _typing.TYPE_CHECKING:
     from hapticrender.errors import DeviceTimeout as DeviceTimeout
     from hapticrender.errors import DriverError as DriverError
     from hapticrender.errors import HapticError as HapticError
+    from hapticrender.errors import PlateMismatch as PlateMismatch
     from hapticrender.errors import ProtocolError as ProtocolError
     from hapticrender.errors import SceneError as SceneError
     from hapticrender.loop import Session as Session
     from hapticrender.loop import prepare as prepare
     from hapticrender.loop import render as render
     from hapticrender.loop import run as run
+    from hapticrender.plants.identify import Identified as Identified
+    from hapticrender.plants.identify import compare as compare
+    from hapticrender.plants.identify import identify as identify
     from hapticrender.protocols import Controller as Controller
     from hapticrender.protocols import Driver as Driver
     from hapticrender.protocols import Flag as Flag

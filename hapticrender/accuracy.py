@@ -8,8 +8,10 @@ slope over windows of max(20 ms, 2/f).
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 
@@ -154,7 +156,7 @@ def chirp(bench: Bench) -> dict[str, float]:
         seconds = 1.0 + 360.0 / sweep
         time = np.arange(int(seconds * RATE) + 2) / RATE
         turns = 30.0 * time + 0.5 * sweep * np.maximum(time - 1.0, 0.0) ** 2
-        path = Sampled(10e-3 + wavelength * turns, RATE)
+        path = Sampled(tuple(10e-3 + wavelength * turns), RATE)
         one = np.ones(1)
         bands = Bands(frequency=0 * one, wavenumber=one / wavelength, phase=0 * one, envelope=AMPLITUDE * (one + 0j))
         worst = 0.0
@@ -378,3 +380,30 @@ def run_suite(
             value = found[target.case, method].get(target.key, np.inf)
             figures.append(Figure(target, method, target.shown(value) if np.isfinite(value) else np.inf))
     return figures
+
+
+def as_rows(figures: Iterable[Figure], methods: Iterable[str]) -> list[list[str]]:
+    """Rows of a table: target, unit, bound, aim, then a column a method."""
+    names = list(methods)
+    rows = [["case", "figure", "unit", "bound", "aim", *names]]
+    values = {(figure.target, figure.method): figure for figure in figures}
+    for target in dict.fromkeys(figure.target for figure in values.values()):
+        found = [values[target, name] for name in names]
+        marks = [f"{each.value:.3g}{'' if each.passed else ' MISSED'}{' *' if each.reached else ''}" for each in found]
+        rows.append([target.case, target.what, target.unit, f"{target.bound:g}", f"{target.aim:g}", *marks])
+    return [*rows, ["", "* reaches its aim", "", "", "", *([""] * len(names))]]
+
+
+def write_json(path: Path, figures: Iterable[Figure]) -> None:
+    """Write every figure with its target, unit, bound and aim; one that is not finite is null."""
+    rows = [
+        {
+            **{key: getattr(figure.target, key) for key in ("case", "key", "what", "unit", "bound", "aim")},
+            "method": figure.method,
+            "value": figure.value if np.isfinite(figure.value) else None,
+            "passed": figure.passed,
+            "reached": figure.reached,
+        }
+        for figure in figures
+    ]
+    path.write_text(json.dumps({"suite": "accuracy", "figures": rows}, indent=2) + "\n", encoding="utf-8")

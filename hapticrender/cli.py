@@ -15,7 +15,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
-from hapticrender import __version__
+from hapticrender import __version__, defaults
 from hapticrender.errors import HapticError, SceneError
 
 if TYPE_CHECKING:
@@ -102,12 +102,24 @@ def _parser() -> argparse.ArgumentParser:
 
     validate = _add_verb(verbs, "validate", _validate, "render scenes and exit 1 when one misses its tolerance")
     validate.add_argument("scenes", metavar="SCENE", nargs="*", help="TOML files or built-in names (default: all)")
+    validate.add_argument(
+        "--suite", metavar="NAME", choices=["accuracy"], help="instead of scenes: accuracy, all targets of the library"
+    )
     validate.add_argument("--json", metavar="FILE", type=_path, help="write all figures as JSON")
     validate.add_argument("--junit", metavar="FILE", type=_path, help="write the JUnit XML that CI systems read")
     _add_method(validate)
 
     show = _add_verb(verbs, "show", _show, "print the figures of a recording, finished or cut off by a crash")
     show.add_argument("path", metavar="PATH", type=_path, help="a recording, or the folder of a rendered scene")
+
+    identify = _add_verb(verbs, "identify", _identify, "find what the plate is made of, while no finger is on it")
+    identify.add_argument("--out", "-o", metavar="FILE", type=_path, help="write it as the [plant] table of a scene")
+    identify.add_argument("--seed", metavar="N", type=_seed, default=0, help="seed of the noise (default: %(default)s)")
+
+    chart = _add_verb(verbs, "chart", _chart, "draw where each method is stable, as a picture and its data")
+    chart.add_argument("name", metavar="NAME", choices=["stability"], help="stability")
+    chart.add_argument("--learnt", action="store_true", help="the finger already learnt, not the moment of touch")
+    _add_out(chart, Path("out/chart"))
 
     _add_verb(verbs, "devices", _devices, "list the renderers and drivers that are installed")
     return parser
@@ -131,7 +143,7 @@ def _add_out(verb: argparse.ArgumentParser, default: Path | None) -> None:
 
 
 def _add_method(verb: argparse.ArgumentParser) -> None:
-    verb.add_argument("--method", metavar="NAME", default="paper", help="control method (default: %(default)s)")
+    verb.add_argument("--method", metavar="NAME", default=defaults.METHOD, help="control method (default: %(default)s)")
     verb.add_argument("--seed", metavar="N", type=_seed, default=0, help="seed of the noise (default: %(default)s)")
 
 
@@ -195,6 +207,8 @@ def _render(arguments: argparse.Namespace) -> int:
     with _progress(sessions).scene(arguments.scene) as tick:
         outputs = run_into(arguments.out, sessions[0], progress=tick)
     _print_figures(outputs.summary)
+    if note := getattr(sessions[0].controller(), "note", ""):
+        print(f"\n{note}")
     _hint_at_pictures([outputs])
     return 0
 
@@ -214,6 +228,8 @@ def _scenes(arguments: argparse.Namespace) -> int:
 
 
 def _validate(arguments: argparse.Namespace) -> int:
+    if arguments.suite:
+        return _suite(arguments)
     from hapticrender.touch.builtin import builtin_scenes
     from hapticrender.validate import run_and_judge, write_json, write_junit
 
@@ -230,6 +246,59 @@ def _validate(arguments: argparse.Namespace) -> int:
         write(path, verdicts)
     print(_overview([verdict.summary for verdict in verdicts]))
     return 0 if all(verdict.passed for verdict in verdicts) else 1
+
+
+def _suite(arguments: argparse.Namespace) -> int:
+    """Run the accuracy suite: the chosen method beside the paper's; exit 1 where it misses a bound."""
+    from hapticrender.accuracy import as_rows, run_suite, write_json
+    from hapticrender.control.methods import METHODS
+    from hapticrender.wording import table
+
+    if arguments.method not in METHODS:
+        raise ValueError(f"--method = {arguments.method!r}: must be one of {', '.join(METHODS)}")
+    if arguments.scenes or arguments.junit:
+        raise ValueError("--suite runs no scenes and writes --json only")
+    if arguments.json:
+        _check_file("--json", arguments.json)
+    methods = list(dict.fromkeys((arguments.method, "paper")))
+    figures = run_suite(methods, progress=lambda line: print(line, file=sys.stderr))
+    print(table(as_rows(figures, methods)))
+    if arguments.json:
+        arguments.json.parent.mkdir(parents=True, exist_ok=True)
+        write_json(arguments.json, figures)
+    return 0 if all(figure.passed for figure in figures if figure.method == arguments.method) else 1
+
+
+def _identify(arguments: argparse.Namespace) -> int:
+    from hapticrender.loop import registered
+    from hapticrender.plants.identify import MECHANICAL, compare, identify
+    from hapticrender.plants.vibrotactile import Plate, PlateParameters
+    from hapticrender.touch.finger import Finger
+    from hapticrender.touch.toml import dumps
+
+    if arguments.out:
+        _check_file("--out", arguments.out)
+    believed = PlateParameters()
+    with registered("drivers", "simulated")(Plate(believed, Finger.absent(), arguments.seed)) as driver:
+        found = identify(driver, believed)
+    print(found.text())
+    for difference in compare(found, believed):
+        print(f"differs from the design: {difference}")
+    if arguments.out:
+        arguments.out.parent.mkdir(parents=True, exist_ok=True)
+        plant = {name: getattr(found.parameters, name) for name in (*MECHANICAL, "delay")}
+        arguments.out.write_text(dumps({"plant": plant}), encoding="utf-8")
+    return 0
+
+
+def _chart(arguments: argparse.Namespace) -> int:
+    from hapticrender import chart
+
+    _check_folder("--out", arguments.out)
+    arguments.out.mkdir(parents=True, exist_ok=True)
+    chart.stability(arguments.out / "stability.png", adapted=arguments.learnt)
+    print(arguments.out / "stability.png")
+    return 0
 
 
 def _show(arguments: argparse.Namespace) -> int:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from importlib.metadata import entry_points
@@ -10,15 +11,17 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from hapticrender import defaults
 from hapticrender.bands import Bands
 from hapticrender.contract import check_driver, check_sensed
 from hapticrender.control.bandmodel import BandModel
 from hapticrender.control.methods import method_named
-from hapticrender.errors import HapticError
+from hapticrender.errors import HapticError, PlateMismatch
 from hapticrender.protocols import Array, Controller, Driver, Plant, Renderer, Sensed
 from hapticrender.recording import Recorder, Recording
 from hapticrender.touch.scene import Scene
 
+MISMATCH = 0.03  # largest share of a target that the integral part may have to add on the untouched device
 CHUNK = 0.25  # s of signal between two writes of the journal
 
 Progress = Callable[[float, float], None]
@@ -59,7 +62,7 @@ def registered(group: str, name: str) -> Any:
         raise HapticError(f"{group[:-1]} {name!r} cannot be loaded: {type(error).__name__}: {error}") from error
 
 
-def prepare(scene: Scene, *, driver: Driver | None = None, method: str = "paper", seed: int = 0) -> Session:
+def prepare(scene: Scene, *, driver: Driver | None = None, method: str = defaults.METHOD, seed: int = 0) -> Session:
     """Do all the design-time work of a run and check it; see `render` for the parameters and errors."""
     if isinstance(seed, bool) or not isinstance(seed, (int, np.integer)) or seed < 0:
         raise ValueError(f"seed = {seed!r}: must be an integer >= 0")
@@ -81,7 +84,7 @@ def render(
     scene: Scene,
     *,
     driver: Driver | None = None,
-    method: str = "paper",
+    method: str = defaults.METHOD,
     seed: int = 0,
     journal: str | Path | None = None,
     progress: Progress | None = None,
@@ -175,6 +178,7 @@ def _blocks(session: Session, total: int) -> Iterator[_Block]:
     ring = _Ring(session, controller) if plant is None else _CompiledRing(session, controller, plant)
     for start in range(0, total, size):
         yield ring.advance(start, min(size, total - start))
+    _compare(controller)
 
 
 def _wanted(session: Session, start: int, position: Array) -> Array:
@@ -191,6 +195,18 @@ def _wanted(session: Session, start: int, position: Array) -> Array:
 
 def _time(session: Session, start: int, count: int) -> Array:
     return (start + np.arange(count)) / session.driver.rate
+
+
+def _compare(controller: Controller) -> None:
+    """Warn where a controller that can tell has met another device than it was designed for."""
+    mismatch = getattr(controller, "mismatch", 0.0)
+    if mismatch > MISMATCH:
+        warnings.warn(
+            f"the device is not the one designed for: the integral part makes up for {100 * mismatch:.1f} % of a "
+            f"target (bound {100 * MISMATCH:g} %); identify it (hapticrender.plants.identify)",
+            PlateMismatch,
+            stacklevel=2,
+        )
 
 
 class _CompiledRing:

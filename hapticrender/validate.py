@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
 
-from hapticrender import __version__, wording
+from hapticrender import __version__, defaults, wording
 from hapticrender.loop import Session, prepare, run
 from hapticrender.progress import Progress
 from hapticrender.touch.scene import Scene
@@ -72,7 +72,7 @@ class Verdict:
 def validate(
     scenes: Iterable[Scene],
     *,
-    method: str = "paper",
+    method: str = defaults.METHOD,
     seed: int = 0,
     progress: Progress | None = None,
 ) -> list[Verdict]:

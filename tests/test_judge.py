@@ -131,8 +131,8 @@ def test_a_target_that_fades_leaves_nothing_beside_the_bands():
 def test_a_coarse_command_shows_beside_the_bands():
     """FACTS 2, row 14: a 12-bit command makes lines at 180 to 220 Hz; the bands' wobble does not hold them."""
     scene = builtin_scenes()["grating-20"]
-    coarse = render(scene, seed=1)
-    fine = render(replace(scene, plant={"current_bits": 0}), seed=1).summary()
+    coarse = render(scene, method="paper", seed=1)
+    fine = render(replace(scene, plant={"current_bits": 0}), method="paper", seed=1).summary()
     late = coarse.motion[coarse.time >= 1.0, 0]
     power = np.abs(np.fft.rfft(late * np.hanning(late.size))) ** 2
     frequency = np.fft.rfftfreq(late.size, 1 / coarse.rate)
@@ -167,7 +167,7 @@ def test_wobble_of_white_noise(rng):
 def test_wobble_of_the_papers_controller(frequency):
     """FACTS 1, corrections: true plate wobble is 0.041-0.045 um rms at 1 um of noise."""
     scene = replace(builtin_scenes()[f"grating-{frequency}"], duration=41.0, plant={"current_bits": 0})
-    wobble = render(scene, seed=1).summary()["wobble"]
+    wobble = render(scene, method="paper", seed=1).summary()["wobble"]
     # 40 s of 5.5 Hz noise bandwidth hold some 400 numbers: standard deviation 3.5 %
     assert 0.93 * 0.041 * UM < wobble < 1.07 * 0.045 * UM
 

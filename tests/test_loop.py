@@ -103,7 +103,7 @@ def test_a_texture_of_ones_own_needs_no_base_class():
         def waveform(self, time, position):
             return np.zeros_like(time)
 
-    recording = hr.render(hr.Scene(texture=Beat(), duration=0.2))
+    recording = hr.render(hr.Scene(texture=Beat(), duration=0.2), method="paper")
     np.testing.assert_array_equal(recording.target, np.broadcast_to([1e-5, 1e-5j], (1000, 2)))
 
 
@@ -174,3 +174,12 @@ def test_bad_arguments_are_refused():
     mono.drive_channels = 1
     with pytest.raises(ValueError, match=r"driver.drive_channels = 1: must be 2"):
         hr.render(TONE, driver=mono)
+
+
+@pytest.mark.parametrize("frequency", [47.0, 143.0, 261.0])
+def test_a_plate_that_is_not_the_one_designed_for_is_noticed(frequency):
+    """5 % of stiffness asks 3-8 % of the integral part, the plate designed for 0.2 % (noise)."""
+    scene = hr.Scene(texture=hr.Grating(frequency=frequency, amplitude=30e-6), duration=3.0)
+    hr.render(scene, driver=simulated(scene))
+    with pytest.warns(hr.PlateMismatch, match=r"integral part makes up for [3-8]\.\d % of a target \(bound 3 %\)"):
+        hr.render(scene, driver=simulated(scene, stiffness_1=1.05 * 22.4e3, stiffness_2=1.05 * 22.9e3))

@@ -11,24 +11,34 @@ from hapticrender.bands import Bands
 from hapticrender.control.bandmodel import BandModel
 from hapticrender.control.bank_kernels import (
     BAND_ROWS,
+    CONTACT,
+    E_IM,
+    E_RE,
     LOOP_ROWS,
+    R_IM,
+    R_RE,
     SCALE,
     TOUCH_ROWS,
     TRACK_ROWS,
     TRUST,
+    V_IM,
+    V_RE,
     BankNumbers,
     BankState,
     BankTables,
     bank_run,
 )
 from hapticrender.control.damping import choose_damping
+from hapticrender.control.kernels import WAVENUMBER
 from hapticrender.control.stability import Checked, Limits, checked_bandwidth
 from hapticrender.protocols import Array
 
-CONTACT = (0.05, 0.03)  # N: on, off
+CONTACT_LOAD = (0.05, 0.03)  # N: on, off
 RAMP_TIME = 0.05  # s: a target grows this long, so that it does not strike the modes
 FAST_POLE, FAST_SIGMAS = 30.0, 5.5  # Hz, of the sensor noise behind that pole
 SLOW_POLE, SLOW_SIGMAS = 4.0, 5.0
+SETTLED = 0.05  # share of a target below which its error counts as settled
+LEAST_WANTED = 3e-6  # m: below it the noise makes up for more than the device
 LIMITS = Limits(modulus=0.29, gain=1.4)  # crowded bands share one residual: 20 Hz apart they leave 0.30 and 1.42
 REMEMBERED = 256  # designs
 _KNOWN: dict[tuple[object, ...], Checked] = {}
@@ -92,6 +102,21 @@ class BankController:
             shaper=np.zeros((2, len(tables.speak))),
             sample=np.zeros(1, np.int64),
         )
+
+    @property
+    def mismatch(self) -> float:
+        """Largest share of a fixed band's target that the integral part adds on the untouched device, once settled.
+
+        There the law alone should do: what the integral has to make up for is what the device is not.
+        """
+        touch, band, loop = self.state.touch, self.state.band, self.state.loop
+        wanted = np.where(self.tables.tone[WAVENUMBER] == 0.0, np.hypot(band[R_RE], band[R_IM]), 0.0)
+        errors = np.hypot(loop[E_RE::LOOP_ROWS], loop[E_IM::LOOP_ROWS]).max(axis=0)
+        large = (wanted > LEAST_WANTED) & (errors < SETTLED * wanted)
+        if touch[CONTACT] or touch[TRUST] < 1.0 or touch[SCALE] < 1.0 or not large.any():
+            return 0.0
+        parts = np.hypot(loop[V_RE::LOOP_ROWS], loop[V_IM::LOOP_ROWS]).max(axis=0)
+        return float((parts[large] / wanted[large]).max())
 
     def run(self, sensed: Array, position: Array, wanted: Array) -> tuple[Array, Array, Array]:
         """Digest n samples; see `Controller`."""
@@ -174,8 +199,8 @@ def design_bank(
         ramp=period / RAMP_TIME,
         lowest=model.lowest_frequency,
         highest=min(model.highest_frequency, 0.4 * model.rate),
-        contact_on=CONTACT[0],
-        contact_off=CONTACT[1],
+        contact_on=CONTACT_LOAD[0],
+        contact_off=CONTACT_LOAD[1],
         drive_limit=float(model.drive_limit),
         drive_step=float(model.drive_step),
         peak_decay=math.exp(-period * lowest),
