@@ -29,8 +29,8 @@ bench: .venv/test.stamp ## run every benchmark
 	@for script in benchmarks/*.py; do echo "$$script"; $(RUN) "$$script" || exit 1; done
 
 picture: .venv/demo.stamp ## draw the picture in README.md anew
-	@.venv/bin/hapticrender render spatial-grating --out out/picture
-	@cp out/picture/picture.png docs/picture.png
+	@.venv/bin/hapticrender chart story --out out/chart
+	@cp out/chart/story.png docs/picture.png
 
 clean: ## remove the environment and everything that was built or written
 	@rm -rf .venv build dist out *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis

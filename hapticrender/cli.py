@@ -116,8 +116,8 @@ def _parser() -> argparse.ArgumentParser:
     identify.add_argument("--out", "-o", metavar="FILE", type=_path, help="write it as the [plant] table of a scene")
     identify.add_argument("--seed", metavar="N", type=_seed, default=0, help="seed of the noise (default: %(default)s)")
 
-    chart = _add_verb(verbs, "chart", _chart, "draw where each method is stable, as a picture and its data")
-    chart.add_argument("name", metavar="NAME", choices=["stability"], help="stability")
+    chart = _add_verb(verbs, "chart", _chart, "draw where each method is stable, or two methods under one finger")
+    chart.add_argument("name", metavar="NAME", choices=["stability", "story"], help="stability or story")
     chart.add_argument("--learnt", action="store_true", help="the finger already learnt, not the moment of touch")
     _add_out(chart, Path("out/chart"))
 
@@ -292,12 +292,18 @@ def _identify(arguments: argparse.Namespace) -> int:
 
 
 def _chart(arguments: argparse.Namespace) -> int:
-    from hapticrender import chart
-
     _check_folder("--out", arguments.out)
     arguments.out.mkdir(parents=True, exist_ok=True)
-    chart.stability(arguments.out / "stability.png", adapted=arguments.learnt)
-    print(arguments.out / "stability.png")
+    path = arguments.out / f"{arguments.name}.png"
+    if arguments.name == "story":
+        from hapticrender.story import draw_story
+
+        draw_story(path)
+    else:
+        from hapticrender import chart
+
+        chart.stability(path, adapted=arguments.learnt)
+    print(path)
     return 0
 
 
