@@ -46,3 +46,25 @@ def simulate(drive, load, rate, **finger):
         motion[i] = state[0], state[0] - REACH * state[1], state[0] + REACH * state[1]
         state = step[:n, :n] @ state + step[:n, n:] @ np.append(row, load)
     return motion
+
+
+def simulate_moving(drive, position, load, strength, finger, rate):
+    """The same with a 4th-order finger whose place, load and grip (a factor on m, b and k) change with every sample."""
+    state = np.zeros(6)  # x_c, theta, x_p, and rates
+    motion = np.zeros((len(drive), 3))
+    for i, row in enumerate(drive):
+        motion[i] = state[0], state[0] - REACH * state[1], state[0] + REACH * state[1]
+        if strength[i] > 0:
+            scale = strength[i]
+            skin = scale * np.array([finger.mass, finger.damping, finger.stiffness])
+            phalanx = scale * np.array([finger.phalanx_mass, finger.phalanx_damping, finger.phalanx_stiffness])
+            a, b = continuous(position[i], skin, phalanx)
+            keep, push = slice(None), np.append(row, load[i])
+        else:
+            a, b = continuous()
+            state[[2, 5]] = 0.0
+            keep, push = [0, 1, 3, 4], np.append(row, 0.0)
+        n = len(a)
+        step = expm(np.block([[a, b], [np.zeros((3, n + 3))]]) / rate)
+        state[keep] = step[:n, :n] @ state[keep] + step[:n, n:] @ push
+    return motion

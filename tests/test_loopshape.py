@@ -369,3 +369,14 @@ def test_importing_leaves_scipy_signal_alone():
     code = "import sys, hapticrender.control.loopshape; print('scipy.signal' in sys.modules)"
     found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=60)
     assert found.stdout.strip() == "False"
+
+
+def test_what_the_paper_calls_the_sensitivity_goes_from_reference_to_output():
+    """FACTS 1: T = C/(1 + L C) is the Butterworth that was asked for; S = 1/(1 + L C) = 1 - L T peaks at 1.553."""
+    loop = design(form="exact")
+    frequency = np.geomspace(0.01, 100, 20_000)
+    c, low = loop.controller.frequency_response(frequency), loop.low_pass.frequency_response(frequency)
+    t, s = c / (1 + low * c), 1 / (1 + low * c)
+    np.testing.assert_allclose(s, 1 - low * t, rtol=0, atol=1e-9)
+    assert abs(s).max() == pytest.approx(1.553, abs=5e-4)
+    np.testing.assert_allclose(abs(t), 1 / np.sqrt(1 + (frequency / 5.0) ** 4), rtol=1e-6)

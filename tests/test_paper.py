@@ -8,9 +8,11 @@ import pytest
 import hapticrender as hr
 from benchmarks.numpy_loop import NumpyPlate, NumpyPolar, run
 from hapticrender.bands import Bands
+from hapticrender.control.kernels import X_IM, X_RE
 from hapticrender.control.loopshape import TransferFunction, design, margins
 from hapticrender.control.methods import METHODS, method_named
 from hapticrender.control.methods.paper import CommonMode
+from hapticrender.control.stdft import StarSTDFT
 from hapticrender.plants.vibrotactile import Plate, PlateParameters
 from hapticrender.touch.mechanics import HEAVY_SECOND
 
@@ -69,6 +71,20 @@ def test_the_kernel_equals_its_naive_twin(method, rng):
     np.testing.assert_allclose(measured.sensed, sensed, rtol=0, atol=1e-9 * abs(sensed).max())
     np.testing.assert_allclose(drive, expected, rtol=0, atol=1e-9 * abs(expected).max())
     np.testing.assert_allclose(target, np.broadcast_to(bands.envelope, target.shape), rtol=1e-12)
+
+
+def test_it_listens_through_the_documented_estimator(rng):
+    """X of each side and band is what `StarSTDFT`, whose response is proven, makes of the same samples."""
+    parameters = PlateParameters(**IDEAL)
+    bands = tones((47.0, 1e-5), (111.0, 1e-5))
+    controller = METHODS["paper"].design(parameters.band_model(RATE, 1), bands)
+    sensed = 1e-5 * rng.standard_normal((400, 2))
+    controller.run(sensed, np.zeros(400), np.zeros(400))
+    phase = bands.carrier_phase(np.arange(400) / RATE, np.zeros(400))
+    sides = sensed @ controller.tables.listen.T
+    heard = StarSTDFT(bandwidth=10.0, rate=RATE).start(channels=2, bands=2).run(sides, phase)[-1]
+    loop = controller.state.loop.reshape(2, -1, 2)
+    np.testing.assert_allclose(loop[:, X_RE] + 1j * loop[:, X_IM], heard, rtol=1e-9)
 
 
 BASELINE = [20.0, 31.0, 47.0, 72.0, 111.0, 261.0, 400.0]

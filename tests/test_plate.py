@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from naive_plate import continuous, simulate
+from naive_plate import continuous, simulate, simulate_moving
 
 import hapticrender as hr
 from hapticrender.plants.vibrotactile import Plate, PlateParameters
@@ -58,6 +58,21 @@ def test_the_plate_is_integrated_exactly(rng, finger, position):
     motion = plate.run(drive).motion
     assert abs(motion).max() > 1e-5
     np.testing.assert_allclose(motion, expected, rtol=0, atol=3000 * 2**-52 * abs(expected).max())
+
+
+@pytest.mark.parametrize("scaled", [False, True])
+def test_a_finger_that_moves_presses_and_lifts_is_integrated_sample_by_sample(rng, scaled):
+    """By scipy's exponential of the plate frozen at each sample's place and grip; a new touch starts at rest."""
+    load = ((0.0, 0.05, 0.1), (0.2, 1.4, 0.5))
+    finger = hr.Finger(
+        hr.Sliding(0.5, 0.1), normal_load=load, touches=((0.0, 0.03), (0.05, 1.0)), mechanics=HEAVY, load_scaling=scaled
+    )
+    drive = rng.uniform(-2, 2, (500, 2))
+    time = np.arange(500) / 5000.0
+    expected = simulate_moving(drive, finger.position(time), finger.load(time), finger.strength(time), HEAVY, 5000.0)
+    motion = Plate(PlateParameters(**IDEAL), finger).run(drive).motion
+    np.testing.assert_allclose(motion, expected, rtol=0, atol=500 * 2**-50 * abs(expected).max())
+    assert len(set(finger.strength(time))) > (100 if scaled else 1)
 
 
 def test_a_run_equals_its_pieces(rng):
@@ -152,8 +167,15 @@ def test_static_load_and_position_from_the_sag():
         assert load == pytest.approx(0.5, rel=1e-6)
         assert found == pytest.approx(position, abs=1e-8)
     assert centre == pytest.approx(-11e-6, rel=0.05)  # FACTS 1: 0.5 N sags 11 um
-    with pytest.raises(ZeroDivisionError):
-        parameters.coil_spacing * (22.9e3 * -1e-5 / (22.4e3 * 0.0) + 1) ** -1
+
+    def printed(x1, x2):  # distance from transducer 2 towards 1, as in the paper
+        with np.errstate(divide="raise"):
+            return np.float64(55e-3) * (22.9e3 * np.float64(x2) / (22.4e3 * np.float64(x1)) + 1) ** -1
+
+    load, found = parameters.static_load(-4e-6, -1e-5)
+    assert printed(-4e-6, -1e-5) == pytest.approx(parameters.half_spacing - found, rel=1e-12)  # the same number
+    with pytest.raises(FloatingPointError):
+        printed(0.0, -1e-5)
     load, found = parameters.static_load(0.0, -1e-5)
     assert found == pytest.approx(parameters.half_spacing)
     with pytest.raises(ValueError, match="no net load"):
