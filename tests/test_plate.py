@@ -220,6 +220,11 @@ def test_amplifier_inverts_and_the_phase_cut_needs_the_sign_taken_out():
     """-V/5: voltage to displacement lies in 0..+180 deg, current to displacement in -180..0."""
     plate = PlateParameters()
     assert plate.amplifier_gain == pytest.approx(-0.1999, abs=5e-5)
+    drive = np.full((100, 2), 0.5)
+    nominal, doubled = (
+        Plate(PlateParameters(amplifier_r1=r1, **IDEAL), hr.Finger.absent()).run(drive).motion for r1 in (10e3, 5e3)
+    )
+    np.testing.assert_allclose(doubled, 2 * nominal, rtol=1e-12)  # half of R1 gives twice the current
     current = np.angle(loaded_gain(plate, np.linspace(20, 400, 500), NONE), deg=True)
     voltage = np.angle(-np.exp(1j * np.radians(current)), deg=True)
     assert current.max() < 0.0

@@ -41,6 +41,7 @@ class PlateTables(NamedTuple):
     coil_shape: float  # of the bending mode at the coils, 1 at the sensors
     centre_shape: float
     shape: Three  # wavenumber times a, and the weights of cosh and cos: shape of the bending mode at p/a
+    amplifier: float  # current that flows over current that is asked for
     current_limit: float  # A
     current_step: float  # A, 0: not quantised
     sensor_limit: float  # m
@@ -221,7 +222,8 @@ def plate_drive(tables, pending, cursor, current, drive):
         if latency > 0:
             due = pending[row, i]
             pending[row, i] = drive[i]
-        current[i] = quantise(due, tables.current_step, tables.current_limit) if math.isfinite(due) else 0.0
+        asked = quantise(due, tables.current_step, tables.current_limit) if math.isfinite(due) else 0.0
+        current[i] = tables.amplifier * asked
     if latency > 0:
         cursor[0] = (row + 1) % latency
 

@@ -39,6 +39,7 @@ if TYPE_CHECKING:
     from hapticrender.touch.finger import Finger, FingerMechanics
 
 PLACES = ("centre", "end 1", "end 2")
+NOMINAL_AMPLIFIER = (1 - 2e3 / 1.0) / 10e3  # A/V: the gain that a drive in A is turned into volts with
 TAYLOR_ROUNDING = 1e-17  # the first term left out of the series, relative to the state
 EXPECTED_BENDING = BendingMode(  # FACTS section 3 A: 1.1-1.4 kHz, either sign [E]; for a plate that was not measured
     frequency=1250.0, damping=0.01, coupling=(0.1 / 9.5e-3, 0.0), spread=150.0, measured=False
@@ -63,7 +64,8 @@ class PlateParameters:
     coil_spacing, glass_length : float, m
         Distance between the coils; length of the glass, the sensors sit at its ends.
     amplifier_r1, amplifier_r2, amplifier_rp : float, ohm
-        Transconductance amplifier, i = V/R1 (1 - R2/Rp).
+        Transconductance amplifier, i = V/R1 (1 - R2/Rp).  Drive is asked for in A, as the paper's parts would give it;
+        other parts give another current.
     current_limit : float, A
         Of each coil, > 0 (engineering default).
     current_bits : int
@@ -441,6 +443,7 @@ def _tables(parameters: PlateParameters, mechanics: FingerMechanics) -> PlateTab
         coil_shape=parameters.bending_coil,
         centre_shape=float(parameters.bending_shape(0.0)),
         shape=(wavenumber * parameters.half_spacing, grow, wave),
+        amplifier=parameters.amplifier_gain / NOMINAL_AMPLIFIER,
         current_limit=parameters.current_limit,
         current_step=parameters.current_step,
         sensor_limit=parameters.sensor_range / 2,
