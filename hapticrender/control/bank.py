@@ -143,48 +143,42 @@ def design_bank(
     method: str, model: BandModel, bands: Bands, rules: BankRules, *, feedback: bool = True
 ) -> BankController:
     """Apply the rules of FACTS section 3 (C, F): observer <= f0/2 and spacing/2 pi, loop <= f0/4, DC band <= f0/8."""
-    heard = rules.observer[0]
-    if not feedback:
-        rules = replace(rules, observer=(0.0, 0.0), integral=(0.0, 0.0, 0.0), inner=(0.0, 0.0), adapt=(-1.0, -1.0))
-    if (bands.wavenumber > 0.0).any():  # what is left over at one frequency is wrong at the next
-        rules = replace(rules, rest=(0.0, 0.0))
-    fixed = bands.frequency[bands.wavenumber == 0.0]
-    lowest = float(fixed.min(initial=model.lowest_frequency if (bands.wavenumber > 0).any() else np.inf))
-    apart = spacing(bands)
-    if apart == 0.0:
-        twice = np.sort(bands.frequency[bands.wavenumber == 0.0])
-        raise ValueError(
-            f"texture has two carriers at {twice[:-1][np.diff(twice) == 0.0][0]:g} Hz: must differ; add them up"
-        )
-    period = 1.0 / model.rate
-    heard = 2 * math.pi * min(heard, lowest / 2, apart / (2 * math.pi))
-    pole = [2 * math.pi * min(width, lowest / 2, apart / (2 * math.pi)) for width in rules.observer]
-    wait = model.delay * period  # integrator, observer and delay leave at least PHASE_MARGIN
-    fastest = [min(2 * math.pi * lowest / 4, PHASE_MARGIN / (wait + 1 / max(each, 1e-9))) for each in pole]
-    quiet, stirred = (min(rate, fastest[0]) for rate in rules.integral[:2])
-    awake = min(rules.integral[2], fastest[1])
-    learning = 1 / (2 * wait + LEARNING_TIME)
-    level = 2 * math.pi * min(6.0, lowest / rules.level) * period if feedback else 0.0
-    noise = np.sqrt((model.coordinate_from_sensed**2).sum(axis=1).max()) * max(model.sensed_noise, LEAST_NOISE)
-    damping = choose_damping(model, bending=model.bending) if any(rules.inner) else None
+    damping = choose_damping(model, bending=model.bending) if any(rules.inner) and feedback else None
     if damping is None or not damping.margins:
         rules = replace(rules, inner=(0.0, 0.0))
-    numbers = BankNumbers(
+    if (bands.wavenumber > 0.0).any():  # what is left over at one frequency is wrong at the next
+        rules = replace(rules, rest=(0.0, 0.0))
+    tables = BankTables(
+        numbers=_numbers(model, bands, rules, feedback),
+        tone=bands.tone(),
+        listen=np.ascontiguousarray(model.coordinate_from_sensed),
+        speak=np.linalg.pinv(model.force_from_drive),
+        mass=model.mass,
+        damping=model.damping,
+        stiffness=model.stiffness,
+        shape=np.eye(len(model.mass))[0],
+        taps=damping.taps if damping else np.zeros((len(model.mass), 1)),
+        grip=damping.grip if damping else np.zeros(len(model.mass)),
+    )
+    notes = [damping.text() if damping else "inner loop off: the method has none"]
+    if feedback:
+        checked = _checked(tables)
+        tables = tables._replace(numbers=checked.tables.numbers)
+        notes += [*checked.notes, *(f"{state}: {margins}" for state, margins in checked.margins.items())]
+    return BankController(method, tables, "\n".join(notes))
+
+
+def _numbers(model: BandModel, bands: Bands, rules: BankRules, feedback: bool) -> BankNumbers:
+    """Numbers of the compiled step: what the rules allow on this device for these bands."""
+    period = 1.0 / model.rate
+    noise = np.sqrt((model.coordinate_from_sensed**2).sum(axis=1).max()) * max(model.sensed_noise, LEAST_NOISE)
+    lowest = _lowest(model, bands)
+    return BankNumbers(
         rate=float(model.rate),
         analysed=bands.envelope is None,
         error_observer=rules.error_observer,
         lead=(model.delay + 0.5) * period,
-        reference=2 * heard * period,
-        observer=2 * pole[0] * period,
-        observer_awake=2 * pole[1] * period,
-        crowd_speed=crowd_speed(bands, max(heard, *pole)),
-        dc=1.6 * level,
-        dc_drift=level**2,
-        integral=quiet,
-        integral_stirred=stirred,
-        integral_awake=awake,
-        adapt=min(rules.adapt[0], learning),
-        adapt_awake=min(rules.adapt[1], learning),
+        **_paces(model, bands, rules, lowest, feedback),
         rest=rules.rest[0],
         rest_awake=rules.rest[1],
         inner=rules.inner[0],
@@ -207,24 +201,42 @@ def design_bank(
         back=1.0 / BACK_TIME,
         sensed_limit=float(model.sensed_limit),
     )
-    tables = BankTables(
-        numbers=numbers,
-        tone=bands.tone(),
-        listen=np.ascontiguousarray(model.coordinate_from_sensed),
-        speak=np.linalg.pinv(model.force_from_drive),
-        mass=model.mass,
-        damping=model.damping,
-        stiffness=model.stiffness,
-        shape=np.eye(len(model.mass))[0],
-        taps=damping.taps if damping else np.zeros((len(model.mass), 1)),
-        grip=damping.grip if damping else np.zeros(len(model.mass)),
-    )
-    notes = [damping.text() if damping else "inner loop off: the method has none"]
-    if feedback:
-        checked = _checked(tables)
-        tables = tables._replace(numbers=checked.tables.numbers)
-        notes += [*checked.notes, *(f"{state}: {margins}" for state, margins in checked.margins.items())]
-    return BankController(method, tables, "\n".join(notes))
+
+
+def _lowest(model: BandModel, bands: Bands) -> float:
+    """Lowest carrier (Hz): of the fixed ones, and of what a moving finger makes of the others."""
+    locked = bands.wavenumber > 0.0
+    return float(bands.frequency[~locked].min(initial=model.lowest_frequency if locked.any() else np.inf))
+
+
+def _paces(model: BandModel, bands: Bands, rules: BankRules, lowest: float, feedback: bool) -> dict[str, float]:
+    """How fast observer, integral, adaptation and DC band may run, by lowest carrier (Hz), spacing and delay."""
+    apart = spacing(bands)
+    if apart == 0.0:
+        twice = np.sort(bands.frequency[bands.wavenumber == 0.0])
+        raise ValueError(
+            f"texture has two carriers at {twice[:-1][np.diff(twice) == 0.0][0]:g} Hz: must differ; add them up"
+        )
+    period = 1.0 / model.rate
+    wait = model.delay * period  # integrator, observer and delay leave at least PHASE_MARGIN
+    pole = [2 * math.pi * min(width, lowest / 2, apart / (2 * math.pi)) for width in rules.observer]
+    fastest = [min(2 * math.pi * lowest / 4, PHASE_MARGIN / (wait + 1 / each)) for each in pole]
+    learning = 1 / (2 * wait + LEARNING_TIME)
+    level = 2 * math.pi * min(6.0, lowest / rules.level) * period
+    paces = {
+        "observer": 2 * pole[0] * period,
+        "observer_awake": 2 * pole[1] * period,
+        "dc": 1.6 * level,
+        "dc_drift": level**2,
+        "integral": min(rules.integral[0], fastest[0]),
+        "integral_stirred": min(rules.integral[1], fastest[0]),
+        "integral_awake": min(rules.integral[2], fastest[1]),
+        "adapt": min(rules.adapt[0], learning),
+        "adapt_awake": min(rules.adapt[1], learning),
+    }
+    if not feedback:
+        paces = dict.fromkeys(paces, 0.0) | {"adapt": -1.0, "adapt_awake": -1.0}
+    return paces | {"reference": 2 * pole[0] * period, "crowd_speed": crowd_speed(bands, max(pole))}
 
 
 def _checked(tables: BankTables) -> Checked:
