@@ -2,11 +2,18 @@
 
 import json
 
+import numpy as np
 import pytest
 
 import hapticrender as hr
 from hapticrender import accuracy, defaults
+from hapticrender.drivers.simulated import SimulatedDriver
+from hapticrender.plants.identify import identify, require_delay
+from hapticrender.plants.vibrotactile import Plate, PlateParameters
 from hapticrender.story import draw_story
+from hapticrender.touch.mechanics import FingerMechanics
+
+RANGES = ((1e-4, 5e-4), (0.5, 12.0), (400.0, 12e3), (1e-3, 10e-3), (0.3, 4.0), (60.0, 900.0))  # skin, then phalanx
 
 QUICK = ("slide", "touch", "chirp", "comb", "overload")
 LONG = tuple(case for case in accuracy.CASES if case not in QUICK)
@@ -72,3 +79,28 @@ def test_the_story_is_drawn(tmp_path):
     pytest.importorskip("matplotlib")
     draw_story(tmp_path / "story.png")
     assert (tmp_path / "story.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_an_unknown_delay_is_detected_and_refused():
+    """A device that is one sample later than its driver says: found within 0.01 sample, refused by name."""
+    believed, late = PlateParameters(), PlateParameters(delay=2)
+    driver = SimulatedDriver(Plate(late, hr.Finger.absent()))
+    driver.delay = 1  # what a driver says that does not know
+    with driver:
+        found = identify(driver, believed)
+    assert found.estimates["delay"].value == pytest.approx(2.0, abs=0.01)
+    with pytest.raises(
+        hr.DesignError, match=r"delay = 2\.00 samples: the controller is designed for 1, must be within 0\.25"
+    ):
+        require_delay(found, believed)
+    require_delay(found, late)
+
+
+def test_no_limit_cycle_under_fingers_that_nobody_designed_for(rng):
+    """24 random fingers of FACTS section 3's ranges come to rest, and peak below its worst of 32 %."""
+    log = [rng.uniform(np.log(low), np.log(high), 24) for low, high in RANGES]
+    names = ("mass", "damping", "stiffness", "phalanx_mass", "phalanx_damping", "phalanx_stiffness")
+    fingers = [(FingerMechanics(order=4, **dict(zip(names, row, strict=True))), 0.8) for row in np.exp(log).T]
+    found = accuracy.touch(accuracy.Bench(method=defaults.METHOD), fingers, (15e-3,))
+    assert found["left"] < 0.05
+    assert found["peak"] < 0.32

@@ -430,6 +430,29 @@ def compare(met: Identified | PlateParameters, designed: BandModel | PlateParame
     return differences
 
 
+def require_delay(met: Identified, designed: BandModel | PlateParameters) -> None:
+    """Refuse a delay that the design does not know: two samples too many already make the loop diverge at 400 Hz.
+
+    Parameters
+    ----------
+    met : Identified
+        The plate as found.
+    designed : BandModel or PlateParameters
+        What the controller was, or will be, designed from.
+
+    Raises
+    ------
+    DesignError
+        The delays lie more than a quarter of a sample, and more than chance, apart.
+    """
+    found, known = met.estimates["delay"], float(designed.delay)
+    if abs(found.value - known) > ABSORBED["delay"] + DIFFERS * found.interval:
+        raise DesignError(
+            f"delay = {found.value:.2f} samples: the controller is designed for {known:g}, must be within "
+            f"{ABSORBED['delay']:g}; give the driver a delay of {round(found.value)}"
+        )
+
+
 def _beyond_absorbed(difference: Difference) -> bool:
     relative = abs(difference.designed) if difference.name in MECHANICAL else 1.0
     change = abs(difference.met - difference.designed)
