@@ -183,3 +183,13 @@ def test_a_plate_that_is_not_the_one_designed_for_is_noticed(frequency):
     hr.render(scene, driver=simulated(scene))
     with pytest.warns(hr.PlateMismatch, match=r"integral part makes up for [3-8]\.\d % of a target \(bound 3 %\)"):
         hr.render(scene, driver=simulated(scene, stiffness_1=1.05 * 22.4e3, stiffness_2=1.05 * 22.9e3))
+
+
+def test_a_block_device_has_no_inner_loop_and_holds_without():
+    """Blocks of 64 at 48 kHz: taps on stale noise would drive the coils to their limit; the rest of h2 keeps 10 %."""
+    scene = dataclasses.replace(hr.builtin_scenes()["sliding"], duration=2.0)
+    session = loop.prepare(scene, driver=simulated(scene, block=64, rate=48_000.0, delay=64))
+    assert session.controller().note.startswith("inner loop off: a delay of 64 samples is that of a block device")
+    recording = loop.run(session)
+    assert recording.summary()["passed"]
+    assert abs(recording.drive).max() < 0.1

@@ -42,6 +42,7 @@ LEAST_WANTED = 3e-6  # m: below it the noise makes up for more than the device
 LIMITS = Limits(modulus=0.29, gain=1.4)  # crowded bands share one residual: 20 Hz apart they leave 0.30 and 1.42
 REMEMBERED = 256  # designs
 _KNOWN: dict[tuple[object, ...], Checked] = {}
+PROMPT = 8  # samples: a longer delay is that of a block device, where the inner loop would act on stale noise
 PHASE_MARGIN = math.pi / 4  # rad: 90 deg less integral gain times (delay + 1/observer pole)
 LEARNING_TIME = 1 / 60  # s: fastest adaptation of the finger; a delay counts twice
 BACK_TIME = 0.02  # s: back-calculation at the limit
@@ -143,7 +144,8 @@ def design_bank(
     method: str, model: BandModel, bands: Bands, rules: BankRules, *, feedback: bool = True
 ) -> BankController:
     """Apply the rules of FACTS section 3 (C, F): observer <= f0/2 and spacing/2 pi, loop <= f0/4, DC band <= f0/8."""
-    damping = choose_damping(model, bending=model.bending) if any(rules.inner) and feedback else None
+    prompt = model.delay <= PROMPT
+    damping = choose_damping(model, bending=model.bending) if any(rules.inner) and feedback and prompt else None
     if damping is None or not damping.margins:
         rules = replace(rules, inner=(0.0, 0.0))
     if (bands.wavenumber > 0.0).any():  # what is left over at one frequency is wrong at the next
@@ -160,7 +162,8 @@ def design_bank(
         taps=damping.taps if damping else np.zeros((len(model.mass), 1)),
         grip=damping.grip if damping else np.zeros(len(model.mass)),
     )
-    notes = [damping.text() if damping else "inner loop off: the method has none"]
+    why = "the method has none" if prompt else f"a delay of {model.delay} samples is that of a block device"
+    notes = [damping.text() if damping else f"inner loop off: {why}"]
     if feedback:
         checked = _checked(tables)
         tables = tables._replace(numbers=checked.tables.numbers)
