@@ -391,7 +391,10 @@ def test_an_interrupted_demo_keeps_what_it_has(run, two_tiny_scenes, tmp_path, m
 def test_an_interrupted_run_leaves_its_journal(tmp_path, tiny):
     tiny.write_text(TINY.replace("duration = 0.1", "duration = 3000.0"))
     journal = tmp_path / "out" / "recording.au"
-    with process("render", tiny, "--out", tmp_path / "out") as child:
+    heeding = {
+        "preexec_fn": lambda: signal.signal(signal.SIGINT, signal.SIG_DFL)
+    }  # a shell's background job ignores it
+    with process("render", tiny, "--out", tmp_path / "out", **heeding) as child:
         wait_until(lambda: journal.exists() and journal.stat().st_size > 2e6, child)
         child.send_signal(signal.SIGINT)
         _, errors = child.communicate(timeout=60)
