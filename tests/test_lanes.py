@@ -1,0 +1,161 @@
+"""Explicit vectors against plain numpy, lane by lane."""
+
+import numpy as np
+import pytest
+
+from hapticrender._jit import kernel
+from hapticrender._lanes import (
+    ALIGNMENT,
+    WIDTH,
+    aligned,
+    any_of,
+    floor,
+    high,
+    lanes,
+    low,
+    nearest,
+    padded,
+    put,
+    read,
+    root,
+    select,
+    size,
+    total,
+    write,
+)
+
+KINDS = [np.float64, np.float32]
+
+
+@kernel
+def arithmetic(a, out, factor):
+    """One row of results a line, the same written for numpy below."""
+    for t in range(a.shape[0]):
+        x, y = lanes(a, t, 0), lanes(a, t, 1)
+        put(out, t, 0, x + y)
+        put(out, t, 1, x - y)
+        put(out, t, 2, x * y + factor)
+        put(out, t, 3, x / y)
+        put(out, t, 4, -x)
+        put(out, t, 5, root(size(x)))
+        put(out, t, 6, floor(x))
+        put(out, t, 7, nearest(x))
+        put(out, t, 8, low(x, y))
+        put(out, t, 9, high(x, 0.5))
+        put(out, t, 10, select((x > y) & (y >= 0.0) | (x <= -1.0), x, 2.0 * y))
+        put(out, t, 11, 3 * x)
+
+
+def expected(x, y, factor):
+    return [
+        x + y,
+        x - y,
+        x * y + factor,
+        x / y,
+        -x,
+        np.sqrt(abs(x)),
+        np.floor(x),
+        np.rint(x),
+        np.minimum(x, y),
+        np.maximum(x, 0.5),
+        np.where((x > y) & (y >= 0.0) | (x <= -1.0), x, 2.0 * y),
+        3 * x,
+    ]
+
+
+@pytest.mark.parametrize("dtype", KINDS)
+def test_every_operation_equals_numpy(dtype, rng):
+    width = WIDTH[np.dtype(dtype)]
+    a = aligned((3, 2, width), dtype)
+    a[:] = 2.0 * rng.standard_normal(a.shape)
+    out = aligned((3, 12, width), dtype)
+    arithmetic(a, out, 0.25)
+    for row, wanted in enumerate(expected(a[:, 0], a[:, 1], dtype(0.25))):
+        np.testing.assert_allclose(out[:, row], wanted, rtol=4 * np.finfo(dtype).eps, atol=np.finfo(dtype).eps)
+
+
+@kernel
+def summed(a, like):
+    acc = 0.0
+    for t in range(a.shape[0]):
+        acc += lanes(a, t, 0)
+    return total(like, acc)
+
+
+@pytest.mark.parametrize("dtype", KINDS)
+def test_a_sum_over_lanes_is_a_number_where_the_scenario_is_one(dtype, rng):
+    a = aligned((4, 1, WIDTH[np.dtype(dtype)]), dtype)
+    a[:] = rng.standard_normal(a.shape)
+    bound = a.size * float(np.finfo(dtype).eps) * float(abs(a).sum())
+    assert summed(a, 1.0) == pytest.approx(float(a.sum(dtype=float)), abs=bound)
+
+
+@kernel
+def summed_by_lane(a, like, out):
+    acc = 0.0
+    for t in range(a.shape[0]):
+        acc += lanes(a, t, 0)
+    put(out, 0, 0, total(lanes(like, 0, 0), acc))
+
+
+def test_a_sum_stays_apart_where_lanes_are_scenarios(rng):
+    a, like, out = aligned((4, 1, 8)), aligned((1, 1, 8)), aligned((1, 1, 8))
+    a[:] = rng.standard_normal(a.shape)
+    summed_by_lane(a, like, out)
+    np.testing.assert_allclose(out[0, 0], a[:, 0].sum(axis=0), rtol=1e-14)
+
+
+@kernel
+def both(x, y, z):
+    """The same source for plain floats."""
+    mask = x > y
+    return select(mask, low(x, z), high(y, z)), any_of(mask), root(z), floor(x), nearest(x), size(x), total(x, y)
+
+
+def test_plain_floats_run_through_the_same_source():
+    assert both(1.7, -2.0, 9.0) == (1.7, True, 3.0, 1.0, 2.0, 1.7, -2.0)
+    assert both(-1.7, 2.0, 9.0) == (9.0, False, 3.0, -2.0, -2.0, 1.7, 2.0)
+
+
+@kernel
+def moved(shared, by):
+    """A quantity of the scenario: a number, or one a lane."""
+    write(shared, 1, read(shared, 0) + by)
+
+
+def test_a_scenarios_own_numbers_are_plain_or_lanes(rng):
+    alone, many = np.array([0.5, 0.0]), aligned((2, 8))
+    many[0] = rng.standard_normal(8)
+    moved(alone, 0.25)
+    moved(many, 0.25)
+    assert alone[1] == 0.75
+    np.testing.assert_allclose(many[1], many[0] + 0.25, rtol=1e-15)
+
+
+@kernel
+def seen(a, bound):
+    return any_of(lanes(a, 0, 0) > bound)
+
+
+def test_any_lane_is_enough():
+    a = aligned((1, 1, 8))
+    assert not seen(a, 0.5)
+    a[0, 0, 7] = 1.0
+    assert seen(a, 0.5)
+
+
+def test_what_is_not_a_number_gives_way():
+    @kernel
+    def bounded(x):
+        return low(x, 2.0), high(x, -2.0)
+
+    assert bounded(np.nan) == (2.0, -2.0)
+
+
+@pytest.mark.parametrize(("count", "dtype", "rows"), [(1, float, 1), (8, float, 1), (9, float, 2), (17, np.float32, 2)])
+def test_rows_are_padded_and_aligned(count, dtype, rows):
+    assert padded(count, dtype) == rows
+    array = aligned((rows, 3, WIDTH[np.dtype(dtype)]), dtype)
+    assert array.ctypes.data % ALIGNMENT == 0
+    assert array.flags.c_contiguous
+    assert not array.any()
