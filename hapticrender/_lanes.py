@@ -326,37 +326,55 @@ def put(typingctx: Any, array: Any, i: Any, j: Any, value: Any) -> Any:
 
 
 @intrinsic
-def read(typingctx: Any, array: Any, i: Any) -> Any:
-    """Take a scenario's own number array[i], or the row array[i, :] where every lane is a scenario."""
-    if _is_rows(array, 1):
-        kind = _lane(array)
-        return kind(array, types.intp), lambda context, builder, sig, args: builder.load(
-            _address(context, builder, sig.args[0], *args), align=_wide(sig.args[0])
-        )
-    if isinstance(array, types.Array) and array.ndim == 1:
-        return array.dtype(array, types.intp), lambda context, builder, sig, args: builder.load(
-            _number(context, builder, sig.args[0], *args)
-        )
-    return None
-
-
-@intrinsic
-def write(typingctx: Any, array: Any, i: Any, value: Any) -> Any:
-    """Write a scenario's own number array[i], or the row array[i, :] where every lane is a scenario."""
-    rows = _is_rows(array, 1)
-    if not rows and not (isinstance(array, types.Array) and array.ndim == 1):
+def read(typingctx: Any, array: Any, *index: Any) -> Any:
+    """Take a scenario's own number array[i, ...], or the row array[i, ..., :] where every lane is a scenario."""
+    index = index[0] if len(index) == 1 and isinstance(index[0], types.BaseTuple) else index
+    count = len(index)
+    rows = _is_rows(array, count)
+    if not rows and not _is_numbers(array, count):
         return None
 
     def build(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        where = cgutils.unpack_tuple(builder, args[1]) if len(args) == 2 and count else args[1:]
         if rows:
-            builder.store(args[2], _address(context, builder, sig.args[0], *args[:2]), align=_wide(sig.args[0]))
+            return builder.load(_address(context, builder, sig.args[0], args[0], *where), align=_wide(sig.args[0]))
+        return builder.load(_number(context, builder, sig.args[0], args[0], *where))
+
+    kind = _lane(array) if rows else array.dtype
+    return kind(array, types.StarArgTuple.from_types([types.intp] * count)), build
+
+
+@intrinsic
+def write(typingctx: Any, value: Any, array: Any, *index: Any) -> Any:
+    """Write a scenario's own number array[i, ...], or the row array[i, ..., :] where every lane is a scenario."""
+    index = index[0] if len(index) == 1 and isinstance(index[0], types.BaseTuple) else index
+    count = len(index)
+    rows = _is_rows(array, count)
+    if not rows and not _is_numbers(array, count):
+        return None
+
+    def build(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        where = cgutils.unpack_tuple(builder, args[2])
+        if rows:
+            at = _address(context, builder, sig.args[1], args[1], *where)
+            builder.store(args[0], at, align=_wide(sig.args[1]))
         else:
-            builder.store(args[2], _number(context, builder, sig.args[0], *args[:2]))
+            builder.store(args[0], _number(context, builder, sig.args[1], args[1], *where))
         return context.get_dummy_value()
 
-    return types.none(array, types.intp, _lane(array) if rows else array.dtype), build
+    kind = _lane(array) if rows else array.dtype
+    return types.none(kind, array, types.StarArgTuple.from_types([types.intp] * count)), build
 
 
-def _number(context: Any, builder: Any, kind: Any, array: Any, i: Any) -> Any:
-    """Pointer to array[i] of a 1-D array."""
-    return builder.gep(cgutils.create_struct_proxy(kind)(context, builder, value=array).data, [i])
+def _is_numbers(kind: Any, indices: int) -> bool:
+    return isinstance(kind, types.Array) and kind.layout == "C" and kind.ndim == indices
+
+
+def _number(context: Any, builder: Any, kind: Any, array: Any, *where: Any) -> Any:
+    """Pointer to one number of an array."""
+    data = cgutils.create_struct_proxy(kind)(context, builder, value=array)
+    shape = cgutils.unpack_tuple(builder, data.shape, kind.ndim)
+    at = where[0]
+    for axis, index in enumerate(where[1:], 1):
+        at = builder.add(builder.mul(at, shape[axis]), index)
+    return builder.gep(data.data, [at])

@@ -120,7 +120,7 @@ def test_plain_floats_run_through_the_same_source():
 @kernel
 def moved(shared, by):
     """A quantity of the scenario: a number, or one a lane."""
-    write(shared, 1, read(shared, 0) + by)
+    write(read(shared, 0) + by, shared, 1)
 
 
 def test_a_scenarios_own_numbers_are_plain_or_lanes(rng):
@@ -130,6 +130,21 @@ def test_a_scenarios_own_numbers_are_plain_or_lanes(rng):
     moved(many, 0.25)
     assert alone[1] == 0.75
     np.testing.assert_allclose(many[1], many[0] + 0.25, rtol=1e-15)
+
+
+@kernel
+def crossed(table):
+    """Element by row and column, in a plain table or in one whose lanes are scenarios."""
+    write(read(table, 0, 1) - read(table, 1, 0), table, 1, 1)
+
+
+def test_tables_are_read_by_row_and_column():
+    alone, many = np.arange(4.0).reshape(2, 2), aligned((2, 2, 8))
+    many[:] = np.arange(4.0).reshape(2, 2, 1)
+    crossed(alone)
+    crossed(many)
+    assert alone[1, 1] == -1.0
+    assert np.array_equal(many[1, 1], -np.ones(8))
 
 
 @kernel
