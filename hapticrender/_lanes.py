@@ -67,6 +67,10 @@ class MaskType(types.Type):
         self.width = width
         super().__init__(f"mask({width})")
 
+    def can_convert_from(self, typingctx: Any, other: Any) -> Any:
+        """Take a plain truth: it holds in every lane."""
+        return Conversion.safe if isinstance(other, types.Boolean) else None
+
 
 def _element(dtype: Any) -> ir.Type:
     return ir.FloatType() if dtype == types.float32 else ir.DoubleType()
@@ -96,6 +100,11 @@ def _repeat(builder: Any, value: Any, width: int) -> Any:
 @lower_cast(types.Integer, LaneType)
 def _cast_number(context: Any, builder: Any, fromty: Any, toty: LaneType, value: Any) -> Any:
     return _repeat(builder, context.cast(builder, value, fromty, toty.dtype), toty.width)
+
+
+@lower_cast(types.Boolean, MaskType)
+def _cast_truth(context: Any, builder: Any, fromty: Any, toty: MaskType, value: Any) -> Any:
+    return _repeat(builder, context.cast(builder, value, fromty, types.boolean), toty.width)
 
 
 def _lane_of(*kinds: Any) -> LaneType | None:
@@ -144,7 +153,7 @@ def _register_mask(function: Any, name: str) -> None:
     class Template(AbstractTemplate):
         def generic(self, args: Any, kws: Any) -> Any:
             mask = next((kind for kind in args if isinstance(kind, MaskType)), None)
-            same = mask is not None and all(kind == mask for kind in args)
+            same = mask is not None and all(kind == mask or isinstance(kind, types.Boolean) for kind in args)
             return signature(mask, mask, mask) if same and len(args) == 2 else None
 
     infer_global(function)(Template)
