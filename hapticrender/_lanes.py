@@ -335,6 +335,54 @@ def put(typingctx: Any, array: Any, i: Any, j: Any, value: Any) -> Any:
 
 
 @intrinsic
+def put_pairs(typingctx: Any, array: Any, i: Any, re: Any, im: Any) -> Any:
+    """Write W complex numbers from array[i * W] on, as many as there is room for; or rows array[i, 0] and array[i, 1].
+
+    The first form is for a complex array of bands, the second for scenarios side by side, shape (bands, 2, W).
+    """
+    if not (isinstance(array, types.Array) and isinstance(re, LaneType) and re == im):
+        return None
+
+    def build(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        kind, (where, index, first, second), width = sig.args[0], args, re.width
+        if kind.ndim == 3:
+            for j, value in enumerate((first, second)):
+                at = _address(context, builder, kind, where, index, ir.IntType(64)(j))
+                builder.store(value, at, align=_wide(kind))
+            return context.get_dummy_value()
+        data = cgutils.create_struct_proxy(kind)(context, builder, value=where)
+        element = _element(kind.dtype.underlying_float)
+        first, second = (_converted(builder, value, element) for value in (first, second))
+        start = builder.mul(index, ir.IntType(64)(width))
+        room = builder.sub(cgutils.unpack_tuple(builder, data.shape, 1)[0], start)
+        numbers = builder.gep(builder.bitcast(data.data, element.as_pointer()), [builder.shl(start, ir.IntType(64)(1))])
+        with builder.if_else(builder.icmp_signed(">=", room, ir.IntType(64)(width))) as (whole, part):
+            with whole:
+                order = [lane for i in range(width) for lane in (i, width + i)]
+                mixed = builder.shuffle_vector(
+                    first, second, ir.Constant(ir.VectorType(ir.IntType(32), 2 * width), order)
+                )
+                builder.store(mixed, builder.bitcast(numbers, mixed.type.as_pointer()), align=8)
+            with part:
+                for lane in range(width):
+                    with builder.if_then(builder.icmp_signed(">", room, ir.IntType(64)(lane))):
+                        for j, value in enumerate((first, second)):
+                            at = builder.gep(numbers, [ir.IntType(64)(2 * lane + j)])
+                            builder.store(builder.extract_element(value, ir.IntType(32)(lane)), at)
+        return context.get_dummy_value()
+
+    return types.none(array, types.intp, re, im), build
+
+
+def _converted(builder: Any, value: Any, element: Any) -> Any:
+    """Vector of another float type."""
+    kind = ir.VectorType(element, value.type.count)
+    if kind == value.type:
+        return value
+    return builder.fpext(value, kind) if element == ir.DoubleType() else builder.fptrunc(value, kind)
+
+
+@intrinsic
 def read(typingctx: Any, array: Any, *index: Any) -> Any:
     """Take a scenario's own number array[i, ...], or the row array[i, ..., :] where every lane is a scenario."""
     index = index[0] if len(index) == 1 and isinstance(index[0], types.BaseTuple) else index

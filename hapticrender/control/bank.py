@@ -9,25 +9,9 @@ import numpy as np
 
 from hapticrender.bands import Bands
 from hapticrender.control.bandmodel import BandModel
-from hapticrender.control.bank_kernels import (
-    BAND_ROWS,
-    CONTACT,
-    E_IM,
-    E_RE,
-    LOOP_ROWS,
-    R_IM,
-    R_RE,
-    SCALE,
-    TOUCH_ROWS,
-    TRACK_ROWS,
-    TRUST,
-    V_IM,
-    V_RE,
-    BankNumbers,
-    BankState,
-    BankTables,
-    bank_run,
-)
+from hapticrender.control import bank_rows as row
+from hapticrender.control.bank_kernels import bank_run
+from hapticrender.control.bank_state import BankNumbers, BankTables, across_bands, bank_state
 from hapticrender.control.damping import choose_damping
 from hapticrender.control.kernels import WAVENUMBER
 from hapticrender.control.stability import Checked, Limits, checked_bandwidth
@@ -85,24 +69,11 @@ class BankController:
     """
 
     def __init__(self, method: str, tables: BankTables, note: str = "") -> None:
-        coordinates, bands = len(tables.listen), tables.tone.shape[1]
         self.method = method
-        self.n_bands = bands
+        self.n_bands = tables.tone.shape[1]
         self.tables = tables
         self.note = note
-        touch = np.zeros(TOUCH_ROWS)
-        touch[SCALE] = touch[TRUST] = 1.0
-        self.state = BankState(
-            band=np.zeros((BAND_ROWS, bands)),
-            loop=np.zeros((coordinates * LOOP_ROWS, bands)),
-            track=np.zeros(TRACK_ROWS),
-            touch=touch,
-            level=np.zeros((2, coordinates)),
-            past=np.zeros((coordinates, tables.taps.shape[1])),
-            residual=np.zeros((3, coordinates)),
-            shaper=np.zeros((2, len(tables.speak))),
-            sample=np.zeros(1, np.int64),
-        )
+        self.state = bank_state(tables)
 
     @property
     def mismatch(self) -> float:
@@ -111,13 +82,19 @@ class BankController:
         There the law alone should do: what the integral has to make up for is what the device is not.
         """
         touch, band, loop = self.state.touch, self.state.band, self.state.loop
-        wanted = np.where(self.tables.tone[WAVENUMBER] == 0.0, np.hypot(band[R_RE], band[R_IM]), 0.0)
-        errors = np.hypot(loop[E_RE::LOOP_ROWS], loop[E_IM::LOOP_ROWS]).max(axis=0)
-        large = (wanted > LEAST_WANTED) & (errors < SETTLED * wanted)
-        if touch[CONTACT] or touch[TRUST] < 1.0 or touch[SCALE] < 1.0 or not large.any():
-            return 0.0
-        parts = np.hypot(loop[V_RE::LOOP_ROWS], loop[V_IM::LOOP_ROWS]).max(axis=0)
-        return float((parts[large] / wanted[large]).max())
+        coordinates = range(0, loop.shape[1], row.LOOP_ROWS)
+
+        def largest(re: int, im: int) -> Array:
+            sizes = [
+                np.hypot(*(across_bands(loop, base + part, self.n_bands) for part in (re, im))) for base in coordinates
+            ]
+            return np.max(sizes, axis=0)
+
+        size = np.hypot(*(across_bands(band, part, self.n_bands) for part in (row.R_RE, row.R_IM)))
+        wanted = np.where(self.tables.tone[WAVENUMBER] == 0.0, size, 0.0)
+        large = (wanted > LEAST_WANTED) & (largest(row.E_RE, row.E_IM) < SETTLED * wanted)
+        settled = touch[row.CONTACT] == 0.0 and touch[row.TRUST] == 1.0 and touch[row.SCALE] == 1.0
+        return float((largest(row.V_RE, row.V_IM)[large] / wanted[large]).max()) if settled and large.any() else 0.0
 
     def run(self, sensed: Array, position: Array, wanted: Array) -> tuple[Array, Array, Array]:
         """Digest n samples; see `Controller`."""
@@ -158,7 +135,7 @@ def design_bank(
         mass=model.mass,
         damping=model.damping,
         stiffness=model.stiffness,
-        shape=np.eye(len(model.mass))[0],
+        shape=(1.0, *[0.0] * (len(model.mass) - 1)),
         taps=damping.taps if damping else np.zeros((len(model.mass), 1)),
         grip=damping.grip if damping else np.zeros(len(model.mass)),
     )
@@ -244,7 +221,7 @@ def _paces(model: BandModel, bands: Bands, rules: BankRules, lowest: float, feed
 
 def _checked(tables: BankTables) -> Checked:
     """Check the bandwidth; a design that was checked before, as a run repeats its own, is remembered."""
-    key = (tables.numbers, *(array.tobytes() for array in tables[1:]))
+    key = (tables.numbers, *(np.asarray(each).tobytes() for each in tables[1:]))
     if key not in _KNOWN:
         if len(_KNOWN) >= REMEMBERED:
             _KNOWN.clear()

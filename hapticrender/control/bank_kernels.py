@@ -1,497 +1,415 @@
-"""Compiled tick of the band bank: residual-coupled observer, dynamic-stiffness law, inner damping, finger, two speeds.
+"""Compiled tick of the band bank: residual-coupled observer, dynamic-stiffness law, inner damping, two speeds.
 
 One step serves the methods that work in the device's coordinates (FACTS
 section 3): the observer watches the error (H2) or the signal (H), the law
-inverts D + D' d/dt, the inner loop damps the deviation at sample rate.
-
-Symbols: R wanted, V commanded and E error envelope of a coordinate, v = V - R
-the integral part, D dynamic stiffness (N/m), z the finger's, h = [1, g] with
-g = p/a its place, eps the deviation y - sum Re V e^{j phi} at sample rate.
-Everything a band owns is a column, the band index innermost; rows are named.
+inverts D + D' d/dt, the inner loop damps the deviation at sample rate.  Symbols
+and rows are those of `bank_rows`.  The same source steps one scenario, whose
+bands are the lanes, and as many scenarios as there are lanes, side by side.
 """
 
 from __future__ import annotations
 
-import math
-from typing import NamedTuple
-
 from hapticrender._jit import kernel
-from hapticrender.control.kernels import (
-    DOUBT_TIME,
-    FAR,
-    FASTEST,
-    FREQUENCY,
-    PHASE,
-    TURN,
-    WANTED_IM,
-    WANTED_RE,
-    WAVENUMBER,
-    fade,
-    size,
-)
-from hapticrender.protocols import Array
+from hapticrender._lanes import any_of, floor, high, lanes, low, put, put_pairs, read, root, select, size, total, write
+from hapticrender._polynomials import unit
+from hapticrender.control.bank_finger import adapt_pass, feel, finger_pull, forget_finger, track_finger
+from hapticrender.control import bank_rows as row
+from hapticrender.control.kernels import DOUBT_TIME, FAR, TURN
 
-# rows of BankState.band: carrier, target (R and its slope), and what the finger adds to it beyond its three numbers
-TURNS, RAMP, WEIGHT, COS, SIN, OMEGA, SWEEP, R_RE, R_IM, DR_RE, DR_IM, RAW_RE, RAW_IM, REST_RE, REST_IM = range(15)
-# the target as the observer sees it: R itself (error observer), or R behind the observer's pole
-SEEN_RE, SEEN_IM = range(15, 17)
-BAND_ROWS = 17
-# rows of BankState.loop, LOOP_ROWS a coordinate: error; integral part, its slope; low-passed like the error; error and
-# low-passed integral part at the last adaptation; fast and slow detector of the deviation
-E_RE, E_IM, V_RE, V_IM, DV_RE, DV_IM, L_RE, L_IM, LAST_RE, LAST_IM, FAST_RE, FAST_IM, SLOW_RE, SLOW_IM = range(14)
-LOOP_ROWS = 14
-# entries of BankState.track: the finger's motion (position as given, smoothed, velocity, acceleration, seen before)
-HELD, SMOOTH, VELOCITY, ACCELERATION, SEEN = range(5)
-TRACK_ROWS = 5
-# entries of BankState.touch: the finger's load (N), place g, contact, its three numbers; timers and openings of the two
-# detectors; limiter; trust in the sensors
-LOAD, PLACE, CONTACT, MASS, DAMPING, STIFFNESS, FAST_TIME, SLOW_TIME, FAST_OPEN, SLOW_OPEN, PEAK, SCALE, TRUST = range(
-    13
-)
-TOUCH_ROWS = 13
+HUGE = 1e300  # stands for infinity, where fast arithmetic is not told of it
+FORGET = 50.0  # 1/s: a carrier near 0 Hz is forgotten, not followed
 ADAPTATION = 4  # samples between two adaptations of the finger
-TRACKER_POLE = TURN * 60.0  # rad/s: triple pole of the finger's tracker; no lag under constant acceleration
-CROWDED_MASS, CROWDED_STIFFNESS = 4e-3, 300.0  # kg, N/m: how far the finger's numbers may be expected to lie from zero
-LEAST_MOTION, LEAST_LOAD = 5e-8, 0.03  # m, N: below these the finger is not adapted
-
-
-class BankNumbers(NamedTuple):
-    """What all bands share."""
-
-    rate: float
-    analysed: bool
-    error_observer: bool
-    lead: float  # s: delay and half the hold
-    reference: float  # g of the bank that analyses and filters the target, per sample
-    observer: float  # g of the observer in quiet, per sample; 0 without feedback
-    observer_awake: float
-    crowd_speed: float  # m/s: below it finger-locked carriers crowd, and the observer slows down with the finger
-    dc: float  # 1.6 w h of the DC band (type 2)
-    dc_drift: float  # (w h)^2
-    integral: float  # 1/s in quiet
-    integral_stirred: float
-    integral_awake: float
-    adapt: float  # 1/s in quiet; negative: never
-    adapt_awake: float
-    rest: float  # 1/s: adaptation of each band's remaining stiffness, in quiet
-    rest_awake: float
-    inner: float  # share of the inner loop that is always on
-    inner_awake: float
-    fast_pole: float  # per sample
-    slow_pole: float
-    fast_level: float  # m, squared
-    slow_level: float
-    fast_time: float  # samples
-    slow_time: float
-    release: float  # per sample
-    ramp: float  # per sample
-    lowest: float  # Hz
-    highest: float
-    contact_on: float  # N
-    contact_off: float
-    drive_limit: float
-    drive_step: float  # 0: not shaped
-    peak_decay: float  # per sample
-    back: float  # 1/s: back-calculation at the limit
-    sensed_limit: float
-
-
-class BankTables(NamedTuple):
-    """Parameters of the bank."""
-
-    numbers: BankNumbers
-    tone: Array  # (5, bands)
-    listen: Array  # (coordinates, sensors)
-    speak: Array  # (channels, coordinates): drive per force
-    mass: Array  # (coordinates, coordinates)
-    damping: Array
-    stiffness: Array
-    shape: Array  # (coordinates,) pattern of the target
-    taps: Array  # (coordinates, taps) of the inner loop, N/m
-    grip: Array  # (coordinates,) damping that the inner loop adds, N s/m
-
-
-class BankState(NamedTuple):
-    """State of the bank; changed in place."""
-
-    band: Array  # (BAND_ROWS, bands)
-    loop: Array  # (coordinates * LOOP_ROWS, bands)
-    track: Array  # (TRACK_ROWS,)
-    touch: Array  # (TOUCH_ROWS,)
-    level: Array  # (2, coordinates) DC band and its drift
-    past: Array  # (coordinates, taps) last deviations, newest first
-    residual: Array  # (3, coordinates) scratch: residual of the observer, force, force a quarter turn ahead
-    shaper: Array  # (2, channels) last two errors of the command's rounding
-    sample: Array  # (1,) integer: samples so far
+REFRESH = 64  # samples between two looks at the tones that are asked for
 
 
 @kernel
-def track_finger(track, rate, position):
-    """Velocity and acceleration of the finger by a tracker with a triple pole; a new touch starts it at rest."""
-    if not abs(position) <= FAR or (track[SEEN] > 0.0 and abs(position - track[HELD]) * rate > FASTEST):
-        track[SEEN] = track[VELOCITY] = track[ACCELERATION] = 0.0  # lifted, or put down elsewhere
-        return
-    if track[SEEN] == 0.0:
-        track[SMOOTH] = position
-    track[SEEN] = 1.0
-    track[HELD] = position
-    pole = TRACKER_POLE / rate
-    track[SMOOTH] += track[VELOCITY] / rate
-    innovation = position - track[SMOOTH]
-    track[SMOOTH] += 3.0 * pole * innovation
-    track[VELOCITY] += track[ACCELERATION] / rate + 3.0 * pole * TRACKER_POLE * innovation
-    track[ACCELERATION] += pole * TRACKER_POLE * TRACKER_POLE * innovation
+def refresh(tables, state):
+    """Take up the tones that are asked for, and the law of the tiles whose carriers are fixed."""
+    tone, band, width = tables.tone, state.band, state.band.shape[2]
+    for t in range(band.shape[0]):
+        state.locked[t] = 0
+        for i in range(min(width, tone.shape[1] - t * width)):
+            k = t * width + i
+            band[t, row.LIVE, i] = 1.0
+            for r in range(5):
+                band[t, row.FREQUENCY + r, i] = tone[r, k]
+            if tone[1, k] > 0.0:
+                state.locked[t] = 1
+        if state.locked[t] == 0:
+            put(band, t, row.OMEGA, TURN * lanes(band, t, row.FREQUENCY))
+            law_tune(tables, band, state.law, t)
 
 
 @kernel
-def carrier_pass(numbers, tone, band, track):
-    """Phase, frequency, sweep and weight of every carrier."""
-    for k in range(tone.shape[1]):
-        wavenumber = tone[WAVENUMBER, k]
-        band[OMEGA, k] = TURN * (tone[FREQUENCY, k] + wavenumber * track[VELOCITY])
-        band[SWEEP, k] = TURN * wavenumber * track[ACCELERATION]
-        turns = band[TURNS, k] + wavenumber * track[HELD] + tone[PHASE, k]
-        psi = TURN * (turns - math.floor(turns))
-        band[COS, k], band[SIN, k] = math.cos(psi), math.sin(psi)
-        felt = wavenumber == 0.0 or track[SEEN] > 0.0
-        ramp = min(band[RAMP, k] + numbers.ramp, 1.0) if felt else max(band[RAMP, k] - numbers.ramp, 0.0)
-        band[RAMP, k] = ramp
-        weight = ramp * ramp * (3.0 - 2.0 * ramp)
-        if wavenumber > 0.0:
-            weight *= fade(abs(band[OMEGA, k]) / TURN, numbers.lowest, numbers.highest)
-        band[WEIGHT, k] = weight
-        turns = band[TURNS, k] + tone[FREQUENCY, k] / numbers.rate
-        band[TURNS, k] = turns - math.floor(turns)
+def law_tune(tables, band, law, t):
+    """Law of a tile: D and D' of every pair of coordinates, turned ahead by delay and hold."""
+    numbers, coordinates = tables.numbers, len(tables.shape)
+    omega, sweep = lanes(band, t, row.OMEGA), lanes(band, t, row.SWEEP)
+    cos, sin = unit(numbers.lead / TURN * (omega + 0.5 * numbers.lead * sweep))
+    half = 0.5 / numbers.rate * omega
+    _, chord = unit(half / TURN)
+    straight = size(half) < 1e-9
+    grow = select(straight, 1.0, half / select(straight, 1.0, chord))
+    cos, sin = grow * cos, grow * sin
+    put(law, t, row.AHEAD_RE, cos)
+    put(law, t, row.AHEAD_IM, sin)
+    for c in range(coordinates):
+        for i in range(coordinates):
+            mass, damping = read(tables.mass, c, i), read(tables.damping, c, i)
+            at = row.FIRST_LAW + row.LAW_ROWS * (c * coordinates + i)
+            re, im = read(tables.stiffness, c, i) - omega * omega * mass, omega * damping + sweep * mass
+            put(law, t, at + row.LAW_RE, re * cos - im * sin)
+            put(law, t, at + row.LAW_IM, re * sin + im * cos)
+            turn = 2.0 * omega * mass
+            put(law, t, at + row.SLOPE_RE, damping * cos - turn * sin)
+            put(law, t, at + row.SLOPE_IM, damping * sin + turn * cos)
 
 
 @kernel
-def target_pass(numbers, tone, band, g, wanted, target):
+def ease(x):
+    """Third-order step from 0 to 1 over 0..1."""
+    x = low(high(x, 0.0), 1.0)
+    return x * x * (3.0 - 2.0 * x)
+
+
+@kernel
+def carrier_pass(tables, state, t):
+    """Phase, frequency, sweep and weight of the carriers of a tile; the law, where they follow the finger."""
+    numbers, band, track = tables.numbers, state.band, state.track
+    turns, frequency = lanes(band, t, row.TURNS), lanes(band, t, row.FREQUENCY)
+    at = turns + lanes(band, t, row.PHASE)
+    ramp = lanes(band, t, row.RAMP)
+    if state.locked[t] == 0:
+        ramp = low(ramp + numbers.ramp, 1.0)
+        weight = lanes(band, t, row.LIVE) * ease(ramp)
+    else:
+        wavenumber = lanes(band, t, row.WAVENUMBER)
+        hertz = frequency + wavenumber * read(track, row.VELOCITY)
+        put(band, t, row.OMEGA, TURN * hertz)
+        put(band, t, row.SWEEP, TURN * wavenumber * read(track, row.ACCELERATION))
+        at += wavenumber * read(track, row.HELD)
+        felt = (wavenumber == 0.0) | (read(track, row.SEEN) > 0.0)
+        ramp = select(felt, low(ramp + numbers.ramp, 1.0), high(ramp - numbers.ramp, 0.0))
+        inside = ease(2.0 / numbers.lowest * size(hertz) - 1.0) * ease(5.0 - 4.0 / numbers.highest * size(hertz))
+        weight = lanes(band, t, row.LIVE) * ease(ramp) * select(wavenumber > 0.0, inside, 1.0)
+        law_tune(tables, band, state.law, t)
+    cos, sin = unit(at)
+    put(band, t, row.COS, lanes(band, t, row.LIVE) * cos)
+    put(band, t, row.SIN, lanes(band, t, row.LIVE) * sin)
+    put(band, t, row.RAMP, ramp)
+    put(band, t, row.WEIGHT, weight)
+    turns += 1.0 / numbers.rate * frequency
+    put(band, t, row.TURNS, turns - floor(turns))
+
+
+@kernel
+def target_pass(tables, state, t, g, residual, target):
     """Wanted envelope R and its slope: constant, or the wanted waveform through the bank and one more pole."""
-    bands = band.shape[1]
-    residual = wanted
+    numbers, band = tables.numbers, state.band
+    weight = lanes(band, t, row.WEIGHT)
+    old_re, old_im = lanes(band, t, row.R_RE), lanes(band, t, row.R_IM)
     if numbers.analysed:
-        for k in range(bands):
-            residual -= band[RAW_RE, k] * band[COS, k] - band[RAW_IM, k] * band[SIN, k]
-    for k in range(bands):
-        weight = band[WEIGHT, k]
-        if numbers.analysed:
-            band[RAW_RE, k] += g * residual * band[COS, k]
-            band[RAW_IM, k] -= g * residual * band[SIN, k]
-            follow = 0.5 * g
-            re = band[R_RE, k] + follow * (weight * band[RAW_RE, k] - band[R_RE, k])
-            im = band[R_IM, k] + follow * (weight * band[RAW_IM, k] - band[R_IM, k])
-        else:
-            re, im = weight * tone[WANTED_RE, k], weight * tone[WANTED_IM, k]
-        target[k] = complex(re, im)
-        pole = 1.0 if numbers.error_observer else 0.5 * numbers.reference
-        band[SEEN_RE, k] += pole * (re - band[SEEN_RE, k])
-        band[SEEN_IM, k] += pole * (im - band[SEEN_IM, k])
-        band[DR_RE, k], band[DR_IM, k] = (re - band[R_RE, k]) * numbers.rate, (im - band[R_IM, k]) * numbers.rate
-        band[R_RE, k], band[R_IM, k] = re, im
+        raw_re = lanes(band, t, row.RAW_RE) + g * residual * lanes(band, t, row.COS)
+        raw_im = lanes(band, t, row.RAW_IM) - g * residual * lanes(band, t, row.SIN)
+        put(band, t, row.RAW_RE, raw_re)
+        put(band, t, row.RAW_IM, raw_im)
+        follow = 0.5 * g
+        re, im = old_re + follow * (weight * raw_re - old_re), old_im + follow * (weight * raw_im - old_im)
+    else:
+        re, im = weight * lanes(band, t, row.WANTED_RE), weight * lanes(band, t, row.WANTED_IM)
+    put(band, t, row.R_RE, re)
+    put(band, t, row.R_IM, im)
+    put(band, t, row.DR_RE, numbers.rate * (re - old_re))
+    put(band, t, row.DR_IM, numbers.rate * (im - old_im))
+    if numbers.error_observer:
+        put(band, t, row.SEEN_RE, re)
+        put(band, t, row.SEEN_IM, im)
+    else:
+        pole = 0.5 * numbers.reference
+        seen_re, seen_im = lanes(band, t, row.SEEN_RE), lanes(band, t, row.SEEN_IM)
+        put(band, t, row.SEEN_RE, seen_re + pole * (re - seen_re))
+        put(band, t, row.SEEN_IM, seen_im + pole * (im - seen_im))
+    put_pairs(target, t, re, im)
 
 
 @kernel
-def feel(numbers, stiffness, level, touch):
-    """Load and place of the finger from the sag (the DC band); true where contact has just begun or ended."""
-    load = moment = 0.0
-    for c in range(level.shape[1]):
-        load -= stiffness[0, c] * level[0, c]
-        if level.shape[1] > 1:
-            moment -= stiffness[1, c] * level[0, c]
-    touch[LOAD] = load
-    was = touch[CONTACT]
-    touch[CONTACT] = 1.0 if load > (numbers.contact_off if was > 0.0 else numbers.contact_on) else 0.0
-    if touch[CONTACT] > 0.0:
-        touch[PLACE] = min(max(moment / max(load, LEAST_LOAD), -2.0), 2.0)
-    return touch[CONTACT] != was
+def wanted_residual(band, wanted):
+    """What the analysis of the target has not explained of the wanted waveform."""
+    explained = 0.0 * wanted
+    for t in range(band.shape[0]):
+        shown = lanes(band, t, row.RAW_RE) * lanes(band, t, row.COS)
+        explained += total(wanted, shown - lanes(band, t, row.RAW_IM) * lanes(band, t, row.SIN))
+    return wanted - explained
+
+
+@kernel
+def residual_pass(tables, state, y, c):
+    """Residual of the observer and deviation from the command, as the limiter has scaled it, in coordinate c."""
+    band, loop, level, past, shape = state.band, state.loop, state.level, state.past, tables.shape[c]
+    base = c * row.LOOP_ROWS
+    observed = commanded = 0.0
+    for t in range(band.shape[0]):
+        cos, sin = lanes(band, t, row.COS), lanes(band, t, row.SIN)
+        observed += (shape * lanes(band, t, row.SEEN_RE) + lanes(loop, t, base + row.E_RE)) * cos
+        observed -= (shape * lanes(band, t, row.SEEN_IM) + lanes(loop, t, base + row.E_IM)) * sin
+        commanded += (shape * lanes(band, t, row.R_RE) + lanes(loop, t, base + row.V_RE)) * cos
+        commanded -= (shape * lanes(band, t, row.R_IM) + lanes(loop, t, base + row.V_IM)) * sin
+    dc = read(level, 0, c)
+    deviation = y - read(state.touch, row.SCALE) * total(y, commanded)
+    for i in range(past.shape[1] - 1, 0, -1):
+        write(read(past, c, i - 1), past, c, i)
+    write(deviation, past, c, 0)
+    write(y - total(y, observed) - dc, state.residual, row.ERROR, c)
+    write(deviation - dc, state.residual, row.DEVIATION, c)
+
+
+@kernel
+def inner_force(tables, state, inner, c):
+    """Force of the inner loop: its taps on the last deviations."""
+    force = 0.0 * inner
+    for i in range(state.past.shape[1]):
+        force -= inner * read(tables.taps, c, i) * read(state.past, c, i)
+    write(force, state.residual, row.FORCE, c)
+
+
+@kernel
+def level_pass(numbers, level, error, c):
+    """DC band of type 2."""
+    drift = read(level, 1, c)
+    write(read(level, 0, c) + numbers.dc * error + drift, level, 0, c)
+    write(drift + numbers.dc_drift * error, level, 1, c)
+
+
+@kernel
+def observer_pass(tables, state, t, c, g, integral, back):
+    """Error envelopes and integral parts of a tile in coordinate c."""
+    numbers, band, loop, shape = tables.numbers, state.band, state.loop, tables.shape[c]
+    base, period, error = c * row.LOOP_ROWS, 1.0 / tables.numbers.rate, read(state.residual, row.ERROR, c)
+    cos, sin = lanes(band, t, row.COS), lanes(band, t, row.SIN)
+    weight = low(lanes(band, t, row.WEIGHT) / high(lanes(band, t, row.RAMP), 1e-9), 1.0)
+    fading = FORGET * (1.0 - weight)
+    keep, pull = 1.0 - period * fading, weight * (g * error)
+    e_re = keep * lanes(loop, t, base + row.E_RE) + pull * cos
+    e_im = keep * lanes(loop, t, base + row.E_IM) - pull * sin
+    if not numbers.error_observer:  # X goes on by itself; E is its distance to a target that has moved
+        moved = shape * 0.5 * numbers.reference / (1.0 - 0.5 * numbers.reference)
+        e_re -= moved * (lanes(band, t, row.R_RE) - lanes(band, t, row.SEEN_RE))
+        e_im -= moved * (lanes(band, t, row.R_IM) - lanes(band, t, row.SEEN_IM))
+    put(loop, t, base + row.E_RE, e_re)
+    put(loop, t, base + row.E_IM, e_im)
+    for r, e in ((0, e_re), (1, e_im)):
+        v = lanes(loop, t, base + row.V_RE + r)
+        slope = -integral * e - back * (v + shape * lanes(band, t, row.R_RE + r)) - fading * v
+        v += period * slope
+        put(loop, t, base + row.DV_RE + r, slope)
+        put(loop, t, base + row.V_RE + r, v)
+        slow = lanes(loop, t, base + row.L_RE + r)
+        put(loop, t, base + row.L_RE + r, slow + 0.5 * g * (v - slow))
+
+
+@kernel
+def detector_pass(numbers, state, t, c):
+    """How much of the deviation in coordinate c either detector hears beyond its level, squared, in a tile."""
+    band, loop = state.band, state.loop
+    base, twice = c * row.LOOP_ROWS, 2.0 * read(state.residual, row.DEVIATION, c)
+    re, im = twice * lanes(band, t, row.COS), -twice * lanes(band, t, row.SIN)
+    fast_re, fast_im = lanes(loop, t, base + row.FAST_RE), lanes(loop, t, base + row.FAST_IM)
+    slow_re, slow_im = lanes(loop, t, base + row.SLOW_RE), lanes(loop, t, base + row.SLOW_IM)
+    fast_re, fast_im = fast_re + numbers.fast_pole * (re - fast_re), fast_im + numbers.fast_pole * (im - fast_im)
+    slow_re, slow_im = slow_re + numbers.slow_pole * (re - slow_re), slow_im + numbers.slow_pole * (im - slow_im)
+    put(loop, t, base + row.FAST_RE, fast_re)
+    put(loop, t, base + row.FAST_IM, fast_im)
+    put(loop, t, base + row.SLOW_RE, slow_re)
+    put(loop, t, base + row.SLOW_IM, slow_im)
+    fast = high(fast_re * fast_re + fast_im * fast_im - numbers.fast_level, 0.0)
+    return fast, high(slow_re * slow_re + slow_im * slow_im - numbers.slow_level, 0.0)
+
+
+@kernel
+def believe(numbers, state, doubt):
+    """Trust in the sensors: falls to 0 within 20 ms where a sample cannot be believed; then the loop starts anew."""
+    step = 1.0 / (DOUBT_TIME * numbers.rate)
+    trust = read(state.touch, row.TRUST)
+    trust = select(doubt > 0.0, high(trust - step, 0.0), low(trust + step, 1.0))
+    write(trust, state.touch, row.TRUST)
+    lost = trust == 0.0
+    if any_of(lost):
+        loop = state.loop
+        for t in range(loop.shape[0]):
+            for r in range(loop.shape[1]):
+                put(loop, t, r, select(lost, 0.0, lanes(loop, t, r)))
+        for array in (state.level, state.past):
+            for i in range(array.shape[0]):
+                for j in range(array.shape[1]):
+                    write(select(lost, 0.0, read(array, i, j)), array, i, j)
 
 
 @kernel
 def wake(numbers, touch, fast, slow):
     """Timers of the two detectors and how far each has opened the loop."""
-    if fast:
-        touch[FAST_TIME] = numbers.fast_time
-    if slow:
-        touch[SLOW_TIME] = numbers.slow_time
-    for timer, opening in ((FAST_TIME, FAST_OPEN), (SLOW_TIME, SLOW_OPEN)):
-        open_ = touch[timer] > 0.0
-        touch[opening] = 1.0 if open_ else max(touch[opening] - numbers.release, 0.0)
-        touch[timer] -= 1.0
+    for timer, opening, heard, time in (
+        (row.FAST_TIME, row.FAST_OPEN, fast, numbers.fast_time),
+        (row.SLOW_TIME, row.SLOW_OPEN, slow, numbers.slow_time),
+    ):
+        left = select(heard > 0.0, time, read(touch, timer))
+        write(select(left > 0.0, 1.0, high(read(touch, opening) - numbers.release, 0.0)), touch, opening)
+        write(left - 1.0, touch, timer)
 
 
 @kernel
-def believe(numbers, touch, loop, level, past, flags):
-    """Trust in the sensors: falls to 0 within 20 ms where a sample cannot be believed; then the loop starts anew."""
-    step = 1.0 / (DOUBT_TIME * numbers.rate)
-    touch[TRUST] = max(touch[TRUST] - step, 0.0) if flags & 2 else min(touch[TRUST] + step, 1.0)
-    if touch[TRUST] == 0.0:
-        loop[:] = 0.0
-        level[:] = 0.0
-        past[:] = 0.0
-
-
-@kernel
-def residual_pass(shape, band, loop, level, residual, past, y, scale, c):
-    """Residual of the observer and deviation from the command, as the limiter has scaled it, in coordinate c."""
-    base = c * LOOP_ROWS
-    observed = commanded = y
-    for k in range(band.shape[1]):
-        cos, sin = band[COS, k], band[SIN, k]
-        x_re = shape[c] * band[SEEN_RE, k] + loop[base + E_RE, k]
-        x_im = shape[c] * band[SEEN_IM, k] + loop[base + E_IM, k]
-        observed -= x_re * cos - x_im * sin
-        v_re = shape[c] * band[R_RE, k] + loop[base + V_RE, k]
-        v_im = shape[c] * band[R_IM, k] + loop[base + V_IM, k]
-        commanded -= scale * (v_re * cos - v_im * sin)
-    residual[0, c] = observed - level[0, c]
-    for i in range(past.shape[1] - 1, 0, -1):
-        past[c, i] = past[c, i - 1]
-    past[c, 0] = commanded
-    return commanded - level[0, c]
-
-
-@kernel
-def observer_pass(numbers, shape, band, loop, c, error, deviation, g, integral, spill):
-    """Error envelopes, integral parts and detectors of coordinate c; returns 1 for fast, 2 for slow, 3 for both."""
-    base = c * LOOP_ROWS
-    period = 1.0 / numbers.rate
-    trips = 0
-    for k in range(band.shape[1]):
-        cos, sin, weight = band[COS, k], band[SIN, k], band[WEIGHT, k] / max(band[RAMP, k], 1e-9)
-        weight = min(weight, 1.0)
-        keep = 1.0 - 50.0 * period * (1.0 - weight)  # a carrier near 0 Hz is forgotten, not followed
-        e_re = keep * loop[base + E_RE, k] + weight * g * error * cos
-        e_im = keep * loop[base + E_IM, k] - weight * g * error * sin
-        if not numbers.error_observer:  # X goes on by itself; E is its distance to a target that has moved
-            moved = 0.5 * numbers.reference / (1.0 - 0.5 * numbers.reference)
-            e_re -= shape[c] * moved * (band[R_RE, k] - band[SEEN_RE, k])
-            e_im -= shape[c] * moved * (band[R_IM, k] - band[SEEN_IM, k])
-        loop[base + E_RE, k], loop[base + E_IM, k] = e_re, e_im
-        v_re, v_im = loop[base + V_RE, k], loop[base + V_IM, k]
-        back = numbers.back * spill
-        dv_re = -integral * e_re - back * (v_re + shape[c] * band[R_RE, k]) - (1.0 - weight) * 50.0 * v_re
-        dv_im = -integral * e_im - back * (v_im + shape[c] * band[R_IM, k]) - (1.0 - weight) * 50.0 * v_im
-        loop[base + DV_RE, k], loop[base + DV_IM, k] = dv_re, dv_im
-        v_re += period * dv_re
-        v_im += period * dv_im
-        loop[base + V_RE, k], loop[base + V_IM, k] = v_re, v_im
-        loop[base + L_RE, k] += 0.5 * g * (v_re - loop[base + L_RE, k])
-        loop[base + L_IM, k] += 0.5 * g * (v_im - loop[base + L_IM, k])
-        p_re, p_im = 2.0 * deviation * cos, -2.0 * deviation * sin
-        loop[base + FAST_RE, k] += numbers.fast_pole * (p_re - loop[base + FAST_RE, k])
-        loop[base + FAST_IM, k] += numbers.fast_pole * (p_im - loop[base + FAST_IM, k])
-        loop[base + SLOW_RE, k] += numbers.slow_pole * (p_re - loop[base + SLOW_RE, k])
-        loop[base + SLOW_IM, k] += numbers.slow_pole * (p_im - loop[base + SLOW_IM, k])
-        if loop[base + FAST_RE, k] ** 2 + loop[base + FAST_IM, k] ** 2 > numbers.fast_level:
-            trips |= 1
-        if loop[base + SLOW_RE, k] ** 2 + loop[base + SLOW_IM, k] ** 2 > numbers.slow_level:
-            trips |= 2
-    return trips
-
-
-@kernel
-def held(band, loop, shape, c, k):
-    """V and dV/dt of coordinate c and band k, complex."""
-    base = c * LOOP_ROWS
-    value = complex(shape[c] * band[R_RE, k] + loop[base + V_RE, k], shape[c] * band[R_IM, k] + loop[base + V_IM, k])
-    slope = complex(
-        shape[c] * band[DR_RE, k] + loop[base + DV_RE, k], shape[c] * band[DR_IM, k] + loop[base + DV_IM, k]
-    )
-    return value, slope
-
-
-@kernel
-def finger_stiffness(touch, band, k):
-    """Dynamic stiffness z (N/m) of the finger at band k: its three numbers and what is left over."""
-    omega = band[OMEGA, k]
-    return complex(
-        touch[STIFFNESS] - omega * omega * touch[MASS] + band[REST_RE, k], omega * touch[DAMPING] + band[REST_IM, k]
-    )
-
-
-@kernel
-def law_pass(numbers, mass, damping, stiffness, shape, band, loop, touch, force, quadrature):
-    """F = D V + D' dV/dt + j dw/dt M V, finger included, turned ahead by delay and hold; adds to `force`."""
-    coordinates = shape.shape[0]
+def law_pass(tables, state, t, with_finger):
+    """F = D V + D' dV/dt + j dw/dt M V of a tile, finger included, turned ahead by delay and hold; adds to the force."""
+    band, loop, law, touch, coordinates = state.band, state.loop, state.law, state.touch, len(tables.shape)
+    cos, sin = lanes(band, t, row.COS), lanes(band, t, row.SIN)
+    pull_re = pull_im = 0.0 * cos
+    if any_of(with_finger):
+        at_re = at_im = dat_re = dat_im = 0.0 * cos
+        for i in range(coordinates):
+            base, shape = i * row.LOOP_ROWS, tables.shape[i]
+            place = 1.0 if i == 0 else read(touch, row.PLACE)
+            at_re += place * (shape * lanes(band, t, row.R_RE) + lanes(loop, t, base + row.V_RE))
+            at_im += place * (shape * lanes(band, t, row.R_IM) + lanes(loop, t, base + row.V_IM))
+            dat_re += place * (shape * lanes(band, t, row.DR_RE) + lanes(loop, t, base + row.DV_RE))
+            dat_im += place * (shape * lanes(band, t, row.DR_IM) + lanes(loop, t, base + row.DV_IM))
+        re, im = finger_pull(touch, band, t, at_re, at_im, dat_re, dat_im)
+        a_re, a_im = lanes(law, t, row.AHEAD_RE), lanes(law, t, row.AHEAD_IM)
+        pull_re = select(with_finger, re * a_re - im * a_im, 0.0)
+        pull_im = select(with_finger, re * a_im + im * a_re, 0.0)
     for c in range(coordinates):
-        quadrature[c] = 0.0
-    with_finger = touch[CONTACT] > 0.0 and numbers.adapt >= 0.0
-    for k in range(band.shape[1]):
-        omega, sweep = band[OMEGA, k], band[SWEEP, k]
-        angle = numbers.lead * (omega + 0.5 * sweep * numbers.lead)
-        x = 0.5 * omega / numbers.rate
-        grow = x / math.sin(x) if abs(x) > 1e-9 else 1.0
-        ahead = grow * complex(math.cos(angle), math.sin(angle)) * complex(band[COS, k], band[SIN, k])
-        at = dat = 0j  # of the finger
-        if with_finger:
-            for c in range(coordinates):
-                value, slope = held(band, loop, shape, c, k)
-                place = 1.0 if c == 0 else touch[PLACE]
-                at += place * value
-                dat += place * slope
-            pull = finger_stiffness(touch, band, k) * at
-            pull += complex(touch[DAMPING], 2.0 * omega * touch[MASS]) * dat + complex(0.0, sweep * touch[MASS]) * at
-        for c in range(coordinates):
-            total = 0j
-            for i in range(coordinates):
-                value, slope = held(band, loop, shape, i, k)
-                total += complex(stiffness[c, i] - omega * omega * mass[c, i], omega * damping[c, i]) * value
-                total += (
-                    complex(damping[c, i], 2.0 * omega * mass[c, i]) * slope + complex(0.0, sweep * mass[c, i]) * value
-                )
-            if with_finger:
-                total += (1.0 if c == 0 else touch[PLACE]) * pull
-            total *= ahead
-            force[c] += total.real
-            quadrature[c] += total.imag
+        place = 1.0 if c == 0 else read(touch, row.PLACE)
+        re, im = place * pull_re, place * pull_im
+        for i in range(coordinates):
+            base, shape = i * row.LOOP_ROWS, tables.shape[i]
+            at = row.FIRST_LAW + row.LAW_ROWS * (c * coordinates + i)
+            v_re = shape * lanes(band, t, row.R_RE) + lanes(loop, t, base + row.V_RE)
+            v_im = shape * lanes(band, t, row.R_IM) + lanes(loop, t, base + row.V_IM)
+            dv_re = shape * lanes(band, t, row.DR_RE) + lanes(loop, t, base + row.DV_RE)
+            dv_im = shape * lanes(band, t, row.DR_IM) + lanes(loop, t, base + row.DV_IM)
+            d_re, d_im = lanes(law, t, at + row.LAW_RE), lanes(law, t, at + row.LAW_IM)
+            s_re, s_im = lanes(law, t, at + row.SLOPE_RE), lanes(law, t, at + row.SLOPE_IM)
+            re += d_re * v_re - d_im * v_im + s_re * dv_re - s_im * dv_im
+            im += d_re * v_im + d_im * v_re + s_re * dv_im + s_im * dv_re
+        force, across = read(state.residual, row.FORCE, c), read(state.residual, row.QUADRATURE, c)
+        write(force + total(force, re * cos - im * sin), state.residual, row.FORCE, c)
+        write(across + total(across, re * sin + im * cos), state.residual, row.QUADRATURE, c)
 
 
 @kernel
-def adapt_pass(numbers, mass, damping, stiffness, shape, grip, band, loop, touch, inner, gain, rest):
-    """The finger's three numbers, pooled over bands, and what is left of each band's stiffness, from the heave row."""
-    coordinates = shape.shape[0]
-    step = ADAPTATION / numbers.rate
-    sum_k = sum_m = sum_b = total = 0.0
-    stiff2, mass2 = CROWDED_STIFFNESS * CROWDED_STIFFNESS, CROWDED_MASS * CROWDED_MASS
-    for k in range(band.shape[1]):
-        omega = band[OMEGA, k]
-        felt = commanded = away = 0j
-        for c in range(coordinates):
-            base = c * LOOP_ROWS
-            place = 1.0 if c == 0 else touch[PLACE]
-            error = complex(loop[base + E_RE, k], loop[base + E_IM, k])
-            own = complex(loop[base + L_RE, k], loop[base + L_IM, k])
-            wanted = complex(shape[c] * band[SEEN_RE, k], shape[c] * band[SEEN_IM, k])
-            felt += place * (wanted + error)
-            commanded += place * (wanted + own)
-            apart = error - own
-            before = complex(loop[base + LAST_RE, k], loop[base + LAST_IM, k])
-            loop[base + LAST_RE, k], loop[base + LAST_IM, k] = apart.real, apart.imag
-            away += complex(stiffness[0, c] - omega * omega * mass[0, c], omega * damping[0, c]) * apart
-            away += complex(damping[0, c], 2.0 * omega * mass[0, c]) * (apart - before) / step
-            if c == 0:
-                away += complex(0.0, inner * omega * grip[0]) * apart
-        size2 = felt.real * felt.real + felt.imag * felt.imag
-        if size2 < LEAST_MOTION * LEAST_MOTION or band[WEIGHT, k] < 1.0:  # too small, or a carrier near 0 Hz
-            continue
-        found = (finger_stiffness(touch, band, k) * commanded - away) * felt.conjugate() / size2
-        own_re = stiffness[0, 0] - omega * omega * mass[0, 0]
-        weight = size2 / (own_re * own_re + (omega * damping[0, 0]) ** 2)
-        miss = found.real - touch[STIFFNESS] + omega * omega * touch[MASS]
-        drag = found.imag - omega * touch[DAMPING]
-        scale = weight / (stiff2 + omega**4 * mass2)
-        sum_k += scale * stiff2 * miss
-        sum_m += scale * omega * omega * mass2 * miss
-        sum_b += weight * drag / omega
-        total += weight
-        band[REST_RE, k] += step * rest * (miss - band[REST_RE, k])
-        band[REST_IM, k] += step * rest * (drag - band[REST_IM, k])
-    if total > 0.0:
-        step *= gain / total
-        touch[STIFFNESS] = min(max(touch[STIFFNESS] + step * sum_k, -500.0), 15e3)
-        touch[MASS] = min(max(touch[MASS] - step * sum_m, -2e-3), 12e-3)
-        touch[DAMPING] = min(max(touch[DAMPING] + step * sum_b, 0.0), 12.0)
-
-
-@kernel
-def forget_finger(touch, band, loop):
-    """Touch or lift-off: what was learnt of one finger does not hold for the next."""
-    touch[MASS] = touch[DAMPING] = touch[STIFFNESS] = 0.0
-    for k in range(band.shape[1]):
-        band[REST_RE, k] = band[REST_IM, k] = 0.0
-        for base in range(0, loop.shape[0], LOOP_ROWS):
-            loop[base + LAST_RE, k] = loop[base + E_RE, k] - loop[base + L_RE, k]
-            loop[base + LAST_IM, k] = loop[base + E_IM, k] - loop[base + L_IM, k]
-
-
-@kernel
-def speak_pass(numbers, speak, force, quadrature, shaper, touch, drive):
+def speak_pass(tables, state, drive):
     """Drive from force: the whole envelope scaled to the limit, the rounding's noise shaped (2nd order).
 
     The envelope is that of the analytic signal, force and its quadrature: steady for a steady tone, so that scaling it
     distorts nothing.
     """
-    peak = 0.0
-    for i in range(drive.shape[0]):
-        total = across = 0.0
-        for c in range(force.shape[0]):
-            total += speak[i, c] * force[c]
-            across += speak[i, c] * quadrature[c]
-        drive[i] = touch[TRUST] * total
-        peak = max(peak, touch[TRUST] * size(total, across) / numbers.drive_limit)
-    touch[PEAK] = max(peak, touch[PEAK] * numbers.peak_decay)
-    touch[SCALE] = 1.0 / touch[PEAK] if touch[PEAK] > 1.0 else 1.0
-    limit, step = numbers.drive_limit, numbers.drive_step
-    for i in range(drive.shape[0]):
-        exact = touch[SCALE] * drive[i]
-        drive[i] = exact
-        if touch[TRUST] == 0.0:
-            shaper[0, i] = shaper[1, i] = 0.0
-        elif step > 0.0:
-            shaped = exact + 2.0 * shaper[0, i] - shaper[1, i]
-            drive[i] = step * math.floor(shaped / step + 0.5)
-            shaper[1, i] = shaper[0, i]
-            shaper[0, i] = min(max(shaped - drive[i], -step), step)
-        drive[i] = min(max(drive[i], -limit), limit)
-    return 1 if touch[SCALE] < 1.0 else 0
+    numbers, touch, shaper = tables.numbers, state.touch, state.shaper
+    trust, limit, step = read(touch, row.TRUST), numbers.drive_limit, numbers.drive_step
+    peak = numbers.peak_decay * numbers.peak_decay * read(touch, row.PEAK)
+    for i in range(shaper.shape[1]):
+        along = across = 0.0 * trust
+        for c in range(len(tables.shape)):
+            along += read(tables.speak, i, c) * read(state.residual, row.FORCE, c)
+            across += read(tables.speak, i, c) * read(state.residual, row.QUADRATURE, c)
+        along, across = trust / limit * along, trust / limit * across
+        write(limit * along, drive, i)
+        peak = high(peak, along * along + across * across)
+    write(peak, touch, row.PEAK)
+    scale = 1.0 + 0.0 * trust
+    if any_of(peak > 1.0):
+        scale = select(peak > 1.0, 1.0 / root(peak), 1.0)
+    write(scale, touch, row.SCALE)
+    for i in range(shaper.shape[1]):
+        exact = scale * read(drive, i)
+        if step > 0.0:
+            before, last = read(shaper, 1, i), read(shaper, 0, i)
+            shaped = exact + 2.0 * last - before
+            exact = select(trust == 0.0, exact, step * floor(shaped * (1.0 / step) + 0.5))
+            write(select(trust == 0.0, 0.0, last), shaper, 1, i)
+            write(select(trust == 0.0, 0.0, low(high(shaped - exact, -step), step)), shaper, 0, i)
+        write(low(high(exact, -limit), limit), drive, i)
+    return select(scale < 1.0, 1.0, 0.0)
+
+
+@kernel
+def listen_pass(tables, sensed, c):
+    """Coordinate c from the sensors; what no sensor can show counts as zero, and raises doubt."""
+    y = doubt = 0.0
+    for s in range(tables.listen.shape[1]):
+        value = read(sensed, s)
+        believed = size(value) <= tables.numbers.sensed_limit
+        y += read(tables.listen, c, s) * select(believed, value, 0.0)
+        doubt = high(doubt, select(believed, 0.0, 1.0))
+    return y, doubt
+
+
+@kernel
+def bank_advance(tables, state, sensed, position, wanted, drive, target):
+    """One sample of the whole controller: fills `drive` (channels,) and `target` (bands,), returns flags as a float."""
+    numbers, band, touch = tables.numbers, state.band, state.touch
+    tiles, coordinates = band.shape[0], len(tables.shape)
+    sane = size(wanted) <= FAR
+    odd = high(select(sane, 0.0, 2.0), select(size(position) > FAR, 2.0, 0.0))
+    wanted = select(sane, wanted, 0.0)
+    if state.sample[0] % REFRESH == 0:
+        refresh(tables, state)
+    state.sample[0] += 1
+    track_finger(state.track, numbers.rate, position)
+    calm = 1.0 + 0.0 * read(touch, row.TRUST)
+    if numbers.crowd_speed > 0.0:
+        calm = low(size(read(state.track, row.VELOCITY)) * (1.0 / numbers.crowd_speed), 1.0)
+    for t in range(tiles):
+        carrier_pass(tables, state, t)
+    residual = wanted
+    if numbers.analysed:
+        residual = wanted_residual(band, wanted)
+    for t in range(tiles):
+        target_pass(tables, state, t, calm * numbers.reference, residual, target)
+    changed = feel(numbers, tables.stiffness, state.level, touch)
+    if any_of(changed):
+        write(select(changed, numbers.fast_time, read(touch, row.FAST_TIME)), touch, row.FAST_TIME)
+        forget_finger(changed, touch, band, state.loop)
+    fast, slow = read(touch, row.FAST_OPEN), read(touch, row.SLOW_OPEN)
+    integral = numbers.integral + slow * (numbers.integral_stirred - numbers.integral)
+    integral += fast * (numbers.integral_awake - integral)
+    inner = numbers.inner + fast * (numbers.inner_awake - numbers.inner)
+    scale = read(touch, row.SCALE)
+    inner = select(scale < 1.0, 0.0, inner)  # no room for it
+    g = calm * (numbers.observer + fast * (numbers.observer_awake - numbers.observer))
+    back = numbers.back * (1.0 - scale)
+    doubt = 0.0 * scale
+    hears_fast = hears_slow = 0.0
+    for c in range(coordinates):
+        y, unbelieved = listen_pass(tables, sensed, c)
+        doubt = high(doubt, unbelieved)
+        residual_pass(tables, state, y, c)
+        inner_force(tables, state, inner, c)
+        write(0.0 * scale, state.residual, row.QUADRATURE, c)
+        level_pass(numbers, state.level, read(state.residual, row.ERROR, c), c)
+        for t in range(tiles):
+            observer_pass(tables, state, t, c, g, integral, back)
+        if numbers.fast_level < HUGE:
+            for t in range(tiles):
+                heard_fast, heard_slow = detector_pass(numbers, state, t, c)
+                hears_fast += heard_fast
+                hears_slow += heard_slow
+    believe(numbers, state, doubt)
+    wake(numbers, touch, total(scale, hears_fast), total(scale, hears_slow))
+    touching = read(touch, row.CONTACT) > 0.0
+    adapts = numbers.adapt >= 0.0
+    if adapts and state.sample[0] % ADAPTATION == 0:
+        if any_of(touching):
+            lively = high(fast, slow)
+            gain = numbers.adapt + lively * (numbers.adapt_awake - numbers.adapt)
+            rest = numbers.rest + lively * (numbers.rest_awake - numbers.rest)
+            adapt_pass(tables, state, inner, gain, rest, touching)
+    for t in range(tiles):
+        law_pass(tables, state, t, touching & adapts)
+    return speak_pass(tables, state, drive) + high(odd, 2.0 * doubt)
 
 
 @kernel
 def bank_step(tables, state, sensed, position, wanted, drive, target):
-    """One sample of the whole controller: fills `drive` (channels,) and `target` (bands,), returns flags."""
-    numbers, shape, taps = tables.numbers, tables.shape, tables.taps
-    band, loop, touch, level = state.band, state.loop, state.touch, state.level
-    past, residual, listen = state.past, state.residual, tables.listen
-    mass, damping, stiffness = tables.mass, tables.damping, tables.stiffness
-    flags = 0
-    odd = 0
-    if not abs(wanted) <= FAR:
-        wanted = 0.0
-        odd = 2
-    if abs(position) > FAR:
-        odd = 2
-    track_finger(state.track, numbers.rate, position)
-    carrier_pass(numbers, tables.tone, band, state.track)
-    calm = 1.0
-    if numbers.crowd_speed > 0.0:
-        calm = min(abs(state.track[VELOCITY]) / numbers.crowd_speed, 1.0)
-    target_pass(numbers, tables.tone, band, calm * numbers.reference, wanted, target)
-    if feel(numbers, stiffness, level, touch):
-        touch[FAST_TIME] = numbers.fast_time
-        forget_finger(touch, band, loop)
-    fast, slow = touch[FAST_OPEN], touch[SLOW_OPEN]
-    integral = numbers.integral + slow * (numbers.integral_stirred - numbers.integral)
-    integral += fast * (numbers.integral_awake - integral)
-    inner = numbers.inner + fast * (numbers.inner_awake - numbers.inner)
-    if touch[SCALE] < 1.0:
-        inner = 0.0  # no room for it
-    g = calm * (numbers.observer + fast * (numbers.observer_awake - numbers.observer))
-    trips = 0
-    for c in range(shape.shape[0]):
-        y = 0.0
-        for s in range(sensed.shape[0]):
-            if abs(sensed[s]) <= numbers.sensed_limit:
-                y += listen[c, s] * sensed[s]
-            else:  # NaN included
-                flags |= 2
-        deviation = residual_pass(shape, band, loop, level, residual, past, y, touch[SCALE], c)
-        residual[1, c] = 0.0
-        for i in range(taps.shape[1]):
-            residual[1, c] -= inner * taps[c, i] * past[c, i]
-        error = residual[0, c]
-        level[0, c] += numbers.dc * error + level[1, c]
-        level[1, c] += numbers.dc_drift * error
-        trips |= observer_pass(numbers, shape, band, loop, c, error, deviation, g, integral, 1.0 - touch[SCALE])
-    believe(numbers, touch, loop, level, past, flags)
-    wake(numbers, touch, trips & 1, trips & 2)
-    state.sample[0] += 1
-    if touch[CONTACT] > 0.0 and numbers.adapt >= 0.0 and state.sample[0] % ADAPTATION == 0:
-        lively = max(fast, slow)
-        gain = numbers.adapt + lively * (numbers.adapt_awake - numbers.adapt)
-        rest = numbers.rest + lively * (numbers.rest_awake - numbers.rest)
-        adapt_pass(numbers, mass, damping, stiffness, shape, tables.grip, band, loop, touch, inner, gain, rest)
-    law_pass(numbers, mass, damping, stiffness, shape, band, loop, touch, residual[1], residual[2])
-    return flags | odd | speak_pass(numbers, tables.speak, residual[1], residual[2], state.shaper, touch, drive)
+    """One sample of a single scenario; see `bank_advance`.  Returns flags."""
+    return int(bank_advance(tables, state, sensed, position, wanted, drive, target))
 
 
 @kernel

@@ -6,7 +6,7 @@ feed-forward; F = D(jw) V, or D(jw) V + D'(jw) dV/dt + j dw/dt M V.  The loop
 compares R with L y, or listens to the deviation y - sum Re R e^{j phi}: then
 the reference passes the same L as the signal, and the 2f image of R is gone.
 
-Carriers are those of the band bank; complex rows have the band index innermost.
+Carriers are those of the band bank; rows have the band index innermost.
 """
 
 from __future__ import annotations
@@ -15,20 +15,28 @@ import math
 from typing import NamedTuple
 
 from hapticrender._jit import kernel
-from hapticrender.control.bank_kernels import COS, OMEGA, SIN, SWEEP, WEIGHT, carrier_pass, track_finger
+from hapticrender.control.bank_finger import track_finger
+from hapticrender.control.bank_rows import ACCELERATION, HELD, SEEN, VELOCITY
 from hapticrender.control.kernels import (
     FAR,
+    FREQUENCY,
+    PHASE,
+    TURN,
     WANTED_IM,
     WANTED_RE,
+    WAVENUMBER,
     Section,
     biquad_step,
     doubt_pass,
+    fade,
     listen_pass,
     speak_pass,
 )
 from hapticrender.protocols import Array
 
-CARRIER_ROWS = SWEEP + 1  # of ComplexState.band, filled by the band bank's carrier_pass
+# rows of ComplexState.band: the carriers
+TURNS, RAMP, WEIGHT, COS, SIN, OMEGA, SWEEP = range(7)
+CARRIER_ROWS = 7
 # rows of ComplexState.wanted: R, its slope, low-pass states of the wanted waveform
 R, DR, RAW1, RAW2 = range(4)
 WANTED_ROWS = 4
@@ -80,6 +88,27 @@ class ComplexState(NamedTuple):
     track: Array  # the finger's motion
     coordinate: Array  # (2, coordinates) scratch: displacement, force
     doubt: Array  # (1,) 0: the sensors are believed, 1: they are not
+
+
+@kernel
+def carrier_pass(numbers, tone, band, track):
+    """Phase, frequency, sweep and weight of every carrier."""
+    for k in range(tone.shape[1]):
+        wavenumber = tone[WAVENUMBER, k]
+        band[OMEGA, k] = TURN * (tone[FREQUENCY, k] + wavenumber * track[VELOCITY])
+        band[SWEEP, k] = TURN * wavenumber * track[ACCELERATION]
+        turns = band[TURNS, k] + wavenumber * track[HELD] + tone[PHASE, k]
+        psi = TURN * (turns - math.floor(turns))
+        band[COS, k], band[SIN, k] = math.cos(psi), math.sin(psi)
+        felt = wavenumber == 0.0 or track[SEEN] > 0.0
+        ramp = min(band[RAMP, k] + numbers.ramp, 1.0) if felt else max(band[RAMP, k] - numbers.ramp, 0.0)
+        band[RAMP, k] = ramp
+        weight = ramp * ramp * (3.0 - 2.0 * ramp)
+        if wavenumber > 0.0:
+            weight *= fade(abs(band[OMEGA, k]) / TURN, numbers.lowest, numbers.highest)
+        band[WEIGHT, k] = weight
+        turns = band[TURNS, k] + tone[FREQUENCY, k] / numbers.rate
+        band[TURNS, k] = turns - math.floor(turns)
 
 
 @kernel

@@ -9,7 +9,7 @@ import numpy as np
 from hapticrender.bands import Bands
 from hapticrender.control.bandmodel import BandModel
 from hapticrender.control.bank import RAMP_TIME
-from hapticrender.control.bank_kernels import TRACK_ROWS
+from hapticrender.control.bank_rows import TRACK_ROWS
 from hapticrender.control.complex_kernels import (
     CARRIER_ROWS,
     LOOP_ROWS,

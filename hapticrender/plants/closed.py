@@ -9,7 +9,8 @@ from __future__ import annotations
 from numba.extending import overload
 
 from hapticrender._jit import kernel
-from hapticrender.control.bank_kernels import BankTables, bank_step
+from hapticrender.control.bank_kernels import bank_step
+from hapticrender.control.bank_state import BankTables
 from hapticrender.control.boxcar_kernels import BoxcarTables, boxcar_step
 from hapticrender.control.complex_kernels import ComplexTables, complex_step
 from hapticrender.control.kernels import PolarTables, polar_step

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from hapticrender.control.bank_kernels import CROWDED_MASS, CROWDED_STIFFNESS
+from hapticrender.control.bank_finger import CROWDED_MASS, CROWDED_STIFFNESS
 from hapticrender.control.bank_loop import BankLoop, KnownFinger, Structure
 from hapticrender.control.damping import damping_taps
 from hapticrender.control.margins import sensitivity

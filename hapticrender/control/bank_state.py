@@ -1,0 +1,114 @@
+"""Parameters and state of the band bank's compiled step.
+
+Everything a band owns is a column of rows named in `bank_rows`, W columns to a tile (`hapticrender._lanes`).  What a
+scenario owns is a plain number, or a row of W scenarios side by side: then a lane of a tile is a scenario, and a tile
+one band of each.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from hapticrender._lanes import WIDTH, aligned, padded
+from hapticrender.control import bank_rows as row
+from hapticrender.protocols import Array
+
+
+class BankNumbers(NamedTuple):
+    """What all bands share."""
+
+    rate: float
+    analysed: bool
+    error_observer: bool
+    lead: float  # s: delay and half the hold
+    reference: float  # g of the bank that analyses and filters the target, per sample
+    observer: float  # g of the observer in quiet, per sample; 0 without feedback
+    observer_awake: float
+    crowd_speed: float  # m/s: below it finger-locked carriers crowd, and the observer slows down with the finger
+    dc: float  # 1.6 w h of the DC band (type 2)
+    dc_drift: float  # (w h)^2
+    integral: float  # 1/s in quiet
+    integral_stirred: float
+    integral_awake: float
+    adapt: float  # 1/s in quiet; negative: never
+    adapt_awake: float
+    rest: float  # 1/s: adaptation of each band's remaining stiffness, in quiet
+    rest_awake: float
+    inner: float  # share of the inner loop that is always on
+    inner_awake: float
+    fast_pole: float  # per sample
+    slow_pole: float
+    fast_level: float  # m, squared; infinite: no detectors
+    slow_level: float
+    fast_time: float  # samples
+    slow_time: float
+    release: float  # per sample
+    ramp: float  # per sample
+    lowest: float  # Hz
+    highest: float
+    contact_on: float  # N
+    contact_off: float
+    drive_limit: float
+    drive_step: float  # 0: not shaped
+    peak_decay: float  # per sample
+    back: float  # 1/s: back-calculation at the limit
+    sensed_limit: float
+
+
+class BankTables(NamedTuple):
+    """Parameters of the bank."""
+
+    numbers: BankNumbers
+    tone: Array  # (5, bands)
+    listen: Array  # (coordinates, sensors)
+    speak: Array  # (channels, coordinates): drive per force
+    mass: Array  # (coordinates, coordinates)
+    damping: Array
+    stiffness: Array
+    shape: tuple[float, ...]  # pattern of the target over the coordinates; their number is known while compiling
+    taps: Array  # (coordinates, taps) of the inner loop, N/m
+    grip: Array  # (coordinates,) damping that the inner loop adds, N s/m
+
+
+class BankState(NamedTuple):
+    """State of the bank; changed in place."""
+
+    band: Array  # (tiles, BAND_ROWS, W)
+    loop: Array  # (tiles, coordinates * LOOP_ROWS, W)
+    law: Array  # (tiles, FIRST_LAW + coordinates^2 * LAW_ROWS, W)
+    locked: Array  # (tiles,) integer: 1 where a carrier of the tile follows the finger
+    track: Array  # (TRACK_ROWS,)
+    touch: Array  # (TOUCH_ROWS,)
+    level: Array  # (2, coordinates) DC band and its drift
+    past: Array  # (coordinates, taps) last deviations, newest first
+    residual: Array  # (4, coordinates) scratch
+    shaper: Array  # (2, channels) last two errors of the command's rounding
+    sample: Array  # (1,) integer: samples so far
+
+
+def bank_state(tables: BankTables, dtype: type = np.float64) -> BankState:
+    """State of a bank at rest, its bands in `dtype`."""
+    coordinates, bands = len(tables.shape), tables.tone.shape[1]
+    tiles, width = padded(bands, dtype), WIDTH[np.dtype(dtype)]
+    touch = np.zeros(row.TOUCH_ROWS)
+    touch[[row.SCALE, row.TRUST]] = 1.0
+    return BankState(
+        band=aligned((tiles, row.BAND_ROWS, width), dtype),
+        loop=aligned((tiles, coordinates * row.LOOP_ROWS, width), dtype),
+        law=aligned((tiles, row.FIRST_LAW + coordinates**2 * row.LAW_ROWS, width), dtype),
+        locked=np.zeros(tiles, np.int64),
+        track=np.zeros(row.TRACK_ROWS),
+        touch=touch,
+        level=np.zeros((2, coordinates)),
+        past=np.zeros((coordinates, tables.taps.shape[1])),
+        residual=np.zeros((4, coordinates)),
+        shaper=np.zeros((2, len(tables.speak))),
+        sample=np.zeros(1, np.int64),
+    )
+
+
+def across_bands(tiled: Array, index: int, bands: int) -> Array:
+    """Copy of row `index` of a tiled array (tiles, rows, W), band after band, shape (bands,)."""
+    return np.ascontiguousarray(tiled[:, index]).reshape(-1)[:bands]
