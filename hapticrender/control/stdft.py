@@ -59,8 +59,10 @@ def _boxcar_run(signal, carrier_phase, envelopes, table, history, total, lap, cu
                 X[k] = complex(gain * t[0, k], gain * t[1, k])
         cursor[0] = (i + 1) % length
         if cursor[0] == 0:
-            total[:] = lap
-            lap[:] = 0.0
+            for c in range(lap.shape[0]):
+                for part in range(2):
+                    for k in range(bands):
+                        total[c, part, k], lap[c, part, k] = lap[c, part, k], 0.0
     return replaced
 
 
