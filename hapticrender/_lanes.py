@@ -271,16 +271,45 @@ def total(typingctx: Any, like: Any, a: Any) -> Any:
         return a(like, a), lambda context, builder, sig, args: args[1]
 
     def build(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        value, width = args[1], a.width
-        while width > 1:  # halves added pairwise
-            width //= 2
-            order = ir.VectorType(ir.IntType(32), width)
-            lower = builder.shuffle_vector(value, value, ir.Constant(order, list(range(width))))
-            upper = builder.shuffle_vector(value, value, ir.Constant(order, list(range(width, 2 * width))))
-            value = builder.fadd(lower, upper)
+        value = args[1]
+        while value.type.count > 1:
+            value = _folded(builder, value)
         return builder.extract_element(value, ir.IntType(32)(0))
 
     return a.dtype(like, a), build
+
+
+@intrinsic
+def totals(typingctx: Any, like: Any, a: Any, b: Any) -> Any:
+    """Both `total(like, a)` and `total(like, b)`, in half the instructions."""
+    if isinstance(like, LaneType) or not isinstance(a, LaneType) or a != b:
+        return types.UniTuple(a, 2)(like, a, b), lambda context, builder, sig, args: context.make_tuple(
+            builder, sig.return_type, args[1:]
+        )
+
+    def build(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        first, second = args[1:]
+        half, index = a.width // 2, ir.VectorType(ir.IntType(32), a.width)
+        lower = [i for pair in range(0, a.width, 2) for i in (pair, a.width + pair)]
+        value = builder.fadd(
+            builder.shuffle_vector(first, second, ir.Constant(index, lower)),
+            builder.shuffle_vector(first, second, ir.Constant(index, [i + 1 for i in lower])),
+        )  # first, second, first, second ...
+        while half > 1:
+            value, half = _folded(builder, value), half // 2
+        sums = [builder.extract_element(value, ir.IntType(32)(i)) for i in range(2)]
+        return context.make_tuple(builder, sig.return_type, sums)
+
+    return types.UniTuple(a.dtype, 2)(like, a, b), build
+
+
+def _folded(builder: Any, value: Any) -> Any:
+    """Sum of the lower and the upper half of a vector."""
+    half = value.type.count // 2
+    order = ir.VectorType(ir.IntType(32), half)
+    lower = builder.shuffle_vector(value, value, ir.Constant(order, list(range(half))))
+    upper = builder.shuffle_vector(value, value, ir.Constant(order, list(range(half, 2 * half))))
+    return builder.fadd(lower, upper)
 
 
 def _address(context: Any, builder: Any, kind: Any, array: Any, *where: Any) -> Any:
@@ -293,6 +322,34 @@ def _address(context: Any, builder: Any, kind: Any, array: Any, *where: Any) -> 
     width = WIDTH[np.dtype(str(kind.dtype))]
     vector = ir.VectorType(_element(kind.dtype), width)
     return builder.gep(builder.bitcast(data.data, vector.as_pointer()), [row])
+
+
+def _kept_apart(builder: Any, access: Any, kind: str) -> None:
+    """Tell LLVM that tiles and a scenario's own numbers never share memory, so that neither is read again in vain."""
+    module = builder.module
+    base = module.add_metadata(
+        [ir.MetaDataString(module, kind), module.add_metadata([ir.MetaDataString(module, "lanes")])]
+    )
+    access.set_metadata("tbaa", module.add_metadata([base, base, ir.IntType(64)(0)]))
+
+
+def _load(context: Any, builder: Any, kind: Any, array: Any, where: Any, count: int) -> Any:
+    """Value at `where`: a row of lanes or a number."""
+    if _is_rows(kind, count):
+        value = builder.load(_address(context, builder, kind, array, *where), align=_wide(kind))
+    else:
+        value = builder.load(_number(context, builder, kind, array, *where))
+    _kept_apart(builder, value, "tile" if kind.ndim == 3 and _is_rows(kind, count) else "own")
+    return value
+
+
+def _store(context: Any, builder: Any, kind: Any, array: Any, where: Any, count: int, value: Any) -> None:
+    """Write a row of lanes or a number at `where`."""
+    if _is_rows(kind, count):
+        access = builder.store(value, _address(context, builder, kind, array, *where), align=_wide(kind))
+    else:
+        access = builder.store(value, _number(context, builder, kind, array, *where))
+    _kept_apart(builder, access, "tile" if kind.ndim == 3 and _is_rows(kind, count) else "own")
 
 
 def _is_rows(kind: Any, indices: int) -> bool:
@@ -313,12 +370,9 @@ def lanes(typingctx: Any, array: Any, i: Any, j: Any) -> Any:
     """Row array[i, j, :]."""
     if not _is_rows(array, 2):
         return None
-
-    def build(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        at = _address(context, builder, sig.args[0], *args)
-        return builder.load(at, align=_wide(sig.args[0]))
-
-    return _lane(array)(array, types.intp, types.intp), build
+    return _lane(array)(array, types.intp, types.intp), lambda context, builder, sig, args: _load(
+        context, builder, sig.args[0], args[0], args[1:], 2
+    )
 
 
 @intrinsic
@@ -328,7 +382,7 @@ def put(typingctx: Any, array: Any, i: Any, j: Any, value: Any) -> Any:
         return None
 
     def build(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        builder.store(args[3], _address(context, builder, sig.args[0], *args[:3]), align=_wide(sig.args[0]))
+        _store(context, builder, sig.args[0], args[0], args[1:3], 2, args[3])
         return context.get_dummy_value()
 
     return types.none(array, types.intp, types.intp, _lane(array)), build
@@ -387,18 +441,12 @@ def read(typingctx: Any, array: Any, *index: Any) -> Any:
     """Take a scenario's own number array[i, ...], or the row array[i, ..., :] where every lane is a scenario."""
     index = index[0] if len(index) == 1 and isinstance(index[0], types.BaseTuple) else index
     count = len(index)
-    rows = _is_rows(array, count)
-    if not rows and not _is_numbers(array, count):
+    if not _is_rows(array, count) and not _is_numbers(array, count):
         return None
-
-    def build(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        where = cgutils.unpack_tuple(builder, args[1]) if len(args) == 2 and count else args[1:]
-        if rows:
-            return builder.load(_address(context, builder, sig.args[0], args[0], *where), align=_wide(sig.args[0]))
-        return builder.load(_number(context, builder, sig.args[0], args[0], *where))
-
-    kind = _lane(array) if rows else array.dtype
-    return kind(array, types.StarArgTuple.from_types([types.intp] * count)), build
+    kind = _lane(array) if _is_rows(array, count) else array.dtype
+    return kind(array, types.StarArgTuple.from_types([types.intp] * count)), lambda context, builder, sig, args: _load(
+        context, builder, sig.args[0], args[0], cgutils.unpack_tuple(builder, args[1]), count
+    )
 
 
 @intrinsic
@@ -406,20 +454,14 @@ def write(typingctx: Any, value: Any, array: Any, *index: Any) -> Any:
     """Write a scenario's own number array[i, ...], or the row array[i, ..., :] where every lane is a scenario."""
     index = index[0] if len(index) == 1 and isinstance(index[0], types.BaseTuple) else index
     count = len(index)
-    rows = _is_rows(array, count)
-    if not rows and not _is_numbers(array, count):
+    if not _is_rows(array, count) and not _is_numbers(array, count):
         return None
 
     def build(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        where = cgutils.unpack_tuple(builder, args[2])
-        if rows:
-            at = _address(context, builder, sig.args[1], args[1], *where)
-            builder.store(args[0], at, align=_wide(sig.args[1]))
-        else:
-            builder.store(args[0], _number(context, builder, sig.args[1], args[1], *where))
+        _store(context, builder, sig.args[1], args[1], cgutils.unpack_tuple(builder, args[2]), count, args[0])
         return context.get_dummy_value()
 
-    kind = _lane(array) if rows else array.dtype
+    kind = _lane(array) if _is_rows(array, count) else array.dtype
     return types.none(kind, array, types.StarArgTuple.from_types([types.intp] * count)), build
 
 

@@ -8,7 +8,6 @@ import scipy.linalg
 from naive_methods import fixed, hold, play
 
 import hapticrender as hr
-from hapticrender.control.bank_kernels import TURNS
 from hapticrender.control.methods import METHODS
 from hapticrender.plants.vibrotactile import Plate, PlateParameters
 from hapticrender.touch.mechanics import HEAVY
@@ -164,7 +163,7 @@ def test_row_15_phase_from_a_growing_time():
     controller = METHODS["h2"].design(IDEAL.band_model(RATE, 1), fixed((float(frequency), 1e-6)))
     play(controller, samples / RATE, IDEAL)
     true = Fraction(float(frequency) / RATE) * samples % 1
-    off = float((Fraction(controller.state.band[TURNS, 0]) - true + Fraction(1, 2)) % 1 - Fraction(1, 2))
+    off = float((Fraction(controller.turns[0]) - true + Fraction(1, 2)) % 1 - Fraction(1, 2))
     assert abs(off) < samples * 2.0**-53
 
 

@@ -10,7 +10,8 @@ from hypothesis import strategies as st
 
 import hapticrender as hr
 from hapticrender.bands import Bands
-from hapticrender.control.bank_kernels import COS, SIN, TURNS
+from hapticrender.control.bank_rows import COS, SIN
+from hapticrender.control.bank_state import across_bands
 from hapticrender.control.methods import METHODS
 from hapticrender.drivers.base import BaseDriver
 from hapticrender.plants.vibrotactile import Plate, PlateParameters
@@ -157,8 +158,8 @@ def test_drive_is_finite_and_inside_its_limit_whatever_comes_in(method, analysed
     assert np.isfinite(drive).all()
     assert abs(drive).max() <= controller.tables.numbers.drive_limit
     assert np.isfinite(target).all()
-    for array in controller.state:
-        assert np.isfinite(array).all()
+    for part in controller.state:
+        assert np.isfinite(part).all()
     for (n, name), value in {(n, name): value for n, name, value in spoilt}.items():
         absurd = not abs(value) <= 1e3 and not (name == "position" and np.isnan(value))  # NaN there: no finger
         assert not absurd or flags[n] & Flag.NONFINITE, (n, name, value)
@@ -227,13 +228,13 @@ def turns_after(samples, frequency):
 
 
 def test_the_phase_keeps_to_one_turn_and_does_not_drift():
-    """400 s: each addition rounds a number below 1 by at most 2^-54, and so does frequency/rate, n times over."""
+    """400 s: frequency/rate rounds a number below 1 by at most 2^-54, n times over, and so does reading the phase."""
     n = 2_000_000
     controller = design("h2", tones(*((f, 1e-9) for f in PITCHES)))
     for _ in range(10):
         controller.run(np.zeros((n // 10, 2)), np.full(n // 10, np.nan), np.zeros(n // 10))
-        assert np.all((controller.state.band[TURNS] >= 0) & (controller.state.band[TURNS] < 1))
-    for found, frequency in zip(controller.state.band[TURNS], PITCHES, strict=True):
+        assert np.all((controller.turns >= 0) & (controller.turns < 1))
+    for found, frequency in zip(controller.turns, PITCHES, strict=True):
         apart = found - turns_after(n, frequency)
         assert abs(apart - round(apart)) <= 2 * n * 2.0**-54
 
@@ -246,7 +247,7 @@ def test_after_ten_hours_it_plays_as_in_the_first_second(method, samples):
     FACTS 2 row 15: a growing time in float32 is by then good to 2 ms, half a turn.
     """
     late = design(method, tones(*((f, 1e-6) for f in PITCHES)))
-    late.state.band[TURNS] = [turns_after(samples, f) for f in PITCHES]
+    late.state.phase[:] = [int(turns_after(samples, f) * 2**64) for f in PITCHES]
     early = design(
         method,
         dataclasses.replace(
@@ -256,7 +257,8 @@ def test_after_ten_hours_it_plays_as_in_the_first_second(method, samples):
     )
     found, expected = (c.run(np.zeros((3000, 2)), np.full(3000, np.nan), np.zeros(3000))[0] for c in (late, early))
     exact = 2 * np.pi * np.array([turns_after(samples + 2999, f) for f in PITCHES])
-    np.testing.assert_allclose(late.state.band[[COS, SIN]], [np.cos(exact), np.sin(exact)], rtol=0, atol=1e-11)
+    carrier = [across_bands(late.state.band, part, len(PITCHES)) for part in (COS, SIN)]
+    np.testing.assert_allclose(carrier, [np.cos(exact), np.sin(exact)], rtol=0, atol=1e-11)
     assert abs(expected).max() > 0
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-9 * abs(expected).max())
     naive = np.float32(samples / RATE) * np.float32(PITCHES[1]) % 1

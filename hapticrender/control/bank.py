@@ -8,12 +8,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from hapticrender.bands import Bands
-from hapticrender.control.bandmodel import BandModel
 from hapticrender.control import bank_rows as row
-from hapticrender.control.bank_kernels import bank_run
+from hapticrender.control.bandmodel import BandModel
+from hapticrender.control.bank_kernels import REFRESH, bank_run
 from hapticrender.control.bank_state import BankNumbers, BankTables, across_bands, bank_state
 from hapticrender.control.damping import choose_damping
-from hapticrender.control.kernels import WAVENUMBER
+from hapticrender.control.kernels import FREQUENCY, WAVENUMBER
 from hapticrender.control.stability import Checked, Limits, checked_bandwidth
 from hapticrender.protocols import Array
 
@@ -95,6 +95,13 @@ class BankController:
         large = (wanted > LEAST_WANTED) & (largest(row.E_RE, row.E_IM) < SETTLED * wanted)
         settled = touch[row.CONTACT] == 0.0 and touch[row.TRUST] == 1.0 and touch[row.SCALE] == 1.0
         return float((largest(row.V_RE, row.V_IM)[large] / wanted[large]).max()) if settled and large.any() else 0.0
+
+    @property
+    def turns(self) -> Array:
+        """Fixed part of each carrier's phase at the next sample (turns, 0 to 1, shape (bands,))."""
+        left = -int(self.state.sample[0]) % REFRESH  # samples until the next refresh, for which the phase is kept
+        step = np.mod(self.tables.tone[FREQUENCY] / self.tables.numbers.rate, 1.0)
+        return np.mod(self.state.phase / 2.0**64 - left * step, 1.0)
 
     def run(self, sensed: Array, position: Array, wanted: Array) -> tuple[Array, Array, Array]:
         """Digest n samples; see `Controller`."""

@@ -35,9 +35,8 @@ def track_finger(track, rate, position):
 
 
 @kernel
-def feel(numbers, stiffness, level, touch):
+def feel(numbers, coordinates, stiffness, level, touch):
     """Load and place of the finger from the sag (the DC band); true where contact has just begun or ended."""
-    coordinates = level.shape[1]
     load = moment = 0.0 * read(level, 0, 0)
     for c in range(coordinates):
         load -= read(stiffness, 0, c) * read(level, 0, c)
@@ -47,7 +46,8 @@ def feel(numbers, stiffness, level, touch):
     on = select(load > select(was > 0.0, numbers.contact_off, numbers.contact_on), 1.0, 0.0)
     write(load, touch, row.LOAD)
     write(on, touch, row.CONTACT)
-    write(select(on > 0.0, low(high(moment / high(load, LEAST_LOAD), -2.0), 2.0), place), touch, row.PLACE)
+    if any_of(on > 0.0):
+        write(select(on > 0.0, low(high(moment / high(load, LEAST_LOAD), -2.0), 2.0), place), touch, row.PLACE)
     return size(on - was) > 0.5
 
 
@@ -71,16 +71,6 @@ def finger_stiffness(touch, band, t):
     omega = lanes(band, t, row.OMEGA)
     re = read(touch, row.STIFFNESS) - omega * omega * read(touch, row.MASS) + lanes(band, t, row.REST_RE)
     return re, omega * read(touch, row.DAMPING) + lanes(band, t, row.REST_IM)
-
-
-@kernel
-def finger_pull(touch, band, t, at_re, at_im, dat_re, dat_im):
-    """Force of the finger on the surface that moves with envelope `at` (m) and its slope `dat` (m/s) under it."""
-    z_re, z_im = finger_stiffness(touch, band, t)
-    z_im += lanes(band, t, row.SWEEP) * read(touch, row.MASS)
-    drag, turn = read(touch, row.DAMPING), 2.0 * lanes(band, t, row.OMEGA) * read(touch, row.MASS)
-    re = z_re * at_re - z_im * at_im + drag * dat_re - turn * dat_im
-    return re, z_re * at_im + z_im * at_re + drag * dat_im + turn * dat_re
 
 
 @kernel

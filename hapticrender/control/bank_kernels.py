@@ -9,11 +9,28 @@ bands are the lanes, and as many scenarios as there are lanes, side by side.
 
 from __future__ import annotations
 
+import numpy as np
+
 from hapticrender._jit import kernel
-from hapticrender._lanes import any_of, floor, high, lanes, low, put, put_pairs, read, root, select, size, total, write
+from hapticrender._lanes import (
+    any_of,
+    floor,
+    high,
+    lanes,
+    low,
+    put,
+    put_pairs,
+    read,
+    root,
+    select,
+    size,
+    total,
+    totals,
+    write,
+)
 from hapticrender._polynomials import unit
-from hapticrender.control.bank_finger import adapt_pass, feel, finger_pull, forget_finger, track_finger
 from hapticrender.control import bank_rows as row
+from hapticrender.control.bank_finger import adapt_pass, feel, finger_stiffness, forget_finger, track_finger
 from hapticrender.control.kernels import DOUBT_TIME, FAR, TURN
 
 HUGE = 1e300  # stands for infinity, where fast arithmetic is not told of it
@@ -23,41 +40,80 @@ REFRESH = 64  # samples between two looks at the tones that are asked for
 
 
 @kernel
-def refresh(tables, state):
-    """Take up the tones that are asked for, and the law of the tiles whose carriers are fixed."""
-    tone, band, width = tables.tone, state.band, state.band.shape[2]
-    for t in range(band.shape[0]):
-        state.locked[t] = 0
-        for i in range(min(width, tone.shape[1] - t * width)):
-            k = t * width + i
-            band[t, row.LIVE, i] = 1.0
-            for r in range(5):
-                band[t, row.FREQUENCY + r, i] = tone[r, k]
-            if tone[1, k] > 0.0:
-                state.locked[t] = 1
-        if state.locked[t] == 0:
-            put(band, t, row.OMEGA, TURN * lanes(band, t, row.FREQUENCY))
-            law_tune(tables, band, state.law, t)
+def count_turns(phase, k, step):
+    """Phase of carrier k in turns, now; in whole 2^-64 turns, so that it never drifts; then counts on."""
+    turns = np.float64(phase[k] >> np.uint64(11)) * 2.0**-53
+    advance = REFRESH * (step - floor(step))
+    phase[k] += np.uint64((advance - floor(advance)) * 2.0**63) << np.uint64(1)
+    return turns
 
 
 @kernel
-def law_tune(tables, band, law, t):
-    """Law of a tile: D and D' of every pair of coordinates, turned ahead by delay and hold."""
-    numbers, coordinates = tables.numbers, len(tables.shape)
+def refresh(tables, state):
+    """Take up the tones that are asked for, and what stays for the next samples: law, turn, settled targets."""
+    numbers, tone, band, width = tables.numbers, tables.tone, state.band, state.band.shape[2]
+    state.follows[0] = 0
+    for t in range(band.shape[0]):
+        pace = row.GROWING if numbers.analysed or not numbers.error_observer else row.STEADY
+        for i in range(min(width, tone.shape[1] - t * width)):
+            k = t * width + i
+            band[t, row.LIVE, i] = 1.0
+            for r in range(row.TONE_ROWS):
+                band[t, row.FREQUENCY + r, i] = tone[r, k]
+            band[t, row.TURNS, i] = count_turns(state.phase, k, tone[0, k] / numbers.rate)
+            if band[t, row.RAMP, i] < 1.0 or band[t, row.R_RE, i] != tone[3, k] or band[t, row.R_IM, i] != tone[4, k]:
+                pace = min(pace, row.GROWING)
+            if tone[1, k] > 0.0:
+                pace = row.LOCKED
+        state.pace[t] = pace
+        if pace == row.LOCKED:
+            state.follows[0] += 1
+        else:
+            frequency = lanes(band, t, row.FREQUENCY)
+            cos, sin = unit(1.0 / numbers.rate * frequency)
+            put(band, t, row.TURN_COS, cos)
+            put(band, t, row.TURN_SIN, sin)
+            put(band, t, row.OMEGA, TURN * frequency)
+            look_ahead(numbers, band, state.law, t)
+            law_tune(tables, state, t)
+            cos, sin = unit(lanes(band, t, row.TURNS) + lanes(band, t, row.PHASE))
+            put(band, t, row.COS, lanes(band, t, row.LIVE) * cos)
+            put(band, t, row.SIN, lanes(band, t, row.LIVE) * sin)
+        if pace == row.STEADY:
+            put(band, t, row.DR_RE, 0.0 * lanes(band, t, row.DR_RE))
+            put(band, t, row.DR_IM, 0.0 * lanes(band, t, row.DR_IM))
+
+
+@kernel
+def look_ahead(numbers, band, law, t):
+    """Turn of a tile's force by delay and hold."""
     omega, sweep = lanes(band, t, row.OMEGA), lanes(band, t, row.SWEEP)
     cos, sin = unit(numbers.lead / TURN * (omega + 0.5 * numbers.lead * sweep))
     half = 0.5 / numbers.rate * omega
     _, chord = unit(half / TURN)
     straight = size(half) < 1e-9
     grow = select(straight, 1.0, half / select(straight, 1.0, chord))
-    cos, sin = grow * cos, grow * sin
-    put(law, t, row.AHEAD_RE, cos)
-    put(law, t, row.AHEAD_IM, sin)
+    put(law, t, row.AHEAD_RE, grow * cos)
+    put(law, t, row.AHEAD_IM, grow * sin)
+
+
+@kernel
+def law_tune(tables, state, t):
+    """Law of a tile: D + z h h^T and its slope for every pair of coordinates, turned ahead."""
+    band, law, touch, coordinates = state.band, state.law, state.touch, len(tables.shape)
+    omega, sweep = lanes(band, t, row.OMEGA), lanes(band, t, row.SWEEP)
+    cos, sin = lanes(law, t, row.AHEAD_RE), lanes(law, t, row.AHEAD_IM)
+    touching = read(touch, row.KNOWN)  # 1 where the finger is on, else 0
+    place = read(touch, row.PLACE)
+    skin, drag = touching * read(touch, row.MASS), touching * read(touch, row.DAMPING)
+    z_re, z_im = finger_stiffness(touch, band, t)
     for c in range(coordinates):
         for i in range(coordinates):
-            mass, damping = read(tables.mass, c, i), read(tables.damping, c, i)
+            arms = (1.0 if c == 0 else place) * (1.0 if i == 0 else place)
+            mass, damping = read(tables.mass, c, i) + arms * skin, read(tables.damping, c, i) + arms * drag
             at = row.FIRST_LAW + row.LAW_ROWS * (c * coordinates + i)
-            re, im = read(tables.stiffness, c, i) - omega * omega * mass, omega * damping + sweep * mass
+            re = read(tables.stiffness, c, i) - omega * omega * read(tables.mass, c, i) + arms * touching * z_re
+            im = omega * read(tables.damping, c, i) + arms * touching * z_im + sweep * mass
             put(law, t, at + row.LAW_RE, re * cos - im * sin)
             put(law, t, at + row.LAW_IM, re * sin + im * cos)
             turn = 2.0 * omega * mass
@@ -73,39 +129,69 @@ def ease(x):
 
 
 @kernel
-def carrier_pass(tables, state, t):
-    """Phase, frequency, sweep and weight of the carriers of a tile; the law, where they follow the finger."""
-    numbers, band, track = tables.numbers, state.band, state.track
-    turns, frequency = lanes(band, t, row.TURNS), lanes(band, t, row.FREQUENCY)
-    at = turns + lanes(band, t, row.PHASE)
-    ramp = lanes(band, t, row.RAMP)
-    if state.locked[t] == 0:
-        ramp = low(ramp + numbers.ramp, 1.0)
-        weight = lanes(band, t, row.LIVE) * ease(ramp)
-    else:
-        wavenumber = lanes(band, t, row.WAVENUMBER)
-        hertz = frequency + wavenumber * read(track, row.VELOCITY)
-        put(band, t, row.OMEGA, TURN * hertz)
-        put(band, t, row.SWEEP, TURN * wavenumber * read(track, row.ACCELERATION))
-        at += wavenumber * read(track, row.HELD)
-        felt = (wavenumber == 0.0) | (read(track, row.SEEN) > 0.0)
-        ramp = select(felt, low(ramp + numbers.ramp, 1.0), high(ramp - numbers.ramp, 0.0))
-        inside = ease(2.0 / numbers.lowest * size(hertz) - 1.0) * ease(5.0 - 4.0 / numbers.highest * size(hertz))
-        weight = lanes(band, t, row.LIVE) * ease(ramp) * select(wavenumber > 0.0, inside, 1.0)
-        law_tune(tables, band, state.law, t)
-    cos, sin = unit(at)
-    put(band, t, row.COS, lanes(band, t, row.LIVE) * cos)
-    put(band, t, row.SIN, lanes(band, t, row.LIVE) * sin)
+def turn_pass(tables, state, t):
+    """Turn the fixed carriers of a tile on to this sample; `refresh` keeps them exact."""
+    band = state.band
+    cos, sin = lanes(band, t, row.COS), lanes(band, t, row.SIN)
+    turn_cos, turn_sin = lanes(band, t, row.TURN_COS), lanes(band, t, row.TURN_SIN)
+    put(band, t, row.COS, cos * turn_cos - sin * turn_sin)
+    put(band, t, row.SIN, sin * turn_cos + cos * turn_sin)
+
+
+@kernel
+def grow_pass(tables, state, t):
+    """Weight of the fixed carriers of a tile while their targets grow."""
+    band = state.band
+    ramp = low(lanes(band, t, row.RAMP) + tables.numbers.ramp, 1.0)
+    weight = lanes(band, t, row.LIVE) * ease(ramp)
     put(band, t, row.RAMP, ramp)
     put(band, t, row.WEIGHT, weight)
-    turns += 1.0 / numbers.rate * frequency
-    put(band, t, row.TURNS, turns - floor(turns))
+    put(band, t, row.SHARE, low(weight / high(ramp, 1e-9), 1.0))
+
+
+@kernel
+def locked_pass(tables, state, t):
+    """Carriers, weights and law of a tile that follows the finger."""
+    numbers, band, track = tables.numbers, state.band, state.track
+    wavenumber = lanes(band, t, row.WAVENUMBER)
+    hertz = lanes(band, t, row.FREQUENCY) + wavenumber * read(track, row.VELOCITY)
+    put(band, t, row.OMEGA, TURN * hertz)
+    put(band, t, row.SWEEP, TURN * wavenumber * read(track, row.ACCELERATION))
+    turns = lanes(band, t, row.TURNS)
+    cos, sin = unit(turns + wavenumber * read(track, row.HELD) + lanes(band, t, row.PHASE))
+    put(band, t, row.TURNS, turns + 1.0 / numbers.rate * lanes(band, t, row.FREQUENCY))
+    put(band, t, row.COS, lanes(band, t, row.LIVE) * cos)
+    put(band, t, row.SIN, lanes(band, t, row.LIVE) * sin)
+    felt = (wavenumber == 0.0) | (read(track, row.SEEN) > 0.0)
+    ramp = lanes(band, t, row.RAMP)
+    ramp = select(felt, low(ramp + numbers.ramp, 1.0), high(ramp - numbers.ramp, 0.0))
+    inside = ease(2.0 / numbers.lowest * size(hertz) - 1.0) * ease(5.0 - 4.0 / numbers.highest * size(hertz))
+    weight = lanes(band, t, row.LIVE) * ease(ramp) * select(wavenumber > 0.0, inside, 1.0)
+    put(band, t, row.RAMP, ramp)
+    put(band, t, row.WEIGHT, weight)
+    put(band, t, row.SHARE, low(weight / high(ramp, 1e-9), 1.0))
+
+
+@kernel
+def carrier_pass(tables, state, fresh):
+    """Phase, frequency, sweep and weight of every carrier; carriers that are `fresh` stand where they belong."""
+    for t in range(state.band.shape[0]):
+        if state.pace[t] == row.LOCKED:
+            locked_pass(tables, state, t)
+        else:
+            if not fresh:
+                turn_pass(tables, state, t)
+            if state.pace[t] == row.GROWING:
+                grow_pass(tables, state, t)
 
 
 @kernel
 def target_pass(tables, state, t, g, residual, target):
     """Wanted envelope R and its slope: constant, or the wanted waveform through the bank and one more pole."""
     numbers, band = tables.numbers, state.band
+    if state.pace[t] == row.STEADY:
+        put_pairs(target, t, lanes(band, t, row.R_RE), lanes(band, t, row.R_IM))
+        return
     weight = lanes(band, t, row.WEIGHT)
     old_re, old_im = lanes(band, t, row.R_RE), lanes(band, t, row.R_IM)
     if numbers.analysed:
@@ -155,11 +241,12 @@ def residual_pass(tables, state, y, c):
         commanded += (shape * lanes(band, t, row.R_RE) + lanes(loop, t, base + row.V_RE)) * cos
         commanded -= (shape * lanes(band, t, row.R_IM) + lanes(loop, t, base + row.V_IM)) * sin
     dc = read(level, 0, c)
-    deviation = y - read(state.touch, row.SCALE) * total(y, commanded)
-    for i in range(past.shape[1] - 1, 0, -1):
+    observed, commanded = totals(y, observed, commanded)
+    deviation = y - read(state.touch, row.SCALE) * commanded
+    for i in range(len(state.lags) - 1, 0, -1):
         write(read(past, c, i - 1), past, c, i)
     write(deviation, past, c, 0)
-    write(y - total(y, observed) - dc, state.residual, row.ERROR, c)
+    write(y - observed - dc, state.residual, row.ERROR, c)
     write(deviation - dc, state.residual, row.DEVIATION, c)
 
 
@@ -167,7 +254,7 @@ def residual_pass(tables, state, y, c):
 def inner_force(tables, state, inner, c):
     """Force of the inner loop: its taps on the last deviations."""
     force = 0.0 * inner
-    for i in range(state.past.shape[1]):
+    for i in range(len(state.lags)):
         force -= inner * read(tables.taps, c, i) * read(state.past, c, i)
     write(force, state.residual, row.FORCE, c)
 
@@ -186,7 +273,7 @@ def observer_pass(tables, state, t, c, g, integral, back):
     numbers, band, loop, shape = tables.numbers, state.band, state.loop, tables.shape[c]
     base, period, error = c * row.LOOP_ROWS, 1.0 / tables.numbers.rate, read(state.residual, row.ERROR, c)
     cos, sin = lanes(band, t, row.COS), lanes(band, t, row.SIN)
-    weight = low(lanes(band, t, row.WEIGHT) / high(lanes(band, t, row.RAMP), 1e-9), 1.0)
+    weight = lanes(band, t, row.SHARE)
     fading = FORGET * (1.0 - weight)
     keep, pull = 1.0 - period * fading, weight * (g * error)
     e_re = keep * lanes(loop, t, base + row.E_RE) + pull * cos
@@ -199,10 +286,12 @@ def observer_pass(tables, state, t, c, g, integral, back):
     put(loop, t, base + row.E_IM, e_im)
     for r, e in ((0, e_re), (1, e_im)):
         v = lanes(loop, t, base + row.V_RE + r)
-        slope = -integral * e - back * (v + shape * lanes(band, t, row.R_RE + r)) - fading * v
+        wanted = shape * lanes(band, t, row.R_RE + r)
+        slope = -integral * e - back * (v + wanted) - fading * v
         v += period * slope
-        put(loop, t, base + row.DV_RE + r, slope)
         put(loop, t, base + row.V_RE + r, v)
+        put(loop, t, base + row.COMMAND_RE + r, v + wanted)
+        put(loop, t, base + row.SLOPED_RE + r, slope + shape * lanes(band, t, row.DR_RE + r))
         slow = lanes(loop, t, base + row.L_RE + r)
         put(loop, t, base + row.L_RE + r, slow + 0.5 * g * (v - slow))
 
@@ -230,6 +319,8 @@ def believe(numbers, state, doubt):
     """Trust in the sensors: falls to 0 within 20 ms where a sample cannot be believed; then the loop starts anew."""
     step = 1.0 / (DOUBT_TIME * numbers.rate)
     trust = read(state.touch, row.TRUST)
+    if not any_of((trust < 1.0) | (doubt > 0.0)):
+        return
     trust = select(doubt > 0.0, high(trust - step, 0.0), low(trust + step, 1.0))
     write(trust, state.touch, row.TRUST)
     lost = trust == 0.0
@@ -257,41 +348,46 @@ def wake(numbers, touch, fast, slow):
 
 
 @kernel
-def law_pass(tables, state, t, with_finger):
-    """F = D V + D' dV/dt + j dw/dt M V of a tile, finger included, turned ahead by delay and hold; adds to the force."""
-    band, loop, law, touch, coordinates = state.band, state.loop, state.law, state.touch, len(tables.shape)
-    cos, sin = lanes(band, t, row.COS), lanes(band, t, row.SIN)
-    pull_re = pull_im = 0.0 * cos
-    if any_of(with_finger):
-        at_re = at_im = dat_re = dat_im = 0.0 * cos
-        for i in range(coordinates):
-            base, shape = i * row.LOOP_ROWS, tables.shape[i]
-            place = 1.0 if i == 0 else read(touch, row.PLACE)
-            at_re += place * (shape * lanes(band, t, row.R_RE) + lanes(loop, t, base + row.V_RE))
-            at_im += place * (shape * lanes(band, t, row.R_IM) + lanes(loop, t, base + row.V_IM))
-            dat_re += place * (shape * lanes(band, t, row.DR_RE) + lanes(loop, t, base + row.DV_RE))
-            dat_im += place * (shape * lanes(band, t, row.DR_IM) + lanes(loop, t, base + row.DV_IM))
-        re, im = finger_pull(touch, band, t, at_re, at_im, dat_re, dat_im)
-        a_re, a_im = lanes(law, t, row.AHEAD_RE), lanes(law, t, row.AHEAD_IM)
-        pull_re = select(with_finger, re * a_re - im * a_im, 0.0)
-        pull_im = select(with_finger, re * a_im + im * a_re, 0.0)
+def know_finger(tables, state, touching, turn):
+    """Take what is known of the finger into the law: where contact changed, and in its turn; at once where it moves."""
+    touch = state.touch
+    known = select(touching, 1.0, 0.0)
+    due = turn & any_of(touching) | any_of(size(known - read(touch, row.KNOWN)) > 0.5)
+    write(known, touch, row.KNOWN)
+    if not due and state.follows[0] == 0:
+        return
+    for t in range(state.band.shape[0]):
+        if state.pace[t] == row.LOCKED:
+            look_ahead(tables.numbers, state.band, state.law, t)
+        if due or state.pace[t] == row.LOCKED:
+            law_tune(tables, state, t)
+
+
+@kernel
+def law_pass(tables, state):
+    """F = D V + D' dV/dt + j dw/dt M V, finger included, turned ahead by delay and hold; adds to the force."""
+    band, loop, law, coordinates = state.band, state.loop, state.law, len(tables.shape)
     for c in range(coordinates):
-        place = 1.0 if c == 0 else read(touch, row.PLACE)
-        re, im = place * pull_re, place * pull_im
-        for i in range(coordinates):
-            base, shape = i * row.LOOP_ROWS, tables.shape[i]
-            at = row.FIRST_LAW + row.LAW_ROWS * (c * coordinates + i)
-            v_re = shape * lanes(band, t, row.R_RE) + lanes(loop, t, base + row.V_RE)
-            v_im = shape * lanes(band, t, row.R_IM) + lanes(loop, t, base + row.V_IM)
-            dv_re = shape * lanes(band, t, row.DR_RE) + lanes(loop, t, base + row.DV_RE)
-            dv_im = shape * lanes(band, t, row.DR_IM) + lanes(loop, t, base + row.DV_IM)
-            d_re, d_im = lanes(law, t, at + row.LAW_RE), lanes(law, t, at + row.LAW_IM)
-            s_re, s_im = lanes(law, t, at + row.SLOPE_RE), lanes(law, t, at + row.SLOPE_IM)
-            re += d_re * v_re - d_im * v_im + s_re * dv_re - s_im * dv_im
-            im += d_re * v_im + d_im * v_re + s_re * dv_im + s_im * dv_re
-        force, across = read(state.residual, row.FORCE, c), read(state.residual, row.QUADRATURE, c)
-        write(force + total(force, re * cos - im * sin), state.residual, row.FORCE, c)
-        write(across + total(across, re * sin + im * cos), state.residual, row.QUADRATURE, c)
+        force = across = 0.0
+        for t in range(band.shape[0]):
+            along_re = along_im = sloped_re = sloped_im = 0.0
+            for i in range(coordinates):
+                base, at = i * row.LOOP_ROWS, row.FIRST_LAW + row.LAW_ROWS * (c * coordinates + i)
+                v_re, v_im = lanes(loop, t, base + row.COMMAND_RE), lanes(loop, t, base + row.COMMAND_IM)
+                dv_re, dv_im = lanes(loop, t, base + row.SLOPED_RE), lanes(loop, t, base + row.SLOPED_IM)
+                d_re, d_im = lanes(law, t, at + row.LAW_RE), lanes(law, t, at + row.LAW_IM)
+                s_re, s_im = lanes(law, t, at + row.SLOPE_RE), lanes(law, t, at + row.SLOPE_IM)
+                along_re += d_re * v_re - d_im * v_im
+                along_im += d_re * v_im + d_im * v_re
+                sloped_re += s_re * dv_re - s_im * dv_im
+                sloped_im += s_re * dv_im + s_im * dv_re
+            cos, sin = lanes(band, t, row.COS), lanes(band, t, row.SIN)
+            re, im = along_re + sloped_re, along_im + sloped_im
+            force += re * cos - im * sin
+            across += re * sin + im * cos
+        along, quarter = totals(read(state.touch, row.TRUST), force, across)
+        write(read(state.residual, row.FORCE, c) + along, state.residual, row.FORCE, c)
+        write(quarter, state.residual, row.QUADRATURE, c)
 
 
 @kernel
@@ -349,21 +445,22 @@ def bank_advance(tables, state, sensed, position, wanted, drive, target):
     sane = size(wanted) <= FAR
     odd = high(select(sane, 0.0, 2.0), select(size(position) > FAR, 2.0, 0.0))
     wanted = select(sane, wanted, 0.0)
-    if state.sample[0] % REFRESH == 0:
+    fresh = state.sample[0] % REFRESH == 0
+    if fresh:
         refresh(tables, state)
     state.sample[0] += 1
-    track_finger(state.track, numbers.rate, position)
+    if state.follows[0] > 0:
+        track_finger(state.track, numbers.rate, position)
     calm = 1.0 + 0.0 * read(touch, row.TRUST)
     if numbers.crowd_speed > 0.0:
         calm = low(size(read(state.track, row.VELOCITY)) * (1.0 / numbers.crowd_speed), 1.0)
-    for t in range(tiles):
-        carrier_pass(tables, state, t)
+    carrier_pass(tables, state, fresh)
     residual = wanted
     if numbers.analysed:
         residual = wanted_residual(band, wanted)
     for t in range(tiles):
         target_pass(tables, state, t, calm * numbers.reference, residual, target)
-    changed = feel(numbers, tables.stiffness, state.level, touch)
+    changed = feel(numbers, coordinates, tables.stiffness, state.level, touch)
     if any_of(changed):
         write(select(changed, numbers.fast_time, read(touch, row.FAST_TIME)), touch, row.FAST_TIME)
         forget_finger(changed, touch, band, state.loop)
@@ -376,13 +473,12 @@ def bank_advance(tables, state, sensed, position, wanted, drive, target):
     g = calm * (numbers.observer + fast * (numbers.observer_awake - numbers.observer))
     back = numbers.back * (1.0 - scale)
     doubt = 0.0 * scale
-    hears_fast = hears_slow = 0.0
+    hears_fast = hears_slow = 0.0 * lanes(band, 0, row.COS)
     for c in range(coordinates):
         y, unbelieved = listen_pass(tables, sensed, c)
         doubt = high(doubt, unbelieved)
         residual_pass(tables, state, y, c)
         inner_force(tables, state, inner, c)
-        write(0.0 * scale, state.residual, row.QUADRATURE, c)
         level_pass(numbers, state.level, read(state.residual, row.ERROR, c), c)
         for t in range(tiles):
             observer_pass(tables, state, t, c, g, integral, back)
@@ -392,17 +488,17 @@ def bank_advance(tables, state, sensed, position, wanted, drive, target):
                 hears_fast += heard_fast
                 hears_slow += heard_slow
     believe(numbers, state, doubt)
-    wake(numbers, touch, total(scale, hears_fast), total(scale, hears_slow))
-    touching = read(touch, row.CONTACT) > 0.0
-    adapts = numbers.adapt >= 0.0
-    if adapts and state.sample[0] % ADAPTATION == 0:
-        if any_of(touching):
-            lively = high(fast, slow)
-            gain = numbers.adapt + lively * (numbers.adapt_awake - numbers.adapt)
-            rest = numbers.rest + lively * (numbers.rest_awake - numbers.rest)
-            adapt_pass(tables, state, inner, gain, rest, touching)
-    for t in range(tiles):
-        law_pass(tables, state, t, touching & adapts)
+    fast_heard, slow_heard = totals(scale, hears_fast, hears_slow)
+    wake(numbers, touch, fast_heard, slow_heard)
+    touching = (read(touch, row.CONTACT) > 0.0) & (numbers.adapt >= 0.0)
+    turn = state.sample[0] % ADAPTATION == 0
+    if turn and any_of(touching):
+        lively = high(fast, slow)
+        gain = numbers.adapt + lively * (numbers.adapt_awake - numbers.adapt)
+        rest = numbers.rest + lively * (numbers.rest_awake - numbers.rest)
+        adapt_pass(tables, state, inner, gain, rest, touching)
+    know_finger(tables, state, touching, turn)
+    law_pass(tables, state)
     return speak_pass(tables, state, drive) + high(odd, 2.0 * doubt)
 
 

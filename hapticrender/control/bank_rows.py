@@ -7,17 +7,21 @@ Symbols: R wanted, V commanded and E error envelope of a coordinate, v = V - R t
 # rows of BankState.band: what the bank was asked for; carrier; target (R and its slope), and what the finger adds to it
 # beyond its three numbers
 LIVE, FREQUENCY, WAVENUMBER, PHASE, WANTED_RE, WANTED_IM = range(6)
-TURNS, RAMP, WEIGHT, COS, SIN, OMEGA, SWEEP = range(6, 13)
-R_RE, R_IM, DR_RE, DR_IM, RAW_RE, RAW_IM, REST_RE, REST_IM = range(13, 21)
+TONE_ROWS = 5
+TURNS, RAMP, WEIGHT, SHARE, COS, SIN, TURN_COS, TURN_SIN, OMEGA, SWEEP = range(6, 16)
+R_RE, R_IM, DR_RE, DR_IM, RAW_RE, RAW_IM, REST_RE, REST_IM = range(16, 24)
 # the target as the observer sees it: R itself (error observer), or R behind the observer's pole
-SEEN_RE, SEEN_IM = range(21, 23)
-BAND_ROWS = 23
-# rows of BankState.loop, LOOP_ROWS a coordinate: error; integral part, its slope; low-passed like the error; error and
-# low-passed integral part at the last adaptation; fast and slow detector of the deviation
-E_RE, E_IM, V_RE, V_IM, DV_RE, DV_IM, L_RE, L_IM, LAST_RE, LAST_IM, FAST_RE, FAST_IM, SLOW_RE, SLOW_IM = range(14)
-LOOP_ROWS = 14
-# rows of BankState.law: ahead, the turn by delay and hold; then, LAW_ROWS for each pair of coordinates, ahead D and
-# ahead D'
+SEEN_RE, SEEN_IM = range(24, 26)
+BAND_ROWS = 26
+# what BankState.pace says of a tile: carriers follow the finger; fixed, their targets growing; fixed, and nothing grows
+LOCKED, GROWING, STEADY = range(3)
+# rows of BankState.loop, LOOP_ROWS a coordinate: error; integral part; low-passed like the error; error and low-passed
+# integral part at the last adaptation; fast and slow detector of the deviation; command V and its slope
+E_RE, E_IM, V_RE, V_IM, L_RE, L_IM, LAST_RE, LAST_IM, FAST_RE, FAST_IM, SLOW_RE, SLOW_IM = range(12)
+COMMAND_RE, COMMAND_IM, SLOPED_RE, SLOPED_IM = range(12, 16)
+LOOP_ROWS = 16
+# rows of BankState.law: the turn ahead, by delay and hold; then, LAW_ROWS for each pair of coordinates, D and D' of
+# device and finger, turned ahead
 AHEAD_RE, AHEAD_IM = range(2)
 FIRST_LAW = 2
 LAW_RE, LAW_IM, SLOPE_RE, SLOPE_IM = range(4)
@@ -26,10 +30,12 @@ LAW_ROWS = 4
 HELD, SMOOTH, VELOCITY, ACCELERATION, SEEN = range(5)
 TRACK_ROWS = 5
 # entries of BankState.touch: the finger's load (N), place g, contact, its three numbers; timers and openings of the two
-# detectors; limiter (peak of the drive over its limit, squared, and the scale that answers it); trust in the sensors
+# detectors; limiter (peak of the drive over its limit, squared, and the scale that answers it); trust in the sensors;
+# contact as the law knows it
 LOAD, PLACE, CONTACT, MASS, DAMPING, STIFFNESS, FAST_TIME, SLOW_TIME, FAST_OPEN, SLOW_OPEN, PEAK, SCALE, TRUST = range(
     13
 )
-TOUCH_ROWS = 13
+KNOWN = 13
+TOUCH_ROWS = 14
 # rows of BankState.residual: residual of the observer, deviation, force, force a quarter turn ahead
 ERROR, DEVIATION, FORCE, QUADRATURE = range(4)

@@ -78,13 +78,16 @@ class BankState(NamedTuple):
     band: Array  # (tiles, BAND_ROWS, W)
     loop: Array  # (tiles, coordinates * LOOP_ROWS, W)
     law: Array  # (tiles, FIRST_LAW + coordinates^2 * LAW_ROWS, W)
-    locked: Array  # (tiles,) integer: 1 where a carrier of the tile follows the finger
+    phase: Array  # (bands,) uint64: fixed part of each carrier at the next refresh, 2^64 a turn
+    pace: Array  # (tiles,) integer: LOCKED, GROWING or STEADY
     track: Array  # (TRACK_ROWS,)
     touch: Array  # (TOUCH_ROWS,)
     level: Array  # (2, coordinates) DC band and its drift
     past: Array  # (coordinates, taps) last deviations, newest first
+    lags: tuple[int, ...]  # samples by which each tap looks back; their number is known while compiling
     residual: Array  # (4, coordinates) scratch
     shaper: Array  # (2, channels) last two errors of the command's rounding
+    follows: Array  # (1,) integer: tiles that follow the finger
     sample: Array  # (1,) integer: samples so far
 
 
@@ -98,13 +101,16 @@ def bank_state(tables: BankTables, dtype: type = np.float64) -> BankState:
         band=aligned((tiles, row.BAND_ROWS, width), dtype),
         loop=aligned((tiles, coordinates * row.LOOP_ROWS, width), dtype),
         law=aligned((tiles, row.FIRST_LAW + coordinates**2 * row.LAW_ROWS, width), dtype),
-        locked=np.zeros(tiles, np.int64),
+        phase=np.zeros(bands, np.uint64),
+        pace=np.zeros(tiles, np.int64),
         track=np.zeros(row.TRACK_ROWS),
         touch=touch,
         level=np.zeros((2, coordinates)),
-        past=np.zeros((coordinates, tables.taps.shape[1])),
+        past=np.zeros(tables.taps.shape),
+        lags=tuple(range(tables.taps.shape[1])),
         residual=np.zeros((4, coordinates)),
         shaper=np.zeros((2, len(tables.speak))),
+        follows=np.zeros(1, np.int64),
         sample=np.zeros(1, np.int64),
     )
 
