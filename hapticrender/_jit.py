@@ -2,8 +2,9 @@
 
 numba's disk cache looks only at the file of the kernel itself, so an edit to
 a helper in another file would bring back stale results.  Here every cache
-entry also carries the hash of every file of the package that holds kernels.  Where no cache
-folder is writable, kernels compile in memory.
+entry also carries the hash of every file of the package that holds kernels or
+speaks of them.  Where no cache folder is writable,
+kernels compile in memory.
 """
 
 from __future__ import annotations
@@ -18,10 +19,11 @@ from numba.core.caching import FunctionCache, IndexDataCacheFile
 
 def _source_stamp() -> str:
     sources = (path.read_bytes() for path in sorted(Path(__file__).parent.rglob("*.py")))
-    return hashlib.sha256(b"".join(source for source in sources if b"@kernel" in source)).hexdigest()
+    return hashlib.sha256(b"".join(source for source in sources if b"kernel" in source)).hexdigest()
 
 
 _STAMP = _source_stamp()
+OPTIONS: Any = {"error_model": "numpy", "fastmath": {"contract"}, "nogil": True, "forceinline": True, "_nrt": False}
 
 
 class _StampedCache(FunctionCache):
@@ -41,8 +43,7 @@ def kernel(function: Any) -> Any:
     A kernel allocates nothing, so arrays need no counting of references inside it (a call of the counter costs more
     than the arithmetic), and it becomes part of its caller, so that named tuples cost nothing to pass.
     """
-    options = {"error_model": "numpy", "fastmath": {"contract"}, "nogil": True, "forceinline": True, "_nrt": False}
-    compiled = numba.njit(**options)(function)
+    compiled = numba.njit(**OPTIONS)(function)
     try:
         compiled._cache = _StampedCache(function)  # type: ignore[attr-defined]
     except RuntimeError:  # numba: no writable cache location

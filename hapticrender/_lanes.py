@@ -439,8 +439,7 @@ def _converted(builder: Any, value: Any, element: Any) -> Any:
 @intrinsic
 def read(typingctx: Any, array: Any, *index: Any) -> Any:
     """Take a scenario's own number array[i, ...], or the row array[i, ..., :] where every lane is a scenario."""
-    index = index[0] if len(index) == 1 and isinstance(index[0], types.BaseTuple) else index
-    count = len(index)
+    count = _count(index)
     if not _is_rows(array, count) and not _is_numbers(array, count):
         return None
     kind = _lane(array) if _is_rows(array, count) else array.dtype
@@ -452,8 +451,7 @@ def read(typingctx: Any, array: Any, *index: Any) -> Any:
 @intrinsic
 def write(typingctx: Any, value: Any, array: Any, *index: Any) -> Any:
     """Write a scenario's own number array[i, ...], or the row array[i, ..., :] where every lane is a scenario."""
-    index = index[0] if len(index) == 1 and isinstance(index[0], types.BaseTuple) else index
-    count = len(index)
+    count = _count(index)
     if not _is_rows(array, count) and not _is_numbers(array, count):
         return None
 
@@ -463,6 +461,11 @@ def write(typingctx: Any, value: Any, array: Any, *index: Any) -> Any:
 
     kind = _lane(array) if _is_rows(array, count) else array.dtype
     return types.none(kind, array, types.StarArgTuple.from_types([types.intp] * count)), build
+
+
+def _count(index: Any) -> int:
+    """How many indices were given: numba hands them over one by one, or as one tuple."""
+    return len(index[0]) if len(index) == 1 and isinstance(index[0], types.BaseTuple) else len(index)
 
 
 def _is_numbers(kind: Any, indices: int) -> bool:

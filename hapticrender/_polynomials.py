@@ -1,71 +1,134 @@
-"""Temporary."""
+"""Sine, cosine and angle as polynomials, for numbers and vectors alike: the C library's cost 10 to 17 ns a call.
 
-from hapticrender._jit import kernel
-from hapticrender._lanes import nearest
+Coefficients interpolate at Chebyshev nodes: in x^2 of sin(2 pi x)/x and cos(2 pi x) for |x| <= 1/4, and in t^2 of
+atan(t)/t for |t| <= 1.  The degree goes with the type: sine and cosine are good to 2.2e-15 in double and 2e-7 in single
+precision, the angle to 4e-11 and 4e-7 rad.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+from numba.core import types
+from numba.extending import overload
+
+from hapticrender._jit import OPTIONS
+from hapticrender._lanes import LaneType, high, low, nearest, select, size
+
+S = (
+    6.283185307179585,
+    -41.341702240398284,
+    81.60524927557972,
+    -76.70585968962543,
+    42.05868995380649,
+    -15.094506137312086,
+    3.8173655924824907,
+    -0.6925065068391115,
+)
+C = (
+    0.9999999999999981,
+    -19.739208802174744,
+    64.93939402133272,
+    -85.45681703563243,
+    60.244630608149656,
+    -26.425888742714854,
+    7.896555728040881,
+    -1.645223312598949,
+)
+S_SHORT = (6.283185280154407, -41.34168061334652, 81.60247636892517, -76.5811726442785, 39.75982708531718)
+C_SHORT = (0.9999999530275123, -19.739171209957835, 64.93457265220157, -85.23987025839904, 56.23870043529675)
+A = (
+    0.9999999999293037,
+    -0.3333333129088999,
+    0.19999901102171566,
+    -0.1428381325574332,
+    0.11091922963683955,
+    -0.08974171958365748,
+    0.07228278345380153,
+    -0.05395668057139031,
+    0.033826218952776495,
+    -0.01582832274912274,
+    0.0047324841934043614,
+    -0.0006633954571063534,
+)
+A_SHORT = (
+    0.9999998819964931,
+    -0.3333181265562783,
+    0.19966961829591534,
+    -0.14003290184652264,
+    0.0986886545813245,
+    -0.0588297531430651,
+    0.023780518597165685,
+    -0.004559791986130401,
+)
+HALF_PI = 0.5 * math.pi
 
 
-@kernel
-def unit(turns):
-    x = turns - nearest(turns)
-    half = 0.5 * x
-    u = half * half * 39.47841760435743
-    s = 1.0 / 6227020800.0 / 210 / 272 / 342
-    # sin(pi x) and cos(pi x), then double the angle
-    y = half * 6.283185307179586
-    c = 1.0 - u * (
-        1.0 / 2
-        - u
-        * (
-            1.0 / 24
-            - u
-            * (
-                1.0 / 720
-                - u
-                * (
-                    1.0 / 40320
-                    - u
-                    * (
-                        1.0 / 3628800
-                        - u
-                        * (
-                            1.0 / 479001600
-                            - u * (1.0 / 87178291200 - u * (1.0 / 20922789888000.0 - u * (1.0 / 6402373705728000.0)))
-                        )
-                    )
-                )
-            )
-        )
-    )
-    n = y * (
-        1.0
-        - u
-        * (
-            1.0 / 6
-            - u
-            * (
-                1.0 / 120
-                - u
-                * (
-                    1.0 / 5040
-                    - u
-                    * (
-                        1.0 / 362880
-                        - u
-                        * (
-                            1.0 / 39916800
-                            - u
-                            * (
-                                1.0 / 6227020800.0
-                                - u
-                                * (
-                                    1.0 / 1307674368000.0
-                                    - u * (1.0 / 355687428096000.0 - u * (1.0 / 121645100408832000.0))
-                                )
-                            )
-                        )
-                    )
-                )
-            )
-        )
-    )
-    return c * c - n * n, 2.0 * c * n
+def _short(kind: Any) -> bool:
+    """Whether numbers of this type are of single precision."""
+    return (kind.dtype if isinstance(kind, LaneType) else kind) == types.float32
+
+
+def unit(turns: Any) -> Any:
+    """Cosine and sine of 2 pi `turns`, of any size that still knows its fraction."""
+    raise TypeError("unit: to be called from a kernel")
+
+
+def angle(im: Any, re: Any) -> Any:
+    """Angle of re + j im (rad, -pi to pi); 0 for 0."""
+    raise TypeError("angle: to be called from a kernel")
+
+
+@overload(unit, jit_options=OPTIONS)
+def _unit(turns):  # type: ignore[no-untyped-def]
+    def long(turns):  # type: ignore[no-untyped-def]
+        x = turns - nearest(turns)
+        far = size(x) > 0.25
+        x = select(far, select(x > 0.0, 0.5, -0.5) - x, x)
+        u = x * x
+        u2 = u * u
+        s = (S[0] + S[1] * u) + (S[2] + S[3] * u) * u2 + ((S[4] + S[5] * u) + (S[6] + S[7] * u) * u2) * (u2 * u2)
+        c = (C[0] + C[1] * u) + (C[2] + C[3] * u) * u2 + ((C[4] + C[5] * u) + (C[6] + C[7] * u) * u2) * (u2 * u2)
+        return select(far, -c, c), s * x
+
+    def short(turns):  # type: ignore[no-untyped-def]
+        x = turns - nearest(turns)
+        far = size(x) > 0.25
+        x = select(far, select(x > 0.0, 0.5, -0.5) - x, x)
+        u = x * x
+        s = S_SHORT[0] + u * (S_SHORT[1] + u * (S_SHORT[2] + u * (S_SHORT[3] + u * S_SHORT[4])))
+        c = C_SHORT[0] + u * (C_SHORT[1] + u * (C_SHORT[2] + u * (C_SHORT[3] + u * C_SHORT[4])))
+        return select(far, -c, c), s * x
+
+    return short if _short(turns) else long
+
+
+@overload(angle, jit_options=OPTIONS)
+def _angle(im, re):  # type: ignore[no-untyped-def]
+    def long(im, re):  # type: ignore[no-untyped-def]
+        across, along = size(im), size(re)
+        steep = across > along
+        t = low(across, along) / high(high(across, along), 1e-300)
+        u = t * t
+        u2 = u * u
+        u4 = u2 * u2
+        p = (A[0] + A[1] * u) + (A[2] + A[3] * u) * u2 + ((A[4] + A[5] * u) + (A[6] + A[7] * u) * u2) * u4
+        p = t * (p + ((A[8] + A[9] * u) + (A[10] + A[11] * u) * u2) * (u4 * u4))
+        p = select(steep, HALF_PI - p, p)
+        p = select(re < 0.0, 2.0 * HALF_PI - p, p)
+        return select(im < 0.0, -p, p)
+
+    def short(im, re):  # type: ignore[no-untyped-def]
+        across, along = size(im), size(re)
+        steep = across > along
+        t = low(across, along) / high(high(across, along), 1e-30)
+        u = t * t
+        u2 = u * u
+        p = (A_SHORT[0] + A_SHORT[1] * u) + (A_SHORT[2] + A_SHORT[3] * u) * u2
+        p = t * (p + ((A_SHORT[4] + A_SHORT[5] * u) + (A_SHORT[6] + A_SHORT[7] * u) * u2) * (u2 * u2))
+        p = select(steep, HALF_PI - p, p)
+        p = select(re < 0.0, 2.0 * HALF_PI - p, p)
+        return select(im < 0.0, -p, p)
+
+    return short if _short(im) else long
