@@ -186,3 +186,14 @@ def test_wrong_fingers_are_refused_with_bound_and_unit(wrong, message):
 def test_a_finger_needs_a_motion():
     with pytest.raises(TypeError, match=r"motion = 0.1: must be a motion with position"):
         Finger(0.1)
+
+
+@pytest.mark.parametrize("load", [0.5, ((0.0, 0.3, 0.6), (0.1, 1.2, 0.2))])
+@pytest.mark.parametrize("touches", [None, ((0.1, 0.2), (0.35, 0.5))])
+@pytest.mark.parametrize("scaled", [False, True])
+def test_touch_is_position_load_and_strength_side_by_side(load, touches, scaled):
+    finger = Finger(Sliding(0.1, 0.05), normal_load=load, touches=touches, mechanics="heavy", load_scaling=scaled)
+    time = np.linspace(0.0, 0.7, 71)
+    expected = np.column_stack([finger.position(time), finger.load(time), finger.strength(time)])
+    np.testing.assert_array_equal(finger.touch(time), expected)
+    assert np.isnan(expected[:, 0]).any() == (touches is not None)

@@ -5,6 +5,7 @@ import pytest
 from naive_plate import continuous, simulate, simulate_moving
 
 import hapticrender as hr
+from hapticrender.plants.propagator import GRIP, NARROWEST, WIDEST, WIDTH
 from hapticrender.plants.vibrotactile import Plate, PlateParameters
 from hapticrender.touch.mechanics import HEAVY, HEAVY_SECOND, LIGHT, LIGHT_SECOND, NONE
 
@@ -73,6 +74,33 @@ def test_a_finger_that_moves_presses_and_lifts_is_integrated_sample_by_sample(rn
     motion = Plate(PlateParameters(**IDEAL), finger).run(drive).motion
     np.testing.assert_allclose(motion, expected, rtol=0, atol=500 * 2**-50 * abs(expected).max())
     assert len(set(finger.strength(time))) > (100 if scaled else 1)
+
+
+@pytest.mark.parametrize("bending", [0.0, 1200.0], ids=["rigid", "bending"])
+@pytest.mark.parametrize("mechanics", [LIGHT, HEAVY, HEAVY_SECOND], ids=["light", "heavy", "2nd order"])
+def test_sliding_in_windows_is_as_exact_as_the_series(rng, mechanics, bending):
+    """The same run, once with its windows shut: each sample's propagator differs by 2e-15, over 2000 samples."""
+    parameters = PlateParameters(bending_frequency=bending, **IDEAL)
+    finger = hr.Finger.sliding(speed=0.1, span=0.09, normal_load=0.8, mechanics=mechanics)
+    drive = rng.uniform(-2, 2, (2000, 2))
+    windowed, summed = Plate(parameters, finger), Plate(parameters, finger)
+    summed._state.window[WIDTH] = 0.0
+    motion, expected = windowed.run(drive).motion, summed.run(drive).motion
+    assert windowed._state.window[GRIP] == 1.0  # one is open
+    assert summed._state.window[GRIP] < 0.0
+    assert not np.array_equal(motion, expected)
+    np.testing.assert_allclose(motion, expected, rtol=0, atol=2000 * 2e-15 * abs(expected).max())
+
+
+def test_a_window_that_is_too_wide_is_halved_until_its_polynomial_is_exact():
+    finger = hr.Finger.sliding(speed=0.1, span=0.09, normal_load=0.8, mechanics=HEAVY)
+    widths = []
+    for bending in (0.0, 1200.0):
+        plate = Plate(PlateParameters(bending_frequency=bending), finger)
+        plate.run(np.zeros((100, 2)))
+        widths.append(plate._state.window[WIDTH])
+    assert widths[0] == WIDEST
+    assert NARROWEST < widths[1] < WIDEST
 
 
 def test_a_run_equals_its_pieces(rng):

@@ -39,12 +39,11 @@ def closed_plate_run(
 
     Row n of `drive` is what the plate was handed for interval n, so it is computed from sample n - 1.
     """
-    z, frozen, system, push, pending, cursor, current = state
     step = step_of(control)
     for n in range(sensed.shape[0]):
-        flags[n] = plate_sense(tables, z, noise[n], sensed[n], motion[n])
-        plate_drive(tables, pending, cursor, current, last)
-        plate_advance(tables, z, frozen, system, push, current, finger[n, 0], finger[n, 1], finger[n, 2])
+        flags[n] = plate_sense(tables, state, noise[n], sensed[n], motion[n])
+        plate_drive(tables, state, last)
+        plate_advance(tables, state, finger[n, 0], finger[n, 1], finger[n, 2])
         drive[n, 0], drive[n, 1] = last[0], last[1]
         flags[n] |= step(control, control_state, sensed[n], finger[n, 0], wanted[n], last, target[n])
 

@@ -1,10 +1,8 @@
 """Compiled plate with a finger on it.
 
 The plate is frozen over one sample (finger position, load and current held)
-and integrated exactly: with z' = A z + b over one period, z grows by the terms
-t_1 = A z + b, t_n = A t_(n-1)/n of the exponential series, as many as rounding
-asks for.  A is renewed whenever the finger has moved or changed its grip.
-Velocities are scaled by the sample period, so that A has no units.
+and integrated exactly (see `propagator`).  Velocities are scaled by the sample
+period, so that A has no units.
 
 States: 0 heave, 1 rocking, 2 phalanx, 3-5 their rates, 6 bending of the glass
 (its displacement at the sensors, m), 7 its rate.  A rigid plate leaves 6 and 7
@@ -17,6 +15,22 @@ import math
 from typing import NamedTuple
 
 from hapticrender._jit import kernel
+from hapticrender._lanes import size
+from hapticrender.plants.propagator import (
+    GRIP,
+    LEAST_STAY,
+    MIDDLE,
+    NARROWEST,
+    NODES,
+    PLACES,
+    TRIAL,
+    WIDTH,
+    agree,
+    interpolate,
+    propagate,
+    sum_series,
+    to_powers,
+)
 from hapticrender.protocols import Array
 
 Three = tuple[float, float, float]
@@ -53,8 +67,14 @@ class PlateTables(NamedTuple):
 class PlateState(NamedTuple):
     """State of the plate; changed in place."""
 
-    z: Array  # (8,) displacements (m) and rates, times the period (m)
-    frozen: Array  # (2,) lever and strength for which `system` and `push` hold
+    z: Array  # (1, 1, 8) displacements (m) and rates, times the period (m)
+    step: Array  # (1, COLUMNS, 8) what a sample does to z: columns of Phi and Gamma
+    frozen: Array  # (2,) lever and strength for which `step` holds
+    powers: Array  # (NODES, COLUMNS, 8) the same as polynomials in the place, over the window
+    window: Array  # (3,) where and for which grip the nodes hold
+    one: Array  # (1, 8, 8) identity
+    nodes: Array  # (NODES, COLUMNS, 8) scratch
+    trial: Array  # (1, COLUMNS, 8) scratch
     system: Array  # (8, 8) A
     push: Array  # (3, 3) inverse mass in heave, rocking and bending, times the period squared, s2/kg
     pending: Array  # (latency, 2) drive on its way
@@ -66,7 +86,7 @@ class PlateState(NamedTuple):
 def quantise(value, step, limit):
     """Nearest step inside the limit; a step of 0 leaves the resolution ideal."""
     value = min(max(value, -limit), limit)
-    return value if step == 0.0 else step * math.floor(value / step + 0.5)
+    return value if step == 0.0 else step * math.floor(value * (1.0 / step) + 0.5)
 
 
 @kernel
@@ -130,77 +150,68 @@ def plate_system(tables, lever, strength, system, push):
 
 
 @kernel
-def rigid_series(terms, z, a, push, force0, force1):
-    """Add the series of one sample to z, forces (N) on heave and rocking held."""
-    t0, t1, t2, t3, t4, t5 = z[0], z[1], z[2], z[3], z[4], z[5]
-    for n in range(1, terms + 1):
-        s = 1.0 / n
-        f = (a[3, 0] * t0 + a[3, 1] * t1) + (a[3, 2] * t2 + a[3, 3] * t3) + (a[3, 4] * t4 + a[3, 5] * t5)
-        g = (a[4, 0] * t0 + a[4, 1] * t1) + (a[4, 2] * t2 + a[4, 3] * t3) + (a[4, 4] * t4 + a[4, 5] * t5)
-        h = (a[5, 0] * t0 + a[5, 1] * t1) + (a[5, 2] * t2 + a[5, 3] * t3) + (a[5, 4] * t4 + a[5, 5] * t5)
-        if n == 1:
-            f += push[0, 0] * force0 + push[0, 1] * force1
-            g += push[1, 0] * force0 + push[1, 1] * force1
-        t0, t1, t2, t3, t4, t5 = s * t3, s * t4, s * a[2, 5] * t5, s * f, s * g, s * h
-        z[0] += t0
-        z[1] += t1
-        z[2] += t2
-        z[3] += t3
-        z[4] += t4
-        z[5] += t5
+def series_at(tables, state, lever, strength, out, at):
+    """Exact propagator for a finger at `lever` with `strength`, into row block `at` of `out`."""
+    plate_system(tables, lever, strength, state.system, state.push)
+    sum_series(tables.terms, tables.flexible, state.system, state.push, state.one, out, at)
 
 
 @kernel
-def row_times(a, row, t):
-    """Row of A times the eight states."""
-    return (
-        (a[row, 0] * t[0] + a[row, 1] * t[1] + a[row, 2] * t[2])
-        + (a[row, 3] * t[3] + a[row, 4] * t[4] + a[row, 5] * t[5])
-        + (a[row, 6] * t[6] + a[row, 7] * t[7])
-    )
+def open_window(tables, state, lever, strength):
+    """Lay nodes ahead of the finger, where it slides to; a window whose polynomial is not exact is halved, thrice."""
+    window, ahead = state.window, 1.0 if lever > state.frozen[0] else -1.0
+    window[GRIP] = strength
+    while window[WIDTH] > NARROWEST:
+        width = window[WIDTH]
+        window[MIDDLE] = lever + 0.9 * ahead * width
+        for m in range(NODES):
+            series_at(tables, state, window[MIDDLE] + width * PLACES[m], strength, state.nodes, m)
+        to_powers(state.nodes, state.powers)
+        series_at(tables, state, window[MIDDLE] + width * TRIAL, strength, state.trial, 0)
+        interpolate(tables.flexible, state.powers, TRIAL, state.step)
+        if agree(state.step, state.trial):
+            return
+        window[WIDTH] *= 0.5
+    window[GRIP] = -1.0
 
 
 @kernel
-def flexible_series(terms, z, a, push, force0, force1, force2):
-    """Add the series of one sample to z, forces (N) on heave, rocking and bending held."""
-    t = (z[0], z[1], z[2], z[3], z[4], z[5], z[6], z[7])
-    for n in range(1, terms + 1):
-        s = 1.0 / n
-        f, g, h, e = row_times(a, 3, t), row_times(a, 4, t), row_times(a, 5, t), row_times(a, 7, t)
-        if n == 1:
-            f += push[0, 0] * force0 + push[0, 1] * force1 + push[0, 2] * force2
-            g += push[1, 0] * force0 + push[1, 1] * force1 + push[1, 2] * force2
-            e += push[2, 0] * force0 + push[2, 1] * force1 + push[2, 2] * force2
-        t = (s * t[3], s * t[4], s * a[2, 5] * t[5], s * f, s * g, s * h, s * t[7], s * e)
-        for i in range(8):
-            z[i] += t[i]
+def renew(tables, state, lever, strength):
+    """Propagator for a finger that has moved or changed its grip."""
+    frozen, window = state.frozen, state.window
+    if strength == frozen[1] and size(lever - frozen[0]) * LEAST_STAY < window[WIDTH]:
+        if strength != window[GRIP] or size(lever - window[MIDDLE]) > window[WIDTH]:
+            open_window(tables, state, lever, strength)
+    if strength == window[GRIP] and size(lever - window[MIDDLE]) <= window[WIDTH]:
+        interpolate(tables.flexible, state.powers, (lever - window[MIDDLE]) / window[WIDTH], state.step)
+    else:
+        series_at(tables, state, lever, strength, state.step, 0)
+    frozen[0], frozen[1] = lever, strength
 
 
 @kernel
-def plate_advance(tables, z, frozen, system, push, current, position, load, strength):
-    """One sample of motion under `current` (A), exact for the frozen plate."""
+def plate_advance(tables, state, position, load, strength):
+    """One sample of motion under the current (A), exact for the frozen plate."""
+    z, current = state.z, state.current
     touching = strength > 0.0
     lever = position * tables.lever if touching else 0.0
     weight = load if touching else 0.0
     if not touching:
-        strength = z[2] = z[5] = 0.0
-    if lever != frozen[0] or strength != frozen[1]:
-        plate_system(tables, lever, strength, system, push)
-        frozen[0], frozen[1] = lever, strength
+        strength = z[0, 0, 2] = z[0, 0, 5] = 0.0
+    if lever != state.frozen[0] or strength != state.frozen[1]:
+        renew(tables, state, lever, strength)
     common = tables.force_constant * (current[0] + current[1])
-    force0 = common - weight
     force1 = tables.force_constant * (current[1] - current[0]) - weight * lever
+    force2 = 0.0
     if tables.flexible:
         force2 = tables.coil_shape * common - weight * bent(tables, lever)
-        flexible_series(tables.terms, z, system, push, force0, force1, force2)
-    else:
-        rigid_series(tables.terms, z, system, push, force0, force1)
+    propagate(tables.flexible, state.step, z, common - weight, force1, force2)
 
 
 @kernel
-def plate_sense(tables, z, noise, sensed, motion):
+def plate_sense(tables, state, noise, sensed, motion):
     """Hall sensors at the glass ends and the true motion at centre, end 1, end 2; returns flags."""
-    flags = 0
+    flags, z = 0, state.z[0, 0]
     for i in range(2):
         side = -tables.reach if i == 0 else tables.reach
         motion[1 + i] = z[0] + side * z[1] + z[6]
@@ -213,8 +224,9 @@ def plate_sense(tables, z, noise, sensed, motion):
 
 
 @kernel
-def plate_drive(tables, pending, cursor, current, drive):
+def plate_drive(tables, state, drive):
     """Queue a drive sample and put the one now due on the coils, quantised and limited."""
+    pending, cursor, current = state.pending, state.cursor, state.current
     latency = pending.shape[0]
     row = cursor[0]
     for i in range(2):
@@ -231,8 +243,7 @@ def plate_drive(tables, pending, cursor, current, drive):
 @kernel
 def plate_run(tables, state, drive, finger, noise, sensed, motion, flags):
     """A block of the plate alone; `finger` rows are position, load, strength."""
-    z, frozen, system, push, pending, cursor, current = state
     for n in range(drive.shape[0]):
-        flags[n] = plate_sense(tables, z, noise[n], sensed[n], motion[n])
-        plate_drive(tables, pending, cursor, current, drive[n])
-        plate_advance(tables, z, frozen, system, push, current, finger[n, 0], finger[n, 1], finger[n, 2])
+        flags[n] = plate_sense(tables, state, noise[n], sensed[n], motion[n])
+        plate_drive(tables, state, drive[n])
+        plate_advance(tables, state, finger[n, 0], finger[n, 1], finger[n, 2])

@@ -29,10 +29,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from hapticrender._lanes import aligned
 from hapticrender.control.bandmodel import BandModel
 from hapticrender.control.damping_margins import BendingMode
 from hapticrender.plants.closed import CLOSED
 from hapticrender.plants.kernels import PlateState, PlateTables, plate_run, plate_system
+from hapticrender.plants.propagator import COLUMNS, NODES, STATES, WIDEST, identity
 from hapticrender.protocols import Array, Controller, Sensed
 
 if TYPE_CHECKING:
@@ -354,8 +356,14 @@ class Plate:
         self._samples = 0
         self._tables = _tables(parameters, finger.mechanics)
         self._state = PlateState(
-            z=np.zeros(8),
+            z=aligned((1, 1, STATES)),
+            step=aligned((1, COLUMNS, STATES)),
             frozen=np.full(2, np.nan),
+            powers=aligned((NODES, COLUMNS, STATES)),
+            window=np.array([0.0, WIDEST, -1.0]),
+            one=identity(),
+            nodes=aligned((NODES, COLUMNS, STATES)),
+            trial=aligned((1, COLUMNS, STATES)),
             system=np.zeros((8, 8)),
             push=np.zeros((3, 3)),
             pending=np.zeros((parameters.delay - block, 2)),
@@ -368,8 +376,8 @@ class Plate:
         """Finger rows, noise and sample flags of the next n samples."""
         time = (self._samples + np.arange(n)) / self.rate
         self._samples += n
-        finger = np.column_stack([self.finger.position(time), self.finger.load(time), self.finger.strength(time)])
-        return finger, self._rng.standard_normal((n, 2)), np.zeros(n, np.int64)
+        noise = self._rng.standard_normal((n, 2)) if self._tables.sensor_noise > 0.0 else np.zeros((n, 2))
+        return self.finger.touch(time), noise, np.zeros(n, np.int64)
 
     def closes(self, controller: Controller) -> bool:
         """Whether `closed_loop` has compiled code for this controller."""

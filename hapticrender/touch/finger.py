@@ -122,6 +122,18 @@ class Finger:
         factor = self.mechanics.load_factor(self._pressed(time)) if self.load_scaling else np.ones(time.shape)
         return np.where(np.isfinite(self.position(time)), factor, 0.0)
 
+    def touch(self, time: Array) -> Array:
+        """Position, load and strength side by side, shape (n, 3), for a plant that wants all three."""
+        time = np.asarray(time, float)
+        touch = np.empty((time.size, 3))
+        touch[:, 0] = self.position(time)
+        touch[:, 1] = self._pressed(time)
+        touch[:, 2] = self.mechanics.load_factor(touch[:, 1]) if self.load_scaling else 1.0
+        away = np.isnan(touch[:, 0])
+        if away.any():
+            touch[away, 1:] = 0.0
+        return touch
+
     def _pressed(self, time: Array) -> Array:
         if self.normal_load is None:
             return self.motion.load(time)  # type: ignore[attr-defined]

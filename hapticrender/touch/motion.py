@@ -83,7 +83,8 @@ class Sliding:
 
     def position(self, time: Array) -> Array:
         """Position (m, shape (n,)): a triangle wave."""
-        turns = np.mod(np.asarray(time, float) * self.speed / (2 * self.span) + 0.25, 1.0)
+        turns = np.asarray(time, float) * (self.speed / (2 * self.span)) + 0.25
+        turns -= np.floor(turns)
         return self.centre + self.span * (0.5 - np.abs(2 * turns - 1))
 
 
