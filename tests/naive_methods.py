@@ -264,22 +264,20 @@ def complex_step(tables, state, sensed, drive):
 
 @kernel
 def polar_plate_run(plate, moving, tables, state, last, finger, noise, wanted, sensed, motion, drive, target, flags):
-    z, frozen, system, push, pending, cursor, current = moving
     for n in range(sensed.shape[0]):
-        flags[n] = plate_sense(plate, z, noise[n], sensed[n], motion[n])
-        plate_drive(plate, pending, cursor, current, last)
-        plate_advance(plate, z, frozen, system, push, current, finger[n, 0], finger[n, 1], finger[n, 2])
+        flags[n] = plate_sense(plate, moving, noise[n], sensed[n], motion[n])
+        plate_drive(plate, moving, last)
+        plate_advance(plate, moving, finger[n, 0], finger[n, 1], finger[n, 2])
         drive[n, 0], drive[n, 1] = last[0], last[1]
         polar_step(tables, state, sensed[n], last)
 
 
 @kernel
 def complex_plate_run(plate, moving, tables, state, last, finger, noise, wanted, sensed, motion, drive, target, flags):
-    z, frozen, system, push, pending, cursor, current = moving
     for n in range(sensed.shape[0]):
-        flags[n] = plate_sense(plate, z, noise[n], sensed[n], motion[n])
-        plate_drive(plate, pending, cursor, current, last)
-        plate_advance(plate, z, frozen, system, push, current, finger[n, 0], finger[n, 1], finger[n, 2])
+        flags[n] = plate_sense(plate, moving, noise[n], sensed[n], motion[n])
+        plate_drive(plate, moving, last)
+        plate_advance(plate, moving, finger[n, 0], finger[n, 1], finger[n, 2])
         drive[n, 0], drive[n, 1] = last[0], last[1]
         complex_step(tables, state, sensed[n], last)
 

@@ -5,6 +5,7 @@ import pytest
 
 from hapticrender.touch.finger import Finger
 from hapticrender.touch.mechanics import HEAVY, HEAVY_SECOND, LIGHT, LIGHT_SECOND, NONE, FingerMechanics
+from hapticrender.touch.motion import Sliding
 
 PAPER = np.array([20.0, 31.0, 47.0, 72.0, 111.0, 170.0, 261.0, 400.0])
 GRID = np.arange(20.0, 401.0)
