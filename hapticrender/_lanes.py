@@ -389,6 +389,36 @@ def put(typingctx: Any, array: Any, i: Any, j: Any, value: Any) -> Any:
 
 
 @intrinsic
+def stretch(typingctx: Any, array: Any, i: Any, j: Any) -> Any:
+    """Read as many neighbours as there are lanes, array[i, j:], wherever they start; their columns have to exist."""
+    if not _is_numbers(array, 2) or array.dtype not in (types.float64, types.float32):
+        return None
+    kind = _lane(array)
+
+    def build(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        at = _number(context, builder, sig.args[0], *args)
+        vector = ir.VectorType(_element(kind.dtype), kind.width)
+        return builder.load(builder.bitcast(at, vector.as_pointer()), align=kind.dtype.bitwidth // 8)
+
+    return kind(array, types.intp, types.intp), build
+
+
+@intrinsic
+def put_stretch(typingctx: Any, array: Any, i: Any, j: Any, value: Any) -> Any:
+    """Write as many neighbours as there are lanes, array[i, j:], wherever they start; their columns have to exist."""
+    if not _is_numbers(array, 2) or array.dtype not in (types.float64, types.float32):
+        return None
+    kind = _lane(array)
+
+    def build(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        at = _number(context, builder, sig.args[0], *args[:3])
+        builder.store(args[3], builder.bitcast(at, args[3].type.as_pointer()), align=kind.dtype.bitwidth // 8)
+        return context.get_dummy_value()
+
+    return types.none(array, types.intp, types.intp, kind), build
+
+
+@intrinsic
 def put_pairs(typingctx: Any, array: Any, i: Any, re: Any, im: Any) -> Any:
     """Write W complex numbers from array[i * W] on, as many as there is room for; or rows array[i, 0] and array[i, 1].
 

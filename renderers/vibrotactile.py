@@ -42,6 +42,7 @@ class VibrotactileRenderer:
                 f"driver.sensed_channels = {driver.sensed_channels}: must be 2 (one an end) or 0 (open loop)"
             )
         model = PlateParameters.with_overrides(scene.plant).band_model(driver.rate, driver.delay)
+        model = replace(model, block=driver.block)
         if model.rigid and not isinstance(getattr(driver, "plant", None), Plate):
             return replace(model, bending=EXPECTED_BENDING, rigid=False)  # only a model of a plate is rigid
         return model

@@ -16,10 +16,12 @@ from hapticrender._lanes import (
     nearest,
     padded,
     put,
+    put_stretch,
     read,
     root,
     select,
     size,
+    stretch,
     total,
     write,
 )
@@ -130,6 +132,21 @@ def test_a_scenarios_own_numbers_are_plain_or_lanes(rng):
     moved(many, 0.25)
     assert alone[1] == 0.75
     np.testing.assert_allclose(many[1], many[0] + 0.25, rtol=1e-15)
+
+
+@kernel
+def moved_on(values, start, out):
+    put_stretch(out, 1, start + 1, stretch(values, 0, start) + 1.0)
+
+
+@pytest.mark.parametrize("dtype", KINDS)
+def test_a_stretch_starts_anywhere(dtype, rng):
+    values, out = rng.standard_normal((2, 40)).astype(dtype), np.zeros((2, 40), dtype)
+    width = WIDTH[np.dtype(dtype)]
+    moved_on(values, 3, out)
+    expected = np.zeros((2, 40), dtype)
+    expected[1, 4 : 4 + width] = values[0, 3 : 3 + width] + dtype(1.0)
+    np.testing.assert_array_equal(out, expected)
 
 
 @kernel

@@ -26,6 +26,8 @@ class BandModel:
         Sampling rate of the loop.
     delay : int, samples
         From a sensed sample to the moment the drive computed from it acts.
+    block : int, samples
+        How many samples the device takes and gives at once.
     mass, damping, stiffness : ndarray, shape (c, c), kg, N s/m, N/m
         The free device in its coordinates.
     force_from_drive : ndarray, shape (c, d), N per drive unit
@@ -74,6 +76,7 @@ class BandModel:
     sensed_noise: float = 0.0
     bending: BendingMode | None = None
     rigid: bool = False
+    block: int = 1
     lowest_frequency: float = 20.0
     highest_frequency: float = 1000.0
 

@@ -11,12 +11,13 @@ from hapticrender.bands import Bands
 from hapticrender.control import bank_rows as row
 from hapticrender.control.bandmodel import BandModel
 from hapticrender.control.bank_kernels import REFRESH, bank_run
-from hapticrender.control.bank_state import BankNumbers, BankTables, across_bands, bank_state
+from hapticrender.control.bank_state import BankNumbers, BankState, BankTables, across_bands, bank_state
 from hapticrender.control.damping import choose_damping
 from hapticrender.control.kernels import FREQUENCY, WAVENUMBER
 from hapticrender.control.stability import Checked, Limits, checked_bandwidth
 from hapticrender.protocols import Array
 
+PRECISIONS = {"double": np.float64, "single": np.float32}
 CONTACT_LOAD = (0.05, 0.03)  # N: on, off
 RAMP_TIME = 0.05  # s: a target grows this long, so that it does not strike the modes
 FAST_POLE, FAST_SIGMAS = 30.0, 5.5  # Hz, of the sensor noise behind that pole
@@ -66,14 +67,22 @@ class BankController:
         Parameters of the compiled step.
     note : str
         What the design chose and why: the inner loop and its margins.
+    precision : {"double", "single"}
+        Of everything that a band owns; phases, and what the scenario owns, are always double.
     """
 
-    def __init__(self, method: str, tables: BankTables, note: str = "") -> None:
+    def __init__(self, method: str, tables: BankTables, note: str = "", precision: str = "double") -> None:
+        if precision not in PRECISIONS:
+            raise ValueError(f"{precision=}: must be one of {', '.join(PRECISIONS)}")
         self.method = method
         self.n_bands = tables.tone.shape[1]
         self.tables = tables
         self.note = note
-        self.state = bank_state(tables)
+        self.state = bank_state(tables, PRECISIONS[precision])
+
+    def in_precision(self, precision: str) -> BankController:
+        """Return the same design at rest, its bands in single or double precision."""
+        return BankController(self.method, self.tables, self.note, precision)
 
     @property
     def mismatch(self) -> float:
@@ -81,20 +90,7 @@ class BankController:
 
         There the law alone should do: what the integral has to make up for is what the device is not.
         """
-        touch, band, loop = self.state.touch, self.state.band, self.state.loop
-        coordinates = range(0, loop.shape[1], row.LOOP_ROWS)
-
-        def largest(re: int, im: int) -> Array:
-            sizes = [
-                np.hypot(*(across_bands(loop, base + part, self.n_bands) for part in (re, im))) for base in coordinates
-            ]
-            return np.max(sizes, axis=0)
-
-        size = np.hypot(*(across_bands(band, part, self.n_bands) for part in (row.R_RE, row.R_IM)))
-        wanted = np.where(self.tables.tone[WAVENUMBER] == 0.0, size, 0.0)
-        large = (wanted > LEAST_WANTED) & (largest(row.E_RE, row.E_IM) < SETTLED * wanted)
-        settled = touch[row.CONTACT] == 0.0 and touch[row.TRUST] == 1.0 and touch[row.SCALE] == 1.0
-        return float((largest(row.V_RE, row.V_IM)[large] / wanted[large]).max()) if settled and large.any() else 0.0
+        return settled_share(self.tables, self.state)
 
     @property
     def turns(self) -> Array:
@@ -111,6 +107,22 @@ class BankController:
         flags = np.zeros(n, np.int64)
         bank_run(self.tables, self.state, np.ascontiguousarray(sensed, float), position, wanted, drive, target, flags)
         return drive, target, flags
+
+
+def settled_share(tables: BankTables, state: BankState) -> float:
+    """Largest share of a settled, fixed target that the integral part adds on the untouched device, else 0."""
+    touch, band, loop, bands = state.touch, state.band, state.loop, tables.tone.shape[1]
+    coordinates = range(0, loop.shape[1], row.LOOP_ROWS)
+
+    def largest(re: int, im: int) -> Array:
+        sizes = [np.hypot(*(across_bands(loop, base + part, bands) for part in (re, im))) for base in coordinates]
+        return np.max(sizes, axis=0)
+
+    size = np.hypot(*(across_bands(band, part, bands) for part in (row.R_RE, row.R_IM)))
+    wanted = np.where(tables.tone[WAVENUMBER] == 0.0, size, 0.0)
+    large = (wanted > LEAST_WANTED) & (largest(row.E_RE, row.E_IM) < SETTLED * wanted)
+    settled = touch[row.CONTACT] == 0.0 and touch[row.TRUST] == 1.0 and touch[row.SCALE] == 1.0
+    return float((largest(row.V_RE, row.V_IM)[large] / wanted[large]).max()) if settled and large.any() else 0.0
 
 
 def spacing(bands: Bands) -> float:

@@ -74,10 +74,12 @@ def finger_stiffness(touch, band, t):
 
 
 @kernel
-def adapt_pass(tables, state, inner, gain, rest, touching):
-    """The finger's three numbers, pooled over bands, and what is left of each band's stiffness, from the heave row."""
+def adapt_pass(tables, state, step, inner, gain, rest, touching):
+    """The finger's three numbers, pooled over bands, and what is left of each band's stiffness, from the heave row.
+
+    `step` is the time since the last adaptation, s.
+    """
     touch, band, loop, coordinates = state.touch, state.band, state.loop, len(tables.shape)
-    step = 4.0 / tables.numbers.rate
     stiff2, mass2 = CROWDED_STIFFNESS * CROWDED_STIFFNESS, CROWDED_MASS * CROWDED_MASS
     sum_k = sum_m = sum_b = weights = 0.0
     for t in range(band.shape[0]):

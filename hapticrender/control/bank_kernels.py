@@ -496,7 +496,7 @@ def bank_advance(tables, state, sensed, position, wanted, drive, target):
         lively = high(fast, slow)
         gain = numbers.adapt + lively * (numbers.adapt_awake - numbers.adapt)
         rest = numbers.rest + lively * (numbers.rest_awake - numbers.rest)
-        adapt_pass(tables, state, inner, gain, rest, touching)
+        adapt_pass(tables, state, ADAPTATION / numbers.rate, inner, gain, rest, touching)
     know_finger(tables, state, touching, turn)
     law_pass(tables, state)
     return speak_pass(tables, state, drive) + high(odd, 2.0 * doubt)

@@ -9,7 +9,8 @@ from __future__ import annotations
 
 from hapticrender.bands import Bands
 from hapticrender.control.bandmodel import BandModel
-from hapticrender.control.bank import BankController, BankRules, design_bank, spacing
+from hapticrender.control.bank import PROMPT, BankController, BankRules, design_bank, spacing
+from hapticrender.control.block import BlockController
 
 CROWDED = 40.0  # Hz: carriers closer than this share what the detectors see
 
@@ -46,9 +47,11 @@ class SignalObserver:
 
     name = "h"
 
-    def design(self, model: BandModel, bands: Bands, *, feedback: bool = True) -> BankController:
-        """Bank on the sensed signal."""
-        return design_bank(self.name, model, bands, SIGNAL, feedback=feedback)
+    def design(
+        self, model: BandModel, bands: Bands, *, feedback: bool = True, precision: str = "double"
+    ) -> BankController | BlockController:
+        """Bank on the sensed signal; in blocks, on the error."""
+        return in_its_blocks(design_bank(self.name, model, bands, SIGNAL, feedback=feedback), model, precision)
 
 
 class ErrorObserver:
@@ -56,7 +59,17 @@ class ErrorObserver:
 
     name = "h2"
 
-    def design(self, model: BandModel, bands: Bands, *, feedback: bool = True) -> BankController:
+    def design(
+        self, model: BandModel, bands: Bands, *, feedback: bool = True, precision: str = "double"
+    ) -> BankController | BlockController:
         """Bank on the error; carriers nearer than 40 Hz, or that may come so near, are watched without detectors."""
         crowded = spacing(bands) < CROWDED or (bands.wavenumber > 0.0).sum() > 1
-        return design_bank(self.name, model, bands, ERROR_CROWDED if crowded else ERROR, feedback=feedback)
+        rules = ERROR_CROWDED if crowded else ERROR
+        return in_its_blocks(design_bank(self.name, model, bands, rules, feedback=feedback), model, precision)
+
+
+def in_its_blocks(controller: BankController, model: BandModel, precision: str) -> BankController | BlockController:
+    """Return the bank as the device of `model` takes it: sample by sample, or in blocks where they are long."""
+    if model.block > 1 and model.delay > PROMPT:
+        return BlockController(controller, model.block, precision)
+    return controller.in_precision(precision)

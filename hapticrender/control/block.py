@@ -1,0 +1,128 @@
+"""The band bank for devices that take blocks: from the bank's own design to a controller that runs block by block."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from hapticrender._lanes import WIDTH, aligned, padded
+from hapticrender.control import bank_rows as row
+from hapticrender.control.bank import PRECISIONS, BankController, settled_share
+from hapticrender.control.bank_state import BankNumbers, BankTables, bank_state
+from hapticrender.control.block_kernels import CHANNEL_ROWS, EIGHT, TURNS, BlockState, BlockTables, block_run
+from hapticrender.protocols import Array
+
+MOST_COORDINATES = 2
+PER_SAMPLE = ("release", "ramp")  # steps that grow with the block
+POLES = ("fast_pole", "slow_pole")  # of first order, per sample
+TIMES = ("fast_time", "slow_time")  # samples
+
+
+class BlockController:
+    """The bank behind the `Controller` protocol, for whole blocks.
+
+    Parameters
+    ----------
+    controller : BankController
+        The bank as it was designed, sample by sample.
+    block : int, samples
+        Samples of a block, >= 2.
+    precision : {"double", "single"}
+        Of everything that a band owns; phases, and what the scenario owns, are always double.
+
+    Raises
+    ------
+    ValueError
+        A number is out of its bound.
+
+    Notes
+    -----
+    No inner loop: it needs an answer within a sample or few.  The observer is the per-sample one to rounding;
+    adaptation, detectors and law act once a block, and the drive runs linearly between them.
+    """
+
+    def __init__(self, controller: BankController, block: int, precision: str = "double") -> None:
+        if precision not in PRECISIONS:
+            raise ValueError(f"{precision=}: must be one of {', '.join(PRECISIONS)}")
+        if block < 2:
+            raise ValueError(f"{block=}: must be >= 2 samples")
+        tables = controller.tables
+        if len(tables.shape) > MOST_COORDINATES:
+            raise ValueError(f"{len(tables.shape)} coordinates: must be <= {MOST_COORDINATES} in blocks")
+        self.method = controller.method
+        self.n_bands = controller.n_bands
+        self.block = block
+        self.note = f"{controller.note}\nin blocks of {block} samples, {precision} precision"
+        self.tables = BlockTables(
+            bank=tables._replace(numbers=numbers_of_blocks(tables.numbers, block)), sample=tables.numbers
+        )
+        self.state = block_state(tables, block, PRECISIONS[precision])
+
+    @property
+    def mismatch(self) -> float:
+        """Share of a target that the integral part adds on the untouched device; see `BankController.mismatch`."""
+        return settled_share(self.tables.bank, self.state.bank)
+
+    @property
+    def turns(self) -> Array:
+        """Fixed part of each carrier's phase at the next sample (turns, 0 to 1, shape (bands,))."""
+        phase = self.tables.bank.tone[2]
+        return np.mod(self.state.phase[:, TURNS].ravel()[: self.n_bands] - phase, 1.0)
+
+    def run(self, sensed: Array, position: Array, wanted: Array) -> tuple[Array, Array, Array]:
+        """Digest whole blocks; see `Controller`.
+
+        Raises
+        ------
+        ValueError
+            The samples are no whole number of blocks.
+        """
+        n = len(sensed)
+        if n % self.block:
+            raise ValueError(f"{n} samples: must be a multiple of the block of {self.block} samples")
+        drive = np.zeros((n, len(self.tables.bank.speak)))
+        target = np.zeros((n // self.block, self.n_bands), complex)
+        flags = np.zeros(n, np.int64)
+        arrays = [np.ascontiguousarray(each, float) for each in (sensed, position, wanted)]
+        block_run(self.tables, self.state, *arrays, drive, target, flags)
+        return drive, np.repeat(target, self.block, axis=0), flags
+
+
+def numbers_of_blocks(numbers: BankNumbers, block: int) -> BankNumbers:
+    """What the bank's own passes are told where a block is their sample; no inner loop."""
+    changes = {name: min(getattr(numbers, name) * block, 1.0) for name in PER_SAMPLE}
+    changes |= {name: 1.0 - (1.0 - getattr(numbers, name)) ** block for name in POLES}
+    changes |= {name: getattr(numbers, name) / block for name in TIMES}
+    return numbers._replace(
+        rate=numbers.rate / block, peak_decay=numbers.peak_decay**block, inner=0.0, inner_awake=0.0, **changes
+    )
+
+
+def block_state(tables: BankTables, block: int, dtype: type) -> BlockState:
+    """State of a bank in blocks, at rest."""
+    bank = bank_state(tables, dtype)
+    coordinates, bands, channels = len(tables.shape), tables.tone.shape[1], len(tables.speak)
+    tiles, width = padded(bands, dtype), WIDTH[np.dtype(dtype)]
+    bank.pace[:] = row.GROWING
+    bank.band[:, row.LIVE] = (np.arange(tiles * width) < bands).reshape(tiles, width)
+    whole = -(-block // EIGHT) * EIGHT
+    phase = aligned((tiles * width // 8, 4, 8))
+    turns = np.zeros(tiles * width)
+    turns[:bands] = np.mod(tables.tone[2], 1.0)
+    phase[:, TURNS] = turns.reshape(-1, 8)
+    return BlockState(
+        bank=bank,
+        phase=phase,
+        table=aligned((tiles, 2 * whole, width), dtype),
+        held=aligned((tiles, 2 * coordinates + CHANNEL_ROWS * (channels + channels % 2), width), dtype),
+        response=np.zeros(whole),
+        inverse=np.zeros((2, 2 * whole)),
+        error=np.zeros((coordinates + 1, whole)),
+        heard=np.zeros((coordinates + 1, whole), dtype),
+        raw=np.zeros((coordinates + 1, whole)),
+        place=np.zeros(block),
+        sum=np.zeros((4, whole)),
+        stale=np.ones(1, np.int64),
+        gain=np.full(1, math.nan),
+    )

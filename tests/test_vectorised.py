@@ -1,0 +1,70 @@
+"""The hot loops are vectorised: read from the compiled code, since a clock on a shared machine proves nothing."""
+
+import platform
+import re
+
+import numpy as np
+import pytest
+
+from hapticrender.accuracy import SLIDING, tones
+from hapticrender.control import bank_kernels, block_kernels
+from hapticrender.control.methods import METHODS
+from hapticrender.plants import kernels as plate_kernels
+from hapticrender.plants.vibrotactile import Plate, PlateParameters
+
+PACKED = re.compile(r"\bv?(?:fn?m(?:add|sub)\d*|mul|add|sub)(p[sd])\b.*%([xyz])mm")
+WIDEST = {"x": 16, "y": 32, "z": 64}  # bytes of a register
+
+
+def instructions(run, *arguments):
+    """Assembly of a kernel for the types of these arguments, compiled anew, as what comes from the cache shows none."""
+    fresh = type(run)(run.py_func, targetoptions=run.targetoptions.copy())
+    fresh(*arguments)
+    return next(iter(fresh.inspect_asm().values()))
+
+
+def packed(assembly, suffix):
+    """Count of packed arithmetic of one precision, and of those instructions on the widest registers there are."""
+    found = [register for kind, register in PACKED.findall(assembly) if kind == suffix]
+    return len(found), sum(register == max(found, key=WIDEST.get) for register in found)
+
+
+def a_bank(precision):
+    model = PlateParameters().band_model(5000.0, 1)
+    controller = METHODS["h2"].design(model, tones(np.linspace(20.0, 400.0, 8), 1e-6), precision=precision)
+    return bank_kernels.bank_run, controller, np.zeros((2, 8), complex)
+
+
+def a_block(precision):
+    from dataclasses import replace
+
+    model = replace(PlateParameters().band_model(5000.0, 16), block=16)
+    controller = METHODS["h2"].design(model, tones(np.linspace(20.0, 400.0, 8), 1e-6), precision=precision)
+    return block_kernels.block_run, controller, np.zeros((1, 8), complex)
+
+
+@pytest.mark.skipif(platform.machine() not in ("x86_64", "AMD64"), reason="reads x86-64 assembly")
+@pytest.mark.parametrize(("precision", "suffix"), [("double", "pd"), ("single", "ps")])
+@pytest.mark.parametrize("kind", [a_bank, a_block])
+def test_banks_work_on_whole_registers(kind, precision, suffix):
+    """Some hundred packed instructions on the widest registers, and no call of the C library's sine or cosine."""
+    run, controller, target = kind(precision)
+    n = 16 if kind is a_block else 2
+    arguments = (np.zeros((n, 2)), np.zeros(n), np.zeros(n), np.zeros((n, 2)), target, np.zeros(n, np.int64))
+    assembly = instructions(run, controller.tables, controller.state, *arguments)
+    every, widest = packed(assembly, suffix)
+    assert every > 200
+    assert widest > 0.8 * every
+    assert not re.search(r"\b(?:sin|cos|atan2)f?\b", assembly)
+
+
+@pytest.mark.skipif(platform.machine() not in ("x86_64", "AMD64"), reason="reads x86-64 assembly")
+def test_the_plate_works_on_whole_registers():
+    plate = Plate(PlateParameters(), SLIDING)
+    n = 2
+    arguments = (np.zeros((n, 2)), np.zeros((n, 3)), np.zeros((n, 2)), np.zeros((n, 2)), np.zeros((n, 3)))
+    run = plate_kernels.plate_run
+    assembly = instructions(run, plate._tables, plate._state, *arguments, np.zeros(n, np.int64))
+    every, widest = packed(assembly, "pd")
+    assert every > 100
+    assert widest > 0.8 * every
