@@ -5,9 +5,9 @@ import pytest
 
 from hapticrender._jit import kernel
 from hapticrender._lanes import WIDTH, aligned, lanes, put
-from hapticrender._polynomials import angle, unit
+from hapticrender._polynomials import polar, unit
 
-BOUNDS = {np.float64: (2.5e-15, 4e-11), np.float32: (2e-7, 4e-7)}  # sine and cosine; angle, rad
+BOUNDS = {np.float64: (2.5e-15, 4e-11, 2e-11), np.float32: (2e-7, 4e-7, 3e-7)}  # sine and cosine; angle, rad; size
 
 
 @kernel
@@ -19,9 +19,11 @@ def units(turns, out):
 
 
 @kernel
-def angles(pairs, out):
+def polars(pairs, out):
     for t in range(pairs.shape[0]):
-        put(out, t, 0, angle(lanes(pairs, t, 1), lanes(pairs, t, 0)))
+        magnitude, angle = polar(lanes(pairs, t, 1), lanes(pairs, t, 0))
+        put(out, t, 0, magnitude)
+        put(out, t, 1, angle)
 
 
 @kernel
@@ -30,8 +32,8 @@ def one_unit(turns):
 
 
 @kernel
-def one_angle(im, re):
-    return angle(im, re)
+def one_polar(im, re):
+    return polar(im, re)
 
 
 def tiles(rows, dtype):
@@ -57,14 +59,16 @@ def test_cosine_and_sine(dtype):
 
 
 @pytest.mark.parametrize("dtype", BOUNDS)
-def test_angle(dtype, rng):
+def test_magnitude_and_angle(dtype, rng):
     theta = np.linspace(-np.pi, np.pi, 2**16)
     radius = 10.0 ** rng.uniform(-9, 3, theta.size)
     pairs = tiles(np.array([radius * np.cos(theta), radius * np.sin(theta)]), dtype)
-    out = aligned((len(pairs), 1, pairs.shape[2]), dtype)
-    angles(pairs, out)
+    out = aligned((len(pairs), 2, pairs.shape[2]), dtype)
+    polars(pairs, out)
     re, im = flat(pairs).astype(float)
-    off = flat(out)[0] - np.arctan2(im, re)
+    magnitude, angle = flat(out)
+    np.testing.assert_allclose(magnitude, np.hypot(re, im), rtol=BOUNDS[dtype][2])
+    off = angle - np.arctan2(im, re)
     assert abs(np.mod(off + np.pi, 2 * np.pi) - np.pi).max() <= BOUNDS[dtype][1]
 
 
@@ -80,5 +84,6 @@ def test_far_from_zero_only_the_fraction_counts():
     [(0.0, 0.0), (0.0, 1.0), (1.0, 0.0), (0.0, -1.0), (-1.0, 0.0), (1.0, 1.0), (-1.0, -1.0), (1e-200, 1.0)],
 )
 def test_axes_and_diagonals(im, re):
-    assert one_angle(im, re) == pytest.approx(np.arctan2(im, re), abs=4e-11)
-    assert abs(float(one_angle(np.float32(im), np.float32(re))) - np.arctan2(im, re)) <= 4e-7
+    assert one_polar(im, re)[1] == pytest.approx(np.arctan2(im, re), abs=4e-11)
+    assert one_polar(im, re)[0] == pytest.approx(np.hypot(im, re), rel=2e-11)
+    assert abs(float(one_polar(np.float32(im), np.float32(re))[1]) - np.arctan2(im, re)) <= 4e-7

@@ -2,12 +2,13 @@
 
 import platform
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from hapticrender.accuracy import SLIDING, tones
-from hapticrender.control import bank_kernels, block_kernels
+from hapticrender.control import bank_kernels, block_kernels, polar_kernels
 from hapticrender.control.methods import METHODS
 from hapticrender.plants import kernels as plate_kernels
 from hapticrender.plants.vibrotactile import Plate, PlateParameters
@@ -35,9 +36,13 @@ def a_bank(precision):
     return bank_kernels.bank_run, controller, np.zeros((2, 8), complex)
 
 
-def a_block(precision):
-    from dataclasses import replace
+def a_polar(precision):
+    model = PlateParameters().band_model(5000.0, 1)
+    controller = METHODS["paper"].design(model, tones(np.linspace(20.0, 400.0, 8), 1e-6), precision=precision)
+    return polar_kernels.polar_run, controller, np.zeros((2, 8), complex)
 
+
+def a_block(precision):
     model = replace(PlateParameters().band_model(5000.0, 16), block=16)
     controller = METHODS["h2"].design(model, tones(np.linspace(20.0, 400.0, 8), 1e-6), precision=precision)
     return block_kernels.block_run, controller, np.zeros((1, 8), complex)
@@ -45,8 +50,8 @@ def a_block(precision):
 
 @pytest.mark.skipif(platform.machine() not in ("x86_64", "AMD64"), reason="reads x86-64 assembly")
 @pytest.mark.parametrize(("precision", "suffix"), [("double", "pd"), ("single", "ps")])
-@pytest.mark.parametrize("kind", [a_bank, a_block])
-def test_banks_work_on_whole_registers(kind, precision, suffix):
+@pytest.mark.parametrize("kind", [a_bank, a_block, a_polar])
+def test_controllers_work_on_whole_registers(kind, precision, suffix):
     """Some hundred packed instructions on the widest registers, and no call of the C library's sine or cosine."""
     run, controller, target = kind(precision)
     n = 16 if kind is a_block else 2

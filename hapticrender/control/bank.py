@@ -11,13 +11,12 @@ from hapticrender.bands import Bands
 from hapticrender.control import bank_rows as row
 from hapticrender.control.bandmodel import BandModel
 from hapticrender.control.bank_kernels import REFRESH, bank_run
-from hapticrender.control.bank_state import BankNumbers, BankState, BankTables, across_bands, bank_state
+from hapticrender.control.bank_state import PRECISIONS, BankNumbers, BankState, BankTables, across_bands, bank_state
 from hapticrender.control.damping import choose_damping
 from hapticrender.control.kernels import FREQUENCY, WAVENUMBER
 from hapticrender.control.stability import Checked, Limits, checked_bandwidth
 from hapticrender.protocols import Array
 
-PRECISIONS = {"double": np.float64, "single": np.float32}
 CONTACT_LOAD = (0.05, 0.03)  # N: on, off
 RAMP_TIME = 0.05  # s: a target grows this long, so that it does not strike the modes
 FAST_POLE, FAST_SIGMAS = 30.0, 5.5  # Hz, of the sensor noise behind that pole

@@ -15,6 +15,8 @@ from hapticrender._lanes import WIDTH, aligned, padded
 from hapticrender.control import bank_rows as row
 from hapticrender.protocols import Array
 
+PRECISIONS = {"double": np.float64, "single": np.float32}
+
 
 class BankNumbers(NamedTuple):
     """What all bands share."""

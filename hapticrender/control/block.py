@@ -8,8 +8,8 @@ import numpy as np
 
 from hapticrender._lanes import WIDTH, aligned, padded
 from hapticrender.control import bank_rows as row
-from hapticrender.control.bank import PRECISIONS, BankController, settled_share
-from hapticrender.control.bank_state import BankNumbers, BankTables, bank_state
+from hapticrender.control.bank import BankController, settled_share
+from hapticrender.control.bank_state import PRECISIONS, BankNumbers, BankTables, bank_state
 from hapticrender.control.block_kernels import CHANNEL_ROWS, EIGHT, TURNS, BlockState, BlockTables, block_run
 from hapticrender.protocols import Array
 

@@ -11,12 +11,11 @@ from numba.extending import overload
 from hapticrender._jit import kernel
 from hapticrender.control.bank_kernels import bank_step
 from hapticrender.control.bank_state import BankTables
-from hapticrender.control.boxcar_kernels import BoxcarTables, boxcar_step
 from hapticrender.control.complex_kernels import ComplexTables, complex_step
-from hapticrender.control.kernels import PolarTables, polar_step
+from hapticrender.control.polar_kernels import PolarTables, polar_step
 from hapticrender.plants.kernels import plate_advance, plate_drive, plate_sense
 
-STEPS = {PolarTables: polar_step, BoxcarTables: boxcar_step, ComplexTables: complex_step, BankTables: bank_step}
+STEPS = {PolarTables: polar_step, ComplexTables: complex_step, BankTables: bank_step}
 
 
 def step_of(tables):

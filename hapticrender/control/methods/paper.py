@@ -14,14 +14,18 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from hapticrender._lanes import WIDTH, aligned, padded
 from hapticrender.bands import Bands
 from hapticrender.control.bandmodel import BandModel
+from hapticrender.control.bank_state import PRECISIONS
 from hapticrender.control.envelope_loop import Bandwidths, EnvelopeLoop, envelope_loop
-from hapticrender.control.kernels import (
+from hapticrender.control.polar_kernels import (
     BAND_ROWS,
     FORWARD,
     HEADING_RE,
     LOOP_ROWS,
+    REFRESH,
+    SHARED_ROWS,
     PolarNumbers,
     PolarState,
     PolarTables,
@@ -41,22 +45,19 @@ class PolarController:
         Name of the method that designed it.
     tables : PolarTables
         Parameters of the compiled step.
+    window : int, samples
+        Length of the boxcar; 0: the STDFT* listens.
+    precision : {"double", "single"}
+        Of everything that a band owns.
     """
 
-    def __init__(self, method: str, tables: PolarTables) -> None:
-        coordinates, bands = len(tables.listen), tables.tone.shape[1]
+    def __init__(self, method: str, tables: PolarTables, window: int = 0, precision: str = "double") -> None:
+        if precision not in PRECISIONS:
+            raise ValueError(f"{precision=}: must be one of {', '.join(PRECISIONS)}")
         self.method = method
-        self.n_bands = bands
+        self.n_bands = tables.tone.shape[1]
         self.tables = tables
-        band = np.zeros((BAND_ROWS, bands))
-        band[[FORWARD, HEADING_RE]] = 1.0
-        self.state = PolarState(
-            band=band,
-            loop=np.zeros((coordinates * LOOP_ROWS, bands)),
-            finger=np.zeros(4),
-            coordinate=np.zeros(coordinates),
-            doubt=np.zeros(1),
-        )
+        self.state = polar_state(tables, window, PRECISIONS[precision])
 
     def run(self, sensed: Array, position: Array, wanted: Array) -> tuple[Array, Array, Array]:
         """Digest n samples; see `Controller`."""
@@ -66,6 +67,28 @@ class PolarController:
         flags = np.zeros(n, np.int64)
         polar_run(self.tables, self.state, np.ascontiguousarray(sensed, float), position, wanted, drive, target, flags)
         return drive, target, flags
+
+
+def polar_state(tables: PolarTables, window: int, dtype: type) -> PolarState:
+    """State of a polar controller at rest, its bands in `dtype`."""
+    coordinates, bands = len(tables.listen), tables.tone.shape[1]
+    tiles, width = padded(bands, dtype), WIDTH[np.dtype(dtype)]
+    band = aligned((tiles, BAND_ROWS, width), dtype)
+    band[:, [FORWARD, HEADING_RE]] = 1.0
+    rows = 2 * tiles * coordinates
+    return PolarState(
+        band=band,
+        loop=aligned((tiles, coordinates * LOOP_ROWS, width), dtype),
+        phase=np.zeros(bands, np.uint64),
+        locked=np.zeros(tiles, np.int64),
+        finger=np.zeros(4),
+        doubt=np.zeros(1),
+        sample=np.zeros(1, np.int64),
+        shared=np.zeros((SHARED_ROWS + coordinates, REFRESH)),
+        sum=aligned((coordinates, REFRESH, width), dtype),
+        window=aligned((window, rows, width), dtype),
+        heap=aligned((2, rows, width), dtype),
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -87,11 +110,20 @@ class Polar:
     bandwidths: Bandwidths | None = None
 
     def _star(
-        self, name: str, model: BandModel, bands: Bands, watched: Array, spread: Array, feedback: bool
+        self,
+        name: str,
+        model: BandModel,
+        bands: Bands,
+        watched: Array,
+        spread: Array,
+        feedback: bool,
+        precision: str,
+        boxcar: bool = False,
     ) -> PolarController:
-        """Loops on the STDFT*."""
-        loop = envelope_loop(model, bands, bandwidths=self.bandwidths, feedback=feedback)
-        return PolarController(name, polar_tables(self, model, bands, watched, spread, loop, feedback))
+        """Loops on the STDFT*, or on the boxcar STDFT."""
+        loop = envelope_loop(model, bands, boxcar=boxcar, bandwidths=self.bandwidths, feedback=feedback)
+        tables = polar_tables(self, model, bands, watched, spread, loop, feedback)
+        return PolarController(name, tables, loop.boxcar if boxcar else 0, precision)
 
 
 class PerSide(Polar):
@@ -99,9 +131,11 @@ class PerSide(Polar):
 
     name = "paper"
 
-    def design(self, model: BandModel, bands: Bands, *, feedback: bool = True) -> PolarController:
+    def design(
+        self, model: BandModel, bands: Bands, *, feedback: bool = True, precision: str = "double"
+    ) -> PolarController:
         """Loops on the displacements at the transducers, interpolated from the sensors at the ends."""
-        return self._star(self.name, model, bands, *per_side(model), feedback)
+        return self._star(self.name, model, bands, *per_side(model), feedback, precision)
 
 
 class CommonMode(Polar):
@@ -109,12 +143,13 @@ class CommonMode(Polar):
 
     name = "paper-common"
 
-    def design(self, model: BandModel, bands: Bands, *, feedback: bool = True) -> PolarController:
+    def design(
+        self, model: BandModel, bands: Bands, *, feedback: bool = True, precision: str = "double"
+    ) -> PolarController:
         """One pair of loops on heave."""
         sides = model.side_from_coordinate
-        return self._star(
-            self.name, model, bands, sides.mean(axis=0, keepdims=True), np.ones((len(sides), 1)), feedback
-        )
+        mean, alike = sides.mean(axis=0, keepdims=True), np.ones((len(sides), 1))
+        return self._star(self.name, model, bands, mean, alike, feedback, precision)
 
 
 def per_side(model: BandModel) -> tuple[Array, Array]:

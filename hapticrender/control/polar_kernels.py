@@ -1,0 +1,457 @@
+"""Compiled tick of the paper's controller (Grigorii et al. 2021): polar loops on the STDFT*, or on the boxcar STDFT.
+
+Symbols: psi carrier phase, X envelope of a coordinate, R wanted envelope, A and Theta commanded amplitude and phase.  A
+carrier that runs backwards (the finger reverses) is followed as its mirror image: x = Re X e^{j phi} =
+Re conj(X) e^{-j phi}, so that psi always runs forward and every complex state is conjugated at the reversal.
+
+Everything that a band owns is a column of rows that are named here, W columns to a tile (`hapticrender._lanes`).  A
+block is done tile by tile, so that a tile's state stays near; what all tiles share is written down before.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+from numba.core import types
+from numba.extending import overload
+
+from hapticrender._jit import OPTIONS, kernel
+from hapticrender._lanes import LaneType, any_of, high, lanes, low, put, put_pairs, root, select, size, total
+from hapticrender._polynomials import polar, unit
+from hapticrender.control.bank_kernels import count_turns
+from hapticrender.control.kernels import (
+    DOUBT_TIME,
+    FAR,
+    FASTEST,
+    QUIET,
+    TURN,
+    Section,
+)
+from hapticrender.protocols import Array
+
+VELOCITY_POLE = 40.0  # Hz: smoothing of the finger's velocity, used only to look up gains and to fade
+GATE_TIME = 0.02  # s: finger-locked targets fade in and out with contact
+REFRESH = 64  # samples between two looks at the tones; a block is cut there, too
+
+# rows of PolarState.band: what was asked for; fixed part of the carrier (turns) and its turn a sample; its direction
+# (+1, -1); the wanted envelope, its amplitude and direction (that of the last target that was not silence); low-pass
+# states of the wanted waveform
+LIVE, FREQUENCY, WAVENUMBER, PHASE, WANTED_RE, WANTED_IM = range(6)
+TURNS, COS, SIN, TURN_COS, TURN_SIN, FORWARD = range(6, 12)
+TARGET_RE, TARGET_IM, AMOUNT, HEADING_RE, HEADING_IM = range(12, 17)
+REF_RE1, REF_RE2, REF_IM1, REF_IM2 = range(17, 21)
+BAND_ROWS = 21
+# rows of PolarState.loop, LOOP_ROWS for each coordinate: low-pass states, states of amplitude and phase loop, X; drive
+# per metre from the look-up table, and the device's lag (rad)
+RE1, RE2, IM1, IM2, AMPLITUDE1, AMPLITUDE2, THETA1, THETA2, X_RE, X_IM, DRIVE, LAG = range(12)
+LOOP_ROWS = 12
+# entries of PolarState.finger
+HELD, VELOCITY, GATE, SEEN = range(4)
+# rows of PolarState.shared, one column a sample of a block: what all tiles are told; then one row a coordinate
+WANTED, TRUST, PLACE, SPEED, OPENING = range(5)
+SHARED_ROWS = 5
+
+
+class PolarNumbers(NamedTuple):
+    """What all bands share."""
+
+    rate: float
+    feedback: bool  # False: nothing is sensed, drive straight from the look-up table
+    analysed: bool  # True: targets come from the wanted waveform
+    drive_limit: float
+    sensed_limit: float  # beyond it a sensor is not believed
+    lowest: float  # Hz
+    highest: float  # Hz
+    floor: float  # m: least command amplitude, 0; naive: -inf
+    subtract: bool  # naive: phase of X minus phase of R, each with its own seam
+    filter: Section  # low pass of the STDFT*
+    law: Section  # loop controller
+    table_step: float  # Hz
+    lead: float  # s: known delay and half the hold
+
+
+class PolarTables(NamedTuple):
+    """Parameters of the polar controller."""
+
+    numbers: PolarNumbers
+    tone: Array  # (5, bands)
+    listen: Array  # (coordinates, sensors)
+    speak: Array  # (channels, coordinates)
+    gain: Array  # (coordinates, table), m per drive unit
+    lag: Array  # (coordinates, table), rad: phase of the free device
+
+
+class PolarState(NamedTuple):
+    """State of the polar controller; changed in place."""
+
+    band: Array  # (tiles, BAND_ROWS, W)
+    loop: Array  # (tiles, coordinates * LOOP_ROWS, W)
+    phase: Array  # (bands,) uint64: fixed part of each carrier at the next refresh, 2^64 a turn
+    locked: Array  # (tiles,) integer: 1 where a carrier of the tile follows the finger
+    finger: Array  # (4,) held position (m), velocity (m/s), gate 0..1, seen before (0 or 1)
+    doubt: Array  # (1,) 0: the sensors are believed, 1: they are not
+    sample: Array  # (1,) integer: samples so far
+    shared: Array  # (SHARED_ROWS + coordinates, REFRESH) scratch
+    sum: Array  # (coordinates, REFRESH, W) scratch: drive of each coordinate, not yet summed over the lanes
+    window: Array  # (length, tiles * 2 * coordinates, W) boxcar: what was heard; of length 0 with the STDFT*
+    heap: Array  # (2, tiles * 2 * coordinates, W) its running sum, and one summed afresh
+
+
+def section_step(section: Any, state1: Any, state2: Any, x: Any) -> Any:
+    """Second-order section; returns output and new states."""
+    raise TypeError("section_step: to be called from a kernel")
+
+
+def clamped_step(section: Any, state1: Any, state2: Any, x: Any, floor: Any) -> Any:
+    """Second-order section whose output stops at `floor`, and whose states know it."""
+    raise TypeError("clamped_step: to be called from a kernel")
+
+
+def _is_short(kind: Any) -> bool:
+    return isinstance(kind, LaneType) and kind.dtype == types.float32
+
+
+@overload(section_step, jit_options=OPTIONS)
+def _section_step(section, state1, state2, x):  # type: ignore[no-untyped-def]
+    def direct(section, state1, state2, x):  # type: ignore[no-untyped-def]
+        """Transposed direct form II."""
+        y = section[0] * x + state1
+        return y, section[1] * x - section[3] * y + state2, section[2] * x - section[4] * y
+
+    def delta(section, state1, state2, x):  # type: ignore[no-untyped-def]
+        """The same in powers of z - 1: poles near 1 keep their place in single precision."""
+        y = section[0] * x + state1
+        middle = state1 + state2 + (2.0 * section[0] + section[1]) * x - (2.0 + section[3]) * y
+        slow = state2 + (section[0] + section[1] + section[2]) * x - (1.0 + section[3] + section[4]) * y
+        return y, middle, slow
+
+    return delta if _is_short(state1) else direct
+
+
+@overload(clamped_step, jit_options=OPTIONS)
+def _clamped_step(section, state1, state2, x, floor):  # type: ignore[no-untyped-def]
+    def direct(section, state1, state2, x, floor):  # type: ignore[no-untyped-def]
+        y = high(section[0] * x + state1, floor)
+        return y, section[1] * x - section[3] * y + state2, section[2] * x - section[4] * y
+
+    def delta(section, state1, state2, x, floor):  # type: ignore[no-untyped-def]
+        """At the floor the states are those of an output that has always been there."""
+        free = section[0] * x + state1
+        held = free < floor
+        y = select(held, floor, free)
+        state1, state2 = select(held, y - section[0] * x, state1), select(held, (2.0 + section[3]) * y, state2)
+        middle = state1 + state2 + (2.0 * section[0] + section[1]) * x - (2.0 + section[3]) * y
+        slow = state2 + (section[0] + section[1] + section[2]) * x - (1.0 + section[3] + section[4]) * y
+        return y, middle, slow
+
+    return delta if _is_short(state1) else direct
+
+
+@kernel
+def lookup(table, c, step, frequency):
+    """Linear interpolation in a table over frequency."""
+    at = min(frequency / step, table.shape[1] - 1.000001)
+    i = int(at)
+    return table[c, i] + (at - i) * (table[c, i + 1] - table[c, i])
+
+
+@kernel
+def polar_cut_at_90(im, re):
+    """Magnitude, and angle in (-270, 90] deg: the discontinuity lies far from the phases of a passive plate."""
+    magnitude, phase = polar(im, re)
+    return magnitude, select(phase > 0.25 * TURN, phase - TURN, phase)
+
+
+@kernel
+def look_up(tables, state, t, i, frequency):
+    """What the table says of band i of a tile at `frequency`."""
+    for c in range(tables.listen.shape[0]):
+        at, step = c * LOOP_ROWS, tables.numbers.table_step
+        state.loop[t, at + DRIVE, i] = 1.0 / lookup(tables.gain, c, step, frequency)
+        state.loop[t, at + LAG, i] = lookup(tables.lag, c, step, frequency)
+
+
+@kernel
+def aim(band, t, re, im):
+    """Take up a wanted envelope: its amplitude, and its direction where it is no silence."""
+    amount = root(re * re + im * im)
+    sounds = amount > QUIET
+    safe = select(sounds, amount, 1.0)
+    put(band, t, TARGET_RE, re)
+    put(band, t, TARGET_IM, im)
+    put(band, t, AMOUNT, amount)
+    put(band, t, HEADING_RE, select(sounds, re / safe, lanes(band, t, HEADING_RE)))
+    put(band, t, HEADING_IM, select(sounds, im / safe, lanes(band, t, HEADING_IM)))
+
+
+@kernel
+def refresh(tables, state):
+    """Take up the tones that are asked for; phases and look-ups of fixed carriers, whose targets stay if constant."""
+    numbers, tone, band, width = tables.numbers, tables.tone, state.band, state.band.shape[2]
+    for t in range(band.shape[0]):
+        state.locked[t] = 0
+        for i in range(min(width, tone.shape[1] - t * width)):
+            k = t * width + i
+            band[t, LIVE, i] = 1.0
+            for r in range(tone.shape[0]):
+                band[t, FREQUENCY + r, i] = tone[r, k]
+            band[t, TURNS, i] = count_turns(state.phase, k, tone[0, k] / numbers.rate)
+            if tone[1, k] > 0.0:
+                state.locked[t] = 1
+            look_up(tables, state, t, i, tone[0, k])
+        if state.locked[t] == 0:
+            live = lanes(band, t, LIVE)
+            cos, sin = unit(lanes(band, t, TURNS) + lanes(band, t, PHASE))
+            put(band, t, COS, live * cos)
+            put(band, t, SIN, live * sin)
+            cos, sin = unit(1.0 / numbers.rate * lanes(band, t, FREQUENCY))
+            put(band, t, TURN_COS, cos)
+            put(band, t, TURN_SIN, sin)
+            if not numbers.analysed:
+                aim(band, t, lanes(band, t, WANTED_RE), lanes(band, t, WANTED_IM))
+
+
+@kernel
+def follow_finger(finger, rate, position):
+    """Hold the position while the finger is away, smooth its velocity, open the gate with contact."""
+    seen = abs(position) <= FAR and not (finger[SEEN] > 0.0 and abs(position - finger[HELD]) * rate > FASTEST)
+    velocity = 0.0
+    if seen:
+        if finger[SEEN] > 0.0:
+            velocity = (position - finger[HELD]) * rate
+        finger[HELD] = position
+    finger[SEEN] = 1.0 if seen else 0.0
+    finger[VELOCITY] += (1.0 - math.exp(-TURN * VELOCITY_POLE / rate)) * (velocity - finger[VELOCITY])
+    ramp = 1.0 / (GATE_TIME * rate)
+    finger[GATE] = min(finger[GATE] + ramp, 1.0) if seen else max(finger[GATE] - ramp, 0.0)
+
+
+@kernel
+def share(tables, state, m, sensed, position, wanted):
+    """Write down what all tiles are told of a sample; what no sensor can show counts as zero.  Returns flags."""
+    numbers, shared, flags = tables.numbers, state.shared, 0
+    for c in range(tables.listen.shape[0]):
+        y = 0.0
+        for s in range(sensed.shape[0]):
+            if abs(sensed[s]) <= numbers.sensed_limit:
+                y += tables.listen[c, s] * sensed[s]
+            else:  # NaN included
+                flags = 2
+        shared[SHARED_ROWS + c, m] = y
+    step = 1.0 / (DOUBT_TIME * numbers.rate)
+    state.doubt[0] = min(state.doubt[0] + step, 1.0) if flags else max(state.doubt[0] - step, 0.0)
+    shared[TRUST, m] = 1.0 - state.doubt[0]
+    sane = abs(wanted) <= FAR
+    shared[WANTED, m] = wanted if sane else 0.0
+    far = abs(position) > FAR
+    follow_finger(state.finger, numbers.rate, math.nan if far else position)
+    shared[PLACE, m], shared[SPEED, m] = state.finger[HELD], state.finger[VELOCITY]
+    shared[OPENING, m] = state.finger[GATE]
+    return flags if sane and not far else 2
+
+
+@kernel
+def mirror(band, loop, t, flip):
+    """Conjugate every complex state of the bands whose carriers have turned round.
+
+    The commanded phase stays: it makes up for the plant's lag at |f|, which does not care about the direction.
+    """
+    for r in (FORWARD, HEADING_IM, REF_IM1, REF_IM2):
+        put(band, t, r, select(flip, -lanes(band, t, r), lanes(band, t, r)))
+    for base in range(0, loop.shape[1], LOOP_ROWS):
+        for r in (IM1, IM2):
+            put(loop, t, base + r, select(flip, -lanes(loop, t, base + r), lanes(loop, t, base + r)))
+
+
+@kernel
+def follow(tables, state, t, m):
+    """Carriers of a tile that follow the finger, their look-ups; returns the weight of their targets."""
+    numbers, band, shared = tables.numbers, state.band, state.shared
+    wavenumber, frequency = lanes(band, t, WAVENUMBER), lanes(band, t, FREQUENCY)
+    hertz = frequency + wavenumber * shared[SPEED, m]
+    flip = hertz * lanes(band, t, FORWARD) < 0.0
+    if any_of(flip):
+        mirror(band, state.loop, t, flip)
+    turns, live = lanes(band, t, TURNS), lanes(band, t, LIVE)
+    cos, sin = unit(turns + wavenumber * shared[PLACE, m] + lanes(band, t, PHASE))
+    put(band, t, TURNS, turns + 1.0 / numbers.rate * frequency)
+    put(band, t, COS, live * cos)
+    put(band, t, SIN, live * lanes(band, t, FORWARD) * sin)
+    for i in range(min(band.shape[2], tables.tone.shape[1] - t * band.shape[2])):
+        speed = band[t, WAVENUMBER, i] * shared[SPEED, m]
+        look_up(tables, state, t, i, abs(band[t, FREQUENCY, i] + speed))
+    inside = low(high(2.0 / numbers.lowest * size(hertz) - 1.0, 0.0), 1.0)
+    below = low(high(5.0 - 4.0 / numbers.highest * size(hertz), 0.0), 1.0)
+    weight = inside * inside * (3.0 - 2.0 * inside) * below * below * (3.0 - 2.0 * below) * shared[OPENING, m]
+    return select(wavenumber > 0.0, weight, 1.0)
+
+
+@kernel
+def carry(tables, state, t, m, target):
+    """Carriers and wanted envelopes of a tile: constant, or the wanted waveform through the same STDFT*."""
+    numbers, band = tables.numbers, state.band
+    weight = 1.0 + 0.0 * lanes(band, t, LIVE)
+    if state.locked[t] > 0:
+        weight = follow(tables, state, t, m)
+    elif (state.sample[0] + m) % REFRESH > 0:
+        cos, sin = lanes(band, t, COS), lanes(band, t, SIN)
+        turn_cos, turn_sin = lanes(band, t, TURN_COS), lanes(band, t, TURN_SIN)
+        put(band, t, COS, cos * turn_cos - sin * turn_sin)
+        put(band, t, SIN, sin * turn_cos + cos * turn_sin)
+    forward = lanes(band, t, FORWARD)
+    if numbers.analysed:
+        twice = 2.0 * state.shared[WANTED, m]
+        re, s1, s2 = section_step(
+            numbers.filter, lanes(band, t, REF_RE1), lanes(band, t, REF_RE2), twice * lanes(band, t, COS)
+        )
+        put(band, t, REF_RE1, s1)
+        put(band, t, REF_RE2, s2)
+        im, s1, s2 = section_step(
+            numbers.filter, lanes(band, t, REF_IM1), lanes(band, t, REF_IM2), -twice * lanes(band, t, SIN)
+        )
+        put(band, t, REF_IM1, s1)
+        put(band, t, REF_IM2, s2)
+        aim(band, t, weight * re, weight * im)
+    elif state.locked[t] > 0:
+        aim(band, t, weight * lanes(band, t, WANTED_RE), weight * forward * lanes(band, t, WANTED_IM))
+    put_pairs(target, t, lanes(band, t, TARGET_RE), forward * lanes(band, t, TARGET_IM))
+
+
+@kernel
+def slide(window, heap, at, r, x):
+    """Mean over the window (eq. 2); once a window its sum is replaced by one summed afresh, as rounding piles up."""
+    running, afresh = lanes(heap, 0, r) + (x - lanes(window, at, r)), lanes(heap, 1, r) + x
+    put(window, at, r, x)
+    last = at == window.shape[0] - 1
+    put(heap, 0, r, afresh if last else running)
+    put(heap, 1, r, 0.0 * afresh if last else afresh)
+    return (1.0 / window.shape[0]) * (afresh if last else running)
+
+
+@kernel
+def listen(tables, state, t, m, c):
+    """STDFT* (eq. 1, 3, 4), or STDFT (eq. 1-3): envelopes X of coordinate c."""
+    band, loop, base, window = state.band, state.loop, c * LOOP_ROWS, state.window
+    twice = 2.0 * state.shared[SHARED_ROWS + c, m]
+    re, im = twice * lanes(band, t, COS), -twice * lanes(band, t, SIN)
+    if window.shape[0] > 0:  # it holds what it hears unmirrored, so that a carrier that turns round need not rewrite it
+        at, r = (state.sample[0] + m) % window.shape[0], 2 * (t * tables.listen.shape[0] + c)
+        forward = lanes(band, t, FORWARD)
+        re, im = slide(window, state.heap, at, r, re), forward * slide(window, state.heap, at, r + 1, forward * im)
+    else:
+        section = tables.numbers.filter
+        re, s1, s2 = section_step(section, lanes(loop, t, base + RE1), lanes(loop, t, base + RE2), re)
+        put(loop, t, base + RE1, s1)
+        put(loop, t, base + RE2, s2)
+        im, s1, s2 = section_step(section, lanes(loop, t, base + IM1), lanes(loop, t, base + IM2), im)
+        put(loop, t, base + IM1, s1)
+        put(loop, t, base + IM2, s2)
+    put(loop, t, base + X_RE, re)
+    put(loop, t, base + X_IM, im)
+    return re, im
+
+
+@kernel
+def answer(numbers, band, loop, t, base, x_re, x_im):
+    """Amplitude and phase loops of a coordinate: commanded amplitude (m) and phase (rad)."""
+    amount, h_re, h_im = lanes(band, t, AMOUNT), lanes(band, t, HEADING_RE), lanes(band, t, HEADING_IM)
+    if numbers.subtract:
+        found, phase = polar_cut_at_90(x_im, x_re)
+        lag = phase - polar_cut_at_90(h_im, h_re)[1]
+    else:  # phase of X against R, eq. 5 with the cut moved
+        found, lag = polar_cut_at_90(x_im * h_re - x_re * h_im, x_re * h_re + x_im * h_im)
+    lag = select(amount > QUIET, lag, 0.0)
+    theta, s1, s2 = section_step(numbers.law, lanes(loop, t, base + THETA1), lanes(loop, t, base + THETA2), -lag)
+    put(loop, t, base + THETA1, s1)
+    put(loop, t, base + THETA2, s2)
+    error = amount - found  # eq. 3
+    command, s1, s2 = clamped_step(
+        numbers.law, lanes(loop, t, base + AMPLITUDE1), lanes(loop, t, base + AMPLITUDE2), error, numbers.floor
+    )  # a negative one would be positive feedback
+    put(loop, t, base + AMPLITUDE1, s1)
+    put(loop, t, base + AMPLITUDE2, s2)
+    return command, theta
+
+
+@kernel
+def tile_step(tables, state, t, m, target):
+    """One sample of a tile: adds the drive of its bands to each coordinate's sum."""
+    numbers, band, loop = tables.numbers, state.band, state.loop
+    carry(tables, state, t, m, target)
+    if state.shared[TRUST, m] == 0.0:  # the loops start anew
+        for base in range(0, loop.shape[1], LOOP_ROWS):
+            for r in range(DRIVE):
+                put(loop, t, base + r, 0.0 * lanes(loop, t, base + DRIVE))
+    cos, sin = lanes(band, t, COS), lanes(band, t, SIN)
+    h_re, h_im = lanes(band, t, HEADING_RE), lanes(band, t, HEADING_IM)
+    for c in range(tables.listen.shape[0]):
+        base = c * LOOP_ROWS
+        if numbers.feedback:
+            x_re, x_im = listen(tables, state, t, m, c)
+            command, theta = answer(numbers, band, loop, t, base, x_re, x_im)
+        else:  # straight from the look-up table, turned ahead by delay and hold
+            speed = lanes(band, t, WAVENUMBER) * state.shared[SPEED, m]
+            now = size(lanes(band, t, FREQUENCY) + speed)
+            command, theta = lanes(band, t, AMOUNT), TURN * numbers.lead * now - lanes(loop, t, base + LAG)
+        u, v = unit((1.0 / TURN) * theta)
+        carried = (h_re * u - h_im * v) * cos - (h_re * v + h_im * u) * sin
+        put(state.sum, c, m, lanes(state.sum, c, m) + command * lanes(loop, t, base + DRIVE) * carried)
+
+
+@kernel
+def speak(tables, state, m, drive):
+    """Drive of the channels from that of the coordinates, each cut to its limit.  Returns flags."""
+    numbers, flags = tables.numbers, 0
+    for i in range(drive.shape[0]):
+        drive[i] = 0.0
+    for c in range(tables.listen.shape[0]):
+        force = state.shared[TRUST, m] * total(1.0, lanes(state.sum, c, m))
+        for i in range(drive.shape[0]):
+            drive[i] += tables.speak[i, c] * force
+    for i in range(drive.shape[0]):
+        asked = drive[i]
+        drive[i] = min(max(asked, -numbers.drive_limit), numbers.drive_limit)
+        if drive[i] != asked:
+            flags = 1
+    return flags
+
+
+@kernel
+def silence(state, m):
+    """Start the sums of a sample."""
+    for c in range(state.sum.shape[0]):
+        put(state.sum, c, m, 0.0 * lanes(state.band, 0, LIVE))
+
+
+@kernel
+def polar_step(tables, state, sensed, position, wanted, drive, target):
+    """One sample of the whole controller: fills `drive` (channels,) and `target` (bands,), returns flags."""
+    if state.sample[0] % REFRESH == 0:
+        refresh(tables, state)
+    flags = share(tables, state, 0, sensed, position, wanted)
+    silence(state, 0)
+    for t in range(state.band.shape[0]):
+        tile_step(tables, state, t, 0, target)
+    state.sample[0] += 1
+    return flags | speak(tables, state, 0, drive)
+
+
+@kernel
+def polar_run(tables, state, sensed, position, wanted, drive, target, flags):
+    """Samples one after another, tile by tile between two looks at the tones."""
+    n = 0
+    while n < sensed.shape[0]:
+        if state.sample[0] % REFRESH == 0:
+            refresh(tables, state)
+        count = min(REFRESH - state.sample[0] % REFRESH, sensed.shape[0] - n)
+        for m in range(count):
+            flags[n + m] = share(tables, state, m, sensed[n + m], position[n + m], wanted[n + m])
+            silence(state, m)
+        for t in range(state.band.shape[0]):
+            for m in range(count):
+                tile_step(tables, state, t, m, target[n + m])
+        state.sample[0] += count
+        for m in range(count):
+            flags[n + m] |= speak(tables, state, m, drive[n + m])
+        n += count
