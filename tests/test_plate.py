@@ -3,10 +3,12 @@
 import numpy as np
 import pytest
 from naive_plate import continuous, simulate, simulate_moving
+from scipy.linalg import expm
 
 import hapticrender as hr
+from hapticrender.plants.kernels import series_at
 from hapticrender.plants.propagator import GRIP, NARROWEST, WIDEST, WIDTH
-from hapticrender.plants.vibrotactile import Plate, PlateParameters
+from hapticrender.plants.vibrotactile import Plate, PlateParameters, plate_state, plate_tables
 from hapticrender.touch.mechanics import HEAVY, HEAVY_SECOND, LIGHT, LIGHT_SECOND, NONE
 
 IDEAL = {"sensor_noise": 0.0, "sensor_bits": 0, "current_bits": 0}
@@ -92,8 +94,9 @@ def test_sliding_in_windows_is_as_exact_as_the_series(rng, mechanics, bending):
     np.testing.assert_allclose(motion, expected, rtol=0, atol=2000 * 2e-15 * abs(expected).max())
 
 
-def test_a_window_that_is_too_wide_is_halved_until_its_polynomial_is_exact():
-    finger = hr.Finger.sliding(speed=0.1, span=0.09, normal_load=0.8, mechanics=HEAVY)
+def test_a_window_that_is_too_wide_shrinks_until_its_polynomial_is_exact():
+    """A light finger on rigid glass needs none of it; bending glass follows the finger's place more closely."""
+    finger = hr.Finger.sliding(speed=0.1, span=0.09, normal_load=0.3, mechanics=LIGHT)
     widths = []
     for bending in (0.0, 1200.0):
         plate = Plate(PlateParameters(bending_frequency=bending), finger)
@@ -101,6 +104,48 @@ def test_a_window_that_is_too_wide_is_halved_until_its_polynomial_is_exact():
         widths.append(plate._state.window[WIDTH])
     assert widths[0] == WIDEST
     assert NARROWEST < widths[1] < WIDEST
+
+
+def propagator(parameters, mechanics, place, strength):
+    """Phi and Gamma (n, n + 3) that the plate uses for a finger, and by scipy's exponential of the same A and B."""
+    state = plate_state(0)
+    tables = plate_tables(parameters, hr.Finger.still(mechanics=mechanics, normal_load=0.4, load_scaling=True))
+    series_at(tables, state, place / parameters.half_spacing, strength, state.step, 0)
+    n, rates = (8, [3, 4, 7]) if tables.flexible else (6, [3, 4])
+    block = np.zeros((n + 3, n + 3))
+    block[:n, :n] = state.system[:n, :n].T
+    block[rates, n:] = state.push.T[: len(rates)]
+    kept = np.concatenate([state.step[0, :n], state.step[0, 8:]])
+    return kept[:, :n].T, expm(block)[:n]
+
+
+@pytest.mark.parametrize("levels", [{}, {"degrees_of_freedom": 1}, {"bending_frequency": 1200.0}, {"rate": 48000.0}])
+@pytest.mark.parametrize("mechanics", [NONE, LIGHT, HEAVY, HEAVY_SECOND], ids=["none", "light", "heavy", "2nd order"])
+def test_the_series_is_the_exponential_to_rounding(levels, mechanics):
+    """Column by column, to 8 roundings of its largest entry: 15 to 22 terms, summed from the smallest."""
+    for place in (0.0, 20e-3, -55e-3):
+        for strength in (0.0, 1.0, 3.0):
+            mine, expected = propagator(PlateParameters(**levels), mechanics, place, strength)
+            assert (abs(mine - expected).max(axis=0) <= 8 * 2**-53 * abs(expected).max(axis=0)).all()
+
+
+def stop_and_go(time):
+    """A finger (m) that slides, rests, turns and jumps."""
+    return 0.01 * np.sin(2 * np.pi * 2 * np.clip(time, 0.0, 0.1)) + np.where((0.15 < time) & (time < 0.2), 0.02, 0.0)
+
+
+def test_a_finger_that_stops_turns_and_jumps_is_as_exact_and_splits_alike(rng):
+    """Windows, series and rest in one run; the series alone differs by 2e-15 a sample."""
+    positions = tuple(stop_and_go(np.arange(1500) / 5000.0))
+    finger = hr.Finger.sampled(positions, rate=5000.0, normal_load=0.8, mechanics=HEAVY)
+    drive = rng.uniform(-2, 2, (1500, 2))
+    parameters = PlateParameters(**IDEAL)
+    summed, pieces = Plate(parameters, finger), Plate(parameters, finger)
+    whole = Plate(parameters, finger).run(drive).motion
+    summed._state.window[WIDTH] = 0.0
+    np.testing.assert_allclose(whole, summed.run(drive).motion, rtol=0, atol=1500 * 2e-15 * abs(whole).max())
+    parts = [pieces.run(part).motion for part in np.split(drive, [1, 499, 500, 501, 502, 760, 1001])]
+    np.testing.assert_array_equal(np.concatenate(parts), whole)
 
 
 def test_a_run_equals_its_pieces(rng):

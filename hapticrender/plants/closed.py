@@ -40,8 +40,8 @@ def closed_plate_run(
     """
     step = step_of(control)
     for n in range(sensed.shape[0]):
-        flags[n] = plate_sense(tables, state, noise[n], sensed[n], motion[n])
         plate_drive(tables, state, last)
+        flags[n] = plate_sense(tables, state, noise[n], sensed[n], motion[n])
         plate_advance(tables, state, finger[n, 0], finger[n, 1], finger[n, 2])
         drive[n, 0], drive[n, 1] = last[0], last[1]
         flags[n] |= step(control, control_state, sensed[n], finger[n, 0], wanted[n], last, target[n])

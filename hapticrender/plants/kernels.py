@@ -11,28 +11,33 @@ at zero and never reads them.
 
 from __future__ import annotations
 
-import math
 from typing import NamedTuple
 
 from hapticrender._jit import kernel
-from hapticrender._lanes import size
+from hapticrender._lanes import floor, high, low, read, select, size, write
 from hapticrender.plants.propagator import (
     GRIP,
     LEAST_STAY,
+    LEVER,
     MIDDLE,
+    NARROWER,
     NARROWEST,
     NODES,
     PLACES,
-    TRIAL,
+    STRENGTH,
     WIDTH,
-    agree,
+    exact,
     interpolate,
+    kept,
+    polynomial,
     propagate,
     sum_series,
     to_powers,
 )
 from hapticrender.protocols import Array
 
+SENSOR_CLIPPED = 4  # Flag.SENSOR_CLIPPED
+HUGE = 1e300  # a drive beyond it is no number
 Three = tuple[float, float, float]
 
 
@@ -48,8 +53,7 @@ class PlateTables(NamedTuple):
     lever: float  # 1/a, 1/m: rocking per metre of position
     reach: float  # l/a: sensor distance over a
     skin: Three  # m b k of the part of the finger that moves with the plate
-    phalanx: Three  # m b k behind it
-    coupled: bool  # the phalanx moves (4th order)
+    phalanx: Three  # 1/m (0: it does not move) b k behind it
     flexible: bool  # the glass bends
     flexure: tuple[float, float]  # stiffness and damping of the bending mode, N/m, N s/m
     coil_shape: float  # of the bending mode at the coils, 1 at the sensors
@@ -65,185 +69,236 @@ class PlateTables(NamedTuple):
 
 
 class PlateState(NamedTuple):
-    """State of the plate; changed in place."""
+    """State of the plate; changed in place.  Matrices are kept column by column."""
 
-    z: Array  # (1, 1, 8) displacements (m) and rates, times the period (m)
+    z: Array  # (1, 8) displacements (m) and rates, times the period (m)
     step: Array  # (1, COLUMNS, 8) what a sample does to z: columns of Phi and Gamma
     frozen: Array  # (2,) lever and strength for which `step` holds
+    seen: Array  # (2,) lever and strength of the last sample
     powers: Array  # (NODES, COLUMNS, 8) the same as polynomials in the place, over the window
     window: Array  # (3,) where and for which grip the nodes hold
-    one: Array  # (1, 8, 8) identity
-    nodes: Array  # (NODES, COLUMNS, 8) scratch
-    trial: Array  # (1, COLUMNS, 8) scratch
+    nodes: Array  # (NODES + 1, COLUMNS, 8) scratch: the propagator at the nodes, and at a place between them
+    one: Array  # (8, 8) identity
     system: Array  # (8, 8) A
-    push: Array  # (3, 3) inverse mass in heave, rocking and bending, times the period squared, s2/kg
+    square: Array  # (8, 8) scratch: A^2
+    cube: Array  # (8, 8) scratch: A^3
+    series: Array  # (8, 8) scratch: the sum so far
+    push: Array  # (3, 3) B: what common and opposed currents and the weight do to the rates of heave, rocking, bending
     pending: Array  # (latency, 2) drive on its way
     cursor: Array  # (1,) integer: oldest row of `pending`
-    current: Array  # (2,) scratch
+    current: Array  # (2,) A: on the coils
 
 
 @kernel
 def quantise(value, step, limit):
     """Nearest step inside the limit; a step of 0 leaves the resolution ideal."""
-    value = min(max(value, -limit), limit)
-    return value if step == 0.0 else step * math.floor(value * (1.0 / step) + 0.5)
+    value = low(high(value, -limit), limit)
+    return select(step > 0.0, step * floor(value * (1.0 / step) + 0.5), value)
 
 
 @kernel
 def bent(tables, lever):
-    """Shape of the bending mode at `lever` (p/a): 1 at the sensors, 0 where the glass is rigid."""
+    """Shape of the bending mode at `lever` (p/a): 1 at the sensors, 0 where the glass is rigid.
+
+    g cosh x + w cos x = (g + w) (1 + x^4/4! + x^8/8! ...) + (g - w) (x^2/2! + x^6/6! ...), to rounding on the glass.
+    """
     if not tables.flexible:
-        return 0.0
-    angle = tables.shape[0] * lever
-    return tables.shape[1] * math.cosh(angle) + tables.shape[2] * math.cos(angle)
+        return 0.0 * lever
+    x = tables.shape[0] * lever
+    x2 = x * x
+    x4 = x2 * x2
+    whole = part = 1.0 + 0.0 * x
+    for n in range(24, 0, -4):
+        whole = 1.0 + x4 * whole * (1.0 / (n * (n - 1) * (n - 2) * (n - 3)))
+        part = 1.0 + x4 * part * (1.0 / ((n + 2) * (n + 1) * n * (n - 1)))
+    return (tables.shape[1] + tables.shape[2]) * whole + (tables.shape[1] - tables.shape[2]) * (0.5 * x2) * part
 
 
 @kernel
-def surface_row(tables, i, row, at, hold, drag, system, push):
-    """Row of A for the rate of heave (0), rocking (1) or bending (2) of the glass."""
-    period, k, c = tables.period, tables.stiffness, tables.damping
-    heave, rock, bend = push[i, 0], push[i, 1], push[i, 2]
-    contact = heave + rock * at[1] + bend * at[2]
-    system[row, 0] = -(heave * k[0] + rock * k[1] + contact * hold)
-    system[row, 1] = -(heave * k[1] + rock * k[2] + contact * hold * at[1])
-    system[row, 3] = -(heave * c[0] + rock * c[1] + contact * drag) / period
-    system[row, 4] = -(heave * c[1] + rock * c[2] + contact * drag * at[1]) / period
-    system[row, 2] = contact * hold if tables.coupled else 0.0
-    system[row, 5] = contact * drag / period if tables.coupled else 0.0
+def surface_row(tables, row, own, contact, at, hold, drag, system):
+    """Row of A for a rate of the glass, of which forces make `own` (3,), and one at the contact `contact`."""
+    rate, k, c = 1.0 / tables.period, tables.stiffness, tables.damping
+    lever, bend = at
+    hold, drag = contact * hold, contact * drag
+    write(-(own[0] * k[0] + own[1] * k[1] + hold), system, 0, row)
+    write(-(own[0] * k[1] + own[1] * k[2] + hold * lever), system, 1, row)
+    write(hold, system, 2, row)
+    write(-rate * (own[0] * c[0] + own[1] * c[1] + drag), system, 3, row)
+    write(-rate * (own[0] * c[1] + own[1] * c[2] + drag * lever), system, 4, row)
+    write(rate * drag, system, 5, row)
     if tables.flexible:
-        system[row, 6] = -(bend * tables.flexure[0] + contact * hold * at[2])
-        system[row, 7] = -(bend * tables.flexure[1] + contact * drag * at[2]) / period
+        write(-(own[2] * tables.flexure[0] + hold * bend), system, 6, row)
+        write(-rate * (own[2] * tables.flexure[1] + drag * bend), system, 7, row)
+
+
+@kernel
+def phalanx_row(tables, strength, at, system):
+    """Row of A for the rate of the phalanx; a finger that is lifted leaves it alone."""
+    rate, skin, phalanx = 1.0 / tables.period, tables.skin, tables.phalanx
+    lever, bend = at
+    share = select(strength > 0.0, tables.period * tables.period * phalanx[0], 0.0)
+    hold, drag = share * skin[2], rate * share * skin[1]
+    write(hold, system, 0, 5)
+    write(hold * lever, system, 1, 5)
+    write(-(hold + share * phalanx[2]), system, 2, 5)
+    write(drag, system, 3, 5)
+    write(drag * lever, system, 4, 5)
+    write(-(drag + rate * share * phalanx[1]), system, 5, 5)
+    if tables.flexible:
+        write(hold * bend, system, 6, 5)
+        write(drag * bend, system, 7, 5)
+
+
+@kernel
+def push_row(tables, row, own, contact, push):
+    """Row of B: what common and opposed currents and the weight do to a rate of the glass."""
+    write(tables.force_constant * (own[0] + tables.coil_shape * own[2]), push, 0, row)
+    write(tables.force_constant * own[1], push, 1, row)
+    write(-contact, push, 2, row)
 
 
 @kernel
 def plate_system(tables, lever, strength, system, push):
-    """Fill A and the inverse mass for a finger at `lever` (p/a) of `strength` times its nominal impedance."""
-    period, skin, phalanx, inverse = tables.period, tables.skin, tables.phalanx, tables.inverse_mass
-    at = (1.0, lever, bent(tables, lever))  # how heave, rocking and bending move the contact
-    give = inverse[0] + lever * lever * inverse[1] + at[2] * at[2] * inverse[2]
-    shared = strength * skin[0] / (1.0 + strength * skin[0] * give)
-    scale = period * period  # inverse of M + m_skin h h^T, h = `at`: Sherman-Morrison
-    push[0, 0] = scale * (inverse[0] - shared * inverse[0] * inverse[0])
-    push[0, 1] = push[1, 0] = -scale * shared * inverse[0] * inverse[1] * lever
-    push[1, 1] = scale * (inverse[1] - shared * inverse[1] * inverse[1] * lever * lever)
-    hold, drag = strength * skin[2], strength * skin[1]
+    """Fill A and B for a finger at `lever` (p/a) of `strength` times its nominal impedance; its shifts stay.
+
+    Inverse mass by Sherman and Morrison: with h = [1, lever, bend] and w = h/M, (M + m h h^T)^-1 = 1/M - m c w^T and
+    c = w/(1 + m h w) is what it makes of h, a force at the contact.  Times the period squared.
+    """
+    bend = bent(tables, lever)
+    at = (lever, bend)
+    scale, skin, inverse = tables.period * tables.period, tables.skin, tables.inverse_mass
+    w0, w1, w2 = inverse[0], inverse[1] * lever, inverse[2] * bend
+    mass, drag, hold = strength * skin[0], strength * skin[1], strength * skin[2]
+    shared = scale / (1.0 + mass * (w0 + w1 * lever + w2 * bend))
+    c0, c1, c2 = shared * w0, shared * w1, shared * w2
+    heave = (scale * inverse[0] - mass * c0 * w0, -mass * c0 * w1, -mass * c0 * w2)
+    rock = (heave[1], scale * inverse[1] - mass * c1 * w1, -mass * c1 * w2)
+    surface_row(tables, 3, heave, c0, at, hold, drag, system)
+    surface_row(tables, 4, rock, c1, at, hold, drag, system)
+    phalanx_row(tables, strength, at, system)
+    push_row(tables, 0, heave, c0, push)
+    push_row(tables, 1, rock, c1, push)
     if tables.flexible:
-        push[0, 2] = push[2, 0] = -scale * shared * inverse[0] * inverse[2] * at[2]
-        push[1, 2] = push[2, 1] = -scale * shared * inverse[1] * inverse[2] * lever * at[2]
-        push[2, 2] = scale * (inverse[2] - shared * inverse[2] * inverse[2] * at[2] * at[2])
-        system[6, 7] = 1.0
-        surface_row(tables, 2, 7, at, hold, drag, system, push)
-    for i in range(2):
-        system[i, i + 3] = 1.0
-        surface_row(tables, i, i + 3, at, hold, drag, system, push)
-    free = tables.coupled and strength > 0.0
-    system[2, 5] = 1.0 if free else 0.0
-    share = scale / phalanx[0] if free else 0.0
-    system[5, 0] = share * skin[2]
-    system[5, 1] = share * skin[2] * lever
-    system[5, 2] = -share * (skin[2] + phalanx[2])
-    system[5, 3] = share * skin[1] / period
-    system[5, 4] = share * skin[1] * lever / period
-    system[5, 5] = -share * (skin[1] + phalanx[1]) / period
-    system[5, 6] = share * skin[2] * at[2]
-    system[5, 7] = share * skin[1] * at[2] / period
+        bending = (heave[2], rock[2], scale * inverse[2] - mass * c2 * w2)
+        surface_row(tables, 7, bending, c2, at, hold, drag, system)
+        push_row(tables, 2, bending, c2, push)
 
 
 @kernel
 def series_at(tables, state, lever, strength, out, at):
     """Exact propagator for a finger at `lever` with `strength`, into row block `at` of `out`."""
     plate_system(tables, lever, strength, state.system, state.push)
-    sum_series(tables.terms, tables.flexible, state.system, state.push, state.one, out, at)
+    sum_series(tables.terms, tables.flexible, state, out, at)
 
 
 @kernel
 def open_window(tables, state, lever, strength):
-    """Lay nodes ahead of the finger, where it slides to; a window whose polynomial is not exact is halved, thrice."""
-    window, ahead = state.window, 1.0 if lever > state.frozen[0] else -1.0
+    """Lay nodes ahead of the finger, where it slides to; where its polynomial is not exact, a narrower one."""
+    window, ahead = state.window, 1.0 if lever > state.seen[LEVER] else -1.0
     window[GRIP] = strength
     while window[WIDTH] > NARROWEST:
         width = window[WIDTH]
         window[MIDDLE] = lever + 0.9 * ahead * width
-        for m in range(NODES):
+        for m in range(NODES + 1):
             series_at(tables, state, window[MIDDLE] + width * PLACES[m], strength, state.nodes, m)
-        to_powers(state.nodes, state.powers)
-        series_at(tables, state, window[MIDDLE] + width * TRIAL, strength, state.trial, 0)
-        interpolate(tables.flexible, state.powers, TRIAL, state.step)
-        if agree(state.step, state.trial):
+        to_powers(tables.flexible, state.nodes, state.powers)
+        if exact(tables.flexible, state.powers, state.nodes):
             return
-        window[WIDTH] *= 0.5
+        window[WIDTH] *= NARROWER
     window[GRIP] = -1.0
 
 
 @kernel
+def inside(window, lever, strength):
+    """Whether a finger is inside the window."""
+    return strength == window[GRIP] and size(lever - window[MIDDLE]) <= window[WIDTH]
+
+
+@kernel
+def slides(tables, state, lever, strength):
+    """Whether the finger slides inside a window; one is opened for it where that pays."""
+    window, moved = state.window, size(lever - state.seen[LEVER])
+    if moved == 0.0 or strength != state.seen[STRENGTH]:
+        return False
+    if moved * LEAST_STAY < window[WIDTH] and not inside(window, lever, strength):
+        open_window(tables, state, lever, strength)
+    return inside(window, lever, strength)
+
+
+@kernel
 def renew(tables, state, lever, strength):
-    """Propagator for a finger that has moved or changed its grip."""
-    frozen, window = state.frozen, state.window
-    if strength == frozen[1] and size(lever - frozen[0]) * LEAST_STAY < window[WIDTH]:
-        if strength != window[GRIP] or size(lever - window[MIDDLE]) > window[WIDTH]:
-            open_window(tables, state, lever, strength)
-    if strength == window[GRIP] and size(lever - window[MIDDLE]) <= window[WIDTH]:
+    """Propagator of a finger that rests, or comes or grips anew."""
+    window, frozen = state.window, state.frozen
+    if inside(window, lever, strength):
         interpolate(tables.flexible, state.powers, (lever - window[MIDDLE]) / window[WIDTH], state.step)
     else:
         series_at(tables, state, lever, strength, state.step, 0)
-    frozen[0], frozen[1] = lever, strength
+    frozen[LEVER], frozen[STRENGTH] = lever, strength
 
 
 @kernel
 def plate_advance(tables, state, position, load, strength):
     """One sample of motion under the current (A), exact for the frozen plate."""
-    z, current = state.z, state.current
+    z, current, frozen, seen, window = state.z, state.current, state.frozen, state.seen, state.window
     touching = strength > 0.0
     lever = position * tables.lever if touching else 0.0
     weight = load if touching else 0.0
     if not touching:
-        strength = z[0, 0, 2] = z[0, 0, 5] = 0.0
-    if lever != state.frozen[0] or strength != state.frozen[1]:
+        strength = z[0, 2] = z[0, 5] = 0.0
+    common, opposed = current[0] + current[1], current[1] - current[0]
+    if lever == frozen[LEVER] and strength == frozen[STRENGTH]:
+        propagate(kept, tables.flexible, state.step, 0.0, z, common, opposed, weight)
+    elif slides(tables, state, lever, strength):
+        x = (lever - window[MIDDLE]) / window[WIDTH]
+        propagate(polynomial, tables.flexible, state.powers, x, z, common, opposed, weight)
+    else:
         renew(tables, state, lever, strength)
-    common = tables.force_constant * (current[0] + current[1])
-    force1 = tables.force_constant * (current[1] - current[0]) - weight * lever
-    force2 = 0.0
-    if tables.flexible:
-        force2 = tables.coil_shape * common - weight * bent(tables, lever)
-    propagate(tables.flexible, state.step, z, common - weight, force1, force2)
+        propagate(kept, tables.flexible, state.step, 0.0, z, common, opposed, weight)
+    seen[LEVER], seen[STRENGTH] = lever, strength
+
+
+@kernel
+def sense(tables, state, noise, sensed, motion):
+    """Hall sensors at the glass ends and the true motion at centre, end 1, end 2; returns flags as a float."""
+    z = state.z
+    heave, tilt, bend = read(z, 0, 0), tables.reach * read(z, 0, 1), read(z, 0, 6)
+    write(heave + tables.centre_shape * bend, motion, 0)
+    clipped = 0.0 * heave
+    for i in range(2):
+        end = heave - tilt + bend if i == 0 else heave + tilt + bend
+        write(end, motion, 1 + i)
+        value = end * tables.sensor_gain[i] + tables.sensor_noise * read(noise, i)
+        clipped = select(size(value) > tables.sensor_limit, 1.0 * SENSOR_CLIPPED, clipped)
+        write(quantise(value, tables.sensor_step, tables.sensor_limit), sensed, i)
+    return clipped
 
 
 @kernel
 def plate_sense(tables, state, noise, sensed, motion):
-    """Hall sensors at the glass ends and the true motion at centre, end 1, end 2; returns flags."""
-    flags, z = 0, state.z[0, 0]
-    for i in range(2):
-        side = -tables.reach if i == 0 else tables.reach
-        motion[1 + i] = z[0] + side * z[1] + z[6]
-        value = motion[1 + i] * tables.sensor_gain[i] + tables.sensor_noise * noise[i]
-        if abs(value) > tables.sensor_limit:
-            flags |= 4
-        sensed[i] = quantise(value, tables.sensor_step, tables.sensor_limit)
-    motion[0] = z[0] + tables.centre_shape * z[6]
-    return flags
+    """`sense` of a single plate; returns flags."""
+    return int(sense(tables, state, noise, sensed, motion))
 
 
 @kernel
 def plate_drive(tables, state, drive):
     """Queue a drive sample and put the one now due on the coils, quantised and limited."""
-    pending, cursor, current = state.pending, state.cursor, state.current
-    latency = pending.shape[0]
-    row = cursor[0]
+    pending, cursor = state.pending, state.cursor
+    latency, row = pending.shape[0], cursor[0]
     for i in range(2):
-        due = drive[i]
+        due = read(drive, i)
         if latency > 0:
-            due = pending[row, i]
-            pending[row, i] = drive[i]
-        asked = quantise(due, tables.current_step, tables.current_limit) if math.isfinite(due) else 0.0
-        current[i] = tables.amplifier * asked
+            due, newest = read(pending, row, i), due
+            write(newest, pending, row, i)
+        asked = quantise(due, tables.current_step, tables.current_limit)
+        write(tables.amplifier * select(size(due) < HUGE, asked, 0.0), state.current, i)
     if latency > 0:
-        cursor[0] = (row + 1) % latency
+        cursor[0] = row + 1 if row + 1 < latency else 0
 
 
 @kernel
 def plate_run(tables, state, drive, finger, noise, sensed, motion, flags):
     """A block of the plate alone; `finger` rows are position, load, strength."""
     for n in range(drive.shape[0]):
-        flags[n] = plate_sense(tables, state, noise[n], sensed[n], motion[n])
         plate_drive(tables, state, drive[n])
+        flags[n] = plate_sense(tables, state, noise[n], sensed[n], motion[n])
         plate_advance(tables, state, finger[n, 0], finger[n, 1], finger[n, 2])

@@ -22,6 +22,7 @@ couples the mode to heave and rocking.
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
@@ -34,14 +35,15 @@ from hapticrender.control.bandmodel import BandModel
 from hapticrender.control.damping_margins import BendingMode
 from hapticrender.plants.closed import CLOSED
 from hapticrender.plants.kernels import PlateState, PlateTables, plate_run, plate_system
-from hapticrender.plants.propagator import COLUMNS, NODES, STATES, WIDEST, identity
+from hapticrender.plants.propagator import COLUMNS, NODES, STATES, WIDEST, identity, shifts
 from hapticrender.protocols import Array, Controller, Sensed
 
 if TYPE_CHECKING:
-    from hapticrender.touch.finger import Finger, FingerMechanics
+    from hapticrender.touch.finger import Finger
 
 PLACES = ("centre", "end 1", "end 2")
 NOMINAL_AMPLIFIER = (1 - 2e3 / 1.0) / 10e3  # A/V: the gain that a drive in A is turned into volts with
+MOST_LOAD = 20.0  # N: hardest that a finger presses
 TAYLOR_ROUNDING = 1e-17  # the first term left out of the series, relative to the state
 EXPECTED_BENDING = BendingMode(  # FACTS section 3 A: 1.1-1.4 kHz, either sign [E]; for a plate that was not measured
     frequency=1250.0, damping=0.01, coupling=(0.1 / 9.5e-3, 0.0), spread=150.0, measured=False
@@ -354,22 +356,8 @@ class Plate:
         self.drive_channels = self.sensed_channels = 2
         self._rng = np.random.default_rng(seed)
         self._samples = 0
-        self._tables = _tables(parameters, finger.mechanics)
-        self._state = PlateState(
-            z=aligned((1, 1, STATES)),
-            step=aligned((1, COLUMNS, STATES)),
-            frozen=np.full(2, np.nan),
-            powers=aligned((NODES, COLUMNS, STATES)),
-            window=np.array([0.0, WIDEST, -1.0]),
-            one=identity(),
-            nodes=aligned((NODES, COLUMNS, STATES)),
-            trial=aligned((1, COLUMNS, STATES)),
-            system=np.zeros((8, 8)),
-            push=np.zeros((3, 3)),
-            pending=np.zeros((parameters.delay - block, 2)),
-            cursor=np.zeros(1, np.int64),
-            current=np.zeros(2),
-        )
+        self._tables = plate_tables(parameters, finger)
+        self._state = plate_state(parameters.delay - block)
         self._last = np.zeros(2)
 
     def _next(self, n: int) -> tuple[Array, Array, Array]:
@@ -419,8 +407,31 @@ class Plate:
         return drive, target, flags, Sensed(sensed, finger[:, 0], motion, finger[:, 1], flags)
 
 
-def _tables(parameters: PlateParameters, mechanics: FingerMechanics) -> PlateTables:
-    """Numbers of the compiled plate."""
+def plate_state(latency: int) -> PlateState:
+    """A plate at rest whose drive takes `latency` samples to act."""
+    return PlateState(
+        z=aligned((1, STATES)),
+        step=aligned((1, COLUMNS, STATES)),
+        frozen=np.full(2, np.nan),
+        seen=np.full(2, np.nan),
+        powers=aligned((NODES, COLUMNS, STATES)),
+        window=np.array([0.0, WIDEST, -1.0]),
+        nodes=aligned((NODES + 1, COLUMNS, STATES)),
+        one=identity(),
+        system=shifts(),
+        square=aligned((STATES, STATES)),
+        cube=aligned((STATES, STATES)),
+        series=aligned((STATES, STATES)),
+        push=np.zeros((3, 3)),
+        pending=np.zeros((latency, 2)),
+        cursor=np.zeros(1, np.int64),
+        current=np.zeros(2),
+    )
+
+
+def plate_tables(parameters: PlateParameters, finger: Finger) -> PlateTables:
+    """Numbers of the compiled plate with this finger on it."""
+    mechanics = finger.mechanics
     order = mechanics.order if parameters.finger_dynamics else 0
     rocking = parameters.degrees_of_freedom == 2
     flexible = parameters.bending_frequency > 0.0
@@ -444,8 +455,9 @@ def _tables(parameters: PlateParameters, mechanics: FingerMechanics) -> PlateTab
         lever=1.0 / parameters.half_spacing,
         reach=parameters.glass_length / parameters.coil_spacing,
         skin=(mechanics.mass, mechanics.damping, mechanics.stiffness) if order else (0.0, 0.0, 0.0),
-        phalanx=(mechanics.phalanx_mass, mechanics.phalanx_damping, mechanics.phalanx_stiffness),
-        coupled=order == 4,
+        phalanx=(1.0 / mechanics.phalanx_mass, mechanics.phalanx_damping, mechanics.phalanx_stiffness)
+        if order == 4
+        else (0.0, 0.0, 0.0),
         flexible=flexible,
         flexure=(omega**2 * parameters.bending_mass, 2 * parameters.bending_damping * omega * parameters.bending_mass),
         coil_shape=parameters.bending_coil,
@@ -459,7 +471,8 @@ def _tables(parameters: PlateParameters, mechanics: FingerMechanics) -> PlateTab
         sensor_noise=parameters.sensor_noise,
         sensor_gain=(float(parameters.sensor_gain_1), float(parameters.sensor_gain_2)),
     )
-    return tables._replace(terms=_taylor_terms(tables))
+    strongest = float(mechanics.load_factor(np.array(MOST_LOAD))) if finger.load_scaling else 1.0
+    return tables._replace(terms=_taylor_terms(tables, strongest))
 
 
 def _upper(matrix: Array) -> tuple[float, float, float]:
@@ -467,12 +480,14 @@ def _upper(matrix: Array) -> tuple[float, float, float]:
     return float(matrix[0, 0]), float(matrix[0, 1]), float(matrix[1, 1])
 
 
-def _taylor_terms(tables: PlateTables) -> int:
-    """Terms after which the exponential series has converged to rounding, at the glass end and pressed hard."""
-    system = np.zeros((8, 8))
-    plate_system(tables, tables.reach, 3.0, system, np.zeros((3, 3)))
-    term, n = system, 1
-    while abs(term).max() > TAYLOR_ROUNDING:
-        n += 1
-        term = system @ term / n
-    return n
+def _taylor_terms(tables: PlateTables, strongest: float) -> int:
+    """Terms after which the exponential series has converged to rounding, wherever and however hard it is pressed."""
+    system, most = shifts(), 2
+    for lever, strength in itertools.product((0.0, tables.reach), (0.0, 1.0, strongest)):
+        plate_system(tables, lever, strength, system, np.zeros((3, 3)))
+        term, n = system, 1
+        while abs(term).max() > TAYLOR_ROUNDING:
+            n += 1
+            term = system @ term / n
+        most = max(most, n)
+    return most
