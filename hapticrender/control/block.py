@@ -86,7 +86,8 @@ class BlockController:
         flags = np.zeros(n, np.int64)
         arrays = [np.ascontiguousarray(each, float) for each in (sensed, position, wanted)]
         block_run(self.tables, self.state, *arrays, drive, target, flags)
-        return drive, np.repeat(target, self.block, axis=0), flags
+        held = np.broadcast_to(target[:, None], (len(target), self.block, self.n_bands))  # copied only where it must be
+        return drive, held.reshape(n, self.n_bands), flags
 
 
 def numbers_of_blocks(numbers: BankNumbers, block: int) -> BankNumbers:

@@ -1,0 +1,175 @@
+"""Every figure that the library claims about its speed, beside its reference and its target."""
+
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+
+import native
+import numpy as np
+import scenes
+import startup
+from native import NaivePolar, NoCompiler, TunedPolar
+from numpy_loop import NumpyPlate, NumpyPolar
+from numpy_loop import run as numpy_run
+from pairing import interleave
+
+from hapticrender.control.block_kernels import block_run
+from hapticrender.control.polar_kernels import polar_run
+
+FEW = 400  # samples of the numpy loop
+DTYPES = {"double": np.float64, "single": np.float32}
+
+
+@dataclass(frozen=True)
+class Figure:
+    """One line of the table.
+
+    `target` is the bound, `at_least` its direction; a ratio is judged in CI with a margin, anything else only shown.
+    """
+
+    name: str
+    measured: float
+    unit: str
+    target: float
+    at_least: bool
+    reference: str
+    note: str = ""
+
+    @property
+    def met(self) -> bool:
+        return self.measured >= self.target if self.at_least else self.measured <= self.target
+
+    def within(self, margin: float) -> bool:
+        """Whether a ratio stays within `margin` times its target."""
+        if self.unit != "x":
+            return True
+        bound = self.target / margin if self.at_least else self.target * margin
+        return self.measured >= bound if self.at_least else self.measured <= bound
+
+
+def polar_against_c(bands: int, precision: str, pairs: int) -> Iterator[Figure]:
+    """The paper's controller in blocks of 64 against C, tuned by hand and naive; outputs are compared first."""
+    controller = scenes.polar(bands, precision)
+    samples = 64 * max(4, 4000 // bands)
+    sensed, nothing = 1e-6 * np.random.default_rng(0).standard_normal((samples, 2)), np.zeros(samples)
+    sides = np.ascontiguousarray(sensed @ controller.tables.listen.T)
+    drive, target, flags = np.zeros((samples, 2)), np.zeros((samples, bands), complex), np.zeros(samples, np.int64)
+
+    def ours():
+        polar_run(controller.tables, controller.state, sensed, nothing, nothing, drive, target, flags)
+
+    tuned, naive = TunedPolar(controller, DTYPES[precision]), NaivePolar(controller)
+    ours()
+    expected = naive.run(sides)
+    bound = {"double": 1e-9, "single": 1e-3}[precision] * abs(expected).max()
+    for found in (drive, tuned.run(sides)):
+        if not abs(found - expected).max() <= bound:
+            raise RuntimeError(f"polar, {bands} bands, {precision}: outputs differ by {abs(found - expected).max()}")
+    for reference, goal, at_least, who in (
+        (tuned, 1.15, False, "C tuned by hand (native/polar.c)"),
+        (naive, {"double": 30.0, "single": 90.0}[precision], True, "naive C, double (native/naive.c)"),
+    ):
+        paired = interleave(ours, lambda reference=reference: reference.run(sides), pairs)
+        each = paired.candidate / samples / bands / 2 * 1e9
+        ratio = paired.ratio if at_least else 1 / paired.ratio
+        name = f"polar, {bands} bands, {precision}: {'times faster than' if at_least else 'time over that of'}"
+        yield Figure(name, ratio, "x", goal, at_least, who, f"{each:.2f} ns a band-sample and channel")
+
+
+def share_of_a_core(bands: int, precision: str, pairs: int) -> Iterator[Figure]:
+    """The default method in blocks of 64 on two channels at 48 kHz."""
+    controller = scenes.in_blocks(bands, precision)
+    samples = scenes.BLOCK * 20
+    sensed, nothing = 1e-9 * np.random.default_rng(0).standard_normal((samples, 2)), np.zeros(samples)
+    drive, target, flags = np.zeros((samples, 2)), np.zeros((20, bands), complex), np.zeros(samples, np.int64)
+
+    def ours():
+        block_run(controller.tables, controller.state, sensed, nothing, nothing, drive, target, flags)
+
+    paired = interleave(ours, lambda: None, pairs)
+    share = 100 * paired.candidate / (samples / scenes.CARD)
+    each = paired.candidate / samples / bands / 2 * 1e9
+    goal = {"double": 2.0, "single": 1.0}[precision]
+    name = f"default method, blocks of 64, {bands} bands x 2 at 48 kHz, {precision}"
+    yield Figure(name, share, "% of a core", goal, False, "on AVX-512", f"{each:.2f} ns a band-sample and channel")
+
+
+def simulation(method: str, goal: float, seconds: float, pairs: int) -> Iterator[Figure]:
+    """Plate with a heavy finger sliding on it, 8 bands, adaptation on, against the numpy loop of the paper's method."""
+    for what, parameters in (
+        ("ideal sensors", replace(scenes.PLATE, sensor_noise=0.0)),
+        ("sensor noise drawn", scenes.PLATE),
+    ):
+        samples = int(seconds * parameters.rate)
+        ours = scenes.closed_loop(method, 8, samples, parameters=parameters)
+        loop, plate = NumpyPolar(scenes.polar(8).tables), NumpyPlate(parameters)
+        noise = np.zeros((FEW, 2))
+        paired = interleave(ours, lambda loop=loop, plate=plate, noise=noise: numpy_run(loop, plate, FEW, noise), pairs)
+        rate = seconds / paired.candidate
+        ratio = rate / (FEW / parameters.rate / paired.reference)
+        name = f"closed loop, 8 bands, {method}, sliding finger, {what}"
+        yield Figure(name, rate, "s/s", goal, True, "simulated seconds a second", f"{ratio:.0f}x the numpy loop")
+
+
+def linear_in_bands(pairs: int) -> Iterator[Figure]:
+    """Cost a band of the default method in blocks, 4096 bands against 64."""
+    runs = []
+    for bands in (4096, 64):
+        controller = scenes.in_blocks(bands)
+        blocks = max(2, 4096 * 4 // bands)
+        samples = scenes.BLOCK * blocks
+        arrays = np.zeros((samples, 2)), np.zeros(samples), np.zeros(samples), np.zeros((samples, 2))
+        arrays += np.zeros((blocks, bands), complex), np.zeros(samples, np.int64)
+        runs.append((lambda c=controller, a=arrays: block_run(c.tables, c.state, *a), samples * bands))
+    paired = interleave(runs[0][0], runs[1][0], pairs)
+    ratio = paired.candidate / runs[0][1] / (paired.reference / runs[1][1])
+    yield Figure("cost a band, 4096 bands over 64", ratio, "x", 1.2, False, "itself")
+
+
+def hours_of_play(hours: float) -> Iterator[Figure]:
+    """Phase of 8 bands after so many hours at 48 kHz in blocks, against whole-number arithmetic."""
+    controller = scenes.in_blocks(8)
+    block = scenes.BLOCK * 1000
+    count = int(hours * 3600 * scenes.CARD) // block
+    nothing, still = np.zeros(block), np.zeros((block, 2))
+    start = time.perf_counter()
+    for _ in range(count):
+        controller.run(still, nothing, nothing)
+    spent = time.perf_counter() - start
+    samples, frequency = count * block, controller.tables.bank.tone[0]
+    exact = np.array([float(_turns(f, samples)) for f in frequency])
+    off = 2 * np.pi * (np.mod(controller.turns - exact + 0.5, 1.0) - 0.5)
+    note = f"{hours * 3600 / spent:.0f} s of play a second"
+    name = f"phase after {hours:g} h of play, 8 bands"
+    yield Figure(name, float(abs(off).max()), "rad", 1e-5, False, "whole-number arithmetic", note)
+
+
+def _turns(frequency: float, samples: int):
+    from fractions import Fraction
+
+    return Fraction(float(frequency)) * samples / Fraction(scenes.CARD) % 1
+
+
+def start_up(pairs: int) -> Iterator[Figure]:
+    """Fresh processes: import, first sample warm and cold."""
+    for name, spent, goal in startup.measure(pairs):
+        yield Figure(name, spent, "s", goal, False, "fresh process")
+
+
+def every_case(short: bool) -> Iterator[tuple[str, Callable[[], Iterator[Figure]]]]:
+    """All cases by name; short ones for CI."""
+    pairs = 3 if short else 9
+    for bands in (64,) if short else (64, 512):
+        for precision in DTYPES:
+            yield f"polar {bands} {precision}", lambda b=bands, p=precision: polar_against_c(b, p, pairs)
+    for precision in DTYPES:
+        yield f"blocks {precision}", lambda p=precision: share_of_a_core(512, p, pairs)
+    for method, goal in (("h2", 1500.0), ("paper", 2500.0)):
+        seconds = 1.0 if short else 10.0
+        yield f"simulation {method}", lambda m=method, g=goal, s=seconds: simulation(m, g, s, pairs)
+    yield "linear", lambda: linear_in_bands(pairs)
+    yield "hours", lambda: hours_of_play(0.01 if short else 10.0)
+    yield "startup", lambda: start_up(1 if short else 5)
+
+
+__all__ = ["Figure", "NoCompiler", "every_case", "native"]

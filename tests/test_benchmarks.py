@@ -1,0 +1,62 @@
+"""The benchmarks' own parts: C references agree with the library, pairing counts right, verdicts go the right way."""
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+FOLDER = Path(__file__).resolve().parent.parent / "benchmarks"
+
+
+@pytest.fixture
+def benchmarks(monkeypatch):
+    """Import path of the benchmarks, and a clean table of modules after them."""
+    monkeypatch.syspath_prepend(str(FOLDER))
+    before = set(sys.modules)
+    yield
+    for name in set(sys.modules) - before:
+        if str(FOLDER) in str(getattr(sys.modules[name], "__file__", "")):
+            del sys.modules[name]
+
+
+@pytest.mark.parametrize(("precision", "bound"), [("double", 1e-9), ("single", 1e-4)])
+def test_the_c_references_are_the_same_controller(benchmarks, precision, bound, rng):
+    """Drive of 20 bands over 1000 samples of noise: library, C tuned by hand, and naive C."""
+    import native
+    import scenes
+
+    try:
+        native.compiler()
+    except native.NoCompiler as missing:
+        pytest.skip(str(missing))
+    controller = scenes.polar(20, precision)
+    sensed, nothing = 1e-6 * rng.standard_normal((1000, 2)), np.zeros(1000)
+    sides = np.ascontiguousarray(sensed @ controller.tables.listen.T)
+    tuned = native.TunedPolar(controller, {"double": np.float64, "single": np.float32}[precision])
+    expected = native.NaivePolar(controller).run(sides)
+    assert abs(expected).max() > 0
+    for found in (controller.run(sensed, nothing, nothing)[0], tuned.run(sides)):
+        np.testing.assert_allclose(found, expected, rtol=0, atol=bound * abs(expected).max())
+
+
+def test_pairs_are_taken_in_turns(benchmarks):
+    from pairing import interleave
+
+    order = []
+    found = interleave(lambda: order.append("a"), lambda: order.append("b"), 3)
+    assert order == ["a", "b"] * 4
+    assert found.candidate > 0
+    assert found.ratio > 0
+
+
+@pytest.mark.parametrize(
+    ("measured", "at_least", "met", "within"),
+    [(1.1, False, True, True), (1.5, False, False, True), (3.1, False, False, False), (0.2, True, False, False)],
+)
+def test_verdicts(benchmarks, measured, at_least, met, within):
+    from cases import Figure
+
+    figure = Figure("each", measured, "x", 1.2 if not at_least else 1.0, at_least, "other")
+    assert figure.met == met
+    assert figure.within(2.0) == within
