@@ -10,7 +10,16 @@ from hapticrender._lanes import WIDTH, aligned, padded
 from hapticrender.control import bank_rows as row
 from hapticrender.control.bank import BankController, settled_share
 from hapticrender.control.bank_state import PRECISIONS, BankNumbers, BankTables, bank_state
-from hapticrender.control.block_kernels import CHANNEL_ROWS, EIGHT, TURNS, BlockState, BlockTables, block_run
+from hapticrender.control.block_kernels import (
+    CHANNEL_ROWS,
+    EIGHT,
+    PHASE_ROWS,
+    TURN_SIN,
+    TURNS,
+    BlockState,
+    BlockTables,
+    block_run,
+)
 from hapticrender.protocols import Array
 
 MOST_COORDINATES = 2
@@ -108,14 +117,14 @@ def block_state(tables: BankTables, block: int, dtype: type) -> BlockState:
     bank.pace[:] = row.GROWING
     bank.band[:, row.LIVE] = (np.arange(tiles * width) < bands).reshape(tiles, width)
     whole = -(-block // EIGHT) * EIGHT
-    phase = aligned((tiles * width // 8, 4, 8))
+    phase = aligned((tiles * width // 8, PHASE_ROWS, 8))
     turns = np.zeros(tiles * width)
     turns[:bands] = np.mod(tables.tone[2], 1.0)
     phase[:, TURNS] = turns.reshape(-1, 8)
     return BlockState(
         bank=bank,
         phase=phase,
-        table=aligned((tiles, 2 * whole, width), dtype),
+        table=aligned((tiles, max(2 * whole, TURN_SIN + 1), width), dtype),
         held=aligned((tiles, 2 * coordinates + CHANNEL_ROWS * (channels + channels % 2), width), dtype),
         response=np.zeros(whole),
         inverse=np.zeros((2, 2 * whole)),
@@ -123,7 +132,8 @@ def block_state(tables: BankTables, block: int, dtype: type) -> BlockState:
         heard=np.zeros((coordinates + 1, whole), dtype),
         raw=np.zeros((coordinates + 1, whole)),
         place=np.zeros(block),
-        sum=np.zeros((4, whole)),
+        sum=np.zeros((2, whole)),
+        lane_sum=aligned((2, whole, width), dtype),
         stale=np.ones(1, np.int64),
         gain=np.full(1, math.nan),
     )

@@ -6,9 +6,11 @@ related by a unit lower-triangular Toeplitz matrix, e = Q e_h, whatever the numb
     e[m] + sum_(j<m) r[m-j] e[j] = e_h[m],  r[d] = g_dc + (d - 1) g_drift + sum_k g_k cos(w_k d)
 
 Then every envelope is updated once, the law is taken at the block's end for the moment its drive will act, and the
-drive runs linearly from one block's envelope to the next.  Carriers are tables over a block, turned by a phasor whose
-phase is counted in double precision; the tables of carriers that follow the finger are made anew.  Everything that
-knows of finger, touch and trust is the per-sample bank's own, called once a block.
+drive runs linearly from one block's envelope to the next.  Samples are taken in groups of eight about the group's
+middle, where a carrier's cosine is even and its sine odd: what a pair of samples has in common and what it differs by
+cost half of what the samples would.  An envelope is turned from group to group, and its phase at the block's start is
+counted in double precision.  Carriers that follow the finger have tables over the whole block, made anew.  Everything
+that knows of finger, touch and trust is the per-sample bank's own, called once a block.
 """
 
 from __future__ import annotations
@@ -29,7 +31,6 @@ from hapticrender._lanes import (
     select,
     size,
     stretch,
-    total,
     totals,
 )
 from hapticrender._polynomials import unit
@@ -40,11 +41,17 @@ from hapticrender.control.bank_state import BankNumbers, BankState, BankTables
 from hapticrender.control.kernels import FAR, TURN
 from hapticrender.protocols import Array
 
-EIGHT = 8  # lanes of double precision: phases are always double
-GROUP = 4  # samples whose sums over the bands are kept in registers together
+EIGHT = 8  # samples of a group, and lanes of double precision: phases are always double
+PAIRS = 4  # of samples in a group, at +-0.5, 1.5, 2.5 and 3.5 samples about its middle
+# rows of BlockState.table where a tile's carriers stay: PAIR_ROWS a pair, then the turn from group to group
+PAIR_COS, PAIR_SIN, FAR_COS, FAR_SIN = range(4)  # at the pair's later sample; the same times its distance over M
+PAIR_ROWS = 4
+TURN_COS, TURN_SIN = PAIRS * PAIR_ROWS, PAIRS * PAIR_ROWS + 1
 NEAR_LIMIT = 0.5  # share of the drive's limit, from which on its envelope is watched and not its samples alone
-# rows of BlockState.phase: turns of the fixed part of each carrier, its cosine and sine, turns a block
-TURNS, COSINE, SINE, TURNED = range(4)
+# rows of BlockState.phase: turns of the fixed part of each carrier at the block's start, its cosine and sine where the
+# tables begin, turns a block, and turns from the block's start to there: the middle of the first group, if it stays
+TURNS, COSINE, SINE, TURNED, TO_MIDDLE = range(5)
+PHASE_ROWS = 5
 # rows of BlockState.held, CHANNEL_ROWS a channel after two for each coordinate: the drive's envelope at the end of the
 # last block and of this one, and both as this block's tables want them
 LAST_RE, LAST_IM, NOW_RE, NOW_IM, FROM_RE, FROM_IM, STEP_RE, STEP_IM = range(8)
@@ -62,27 +69,30 @@ class BlockState(NamedTuple):
     """State of the bank in blocks; changed in place.  M is the block, rounded up to a multiple of eight in scratch."""
 
     bank: BankState
-    phase: Array  # (tiles of 8, 4, 8) float64
-    table: Array  # (tiles, 2 M, W) cosine and sine of every carrier at each sample, from the block's start
+    phase: Array  # (tiles of 8, PHASE_ROWS, 8) float64
+    table: (
+        Array  # (tiles, max(2 M, TURN_SIN + 1), W): see PAIR_COS; where a tile follows, cosine and sine at each sample
+    )
     held: Array  # (tiles, 2 coordinates + CHANNEL_ROWS channels, W)
     response: Array  # (M,) r: what a residual of 1 adds to the ones after it
     inverse: Array  # (2, 2 M) first column of Q, and of its like for the wanted waveform, behind M zeros
     error: Array  # (coordinates + 1, M) scratch: residuals; the last row that of the wanted waveform
-    heard: Array  # the same in the precision of the bands
+    heard: Array  # the same in the precision of the bands, folded: sums of a group's pairs, then differences
     raw: Array  # (coordinates + 1, M) scratch: residuals as the held envelopes would leave them
     place: Array  # (M,) scratch: position of the finger
-    sum: Array  # (4, M) scratch: sums over the bands
+    sum: Array  # (2, M) scratch: sums over the bands
+    lane_sum: Array  # (2, M, W) scratch: the same a lane, and folded
     stale: Array  # (1,) integer: 1 where tables and `response` have to be found anew
     gain: Array  # (1,) gain of the observer that `inverse` holds for
 
 
 @kernel
 def count_phases(tables, state):
-    """Phasors of the carriers at the block's start; then their phases at the next."""
+    """Phasors of the carriers where their tables begin; then their phases at the next block's start."""
     bank, phase = state.bank, state.phase
     for i in range(phase.shape[0]):
         turns = lanes(phase, i, TURNS)
-        cos, sin = unit(turns)
+        cos, sin = unit(turns + lanes(phase, i, TO_MIDDLE))
         put(phase, i, COSINE, cos)
         put(phase, i, SINE, sin)
         turns += lanes(phase, i, TURNED)
@@ -127,16 +137,20 @@ def follow_pass(tables, state, t):
 @kernel
 def respond(tables, state, g):
     """What a residual adds to the ones after it in the carriers; then the inverse of that, and of the wanted one."""
-    band, table, response = state.bank.band, state.table, state.response
-    for d in range(1, response.shape[0]):
-        reached = 0.0 * lanes(table, 0, 0)
-        for t in range(band.shape[0]):
-            start_re, start_im = lanes(table, t, 0), lanes(table, t, 1)
-            turned = lanes(table, t, 2 * d) * start_re + lanes(table, t, 2 * d + 1) * start_im
-            reached += lanes(band, t, row.SHARE) * turned
-        response[d] = total(1.0, reached)
-    invert(response, g, tables.sample.dc, tables.sample.dc_drift, state.inverse, 0)
-    invert(response, tables.sample.reference, 0.0, 0.0, state.inverse, 1)
+    band, held = state.bank.band, state.held
+    for t in range(band.shape[0]):
+        share, at = lanes(band, t, row.SHARE), PAIR_ROWS * (PAIRS - 1)
+        if state.bank.pace[t] == row.LOCKED:
+            put(held, t, 0, share * lanes(state.table, t, 0))
+            put(held, t, 1, -share * lanes(state.table, t, 1))
+        else:
+            put(held, t, 0, share * lanes(state.table, t, at + PAIR_COS))
+            put(held, t, 1, share * lanes(state.table, t, at + PAIR_SIN))
+    sum_bands(state, 0, 0)
+    for d in range(state.response.shape[0]):
+        state.response[d] = state.sum[0, d]
+    invert(state.response, g, tables.sample.dc, tables.sample.dc_drift, state.inverse, 0)
+    invert(state.response, tables.sample.reference, 0.0, 0.0, state.inverse, 1)
 
 
 @kernel
@@ -160,92 +174,172 @@ def turn_held(band, held, t, r, re, im):
 
 
 @kernel
-def sum_bands(table, held, r, s, out):
-    """Two sums over the bands at every sample: of Re x e^(j w m), x in rows r, r + 1 and in rows s, s + 1 of `held`."""
-    for m in range(0, out.shape[1], GROUP):
-        a0 = a1 = a2 = a3 = b0 = b1 = b2 = b3 = 0.0 * lanes(held, 0, r)
-        for t in range(table.shape[0]):
-            re, im, at, up = lanes(held, t, r), lanes(held, t, r + 1), lanes(held, t, s), lanes(held, t, s + 1)
-            cos, sin = lanes(table, t, 2 * m), lanes(table, t, 2 * m + 1)
-            a0, b0 = a0 + re * cos - im * sin, b0 + at * cos - up * sin
-            cos, sin = lanes(table, t, 2 * m + 2), lanes(table, t, 2 * m + 3)
-            a1, b1 = a1 + re * cos - im * sin, b1 + at * cos - up * sin
-            cos, sin = lanes(table, t, 2 * m + 4), lanes(table, t, 2 * m + 5)
-            a2, b2 = a2 + re * cos - im * sin, b2 + at * cos - up * sin
-            cos, sin = lanes(table, t, 2 * m + 6), lanes(table, t, 2 * m + 7)
-            a3, b3 = a3 + re * cos - im * sin, b3 + at * cos - up * sin
-        out[0, m], out[1, m] = totals(1.0, a0, b0)
-        out[0, m + 1], out[1, m + 1] = totals(1.0, a1, b1)
-        out[0, m + 2], out[1, m + 2] = totals(1.0, a2, b2)
-        out[0, m + 3], out[1, m + 3] = totals(1.0, a3, b3)
+def turned(cos, sin, re, im):
+    """An envelope turned ahead."""
+    return re * cos - im * sin, re * sin + im * cos
 
 
 @kernel
-def sum_drives(table, held, at, out):
-    """Sums over the bands of two channels' drives at every sample: from the last envelope, and what a block adds to it.
+def clear(state):
+    """Begin the sums over the bands."""
+    nothing = 0.0 * lanes(state.table, 0, 0)
+    for s in range(2):
+        for m in range(state.lane_sum.shape[1]):
+            put(state.lane_sum, s, m, nothing)
+
+
+@kernel
+def add(lane_sum, s, m, value):
+    """Add to a sum."""
+    put(lane_sum, s, m, lanes(lane_sum, s, m) + value)
+
+
+@kernel
+def unfold(state):
+    """Sums over the lanes, sample by sample."""
+    out, lane_sum = state.sum, state.lane_sum
+    for q in range(0, out.shape[1], EIGHT):
+        for i in range(PAIRS):
+            early, late = q + PAIRS - 1 - i, q + PAIRS + i
+            even, even2 = totals(1.0, lanes(lane_sum, 0, early), lanes(lane_sum, 1, early))
+            odd, odd2 = totals(1.0, lanes(lane_sum, 0, late), lanes(lane_sum, 1, late))
+            out[0, early], out[0, late] = even - odd, even + odd
+            out[1, early], out[1, late] = even2 - odd2, even2 + odd2
+
+
+@kernel
+def add_following(state, t, s, re, im, step_re, step_im):
+    """Add a tile that follows the finger to sum s: Re (x + (m + 1) step) e^(j phase of m)."""
+    table, sums = state.table, state.lane_sum
+    for q in range(0, state.place.shape[0], EIGHT):
+        for i in range(PAIRS):
+            early, late = q + PAIRS - 1 - i, q + PAIRS + i
+            cos, sin = lanes(table, t, 2 * early), lanes(table, t, 2 * early + 1)
+            u, v = lanes(table, t, 2 * late), lanes(table, t, 2 * late + 1)
+            before = (re + (early + 1.0) * step_re) * cos - (im + (early + 1.0) * step_im) * sin
+            after = (re + (late + 1.0) * step_re) * u - (im + (late + 1.0) * step_im) * v
+            add(sums, s, early, 0.5 * (after + before))
+            add(sums, s, late, 0.5 * (after - before))
+
+
+@kernel
+def sum_bands(state, r, s):
+    """Two sums over the bands at every sample: of Re x e^(j w m), x in rows r, r + 1 and in rows s, s + 1 of `held`."""
+    table, held, sums = state.table, state.held, state.lane_sum
+    clear(state)
+    for t in range(table.shape[0]):
+        re, im, at, up = lanes(held, t, r), lanes(held, t, r + 1), lanes(held, t, s), lanes(held, t, s + 1)
+        if state.bank.pace[t] == row.LOCKED:
+            nothing = 0.0 * re
+            add_following(state, t, 0, re, im, nothing, nothing)
+            add_following(state, t, 1, at, up, nothing, nothing)
+            continue
+        turn, on = lanes(table, t, TURN_COS), lanes(table, t, TURN_SIN)
+        for q in range(0, sums.shape[1], EIGHT):
+            for i in range(PAIRS):
+                cos, sin = lanes(table, t, PAIR_ROWS * i + PAIR_COS), lanes(table, t, PAIR_ROWS * i + PAIR_SIN)
+                early, late = q + PAIRS - 1 - i, q + PAIRS + i
+                add(sums, 0, early, re * cos)
+                add(sums, 0, late, -im * sin)
+                add(sums, 1, early, at * cos)
+                add(sums, 1, late, -up * sin)
+            re, im = turned(turn, on, re, im)
+            at, up = turned(turn, on, at, up)
+    unfold(state)
+
+
+@kernel
+def sum_drives(state, at):
+    """Sums over the bands of two channels' drives at every sample, linear from the last block's envelope to this one's.
 
     The first channel's rows start at `at`.
     """
-    fr, to = at + FROM_RE, at + CHANNEL_ROWS + FROM_RE
-    for m in range(0, out.shape[1], GROUP):
-        a0 = a1 = a2 = a3 = b0 = b1 = b2 = b3 = c0 = c1 = c2 = c3 = d0 = d1 = d2 = d3 = 0.0 * lanes(held, 0, fr)
-        for t in range(table.shape[0]):
-            p, q, v, w = lanes(held, t, fr), lanes(held, t, fr + 1), lanes(held, t, fr + 2), lanes(held, t, fr + 3)
-            x, y, z, u = lanes(held, t, to), lanes(held, t, to + 1), lanes(held, t, to + 2), lanes(held, t, to + 3)
-            cos, sin = lanes(table, t, 2 * m), lanes(table, t, 2 * m + 1)
-            a0, b0 = a0 + p * cos - q * sin, b0 + v * cos - w * sin
-            c0, d0 = c0 + x * cos - y * sin, d0 + z * cos - u * sin
-            cos, sin = lanes(table, t, 2 * m + 2), lanes(table, t, 2 * m + 3)
-            a1, b1 = a1 + p * cos - q * sin, b1 + v * cos - w * sin
-            c1, d1 = c1 + x * cos - y * sin, d1 + z * cos - u * sin
-            cos, sin = lanes(table, t, 2 * m + 4), lanes(table, t, 2 * m + 5)
-            a2, b2 = a2 + p * cos - q * sin, b2 + v * cos - w * sin
-            c2, d2 = c2 + x * cos - y * sin, d2 + z * cos - u * sin
-            cos, sin = lanes(table, t, 2 * m + 6), lanes(table, t, 2 * m + 7)
-            a3, b3 = a3 + p * cos - q * sin, b3 + v * cos - w * sin
-            c3, d3 = c3 + x * cos - y * sin, d3 + z * cos - u * sin
-        out[0, m], out[1, m] = totals(1.0, a0, b0)
-        out[2, m], out[3, m] = totals(1.0, c0, d0)
-        out[0, m + 1], out[1, m + 1] = totals(1.0, a1, b1)
-        out[2, m + 1], out[3, m + 1] = totals(1.0, c1, d1)
-        out[0, m + 2], out[1, m + 2] = totals(1.0, a2, b2)
-        out[2, m + 2], out[3, m + 2] = totals(1.0, c2, d2)
-        out[0, m + 3], out[1, m + 3] = totals(1.0, a3, b3)
-        out[2, m + 3], out[3, m + 3] = totals(1.0, c3, d3)
+    table, held, sums, share = state.table, state.held, state.lane_sum, 1.0 / state.place.shape[0]
+    first, second = at + FROM_RE, at + CHANNEL_ROWS + FROM_RE
+    clear(state)
+    for t in range(table.shape[0]):
+        re, im, step_re, step_im = four(held, t, first)
+        up_re, up_im, rise_re, rise_im = four(held, t, second)
+        if state.bank.pace[t] == row.LOCKED:
+            add_following(state, t, 0, re, im, share * step_re, share * step_im)
+            add_following(state, t, 1, up_re, up_im, share * rise_re, share * rise_im)
+            continue
+        turn, on, ahead = lanes(table, t, TURN_COS), lanes(table, t, TURN_SIN), share * (PAIRS + 0.5)
+        for q in range(0, sums.shape[1], EIGHT):
+            re, im = re + ahead * step_re, im + ahead * step_im
+            up_re, up_im = up_re + ahead * rise_re, up_im + ahead * rise_im
+            for i in range(PAIRS):
+                cos, sin, far_cos, far_sin = four(table, t, PAIR_ROWS * i)
+                early, late = q + PAIRS - 1 - i, q + PAIRS + i
+                add(sums, 0, early, re * cos - step_im * far_sin)
+                add(sums, 0, late, step_re * far_cos - im * sin)
+                add(sums, 1, early, up_re * cos - rise_im * far_sin)
+                add(sums, 1, late, rise_re * far_cos - up_im * sin)
+            re, im = turned(turn, on, re, im)
+            step_re, step_im = turned(turn, on, step_re, step_im)
+            up_re, up_im = turned(turn, on, up_re, up_im)
+            rise_re, rise_im = turned(turn, on, rise_re, rise_im)
+            ahead = share * EIGHT
+    unfold(state)
 
 
 @kernel
-def solve(inverse, which, raw, error, heard, c):
+def four(array, t, r):
+    """Rows r to r + 3 of a tile."""
+    return lanes(array, t, r), lanes(array, t, r + 1), lanes(array, t, r + 2), lanes(array, t, r + 3)
+
+
+@kernel
+def solve(state, which, c):
     """Residuals e = Q e_h of row c, and the same in the precision of the bands.
 
     `inverse` has as many zeros in front as a block has samples, so that what lies in the future adds nothing.
     """
-    block = raw.shape[1]
-    for m in range(0, block, EIGHT):
+    inverse, raw, whole = state.inverse, state.raw, state.raw.shape[1]
+    for m in range(0, whole, EIGHT):
         first = second = third = fourth = 0.0 * stretch(inverse, which, 0)
-        at = block + m
+        at = whole + m
         for j in range(0, m + EIGHT, 4):
             first += raw[c, j] * stretch(inverse, which, at - j)
             second += raw[c, j + 1] * stretch(inverse, which, at - j - 1)
             third += raw[c, j + 2] * stretch(inverse, which, at - j - 2)
             fourth += raw[c, j + 3] * stretch(inverse, which, at - j - 3)
-        put_stretch(error, c, m, (first + second) + (third + fourth))
-    for m in range(block):
-        heard[c, m] = error[c, m]
+        put_stretch(state.error, c, m, (first + second) + (third + fourth))
+    for m in range(state.place.shape[0], whole):  # none is heard after the block's end
+        state.error[c, m] = 0.0
+    for q in range(0, whole, EIGHT):
+        for i in range(PAIRS):
+            early, late = q + PAIRS - 1 - i, q + PAIRS + i
+            state.heard[c, early] = state.error[c, late] + state.error[c, early]
+            state.heard[c, late] = state.error[c, late] - state.error[c, early]
 
 
 @kernel
-def correlate(table, heard, t, c, d):
+def correlate(state, t, c, d):
     """Sums over the block of rows c and d of `heard` with the carriers of a tile, e^(-j w m)."""
-    re = im = at = up = re2 = im2 = at2 = up2 = 0.0 * lanes(table, t, 0)
-    for m in range(0, heard.shape[1], 2):
-        cos, sin = lanes(table, t, 2 * m), lanes(table, t, 2 * m + 1)
-        re, im = re + heard[c, m] * cos, im - heard[c, m] * sin
-        at, up = at + heard[d, m] * cos, up - heard[d, m] * sin
-        cos, sin = lanes(table, t, 2 * m + 2), lanes(table, t, 2 * m + 3)
-        re2, im2 = re2 + heard[c, m + 1] * cos, im2 - heard[c, m + 1] * sin
-        at2, up2 = at2 + heard[d, m + 1] * cos, up2 - heard[d, m + 1] * sin
-    return re + re2, im + im2, at + at2, up + up2
+    table, heard = state.table, state.heard
+    re = im = at = up = 0.0 * lanes(table, t, 0)
+    if state.bank.pace[t] == row.LOCKED:
+        for q in range(0, state.place.shape[0], EIGHT):
+            for i in range(PAIRS):
+                early, late = q + PAIRS - 1 - i, q + PAIRS + i
+                cos, sin = lanes(table, t, 2 * early), lanes(table, t, 2 * early + 1)
+                u, v = lanes(table, t, 2 * late), lanes(table, t, 2 * late + 1)
+                even, odd = 0.5 * heard[c, early], 0.5 * heard[c, late]
+                re, im = re + even * (u + cos) + odd * (u - cos), im - even * (v + sin) - odd * (v - sin)
+                even, odd = 0.5 * heard[d, early], 0.5 * heard[d, late]
+                at, up = at + even * (u + cos) + odd * (u - cos), up - even * (v + sin) - odd * (v - sin)
+        return re, im, at, up
+    turn, back = lanes(table, t, TURN_COS), -lanes(table, t, TURN_SIN)
+    for q in range(heard.shape[1] - EIGHT, -1, -EIGHT):
+        re, im = turned(turn, back, re, im)
+        at, up = turned(turn, back, at, up)
+        for i in range(PAIRS):
+            cos, sin = lanes(table, t, PAIR_ROWS * i + PAIR_COS), lanes(table, t, PAIR_ROWS * i + PAIR_SIN)
+            early, late = q + PAIRS - 1 - i, q + PAIRS + i
+            re, im = re + heard[c, early] * cos, im - heard[c, late] * sin
+            at, up = at + heard[d, early] * cos, up - heard[d, late] * sin
+    return re, im, at, up
 
 
 @kernel
@@ -254,10 +348,10 @@ def analyse(state, wanted):
     band, last = state.bank.band, state.error.shape[0] - 1
     for t in range(band.shape[0]):
         turn_held(band, state.held, t, 0, lanes(band, t, row.RAW_RE), lanes(band, t, row.RAW_IM))
-    sum_bands(state.table, state.held, 0, 0, state.sum)
+    sum_bands(state, 0, 0)
     for m in range(wanted.shape[0]):
         state.raw[last, m] = (wanted[m] if size(wanted[m]) <= FAR else 0.0) - state.sum[0, m]
-    solve(state.inverse, 1, state.raw, state.error, state.heard, last)
+    solve(state, 1, last)
 
 
 @kernel
@@ -299,14 +393,22 @@ def take_up(tables, state, t):
     put(band, t, row.OMEGA, TURN * carrier)
     bank.follows[0] -= 1 if bank.pace[t] == row.LOCKED else 0
     bank.pace[t] = row.LOCKED if any_of(lanes(band, t, row.WAVENUMBER) > 0.0) else row.GROWING
-    if bank.pace[t] == row.LOCKED:
+    follows, step = bank.pace[t] == row.LOCKED, 1.0 / tables.sample.rate * carrier
+    for i in range(width):
+        turns = 0.0 if follows else (PAIRS - 0.5) / tables.sample.rate * band[t, row.FREQUENCY, i]
+        state.phase[t * parts + i // EIGHT, TO_MIDDLE, i % EIGHT] = turns
+    if follows:
         bank.follows[0] += 1
         return
-    step = 1.0 / tables.sample.rate * carrier
-    for m in range(block):
-        cos, sin = unit(step * m)
-        put(state.table, t, 2 * m, cos)
-        put(state.table, t, 2 * m + 1, sin)
+    for i in range(PAIRS):
+        cos, sin = unit(step * (i + 0.5))
+        put(state.table, t, PAIR_ROWS * i + PAIR_COS, cos)
+        put(state.table, t, PAIR_ROWS * i + PAIR_SIN, sin)
+        put(state.table, t, PAIR_ROWS * i + FAR_COS, (i + 0.5) / block * cos)
+        put(state.table, t, PAIR_ROWS * i + FAR_SIN, (i + 0.5) / block * sin)
+    cos, sin = unit(step * EIGHT)
+    put(state.table, t, TURN_COS, cos)
+    put(state.table, t, TURN_SIN, sin)
 
 
 @kernel
@@ -318,7 +420,7 @@ def want(tables, state, t, g):
     if numbers.analysed:
         cos, sin = lanes(band, t, row.COS), lanes(band, t, row.SIN)
         last = state.heard.shape[0] - 1
-        a, b, _, _ = correlate(state.table, state.heard, t, last, last)
+        a, b, _, _ = correlate(state, t, last, last)
         raw_re = lanes(band, t, row.RAW_RE) + g * (a * cos + b * sin)
         raw_im = lanes(band, t, row.RAW_IM) + g * (b * cos - a * sin)
         put(band, t, row.RAW_RE, raw_re)
@@ -418,18 +520,18 @@ def speak(tables, state, drive):
     trust, unit_drive, peak = state.bank.touch[row.TRUST], 1.0 / tables.sample.drive_limit, 0.0
     for channel in range(0, drive.shape[1], 2):
         at, pair = first + CHANNEL_ROWS * channel, min(drive.shape[1] - channel, 2)
-        sum_drives(state.table, state.held, at, sums)
+        sum_drives(state, at)
         for i in range(pair):
             for m in range(block):
-                drive[m, channel + i] = trust * (sums[2 * i, m] + (m + 1.0) / block * sums[2 * i + 1, m])
+                drive[m, channel + i] = trust * sums[i, m]
                 peak = max(peak, (unit_drive * drive[m, channel + i]) ** 2)
         if max(peak, state.bank.touch[row.PEAK]) > NEAR_LIMIT * NEAR_LIMIT:
             for i in range(pair):
                 quarter_ahead(state.held, at + CHANNEL_ROWS * i)
-            sum_drives(state.table, state.held, at, sums)
+            sum_drives(state, at)
             for i in range(pair):
                 for m in range(block):
-                    across = unit_drive * trust * (sums[2 * i, m] + (m + 1.0) / block * sums[2 * i + 1, m])
+                    across = unit_drive * trust * sums[i, m]
                     peak = max(peak, (unit_drive * drive[m, channel + i]) ** 2 + across * across)
     return peak
 
@@ -534,7 +636,7 @@ def block_step(tables, state, sensed, position, wanted, drive, target, flags):
             re = shape * lanes(band, t, row.SEEN_RE) + lanes(loop, t, base + row.E_RE)
             im = shape * lanes(band, t, row.SEEN_IM) + lanes(loop, t, base + row.E_IM)
             turn_held(band, state.held, t, 2 * c, re, im)
-    sum_bands(state.table, state.held, 0, 2 * (coordinates - 1), state.sum)
+    sum_bands(state, 0, 2 * (coordinates - 1))
     integral = numbers.integral + slow * (numbers.integral_stirred - numbers.integral)
     integral += fast * (numbers.integral_awake - integral)
     back = numbers.back * (1.0 - touch[row.SCALE])
@@ -542,10 +644,10 @@ def block_step(tables, state, sensed, position, wanted, drive, target, flags):
     for c in range(coordinates):
         for m in range(block):
             state.raw[c, m] -= state.sum[c, m]
-        solve(state.inverse, 0, state.raw, state.error, state.heard, c)
+        solve(state, 0, c)
         settle_level(tables, state, c)
     for t in range(tiles):
-        a, b, a2, b2 = correlate(state.table, state.heard, t, 0, coordinates - 1)
+        a, b, a2, b2 = correlate(state, t, 0, coordinates - 1)
         for c in range(coordinates):
             heard_fast, heard_slow = update(tables, state, t, c, a, b, g, integral, back)
             hears_fast, hears_slow = hears_fast + heard_fast, hears_slow + heard_slow
