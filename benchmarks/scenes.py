@@ -35,16 +35,16 @@ def polar(bands, precision="double"):
     return controller
 
 
-def in_blocks(bands, precision="double"):
+def in_blocks(bands, precision="double", **numbers):
     """The default method on a sound card, 64 samples a block.
 
-    Designed for 8 bands and then given as many as asked for: the design check is not what is measured here.
+    `numbers` replaces some of the design.  Designed for 8 bands and then given as many as asked for: the design check is not what is measured here.
     """
     parameters = replace(PLATE, rate=CARD, delay=BLOCK)
     model = replace(parameters.band_model(CARD, BLOCK), block=1)
     few = METHODS["h2"].design(model, comb(8))
     many = comb(bands, amplitude=1e-9, highest=1000.0)
-    few.tables = few.tables._replace(tone=many.tone(), numbers=few.tables.numbers._replace(observer=1e-4))
+    few.tables = few.tables._replace(tone=many.tone(), numbers=few.tables.numbers._replace(observer=1e-4, **numbers))
     few.n_bands = bands
     return BlockController(few, BLOCK, precision)
 

@@ -40,6 +40,26 @@ def test_the_c_references_are_the_same_controller(benchmarks, precision, bound, 
         np.testing.assert_allclose(found, expected, rtol=0, atol=bound * abs(expected).max())
 
 
+@pytest.mark.parametrize(("precision", "bound"), [("double", 1e-6), ("single", 1e-3)])
+def test_the_c_reference_in_blocks_is_the_same_controller(benchmarks, precision, bound, rng):
+    """Drive of 20 bands over 100 blocks of noise, from the second block on; the drive's steps are made negligible."""
+    import native
+    import scenes
+
+    try:
+        native.compiler()
+    except native.NoCompiler as missing:
+        pytest.skip(str(missing))
+    controller = scenes.in_blocks(20, precision, drive_step=1e-12)
+    block, nothing = scenes.BLOCK, np.zeros(100 * scenes.BLOCK)
+    controller.run(np.zeros((block, 2)), nothing[:block], nothing[:block])
+    tuned = native.TunedBlock(controller)
+    sensed = 1e-9 * rng.standard_normal((len(nothing), 2))
+    found = controller.run(sensed, nothing, nothing)[0]
+    assert abs(found).max() > 0
+    np.testing.assert_allclose(tuned.run(sensed), found, rtol=0, atol=bound * abs(found).max())
+
+
 def test_pairs_are_taken_in_turns(benchmarks):
     from pairing import interleave
 

@@ -13,6 +13,9 @@ import numpy as np
 
 from hapticrender import _polynomials
 from hapticrender._lanes import WIDTH, aligned
+from hapticrender.control import bank_rows as row
+from hapticrender.control import block_kernels
+from hapticrender.control.bank_kernels import FORGET
 
 HERE = Path(__file__).parent
 FLAGS = ["-O3", "-march=native", "-ffp-contract=fast", "-fno-math-errno", "-fno-trapping-math", "-fPIC", "-shared"]
@@ -146,7 +149,67 @@ class TunedPolar:
         return drive
 
 
+class TunedBlock:
+    """`block.c` on a copy of what a `BlockController` holds, from its state of the moment on."""
+
+    names = ("rate", "block_rate", "g", "dc", "dc_drift", "lead", "integral", "back", "forget", "ramp", "fast_pole")
+    names += ("slow_pole", "fast_level", "slow_level", "limit", "sensed_limit", "step")
+
+    def __init__(self, controller):
+        tables, state = controller.tables, controller.state
+        numbers, sample, block = tables.bank.numbers, tables.sample, len(state.place)
+        if block % 8 or sample.drive_step <= 0.0 or len(tables.bank.shape) != 2 or len(tables.bank.speak) != 2:
+            raise ValueError(f"{block=}: must be a multiple of 8, on two coordinates and two channels of finite steps")
+        self.arrays = [
+            same(each) for each in (state.bank.band, state.bank.loop, state.bank.law, state.held, state.phase)
+        ]
+        self.arrays += [same(state.table), state.inverse[0].copy(), state.bank.level.copy()]
+        values = {
+            **{name: getattr(sample, name) for name in ("rate", "dc", "dc_drift", "lead", "sensed_limit")},
+            **{name: getattr(numbers, name) for name in ("fast_pole", "slow_pole", "integral", "ramp")},
+            **{name: max(min(getattr(numbers, name), 1e30), -1e30) for name in ("fast_level", "slow_level")},
+            "block_rate": numbers.rate,
+            "g": float(state.gain[0]),
+            "back": 0.0,
+            "forget": FORGET,
+            "limit": sample.drive_limit,
+            "step": sample.drive_step,
+        }
+        rest = [tables.bank.listen.ravel(), tables.bank.speak.ravel(), tables.bank.shape, np.zeros(4)]
+        self.numbers = np.concatenate([[values[name] for name in self.names], *rest]).astype(float)
+        self.tiles, self.block = len(state.bank.band), block
+        rows = {name: getattr(row, name) for name in dir(row) if name.isupper()}
+        rows |= {name: getattr(block_kernels, name) for name in dir(block_kernels) if name.isupper()}
+        rows |= {"TABLE_ROWS": state.table.shape[1], "HELD_ROWS": state.held.shape[1]}
+        rows["LAW_TILE_ROWS"] = state.bank.law.shape[1]
+        dtype = state.table.dtype.type
+        options = [f"-DR_{name}={value}" for name, value in sorted(rows.items()) if isinstance(value, int)]
+        options += [*_coefficients(), *(["-DSINGLE"] if dtype == np.float32 else [])]
+        self.run_c = getattr(library("block.c", *options), f"block_{NAMES[dtype]}")
+
+    def run(self, sensed):
+        """Drive (samples, 2) from whole blocks of the sensors (samples, 2)."""
+        drive = np.zeros_like(sensed)
+        self.run_c(
+            *(each.ctypes.data_as(ctypes.c_void_p) for each in self.arrays),
+            _pointer(self.numbers),
+            self.tiles,
+            self.block,
+            _pointer(sensed),
+            _pointer(drive),
+            len(sensed) // self.block,
+        )
+        return drive
+
+
+def same(array):
+    """Copy of an array of vectors, aligned like it."""
+    copy = aligned(array.shape, array.dtype)
+    copy[:] = array
+    return copy
+
+
 def drive_per_metre(tables):
     """Of every coordinate and band, from the look-up table, shape (coordinates, bands)."""
     at = tables.tone[0] / tables.numbers.table_step
-    return 1.0 / np.array([np.interp(at, np.arange(row.size), row) for row in tables.gain])
+    return 1.0 / np.array([np.interp(at, np.arange(each.size), each) for each in tables.gain])

@@ -537,21 +537,23 @@ def speak(tables, state, drive):
 
 
 @kernel
-def shape_drive(tables, state, channel, scale, drive):
-    """Scale a channel into its limit and shape the noise of its rounding (2nd order)."""
+def shape_drive(tables, state, scale, drive):
+    """Scale every channel into its limit and shape the noise of its rounding (2nd order)."""
     numbers, shaper, touch = tables.sample, state.bank.shaper, state.bank.touch
-    limit, step, block = numbers.drive_limit, numbers.drive_step, drive.shape[0]
-    before = touch[row.SCALE]
+    limit, step, block, before = numbers.drive_limit, numbers.drive_step, drive.shape[0], touch[row.SCALE]
+    believed, per_step = touch[row.TRUST] > 0.0, 1.0 / step if step > 0.0 else 0.0
     for m in range(block):
-        exact = (before + (scale - before) * (m + 1.0) / block) * drive[m, channel]
-        if touch[row.TRUST] == 0.0:
-            exact = shaper[0, channel] = shaper[1, channel] = 0.0
-        elif step > 0.0:
-            shaped = exact + 2.0 * shaper[0, channel] - shaper[1, channel]
-            exact = step * floor(shaped * (1.0 / step) + 0.5)
-            shaper[1, channel] = shaper[0, channel]
-            shaper[0, channel] = min(max(shaped - exact, -step), step)
-        drive[m, channel] = min(max(exact, -limit), limit)
+        share = before + (scale - before) * (m + 1.0) / block
+        for channel in range(tables.bank.speak.shape[0]):  # side by side: each waits for its own last sample
+            exact = share * drive[m, channel]
+            if not believed:
+                exact = shaper[0, channel] = shaper[1, channel] = 0.0
+            elif step > 0.0:
+                shaped = exact + 2.0 * shaper[0, channel] - shaper[1, channel]
+                exact = step * floor(shaped * per_step + 0.5)
+                shaper[1, channel] = shaper[0, channel]
+                shaper[0, channel] = min(max(shaped - exact, -step), step)
+            drive[m, channel] = min(max(exact, -limit), limit)
 
 
 @kernel
@@ -669,8 +671,7 @@ def block_step(tables, state, sensed, position, wanted, drive, target, flags):
     peak = max(peak, speak(tables, state, drive))
     touch[row.PEAK] = peak
     scale = 1.0 / root(peak) if peak > 1.0 else 1.0
-    for channel in range(tables.bank.speak.shape[0]):
-        shape_drive(tables, state, channel, scale, drive)
+    shape_drive(tables, state, scale, drive)
     touch[row.SCALE] = scale
     if scale < 1.0:
         for m in range(block):
