@@ -38,7 +38,8 @@ def polar(bands, precision="double"):
 def in_blocks(bands, precision="double", **numbers):
     """The default method on a sound card, 64 samples a block.
 
-    `numbers` replaces some of the design.  Designed for 8 bands and then given as many as asked for: the design check is not what is measured here.
+    `numbers` replaces some of the design.
+    Designed for 8 bands and then given as many as asked for: the design check is not what is measured here.
     """
     parameters = replace(PLATE, rate=CARD, delay=BLOCK)
     model = replace(parameters.band_model(CARD, BLOCK), block=1)

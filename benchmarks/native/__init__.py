@@ -159,7 +159,7 @@ class TunedBlock:
         tables, state = controller.tables, controller.state
         numbers, sample, block = tables.bank.numbers, tables.sample, len(state.place)
         if block % 8 or sample.drive_step <= 0.0 or len(tables.bank.shape) != 2 or len(tables.bank.speak) != 2:
-            raise ValueError(f"{block=}: must be a multiple of 8, on two coordinates and two channels of finite steps")
+            raise ValueError(f"{block=}: must be a multiple of 8, on two coordinates and two stepped channels")
         self.arrays = [
             same(each) for each in (state.bank.band, state.bank.loop, state.bank.law, state.held, state.phase)
         ]
