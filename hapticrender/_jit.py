@@ -15,6 +15,7 @@ from typing import Any
 
 import numba
 from numba.core.caching import FunctionCache, IndexDataCacheFile
+from numba.core.ccallback import CFunc
 
 
 def _source_stamp() -> str:
@@ -48,4 +49,15 @@ def kernel(function: Any) -> Any:
         compiled._cache = _StampedCache(function)  # type: ignore[attr-defined]
     except RuntimeError:  # numba: no writable cache location
         pass
+    return compiled
+
+
+def callback(function: Any, returned: Any, *taken: Any) -> Any:
+    """Compile `function` for callers in C, cached on disk: a `CFunc` with `address` and `ctypes`."""
+    compiled = CFunc(function, (taken, returned), {}, OPTIONS)
+    try:
+        compiled._cache = _StampedCache(function)
+    except RuntimeError:
+        pass
+    compiled.compile()
     return compiled

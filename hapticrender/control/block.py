@@ -7,6 +7,7 @@ import math
 import numpy as np
 
 from hapticrender._lanes import WIDTH, aligned, padded
+from hapticrender.bands import Bands
 from hapticrender.control import bank_rows as row
 from hapticrender.control.bank import BankController, settled_share
 from hapticrender.control.bank_state import PRECISIONS, BankNumbers, BankTables, bank_state
@@ -79,6 +80,22 @@ class BlockController:
         phase = self.tables.bank.tone[2]
         return np.mod(self.state.phase[:, TURNS].ravel()[: self.n_bands] - phase, 1.0)
 
+    def send(self, bands: Bands) -> None:
+        """Take up other targets at the next block.
+
+        Raises
+        ------
+        ValueError
+            Their number differs from what was designed for, or they have no constant envelope where that was.
+        """
+        tone = bands.tone()
+        if tone.shape[1] != self.n_bands:
+            raise ValueError(f"{tone.shape[1]} bands: must be {self.n_bands}, as designed for")
+        if (bands.envelope is None) != self.tables.bank.numbers.analysed:
+            raise ValueError("the targets are a waveform: must be constant envelopes, as designed for")
+        self.tables.bank.tone[:] = tone
+        self.state.news[0] = 1
+
     def run(self, sensed: Array, position: Array, wanted: Array) -> tuple[Array, Array, Array]:
         """Digest whole blocks; see `Controller`.
 
@@ -135,5 +152,6 @@ def block_state(tables: BankTables, block: int, dtype: type) -> BlockState:
         sum=np.zeros((2, whole)),
         lane_sum=aligned((2, whole, width), dtype),
         stale=np.ones(1, np.int64),
+        news=np.zeros(1, np.int64),
         gain=np.full(1, math.nan),
     )

@@ -83,6 +83,7 @@ class BlockState(NamedTuple):
     sum: Array  # (2, M) scratch: sums over the bands
     lane_sum: Array  # (2, M, W) scratch: the same a lane, and folded
     stale: Array  # (1,) integer: 1 where tables and `response` have to be found anew
+    news: Array  # (1,) integer: 1 where all tones are to be looked at; otherwise it is one tile a block
     gain: Array  # (1,) gain of the observer that `inverse` holds for
 
 
@@ -593,7 +594,8 @@ def block_step(tables, state, sensed, position, wanted, drive, target, flags):
     bank, numbers, sample = state.bank, tables.bank.numbers, tables.sample
     band, loop, touch, track = bank.band, bank.loop, bank.touch, bank.track
     tiles, block, coordinates = band.shape[0], sensed.shape[0], len(tables.bank.shape)
-    if state.stale[0] > 0:
+    if state.stale[0] > 0 or state.news[0] > 0:
+        state.news[0] = 0
         for t in range(tiles):
             take_up(tables, state, t)
     else:

@@ -1,0 +1,250 @@
+"""The compiled entry: called from a thread of C while Python keeps its lock, it does what the Python path does."""
+
+import ctypes
+import subprocess
+import sys
+import time
+from dataclasses import replace
+
+import numba
+import numpy as np
+import pytest
+from numba import types
+
+from hapticrender._exchange import FRESH, SLOTS, swap
+from hapticrender.bands import Bands
+from hapticrender.control.block import BlockController
+from hapticrender.control.methods import METHODS
+from hapticrender.plants.vibrotactile import PlateParameters
+from hapticrender.protocols import Flag
+from hapticrender.realtime import HORIZON, RealtimeEntry
+
+RATE, BLOCK, CARD = 5000.0, 10, 48000.0
+PLAIN = ctypes.CFUNCTYPE(ctypes.c_int32, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_uint64, ctypes.c_void_p)
+AUDIO = ctypes.CFUNCTYPE(
+    ctypes.c_int32,
+    ctypes.c_void_p,
+    ctypes.c_void_p,
+    ctypes.c_ulong,
+    ctypes.c_void_p,
+    ctypes.c_ulong,
+    ctypes.c_void_p,
+)
+
+
+def bands(amplitude=5e-6, wavenumber=0.0):
+    moves = wavenumber > 0
+    return Bands(
+        frequency=np.where(moves, 0.0, [47.0, 130.0, 261.0]),
+        wavenumber=np.where(moves, [1.0, 2.0, 3.0], 0.0) * wavenumber,
+        phase=[0.0, 1.0, 2.0],
+        envelope=np.full(3, amplitude + 0j),
+    )
+
+
+def controller(wanted=None, precision="double"):
+    parameters = replace(PlateParameters(), rate=RATE, delay=BLOCK)
+    model = parameters.band_model(RATE, BLOCK)
+    designed = METHODS["h2"].design(replace(model, block=1), wanted or bands())
+    return BlockController(designed, BLOCK, precision)
+
+
+def plain(entry, sensed):
+    """Drive of the plain function, and what it returned."""
+    drive = np.full((len(sensed), 2), np.nan)
+    answer = PLAIN(entry.plain_address)(sensed.ctypes.data, drive.ctypes.data, len(sensed), entry.user_data)
+    return drive, answer
+
+
+@pytest.mark.parametrize("precision", ["double", "single"])
+def test_it_is_the_python_path_sample_for_sample(rng, precision):
+    """Noise in, in calls of one block and of many; other targets on the way."""
+    entry, twin = RealtimeEntry(controller(precision=precision)), controller(precision=precision)
+    sensed, nothing = 1e-6 * rng.standard_normal((2000, 2)), np.zeros(2000)
+    away = np.full(2000, np.nan)
+    found = [plain(entry, sensed[n : n + BLOCK])[0] for n in range(0, 500, BLOCK)] + [plain(entry, sensed[500:1000])[0]]
+    entry.send(bands(amplitude=9e-6))
+    found.append(plain(entry, sensed[1000:])[0])
+    expected = [twin.run(sensed[:1000], away[:1000], nothing[:1000])[0]]
+    twin.send(bands(amplitude=9e-6))
+    expected.append(twin.run(sensed[1000:], away[1000:], nothing[1000:])[0])
+    np.testing.assert_array_equal(np.concatenate(found), np.concatenate(expected))
+    assert entry.samples == 2000
+    assert entry.flags == Flag(0)
+
+
+def test_the_finger_is_followed_between_its_words(rng):
+    """Its place goes on at its speed, and stops where nothing is heard for `HORIZON`."""
+    wanted = bands(wavenumber=500.0)
+    entry, twin = RealtimeEntry(controller(wanted)), controller(wanted)
+    sensed = 1e-7 * rng.standard_normal((1500, 2))
+    position = np.empty(1500)
+    found = []
+    for start, place, speed in ((0, -0.01, 0.05), (200, -0.0078, 0.06), (500, 0.002, 0.1)):
+        stop = {0: 200, 200: 500, 500: 1500}[start]
+        entry.finger(place, speed)
+        position[start:stop] = place + np.minimum(np.arange(stop - start) / RATE, HORIZON) * speed
+        found.append(plain(entry, sensed[start:stop])[0])
+    expected = twin.run(sensed, position, np.zeros(1500))[0]
+    assert abs(expected).max() > 0
+    np.testing.assert_array_equal(np.concatenate(found), expected)
+
+
+def test_the_audio_callback_scales_full_scale_to_metres_and_amperes(rng):
+    """Floats of 2e-4 m at full scale in, 1.0 for 4 A out."""
+    entry, twin = RealtimeEntry(controller(), sensed_scale=2e-4, drive_scale=0.25), controller()
+    floats = rng.standard_normal((400, 2)).astype(np.float32) * np.float32(0.01)
+    given = np.full((400, 2), np.nan, np.float32)
+    assert AUDIO(entry.address)(floats.ctypes.data, given.ctypes.data, 400, None, 0, entry.user_data) == 0
+    expected = 0.25 * twin.run(2e-4 * floats.astype(float), np.full(400, np.nan), np.zeros(400))[0]
+    np.testing.assert_array_equal(given, expected.astype(np.float32))
+
+
+def test_what_does_not_fit_is_answered_with_zeros():
+    """A broken block, a missing input; and samples that the audio library has lost are told."""
+    entry = RealtimeEntry(controller())
+    floats, given = np.ones((2 * BLOCK, 2), np.float32), np.full((2 * BLOCK, 2), np.nan, np.float32)
+    audio = AUDIO(entry.address)
+    assert audio(floats.ctypes.data, given.ctypes.data, BLOCK + 1, None, 0, entry.user_data) == 2
+    assert (given[: BLOCK + 1] == 0).all()
+    given[:] = np.nan
+    assert audio(None, given.ctypes.data, BLOCK, None, 0, entry.user_data) == 2
+    assert (given[:BLOCK] == 0).all()
+    assert audio(floats.ctypes.data, None, BLOCK, None, 0, entry.user_data) == 2
+    assert plain(entry, np.zeros((BLOCK - 1, 2)))[1] == -1
+    assert entry.refused == 4
+    assert entry.samples == 0
+    assert audio(np.zeros((BLOCK, 2), np.float32).ctypes.data, given.ctypes.data, BLOCK, None, 4, entry.user_data) == 0
+    assert entry.flags == Flag.OVERRUN
+
+
+def test_silence_is_zero_drive_and_ends_where_it_should(rng):
+    entry = RealtimeEntry(controller())
+    sensed = 1e-6 * rng.standard_normal((300, 2))
+    assert abs(plain(entry, sensed)[0]).max() > 0
+    entry.silence()
+    assert (plain(entry, sensed)[0] == 0).all()
+    entry.silence(quiet=False)
+    assert abs(plain(entry, sensed)[0]).max() > 0
+    assert entry.samples == 900
+
+
+def test_a_mad_sensor_is_flagged():
+    entry = RealtimeEntry(controller())
+    sensed = np.zeros((BLOCK, 2))
+    sensed[3, 1] = np.nan
+    drive, answer = plain(entry, sensed)
+    assert answer == Flag.NONFINITE == entry.flags
+    assert np.isfinite(drive).all()
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="threads are made with pthread_create")
+def test_a_thread_of_c_plays_on_while_python_keeps_its_lock(rng):
+    """Python holds its lock in a loop that never gives it up; a thread that never knew Python fills every block."""
+    entry, twin = RealtimeEntry(controller()), controller()
+    sensed, drive = 1e-6 * rng.standard_normal((20_000, 2)), np.zeros((20_000, 2))
+    process, pointer, into, out = (
+        PLAIN(entry.plain_address),
+        entry.user_data,
+        int(sensed.ctypes.data),
+        int(drive.ctypes.data),
+    )
+
+    @numba.cfunc(types.uintp(types.uintp))
+    def thread(job):
+        for start in range(0, 20_000, BLOCK):
+            process(into + 16 * start, out + 16 * start, BLOCK, pointer)
+        return job
+
+    library, handle = ctypes.CDLL(None), ctypes.c_ulong()
+    meter, last, before = entry._parts.meter, 0, sys.getswitchinterval()
+    seen = set()
+    sys.setswitchinterval(1000.0)  # s: nobody else gets the lock
+    try:
+        function = ctypes.c_void_p(thread.address)
+        assert library.pthread_create(ctypes.byref(handle), None, function, None) == 0
+        end = time.monotonic() + 60
+        while last < 20_000 and time.monotonic() < end:
+            last = int(meter[0])
+            seen.add(last)
+    finally:
+        sys.setswitchinterval(before)
+        library.pthread_join(handle, None)
+    assert last == 20_000
+    assert len(seen) > 2, "the thread did not run beside Python"
+    expected = twin.run(sensed, np.full(20_000, np.nan), np.zeros(20_000))[0]
+    np.testing.assert_array_equal(drive, expected)
+
+
+def test_slots_change_hands_whole():
+    """A writer and a reader at full speed: no slot is ever seen half written, and what is seen never goes back."""
+    slot, middle = np.zeros((SLOTS, 64)), np.array([1])
+    rounds = 200_000
+
+    @numba.njit(nogil=True)
+    def write(slot, middle, rounds):
+        back = 0
+        for i in range(1, rounds + 1):
+            for j in range(slot.shape[1]):
+                slot[back, j] = i
+            back = swap(middle, back | FRESH) & (FRESH - 1)
+
+    @numba.njit(nogil=True)
+    def read(slot, middle, rounds):
+        front, torn, backwards, last = 2, 0, 0, 0.0
+        while last < rounds:
+            if middle[0] & FRESH:
+                front = swap(middle, front) & (FRESH - 1)
+            first = slot[front, 0]
+            for j in range(slot.shape[1]):
+                torn += slot[front, j] != first
+            backwards += first < last
+            last = first
+        return torn, backwards
+
+    write(slot.copy(), middle.copy(), 1)
+    done, one = np.ones((SLOTS, 64)), np.array([1])
+    read(done, one, 1)
+    from concurrent.futures import ThreadPoolExecutor
+
+    with ThreadPoolExecutor(2) as pool:
+        found = pool.submit(read, slot, middle, rounds)
+        pool.submit(write, slot, middle, rounds)
+        assert found.result(60) == (0, 0)
+
+
+def test_what_it_refuses():
+    with pytest.raises(TypeError, match="must be a BlockController"):
+        RealtimeEntry(METHODS["h2"].design(PlateParameters().band_model(RATE, 1), bands()))
+    with pytest.raises(ValueError, match=r"drive_scale \(1/A\)=0.0: must be finite and > 0"):
+        RealtimeEntry(controller(), drive_scale=0.0)
+    entry = RealtimeEntry(controller())
+    with pytest.raises(ValueError, match="1 bands: must be 3"):
+        entry.send(Bands(frequency=[50.0], wavenumber=[0.0], phase=[0.0], envelope=[1e-6]))
+    with pytest.raises(ValueError, match="the targets are a waveform"):
+        entry.send(replace(bands(), envelope=None))
+    with pytest.raises(ValueError, match="must be finite"):
+        entry.finger(np.inf)
+    with pytest.raises(ValueError, match="must be finite"):
+        entry.finger(0.0, np.nan)
+    with pytest.raises(ValueError, match="the targets are a waveform"):
+        RealtimeEntry(controller(replace(bands(), envelope=None)))
+
+
+def test_a_second_process_finds_it_compiled():
+    """The compiled callback comes from the cache: compile, then ask a fresh process whether it had to."""
+    code = (
+        "import hapticrender._jit as jit; made = jit.callback\n"
+        "jit.callback = lambda *a: hits.append(made(*a)) or hits[-1]\n"
+        "hits = []\n"
+        "from tests.test_realtime import controller\n"
+        "from hapticrender import realtime\n"
+        "realtime.callback = jit.callback\n"
+        "realtime.RealtimeEntry(controller()).plain_address\n"
+        "print(hits[0].cache_hits)\n"
+    )
+    controller_made = RealtimeEntry(controller())
+    assert controller_made.plain_address
+    root = __file__.rsplit("/tests/", 1)[0]
+    found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=root, check=False)
+    assert found.stdout.strip() == "1", found.stderr
