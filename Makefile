@@ -28,9 +28,11 @@ lint: .venv/test.stamp ## check style, formatting and types
 bench: .venv/test.stamp ## measure every figure of speed beside its target (BENCH_ARGS="--short" as CI does)
 	@$(RUN) benchmarks/run.py $(BENCH_ARGS)
 
-picture: .venv/demo.stamp ## draw the picture in README.md anew
+picture: .venv/demo.stamp ## draw the pictures in README.md anew
 	@.venv/bin/hapticrender chart story --out out/chart
+	@.venv/bin/hapticrender chart pareto --out out/chart
 	@cp out/chart/story.png docs/picture.png
+	@cp out/chart/pareto.png docs/pareto.png
 
 clean: ## remove the environment and everything that was built or written
 	@rm -rf .venv build dist out *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis

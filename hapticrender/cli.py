@@ -116,8 +116,10 @@ def _parser() -> argparse.ArgumentParser:
     identify.add_argument("--out", "-o", metavar="FILE", type=_path, help="write it as the [plant] table of a scene")
     identify.add_argument("--seed", metavar="N", type=_seed, default=0, help="seed of the noise (default: %(default)s)")
 
-    chart = _add_verb(verbs, "chart", _chart, "draw where each method is stable, or two methods under one finger")
-    chart.add_argument("name", metavar="NAME", choices=["stability", "story"], help="stability or story")
+    chart = _add_verb(verbs, "chart", _chart, "draw accuracy against cost, where each method is stable, or two methods")
+    chart.add_argument(
+        "name", metavar="NAME", choices=["pareto", "stability", "story"], help="pareto, stability or story"
+    )
     chart.add_argument("--learnt", action="store_true", help="the finger already learnt, not the moment of touch")
     _add_out(chart, Path("out/chart"))
 
@@ -299,6 +301,10 @@ def _chart(arguments: argparse.Namespace) -> int:
         from hapticrender.story import draw_story
 
         draw_story(path)
+    elif arguments.name == "pareto":
+        from hapticrender.pareto import pareto
+
+        pareto(path, progress=lambda what: print(what, file=sys.stderr))
     else:
         from hapticrender import chart
 
