@@ -54,7 +54,7 @@ def kernel(function: Any) -> Any:
 
 def callback(function: Any, returned: Any, *taken: Any) -> Any:
     """Compile `function` for callers in C, cached on disk: a `CFunc` with `address` and `ctypes`."""
-    compiled = CFunc(function, (taken, returned), {}, OPTIONS)
+    compiled: Any = CFunc(function, (taken, returned), {}, OPTIONS)
     try:
         compiled._cache = _StampedCache(function)
     except RuntimeError:

@@ -116,9 +116,9 @@ def _parser() -> argparse.ArgumentParser:
     identify.add_argument("--out", "-o", metavar="FILE", type=_path, help="write it as the [plant] table of a scene")
     identify.add_argument("--seed", metavar="N", type=_seed, default=0, help="seed of the noise (default: %(default)s)")
 
-    chart = _add_verb(verbs, "chart", _chart, "draw accuracy against cost, where each method is stable, or two methods")
+    chart = _add_verb(verbs, "chart", _chart, "draw accuracy against cost, stability, or two methods")
     chart.add_argument(
-        "name", metavar="NAME", choices=["pareto", "stability", "story"], help="pareto, stability or story"
+        "name", metavar="NAME", choices=["pareto", "stability", "story"], help="pareto, stability, story"
     )
     chart.add_argument("--learnt", action="store_true", help="the finger already learnt, not the moment of touch")
     _add_out(chart, Path("out/chart"))

@@ -144,7 +144,7 @@ def _map(figure: Any, axes: Any, held: dict[str, Array]) -> None:
     axes.minorticks_off()
     axes.grid(False)
     axes.set_title(
-        "Where each stops holding: error 2 s after the worst of three touches; crossed: not stable, it wanders or stays off"
+        "Where each stops holding: error 2 s after the worst of three touches; crossed: it wanders or stays off"
     )
     bar = figure.colorbar(shade, ax=axes, pad=0.01, ticks=LEVELS)
     bar.set_label("error (%)")
@@ -157,7 +157,7 @@ def _keys(points: Sequence[Point]) -> list[Any]:
 
     present = dict.fromkeys(each.setting.method for each in points)
     handles = [Line2D([], [], color=COLOURS[name], marker="o", ls="none", label=name) for name in present]
-    shapes = (
+    shapes: tuple[tuple[str, Any, str], ...] = (
         ("o", "full", "sample by sample"),
         ("s", "full", "in blocks"),
         ("^", "full", "knows heave only"),

@@ -199,17 +199,17 @@ class RealtimeEntry:
 
 
 @numba.njit(cache=True)
-def _size(parts: Any) -> Any:
+def _size(parts):
     return bytes_of(parts)
 
 
 @numba.njit(cache=True)
-def _settle(address: Any, parts: Any) -> Any:
+def _settle(address, parts):
     place(address, parts)
 
 
 @numba.njit(cache=True)
-def _publish(middle: Any, back: Any) -> Any:
+def _publish(middle, back):
     return swap(middle, back | FRESH) & (FRESH - 1)
 
 
