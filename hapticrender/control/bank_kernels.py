@@ -143,7 +143,7 @@ def law_tune(tables, state, t):
     omega, sweep = lanes(band, t, row.OMEGA), lanes(band, t, row.SWEEP)
     cos, sin = lanes(law, t, row.AHEAD_RE), lanes(law, t, row.AHEAD_IM)
     touching = read(touch, row.KNOWN)  # 1 where the finger is on, else 0
-    place = read(touch, row.PLACE)
+    place = read(touch, row.KNOWN_PLACE)
     skin, drag = touching * read(touch, row.MASS), touching * read(touch, row.DAMPING)
     z_re, z_im = finger_stiffness(touch, band, t)
     for c in range(coordinates):
@@ -391,14 +391,17 @@ def know_finger(tables, state, touching, turn):
     """Take what is known of the finger into the law: where contact changed, and in its turn; at once where it moves."""
     touch = state.touch
     known = select(touching, 1.0, 0.0)
-    due = turn & any_of(touching) | any_of(size(known - read(touch, row.KNOWN)) > 0.5)
+    due = size(known - read(touch, row.KNOWN)) > 0.5
+    if turn:
+        due = due | touching
     write(known, touch, row.KNOWN)
-    if not due and state.follows[0] == 0:
+    write(select(due, read(touch, row.PLACE), read(touch, row.KNOWN_PLACE)), touch, row.KNOWN_PLACE)
+    if not any_of(due) and state.follows[0] == 0:
         return
     for t in range(state.band.shape[0]):
         if state.pace[t] == row.LOCKED:
             look_ahead(tables.numbers, state.band, state.law, t)
-        if due or state.pace[t] == row.LOCKED:
+        if any_of(due) or state.pace[t] == row.LOCKED:
             law_tune(tables, state, t)
 
 

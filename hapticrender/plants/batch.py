@@ -156,34 +156,53 @@ def _together(scenarios: Sequence[Scenario], controllers: Sequence[Controller], 
     each = tuple(plate._tables for plate in plates)
     each += (each[-1],) * (LANES - len(each))
     state, work, last = batch_state(plates), plates[0]._state, aligned((2, LANES))
-    target = aligned((control.tone.shape[0], 2, LANES))
-    wanted = aligned((CHUNK, LANES))
-    parts: list[list[Array]] = []
+    target, wanted = aligned((control.tone.shape[0], 2, LANES)), aligned((CHUNK, LANES))
+    noise, finger, flags = aligned((CHUNK, 2, LANES)), aligned((samples, 3, LANES)), aligned((samples, LANES))
+    motion, sensed, drive = (aligned((samples, width, LANES)) for width in (3, 2, 2))
     for start in range(0, samples, CHUNK):
-        count = min(CHUNK, samples - start)
-        rows = [plate._next(count) for plate in plates]
-        finger, noise = (side_by_side([row[part] for row in rows]) for part in range(2))
-        motion, sensed, drive = (aligned((count, width, LANES)) for width in (3, 2, 2))
-        flags = aligned((count, LANES))
+        part = slice(start, min(start + CHUNK, samples))
+        count = part.stop - start
+        _prepare(plates, start, finger[part], noise[:count])
         closed_batch_run(
-            each, work, state, control, bank, last, finger, noise, wanted[:count], sensed, motion, drive, target, flags
+            each,
+            work,
+            state,
+            control,
+            bank,
+            last,
+            finger[part],
+            noise[:count],
+            wanted[:count],
+            sensed[part],
+            motion[part],
+            drive[part],
+            target,
+            flags[part],
         )
-        parts.append([motion, finger[:, 0], drive, sensed, flags])
-    columns = [np.concatenate(column) for column in zip(*parts, strict=True)]
-    found = []
-    for lane, scenario in enumerate(scenarios):
-        motion, position, drive, sensed, flags = (np.ascontiguousarray(column[..., lane]) for column in columns)
-        found.append(
-            Played(
-                scenario=scenario,
-                motion=motion,
-                position=position,
-                drive=drive,
-                sensed=sensed,
-                flags=flags.astype(np.int64),
-            )
+    return [
+        Played(
+            scenario=scenario,
+            motion=motion[..., lane],
+            position=finger[:, 0, lane],
+            drive=drive[..., lane],
+            sensed=sensed[..., lane],
+            flags=flags[:, lane].astype(np.int64),
         )
-    return found
+        for lane, scenario in enumerate(scenarios)
+    ]
+
+
+def _prepare(plates: Sequence[Plate], start: int, finger: Array, noise: Array) -> None:
+    """Fingers and noise of every lane from sample `start` on; a finger that all lanes share is asked once."""
+    time = (start + np.arange(len(finger))) / plates[0].rate
+    if all(plate.finger is plates[0].finger for plate in plates):
+        finger[:] = plates[0].finger.touch(time)[..., None]
+    else:
+        for lane in range(LANES):
+            finger[..., lane] = plates[min(lane, len(plates) - 1)].finger.touch(time)
+    for lane, plate in enumerate(plates):
+        if plate.parameters.sensor_noise > 0.0:
+            noise[..., lane] = plate._rng.standard_normal((len(finger), 2))
 
 
 def batch_state(plates: Sequence[Plate]) -> BatchState:
