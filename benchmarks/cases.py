@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Callable, Iterator
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 
 import native
@@ -11,10 +12,15 @@ import startup
 from native import NaivePolar, NoCompiler, TunedBlock, TunedPolar
 from numpy_loop import NumpyPlate, NumpyPolar
 from numpy_loop import run as numpy_run
-from pairing import interleave
+from pairing import CORES, interleave, use_all_cores
+from peers import Absent, PythonControl, ScipyLockIn, SlidingDFT
+from scenes import Batch, absent
 
+from hapticrender.batch import LANES, simulate
+from hapticrender.control.analyser import Analyser
 from hapticrender.control.block_kernels import block_run
 from hapticrender.control.polar_kernels import polar_run
+from hapticrender.sweep import sweep, worst_error
 
 FEW = 400  # samples of the numpy loop
 DTYPES = {"double": np.float64, "single": np.float32}
@@ -115,7 +121,74 @@ def simulation(method: str, goal: float, seconds: float, pairs: int) -> Iterator
         rate = seconds / paired.candidate
         ratio = rate / (FEW / parameters.rate / paired.reference)
         name = f"closed loop, 8 bands, {method}, sliding finger, {what}"
-        yield Figure(name, rate, "s/s", goal, True, "simulated seconds a second", f"{ratio:.0f}x the numpy loop")
+        note = f"{ratio:.0f}x the numpy loop{beside_control(rate, pairs)}"
+        yield Figure(name, rate, "s/s", goal, True, "simulated seconds a second", note)
+
+
+def beside_control(rate: float, pairs: int) -> str:
+    """Words on python-control's open loop of the free plate in the same run, where it is installed."""
+    try:
+        peer = PythonControl(scenes.PLATE)
+    except Absent:
+        return ""
+    spent = interleave(lambda: peer.run(FEW), lambda: None, pairs).candidate
+    return f", {rate / (FEW / scenes.PLATE.rate / spent):.0f}x python-control's open loop of the bare plate"
+
+
+def analysis(bands: int, pairs: int) -> Iterator[Figure]:
+    """The lock-in alone, 2 channels in blocks of 64: against scipy's filters and the sliding DFT of `sdft`."""
+    frequency, rate, blocks = np.linspace(20.0, 2000.0, bands), scenes.CARD, max(4, 2048 // bands)
+    signal = np.random.default_rng(0).standard_normal((blocks * scenes.BLOCK, 2))
+    parts = np.split(signal, blocks)
+    ours, filters = Analyser(frequency, 5.0, rate, channels=2), ScipyLockIn(frequency, 5.0, rate, 2)
+    expected = filters.run(signal)
+    off = abs(ours.run(signal) - expected).max()
+    if not off <= 1e-9 * abs(expected).max():
+        raise RuntimeError(f"analysis, {bands} bands: envelopes differ by {off}")
+    out = np.empty((scenes.BLOCK, 2, bands), complex)
+    for who, peer, goal in (
+        ("scipy.signal.sosfilt", lambda: filters, 10.0),
+        ("the sdft package", lambda: SlidingDFT(bands, 2), 15.0),
+    ):
+        reference = peer()
+        paired = interleave(
+            lambda: [ours.run(part, out) for part in parts],
+            lambda reference=reference: [reference.run(part) for part in parts],
+            pairs,
+        )
+        each = paired.candidate / signal.size / bands * 1e9
+        note = f"{each:.2f} ns a band-sample and channel"
+        yield Figure(f"analysis alone, {bands} bands: times faster than", paired.ratio, "x", goal, True, who, note)
+
+
+def batches(seconds: float, pairs: int) -> Iterator[Figure]:
+    """Scenarios side by side on one core, 8 bands, default method; then a sweep on two processes over one."""
+    for what, finger, noise in (
+        ("free plate, ideal sensors", absent(), 0.0),
+        ("heavy finger at rest, ideal sensors", scenes.RESTING, 0.0),
+        ("heavy finger sliding, noise drawn", scenes.TOUCHING, scenes.PLATE.sensor_noise),
+    ):
+        many = scenes.scenarios(LANES, finger, noise)
+        run = Batch(many)
+        paired = interleave(lambda run=run: run.advance(seconds), lambda many=many: simulate(many[:1], seconds), pairs)
+        rate, one = LANES * seconds / paired.candidate, seconds / paired.reference
+        note = f"{rate / one:.1f}x one by one"
+        yield Figure(f"batch, 8 bands, {what}", rate, "s/s", 5000.0, True, "scenario-seconds a second and core", note)
+    if len(CORES) < 2:
+        return
+    many = scenes.scenarios(8 * LANES, scenes.TOUCHING, scenes.PLATE.sensor_noise)
+    runs = []
+    pools = [ProcessPoolExecutor(workers, initializer=use_all_cores) for workers in (2, 1)]
+    try:
+        for pool in pools:
+            runs.append(lambda pool=pool: sweep(many, seconds, worst_error, executor=pool, at_a_time=LANES))
+        paired = interleave(runs[0], runs[1], pairs)
+    finally:
+        for pool in pools:
+            pool.shutdown()
+    rate = len(many) * seconds / paired.candidate
+    note = f"{rate:.0f} scenario-seconds a second, judged"
+    yield Figure("sweep on two cores: times faster than", paired.ratio, "x", 1.8, True, "the same on one", note)
 
 
 def linear_in_bands(pairs: int) -> Iterator[Figure]:
@@ -175,9 +248,12 @@ def every_case(short: bool) -> Iterator[tuple[str, Callable[[], Iterator[Figure]
     for method, goal in (("h2", 1500.0), ("paper", 2500.0)):
         seconds = 1.0 if short else 10.0
         yield f"simulation {method}", lambda m=method, g=goal, s=seconds: simulation(m, g, s, pairs)
+    for bands in (64,) if short else (8, 64, 512):
+        yield f"analysis {bands}", lambda b=bands: analysis(b, pairs)
+    yield "batch", lambda: batches(0.5 if short else 2.0, pairs)
     yield "linear", lambda: linear_in_bands(pairs)
     yield "hours", lambda: hours_of_play(0.01 if short else 10.0)
     yield "startup", lambda: start_up(1 if short else 5)
 
 
-__all__ = ["Figure", "NoCompiler", "every_case", "native"]
+__all__ = ["Absent", "Figure", "NoCompiler", "every_case", "native"]

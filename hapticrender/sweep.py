@@ -18,8 +18,8 @@ from typing import Any
 
 import numpy as np
 
+from hapticrender.batch import LANES, Played, Scenario, simulate
 from hapticrender.judge import fit
-from hapticrender.plants.batch import LANES, Played, Scenario, simulate
 from hapticrender.protocols import Array
 
 AT_A_TIME = 4 * LANES  # scenarios a task: enough to be worth sending

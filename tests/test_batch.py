@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 import hapticrender as hr
+from hapticrender import batch
 from hapticrender.accuracy import SLIDING, tones
-from hapticrender.plants import batch
-from hapticrender.plants.batch import LANES, Scenario, simulate
+from hapticrender.batch import LANES, Scenario, simulate
 from hapticrender.plants.vibrotactile import PlateParameters
 from hapticrender.sweep import errors, sweep, worst_error
 from hapticrender.touch.mechanics import HEAVY, HEAVY_SECOND, LIGHT, LIGHT_SECOND

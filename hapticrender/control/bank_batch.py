@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
@@ -39,8 +40,10 @@ def batch_of(controllers: Sequence[BankController]) -> tuple[BankTables, BankSta
     first = controllers[0]
     tables, state, bands = first.tables, first.state, first.n_bands
     tones = side_by_side([each.tables.tone.T for each in controllers])  # (bands, TONE_ROWS, W)
-    many = {name: side_by_side([getattr(each.tables, name) for each in controllers]) for name in _TABLES}
-    own = {name: side_by_side([getattr(each.state, name) for each in controllers]) for name in _STATE}
+    many: dict[str, Any] = {
+        name: side_by_side([getattr(each.tables, name) for each in controllers]) for name in _TABLES
+    }
+    own: dict[str, Any] = {name: side_by_side([getattr(each.state, name) for each in controllers]) for name in _STATE}
     return tables._replace(tone=tones, **many), state._replace(
         band=aligned((bands, row.BAND_ROWS, LANES)),
         loop=aligned((bands, state.loop.shape[1], LANES)),

@@ -107,7 +107,7 @@ def simulate(scenarios: Sequence[Scenario], seconds: float, *, method: str = "h2
     found: dict[int, Played] = {}
     for group in _groups(scenarios, controllers):
         few, banks = [scenarios[index] for index in group], [controllers[index] for index in group]
-        played = _together(few, banks, seconds) if len(few) > 1 else [_alone(few[0], banks[0], seconds)]
+        played = together(few, banks, seconds) if len(few) > 1 else [_alone(few[0], banks[0], seconds)]
         found |= dict(zip(group, played, strict=True))
     return [found[index] for index in range(len(scenarios))]
 
@@ -148,7 +148,7 @@ def _alone(scenario: Scenario, controller: Controller, seconds: float) -> Played
     )
 
 
-def _together(scenarios: Sequence[Scenario], controllers: Sequence[Controller], seconds: float) -> list[Played]:
+def together(scenarios: Sequence[Scenario], controllers: Sequence[Controller], seconds: float) -> list[Played]:
     """At most `LANES` scenarios that fit each other."""
     plates = [Plate(each.plate, each.finger, each.seed) for each in scenarios]
     samples = int(round(seconds * plates[0].rate))
