@@ -45,7 +45,7 @@ clean: ## remove the environment and everything that was built or written
 
 .venv/demo.stamp: .venv/made.stamp pyproject.toml
 	@echo "installing hapticrender into .venv"
-	@$(RUN) -m pip install --quiet --disable-pip-version-check --editable '.[plot,hdf5]'
+	@$(RUN) -m pip install --quiet --disable-pip-version-check --editable '.[all]'
 	@touch $@
 
 .venv/test.stamp: .venv/made.stamp pyproject.toml
