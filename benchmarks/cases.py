@@ -19,7 +19,7 @@ from scenes import Batch, absent
 from hapticrender.batch import LANES, simulate
 from hapticrender.control.analyser import Analyser
 from hapticrender.control.block_kernels import block_run
-from hapticrender.control.polar_kernels import polar_run
+from hapticrender.control.polar_passes import polar_run
 from hapticrender.sweep import sweep, worst_error
 
 FEW = 400  # samples of the numpy loop
@@ -59,7 +59,7 @@ def polar_against_c(bands: int, precision: str, pairs: int) -> Iterator[Figure]:
     samples = 64 * max(4, 4000 // bands)
     sensed, nothing = 1e-6 * np.random.default_rng(0).standard_normal((samples, 2)), np.zeros(samples)
     sides = np.ascontiguousarray(sensed @ controller.tables.listen.T)
-    drive, target, flags = np.zeros((samples, 2)), np.zeros((samples, bands), complex), np.zeros(samples, np.int64)
+    drive, target, flags = np.zeros((samples, 2)), np.zeros((1, bands), complex), np.zeros(samples, np.int64)
 
     def ours():
         polar_run(controller.tables, controller.state, sensed, nothing, nothing, drive, target, flags)
