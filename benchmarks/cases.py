@@ -4,6 +4,7 @@ import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
+from multiprocessing import get_context
 
 import native
 import numpy as np
@@ -12,7 +13,7 @@ import startup
 from native import NaivePolar, NoCompiler, TunedBlock, TunedPolar
 from numpy_loop import NumpyPlate, NumpyPolar
 from numpy_loop import run as numpy_run
-from pairing import CORES, interleave, use_all_cores
+from pairing import CORES, interleave, use
 from peers import Absent, PythonControl, ScipyLockIn, SlidingDFT
 from scenes import Batch, absent
 
@@ -178,7 +179,7 @@ def batches(seconds: float, pairs: int) -> Iterator[Figure]:
         return
     many = scenes.scenarios(8 * LANES, scenes.TOUCHING, scenes.PLATE.sensor_noise)
     runs = []
-    pools = [ProcessPoolExecutor(workers, initializer=use_all_cores) for workers in (2, 1)]
+    pools = [ProcessPoolExecutor(workers, get_context("spawn"), use, (CORES,)) for workers in (2, 1)]
     try:
         for pool in pools:
             runs.append(lambda pool=pool: sweep(many, seconds, worst_error, executor=pool, at_a_time=LANES))

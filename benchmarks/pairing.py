@@ -27,10 +27,10 @@ def keep_to_one_core() -> None:
         os.sched_setaffinity(0, {max(CORES)})
 
 
-def use_all_cores() -> None:
-    """Undo that, in a process that works beside others."""
+def use(cores: set[int]) -> None:
+    """Run on any of these, in a process that works beside others."""
     if hasattr(os, "sched_setaffinity"):
-        os.sched_setaffinity(0, CORES)
+        os.sched_setaffinity(0, cores)
 
 
 def seconds(run: Run) -> float:

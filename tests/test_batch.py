@@ -2,6 +2,7 @@
 
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from dataclasses import replace
+from multiprocessing import get_context
 
 import numpy as np
 import pytest
@@ -131,7 +132,11 @@ def test_what_it_refuses():
         errors(alone(scenarios()[0], 0.3))
 
 
-@pytest.mark.parametrize("pool", [None, ThreadPoolExecutor, ProcessPoolExecutor])
+def processes(count):
+    return ProcessPoolExecutor(count, get_context("spawn"))
+
+
+@pytest.mark.parametrize("pool", [None, ThreadPoolExecutor, processes])
 def test_any_executor_gives_the_same(pool):
     wanted = [replace(each, seed=seed) for each in scenarios() for seed in range(2)]
     expected = [worst_error(each) for each in simulate(wanted, 1.0)]

@@ -2,7 +2,7 @@
 
 Where carriers and targets stay and sensors are believed, nothing of a sample waits for the one before it but two short
 recursions.  In a pass of its own each of them runs beside the other coordinate's, and the rest is free of them, so that
-the processor works on many samples at once.  The arithmetic is that of `polar_kernels.tile_step`.
+the processor works on many samples at once.  The arithmetic is that of `polar_kernels.tile_step`, to rounding.
 """
 
 from __future__ import annotations
