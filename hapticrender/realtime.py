@@ -143,19 +143,8 @@ class RealtimeEntry:
         return int(callback(_plain, types.int32, doubles, doubles, types.uint64, self._pointer).address)
 
     def send(self, bands: Bands) -> None:
-        """Hand over other targets; they are taken up at the next block.
-
-        Raises
-        ------
-        ValueError
-            Their number differs from what was designed for, or they have no constant envelope.
-        """
-        if bands.envelope is None:
-            raise ValueError("the targets are a waveform: must be constant envelopes (`Bands.envelope`)")
-        tone = bands.tone()
-        if tone.shape[1] != self.controller.n_bands:
-            raise ValueError(f"{tone.shape[1]} bands: must be {self.controller.n_bands}, as designed for")
-        self._now[HEAD:] = tone.ravel()
+        """Hand over other targets, for the next block; see `BlockController.fitting` for the errors."""
+        self._now[HEAD:] = self.controller.fitting(bands).ravel()
         self._now[TONE_NEWS] += 1
         self._hand_over()
 

@@ -9,7 +9,7 @@ import numpy as np
 from hapticrender._lanes import WIDTH, aligned, padded
 from hapticrender.bands import Bands
 from hapticrender.control import bank_rows as row
-from hapticrender.control.bank import BankController, settled_share
+from hapticrender.control.bank import BankController, settled_share, spacing
 from hapticrender.control.bank_state import PRECISIONS, BankNumbers, BankTables, bank_state
 from hapticrender.control.block_kernels import (
     CHANNEL_ROWS,
@@ -62,6 +62,8 @@ class BlockController:
             raise ValueError(f"{len(tables.shape)} coordinates: must be <= {MOST_COORDINATES} in blocks")
         self.method = controller.method
         self.n_bands = controller.n_bands
+        frequency, wavenumber, *_ = tables.tone.copy()
+        self._designed = Bands(frequency=frequency, wavenumber=wavenumber, phase=np.zeros(self.n_bands))
         self.block = block
         self.note = f"{controller.note}\nin blocks of {block} samples, {precision} precision"
         self.tables = BlockTables(
@@ -81,20 +83,33 @@ class BlockController:
         return np.mod(self.state.phase[:, TURNS].ravel()[: self.n_bands] - phase, 1.0)
 
     def send(self, bands: Bands) -> None:
-        """Take up other targets at the next block.
+        """Take up other targets at the next block; see `fitting` for the errors."""
+        self.tables.bank.tone[:] = self.fitting(bands)
+        self.state.news[0] = 1
+
+    def fitting(self, bands: Bands) -> Array:
+        """Return the rows of other targets, if this design can bear them: its bandwidths rest on the carriers.
 
         Raises
         ------
         ValueError
-            Their number differs from what was designed for, or they have no constant envelope where that was.
+            Their number differs from what was designed for, they are a waveform where that was none, or the other way
+            round; others follow the finger; a carrier is lower, or two are nearer, than any that was designed for.
         """
-        tone = bands.tone()
-        if tone.shape[1] != self.n_bands:
-            raise ValueError(f"{tone.shape[1]} bands: must be {self.n_bands}, as designed for")
+        if len(bands) != self.n_bands:
+            raise ValueError(f"{len(bands)} bands: must be {self.n_bands}, as designed for")
         if (bands.envelope is None) != self.tables.bank.numbers.analysed:
             raise ValueError("the targets are a waveform: must be constant envelopes, as designed for")
-        self.tables.bank.tone[:] = tone
-        self.state.news[0] = 1
+        follows, followed = ((each > 0.0) for each in (bands.wavenumber, self._designed.wavenumber))
+        if (follows != followed).any():
+            raise ValueError(f"bands {np.flatnonzero(follows != followed)}: must follow the finger as designed for")
+        for what, now, then in (
+            ("lowest fixed carrier", _lowest(bands), _lowest(self._designed)),
+            ("least spacing", spacing(bands), spacing(self._designed)),
+        ):
+            if now < then * (1.0 - 1e-9):
+                raise ValueError(f"{what} of {now:g} Hz: must be >= {then:g} Hz, as designed for")
+        return bands.tone()
 
     def run(self, sensed: Array, position: Array, wanted: Array) -> tuple[Array, Array, Array]:
         """Digest whole blocks; see `Controller`.
@@ -114,6 +129,11 @@ class BlockController:
         block_run(self.tables, self.state, *arrays, drive, target, flags)
         held = np.broadcast_to(target[:, None], (len(target), self.block, self.n_bands))  # copied only where it must be
         return drive, held.reshape(n, self.n_bands), flags
+
+
+def _lowest(bands: Bands) -> float:
+    """Lowest carrier that does not follow the finger, Hz; infinite where all do."""
+    return float(np.min(bands.frequency[bands.wavenumber == 0.0], initial=math.inf))
 
 
 def numbers_of_blocks(numbers: BankNumbers, block: int) -> BankNumbers:
