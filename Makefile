@@ -25,7 +25,7 @@ lint: .venv/test.stamp ## check style, formatting and types
 	@$(RUN) -m ruff format --check .
 	@$(RUN) -m mypy
 
-bench: .venv/test.stamp ## measure every figure of speed beside its target (BENCH_ARGS="--short" as CI does)
+bench: .venv/bench.stamp ## measure every figure of speed beside its target (BENCH_ARGS="--short" as CI does)
 	@$(RUN) benchmarks/run.py $(BENCH_ARGS)
 
 picture: .venv/demo.stamp ## draw the pictures in README.md anew
@@ -52,3 +52,8 @@ clean: ## remove the environment and everything that was built or written
 	@echo "installing hapticrender and its test tools into .venv"
 	@$(RUN) -m pip install --quiet --disable-pip-version-check --editable '.[all,test]'
 	@touch $@ .venv/demo.stamp
+
+.venv/bench.stamp: .venv/test.stamp
+	@echo "installing what the benchmarks compare with into .venv"
+	@$(RUN) -m pip install --quiet --disable-pip-version-check --editable '.[bench]'
+	@touch $@

@@ -12,11 +12,14 @@ from native import NaivePolar, NoCompiler, TunedBlock, TunedPolar
 from numpy_loop import NumpyPlate, NumpyPolar
 from numpy_loop import run as numpy_run
 from pairing import interleave
+from peers import LockIn, NoPeer, SlidingDft, in_blocks, open_loop
 
+from hapticrender.control.analyser import Analyser
 from hapticrender.control.block_kernels import block_run
 from hapticrender.control.polar_kernels import polar_run
 
 FEW = 400  # samples of the numpy loop
+BANDWIDTH = 10.0  # Hz, of the analysis
 DTYPES = {"double": np.float64, "single": np.float32}
 
 
@@ -101,8 +104,59 @@ def block_against_c(bands: int, precision: str, pairs: int) -> Iterator[Figure]:
         yield Figure(name, share, "% of a core", {"double": 2.0, "single": 1.0}[precision], False, "on AVX-512")
 
 
+def _analysis(bands: int) -> tuple[Analyser, np.ndarray]:
+    """Analyser of two channels at 48 kHz on the bins of a sliding DFT, and noise for it."""
+    frequency = 0.5 * scenes.CARD / bands * np.arange(bands)
+    samples = np.random.default_rng(0).standard_normal((scenes.BLOCK * max(8, 4000 // bands), 2))
+    return Analyser(frequency, BANDWIDTH, scenes.CARD, channels=2), samples
+
+
+def _faster(bands: int, run: Callable[[np.ndarray], object], goal: float, who: str, pairs: int) -> Figure:
+    """How much sooner the analyser is through the same blocks, into memory made beforehand."""
+    analyser, samples = _analysis(bands)
+    ours, room = analyser.run, analyser.room(scenes.BLOCK)
+    paired = interleave(
+        lambda: in_blocks(lambda block: ours(block, out=room), samples), lambda: in_blocks(run, samples), pairs
+    )
+    spent, theirs = (each / samples.size / bands * 1e9 for each in (paired.candidate, paired.reference))
+    note = f"{spent:.2f} against {theirs:.1f} ns a band-sample and channel"
+    name = f"analysis alone, {bands} bands x 2: times faster than {who.split('.')[0]}"
+    return Figure(name, paired.ratio, "x", goal, True, who, note)
+
+
+def analysis_against_scipy(bands: int, pairs: int) -> Iterator[Figure]:
+    """The STDFT* in blocks of 64 from Python against scipy's lock-in; envelopes are compared first."""
+    analyser, samples = _analysis(bands)
+    lock_in = LockIn(analyser.frequency, BANDWIDTH, scenes.CARD, channels=2)
+    for start in range(0, len(samples), scenes.BLOCK):
+        block = samples[start : start + scenes.BLOCK]
+        found, expected = analyser.run(block), lock_in.run(block)
+        np.testing.assert_allclose(found, expected, rtol=0, atol=1e-9 * abs(expected).max())
+    yield _faster(bands, lock_in.run, 10.0, "scipy.signal.sosfilt", pairs)
+
+
+def analysis_against_sdft(bands: int, pairs: int) -> Iterator[Figure]:
+    """The STDFT* in blocks of 64 from Python against sliding DFTs; both first find a tone in the middle."""
+    analyser, sliding = _analysis(bands)[0], SlidingDft(bands, channels=2)
+    phase = 2 * np.pi * analyser.frequency[bands // 2] / scenes.CARD * np.arange(240 * scenes.BLOCK)
+    tone = np.stack([np.cos(phase), np.cos(phase)], axis=1)
+    found, expected = abs(in_blocks(analyser.run, tone)[-1, 0]), 2 * abs(in_blocks(sliding.run, tone)[0][-1])
+    np.testing.assert_allclose([found[bands // 2], expected[bands // 2]], 1.0, rtol=1e-3)
+    yield _faster(bands, sliding.run, 15.0, "sdft.SDFT, boxcar", pairs)
+
+
+def _open_loop_note(pairs: int) -> str:
+    """What python-control makes of a second of the free plate without a controller."""
+    try:
+        forced, stepped = open_loop(scenes.PLATE, pairs)
+    except NoPeer as missing:
+        return f"python-control left out: {missing}"
+    return f"python-control, open loop: {forced:.0f} (forced_response), {stepped:.1f} (input_output_response) s/s"
+
+
 def simulation(method: str, goal: float, seconds: float, pairs: int) -> Iterator[Figure]:
     """Plate with a heavy finger sliding on it, 8 bands, adaptation on, against the numpy loop of the paper's method."""
+    aside = _open_loop_note(pairs)
     for what, parameters in (
         ("ideal sensors", replace(scenes.PLATE, sensor_noise=0.0)),
         ("sensor noise drawn", scenes.PLATE),
@@ -115,7 +169,8 @@ def simulation(method: str, goal: float, seconds: float, pairs: int) -> Iterator
         rate = seconds / paired.candidate
         ratio = rate / (FEW / parameters.rate / paired.reference)
         name = f"closed loop, 8 bands, {method}, sliding finger, {what}"
-        yield Figure(name, rate, "s/s", goal, True, "simulated seconds a second", f"{ratio:.0f}x the numpy loop")
+        note = f"{ratio:.0f}x the numpy loop; {aside}"
+        yield Figure(name, rate, "s/s", goal, True, "simulated seconds a second", note)
 
 
 def linear_in_bands(pairs: int) -> Iterator[Figure]:
@@ -172,6 +227,9 @@ def every_case(short: bool) -> Iterator[tuple[str, Callable[[], Iterator[Figure]
     for bands in (512,) if short else (8, 64, 512):
         for precision in DTYPES:
             yield f"blocks {bands} {precision}", lambda b=bands, p=precision: block_against_c(b, p, pairs)
+    for bands in (64,) if short else (8, 64, 512):
+        yield f"peers scipy {bands}", lambda b=bands: analysis_against_scipy(b, pairs)
+        yield f"peers sdft {bands}", lambda b=bands: analysis_against_sdft(b, pairs)
     for method, goal in (("h2", 1500.0), ("paper", 2500.0)):
         seconds = 1.0 if short else 10.0
         yield f"simulation {method}", lambda m=method, g=goal, s=seconds: simulation(m, g, s, pairs)
@@ -180,4 +238,4 @@ def every_case(short: bool) -> Iterator[tuple[str, Callable[[], Iterator[Figure]
     yield "startup", lambda: start_up(1 if short else 5)
 
 
-__all__ = ["Figure", "NoCompiler", "every_case", "native"]
+__all__ = ["Figure", "NoCompiler", "NoPeer", "every_case", "native"]

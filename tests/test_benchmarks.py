@@ -60,6 +60,40 @@ def test_the_c_reference_in_blocks_is_the_same_controller(benchmarks, precision,
     np.testing.assert_allclose(tuned.run(sensed), found, rtol=0, atol=bound * abs(found).max())
 
 
+def test_the_lock_in_of_scipy_is_the_same_analysis(benchmarks, rng):
+    """Envelopes of 20 bands in the fourth block of noise."""
+    from peers import LockIn, in_blocks
+
+    from hapticrender.control.analyser import Analyser
+
+    frequency, samples = np.linspace(0.0, 1000.0, 20), rng.standard_normal((256, 2))
+    found = in_blocks(Analyser(frequency, 10.0, 48_000.0, channels=2).run, samples)
+    expected = in_blocks(LockIn(frequency, 10.0, 48_000.0, channels=2).run, samples)
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1.3e-10 * abs(expected).max())
+
+
+def test_the_plate_of_python_control_is_the_same_plate(benchmarks):
+    """`open_loop` compares its outputs with the numpy plate's before it measures."""
+    pytest.importorskip("control")
+    import scenes
+    from peers import open_loop
+
+    assert min(open_loop(scenes.PLATE, 1)) > 0
+
+
+def test_a_peer_that_is_not_there_is_left_out(benchmarks, monkeypatch, capsys):
+    import run
+    from peers import NoPeer, peer
+
+    monkeypatch.setitem(sys.modules, "sdft", None)
+    with pytest.raises(NoPeer, match="sdft is not installed"):
+        peer("sdft")
+    monkeypatch.setattr(run, "keep_to_one_core", lambda: None)
+    monkeypatch.setattr(sys, "argv", ["run.py", "--short", "--only", "peers sdft"])
+    assert run.main() == 0
+    assert "peers sdft 64: left out: sdft is not installed" in capsys.readouterr().out
+
+
 def test_pairs_are_taken_in_turns(benchmarks):
     from pairing import interleave
 

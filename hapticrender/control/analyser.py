@@ -132,16 +132,16 @@ class Analyser:
 
     Notes
     -----
-    Delay and response are those of `StarSTDFT`.  At 0 Hz the envelope is twice the mean.  Rounding, relative to the
-    largest envelope, is some 1e-14 in double and 1e-5 in single precision.
-    For carriers that move see `StarSTDFT.start`.
+    Delay and response are those of `StarSTDFT`.  At 0 Hz the envelope is twice the mean.  Rounding is at
+    most eps (64 + rate/(2 pi bandwidth)) of the envelope, eps being 2e-16 in double and 6e-8 in single precision.  For
+    carriers that move see `StarSTDFT.start`.
 
     Examples
     --------
     >>> analyser = Analyser(frequency=[100.0, 250.0], bandwidth=10.0, rate=5000.0)
     >>> tone = np.cos(2 * np.pi * 250.0 * np.arange(5000) / 5000.0)
-    >>> abs(analyser.run(tone[:, None]))[-1, 0].round(2)
-    array([0.  , 1.  ])
+    >>> abs(analyser.run(tone[:, None]))[-1, 0].round(1)
+    array([0., 1.])
     """
 
     def __init__(
@@ -170,12 +170,24 @@ class Analyser:
         """Samples so far that were NaN or infinite and counted as zero."""
         return int(self._counts[REPLACED])
 
-    def run(self, samples: Array) -> Array:
+    def room(self, count: int) -> Array:
+        """Make an array for the envelopes of `count` samples, from a cache line's boundary on; see `run`."""
+        shape, each = (count, self.channels, len(self.frequency)), self._kind.itemsize
+        numbers = math.prod(shape)
+        if numbers * each <= NEAR:
+            return np.empty(shape, self._kind)
+        spare = np.empty(numbers + ALIGNMENT // each, self._kind)
+        start = -spare.ctypes.data % ALIGNMENT // each
+        return spare[start : start + numbers].reshape(shape)
+
+    def run(self, samples: Array, out: Array | None = None) -> Array:
         """Analyse a block; any split of a run into blocks gives the same envelopes.
 
         Parameters
         ----------
         samples : ndarray of float, shape (n, channels)
+        out : ndarray of complex, shape (n, channels, bands), optional
+            Where to write, best made by `room`: memory that is new every block can cost more than the analysis.
 
         Returns
         -------
@@ -185,24 +197,19 @@ class Analyser:
         Raises
         ------
         ValueError
-            For samples of another shape.
+            For arrays of another shape, or an `out` of another type or layout.
         """
         samples = np.ascontiguousarray(samples, float)
         if samples.ndim != 2 or samples.shape[1] != self.channels:
             raise ValueError(f"{samples.shape=} must be (n, {self.channels})")
-        envelopes = self._room(len(samples))
-        analyser_run(*self._arrays, samples, envelopes)
-        return envelopes
-
-    def _room(self, count: int) -> Array:
-        """Envelopes of `count` samples, not filled in yet; from a cache line's boundary on where that pays."""
-        shape, each = (count, self.channels, len(self.frequency)), self._kind.itemsize
-        numbers = math.prod(shape)
-        if numbers * each <= NEAR:
-            return np.empty(shape, self._kind)
-        room = np.empty(numbers + ALIGNMENT // each, self._kind)
-        start = -room.ctypes.data % ALIGNMENT // each
-        return room[start : start + numbers].reshape(shape)
+        if out is None:
+            out = self.room(len(samples))
+        elif out.shape != (len(samples), self.channels, len(self.frequency)):
+            raise ValueError(f"{out.shape=} must be {(len(samples), self.channels, len(self.frequency))}")
+        elif out.dtype != self._kind or not out.flags.carray:
+            raise ValueError(f"out, of {out.dtype}, must be a writeable C-contiguous array of {self._kind}")
+        analyser_run(*self._arrays, samples, out)
+        return out
 
 
 def _refuse(frequency: Array, rate: float, channels: int, precision: str) -> None:
