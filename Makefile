@@ -55,5 +55,5 @@ clean: ## remove the environment and everything that was built or written
 
 .venv/bench.stamp: .venv/test.stamp
 	@echo "installing what the benchmarks compare with into .venv"
-	@$(RUN) -m pip install --quiet --disable-pip-version-check --editable '.[bench]'
+	@$(RUN) -m pip install --quiet --disable-pip-version-check --editable '.[all,test,bench]'
 	@touch $@

@@ -2,7 +2,9 @@
 
 import time
 from collections.abc import Callable, Iterator
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
+from multiprocessing import get_context
 
 import native
 import numpy as np
@@ -11,15 +13,17 @@ import startup
 from native import NaivePolar, NoCompiler, TunedBlock, TunedPolar
 from numpy_loop import NumpyPlate, NumpyPolar
 from numpy_loop import run as numpy_run
-from pairing import interleave
-from peers import LockIn, NoPeer, SlidingDft, in_blocks, open_loop
+from pairing import CORES, interleave, use
+from peers import Absent, PythonControl, ScipyLockIn, SlidingDFT
+from scenes import Batch, absent
 
+from hapticrender.batch import LANES, simulate
 from hapticrender.control.analyser import Analyser
 from hapticrender.control.block_kernels import block_run
-from hapticrender.control.polar_kernels import polar_run
+from hapticrender.control.polar_passes import polar_run
+from hapticrender.sweep import sweep, worst_error
 
 FEW = 400  # samples of the numpy loop
-BANDWIDTH = 10.0  # Hz, of the analysis
 DTYPES = {"double": np.float64, "single": np.float32}
 
 
@@ -56,7 +60,7 @@ def polar_against_c(bands: int, precision: str, pairs: int) -> Iterator[Figure]:
     samples = 64 * max(4, 4000 // bands)
     sensed, nothing = 1e-6 * np.random.default_rng(0).standard_normal((samples, 2)), np.zeros(samples)
     sides = np.ascontiguousarray(sensed @ controller.tables.listen.T)
-    drive, target, flags = np.zeros((samples, 2)), np.zeros((samples, bands), complex), np.zeros(samples, np.int64)
+    drive, target, flags = np.zeros((samples, 2)), np.zeros((1, bands), complex), np.zeros(samples, np.int64)
 
     def ours():
         polar_run(controller.tables, controller.state, sensed, nothing, nothing, drive, target, flags)
@@ -104,59 +108,8 @@ def block_against_c(bands: int, precision: str, pairs: int) -> Iterator[Figure]:
         yield Figure(name, share, "% of a core", {"double": 2.0, "single": 1.0}[precision], False, "on AVX-512")
 
 
-def _analysis(bands: int) -> tuple[Analyser, np.ndarray]:
-    """Analyser of two channels at 48 kHz on the bins of a sliding DFT, and noise for it."""
-    frequency = 0.5 * scenes.CARD / bands * np.arange(bands)
-    samples = np.random.default_rng(0).standard_normal((scenes.BLOCK * max(8, 4000 // bands), 2))
-    return Analyser(frequency, BANDWIDTH, scenes.CARD, channels=2), samples
-
-
-def _faster(bands: int, run: Callable[[np.ndarray], object], goal: float, who: str, pairs: int) -> Figure:
-    """How much sooner the analyser is through the same blocks, into memory made beforehand."""
-    analyser, samples = _analysis(bands)
-    ours, room = analyser.run, analyser.room(scenes.BLOCK)
-    paired = interleave(
-        lambda: in_blocks(lambda block: ours(block, out=room), samples), lambda: in_blocks(run, samples), pairs
-    )
-    spent, theirs = (each / samples.size / bands * 1e9 for each in (paired.candidate, paired.reference))
-    note = f"{spent:.2f} against {theirs:.1f} ns a band-sample and channel"
-    name = f"analysis alone, {bands} bands x 2: times faster than {who.split('.')[0]}"
-    return Figure(name, paired.ratio, "x", goal, True, who, note)
-
-
-def analysis_against_scipy(bands: int, pairs: int) -> Iterator[Figure]:
-    """The STDFT* in blocks of 64 from Python against scipy's lock-in; envelopes are compared first."""
-    analyser, samples = _analysis(bands)
-    lock_in = LockIn(analyser.frequency, BANDWIDTH, scenes.CARD, channels=2)
-    for start in range(0, len(samples), scenes.BLOCK):
-        block = samples[start : start + scenes.BLOCK]
-        found, expected = analyser.run(block), lock_in.run(block)
-        np.testing.assert_allclose(found, expected, rtol=0, atol=1e-9 * abs(expected).max())
-    yield _faster(bands, lock_in.run, 10.0, "scipy.signal.sosfilt", pairs)
-
-
-def analysis_against_sdft(bands: int, pairs: int) -> Iterator[Figure]:
-    """The STDFT* in blocks of 64 from Python against sliding DFTs; both first find a tone in the middle."""
-    analyser, sliding = _analysis(bands)[0], SlidingDft(bands, channels=2)
-    phase = 2 * np.pi * analyser.frequency[bands // 2] / scenes.CARD * np.arange(240 * scenes.BLOCK)
-    tone = np.stack([np.cos(phase), np.cos(phase)], axis=1)
-    found, expected = abs(in_blocks(analyser.run, tone)[-1, 0]), 2 * abs(in_blocks(sliding.run, tone)[0][-1])
-    np.testing.assert_allclose([found[bands // 2], expected[bands // 2]], 1.0, rtol=1e-3)
-    yield _faster(bands, sliding.run, 15.0, "sdft.SDFT, boxcar", pairs)
-
-
-def _open_loop_note(pairs: int) -> str:
-    """What python-control makes of a second of the free plate without a controller."""
-    try:
-        forced, stepped = open_loop(scenes.PLATE, pairs)
-    except NoPeer as missing:
-        return f"python-control left out: {missing}"
-    return f"python-control, open loop: {forced:.0f} (forced_response), {stepped:.1f} (input_output_response) s/s"
-
-
 def simulation(method: str, goal: float, seconds: float, pairs: int) -> Iterator[Figure]:
     """Plate with a heavy finger sliding on it, 8 bands, adaptation on, against the numpy loop of the paper's method."""
-    aside = _open_loop_note(pairs)
     for what, parameters in (
         ("ideal sensors", replace(scenes.PLATE, sensor_noise=0.0)),
         ("sensor noise drawn", scenes.PLATE),
@@ -169,8 +122,83 @@ def simulation(method: str, goal: float, seconds: float, pairs: int) -> Iterator
         rate = seconds / paired.candidate
         ratio = rate / (FEW / parameters.rate / paired.reference)
         name = f"closed loop, 8 bands, {method}, sliding finger, {what}"
-        note = f"{ratio:.0f}x the numpy loop; {aside}"
+        note = f"{ratio:.0f}x the numpy loop{beside_control(rate, pairs)}"
         yield Figure(name, rate, "s/s", goal, True, "simulated seconds a second", note)
+
+
+def beside_control(rate: float, pairs: int) -> str:
+    """Words on python-control's open loop of the free plate for a second in the same run, where it is installed."""
+    try:
+        peer = PythonControl(scenes.PLATE)
+    except Absent as missing:
+        return f"; python-control left out: {missing}"
+    current = 0.1 * np.random.default_rng(0).standard_normal((int(scenes.PLATE.rate), 2))
+    paired = interleave(lambda: peer.forced(current), lambda: peer.stepped(current), pairs)
+    forced, stepped = 1 / paired.candidate, 1 / paired.reference
+    figures = f"{forced:.0f} s/s by forced_response, {stepped:.0f} by input_output_response"
+    return f", {rate / forced:.0f}x python-control's open loop of the bare plate ({figures})"
+
+
+def one_by_one(run: Callable[[np.ndarray], object], parts: list[np.ndarray]) -> None:
+    """Hand over blocks, keeping nothing: memory that is held back makes the next block's new."""
+    for part in parts:
+        run(part)
+
+
+def analysis(bands: int, pairs: int) -> Iterator[Figure]:
+    """The lock-in alone, 2 channels in blocks of 64: against scipy's filters and the sliding DFT of `sdft`."""
+    frequency, rate, blocks = np.linspace(20.0, 2000.0, bands), scenes.CARD, max(8, 4000 // bands)
+    signal = np.random.default_rng(0).standard_normal((blocks * scenes.BLOCK, 2))
+    parts = np.split(signal, blocks)
+    ours, filters = Analyser(frequency, 5.0, rate, channels=2), ScipyLockIn(frequency, 5.0, rate, 2)
+    for part in parts:
+        found, expected = ours.run(part), filters.run(part)
+        if not abs(found - expected).max() <= 1e-9 * abs(expected).max():
+            raise RuntimeError(f"analysis, {bands} bands: envelopes differ by {abs(found - expected).max()}")
+    out = ours.room(scenes.BLOCK)
+    for who, peer, goal in (
+        ("scipy.signal.sosfilt", lambda: filters, 10.0),
+        ("the sdft package", lambda: SlidingDFT(bands, 2), 15.0),
+    ):
+        reference = peer()
+        paired = interleave(
+            lambda: one_by_one(lambda part: ours.run(part, out), parts),
+            lambda reference=reference: one_by_one(reference.run, parts),
+            pairs,
+        )
+        spent, theirs = (each / signal.size / bands * 1e9 for each in (paired.candidate, paired.reference))
+        note = f"{spent:.2f} against {theirs:.1f} ns a band-sample and channel"
+        yield Figure(f"analysis alone, {bands} bands: times faster than", paired.ratio, "x", goal, True, who, note)
+
+
+def batches(seconds: float, pairs: int) -> Iterator[Figure]:
+    """Scenarios side by side on one core, 8 bands, default method; then a sweep on two processes over one."""
+    for what, finger, noise in (
+        ("free plate, ideal sensors", absent(), 0.0),
+        ("heavy finger at rest, ideal sensors", scenes.RESTING, 0.0),
+        ("heavy finger sliding, noise drawn", scenes.TOUCHING, scenes.PLATE.sensor_noise),
+    ):
+        many = scenes.scenarios(LANES, finger, noise)
+        run = Batch(many)
+        paired = interleave(lambda run=run: run.advance(seconds), lambda many=many: simulate(many[:1], seconds), pairs)
+        rate, one = LANES * seconds / paired.candidate, seconds / paired.reference
+        note = f"{rate / one:.1f}x one by one"
+        yield Figure(f"batch, 8 bands, {what}", rate, "s/s", 5000.0, True, "scenario-seconds a second and core", note)
+    if len(CORES) < 2:
+        return
+    many = scenes.scenarios(8 * LANES, scenes.TOUCHING, scenes.PLATE.sensor_noise)
+    runs = []
+    pools = [ProcessPoolExecutor(workers, get_context("spawn"), use, (CORES,)) for workers in (2, 1)]
+    try:
+        for pool in pools:
+            runs.append(lambda pool=pool: sweep(many, seconds, worst_error, executor=pool, at_a_time=LANES))
+        paired = interleave(runs[0], runs[1], pairs)
+    finally:
+        for pool in pools:
+            pool.shutdown()
+    rate = len(many) * seconds / paired.candidate
+    note = f"{rate:.0f} scenario-seconds a second, judged"
+    yield Figure("sweep on two cores: times faster than", paired.ratio, "x", 1.8, True, "the same on one", note)
 
 
 def linear_in_bands(pairs: int) -> Iterator[Figure]:
@@ -227,15 +255,15 @@ def every_case(short: bool) -> Iterator[tuple[str, Callable[[], Iterator[Figure]
     for bands in (512,) if short else (8, 64, 512):
         for precision in DTYPES:
             yield f"blocks {bands} {precision}", lambda b=bands, p=precision: block_against_c(b, p, pairs)
-    for bands in (64,) if short else (8, 64, 512):
-        yield f"peers scipy {bands}", lambda b=bands: analysis_against_scipy(b, pairs)
-        yield f"peers sdft {bands}", lambda b=bands: analysis_against_sdft(b, pairs)
     for method, goal in (("h2", 1500.0), ("paper", 2500.0)):
         seconds = 1.0 if short else 10.0
         yield f"simulation {method}", lambda m=method, g=goal, s=seconds: simulation(m, g, s, pairs)
+    for bands in (64,) if short else (8, 64, 512):
+        yield f"peers analysis {bands}", lambda b=bands: analysis(b, pairs)
+    yield "batch", lambda: batches(0.5 if short else 2.0, pairs)
     yield "linear", lambda: linear_in_bands(pairs)
     yield "hours", lambda: hours_of_play(0.01 if short else 10.0)
     yield "startup", lambda: start_up(1 if short else 5)
 
 
-__all__ = ["Figure", "NoCompiler", "NoPeer", "every_case", "native"]
+__all__ = ["Absent", "Figure", "NoCompiler", "every_case", "native"]

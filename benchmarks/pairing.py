@@ -18,10 +18,19 @@ class Paired:
     ratio: float
 
 
+CORES = os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else set(range(os.cpu_count() or 1))
+
+
 def keep_to_one_core() -> None:
     """Stay on the core that runs this process, where the system can tell it to."""
     if hasattr(os, "sched_setaffinity"):
-        os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})
+        os.sched_setaffinity(0, {max(CORES)})
+
+
+def use(cores: set[int]) -> None:
+    """Run on any of these, in a process that works beside others."""
+    if hasattr(os, "sched_setaffinity"):
+        os.sched_setaffinity(0, cores)
 
 
 def seconds(run: Run) -> float:

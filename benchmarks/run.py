@@ -13,7 +13,7 @@ import sys
 from dataclasses import asdict
 from pathlib import Path
 
-from cases import Figure, NoCompiler, NoPeer, every_case
+from cases import Absent, Figure, NoCompiler, every_case
 from pairing import keep_to_one_core
 
 
@@ -42,7 +42,7 @@ def main() -> int:
                 show(figure)
                 sys.stdout.flush()
                 figures.append(figure)
-        except (NoCompiler, NoPeer) as missing:
+        except (Absent, NoCompiler) as missing:
             print(f"{name}: left out: {missing}")
     if arguments.json:
         arguments.json.write_text(json.dumps([asdict(each) | {"met": each.met} for each in figures], indent=2) + "\n")

@@ -7,9 +7,11 @@ import numpy as np
 import hapticrender as hr
 from hapticrender.accuracy import SLIDING
 from hapticrender.bands import Bands
+from hapticrender.batch import Scenario, together
 from hapticrender.control.block import BlockController
 from hapticrender.control.methods import METHODS
 from hapticrender.plants.vibrotactile import Plate, PlateParameters
+from hapticrender.touch.mechanics import HEAVY
 
 PLATE = PlateParameters()
 CARD = 48000.0  # Hz: a sound card
@@ -55,6 +57,30 @@ def closed_loop(method, bands, samples, finger=TOUCHING, parameters=PLATE):
     controller = METHODS[method].design(parameters.band_model(parameters.rate, parameters.delay), comb(bands))
     plate, nothing = Plate(parameters, finger), np.zeros(samples)
     return lambda: plate.closed_loop(controller, nothing)
+
+
+RESTING = hr.Finger.still(normal_load=0.5, mechanics=HEAVY)
+
+
+def scenarios(count, finger, noise):
+    """Scenarios of 8 bands that differ in the plate's mass and the noise's seed."""
+    plate = replace(PLATE, sensor_noise=noise)
+    return [
+        Scenario(bands=comb(8), finger=finger, plate=replace(plate, mass=0.032 * (1 + 1e-4 * i)), known=plate, seed=i)
+        for i in range(count)
+    ]
+
+
+class Batch:
+    """Scenarios side by side, designed already: what `simulate` does a chunk at a time."""
+
+    def __init__(self, many):
+        self.many = many
+        self.controllers = [each.design("h2") for each in many]
+
+    def advance(self, seconds):
+        """Play them from the start."""
+        return together(self.many, self.controllers, seconds)
 
 
 def absent():

@@ -9,13 +9,20 @@ kernels compile in memory.
 
 from __future__ import annotations
 
+import copy
 import hashlib
 from pathlib import Path
 from typing import Any
 
-import numba
+from numba.core import types
 from numba.core.caching import FunctionCache, IndexDataCacheFile
 from numba.core.ccallback import CFunc
+from numba.core.codegen import JITCodeLibrary
+from numba.core.compiler import Compiler
+from numba.core.compiler_lock import global_compiler_lock
+from numba.core.dispatcher import _FunctionCompiler  # type: ignore[attr-defined]
+from numba.core.registry import CPUDispatcher
+from numba.core.sigutils import normalize_signature
 
 
 def _source_stamp() -> str:
@@ -38,13 +45,72 @@ class _StampedCache(FunctionCache):
         )
 
 
+class _FragmentLibrary(JITCodeLibrary):
+    """Code of a kernel as a part of others: neither optimised as a whole nor made to run by itself."""
+
+    def _optimize_final_module(self) -> None:
+        pass
+
+    def _finalize_final_module(self) -> None:
+        self._finalized = True
+
+
+class _FragmentCompiler(_FunctionCompiler):
+    def _customize_flags(self, flags: Any) -> Any:
+        flags.no_cpython_wrapper = flags.no_cfunc_wrapper = flags.no_compile = True
+        return flags
+
+
+class _FragmentTarget:
+    """The processor, with libraries that are fragments."""
+
+    def __init__(self, target: Any) -> None:
+        self.options, self.typing_context = target.options, target.typing_context
+        codegen = copy.copy(target.target_context.codegen())
+        codegen._library_class = _FragmentLibrary
+        self.target_context = target.target_context.subtarget(_internal_codegen=codegen)
+
+
+class _Fragment(CPUDispatcher):
+    """A kernel as its callers see it: typed and lowered once for each of its types, compiled inside of them."""
+
+    def __init__(self, function: Any) -> None:
+        super().__init__(function, targetoptions=dict(OPTIONS, nopython=True))
+        target, options = _FragmentTarget(self.targetdescr), self.targetoptions
+        self._compiler: Any = _FragmentCompiler(function, target, options, {}, Compiler)
+
+    def compile(self, sig: Any) -> Any:
+        """Type and lower the kernel for these arguments."""
+        args, returned = normalize_signature(sig)
+        with global_compiler_lock, self._compiling_counter:
+            known: Any = self.overloads.get(tuple(args))
+            if known is None:
+                key = object()
+                lowered: Any = self._compiler.compile(args, returned)
+                known = lowered._replace(entry_point=key)
+                self.targetctx.insert_user_function(key, known.fndesc, [known.library])
+                self.overloads[tuple(args)] = known
+        return known.entry_point
+
+
+class _Kernel(CPUDispatcher):
+    """A kernel as Python sees it: whole, and cached; other kernels get its fragment."""
+
+    fragment: Any = None
+
+    @property
+    def _numba_type_(self) -> Any:
+        return types.Dispatcher(self.fragment)
+
+
 def kernel(function: Any) -> Any:
     """Compile `function` for the tick: no bounds checks, numpy error model, contracted arithmetic, cached on disk.
 
     A kernel allocates nothing, so arrays need no counting of references inside it (a call of the counter costs more
     than the arithmetic), and it becomes part of its caller, so that named tuples cost nothing to pass.
     """
-    compiled = numba.njit(**OPTIONS)(function)
+    compiled = _Kernel(function, targetoptions=dict(OPTIONS, nopython=True))
+    compiled.fragment = _Fragment(function)
     try:
         compiled._cache = _StampedCache(function)  # type: ignore[attr-defined]
     except RuntimeError:  # numba: no writable cache location

@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import sys
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numba
 import numpy as np

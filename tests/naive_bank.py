@@ -47,7 +47,7 @@ class NaiveBank:
         self.timers, self.open = [0.0, 0.0], [0.0, 0.0]  # fast, slow
         self.peak, self.scale, self.trust = 0.0, 1.0, 1.0
         self.round_1, self.round_2 = np.zeros(len(tables.speak)), np.zeros(len(tables.speak))
-        self.samples, self.knew_contact, self.known_lever = 0, False, [None] * K
+        self.samples, self.knew_contact, self.known_lever = 0, False, None
 
     def step(self, sensed, position, wanted):
         """Drive, target and flags of one sample."""
@@ -201,13 +201,11 @@ class NaiveBank:
         return self.k - w**2 * self.m + 1j * w * self.b + self.rest[k]
 
     def know(self):
-        """The law looks at the finger's place in turn with the adaptation, at a touch, and where carriers follow it."""
-        together = [(self.wavenumber[k - k % 8 : k - k % 8 + 8] > 0).any() for k in range(len(self.wavenumber))]
+        """The law looks at the finger's place in turn with the adaptation, and at a touch."""
         due = self.samples % 4 == 0 or self.contact != self.knew_contact
         self.knew_contact = self.contact
-        for k, follows in enumerate(together):
-            if due or follows:
-                self.known_lever[k] = self.lever()
+        if due:
+            self.known_lever = self.lever()
 
     def force(self, R, dR):
         """L: F = D V + D' dV/dt + j dw/dt M V in a matrix a band, finger included."""
@@ -216,7 +214,7 @@ class NaiveBank:
         for k, w in enumerate(self.omega):
             D, slope, chirp = self.stiffness_of(k)
             if self.contact and self.p.adapt >= 0:
-                structure = np.outer(self.known_lever[k], self.known_lever[k])
+                structure = np.outer(self.known_lever, self.known_lever)
                 D = D + self.finger_at(k) * structure
                 slope = slope + (self.b + 2j * w * self.m) * structure
                 chirp = chirp + 1j * self.sweep[k] * self.m * structure

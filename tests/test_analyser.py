@@ -130,10 +130,10 @@ def test_no_samples_give_no_envelopes():
     ("change", "message"),
     [
         ({"frequency": []}, r"frequency.shape=\(0,\) must be \(bands,\)"),
-        ({"frequency": 100.0}, r"frequency.shape=\(\) must be \(bands,\)"),
-        ({"frequency": [1.0, -2.0]}, r"frequency=-2.0 Hz must be at least 0 and below half the rate, 24000 Hz"),
-        ({"frequency": [24_000.0]}, r"frequency=24000.0 Hz must be at least 0 and below half the rate, 24000 Hz"),
-        ({"frequency": [np.nan]}, "frequency=nan Hz must be"),
+        ({"frequency": [[100.0]]}, r"frequency.shape=\(1, 1\) must be \(bands,\)"),
+        ({"frequency": [1.0, -2.0]}, r"frequency=-2.0 Hz must lie between 0 and half the rate, 24000 Hz"),
+        ({"frequency": [24_000.5]}, r"frequency=24000.5 Hz must lie between 0 and half the rate, 24000 Hz"),
+        ({"frequency": [np.nan]}, "frequency=nan Hz must lie"),
         ({"bandwidth": 0.0}, "bandwidth=0.0 Hz must lie between 0 and half the rate, 24000 Hz"),
         ({"bandwidth": 24_000.0}, "bandwidth=24000.0 Hz must lie between 0 and half the rate, 24000 Hz"),
         ({"rate": 0.0}, "rate=0.0 must be positive and finite"),
@@ -147,8 +147,8 @@ def test_bad_parameters_are_refused_with_value_bound_and_unit(change, message):
         Analyser(**{"frequency": [100.0], "bandwidth": BANDWIDTH, "rate": RATE} | change)
 
 
-def test_frequencies_just_inside_their_bounds_are_taken():
-    Analyser([0.0, np.nextafter(RATE / 2, 0.0)], BANDWIDTH, RATE)
+def test_frequencies_on_their_bounds_are_taken():
+    Analyser([0.0, RATE / 2], BANDWIDTH, RATE)
 
 
 @pytest.mark.parametrize("shape", [(4,), (4, 1), (4, 2, 1)])

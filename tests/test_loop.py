@@ -45,18 +45,22 @@ def simulated(scene, seed=0, block=1, **overrides):
     return SimulatedDriver(Plate(PlateParameters(**overrides), scene.finger, seed, block))
 
 
-def equal(one, other, columns=COLUMNS):
+def equal(one, other, columns=COLUMNS, rounding=0.0):
     for name in columns:
-        np.testing.assert_array_equal(getattr(one, name), getattr(other, name), err_msg=name)
+        right = getattr(other, name)
+        largest = np.nanmax(abs(right), initial=0.0) if rounding else 0.0
+        np.testing.assert_allclose(getattr(one, name), right, rtol=0, atol=rounding * largest, err_msg=name)
 
 
 @pytest.mark.parametrize("method", ["paper", "paper-common"])
 @pytest.mark.parametrize("scene", [SPATIAL, RECORDED, TONE], ids=["spatial", "recorded", "temporal"])
 def test_compiled_loop_equals_the_ring_of_blocks(scene, method):
+    """Sample for sample; the paper's blocks sum constant targets in another order, 1e-16 each of 2000 samples."""
     scene = dataclasses.replace(scene, duration=0.4)
     equal(
         hr.render(scene, method=method, seed=5),
         hr.render(scene, method=method, seed=5, driver=Blocks(simulated(scene, 5))),
+        rounding=1e-12 if scene.texture is TONE.texture else 0.0,
     )
 
 

@@ -7,9 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from hapticrender._lanes import aligned
 from hapticrender.accuracy import SLIDING, tones
-from hapticrender.control import bank_kernels, block_kernels, polar_kernels
+from hapticrender.batch import LANES, Scenario, batch_state
+from hapticrender.control import analyser, bank_kernels, block_kernels, polar_passes
+from hapticrender.control.bank_batch import batch_of
 from hapticrender.control.methods import METHODS
+from hapticrender.plants import batch_kernels
 from hapticrender.plants import kernels as plate_kernels
 from hapticrender.plants.vibrotactile import Plate, PlateParameters
 
@@ -39,7 +43,7 @@ def a_bank(precision):
 def a_polar(precision):
     model = PlateParameters().band_model(5000.0, 1)
     controller = METHODS["paper"].design(model, tones(np.linspace(20.0, 400.0, 8), 1e-6), precision=precision)
-    return polar_kernels.polar_run, controller, np.zeros((2, 8), complex)
+    return polar_passes.polar_run, controller, np.zeros((2, 8), complex)
 
 
 def a_block(precision):
@@ -61,6 +65,31 @@ def test_controllers_work_on_whole_registers(kind, precision, suffix):
     assert every > 200
     assert widest > 0.8 * every
     assert not re.search(r"\b(?:sin|cos|atan2)f?\b", assembly)
+
+
+@pytest.mark.skipif(platform.machine() not in ("x86_64", "AMD64"), reason="reads x86-64 assembly")
+def test_the_analyser_works_on_whole_registers():
+    found = analyser.Analyser([50.0, 90.0], 5.0, 5000.0)
+    signal, envelopes = np.zeros((2, 1)), np.zeros((2, 1, 2), complex)
+    assembly = instructions(analyser.analyse_run, *found._arrays, signal, envelopes)
+    every, widest = packed(assembly, "pd")
+    assert every > 40
+    assert widest > 0.8 * every
+
+
+@pytest.mark.skipif(platform.machine() not in ("x86_64", "AMD64"), reason="reads x86-64 assembly")
+def test_a_batch_works_on_whole_registers():
+    """Eight scenarios side by side: bank and plates in one loop."""
+    scenarios = [Scenario(bands=tones([50.0], 1e-6), finger=SLIDING) for _ in range(LANES)]
+    control, bank = batch_of([each.design("h2") for each in scenarios])
+    plates = [Plate(each.plate, each.finger) for each in scenarios]
+    rows = [aligned((2, *shape, LANES)) for shape in ((3,), (2,), (), (2,), (3,), (2,))]
+    arguments = (tuple(plate._tables for plate in plates), plates[0]._state, batch_state(plates), control, bank)
+    last, target, flags = aligned((2, LANES)), aligned((1, 2, LANES)), aligned((2, LANES))
+    assembly = instructions(batch_kernels.closed_batch_run, *arguments, last, *rows, target, flags)
+    every, widest = packed(assembly, "pd")
+    assert every > 500
+    assert widest > 0.8 * every
 
 
 @pytest.mark.skipif(platform.machine() not in ("x86_64", "AMD64"), reason="reads x86-64 assembly")

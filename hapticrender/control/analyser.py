@@ -93,7 +93,7 @@ def listen(section, tiles, heard, envelopes, n, count, t, c):
 
 
 @kernel
-def analyser_run(section, tiles, phase, advance, counts, heard, samples, envelopes):
+def analyse_run(section, tiles, phase, advance, counts, heard, samples, envelopes):
     """Samples one after another, tile by tile between two settings of the carriers."""
     n = 0
     while n < samples.shape[0]:
@@ -115,7 +115,7 @@ class Analyser:
     Parameters
     ----------
     frequency : array_like, shape (bands,), Hz
-        Carriers f_k, at least one, from 0 to below half the rate.
+        Carriers f_k, at least one, from 0 to half the rate.
     bandwidth : float
         -3 dB frequency of the low pass, Hz, between 0 and half the rate.
     rate : float
@@ -132,7 +132,7 @@ class Analyser:
 
     Notes
     -----
-    Delay and response are those of `StarSTDFT`.  At 0 Hz the envelope is twice the mean.  Rounding is at
+    Delay and response are those of `StarSTDFT`.  At 0 Hz and half the rate the envelope is doubled.  Rounding is at
     most eps (64 + rate/(2 pi bandwidth)) of the envelope, eps being 2e-16 in double and 6e-8 in single precision.  For
     carriers that move see `StarSTDFT.start`.
 
@@ -147,7 +147,7 @@ class Analyser:
     def __init__(
         self, frequency: Any, bandwidth: float, rate: float, channels: int = 1, precision: str = "double"
     ) -> None:
-        frequency = np.array(frequency, float)
+        frequency = np.atleast_1d(np.array(frequency, float))
         require_positive(rate=rate)
         _refuse(frequency, rate, channels, precision)
         b, a = StarSTDFT(bandwidth=bandwidth, rate=rate).coefficients
@@ -208,7 +208,7 @@ class Analyser:
             raise ValueError(f"{out.shape=} must be {(len(samples), self.channels, len(self.frequency))}")
         elif out.dtype != self._kind or not out.flags.carray:
             raise ValueError(f"out, of {out.dtype}, must be a writeable C-contiguous array of {self._kind}")
-        analyser_run(*self._arrays, samples, out)
+        analyse_run(*self._arrays, samples, out)
         return out
 
 
@@ -216,9 +216,9 @@ def _refuse(frequency: Array, rate: float, channels: int, precision: str) -> Non
     """Raise ValueError for what the low pass does not refuse itself."""
     if frequency.ndim != 1 or len(frequency) == 0:
         raise ValueError(f"{frequency.shape=} must be (bands,), with at least one band")
-    outside = frequency[~((frequency >= 0) & (frequency < rate / 2))]
+    outside = frequency[~((frequency >= 0) & (frequency <= rate / 2))]
     if len(outside):
-        raise ValueError(f"frequency={outside[0]} Hz must be at least 0 and below half the rate, {rate / 2:g} Hz")
+        raise ValueError(f"frequency={outside[0]} Hz must lie between 0 and half the rate, {rate / 2:g} Hz")
     if isinstance(channels, bool) or not isinstance(channels, (int, np.integer)) or channels < 1:
         raise ValueError(f"{channels=} must be a whole number >= 1")
     if precision not in PRECISIONS:

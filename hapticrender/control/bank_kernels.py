@@ -10,6 +10,7 @@ bands are the lanes, and as many scenarios as there are lanes, side by side.
 from __future__ import annotations
 
 import numpy as np
+from numba.extending import overload
 
 from hapticrender._jit import kernel
 from hapticrender._lanes import (
@@ -49,37 +50,75 @@ def count_turns(phase, k, step):
 
 
 @kernel
+def take_bands(tables, state, t):
+    """Tones of a tile whose lanes are bands; returns whether a target still grows, and whether one follows a finger."""
+    tone, band, width = tables.tone, state.band, state.band.shape[2]
+    grows = follows = False
+    for i in range(min(width, tone.shape[1] - t * width)):
+        k = t * width + i
+        band[t, row.LIVE, i] = 1.0
+        for r in range(row.TONE_ROWS):
+            band[t, row.FREQUENCY + r, i] = tone[r, k]
+        band[t, row.TURNS, i] = count_turns(state.phase, k, tone[0, k] / tables.numbers.rate)
+        if band[t, row.RAMP, i] < 1.0 or band[t, row.R_RE, i] != tone[3, k] or band[t, row.R_IM, i] != tone[4, k]:
+            grows = True
+        follows = follows or tone[1, k] > 0.0
+    return grows, follows
+
+
+@kernel
+def take_scenarios(tables, state, t):
+    """The same where lanes are scenarios and a tile is a band of each; `tone` is (bands, TONE_ROWS, W)."""
+    tone, band, width = tables.tone, state.band, state.band.shape[2]
+    grows = follows = False
+    for i in range(width):
+        band[t, row.LIVE, i] = 1.0
+        for r in range(row.TONE_ROWS):
+            band[t, row.FREQUENCY + r, i] = tone[t, r, i]
+        band[t, row.TURNS, i] = count_turns(state.phase, t * width + i, tone[t, 0, i] / tables.numbers.rate)
+        if band[t, row.RAMP, i] < 1.0 or band[t, row.R_RE, i] != tone[t, 3, i] or band[t, row.R_IM, i] != tone[t, 4, i]:
+            grows = True
+        follows = follows or tone[t, 1, i] > 0.0
+    return grows, follows
+
+
+def taker(tone):
+    """Which of the two fits the shape of `tone`."""
+    return take_bands if tone.ndim == 2 else take_scenarios
+
+
+@overload(taker)
+def _compiled_taker(tone):
+    """Decided while the kernel is compiled."""
+    chosen = taker(tone)
+    return lambda tone: chosen
+
+
+@kernel
 def refresh(tables, state):
     """Take up the tones that are asked for, and what stays for the next samples: law, turn, settled targets."""
-    numbers, tone, band, width = tables.numbers, tables.tone, state.band, state.band.shape[2]
+    numbers, band = tables.numbers, state.band
+    take = taker(tables.tone)
     state.follows[0] = 0
     for t in range(band.shape[0]):
-        pace = row.GROWING if numbers.analysed or not numbers.error_observer else row.STEADY
-        for i in range(min(width, tone.shape[1] - t * width)):
-            k = t * width + i
-            band[t, row.LIVE, i] = 1.0
-            for r in range(row.TONE_ROWS):
-                band[t, row.FREQUENCY + r, i] = tone[r, k]
-            band[t, row.TURNS, i] = count_turns(state.phase, k, tone[0, k] / numbers.rate)
-            if band[t, row.RAMP, i] < 1.0 or band[t, row.R_RE, i] != tone[3, k] or band[t, row.R_IM, i] != tone[4, k]:
-                pace = min(pace, row.GROWING)
-            if tone[1, k] > 0.0:
-                pace = row.LOCKED
-        state.pace[t] = pace
-        if pace == row.LOCKED:
+        grows, follows = take(tables, state, t)
+        if follows:
+            state.pace[t] = row.LOCKED
             state.follows[0] += 1
-        else:
-            frequency = lanes(band, t, row.FREQUENCY)
-            cos, sin = unit(1.0 / numbers.rate * frequency)
-            put(band, t, row.TURN_COS, cos)
-            put(band, t, row.TURN_SIN, sin)
-            put(band, t, row.OMEGA, TURN * frequency)
-            look_ahead(numbers, band, state.law, t)
-            law_tune(tables, state, t)
-            cos, sin = unit(lanes(band, t, row.TURNS) + lanes(band, t, row.PHASE))
-            put(band, t, row.COS, lanes(band, t, row.LIVE) * cos)
-            put(band, t, row.SIN, lanes(band, t, row.LIVE) * sin)
-        if pace == row.STEADY:
+            continue
+        still = not (grows or numbers.analysed) and numbers.error_observer
+        state.pace[t] = row.STEADY if still else row.GROWING
+        frequency = lanes(band, t, row.FREQUENCY)
+        cos, sin = unit(1.0 / numbers.rate * frequency)
+        put(band, t, row.TURN_COS, cos)
+        put(band, t, row.TURN_SIN, sin)
+        put(band, t, row.OMEGA, TURN * frequency)
+        look_ahead(numbers, band, state.law, t)
+        law_tune(tables, state, t)
+        cos, sin = unit(lanes(band, t, row.TURNS) + lanes(band, t, row.PHASE))
+        put(band, t, row.COS, lanes(band, t, row.LIVE) * cos)
+        put(band, t, row.SIN, lanes(band, t, row.LIVE) * sin)
+        if still:
             put(band, t, row.DR_RE, 0.0 * lanes(band, t, row.DR_RE))
             put(band, t, row.DR_IM, 0.0 * lanes(band, t, row.DR_IM))
 
@@ -104,7 +143,7 @@ def law_tune(tables, state, t):
     omega, sweep = lanes(band, t, row.OMEGA), lanes(band, t, row.SWEEP)
     cos, sin = lanes(law, t, row.AHEAD_RE), lanes(law, t, row.AHEAD_IM)
     touching = read(touch, row.KNOWN)  # 1 where the finger is on, else 0
-    place = read(touch, row.PLACE)
+    place = read(touch, row.KNOWN_PLACE)
     skin, drag = touching * read(touch, row.MASS), touching * read(touch, row.DAMPING)
     z_re, z_im = finger_stiffness(touch, band, t)
     for c in range(coordinates):
@@ -352,14 +391,17 @@ def know_finger(tables, state, touching, turn):
     """Take what is known of the finger into the law: where contact changed, and in its turn; at once where it moves."""
     touch = state.touch
     known = select(touching, 1.0, 0.0)
-    due = turn & any_of(touching) | any_of(size(known - read(touch, row.KNOWN)) > 0.5)
+    due = size(known - read(touch, row.KNOWN)) > 0.5
+    if turn:
+        due = due | touching
     write(known, touch, row.KNOWN)
-    if not due and state.follows[0] == 0:
+    write(select(due, read(touch, row.PLACE), read(touch, row.KNOWN_PLACE)), touch, row.KNOWN_PLACE)
+    if not any_of(due) and state.follows[0] == 0:
         return
     for t in range(state.band.shape[0]):
         if state.pace[t] == row.LOCKED:
             look_ahead(tables.numbers, state.band, state.law, t)
-        if due or state.pace[t] == row.LOCKED:
+        if any_of(due) or state.pace[t] == row.LOCKED:
             law_tune(tables, state, t)
 
 

@@ -31,11 +31,11 @@ HELD, SMOOTH, VELOCITY, ACCELERATION, SEEN = range(5)
 TRACK_ROWS = 5
 # entries of BankState.touch: the finger's load (N), place g, contact, its three numbers; timers and openings of the two
 # detectors; limiter (peak of the drive over its limit, squared, and the scale that answers it); trust in the sensors;
-# contact as the law knows it
+# contact and place as the law knows them
 LOAD, PLACE, CONTACT, MASS, DAMPING, STIFFNESS, FAST_TIME, SLOW_TIME, FAST_OPEN, SLOW_OPEN, PEAK, SCALE, TRUST = range(
     13
 )
-KNOWN = 13
-TOUCH_ROWS = 14
+KNOWN, KNOWN_PLACE = 13, 14
+TOUCH_ROWS = 15
 # rows of BankState.residual: residual of the observer, deviation, force, force a quarter turn ahead
 ERROR, DEVIATION, FORCE, QUADRATURE = range(4)

@@ -360,7 +360,7 @@ def know(tables, state, touching):
     """Take what is known of the finger into the law; carriers that follow it as they will be when the drive acts."""
     bank, known = state.bank, 1.0 if touching else 0.0
     due = touching or known != bank.touch[row.KNOWN] or state.stale[0] > 0
-    bank.touch[row.KNOWN] = known
+    bank.touch[row.KNOWN], bank.touch[row.KNOWN_PLACE] = known, bank.touch[row.PLACE]
     for t in range(bank.band.shape[0]):
         follows = bank.pace[t] == row.LOCKED
         if follows or state.stale[0] > 0:

@@ -4,8 +4,8 @@ Symbols: psi carrier phase, X envelope of a coordinate, R wanted envelope, A and
 carrier that runs backwards (the finger reverses) is followed as its mirror image: x = Re X e^{j phi} =
 Re conj(X) e^{-j phi}, so that psi always runs forward and every complex state is conjugated at the reversal.
 
-Everything that a band owns is a column of rows that are named here, W columns to a tile (`hapticrender._lanes`).  A
-block is done tile by tile, so that a tile's state stays near; what all tiles share is written down before.
+Everything that a band owns is a column of rows that are named here, W columns to a tile (`hapticrender._lanes`).  What
+all tiles share is written down before; blocks are in `polar_passes`.
 """
 
 from __future__ import annotations
@@ -93,6 +93,7 @@ class PolarState(NamedTuple):
     doubt: Array  # (1,) 0: the sensors are believed, 1: they are not
     sample: Array  # (1,) integer: samples so far
     shared: Array  # (SHARED_ROWS + coordinates, REFRESH) scratch
+    scratch: Array  # (2 + 2 coordinates, REFRESH, W) scratch of a block's passes, see `polar_passes`
     sum: Array  # (coordinates, REFRESH, W) scratch: drive of each coordinate, not yet summed over the lanes
     window: Array  # (length, tiles * 2 * coordinates, W) boxcar: what was heard; of length 0 with the STDFT*
     heap: Array  # (2, tiles * 2 * coordinates, W) its running sum, and one summed afresh
@@ -190,16 +191,18 @@ def refresh(tables, state):
     """Take up the tones that are asked for; phases and look-ups of fixed carriers, whose targets stay if constant."""
     numbers, tone, band, width = tables.numbers, tables.tone, state.band, state.band.shape[2]
     for t in range(band.shape[0]):
-        state.locked[t] = 0
+        followed, state.locked[t] = state.locked[t] > 0, 0
         for i in range(min(width, tone.shape[1] - t * width)):
             k = t * width + i
+            known, frequency = band[t, LIVE, i] > 0.0 and not followed, band[t, FREQUENCY, i]
             band[t, LIVE, i] = 1.0
             for r in range(tone.shape[0]):
                 band[t, FREQUENCY + r, i] = tone[r, k]
+            if not known or band[t, FREQUENCY, i] != frequency:
+                look_up(tables, state, t, i, tone[0, k])
             band[t, TURNS, i] = count_turns(state.phase, k, tone[0, k] / numbers.rate)
             if tone[1, k] > 0.0:
                 state.locked[t] = 1
-            look_up(tables, state, t, i, tone[0, k])
         if state.locked[t] == 0:
             live = lanes(band, t, LIVE)
             cos, sin = unit(lanes(band, t, TURNS) + lanes(band, t, PHASE))
@@ -435,23 +438,3 @@ def polar_step(tables, state, sensed, position, wanted, drive, target):
         tile_step(tables, state, t, 0, target)
     state.sample[0] += 1
     return flags | speak(tables, state, 0, drive)
-
-
-@kernel
-def polar_run(tables, state, sensed, position, wanted, drive, target, flags):
-    """Samples one after another, tile by tile between two looks at the tones."""
-    n = 0
-    while n < sensed.shape[0]:
-        if state.sample[0] % REFRESH == 0:
-            refresh(tables, state)
-        count = min(REFRESH - state.sample[0] % REFRESH, sensed.shape[0] - n)
-        for m in range(count):
-            flags[n + m] = share(tables, state, m, sensed[n + m], position[n + m], wanted[n + m])
-            silence(state, m)
-        for t in range(state.band.shape[0]):
-            for m in range(count):
-                tile_step(tables, state, t, m, target[n + m])
-        state.sample[0] += count
-        for m in range(count):
-            flags[n + m] |= speak(tables, state, m, drive[n + m])
-        n += count

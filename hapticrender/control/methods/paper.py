@@ -19,6 +19,7 @@ from hapticrender.bands import Bands
 from hapticrender.control.bandmodel import BandModel
 from hapticrender.control.bank_state import PRECISIONS
 from hapticrender.control.envelope_loop import Bandwidths, EnvelopeLoop, envelope_loop
+from hapticrender.control.kernels import WAVENUMBER
 from hapticrender.control.polar_kernels import (
     BAND_ROWS,
     FORWARD,
@@ -29,8 +30,8 @@ from hapticrender.control.polar_kernels import (
     PolarNumbers,
     PolarState,
     PolarTables,
-    polar_run,
 )
+from hapticrender.control.polar_passes import SCRATCH_ROWS, polar_run
 from hapticrender.protocols import Array
 
 TABLE_STEP = 0.5  # Hz, resolution of the look-up table
@@ -63,10 +64,21 @@ class PolarController:
         """Digest n samples; see `Controller`."""
         n = len(sensed)
         drive = np.zeros((n, len(self.tables.speak)))
-        target = np.zeros((n, self.n_bands), complex)
         flags = np.zeros(n, np.int64)
-        polar_run(self.tables, self.state, np.ascontiguousarray(sensed, float), position, wanted, drive, target, flags)
-        return drive, target, flags
+        columns = (np.ascontiguousarray(sensed, float), position, wanted, drive)
+        follows = self.tables.numbers.analysed or (self.tables.tone[WAVENUMBER] > 0.0).any()
+        # constant targets change only where the tones are looked at anew
+        cuts = [0, n] if follows else [0, min(-int(self.state.sample[0]) % REFRESH, n), n]
+        parts = []
+        for start, stop in zip(cuts, cuts[1:], strict=False):
+            target = np.zeros((stop - start if follows else 1, self.n_bands), complex)
+            if stop > start:
+                part = [column[start:stop] for column in columns]
+                polar_run(self.tables, self.state, *part, target, flags[start:stop])
+                parts.append(np.broadcast_to(target, (stop - start, self.n_bands)))
+        if not parts:
+            return drive, np.zeros((0, self.n_bands), complex), flags
+        return drive, parts[0] if len(parts) == 1 else np.concatenate(parts), flags
 
 
 def polar_state(tables: PolarTables, window: int, dtype: type) -> PolarState:
@@ -85,6 +97,7 @@ def polar_state(tables: PolarTables, window: int, dtype: type) -> PolarState:
         doubt=np.zeros(1),
         sample=np.zeros(1, np.int64),
         shared=np.zeros((SHARED_ROWS + coordinates, REFRESH)),
+        scratch=aligned((SCRATCH_ROWS + 2 * coordinates, REFRESH, width), dtype),
         sum=aligned((coordinates, REFRESH, width), dtype),
         window=aligned((window, rows, width), dtype),
         heap=aligned((2, rows, width), dtype),

@@ -1,0 +1,55 @@
+"""The controller as a C function, which an audio library calls block after block while Python does something else.
+
+Here a thread stands in for the audio library and a simulated plate for the sound card.  The figure is the amplitude (m)
+of the last second, after the application has asked for another one on the way.
+"""
+
+import ctypes
+import threading
+from dataclasses import replace
+
+import numpy as np
+
+import hapticrender as hr
+from hapticrender.control.methods import METHODS
+from hapticrender.plants.vibrotactile import Plate, PlateParameters
+from hapticrender.realtime import RealtimeEntry
+
+RATE, BLOCK, SECONDS = 48_000.0, 64, 3  # Hz, samples, s
+FULL_SCALE = 1e-3  # m: what the sensors' amplifier makes of 1.0
+POINTER, LONG = ctypes.c_void_p, ctypes.c_ulong
+CALLBACK = ctypes.CFUNCTYPE(ctypes.c_int, POINTER, POINTER, LONG, POINTER, LONG, POINTER)  # as PortAudio declares it
+
+
+def play(entry: RealtimeEntry, plate: Plate, motion: list[np.ndarray]) -> None:
+    """What the audio library does: hand over what was recorded, take what is to be played."""
+    callback = CALLBACK(entry.address)
+    recorded, played = np.zeros((BLOCK, 2), np.float32), np.zeros((BLOCK, 2), np.float32)
+    for _ in range(int(SECONDS * RATE) // BLOCK):
+        sensed = plate.run(played.astype(float))
+        motion.append(sensed.motion[:, 0])
+        recorded[:] = sensed.sensed / FULL_SCALE
+        callback(recorded.ctypes.data, played.ctypes.data, BLOCK, None, 0, entry.user_data)
+
+
+def main() -> float:
+    parameters = replace(PlateParameters(), rate=RATE, delay=BLOCK)
+    model = replace(parameters.band_model(RATE, BLOCK), block=BLOCK)
+    bands = hr.Grating(frequency=80.0, amplitude=5e-6).bands(RATE)
+    entry = RealtimeEntry(METHODS["h2"].design(model, bands), sensed_scale=FULL_SCALE)
+    motion: list[np.ndarray] = []
+    audio = threading.Thread(target=play, args=(entry, Plate(parameters, hr.Finger.absent(), block=BLOCK), motion))
+    audio.start()
+    while entry.samples < RATE:  # the application is busy; then it wants more
+        sum(range(1000))
+    entry.send(replace(bands, envelope=2 * bands.envelope))
+    audio.join()
+    time = np.arange(int(SECONDS * RATE) // BLOCK * BLOCK) / RATE
+    last = time >= SECONDS - 1
+    amplitude = abs(2 * np.mean(np.concatenate(motion)[last] * np.exp(-2j * np.pi * 80.0 * time[last])))
+    print(f"asked for 5 um, then for 10 um: {1e6 * amplitude:.2f} um; {entry.samples} samples, {entry.refused} refused")
+    return float(amplitude)
+
+
+if __name__ == "__main__":
+    print(main())

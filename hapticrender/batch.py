@@ -1,0 +1,227 @@
+"""Many plates at once: scenarios that differ in finger, plate, noise or targets run side by side, a lane each."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from hapticrender._lanes import aligned
+from hapticrender.bands import Bands
+from hapticrender.control.bank import BankController
+from hapticrender.control.bank_batch import LANES, alike, batch_of, side_by_side
+from hapticrender.control.methods import method_named
+from hapticrender.plants.batch_kernels import CENTRE, HOLD, SPAN_ROWS, WINDOW, BatchState, closed_batch_run
+from hapticrender.plants.propagator import COLUMNS, NODES, STATES, WIDEST
+from hapticrender.plants.vibrotactile import Plate, PlateParameters
+from hapticrender.protocols import Array, Controller
+from hapticrender.touch.finger import Finger
+
+CHUNK = 1000  # samples: what is handed to and fro stays in the cache
+
+
+@dataclass(frozen=True, kw_only=True)
+class Scenario:
+    """One run of a sweep.
+
+    Parameters
+    ----------
+    bands : Bands
+        Targets, of constant envelope.
+    finger : Finger, optional
+        On the plate; absent by default.
+    plate : PlateParameters, optional
+        The plate that is simulated.
+    known : PlateParameters, optional
+        The plate that the controller is designed for; by default the same.
+    seed : int
+        Of the sensor noise.
+    """
+
+    bands: Bands
+    finger: Finger = Finger.absent()
+    plate: PlateParameters = PlateParameters()
+    known: PlateParameters | None = None
+    seed: int = 0
+
+    def design(self, method: str) -> Controller:
+        """A controller at rest."""
+        known = self.known or self.plate
+        return method_named(method).design(known.band_model(known.rate, known.delay), self.bands)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Played:
+    """What happened in a scenario, sample by sample.
+
+    Parameters
+    ----------
+    scenario : Scenario
+    motion : ndarray, shape (n, 3), m
+        True motion at centre, end 1 and end 2.
+    position : ndarray, shape (n,), m
+        Of the finger, NaN while lifted.
+    drive : ndarray, shape (n, 2), A
+    sensed : ndarray, shape (n, 2), m
+    flags : ndarray of int, shape (n,)
+        `Flag` bits.
+    """
+
+    scenario: Scenario
+    motion: Array
+    position: Array
+    drive: Array
+    sensed: Array
+    flags: Array
+
+
+def simulate(scenarios: Sequence[Scenario], seconds: float, *, method: str = "h2") -> list[Played]:
+    """Play scenarios in closed loop, as many side by side as the processor has lanes.
+
+    Parameters
+    ----------
+    scenarios : sequence of Scenario
+        Those whose controllers share their numbers (method, rate, delay, bandwidths) run side by side, the others one
+        by one.
+    seconds : float, > 0
+    method : str
+        Name of the control method; the band bank's methods (h, h2) run side by side.
+
+    Returns
+    -------
+    list of Played
+        In the order of the scenarios.
+
+    Raises
+    ------
+    ValueError
+        A number is out of its bound, or a target is no constant envelope.
+    """
+    if not seconds > 0:
+        raise ValueError(f"{seconds=}: must be > 0 s")
+    for index, scenario in enumerate(scenarios):
+        if scenario.bands.envelope is None:
+            raise ValueError(f"scenarios[{index}].bands: must have constant envelopes")
+    controllers = [scenario.design(method) for scenario in scenarios]
+    found: dict[int, Played] = {}
+    for group in _groups(scenarios, controllers):
+        few, banks = [scenarios[index] for index in group], [controllers[index] for index in group]
+        played = together(few, banks, seconds) if len(few) > 1 else [_alone(few[0], banks[0], seconds)]
+        found |= dict(zip(group, played, strict=True))
+    return [found[index] for index in range(len(scenarios))]
+
+
+def _groups(scenarios: Sequence[Scenario], controllers: Sequence[Controller]) -> Iterator[list[int]]:
+    """Indices of scenarios that can run side by side, at most `LANES` at a time."""
+    left = list(range(len(scenarios)))
+    while left:
+        first, group = left[0], [left[0]]
+        for index in left[1:]:
+            if len(group) == LANES:
+                break
+            if _fits(scenarios[first], scenarios[index], controllers[first], controllers[index]):
+                group.append(index)
+        yield group
+        left = [index for index in left if index not in group]
+
+
+def _fits(one: Scenario, other: Scenario, mine: Controller, yours: Controller) -> bool:
+    same = all(getattr(one.plate, name) == getattr(other.plate, name) for name in ("rate", "delay"))
+    flexible = (one.plate.bending_frequency > 0.0) == (other.plate.bending_frequency > 0.0)
+    banks = isinstance(mine, BankController) and isinstance(yours, BankController)
+    return same and flexible and banks and alike(mine, yours)  # type: ignore[arg-type]
+
+
+def _alone(scenario: Scenario, controller: Controller, seconds: float) -> Played:
+    plate = Plate(scenario.plate, scenario.finger, scenario.seed)
+    samples = int(round(seconds * plate.rate))
+    drive, _, flags, sensed = plate.closed_loop(controller, np.zeros(samples))
+    position = np.asarray(sensed.position)
+    return Played(
+        scenario=scenario,
+        motion=np.asarray(sensed.motion),
+        position=position,
+        drive=drive,
+        sensed=sensed.sensed,
+        flags=flags,
+    )
+
+
+def together(scenarios: Sequence[Scenario], controllers: Sequence[Controller], seconds: float) -> list[Played]:
+    """At most `LANES` scenarios that fit each other."""
+    plates = [Plate(each.plate, each.finger, each.seed) for each in scenarios]
+    samples = int(round(seconds * plates[0].rate))
+    control, bank = batch_of(controllers)  # type: ignore[arg-type]
+    each = tuple(plate._tables for plate in plates)
+    each += (each[-1],) * (LANES - len(each))
+    state, work, last = batch_state(plates), plates[0]._state, aligned((2, LANES))
+    target, wanted = aligned((control.tone.shape[0], 2, LANES)), aligned((CHUNK, LANES))
+    noise, finger, flags = aligned((CHUNK, 2, LANES)), aligned((samples, 3, LANES)), aligned((samples, LANES))
+    motion, sensed, drive = (aligned((samples, width, LANES)) for width in (3, 2, 2))
+    for start in range(0, samples, CHUNK):
+        part = slice(start, min(start + CHUNK, samples))
+        count = part.stop - start
+        _prepare(plates, start, finger[part], noise[:count])
+        closed_batch_run(
+            each,
+            work,
+            state,
+            control,
+            bank,
+            last,
+            finger[part],
+            noise[:count],
+            wanted[:count],
+            sensed[part],
+            motion[part],
+            drive[part],
+            target,
+            flags[part],
+        )
+    return [
+        Played(
+            scenario=scenario,
+            motion=motion[..., lane],
+            position=finger[:, 0, lane],
+            drive=drive[..., lane],
+            sensed=sensed[..., lane],
+            flags=flags[:, lane].astype(np.int64),
+        )
+        for lane, scenario in enumerate(scenarios)
+    ]
+
+
+def _prepare(plates: Sequence[Plate], start: int, finger: Array, noise: Array) -> None:
+    """Fingers and noise of every lane from sample `start` on; a finger that all lanes share is asked once."""
+    time = (start + np.arange(len(finger))) / plates[0].rate
+    if all(plate.finger is plates[0].finger for plate in plates):
+        finger[:] = plates[0].finger.touch(time)[..., None]
+    else:
+        for lane in range(LANES):
+            finger[..., lane] = plates[min(lane, len(plates) - 1)].finger.touch(time)
+    for lane, plate in enumerate(plates):
+        if plate.parameters.sensor_noise > 0.0:
+            noise[..., lane] = plate._rng.standard_normal((len(finger), 2))
+
+
+def batch_state(plates: Sequence[Plate]) -> BatchState:
+    """State of plates at rest, a lane each; no polynomial holds yet."""
+    tables = [plate._tables for plate in plates]
+    names = ("lever", "reach", "amplifier", "current_limit", "current_step", "sensor_limit", "sensor_step")
+    numbers = [
+        [*(getattr(each, name) for name in names), each.sensor_noise, *each.sensor_gain, each.centre_shape]
+        for each in tables
+    ]
+    span = aligned((SPAN_ROWS, LANES))
+    span[CENTRE], span[HOLD], span[WINDOW] = np.inf, -1.0, WIDEST
+    return BatchState(
+        z=aligned((1, STATES, LANES)),
+        after=aligned((STATES, LANES)),
+        powers=aligned((NODES, COLUMNS * STATES, LANES)),
+        span=span,
+        number=side_by_side([np.array(row) for row in numbers]),
+        pending=aligned((plates[0].delay - 1, 2, LANES)),
+        cursor=np.zeros(1, np.int64),
+        current=aligned((2, LANES)),
+    )

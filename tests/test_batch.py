@@ -1,0 +1,168 @@
+"""Scenarios side by side: the same as one by one, whatever their fingers and plates do."""
+
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
+from dataclasses import replace
+from multiprocessing import get_context
+
+import numpy as np
+import pytest
+
+import hapticrender as hr
+from hapticrender import batch
+from hapticrender.accuracy import SLIDING, tones
+from hapticrender.batch import LANES, Scenario, simulate
+from hapticrender.plants.vibrotactile import PlateParameters
+from hapticrender.sweep import errors, sweep, worst_error
+from hapticrender.touch.mechanics import HEAVY, HEAVY_SECOND, LIGHT, LIGHT_SECOND
+
+IDEAL = PlateParameters(sensor_noise=0.0, sensor_bits=0, current_bits=0)  # no rounding that would tell 1e-16 from 0
+BANDS = tones([50.0, 178.0, 261.0], 20e-6)
+FINGERS = (
+    hr.Finger.absent(),
+    replace(SLIDING, touches=((0.1, 0.4),)),
+    replace(SLIDING, touches=((0.05, 0.2), (0.3, 9.0)), mechanics=LIGHT, normal_load=0.3),
+    hr.Finger.still(normal_load=0.5, mechanics=HEAVY),
+    hr.Finger.still(20e-3, normal_load=0.3, mechanics=LIGHT_SECOND),
+    hr.Finger.sliding(speed=0.3, normal_load=0.2, mechanics=HEAVY_SECOND),
+    replace(SLIDING, normal_load=((0.0, 0.25, 0.5), (0.2, 0.9, 0.4)), touches=None, load_scaling=True),
+)
+
+
+def alone(scenario, seconds, method="h2"):
+    return batch._alone(scenario, scenario.design(method), seconds)
+
+
+def scenarios(plate=IDEAL, **changes):
+    """A finger each, on plates that differ in mass and stiffness from the one that is known."""
+    return [
+        Scenario(
+            bands=BANDS,
+            finger=finger,
+            plate=replace(plate, mass=0.032 * (1 + 0.002 * i), stiffness_1=22.4e3 + 20.0 * i, **changes),
+            known=replace(plate, **changes),
+            seed=i,
+        )
+        for i, finger in enumerate(FINGERS)
+    ]
+
+
+@pytest.mark.parametrize("method", ["h", "h2"])
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {},
+        {"delay": 4},
+        {"bending_frequency": 1250.0, "bending_coil": 0.1},
+        {"degrees_of_freedom": 1},
+        {"finger_dynamics": 0},
+    ],
+    ids=lambda changes: next(iter(changes), "as it is"),
+)
+def test_a_lane_is_the_run_of_its_scenario(method, changes):
+    """Motion, drive and flags of 0.5 s; rounding differs, 1e-16 a sample and state, and a loop keeps it small."""
+    wanted = scenarios(**changes)
+    for scenario, found in zip(wanted, simulate(wanted, 0.5, method=method), strict=True):
+        expected = alone(scenario, 0.5, method)
+        assert found.scenario is scenario
+        np.testing.assert_array_equal(found.position, expected.position)
+        np.testing.assert_array_equal(found.flags, expected.flags)
+        for name in ("motion", "sensed", "drive"):
+            right = getattr(expected, name)
+            np.testing.assert_allclose(getattr(found, name), right, rtol=0, atol=1e-9 * abs(right).max())
+
+
+def test_a_finger_locked_carrier_is_followed_in_its_lane():
+    bands = hr.Grating(wavelength=2e-3, amplitude=10e-6).bands(5000.0)
+    fingers = [hr.Finger.sliding(speed=speed, normal_load=0.4) for speed in (0.06, 0.08, 0.1)]
+    wanted = [Scenario(bands=bands, finger=finger, plate=IDEAL) for finger in fingers]
+    for scenario, found in zip(wanted, simulate(wanted, 0.6), strict=True):
+        right = alone(scenario, 0.6).motion
+        assert abs(right).max() > 5e-6
+        np.testing.assert_allclose(found.motion, right, rtol=0, atol=1e-9 * abs(right).max())
+
+
+def test_noise_and_rounding_are_those_of_the_scenario():
+    """With 1 um of noise and its seed; a step of sensor or drive may fall the other way, and is felt no further."""
+    wanted = scenarios(PlateParameters())
+    for scenario, found in zip(wanted, simulate(wanted, 0.5), strict=True):
+        expected = alone(scenario, 0.5)
+        steps = scenario.plate.sensor_step
+        assert abs(found.sensed[:50] - expected.sensed[:50]).max() <= 1e-12
+        assert np.sqrt(np.mean((found.motion - expected.motion) ** 2)) < 0.2 * steps
+
+
+def test_overload_saturates_its_own_lane_only():
+    loud = [replace(each, bands=tones([400.0], 1e-3 if i == 1 else 1e-5)) for i, each in enumerate(scenarios()[:3])]
+    found = simulate(loud, 0.4)
+    assert [bool((each.flags & 1).any()) for each in found] == [False, True, False]
+    assert all(abs(each.drive).max() <= IDEAL.current_limit for each in found)
+
+
+def test_what_does_not_fit_runs_on_its_own():
+    """Other bands have other numbers, other rates other samples; order stays."""
+    mixed = [
+        Scenario(bands=tones([50.0], 1e-5), plate=IDEAL),
+        Scenario(bands=tones([50.0, 90.0], 1e-5), plate=IDEAL),
+        Scenario(bands=tones([50.0], 2e-5), plate=IDEAL),
+        Scenario(bands=tones([50.0], 1e-5), plate=replace(IDEAL, rate=10_000.0)),
+    ]
+    found = simulate(mixed, 0.2)
+    assert [each.scenario for each in found] == mixed
+    assert [len(each.motion) for each in found] == [1000, 1000, 1000, 2000]
+    for each in found:
+        right = alone(each.scenario, 0.2).motion
+        np.testing.assert_allclose(each.motion, right, rtol=0, atol=1e-9 * abs(right).max())
+
+
+def test_more_than_the_lanes_and_other_methods():
+    many = [Scenario(bands=BANDS, plate=IDEAL, seed=i) for i in range(2 * LANES + 3)]
+    assert len(simulate(many, 0.01)) == len(many)
+    (paper,) = simulate([Scenario(bands=tones([50.0], 1e-5), plate=IDEAL)], 0.05, method="paper")
+    assert np.isfinite(paper.motion).all()
+
+
+def test_what_it_refuses():
+    with pytest.raises(ValueError, match="seconds=0: must be > 0 s"):
+        simulate([], 0)
+    with pytest.raises(ValueError, match=r"scenarios\[0\].bands: must have constant envelopes"):
+        simulate([Scenario(bands=replace(BANDS, envelope=None))], 1.0)
+    with pytest.raises(ValueError, match="at_a_time=0: must be >= 1"):
+        sweep([], 1.0, worst_error, at_a_time=0)
+    with pytest.raises(ValueError, match="must be >= 0.6 s to be judged"):
+        errors(alone(scenarios()[0], 0.3))
+
+
+def processes(count):
+    return ProcessPoolExecutor(count, get_context("spawn"))
+
+
+@pytest.mark.parametrize("pool", [None, ThreadPoolExecutor, processes])
+def test_any_executor_gives_the_same(pool):
+    wanted = [replace(each, seed=seed) for each in scenarios() for seed in range(2)]
+    expected = [worst_error(each) for each in simulate(wanted, 1.0)]
+    assert max(expected) < 0.1
+    assert len(set(expected)) > 3
+    if pool is None:
+        found = sweep(wanted, 1.0, worst_error, at_a_time=5)
+    else:
+        with pool(2) as executor:
+            found = sweep(wanted, 1.0, worst_error, executor=executor, at_a_time=5)
+    np.testing.assert_allclose(found, expected, rtol=1e-6)
+
+
+def test_a_cluster_gives_the_same():
+    """dask.distributed on this machine alone, an executor like any other."""
+    distributed = pytest.importorskip("distributed")
+    wanted = scenarios()[:4]
+    expected = [worst_error(each) for each in simulate(wanted, 1.0)]
+    with (
+        distributed.LocalCluster(n_workers=2, threads_per_worker=1, processes=False, dashboard_address=None) as cluster,
+        distributed.Client(cluster) as client,
+    ):
+        found = sweep(wanted, 1.0, worst_error, executor=client.get_executor(), at_a_time=2)
+    np.testing.assert_allclose(found, expected, rtol=1e-6)
+
+
+def test_a_failure_in_a_task_comes_back():
+    with ThreadPoolExecutor(1) as pool, pytest.raises(ValueError, match="must have constant envelopes"):
+        sweep([Scenario(bands=replace(BANDS, envelope=None))], 1.0, worst_error, executor=pool)
