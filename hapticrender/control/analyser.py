@@ -21,7 +21,8 @@ from hapticrender.control.stdft import StarSTDFT
 from hapticrender.control.transfer import require_positive
 from hapticrender.protocols import Array
 
-REFRESH = 64  # samples between two settings of the carriers; a block is cut there, too
+REFRESH = 64  # samples between two settings of the carriers
+GROUP = 16  # samples that every tile takes in turn, so that their envelopes lie together; a block is cut there
 TINY = 1e-30  # an envelope's state below it is silence: numbers near the smallest would cost a hundred times as much
 NEAR = 32768  # bytes: results beyond it leave the nearest cache, and cost twice the time where they straddle its lines
 # rows of a tile: turns of the carrier at the last refresh, its conjugate now, the conjugate's turn a sample; then
@@ -94,13 +95,13 @@ def listen(section, tiles, heard, envelopes, n, count, t, c):
 
 @kernel
 def analyse_run(section, tiles, phase, advance, counts, heard, samples, envelopes):
-    """Samples one after another, tile by tile between two settings of the carriers."""
+    """Groups of samples one after another, each tile by tile."""
     n = 0
     while n < samples.shape[0]:
         at = counts[SAMPLE] % REFRESH
         if at == 0:
             set_carriers(tiles, phase, advance)
-        count = min(REFRESH - at, samples.shape[0] - n)
+        count = min(GROUP - at % GROUP, samples.shape[0] - n)
         counts[REPLACED] += hear(section[0], heard, samples, n, count)
         for t in range(tiles.shape[0]):
             for c in range(samples.shape[1]):
@@ -161,7 +162,7 @@ class Analyser:
         tiles[:, TURN_COS], tiles[:, TURN_SIN] = np.cos(turn).reshape(-1, width), -np.sin(turn).reshape(-1, width)
         steps = [Fraction(f) / Fraction(float(rate)) * REFRESH for f in frequency.tolist()]
         advance = np.array([int(step % 1 * 2**64) for step in steps], np.uint64)
-        heard, self._counts = np.zeros((channels, REFRESH), kind), np.zeros(2, np.int64)
+        heard, self._counts = np.zeros((channels, GROUP), kind), np.zeros(2, np.int64)
         self.frequency, self.bandwidth, self.rate, self.channels = frequency, bandwidth, rate, channels
         self._arrays = section, tiles, np.zeros(bands, np.uint64), advance, self._counts, heard
 
