@@ -23,7 +23,7 @@ from hapticrender.protocols import Array
 
 REFRESH = 64  # samples between two settings of the carriers
 GROUP = 16  # samples that every tile takes in turn, so that their envelopes lie together; a block is cut there
-TINY = 1e-30  # an envelope's state below it is silence: numbers near the smallest would cost a hundred times as much
+TINY = 1e-30  # an envelope's state below it is silence: numbers near the smallest cost twenty times as much
 NEAR = 32768  # bytes: results beyond it leave the nearest cache, and cost twice the time where they straddle its lines
 # rows of a tile: turns of the carrier at the last refresh, its conjugate now, the conjugate's turn a sample; then
 # CHANNEL_ROWS for each channel: low-pass states
@@ -60,7 +60,7 @@ def smooth(section, s1, s2, x):
 
 @kernel
 def hear(gain, heard, samples, n, count):
-    """Write down 2 x for all tiles, 0 where it is no number; returns how often."""
+    """Write down gain x for all tiles, the gain being 2 b0; 0 where that is no number.  Returns how often."""
     replaced = 0
     for c in range(samples.shape[1]):
         for m in range(count):
