@@ -109,19 +109,21 @@ def block_against_c(bands: int, precision: str, pairs: int) -> Iterator[Figure]:
 
 
 def simulation(method: str, goal: float, seconds: float, pairs: int) -> Iterator[Figure]:
-    """Plate with a heavy finger sliding on it, 8 bands, adaptation on, against the numpy loop of the paper's method."""
-    for what, parameters in (
-        ("ideal sensors", replace(scenes.PLATE, sensor_noise=0.0)),
-        ("sensor noise drawn", scenes.PLATE),
+    """Plate with a heavy finger on it, 8 bands, adaptation on, against the numpy loop of the paper's method."""
+    ideal = replace(scenes.PLATE, sensor_noise=0.0)
+    for what, finger, parameters in (
+        ("finger at rest, ideal sensors", scenes.RESTING, ideal),
+        ("sliding finger, ideal sensors", scenes.TOUCHING, ideal),
+        ("sliding finger, noise drawn", scenes.TOUCHING, scenes.PLATE),
     ):
         samples = int(seconds * parameters.rate)
-        ours = scenes.closed_loop(method, 8, samples, parameters=parameters)
+        ours = scenes.closed_loop(method, 8, samples, finger, parameters)
         loop, plate = NumpyPolar(scenes.polar(8).tables), NumpyPlate(parameters)
         noise = np.zeros((FEW, 2))
         paired = interleave(ours, lambda loop=loop, plate=plate, noise=noise: numpy_run(loop, plate, FEW, noise), pairs)
         rate = seconds / paired.candidate
         ratio = rate / (FEW / parameters.rate / paired.reference)
-        name = f"closed loop, 8 bands, {method}, sliding finger, {what}"
+        name = f"closed loop, 8 bands, {method}, {what}"
         note = f"{ratio:.0f}x the numpy loop{beside_control(rate, pairs)}"
         yield Figure(name, rate, "s/s", goal, True, "simulated seconds a second", note)
 

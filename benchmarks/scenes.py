@@ -10,6 +10,7 @@ from hapticrender.bands import Bands
 from hapticrender.batch import Scenario, together
 from hapticrender.control.block import BlockController
 from hapticrender.control.methods import METHODS
+from hapticrender.loop import CHUNK
 from hapticrender.plants.vibrotactile import Plate, PlateParameters
 from hapticrender.touch.mechanics import HEAVY
 
@@ -53,10 +54,15 @@ def in_blocks(bands, precision="double", **numbers):
 
 
 def closed_loop(method, bands, samples, finger=TOUCHING, parameters=PLATE):
-    """A run of plate and controller in one compiled loop, as a function without arguments."""
+    """A run of plate and controller in one compiled loop, as a function; in the pieces in which the library runs it."""
     controller = METHODS[method].design(parameters.band_model(parameters.rate, parameters.delay), comb(bands))
-    plate, nothing = Plate(parameters, finger), np.zeros(samples)
-    return lambda: plate.closed_loop(controller, nothing)
+    plate, piece = Plate(parameters, finger), np.zeros(int(CHUNK * parameters.rate))
+
+    def run():
+        for _ in range(samples // len(piece)):
+            plate.closed_loop(controller, piece)
+
+    return run
 
 
 RESTING = hr.Finger.still(normal_load=0.5, mechanics=HEAVY)

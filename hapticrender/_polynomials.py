@@ -86,6 +86,7 @@ R_SHORT = (
     -0.007282173243121042,
     0.0013504976258104989,
 )
+WHOLE = 1.5 * 2.0**52  # added and taken away it leaves no fraction, of numbers up to 2^51
 HALF_PI = 0.5 * math.pi
 
 
@@ -102,6 +103,16 @@ def unit(turns: Any) -> Any:
 def polar(im: Any, re: Any) -> Any:
     """Magnitude of re + j im and its angle (rad, -pi to pi; 0 for 0)."""
     raise TypeError("polar: to be called from a kernel")
+
+
+def whole(value: Any, factor: Any) -> Any:
+    """Nearest whole number to value * factor, up to 2^51, in double precision."""
+    raise TypeError("whole: to be called from a kernel")
+
+
+@overload(whole, jit_options=OPTIONS)
+def _whole(value, factor):  # type: ignore[no-untyped-def]
+    return lambda value, factor: (value * factor + WHOLE) - WHOLE
 
 
 @overload(unit, jit_options=OPTIONS)

@@ -60,3 +60,43 @@ def test_an_edit_in_another_file_is_noticed(toy):
     assert run(package, 2.0) == (2.0, 0)
     assert run(package, 2.0) == (2.0, 1)
     assert run(package, 3.0) == ((3.0, 0) if kind == "ours" else (2.0, 1))
+
+
+def test_a_read_only_install_with_no_cache_still_runs(tmp_path):
+    """Nothing can be written, neither beside the package nor in the user's home: it compiles in memory, and renders."""
+    if not hasattr(os, "geteuid"):
+        pytest.skip("permissions are checked the POSIX way")
+    shutil.copytree(
+        ROOT / "hapticrender", tmp_path / "site" / "hapticrender", ignore=shutil.ignore_patterns("__pycache__")
+    )
+    for room in ("renderers", "drivers"):
+        shutil.copytree(
+            ROOT / room, tmp_path / "site" / "hapticrender" / room, ignore=shutil.ignore_patterns("__pycache__")
+        )
+    script = """
+import pathlib, sys
+import hapticrender as hr
+from hapticrender import _jit
+from hapticrender.control.bank_kernels import bank_run
+from numba.core.caching import NullCache
+assert pathlib.Path(hr.__file__).is_relative_to(sys.argv[1]), hr.__file__
+assert isinstance(bank_run._cache, NullCache), bank_run._cache
+scene = hr.Scene(texture=hr.Grating(frequency=47.0, amplitude=10e-6), duration=0.01)
+print(len(hr.render(scene).drive))
+"""
+    for path in sorted((tmp_path / "site").rglob("*"), reverse=True):
+        path.chmod(0o555 if path.is_dir() else 0o444)
+    (tmp_path / "site").chmod(0o555)
+    kept = {name: text for name, text in os.environ.items() if name != "NUMBA_CACHE_DIR"}
+    nowhere = {"HOME": "/proc/none", "XDG_CACHE_HOME": "/proc/none", "PYTHONPATH": str(tmp_path / "site")}
+    command = [sys.executable, "-B", "-c", script, str(tmp_path / "site")]
+    if os.geteuid() == 0:  # root may write anywhere: be somebody else
+        for parent in [tmp_path, *tmp_path.parents][:-2]:
+            parent.chmod(parent.stat().st_mode | 0o055)
+        nobody = ["setpriv", "--reuid=65534", "--regid=65534", "--clear-groups"]
+        trial = [*nobody, sys.executable, "-c", "import numba"]
+        if not shutil.which("setpriv") or subprocess.run(trial, capture_output=True, cwd="/").returncode:
+            pytest.skip("root may write anywhere, and nobody else may run this interpreter")
+        command = [*nobody, *command]
+    done = subprocess.run(command, env=kept | nowhere, capture_output=True, text=True, cwd="/", timeout=300)
+    assert done.stdout.strip() == "50", done.stderr

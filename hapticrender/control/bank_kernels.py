@@ -29,7 +29,7 @@ from hapticrender._lanes import (
     totals,
     write,
 )
-from hapticrender._polynomials import unit
+from hapticrender._polynomials import unit, whole
 from hapticrender.control import bank_rows as row
 from hapticrender.control.bank_finger import adapt_pass, feel, finger_stiffness, forget_finger, track_finger
 from hapticrender.control.kernels import DOUBT_TIME, FAR, TURN
@@ -447,8 +447,8 @@ def speak_pass(tables, state, drive):
         for c in range(len(tables.shape)):
             along += read(tables.speak, i, c) * read(state.residual, row.FORCE, c)
             across += read(tables.speak, i, c) * read(state.residual, row.QUADRATURE, c)
+        write(trust * along, drive, i)
         along, across = trust / limit * along, trust / limit * across
-        write(limit * along, drive, i)
         peak = high(peak, along * along + across * across)
     write(peak, touch, row.PEAK)
     scale = 1.0 + 0.0 * trust
@@ -459,8 +459,8 @@ def speak_pass(tables, state, drive):
         exact = scale * read(drive, i)
         if step > 0.0:
             before, last = read(shaper, 1, i), read(shaper, 0, i)
-            shaped = exact + 2.0 * last - before
-            exact = select(trust == 0.0, exact, step * floor(shaped * (1.0 / step) + 0.5))
+            shaped = exact + (2.0 * last - before)
+            exact = select(trust == 0.0, exact, step * whole(shaped, 1.0 / step))
             write(select(trust == 0.0, 0.0, last), shaper, 1, i)
             write(select(trust == 0.0, 0.0, low(high(shaped - exact, -step), step)), shaper, 0, i)
         write(low(high(exact, -limit), limit), drive, i)

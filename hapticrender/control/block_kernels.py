@@ -33,7 +33,7 @@ from hapticrender._lanes import (
     stretch,
     totals,
 )
-from hapticrender._polynomials import unit
+from hapticrender._polynomials import unit, whole
 from hapticrender.control import bank_rows as row
 from hapticrender.control.bank_finger import adapt_pass, feel, forget_finger, track_finger
 from hapticrender.control.bank_kernels import FORGET, believe, ease, grow_pass, law_tune, look_ahead, wake
@@ -551,7 +551,7 @@ def shape_drive(tables, state, scale, drive):
                 exact = shaper[0, channel] = shaper[1, channel] = 0.0
             elif step > 0.0:
                 shaped = exact + 2.0 * shaper[0, channel] - shaper[1, channel]
-                exact = step * floor(shaped * per_step + 0.5)
+                exact = step * whole(shaped, per_step)
                 shaper[1, channel] = shaper[0, channel]
                 shaper[0, channel] = min(max(shaped - exact, -step), step)
             drive[m, channel] = min(max(exact, -limit), limit)

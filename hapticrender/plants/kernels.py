@@ -14,7 +14,8 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from hapticrender._jit import kernel
-from hapticrender._lanes import floor, high, low, read, select, size, write
+from hapticrender._lanes import high, low, read, select, size, write
+from hapticrender._polynomials import whole
 from hapticrender.plants.propagator import (
     GRIP,
     LEAST_STAY,
@@ -93,7 +94,7 @@ class PlateState(NamedTuple):
 def quantise(value, step, limit):
     """Nearest step inside the limit; a step of 0 leaves the resolution ideal."""
     value = low(high(value, -limit), limit)
-    return select(step > 0.0, step * floor(value * (1.0 / step) + 0.5), value)
+    return select(step > 0.0, step * whole(value, 1.0 / step), value)
 
 
 @kernel
