@@ -1,9 +1,9 @@
 """What others offer for a part of the work; where a package is not installed its case is left out."""
 
 import numpy as np
-from scipy.signal import sosfilt
+from scipy.signal import butter, sosfilt
 
-from hapticrender.control.stdft import StarSTDFT
+BLOCK = 64  # samples
 
 
 class Absent(RuntimeError):
@@ -11,41 +11,45 @@ class Absent(RuntimeError):
 
 
 class ScipyLockIn:
-    """Heterodyne and `scipy.signal.sosfilt`, all bands and channels at once, states carried from block to block."""
+    """Heterodyne and `scipy.signal.sosfilt`, all bands and channels at once, states carried from block to block.
+
+    At its best: a block's carriers are a table made beforehand, turned by where the block starts.
+    """
 
     def __init__(self, frequency, bandwidth, rate, channels):
-        b, a = StarSTDFT(bandwidth=bandwidth, rate=rate).coefficients
-        self.sections = np.concatenate([b, a])[None]
-        self.step = -2j * np.pi * np.asarray(frequency) / rate
-        self.state = np.zeros((1, 2, channels, len(self.step)), complex)
+        self.sections = butter(2, bandwidth, fs=rate, output="sos")
+        self.turn = np.asarray(frequency) / rate
+        self.table = 2.0 * np.exp(-2j * np.pi * np.outer(np.arange(BLOCK), self.turn))
+        self.state = np.zeros((1, 2, channels, len(self.turn)), complex)
+        self.turned = np.empty((BLOCK, channels, len(self.turn)), complex)
         self.sample = 0
 
     def run(self, signal):
-        """Envelopes (n, channels, bands) of a block (n, channels)."""
-        index = np.arange(self.sample, self.sample + len(signal))
-        self.sample += len(signal)
-        turned = 2.0 * signal[:, :, None] * np.exp(np.outer(index, self.step))[:, None]
-        found, self.state = sosfilt(self.sections, turned, axis=0, zi=self.state)
+        """Envelopes (64, channels, bands) of a block (64, channels)."""
+        carrier = self.table * np.exp(-2j * np.pi * np.mod(self.sample * self.turn, 1.0))
+        self.sample += BLOCK
+        np.multiply(signal[:, :, None], carrier[:, None], out=self.turned)
+        found, self.state = sosfilt(self.sections, self.turned, axis=0, zi=self.state)
         return found
 
 
 class SlidingDFT:
-    """The `sdft` package: as many bins as bands, a transform a channel."""
+    """The `sdft` package: as many bins as bands, a transform a channel, with its cheapest window."""
 
     def __init__(self, bands, channels):
         try:
             from sdft import SDFT
         except ImportError as error:
             raise Absent("the package sdft is not installed: pip install 'hapticrender[bench]'") from error
-        self.each = [SDFT(bands) for _ in range(channels)]
+        self.each = [SDFT(bands, window="boxcar") for _ in range(channels)]
 
     def run(self, signal):
-        """Bins (channels, n, bands) of a block (n, channels)."""
-        return np.stack([one.sdft(np.ascontiguousarray(signal[:, c])) for c, one in enumerate(self.each)])
+        """Bins (n, bands) of every channel of a block (n, channels)."""
+        return [one.sdft(signal[:, c]) for c, one in enumerate(self.each)]
 
 
 class PythonControl:
-    """Open loop of the free plate by `control.forced_response`: not even a controller, and no finger."""
+    """Open loop of the free plate in python-control, currents held: not even a controller, and no finger."""
 
     def __init__(self, parameters):
         try:
@@ -57,10 +61,15 @@ class PythonControl:
         zero, one = np.zeros((2, 2)), np.eye(2)
         a = np.block([[zero, one], [-inverse @ parameters.stiffness_matrix, -inverse @ parameters.damping_matrix]])
         b = np.vstack([zero, inverse @ parameters.force_from_drive])
-        self.system = control.ss(a, b, np.hstack([one, zero]), np.zeros((2, 2))).sample(1 / parameters.rate)
+        self.system = control.ss(a, b, np.hstack([one, zero]), zero).sample(1 / parameters.rate)
 
-    def run(self, samples):
-        """Displacements (2, samples) under two sinusoidal currents."""
-        time = np.arange(samples) / self.rate
-        drive = np.vstack([np.sin(2 * np.pi * 47.0 * time)] * 2)
-        return self.control.forced_response(self.system, timepts=time, inputs=drive).outputs
+    def forced(self, current):
+        """Displacements (samples, 2) under `current`, by `forced_response`."""
+        return self.control.forced_response(self.system, self._time(current), current.T).outputs.T
+
+    def stepped(self, current):
+        """The same by `input_output_response`, which takes nonlinear systems as well."""
+        return self.control.input_output_response(self.system, self._time(current), current.T).outputs.T
+
+    def _time(self, current):
+        return np.arange(len(current)) / self.rate

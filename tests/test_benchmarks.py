@@ -60,6 +60,58 @@ def test_the_c_reference_in_blocks_is_the_same_controller(benchmarks, precision,
     np.testing.assert_allclose(tuned.run(sensed), found, rtol=0, atol=bound * abs(found).max())
 
 
+def test_the_lock_in_of_scipy_is_the_same_analysis(benchmarks, rng):
+    """Envelopes of 20 bands in four blocks of noise."""
+    from peers import ScipyLockIn
+
+    from hapticrender.control.analyser import Analyser
+
+    frequency, samples = np.linspace(0.0, 1000.0, 20), rng.standard_normal((256, 2))
+    found, filters = Analyser(frequency, 10.0, 48_000.0, channels=2), ScipyLockIn(frequency, 10.0, 48_000.0, 2)
+    for part in np.split(samples, 4):
+        expected = filters.run(part)
+        np.testing.assert_allclose(found.run(part), expected, rtol=0, atol=1.3e-10 * abs(expected).max())
+
+
+def test_a_sliding_dft_hears_the_same_tone(benchmarks):
+    """Unit tones on a bin in the middle: half of the amplitude there, as `sdft` counts both halves of the spectrum."""
+    pytest.importorskip("sdft")
+    from peers import SlidingDFT
+
+    tone = np.cos(np.pi * 8 / 16 * np.arange(640))
+    for found in SlidingDFT(16, 2).run(np.stack([tone, tone], axis=1)):
+        assert abs(found[-1]) == pytest.approx(0.5 * (np.arange(16) == 8), abs=1e-9)
+
+
+def test_the_plate_of_python_control_is_the_same_plate(benchmarks, rng):
+    pytest.importorskip("control")
+    import scenes
+    from numpy_loop import NumpyPlate
+    from peers import PythonControl
+
+    peer, plate, current = PythonControl(scenes.PLATE), NumpyPlate(scenes.PLATE), 0.1 * rng.standard_normal((500, 2))
+    expected = np.empty_like(current)
+    for n, each in enumerate(current):
+        expected[n] = plate.state[:2]
+        plate.advance(each)
+    for found in (peer.forced(current), peer.stepped(current)):
+        np.testing.assert_allclose(found, expected, rtol=0, atol=1e-9 * abs(expected).max())
+
+
+def test_a_peer_that_is_not_there_is_left_out(benchmarks, monkeypatch, capsys):
+    import cases
+    import run
+
+    for name in ("sdft", "control"):
+        monkeypatch.setitem(sys.modules, name, None)
+    monkeypatch.setattr(run, "keep_to_one_core", lambda: None)
+    monkeypatch.setattr(run, "every_case", lambda short: [("peers analysis 8", lambda: cases.analysis(8, 1))])
+    monkeypatch.setattr(sys, "argv", ["run.py"])
+    assert run.main() == 0
+    assert "peers analysis 8: left out: the package sdft is not installed" in capsys.readouterr().out
+    assert "python-control left out: the package control is not installed" in cases.beside_control(1.0, 1)
+
+
 def test_pairs_are_taken_in_turns(benchmarks):
     from pairing import interleave
 

@@ -70,9 +70,8 @@ def test_controllers_work_on_whole_registers(kind, precision, suffix):
 @pytest.mark.skipif(platform.machine() not in ("x86_64", "AMD64"), reason="reads x86-64 assembly")
 def test_the_analyser_works_on_whole_registers():
     found = analyser.Analyser([50.0, 90.0], 5.0, 5000.0)
-    state = (found._band, found._phase, found.frequency, found._sample)
     signal, envelopes = np.zeros((2, 1)), np.zeros((2, 1, 2), complex)
-    assembly = instructions(analyser.analyse_run, found._section, found.rate, *state, signal, envelopes)
+    assembly = instructions(analyser.analyse_run, *found._arrays, signal, envelopes)
     every, widest = packed(assembly, "pd")
     assert every > 40
     assert widest > 0.8 * every
