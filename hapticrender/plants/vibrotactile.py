@@ -26,6 +26,7 @@ import itertools
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
+from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -480,6 +481,7 @@ def _upper(matrix: Array) -> tuple[float, float, float]:
     return float(matrix[0, 0]), float(matrix[0, 1]), float(matrix[1, 1])
 
 
+@lru_cache(maxsize=1024)
 def _taylor_terms(tables: PlateTables, strongest: float) -> int:
     """Terms after which the exponential series has converged to rounding, wherever and however hard it is pressed."""
     system, most = shifts(), 2
