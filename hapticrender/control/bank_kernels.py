@@ -189,18 +189,12 @@ def grow_pass(tables, state, t):
 
 
 @kernel
-def locked_pass(tables, state, t):
-    """Carriers, weights and law of a tile that follows the finger."""
-    numbers, band, track = tables.numbers, state.band, state.track
+def motion_pass(numbers, band, track, t):
+    """Frequency, sweep and weight of a tile whose carriers follow the finger."""
     wavenumber = lanes(band, t, row.WAVENUMBER)
     hertz = lanes(band, t, row.FREQUENCY) + wavenumber * read(track, row.VELOCITY)
     put(band, t, row.OMEGA, TURN * hertz)
     put(band, t, row.SWEEP, TURN * wavenumber * read(track, row.ACCELERATION))
-    turns = lanes(band, t, row.TURNS)
-    cos, sin = unit(turns + wavenumber * read(track, row.HELD) + lanes(band, t, row.PHASE))
-    put(band, t, row.TURNS, turns + 1.0 / numbers.rate * lanes(band, t, row.FREQUENCY))
-    put(band, t, row.COS, lanes(band, t, row.LIVE) * cos)
-    put(band, t, row.SIN, lanes(band, t, row.LIVE) * sin)
     felt = (wavenumber == 0.0) | (read(track, row.SEEN) > 0.0)
     ramp = lanes(band, t, row.RAMP)
     ramp = select(felt, low(ramp + numbers.ramp, 1.0), high(ramp - numbers.ramp, 0.0))
@@ -209,6 +203,19 @@ def locked_pass(tables, state, t):
     put(band, t, row.RAMP, ramp)
     put(band, t, row.WEIGHT, weight)
     put(band, t, row.SHARE, low(weight / high(ramp, 1e-9), 1.0))
+
+
+@kernel
+def locked_pass(tables, state, t):
+    """Carriers, weights and law of a tile that follows the finger."""
+    numbers, band, track = tables.numbers, state.band, state.track
+    wavenumber = lanes(band, t, row.WAVENUMBER)
+    turns = lanes(band, t, row.TURNS)
+    cos, sin = unit(turns + wavenumber * read(track, row.HELD) + lanes(band, t, row.PHASE))
+    put(band, t, row.TURNS, turns + 1.0 / numbers.rate * lanes(band, t, row.FREQUENCY))
+    put(band, t, row.COS, lanes(band, t, row.LIVE) * cos)
+    put(band, t, row.SIN, lanes(band, t, row.LIVE) * sin)
+    motion_pass(numbers, band, track, t)
 
 
 @kernel

@@ -23,12 +23,10 @@ from hapticrender._lanes import (
     floor,
     high,
     lanes,
-    low,
     put,
     put_pairs,
     put_stretch,
     root,
-    select,
     size,
     stretch,
     totals,
@@ -36,7 +34,7 @@ from hapticrender._lanes import (
 from hapticrender._polynomials import unit, whole
 from hapticrender.control import bank_rows as row
 from hapticrender.control.bank_finger import adapt_pass, feel, forget_finger, track_finger
-from hapticrender.control.bank_kernels import FORGET, believe, ease, grow_pass, law_tune, look_ahead, wake
+from hapticrender.control.bank_kernels import FORGET, believe, grow_pass, law_tune, look_ahead, motion_pass, wake
 from hapticrender.control.bank_state import BankNumbers, BankState, BankTables
 from hapticrender.control.kernels import FAR, TURN
 from hapticrender.protocols import Array
@@ -111,8 +109,8 @@ def count_phases(tables, state):
 @kernel
 def follow_pass(tables, state, t):
     """Tables, weights and frequencies of a tile whose carriers follow the finger."""
-    numbers, bank, block = tables.bank.numbers, state.bank, state.place.shape[0]
-    band, track = bank.band, bank.track
+    bank, block = state.bank, state.place.shape[0]
+    band = bank.band
     wavenumber, frequency = lanes(band, t, row.WAVENUMBER), lanes(band, t, row.FREQUENCY)
     cos, sin = lanes(band, t, row.COS), lanes(band, t, row.SIN)
     step = 1.0 / tables.sample.rate * frequency
@@ -122,17 +120,7 @@ def follow_pass(tables, state, t):
         put(state.table, t, 2 * m + 1, cos * v + sin * u)
     put(band, t, row.COS, lanes(band, t, row.LIVE))
     put(band, t, row.SIN, 0.0 * sin)
-    hertz = frequency + wavenumber * track[row.VELOCITY]
-    put(band, t, row.OMEGA, TURN * hertz)
-    put(band, t, row.SWEEP, TURN * wavenumber * track[row.ACCELERATION])
-    felt = (wavenumber == 0.0) | (track[row.SEEN] > 0.0)
-    ramp = lanes(band, t, row.RAMP)
-    ramp = select(felt, low(ramp + numbers.ramp, 1.0), high(ramp - numbers.ramp, 0.0))
-    inside = ease(2.0 / numbers.lowest * size(hertz) - 1.0) * ease(5.0 - 4.0 / numbers.highest * size(hertz))
-    weight = lanes(band, t, row.LIVE) * ease(ramp) * select(wavenumber > 0.0, inside, 1.0)
-    put(band, t, row.RAMP, ramp)
-    put(band, t, row.WEIGHT, weight)
-    put(band, t, row.SHARE, low(weight / high(ramp, 1e-9), 1.0))
+    motion_pass(tables.bank.numbers, band, bank.track, t)
 
 
 @kernel
