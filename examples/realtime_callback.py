@@ -15,17 +15,17 @@ from hapticrender.control.methods import METHODS
 from hapticrender.plants.vibrotactile import Plate, PlateParameters
 from hapticrender.realtime import RealtimeEntry
 
-RATE, BLOCK, SECONDS = 48_000.0, 64, 3  # Hz, samples, s
+RATE, BLOCK = 48_000.0, 64  # Hz, samples
 FULL_SCALE = 1e-3  # m: what the sensors' amplifier makes of 1.0
 POINTER, LONG = ctypes.c_void_p, ctypes.c_ulong
 CALLBACK = ctypes.CFUNCTYPE(ctypes.c_int, POINTER, POINTER, LONG, POINTER, LONG, POINTER)  # as PortAudio declares it
 
 
-def play(entry: RealtimeEntry, plate: Plate, motion: list[np.ndarray]) -> None:
+def play(entry: RealtimeEntry, plate: Plate, motion: list[np.ndarray], stop: threading.Event) -> None:
     """What the audio library does: hand over what was recorded, take what is to be played."""
     callback = CALLBACK(entry.address)
     recorded, played = np.zeros((BLOCK, 2), np.float32), np.zeros((BLOCK, 2), np.float32)
-    for _ in range(int(SECONDS * RATE) // BLOCK):
+    while not stop.is_set():
         sensed = plate.run(played.astype(float))
         motion.append(sensed.motion[:, 0])
         recorded[:] = sensed.sensed / FULL_SCALE
@@ -38,15 +38,19 @@ def main() -> float:
     bands = hr.Grating(frequency=80.0, amplitude=5e-6).bands(RATE)
     entry = RealtimeEntry(METHODS["h2"].design(model, bands), sensed_scale=FULL_SCALE)
     motion: list[np.ndarray] = []
-    audio = threading.Thread(target=play, args=(entry, Plate(parameters, hr.Finger.absent(), block=BLOCK), motion))
+    plate, stop = Plate(parameters, hr.Finger.absent(), block=BLOCK), threading.Event()
+    audio = threading.Thread(target=play, args=(entry, plate, motion, stop))
     audio.start()
     while entry.samples < RATE:  # the application is busy; then it wants more
         sum(range(1000))
     entry.send(replace(bands, envelope=2 * bands.envelope))
+    enough = entry.samples + 2 * RATE
+    while entry.samples < enough:
+        sum(range(1000))
+    stop.set()
     audio.join()
-    time = np.arange(int(SECONDS * RATE) // BLOCK * BLOCK) / RATE
-    last = time >= SECONDS - 1
-    amplitude = abs(2 * np.mean(np.concatenate(motion)[last] * np.exp(-2j * np.pi * 80.0 * time[last])))
+    last = np.concatenate(motion)[-int(RATE) :]
+    amplitude = abs(2 * np.mean(last * np.exp(-2j * np.pi * 80.0 * np.arange(len(last)) / RATE)))
     print(f"asked for 5 um, then for 10 um: {1e6 * amplitude:.2f} um; {entry.samples} samples, {entry.refused} refused")
     return float(amplitude)
 

@@ -45,6 +45,10 @@ class Scenario:
     known: PlateParameters | None = None
     seed: int = 0
 
+    def __post_init__(self) -> None:
+        if self.known is not None and self.known.rate != self.plate.rate:
+            raise ValueError(f"known.rate={self.known.rate:g} Hz: must be that of the plate, {self.plate.rate:g} Hz")
+
     def design(self, method: str) -> Controller:
         """A controller at rest."""
         known = self.known or self.plate
@@ -97,9 +101,13 @@ def simulate(scenarios: Sequence[Scenario], seconds: float, *, method: str = "h2
     ------
     ValueError
         A number is out of its bound, or a target is no constant envelope.
+
+    Notes
+    -----
+    What is returned are views of memory that up to `LANES` scenarios share; copy what you keep of a few.
     """
-    if not seconds > 0:
-        raise ValueError(f"{seconds=}: must be > 0 s")
+    if not 0 < seconds < np.inf:
+        raise ValueError(f"{seconds=}: must be > 0 s and finite")
     for index, scenario in enumerate(scenarios):
         if scenario.bands.envelope is None:
             raise ValueError(f"scenarios[{index}].bands: must have constant envelopes")

@@ -163,7 +163,10 @@ class RealtimeEntry:
         self._hand_over()
 
     def silence(self, quiet: bool = True) -> None:
-        """Drive nothing from the next block on, whatever is sensed; or, with ``quiet=False``, go on."""
+        """Drive nothing from the next block on, whatever is sensed.
+
+        With ``quiet=False`` the controller goes on where it was, at once; its carriers have waited meanwhile.
+        """
         self._now[PLAYING] = 0.0 if quiet else 1.0
         self._hand_over()
 
@@ -187,17 +190,17 @@ class RealtimeEntry:
         self._back = _publish(self._parts.middle, self._back)
 
 
-@numba.njit(cache=True)
+@kernel
 def _size(parts):
     return bytes_of(parts)
 
 
-@numba.njit(cache=True)
+@kernel
 def _settle(address, parts):
     place(address, parts)
 
 
-@numba.njit(cache=True)
+@kernel
 def _publish(middle, back):
     return swap(middle, back | FRESH) & (FRESH - 1)
 
@@ -255,9 +258,9 @@ def _plain(sensed, drive, frames, user_data):
     parts = behind(user_data)
     block, sensors = parts.sensed.shape
     channels, samples, raised = parts.drive.shape[1], int(frames), 0
-    if samples % block:
+    if samples % block or empty(sensed) or empty(drive):
         parts.meter[REFUSED] += 1
-        for i in range(samples * channels):
+        for i in range(0 if empty(drive) else samples * channels):
             drive[i] = 0.0
         return -1
     for start in range(0, samples, block):

@@ -81,19 +81,28 @@ def _judged(part: list[Scenario], seconds: float, method: str, judge: Callable[[
 
 
 def errors(played: Played, start: float = 0.5) -> Array:
-    """Relative amplitude error of every band from `start` (s) on, rms over windows of 0.1 s, shape (3, bands)."""
+    """Relative amplitude error of every band from `start` (s) on, rms over windows of 0.1 s, shape (3, bands).
+
+    NaN for a band of which nothing is wanted.  Where carriers follow the finger, windows without it do not count.
+    """
     scenario, rate = played.scenario, played.scenario.plate.rate
     size = int(round(LENGTH * rate))
     first = np.arange(int(start * rate), len(played.motion) - size + 1, size)
     if not len(first):
         raise ValueError(f"{len(played.motion) / rate:g} s: must be >= {start + LENGTH:g} s to be judged")
     index = first[:, None] + np.arange(size)
-    position = np.nan_to_num(played.position)
-    phase = scenario.bands.carrier_phase(np.arange(len(played.motion)) / rate, position)
+    if (scenario.bands.wavenumber > 0.0).any():
+        index = index[np.isfinite(played.position[index]).all(axis=1)]
+        if not len(index):
+            raise ValueError(f"the finger is never there for {LENGTH:g} s after {start:g} s")
+    phase = scenario.bands.carrier_phase(np.arange(len(played.motion)) / rate, played.position)
     found = fit(phase[index], played.motion[index])[0]
-    return np.sqrt(np.mean((abs(found) / abs(np.asarray(scenario.bands.envelope)) - 1.0) ** 2, axis=0))
+    wanted = abs(np.asarray(scenario.bands.envelope))
+    off = abs(found) / np.where(wanted > 0.0, wanted, np.nan) - 1.0
+    return np.sqrt(np.mean(off**2, axis=0))
 
 
 def worst_error(played: Played) -> float:
-    """Largest of `errors` at the centre."""
-    return float(errors(played)[0].max())
+    """Largest of `errors` at the centre, of bands of which something is wanted."""
+    found = errors(played)[0]
+    return float(found[np.isfinite(found)].max(initial=0.0)) if np.isfinite(played.motion).all() else np.inf

@@ -121,9 +121,32 @@ def test_more_than_the_lanes_and_other_methods():
     assert np.isfinite(paper.motion).all()
 
 
+def test_whole_numbers_are_numbers():
+    """Plates may be given in integers, and run beside others that are not."""
+    plates = [IDEAL, replace(IDEAL, current_limit=3, force_constant=8, bending_coil=0)]
+    found = simulate([Scenario(bands=BANDS, plate=plate, known=IDEAL) for plate in plates], 0.05)
+    assert len(found) == 2
+
+
+def test_silent_bands_and_lifted_fingers_are_not_judged():
+    """A target that fades in for 50 ms costs its window of 100 ms a quarter, and the rms of eight windows a tenth."""
+    silent = replace(BANDS, envelope=np.array([20e-6, 0.0, 20e-6], complex))
+    (played,) = simulate([Scenario(bands=silent, plate=IDEAL)], 1.0)
+    assert np.isnan(errors(played)[0]).tolist() == [False, True, False]
+    assert worst_error(played) < 1e-3
+    ridges = hr.Grating(wavelength=2e-3, amplitude=10e-6).bands(5000.0)
+    finger = replace(hr.Finger.sliding(speed=0.1, normal_load=0.4), touches=((0.0, 1.05), (1.15, 9.0)))
+    (played,) = simulate([Scenario(bands=ridges, finger=finger, plate=IDEAL)], 1.5)
+    assert worst_error(played) < 0.15
+
+
 def test_what_it_refuses():
     with pytest.raises(ValueError, match="seconds=0: must be > 0 s"):
         simulate([], 0)
+    with pytest.raises(ValueError, match="seconds=inf: must be > 0 s and finite"):
+        simulate([], np.inf)
+    with pytest.raises(ValueError, match="known.rate=10000 Hz: must be that of the plate, 5000 Hz"):
+        Scenario(bands=BANDS, plate=IDEAL, known=replace(IDEAL, rate=10_000.0))
     with pytest.raises(ValueError, match=r"scenarios\[0\].bands: must have constant envelopes"):
         simulate([Scenario(bands=replace(BANDS, envelope=None))], 1.0)
     with pytest.raises(ValueError, match="at_a_time=0: must be >= 1"):

@@ -210,6 +210,16 @@ def test_slots_change_hands_whole():
         assert found.result(60) == (0, 0)
 
 
+def test_controllers_of_one_design_have_targets_of_their_own():
+    parameters = replace(PlateParameters(), rate=RATE, delay=BLOCK)
+    bank = METHODS["h2"].design(replace(parameters.band_model(RATE, BLOCK), block=1), bands())
+    one, other = BlockController(bank, BLOCK), BlockController(bank, BLOCK)
+    one.send(bands(amplitude=50e-6))
+    nothing = np.zeros(2000)
+    found = other.run(np.zeros((2000, 2)), nothing, nothing)[1][-1]
+    np.testing.assert_allclose(abs(found), 5e-6)
+
+
 def test_what_it_refuses():
     with pytest.raises(TypeError, match="must be a BlockController"):
         RealtimeEntry(METHODS["h2"].design(PlateParameters().band_model(RATE, 1), bands()))
@@ -220,13 +230,18 @@ def test_what_it_refuses():
         entry.send(Bands(frequency=[50.0], wavenumber=[0.0], phase=[0.0], envelope=[1e-6]))
     with pytest.raises(ValueError, match="the targets are a waveform"):
         entry.send(replace(bands(), envelope=None))
-    with pytest.raises(ValueError, match="lowest fixed carrier of 46 Hz: must be >= 47 Hz"):
+    with pytest.raises(ValueError, match="lowest fixed carrier of 46: must be >= 47"):
         entry.send(replace(bands(), frequency=[46.0, 130.0, 261.0]))
-    with pytest.raises(ValueError, match="least spacing of 82 Hz: must be >= 83 Hz"):
+    with pytest.raises(ValueError, match="least spacing of 82: must be >= 83"):
         entry.send(replace(bands(), frequency=[48.0, 130.0, 261.0]))
     with pytest.raises(ValueError, match="must follow the finger as designed for"):
         entry.send(bands(wavenumber=500.0))
     entry.send(replace(bands(), frequency=[50.0, 140.0, 300.0]))
+    with pytest.raises(ValueError, match="carrier of 4900 Hz: must be <= 1000 Hz"):
+        entry.send(replace(bands(), frequency=[50.0, 140.0, 4900.0]))
+    ridges = RealtimeEntry(controller(bands(wavenumber=500.0)))
+    with pytest.raises(ValueError, match="least spacing of ridges per metre of 10: must be >= 500"):
+        ridges.send(replace(bands(wavenumber=500.0), wavenumber=[500.0, 510.0, 1500.0]))
     with pytest.raises(ValueError, match="must be finite"):
         entry.finger(np.inf)
     with pytest.raises(ValueError, match="must be finite"):

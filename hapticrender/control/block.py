@@ -57,7 +57,7 @@ class BlockController:
             raise ValueError(f"{precision=}: must be one of {', '.join(PRECISIONS)}")
         if block < 2:
             raise ValueError(f"{block=}: must be >= 2 samples")
-        tables = controller.tables
+        tables = controller.tables._replace(tone=controller.tables.tone.copy())
         if len(tables.shape) > MOST_COORDINATES:
             raise ValueError(f"{len(tables.shape)} coordinates: must be <= {MOST_COORDINATES} in blocks")
         self.method = controller.method
@@ -94,7 +94,8 @@ class BlockController:
         ------
         ValueError
             Their number differs from what was designed for, they are a waveform where that was none, or the other way
-            round; others follow the finger; a carrier is lower, or two are nearer, than any that was designed for.
+            round; others follow the finger; a carrier is lower, or two are nearer, than any that was designed for; or
+            one is higher than the device's highest.
         """
         if len(bands) != self.n_bands:
             raise ValueError(f"{len(bands)} bands: must be {self.n_bands}, as designed for")
@@ -106,9 +107,13 @@ class BlockController:
         for what, now, then in (
             ("lowest fixed carrier", _lowest(bands), _lowest(self._designed)),
             ("least spacing", spacing(bands), spacing(self._designed)),
+            ("least spacing of ridges per metre", _ridges_apart(bands), _ridges_apart(self._designed)),
         ):
             if now < then * (1.0 - 1e-9):
-                raise ValueError(f"{what} of {now:g} Hz: must be >= {then:g} Hz, as designed for")
+                raise ValueError(f"{what} of {now:g}: must be >= {then:g}, as designed for (Hz, or 1/m)")
+        highest = max(self.tables.sample.highest, float(self._designed.frequency.max(initial=0.0)))
+        if bands.frequency.max(initial=0.0) > highest:
+            raise ValueError(f"carrier of {bands.frequency.max():g} Hz: must be <= {highest:g} Hz")
         return bands.tone()
 
     def run(self, sensed: Array, position: Array, wanted: Array) -> tuple[Array, Array, Array]:
@@ -134,6 +139,11 @@ class BlockController:
 def _lowest(bands: Bands) -> float:
     """Lowest carrier that does not follow the finger, Hz; infinite where all do."""
     return float(np.min(bands.frequency[bands.wavenumber == 0.0], initial=math.inf))
+
+
+def _ridges_apart(bands: Bands) -> float:
+    """Least distance between two carriers that follow the finger, 1/m; infinite where there is one or none."""
+    return float(np.diff(np.sort(bands.wavenumber[bands.wavenumber > 0.0])).min(initial=math.inf))
 
 
 def numbers_of_blocks(numbers: BankNumbers, block: int) -> BankNumbers:

@@ -443,7 +443,7 @@ def plate_tables(parameters: PlateParameters, finger: Finger) -> PlateTables:
     if not rocking:
         stiffness, damping = np.diag(stiffness.diagonal()), np.diag(damping.diagonal())
     tables = PlateTables(
-        period=1.0 / parameters.rate,
+        period=float(1.0 / parameters.rate),
         terms=0,
         inverse_mass=(
             float(1.0 / mass[0]),
@@ -472,8 +472,16 @@ def plate_tables(parameters: PlateParameters, finger: Finger) -> PlateTables:
         sensor_noise=parameters.sensor_noise,
         sensor_gain=(float(parameters.sensor_gain_1), float(parameters.sensor_gain_2)),
     )
+    tables = PlateTables(*(_as_float(value) for value in tables))  # else every mix of types compiles anew
     strongest = float(mechanics.load_factor(np.array(MOST_LOAD))) if finger.load_scaling else 1.0
-    return tables._replace(terms=_taylor_terms(tables, strongest))
+    return tables._replace(terms=_taylor_terms(tables._replace(terms=0), strongest))
+
+
+def _as_float(value: Any) -> Any:
+    """Floats for integers, also inside tuples; flags and the number of terms stay."""
+    if isinstance(value, tuple):
+        return tuple(float(each) for each in value)
+    return value if isinstance(value, (bool, np.bool_)) else float(value)
 
 
 def _upper(matrix: Array) -> tuple[float, float, float]:
