@@ -100,3 +100,22 @@ print(len(hr.render(scene).drive))
         command = [*nobody, *command]
     done = subprocess.run(command, env=kept | nowhere, capture_output=True, text=True, cwd="/", timeout=300)
     assert done.stdout.strip() == "50", done.stderr
+
+
+def test_numbers_that_are_compiled_in_count(tmp_path):
+    """A file of row numbers, which never says what it is for: an edit makes another stamp, one to a page does not."""
+    package = tmp_path / "toy"
+    (package / "control").mkdir(parents=True)
+    shutil.copy(ROOT / "hapticrender" / "_jit.py", package / "_jit.py")
+
+    def stamp(rows, page):
+        (package / "control" / "rows.py").write_text(rows)
+        (package / "page.py").write_text(page)
+        script = "from toy._jit import _STAMP; print(_STAMP)"
+        return subprocess.run(
+            [sys.executable, "-c", script], cwd=tmp_path, capture_output=True, text=True, check=True
+        ).stdout
+
+    first = stamp("RE, IM = 0, 1", "a")
+    assert stamp("RE, IM = 0, 1", "b") == first
+    assert stamp("IM, RE = 0, 1", "b") != first
