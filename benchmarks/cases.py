@@ -262,7 +262,7 @@ def every_case(short: bool) -> Iterator[tuple[str, Callable[[], Iterator[Figure]
         yield f"simulation {method}", lambda m=method, g=goal, s=seconds: simulation(m, g, s, pairs)
     for bands in (64,) if short else (8, 64, 512):
         yield f"peers analysis {bands}", lambda b=bands: analysis(b, pairs)
-    yield "batch", lambda: batches(0.5 if short else 2.0, pairs)
+    yield "batch", lambda: batches(1.0 if short else 2.0, pairs)
     yield "linear", lambda: linear_in_bands(pairs)
     yield "hours", lambda: hours_of_play(0.01 if short else 10.0)
     yield "startup", lambda: start_up(1 if short else 5)
