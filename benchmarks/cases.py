@@ -258,7 +258,7 @@ def every_case(short: bool) -> Iterator[tuple[str, Callable[[], Iterator[Figure]
         for precision in DTYPES:
             yield f"blocks {bands} {precision}", lambda b=bands, p=precision: block_against_c(b, p, pairs)
     for method, goal in (("h2", 1500.0), ("paper", 2500.0)):
-        seconds = 1.0 if short else 10.0
+        seconds = 1.0 if short else 12.0
         yield f"simulation {method}", lambda m=method, g=goal, s=seconds: simulation(m, g, s, pairs)
     for bands in (64,) if short else (8, 64, 512):
         yield f"peers analysis {bands}", lambda b=bands: analysis(b, pairs)

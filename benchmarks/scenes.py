@@ -10,13 +10,13 @@ from hapticrender.bands import Bands
 from hapticrender.batch import Scenario, together
 from hapticrender.control.block import BlockController
 from hapticrender.control.methods import METHODS
-from hapticrender.loop import CHUNK
 from hapticrender.plants.vibrotactile import Plate, PlateParameters
 from hapticrender.touch.mechanics import HEAVY
 
 PLATE = PlateParameters()
 CARD = 48000.0  # Hz: a sound card
 BLOCK = 64  # samples
+PIECE = 4.0  # s: longer arrays than these cost page faults, which no loop has part in
 TOUCHING = replace(SLIDING, touches=((0.0, 36_000.0),))  # a heavy finger, sliding from the start
 
 
@@ -54,9 +54,9 @@ def in_blocks(bands, precision="double", **numbers):
 
 
 def closed_loop(method, bands, samples, finger=TOUCHING, parameters=PLATE):
-    """A run of plate and controller in one compiled loop, as a function; in the pieces in which the library runs it."""
+    """A run of plate and controller in one compiled loop, as a function, in pieces of `PIECE` seconds at most."""
     controller = METHODS[method].design(parameters.band_model(parameters.rate, parameters.delay), comb(bands))
-    plate, piece = Plate(parameters, finger), np.zeros(int(CHUNK * parameters.rate))
+    plate, piece = Plate(parameters, finger), np.zeros(min(int(PIECE * parameters.rate), samples))
 
     def run():
         for _ in range(samples // len(piece)):
