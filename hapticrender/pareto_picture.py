@@ -101,9 +101,10 @@ def _scatter(axes: Any, points: Sequence[Point], cost: Callable[[Point], float],
             (abs(cost(point)), max(100 * point.error, FOOT)),
             xytext=(-8, -3), textcoords="offset points", ha="right", va="top", fontsize=9, fontweight="bold",
         )  # fmt: skip
+    at, side = (0.99, "right") if cost(best[0]) > 0 else (0.02, "left")  # where there are no points
     lines = [f"{number}  {each.setting.method}, {each.setting.what}" for number, each in enumerate(best, start=1)]
     axes.text(
-        0.99, 0.97, "the front:\n" + "\n".join(lines), transform=axes.transAxes, ha="right", va="top", fontsize=8,
+        at, 0.97, "the front:\n" + "\n".join(lines), transform=axes.transAxes, ha=side, va="top", fontsize=8,
         bbox={"facecolor": "white", "edgecolor": "#DDDDDD", "boxstyle": "round,pad=0.4"}, zorder=4,
     )  # fmt: skip
     axes.set(xscale="log", yscale="log", xlabel=label, ylim=(FOOT, reach))
