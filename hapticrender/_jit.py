@@ -97,7 +97,8 @@ class _Fragment(CPUDispatcher):
                 key = object()
                 lowered: Any = self._compiler.compile(args, returned)
                 known = lowered._replace(entry_point=key)
-                self.targetctx.insert_user_function(key, known.fndesc, [known.library])
+                part = known._asdict()
+                self.targetctx.insert_user_function(key, part["fndesc"], [part["library"]])
                 self.overloads[tuple(args)] = known
         return known.entry_point
 
