@@ -27,7 +27,8 @@ from hapticrender._jit import callback, kernel
 from hapticrender.bands import Bands
 from hapticrender.control.bank_rows import TONE_ROWS
 from hapticrender.control.block import BlockController
-from hapticrender.control.block_kernels import BlockState, BlockTables, block_step
+from hapticrender.control.block_kernels import block_step
+from hapticrender.control.block_state import BlockState, BlockTables
 from hapticrender.protocols import Array, Flag
 
 HORIZON = 0.05  # s: a finger that is not heard of stays where it was bound for by then

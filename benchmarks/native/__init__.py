@@ -14,8 +14,8 @@ import numpy as np
 from hapticrender import _polynomials
 from hapticrender._lanes import WIDTH, aligned
 from hapticrender.control import bank_rows as row
-from hapticrender.control import block_kernels
-from hapticrender.control.bank_kernels import FORGET
+from hapticrender.control import block_state
+from hapticrender.control.bank_carriers import FORGET
 
 HERE = Path(__file__).parent
 FLAGS = ["-O3", "-march=native", "-ffp-contract=fast", "-fno-math-errno", "-fno-trapping-math", "-fPIC", "-shared"]
@@ -179,7 +179,7 @@ class TunedBlock:
         self.numbers = np.concatenate([[values[name] for name in self.names], *rest]).astype(float)
         self.tiles, self.block = len(state.bank.band), block
         rows = {name: getattr(row, name) for name in dir(row) if name.isupper()}
-        rows |= {name: getattr(block_kernels, name) for name in dir(block_kernels) if name.isupper()}
+        rows |= {name: getattr(block_state, name) for name in dir(block_state) if name.isupper()}
         rows |= {"TABLE_ROWS": state.table.shape[1], "HELD_ROWS": state.held.shape[1]}
         rows["LAW_TILE_ROWS"] = state.bank.law.shape[1]
         dtype = state.table.dtype.type

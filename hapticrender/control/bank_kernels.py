@@ -9,13 +9,9 @@ bands are the lanes, and as many scenarios as there are lanes, side by side.
 
 from __future__ import annotations
 
-import numpy as np
-from numba.extending import overload
-
 from hapticrender._jit import kernel
 from hapticrender._lanes import (
     any_of,
-    floor,
     high,
     lanes,
     low,
@@ -29,206 +25,14 @@ from hapticrender._lanes import (
     totals,
     write,
 )
-from hapticrender._polynomials import unit, whole
+from hapticrender._polynomials import whole
 from hapticrender.control import bank_rows as row
-from hapticrender.control.bank_finger import adapt_pass, feel, finger_stiffness, forget_finger, track_finger
-from hapticrender.control.kernels import DOUBT_TIME, FAR, TURN
+from hapticrender.control.bank_carriers import FORGET, REFRESH, carrier_pass, law_tune, look_ahead, refresh
+from hapticrender.control.bank_finger import adapt_pass, feel, forget_finger, track_finger
+from hapticrender.control.kernels import DOUBT_TIME, FAR
 
 HUGE = 1e300  # stands for infinity, where fast arithmetic is not told of it
-FORGET = 50.0  # 1/s: a carrier near 0 Hz is forgotten, not followed
 ADAPTATION = 4  # samples between two adaptations of the finger
-REFRESH = 64  # samples between two looks at the tones that are asked for
-
-
-@kernel
-def count_turns(phase, k, step):
-    """Phase of carrier k in turns, now; in whole 2^-64 turns, so that it never drifts; then counts on."""
-    turns = np.float64(phase[k] >> np.uint64(11)) * 2.0**-53
-    advance = REFRESH * (step - floor(step))
-    phase[k] += np.uint64((advance - floor(advance)) * 2.0**63) << np.uint64(1)
-    return turns
-
-
-@kernel
-def take_bands(tables, state, t):
-    """Tones of a tile whose lanes are bands; returns whether a target still grows, and whether one follows a finger."""
-    tone, band, width = tables.tone, state.band, state.band.shape[2]
-    grows = follows = False
-    for i in range(min(width, tone.shape[1] - t * width)):
-        k = t * width + i
-        band[t, row.LIVE, i] = 1.0
-        for r in range(row.TONE_ROWS):
-            band[t, row.FREQUENCY + r, i] = tone[r, k]
-        band[t, row.TURNS, i] = count_turns(state.phase, k, tone[0, k] / tables.numbers.rate)
-        if band[t, row.RAMP, i] < 1.0 or band[t, row.R_RE, i] != tone[3, k] or band[t, row.R_IM, i] != tone[4, k]:
-            grows = True
-        follows = follows or tone[1, k] > 0.0
-    return grows, follows
-
-
-@kernel
-def take_scenarios(tables, state, t):
-    """The same where lanes are scenarios and a tile is a band of each; `tone` is (bands, TONE_ROWS, W)."""
-    tone, band, width = tables.tone, state.band, state.band.shape[2]
-    grows = follows = False
-    for i in range(width):
-        band[t, row.LIVE, i] = 1.0
-        for r in range(row.TONE_ROWS):
-            band[t, row.FREQUENCY + r, i] = tone[t, r, i]
-        band[t, row.TURNS, i] = count_turns(state.phase, t * width + i, tone[t, 0, i] / tables.numbers.rate)
-        if band[t, row.RAMP, i] < 1.0 or band[t, row.R_RE, i] != tone[t, 3, i] or band[t, row.R_IM, i] != tone[t, 4, i]:
-            grows = True
-        follows = follows or tone[t, 1, i] > 0.0
-    return grows, follows
-
-
-def taker(tone):
-    """Which of the two fits the shape of `tone`."""
-    return take_bands if tone.ndim == 2 else take_scenarios
-
-
-@overload(taker)
-def _compiled_taker(tone):
-    """Decided while the kernel is compiled."""
-    chosen = taker(tone)
-    return lambda tone: chosen
-
-
-@kernel
-def refresh(tables, state):
-    """Take up the tones that are asked for, and what stays for the next samples: law, turn, settled targets."""
-    numbers, band = tables.numbers, state.band
-    take = taker(tables.tone)
-    state.follows[0] = 0
-    for t in range(band.shape[0]):
-        grows, follows = take(tables, state, t)
-        if follows:
-            state.pace[t] = row.LOCKED
-            state.follows[0] += 1
-            continue
-        still = not (grows or numbers.analysed) and numbers.error_observer
-        state.pace[t] = row.STEADY if still else row.GROWING
-        frequency = lanes(band, t, row.FREQUENCY)
-        cos, sin = unit(1.0 / numbers.rate * frequency)
-        put(band, t, row.TURN_COS, cos)
-        put(band, t, row.TURN_SIN, sin)
-        put(band, t, row.OMEGA, TURN * frequency)
-        look_ahead(numbers, band, state.law, t)
-        law_tune(tables, state, t)
-        cos, sin = unit(lanes(band, t, row.TURNS) + lanes(band, t, row.PHASE))
-        put(band, t, row.COS, lanes(band, t, row.LIVE) * cos)
-        put(band, t, row.SIN, lanes(band, t, row.LIVE) * sin)
-        if still:
-            put(band, t, row.DR_RE, 0.0 * lanes(band, t, row.DR_RE))
-            put(band, t, row.DR_IM, 0.0 * lanes(band, t, row.DR_IM))
-
-
-@kernel
-def look_ahead(numbers, band, law, t):
-    """Turn of a tile's force by delay and hold."""
-    omega, sweep = lanes(band, t, row.OMEGA), lanes(band, t, row.SWEEP)
-    cos, sin = unit(numbers.lead / TURN * (omega + 0.5 * numbers.lead * sweep))
-    half = 0.5 / numbers.rate * omega
-    _, chord = unit(half / TURN)
-    straight = size(half) < 1e-9
-    grow = select(straight, 1.0, half / select(straight, 1.0, chord))
-    put(law, t, row.AHEAD_RE, grow * cos)
-    put(law, t, row.AHEAD_IM, grow * sin)
-
-
-@kernel
-def law_tune(tables, state, t):
-    """Law of a tile: D + z h h^T and its slope for every pair of coordinates, turned ahead."""
-    band, law, touch, coordinates = state.band, state.law, state.touch, len(tables.shape)
-    omega, sweep = lanes(band, t, row.OMEGA), lanes(band, t, row.SWEEP)
-    cos, sin = lanes(law, t, row.AHEAD_RE), lanes(law, t, row.AHEAD_IM)
-    touching = read(touch, row.KNOWN)  # 1 where the finger is on, else 0
-    place = read(touch, row.KNOWN_PLACE)
-    skin, drag = touching * read(touch, row.MASS), touching * read(touch, row.DAMPING)
-    z_re, z_im = finger_stiffness(touch, band, t)
-    for c in range(coordinates):
-        for i in range(coordinates):
-            arms = (1.0 if c == 0 else place) * (1.0 if i == 0 else place)
-            mass, damping = read(tables.mass, c, i) + arms * skin, read(tables.damping, c, i) + arms * drag
-            at = row.FIRST_LAW + row.LAW_ROWS * (c * coordinates + i)
-            re = read(tables.stiffness, c, i) - omega * omega * read(tables.mass, c, i) + arms * touching * z_re
-            im = omega * read(tables.damping, c, i) + arms * touching * z_im + sweep * mass
-            put(law, t, at + row.LAW_RE, re * cos - im * sin)
-            put(law, t, at + row.LAW_IM, re * sin + im * cos)
-            turn = 2.0 * omega * mass
-            put(law, t, at + row.SLOPE_RE, damping * cos - turn * sin)
-            put(law, t, at + row.SLOPE_IM, damping * sin + turn * cos)
-
-
-@kernel
-def ease(x):
-    """Third-order step from 0 to 1 over 0..1."""
-    x = low(high(x, 0.0), 1.0)
-    return x * x * (3.0 - 2.0 * x)
-
-
-@kernel
-def turn_pass(tables, state, t):
-    """Turn the fixed carriers of a tile on to this sample; `refresh` keeps them exact."""
-    band = state.band
-    cos, sin = lanes(band, t, row.COS), lanes(band, t, row.SIN)
-    turn_cos, turn_sin = lanes(band, t, row.TURN_COS), lanes(band, t, row.TURN_SIN)
-    put(band, t, row.COS, cos * turn_cos - sin * turn_sin)
-    put(band, t, row.SIN, sin * turn_cos + cos * turn_sin)
-
-
-@kernel
-def grow_pass(tables, state, t):
-    """Weight of the fixed carriers of a tile while their targets grow."""
-    band = state.band
-    ramp = low(lanes(band, t, row.RAMP) + tables.numbers.ramp, 1.0)
-    weight = lanes(band, t, row.LIVE) * ease(ramp)
-    put(band, t, row.RAMP, ramp)
-    put(band, t, row.WEIGHT, weight)
-    put(band, t, row.SHARE, low(weight / high(ramp, 1e-9), 1.0))
-
-
-@kernel
-def motion_pass(numbers, band, track, t):
-    """Frequency, sweep and weight of a tile whose carriers follow the finger."""
-    wavenumber = lanes(band, t, row.WAVENUMBER)
-    hertz = lanes(band, t, row.FREQUENCY) + wavenumber * read(track, row.VELOCITY)
-    put(band, t, row.OMEGA, TURN * hertz)
-    put(band, t, row.SWEEP, TURN * wavenumber * read(track, row.ACCELERATION))
-    felt = (wavenumber == 0.0) | (read(track, row.SEEN) > 0.0)
-    ramp = lanes(band, t, row.RAMP)
-    ramp = select(felt, low(ramp + numbers.ramp, 1.0), high(ramp - numbers.ramp, 0.0))
-    inside = ease(2.0 / numbers.lowest * size(hertz) - 1.0) * ease(5.0 - 4.0 / numbers.highest * size(hertz))
-    weight = lanes(band, t, row.LIVE) * ease(ramp) * select(wavenumber > 0.0, inside, 1.0)
-    put(band, t, row.RAMP, ramp)
-    put(band, t, row.WEIGHT, weight)
-    put(band, t, row.SHARE, low(weight / high(ramp, 1e-9), 1.0))
-
-
-@kernel
-def locked_pass(tables, state, t):
-    """Carriers, weights and law of a tile that follows the finger."""
-    numbers, band, track = tables.numbers, state.band, state.track
-    wavenumber = lanes(band, t, row.WAVENUMBER)
-    turns = lanes(band, t, row.TURNS)
-    cos, sin = unit(turns + wavenumber * read(track, row.HELD) + lanes(band, t, row.PHASE))
-    put(band, t, row.TURNS, turns + 1.0 / numbers.rate * lanes(band, t, row.FREQUENCY))
-    put(band, t, row.COS, lanes(band, t, row.LIVE) * cos)
-    put(band, t, row.SIN, lanes(band, t, row.LIVE) * sin)
-    motion_pass(numbers, band, track, t)
-
-
-@kernel
-def carrier_pass(tables, state, fresh):
-    """Phase, frequency, sweep and weight of every carrier; carriers that are `fresh` stand where they belong."""
-    for t in range(state.band.shape[0]):
-        if state.pace[t] == row.LOCKED:
-            locked_pass(tables, state, t)
-        else:
-            if not fresh:
-                turn_pass(tables, state, t)
-            if state.pace[t] == row.GROWING:
-                grow_pass(tables, state, t)
 
 
 @kernel

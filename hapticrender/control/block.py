@@ -11,16 +11,8 @@ from hapticrender.bands import Bands
 from hapticrender.control import bank_rows as row
 from hapticrender.control.bank import BankController, settled_share, spacing
 from hapticrender.control.bank_state import PRECISIONS, BankNumbers, BankTables, bank_state
-from hapticrender.control.block_kernels import (
-    CHANNEL_ROWS,
-    EIGHT,
-    PHASE_ROWS,
-    TURN_SIN,
-    TURNS,
-    BlockState,
-    BlockTables,
-    block_run,
-)
+from hapticrender.control.block_kernels import block_run
+from hapticrender.control.block_state import CHANNEL_ROWS, EIGHT, PHASE_ROWS, TURN_SIN, TURNS, BlockState, BlockTables
 from hapticrender.protocols import Array
 
 MOST_COORDINATES = 2

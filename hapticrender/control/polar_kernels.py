@@ -19,7 +19,7 @@ from numba.extending import overload
 from hapticrender._jit import OPTIONS, kernel
 from hapticrender._lanes import LaneType, any_of, high, lanes, low, put, put_pairs, root, select, size, total
 from hapticrender._polynomials import polar, unit
-from hapticrender.control.bank_kernels import count_turns
+from hapticrender.control.bank_carriers import count_turns
 from hapticrender.control.kernels import (
     DOUBT_TIME,
     FAR,

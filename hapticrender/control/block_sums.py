@@ -1,0 +1,223 @@
+"""Sums over the bands and over the samples of a block, and the exact solve between residuals.
+
+Samples are taken in groups of eight about the group's middle, where a carrier's cosine is even and its sine odd: what a
+pair of samples has in common and what it differs by cost half of what the samples would.  An envelope is turned from
+group to group.  Carriers that follow the finger have tables over the whole block instead.
+"""
+
+from __future__ import annotations
+
+from hapticrender._jit import kernel
+from hapticrender._lanes import lanes, put, put_stretch, stretch, totals
+from hapticrender.control import bank_rows as row
+from hapticrender.control.block_state import (
+    CHANNEL_ROWS,
+    EIGHT,
+    FROM_RE,
+    PAIR_COS,
+    PAIR_ROWS,
+    PAIR_SIN,
+    PAIRS,
+    TURN_COS,
+    TURN_SIN,
+)
+
+
+@kernel
+def turned(cos, sin, re, im):
+    """An envelope turned ahead."""
+    return re * cos - im * sin, re * sin + im * cos
+
+
+@kernel
+def clear(state):
+    """Begin the sums over the bands."""
+    nothing = 0.0 * lanes(state.table, 0, 0)
+    for s in range(2):
+        for m in range(state.lane_sum.shape[1]):
+            put(state.lane_sum, s, m, nothing)
+
+
+@kernel
+def add(lane_sum, s, m, value):
+    """Add to a sum."""
+    put(lane_sum, s, m, lanes(lane_sum, s, m) + value)
+
+
+@kernel
+def unfold(state):
+    """Sums over the lanes, sample by sample."""
+    out, lane_sum = state.sum, state.lane_sum
+    for q in range(0, out.shape[1], EIGHT):
+        for i in range(PAIRS):
+            early, late = q + PAIRS - 1 - i, q + PAIRS + i
+            even, even2 = totals(1.0, lanes(lane_sum, 0, early), lanes(lane_sum, 1, early))
+            odd, odd2 = totals(1.0, lanes(lane_sum, 0, late), lanes(lane_sum, 1, late))
+            out[0, early], out[0, late] = even - odd, even + odd
+            out[1, early], out[1, late] = even2 - odd2, even2 + odd2
+
+
+@kernel
+def add_following(state, t, s, re, im, step_re, step_im):
+    """Add a tile that follows the finger to sum s: Re (x + (m + 1) step) e^(j phase of m)."""
+    table, sums = state.table, state.lane_sum
+    for q in range(0, state.place.shape[0], EIGHT):
+        for i in range(PAIRS):
+            early, late = q + PAIRS - 1 - i, q + PAIRS + i
+            cos, sin = lanes(table, t, 2 * early), lanes(table, t, 2 * early + 1)
+            u, v = lanes(table, t, 2 * late), lanes(table, t, 2 * late + 1)
+            before = (re + (early + 1.0) * step_re) * cos - (im + (early + 1.0) * step_im) * sin
+            after = (re + (late + 1.0) * step_re) * u - (im + (late + 1.0) * step_im) * v
+            add(sums, s, early, 0.5 * (after + before))
+            add(sums, s, late, 0.5 * (after - before))
+
+
+@kernel
+def sum_bands(state, r, s):
+    """Two sums over the bands at every sample: of Re x e^(j w m), x in rows r, r + 1 and in rows s, s + 1 of `held`."""
+    table, held, sums = state.table, state.held, state.lane_sum
+    clear(state)
+    for t in range(table.shape[0]):
+        re, im, at, up = lanes(held, t, r), lanes(held, t, r + 1), lanes(held, t, s), lanes(held, t, s + 1)
+        if state.bank.pace[t] == row.LOCKED:
+            nothing = 0.0 * re
+            add_following(state, t, 0, re, im, nothing, nothing)
+            add_following(state, t, 1, at, up, nothing, nothing)
+            continue
+        turn, on = lanes(table, t, TURN_COS), lanes(table, t, TURN_SIN)
+        for q in range(0, sums.shape[1], EIGHT):
+            for i in range(PAIRS):
+                cos, sin = lanes(table, t, PAIR_ROWS * i + PAIR_COS), lanes(table, t, PAIR_ROWS * i + PAIR_SIN)
+                early, late = q + PAIRS - 1 - i, q + PAIRS + i
+                add(sums, 0, early, re * cos)
+                add(sums, 0, late, -im * sin)
+                add(sums, 1, early, at * cos)
+                add(sums, 1, late, -up * sin)
+            re, im = turned(turn, on, re, im)
+            at, up = turned(turn, on, at, up)
+    unfold(state)
+
+
+@kernel
+def sum_drives(state, at):
+    """Sums over the bands of two channels' drives at every sample, linear from the last block's envelope to this one's.
+
+    The first channel's rows start at `at`.
+    """
+    table, held, sums, share = state.table, state.held, state.lane_sum, 1.0 / state.place.shape[0]
+    first, second = at + FROM_RE, at + CHANNEL_ROWS + FROM_RE
+    clear(state)
+    for t in range(table.shape[0]):
+        re, im, step_re, step_im = four(held, t, first)
+        up_re, up_im, rise_re, rise_im = four(held, t, second)
+        if state.bank.pace[t] == row.LOCKED:
+            add_following(state, t, 0, re, im, share * step_re, share * step_im)
+            add_following(state, t, 1, up_re, up_im, share * rise_re, share * rise_im)
+            continue
+        turn, on, ahead = lanes(table, t, TURN_COS), lanes(table, t, TURN_SIN), share * (PAIRS + 0.5)
+        for q in range(0, sums.shape[1], EIGHT):
+            re, im = re + ahead * step_re, im + ahead * step_im
+            up_re, up_im = up_re + ahead * rise_re, up_im + ahead * rise_im
+            for i in range(PAIRS):
+                cos, sin, far_cos, far_sin = four(table, t, PAIR_ROWS * i)
+                early, late = q + PAIRS - 1 - i, q + PAIRS + i
+                add(sums, 0, early, re * cos - step_im * far_sin)
+                add(sums, 0, late, step_re * far_cos - im * sin)
+                add(sums, 1, early, up_re * cos - rise_im * far_sin)
+                add(sums, 1, late, rise_re * far_cos - up_im * sin)
+            re, im = turned(turn, on, re, im)
+            step_re, step_im = turned(turn, on, step_re, step_im)
+            up_re, up_im = turned(turn, on, up_re, up_im)
+            rise_re, rise_im = turned(turn, on, rise_re, rise_im)
+            ahead = share * EIGHT
+    unfold(state)
+
+
+@kernel
+def four(array, t, r):
+    """Rows r to r + 3 of a tile."""
+    return lanes(array, t, r), lanes(array, t, r + 1), lanes(array, t, r + 2), lanes(array, t, r + 3)
+
+
+@kernel
+def solve(state, which, c):
+    """Residuals e = Q e_h of row c, and the same in the precision of the bands.
+
+    `inverse` has as many zeros in front as a block has samples, so that what lies in the future adds nothing.
+    """
+    inverse, raw, whole = state.inverse, state.raw, state.raw.shape[1]
+    for m in range(0, whole, EIGHT):
+        first = second = third = fourth = 0.0 * stretch(inverse, which, 0)
+        at = whole + m
+        for j in range(0, m + EIGHT, 4):
+            first += raw[c, j] * stretch(inverse, which, at - j)
+            second += raw[c, j + 1] * stretch(inverse, which, at - j - 1)
+            third += raw[c, j + 2] * stretch(inverse, which, at - j - 2)
+            fourth += raw[c, j + 3] * stretch(inverse, which, at - j - 3)
+        put_stretch(state.error, c, m, (first + second) + (third + fourth))
+    for m in range(state.place.shape[0], whole):  # none is heard after the block's end
+        state.error[c, m] = 0.0
+    for q in range(0, whole, EIGHT):
+        for i in range(PAIRS):
+            early, late = q + PAIRS - 1 - i, q + PAIRS + i
+            state.heard[c, early] = state.error[c, late] + state.error[c, early]
+            state.heard[c, late] = state.error[c, late] - state.error[c, early]
+
+
+@kernel
+def correlate(state, t, c, d):
+    """Sums over the block of rows c and d of `heard` with the carriers of a tile, e^(-j w m)."""
+    table, heard = state.table, state.heard
+    re = im = at = up = 0.0 * lanes(table, t, 0)
+    if state.bank.pace[t] == row.LOCKED:
+        for q in range(0, state.place.shape[0], EIGHT):
+            for i in range(PAIRS):
+                early, late = q + PAIRS - 1 - i, q + PAIRS + i
+                cos, sin = lanes(table, t, 2 * early), lanes(table, t, 2 * early + 1)
+                u, v = lanes(table, t, 2 * late), lanes(table, t, 2 * late + 1)
+                even, odd = 0.5 * heard[c, early], 0.5 * heard[c, late]
+                re, im = re + even * (u + cos) + odd * (u - cos), im - even * (v + sin) - odd * (v - sin)
+                even, odd = 0.5 * heard[d, early], 0.5 * heard[d, late]
+                at, up = at + even * (u + cos) + odd * (u - cos), up - even * (v + sin) - odd * (v - sin)
+        return re, im, at, up
+    turn, back = lanes(table, t, TURN_COS), -lanes(table, t, TURN_SIN)
+    for q in range(heard.shape[1] - EIGHT, -1, -EIGHT):
+        re, im = turned(turn, back, re, im)
+        at, up = turned(turn, back, at, up)
+        for i in range(PAIRS):
+            cos, sin = lanes(table, t, PAIR_ROWS * i + PAIR_COS), lanes(table, t, PAIR_ROWS * i + PAIR_SIN)
+            early, late = q + PAIRS - 1 - i, q + PAIRS + i
+            re, im = re + heard[c, early] * cos, im - heard[c, late] * sin
+            at, up = at + heard[d, early] * cos, up - heard[d, late] * sin
+    return re, im, at, up
+
+
+@kernel
+def respond(tables, state, g):
+    """What a residual adds to the ones after it in the carriers; then the inverse of that, and of the wanted one."""
+    band, held = state.bank.band, state.held
+    for t in range(band.shape[0]):
+        share, at = lanes(band, t, row.SHARE), PAIR_ROWS * (PAIRS - 1)
+        if state.bank.pace[t] == row.LOCKED:
+            put(held, t, 0, share * lanes(state.table, t, 0))
+            put(held, t, 1, -share * lanes(state.table, t, 1))
+        else:
+            put(held, t, 0, share * lanes(state.table, t, at + PAIR_COS))
+            put(held, t, 1, share * lanes(state.table, t, at + PAIR_SIN))
+    sum_bands(state, 0, 0)
+    for d in range(state.response.shape[0]):
+        state.response[d] = state.sum[0, d]
+    invert(state.response, g, tables.sample.dc, tables.sample.dc_drift, state.inverse, 0)
+    invert(state.response, tables.sample.reference, 0.0, 0.0, state.inverse, 1)
+
+
+@kernel
+def invert(response, g, dc, drift, inverse, which):
+    """First column of the inverse of 1 + L, L[m, j] = r[m - j], behind as many zeros."""
+    block = response.shape[0]
+    for m in range(block):
+        inverse[which, block + m] = 1.0 if m == 0 else 0.0
+    for j in range(block):
+        value = inverse[which, block + j]
+        for m in range(j + 1, block):
+            inverse[which, block + m] -= (dc + (m - j - 1) * drift + g * response[m - j]) * value
