@@ -37,7 +37,8 @@ def line_data(found):
     return found.get_xdata(), found.get_ydata()
 
 
-def test_a_png_of_full_size_is_written_without_pyplot(tmp_path):
+def test_a_png_of_full_size_is_written_without_pyplot(tmp_path, monkeypatch):
+    monkeypatch.delitem(sys.modules, "matplotlib.pyplot", raising=False)  # another package may have imported it
     path = tmp_path / "run.png"
     swiped().plot(path)
     data = path.read_bytes()

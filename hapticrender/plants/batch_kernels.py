@@ -24,6 +24,8 @@ from hapticrender.plants.propagator import (
     STATES,
     STRENGTH,
     WIDTH,
+    kept,
+    polynomial,
 )
 from hapticrender.protocols import Array
 
@@ -109,21 +111,6 @@ def lay(tables, work, state, i, lever, strength):
             scatter(work.step, 0 if n == 0 else -1, state.powers, n, i)
         span[CENTRE, i], span[HALF, i], span[SCALE, i] = lever, 0.0, 0.0
     span[HOLD, i] = strength
-
-
-@kernel
-def kept(powers, at, x):
-    """An entry of Phi or Gamma where no finger slides."""
-    return read(powers, 0, at)
-
-
-@kernel
-def polynomial(powers, at, x):
-    """An entry of Phi or Gamma at `x`, -1 to 1 over each window."""
-    value = read(powers, NODES - 1, at)
-    for n in range(NODES - 2, -1, -1):
-        value = read(powers, n, at) + x * value
-    return value
 
 
 @kernel
