@@ -53,6 +53,10 @@ class Bands:
     envelope : ndarray of complex, shape (n,), m, or None
         Constant wanted envelopes, finite; None where the wanted waveform has
         to be analysed by the bank that listens to the device (recordings).
+    modulated : bool
+        The wanted waveform is a factor of every envelope, which is then constant but for it.
+    differentiated : bool
+        Wanted is the time derivative of what the envelopes say, whatever the carriers' frequencies come to be.
 
     Raises
     ------
@@ -70,6 +74,8 @@ class Bands:
     wavenumber: Array
     phase: Array
     envelope: Array | None = None
+    modulated: bool = False
+    differentiated: bool = False
 
     def __post_init__(self) -> None:
         for name, (unit, kind, least) in _COLUMNS.items():

@@ -181,12 +181,12 @@ def _h5py() -> Any:
 
 
 def _write_h5(path: Path, header: Header, frames: Array) -> None:
-    units = {"drive": "A", "normal_load": "N", "flags": "1"}
+    units = {"drive": header.drive_unit, "position": "m", "normal_load": "N", "flags": "1"}
     with _h5py().File(path, "w") as file:
         file["header"] = header.to_json()
         for name, values in split(header, frames).items():
             file[name] = values
-            file[name].attrs["unit"] = units.get(name, "m")
+            file[name].attrs["unit"] = units.get(name, header.unit)
 
 
 def _read_h5(path: Path) -> tuple[Header, Array]:
@@ -231,8 +231,8 @@ def _write_flac(path: Path, header: Header, frames: Array) -> None:
         raise ValueError(f"{path}: {width} channels, but FLAC holds at most {FLAC_CHANNELS}: choose .w64 or .au")
     scales = {name: float(np.nanmax(np.abs(signal), initial=0.0)) or 1.0 for name, signal in signals.items()}
     names = ", ".join(name for name, _ in header.channels[:width])
-    units = {"drive": "A", "sensed": "m", "motion": "m"}
-    stated = ", ".join(f"{name} {scale:.6g} {units[name]}" for name, scale in scales.items())
+    units = {"drive": header.drive_unit}
+    stated = ", ".join(f"{name} {scale:.6g} {units.get(name, header.unit)}" for name, scale in scales.items())
     scaled = np.hstack([signal / scales[name] for name, signal in signals.items()])
     comment = f"channels: {names}; full scale: {stated}; rate = {header.rate!r} Hz; the other signals do not fit"
     _write_audio(path, "FLAC", "PCM_24", np.nan_to_num(scaled), header.rate, comment)

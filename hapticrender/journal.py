@@ -59,7 +59,11 @@ class Header:
     places : tuple of str
         Names of the judged places, one column of motion each.
     drive_limit : float or None
-        Largest drive (A, either sign) that the device takes; None where unknown.
+        Largest drive (either sign) that the device takes; None where unknown.
+    unit, drive_unit : str
+        Of the sensors, motion and targets; of the drive.
+    profile : tuple of float, or None
+        What is wanted at each place, as a multiple of the target; None: the same everywhere.
     """
 
     scene: str
@@ -76,6 +80,9 @@ class Header:
     sensed_channels: int = 2
     places: tuple[str, ...] = ("centre", "end 1", "end 2")
     drive_limit: float | None = None
+    unit: str = "m"
+    drive_unit: str = "A"
+    profile: tuple[float, ...] | None = None
 
     @classmethod
     def of(cls, scene: Scene, **rest: Any) -> Header:
@@ -113,13 +120,13 @@ class Header:
     def channels(self) -> list[tuple[str, str]]:
         """Name and unit of every column."""
         return [
-            *((f"drive {i + 1}", "A") for i in range(self.drive_channels)),
-            *((f"sensed {i + 1}", "m") for i in range(self.sensed_channels)),
-            *((f"motion {place}", "m") for place in self.places),
+            *((f"drive {i + 1}", self.drive_unit) for i in range(self.drive_channels)),
+            *((f"sensed {i + 1}", self.unit) for i in range(self.sensed_channels)),
+            *((f"motion {place}", self.unit) for place in self.places),
             ("position", "m"),
             ("normal load", "N"),
             ("flags", "1"),
-            *((f"target {k + 1} {part}", "m") for k in range(len(self.bands)) for part in ("re", "im")),
+            *((f"target {k + 1} {part}", self.unit) for k in range(len(self.bands)) for part in ("re", "im")),
         ]
 
     def to_json(self) -> str:
@@ -127,6 +134,7 @@ class Header:
         fields = {name: getattr(self, name) for name in self.__dataclass_fields__ if name != "bands"}
         envelope = self.bands.envelope
         bands = {name: getattr(self.bands, name).tolist() for name in ("frequency", "wavenumber", "phase")}
+        bands |= {name: getattr(self.bands, name) for name in ("modulated", "differentiated")}
         bands["envelope"] = None if envelope is None else [[z.real, z.imag] for z in envelope.tolist()]
         channels = [{"name": name, "unit": unit} for name, unit in self.channels]
         return json.dumps({"format": FORMAT, "version": VERSION, **fields, "bands": bands, "channels": channels})
@@ -142,18 +150,28 @@ class Header:
             if version != VERSION:
                 raise ValueError(f"{version=} of the header is unknown, this library reads {VERSION}")
             del fields["channels"]
-            return cls(**{**fields, "bands": _bands(**fields["bands"]), "places": tuple(fields["places"])})
+            lists = {name: tuple(fields[name]) for name in ("places", "profile") if fields.get(name) is not None}
+            return cls(**{**fields, "bands": _bands(**fields["bands"]), **lists})
         except (KeyError, TypeError, AttributeError, ValueError) as error:
             raise ValueError(f"{where}: not a recording of this library ({error})") from error
 
 
-def _bands(frequency: list[float], wavenumber: list[float], phase: list[float], envelope: list[Any] | None) -> Bands:
+def _bands(
+    frequency: list[float],
+    wavenumber: list[float],
+    phase: list[float],
+    envelope: list[Any] | None,
+    modulated: bool = False,
+    differentiated: bool = False,
+) -> Bands:
     constant = None if envelope is None else np.array([complex(re, im) for re, im in envelope], complex)
     return Bands(
         frequency=np.array(frequency, float),
         wavenumber=np.array(wavenumber, float),
         phase=np.array(phase, float),
         envelope=constant,
+        modulated=modulated,
+        differentiated=differentiated,
     )
 
 

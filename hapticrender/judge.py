@@ -288,6 +288,7 @@ def summary(recording: Recording) -> dict[str, Any]:
         "device": header.device,
         "method": header.method,
         "seed": header.seed,
+        "unit": header.unit,
         "rate": header.rate,
         "duration": len(recording) / recording.rate,
         "judged_from": begin,
@@ -308,7 +309,7 @@ def _band(recording: Recording, k: int, judged: Array, places: list[str]) -> dic
     bands, envelopes = recording.bands, recording.envelopes
     wavenumber = float(bands.wavenumber[k])
     wanted = envelopes.wanted[judged, k]
-    achieved = envelopes.achieved[judged, :, k]
+    achieved = envelopes.achieved[judged, :, k] / np.array(recording.header.profile or 1.0)
     figures: dict[str, Any] = {
         "frequency": _median(envelopes.frequency[judged, k]) if wavenumber else float(bands.frequency[k]),
         "wavelength": 1 / wavenumber if wavenumber else None,
@@ -427,8 +428,8 @@ def text(summary: Mapping[str, Any]) -> str:
         rows.append(
             [
                 wording.band_label(band),
-                wording.quantity(band["target"], "m"),
-                wording.quantity(band["achieved"], "m"),
+                wording.quantity(band["target"], summary["unit"]),
+                wording.quantity(band["achieved"], summary["unit"]),
                 *(wording.percent(band[f"rms_error_{place}"]) for place in places),
                 "–" if phase is None else f"{round(math.degrees(phase), 1) + 0.0:.1f}°",
                 wording.quantity(band["settling_time"], "s"),
@@ -436,11 +437,19 @@ def text(summary: Mapping[str, Any]) -> str:
         )
     widths = [max(len(row[i]) for row in rows) for i in range(len(titles))]
     lines = ["  ".join(cell.rjust(width) for cell, width in zip(row, widths, strict=True)) for row in rows]
-    wobble, residual = (wording.quantity(summary[key], "m") for key in ("wobble", "residual_rms"))
+    wobble, residual = (wording.quantity(summary[key], summary["unit"]) for key in ("wobble", "residual_rms"))
     saturated = wording.percent(summary["saturated_share"])
-    lines.append(f"rms errors at centre and ends; wobble {wobble}, beside the bands {residual}, saturated {saturated}")
+    lines.append(
+        f"rms errors at {' and '.join(_said(places))}; wobble {wobble}, beside the bands {residual}, saturated {saturated}"
+    )
     lines.extend(summary["notes"])
     return "\n".join([*lines, f"{summary['scene']} {wording.verdict(summary)}"])
+
+
+def _said(places: list[str]) -> list[str]:
+    """Places in words, the ends of a plate as one."""
+    names = [place.replace("_", " ") for place in places]
+    return list(dict.fromkeys("ends" if name.startswith("end ") else name for name in names))
 
 
 def _mean(values: Array) -> float | None:

@@ -138,6 +138,9 @@ def run(session: Session, *, journal: str | Path | None = None, progress: Progre
         sensed_channels=driver.sensed_channels,
         places=session.model.places,
         drive_limit=session.model.drive_limit,
+        unit=session.model.unit,
+        drive_unit=session.model.drive_unit,
+        profile=session.model.profile,
     )
     with recorder, driver:
         done = 0

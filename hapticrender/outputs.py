@@ -61,9 +61,13 @@ def run_into(folder: Path, session: Session, *, progress: Callable[[float, float
         (folder / name).unlink(missing_ok=True)
     (folder / "scene.toml").write_text(toml, encoding="utf-8")
     recording = run(session, journal=folder / "recording.au", progress=progress)
+    header = recording.header
     sound = {
         name: {"full_scale": _write_sound(folder / name, samples, recording.rate, unit), "unit": unit}
-        for name, samples, unit in (("drive.wav", recording.drive, "A"), ("sensed.wav", recording.sensed, "m"))
+        for name, samples, unit in (
+            ("drive.wav", recording.drive, header.drive_unit),
+            ("sensed.wav", recording.sensed, header.unit),
+        )
     }
     picture = _plotted(recording, folder / "picture.png")
     summary = {**recording.summary(), "sound": sound}

@@ -107,12 +107,13 @@ def _scenes(count: int) -> str:
 def _overview(scenes: Sequence[Outputs]) -> str:
     """Table of all scenes, a row each, with a little chart of the errors."""
     rows = "\n".join(_row(scene) for scene in scenes)
+    heads = "".join(f"<th>{title}</th>" for title in wording.titles([scene.summary for scene in scenes]))
     return f"""<div class="scroll"><table>
 <thead>
 <tr><th class="text" rowspan="2">Scene</th><th rowspan="2">Target</th><th rowspan="2">Achieved</th>
 <th class="group" colspan="3">rms error</th><th class="text" rowspan="2">{_axis()}</th>
 <th class="text" rowspan="2">Verdict</th></tr>
-<tr><th>centre</th><th>end 1</th><th>end 2</th></tr>
+<tr>{heads}</tr>
 </thead>
 <tbody>
 {rows}
@@ -127,11 +128,11 @@ def _row(scene: Outputs) -> str:
     """One scene in the table of all."""
     summary = scene.summary
     bands = summary["bands"]
-    errors = [wording.worst_at(bands, place) for place in wording.PLACES]
+    errors = [wording.worst_at(bands, place) for place in wording.columns_of(summary)]
     cells = "".join(_error_cell(error, summary["tolerance"]) for error in errors)
     return f"""<tr><td class="text"><a href="#{quote(scene.name)}">{escape(scene.name)}</a></td>
-<td>{wording.quantity(wording.total(bands, "target"), "m")}</td>
-<td>{wording.quantity(wording.total(bands, "achieved"), "m")}</td>{cells}
+<td>{wording.quantity(wording.total(bands, "target"), summary["unit"])}</td>
+<td>{wording.quantity(wording.total(bands, "achieved"), summary["unit"])}</td>{cells}
 <td class="text">{_chart(errors, summary["tolerance"])}</td>{_verdict_cell(summary)}</tr>"""
 
 
@@ -222,13 +223,16 @@ def _capital(text: str) -> str:
 def _bands(summary: Mapping[str, Any]) -> str:
     """Table of a scene's bands; folded where there are many."""
     bands = summary["bands"]
-    rows = "\n".join(_band_row(band, summary["tolerance"]) for band in bands)
+    places = [place for place in wording.columns_of(summary) if f"error_{place}" in (bands or [{}])[0]]
+    rows = "\n".join(_band_row(band, places, summary) for band in bands)
+    heads = "".join(f"<th>{place.replace('_', ' ')}</th>" for place in places)
     table = f"""<div class="scroll"><table>
 <thead>
 <tr><th class="text" rowspan="2">Band</th><th rowspan="2">Target</th><th rowspan="2">Achieved</th>
-<th class="group" colspan="3">error of the mean</th><th class="group" colspan="3">rms error</th>
+<th class="group" colspan="{len(places)}">error of the mean</th>
+<th class="group" colspan="{len(places)}">rms error</th>
 <th rowspan="2">Phase error</th><th rowspan="2">Settles in</th></tr>
-<tr>{"<th>centre</th><th>end 1</th><th>end 2</th>" * 2}</tr>
+<tr>{heads}{heads}</tr>
 </thead>
 <tbody>
 {rows}
@@ -239,12 +243,13 @@ def _bands(summary: Mapping[str, Any]) -> str:
     return f"<details><summary>{escape(wording.bands_label(bands))}</summary>{table}</details>"
 
 
-def _band_row(band: Mapping[str, Any], tolerance: float) -> str:
+def _band_row(band: Mapping[str, Any], places: Sequence[str], summary: Mapping[str, Any]) -> str:
     """One band of a scene."""
-    means = "".join(f"<td>{wording.percent(band.get(f'error_{place}'))}</td>" for place in wording.PLACES)
-    spreads = "".join(_error_cell(band.get(f"rms_error_{place}"), tolerance) for place in wording.PLACES)
-    return f"""<tr><td class="text">{wording.band_label(band)}</td><td>{wording.quantity(band["target"], "m")}</td>
-<td>{wording.quantity(band["achieved"], "m")}</td>{means}{spreads}
+    unit, tolerance = summary["unit"], summary["tolerance"]
+    means = "".join(f"<td>{wording.percent(band.get(f'error_{place}'))}</td>" for place in places)
+    spreads = "".join(_error_cell(band.get(f"rms_error_{place}"), tolerance) for place in places)
+    return f"""<tr><td class="text">{wording.band_label(band)}</td><td>{wording.quantity(band["target"], unit)}</td>
+<td>{wording.quantity(band["achieved"], unit)}</td>{means}{spreads}
 <td>{wording.degrees(band["phase_error"])}</td>
 <td>{wording.quantity(band["settling_time"], "s")}</td></tr>"""
 
@@ -256,8 +261,8 @@ def _figures(summary: Mapping[str, Any]) -> str:
         "Judged from": wording.short(summary["judged_from"], "s"),
         "Sampling rate": wording.short(summary["rate"], "Hz"),
         "Method": f"{summary['method']}, seed {summary['seed']}",
-        "Wobble of the bands": wording.quantity(summary["wobble"], "m"),
-        "Beside the bands": f"{wording.quantity(summary['residual_rms'], 'm')} rms",
+        "Wobble of the bands": wording.quantity(summary["wobble"], summary["unit"]),
+        "Beside the bands": f"{wording.quantity(summary['residual_rms'], summary['unit'])} rms",
         "Drive at its limit": f"{wording.percent(summary['saturated_share'])} of the time",
         "Flagged samples": wording.flags(summary),
     }

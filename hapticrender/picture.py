@@ -22,6 +22,7 @@ BLUE, ORANGE, GREEN, RED, INK, PALE = "#0072B2", "#E69F00", "#009E73", "#D55E00"
 PLACES = ((BLUE, "o"), (ORANGE, "<"), (GREEN, ">"))
 COILS = (BLUE, ORANGE, GREEN, RED)
 COLUMNS = 1400  # points that a full-width panel can show
+QUANTITIES = {"m": "displacement", "N": "friction", "m/s": "skin velocity"}
 PERIODS = 4  # of the strongest carrier in the close-up
 MOST_LABELS = 10
 MOST_NOTES = 3  # lines
@@ -126,7 +127,9 @@ def _amplitude(axes: Any, recording: Recording, summary: dict[str, Any]) -> None
     achieved = _together(envelopes.achieved[:, :, shown])
     achieved[~readable] = np.nan
     time, wanted = _target(recording, shown)
-    tolerance = recording.header.tolerance
+    tolerance, profile = recording.header.tolerance, recording.header.profile
+    scale, unit = wording.drawn(recording.header.unit)
+    achieved = scale * achieved / np.array(profile or 1.0)
     axes.fill_between(
         time, (1 - tolerance) * wanted, (1 + tolerance) * wanted, color=PALE, alpha=0.2, lw=0, label="tolerance"
     )
@@ -134,12 +137,12 @@ def _amplitude(axes: Any, recording: Recording, summary: dict[str, Any]) -> None
     for i in reversed(range(len(names))):
         colour = PLACES[i % len(PLACES)][0]
         style = {"color": colour, "lw": 1.8 if i == 0 else 1.1, "marker": "." if len(achieved) < 500 else "", "ms": 3}
-        axes.plot(envelopes.time, 1e6 * achieved[:, i], label=names[i], **style)
+        axes.plot(envelopes.time, achieved[:, i], label=names[i], **style)
     axes.plot(time, wanted, color=INK, lw=1.1, ls=(0, (4, 2)), label="target")
     axes.axvline(summary["judged_from"], color=PALE, lw=0.9, ls=":", label="judged from here")
     several = "" if shown.sum() <= 1 else f" ({int(shown.sum())} bands: root of the sum of squares)"
-    axes.set(title=f"Peak amplitude{several}", ylabel="amplitude (µm)")
-    axes.set_ylim(0, 1.25 * max(np.nanmax(1e6 * achieved, initial=0), (1 + tolerance) * wanted.max(initial=0)) or 1)
+    axes.set(title=f"Peak amplitude{several}", ylabel=f"amplitude ({unit})")
+    axes.set_ylim(0, 1.25 * max(np.nanmax(achieved, initial=0), (1 + tolerance) * wanted.max(initial=0)) or 1)
     handles, labels = axes.get_legend_handles_labels()
     order = sorted(
         range(len(labels)), key=lambda i: [*names, "target", "tolerance", "judged from here"].index(labels[i])
@@ -153,7 +156,7 @@ def _bounded(values: Array) -> Array:
 
 
 def _target(recording: Recording, shown: Array) -> tuple[Array, Array]:
-    """Time (s) and wanted amplitude (µm), all shown bands together, thinned to what the panel can show."""
+    """Time (s) and wanted amplitude (as drawn), all shown bands together, thinned to what the panel can show."""
     step = max(1, len(recording) // COLUMNS)
     target = np.concatenate(
         [
@@ -162,7 +165,7 @@ def _target(recording: Recording, shown: Array) -> tuple[Array, Array]:
         ]
         or [np.empty((0, int(shown.sum())), complex)]
     )
-    return np.arange(len(target)) * step / recording.rate, 1e6 * _together(target)
+    return np.arange(len(target)) * step / recording.rate, wording.drawn(recording.header.unit)[0] * _together(target)
 
 
 def _together(envelope: Array) -> Array:
@@ -174,15 +177,20 @@ def _close_up(axes: Any, recording: Recording) -> None:
     start, stop = _close_span(recording)
     time = np.arange(start, stop) / recording.rate
     phase = recording.bands.carrier_phase(time, recording.read("position", start, stop))
-    wanted = 1e6 * (recording.read("target", start, stop) * np.exp(1j * phase)).real.sum(axis=1)
-    motion = 1e6 * _bounded(recording.read("motion", start, stop)[:, 0])
+    scale, unit = wording.drawn(recording.header.unit)
+    wanted = scale * (recording.read("target", start, stop) * np.exp(1j * phase)).real.sum(axis=1)
+    motion = scale * _bounded(recording.read("motion", start, stop)[:, 0])
     offset = np.nan_to_num(np.mean(motion)) if motion.size else 0.0
     milliseconds = 1e3 * (time - time[:1])
-    axes.plot(milliseconds, motion - offset, color=BLUE, lw=1.8, label="centre")
+    axes.plot(milliseconds, motion - offset, color=BLUE, lw=1.8, label=recording.header.places[0])
     axes.plot(milliseconds, wanted, color=INK, lw=1.1, ls=(0, (4, 2)), label="target")
     begin = f"{time[0]:.2f} s" if time.size else "the start"
-    level = f", offset of {offset:.3g} µm removed" if abs(offset) > 0.05 * np.abs(wanted).max(initial=0) else ""
-    axes.set(title=f"Waveform from {begin}{level}", xlabel="time (ms)", ylabel="displacement (µm)")
+    level = f", offset of {offset:.3g} {unit} removed" if abs(offset) > 0.05 * np.abs(wanted).max(initial=0) else ""
+    axes.set(
+        title=f"Waveform from {begin}{level}",
+        xlabel="time (ms)",
+        ylabel=f"{QUANTITIES.get(recording.header.unit, 'motion')} ({unit})",
+    )
     axes.margins(x=0, y=0.12)
     _legend(axes)
 
@@ -239,21 +247,23 @@ def _errors(axes: Any, recording: Recording, summary: dict[str, Any]) -> None:
 
 
 def _drive(lanes: list[Any], recording: Recording) -> None:
-    """Drive of every coil in its lane; a long run as the range that each column of pixels covers."""
+    """Drive of every channel in its lane; a long run as the range that each column of pixels covers."""
     drive = _bounded(recording.drive)
     limit: Any = recording.header.drive_limit
     peak = np.nanmax(np.abs(drive), initial=0.0) or 1e-3
     near = limit is not None and peak > 0.4 * limit
     reach = 1.12 * (max(peak, limit) if near else peak)
+    unit = recording.header.drive_unit
+    lane = "coil" if unit == "A" else "channel"
     for i, axes in enumerate(lanes[: drive.shape[1]]):
         time, low, high = outline(drive[:, i], recording.rate)
         axes.fill_between(time, low, high, color=COILS[i % len(COILS)], lw=0.5)
         for sign in (-1, 1) if near else ():
             axes.axhline(sign * limit, color=INK, lw=1, ls=(0, (4, 2)))
-        axes.set(ylabel=f"coil {i + 1} (A)", ylim=(-reach, reach))
+        axes.set(ylabel=f"{lane} {i + 1} ({unit})" if drive.shape[1] > 1 else f"drive ({unit})", ylim=(-reach, reach))
         if near:
             axes.set_yticks([-limit, 0, limit])
-    stated = "" if limit is None else f", limit ±{limit:g} A" + (" (dashed)" if near else "")
+    stated = "" if limit is None else f", limit ±{limit:g} {unit}" + (" (dashed)" if near else "")
     saturated = float(np.mean((recording.flags & Flag.SATURATED) != 0)) if len(recording) else 0.0
     if saturated:
         stated += f", saturated in {wording.percent(saturated)} of the samples"

@@ -46,7 +46,11 @@ class Recorder:
     places : tuple of str
         Names of the judged places, the centre first; one column of motion each.
     drive_limit : float or None
-        Largest drive (A) that the device takes, where it is known.
+        Largest drive that the device takes, where it is known.
+    unit, drive_unit : str
+        Of sensors, motion and targets; of the drive.
+    profile : tuple of float, or None
+        What is wanted at each place, as a multiple of the target; None: the same everywhere.
 
     Raises
     ------
@@ -67,6 +71,9 @@ class Recorder:
         sensed_channels: int = 2,
         places: tuple[str, ...] = ("centre", "end 1", "end 2"),
         drive_limit: float | None = None,
+        unit: str = "m",
+        drive_unit: str = "A",
+        profile: tuple[float, ...] | None = None,
     ) -> None:
         self.path = None if path is None else Path(path)
         if self.path is not None and self.path.suffix.lower() != ".au":
@@ -83,6 +90,9 @@ class Recorder:
             sensed_channels=int(sensed_channels),
             places=tuple(places),
             drive_limit=None if drive_limit is None else float(drive_limit),
+            unit=unit,
+            drive_unit=drive_unit,
+            profile=profile,
         )
         self._scene = scene
         self._file: BinaryIO | None = None

@@ -66,6 +66,29 @@ def bands_label(bands: Sequence[Mapping[str, Any]]) -> str:
     return labels[0] if len(labels) == 1 else f"{len(labels)} bands, {labels[0]} to {labels[-1]}"
 
 
+def columns_of(summary: Mapping[str, Any]) -> tuple[str, ...]:
+    """Places whose errors stand in the columns of a table: the first one that the device has, and the ends."""
+    keys = [key.removeprefix("rms_error_") for key in (summary["bands"] or [{}])[0] if key.startswith("rms_error_")]
+    return (keys[0] if keys else PLACES[0], *PLACES[1:])
+
+
+def titles(summaries: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Titles of those columns."""
+    first = dict.fromkeys(columns_of(summary)[0].replace("_", " ") for summary in summaries)
+    return [" or ".join(first), "end 1", "end 2"]
+
+
+def drawn(unit: str) -> tuple[float, str]:
+    """Scale and unit in which a quantity of `unit` (SI) is drawn.
+
+    Examples
+    --------
+    >>> drawn("m")
+    (1000000.0, 'µm')
+    """
+    return (1e6, "µm") if unit == "m" else (1e3, f"m{unit}")
+
+
 def worst_at(bands: Sequence[Mapping[str, Any]], place: str) -> float | None:
     """Find the largest abs(rms error) (1) of all bands at "centre", "end_1" or "end_2"; None without figures."""
     errors = [band.get(f"rms_error_{place}") for band in bands]
@@ -103,11 +126,11 @@ def worst_figure(summary: Mapping[str, Any]) -> str:
 
 def overview(summaries: Sequence[Mapping[str, Any]]) -> str:
     """Tabulate scenes, a line each: amplitudes, the largest rms error at each place, the verdict."""
-    rows = [["scene", "target", "achieved", "centre", "end 1", "end 2", "verdict"]]
+    rows = [["scene", "target", "achieved", *titles(summaries), "verdict"]]
     for summary in summaries:
         bands = summary["bands"]
-        amplitudes = [quantity(total(bands, key), "m") for key in ("target", "achieved")]
-        errors = [percent(worst_at(bands, place)) for place in PLACES]
+        amplitudes = [quantity(total(bands, key), summary["unit"]) for key in ("target", "achieved")]
+        errors = [percent(worst_at(bands, place)) for place in columns_of(summary)]
         within = f"within {100 * summary['tolerance']:.4g} %"
         rows.append([summary["scene"], *amplitudes, *errors, within if summary["passed"] else verdict(summary)])
     return table(rows)

@@ -61,6 +61,7 @@ def summary(bands, name="grating", notes=()):
         "method": "paper",
         "seed": 3,
         "rate": 5000.0,
+        "unit": "m",
         "duration": 4.0,
         "judged_from": 1.0,
         "tolerance": 0.1,

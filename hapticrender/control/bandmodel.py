@@ -14,11 +14,39 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, kw_only=True)
+class FingerRange:
+    """What a finger can add to the first coordinate's dynamic stiffness, z(s) = mass s^2 + damping s + stiffness.
+
+    The defaults are those of a finger on a plate that moves normal to it.
+
+    Parameters
+    ----------
+    mass, damping, stiffness : (float, float)
+        Least and most of each number; in kg, N s/m, N/m where the coordinate is a displacement.
+    typical_mass, typical_stiffness : float
+        How far from zero either may be expected, > 0; by these a residue is shared out between them.
+    least_motion : float, coordinate's unit
+        A smaller motion teaches nothing, > 0.
+    contact : (float, float), N, or None
+        Loads at which touch begins and ends, as felt by the sag; None: the load is always there.
+    """
+
+    mass: tuple[float, float] = (-2e-3, 12e-3)
+    damping: tuple[float, float] = (0.0, 12.0)
+    stiffness: tuple[float, float] = (-500.0, 15e3)
+    typical_mass: float = 4e-3
+    typical_stiffness: float = 300.0
+    least_motion: float = 5e-8
+    contact: tuple[float, float] | None = (0.05, 0.03)
+
+
+@dataclass(frozen=True, kw_only=True)
 class BandModel:
     """All that the controller ever knows of a device.
 
     In the controlled coordinates q the device obeys ``D(s) q = force_from_drive @ drive``
-    with the dynamic stiffness ``D(s) = mass s^2 + damping s + stiffness`` (N/m).
+    with the dynamic stiffness ``D(s) = mass s^2 + damping s + stiffness``.  Coordinates are displacements (m) on a
+    plate, a lateral force (N) on a screen; units below are those of a plate.
 
     Parameters
     ----------
@@ -54,6 +82,17 @@ class BandModel:
         The surface is known to have no mode of its own in reach.
     lowest_frequency, highest_frequency : float, Hz
         Finger-locked carriers fade out beyond these.
+    shape : tuple of float, or None
+        Pattern of the target over the coordinates; None: all of it in the first one.
+    finger : FingerRange
+        What a finger can add to D.
+    pace : float
+        Factor on every bandwidth of a method's rules, which are meant for carriers from 20 Hz on; > 0.  Limits that
+        delay, carriers and spacing set stay as they are.
+    lock : float, Hz
+        Bandwidth of the resonance lock, which moves the fixed carriers to where the device is resonant; 0: none.
+    unit, drive_unit : str
+        Of the coordinates and of the drive.
 
     Notes
     -----
@@ -79,6 +118,22 @@ class BandModel:
     block: int = 1
     lowest_frequency: float = 20.0
     highest_frequency: float = 1000.0
+    shape: tuple[float, ...] | None = None
+    finger: FingerRange = FingerRange()
+    pace: float = 1.0
+    lock: float = 0.0
+    unit: str = "m"
+    drive_unit: str = "A"
+
+    @property
+    def pattern(self) -> tuple[float, ...]:
+        """Pattern of the target over the coordinates."""
+        return self.shape or (1.0, *[0.0] * (len(self.mass) - 1))
+
+    @property
+    def profile(self) -> tuple[float, ...] | None:
+        """What the pattern asks for at each judged place, as a multiple of the target; None: the same everywhere."""
+        return None if self.shape is None else tuple((self.place_from_coordinate @ self.shape).tolist())
 
     def dynamic_stiffness(self, frequency: Array) -> Array:
         """D(j w), N/m, complex, shape (..., c, c), at `frequency` (Hz, shape (...))."""

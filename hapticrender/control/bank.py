@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -18,12 +19,11 @@ from hapticrender.control.kernels import FREQUENCY, WAVENUMBER
 from hapticrender.control.stability import Checked, Limits, checked_bandwidth
 from hapticrender.protocols import Array
 
-CONTACT_LOAD = (0.05, 0.03)  # N: on, off
 RAMP_TIME = 0.05  # s: a target grows this long, so that it does not strike the modes
 FAST_POLE, FAST_SIGMAS = 30.0, 5.5  # Hz, of the sensor noise behind that pole
 SLOW_POLE, SLOW_SIGMAS = 4.0, 5.0
 SETTLED = 0.05  # share of a target below which its error counts as settled
-LEAST_WANTED = 3e-6  # m: below it the noise makes up for more than the device
+LEAST_WANTED = 3e-3  # of the sensors' range: below it the noise makes up for more than the device
 LIMITS = Limits(modulus=0.29, gain=1.4)  # crowded bands share one residual: 20 Hz apart they leave 0.30 and 1.42
 REMEMBERED = 256  # designs
 _KNOWN: dict[tuple[object, ...], Checked] = {}
@@ -31,7 +31,8 @@ PROMPT = 8  # samples: a longer delay is that of a block device, where the inner
 PHASE_MARGIN = math.pi / 4  # rad: 90 deg less integral gain times (delay + 1/observer pole)
 LEARNING_TIME = 1 / 60  # s: fastest adaptation of the finger; a delay counts twice
 BACK_TIME = 0.02  # s: back-calculation at the limit
-LEAST_NOISE = 1e-9  # m: thresholds never fall to nothing
+LEAST_NOISE = 1e-6  # of the sensors' range: thresholds never fall to nothing
+ALWAYS = -1e300  # N: every load is larger
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -120,7 +121,7 @@ def settled_share(tables: BankTables, state: BankState) -> float:
 
     size = np.hypot(*(across_bands(band, part, bands) for part in (row.R_RE, row.R_IM)))
     wanted = np.where(tables.tone[WAVENUMBER] == 0.0, size, 0.0)
-    large = (wanted > LEAST_WANTED) & (largest(row.E_RE, row.E_IM) < SETTLED * wanted)
+    large = (wanted > LEAST_WANTED * tables.numbers.sensed_limit) & (largest(row.E_RE, row.E_IM) < SETTLED * wanted)
     settled = touch[row.CONTACT] == 0.0 and touch[row.TRUST] == 1.0 and touch[row.SCALE] == 1.0
     return float((largest(row.V_RE, row.V_IM)[large] / wanted[large]).max()) if settled and large.any() else 0.0
 
@@ -140,6 +141,7 @@ def design_bank(
     method: str, model: BandModel, bands: Bands, rules: BankRules, *, feedback: bool = True
 ) -> BankController:
     """Apply the rules of FACTS section 3 (C, F): observer <= f0/2 and spacing/2 pi, loop <= f0/4, DC band <= f0/8."""
+    rules = _paced(rules, model.pace)
     prompt = model.delay <= PROMPT
     damping = choose_damping(model, bending=model.bending) if any(rules.inner) and feedback and prompt else None
     if damping is None or not damping.margins:
@@ -154,7 +156,7 @@ def design_bank(
         mass=model.mass,
         damping=model.damping,
         stiffness=model.stiffness,
-        shape=(1.0, *[0.0] * (len(model.mass) - 1)),
+        shape=tuple(float(each) for each in model.pattern),
         taps=damping.taps if damping else np.zeros((len(model.mass), 1)),
         grip=damping.grip if damping else np.zeros(len(model.mass)),
     )
@@ -170,8 +172,13 @@ def design_bank(
 def _numbers(model: BandModel, bands: Bands, rules: BankRules, feedback: bool) -> BankNumbers:
     """Numbers of the compiled step: what the rules allow on this device for these bands."""
     period = 1.0 / model.rate
-    noise = np.sqrt((model.coordinate_from_sensed**2).sum(axis=1).max()) * max(model.sensed_noise, LEAST_NOISE)
+    noise = np.sqrt((model.coordinate_from_sensed**2).sum(axis=1).max()) * max(
+        model.sensed_noise, LEAST_NOISE * model.sensed_limit
+    )
     lowest = _lowest(model, bands)
+    finger = model.finger
+    contact_on, contact_off = finger.contact or (ALWAYS, ALWAYS)
+    fast, slow = FAST_POLE * model.pace, SLOW_POLE * model.pace
     return BankNumbers(
         rate=float(model.rate),
         analysed=bands.envelope is None,
@@ -182,24 +189,45 @@ def _numbers(model: BandModel, bands: Bands, rules: BankRules, feedback: bool) -
         rest_awake=rules.rest[1],
         inner=rules.inner[0],
         inner_awake=rules.inner[1],
-        fast_pole=-math.expm1(-2 * math.pi * FAST_POLE * period),
-        slow_pole=-math.expm1(-2 * math.pi * SLOW_POLE * period),
-        fast_level=_threshold(FAST_SIGMAS, noise, FAST_POLE, period) if rules.detect else math.inf,
-        slow_level=_threshold(SLOW_SIGMAS, noise, SLOW_POLE, period) if rules.detect else math.inf,
+        fast_pole=-math.expm1(-2 * math.pi * fast * period),
+        slow_pole=-math.expm1(-2 * math.pi * slow * period),
+        fast_level=_threshold(FAST_SIGMAS, noise, fast, period) if rules.detect else math.inf,
+        slow_level=_threshold(SLOW_SIGMAS, noise, slow, period) if rules.detect else math.inf,
         fast_time=rules.awake_time * model.rate,
         slow_time=rules.stirred_time * model.rate,
         release=period / rules.release,
-        ramp=period / RAMP_TIME,
+        ramp=period / RAMP_TIME * model.pace,
         lowest=model.lowest_frequency,
         highest=min(model.highest_frequency, 0.4 * model.rate),
-        contact_on=CONTACT_LOAD[0],
-        contact_off=CONTACT_LOAD[1],
+        contact_on=contact_on,
+        contact_off=contact_off,
         drive_limit=float(model.drive_limit),
         drive_step=float(model.drive_step),
         peak_decay=math.exp(-period * lowest),
-        back=1.0 / BACK_TIME,
+        back=model.pace / BACK_TIME,
         sensed_limit=float(model.sensed_limit),
+        modulated=bands.modulated,
+        differentiated=bands.differentiated,
+        lock=2 * math.pi * model.lock,
+        least_motion=finger.least_motion,
+        typical_mass=finger.typical_mass,
+        typical_stiffness=finger.typical_stiffness,
+        least_mass=finger.mass[0],
+        most_mass=finger.mass[1],
+        least_damping=finger.damping[0],
+        most_damping=finger.damping[1],
+        least_stiffness=finger.stiffness[0],
+        most_stiffness=finger.stiffness[1],
     )
+
+
+def _paced(rules: BankRules, pace: float) -> BankRules:
+    """Rules for a device that is to be followed `pace` times as fast."""
+    faster: dict[str, Any] = {
+        name: tuple(pace * each for each in getattr(rules, name)) for name in ("observer", "integral", "adapt", "rest")
+    }
+    shorter = {name: getattr(rules, name) / pace for name in ("awake_time", "stirred_time", "release")}
+    return replace(rules, **faster, **shorter)
 
 
 def _lowest(model: BandModel, bands: Bands) -> float:
@@ -220,7 +248,7 @@ def _paces(model: BandModel, bands: Bands, rules: BankRules, lowest: float, feed
     wait = model.delay * period  # integrator, observer and delay leave at least PHASE_MARGIN
     pole = [2 * math.pi * min(width, lowest / 2, apart / (2 * math.pi)) for width in rules.observer]
     fastest = [min(2 * math.pi * lowest / 4, PHASE_MARGIN / (wait + 1 / each)) for each in pole]
-    learning = 1 / (2 * wait + LEARNING_TIME)
+    learning = 1 / (2 * wait + LEARNING_TIME / model.pace)
     level = 2 * math.pi * min(6.0, lowest / rules.level) * period
     paces = {
         "observer": 2 * pole[0] * period,

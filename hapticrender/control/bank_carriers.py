@@ -29,16 +29,40 @@ def count_turns(phase, k, step):
 
 
 @kernel
+def follow_resonance(tables, state):
+    """Move the shift of the carriers towards the resonance, where Re D = 0: force and motion are a quarter turn apart.
+
+    D is that of the device with what was learnt of force and motion; near a resonance w0 of the mass m it is
+    2 m w (w0 - w) + j Im D.  The lock is lost while they are more than an eighth of a turn from a quarter turn.
+    """
+    numbers, touch, band = tables.numbers, state.touch, state.band
+    omega = band[0, row.OMEGA, 0]
+    if omega == 0.0:
+        return
+    mass = tables.mass[0, 0] + touch[row.MASS]
+    along = tables.stiffness[0, 0] + touch[row.STIFFNESS] - omega * omega * mass
+    across = omega * (tables.damping[0, 0] + touch[row.DAMPING])
+    hertz = along / (2.0 * TURN * mass * omega)
+    state.shift[0] += min(numbers.lock * REFRESH / numbers.rate, 1.0) * hertz
+    re, im = band[0, row.R_RE, 0], band[0, row.R_IM, 0]
+    heard = re * re + im * im > numbers.least_motion * numbers.least_motion
+    state.shift[1] = 0.0 if heard and size(along) <= across else 1.0
+
+
+@kernel
 def take_bands(tables, state, t):
     """Tones of a tile whose lanes are bands; returns whether a target still grows, and whether one follows a finger."""
     tone, band, width = tables.tone, state.band, state.band.shape[2]
     grows = follows = False
+    if tables.numbers.lock > 0.0 and t == 0:
+        follow_resonance(tables, state)
     for i in range(min(width, tone.shape[1] - t * width)):
         k = t * width + i
         band[t, row.LIVE, i] = 1.0
         for r in range(row.TONE_ROWS):
             band[t, row.FREQUENCY + r, i] = tone[r, k]
-        band[t, row.TURNS, i] = count_turns(state.phase, k, tone[0, k] / tables.numbers.rate)
+        band[t, row.FREQUENCY, i] += state.shift[0]
+        band[t, row.TURNS, i] = count_turns(state.phase, k, (tone[0, k] + state.shift[0]) / tables.numbers.rate)
         if band[t, row.RAMP, i] < 1.0 or band[t, row.R_RE, i] != tone[3, k] or band[t, row.R_IM, i] != tone[4, k]:
             grows = True
         follows = follows or tone[1, k] > 0.0
@@ -85,7 +109,7 @@ def refresh(tables, state):
             state.pace[t] = row.LOCKED
             state.follows[0] += 1
             continue
-        still = not (grows or numbers.analysed) and numbers.error_observer
+        still = not (grows or numbers.analysed or numbers.modulated) and numbers.error_observer
         state.pace[t] = row.STEADY if still else row.GROWING
         frequency = lanes(band, t, row.FREQUENCY)
         cos, sin = unit(1.0 / numbers.rate * frequency)

@@ -8,8 +8,7 @@ from hapticrender.control import bank_rows as row
 from hapticrender.control.kernels import FAR, FASTEST, TURN
 
 TRACKER_POLE = TURN * 60.0  # rad/s: triple pole of the finger's tracker; no lag under constant acceleration
-CROWDED_MASS, CROWDED_STIFFNESS = 4e-3, 300.0  # kg, N/m: how far the finger's numbers may be expected to lie from zero
-LEAST_MOTION, LEAST_LOAD = 5e-8, 0.03  # m, N: below these the finger is not adapted
+LEAST_LOAD = 0.03  # N: a place is not told by less
 
 
 @kernel
@@ -80,7 +79,8 @@ def adapt_pass(tables, state, step, inner, gain, rest, touching):
     `step` is the time since the last adaptation, s.
     """
     touch, band, loop, coordinates = state.touch, state.band, state.loop, len(tables.shape)
-    stiff2, mass2 = CROWDED_STIFFNESS * CROWDED_STIFFNESS, CROWDED_MASS * CROWDED_MASS
+    numbers = tables.numbers
+    stiff2, mass2 = numbers.typical_stiffness * numbers.typical_stiffness, numbers.typical_mass * numbers.typical_mass
     sum_k = sum_m = sum_b = weights = 0.0
     for t in range(band.shape[0]):
         omega = lanes(band, t, row.OMEGA)
@@ -106,7 +106,7 @@ def adapt_pass(tables, state, step, inner, gain, rest, touching):
             away_re += d_re * a_re - d_im * a_im + damping * da_re - turn * da_im
             away_im += d_re * a_im + d_im * a_re + damping * da_im + turn * da_re
         size2 = felt_re * felt_re + felt_im * felt_im
-        counts = (size2 >= LEAST_MOTION * LEAST_MOTION) & (lanes(band, t, row.WEIGHT) >= 1.0) & touching
+        counts = (size2 >= numbers.least_motion * numbers.least_motion) & (lanes(band, t, row.WEIGHT) >= 1.0) & touching
         z_re, z_im = finger_stiffness(touch, band, t)
         re, im = z_re * own_re - z_im * own_im - away_re, z_re * own_im + z_im * own_re - away_im
         safe = select(counts, size2, 1.0)
@@ -127,6 +127,9 @@ def adapt_pass(tables, state, step, inner, gain, rest, touching):
     like = read(touch, row.TRUST)
     pooled = total(like, weights)
     step = step * gain / select(pooled > 0.0, pooled, 1.0)
-    write(low(high(read(touch, row.STIFFNESS) + step * total(like, sum_k), -500.0), 15e3), touch, row.STIFFNESS)
-    write(low(high(read(touch, row.MASS) - step * total(like, sum_m), -2e-3), 12e-3), touch, row.MASS)
-    write(low(high(read(touch, row.DAMPING) + step * total(like, sum_b), 0.0), 12.0), touch, row.DAMPING)
+    found = read(touch, row.STIFFNESS) + step * total(like, sum_k)
+    write(low(high(found, numbers.least_stiffness), numbers.most_stiffness), touch, row.STIFFNESS)
+    found = read(touch, row.MASS) - step * total(like, sum_m)
+    write(low(high(found, numbers.least_mass), numbers.most_mass), touch, row.MASS)
+    found = read(touch, row.DAMPING) + step * total(like, sum_b)
+    write(low(high(found, numbers.least_damping), numbers.most_damping), touch, row.DAMPING)

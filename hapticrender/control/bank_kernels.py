@@ -36,8 +36,8 @@ ADAPTATION = 4  # samples between two adaptations of the finger
 
 
 @kernel
-def target_pass(tables, state, t, g, residual, target):
-    """Wanted envelope R and its slope: constant, or the wanted waveform through the bank and one more pole."""
+def target_pass(tables, state, t, g, wanted, residual, target):
+    """Wanted envelope R and its slope: constant, times `wanted`, or what `wanted` holds (through its `residual`)."""
     numbers, band = tables.numbers, state.band
     if state.pace[t] == row.STEADY:
         put_pairs(target, t, lanes(band, t, row.R_RE), lanes(band, t, row.R_IM))
@@ -52,7 +52,12 @@ def target_pass(tables, state, t, g, residual, target):
         follow = 0.5 * g
         re, im = old_re + follow * (weight * raw_re - old_re), old_im + follow * (weight * raw_im - old_im)
     else:
+        if numbers.modulated:
+            weight = weight * wanted
         re, im = weight * lanes(band, t, row.WANTED_RE), weight * lanes(band, t, row.WANTED_IM)
+        if numbers.differentiated:
+            omega = lanes(band, t, row.OMEGA)
+            re, im = -omega * im, omega * re
     put(band, t, row.R_RE, re)
     put(band, t, row.R_IM, im)
     put(band, t, row.DR_RE, numbers.rate * (re - old_re))
@@ -312,7 +317,7 @@ def bank_advance(tables, state, sensed, position, wanted, drive, target):
     if numbers.analysed:
         residual = wanted_residual(band, wanted)
     for t in range(tiles):
-        target_pass(tables, state, t, calm * numbers.reference, residual, target)
+        target_pass(tables, state, t, calm * numbers.reference, wanted, residual, target)
     changed = feel(numbers, coordinates, tables.stiffness, state.level, touch)
     if any_of(changed):
         write(select(changed, numbers.fast_time, read(touch, row.FAST_TIME)), touch, row.FAST_TIME)
@@ -358,7 +363,10 @@ def bank_advance(tables, state, sensed, position, wanted, drive, target):
 @kernel
 def bank_step(tables, state, sensed, position, wanted, drive, target):
     """One sample of a single scenario; see `bank_advance`.  Returns flags."""
-    return int(bank_advance(tables, state, sensed, position, wanted, drive, target))
+    flags = int(bank_advance(tables, state, sensed, position, wanted, drive, target))
+    if tables.numbers.lock > 0.0 and state.shift[1] > 0.0:
+        flags |= 32
+    return flags
 
 
 @kernel

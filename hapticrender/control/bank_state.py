@@ -57,6 +57,18 @@ class BankNumbers(NamedTuple):
     peak_decay: float  # per sample
     back: float  # 1/s: back-calculation at the limit
     sensed_limit: float
+    modulated: bool  # the wanted waveform is a factor of every target
+    differentiated: bool  # what is wanted is the time derivative of what the tones say
+    lock: float  # 1/s: pace at which the carriers follow the resonance; 0: not
+    least_motion: float
+    typical_mass: float
+    typical_stiffness: float
+    least_mass: float
+    most_mass: float
+    least_damping: float
+    most_damping: float
+    least_stiffness: float
+    most_stiffness: float
 
 
 class BankTables(NamedTuple):
@@ -91,6 +103,7 @@ class BankState(NamedTuple):
     shaper: Array  # (2, channels) last two errors of the command's rounding
     follows: Array  # (1,) integer: tiles that follow the finger
     sample: Array  # (1,) integer: samples so far
+    shift: Array  # (2,) resonance lock: shift of the fixed carriers (Hz), and 1 while it is lost
 
 
 def bank_state(tables: BankTables, dtype: type = np.float64) -> BankState:
@@ -114,6 +127,7 @@ def bank_state(tables: BankTables, dtype: type = np.float64) -> BankState:
         shaper=np.zeros((2, len(tables.speak))),
         follows=np.zeros(1, np.int64),
         sample=np.zeros(1, np.int64),
+        shift=np.array([0.0, 1.0]),
     )
 
 

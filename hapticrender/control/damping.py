@@ -195,6 +195,8 @@ def choose_damping(
     them, the loop is off.  Notched taps reach back 0.6 to 1 bending period; the reach with the least noise is taken.
     """
     bounds = bounds or DampingBounds()
+    if not (model.mass.diagonal() > 0.0).all():
+        return _off(model, "off: the device has no mode")
     mode, ratio = modes_of(model)
     known = model.rigid if bending is None else bending.measured
     least = QUALITY if known else QUALITY_UNMEASURED

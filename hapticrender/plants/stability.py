@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from hapticrender.control.bank_finger import CROWDED_MASS, CROWDED_STIFFNESS
+from hapticrender.control.bandmodel import FingerRange
 from hapticrender.control.bank_loop import BankLoop, KnownFinger, Structure
 from hapticrender.control.damping import damping_taps
 from hapticrender.control.margins import sensitivity
@@ -344,12 +344,13 @@ def learnt_finger(
         return None
     omega = 2 * np.pi * frequency
     z = 1j * omega * mechanics.impedance(frequency) * strength
-    heavy = omega**2 * CROWDED_MASS**2
-    share = z.real / (CROWDED_STIFFNESS**2 + omega**2 * heavy)
+    known = FingerRange()
+    heavy = omega**2 * known.typical_mass**2
+    share = z.real / (known.typical_stiffness**2 + omega**2 * heavy)
     numbers = (
-        np.clip(-heavy * share, -2e-3, 12e-3),
-        np.clip(z.imag / omega, 0.0, 12.0),
-        np.maximum(CROWDED_STIFFNESS**2 * share, -500.0),
+        np.clip(-heavy * share, *known.mass),
+        np.clip(z.imag / omega, *known.damping),
+        np.clip(known.typical_stiffness**2 * share, *known.stiffness),
     )
     mass, damping, stiffness = (number[:, None, None, None] for number in numbers)
     return KnownFinger(mass, damping, stiffness, position / parameters.half_spacing)
