@@ -164,6 +164,13 @@ def law_tune(tables, state, t):
 
 
 @kernel
+def derivative(band, t, re, im):
+    """Envelope of the time derivative: j w times that of a tile's carriers."""
+    omega = lanes(band, t, row.OMEGA)
+    return -omega * im, omega * re
+
+
+@kernel
 def ease(x):
     """Third-order step from 0 to 1 over 0..1."""
     x = low(high(x, 0.0), 1.0)

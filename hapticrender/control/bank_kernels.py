@@ -27,7 +27,15 @@ from hapticrender._lanes import (
 )
 from hapticrender._polynomials import whole
 from hapticrender.control import bank_rows as row
-from hapticrender.control.bank_carriers import FORGET, REFRESH, carrier_pass, law_tune, look_ahead, refresh
+from hapticrender.control.bank_carriers import (
+    FORGET,
+    REFRESH,
+    carrier_pass,
+    derivative,
+    law_tune,
+    look_ahead,
+    refresh,
+)
 from hapticrender.control.bank_finger import adapt_pass, feel, forget_finger, track_finger
 from hapticrender.control.kernels import DOUBT_TIME, FAR
 
@@ -49,6 +57,8 @@ def target_pass(tables, state, t, g, wanted, residual, target):
         raw_im = lanes(band, t, row.RAW_IM) - g * residual * lanes(band, t, row.SIN)
         put(band, t, row.RAW_RE, raw_re)
         put(band, t, row.RAW_IM, raw_im)
+        if numbers.differentiated:
+            raw_re, raw_im = derivative(band, t, raw_re, raw_im)
         follow = 0.5 * g
         re, im = old_re + follow * (weight * raw_re - old_re), old_im + follow * (weight * raw_im - old_im)
     else:
@@ -56,8 +66,7 @@ def target_pass(tables, state, t, g, wanted, residual, target):
             weight = weight * wanted
         re, im = weight * lanes(band, t, row.WANTED_RE), weight * lanes(band, t, row.WANTED_IM)
         if numbers.differentiated:
-            omega = lanes(band, t, row.OMEGA)
-            re, im = -omega * im, omega * re
+            re, im = derivative(band, t, re, im)
     put(band, t, row.R_RE, re)
     put(band, t, row.R_IM, im)
     put(band, t, row.DR_RE, numbers.rate * (re - old_re))

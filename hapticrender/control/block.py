@@ -52,6 +52,10 @@ class BlockController:
         tables = controller.tables._replace(tone=controller.tables.tone.copy())
         if len(tables.shape) > MOST_COORDINATES:
             raise ValueError(f"{len(tables.shape)} coordinates: must be <= {MOST_COORDINATES} in blocks")
+        if tables.numbers.lock > 0.0:
+            tables = tables._replace(
+                numbers=tables.numbers._replace(lock=0.0)
+            )  # what it learns of the device has to do
         self.method = controller.method
         self.n_bands = controller.n_bands
         frequency, wavenumber, *_ = tables.tone.copy()

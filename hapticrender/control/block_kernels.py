@@ -27,7 +27,7 @@ from hapticrender._lanes import (
 )
 from hapticrender._polynomials import unit, whole
 from hapticrender.control import bank_rows as row
-from hapticrender.control.bank_carriers import FORGET, grow_pass, law_tune, look_ahead, motion_pass
+from hapticrender.control.bank_carriers import FORGET, derivative, grow_pass, law_tune, look_ahead, motion_pass
 from hapticrender.control.bank_finger import adapt_pass, feel, forget_finger, track_finger
 from hapticrender.control.bank_kernels import believe, wake
 from hapticrender.control.block_state import (
@@ -173,8 +173,11 @@ def take_up(tables, state, t):
 
 
 @kernel
-def want(tables, state, t, g):
-    """Wanted envelope R at the block's end, its slope, and R as the observer sees it, in the block's middle."""
+def want(tables, state, t, g, factor):
+    """Wanted envelope R at the block's end, its slope, and R as the observer sees it, in the block's middle.
+
+    `factor` is what the wanted waveform makes of a modulated target.
+    """
     numbers, band = tables.bank.numbers, state.bank.band
     weight = lanes(band, t, row.WEIGHT)
     old_re, old_im = lanes(band, t, row.R_RE), lanes(band, t, row.R_IM)
@@ -186,10 +189,16 @@ def want(tables, state, t, g):
         raw_im = lanes(band, t, row.RAW_IM) + g * (b * cos - a * sin)
         put(band, t, row.RAW_RE, raw_re)
         put(band, t, row.RAW_IM, raw_im)
+        if numbers.differentiated:
+            raw_re, raw_im = derivative(band, t, raw_re, raw_im)
         follow = min(0.5 * g * state.place.shape[0], 1.0)
         re, im = old_re + follow * (weight * raw_re - old_re), old_im + follow * (weight * raw_im - old_im)
     else:
+        if numbers.modulated:
+            weight = weight * factor
         re, im = weight * lanes(band, t, row.WANTED_RE), weight * lanes(band, t, row.WANTED_IM)
+        if numbers.differentiated:
+            re, im = derivative(band, t, re, im)
     put(band, t, row.R_RE, re)
     put(band, t, row.R_IM, im)
     put(band, t, row.DR_RE, numbers.rate * (re - old_re))
@@ -385,8 +394,9 @@ def block_step(tables, state, sensed, position, wanted, drive, target, flags):
         state.gain[0] = g
     if numbers.analysed:
         analyse(state, wanted)
+    factor = wanted[block - 1] if size(wanted[block - 1]) <= FAR else 0.0
     for t in range(tiles):
-        want(tables, state, t, sample.reference)
+        want(tables, state, t, sample.reference, factor)
         put_pairs(target, t, lanes(band, t, row.R_RE), lanes(band, t, row.R_IM))
     changed = feel(numbers, coordinates, tables.bank.stiffness, bank.level, touch)
     if changed:

@@ -52,6 +52,8 @@ class ComplexNumbers(NamedTuple):
     rate: float
     feedback: bool
     analysed: bool
+    modulated: bool  # the wanted waveform is a factor of every target
+    differentiated: bool  # what is wanted is the time derivative of what the tones say
     forward: bool  # V = R + v
     deviation: bool  # listen to the deviation
     dynamic: bool  # D and D', not D alone
@@ -122,6 +124,10 @@ def wanted_pass(numbers, tone, band, envelope, waveform, target):
             raw, envelope[RAW1, k], envelope[RAW2, k] = biquad_step(
                 numbers.analysis, envelope[RAW1, k], envelope[RAW2, k], 2.0 * waveform * carrier.conjugate()
             )
+        if numbers.modulated:
+            raw *= waveform
+        if numbers.differentiated:
+            raw *= complex(0.0, band[OMEGA, k])
         now = band[WEIGHT, k] * raw
         envelope[DR, k] = (now - envelope[R, k]) * numbers.rate
         envelope[R, k] = target[k] = now

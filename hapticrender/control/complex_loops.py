@@ -90,6 +90,8 @@ def design_complex(
         rate=float(model.rate),
         feedback=feedback,
         analysed=bands.envelope is None,
+        modulated=bands.modulated,
+        differentiated=bands.differentiated,
         forward=forward,
         deviation=rules.deviation,
         dynamic=rules.dynamic,

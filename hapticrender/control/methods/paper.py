@@ -32,6 +32,7 @@ from hapticrender.control.polar_kernels import (
     PolarTables,
 )
 from hapticrender.control.polar_passes import SCRATCH_ROWS, polar_run
+from hapticrender.errors import DesignError
 from hapticrender.protocols import Array
 
 TABLE_STEP = 0.5  # Hz, resolution of the look-up table
@@ -181,6 +182,8 @@ def polar_tables(
     feedback: bool,
 ) -> PolarTables:
     """Tables of the compiled step: `watched` rows are the controlled displacements, `spread` their drive channels."""
+    if bands.modulated or bands.differentiated:
+        raise DesignError("targets that grow with a waveform or with the finger's speed: a polar method has none")
     frequency = np.arange(0.0, model.rate / 2 + TABLE_STEP, TABLE_STEP)
     response = watched @ model.response(frequency) @ spread  # (table, coordinates, coordinates)
     alike = np.ones(len(watched))
