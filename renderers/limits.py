@@ -1,0 +1,121 @@
+"""What every device refuses before it plays: carriers that it cannot carry, and targets beyond its drive or sensors."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from hapticrender.bands import Bands
+from hapticrender.control.bandmodel import BandModel
+from hapticrender.protocols import Array
+from hapticrender.touch.scene import Scene
+
+NYQUIST_MARGIN = 0.45  # of the rate: above this the hold's image cannot be told from the carrier
+CHECK_STEP = 1e-3  # s: resolution at which the finger's path is checked against the surface
+LOOK_AHEAD = 30.0  # s of a scene that are looked at for the finger's speed and the drive that a waveform needs
+FADED = 1.25  # times the highest frequency: finger-locked carriers are silent beyond
+
+Waveform = Callable[[Array, Array], Array]
+
+
+def check_path(scene: Scene, half: float, surface: str) -> None:
+    """Refuse a finger that leaves a surface of half length `half` (m)."""
+    duration = min(scene.duration, 3600.0)
+    position = scene.finger.position(np.arange(0.0, duration, max(CHECK_STEP, duration / 1e6)))
+    reach = np.nanmax(abs(position), initial=0.0)
+    if reach > half:
+        raise ValueError(f"finger.position reaches {reach:g} m: must stay within {half:g} m of the {surface}'s middle")
+
+
+def speeds(scene: Scene) -> Array:
+    """Speed of the finger (m/s) every millisecond, NaN while it is lifted."""
+    time = np.arange(0.0, min(scene.duration, LOOK_AHEAD), CHECK_STEP)
+    return abs(np.diff(scene.finger.position(time))) / CHECK_STEP
+
+
+def top_speed(scene: Scene) -> float:
+    """Largest speed of the finger (m/s)."""
+    return float(np.nanmax(speeds(scene), initial=0.0))
+
+
+def check_carriers(scene: Scene, model: BandModel, bands: Bands) -> None:
+    """Refuse carriers that the rate cannot carry, at the finger's top speed too."""
+    highest = NYQUIST_MARGIN * model.rate
+    for frequency in bands.frequency:
+        if not 0.0 <= frequency <= highest:
+            raise ValueError(
+                f"texture.frequency = {frequency:g}: must be <= {highest:g} Hz, "
+                f"{NYQUIST_MARGIN} of the rate of {model.rate:g} Hz"
+            )
+    fastest = top_speed(scene) * bands.wavenumber.max(initial=0.0)
+    if fastest > highest:
+        raise ValueError(
+            f"texture.wavelength = {1 / bands.wavenumber.max():g} m passes at {fastest:g} Hz at the finger's "
+            f"{top_speed(scene):g} m/s: must be <= {highest:g} Hz"
+        )
+
+
+def check_targets(scene: Scene, model: BandModel, bands: Bands, waveform: Waveform) -> None:
+    """Refuse targets that the free device cannot reach within its drive, or that its sensors cannot follow."""
+    if bands.envelope is None:
+        _check_waveform(scene, model, bands, waveform)
+    else:
+        _check_envelopes(scene, model, bands)
+
+
+def _check_envelopes(scene: Scene, model: BandModel, bands: Bands) -> None:
+    """Refuse constant targets.
+
+    A finger-locked carrier passes every frequency up to that of the finger's top speed; the worst of them counts.
+    """
+    sweep = np.minimum(top_speed(scene) * bands.wavenumber, FADED * model.highest_frequency)
+    top = bands.frequency + sweep
+    low = np.where(bands.wavenumber > 0.0, np.minimum(model.lowest_frequency, top), top)
+    passed = low + np.linspace(0.0, 1.0, 400)[:, None] * (top - low)
+    wanted = abs(bands.envelope) * (2 * np.pi * passed if bands.differentiated else 1.0)
+    _check_range(float(wanted.max(axis=0).sum()), model)
+    drive = (wanted / common_gain(model, passed)).max(axis=0)
+    if drive.sum() > model.drive_limit:
+        worst = int(drive.argmax())
+        at = int((wanted / common_gain(model, passed))[:, worst].argmax())
+        _refuse(float(np.broadcast_to(wanted, passed.shape)[at, worst]), float(passed[at, worst]), drive.sum(), model)
+
+
+def _check_waveform(scene: Scene, model: BandModel, bands: Bands, waveform: Waveform) -> None:
+    """Refuse a wanted waveform."""
+    time = np.arange(int(min(scene.duration, LOOK_AHEAD) * model.rate) + 2) / model.rate
+    wanted = np.nan_to_num(waveform(time, scene.finger.position(time)))
+    frequency = np.fft.rfftfreq(len(time), 1.0 / model.rate)
+    felt = (frequency >= model.lowest_frequency / 2) & (frequency <= min(model.highest_frequency, 0.4 * model.rate))
+    if bands.differentiated:
+        wanted = np.fft.irfft(np.where(felt, 2j * np.pi * frequency * np.fft.rfft(wanted), 0.0), len(time))
+    _check_range(float(abs(wanted).max()), model)
+    spectrum = np.where(felt, np.fft.rfft(wanted), 0.0)
+    drive = abs(np.fft.irfft(spectrum / model.response(frequency).sum(axis=-1)[:, 0], len(time))).max()
+    if drive > model.drive_limit:
+        _refuse(abs(wanted).max(), float(frequency[abs(spectrum).argmax()]), drive, model)
+
+
+def _check_range(amplitude: float, model: BandModel) -> None:
+    """Refuse what the sensors cannot follow."""
+    if amplitude > model.sensed_limit:
+        raise ValueError(f"{_named(amplitude, model)}: must be <= {model.sensed_limit:g} {model.unit}, the sensors' range")
+
+
+def _refuse(amplitude: float, frequency: float, drive: float, model: BandModel) -> None:
+    each = " in each coil" if model.drive_unit == "A" else ""
+    raise ValueError(
+        f"{_named(amplitude, model)} at {frequency:.3g} Hz needs {drive:.3g} {model.drive_unit}: "
+        f"must be <= {model.drive_limit:g} {model.drive_unit}{each}"
+    )
+
+
+def _named(amplitude: float, model: BandModel) -> str:
+    """Name a target in the device's quantity."""
+    return f"{'texture.amplitude =' if model.unit == 'm' else 'texture.amplitude asks for'} {amplitude:.3g} {model.unit}"
+
+
+def common_gain(model: BandModel, frequency: Array) -> Array:
+    """First coordinate of the free device per drive, all channels driven alike (shape of `frequency`)."""
+    return abs(model.response(frequency).sum(axis=-1)[..., 0])
