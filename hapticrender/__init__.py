@@ -43,6 +43,7 @@ _HOMES = {
     "touch.grating": ("Grating",),
     "touch.mechanics": ("FingerMechanics",),
     "touch.motion": ("Sampled", "Sliding", "Still", "Swiping", "Tracked"),
+    "touch.perception": ("detection_threshold", "roughness", "sensation_level"),
     "touch.recorded": ("Recorded", "Swipe", "Synthetic"),
     "touch.scene": ("Scene",),
 }
@@ -88,6 +89,9 @@ if _typing.TYPE_CHECKING:
     from hapticrender.touch.motion import Still as Still
     from hapticrender.touch.motion import Swiping as Swiping
     from hapticrender.touch.motion import Tracked as Tracked
+    from hapticrender.touch.perception import detection_threshold as detection_threshold
+    from hapticrender.touch.perception import roughness as roughness
+    from hapticrender.touch.perception import sensation_level as sensation_level
     from hapticrender.touch.recorded import Recorded as Recorded
     from hapticrender.touch.recorded import Swipe as Swipe
     from hapticrender.touch.recorded import Synthetic as Synthetic

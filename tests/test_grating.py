@@ -1,5 +1,8 @@
 """Gratings: waveform, bands and refusals."""
 
+import pickle
+from dataclasses import fields, replace
+
 import numpy as np
 import pytest
 
@@ -76,13 +79,81 @@ def test_tables_and_tuples_are_the_same_partials():
     assert tables == Grating(amplitude=1e-6, frequency=20.0, partials=((2.0, 0.5, 0.0),))
 
 
+def test_velocity_and_level_become_the_amplitude():
+    """FACTS section 7: 0.06 m/s is 0.48 mm at 20 Hz and 0.024 mm at 400 Hz; threshold 0.63 um at 100 Hz."""
+    assert Grating(velocity=0.06, frequency=20.0).amplitude == pytest.approx(0.48e-3, abs=0.005e-3)
+    assert Grating(velocity=0.06, frequency=400.0).amplitude == pytest.approx(0.024e-3, abs=0.0005e-3)
+    assert Grating(velocity=0.06, wavelength=1e-3, speed=0.4).amplitude == pytest.approx(0.024e-3, abs=0.0005e-3)
+    assert Grating(level=20.0, frequency=100.0).amplitude == pytest.approx(6.3e-6, rel=1e-12)
+    assert Grating(level=-20.0, wavelength=1e-3, speed=0.1).amplitude == pytest.approx(0.063e-6, rel=1e-12)
+
+
+@pytest.mark.parametrize(
+    "stated", [{"velocity": 0.01, "frequency": 70.0}, {"level": 0, "wavelength": 1e-3, "speed": np.float32(0.1)}]
+)
+def test_gratings_are_equal_however_they_were_stated(stated):
+    grating = Grating(**stated, shape="square")
+    again = replace(grating, velocity=None, level=None, speed=None)
+    plain = Grating(grating.amplitude, stated.get("frequency"), stated.get("wavelength"), "square")
+    for other in (again, plain, pickle.loads(pickle.dumps(grating)), replace(grating, phase=0.0)):
+        assert other == grating
+        assert hash(other) == hash(grating)
+    assert repr(plain) == repr(grating)
+    assert {type(value) for value in (grating.amplitude, grating.frequency or grating.wavelength)} == {float}
+
+
+def test_positional_arguments_keep_their_places():
+    names = [entry.name for entry in fields(Grating)]
+    assert names[:7] == ["amplitude", "frequency", "wavelength", "shape", "harmonics", "partials", "phase"]
+
+
+@pytest.mark.parametrize(
+    ("stated", "message"),
+    [
+        (
+            {"amplitude": 1e-6, "level": 20},
+            r"amplitude, velocity, level: exactly .* amplitude = 1e-06 and level = 20 are",
+        ),
+        ({"velocity": 0.0}, r"velocity = 0.0: must be a finite number >= 1e-09 and <= 10 m/s"),
+        ({"velocity": np.inf}, r"velocity = inf: must be a finite number .* m/s"),
+        ({"velocity": 2.0}, r"velocity = 2.0: must be <= 0.01 m as an amplitude; at 20 Hz it is 0.0159 m"),
+        (
+            {"velocity": 1.0, "frequency": 5e-324},
+            r"velocity = 1.0: must be <= 0.01 m as an amplitude; at .* it is inf m",
+        ),
+        ({"level": 101}, r"level = 101: must be a finite number >= -100 and <= 100 dB"),
+        ({"level": "loud"}, r"level = 'loud': must be a finite number .* dB"),
+        ({"level": 70}, r"level = 70.0: must be <= 0.01 m as an amplitude; at 20 Hz it is 0.0199 m"),
+        ({"level": 20, "frequency": 0.99}, r"level = 20.0: must be stated at 1 to 1000 Hz, .*; it is at 0.99 Hz"),
+        ({"level": 20, "frequency": 1001}, r"level = 20.0: must be stated at 1 to 1000 Hz, .*; it is at 1001 Hz"),
+        ({"level": 20, "speed": 0.1}, r"speed = 0.1: must be left out but where velocity or level"),
+        (
+            {"amplitude": 1e-6, "frequency": None, "wavelength": 1e-3, "speed": 0.1},
+            r"speed = 0.1: must be left out but",
+        ),
+        ({"level": 20, "frequency": None, "wavelength": 1e-3}, r"speed is missing: must be .* >= 1e-06 and <= 10 m/s"),
+        ({"level": 20, "frequency": None, "wavelength": 1e-3, "speed": 0}, r"speed = 0: must be .* m/s"),
+    ],
+)
+def test_amplitudes_stated_wrongly_are_refused_with_bound_and_unit(stated, message):
+    with pytest.raises((ValueError, TypeError), match=f"^{message}"):
+        Grating(**({"frequency": 20.0} | stated))
+
+
+def test_the_bounds_of_velocity_and_level_are_accepted():
+    assert Grating(level=99, frequency=250.0).amplitude == pytest.approx(0.11e-6 * 10**4.95, rel=1e-12)
+    assert Grating(level=-100, frequency=1.0).amplitude == pytest.approx(28e-11, rel=1e-12)
+    assert Grating(level=0, frequency=1000.0).amplitude == pytest.approx(5e-6, rel=1e-12)
+    assert Grating(velocity=1e-9, frequency=1e6).amplitude == pytest.approx(1e-15 / (2 * np.pi), rel=1e-12)
+
+
 @pytest.mark.parametrize(
     ("wrong", "message"),
     [
         ({"amplitude": -1e-6}, r"amplitude = -1e-06: must be a finite number > 0 and <= 0.01 m"),
         ({"amplitude": 10.0}, r"amplitude = 10.0: must be .* <= 0.01 m"),
         ({"amplitude": float("nan")}, r"amplitude = nan: must be a finite number"),
-        ({"amplitude": None}, r"amplitude is missing: must be .* m"),
+        ({"amplitude": None}, r"amplitude, velocity, level: exactly one must be given; none is"),
         ({"frequency": 0.0}, r"frequency = 0.0: must be .* > 0 .* Hz"),
         ({"frequency": float("inf")}, r"frequency = inf: must be a finite number"),
         ({"frequency": None}, r"frequency, wavelength: exactly one must be given; neither"),

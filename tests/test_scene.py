@@ -44,6 +44,8 @@ TEXTURE_CASES = {
     "tone": TONE,
     "partials": Grating(amplitude=1e-6, wavelength=1e-3, partials=[(1, 1, 0), (2.5, -1 / 3, 0.1)]),
     "square": Grating(amplitude=1e-6, frequency=20.0, shape="square", harmonics=7, phase=-0.3),
+    "by velocity": Grating(velocity=1 / 30, wavelength=1e-3, speed=0.07),
+    "by level": Grating(level=20.0, frequency=70.0),
     "synthetic": Synthetic(amplitude=1e-6, speed=0.08, seed=5),
 }
 
@@ -86,6 +88,7 @@ def test_every_scene_survives_toml_to_the_last_bit(texture, finger):
         duration=1 / 3,
         tolerance=0.1 + 0.2,
         settle=0.0,
+        keep_unfelt=texture == "tone",
         name='π "quoted" \x20name',
         plant={"sensor_noise": 1e-300, "shaped": True, "count": 3, "level of\x7f\n": 'a "b"\x7f\n\\'},
     )
@@ -104,6 +107,20 @@ def test_a_scene_file_has_its_stem_for_a_name_and_finds_files_beside_it(tmp_path
     assert scene.name == "my scene"
     assert scene.texture == Recorded(file=tmp_path / "denim.wav", amplitude=1e-5)
     assert Scene.from_toml_text(scene.to_toml()) == scene
+
+
+def test_an_amplitude_may_be_written_as_velocity_or_level():
+    level = GOOD.replace("amplitude = 1e-5", "level = 20\nspeed = 0.08")
+    velocity = GOOD.replace("amplitude = 1e-5", "velocity = 0.01\nspeed = 0.08")
+    assert Scene.from_toml_text(level).texture == Grating(level=20, wavelength=1e-3, speed=0.08)
+    assert Scene.from_toml_text(velocity).texture.amplitude == pytest.approx(0.01 / (2 * np.pi * 80), rel=1e-12)
+
+
+def test_bands_that_no_one_feels_are_left_out_unless_the_scene_says_so():
+    assert not Scene.from_toml_text(GOOD).keep_unfelt
+    assert Scene.from_toml_text("keep_unfelt = true\n" + GOOD).keep_unfelt
+    kept = [name for name, scene in builtin_scenes().items() if scene.keep_unfelt]
+    assert kept == ["pressing"]
 
 
 def test_the_real_finger_survives_toml(shared_data):
@@ -173,6 +190,7 @@ REFUSED = {
         ("duration = 2.0", "duration = " + "9" * 6000, r"must be TOML"),
         ("duration = 2.0", "duration = 2.0\ntolerance = nan", r"tolerance = nan: must be a finite number > 0"),
         ("duration = 2.0", "duration = 2.0\nsettle = -1", r"settle = -1: must be .* >= 0 .* s"),
+        ("duration = 2.0", "duration = 2.0\nkeep_unfelt = 1", r"keep_unfelt = 1: must be true or false"),
         ("duration = 2.0", "duration = 2.0\nlength = 1", r"length = 1: unknown key; known: texture, finger, device"),
         ("duration = 2.0", 'duration = 2.0\nname = "../up"', r"name = '../up': must be 1 to 100 printable"),
         ("duration = 2.0", 'duration = 2.0\n"\\n" = 1', r"'\\n' = 1: unknown key"),
@@ -182,7 +200,9 @@ REFUSED = {
         ('kind = "grating"', "", r"texture.kind is missing: must be one of grating, recorded, swipe"),
         ('kind = "grating"', 'kind = "gratin"', r"texture.kind = 'gratin': must be one of grating"),
         ('kind = "grating"', "kind = [1]", r"texture.kind = \[1\]: must be one of grating"),
-        ("amplitude = 1e-5", "", r"texture.amplitude is missing: must be .* m"),
+        ("amplitude = 1e-5", "", r"texture.amplitude, velocity, level: exactly one must be given; none is"),
+        ("amplitude = 1e-5", "level = 20", r"texture.speed is missing: must be .* m/s"),
+        ("amplitude = 1e-5", "velocity = 0\nspeed = 0.1", r"texture.velocity = 0: must be .* m/s"),
         ("amplitude = 1e-5", "amplitude = 10", r"texture.amplitude = 10: must be .* > 0 and <= 0.01 m"),
         ("wavelength = 1e-3", "wavelength = 0.0", r"texture.wavelength = 0.0: must be .* m"),
         ("wavelength = 1e-3", "wavelenght = 1e-3", r"texture.wavelenght = 0.001: unknown key; known: kind, amplitude"),
@@ -287,9 +307,9 @@ NUMBERS = st.one_of(
 NAMES = st.sampled_from([*TEXTURES, *MOTIONS, "light", "heavy", "auto", "sine", "square", "vt-plate", ".", "/", "a\0"])
 LEAVES = st.one_of(NUMBERS, NAMES, st.booleans(), st.text(st.characters(exclude_categories=["Cs"]), max_size=5))
 KEYS = st.sampled_from(
-    "kind amplitude gain frequency wavelength shape harmonics partials phase file channel speed carriers spacing "
-    "passband components seed motion at span centre stroke positions rate times start normal_load touches mechanics "
-    "load_scaling description order mass damping".split()
+    "kind amplitude velocity level gain frequency wavelength shape harmonics partials phase file channel speed "
+    "carriers spacing passband components seed motion at span centre stroke positions rate times start normal_load "
+    "touches mechanics load_scaling description order mass damping".split()
 )
 VALUES = st.recursive(LEAVES, lambda inner: st.lists(inner, max_size=4) | st.dictionaries(KEYS, inner, max_size=3))
 SCENES = st.fixed_dictionaries(
@@ -298,7 +318,7 @@ SCENES = st.fixed_dictionaries(
         "duration": NUMBERS | VALUES,
         "finger": st.dictionaries(KEYS, VALUES, max_size=6) | VALUES,
         "plant": st.dictionaries(st.text(st.characters(exclude_categories=["Cs"])), VALUES, max_size=2) | VALUES,
-        **{key: VALUES for key in ("tolerance", "settle", "name", "device", "other")},
+        **{key: VALUES for key in ("tolerance", "settle", "keep_unfelt", "name", "device", "other")},
     },
 )
 
@@ -339,6 +359,8 @@ POSITIVE = st.floats(0, 1e-2) | st.floats(0, 10) | NUMBERS
 GOOD_TEXTURES = [
     {"kind": "grating", "amplitude": 1e-6, "frequency": 20.0},
     {"kind": "grating", "amplitude": 1e-6, "wavelength": 1e-3, "shape": "square"},
+    {"kind": "grating", "velocity": 0.01, "wavelength": 1e-3, "speed": 0.1},
+    {"kind": "grating", "level": 20, "frequency": 70.0},
     {"kind": "synthetic", "amplitude": 1e-6, "speed": 0.1},
     {"kind": "foreign", "description": "own"},
     {"kind": "recorded", "amplitude": 1e-6, "file": "absent.wav"},

@@ -42,9 +42,10 @@ def _sliding() -> Scene:
 
 
 def _pressing() -> Scene:
-    """Return a small slow grating under a press whose sag is many times larger."""
+    """Return a small slow grating, too small to be felt, under a press whose sag is many times larger."""
     finger = Finger.still(normal_load=0.5, touches=[(0.5, 5.0)], mechanics="auto")
-    return Scene(texture=Grating(amplitude=1e-6, frequency=20.0), finger=finger, duration=5.0, name="pressing")
+    texture = Grating(amplitude=1e-6, frequency=20.0)
+    return Scene(texture=texture, finger=finger, duration=5.0, keep_unfelt=True, name="pressing")
 
 
 def _swiping() -> Scene:

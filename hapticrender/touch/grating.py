@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
-from typing import Any, ClassVar
+from dataclasses import dataclass, field
+from typing import Any, ClassVar, cast
 
 import numpy as np
 
 from hapticrender.bands import Bands
 from hapticrender.protocols import Array
-from hapticrender.touch import checks
+from hapticrender.touch import checks, perception
 
 MOST_AMPLITUDE = 0.01  # m: ten times the travel of any plate, so it catches a wrong unit
 MOST_PARTIALS = 4096
@@ -47,6 +47,10 @@ class Grating:
     ----------
     amplitude : float, m
         Peak of a sine, height of a square or triangle; > 0 and <= 0.01 m.
+        It may be stated as `velocity` or `level` instead, which become
+        `amplitude` at once: a grating keeps metres only, so that gratings
+        are equal however they were stated, and stay what they are if the
+        threshold is ever measured anew.
     frequency : float, Hz, or None
         Of the fundamental, > 0 and <= 1e6; exactly one of `frequency` and
         `wavelength` is given.
@@ -62,6 +66,15 @@ class Grating:
         keys ``order``, ``amplitude``, ``phase``.  Orders need not be whole.
     phase : float, rad
         Of the fundamental at t = 0, x = 0.
+    velocity : float, m/s
+        Peak skin velocity V of a sine at the fundamental's frequency f, >= 1e-9
+        and <= 10: amplitude V/(2 pi f).
+    level : float, dB
+        Of a sine at the fundamental's frequency (1 to 1000 Hz) above the
+        classic detection threshold, >= -100 and <= 100.
+    speed : float, m/s
+        Of the finger at which `velocity` or `level` hold, >= 1e-6 and <= 10;
+        given with them for a grating in space (f = speed/wavelength), only then.
 
     Examples
     --------
@@ -71,20 +84,26 @@ class Grating:
     >>> ridges = Grating(amplitude=10e-6, wavelength=1e-3, shape="square", harmonics=2)
     >>> ridges.bands(rate=5000.0).wavenumber.round(6).tolist()
     [1000.0, 3000.0]
+    >>> Grating(velocity=0.01, wavelength=1e-3, speed=0.1) == Grating(amplitude=0.01 / (200 * np.pi), wavelength=1e-3)
+    True
+    >>> f"{Grating(level=20.0, frequency=250.0).amplitude:.3g} m"
+    '1.1e-06 m'
     """
 
     kind: ClassVar[str] = "grating"
 
-    amplitude: float
+    amplitude: float = cast(float, None)  # never None once it is made
     frequency: float | None = None
     wavelength: float | None = None
     shape: str = "sine"
     harmonics: int = 5
     partials: tuple[Partial, ...] | None = None
     phase: float = 0.0
+    velocity: float | None = field(default=None, repr=False)
+    level: float | None = field(default=None, repr=False)
+    speed: float | None = field(default=None, repr=False)
 
     def __post_init__(self) -> None:
-        amplitude = checks.number("amplitude", self.amplitude, "m", above=0, most=MOST_AMPLITUDE)
         checks.one_of_two("frequency", self.frequency, "wavelength", self.wavelength)
         if self.frequency is not None:
             checks.keep(self, frequency=checks.number("frequency", self.frequency, "Hz", above=0, most=1e6))
@@ -94,7 +113,29 @@ class Grating:
         harmonics = checks.integer("harmonics", self.harmonics, least=1, most=MOST_PARTIALS)
         phase = checks.number("phase", self.phase, "rad", least=-1e6, most=1e6)
         partials = None if self.partials is None else _read_partials(self.partials)
-        checks.keep(self, amplitude=amplitude, harmonics=harmonics, phase=phase, partials=partials)
+        checks.keep(self, harmonics=harmonics, phase=phase, partials=partials)
+        checks.keep(self, amplitude=self._stated_amplitude(), velocity=None, level=None, speed=None)
+
+    def _stated_amplitude(self) -> float:
+        """Amplitude (m), from whichever of amplitude, velocity and level is given."""
+        given = {key: value for key in _WAYS if (value := getattr(self, key)) is not None}
+        if len(given) != 1:
+            said = " and ".join(f"{key} = {checks.show(value)}" for key, value in given.items())
+            raise ValueError(f"{', '.join(_WAYS)}: exactly one must be given; {f'{said} are' if given else 'none is'}")
+        ((key, value),) = given.items()
+        if self.speed is not None and not (self.spatial and key != "amplitude"):
+            checks.refuse("speed", self.speed, "left out but where velocity or level of a grating in space is given")
+        if key == "amplitude":
+            return checks.number("amplitude", value, "m", above=0, most=MOST_AMPLITUDE)
+        unit, least, most = _WAYS[key]
+        number = checks.number(key, value, unit, least=least, most=most)
+        return _in_metres(key, number, self._stated_frequency())
+
+    def _stated_frequency(self) -> float:
+        """Frequency (Hz) of the fundamental, at the stated speed in space."""
+        if self.frequency is not None:
+            return self.frequency
+        return checks.number("speed", self.speed, "m/s", least=1e-6, most=10) / cast(float, self.wavelength)
 
     @property
     def spatial(self) -> bool:
@@ -125,6 +166,25 @@ class Grating:
         for order, envelope in zip(*self.spectrum(), strict=True):
             total += (envelope * np.exp(2j * np.pi * (order * turns % 1.0))).real
         return np.where(np.isfinite(turns), total, 0.0)
+
+
+# Unit and bounds of the three ways to state an amplitude.
+_WAYS = {"amplitude": ("m", 0.0, MOST_AMPLITUDE), "velocity": ("m/s", 1e-9, 10.0), "level": ("dB", -100.0, 100.0)}
+
+
+def _in_metres(key: str, value: float, frequency: float) -> float:
+    """Amplitude (m) of a velocity (m/s) or level (dB) at `frequency` (Hz)."""
+    if key == "level" and not perception.LOWEST <= frequency <= perception.HIGHEST:
+        bound = f"stated at {perception.LOWEST:g} to {perception.HIGHEST:g} Hz, where the threshold is known"
+        checks.refuse(key, value, f"{bound}; it is at {frequency:.4g} Hz")
+    convert = perception.from_velocity if key == "velocity" else perception.displacement
+    with np.errstate(over="ignore", under="ignore"):
+        amplitude = float(convert(value, frequency))
+    if not amplitude <= MOST_AMPLITUDE:
+        checks.refuse(
+            key, value, f"<= {MOST_AMPLITUDE} m as an amplitude; at {frequency:.4g} Hz it is {amplitude:.3g} m"
+        )
+    return amplitude
 
 
 def _read_partials(partials: Any) -> tuple[Partial, ...]:

@@ -50,6 +50,9 @@ class Scene:
     settle : float, s
         Left out of the judgement at the beginning, >= 0; of a scene shorter
         than twice this the last half is judged.
+    keep_unfelt : bool
+        Whether bands below the safe detection threshold are rendered all the
+        same; default: they are left out.
     name : str
         Also names files: 1 to 100 printable characters.
     plant : mapping of str to number, str or bool
@@ -69,6 +72,7 @@ class Scene:
     duration: float
     tolerance: float = 0.1
     settle: float = 1.0
+    keep_unfelt: bool = False
     name: str = "scene"
     plant: Mapping[str, PlantValue] = field(default_factory=dict, hash=False)
 
@@ -78,6 +82,7 @@ class Scene:
         duration = checks.number("duration", self.duration, "s", above=0, most=LONGEST_TIME)
         tolerance = checks.number("tolerance", self.tolerance, "", above=0, most=10)
         settle = checks.number("settle", self.settle, "s", least=0, most=LONGEST_TIME)
+        checks.keep(self, keep_unfelt=checks.flag("keep_unfelt", self.keep_unfelt))
         checks.keep(self, duration=duration, tolerance=tolerance, settle=settle, plant=_read_plant(self.plant))
         if not isinstance(self.texture, Texture):
             checks.refuse("texture", self.texture, "a texture with bands(rate) and waveform(time, position)", TypeError)
@@ -132,7 +137,8 @@ class Scene:
 
     def to_toml(self) -> str:
         """TOML text that `from_toml_text` reads back to an equal scene (textures of your own: by description only)."""
-        head = {key: getattr(self, key) for key in ("name", "device", "duration", "tolerance", "settle")}
+        keys = ("name", "device", "duration", "tolerance", "settle", "keep_unfelt")
+        head = {key: getattr(self, key) for key in keys}
         texture: Any = self.texture if type(self.texture) in TEXTURES.values() else ForeignTexture(repr(self.texture))
         return toml.dumps(
             head
