@@ -57,6 +57,8 @@ class Bands:
         The wanted waveform is a factor of every envelope, which is then constant but for it.
     differentiated : bool
         Wanted is the time derivative of what the envelopes say, whatever the carriers' frequencies come to be.
+    unfelt : tuple of str
+        Which bands were left out because no one could feel them, and why, one sentence each.
 
     Raises
     ------
@@ -76,6 +78,7 @@ class Bands:
     envelope: Array | None = None
     modulated: bool = False
     differentiated: bool = False
+    unfelt: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         for name, (unit, kind, least) in _COLUMNS.items():

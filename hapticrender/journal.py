@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import json
 import struct
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -134,7 +134,7 @@ class Header:
         fields = {name: getattr(self, name) for name in self.__dataclass_fields__ if name != "bands"}
         envelope = self.bands.envelope
         bands = {name: getattr(self.bands, name).tolist() for name in ("frequency", "wavenumber", "phase")}
-        bands |= {name: getattr(self.bands, name) for name in ("modulated", "differentiated")}
+        bands |= {name: getattr(self.bands, name) for name in ("modulated", "differentiated", "unfelt")}
         bands["envelope"] = None if envelope is None else [[z.real, z.imag] for z in envelope.tolist()]
         channels = [{"name": name, "unit": unit} for name, unit in self.channels]
         return json.dumps({"format": FORMAT, "version": VERSION, **fields, "bands": bands, "channels": channels})
@@ -163,6 +163,7 @@ def _bands(
     envelope: list[Any] | None,
     modulated: bool = False,
     differentiated: bool = False,
+    unfelt: Sequence[str] = (),
 ) -> Bands:
     constant = None if envelope is None else np.array([complex(re, im) for re, im in envelope], complex)
     return Bands(
@@ -172,6 +173,7 @@ def _bands(
         envelope=constant,
         modulated=modulated,
         differentiated=differentiated,
+        unfelt=tuple(unfelt),
     )
 
 

@@ -383,7 +383,7 @@ def _worst(bands: list[dict[str, Any]], places: list[str], tolerance: float) -> 
 def _notes(recording: Recording, bands: list[dict[str, Any]], late: Array) -> list[str]:
     """Say in plain sentences what a reader of the figures ought to know."""
     header, envelopes = recording.header, recording.envelopes
-    seconds, notes = len(recording) / recording.rate, []
+    seconds, notes = len(recording) / recording.rate, [f"left out, {text}" for text in recording.bands.unfelt]
     if seconds < header.duration - 0.5 / recording.rate:
         notes.append(f"the run ended after {seconds:.3f} s of {header.duration:.3f} s")
     if seconds < 2 * header.settle:
@@ -439,9 +439,8 @@ def text(summary: Mapping[str, Any]) -> str:
     lines = ["  ".join(cell.rjust(width) for cell, width in zip(row, widths, strict=True)) for row in rows]
     wobble, residual = (wording.quantity(summary[key], summary["unit"]) for key in ("wobble", "residual_rms"))
     saturated = wording.percent(summary["saturated_share"])
-    lines.append(
-        f"rms errors at {' and '.join(_said(places))}; wobble {wobble}, beside the bands {residual}, saturated {saturated}"
-    )
+    where = " and ".join(_said(places))
+    lines.append(f"rms errors at {where}; wobble {wobble}, beside the bands {residual}, saturated {saturated}")
     lines.extend(summary["notes"])
     return "\n".join([*lines, f"{summary['scene']} {wording.verdict(summary)}"])
 

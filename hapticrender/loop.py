@@ -5,6 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -38,6 +39,7 @@ class Session:
     model: BandModel
     bands: Bands
     design: Callable[..., Controller]
+    waveform: Callable[[Array, Array], Array]
 
     def controller(self) -> Controller:
         """Return a controller at rest, designed for this session."""
@@ -70,11 +72,21 @@ def prepare(scene: Scene, *, driver: Driver | None = None, method: str = default
     renderer: Renderer = registered("renderers", scene.device)()
     if driver is None:
         driver = registered("drivers", "simulated")(renderer.plant(scene, seed))
+    else:
+        check_driver(driver)
+        driver = renderer.connect(scene, driver)
     check_driver(driver)
     model = renderer.band_model(scene, driver)
     bands = renderer.bands(scene, model)
     session = Session(
-        scene=scene, method=method, seed=int(seed), driver=driver, model=model, bands=bands, design=chosen.design
+        scene=scene,
+        method=method,
+        seed=int(seed),
+        driver=driver,
+        model=model,
+        bands=bands,
+        design=partial(renderer.design, chosen),
+        waveform=renderer.waveform(scene),
     )
     _warm_up(session)
     return session
@@ -194,7 +206,7 @@ def _wanted(session: Session, start: int, position: Array) -> Array:
     """Waveform of the texture over a block, where the controller has to analyse it."""
     if session.bands.envelope is not None:
         return np.zeros(len(position))
-    wanted = np.asarray(session.scene.texture.waveform(_time(session, start, len(position)), position), float)
+    wanted = np.asarray(session.waveform(_time(session, start, len(position)), position), float)
     if wanted.shape != position.shape:
         kind = type(session.scene.texture).__name__
         raise ValueError(f"{kind}.waveform returned shape {wanted.shape}: must be {position.shape}, one a sample")

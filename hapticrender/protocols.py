@@ -13,6 +13,7 @@ the band (or channel) last.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from enum import IntFlag
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, runtime_checkable
 
@@ -158,6 +159,18 @@ class Renderer(Protocol):
 
     def plant(self, scene: Scene, seed: int) -> Plant:
         """The simulated device with the scene's finger on it."""
+        ...
+
+    def connect(self, scene: Scene, driver: Driver) -> Driver:
+        """A driver of the user's as the controller is to see it; where nothing is in between, `driver` itself."""
+        ...
+
+    def waveform(self, scene: Scene) -> Callable[[Array, Array], Array]:
+        """Wanted waveform over time (s) and position (m), in the device's quantity."""
+        ...
+
+    def design(self, method: Method, model: BandModel, bands: Bands, *, feedback: bool = True) -> Controller:
+        """A controller of `method` for the whole device."""
         ...
 
 

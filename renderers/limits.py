@@ -2,21 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 
 from hapticrender.bands import Bands
 from hapticrender.control.bandmodel import BandModel
 from hapticrender.protocols import Array
+from hapticrender.renderers.base import Waveform
+from hapticrender.touch.perception import drop_unfelt
 from hapticrender.touch.scene import Scene
 
 NYQUIST_MARGIN = 0.45  # of the rate: above this the hold's image cannot be told from the carrier
 CHECK_STEP = 1e-3  # s: resolution at which the finger's path is checked against the surface
 LOOK_AHEAD = 30.0  # s of a scene that are looked at for the finger's speed and the drive that a waveform needs
+FASTEST = 10.0  # m/s: no finger is faster
 FADED = 1.25  # times the highest frequency: finger-locked carriers are silent beyond
-
-Waveform = Callable[[Array, Array], Array]
 
 
 def check_path(scene: Scene, half: float, surface: str) -> None:
@@ -37,6 +38,19 @@ def speeds(scene: Scene) -> Array:
 def top_speed(scene: Scene) -> float:
     """Largest speed of the finger (m/s)."""
     return float(np.nanmax(speeds(scene), initial=0.0))
+
+
+def felt(scene: Scene, bands: Bands, model: BandModel) -> Bands:
+    """Leave out the bands that no one can feel, unless the scene keeps them, and note which and why."""
+    if scene.keep_unfelt:
+        return bands
+    left, dropped = drop_unfelt(
+        bands,
+        top_speed=min(top_speed(scene), FASTEST),
+        lowest=max(model.lowest_frequency / 2, 1.0),
+        highest=FADED * model.highest_frequency,
+    )
+    return replace(left, unfelt=tuple(each.text() for each in dropped))
 
 
 def check_carriers(scene: Scene, model: BandModel, bands: Bands) -> None:
@@ -100,7 +114,9 @@ def _check_waveform(scene: Scene, model: BandModel, bands: Bands, waveform: Wave
 def _check_range(amplitude: float, model: BandModel) -> None:
     """Refuse what the sensors cannot follow."""
     if amplitude > model.sensed_limit:
-        raise ValueError(f"{_named(amplitude, model)}: must be <= {model.sensed_limit:g} {model.unit}, the sensors' range")
+        raise ValueError(
+            f"{_named(amplitude, model)}: must be <= {model.sensed_limit:g} {model.unit}, the sensors' range"
+        )
 
 
 def _refuse(amplitude: float, frequency: float, drive: float, model: BandModel) -> None:
@@ -113,7 +129,9 @@ def _refuse(amplitude: float, frequency: float, drive: float, model: BandModel) 
 
 def _named(amplitude: float, model: BandModel) -> str:
     """Name a target in the device's quantity."""
-    return f"{'texture.amplitude =' if model.unit == 'm' else 'texture.amplitude asks for'} {amplitude:.3g} {model.unit}"
+    return (
+        f"{'texture.amplitude =' if model.unit == 'm' else 'texture.amplitude asks for'} {amplitude:.3g} {model.unit}"
+    )
 
 
 def common_gain(model: BandModel, frequency: Array) -> Array:

@@ -12,11 +12,12 @@ from hapticrender.bands import Bands
 from hapticrender.control.bandmodel import BandModel
 from hapticrender.plants.vibrotactile import EXPECTED_BENDING, Plate, PlateParameters
 from hapticrender.protocols import Driver
-from hapticrender.renderers.limits import Waveform, check_carriers, check_path, check_targets, felt
+from hapticrender.renderers.base import BaseRenderer
+from hapticrender.renderers.limits import check_carriers, check_path, check_targets, felt
 from hapticrender.touch.scene import Scene
 
 
-class VibrotactileRenderer:
+class VibrotactileRenderer(BaseRenderer):
     """Renderer for the two-coil plate of Grigorii et al. 2021."""
 
     name = "vt-plate"
@@ -48,7 +49,3 @@ class VibrotactileRenderer:
         check_carriers(scene, model, bands)
         check_targets(scene, model, bands, scene.texture.waveform)
         return bands
-
-    def waveform(self, scene: Scene) -> Waveform:
-        """Wanted displacement (m) over time and position."""
-        return scene.texture.waveform

@@ -5,6 +5,7 @@ Amplitudes are peaks (m, m/s, N) of sinusoids; levels are dB above the classic d
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -300,9 +301,8 @@ def _unfelt(bands: Bands, index: int, least: Array, place: Array) -> Unfelt:
 
 def _select(bands: Bands, kept: Array) -> Bands:
     envelope = None if bands.envelope is None else bands.envelope[kept]
-    return Bands(
-        frequency=bands.frequency[kept], wavenumber=bands.wavenumber[kept], phase=bands.phase[kept], envelope=envelope
-    )
+    frequency, wavenumber, phase = (each[kept] for each in (bands.frequency, bands.wavenumber, bands.phase))
+    return replace(bands, frequency=frequency, wavenumber=wavenumber, phase=phase, envelope=envelope)
 
 
 def _length(metres: float) -> str:
