@@ -22,30 +22,24 @@ couples the mode to heave and rocking.
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
-from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from hapticrender._lanes import aligned
 from hapticrender.control.bandmodel import BandModel
 from hapticrender.control.damping_margins import BendingMode
 from hapticrender.plants.closed import CLOSED
-from hapticrender.plants.kernels import PlateState, PlateTables, plate_run, plate_system
-from hapticrender.plants.propagator import COLUMNS, NODES, STATES, WIDEST, identity, shifts
+from hapticrender.plants.kernels import plate_run
+from hapticrender.plants.plate_tables import plate_state, plate_tables
 from hapticrender.protocols import Array, Controller, Sensed
 
 if TYPE_CHECKING:
     from hapticrender.touch.finger import Finger
 
 PLACES = ("centre", "end 1", "end 2")
-NOMINAL_AMPLIFIER = (1 - 2e3 / 1.0) / 10e3  # A/V: the gain that a drive in A is turned into volts with
-MOST_LOAD = 20.0  # N: hardest that a finger presses
-TAYLOR_ROUNDING = 1e-17  # the first term left out of the series, relative to the state
 EXPECTED_BENDING = BendingMode(  # FACTS section 3 A: 1.1-1.4 kHz, either sign [E]; for a plate that was not measured
     frequency=1250.0, damping=0.01, coupling=(0.1 / 9.5e-3, 0.0), spread=150.0, measured=False
 )
@@ -87,6 +81,8 @@ class PlateParameters:
         Sampling rate of the embedded loop.
     delay : int, samples
         Loop delay, >= 1: from a sensed sample to the drive computed from it.
+    coils : int
+        2: each at its suspension; 1: in the middle, which moves heave alone.
     degrees_of_freedom : int
         2: heave and rocking; 1: heave only.
     finger_dynamics : int
@@ -127,6 +123,7 @@ class PlateParameters:
     sensor_gain_2: float = 1.0
     rate: float = 5000.0
     delay: int = 1
+    coils: int = 2
     degrees_of_freedom: int = 2
     finger_dynamics: int = 1
     bending_frequency: float = 0.0
@@ -201,7 +198,9 @@ class PlateParameters:
 
     @property
     def force_from_drive(self) -> Array:
-        """Generalised forces per coil current (N/A, shape (2, 2))."""
+        """Generalised forces per coil current (N/A, shape (2, coils))."""
+        if self.coils == 1:
+            return self.force_constant * np.array([[1.0], [0.0]])
         return self.force_constant * np.array([[1.0, 1.0], [-1.0, 1.0]])
 
     @property
@@ -263,17 +262,17 @@ class PlateParameters:
 
     def band_model(self, rate: float, delay: int) -> BandModel:
         """What the controller may know of this plate, in a loop of `rate` (Hz) and `delay` (samples)."""
-        reach = self.glass_length / self.coil_spacing
+        reach, n = self.glass_length / self.coil_spacing, self.coils  # one coil moves one coordinate
         return BandModel(
             rate=rate,
             delay=delay,
-            mass=self.mass_matrix,
-            damping=self.damping_matrix,
-            stiffness=self.stiffness_matrix,
-            force_from_drive=self.force_from_drive,
-            coordinate_from_sensed=np.linalg.inv(np.array([[1.0, -reach], [1.0, reach]])),
-            side_from_coordinate=np.array([[1.0, -1.0], [1.0, 1.0]]),
-            place_from_coordinate=np.array([[1.0, 0.0], [1.0, -reach], [1.0, reach]]),
+            mass=self.mass_matrix[:n, :n],
+            damping=self.damping_matrix[:n, :n],
+            stiffness=self.stiffness_matrix[:n, :n],
+            force_from_drive=self.force_from_drive[:n],
+            coordinate_from_sensed=np.linalg.inv(np.array([[1.0, -reach], [1.0, reach]]))[:n],
+            side_from_coordinate=np.array([[1.0, -1.0], [1.0, 1.0]])[:n, :n],
+            place_from_coordinate=np.array([[1.0, 0.0], [1.0, -reach], [1.0, reach]])[:, :n],
             places=PLACES,
             drive_limit=self.current_limit,
             sensed_limit=self.sensor_range / 2,
@@ -298,7 +297,7 @@ _BOUNDS = {
         ),
         (0.0, False),
     ),
-    **dict.fromkeys(("delay", "degrees_of_freedom"), (1.0, False)),
+    **dict.fromkeys(("delay", "coils", "degrees_of_freedom"), (1.0, False)),
     "rate": (500.0, False),
     "bending_coil": (-1.0, False),
 }
@@ -306,6 +305,7 @@ _CEILINGS = {
     "current_bits": 24,
     "sensor_bits": 24,
     "delay": 100_000,
+    "coils": 2,
     "degrees_of_freedom": 2,
     "finger_dynamics": 1,
     "rate": 1e6,
@@ -354,7 +354,7 @@ class Plate:
         self.rate = float(parameters.rate)
         self.delay = parameters.delay
         self.block = block
-        self.drive_channels = self.sensed_channels = 2
+        self.drive_channels, self.sensed_channels = parameters.coils, 2
         self._rng = np.random.default_rng(seed)
         self._samples = 0
         self._tables = plate_tables(parameters, finger)
@@ -370,18 +370,19 @@ class Plate:
 
     def closes(self, controller: Controller) -> bool:
         """Whether `closed_loop` has compiled code for this controller."""
-        return type(getattr(controller, "tables", None)) in CLOSED
+        return type(getattr(controller, "tables", None)) in CLOSED and self.drive_channels == 2
 
     def finger_position(self, n: int) -> Array:
         """Finger positions (m, shape (n,)) of the next n samples, NaN while lifted; the plant does not advance."""
         return self.finger.position((self._samples + np.arange(n)) / self.rate)
 
     def run(self, drive: Array) -> Sensed:
-        """Advance by n samples under `drive` (A, shape (n, 2)); row i acts from sample i on, sensed at its start."""
+        """Advance by n samples under `drive` (A, shape (n, coils)); row i acts from sample i, sensed at its start."""
         n = len(drive)
         finger, noise, flags = self._next(n)
         sensed, motion = np.zeros((n, 2)), np.zeros((n, 3))
-        plate_run(self._tables, self._state, np.ascontiguousarray(drive, float), finger, noise, sensed, motion, flags)
+        each = np.repeat(drive, 2 // self.drive_channels, axis=1)  # a coil in the middle acts like two that share it
+        plate_run(self._tables, self._state, np.ascontiguousarray(each, float), finger, noise, sensed, motion, flags)
         return Sensed(sensed, finger[:, 0], motion, finger[:, 1], flags)
 
     def closed_loop(self, controller: Controller, wanted: Array) -> tuple[Array, Array, Array, Sensed]:
@@ -406,98 +407,3 @@ class Plate:
             flags,
         )
         return drive, target, flags, Sensed(sensed, finger[:, 0], motion, finger[:, 1], flags)
-
-
-def plate_state(latency: int) -> PlateState:
-    """A plate at rest whose drive takes `latency` samples to act."""
-    return PlateState(
-        z=aligned((1, STATES)),
-        step=aligned((1, COLUMNS, STATES)),
-        frozen=np.full(2, np.nan),
-        seen=np.full(2, np.nan),
-        powers=aligned((NODES, COLUMNS, STATES)),
-        window=np.array([0.0, WIDEST, -1.0]),
-        nodes=aligned((NODES + 1, COLUMNS, STATES)),
-        one=identity(),
-        system=shifts(),
-        square=aligned((STATES, STATES)),
-        cube=aligned((STATES, STATES)),
-        series=aligned((STATES, STATES)),
-        push=np.zeros((3, 3)),
-        pending=np.zeros((latency, 2)),
-        cursor=np.zeros(1, np.int64),
-        current=np.zeros(2),
-    )
-
-
-def plate_tables(parameters: PlateParameters, finger: Finger) -> PlateTables:
-    """Numbers of the compiled plate with this finger on it."""
-    mechanics = finger.mechanics
-    order = mechanics.order if parameters.finger_dynamics else 0
-    rocking = parameters.degrees_of_freedom == 2
-    flexible = parameters.bending_frequency > 0.0
-    omega = 2 * math.pi * parameters.bending_frequency
-    wavenumber, grow, wave = parameters._bar()
-    mass = parameters.mass_matrix.diagonal()
-    stiffness, damping = parameters.stiffness_matrix, parameters.damping_matrix
-    if not rocking:
-        stiffness, damping = np.diag(stiffness.diagonal()), np.diag(damping.diagonal())
-    tables = PlateTables(
-        period=float(1.0 / parameters.rate),
-        terms=0,
-        inverse_mass=(
-            float(1.0 / mass[0]),
-            float(1.0 / mass[1]) if rocking else 0.0,
-            1.0 / parameters.bending_mass if flexible else 0.0,
-        ),
-        stiffness=_upper(stiffness),
-        damping=_upper(damping),
-        force_constant=parameters.force_constant,
-        lever=1.0 / parameters.half_spacing,
-        reach=parameters.glass_length / parameters.coil_spacing,
-        skin=(mechanics.mass, mechanics.damping, mechanics.stiffness) if order else (0.0, 0.0, 0.0),
-        phalanx=(1.0 / mechanics.phalanx_mass, mechanics.phalanx_damping, mechanics.phalanx_stiffness)
-        if order == 4
-        else (0.0, 0.0, 0.0),
-        flexible=flexible,
-        flexure=(omega**2 * parameters.bending_mass, 2 * parameters.bending_damping * omega * parameters.bending_mass),
-        coil_shape=parameters.bending_coil,
-        centre_shape=float(parameters.bending_shape(0.0)),
-        shape=(wavenumber * parameters.half_spacing, grow, wave),
-        amplifier=parameters.amplifier_gain / NOMINAL_AMPLIFIER,
-        current_limit=parameters.current_limit,
-        current_step=parameters.current_step,
-        sensor_limit=parameters.sensor_range / 2,
-        sensor_step=parameters.sensor_step,
-        sensor_noise=parameters.sensor_noise,
-        sensor_gain=(float(parameters.sensor_gain_1), float(parameters.sensor_gain_2)),
-    )
-    tables = PlateTables(*(_as_float(value) for value in tables))  # else every mix of types compiles anew
-    strongest = float(mechanics.load_factor(np.array(MOST_LOAD))) if finger.load_scaling else 1.0
-    return tables._replace(terms=_taylor_terms(tables._replace(terms=0), strongest))
-
-
-def _as_float(value: Any) -> Any:
-    """Floats for integers, also inside tuples; flags and the number of terms stay."""
-    if isinstance(value, tuple):
-        return tuple(float(each) for each in value)
-    return value if isinstance(value, (bool, np.bool_)) else float(value)
-
-
-def _upper(matrix: Array) -> tuple[float, float, float]:
-    """Upper triangle of a symmetric 2 x 2 matrix."""
-    return float(matrix[0, 0]), float(matrix[0, 1]), float(matrix[1, 1])
-
-
-@lru_cache(maxsize=1024)
-def _taylor_terms(tables: PlateTables, strongest: float) -> int:
-    """Terms after which the exponential series has converged to rounding, wherever and however hard it is pressed."""
-    system, most = shifts(), 2
-    for lever, strength in itertools.product((0.0, tables.reach), (0.0, 1.0, strongest)):
-        plate_system(tables, lever, strength, system, np.zeros((3, 3)))
-        term, n = system, 1
-        while abs(term).max() > TAYLOR_ROUNDING:
-            n += 1
-            term = system @ term / n
-        most = max(most, n)
-    return most

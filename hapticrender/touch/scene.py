@@ -55,6 +55,9 @@ class Scene:
         same; default: they are left out.
     name : str
         Also names files: 1 to 100 printable characters.
+    gradient : float, 1/m
+        The wanted amplitude grows by this share of itself per metre along the surface, from its middle on; -1000 to
+        1000.  Only a plate with two coils can do so.
     plant : mapping of str to number, str or bool
         Parameters of the simulated device that differ from its defaults.
 
@@ -73,6 +76,7 @@ class Scene:
     tolerance: float = 0.1
     settle: float = 1.0
     keep_unfelt: bool = False
+    gradient: float = 0.0
     name: str = "scene"
     plant: Mapping[str, PlantValue] = field(default_factory=dict, hash=False)
 
@@ -83,6 +87,7 @@ class Scene:
         tolerance = checks.number("tolerance", self.tolerance, "", above=0, most=10)
         settle = checks.number("settle", self.settle, "s", least=0, most=LONGEST_TIME)
         checks.keep(self, keep_unfelt=checks.flag("keep_unfelt", self.keep_unfelt))
+        checks.keep(self, gradient=checks.number("gradient", self.gradient, "1/m", least=-1e3, most=1e3))
         checks.keep(self, duration=duration, tolerance=tolerance, settle=settle, plant=_read_plant(self.plant))
         if not isinstance(self.texture, Texture):
             checks.refuse("texture", self.texture, "a texture with bands(rate) and waveform(time, position)", TypeError)
@@ -137,7 +142,7 @@ class Scene:
 
     def to_toml(self) -> str:
         """TOML text that `from_toml_text` reads back to an equal scene (textures of your own: by description only)."""
-        keys = ("name", "device", "duration", "tolerance", "settle", "keep_unfelt")
+        keys = ("name", "device", "duration", "tolerance", "settle", "keep_unfelt", "gradient")
         head = {key: getattr(self, key) for key in keys}
         texture: Any = self.texture if type(self.texture) in TEXTURES.values() else ForeignTexture(repr(self.texture))
         return toml.dumps(
