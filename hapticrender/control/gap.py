@@ -219,12 +219,14 @@ def _learn(tables, state, doing):
 
 @kernel
 def gap_step(tables, state, voltage_re, voltage_im, current_re, current_im, speed):
-    """Attraction (N) and whether it had to be taken open loop, from the envelopes of one sample."""
+    """Attraction (N) and whether it had to be taken open loop, from one sample of envelopes; junk counts as zero."""
     x, known = state.envelope, state.known
     x[0], x[1], x[2], x[3] = voltage_re, voltage_im, current_re, current_im
     for i in range(4):
-        w = state.filters[i]
-        x[i], w[0], w[1] = biquad_step(tables.section, w[0], w[1], x[i])
+        w, value = state.filters[i], x[i]
+        if not math.isfinite(value):
+            value = 0.0
+        x[i], w[0], w[1] = biquad_step(tables.section, w[0], w[1], value)
     if math.isnan(speed):
         state.mode[DOING] = LIFTED
         known[AREA] = known[SHARE] = 0.0

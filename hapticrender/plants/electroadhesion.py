@@ -105,9 +105,9 @@ class ElectroadhesionParameters(SlidingParameters):
     unevenness : float
         kappa = <d^-2>/<d^-1>^2 of the gap, 1 to 10 (1-3).
     current_limit : float, A
-        Largest peak that the source makes, > 0.
+        Largest peak that is asked of the source, where its drive is a current, > 0.
     voltage_limit : float, V
-        Its compliance, peak, > 0 (150-300).
+        Its compliance, peak, > 0 (150-300); also the largest drive where that is a voltage.
     current_offset : float, A
         Direct current that the source leaks, -1 to 1 mA.
     servo_conductance : float, S
@@ -165,7 +165,7 @@ class ElectroadhesionParameters(SlidingParameters):
         turns = self.carrier_frequency / self.rate
         if turns != round(turns):
             raise ValueError(
-                f"carrier_frequency = {self.carrier_frequency!r}: must be a whole multiple of {self.rate:g} Hz, the rate"
+                f"carrier_frequency = {self.carrier_frequency!r}: must be a whole multiple of rate = {self.rate:g} Hz"
             )
         if self.oversampling < LEAST_SUBSTEPS * turns:
             raise ValueError(
@@ -173,9 +173,7 @@ class ElectroadhesionParameters(SlidingParameters):
                 f"{LEAST_SUBSTEPS} a turn of the carrier"
             )
         if self.sensor == "impedance" and self.level == "envelope":
-            raise ValueError(
-                "sensor = 'impedance': must be 'tribometer' where level = 'envelope', which has no carrier"
-            )
+            raise ValueError("sensor = 'impedance': must be 'tribometer' where level = 'envelope': no carrier")
         _ = self.estimator  # refuses a bad bandwidth or smoothing
 
     @property
@@ -222,7 +220,7 @@ class ElectroadhesionParameters(SlidingParameters):
         return complex(self.body_resistance + (self.series_impedance + gap) / self.area(normal_load))
 
     def gain(self, normal_load: float) -> float:
-        """g of ``F_e = g I^2`` while sliding (N/A^2, I the peak) under `normal_load` (N)."""
+        """Return g of ``F_e = g I^2`` while sliding (N/A^2, I the peak) under `normal_load` (N)."""
         return float(self.unevenness * self.leakage / (4 * self.omega**2 * VACUUM * self.area(normal_load)))
 
     def attraction(self, drive: Any, normal_load: float) -> Any:
