@@ -34,6 +34,7 @@ class Flag(IntFlag):
     NONFINITE = 2  # a sensed value that no sensor can show (NaN, infinite, out of all range) was replaced by zero
     SENSOR_CLIPPED = 4  # a sensor stood at the end of its range
     OVERRUN = 8  # the driver lost samples
+    OPEN_LOOP = 16  # a force could not be sensed and is driven open loop
     UNLOCKED = 32  # a carrier is off its resonance, or the motion too small to tell
 
 

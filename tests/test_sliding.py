@@ -1,0 +1,154 @@
+"""The sliding contact: lag, tribometer and skin against their closed forms, and what sticks, lifts or clips."""
+
+import numpy as np
+import pytest
+
+from hapticrender._jit import kernel
+from hapticrender.plants.sliding import SlidingParameters, sliding_state, sliding_step, sliding_tables
+from hapticrender.touch.mechanics import HEAVY, LIGHT, LIGHT_SECOND, NONE, FingerMechanics
+
+QUIET = SlidingParameters(force_noise=0.0)
+SPEEDS = [5e-3, 40e-3, 160e-3]
+
+
+@kernel
+def _run(tables, state, steady, speed, noise, out):
+    for n in range(steady.shape[0]):
+        out[n, 0], out[n, 1], out[n, 2] = sliding_step(tables, state, steady[n], speed[n], noise[n])
+
+
+def run(steady, speed, parameters=QUIET, mechanics=LIGHT, state=None, noise=None):
+    """Friction, sensed friction and skin velocity, shape (n, 3)."""
+    steady = np.asarray(steady, float)
+    speed = np.broadcast_to(np.asarray(speed, float), steady.shape).copy()
+    noise = np.zeros(steady.size) if noise is None else noise
+    out = np.empty((steady.size, 3))
+    _run(sliding_tables(parameters, mechanics), state or sliding_state(), steady, speed, noise, out)
+    return out
+
+
+def measured(frequency, speed, mechanics=LIGHT):
+    """Responses at `frequency` (whole Hz) to a steady friction of 1 N: over the second of two seconds."""
+    time = np.arange(2 * int(QUIET.rate)) / QUIET.rate
+    out = run(np.cos(2 * np.pi * frequency * time), speed, mechanics=mechanics)[time >= 1.0]
+    return 2 * np.mean(out * np.exp(-2j * np.pi * frequency * time[time >= 1.0])[:, None], axis=0)
+
+
+@pytest.mark.parametrize("speed", SPEEDS)
+@pytest.mark.parametrize("frequency", [20.0, 170.0, 400.0, 1300.0])
+def test_measured_responses_are_the_predicted_ones(frequency, speed):
+    """The start dies away by exp(-69) (lag at 5 mm/s: exp(-435)) in a second; the rest is rounding of 1e4 terms."""
+    friction, sensed, skin = measured(frequency, speed)
+    assert friction == pytest.approx(QUIET.lag_response(frequency, speed), rel=1e-9)
+    assert sensed == pytest.approx(QUIET.frequency_response(frequency, speed), rel=1e-9)
+    assert skin == pytest.approx(friction * QUIET.skin_response(frequency, LIGHT), rel=1e-6)
+
+
+@pytest.mark.parametrize("speed", SPEEDS)
+def test_the_lag_is_first_order_behind_a_hold(speed):
+    """Hold and lag delay by T/2 + T/x, x = |v| T/delta; sampled, by T/(1 - exp(-x)) = T/x + T/2 + x T/12 - ..."""
+    frequency = np.array([20.0, 100.0, 400.0])
+    angle, renewed = 2 * np.pi * frequency / QUIET.rate, speed / (QUIET.rate * QUIET.memory_length)
+    hold = np.sinc(frequency / QUIET.rate) * np.exp(-0.5j * angle)
+    first_order = hold / (1 + 1j * frequency / QUIET.cutoff(speed))
+    error = abs(QUIET.lag_response(frequency, speed) / first_order - 1)
+    assert np.all(error < angle * (renewed + angle) / 12)  # the next order is that of the straight line
+
+
+def test_cutoff_grows_by_13_8_hz_per_mm_per_s():
+    """FACTS 5, to its last printed digit."""
+    assert QUIET.cutoff(1e-3) == pytest.approx(13.8, abs=0.05)
+    response = abs(QUIET.lag_response(np.array([1.0, QUIET.cutoff(10e-3)]), 10e-3))
+    assert response[1] / response[0] == pytest.approx(np.sqrt(0.5), rel=2e-3)
+
+
+def test_tribometer_is_flat_within_half_a_decibel_up_to_400_hz():
+    """FACTS 5; and it is the second-order resonance to the error of the straight line, (w T)^2/12."""
+    frequency = np.linspace(20.0, 400.0, 200)
+    response = QUIET.tribometer_response(frequency)
+    assert abs(20 * np.log10(abs(response))).max() < 0.5
+    ratio = frequency / QUIET.tribometer_frequency
+    exact = 1 / (1 - ratio**2 + 2j * QUIET.tribometer_damping * ratio)
+    assert np.all(abs(response / exact - 1) < 1.02 * (2 * np.pi * frequency / QUIET.rate) ** 2 / 12)
+    barely = SlidingParameters(tribometer_damping=0.39)
+    assert 20 * np.log10(abs(barely.tribometer_response(400.0))) > 0.5
+
+
+@pytest.mark.parametrize("mechanics", [LIGHT_SECOND, LIGHT, HEAVY], ids=["2nd", "light", "heavy"])
+def test_skin_moves_as_its_mechanics_say(mechanics):
+    """Against V_s/F of the finger, to the error of the straight line."""
+    frequency = np.array([20.0, 47.0, 111.0, 170.0, 400.0])
+    exact = mechanics.skin_velocity_per_force(frequency)
+    error = abs(QUIET.skin_response(frequency, mechanics) / exact - 1)
+    assert np.all(error < 1.02 * (2 * np.pi * frequency / QUIET.rate) ** 2 / 12)
+
+
+def test_a_finger_without_mechanics_has_no_skin():
+    out = run(np.ones(2000), 0.05, mechanics=NONE)
+    assert not out[:, 2].any()
+    assert out[-1, 1] == pytest.approx(1.0, rel=1e-9)
+
+
+def test_a_slow_contact_sticks_and_keeps_its_friction():
+    steady = np.r_[np.ones(3000), np.zeros(3000)]
+    speed = np.r_[np.full(3000, 0.05), np.full(3000, 0.99e-3)]
+    held = run(steady, speed)
+    assert held[-1, 0] == held[3000, 0] == pytest.approx(1.0, rel=1e-12)
+    speed[3000:] = -1.01e-3  # slides, backwards
+    passed = np.exp(-1.01e-3 * 2999 / QUIET.rate / QUIET.memory_length)
+    assert run(steady, speed)[-1, 0] == pytest.approx(passed, rel=1e-9)
+
+
+def test_a_lifted_finger_has_no_friction():
+    speed = np.full(6000, 0.05)
+    speed[3000:] = np.nan
+    out = run(np.ones(6000), speed)
+    assert out[3000, 0] > 0.99
+    assert not out[3001:, 0].any()
+    assert abs(out[-1, 1]) < 1e-9
+    assert np.isfinite(out).all()
+
+
+def test_a_run_equals_its_pieces(rng):
+    steady, speed, noise = rng.random(500), 0.1 * rng.standard_normal(500), rng.standard_normal(500)
+    whole = run(steady, speed, SlidingParameters(), HEAVY, noise=noise)
+    state = sliding_state()
+    pieces = [
+        run(steady[part], speed[part], SlidingParameters(), HEAVY, state, noise[part])
+        for part in (slice(0, 1), slice(1, 77), slice(77, 500))
+    ]
+    assert np.array_equal(np.concatenate(pieces), whole)
+
+
+def test_tribometer_noise_resolution_and_range():
+    noise = np.random.default_rng(5).standard_normal(20_000)
+    sensed = run(np.zeros(20_000), 0.0, SlidingParameters(), noise=noise)[:, 1]
+    assert sensed.std() == pytest.approx(1e-3, rel=3 / np.sqrt(2 * 20_000))  # three standard deviations of it
+    coarse = SlidingParameters(force_noise=0.0, force_range=0.8, force_bits=4)
+    sensed = run(np.ones(3000), 0.05, coarse)[:, 1]
+    assert sensed.max() == 0.8
+    np.testing.assert_allclose(sensed / 0.1, np.round(sensed / 0.1), atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        ({"memory_length": 0.0}, r"plant.memory_length = 0.0: must be > 0 m"),
+        ({"friction_coefficient": -0.1}, r"plant.friction_coefficient = -0.1: must be >= 0"),
+        ({"tribometer_frequency": 6e3}, r"plant.tribometer_frequency = 6000.0: must be <= 5000 Hz"),
+        ({"force_bits": 2.0}, r"plant.force_bits = 2.0: must be an integer"),
+        ({"force_bits": 25}, r"plant.force_bits = 25: must be <= 24"),
+        ({"rate": 10.0}, r"plant.rate = 10.0: must be >= 1000 Hz"),
+        ({"rate": float("nan")}, r"plant.rate = nan: must be >= 1000 Hz"),
+        ({"least_speed": True}, r"plant.least_speed = True: must be a number"),
+        ({"memory": 1.0}, r"plant.memory: no such parameter; known: .*memory_length"),
+    ],
+)
+def test_bad_parameters_are_refused_with_value_bound_and_unit(overrides, message):
+    with pytest.raises((ValueError, TypeError), match=message):
+        SlidingParameters.with_overrides(overrides)
+
+
+def test_a_finger_without_mass_is_refused():
+    with pytest.raises(ValueError, match=r"mechanics.mass = 0.0: must be > 0 kg where order = 2"):
+        sliding_tables(QUIET, FingerMechanics(order=2, stiffness=100.0))
