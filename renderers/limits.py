@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -72,59 +73,71 @@ def check_carriers(scene: Scene, model: BandModel, bands: Bands) -> None:
 
 def check_targets(scene: Scene, model: BandModel, bands: Bands, waveform: Waveform) -> None:
     """Refuse targets that the free device cannot reach within its drive, or that its sensors cannot follow."""
+    need = _need(scene, model, bands, waveform)
+    if need.amplitude > model.sensed_limit:
+        raise ValueError(
+            f"{_named(need.amplitude, model)}: must be <= {model.sensed_limit:g} {model.unit}, the sensors' range"
+        )
+    if need.drive > model.drive_limit:
+        each = " in each coil" if model.drive_unit == "A" else ""
+        raise ValueError(
+            f"{_named(need.worst, model)} at {need.frequency:.3g} Hz needs {need.drive:.3g} {model.drive_unit}: "
+            f"must be <= {model.drive_limit:g} {model.drive_unit}{each}"
+        )
+
+
+def needed_drive(scene: Scene, model: BandModel, bands: Bands, waveform: Waveform) -> float:
+    """Largest drive that the free device needs for the targets."""
+    return _need(scene, model, bands, waveform).drive
+
+
+class _Need(NamedTuple):
+    """What targets ask for: their sum, the drive for it, and the band (or peak) that takes most of it."""
+
+    amplitude: float
+    drive: float
+    worst: float
+    frequency: float  # Hz
+
+
+def _need(scene: Scene, model: BandModel, bands: Bands, waveform: Waveform) -> _Need:
     if bands.envelope is None:
-        _check_waveform(scene, model, bands, waveform)
-    else:
-        _check_envelopes(scene, model, bands)
+        return _need_of_waveform(scene, model, bands, waveform)
+    return _need_of_envelopes(scene, model, bands)
 
 
-def _check_envelopes(scene: Scene, model: BandModel, bands: Bands) -> None:
-    """Refuse constant targets.
-
-    A finger-locked carrier passes every frequency up to that of the finger's top speed; the worst of them counts.
-    """
+def _need_of_envelopes(scene: Scene, model: BandModel, bands: Bands) -> _Need:
+    """Constant targets: a finger-locked carrier passes every frequency up to that of the finger's top speed."""
     sweep = np.minimum(top_speed(scene) * bands.wavenumber, FADED * model.highest_frequency)
     top = bands.frequency + sweep
     low = np.where(bands.wavenumber > 0.0, np.minimum(model.lowest_frequency, top), top)
     passed = low + np.linspace(0.0, 1.0, 400)[:, None] * (top - low)
-    wanted = abs(bands.envelope) * (2 * np.pi * passed if bands.differentiated else 1.0)
-    _check_range(float(wanted.max(axis=0).sum()), model)
-    drive = (wanted / common_gain(model, passed)).max(axis=0)
-    if drive.sum() > model.drive_limit:
-        worst = int(drive.argmax())
-        at = int((wanted / common_gain(model, passed))[:, worst].argmax())
-        _refuse(float(np.broadcast_to(wanted, passed.shape)[at, worst]), float(passed[at, worst]), drive.sum(), model)
+    wanted = abs(bands.envelope) * (2 * np.pi * passed if bands.differentiated else np.ones_like(passed))
+    drive = wanted / common_gain(model, passed)
+    worst = int(drive.max(axis=0).argmax())
+    at = int(drive[:, worst].argmax())
+    return _Need(
+        float(wanted.max(axis=0).sum()),
+        float(drive.max(axis=0).sum()),
+        float(wanted[at, worst]),
+        float(passed[at, worst]),
+    )
 
 
-def _check_waveform(scene: Scene, model: BandModel, bands: Bands, waveform: Waveform) -> None:
-    """Refuse a wanted waveform."""
+def _need_of_waveform(scene: Scene, model: BandModel, bands: Bands, waveform: Waveform) -> _Need:
+    """A wanted waveform, over all the frequencies that are felt."""
     time = np.arange(int(min(scene.duration, LOOK_AHEAD) * model.rate) + 2) / model.rate
     wanted = np.nan_to_num(waveform(time, scene.finger.position(time)))
     frequency = np.fft.rfftfreq(len(time), 1.0 / model.rate)
-    felt = (frequency >= model.lowest_frequency / 2) & (frequency <= min(model.highest_frequency, 0.4 * model.rate))
+    heard = (frequency >= model.lowest_frequency / 2) & (frequency <= min(model.highest_frequency, 0.4 * model.rate))
+    turn = 2j * np.pi * frequency if bands.differentiated else 1.0
+    spectrum = np.where(heard, turn * np.fft.rfft(wanted), 0.0)
     if bands.differentiated:
-        wanted = np.fft.irfft(np.where(felt, 2j * np.pi * frequency * np.fft.rfft(wanted), 0.0), len(time))
-    _check_range(float(abs(wanted).max()), model)
-    spectrum = np.where(felt, np.fft.rfft(wanted), 0.0)
-    drive = abs(np.fft.irfft(spectrum / model.response(frequency).sum(axis=-1)[:, 0], len(time))).max()
-    if drive > model.drive_limit:
-        _refuse(abs(wanted).max(), float(frequency[abs(spectrum).argmax()]), drive, model)
-
-
-def _check_range(amplitude: float, model: BandModel) -> None:
-    """Refuse what the sensors cannot follow."""
-    if amplitude > model.sensed_limit:
-        raise ValueError(
-            f"{_named(amplitude, model)}: must be <= {model.sensed_limit:g} {model.unit}, the sensors' range"
-        )
-
-
-def _refuse(amplitude: float, frequency: float, drive: float, model: BandModel) -> None:
-    each = " in each coil" if model.drive_unit == "A" else ""
-    raise ValueError(
-        f"{_named(amplitude, model)} at {frequency:.3g} Hz needs {drive:.3g} {model.drive_unit}: "
-        f"must be <= {model.drive_limit:g} {model.drive_unit}{each}"
-    )
+        wanted = np.fft.irfft(spectrum, len(time))
+    gain = model.response(frequency).sum(axis=-1)[:, 0]
+    drive = abs(np.fft.irfft(spectrum / gain, len(time))).max()
+    amplitude = float(abs(wanted).max())
+    return _Need(amplitude, float(drive), amplitude, float(frequency[abs(spectrum).argmax()]))
 
 
 def _named(amplitude: float, model: BandModel) -> str:
