@@ -57,6 +57,9 @@ class Bands:
         The wanted waveform is a factor of every envelope, which is then constant but for it.
     differentiated : bool
         Wanted is the time derivative of what the envelopes say, whatever the carriers' frequencies come to be.
+    shown : ndarray of complex, shape (n,), or None
+        What the device's sensor shows of each band, as a multiple of it, > 0; None: all of it.  The controller is asked
+        for what will be shown.
     unfelt : tuple of str
         Which bands were left out because no one could feel them, and why, one sentence each.
 
@@ -78,6 +81,7 @@ class Bands:
     envelope: Array | None = None
     modulated: bool = False
     differentiated: bool = False
+    shown: Array | None = None
     unfelt: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
@@ -93,6 +97,7 @@ class Bands:
     def tone(self) -> Array:
         """Rows of a compiled controller: frequency, wavenumber, phase (turns), wanted real and imaginary part (m)."""
         wanted = np.zeros(len(self), complex) if self.envelope is None else self.envelope
+        wanted = wanted if self.shown is None else wanted * self.shown
         return np.array([self.frequency, self.wavenumber, self.phase / (2 * np.pi), wanted.real, wanted.imag], float)
 
     def carrier_phase(self, time: Array, position: Array) -> Array:

@@ -214,6 +214,12 @@ def _wanted(session: Session, start: int, position: Array) -> Array:
     return np.where(away, 0.0, wanted)  # nothing is wanted of a finger that is away
 
 
+def _asked(session: Session, target: Array) -> Array:
+    """Return what is wanted of the device, from what its sensors are to show."""
+    shown = session.bands.shown
+    return target if shown is None else target / shown
+
+
 def _time(session: Session, start: int, count: int) -> Array:
     return (start + np.arange(count)) / session.driver.rate
 
@@ -240,6 +246,7 @@ class _CompiledRing:
         """Play `count` samples."""
         wanted = _wanted(self.session, start, self.plant.finger_position(count))
         drive, target, flags, sensed = self.plant.closed_loop(self.controller, wanted)
+        target = _asked(self.session, target)
         return _complete(self.session, start, sensed)._replace(drive=drive, target=target, flags=flags)
 
 
@@ -263,7 +270,7 @@ class _Ring:
         block = _complete(session, at, sensed)
         wanted = _wanted(session, at, block.position)
         self.drive, target, flags = self.controller.run(block.sensed, block.position, wanted)
-        return block._replace(drive=played, target=target, flags=flags | block.flags)
+        return block._replace(drive=played, target=_asked(session, target), flags=flags | block.flags)
 
 
 def _complete(session: Session, at: int, sensed: Sensed) -> _Block:

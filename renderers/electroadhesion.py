@@ -13,8 +13,8 @@ from dataclasses import replace
 from hapticrender.control.bandmodel import BandModel
 from hapticrender.control.square_root import SquareRoot
 from hapticrender.plants.electroadhesion import NORMAL, ElectroadhesionParameters, ElectroadhesionScreen
-from hapticrender.protocols import Driver
-from hapticrender.renderers.friction import ROOM, FrictionRenderer, FrictionSettings, typical_load
+from hapticrender.protocols import Array, Driver
+from hapticrender.renderers.friction import ROOM, FrictionRenderer, FrictionSettings, typical_load, typical_speed
 from hapticrender.renderers.shaped import ShapedDriver
 from hapticrender.touch.scene import Scene
 
@@ -50,6 +50,15 @@ class ElectroadhesionRenderer(FrictionRenderer):
         compensation = self.compensation(scene)
         return replace(model, drive_limit=compensation.bias - compensation.floor)
 
+    def sensor_response(self, scene: Scene, frequency: Array) -> Array:
+        """Return what the tribometer shows of friction, or what the gap's impedance says of it before it lags."""
+        _, parameters = _read(scene)
+        if parameters.sensor == "tribometer":
+            return parameters.tribometer_response(frequency)
+        speed = typical_speed(scene, parameters.least_speed)
+        shown = parameters.friction_coefficient * parameters.sensed_response(frequency, speed)
+        return shown / (parameters.friction_coefficient * parameters.lag_response(frequency, speed))
+
     def compensation(self, scene: Scene) -> SquareRoot:
         """Return the square root for a nominal finger under the scene's load, its bias as large as the scene needs.
 
@@ -68,8 +77,8 @@ class ElectroadhesionRenderer(FrictionRenderer):
         bias = ROOM * need / (1.0 - FLOOR)
         if bias + ROOM * need > most:
             raise ValueError(
-                f"texture.amplitude asks for an attraction of {bias + ROOM * need:.3g} N: must be <= {most:.3g} N, what "
-                f"{current:.3g} A make of a nominal finger of {load:.3g} N"
+                f"texture.amplitude asks for an attraction of {bias + ROOM * need:.3g} N: must be <= {most:.3g} N, "
+                f"what {current:.3g} A make of a nominal finger of {load:.3g} N"
             )
         return SquareRoot(bias=bias, floor=FLOOR * bias, gain=gain)
 

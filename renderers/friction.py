@@ -25,7 +25,7 @@ from hapticrender.touch.perception import VELOCITY_PER_FORCE
 from hapticrender.touch.scene import Scene
 
 LEAST_FORCE = 1e-4  # N: a smaller friction teaches nothing of the contact
-ROOM = 1.25  # of the drive that the free device needs: left to the feedback
+ROOM = 2.0  # of the drive that the free device needs: half is left to the feedback
 PLACES = ("friction",)
 
 
@@ -73,9 +73,19 @@ class FrictionRenderer(BaseRenderer):
             return replace(bands, differentiated=True)
         return replace(bands, **_as_friction(scene, bands, settings))
 
+    def sensor_response(self, scene: Scene, frequency: Array) -> Array:
+        """Return what is sensed per friction (complex) at `frequency` (Hz)."""
+        raise NotImplementedError
+
     def bands(self, scene: Scene, model: BandModel) -> Bands:
-        """Carriers and targets of a scene; `band_model` has refused what is beyond the device."""
-        return self.wanted(scene, model)
+        """Carriers and targets of a scene; `band_model` has refused what is beyond the device.
+
+        What the sensor makes of a fixed carrier is known, and taken into account.
+        """
+        bands = self.wanted(scene, model)
+        if bands.envelope is None or (bands.wavenumber > 0.0).any():
+            return bands
+        return replace(bands, shown=self.sensor_response(scene, bands.frequency))
 
     def contact(
         self,
@@ -153,7 +163,7 @@ def typical_load(scene: Scene) -> float:
 
 
 def _as_friction(scene: Scene, bands: Bands, settings: FrictionSettings) -> dict[str, Any]:
-    """Envelopes of displacement (m) as friction (N): j w X/(v/F), w left to the carrier where that follows the finger."""
+    """Envelopes of displacement (m) as friction (N): j w X/(v/F), w left to a carrier that follows the finger."""
     locked = bool((bands.wavenumber > 0.0).any())
     if settings.velocity_per_force:
         share: Array | float = settings.velocity_per_force

@@ -1,4 +1,4 @@
-"""A driver behind a static shape of its drive: what a renderer puts between the controller and a device of the user's."""
+"""A driver behind a static shape of its drive, which a renderer puts between the controller and a user's device."""
 
 from __future__ import annotations
 

@@ -30,6 +30,7 @@ _KNOWN: dict[tuple[object, ...], Checked] = {}
 PROMPT = 8  # samples: a longer delay is that of a block device, where the inner loop would act on stale noise
 PHASE_MARGIN = math.pi / 4  # rad: 90 deg less integral gain times (delay + 1/observer pole)
 LEARNING_TIME = 1 / 60  # s: fastest adaptation of the finger; a delay counts twice
+LEARNING_MARGIN = 4.0  # of the observer's pole over the adaptation, where that learns all of D
 BACK_TIME = 0.02  # s: back-calculation at the limit
 LEAST_NOISE = 1e-6  # of the sensors' range: thresholds never fall to nothing
 ALWAYS = -1e300  # N: every load is larger
@@ -249,6 +250,8 @@ def _paces(model: BandModel, bands: Bands, rules: BankRules, lowest: float, feed
     pole = [2 * math.pi * min(width, lowest / 2, apart / (2 * math.pi)) for width in rules.observer]
     fastest = [min(2 * math.pi * lowest / 4, PHASE_MARGIN / (wait + 1 / each)) for each in pole]
     learning = 1 / (2 * wait + LEARNING_TIME / model.pace)
+    if model.finger.contact is None:  # what is always there is as large as D: learning closes a loop by the observer
+        learning = min(learning, pole[0] / LEARNING_MARGIN)
     level = 2 * math.pi * min(6.0, lowest / rules.level) * period
     paces = {
         "observer": 2 * pole[0] * period,
