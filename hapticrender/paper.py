@@ -160,5 +160,7 @@ def _report(items: Sequence[Item]) -> dict[str, object]:
 
 def _entry(claim: Claim) -> dict[str, object]:
     """A claim as plain numbers."""
-    plain = {key: float(value) if not isinstance(value, str | None) else value for key, value in asdict(claim).items()}
+    plain: dict[str, object] = {
+        key: float(value) if not isinstance(value, str | None) else value for key, value in asdict(claim).items()
+    }
     return plain | {"verdict": claim.verdict}

@@ -13,7 +13,7 @@ import numpy as np
 
 from hapticrender.control.loopshape import margins, reduced_controller
 from hapticrender.control.transfer import TransferFunction, butterworth
-from hapticrender.paper_claims import Claim, Item
+from hapticrender.paper_claims import Claim, Item, Relation
 from hapticrender.paper_formulas import FILTER, FREQUENCIES, GRID, LOOP
 from hapticrender.plants.vibrotactile import PlateParameters
 from hapticrender.protocols import Array
@@ -22,6 +22,8 @@ from hapticrender.touch.mechanics import HEAVY, HEAVY_SECOND, LIGHT, LIGHT_SECON
 MATCH = 0.64  # m/(N s): plate velocity per friction force at equal intensity
 JND = 2.2  # dB: just noticeable difference of an amplitude (Israr 2006, FACTS section 7)
 BESIDE = 100 * (10 ** (JND / 20) - 1)  # the same, %
+AT_LEAST: Relation = ">="
+AT_MOST: Relation = "<="
 FINGERS = {
     "light, 4th order": LIGHT,
     "light, 2nd order": LIGHT_SECOND,
@@ -135,7 +137,7 @@ def impedance() -> Item:
             *(
                 Claim(what=f"{what} of the heavy skin over the light", paper=bound, ours=ratio, within=0, relation=sign)
                 for what, ratio in (("stiffness", stiffer), ("damping", firmer))
-                for bound, sign in ((2, ">="), (8, "<="))
+                for bound, sign in ((2, AT_LEAST), (8, AT_MOST))
             ),
         ),
         tables={
@@ -195,7 +197,7 @@ def admittance() -> Item:
             *(
                 Claim(what="stiffness w/|V_s/F| at 20 Hz", paper=bound, ours=2 * pi * 20 / eight[0], within=0,
                       unit="N/m", relation=sign, why="“consistent with 100-250 N/m”")
-                for bound, sign in ((100, ">="), (250, "<="))
+                for bound, sign in ((100, AT_LEAST), (250, AT_MOST))
             ),
             Claim(what="|V_p|/|V_t| at 20 Hz, mostly phalanx", paper=1, ours=phalanx[0] / tissue[0], within=0,
                   relation=">="),

@@ -107,7 +107,7 @@ def transform() -> Item:
         each for m in range(2, 5000)
         if abs((each := BoxcarSTDFT(length=m, rate=rate)).frequency_response(FILTER)) <= sqrt(0.5)
     )  # fmt: skip
-    kinds = {"STDFT*": star, "STDFT, as quiet": alike, "STDFT, as wide": as_wide}
+    kinds: dict[str, BoxcarSTDFT | StarSTDFT] = {"STDFT*": star, "STDFT, as quiet": alike, "STDFT, as wide": as_wide}
     time = np.arange(round(0.2 * rate)) / rate
     steps = {name: _step(kind, time) for name, kind in kinds.items()}
     rise = {name: 1e3 * (_first(time, step, 0.9) - _first(time, step, 0.1)) for name, step in steps.items()}
@@ -191,7 +191,14 @@ def plate() -> Item:
                 what="command per coil current", paper=-5, ours=1 / parameters.amplifier_gain, within=0.5, unit="V/A"
             ),
         ),
-        tables={"response": _plate_table(parameters, printed)},
+        tables={
+            "response": _plate_table(parameters, printed),
+            "modes": {
+                "mode": np.array(["rocking", "heave"]),
+                "frequency (Hz)": parameters.modes()[0],
+                "as printed (Hz)": np.array(print_modes),
+            },
+        },
         note="Also: the amplifier inverts, so from command to displacement the phase runs from +180 to 0 degrees, not "
         "from 0 to -180; commands leave through the 12-bit DAC and readings enter by the 14-bit ADC, printed the other "
         "way round; b is in N s/m, printed Nm/s.",

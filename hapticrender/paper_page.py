@@ -7,12 +7,12 @@ from html import escape
 
 from hapticrender import __version__
 from hapticrender.page import STYLE
-from hapticrender.paper_claims import Claim, Item, Missing
+from hapticrender.paper_claims import Claim, Item, Missing, Verdict
 
-_CLASSES = {"reproduced": "good", "corrected": "fixed", "not reproducible": "bad"}
+_CLASSES: dict[Verdict, str] = {"reproduced": "good", "corrected": "fixed", "not reproducible": "bad"}
 _SIGNS = {"=": "", "<=": "≤ ", ">=": "≥ "}
 _ADDED = """.fixed { color: #8a6414; }
-td.what { white-space: normal; min-width: 15rem; max-width: 24rem; line-height: 1.35; }
+td.what { white-space: normal; min-width: 11rem; max-width: 22rem; line-height: 1.35; }
 h2 + p { margin-bottom: 0.4rem; }
 """
 
@@ -63,13 +63,13 @@ plate and finger. Of {len(claims)} numbers: {counted}.</p>
 def _overview(items: Sequence[Item], missing: Sequence[Missing]) -> str:
     """Table of all items, and of what is missing."""
     rows = "\n".join(
-        f'<tr><td class="text"><a href="#{item.name}">{escape(item.title)}</a></td>'
+        f'<tr><td class="text what"><a href="#{item.name}">{escape(item.title)}</a></td>'
         f'<td class="text what">{escape(item.where)}</td>{_verdict(item.verdict)}'
         f'<td class="text wide">{escape(item.reason)}</td></tr>'
         for item in items
     )
     lost = "\n".join(
-        f'<tr><td class="text">{escape(each.title)}</td><td class="text what">{escape(each.where)}</td>'
+        f'<tr><td class="text what">{escape(each.title)}</td><td class="text what">{escape(each.where)}</td>'
         f'{_verdict(each.verdict)}<td class="text wide">{escape(each.reason)}</td></tr>'
         for each in missing
     )
@@ -83,7 +83,7 @@ def _overview(items: Sequence[Item], missing: Sequence[Missing]) -> str:
 </table></div>"""
 
 
-def _verdict(verdict: str) -> str:
+def _verdict(verdict: Verdict) -> str:
     return f'<td class="text {_CLASSES[verdict]}">{verdict}</td>'
 
 

@@ -50,7 +50,7 @@ def draw(path: Path, item: Item) -> None:
 def _frequency_axis(*lanes: Any) -> None:
     """Logarithmic frequency axis with the paper's own frequencies."""
     for axes in lanes:
-        axes.set(xscale="log", xlim=(19, 420), xlabel="frequency (Hz)")
+        axes.set(xscale="log", xlim=(18, 445), xlabel="frequency (Hz)")
         axes.set_xticks(TICKS, [f"{each}" for each in TICKS])
         axes.minorticks_off()
 
@@ -70,20 +70,22 @@ def _controller(figure: Any, tables: Any) -> None:
         left.plot(frequency, columns[f"{symbol} exact (dB)"], color=colour, lw=1.8, label=symbol)
         left.plot(frequency, columns[f"{symbol} 2nd order (dB)"], color=colour, lw=1.0, ls=":")
     for symbol, colour in (("C", BLUE), ("T", RED)):
-        right.plot(
-            frequency, columns[f"{symbol} exact (deg)"], color=colour, lw=1.8, label=f"{symbol} exact, 4th order"
-        )
+        right.plot(frequency, columns[f"{symbol} exact (deg)"], color=colour, lw=1.8, label=f"{symbol} exact")
         right.plot(
             frequency,
             columns[f"{symbol} 2nd order (deg)"],
             color=colour,
             lw=1.2,
             ls=":",
-            label=f"{symbol}, C of 2nd order",
+            label=f"{symbol} by the 2nd-order C",
         )
     left.plot([0.1, 5, 5], [-3, -3, -60], **PRINTED, label="paper: T is -3 dB at 5 Hz")
-    left.set(title="Controller C, closed loop T, sensitivity S", ylabel="magnitude (dB)", ylim=(-60, 35))
-    right.set(title="Phase: the 2nd order follows to beyond the bandwidth", ylabel="phase (deg)")
+    left.set(
+        title="Controller C, closed loop T, sensitivity S; dotted: C of 2nd order",
+        ylabel="magnitude (dB)",
+        ylim=(-60, 35),
+    )
+    right.set(title="Their phase", ylabel="phase (deg)")
     for axes in (left, right):
         axes.set(xscale="log", xlabel="frequency (Hz)", xlim=(0.1, 100))
         _plain(axes.xaxis, 0.1, 1, 5, 10, 100)
@@ -99,12 +101,12 @@ def _transform(figure: Any, tables: Any) -> None:
             tables["response"]["offset (Hz)"], tables["response"][f"{name} (dB)"], color=colour, lw=width, label=name
         )
         right.plot(1e3 * tables["step"]["time (s)"], tables["step"][name], color=colour, lw=width, label=name)
-    left.plot([0, 10, 10], [-3, -3, -70], **PRINTED, label="paper: cut-off 10 Hz")
+    left.plot([0, 10, 10], [-3, -3, -70], **PRINTED)
+    left.text(11, -2, "paper: cut-off 10 Hz", va="center", fontsize=8)
     left.axvspan(40, 100, color=PALE, alpha=0.12, lw=0)
-    left.text(98, -2, "images of carriers from 20 Hz on", ha="right", va="top", fontsize=8)
+    left.text(98, -6, "images of carriers from 20 Hz on", ha="right", va="top", fontsize=8)
     left.set(title="What is heard beside the carrier", xlabel="offset from the carrier (Hz)", ylabel="gain (dB)",
-             ylim=(-70, 3), xlim=(0, 100))  # fmt: skip
-    left.legend(loc="lower left")
+             ylim=(-45, 3), xlim=(0, 100))  # fmt: skip
     right.set(title="An amplitude switched on", xlabel="time (ms)", ylabel="estimated amplitude", xlim=(0, 200))
     right.legend(loc="lower right")
 
@@ -134,8 +136,9 @@ def _commanded(figure: Any, tables: Any) -> None:
             upper.set_ylabel("displacement (µm)")
             lower.set_ylabel("peak amplitude (µm)")
             lower.axhline(0.01, color=RED, lw=1.0, ls=":")
-            lower.text(372, 0.012, "paper: accuracy 0.01 µm", color=RED, fontsize=8, ha="right", va="bottom")
+            lower.text(370, 60, "dotted: paper's accuracy, 0.01 µm", color=RED, fontsize=8, ha="right", va="bottom")
             lower.text(152, 1.25, "paper: as set", fontsize=8, va="bottom")
+            upper.text(0, 1.05, "paper: as set", fontsize=8, va="bottom")
     figure.suptitle("261 Hz, heavy finger, 0.5 N, sliding at 100 mm/s: the paper's controller, each side apart",
                     fontweight="bold", fontsize=11, x=0.01, ha="left")  # fmt: skip
 
@@ -160,12 +163,12 @@ def _end(axes: Any, columns: Table) -> None:
 
 def _errors(axes: Any, columns: Table) -> None:
     """Mean amplitude of the centre under a heavy finger, by method."""
-    for name, colour, marker in METHODS:
+    for (name, colour, marker), shift in zip(METHODS, (0.8, 1.0, 1.25), strict=True):
         chosen = (columns["finger"] == "heavy") & (columns["method"] == name)
         for place, filled in (("centre", True), ("end 1", False)):
             wanted, off = columns["wanted (um)"][chosen], columns[f"{place}, off by (%)"][chosen]
             fill = colour if filled else "none"
-            axes.plot(wanted, off, marker, color=colour, ms=6, mfc=fill, label=name if filled else None)
+            axes.plot(shift * wanted, off, marker, color=colour, ms=6, mfc=fill, label=name if filled else None)
     axes.axhline(0, **PRINTED)
     axes.set(title="Mean amplitude off by (ring: end 1)", xlabel="wanted (µm)", ylabel="error (%)", xscale="log")
     axes.set_xlim(0.5, 200)
@@ -177,17 +180,17 @@ def _errors(axes: Any, columns: Table) -> None:
 def _frequencies(figure: Any, tables: Any) -> None:
     """Errors at the eight frequencies, free and under a finger."""
     lanes = figure.subplots(1, 2, sharey=True)
-    for axes, (name, columns), title in zip(
-        lanes, tables.items(), ("Free plate", "Heavy finger, 0.5 N, sliding at 100 mm/s"), strict=True
+    for axes, columns, title in zip(
+        lanes, tables.values(), ("Free plate", "Heavy finger, 0.5 N, sliding at 100 mm/s"), strict=True
     ):
         frequency = columns["frequency (Hz)"]
-        axes.axhspan(-5, 5, color=PALE, alpha=0.15, lw=0, label="5 %" if name == "free" else None)
+        axes.axhspan(-5, 5, color=PALE, alpha=0.15, lw=0, label="5 %")
         axes.axhline(0, **PRINTED, label="paper: as commanded")
         for (method, colour, marker), shift in zip(METHODS, (0.97, 1.0, 1.03), strict=True):
             places = np.array([columns[f"{method}, {place} (%)"] for place in ("end 1", "end 2")])
             axes.vlines(shift * frequency, places.min(axis=0), places.max(axis=0), color=colour, lw=1.2)
             axes.plot(shift * frequency, columns[f"{method}, centre (%)"], marker, color=colour, ms=5, label=method)
-        axes.set(title=title, yscale="symlog")
+        axes.set_title(title)
         axes.set_yscale("symlog", linthresh=5)
         axes.set_yticks([-100, -10, -5, 0, 5, 10, 100, 400], ["-100", "-10", "-5", "0", "5", "10", "100", "400"])
         axes.minorticks_off()
@@ -207,18 +210,15 @@ def _press(figure: Any, tables: Any) -> None:
         axes.axhline(0, **PRINTED, label="paper: the load is ignored")
         for (colour, label), marker in zip(AMPLITUDES, ("o", "s", "D"), strict=True):
             name = f"{label.replace('µ', 'u')}, {method} (%)"
-            axes.plot(columns["frequency (Hz)"], columns[name], marker=marker, color=colour, lw=1.2, ms=5, label=label)
+            off = np.where(columns[name] < 20, columns[name], np.nan)
+            axes.plot(columns["frequency (Hz)"], off, marker=marker, color=colour, lw=1.2, ms=5, label=label)
         axes.set(title=title, ylim=(-108, 20))
         _frequency_axis(axes)
-    lanes[0].annotate(
-        "nothing moves", (21, columns["1 um, paper (%)"][0]), (45, -92),
-        arrowprops={"arrowstyle": "-", "color": PALE}, fontsize=8,
-    )  # fmt: skip
-    lanes[0].annotate(
-        "two sides apart fail here,\nload or not",
-        (170, min(20, columns["100 um, paper (%)"][5])), (120, -40),
-        arrowprops={"arrowstyle": "-", "color": PALE}, fontsize=8,
-    )  # fmt: skip
+    lanes[0].text(21, -97, "nothing moves", fontsize=8, va="bottom")
+    beyond = columns["100 um, paper (%)"][TICKS.index(170)]
+    lanes[0].text(
+        170, -12, f"170 Hz: {beyond:+.0f} %,\ntwo sides apart fail,\nload or not", fontsize=8, ha="center", va="top"
+    )
     lanes[0].set_ylabel("amplitude at the centre off by (%)")
     lanes[1].legend(loc="lower right", title="still press of 0.5 N, no sensor noise", title_fontsize=8)
 
@@ -236,12 +236,16 @@ def _plate(figure: Any, tables: Any) -> None:
     right.plot(frequency, columns["end 2, coils opposed, as printed (um/A)"], **PRINTED,
                label="end 2, equations as printed")  # fmt: skip
     right.set_title("Coils opposed: rocking")
-    for axes, names in ((left, list(columns)[1:2]), (right, list(columns)[3:5])):
-        for place, name in enumerate(names):
-            top = int(columns[name].argmax())
-            side = 1 if place else -1
-            axes.annotate(f"{frequency[top]:.1f} Hz", (frequency[top], columns[name][top]), (side * 6, 3),
-                          textcoords="offset points", ha="left" if place else "right", fontsize=8)  # fmt: skip
+    (rocking, heave), (printed, _) = tables["modes"]["frequency (Hz)"], tables["modes"]["as printed (Hz)"]
+    peaks = (
+        (left, heave, "centre, coils together (um/A)", "right"),
+        (right, rocking, "end 2, coils opposed (um/A)", "right"),
+        (right, printed, "end 2, coils opposed, as printed (um/A)", "left"),
+    )
+    for axes, mode, name, side in peaks:
+        axes.annotate(f"{mode:.1f} Hz", (mode, columns[name].max()), (-6 if side == "right" else 6, 3),
+                      textcoords="offset points", ha=side, fontsize=8)  # fmt: skip
+    for axes in (left, right):
         axes.set(yscale="log", ylabel="displacement per coil current (µm/A)")
         axes.margins(y=0.12)
         _frequency_axis(axes)
@@ -274,16 +278,16 @@ def _extraction(figure: Any, tables: Any) -> None:
     columns = tables["over time"]
     time = columns["time (s)"]
     pairs = (
-        ("load (N)", "W found (N)", "normal load (N)", INK),
+        ("load (N)", "W found (N)", "normal load (N)", GREEN),
         ("place (mm)", "P found (mm)", "place (mm)", BLUE),
         ("|Z_f| (N s/m)", "|Z_f| found (N s/m)", "|Z_f| (N s/m)", RED),
     )
     lanes = figure.subplots(3, 1, sharex=True)
     for axes, (true, found, label, colour) in zip(lanes, pairs, strict=True):
         axes.plot(time, columns[found], color=colour, lw=1.0, label="found, as the paper does it")
-        axes.plot(time, columns[true], color=PALE, lw=2.2, alpha=0.7, zorder=1, label="put in")
+        axes.plot(time, columns[true], **PRINTED, label="put in")
         axes.set(ylabel=label, xlim=(0, 10))
-        axes.legend(loc="upper right")
+    lanes[0].legend(loc="upper right")
     lanes[2].set_xlabel("time (s)")
     lanes[0].set_title(
         "A simulated heavy finger under 50 µm at 111 Hz: touches at 1 s, leaves at 9 s, |Z_f| as W^(1/3)"
@@ -383,7 +387,7 @@ def _statistics(figure: Any, tables: Any) -> None:
     axes.set_yticks(rows, names)
     axes.set(title="p of the printed t", xlabel="p", xscale="log", xlim=(1e-9, 1), ylim=(-0.7, rows.max() + 0.7))
     axes.minorticks_off()
-    axes.legend(loc="upper left")
+    axes.legend(loc="lower left", markerscale=0.6)
 
 
 PICTURES: dict[str, Callable[[Any, Any], None]] = {

@@ -69,8 +69,8 @@ def commanded() -> Item:
     line = 1e6 * PlateParameters().sensor_noise * sqrt(pi / 30_000)
     claims = [
         Claim(
-            what=f"amplitude under a {finger} finger that slides, {1e6 * wanted:g} um wanted", paper=1e6 * wanted,
-            ours=1e6 * wanted * (1 + off[finger, wanted, "paper"][0] / 100), within=0.05e6 * wanted, unit="um",
+            what=f"amplitude under a {finger} finger that slides, {1e6 * wanted:g} µm wanted", paper=1e6 * wanted,
+            ours=1e6 * wanted * (1 + off[finger, wanted, "paper"][0] / 100), within=0.05e6 * wanted, unit="µm",
             why="the printed figure can be read to 5 %",
         )
         for finger in ("light", "heavy") for wanted in AMPLITUDES
@@ -84,16 +84,16 @@ def commanded() -> Item:
             *claims,
             Claim(
                 what="highest rise of an end above rest, beyond the amplitude, finger at the far end",
-                paper=0, ours=float(upward - 1e6 * AMPLITUDES[1]), within=0, unit="um", relation=">=",
+                paper=0, ours=float(upward - 1e6 * AMPLITUDES[1]), within=0, unit="µm", relation=">=",
             ),
             Claim(
                 what="mean line of the spectrum of the sensor's noise, 1 s at 30 kHz", paper=0.01, ours=line,
-                within=0.005, unit="um", why="1 um rms times sqrt(pi/30000)",
+                within=0.005, unit="µm", why="1 µm rms times sqrt(pi/30000)",
             ),
             Claim(
                 what="accuracy: wobble of the plate through the loop", paper=0.01, ours=wobble, within=0.005,
-                unit="um rms", check=expected, why="the printed floor is that of the record's length; what the loop "
-                "makes of 1 um of noise is the check: 1 um sqrt(2 B/rate), B the noise bandwidth of T L",
+                unit="µm rms", check=expected, why="the printed floor is that of the record's length; what the loop "
+                "makes of 1 µm of noise is the check: 1 µm sqrt(2 B/rate), B the noise bandwidth of T L",
             ),
         ),
         tables={"errors": _error_table(off), **_commanded_tables(shown)},
@@ -173,7 +173,7 @@ def frequencies() -> Item:
     }
     return Item(
         name="frequencies",
-        title="10 um at the eight frequencies",
+        title="10 µm at the eight frequencies",
         where="“precise … 20Hz - 400Hz”, and the phase loop under “Computing filter and control dynamics”",
         claims=tuple(
             Claim(
@@ -202,7 +202,7 @@ def _one_sided(frequency: float) -> float:
     """Error of the centre (%) where one coil alone holds its own side at the target, the stronger of the two."""
     parameters = PlateParameters()
     model = parameters.band_model(parameters.rate, parameters.delay)
-    motion = np.linalg.solve(parameters.dynamic_stiffness(frequency), parameters.force_from_drive)
+    motion = np.linalg.solve(parameters.dynamic_stiffness(np.array(frequency)), parameters.force_from_drive)
     own = np.abs(np.diag(model.side_from_coordinate @ motion))
     return float(100 * (np.abs(motion[0]) / own - 1).max())
 
@@ -222,9 +222,9 @@ def press() -> Item:
     }
     claims = [
         Claim(
-            what=f"{1e6 * wanted:g} um at {frequency:g} Hz, off by", paper=0, ours=float(off[wanted, "paper"][at]),
+            what=f"{1e6 * wanted:g} µm at {frequency:g} Hz, off by", paper=0, ours=float(off[wanted, "paper"][at]),
             within=1, unit="%", check=_blinded(frequency, wanted),
-            why="“ignores … displacement due to the applied normal load”; the sag of 11 um leaks through L at the "
+            why="“ignores … displacement due to the applied normal load”; the sag of 11 µm leaks through L at the "
             "carrier; check: the mean modulus of target and leak",
         )
         for wanted, at, frequency in ((1e-6, 0, 20.0), (10e-6, 0, 20.0), (1e-6, 6, 261.0), (10e-6, 6, 261.0))
