@@ -123,6 +123,11 @@ def _parser() -> argparse.ArgumentParser:
     chart.add_argument("--learnt", action="store_true", help="the finger already learnt, not the moment of touch")
     _add_out(chart, Path("out/chart"))
 
+    paper = _add_verb(
+        verbs, "paper", _paper, "compute the paper's tables and figures again, those without participants"
+    )
+    _add_out(paper, Path("out/paper"))
+
     _add_verb(verbs, "devices", _devices, "list the renderers and drivers that are installed")
     return parser
 
@@ -310,6 +315,19 @@ def _chart(arguments: argparse.Namespace) -> int:
 
         chart.stability(path, adapted=arguments.learnt)
     print(path)
+    return 0
+
+
+def _paper(arguments: argparse.Namespace) -> int:
+    from hapticrender.paper import reproduce
+    from hapticrender.wording import table
+
+    _check_folder("--out", arguments.out)
+    found = reproduce(arguments.out, progress=lambda name: print(name, file=sys.stderr))
+    print(table(found.rows()))
+    if not found.pictures:
+        print(PICTURES_HINT)
+    print(f"page: {found.page}")
     return 0
 
 

@@ -16,7 +16,7 @@ _MANY_BANDS = 10
 _AXIS = (1e-3, 10.0)  # relative errors at the ends of the little charts, logarithmic
 _CHART = (150, 22)  # px
 
-_STYLE = """
+STYLE = """
 :root { --ink: #22303c; --soft: #6b7883; --line: #dfe4e8; --wash: #f6f8f9; --good: #2b6f77; --bad: #b3432b; }
 * { box-sizing: border-box; }
 body { margin: 0 auto; max-width: 70rem; padding: 3rem 1.5rem 5rem; color: var(--ink); background: #fff;
@@ -75,7 +75,7 @@ def page(folder: Path, scenes: Sequence[Outputs]) -> str:
 <meta charset="utf-8">
 <meta name="viewport" content="width=device-width, initial-scale=1">
 <title>hapticrender: {_scenes(len(scenes))} in closed loop</title>
-<style>{_STYLE}</style>
+<style>{STYLE}</style>
 </head>
 <body>
 <h1>Textures, rendered in closed loop</h1>
