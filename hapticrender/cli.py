@@ -319,7 +319,7 @@ def _chart(arguments: argparse.Namespace) -> int:
 
 
 def _paper(arguments: argparse.Namespace) -> int:
-    from hapticrender.paper import reproduce
+    from hapticrender.paper.reproduce import reproduce
     from hapticrender.wording import table
 
     _check_folder("--out", arguments.out)

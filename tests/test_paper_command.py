@@ -8,8 +8,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hapticrender import cli, paper, paper_finger, paper_formulas, paper_runs
-from hapticrender.paper_claims import Claim, Item, Missing
+from hapticrender import cli
+from hapticrender.paper import finger as paper_finger
+from hapticrender.paper import formulas as paper_formulas
+from hapticrender.paper import reproduce as paper
+from hapticrender.paper import runs as paper_runs
+from hapticrender.paper.claims import Claim, Item, Missing
 from hapticrender.plants.vibrotactile import PlateParameters
 
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from hapticrender.formats import MissingExtra, replacing
-from hapticrender.paper_claims import Item, Table
+from hapticrender.paper.claims import Item, Table
 from hapticrender.picture import BLUE, GREEN, INK, ORANGE, PALE, RED, STYLE
 
 PRINTED: dict[str, Any] = {"color": INK, "lw": 1.1, "ls": (0, (4, 2))}

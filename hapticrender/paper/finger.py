@@ -13,8 +13,8 @@ import numpy as np
 
 from hapticrender.control.loopshape import margins, reduced_controller
 from hapticrender.control.transfer import TransferFunction, butterworth
-from hapticrender.paper_claims import Claim, Item, Relation
-from hapticrender.paper_formulas import FILTER, FREQUENCIES, GRID, LOOP
+from hapticrender.paper.claims import Claim, Item, Relation
+from hapticrender.paper.formulas import FILTER, FREQUENCIES, GRID, LOOP
 from hapticrender.plants.vibrotactile import PlateParameters
 from hapticrender.protocols import Array
 from hapticrender.touch.mechanics import HEAVY, HEAVY_SECOND, LIGHT, LIGHT_SECOND, FingerMechanics

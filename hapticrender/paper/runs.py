@@ -16,8 +16,8 @@ import numpy as np
 from hapticrender.control.stdft import StarSTDFT
 from hapticrender.control.transfer import butterworth
 from hapticrender.loop import render
-from hapticrender.paper_claims import Claim, Item, Table
-from hapticrender.paper_formulas import FILTER, FREQUENCIES, LOOP
+from hapticrender.paper.claims import Claim, Item, Table
+from hapticrender.paper.formulas import FILTER, FREQUENCIES, LOOP
 from hapticrender.plants.vibrotactile import PLACES, PlateParameters
 from hapticrender.protocols import Array
 from hapticrender.recording import Recording

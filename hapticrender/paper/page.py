@@ -7,7 +7,7 @@ from html import escape
 
 from hapticrender import __version__
 from hapticrender.page import STYLE
-from hapticrender.paper_claims import Claim, Item, Missing, Verdict
+from hapticrender.paper.claims import Claim, Item, Missing, Verdict
 
 _CLASSES: dict[Verdict, str] = {"reproduced": "good", "corrected": "fixed", "not reproducible": "bad"}
 _SIGNS = {"=": "", "<=": "≤ ", ">=": "≥ "}

@@ -12,28 +12,29 @@ from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from hapticrender import __version__, paper_finger, paper_formulas, paper_runs
+from hapticrender import __version__
 from hapticrender.formats import MissingExtra, replacing
-from hapticrender.paper_claims import Claim, Item, Missing, Table
-from hapticrender.paper_page import page
+from hapticrender.paper import finger, formulas, runs
+from hapticrender.paper.claims import Claim, Item, Missing, Table
+from hapticrender.paper.page import page
 from hapticrender.validate import as_json
 
 ITEMS: dict[str, Callable[[], Item]] = {
     each.__name__: each
     for each in (
-        paper_formulas.controller,
-        paper_formulas.transform,
-        paper_runs.commanded,
-        paper_runs.frequencies,
-        paper_runs.press,
-        paper_formulas.plate,
-        paper_finger.loaded,
-        paper_runs.extraction,
-        paper_finger.impedance,
-        paper_finger.admittance,
-        paper_formulas.electroadhesion,
-        paper_formulas.stimuli,
-        paper_formulas.statistics,
+        formulas.controller,
+        formulas.transform,
+        runs.commanded,
+        runs.frequencies,
+        runs.press,
+        formulas.plate,
+        finger.loaded,
+        runs.extraction,
+        finger.impedance,
+        finger.admittance,
+        formulas.electroadhesion,
+        formulas.stimuli,
+        formulas.statistics,
     )
 }
 _SUBJECTS = "13 participants, on the plate and on the electroadhesion surface"
@@ -120,7 +121,7 @@ def reproduce(
 
 def _draw(path: Path, item: Item) -> bool:
     """Draw an item where matplotlib is installed; an older picture never stays beside newer numbers."""
-    from hapticrender.paper_pictures import draw
+    from hapticrender.paper.pictures import draw
 
     path.unlink(missing_ok=True)
     try:

@@ -15,7 +15,7 @@ import numpy as np
 from hapticrender.control.loopshape import exact_controller, margins, reduced_controller
 from hapticrender.control.stdft import BoxcarSTDFT, StarSTDFT
 from hapticrender.control.transfer import TransferFunction, butterworth
-from hapticrender.paper_claims import Claim, Item, Table
+from hapticrender.paper.claims import Claim, Item, Table
 from hapticrender.plants.vibrotactile import PlateParameters
 from hapticrender.protocols import Array
 
