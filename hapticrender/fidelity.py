@@ -51,9 +51,11 @@ class Choice:
     bound: float | None
     reason: str = ""
 
-    def __str__(self) -> str:
-        end = self.reason if self.bound is None else f"strays by at most {percent(self.bound)}"
-        return f"{'may be left out' if self.taken else 'is needed'}: {self.meaning} ({self.option} {self.value}): {end}"
+    def text(self, used: bool = False) -> str:
+        """Say in a line what became of it; `used` where the least model was the one that played."""
+        end = self.reason if self.bound is None else f"off by at most {percent(self.bound)}"
+        verdict = ("left out" if used else "may be left out") if self.taken else "needed"
+        return f"{verdict}: {self.meaning} ({self.option} {self.value}: {end})"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -101,12 +103,12 @@ class Fidelity:
         """The least model's finger."""
         return self.least.finger
 
-    def text(self) -> str:
-        """Say what may be left out, what is needed, and by how much each would be wrong."""
+    def text(self, used: bool = False) -> str:
+        """Say what may be left out (or is, where `used`), what is needed, and by how much each would be wrong."""
         if self.note:
             return f"least model: the full one; {self.note}"
-        head = f"least model, that strays from the full one by at most {percent(self.tolerance)}:"
-        return "\n".join([head, *(f"  {choice}" for choice in self.choices or ("nothing can be left out",))])
+        lines = [choice.text(used) for choice in self.choices] or ["nothing can be left out"]
+        return "\n  ".join([f"least model, off by at most {percent(self.tolerance)}:", *lines])
 
 
 def fidelity(scene: Scene, tolerance: float | None = None) -> Fidelity:

@@ -11,21 +11,33 @@ import numpy as np
 from scipy.optimize import nnls
 
 from hapticrender.bands import Bands
-from hapticrender.judge import HOPS_LOCKED, LARGEST_INFLATION, LOWEST_FREQUENCY, fit, window_length
-from hapticrender.plants.fidelity import FingerPath, PlateModel, sag, settling_time, stray
+from hapticrender.judge import LARGEST_INFLATION, LOWEST_FREQUENCY, fit, window_length
+from hapticrender.plants.fidelity import FingerPath, PlateModel, forgetting_time, held, sag, stray
 from hapticrender.plants.vibrotactile import PlateParameters
 from hapticrender.protocols import Array
 from hapticrender.touch.mechanics import FingerMechanics
 from hapticrender.touch.motion import Nowhere, Sliding, Still, Swiping
 from hapticrender.touch.scene import Scene
 
-LONGEST_STEP = 1e-3  # s: the plate's modes turn by less than 1.2 rad in it
-STEPS_PER_PERIOD = 4
+LONGEST_STEP = 0.5e-3  # s: the plate's modes turn by less than 0.6 rad in it
+STEPS_PER_PERIOD = 8
+ACCURACY = 5e-5  # relative error below which nothing is told
+SETTLING = 10.0  # time constants between the last touch and the judgement, at least
+TOUCHING = 10.0  # a touch rings by less than so many times what it settles to
 LOOK_AHEAD = 60.0  # s of a scene that are followed; what comes later has to be a repetition
 FIT_FREQUENCIES = 50  # at which a lesser finger is fitted, at most
+HOPS = 16  # window starts in a window's length: the worst window is sought, not a mean
 COARSE = 2000  # times at which a path is looked at before it is followed
 CHUNK_VALUES = 2**20  # numbers in one batch of regressors
 NUMBERS = ("mass", "damping", "stiffness", "phalanx_mass", "phalanx_damping", "phalanx_stiffness")
+
+
+class _Times(NamedTuple):
+    """Times (s) to follow the plate at, when the judgement begins (s), and what is left of a touch by then (1)."""
+
+    steps: Array
+    begin: float
+    left: float
 
 
 class NoBound(Exception):
@@ -53,26 +65,46 @@ def bound(scene: Scene, lesser: Scene) -> float:
     bands, wanted = _bands(scene)
     if not (wanted > 0.0).any():
         return 0.0
-    time, begin = _times(scene, lesser, bands)
-    fine = _error(scene, lesser, time, begin)
-    if _touch(scene, time).constant:
+    times = _times(scene, lesser, bands)
+    fine = _error(scene, lesser, times)
+    if _touch(scene, times.steps).constant:
         return fine
-    return fine + abs(fine - _error(scene, lesser, time[::2], begin))
+    return fine + abs(fine - _error(scene, lesser, times._replace(steps=times.steps[::2])))
 
 
-def _error(scene: Scene, lesser: Scene, time: Array, begin: float) -> float:
-    """Largest relative error from `begin` (s) on, as found with steps from one `time` (s) to the next."""
-    full, less = (_model(each, _touch(each, time)) for each in (scene, lesser))
+def _error(scene: Scene, lesser: Scene, times: _Times) -> float:
+    """Largest relative error once the judgement has begun, as found with these steps."""
+    full, less = (_model(each, _touch(each, times.steps)) for each in (scene, lesser))
     bands, wanted = _bands(scene)
-    omega, judged = _omega(bands, full.path), time >= begin
-    leak = _leak(full, less, bands, begin)
+    omega, judged = _omega(bands, full.path), times.steps >= times.begin
+    window = window_length(bands, 1 / full.path.step, full.path.position[judged], np.ptp(times.steps[judged]) / 2)
+    leak, ring = _leak(full, less, bands, times.begin, window), times.left * _sagging(full, less)
     worst = 0.0
     for k in np.flatnonzero(wanted):
-        read = judged & _readable(omega[:, k], full.parameters)
+        read = _readable(omega[:, k], full.parameters)[judged]
         if read.any():
-            apart = abs(stray(full, less, omega[:, k]))[read].max(axis=0) * abs(bands.envelope[k])  # type: ignore[index]
-            worst = max(worst, float((apart + leak[:, k]).max() / wanted[k]))
-    return worst
+            parted = abs(stray(full, less, omega[:, k])[judged])
+            apart = _worst_mean(parted, read, round(window / 2 / full.path.step)) + held(full, less, omega[:, k])
+            apart *= abs(bands.envelope[k])  # type: ignore[index]
+            worst = max(worst, times.left + float((apart + leak[:, k] + ring).max() / wanted[k]))
+    return worst + ACCURACY
+
+
+def _worst_mean(values: Array, read: Array, many: int) -> Array:
+    """Largest mean (3,) of `values` (n, 3) over `many` rows of which one is `read` (n,).
+
+    Half a window of the judge's: the mean over a whole one is never larger than that over its worse half.
+    """
+    many = max(1, min(many, len(values)))
+    running = np.cumsum(np.column_stack([values, read]), axis=0)
+    total = running[many - 1 :]
+    total[1:] -= running[:-many].copy()
+    return total[total[:, 3] > 0.5, :3].max(axis=0) / many
+
+
+def _sagging(*models: PlateModel) -> float:
+    """Displacement (m) of the plate by its finger's load, of all models together, at the worst place."""
+    return sum(float(abs(sag(model)).max()) for model in models)
 
 
 def _model(scene: Scene, path: FingerPath) -> PlateModel:
@@ -101,21 +133,28 @@ def _readable(omega: Array, parameters: PlateParameters) -> Array:
     return (frequency >= LOWEST_FREQUENCY * (1 - 1e-6)) & (frequency <= max(highest, 1.0))
 
 
-def _times(scene: Scene, lesser: Scene, bands: Bands) -> tuple[Array, float]:
-    """Times (s) to follow the plate at, from rest on, and when the judgement begins (s)."""
+def _times(scene: Scene, lesser: Scene, bands: Bands) -> _Times:
+    """Times to follow the plate at."""
     begin = scene.settle if scene.duration >= 2 * scene.settle else scene.duration / 2
     end = min(scene.duration, begin + LOOK_AHEAD)
     if end < scene.duration and not isinstance(scene.finger.motion, Nowhere | Still | Sliding | Swiping):
         raise NoBound(f"its finger's path is longer than {LOOK_AHEAD:g} s and no repetition")
     coarse = np.linspace(0.0, end, COARSE)
-    rest = settling_time(*(_model(each, _touch(each, coarse)) for each in (scene, lesser)))
-    if rest > begin:
-        raise NoBound(f"it is judged from {begin:.3g} s on, and the plate takes {rest:.3g} s to settle")
+    forgets = forgetting_time(*(_model(each, _touch(each, coarse)) for each in (scene, lesser)))
+    rest = SETTLING * forgets
     top = float(abs(_omega(bands, _touch(scene, coarse))).max(initial=1.0)) / (2 * math.pi)
-    time = np.arange(begin - rest, end, min(LONGEST_STEP, 1 / (STEPS_PER_PERIOD * top)))
-    if len(set(np.isfinite(scene.finger.position(time)))) > 1:
-        raise NoBound(f"its finger touches or lifts later than {rest:.3g} s before it is judged")
-    return time, begin
+    step = min(LONGEST_STEP, 1 / (STEPS_PER_PERIOD * top))
+    steps = np.arange(begin - math.ceil(begin / step) * step, end, step)[1:]
+    down = np.isfinite(scene.finger.position(steps))
+    changed = steps[1:][down[1:] != down[:-1]].max(initial=0.0)
+    if begin - changed < rest:
+        raise NoBound(f"it is judged from {begin:.3g} s on, less than {rest:.3g} s after its finger last came or went")
+    steps = steps[steps >= begin - rest]
+    if abs(np.diff(_omega(bands, _touch(scene, steps)), axis=0)).max(initial=0.0) > 2 * math.pi * LOWEST_FREQUENCY:
+        raise NoBound("its finger changes its speed at once, and the texture's frequency with it")
+    if all(_touch(each, steps).constant for each in (scene, lesser)):
+        steps = np.array([begin, begin + step])  # one time tells all
+    return _Times(steps, begin, TOUCHING * math.exp(-(begin - changed) / forgets))
 
 
 def _touch(scene: Scene, time: Array) -> FingerPath:
@@ -126,7 +165,7 @@ def _touch(scene: Scene, time: Array) -> FingerPath:
     return FingerPath(time, np.where(down, position, seen), load, strength)
 
 
-def _leak(full: PlateModel, less: PlateModel, bands: Bands, begin: float) -> Array:
+def _leak(full: PlateModel, less: PlateModel, bands: Bands, begin: float, window: float) -> Array:
     """Amplitude (m, shape (3, bands)) that the sag under a moving load feigns in each band, in the worst window."""
     worst = np.zeros((3, len(bands)))
     path = full.path
@@ -135,10 +174,9 @@ def _leak(full: PlateModel, less: PlateModel, bands: Bands, begin: float) -> Arr
         return worst
     late = path.time >= begin
     time, position, apart = path.time[late], path.position[late], apart[late]
-    size = round(window_length(bands, 1 / path.step, position, (time[-1] - time[0]) / 2) / path.step)
-    size = max(2, size + size % 2)
+    size = max(2, round(window / path.step))
     phase, frequency = bands.carrier_phase(time, position), abs(_omega(bands, path)[late]) / (2 * math.pi)
-    first = np.arange(0, len(time) - size + 1, max(1, size // HOPS_LOCKED))
+    first = np.arange(0, len(time) - size + 1, max(1, size // HOPS))
     for starts in np.array_split(first, 1 + len(first) * size * len(bands) // CHUNK_VALUES):
         index = starts[:, None] + np.arange(size)
         envelope, inflation, _ = fit(phase[index], apart[index])
@@ -195,7 +233,7 @@ def _second_order(scene: Scene) -> Scene | str | None:
     own = scene.finger.mechanics
     bands = _bands(scene)[0]
     path = _touch(scene, np.linspace(0.0, min(scene.duration, LOOK_AHEAD), COARSE))
-    frequency = np.unique(abs(_omega(bands, path)).round(0)) / (2 * math.pi)
+    frequency = np.unique(abs(_omega(bands, path))) / (2 * math.pi)
     frequency = frequency[frequency >= LOWEST_FREQUENCY * 0.99]
     if not frequency.size:
         return "no band is fast enough to be judged"

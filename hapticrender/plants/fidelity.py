@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from hapticrender.touch.mechanics import FingerMechanics
 
 PLACE_STEP, GRIP_STEP = 0.1e-3, 0.01  # m, 1: resolution at which A is tabled; zeta_s knows the finger exactly
-SETTLING = 10.0  # time constants after which the plate has forgotten how it was touched: e^-10 = 5e-5
+IMAGES_SEEN = 50  # places along the path at which the hold's images are looked at
 SERIES = 13  # terms of the exponential of a matrix of norm 1/2 or less: what is left out is below rounding
 
 
@@ -228,6 +228,10 @@ class PlateModel:
         follow_run(half, index, turn, settled, out)
         return out[2:, : self.places.shape[1]] @ self.places.T
 
+    def _at(self, few: slice) -> PlateModel:
+        """The model at some of the times of its path."""
+        return PlateModel(self.parameters, self.mechanics, FingerPath(*(column[few] for column in self.path)))
+
     @cached_property
     def _table(self) -> tuple[Array, Array]:
         return self.propagators()
@@ -268,18 +272,36 @@ def stray(full: PlateModel, lesser: PlateModel, omega: Array) -> Array:
     return full.answer(omega, full.pushed(drive)) - lesser.answer(omega, lesser.pushed(drive))
 
 
+def held(full: PlateModel, lesser: PlateModel, omega: Array) -> Array:
+    """How far two models part (3,), per metre of target, for the drive's being held over each sample.
+
+    The hold's images at n w_s -+ w carry w/(n w_s -+ w) of the drive each, and sampling folds them back on w; both
+    first ones are counted twice, for the ones beyond, which the plate's mass lets through with less than 1/n^3.
+    """
+    few = slice(None, None, max(1, len(omega) // IMAGES_SEEN))
+    rate = 2 * math.pi * full.parameters.rate
+    apart = np.zeros((len(omega[few]), 3))
+    drive = lesser._at(few).wanted_force(omega[few])
+    for image in (rate - abs(omega[few]), rate + abs(omega[few])):
+        both = [model._at(few) for model in (full, lesser)]
+        moved = [model.quasi_static(image, model.pushed(drive))[:, : model.places.shape[1]] @ model.places.T
+                 for model in both]  # fmt: skip
+        apart += 2 * abs(moved[0] - moved[1]) * (abs(omega[few]) / image)[:, None]
+    return apart.max(axis=0)
+
+
 def sag(model: PlateModel) -> Array:
     """Motion of centre and ends (m, shape (n, 3)) under the finger's load alone, which moves with it."""
     weight = -model.path.load[:, None] * model.contact(model.path.position)
     return model.answer(np.zeros(len(weight)), weight + 0j).real
 
 
-def settling_time(*models: PlateModel) -> float:
-    """Time (s) after which every model has forgotten how it was touched, at either end of the path and between."""
+def forgetting_time(*models: PlateModel) -> float:
+    """Longest time constant (s) of the models, at either end of the path and between."""
     slowest = math.inf
     for model in models:
         position, strength = model.path.position, model.path.strength
         ends = np.array([position.min(), (position.min() + position.max()) / 2, position.max()])
         system = model._system(ends, np.full(3, strength.mean()))
         slowest = min(slowest, float(-np.linalg.eigvals(system).real.max()))
-    return SETTLING / slowest if slowest > 0.0 else math.inf
+    return 1.0 / slowest if slowest > 0.0 else math.inf
