@@ -94,7 +94,7 @@ def _parser() -> argparse.ArgumentParser:
     render.add_argument("scene", metavar="SCENE", help="a TOML file, or the name of a built-in scene")
     _add_out(render, None)
     _add_method(render)
-    render.add_argument("--least-model", action="store_true", help="leave out of the model what the scene does not need")
+    render.add_argument("--least-model", action="store_true", help="leave out of the model what a scene does not need")
 
     scenes = _add_verb(
         verbs, "scenes", _scenes, "list the built-in scenes, or print one as TOML to start your own from"
@@ -208,9 +208,11 @@ def _render(arguments: argparse.Namespace) -> int:
 
     _check_folder("--out", arguments.out)
     scene, used = _scene(arguments.scene), arguments.least_model
+    sessions = _prepare({arguments.scene: scene}, arguments)
     with _blaming(arguments.scene):
         found = fidelity(scene)
-    sessions = _prepare({arguments.scene: found.least if used else scene}, arguments)
+    if used:
+        sessions = _prepare({arguments.scene: found.least}, arguments)
     with _progress(sessions).scene(arguments.scene) as tick:
         outputs = run_into(arguments.out, sessions[0], progress=tick)
     _print_figures(outputs.summary)

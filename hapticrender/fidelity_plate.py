@@ -141,14 +141,19 @@ def _times(scene: Scene, lesser: Scene, bands: Bands) -> _Times:
         raise NoBound(f"its finger's path is longer than {LOOK_AHEAD:g} s and no repetition")
     coarse = np.linspace(0.0, end, COARSE)
     forgets = forgetting_time(*(_model(each, _touch(each, coarse)) for each in (scene, lesser)))
-    rest = SETTLING * forgets
+    rest, rate = SETTLING * forgets, PlateParameters.with_overrides(scene.plant).rate
+    late = f"it is judged from {begin:.3g} s on, less than {rest:.3g} s after its finger last came or went"
     top = float(abs(_omega(bands, _touch(scene, coarse))).max(initial=1.0)) / (2 * math.pi)
+    if rest > begin:
+        raise NoBound(late)
+    if top > rate / 2:
+        raise NoBound(f"it reaches {top:.4g} Hz, more than half the rate of {rate:g} Hz")
     step = min(LONGEST_STEP, 1 / (STEPS_PER_PERIOD * top))
-    steps = np.arange(begin - math.ceil(begin / step) * step, end, step)[1:]
+    steps = begin + step * np.arange(-math.floor(min(begin, 2 * rest) / step), math.ceil((end - begin) / step))
     down = np.isfinite(scene.finger.position(steps))
-    changed = steps[1:][down[1:] != down[:-1]].max(initial=0.0)
+    changed = steps[1:][down[1:] != down[:-1]].max(initial=steps[0])
     if begin - changed < rest:
-        raise NoBound(f"it is judged from {begin:.3g} s on, less than {rest:.3g} s after its finger last came or went")
+        raise NoBound(late)
     steps = steps[steps >= begin - rest]
     if abs(np.diff(_omega(bands, _touch(scene, steps)), axis=0)).max(initial=0.0) > 2 * math.pi * LOWEST_FREQUENCY:
         raise NoBound("its finger changes its speed at once, and the texture's frequency with it")

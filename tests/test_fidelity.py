@@ -204,6 +204,8 @@ def test_the_tolerance_decides():
             replace(temporal(hr.Finger.sampled([0.0, 0.01], times=[0.0, 90.0], **HEAVY), 72.0), duration=90.0),
             "path is longer than 60 s",
         ),
+        (temporal(FREE, 4000.0), "it reaches 4000 Hz, more than half the rate of 5000 Hz"),
+        (temporal(FREE, 72.0, plant={"damping_1": 0.0, "damping_2": 0.0}), "less than inf s after"),
         (replace(temporal(FREE, 72.0), device="other"), "other has no lesser ones"),
     ],
 )
@@ -218,6 +220,13 @@ def test_a_finger_that_came_in_time_is_bounded():
     lesser = reduced(scene, "finger order 0")
     true = true_error(scene, lesser)
     assert true <= bound(scene, lesser) <= 1.5 * true
+
+
+def test_a_long_scene_is_looked_at_only_where_it_has_to_be():
+    """100 h, of which none but the last minute and what leads to it could be held in memory."""
+    scene = replace(temporal(SLIDING, 20.0), duration=360_000.0, settle=100_000.0)
+    known = bound(temporal(SLIDING, 20.0), reduced(temporal(SLIDING, 20.0), "finger order 2"))
+    assert bound(scene, reduced(scene, "finger order 2")) == pytest.approx(known, rel=0.05)  # other windows, same path
 
 
 def test_a_texture_over_position_keeps_its_finger_moving():

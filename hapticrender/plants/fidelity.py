@@ -23,6 +23,7 @@ from functools import cached_property
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
+from scipy.linalg import block_diag
 
 from hapticrender._jit import kernel
 from hapticrender.plants.vibrotactile import PlateParameters
@@ -111,8 +112,7 @@ class PlateModel:
         rigid = (plate.mass_matrix, plate.damping_matrix, plate.stiffness_matrix)
         parts = [matrix[keep, keep] for matrix in rigid]
         if omega:
-            parts = [np.block([[part, np.zeros((len(part), 1))], [np.zeros((1, len(part))), np.array([[value]])]])
-                     for part, value in zip(parts, bending, strict=True)]  # fmt: skip
+            parts = [block_diag(part, value) for part, value in zip(parts, bending, strict=True)]
         return parts[0], parts[1], parts[2]
 
     def contact(self, position: Array) -> Array:
@@ -180,8 +180,7 @@ class PlateModel:
         same = not np.ptp(omega)
         at = s[:1, None, None] if same else s[:, None, None]
         free = np.linalg.inv(mass * at**2 + damping * at + stiffness)
-        moved, yields = (np.einsum("nij,nj->ni", np.broadcast_to(free, (len(s), *free.shape[1:])), v)
-                         for v in (force, h + 0j))  # fmt: skip
+        moved, yields = ((free @ column[:, :, None])[:, :, 0] for column in (force, h))
         felt = (h * moved).sum(axis=1) / (1.0 + grip * (h * yields).sum(axis=1))
         moved = moved - yields * (grip * felt)[:, None]
         if self.order == 4:
@@ -189,7 +188,7 @@ class PlateModel:
         return np.hstack([moved, s[:, None] * moved])
 
     def propagators(self) -> tuple[Array, Array]:
-        """Exponential of half a step of A for each tabled grip and place (m, s, s), and the entry for each step (n,)."""
+        """Exponential of half a step of A at each tabled grip and place (m, s, s), and the entry for each step."""
         middle = (self.path.position[1:] + self.path.position[:-1]) / 2
         grip = (self.path.strength[1:] + self.path.strength[:-1]) / 2
         tabled = np.stack([np.rint(middle / PLACE_STEP), np.rint(grip / GRIP_STEP)], axis=1)
@@ -221,12 +220,16 @@ class PlateModel:
         """Envelopes at centre and ends (m, shape (n, 3)) under `force` (N, coordinates); `omega` in rad/s, (n,)."""
         settled = self.quasi_static(omega, force)
         if not (np.ptp(settled.real, axis=0).any() or np.ptp(settled.imag, axis=0).any()):
-            return settled[:, : self.places.shape[1]] @ self.places.T
+            return self.moved(settled)
         half, index = self._table
         turn = np.exp(-0.25j * self.path.step * (omega[1:] + omega[:-1]))
         out = np.empty((len(settled) + 2, settled.shape[1]), complex)
         follow_run(half, index, turn, settled, out)
-        return out[2:, : self.places.shape[1]] @ self.places.T
+        return self.moved(out[2:])
+
+    def moved(self, states: Array) -> Array:
+        """Displacement (m, shape (n, 3)) of centre and ends in `states` (n, s)."""
+        return states[:, : self.places.shape[1]] @ self.places.T
 
     def _at(self, few: slice) -> PlateModel:
         """The model at some of the times of its path."""
@@ -283,9 +286,8 @@ def held(full: PlateModel, lesser: PlateModel, omega: Array) -> Array:
     apart = np.zeros((len(omega[few]), 3))
     drive = lesser._at(few).wanted_force(omega[few])
     for image in (rate - abs(omega[few]), rate + abs(omega[few])):
-        both = [model._at(few) for model in (full, lesser)]
-        moved = [model.quasi_static(image, model.pushed(drive))[:, : model.places.shape[1]] @ model.places.T
-                 for model in both]  # fmt: skip
+        both = (model._at(few) for model in (full, lesser))
+        moved = [model.moved(model.quasi_static(image, model.pushed(drive))) for model in both]
         apart += 2 * abs(moved[0] - moved[1]) * (abs(omega[few]) / image)[:, None]
     return apart.max(axis=0)
 
