@@ -83,7 +83,7 @@ def _error(scene: Scene, lesser: Scene, times: _Times) -> float:
     for k in np.flatnonzero(wanted):
         read = _readable(omega[:, k], full.parameters)[judged]
         if read.any():
-            parted = abs(stray(full, less, omega[:, k])[judged])
+            parted = stray(full, less, omega[:, k])[judged]
             apart = _worst_mean(parted, read, round(window / 2 / full.path.step)) + held(full, less, omega[:, k])
             apart *= abs(bands.envelope[k])  # type: ignore[index]
             worst = max(worst, times.left + float((apart + leak[:, k] + ring).max() / wanted[k]))
@@ -91,15 +91,14 @@ def _error(scene: Scene, lesser: Scene, times: _Times) -> float:
 
 
 def _worst_mean(values: Array, read: Array, many: int) -> Array:
-    """Largest mean (3,) of `values` (n, 3) over `many` rows of which one is `read` (n,).
+    """Largest magnitude (3,) of the mean of envelopes `values` (n, 3) over `many` rows of which one is `read` (n,).
 
     Half a window of the judge's: the mean over a whole one is never larger than that over its worse half.
     """
     many = max(1, min(many, len(values)))
     running = np.cumsum(np.column_stack([values, read]), axis=0)
-    total = running[many - 1 :]
-    total[1:] -= running[:-many].copy()
-    return total[total[:, 3] > 0.5, :3].max(axis=0) / many
+    total = np.vstack([running[many - 1], running[many:] - running[:-many]])
+    return abs(total[total[:, 3].real > 0.5, :3]).max(axis=0) / many
 
 
 def _sagging(*models: PlateModel) -> float:
