@@ -142,8 +142,9 @@ def fidelity(scene: Scene, tolerance: float | None = None) -> Fidelity:
     the target.  The verdict's figure, an rms over time, then differs by no
     more under that drive; that the loop finds it on both is not part of the bound.
     It is at most 1.5 times the error that two played plates show, where that
-    is 2e-4 or more; up to twice, where a carrier that is locked to the finger
-    sweeps through a mode or the sag under a moving load is much larger than the target.
+    is 2e-4 or more.  Where a carrier that is locked to the finger sweeps through
+    a mode, or the sag under a moving load is much larger than the target, up to
+    3.2 times was seen.
 
     Examples
     --------
