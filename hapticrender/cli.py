@@ -94,6 +94,7 @@ def _parser() -> argparse.ArgumentParser:
     render.add_argument("scene", metavar="SCENE", help="a TOML file, or the name of a built-in scene")
     _add_out(render, None)
     _add_method(render)
+    render.add_argument("--least-model", action="store_true", help="leave out of the model what a scene does not need")
 
     scenes = _add_verb(
         verbs, "scenes", _scenes, "list the built-in scenes, or print one as TOML to start your own from"
@@ -207,15 +208,22 @@ def _write_page(arguments: argparse.Namespace, scenes: list[Outputs]) -> Path:
 
 
 def _render(arguments: argparse.Namespace) -> int:
+    from hapticrender.fidelity import fidelity
     from hapticrender.outputs import run_into
 
     _check_folder("--out", arguments.out)
-    sessions = _prepare({arguments.scene: _scene(arguments.scene)}, arguments)
+    scene, used = _scene(arguments.scene), arguments.least_model
+    sessions = _prepare({arguments.scene: scene}, arguments)
+    with _blaming(arguments.scene):
+        found = fidelity(scene)
+    if used:
+        sessions = _prepare({arguments.scene: found.least}, arguments)
     with _progress(sessions).scene(arguments.scene) as tick:
         outputs = run_into(arguments.out, sessions[0], progress=tick)
     _print_figures(outputs.summary)
     if note := getattr(sessions[0].controller(), "note", ""):
         print(f"\n{note}")
+    print(f"\n{found.text(used)}")
     _hint_at_pictures([outputs])
     return 0
 

@@ -1,0 +1,67 @@
+"""What the least model saves, at equal verdict: ``python benchmarks/least_model.py``."""
+
+import time
+from dataclasses import replace
+
+import numpy as np
+from pairing import interleave, keep_to_one_core
+
+import hapticrender as hr
+from hapticrender.fidelity import fidelity
+from hapticrender.touch.builtin import builtin_scenes
+from hapticrender.wording import percent, table
+
+PIECE = 2.0  # s of signal a run
+PAIRS = 15
+LIGHT = {"mechanics": "light", "normal_load": 0.3}
+
+
+def scenes():
+    """The built-in ones, and some that need little."""
+    swiping = hr.Finger.swiping(frequency=0.5, stroke=0.01, **LIGHT)
+    slow = replace(builtin_scenes()["grating-20"], finger=hr.Finger.still(0.0, **LIGHT), tolerance=0.1)
+    fast = hr.Scene(texture=hr.Grating(amplitude=1e-5, frequency=400.0), finger=swiping, duration=5.0)
+    own = [
+        replace(slow, name="light-still-20"),
+        replace(fast, name="light-swiping-400"),
+        replace(fast, name="light-swiping-400-rough", tolerance=0.5),
+    ]
+    return [*builtin_scenes().values(), *own]
+
+
+def loop(scene):
+    """Plate and controller in their compiled loop for another piece of time, as a function."""
+    session = hr.prepare(scene)
+    plant, controller = session.driver.plant, session.controller()
+    wanted = np.zeros(int(PIECE * plant.rate))
+    return lambda: plant.closed_loop(controller, wanted)
+
+
+def verdict(scene):
+    """Whether a scene stays inside its tolerance, and its worst figure."""
+    summary = hr.render(scene).summary()
+    return f"{'within' if summary['passed'] else 'misses'}, {percent(summary['worst']['value'])}"
+
+
+def row(scene):
+    """One line of the table."""
+    start = time.perf_counter()
+    found = fidelity(scene)
+    spent = time.perf_counter() - start
+    left = ", ".join(f"{choice.option} {choice.value}" for choice in found.taken) or "nothing"
+    head = [scene.name, f"{1e3 * spent:.0f} ms", percent(found.bound), verdict(scene)]
+    if not found.taken:
+        return [*head, "the same", "1", left]
+    saved = interleave(loop(found.least), loop(scene), PAIRS)
+    return [*head, verdict(found.least), f"{saved.ratio:.2f}", left]
+
+
+def main():
+    keep_to_one_core()
+    fidelity(scenes()[0])
+    titles = ["scene", "to choose", "bound", "full model", "least model", "full / least time", "left out"]
+    print(table([titles, *map(row, scenes())]))
+
+
+if __name__ == "__main__":
+    main()
