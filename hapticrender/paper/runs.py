@@ -38,7 +38,7 @@ THINNED = 25  # samples a row of the tables over time
 def _run(frequency: float, amplitude: float, finger: Finger, method: str, seconds: float, **plant: Any) -> Recording:
     """Render one grating in closed loop."""
     texture = Grating(frequency=frequency, amplitude=amplitude)
-    return render(Scene(texture=texture, finger=finger, duration=seconds, plant=plant), method=method)
+    return render(Scene(texture=texture, finger=finger, duration=seconds, plant=plant, keep_unfelt=True), method=method)
 
 
 def _amplitudes(recording: Recording, frequency: float, start: float, stop: float) -> Array:
