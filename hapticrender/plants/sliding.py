@@ -52,8 +52,9 @@ class Validated:
 
     def __post_init__(self) -> None:
         for each in fields(self):  # type: ignore[arg-type]
-            check = _check_choice if "known" in each.metadata else _check_number
-            check(each, getattr(self, each.name))
+            if "free" not in each.metadata:  # checked by its own class
+                check = _check_choice if "known" in each.metadata else _check_number
+                check(each, getattr(self, each.name))
 
     @classmethod
     def with_overrides(cls, overrides: Mapping[str, Any]) -> Self:

@@ -333,13 +333,7 @@ class UltrasonicPlate:
         finger = self.finger.touch(count / self.rate)
         load = np.where(finger[:, 2] > 0.0, finger[:, 1], 0.0)
         noise = self._rng.standard_normal((n, 1)) if self._tables.sensor_noise > 0.0 else np.zeros((n, 1))
-        return finger, self._mode(count, load), noise, np.zeros(n, np.int64)
-
-    def _mode(self, count: Array, load: Array) -> Array:
-        """Damping (N s/m) and resonance (rad/s) at each sample, shape (n, 2)."""
-        time = (count * RAMPS) // self.rate / RAMPS
-        rise = self.parameters.temperature_rise * np.minimum(time / self.parameters.temperature_time, 1.0)
-        return np.stack([self.parameters.damping(load), 2 * np.pi * self.parameters.resonance(load, rise)], axis=1)
+        return finger, mode_rows(self.parameters, count / self.rate, load), noise, np.zeros(n, np.int64)
 
     def closes(self, controller: Controller) -> bool:
         """Whether `closed_loop` has compiled code for this controller."""
@@ -381,6 +375,13 @@ class UltrasonicPlate:
             flags,
         )
         return drive, target, flags, Sensed(sensed, finger[:, 0], motion, finger[:, 1], flags)
+
+
+def mode_rows(parameters: UltrasonicParameters, time: Array, load: Array) -> Array:
+    """Damping (N s/m) and resonance (rad/s) at each `time` (s) under a `load` (N), shape (n, 2)."""
+    steps = np.floor(time * RAMPS * (1 + 1e-12)) / RAMPS
+    rise = parameters.temperature_rise * np.minimum(steps / parameters.temperature_time, 1.0)
+    return np.stack([parameters.damping(load), 2 * np.pi * parameters.resonance(load, rise)], axis=1)
 
 
 def ultrasonic_state(latency: int) -> UltrasonicState:

@@ -1,0 +1,299 @@
+"""An ultrasonic surface: the resonant plate, its amplitude loop, and the friction of a finger that slides on it.
+
+Levels: "carrier" simulates the mode where it is; "envelope" moves it down to a low carrier (see `ultrasonic`), with
+the same amplitude loop on a fraction of the samples.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields, replace
+from functools import cached_property
+from typing import TYPE_CHECKING, Any, Self
+
+import numpy as np
+
+from hapticrender.bands import Bands
+from hapticrender.control.bandmodel import BandModel, FingerRange
+from hapticrender.control.bank import BankController
+from hapticrender.plants.bounds import overridden
+from hapticrender.plants.closed import STEPS
+from hapticrender.plants.electroadhesion import finger_rows
+from hapticrender.plants.friction_laws import LAWS, FrictionLaw
+from hapticrender.plants.sliding import SlidingParameters, choice, number, sliding_state, sliding_tables
+from hapticrender.plants.surface_kernels import (
+    LOAD,
+    POSITION,
+    STRENGTH,
+    SurfaceState,
+    SurfaceTables,
+    closed_surface_run,
+    surface_run,
+)
+from hapticrender.plants.ultrasonic import LEVELS, UltrasonicParameters, mode_rows, ultrasonic_state, ultrasonic_tables
+from hapticrender.protocols import Array, Controller, Sensed
+
+if TYPE_CHECKING:
+    from hapticrender.touch.finger import Finger
+
+PLACES = ("friction",)
+PACE = 25.0  # times the rules of a plate: an amplitude settles within a millisecond
+MOST_DETUNING = 0.015  # of the resonance: as far as the amplitude loop looks for it
+TYPICAL_DETUNING = 1e-3
+MOST_DAMPING = 20.0  # times that of the nominal finger
+LEAST_AMPLITUDE = 0.05e-6  # m: below it a resonance is not told [FACTS 6]
+
+
+@dataclass(frozen=True, kw_only=True)
+class SurfaceParameters(SlidingParameters):
+    """Everything that describes the surface, and how finely it is modelled.
+
+    Parameters
+    ----------
+    rate, friction_coefficient, memory_length, least_speed : float
+        See `SlidingParameters`; `rate` is that of the friction.
+    tribometer_frequency, tribometer_damping, force_noise, force_range, force_bits : float or int
+        See `SlidingParameters`.
+    level : {"carrier", "envelope"}
+        Whether the mode is simulated where it is.
+    sensor : {"amplitude", "tribometer"}
+        Whether the friction loop listens to the friction that the sensed amplitude must leave, or to a tribometer.
+    law : {"fit", "load-sharing", "intermittent"}
+        Of friction over amplitude; its own numbers are those of `friction_laws`.
+    bias : float
+        Friction without a texture, mu/mu0: 0.1 to 0.95.
+    lock : float, Hz
+        Bandwidth of the resonance lock, 0 to 100 (1-20); 0: none.
+    oversampling, envelope_oversampling : int
+        Samples of the carrier in one of the friction, at either level.
+    mode : UltrasonicParameters
+        The plate; its rate and level follow from those above.
+    law_parameters : mapping
+        Numbers of the law that differ from its defaults.
+
+    Notes
+    -----
+    Bias, lock and oversampling are engineering defaults.
+    """
+
+    rate: float = number(12e3, "Hz", least=1e3, most=1e6)
+    level: str = choice("carrier", *LEVELS)
+    sensor: str = choice("amplitude", "amplitude", "tribometer")
+    law: str = choice("fit", *LAWS)
+    bias: float = number(0.55, least=0.1, most=0.95)
+    lock: float = number(20.0, "Hz", most=100.0)
+    oversampling: int = number(16, "samples", least=1, most=1000)
+    envelope_oversampling: int = number(4, "samples", least=1, most=1000)
+    mode: UltrasonicParameters = field(default_factory=UltrasonicParameters, metadata={"free": True})
+    law_parameters: Mapping[str, float] = field(default_factory=dict, hash=False, metadata={"free": True})
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        _ = self.carrier_mode, self.friction_law  # refuse what does not fit together
+
+    @classmethod
+    def with_overrides(cls, overrides: Mapping[str, Any]) -> Self:
+        """Defaults with some parameters replaced, of the surface, its mode or its law; an unknown name is refused."""
+        law = overrides.get("law", "fit")
+        names = {
+            "own": {each.name for each in fields(cls)} - {"mode", "law_parameters"},
+            "mode": {each.name for each in fields(UltrasonicParameters)} - {"rate", "level"},
+            "law": {each.name for each in fields(LAWS.get(law, LAWS["fit"]))},
+        }
+        parts: dict[str, dict[str, Any]] = {part: {} for part in names}
+        for name, value in overrides.items():
+            part = next((part for part, known in names.items() if name in known), None)
+            if part is None:
+                known = sorted(set().union(*names.values()))
+                raise ValueError(f"plant.{name}: no such parameter; known: {', '.join(known)}")
+            parts[part][name] = value
+        mode = overridden(UltrasonicParameters, parts["mode"])
+        try:
+            return cls(**parts["own"], mode=mode, law_parameters=parts["law"])
+        except (ValueError, TypeError) as error:
+            raise type(error)(f"plant.{error}") from None
+
+    @cached_property
+    def friction_law(self) -> FrictionLaw:
+        """The law of friction over amplitude."""
+        return LAWS[self.law](**self.law_parameters)
+
+    @cached_property
+    def carrier_mode(self) -> UltrasonicParameters:
+        """The mode as it is simulated."""
+        if self.level == "carrier":
+            return replace(self.mode, rate=self.rate * self.substeps)
+        return self.mode.transposed(self.mode.envelope_frequency, self.rate * self.substeps)
+
+    @property
+    def substeps(self) -> int:
+        """Samples of the carrier in one of the friction."""
+        return self.oversampling if self.level == "carrier" else self.envelope_oversampling
+
+    def amplitude_model(self) -> BandModel:
+        """Band model of the mode with what a finger and the heat can make of it, for its amplitude loop."""
+        mode = self.carrier_mode
+        return resonant(mode.band_model(mode.rate, mode.delay), mode, self.lock)
+
+    def amplitude_bands(self) -> Bands:
+        """Return the carrier, whose amplitude (m) is the waveform that is asked for."""
+        carrier = np.array([self.carrier_mode.carrier])
+        none = np.zeros(1)
+        return Bands(frequency=carrier, wavenumber=none, phase=none, envelope=none + 1.0, modulated=True)
+
+
+def resonant(model: BandModel, mode: UltrasonicParameters, lock: float) -> BandModel:
+    """Band model of a mode that is to be found and held where it is resonant, by a lock of `lock` (Hz)."""
+    stiffness, damping = float(model.stiffness[0, 0]), float(model.damping[0, 0])
+    detuned = 2 * MOST_DETUNING * stiffness * mode.frequency / mode.carrier  # shifts are kept in Hz at either level
+    finger = MOST_DAMPING * mode.finger_damping * mode.frequency / mode.carrier
+    return replace(
+        model,
+        pace=PACE,
+        lock=lock,
+        finger=FingerRange(
+            mass=(0.0, 0.0),
+            damping=(-0.9 * damping, finger),
+            stiffness=(-detuned, detuned),
+            typical_mass=1e-12,
+            typical_stiffness=detuned * TYPICAL_DETUNING / MOST_DETUNING,
+            least_motion=LEAST_AMPLITUDE,
+            contact=None,
+        ),
+    )
+
+
+class UltrasonicSurface:
+    """The surface in discrete time, behind the `Plant` protocol.
+
+    Parameters
+    ----------
+    parameters : SurfaceParameters
+        The surface and its level of modelling.
+    amplitude : BankController
+        The amplitude loop, designed for `parameters.amplitude_model()` and `parameters.amplitude_bands()`.
+    finger : Finger
+        Where the finger is, how hard it presses, and its lateral mechanics.
+    seed : int
+        Of the noise.
+    nominal : (float, float), N and m/s
+        Load and speed that the amplitude is held for while no finger is there.
+
+    Attributes
+    ----------
+    amplitude, skin_velocity : ndarray, shape (n,), m and m/s
+        True amplitude of the mode, and velocity of the skin under friction, over the samples of the last run.
+    """
+
+    delay = block = 1
+    drive_channels = sensed_channels = 1
+
+    def __init__(
+        self,
+        parameters: SurfaceParameters,
+        amplitude: BankController,
+        finger: Finger,
+        seed: int = 0,
+        nominal: tuple[float, float] = (0.5, 0.05),
+    ) -> None:
+        self.parameters = parameters
+        self.finger = finger
+        self.rate = float(parameters.rate)
+        self.amplitude = self.skin_velocity = np.zeros(0)
+        self.loop = amplitude
+        self._rng = np.random.default_rng(seed)
+        self._samples = 0
+        self._tables = surface_tables(parameters, amplitude, finger, nominal)
+        self._state = surface_state(parameters, amplitude)
+        self._last = np.zeros(1)
+
+    def _next(self, n: int) -> tuple[Array, Array, Array, Array]:
+        """Finger rows, mode rows, noise and sample flags of the next n samples."""
+        finger = finger_rows(self.finger, self._samples, n, self.rate)
+        time = (self._samples + np.arange(n)) / self.rate
+        self._samples += n
+        mode = mode_rows(self.parameters.carrier_mode, time, np.where(finger[:, STRENGTH] > 0.0, finger[:, LOAD], 0.0))
+        noise = self._rng.standard_normal((n, 1 + self._tables.substeps))
+        return finger, mode, noise, np.zeros(n, np.int64)
+
+    def closes(self, controller: Controller) -> bool:
+        """Whether `closed_loop` has compiled code for this controller."""
+        return type(getattr(controller, "tables", None)) in STEPS
+
+    def finger_position(self, n: int) -> Array:
+        """Finger positions (m, shape (n,)) of the next n samples, NaN while lifted; the plant does not advance."""
+        return self.finger.position((self._samples + np.arange(n)) / self.rate)
+
+    def run(self, drive: Array) -> Sensed:
+        """Advance by n samples under `drive` (N, shape (n, 1)); row i acts from sample i on, sensed at its start."""
+        n = len(drive)
+        finger, mode, noise, flags = self._next(n)
+        outputs = tuple(np.zeros((n, 1)) for _ in range(4))
+        drive = np.ascontiguousarray(drive, float)
+        surface_run(self._tables, self._state, drive, finger, mode, noise, *outputs, flags)
+        return self._sensed(finger, outputs, flags)
+
+    def closed_loop(self, controller: Controller, wanted: Array) -> tuple[Array, Array, Array, Sensed]:
+        """Advance surface and controller together, sample by sample, over `wanted` (N, shape (n,))."""
+        n = len(wanted)
+        finger, mode, noise, flags = self._next(n)
+        outputs, drive = tuple(np.zeros((n, 1)) for _ in range(4)), np.zeros((n, 1))
+        target = np.zeros((n, controller.n_bands), complex)
+        tables, state = controller.tables, controller.state
+        closed_surface_run(
+            self._tables,
+            self._state,
+            tables,
+            state,
+            self._last,
+            finger,
+            mode,
+            noise,
+            wanted,
+            outputs,
+            drive,
+            target,
+            flags,
+        )
+        return drive, target, flags, self._sensed(finger, outputs, flags)
+
+    def _sensed(self, finger: Array, outputs: tuple[Array, ...], flags: Array) -> Sensed:
+        sensed, motion, skin, amplitude = outputs
+        self.skin_velocity, self.amplitude = skin[:, 0], amplitude[:, 0]
+        return Sensed(sensed, finger[:, POSITION], motion, finger[:, LOAD], flags)
+
+
+def surface_state(parameters: SurfaceParameters, amplitude: BankController) -> SurfaceState:
+    """A surface at rest."""
+    return SurfaceState(
+        mode=ultrasonic_state(parameters.carrier_mode.delay - 1),
+        control=amplitude.state,
+        sliding=sliding_state(),
+        wanted=np.zeros(1),
+        estimate=np.zeros(1),
+        heard=np.zeros(1),
+        motion=np.zeros(1),
+        drive=np.zeros(1),
+        target=np.zeros(1, complex),
+    )
+
+
+def surface_tables(
+    parameters: SurfaceParameters, amplitude: BankController, finger: Finger, nominal: tuple[float, float]
+) -> SurfaceTables:
+    """Numbers of the compiled surface with this finger on it."""
+    numbers = parameters.friction_law.numbers
+    load, speed = nominal
+    return SurfaceTables(
+        substeps=int(parameters.substeps),
+        friction=float(parameters.friction_coefficient),
+        bias=float(parameters.bias),
+        least=float(numbers.floor + 0.01 * (1.0 - numbers.floor)),
+        load=float(load),
+        speed=float(speed),
+        estimating=parameters.sensor == "amplitude",
+        law=numbers,
+        mode=ultrasonic_tables(parameters.carrier_mode),
+        control=amplitude.tables,
+        sliding=sliding_tables(parameters, finger.mechanics),
+    )
