@@ -60,7 +60,7 @@ class UltrasonicRenderer(FrictionRenderer):
         _, parameters = _read(scene)
         if parameters.sensor == "tribometer":
             return parameters.tribometer_response(frequency)
-        late = np.exp(2j * np.pi * np.asarray(frequency, float) / parameters.rate)  # sensed a sample after it is there
+        late = np.exp(1j * np.pi * np.asarray(frequency, float) / parameters.rate)  # from the sample's middle to its end
         speed = typical_speed(scene, parameters.least_speed)
         return 1.0 / (parameters.lag_response(frequency, speed) * late)
 

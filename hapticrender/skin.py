@@ -1,0 +1,93 @@
+"""What the skin is predicted to feel of a recording, whatever the device: its velocity, band by band and over time.
+
+A plate moves the skin with it, V = j w X; friction moves it by V = (v/F) F, with v/F as the scene has it.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from hapticrender.protocols import Array
+from hapticrender.touch.perception import VELOCITY_PER_FORCE, sensation_level
+
+if TYPE_CHECKING:
+    from hapticrender.recording import Recording
+
+
+class Felt(NamedTuple):
+    """Skin velocity of a band (m/s peak), and its level above the classic detection threshold."""
+
+    frequency: float  # Hz: the median while it is judged
+    wanted: float
+    achieved: float
+    level: float  # dB; NaN where the threshold is not known
+
+    @property
+    def error(self) -> float:
+        """Relative error of the achieved velocity."""
+        return self.achieved / self.wanted - 1.0
+
+
+def velocity_per_unit(recording: Recording, frequency: Any) -> Array:
+    """Skin velocity (m/s, complex) per unit of what the device makes, at `frequency` (Hz, > 0)."""
+    hertz = np.asarray(frequency, float)
+    unit = recording.header.unit
+    if unit == "m":
+        return 2j * np.pi * hertz
+    if unit == "m/s":
+        return np.ones_like(hertz, complex)
+    share = float(recording.scene.plant.get("velocity_per_force", VELOCITY_PER_FORCE))  # type: ignore[arg-type]
+    if share:
+        return share * np.ones_like(hertz, complex)
+    return recording.scene.finger.mechanics.skin_velocity_per_force(hertz)
+
+
+def felt_bands(recording: Recording) -> list[Felt]:
+    """Predicted skin velocity of every judged band, at the device's first place.
+
+    Examples
+    --------
+    >>> import hapticrender as hr
+    >>> scene = hr.Scene(texture=hr.Grating(velocity=5e-3, frequency=100.0), duration=1.5)
+    >>> [band] = felt_bands(hr.render(scene))
+    >>> f"{1e3 * band.wanted:.2f} mm/s, {band.level:.0f} dB above threshold"
+    '5.00 mm/s, 22 dB above threshold'
+    """
+    found = []
+    for band in recording.summary()["bands"]:
+        if band["target"] is None or not band["frequency"]:
+            continue
+        share = float(abs(velocity_per_unit(recording, band["frequency"])))
+        achieved = share * band["achieved"]
+        level = float(sensation_level(achieved / (2 * math.pi * band["frequency"]), band["frequency"]))
+        found.append(Felt(band["frequency"], share * band["target"], achieved, level))
+    return found
+
+
+def skin_waveform(recording: Recording, start: float, seconds: float) -> tuple[Array, Array, Array]:
+    """Time (s), wanted and achieved skin velocity (m/s) over a stretch, from the envelopes of the windows around it.
+
+    Parameters
+    ----------
+    recording : Recording
+    start, seconds : float, s
+        Where the stretch begins, and how long it is.
+    """
+    envelopes, rate, bands = recording.envelopes, recording.rate, recording.bands
+    first, last = round(start * rate), min(round((start + seconds) * rate), len(recording))
+    count = np.arange(first, last)
+    time, position = count / rate, recording.read("position", first, last)
+    velocity = np.gradient(position) * rate if len(count) > 1 else np.zeros(len(count))
+    frequency = bands.instantaneous_frequency(np.nan_to_num(velocity))
+    share = velocity_per_unit(recording, np.maximum(abs(frequency), 1e-9))
+    if recording.header.unit == "m":
+        share = 2j * np.pi * frequency
+    turned = share * np.exp(1j * bands.carrier_phase(time, position))
+    target = recording.read("target", first, last)
+    nearest = np.abs(envelopes.time[None, :] - time[:, None]).argmin(axis=1) if len(envelopes.start) else None
+    achieved = np.zeros_like(target) if nearest is None else envelopes.achieved[nearest, 0]
+    achieved = achieved / (recording.header.profile or (1.0,))[0]
+    return time, (turned * target).real.sum(axis=1), (turned * achieved).real.sum(axis=1)
