@@ -129,7 +129,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     _add_out(paper, Path("out/paper"))
 
-    _add_verb(verbs, "devices", _devices, "list the renderers and drivers that are installed")
+    _add_verb(verbs, "devices", _devices, "list the kinds of device, what each needs, and whether it is there")
     return parser
 
 
@@ -350,26 +350,10 @@ def _show(arguments: argparse.Namespace) -> int:
 
 
 def _devices(arguments: argparse.Namespace) -> int:
-    from importlib.metadata import entry_points
+    from hapticrender.inventory import text
 
-    from hapticrender.wording import table
-
-    for kind in ("renderers", "drivers"):
-        found = sorted(entry_points(group=f"hapticrender.{kind}"), key=lambda entry: entry.name)
-        print(f"{kind}:")
-        print(table([[f"  {entry.name}", _first_line(entry)] for entry in found]) if found else "  none installed")
+    print(text())
     return 0
-
-
-def _first_line(entry: Any) -> str:
-    """Say what an entry point is, or why it cannot be used."""
-    try:
-        loaded = entry.load()
-    except (Exception, SystemExit) as error:  # a third party's module may fail in any way; the list must go on
-        reason = " ".join(f"{type(error).__name__}: {error}".split())
-        return f"broken: cannot be loaded from {entry.value} ({reason})"
-    text = str(loaded.__doc__ or "").strip().partition("\n")[0]
-    return f"{text}  ({entry.value})"
 
 
 def _overview(summaries: list[Any]) -> str:

@@ -64,12 +64,19 @@ def registered(group: str, name: str) -> Any:
         raise HapticError(f"{group[:-1]} {name!r} cannot be loaded: {type(error).__name__}: {error}") from error
 
 
-def prepare(scene: Scene, *, driver: Driver | None = None, method: str = defaults.METHOD, seed: int = 0) -> Session:
+def prepare(
+    scene: Scene,
+    *,
+    driver: Driver | None = None,
+    method: str = defaults.METHOD,
+    seed: int = 0,
+    renderer: Renderer | None = None,
+) -> Session:
     """Do all the design-time work of a run and check it; see `render` for the parameters and errors."""
     if isinstance(seed, bool) or not isinstance(seed, (int, np.integer)) or seed < 0:
         raise ValueError(f"seed = {seed!r}: must be an integer >= 0")
     chosen = method_named(method)
-    renderer: Renderer = registered("renderers", scene.device)()
+    renderer = renderer or registered("renderers", scene.device)()
     if driver is None:
         driver = registered("drivers", "simulated")(renderer.plant(scene, seed))
     else:
@@ -98,6 +105,7 @@ def render(
     driver: Driver | None = None,
     method: str = defaults.METHOD,
     seed: int = 0,
+    renderer: Renderer | None = None,
     journal: str | Path | None = None,
     progress: Progress | None = None,
 ) -> Recording:
@@ -113,6 +121,8 @@ def render(
         Name of the control method (`hapticrender.control.methods.METHODS`).
     seed : int
         Of the simulated sensor noise, >= 0.
+    renderer : Renderer, optional
+        Of the device's kind; by default the installed one that `scene.device` names.
     journal : path, optional
         File (.au) that keeps every sample while it happens; a killed process leaves it readable.
     progress : callable, optional
@@ -132,7 +142,8 @@ def render(
     DriverError
         The device failed; it was left at zero drive, and the journal holds what happened until then.
     """
-    return run(prepare(scene, driver=driver, method=method, seed=seed), journal=journal, progress=progress)
+    session = prepare(scene, driver=driver, method=method, seed=seed, renderer=renderer)
+    return run(session, journal=journal, progress=progress)
 
 
 def run(session: Session, *, journal: str | Path | None = None, progress: Progress | None = None) -> Recording:

@@ -149,6 +149,7 @@ class Renderer(Protocol):
     """Knows one kind of device and turns a scene into bands and a band model."""
 
     name: str
+    needs: str  # what a real device of this kind takes, in a few words
 
     def band_model(self, scene: Scene, driver: Driver) -> BandModel:
         """All that the controller ever knows of the device behind `driver`."""

@@ -15,6 +15,8 @@ Waveform = Callable[[Array, Array], Array]
 class BaseRenderer:
     """Renderer of a device that takes and gives what its controller does; see ``protocols.Renderer``."""
 
+    needs = "a driver"  # of a real device of this kind, in a few words
+
     def connect(self, scene: Scene, driver: Driver) -> Driver:
         """Return `driver` as the controller is to see it."""
         return driver

@@ -26,6 +26,7 @@ class ElectroadhesionRenderer(FrictionRenderer):
     """Renderer for current-driven electroadhesion screens."""
 
     name = "electroadhesion"
+    needs = "a current source on a carrier, driven by its envelope (A peak); a tribometer (N), or open loop"
 
     def plant(self, scene: Scene, seed: int) -> ElectroadhesionScreen:
         """Return the simulated screen, with the scene's overrides and finger."""

@@ -25,6 +25,7 @@ class UltrasonicRenderer(FrictionRenderer):
     """Renderer for plates that take friction away by ultrasonic vibration."""
 
     name = "ultrasonic"
+    needs = "a drive at the carrier's rate (V), the vibration sensed (m), or open loop"
 
     def plant(self, scene: Scene, seed: int) -> UltrasonicSurface:
         """Return the simulated surface, with the scene's overrides and finger."""
@@ -60,7 +61,9 @@ class UltrasonicRenderer(FrictionRenderer):
         _, parameters = _read(scene)
         if parameters.sensor == "tribometer":
             return parameters.tribometer_response(frequency)
-        late = np.exp(1j * np.pi * np.asarray(frequency, float) / parameters.rate)  # from the sample's middle to its end
+        late = np.exp(
+            1j * np.pi * np.asarray(frequency, float) / parameters.rate
+        )  # from the sample's middle to its end
         speed = typical_speed(scene, parameters.least_speed)
         return 1.0 / (parameters.lag_response(frequency, speed) * late)
 

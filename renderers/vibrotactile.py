@@ -25,6 +25,7 @@ class VibrotactileRenderer(BaseRenderer):
     """Renderer for plates on one or two coils, like that of Grigorii et al. 2021."""
 
     name = "vt-plate"
+    needs = "1 or 2 coils (A), 2 displacement sensors at the plate's ends (m)"
 
     def plant(self, scene: Scene, seed: int) -> Plate:
         """Return the simulated plate, with the scene's overrides and finger."""

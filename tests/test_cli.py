@@ -240,7 +240,7 @@ def test_a_broken_package_is_shown_as_broken_and_hides_no_other(run, tmp_path, m
     monkeypatch.syspath_prepend(tmp_path)
     test_devices_are_listed(run)
     _, out, _ = run("devices")
-    (line,) = [line for line in out.splitlines() if line.split()[0] == "theirs"]
+    (line,) = [line for line in out.splitlines() if line.split()[:1] == ["theirs"]]
     assert line.split(maxsplit=1)[1] == f"broken: cannot be loaded from third_party:Driver ({reason})"
 
 
