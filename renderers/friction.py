@@ -24,7 +24,7 @@ from hapticrender.renderers.limits import check_carriers, felt, needed_drive, sp
 from hapticrender.touch.perception import VELOCITY_PER_FORCE
 from hapticrender.touch.scene import Scene
 
-LEAST_FORCE = 1e-4  # N: a smaller friction teaches nothing of the contact
+LEAST_FORCE = 1e-3  # N: a smaller friction teaches nothing of the contact
 ROOM = 2.0  # of the drive that the free device needs: half is left to the feedback
 PLACES = ("friction",)
 
@@ -133,6 +133,7 @@ class FrictionRenderer(BaseRenderer):
                 typical_stiffness=0.5 * own,
                 least_motion=LEAST_FORCE,
                 contact=None,
+                presence=True,
             ),
         )
 

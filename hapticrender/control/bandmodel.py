@@ -29,6 +29,9 @@ class FingerRange:
         A smaller motion teaches nothing, > 0.
     contact : (float, float), N, or None
         Loads at which touch begins and ends, as felt by the sag; None: the load is always there.
+    presence : bool
+        Targets are wanted, and learnt from, only while the finger's position is known: what it does not touch it does
+        not feel.
     """
 
     mass: tuple[float, float] = (-2e-3, 12e-3)
@@ -38,6 +41,7 @@ class FingerRange:
     typical_stiffness: float = 300.0
     least_motion: float = 5e-8
     contact: tuple[float, float] | None = (0.05, 0.03)
+    presence: bool = False
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -31,6 +31,7 @@ PROMPT = 8  # samples: a longer delay is that of a block device, where the inner
 PHASE_MARGIN = math.pi / 4  # rad: 90 deg less integral gain times (delay + 1/observer pole)
 LEARNING_TIME = 1 / 60  # s: fastest adaptation of the finger; a delay counts twice
 LEARNING_MARGIN = 4.0  # of the observer's pole over the adaptation, where that learns all of D
+QUICK_LEVEL = 60.0  # Hz: bandwidth of the DC band while the step of a touch goes into it
 BACK_TIME = 0.02  # s: back-calculation at the limit
 LEAST_NOISE = 1e-6  # of the sensors' range: thresholds never fall to nothing
 ALWAYS = -1e300  # N: every load is larger
@@ -179,6 +180,7 @@ def _numbers(model: BandModel, bands: Bands, rules: BankRules, feedback: bool) -
     lowest = _lowest(model, bands)
     finger = model.finger
     contact_on, contact_off = finger.contact or (ALWAYS, ALWAYS)
+    quick = 2 * math.pi * QUICK_LEVEL * period
     fast, slow = FAST_POLE * model.pace, SLOW_POLE * model.pace
     return BankNumbers(
         rate=float(model.rate),
@@ -209,6 +211,9 @@ def _numbers(model: BandModel, bands: Bands, rules: BankRules, feedback: bool) -
         sensed_limit=float(model.sensed_limit),
         modulated=bands.modulated,
         differentiated=bands.differentiated,
+        presence=finger.presence,
+        dc_quick=1.6 * quick,
+        dc_drift_quick=quick**2,
         lock=2 * math.pi * model.lock,
         least_motion=finger.least_motion,
         typical_mass=finger.typical_mass,

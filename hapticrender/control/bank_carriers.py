@@ -65,7 +65,7 @@ def take_bands(tables, state, t):
         band[t, row.TURNS, i] = count_turns(state.phase, k, (tone[0, k] + state.shift[0]) / tables.numbers.rate)
         if band[t, row.RAMP, i] < 1.0 or band[t, row.R_RE, i] != tone[3, k] or band[t, row.R_IM, i] != tone[4, k]:
             grows = True
-        follows = follows or tone[1, k] > 0.0
+        follows = follows or tone[1, k] > 0.0 or tables.numbers.presence
     return grows, follows
 
 
@@ -81,7 +81,7 @@ def take_scenarios(tables, state, t):
         band[t, row.TURNS, i] = count_turns(state.phase, t * width + i, tone[t, 0, i] / tables.numbers.rate)
         if band[t, row.RAMP, i] < 1.0 or band[t, row.R_RE, i] != tone[t, 3, i] or band[t, row.R_IM, i] != tone[t, 4, i]:
             grows = True
-        follows = follows or tone[t, 1, i] > 0.0
+        follows = follows or tone[t, 1, i] > 0.0 or tables.numbers.presence
     return grows, follows
 
 
@@ -205,7 +205,9 @@ def motion_pass(numbers, band, track, t):
     hertz = lanes(band, t, row.FREQUENCY) + wavenumber * read(track, row.VELOCITY)
     put(band, t, row.OMEGA, TURN * hertz)
     put(band, t, row.SWEEP, TURN * wavenumber * read(track, row.ACCELERATION))
-    felt = (wavenumber == 0.0) | (read(track, row.SEEN) > 0.0)
+    felt = read(track, row.SEEN) > 0.0
+    if not numbers.presence:
+        felt = (wavenumber == 0.0) | felt
     ramp = lanes(band, t, row.RAMP)
     ramp = select(felt, low(ramp + numbers.ramp, 1.0), high(ramp - numbers.ramp, 0.0))
     inside = ease(2.0 / numbers.lowest * size(hertz) - 1.0) * ease(5.0 - 4.0 / numbers.highest * size(hertz))

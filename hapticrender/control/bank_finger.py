@@ -8,6 +8,7 @@ from hapticrender.control import bank_rows as row
 from hapticrender.control.kernels import FAR, FASTEST, TURN
 
 TRACKER_POLE = TURN * 60.0  # rad/s: triple pole of the finger's tracker; no lag under constant acceleration
+FRESH_TIME = 0.03  # s: for so long after a touch a friction is told from its step
 LEAST_LOAD = 0.03  # N: a place is not told by less
 
 
@@ -31,6 +32,8 @@ def track_finger(track, rate, position):
     write(select(present, steeper, 0.0), track, row.ACCELERATION)
     write(position, track, row.HELD)
     write(here, track, row.SEEN)
+    came = present & ((seen <= 0.0) | leapt)
+    write(select(came, FRESH_TIME * rate, high(read(track, row.FRESH) - 1.0, 0.0)), track, row.FRESH)
 
 
 @kernel

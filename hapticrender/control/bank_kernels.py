@@ -124,11 +124,15 @@ def inner_force(tables, state, inner, c):
 
 
 @kernel
-def level_pass(numbers, level, error, c):
-    """DC band of type 2."""
+def level_pass(numbers, level, error, c, quick):
+    """DC band of type 2, faster where it is `quick`."""
     drift = read(level, 1, c)
-    write(read(level, 0, c) + numbers.dc * error + drift, level, 0, c)
-    write(drift + numbers.dc_drift * error, level, 1, c)
+    dc, bend = numbers.dc, numbers.dc_drift
+    if numbers.presence:
+        dc = select(quick, numbers.dc_quick, dc)
+        bend = select(quick, numbers.dc_drift_quick, bend)
+    write(read(level, 0, c) + dc * error + drift, level, 0, c)
+    write(drift + bend * error, level, 1, c)
 
 
 @kernel
@@ -339,6 +343,10 @@ def bank_advance(tables, state, sensed, position, wanted, drive, target):
     inner = select(scale < 1.0, 0.0, inner)  # no room for it
     g = calm * (numbers.observer + fast * (numbers.observer_awake - numbers.observer))
     back = numbers.back * (1.0 - scale)
+    quick = scale < 0.0
+    if numbers.presence:  # the step of a friction is not what the texture does
+        quick = (read(state.track, row.SEEN) <= 0.0) | (read(state.track, row.FRESH) > 0.0)
+        g, integral = select(quick, 0.0, g), select(quick, 0.0, integral)
     doubt = 0.0 * scale
     hears_fast = hears_slow = 0.0 * lanes(band, 0, row.COS)
     for c in range(coordinates):
@@ -346,7 +354,7 @@ def bank_advance(tables, state, sensed, position, wanted, drive, target):
         doubt = high(doubt, unbelieved)
         residual_pass(tables, state, y, c)
         inner_force(tables, state, inner, c)
-        level_pass(numbers, state.level, read(state.residual, row.ERROR, c), c)
+        level_pass(numbers, state.level, read(state.residual, row.ERROR, c), c, quick)
         for t in range(tiles):
             observer_pass(tables, state, t, c, g, integral, back)
         if numbers.fast_level < HUGE:

@@ -59,6 +59,9 @@ class BankNumbers(NamedTuple):
     sensed_limit: float
     modulated: bool  # the wanted waveform is a factor of every target
     differentiated: bool  # what is wanted is the time derivative of what the tones say
+    presence: bool  # targets are wanted only while a finger is there
+    dc_quick: float  # of the DC band after a touch, and while no finger is there
+    dc_drift_quick: float
     lock: float  # 1/s: pace at which the carriers follow the resonance; 0: not
     least_motion: float
     typical_mass: float
