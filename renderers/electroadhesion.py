@@ -95,6 +95,7 @@ class ElectroadhesionRenderer(FrictionRenderer):
                 mass=lag**2 / 2 / mu * model.force_from_drive,
                 damping=lag / mu * model.force_from_drive,
                 coordinate_from_sensed=mu * model.coordinate_from_sensed,
+                memory=0.0,
             )
         return model
 

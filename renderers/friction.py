@@ -102,7 +102,8 @@ class FrictionRenderer(BaseRenderer):
         ``(1 + s delta/v) (1 + 2 zeta s/w0 + s^2/w0^2) F = friction_per_drive u`` up to s^2, at the scene's median
         speed; the drive limit is not set.
         """
-        lag = sliding.memory_length / typical_speed(scene, sliding.least_speed)
+        speed = typical_speed(scene, sliding.least_speed)
+        lag = sliding.memory_length / speed
         w0 = 2 * np.pi * sliding.tribometer_frequency
         ring = 2 * sliding.tribometer_damping / w0
         own = 1.0 / friction_per_drive
@@ -123,6 +124,8 @@ class FrictionRenderer(BaseRenderer):
             sensed_limit=sliding.force_range,
             sensed_noise=sliding.force_noise,
             rigid=True,
+            memory=own * sliding.memory_length,
+            typical_speed=speed,
             unit="N",
             drive_unit="N",
             finger=FingerRange(

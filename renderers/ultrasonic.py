@@ -76,7 +76,12 @@ class UltrasonicRenderer(FrictionRenderer):
             late = 0.5 / driver.rate
             noise = 1e-6 * model.sensed_limit
             return replace(
-                model, mass=late**2 / 2 * np.eye(1), damping=late * np.eye(1), stiffness=np.eye(1), sensed_noise=noise
+                model,
+                mass=late**2 / 2 * np.eye(1),
+                damping=late * np.eye(1),
+                stiffness=np.eye(1),
+                memory=0.0,
+                sensed_noise=noise,
             )
         return replace(model, damping=model.damping + 0.5 / driver.rate)
 

@@ -93,6 +93,11 @@ class BandModel:
     pace : float
         Factor on every bandwidth of a method's rules, which are meant for carriers from 20 Hz on; > 0.  Limits that
         delay, carriers and spacing set stay as they are.
+    memory : float, N s/m times m/s
+        Part of the first damping that goes as 1/|v| with the finger's speed, times that speed; it is in `damping` as it
+        is at `typical_speed`.  0: none.
+    typical_speed : float, m/s
+        Of the finger, > 0.
     lock : float, Hz
         Bandwidth of the resonance lock, which moves the fixed carriers to where the device is resonant; 0: none.
     unit, drive_unit : str
@@ -125,6 +130,8 @@ class BandModel:
     shape: tuple[float, ...] | None = None
     finger: FingerRange = FingerRange()
     pace: float = 1.0
+    memory: float = 0.0
+    typical_speed: float = 1.0
     lock: float = 0.0
     unit: str = "m"
     drive_unit: str = "A"

@@ -214,6 +214,8 @@ def _numbers(model: BandModel, bands: Bands, rules: BankRules, feedback: bool) -
         presence=finger.presence,
         dc_quick=1.6 * quick,
         dc_drift_quick=quick**2,
+        memory=model.memory,
+        typical_speed=model.typical_speed,
         lock=2 * math.pi * model.lock,
         least_motion=finger.least_motion,
         typical_mass=finger.typical_mass,

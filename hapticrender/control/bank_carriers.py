@@ -16,6 +16,7 @@ from hapticrender.control.bank_finger import finger_stiffness
 from hapticrender.control.kernels import TURN
 
 FORGET = 50.0  # 1/s: a carrier near 0 Hz is forgotten, not followed
+SLOWEST = 0.1  # of the typical speed: a slower contact hardly modulates at all
 REFRESH = 64  # samples between two looks at the tones that are asked for
 
 
@@ -140,6 +141,13 @@ def look_ahead(numbers, band, law, t):
 
 
 @kernel
+def memory_damping(numbers, track):
+    """Damping of a contact that remembers a length of its way, beyond what it is at the typical speed."""
+    speed = size(read(track, row.VELOCITY))
+    return numbers.memory * (1.0 / high(speed, SLOWEST * numbers.typical_speed) - 1.0 / numbers.typical_speed)
+
+
+@kernel
 def law_tune(tables, state, t):
     """Law of a tile: D + z h h^T and its slope for every pair of coordinates, turned ahead."""
     band, law, touch, coordinates = state.band, state.law, state.touch, len(tables.shape)
@@ -149,6 +157,10 @@ def law_tune(tables, state, t):
     place = read(touch, row.KNOWN_PLACE)
     skin, drag = touching * read(touch, row.MASS), touching * read(touch, row.DAMPING)
     z_re, z_im = finger_stiffness(touch, band, t)
+    if tables.numbers.memory > 0.0:
+        lag = memory_damping(tables.numbers, state.track)
+        drag = drag + lag
+        z_im = z_im + omega * lag
     for c in range(coordinates):
         for i in range(coordinates):
             arms = (1.0 if c == 0 else place) * (1.0 if i == 0 else place)

@@ -62,6 +62,8 @@ class BankNumbers(NamedTuple):
     presence: bool  # targets are wanted only while a finger is there
     dc_quick: float  # of the DC band after a touch, and while no finger is there
     dc_drift_quick: float
+    memory: float  # damping times speed of a sliding contact; 0: none
+    typical_speed: float  # m/s: for which the device's own damping holds
     lock: float  # 1/s: pace at which the carriers follow the resonance; 0: not
     least_motion: float
     typical_mass: float

@@ -124,7 +124,7 @@ class SlidingParameters(Validated):
     memory_length: float = number(11.5e-6, "m", above=0.0)
     least_speed: float = number(1e-3, "m/s", above=0.0)
     tribometer_frequency: float = number(1300.0, "Hz", above=0.0)
-    tribometer_damping: float = number(0.5, above=0.0)
+    tribometer_damping: float = number(0.65, above=0.0)
     force_noise: float = number(1e-3, "N")
     force_range: float = number(20.0, "N", above=0.0)
     force_bits: int = number(0, least=0, most=24)
