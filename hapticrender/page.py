@@ -11,6 +11,7 @@ from urllib.parse import quote
 
 from hapticrender import __version__, wording
 from hapticrender.outputs import Outputs
+from hapticrender.page_devices import devices_section
 
 _MANY_BANDS = 10
 _AXIS = (1e-3, 10.0)  # relative errors at the ends of the little charts, logarithmic
@@ -62,12 +63,12 @@ def write_page(folder: Path, scenes: Sequence[Outputs]) -> Path:
         The page.
     """
     path = folder / "index.html"
-    path.write_text(page(folder, scenes), encoding="utf-8")
+    path.write_text(page(folder, scenes, devices_section(folder, scenes)), encoding="utf-8")
     return path
 
 
-def page(folder: Path, scenes: Sequence[Outputs]) -> str:
-    """HTML of the page: an introduction, a table of all scenes, and a section for each."""
+def page(folder: Path, scenes: Sequence[Outputs], devices: str = "") -> str:
+    """HTML of the page: an introduction, what `devices` share, a table of all scenes, and a section for each."""
     sections = "\n".join(_section(scene, quote(scene.folder.relative_to(folder).as_posix())) for scene in scenes)
     return f"""<!DOCTYPE html>
 <html lang="en">
@@ -80,6 +81,7 @@ def page(folder: Path, scenes: Sequence[Outputs]) -> str:
 <body>
 <h1>Textures, rendered in closed loop</h1>
 {_introduction(scenes)}
+{devices}
 {_overview(scenes)}
 {sections}
 <footer class="note">Made by hapticrender {escape(__version__)}.</footer>
@@ -93,11 +95,11 @@ def _introduction(scenes: Sequence[Outputs]) -> str:
     missed = sum(not scene.summary["passed"] for scene in scenes)
     methods = " and ".join(sorted({f"“{scene.summary['method']}”" for scene in scenes}))
     count = f"{missed or 'none'} of {len(scenes)} here {'does' if missed == 1 else 'do'}."
-    return f"""<p>hapticrender makes a finger feel a texture on a surface: it shakes a glass plate, listens to how the
-plate moves, and corrects the drive until the motion is the wanted one. Below, {_scenes(len(scenes))} ran in closed
-loop on a model of the plate with the method {escape(methods)}; each shows what was wanted, what the plate did at its
-centre and at both ends, and the current that it took. A scene misses its tolerance where the worst rms error of any
-band, at any of the three places, is larger; {count}</p>"""
+    return f"""<p>hapticrender makes a finger feel a texture on a surface: it shakes a glass plate, or changes the
+friction of a screen, listens to what happens, and corrects the drive until it is what was wanted. Below,
+{_scenes(len(scenes))} ran in closed loop on models of the devices with the method {escape(methods)}; each shows what
+was wanted, what the device did (a plate at its centre and at both ends), and the drive that it took. A scene misses its
+tolerance where the worst rms error of any band, at any of its places, is larger; {count}</p>"""
 
 
 def _scenes(count: int) -> str:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from hapticrender.formats import MissingExtra, replacing
-from hapticrender.picture import BLUE, GREEN, INK, ORANGE, RED, STYLE
+from hapticrender.picture import BLUE, GREEN, INK, ORANGE, QUANTITIES, RED, STYLE
 from hapticrender.recording import Recording
 from hapticrender.skin import felt_bands, skin_waveform
 
@@ -75,9 +75,8 @@ def _waveform(axes: Any, recording: Recording, device: str, colour: str) -> None
     milliseconds = 1e3 * (time - time[0])
     axes.plot(milliseconds, 1e3 * achieved, color=colour, lw=2.0, label="achieved")
     axes.plot(milliseconds, 1e3 * wanted, color=INK, lw=1.0, ls=(0, (4, 2)), label="wanted")
-    axes.set(
-        title=f"{device}  (drives {recording.header.drive_unit}, makes {recording.header.unit})", xlabel="time (ms)"
-    )
+    quantity = QUANTITIES.get(recording.header.unit, "motion")
+    axes.set(title=f"{device}, which makes {quantity}", xlabel="time (ms)")
     axes.margins(x=0, y=0.18)
     axes.legend(loc="upper right", ncols=2, borderaxespad=0.1)
 
