@@ -18,7 +18,6 @@ NYQUIST_MARGIN = 0.45  # of the rate: above this the hold's image cannot be told
 CHECK_STEP = 1e-3  # s: resolution at which the finger's path is checked against the surface
 LOOK_AHEAD = 30.0  # s of a scene that are looked at for the finger's speed and the drive that a waveform needs
 FASTEST = 10.0  # m/s: no finger is faster
-FADED = 1.25  # times the highest frequency: finger-locked carriers are silent beyond
 
 
 def check_path(scene: Scene, half: float, surface: str) -> None:
@@ -49,7 +48,7 @@ def felt(scene: Scene, bands: Bands, model: BandModel) -> Bands:
         bands,
         top_speed=min(top_speed(scene), FASTEST),
         lowest=max(model.lowest_frequency / 2, 1.0),
-        highest=FADED * model.highest_frequency,
+        highest=model.highest_edge * model.highest_frequency,
     )
     return replace(left, unfelt=tuple(each.text() for each in dropped))
 
@@ -108,7 +107,7 @@ def _need(scene: Scene, model: BandModel, bands: Bands, waveform: Waveform) -> _
 
 def _need_of_envelopes(scene: Scene, model: BandModel, bands: Bands) -> _Need:
     """Constant targets: a finger-locked carrier passes every frequency up to that of the finger's top speed."""
-    sweep = np.minimum(top_speed(scene) * bands.wavenumber, FADED * model.highest_frequency)
+    sweep = np.minimum(top_speed(scene) * bands.wavenumber, model.highest_edge * model.highest_frequency)
     top = bands.frequency + sweep
     low = np.where(bands.wavenumber > 0.0, np.minimum(model.lowest_frequency, top), top)
     passed = low + np.linspace(0.0, 1.0, 400)[:, None] * (top - low)

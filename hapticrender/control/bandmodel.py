@@ -86,6 +86,8 @@ class BandModel:
         The surface is known to have no mode of its own in reach.
     lowest_frequency, highest_frequency : float, Hz
         Finger-locked carriers fade out beyond these.
+    highest_edge : float
+        Times `highest_frequency`, where they have faded out, > 1; methods without a bank know 1.25 alone.
     shape : tuple of float, or None
         Pattern of the target over the coordinates; None: all of it in the first one.
     finger : FingerRange
@@ -127,6 +129,7 @@ class BandModel:
     block: int = 1
     lowest_frequency: float = 20.0
     highest_frequency: float = 1000.0
+    highest_edge: float = 1.25
     shape: tuple[float, ...] | None = None
     finger: FingerRange = FingerRange()
     pace: float = 1.0

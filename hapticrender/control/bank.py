@@ -202,6 +202,7 @@ def _numbers(model: BandModel, bands: Bands, rules: BankRules, feedback: bool) -
         ramp=period / RAMP_TIME * model.pace,
         lowest=model.lowest_frequency,
         highest=min(model.highest_frequency, 0.4 * model.rate),
+        highest_edge=float(model.highest_edge),
         contact_on=contact_on,
         contact_off=contact_off,
         drive_limit=float(model.drive_limit),

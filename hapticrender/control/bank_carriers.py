@@ -222,7 +222,9 @@ def motion_pass(numbers, band, track, t):
         felt = (wavenumber == 0.0) | felt
     ramp = lanes(band, t, row.RAMP)
     ramp = select(felt, low(ramp + numbers.ramp, 1.0), high(ramp - numbers.ramp, 0.0))
-    inside = ease(2.0 / numbers.lowest * size(hertz) - 1.0) * ease(5.0 - 4.0 / numbers.highest * size(hertz))
+    steep = 1.0 / (numbers.highest_edge - 1.0)
+    below = ease(steep * numbers.highest_edge - steep / numbers.highest * size(hertz))
+    inside = ease(2.0 / numbers.lowest * size(hertz) - 1.0) * below
     weight = lanes(band, t, row.LIVE) * ease(ramp) * select(wavenumber > 0.0, inside, 1.0)
     put(band, t, row.RAMP, ramp)
     put(band, t, row.WEIGHT, weight)

@@ -50,6 +50,7 @@ class BankNumbers(NamedTuple):
     ramp: float  # per sample
     lowest: float  # Hz
     highest: float
+    highest_edge: float  # times it: where finger-locked carriers have faded out
     contact_on: float  # N
     contact_off: float
     drive_limit: float
