@@ -3,23 +3,48 @@
 The target quantity is friction (N); the drive is an attraction (N) around a
 bias, which the square root turns into the envelope of the current on the
 carrier.  A driver of your own gets that envelope (A, peak), for an external
-modulator; it senses friction (N) on a tribometer, or nothing.
+modulator, or the carrier itself; it senses friction (N) on a tribometer, the
+attraction (N) that `control.gap` reads from voltage and current, or nothing.
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 from hapticrender.control.bandmodel import BandModel
 from hapticrender.control.square_root import SquareRoot
 from hapticrender.plants.electroadhesion import NORMAL, ElectroadhesionParameters, ElectroadhesionScreen
+from hapticrender.plants.sliding import choice, number
 from hapticrender.protocols import Array, Driver
 from hapticrender.renderers.friction import ROOM, FrictionRenderer, FrictionSettings, typical_load, typical_speed
-from hapticrender.renderers.shaped import ShapedDriver
+from hapticrender.renderers.shaped import CarrierDriver, ShapedDriver
 from hapticrender.touch.scene import Scene
 
-FLOOR = 0.05  # of the bias: the least attraction, which rounds off the cusps of the square root
 NOMINAL_GAP = 1.5e-6  # m
+
+
+@dataclass(frozen=True, kw_only=True)
+class ElectroadhesionSettings(FrictionSettings):
+    """What a scene's `plant` table says of the drive, beside the screen's own parameters.
+
+    Parameters
+    ----------
+    velocity_per_force : float, m/(N s)
+        See `FrictionSettings`.
+    square_root : {"on", "off"}
+        Whether the envelope is the root of the wanted attraction, or goes straight with it, naively.
+    headroom : float
+        Swing of the drive over what a nominal finger needs, >= 1: what is more is left to the feedback.
+    floor : float
+        Least attraction as a share of the bias, 0 to 0.5; rounds off the cusps of the square root.
+    output : {"envelope", "carrier"}
+        What a driver of your own is handed: the peak of the carrier, or the carrier itself; that takes a driver
+        without sensors whose rate is at least 4 times the carrier's frequency.
+    """
+
+    headroom: float = number(ROOM, least=1.0, most=100.0)
+    floor: float = number(0.05, most=0.5)
+    output: str = choice("envelope", "envelope", "carrier")
 
 
 class ElectroadhesionRenderer(FrictionRenderer):
@@ -30,24 +55,27 @@ class ElectroadhesionRenderer(FrictionRenderer):
 
     def plant(self, scene: Scene, seed: int) -> ElectroadhesionScreen:
         """Return the simulated screen, with the scene's overrides and finger."""
-        settings, parameters = _read(scene)
-        naive = settings.square_root == "off" or parameters.drive_kind == "voltage"
-        compensation = None if naive else self.compensation(scene)
-        return ElectroadhesionScreen(parameters, scene.finger, seed, compensation)
+        _, parameters = _read(scene)
+        if "open_loop_gain" not in scene.plant:
+            parameters = replace(parameters, open_loop_gain=_nominal(parameters).gain(typical_load(scene)))
+        return ElectroadhesionScreen(parameters, scene.finger, seed, self.compensation(scene))
 
     def connect(self, scene: Scene, driver: Driver) -> Driver:
-        """Return `driver` behind the square root: it gets the current's envelope (A, peak)."""
-        return ShapedDriver(driver, self.compensation(scene))
+        """Return `driver` behind the square root: it gets the current's envelope (A, peak), or the carrier."""
+        settings, parameters = _read(scene)
+        compensation = self.compensation(scene)
+        if settings.output == "envelope":
+            return ShapedDriver(driver, compensation)
+        return CarrierDriver(
+            driver, compensation, frequency=parameters.carrier_frequency, envelope_rate=parameters.rate
+        )
 
     def band_model(self, scene: Scene, driver: Driver) -> BandModel:
         """Return what the controller may know of the screen behind `driver`."""
         for name, value, known in (("drive", driver.drive_channels, (1,)), ("sensed", driver.sensed_channels, (0, 1))):
             if value not in known:
                 raise ValueError(f"driver.{name}_channels = {value}: must be {' or '.join(map(str, known))}")
-        settings, parameters = _read(scene)
         model = self._model(scene, driver.rate, driver.delay, driver.block)
-        if settings.square_root == "off":
-            return replace(model, drive_limit=parameters.current_limit, drive_unit="A")
         compensation = self.compensation(scene)
         return replace(model, drive_limit=compensation.bias - compensation.floor)
 
@@ -66,22 +94,28 @@ class ElectroadhesionRenderer(FrictionRenderer):
         Raises
         ------
         ValueError
-            The scene needs more attraction than the current source can make.
+            The scene needs more attraction than the source can make.
         """
-        _, parameters = _read(scene)
-        finger = _nominal(parameters)
-        load = typical_load(scene)
-        gain = finger.gain(load)
-        current = min(parameters.current_limit, parameters.voltage_limit / abs(finger.impedance(load)))
-        most = gain * current**2
-        need = self.needed(scene, self._model(scene, parameters.rate, 1, 1))
-        bias = ROOM * need / (1.0 - FLOOR)
-        if bias + ROOM * need > most:
+        settings, parameters = _read(scene)
+        finger, load = _nominal(parameters), typical_load(scene)
+        limit, unit = parameters.voltage_limit, "V"
+        if parameters.drive_kind == "current":
+            limit, unit = min(parameters.current_limit, limit / abs(finger.impedance(load))), "A"
+        most = float(finger.attraction(limit, load))
+        swing = settings.headroom * self.needed(scene, self._model(scene, parameters.rate, 1, 1))
+        bias = swing / (1.0 - settings.floor)
+        peak = bias + swing
+        if peak > most:
             raise ValueError(
-                f"texture.amplitude asks for an attraction of {bias + ROOM * need:.3g} N: must be <= {most:.3g} N, "
-                f"what {current:.3g} A make of a nominal finger of {load:.3g} N"
+                f"texture.amplitude asks for an attraction of {peak:.3g} N: must be <= {most:.3g} N, "
+                f"what {limit:.3g} {unit} make of a nominal finger of {load:.3g} N"
             )
-        return SquareRoot(bias=bias, floor=FLOOR * bias, gain=gain)
+        return SquareRoot(
+            bias=bias,
+            floor=settings.floor * bias,
+            gain=float(finger.attraction(1.0, load)),
+            straight=settings.square_root == "off",
+        )
 
     def _model(self, scene: Scene, rate: float, delay: int, block: int) -> BandModel:
         """Band model without its drive limit."""
@@ -100,9 +134,9 @@ class ElectroadhesionRenderer(FrictionRenderer):
         return model
 
 
-def _read(scene: Scene) -> tuple[FrictionSettings, ElectroadhesionParameters]:
-    settings, rest = FrictionSettings.split(scene.plant)
-    return settings, ElectroadhesionParameters.with_overrides(rest)
+def _read(scene: Scene) -> tuple[ElectroadhesionSettings, ElectroadhesionParameters]:
+    settings, rest = ElectroadhesionSettings.split(scene.plant)
+    return settings, ElectroadhesionParameters.with_overrides(rest)  # type: ignore[return-value]
 
 
 def _nominal(parameters: ElectroadhesionParameters) -> ElectroadhesionParameters:

@@ -1,11 +1,16 @@
-"""A driver behind a static shape of its drive, which a renderer puts between the controller and a user's device."""
+"""Drivers behind a static shape of their drive, which a renderer puts between the controller and a user's device."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Any
 
+import numpy as np
+
 from hapticrender.protocols import Array, Driver, Sensed
+
+LEAST_SAMPLES = 4  # in a turn of a carrier
 
 
 class ShapedDriver:
@@ -34,3 +39,64 @@ class ShapedDriver:
     def play(self, drive: Array) -> Sensed:
         """Play `shape` of a block."""
         return self.driver.play(self.shape(drive))
+
+
+class CarrierDriver(ShapedDriver):
+    """A driver without sensors that is handed the carrier itself: ``shape(drive) cos(2 pi frequency t)``.
+
+    The controller sees a device at a whole part of the driver's rate, whose drive is held from sample to sample.
+
+    Parameters
+    ----------
+    driver : Driver
+        The device; senses nothing, its rate at least 4 times `frequency`.
+    shape : callable
+        Envelope of the carrier, peak, from the controller's drive, sample by sample.
+    frequency : float, Hz
+        Of the carrier, > 0.
+    envelope_rate : float, Hz
+        Least rate of the envelope where the driver's is as large, > 0: the lowest that its block and delay allow.
+
+    Notes
+    -----
+    The carrier starts at its crest, so that a device that blocks direct current keeps no charge; its phase is counted
+    in 2^-64 of a turn.
+    """
+
+    def __init__(
+        self, driver: Driver, shape: Callable[[Array], Any], *, frequency: float, envelope_rate: float
+    ) -> None:
+        if driver.sensed_channels:
+            raise ValueError(
+                f"driver.sensed_channels = {driver.sensed_channels}: must be 0 where output = 'carrier'; "
+                "a driver that senses is handed the envelope"
+            )
+        if driver.rate < LEAST_SAMPLES * frequency:
+            raise ValueError(
+                f"driver.rate = {driver.rate:g} Hz: must be >= {LEAST_SAMPLES * frequency:g} Hz where output = "
+                f"'carrier', {LEAST_SAMPLES} samples a turn of {frequency:g} Hz"
+            )
+        super().__init__(driver, shape)
+        whole = math.gcd(driver.block, driver.delay)
+        most = max(int(driver.rate / envelope_rate), 1)
+        self.hold = max(each for each in range(1, min(whole, most) + 1) if whole % each == 0)
+        self.rate = driver.rate / self.hold
+        self.block, self.delay = driver.block // self.hold, driver.delay // self.hold
+        self._advance = np.uint64(round(frequency / driver.rate * 2**64))
+        self._phase = np.uint64(0)  # of the next sample, 2^64 a turn
+
+    def play(self, drive: Array) -> Sensed:
+        """Play the carrier under `shape` of a block."""
+        count = len(drive) * self.hold
+        phase = self._phase + np.arange(count, dtype=np.uint64) * self._advance
+        self._phase = np.uint64((int(self._phase) + count * int(self._advance)) % 2**64)
+        carrier = np.cos(2 * np.pi * 2.0**-64 * phase)
+        sensed = self.driver.play(np.repeat(self.shape(drive), self.hold, axis=0) * carrier[:, None])
+        return self._thinned(sensed)
+
+    def _thinned(self, sensed: Sensed) -> Sensed:
+        """Return what the device tells, once a sample of the envelope; flags of all of its samples."""
+        told = Sensed(*(None if column is None else column[:: self.hold] for column in sensed))
+        if sensed.flags is None:
+            return told
+        return told._replace(flags=np.bitwise_or.reduce(np.reshape(sensed.flags, (-1, self.hold)), axis=1))

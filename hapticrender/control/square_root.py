@@ -4,8 +4,12 @@ Electroadhesion attracts with ``F = g I^2``, so an attraction u around a bias as
 
     I = sqrt(max(bias + u, floor)/g)
 
-Without it a sinusoidal envelope gives a second harmonic of 25 % in the friction (FACTS section 5); Grigorii et al.
-2021 drive 6 mA sqrt((sin(2 pi f t) + 1)/2).  That envelope has cusps where it touches zero; the floor rounds them off.
+Without it the envelope goes straight from nothing to the same peak, and squaring leaves a second harmonic::
+
+    I = sqrt(2 bias/g) (1 + u/bias)/2,   g I^2 = bias/2 + u + u^2/(2 bias)
+
+which is 25 % of the first at u = bias sin(2 pi f t) (FACTS section 5); Grigorii et al. 2021 drive
+6 mA sqrt((sin(2 pi f t) + 1)/2).  That envelope has cusps where it touches zero; the floor rounds them off.
 """
 
 from __future__ import annotations
@@ -25,11 +29,12 @@ class SquareRootTables(NamedTuple):
     bias: float  # N
     floor: float  # N
     gain: float  # N/A^2
+    straight: bool
 
 
 @dataclass(frozen=True, kw_only=True)
 class SquareRoot:
-    """Attraction around a bias (N) to the peak of the current's envelope (A).
+    """Attraction around a bias (N) to the peak of the envelope of the current (A), or of the voltage where that is driven.
 
     Parameters
     ----------
@@ -38,8 +43,11 @@ class SquareRoot:
     floor : float, N
         Least attraction that is asked for, >= 0.  The slope of the current is that of a drive at the floor,
         1/(2 sqrt(floor gain)): a floor of 0 has no bound to it.
-    gain : float, N/A^2
+    gain : float, N/A^2 (or N/V^2)
         g of ``F = g I^2``, > 0.
+    straight : bool
+        Leave the square root out, for comparison: the envelope is straight in the drive, of the same peak at
+        a drive of `bias`, and of the same slope of attraction at none.
 
     Examples
     --------
@@ -50,6 +58,7 @@ class SquareRoot:
     bias: float
     floor: float
     gain: float
+    straight: bool = False
 
     def __post_init__(self) -> None:
         for name, bound, unit in (("bias", self.floor, "N"), ("gain", 0.0, "N/A^2")):
@@ -61,15 +70,21 @@ class SquareRoot:
 
     def __call__(self, drive: Any) -> Any:
         """Current envelope (A, peak) for a `drive` (N of attraction around the bias)."""
-        return np.sqrt(np.maximum(self.bias + np.asarray(drive, float), self.floor) / self.gain)
+        wanted = np.maximum(self.bias + np.asarray(drive, float), self.floor)
+        if self.straight:
+            return wanted / np.sqrt(2 * self.bias * self.gain)
+        return np.sqrt(wanted / self.gain)
 
     @property
     def tables(self) -> SquareRootTables:
         """Numbers of the compiled square root."""
-        return SquareRootTables(float(self.bias), float(self.floor), float(self.gain))
+        return SquareRootTables(float(self.bias), float(self.floor), float(self.gain), bool(self.straight))
 
 
 @kernel
 def square_root_step(tables, drive):
     """Current envelope (A, peak) of a finite drive (N)."""
-    return sqrt(max(tables.bias + drive, tables.floor) / tables.gain)
+    wanted = max(tables.bias + drive, tables.floor)
+    if tables.straight:
+        return wanted / sqrt(2.0 * tables.bias * tables.gain)
+    return sqrt(wanted / tables.gain)

@@ -248,12 +248,15 @@ class ElectroadhesionScreen:
     seed : int
         Of the noise.
     compensation : SquareRoot, optional
-        Makes the drive an attraction around its bias (N); by default it is the peak of the carrier (A or V).
+        Makes the drive an attraction around its bias (N), by a gain in N/A^2, or N/V^2 where a voltage is driven; by
+        default the drive is the peak of the carrier (A or V).
 
     Attributes
     ----------
     skin_velocity : ndarray, shape (n,), m/s
         Of the skin under friction, against the motion, over the samples of the last run.
+    attraction : ndarray, shape (n,), N
+        Mean over each of those samples.
     """
 
     delay = block = 1
@@ -266,13 +269,11 @@ class ElectroadhesionScreen:
         seed: int = 0,
         compensation: SquareRoot | None = None,
     ) -> None:
-        if compensation is not None and parameters.drive_kind != "current":
-            raise ValueError("compensation: must be None where drive_kind = 'voltage': it asks for a current")
         self.parameters = parameters
         self.finger = finger
         self.compensation = compensation
         self.rate = float(parameters.rate)
-        self.skin_velocity = np.zeros(0)
+        self.skin_velocity = self.attraction = np.zeros(0)
         self._rng = np.random.default_rng(seed)
         self._samples = 0
         self._tables = screen_tables(parameters, finger, compensation)
@@ -298,17 +299,18 @@ class ElectroadhesionScreen:
         """Advance by n samples under `drive` (shape (n, 1)); row i acts from sample i on, sensed at its start."""
         n = len(drive)
         finger, noise, flags = self._next(n)
-        sensed, motion, skin = np.zeros((n, 1)), np.zeros((n, 1)), np.zeros((n, 1))
+        sensed, motion, felt = np.zeros((n, 1)), np.zeros((n, 1)), np.zeros((n, 2))
         drive = np.ascontiguousarray(drive, float)
-        screen_run(self._tables, self._state, drive, finger, noise, sensed, motion, skin, flags)
-        self.skin_velocity = skin[:, 0]
+        screen_run(self._tables, self._state, drive, finger, noise, sensed, motion, felt, flags)
+        self.skin_velocity, self.attraction = felt.T
         return Sensed(sensed, finger[:, POSITION], motion, finger[:, LOAD], flags)
 
     def closed_loop(self, controller: Controller, wanted: Array) -> tuple[Array, Array, Array, Sensed]:
         """Advance screen and controller together, sample by sample, over `wanted` (N, shape (n,))."""
         n = len(wanted)
         finger, noise, flags = self._next(n)
-        sensed, motion, skin, drive = (np.zeros((n, 1)) for _ in range(4))
+        sensed, motion, drive = (np.zeros((n, 1)) for _ in range(3))
+        felt = np.zeros((n, 2))
         target = np.zeros((n, controller.n_bands), complex)
         closed_screen_run(
             self._tables,
@@ -321,12 +323,12 @@ class ElectroadhesionScreen:
             wanted,
             sensed,
             motion,
-            skin,
+            felt,
             drive,
             target,
             flags,
         )
-        self.skin_velocity = skin[:, 0]
+        self.skin_velocity, self.attraction = felt.T
         return drive, target, flags, Sensed(sensed, finger[:, POSITION], motion, finger[:, LOAD], flags)
 
 
@@ -365,7 +367,7 @@ def screen_tables(
         voltage=p.drive_kind == "voltage",
         sensing=p.sensor == "impedance",
         compensated=compensation is not None,
-        compensation=SquareRootTables(0.0, 0.0, 1.0) if compensation is None else compensation.tables,
+        compensation=SquareRootTables(0.0, 0.0, 1.0, False) if compensation is None else compensation.tables,
         substeps=int(p.oversampling),
         substep=substep,
         omega=p.omega,

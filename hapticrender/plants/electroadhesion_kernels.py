@@ -222,15 +222,19 @@ def attract(tables, state, drive, finger, noise):
 
 
 @kernel
-def screen_step(tables, state, drive, finger, noise, sensed, motion, skin):
-    """What is sensed at the start of a sample, which then passes under `drive`; returns flags."""
+def screen_step(tables, state, drive, finger, noise, sensed, motion, felt):
+    """What is sensed at the start of a sample, which then passes under `drive`; returns flags.
+
+    `felt` is the skin velocity (m/s) at the start and the attraction (N) over the sample.
+    """
     held = state.held
     reading, flags = held[FORCE], OPEN_LOOP if held[UNSENSED] > 0.0 else 0
     attraction, cut = attract(tables, state, drive, finger, noise)
     steady = tables.friction * (finger[LOAD] + attraction)
     friction, shown, skin_velocity = sliding_step(tables.sliding, state.sliding, steady, finger[SPEED], noise[0])
     motion[0] = friction
-    skin[0] = skin_velocity / finger[STRENGTH] if finger[STRENGTH] > 0.0 else 0.0
+    felt[0] = skin_velocity / finger[STRENGTH] if finger[STRENGTH] > 0.0 else 0.0
+    felt[1] = attraction
     if not tables.sensing:
         reading = shown
         if abs(shown) >= tables.sliding.force_range:
@@ -240,19 +244,19 @@ def screen_step(tables, state, drive, finger, noise, sensed, motion, skin):
 
 
 @kernel
-def screen_run(tables, state, drive, finger, noise, sensed, motion, skin, flags):
+def screen_run(tables, state, drive, finger, noise, sensed, motion, felt, flags):
     """A block of the screen alone; columns of `finger` are position, load, strength, speed."""
     for n in range(drive.shape[0]):
-        flags[n] = screen_step(tables, state, drive[n, 0], finger[n], noise[n], sensed[n], motion[n], skin[n])
+        flags[n] = screen_step(tables, state, drive[n, 0], finger[n], noise[n], sensed[n], motion[n], felt[n])
 
 
 @kernel
 def closed_screen_run(
-    tables, state, control, control_state, last, finger, noise, wanted, sensed, motion, skin, drive, target, flags
+    tables, state, control, control_state, last, finger, noise, wanted, sensed, motion, felt, drive, target, flags
 ):
     """Screen and controller closed sample by sample; `last` (1,) is the drive computed one sample ago."""
     step = step_of(control)
     for n in range(sensed.shape[0]):
         drive[n, 0] = last[0]
-        flags[n] = screen_step(tables, state, last[0], finger[n], noise[n], sensed[n], motion[n], skin[n])
+        flags[n] = screen_step(tables, state, last[0], finger[n], noise[n], sensed[n], motion[n], felt[n])
         flags[n] |= step(control, control_state, sensed[n], finger[n, POSITION], wanted[n], last, target[n])
