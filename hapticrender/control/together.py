@@ -232,6 +232,4 @@ def design_together(method: Method, model: TwoModels, bands: TwoBands, *, feedba
                 "crossover follows the finger, sample by sample"
             )
     coils, sensors = model.moved.force_from_drive.shape[1], model.moved.coordinate_from_sensed.shape[1]
-    return TogetherController(
-        *parts, bands, model.velocity_per_force, (sensors, 1), (coils, 1), listens=feedback
-    )
+    return TogetherController(*parts, bands, model.velocity_per_force, (sensors, 1), (coils, 1), listens=feedback)

@@ -1,0 +1,93 @@
+"""Predicted skin velocity: closed forms for every unit, and the picture and page of several devices."""
+
+import math
+
+import numpy as np
+import pytest
+
+import hapticrender as hr
+from hapticrender.skin import felt_bands, skin_waveform, velocity_per_unit
+
+FINGER = hr.Finger.sliding(speed=0.08, normal_load=0.4, mechanics="light")
+
+
+@pytest.fixture(scope="module")
+def recordings():
+    texture = hr.Grating(velocity=8e-3, frequency=60.0, partials=((1.0, 1.0, 0.0), (2.0, 0.5, 0.7)))
+    return {
+        device: hr.render(hr.Scene(texture=texture, finger=FINGER, device=device, duration=2.0))
+        for device in ("vt-plate", "electroadhesion")
+    }
+
+
+def test_a_displacement_moves_the_skin_by_its_derivative(recordings):
+    assert velocity_per_unit(recordings["vt-plate"], 60.0) == pytest.approx(2j * math.pi * 60.0)
+
+
+def test_a_friction_moves_it_by_the_matched_ratio(recordings):
+    assert velocity_per_unit(recordings["electroadhesion"], 60.0) == pytest.approx(0.64)
+
+
+def test_a_friction_moves_it_by_the_fingers_admittance_where_the_scene_says_so():
+    scene = hr.Scene(
+        texture=hr.Grating(velocity=8e-3, frequency=111.0),
+        finger=FINGER,
+        device="electroadhesion",
+        duration=1.5,
+        plant={"velocity_per_force": 0.0},
+    )
+    recording = hr.render(scene)
+    share = velocity_per_unit(recording, 111.0)
+    assert abs(share) == pytest.approx(0.484, abs=5e-4)  # FACTS 4, light finger, 4th order
+    [band] = felt_bands(recording)
+    assert band.wanted == pytest.approx(8e-3, rel=1e-9)
+    assert band.achieved == pytest.approx(8e-3, rel=0.02)
+
+
+def test_felt_bands_say_velocity_level_and_error(recordings):
+    for recording in recordings.values():
+        bands = felt_bands(recording)
+        assert [band.wanted for band in bands] == pytest.approx([8e-3, 8e-3], rel=1e-9)
+        assert [band.error for band in bands] == pytest.approx([0.0, 0.0], abs=0.02)
+        amplitude = 8e-3 / (2 * math.pi * 60.0)
+        assert bands[0].level == pytest.approx(hr.sensation_level(amplitude, 60.0), abs=0.2)
+
+
+def test_the_waveform_is_the_derivative_of_the_texture_on_both(recordings):
+    """Wanted is exact; achieved has the error of its envelopes, below 2 % of the sum of both partials."""
+    for recording in recordings.values():
+        time, wanted, achieved = skin_waveform(recording, 1.5, 0.05)
+        texture = recording.scene.texture
+        step = 1e-7
+        ahead, behind = (texture.waveform(time + side * step, np.full(time.shape, np.nan)) for side in (1, -1))
+        np.testing.assert_allclose(wanted, (ahead - behind) / (2 * step), atol=1e-6 * 16e-3)
+        np.testing.assert_allclose(achieved, wanted, atol=0.02 * 16e-3)
+
+
+def test_devices_are_drawn_side_by_side(recordings, tmp_path):
+    pytest.importorskip("matplotlib")
+    from hapticrender.skin_picture import draw_devices, plot_devices
+
+    figure = draw_devices(recordings)
+    assert [axes.get_title(loc="left").split(",")[0] for axes in figure.axes[:2]] == list(recordings)
+    plot_devices(recordings, tmp_path / "devices.png")
+    assert (tmp_path / "devices.png").read_bytes()[:4] == b"\x89PNG"
+
+
+def test_the_page_shows_what_devices_share(tmp_path):
+    from hapticrender.loop import prepare
+    from hapticrender.outputs import run_into
+    from hapticrender.page_devices import devices_section
+
+    texture = hr.Grating(velocity=8e-3, frequency=60.0)
+    outputs = [
+        run_into(
+            tmp_path / device,
+            prepare(hr.Scene(texture=texture, finger=FINGER, device=device, duration=1.0, name=device)),
+        )
+        for device in ("vt-plate", "ultrasonic")
+    ]
+    section = devices_section(tmp_path, outputs)
+    assert "One texture, 2 devices" in section
+    assert section.count("<td>8.00 mm/s</td>") == 1
+    assert devices_section(tmp_path, outputs[:1]) == ""
