@@ -226,6 +226,12 @@ def size(typingctx: Any, a: Any) -> Any:
 
 
 @intrinsic
+def signed(typingctx: Any, a: Any, b: Any) -> Any:
+    """Magnitude of a with the sign of b."""
+    return _elementwise(lambda builder, a, b: _call(builder, "llvm.copysign", a, b))(typingctx, a, b)
+
+
+@intrinsic
 def low(typingctx: Any, a: Any, b: Any) -> Any:
     """Smaller of two; b where a is not a number."""
     return _elementwise(lambda builder, a, b: builder.select(builder.fcmp_ordered("<", a, b), a, b))(typingctx, a, b)

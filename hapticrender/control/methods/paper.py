@@ -31,7 +31,7 @@ from hapticrender.control.polar_kernels import (
     PolarState,
     PolarTables,
 )
-from hapticrender.control.polar_passes import SCRATCH_ROWS, polar_run
+from hapticrender.control.polar_passes import SCRATCH_ROWS, TOLD_ROWS, polar_run
 from hapticrender.errors import DesignError
 from hapticrender.protocols import Array
 
@@ -98,6 +98,7 @@ def polar_state(tables: PolarTables, window: int, dtype: type) -> PolarState:
         doubt=np.zeros(1),
         sample=np.zeros(1, np.int64),
         shared=np.zeros((SHARED_ROWS + coordinates, REFRESH)),
+        told=np.zeros((TOLD_ROWS + 2 * coordinates, REFRESH), dtype),
         scratch=aligned((SCRATCH_ROWS + 2 * coordinates, REFRESH, width), dtype),
         sum=aligned((coordinates, REFRESH, width), dtype),
         window=aligned((window, rows, width), dtype),
