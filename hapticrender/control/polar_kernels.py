@@ -32,15 +32,16 @@ GATE_TIME = 0.02  # s: finger-locked targets fade in and out with contact
 REFRESH = 64  # samples between two looks at the tones; a block is cut there, too
 
 # rows of PolarState.band: what was asked for; fixed part of the carrier (turns) and its turn a sample; its direction
-# (+1, -1); the wanted envelope, its amplitude and direction (that of the last target that was not silence); phase of
-# what is wanted of a fixed carrier at the last refresh (turns); low-pass states of the wanted waveform
+# (+1, -1); the wanted envelope, its amplitude and direction (that of the last target that was not silence); the frame,
+# a direction that the carrier (COS, SIN) has been turned by, see `turn_frame`; phase of a fixed carrier turned by it at
+# the last refresh (turns); low-pass states of the wanted waveform
 LIVE, FREQUENCY, WAVENUMBER, PHASE, WANTED_RE, WANTED_IM = range(6)
 TURNS, COS, SIN, TURN_COS, TURN_SIN, FORWARD = range(6, 12)
-TARGET_RE, TARGET_IM, AMOUNT, HEADING_RE, HEADING_IM, START = range(12, 18)
-REF_RE1, REF_RE2, REF_IM1, REF_IM2 = range(18, 22)
-BAND_ROWS = 22
-# rows of PolarState.loop, LOOP_ROWS for each coordinate: low-pass states, states of amplitude and phase loop, X; drive
-# per metre from the look-up table, and the device's lag (rad)
+TARGET_RE, TARGET_IM, AMOUNT, HEADING_RE, HEADING_IM, FRAME_RE, FRAME_IM, START = range(12, 20)
+REF_RE1, REF_RE2, REF_IM1, REF_IM2 = range(20, 24)
+BAND_ROWS = 24
+# rows of PolarState.loop, LOOP_ROWS for each coordinate: low-pass states, states of amplitude and phase loop, X over the
+# frame; drive per metre from the look-up table, and the device's lag (rad)
 RE1, RE2, IM1, IM2, AMPLITUDE1, AMPLITUDE2, THETA1, THETA2, X_RE, X_IM, DRIVE, LAG = range(12)
 LOOP_ROWS = 12
 # entries of PolarState.finger
@@ -92,7 +93,7 @@ class PolarState(NamedTuple):
     shared: Array  # (SHARED_ROWS + coordinates, REFRESH) scratch
     told: Array  # (1 + 2 coordinates, REFRESH) scratch of a block's passes, in the precision of the bands
     scratch: Array  # (1 + 2 coordinates, REFRESH, W) scratch of theirs, see `polar_passes`
-    sum: Array  # (coordinates, REFRESH, W) scratch: drive of each coordinate, not yet summed over the lanes
+    sum: Array  # (coordinates, REFRESH, W) scratch, 0: drive of each coordinate, not yet summed over the lanes
     window: Array  # (length, tiles * 2 * coordinates, W) boxcar: what was heard; of length 0 with the STDFT*
     heap: Array  # (2, tiles * 2 * coordinates, W) its running sum, and one summed afresh
 
@@ -155,6 +156,34 @@ def aim(band, t, re, im):
 
 
 @kernel
+def in_frames(numbers, state):
+    """Whether fixed carriers may be counted from what is wanted: it is constant, and the STDFT* listens."""
+    return numbers.feedback and not numbers.analysed and not numbers.subtract and state.window.shape[0] == 0
+
+
+@kernel
+def turn_frame(state, t, aimed):
+    """Count a tile from the direction of what is wanted, which then is 1, or from 1; its low passes turn with it.
+
+    X/R then is the low pass's own output, and no sample has to turn it.
+    """
+    band, loop = state.band, state.loop
+    old_re, old_im = lanes(band, t, FRAME_RE), lanes(band, t, FRAME_IM)
+    h_re, h_im = lanes(band, t, HEADING_RE), lanes(band, t, HEADING_IM)
+    one = 1.0 + 0.0 * h_re
+    re, im = (h_re, h_im) if aimed else (one, 0.0 * one)
+    if any_of(size(re - old_re) + size(im - old_im) > 0.0):
+        by_re, by_im = old_re * re + old_im * im, old_im * re - old_re * im
+        for base in range(0, loop.shape[1], LOOP_ROWS):
+            for r in (0, 1):
+                x, y = lanes(loop, t, base + RE1 + r), lanes(loop, t, base + IM1 + r)
+                put(loop, t, base + RE1 + r, x * by_re - y * by_im)
+                put(loop, t, base + IM1 + r, x * by_im + y * by_re)
+        put(band, t, FRAME_RE, re)
+        put(band, t, FRAME_IM, im)
+
+
+@kernel
 def refresh(tables, state):
     """Take up the tones that are asked for; phases and look-ups of fixed carriers, whose targets stay if constant."""
     numbers, tone, band, width = tables.numbers, tables.tone, state.band, state.band.shape[2]
@@ -173,18 +202,20 @@ def refresh(tables, state):
             band[t, TURNS, i] = count_turns(state.phase, start + i, tone[0, start + i] / numbers.rate)
             if tone[1, start + i] > 0.0:
                 state.locked[t] = 1
-        if state.locked[t] == 0:
-            live = lanes(band, t, LIVE)
-            cos, sin = unit(lanes(band, t, TURNS) + lanes(band, t, PHASE))
-            put(band, t, COS, live * cos)
-            put(band, t, SIN, live * sin)
+        fixed = state.locked[t] == 0
+        if fixed and not numbers.analysed:
+            aim(band, t, lanes(band, t, WANTED_RE), lanes(band, t, WANTED_IM))
+        turn_frame(state, t, fixed and in_frames(numbers, state))
+        if fixed:
+            live, turns = lanes(band, t, LIVE), lanes(band, t, TURNS) + lanes(band, t, PHASE)
+            re, im = lanes(band, t, FRAME_RE), lanes(band, t, FRAME_IM)
+            cos, sin = unit(turns)
+            put(band, t, COS, live * (cos * re - sin * im))
+            put(band, t, SIN, live * (sin * re + cos * im))
+            put(band, t, START, turns + (1.0 / TURN) * polar(im, re)[1])
             cos, sin = unit(1.0 / numbers.rate * lanes(band, t, FREQUENCY))
             put(band, t, TURN_COS, cos)
             put(band, t, TURN_SIN, sin)
-            if not numbers.analysed:
-                aim(band, t, lanes(band, t, WANTED_RE), lanes(band, t, WANTED_IM))
-            _, angle = polar(lanes(band, t, HEADING_IM), lanes(band, t, HEADING_RE))
-            put(band, t, START, lanes(band, t, TURNS) + lanes(band, t, PHASE) + (1.0 / TURN) * angle)
 
 
 @kernel
@@ -334,9 +365,9 @@ def listen(tables, state, t, m, c):
 
 
 @kernel
-def answer(numbers, band, loop, t, base, x_re, x_im):
+def answer(numbers, band, loop, t, base, x_re, x_im, h_re, h_im):
     """Amplitude and phase loops of a coordinate: commanded amplitude (m) and phase (rad)."""
-    amount, h_re, h_im = lanes(band, t, AMOUNT), lanes(band, t, HEADING_RE), lanes(band, t, HEADING_IM)
+    amount = lanes(band, t, AMOUNT)
     if numbers.subtract:
         found, phase = polar(x_im, x_re)
         lag = phase - polar(h_im, h_re)[1]
@@ -367,12 +398,14 @@ def tile_step(tables, state, t, m, target):
             for r in range(DRIVE):
                 put(loop, t, base + r, 0.0 * lanes(loop, t, base + DRIVE))
     cos, sin = lanes(band, t, COS), lanes(band, t, SIN)
-    h_re, h_im = lanes(band, t, HEADING_RE), lanes(band, t, HEADING_IM)
+    f_re, f_im = lanes(band, t, FRAME_RE), lanes(band, t, FRAME_IM)
+    re, im = lanes(band, t, HEADING_RE), lanes(band, t, HEADING_IM)
+    h_re, h_im = re * f_re + im * f_im, im * f_re - re * f_im
     for c in range(tables.listen.shape[0]):
         base = c * LOOP_ROWS
         if numbers.feedback:
             x_re, x_im = listen(tables, state, t, m, c)
-            command, theta = answer(numbers, band, loop, t, base, x_re, x_im)
+            command, theta = answer(numbers, band, loop, t, base, x_re, x_im, h_re, h_im)
         else:  # straight from the look-up table, turned ahead by delay and hold
             speed = lanes(band, t, WAVENUMBER) * state.shared[SPEED, m]
             now = size(lanes(band, t, FREQUENCY) + speed)
@@ -384,7 +417,7 @@ def tile_step(tables, state, t, m, target):
 
 @kernel
 def gather(state, count):
-    """Sum the drive of each coordinate over the lanes, as far as it is trusted."""
+    """Sum the drive of each coordinate over the lanes, as far as it is trusted, and clear the sums for the next."""
     shared, coordinates = state.shared, state.sum.shape[0]
     for c in range(0, coordinates, 2):
         d = min(c + 1, coordinates - 1)
@@ -392,6 +425,8 @@ def gather(state, count):
             one, other = totals(1.0, lanes(state.sum, c, m), lanes(state.sum, d, m))
             shared[SHARED_ROWS + c, m] = shared[TRUST, m] * one
             shared[SHARED_ROWS + d, m] = shared[TRUST, m] * other
+            put(state.sum, c, m, 0.0 * lanes(state.band, 0, LIVE))
+            put(state.sum, d, m, 0.0 * lanes(state.band, 0, LIVE))
 
 
 @kernel
@@ -409,19 +444,11 @@ def speak(tables, state, m, drive):
 
 
 @kernel
-def silence(state, m):
-    """Start the sums of a sample."""
-    for c in range(state.sum.shape[0]):
-        put(state.sum, c, m, 0.0 * lanes(state.band, 0, LIVE))
-
-
-@kernel
 def polar_step(tables, state, sensed, position, wanted, drive, target):
     """One sample of the whole controller: fills `drive` (channels,) and `target` (bands,), returns flags."""
     if state.sample[0] % REFRESH == 0:
         refresh(tables, state)
     flags = share(tables, state, 0, sensed, position, wanted)
-    silence(state, 0)
     for t in range(state.band.shape[0]):
         tile_step(tables, state, t, 0, target)
     state.sample[0] += 1

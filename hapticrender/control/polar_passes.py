@@ -18,8 +18,6 @@ from hapticrender.control.polar_kernels import (
     DRIVE,
     FORWARD,
     FREQUENCY,
-    HEADING_IM,
-    HEADING_RE,
     LOOP_ROWS,
     RE1,
     REFRESH,
@@ -39,7 +37,6 @@ from hapticrender.control.polar_kernels import (
     refresh,
     section_step,
     share,
-    silence,
     speak,
     tile_step,
 )
@@ -105,35 +102,40 @@ def hear(tables, state, t, count, c, d):
 
 @kernel
 def compare(state, t, count, c):
-    """Amplitude and phase of X against what is wanted (eq. 3, 5)."""
-    band, scratch = state.band, state.scratch
-    amount, h_re, h_im = lanes(band, t, AMOUNT), lanes(band, t, HEADING_RE), lanes(band, t, HEADING_IM)
+    """Amplitude and phase of X against what is wanted, from which it is counted (eq. 3, 5)."""
+    scratch, amount = state.scratch, lanes(state.band, t, AMOUNT)
     for m in range(count):
         re, im = lanes(scratch, FIRST + 2 * c, m), lanes(scratch, FIRST + 2 * c + 1, m)
-        found, lag = polar(im * h_re - re * h_im, re * h_re + im * h_im)
+        found, lag = polar(im, re)
         put(scratch, FIRST + 2 * c, m, amount - found)
         put(scratch, FIRST + 2 * c + 1, m, lag)
 
 
 @kernel
-def decide(tables, state, t, count, c):
-    """Amplitude and phase loops of coordinate c, and the drive of a tile's bands, added to the coordinate's sum.
+def decide(tables, state, t, count, c, d):
+    """Amplitude and phase loops of coordinates c and d side by side; adds the drive of a tile's bands to their sums.
 
-    Re R A/|R| e^j(theta + psi) is one cosine; many of them are worked out while the loops wait for themselves.
+    A Re e^j(theta + psi + arg R) is one cosine, worked out while the loops wait for themselves.
     """
-    loop, scratch, law, floor = state.loop, state.scratch, tables.numbers.law, tables.numbers.floor
-    at, amounts = c * LOOP_ROWS + AMPLITUDE1, lanes(state.band, t, AMOUNT)
+    loop, scratch, law, floor, sums = state.loop, state.scratch, tables.numbers.law, tables.numbers.floor, state.sum
+    at, to, wanted = c * LOOP_ROWS + AMPLITUDE1, d * LOOP_ROWS + AMPLITUDE1, lanes(state.band, t, AMOUNT)
     a1, a2, p1, p2 = lanes(loop, t, at), lanes(loop, t, at + 1), lanes(loop, t, at + 2), lanes(loop, t, at + 3)
-    gain, sounds = law[0] * lanes(loop, t, c * LOOP_ROWS + DRIVE), select(amounts > QUIET, 1.0, 0.0 * amounts)
+    e1, e2, q1, q2 = lanes(loop, t, to), lanes(loop, t, to + 1), lanes(loop, t, to + 2), lanes(loop, t, to + 3)
+    gain, strength = law[0] * lanes(loop, t, c * LOOP_ROWS + DRIVE), law[0] * lanes(loop, t, d * LOOP_ROWS + DRIVE)
+    sounds = select(wanted > QUIET, 1.0, 0.0 * wanted)
     four = 4.0 * sounds
     for m in range(count):
-        amount, theta = lanes(scratch, FIRST + 2 * c, m), lanes(scratch, FIRST + 2 * c + 1, m)
-        amount, a1, a2 = clamped_step(law, a1, a2, amount, floor)
-        theta, p1, p2 = law_step(law, p1, p2, sounds, four, theta)
-        turns = lanes(scratch, WISH, m) - (law[0] / TURN) * theta
-        put(state.sum, c, m, lanes(state.sum, c, m) + gain * amount * cosine(turns))
+        wish, one, two = lanes(scratch, WISH, m), lanes(sums, c, m), lanes(sums, d, m)
+        amount, a1, a2 = clamped_step(law, a1, a2, lanes(scratch, FIRST + 2 * c, m), floor)
+        other, e1, e2 = clamped_step(law, e1, e2, lanes(scratch, FIRST + 2 * d, m), floor)
+        theta, p1, p2 = law_step(law, p1, p2, sounds, four, lanes(scratch, FIRST + 2 * c + 1, m))
+        turned, q1, q2 = law_step(law, q1, q2, sounds, four, lanes(scratch, FIRST + 2 * d + 1, m))
+        put(sums, c, m, one + gain * amount * cosine(wish - (law[0] / TURN) * theta))
+        put(sums, d, m, two + strength * other * cosine(wish - (law[0] / TURN) * turned))
     for r, value in enumerate((a1, a2, p1, p2)):
         put(loop, t, at + r, value)
+    for r, value in enumerate((e1, e2, q1, q2)):
+        put(loop, t, to + r, value)
 
 
 @kernel
@@ -147,7 +149,8 @@ def tile_block(tables, state, t, count, n, target):
         hear(tables, state, t, count, c, min(c + 1, coordinates - 1))
     for c in range(coordinates):
         compare(state, t, count, c)
-        decide(tables, state, t, count, c)
+    for c in range(0, coordinates, 2):
+        decide(tables, state, t, count, c, min(c + 1, coordinates - 1))
 
 
 @kernel
@@ -173,7 +176,6 @@ def polar_run(tables, state, sensed, position, wanted, drive, target, flags):
         count = min(REFRESH - state.sample[0] % REFRESH, sensed.shape[0] - n)
         for m in range(count):
             flags[n + m] = share(tables, state, m, sensed[n + m], position[n + m], wanted[n + m])
-            silence(state, m)
         passes = usual(tables, state, count)
         if passes:
             tell(tables, state, count)

@@ -23,6 +23,7 @@ from hapticrender.control.kernels import WAVENUMBER
 from hapticrender.control.polar_kernels import (
     BAND_ROWS,
     FORWARD,
+    FRAME_RE,
     HEADING_RE,
     LOOP_ROWS,
     REFRESH,
@@ -87,7 +88,7 @@ def polar_state(tables: PolarTables, window: int, dtype: type) -> PolarState:
     coordinates, bands = len(tables.listen), tables.tone.shape[1]
     tiles, width = padded(bands, dtype), WIDTH[np.dtype(dtype)]
     band = aligned((tiles, BAND_ROWS, width), dtype)
-    band[:, [FORWARD, HEADING_RE]] = 1.0
+    band[:, [FORWARD, HEADING_RE, FRAME_RE]] = 1.0
     rows = 2 * tiles * coordinates
     return PolarState(
         band=band,
