@@ -40,8 +40,8 @@ TURNS, COS, SIN, TURN_COS, TURN_SIN, FORWARD = range(6, 12)
 TARGET_RE, TARGET_IM, AMOUNT, HEADING_RE, HEADING_IM, FRAME_RE, FRAME_IM, START = range(12, 20)
 REF_RE1, REF_RE2, REF_IM1, REF_IM2 = range(20, 24)
 BAND_ROWS = 24
-# rows of PolarState.loop, LOOP_ROWS for each coordinate: low-pass states, states of amplitude and phase loop, X over the
-# frame; drive per metre from the look-up table, and the device's lag (rad)
+# rows of PolarState.loop, LOOP_ROWS for each coordinate: low-pass states, states of amplitude and phase loop, X over
+# the frame; drive per metre from the look-up table, and the device's lag (rad)
 RE1, RE2, IM1, IM2, AMPLITUDE1, AMPLITUDE2, THETA1, THETA2, X_RE, X_IM, DRIVE, LAG = range(12)
 LOOP_ROWS = 12
 # entries of PolarState.finger
