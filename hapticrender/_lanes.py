@@ -410,6 +410,21 @@ def stretch(typingctx: Any, array: Any, i: Any, j: Any) -> Any:
 
 
 @intrinsic
+def taken(typingctx: Any, array: Any, i: Any, j: Any, like: Any) -> Any:
+    """Read as many neighbours as `like` has lanes from a plain array of any precision, in the precision of `like`."""
+    if not _is_numbers(array, 2) or not isinstance(like, LaneType):
+        return None
+
+    def build(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        at = _number(context, builder, sig.args[0], *args[:3])
+        vector = ir.VectorType(_element(array.dtype), like.width)
+        value = builder.load(builder.bitcast(at, vector.as_pointer()), align=array.dtype.bitwidth // 8)
+        return _converted(builder, value, _element(like.dtype))
+
+    return like(array, types.intp, types.intp, like), build
+
+
+@intrinsic
 def put_stretch(typingctx: Any, array: Any, i: Any, j: Any, value: Any) -> Any:
     """Write as many neighbours as there are lanes, array[i, j:], wherever they start; their columns have to exist."""
     if not _is_numbers(array, 2) or array.dtype not in (types.float64, types.float32):

@@ -14,7 +14,7 @@ import math
 from typing import NamedTuple
 
 from hapticrender._jit import kernel
-from hapticrender._lanes import any_of, high, lanes, low, put, put_pairs, root, select, size, totals
+from hapticrender._lanes import any_of, high, lanes, low, put, put_pairs, root, select, size, taken, totals
 from hapticrender._polynomials import polar, unit
 from hapticrender.control.bank_carriers import count_turns
 from hapticrender.control.kernels import (
@@ -184,24 +184,39 @@ def turn_frame(state, t, aimed):
 
 
 @kernel
-def refresh(tables, state):
-    """Take up the tones that are asked for; phases and look-ups of fixed carriers, whose targets stay if constant."""
-    numbers, tone, band, width = tables.numbers, tables.tone, state.band, state.band.shape[2]
-    for t in range(band.shape[0]):
-        followed, state.locked[t], start = state.locked[t] > 0, 0, t * width
-        count = min(width, tone.shape[1] - start)
-        for i in range(count):
-            known, frequency = band[t, LIVE, i] > 0.0 and not followed, band[t, FREQUENCY, i]
-            band[t, LIVE, i], band[t, FREQUENCY, i] = 1.0, tone[0, start + i]
-            if not known or band[t, FREQUENCY, i] != frequency:
-                look_up(tables, state, t, i, tone[0, start + i])
+def take_tones(tables, state, t):
+    """Tones of a tile, as they are asked for now; their phases, and look-ups where they are new."""
+    tone, band, width, start = tables.tone, state.band, state.band.shape[2], t * state.band.shape[2]
+    count, known = min(width, tone.shape[1] - start), state.locked[t] == 0
+    if known and count == width:  # at most of the refreshes nothing is new
+        now = taken(tone, 0, start, lanes(band, t, FREQUENCY))
+        known = not any_of((lanes(band, t, LIVE) <= 0.0) | (size(now - lanes(band, t, FREQUENCY)) > 0.0))
         for r in range(1, tone.shape[0]):
-            for i in range(count):
-                band[t, FREQUENCY + r, i] = tone[r, start + i]
+            put(band, t, FREQUENCY + r, taken(tone, r, start, now))
+        state.locked[t] = 1 if any_of(lanes(band, t, WAVENUMBER) > 0.0) else 0
+    else:
+        state.locked[t] = 0
         for i in range(count):
-            band[t, TURNS, i] = count_turns(state.phase, start + i, tone[0, start + i] / numbers.rate)
+            frequency = band[t, FREQUENCY, i]
+            for r in range(tone.shape[0]):
+                band[t, FREQUENCY + r, i] = tone[r, start + i]
+            known = known and band[t, LIVE, i] > 0.0 and band[t, FREQUENCY, i] == frequency
             if tone[1, start + i] > 0.0:
                 state.locked[t] = 1
+    for i in range(count):
+        band[t, TURNS, i] = count_turns(state.phase, start + i, tone[0, start + i] / tables.numbers.rate)
+    if not known:
+        for i in range(count):
+            band[t, LIVE, i], band[t, FREQUENCY, i] = 1.0, tone[0, start + i]
+            look_up(tables, state, t, i, tone[0, start + i])
+
+
+@kernel
+def refresh(tables, state):
+    """Take up the tones that are asked for; phases and look-ups of fixed carriers, whose targets stay if constant."""
+    numbers, band = tables.numbers, state.band
+    for t in range(band.shape[0]):
+        take_tones(tables, state, t)
         fixed = state.locked[t] == 0
         if fixed and not numbers.analysed:
             aim(band, t, lanes(band, t, WANTED_RE), lanes(band, t, WANTED_IM))
