@@ -101,14 +101,16 @@ def hear(tables, state, t, count, c, d):
 
 
 @kernel
-def compare(state, t, count, c):
-    """Amplitude and phase of X against what is wanted, from which it is counted (eq. 3, 5)."""
+def compare(state, t, count, c, d):
+    """Amplitude and phase of X in coordinates c and d against what is wanted, from which it is counted (eq. 3, 5)."""
     scratch, amount = state.scratch, lanes(state.band, t, AMOUNT)
     for m in range(count):
-        re, im = lanes(scratch, FIRST + 2 * c, m), lanes(scratch, FIRST + 2 * c + 1, m)
-        found, lag = polar(im, re)
+        found, lag = polar(lanes(scratch, FIRST + 2 * c + 1, m), lanes(scratch, FIRST + 2 * c, m))
+        other, delay = polar(lanes(scratch, FIRST + 2 * d + 1, m), lanes(scratch, FIRST + 2 * d, m))
         put(scratch, FIRST + 2 * c, m, amount - found)
         put(scratch, FIRST + 2 * c + 1, m, lag)
+        put(scratch, FIRST + 2 * d, m, amount - other)
+        put(scratch, FIRST + 2 * d + 1, m, delay)
 
 
 @kernel
@@ -146,11 +148,10 @@ def tile_block(tables, state, t, count, n, target):
     for m in range(count if target.shape[0] > 1 else 1):
         put_pairs(target[n + m if target.shape[0] > 1 else 0], t, re, im)
     for c in range(0, coordinates, 2):
-        hear(tables, state, t, count, c, min(c + 1, coordinates - 1))
-    for c in range(coordinates):
-        compare(state, t, count, c)
-    for c in range(0, coordinates, 2):
-        decide(tables, state, t, count, c, min(c + 1, coordinates - 1))
+        d = min(c + 1, coordinates - 1)
+        hear(tables, state, t, count, c, d)
+        compare(state, t, count, c, d)
+        decide(tables, state, t, count, c, d)
 
 
 @kernel
