@@ -4,7 +4,7 @@ Coefficients interpolate at Chebyshev nodes: in x^2 of sin(2 pi x)/x and cos(2 p
 for |x| <= 1/2; and in t^2 of atan(t)/t and sqrt(1 + t^2) for |t| <= tan(pi/8), to which an octant shrinks when it is
 turned back by half of it: its singularity at t = +-j is then so far away that a term is worth 1.4 digits, not 0.77.
 The degree goes with the type: sine and cosine are good to 2.2e-15 in double and 2e-7 in single precision, the shorter
-cosine to 1.2e-10 and 1.5e-6, the angle to 2.3e-10 and 4e-7 rad, the magnitude to 1.8e-10 and 4e-7 of itself.
+cosine to 1.2e-10 and 1.5e-6, the angle to 2.3e-10 and 6.6e-7 rad, the magnitude to 1.8e-10 and 4e-7 of itself.
 """
 
 from __future__ import annotations
