@@ -1,6 +1,6 @@
-/* The same arithmetic as the library's polar passes, tuned by hand: bands in vector registers, three short passes over a
- * block of up to 64 samples with everything between them in L1, polynomials for sine, cosine and angle, sections in powers
- * of z - 1.  Compiled twice: -DSINGLE makes it float. */
+/* The same arithmetic as the library's polar passes, tuned by hand: bands in vector registers, three short passes over
+ * a block of up to 64 samples with everything between them in L1, polynomials for sine, cosine and angle, sections in
+ * powers of z - 1.  Compiled twice: -DSINGLE makes it float. */
 #include <math.h>
 #ifdef __AVX512DQ__
 #include <immintrin.h>
@@ -133,8 +133,10 @@ void NAME(Tile *tiles, int count, double rate, const double *filter, const doubl
             s = s * h_re + c * h_im, c = seed;
             polar(h_im, h_re, &seed, &angle);
             first += angle * (real)(0.5 / M_PI);
-            v a1 = tile->channel[0].re1, a2 = tile->channel[0].re2, b1 = tile->channel[0].im1, b2 = tile->channel[0].im2;
-            v e1 = tile->channel[1].re1, e2 = tile->channel[1].re2, f1 = tile->channel[1].im1, f2 = tile->channel[1].im2;
+            v a1 = tile->channel[0].re1, a2 = tile->channel[0].re2;
+            v b1 = tile->channel[0].im1, b2 = tile->channel[0].im2;
+            v e1 = tile->channel[1].re1, e2 = tile->channel[1].re2;
+            v f1 = tile->channel[1].im1, f2 = tile->channel[1].im2;
             for (int m = 0; m < block; m++) {
                 wish[m] = first + (real)m * step;
                 re[0][m] = low_pass(section, &a1, &a2, gain[0][m], c);
