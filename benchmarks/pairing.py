@@ -33,18 +33,22 @@ def use(cores: set[int]) -> None:
         os.sched_setaffinity(0, cores)
 
 
-def seconds(run: Run) -> float:
-    """Wall-clock time of one run."""
-    start = time.perf_counter()
+def seconds(run: Run, clock: Callable[[], float] = time.perf_counter) -> float:
+    """Time of one run."""
+    start = clock()
     run()
-    return time.perf_counter() - start
+    return clock() - start
 
 
-def interleave(candidate: Run, reference: Run, pairs: int) -> Paired:
-    """Run both `pairs` times in turns, after one run each that does not count."""
+def interleave(candidate: Run, reference: Run, pairs: int, clock: Callable[[], float] = time.perf_counter) -> Paired:
+    """Run both `pairs` times in turns, after one run each that does not count.
+
+    On a core that others share, a long run meets them and a short one does not: where one takes many times as long as
+    the other, and both work in this thread only, `clock` should be the thread's own, `time.thread_time`.
+    """
     candidate()
     reference()
-    rows = [(seconds(candidate), seconds(reference)) for _ in range(pairs)]
+    rows = [(seconds(candidate, clock), seconds(reference, clock)) for _ in range(pairs)]
     return Paired(
         candidate=statistics.median(row[0] for row in rows),
         reference=statistics.median(row[1] for row in rows),

@@ -226,6 +226,12 @@ def size(typingctx: Any, a: Any) -> Any:
 
 
 @intrinsic
+def signed(typingctx: Any, a: Any, b: Any) -> Any:
+    """Magnitude of a with the sign of b."""
+    return _elementwise(lambda builder, a, b: _call(builder, "llvm.copysign", a, b))(typingctx, a, b)
+
+
+@intrinsic
 def low(typingctx: Any, a: Any, b: Any) -> Any:
     """Smaller of two; b where a is not a number."""
     return _elementwise(lambda builder, a, b: builder.select(builder.fcmp_ordered("<", a, b), a, b))(typingctx, a, b)
@@ -401,6 +407,21 @@ def stretch(typingctx: Any, array: Any, i: Any, j: Any) -> Any:
         return builder.load(builder.bitcast(at, vector.as_pointer()), align=kind.dtype.bitwidth // 8)
 
     return kind(array, types.intp, types.intp), build
+
+
+@intrinsic
+def taken(typingctx: Any, array: Any, i: Any, j: Any, like: Any) -> Any:
+    """Read as many neighbours as `like` has lanes from a plain array of any precision, in the precision of `like`."""
+    if not _is_numbers(array, 2) or not isinstance(like, LaneType):
+        return None
+
+    def build(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        at = _number(context, builder, sig.args[0], *args[:3])
+        vector = ir.VectorType(_element(array.dtype), like.width)
+        value = builder.load(builder.bitcast(at, vector.as_pointer()), align=array.dtype.bitwidth // 8)
+        return _converted(builder, value, _element(like.dtype))
+
+    return like(array, types.intp, types.intp, like), build
 
 
 @intrinsic

@@ -20,6 +20,7 @@ from hapticrender._lanes import (
     read,
     root,
     select,
+    signed,
     size,
     stretch,
     total,
@@ -46,6 +47,7 @@ def arithmetic(a, out, factor):
         put(out, t, 9, high(x, 0.5))
         put(out, t, 10, select((x > y) & (y >= 0.0) | (x <= -1.0), x, 2.0 * y))
         put(out, t, 11, 3 * x)
+        put(out, t, 12, signed(x, y))
 
 
 def expected(x, y, factor):
@@ -62,6 +64,7 @@ def expected(x, y, factor):
         np.maximum(x, 0.5),
         np.where((x > y) & (y >= 0.0) | (x <= -1.0), x, 2.0 * y),
         3 * x,
+        np.copysign(x, y),
     ]
 
 
@@ -70,7 +73,7 @@ def test_every_operation_equals_numpy(dtype, rng):
     width = WIDTH[np.dtype(dtype)]
     a = aligned((3, 2, width), dtype)
     a[:] = 2.0 * rng.standard_normal(a.shape)
-    out = aligned((3, 12, width), dtype)
+    out = aligned((3, 13, width), dtype)
     arithmetic(a, out, 0.25)
     for row, wanted in enumerate(expected(a[:, 0], a[:, 1], dtype(0.25))):
         np.testing.assert_allclose(out[:, row], wanted, rtol=4 * np.finfo(dtype).eps, atol=np.finfo(dtype).eps)

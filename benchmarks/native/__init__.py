@@ -58,7 +58,7 @@ def library(source: str, *options: str) -> ctypes.CDLL:
 
 
 def _coefficients() -> list[str]:
-    names = ("S", "C", "A", "R", "S_SHORT", "C_SHORT", "A_SHORT", "R_SHORT")
+    names = [name + short for short in ("", "_SHORT") for name in ("S", "C", "A", "R", "W")]
     return [f"-DPOLY_{name}={','.join(map(repr, getattr(_polynomials, name)))}" for name in names]
 
 
@@ -130,8 +130,7 @@ class TunedPolar:
             self.state["channel"][:, c, 0] = padded
         options = [*_coefficients(), *(["-DSINGLE"] if dtype == np.float32 else [])]
         self.run_c = getattr(library("polar.c", *options), f"polar_{NAMES[dtype]}")
-        sections = (self.numbers.filter, self.numbers.law)
-        self.filter, self.law = (in_delta(s) if dtype == np.float32 else np.array(s) for s in sections)
+        self.filter, self.law = in_delta(self.numbers.filter), in_delta(self.numbers.law)
 
     def run(self, sides):
         """Drive (samples, 2) from the watched displacements (samples, 2), before any limit."""

@@ -1,19 +1,28 @@
-/* The same arithmetic as the library's polar kernel, tuned by hand: bands in vector registers, four short passes over a
- * block of up to 64 samples with everything between them in L1, polynomials for sine, cosine and angle.
- * Compiled twice: -DSINGLE makes it float with filters in powers of z - 1. */
+/* The same arithmetic as the library's polar passes, tuned by hand: bands in vector registers, three short passes over
+ * a block of up to 64 samples with everything between them in L1, polynomials for sine, cosine and angle, sections in
+ * powers of z - 1.  Compiled twice: -DSINGLE makes it float. */
 #include <math.h>
+#ifdef __AVX512DQ__
+#include <immintrin.h>
+#endif
 
 #ifdef SINGLE
 typedef float real;
 #define W 16
 #define NAME polar_single
 #define RINT(x) __builtin_rintf(x)
+#define TINY 1e-30f
+#define AVX(name) _mm512_##name##_ps
+#define MASK(name) _mm512_##name##_ps_mask
 typedef int mask_element;
 #else
 typedef double real;
 #define W 8
 #define NAME polar_double
 #define RINT(x) __builtin_rint(x)
+#define TINY 1e-150
+#define AVX(name) _mm512_##name##_pd
+#define MASK(name) _mm512_##name##_pd_mask
 typedef long mask_element;
 #endif
 typedef real v __attribute__((vector_size(64)));
@@ -26,147 +35,154 @@ typedef struct {
     struct { v drive, re1, re2, im1, im2, amplitude1, amplitude2, theta1, theta2; } channel[2];
 } Tile;
 
-typedef struct { real b0, b1, b2, a1, a2; } Section;
+typedef struct { real b0, b1, b2, a1, a2; } Section; /* b and a are those of powers of z - 1 */
 
-static inline v pick(mask m, v a, v b) { return (v)(((mask)a & m) | ((mask)b & ~m)); }
-static inline v size(v a) { return pick(a < 0, -a, a); }
 static inline v all(real a) { return a - (v){}; }
+#ifdef __AVX512DQ__
+static inline v size(v a) { return AVX(andnot)(all(-0.0), a); }
+static inline v larger_of(v a, v b) { return AVX(max)(a, b); }
+static inline v smaller_of(v a, v b) { return AVX(min)(a, b); }
+static inline v above(v a, v b, v yes, v no) { return AVX(mask_blend)(MASK(cmp)(a, b, _CMP_GT_OQ), no, yes); }
+static inline v nearest(v a) { return AVX(roundscale)(a, 8); }
+#else
+static inline v above(v a, v b, v yes, v no) {
+    mask m = a > b;
+    return (v)(((mask)yes & m) | ((mask)no & ~m));
+}
+static inline v size(v a) { return above(all(0), a, -a, a); }
+static inline v larger_of(v a, v b) { return above(a, b, a, b); }
+static inline v smaller_of(v a, v b) { return above(b, a, a, b); }
 static inline v nearest(v a) {
     v r;
     for (int i = 0; i < W; i++) r[i] = RINT(a[i]);
     return r;
 }
-
-static inline v section(Section s, v *s1, v *s2, v x) {
-    v y = s.b0 * x + *s1;
-#ifdef SINGLE
-    v middle = *s1 + *s2 + s.b1 * x - s.a1 * y; /* here b and a are those of powers of z - 1 */
-    *s2 = *s2 + s.b2 * x - s.a2 * y;
-    *s1 = middle;
-#else
-    *s1 = s.b1 * x - s.a1 * y + *s2;
-    *s2 = s.b2 * x - s.a2 * y;
 #endif
-    return y;
-}
+static inline v with_sign(v a, v b) { return (v)((mask)a | ((mask)b & (mask)all(-0.0))); } /* of a >= 0 */
 
 #ifdef SINGLE
 static const real S[] = {POLY_S_SHORT}, C[] = {POLY_C_SHORT}, A[] = {POLY_A_SHORT}, R[] = {POLY_R_SHORT};
+static const real O[] = {POLY_W_SHORT};
 #else
-static const real S[] = {POLY_S}, C[] = {POLY_C}, A[] = {POLY_A}, R[] = {POLY_R};
+static const real S[] = {POLY_S}, C[] = {POLY_C}, A[] = {POLY_A}, R[] = {POLY_R}, O[] = {POLY_W};
 #endif
+#define TERMS(x) ((int)(sizeof(x) / sizeof(*x)))
+
+static inline v horner(const real *c, int terms, v u) {
+    v p = all(c[terms - 1]);
+    for (int i = terms - 2; i >= 0; i--) p = c[i] + u * p;
+    return p;
+}
 
 static inline void unit(v turns, v *cosine, v *sine) {
+    v x = turns - nearest(turns), far = size(x), quarter = all(0.25);
+    v folded = above(far, quarter, with_sign(all(0.5), x) - x, x), u = folded * folded;
+    v c = horner(C, TERMS(C), u);
+    *cosine = above(far, quarter, -c, c);
+    *sine = folded * horner(S, TERMS(S), u);
+}
+
+static inline v cosine_of(v turns) {
     v x = turns - nearest(turns);
-    mask far = size(x) > (real)0.25;
-    x = pick(far, pick(x > 0, all(0.5), all(-0.5)) - x, x);
-    v u = x * x, u2 = u * u;
-#ifdef SINGLE
-    v s = S[0] + u * (S[1] + u * (S[2] + u * (S[3] + u * S[4])));
-    v c = C[0] + u * (C[1] + u * (C[2] + u * (C[3] + u * C[4])));
-#else
-    v s = (S[0] + S[1] * u) + (S[2] + S[3] * u) * u2 + ((S[4] + S[5] * u) + (S[6] + S[7] * u) * u2) * (u2 * u2);
-    v c = (C[0] + C[1] * u) + (C[2] + C[3] * u) * u2 + ((C[4] + C[5] * u) + (C[6] + C[7] * u) * u2) * (u2 * u2);
-#endif
-    *cosine = pick(far, -c, c);
-    *sine = s * x;
+    return horner(O, TERMS(O), x * x);
 }
 
+/* magnitude, and angle cut at 90 degrees */
 static inline void polar(v im, v re, v *magnitude, v *angle) {
-    v across = size(im), along = size(re);
-    mask steep = across > along;
-    v larger = pick(steep, across, along), smaller = pick(steep, along, across);
-    v t = smaller / pick(larger > (real)1e-30, larger, all((real)1e-30));
-    v u = t * t, u2 = u * u, u4 = u2 * u2;
-    v p = (A[0] + A[1] * u) + (A[2] + A[3] * u) * u2 + ((A[4] + A[5] * u) + (A[6] + A[7] * u) * u2) * u4;
-    v r = (R[0] + R[1] * u) + (R[2] + R[3] * u) * u2 + ((R[4] + R[5] * u) + (R[6] + R[7] * u) * u2) * u4;
-#ifndef SINGLE
-    p += ((A[8] + A[9] * u) + (A[10] + A[11] * u) * u2) * (u4 * u4);
-    r += ((R[8] + R[9] * u) + (R[10] + R[11] * u) * u2) * (u4 * u4);
-#endif
-    p = t * p;
-    p = pick(steep, (real)M_PI_2 - p, p);
-    p = pick(re < 0, (real)M_PI - p, p);
-    *magnitude = larger * r;
-    *angle = pick(im < 0, -p, p);
+    const real eighth = 0.41421356237309503; /* tan(pi/8) */
+    re += TINY;
+    v across = size(im), along = size(re), larger = larger_of(across, along), smaller = smaller_of(across, along);
+    v x = larger + eighth * smaller, t = (smaller - eighth * larger) / x, u = t * t;
+    v p = (real)(M_PI / 8) + t * horner(A, TERMS(A), u);
+    p = with_sign(above(across, along, (real)M_PI_2 - p, p), im);
+    *magnitude = x * horner(R, TERMS(R), u);
+    *angle = above(all(0), re, -(real)M_PI - p, p);
 }
 
-/* y and drive: (samples, 2), double; filter and law: b0 b1 b2 a1 a2, in powers of z - 1 for float */
+static inline v low_pass(Section s, v *s1, v *s2, real gain, v x) {
+    v y = gain * x + *s1, slow = 4 * gain * x + *s2;
+    *s1 = *s1 + slow - s.a1 * y;
+    *s2 = slow - s.a2 * y;
+    return y;
+}
+
+/* y and drive: (samples, 2), double; filter and law: b0 b1 b2 a1 a2 in powers of z - 1, zeros at -1, law a pole at 1 */
 void NAME(Tile *tiles, int count, double rate, const double *filter, const double *law,
           const double *y, double *drive, int samples) {
-    Section low_pass = {filter[0], filter[1], filter[2], filter[3], filter[4]};
+    Section section = {filter[0], filter[1], filter[2], filter[3], filter[4]};
     Section loop = {law[0], law[1], law[2], law[3], law[4]};
-    v cosine[BLOCK], sine[BLOCK], re[BLOCK], im[BLOCK], sum[2][BLOCK];
+    const real turn = loop.b0 * (real)(0.5 / M_PI);
+    v wish[BLOCK], re[2][BLOCK], im[2][BLOCK], sum[2][BLOCK];
+    real gain[2][BLOCK];
     for (int start = 0; start < samples; start += BLOCK) {
         int block = samples - start < BLOCK ? samples - start : BLOCK;
-        for (int m = 0; m < block; m++) sum[0][m] = sum[1][m] = (v){};
+        for (int m = 0; m < block; m++)
+            for (int k = 0; k < 2; k++) sum[k][m] = (v){}, gain[k][m] = 2 * section.b0 * (real)y[2 * (start + m) + k];
         for (int t = 0; t < count; t++) {
             Tile *tile = &tiles[t];
-            v c, s, turn_c, turn_s;
-            for (int i = 0; i < W; i++) { /* seeded anew each block, in double */
-                c[i] = cos(2 * M_PI * tile->turns[i]), s[i] = sin(2 * M_PI * tile->turns[i]);
-                double step = tile->frequency[i] / rate;
-                turn_c[i] = cos(2 * M_PI * step), turn_s[i] = sin(2 * M_PI * step);
-                tile->turns[i] += step * block;
-                tile->turns[i] -= floor(tile->turns[i]);
+            v c, s, turn_c, turn_s, angle, step, first, h_re = tile->heading_re, h_im = tile->heading_im;
+            for (int i = 0; i < W; i++) { /* seeded anew each block, from double */
+                double turns = tile->turns[i], advance = tile->frequency[i] / rate;
+                first[i] = turns, step[i] = advance;
+                turns += advance * block;
+                tile->turns[i] = turns - floor(turns);
             }
+            unit(first, &c, &s);
+            unit(step, &turn_c, &turn_s);
+            v seed = c * h_re - s * h_im;
+            s = s * h_re + c * h_im, c = seed;
+            polar(h_im, h_re, &seed, &angle);
+            first += angle * (real)(0.5 / M_PI);
+            v a1 = tile->channel[0].re1, a2 = tile->channel[0].re2;
+            v b1 = tile->channel[0].im1, b2 = tile->channel[0].im2;
+            v e1 = tile->channel[1].re1, e2 = tile->channel[1].re2;
+            v f1 = tile->channel[1].im1, f2 = tile->channel[1].im2;
             for (int m = 0; m < block; m++) {
-                cosine[m] = c, sine[m] = s;
+                wish[m] = first + (real)m * step;
+                re[0][m] = low_pass(section, &a1, &a2, gain[0][m], c);
+                im[0][m] = low_pass(section, &b1, &b2, -gain[0][m], s);
+                re[1][m] = low_pass(section, &e1, &e2, gain[1][m], c);
+                im[1][m] = low_pass(section, &f1, &f2, -gain[1][m], s);
                 v next = c * turn_c - s * turn_s;
                 s = s * turn_c + c * turn_s;
                 c = next;
             }
-            v h_re = tile->heading_re, h_im = tile->heading_im, amount = tile->amplitude;
-            for (int channel = 0; channel < 2; channel++) {
-                v re1 = tile->channel[channel].re1, re2 = tile->channel[channel].re2;
-                v im1 = tile->channel[channel].im1, im2 = tile->channel[channel].im2;
+            tile->channel[0].re1 = a1, tile->channel[0].re2 = a2, tile->channel[0].im1 = b1, tile->channel[0].im2 = b2;
+            tile->channel[1].re1 = e1, tile->channel[1].re2 = e2, tile->channel[1].im1 = f1, tile->channel[1].im2 = f2;
+            v amount = tile->amplitude;
+            for (int k = 0; k < 2; k++)
                 for (int m = 0; m < block; m++) {
-                    real twice = 2 * y[2 * (start + m) + channel];
-                    re[m] = section(low_pass, &re1, &re2, twice * cosine[m]);
-                    im[m] = section(low_pass, &im1, &im2, -twice * sine[m]);
+                    v magnitude;
+                    polar(im[k][m], re[k][m], &magnitude, &im[k][m]);
+                    re[k][m] = amount - magnitude;
                 }
-                tile->channel[channel].re1 = re1, tile->channel[channel].re2 = re2;
-                tile->channel[channel].im1 = im1, tile->channel[channel].im2 = im2;
-                for (int m = 0; m < block; m++) {
-                    v magnitude, lag;
-                    polar(im[m] * h_re - re[m] * h_im, re[m] * h_re + im[m] * h_im, &magnitude, &lag);
-                    re[m] = amount - magnitude;
-                    im[m] = pick(lag > (real)M_PI_2, lag - (real)(2 * M_PI), lag);
+            v state1[2], state2[2], theta1[2], theta2[2], strength[2];
+            for (int k = 0; k < 2; k++) {
+                state1[k] = tile->channel[k].amplitude1, state2[k] = tile->channel[k].amplitude2;
+                theta1[k] = tile->channel[k].theta1, theta2[k] = tile->channel[k].theta2;
+                strength[k] = loop.b0 * tile->channel[k].drive;
+            }
+            for (int m = 0; m < block; m++)
+                for (int k = 0; k < 2; k++) {
+                    v error = re[k][m], lag = im[k][m], free = error + state1[k], slow = 4 * error + state2[k];
+                    v command = larger_of(free, all(0)), held = command - free;
+                    state1[k] = 2 * held + (state1[k] + slow - loop.a1 * command);
+                    state2[k] = slow + held;
+                    v theta = lag + theta1[k], drift = 4 * lag + theta2[k];
+                    theta1[k] = theta1[k] + drift - loop.a1 * theta;
+                    theta2[k] = drift;
+                    sum[k][m] += strength[k] * command * cosine_of(wish[m] - turn * theta);
                 }
-                v theta1 = tile->channel[channel].theta1, theta2 = tile->channel[channel].theta2;
-                v state1 = tile->channel[channel].amplitude1, state2 = tile->channel[channel].amplitude2;
-                for (int m = 0; m < block; m++) {
-                    im[m] = section(loop, &theta1, &theta2, -im[m]);
-                    v error = re[m], command = loop.b0 * error + state1;
-                    mask held = command < 0;
-                    command = pick(held, (v){}, command);
-#ifdef SINGLE
-                    state1 = pick(held, -loop.b0 * error, state1), state2 = pick(held, (v){}, state2);
-                    v middle = state1 + state2 + loop.b1 * error - loop.a1 * command;
-                    state2 = state2 + loop.b2 * error - loop.a2 * command;
-                    state1 = middle;
-#else
-                    state1 = loop.b1 * error - loop.a1 * command + state2;
-                    state2 = loop.b2 * error - loop.a2 * command;
-#endif
-                    re[m] = command;
-                }
-                tile->channel[channel].theta1 = theta1, tile->channel[channel].theta2 = theta2;
-                tile->channel[channel].amplitude1 = state1, tile->channel[channel].amplitude2 = state2;
-                v gain = tile->channel[channel].drive;
-                for (int m = 0; m < block; m++) {
-                    v p, q;
-                    unit(im[m] * (real)(0.5 / M_PI), &p, &q);
-                    v carried = (h_re * p - h_im * q) * cosine[m] - (h_re * q + h_im * p) * sine[m];
-                    sum[channel][m] += re[m] * gain * carried;
-                }
+            for (int k = 0; k < 2; k++) {
+                tile->channel[k].amplitude1 = state1[k], tile->channel[k].amplitude2 = state2[k];
+                tile->channel[k].theta1 = theta1[k], tile->channel[k].theta2 = theta2[k];
             }
         }
         for (int m = 0; m < block; m++)
-            for (int channel = 0; channel < 2; channel++) {
+            for (int k = 0; k < 2; k++) {
                 double total = 0.0;
-                for (int i = 0; i < W; i++) total += sum[channel][m][i];
-                drive[2 * (start + m) + channel] = total;
+                for (int i = 0; i < W; i++) total += sum[k][m][i];
+                drive[2 * (start + m) + k] = total;
             }
     }
 }

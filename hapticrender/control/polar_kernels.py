@@ -11,13 +11,10 @@ all tiles share is written down before; blocks are in `polar_passes`.
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
-from numba.core import types
-from numba.extending import overload
-
-from hapticrender._jit import OPTIONS, kernel
-from hapticrender._lanes import LaneType, any_of, high, lanes, low, put, put_pairs, root, select, size, total
+from hapticrender._jit import kernel
+from hapticrender._lanes import any_of, high, lanes, low, put, put_pairs, root, select, size, taken, totals
 from hapticrender._polynomials import polar, unit
 from hapticrender.control.bank_carriers import count_turns
 from hapticrender.control.kernels import (
@@ -35,15 +32,16 @@ GATE_TIME = 0.02  # s: finger-locked targets fade in and out with contact
 REFRESH = 64  # samples between two looks at the tones; a block is cut there, too
 
 # rows of PolarState.band: what was asked for; fixed part of the carrier (turns) and its turn a sample; its direction
-# (+1, -1); the wanted envelope, its amplitude and direction (that of the last target that was not silence); low-pass
-# states of the wanted waveform
+# (+1, -1); the wanted envelope, its amplitude and direction (that of the last target that was not silence); the frame,
+# a direction that the carrier (COS, SIN) has been turned by, see `turn_frame`; phase of a fixed carrier turned by it at
+# the last refresh (turns); low-pass states of the wanted waveform
 LIVE, FREQUENCY, WAVENUMBER, PHASE, WANTED_RE, WANTED_IM = range(6)
 TURNS, COS, SIN, TURN_COS, TURN_SIN, FORWARD = range(6, 12)
-TARGET_RE, TARGET_IM, AMOUNT, HEADING_RE, HEADING_IM = range(12, 17)
-REF_RE1, REF_RE2, REF_IM1, REF_IM2 = range(17, 21)
-BAND_ROWS = 21
-# rows of PolarState.loop, LOOP_ROWS for each coordinate: low-pass states, states of amplitude and phase loop, X; drive
-# per metre from the look-up table, and the device's lag (rad)
+TARGET_RE, TARGET_IM, AMOUNT, HEADING_RE, HEADING_IM, FRAME_RE, FRAME_IM, START = range(12, 20)
+REF_RE1, REF_RE2, REF_IM1, REF_IM2 = range(20, 24)
+BAND_ROWS = 24
+# rows of PolarState.loop, LOOP_ROWS for each coordinate: low-pass states, states of amplitude and phase loop, X over
+# the frame; drive per metre from the look-up table, and the device's lag (rad)
 RE1, RE2, IM1, IM2, AMPLITUDE1, AMPLITUDE2, THETA1, THETA2, X_RE, X_IM, DRIVE, LAG = range(12)
 LOOP_ROWS = 12
 # entries of PolarState.finger
@@ -65,8 +63,8 @@ class PolarNumbers(NamedTuple):
     highest: float  # Hz
     floor: float  # m: least command amplitude, 0; naive: -inf
     subtract: bool  # naive: phase of X minus phase of R, each with its own seam
-    filter: Section  # low pass of the STDFT*
-    law: Section  # loop controller
+    filter: Section  # low pass of the STDFT*, both zeros at half the rate
+    law: Section  # loop controller, both zeros at half the rate, a pole at 1
     table_step: float  # Hz
     lead: float  # s: known delay and half the hold
 
@@ -93,60 +91,38 @@ class PolarState(NamedTuple):
     doubt: Array  # (1,) 0: the sensors are believed, 1: they are not
     sample: Array  # (1,) integer: samples so far
     shared: Array  # (SHARED_ROWS + coordinates, REFRESH) scratch
-    scratch: Array  # (2 + 2 coordinates, REFRESH, W) scratch of a block's passes, see `polar_passes`
-    sum: Array  # (coordinates, REFRESH, W) scratch: drive of each coordinate, not yet summed over the lanes
+    told: Array  # (1 + 2 coordinates, REFRESH) scratch of a block's passes, in the precision of the bands
+    scratch: Array  # (1 + 2 coordinates, REFRESH, W) scratch of theirs, see `polar_passes`
+    sum: Array  # (coordinates, REFRESH, W) scratch, 0: drive of each coordinate, not yet summed over the lanes
     window: Array  # (length, tiles * 2 * coordinates, W) boxcar: what was heard; of length 0 with the STDFT*
     heap: Array  # (2, tiles * 2 * coordinates, W) its running sum, and one summed afresh
 
 
-def section_step(section: Any, state1: Any, state2: Any, x: Any) -> Any:
-    """Second-order section; returns output and new states."""
-    raise TypeError("section_step: to be called from a kernel")
+@kernel
+def section_step(section, state1, state2, gain, four, x):
+    """Low pass with both zeros at half the rate, b0 (1 + z^-1)^2; `gain` is b0 and what else x is to be multiplied by.
+
+    In powers of z - 1, where poles near 1 keep their place in single precision.  `four` is 4 gain.  Returns output and
+    new states.
+    """
+    y, slow = gain * x + state1, four * x + state2
+    return y, state1 + slow - (2.0 + section[3]) * y, slow - (1.0 + section[3] + section[4]) * y
 
 
-def clamped_step(section: Any, state1: Any, state2: Any, x: Any, floor: Any) -> Any:
-    """Second-order section whose output stops at `floor`, and whose states know it."""
-    raise TypeError("clamped_step: to be called from a kernel")
+@kernel
+def law_step(law, state1, state2, weight, four, x):
+    """The same with a pole at 1 and, for want of b0, an output of 1/b0; x counts by its weight, 1 or 0."""
+    y, slow = weight * x + state1, four * x + state2
+    return y, state1 + slow - (2.0 + law[3]) * y, slow
 
 
-def _is_short(kind: Any) -> bool:
-    return isinstance(kind, LaneType) and kind.dtype == types.float32
-
-
-@overload(section_step, jit_options=OPTIONS)
-def _section_step(section, state1, state2, x):  # type: ignore[no-untyped-def]
-    def direct(section, state1, state2, x):  # type: ignore[no-untyped-def]
-        """Transposed direct form II."""
-        y = section[0] * x + state1
-        return y, section[1] * x - section[3] * y + state2, section[2] * x - section[4] * y
-
-    def delta(section, state1, state2, x):  # type: ignore[no-untyped-def]
-        """The same in powers of z - 1: poles near 1 keep their place in single precision."""
-        y = section[0] * x + state1
-        middle = state1 + state2 + (2.0 * section[0] + section[1]) * x - (2.0 + section[3]) * y
-        slow = state2 + (section[0] + section[1] + section[2]) * x - (1.0 + section[3] + section[4]) * y
-        return y, middle, slow
-
-    return delta if _is_short(state1) else direct
-
-
-@overload(clamped_step, jit_options=OPTIONS)
-def _clamped_step(section, state1, state2, x, floor):  # type: ignore[no-untyped-def]
-    def direct(section, state1, state2, x, floor):  # type: ignore[no-untyped-def]
-        y = high(section[0] * x + state1, floor)
-        return y, section[1] * x - section[3] * y + state2, section[2] * x - section[4] * y
-
-    def delta(section, state1, state2, x, floor):  # type: ignore[no-untyped-def]
-        """At the floor the states are those of an output that has always been there."""
-        free = section[0] * x + state1
-        held = free < floor
-        y = select(held, floor, free)
-        state1, state2 = select(held, y - section[0] * x, state1), select(held, (2.0 + section[3]) * y, state2)
-        middle = state1 + state2 + (2.0 * section[0] + section[1]) * x - (2.0 + section[3]) * y
-        slow = state2 + (section[0] + section[1] + section[2]) * x - (1.0 + section[3] + section[4]) * y
-        return y, middle, slow
-
-    return delta if _is_short(state1) else direct
+@kernel
+def clamped_step(law, state1, state2, x, floor):
+    """`law_step` whose output stops at `floor`, and whose states know it; what waits for the output comes last."""
+    free, slow = x + state1, 4.0 * x + state2
+    y = high(free, floor)
+    held = y - free
+    return y, 2.0 * held + (state1 + slow - (2.0 + law[3]) * y), slow + held
 
 
 @kernel
@@ -155,13 +131,6 @@ def lookup(table, c, step, frequency):
     at = min(frequency / step, table.shape[1] - 1.000001)
     i = int(at)
     return table[c, i] + (at - i) * (table[c, i + 1] - table[c, i])
-
-
-@kernel
-def polar_cut_at_90(im, re):
-    """Magnitude, and angle in (-270, 90] deg: the discontinuity lies far from the phases of a passive plate."""
-    magnitude, phase = polar(im, re)
-    return magnitude, select(phase > 0.25 * TURN, phase - TURN, phase)
 
 
 @kernel
@@ -187,32 +156,81 @@ def aim(band, t, re, im):
 
 
 @kernel
+def in_frames(numbers, state):
+    """Whether fixed carriers may be counted from what is wanted: it is constant, and the STDFT* listens."""
+    return numbers.feedback and not numbers.analysed and not numbers.subtract and state.window.shape[0] == 0
+
+
+@kernel
+def turn_frame(state, t, aimed):
+    """Count a tile from the direction of what is wanted, which then is 1, or from 1; its low passes turn with it.
+
+    X/R then is the low pass's own output, and no sample has to turn it.
+    """
+    band, loop = state.band, state.loop
+    old_re, old_im = lanes(band, t, FRAME_RE), lanes(band, t, FRAME_IM)
+    h_re, h_im = lanes(band, t, HEADING_RE), lanes(band, t, HEADING_IM)
+    one = 1.0 + 0.0 * h_re
+    re, im = (h_re, h_im) if aimed else (one, 0.0 * one)
+    if any_of(size(re - old_re) + size(im - old_im) > 0.0):
+        by_re, by_im = old_re * re + old_im * im, old_im * re - old_re * im
+        for base in range(0, loop.shape[1], LOOP_ROWS):
+            for r in (0, 1):
+                x, y = lanes(loop, t, base + RE1 + r), lanes(loop, t, base + IM1 + r)
+                put(loop, t, base + RE1 + r, x * by_re - y * by_im)
+                put(loop, t, base + IM1 + r, x * by_im + y * by_re)
+        put(band, t, FRAME_RE, re)
+        put(band, t, FRAME_IM, im)
+
+
+@kernel
+def take_tones(tables, state, t):
+    """Tones of a tile, as they are asked for now; their phases, and look-ups where they are new."""
+    tone, band, width, start = tables.tone, state.band, state.band.shape[2], t * state.band.shape[2]
+    count, known = min(width, tone.shape[1] - start), state.locked[t] == 0
+    if known and count == width:  # at most of the refreshes nothing is new
+        now = taken(tone, 0, start, lanes(band, t, FREQUENCY))
+        known = not any_of((lanes(band, t, LIVE) <= 0.0) | (size(now - lanes(band, t, FREQUENCY)) > 0.0))
+        for r in range(1, tone.shape[0]):
+            put(band, t, FREQUENCY + r, taken(tone, r, start, now))
+        state.locked[t] = 1 if any_of(lanes(band, t, WAVENUMBER) > 0.0) else 0
+    else:
+        state.locked[t] = 0
+        for i in range(count):
+            frequency = band[t, FREQUENCY, i]
+            for r in range(tone.shape[0]):
+                band[t, FREQUENCY + r, i] = tone[r, start + i]
+            known = known and band[t, LIVE, i] > 0.0 and band[t, FREQUENCY, i] == frequency
+            if tone[1, start + i] > 0.0:
+                state.locked[t] = 1
+    for i in range(count):
+        band[t, TURNS, i] = count_turns(state.phase, start + i, tone[0, start + i] / tables.numbers.rate)
+    if not known:
+        for i in range(count):
+            band[t, LIVE, i], band[t, FREQUENCY, i] = 1.0, tone[0, start + i]
+            look_up(tables, state, t, i, tone[0, start + i])
+
+
+@kernel
 def refresh(tables, state):
     """Take up the tones that are asked for; phases and look-ups of fixed carriers, whose targets stay if constant."""
-    numbers, tone, band, width = tables.numbers, tables.tone, state.band, state.band.shape[2]
+    numbers, band = tables.numbers, state.band
     for t in range(band.shape[0]):
-        followed, state.locked[t] = state.locked[t] > 0, 0
-        for i in range(min(width, tone.shape[1] - t * width)):
-            k = t * width + i
-            known, frequency = band[t, LIVE, i] > 0.0 and not followed, band[t, FREQUENCY, i]
-            band[t, LIVE, i] = 1.0
-            for r in range(tone.shape[0]):
-                band[t, FREQUENCY + r, i] = tone[r, k]
-            if not known or band[t, FREQUENCY, i] != frequency:
-                look_up(tables, state, t, i, tone[0, k])
-            band[t, TURNS, i] = count_turns(state.phase, k, tone[0, k] / numbers.rate)
-            if tone[1, k] > 0.0:
-                state.locked[t] = 1
-        if state.locked[t] == 0:
-            live = lanes(band, t, LIVE)
-            cos, sin = unit(lanes(band, t, TURNS) + lanes(band, t, PHASE))
-            put(band, t, COS, live * cos)
-            put(band, t, SIN, live * sin)
+        take_tones(tables, state, t)
+        fixed = state.locked[t] == 0
+        if fixed and not numbers.analysed:
+            aim(band, t, lanes(band, t, WANTED_RE), lanes(band, t, WANTED_IM))
+        turn_frame(state, t, fixed and in_frames(numbers, state))
+        if fixed:
+            live, turns = lanes(band, t, LIVE), lanes(band, t, TURNS) + lanes(band, t, PHASE)
+            re, im = lanes(band, t, FRAME_RE), lanes(band, t, FRAME_IM)
+            cos, sin = unit(turns)
+            put(band, t, COS, live * (cos * re - sin * im))
+            put(band, t, SIN, live * (sin * re + cos * im))
+            put(band, t, START, turns + (1.0 / TURN) * polar(im, re)[1])
             cos, sin = unit(1.0 / numbers.rate * lanes(band, t, FREQUENCY))
             put(band, t, TURN_COS, cos)
             put(band, t, TURN_SIN, sin)
-            if not numbers.analysed:
-                aim(band, t, lanes(band, t, WANTED_RE), lanes(band, t, WANTED_IM))
 
 
 @kernel
@@ -304,14 +322,15 @@ def carry(tables, state, t, m, target):
         put(band, t, SIN, sin * turn_cos + cos * turn_sin)
     forward = lanes(band, t, FORWARD)
     if numbers.analysed:
-        twice = 2.0 * state.shared[WANTED, m]
+        twice = 2.0 * numbers.filter[0] * state.shared[WANTED, m]
+        section, four = numbers.filter, 4.0 * twice
         re, s1, s2 = section_step(
-            numbers.filter, lanes(band, t, REF_RE1), lanes(band, t, REF_RE2), twice * lanes(band, t, COS)
+            section, lanes(band, t, REF_RE1), lanes(band, t, REF_RE2), twice, four, lanes(band, t, COS)
         )
         put(band, t, REF_RE1, s1)
         put(band, t, REF_RE2, s2)
         im, s1, s2 = section_step(
-            numbers.filter, lanes(band, t, REF_IM1), lanes(band, t, REF_IM2), -twice * lanes(band, t, SIN)
+            section, lanes(band, t, REF_IM1), lanes(band, t, REF_IM2), -twice, -four, lanes(band, t, SIN)
         )
         put(band, t, REF_IM1, s1)
         put(band, t, REF_IM2, s2)
@@ -336,18 +355,23 @@ def slide(window, heap, at, r, x):
 def listen(tables, state, t, m, c):
     """STDFT* (eq. 1, 3, 4), or STDFT (eq. 1-3): envelopes X of coordinate c."""
     band, loop, base, window = state.band, state.loop, c * LOOP_ROWS, state.window
-    twice = 2.0 * state.shared[SHARED_ROWS + c, m]
-    re, im = twice * lanes(band, t, COS), -twice * lanes(band, t, SIN)
+    twice, section = 2.0 * state.shared[SHARED_ROWS + c, m], tables.numbers.filter
+    cos, sin = lanes(band, t, COS), lanes(band, t, SIN)
     if window.shape[0] > 0:  # it holds what it hears unmirrored, so that a carrier that turns round need not rewrite it
         at, r = (state.sample[0] + m) % window.shape[0], 2 * (t * tables.listen.shape[0] + c)
         forward = lanes(band, t, FORWARD)
-        re, im = slide(window, state.heap, at, r, re), forward * slide(window, state.heap, at, r + 1, forward * im)
+        re = slide(window, state.heap, at, r, twice * cos)
+        im = forward * slide(window, state.heap, at, r + 1, forward * (-twice * sin))
     else:
-        section = tables.numbers.filter
-        re, s1, s2 = section_step(section, lanes(loop, t, base + RE1), lanes(loop, t, base + RE2), re)
+        gain = section[0] * twice
+        re, s1, s2 = section_step(
+            section, lanes(loop, t, base + RE1), lanes(loop, t, base + RE2), gain, 4.0 * gain, cos
+        )
         put(loop, t, base + RE1, s1)
         put(loop, t, base + RE2, s2)
-        im, s1, s2 = section_step(section, lanes(loop, t, base + IM1), lanes(loop, t, base + IM2), im)
+        im, s1, s2 = section_step(
+            section, lanes(loop, t, base + IM1), lanes(loop, t, base + IM2), -gain, -4.0 * gain, sin
+        )
         put(loop, t, base + IM1, s1)
         put(loop, t, base + IM2, s2)
     put(loop, t, base + X_RE, re)
@@ -356,16 +380,18 @@ def listen(tables, state, t, m, c):
 
 
 @kernel
-def answer(numbers, band, loop, t, base, x_re, x_im):
+def answer(numbers, band, loop, t, base, x_re, x_im, h_re, h_im):
     """Amplitude and phase loops of a coordinate: commanded amplitude (m) and phase (rad)."""
-    amount, h_re, h_im = lanes(band, t, AMOUNT), lanes(band, t, HEADING_RE), lanes(band, t, HEADING_IM)
+    amount = lanes(band, t, AMOUNT)
     if numbers.subtract:
-        found, phase = polar_cut_at_90(x_im, x_re)
-        lag = phase - polar_cut_at_90(h_im, h_re)[1]
+        found, phase = polar(x_im, x_re)
+        lag = phase - polar(h_im, h_re)[1]
     else:  # phase of X against R, eq. 5 with the cut moved
-        found, lag = polar_cut_at_90(x_im * h_re - x_re * h_im, x_re * h_re + x_im * h_im)
-    lag = select(amount > QUIET, lag, 0.0)
-    theta, s1, s2 = section_step(numbers.law, lanes(loop, t, base + THETA1), lanes(loop, t, base + THETA2), -lag)
+        found, lag = polar(x_im * h_re - x_re * h_im, x_re * h_re + x_im * h_im)
+    sounds = select(amount > QUIET, 1.0, 0.0 * amount)
+    theta, s1, s2 = law_step(
+        numbers.law, lanes(loop, t, base + THETA1), lanes(loop, t, base + THETA2), sounds, 4.0 * sounds, lag
+    )
     put(loop, t, base + THETA1, s1)
     put(loop, t, base + THETA2, s2)
     error = amount - found  # eq. 3
@@ -374,7 +400,7 @@ def answer(numbers, band, loop, t, base, x_re, x_im):
     )  # a negative one would be positive feedback
     put(loop, t, base + AMPLITUDE1, s1)
     put(loop, t, base + AMPLITUDE2, s2)
-    return command, theta
+    return numbers.law[0] * command, -numbers.law[0] * theta
 
 
 @kernel
@@ -387,12 +413,14 @@ def tile_step(tables, state, t, m, target):
             for r in range(DRIVE):
                 put(loop, t, base + r, 0.0 * lanes(loop, t, base + DRIVE))
     cos, sin = lanes(band, t, COS), lanes(band, t, SIN)
-    h_re, h_im = lanes(band, t, HEADING_RE), lanes(band, t, HEADING_IM)
+    f_re, f_im = lanes(band, t, FRAME_RE), lanes(band, t, FRAME_IM)
+    re, im = lanes(band, t, HEADING_RE), lanes(band, t, HEADING_IM)
+    h_re, h_im = re * f_re + im * f_im, im * f_re - re * f_im
     for c in range(tables.listen.shape[0]):
         base = c * LOOP_ROWS
         if numbers.feedback:
             x_re, x_im = listen(tables, state, t, m, c)
-            command, theta = answer(numbers, band, loop, t, base, x_re, x_im)
+            command, theta = answer(numbers, band, loop, t, base, x_re, x_im, h_re, h_im)
         else:  # straight from the look-up table, turned ahead by delay and hold
             speed = lanes(band, t, WAVENUMBER) * state.shared[SPEED, m]
             now = size(lanes(band, t, FREQUENCY) + speed)
@@ -403,28 +431,31 @@ def tile_step(tables, state, t, m, target):
 
 
 @kernel
-def speak(tables, state, m, drive):
-    """Drive of the channels from that of the coordinates, each cut to its limit.  Returns flags."""
-    numbers, flags = tables.numbers, 0
-    for i in range(drive.shape[0]):
-        drive[i] = 0.0
-    for c in range(tables.listen.shape[0]):
-        force = state.shared[TRUST, m] * total(1.0, lanes(state.sum, c, m))
-        for i in range(drive.shape[0]):
-            drive[i] += tables.speak[i, c] * force
-    for i in range(drive.shape[0]):
-        asked = drive[i]
-        drive[i] = min(max(asked, -numbers.drive_limit), numbers.drive_limit)
-        if drive[i] != asked:
-            flags = 1
-    return flags
+def gather(state, count):
+    """Sum the drive of each coordinate over the lanes, as far as it is trusted, and clear the sums for the next."""
+    shared, coordinates = state.shared, state.sum.shape[0]
+    for c in range(0, coordinates, 2):
+        d = min(c + 1, coordinates - 1)
+        for m in range(count):
+            one, other = totals(1.0, lanes(state.sum, c, m), lanes(state.sum, d, m))
+            shared[SHARED_ROWS + c, m] = shared[TRUST, m] * one
+            shared[SHARED_ROWS + d, m] = shared[TRUST, m] * other
+            put(state.sum, c, m, 0.0 * lanes(state.band, 0, LIVE))
+            put(state.sum, d, m, 0.0 * lanes(state.band, 0, LIVE))
 
 
 @kernel
-def silence(state, m):
-    """Start the sums of a sample."""
-    for c in range(state.sum.shape[0]):
-        put(state.sum, c, m, 0.0 * lanes(state.band, 0, LIVE))
+def speak(tables, state, m, drive):
+    """Drive of the channels from that of the coordinates, each cut to its limit.  Returns flags."""
+    limit, flags = tables.numbers.drive_limit, 0
+    for i in range(drive.shape[0]):
+        asked = 0.0
+        for c in range(tables.listen.shape[0]):
+            asked += tables.speak[i, c] * state.shared[SHARED_ROWS + c, m]
+        drive[i] = min(max(asked, -limit), limit)
+        if drive[i] != asked:
+            flags = 1
+    return flags
 
 
 @kernel
@@ -433,8 +464,8 @@ def polar_step(tables, state, sensed, position, wanted, drive, target):
     if state.sample[0] % REFRESH == 0:
         refresh(tables, state)
     flags = share(tables, state, 0, sensed, position, wanted)
-    silence(state, 0)
     for t in range(state.band.shape[0]):
         tile_step(tables, state, t, 0, target)
     state.sample[0] += 1
+    gather(state, 1)
     return flags | speak(tables, state, 0, drive)

@@ -1,4 +1,4 @@
-"""A block of the paper's controller: in the usual case four short passes over a tile, else sample by sample.
+"""A block of the paper's controller: in the usual case three short passes over a tile, else sample by sample.
 
 Where carriers and targets stay and sensors are believed, nothing of a sample waits for the one before it but two short
 recursions.  In a pass of its own each of them runs beside the other coordinate's, and the rest is free of them, so that
@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from hapticrender._jit import kernel
 from hapticrender._lanes import lanes, put, put_pairs, select
-from hapticrender._polynomials import unit
+from hapticrender._polynomials import cosine, polar
 from hapticrender.control.kernels import QUIET, TURN
 from hapticrender.control.polar_kernels import (
     AMOUNT,
@@ -17,13 +17,13 @@ from hapticrender.control.polar_kernels import (
     COS,
     DRIVE,
     FORWARD,
-    HEADING_IM,
-    HEADING_RE,
+    FREQUENCY,
     LOOP_ROWS,
     RE1,
     REFRESH,
     SHARED_ROWS,
     SIN,
+    START,
     TARGET_IM,
     TARGET_RE,
     TRUST,
@@ -32,41 +32,58 @@ from hapticrender.control.polar_kernels import (
     X_IM,
     X_RE,
     clamped_step,
-    polar_cut_at_90,
+    gather,
+    law_step,
     refresh,
     section_step,
     share,
-    silence,
     speak,
     tile_step,
 )
 
-# rows of PolarState.scratch: carrier; then, two a coordinate, its envelope, which becomes what the loops compare, and
-# then what they command: amplitude and phase
-CARRIER_COS, CARRIER_SIN, FIRST = range(3)
-SCRATCH_ROWS = 2  # and two a coordinate
+# rows of PolarState.told, one column a sample: samples since the refresh; then, two a coordinate, b0 of the low pass
+# times twice what it hears, and four times that
+NUMBER, TOLD = range(2)
+TOLD_ROWS = 1  # and two a coordinate
+# rows of PolarState.scratch: phase of what is wanted (turns); then, two a coordinate, its envelope, which becomes what
+# the loops compare: amplitude and phase
+WISH, FIRST = range(2)
+SCRATCH_ROWS = 1  # and two a coordinate
+
+
+@kernel
+def tell(tables, state, count):
+    """What the passes are told of every sample, in the precision of the bands."""
+    first, told, shared = state.sample[0] % REFRESH, state.told, state.shared
+    for m in range(count):
+        told[NUMBER, m] = first + m
+    for c in range(tables.listen.shape[0]):
+        for m in range(count):
+            gain = 2.0 * tables.numbers.filter[0] * shared[SHARED_ROWS + c, m]
+            told[TOLD + 2 * c, m], told[TOLD + 2 * c + 1, m] = gain, 4.0 * gain
 
 
 @kernel
 def hear(tables, state, t, count, c, d):
     """Carriers of a tile, and the STDFT* of coordinates c and d side by side."""
-    band, loop, shared, scratch, section = state.band, state.loop, state.shared, state.scratch, tables.numbers.filter
-    cos, sin = lanes(band, t, COS), lanes(band, t, SIN)
+    band, loop, told, scratch, section = state.band, state.loop, state.told, state.scratch, tables.numbers.filter
+    cos, sin, start = lanes(band, t, COS), lanes(band, t, SIN), lanes(band, t, START)
     turn_cos, turn_sin = lanes(band, t, TURN_COS), lanes(band, t, TURN_SIN)
+    step, begun = 1.0 / tables.numbers.rate * lanes(band, t, FREQUENCY), state.sample[0] % REFRESH
     at, to = c * LOOP_ROWS + RE1, d * LOOP_ROWS + RE1
     a1, a2, b1, b2 = lanes(loop, t, at), lanes(loop, t, at + 1), lanes(loop, t, at + 2), lanes(loop, t, at + 3)
     e1, e2, f1, f2 = lanes(loop, t, to), lanes(loop, t, to + 1), lanes(loop, t, to + 2), lanes(loop, t, to + 3)
     re = im = x = y = cos
     for m in range(count):
-        if (state.sample[0] + m) % REFRESH > 0:
+        if begun + m > 0:
             cos, sin = cos * turn_cos - sin * turn_sin, sin * turn_cos + cos * turn_sin
-        put(scratch, CARRIER_COS, m, cos)
-        put(scratch, CARRIER_SIN, m, sin)
-        one, other = 2.0 * shared[SHARED_ROWS + c, m], 2.0 * shared[SHARED_ROWS + d, m]
-        re, a1, a2 = section_step(section, a1, a2, one * cos)
-        im, b1, b2 = section_step(section, b1, b2, -one * sin)
-        x, e1, e2 = section_step(section, e1, e2, other * cos)
-        y, f1, f2 = section_step(section, f1, f2, -other * sin)
+        put(scratch, WISH, m, start + told[NUMBER, m] * step)
+        gain, four = told[TOLD + 2 * c, m], told[TOLD + 2 * c + 1, m]
+        re, a1, a2 = section_step(section, a1, a2, gain, four, cos)
+        im, b1, b2 = section_step(section, b1, b2, -gain, -four, sin)
+        gain, four = told[TOLD + 2 * d, m], told[TOLD + 2 * d + 1, m]
+        x, e1, e2 = section_step(section, e1, e2, gain, four, cos)
+        y, f1, f2 = section_step(section, f1, f2, -gain, -four, sin)
         put(scratch, FIRST + 2 * c, m, re)
         put(scratch, FIRST + 2 * c + 1, m, im)
         put(scratch, FIRST + 2 * d, m, x)
@@ -84,52 +101,43 @@ def hear(tables, state, t, count, c, d):
 
 
 @kernel
-def compare(state, t, count, c):
-    """Amplitude and phase of X against what is wanted (eq. 3, 5)."""
-    band, scratch = state.band, state.scratch
-    amount, h_re, h_im = lanes(band, t, AMOUNT), lanes(band, t, HEADING_RE), lanes(band, t, HEADING_IM)
-    sounds = amount > QUIET
+def compare(state, t, count, c, d):
+    """Amplitude and phase of X in coordinates c and d against what is wanted, from which it is counted (eq. 3, 5)."""
+    scratch, amount = state.scratch, lanes(state.band, t, AMOUNT)
     for m in range(count):
-        re, im = lanes(scratch, FIRST + 2 * c, m), lanes(scratch, FIRST + 2 * c + 1, m)
-        found, lag = polar_cut_at_90(im * h_re - re * h_im, re * h_re + im * h_im)
+        found, lag = polar(lanes(scratch, FIRST + 2 * c + 1, m), lanes(scratch, FIRST + 2 * c, m))
+        other, delay = polar(lanes(scratch, FIRST + 2 * d + 1, m), lanes(scratch, FIRST + 2 * d, m))
         put(scratch, FIRST + 2 * c, m, amount - found)
-        put(scratch, FIRST + 2 * c + 1, m, -select(sounds, lag, 0.0))
+        put(scratch, FIRST + 2 * c + 1, m, lag)
+        put(scratch, FIRST + 2 * d, m, amount - other)
+        put(scratch, FIRST + 2 * d + 1, m, delay)
 
 
 @kernel
 def decide(tables, state, t, count, c, d):
-    """Amplitude and phase loops of coordinates c and d side by side."""
-    loop, scratch, law, floor = state.loop, state.scratch, tables.numbers.law, tables.numbers.floor
-    at, to = c * LOOP_ROWS + AMPLITUDE1, d * LOOP_ROWS + AMPLITUDE1
+    """Amplitude and phase loops of coordinates c and d side by side; adds the drive of a tile's bands to their sums.
+
+    A Re e^j(theta + psi + arg R) is one cosine, worked out while the loops wait for themselves.
+    """
+    loop, scratch, law, floor, sums = state.loop, state.scratch, tables.numbers.law, tables.numbers.floor, state.sum
+    at, to, wanted = c * LOOP_ROWS + AMPLITUDE1, d * LOOP_ROWS + AMPLITUDE1, lanes(state.band, t, AMOUNT)
     a1, a2, p1, p2 = lanes(loop, t, at), lanes(loop, t, at + 1), lanes(loop, t, at + 2), lanes(loop, t, at + 3)
     e1, e2, q1, q2 = lanes(loop, t, to), lanes(loop, t, to + 1), lanes(loop, t, to + 2), lanes(loop, t, to + 3)
+    gain, strength = law[0] * lanes(loop, t, c * LOOP_ROWS + DRIVE), law[0] * lanes(loop, t, d * LOOP_ROWS + DRIVE)
+    sounds = select(wanted > QUIET, 1.0, 0.0 * wanted)
+    four = 4.0 * sounds
     for m in range(count):
-        amount, theta = lanes(scratch, FIRST + 2 * c, m), lanes(scratch, FIRST + 2 * c + 1, m)
-        other, turned = lanes(scratch, FIRST + 2 * d, m), lanes(scratch, FIRST + 2 * d + 1, m)
-        amount, a1, a2 = clamped_step(law, a1, a2, amount, floor)
-        theta, p1, p2 = section_step(law, p1, p2, theta)
-        other, e1, e2 = clamped_step(law, e1, e2, other, floor)
-        turned, q1, q2 = section_step(law, q1, q2, turned)
-        put(scratch, FIRST + 2 * c, m, amount)
-        put(scratch, FIRST + 2 * c + 1, m, theta)
-        put(scratch, FIRST + 2 * d, m, other)
-        put(scratch, FIRST + 2 * d + 1, m, turned)
+        wish, one, two = lanes(scratch, WISH, m), lanes(sums, c, m), lanes(sums, d, m)
+        amount, a1, a2 = clamped_step(law, a1, a2, lanes(scratch, FIRST + 2 * c, m), floor)
+        other, e1, e2 = clamped_step(law, e1, e2, lanes(scratch, FIRST + 2 * d, m), floor)
+        theta, p1, p2 = law_step(law, p1, p2, sounds, four, lanes(scratch, FIRST + 2 * c + 1, m))
+        turned, q1, q2 = law_step(law, q1, q2, sounds, four, lanes(scratch, FIRST + 2 * d + 1, m))
+        put(sums, c, m, one + gain * amount * cosine(wish - (law[0] / TURN) * theta))
+        put(sums, d, m, two + strength * other * cosine(wish - (law[0] / TURN) * turned))
     for r, value in enumerate((a1, a2, p1, p2)):
         put(loop, t, at + r, value)
     for r, value in enumerate((e1, e2, q1, q2)):
         put(loop, t, to + r, value)
-
-
-@kernel
-def say(state, t, count, c):
-    """Add the drive of a tile's bands to the sum of coordinate c."""
-    band, scratch, gain = state.band, state.scratch, lanes(state.loop, t, c * LOOP_ROWS + DRIVE)
-    h_re, h_im = gain * lanes(band, t, HEADING_RE), gain * lanes(band, t, HEADING_IM)
-    for m in range(count):
-        cos, sin = lanes(scratch, CARRIER_COS, m), lanes(scratch, CARRIER_SIN, m)
-        u, v = unit((1.0 / TURN) * lanes(scratch, FIRST + 2 * c + 1, m))
-        carried = (h_re * u - h_im * v) * cos - (h_re * v + h_im * u) * sin
-        put(state.sum, c, m, lanes(state.sum, c, m) + lanes(scratch, FIRST + 2 * c, m) * carried)
 
 
 @kernel
@@ -140,13 +148,10 @@ def tile_block(tables, state, t, count, n, target):
     for m in range(count if target.shape[0] > 1 else 1):
         put_pairs(target[n + m if target.shape[0] > 1 else 0], t, re, im)
     for c in range(0, coordinates, 2):
-        hear(tables, state, t, count, c, min(c + 1, coordinates - 1))
-    for c in range(coordinates):
-        compare(state, t, count, c)
-    for c in range(0, coordinates, 2):
-        decide(tables, state, t, count, c, min(c + 1, coordinates - 1))
-    for c in range(coordinates):
-        say(state, t, count, c)
+        d = min(c + 1, coordinates - 1)
+        hear(tables, state, t, count, c, d)
+        compare(state, t, count, c, d)
+        decide(tables, state, t, count, c, d)
 
 
 @kernel
@@ -172,8 +177,9 @@ def polar_run(tables, state, sensed, position, wanted, drive, target, flags):
         count = min(REFRESH - state.sample[0] % REFRESH, sensed.shape[0] - n)
         for m in range(count):
             flags[n + m] = share(tables, state, m, sensed[n + m], position[n + m], wanted[n + m])
-            silence(state, m)
         passes = usual(tables, state, count)
+        if passes:
+            tell(tables, state, count)
         for t in range(state.band.shape[0]):
             if passes and state.locked[t] == 0:
                 tile_block(tables, state, t, count, n, target)
@@ -181,6 +187,7 @@ def polar_run(tables, state, sensed, position, wanted, drive, target, flags):
                 for m in range(count):
                     tile_step(tables, state, t, m, target[n + m if target.shape[0] > 1 else 0])
         state.sample[0] += count
+        gather(state, count)
         for m in range(count):
             flags[n + m] |= speak(tables, state, m, drive[n + m])
         n += count

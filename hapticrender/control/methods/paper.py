@@ -23,6 +23,7 @@ from hapticrender.control.kernels import WAVENUMBER
 from hapticrender.control.polar_kernels import (
     BAND_ROWS,
     FORWARD,
+    FRAME_RE,
     HEADING_RE,
     LOOP_ROWS,
     REFRESH,
@@ -31,7 +32,7 @@ from hapticrender.control.polar_kernels import (
     PolarState,
     PolarTables,
 )
-from hapticrender.control.polar_passes import SCRATCH_ROWS, polar_run
+from hapticrender.control.polar_passes import SCRATCH_ROWS, TOLD_ROWS, polar_run
 from hapticrender.errors import DesignError
 from hapticrender.protocols import Array
 
@@ -87,7 +88,7 @@ def polar_state(tables: PolarTables, window: int, dtype: type) -> PolarState:
     coordinates, bands = len(tables.listen), tables.tone.shape[1]
     tiles, width = padded(bands, dtype), WIDTH[np.dtype(dtype)]
     band = aligned((tiles, BAND_ROWS, width), dtype)
-    band[:, [FORWARD, HEADING_RE]] = 1.0
+    band[:, [FORWARD, HEADING_RE, FRAME_RE]] = 1.0
     rows = 2 * tiles * coordinates
     return PolarState(
         band=band,
@@ -98,6 +99,7 @@ def polar_state(tables: PolarTables, window: int, dtype: type) -> PolarState:
         doubt=np.zeros(1),
         sample=np.zeros(1, np.int64),
         shared=np.zeros((SHARED_ROWS + coordinates, REFRESH)),
+        told=np.zeros((TOLD_ROWS + 2 * coordinates, REFRESH), dtype),
         scratch=aligned((SCRATCH_ROWS + 2 * coordinates, REFRESH, width), dtype),
         sum=aligned((coordinates, REFRESH, width), dtype),
         window=aligned((window, rows, width), dtype),
