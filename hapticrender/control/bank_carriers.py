@@ -143,7 +143,7 @@ def look_ahead(numbers, band, law, t):
 @kernel
 def memory_damping(numbers, track):
     """Damping of a contact that remembers a length of its way, beyond what it is at the typical speed."""
-    speed = size(read(track, row.VELOCITY))
+    speed = read(track, row.SPEED)  # a finger that turns round at once does not slow down
     return numbers.memory * (1.0 / high(speed, SLOWEST * numbers.typical_speed) - 1.0 / numbers.typical_speed)
 
 

@@ -32,6 +32,9 @@ def track_finger(track, rate, position):
     write(select(present, steeper, 0.0), track, row.ACCELERATION)
     write(position, track, row.HELD)
     write(here, track, row.SEEN)
+    moved = select(present & (seen > 0.0), size(position - held) * rate, 0.0)
+    speed = read(track, row.SPEED)
+    write(select(leapt, 0.0, speed + pole * (moved - speed)), track, row.SPEED)
     came = present & ((seen <= 0.0) | leapt)
     write(select(came, FRESH_TIME * rate, high(read(track, row.FRESH) - 1.0, 0.0)), track, row.FRESH)
 

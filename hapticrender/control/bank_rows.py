@@ -27,9 +27,9 @@ FIRST_LAW = 2
 LAW_RE, LAW_IM, SLOPE_RE, SLOPE_IM = range(4)
 LAW_ROWS = 4
 # entries of BankState.track: the finger's motion (position as given, smoothed, velocity, acceleration, seen before)
-# and how many samples ago it came is still told
-HELD, SMOOTH, VELOCITY, ACCELERATION, SEEN, FRESH = range(6)
-TRACK_ROWS = 6
+# for how many samples more its coming counts as fresh, and its speed whichever way it goes
+HELD, SMOOTH, VELOCITY, ACCELERATION, SEEN, FRESH, SPEED = range(7)
+TRACK_ROWS = 7
 # entries of BankState.touch: the finger's load (N), place g, contact, its three numbers; timers and openings of the two
 # detectors; limiter (peak of the drive over its limit, squared, and the scale that answers it); trust in the sensors;
 # contact and place as the law knows them
