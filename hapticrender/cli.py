@@ -265,7 +265,8 @@ def _validate(arguments: argparse.Namespace) -> int:
 
 def _suite(arguments: argparse.Namespace) -> int:
     """Run the accuracy suite: the chosen method beside the paper's; exit 1 where it misses a bound."""
-    from hapticrender.accuracy import as_rows, run_suite, write_json
+    from hapticrender.accuracy_figures import as_rows, write_json
+    from hapticrender.accuracy_suite import run_suite
     from hapticrender.control.methods import METHODS
     from hapticrender.wording import table
 

@@ -1,0 +1,133 @@
+"""The picture of `hapticrender.device_chart`: accuracy against speed of every device kind, and error over frequency."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from hapticrender import defaults
+from hapticrender.device_chart import SWEEP, Point, fronts
+from hapticrender.formats import MissingExtra
+from hapticrender.picture import BLUE, GREEN, INK, ORANGE, PALE, RED, STYLE
+
+DEVICES = {
+    "vt-plate": (BLUE, "vibrotactile plate"),
+    "electroadhesion": (ORANGE, "electroadhesion screen"),
+    "ultrasonic": (GREEN, "ultrasonic surface"),
+}
+SHAPES = {"h2": "o", "h": "s", "static": "^", "stiffness": "v", "paper-common": "D"}
+UNFELT = 10.0  # %: errors below every just noticeable difference
+LOST_LANE = 60.0  # %: where what is lost, or refused, is drawn
+FREQUENCIES = (20, 50, 100, 200, 400)  # Hz
+
+
+def draw(points: Sequence[Point], swept: dict[str, list[float]]) -> Any:
+    """Draw into a new ``matplotlib.figure.Figure``.
+
+    Raises
+    ------
+    MissingExtra
+        matplotlib is not installed.
+    """
+    try:
+        import matplotlib
+        from matplotlib.backends.backend_agg import FigureCanvasAgg
+        from matplotlib.figure import Figure
+    except ImportError as error:
+        raise MissingExtra("pictures need matplotlib: pip install 'hapticrender[plot]'") from error
+    with matplotlib.rc_context(STYLE), np.errstate(all="ignore"):
+        figure: Any = Figure(figsize=(12.5, 6.2), layout="constrained")
+        FigureCanvasAgg(figure)
+        figure.get_layout_engine().set(w_pad=0.1, h_pad=0.07)
+        speed, frequency = figure.subplots(1, 2, width_ratios=[1.35, 1])
+        _scatter(speed, points)
+        _sweep(frequency, swept)
+        figure.legend(handles=_keys(points), loc="outside lower center", ncols=5, columnspacing=1.6, handlelength=1.6)
+        figure.suptitle(
+            "Three kinds of device, one control core: a sliding finger of 0.4 N at 80 mm/s",
+            x=0.01, ha="left", fontsize=12.5, fontweight="bold",
+        )  # fmt: skip
+    return figure
+
+
+def _look(device: str) -> tuple[str, str]:
+    """Colour and name of a device; one that this file does not know is red under its own name."""
+    return DEVICES.get(device, (RED, device))
+
+
+def _scatter(axes: Any, points: Sequence[Point]) -> None:
+    """Error against speed, the front of every device as a staircase with its points named."""
+    for point in points:
+        colour, _ = _look(point.setting.device)
+        axes.plot(
+            point.speed, 100 * point.error if point.stable else LOST_LANE,
+            marker=SHAPES.get(point.setting.method, "P") if point.stable else "x", ms=7.5, mew=1.5, ls="none",
+            color=colour, fillstyle="none" if point.setting.level == "envelope" else "full", zorder=3,
+        )  # fmt: skip
+    for device, best in fronts(points).items():
+        _staircase(axes, best, _look(device)[0])
+    stable = [100 * point.error for point in points if point.stable]
+    axes.set(xscale="log", yscale="log", xlabel="simulated seconds a second: controller, device and finger together")
+    axes.set(ylabel="worst error of any band at the finger (%)", title="Accuracy against speed: lower right is better")
+    axes.set_ylim(0.6 * min(stable, default=1.0), 1.6 * LOST_LANE)
+    low, high = axes.get_xlim()
+    ticks = [mantissa * 10.0**power for power in range(-1, 6) for mantissa in (1, 2, 5)]
+    axes.set_xticks([tick for tick in ticks if low <= tick <= high])
+    axes.set_xlim(low, high)
+    _plain(axes)
+
+
+def _staircase(axes: Any, best: Sequence[Point], colour: str) -> None:
+    """The front of one device, its points named where there is room."""
+    if not best:
+        return
+    stairs = sorted((point.speed, 100 * point.error) for point in best)
+    axes.plot(*zip(*stairs, strict=True), color=colour, lw=1.2, drawstyle="steps-pre", zorder=2)
+    for point in best:
+        level = f", {point.setting.level}" if point.setting.level else ""
+        axes.annotate(
+            f"{point.setting.method}{level}", (point.speed, 100 * point.error), xytext=(8, 0),
+            textcoords="offset points", va="center", fontsize=8, fontweight="bold", color=colour,
+        )  # fmt: skip
+
+
+def _sweep(axes: Any, swept: dict[str, list[float]]) -> None:
+    """Error over frequency, a line a device."""
+    for device, errors in swept.items():
+        colour, name = _look(device)
+        axes.plot(SWEEP, 100 * np.array(errors), "o-", color=colour, ms=4.5, lw=1.6, label=name)
+    axes.axhline(UNFELT, color=INK, lw=1, ls=(0, (4, 2)))
+    axes.annotate("10 %: below every just noticeable difference", (SWEEP[0], UNFELT), xytext=(0, 4), color=INK,
+                  textcoords="offset points", fontsize=8)  # fmt: skip
+    axes.set(xscale="log", yscale="log", xlabel="frequency of a tone (Hz)", ylabel="error at the finger (%)")
+    axes.set_title(f"Error over frequency, {defaults.METHOD}, each device as it comes")
+    axes.set_xticks(FREQUENCIES, [str(each) for each in FREQUENCIES])
+    axes.set_ylim(top=2 * UNFELT)
+    _plain(axes)
+
+
+def _plain(axes: Any) -> None:
+    """Write numbers as they are, and none at the minor ticks."""
+    if axes.get_xlabel().startswith("simulated"):
+        axes.xaxis.set_major_formatter(lambda value, _: f"{value:g}")
+    axes.yaxis.set_major_formatter(lambda value, _: f"{value:g}")
+    for axis in (axes.xaxis, axes.yaxis):
+        axis.set_minor_formatter(lambda value, _: "")
+
+
+def _keys(points: Sequence[Point]) -> list[Any]:
+    """What colours, shapes and fillings mean."""
+    from matplotlib.lines import Line2D
+
+    devices = dict.fromkeys(each.setting.device for each in points)
+    methods = dict.fromkeys(each.setting.method for each in points)
+    handles = [Line2D([], [], color=_look(each)[0], lw=4, label=_look(each)[1]) for each in devices]
+    handles += [
+        Line2D([], [], color=INK, marker="o", fillstyle="none", ls="none", label="hollow: envelope level"),
+        Line2D([], [], color=INK, marker="x", ls="none", label="a scene is lost, or the method refuses"),
+    ]
+    return handles + [
+        Line2D([], [], color=PALE, marker=SHAPES.get(each, "P"), ls="none", label=each) for each in methods
+    ]
