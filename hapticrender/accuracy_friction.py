@@ -55,7 +55,7 @@ def texture(frequencies: Sequence[float], velocity: float, seed: int = 1) -> Gra
     """Partials (Hz) of one skin velocity (m/s) each, their phases drawn."""
     lowest = frequencies[0]
     phases = np.random.default_rng(seed).uniform(0.0, 2 * np.pi, len(frequencies))
-    partials = [(f / lowest, lowest / f, float(p)) for f, p in zip(frequencies, phases, strict=True)]
+    partials = tuple((f / lowest, lowest / f, float(p)) for f, p in zip(frequencies, phases, strict=True))
     return Grating(frequency=lowest, velocity=velocity, partials=partials)
 
 
@@ -131,7 +131,9 @@ def _line(signal: Array, rate: float, frequency: float, start: float) -> complex
     return complex(2 * np.mean(kept * np.exp(-2j * np.pi * frequency * np.arange(len(kept)) / rate)))
 
 
-def surface(load: float, touches: Sequence[tuple[float, float]] | None = None, **plant: PlantValue) -> UltrasonicSurface:
+def surface(
+    load: float, touches: Sequence[tuple[float, float]] | None = None, **plant: PlantValue
+) -> UltrasonicSurface:
     """An ultrasonic surface as it comes, but for `plant`, under a finger of so much load (N)."""
     finger = Finger.sliding(speed=SPEED, normal_load=load, touches=touches, mechanics="light")
     scene = Scene(texture=Grating(frequency=100.0, amplitude=1e-6), finger=finger, device="ultrasonic", duration=2.0)
@@ -158,7 +160,7 @@ def back(off: Array, within: float, rate: float) -> float:
 
 
 def step(_: str) -> dict[str, float]:
-    """Steps of the wanted amplitude, from rest and between levels, under three loads: until 5 % of the step are left."""
+    """Steps of the wanted amplitude, from rest and between levels, under three loads: until 5 % of it are left."""
     slowest = 0.0
     for (low, high), load in product(STEPS, LOADS):
         plate = surface(load)

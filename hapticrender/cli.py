@@ -119,7 +119,10 @@ def _parser() -> argparse.ArgumentParser:
 
     chart = _add_verb(verbs, "chart", _chart, "draw accuracy against cost, stability, or two methods")
     chart.add_argument(
-        "name", metavar="NAME", choices=["pareto", "stability", "story"], help="pareto, stability, story"
+        "name",
+        metavar="NAME",
+        choices=["pareto", "stability", "story", "devices"],
+        help="pareto, stability, story, devices",
     )
     chart.add_argument("--learnt", action="store_true", help="the finger already learnt, not the moment of touch")
     _add_out(chart, Path("out/chart"))
@@ -319,6 +322,10 @@ def _chart(arguments: argparse.Namespace) -> int:
         from hapticrender.pareto import pareto
 
         pareto(path, progress=lambda what: print(what, file=sys.stderr))
+    elif arguments.name == "devices":
+        from hapticrender.device_chart import device_chart
+
+        device_chart(path, progress=lambda what: print(what, file=sys.stderr))
     else:
         from hapticrender import chart
 

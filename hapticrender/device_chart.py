@@ -2,8 +2,7 @@
 
 Accuracy is the worst error of any band over `scenes` at the finger, the first judged place of a device; speed is how
 many seconds are simulated in one, controller, device and finger together, measured in turns.  The level "envelope" is
-judged on itself: what it leaves out of the carrier is told by `hapticrender.fidelity`.  Speeds are this machine's, their
-order is not.
+judged on itself, not against the carrier that it leaves out.  Speeds are this machine's, their order is not.
 """
 
 from __future__ import annotations

@@ -19,8 +19,7 @@ DEVICES = {
 }
 SHAPES = {"h2": "o", "h": "s", "static": "^", "stiffness": "v", "paper-common": "D"}
 UNFELT = 10.0  # %: errors below every just noticeable difference
-LOST_LANE = 60.0  # %: where what is lost, or refused, is drawn
-FREQUENCIES = (20, 50, 100, 200, 400)  # Hz
+TENTHS, THIRDS, FREQUENCIES = (1.0, 2.0, 5.0), (1.0, 3.0), (1.0, 2.0, 4.0)  # ticks of a decade
 
 
 def draw(points: Sequence[Point], swept: dict[str, list[float]]) -> Any:
@@ -44,9 +43,9 @@ def draw(points: Sequence[Point], swept: dict[str, list[float]]) -> Any:
         speed, frequency = figure.subplots(1, 2, width_ratios=[1.35, 1])
         _scatter(speed, points)
         _sweep(frequency, swept)
-        figure.legend(handles=_keys(points), loc="outside lower center", ncols=5, columnspacing=1.6, handlelength=1.6)
+        figure.legend(handles=_keys(points), loc="outside lower center", ncols=4, columnspacing=1.6, handlelength=1.6)
         figure.suptitle(
-            "Three kinds of device, one control core: a sliding finger of 0.4 N at 80 mm/s",
+            "Three kinds of device, one control core: tones and a texture of three partials under a finger that slides",
             x=0.01, ha="left", fontsize=12.5, fontweight="bold",
         )  # fmt: skip
     return figure
@@ -58,29 +57,37 @@ def _look(device: str) -> tuple[str, str]:
 
 
 def _scatter(axes: Any, points: Sequence[Point]) -> None:
-    """Error against speed, the front of every device as a staircase with its points named."""
+    """Error against speed, the front of every device as a staircase, and a lane for what is lost."""
+    errors = [100 * point.error for point in points if point.stable]
+    foot, top = 0.7 * min(errors, default=1.0), 1.6 * max(errors, default=1.0)
+    lane, end = 1.35 * top, 1.8 * top
+    axes.axhspan(top, end, color=PALE, alpha=0.13, lw=0)
     for point in points:
-        colour, _ = _look(point.setting.device)
+        if point.refused:
+            continue
         axes.plot(
-            point.speed, 100 * point.error if point.stable else LOST_LANE,
-            marker=SHAPES.get(point.setting.method, "P") if point.stable else "x", ms=7.5, mew=1.5, ls="none",
-            color=colour, fillstyle="none" if point.setting.level == "envelope" else "full", zorder=3,
+            point.speed, 100 * point.error if point.stable else lane,
+            marker=SHAPES.get(point.setting.method, "P") if point.stable else "x", ms=8.5, mew=1.6, ls="none",
+            color=_look(point.setting.device)[0], zorder=3, alpha=0.85,
+            fillstyle="none" if point.setting.level == "envelope" else "full",
         )  # fmt: skip
+    lost = dict.fromkeys(each.setting.method for each in points if not each.stable and not each.refused)
+    refused = dict.fromkeys(each.setting.method for each in points if each.refused)
+    told = [f"{what}: {', '.join(names)}" for what, names in (("lost", lost), ("refused", refused)) if names]
+    axes.text(0.99, lane, "; ".join(told), transform=axes.get_yaxis_transform(), ha="right", va="center", fontsize=8)
     for device, best in fronts(points).items():
         _staircase(axes, best, _look(device)[0])
-    stable = [100 * point.error for point in points if point.stable]
     axes.set(xscale="log", yscale="log", xlabel="simulated seconds a second: controller, device and finger together")
     axes.set(ylabel="worst error of any band at the finger (%)", title="Accuracy against speed: lower right is better")
-    axes.set_ylim(0.6 * min(stable, default=1.0), 1.6 * LOST_LANE)
     low, high = axes.get_xlim()
-    ticks = [mantissa * 10.0**power for power in range(-1, 6) for mantissa in (1, 2, 5)]
-    axes.set_xticks([tick for tick in ticks if low <= tick <= high])
-    axes.set_xlim(low, high)
-    _plain(axes)
+    axes.set_xlim(low, 1.9 * high)
+    axes.set_ylim(foot, end)
+    _ticks(axes.xaxis, TENTHS)
+    _ticks(axes.yaxis, THIRDS)
 
 
 def _staircase(axes: Any, best: Sequence[Point], colour: str) -> None:
-    """The front of one device, its points named where there is room."""
+    """The front of one device, its points named."""
     if not best:
         return
     stairs = sorted((point.speed, 100 * point.error) for point in best)
@@ -88,7 +95,7 @@ def _staircase(axes: Any, best: Sequence[Point], colour: str) -> None:
     for point in best:
         level = f", {point.setting.level}" if point.setting.level else ""
         axes.annotate(
-            f"{point.setting.method}{level}", (point.speed, 100 * point.error), xytext=(8, 0),
+            f"{point.setting.method}{level}", (point.speed, 100 * point.error), xytext=(9, 0),
             textcoords="offset points", va="center", fontsize=8, fontweight="bold", color=colour,
         )  # fmt: skip
 
@@ -103,18 +110,18 @@ def _sweep(axes: Any, swept: dict[str, list[float]]) -> None:
                   textcoords="offset points", fontsize=8)  # fmt: skip
     axes.set(xscale="log", yscale="log", xlabel="frequency of a tone (Hz)", ylabel="error at the finger (%)")
     axes.set_title(f"Error over frequency, {defaults.METHOD}, each device as it comes")
-    axes.set_xticks(FREQUENCIES, [str(each) for each in FREQUENCIES])
     axes.set_ylim(top=2 * UNFELT)
-    _plain(axes)
+    _ticks(axes.xaxis, FREQUENCIES)
+    _ticks(axes.yaxis, THIRDS)
 
 
-def _plain(axes: Any) -> None:
-    """Write numbers as they are, and none at the minor ticks."""
-    if axes.get_xlabel().startswith("simulated"):
-        axes.xaxis.set_major_formatter(lambda value, _: f"{value:g}")
-    axes.yaxis.set_major_formatter(lambda value, _: f"{value:g}")
-    for axis in (axes.xaxis, axes.yaxis):
-        axis.set_minor_formatter(lambda value, _: "")
+def _ticks(axis: Any, mantissas: Sequence[float]) -> None:
+    """Ticks at these in every decade, their numbers written as they are."""
+    low, high = axis.get_view_interval()
+    ticks = [mantissa * 10.0**power for power in range(-3, 6) for mantissa in mantissas]
+    axis.set_ticks([tick for tick in ticks if low <= tick <= high])
+    axis.set_major_formatter(lambda value, _: f"{value:g}")
+    axis.set_ticks([], minor=True)
 
 
 def _keys(points: Sequence[Point]) -> list[Any]:
@@ -126,7 +133,8 @@ def _keys(points: Sequence[Point]) -> list[Any]:
     handles = [Line2D([], [], color=_look(each)[0], lw=4, label=_look(each)[1]) for each in devices]
     handles += [
         Line2D([], [], color=INK, marker="o", fillstyle="none", ls="none", label="hollow: envelope level"),
-        Line2D([], [], color=INK, marker="x", ls="none", label="a scene is lost, or the method refuses"),
+        Line2D([], [], color=INK, marker="x", ls="none", label="a scene is lost"),
+        Line2D([], [], color=INK, lw=1.2, label="line and names: the front of a device"),
     ]
     return handles + [
         Line2D([], [], color=PALE, marker=SHAPES.get(each, "P"), ls="none", label=each) for each in methods
