@@ -86,7 +86,7 @@ def tones(device: str, method: str) -> dict[str, float]:
 def comb(device: str, method: str) -> dict[str, float]:
     """20 bands, 20 to 400 Hz, from 1 s on: rms error of all amplitudes over what is wanted, as a ratio."""
     bands = tuple(np.arange(20.0, 401.0, 20.0).tolist())
-    seen = play(device, method, texture(bands, 4e-3), Finger.sliding(SPEED, 0.8, mechanics="light"), 4.0).envelopes
+    seen = play(device, method, texture(bands, 4e-3), Finger.sliding(SPEED, 0.8, mechanics="light"), 6.0).envelopes
     late = (seen.start >= 1.0) & seen.finite
     if not late.any():
         return {}

@@ -113,14 +113,14 @@ def found_error(setting: Setting, touched: Grating) -> float:
     return worst if worst < LOST else np.inf
 
 
-def measure(settings: Sequence[Setting], rounds: int = 3, progress: Callable[[str], None] | None = None) -> list[Point]:
+def measure(settings: Sequence[Setting], rounds: int = 5, progress: Callable[[str], None] | None = None) -> list[Point]:
     """Accuracy of every setting, then its speed, in turns.
 
     Parameters
     ----------
     settings : sequence of Setting
     rounds : int
-        Of timing; the median counts.
+        Of timing; the fastest counts, the rest is the machine's other work.
     progress : callable, optional
         Told what is done next.
 
@@ -141,7 +141,7 @@ def measure(settings: Sequence[Setting], rounds: int = 3, progress: Callable[[st
         for index, clock in clocks.items():
             spent[index].append(clock())
     for index, times in spent.items():
-        points[index] = replace(points[index], speed=1.0 / float(np.median(times)))
+        points[index] = replace(points[index], speed=1.0 / min(times))
     return points
 
 
@@ -201,7 +201,7 @@ def device_chart(
     path: str | os.PathLike[str],
     *,
     settings: Sequence[Setting] | None = None,
-    rounds: int = 3,
+    rounds: int = 5,
     progress: Callable[[str], None] | None = None,
 ) -> list[Point]:
     """Measure and draw the chart, and write the data beside the picture.
