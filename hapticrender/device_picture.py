@@ -59,7 +59,7 @@ def _look(device: str) -> tuple[str, str]:
 def _scatter(axes: Any, points: Sequence[Point]) -> None:
     """Error against speed, the front of every device as a staircase, and a lane for what is lost."""
     errors = [100 * point.error for point in points if point.stable]
-    foot, top = 0.7 * min(errors, default=1.0), 1.6 * max(errors, default=1.0)
+    foot, top = 0.62 * min(errors, default=1.0), 1.6 * max(errors, default=1.0)
     lane, end = 1.35 * top, 1.8 * top
     axes.axhspan(top, end, color=PALE, alpha=0.13, lw=0)
     for point in points:
@@ -95,8 +95,8 @@ def _staircase(axes: Any, best: Sequence[Point], colour: str) -> None:
     for point in best:
         level = f", {point.setting.level}" if point.setting.level else ""
         axes.annotate(
-            f"{point.setting.method}{level}", (point.speed, 100 * point.error), xytext=(9, 0),
-            textcoords="offset points", va="center", fontsize=8, fontweight="bold", color=colour,
+            f"{point.setting.method}{level}", (point.speed, 100 * point.error), xytext=(0, -8),
+            textcoords="offset points", ha="center", va="top", fontsize=8, fontweight="bold", color=colour,
         )  # fmt: skip
 
 
