@@ -93,10 +93,13 @@ def _staircase(axes: Any, best: Sequence[Point], colour: str) -> None:
     stairs = sorted((point.speed, 100 * point.error) for point in best)
     axes.plot(*zip(*stairs, strict=True), color=colour, lw=1.2, drawstyle="steps-pre", zorder=2)
     for point in best:
+        place: Any = {"xytext": (0, -8), "ha": "center", "va": "top"}
+        if point is not best[-1]:  # another stands below it
+            place = {"xytext": (9, 0), "ha": "left", "va": "center"}
         level = f", {point.setting.level}" if point.setting.level else ""
         axes.annotate(
-            f"{point.setting.method}{level}", (point.speed, 100 * point.error), xytext=(0, -8),
-            textcoords="offset points", ha="center", va="top", fontsize=8, fontweight="bold", color=colour,
+            f"{point.setting.method}{level}", (point.speed, 100 * point.error), **place,
+            textcoords="offset points", fontsize=8, fontweight="bold", color=colour,
         )  # fmt: skip
 
 
