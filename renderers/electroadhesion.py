@@ -56,8 +56,7 @@ class ElectroadhesionRenderer(FrictionRenderer):
     def plant(self, scene: Scene, seed: int) -> ElectroadhesionScreen:
         """Return the simulated screen, with the scene's overrides and finger."""
         _, parameters = _read(scene)
-        if "open_loop_gain" not in scene.plant:
-            parameters = replace(parameters, open_loop_gain=_nominal(parameters).gain(typical_load(scene)))
+        parameters = replace(parameters, open_loop_gain=_believed_gain(scene, parameters))
         return ElectroadhesionScreen(parameters, scene.finger, seed, self.compensation(scene))
 
     def connect(self, scene: Scene, driver: Driver) -> Driver:
@@ -91,6 +90,8 @@ class ElectroadhesionRenderer(FrictionRenderer):
     def compensation(self, scene: Scene) -> SquareRoot:
         """Return the square root for a nominal finger under the scene's load, its bias as large as the scene needs.
 
+        A scene that gives `open_loop_gain` is believed.
+
         Raises
         ------
         ValueError
@@ -101,19 +102,19 @@ class ElectroadhesionRenderer(FrictionRenderer):
         limit, unit = parameters.voltage_limit, "V"
         if parameters.drive_kind == "current":
             limit, unit = min(parameters.current_limit, limit / abs(finger.impedance(load))), "A"
-        most = float(finger.attraction(limit, load))
+        gain = _believed_gain(scene, parameters) / finger.gain(load) * float(finger.attraction(1.0, load))
+        most = gain * limit**2
         swing = settings.headroom * self.needed(scene, self._model(scene, parameters.rate, 1, 1))
         bias = swing / (1.0 - settings.floor)
-        peak = bias + swing
-        if peak > most:
+        if bias + swing > most:
             raise ValueError(
-                f"texture.amplitude asks for an attraction of {peak:.3g} N: must be <= {most:.3g} N, "
+                f"texture.amplitude asks for an attraction of {bias + swing:.3g} N: must be <= {most:.3g} N, "
                 f"what {limit:.3g} {unit} make of a nominal finger of {load:.3g} N"
             )
         return SquareRoot(
             bias=bias,
             floor=settings.floor * bias,
-            gain=float(finger.attraction(1.0, load)),
+            gain=gain,
             straight=settings.square_root == "off",
         )
 
@@ -142,3 +143,10 @@ def _read(scene: Scene) -> tuple[ElectroadhesionSettings, ElectroadhesionParamet
 def _nominal(parameters: ElectroadhesionParameters) -> ElectroadhesionParameters:
     """Return the screen under a finger as one must be taken to be before it is felt."""
     return replace(parameters, area_scale=1.0, gap_thickness=NOMINAL_GAP, gap_resistance=NORMAL)
+
+
+def _believed_gain(scene: Scene, parameters: ElectroadhesionParameters) -> float:
+    """Return g (N/A^2) of a finger that is not sensed: as the scene says, else of a nominal one under its load."""
+    if "open_loop_gain" in scene.plant:
+        return parameters.open_loop_gain
+    return _nominal(parameters).gain(typical_load(scene))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from fractions import Fraction
 from typing import Any
 
 import numpy as np
@@ -82,7 +83,7 @@ class CarrierDriver(ShapedDriver):
         self.hold = max(each for each in range(1, min(whole, most) + 1) if whole % each == 0)
         self.rate = driver.rate / self.hold
         self.block, self.delay = driver.block // self.hold, driver.delay // self.hold
-        self._advance = np.uint64(round(frequency / driver.rate * 2**64))
+        self._advance = np.uint64(round(Fraction(frequency) / Fraction(driver.rate) * 2**64))
         self._phase = np.uint64(0)  # of the next sample, 2^64 a turn
 
     def play(self, drive: Array) -> Sensed:

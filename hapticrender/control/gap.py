@@ -12,8 +12,8 @@ The area changes with the load and only a resting finger shows it: 10 % of area 
 between the two channels some 10 %, for it turns Z.  The force itself follows |I|^2 at once; only the impedance is
 averaged for long, weighed by power, so that an envelope may pass through zero.
 
-A finger that rests, that was never seen at rest, or whose gap leaks so much that L falls below a bound, is not sensed: it
-counts as F = g |I|^2, what a loop expects to see, so that nothing winds up on it; the flag `OPEN_LOOP` says so.
+A finger that rests, that was never seen at rest, or whose gap leaks so much that L falls below a bound, is not sensed:
+it counts as F = g |I|^2, what a loop expects to see, so that nothing winds up on it; the flag `OPEN_LOOP` says so.
 
 References
 ----------

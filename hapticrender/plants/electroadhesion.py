@@ -121,7 +121,7 @@ class ElectroadhesionParameters(SlidingParameters):
     least_leakage : float
         L below which a finger counts as moist and is not sensed, 0 to 1.
     open_loop_gain : float, N/A^2
-        g of a finger that is not sensed, > 0.
+        g of a finger that is not sensed, > 0; a renderer takes that of a nominal finger, unless its scene tells.
 
     Notes
     -----
