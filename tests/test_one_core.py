@@ -24,6 +24,7 @@ CORE_ONLY = {  # of `control`, what a renderer may touch: descriptions, and whol
     "hapticrender.control.bank",
     "hapticrender.control.block",
     "hapticrender.control.methods",
+    "hapticrender.control.oscillator",
     "hapticrender.control.square_root",
     "hapticrender.control.together",
 }
