@@ -171,8 +171,10 @@ class HybridRenderer(BaseRenderer):
         rubbed = None
         if len(parts.bands.rubbed):
             rubbed = self._screen.band_model(parts.rubbed, _View(driver, 1, 1, "screen"))  # type: ignore[arg-type]
-            rubbed = replace(rubbed, lowest_frequency=2 * parts.settings.start)
-        moved = replace(moved, highest_frequency=parts.settings.start, highest_edge=2.0)
+        if rubbed is not None and (parts.bands.wavenumber > 0.0).any():  # fixed carriers have their share for good
+            start = parts.settings.start
+            moved = replace(moved, highest_frequency=start, highest_edge=2.0)
+            rubbed = replace(rubbed, lowest_frequency=2 * start)
         return _side_by_side(moved, rubbed, parts.velocity_per_force)
 
     def bands(self, scene: Scene, model: BandModel) -> TwoBands:
