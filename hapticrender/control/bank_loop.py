@@ -6,10 +6,10 @@ resonator driven by the residual: with eps = E e^(j phi), nu = v e^(j phi) and a
     eps' = eps + g e,  nu' = nu - T ki eps',  F = Re sum rho (D nu' - ki D' eps') - inner sum_i c_i dev[n-i],
     e = y - level - Re sum eps,  dev = y - Re sum nu,  next eps = a eps', next nu = a nu',
 
-rho = e^(j w lead)/sinc(w T/2).  A carrier that fades out with the weight s has s g for g, and forgets both eps and nu
-at the rate (1 - s) times `FORGET`.  No envelope is averaged: all bands, their images and the DC band, all coordinates, the
-delay and the hold are inside.  Assumed: carriers of fixed frequency (a moving finger: its speed frozen), the finger's
-three numbers frozen, drive inside its limits, no rounding.
+rho = e^(j w lead)/sinc(w T/2).  A carrier that fades out, with the share s of its feedback, has s g for g and forgets
+both eps and nu at the rate (1 - s) times `FORGET`.  No envelope is averaged: all bands, their images and the DC band,
+all coordinates, the delay and the hold are inside.  Assumed: carriers of fixed frequency (a moving finger: its speed
+frozen), the finger's three numbers frozen, drive inside its limits, no rounding.
 """
 
 from __future__ import annotations

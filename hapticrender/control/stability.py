@@ -144,9 +144,8 @@ def bank_loop(
 
 
 def _faded(numbers: BankNumbers, frequency: Array) -> Array:
-    """Weight of carriers that follow the finger, at `frequency` (Hz), as in the compiled step."""
-    edge = numbers.highest_edge
-    ends = 2.0 * frequency / numbers.lowest - 1.0, (edge - frequency / numbers.highest) / (edge - 1.0)
+    """Share of the observer that carriers which follow the finger have at `frequency` (Hz), as in the compiled step."""
+    ends = 2.0 * frequency / numbers.lowest - 1.0, 4.0 * (numbers.highest_edge - frequency / numbers.highest)
     below, above = (np.clip(end, 0.0, 1.0) for end in ends)
     return np.asarray(below**2 * (3.0 - 2.0 * below) * above**2 * (3.0 - 2.0 * above))
 
