@@ -171,8 +171,10 @@ class HybridRenderer(BaseRenderer):
         rubbed = None
         if len(parts.bands.rubbed):
             rubbed = self._screen.band_model(parts.rubbed, _View(driver, 1, 1, "screen"))  # type: ignore[arg-type]
-            rubbed = replace(rubbed, lowest_frequency=2 * parts.settings.start)
-        moved = replace(moved, highest_frequency=parts.settings.start, highest_edge=2.0)
+        if rubbed is not None and (parts.bands.wavenumber > 0.0).any():  # fixed carriers have their share for good
+            start = parts.settings.start
+            moved = replace(moved, highest_frequency=start, highest_edge=2.0)
+            rubbed = replace(rubbed, lowest_frequency=2 * start)
         return _side_by_side(moved, rubbed, parts.velocity_per_force)
 
     def bands(self, scene: Scene, model: BandModel) -> TwoBands:
@@ -227,11 +229,11 @@ def _part(scene: Scene, bands: Bands, plant: Mapping[str, Any]) -> Scene:
 def _share_out(scene: Scene, settings: HybridSettings, plate: PlateParameters, rate: float) -> TwoBands:
     """Bands of a scene, and the share of each part as displacement (m)."""
     whole = felt(scene, scene.texture.bands(rate), plate.band_model(rate, 1))
-    if whole.envelope is None:
-        raise ValueError(
-            "texture: must have constant envelopes on a hybrid (a grating); a waveform is not shared out in time"
-        )
     locked = whole.wavenumber > 0.0
+    if whole.envelope is None and not locked.all():
+        raise ValueError(
+            "texture: must be a grating, or go over position, on a hybrid: a recording over time is not shared out"
+        )
     high = settings.share_of_screen(whole.frequency)
     shares = np.where(locked, 1.0, 1.0 - high), np.where(locked, 1.0, high)  # locked: the fades of the banks share
     index = [np.flatnonzero(share > 0.0) for share in shares]
@@ -241,7 +243,7 @@ def _share_out(scene: Scene, settings: HybridSettings, plate: PlateParameters, r
             frequency=whole.frequency[which],
             wavenumber=whole.wavenumber[which],
             phase=whole.phase[which],
-            envelope=(share * whole.envelope)[which],
+            envelope=None if whole.envelope is None else (share * whole.envelope)[which],
             unfelt=(),
         )
         for share, which in zip(shares, index, strict=True)

@@ -87,7 +87,8 @@ class BandModel:
     lowest_frequency, highest_frequency : float, Hz
         Finger-locked carriers fade out beyond these.
     highest_edge : float
-        Times `highest_frequency`, where they have faded out, > 1; methods without a bank know 1.25 alone.
+        Times `highest_frequency`, where they have faded out, > 1.  Feedback stays on until the last quarter of
+        `highest_frequency`.  Methods without a bank know 1.25 alone.
     shape : tuple of float, or None
         Pattern of the target over the coordinates; None: all of it in the first one.
     finger : FingerRange

@@ -224,11 +224,12 @@ def motion_pass(numbers, band, track, t):
     ramp = select(felt, low(ramp + numbers.ramp, 1.0), high(ramp - numbers.ramp, 0.0))
     steep = 1.0 / (numbers.highest_edge - 1.0)
     below = ease(steep * numbers.highest_edge - steep / numbers.highest * size(hertz))
-    inside = ease(2.0 / numbers.lowest * size(hertz) - 1.0) * below
-    weight = lanes(band, t, row.LIVE) * ease(ramp) * select(wavenumber > 0.0, inside, 1.0)
+    heard = ease(4.0 * numbers.highest_edge - 4.0 / numbers.highest * size(hertz))  # to a wide fade's end, or nearly
+    above = select(wavenumber > 0.0, ease(2.0 / numbers.lowest * size(hertz) - 1.0), 1.0)
+    grown = lanes(band, t, row.LIVE) * ease(ramp) * above
     put(band, t, row.RAMP, ramp)
-    put(band, t, row.WEIGHT, weight)
-    put(band, t, row.SHARE, low(weight / high(ramp, 1e-9), 1.0))
+    put(band, t, row.WEIGHT, grown * select(wavenumber > 0.0, below, 1.0))
+    put(band, t, row.SHARE, low(grown * select(wavenumber > 0.0, heard, 1.0) / high(ramp, 1e-9), 1.0))
 
 
 @kernel
