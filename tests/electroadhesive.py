@@ -1,29 +1,14 @@
 """Scenes and devices that the tests of electroadhesion share."""
 
 import numpy as np
-import pytest
 
 import hapticrender as hr
-from hapticrender import loop
 from hapticrender.drivers.simulated import SimulatedDriver
 from hapticrender.plants.electroadhesion import ElectroadhesionParameters, ElectroadhesionScreen
-from hapticrender.renderers.electroadhesion import ElectroadhesionRenderer
 
 RATE, SPEED, MU = 10_000, 0.05, 0.8
 FORCE = 0.1  # N of friction
 SLIDE = hr.Finger.sliding(speed=SPEED, normal_load=1.0)
-
-
-@pytest.fixture(autouse=True)
-def entry_point(monkeypatch):
-    """The renderer under its name, also where an older hapticrender is installed."""
-    installed = loop.registered
-
-    def known(group, name):
-        mine = (group, name) == ("renderers", "electroadhesion")
-        return ElectroadhesionRenderer if mine else installed(group, name)
-
-    monkeypatch.setattr(loop, "registered", known)
 
 
 def tone(frequency, force=FORCE, finger=SLIDE, duration=2.0, **plant):

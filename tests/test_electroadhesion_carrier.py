@@ -4,7 +4,7 @@ from fractions import Fraction
 
 import numpy as np
 import pytest
-from electroadhesive import entry_point, tone
+from electroadhesive import tone
 
 import hapticrender as hr
 from hapticrender.control.stdft import StarSTDFT
@@ -12,8 +12,6 @@ from hapticrender.drivers.base import BaseDriver
 from hapticrender.drivers.wavefile import WaveFileDriver
 from hapticrender.renderers.electroadhesion import ElectroadhesionRenderer
 from hapticrender.renderers.shaped import CarrierDriver
-
-__all__ = ["entry_point"]
 
 FAST, CARRIER = 192_000, 20_000  # Hz
 FULL = 10e-3  # A

@@ -2,12 +2,10 @@
 
 import numpy as np
 import pytest
-from electroadhesive import FORCE, MU, RATE, SLIDE, SPEED, Screen, band, entry_point, tone
+from electroadhesive import FORCE, MU, RATE, SLIDE, SPEED, Screen, band, tone
 
 import hapticrender as hr
 from hapticrender.plants.electroadhesion import ElectroadhesionParameters
-
-__all__ = ["entry_point"]
 
 # A millinewton of noise on the tribometer, white over 10 kHz, in an observer whose pole lies at 10 Hz: the envelope's
 # standard deviation is 1e-3 sqrt(4 * 10 pi/2/10e3) = 0.08 mN; four of them in 0.1 N.  The issue asks for 1 %.

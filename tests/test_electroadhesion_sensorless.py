@@ -2,13 +2,11 @@
 
 import numpy as np
 import pytest
-from electroadhesive import FORCE, MU, RATE, SLIDE, SPEED, Screen, band, entry_point, tone
+from electroadhesive import FORCE, MU, RATE, SLIDE, SPEED, Screen, band, tone
 
 import hapticrender as hr
 from hapticrender import loop
 from hapticrender.plants.electroadhesion import DRY, MOIST, NORMAL, ElectroadhesionParameters
-
-__all__ = ["entry_point"]
 
 SENSORLESS = {"sensor": "impedance", "level": "carrier"}
 REST = 0.2  # s
@@ -91,6 +89,23 @@ def test_nothing_winds_up_on_a_finger_that_rests():
         assert swing(drive[still]) == pytest.approx(WANTED, rel=0.03)
         ends.append((swing(drive), swing(attraction)))
     np.testing.assert_allclose(ends[0], ends[1], rtol=5e-3)
+
+
+def test_nothing_winds_up_while_the_finger_is_away():
+    """It slides, is lifted, lands, rests and slides again; the second stroke is as good as the first."""
+    path = hr.Finger.sampled(
+        [0.0, 0.0, 0.025, 0.025, 0.055],
+        times=[0.0, 0.2, 0.7, 1.1, 1.7],
+        normal_load=1.0,
+        touches=[(0.0, 0.7), (0.9, 2.0)],
+    )
+    drive, flags, attraction = sensed(seconds=1.7, finger=path, area_scale=0.7)
+    assert not (flags & hr.Flag.SATURATED).any()
+    assert (flags[7010:11000] == hr.Flag.OPEN_LOOP).all()
+    assert not attraction[7000:11000].any()
+    assert swing(drive[:10900]) == pytest.approx(WANTED, rel=0.03)
+    assert swing(attraction[:6900]) == pytest.approx(WANTED, rel=0.03)
+    assert swing(attraction) == pytest.approx(WANTED, rel=0.03)
 
 
 def test_a_swipe_shows_its_area_where_it_turns():

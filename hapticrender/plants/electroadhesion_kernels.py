@@ -177,15 +177,18 @@ def carrier_pass(tables, state, gap, area, envelope, speed, noise):
 
 
 @kernel
-def lift(tables, state):
-    """Let a finger go: no charge, no current, no voltage, nothing to sense."""
+def lift(tables, state, envelope):
+    """Let a finger go: no charge, no voltage; the source's own word for the current is all that there is to sense."""
+    held = state.held
     for k in range(3):
         state.charge[k] = 0.0
-    state.held[SERVO] = state.held[FORCE] = state.held[UNSENSED] = 0.0
+    held[SERVO] = 0.0
     turns = state.carrier[0] + tables.turns
     state.carrier[0] = turns - math.floor(turns)
     if tables.sensing:
-        gap_step(tables.estimator, state.estimator, 0.0, 0.0, 0.0, 0.0, math.nan)
+        current = 0.0 if tables.voltage else envelope
+        held[FORCE], _ = gap_step(tables.estimator, state.estimator, 0.0, 0.0, current, 0.0, math.nan)
+        held[UNSENSED] = 1.0
 
 
 @kernel
@@ -201,10 +204,10 @@ def asked(tables, drive):
 def attract(tables, state, drive, finger, noise):
     """Mean attraction (N) over a sample, and flags."""
     load, speed = finger[LOAD], finger[SPEED]
-    if math.isnan(speed) or load <= 0.0:
-        lift(tables, state)
-        return 0.0, 0
     envelope, flags = asked(tables, drive)
+    if math.isnan(speed) or load <= 0.0:
+        lift(tables, state, envelope)
+        return 0.0, 0
     area = tables.area * load**tables.exponent
     thickness = tables.gap * (1.0 + tables.ripple * math.cos(tables.wavenumber * finger[POSITION]))
     resistance = tables.gap_short if abs(speed) < tables.sliding.least_speed else tables.gap_resistance
