@@ -137,6 +137,7 @@ class FrictionRenderer(BaseRenderer):
                 least_motion=LEAST_FORCE,
                 contact=None,
                 presence=True,
+                least_speed=sliding.least_speed,
             ),
         )
 

@@ -165,3 +165,22 @@ def test_a_driver_with_other_channels_is_refused():
     wrong.drive_channels, wrong.sensed_channels = 1, 2
     with pytest.raises(ValueError, match=r"driver.sensed_channels = 2: must be 0 or 1"):
         hr.render(tone(100.0), driver=wrong)
+
+
+@pytest.mark.parametrize("device", ["electroadhesion", "ultrasonic"])
+@pytest.mark.parametrize("lifted", [False, True])
+def test_a_finger_that_rests_or_is_away_winds_nothing_up(device, lifted):
+    """Slides, rests (or is lifted) for 1.2 s, slides on: nothing saturates, and 0.2 s later the texture is back."""
+    time = np.arange(0.0, 3.2, 1e-3)
+    way = np.cumsum(np.where((time < 1.2) | (time > 2.4), 0.08, 0.0)) * 1e-3
+    position = abs(way % 0.1 - 0.05) - 0.025
+    touches = [(0.0, 1.2), (2.4, 3.2)] if lifted else None
+    finger = hr.Finger.sampled(position, rate=1000.0, normal_load=0.4, mechanics="light", touches=touches)
+    texture = hr.Grating(frequency=100.0, velocity=10e-3)
+    recording = hr.render(hr.Scene(texture=texture, finger=finger, duration=3.2, device=device))
+    late = recording.time > 0.3  # the first touch finds a loop that knows nothing yet
+    assert not (recording.flags[late] & hr.Flag.SATURATED).any()
+    back = recording.motion[recording.time >= 2.6, 0]
+    whole = int(len(back) * 100 / recording.rate) * recording.rate / 100
+    turn = np.exp(-2j * np.pi * 100.0 * np.arange(int(whole)) / recording.rate)
+    assert abs(2 * np.mean(back[: int(whole)] * turn)) == pytest.approx(10e-3 / 0.64, rel=0.01)

@@ -32,6 +32,8 @@ class FingerRange:
     presence : bool
         Targets are wanted, and learnt from, only while the finger's position is known: what it does not touch it does
         not feel.
+    least_speed : float, m/s
+        And only while it slides at least so fast, where `presence` holds.
     """
 
     mass: tuple[float, float] = (-2e-3, 12e-3)
@@ -42,6 +44,7 @@ class FingerRange:
     least_motion: float = 5e-8
     contact: tuple[float, float] | None = (0.05, 0.03)
     presence: bool = False
+    least_speed: float = 0.0
 
 
 @dataclass(frozen=True, kw_only=True)

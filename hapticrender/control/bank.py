@@ -213,6 +213,7 @@ def _numbers(model: BandModel, bands: Bands, rules: BankRules, feedback: bool) -
         modulated=bands.modulated,
         differentiated=bands.differentiated,
         presence=finger.presence,
+        least_speed=finger.least_speed,
         dc_quick=1.6 * quick,
         dc_drift_quick=quick**2,
         memory=model.memory,

@@ -218,7 +218,9 @@ def motion_pass(numbers, band, track, t):
     put(band, t, row.OMEGA, TURN * hertz)
     put(band, t, row.SWEEP, TURN * wavenumber * read(track, row.ACCELERATION))
     felt = read(track, row.SEEN) > 0.0
-    if not numbers.presence:
+    if numbers.presence:
+        felt = felt & (read(track, row.SPEED) >= numbers.least_speed)
+    else:
         felt = (wavenumber == 0.0) | felt
     ramp = lanes(band, t, row.RAMP)
     ramp = select(felt, low(ramp + numbers.ramp, 1.0), high(ramp - numbers.ramp, 0.0))

@@ -346,7 +346,8 @@ def bank_advance(tables, state, sensed, position, wanted, drive, target):
     quick = scale < 0.0
     if numbers.presence:  # the step of a friction is not what the texture does
         quick = (read(state.track, row.SEEN) <= 0.0) | (read(state.track, row.FRESH) > 0.0)
-        g, integral = select(quick, 0.0, g), select(quick, 0.0, integral)
+        idle = quick | (read(state.track, row.SPEED) < numbers.least_speed)  # a finger that rests feels no texture
+        g, integral = select(idle, 0.0, g), select(idle, 0.0, integral)
     doubt = 0.0 * scale
     hears_fast = hears_slow = 0.0 * lanes(band, 0, row.COS)
     for c in range(coordinates):

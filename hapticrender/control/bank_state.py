@@ -61,6 +61,7 @@ class BankNumbers(NamedTuple):
     modulated: bool  # the wanted waveform is a factor of every target
     differentiated: bool  # what is wanted is the time derivative of what the tones say
     presence: bool  # targets are wanted only while a finger is there
+    least_speed: float  # m/s: and slides at least so fast
     dc_quick: float  # of the DC band after a touch, and while no finger is there
     dc_drift_quick: float
     memory: float  # damping times speed of a sliding contact; 0: none
