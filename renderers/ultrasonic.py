@@ -2,7 +2,9 @@
 
 The target quantity is friction (N), as a change around a bias below that of
 the surface at rest.  The inverse of the friction law makes it an amplitude of
-the plate's mode, which the same controller holds on the resonant carrier.
+the plate's mode, which the same controller holds on the resonant carrier.  A
+driver of your own gets that carrier (V) at its own rate, and senses the mode's
+displacement (m), or nothing.
 """
 
 from __future__ import annotations
@@ -11,13 +13,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from hapticrender import defaults
 from hapticrender.control.bandmodel import BandModel
-from hapticrender.control.bank import BankController
-from hapticrender.control.methods import method_named
 from hapticrender.plants.surface import SurfaceParameters, UltrasonicSurface
 from hapticrender.protocols import Array, Driver
 from hapticrender.renderers.friction import FrictionRenderer, FrictionSettings, typical_load, typical_speed
+from hapticrender.renderers.resonant import ResonantDriver, amplitude_loop
 from hapticrender.touch.scene import Scene
 
 
@@ -32,6 +32,12 @@ class UltrasonicRenderer(FrictionRenderer):
         _, parameters = _read(scene)
         nominal = typical_load(scene), typical_speed(scene, parameters.least_speed)
         return UltrasonicSurface(parameters, amplitude_loop(parameters), scene.finger, seed, nominal)
+
+    def connect(self, scene: Scene, driver: Driver) -> Driver:
+        """Return a device at the carrier's rate as a driver of friction; see `ResonantDriver`."""
+        _, parameters = _read(scene)
+        nominal = typical_load(scene), typical_speed(scene, parameters.least_speed)
+        return ResonantDriver(driver, parameters, scene.finger, nominal)
 
     def band_model(self, scene: Scene, driver: Driver) -> BandModel:
         """Return what the controller may know of the surface behind `driver`.
@@ -84,14 +90,6 @@ class UltrasonicRenderer(FrictionRenderer):
                 sensed_noise=noise,
             )
         return replace(model, damping=model.damping + 0.5 / driver.rate)
-
-
-def amplitude_loop(parameters: SurfaceParameters) -> BankController:
-    """Return the amplitude's own controller, of the default method, at rest."""
-    loop = method_named(defaults.METHOD).design(parameters.amplitude_model(), parameters.amplitude_bands())
-    if not isinstance(loop, BankController):
-        raise TypeError(f"method {defaults.METHOD!r}: must step sample by sample on a carrier")
-    return loop
 
 
 def _read(scene: Scene) -> tuple[FrictionSettings, SurfaceParameters]:

@@ -153,7 +153,7 @@ def design_bank(
     tables = BankTables(
         numbers=_numbers(model, bands, rules, feedback),
         tone=bands.tone(),
-        listen=np.ascontiguousarray(model.coordinate_from_sensed),
+        listen=np.ascontiguousarray(model.coordinate_from_sensed[:, : None if feedback else 0]),
         speak=np.linalg.pinv(model.force_from_drive),
         mass=model.mass,
         damping=model.damping,

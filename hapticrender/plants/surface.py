@@ -37,7 +37,8 @@ if TYPE_CHECKING:
     from hapticrender.touch.finger import Finger
 
 PLACES = ("friction",)
-PACE = 25.0  # times the rules of a plate: an amplitude settles within a millisecond
+PACE = 100.0  # times the rules of a plate: within half a millisecond an amplitude has recovered from a touch
+PACED_DELAY = 1 / 60  # s, most of pace times delay: an amplitude is learnt no faster than the drive can answer
 MOST_DETUNING = 0.015  # of the resonance: as far as the amplitude loop looks for it
 TYPICAL_DETUNING = 1e-3
 MOST_DAMPING = 20.0  # times that of the nominal finger
@@ -130,6 +131,12 @@ class SurfaceParameters(SlidingParameters):
         """Samples of the carrier in one of the friction."""
         return self.oversampling if self.level == "carrier" else self.envelope_oversampling
 
+    @property
+    def least_ratio(self) -> float:
+        """Least mu/mu0 that is asked for: near its floor a law takes ever more amplitude for ever less."""
+        floor = self.friction_law.numbers.floor
+        return floor + 0.01 * (1.0 - floor)
+
     def amplitude_model(self) -> BandModel:
         """Band model of the mode with what a finger and the heat can make of it, for its amplitude loop."""
         mode = self.carrier_mode
@@ -149,7 +156,7 @@ def resonant(model: BandModel, mode: UltrasonicParameters, lock: float) -> BandM
     finger = MOST_DAMPING * mode.finger_damping * mode.frequency / mode.carrier
     return replace(
         model,
-        pace=PACE,
+        pace=min(PACE, PACED_DELAY * model.rate / model.delay),
         lock=lock,
         finger=FingerRange(
             mass=(0.0, 0.0),
@@ -288,7 +295,7 @@ def surface_tables(
         substeps=int(parameters.substeps),
         friction=float(parameters.friction_coefficient),
         bias=float(parameters.bias),
-        least=float(numbers.floor + 0.01 * (1.0 - numbers.floor)),
+        least=float(parameters.least_ratio),
         load=float(load),
         speed=float(speed),
         estimating=parameters.sensor == "amplitude",

@@ -88,9 +88,8 @@ def amplitude_pass(tables, state, wanted, mode, noise):
 
 
 @kernel
-def sensed_amplitude(state):
-    """Amplitude (m) as the loop's observer has it."""
-    band, loop = state.control.band, state.control.loop
+def sensed_amplitude(band, loop):
+    """Amplitude (m) as the observer of an amplitude loop has it, by its state."""
     re = band[0, row.SEEN_RE, 0] + loop[0, row.E_RE, 0]
     im = band[0, row.SEEN_IM, 0] + loop[0, row.E_IM, 0]
     return math.hypot(re, im)
@@ -116,7 +115,8 @@ def surface_step(tables, state, drive, finger, mode, noise, sensed, motion, skin
     flags |= trouble
     if tables.estimating:
         sensed[0] = state.estimate[0]
-        state.estimate[0] = whole * friction_ratio(tables.law, sensed_amplitude(state), load, pace) if there else 0.0
+        heard = sensed_amplitude(state.control.band, state.control.loop)
+        state.estimate[0] = whole * friction_ratio(tables.law, heard, load, pace) if there else 0.0
         return flags
     sensed[0] = shown
     return flags | (SENSOR_CLIPPED if abs(shown) >= tables.sliding.force_range else 0)
