@@ -23,6 +23,7 @@ from numba.core.imputils import lower_builtin, lower_cast
 from numba.core.typeconv import Conversion
 from numba.core.typing.templates import AbstractTemplate, infer_global, signature
 
+from hapticrender._records import kept_apart
 from hapticrender.protocols import Array
 
 WIDTH = {np.dtype(np.float64): 8, np.dtype(np.float32): 16}  # lanes of a 512-bit register; narrower machines split it
@@ -324,22 +325,13 @@ def _address(context: Any, builder: Any, kind: Any, array: Any, *where: Any) -> 
     return builder.gep(builder.bitcast(data.data, vector.as_pointer()), [row])
 
 
-def _kept_apart(builder: Any, access: Any, kind: str) -> None:
-    """Tell LLVM that tiles and a scenario's own numbers never share memory, so that neither is read again in vain."""
-    module = builder.module
-    base = module.add_metadata(
-        [ir.MetaDataString(module, kind), module.add_metadata([ir.MetaDataString(module, "lanes")])]
-    )
-    access.set_metadata("tbaa", module.add_metadata([base, base, ir.IntType(64)(0)]))
-
-
 def _load(context: Any, builder: Any, kind: Any, array: Any, where: Any, count: int) -> Any:
     """Value at `where`: a row of lanes or a number."""
     if _is_rows(kind, count):
         value = builder.load(_address(context, builder, kind, array, *where), align=_wide(kind))
     else:
         value = builder.load(_number(context, builder, kind, array, *where))
-    _kept_apart(builder, value, "tile" if kind.ndim == 3 and _is_rows(kind, count) else "own")
+    kept_apart(builder, value, "tile" if kind.ndim == 3 and _is_rows(kind, count) else "own")
     return value
 
 
@@ -349,7 +341,7 @@ def _store(context: Any, builder: Any, kind: Any, array: Any, where: Any, count:
         access = builder.store(value, _address(context, builder, kind, array, *where), align=_wide(kind))
     else:
         access = builder.store(value, _number(context, builder, kind, array, *where))
-    _kept_apart(builder, access, "tile" if kind.ndim == 3 and _is_rows(kind, count) else "own")
+    kept_apart(builder, access, "tile" if kind.ndim == 3 and _is_rows(kind, count) else "own")
 
 
 def _is_rows(kind: Any, indices: int) -> bool:
