@@ -11,9 +11,8 @@ import math
 from typing import Any
 
 from numba.core import types
-from numba.extending import overload
 
-from hapticrender._jit import OPTIONS
+from hapticrender._jit import by_types, kernel
 from hapticrender._lanes import LaneType, high, low, nearest, select, size
 
 S = (
@@ -95,80 +94,80 @@ def _short(kind: Any) -> bool:
     return (kind.dtype if isinstance(kind, LaneType) else kind) == types.float32
 
 
+@kernel
+def whole(value, factor):  # type: ignore[no-untyped-def]
+    """Nearest whole number to value * factor, up to 2^51, in double precision."""
+    return (value * factor + WHOLE) - WHOLE
+
+
+@kernel
+def _long_unit(turns):  # type: ignore[no-untyped-def]
+    """`unit` in double precision."""
+    x = turns - nearest(turns)
+    far = size(x) > 0.25
+    x = select(far, select(x > 0.0, 0.5, -0.5) - x, x)
+    u = x * x
+    u2 = u * u
+    s = (S[0] + S[1] * u) + (S[2] + S[3] * u) * u2 + ((S[4] + S[5] * u) + (S[6] + S[7] * u) * u2) * (u2 * u2)
+    c = (C[0] + C[1] * u) + (C[2] + C[3] * u) * u2 + ((C[4] + C[5] * u) + (C[6] + C[7] * u) * u2) * (u2 * u2)
+    return select(far, -c, c), s * x
+
+
+@kernel
+def _short_unit(turns):  # type: ignore[no-untyped-def]
+    """`unit` in single precision."""
+    x = turns - nearest(turns)
+    far = size(x) > 0.25
+    x = select(far, select(x > 0.0, 0.5, -0.5) - x, x)
+    u = x * x
+    s = S_SHORT[0] + u * (S_SHORT[1] + u * (S_SHORT[2] + u * (S_SHORT[3] + u * S_SHORT[4])))
+    c = C_SHORT[0] + u * (C_SHORT[1] + u * (C_SHORT[2] + u * (C_SHORT[3] + u * C_SHORT[4])))
+    return select(far, -c, c), s * x
+
+
+@by_types
 def unit(turns: Any) -> Any:
     """Cosine and sine of 2 pi `turns`, of any size that still knows its fraction."""
-    raise TypeError("unit: to be called from a kernel")
+    return _short_unit if _short(turns) else _long_unit
 
 
+@kernel
+def _long_polar(im, re):  # type: ignore[no-untyped-def]
+    """`polar` in double precision."""
+    across, along = size(im), size(re)
+    steep, larger = across > along, high(across, along)
+    t = low(across, along) / high(larger, 1e-300)
+    u = t * t
+    u2 = u * u
+    u4 = u2 * u2
+    p = (A[0] + A[1] * u) + (A[2] + A[3] * u) * u2 + ((A[4] + A[5] * u) + (A[6] + A[7] * u) * u2) * u4
+    p = t * (p + ((A[8] + A[9] * u) + (A[10] + A[11] * u) * u2) * (u4 * u4))
+    r = (R[0] + R[1] * u) + (R[2] + R[3] * u) * u2 + ((R[4] + R[5] * u) + (R[6] + R[7] * u) * u2) * u4
+    r += ((R[8] + R[9] * u) + (R[10] + R[11] * u) * u2) * (u4 * u4)
+    p = select(steep, HALF_PI - p, p)
+    p = select(re < 0.0, 2.0 * HALF_PI - p, p)
+    return larger * r, select(im < 0.0, -p, p)
+
+
+@kernel
+def _short_polar(im, re):  # type: ignore[no-untyped-def]
+    """`polar` in single precision."""
+    across, along = size(im), size(re)
+    steep, larger = across > along, high(across, along)
+    t = low(across, along) / high(larger, 1e-30)
+    u = t * t
+    u2 = u * u
+    u4 = u2 * u2
+    p = (A_SHORT[0] + A_SHORT[1] * u) + (A_SHORT[2] + A_SHORT[3] * u) * u2
+    p = t * (p + ((A_SHORT[4] + A_SHORT[5] * u) + (A_SHORT[6] + A_SHORT[7] * u) * u2) * u4)
+    r = (R_SHORT[0] + R_SHORT[1] * u) + (R_SHORT[2] + R_SHORT[3] * u) * u2
+    r += ((R_SHORT[4] + R_SHORT[5] * u) + (R_SHORT[6] + R_SHORT[7] * u) * u2) * u4
+    p = select(steep, HALF_PI - p, p)
+    p = select(re < 0.0, 2.0 * HALF_PI - p, p)
+    return larger * r, select(im < 0.0, -p, p)
+
+
+@by_types
 def polar(im: Any, re: Any) -> Any:
     """Magnitude of re + j im and its angle (rad, -pi to pi; 0 for 0)."""
-    raise TypeError("polar: to be called from a kernel")
-
-
-def whole(value: Any, factor: Any) -> Any:
-    """Nearest whole number to value * factor, up to 2^51, in double precision."""
-    raise TypeError("whole: to be called from a kernel")
-
-
-@overload(whole, jit_options=OPTIONS)
-def _whole(value, factor):  # type: ignore[no-untyped-def]
-    return lambda value, factor: (value * factor + WHOLE) - WHOLE
-
-
-@overload(unit, jit_options=OPTIONS)
-def _unit(turns):  # type: ignore[no-untyped-def]
-    def long(turns):  # type: ignore[no-untyped-def]
-        x = turns - nearest(turns)
-        far = size(x) > 0.25
-        x = select(far, select(x > 0.0, 0.5, -0.5) - x, x)
-        u = x * x
-        u2 = u * u
-        s = (S[0] + S[1] * u) + (S[2] + S[3] * u) * u2 + ((S[4] + S[5] * u) + (S[6] + S[7] * u) * u2) * (u2 * u2)
-        c = (C[0] + C[1] * u) + (C[2] + C[3] * u) * u2 + ((C[4] + C[5] * u) + (C[6] + C[7] * u) * u2) * (u2 * u2)
-        return select(far, -c, c), s * x
-
-    def short(turns):  # type: ignore[no-untyped-def]
-        x = turns - nearest(turns)
-        far = size(x) > 0.25
-        x = select(far, select(x > 0.0, 0.5, -0.5) - x, x)
-        u = x * x
-        s = S_SHORT[0] + u * (S_SHORT[1] + u * (S_SHORT[2] + u * (S_SHORT[3] + u * S_SHORT[4])))
-        c = C_SHORT[0] + u * (C_SHORT[1] + u * (C_SHORT[2] + u * (C_SHORT[3] + u * C_SHORT[4])))
-        return select(far, -c, c), s * x
-
-    return short if _short(turns) else long
-
-
-@overload(polar, jit_options=OPTIONS)
-def _polar(im, re):  # type: ignore[no-untyped-def]
-    def long(im, re):  # type: ignore[no-untyped-def]
-        across, along = size(im), size(re)
-        steep, larger = across > along, high(across, along)
-        t = low(across, along) / high(larger, 1e-300)
-        u = t * t
-        u2 = u * u
-        u4 = u2 * u2
-        p = (A[0] + A[1] * u) + (A[2] + A[3] * u) * u2 + ((A[4] + A[5] * u) + (A[6] + A[7] * u) * u2) * u4
-        p = t * (p + ((A[8] + A[9] * u) + (A[10] + A[11] * u) * u2) * (u4 * u4))
-        r = (R[0] + R[1] * u) + (R[2] + R[3] * u) * u2 + ((R[4] + R[5] * u) + (R[6] + R[7] * u) * u2) * u4
-        r += ((R[8] + R[9] * u) + (R[10] + R[11] * u) * u2) * (u4 * u4)
-        p = select(steep, HALF_PI - p, p)
-        p = select(re < 0.0, 2.0 * HALF_PI - p, p)
-        return larger * r, select(im < 0.0, -p, p)
-
-    def short(im, re):  # type: ignore[no-untyped-def]
-        across, along = size(im), size(re)
-        steep, larger = across > along, high(across, along)
-        t = low(across, along) / high(larger, 1e-30)
-        u = t * t
-        u2 = u * u
-        u4 = u2 * u2
-        p = (A_SHORT[0] + A_SHORT[1] * u) + (A_SHORT[2] + A_SHORT[3] * u) * u2
-        p = t * (p + ((A_SHORT[4] + A_SHORT[5] * u) + (A_SHORT[6] + A_SHORT[7] * u) * u2) * u4)
-        r = (R_SHORT[0] + R_SHORT[1] * u) + (R_SHORT[2] + R_SHORT[3] * u) * u2
-        r += ((R_SHORT[4] + R_SHORT[5] * u) + (R_SHORT[6] + R_SHORT[7] * u) * u2) * u4
-        p = select(steep, HALF_PI - p, p)
-        p = select(re < 0.0, 2.0 * HALF_PI - p, p)
-        return larger * r, select(im < 0.0, -p, p)
-
-    return short if _short(im) else long
+    return _short_polar if _short(im) else _long_polar

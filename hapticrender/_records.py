@@ -18,7 +18,7 @@ from numba.core.extending import NativeValue, lower_getattr_generic, models, reg
 class RecordType(types.NamedTuple):
     """Numba's type of a named tuple that is known by its address; those inside of it lie in the same memory."""
 
-    def __init__(self, plain: types.BaseNamedTuple) -> None:
+    def __init__(self, plain: Any) -> None:
         super().__init__([as_record(each) for each in plain], plain.instance_class)
         self.name = f"{plain.instance_class.__name__}.{hashlib.sha256(self.name.encode()).hexdigest()[:16]}"
 
@@ -33,6 +33,7 @@ class Layout(ir.LiteralStructType):
 
 
 def _memory(context: Any, kind: RecordType) -> Layout:
+    """Layout of a record, with those inside of it."""
     return Layout(
         [
             _memory(context, each) if isinstance(each, RecordType) else context[each].get_value_type()
@@ -80,6 +81,7 @@ def _unboxed(kind: RecordType, source: Any, c: Any) -> NativeValue:
 
 
 def _fill(kind: RecordType, source: Any, record: Any, wrong: Any, c: Any) -> None:
+    """Copy field by field; a number that is none is noticed once, at the end."""
     for i, each in enumerate(kind.types):
         found, at = c.pyapi.tuple_getitem(source, i), cgutils.gep_inbounds(c.builder, record, 0, i)
         if isinstance(each, RecordType):

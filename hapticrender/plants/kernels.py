@@ -304,7 +304,7 @@ def sense(tables, state, noise, sensed, motion):
 @kernel
 def plate_sense(tables, state, noise, sensed, motion):
     """`sense` of a single plate; returns flags."""
-    return int(sense(tables, state, noise, sensed, motion))
+    return np.int64(sense(tables, state, noise, sensed, motion))
 
 
 @kernel
