@@ -70,12 +70,23 @@ class _KernelTyping(Context):
 class _FragmentLibrary(JITCodeLibrary):
     """Code of a kernel as a part of others: each function optimised, not linked, nor made to run by itself."""
 
+    def add_linking_library(self, library: Any) -> None:
+        """Note a part, once: who calls this kernel gets all of them (`parts`)."""
+        if library not in self._linking_libraries:
+            super().add_linking_library(library)
+
+    @property
+    def parts(self) -> list[Any]:
+        """Itself and everything that it calls."""
+        return [self, *self._linking_libraries]
+
     def finalize(self) -> None:
+        """Leave everything else to who calls it."""
         self._finalized = True
 
 
 class _WholeLibrary(JITCodeLibrary):
-    """Code of a kernel with all its parts, each linked once."""
+    """Code of a kernel with all its parts."""
 
     def add_ir_module(self, ir_module: Any) -> None:
         """Add code, and promise that nothing else writes to its records, so that their numbers are read once."""
@@ -90,12 +101,6 @@ class _WholeLibrary(JITCodeLibrary):
         """Optimise once: the parts are in order already, and what pays as vectors is written as vectors."""
         passes, builder = self._codegen._module_pass_manager(opt=2)
         passes.run(self._final_module, builder)
-
-    def add_linking_library(self, library: Any) -> None:
-        if library not in self._linking_libraries:
-            super().add_linking_library(library)
-            for each in library._linking_libraries:
-                self.add_linking_library(each)
 
 
 class _WholeCompiler(_FunctionCompiler):

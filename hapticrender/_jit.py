@@ -74,7 +74,7 @@ class _Fragment(CPUDispatcher):
                 lowered: Any = self._compiler.compile(args, returned)
                 known = lowered._replace(entry_point=key)
                 part = known._asdict()
-                self.targetctx.insert_user_function(key, part["fndesc"], [part["library"]])
+                self.targetctx.insert_user_function(key, part["fndesc"], part["library"].parts)
                 self.overloads[tuple(args)] = known
         return known.entry_point
 

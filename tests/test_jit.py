@@ -6,6 +6,7 @@ import subprocess
 import sys
 from typing import NamedTuple
 
+import numba
 import numpy as np
 import pytest
 from conftest import ROOT
@@ -180,3 +181,11 @@ def both(x, y):
 
 def test_types_choose_what_is_called():
     assert both(np.array([3.0]), 4.0) == 11.0
+
+
+def test_plain_numba_calls_a_kernel_with_all_its_parts():
+    @numba.njit
+    def caller(x, y):
+        return both(x, y)
+
+    assert caller(np.array([3.0]), 4.0) == 11.0
