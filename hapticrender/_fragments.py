@@ -67,25 +67,31 @@ class _KernelTyping(Context):
         return self.found[key][1]  # type: ignore[attr-defined]
 
 
-class _FragmentLibrary(JITCodeLibrary):
-    """Code of a kernel as a part of others: each function optimised, not linked, nor made to run by itself."""
+class _Library(JITCodeLibrary):
+    """Code of a kernel, which knows everything that it calls, also by others."""
 
     def add_linking_library(self, library: Any) -> None:
-        """Note a part, once: who calls this kernel gets all of them (`parts`)."""
+        """Note a part, and its parts, once."""
         if library not in self._linking_libraries:
             super().add_linking_library(library)
+            for each in library._linking_libraries:
+                self.add_linking_library(each)
 
     @property
     def parts(self) -> list[Any]:
         """Itself and everything that it calls."""
         return [self, *self._linking_libraries]
 
+
+class _FragmentLibrary(_Library):
+    """Code of a kernel as a part of others: each function optimised, not linked, nor made to run by itself."""
+
     def finalize(self) -> None:
         """Leave everything else to who calls it."""
         self._finalized = True
 
 
-class _WholeLibrary(JITCodeLibrary):
+class _WholeLibrary(_Library):
     """Code of a kernel with all its parts."""
 
     def add_ir_module(self, ir_module: Any) -> None:

@@ -183,9 +183,25 @@ def test_types_choose_what_is_called():
     assert both(np.array([3.0]), 4.0) == 11.0
 
 
+@kernel
+def loudness(x):
+    return abs(x)
+
+
+@kernel
+def louder(x):
+    return 2.0 * loudness(x)
+
+
+def test_what_numba_compiles_inside_of_a_part_is_linked():
+    """The magnitude of a complex number is numba's own function, which calls another."""
+    assert louder(3.0 + 4.0j) == 10.0
+
+
 def test_plain_numba_calls_a_kernel_with_all_its_parts():
     @numba.njit
     def caller(x, y):
         return both(x, y)
 
     assert caller(np.array([3.0]), 4.0) == 11.0
+    assert numba.njit(lambda x: louder(x))(3.0 + 4.0j) == 10.0
