@@ -89,7 +89,18 @@ def test_type_checkers_are_told_of_every_public_name():
 
 GROUND = {
     f"hapticrender.{name}"
-    for name in ("protocols", "errors", "bands", "contract", "defaults", "_jit", "_lanes", "_polynomials")
+    for name in (
+        "protocols",
+        "errors",
+        "bands",
+        "contract",
+        "defaults",
+        "_records",
+        "_fragments",
+        "_jit",
+        "_lanes",
+        "_polynomials",
+    )
 }
 MAY_IMPORT = {  # room: the other rooms that it may look into
     "ground": set(),

@@ -6,9 +6,8 @@ A tile's lanes are bands of one scenario, or one band of as many scenarios; only
 from __future__ import annotations
 
 import numpy as np
-from numba.extending import overload
 
-from hapticrender._jit import kernel
+from hapticrender._jit import by_types, kernel
 from hapticrender._lanes import floor, high, lanes, low, put, read, select, size
 from hapticrender._polynomials import unit
 from hapticrender.control import bank_rows as row
@@ -44,7 +43,7 @@ def follow_resonance(tables, state):
     along = tables.stiffness[0, 0] + touch[row.STIFFNESS] - omega * omega * mass
     across = omega * (tables.damping[0, 0] + touch[row.DAMPING])
     hertz = along / (2.0 * TURN * mass * omega)
-    state.shift[0] += min(numbers.lock * REFRESH / numbers.rate, 1.0) * hertz
+    state.shift[0] += low(numbers.lock * REFRESH / numbers.rate, 1.0) * hertz
     re, im = band[0, row.R_RE, 0], band[0, row.R_IM, 0]
     heard = re * re + im * im > numbers.least_motion * numbers.least_motion
     state.shift[1] = 0.0 if heard and size(along) <= across else 1.0
@@ -57,7 +56,8 @@ def take_bands(tables, state, t):
     grows = follows = False
     if tables.numbers.lock > 0.0 and t == 0:
         follow_resonance(tables, state)
-    for i in range(min(width, tone.shape[1] - t * width)):
+    left = tone.shape[1] - t * width
+    for i in range(width if left > width else left):
         k = t * width + i
         band[t, row.LIVE, i] = 1.0
         for r in range(row.TONE_ROWS):
@@ -86,23 +86,16 @@ def take_scenarios(tables, state, t):
     return grows, follows
 
 
-def taker(tone):
-    """Which of the two fits the shape of `tone`."""
-    return take_bands if tone.ndim == 2 else take_scenarios
-
-
-@overload(taker)
-def _compiled_taker(tone):
-    """Decided while the kernel is compiled."""
-    chosen = taker(tone)
-    return lambda tone: chosen
+@by_types
+def take(tables, state, t):
+    """Which of the two fits the shape of `tables.tone`."""
+    return take_bands if tables[tables.fields.index("tone")].ndim == 2 else take_scenarios
 
 
 @kernel
 def refresh(tables, state):
     """Take up the tones that are asked for, and what stays for the next samples: law, turn, settled targets."""
     numbers, band = tables.numbers, state.band
-    take = taker(tables.tone)
     state.follows[0] = 0
     for t in range(band.shape[0]):
         grows, follows = take(tables, state, t)

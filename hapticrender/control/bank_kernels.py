@@ -9,6 +9,8 @@ bands are the lanes, and as many scenarios as there are lanes, side by side.
 
 from __future__ import annotations
 
+import numpy as np
+
 from hapticrender._jit import kernel
 from hapticrender._lanes import (
     any_of,
@@ -381,7 +383,7 @@ def bank_advance(tables, state, sensed, position, wanted, drive, target):
 @kernel
 def bank_step(tables, state, sensed, position, wanted, drive, target):
     """One sample of a single scenario; see `bank_advance`.  Returns flags."""
-    flags = int(bank_advance(tables, state, sensed, position, wanted, drive, target))
+    flags = np.int64(bank_advance(tables, state, sensed, position, wanted, drive, target))
     if tables.numbers.lock > 0.0 and state.shift[1] > 0.0:
         flags |= 32
     return flags

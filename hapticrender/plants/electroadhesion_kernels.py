@@ -14,7 +14,7 @@ from typing import NamedTuple
 from hapticrender._jit import kernel
 from hapticrender.control.gap import VACUUM, GapState, GapTables, gap_step
 from hapticrender.control.square_root import SquareRootTables, square_root_step
-from hapticrender.plants.closed import step_of
+from hapticrender.plants.closed import control_step
 from hapticrender.plants.sliding import SlidingState, SlidingTables, sliding_step
 from hapticrender.protocols import Array
 
@@ -258,8 +258,7 @@ def closed_screen_run(
     tables, state, control, control_state, last, finger, noise, wanted, sensed, motion, felt, drive, target, flags
 ):
     """Screen and controller closed sample by sample; `last` (1,) is the drive computed one sample ago."""
-    step = step_of(control)
     for n in range(sensed.shape[0]):
         drive[n, 0] = last[0]
         flags[n] = screen_step(tables, state, last[0], finger[n], noise[n], sensed[n], motion[n], felt[n])
-        flags[n] |= step(control, control_state, sensed[n], finger[n, POSITION], wanted[n], last, target[n])
+        flags[n] |= control_step(control, control_state, sensed[n], finger[n, POSITION], wanted[n], last, target[n])

@@ -14,7 +14,7 @@ from hapticrender._jit import kernel
 from hapticrender.control import bank_rows as row
 from hapticrender.control.bank_kernels import bank_step
 from hapticrender.control.bank_state import BankState, BankTables
-from hapticrender.plants.closed import step_of
+from hapticrender.plants.closed import control_step
 from hapticrender.plants.friction_laws import LawNumbers, friction_ratio, wanted_amplitude
 from hapticrender.plants.kernels import HUGE, SENSOR_CLIPPED
 from hapticrender.plants.sliding import SlidingState, SlidingTables, sliding_step
@@ -139,11 +139,10 @@ def closed_surface_run(
 
     `outputs` are the columns sensed, motion, skin velocity and amplitude.
     """
-    step = step_of(control)
     sensed, motion, skin, amplitude = outputs
     for n in range(sensed.shape[0]):
         drive[n, 0] = last[0]
         flags[n] = surface_step(
             tables, state, last[0], finger[n], mode[n], noise[n], sensed[n], motion[n], skin[n], amplitude[n]
         )
-        flags[n] |= step(control, control_state, sensed[n], finger[n, POSITION], wanted[n], last, target[n])
+        flags[n] |= control_step(control, control_state, sensed[n], finger[n, POSITION], wanted[n], last, target[n])
