@@ -13,8 +13,8 @@ from dataclasses import dataclass, replace
 
 from hapticrender.control.bandmodel import BandModel
 from hapticrender.control.square_root import SquareRoot
+from hapticrender.plants.bounds import choice, number
 from hapticrender.plants.electroadhesion import NORMAL, ElectroadhesionParameters, ElectroadhesionScreen
-from hapticrender.plants.sliding import choice, number
 from hapticrender.protocols import Array, Driver
 from hapticrender.renderers.friction import ROOM, FrictionRenderer, FrictionSettings, typical_load, typical_speed
 from hapticrender.renderers.shaped import CarrierDriver, ShapedDriver

@@ -17,7 +17,8 @@ import numpy as np
 
 from hapticrender.bands import Bands
 from hapticrender.control.bandmodel import BandModel, FingerRange
-from hapticrender.plants.sliding import SlidingParameters, Validated, choice, number
+from hapticrender.plants.bounds import Validated, choice, number
+from hapticrender.plants.sliding import SlidingParameters
 from hapticrender.protocols import Array
 from hapticrender.renderers.base import BaseRenderer, Waveform
 from hapticrender.renderers.limits import check_carriers, felt, needed_drive, speeds

@@ -20,9 +20,9 @@ import numpy as np
 from hapticrender.bands import Bands
 from hapticrender.control.bandmodel import BandModel
 from hapticrender.control.together import TogetherController, TwoBands, TwoModels, design_together
+from hapticrender.plants.bounds import Validated, number
 from hapticrender.plants.electroadhesion import ElectroadhesionParameters, ElectroadhesionScreen
 from hapticrender.plants.hybrid import PLACES, HybridPlant
-from hapticrender.plants.sliding import Validated, number
 from hapticrender.plants.vibrotactile import PlateParameters
 from hapticrender.protocols import Array, Driver, Method, Sensed, Texture
 from hapticrender.renderers.base import BaseRenderer

@@ -33,6 +33,7 @@ import numpy as np
 
 from hapticrender.control.gap import VACUUM, GapEstimator, gap_state
 from hapticrender.control.square_root import SquareRoot, SquareRootTables
+from hapticrender.plants.bounds import choice, number
 from hapticrender.plants.closed import STEPS
 from hapticrender.plants.electroadhesion_kernels import (
     LOAD,
@@ -45,7 +46,7 @@ from hapticrender.plants.electroadhesion_kernels import (
     element,
     screen_run,
 )
-from hapticrender.plants.sliding import SlidingParameters, choice, number, sliding_state, sliding_tables
+from hapticrender.plants.sliding import SlidingParameters, sliding_state, sliding_tables
 from hapticrender.protocols import Array, Controller, Sensed
 
 if TYPE_CHECKING:

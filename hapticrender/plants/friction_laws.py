@@ -19,7 +19,7 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 
 from hapticrender._jit import kernel
-from hapticrender.plants.bounds import Bound, check_fields, positive
+from hapticrender.plants.bounds import Validated, number
 from hapticrender.protocols import Array
 
 FIT, FILM, BOUNCE = 0, 1, 2  # kinds of law
@@ -156,7 +156,7 @@ class _Law:
 
 
 @dataclass(frozen=True, kw_only=True)
-class FitLaw(_Law):
+class FitLaw(_Law, Validated):
     """mu/mu0 = floor + (1 - floor) exp(-(a/scale)^exponent).
 
     Parameters
@@ -179,12 +179,9 @@ class FitLaw(_Law):
     [1.0, 0.48, 0.11]
     """
 
-    floor: float = 0.10
-    scale: float = 1.1e-6
-    exponent: float = 1.5
-
-    def __post_init__(self) -> None:
-        check_fields(self, _BOUNDS)
+    floor: float = number(0.10, most=0.999)
+    scale: float = number(1.1e-6, "m", above=0.0)
+    exponent: float = number(1.5, above=0.0)
 
     @property
     def numbers(self) -> LawNumbers:
@@ -193,7 +190,7 @@ class FitLaw(_Law):
 
 
 @dataclass(frozen=True, kw_only=True)
-class LoadSharing(_Law):
+class LoadSharing(_Law, Validated):
     """Asperities and a squeeze film carry the load together: W/A = pc exp(-u/u0) + 1.25 p0 (a/u)^2.
 
     Parameters
@@ -217,15 +214,12 @@ class LoadSharing(_Law):
     [0.29, 0.45, 0.56]
     """
 
-    contact_pressure: float = 200e3
-    decay: float = 1.5e-6
-    pressure: float = 101e3
-    area: float = 1e-4
+    contact_pressure: float = number(200e3, "Pa", above=0.0)
+    decay: float = number(1.5e-6, "m", above=0.0)
+    pressure: float = number(101e3, "Pa", above=0.0)
+    area: float = number(1e-4, "m2", above=0.0)
 
     _unloaded = False
-
-    def __post_init__(self) -> None:
-        check_fields(self, _BOUNDS)
 
     @property
     def _heaviest(self) -> float:  # type: ignore[override]
@@ -239,7 +233,7 @@ class LoadSharing(_Law):
 
 
 @dataclass(frozen=True, kw_only=True)
-class IntermittentContact(_Law):
+class IntermittentContact(_Law, Validated):
     """mu/mu0 = exp(-c mu0 a f/v): a bouncing skin touches for a part of each cycle.
 
     Parameters
@@ -262,12 +256,9 @@ class IntermittentContact(_Law):
     [0.15, 0.38, 0.62]
     """
 
-    coefficient: float = 2.0
-    friction: float = 0.8
-    frequency: float = 30e3
-
-    def __post_init__(self) -> None:
-        check_fields(self, _BOUNDS)
+    coefficient: float = number(2.0, above=0.0)
+    friction: float = number(0.8, above=0.0)
+    frequency: float = number(30e3, "Hz", above=0.0)
 
     @property
     def numbers(self) -> LawNumbers:
@@ -276,19 +267,6 @@ class IntermittentContact(_Law):
 
 
 LAWS = {"fit": FitLaw, "load-sharing": LoadSharing, "intermittent": IntermittentContact}
-
-_BOUNDS = {
-    "floor": Bound(most=0.999),
-    "scale": positive("m"),
-    "exponent": positive(),
-    "contact_pressure": positive("Pa"),
-    "decay": positive("m"),
-    "pressure": positive("Pa"),
-    "area": positive("m2"),
-    "coefficient": positive(),
-    "friction": positive(),
-    "frequency": positive("Hz"),
-}
 
 
 def _checked(name: str, value: Any, least: float, most: float, unit: str = "") -> Array:

@@ -16,11 +16,11 @@ import numpy as np
 from hapticrender.bands import Bands
 from hapticrender.control.bandmodel import BandModel, FingerRange
 from hapticrender.control.bank import BankController
-from hapticrender.plants.bounds import overridden
+from hapticrender.plants.bounds import choice, number
 from hapticrender.plants.closed import STEPS
 from hapticrender.plants.electroadhesion import finger_rows
 from hapticrender.plants.friction_laws import LAWS, FrictionLaw
-from hapticrender.plants.sliding import SlidingParameters, choice, number, sliding_state, sliding_tables
+from hapticrender.plants.sliding import SlidingParameters, sliding_state, sliding_tables
 from hapticrender.plants.surface_kernels import (
     LOAD,
     POSITION,
@@ -108,7 +108,7 @@ class SurfaceParameters(SlidingParameters):
                 known = sorted(set().union(*names.values()))
                 raise ValueError(f"plant.{name}: no such parameter; known: {', '.join(known)}")
             parts[part][name] = value
-        mode = overridden(UltrasonicParameters, parts["mode"])
+        mode = UltrasonicParameters.with_overrides(parts["mode"])
         try:
             return cls(**parts["own"], mode=mode, law_parameters=parts["law"])
         except (ValueError, TypeError) as error:

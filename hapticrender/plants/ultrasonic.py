@@ -19,14 +19,13 @@ That is the level "envelope": still a mode on a carrier, for the same controller
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from hapticrender.control.bandmodel import BandModel
-from hapticrender.plants.bounds import Bound, check_fields, overridden, positive
+from hapticrender.plants.bounds import Validated, choice, number
 from hapticrender.plants.closed import STEPS
 from hapticrender.plants.ultrasonic_kernels import (
     STEP,
@@ -52,7 +51,7 @@ RAMPS = 1000  # steps a second in which the temperature rises
 
 
 @dataclass(frozen=True, kw_only=True)
-class UltrasonicParameters:
+class UltrasonicParameters(Validated):
     """Everything that describes the mode, its electronics and how finely it is modelled.
 
     Parameters
@@ -104,31 +103,27 @@ class UltrasonicParameters:
     ([75.0, 250.1], 2.0)
     """
 
-    frequency: float = 30e3
-    modal_mass: float = 5e-3
-    quality: float = 200.0
-    finger_damping: float = 11.0
-    finger_shift: float = -30.0
-    temperature_coefficient: float = -100e-6
-    temperature_rise: float = 0.0
-    temperature_time: float = 1.0
-    drive_limit: float = 10.0
-    force_constant: float = 1.777
-    sensor_range: float = 50e-6
-    sensor_bits: int = 16
-    drive_bits: int = 16
-    sensor_noise: float = 2e-9
-    rate: float = 192e3
-    delay: int = 1
-    level: str = "carrier"
-    envelope_frequency: float = 6e3
+    frequency: float = number(30e3, "Hz", least=20e3, most=70e3)
+    modal_mass: float = number(5e-3, "kg", above=0.0)
+    quality: float = number(200.0, least=5.0, most=1e5)
+    finger_damping: float = number(11.0, "N s/m")
+    finger_shift: float = number(-30.0, "Hz", least=-1e4, most=1e4)
+    temperature_coefficient: float = number(-100e-6, "1/K", least=-1e-3, most=1e-3)
+    temperature_rise: float = number(0.0, "K", least=-100.0, most=100.0)
+    temperature_time: float = number(1.0, "s", above=0.0)
+    drive_limit: float = number(10.0, "V", above=0.0)
+    force_constant: float = number(1.777, "N/V", above=0.0)
+    sensor_range: float = number(50e-6, "m", above=0.0)
+    sensor_bits: int = number(16, least=0, most=24)
+    drive_bits: int = number(16, least=0, most=24)
+    sensor_noise: float = number(2e-9, "m")
+    rate: float = number(192e3, "Hz", least=500.0, most=1e7)
+    delay: int = number(1, "samples", least=1, most=100_000)
+    level: str = choice("carrier", *LEVELS)
+    envelope_frequency: float = number(6e3, "Hz", least=500.0)
 
     def __post_init__(self) -> None:
-        if not isinstance(self.level, str):
-            raise TypeError(f"level = {self.level!r}: must be one of {', '.join(LEVELS)}")
-        if self.level not in LEVELS:
-            raise ValueError(f"level = {self.level!r}: must be one of {', '.join(LEVELS)}")
-        check_fields(self, _BOUNDS)
+        super().__post_init__()
         if self.envelope_frequency >= self.frequency:
             raise ValueError(
                 f"envelope_frequency = {self.envelope_frequency!r}: must be < frequency = {self.frequency:g} Hz"
@@ -155,11 +150,6 @@ class UltrasonicParameters:
                     f"{name} = {getattr(self, name)!r}: shifts the resonance by up to {shift:g} Hz, "
                     f"must be within {MOST_SHIFT * self.carrier:g} Hz of a carrier of {self.carrier:g} Hz"
                 )
-
-    @classmethod
-    def with_overrides(cls, overrides: Mapping[str, Any]) -> UltrasonicParameters:
-        """Defaults with some parameters replaced; an unknown name is a ValueError that lists the known ones."""
-        return overridden(cls, overrides)
 
     def transposed(self, frequency: float, rate: float) -> UltrasonicParameters:
         """Return the same plate at level "envelope": its mode on a carrier of `frequency` (Hz) at `rate` (Hz).
@@ -268,27 +258,6 @@ class UltrasonicParameters:
             sensed_noise=self.sensor_noise,
             rigid=True,
         )
-
-
-_BOUNDS = {
-    "frequency": Bound("Hz", 20e3, 70e3),
-    "modal_mass": positive("kg"),
-    "quality": Bound("", 5.0, 1e5),
-    "finger_damping": Bound("N s/m"),
-    "finger_shift": Bound("Hz", -1e4, 1e4),
-    "temperature_coefficient": Bound("1/K", -1e-3, 1e-3),
-    "temperature_rise": Bound("K", -100.0, 100.0),
-    "temperature_time": positive("s"),
-    "drive_limit": positive("V"),
-    "force_constant": positive("N/V"),
-    "sensor_range": positive("m"),
-    "sensor_bits": Bound("", 0, 24),
-    "drive_bits": Bound("", 0, 24),
-    "sensor_noise": Bound("m"),
-    "rate": Bound("Hz", 500.0, 1e7),
-    "delay": Bound("samples", 1, 100_000),
-    "envelope_frequency": Bound("Hz", 500.0),
-}
 
 
 def _grip(normal_load: Array | float) -> Array:
