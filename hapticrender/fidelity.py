@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from hapticrender import fidelity_plate
+from hapticrender import fidelity_friction, fidelity_plate
 from hapticrender.fidelity_plate import NoBound, Option
 from hapticrender.touch.finger import Finger
 from hapticrender.touch.scene import PlantValue, Scene
@@ -23,7 +23,11 @@ class Ladder(NamedTuple):
     bound: Callable[[Scene, Scene], float]
 
 
-LADDERS: dict[str, Ladder] = {"vt-plate": Ladder(fidelity_plate.OPTIONS, fidelity_plate.bound)}
+LADDERS: dict[str, Ladder] = {
+    "vt-plate": Ladder(fidelity_plate.OPTIONS, fidelity_plate.bound),
+    "electroadhesion": Ladder(fidelity_friction.SCREEN_OPTIONS, fidelity_friction.bound),
+    "ultrasonic": Ladder(fidelity_friction.SURFACE_OPTIONS, fidelity_friction.bound),
+}
 
 
 @dataclass(frozen=True, kw_only=True)

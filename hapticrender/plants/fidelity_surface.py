@@ -1,0 +1,187 @@
+"""How an ultrasonic surface's amplitude follows what is wanted of it, in closed form at either level.
+
+In the frame of the carrier w, at the offset W, the amplitude loop is linear for small modulation.  With
+z = e^(j (w+W) h) at the carrier's period h, the mode G held over it, the loop's delay d, its feedback K and its law's
+feed-forward::
+
+    Y/R = G z^-d (FF + K + K_z)/(1 + G z^-d (K + K_z)),    FF = rho (D + D' (1 - e^(-j W h))/h)
+
+K is that of `bank_loop`.  K_z is what learning adds, which acts like one more integral: the learnt part zeta of D goes
+after the error envelope e less its slow part l, with the pace gamma, and its force zeta R undoes R's division::
+
+    zeta' = -gamma (D e + D'_0 e')/R  for e - l in place of e
+
+The mode at level "envelope" differs in D by `UltrasonicParameters.envelope_error`; but the loop's sample is longer
+there, and lateness and learning tell more of the two levels apart than that.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from scipy.fft import fft, fftfreq, ifft, next_fast_len
+
+from hapticrender.control.bank_kernels import ADAPTATION
+from hapticrender.control.bank_loop import BankLoop, KnownFinger, Structure
+from hapticrender.control.bank_state import BankTables
+from hapticrender.control.kernels import FREQUENCY
+from hapticrender.control.stability import STATES, bank_loop
+from hapticrender.plants.surface import SurfaceParameters
+from hapticrender.protocols import Array
+
+GRID = 400  # offsets of either sign at which the loop is computed; between them it is interpolated
+LEAST_OFFSET = 1e-3  # Hz: a slower change of the amplitude is followed perfectly
+NYQUIST = 0.49  # of the rate: to there, lest an offset should take the carrier to nothing
+
+
+@dataclass(frozen=True, kw_only=True)
+class AmplitudeLoop:
+    """The amplitude loop under a finger of one load, settled.
+
+    Parameters
+    ----------
+    parameters : SurfaceParameters
+        The surface and its level.
+    tables : BankTables
+        Of the loop, as designed.
+    load : float, N
+        Of the finger; 0: none.
+    rise : float, K
+        Of the temperature.
+    state : {"quiet", "stirred", "awake"}
+        Which of the loop's detectors stand open.
+    """
+
+    parameters: SurfaceParameters
+    tables: BankTables
+    load: float
+    rise: float
+    state: str
+
+    @cached_property
+    def omega(self) -> float:
+        """Angular frequency (rad/s) of the carrier: the resonance, where it is followed."""
+        mode = self.parameters.carrier_mode
+        frequency = mode.resonance(self.load, self.rise) if self.parameters.lock else mode.carrier
+        return 2 * np.pi * float(frequency)
+
+    @cached_property
+    def damping(self) -> float:
+        """Of the mode (N s/m)."""
+        return float(self.parameters.carrier_mode.damping(self.load))
+
+    @cached_property
+    def stiffness(self) -> complex:
+        """D (N/m) of the mode at the carrier, which the loop has learnt."""
+        mode = self.parameters.carrier_mode
+        resonance = 2 * np.pi * float(mode.resonance(self.load, self.rise))
+        return mode.mass * (resonance - self.omega) * (resonance + self.omega) + 1j * self.omega * self.damping
+
+    @cached_property
+    def loop(self) -> BankLoop:
+        """The bank on the mode."""
+        mode, known = self.parameters.carrier_mode, self.tables
+        resonance = 2 * np.pi * float(mode.resonance(self.load, self.rise))
+        free = known.stiffness[0, 0] - self.omega**2 * known.mass[0, 0] + 1j * self.omega * known.damping[0, 0]
+        learnt = self.stiffness - free
+        tone = known.tone.copy()
+        tone[FREQUENCY] = self.omega / (2 * np.pi)
+        numbers = ([[mode.mass]], [[self.damping]], [[mode.mass * resonance**2]])
+        return bank_loop(
+            known._replace(tone=tone),
+            self.state,
+            plant=Structure.free(*(np.array(number) for number in numbers)),
+            finger=KnownFinger(0.0, learnt.imag / self.omega, learnt.real, 0.0),
+        )
+
+    def response(self, offset: Array) -> Array:
+        """Envelope of the mode per wanted amplitude (complex) at `offset` (Hz, not 0) from the carrier, in one sample.
+
+        Returns
+        -------
+        ndarray of complex
+            At the sample that a wanted amplitude is handed to the loop, of what is sensed then.
+        """
+        turn, h = 2 * np.pi * np.asarray(offset, float), self.loop.period
+        z = np.exp(1j * (self.omega + turn) * h)
+        gain, rest = (each[0] for each in self.loop.controller(z))
+        fed_back = gain[:, 0, 0] + self._learning(turn, z) / rest
+        slope = self.damping + 2j * self.omega * self.parameters.carrier_mode.mass
+        forward = self._ahead * (self.stiffness + slope * (1 - np.exp(-1j * turn * h)) / h)
+        mode = self.loop.plant.response(z)[:, 0, 0] * z**-self.loop.delay
+        return mode * (forward + fed_back) / (1 + mode * fed_back)
+
+    @property
+    def _ahead(self) -> complex:
+        """Return rho, which turns the force ahead by delay and hold."""
+        h = self.loop.period
+        return complex(np.exp(1j * self.omega * self.tables.numbers.lead) / np.sinc(self.omega * h / (2 * np.pi)))
+
+    def _learning(self, turn: Array, z: Array) -> Array:
+        """Force (N/m) that learning adds, per residual."""
+        known, h = self.tables, self.loop.period
+        g, integral, inner = (float(each[0]) for each in (self.loop.observer, self.loop.integral, self.loop.inner))
+        lively = max(STATES[self.state])
+        pace = known.numbers.adapt + lively * (known.numbers.adapt_awake - known.numbers.adapt)
+        still = z / (z - np.exp(1j * self.omega * h))  # of an integral in the carrier's frame
+        error = g * still
+        slow = -integral * h * still * error * 0.5 * g / (1 - (1 - 0.5 * g) * np.exp(-1j * turn * h))
+        step = ADAPTATION * h
+        change = (1 - np.exp(-1j * turn * step)) / step
+        held = _mean_turn(ADAPTATION, turn * h) * np.exp(-0.5j * (ADAPTATION - 1) * turn * h)
+        law = self.stiffness + 1j * self.omega * inner * known.grip[0]
+        slope = known.damping[0, 0] + 2j * self.omega * known.mass[0, 0]
+        learnt = pace * (law + slope * change) * (error - slow) * held / change
+        return 0.5 * self._ahead * learnt
+
+    def needed(self, wanted: Array) -> Array:
+        """Drive (V, shape (n,)) for a wanted amplitude (m, (n,)): |D a + D' a'| over the modal force of a volt."""
+        mode = self.parameters.carrier_mode
+        slope = self.damping + 2j * self.omega * mode.mass
+        force = self.stiffness * wanted + slope * np.gradient(wanted) * self.parameters.rate
+        return abs(force) / mode.force_constant
+
+    def follow(self, wanted: Array) -> tuple[Array, Array, Array]:
+        """Amplitude in the mean over every sample of the surface, and the loop's deviation.
+
+        Parameters
+        ----------
+        wanted : ndarray, shape (n,), m
+            At the end of each sample; what comes before is taken for a repetition of it.
+
+        Returns
+        -------
+        amplitude, slow, fast : ndarray, shape (n,), m
+            The last two are what the detectors that open "stirred" and "awake" hear of the deviation.
+        """
+        size = next_fast_len(len(wanted) + 1)
+        padded = np.concatenate([wanted, np.linspace(wanted[-1], wanted[0], size - len(wanted) + 2)[1:-1]])
+        rate, many, numbers = self.parameters.rate, self.parameters.substeps, self.tables.numbers
+        offset, spectrum = fftfreq(size, 1 / rate), fft(padded)
+        one_side = np.geomspace(LEAST_OFFSET, NYQUIST * rate, GRID)
+        known = np.concatenate([-one_side[::-1], one_side])
+        whole, turn = self.response(known), 2 * np.pi * known * self.loop.period
+        asked = _mean_turn(many, turn) ** 2  # the straight line between samples
+        late = np.exp(0.5j * (3 - many) * turn)  # from that line to the middle of what is then there
+        heard = [
+            asked * (whole - 1.0) * pole / (1 - (1 - pole) * np.exp(-1j * turn))
+            for pole in (numbers.slow_pole, numbers.fast_pole)
+        ]
+        parts = ((asked * _mean_turn(many, turn) * late * whole, 1.0), (heard[0], 0.0), (heard[1], 0.0))
+        played, slow, fast = (
+            abs(ifft(_between(offset, known, part, steady) * spectrum))[: len(wanted)] for part, steady in parts
+        )
+        return played, slow, fast
+
+
+def _between(offset: Array, known: Array, values: Array, steady: float) -> Array:
+    """Values at `offset` (Hz), `steady` at 0."""
+    real, imaginary = (np.interp(offset, known, part) for part in (values.real, values.imag))
+    return np.where(abs(offset) < LEAST_OFFSET, steady, real + 1j * imaginary)
+
+
+def _mean_turn(many: int, turn: Array) -> Array:
+    """Mean of e^(j turn k) over `many` k around 0."""
+    return np.sinc(many * turn / (2 * np.pi)) / np.sinc(turn / (2 * np.pi))
