@@ -36,8 +36,13 @@ GROWTH = 0.05  # s in which a target grows after a touch
 SETTLING = 10.0  # time constants between the last touch and the judgement
 ACCURACY = 5e-5  # relative error below which nothing is told
 BETWEEN = 1.03  # of the error in the windows that are looked at: in those between
-SMALL_SIGNAL = 1.12  # of an amplitude loop's error by its linear model: at large modulation
+SMALL_SIGNAL = 1.15  # of an amplitude loop's error by its linear model: at large modulation
+HEARD = 0.8  # of a detector's level: a deviation that may open it, as it hears twice the carrier as well
+HEARD_IN_NOISE = 0.25  # the same where there is noise, whose 5 or 5.5 sigma the level is: 4 of them come by chance
+CHANCES = 20.0  # windows for each that there is, of which noise is never worse in one
 LOADS = 5  # of a finger that presses more or less, at which an amplitude loop is computed
+PASSED = 8  # frequencies of a carrier that moves with the finger, at which noise is looked at
+SMALL = 1e-4  # relative step of an amplitude
 POSITION, LOAD, _, SPEED = range(4)  # columns of the finger
 
 
@@ -57,6 +62,13 @@ class _Track(NamedTuple):
     def touched(self) -> Array:
         """Where the finger presses (n,)."""
         return np.isfinite(self.finger[:, SPEED]) & (self.finger[:, LOAD] > 0.0)
+
+
+class _Friction(NamedTuple):
+    """What a plant makes of what is asked for."""
+
+    steady: Array  # (n,) N
+    noise: Array  # (bands,) N2/Hz: largest power density where the band is
 
 
 @kernel
@@ -80,12 +92,14 @@ def bound(scene: Scene, lesser: Scene) -> float:
         return 0.0
     track = _track(scene, full.parameters, bands, model.highest_frequency, max(map(_lead, (full, less))))
     asked = _asked(track)
-    worst = 0.0
+    margin = BETWEEN if isinstance(full, ElectroadhesionScreen) else SMALL_SIGNAL
+    worst = np.zeros(len(bands))
     for one, other in product(*(_frictions(each, track, asked) for each in (full, less))):
         apart = np.empty(len(asked))
-        follow_friction(one - other, track.kept, apart)
-        worst = float(np.maximum(worst, _worst(scene, bands, track, apart)))  # which no NaN slips through
-    return worst * (BETWEEN if isinstance(full, ElectroadhesionScreen) else SMALL_SIGNAL) + ACCURACY
+        follow_friction(one.steady - other.steady, track.kept, apart)
+        found = _worst(scene, bands, track, apart, one.noise + other.noise)
+        worst = np.maximum(worst, margin * found)
+    return float(worst.max()) + ACCURACY
 
 
 def _lead(plant: Any) -> float:
@@ -139,8 +153,8 @@ def _envelope(bands: Bands, frequency: Array, down: Array, highest: float, rate:
     weight = _ease(since / (GROWTH * rate))[:, None] * np.ones_like(frequency)
     slow, fast = 2 / LOWEST_FREQUENCY * abs(frequency) - 1, 5 - 4 / highest * abs(frequency)
     weight *= np.where(bands.wavenumber > 0.0, _ease(slow) * _ease(fast), 1.0)
-    turned = 2j * np.pi * frequency if bands.differentiated else 1.0
-    return turned * weight * bands.envelope
+    envelope = weight * np.asarray(bands.envelope)
+    return 2j * np.pi * frequency * envelope if bands.differentiated else envelope
 
 
 def _ease(x: Array) -> Array:
@@ -161,10 +175,10 @@ def _waveform(track: _Track) -> Array:
     return (track.envelope * np.exp(1j * track.phase)).real.sum(axis=1)
 
 
-def _frictions(plant: Any, track: _Track, asked: Array) -> list[Array]:
-    """Steady frictions (N, each (n,)) that a plant may make of what is asked for, one for every state it may be in."""
+def _frictions(plant: Any, track: _Track, asked: Array) -> list[_Friction]:
+    """Steady frictions that a plant may make of what is asked for, one for every state that it may be in."""
     if isinstance(plant, ElectroadhesionScreen):
-        return [_screen_friction(plant, track, asked)]
+        return [_Friction(_screen_friction(plant, track, asked), np.zeros(track.phase.shape[1]))]
     return _surface_frictions(plant, track, asked)
 
 
@@ -182,7 +196,7 @@ def _screen_friction(screen: ElectroadhesionScreen, track: _Track, asked: Array)
     return p.friction_coefficient * (carrier if p.level == "carrier" else envelope)
 
 
-def _surface_frictions(surface: UltrasonicSurface, track: _Track, asked: Array) -> list[Array]:
+def _surface_frictions(surface: UltrasonicSurface, track: _Track, asked: Array) -> list[_Friction]:
     """Frictions of an ultrasonic surface."""
     p, load, speed = surface.parameters, track.finger[:, LOAD], track.finger[:, SPEED]
     rest = _lead(surface)
@@ -196,46 +210,53 @@ def _surface_frictions(surface: UltrasonicSurface, track: _Track, asked: Array) 
     whole = tables.friction * load
     wanted, found = np.empty(len(asked)), []
     wanted_amplitudes(tables.law, np.clip(p.bias + asked / whole, tables.least, 1.0), load, pace, wanted)
-    for amplitude in _amplitudes(surface, track, wanted, load):
-        left = np.empty(len(asked))
+    left, more = np.empty(len(asked)), np.empty(len(asked))
+    for amplitude, noise in _amplitudes(surface, track, wanted, load):
         friction_ratios(tables.law, amplitude, load, pace, left)
-        found.append(whole * left)
+        friction_ratios(tables.law, (1.0 + SMALL) * amplitude, load, pace, more)
+        steep = (whole * (more - left) / (SMALL * amplitude))[track.judged]
+        found.append(_Friction(whole * left, np.mean(steep**2) * noise))
     return found
 
 
-def _amplitudes(surface: UltrasonicSurface, track: _Track, wanted: Array, load: Array) -> list[Array]:
-    """Amplitudes (m) that the loop may make of the wanted one: its state's, or those between which it changes state.
+def _amplitudes(surface: UltrasonicSurface, track: _Track, wanted: Array, load: Array) -> list[tuple[Array, Array]]:
+    """Amplitudes (m) that the loop may make of the wanted one, each with its noise in every band (m2/Hz).
 
-    A detector that the calmer state opens, and that the livelier one does not keep open, opens and closes: then the
-    deviation is hardly above what it hears, which is as much of the way from one state to the other.
+    They are its state's, or those between which it changes state.  A detector that the calmer state opens, and that the
+    livelier one does not keep open, opens and closes: then the deviation is hardly above what it hears, which is as
+    much of the way from one state to the other.
     """
-    numbers = surface.loop.tables.numbers
-    calm, moved = _followed(surface, track, wanted, load, "quiet")
-    found = [calm]
+    numbers, noisy = surface.loop.tables.numbers, surface.parameters.mode.sensor_noise > 0.0
+    calm, moved, noise = _followed(surface, track, wanted, load, "quiet")
+    found = [(calm, noise)]
     for state, level, time in (
         ("stirred", math.sqrt(numbers.slow_level), numbers.slow_time),
         ("awake", math.sqrt(numbers.fast_level), numbers.fast_time),
     ):
         heard = float(moved[state].max())
-        if heard < level:
+        if heard < (HEARD_IN_NOISE if noisy else HEARD) * level:
             continue
-        lively, moved = _followed(surface, track, wanted, load, state)
+        lively, moved, noise = _followed(surface, track, wanted, load, state)
         span = max(1, int(time / numbers.rate * track.rate))
         least = np.maximum.reduceat(moved[state], np.arange(0, len(moved[state]), span))[:-1].min(initial=math.inf)
-        found = [lively] if least > level else [lively, lively + level / heard * (calm - lively)]
+        between = lively + min(level / heard, 1.0) * (calm - lively)
+        found = [(lively, noise)] if least > level else [(lively, noise), (between, noise)]
         calm = lively
     return found
 
 
 def _followed(
     surface: UltrasonicSurface, track: _Track, wanted: Array, load: Array, state: str
-) -> tuple[Array, dict[str, Array]]:
-    """Amplitude (m) of a loop in this state, under a finger of changing load, and what either detector hears of it."""
+) -> tuple[Array, dict[str, Array], Array]:
+    """Amplitude (m) of a loop in this state, under a finger of changing load, what its detectors hear, and noise."""
     p, judged = surface.parameters, track.judged
     least, most = float(load[judged].min()), float(load[judged].max())
     tabled = np.linspace(least, most, LOADS if most > least else 1)
     place = np.interp(load, tabled, np.arange(len(tabled))) if len(tabled) > 1 else np.zeros(len(load))
-    amplitude, heard = np.zeros(len(load)), dict.fromkeys(("stirred", "awake"), np.zeros(len(load[judged])))
+    amplitude, noise = np.zeros(len(load)), np.zeros(track.phase.shape[1])
+    heard = dict.fromkeys(("stirred", "awake"), np.zeros(len(load[judged])))
+    size = abs(track.frequency[judged])
+    passed = np.maximum(np.linspace(size.min(axis=0), size.max(axis=0), PASSED), LOWEST_FREQUENCY)
     for k, each in enumerate(tabled):
         loop = AmplitudeLoop(parameters=p, tables=surface.loop.tables, load=float(each), rise=track.rise, state=state)
         if np.max(loop.needed(wanted)[judged]) > p.mode.drive_limit:
@@ -243,12 +264,17 @@ def _followed(
         weight = np.clip(1.0 - abs(place - k), 0.0, 1.0)
         played, slow, fast = loop.follow(wanted)
         amplitude += weight * played
-        heard = {"stirred": heard["stirred"] + (weight * slow)[judged], "awake": heard["awake"] + (weight * fast)[judged]}
-    return amplitude, heard
+        for state_heard, more in (("stirred", slow), ("awake", fast)):
+            heard[state_heard] = heard[state_heard] + (weight * more)[judged]
+        noise = np.maximum(noise, loop.noise(passed.ravel()).reshape(passed.shape).max(axis=0))
+    return amplitude, heard, noise
 
 
-def _worst(scene: Scene, bands: Bands, track: _Track, apart: Array) -> float:
-    """Largest envelope of `apart` (N, (n,)) in any judged window and band, relative to the band's target."""
+def _worst(scene: Scene, bands: Bands, track: _Track, apart: Array, noise: Array) -> Array:
+    """Largest envelope of `apart` (N, (n,)) and noise (N2/Hz) in any judged window of each band, by the band's target.
+
+    In a window of T seconds a power density S feigns an envelope with the mean square 2 S/T, Rayleigh distributed.
+    """
     late = track.judged
     signals = np.column_stack([apart, _waveform(track)])[late]
     phase, asked = track.phase[late], (track.envelope != 0.0)[late]
@@ -268,7 +294,9 @@ def _worst(scene: Scene, bands: Bands, track: _Track, apart: Array) -> float:
         count += told.sum(axis=0)
     target = np.sqrt(square / np.maximum(count, 1.0))
     target = np.maximum(target, scene.tolerance * target.max(initial=0.0))
-    return float((worst / np.where(target > 0.0, target, np.inf)).max(initial=0.0))
+    chance = math.log(CHANCES * max(len(signals) / size, 1.0))
+    worst += np.sqrt(2 * noise / window * chance) * (count > 0)
+    return worst / np.where(target > 0.0, target, np.inf)
 
 
 def _carrier_at_once(scene: Scene) -> Scene | str | None:

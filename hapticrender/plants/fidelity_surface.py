@@ -17,6 +17,7 @@ there, and lateness and learning tell more of the two levels apart than that.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -33,6 +34,7 @@ from hapticrender.protocols import Array
 
 GRID = 400  # offsets of either sign at which the loop is computed; between them it is interpolated
 LEAST_OFFSET = 1e-3  # Hz: a slower change of the amplitude is followed perfectly
+RIPPLE = 3e-5  # of the amplitude, at twice the carrier of level "envelope" as samples show it: as seen, not derived
 NYQUIST = 0.49  # of the rate: to there, lest an offset should take the carrier to nothing
 
 
@@ -97,21 +99,32 @@ class AmplitudeLoop:
         )
 
     def response(self, offset: Array) -> Array:
-        """Envelope of the mode per wanted amplitude (complex) at `offset` (Hz, not 0) from the carrier, in one sample.
+        """Envelope of the mode per wanted amplitude (complex) at `offset` (Hz, not 0) from the carrier.
 
-        Returns
-        -------
-        ndarray of complex
-            At the sample that a wanted amplitude is handed to the loop, of what is sensed then.
+        In one sample: what is sensed at that at which the amplitude is asked for.
         """
         turn, h = 2 * np.pi * np.asarray(offset, float), self.loop.period
-        z = np.exp(1j * (self.omega + turn) * h)
-        gain, rest = (each[0] for each in self.loop.controller(z))
-        fed_back = gain[:, 0, 0] + self._learning(turn, z) / rest
+        mode, fed_back = self._round(turn)
         slope = self.damping + 2j * self.omega * self.parameters.carrier_mode.mass
         forward = self._ahead * (self.stiffness + slope * (1 - np.exp(-1j * turn * h)) / h)
-        mode = self.loop.plant.response(z)[:, 0, 0] * z**-self.loop.delay
         return mode * (forward + fed_back) / (1 + mode * fed_back)
+
+    def noise(self, frequency: Array) -> Array:
+        """Power density (m2/Hz) of the amplitude at `frequency` (Hz, > 0), by the sensor's noise and resolution."""
+        mode = self.parameters.carrier_mode
+        density = 2 * (mode.sensor_noise**2 + mode.sensor_step**2 / 12) / mode.rate
+        sides = []
+        for turn in (2 * np.pi * np.asarray(frequency, float), -2 * np.pi * np.asarray(frequency, float)):
+            along, fed_back = self._round(turn)
+            sides.append(abs(along * fed_back / (1 + along * fed_back)) ** 2)
+        return density * (sides[0] + sides[1])
+
+    def _round(self, turn: Array) -> tuple[Array, Array]:
+        """Mode, delay included (m/N), and feedback (N/m) at `turn` (rad/s) from the carrier."""
+        z = np.exp(1j * (self.omega + turn) * self.loop.period)
+        gain, rest = (each[0] for each in self.loop.controller(z))
+        mode = self.loop.plant.response(z)[:, 0, 0] * z**-self.loop.delay
+        return mode, gain[:, 0, 0] + self._learning(turn, z) / rest
 
     @property
     def _ahead(self) -> complex:
@@ -126,15 +139,14 @@ class AmplitudeLoop:
         lively = max(STATES[self.state])
         pace = known.numbers.adapt + lively * (known.numbers.adapt_awake - known.numbers.adapt)
         still = z / (z - np.exp(1j * self.omega * h))  # of an integral in the carrier's frame
-        error = g * still
+        error = 0.5 * g * still
         slow = -integral * h * still * error * 0.5 * g / (1 - (1 - 0.5 * g) * np.exp(-1j * turn * h))
         step = ADAPTATION * h
         change = (1 - np.exp(-1j * turn * step)) / step
         held = _mean_turn(ADAPTATION, turn * h) * np.exp(-0.5j * (ADAPTATION - 1) * turn * h)
         law = self.stiffness + 1j * self.omega * inner * known.grip[0]
         slope = known.damping[0, 0] + 2j * self.omega * known.mass[0, 0]
-        learnt = pace * (law + slope * change) * (error - slow) * held / change
-        return 0.5 * self._ahead * learnt
+        return self._ahead * pace * (law + slope * change) * (error - slow) * held / change
 
     def needed(self, wanted: Array) -> Array:
         """Drive (V, shape (n,)) for a wanted amplitude (m, (n,)): |D a + D' a'| over the modal force of a volt."""
@@ -164,16 +176,34 @@ class AmplitudeLoop:
         known = np.concatenate([-one_side[::-1], one_side])
         whole, turn = self.response(known), 2 * np.pi * known * self.loop.period
         asked = _mean_turn(many, turn) ** 2  # the straight line between samples
-        late = np.exp(0.5j * (3 - many) * turn)  # from that line to the middle of what is then there
-        heard = [
-            asked * (whole - 1.0) * pole / (1 - (1 - pole) * np.exp(-1j * turn))
+        late = _mean_turn(many, turn) * np.exp(0.5j * (3 - many) * turn)  # to the mean over what is then there
+
+        def played(response: Array, steady: float) -> Array:
+            return ifft(_between(offset, known, response, steady) * spectrum)[: len(wanted)]
+
+        amplitude = played(asked * late * whole, 1.0)
+        amplitude += self._image(known, played, float(wanted.mean()))
+        away = asked * (whole - 1.0)
+        slow, fast = (
+            abs(played(away * pole / (1 - (1 - pole) * np.exp(-1j * turn)), 0.0))
             for pole in (numbers.slow_pole, numbers.fast_pole)
-        ]
-        parts = ((asked * _mean_turn(many, turn) * late * whole, 1.0), (heard[0], 0.0), (heard[1], 0.0))
-        played, slow, fast = (
-            abs(ifft(_between(offset, known, part, steady) * spectrum))[: len(wanted)] for part, steady in parts
         )
-        return played, slow, fast
+        return abs(amplitude), slow, fast
+
+    def _image(self, offset: Array, played: Callable[[Array, float], Array], steady: float) -> Array:
+        """What the corners of the straight line between samples leave of it near minus the carrier, and a ripple.
+
+        The line's images lie a multiple of the surface's rate away.  One that comes to -2 w is, as all is real, at the
+        resonance, and the law has raised it there, taking it for a change as fast as that.  Its phase is chance: here
+        it is opposite at the two levels, which tells most of them apart.
+        """
+        rate, twice, moved = self.parameters.rate, self.omega / np.pi, self.parameters.level == "envelope"
+        away = -rate * round(twice / rate)
+        alias = -away - twice
+        found = _mean_turn(self.parameters.substeps, 2 * np.pi * (offset + away) * self.loop.period) ** 2
+        image = played(found * self.response(offset + away), 0.0).conj()
+        image = image + RIPPLE * steady if moved else -image
+        return image * np.exp(2j * np.pi * alias * np.arange(len(image)) / rate)
 
 
 def _between(offset: Array, known: Array, values: Array, steady: float) -> Array:
