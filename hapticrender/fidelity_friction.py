@@ -40,6 +40,7 @@ SMALL_SIGNAL = 1.15  # of an amplitude loop's error by its linear model: at larg
 HEARD = 0.8  # of a detector's level: a deviation that may open it, as it hears twice the carrier as well
 HEARD_IN_NOISE = 0.25  # the same where there is noise, whose 5 or 5.5 sigma the level is: 4 of them come by chance
 CHANCES = 20.0  # windows for each that there is, of which noise is never worse in one
+DRIVEN = 0.9  # of the drive's limit: what the amplitude may ask for, as feedback asks for some on top
 LOADS = 5  # of a finger that presses more or less, at which an amplitude loop is computed
 PASSED = 8  # frequencies of a carrier that moves with the finger, at which noise is looked at
 SMALL = 1e-4  # relative step of an amplitude
@@ -259,7 +260,7 @@ def _followed(
     passed = np.maximum(np.linspace(size.min(axis=0), size.max(axis=0), PASSED), LOWEST_FREQUENCY)
     for k, each in enumerate(tabled):
         loop = AmplitudeLoop(parameters=p, tables=surface.loop.tables, load=float(each), rise=track.rise, state=state)
-        if np.max(loop.needed(wanted)[judged]) > p.mode.drive_limit:
+        if np.max(loop.needed(wanted)[judged]) > DRIVEN * p.mode.drive_limit:
             raise NoBound(f"its amplitude may ask for more than {p.mode.drive_limit:g} V")
         weight = np.clip(1.0 - abs(place - k), 0.0, 1.0)
         played, slow, fast = loop.follow(wanted)
