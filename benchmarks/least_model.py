@@ -38,8 +38,8 @@ def scenes():
 
 
 def loop(scene):
-    """Device and controller in their compiled loop for another piece of time, as a function."""
-    session = hr.prepare(scene)
+    """Device and controller in their compiled loop for another piece of time, the finger down, as a function."""
+    session = hr.prepare(replace(scene, finger=replace(scene.finger, touches=None)))
     plant, controller = session.driver.plant, session.controller()
     wanted = np.zeros(int(PIECE * plant.rate))
     return lambda: plant.closed_loop(controller, wanted)
