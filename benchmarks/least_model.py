@@ -7,7 +7,7 @@ import numpy as np
 from pairing import interleave, keep_to_one_core
 
 import hapticrender as hr
-from hapticrender.fidelity import fidelity
+from hapticrender.fidelity import LADDERS, fidelity
 from hapticrender.touch.builtin import builtin_scenes
 from hapticrender.wording import percent, table
 
@@ -17,21 +17,29 @@ LIGHT = {"mechanics": "light", "normal_load": 0.3}
 
 
 def scenes():
-    """The built-in ones, and some that need little."""
+    """The built-in ones, electroadhesion on its carrier, and some that need little."""
+    known = {name: scene for name, scene in builtin_scenes().items() if scene.device in LADDERS}
+    for name, scene in known.items():
+        if scene.device == "electroadhesion":
+            known[name] = replace(scene, plant={"level": "carrier"})
     swiping = hr.Finger.swiping(frequency=0.5, stroke=0.01, **LIGHT)
-    slow = replace(builtin_scenes()["grating-20"], finger=hr.Finger.still(0.0, **LIGHT), tolerance=0.1)
+    slow = replace(known["grating-20"], finger=hr.Finger.still(0.0, **LIGHT), tolerance=0.1)
     fast = hr.Scene(texture=hr.Grating(amplitude=1e-5, frequency=400.0), finger=swiping, duration=5.0)
+    ridges = hr.Grating(velocity=8e-3, frequency=20.0)
     own = [
         replace(slow, name="light-still-20"),
         replace(fast, name="light-swiping-400"),
         replace(fast, name="light-swiping-400-rough", tolerance=0.5),
+        replace(known["one-texture-electroadhesion"], name="screen-rough", tolerance=0.1),
+        replace(known["one-texture-ultrasonic"], name="ultrasonic-20", texture=ridges, tolerance=0.1),
+        replace(known["ultrasonic-swiping"], name="ultrasonic-swiping-rough", tolerance=0.5),
     ]
-    return [*builtin_scenes().values(), *own]
+    return [*known.values(), *own]
 
 
 def loop(scene):
-    """Plate and controller in their compiled loop for another piece of time, as a function."""
-    session = hr.prepare(scene)
+    """Device and controller in their compiled loop for another piece of time, the finger down, as a function."""
+    session = hr.prepare(replace(scene, finger=replace(scene.finger, touches=None)))
     plant, controller = session.driver.plant, session.controller()
     wanted = np.zeros(int(PIECE * plant.rate))
     return lambda: plant.closed_loop(controller, wanted)
