@@ -220,6 +220,9 @@ def test_documented_parameters_are_the_signatures(name):
         told = documented(value)
         if told is not None:
             names, in_order = parameters(value)
+            above = {each for base in getattr(value, "__mro__", ())[1:] for each in documented(base) or ()}
+            if above.isdisjoint(told):  # what a base class says of its parameters need not be said again
+                names, in_order = ([each for each in listed if each not in above] for listed in (names, in_order))
             assert sorted(told) == sorted(names), f"{name}.{value.__qualname__}"
             assert [each for each in told if each in in_order] == in_order, f"{name}.{value.__qualname__}"
 
