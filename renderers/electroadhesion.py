@@ -74,7 +74,7 @@ class ElectroadhesionRenderer(FrictionRenderer):
         for name, value, known in (("drive", driver.drive_channels, (1,)), ("sensed", driver.sensed_channels, (0, 1))):
             if value not in known:
                 raise ValueError(f"driver.{name}_channels = {value}: must be {' or '.join(map(str, known))}")
-        model = self._model(scene, driver.rate, driver.delay, driver.block)
+        model = self._model(scene, driver.rate, driver.delay, driver.block, driver.sensed_channels > 0)
         compensation = self.compensation(scene)
         return replace(model, drive_limit=compensation.bias - compensation.floor)
 
@@ -118,12 +118,16 @@ class ElectroadhesionRenderer(FrictionRenderer):
             straight=settings.square_root == "off",
         )
 
-    def _model(self, scene: Scene, rate: float, delay: int, block: int) -> BandModel:
+    def _model(self, scene: Scene, rate: float, delay: int, block: int, listening: bool = True) -> BandModel:
         """Band model without its drive limit."""
         _, parameters = _read(scene)
         mu = parameters.friction_coefficient
-        model = self.contact(scene, parameters, rate=rate, delay=delay, block=block, friction_per_drive=mu)
-        if parameters.sensor == "impedance":  # what is sensed is the attraction, behind the estimator's low pass
+        model = self.contact(
+            scene, parameters, rate=rate, delay=delay, block=block, friction_per_drive=mu, listening=listening
+        )
+        if (
+            listening and parameters.sensor == "impedance"
+        ):  # what is sensed is the attraction, behind the estimator's low pass
             lag = parameters.estimator.delay
             model = replace(
                 model,
@@ -131,6 +135,8 @@ class ElectroadhesionRenderer(FrictionRenderer):
                 damping=lag / mu * model.force_from_drive,
                 coordinate_from_sensed=mu * model.coordinate_from_sensed,
                 memory=0.0,
+                late=lag,
+                foresight=parameters.memory_length,
             )
         return model
 

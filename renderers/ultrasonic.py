@@ -20,6 +20,8 @@ from hapticrender.renderers.friction import FrictionRenderer, FrictionSettings, 
 from hapticrender.renderers.resonant import ResonantDriver, amplitude_loop
 from hapticrender.touch.scene import Scene
 
+LEAST_NOISE = 1e-6  # of the range: of a friction that is worked out from the amplitude
+
 
 class UltrasonicRenderer(FrictionRenderer):
     """Renderer for plates that take friction away by ultrasonic vibration."""
@@ -75,21 +77,28 @@ class UltrasonicRenderer(FrictionRenderer):
 
     def _model(self, scene: Scene, parameters: SurfaceParameters, driver: Driver) -> BandModel:
         """Band model without its drive limit: what carries the amplitude along takes half a sample more than a hold."""
+        listening, late = driver.sensed_channels > 0, 0.5 / driver.rate
         model = self.contact(
-            scene, parameters, rate=driver.rate, delay=driver.delay, block=driver.block, friction_per_drive=1.0
+            scene,
+            parameters,
+            rate=driver.rate,
+            delay=driver.delay,
+            block=driver.block,
+            friction_per_drive=1.0,
+            listening=listening,
         )
-        if parameters.sensor == "amplitude":  # no contact and no tribometer between
-            late = 0.5 / driver.rate
-            noise = 1e-6 * model.sensed_limit
+        if listening and parameters.sensor == "amplitude":  # no contact and no tribometer between
             return replace(
                 model,
                 mass=late**2 / 2 * np.eye(1),
                 damping=late * np.eye(1),
                 stiffness=np.eye(1),
                 memory=0.0,
-                sensed_noise=noise,
+                late=0.0,
+                foresight=parameters.memory_length,
+                sensed_noise=LEAST_NOISE * model.sensed_limit,
             )
-        return replace(model, damping=model.damping + 0.5 / driver.rate)
+        return replace(model, damping=model.damping + late)
 
 
 def _read(scene: Scene) -> tuple[FrictionSettings, SurfaceParameters]:

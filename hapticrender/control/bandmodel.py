@@ -104,6 +104,10 @@ class BandModel:
         is at `typical_speed`.  0: none.
     typical_speed : float, m/s
         Of the finger, > 0.
+    late : float, s
+        How much later than the judged place the sensor shows a band; negative: earlier.
+    foresight : float, m
+        Length by which a sliding contact lags behind what the sensor shows.
     lock : float, Hz
         Bandwidth of the resonance lock, which moves the fixed carriers to where the device is resonant; 0: none.
     unit, drive_unit : str
@@ -139,6 +143,8 @@ class BandModel:
     pace: float = 1.0
     memory: float = 0.0
     typical_speed: float = 1.0
+    late: float = 0.0
+    foresight: float = 0.0
     lock: float = 0.0
     unit: str = "m"
     drive_unit: str = "A"

@@ -150,17 +150,17 @@ def law_tune(tables, state, t):
     place = read(touch, row.KNOWN_PLACE)
     skin, drag = touching * read(touch, row.MASS), touching * read(touch, row.DAMPING)
     z_re, z_im = finger_stiffness(touch, band, t)
+    lag = 0.0 * drag
     if tables.numbers.memory > 0.0:
         lag = memory_damping(tables.numbers, state.track)
         drag = drag + lag
-        z_im = z_im + omega * lag
     for c in range(coordinates):
         for i in range(coordinates):
             arms = (1.0 if c == 0 else place) * (1.0 if i == 0 else place)
             mass, damping = read(tables.mass, c, i) + arms * skin, read(tables.damping, c, i) + arms * drag
             at = row.FIRST_LAW + row.LAW_ROWS * (c * coordinates + i)
             re = read(tables.stiffness, c, i) - omega * omega * read(tables.mass, c, i) + arms * touching * z_re
-            im = omega * read(tables.damping, c, i) + arms * touching * z_im + sweep * mass
+            im = omega * read(tables.damping, c, i) + arms * (touching * z_im + omega * lag) + sweep * mass
             put(law, t, at + row.LAW_RE, re * cos - im * sin)
             put(law, t, at + row.LAW_IM, re * sin + im * cos)
             turn = 2.0 * omega * mass
@@ -173,6 +173,27 @@ def derivative(band, t, re, im):
     """Envelope of the time derivative: j w times that of a tile's carriers."""
     omega = lanes(band, t, row.OMEGA)
     return -omega * im, omega * re
+
+
+@kernel
+def shown_pass(numbers, band, track, t, re, im):
+    """What the sensor shows of a wanted envelope of a tile: before the contact's lag, and late."""
+    omega = lanes(band, t, row.OMEGA)
+    lag = numbers.foresight / high(read(track, row.SPEED), SLOWEST * numbers.typical_speed) * omega
+    cos, sin = unit(-numbers.late / TURN * omega)
+    re, im = re - lag * im, im + lag * re
+    return re * cos - im * sin, re * sin + im * cos
+
+
+@kernel
+def told_pass(numbers, band, track, t, re, im):
+    """What is wanted of a tile where the sensor shows re + j im: the inverse of `shown_pass`."""
+    omega = lanes(band, t, row.OMEGA)
+    lag = numbers.foresight / high(read(track, row.SPEED), SLOWEST * numbers.typical_speed) * omega
+    cos, sin = unit(numbers.late / TURN * omega)
+    re, im = re * cos - im * sin, re * sin + im * cos
+    share = 1.0 / (1.0 + lag * lag)
+    return share * (re + lag * im), share * (im - lag * re)
 
 
 @kernel

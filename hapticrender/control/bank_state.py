@@ -66,6 +66,9 @@ class BankNumbers(NamedTuple):
     dc_drift_quick: float
     memory: float  # damping times speed of a sliding contact; 0: none
     typical_speed: float  # m/s: for which the device's own damping holds
+    shows: bool  # the sensor does not show what is wanted, but is `late` (s), and has not lagged by `foresight` (m)
+    late: float
+    foresight: float
     lock: float  # 1/s: pace at which the carriers follow the resonance; 0: not
     least_motion: float
     typical_mass: float

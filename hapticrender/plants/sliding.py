@@ -44,7 +44,7 @@ class SlidingParameters(Validated):
     rate : float, Hz
         Sampling rate of the surface, 1000 to 1e6.
     friction_coefficient : float
-        mu, of friction over normal force, >= 0 (dry to moist glass: 0.3 to 2).
+        mu, of friction over normal force, > 0 (dry to moist glass: 0.3 to 2).
     memory_length : float, m
         delta, the way after which the contact has renewed itself, > 0.
     least_speed : float, m/s
@@ -69,7 +69,7 @@ class SlidingParameters(Validated):
     """
 
     rate: float = number(10e3, "Hz", least=1e3, most=1e6)
-    friction_coefficient: float = number(0.8)
+    friction_coefficient: float = number(0.8, above=0.0)
     memory_length: float = number(11.5e-6, "m", above=0.0)
     least_speed: float = number(1e-3, "m/s", above=0.0)
     tribometer_frequency: float = number(1300.0, "Hz", above=0.0)
