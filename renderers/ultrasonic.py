@@ -98,7 +98,8 @@ class UltrasonicRenderer(FrictionRenderer):
                 foresight=parameters.memory_length,
                 sensed_noise=LEAST_NOISE * model.sensed_limit,
             )
-        return replace(model, damping=model.damping + late)
+        mass = model.mass + late * model.damping + late**2 / 2 * model.stiffness
+        return replace(model, mass=mass, damping=model.damping + late * model.stiffness)
 
 
 def _read(scene: Scene) -> tuple[FrictionSettings, SurfaceParameters]:

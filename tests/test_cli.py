@@ -241,7 +241,7 @@ def test_a_broken_package_is_shown_as_broken_and_hides_no_other(run, tmp_path, m
     test_devices_are_listed(run)
     _, out, _ = run("devices")
     (line,) = [line for line in out.splitlines() if line.split()[:1] == ["theirs"]]
-    assert line.split(maxsplit=1)[1] == f"broken: cannot be loaded from third_party:Driver ({reason})"
+    assert line.split(maxsplit=2)[2] == f"broken: cannot be loaded from third_party:Driver ({reason})"
 
 
 def test_help_and_version(capsys):

@@ -73,11 +73,7 @@ def test_open_loop_the_same_cases_spread(kind, leak):
 
 
 def test_nothing_winds_up_on_a_finger_that_rests():
-    """A second at rest or a fifth of it: what follows is the same, to the noise; the drive at rest is the nominal one.
-
-    The nominal finger needs WANTED of attraction, D beyond s^2 is off by 0.1 %, and noise of the estimate is 1 % of
-    |I|^2 (test_gap), a fifth of which an inner loop may hand on.
-    """
+    """A second at rest or a fifth of it: what follows is the same, to the noise; at rest nothing is wanted."""
     late = hr.Finger.sampled([0.0, 0.0, 0.1], times=[0.0, 1.0, 1.0 + 0.1 / SPEED], normal_load=1.0)
     ends = []
     for rest, finger in ((REST, REST_THEN_SLIDE), (1.0, late)):
@@ -86,7 +82,7 @@ def test_nothing_winds_up_on_a_finger_that_rests():
         assert (flags[still] == hr.Flag.OPEN_LOOP).all()
         assert not attraction[still].any()
         assert not (flags & hr.Flag.SATURATED).any()
-        assert swing(drive[still]) == pytest.approx(WANTED, rel=0.03)
+        assert abs(drive[still]).max() < 1e-9 * WANTED
         ends.append((swing(drive), swing(attraction)))
     np.testing.assert_allclose(ends[0], ends[1], rtol=5e-3)
 
@@ -103,7 +99,7 @@ def test_nothing_winds_up_while_the_finger_is_away():
     assert not (flags & hr.Flag.SATURATED).any()
     assert (flags[7010:11000] == hr.Flag.OPEN_LOOP).all()
     assert not attraction[7000:11000].any()
-    assert swing(drive[:10900]) == pytest.approx(WANTED, rel=0.03)
+    assert abs(drive[8000:10900]).max() < 1e-3 * WANTED  # lifted and at rest
     assert swing(attraction[:6900]) == pytest.approx(WANTED, rel=0.03)
     assert swing(attraction) == pytest.approx(WANTED, rel=0.03)
 
