@@ -16,7 +16,14 @@ from hapticrender.control.square_root import SquareRoot
 from hapticrender.plants.bounds import choice, number
 from hapticrender.plants.electroadhesion import NORMAL, ElectroadhesionParameters, ElectroadhesionScreen
 from hapticrender.protocols import Array, Driver
-from hapticrender.renderers.friction import ROOM, FrictionRenderer, FrictionSettings, typical_load, typical_speed
+from hapticrender.renderers.friction import (
+    ROOM,
+    FrictionRenderer,
+    FrictionSettings,
+    largest_load,
+    typical_load,
+    typical_speed,
+)
 from hapticrender.renderers.shaped import CarrierDriver, ShapedDriver
 from hapticrender.touch.scene import Scene
 
@@ -76,6 +83,10 @@ class ElectroadhesionRenderer(FrictionRenderer):
                 raise ValueError(f"driver.{name}_channels = {value}: must be {' or '.join(map(str, known))}")
         model = self._model(scene, driver.rate, driver.delay, driver.block, driver.sensed_channels > 0)
         compensation = self.compensation(scene)
+        _, parameters = _read(scene)
+        if driver.sensed_channels and parameters.sensor == "tribometer":
+            steady = parameters.friction_coefficient * (largest_load(scene) + compensation.bias)
+            self.check_range(scene, model, parameters, steady)
         return replace(model, drive_limit=compensation.bias - compensation.floor)
 
     def sensor_response(self, scene: Scene, frequency: Array) -> Array:

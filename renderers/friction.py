@@ -21,7 +21,7 @@ from hapticrender.plants.bounds import Validated, choice, number
 from hapticrender.plants.sliding import SlidingParameters
 from hapticrender.protocols import Array
 from hapticrender.renderers.base import BaseRenderer, Waveform
-from hapticrender.renderers.limits import check_carriers, felt, looked_at, needed_drive, speeds
+from hapticrender.renderers.limits import check_carriers, felt, looked_at, needed_drive, speeds, wanted_amplitude
 from hapticrender.touch.perception import VELOCITY_PER_FORCE
 from hapticrender.touch.scene import Scene
 
@@ -148,6 +148,12 @@ class FrictionRenderer(BaseRenderer):
             ),
         )
 
+    def check_range(self, scene: Scene, model: BandModel, sliding: SlidingParameters, steady: float) -> None:
+        """Refuse a friction, `steady` (N) for the most part, that a tribometer cannot show."""
+        most = steady + wanted_amplitude(scene, model, self.wanted(scene, model), self.waveform(scene))
+        if most > sliding.force_range:
+            raise ValueError(f"friction of {most:.3g} N: must be <= {sliding.force_range:g} N, the tribometer's range")
+
     def needed(self, scene: Scene, model: BandModel) -> float:
         """Largest drive (N) that the scene needs of `model`, the finger as assumed there."""
         return needed_drive(scene, model, self.wanted(scene, model), self.waveform(scene))
@@ -172,6 +178,11 @@ def typical_load(scene: Scene) -> float:
     if not mean > 0.0:
         raise ValueError("finger.normal_load = 0: must be > 0 N, friction needs a load")
     return mean
+
+
+def largest_load(scene: Scene) -> float:
+    """Largest normal load (N) of the finger."""
+    return float(np.max(scene.finger.load(looked_at(scene)), initial=0.0))
 
 
 def _as_friction(scene: Scene, bands: Bands, settings: FrictionSettings) -> dict[str, Any]:

@@ -96,6 +96,11 @@ def needed_drive(scene: Scene, model: BandModel, bands: Bands, waveform: Wavefor
     return _need(scene, model, bands, waveform).drive
 
 
+def wanted_amplitude(scene: Scene, model: BandModel, bands: Bands, waveform: Waveform) -> float:
+    """Largest sum of the targets, in the device's quantity."""
+    return _need(scene, model, bands, waveform).amplitude
+
+
 class _Need(NamedTuple):
     """What targets ask for: their sum, the drive for it, and the band (or peak) that takes most of it."""
 

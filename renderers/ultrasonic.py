@@ -13,10 +13,17 @@ from dataclasses import replace
 
 import numpy as np
 
+from hapticrender.bands import Bands
 from hapticrender.control.bandmodel import BandModel
 from hapticrender.plants.surface import SurfaceParameters, UltrasonicSurface
 from hapticrender.protocols import Array, Driver
-from hapticrender.renderers.friction import FrictionRenderer, FrictionSettings, typical_load, typical_speed
+from hapticrender.renderers.friction import (
+    FrictionRenderer,
+    FrictionSettings,
+    largest_load,
+    typical_load,
+    typical_speed,
+)
 from hapticrender.renderers.resonant import ResonantDriver, amplitude_loop
 from hapticrender.touch.scene import Scene
 
@@ -62,7 +69,20 @@ class UltrasonicRenderer(FrictionRenderer):
                 f"texture.amplitude asks for {need:.3g} N of friction: must be <= {room:.3g} N, what amplitude can "
                 f"change around {parameters.bias:g} of the friction of a finger of {typical_load(scene):.3g} N"
             )
+        if driver.sensed_channels and parameters.sensor == "tribometer":
+            self.check_range(scene, model, parameters, parameters.friction_coefficient * largest_load(scene))
+        _check_amplitude(parameters, need / whole, typical_load(scene), typical_speed(scene, parameters.least_speed))
         return replace(model, drive_limit=room)
+
+    def bands(self, scene: Scene, model: BandModel) -> Bands:
+        """Carriers and targets of a scene, refused where the amplitude could not follow."""
+        bands = super().bands(scene, model)
+        if bands.frequency.max(initial=0.0) > model.highest_frequency:
+            raise ValueError(
+                f"texture.frequency = {bands.frequency.max():g}: must be <= {model.highest_frequency:g} Hz, "
+                "which the amplitude can follow"
+            )
+        return bands
 
     def sensor_response(self, scene: Scene, frequency: Array) -> Array:
         """Return what the tribometer shows of friction, or what the sensed amplitude says of it before it lags."""
@@ -100,6 +120,19 @@ class UltrasonicRenderer(FrictionRenderer):
             )
         mass = model.mass + late * model.damping + late**2 / 2 * model.stiffness
         return replace(model, mass=mass, damping=model.damping + late * model.stiffness)
+
+
+def _check_amplitude(parameters: SurfaceParameters, swing: float, load: float, speed: float) -> None:
+    """Refuse a `swing` of the friction (1) around the bias for which the drive is too weak, however slow it is."""
+    least = max(parameters.bias - swing, parameters.least_ratio)
+    amplitude = float(parameters.friction_law.amplitude(least, load, speed))
+    mode = parameters.mode
+    volts = mode.drive_for(amplitude, normal_load=load)
+    if volts > mode.drive_limit:
+        raise ValueError(
+            f"texture.amplitude asks for a vibration of {amplitude:.3g} m, which takes {volts:.3g} V under "
+            f"{load:.3g} N: must be <= {mode.drive_limit:g} V"
+        )
 
 
 def _read(scene: Scene) -> tuple[FrictionSettings, SurfaceParameters]:

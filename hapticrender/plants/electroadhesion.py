@@ -337,9 +337,10 @@ def finger_rows(finger: Finger, first: int, n: int, rate: float) -> Array:
     """Position (m), load (N), strength and speed (m/s) of samples `first` to `first` + n - 1, shape (n, 4).
 
     The speed over a sample is the way to the next one; a finger that is lifted there keeps that of the sample before,
-    one that touches for a single sample rests.  NaN while lifted.
+    one that touches for a single sample rests.  NaN while lifted, as a finger without load is.
     """
     touch = finger.touch(np.arange(max(first - 1, 0), first + n + 1) / rate)
+    touch[~(touch[:, 1] > 0.0), 0] = np.nan
     way = rate * np.diff(touch[:, 0])
     if first == 0:
         way = np.r_[np.nan, way]

@@ -90,7 +90,9 @@ class SurfaceParameters(SlidingParameters):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        _ = self.carrier_mode, self.friction_law  # refuse what does not fit together
+        _ = self.carrier_mode  # refuses what does not fit together
+        if self.bias <= self.least_ratio:
+            raise ValueError(f"bias = {self.bias!r}: must be > {self.least_ratio:.3g}, the least that the law leaves")
 
     @classmethod
     def with_overrides(cls, overrides: Mapping[str, Any]) -> Self:
