@@ -4,21 +4,18 @@ from __future__ import annotations
 
 import os
 import textwrap
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from hapticrender import wording
-from hapticrender.formats import MissingExtra, replacing
+from hapticrender.figures import BLUE, GREEN, INK, ORANGE, PALE, RED, new_figure, save
 from hapticrender.judge import RUNAWAY
 from hapticrender.protocols import Array, Flag
 
 if TYPE_CHECKING:
     from hapticrender.recording import Recording
 
-# Okabe and Ito's colours: told apart by every kind of colour vision, and of different lightness.
-BLUE, ORANGE, GREEN, RED, INK, PALE = "#0072B2", "#E69F00", "#009E73", "#D55E00", "#222222", "#8A8A8A"
 PLACES = ((BLUE, "o"), (ORANGE, "<"), (GREEN, ">"))
 COILS = (BLUE, ORANGE, GREEN, RED)
 COLUMNS = 1400  # points that a full-width panel can show
@@ -27,21 +24,6 @@ PERIODS = 4  # of the strongest carrier in the close-up
 MOST_LABELS = 10
 MOST_NOTES = 3  # lines
 FLOOR = 1e-5  # relative error below which a dot stands at the foot of its panel
-STYLE: Any = {
-    "font.size": 9,
-    "axes.titlesize": 9.5,
-    "axes.titlelocation": "left",
-    "axes.titleweight": "bold",
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.edgecolor": PALE,
-    "axes.grid": True,
-    "axes.axisbelow": True,
-    "grid.color": "#E4E4E4",
-    "grid.linewidth": 0.6,
-    "legend.frameon": False,
-    "legend.fontsize": 8,
-}
 
 
 def plot(recording: Recording, path: str | os.PathLike[str]) -> None:
@@ -58,23 +40,13 @@ def plot(recording: Recording, path: str | os.PathLike[str]) -> None:
     MissingExtra
         matplotlib is not installed.
     """
-    with np.errstate(all="ignore"), replacing(Path(path)) as scratch:
-        draw(recording).savefig(scratch, dpi=110, format="png")
+    save(draw(recording), path)
 
 
 def draw(recording: Recording) -> Any:
     """Draw a recording into a new ``matplotlib.figure.Figure``, apart from pyplot and its global state; see `plot`."""
-    try:
-        import matplotlib
-        from matplotlib.backends.backend_agg import FigureCanvasAgg
-        from matplotlib.figure import Figure
-    except ImportError as error:
-        raise MissingExtra("pictures need matplotlib: pip install 'hapticrender[plot]'") from error
-    with matplotlib.rc_context(STYLE), np.errstate(all="ignore"):
-        touched = bool(np.isfinite(recording.position).any())
-        figure: Any = Figure(figsize=(11, 10.2 if touched else 8.6), layout="constrained")
-        FigureCanvasAgg(figure)
-        figure.get_layout_engine().set(w_pad=0.12, h_pad=0.07)
+    touched = bool(np.isfinite(recording.position).any())
+    with new_figure((11, 10.2 if touched else 8.6), pads=(0.12, 0.07)) as figure:
         _draw(figure, recording, touched)
     return figure
 

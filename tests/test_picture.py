@@ -11,7 +11,7 @@ UM = 1e-6
 
 pytest.importorskip("matplotlib", reason="pictures are an extra")
 
-from hapticrender import picture  # noqa: E402
+from hapticrender import figures, picture  # noqa: E402
 from hapticrender.formats import MissingExtra  # noqa: E402
 
 
@@ -146,3 +146,26 @@ def test_without_matplotlib_the_extra_is_named_and_nothing_is_written(tmp_path, 
     with pytest.raises(MissingExtra, match=r"pip install 'hapticrender\[plot\]'"):
         swiped().plot(tmp_path / "x.png")
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_new_figure_has_our_style_only_while_it_is_drawn():
+    import matplotlib
+
+    before = dict(matplotlib.rcParams)
+    with figures.new_figure((5, 3), pads=(0.12, 0.07), style={"axes.grid": False}) as figure:
+        assert matplotlib.rcParams["legend.fontsize"] == figures.STYLE["legend.fontsize"]
+        assert not matplotlib.rcParams["axes.grid"]
+    assert dict(matplotlib.rcParams) == before
+    assert tuple(figure.get_size_inches()) == (5, 3)
+    assert figure.get_layout_engine().get()["w_pad"] == 0.12
+
+
+def test_a_picture_that_fails_leaves_the_older_one(tmp_path):
+    path = tmp_path / "x.png"
+    path.write_bytes(b"older")
+    with figures.new_figure((5, 3)) as figure:
+        figure.savefig = lambda *_, **__: 1 / 0
+    with pytest.raises(ZeroDivisionError):
+        figures.save(figure, path)
+    assert path.read_bytes() == b"older"
+    assert list(tmp_path.iterdir()) == [path]
