@@ -152,7 +152,7 @@ def _close_up(axes: Any, recording: Recording) -> None:
     scale, unit = wording.drawn(recording.header.unit)
     wanted = scale * (recording.read("target", start, stop) * np.exp(1j * phase)).real.sum(axis=1)
     motion = scale * _bounded(recording.read("motion", start, stop)[:, 0])
-    offset = np.nan_to_num(np.mean(motion)) if motion.size else 0.0
+    offset = np.nan_to_num(np.mean(motion - wanted)) if motion.size else 0.0  # a stretch holds parts of periods
     milliseconds = 1e3 * (time - time[:1])
     axes.plot(milliseconds, motion - offset, color=BLUE, lw=1.8, label=recording.header.places[0])
     axes.plot(milliseconds, wanted, color=INK, lw=1.1, ls=(0, (4, 2)), label="target")

@@ -66,6 +66,22 @@ def test_the_panels_show_what_was_recorded():
     assert "±3 A" in panel(figure, "Drive").get_title(loc="left")
 
 
+def test_only_a_true_offset_is_taken_from_the_waveform():
+    """The stretch holds 1.5 periods of the lowest band: its mean, 10 um 2/(3 pi) for a sine, is no offset.
+
+    The other band adds half a period, a sample of the 150 at most, and a sum over samples is off by 0.04 %: 10 um / 140.
+    """
+    bands = make_bands([50.0, 250.0], [10 * UM, 10 * UM], phase=[np.pi / 2, 0.0])
+    for offset in (0.0, 177.0):
+        waveform = panel(
+            picture.draw(make_recording(bands, bands.envelope, duration=2.0, extra=offset * UM)), "Waveform"
+        )
+        _, wanted = line(waveform, "target")
+        assert abs(wanted.mean()) == pytest.approx(10 * 2 / (3 * np.pi), abs=10 / 140)
+        np.testing.assert_allclose(line(waveform, "centre")[1], wanted, atol=1e-6)
+        assert ("offset of 177 µm removed" in waveform.get_title(loc="left")) == bool(offset)
+
+
 def test_bands_over_position_are_labelled_with_their_frequency_too():
     recording = swiped()
     labels = [label.get_text() for label in panel(picture.draw(recording), "Rms error").get_xticklabels()]
