@@ -192,3 +192,22 @@ def test_full_scale_is_round_and_just_above_the_peak(peak):
 def test_the_page_links_only_below_itself(tmp_path):
     with pytest.raises(ValueError, match="is not in the subpath"):
         page(tmp_path / "elsewhere", [outputs(Path("/somewhere"), [GOOD])])
+
+
+def test_a_device_that_judges_a_quantity_says_so():
+    worst = {"figure": "rms_error_friction", "value": 0.002, "band": "50 Hz", "place": "friction"}
+    assert wording.worst_figure({"worst": worst}) == "rms error of friction in the 50 Hz band = 0.200 %"
+    worst = {"figure": "rms_error_end_2", "value": 0.5, "band": "50 Hz", "place": "end 2"}
+    assert wording.worst_figure({"worst": worst}) == "rms error of the 50 Hz band at end 2 = 50.0 %"
+
+
+@pytest.mark.parametrize(
+    ("places", "title"),
+    [(["centre"], "centre"), (["skin", "skin"], "skin"), (["centre", "friction", "skin"], "at the finger"),
+     (["friction", "centre"], "at the finger")],
+)  # fmt: skip
+def test_the_first_column_is_headed_by_what_all_devices_share(places, title):
+    """A scene with no figures counts as a plate."""
+    summaries = [{"bands": [{f"rms_error_{place}": 0.1}]} for place in places]
+    assert wording.titles(summaries) == [title, "end 1", "end 2"]
+    assert wording.titles([*summaries, {"bands": []}])[0] == ("centre" if title == "centre" else "at the finger")
