@@ -164,16 +164,25 @@ def conditions(summary: Mapping[str, Any]) -> str:
 
 
 def describe(scene: Scene) -> str:
-    """Describe a scene in a few words: its texture, its finger, its length."""
+    """Describe a scene in a few words: its texture, its finger, its length and its device."""
     texture, motion = scene.texture, scene.finger.motion
     sizes = [
         short(size, unit)
         for key, unit in (("amplitude", "m"), ("wavelength", "m"), ("frequency", "Hz"))
         if (size := getattr(texture, key, None)) is not None
     ]
+    count = _partials(texture)
+    what = f"{_kind(texture)} {' '.join(sizes)}{f', {count} partials' if count > 1 else ''}"
     speed = getattr(motion, "speed", None)
     finger = [f"{_kind(motion)} finger", *([] if speed is None else [short(speed, "m/s")])]
-    return f"{_kind(texture)} {' '.join(sizes)}; {' '.join(finger)}; {short(scene.duration, 's')}"
+    return f"{what}; {' '.join(finger)}; {short(scene.duration, 's')} on {scene.device}"
+
+
+def _partials(texture: Any) -> int:
+    """How many partials a texture has by its own parameters; 1 where it does not say."""
+    if partials := getattr(texture, "partials", None):
+        return len(partials)
+    return getattr(texture, "harmonics", 1) if getattr(texture, "shape", "sine") != "sine" else 1
 
 
 def _kind(thing: Any) -> str:

@@ -8,6 +8,9 @@ import pytest
 from hapticrender import wording
 from hapticrender.outputs import Outputs, round_up
 from hapticrender.page import page, write_page
+from hapticrender.touch.builtin import builtin_scenes
+from hapticrender.touch.grating import Grating
+from hapticrender.touch.scene import Scene
 
 VOID = {"meta", "img", "br", "circle", "path"}
 FILES = ("scene.toml", "summary.json", "recording.au", "drive.wav", "sensed.wav", "picture.png")
@@ -211,3 +214,14 @@ def test_the_first_column_is_headed_by_what_all_devices_share(places, title):
     summaries = [{"bands": [{f"rms_error_{place}": 0.1}]} for place in places]
     assert wording.titles(summaries) == [title, "end 1", "end 2"]
     assert wording.titles([*summaries, {"bands": []}])[0] == ("centre" if title == "centre" else "at the finger")
+
+
+def test_a_scene_is_described_with_its_partials_and_its_device():
+    scenes = builtin_scenes()
+    assert wording.describe(scenes["grating-20"]) == "grating 10 µm 20 Hz; no finger; 5 s on vt-plate"
+    assert wording.describe(scenes["one-texture-hybrid"]) == (
+        "grating 25.46 µm 50 Hz, 3 partials; sliding finger 80 mm/s; 3 s on hybrid"
+    )
+    square = Scene(texture=Grating(amplitude=1e-5, frequency=20.0, shape="square", harmonics=4), duration=1.0)
+    assert wording.describe(square) == "grating 10 µm 20 Hz, 4 partials; no finger; 1 s on vt-plate"
+    assert len(square.texture.bands(rate=5000.0)) == 4
