@@ -21,6 +21,7 @@ import numpy as np
 from hapticrender import defaults
 from hapticrender.accuracy_friction import EACH, FINGER, VELOCITY, texture
 from hapticrender.errors import HapticError
+from hapticrender.figures import save
 from hapticrender.formats import replacing
 from hapticrender.loop import Session, prepare, run
 from hapticrender.protocols import Plant
@@ -232,8 +233,7 @@ def device_chart(
         scratch.write_text(json.dumps(as_data(points, swept), indent=2) + "\n", encoding="utf-8")
     from hapticrender.device_picture import draw
 
-    with np.errstate(all="ignore"), replacing(path) as scratch:
-        draw(points, swept).savefig(scratch, dpi=110, format="png")
+    save(draw(points, swept), path)
     return points
 
 

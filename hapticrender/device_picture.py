@@ -9,8 +9,7 @@ import numpy as np
 
 from hapticrender import defaults
 from hapticrender.device_chart import SWEEP, Point, fronts
-from hapticrender.formats import MissingExtra
-from hapticrender.picture import BLUE, GREEN, INK, ORANGE, PALE, RED, STYLE
+from hapticrender.figures import BLUE, GREEN, INK, ORANGE, PALE, RED, new_figure
 
 DEVICES = {
     "vt-plate": (BLUE, "vibrotactile plate"),
@@ -30,16 +29,7 @@ def draw(points: Sequence[Point], swept: dict[str, list[float]]) -> Any:
     MissingExtra
         matplotlib is not installed.
     """
-    try:
-        import matplotlib
-        from matplotlib.backends.backend_agg import FigureCanvasAgg
-        from matplotlib.figure import Figure
-    except ImportError as error:
-        raise MissingExtra("pictures need matplotlib: pip install 'hapticrender[plot]'") from error
-    with matplotlib.rc_context(STYLE), np.errstate(all="ignore"):
-        figure: Any = Figure(figsize=(12.5, 6.2), layout="constrained")
-        FigureCanvasAgg(figure)
-        figure.get_layout_engine().set(w_pad=0.1, h_pad=0.07)
+    with new_figure((12.5, 6.2), pads=(0.1, 0.07)) as figure:
         speed, frequency = figure.subplots(1, 2, width_ratios=[1.35, 1])
         _scatter(speed, points)
         _sweep(frequency, swept)

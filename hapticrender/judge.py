@@ -449,16 +449,11 @@ def text(summary: Mapping[str, Any]) -> str:
     lines = ["  ".join(cell.rjust(width) for cell, width in zip(row, widths, strict=True)) for row in rows]
     wobble, residual = (wording.quantity(summary[key], summary["unit"]) for key in ("wobble", "residual_rms"))
     saturated = wording.percent(summary["saturated_share"])
-    where = " and ".join(_said(places))
-    lines.append(f"rms errors at {where}; wobble {wobble}, beside the bands {residual}, saturated {saturated}")
+    lines.append(
+        f"rms errors {wording.at(places)}; wobble {wobble}, beside the bands {residual}, saturated {saturated}"
+    )
     lines.extend(summary["notes"])
     return "\n".join([*lines, f"{summary['scene']} {wording.verdict(summary)}"])
-
-
-def _said(places: list[str]) -> list[str]:
-    """Places in words, the ends of a plate as one."""
-    names = [place.replace("_", " ") for place in places]
-    return list(dict.fromkeys("ends" if name.startswith("end ") else name for name in names))
 
 
 def _mean(values: Array) -> float | None:

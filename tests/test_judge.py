@@ -6,11 +6,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from synthetic import PLACES, RATE, make_bands, make_recorder, make_recording, make_signals, times
+from synthetic import PLACES, RATE, make_bands, make_recorder, make_recording, make_scene, make_signals, times
 
 from hapticrender import judge
 from hapticrender.loop import render
 from hapticrender.protocols import Flag
+from hapticrender.recording import Recorder
 from hapticrender.touch.builtin import builtin_scenes
 
 EXACT = 1e-9  # relative: the ridge of 1e-12 times the inverse of the worst inflation, with digits to spare
@@ -368,3 +369,20 @@ def test_a_lead_in_time_is_a_lead_whichever_way_the_finger_goes():
     backward = recording.envelopes.backward[recording.envelopes.judged]
     assert backward.any()
     assert not backward.all()
+
+
+@pytest.mark.parametrize(
+    ("places", "said"),
+    [(PLACES, "at centre and ends"), (("friction",), "of friction"), (("skin",), "of skin velocity")],
+)
+def test_the_table_says_what_its_errors_are_of(places, said):
+    bands = make_bands(100.0, 10 * UM)
+    signals = make_signals(bands, bands.envelope, duration=2.0)
+    signals["motion"] = signals["motion"][:, : len(places)]
+    recorder = Recorder(
+        None, scene=make_scene(duration=2.0), method="h2", seed=0, rate=RATE, bands=bands, places=places
+    )
+    recorder.append(**signals)
+    text = recorder.finish().text()
+    assert f"rms errors {said}; wobble" in text
+    assert f"worst figure rms error {'of the 100 Hz band at' if len(places) > 1 else said}" in text
