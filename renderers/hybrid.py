@@ -139,6 +139,7 @@ class HybridRenderer(BaseRenderer):
     """Renderer for a plate on two coils with a current-driven electroadhesion screen laminated on it."""
 
     name = "hybrid"
+    needs = "2 coils (A), 2 displacement sensors (m), a current source on a carrier (A peak), a tribometer (N)"
 
     def __init__(self) -> None:
         self._plate, self._screen = VibrotactileRenderer(), ElectroadhesionRenderer()
