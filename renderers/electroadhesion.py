@@ -137,7 +137,7 @@ class ElectroadhesionRenderer(FrictionRenderer):
 
 def _read(scene: Scene) -> tuple[ElectroadhesionSettings, ElectroadhesionParameters]:
     settings, rest = ElectroadhesionSettings.split(scene.plant)
-    return settings, ElectroadhesionParameters.with_overrides(rest)  # type: ignore[return-value]
+    return settings, ElectroadhesionParameters.with_overrides(rest, settings.names())  # type: ignore[return-value]
 
 
 def _nominal(parameters: ElectroadhesionParameters) -> ElectroadhesionParameters:

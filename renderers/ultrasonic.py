@@ -94,4 +94,4 @@ class UltrasonicRenderer(FrictionRenderer):
 
 def _read(scene: Scene) -> tuple[FrictionSettings, SurfaceParameters]:
     settings, rest = FrictionSettings.split(scene.plant)
-    return settings, SurfaceParameters.with_overrides(rest)
+    return settings, SurfaceParameters.with_overrides(rest, settings.names())

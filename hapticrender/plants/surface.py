@@ -6,8 +6,8 @@ the same amplitude loop on a fraction of the samples.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field, fields, replace
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, Self
 
@@ -16,7 +16,7 @@ import numpy as np
 from hapticrender.bands import Bands
 from hapticrender.control.bandmodel import BandModel, FingerRange
 from hapticrender.control.bank import BankController
-from hapticrender.plants.bounds import choice, number
+from hapticrender.plants.bounds import check_names, choice, number
 from hapticrender.plants.closed import STEPS
 from hapticrender.plants.electroadhesion import finger_rows
 from hapticrender.plants.friction_laws import LAWS, FrictionLaw
@@ -93,24 +93,15 @@ class SurfaceParameters(SlidingParameters):
         _ = self.carrier_mode, self.friction_law  # refuse what does not fit together
 
     @classmethod
-    def with_overrides(cls, overrides: Mapping[str, Any]) -> Self:
-        """Defaults with some parameters replaced, of the surface, its mode or its law; an unknown name is refused."""
-        law = overrides.get("law", "fit")
-        names = {
-            "own": {each.name for each in fields(cls)} - {"mode", "law_parameters"},
-            "mode": {each.name for each in fields(UltrasonicParameters)} - {"rate", "level"},
-            "law": {each.name for each in fields(LAWS.get(law, LAWS["fit"]))},
-        }
-        parts: dict[str, dict[str, Any]] = {part: {} for part in names}
-        for name, value in overrides.items():
-            part = next((part for part, known in names.items() if name in known), None)
-            if part is None:
-                known = sorted(set().union(*names.values()))
-                raise ValueError(f"plant.{name}: no such parameter; known: {', '.join(known)}")
-            parts[part][name] = value
-        mode = UltrasonicParameters.with_overrides(parts["mode"])
+    def with_overrides(cls, overrides: Mapping[str, Any], also: Iterable[str] = ()) -> Self:
+        """Defaults with some parameters replaced, of the surface, its mode or its law; see `Validated`."""
+        own, mode = cls.names(), UltrasonicParameters.names() - cls.names()
+        law = LAWS.get(overrides.get("law", "fit"), LAWS["fit"])
+        of_law = law.names() - own - mode
+        check_names(overrides, own | mode | of_law, also)
+        parts = [{name: overrides[name] for name in overrides if name in known} for known in (own, mode, of_law)]
         try:
-            return cls(**parts["own"], mode=mode, law_parameters=parts["law"])
+            return cls(**parts[0], mode=UltrasonicParameters(**parts[1]), law_parameters=parts[2])
         except (ValueError, TypeError) as error:
             raise type(error)(f"plant.{error}") from None
 
