@@ -236,6 +236,12 @@ class ElectroadhesionParameters(SlidingParameters):
             return self.friction_coefficient * self.frequency_response(frequency, speed)
         return self.estimator.frequency_response(frequency) / self._shift(frequency)
 
+    def sensor_response(self, frequency: Any, speed: float) -> Any:
+        """Return what is sensed, as friction, per friction (complex) at `frequency` (Hz), finger at `speed` (m/s)."""
+        if self.sensor == "tribometer":
+            return self.tribometer_response(frequency)
+        return self.sensed_response(frequency, speed) / self.lag_response(frequency, speed)
+
 
 class ElectroadhesionScreen:
     """The screen in discrete time, behind the `Plant` protocol.

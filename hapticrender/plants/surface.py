@@ -128,6 +128,16 @@ class SurfaceParameters(SlidingParameters):
         floor = self.friction_law.numbers.floor
         return floor + 0.01 * (1.0 - floor)
 
+    def sensor_response(self, frequency: Any, speed: float) -> Any:
+        """Return what is sensed per friction (complex) at `frequency` (Hz) under a finger at `speed` (m/s).
+
+        The tribometer's response; or what the sensed amplitude says before the contact's lag, at the middle of the
+        sample at whose end friction is felt.
+        """
+        if self.sensor == "tribometer":
+            return self.tribometer_response(frequency)
+        return 1.0 / (self.lag_response(frequency, speed) * self._shift(np.asarray(frequency, float) / 2))
+
     def amplitude_model(self) -> BandModel:
         """Band model of the mode with what a finger and the heat can make of it, for its amplitude loop."""
         mode = self.carrier_mode
