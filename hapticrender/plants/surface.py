@@ -16,8 +16,8 @@ import numpy as np
 from hapticrender.bands import Bands
 from hapticrender.control.bandmodel import BandModel, FingerRange
 from hapticrender.control.bank import BankController
+from hapticrender.plants.base import TouchedPlant
 from hapticrender.plants.bounds import check_names, choice, number
-from hapticrender.plants.closed import STEPS
 from hapticrender.plants.electroadhesion import finger_rows
 from hapticrender.plants.friction_laws import LAWS, FrictionLaw
 from hapticrender.plants.sliding import SlidingParameters, sliding_state, sliding_tables
@@ -171,7 +171,7 @@ def resonant(model: BandModel, mode: UltrasonicParameters, lock: float) -> BandM
     )
 
 
-class UltrasonicSurface:
+class UltrasonicSurface(TouchedPlant):
     """The surface in discrete time, behind the `Plant` protocol.
 
     Parameters
@@ -204,13 +204,11 @@ class UltrasonicSurface:
         seed: int = 0,
         nominal: tuple[float, float] = (0.5, 0.05),
     ) -> None:
+        super().__init__(finger, parameters.rate)
         self.parameters = parameters
-        self.finger = finger
-        self.rate = float(parameters.rate)
         self.amplitude = self.skin_velocity = np.zeros(0)
         self.loop = amplitude
         self._rng = np.random.default_rng(seed)
-        self._samples = 0
         self._tables = surface_tables(parameters, amplitude, finger, nominal)
         self._state = surface_state(parameters, amplitude)
         self._last = np.zeros(1)
@@ -218,19 +216,11 @@ class UltrasonicSurface:
     def _next(self, n: int) -> tuple[Array, Array, Array, Array]:
         """Finger rows, mode rows, noise and sample flags of the next n samples."""
         finger = finger_rows(self.finger, self._samples, n, self.rate)
-        time = (self._samples + np.arange(n)) / self.rate
+        time = self._time(n)
         self._samples += n
         mode = mode_rows(self.parameters.carrier_mode, time, np.where(finger[:, STRENGTH] > 0.0, finger[:, LOAD], 0.0))
         noise = self._rng.standard_normal((n, 1 + self._tables.substeps))
         return finger, mode, noise, np.zeros(n, np.int64)
-
-    def closes(self, controller: Controller) -> bool:
-        """Whether `closed_loop` has compiled code for this controller."""
-        return type(getattr(controller, "tables", None)) in STEPS
-
-    def finger_position(self, n: int) -> Array:
-        """Finger positions (m, shape (n,)) of the next n samples, NaN while lifted; the plant does not advance."""
-        return self.finger.position((self._samples + np.arange(n)) / self.rate)
 
     def run(self, drive: Array) -> Sensed:
         """Advance by n samples under `drive` (N, shape (n, 1)); row i acts from sample i on, sensed at its start."""
