@@ -1,8 +1,9 @@
 """Every kind of device in one chart: accuracy against the speed of its simulation, and over the frequency.
 
 Accuracy is the worst error of any band over `scenes` at the finger, the first judged place of a device; speed is how
-many seconds are simulated in one, controller, device and finger together, measured in turns.  The level "envelope" is
-judged on itself, not against the carrier that it leaves out.  Speeds are this machine's, their order is not.
+many seconds are simulated in one of this thread's own, controller, device and finger together, measured in turns.  The
+level "envelope" is judged on itself, not against the carrier that it leaves out, so each level has a front of its own.
+Speeds are this machine's, their order is not.
 """
 
 from __future__ import annotations
@@ -55,6 +56,11 @@ class Setting:
     device: str
     level: str
     method: str
+
+    @property
+    def model(self) -> tuple[str, str]:
+        """Device and level."""
+        return self.device, self.level
 
     def scene(self, touched: Grating) -> Scene:
         """A texture under the sliding finger, every band of it."""
@@ -155,15 +161,15 @@ def _judged(setting: Setting) -> Point:
 
 
 def _clock(setting: Setting) -> Callable[[], float]:
-    """A function that times a simulated second of the texture of three partials, going on from where it is."""
+    """A function that times a simulated second of three partials, in this thread's own time, from where it is."""
     session = prepare(setting.scene(scenes()["3 partials"]), method=setting.method)
     controller, plant = session.controller(), _plant(session)
     wanted = np.zeros(int(session.driver.rate))
 
     def clock() -> float:
-        start = time.perf_counter()
+        start = time.thread_time()
         plant.closed_loop(controller, wanted)
-        return time.perf_counter() - start
+        return time.thread_time() - start
 
     return clock
 
@@ -177,7 +183,7 @@ def _plant(session: Session) -> Plant:
 
 
 def front(points: Sequence[Point]) -> list[Point]:
-    """Points of one device that no other beats in both error and speed, the fastest first; `ALIKE` errors are one."""
+    """Points of one device and level that none beats in both error and speed, fastest first; `ALIKE` errors are one."""
     found: list[Point] = []
     for point in sorted((each for each in points if each.stable), key=lambda each: (-each.speed, each.error)):
         if not found or point.error < ALIKE * found[-1].error:
@@ -237,10 +243,10 @@ def device_chart(
     return points
 
 
-def fronts(points: Sequence[Point]) -> dict[str, list[Point]]:
-    """The front of every device."""
-    devices = dict.fromkeys(each.setting.device for each in points)
-    return {device: front([each for each in points if each.setting.device == device]) for device in devices}
+def fronts(points: Sequence[Point]) -> dict[tuple[str, str], list[Point]]:
+    """The front of every device and level, each of which is judged on itself."""
+    models = dict.fromkeys(each.setting.model for each in points)
+    return {model: front([each for each in points if each.setting.model == model]) for model in models}
 
 
 def as_data(points: Sequence[Point], swept: dict[str, list[float]]) -> dict[str, Any]:

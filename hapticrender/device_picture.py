@@ -47,7 +47,7 @@ def _look(device: str) -> tuple[str, str]:
 
 
 def _scatter(axes: Any, points: Sequence[Point]) -> None:
-    """Error against speed, the front of every device as a staircase, and a lane for what is lost."""
+    """Error against speed, the front of every device and level as a staircase, and a lane for what is lost."""
     errors = [100 * point.error for point in points if point.stable]
     foot, top = 0.62 * min(errors, default=1.0), 1.6 * max(errors, default=1.0)
     lane, end = 1.35 * top, 1.8 * top
@@ -65,23 +65,23 @@ def _scatter(axes: Any, points: Sequence[Point]) -> None:
     refused = dict.fromkeys(each.setting.method for each in points if each.refused)
     told = [f"{what}: {', '.join(names)}" for what, names in (("lost", lost), ("refused", refused)) if names]
     axes.text(0.99, lane, "; ".join(told), transform=axes.get_yaxis_transform(), ha="right", va="center", fontsize=8)
-    for device, best in fronts(points).items():
-        _staircase(axes, best, _look(device)[0])
+    for (device, level), best in fronts(points).items():
+        _staircase(axes, best, _look(device)[0], "--" if level == "envelope" else "-")
     axes.set(xscale="log", yscale="log", xlabel="simulated seconds a second: controller, device and finger together")
     axes.set(ylabel="worst error of any band at the finger (%)", title="Accuracy against speed: lower right is better")
     low, high = axes.get_xlim()
-    axes.set_xlim(low, 1.9 * high)
+    axes.set_xlim(0.8 * low, 1.9 * high)  # room for names
     axes.set_ylim(foot, end)
     _ticks(axes.xaxis, TENTHS)
     _ticks(axes.yaxis, THIRDS)
 
 
-def _staircase(axes: Any, best: Sequence[Point], colour: str) -> None:
-    """The front of one device, its points named."""
+def _staircase(axes: Any, best: Sequence[Point], colour: str, dashes: str) -> None:
+    """The front of one device and level, its points named."""
     if not best:
         return
     stairs = sorted((point.speed, 100 * point.error) for point in best)
-    axes.plot(*zip(*stairs, strict=True), color=colour, lw=1.2, drawstyle="steps-pre", zorder=2)
+    axes.plot(*zip(*stairs, strict=True), color=colour, lw=1.2, ls=dashes, drawstyle="steps-pre", zorder=2)
     for point in best:
         place: Any = {"xytext": (0, -8), "ha": "center", "va": "top"}
         if point is not best[-1]:  # another stands below it
@@ -125,9 +125,9 @@ def _keys(points: Sequence[Point]) -> list[Any]:
     methods = dict.fromkeys(each.setting.method for each in points)
     handles = [Line2D([], [], color=_look(each)[0], lw=4, label=_look(each)[1]) for each in devices]
     handles += [
-        Line2D([], [], color=INK, marker="o", fillstyle="none", ls="none", label="hollow: envelope level"),
+        Line2D([], [], color=INK, marker="o", fillstyle="none", ls="none", label="hollow, dashed: envelope level"),
         Line2D([], [], color=INK, marker="x", ls="none", label="a scene is lost"),
-        Line2D([], [], color=INK, lw=1.2, label="line and names: the front of a device"),
+        Line2D([], [], color=INK, lw=1.2, label="line and names: the front of a device and level"),
     ]
     return handles + [
         Line2D([], [], color=PALE, marker=SHAPES.get(each, "P"), ls="none", label=each) for each in methods

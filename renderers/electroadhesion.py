@@ -92,11 +92,7 @@ class ElectroadhesionRenderer(FrictionRenderer):
     def sensor_response(self, scene: Scene, frequency: Array) -> Array:
         """Return what the tribometer shows of friction, or what the gap's impedance says of it before it lags."""
         _, parameters = _read(scene)
-        if parameters.sensor == "tribometer":
-            return parameters.tribometer_response(frequency)
-        speed = typical_speed(scene, parameters.least_speed)
-        shown = parameters.friction_coefficient * parameters.sensed_response(frequency, speed)
-        return shown / (parameters.friction_coefficient * parameters.lag_response(frequency, speed))
+        return parameters.sensor_response(frequency, typical_speed(scene, parameters.least_speed))
 
     def compensation(self, scene: Scene) -> SquareRoot:
         """Return the square root for a nominal finger under the scene's load, its bias as large as the scene needs.
@@ -154,7 +150,7 @@ class ElectroadhesionRenderer(FrictionRenderer):
 
 def _read(scene: Scene) -> tuple[ElectroadhesionSettings, ElectroadhesionParameters]:
     settings, rest = ElectroadhesionSettings.split(scene.plant)
-    return settings, ElectroadhesionParameters.with_overrides(rest)  # type: ignore[return-value]
+    return settings, ElectroadhesionParameters.with_overrides(rest, settings.names())  # type: ignore[return-value]
 
 
 def _nominal(parameters: ElectroadhesionParameters) -> ElectroadhesionParameters:

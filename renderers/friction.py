@@ -10,7 +10,7 @@ speed, as the skin velocity of a real grating does.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -49,7 +49,7 @@ class FrictionSettings(Validated):
     @classmethod
     def split(cls, plant: Mapping[str, Any]) -> tuple[FrictionSettings, dict[str, Any]]:
         """Settings, and what is left of a scene's `plant` table for the device."""
-        own = {each.name for each in fields(cls)}
+        own = cls.names()
         settings = cls.with_overrides({key: value for key, value in plant.items() if key in own})
         return settings, {key: value for key, value in plant.items() if key not in own}
 

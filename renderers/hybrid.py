@@ -20,7 +20,7 @@ import numpy as np
 from hapticrender.bands import Bands
 from hapticrender.control.bandmodel import BandModel
 from hapticrender.control.together import TogetherController, TwoBands, TwoModels, design_together
-from hapticrender.plants.bounds import Validated, number
+from hapticrender.plants.bounds import Validated, check_names, number
 from hapticrender.plants.electroadhesion import ElectroadhesionParameters, ElectroadhesionScreen
 from hapticrender.plants.hybrid import PLACES, HybridPlant
 from hapticrender.plants.vibrotactile import PlateParameters
@@ -139,6 +139,7 @@ class HybridRenderer(BaseRenderer):
     """Renderer for a plate on two coils with a current-driven electroadhesion screen laminated on it."""
 
     name = "hybrid"
+    needs = "2 coils (A), 2 displacement sensors (m), a current source on a carrier (A peak), a tribometer (N)"
 
     def __init__(self) -> None:
         self._plate, self._screen = VibrotactileRenderer(), ElectroadhesionRenderer()
@@ -254,30 +255,25 @@ def _share_out(scene: Scene, settings: HybridSettings, plate: PlateParameters, r
 
 def _split(plant: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any], dict[str, Any]]:
     """Settings of the hybrid, parameters of the plate and of the screen; `plate_` or `screen_` tells which is meant."""
-    own = {each.name for each in fields(HybridSettings)}
-    plate = {each.name for each in fields(PlateParameters)}
-    screen = {each.name for kind in (FrictionSettings, ElectroadhesionParameters) for each in fields(kind)}
+    own, plate = HybridSettings.names(), PlateParameters.names()
+    screen = FrictionSettings.names() | ElectroadhesionParameters.names()
     double = plate & screen - {BOTH}
+    known = own | (plate | screen) - double | {f"{of}_{each}" for each in double for of in ("plate", "screen")}
+    check_names([key for key in plant if key not in double], known)
     found: tuple[dict[str, Any], ...] = ({}, {}, {})
     for key, value in plant.items():
         if key in double:
             raise ValueError(f"plant.{key} = {value!r}: must be plate_{key} or screen_{key}: both have one")
         whose = [
             (table, name)
-            for table, known, name in zip(
+            for table, names, name in zip(
                 found, (own, plate, screen), (key, key.removeprefix("plate_"), key.removeprefix("screen_")), strict=True
             )
-            if name in known and (name == key or name in double)
+            if name in names and (name == key or name in double)
         ]
-        if not whose:
-            known = sorted(own | (plate | screen) - double | {f"{of}_{each}" for each in double for of in _OF})
-            raise ValueError(f"plant.{key}: no such parameter; known: {', '.join(known)}")
         for table, name in whose:
             table[name] = value
     return found[0], found[1], found[2]
-
-
-_OF = ("plate", "screen")
 
 
 def _side_by_side(moved: BandModel, rubbed: BandModel | None, velocity_per_force: float) -> TwoModels:

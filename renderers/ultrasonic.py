@@ -87,13 +87,7 @@ class UltrasonicRenderer(FrictionRenderer):
     def sensor_response(self, scene: Scene, frequency: Array) -> Array:
         """Return what the tribometer shows of friction, or what the sensed amplitude says of it before it lags."""
         _, parameters = _read(scene)
-        if parameters.sensor == "tribometer":
-            return parameters.tribometer_response(frequency)
-        late = np.exp(
-            1j * np.pi * np.asarray(frequency, float) / parameters.rate
-        )  # from the sample's middle to its end
-        speed = typical_speed(scene, parameters.least_speed)
-        return 1.0 / (parameters.lag_response(frequency, speed) * late)
+        return parameters.sensor_response(frequency, typical_speed(scene, parameters.least_speed))
 
     def _model(self, scene: Scene, parameters: SurfaceParameters, driver: Driver) -> BandModel:
         """Band model without its drive limit: what carries the amplitude along takes half a sample more than a hold."""
@@ -137,4 +131,4 @@ def _check_amplitude(parameters: SurfaceParameters, swing: float, load: float, s
 
 def _read(scene: Scene) -> tuple[FrictionSettings, SurfaceParameters]:
     settings, rest = FrictionSettings.split(scene.plant)
-    return settings, SurfaceParameters.with_overrides(rest)
+    return settings, SurfaceParameters.with_overrides(rest, settings.names())

@@ -12,11 +12,11 @@ from hapticrender.touch.grating import Grating
 TONE = Grating(frequency=120.0, velocity=10e-3)
 
 
-def point(error, speed, device="ultrasonic", **told):
-    return Point(setting=Setting(device=device, level="", method="h2"), error=error, speed=speed, **told)
+def point(error, speed, device="ultrasonic", level="", **told):
+    return Point(setting=Setting(device=device, level=level, method="h2"), error=error, speed=speed, **told)
 
 
-def test_the_front_of_a_device_holds_what_nothing_beats_in_both():
+def test_the_front_of_a_device_and_level_holds_what_nothing_beats_in_both():
     fast, good, worse, alike, lost = (
         point(0.1, 9.0),
         point(0.01, 5.0),
@@ -24,10 +24,11 @@ def test_the_front_of_a_device_holds_what_nothing_beats_in_both():
         point(0.0095, 3.0),
         point(np.inf, 99.0),
     )
-    other = point(0.2, 1.0, device="vt-plate")
-    assert device_chart.fronts([worse, good, lost, other, alike, fast]) == {
-        "ultrasonic": [fast, good],
-        "vt-plate": [other],
+    other, whole = point(0.2, 1.0, device="vt-plate"), point(0.2, 1.0, level="carrier")
+    assert device_chart.fronts([worse, good, lost, other, alike, fast, whole]) == {
+        ("ultrasonic", ""): [fast, good],
+        ("vt-plate", ""): [other],
+        ("ultrasonic", "carrier"): [whole],
     }
 
 
@@ -41,10 +42,13 @@ def test_every_device_and_level_is_there_with_every_method():
     assert [float(each) for each in (device_chart.SWEEP[0], device_chart.SWEEP[-1])] == pytest.approx([20.0, 400.0])
 
 
-@pytest.mark.parametrize("device", ["vt-plate", "electroadhesion", "ultrasonic"])
-def test_a_tone_is_held_within_the_bound_of_the_suite(device):
-    """1 %, as in the accuracy suite; the paper's method on the plate too, two carriers away from resonance."""
-    assert device_chart.found_error(Setting(device=device, level="", method="h2"), TONE) < 0.01
+@pytest.mark.parametrize(
+    ("device", "method"),
+    [("vt-plate", "h2"), ("vt-plate", "paper-common"), ("electroadhesion", "h2"), ("ultrasonic", "h2")],
+)
+def test_a_tone_is_held_within_the_bound_of_the_suite(device, method):
+    """1 %, as in the accuracy suite; 120 Hz is 27 Hz below the heave mode, so the paper's method holds it too."""
+    assert device_chart.found_error(Setting(device=device, level="", method=method), TONE) < 0.01
 
 
 def test_what_a_polar_method_loses_is_lost():
@@ -83,6 +87,22 @@ def test_it_draws_and_writes_what_it_measured(tmp_path, monkeypatch):
     assert all(0.0 < error < 0.01 for errors in swept["error"].values() for error in errors)
     assert (tmp_path / "devices.png").stat().st_size > 10_000
     assert told[-1] == "over frequency: electroadhesion"
+
+
+def test_every_point_of_a_front_is_named():
+    pytest.importorskip("matplotlib")
+    points = [point(0.1, 9.0, level="envelope"), point(0.01, 5.0, level="envelope"), point(0.2, 1.0, level="carrier")]
+    axes = device_picture.draw([*points, point(0.3, 0.5, level="carrier")], {}).axes[0]
+    named = [each.get_text() for each in axes.texts if each.get_text().startswith("h2")]
+    assert named == ["h2, envelope", "h2, envelope", "h2, carrier"]
+
+
+def test_speed_is_told_by_the_time_of_the_own_thread(monkeypatch):
+    """Ten seconds that the machine spends elsewhere do not count."""
+    clocks = {"perf_counter": iter(np.arange(0.0, 100.0, 10.0)), "thread_time": iter([1.0, 1.5])}
+    for name, values in clocks.items():
+        monkeypatch.setattr(device_chart.time, name, lambda values=values: float(next(values)))
+    assert device_chart._clock(Setting(device="vt-plate", level="", method="h2"))() == 0.5
 
 
 def test_a_picture_of_nothing_but_losses_and_unknown_devices_is_drawn():

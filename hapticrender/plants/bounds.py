@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import field, fields
 from typing import Any, Self
 
@@ -30,16 +30,40 @@ class Validated:
                 check(each, getattr(self, each.name))
 
     @classmethod
-    def with_overrides(cls, overrides: Mapping[str, Any]) -> Self:
-        """Defaults with some parameters replaced; an unknown name is a ValueError that lists the known ones."""
-        known = {each.name for each in fields(cls)}  # type: ignore[arg-type]
-        for name in overrides:
-            if name not in known:
-                raise ValueError(f"plant.{name}: no such parameter; known: {', '.join(sorted(known))}")
+    def names(cls) -> set[str]:
+        """Names of the parameters that `number` and `choice` made."""
+        return {each.name for each in fields(cls) if "free" not in each.metadata}  # type: ignore[arg-type]
+
+    @classmethod
+    def with_overrides(cls, overrides: Mapping[str, Any], also: Iterable[str] = ()) -> Self:
+        """Defaults with some parameters replaced.
+
+        Parameters
+        ----------
+        overrides : mapping
+            Values by name.
+        also : iterable of str
+            What else a scene's `plant` table knows, read elsewhere.
+
+        Raises
+        ------
+        ValueError
+            A name is unknown; the known ones are listed, `also` among them.
+        """
+        check_names(overrides, cls.names(), also)
         try:
             return cls(**overrides)
         except (ValueError, TypeError) as error:
             raise type(error)(f"plant.{error}") from None
+
+
+def check_names(given: Iterable[str], known: Iterable[str], also: Iterable[str] = ()) -> None:
+    """Refuse a name of a scene's `plant` table that is not `known`; list those that are, and what is known `also`."""
+    known = set(known)
+    for name in given:
+        if name not in known:
+            listed = ", ".join(sorted(known.union(also)))
+            raise ValueError(f"plant.{name}: no such parameter; known: {listed}")
 
 
 def _check_choice(each: Any, value: Any) -> None:

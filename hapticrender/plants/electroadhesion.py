@@ -33,8 +33,8 @@ import numpy as np
 
 from hapticrender.control.gap import VACUUM, GapEstimator, gap_state
 from hapticrender.control.square_root import SquareRoot, SquareRootTables
+from hapticrender.plants.base import TouchedPlant
 from hapticrender.plants.bounds import choice, number
-from hapticrender.plants.closed import STEPS
 from hapticrender.plants.electroadhesion_kernels import (
     LOAD,
     POSITION,
@@ -236,8 +236,14 @@ class ElectroadhesionParameters(SlidingParameters):
             return self.friction_coefficient * self.frequency_response(frequency, speed)
         return self.estimator.frequency_response(frequency) / self._shift(frequency)
 
+    def sensor_response(self, frequency: Any, speed: float) -> Any:
+        """Return what is sensed, as friction, per friction (complex) at `frequency` (Hz), finger at `speed` (m/s)."""
+        if self.sensor == "tribometer":
+            return self.tribometer_response(frequency)
+        return self.sensed_response(frequency, speed) / self.lag_response(frequency, speed)
 
-class ElectroadhesionScreen:
+
+class ElectroadhesionScreen(TouchedPlant):
     """The screen in discrete time, behind the `Plant` protocol.
 
     Parameters
@@ -270,13 +276,11 @@ class ElectroadhesionScreen:
         seed: int = 0,
         compensation: SquareRoot | None = None,
     ) -> None:
+        super().__init__(finger, parameters.rate)
         self.parameters = parameters
-        self.finger = finger
         self.compensation = compensation
-        self.rate = float(parameters.rate)
         self.skin_velocity = self.attraction = np.zeros(0)
         self._rng = np.random.default_rng(seed)
-        self._samples = 0
         self._tables = screen_tables(parameters, finger, compensation)
         self._state = screen_state()
         self._last = np.zeros(1)
@@ -287,14 +291,6 @@ class ElectroadhesionScreen:
         self._samples += n
         width = 1 + 2 * self.parameters.oversampling if self._tables.sensing else 1
         return finger, self._rng.standard_normal((n, width)), np.zeros(n, np.int64)
-
-    def closes(self, controller: Controller) -> bool:
-        """Whether `closed_loop` has compiled code for this controller."""
-        return type(getattr(controller, "tables", None)) in STEPS
-
-    def finger_position(self, n: int) -> Array:
-        """Finger positions (m, shape (n,)) of the next n samples, NaN while lifted; the plant does not advance."""
-        return self.finger.position((self._samples + np.arange(n)) / self.rate)
 
     def run(self, drive: Array) -> Sensed:
         """Advance by n samples under `drive` (shape (n, 1)); row i acts from sample i on, sensed at its start."""

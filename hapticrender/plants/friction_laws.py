@@ -123,7 +123,7 @@ class FrictionLaw(Protocol):
         ...
 
 
-class _Law:
+class _Law(Validated):
     """Checks and broadcasts for the kernels above; laws add their numbers."""
 
     _heaviest = math.inf  # N: a law holds below this load
@@ -156,7 +156,7 @@ class _Law:
 
 
 @dataclass(frozen=True, kw_only=True)
-class FitLaw(_Law, Validated):
+class FitLaw(_Law):
     """mu/mu0 = floor + (1 - floor) exp(-(a/scale)^exponent).
 
     Parameters
@@ -190,7 +190,7 @@ class FitLaw(_Law, Validated):
 
 
 @dataclass(frozen=True, kw_only=True)
-class LoadSharing(_Law, Validated):
+class LoadSharing(_Law):
     """Asperities and a squeeze film carry the load together: W/A = pc exp(-u/u0) + 1.25 p0 (a/u)^2.
 
     Parameters
@@ -233,7 +233,7 @@ class LoadSharing(_Law, Validated):
 
 
 @dataclass(frozen=True, kw_only=True)
-class IntermittentContact(_Law, Validated):
+class IntermittentContact(_Law):
     """mu/mu0 = exp(-c mu0 a f/v): a bouncing skin touches for a part of each cycle.
 
     Parameters
@@ -266,7 +266,7 @@ class IntermittentContact(_Law, Validated):
         return LawNumbers(BOUNCE, 0.0, 1.0 / (self.coefficient * self.friction * self.frequency), 1.0, 1.0, 1.0)
 
 
-LAWS = {"fit": FitLaw, "load-sharing": LoadSharing, "intermittent": IntermittentContact}
+LAWS: dict[str, type[_Law]] = {"fit": FitLaw, "load-sharing": LoadSharing, "intermittent": IntermittentContact}
 
 
 def _checked(name: str, value: Any, least: float, most: float, unit: str = "") -> Array:

@@ -25,8 +25,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from hapticrender.control.bandmodel import BandModel
+from hapticrender.plants.base import TouchedPlant
 from hapticrender.plants.bounds import Validated, choice, number
-from hapticrender.plants.closed import STEPS
 from hapticrender.plants.ultrasonic_kernels import (
     STEP,
     UltrasonicState,
@@ -265,7 +265,7 @@ def _grip(normal_load: Array | float) -> Array:
     return np.cbrt(np.maximum(np.asarray(normal_load, float), 0.0) / NOMINAL_LOAD)
 
 
-class UltrasonicPlate:
+class UltrasonicPlate(TouchedPlant):
     """The mode in discrete time, behind the `Plant` protocol.
 
     Parameters
@@ -283,34 +283,24 @@ class UltrasonicPlate:
     def __init__(self, parameters: UltrasonicParameters, finger: Finger, seed: int = 0, block: int = 1) -> None:
         if not 1 <= block <= parameters.delay:
             raise ValueError(f"block = {block}: must be between 1 and the loop's delay of {parameters.delay} samples")
+        super().__init__(finger, parameters.rate)
         self.parameters = parameters
-        self.finger = finger
-        self.rate = float(parameters.rate)
         self.delay = parameters.delay
         self.block = block
         self.drive_channels = self.sensed_channels = 1
         self._rng = np.random.default_rng(seed)
-        self._samples = 0
         self._tables = ultrasonic_tables(parameters)
         self._state = ultrasonic_state(parameters.delay - block)
         self._last = np.zeros(1)
 
     def _next(self, n: int) -> tuple[Array, Array, Array, Array]:
         """Finger rows, mode rows, noise and sample flags of the next n samples."""
-        count = self._samples + np.arange(n)
+        time = self._time(n)
         self._samples += n
-        finger = self.finger.touch(count / self.rate)
+        finger = self.finger.touch(time)
         load = np.where(finger[:, 2] > 0.0, finger[:, 1], 0.0)
         noise = self._rng.standard_normal((n, 1)) if self._tables.sensor_noise > 0.0 else np.zeros((n, 1))
-        return finger, mode_rows(self.parameters, count / self.rate, load), noise, np.zeros(n, np.int64)
-
-    def closes(self, controller: Controller) -> bool:
-        """Whether `closed_loop` has compiled code for this controller."""
-        return type(getattr(controller, "tables", None)) in STEPS
-
-    def finger_position(self, n: int) -> Array:
-        """Finger positions (m, shape (n,)) of the next n samples, NaN while lifted; the plant does not advance."""
-        return self.finger.position((self._samples + np.arange(n)) / self.rate)
+        return finger, mode_rows(self.parameters, time, load), noise, np.zeros(n, np.int64)
 
     def run(self, drive: Array) -> Sensed:
         """Advance by n samples under `drive` (V, shape (n, 1)); row i acts from sample i on, sensed at its start."""

@@ -30,6 +30,7 @@ import numpy as np
 
 from hapticrender.control.bandmodel import BandModel
 from hapticrender.control.damping_margins import BendingMode
+from hapticrender.plants.base import TouchedPlant
 from hapticrender.plants.bounds import Validated, number
 from hapticrender.plants.closed import CLOSED
 from hapticrender.plants.kernels import plate_run
@@ -263,7 +264,7 @@ def _pair(side_1: float, side_2: float) -> Array:
     return np.array([[side_1 + side_2, side_2 - side_1], [side_2 - side_1, side_1 + side_2]])
 
 
-class Plate:
+class Plate(TouchedPlant):
     """The plate in discrete time, behind the `Plant` protocol.
 
     Parameters
@@ -281,32 +282,26 @@ class Plate:
     def __init__(self, parameters: PlateParameters, finger: Finger, seed: int = 0, block: int = 1) -> None:
         if not 1 <= block <= parameters.delay:
             raise ValueError(f"block = {block}: must be between 1 and the loop's delay of {parameters.delay} samples")
+        super().__init__(finger, parameters.rate)
         self.parameters = parameters
-        self.finger = finger
-        self.rate = float(parameters.rate)
         self.delay = parameters.delay
         self.block = block
         self.drive_channels, self.sensed_channels = parameters.coils, 2
         self._rng = np.random.default_rng(seed)
-        self._samples = 0
         self._tables = plate_tables(parameters, finger)
         self._state = plate_state(parameters.delay - block)
         self._last = np.zeros(2)
 
     def _next(self, n: int) -> tuple[Array, Array, Array]:
         """Finger rows, noise and sample flags of the next n samples."""
-        time = (self._samples + np.arange(n)) / self.rate
+        time = self._time(n)
         self._samples += n
         noise = self._rng.standard_normal((n, 2)) if self._tables.sensor_noise > 0.0 else np.zeros((n, 2))
         return self.finger.touch(time), noise, np.zeros(n, np.int64)
 
     def closes(self, controller: Controller) -> bool:
         """Whether `closed_loop` has compiled code for this controller."""
-        return type(getattr(controller, "tables", None)) in CLOSED and self.drive_channels == 2
-
-    def finger_position(self, n: int) -> Array:
-        """Finger positions (m, shape (n,)) of the next n samples, NaN while lifted; the plant does not advance."""
-        return self.finger.position((self._samples + np.arange(n)) / self.rate)
+        return super().closes(controller) and self.drive_channels == 2
 
     def run(self, drive: Array) -> Sensed:
         """Advance by n samples under `drive` (A, shape (n, coils)); row i acts from sample i, sensed at its start."""
