@@ -166,19 +166,12 @@ def _batches(first: Array, values: int) -> Iterator[Array]:
 
 
 def _analyse_chunk(recording: Recording, position: Array, first: Array, size: int) -> tuple[Array, ...]:
-    start, stop = int(first[0]), int(first[-1]) + size
-    bands, rate = recording.bands, recording.rate
-    index = (first - start)[:, None] + np.arange(size)
-    finger = position[start:stop]
-    phase = bands.carrier_phase(np.arange(start, stop) / rate, finger)
-    target = recording.read("target", start, stop)
-    waveform = (target.real * np.cos(phase) - target.imag * np.sin(phase)).sum(axis=1)
-    signals = np.column_stack([waveform, recording.read("motion", start, stop)])[index]
-    envelope, inflation, rest = fit(phase[index], signals)
-    signed = _quarterly(bands, rate, finger[index])
+    envelope, inflation, rest, asked = _fit_windows(recording, position, first, size)
+    signed = _quarterly(recording.bands, recording.rate, position[first[:, None] + np.arange(size)])
     frequency = abs(signed)
     fast = np.all(frequency >= LOWEST_FREQUENCY * (1 - 1e-6), axis=1)
-    asked = (target != 0)[index].all(axis=1)
+    with np.errstate(invalid="ignore", over="ignore", under="ignore"):
+        residual = np.mean(rest**2, axis=1)
     return (
         envelope[:, 0],
         envelope[:, 1:],
@@ -186,8 +179,37 @@ def _analyse_chunk(recording: Recording, position: Array, first: Array, size: in
         asked,
         frequency.mean(axis=1),
         signed.mean(axis=1) < 0.0,
-        _unexplained(rest[..., 1], rest[..., 0], signals[..., 0]),
+        residual,
     )
+
+
+def _fit_windows(recording: Recording, position: Array, first: Array, size: int) -> tuple[Array, ...]:
+    """Fit windows that begin at samples `first`: envelopes, inflation, what is beside the bands, whether all ask."""
+    start, stop = int(first[0]), int(first[-1]) + size
+    index = (first - start)[:, None] + np.arange(size)
+    phase = recording.bands.carrier_phase(np.arange(start, stop) / recording.rate, position[start:stop])
+    target = recording.read("target", start, stop)
+    waveform = (target.real * np.cos(phase) - target.imag * np.sin(phase)).sum(axis=1)
+    signals = np.column_stack([waveform, recording.read("motion", start, stop)])[index]
+    envelope, inflation, rest = fit(phase[index], signals)
+    beside = _unexplained(rest[..., 1], rest[..., 0], signals[..., 0])
+    return envelope, inflation, beside, (target != 0)[index].all(axis=1)
+
+
+def beside_the_bands(recording: Recording) -> Iterator[Array]:
+    """Motion at the first place that is no band's, in batches of the judged windows; see `summary`, `residual_rms`.
+
+    Yields
+    ------
+    ndarray, shape (w, m)
+        In the device's unit, w windows of m samples.
+    """
+    envelopes, rate = recording.envelopes, recording.rate
+    size = round(envelopes.window * rate)
+    late = (envelopes.start >= judged_from(recording) * (1 - 1e-9)) & envelopes.finite
+    first, position = np.rint(envelopes.start[late] * rate).astype(int), recording.position
+    for starts in _batches(first, size * (2 * len(recording.bands) + 2)):
+        yield _fit_windows(recording, position, starts, size)[2]
 
 
 def fit(phase: Array, signals: Array) -> tuple[Array, Array, Array]:
@@ -228,14 +250,14 @@ def fit(phase: Array, signals: Array) -> tuple[Array, Array, Array]:
 
 
 def _unexplained(rest: Array, wanted_rest: Array, wanted: Array) -> Array:
-    """Mean square (shape (w,)) of what is left of a motion, less the multiple of what is left of the wanted waveform.
+    """What is left of a motion (shape (w, m)), less the multiple of what is left of the wanted waveform.
 
     A window in which the target fades holds wanted motion that no constant envelope explains.
     """
     with np.errstate(invalid="ignore", over="ignore", under="ignore"):
         floor = RIDGE * np.mean(wanted**2, axis=1) + np.finfo(float).tiny
-        shared = np.mean(rest * wanted_rest, axis=1) ** 2 / (np.mean(wanted_rest**2, axis=1) + floor)
-        return np.maximum(np.mean(rest**2, axis=1) - shared, 0.0)
+        multiple = np.mean(rest * wanted_rest, axis=1) / (np.mean(wanted_rest**2, axis=1) + floor)
+        return rest - multiple[:, None] * wanted_rest
 
 
 def _quarterly(bands: Bands, rate: float, finger: Array) -> Array:

@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from hapticrender.judge import beside_the_bands
 from hapticrender.protocols import Array
-from hapticrender.touch.perception import VELOCITY_PER_FORCE, sensation_level
+from hapticrender.touch.perception import HIGHEST, VELOCITY_PER_FORCE, sensation_level
 
 if TYPE_CHECKING:
     from hapticrender.recording import Recording
@@ -68,7 +69,10 @@ def felt_bands(recording: Recording) -> list[Felt]:
 
 
 def skin_waveform(recording: Recording, start: float, seconds: float) -> tuple[Array, Array, Array]:
-    """Time (s), wanted and achieved skin velocity (m/s) over a stretch, from the envelopes of the windows around it.
+    """Time (s), wanted and achieved skin velocity (m/s) of the bands over a stretch.
+
+    The achieved one is rebuilt from the envelopes of the windows around: what is beside the bands is not in it,
+    and `residual_velocity` says how large that is.
 
     Parameters
     ----------
@@ -91,3 +95,31 @@ def skin_waveform(recording: Recording, start: float, seconds: float) -> tuple[A
     achieved = np.zeros_like(target) if nearest is None else envelopes.achieved[nearest, 0]
     achieved = achieved / (recording.header.profile or (1.0,))[0]
     return time, (turned * target).real.sum(axis=1), (turned * achieved).real.sum(axis=1)
+
+
+def residual_velocity(recording: Recording, highest: float = HIGHEST) -> float:
+    """Rms skin velocity (m/s) at the first place of what is beside the bands, in the judged time; NaN without any.
+
+    Parameters
+    ----------
+    recording : Recording
+    highest : float, Hz
+        What is faster does not count; by default as far as thresholds are known.
+
+    Notes
+    -----
+    Welch's estimate over the windows of the judge: the spectrum of the residual waveform, Hann-windowed, times
+    `velocity_per_unit` at each frequency (a spectral derivative where the device makes displacement), summed by
+    Parseval.  A window of T adds 1/(6 (f T)^2) to the rms of a tone at f that is differentiated.  It hardly hears the
+    window's edges, where most of an envelope's drift is left, so it can be below the judge's `residual_rms`.
+    """
+    mean_squares = []
+    for rest in beside_the_bands(recording):
+        size = rest.shape[1]
+        window = np.hanning(size)
+        frequency = np.fft.rfftfreq(size, 1 / recording.rate)
+        counted = (frequency > 0) & (frequency <= highest) & (frequency < recording.rate / 2)
+        share = np.abs(velocity_per_unit(recording, frequency[counted]))
+        spectrum = np.abs(np.fft.rfft(rest * window, axis=1)[:, counted])
+        mean_squares.append(2 * ((share * spectrum) ** 2).sum(axis=1) / (size * (window**2).sum()))
+    return math.sqrt(np.concatenate(mean_squares).mean()) if mean_squares else math.nan

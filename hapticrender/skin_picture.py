@@ -8,10 +8,12 @@ from typing import Any
 
 import numpy as np
 
+from hapticrender import wording
 from hapticrender.figures import BLUE, GREEN, INK, ORANGE, RED, new_figure, save
 from hapticrender.picture import QUANTITIES
 from hapticrender.recording import Recording
-from hapticrender.skin import felt_bands, skin_waveform
+from hapticrender.skin import felt_bands, residual_velocity, skin_waveform
+from hapticrender.touch.perception import HIGHEST
 
 COLOURS = (BLUE, ORANGE, GREEN, RED)
 PERIODS = 3.0  # of the lowest band
@@ -31,7 +33,7 @@ def plot_devices(recordings: Mapping[str, Recording], path: str | os.PathLike[st
 
 def draw_devices(recordings: Mapping[str, Recording]) -> Any:
     """Draw into a new ``matplotlib.figure.Figure``; see `plot_devices`."""
-    with new_figure((12.5, 6.6)) as figure:
+    with new_figure((12.5, 6.8)) as figure:
         grid = figure.add_gridspec(2, len(recordings), height_ratios=[1.15, 1])
         first: Any = None
         for i, (device, recording) in enumerate(recordings.items()):
@@ -56,7 +58,7 @@ def _said(texture: Any) -> str:
 
 
 def _waveform(axes: Any, recording: Recording, device: str, colour: str) -> None:
-    """Show a few periods of wanted and achieved skin velocity, late in the run."""
+    """Show a few periods of the bands' wanted and achieved skin velocity, late in the run, and what is beside them."""
     lowest = min(band.frequency for band in felt_bands(recording))
     seconds = PERIODS / lowest
     start = len(recording) / recording.rate - 0.2 - seconds
@@ -66,7 +68,12 @@ def _waveform(axes: Any, recording: Recording, device: str, colour: str) -> None
     axes.plot(milliseconds, 1e3 * achieved, color=colour, lw=2.0, label="achieved")
     axes.plot(milliseconds, 1e3 * wanted, color=INK, lw=1.0, ls=(0, (4, 2)), label="wanted")
     quantity = QUANTITIES.get(recording.header.unit, "motion")
-    axes.set(title=f"{device}, which makes {quantity}", xlabel="time (ms)")
+    axes.set(title=f"{device}, by {quantity}:\nits bands, from their envelopes", xlabel="time (ms)")
+    beside = wording.quantity(residual_velocity(recording), "m/s")
+    axes.text(
+        0.98, 0.02, f"beside them {beside} rms, up to {wording.short(HIGHEST, 'Hz')}",
+        transform=axes.transAxes, ha="right", va="bottom", fontsize=8,
+    )  # fmt: skip
     axes.margins(x=0, y=0.18)
     axes.legend(loc="upper right", ncols=2, borderaxespad=0.1)
 
