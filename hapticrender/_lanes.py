@@ -429,11 +429,12 @@ def put_stretch(typingctx: Any, array: Any, i: Any, j: Any, value: Any) -> Any:
     """Write as many neighbours as there are lanes, array[i, j:], wherever they start; their columns have to exist."""
     if not _is_numbers(array, 2) or array.dtype not in (types.float64, types.float32):
         return None
-    kind = _lane(array)
+    kind = value if isinstance(value, LaneType) else _lane(array)
 
     def build(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         at = _number(context, builder, sig.args[0], *args[:3])
-        builder.store(args[3], builder.bitcast(at, args[3].type.as_pointer()), align=kind.dtype.bitwidth // 8)
+        given = _converted(builder, args[3], _element(array.dtype))
+        builder.store(given, builder.bitcast(at, given.type.as_pointer()), align=array.dtype.bitwidth // 8)
         return context.get_dummy_value()
 
     return types.none(array, types.intp, types.intp, kind), build
@@ -485,6 +486,35 @@ def _converted(builder: Any, value: Any, element: Any) -> Any:
     if kind == value.type:
         return value
     return builder.fpext(value, kind) if element == ir.DoubleType() else builder.fptrunc(value, kind)
+
+
+@intrinsic
+def row_totals(typingctx: Any, array: Any, i: Any, j: Any) -> Any:
+    """Sums of the rows array[i, j], array[i, j + 1] ... side by side, as many rows as there are lanes."""
+    if not _is_rows(array, 2):
+        return None
+
+    def build(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        width, index = sig.return_type.width, ir.VectorType(ir.IntType(32), sig.return_type.width)
+        rows = [
+            _load(context, builder, sig.args[0], args[0], (args[1], builder.add(args[2], ir.IntType(64)(k))), 2)
+            for k in range(width)
+        ]
+        block = 1
+        while len(rows) > 1:  # of two vectors the lanes that belong to the same row, added pair by pair
+            lower = [k + base + b for base in range(0, width, 2 * block) for k in (0, width) for b in range(block)]
+            upper = [at + block for at in lower]
+            rows = [
+                builder.fadd(
+                    builder.shuffle_vector(first, second, ir.Constant(index, lower)),
+                    builder.shuffle_vector(first, second, ir.Constant(index, upper)),
+                )
+                for first, second in zip(rows[::2], rows[1::2], strict=True)
+            ]
+            block *= 2
+        return rows[0]
+
+    return _lane(array)(array, types.intp, types.intp), build
 
 
 @intrinsic

@@ -234,42 +234,54 @@ def refresh(tables, state):
 
 
 @kernel
-def follow_finger(finger, rate, position):
+def follow_finger(rate, held, velocity, gate, seen, position):
     """Hold the position while the finger is away, smooth its velocity, open the gate with contact."""
-    seen = abs(position) <= FAR and not (finger[SEEN] > 0.0 and abs(position - finger[HELD]) * rate > FASTEST)
-    velocity = 0.0
-    if seen:
-        if finger[SEEN] > 0.0:
-            velocity = (position - finger[HELD]) * rate
-        finger[HELD] = position
-    finger[SEEN] = 1.0 if seen else 0.0
-    finger[VELOCITY] += (1.0 - math.exp(-TURN * VELOCITY_POLE / rate)) * (velocity - finger[VELOCITY])
+    now = abs(position) <= FAR and not (seen > 0.0 and abs(position - held) * rate > FASTEST)
+    speed = (position - held) * rate if now and seen > 0.0 else 0.0
+    velocity += (1.0 - math.exp(-TURN * VELOCITY_POLE / rate)) * (speed - velocity)
     ramp = 1.0 / (GATE_TIME * rate)
-    finger[GATE] = min(finger[GATE] + ramp, 1.0) if seen else max(finger[GATE] - ramp, 0.0)
+    gate = min(gate + ramp, 1.0) if now else max(gate - ramp, 0.0)
+    return position if now else held, velocity, gate, 1.0 if now else 0.0
 
 
 @kernel
-def share(tables, state, m, sensed, position, wanted):
-    """Write down what all tiles are told of a sample; what no sensor can show counts as zero.  Returns flags."""
-    numbers, shared, flags = tables.numbers, state.shared, 0
+def share(tables, state, m, sensed, position, wanted, known):
+    """Write down what all tiles are told of a sample; what no sensor can show counts as zero.
+
+    `known` is what is known of finger and sensors, see `recall`.  Returns flags and what is known now.
+    """
+    numbers, shared, bad = tables.numbers, state.shared, False
     for c in range(tables.listen.shape[0]):
         y = 0.0
         for s in range(sensed.shape[0]):
             if abs(sensed[s]) <= numbers.sensed_limit:
                 y += tables.listen[c, s] * sensed[s]
             else:  # NaN included
-                flags = 2
+                bad = True
         shared[SHARED_ROWS + c, m] = y
-    step = 1.0 / (DOUBT_TIME * numbers.rate)
-    state.doubt[0] = min(state.doubt[0] + step, 1.0) if flags else max(state.doubt[0] - step, 0.0)
-    shared[TRUST, m] = 1.0 - state.doubt[0]
+    held, velocity, gate, seen, doubt = known
+    if bad or doubt > 0.0:
+        step = 1.0 / (DOUBT_TIME * numbers.rate)
+        doubt = min(doubt + step, 1.0) if bad else max(doubt - step, 0.0)
     sane = abs(wanted) <= FAR
-    shared[WANTED, m] = wanted if sane else 0.0
-    far = abs(position) > FAR
-    follow_finger(state.finger, numbers.rate, math.nan if far else position)
-    shared[PLACE, m], shared[SPEED, m] = state.finger[HELD], state.finger[VELOCITY]
-    shared[OPENING, m] = state.finger[GATE]
-    return flags if sane and not far else 2
+    held, velocity, gate, seen = follow_finger(numbers.rate, held, velocity, gate, seen, position)
+    shared[WANTED, m], shared[TRUST, m] = wanted if sane else 0.0, 1.0 - doubt
+    shared[PLACE, m], shared[SPEED, m], shared[OPENING, m] = held, velocity, gate
+    return 2 if bad or not sane or abs(position) > FAR else 0, (held, velocity, gate, seen, doubt)
+
+
+@kernel
+def recall(state):
+    """What is known of finger and sensors: held position (m), velocity (m/s), gate, whether it was seen; doubt."""
+    finger = state.finger
+    return finger[HELD], finger[VELOCITY], finger[GATE], finger[SEEN], state.doubt[0]
+
+
+@kernel
+def remember(state, known):
+    """Keep what is known until the next block."""
+    finger = state.finger
+    finger[HELD], finger[VELOCITY], finger[GATE], finger[SEEN], state.doubt[0] = known
 
 
 @kernel
@@ -431,17 +443,15 @@ def tile_step(tables, state, t, m, target):
 
 
 @kernel
-def gather(state, count):
+def gather(state):
     """Sum the drive of each coordinate over the lanes, as far as it is trusted, and clear the sums for the next."""
     shared, coordinates = state.shared, state.sum.shape[0]
     for c in range(0, coordinates, 2):
         d = min(c + 1, coordinates - 1)
-        for m in range(count):
-            one, other = totals(1.0, lanes(state.sum, c, m), lanes(state.sum, d, m))
-            shared[SHARED_ROWS + c, m] = shared[TRUST, m] * one
-            shared[SHARED_ROWS + d, m] = shared[TRUST, m] * other
-            put(state.sum, c, m, 0.0 * lanes(state.band, 0, LIVE))
-            put(state.sum, d, m, 0.0 * lanes(state.band, 0, LIVE))
+        one, other = totals(1.0, lanes(state.sum, c, 0), lanes(state.sum, d, 0))
+        shared[SHARED_ROWS + c, 0], shared[SHARED_ROWS + d, 0] = shared[TRUST, 0] * one, shared[TRUST, 0] * other
+        put(state.sum, c, 0, 0.0 * lanes(state.band, 0, LIVE))
+        put(state.sum, d, 0, 0.0 * lanes(state.band, 0, LIVE))
 
 
 @kernel
@@ -449,8 +459,8 @@ def speak(tables, state, m, drive):
     """Drive of the channels from that of the coordinates, each cut to its limit.  Returns flags."""
     limit, flags = tables.numbers.drive_limit, 0
     for i in range(drive.shape[0]):
-        asked = 0.0
-        for c in range(tables.listen.shape[0]):
+        asked = tables.speak[i, 0] * state.shared[SHARED_ROWS, m]
+        for c in range(1, tables.listen.shape[0]):
             asked += tables.speak[i, c] * state.shared[SHARED_ROWS + c, m]
         drive[i] = min(max(asked, -limit), limit)
         if drive[i] != asked:
@@ -463,9 +473,10 @@ def polar_step(tables, state, sensed, position, wanted, drive, target):
     """One sample of the whole controller: fills `drive` (channels,) and `target` (bands,), returns flags."""
     if state.sample[0] % REFRESH == 0:
         refresh(tables, state)
-    flags = share(tables, state, 0, sensed, position, wanted)
+    flags, known = share(tables, state, 0, sensed, position, wanted, recall(state))
+    remember(state, known)
     for t in range(state.band.shape[0]):
         tile_step(tables, state, t, 0, target)
     state.sample[0] += 1
-    gather(state, 1)
+    gather(state)
     return flags | speak(tables, state, 0, drive)

@@ -8,7 +8,7 @@ the processor works on many samples at once.  The arithmetic is that of `polar_k
 from __future__ import annotations
 
 from hapticrender._jit import kernel
-from hapticrender._lanes import lanes, put, put_pairs, select
+from hapticrender._lanes import lanes, put, put_pairs, put_stretch, row_totals, select, taken
 from hapticrender._polynomials import cosine, polar
 from hapticrender.control.kernels import QUIET, TURN
 from hapticrender.control.polar_kernels import (
@@ -18,6 +18,7 @@ from hapticrender.control.polar_kernels import (
     DRIVE,
     FORWARD,
     FREQUENCY,
+    LIVE,
     LOOP_ROWS,
     RE1,
     REFRESH,
@@ -32,12 +33,12 @@ from hapticrender.control.polar_kernels import (
     X_IM,
     X_RE,
     clamped_step,
-    gather,
     law_step,
+    recall,
     refresh,
+    remember,
     section_step,
     share,
-    speak,
     tile_step,
 )
 
@@ -165,6 +166,44 @@ def usual(tables, state, count):
 
 
 @kernel
+def share_all(tables, state, sensed, position, wanted, flags, n, count):
+    """Write down what all tiles are told of `count` samples from n on."""
+    known = recall(state)
+    for m in range(count):
+        flags[n + m], known = share(tables, state, m, sensed[n + m], position[n + m], wanted[n + m], known)
+    remember(state, known)
+
+
+@kernel
+def gather_all(state, count):
+    """Sum the drive of each coordinate over the lanes, as far as it is trusted, and clear the sums for the next."""
+    sums, shared, nothing = state.sum, state.shared, 0.0 * lanes(state.band, 0, LIVE)
+    for c in range(sums.shape[0]):
+        for m in range(0, count, sums.shape[2]):
+            put_stretch(shared, SHARED_ROWS + c, m, taken(shared, TRUST, m, nothing) * row_totals(sums, c, m))
+        for m in range(count):
+            put(sums, c, m, nothing)
+
+
+@kernel
+def speak_all(tables, state, drive, flags, n, count):
+    """Drive of the channels from that of the coordinates, each cut to its limit."""
+    shared, limit, coordinates = state.shared, tables.numbers.drive_limit, tables.listen.shape[0]
+    for i in range(drive.shape[1]):
+        first, second = tables.speak[i, 0], tables.speak[i, 1] if coordinates > 1 else 0.0
+        for m in range(count):
+            asked = first * shared[SHARED_ROWS, m]
+            if coordinates > 1:
+                asked += second * shared[SHARED_ROWS + 1, m]
+            for c in range(2, coordinates):
+                asked += tables.speak[i, c] * shared[SHARED_ROWS + c, m]
+            cut = min(max(asked, -limit), limit)
+            drive[n + m, i] = cut
+            if cut != asked:
+                flags[n + m] |= 1
+
+
+@kernel
 def polar_run(tables, state, sensed, position, wanted, drive, target, flags):
     """Samples one after another, tile by tile between two looks at the tones.
 
@@ -175,8 +214,7 @@ def polar_run(tables, state, sensed, position, wanted, drive, target, flags):
         if state.sample[0] % REFRESH == 0:
             refresh(tables, state)
         count = min(REFRESH - state.sample[0] % REFRESH, sensed.shape[0] - n)
-        for m in range(count):
-            flags[n + m] = share(tables, state, m, sensed[n + m], position[n + m], wanted[n + m])
+        share_all(tables, state, sensed, position, wanted, flags, n, count)
         passes = usual(tables, state, count)
         if passes:
             tell(tables, state, count)
@@ -187,7 +225,6 @@ def polar_run(tables, state, sensed, position, wanted, drive, target, flags):
                 for m in range(count):
                     tile_step(tables, state, t, m, target[n + m if target.shape[0] > 1 else 0])
         state.sample[0] += count
-        gather(state, count)
-        for m in range(count):
-            flags[n + m] |= speak(tables, state, m, drive[n + m])
+        gather_all(state, count)
+        speak_all(tables, state, drive, flags, n, count)
         n += count
