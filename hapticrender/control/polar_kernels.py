@@ -245,20 +245,37 @@ def follow_finger(rate, held, velocity, gate, seen, position):
 
 
 @kernel
+def heard(tables, c, sensed):
+    """What coordinate c hears; two sensors are the usual case, and a loop over them costs more than what it does."""
+    limit, last = tables.numbers.sensed_limit, sensed.shape[0] - 1
+    y = tables.listen[c, 0] * (sensed[0] if abs(sensed[0]) <= limit else 0.0)
+    for s in range(1, last):
+        y += tables.listen[c, s] * (sensed[s] if abs(sensed[s]) <= limit else 0.0)
+    if last > 0:
+        y += tables.listen[c, last] * (sensed[last] if abs(sensed[last]) <= limit else 0.0)
+    return y
+
+
+@kernel
+def shown(sensed, limit):
+    """Whether sensors can show what they tell; NaN is not shown."""
+    last = sensed.shape[0] - 1
+    fits = (abs(sensed[0]) <= limit) & (abs(sensed[last]) <= limit)
+    for s in range(1, last):
+        fits = fits & (abs(sensed[s]) <= limit)
+    return fits
+
+
+@kernel
 def share(tables, state, m, sensed, position, wanted, known):
     """Write down what all tiles are told of a sample; what no sensor can show counts as zero.
 
     `known` is what is known of finger and sensors, see `recall`.  Returns flags and what is known now.
     """
-    numbers, shared, bad = tables.numbers, state.shared, False
+    numbers, shared = tables.numbers, state.shared
     for c in range(tables.listen.shape[0]):
-        y = 0.0
-        for s in range(sensed.shape[0]):
-            if abs(sensed[s]) <= numbers.sensed_limit:
-                y += tables.listen[c, s] * sensed[s]
-            else:  # NaN included
-                bad = True
-        shared[SHARED_ROWS + c, m] = y
+        shared[SHARED_ROWS + c, m] = heard(tables, c, sensed)
+    bad = not shown(sensed, numbers.sensed_limit)
     held, velocity, gate, seen, doubt = known
     if bad or doubt > 0.0:
         step = 1.0 / (DOUBT_TIME * numbers.rate)
