@@ -14,7 +14,7 @@ import math
 from typing import NamedTuple
 
 from hapticrender._jit import kernel
-from hapticrender._lanes import any_of, high, lanes, low, put, put_pairs, root, select, size, taken, totals
+from hapticrender._lanes import any_of, high, lanes, low, put, put_pairs, root, select, size, taken
 from hapticrender._polynomials import polar, unit
 from hapticrender.control.bank_carriers import count_turns
 from hapticrender.control.kernels import (
@@ -457,43 +457,3 @@ def tile_step(tables, state, t, m, target):
         u, v = unit((1.0 / TURN) * theta)
         carried = (h_re * u - h_im * v) * cos - (h_re * v + h_im * u) * sin
         put(state.sum, c, m, lanes(state.sum, c, m) + command * lanes(loop, t, base + DRIVE) * carried)
-
-
-@kernel
-def gather(state):
-    """Sum the drive of each coordinate over the lanes, as far as it is trusted, and clear the sums for the next."""
-    shared, coordinates = state.shared, state.sum.shape[0]
-    for c in range(0, coordinates, 2):
-        d = min(c + 1, coordinates - 1)
-        one, other = totals(1.0, lanes(state.sum, c, 0), lanes(state.sum, d, 0))
-        shared[SHARED_ROWS + c, 0], shared[SHARED_ROWS + d, 0] = shared[TRUST, 0] * one, shared[TRUST, 0] * other
-        put(state.sum, c, 0, 0.0 * lanes(state.band, 0, LIVE))
-        put(state.sum, d, 0, 0.0 * lanes(state.band, 0, LIVE))
-
-
-@kernel
-def speak(tables, state, m, drive):
-    """Drive of the channels from that of the coordinates, each cut to its limit.  Returns flags."""
-    limit, flags = tables.numbers.drive_limit, 0
-    for i in range(drive.shape[0]):
-        asked = tables.speak[i, 0] * state.shared[SHARED_ROWS, m]
-        for c in range(1, tables.listen.shape[0]):
-            asked += tables.speak[i, c] * state.shared[SHARED_ROWS + c, m]
-        drive[i] = min(max(asked, -limit), limit)
-        if drive[i] != asked:
-            flags = 1
-    return flags
-
-
-@kernel
-def polar_step(tables, state, sensed, position, wanted, drive, target):
-    """One sample of the whole controller: fills `drive` (channels,) and `target` (bands,), returns flags."""
-    if state.sample[0] % REFRESH == 0:
-        refresh(tables, state)
-    flags, known = share(tables, state, 0, sensed, position, wanted, recall(state))
-    remember(state, known)
-    for t in range(state.band.shape[0]):
-        tile_step(tables, state, t, 0, target)
-    state.sample[0] += 1
-    gather(state)
-    return flags | speak(tables, state, 0, drive)

@@ -41,6 +41,7 @@ from hapticrender.control.polar_kernels import (
     share,
     tile_step,
 )
+from hapticrender.control.polar_steps import usual
 
 # rows of PolarState.told, one column a sample: samples since the refresh; then, two a coordinate, b0 of the low pass
 # times twice what it hears, and four times that
@@ -153,16 +154,6 @@ def tile_block(tables, state, t, count, n, target):
         hear(tables, state, t, count, c, d)
         compare(state, t, count, c, d)
         decide(tables, state, t, count, c, d)
-
-
-@kernel
-def usual(tables, state, count):
-    """Whether the passes can do a block: two coordinates at most, constant targets, and every sensor believed."""
-    numbers = tables.numbers
-    fit = numbers.feedback and not numbers.analysed and not numbers.subtract and state.window.shape[0] == 0
-    for m in range(count):
-        fit = fit and state.shared[TRUST, m] == 1.0
-    return fit and tables.listen.shape[0] <= 2
 
 
 @kernel
