@@ -141,7 +141,9 @@ def _cosine(turns):  # type: ignore[no-untyped-def]
     def long(turns):  # type: ignore[no-untyped-def]
         x = turns - nearest(turns)
         u = x * x
-        return W[0] + u * (W[1] + u * (W[2] + u * (W[3] + u * (W[4] + u * (W[5] + u * (W[6] + u * W[7]))))))
+        u2 = u * u
+        late = (W[4] + W[5] * u) + (W[6] + W[7] * u) * u2
+        return (W[0] + W[1] * u) + u2 * ((W[2] + W[3] * u) + u2 * late)
 
     def short(turns):  # type: ignore[no-untyped-def]
         x = turns - nearest(turns)
@@ -161,8 +163,9 @@ def _polar(im, re):  # type: ignore[no-untyped-def]
         x = larger + EIGHTH * smaller
         t = (smaller - EIGHTH * larger) / x
         u = t * t
-        r = x * (R[0] + u * (R[1] + u * (R[2] + u * (R[3] + u * (R[4] + u * R[5])))))
-        p = 0.25 * HALF_PI + t * (A[0] + u * (A[1] + u * (A[2] + u * (A[3] + u * (A[4] + u * A[5])))))
+        u2 = u * u
+        r = x * ((R[0] + R[1] * u) + u2 * ((R[2] + R[3] * u) + u2 * (R[4] + R[5] * u)))
+        p = 0.25 * HALF_PI + t * ((A[0] + A[1] * u) + u2 * ((A[2] + A[3] * u) + u2 * (A[4] + A[5] * u)))
         p = signed(select(across > along, HALF_PI - p, p), im)
         return r, select(re < 0.0, -2.0 * HALF_PI - p, p)
 
