@@ -245,24 +245,22 @@ def follow_finger(rate, held, velocity, gate, seen, position):
 
 
 @kernel
-def heard(tables, c, sensed):
-    """What coordinate c hears; two sensors are the usual case, and a loop over them costs more than what it does."""
-    limit, last = tables.numbers.sensed_limit, sensed.shape[0] - 1
-    y = tables.listen[c, 0] * (sensed[0] if abs(sensed[0]) <= limit else 0.0)
-    for s in range(1, last):
-        y += tables.listen[c, s] * (sensed[s] if abs(sensed[s]) <= limit else 0.0)
-    if last > 0:
-        y += tables.listen[c, last] * (sensed[last] if abs(sensed[last]) <= limit else 0.0)
-    return y
+def hearing(tables, shared, m, sensed):
+    """What the coordinates hear; a sensor beyond its limit counts as zero.  Returns whether all are inside.
 
-
-@kernel
-def shown(sensed, limit):
-    """Whether sensors can show what they tell; NaN is not shown."""
-    last = sensed.shape[0] - 1
-    fits = (abs(sensed[0]) <= limit) & (abs(sensed[last]) <= limit)
+    Two sensors are the usual case, and a loop over them costs more than what it does.
+    """
+    listen, limit, last = tables.listen, tables.numbers.sensed_limit, sensed.shape[0] - 1
+    fits = (abs(sensed[0]) <= limit) & (abs(sensed[last]) <= limit)  # NaN does not
+    first = sensed[0] if abs(sensed[0]) <= limit else 0.0
+    second = sensed[last] if abs(sensed[last]) <= limit and last > 0 else 0.0
     for s in range(1, last):
         fits = fits & (abs(sensed[s]) <= limit)
+    for c in range(listen.shape[0]):
+        y = listen[c, 0] * first + listen[c, last] * second
+        for s in range(1, last):
+            y += listen[c, s] * (sensed[s] if abs(sensed[s]) <= limit else 0.0)
+        shared[SHARED_ROWS + c, m] = y
     return fits
 
 
@@ -273,9 +271,7 @@ def share(tables, state, m, sensed, position, wanted, known):
     `known` is what is known of finger and sensors, see `recall`.  Returns flags and what is known now.
     """
     numbers, shared = tables.numbers, state.shared
-    for c in range(tables.listen.shape[0]):
-        shared[SHARED_ROWS + c, m] = heard(tables, c, sensed)
-    bad = not shown(sensed, numbers.sensed_limit)
+    bad = not hearing(tables, shared, m, sensed)
     held, velocity, gate, seen, doubt = known
     if bad or doubt > 0.0:
         step = 1.0 / (DOUBT_TIME * numbers.rate)
