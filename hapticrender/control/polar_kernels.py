@@ -245,42 +245,27 @@ def follow_finger(rate, held, velocity, gate, seen, position):
 
 
 @kernel
-def hearing(tables, shared, m, sensed):
-    """What the coordinates hear; a sensor beyond its limit counts as zero.  Returns whether all are inside.
-
-    Two sensors are the usual case, and a loop over them costs more than what it does.
-    """
-    listen, limit, last = tables.listen, tables.numbers.sensed_limit, sensed.shape[0] - 1
-    fits = (abs(sensed[0]) <= limit) & (abs(sensed[last]) <= limit)  # NaN does not
-    first = sensed[0] if abs(sensed[0]) <= limit else 0.0
-    second = sensed[last] if abs(sensed[last]) <= limit and last > 0 else 0.0
-    for s in range(1, last):
-        fits = fits & (abs(sensed[s]) <= limit)
-    for c in range(listen.shape[0]):
-        y = listen[c, 0] * first + listen[c, last] * second
-        for s in range(1, last):
-            y += listen[c, s] * (sensed[s] if abs(sensed[s]) <= limit else 0.0)
-        shared[SHARED_ROWS + c, m] = y
-    return fits
+def believed(value, limit):
+    """What a sensor tells, or zero where it cannot show that."""
+    return value if abs(value) <= limit else 0.0
 
 
 @kernel
-def share(tables, state, m, sensed, position, wanted, known):
-    """Write down what all tiles are told of a sample; what no sensor can show counts as zero.
+def share(tables, state, m, fits, position, wanted, known):
+    """Write down what else all tiles are told of a sample, whose sensors are inside their limits or not.
 
     `known` is what is known of finger and sensors, see `recall`.  Returns flags and what is known now.
     """
     numbers, shared = tables.numbers, state.shared
-    bad = not hearing(tables, shared, m, sensed)
     held, velocity, gate, seen, doubt = known
-    if bad or doubt > 0.0:
+    if not fits or doubt > 0.0:
         step = 1.0 / (DOUBT_TIME * numbers.rate)
-        doubt = min(doubt + step, 1.0) if bad else max(doubt - step, 0.0)
+        doubt = max(doubt - step, 0.0) if fits else min(doubt + step, 1.0)
     sane = abs(wanted) <= FAR
     held, velocity, gate, seen = follow_finger(numbers.rate, held, velocity, gate, seen, position)
     shared[WANTED, m], shared[TRUST, m] = wanted if sane else 0.0, 1.0 - doubt
     shared[PLACE, m], shared[SPEED, m], shared[OPENING, m] = held, velocity, gate
-    return 2 if bad or not sane or abs(position) > FAR else 0, (held, velocity, gate, seen, doubt)
+    return 0 if fits and sane and not abs(position) > FAR else 2, (held, velocity, gate, seen, doubt)
 
 
 @kernel

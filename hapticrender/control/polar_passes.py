@@ -32,6 +32,7 @@ from hapticrender.control.polar_kernels import (
     TURN_SIN,
     X_IM,
     X_RE,
+    believed,
     clamped_step,
     law_step,
     recall,
@@ -157,11 +158,30 @@ def tile_block(tables, state, t, count, n, target):
 
 
 @kernel
+def sense_all(tables, state, sensed, flags, n, count):
+    """What the coordinates hear in `count` samples from n on; flags where a sensor is beyond its limit (NaN is)."""
+    listen, limit, last = tables.listen, tables.numbers.sensed_limit, sensed.shape[1] - 1
+    for m in range(count):
+        flags[n + m] = 0 if (abs(sensed[n + m, 0]) <= limit) & (abs(sensed[n + m, last]) <= limit) else 2
+    for c in range(listen.shape[0]):
+        first, second, row = listen[c, 0], listen[c, last] if last > 0 else 0.0, SHARED_ROWS + c
+        for m in range(count):
+            one, other = believed(sensed[n + m, 0], limit), believed(sensed[n + m, last], limit)
+            state.shared[row, m] = first * one + second * other
+    for s in range(1, last):
+        for m in range(count):
+            flags[n + m] |= 0 if abs(sensed[n + m, s]) <= limit else 2
+            for c in range(listen.shape[0]):
+                state.shared[SHARED_ROWS + c, m] += listen[c, s] * believed(sensed[n + m, s], limit)
+
+
+@kernel
 def share_all(tables, state, sensed, position, wanted, flags, n, count):
     """Write down what all tiles are told of `count` samples from n on."""
     known = recall(state)
+    sense_all(tables, state, sensed, flags, n, count)
     for m in range(count):
-        flags[n + m], known = share(tables, state, m, sensed[n + m], position[n + m], wanted[n + m], known)
+        flags[n + m], known = share(tables, state, m, flags[n + m] == 0, position[n + m], wanted[n + m], known)
     remember(state, known)
 
 

@@ -32,6 +32,7 @@ from hapticrender.control.polar_kernels import (
     TURN_SIN,
     X_IM,
     X_RE,
+    believed,
     clamped_step,
     law_step,
     recall,
@@ -41,6 +42,25 @@ from hapticrender.control.polar_kernels import (
     share,
     tile_step,
 )
+
+
+@kernel
+def hearing(tables, shared, m, sensed):
+    """What the coordinates hear; a sensor beyond its limit counts as zero.  Returns whether all are inside.
+
+    Two sensors are the usual case, and a loop over them costs more than what it does.
+    """
+    listen, limit, last = tables.listen, tables.numbers.sensed_limit, sensed.shape[0] - 1
+    fits = (abs(sensed[0]) <= limit) & (abs(sensed[last]) <= limit)  # NaN does not
+    first, second = believed(sensed[0], limit), believed(sensed[last], limit) if last > 0 else 0.0
+    for s in range(1, last):
+        fits = fits & (abs(sensed[s]) <= limit)
+    for c in range(listen.shape[0]):
+        y = listen[c, 0] * first + listen[c, last] * second
+        for s in range(1, last):
+            y += listen[c, s] * believed(sensed[s], limit)
+        shared[SHARED_ROWS + c, m] = y
+    return fits
 
 
 @kernel
@@ -134,7 +154,8 @@ def polar_step(tables, state, sensed, position, wanted, drive, target):
     """One sample of the whole controller: fills `drive` (channels,) and `target` (bands,), returns flags."""
     if state.sample[0] % REFRESH == 0:
         refresh(tables, state)
-    flags, known = share(tables, state, 0, sensed, position, wanted, recall(state))
+    fits = hearing(tables, state.shared, 0, sensed)
+    flags, known = share(tables, state, 0, fits, position, wanted, recall(state))
     remember(state, known)
     plain = usual(tables, state, 1)
     for t in range(state.band.shape[0]):
