@@ -214,9 +214,30 @@ def floor(typingctx: Any, a: Any) -> Any:
 
 
 @intrinsic
-def nearest(typingctx: Any, a: Any) -> Any:
-    """Nearest whole number, halves to even, as a float."""
-    return _elementwise(lambda builder, a: _call(builder, "llvm.rint", a))(typingctx, a)
+def fraction(typingctx: Any, a: Any) -> Any:
+    """What is left of a after taking away its nearest whole number, halves to even: within 1/2 of zero."""
+    kind = _common((a,))
+    if kind is None:
+        return None
+
+    def build(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        (value,) = args
+        if isinstance(kind, LaneType) and "+avx512dq" in context.codegen().magic_tuple()[2].split(","):
+            return _reduced(builder, value)
+        return builder.fsub(value, _call(builder, "llvm.rint", value))
+
+    return kind(kind), build
+
+
+def _reduced(builder: Any, value: Any) -> Any:
+    """`fraction` by the one instruction that AVX-512 has for it."""
+    kind = value.type
+    element, mask, number = "pd" if kind.element == ir.DoubleType() else "ps", ir.IntType(kind.count), ir.IntType(32)
+    function = builder.module.declare_intrinsic(
+        f"llvm.x86.avx512.mask.reduce.{element}.512", (), ir.FunctionType(kind, [kind, number, kind, mask, number])
+    )
+    quiet, as_set = number(8), number(4)
+    return builder.call(function, [value, quiet, ir.Constant(kind, ir.Undefined), mask(-1), as_set])
 
 
 @intrinsic

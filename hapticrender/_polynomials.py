@@ -16,7 +16,7 @@ from numba.core import types
 from numba.extending import overload
 
 from hapticrender._jit import OPTIONS
-from hapticrender._lanes import LaneType, high, low, nearest, select, signed, size
+from hapticrender._lanes import LaneType, fraction, high, low, select, signed, size
 
 S = (
     6.283185307179585,
@@ -115,7 +115,7 @@ def _whole(value, factor):  # type: ignore[no-untyped-def]
 @overload(unit, jit_options=OPTIONS)
 def _unit(turns):  # type: ignore[no-untyped-def]
     def long(turns):  # type: ignore[no-untyped-def]
-        x = turns - nearest(turns)
+        x = fraction(turns)
         far = size(x) > 0.25
         x = select(far, select(x > 0.0, 0.5, -0.5) - x, x)
         u = x * x
@@ -125,7 +125,7 @@ def _unit(turns):  # type: ignore[no-untyped-def]
         return select(far, -c, c), s * x
 
     def short(turns):  # type: ignore[no-untyped-def]
-        x = turns - nearest(turns)
+        x = fraction(turns)
         far = size(x) > 0.25
         x = select(far, select(x > 0.0, 0.5, -0.5) - x, x)
         u = x * x
@@ -139,14 +139,14 @@ def _unit(turns):  # type: ignore[no-untyped-def]
 @overload(cosine, jit_options=OPTIONS)
 def _cosine(turns):  # type: ignore[no-untyped-def]
     def long(turns):  # type: ignore[no-untyped-def]
-        x = turns - nearest(turns)
+        x = fraction(turns)
         u = x * x
         u2 = u * u
         late = (W[4] + W[5] * u) + (W[6] + W[7] * u) * u2
         return (W[0] + W[1] * u) + u2 * ((W[2] + W[3] * u) + u2 * late)
 
     def short(turns):  # type: ignore[no-untyped-def]
-        x = turns - nearest(turns)
+        x = fraction(turns)
         u = x * x
         w = W_SHORT[2] + u * (W_SHORT[3] + u * (W_SHORT[4] + u * W_SHORT[5]))
         return W_SHORT[0] + u * (W_SHORT[1] + u * w)
