@@ -209,6 +209,9 @@ def take_tones(tables, state, t):
         for i in range(count):
             band[t, LIVE, i], band[t, FREQUENCY, i] = 1.0, tone[0, start + i]
             look_up(tables, state, t, i, tone[0, start + i])
+        cos, sin = unit(1.0 / tables.numbers.rate * lanes(band, t, FREQUENCY))
+        put(band, t, TURN_COS, cos)
+        put(band, t, TURN_SIN, sin)
 
 
 @kernel
@@ -228,9 +231,6 @@ def refresh(tables, state):
             put(band, t, COS, live * (cos * re - sin * im))
             put(band, t, SIN, live * (sin * re + cos * im))
             put(band, t, START, turns + (1.0 / TURN) * polar(im, re)[1])
-            cos, sin = unit(1.0 / numbers.rate * lanes(band, t, FREQUENCY))
-            put(band, t, TURN_COS, cos)
-            put(band, t, TURN_SIN, sin)
 
 
 @kernel
