@@ -4,7 +4,8 @@ Coefficients interpolate at Chebyshev nodes: in x^2 of sin(2 pi x)/x and cos(2 p
 for |x| <= 1/2; and in t^2 of atan(t)/t and sqrt(1 + t^2) for |t| <= tan(pi/8), to which an octant shrinks when it is
 turned back by half of it: its singularity at t = +-j is then so far away that a term is worth 1.4 digits, not 0.77.
 The degree goes with the type: sine and cosine are good to 2.2e-15 in double and 2e-7 in single precision, the shorter
-cosine to 1.2e-10 and 1.5e-6, the angle to 2.3e-10 and 6.6e-7 rad, the magnitude to 1.8e-10 and 4e-7 of itself.
+cosine to 1.2e-10 and 1.5e-6, the angle to 2.3e-10 and 7.3e-6 rad, the magnitude to 1.8e-10 and 8.7e-6 of itself: no
+sensor of these envelopes is that good, and a term more of each costs 3 % of the paper's controller.
 """
 
 from __future__ import annotations
@@ -48,7 +49,7 @@ A = (
     0.10569828793087244,
     -0.060263052137509994,
 )
-A_SHORT = (0.9999994231681626, -0.3332252809249713, 0.19677712909074255, -0.11100372207499867)
+A_SHORT = (0.9999813450979946, -0.3313618483144449, 0.16806253719203817)
 R = (
     0.9238795326722804,
     0.4619396985700442,
@@ -57,7 +58,7 @@ R = (
     -0.034713385758947064,
     0.01753980290023211,
 )
-R_SHORT = (0.9238797270942334, 0.4619033406484334, -0.11440223396879279, 0.04713273128841577)
+R_SHORT = (0.9238873553347188, 0.4611142601786392, -0.10222220273104511)
 W = (
     0.999999999884617,
     -19.739208743087502,
@@ -176,8 +177,8 @@ def _polar(im, re):  # type: ignore[no-untyped-def]
         x = larger + EIGHTH * smaller
         t = (smaller - EIGHTH * larger) / x
         u = t * t
-        r = x * (R_SHORT[0] + u * (R_SHORT[1] + u * (R_SHORT[2] + u * R_SHORT[3])))
-        p = 0.25 * HALF_PI + t * (A_SHORT[0] + u * (A_SHORT[1] + u * (A_SHORT[2] + u * A_SHORT[3])))
+        r = x * (R_SHORT[0] + u * (R_SHORT[1] + u * R_SHORT[2]))
+        p = 0.25 * HALF_PI + t * (A_SHORT[0] + u * (A_SHORT[1] + u * A_SHORT[2]))
         p = signed(select(across > along, HALF_PI - p, p), im)
         return r, select(re < 0.0, -2.0 * HALF_PI - p, p)
 
