@@ -44,8 +44,8 @@ from hapticrender.control.polar_kernels import (
 )
 from hapticrender.control.polar_steps import usual
 
-# rows of PolarState.told, one column a sample: samples since the refresh; then, two a coordinate, b0 of the low pass
-# times twice what it hears, and four times that
+# rows of PolarState.told, one column a sample: whole numbers from 0; then, two a coordinate, b0 of the low pass times
+# twice what it hears, and four times that
 NUMBER, TOLD = range(2)
 TOLD_ROWS = 1  # and two a coordinate
 # rows of PolarState.scratch: phase of what is wanted (turns); then, two a coordinate, its envelope, which becomes what
@@ -57,13 +57,12 @@ SCRATCH_ROWS = 1  # and two a coordinate
 @kernel
 def tell(tables, state, count):
     """What the passes are told of every sample, in the precision of the bands."""
-    first, told, shared = state.sample[0] % REFRESH, state.told, state.shared
-    for m in range(count):
-        told[NUMBER, m] = first + m
+    like, twice = lanes(state.band, 0, LIVE), 2.0 * tables.numbers.filter[0]
     for c in range(tables.listen.shape[0]):
-        for m in range(count):
-            gain = 2.0 * tables.numbers.filter[0] * shared[SHARED_ROWS + c, m]
-            told[TOLD + 2 * c, m], told[TOLD + 2 * c + 1, m] = gain, 4.0 * gain
+        for m in range(0, count, state.band.shape[2]):
+            gain = twice * taken(state.shared, SHARED_ROWS + c, m, like)
+            put_stretch(state.told, TOLD + 2 * c, m, gain)
+            put_stretch(state.told, TOLD + 2 * c + 1, m, 4.0 * gain)
 
 
 @kernel
@@ -80,7 +79,7 @@ def hear(tables, state, t, count, c, d):
     for m in range(count):
         if begun + m > 0:
             cos, sin = cos * turn_cos - sin * turn_sin, sin * turn_cos + cos * turn_sin
-        put(scratch, WISH, m, start + told[NUMBER, m] * step)
+        put(scratch, WISH, m, start + told[NUMBER, begun + m] * step)
         gain, four = told[TOLD + 2 * c, m], told[TOLD + 2 * c + 1, m]
         re, a1, a2 = section_step(section, a1, a2, gain, four, cos)
         im, b1, b2 = section_step(section, b1, b2, -gain, -four, sin)
