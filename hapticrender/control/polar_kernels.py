@@ -16,7 +16,7 @@ from typing import NamedTuple
 from hapticrender._jit import kernel
 from hapticrender._lanes import any_of, high, lanes, low, put, put_pairs, root, select, size, taken
 from hapticrender._polynomials import polar, unit
-from hapticrender.control.bank_carriers import count_turns
+from hapticrender.control.bank_carriers import advance_of, turns_of
 from hapticrender.control.kernels import (
     DOUBT_TIME,
     FAR,
@@ -86,6 +86,8 @@ class PolarState(NamedTuple):
     band: Array  # (tiles, BAND_ROWS, W)
     loop: Array  # (tiles, coordinates * LOOP_ROWS, W)
     phase: Array  # (bands,) uint64: fixed part of each carrier at the next refresh, 2^64 a turn
+    advance: Array  # (bands,) uint64: how far it goes until then
+    counted: Array  # (bands,) Hz: the frequency that `advance` is made of
     locked: Array  # (tiles,) integer: 1 where a carrier of the tile follows the finger
     finger: Array  # (4,) held position (m), velocity (m/s), gate 0..1, seen before (0 or 1)
     doubt: Array  # (1,) 0: the sensors are believed, 1: they are not
@@ -184,6 +186,19 @@ def turn_frame(state, t, aimed):
 
 
 @kernel
+def count_on(tables, state, t, count):
+    """Phases of a tile's carriers, now, as `count_turns` counts them; how far they go changes with the tones only."""
+    band, phase, advance, start = state.band, state.phase, state.advance, t * state.band.shape[2]
+    for k in range(start, start + count):
+        if tables.tone[0, k] != state.counted[k]:  # in double precision, unlike the bands
+            state.counted[k] = tables.tone[0, k]
+            advance[k] = advance_of(tables.tone[0, k] / tables.numbers.rate)
+    for i in range(count):
+        band[t, TURNS, i] = turns_of(phase[start + i])
+        phase[start + i] += advance[start + i]
+
+
+@kernel
 def take_tones(tables, state, t):
     """Tones of a tile, as they are asked for now; their phases, and look-ups where they are new."""
     tone, band, width, start = tables.tone, state.band, state.band.shape[2], t * state.band.shape[2]
@@ -203,8 +218,7 @@ def take_tones(tables, state, t):
             known = known and band[t, LIVE, i] > 0.0 and band[t, FREQUENCY, i] == frequency
             if tone[1, start + i] > 0.0:
                 state.locked[t] = 1
-    for i in range(count):
-        band[t, TURNS, i] = count_turns(state.phase, start + i, tone[0, start + i] / tables.numbers.rate)
+    count_on(tables, state, t, count)
     if not known:
         for i in range(count):
             band[t, LIVE, i], band[t, FREQUENCY, i] = 1.0, tone[0, start + i]

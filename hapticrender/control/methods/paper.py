@@ -96,6 +96,8 @@ def polar_state(tables: PolarTables, window: int, dtype: type) -> PolarState:
         band=band,
         loop=aligned((tiles, coordinates * LOOP_ROWS, width), dtype),
         phase=np.zeros(bands, np.uint64),
+        advance=np.zeros(bands, np.uint64),
+        counted=np.zeros(bands),
         locked=np.zeros(tiles, np.int64),
         finger=np.zeros(4),
         doubt=np.zeros(1),
