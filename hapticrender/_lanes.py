@@ -221,23 +221,45 @@ def fraction(typingctx: Any, a: Any) -> Any:
         return None
 
     def build(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        (value,) = args
-        if isinstance(kind, LaneType) and "+avx512dq" in context.codegen().magic_tuple()[2].split(","):
-            return _reduced(builder, value)
-        return builder.fsub(value, _call(builder, "llvm.rint", value))
+        if _has_avx512(context, kind):
+            return _avx512(builder, "reduce", 8, *args)
+        return builder.fsub(args[0], _call(builder, "llvm.rint", args[0]))
 
     return kind(kind), build
 
 
-def _reduced(builder: Any, value: Any) -> Any:
-    """`fraction` by the one instruction that AVX-512 has for it."""
-    kind = value.type
-    element, mask, number = "pd" if kind.element == ir.DoubleType() else "ps", ir.IntType(kind.count), ir.IntType(32)
-    function = builder.module.declare_intrinsic(
-        f"llvm.x86.avx512.mask.reduce.{element}.512", (), ir.FunctionType(kind, [kind, number, kind, mask, number])
-    )
-    quiet, as_set = number(8), number(4)
-    return builder.call(function, [value, quiet, ir.Constant(kind, ir.Undefined), mask(-1), as_set])
+@intrinsic
+def by_size(typingctx: Any, a: Any, b: Any) -> Any:
+    """Magnitudes of two, the larger one first."""
+    kind = _common((a, b))
+    if kind is None:
+        return None
+
+    def build(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        if _has_avx512(context, kind):
+            ordered = [_avx512(builder, "range", 11, *args), _avx512(builder, "range", 10, *args)]
+        else:
+            one, other = (_call(builder, "llvm.fabs", value) for value in args)
+            more = builder.fcmp_ordered(">", one, other)
+            ordered = [builder.select(more, one, other), builder.select(more, other, one)]
+        return context.make_tuple(builder, sig.return_type, ordered)
+
+    return types.UniTuple(kind, 2)(kind, kind), build
+
+
+def _has_avx512(context: Any, kind: Any) -> bool:
+    """Whether AVX-512 can work on these vectors; its instructions do in one what LLVM needs three for."""
+    return isinstance(kind, LaneType) and "+avx512dq" in context.codegen().magic_tuple()[2].split(",")
+
+
+def _avx512(builder: Any, name: str, immediate: int, *values: Any) -> Any:
+    """Call the AVX-512 instruction `name` with its immediate operand, for all lanes, rounding as it is set."""
+    kind, mask, number = values[0].type, ir.IntType(values[0].type.count), ir.IntType(32)
+    named = f"llvm.x86.avx512.mask.{name}.{'pd' if kind.element == ir.DoubleType() else 'ps'}.512"
+    taken = [kind] * len(values) + [number, kind, mask, number]
+    function = builder.module.declare_intrinsic(named, (), ir.FunctionType(kind, taken))
+    rest = [number(immediate), ir.Constant(kind, ir.Undefined), mask(-1), number(4)]
+    return builder.call(function, [*values, *rest])
 
 
 @intrinsic

@@ -17,7 +17,7 @@ from numba.core import types
 from numba.extending import overload
 
 from hapticrender._jit import OPTIONS
-from hapticrender._lanes import LaneType, fraction, high, low, select, signed, size
+from hapticrender._lanes import LaneType, by_size, fraction, select, signed, size
 
 S = (
     6.283185307179585,
@@ -159,27 +159,25 @@ def _cosine(turns):  # type: ignore[no-untyped-def]
 def _polar(im, re):  # type: ignore[no-untyped-def]
     def long(im, re):  # type: ignore[no-untyped-def]
         re = re + TINY
-        across, along = size(im), size(re)
-        larger, smaller = high(across, along), low(across, along)
+        larger, smaller = by_size(im, re)
         x = larger + EIGHTH * smaller
         t = (smaller - EIGHTH * larger) / x
         u = t * t
         u2 = u * u
         r = x * ((R[0] + R[1] * u) + u2 * ((R[2] + R[3] * u) + u2 * (R[4] + R[5] * u)))
         p = 0.25 * HALF_PI + t * ((A[0] + A[1] * u) + u2 * ((A[2] + A[3] * u) + u2 * (A[4] + A[5] * u)))
-        p = signed(select(across > along, HALF_PI - p, p), im)
+        p = signed(select(larger > size(re), HALF_PI - p, p), im)
         return r, select(re < 0.0, -2.0 * HALF_PI - p, p)
 
     def short(im, re):  # type: ignore[no-untyped-def]
         re = re + TINY_SHORT
-        across, along = size(im), size(re)
-        larger, smaller = high(across, along), low(across, along)
+        larger, smaller = by_size(im, re)
         x = larger + EIGHTH * smaller
         t = (smaller - EIGHTH * larger) / x
         u = t * t
         r = x * (R_SHORT[0] + u * (R_SHORT[1] + u * R_SHORT[2]))
         p = 0.25 * HALF_PI + t * (A_SHORT[0] + u * (A_SHORT[1] + u * A_SHORT[2]))
-        p = signed(select(across > along, HALF_PI - p, p), im)
+        p = signed(select(larger > size(re), HALF_PI - p, p), im)
         return r, select(re < 0.0, -2.0 * HALF_PI - p, p)
 
     return short if _short(im) else long
