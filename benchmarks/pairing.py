@@ -11,11 +11,16 @@ Run = Callable[[], object]
 
 @dataclass(frozen=True)
 class Paired:
-    """Seconds a run of candidate and reference (medians), and the median of the pairs' ratios reference/candidate."""
+    """Seconds a run of candidate and reference (medians), and the pairs' ratios reference/candidate.
+
+    `ratio` is their median; a quarter of them is below `low`, a quarter above `high`.
+    """
 
     candidate: float
     reference: float
     ratio: float
+    low: float
+    high: float
 
 
 CORES = os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else set(range(os.cpu_count() or 1))
@@ -49,8 +54,12 @@ def interleave(candidate: Run, reference: Run, pairs: int, clock: Callable[[], f
     candidate()
     reference()
     rows = [(seconds(candidate, clock), seconds(reference, clock)) for _ in range(pairs)]
+    ratios = [reference / candidate for candidate, reference in rows]
+    low, middle, high = statistics.quantiles(ratios, n=4, method="inclusive") if pairs > 1 else 3 * ratios
     return Paired(
         candidate=statistics.median(row[0] for row in rows),
         reference=statistics.median(row[1] for row in rows),
-        ratio=statistics.median(row[1] / row[0] for row in rows),
+        ratio=middle,
+        low=low,
+        high=high,
     )

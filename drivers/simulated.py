@@ -21,6 +21,7 @@ class SimulatedDriver(BaseDriver):
 
     def __init__(self, plant: Plant) -> None:
         self.plant = plant
+        self._played = False
         super().__init__(
             rate=plant.rate,
             drive_channels=plant.drive_channels,
@@ -37,5 +38,12 @@ class SimulatedDriver(BaseDriver):
         whole = type(self) is SimulatedDriver and self.block == 1
         return self.plant if whole and self.plant.closes(controller) else None
 
+    def close(self) -> None:
+        """Play zeros as any driver does, where anything was played: a plant closed in compiled code is no device."""
+        if self._played:
+            super().close()
+        self._state = "closed"
+
     def _play(self, drive: Array) -> Sensed:
+        self._played = True
         return self.plant.run(drive)

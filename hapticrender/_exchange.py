@@ -14,6 +14,8 @@ from llvmlite import ir
 from numba.core import cgutils, types
 from numba.extending import intrinsic
 
+from hapticrender._records import RecordType
+
 SLOTS = 3
 FRESH = 4  # bit beside the number of the slot in the middle: the reader has not had it
 
@@ -36,14 +38,12 @@ def swap(typingctx: Any, array: Any, value: Any) -> Any:
 
 @intrinsic
 def behind(typingctx: Any, pointer: Any) -> Any:
-    """The value that a pointer points to, of any type that numba knows."""
-    if not isinstance(pointer, types.CPointer):
+    """The record that a pointer points to."""
+    if not (isinstance(pointer, types.CPointer) and isinstance(pointer.dtype, RecordType)):
         return None
 
     def build(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        model = context.data_model_manager[sig.return_type]
-        typed = builder.bitcast(args[0], model.get_data_type().as_pointer())
-        return model.load_from_data_pointer(builder, typed)
+        return builder.bitcast(args[0], context.get_value_type(sig.return_type))
 
     return pointer.dtype(pointer), build
 
@@ -58,12 +58,12 @@ def empty(typingctx: Any, pointer: Any) -> Any:
 
 @intrinsic
 def place(typingctx: Any, address: Any, value: Any) -> Any:
-    """Store a value where `behind` will find it."""
+    """Copy a record to where `behind` will find it."""
+    if not isinstance(value, RecordType):
+        return None
 
     def build(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        model = context.data_model_manager[sig.args[1]]
-        pointer = builder.inttoptr(args[0], model.get_data_type().as_pointer())
-        builder.store(model.as_data(builder, args[1]), pointer)
+        builder.store(builder.load(args[1]), builder.inttoptr(args[0], args[1].type))
         return context.get_dummy_value()
 
     return types.void(types.uintp, value), build
@@ -71,10 +71,12 @@ def place(typingctx: Any, address: Any, value: Any) -> Any:
 
 @intrinsic
 def bytes_of(typingctx: Any, value: Any) -> Any:
-    """Bytes that `place` needs for a value."""
+    """Bytes that `place` needs for a record."""
+    if not isinstance(value, RecordType):
+        return None
 
     def build(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        size = context.get_abi_sizeof(context.data_model_manager[sig.args[0]].get_data_type())
+        size = context.get_abi_sizeof(args[0].type.pointee)
         return ir.Constant(cgutils.intp_t, size)
 
     return types.intp(value), build

@@ -1,4 +1,4 @@
-"""The one place that knows how kernels are compiled and cached.
+"""The one place that knows what a kernel is and how it is cached; `_fragments` knows how it is compiled.
 
 numba's disk cache looks only at the file of the kernel itself, so an edit to
 a helper in another file would bring back stale results.  Here every cache
@@ -10,7 +10,7 @@ kernels compile in memory.
 
 from __future__ import annotations
 
-import copy
+import gc
 import hashlib
 from pathlib import Path
 from typing import Any
@@ -18,12 +18,14 @@ from typing import Any
 from numba.core import types
 from numba.core.caching import FunctionCache, IndexDataCacheFile
 from numba.core.ccallback import CFunc
-from numba.core.codegen import JITCodeLibrary
-from numba.core.compiler import Compiler
 from numba.core.compiler_lock import global_compiler_lock
-from numba.core.dispatcher import _FunctionCompiler  # type: ignore[attr-defined]
+from numba.core.imputils import lower_builtin
 from numba.core.registry import CPUDispatcher
 from numba.core.sigutils import normalize_signature
+from numba.core.typing.templates import AbstractTemplate, infer_global
+
+from hapticrender._fragments import compiler
+from hapticrender._records import as_record
 
 ROOMS = ("control", "plants")  # where kernels and their numbers live, besides files that begin with _
 
@@ -54,43 +56,17 @@ class _StampedCache(FunctionCache):
         )
 
 
-class _FragmentLibrary(JITCodeLibrary):
-    """Code of a kernel as a part of others: neither optimised as a whole nor made to run by itself."""
-
-    def _optimize_final_module(self) -> None:
-        pass
-
-    def _finalize_final_module(self) -> None:
-        self._finalized = True
-
-
-class _FragmentCompiler(_FunctionCompiler):
-    def _customize_flags(self, flags: Any) -> Any:
-        flags.no_cpython_wrapper = flags.no_cfunc_wrapper = flags.no_compile = True
-        return flags
-
-
-class _FragmentTarget:
-    """The processor, with libraries that are fragments."""
-
-    def __init__(self, target: Any) -> None:
-        self.options, self.typing_context = target.options, target.typing_context
-        codegen = copy.copy(target.target_context.codegen())
-        codegen._library_class = _FragmentLibrary
-        self.target_context = target.target_context.subtarget(_internal_codegen=codegen)
-
-
 class _Fragment(CPUDispatcher):
     """A kernel as its callers see it: typed and lowered once for each of its types, compiled inside of them."""
 
     def __init__(self, function: Any) -> None:
         super().__init__(function, targetoptions=dict(OPTIONS, nopython=True))
-        target, options = _FragmentTarget(self.targetdescr), self.targetoptions
-        self._compiler: Any = _FragmentCompiler(function, target, options, {}, Compiler)
+        self._compiler: Any = compiler(function, self.targetdescr, self.targetoptions, whole=False)
 
     def compile(self, sig: Any) -> Any:
         """Type and lower the kernel for these arguments."""
         args, returned = normalize_signature(sig)
+        args = tuple(types.unliteral(each) for each in args)  # once for all numbers: LLVM sees them where it inlines
         with global_compiler_lock, self._compiling_counter:
             known: Any = self.overloads.get(tuple(args))
             if known is None:
@@ -98,7 +74,7 @@ class _Fragment(CPUDispatcher):
                 lowered: Any = self._compiler.compile(args, returned)
                 known = lowered._replace(entry_point=key)
                 part = known._asdict()
-                self.targetctx.insert_user_function(key, part["fndesc"], [part["library"]])
+                self.targetctx.insert_user_function(key, part["fndesc"], part["library"].parts)
                 self.overloads[tuple(args)] = known
         return known.entry_point
 
@@ -106,7 +82,24 @@ class _Fragment(CPUDispatcher):
 class _Kernel(CPUDispatcher):
     """A kernel as Python sees it: whole, and cached; other kernels get its fragment."""
 
-    fragment: Any = None
+    def __init__(self, function: Any, targetoptions: Any = None) -> None:
+        super().__init__(function, targetoptions=targetoptions or dict(OPTIONS, nopython=True))
+        self.fragment = _Fragment(function)
+        self._compiler: Any = compiler(function, self.targetdescr, self.targetoptions, whole=True)
+
+    def compile(self, sig: Any) -> Any:
+        """Compile for these arguments, without a look for garbage at every step."""
+        collects = gc.isenabled()
+        gc.disable()
+        try:
+            return super().compile(sig)
+        finally:
+            if collects:
+                gc.enable()
+
+    def typeof_pyval(self, val: Any) -> Any:
+        """Numba's type of an argument: named tuples go by address."""
+        return as_record(super().typeof_pyval(val))  # type: ignore[misc]
 
     @property
     def _numba_type_(self) -> Any:
@@ -119,13 +112,34 @@ def kernel(function: Any) -> Any:
     A kernel allocates nothing, so arrays need no counting of references inside it (a call of the counter costs more
     than the arithmetic), and it becomes part of its caller, so that named tuples cost nothing to pass.
     """
-    compiled = _Kernel(function, targetoptions=dict(OPTIONS, nopython=True))
-    compiled.fragment = _Fragment(function)
+    compiled = _Kernel(function)
     try:
         compiled._cache = _StampedCache(function)  # type: ignore[attr-defined]
     except RuntimeError:  # numba: no writable cache location
         pass
     return compiled
+
+
+def by_types(choose: Any) -> Any:
+    """Make of a function, which returns a kernel for the types of some arguments, what kernels call with those.
+
+    What is called is decided while the caller is compiled, and becomes part of it, as a kernel does.
+    """
+
+    class Template(AbstractTemplate):
+        key = choose
+
+        def generic(self, args: Any, kws: Any) -> Any:
+            return choose(*args)._numba_type_.get_call_type(self.context, args, kws)
+
+    def build(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        call = context.get_function(choose(*sig.args)._numba_type_, sig)
+        context.add_linking_libs(getattr(call, "libs", ()))
+        return call(builder, args)
+
+    infer_global(choose, types.Function(Template))
+    lower_builtin(choose, types.VarArg(types.Any))(build)
+    return choose
 
 
 def callback(function: Any, returned: Any, *taken: Any) -> Any:

@@ -23,6 +23,7 @@ from numba.core.imputils import lower_builtin, lower_cast
 from numba.core.typeconv import Conversion
 from numba.core.typing.templates import AbstractTemplate, infer_global, signature
 
+from hapticrender._records import kept_apart
 from hapticrender.protocols import Array
 
 WIDTH = {np.dtype(np.float64): 8, np.dtype(np.float32): 16}  # lanes of a 512-bit register; narrower machines split it
@@ -361,25 +362,22 @@ def _folded(builder: Any, value: Any) -> Any:
     return builder.fadd(lower, upper)
 
 
+def _parts(context: Any, builder: Any, kind: Any, array: Any) -> Any:
+    """Pointer to an array's numbers, and its shape."""
+    model = context.data_model_manager[kind]
+    data, shape = (builder.extract_value(array, model.get_field_position(name)) for name in ("data", "shape"))
+    return data, cgutils.unpack_tuple(builder, shape, kind.ndim)
+
+
 def _address(context: Any, builder: Any, kind: Any, array: Any, *where: Any) -> Any:
     """Pointer to a row of lanes: array[where], each where counted in rows of the last axis but one."""
-    data = cgutils.create_struct_proxy(kind)(context, builder, value=array)
-    shape = cgutils.unpack_tuple(builder, data.shape, kind.ndim)
+    data, shape = _parts(context, builder, kind, array)
     row = where[0]
     for axis, index in enumerate(where[1:], 1):
         row = builder.add(builder.mul(row, shape[axis]), index)
     width = WIDTH[np.dtype(str(kind.dtype))]
     vector = ir.VectorType(_element(kind.dtype), width)
-    return builder.gep(builder.bitcast(data.data, vector.as_pointer()), [row])
-
-
-def _kept_apart(builder: Any, access: Any, kind: str) -> None:
-    """Tell LLVM that tiles and a scenario's own numbers never share memory, so that neither is read again in vain."""
-    module = builder.module
-    base = module.add_metadata(
-        [ir.MetaDataString(module, kind), module.add_metadata([ir.MetaDataString(module, "lanes")])]
-    )
-    access.set_metadata("tbaa", module.add_metadata([base, base, ir.IntType(64)(0)]))
+    return builder.gep(builder.bitcast(data, vector.as_pointer()), [row])
 
 
 def _load(context: Any, builder: Any, kind: Any, array: Any, where: Any, count: int) -> Any:
@@ -388,7 +386,7 @@ def _load(context: Any, builder: Any, kind: Any, array: Any, where: Any, count: 
         value = builder.load(_address(context, builder, kind, array, *where), align=_wide(kind))
     else:
         value = builder.load(_number(context, builder, kind, array, *where))
-    _kept_apart(builder, value, "tile" if kind.ndim == 3 and _is_rows(kind, count) else "own")
+    kept_apart(builder, value, "tile" if kind.ndim == 3 and _is_rows(kind, count) else "own")
     return value
 
 
@@ -398,7 +396,7 @@ def _store(context: Any, builder: Any, kind: Any, array: Any, where: Any, count:
         access = builder.store(value, _address(context, builder, kind, array, *where), align=_wide(kind))
     else:
         access = builder.store(value, _number(context, builder, kind, array, *where))
-    _kept_apart(builder, access, "tile" if kind.ndim == 3 and _is_rows(kind, count) else "own")
+    kept_apart(builder, access, "tile" if kind.ndim == 3 and _is_rows(kind, count) else "own")
 
 
 def _is_rows(kind: Any, indices: int) -> bool:
@@ -499,12 +497,12 @@ def put_pairs(typingctx: Any, array: Any, i: Any, re: Any, im: Any) -> Any:
                 at = _address(context, builder, kind, where, index, ir.IntType(64)(j))
                 builder.store(value, at, align=_wide(kind))
             return context.get_dummy_value()
-        data = cgutils.create_struct_proxy(kind)(context, builder, value=where)
+        data, shape = _parts(context, builder, kind, where)
         element = _element(kind.dtype.underlying_float)
         first, second = (_converted(builder, value, element) for value in (first, second))
         start = builder.mul(index, ir.IntType(64)(width))
-        room = builder.sub(cgutils.unpack_tuple(builder, data.shape, 1)[0], start)
-        numbers = builder.gep(builder.bitcast(data.data, element.as_pointer()), [builder.shl(start, ir.IntType(64)(1))])
+        room = builder.sub(shape[0], start)
+        numbers = builder.gep(builder.bitcast(data, element.as_pointer()), [builder.shl(start, ir.IntType(64)(1))])
         with builder.if_else(builder.icmp_signed(">=", room, ir.IntType(64)(width))) as (whole, part):
             with whole:
                 order = [lane for i in range(width) for lane in (i, width + i)]
@@ -598,9 +596,8 @@ def _is_numbers(kind: Any, indices: int) -> bool:
 
 def _number(context: Any, builder: Any, kind: Any, array: Any, *where: Any) -> Any:
     """Pointer to one number of an array."""
-    data = cgutils.create_struct_proxy(kind)(context, builder, value=array)
-    shape = cgutils.unpack_tuple(builder, data.shape, kind.ndim)
+    data, shape = _parts(context, builder, kind, array)
     at = where[0]
     for axis, index in enumerate(where[1:], 1):
         at = builder.add(builder.mul(at, shape[axis]), index)
-    return builder.gep(data.data, [at])
+    return builder.gep(data, [at])

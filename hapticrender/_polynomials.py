@@ -14,9 +14,8 @@ import math
 from typing import Any
 
 from numba.core import types
-from numba.extending import overload
 
-from hapticrender._jit import OPTIONS
+from hapticrender._jit import by_types, kernel
 from hapticrender._lanes import LaneType, by_size, fraction, select, signed, size
 
 S = (
@@ -88,96 +87,98 @@ def _short(kind: Any) -> bool:
     return (kind.dtype if isinstance(kind, LaneType) else kind) == types.float32
 
 
+@kernel
+def whole(value, factor):  # type: ignore[no-untyped-def]
+    """Nearest whole number to value * factor, up to 2^51, in double precision."""
+    return (value * factor + WHOLE) - WHOLE
+
+
+@kernel
+def _long_unit(turns):  # type: ignore[no-untyped-def]
+    """`unit` in double precision."""
+    x = fraction(turns)
+    far = size(x) > 0.25
+    x = select(far, select(x > 0.0, 0.5, -0.5) - x, x)
+    u = x * x
+    u2 = u * u
+    s = (S[0] + S[1] * u) + (S[2] + S[3] * u) * u2 + ((S[4] + S[5] * u) + (S[6] + S[7] * u) * u2) * (u2 * u2)
+    c = (C[0] + C[1] * u) + (C[2] + C[3] * u) * u2 + ((C[4] + C[5] * u) + (C[6] + C[7] * u) * u2) * (u2 * u2)
+    return select(far, -c, c), s * x
+
+
+@kernel
+def _short_unit(turns):  # type: ignore[no-untyped-def]
+    """`unit` in single precision."""
+    x = fraction(turns)
+    far = size(x) > 0.25
+    x = select(far, select(x > 0.0, 0.5, -0.5) - x, x)
+    u = x * x
+    s = S_SHORT[0] + u * (S_SHORT[1] + u * (S_SHORT[2] + u * (S_SHORT[3] + u * S_SHORT[4])))
+    c = C_SHORT[0] + u * (C_SHORT[1] + u * (C_SHORT[2] + u * (C_SHORT[3] + u * C_SHORT[4])))
+    return select(far, -c, c), s * x
+
+
+@by_types
 def unit(turns: Any) -> Any:
     """Cosine and sine of 2 pi `turns`, of any size that still knows its fraction."""
-    raise TypeError("unit: to be called from a kernel")
+    return _short_unit if _short(turns) else _long_unit
 
 
+@kernel
+def _long_cosine(turns):  # type: ignore[no-untyped-def]
+    """`cosine` in double precision."""
+    x = fraction(turns)
+    u = x * x
+    u2 = u * u
+    late = (W[4] + W[5] * u) + (W[6] + W[7] * u) * u2
+    return (W[0] + W[1] * u) + u2 * ((W[2] + W[3] * u) + u2 * late)
+
+
+@kernel
+def _short_cosine(turns):  # type: ignore[no-untyped-def]
+    """`cosine` in single precision."""
+    x = fraction(turns)
+    u = x * x
+    w = W_SHORT[2] + u * (W_SHORT[3] + u * (W_SHORT[4] + u * W_SHORT[5]))
+    return W_SHORT[0] + u * (W_SHORT[1] + u * w)
+
+
+@by_types
 def cosine(turns: Any) -> Any:
     """Cosine of 2 pi `turns`, like that of `unit` but with fewer digits."""
-    raise TypeError("cosine: to be called from a kernel")
+    return _short_cosine if _short(turns) else _long_cosine
 
 
+@kernel
+def _long_polar(im, re):  # type: ignore[no-untyped-def]
+    """`polar` in double precision."""
+    re = re + TINY
+    larger, smaller = by_size(im, re)
+    x = larger + EIGHTH * smaller
+    t = (smaller - EIGHTH * larger) / x
+    u = t * t
+    u2 = u * u
+    r = x * ((R[0] + R[1] * u) + u2 * ((R[2] + R[3] * u) + u2 * (R[4] + R[5] * u)))
+    p = 0.25 * HALF_PI + t * ((A[0] + A[1] * u) + u2 * ((A[2] + A[3] * u) + u2 * (A[4] + A[5] * u)))
+    p = signed(select(larger > size(re), HALF_PI - p, p), im)
+    return r, select(re < 0.0, -2.0 * HALF_PI - p, p)
+
+
+@kernel
+def _short_polar(im, re):  # type: ignore[no-untyped-def]
+    """`polar` in single precision."""
+    re = re + TINY_SHORT
+    larger, smaller = by_size(im, re)
+    x = larger + EIGHTH * smaller
+    t = (smaller - EIGHTH * larger) / x
+    u = t * t
+    r = x * (R_SHORT[0] + u * (R_SHORT[1] + u * R_SHORT[2]))
+    p = 0.25 * HALF_PI + t * (A_SHORT[0] + u * (A_SHORT[1] + u * A_SHORT[2]))
+    p = signed(select(larger > size(re), HALF_PI - p, p), im)
+    return r, select(re < 0.0, -2.0 * HALF_PI - p, p)
+
+
+@by_types
 def polar(im: Any, re: Any) -> Any:
     """Magnitude of re + j im and its angle (rad, cut at a quarter turn: above -3/2 pi, up to pi/2; 0 for 0)."""
-    raise TypeError("polar: to be called from a kernel")
-
-
-def whole(value: Any, factor: Any) -> Any:
-    """Nearest whole number to value * factor, up to 2^51, in double precision."""
-    raise TypeError("whole: to be called from a kernel")
-
-
-@overload(whole, jit_options=OPTIONS)
-def _whole(value, factor):  # type: ignore[no-untyped-def]
-    return lambda value, factor: (value * factor + WHOLE) - WHOLE
-
-
-@overload(unit, jit_options=OPTIONS)
-def _unit(turns):  # type: ignore[no-untyped-def]
-    def long(turns):  # type: ignore[no-untyped-def]
-        x = fraction(turns)
-        far = size(x) > 0.25
-        x = select(far, select(x > 0.0, 0.5, -0.5) - x, x)
-        u = x * x
-        u2 = u * u
-        s = (S[0] + S[1] * u) + (S[2] + S[3] * u) * u2 + ((S[4] + S[5] * u) + (S[6] + S[7] * u) * u2) * (u2 * u2)
-        c = (C[0] + C[1] * u) + (C[2] + C[3] * u) * u2 + ((C[4] + C[5] * u) + (C[6] + C[7] * u) * u2) * (u2 * u2)
-        return select(far, -c, c), s * x
-
-    def short(turns):  # type: ignore[no-untyped-def]
-        x = fraction(turns)
-        far = size(x) > 0.25
-        x = select(far, select(x > 0.0, 0.5, -0.5) - x, x)
-        u = x * x
-        s = S_SHORT[0] + u * (S_SHORT[1] + u * (S_SHORT[2] + u * (S_SHORT[3] + u * S_SHORT[4])))
-        c = C_SHORT[0] + u * (C_SHORT[1] + u * (C_SHORT[2] + u * (C_SHORT[3] + u * C_SHORT[4])))
-        return select(far, -c, c), s * x
-
-    return short if _short(turns) else long
-
-
-@overload(cosine, jit_options=OPTIONS)
-def _cosine(turns):  # type: ignore[no-untyped-def]
-    def long(turns):  # type: ignore[no-untyped-def]
-        x = fraction(turns)
-        u = x * x
-        u2 = u * u
-        late = (W[4] + W[5] * u) + (W[6] + W[7] * u) * u2
-        return (W[0] + W[1] * u) + u2 * ((W[2] + W[3] * u) + u2 * late)
-
-    def short(turns):  # type: ignore[no-untyped-def]
-        x = fraction(turns)
-        u = x * x
-        w = W_SHORT[2] + u * (W_SHORT[3] + u * (W_SHORT[4] + u * W_SHORT[5]))
-        return W_SHORT[0] + u * (W_SHORT[1] + u * w)
-
-    return short if _short(turns) else long
-
-
-@overload(polar, jit_options=OPTIONS)
-def _polar(im, re):  # type: ignore[no-untyped-def]
-    def long(im, re):  # type: ignore[no-untyped-def]
-        re = re + TINY
-        larger, smaller = by_size(im, re)
-        x = larger + EIGHTH * smaller
-        t = (smaller - EIGHTH * larger) / x
-        u = t * t
-        u2 = u * u
-        r = x * ((R[0] + R[1] * u) + u2 * ((R[2] + R[3] * u) + u2 * (R[4] + R[5] * u)))
-        p = 0.25 * HALF_PI + t * ((A[0] + A[1] * u) + u2 * ((A[2] + A[3] * u) + u2 * (A[4] + A[5] * u)))
-        p = signed(select(larger > size(re), HALF_PI - p, p), im)
-        return r, select(re < 0.0, -2.0 * HALF_PI - p, p)
-
-    def short(im, re):  # type: ignore[no-untyped-def]
-        re = re + TINY_SHORT
-        larger, smaller = by_size(im, re)
-        x = larger + EIGHTH * smaller
-        t = (smaller - EIGHTH * larger) / x
-        u = t * t
-        r = x * (R_SHORT[0] + u * (R_SHORT[1] + u * R_SHORT[2]))
-        p = 0.25 * HALF_PI + t * (A_SHORT[0] + u * (A_SHORT[1] + u * A_SHORT[2]))
-        p = signed(select(larger > size(re), HALF_PI - p, p), im)
-        return r, select(re < 0.0, -2.0 * HALF_PI - p, p)
-
-    return short if _short(im) else long
+    return _short_polar if _short(im) else _long_polar

@@ -1,4 +1,4 @@
-"""The accuracy suite: how well a method does where methods fail, against stated targets.
+"""The accuracy suite on the plate: how well a method does where methods fail, against stated targets.
 
 Every case runs on the plate of Grigorii et al. 2021 with 1 um of sensor noise,
 14-bit sensing, 12-bit command, 5 kHz and one sample of delay.  Errors are
@@ -8,13 +8,12 @@ slope over windows of max(20 ms, 2/f).
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 
+from hapticrender.accuracy_figures import Target
 from hapticrender.bands import Bands
 from hapticrender.control.methods import method_named
 from hapticrender.judge import fit
@@ -279,26 +278,10 @@ def identified(bench: Bench) -> dict[str, float]:
     return worst
 
 
-@dataclass(frozen=True)
-class Target:
-    """A figure of the suite: its bound must hold, its aim is wanted; both in `unit`, which is `scale` of the figure."""
-
-    case: str
-    key: str
-    what: str
-    unit: str
-    scale: float
-    bound: float
-    aim: float
-
-    def shown(self, value: float) -> float:
-        """Value of the figure in `unit`; a ratio is shown in dB where that is the unit."""
-        return float(20 * np.log10(max(value, 1e-12))) if self.unit == "dB" else value * self.scale
-
-
 CASES: dict[str, Callable[[Bench], dict[str, float]]] = {
     case.__name__: case for case in (free, slide, touch, chirp, comb, press, wobble, wrong, late, overload, identified)
 }
+METHOD_FREE = ("identified",)  # cases that no method has a hand in
 TARGETS = (
     Target("free", "error", "free plate, 11 frequencies, ends included, noise averaged", "%", 100, 0.05, 0.03),
     Target("slide", "centre", "heavy finger sliding at 100 mm/s, rms at the centre", "%", 100, 0.4, 0.2),
@@ -328,82 +311,3 @@ TARGETS = (
     Target("identified", "b", "the same: damping", "%", 100, 1.0, 0.4),
     Target("identified", "delay", "the same: delay", "samples", 1, 0.01, 0.001),
 )
-
-
-@dataclass(frozen=True)
-class Figure:
-    """What a method reached for a target, in the target's unit."""
-
-    target: Target
-    method: str
-    value: float
-
-    @property
-    def passed(self) -> bool:
-        """True where the bound holds."""
-        return bool(self.value <= self.target.bound)
-
-    @property
-    def reached(self) -> bool:
-        """True where the aim holds."""
-        return bool(self.value <= self.target.aim)
-
-
-def run_suite(
-    methods: Iterable[str], cases: Iterable[str] | None = None, progress: Callable[[str], None] | None = None
-) -> list[Figure]:
-    """Run the suite and return every figure, target by target, method by method.
-
-    Parameters
-    ----------
-    methods : iterable of str
-        Names of the methods; what diverges counts as infinite.
-    cases : iterable of str, optional
-        Names of the cases (`CASES`); all by default.
-    progress : callable, optional
-        Called with a line before each case.
-
-    Returns
-    -------
-    list of Figure
-    """
-    found: dict[tuple[str, str], dict[str, float]] = {}
-    chosen, methods = list(cases or CASES), list(methods)
-    for case in chosen:
-        for method in methods:
-            if progress is not None:
-                progress(f"{case}: {method}")
-            found[case, method] = CASES[case](Bench(method=method))
-    figures = []
-    for target in TARGETS:
-        for method in methods if target.case in chosen else ():
-            value = found[target.case, method].get(target.key, np.inf)
-            figures.append(Figure(target, method, target.shown(value) if np.isfinite(value) else np.inf))
-    return figures
-
-
-def as_rows(figures: Iterable[Figure], methods: Iterable[str]) -> list[list[str]]:
-    """Rows of a table: target, unit, bound, aim, then a column a method."""
-    names = list(methods)
-    rows = [["case", "figure", "unit", "bound", "aim", *names]]
-    values = {(figure.target, figure.method): figure for figure in figures}
-    for target in dict.fromkeys(figure.target for figure in values.values()):
-        found = [values[target, name] for name in names]
-        marks = [f"{each.value:.3g}{'' if each.passed else ' MISSED'}{' *' if each.reached else ''}" for each in found]
-        rows.append([target.case, target.what, target.unit, f"{target.bound:g}", f"{target.aim:g}", *marks])
-    return [*rows, ["", "* reaches its aim", "", "", "", *([""] * len(names))]]
-
-
-def write_json(path: Path, figures: Iterable[Figure]) -> None:
-    """Write every figure with its target, unit, bound and aim; one that is not finite is null."""
-    rows = [
-        {
-            **{key: getattr(figure.target, key) for key in ("case", "key", "what", "unit", "bound", "aim")},
-            "method": figure.method,
-            "value": figure.value if np.isfinite(figure.value) else None,
-            "passed": figure.passed,
-            "reached": figure.reached,
-        }
-        for figure in figures
-    ]
-    path.write_text(json.dumps({"suite": "accuracy", "figures": rows}, indent=2) + "\n", encoding="utf-8")

@@ -9,8 +9,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from hapticrender.formats import MissingExtra, replacing
-from hapticrender.picture import INK, ORANGE, PALE, STYLE
+from hapticrender.figures import INK, ORANGE, PALE, new_figure, save
+from hapticrender.formats import replacing
 from hapticrender.plants.stability import LOOPS, StabilityMap, stability_map
 from hapticrender.plants.vibrotactile import PlateParameters
 from hapticrender.protocols import Array
@@ -115,8 +115,7 @@ def stability(
                 progress((row * len(cases) + column + 1) / (len(methods) * len(cases)))
     path = Path(path)
     _save(path.with_suffix(".npz"), rows, cases)
-    with np.errstate(all="ignore"), replacing(path) as scratch:
-        draw_stability(rows, cases).savefig(scratch, dpi=130, format="png")
+    save(draw_stability(rows, cases), path, dpi=130)
     return rows
 
 
@@ -138,15 +137,8 @@ def _save(path: Path, rows: list[list[StabilityMap]], cases: Sequence[Case]) -> 
 
 def draw_stability(rows: list[list[StabilityMap]], cases: Sequence[Case]) -> Any:
     """Draw maps into a new ``matplotlib.figure.Figure``; see `stability`."""
-    try:
-        import matplotlib
-        from matplotlib.backends.backend_agg import FigureCanvasAgg
-        from matplotlib.figure import Figure
-    except ImportError as error:
-        raise MissingExtra("pictures need matplotlib: pip install 'hapticrender[plot]'") from error
-    with matplotlib.rc_context({**STYLE, "axes.grid": False, "hatch.linewidth": 0.6}), np.errstate(all="ignore"):
-        figure: Any = Figure(figsize=(2.7 * len(cases) + 1.6, 2.15 * len(rows) + 2.2), layout="constrained")
-        FigureCanvasAgg(figure)
+    size = (2.7 * len(cases) + 1.6, 2.15 * len(rows) + 2.2)
+    with new_figure(size, style={"axes.grid": False, "hatch.linewidth": 0.6}) as figure:
         axes = figure.subplots(len(rows), len(cases), sharex=True, sharey=True, squeeze=False)
         for lane, row in zip(axes, rows, strict=True):
             for panel, each in zip(lane, row, strict=True):

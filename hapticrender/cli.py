@@ -119,7 +119,10 @@ def _parser() -> argparse.ArgumentParser:
 
     chart = _add_verb(verbs, "chart", _chart, "draw accuracy against cost, stability, or two methods")
     chart.add_argument(
-        "name", metavar="NAME", choices=["pareto", "stability", "story"], help="pareto, stability, story"
+        "name",
+        metavar="NAME",
+        choices=["pareto", "stability", "story", "devices"],
+        help="pareto, stability, story, devices",
     )
     chart.add_argument("--learnt", action="store_true", help="the finger already learnt, not the moment of touch")
     _add_out(chart, Path("out/chart"))
@@ -265,7 +268,8 @@ def _validate(arguments: argparse.Namespace) -> int:
 
 def _suite(arguments: argparse.Namespace) -> int:
     """Run the accuracy suite: the chosen method beside the paper's; exit 1 where it misses a bound."""
-    from hapticrender.accuracy import as_rows, run_suite, write_json
+    from hapticrender.accuracy_figures import as_rows, write_json
+    from hapticrender.accuracy_suite import run_suite
     from hapticrender.control.methods import METHODS
     from hapticrender.wording import table
 
@@ -318,6 +322,10 @@ def _chart(arguments: argparse.Namespace) -> int:
         from hapticrender.pareto import pareto
 
         pareto(path, progress=lambda what: print(what, file=sys.stderr))
+    elif arguments.name == "devices":
+        from hapticrender.device_chart import device_chart
+
+        device_chart(path, progress=lambda what: print(what, file=sys.stderr))
     else:
         from hapticrender import chart
 

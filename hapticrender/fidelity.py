@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from hapticrender import fidelity_plate
+from hapticrender import fidelity_friction, fidelity_plate
 from hapticrender.fidelity_plate import NoBound, Option
 from hapticrender.touch.finger import Finger
 from hapticrender.touch.scene import PlantValue, Scene
@@ -23,7 +23,11 @@ class Ladder(NamedTuple):
     bound: Callable[[Scene, Scene], float]
 
 
-LADDERS: dict[str, Ladder] = {"vt-plate": Ladder(fidelity_plate.OPTIONS, fidelity_plate.bound)}
+LADDERS: dict[str, Ladder] = {
+    "vt-plate": Ladder(fidelity_plate.OPTIONS, fidelity_plate.bound),
+    "electroadhesion": Ladder(fidelity_friction.SCREEN_OPTIONS, fidelity_friction.bound),
+    "ultrasonic": Ladder(fidelity_friction.SURFACE_OPTIONS, fidelity_friction.bound),
+}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -137,14 +141,15 @@ def fidelity(scene: Scene, tolerance: float | None = None) -> Fidelity:
     Notes
     -----
     The error is the largest difference, at any time that is judged, of the
-    motion's envelopes at the judged places, in the worst band, relative to its
-    target, while both models get the drive with which the lesser one reaches
-    the target.  The verdict's figure, an rms over time, then differs by no
-    more under that drive; that the loop finds it on both is not part of the bound.
-    It is at most 1.5 times the error that two played plates show, where that
-    is 2e-4 or more.  Where a carrier that is locked to the finger sweeps through
-    a mode, or the sag under a moving load is much larger than the target, up to
-    3.2 times was seen.
+    envelopes of motion or friction at the judged places, in the worst band,
+    relative to its target, while both models get the drive with which the lesser
+    one reaches the target.  The verdict's figure, an rms over time, then differs by
+    no more under that drive; that the loop finds it on both is not part of the bound.
+    It is at most 1.5 times the error that two played devices show, where that
+    is 2e-4 or more.  On a plate where a carrier that is locked to the finger sweeps
+    through a mode, or the sag under a moving load is much larger than the target, up
+    to 3.2 times was seen; on an ultrasonic surface in whose noise the amplitude loop
+    seldom wakes, 1.6 times.
 
     Examples
     --------

@@ -1,4 +1,4 @@
-"""What is installed: kinds of device, drivers and extras, what each needs and whether it is there."""
+"""What is installed: kinds of device, drivers and extras, what each needs and whether it is installed."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ EXTRAS = (  # package, extra, what it is good for
 
 def text() -> str:
     """Everything as a table for the terminal."""
-    kinds = [["kind", "there", "simulated", "a real one needs"], *map(_kind, _registered("renderers"))]
-    drivers = [["driver", "there", "what it does"], *map(_driver, _registered("drivers"))]
-    extras = [["extra", "there", "for"], *([extra, _there(package), use] for package, extra, use in EXTRAS)]
+    kinds = [["kind", "installed", "simulated", "a real one needs"], *map(_kind, _registered("renderers"))]
+    drivers = [["driver", "installed", "what it does"], *map(_driver, _registered("drivers"))]
+    extras = [["extra", "installed", "for"], *([extra, _installed(package), use] for package, extra, use in EXTRAS)]
     hint = "A driver of your own serves any kind: hapticrender.drivers.base says in a page what it is."
     return "\n\n".join([table(kinds), table(drivers), hint, table(extras)])
 
@@ -32,7 +32,7 @@ def _kind(entry: Any) -> list[str]:
     """Row of a kind of device: whether a model of it comes along, and what hardware it takes."""
     loaded, trouble = _load(entry)
     if loaded is None:
-        return [entry.name, "no", "no", trouble]
+        return [entry.name, "broken", "no", trouble]
     simulated = "yes" if hasattr(loaded, "plant") else "no"
     return [entry.name, "yes", simulated, f"{getattr(loaded, 'needs', 'a driver')}  ({entry.value})"]
 
@@ -41,7 +41,7 @@ def _driver(entry: Any) -> list[str]:
     """Row of a driver."""
     loaded, trouble = _load(entry)
     if loaded is None:
-        return [entry.name, "no", trouble]
+        return [entry.name, "broken", trouble]
     first = str(loaded.__doc__ or "").strip().partition("\n")[0]
     return [entry.name, "yes", f"{first}  ({entry.value})"]
 
@@ -52,8 +52,8 @@ def _load(entry: Any) -> tuple[Any, str]:
         return entry.load(), ""
     except (Exception, SystemExit) as error:  # a third party's module may fail in any way; the list must go on
         reason = " ".join(f"{type(error).__name__}: {error}".split())
-        return None, f"broken: cannot be loaded from {entry.value} ({reason})"
+        return None, f"cannot be loaded from {entry.value} ({reason})"
 
 
-def _there(package: str) -> str:
+def _installed(package: str) -> str:
     return "yes" if find_spec(package) else "no"

@@ -117,10 +117,16 @@ class Header:
         return {name: slice(end - width, end) for (name, width), end in zip(self.widths.items(), ends, strict=True)}
 
     @property
+    def drive_units(self) -> tuple[str, ...]:
+        """Unit of every drive channel: `drive_unit` names one for all, or one each with ", " between them."""
+        units = tuple(self.drive_unit.split(", "))
+        return units if len(units) == self.drive_channels else (self.drive_unit,) * self.drive_channels
+
+    @property
     def channels(self) -> list[tuple[str, str]]:
         """Name and unit of every column."""
         return [
-            *((f"drive {i + 1}", self.drive_unit) for i in range(self.drive_channels)),
+            *((f"drive {i + 1}", unit) for i, unit in enumerate(self.drive_units)),
             *((f"sensed {i + 1}", self.unit) for i in range(self.sensed_channels)),
             *((f"motion {place}", self.unit) for place in self.places),
             ("position", "m"),

@@ -57,6 +57,8 @@ class Envelopes:
         Something is wanted of the band all through the window.
     frequency : ndarray, shape (w, n_bands), Hz
         Mean magnitude of the carrier's frequency; 0 for a finger-locked one while the finger is up.
+    backward : ndarray of bool, shape (w, n_bands)
+        The carrier runs backwards, as a finger-locked one does on the way back.
     residual : ndarray, shape (w,), m^2
         Mean square of the motion at the first place that neither the carriers nor an offset and a slope explain.
     """
@@ -68,6 +70,7 @@ class Envelopes:
     readable: Array
     asked: Array
     frequency: Array
+    backward: Array
     residual: Array
 
     @property
@@ -149,8 +152,8 @@ def analyse(recording: Recording) -> Envelopes:
         _analyse_chunk(recording, position, starts, size) for starts in _batches(first, size * (2 * len(bands) + 2))
     ]
     places, n_bands = len(recording.header.places), len(bands)
-    shapes = [(0, n_bands), (0, places, n_bands), (0, n_bands), (0, n_bands), (0, n_bands), (0,)]
-    kinds = [complex, complex, bool, bool, float, float]
+    shapes = [(0, n_bands), (0, places, n_bands), (0, n_bands), (0, n_bands), (0, n_bands), (0, n_bands), (0,)]
+    kinds = [complex, complex, bool, bool, float, bool, float]
     empty: list[Array] = [np.empty(shape, kind) for shape, kind in zip(shapes, kinds, strict=True)]
     return Envelopes(first / rate, size / rate, *(np.concatenate(part) for part in zip(empty, *parts, strict=True)))
 
@@ -172,7 +175,8 @@ def _analyse_chunk(recording: Recording, position: Array, first: Array, size: in
     waveform = (target.real * np.cos(phase) - target.imag * np.sin(phase)).sum(axis=1)
     signals = np.column_stack([waveform, recording.read("motion", start, stop)])[index]
     envelope, inflation, rest = fit(phase[index], signals)
-    frequency = _quarterly(bands, rate, finger[index])
+    signed = _quarterly(bands, rate, finger[index])
+    frequency = abs(signed)
     fast = np.all(frequency >= LOWEST_FREQUENCY * (1 - 1e-6), axis=1)
     asked = (target != 0)[index].all(axis=1)
     return (
@@ -181,6 +185,7 @@ def _analyse_chunk(recording: Recording, position: Array, first: Array, size: in
         fast & (inflation <= LARGEST_INFLATION),
         asked,
         frequency.mean(axis=1),
+        signed.mean(axis=1) < 0.0,
         _unexplained(rest[..., 1], rest[..., 0], signals[..., 0]),
     )
 
@@ -234,12 +239,12 @@ def _unexplained(rest: Array, wanted_rest: Array, wanted: Array) -> Array:
 
 
 def _quarterly(bands: Bands, rate: float, finger: Array) -> Array:
-    """Frequency (Hz, shape (w, quarters, n_bands)) in every quarter of a window; 0 where the finger it needs is up."""
+    """Signed frequency (Hz, shape (w, quarters, n_bands)) in each quarter of a window; 0 where its finger is up."""
     edges = np.linspace(0, finger.shape[1] - 1, QUARTERS + 1).round().astype(int)
     down = np.all(np.isfinite(finger), axis=1)[:, None]
     velocity = np.diff(np.where(down, finger[:, edges], 0.0), axis=1) * rate / np.diff(edges)
     free = bands.wavenumber == 0
-    return np.where(down[:, :, None] | free, np.abs(bands.instantaneous_frequency(velocity)), 0.0)
+    return np.where(down[:, :, None] | free, bands.instantaneous_frequency(velocity), 0.0)
 
 
 def summary(recording: Recording) -> dict[str, Any]:
@@ -262,7 +267,10 @@ def summary(recording: Recording) -> dict[str, Any]:
     of what that fit leaves of the wanted waveform where a target fades, nor
     the window's offset and slope.
 
-    `frequency` of a band that is locked to the finger is the median while it
+    `phase_error` is the lead of the mean at the first place, on a carrier
+    that runs backwards as well as on one that runs forwards, and
+    `complex_error` the rms of |X - target| over the rms of |target| there,
+    phase included.  `frequency` of a band that is locked to the finger is the median while it
     is judged.  `settling_time` is None unless the band stays within 5 % of
     its target, in amplitude and phase, for the last 0.5 s, or for the last
     10 % of the judged time where that is shorter.
@@ -321,6 +329,8 @@ def _band(recording: Recording, k: int, judged: Array, places: list[str]) -> dic
     for place, amplitude in zip(places, np.abs(achieved).T, strict=True):
         figures[f"rms_error_{place}"] = _ratio(_rms(amplitude - np.abs(wanted)), _rms(wanted))
     product = achieved[:, 0] * wanted.conj()
+    product = np.where(envelopes.backward[judged, k], product.conj(), product)  # a lead is one on the way back, too
+    figures["complex_error"] = _ratio(_rms(achieved[:, 0] - wanted), _rms(wanted))
     figures["phase_error"] = float(np.angle(product.mean())) if product.size else None
     judged_time = len(recording) / recording.rate - judged_from(recording)
     figures["settling_time"] = _settling_time(envelopes, k, min(SETTLED_FOR, SETTLED_SHARE * judged_time))
@@ -439,16 +449,11 @@ def text(summary: Mapping[str, Any]) -> str:
     lines = ["  ".join(cell.rjust(width) for cell, width in zip(row, widths, strict=True)) for row in rows]
     wobble, residual = (wording.quantity(summary[key], summary["unit"]) for key in ("wobble", "residual_rms"))
     saturated = wording.percent(summary["saturated_share"])
-    where = " and ".join(_said(places))
-    lines.append(f"rms errors at {where}; wobble {wobble}, beside the bands {residual}, saturated {saturated}")
+    lines.append(
+        f"rms errors {wording.at(places)}; wobble {wobble}, beside the bands {residual}, saturated {saturated}"
+    )
     lines.extend(summary["notes"])
     return "\n".join([*lines, f"{summary['scene']} {wording.verdict(summary)}"])
-
-
-def _said(places: list[str]) -> list[str]:
-    """Places in words, the ends of a plate as one."""
-    names = [place.replace("_", " ") for place in places]
-    return list(dict.fromkeys("ends" if name.startswith("end ") else name for name in names))
 
 
 def _mean(values: Array) -> float | None:

@@ -29,6 +29,7 @@ from hapticrender.control.methods.paper import CommonMode, PerSide
 from hapticrender.control.methods.resonant import Resonant
 from hapticrender.control.methods.stiffness import ERROR, ERROR_CROWDED, SIGNAL
 from hapticrender.errors import HapticError
+from hapticrender.figures import save
 from hapticrender.formats import replacing
 from hapticrender.judge import fit
 from hapticrender.plants.vibrotactile import Plate, PlateParameters
@@ -374,8 +375,7 @@ def pareto(
         scratch.write_text(json.dumps(as_data(points, held), indent=2) + "\n", encoding="utf-8")
     from hapticrender.pareto_picture import draw
 
-    with np.errstate(all="ignore"), replacing(path) as scratch:
-        draw(points, held).savefig(scratch, dpi=110, format="png")
+    save(draw(points, held), path)
     return points
 
 

@@ -7,9 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from hapticrender.formats import MissingExtra
+from hapticrender.figures import BLUE, GREEN, INK, ORANGE, PALE, RED, new_figure
 from hapticrender.pareto import LOST, MAP, OFF, RESTLESS, Point, front
-from hapticrender.picture import BLUE, GREEN, INK, ORANGE, PALE, RED, STYLE
 from hapticrender.protocols import Array
 
 COLOURS = {
@@ -35,15 +34,7 @@ def draw(points: Sequence[Point], held: dict[str, Array]) -> Any:
     MissingExtra
         matplotlib is not installed.
     """
-    try:
-        import matplotlib
-        from matplotlib.backends.backend_agg import FigureCanvasAgg
-        from matplotlib.figure import Figure
-    except ImportError as error:
-        raise MissingExtra("pictures need matplotlib: pip install 'hapticrender[plot]'") from error
-    with matplotlib.rc_context(STYLE), np.errstate(all="ignore"):
-        figure: Any = Figure(figsize=(12.5, 8.6), layout="constrained")
-        FigureCanvasAgg(figure)
+    with new_figure((12.5, 8.6)) as figure:
         panels = figure.subplot_mosaic([["cost", "speed"], ["map", "map"]], height_ratios=[3, 2])
         _scatter(panels["cost"], points, lambda each: each.nanoseconds, "controller, ns a band-sample (8 bands)")
         _scatter(

@@ -4,44 +4,28 @@ from __future__ import annotations
 
 import os
 import textwrap
-from pathlib import Path
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from hapticrender import wording
-from hapticrender.formats import MissingExtra, replacing
+from hapticrender.figures import BLUE, GREEN, INK, ORANGE, PALE, RED, new_figure, save
 from hapticrender.judge import RUNAWAY
 from hapticrender.protocols import Array, Flag
 
 if TYPE_CHECKING:
     from hapticrender.recording import Recording
 
-# Okabe and Ito's colours: told apart by every kind of colour vision, and of different lightness.
-BLUE, ORANGE, GREEN, RED, INK, PALE = "#0072B2", "#E69F00", "#009E73", "#D55E00", "#222222", "#8A8A8A"
 PLACES = ((BLUE, "o"), (ORANGE, "<"), (GREEN, ">"))
 COILS = (BLUE, ORANGE, GREEN, RED)
 COLUMNS = 1400  # points that a full-width panel can show
 QUANTITIES = {"m": "displacement", "N": "friction", "m/s": "skin velocity"}
 PERIODS = 4  # of the strongest carrier in the close-up
+LANE = 0.95  # inch: a lane of drive beyond the two of a plate
 MOST_LABELS = 10
 MOST_NOTES = 3  # lines
 FLOOR = 1e-5  # relative error below which a dot stands at the foot of its panel
-STYLE: Any = {
-    "font.size": 9,
-    "axes.titlesize": 9.5,
-    "axes.titlelocation": "left",
-    "axes.titleweight": "bold",
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.edgecolor": PALE,
-    "axes.grid": True,
-    "axes.axisbelow": True,
-    "grid.color": "#E4E4E4",
-    "grid.linewidth": 0.6,
-    "legend.frameon": False,
-    "legend.fontsize": 8,
-}
 
 
 def plot(recording: Recording, path: str | os.PathLike[str]) -> None:
@@ -58,23 +42,14 @@ def plot(recording: Recording, path: str | os.PathLike[str]) -> None:
     MissingExtra
         matplotlib is not installed.
     """
-    with np.errstate(all="ignore"), replacing(Path(path)) as scratch:
-        draw(recording).savefig(scratch, dpi=110, format="png")
+    save(draw(recording), path)
 
 
 def draw(recording: Recording) -> Any:
     """Draw a recording into a new ``matplotlib.figure.Figure``, apart from pyplot and its global state; see `plot`."""
-    try:
-        import matplotlib
-        from matplotlib.backends.backend_agg import FigureCanvasAgg
-        from matplotlib.figure import Figure
-    except ImportError as error:
-        raise MissingExtra("pictures need matplotlib: pip install 'hapticrender[plot]'") from error
-    with matplotlib.rc_context(STYLE), np.errstate(all="ignore"):
-        touched = bool(np.isfinite(recording.position).any())
-        figure: Any = Figure(figsize=(11, 10.2 if touched else 8.6), layout="constrained")
-        FigureCanvasAgg(figure)
-        figure.get_layout_engine().set(w_pad=0.12, h_pad=0.07)
+    touched = bool(np.isfinite(recording.position).any())
+    height = (10.2 if touched else 8.6) + LANE * max(0, recording.header.drive_channels - 2)
+    with new_figure((11, height), pads=(0.12, 0.07)) as figure:
         _draw(figure, recording, touched)
     return figure
 
@@ -180,7 +155,7 @@ def _close_up(axes: Any, recording: Recording) -> None:
     scale, unit = wording.drawn(recording.header.unit)
     wanted = scale * (recording.read("target", start, stop) * np.exp(1j * phase)).real.sum(axis=1)
     motion = scale * _bounded(recording.read("motion", start, stop)[:, 0])
-    offset = np.nan_to_num(np.mean(motion)) if motion.size else 0.0
+    offset = np.nan_to_num(np.mean(motion - wanted)) if motion.size else 0.0  # a stretch holds parts of periods
     milliseconds = 1e3 * (time - time[:1])
     axes.plot(milliseconds, motion - offset, color=BLUE, lw=1.8, label=recording.header.places[0])
     axes.plot(milliseconds, wanted, color=INK, lw=1.1, ls=(0, (4, 2)), label="target")
@@ -248,26 +223,34 @@ def _errors(axes: Any, recording: Recording, summary: dict[str, Any]) -> None:
 
 def _drive(lanes: list[Any], recording: Recording) -> None:
     """Drive of every channel in its lane; a long run as the range that each column of pixels covers."""
-    drive = _bounded(recording.drive)
-    limit: Any = recording.header.drive_limit
-    peak = np.nanmax(np.abs(drive), initial=0.0) or 1e-3
-    near = limit is not None and peak > 0.4 * limit
-    reach = 1.12 * (max(peak, limit) if near else peak)
-    unit = recording.header.drive_unit
-    lane = "coil" if unit == "A" else "channel"
-    for i, axes in enumerate(lanes[: drive.shape[1]]):
+    header, drive = recording.header, _bounded(recording.drive)
+    units = header.drive_units
+    limit: Any = header.drive_limit if len(set(units)) == 1 else None
+    peaks = {unit: np.nanmax(np.abs(drive[:, [each == unit for each in units]]), initial=0.0) or 1e-3 for unit in units}
+    near = limit is not None and peaks[units[0]] > 0.4 * limit
+    for i, (axes, unit, name) in enumerate(zip(lanes, units, _lane_names(units), strict=True)):
+        reach = 1.12 * (max(peaks[unit], limit) if near else peaks[unit])
         time, low, high = outline(drive[:, i], recording.rate)
         axes.fill_between(time, low, high, color=COILS[i % len(COILS)], lw=0.5)
         for sign in (-1, 1) if near else ():
             axes.axhline(sign * limit, color=INK, lw=1, ls=(0, (4, 2)))
-        axes.set(ylabel=f"{lane} {i + 1} ({unit})" if drive.shape[1] > 1 else f"drive ({unit})", ylim=(-reach, reach))
+        axes.set(ylabel=f"{name} ({unit})", ylim=(-reach, reach))
         if near:
             axes.set_yticks([-limit, 0, limit])
-    stated = "" if limit is None else f", limit ±{limit:g} {unit}" + (" (dashed)" if near else "")
+    stated = "" if limit is None else f", limit ±{limit:g} {units[0]}" + (" (dashed)" if near else "")
     saturated = float(np.mean((recording.flags & Flag.SATURATED) != 0)) if len(recording) else 0.0
     if saturated:
         stated += f", saturated in {wording.percent(saturated)} of the samples"
     lanes[0].set_title(f"Drive{stated}")
+
+
+def _lane_names(units: Sequence[str]) -> list[str]:
+    """Names of the drive's lanes; where units differ, what takes newtons is a screen."""
+    if len(units) == 1:
+        return ["drive"]
+    known = {"A": "coil"} if len(set(units)) == 1 else {"A": "coil", "N": "screen"}
+    names = [known.get(unit, "channel") for unit in units]
+    return [f"{name} {names[: i + 1].count(name)}" if names.count(name) > 1 else name for i, name in enumerate(names)]
 
 
 def _finger(upper: Any, lower: Any, recording: Recording) -> None:

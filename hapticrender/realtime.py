@@ -24,6 +24,7 @@ from numba import types
 
 from hapticrender._exchange import FRESH, SLOTS, behind, bytes_of, empty, place, swap
 from hapticrender._jit import callback, kernel
+from hapticrender._records import as_record
 from hapticrender.bands import Bands
 from hapticrender.control.bank_rows import TONE_ROWS
 from hapticrender.control.block import BlockController
@@ -128,7 +129,7 @@ class RealtimeEntry:
         self._memory = np.zeros(_size(self._parts) // 8 + 8)
         self.user_data = int(self._memory.ctypes.data) // 64 * 64 + 64
         _settle(self.user_data, self._parts)
-        self._pointer = types.CPointer(numba.typeof(self._parts))
+        self._pointer = types.CPointer(as_record(numba.typeof(self._parts)))
 
     @cached_property
     def address(self) -> int:

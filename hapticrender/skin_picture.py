@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from hapticrender.formats import MissingExtra, replacing
-from hapticrender.picture import BLUE, GREEN, INK, ORANGE, QUANTITIES, RED, STYLE
+from hapticrender.figures import BLUE, GREEN, INK, ORANGE, RED, new_figure, save
+from hapticrender.picture import QUANTITIES
 from hapticrender.recording import Recording
 from hapticrender.skin import felt_bands, skin_waveform
 
@@ -27,21 +26,12 @@ def plot_devices(recordings: Mapping[str, Recording], path: str | os.PathLike[st
     MissingExtra
         matplotlib is not installed.
     """
-    with np.errstate(all="ignore"), replacing(Path(path)) as scratch:
-        draw_devices(recordings).savefig(scratch, dpi=110, format="png")
+    save(draw_devices(recordings), path)
 
 
 def draw_devices(recordings: Mapping[str, Recording]) -> Any:
     """Draw into a new ``matplotlib.figure.Figure``; see `plot_devices`."""
-    try:
-        import matplotlib
-        from matplotlib.backends.backend_agg import FigureCanvasAgg
-        from matplotlib.figure import Figure
-    except ImportError as error:
-        raise MissingExtra("pictures need matplotlib: pip install 'hapticrender[plot]'") from error
-    with matplotlib.rc_context(STYLE):
-        figure: Any = Figure(figsize=(12.5, 6.6), layout="constrained")
-        FigureCanvasAgg(figure)
+    with new_figure((12.5, 6.6)) as figure:
         grid = figure.add_gridspec(2, len(recordings), height_ratios=[1.15, 1])
         first: Any = None
         for i, (device, recording) in enumerate(recordings.items()):

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import os
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from hapticrender.formats import MissingExtra, replacing
+from hapticrender.figures import BLUE, GREEN, INK, ORANGE, PALE, new_figure, save
 from hapticrender.loop import render
-from hapticrender.picture import BLUE, GREEN, INK, ORANGE, PALE, STYLE
 from hapticrender.recording import Recording
 from hapticrender.touch.finger import Finger
 from hapticrender.touch.grating import Grating
@@ -40,16 +38,8 @@ def draw_story(path: str | os.PathLike[str], scene: Scene = SCENE) -> None:
     MissingExtra
         matplotlib is not installed.
     """
-    try:
-        import matplotlib
-        from matplotlib.backends.backend_agg import FigureCanvasAgg
-        from matplotlib.figure import Figure
-    except ImportError as error:
-        raise MissingExtra("pictures need matplotlib: pip install 'hapticrender[plot]'") from error
-    recordings = [(title, render(scene, method=name)) for name, title in METHODS]
-    with matplotlib.rc_context(STYLE), np.errstate(all="ignore"), replacing(Path(path)) as scratch:
-        figure: Any = Figure(figsize=(11, 5.4), layout="constrained")
-        FigureCanvasAgg(figure)
+    with new_figure((11, 5.4)) as figure:
+        recordings = [(title, render(scene, method=name)) for name, title in METHODS]
         lanes = figure.subplots(2, 2, sharex=True, sharey="row", height_ratios=[3, 1])
         for column, (title, recording) in enumerate(recordings):
             _motion(lanes[0, column], title, recording)
@@ -63,7 +53,7 @@ def draw_story(path: str | os.PathLike[str], scene: Scene = SCENE) -> None:
             fontweight="bold",
             fontsize=11,
         )
-        figure.savefig(scratch, dpi=110, format="png")
+        save(figure, path)
 
 
 def _motion(axes: Any, title: str, recording: Recording) -> None:

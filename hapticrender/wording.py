@@ -10,6 +10,7 @@ if TYPE_CHECKING:
     from hapticrender.touch.scene import Scene
 
 PLACES = ("centre", "end_1", "end_2")
+MEASURED = {"friction": "friction", "skin": "skin velocity"}  # places that name what is measured, not where
 _PREFIXES = ((1.0, ""), (1e-3, "m"), (1e-6, "µ"), (1e-9, "n"), (1e-12, "p"))
 
 
@@ -73,9 +74,24 @@ def columns_of(summary: Mapping[str, Any]) -> tuple[str, ...]:
 
 
 def titles(summaries: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Titles of those columns."""
-    first = dict.fromkeys(columns_of(summary)[0].replace("_", " ") for summary in summaries)
-    return [" or ".join(first), "end 1", "end 2"]
+    """Titles of those columns; the first is the place's own name where all devices agree on it."""
+    first = {columns_of(summary)[0].replace("_", " ") for summary in summaries}
+    return [first.pop() if len(first) == 1 else "at the finger", "end 1", "end 2"]
+
+
+def at(places: Sequence[str]) -> str:
+    """Say where errors are taken, or of which quantity.
+
+    Examples
+    --------
+    >>> at(["centre", "end_1", "end_2"]), at(["end_1"]), at(["skin"])
+    ('at centre and ends', 'at end 1', 'of skin velocity')
+    """
+    names = [place.replace("_", " ") for place in places]
+    if names and set(names) <= MEASURED.keys():
+        return f"of {' and '.join(MEASURED[name] for name in names)}"
+    ends = len(names) > 1
+    return "at " + " and ".join(dict.fromkeys("ends" if ends and name.startswith("end ") else name for name in names))
 
 
 def drawn(unit: str) -> tuple[float, str]:
@@ -117,11 +133,13 @@ def verdict(summary: Mapping[str, Any]) -> str:
 
 
 def worst_figure(summary: Mapping[str, Any]) -> str:
-    """Say which figure decides the verdict: its name, band, place and value."""
+    """Say which figure decides the verdict: its name, band, place or quantity, and value."""
     worst = summary["worst"]
     place, figure = (str(worst[key]).replace("_", " ") for key in ("place", "figure"))
-    name = figure.removesuffix(f" {place}")
-    return f"{name} of the {worst['band']} band at {place} = {percent(worst['value'])}"
+    name, where = figure.removesuffix(f" {place}"), at([place])
+    band = f"the {worst['band']} band"
+    said = f"{where} in {band}" if place in MEASURED else f"of {band} {where}"
+    return f"{name} {said} = {percent(worst['value'])}"
 
 
 def overview(summaries: Sequence[Mapping[str, Any]]) -> str:
@@ -146,16 +164,25 @@ def conditions(summary: Mapping[str, Any]) -> str:
 
 
 def describe(scene: Scene) -> str:
-    """Describe a scene in a few words: its texture, its finger, its length."""
+    """Describe a scene in a few words: its texture, its finger, its length and its device."""
     texture, motion = scene.texture, scene.finger.motion
     sizes = [
         short(size, unit)
         for key, unit in (("amplitude", "m"), ("wavelength", "m"), ("frequency", "Hz"))
         if (size := getattr(texture, key, None)) is not None
     ]
+    count = _partials(texture)
+    what = f"{_kind(texture)} {' '.join(sizes)}{f', {count} partials' if count > 1 else ''}"
     speed = getattr(motion, "speed", None)
     finger = [f"{_kind(motion)} finger", *([] if speed is None else [short(speed, "m/s")])]
-    return f"{_kind(texture)} {' '.join(sizes)}; {' '.join(finger)}; {short(scene.duration, 's')}"
+    return f"{what}; {' '.join(finger)}; {short(scene.duration, 's')} on {scene.device}"
+
+
+def _partials(texture: Any) -> int:
+    """How many partials a texture has by its own parameters; 1 where it does not say."""
+    if partials := getattr(texture, "partials", None):
+        return len(partials)
+    return getattr(texture, "harmonics", 1) if getattr(texture, "shape", "sine") != "sine" else 1
 
 
 def _kind(thing: Any) -> str:

@@ -13,10 +13,17 @@ from dataclasses import dataclass, replace
 
 from hapticrender.control.bandmodel import BandModel
 from hapticrender.control.square_root import SquareRoot
+from hapticrender.plants.bounds import choice, number
 from hapticrender.plants.electroadhesion import NORMAL, ElectroadhesionParameters, ElectroadhesionScreen
-from hapticrender.plants.sliding import choice, number
 from hapticrender.protocols import Array, Driver
-from hapticrender.renderers.friction import ROOM, FrictionRenderer, FrictionSettings, typical_load, typical_speed
+from hapticrender.renderers.friction import (
+    ROOM,
+    FrictionRenderer,
+    FrictionSettings,
+    largest_load,
+    typical_load,
+    typical_speed,
+)
 from hapticrender.renderers.shaped import CarrierDriver, ShapedDriver
 from hapticrender.touch.scene import Scene
 
@@ -56,8 +63,7 @@ class ElectroadhesionRenderer(FrictionRenderer):
     def plant(self, scene: Scene, seed: int) -> ElectroadhesionScreen:
         """Return the simulated screen, with the scene's overrides and finger."""
         _, parameters = _read(scene)
-        if "open_loop_gain" not in scene.plant:
-            parameters = replace(parameters, open_loop_gain=_nominal(parameters).gain(typical_load(scene)))
+        parameters = replace(parameters, open_loop_gain=_believed_gain(scene, parameters))
         return ElectroadhesionScreen(parameters, scene.finger, seed, self.compensation(scene))
 
     def connect(self, scene: Scene, driver: Driver) -> Driver:
@@ -75,21 +81,23 @@ class ElectroadhesionRenderer(FrictionRenderer):
         for name, value, known in (("drive", driver.drive_channels, (1,)), ("sensed", driver.sensed_channels, (0, 1))):
             if value not in known:
                 raise ValueError(f"driver.{name}_channels = {value}: must be {' or '.join(map(str, known))}")
-        model = self._model(scene, driver.rate, driver.delay, driver.block)
+        model = self._model(scene, driver.rate, driver.delay, driver.block, driver.sensed_channels > 0)
         compensation = self.compensation(scene)
+        _, parameters = _read(scene)
+        if driver.sensed_channels and parameters.sensor == "tribometer":
+            steady = parameters.friction_coefficient * (largest_load(scene) + compensation.bias)
+            self.check_range(scene, model, parameters, steady)
         return replace(model, drive_limit=compensation.bias - compensation.floor)
 
     def sensor_response(self, scene: Scene, frequency: Array) -> Array:
         """Return what the tribometer shows of friction, or what the gap's impedance says of it before it lags."""
         _, parameters = _read(scene)
-        if parameters.sensor == "tribometer":
-            return parameters.tribometer_response(frequency)
-        speed = typical_speed(scene, parameters.least_speed)
-        shown = parameters.friction_coefficient * parameters.sensed_response(frequency, speed)
-        return shown / (parameters.friction_coefficient * parameters.lag_response(frequency, speed))
+        return parameters.sensor_response(frequency, typical_speed(scene, parameters.least_speed))
 
     def compensation(self, scene: Scene) -> SquareRoot:
         """Return the square root for a nominal finger under the scene's load, its bias as large as the scene needs.
+
+        A scene that gives `open_loop_gain` is believed.
 
         Raises
         ------
@@ -101,28 +109,32 @@ class ElectroadhesionRenderer(FrictionRenderer):
         limit, unit = parameters.voltage_limit, "V"
         if parameters.drive_kind == "current":
             limit, unit = min(parameters.current_limit, limit / abs(finger.impedance(load))), "A"
-        most = float(finger.attraction(limit, load))
+        gain = _believed_gain(scene, parameters) / finger.gain(load) * float(finger.attraction(1.0, load))
+        most = gain * limit**2
         swing = settings.headroom * self.needed(scene, self._model(scene, parameters.rate, 1, 1))
         bias = swing / (1.0 - settings.floor)
-        peak = bias + swing
-        if peak > most:
+        if bias + swing > most:
             raise ValueError(
-                f"texture.amplitude asks for an attraction of {peak:.3g} N: must be <= {most:.3g} N, "
+                f"texture.amplitude asks for an attraction of {bias + swing:.3g} N: must be <= {most:.3g} N, "
                 f"what {limit:.3g} {unit} make of a nominal finger of {load:.3g} N"
             )
         return SquareRoot(
             bias=bias,
             floor=settings.floor * bias,
-            gain=float(finger.attraction(1.0, load)),
+            gain=gain,
             straight=settings.square_root == "off",
         )
 
-    def _model(self, scene: Scene, rate: float, delay: int, block: int) -> BandModel:
+    def _model(self, scene: Scene, rate: float, delay: int, block: int, listening: bool = True) -> BandModel:
         """Band model without its drive limit."""
         _, parameters = _read(scene)
         mu = parameters.friction_coefficient
-        model = self.contact(scene, parameters, rate=rate, delay=delay, block=block, friction_per_drive=mu)
-        if parameters.sensor == "impedance":  # what is sensed is the attraction, behind the estimator's low pass
+        model = self.contact(
+            scene, parameters, rate=rate, delay=delay, block=block, friction_per_drive=mu, listening=listening
+        )
+        if (
+            listening and parameters.sensor == "impedance"
+        ):  # what is sensed is the attraction, behind the estimator's low pass
             lag = parameters.estimator.delay
             model = replace(
                 model,
@@ -130,15 +142,24 @@ class ElectroadhesionRenderer(FrictionRenderer):
                 damping=lag / mu * model.force_from_drive,
                 coordinate_from_sensed=mu * model.coordinate_from_sensed,
                 memory=0.0,
+                late=lag,
+                foresight=parameters.memory_length,
             )
         return model
 
 
 def _read(scene: Scene) -> tuple[ElectroadhesionSettings, ElectroadhesionParameters]:
     settings, rest = ElectroadhesionSettings.split(scene.plant)
-    return settings, ElectroadhesionParameters.with_overrides(rest)  # type: ignore[return-value]
+    return settings, ElectroadhesionParameters.with_overrides(rest, settings.names())  # type: ignore[return-value]
 
 
 def _nominal(parameters: ElectroadhesionParameters) -> ElectroadhesionParameters:
     """Return the screen under a finger as one must be taken to be before it is felt."""
     return replace(parameters, area_scale=1.0, gap_thickness=NOMINAL_GAP, gap_resistance=NORMAL)
+
+
+def _believed_gain(scene: Scene, parameters: ElectroadhesionParameters) -> float:
+    """Return g (N/A^2) of a finger that is not sensed: as the scene says, else of a nominal one under its load."""
+    if "open_loop_gain" in scene.plant:
+        return parameters.open_loop_gain
+    return _nominal(parameters).gain(typical_load(scene))

@@ -10,17 +10,18 @@ speed, as the skin velocity of a real grating does.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from hapticrender.bands import Bands
 from hapticrender.control.bandmodel import BandModel, FingerRange
-from hapticrender.plants.sliding import SlidingParameters, Validated, choice, number
+from hapticrender.plants.bounds import Validated, choice, number
+from hapticrender.plants.sliding import SlidingParameters
 from hapticrender.protocols import Array
 from hapticrender.renderers.base import BaseRenderer, Waveform
-from hapticrender.renderers.limits import check_carriers, felt, needed_drive, speeds
+from hapticrender.renderers.limits import check_carriers, felt, looked_at, needed_drive, speeds, wanted_amplitude
 from hapticrender.touch.perception import VELOCITY_PER_FORCE
 from hapticrender.touch.scene import Scene
 
@@ -48,7 +49,7 @@ class FrictionSettings(Validated):
     @classmethod
     def split(cls, plant: Mapping[str, Any]) -> tuple[FrictionSettings, dict[str, Any]]:
         """Settings, and what is left of a scene's `plant` table for the device."""
-        own = {each.name for each in fields(cls)}
+        own = cls.names()
         settings = cls.with_overrides({key: value for key, value in plant.items() if key in own})
         return settings, {key: value for key, value in plant.items() if key not in own}
 
@@ -70,6 +71,8 @@ class FrictionRenderer(BaseRenderer):
         bands = felt(scene, scene.texture.bands(model.rate), model)
         check_carriers(scene, model, bands)
         if bands.envelope is None:
+            if not settings.velocity_per_force:
+                raise ValueError("plant.velocity_per_force = 0: must be > 0 m/(N s) for a recording")
             return replace(bands, differentiated=True)
         return replace(bands, **_as_friction(scene, bands, settings))
 
@@ -80,10 +83,12 @@ class FrictionRenderer(BaseRenderer):
     def bands(self, scene: Scene, model: BandModel) -> Bands:
         """Carriers and targets of a scene; `band_model` has refused what is beyond the device.
 
-        What the sensor makes of a fixed carrier is known, and taken into account.
+        What the sensor makes of a fixed carrier is known, and taken into account; of one that follows the finger the
+        controller knows how late it is shown.
         """
         bands = self.wanted(scene, model)
-        if bands.envelope is None or (bands.wavenumber > 0.0).any():
+        deaf = model.late == model.foresight == 0.0
+        if deaf or bands.envelope is None or (bands.wavenumber > 0.0).any():
             return bands
         return replace(bands, shown=self.sensor_response(scene, bands.frequency))
 
@@ -96,23 +101,25 @@ class FrictionRenderer(BaseRenderer):
         delay: int,
         block: int,
         friction_per_drive: float,
+        listening: bool = True,
     ) -> BandModel:
         """Band model of a sliding contact whose drive makes `friction_per_drive` (N per N), seen by a tribometer.
 
         ``(1 + s delta/v) (1 + 2 zeta s/w0 + s^2/w0^2) F = friction_per_drive u`` up to s^2, at the scene's median
-        speed; the drive limit is not set.
+        speed; without the tribometer's part where nothing is `listening`.  The drive limit is not set.
         """
         speed = typical_speed(scene, sliding.least_speed)
         lag = sliding.memory_length / speed
         w0 = 2 * np.pi * sliding.tribometer_frequency
-        ring = 2 * sliding.tribometer_damping / w0
+        ring = 2 * sliding.tribometer_damping / w0 if listening else 0.0
         own = 1.0 / friction_per_drive
         one = np.eye(1)
         return BandModel(
             rate=rate,
             delay=delay,
             block=block,
-            mass=own * (1 / w0**2 + ring * lag) * one,
+            mass=own * (1 / w0**2 + ring * lag if listening else 0.0) * one,
+            late=ring,
             damping=own * (lag + ring) * one,
             stiffness=own * one,
             force_from_drive=one,
@@ -137,8 +144,15 @@ class FrictionRenderer(BaseRenderer):
                 least_motion=LEAST_FORCE,
                 contact=None,
                 presence=True,
+                least_speed=sliding.least_speed,
             ),
         )
+
+    def check_range(self, scene: Scene, model: BandModel, sliding: SlidingParameters, steady: float) -> None:
+        """Refuse a friction, `steady` (N) for the most part, that a tribometer cannot show."""
+        most = steady + wanted_amplitude(scene, model, self.wanted(scene, model), self.waveform(scene))
+        if most > sliding.force_range:
+            raise ValueError(f"friction of {most:.3g} N: must be <= {sliding.force_range:g} N, the tribometer's range")
 
     def needed(self, scene: Scene, model: BandModel) -> float:
         """Largest drive (N) that the scene needs of `model`, the finger as assumed there."""
@@ -158,12 +172,17 @@ def typical_speed(scene: Scene, least: float) -> float:
 
 def typical_load(scene: Scene) -> float:
     """Mean normal load (N) of the finger while it touches."""
-    time = np.arange(0.0, min(scene.duration, 30.0), 1e-3)
+    time = looked_at(scene)
     load = scene.finger.load(time)[np.isfinite(scene.finger.position(time))]
     mean = float(load.mean()) if load.size else 0.0
     if not mean > 0.0:
         raise ValueError("finger.normal_load = 0: must be > 0 N, friction needs a load")
     return mean
+
+
+def largest_load(scene: Scene) -> float:
+    """Largest normal load (N) of the finger."""
+    return float(np.max(scene.finger.load(looked_at(scene)), initial=0.0))
 
 
 def _as_friction(scene: Scene, bands: Bands, settings: FrictionSettings) -> dict[str, Any]:
@@ -174,6 +193,10 @@ def _as_friction(scene: Scene, bands: Bands, settings: FrictionSettings) -> dict
     elif locked:
         raise ValueError("plant.velocity_per_force = 0: must be > 0 m/(N s) for a texture over position")
     else:
+        if scene.finger.mechanics.order == 0:
+            raise ValueError(
+                "plant.velocity_per_force = 0: must be > 0 m/(N s), or finger.mechanics one that moves: it has none"
+            )
         share = scene.finger.mechanics.skin_velocity_per_force(bands.frequency)
     if locked:
         return {"envelope": bands.envelope / share, "differentiated": True}

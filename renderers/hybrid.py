@@ -20,9 +20,9 @@ import numpy as np
 from hapticrender.bands import Bands
 from hapticrender.control.bandmodel import BandModel
 from hapticrender.control.together import TogetherController, TwoBands, TwoModels, design_together
+from hapticrender.plants.bounds import Validated, check_names, number
 from hapticrender.plants.electroadhesion import ElectroadhesionParameters, ElectroadhesionScreen
 from hapticrender.plants.hybrid import PLACES, HybridPlant
-from hapticrender.plants.sliding import Validated, number
 from hapticrender.plants.vibrotactile import PlateParameters
 from hapticrender.protocols import Array, Driver, Method, Sensed, Texture
 from hapticrender.renderers.base import BaseRenderer
@@ -139,6 +139,7 @@ class HybridRenderer(BaseRenderer):
     """Renderer for a plate on two coils with a current-driven electroadhesion screen laminated on it."""
 
     name = "hybrid"
+    needs = "2 coils (A), 2 displacement sensors (m), a current source on a carrier (A peak), a tribometer (N)"
 
     def __init__(self) -> None:
         self._plate, self._screen = VibrotactileRenderer(), ElectroadhesionRenderer()
@@ -171,8 +172,10 @@ class HybridRenderer(BaseRenderer):
         rubbed = None
         if len(parts.bands.rubbed):
             rubbed = self._screen.band_model(parts.rubbed, _View(driver, 1, 1, "screen"))  # type: ignore[arg-type]
-            rubbed = replace(rubbed, lowest_frequency=2 * parts.settings.start)
-        moved = replace(moved, highest_frequency=parts.settings.start, highest_edge=2.0)
+        if rubbed is not None and (parts.bands.wavenumber > 0.0).any():  # fixed carriers have their share for good
+            start = parts.settings.start
+            moved = replace(moved, highest_frequency=start, highest_edge=2.0)
+            rubbed = replace(rubbed, lowest_frequency=2 * start)
         return _side_by_side(moved, rubbed, parts.velocity_per_force)
 
     def bands(self, scene: Scene, model: BandModel) -> TwoBands:
@@ -227,11 +230,11 @@ def _part(scene: Scene, bands: Bands, plant: Mapping[str, Any]) -> Scene:
 def _share_out(scene: Scene, settings: HybridSettings, plate: PlateParameters, rate: float) -> TwoBands:
     """Bands of a scene, and the share of each part as displacement (m)."""
     whole = felt(scene, scene.texture.bands(rate), plate.band_model(rate, 1))
-    if whole.envelope is None:
-        raise ValueError(
-            "texture: must have constant envelopes on a hybrid (a grating); a waveform is not shared out in time"
-        )
     locked = whole.wavenumber > 0.0
+    if whole.envelope is None and not locked.all():
+        raise ValueError(
+            "texture: must be a grating, or go over position, on a hybrid: a recording over time is not shared out"
+        )
     high = settings.share_of_screen(whole.frequency)
     shares = np.where(locked, 1.0, 1.0 - high), np.where(locked, 1.0, high)  # locked: the fades of the banks share
     index = [np.flatnonzero(share > 0.0) for share in shares]
@@ -241,7 +244,7 @@ def _share_out(scene: Scene, settings: HybridSettings, plate: PlateParameters, r
             frequency=whole.frequency[which],
             wavenumber=whole.wavenumber[which],
             phase=whole.phase[which],
-            envelope=(share * whole.envelope)[which],
+            envelope=None if whole.envelope is None else (share * whole.envelope)[which],
             unfelt=(),
         )
         for share, which in zip(shares, index, strict=True)
@@ -252,30 +255,25 @@ def _share_out(scene: Scene, settings: HybridSettings, plate: PlateParameters, r
 
 def _split(plant: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any], dict[str, Any]]:
     """Settings of the hybrid, parameters of the plate and of the screen; `plate_` or `screen_` tells which is meant."""
-    own = {each.name for each in fields(HybridSettings)}
-    plate = {each.name for each in fields(PlateParameters)}
-    screen = {each.name for kind in (FrictionSettings, ElectroadhesionParameters) for each in fields(kind)}
+    own, plate = HybridSettings.names(), PlateParameters.names()
+    screen = FrictionSettings.names() | ElectroadhesionParameters.names()
     double = plate & screen - {BOTH}
+    known = own | (plate | screen) - double | {f"{of}_{each}" for each in double for of in ("plate", "screen")}
+    check_names([key for key in plant if key not in double], known)
     found: tuple[dict[str, Any], ...] = ({}, {}, {})
     for key, value in plant.items():
         if key in double:
             raise ValueError(f"plant.{key} = {value!r}: must be plate_{key} or screen_{key}: both have one")
         whose = [
             (table, name)
-            for table, known, name in zip(
+            for table, names, name in zip(
                 found, (own, plate, screen), (key, key.removeprefix("plate_"), key.removeprefix("screen_")), strict=True
             )
-            if name in known and (name == key or name in double)
+            if name in names and (name == key or name in double)
         ]
-        if not whose:
-            known = sorted(own | (plate | screen) - double | {f"{of}_{each}" for each in double for of in _OF})
-            raise ValueError(f"plant.{key}: no such parameter; known: {', '.join(known)}")
         for table, name in whose:
             table[name] = value
     return found[0], found[1], found[2]
-
-
-_OF = ("plate", "screen")
 
 
 def _side_by_side(moved: BandModel, rubbed: BandModel | None, velocity_per_force: float) -> TwoModels:

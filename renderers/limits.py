@@ -31,8 +31,14 @@ def check_path(scene: Scene, half: float, surface: str) -> None:
 
 def speeds(scene: Scene) -> Array:
     """Speed of the finger (m/s) every millisecond, NaN while it is lifted."""
-    time = np.arange(0.0, min(scene.duration, LOOK_AHEAD), CHECK_STEP)
-    return abs(np.diff(scene.finger.position(time))) / CHECK_STEP
+    return abs(np.diff(scene.finger.position(looked_at(scene)))) / CHECK_STEP
+
+
+def looked_at(scene: Scene) -> Array:
+    """Times (s) at which the finger is looked at: every millisecond of the first `LOOK_AHEAD` in which it touches."""
+    touches = scene.finger.touches
+    start = min((on for on, _ in touches), default=0.0) if touches else 0.0
+    return np.arange(start, min(scene.duration, start + LOOK_AHEAD) + 2 * CHECK_STEP, CHECK_STEP)
 
 
 def top_speed(scene: Scene) -> float:
@@ -88,6 +94,11 @@ def check_targets(scene: Scene, model: BandModel, bands: Bands, waveform: Wavefo
 def needed_drive(scene: Scene, model: BandModel, bands: Bands, waveform: Waveform) -> float:
     """Largest drive that the free device needs for the targets."""
     return _need(scene, model, bands, waveform).drive
+
+
+def wanted_amplitude(scene: Scene, model: BandModel, bands: Bands, waveform: Waveform) -> float:
+    """Largest sum of the targets, in the device's quantity."""
+    return _need(scene, model, bands, waveform).amplitude
 
 
 class _Need(NamedTuple):

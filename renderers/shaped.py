@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from hapticrender.control.oscillator import Oscillator
 from hapticrender.protocols import Array, Driver, Sensed
 
 LEAST_SAMPLES = 4  # in a turn of a carrier
@@ -59,8 +60,7 @@ class CarrierDriver(ShapedDriver):
 
     Notes
     -----
-    The carrier starts at its crest, so that a device that blocks direct current keeps no charge; its phase is counted
-    in 2^-64 of a turn.
+    The carrier starts at its crest, so that a device that blocks direct current keeps no charge.
     """
 
     def __init__(
@@ -82,15 +82,11 @@ class CarrierDriver(ShapedDriver):
         self.hold = max(each for each in range(1, min(whole, most) + 1) if whole % each == 0)
         self.rate = driver.rate / self.hold
         self.block, self.delay = driver.block // self.hold, driver.delay // self.hold
-        self._advance = np.uint64(round(frequency / driver.rate * 2**64))
-        self._phase = np.uint64(0)  # of the next sample, 2^64 a turn
+        self._carrier = Oscillator(frequency, driver.rate)
 
     def play(self, drive: Array) -> Sensed:
         """Play the carrier under `shape` of a block."""
-        count = len(drive) * self.hold
-        phase = self._phase + np.arange(count, dtype=np.uint64) * self._advance
-        self._phase = np.uint64((int(self._phase) + count * int(self._advance)) % 2**64)
-        carrier = np.cos(2 * np.pi * 2.0**-64 * phase)
+        carrier = self._carrier.take(len(drive) * self.hold)
         sensed = self.driver.play(np.repeat(self.shape(drive), self.hold, axis=0) * carrier[:, None])
         return self._thinned(sensed)
 

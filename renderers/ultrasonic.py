@@ -2,7 +2,9 @@
 
 The target quantity is friction (N), as a change around a bias below that of
 the surface at rest.  The inverse of the friction law makes it an amplitude of
-the plate's mode, which the same controller holds on the resonant carrier.
+the plate's mode, which the same controller holds on the resonant carrier.  A
+driver of your own gets that carrier (V) at its own rate, and senses the mode's
+displacement (m), or nothing.
 """
 
 from __future__ import annotations
@@ -11,14 +13,21 @@ from dataclasses import replace
 
 import numpy as np
 
-from hapticrender import defaults
+from hapticrender.bands import Bands
 from hapticrender.control.bandmodel import BandModel
-from hapticrender.control.bank import BankController
-from hapticrender.control.methods import method_named
 from hapticrender.plants.surface import SurfaceParameters, UltrasonicSurface
 from hapticrender.protocols import Array, Driver
-from hapticrender.renderers.friction import FrictionRenderer, FrictionSettings, typical_load, typical_speed
+from hapticrender.renderers.friction import (
+    FrictionRenderer,
+    FrictionSettings,
+    largest_load,
+    typical_load,
+    typical_speed,
+)
+from hapticrender.renderers.resonant import ResonantDriver, amplitude_loop
 from hapticrender.touch.scene import Scene
+
+LEAST_NOISE = 1e-6  # of the range: of a friction that is worked out from the amplitude
 
 
 class UltrasonicRenderer(FrictionRenderer):
@@ -32,6 +41,12 @@ class UltrasonicRenderer(FrictionRenderer):
         _, parameters = _read(scene)
         nominal = typical_load(scene), typical_speed(scene, parameters.least_speed)
         return UltrasonicSurface(parameters, amplitude_loop(parameters), scene.finger, seed, nominal)
+
+    def connect(self, scene: Scene, driver: Driver) -> Driver:
+        """Return a device at the carrier's rate as a driver of friction; see `ResonantDriver`."""
+        _, parameters = _read(scene)
+        nominal = typical_load(scene), typical_speed(scene, parameters.least_speed)
+        return ResonantDriver(driver, parameters, scene.finger, nominal)
 
     def band_model(self, scene: Scene, driver: Driver) -> BandModel:
         """Return what the controller may know of the surface behind `driver`.
@@ -54,46 +69,66 @@ class UltrasonicRenderer(FrictionRenderer):
                 f"texture.amplitude asks for {need:.3g} N of friction: must be <= {room:.3g} N, what amplitude can "
                 f"change around {parameters.bias:g} of the friction of a finger of {typical_load(scene):.3g} N"
             )
+        if driver.sensed_channels and parameters.sensor == "tribometer":
+            self.check_range(scene, model, parameters, parameters.friction_coefficient * largest_load(scene))
+        _check_amplitude(parameters, need / whole, typical_load(scene), typical_speed(scene, parameters.least_speed))
         return replace(model, drive_limit=room)
+
+    def bands(self, scene: Scene, model: BandModel) -> Bands:
+        """Carriers and targets of a scene, refused where the amplitude could not follow."""
+        bands = super().bands(scene, model)
+        if bands.frequency.max(initial=0.0) > model.highest_frequency:
+            raise ValueError(
+                f"texture.frequency = {bands.frequency.max():g}: must be <= {model.highest_frequency:g} Hz, "
+                "which the amplitude can follow"
+            )
+        return bands
 
     def sensor_response(self, scene: Scene, frequency: Array) -> Array:
         """Return what the tribometer shows of friction, or what the sensed amplitude says of it before it lags."""
         _, parameters = _read(scene)
-        if parameters.sensor == "tribometer":
-            return parameters.tribometer_response(frequency)
-        late = np.exp(
-            1j * np.pi * np.asarray(frequency, float) / parameters.rate
-        )  # from the sample's middle to its end
-        speed = typical_speed(scene, parameters.least_speed)
-        return 1.0 / (parameters.lag_response(frequency, speed) * late)
+        return parameters.sensor_response(frequency, typical_speed(scene, parameters.least_speed))
 
     def _model(self, scene: Scene, parameters: SurfaceParameters, driver: Driver) -> BandModel:
         """Band model without its drive limit: what carries the amplitude along takes half a sample more than a hold."""
+        listening, late = driver.sensed_channels > 0, 0.5 / driver.rate
         model = self.contact(
-            scene, parameters, rate=driver.rate, delay=driver.delay, block=driver.block, friction_per_drive=1.0
+            scene,
+            parameters,
+            rate=driver.rate,
+            delay=driver.delay,
+            block=driver.block,
+            friction_per_drive=1.0,
+            listening=listening,
         )
-        if parameters.sensor == "amplitude":  # no contact and no tribometer between
-            late = 0.5 / driver.rate
-            noise = 1e-6 * model.sensed_limit
+        if listening and parameters.sensor == "amplitude":  # no contact and no tribometer between
             return replace(
                 model,
                 mass=late**2 / 2 * np.eye(1),
                 damping=late * np.eye(1),
                 stiffness=np.eye(1),
                 memory=0.0,
-                sensed_noise=noise,
+                late=0.0,
+                foresight=parameters.memory_length,
+                sensed_noise=LEAST_NOISE * model.sensed_limit,
             )
-        return replace(model, damping=model.damping + 0.5 / driver.rate)
+        mass = model.mass + late * model.damping + late**2 / 2 * model.stiffness
+        return replace(model, mass=mass, damping=model.damping + late * model.stiffness)
 
 
-def amplitude_loop(parameters: SurfaceParameters) -> BankController:
-    """Return the amplitude's own controller, of the default method, at rest."""
-    loop = method_named(defaults.METHOD).design(parameters.amplitude_model(), parameters.amplitude_bands())
-    if not isinstance(loop, BankController):
-        raise TypeError(f"method {defaults.METHOD!r}: must step sample by sample on a carrier")
-    return loop
+def _check_amplitude(parameters: SurfaceParameters, swing: float, load: float, speed: float) -> None:
+    """Refuse a `swing` of the friction (1) around the bias for which the drive is too weak, however slow it is."""
+    least = max(parameters.bias - swing, parameters.least_ratio)
+    amplitude = float(parameters.friction_law.amplitude(least, load, speed))
+    mode = parameters.mode
+    volts = mode.drive_for(amplitude, normal_load=load)
+    if volts > mode.drive_limit:
+        raise ValueError(
+            f"texture.amplitude asks for a vibration of {amplitude:.3g} m, which takes {volts:.3g} V under "
+            f"{load:.3g} N: must be <= {mode.drive_limit:g} V"
+        )
 
 
 def _read(scene: Scene) -> tuple[FrictionSettings, SurfaceParameters]:
     settings, rest = FrictionSettings.split(scene.plant)
-    return settings, SurfaceParameters.with_overrides(rest)
+    return settings, SurfaceParameters.with_overrides(rest, settings.names())

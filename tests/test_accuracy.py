@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import hapticrender as hr
-from hapticrender import accuracy, defaults
+from hapticrender import accuracy, accuracy_figures, accuracy_suite, defaults
 from hapticrender.drivers.simulated import SimulatedDriver
 from hapticrender.plants.identify import identify, require_delay
 from hapticrender.plants.vibrotactile import Plate, PlateParameters
@@ -29,21 +29,21 @@ def test_every_case_has_its_targets_and_every_target_its_case():
 
 
 def test_the_default_method_meets_every_bound_in_motion():
-    assert not missed(accuracy.run_suite([defaults.METHOD], QUICK))
+    assert not missed(accuracy_suite.run_suite([defaults.METHOD], QUICK))
 
 
 @pytest.mark.slow
 def test_the_default_method_meets_every_bound_at_rest():
-    assert not missed(accuracy.run_suite([defaults.METHOD], LONG))
+    assert not missed(accuracy_suite.run_suite([defaults.METHOD], LONG))
 
 
 def test_the_papers_method_misses_and_the_report_says_so(tmp_path):
-    figures = accuracy.run_suite(["paper"], ["chirp"])
+    figures = accuracy_suite.run_suite(["paper"], ["chirp"])
     assert len(missed(figures)) == 4
-    accuracy.write_json(tmp_path / "a.json", figures)
+    accuracy_figures.write_json(tmp_path / "a.json", figures)
     report = json.loads((tmp_path / "a.json").read_text(encoding="utf-8"))
     assert [row["passed"] for row in report["figures"]] == [False] * 4
-    assert "MISSED" in accuracy.as_rows(figures, ["paper"])[1][-1]
+    assert "MISSED" in accuracy_figures.as_rows(figures, ["paper"])[1][-1]
 
 
 @pytest.mark.parametrize("wavelength", [0.5e-3, 1e-3, 2e-3])

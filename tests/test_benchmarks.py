@@ -122,6 +122,18 @@ def test_pairs_are_taken_in_turns(benchmarks):
     assert found.ratio > 0
 
 
+def test_the_spread_of_pairs_is_that_of_their_quarters(benchmarks):
+    from pairing import interleave
+
+    def nothing():
+        pass
+
+    times = iter([0.0, 1.0, 0.0, 1.0, 0.0, 1.0, 0.0, 2.0, 0.0, 1.0, 0.0, 3.0])  # candidate 1 s, reference 1, 2, 3 s
+    found = interleave(nothing, nothing, 3, lambda: next(times))
+    assert (found.candidate, found.reference, found.ratio) == (1.0, 2.0, 2.0)
+    assert (found.low, found.high) == (1.5, 2.5)
+
+
 @pytest.mark.parametrize(
     ("measured", "at_least", "met", "within"),
     [(1.1, False, True, True), (1.5, False, False, True), (3.1, False, False, False), (0.2, True, False, False)],

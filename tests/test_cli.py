@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 
 from hapticrender import __version__, cli
 from hapticrender.recording import Recording
-from hapticrender.touch.builtin import builtin_scenes
+from hapticrender.touch.builtin import DEVICES, builtin_scenes
 from hapticrender.touch.scene import Scene
 
 TINY = """\
@@ -223,6 +223,18 @@ def test_devices_are_listed(run):
         assert len(line.split()) > 4
 
 
+def test_every_kind_of_device_says_what_a_real_one_needs(run):
+    _, out, _ = run("devices")
+    head, *kinds = out.partition("\n\n")[0].splitlines()
+    assert head.split()[:2] == ["kind", "installed"]
+    assert {line.split()[0] for line in kinds} >= set(DEVICES)
+    for line in kinds:
+        assert "a driver  (" not in line, "the words for one that does not say"
+    (hybrid,) = [line for line in kinds if line.startswith("hybrid ")]
+    for part in ("2 coils (A)", "2 displacement sensors (m)", "a current source", "a tribometer (N)"):
+        assert part in hybrid
+
+
 @pytest.mark.parametrize(
     ("source", "reason"),
     [
@@ -241,7 +253,7 @@ def test_a_broken_package_is_shown_as_broken_and_hides_no_other(run, tmp_path, m
     test_devices_are_listed(run)
     _, out, _ = run("devices")
     (line,) = [line for line in out.splitlines() if line.split()[:1] == ["theirs"]]
-    assert line.split(maxsplit=1)[1] == f"broken: cannot be loaded from third_party:Driver ({reason})"
+    assert line.split(maxsplit=1)[1] == f"broken  cannot be loaded from third_party:Driver ({reason})"
 
 
 def test_help_and_version(capsys):

@@ -362,9 +362,38 @@ def test_bad_parameters_are_refused_with_value_bound_and_unit(overrides, message
         ElectroadhesionParameters.with_overrides(overrides)
 
 
-def test_a_square_root_needs_a_current_and_good_numbers():
-    with pytest.raises(ValueError, match="compensation: must be None where drive_kind = 'voltage'"):
-        screen(SLIDE, ROOT, drive_kind="voltage")
+@LEVELS
+def test_a_square_root_of_a_voltage_has_its_gain_in_newtons_per_square_volt(level):
+    """As the nominal finger makes the wanted attraction; carrier and envelope agree to the gap's own memory."""
+    nominal = ElectroadhesionParameters(drive_kind="voltage")
+    root = SquareRoot(bias=0.3, floor=0.01, gain=float(nominal.attraction(1.0, 1.0)))
+    assert attraction(0.1, compensation=root, drive_kind="voltage", level=level) == pytest.approx(0.4, rel=1e-6)
+
+
+def test_the_straight_envelope_has_the_same_peak_and_slope():
+    """I = sqrt(2 bias/g)(1 + u/bias)/2, so g I^2 = bias/2 + u + u^2/(2 bias), down to its floor."""
+    straight = SquareRoot(bias=0.45, floor=0.02, gain=2.2e4, straight=True)
+    drive = np.array([-0.6, -0.2, 0.0, 0.45])
+    wanted = np.maximum(drive, 0.02 - 0.45)
+    np.testing.assert_allclose(2.2e4 * straight(drive) ** 2, 0.225 + wanted + wanted**2 / 0.9, rtol=1e-12)
+    assert straight(0.45) == pytest.approx(ROOT(0.45), rel=1e-14)
+    for value, expected in zip(drive, straight(drive), strict=True):
+        assert attraction(float(value), compensation=straight) == pytest.approx(
+            ElectroadhesionParameters().gain(1.0) * expected**2, rel=1e-9
+        )
+
+
+def test_attraction_is_told_sample_by_sample():
+    """The law of the envelope, and nothing where the finger rests or is away."""
+    path = hr.Finger.sampled([0.0, 0.02, 0.02], times=[0.0, 0.4, 0.8], normal_load=1.0, touches=[(0.0, 0.6)])
+    s = screen(path, ROOT)
+    s.run(np.full((8000, 1), 0.1))
+    expected = ElectroadhesionParameters().gain(1.0) / ROOT.gain * 0.55
+    np.testing.assert_allclose(s.attraction[:3999], expected, rtol=1e-12)
+    assert not s.attraction[4000:].any()
+
+
+def test_a_square_root_needs_good_numbers():
     with pytest.raises(ValueError, match=r"bias = 0.1: must be > 0.2 N"):
         SquareRoot(bias=0.1, floor=0.2, gain=1e4)
     with pytest.raises(ValueError, match=r"gain = 0.0: must be > 0 N/A\^2"):

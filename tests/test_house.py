@@ -89,7 +89,18 @@ def test_type_checkers_are_told_of_every_public_name():
 
 GROUND = {
     f"hapticrender.{name}"
-    for name in ("protocols", "errors", "bands", "contract", "defaults", "_jit", "_lanes", "_polynomials")
+    for name in (
+        "protocols",
+        "errors",
+        "bands",
+        "contract",
+        "defaults",
+        "_records",
+        "_fragments",
+        "_jit",
+        "_lanes",
+        "_polynomials",
+    )
 }
 MAY_IMPORT = {  # room: the other rooms that it may look into
     "ground": set(),
@@ -166,6 +177,15 @@ def test_the_layers_would_notice_an_upward_import(tmp_path):
     }
 
 
+LONGEST = 500  # lines
+LONG = {"hapticrender/_lanes.py"}  # to be split
+
+
+def test_no_shipped_file_is_too_long_to_read():
+    lengths = {path.relative_to(ROOT).as_posix(): len(path.read_text("utf-8").splitlines()) for path in shipped_files()}
+    assert {name for name, length in lengths.items() if length > LONGEST} <= LONG
+
+
 @pytest.mark.parametrize("name", MODULES)
 def test_shipped_code_does_not_assert(name):
     assert not [node.lineno for node in ast.walk(tree_of(MODULES[name])) if isinstance(node, ast.Assert)]
@@ -209,6 +229,9 @@ def test_documented_parameters_are_the_signatures(name):
         told = documented(value)
         if told is not None:
             names, in_order = parameters(value)
+            above = {each for base in getattr(value, "__mro__", ())[1:] for each in documented(base) or ()}
+            if above.isdisjoint(told):  # what a base class says of its parameters need not be said again
+                names, in_order = ([each for each in listed if each not in above] for listed in (names, in_order))
             assert sorted(told) == sorted(names), f"{name}.{value.__qualname__}"
             assert [each for each in told if each in in_order] == in_order, f"{name}.{value.__qualname__}"
 

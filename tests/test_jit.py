@@ -4,9 +4,16 @@ import os
 import shutil
 import subprocess
 import sys
+from typing import NamedTuple
 
+import numba
+import numpy as np
 import pytest
 from conftest import ROOT
+from numba.core import types
+from numba.core.errors import TypingError
+
+from hapticrender._jit import by_types, kernel
 
 HELPER = """
 from {jit} import kernel
@@ -119,3 +126,82 @@ def test_numbers_that_are_compiled_in_count(tmp_path):
     first = stamp("RE, IM = 0, 1", "a")
     assert stamp("RE, IM = 0, 1", "b") == first
     assert stamp("IM, RE = 0, 1", "b") != first
+
+
+class Inner(NamedTuple):
+    gain: float
+    steps: tuple
+
+
+class Outer(NamedTuple):
+    offset: float
+    inner: Inner
+    out: np.ndarray
+
+
+@kernel
+def apply(inner, x):
+    return inner.gain * x + inner.steps[1]
+
+
+@kernel
+def fill(outer, x):
+    for i in range(outer.out.shape[0]):
+        outer.out[i] = outer.offset + apply(outer.inner, x[i])
+
+
+def test_named_tuples_reach_a_kernel_and_its_parts():
+    """Fields, a tuple inside, an array that is written to, and a field that is no number."""
+    x, record = np.array([1.0, 2.0]), Outer(10.0, Inner(3.0, (5.0, 7.0)), np.zeros(2))
+    fill(record, x)
+    np.testing.assert_array_equal(record.out, 10.0 + 3.0 * x + 7.0)
+    with pytest.raises(TypingError):
+        fill(record._replace(offset="10"), x)
+
+
+@kernel
+def twice(x):
+    return 2.0 * x
+
+
+@kernel
+def first(x):
+    return x[0]
+
+
+@by_types
+def plain(x):
+    return first if isinstance(x, types.Array) else twice
+
+
+@kernel
+def both(x, y):
+    return plain(x) + plain(y)
+
+
+def test_types_choose_what_is_called():
+    assert both(np.array([3.0]), 4.0) == 11.0
+
+
+@kernel
+def loudness(x):
+    return abs(x)
+
+
+@kernel
+def louder(x):
+    return 2.0 * loudness(x)
+
+
+def test_what_numba_compiles_inside_of_a_part_is_linked():
+    """The magnitude of a complex number is numba's own function, which calls another."""
+    assert louder(3.0 + 4.0j) == 10.0
+
+
+def test_plain_numba_calls_a_kernel_with_all_its_parts():
+    @numba.njit
+    def caller(x, y):
+        return both(x, y)
+
+    assert caller(np.array([3.0]), 4.0) == 11.0
+    assert numba.njit(lambda x: louder(x))(3.0 + 4.0j) == 10.0

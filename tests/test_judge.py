@@ -6,11 +6,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from synthetic import PLACES, RATE, make_bands, make_recorder, make_recording, make_signals, times
+from synthetic import PLACES, RATE, make_bands, make_recorder, make_recording, make_scene, make_signals, times
 
 from hapticrender import judge
 from hapticrender.loop import render
 from hapticrender.protocols import Flag
+from hapticrender.recording import Recorder
 from hapticrender.touch.builtin import builtin_scenes
 
 EXACT = 1e-9  # relative: the ridge of 1e-12 times the inverse of the worst inflation, with digits to spare
@@ -347,3 +348,41 @@ def test_the_table_shows_every_band_and_the_verdict():
     assert lines[1].count("25.0 %") == 3
     assert len({len(line) for line in lines[:3]}) == 1
     assert lines[-1].startswith("known misses its tolerance: ")
+
+
+def test_a_lead_in_time_is_a_lead_whichever_way_the_finger_goes():
+    """A motion 0.2 ms early leads by 2 pi f 0.2 ms on both strokes; averaged without regard to them it would be 0.
+
+    One window in eight of a stroke of 25 holds a turn, and there up to a quarter of the other lead.
+    """
+    speed, wavelength, early = 0.08, 1e-3, 2e-4
+    time = times(4.0)
+    back = (time % 1.25) >= 0.625  # strokes of 50 mm
+    position = np.where(back, 0.05 - speed * (time % 0.625), speed * (time % 0.625)) - 0.025
+    bands = make_bands(0.0, 1e-5, wavenumber=1 / wavelength)
+    lead = 2 * np.pi * speed / wavelength * early
+    turned = 1e-5 * np.exp(1j * np.where(back, -lead, lead))[:, None, None]
+    recording = make_recording(bands, turned, position=position)
+    band = only(recording)
+    assert band["phase_error"] == pytest.approx(lead, rel=0.02)
+    assert band["complex_error"] == pytest.approx(2 * np.sin(lead / 2), rel=0.02)
+    backward = recording.envelopes.backward[recording.envelopes.judged]
+    assert backward.any()
+    assert not backward.all()
+
+
+@pytest.mark.parametrize(
+    ("places", "said"),
+    [(PLACES, "at centre and ends"), (("friction",), "of friction"), (("skin",), "of skin velocity")],
+)
+def test_the_table_says_what_its_errors_are_of(places, said):
+    bands = make_bands(100.0, 10 * UM)
+    signals = make_signals(bands, bands.envelope, duration=2.0)
+    signals["motion"] = signals["motion"][:, : len(places)]
+    recorder = Recorder(
+        None, scene=make_scene(duration=2.0), method="h2", seed=0, rate=RATE, bands=bands, places=places
+    )
+    recorder.append(**signals)
+    text = recorder.finish().text()
+    assert f"rms errors {said}; wobble" in text
+    assert f"worst figure rms error {'of the 100 Hz band at' if len(places) > 1 else said}" in text

@@ -55,12 +55,12 @@ def equal(one, other, columns=COLUMNS, rounding=0.0):
 @pytest.mark.parametrize("method", ["paper", "paper-common"])
 @pytest.mark.parametrize("scene", [SPATIAL, RECORDED, TONE], ids=["spatial", "recorded", "temporal"])
 def test_compiled_loop_equals_the_ring_of_blocks(scene, method):
-    """Sample for sample; the paper's blocks sum constant targets in another order, 1e-16 each of 2000 samples."""
+    """Sample for sample; the paper's blocks round their polynomials elsewhere, 5e-10 in all (test_polynomials)."""
     scene = dataclasses.replace(scene, duration=0.4)
     equal(
         hr.render(scene, method=method, seed=5),
         hr.render(scene, method=method, seed=5, driver=Blocks(simulated(scene, 5))),
-        rounding=1e-12 if scene.texture is TONE.texture else 0.0,
+        rounding=6e-10 if scene.texture is TONE.texture else 0.0,
     )
 
 

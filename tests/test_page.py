@@ -8,6 +8,9 @@ import pytest
 from hapticrender import wording
 from hapticrender.outputs import Outputs, round_up
 from hapticrender.page import page, write_page
+from hapticrender.touch.builtin import builtin_scenes
+from hapticrender.touch.grating import Grating
+from hapticrender.touch.scene import Scene
 
 VOID = {"meta", "img", "br", "circle", "path"}
 FILES = ("scene.toml", "summary.json", "recording.au", "drive.wav", "sensed.wav", "picture.png")
@@ -192,3 +195,33 @@ def test_full_scale_is_round_and_just_above_the_peak(peak):
 def test_the_page_links_only_below_itself(tmp_path):
     with pytest.raises(ValueError, match="is not in the subpath"):
         page(tmp_path / "elsewhere", [outputs(Path("/somewhere"), [GOOD])])
+
+
+def test_a_device_that_judges_a_quantity_says_so():
+    worst = {"figure": "rms_error_friction", "value": 0.002, "band": "50 Hz", "place": "friction"}
+    assert wording.worst_figure({"worst": worst}) == "rms error of friction in the 50 Hz band = 0.200 %"
+    worst = {"figure": "rms_error_end_2", "value": 0.5, "band": "50 Hz", "place": "end 2"}
+    assert wording.worst_figure({"worst": worst}) == "rms error of the 50 Hz band at end 2 = 50.0 %"
+
+
+@pytest.mark.parametrize(
+    ("places", "title"),
+    [(["centre"], "centre"), (["skin", "skin"], "skin"), (["centre", "friction", "skin"], "at the finger"),
+     (["friction", "centre"], "at the finger")],
+)  # fmt: skip
+def test_the_first_column_is_headed_by_what_all_devices_share(places, title):
+    """A scene with no figures counts as a plate."""
+    summaries = [{"bands": [{f"rms_error_{place}": 0.1}]} for place in places]
+    assert wording.titles(summaries) == [title, "end 1", "end 2"]
+    assert wording.titles([*summaries, {"bands": []}])[0] == ("centre" if title == "centre" else "at the finger")
+
+
+def test_a_scene_is_described_with_its_partials_and_its_device():
+    scenes = builtin_scenes()
+    assert wording.describe(scenes["grating-20"]) == "grating 10 µm 20 Hz; no finger; 5 s on vt-plate"
+    assert wording.describe(scenes["one-texture-hybrid"]) == (
+        "grating 25.46 µm 50 Hz, 3 partials; sliding finger 80 mm/s; 3 s on hybrid"
+    )
+    square = Scene(texture=Grating(amplitude=1e-5, frequency=20.0, shape="square", harmonics=4), duration=1.0)
+    assert wording.describe(square) == "grating 10 µm 20 Hz, 4 partials; no finger; 1 s on vt-plate"
+    assert len(square.texture.bands(rate=5000.0)) == 4

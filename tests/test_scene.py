@@ -61,6 +61,8 @@ def test_the_built_in_scenes_are_those_of_the_demo():
     assert list(builtin_scenes()) == [
         *(f"grating-{frequency}" for frequency in (20, 31, 47, 72, 111, 170, 261, 400)),
         *("spatial-grating", "recorded-texture", "sliding", "pressing", "swiping"),
+        *(f"one-texture-{device}" for device in ("vt-plate", "electroadhesion", "ultrasonic", "hybrid")),
+        *("screen-spatial", "screen-recorded", "ultrasonic-swiping", "ultrasonic-warming"),
     ]
 
 

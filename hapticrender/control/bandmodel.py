@@ -32,6 +32,8 @@ class FingerRange:
     presence : bool
         Targets are wanted, and learnt from, only while the finger's position is known: what it does not touch it does
         not feel.
+    least_speed : float, m/s
+        And only while it slides at least so fast, where `presence` holds.
     """
 
     mass: tuple[float, float] = (-2e-3, 12e-3)
@@ -42,6 +44,7 @@ class FingerRange:
     least_motion: float = 5e-8
     contact: tuple[float, float] | None = (0.05, 0.03)
     presence: bool = False
+    least_speed: float = 0.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -87,7 +90,8 @@ class BandModel:
     lowest_frequency, highest_frequency : float, Hz
         Finger-locked carriers fade out beyond these.
     highest_edge : float
-        Times `highest_frequency`, where they have faded out, > 1; methods without a bank know 1.25 alone.
+        Times `highest_frequency`, where they have faded out, > 1.  Feedback stays on until the last quarter of
+        `highest_frequency`.  Methods without a bank know 1.25 alone.
     shape : tuple of float, or None
         Pattern of the target over the coordinates; None: all of it in the first one.
     finger : FingerRange
@@ -100,6 +104,10 @@ class BandModel:
         is at `typical_speed`.  0: none.
     typical_speed : float, m/s
         Of the finger, > 0.
+    late : float, s
+        How much later than the judged place the sensor shows a band; negative: earlier.
+    foresight : float, m
+        Length by which a sliding contact lags behind what the sensor shows.
     lock : float, Hz
         Bandwidth of the resonance lock, which moves the fixed carriers to where the device is resonant; 0: none.
     unit, drive_unit : str
@@ -135,6 +143,8 @@ class BandModel:
     pace: float = 1.0
     memory: float = 0.0
     typical_speed: float = 1.0
+    late: float = 0.0
+    foresight: float = 0.0
     lock: float = 0.0
     unit: str = "m"
     drive_unit: str = "A"

@@ -6,9 +6,8 @@ A tile's lanes are bands of one scenario, or one band of as many scenarios; only
 from __future__ import annotations
 
 import numpy as np
-from numba.extending import overload
 
-from hapticrender._jit import kernel
+from hapticrender._jit import by_types, kernel
 from hapticrender._lanes import floor, high, lanes, low, put, read, select, size
 from hapticrender._polynomials import unit
 from hapticrender.control import bank_rows as row
@@ -56,7 +55,7 @@ def follow_resonance(tables, state):
     along = tables.stiffness[0, 0] + touch[row.STIFFNESS] - omega * omega * mass
     across = omega * (tables.damping[0, 0] + touch[row.DAMPING])
     hertz = along / (2.0 * TURN * mass * omega)
-    state.shift[0] += min(numbers.lock * REFRESH / numbers.rate, 1.0) * hertz
+    state.shift[0] += low(numbers.lock * REFRESH / numbers.rate, 1.0) * hertz
     re, im = band[0, row.R_RE, 0], band[0, row.R_IM, 0]
     heard = re * re + im * im > numbers.least_motion * numbers.least_motion
     state.shift[1] = 0.0 if heard and size(along) <= across else 1.0
@@ -69,7 +68,8 @@ def take_bands(tables, state, t):
     grows = follows = False
     if tables.numbers.lock > 0.0 and t == 0:
         follow_resonance(tables, state)
-    for i in range(min(width, tone.shape[1] - t * width)):
+    left = tone.shape[1] - t * width
+    for i in range(width if left > width else left):
         k = t * width + i
         band[t, row.LIVE, i] = 1.0
         for r in range(row.TONE_ROWS):
@@ -98,23 +98,16 @@ def take_scenarios(tables, state, t):
     return grows, follows
 
 
-def taker(tone):
-    """Which of the two fits the shape of `tone`."""
-    return take_bands if tone.ndim == 2 else take_scenarios
-
-
-@overload(taker)
-def _compiled_taker(tone):
-    """Decided while the kernel is compiled."""
-    chosen = taker(tone)
-    return lambda tone: chosen
+@by_types
+def take(tables, state, t):
+    """Which of the two fits the shape of `tables.tone`."""
+    return take_bands if tables[tables.fields.index("tone")].ndim == 2 else take_scenarios
 
 
 @kernel
 def refresh(tables, state):
     """Take up the tones that are asked for, and what stays for the next samples: law, turn, settled targets."""
     numbers, band = tables.numbers, state.band
-    take = taker(tables.tone)
     state.follows[0] = 0
     for t in range(band.shape[0]):
         grows, follows = take(tables, state, t)
@@ -169,17 +162,17 @@ def law_tune(tables, state, t):
     place = read(touch, row.KNOWN_PLACE)
     skin, drag = touching * read(touch, row.MASS), touching * read(touch, row.DAMPING)
     z_re, z_im = finger_stiffness(touch, band, t)
+    lag = 0.0 * drag
     if tables.numbers.memory > 0.0:
         lag = memory_damping(tables.numbers, state.track)
         drag = drag + lag
-        z_im = z_im + omega * lag
     for c in range(coordinates):
         for i in range(coordinates):
             arms = (1.0 if c == 0 else place) * (1.0 if i == 0 else place)
             mass, damping = read(tables.mass, c, i) + arms * skin, read(tables.damping, c, i) + arms * drag
             at = row.FIRST_LAW + row.LAW_ROWS * (c * coordinates + i)
             re = read(tables.stiffness, c, i) - omega * omega * read(tables.mass, c, i) + arms * touching * z_re
-            im = omega * read(tables.damping, c, i) + arms * touching * z_im + sweep * mass
+            im = omega * read(tables.damping, c, i) + arms * (touching * z_im + omega * lag) + sweep * mass
             put(law, t, at + row.LAW_RE, re * cos - im * sin)
             put(law, t, at + row.LAW_IM, re * sin + im * cos)
             turn = 2.0 * omega * mass
@@ -192,6 +185,27 @@ def derivative(band, t, re, im):
     """Envelope of the time derivative: j w times that of a tile's carriers."""
     omega = lanes(band, t, row.OMEGA)
     return -omega * im, omega * re
+
+
+@kernel
+def shown_pass(numbers, band, track, t, re, im):
+    """What the sensor shows of a wanted envelope of a tile: before the contact's lag, and late."""
+    omega = lanes(band, t, row.OMEGA)
+    lag = numbers.foresight / high(read(track, row.SPEED), SLOWEST * numbers.typical_speed) * omega
+    cos, sin = unit(-numbers.late / TURN * omega)
+    re, im = re - lag * im, im + lag * re
+    return re * cos - im * sin, re * sin + im * cos
+
+
+@kernel
+def told_pass(numbers, band, track, t, re, im):
+    """What is wanted of a tile where the sensor shows re + j im: the inverse of `shown_pass`."""
+    omega = lanes(band, t, row.OMEGA)
+    lag = numbers.foresight / high(read(track, row.SPEED), SLOWEST * numbers.typical_speed) * omega
+    cos, sin = unit(numbers.late / TURN * omega)
+    re, im = re * cos - im * sin, re * sin + im * cos
+    share = 1.0 / (1.0 + lag * lag)
+    return share * (re + lag * im), share * (im - lag * re)
 
 
 @kernel
@@ -230,17 +244,20 @@ def motion_pass(numbers, band, track, t):
     put(band, t, row.OMEGA, TURN * hertz)
     put(band, t, row.SWEEP, TURN * wavenumber * read(track, row.ACCELERATION))
     felt = read(track, row.SEEN) > 0.0
-    if not numbers.presence:
+    if numbers.presence:
+        felt = felt & (read(track, row.SPEED) >= numbers.least_speed)
+    else:
         felt = (wavenumber == 0.0) | felt
     ramp = lanes(band, t, row.RAMP)
     ramp = select(felt, low(ramp + numbers.ramp, 1.0), high(ramp - numbers.ramp, 0.0))
     steep = 1.0 / (numbers.highest_edge - 1.0)
     below = ease(steep * numbers.highest_edge - steep / numbers.highest * size(hertz))
-    inside = ease(2.0 / numbers.lowest * size(hertz) - 1.0) * below
-    weight = lanes(band, t, row.LIVE) * ease(ramp) * select(wavenumber > 0.0, inside, 1.0)
+    heard = ease(4.0 * numbers.highest_edge - 4.0 / numbers.highest * size(hertz))  # to a wide fade's end, or nearly
+    above = select(wavenumber > 0.0, ease(2.0 / numbers.lowest * size(hertz) - 1.0), 1.0)
+    grown = lanes(band, t, row.LIVE) * ease(ramp) * above
     put(band, t, row.RAMP, ramp)
-    put(band, t, row.WEIGHT, weight)
-    put(band, t, row.SHARE, low(weight / high(ramp, 1e-9), 1.0))
+    put(band, t, row.WEIGHT, grown * select(wavenumber > 0.0, below, 1.0))
+    put(band, t, row.SHARE, low(grown * select(wavenumber > 0.0, heard, 1.0) / high(ramp, 1e-9), 1.0))
 
 
 @kernel

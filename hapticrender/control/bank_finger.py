@@ -112,7 +112,8 @@ def adapt_pass(tables, state, step, inner, gain, rest, touching):
             away_re += d_re * a_re - d_im * a_im + damping * da_re - turn * da_im
             away_im += d_re * a_im + d_im * a_re + damping * da_im + turn * da_re
         size2 = felt_re * felt_re + felt_im * felt_im
-        counts = (size2 >= numbers.least_motion * numbers.least_motion) & (lanes(band, t, row.WEIGHT) >= 1.0) & touching
+        whole = (lanes(band, t, row.RAMP) >= 1.0) & (lanes(band, t, row.SHARE) >= 1.0)
+        counts = (size2 >= numbers.least_motion * numbers.least_motion) & whole & touching
         z_re, z_im = finger_stiffness(touch, band, t)
         re, im = z_re * own_re - z_im * own_im - away_re, z_re * own_im + z_im * own_re - away_im
         safe = select(counts, size2, 1.0)

@@ -9,6 +9,8 @@ bands are the lanes, and as many scenarios as there are lanes, side by side.
 
 from __future__ import annotations
 
+import numpy as np
+
 from hapticrender._jit import kernel
 from hapticrender._lanes import (
     any_of,
@@ -35,6 +37,8 @@ from hapticrender.control.bank_carriers import (
     law_tune,
     look_ahead,
     refresh,
+    shown_pass,
+    told_pass,
 )
 from hapticrender.control.bank_finger import adapt_pass, feel, forget_finger, track_finger
 from hapticrender.control.kernels import DOUBT_TIME, FAR
@@ -59,14 +63,23 @@ def target_pass(tables, state, t, g, wanted, residual, target):
         put(band, t, row.RAW_IM, raw_im)
         if numbers.differentiated:
             raw_re, raw_im = derivative(band, t, raw_re, raw_im)
+        if numbers.shows:
+            raw_re, raw_im = shown_pass(numbers, band, state.track, t, raw_re, raw_im)
         follow = 0.5 * g
         re, im = old_re + follow * (weight * raw_re - old_re), old_im + follow * (weight * raw_im - old_im)
+        told_re, told_im = re, im
+        if numbers.shows:
+            told_re, told_im = told_pass(numbers, band, state.track, t, re, im)
     else:
         if numbers.modulated:
             weight = weight * wanted
         re, im = weight * lanes(band, t, row.WANTED_RE), weight * lanes(band, t, row.WANTED_IM)
         if numbers.differentiated:
             re, im = derivative(band, t, re, im)
+        told_re, told_im = re, im
+        if numbers.shows:
+            re, im = shown_pass(numbers, band, state.track, t, re, im)
+    put_pairs(target, t, told_re, told_im)
     put(band, t, row.R_RE, re)
     put(band, t, row.R_IM, im)
     put(band, t, row.DR_RE, numbers.rate * (re - old_re))
@@ -79,7 +92,6 @@ def target_pass(tables, state, t, g, wanted, residual, target):
         seen_re, seen_im = lanes(band, t, row.SEEN_RE), lanes(band, t, row.SEEN_IM)
         put(band, t, row.SEEN_RE, seen_re + pole * (re - seen_re))
         put(band, t, row.SEEN_IM, seen_im + pole * (im - seen_im))
-    put_pairs(target, t, re, im)
 
 
 @kernel
@@ -346,7 +358,8 @@ def bank_advance(tables, state, sensed, position, wanted, drive, target):
     quick = scale < 0.0
     if numbers.presence:  # the step of a friction is not what the texture does
         quick = (read(state.track, row.SEEN) <= 0.0) | (read(state.track, row.FRESH) > 0.0)
-        g, integral = select(quick, 0.0, g), select(quick, 0.0, integral)
+        idle = quick | (read(state.track, row.SPEED) < numbers.least_speed)  # a finger that rests feels no texture
+        g, integral = select(idle, 0.0, g), select(idle, 0.0, integral)
     doubt = 0.0 * scale
     hears_fast = hears_slow = 0.0 * lanes(band, 0, row.COS)
     for c in range(coordinates):
@@ -380,7 +393,7 @@ def bank_advance(tables, state, sensed, position, wanted, drive, target):
 @kernel
 def bank_step(tables, state, sensed, position, wanted, drive, target):
     """One sample of a single scenario; see `bank_advance`.  Returns flags."""
-    flags = int(bank_advance(tables, state, sensed, position, wanted, drive, target))
+    flags = np.int64(bank_advance(tables, state, sensed, position, wanted, drive, target))
     if tables.numbers.lock > 0.0 and state.shift[1] > 0.0:
         flags |= 32
     return flags

@@ -6,9 +6,10 @@ resonator driven by the residual: with eps = E e^(j phi), nu = v e^(j phi) and a
     eps' = eps + g e,  nu' = nu - T ki eps',  F = Re sum rho (D nu' - ki D' eps') - inner sum_i c_i dev[n-i],
     e = y - level - Re sum eps,  dev = y - Re sum nu,  next eps = a eps', next nu = a nu',
 
-rho = e^(j w lead)/sinc(w T/2).  No envelope is averaged: all bands, their images and the DC band, all coordinates, the
-delay and the hold are inside.  Assumed: carriers of fixed frequency (a moving finger: its speed frozen), the finger's
-three numbers frozen, drive inside its limits, no rounding.
+rho = e^(j w lead)/sinc(w T/2).  A carrier that fades out, with the share s of its feedback, has s g for g and forgets
+both eps and nu at the rate (1 - s) times `FORGET`.  No envelope is averaged: all bands, their images and the DC band,
+all coordinates, the delay and the hold are inside.  Assumed: carriers of fixed frequency (a moving finger: its speed
+frozen), the finger's three numbers frozen, drive inside its limits, no rounding.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from hapticrender.control.bandmodel import BandModel
+from hapticrender.control.bank_carriers import FORGET
 from hapticrender.control.margins import (
     Margins,
     borne_errors,
@@ -143,6 +145,8 @@ class BankLoop:
         Of the inner loop.
     law, slope : ndarray of complex, shape (B, K, c, c), N/m, N s/m
         D and D' of every band as the law knows them, already turned ahead by rho.
+    share : ndarray, shape (B, K)
+        Of the observer's gain that each band has, less than 1 where it fades out.
     """
 
     plant: Sampled
@@ -156,6 +160,7 @@ class BankLoop:
     taps: Array
     law: Array
     slope: Array
+    share: Array
 
     @classmethod
     def on(
@@ -173,6 +178,7 @@ class BankLoop:
         inner: Array,
         taps: Array,
         finger: KnownFinger | None = None,
+        share: Array | float = 1.0,
     ) -> BankLoop:
         """Loop of a bank whose law believes in the free device `known` and in `finger`; `lead` in s."""
         jw = 2j * np.pi * np.asarray(frequency, float)[..., None, None]
@@ -197,6 +203,7 @@ class BankLoop:
             taps=taps,
             law=ahead * law,
             slope=ahead * slope,
+            share=share * np.ones_like(frequency, float),
         )
 
     @property
@@ -213,18 +220,20 @@ class BankLoop:
         `z` is complex, shape (B, N) or (N,).
         """
         z = np.broadcast_to(z, (len(self.frequency), np.shape(z)[-1]))
-        g, ki = self.observer[:, None, None], self.integral[:, None, None]
+        g, ki = (self.observer[:, None] * self.share)[:, None], self.integral[:, None, None]
         turn, at = self._turn()[:, None, :], z[:, :, None]
+        fading = FORGET * (1.0 - self.share)[:, None]
+        kept = 1.0 - self.period * fading
         force = np.zeros((*z.shape, *self.law.shape[-2:]), complex)
         observed = self.dc[:, None] / (z - 1.0) + self.dc_drift[:, None] / (z - 1.0) ** 2
         integrated = np.zeros(z.shape, complex)
         for a, law, slope in ((turn, self.law, self.slope), (turn.conj(), self.law.conj(), self.slope.conj())):
-            error = g * at / (at - a)
-            part = -ki * self.period * at / (at - a) * error
+            error = g * at / (at - kept * a)
+            part = -ki * self.period * at / (at - kept * a) * error
             observed = observed + 0.5 * (a / at * error).sum(axis=-1)
             integrated += 0.5 * (a / at * part).sum(axis=-1)
             force += 0.5 * np.einsum("bnk,bkij->bnij", part, law)
-            force += 0.5 * np.einsum("bnk,bkij->bnij", -ki * error, slope)
+            force += 0.5 * np.einsum("bnk,bkij->bnij", -ki * error - fading * a / at * part, slope)
         rest = 1.0 + observed
         order = np.arange(self.taps.shape[1])
         taps = self.inner[:, None, None] * (z[:, :, None, None] ** -order * self.taps).sum(axis=-1)
@@ -268,8 +277,10 @@ class BankLoop:
         error = y - level - eps.real.sum(axis=1)
         deviation = y - nu.real.sum(axis=1)
         held = np.concatenate([deviation[:, None], past], axis=1)
-        eps = eps + self.observer.reshape(*wide, 1) * error[:, None]
-        slope = -self.integral.reshape(*wide, 1) * eps
+        fading = FORGET * (1.0 - self.share)[..., None, None]
+        eps = (1.0 - self.period * fading) * eps
+        eps = eps + (self.observer[:, None] * self.share)[..., None, None] * error[:, None]
+        slope = -self.integral.reshape(*wide, 1) * eps - fading * nu
         nu = nu + self.period * slope
         force = (self.law @ nu + self.slope @ slope).real.sum(axis=1)
         taps = self.taps.T[: held.shape[1], :, None]

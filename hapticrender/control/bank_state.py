@@ -61,10 +61,14 @@ class BankNumbers(NamedTuple):
     modulated: bool  # the wanted waveform is a factor of every target
     differentiated: bool  # what is wanted is the time derivative of what the tones say
     presence: bool  # targets are wanted only while a finger is there
+    least_speed: float  # m/s: and slides at least so fast
     dc_quick: float  # of the DC band after a touch, and while no finger is there
     dc_drift_quick: float
     memory: float  # damping times speed of a sliding contact; 0: none
     typical_speed: float  # m/s: for which the device's own damping holds
+    shows: bool  # the sensor does not show what is wanted, but is `late` (s), and has not lagged by `foresight` (m)
+    late: float
+    foresight: float
     lock: float  # 1/s: pace at which the carriers follow the resonance; 0: not
     least_motion: float
     typical_mass: float

@@ -16,7 +16,7 @@ from typing import NamedTuple
 
 from hapticrender._jit import kernel
 from hapticrender.control.bank_finger import track_finger
-from hapticrender.control.bank_rows import ACCELERATION, HELD, SEEN, VELOCITY
+from hapticrender.control.bank_rows import ACCELERATION, HELD, SEEN, SPEED, VELOCITY
 from hapticrender.control.kernels import (
     FAR,
     FREQUENCY,
@@ -52,6 +52,8 @@ class ComplexNumbers(NamedTuple):
     rate: float
     feedback: bool
     analysed: bool
+    presence: bool  # targets are wanted only while a finger is there
+    least_speed: float  # m/s: and slides at least so fast
     modulated: bool  # the wanted waveform is a factor of every target
     differentiated: bool  # what is wanted is the time derivative of what the tones say
     forward: bool  # V = R + v
@@ -102,7 +104,11 @@ def carrier_pass(numbers, tone, band, track):
         turns = band[TURNS, k] + wavenumber * track[HELD] + tone[PHASE, k]
         psi = TURN * (turns - math.floor(turns))
         band[COS, k], band[SIN, k] = math.cos(psi), math.sin(psi)
-        felt = wavenumber == 0.0 or track[SEEN] > 0.0
+        felt = track[SEEN] > 0.0
+        if numbers.presence:
+            felt = felt and track[SPEED] >= numbers.least_speed
+        else:
+            felt = felt or wavenumber == 0.0
         ramp = min(band[RAMP, k] + numbers.ramp, 1.0) if felt else max(band[RAMP, k] - numbers.ramp, 0.0)
         band[RAMP, k] = ramp
         weight = ramp * ramp * (3.0 - 2.0 * ramp)

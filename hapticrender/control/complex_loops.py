@@ -90,6 +90,8 @@ def design_complex(
         rate=float(model.rate),
         feedback=feedback,
         analysed=bands.envelope is None,
+        presence=model.finger.presence,
+        least_speed=model.finger.least_speed,
         modulated=bands.modulated,
         differentiated=bands.differentiated,
         forward=forward,

@@ -12,8 +12,9 @@ The area changes with the load and only a resting finger shows it: 10 % of area 
 between the two channels some 10 %, for it turns Z.  The force itself follows |I|^2 at once; only the impedance is
 averaged for long, weighed by power, so that an envelope may pass through zero.
 
-A finger that rests, that was never seen at rest, or whose gap leaks so much that L falls below a bound, is not sensed: it
-counts as F = g |I|^2, what a loop expects to see, so that nothing winds up on it; the flag `OPEN_LOOP` says so.
+A finger that is away, that rests, that was never seen at rest, or whose gap leaks so much that L falls below a bound,
+is not sensed: it counts as F = g |I|^2, what a loop expects to see, so that nothing winds up on it, and the flag
+`OPEN_LOOP` says so.  While the finger is away I is the current that the source is asked for.
 
 References
 ----------
@@ -227,14 +228,14 @@ def gap_step(tables, state, voltage_re, voltage_im, current_re, current_im, spee
         if not math.isfinite(value):
             value = 0.0
         x[i], w[0], w[1] = biquad_step(tables.section, w[0], w[1], value)
+    power = x[2] * x[2] + x[3] * x[3]
     if math.isnan(speed):
         state.mode[DOING] = LIFTED
         known[AREA] = known[SHARE] = 0.0
-        return 0.0, False
+        return tables.open_loop_gain * power, True
     doing = SLIDING if abs(speed) >= tables.least_speed else RESTING
     if _average(tables, state, doing):
         _learn(tables, state, doing)
-    power = x[2] * x[2] + x[3] * x[3]
     if doing == SLIDING and known[AREA] > 0.0 and known[SHARE] > tables.least_share:
         return tables.force * power * known[SHARE] / known[AREA], False
     return tables.open_loop_gain * power, True

@@ -34,7 +34,7 @@ class SquareRootTables(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class SquareRoot:
-    """Attraction around a bias (N) to the peak of the envelope of the current (A), or of the voltage where that is driven.
+    """Attraction around a bias (N) to the peak of the envelope of the current (A), or of a voltage (V).
 
     Parameters
     ----------

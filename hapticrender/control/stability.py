@@ -123,11 +123,13 @@ def bank_loop(
     known = Structure.free(tables.mass, tables.damping, tables.stiffness)
     observer, integral, inner = _opened(numbers, *STATES[state])
     calm = min(abs(speed) / numbers.crowd_speed, 1.0) if numbers.crowd_speed > 0 else 1.0
-    frequency = np.sort(np.abs(tables.tone[FREQUENCY] + speed * tables.tone[WAVENUMBER]))
+    frequency = np.abs(tables.tone[FREQUENCY] + speed * tables.tone[WAVENUMBER])
+    share = np.where(tables.tone[WAVENUMBER] > 0.0, _faded(numbers, frequency), 1.0)
+    order = np.argsort(frequency)
     return BankLoop.on(
         plant if isinstance(plant, Sampled) else (plant or known).sampled(numbers.rate),
         known,
-        frequency[None],
+        frequency[None, order],
         delay=round(numbers.lead * numbers.rate - 0.5) if delay is None else delay,
         lead=numbers.lead,
         observer=np.array([calm * observer]),
@@ -137,7 +139,15 @@ def bank_loop(
         inner=np.array([inner]),
         taps=tables.taps,
         finger=finger,
+        share=share[None, order],
     )
+
+
+def _faded(numbers: BankNumbers, frequency: Array) -> Array:
+    """Share of the observer that carriers which follow the finger have at `frequency` (Hz), as in the compiled step."""
+    ends = 2.0 * frequency / numbers.lowest - 1.0, 4.0 * (numbers.highest_edge - frequency / numbers.highest)
+    below, above = (np.clip(end, 0.0, 1.0) for end in ends)
+    return np.asarray(below**2 * (3.0 - 2.0 * below) * above**2 * (3.0 - 2.0 * above))
 
 
 def _opened(numbers: BankNumbers, fast: float, slow: float) -> tuple[float, float, float]:
@@ -280,9 +290,14 @@ def _highest(tables: BankTables) -> float:
 
 
 def _speeds(tables: BankTables) -> Array:
-    """Speeds (m/s) that take the slowest of the finger-locked carriers from the lowest to the highest frequency."""
+    """Speeds (m/s) from which on all finger-locked carriers are in range, to where the fastest leaves it.
+
+    In a range that never holds all of them at once, to where the slowest leaves it.
+    """
     wavenumber = tables.tone[WAVENUMBER]
     locked = wavenumber[wavenumber > 0]
     if not locked.size:
         return np.zeros(1)
-    return np.geomspace(tables.numbers.lowest / locked.min(), tables.numbers.highest / locked.max(), SPEEDS)
+    first, highest = tables.numbers.lowest / locked.min(), tables.numbers.highest
+    last = highest / locked.max()
+    return np.geomspace(first, last if last >= first else highest / locked.min(), SPEEDS)

@@ -65,6 +65,9 @@ class TwoBands(Bands):
     of_rubbed: Array
 
 
+_NAMES = ("moved", "rubbed")
+
+
 class TogetherTables(NamedTuple):
     """Parameters of two banks and of how they lie side by side."""
 
@@ -73,6 +76,7 @@ class TogetherTables(NamedTuple):
     of_moved: Array  # (bands of moved,) integer: which of all bands each is
     of_rubbed: Array
     felt: Array  # (bands of rubbed,) complex: skin velocity per target, m/(N s)
+    wanted: float  # of rubbed, per wanted waveform
     sensors: int  # of moved; those of rubbed follow
     channels: int  # of moved
 
@@ -92,6 +96,7 @@ def together_step(tables, state, sensed, position, wanted, drive, target):
     moved, rubbed, band = state.displacement, state.friction, state.moved.band
     s, c, width = tables.sensors, tables.channels, band.shape[2]
     flags = bank_step(tables.moved, state.moved, sensed[:s], position, wanted, drive[:c], moved)
+    wanted *= tables.wanted
     flags |= bank_step(tables.rubbed, state.rubbed, sensed[s:], position, wanted, drive[c:], rubbed)
     for k in range(target.shape[0]):
         target[k] = 0.0
@@ -171,7 +176,14 @@ class TogetherController:
         self.felt = velocity_per_force / np.asarray(shown, complex)
         if isinstance(moved, BankController) and isinstance(rubbed, BankController):
             self.tables = TogetherTables(
-                moved.tables, rubbed.tables, bands.of_moved, bands.of_rubbed, self.felt, sensors[0], channels[0]
+                moved.tables,
+                rubbed.tables,
+                bands.of_moved,
+                bands.of_rubbed,
+                self.felt,
+                1.0 / velocity_per_force if bands.envelope is None else 1.0,
+                sensors[0],
+                channels[0],
             )
             envelopes = (np.zeros(each.n_bands, complex) for each in self.parts)
             self.state = TogetherState(moved.state, rubbed.state, *envelopes)
@@ -207,9 +219,6 @@ class TogetherController:
         return np.hstack([moved[0], rubbed[0]]), target, moved[2] | rubbed[2]
 
 
-_NAMES = ("moved", "rubbed")
-
-
 def design_together(method: Method, model: TwoModels, bands: TwoBands, *, feedback: bool = True) -> TogetherController:
     """Design a controller of `method` for each part, with what is wanted of it.
 
@@ -218,18 +227,15 @@ def design_together(method: Method, model: TwoModels, bands: TwoBands, *, feedba
     DesignError
         Carriers follow the finger, and the method has no bank, whose fades make the crossover.
     """
-    locked = bool((bands.wavenumber > 0.0).any())
-    parts: list[Controller] = []
-    for each, own, channels in ((model.moved, bands.moved, None), (model.rubbed, bands.rubbed, 1)):
-        if each is None or not len(own):
-            count = channels if each is None else each.force_from_drive.shape[1]
-            parts.append(Silent(method.name, int(count or 1)))
-            continue
-        parts.append(method.design(each, own, feedback=feedback))
-        if locked and not isinstance(parts[-1], BankController):
-            raise DesignError(
-                f"method = {method.name!r}: must be 'h' or 'h2' for a texture over position on two parts, whose "
-                "crossover follows the finger, sample by sample"
-            )
-    coils, sensors = model.moved.force_from_drive.shape[1], model.moved.coordinate_from_sensed.shape[1]
-    return TogetherController(*parts, bands, model.velocity_per_force, (sensors, 1), (coils, 1), listens=feedback)
+    channels = model.moved.force_from_drive.shape[1], 1
+    sensors = model.moved.coordinate_from_sensed.shape[1], 1
+    moved, rubbed = (
+        method.design(each, own, feedback=feedback) if each is not None and len(own) else Silent(method.name, count)
+        for each, own, count in zip((model.moved, model.rubbed), (bands.moved, bands.rubbed), channels, strict=True)
+    )
+    if (bands.wavenumber > 0.0).any() and not all(isinstance(part, BankController) for part in (moved, rubbed)):
+        raise DesignError(
+            f"method = {method.name!r}: must be 'h' or 'h2' for a texture over position on two parts, whose crossover "
+            "follows the finger, sample by sample"
+        )
+    return TogetherController(moved, rubbed, bands, model.velocity_per_force, sensors, channels, listens=feedback)

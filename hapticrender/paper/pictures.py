@@ -8,9 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from hapticrender.formats import MissingExtra, replacing
+from hapticrender.figures import BLUE, GREEN, INK, ORANGE, PALE, RED, new_figure, save
 from hapticrender.paper.claims import Item, Table
-from hapticrender.picture import BLUE, GREEN, INK, ORANGE, PALE, RED, STYLE
 
 PRINTED: dict[str, Any] = {"color": INK, "lw": 1.1, "ls": (0, (4, 2))}
 METHODS = (("paper", RED, "o"), ("paper-common", ORANGE, "s"), ("h2", BLUE, "D"))
@@ -33,18 +32,9 @@ def draw(path: Path, item: Item) -> None:
     MissingExtra
         matplotlib is not installed.
     """
-    try:
-        import matplotlib
-        from matplotlib.backends.backend_agg import FigureCanvasAgg
-        from matplotlib.figure import Figure
-    except ImportError as error:
-        raise MissingExtra("pictures need matplotlib: pip install 'hapticrender[plot]'") from error
-    with matplotlib.rc_context(STYLE), np.errstate(all="ignore"), replacing(path) as scratch:
-        figure: Any = Figure(figsize=(11, 4.4), layout="constrained")
-        FigureCanvasAgg(figure)
-        figure.get_layout_engine().set(w_pad=0.12, h_pad=0.07)
+    with new_figure((11, 4.4), pads=(0.12, 0.07)) as figure:
         PICTURES[item.name](figure, item.tables)
-        figure.savefig(scratch, dpi=110, format="png")
+        save(figure, path)
 
 
 def _frequency_axis(*lanes: Any) -> None:

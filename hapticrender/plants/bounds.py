@@ -1,55 +1,83 @@
-"""Parameters of plants, checked field by field against a table of bounds."""
+"""Parameter classes whose fields say their own bounds, and check them."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from dataclasses import fields
-from typing import Any, NamedTuple, TypeVar
-
-Parameters = TypeVar("Parameters")
+from collections.abc import Iterable, Mapping
+from dataclasses import field, fields
+from typing import Any, Self
 
 
-class Bound(NamedTuple):
-    """What a parameter may be: `least` to `most` in `unit`; `above`: `least` itself is refused."""
-
-    unit: str = ""
-    least: float = 0.0
-    most: float = math.inf
-    above: bool = False
+def number(
+    default: float, unit: str = "", *, above: float | None = None, least: float = 0.0, most: float = math.inf
+) -> Any:
+    """Field of a parameter class: > `above`, or >= `least`, and <= `most`, in `unit`."""
+    return field(default=default, metadata={"unit": unit, "above": above, "least": least, "most": most})
 
 
-def positive(unit: str = "") -> Bound:
-    """Bound of a parameter that must be > 0."""
-    return Bound(unit, above=True)
+def choice(default: str, *known: str) -> Any:
+    """Field of a parameter class that is one of the words in `known`."""
+    return field(default=default, metadata={"known": known})
 
 
-def check_fields(parameters: Any, bounds: Mapping[str, Bound]) -> None:
-    """Refuse the first field of a dataclass, in its order, that is no number of its kind inside its bound."""
-    for field in fields(parameters):
-        if field.name in bounds:
-            check_number(field.name, getattr(parameters, field.name), bounds[field.name], whole=field.type == "int")
+class Validated:
+    """Parameter class whose fields are made by `number` and `choice`, and say so when they are broken."""
+
+    def __post_init__(self) -> None:
+        for each in fields(self):  # type: ignore[arg-type]
+            if "free" not in each.metadata:  # checked by its own class
+                check = _check_choice if "known" in each.metadata else _check_number
+                check(each, getattr(self, each.name))
+
+    @classmethod
+    def names(cls) -> set[str]:
+        """Names of the parameters that `number` and `choice` made."""
+        return {each.name for each in fields(cls) if "free" not in each.metadata}  # type: ignore[arg-type]
+
+    @classmethod
+    def with_overrides(cls, overrides: Mapping[str, Any], also: Iterable[str] = ()) -> Self:
+        """Defaults with some parameters replaced.
+
+        Parameters
+        ----------
+        overrides : mapping
+            Values by name.
+        also : iterable of str
+            What else a scene's `plant` table knows, read elsewhere.
+
+        Raises
+        ------
+        ValueError
+            A name is unknown; the known ones are listed, `also` among them.
+        """
+        check_names(overrides, cls.names(), also)
+        try:
+            return cls(**overrides)
+        except (ValueError, TypeError) as error:
+            raise type(error)(f"plant.{error}") from None
 
 
-def check_number(name: str, value: Any, bound: Bound, *, whole: bool = False) -> None:
-    """Refuse what is no finite number (or, if `whole`, integer) inside `bound`."""
-    if isinstance(value, bool) or not isinstance(value, int if whole else (int, float)):
-        raise TypeError(f"{name} = {value!r}: must be {'an integer' if whole else 'a number'}")
-    if not math.isfinite(value) or value < bound.least or (bound.above and value == bound.least):
-        raise ValueError(
-            f"{name} = {value!r}: must be {'>' if bound.above else '>='} {bound.least:g} {bound.unit}".rstrip()
-        )
-    if value > bound.most:
-        raise ValueError(f"{name} = {value!r}: must be <= {bound.most:g} {bound.unit}".rstrip())
-
-
-def overridden(kind: type[Parameters], overrides: Mapping[str, Any], table: str = "plant") -> Parameters:
-    """Defaults of a dataclass with some replaced; whatever is refused is named with the `table` it stands in."""
-    known = {field.name for field in fields(kind)}  # type: ignore[arg-type]
-    for name in overrides:
+def check_names(given: Iterable[str], known: Iterable[str], also: Iterable[str] = ()) -> None:
+    """Refuse a name of a scene's `plant` table that is not `known`; list those that are, and what is known `also`."""
+    known = set(known)
+    for name in given:
         if name not in known:
-            raise ValueError(f"{table}.{name}: no such parameter; known: {', '.join(sorted(known))}")
-    try:
-        return kind(**overrides)
-    except (ValueError, TypeError) as error:
-        raise type(error)(f"{table}.{error}") from None
+            listed = ", ".join(sorted(known.union(also)))
+            raise ValueError(f"plant.{name}: no such parameter; known: {listed}")
+
+
+def _check_choice(each: Any, value: Any) -> None:
+    if value not in each.metadata["known"]:
+        raise ValueError(f"{each.name} = {value!r}: must be one of {', '.join(each.metadata['known'])}")
+
+
+def _check_number(each: Any, value: Any) -> None:
+    whole = each.type in (int, "int")
+    if isinstance(value, bool) or not isinstance(value, int if whole else (int, float)):
+        raise TypeError(f"{each.name} = {value!r}: must be {'an integer' if whole else 'a number'}")
+    unit, above, least, most = (each.metadata[key] for key in ("unit", "above", "least", "most"))
+    bound = f">= {least:g}" if above is None else f"> {above:g}"
+    if not math.isfinite(value) or (value < least if above is None else value <= above):
+        raise ValueError(f"{each.name} = {value!r}: must be {bound} {unit}".rstrip())
+    if value > most:
+        raise ValueError(f"{each.name} = {value!r}: must be <= {most:g} {unit}".rstrip())

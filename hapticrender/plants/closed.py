@@ -6,9 +6,7 @@ handing single samples to each other, without leaving compiled code.
 
 from __future__ import annotations
 
-from numba.extending import overload
-
-from hapticrender._jit import kernel
+from hapticrender._jit import by_types, kernel
 from hapticrender.control.bank_kernels import bank_step
 from hapticrender.control.bank_state import BankTables
 from hapticrender.control.complex_kernels import ComplexTables, complex_step
@@ -19,16 +17,10 @@ from hapticrender.plants.kernels import plate_advance, plate_drive, plate_sense
 STEPS = {PolarTables: polar_step, ComplexTables: complex_step, BankTables: bank_step}
 
 
-def step_of(tables):
+@by_types
+def control_step(tables, *rest):
     """Step of the controller that `tables` belong to."""
-    return STEPS[type(tables)]
-
-
-@overload(step_of)
-def _compiled_step_of(tables):
-    """Inside a kernel the type of `tables` decides, while the kernel is compiled: the call costs nothing."""
-    step = STEPS[tables.instance_class]
-    return lambda tables: step
+    return STEPS[tables.instance_class]
 
 
 @kernel
@@ -39,13 +31,12 @@ def closed_plate_run(
 
     Row n of `drive` is what the plate was handed for interval n, so it is computed from sample n - 1.
     """
-    step = step_of(control)
     for n in range(sensed.shape[0]):
         plate_drive(tables, state, last)
         flags[n] = plate_sense(tables, state, noise[n], sensed[n], motion[n])
         plate_advance(tables, state, finger[n, 0], finger[n, 1], finger[n, 2])
         drive[n, 0], drive[n, 1] = last[0], last[1]
-        flags[n] |= step(control, control_state, sensed[n], finger[n, 0], wanted[n], last, target[n])
+        flags[n] |= control_step(control, control_state, sensed[n], finger[n, 0], wanted[n], last, target[n])
 
 
 CLOSED = dict.fromkeys(STEPS, closed_plate_run)

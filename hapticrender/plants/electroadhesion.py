@@ -33,7 +33,8 @@ import numpy as np
 
 from hapticrender.control.gap import VACUUM, GapEstimator, gap_state
 from hapticrender.control.square_root import SquareRoot, SquareRootTables
-from hapticrender.plants.closed import STEPS
+from hapticrender.plants.base import TouchedPlant
+from hapticrender.plants.bounds import choice, number
 from hapticrender.plants.electroadhesion_kernels import (
     LOAD,
     POSITION,
@@ -45,7 +46,7 @@ from hapticrender.plants.electroadhesion_kernels import (
     element,
     screen_run,
 )
-from hapticrender.plants.sliding import SlidingParameters, choice, number, sliding_state, sliding_tables
+from hapticrender.plants.sliding import SlidingParameters, sliding_state, sliding_tables
 from hapticrender.protocols import Array, Controller, Sensed
 
 if TYPE_CHECKING:
@@ -121,7 +122,7 @@ class ElectroadhesionParameters(SlidingParameters):
     least_leakage : float
         L below which a finger counts as moist and is not sensed, 0 to 1.
     open_loop_gain : float, N/A^2
-        g of a finger that is not sensed, > 0.
+        g of a finger that is not sensed, > 0; a renderer takes that of a nominal finger, unless its scene tells.
 
     Notes
     -----
@@ -235,8 +236,14 @@ class ElectroadhesionParameters(SlidingParameters):
             return self.friction_coefficient * self.frequency_response(frequency, speed)
         return self.estimator.frequency_response(frequency) / self._shift(frequency)
 
+    def sensor_response(self, frequency: Any, speed: float) -> Any:
+        """Return what is sensed, as friction, per friction (complex) at `frequency` (Hz), finger at `speed` (m/s)."""
+        if self.sensor == "tribometer":
+            return self.tribometer_response(frequency)
+        return self.sensed_response(frequency, speed) / self.lag_response(frequency, speed)
 
-class ElectroadhesionScreen:
+
+class ElectroadhesionScreen(TouchedPlant):
     """The screen in discrete time, behind the `Plant` protocol.
 
     Parameters
@@ -269,13 +276,11 @@ class ElectroadhesionScreen:
         seed: int = 0,
         compensation: SquareRoot | None = None,
     ) -> None:
+        super().__init__(finger, parameters.rate)
         self.parameters = parameters
-        self.finger = finger
         self.compensation = compensation
-        self.rate = float(parameters.rate)
         self.skin_velocity = self.attraction = np.zeros(0)
         self._rng = np.random.default_rng(seed)
-        self._samples = 0
         self._tables = screen_tables(parameters, finger, compensation)
         self._state = screen_state()
         self._last = np.zeros(1)
@@ -286,14 +291,6 @@ class ElectroadhesionScreen:
         self._samples += n
         width = 1 + 2 * self.parameters.oversampling if self._tables.sensing else 1
         return finger, self._rng.standard_normal((n, width)), np.zeros(n, np.int64)
-
-    def closes(self, controller: Controller) -> bool:
-        """Whether `closed_loop` has compiled code for this controller."""
-        return type(getattr(controller, "tables", None)) in STEPS
-
-    def finger_position(self, n: int) -> Array:
-        """Finger positions (m, shape (n,)) of the next n samples, NaN while lifted; the plant does not advance."""
-        return self.finger.position((self._samples + np.arange(n)) / self.rate)
 
     def run(self, drive: Array) -> Sensed:
         """Advance by n samples under `drive` (shape (n, 1)); row i acts from sample i on, sensed at its start."""
@@ -336,9 +333,10 @@ def finger_rows(finger: Finger, first: int, n: int, rate: float) -> Array:
     """Position (m), load (N), strength and speed (m/s) of samples `first` to `first` + n - 1, shape (n, 4).
 
     The speed over a sample is the way to the next one; a finger that is lifted there keeps that of the sample before,
-    one that touches for a single sample rests.  NaN while lifted.
+    one that touches for a single sample rests.  NaN while lifted, as a finger without load is.
     """
     touch = finger.touch(np.arange(max(first - 1, 0), first + n + 1) / rate)
+    touch[~(touch[:, 1] > 0.0), 0] = np.nan
     way = rate * np.diff(touch[:, 0])
     if first == 0:
         way = np.r_[np.nan, way]

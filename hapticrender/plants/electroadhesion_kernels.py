@@ -14,7 +14,7 @@ from typing import NamedTuple
 from hapticrender._jit import kernel
 from hapticrender.control.gap import VACUUM, GapState, GapTables, gap_step
 from hapticrender.control.square_root import SquareRootTables, square_root_step
-from hapticrender.plants.closed import step_of
+from hapticrender.plants.closed import control_step
 from hapticrender.plants.sliding import SlidingState, SlidingTables, sliding_step
 from hapticrender.protocols import Array
 
@@ -177,15 +177,18 @@ def carrier_pass(tables, state, gap, area, envelope, speed, noise):
 
 
 @kernel
-def lift(tables, state):
-    """Let a finger go: no charge, no current, no voltage, nothing to sense."""
+def lift(tables, state, envelope):
+    """Let a finger go: no charge, no voltage; the source's own word for the current is all that there is to sense."""
+    held = state.held
     for k in range(3):
         state.charge[k] = 0.0
-    state.held[SERVO] = state.held[FORCE] = state.held[UNSENSED] = 0.0
+    held[SERVO] = 0.0
     turns = state.carrier[0] + tables.turns
     state.carrier[0] = turns - math.floor(turns)
     if tables.sensing:
-        gap_step(tables.estimator, state.estimator, 0.0, 0.0, 0.0, 0.0, math.nan)
+        current = 0.0 if tables.voltage else envelope
+        held[FORCE], _ = gap_step(tables.estimator, state.estimator, 0.0, 0.0, current, 0.0, math.nan)
+        held[UNSENSED] = 1.0
 
 
 @kernel
@@ -201,10 +204,10 @@ def asked(tables, drive):
 def attract(tables, state, drive, finger, noise):
     """Mean attraction (N) over a sample, and flags."""
     load, speed = finger[LOAD], finger[SPEED]
-    if math.isnan(speed) or load <= 0.0:
-        lift(tables, state)
-        return 0.0, 0
     envelope, flags = asked(tables, drive)
+    if math.isnan(speed) or load <= 0.0:
+        lift(tables, state, envelope)
+        return 0.0, 0
     area = tables.area * load**tables.exponent
     thickness = tables.gap * (1.0 + tables.ripple * math.cos(tables.wavenumber * finger[POSITION]))
     resistance = tables.gap_short if abs(speed) < tables.sliding.least_speed else tables.gap_resistance
@@ -255,8 +258,7 @@ def closed_screen_run(
     tables, state, control, control_state, last, finger, noise, wanted, sensed, motion, felt, drive, target, flags
 ):
     """Screen and controller closed sample by sample; `last` (1,) is the drive computed one sample ago."""
-    step = step_of(control)
     for n in range(sensed.shape[0]):
         drive[n, 0] = last[0]
         flags[n] = screen_step(tables, state, last[0], finger[n], noise[n], sensed[n], motion[n], felt[n])
-        flags[n] |= step(control, control_state, sensed[n], finger[n, POSITION], wanted[n], last, target[n])
+        flags[n] |= control_step(control, control_state, sensed[n], finger[n, POSITION], wanted[n], last, target[n])

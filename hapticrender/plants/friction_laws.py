@@ -19,7 +19,7 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 
 from hapticrender._jit import kernel
-from hapticrender.plants.bounds import Bound, check_fields, positive
+from hapticrender.plants.bounds import Validated, number
 from hapticrender.protocols import Array
 
 FIT, FILM, BOUNCE = 0, 1, 2  # kinds of law
@@ -123,7 +123,7 @@ class FrictionLaw(Protocol):
         ...
 
 
-class _Law:
+class _Law(Validated):
     """Checks and broadcasts for the kernels above; laws add their numbers."""
 
     _heaviest = math.inf  # N: a law holds below this load
@@ -179,12 +179,9 @@ class FitLaw(_Law):
     [1.0, 0.48, 0.11]
     """
 
-    floor: float = 0.10
-    scale: float = 1.1e-6
-    exponent: float = 1.5
-
-    def __post_init__(self) -> None:
-        check_fields(self, _BOUNDS)
+    floor: float = number(0.10, most=0.999)
+    scale: float = number(1.1e-6, "m", above=0.0)
+    exponent: float = number(1.5, above=0.0)
 
     @property
     def numbers(self) -> LawNumbers:
@@ -217,15 +214,12 @@ class LoadSharing(_Law):
     [0.29, 0.45, 0.56]
     """
 
-    contact_pressure: float = 200e3
-    decay: float = 1.5e-6
-    pressure: float = 101e3
-    area: float = 1e-4
+    contact_pressure: float = number(200e3, "Pa", above=0.0)
+    decay: float = number(1.5e-6, "m", above=0.0)
+    pressure: float = number(101e3, "Pa", above=0.0)
+    area: float = number(1e-4, "m2", above=0.0)
 
     _unloaded = False
-
-    def __post_init__(self) -> None:
-        check_fields(self, _BOUNDS)
 
     @property
     def _heaviest(self) -> float:  # type: ignore[override]
@@ -262,12 +256,9 @@ class IntermittentContact(_Law):
     [0.15, 0.38, 0.62]
     """
 
-    coefficient: float = 2.0
-    friction: float = 0.8
-    frequency: float = 30e3
-
-    def __post_init__(self) -> None:
-        check_fields(self, _BOUNDS)
+    coefficient: float = number(2.0, above=0.0)
+    friction: float = number(0.8, above=0.0)
+    frequency: float = number(30e3, "Hz", above=0.0)
 
     @property
     def numbers(self) -> LawNumbers:
@@ -275,20 +266,7 @@ class IntermittentContact(_Law):
         return LawNumbers(BOUNCE, 0.0, 1.0 / (self.coefficient * self.friction * self.frequency), 1.0, 1.0, 1.0)
 
 
-LAWS = {"fit": FitLaw, "load-sharing": LoadSharing, "intermittent": IntermittentContact}
-
-_BOUNDS = {
-    "floor": Bound(most=0.999),
-    "scale": positive("m"),
-    "exponent": positive(),
-    "contact_pressure": positive("Pa"),
-    "decay": positive("m"),
-    "pressure": positive("Pa"),
-    "area": positive("m2"),
-    "coefficient": positive(),
-    "friction": positive(),
-    "frequency": positive("Hz"),
-}
+LAWS: dict[str, type[_Law]] = {"fit": FitLaw, "load-sharing": LoadSharing, "intermittent": IntermittentContact}
 
 
 def _checked(name: str, value: Any, least: float, most: float, unit: str = "") -> Array:

@@ -16,6 +16,7 @@ from __future__ import annotations
 import numpy as np
 
 from hapticrender.control.together import TogetherTables
+from hapticrender.plants.base import TouchedPlant
 from hapticrender.plants.electroadhesion import ElectroadhesionScreen, finger_rows
 from hapticrender.plants.electroadhesion_kernels import LOAD, POSITION
 from hapticrender.plants.hybrid_kernels import (
@@ -31,7 +32,7 @@ from hapticrender.protocols import Array, Controller, Sensed
 PLACES = ("skin",)
 
 
-class HybridPlant:
+class HybridPlant(TouchedPlant):
     """Plate and screen in discrete time, behind the `Plant` protocol.
 
     Drive: a current for each coil (A), then the screen's; sensed: both ends of the plate (m), then what the screen
@@ -57,6 +58,7 @@ class HybridPlant:
         Plate and screen differ in rate, delay or finger, or the plate has a single coil.
     """
 
+    closed_with = (TogetherTables,)
     sensed_channels = drive_channels = 3
     delay = block = 1
 
@@ -71,10 +73,9 @@ class HybridPlant:
                 raise ValueError(f"plate.{name} = {found}: must be {needed} with this screen")
         if not velocity_per_force > 0.0:
             raise ValueError(f"{velocity_per_force=}: must be > 0 m/(N s)")
+        super().__init__(screen.finger, screen.rate)
         self.plate, self.screen = plate, screen
-        self.rate, self.finger = screen.rate, screen.finger
         self.felt = np.zeros((0, 2))
-        self._samples = 0
         self._tables = HybridTables(plate._tables, screen._tables, float(velocity_per_force))
         self._state = HybridState(plate._state, screen._state, np.zeros(3), np.zeros(1), np.zeros(1))
         self._last = np.zeros(self.drive_channels)
@@ -86,14 +87,6 @@ class HybridPlant:
         self._samples += n
         self.felt = np.zeros((n, 2))
         return finger, noise, (np.zeros((n, 3)), np.zeros((n, 1)), self.felt, np.zeros(n, np.int64))
-
-    def closes(self, controller: Controller) -> bool:
-        """Whether `closed_loop` has compiled code for this controller."""
-        return isinstance(getattr(controller, "tables", None), TogetherTables)
-
-    def finger_position(self, n: int) -> Array:
-        """Finger positions (m, shape (n,)) of the next n samples, NaN while lifted; the plant does not advance."""
-        return self.finger.position((self._samples + np.arange(n)) / self.rate)
 
     def run(self, drive: Array) -> Sensed:
         """Advance by n samples under `drive` (shape (n, 3)); row i acts from sample i on, sensed at its start."""

@@ -11,7 +11,10 @@ at zero and never reads them.
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
+
+import numpy as np
 
 from hapticrender._jit import kernel
 from hapticrender._lanes import high, low, read, select, size, write
@@ -185,6 +188,30 @@ def plate_system(tables, lever, strength, system, push):
         push_row(tables, 2, bending, c2, push)
 
 
+def plate_matrix(tables: PlateTables, lever: float, strength: float) -> Array:
+    """A of `plate_system`, row by row over heave, rocking, bending, phalanx and their rates, without compiling it.
+
+    Its own way to the same numbers: M^-1 K and M^-1 C of the plate with the finger as a fourth coordinate.
+    """
+    x, period = tables.shape[0] * lever, tables.period
+    bend = tables.shape[1] * math.cosh(x) + tables.shape[2] * math.cos(x) if tables.flexible else 0.0
+    felt = np.array([1.0, lever, bend, -1.0])
+    glass = felt * (1.0, 1.0, 1.0, 0.0)
+    mass, grip = strength * tables.skin[0], strength or 1.0
+    inverse = np.diag([*tables.inverse_mass, tables.phalanx[0] / grip if strength > 0.0 else 0.0])
+    moved = inverse @ glass
+    inverse -= mass / (1.0 + mass * (glass @ moved)) * np.outer(moved, moved)  # Sherman and Morrison
+
+    def forces(own: Three, bending: float, skin: float, phalanx: float) -> Array:
+        alone = np.diag([own[0], own[2], bending, grip * phalanx])
+        alone[0, 1] = alone[1, 0] = own[1]
+        return -inverse @ (alone + strength * skin * np.outer(felt, felt))
+
+    k = forces(tables.stiffness, tables.flexure[0], tables.skin[2], tables.phalanx[2])
+    c = forces(tables.damping, tables.flexure[1], tables.skin[1], tables.phalanx[1])
+    return np.block([[np.zeros((4, 4)), np.eye(4)], [period**2 * k, period * c]])
+
+
 @kernel
 def series_at(tables, state, lever, strength, out, at):
     """Exact propagator for a finger at `lever` with `strength`, into row block `at` of `out`."""
@@ -277,7 +304,7 @@ def sense(tables, state, noise, sensed, motion):
 @kernel
 def plate_sense(tables, state, noise, sensed, motion):
     """`sense` of a single plate; returns flags."""
-    return int(sense(tables, state, noise, sensed, motion))
+    return np.int64(sense(tables, state, noise, sensed, motion))
 
 
 @kernel

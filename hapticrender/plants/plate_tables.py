@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from hapticrender._lanes import aligned
-from hapticrender.plants.kernels import PlateState, PlateTables, plate_system
+from hapticrender.plants.kernels import PlateState, PlateTables, plate_matrix
 from hapticrender.plants.propagator import COLUMNS, NODES, STATES, WIDEST, identity, shifts
 from hapticrender.protocols import Array
 
@@ -107,9 +107,9 @@ def _upper(matrix: Array) -> tuple[float, float, float]:
 @lru_cache(maxsize=1024)
 def _taylor_terms(tables: PlateTables, strongest: float) -> int:
     """Terms after which the exponential series has converged to rounding, wherever and however hard it is pressed."""
-    system, most = shifts(), 2
+    most = 2
     for lever, strength in itertools.product((0.0, tables.reach), (0.0, 1.0, strongest)):
-        plate_system(tables, lever, strength, system, np.zeros((3, 3)))
+        system = plate_matrix(tables, lever, strength)
         term, n = system, 1
         while abs(term).max() > TAYLOR_ROUNDING:
             n += 1

@@ -18,13 +18,13 @@ skin and the tribometer follow a friction that goes in a straight line from samp
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass, field, fields
-from typing import TYPE_CHECKING, Any, NamedTuple, Self
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from hapticrender._jit import kernel
+from hapticrender.plants.bounds import Validated, number
 from hapticrender.plants.kernels import quantise
 from hapticrender.protocols import Array
 
@@ -33,57 +33,6 @@ if TYPE_CHECKING:
 
 SKIN_STATES = 4  # displacements of skin and phalanx, then their velocities
 SKIN_VELOCITY = 2
-
-
-def number(
-    default: float, unit: str = "", *, above: float | None = None, least: float = 0.0, most: float = math.inf
-) -> Any:
-    """Field of a parameter class: > `above`, or >= `least`, and <= `most`, in `unit`."""
-    return field(default=default, metadata={"unit": unit, "above": above, "least": least, "most": most})
-
-
-def choice(default: str, *known: str) -> Any:
-    """Field of a parameter class that is one of the words in `known`."""
-    return field(default=default, metadata={"known": known})
-
-
-class Validated:
-    """Parameter class whose fields are made by `number` and `choice`, and say so when they are broken."""
-
-    def __post_init__(self) -> None:
-        for each in fields(self):  # type: ignore[arg-type]
-            if "free" not in each.metadata:  # checked by its own class
-                check = _check_choice if "known" in each.metadata else _check_number
-                check(each, getattr(self, each.name))
-
-    @classmethod
-    def with_overrides(cls, overrides: Mapping[str, Any]) -> Self:
-        """Defaults with some parameters replaced; an unknown name is a ValueError that lists the known ones."""
-        known = {each.name for each in fields(cls)}  # type: ignore[arg-type]
-        for name in overrides:
-            if name not in known:
-                raise ValueError(f"plant.{name}: no such parameter; known: {', '.join(sorted(known))}")
-        try:
-            return cls(**overrides)
-        except (ValueError, TypeError) as error:
-            raise type(error)(f"plant.{error}") from None
-
-
-def _check_choice(each: Any, value: Any) -> None:
-    if value not in each.metadata["known"]:
-        raise ValueError(f"{each.name} = {value!r}: must be one of {', '.join(each.metadata['known'])}")
-
-
-def _check_number(each: Any, value: Any) -> None:
-    whole = each.type in (int, "int")
-    if isinstance(value, bool) or not isinstance(value, int if whole else (int, float)):
-        raise TypeError(f"{each.name} = {value!r}: must be {'an integer' if whole else 'a number'}")
-    unit, above, least, most = (each.metadata[key] for key in ("unit", "above", "least", "most"))
-    bound = f">= {least:g}" if above is None else f"> {above:g}"
-    if not math.isfinite(value) or (value < least if above is None else value <= above):
-        raise ValueError(f"{each.name} = {value!r}: must be {bound} {unit}".rstrip())
-    if value > most:
-        raise ValueError(f"{each.name} = {value!r}: must be <= {most:g} {unit}".rstrip())
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -95,7 +44,7 @@ class SlidingParameters(Validated):
     rate : float, Hz
         Sampling rate of the surface, 1000 to 1e6.
     friction_coefficient : float
-        mu, of friction over normal force, >= 0 (dry to moist glass: 0.3 to 2).
+        mu, of friction over normal force, > 0 (dry to moist glass: 0.3 to 2).
     memory_length : float, m
         delta, the way after which the contact has renewed itself, > 0.
     least_speed : float, m/s
@@ -120,7 +69,7 @@ class SlidingParameters(Validated):
     """
 
     rate: float = number(10e3, "Hz", least=1e3, most=1e6)
-    friction_coefficient: float = number(0.8)
+    friction_coefficient: float = number(0.8, above=0.0)
     memory_length: float = number(11.5e-6, "m", above=0.0)
     least_speed: float = number(1e-3, "m/s", above=0.0)
     tribometer_frequency: float = number(1300.0, "Hz", above=0.0)

@@ -6,8 +6,8 @@ the same amplitude loop on a fraction of the samples.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field, fields, replace
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, Self
 
@@ -16,11 +16,11 @@ import numpy as np
 from hapticrender.bands import Bands
 from hapticrender.control.bandmodel import BandModel, FingerRange
 from hapticrender.control.bank import BankController
-from hapticrender.plants.bounds import overridden
-from hapticrender.plants.closed import STEPS
+from hapticrender.plants.base import TouchedPlant
+from hapticrender.plants.bounds import check_names, choice, number
 from hapticrender.plants.electroadhesion import finger_rows
 from hapticrender.plants.friction_laws import LAWS, FrictionLaw
-from hapticrender.plants.sliding import SlidingParameters, choice, number, sliding_state, sliding_tables
+from hapticrender.plants.sliding import SlidingParameters, sliding_state, sliding_tables
 from hapticrender.plants.surface_kernels import (
     LOAD,
     POSITION,
@@ -37,7 +37,8 @@ if TYPE_CHECKING:
     from hapticrender.touch.finger import Finger
 
 PLACES = ("friction",)
-PACE = 25.0  # times the rules of a plate: an amplitude settles within a millisecond
+PACE = 100.0  # times the rules of a plate: within half a millisecond an amplitude has recovered from a touch
+PACED_DELAY = 1 / 60  # s, most of pace times delay: an amplitude is learnt no faster than the drive can answer
 MOST_DETUNING = 0.015  # of the resonance: as far as the amplitude loop looks for it
 TYPICAL_DETUNING = 1e-3
 MOST_DAMPING = 20.0  # times that of the nominal finger
@@ -89,27 +90,20 @@ class SurfaceParameters(SlidingParameters):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        _ = self.carrier_mode, self.friction_law  # refuse what does not fit together
+        _ = self.carrier_mode  # refuses what does not fit together
+        if self.bias <= self.least_ratio:
+            raise ValueError(f"bias = {self.bias!r}: must be > {self.least_ratio:.3g}, the least that the law leaves")
 
     @classmethod
-    def with_overrides(cls, overrides: Mapping[str, Any]) -> Self:
-        """Defaults with some parameters replaced, of the surface, its mode or its law; an unknown name is refused."""
-        law = overrides.get("law", "fit")
-        names = {
-            "own": {each.name for each in fields(cls)} - {"mode", "law_parameters"},
-            "mode": {each.name for each in fields(UltrasonicParameters)} - {"rate", "level"},
-            "law": {each.name for each in fields(LAWS.get(law, LAWS["fit"]))},
-        }
-        parts: dict[str, dict[str, Any]] = {part: {} for part in names}
-        for name, value in overrides.items():
-            part = next((part for part, known in names.items() if name in known), None)
-            if part is None:
-                known = sorted(set().union(*names.values()))
-                raise ValueError(f"plant.{name}: no such parameter; known: {', '.join(known)}")
-            parts[part][name] = value
-        mode = overridden(UltrasonicParameters, parts["mode"])
+    def with_overrides(cls, overrides: Mapping[str, Any], also: Iterable[str] = ()) -> Self:
+        """Defaults with some parameters replaced, of the surface, its mode or its law; see `Validated`."""
+        own, mode = cls.names(), UltrasonicParameters.names() - cls.names()
+        law = LAWS.get(overrides.get("law", "fit"), LAWS["fit"])
+        of_law = law.names() - own - mode
+        check_names(overrides, own | mode | of_law, also)
+        parts = [{name: overrides[name] for name in overrides if name in known} for known in (own, mode, of_law)]
         try:
-            return cls(**parts["own"], mode=mode, law_parameters=parts["law"])
+            return cls(**parts[0], mode=UltrasonicParameters(**parts[1]), law_parameters=parts[2])
         except (ValueError, TypeError) as error:
             raise type(error)(f"plant.{error}") from None
 
@@ -130,6 +124,22 @@ class SurfaceParameters(SlidingParameters):
         """Samples of the carrier in one of the friction."""
         return self.oversampling if self.level == "carrier" else self.envelope_oversampling
 
+    @property
+    def least_ratio(self) -> float:
+        """Least mu/mu0 that is asked for: near its floor a law takes ever more amplitude for ever less."""
+        floor = self.friction_law.numbers.floor
+        return floor + 0.01 * (1.0 - floor)
+
+    def sensor_response(self, frequency: Any, speed: float) -> Any:
+        """Return what is sensed per friction (complex) at `frequency` (Hz) under a finger at `speed` (m/s).
+
+        The tribometer's response; or what the sensed amplitude says before the contact's lag, at the middle of the
+        sample at whose end friction is felt.
+        """
+        if self.sensor == "tribometer":
+            return self.tribometer_response(frequency)
+        return 1.0 / (self.lag_response(frequency, speed) * self._shift(np.asarray(frequency, float) / 2))
+
     def amplitude_model(self) -> BandModel:
         """Band model of the mode with what a finger and the heat can make of it, for its amplitude loop."""
         mode = self.carrier_mode
@@ -149,7 +159,7 @@ def resonant(model: BandModel, mode: UltrasonicParameters, lock: float) -> BandM
     finger = MOST_DAMPING * mode.finger_damping * mode.frequency / mode.carrier
     return replace(
         model,
-        pace=PACE,
+        pace=min(PACE, PACED_DELAY * model.rate / model.delay),
         lock=lock,
         finger=FingerRange(
             mass=(0.0, 0.0),
@@ -163,7 +173,7 @@ def resonant(model: BandModel, mode: UltrasonicParameters, lock: float) -> BandM
     )
 
 
-class UltrasonicSurface:
+class UltrasonicSurface(TouchedPlant):
     """The surface in discrete time, behind the `Plant` protocol.
 
     Parameters
@@ -196,13 +206,11 @@ class UltrasonicSurface:
         seed: int = 0,
         nominal: tuple[float, float] = (0.5, 0.05),
     ) -> None:
+        super().__init__(finger, parameters.rate)
         self.parameters = parameters
-        self.finger = finger
-        self.rate = float(parameters.rate)
         self.amplitude = self.skin_velocity = np.zeros(0)
         self.loop = amplitude
         self._rng = np.random.default_rng(seed)
-        self._samples = 0
         self._tables = surface_tables(parameters, amplitude, finger, nominal)
         self._state = surface_state(parameters, amplitude)
         self._last = np.zeros(1)
@@ -210,19 +218,11 @@ class UltrasonicSurface:
     def _next(self, n: int) -> tuple[Array, Array, Array, Array]:
         """Finger rows, mode rows, noise and sample flags of the next n samples."""
         finger = finger_rows(self.finger, self._samples, n, self.rate)
-        time = (self._samples + np.arange(n)) / self.rate
+        time = self._time(n)
         self._samples += n
         mode = mode_rows(self.parameters.carrier_mode, time, np.where(finger[:, STRENGTH] > 0.0, finger[:, LOAD], 0.0))
         noise = self._rng.standard_normal((n, 1 + self._tables.substeps))
         return finger, mode, noise, np.zeros(n, np.int64)
-
-    def closes(self, controller: Controller) -> bool:
-        """Whether `closed_loop` has compiled code for this controller."""
-        return type(getattr(controller, "tables", None)) in STEPS
-
-    def finger_position(self, n: int) -> Array:
-        """Finger positions (m, shape (n,)) of the next n samples, NaN while lifted; the plant does not advance."""
-        return self.finger.position((self._samples + np.arange(n)) / self.rate)
 
     def run(self, drive: Array) -> Sensed:
         """Advance by n samples under `drive` (N, shape (n, 1)); row i acts from sample i on, sensed at its start."""
@@ -288,7 +288,7 @@ def surface_tables(
         substeps=int(parameters.substeps),
         friction=float(parameters.friction_coefficient),
         bias=float(parameters.bias),
-        least=float(numbers.floor + 0.01 * (1.0 - numbers.floor)),
+        least=float(parameters.least_ratio),
         load=float(load),
         speed=float(speed),
         estimating=parameters.sensor == "amplitude",

@@ -14,7 +14,7 @@ from hapticrender._jit import kernel
 from hapticrender.control import bank_rows as row
 from hapticrender.control.bank_kernels import bank_step
 from hapticrender.control.bank_state import BankState, BankTables
-from hapticrender.plants.closed import step_of
+from hapticrender.plants.closed import control_step
 from hapticrender.plants.friction_laws import LawNumbers, friction_ratio, wanted_amplitude
 from hapticrender.plants.kernels import HUGE, SENSOR_CLIPPED
 from hapticrender.plants.sliding import SlidingState, SlidingTables, sliding_step
@@ -88,9 +88,8 @@ def amplitude_pass(tables, state, wanted, mode, noise):
 
 
 @kernel
-def sensed_amplitude(state):
-    """Amplitude (m) as the loop's observer has it."""
-    band, loop = state.control.band, state.control.loop
+def sensed_amplitude(band, loop):
+    """Amplitude (m) as the observer of an amplitude loop has it, by its state."""
     re = band[0, row.SEEN_RE, 0] + loop[0, row.E_RE, 0]
     im = band[0, row.SEEN_IM, 0] + loop[0, row.E_IM, 0]
     return math.hypot(re, im)
@@ -116,7 +115,8 @@ def surface_step(tables, state, drive, finger, mode, noise, sensed, motion, skin
     flags |= trouble
     if tables.estimating:
         sensed[0] = state.estimate[0]
-        state.estimate[0] = whole * friction_ratio(tables.law, sensed_amplitude(state), load, pace) if there else 0.0
+        heard = sensed_amplitude(state.control.band, state.control.loop)
+        state.estimate[0] = whole * friction_ratio(tables.law, heard, load, pace) if there else 0.0
         return flags
     sensed[0] = shown
     return flags | (SENSOR_CLIPPED if abs(shown) >= tables.sliding.force_range else 0)
@@ -139,11 +139,10 @@ def closed_surface_run(
 
     `outputs` are the columns sensed, motion, skin velocity and amplitude.
     """
-    step = step_of(control)
     sensed, motion, skin, amplitude = outputs
     for n in range(sensed.shape[0]):
         drive[n, 0] = last[0]
         flags[n] = surface_step(
             tables, state, last[0], finger[n], mode[n], noise[n], sensed[n], motion[n], skin[n], amplitude[n]
         )
-        flags[n] |= step(control, control_state, sensed[n], finger[n, POSITION], wanted[n], last, target[n])
+        flags[n] |= control_step(control, control_state, sensed[n], finger[n, POSITION], wanted[n], last, target[n])

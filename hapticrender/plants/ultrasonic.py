@@ -19,15 +19,14 @@ That is the level "envelope": still a mode on a carrier, for the same controller
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from hapticrender.control.bandmodel import BandModel
-from hapticrender.plants.bounds import Bound, check_fields, overridden, positive
-from hapticrender.plants.closed import STEPS
+from hapticrender.plants.base import TouchedPlant
+from hapticrender.plants.bounds import Validated, choice, number
 from hapticrender.plants.ultrasonic_kernels import (
     STEP,
     UltrasonicState,
@@ -52,7 +51,7 @@ RAMPS = 1000  # steps a second in which the temperature rises
 
 
 @dataclass(frozen=True, kw_only=True)
-class UltrasonicParameters:
+class UltrasonicParameters(Validated):
     """Everything that describes the mode, its electronics and how finely it is modelled.
 
     Parameters
@@ -104,31 +103,27 @@ class UltrasonicParameters:
     ([75.0, 250.1], 2.0)
     """
 
-    frequency: float = 30e3
-    modal_mass: float = 5e-3
-    quality: float = 200.0
-    finger_damping: float = 11.0
-    finger_shift: float = -30.0
-    temperature_coefficient: float = -100e-6
-    temperature_rise: float = 0.0
-    temperature_time: float = 1.0
-    drive_limit: float = 10.0
-    force_constant: float = 1.777
-    sensor_range: float = 50e-6
-    sensor_bits: int = 16
-    drive_bits: int = 16
-    sensor_noise: float = 2e-9
-    rate: float = 192e3
-    delay: int = 1
-    level: str = "carrier"
-    envelope_frequency: float = 6e3
+    frequency: float = number(30e3, "Hz", least=20e3, most=70e3)
+    modal_mass: float = number(5e-3, "kg", above=0.0)
+    quality: float = number(200.0, least=5.0, most=1e5)
+    finger_damping: float = number(11.0, "N s/m")
+    finger_shift: float = number(-30.0, "Hz", least=-1e4, most=1e4)
+    temperature_coefficient: float = number(-100e-6, "1/K", least=-1e-3, most=1e-3)
+    temperature_rise: float = number(0.0, "K", least=-100.0, most=100.0)
+    temperature_time: float = number(1.0, "s", above=0.0)
+    drive_limit: float = number(10.0, "V", above=0.0)
+    force_constant: float = number(1.777, "N/V", above=0.0)
+    sensor_range: float = number(50e-6, "m", above=0.0)
+    sensor_bits: int = number(16, least=0, most=24)
+    drive_bits: int = number(16, least=0, most=24)
+    sensor_noise: float = number(2e-9, "m")
+    rate: float = number(192e3, "Hz", least=500.0, most=1e7)
+    delay: int = number(1, "samples", least=1, most=100_000)
+    level: str = choice("carrier", *LEVELS)
+    envelope_frequency: float = number(6e3, "Hz", least=500.0)
 
     def __post_init__(self) -> None:
-        if not isinstance(self.level, str):
-            raise TypeError(f"level = {self.level!r}: must be one of {', '.join(LEVELS)}")
-        if self.level not in LEVELS:
-            raise ValueError(f"level = {self.level!r}: must be one of {', '.join(LEVELS)}")
-        check_fields(self, _BOUNDS)
+        super().__post_init__()
         if self.envelope_frequency >= self.frequency:
             raise ValueError(
                 f"envelope_frequency = {self.envelope_frequency!r}: must be < frequency = {self.frequency:g} Hz"
@@ -155,11 +150,6 @@ class UltrasonicParameters:
                     f"{name} = {getattr(self, name)!r}: shifts the resonance by up to {shift:g} Hz, "
                     f"must be within {MOST_SHIFT * self.carrier:g} Hz of a carrier of {self.carrier:g} Hz"
                 )
-
-    @classmethod
-    def with_overrides(cls, overrides: Mapping[str, Any]) -> UltrasonicParameters:
-        """Defaults with some parameters replaced; an unknown name is a ValueError that lists the known ones."""
-        return overridden(cls, overrides)
 
     def transposed(self, frequency: float, rate: float) -> UltrasonicParameters:
         """Return the same plate at level "envelope": its mode on a carrier of `frequency` (Hz) at `rate` (Hz).
@@ -270,33 +260,12 @@ class UltrasonicParameters:
         )
 
 
-_BOUNDS = {
-    "frequency": Bound("Hz", 20e3, 70e3),
-    "modal_mass": positive("kg"),
-    "quality": Bound("", 5.0, 1e5),
-    "finger_damping": Bound("N s/m"),
-    "finger_shift": Bound("Hz", -1e4, 1e4),
-    "temperature_coefficient": Bound("1/K", -1e-3, 1e-3),
-    "temperature_rise": Bound("K", -100.0, 100.0),
-    "temperature_time": positive("s"),
-    "drive_limit": positive("V"),
-    "force_constant": positive("N/V"),
-    "sensor_range": positive("m"),
-    "sensor_bits": Bound("", 0, 24),
-    "drive_bits": Bound("", 0, 24),
-    "sensor_noise": Bound("m"),
-    "rate": Bound("Hz", 500.0, 1e7),
-    "delay": Bound("samples", 1, 100_000),
-    "envelope_frequency": Bound("Hz", 500.0),
-}
-
-
 def _grip(normal_load: Array | float) -> Array:
     """(W/0.5 N)^(1/3), 0 without load: how much of the nominal finger is on the plate."""
     return np.cbrt(np.maximum(np.asarray(normal_load, float), 0.0) / NOMINAL_LOAD)
 
 
-class UltrasonicPlate:
+class UltrasonicPlate(TouchedPlant):
     """The mode in discrete time, behind the `Plant` protocol.
 
     Parameters
@@ -314,34 +283,24 @@ class UltrasonicPlate:
     def __init__(self, parameters: UltrasonicParameters, finger: Finger, seed: int = 0, block: int = 1) -> None:
         if not 1 <= block <= parameters.delay:
             raise ValueError(f"block = {block}: must be between 1 and the loop's delay of {parameters.delay} samples")
+        super().__init__(finger, parameters.rate)
         self.parameters = parameters
-        self.finger = finger
-        self.rate = float(parameters.rate)
         self.delay = parameters.delay
         self.block = block
         self.drive_channels = self.sensed_channels = 1
         self._rng = np.random.default_rng(seed)
-        self._samples = 0
         self._tables = ultrasonic_tables(parameters)
         self._state = ultrasonic_state(parameters.delay - block)
         self._last = np.zeros(1)
 
     def _next(self, n: int) -> tuple[Array, Array, Array, Array]:
         """Finger rows, mode rows, noise and sample flags of the next n samples."""
-        count = self._samples + np.arange(n)
+        time = self._time(n)
         self._samples += n
-        finger = self.finger.touch(count / self.rate)
+        finger = self.finger.touch(time)
         load = np.where(finger[:, 2] > 0.0, finger[:, 1], 0.0)
         noise = self._rng.standard_normal((n, 1)) if self._tables.sensor_noise > 0.0 else np.zeros((n, 1))
-        return finger, mode_rows(self.parameters, count / self.rate, load), noise, np.zeros(n, np.int64)
-
-    def closes(self, controller: Controller) -> bool:
-        """Whether `closed_loop` has compiled code for this controller."""
-        return type(getattr(controller, "tables", None)) in STEPS
-
-    def finger_position(self, n: int) -> Array:
-        """Finger positions (m, shape (n,)) of the next n samples, NaN while lifted; the plant does not advance."""
-        return self.finger.position((self._samples + np.arange(n)) / self.rate)
+        return finger, mode_rows(self.parameters, time, load), noise, np.zeros(n, np.int64)
 
     def run(self, drive: Array) -> Sensed:
         """Advance by n samples under `drive` (V, shape (n, 1)); row i acts from sample i on, sensed at its start."""

@@ -15,7 +15,7 @@ import math
 from typing import NamedTuple
 
 from hapticrender._jit import kernel
-from hapticrender.plants.closed import step_of
+from hapticrender.plants.closed import control_step
 from hapticrender.plants.kernels import HUGE, SENSOR_CLIPPED, quantise
 from hapticrender.protocols import Array
 
@@ -114,10 +114,9 @@ def closed_ultrasonic_run(
 
     Row n of `drive` is what the mode was handed for interval n, so it is computed from sample n - 1.
     """
-    step = step_of(control)
     for n in range(sensed.shape[0]):
         mode_drive(tables, state, last)
         flags[n] = mode_sense(tables, state, noise[n], sensed[n], motion[n])
         mode_advance(tables, state, mode[n])
         drive[n, 0] = last[0]
-        flags[n] |= step(control, control_state, sensed[n], position[n], wanted[n], last, target[n])
+        flags[n] |= control_step(control, control_state, sensed[n], position[n], wanted[n], last, target[n])

@@ -23,14 +23,15 @@ couples the mode to heave and rocking.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass, fields
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from hapticrender.control.bandmodel import BandModel
 from hapticrender.control.damping_margins import BendingMode
+from hapticrender.plants.base import TouchedPlant
+from hapticrender.plants.bounds import Validated, number
 from hapticrender.plants.closed import CLOSED
 from hapticrender.plants.kernels import plate_run
 from hapticrender.plants.plate_tables import plate_state, plate_tables
@@ -47,7 +48,7 @@ FREE_FREE = 2.365020372431352  # half of the first root of cos(x) cosh(x) = 1: t
 
 
 @dataclass(frozen=True, kw_only=True)
-class PlateParameters:
+class PlateParameters(Validated):
     """Everything that describes the plate, its electronics and how finely it is modelled.
 
     Parameters
@@ -102,64 +103,39 @@ class PlateParameters:
     are the numbers of the bending mode (FACTS section 3 A: 1.1-1.4 kHz, 9.5 g, 0.01, about +-0.1).
     """
 
-    mass: float = 32e-3
-    inertia: float = 4e-5
-    stiffness_1: float = 22.4e3
-    stiffness_2: float = 22.9e3
-    damping_1: float = 0.85
-    damping_2: float = 0.85
-    force_constant: float = 7.4
-    coil_spacing: float = 55e-3
-    glass_length: float = 110e-3
-    amplifier_r1: float = 10e3
-    amplifier_r2: float = 2e3
-    amplifier_rp: float = 1.0
-    current_limit: float = 3.0
-    current_bits: int = 12
-    sensor_range: float = 2e-3
-    sensor_bits: int = 14
-    sensor_noise: float = 1e-6
-    sensor_gain_1: float = 1.0
-    sensor_gain_2: float = 1.0
-    rate: float = 5000.0
-    delay: int = 1
-    coils: int = 2
-    degrees_of_freedom: int = 2
-    finger_dynamics: int = 1
-    bending_frequency: float = 0.0
-    bending_damping: float = 0.01
-    bending_mass: float = 9.5e-3
-    bending_coil: float = -0.1
+    mass: float = number(32e-3, "kg", above=0.0)
+    inertia: float = number(4e-5, "kg m2", above=0.0)
+    stiffness_1: float = number(22.4e3, "N/m", above=0.0)
+    stiffness_2: float = number(22.9e3, "N/m", above=0.0)
+    damping_1: float = number(0.85, "N s/m")
+    damping_2: float = number(0.85, "N s/m")
+    force_constant: float = number(7.4, "N/A", above=0.0)
+    coil_spacing: float = number(55e-3, "m", above=0.0)
+    glass_length: float = number(110e-3, "m", above=0.0)
+    amplifier_r1: float = number(10e3, "ohm", above=0.0)
+    amplifier_r2: float = number(2e3, "ohm", above=0.0)
+    amplifier_rp: float = number(1.0, "ohm", above=0.0)
+    current_limit: float = number(3.0, "A", above=0.0)
+    current_bits: int = number(12, most=24)
+    sensor_range: float = number(2e-3, "m", above=0.0)
+    sensor_bits: int = number(14, most=24)
+    sensor_noise: float = number(1e-6, "m")
+    sensor_gain_1: float = number(1.0, above=0.0)
+    sensor_gain_2: float = number(1.0, above=0.0)
+    rate: float = number(5000.0, "Hz", least=500.0, most=1000000.0)
+    delay: int = number(1, "samples", least=1, most=100_000)
+    coils: int = number(2, least=1, most=2)
+    degrees_of_freedom: int = number(2, least=1, most=2)
+    finger_dynamics: int = number(1, most=1)
+    bending_frequency: float = number(0.0, "Hz")
+    bending_damping: float = number(0.01)
+    bending_mass: float = number(9.5e-3, "kg", above=0.0)
+    bending_coil: float = number(-0.1, least=-1.0, most=1.0)
 
     def __post_init__(self) -> None:
-        for field in fields(self):
-            unit = _UNITS[field.name]
-            value = getattr(self, field.name)
-            whole = field.type == "int"
-            if isinstance(value, bool) or not isinstance(value, int if whole else (int, float)):
-                raise TypeError(f"{field.name} = {value!r}: must be {'an integer' if whole else 'a number'}")
-            floor, strict = _BOUNDS.get(field.name, (0.0, True))
-            if not math.isfinite(value) or value < floor or (strict and value == floor):
-                raise ValueError(
-                    f"{field.name} = {value!r}: must be {'>' if strict else '>='} {floor:g} {unit}".rstrip()
-                )
-            ceiling = _CEILINGS.get(field.name, math.inf)
-            if value > ceiling:
-                raise ValueError(f"{field.name} = {value!r}: must be <= {ceiling:g} {unit}".rstrip())
+        super().__post_init__()
         if self.bending_frequency > self.rate:
             raise ValueError(f"bending_frequency = {self.bending_frequency!r}: must be <= rate = {self.rate:g} Hz")
-
-    @classmethod
-    def with_overrides(cls, overrides: Mapping[str, Any]) -> PlateParameters:
-        """Defaults with some parameters replaced; an unknown name is a ValueError that lists the known ones."""
-        known = {field.name for field in fields(cls)}
-        for name in overrides:
-            if name not in known:
-                raise ValueError(f"plant.{name}: no such parameter; known: {', '.join(sorted(known))}")
-        try:
-            return cls(**overrides)
-        except (ValueError, TypeError) as error:
-            raise type(error)(f"plant.{error}") from None
 
     @property
     def half_spacing(self) -> float:
@@ -283,55 +259,12 @@ class PlateParameters:
         )
 
 
-_BOUNDS = {
-    **dict.fromkeys(
-        (
-            "damping_1",
-            "damping_2",
-            "sensor_noise",
-            "current_bits",
-            "sensor_bits",
-            "finger_dynamics",
-            "bending_frequency",
-            "bending_damping",
-        ),
-        (0.0, False),
-    ),
-    **dict.fromkeys(("delay", "coils", "degrees_of_freedom"), (1.0, False)),
-    "rate": (500.0, False),
-    "bending_coil": (-1.0, False),
-}
-_CEILINGS = {
-    "current_bits": 24,
-    "sensor_bits": 24,
-    "delay": 100_000,
-    "coils": 2,
-    "degrees_of_freedom": 2,
-    "finger_dynamics": 1,
-    "rate": 1e6,
-    "bending_coil": 1.0,
-}
-_UNITS = {
-    **dict.fromkeys((field.name for field in fields(PlateParameters)), ""),
-    **dict.fromkeys(("coil_spacing", "glass_length", "sensor_range", "sensor_noise"), "m"),
-    **dict.fromkeys(("stiffness_1", "stiffness_2"), "N/m"),
-    **dict.fromkeys(("damping_1", "damping_2"), "N s/m"),
-    **dict.fromkeys(("amplifier_r1", "amplifier_r2", "amplifier_rp"), "ohm"),
-    **dict.fromkeys(("mass", "bending_mass"), "kg"),
-    "inertia": "kg m2",
-    "force_constant": "N/A",
-    "current_limit": "A",
-    **dict.fromkeys(("rate", "bending_frequency"), "Hz"),
-    "delay": "samples",
-}
-
-
 def _pair(side_1: float, side_2: float) -> Array:
     """Two equal-kind elements at the coils, in heave and rocking."""
     return np.array([[side_1 + side_2, side_2 - side_1], [side_2 - side_1, side_1 + side_2]])
 
 
-class Plate:
+class Plate(TouchedPlant):
     """The plate in discrete time, behind the `Plant` protocol.
 
     Parameters
@@ -349,32 +282,26 @@ class Plate:
     def __init__(self, parameters: PlateParameters, finger: Finger, seed: int = 0, block: int = 1) -> None:
         if not 1 <= block <= parameters.delay:
             raise ValueError(f"block = {block}: must be between 1 and the loop's delay of {parameters.delay} samples")
+        super().__init__(finger, parameters.rate)
         self.parameters = parameters
-        self.finger = finger
-        self.rate = float(parameters.rate)
         self.delay = parameters.delay
         self.block = block
         self.drive_channels, self.sensed_channels = parameters.coils, 2
         self._rng = np.random.default_rng(seed)
-        self._samples = 0
         self._tables = plate_tables(parameters, finger)
         self._state = plate_state(parameters.delay - block)
         self._last = np.zeros(2)
 
     def _next(self, n: int) -> tuple[Array, Array, Array]:
         """Finger rows, noise and sample flags of the next n samples."""
-        time = (self._samples + np.arange(n)) / self.rate
+        time = self._time(n)
         self._samples += n
         noise = self._rng.standard_normal((n, 2)) if self._tables.sensor_noise > 0.0 else np.zeros((n, 2))
         return self.finger.touch(time), noise, np.zeros(n, np.int64)
 
     def closes(self, controller: Controller) -> bool:
         """Whether `closed_loop` has compiled code for this controller."""
-        return type(getattr(controller, "tables", None)) in CLOSED and self.drive_channels == 2
-
-    def finger_position(self, n: int) -> Array:
-        """Finger positions (m, shape (n,)) of the next n samples, NaN while lifted; the plant does not advance."""
-        return self.finger.position((self._samples + np.arange(n)) / self.rate)
+        return super().closes(controller) and self.drive_channels == 2
 
     def run(self, drive: Array) -> Sensed:
         """Advance by n samples under `drive` (A, shape (n, coils)); row i acts from sample i, sensed at its start."""

@@ -32,7 +32,6 @@ REALISTIC_FORCE = 0.05  # N: lateral force of a texture up to which motion above
 
 # Just noticeable differences, the smallest of each source: an error below them is not felt.
 AMPLITUDE_JND = 2.2  # dB, of 2.2 to 2.5: Israr, Tan and Reed 2006
-FREQUENCY_JND = 0.18  # of the frequency, of 0.18 to 0.25: Israr, Tan and Reed 2006
 ELECTROVIBRATION_JND = 1.21  # dB of voltage, twice that of force: Ryu et al. 2018
 
 

@@ -69,7 +69,11 @@ class ErrorObserver:
 
 
 def in_its_blocks(controller: BankController, model: BandModel, precision: str) -> BankController | BlockController:
-    """Return the bank as the device of `model` takes it: sample by sample, or in blocks where they are long."""
-    if model.block > 1 and model.delay > PROMPT:
+    """Return the bank as the device of `model` takes it: sample by sample, or in blocks where they are long.
+
+    The block form knows nothing of a finger that is away or of a contact's memory; there the bank steps through them.
+    """
+    friction = model.finger.presence or model.memory > 0.0
+    if model.block > 1 and model.delay > PROMPT and not friction:
         return BlockController(controller, model.block, precision)
     return controller.in_precision(precision)

@@ -1,0 +1,315 @@
+"""What the models of the surfaces that make friction can leave out for a scene, and the error bound of one that does.
+
+What is compared is the friction under the finger while both levels are driven alike, with what the friction loop has to
+ask for: the target, led by the contact's lag.  Of the finger nothing is left out.  Its mechanics move its skin and
+change no friction, and simpler ones take as long; one that rests feels none.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from itertools import product
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from hapticrender._jit import kernel
+from hapticrender.bands import Bands
+from hapticrender.control.gap import VACUUM
+from hapticrender.fidelity_plate import CHUNK_VALUES, HOPS, LOOK_AHEAD, NoBound, Option
+from hapticrender.judge import LARGEST_INFLATION, LOWEST_FREQUENCY, fit, window_length
+from hapticrender.loop import registered
+from hapticrender.plants.electroadhesion import ElectroadhesionParameters, ElectroadhesionScreen, finger_rows
+from hapticrender.plants.fidelity_screen import attractions
+from hapticrender.plants.fidelity_surface import AmplitudeLoop
+from hapticrender.plants.friction_laws import friction_ratios, wanted_amplitudes
+from hapticrender.plants.sliding import SlidingParameters
+from hapticrender.plants.surface import SurfaceParameters, UltrasonicSurface, surface_tables
+from hapticrender.protocols import Array
+from hapticrender.touch.motion import Sliding, Swiping
+from hapticrender.touch.scene import Scene
+
+LEAD = 0.5  # s of a scene that are followed before its judgement, at least
+TAIL = 0.02  # s behind it, in which what an amplitude loop makes of the end dies away
+GROWTH = 0.05  # s in which a target grows after a touch
+SETTLING = 10.0  # time constants between the last touch and the judgement
+ACCURACY = 5e-5  # relative error below which nothing is told
+BETWEEN = 1.03  # of the error in the windows that are looked at: in those between
+SMALL_SIGNAL = 1.15  # of an amplitude loop's error by its linear model: at large modulation
+HEARD = 0.8  # of a detector's level: a deviation that may open it, as it hears twice the carrier as well
+HEARD_IN_NOISE = 0.25  # the same where there is noise, whose 5 or 5.5 sigma the level is: 4 of them come by chance
+CHANCES = 20.0  # windows for each that there is, of which noise is never worse in one
+DRIVEN = 0.9  # of the drive's limit: what the amplitude may ask for, as feedback asks for some on top
+LOADS = 5  # of a finger that presses more or less, at which an amplitude loop is computed
+PASSED = 8  # frequencies of a carrier that moves with the finger, at which noise is looked at
+SMALL = 1e-4  # relative step of an amplitude
+POSITION, LOAD, _, SPEED = range(4)  # columns of the finger
+
+
+class _Track(NamedTuple):
+    """A stretch of a scene, sample by sample: its finger, and what is wanted of friction."""
+
+    rate: float  # Hz
+    judged: slice  # samples that are judged
+    rise: float  # K: of the temperature, at the end
+    finger: Array  # (n, 4) position (m), load (N), strength, speed (m/s)
+    kept: Array  # (n,) share of its friction that the contact keeps over a sample
+    phase: Array  # (n, bands) rad
+    frequency: Array  # (n, bands) Hz
+    envelope: Array  # (n, bands) N, complex
+
+    @property
+    def touched(self) -> Array:
+        """Where the finger presses (n,)."""
+        return np.isfinite(self.finger[:, SPEED]) & (self.finger[:, LOAD] > 0.0)
+
+
+class _Friction(NamedTuple):
+    """What a plant makes of what is asked for."""
+
+    steady: Array  # (n,) N
+    noise: Array  # (bands,) N2/Hz: largest power density where the band is
+
+
+@kernel
+def follow_friction(steady, kept, friction):
+    """Friction (N) at the start of every sample, which goes after `steady` (N) by all but `kept` (1) of its way."""
+    here = 0.0
+    for n in range(steady.shape[0]):
+        friction[n] = here
+        here = steady[n] + (here - steady[n]) * kept[n]
+
+
+def bound(scene: Scene, lesser: Scene) -> float:
+    """Largest relative error (1) of the friction in a lesser model; see `hapticrender.fidelity.fidelity`."""
+    renderer = registered("renderers", scene.device)()
+    full, less = (renderer.plant(each, 0) for each in (scene, lesser))
+    model = renderer.band_model(scene, registered("drivers", "simulated")(full))
+    bands = renderer.bands(scene, model)
+    if bands.envelope is None:
+        raise NoBound("its texture has no constant envelopes, so no tight bound is known")
+    if not bands.envelope.any():
+        return 0.0
+    track = _track(scene, full.parameters, bands, model.highest_frequency, max(map(_lead, (full, less))))
+    asked = _asked(track)
+    margin = BETWEEN if isinstance(full, ElectroadhesionScreen) else SMALL_SIGNAL
+    worst = np.zeros(len(bands))
+    for one, other in product(*(_frictions(each, track, asked) for each in (full, less))):
+        apart = np.empty(len(asked))
+        follow_friction(one.steady - other.steady, track.kept, apart)
+        found = _worst(scene, bands, track, apart, one.noise + other.noise)
+        worst = np.maximum(worst, margin * found)
+    return float(worst.max()) + ACCURACY
+
+
+def _lead(plant: Any) -> float:
+    """Time (s) in which a plant settles after a touch."""
+    p = plant.parameters
+    if isinstance(plant, UltrasonicSurface):
+        numbers = plant.loop.tables.numbers
+        return SETTLING / min(pace for pace in (numbers.adapt, numbers.lock) if pace > 0.0)
+    if not p.current_offset:
+        return LEAD
+    charging = p.insulator_capacitance * float(p.area(1.0)) / p.servo_conductance if p.servo_conductance else math.inf
+    return max(LEAD, SETTLING * charging)
+
+
+def _track(scene: Scene, parameters: Any, bands: Bands, highest: float, lead: float) -> _Track:
+    """What is followed of a scene, from `lead` (s) before its judgement on."""
+    begin = scene.settle if scene.duration >= 2 * scene.settle else scene.duration / 2
+    end = min(scene.duration, begin + LOOK_AHEAD)
+    if end < scene.duration and not isinstance(scene.finger.motion, Sliding | Swiping):
+        raise NoBound(f"its finger's path is longer than {LOOK_AHEAD:g} s and no repetition")
+    if min(lead, begin) > LOOK_AHEAD:
+        raise NoBound(f"it takes more than {LOOK_AHEAD:g} s to settle")
+    rate = float(parameters.rate)
+    first, last = math.floor(max(begin - max(lead, LEAD), 0.0) * rate), math.ceil((end + TAIL) * rate)
+    finger = finger_rows(scene.finger, first, last - first, rate)
+    frequency = bands.instantaneous_frequency(np.nan_to_num(finger[:, SPEED]))
+    mode = getattr(parameters, "mode", None)
+    return _Track(
+        rate=rate,
+        judged=slice(math.ceil(begin * rate) - first, math.floor(end * rate) - first),
+        rise=mode.temperature_rise * min(end / mode.temperature_time, 1.0) if mode else 0.0,
+        finger=finger,
+        kept=_kept(parameters, finger[:, SPEED]),
+        phase=bands.carrier_phase(np.arange(first, last) / rate, finger[:, POSITION]),
+        frequency=frequency,
+        envelope=_envelope(bands, frequency, np.isfinite(finger[:, SPEED]), highest, rate),
+    )
+
+
+def _kept(parameters: SlidingParameters, speed: Array) -> Array:
+    """Share of its friction that the contact keeps over each sample (n,)."""
+    speed = abs(np.nan_to_num(speed))
+    renewed = speed / (parameters.rate * parameters.memory_length)
+    return np.where(speed >= parameters.least_speed, np.exp(-renewed), 1.0)
+
+
+def _envelope(bands: Bands, frequency: Array, down: Array, highest: float, rate: float) -> Array:
+    """Wanted envelopes (N, (n, bands)): they grow after a touch, and fade where a carrier is too slow or too fast."""
+    count = np.arange(len(down))
+    since = count - np.maximum.accumulate(np.where(down, -1, count))
+    weight = _ease(since / (GROWTH * rate))[:, None] * np.ones_like(frequency)
+    slow, fast = 2 / LOWEST_FREQUENCY * abs(frequency) - 1, 5 - 4 / highest * abs(frequency)
+    weight *= np.where(bands.wavenumber > 0.0, _ease(slow) * _ease(fast), 1.0)
+    envelope = weight * np.asarray(bands.envelope)
+    return 2j * np.pi * frequency * envelope if bands.differentiated else envelope
+
+
+def _ease(x: Array) -> Array:
+    """Third-order step from 0 to 1 over 0..1."""
+    x = np.clip(x, 0.0, 1.0)
+    return x * x * (3.0 - 2.0 * x)
+
+
+def _asked(track: _Track) -> Array:
+    """Steady friction (N, (n,)) that makes the wanted one, around its mean: none where the contact sticks."""
+    wanted, kept = _waveform(track), track.kept
+    renewed = np.where(kept < 1.0, 1.0 - kept, np.inf)
+    return (np.append(wanted[1:], wanted[-1]) - kept * wanted) / renewed
+
+
+def _waveform(track: _Track) -> Array:
+    """Wanted friction (N, (n,))."""
+    return (track.envelope * np.exp(1j * track.phase)).real.sum(axis=1)
+
+
+def _frictions(plant: Any, track: _Track, asked: Array) -> list[_Friction]:
+    """Steady frictions that a plant may make of what is asked for, one for every state that it may be in."""
+    if isinstance(plant, ElectroadhesionScreen):
+        return [_Friction(_screen_friction(plant, track, asked), np.zeros(track.phase.shape[1]))]
+    return _surface_frictions(plant, track, asked)
+
+
+def _screen_friction(screen: ElectroadhesionScreen, track: _Track, asked: Array) -> Array:
+    """Friction of an electroadhesion screen, but for that of the load, which no level changes."""
+    p, root = screen.parameters, screen.compensation
+    if root is None:
+        raise NoBound("its drive is no attraction, so what the scene asks of it is not known")
+    area = p.area(np.where(track.touched, track.finger[:, LOAD], 1.0))
+    gain = p.unevenness * p.leakage / (4 * p.omega**2 * VACUUM * area)
+    current = np.minimum(root(asked / p.friction_coefficient * root.gain / gain), p.current_limit)
+    carrier, envelope, voltage = attractions(p, current, track.finger)
+    if voltage > p.voltage_limit:
+        raise NoBound(f"its source may come to the end of its compliance of {p.voltage_limit:g} V")
+    return p.friction_coefficient * (carrier if p.level == "carrier" else envelope)
+
+
+def _surface_frictions(surface: UltrasonicSurface, track: _Track, asked: Array) -> list[_Friction]:
+    """Frictions of an ultrasonic surface."""
+    p, load, speed = surface.parameters, track.finger[:, LOAD], track.finger[:, SPEED]
+    rest = _lead(surface)
+    first = track.judged.start - math.floor(rest * track.rate)
+    if first < 0 or not track.touched[first : track.judged.stop].all():
+        raise NoBound(f"it is judged less than {rest:.3g} s after its finger last came or went, or while it is up")
+    if p.mode.temperature_rise and not p.lock:
+        raise NoBound("its resonance drifts, and nothing follows it")
+    tables = surface_tables(p, surface.loop, surface.finger, (1.0, 1.0))  # nominal touch: for a finger that is up
+    load, pace = np.where(track.touched, load, 1.0), np.maximum(abs(np.nan_to_num(speed)), p.least_speed)
+    whole = tables.friction * load
+    wanted, found = np.empty(len(asked)), []
+    wanted_amplitudes(tables.law, np.clip(p.bias + asked / whole, tables.least, 1.0), load, pace, wanted)
+    left, more = np.empty(len(asked)), np.empty(len(asked))
+    for amplitude, noise in _amplitudes(surface, track, wanted, load):
+        friction_ratios(tables.law, amplitude, load, pace, left)
+        friction_ratios(tables.law, (1.0 + SMALL) * amplitude, load, pace, more)
+        steep = (whole * (more - left) / (SMALL * amplitude))[track.judged]
+        found.append(_Friction(whole * left, np.mean(steep**2) * noise))
+    return found
+
+
+def _amplitudes(surface: UltrasonicSurface, track: _Track, wanted: Array, load: Array) -> list[tuple[Array, Array]]:
+    """Amplitudes (m) that the loop may make of the wanted one, each with its noise in every band (m2/Hz).
+
+    They are its state's, or those between which it changes state.  A detector that the calmer state opens, and that the
+    livelier one does not keep open, opens and closes: then the deviation is hardly above what it hears, which is as
+    much of the way from one state to the other.
+    """
+    numbers, noisy = surface.loop.tables.numbers, surface.parameters.mode.sensor_noise > 0.0
+    calm, moved, noise = _followed(surface, track, wanted, load, "quiet")
+    found = [(calm, noise)]
+    for state, level, time in (
+        ("stirred", math.sqrt(numbers.slow_level), numbers.slow_time),
+        ("awake", math.sqrt(numbers.fast_level), numbers.fast_time),
+    ):
+        heard = float(moved[state].max())
+        if heard < (HEARD_IN_NOISE if noisy else HEARD) * level:
+            continue
+        lively, moved, noise = _followed(surface, track, wanted, load, state)
+        span = max(1, int(time / numbers.rate * track.rate))
+        least = np.maximum.reduceat(moved[state], np.arange(0, len(moved[state]), span))[:-1].min(initial=math.inf)
+        between = lively + min(level / heard, 1.0) * (calm - lively)
+        found = [(lively, noise)] if least > level else [(lively, noise), (between, noise)]
+        calm = lively
+    return found
+
+
+def _followed(
+    surface: UltrasonicSurface, track: _Track, wanted: Array, load: Array, state: str
+) -> tuple[Array, dict[str, Array], Array]:
+    """Amplitude (m) of a loop in this state, under a finger of changing load, what its detectors hear, and noise."""
+    p, judged = surface.parameters, track.judged
+    least, most = float(load[judged].min()), float(load[judged].max())
+    tabled = np.linspace(least, most, LOADS if most > least else 1)
+    place = np.interp(load, tabled, np.arange(len(tabled))) if len(tabled) > 1 else np.zeros(len(load))
+    amplitude, noise = np.zeros(len(load)), np.zeros(track.phase.shape[1])
+    heard = dict.fromkeys(("stirred", "awake"), np.zeros(len(load[judged])))
+    size = abs(track.frequency[judged])
+    passed = np.maximum(np.linspace(size.min(axis=0), size.max(axis=0), PASSED), LOWEST_FREQUENCY)
+    for k, each in enumerate(tabled):
+        loop = AmplitudeLoop(parameters=p, tables=surface.loop.tables, load=float(each), rise=track.rise, state=state)
+        if np.max(loop.needed(wanted)[judged]) > DRIVEN * p.mode.drive_limit:
+            raise NoBound(f"its amplitude may ask for more than {p.mode.drive_limit:g} V")
+        weight = np.clip(1.0 - abs(place - k), 0.0, 1.0)
+        played, slow, fast = loop.follow(wanted)
+        amplitude += weight * played
+        for state_heard, more in (("stirred", slow), ("awake", fast)):
+            heard[state_heard] = heard[state_heard] + (weight * more)[judged]
+        noise = np.maximum(noise, loop.noise(passed.ravel()).reshape(passed.shape).max(axis=0))
+    return amplitude, heard, noise
+
+
+def _worst(scene: Scene, bands: Bands, track: _Track, apart: Array, noise: Array) -> Array:
+    """Largest envelope of `apart` (N, (n,)) and noise (N2/Hz) in any judged window of each band, by the band's target.
+
+    In a window of T seconds a power density S feigns an envelope with the mean square 2 S/T, Rayleigh distributed.
+    """
+    late = track.judged
+    signals = np.column_stack([apart, _waveform(track)])[late]
+    phase, asked = track.phase[late], (track.envelope != 0.0)[late]
+    asked &= abs(track.frequency[late]) >= LOWEST_FREQUENCY * (1 - 1e-6)
+    asked &= track.touched[late, None]
+    window = window_length(bands, track.rate, track.finger[late, POSITION], len(signals) / track.rate / 2)
+    size = max(2, round(window * track.rate))
+    starts = np.arange(0, len(signals) - size + 1, max(1, size // HOPS))
+    worst, square, count = (np.zeros(len(bands)) for _ in range(3))
+    for part in np.array_split(starts, 1 + len(starts) * size * (2 * len(bands) + 2) // CHUNK_VALUES):
+        index = part[:, None] + np.arange(size)
+        envelope, inflation, _ = fit(phase[index], signals[index])
+        told = (inflation <= LARGEST_INFLATION) & asked[index].all(axis=1)
+        size_of = np.where(told[:, None, :], abs(envelope), 0.0)
+        worst = np.maximum(worst, size_of[:, 0].max(axis=0, initial=0.0))
+        square += (size_of[:, 1] ** 2).sum(axis=0)
+        count += told.sum(axis=0)
+    target = np.sqrt(square / np.maximum(count, 1.0))
+    target = np.maximum(target, scene.tolerance * target.max(initial=0.0))
+    chance = math.log(CHANCES * max(len(signals) / size, 1.0))
+    worst += np.sqrt(2 * noise / window * chance) * (count > 0)
+    return worst / np.where(target > 0.0, target, np.inf)
+
+
+def _carrier_at_once(scene: Scene) -> Scene | str | None:
+    """Leave out the carrier, or where it lies."""
+    plant = scene.plant
+    if plant.get("level", LEVEL[scene.device]) == "envelope":
+        return None
+    if scene.device == "electroadhesion" and plant.get("sensor") == "impedance":
+        return "what is sensed is the gap's impedance at the carrier"
+    return replace(scene, plant={**plant, "level": "envelope"})
+
+
+LEVEL = {"electroadhesion": ElectroadhesionParameters.level, "ultrasonic": SurfaceParameters.level}
+SCREEN_OPTIONS = (Option("level", "envelope", "every turn of the carrier", _carrier_at_once),)
+SURFACE_OPTIONS = (Option("level", "envelope", "where the carrier lies", _carrier_at_once),)

@@ -1,0 +1,72 @@
+"""What all pictures share: colours, style, a figure apart from pyplot, and how it is written."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hapticrender.formats import MissingExtra, replacing
+
+# Okabe and Ito's colours: told apart by every kind of colour vision, and of different lightness.
+BLUE, ORANGE, GREEN, RED, INK, PALE = "#0072B2", "#E69F00", "#009E73", "#D55E00", "#222222", "#8A8A8A"
+STYLE: Any = {
+    "font.size": 9,
+    "axes.titlesize": 9.5,
+    "axes.titlelocation": "left",
+    "axes.titleweight": "bold",
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.edgecolor": PALE,
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "grid.color": "#E4E4E4",
+    "grid.linewidth": 0.6,
+    "legend.frameon": False,
+    "legend.fontsize": 8,
+}
+
+
+@contextmanager
+def new_figure(
+    size: tuple[float, float], *, pads: tuple[float, float] | None = None, style: Mapping[str, Any] | None = None
+) -> Iterator[Any]:
+    """Make a ``matplotlib.figure.Figure``, apart from pyplot and its global state, and draw into it in our style.
+
+    Parameters
+    ----------
+    size : tuple of float, inch
+        Width and height.
+    pads : tuple of float, inch, optional
+        Room around every panel, beside it and above; by default as matplotlib has it.
+    style : mapping, optional
+        What differs from `STYLE`.
+
+    Raises
+    ------
+    MissingExtra
+        matplotlib is not installed.
+    """
+    try:
+        import matplotlib
+        from matplotlib.backends.backend_agg import FigureCanvasAgg
+        from matplotlib.figure import Figure
+    except ImportError as error:
+        raise MissingExtra("pictures need matplotlib: pip install 'hapticrender[plot]'") from error
+    chosen: Any = {**STYLE, **(style or {})}
+    with matplotlib.rc_context(chosen), np.errstate(all="ignore"):
+        figure: Any = Figure(figsize=size, layout="constrained")
+        FigureCanvasAgg(figure)
+        if pads is not None:
+            figure.get_layout_engine().set(w_pad=pads[0], h_pad=pads[1])
+        yield figure
+
+
+def save(figure: Any, path: str | os.PathLike[str], dpi: int = 110) -> None:
+    """Write a figure into a PNG; an older file is replaced when the new one is whole."""
+    with np.errstate(all="ignore"), replacing(Path(path)) as scratch:
+        figure.savefig(scratch, dpi=dpi, format="png")

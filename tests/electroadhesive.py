@@ -1,0 +1,39 @@
+"""Scenes and devices that the tests of electroadhesion share."""
+
+import numpy as np
+
+import hapticrender as hr
+from hapticrender.drivers.simulated import SimulatedDriver
+from hapticrender.plants.electroadhesion import ElectroadhesionParameters, ElectroadhesionScreen
+
+RATE, SPEED, MU = 10_000, 0.05, 0.8
+FORCE = 0.1  # N of friction
+SLIDE = hr.Finger.sliding(speed=SPEED, normal_load=1.0)
+
+
+def tone(frequency, force=FORCE, finger=SLIDE, duration=2.0, **plant):
+    """A friction of `force` (N) at `frequency` (Hz): a displacement of 0.64 m/(N s) of it over w."""
+    texture = hr.Grating(frequency=frequency, amplitude=0.64 * force / (2 * np.pi * frequency))
+    return hr.Scene(
+        texture=texture, finger=finger, device="electroadhesion", duration=duration, plant=plant, keep_unfelt=True
+    )
+
+
+class Screen(SimulatedDriver):
+    """A screen of the user's own: it takes the envelope, in blocks, and shows friction or, blind, nothing."""
+
+    def __init__(self, *, blind=True, block=1, finger=SLIDE, **parameters):
+        super().__init__(ElectroadhesionScreen(ElectroadhesionParameters(**parameters), finger, seed=1))
+        self.block = self.delay = block
+        self.attraction = []  # N, block by block
+        self.sensed_channels = 0 if blind else 1
+
+    def _play(self, drive):
+        played = super()._play(drive)
+        self.attraction.append(self.plant.attraction)
+        return played if self.sensed_channels else played._replace(sensed=np.zeros((len(drive), 0)))
+
+
+def band(recording):
+    (figures,) = recording.summary()["bands"]
+    return figures

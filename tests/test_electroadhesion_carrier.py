@@ -1,0 +1,128 @@
+"""The carrier itself for a driver that is fast enough: what a file of it holds, and who is refused."""
+
+from fractions import Fraction
+
+import numpy as np
+import pytest
+from electroadhesive import tone
+
+import hapticrender as hr
+from hapticrender.control.stdft import StarSTDFT
+from hapticrender.drivers.base import BaseDriver
+from hapticrender.drivers.wavefile import WaveFileDriver
+from hapticrender.renderers.electroadhesion import ElectroadhesionRenderer
+from hapticrender.renderers.shaped import CarrierDriver
+
+FAST, CARRIER = 192_000, 20_000  # Hz
+FULL = 10e-3  # A
+
+
+def played(tmp_path, **plant):
+    """The recording of half a second of 100 Hz, the scene, and the file's samples (A) that belong to it."""
+    driver = WaveFileDriver(tmp_path / "carrier.wav", rate=FAST, drive_channels=1, full_scale=FULL, subtype="DOUBLE")
+    scene = tone(100.0, duration=0.5, output="carrier", **plant)
+    recording = hr.render(scene, driver=driver)
+    return recording, scene, driver.read_back()[:, 0]
+
+
+def held(recording, scene):
+    """Envelope of the current (A) that the recorded drive asks for, at the file's rate."""
+    envelope = ElectroadhesionRenderer().compensation(scene)(recording.drive[:, 0])
+    return np.repeat(envelope, round(FAST / recording.rate))
+
+
+def test_the_envelope_of_the_file_is_the_wanted_current(tmp_path):
+    """Demodulated by the STDFT* it is the wanted one behind the same low pass, and the image at twice the carrier.
+
+    The image is the current, and its steps, 38 to 42 kHz away: at most its peak times what the low pass leaves there.
+    The start of the file is a step, whose image has died away by exp(-2 pi 1500 Hz sqrt(1/2) 5 ms) = 1e-14.
+    """
+    recording, scene, file = played(tmp_path)
+    wanted = held(recording, scene)
+    file = file[: len(wanted)]
+    low_pass = StarSTDFT(bandwidth=1500.0, rate=FAST)
+    time = np.arange(len(file)) / FAST
+    heard = low_pass.start(channels=1, bands=1).run(file[:, None], 2 * np.pi * CARRIER * time[:, None])[:, 0, 0]
+    passed = low_pass.start(channels=1, bands=1).run(wanted[:, None], np.zeros((len(file), 1)))[:, 0, 0] / 2
+    left = abs(low_pass.frequency_response(np.linspace(38e3, 42e3, 100))).max()
+    assert left < 2e-3
+    late = slice(FAST // 200, None)
+    assert abs(heard - passed)[late].max() < wanted.max() * left
+    assert np.ptp(passed.real[late]) > 0.3 * wanted.max()  # so that a constant would fail
+
+
+def test_the_attraction_of_the_file_is_the_wanted_force(tmp_path):
+    """Mean of g I(t)^2 cos^2 over whole turns of the carrier: bias/2 + half of 100 Hz, without harmonics."""
+    recording, scene, file = played(tmp_path)
+    root = ElectroadhesionRenderer().compensation(scene)
+    force = 2 * root.gain * file[FAST // 5 :][: FAST // 5] ** 2  # 0.2 s from 0.2 s on
+    line = 2 * np.fft.rfft(force) / len(force)
+    assert abs(line[0]) / 2 == pytest.approx(root.bias, rel=1e-3)
+    last = recording.drive[-round(recording.rate / 10) :, 0]
+    wanted = 2 * abs(np.mean(last * np.exp(-2j * np.pi * 100 * np.arange(len(last)) / recording.rate)))
+    assert abs(line[20]) == pytest.approx(wanted * np.sinc(100 / recording.rate), rel=1e-6)  # the hold
+    assert abs(line[40]) < 1e-3 * abs(line[20])
+
+
+def test_the_carrier_starts_at_its_crest_and_keeps_its_phase(tmp_path):
+    """Every sample is the envelope's times cos(2 pi k 5/48).
+
+    Counting in 2^-64 of a turn loses at most 2^-65 a sample, 2e-14 rad in 96000; a turn in doubles is good to 1e-15.
+    """
+    recording, scene, file = played(tmp_path)
+    wanted = held(recording, scene)
+    turns = np.array([float(Fraction(5 * k % 48, 48)) for k in range(48)])
+    carrier = np.cos(2 * np.pi * np.resize(turns, len(wanted)))
+    np.testing.assert_allclose(file[: len(wanted)], wanted * carrier, rtol=0, atol=3e-14 * FULL)
+    assert file[0] == pytest.approx(wanted[0])
+
+
+class Still(BaseDriver):
+    """A device that keeps what it was handed."""
+
+    def __init__(self, rate=FAST, block=96, delay=None, sensed_channels=0, **told):
+        super().__init__(rate=rate, drive_channels=1, sensed_channels=sensed_channels, block=block, delay=delay)
+        self.told, self.drive = told, []
+
+    def _play(self, drive):
+        self.drive.append(drive)
+        return hr.Sensed(np.zeros((len(drive), 0)), **self.told)
+
+
+@pytest.mark.parametrize(
+    ("block", "delay", "hold"), [(96, None, 16), (1024, None, 16), (100, 150, 10), (97, None, 1), (1, None, 1)]
+)
+def test_the_controller_sees_a_whole_part_of_the_rate(block, delay, hold):
+    """The largest that divides block and delay and leaves 10 kHz; 19 would be the most."""
+    driver = CarrierDriver(Still(block=block, delay=delay), abs, frequency=CARRIER, envelope_rate=10e3)
+    assert (driver.hold, driver.rate, driver.block) == (hold, FAST / hold, block // hold)
+    assert driver.delay == (delay or block) // hold
+
+
+def test_what_the_device_tells_is_thinned_and_its_flags_are_gathered():
+    flags = np.zeros(96, int)
+    flags[[17, 40, 41]] = 1, 8, 4
+    device = Still(position=np.arange(96.0), flags=flags)
+    with CarrierDriver(device, lambda drive: 1.0 + drive, frequency=CARRIER, envelope_rate=10e3) as driver:
+        for _ in range(2):
+            told = driver.play(np.arange(6.0)[:, None])
+    assert told.flags.tolist() == [0, 1, 12, 0, 0, 0]
+    assert told.position.tolist() == [0, 16, 32, 48, 64, 80]
+    assert told.motion is None
+    assert told.sensed.shape == (6, 0)
+    both = np.concatenate(device.drive[:2])[:, 0]
+    np.testing.assert_allclose(
+        both, np.tile(np.repeat(1 + np.arange(6.0), 16), 2) * np.cos(2 * np.pi * np.arange(192) * 5 / 48), atol=1e-12
+    )
+
+
+@pytest.mark.parametrize(
+    ("device", "message"),
+    [
+        (Still(rate=79_999), r"driver.rate = 79999 Hz: must be >= 80000 Hz where output = 'carrier', 4 samples a turn"),
+        (Still(sensed_channels=1), r"driver.sensed_channels = 1: must be 0 where output = 'carrier'"),
+    ],
+)
+def test_a_driver_that_cannot_carry_it_is_refused(device, message):
+    with pytest.raises(ValueError, match=message):
+        hr.render(tone(100.0, output="carrier"), driver=device)

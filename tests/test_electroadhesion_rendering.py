@@ -1,0 +1,186 @@
+"""Electroadhesion end to end: tones on the tribometer, gratings, recordings, the square root, refusals."""
+
+import numpy as np
+import pytest
+from electroadhesive import FORCE, MU, RATE, SLIDE, SPEED, Screen, band, tone
+
+import hapticrender as hr
+from hapticrender.plants.electroadhesion import ElectroadhesionParameters
+
+# A millinewton of noise on the tribometer, white over 10 kHz, in an observer whose pole lies at 10 Hz: the envelope's
+# standard deviation is 1e-3 sqrt(4 * 10 pi/2/10e3) = 0.08 mN; four of them in 0.1 N.  The issue asks for 1 %.
+NOISE = 4 * 0.8e-4 / FORCE
+
+
+def harmonics(recording, frequency):
+    """Amplitudes of the attraction's first two harmonics over the last second, friction's lag undone."""
+    friction = recording.motion[-RATE:, 0]
+    lines = 2 * abs(np.fft.rfft(friction))[[frequency, 2 * frequency]] / len(friction)
+    lag = ElectroadhesionParameters().lag_response(np.array([frequency, 2 * frequency]), SPEED)
+    return lines / abs(lag) / MU
+
+
+@pytest.mark.parametrize("frequency", [20.0, 50.0, 100.0, 200.0, 400.0])
+@pytest.mark.parametrize(
+    "finger",
+    [
+        {},
+        {"area_scale": 0.7},
+        {"area_scale": 1.3, "gap_thickness": 3e-6},
+        {"area_scale": 1.3, "gap_thickness": 0.5e-6},
+    ],
+    ids=["nominal", "small", "large-thick", "large-thin"],
+)
+def test_a_tone_is_felt_as_wanted_whatever_the_finger(frequency, finger):
+    """Area +-30 % and gaps of 0.5 to 3 um change the gain by -41 to +43 %; the loop leaves the noise alone."""
+    recording = hr.render(tone(frequency, **finger))
+    figures = band(recording)
+    assert figures["target"] == pytest.approx(FORCE, rel=1e-6)
+    assert figures["rms_error_friction"] < NOISE
+    assert abs(figures["phase_error"]) < NOISE  # rad, of the same noise
+    assert not recording.flags[RATE:].any()
+
+
+def test_open_loop_the_same_fingers_differ_by_their_gains():
+    """The other side of the test above: what the loop has to make up for, to the rounding of D beyond s^2 (0.1 %)."""
+    nominal = ElectroadhesionParameters().gain(1.0)
+    for case in ({"area_scale": 0.7}, {"area_scale": 1.3, "gap_thickness": 3e-6}):
+        error = band(hr.render(tone(100.0), driver=Screen(block=8, **case)))["error_friction"]
+        ratio = ElectroadhesionParameters(**case).gain(1.0) / nominal
+        assert error == pytest.approx(ratio - 1, abs=1e-3)
+        assert abs(error) > 0.4
+
+
+@pytest.mark.parametrize("mu", [0.5, 1.1])
+def test_a_friction_coefficient_that_is_not_the_believed_one_is_made_up_for(mu):
+    """A driver of the user's own, whose finger has another mu than the scene's 0.8."""
+    recording = hr.render(tone(100.0, duration=1.6, finger=SLIDE), driver=Screen(blind=False, friction_coefficient=mu))
+    assert band(recording)["rms_error_friction"] < NOISE
+
+
+def test_a_grating_follows_a_swiping_finger():
+    """The target grows with the speed; the mean is kept to what the changing lag and speed leave, far below 10 %."""
+    scene = hr.Scene(
+        texture=hr.Grating(wavelength=1e-3, amplitude=20e-6),
+        finger=hr.Finger.swiping(frequency=0.5, speed=0.1, normal_load=1.0),
+        device="electroadhesion",
+        duration=5.0,
+    )
+    recording = hr.render(scene)
+    figures = band(recording)
+    assert recording.summary()["passed"]
+    assert figures["judged_windows"] > 100
+    speed = abs(np.diff(recording.position, append=recording.position[-1])) * RATE
+    expected = 2 * np.pi * speed / 1e-3 * 20e-6 / 0.64  # N: the skin velocity of the grating over v/F
+    felt = abs(recording.target[:, 0])
+    fast = (speed > 0.06) & (recording.time > 1.0)  # the speed is known behind a pole of 40 Hz, 4 ms late
+    lost = 0.1 * np.pi / 0.08 * 4e-3  # of the target: relative change of the speed from 0.06 m/s on over 4 ms
+    np.testing.assert_allclose(felt[fast], expected[fast], rtol=lost)
+
+
+def test_a_recorded_texture_is_analysed_and_felt():
+    """Three components that wax and wane; the scene's own 10 % is the bound."""
+    scene = hr.Scene(
+        texture=hr.Synthetic(amplitude=20e-6, components=3),
+        finger=SLIDE,
+        device="electroadhesion",
+        duration=3.0,
+        keep_unfelt=True,
+    )
+    summary = hr.render(scene).summary()
+    assert len(summary["bands"]) == 3
+    assert summary["passed"], summary["worst"]
+    assert "SATURATED" not in summary["flags"]
+
+
+NAIVE = {"square_root": "off", "headroom": 1.0, "floor": 0.0}
+
+
+@pytest.mark.parametrize("frequency", [50, 100])
+def test_without_the_square_root_a_quarter_of_the_friction_is_its_second_harmonic(frequency):
+    """Open loop at full swing, which the limiter sets: ``(1 + sin)^2`` is 1.5 + 2 sin - cos(2)/2, to rounding."""
+    second = {}
+    for name, plant in (("off", NAIVE), ("on", NAIVE | {"square_root": "on"})):
+        recording = hr.render(tone(float(frequency), **plant), driver=Screen(block=8))
+        first, higher = harmonics(recording, frequency)
+        second[name] = higher / first
+    assert second["off"] == pytest.approx(0.25, rel=1e-9)
+    assert second["on"] < 1e-3  # the issue's bound; on the envelope only rounding is left
+    assert second["on"] < 1e-12
+
+
+def test_the_loop_does_not_take_the_harmonic_away_but_the_square_root_does():
+    """The first harmonic is as wanted either way; at half the swing 12 % of second are left, closed as open."""
+    wanted = FORCE / MU / abs(ElectroadhesionParameters().lag_response(100.0, SPEED))
+    shares = {}
+    for word in ("off", "on"):
+        first, second = harmonics(hr.render(tone(100.0, square_root=word)), 100)
+        assert first == pytest.approx(wanted, rel=NOISE)
+        shares[word] = second / first
+    assert shares["off"] > 0.1
+    assert shares["on"] < 1e-3  # the issue's bound
+
+
+def test_the_square_root_serves_a_voltage_too():
+    """On the nominal finger, 100 Hz; the gain is in N/V^2 then."""
+    open_loop = hr.render(tone(100.0, drive_kind="voltage"), driver=Screen(block=8, drive_kind="voltage"))
+    assert abs(band(open_loop)["error_friction"]) < 1e-3
+    assert band(hr.render(tone(100.0, drive_kind="voltage", area_scale=0.7)))["rms_error_friction"] < NOISE
+
+
+@pytest.mark.parametrize(
+    ("scene", "message"),
+    [
+        (tone(100.0, finger=hr.Finger.still(normal_load=1.0)), r"finger: must slide faster than 0.001 m/s"),
+        (tone(100.0, finger=hr.Finger.absent()), r"finger.normal_load = 0: must be > 0 N"),
+        (
+            tone(100.0, finger=hr.Finger.sliding(speed=0.05, normal_load=1.0, touches=[(5.0, 6.0)])),
+            r"finger.normal_load = 0: must be > 0 N",
+        ),
+        (tone(100.0, finger=hr.Finger.sliding(speed=0.05, normal_load=0.0)), r"finger.normal_load = 0: must be > 0 N"),
+        (tone(100.0, force=2.0), r"asks for an attraction of 10.* N: must be <= 2.23 N, what 0.01 A make of a nominal"),
+        (tone(100.0, force=2.0, drive_kind="voltage"), r"must be <= 3.28 N, what 300 V make of a nominal"),
+        (tone(4600.0), r"texture.frequency = 4600: must be <= 4500 Hz"),
+        (tone(100.0, currents=1.0), r"plant.currents: no such parameter; known: "),
+        (tone(100.0, headroom=0.9), r"plant.headroom = 0.9: must be >= 1"),
+        (tone(100.0, floor=0.6), r"plant.floor = 0.6: must be <= 0.5"),
+        (tone(100.0, output="light"), r"plant.output = 'light': must be one of envelope, carrier"),
+        (
+            hr.Scene(texture=hr.Grating(frequency=80.0, amplitude=1e-5), finger=SLIDE, device="electroadhesion",
+                     duration=1.0, gradient=1.0),
+            r"gradient = 1 1/m: must be 0, friction is made under the finger alone",
+        ),
+    ],
+)  # fmt: skip
+def test_what_the_screen_cannot_do_is_refused(scene, message):
+    with pytest.raises(ValueError, match=message):
+        hr.render(scene)
+
+
+def test_a_driver_with_other_channels_is_refused():
+    wrong = Screen()
+    wrong.drive_channels = 2
+    with pytest.raises(ValueError, match=r"driver.drive_channels = 2: must be 1"):
+        hr.render(tone(100.0), driver=wrong)
+    wrong.drive_channels, wrong.sensed_channels = 1, 2
+    with pytest.raises(ValueError, match=r"driver.sensed_channels = 2: must be 0 or 1"):
+        hr.render(tone(100.0), driver=wrong)
+
+
+@pytest.mark.parametrize("device", ["electroadhesion", "ultrasonic"])
+@pytest.mark.parametrize("lifted", [False, True])
+def test_a_finger_that_rests_or_is_away_winds_nothing_up(device, lifted):
+    """Slides, rests (or is lifted) for 1.2 s, slides on: nothing saturates, and 0.2 s later the texture is back."""
+    time = np.arange(0.0, 3.2, 1e-3)
+    way = np.cumsum(np.where((time < 1.2) | (time > 2.4), 0.08, 0.0)) * 1e-3
+    position = abs(way % 0.1 - 0.05) - 0.025
+    touches = [(0.0, 1.2), (2.4, 3.2)] if lifted else None
+    finger = hr.Finger.sampled(position, rate=1000.0, normal_load=0.4, mechanics="light", touches=touches)
+    texture = hr.Grating(frequency=100.0, velocity=10e-3)
+    recording = hr.render(hr.Scene(texture=texture, finger=finger, duration=3.2, device=device))
+    late = recording.time > 0.3  # the first touch finds a loop that knows nothing yet
+    assert not (recording.flags[late] & hr.Flag.SATURATED).any()
+    back = recording.motion[recording.time >= 2.6, 0]
+    whole = int(len(back) * 100 / recording.rate) * recording.rate / 100
+    turn = np.exp(-2j * np.pi * 100.0 * np.arange(int(whole)) / recording.rate)
+    assert abs(2 * np.mean(back[: int(whole)] * turn)) == pytest.approx(10e-3 / 0.64, rel=0.01)

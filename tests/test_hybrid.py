@@ -1,0 +1,353 @@
+"""The hybrid: shares that sum to the target, two controllers as one, plate and screen under one finger, refusals."""
+
+import tomllib
+from importlib.metadata import EntryPoint
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import hapticrender as hr
+from hapticrender import loop
+from hapticrender.control.methods import method_named
+from hapticrender.control.stability import bank_loop
+from hapticrender.drivers.base import BaseDriver
+from hapticrender.plants.electroadhesion import ElectroadhesionParameters, ElectroadhesionScreen
+from hapticrender.plants.hybrid import HybridPlant
+from hapticrender.plants.vibrotactile import Plate, PlateParameters
+from hapticrender.protocols import Sensed
+from hapticrender.renderers.hybrid import HybridSettings
+
+RATE = 10_000
+SLIDE = hr.Finger.sliding(speed=0.08, normal_load=0.4, mechanics="light")
+START = 100.0 / 1.5  # Hz, F of the default crossover
+
+
+@pytest.fixture(autouse=True)
+def devices_of_the_project(monkeypatch):
+    """Renderers and drivers as pyproject names them, also where the installed package is older."""
+    project = tomllib.loads((Path(__file__).parent.parent / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+
+    def registered(group, name):
+        return EntryPoint(name, project["entry-points"][f"hapticrender.{group}"][name], group).load()
+
+    monkeypatch.setattr(loop, "registered", registered)
+
+
+def scene(texture, finger=SLIDE, duration=1.2, **plant):
+    return hr.Scene(
+        texture=texture, finger=finger, device="hybrid", duration=duration, settle=0.6, keep_unfelt=True, plant=plant
+    )
+
+
+def tone(frequency, velocity=0.02):
+    return hr.Grating(velocity=velocity, frequency=frequency)
+
+
+def smoothstep(x):
+    """3 x^2 - 2 x^3, the polynomial written another way."""
+    x = min(max(x, 0.0), 1.0)
+    return 3 * x**2 - 2 * x**3
+
+
+def moving(speeds, finger_rate=2000, **touch):
+    """A finger through (time, speed) pairs, speeds joined by straight lines, its way centred."""
+    times, speed = np.array(speeds).T
+    v = np.interp(np.arange(0.0, times[-1] + 0.05, 1 / finger_rate), times, speed)
+    way = np.cumsum(v) / finger_rate
+    return hr.Finger.sampled(way - way.max() / 2, rate=finger_rate, normal_load=0.4, **touch)
+
+
+def test_shares_sum_to_one():
+    settings = HybridSettings()
+    frequency = np.linspace(0.0, 400.0, 4001)
+    share = settings.share_of_screen(frequency)
+    assert (share[frequency <= START] == 0.0).all()
+    assert (share[frequency >= 2 * START] == 1.0).all()
+    assert settings.share_of_screen(settings.crossover) == pytest.approx(0.5)
+    assert (np.diff(share) >= 0.0).all()
+    np.testing.assert_allclose(share, [smoothstep(f / START - 1) for f in frequency], atol=1e-15)
+    mirrored = settings.share_of_screen(3 * START - frequency)  # around the crossover, where the plate has it
+    np.testing.assert_allclose(share + mirrored, 1.0, atol=1e-14)
+
+
+def test_fixed_carriers_are_shared_out_by_their_frequency():
+    partials = [(1, 1.0, 0.3), (2, 0.5, 1.0), (5, 0.2, 2.0)]  # 50, 100 and 250 Hz
+    bands = loop.prepare(scene(hr.Grating(amplitude=8e-6, frequency=50.0, partials=partials))).bands
+    assert bands.of_moved.tolist() == [0, 1]
+    assert bands.of_rubbed.tolist() == [1, 2]
+    total = np.zeros(3, complex)
+    total[bands.of_moved] += 2j * np.pi * bands.moved.frequency * bands.moved.envelope
+    total[bands.of_rubbed] += 0.64 * bands.rubbed.envelope
+    np.testing.assert_allclose(total, 2j * np.pi * bands.frequency * bands.envelope, rtol=1e-12)
+    np.testing.assert_allclose(abs(bands.moved.envelope), [8e-6, 2e-6], rtol=1e-12)
+
+
+def test_targets_of_a_carrier_that_follows_the_finger_sum_to_all_of_it():
+    """From 30 to 240 Hz under constant acceleration, of which the finger's tracker has no lag.
+
+    It knows the velocity half a sample on.  Its triple pole at 60 Hz has forgotten how it began after 0.2 s: 2e-33,
+    times a polynomial.
+    """
+    amplitude, acceleration, n = 1e-5, 0.3, 8000
+    session = loop.prepare(scene(hr.Grating(amplitude=amplitude, wavelength=1e-3), duration=0.8))
+    controller, time = session.controller(), np.arange(n) / RATE
+    position = 0.01 * time + acceleration * time**2 / 2 - 0.05
+    parts = []
+    for k in range(n):
+        _, target, _ = controller.run(np.zeros((1, 3)), position[k : k + 1], np.zeros(1))
+        parts.append([target[0, 0], controller.state.displacement[0], controller.state.friction[0]])
+    total, moved, rubbed = np.array(parts[2000:]).T
+    hertz = (0.01 + acceleration * (time[2000:] + 0.5 / RATE)) / 1e-3
+    turn = 2j * np.pi * hertz
+    assert hertz[0] < 75.0 < 230.0 < hertz[-1]
+    np.testing.assert_allclose(total, turn * amplitude, rtol=1e-6)
+    share = np.array([smoothstep(f / START - 1.0) for f in hertz])
+    np.testing.assert_allclose(0.64 * rubbed / (turn * amplitude), share, atol=1e-6)
+    np.testing.assert_allclose(moved / amplitude, 1.0 - share, atol=1e-6)
+
+
+@pytest.mark.parametrize("frequency", [40.0, 100.0, 250.0])
+def test_a_tone_is_felt_whole(frequency):
+    """Within 1 % of the velocity, on the plate, on both, or on the screen alone: then the other is left alone."""
+    recording = hr.render(scene(tone(frequency)))
+    figures = recording.summary()
+    assert figures["unit"] == "m/s"
+    (band,) = figures["bands"]
+    assert band["target"] == pytest.approx(0.02, rel=1e-6)
+    assert abs(band["error_skin"]) < 0.01
+    assert band["rms_error_skin"] < 0.01
+    assert not recording.flags.any()
+    moved, rubbed = abs(recording.drive[:, :2]).max(), abs(recording.drive[:, 2]).max()
+    assert (moved > 0.0) == (frequency < 2 * START)
+    assert (rubbed > 0.0) == (frequency > START)
+
+
+def test_each_part_gives_its_share_and_no_more():
+    """At 90 Hz the screen gives 28 %; by a fit over 0.5 s, 45 periods, within 1 % of the whole."""
+    session = loop.prepare(scene(tone(90.0)))
+    plant, controller = session.driver.plant, session.controller()
+    assert plant.closes(controller)
+    plant.closed_loop(controller, np.zeros(12_000))
+    felt = plant.felt[7000:] - plant.felt[7000:].mean(axis=0)
+    parts = abs(2 * np.exp(-2j * np.pi * 90.0 * np.arange(5000) / RATE) @ felt) / 5000
+    share = smoothstep(90.0 / START - 1)
+    assert share == pytest.approx(0.28175)
+    np.testing.assert_allclose(parts, [0.02 * (1 - share), 0.02 * share], atol=2e-4)
+
+
+def session_plant(session):
+    """A fresh plant of a session's scene."""
+    return loop.registered("renderers", "hybrid")().plant(session.scene, 0)
+
+
+def test_partials_on_both_sides_of_the_crossover():
+    partials = [(1, 1.0, 0.3), (2, 0.5, 1.0), (5, 0.2, 2.0)]
+    figures = hr.render(scene(hr.Grating(amplitude=20e-6, frequency=50.0, partials=partials))).summary()
+    assert [band["frequency"] for band in figures["bands"]] == [50.0, 100.0, 250.0]
+    for band in figures["bands"]:
+        assert abs(band["error_skin"]) < 0.01
+        assert band["rms_error_skin"] < 0.05
+
+
+def test_a_grating_swept_through_the_crossover():
+    """From 50 to 170 Hz and back, every window within 5 % of what is wanted there, once the finger is learnt."""
+    finger = moving([(0.0, 0.025), (0.4, 0.025), (0.9, 0.085), (1.0, 0.085), (1.5, 0.025)], mechanics="light")
+    recording = hr.render(scene(hr.Grating(amplitude=1e-5, wavelength=0.5e-3), finger, 1.5))
+    envelopes = recording.envelopes
+    late = envelopes.judged[:, 0] & (envelopes.start > 0.5)
+    frequency = envelopes.frequency[late, 0]
+    assert frequency.min() < 60.0 < 160.0 < frequency.max()
+    ratio = abs(envelopes.achieved[late, 0, 0] / envelopes.wanted[late, 0])
+    np.testing.assert_allclose(ratio, 1.0, atol=0.05)
+    np.testing.assert_allclose(
+        abs(envelopes.wanted[late, 0]), 2 * np.pi * frequency * 1e-5, rtol=0.01
+    )  # a window of two periods averages a sweep of 240 Hz/s
+
+
+def test_partials_wider_apart_than_the_plate_reaches():
+    """Orders 1 to 5 never fit between 20 and 67 Hz together: they leave the plate one after another."""
+    partials = [(1, 1.0, 0.0), (2, 0.5, 1.0), (5, 0.2, 2.0)]
+    texture = hr.Grating(amplitude=12e-6, wavelength=1e-3, partials=partials)
+    figures = hr.render(scene(texture, hr.Finger.sliding(speed=0.06, normal_load=0.4, mechanics="light"))).summary()
+    for band in figures["bands"]:
+        assert band["rms_error_skin"] < 0.05
+
+
+def test_a_recording_over_position_is_shared_out_by_the_fades():
+    """Both banks analyse the same waveform; components at 34, 168 and 304 Hz at 0.08 m/s."""
+    figures = hr.render(scene(hr.Synthetic(amplitude=2e-5, speed=0.1, components=3), duration=1.6)).summary()
+    assert len(figures["bands"]) == 3
+    for band in figures["bands"]:
+        assert band["rms_error_skin"] < 0.1
+
+
+def test_the_loop_of_a_bank_that_fades_has_the_poles_of_its_state_matrix():
+    """Zeros of the closed over the open characteristic polynomial are eigenvalues, to rounding of the matrix."""
+    partials = [(1, 1.0, 0.0), (2, 0.5, 1.0), (5, 0.2, 2.0)]
+    session = loop.prepare(scene(hr.Grating(amplitude=8e-6, wavelength=1e-3, partials=partials)))
+    tables = session.controller().parts[0].tables
+    found = bank_loop(tables, "awake", speed=0.015)  # 15, 30 and 75 Hz
+    assert 0.4 < found.share[0, 0] < 0.6
+    assert found.share[0, 1] == 1.0
+    poles = np.linalg.eigvals(found.matrix()[0])
+    slow = poles[abs(abs(np.angle(poles)) * RATE / (2 * np.pi) - 15.0) < 5.0]
+    assert slow.size >= 4  # the carrier's two, and their images
+    at, beside = (abs(found.difference(z[None])[0]) for z in (slow, slow * np.exp(2j * np.pi * 1.0 / RATE)))
+    assert (at < 1e-6 * beside.max()).all()
+    assert abs(poles).max() < 1.0
+
+
+def test_plate_and_screen_are_those_of_their_own(rng):
+    """What is sensed is that of plate and screen alone; the velocity is the derivative of the displacement.
+
+    Central differences are off by (w T)^2/6 = 4e-4 at 80 Hz.
+    """
+    finger = hr.Finger.sliding(speed=0.03, normal_load=0.4, centre=0.02, span=0.02)
+    parameters, own = PlateParameters(rate=RATE, bending_frequency=1250.0), ElectroadhesionParameters()
+
+    def fresh():
+        return Plate(parameters, finger, 1), ElectroadhesionScreen(own, finger, 2)
+
+    plate, screen = fresh()
+    hybrid = HybridPlant(*fresh(), 0.64)
+    time = np.arange(4000) / RATE
+    drive = np.column_stack(
+        [0.2 * np.sin(2 * np.pi * 80 * time), 0.05 * np.cos(2 * np.pi * 80 * time), 3e-3 * (1 + np.sin(500 * time))]
+    )
+    both = hybrid.run(drive)
+    moved, rubbed = plate.run(drive[:, :2]), screen.run(drive[:, 2:])
+    np.testing.assert_array_equal(both.sensed, np.hstack([moved.sensed, rubbed.sensed]))
+    np.testing.assert_allclose(hybrid.felt[:, 1], 0.64 * rubbed.motion[:, 0], rtol=1e-14)
+    np.testing.assert_allclose(both.motion[:, 0], hybrid.felt.sum(axis=1), rtol=1e-12)
+    centre, one, other = moved.motion.T
+    position, bend = both.position, (one + other) / 2 - centre  # of a rigid plate nothing
+    tilt = (other - one) / parameters.glass_length
+    shape = parameters.bending_shape(position) - parameters.bending_shape(0.0)
+    bend = bend / (1.0 - parameters.bending_shape(0.0))
+    glass = centre + position * tilt + shape * bend
+    slope = np.gradient(glass, 1 / RATE) - np.gradient(position, 1 / RATE) * (
+        tilt + np.gradient(parameters.bending_shape(position)) / np.gradient(position) * bend
+    )  # as the finger's place moves, not its skin
+    steady = slice(1500, -1)
+    np.testing.assert_allclose(hybrid.felt[steady, 0], slope[steady], atol=2e-3 * abs(slope[steady]).max())
+
+
+@pytest.mark.parametrize("texture", [tone(100.0), hr.Grating(amplitude=1e-5, wavelength=1e-3)], ids=["time", "space"])
+def test_the_compiled_ring_is_the_open_one(texture):
+    """Sample by sample through Python or not, to rounding."""
+    session = loop.prepare(scene(texture, duration=0.2))
+    closed, ring = session_plant(session), session_plant(session)
+    first, second = session.controller(), session.controller()
+    assert closed.closes(first)
+    drive, target, flags, sensed = closed.closed_loop(first, np.zeros(1500))
+    played, rows = np.zeros((1, 3)), []
+    for _ in range(1500):
+        heard = ring.run(played)
+        rows.append([played[0], heard.motion[0, 0]])
+        played, *_ = second.run(heard.sensed, heard.position, np.zeros(1))
+    np.testing.assert_allclose(drive, [row[0] for row in rows], rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(sensed.motion[:, 0], [row[1] for row in rows], rtol=1e-9, atol=1e-12)
+    assert target.shape == (1500, 1)
+    assert not flags.any()
+
+
+def test_any_method_takes_fixed_carriers():
+    """`stiffness` for both parts: within 5 % like each alone."""
+    figures = hr.render(scene(tone(100.0), duration=0.8), method="stiffness").summary()
+    assert figures["worst"]["value"] < 0.05
+
+
+class Bench(BaseDriver):
+    """A user's device: a plate and a screen that take currents and tell nothing but what is sensed."""
+
+    def __init__(self, played, sensed_channels=3):
+        self.device = HybridPlant(
+            Plate(PlateParameters(rate=RATE), SLIDE, 1),
+            ElectroadhesionScreen(ElectroadhesionParameters(), SLIDE, 2),
+            0.64,
+        )
+        self.played = played
+        super().__init__(rate=RATE, drive_channels=3, sensed_channels=sensed_channels, block=1, delay=1)
+
+    def _play(self, drive):
+        self.played.append(drive[0].copy())
+        return Sensed(self.device.run(drive).sensed[:, : self.sensed_channels])
+
+
+def test_a_driver_of_ones_own_gets_currents_and_is_judged_by_its_sensors():
+    played = []
+    recording = hr.render(scene(tone(100.0)), driver=Bench(played))
+    envelope = np.array(played)[:, 2]
+    assert envelope.max() < 10e-3  # A
+    assert envelope[5000:-1].min() > 0.0  # around a bias
+    assert envelope[-1] == 0.0  # closed
+    (band,) = recording.summary()["bands"]
+    assert abs(band["error_skin"]) < 0.02
+
+
+def test_without_sensors_both_parts_are_driven_open_loop():
+    """From the free device: a finger of 0.4 N takes a little of the plate's half, friction comes as designed."""
+    played = []
+    recording = hr.render(scene(tone(100.0), duration=0.5), driver=Bench(played, sensed_channels=0))
+    assert np.isnan(recording.motion).all()
+    assert abs(recording.target[-1, 0]) == pytest.approx(0.02, rel=1e-6)
+    peaks = abs(np.array(played)[3000:]).max(axis=0)
+    assert (peaks[:2] > 0.02).all()
+    assert peaks[2] > 1e-3
+
+
+BOTH_HAVE = r"must be plate_current_limit or screen_current_limit"
+
+
+@pytest.mark.parametrize(
+    ("plant", "message"),
+    [
+        ({"crossover": 30.0}, r"plant.crossover = 30.0: must be >= 40 Hz"),
+        ({"current_limit": 2.0}, BOTH_HAVE),
+        ({"plate_current_limit": 0.01}, r"must be <= 0.01 A in each coil"),
+        ({"coils": 1}, r"plant.coils = 1: must be 2 on a hybrid"),
+        ({"delay": 2}, r"plant.delay = 2: must be 1 on a hybrid"),
+        ({"velocity_per_force": 0.0}, r"plant.velocity_per_force = 0: must be > 0"),
+        ({"mas": 1.0}, r"plant.mas: no such parameter; known: .*crossover.*mass.*plate_current_limit"),
+        ({"plate_rate": 1e4}, r"plant.plate_rate: no such parameter"),
+    ],
+)
+def test_parameters_are_refused(plant, message):
+    with pytest.raises(ValueError, match=message):
+        loop.prepare(scene(tone(100.0), **plant))
+
+
+def test_scenes_are_refused():
+    with pytest.raises(ValueError, match="a recording over time is not shared out"):
+        loop.prepare(scene(hr.Synthetic(amplitude=1e-5)))
+    with pytest.raises(ValueError, match="finger: must slide faster"):
+        loop.prepare(scene(tone(100.0), hr.Finger.still()))
+    with pytest.raises(ValueError, match="texture.amplitude asks for an attraction of"):
+        loop.prepare(scene(tone(250.0, 1.5)))
+    with pytest.raises(hr.DesignError, match="must be 'h' or 'h2' for a texture over position"):
+        loop.prepare(scene(hr.Grating(amplitude=8e-6, wavelength=1e-3)), method="stiffness")
+
+
+@pytest.mark.parametrize("channels", [{"drive_channels": 2}, {"sensed_channels": 1}])
+def test_drivers_are_refused(channels):
+    driver = BaseDriver(**{"rate": RATE, "drive_channels": 3, "sensed_channels": 3, "block": 1, "delay": 1} | channels)
+    with pytest.raises(ValueError, match=rf"driver.{next(iter(channels))} = \d: must be 3"):
+        loop.prepare(scene(tone(100.0)), driver=driver)
+
+
+def test_parts_that_do_not_fit_are_refused():
+    screen = ElectroadhesionScreen(ElectroadhesionParameters(), SLIDE)
+    with pytest.raises(ValueError, match="plate.rate = 5000.0: must be 10000.0"):
+        HybridPlant(Plate(PlateParameters(), SLIDE), screen, 0.64)
+    with pytest.raises(ValueError, match="velocity_per_force=0.0: must be > 0"):
+        HybridPlant(Plate(PlateParameters(rate=RATE), SLIDE), screen, 0.0)
+
+
+def test_a_part_of_which_nothing_is_wanted_is_left_alone():
+    session = loop.prepare(scene(tone(40.0)))
+    drive, target, _ = session.controller().run(np.zeros((5, 3)), np.zeros(5), np.zeros(5))
+    assert session.model.rubbed is None
+    assert not drive[:, 2].any()
+    assert method_named("h2").name == session.controller().method
+    assert target.shape == (5, 1)
