@@ -13,21 +13,15 @@ from hapticrender._lanes import (
     floor,
     fraction,
     high,
-    lanes,
     low,
     padded,
-    put,
-    put_stretch,
-    read,
     root,
-    row_totals,
     select,
     signed,
     size,
-    stretch,
     total,
-    write,
 )
+from hapticrender._lanes_memory import lanes, put, put_stretch, read, row_totals, stretch, write
 
 KINDS = [np.float64, np.float32]
 

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from hapticrender._jit import kernel
-from hapticrender._lanes import WIDTH, aligned, lanes, put
+from hapticrender._lanes import WIDTH, aligned
+from hapticrender._lanes_memory import lanes, put
 from hapticrender._polynomials import cosine, polar, unit
 
 # sine and cosine; angle, rad; size; the shorter cosine: what the polynomials leave (2.3e-10, 1.8e-10 and 1.2e-10 in

@@ -8,7 +8,8 @@ from __future__ import annotations
 import numpy as np
 
 from hapticrender._jit import by_types, kernel
-from hapticrender._lanes import floor, high, lanes, low, put, read, select, size
+from hapticrender._lanes import floor, high, low, select, size
+from hapticrender._lanes_memory import lanes, put, read
 from hapticrender._polynomials import unit
 from hapticrender.control import bank_rows as row
 from hapticrender.control.bank_finger import finger_stiffness

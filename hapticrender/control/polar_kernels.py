@@ -14,7 +14,8 @@ import math
 from typing import NamedTuple
 
 from hapticrender._jit import kernel
-from hapticrender._lanes import any_of, high, lanes, low, put, put_pairs, root, select, size, taken
+from hapticrender._lanes import any_of, high, low, root, select, size
+from hapticrender._lanes_memory import lanes, put, put_pairs, taken
 from hapticrender._polynomials import polar, unit
 from hapticrender.control.bank_carriers import advance_of, turns_of
 from hapticrender.control.kernels import (

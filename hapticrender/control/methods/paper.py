@@ -90,7 +90,7 @@ def polar_state(tables: PolarTables, window: int, dtype: type) -> PolarState:
     band = aligned((tiles, BAND_ROWS, width), dtype)
     band[:, [FORWARD, HEADING_RE, FRAME_RE]] = 1.0
     rows = 2 * tiles * coordinates
-    told = np.zeros((TOLD_ROWS + 2 * coordinates, REFRESH), dtype)
+    told: Array = np.zeros((TOLD_ROWS + 2 * coordinates, REFRESH), dtype)
     told[NUMBER] = np.arange(REFRESH)
     return PolarState(
         band=band,
