@@ -1,13 +1,11 @@
 """Explicit vectors inside kernels: a value that holds as many neighbouring numbers as fit a register.
 
-`lanes(array, i, j)` reads the row ``array[i, j, :]`` of a C-contiguous array whose last axis is as long as a register
-(`WIDTH`) and `put(array, i, j, value)` writes one; between them such values read like
-arithmetic: ``+ - * /``, comparisons, `select`, `root`, `floor`, `low`, `high`, `size`, `any_of`, `total`.  Everything
-but the array access takes plain floats as well, and a float meeting a vector is repeated in every lane, so that one
+Such values read like arithmetic: ``+ - * /``, comparisons, `select`, `root`, `floor`, `low`, `high`, `size`, `any_of`,
+`total`.  Everything takes plain floats as well, and a float meeting a vector is repeated in every lane, so that one
 source serves lanes that are bands and lanes that are scenarios.  `total` sums what lanes of bands share; where the
-scalars of a scenario are themselves lanes, there is nothing to sum.
+scalars of a scenario are themselves lanes, there is nothing to sum.  They come from memory by `_lanes_memory`.
 
-Auto-vectorised loops reach C only for a few hundred bands; this file is the price of the rest (decision 7).
+Auto-vectorised loops reach C only for a few hundred bands; these files are the price of the rest (decision 7).
 """
 
 from __future__ import annotations
@@ -17,13 +15,12 @@ from typing import Any
 
 import numpy as np
 from llvmlite import ir
-from numba.core import cgutils, types
+from numba.core import types
 from numba.core.extending import intrinsic, models, register_model
 from numba.core.imputils import lower_builtin, lower_cast
 from numba.core.typeconv import Conversion
 from numba.core.typing.templates import AbstractTemplate, infer_global, signature
 
-from hapticrender._records import kept_apart
 from hapticrender.protocols import Array
 
 WIDTH = {np.dtype(np.float64): 8, np.dtype(np.float32): 16}  # lanes of a 512-bit register; narrower machines split it
@@ -73,14 +70,14 @@ class MaskType(types.Type):
         return Conversion.safe if isinstance(other, types.Boolean) else None
 
 
-def _element(dtype: Any) -> ir.Type:
+def number_type(dtype: Any) -> ir.Type:
     return ir.FloatType() if dtype == types.float32 else ir.DoubleType()
 
 
 @register_model(LaneType)
 class _LaneModel(models.PrimitiveModel):
     def __init__(self, manager: Any, kind: LaneType) -> None:
-        super().__init__(manager, kind, ir.VectorType(_element(kind.dtype), kind.width))
+        super().__init__(manager, kind, ir.VectorType(number_type(kind.dtype), kind.width))
 
 
 @register_model(MaskType)
@@ -215,9 +212,52 @@ def floor(typingctx: Any, a: Any) -> Any:
 
 
 @intrinsic
-def nearest(typingctx: Any, a: Any) -> Any:
-    """Nearest whole number, halves to even, as a float."""
-    return _elementwise(lambda builder, a: _call(builder, "llvm.rint", a))(typingctx, a)
+def fraction(typingctx: Any, a: Any) -> Any:
+    """What is left of a after taking away its nearest whole number, halves to even: within 1/2 of zero."""
+    kind = _common((a,))
+    if kind is None:
+        return None
+
+    def build(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        if _has_avx512(context, kind):
+            return _avx512(builder, "reduce", 8, *args)
+        return builder.fsub(args[0], _call(builder, "llvm.rint", args[0]))
+
+    return kind(kind), build
+
+
+@intrinsic
+def by_size(typingctx: Any, a: Any, b: Any) -> Any:
+    """Magnitudes of two, the larger one first."""
+    kind = _common((a, b))
+    if kind is None:
+        return None
+
+    def build(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        if _has_avx512(context, kind):
+            ordered = [_avx512(builder, "range", 11, *args), _avx512(builder, "range", 10, *args)]
+        else:
+            one, other = (_call(builder, "llvm.fabs", value) for value in args)
+            more = builder.fcmp_ordered(">", one, other)
+            ordered = [builder.select(more, one, other), builder.select(more, other, one)]
+        return context.make_tuple(builder, sig.return_type, ordered)
+
+    return types.UniTuple(kind, 2)(kind, kind), build
+
+
+def _has_avx512(context: Any, kind: Any) -> bool:
+    """Whether AVX-512 can work on these vectors; its instructions do in one what LLVM needs three for."""
+    return isinstance(kind, LaneType) and "+avx512dq" in context.codegen().magic_tuple()[2].split(",")
+
+
+def _avx512(builder: Any, name: str, immediate: int, *values: Any) -> Any:
+    """Call the AVX-512 instruction `name` with its immediate operand, for all lanes, rounding as it is set."""
+    kind, mask, number = values[0].type, ir.IntType(values[0].type.count), ir.IntType(32)
+    named = f"llvm.x86.avx512.mask.{name}.{'pd' if kind.element == ir.DoubleType() else 'ps'}.512"
+    taken = [kind] * len(values) + [number, kind, mask, number]
+    function = builder.module.declare_intrinsic(named, (), ir.FunctionType(kind, taken))
+    rest = [number(immediate), ir.Constant(kind, ir.Undefined), mask(-1), number(4)]
+    return builder.call(function, [*values, *rest])
 
 
 @intrinsic
@@ -317,214 +357,3 @@ def _folded(builder: Any, value: Any) -> Any:
     lower = builder.shuffle_vector(value, value, ir.Constant(order, list(range(half))))
     upper = builder.shuffle_vector(value, value, ir.Constant(order, list(range(half, 2 * half))))
     return builder.fadd(lower, upper)
-
-
-def _parts(context: Any, builder: Any, kind: Any, array: Any) -> Any:
-    """Pointer to an array's numbers, and its shape."""
-    model = context.data_model_manager[kind]
-    data, shape = (builder.extract_value(array, model.get_field_position(name)) for name in ("data", "shape"))
-    return data, cgutils.unpack_tuple(builder, shape, kind.ndim)
-
-
-def _address(context: Any, builder: Any, kind: Any, array: Any, *where: Any) -> Any:
-    """Pointer to a row of lanes: array[where], each where counted in rows of the last axis but one."""
-    data, shape = _parts(context, builder, kind, array)
-    row = where[0]
-    for axis, index in enumerate(where[1:], 1):
-        row = builder.add(builder.mul(row, shape[axis]), index)
-    width = WIDTH[np.dtype(str(kind.dtype))]
-    vector = ir.VectorType(_element(kind.dtype), width)
-    return builder.gep(builder.bitcast(data, vector.as_pointer()), [row])
-
-
-def _load(context: Any, builder: Any, kind: Any, array: Any, where: Any, count: int) -> Any:
-    """Value at `where`: a row of lanes or a number."""
-    if _is_rows(kind, count):
-        value = builder.load(_address(context, builder, kind, array, *where), align=_wide(kind))
-    else:
-        value = builder.load(_number(context, builder, kind, array, *where))
-    kept_apart(builder, value, "tile" if kind.ndim == 3 and _is_rows(kind, count) else "own")
-    return value
-
-
-def _store(context: Any, builder: Any, kind: Any, array: Any, where: Any, count: int, value: Any) -> None:
-    """Write a row of lanes or a number at `where`."""
-    if _is_rows(kind, count):
-        access = builder.store(value, _address(context, builder, kind, array, *where), align=_wide(kind))
-    else:
-        access = builder.store(value, _number(context, builder, kind, array, *where))
-    kept_apart(builder, access, "tile" if kind.ndim == 3 and _is_rows(kind, count) else "own")
-
-
-def _is_rows(kind: Any, indices: int) -> bool:
-    floats = (types.float64, types.float32)
-    return isinstance(kind, types.Array) and kind.layout == "C" and kind.ndim == indices + 1 and kind.dtype in floats
-
-
-def _lane(kind: Any) -> LaneType:
-    return LaneType(kind.dtype, WIDTH[np.dtype(str(kind.dtype))])
-
-
-def _wide(kind: Any) -> int:
-    return WIDTH[np.dtype(str(kind.dtype))] * (4 if kind.dtype == types.float32 else 8)
-
-
-@intrinsic
-def lanes(typingctx: Any, array: Any, i: Any, j: Any) -> Any:
-    """Row array[i, j, :]."""
-    if not _is_rows(array, 2):
-        return None
-    return _lane(array)(array, types.intp, types.intp), lambda context, builder, sig, args: _load(
-        context, builder, sig.args[0], args[0], args[1:], 2
-    )
-
-
-@intrinsic
-def put(typingctx: Any, array: Any, i: Any, j: Any, value: Any) -> Any:
-    """Write a row: array[i, j, :] = value."""
-    if not _is_rows(array, 2):
-        return None
-
-    def build(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        _store(context, builder, sig.args[0], args[0], args[1:3], 2, args[3])
-        return context.get_dummy_value()
-
-    return types.none(array, types.intp, types.intp, _lane(array)), build
-
-
-@intrinsic
-def stretch(typingctx: Any, array: Any, i: Any, j: Any) -> Any:
-    """Read as many neighbours as there are lanes, array[i, j:], wherever they start; their columns have to exist."""
-    if not _is_numbers(array, 2) or array.dtype not in (types.float64, types.float32):
-        return None
-    kind = _lane(array)
-
-    def build(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        at = _number(context, builder, sig.args[0], *args)
-        vector = ir.VectorType(_element(kind.dtype), kind.width)
-        return builder.load(builder.bitcast(at, vector.as_pointer()), align=kind.dtype.bitwidth // 8)
-
-    return kind(array, types.intp, types.intp), build
-
-
-@intrinsic
-def taken(typingctx: Any, array: Any, i: Any, j: Any, like: Any) -> Any:
-    """Read as many neighbours as `like` has lanes from a plain array of any precision, in the precision of `like`."""
-    if not _is_numbers(array, 2) or not isinstance(like, LaneType):
-        return None
-
-    def build(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        at = _number(context, builder, sig.args[0], *args[:3])
-        vector = ir.VectorType(_element(array.dtype), like.width)
-        value = builder.load(builder.bitcast(at, vector.as_pointer()), align=array.dtype.bitwidth // 8)
-        return _converted(builder, value, _element(like.dtype))
-
-    return like(array, types.intp, types.intp, like), build
-
-
-@intrinsic
-def put_stretch(typingctx: Any, array: Any, i: Any, j: Any, value: Any) -> Any:
-    """Write as many neighbours as there are lanes, array[i, j:], wherever they start; their columns have to exist."""
-    if not _is_numbers(array, 2) or array.dtype not in (types.float64, types.float32):
-        return None
-    kind = _lane(array)
-
-    def build(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        at = _number(context, builder, sig.args[0], *args[:3])
-        builder.store(args[3], builder.bitcast(at, args[3].type.as_pointer()), align=kind.dtype.bitwidth // 8)
-        return context.get_dummy_value()
-
-    return types.none(array, types.intp, types.intp, kind), build
-
-
-@intrinsic
-def put_pairs(typingctx: Any, array: Any, i: Any, re: Any, im: Any) -> Any:
-    """Write W complex numbers from array[i * W] on, as many as there is room for; or rows array[i, 0] and array[i, 1].
-
-    The first form is for a complex array of bands, the second for scenarios side by side, shape (bands, 2, W).
-    """
-    if not (isinstance(array, types.Array) and isinstance(re, LaneType) and re == im):
-        return None
-
-    def build(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        kind, (where, index, first, second), width = sig.args[0], args, re.width
-        if kind.ndim == 3:
-            for j, value in enumerate((first, second)):
-                at = _address(context, builder, kind, where, index, ir.IntType(64)(j))
-                builder.store(value, at, align=_wide(kind))
-            return context.get_dummy_value()
-        data, shape = _parts(context, builder, kind, where)
-        element = _element(kind.dtype.underlying_float)
-        first, second = (_converted(builder, value, element) for value in (first, second))
-        start = builder.mul(index, ir.IntType(64)(width))
-        room = builder.sub(shape[0], start)
-        numbers = builder.gep(builder.bitcast(data, element.as_pointer()), [builder.shl(start, ir.IntType(64)(1))])
-        with builder.if_else(builder.icmp_signed(">=", room, ir.IntType(64)(width))) as (whole, part):
-            with whole:
-                order = [lane for i in range(width) for lane in (i, width + i)]
-                mixed = builder.shuffle_vector(
-                    first, second, ir.Constant(ir.VectorType(ir.IntType(32), 2 * width), order)
-                )
-                builder.store(mixed, builder.bitcast(numbers, mixed.type.as_pointer()), align=8)
-            with part:
-                for lane in range(width):
-                    with builder.if_then(builder.icmp_signed(">", room, ir.IntType(64)(lane))):
-                        for j, value in enumerate((first, second)):
-                            at = builder.gep(numbers, [ir.IntType(64)(2 * lane + j)])
-                            builder.store(builder.extract_element(value, ir.IntType(32)(lane)), at)
-        return context.get_dummy_value()
-
-    return types.none(array, types.intp, re, im), build
-
-
-def _converted(builder: Any, value: Any, element: Any) -> Any:
-    """Vector of another float type."""
-    kind = ir.VectorType(element, value.type.count)
-    if kind == value.type:
-        return value
-    return builder.fpext(value, kind) if element == ir.DoubleType() else builder.fptrunc(value, kind)
-
-
-@intrinsic
-def read(typingctx: Any, array: Any, *index: Any) -> Any:
-    """Take a scenario's own number array[i, ...], or the row array[i, ..., :] where every lane is a scenario."""
-    count = _count(index)
-    if not _is_rows(array, count) and not _is_numbers(array, count):
-        return None
-    kind = _lane(array) if _is_rows(array, count) else array.dtype
-    return kind(array, types.StarArgTuple.from_types([types.intp] * count)), lambda context, builder, sig, args: _load(
-        context, builder, sig.args[0], args[0], cgutils.unpack_tuple(builder, args[1]), count
-    )
-
-
-@intrinsic
-def write(typingctx: Any, value: Any, array: Any, *index: Any) -> Any:
-    """Write a scenario's own number array[i, ...], or the row array[i, ..., :] where every lane is a scenario."""
-    count = _count(index)
-    if not _is_rows(array, count) and not _is_numbers(array, count):
-        return None
-
-    def build(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        _store(context, builder, sig.args[1], args[1], cgutils.unpack_tuple(builder, args[2]), count, args[0])
-        return context.get_dummy_value()
-
-    kind = _lane(array) if _is_rows(array, count) else array.dtype
-    return types.none(kind, array, types.StarArgTuple.from_types([types.intp] * count)), build
-
-
-def _count(index: Any) -> int:
-    """How many indices were given: numba hands them over one by one, or as one tuple."""
-    return len(index[0]) if len(index) == 1 and isinstance(index[0], types.BaseTuple) else len(index)
-
-
-def _is_numbers(kind: Any, indices: int) -> bool:
-    return isinstance(kind, types.Array) and kind.layout == "C" and kind.ndim == indices
-
-
-def _number(context: Any, builder: Any, kind: Any, array: Any, *where: Any) -> Any:
-    """Pointer to one number of an array."""
-    data, shape = _parts(context, builder, kind, array)
-    at = where[0]
-    for axis, index in enumerate(where[1:], 1):
-        at = builder.add(builder.mul(at, shape[axis]), index)
-    return builder.gep(data, [at])

@@ -9,23 +9,19 @@ from hapticrender._lanes import (
     WIDTH,
     aligned,
     any_of,
+    by_size,
     floor,
+    fraction,
     high,
-    lanes,
     low,
-    nearest,
     padded,
-    put,
-    put_stretch,
-    read,
     root,
     select,
     signed,
     size,
-    stretch,
     total,
-    write,
 )
+from hapticrender._lanes_memory import lanes, put, put_stretch, read, row_totals, stretch, write
 
 KINDS = [np.float64, np.float32]
 
@@ -42,12 +38,15 @@ def arithmetic(a, out, factor):
         put(out, t, 4, -x)
         put(out, t, 5, root(size(x)))
         put(out, t, 6, floor(x))
-        put(out, t, 7, nearest(x))
+        put(out, t, 7, fraction(x))
         put(out, t, 8, low(x, y))
         put(out, t, 9, high(x, 0.5))
         put(out, t, 10, select((x > y) & (y >= 0.0) | (x <= -1.0), x, 2.0 * y))
         put(out, t, 11, 3 * x)
         put(out, t, 12, signed(x, y))
+        larger, smaller = by_size(x, y)
+        put(out, t, 13, larger)
+        put(out, t, 14, smaller)
 
 
 def expected(x, y, factor):
@@ -59,12 +58,14 @@ def expected(x, y, factor):
         -x,
         np.sqrt(abs(x)),
         np.floor(x),
-        np.rint(x),
+        x - np.rint(x),
         np.minimum(x, y),
         np.maximum(x, 0.5),
         np.where((x > y) & (y >= 0.0) | (x <= -1.0), x, 2.0 * y),
         3 * x,
         np.copysign(x, y),
+        np.maximum(abs(x), abs(y)),
+        np.minimum(abs(x), abs(y)),
     ]
 
 
@@ -73,7 +74,7 @@ def test_every_operation_equals_numpy(dtype, rng):
     width = WIDTH[np.dtype(dtype)]
     a = aligned((3, 2, width), dtype)
     a[:] = 2.0 * rng.standard_normal(a.shape)
-    out = aligned((3, 13, width), dtype)
+    out = aligned((3, 15, width), dtype)
     arithmetic(a, out, 0.25)
     for row, wanted in enumerate(expected(a[:, 0], a[:, 1], dtype(0.25))):
         np.testing.assert_allclose(out[:, row], wanted, rtol=4 * np.finfo(dtype).eps, atol=np.finfo(dtype).eps)
@@ -114,12 +115,13 @@ def test_a_sum_stays_apart_where_lanes_are_scenarios(rng):
 def both(x, y, z):
     """The same source for plain floats."""
     mask = x > y
-    return select(mask, low(x, z), high(y, z)), any_of(mask), root(z), floor(x), nearest(x), size(x), total(x, y)
+    picked = select(mask, low(x, z), high(y, z))
+    return picked, any_of(mask), root(z), floor(x), fraction(x), size(x), total(x, y), *by_size(x, y)
 
 
 def test_plain_floats_run_through_the_same_source():
-    assert both(1.7, -2.0, 9.0) == (1.7, True, 3.0, 1.0, 2.0, 1.7, -2.0)
-    assert both(-1.7, 2.0, 9.0) == (9.0, False, 3.0, -2.0, -2.0, 1.7, 2.0)
+    assert both(1.7, -2.0, 9.0) == (1.7, True, 3.0, 1.0, 1.7 - 2.0, 1.7, -2.0, 2.0, 1.7)
+    assert both(-1.7, 2.0, 9.0) == (9.0, False, 3.0, -2.0, 2.0 - 1.7, 1.7, 2.0, 2.0, 1.7)
 
 
 @kernel
@@ -135,6 +137,23 @@ def test_a_scenarios_own_numbers_are_plain_or_lanes(rng):
     moved(many, 0.25)
     assert alone[1] == 0.75
     np.testing.assert_allclose(many[1], many[0] + 0.25, rtol=1e-15)
+
+
+@kernel
+def summed_rows(values, out):
+    for m in range(0, values.shape[1], values.shape[2]):
+        put_stretch(out, 0, m, row_totals(values, 0, m))
+
+
+@pytest.mark.parametrize("dtype", KINDS)
+def test_rows_are_summed_side_by_side_in_any_precision(dtype, rng):
+    """W rows at once add up in a tree: each sum is off by a rounding a level, log2(W), of its magnitudes."""
+    width = WIDTH[np.dtype(dtype)]
+    values, out = aligned((1, 2 * width, width), dtype), np.zeros((1, 2 * width))
+    values[:] = rng.standard_normal(values.shape)
+    summed_rows(values, out)
+    bound = np.log2(width) * np.finfo(dtype).eps * abs(values[0]).sum(axis=1, dtype=float)
+    assert (abs(out[0] - values[0].sum(axis=1, dtype=float)) <= bound).all()
 
 
 @kernel

@@ -21,7 +21,9 @@ from hapticrender.touch.perception import VELOCITY_PER_FORCE
 RENDERERS = sorted((Path(__file__).resolve().parent.parent / "renderers").glob("*.py"))
 KINDS = ("vt-plate", "electroadhesion", "ultrasonic", "hybrid")
 # What makes a demodulator, a filter, a loop or an oscillator; a renderer may only hand over to the core's.
-FORBIDDEN_PACKAGES = {"numba", "scipy.signal", "hapticrender._jit", "hapticrender._lanes", "hapticrender._polynomials"}
+FORBIDDEN_PACKAGES = {"numba", "scipy.signal"} | {
+    f"hapticrender.{name}" for name in ("_jit", "_lanes", "_lanes_memory", "_polynomials")
+}
 CORE_ONLY = {  # of `control`, what a renderer may touch: descriptions, and whole controllers
     "hapticrender.control.bandmodel",
     "hapticrender.control.bank",

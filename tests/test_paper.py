@@ -12,7 +12,8 @@ from hapticrender.control.bank_state import across_bands
 from hapticrender.control.loopshape import TransferFunction, design, margins
 from hapticrender.control.methods import METHODS, method_named
 from hapticrender.control.methods.paper import CommonMode
-from hapticrender.control.polar_kernels import LOOP_ROWS, X_IM, X_RE, polar_step
+from hapticrender.control.polar_kernels import LOOP_ROWS, X_IM, X_RE
+from hapticrender.control.polar_steps import polar_step
 from hapticrender.control.stdft import StarSTDFT
 from hapticrender.plants.vibrotactile import Plate, PlateParameters
 from hapticrender.touch.mechanics import HEAVY_SECOND

@@ -41,9 +41,10 @@ static inline v all(real a) { return a - (v){}; }
 #ifdef __AVX512DQ__
 static inline v size(v a) { return AVX(andnot)(all(-0.0), a); }
 static inline v larger_of(v a, v b) { return AVX(max)(a, b); }
-static inline v smaller_of(v a, v b) { return AVX(min)(a, b); }
+static inline v larger_size(v a, v b) { return AVX(range)(a, b, 11); }
+static inline v smaller_size(v a, v b) { return AVX(range)(a, b, 10); }
 static inline v above(v a, v b, v yes, v no) { return AVX(mask_blend)(MASK(cmp)(a, b, _CMP_GT_OQ), no, yes); }
-static inline v nearest(v a) { return AVX(roundscale)(a, 8); }
+static inline v fraction(v a) { return AVX(reduce)(a, 8); }
 #else
 static inline v above(v a, v b, v yes, v no) {
     mask m = a > b;
@@ -51,10 +52,11 @@ static inline v above(v a, v b, v yes, v no) {
 }
 static inline v size(v a) { return above(all(0), a, -a, a); }
 static inline v larger_of(v a, v b) { return above(a, b, a, b); }
-static inline v smaller_of(v a, v b) { return above(b, a, a, b); }
-static inline v nearest(v a) {
+static inline v larger_size(v a, v b) { return larger_of(size(a), size(b)); }
+static inline v smaller_size(v a, v b) { return above(size(b), size(a), size(a), size(b)); }
+static inline v fraction(v a) {
     v r;
-    for (int i = 0; i < W; i++) r[i] = RINT(a[i]);
+    for (int i = 0; i < W; i++) r[i] = a[i] - RINT(a[i]);
     return r;
 }
 #endif
@@ -75,7 +77,7 @@ static inline v horner(const real *c, int terms, v u) {
 }
 
 static inline void unit(v turns, v *cosine, v *sine) {
-    v x = turns - nearest(turns), far = size(x), quarter = all(0.25);
+    v x = fraction(turns), far = size(x), quarter = all(0.25);
     v folded = above(far, quarter, with_sign(all(0.5), x) - x, x), u = folded * folded;
     v c = horner(C, TERMS(C), u);
     *cosine = above(far, quarter, -c, c);
@@ -83,7 +85,7 @@ static inline void unit(v turns, v *cosine, v *sine) {
 }
 
 static inline v cosine_of(v turns) {
-    v x = turns - nearest(turns);
+    v x = fraction(turns);
     return horner(O, TERMS(O), x * x);
 }
 
@@ -91,10 +93,10 @@ static inline v cosine_of(v turns) {
 static inline void polar(v im, v re, v *magnitude, v *angle) {
     const real eighth = 0.41421356237309503; /* tan(pi/8) */
     re += TINY;
-    v across = size(im), along = size(re), larger = larger_of(across, along), smaller = smaller_of(across, along);
+    v larger = larger_size(im, re), smaller = smaller_size(im, re);
     v x = larger + eighth * smaller, t = (smaller - eighth * larger) / x, u = t * t;
     v p = (real)(M_PI / 8) + t * horner(A, TERMS(A), u);
-    p = with_sign(above(across, along, (real)M_PI_2 - p, p), im);
+    p = with_sign(above(larger, size(re), (real)M_PI_2 - p, p), im);
     *magnitude = x * horner(R, TERMS(R), u);
     *angle = above(all(0), re, -(real)M_PI - p, p);
 }

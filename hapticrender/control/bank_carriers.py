@@ -8,7 +8,8 @@ from __future__ import annotations
 import numpy as np
 
 from hapticrender._jit import by_types, kernel
-from hapticrender._lanes import floor, high, lanes, low, put, read, select, size
+from hapticrender._lanes import floor, high, low, select, size
+from hapticrender._lanes_memory import lanes, put, read
 from hapticrender._polynomials import unit
 from hapticrender.control import bank_rows as row
 from hapticrender.control.bank_finger import finger_stiffness
@@ -22,10 +23,22 @@ REFRESH = 64  # samples between two looks at the tones that are asked for
 @kernel
 def count_turns(phase, k, step):
     """Phase of carrier k in turns, now; in whole 2^-64 turns, so that it never drifts; then counts on."""
-    turns = np.float64(phase[k] >> np.uint64(11)) * 2.0**-53
-    advance = REFRESH * (step - floor(step))
-    phase[k] += np.uint64((advance - floor(advance)) * 2.0**63) << np.uint64(1)
+    turns = turns_of(phase[k])
+    phase[k] += advance_of(step)
     return turns
+
+
+@kernel
+def turns_of(phase):
+    """Phase in turns, of one in whole 2^-64 turns."""
+    return np.float64(phase >> np.uint64(11)) * 2.0**-53
+
+
+@kernel
+def advance_of(step):
+    """What a carrier that turns by `step` a sample goes on by until the next look, in whole 2^-64 turns."""
+    advance = REFRESH * (step - floor(step))
+    return np.uint64((advance - floor(advance)) * 2.0**63) << np.uint64(1)
 
 
 @kernel

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from hapticrender._jit import kernel
-from hapticrender._lanes import any_of, high, lanes, low, put, read, select, size, total, write
+from hapticrender._lanes import any_of, high, low, select, size, total
+from hapticrender._lanes_memory import lanes, put, read, write
 from hapticrender.control import bank_rows as row
 from hapticrender.control.kernels import FAR, FASTEST, TURN
 

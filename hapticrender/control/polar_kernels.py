@@ -14,9 +14,10 @@ import math
 from typing import NamedTuple
 
 from hapticrender._jit import kernel
-from hapticrender._lanes import any_of, high, lanes, low, put, put_pairs, root, select, size, taken, totals
+from hapticrender._lanes import any_of, high, low, root, select, size
+from hapticrender._lanes_memory import lanes, put, put_pairs, taken
 from hapticrender._polynomials import polar, unit
-from hapticrender.control.bank_carriers import count_turns
+from hapticrender.control.bank_carriers import advance_of, turns_of
 from hapticrender.control.kernels import (
     DOUBT_TIME,
     FAR,
@@ -86,6 +87,8 @@ class PolarState(NamedTuple):
     band: Array  # (tiles, BAND_ROWS, W)
     loop: Array  # (tiles, coordinates * LOOP_ROWS, W)
     phase: Array  # (bands,) uint64: fixed part of each carrier at the next refresh, 2^64 a turn
+    advance: Array  # (bands,) uint64: how far it goes until then
+    counted: Array  # (bands,) Hz: the frequency that `advance` is made of
     locked: Array  # (tiles,) integer: 1 where a carrier of the tile follows the finger
     finger: Array  # (4,) held position (m), velocity (m/s), gate 0..1, seen before (0 or 1)
     doubt: Array  # (1,) 0: the sensors are believed, 1: they are not
@@ -184,6 +187,19 @@ def turn_frame(state, t, aimed):
 
 
 @kernel
+def count_on(tables, state, t, count):
+    """Phases of a tile's carriers, now, as `count_turns` counts them; how far they go changes with the tones only."""
+    band, phase, advance, start = state.band, state.phase, state.advance, t * state.band.shape[2]
+    for k in range(start, start + count):
+        if tables.tone[0, k] != state.counted[k]:  # in double precision, unlike the bands
+            state.counted[k] = tables.tone[0, k]
+            advance[k] = advance_of(tables.tone[0, k] / tables.numbers.rate)
+    for i in range(count):
+        band[t, TURNS, i] = turns_of(phase[start + i])
+        phase[start + i] += advance[start + i]
+
+
+@kernel
 def take_tones(tables, state, t):
     """Tones of a tile, as they are asked for now; their phases, and look-ups where they are new."""
     tone, band, width, start = tables.tone, state.band, state.band.shape[2], t * state.band.shape[2]
@@ -203,12 +219,14 @@ def take_tones(tables, state, t):
             known = known and band[t, LIVE, i] > 0.0 and band[t, FREQUENCY, i] == frequency
             if tone[1, start + i] > 0.0:
                 state.locked[t] = 1
-    for i in range(count):
-        band[t, TURNS, i] = count_turns(state.phase, start + i, tone[0, start + i] / tables.numbers.rate)
+    count_on(tables, state, t, count)
     if not known:
         for i in range(count):
             band[t, LIVE, i], band[t, FREQUENCY, i] = 1.0, tone[0, start + i]
             look_up(tables, state, t, i, tone[0, start + i])
+        cos, sin = unit(1.0 / tables.numbers.rate * lanes(band, t, FREQUENCY))
+        put(band, t, TURN_COS, cos)
+        put(band, t, TURN_SIN, sin)
 
 
 @kernel
@@ -228,48 +246,55 @@ def refresh(tables, state):
             put(band, t, COS, live * (cos * re - sin * im))
             put(band, t, SIN, live * (sin * re + cos * im))
             put(band, t, START, turns + (1.0 / TURN) * polar(im, re)[1])
-            cos, sin = unit(1.0 / numbers.rate * lanes(band, t, FREQUENCY))
-            put(band, t, TURN_COS, cos)
-            put(band, t, TURN_SIN, sin)
 
 
 @kernel
-def follow_finger(finger, rate, position):
+def follow_finger(rate, held, velocity, gate, seen, position):
     """Hold the position while the finger is away, smooth its velocity, open the gate with contact."""
-    seen = abs(position) <= FAR and not (finger[SEEN] > 0.0 and abs(position - finger[HELD]) * rate > FASTEST)
-    velocity = 0.0
-    if seen:
-        if finger[SEEN] > 0.0:
-            velocity = (position - finger[HELD]) * rate
-        finger[HELD] = position
-    finger[SEEN] = 1.0 if seen else 0.0
-    finger[VELOCITY] += (1.0 - math.exp(-TURN * VELOCITY_POLE / rate)) * (velocity - finger[VELOCITY])
+    now = abs(position) <= FAR and not (seen > 0.0 and abs(position - held) * rate > FASTEST)
+    speed = (position - held) * rate if now and seen > 0.0 else 0.0
+    velocity += (1.0 - math.exp(-TURN * VELOCITY_POLE / rate)) * (speed - velocity)
     ramp = 1.0 / (GATE_TIME * rate)
-    finger[GATE] = min(finger[GATE] + ramp, 1.0) if seen else max(finger[GATE] - ramp, 0.0)
+    gate = min(gate + ramp, 1.0) if now else max(gate - ramp, 0.0)
+    return position if now else held, velocity, gate, 1.0 if now else 0.0
 
 
 @kernel
-def share(tables, state, m, sensed, position, wanted):
-    """Write down what all tiles are told of a sample; what no sensor can show counts as zero.  Returns flags."""
-    numbers, shared, flags = tables.numbers, state.shared, 0
-    for c in range(tables.listen.shape[0]):
-        y = 0.0
-        for s in range(sensed.shape[0]):
-            if abs(sensed[s]) <= numbers.sensed_limit:
-                y += tables.listen[c, s] * sensed[s]
-            else:  # NaN included
-                flags = 2
-        shared[SHARED_ROWS + c, m] = y
-    step = 1.0 / (DOUBT_TIME * numbers.rate)
-    state.doubt[0] = min(state.doubt[0] + step, 1.0) if flags else max(state.doubt[0] - step, 0.0)
-    shared[TRUST, m] = 1.0 - state.doubt[0]
+def believed(value, limit):
+    """What a sensor tells, or zero where it cannot show that."""
+    return value if abs(value) <= limit else 0.0
+
+
+@kernel
+def share(tables, state, m, fits, position, wanted, known):
+    """Write down what else all tiles are told of a sample, whose sensors are inside their limits or not.
+
+    `known` is what is known of finger and sensors, see `recall`.  Returns flags and what is known now.
+    """
+    numbers, shared = tables.numbers, state.shared
+    held, velocity, gate, seen, doubt = known
+    if not fits or doubt > 0.0:
+        step = 1.0 / (DOUBT_TIME * numbers.rate)
+        doubt = max(doubt - step, 0.0) if fits else min(doubt + step, 1.0)
     sane = abs(wanted) <= FAR
-    shared[WANTED, m] = wanted if sane else 0.0
-    far = abs(position) > FAR
-    follow_finger(state.finger, numbers.rate, math.nan if far else position)
-    shared[PLACE, m], shared[SPEED, m] = state.finger[HELD], state.finger[VELOCITY]
-    shared[OPENING, m] = state.finger[GATE]
-    return flags if sane and not far else 2
+    held, velocity, gate, seen = follow_finger(numbers.rate, held, velocity, gate, seen, position)
+    shared[WANTED, m], shared[TRUST, m] = wanted if sane else 0.0, 1.0 - doubt
+    shared[PLACE, m], shared[SPEED, m], shared[OPENING, m] = held, velocity, gate
+    return 0 if fits and sane and not abs(position) > FAR else 2, (held, velocity, gate, seen, doubt)
+
+
+@kernel
+def recall(state):
+    """What is known of finger and sensors: held position (m), velocity (m/s), gate, whether it was seen; doubt."""
+    finger = state.finger
+    return finger[HELD], finger[VELOCITY], finger[GATE], finger[SEEN], state.doubt[0]
+
+
+@kernel
+def remember(state, known):
+    """Keep what is known until the next block."""
+    finger = state.finger
+    finger[HELD], finger[VELOCITY], finger[GATE], finger[SEEN], state.doubt[0] = known
 
 
 @kernel
@@ -428,44 +453,3 @@ def tile_step(tables, state, t, m, target):
         u, v = unit((1.0 / TURN) * theta)
         carried = (h_re * u - h_im * v) * cos - (h_re * v + h_im * u) * sin
         put(state.sum, c, m, lanes(state.sum, c, m) + command * lanes(loop, t, base + DRIVE) * carried)
-
-
-@kernel
-def gather(state, count):
-    """Sum the drive of each coordinate over the lanes, as far as it is trusted, and clear the sums for the next."""
-    shared, coordinates = state.shared, state.sum.shape[0]
-    for c in range(0, coordinates, 2):
-        d = min(c + 1, coordinates - 1)
-        for m in range(count):
-            one, other = totals(1.0, lanes(state.sum, c, m), lanes(state.sum, d, m))
-            shared[SHARED_ROWS + c, m] = shared[TRUST, m] * one
-            shared[SHARED_ROWS + d, m] = shared[TRUST, m] * other
-            put(state.sum, c, m, 0.0 * lanes(state.band, 0, LIVE))
-            put(state.sum, d, m, 0.0 * lanes(state.band, 0, LIVE))
-
-
-@kernel
-def speak(tables, state, m, drive):
-    """Drive of the channels from that of the coordinates, each cut to its limit.  Returns flags."""
-    limit, flags = tables.numbers.drive_limit, 0
-    for i in range(drive.shape[0]):
-        asked = 0.0
-        for c in range(tables.listen.shape[0]):
-            asked += tables.speak[i, c] * state.shared[SHARED_ROWS + c, m]
-        drive[i] = min(max(asked, -limit), limit)
-        if drive[i] != asked:
-            flags = 1
-    return flags
-
-
-@kernel
-def polar_step(tables, state, sensed, position, wanted, drive, target):
-    """One sample of the whole controller: fills `drive` (channels,) and `target` (bands,), returns flags."""
-    if state.sample[0] % REFRESH == 0:
-        refresh(tables, state)
-    flags = share(tables, state, 0, sensed, position, wanted)
-    for t in range(state.band.shape[0]):
-        tile_step(tables, state, t, 0, target)
-    state.sample[0] += 1
-    gather(state, 1)
-    return flags | speak(tables, state, 0, drive)

@@ -8,7 +8,8 @@ the processor works on many samples at once.  The arithmetic is that of `polar_k
 from __future__ import annotations
 
 from hapticrender._jit import kernel
-from hapticrender._lanes import lanes, put, put_pairs, select
+from hapticrender._lanes import select
+from hapticrender._lanes_memory import lanes, put, put_pairs, put_stretch, row_totals, taken
 from hapticrender._polynomials import cosine, polar
 from hapticrender.control.kernels import QUIET, TURN
 from hapticrender.control.polar_kernels import (
@@ -18,6 +19,7 @@ from hapticrender.control.polar_kernels import (
     DRIVE,
     FORWARD,
     FREQUENCY,
+    LIVE,
     LOOP_ROWS,
     RE1,
     REFRESH,
@@ -31,18 +33,20 @@ from hapticrender.control.polar_kernels import (
     TURN_SIN,
     X_IM,
     X_RE,
+    believed,
     clamped_step,
-    gather,
     law_step,
+    recall,
     refresh,
+    remember,
     section_step,
     share,
-    speak,
     tile_step,
 )
+from hapticrender.control.polar_steps import usual
 
-# rows of PolarState.told, one column a sample: samples since the refresh; then, two a coordinate, b0 of the low pass
-# times twice what it hears, and four times that
+# rows of PolarState.told, one column a sample: whole numbers from 0; then, two a coordinate, b0 of the low pass times
+# twice what it hears, and four times that
 NUMBER, TOLD = range(2)
 TOLD_ROWS = 1  # and two a coordinate
 # rows of PolarState.scratch: phase of what is wanted (turns); then, two a coordinate, its envelope, which becomes what
@@ -54,13 +58,12 @@ SCRATCH_ROWS = 1  # and two a coordinate
 @kernel
 def tell(tables, state, count):
     """What the passes are told of every sample, in the precision of the bands."""
-    first, told, shared = state.sample[0] % REFRESH, state.told, state.shared
-    for m in range(count):
-        told[NUMBER, m] = first + m
+    like, twice = lanes(state.band, 0, LIVE), 2.0 * tables.numbers.filter[0]
     for c in range(tables.listen.shape[0]):
-        for m in range(count):
-            gain = 2.0 * tables.numbers.filter[0] * shared[SHARED_ROWS + c, m]
-            told[TOLD + 2 * c, m], told[TOLD + 2 * c + 1, m] = gain, 4.0 * gain
+        for m in range(0, count, state.band.shape[2]):
+            gain = twice * taken(state.shared, SHARED_ROWS + c, m, like)
+            put_stretch(state.told, TOLD + 2 * c, m, gain)
+            put_stretch(state.told, TOLD + 2 * c + 1, m, 4.0 * gain)
 
 
 @kernel
@@ -77,7 +80,7 @@ def hear(tables, state, t, count, c, d):
     for m in range(count):
         if begun + m > 0:
             cos, sin = cos * turn_cos - sin * turn_sin, sin * turn_cos + cos * turn_sin
-        put(scratch, WISH, m, start + told[NUMBER, m] * step)
+        put(scratch, WISH, m, start + told[NUMBER, begun + m] * step)
         gain, four = told[TOLD + 2 * c, m], told[TOLD + 2 * c + 1, m]
         re, a1, a2 = section_step(section, a1, a2, gain, four, cos)
         im, b1, b2 = section_step(section, b1, b2, -gain, -four, sin)
@@ -155,13 +158,60 @@ def tile_block(tables, state, t, count, n, target):
 
 
 @kernel
-def usual(tables, state, count):
-    """Whether the passes can do a block: two coordinates at most, constant targets, and every sensor believed."""
-    numbers = tables.numbers
-    fit = numbers.feedback and not numbers.analysed and not numbers.subtract and state.window.shape[0] == 0
+def sense_all(tables, state, sensed, flags, n, count):
+    """What the coordinates hear in `count` samples from n on; flags where a sensor is beyond its limit (NaN is)."""
+    listen, limit, last = tables.listen, tables.numbers.sensed_limit, sensed.shape[1] - 1
     for m in range(count):
-        fit = fit and state.shared[TRUST, m] == 1.0
-    return fit and tables.listen.shape[0] <= 2
+        flags[n + m] = 0 if (abs(sensed[n + m, 0]) <= limit) & (abs(sensed[n + m, last]) <= limit) else 2
+    for c in range(listen.shape[0]):
+        first, second, row = listen[c, 0], listen[c, last] if last > 0 else 0.0, SHARED_ROWS + c
+        for m in range(count):
+            one, other = believed(sensed[n + m, 0], limit), believed(sensed[n + m, last], limit)
+            state.shared[row, m] = first * one + second * other
+    for s in range(1, last):
+        for m in range(count):
+            flags[n + m] |= 0 if abs(sensed[n + m, s]) <= limit else 2
+            for c in range(listen.shape[0]):
+                state.shared[SHARED_ROWS + c, m] += listen[c, s] * believed(sensed[n + m, s], limit)
+
+
+@kernel
+def share_all(tables, state, sensed, position, wanted, flags, n, count):
+    """Write down what all tiles are told of `count` samples from n on."""
+    known = recall(state)
+    sense_all(tables, state, sensed, flags, n, count)
+    for m in range(count):
+        flags[n + m], known = share(tables, state, m, flags[n + m] == 0, position[n + m], wanted[n + m], known)
+    remember(state, known)
+
+
+@kernel
+def gather_all(state, count):
+    """Sum the drive of each coordinate over the lanes, as far as it is trusted, and clear the sums for the next."""
+    sums, shared, nothing = state.sum, state.shared, 0.0 * lanes(state.band, 0, LIVE)
+    for c in range(sums.shape[0]):
+        for m in range(0, count, sums.shape[2]):
+            put_stretch(shared, SHARED_ROWS + c, m, taken(shared, TRUST, m, nothing) * row_totals(sums, c, m))
+        for m in range(count):
+            put(sums, c, m, nothing)
+
+
+@kernel
+def speak_all(tables, state, drive, flags, n, count):
+    """Drive of the channels from that of the coordinates, each cut to its limit."""
+    shared, limit, coordinates = state.shared, tables.numbers.drive_limit, tables.listen.shape[0]
+    for i in range(drive.shape[1]):
+        first, second = tables.speak[i, 0], tables.speak[i, 1] if coordinates > 1 else 0.0
+        for m in range(count):
+            asked = first * shared[SHARED_ROWS, m]
+            if coordinates > 1:
+                asked += second * shared[SHARED_ROWS + 1, m]
+            for c in range(2, coordinates):
+                asked += tables.speak[i, c] * shared[SHARED_ROWS + c, m]
+            cut = min(max(asked, -limit), limit)
+            drive[n + m, i] = cut
+            if cut != asked:
+                flags[n + m] |= 1
 
 
 @kernel
@@ -175,8 +225,7 @@ def polar_run(tables, state, sensed, position, wanted, drive, target, flags):
         if state.sample[0] % REFRESH == 0:
             refresh(tables, state)
         count = min(REFRESH - state.sample[0] % REFRESH, sensed.shape[0] - n)
-        for m in range(count):
-            flags[n + m] = share(tables, state, m, sensed[n + m], position[n + m], wanted[n + m])
+        share_all(tables, state, sensed, position, wanted, flags, n, count)
         passes = usual(tables, state, count)
         if passes:
             tell(tables, state, count)
@@ -187,7 +236,6 @@ def polar_run(tables, state, sensed, position, wanted, drive, target, flags):
                 for m in range(count):
                     tile_step(tables, state, t, m, target[n + m if target.shape[0] > 1 else 0])
         state.sample[0] += count
-        gather(state, count)
-        for m in range(count):
-            flags[n + m] |= speak(tables, state, m, drive[n + m])
+        gather_all(state, count)
+        speak_all(tables, state, drive, flags, n, count)
         n += count

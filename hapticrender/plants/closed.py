@@ -10,7 +10,8 @@ from hapticrender._jit import by_types, kernel
 from hapticrender.control.bank_kernels import bank_step
 from hapticrender.control.bank_state import BankTables
 from hapticrender.control.complex_kernels import ComplexTables, complex_step
-from hapticrender.control.polar_kernels import PolarTables, polar_step
+from hapticrender.control.polar_kernels import PolarTables
+from hapticrender.control.polar_steps import polar_step
 from hapticrender.plants.kernels import plate_advance, plate_drive, plate_sense
 
 STEPS = {PolarTables: polar_step, ComplexTables: complex_step, BankTables: bank_step}

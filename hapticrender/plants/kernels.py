@@ -17,7 +17,8 @@ from typing import NamedTuple
 import numpy as np
 
 from hapticrender._jit import kernel
-from hapticrender._lanes import high, low, read, select, size, write
+from hapticrender._lanes import high, low, select, size
+from hapticrender._lanes_memory import read, write
 from hapticrender._polynomials import whole
 from hapticrender.plants.propagator import (
     GRIP,

@@ -32,7 +32,7 @@ from hapticrender.control.polar_kernels import (
     PolarState,
     PolarTables,
 )
-from hapticrender.control.polar_passes import SCRATCH_ROWS, TOLD_ROWS, polar_run
+from hapticrender.control.polar_passes import NUMBER, SCRATCH_ROWS, TOLD_ROWS, polar_run
 from hapticrender.errors import DesignError
 from hapticrender.protocols import Array
 
@@ -90,16 +90,20 @@ def polar_state(tables: PolarTables, window: int, dtype: type) -> PolarState:
     band = aligned((tiles, BAND_ROWS, width), dtype)
     band[:, [FORWARD, HEADING_RE, FRAME_RE]] = 1.0
     rows = 2 * tiles * coordinates
+    told: Array = np.zeros((TOLD_ROWS + 2 * coordinates, REFRESH), dtype)
+    told[NUMBER] = np.arange(REFRESH)
     return PolarState(
         band=band,
         loop=aligned((tiles, coordinates * LOOP_ROWS, width), dtype),
         phase=np.zeros(bands, np.uint64),
+        advance=np.zeros(bands, np.uint64),
+        counted=np.zeros(bands),
         locked=np.zeros(tiles, np.int64),
         finger=np.zeros(4),
         doubt=np.zeros(1),
         sample=np.zeros(1, np.int64),
         shared=np.zeros((SHARED_ROWS + coordinates, REFRESH)),
-        told=np.zeros((TOLD_ROWS + 2 * coordinates, REFRESH), dtype),
+        told=told,
         scratch=aligned((SCRATCH_ROWS + 2 * coordinates, REFRESH, width), dtype),
         sum=aligned((coordinates, REFRESH, width), dtype),
         window=aligned((window, rows, width), dtype),

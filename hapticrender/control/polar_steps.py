@@ -1,0 +1,173 @@
+"""A sample of the paper's controller by itself, as a loop that is closed sample by sample needs it.
+
+What is usual (see `usual`) is done in as few instructions as the passes of a block need: a processor looks ahead by
+some hundreds of them only, and what a sample waits for is then hidden behind the next one and the device.
+"""
+
+from __future__ import annotations
+
+from hapticrender._jit import kernel
+from hapticrender._lanes import select, totals
+from hapticrender._lanes_memory import lanes, put, put_pairs
+from hapticrender._polynomials import cosine, polar
+from hapticrender.control.kernels import QUIET, TURN
+from hapticrender.control.polar_kernels import (
+    AMOUNT,
+    AMPLITUDE1,
+    COS,
+    DRIVE,
+    FORWARD,
+    FREQUENCY,
+    LIVE,
+    LOOP_ROWS,
+    RE1,
+    REFRESH,
+    SHARED_ROWS,
+    SIN,
+    START,
+    TARGET_IM,
+    TARGET_RE,
+    THETA1,
+    TRUST,
+    TURN_COS,
+    TURN_SIN,
+    X_IM,
+    X_RE,
+    believed,
+    clamped_step,
+    law_step,
+    recall,
+    refresh,
+    remember,
+    section_step,
+    share,
+    tile_step,
+)
+
+
+@kernel
+def hearing(tables, shared, m, sensed):
+    """What the coordinates hear; a sensor beyond its limit counts as zero.  Returns whether all are inside.
+
+    Two sensors are the usual case, and a loop over them costs more than what it does.
+    """
+    listen, limit, last = tables.listen, tables.numbers.sensed_limit, sensed.shape[0] - 1
+    fits = (abs(sensed[0]) <= limit) & (abs(sensed[last]) <= limit)  # NaN does not
+    first, second = believed(sensed[0], limit), believed(sensed[last], limit) if last > 0 else 0.0
+    for s in range(1, last):
+        fits = fits & (abs(sensed[s]) <= limit)
+    for c in range(listen.shape[0]):
+        y = listen[c, 0] * first + listen[c, last] * second
+        for s in range(1, last):
+            y += listen[c, s] * believed(sensed[s], limit)
+        shared[SHARED_ROWS + c, m] = y
+    return fits
+
+
+@kernel
+def usual(tables, state, count):
+    """Whether the short ways can do `count` samples: two coordinates at most, constant targets, sensors believed."""
+    numbers = tables.numbers
+    fit = numbers.feedback and not numbers.analysed and not numbers.subtract and state.window.shape[0] == 0
+    for m in range(count):
+        fit = fit and state.shared[TRUST, m] == 1.0
+    return fit and tables.listen.shape[0] <= 2
+
+
+@kernel
+def carry_on(state, t, number, rate):
+    """Fixed carriers of a tile, and the phase of what is wanted (turns), `number` samples after they were set."""
+    band = state.band
+    cos, sin = lanes(band, t, COS), lanes(band, t, SIN)
+    if number > 0:
+        turn_cos, turn_sin = lanes(band, t, TURN_COS), lanes(band, t, TURN_SIN)
+        cos, sin = cos * turn_cos - sin * turn_sin, sin * turn_cos + cos * turn_sin
+        put(band, t, COS, cos)
+        put(band, t, SIN, sin)
+    return cos, sin, lanes(band, t, START) + (number / rate) * lanes(band, t, FREQUENCY)
+
+
+@kernel
+def usual_step(tables, state, t, c, cos, sin, wish):
+    """Drive of a tile in coordinate c: `listen` and `answer` where X is counted from what is wanted."""
+    section, law, loop, base = tables.numbers.filter, tables.numbers.law, state.loop, c * LOOP_ROWS
+    gain = 2.0 * section[0] * state.shared[SHARED_ROWS + c, 0]
+    at, wanted = base + RE1, lanes(state.band, t, AMOUNT)
+    re, a1, a2 = section_step(section, lanes(loop, t, at), lanes(loop, t, at + 1), gain, 4.0 * gain, cos)
+    im, b1, b2 = section_step(section, lanes(loop, t, at + 2), lanes(loop, t, at + 3), -gain, -4.0 * gain, sin)
+    for r, value in enumerate((a1, a2, b1, b2)):
+        put(loop, t, at + r, value)
+    put(loop, t, base + X_RE, re)
+    put(loop, t, base + X_IM, im)
+    found, lag = polar(im, re)
+    at, to, sounds = base + AMPLITUDE1, base + THETA1, select(wanted > QUIET, 1.0, 0.0 * wanted)
+    amount, a1, a2 = clamped_step(law, lanes(loop, t, at), lanes(loop, t, at + 1), wanted - found, tables.numbers.floor)
+    theta, b1, b2 = law_step(law, lanes(loop, t, to), lanes(loop, t, to + 1), sounds, 4.0 * sounds, lag)
+    for r, value in enumerate((a1, a2, b1, b2)):
+        put(loop, t, at + r, value)
+    return law[0] * lanes(loop, t, base + DRIVE) * amount * cosine(wish - (law[0] / TURN) * theta)
+
+
+@kernel
+def tiles_step(tables, state, target):
+    """Drive of one or two coordinates where all is usual and no carrier follows the finger."""
+    band, last = state.band, tables.listen.shape[0] - 1
+    one = other = 0.0 * lanes(band, 0, LIVE)
+    for t in range(band.shape[0]):
+        put_pairs(target, t, lanes(band, t, TARGET_RE), lanes(band, t, FORWARD) * lanes(band, t, TARGET_IM))
+        cos, sin, wish = carry_on(state, t, state.sample[0] % REFRESH, tables.numbers.rate)
+        one += usual_step(tables, state, t, 0, cos, sin, wish)
+        if last > 0:
+            other += usual_step(tables, state, t, last, cos, sin, wish)
+    return totals(1.0, one, other)
+
+
+@kernel
+def gather(state):
+    """Sum the drive of each coordinate over the lanes, as far as it is trusted, and clear the sums for the next."""
+    shared, coordinates = state.shared, state.sum.shape[0]
+    for c in range(0, coordinates, 2):
+        d = min(c + 1, coordinates - 1)
+        one, other = totals(1.0, lanes(state.sum, c, 0), lanes(state.sum, d, 0))
+        shared[SHARED_ROWS + c, 0], shared[SHARED_ROWS + d, 0] = shared[TRUST, 0] * one, shared[TRUST, 0] * other
+        put(state.sum, c, 0, 0.0 * lanes(state.band, 0, LIVE))
+        put(state.sum, d, 0, 0.0 * lanes(state.band, 0, LIVE))
+
+
+@kernel
+def speak(tables, state, one, other, drive):
+    """Drive of the channels from that of the coordinates, each cut to its limit.  Returns flags."""
+    limit, flags, coordinates = tables.numbers.drive_limit, 0, tables.listen.shape[0]
+    for i in range(drive.shape[0]):
+        asked = tables.speak[i, 0] * one
+        if coordinates > 1:
+            asked += tables.speak[i, 1] * other
+        for c in range(2, coordinates):
+            asked += tables.speak[i, c] * state.shared[SHARED_ROWS + c, 0]
+        drive[i] = min(max(asked, -limit), limit)
+        if drive[i] != asked:
+            flags = 1
+    return flags
+
+
+@kernel
+def polar_step(tables, state, sensed, position, wanted, drive, target):
+    """One sample of the whole controller: fills `drive` (channels,) and `target` (bands,), returns flags."""
+    if state.sample[0] % REFRESH == 0:
+        refresh(tables, state)
+    fits = hearing(tables, state.shared, 0, sensed)
+    flags, known = share(tables, state, 0, fits, position, wanted, recall(state))
+    remember(state, known)
+    plain = usual(tables, state, 1)
+    for t in range(state.band.shape[0]):
+        plain = plain and state.locked[t] == 0
+    if plain:
+        one, other = tiles_step(tables, state, target)
+    else:
+        for t in range(state.band.shape[0]):
+            tile_step(tables, state, t, 0, target)
+        gather(state)
+        last = min(tables.listen.shape[0] - 1, 1)
+        one, other = state.shared[SHARED_ROWS, 0], state.shared[SHARED_ROWS + last, 0]
+    state.sample[0] += 1
+    return flags | speak(tables, state, one, other, drive)
