@@ -83,6 +83,8 @@ def follow_friction(steady, kept, friction):
 
 def bound(scene: Scene, lesser: Scene) -> float:
     """Largest relative error (1) of the friction in a lesser model; see `hapticrender.fidelity.fidelity`."""
+    if lesser == scene:
+        return ACCURACY
     renderer = registered("renderers", scene.device)()
     full, less = (renderer.plant(each, 0) for each in (scene, lesser))
     model = renderer.band_model(scene, registered("drivers", "simulated")(full))
@@ -186,7 +188,7 @@ def _frictions(plant: Any, track: _Track, asked: Array) -> list[_Friction]:
 def _screen_friction(screen: ElectroadhesionScreen, track: _Track, asked: Array) -> Array:
     """Friction of an electroadhesion screen, but for that of the load, which no level changes."""
     p, root = screen.parameters, screen.compensation
-    if root is None:
+    if root is None or root.straight:
         raise NoBound("its drive is no attraction, so what the scene asks of it is not known")
     area = p.area(np.where(track.touched, track.finger[:, LOAD], 1.0))
     gain = p.unevenness * p.leakage / (4 * p.omega**2 * VACUUM * area)

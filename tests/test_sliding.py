@@ -134,7 +134,7 @@ def test_tribometer_noise_resolution_and_range():
     ("overrides", "message"),
     [
         ({"memory_length": 0.0}, r"plant.memory_length = 0.0: must be > 0 m"),
-        ({"friction_coefficient": -0.1}, r"plant.friction_coefficient = -0.1: must be >= 0"),
+        ({"friction_coefficient": -0.1}, r"plant.friction_coefficient = -0.1: must be > 0"),
         ({"tribometer_frequency": 6e3}, r"plant.tribometer_frequency = 6000.0: must be <= 5000 Hz"),
         ({"force_bits": 2.0}, r"plant.force_bits = 2.0: must be an integer"),
         ({"force_bits": 25}, r"plant.force_bits = 25: must be <= 24"),
