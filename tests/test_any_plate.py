@@ -1,0 +1,98 @@
+"""Plates other than the paper's: one coil, amplitudes that grow along the plate, and numbers that were identified."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import hapticrender as hr
+from hapticrender.plants.vibrotactile import Plate, PlateParameters
+
+SLIDE = hr.Finger.sliding(speed=0.08, normal_load=0.4, mechanics="light")
+A = 10e-6  # m
+QUIET = {"sensor_noise": 0.0, "current_bits": 0, "sensor_bits": 0}
+
+
+def rendered(frequency=72.0, gradient=0.0, finger=SLIDE, **plant):
+    texture = hr.Grating(frequency=frequency, amplitude=A)
+    return hr.render(hr.Scene(texture=texture, finger=finger, duration=2.5, gradient=gradient, plant=plant))
+
+
+def amplitudes(recording, frequency):
+    """Mean amplitude (m) at centre and ends over whole periods of the last second."""
+    n = int(recording.rate / frequency * int(frequency))
+    late = recording.motion[-n:]
+    turn = np.exp(-2j * np.pi * frequency * np.arange(n) / recording.rate)
+    return abs(2 * np.mean(late * turn[:, None], axis=0))
+
+
+@pytest.mark.parametrize("gradient", [-12.0, 5.0])
+@pytest.mark.parametrize("frequency", [40.0, 111.0])
+def test_an_amplitude_grows_along_the_plate(frequency, gradient):
+    """1 + gradient x at the middle and at the ends, 55 mm away; a slide is off by 1.5 % of the amplitude at most.
+
+    That is the accuracy suite's bound for the ends, of the amplitude in the middle; where little is wanted it is more.
+    """
+    recording = rendered(frequency, gradient)
+    wanted = A * (1.0 + gradient * np.array([0.0, -55e-3, 55e-3]))
+    np.testing.assert_allclose(amplitudes(recording, frequency), wanted, rtol=0, atol=0.015 * A)
+    assert recording.summary()["worst"]["value"] < 0.02 * A / wanted.min()  # rms, noise of the windows included
+    assert recording.header.profile == pytest.approx((wanted / A).tolist())
+
+
+def test_without_a_gradient_the_ends_are_like_the_middle():
+    """The naive side: a uniform plate misses such a target by the gradient times the reach."""
+    found = amplitudes(rendered(40.0), 40.0)
+    assert found[2] / (A * (1.0 + 5.0 * 55e-3)) - 1.0 == pytest.approx(1 / 1.275 - 1.0, abs=0.015)
+
+
+def test_one_coil_holds_the_middle_and_leaves_the_ends_to_the_finger():
+    """Heave alone is controlled; a finger off the middle tilts the plate, most near its rocking mode of 147 Hz."""
+    for frequency, within in ((40.0, 0.05), (143.0, None)):
+        recording = rendered(frequency, coils=1)
+        assert recording.drive.shape[1] == 1
+        found = amplitudes(recording, frequency) / A - 1.0
+        assert abs(found[0]) < 0.015
+        if within:
+            assert abs(found[1:]).max() < within
+        else:
+            assert abs(found[1:]).max() > 0.05
+
+
+def test_one_coil_in_the_middle_moves_the_plate_as_two_that_share_it():
+    """The same force at the middle, sample for sample."""
+    drive = 0.3 * np.random.default_rng(0).standard_normal((500, 1))
+    one = Plate(PlateParameters(coils=1, **QUIET), hr.Finger.absent()).run(drive)
+    two = Plate(PlateParameters(**QUIET), hr.Finger.absent()).run(np.repeat(0.5 * drive, 2, axis=1))
+    np.testing.assert_allclose(one.motion, two.motion, rtol=0, atol=1e-12 * abs(two.motion).max())
+
+
+@pytest.mark.parametrize(
+    ("gradient", "plant", "message"),
+    [
+        (2.0, {"coils": 1}, "gradient = 2 1/m: must be 0, a plate with one coil moves as a whole"),
+        (19.0, {}, "gradient = 19 1/m: must be <= 18.1818 1/m"),
+        (0.0, {"coils": 3}, "plant.coils = 3: must be <= 2"),
+    ],
+)
+def test_what_a_plate_cannot_do_is_refused(gradient, plant, message):
+    with pytest.raises(ValueError, match=message):
+        rendered(gradient=gradient, **plant)
+
+
+def test_a_plate_of_other_numbers_is_identified_and_then_held():
+    """Twice the glass on stiffer springs: what was found makes the scene's plant table, and the free plate holds."""
+    other = replace(PlateParameters(), mass=60e-3, inertia=8e-5, stiffness_1=50e3, stiffness_2=47e3, force_constant=9.0)
+    numbers = ("mass", "inertia", "stiffness_1", "stiffness_2", "damping_1", "damping_2")
+    from hapticrender.drivers.simulated import SimulatedDriver
+
+    believed = replace(other, **{name: 1.15 * getattr(other, name) for name in numbers})
+    with SimulatedDriver(Plate(other, hr.Finger.absent(), 3)) as driver:
+        found = hr.identify(driver, believed).parameters
+    for name in numbers[:4]:
+        assert getattr(found, name) == pytest.approx(getattr(other, name), rel=0.01)
+    plant = {name: getattr(found, name) for name in (*numbers, "force_constant")}
+    texture = hr.Grating(frequency=111.0, amplitude=A)
+    scene = hr.Scene(texture=texture, finger=SLIDE, duration=2.5, plant=plant)
+    recording = hr.render(scene, driver=SimulatedDriver(Plate(other, SLIDE, 5)))
+    assert abs(amplitudes(recording, 111.0) / A - 1.0).max() < 0.015
