@@ -55,12 +55,15 @@ def equal(one, other, columns=COLUMNS, rounding=0.0):
 @pytest.mark.parametrize("method", ["paper", "paper-common"])
 @pytest.mark.parametrize("scene", [SPATIAL, RECORDED, TONE], ids=["spatial", "recorded", "temporal"])
 def test_compiled_loop_equals_the_ring_of_blocks(scene, method):
-    """Sample for sample; the paper's blocks round their polynomials elsewhere, 5e-10 in all (test_polynomials)."""
+    """Sample for sample; the paper's blocks sum in another order, 1e-16 for each of 2000 samples.
+
+    Of constant targets they round the polynomials elsewhere as well, 5e-10 in all (test_polynomials).
+    """
     scene = dataclasses.replace(scene, duration=0.4)
     equal(
         hr.render(scene, method=method, seed=5),
         hr.render(scene, method=method, seed=5, driver=Blocks(simulated(scene, 5))),
-        rounding=6e-10 if scene.texture is TONE.texture else 0.0,
+        rounding=6e-10 if scene.texture is TONE.texture else 2e-13,
     )
 
 
