@@ -92,7 +92,7 @@ def wanted_residual(band, wanted):
 
 
 @kernel
-def residual_pass(tables, state, y, c):
+def residual_pass(tables, state, y, c, inner):
     """Residual of the observer and deviation from the command, as the limiter has scaled it, in coordinate c."""
     band, loop, level, past, shape = state.band, state.loop, state.level, state.past, tables.shape[c]
     base = c * row.LOOP_ROWS
@@ -106,20 +106,16 @@ def residual_pass(tables, state, y, c):
     dc = read(level, 0, c)
     observed, commanded = totals(y, observed, commanded)
     deviation = y - read(state.touch, row.SCALE) * commanded
-    for i in range(len(state.lags) - 1, 0, -1):
-        write(read(past, c, i - 1), past, c, i)
-    write(deviation, past, c, 0)
+    newer, force = deviation, 0.0 * deviation
+    for i in range(len(state.lags)):  # each value is read before its place is taken
+        older = read(past, c, i)
+        write(newer, past, c, i)
+        if i > 0:
+            force -= read(tables.taps, c, i) * newer
+        newer = older
+    write(inner * (force - read(tables.taps, c, 0) * deviation), state.residual, row.FORCE, c)
     write(y - observed - dc, state.residual, row.ERROR, c)
     write(deviation - dc, state.residual, row.DEVIATION, c)
-
-
-@kernel
-def inner_force(tables, state, inner, c):
-    """Force of the inner loop: its taps on the last deviations."""
-    force = 0.0 * inner
-    for i in range(len(state.lags)):
-        force -= inner * read(tables.taps, c, i) * read(state.past, c, i)
-    write(force, state.residual, row.FORCE, c)
 
 
 @kernel
@@ -352,8 +348,7 @@ def bank_advance(tables, state, sensed, position, wanted, drive, target):
     for c in range(coordinates):
         y, unbelieved = listen_pass(tables, sensed, c)
         doubt = high(doubt, unbelieved)
-        residual_pass(tables, state, y, c)
-        inner_force(tables, state, inner, c)
+        residual_pass(tables, state, y, c, inner)
         level_pass(numbers, state.level, read(state.residual, row.ERROR, c), c, quick)
         for t in range(tiles):
             observer_pass(tables, state, t, c, g, integral, back)

@@ -32,10 +32,10 @@ def closed_plate_run(
     Row n of `drive` is what the plate was handed for interval n, so it is computed from sample n - 1.
     """
     for n in range(sensed.shape[0]):
+        drive[n, 0], drive[n, 1] = last[0], last[1]
         plate_drive(tables, state, last)
         flags[n] = plate_sense(tables, state, noise[n], sensed[n], motion[n])
         plate_advance(tables, state, finger[n, 0], finger[n, 1], finger[n, 2])
-        drive[n, 0], drive[n, 1] = last[0], last[1]
         flags[n] |= control_step(control, control_state, sensed[n], finger[n, 0], wanted[n], last, target[n])
 
 
