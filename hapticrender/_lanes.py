@@ -10,6 +10,7 @@ Auto-vectorised loops reach C only for a few hundred bands; these files are the 
 
 from __future__ import annotations
 
+import math
 import operator
 from typing import Any
 
@@ -36,7 +37,7 @@ def padded(count: int, dtype: Any = float) -> int:
 def aligned(shape: tuple[int, ...], dtype: Any = float) -> Array:
     """Zeros on a cache line's boundary: unaligned vectors cost twice the time."""
     dtype = np.dtype(dtype)
-    size = int(np.prod(shape)) * dtype.itemsize
+    size = math.prod(shape) * dtype.itemsize
     room = np.zeros(size + ALIGNMENT, np.uint8)
     start = -room.ctypes.data % ALIGNMENT
     return room[start : start + size].view(dtype).reshape(shape)

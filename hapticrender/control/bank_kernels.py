@@ -31,7 +31,7 @@ from hapticrender.control.bank_finger import adapt_pass, feel, forget_finger, tr
 from hapticrender.control.kernels import DOUBT_TIME, FAR
 
 HUGE = 1e300  # stands for infinity, where fast arithmetic is not told of it
-ADAPTATION = 4  # samples between two adaptations of the finger
+ADAPTATION = 8  # samples between two adaptations of the finger
 
 
 @kernel

@@ -24,6 +24,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -33,7 +34,7 @@ from hapticrender.control.damping_margins import BendingMode
 from hapticrender.plants.base import TouchedPlant
 from hapticrender.plants.bounds import Validated, number
 from hapticrender.plants.closed import CLOSED
-from hapticrender.plants.kernels import plate_run
+from hapticrender.plants.kernels import PlateState, plate_run
 from hapticrender.plants.plate_tables import plate_state, plate_tables
 from hapticrender.protocols import Array, Controller, Sensed
 
@@ -289,8 +290,11 @@ class Plate(TouchedPlant):
         self.drive_channels, self.sensed_channels = parameters.coils, 2
         self._rng = np.random.default_rng(seed)
         self._tables = plate_tables(parameters, finger)
-        self._state = plate_state(parameters.delay - block)
         self._last = np.zeros(2)
+
+    @cached_property
+    def _state(self) -> PlateState:
+        return plate_state(self.delay - self.block)
 
     def _next(self, n: int) -> tuple[Array, Array, Array]:
         """Finger rows, noise and sample flags of the next n samples."""
