@@ -173,8 +173,8 @@ def detector_pass(numbers, state, t, c):
     put(loop, t, base + row.FAST_IM, fast_im)
     put(loop, t, base + row.SLOW_RE, slow_re)
     put(loop, t, base + row.SLOW_IM, slow_im)
-    fast = high(fast_re * fast_re + fast_im * fast_im - numbers.fast_level, 0.0)
-    return fast, high(slow_re * slow_re + slow_im * slow_im - numbers.slow_level, 0.0)
+    fast = high((fast_re * fast_re - numbers.fast_level) + fast_im * fast_im, 0.0)
+    return fast, high((slow_re * slow_re - numbers.slow_level) + slow_im * slow_im, 0.0)
 
 
 @kernel
@@ -236,21 +236,21 @@ def law_pass(tables, state):
     for c in range(coordinates):
         force = across = 0.0
         for t in range(band.shape[0]):
-            along_re = along_im = sloped_re = sloped_im = 0.0
+            re = im = 0.0
             for i in range(coordinates):
                 base, at = i * row.LOOP_ROWS, row.FIRST_LAW + row.LAW_ROWS * (c * coordinates + i)
-                v_re, v_im = lanes(loop, t, base + row.COMMAND_RE), lanes(loop, t, base + row.COMMAND_IM)
-                dv_re, dv_im = lanes(loop, t, base + row.SLOPED_RE), lanes(loop, t, base + row.SLOPED_IM)
-                d_re, d_im = lanes(law, t, at + row.LAW_RE), lanes(law, t, at + row.LAW_IM)
-                s_re, s_im = lanes(law, t, at + row.SLOPE_RE), lanes(law, t, at + row.SLOPE_IM)
-                along_re += d_re * v_re - d_im * v_im
-                along_im += d_re * v_im + d_im * v_re
-                sloped_re += s_re * dv_re - s_im * dv_im
-                sloped_im += s_re * dv_im + s_im * dv_re
+                for d, v in ((row.LAW_RE, row.COMMAND_RE), (row.SLOPE_RE, row.SLOPED_RE)):
+                    d_re, d_im = lanes(law, t, at + d), lanes(law, t, at + d + 1)
+                    v_re, v_im = lanes(loop, t, base + v), lanes(loop, t, base + v + 1)
+                    re += d_re * v_re  # term by term: each is one instruction
+                    re -= d_im * v_im
+                    im += d_re * v_im
+                    im += d_im * v_re
             cos, sin = lanes(band, t, row.COS), lanes(band, t, row.SIN)
-            re, im = along_re + sloped_re, along_im + sloped_im
-            force += re * cos - im * sin
-            across += re * sin + im * cos
+            force += re * cos
+            force -= im * sin
+            across += re * sin
+            across += im * cos
         along, quarter = totals(read(state.touch, row.TRUST), force, across)
         write(read(state.residual, row.FORCE, c) + along, state.residual, row.FORCE, c)
         write(quarter, state.residual, row.QUADRATURE, c)
