@@ -12,7 +12,7 @@ from hapticrender.control import bank_rows as row
 from hapticrender.control.bank import BankController, settled_share, spacing
 from hapticrender.control.bank_state import PRECISIONS, BankNumbers, BankTables, bank_state
 from hapticrender.control.block_kernels import block_run
-from hapticrender.control.block_state import CHANNEL_ROWS, EIGHT, PHASE_ROWS, TURN_SIN, TURNS, BlockState, BlockTables
+from hapticrender.control.block_state import CHANNEL_ROWS, EIGHT, PHASE_ROWS, SENT_ROWS, TURN_SIN, TURNS, BlockState, BlockTables
 from hapticrender.protocols import Array
 
 MOST_COORDINATES = 2
@@ -63,7 +63,9 @@ class BlockController:
         self.block = block
         self.note = f"{controller.note}\nin blocks of {block} samples, {precision} precision"
         self.tables = BlockTables(
-            bank=tables._replace(numbers=numbers_of_blocks(tables.numbers, block)), sample=tables.numbers
+            bank=tables._replace(numbers=numbers_of_blocks(tables.numbers, block)),
+            sample=tables.numbers,
+            back=slots_back(tables.numbers, block),
         )
         self.state = block_state(tables, block, PRECISIONS[precision])
 
@@ -152,6 +154,11 @@ def numbers_of_blocks(numbers: BankNumbers, block: int) -> BankNumbers:
     )
 
 
+def slots_back(numbers: BankNumbers, block: int) -> float:
+    """How many blocks ago the drive was commanded that acted in a block's middle."""
+    return max((numbers.lead * numbers.rate - 0.5) / block, 1.0) + 0.5
+
+
 def block_state(tables: BankTables, block: int, dtype: type) -> BlockState:
     """State of a bank in blocks, at rest."""
     bank = bank_state(tables, dtype)
@@ -169,6 +176,7 @@ def block_state(tables: BankTables, block: int, dtype: type) -> BlockState:
         phase=phase,
         table=aligned((tiles, max(2 * whole, TURN_SIN + 1), width), dtype),
         held=aligned((tiles, 2 * coordinates + CHANNEL_ROWS * (channels + channels % 2), width), dtype),
+        sent=aligned((tiles, SENT_ROWS * (int(slots_back(tables.numbers, block)) + 2) + 2, width), dtype),
         response=np.zeros(whole),
         inverse=np.zeros((2, 2 * whole)),
         error=np.zeros((coordinates + 1, whole)),

@@ -19,8 +19,9 @@ from hapticrender._lanes_memory import lanes, put, put_pairs
 from hapticrender._polynomials import unit, whole
 from hapticrender.control import bank_rows as row
 from hapticrender.control.bank_carriers import FORGET, derivative, grow_pass, law_tune, look_ahead, motion_pass
-from hapticrender.control.bank_finger import adapt_pass, feel, forget_finger, track_finger
+from hapticrender.control.bank_finger import feel, forget_finger, track_finger
 from hapticrender.control.bank_kernels import believe, wake
+from hapticrender.control.block_finger import adapt_block, begin, send_pass, smooth_pass
 from hapticrender.control.block_state import (
     CHANNEL_ROWS,
     COSINE,
@@ -34,6 +35,7 @@ from hapticrender.control.block_state import (
     PAIR_ROWS,
     PAIR_SIN,
     PAIRS,
+    SENT_ROWS,
     SINE,
     STEP_RE,
     TO_MIDDLE,
@@ -222,8 +224,6 @@ def update(tables, state, t, c, a, b, g, integral, back):
         steeper = shape * lanes(band, t, row.DR_RE + r)
         put(loop, t, base + row.COMMAND_RE + r, v + wanted + tables.sample.lead * steeper)
         put(loop, t, base + row.SLOPED_RE + r, slope + steeper)
-        slow = lanes(loop, t, base + row.L_RE + r)
-        put(loop, t, base + row.L_RE + r, slow + min(0.5 * g * block, 1.0) * (v - slow))
         fast = lanes(loop, t, base + row.FAST_RE + r)
         fast += numbers.fast_pole * (heard - fast)
         put(loop, t, base + row.FAST_RE + r, fast)
@@ -393,6 +393,7 @@ def block_step(tables, state, sensed, position, wanted, drive, target, flags):
     if changed:
         touch[row.FAST_TIME] = numbers.fast_time
         forget_finger(changed, touch, band, loop)
+        begin(state, coordinates)
         fast = 1.0
     doubt = take_in(tables, state, sensed, flags)
     for t in range(tiles):
@@ -425,12 +426,20 @@ def block_step(tables, state, sensed, position, wanted, drive, target, flags):
         lively = max(fast, slow)
         gain = numbers.adapt + lively * (numbers.adapt_awake - numbers.adapt)
         rest = numbers.rest + lively * (numbers.rest_awake - numbers.rest)
-        adapt_pass(tables.bank, bank, 1.0 / numbers.rate, 0.0, gain, rest, touching)
+        slots, slot = (state.sent.shape[1] - 2) // SENT_ROWS, bank.sample[0] - int(tables.back)
+        for t in range(tiles):
+            share, pole = tables.back - int(tables.back), 1.0 - (1.0 - 0.5 * g) ** block
+            smooth_pass(state, t, slot % slots, (slot - 1) % slots, share, pole, coordinates)
+        adapt_block(tables, state, gain, rest)
     know(tables, state, touching)
     state.stale[0] = 0
     peak = numbers.peak_decay * numbers.peak_decay * touch[row.PEAK]
     for t in range(tiles):
         command(tables, state, t)
+    if touching:
+        slots = (state.sent.shape[1] - 2) // SENT_ROWS
+        for t in range(tiles):
+            send_pass(tables, state, t, bank.sample[0] % slots)
     peak = max(peak, speak(tables, state, drive))
     touch[row.PEAK] = peak
     scale = 1.0 / root(peak) if peak > 1.0 else 1.0
