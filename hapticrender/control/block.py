@@ -176,7 +176,7 @@ def block_state(tables: BankTables, block: int, dtype: type) -> BlockState:
         phase=phase,
         table=aligned((tiles, max(2 * whole, TURN_SIN + 1), width), dtype),
         held=aligned((tiles, 2 * coordinates + CHANNEL_ROWS * (channels + channels % 2), width), dtype),
-        sent=aligned((tiles, SENT_ROWS * (int(slots_back(tables.numbers, block)) + 2) + 2, width), dtype),
+        sent=aligned((tiles, SENT_ROWS * (int(slots_back(tables.numbers, block)) + 2) + 3, width), dtype),
         response=np.zeros(whole),
         inverse=np.zeros((2, 2 * whole)),
         error=np.zeros((coordinates + 1, whole)),

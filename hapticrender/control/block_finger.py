@@ -21,7 +21,7 @@ from hapticrender.control.block_state import FORCE_IM, FORCE_RE, SENT_ROWS
 
 
 @kernel
-def smooth_pass(state, t, slot, before, share, pole, coordinates):
+def smooth_pass(tables, state, t, slot, before, share, pole, coordinates):
     """Integral parts and the finger's force of a tile, as they acted in this block and as the observer shows them."""
     sent, loop = state.sent, state.bank.loop
     first, second = slot * SENT_ROWS, before * SENT_ROWS
@@ -31,11 +31,14 @@ def smooth_pass(state, t, slot, before, share, pole, coordinates):
             at = c * row.LOOP_ROWS + row.L_RE + r
             slow = lanes(loop, t, at)
             put(loop, t, at, slow + pole * (acted - slow))
-    last = sent.shape[1] - 2
+    last = sent.shape[1] - 3
     for r in range(2):
         acted = (1.0 - share) * lanes(sent, t, first + FORCE_RE + r) + share * lanes(sent, t, second + FORCE_RE + r)
         slow = lanes(sent, t, last + r)
         put(sent, t, last + r, slow + pole * (acted - slow))
+    omega = lanes(state.bank.band, t, row.OMEGA) - 0.5 / tables.bank.numbers.rate * lanes(state.bank.band, t, row.SWEEP)
+    slow = lanes(sent, t, last + 2)
+    put(sent, t, last + 2, slow + pole * (omega - slow))
 
 
 @kernel
@@ -58,10 +61,11 @@ def send_pass(tables, state, t, slot):
 def begin(state, coordinates):
     """A touch: what was sent before knew of no finger."""
     sent, loop = state.sent, state.bank.loop
-    slots = (sent.shape[1] - 2) // SENT_ROWS
+    slots = (sent.shape[1] - 3) // SENT_ROWS
     for t in range(sent.shape[0]):
         for r in range(sent.shape[1]):
             put(sent, t, r, 0.0 * lanes(sent, t, r))
+        put(sent, t, sent.shape[1] - 1, lanes(state.bank.band, t, row.OMEGA))
         for c in range(coordinates):
             base = c * row.LOOP_ROWS
             for r in range(2):
@@ -80,9 +84,9 @@ def adapt_block(tables, state, gain, rest):
     step = 1.0 / numbers.rate
     stiff2, mass2 = numbers.typical_stiffness * numbers.typical_stiffness, numbers.typical_mass * numbers.typical_mass
     sum_k = sum_m = sum_b = weights = 0.0
-    last = sent.shape[1] - 2
+    last = sent.shape[1] - 3
     for t in range(band.shape[0]):
-        omega = lanes(band, t, row.OMEGA)
+        omega, sweep = lanes(sent, t, last + 2), lanes(band, t, row.SWEEP)
         felt_re = felt_im = away_re = away_im = 0.0 * omega
         for c in range(len(tables.bank.shape)):
             base, shape = c * row.LOOP_ROWS, tables.bank.shape[c]
@@ -96,7 +100,7 @@ def adapt_block(tables, state, gain, rest):
             da_im = numbers.rate * (a_im - lanes(loop, t, base + row.LAST_IM))
             put(loop, t, base + row.LAST_RE, a_re)
             put(loop, t, base + row.LAST_IM, a_im)
-            d_re, d_im = tables.bank.stiffness[0, c] - omega * omega * mass, omega * damping
+            d_re, d_im = tables.bank.stiffness[0, c] - omega * omega * mass, omega * damping + sweep * (mass + place * touch[row.MASS])
             drag, turn = damping + place * touch[row.DAMPING], 2.0 * omega * (mass + place * touch[row.MASS])
             away_re += d_re * a_re - d_im * a_im + drag * da_re - turn * da_im
             away_im += d_re * a_im + d_im * a_re + drag * da_im + turn * da_re

@@ -426,10 +426,10 @@ def block_step(tables, state, sensed, position, wanted, drive, target, flags):
         lively = max(fast, slow)
         gain = numbers.adapt + lively * (numbers.adapt_awake - numbers.adapt)
         rest = numbers.rest + lively * (numbers.rest_awake - numbers.rest)
-        slots, slot = (state.sent.shape[1] - 2) // SENT_ROWS, bank.sample[0] - int(tables.back)
+        slots, slot = (state.sent.shape[1] - 3) // SENT_ROWS, bank.sample[0] - int(tables.back)
         for t in range(tiles):
             share, pole = tables.back - int(tables.back), 1.0 - (1.0 - 0.5 * g) ** block
-            smooth_pass(state, t, slot % slots, (slot - 1) % slots, share, pole, coordinates)
+            smooth_pass(tables, state, t, slot % slots, (slot - 1) % slots, share, pole, coordinates)
         adapt_block(tables, state, gain, rest)
     know(tables, state, touching)
     state.stale[0] = 0
@@ -437,7 +437,7 @@ def block_step(tables, state, sensed, position, wanted, drive, target, flags):
     for t in range(tiles):
         command(tables, state, t)
     if touching:
-        slots = (state.sent.shape[1] - 2) // SENT_ROWS
+        slots = (state.sent.shape[1] - 3) // SENT_ROWS
         for t in range(tiles):
             send_pass(tables, state, t, bank.sample[0] % slots)
     peak = max(peak, speak(tables, state, drive))
