@@ -21,7 +21,7 @@ from hapticrender.control import bank_rows as row
 from hapticrender.control.bank_carriers import FORGET, derivative, grow_pass, law_tune, look_ahead, motion_pass
 from hapticrender.control.bank_finger import feel, forget_finger, track_finger
 from hapticrender.control.bank_kernels import believe, wake
-from hapticrender.control.block_finger import adapt_block, begin, send_pass, smooth_pass
+from hapticrender.control.block_finger import adapt_finger, begin_finger, send_finger, show_finger
 from hapticrender.control.block_state import (
     CHANNEL_ROWS,
     COSINE,
@@ -35,7 +35,6 @@ from hapticrender.control.block_state import (
     PAIR_ROWS,
     PAIR_SIN,
     PAIRS,
-    SENT_ROWS,
     SINE,
     STEP_RE,
     TO_MIDDLE,
@@ -393,7 +392,7 @@ def block_step(tables, state, sensed, position, wanted, drive, target, flags):
     if changed:
         touch[row.FAST_TIME] = numbers.fast_time
         forget_finger(changed, touch, band, loop)
-        begin(state, coordinates)
+        begin_finger(coordinates, state)
         fast = 1.0
     doubt = take_in(tables, state, sensed, flags)
     for t in range(tiles):
@@ -426,20 +425,17 @@ def block_step(tables, state, sensed, position, wanted, drive, target, flags):
         lively = max(fast, slow)
         gain = numbers.adapt + lively * (numbers.adapt_awake - numbers.adapt)
         rest = numbers.rest + lively * (numbers.rest_awake - numbers.rest)
-        slots, slot = (state.sent.shape[1] - 3) // SENT_ROWS, bank.sample[0] - int(tables.back)
+        pole = 1.0 - (1.0 - 0.5 * g) ** block
         for t in range(tiles):
-            share, pole = tables.back - int(tables.back), 1.0 - (1.0 - 0.5 * g) ** block
-            smooth_pass(tables, state, t, slot % slots, (slot - 1) % slots, share, pole, coordinates)
-        adapt_block(tables, state, gain, rest)
+            show_finger(tables, state, t, pole)
+        adapt_finger(tables, state, gain, rest)
     know(tables, state, touching)
     state.stale[0] = 0
     peak = numbers.peak_decay * numbers.peak_decay * touch[row.PEAK]
     for t in range(tiles):
         command(tables, state, t)
-    if touching:
-        slots = (state.sent.shape[1] - 3) // SENT_ROWS
-        for t in range(tiles):
-            send_pass(tables, state, t, bank.sample[0] % slots)
+        if touching:
+            send_finger(tables, state, t)
     peak = max(peak, speak(tables, state, drive))
     touch[row.PEAK] = peak
     scale = 1.0 / root(peak) if peak > 1.0 else 1.0
