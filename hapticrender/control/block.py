@@ -53,7 +53,8 @@ class BlockController:
     Notes
     -----
     No inner loop: it needs an answer within a sample or few.  The observer is the per-sample one to rounding;
-    adaptation, detectors and law act once a block, and the drive runs linearly between them.
+    adaptation, detectors and law act once a block, and the drive runs linearly between them.  The finger is learnt from
+    the force that acted (`block_finger`), awake at `LEARNING` whatever the delay.
     """
 
     def __init__(self, controller: BankController, block: int, precision: str = "double") -> None:
