@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import hapticrender as hr
-from hapticrender.accuracy import AMPLITUDE, SLIDING, rms, tones
+from hapticrender.accuracy import AMPLITUDE, SLIDING, pressing, rms, tones
 from hapticrender.bands import Bands
 from hapticrender.control import bank_rows as row
 from hapticrender.control.bank_state import across_bands
@@ -16,7 +16,7 @@ from hapticrender.drivers.simulated import SimulatedDriver
 from hapticrender.judge import fit
 from hapticrender.plants.vibrotactile import Plate, PlateParameters
 from hapticrender.protocols import Flag
-from hapticrender.touch.mechanics import HEAVY
+from hapticrender.touch.mechanics import HEAVY, HEAVY_SECOND
 from hapticrender.touch.motion import Sampled
 
 IDEAL = PlateParameters(sensor_noise=0.0, sensor_bits=0, current_bits=0)
@@ -117,16 +117,39 @@ def test_a_sliding_heavy_finger(device, frequency):
     assert rms(abs(found[time > 2.0, 0, 0]) / AMPLITUDE - 1.0) < 0.006
 
 
-@pytest.mark.parametrize(("device", "bound"), [(CARD, -44.0), ((48000.0, 32), -44.0), ((5000.0, 10), -44.0)])
-def test_a_comb_under_a_sliding_finger(device, bound):
-    """Issue's bound without noise; a block of 5 ms leaves -40.6 dB."""
+@pytest.mark.parametrize("device", DEVICES)
+def test_a_comb_under_a_sliding_finger(device):
+    """Issue's bound without noise."""
     bands = comb()
-    assert comb_error(*in_blocks(bands, *device), bands) < bound
+    assert comb_error(*in_blocks(bands, *device), bands) < -44.0
 
 
-def test_blocks_of_5_ms_cost_the_comb_some_decibels():
+@pytest.mark.parametrize("device", [CARD, EMBEDDED])
+def test_a_comb_under_a_sliding_finger_with_noise(device):
+    """The same bound holds with 1 um of sensor noise and 14 and 12 bits."""
     bands = comb()
-    assert -44.0 < comb_error(*in_blocks(bands, *EMBEDDED), bands) < -39.0
+    assert comb_error(*in_blocks(bands, *device, plate=PlateParameters()), bands) < -44.0
+
+
+def test_a_delay_does_not_make_learning_swing():
+    """A finger of 4 g pressed on at once, its mass learnt under a comb, 5 and 20 ms of delay.
+
+    What is learnt is told from the force that acted, so it comes near from one side alone, and in the same time.  A
+    force at the numbers of the moment swings to 6 g at either delay.
+    """
+    learnt = []
+    for delay in (25, 100):
+        controller, parameters = in_blocks(comb(), *EMBEDDED, delay=delay)
+        plate = Plate(parameters, pressing(HEAVY_SECOND, 0.8, 15e-3), 0, block=25)
+        drive, mass = np.zeros((25, 2)), []
+        for _ in range(260):  # 1.3 s, of which 0.3 s of touch
+            sensed = plate.run(drive)
+            drive, _, _ = controller.run(sensed.sensed, sensed.position, np.zeros(25))
+            mass.append(controller.state.bank.touch[row.MASS])
+        assert max(mass) < HEAVY_SECOND.mass
+        assert mass[-1] > 0.8 * HEAVY_SECOND.mass
+        learnt.append(mass[-1])
+    assert learnt[1] == pytest.approx(learnt[0], rel=0.02)
 
 
 @pytest.mark.parametrize("block", [5, 25])
@@ -148,7 +171,7 @@ def test_without_the_solve_the_comb_breaks(block):
     assert errors[1] > {5: -30.0, 25: -12.0}[block]
 
 
-@pytest.mark.parametrize("device", [CARD, (48000.0, 32), (5000.0, 10)])
+@pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize(("sweep", "bound"), [(200.0, 0.006), (400.0, 0.013), (800.0, 0.025)])
 def test_chirps(device, sweep, bound):
     """Issue's bounds; the carrier follows a finger that crosses a micrometre a turn."""

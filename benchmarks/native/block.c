@@ -160,7 +160,6 @@ void NAME(v *bands, v *loops, v *laws, v *helds, v8 *phases, const v *tables, co
                     own[R_E_RE + r] = e, own[R_V_RE + r] = x;
                     own[R_COMMAND_RE + r] = x + wanted + (real)n->lead * steeper;
                     own[R_SLOPED_RE + r] = slope + steeper;
-                    own[R_L_RE + r] += (real)MIN(0.5 * n->g * block, 1) * (x - own[R_L_RE + r]);
                     own[R_FAST_RE + r] += (real)n->fast_pole * (heard - own[R_FAST_RE + r]);
                     own[R_SLOW_RE + r] += (real)n->slow_pole * (heard - own[R_SLOW_RE + r]);
                     fast2 += own[R_FAST_RE + r] * own[R_FAST_RE + r], slow2 += own[R_SLOW_RE + r] * own[R_SLOW_RE + r];

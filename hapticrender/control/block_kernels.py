@@ -19,8 +19,9 @@ from hapticrender._lanes_memory import lanes, put, put_pairs
 from hapticrender._polynomials import unit, whole
 from hapticrender.control import bank_rows as row
 from hapticrender.control.bank_carriers import FORGET, derivative, grow_pass, law_tune, look_ahead, motion_pass
-from hapticrender.control.bank_finger import adapt_pass, feel, forget_finger, track_finger
+from hapticrender.control.bank_finger import feel, forget_finger, track_finger
 from hapticrender.control.bank_kernels import believe, wake
+from hapticrender.control.block_finger import adapt_finger, begin_finger, send_finger, show_finger
 from hapticrender.control.block_state import (
     CHANNEL_ROWS,
     COSINE,
@@ -222,8 +223,6 @@ def update(tables, state, t, c, a, b, g, integral, back):
         steeper = shape * lanes(band, t, row.DR_RE + r)
         put(loop, t, base + row.COMMAND_RE + r, v + wanted + tables.sample.lead * steeper)
         put(loop, t, base + row.SLOPED_RE + r, slope + steeper)
-        slow = lanes(loop, t, base + row.L_RE + r)
-        put(loop, t, base + row.L_RE + r, slow + min(0.5 * g * block, 1.0) * (v - slow))
         fast = lanes(loop, t, base + row.FAST_RE + r)
         fast += numbers.fast_pole * (heard - fast)
         put(loop, t, base + row.FAST_RE + r, fast)
@@ -393,6 +392,7 @@ def block_step(tables, state, sensed, position, wanted, drive, target, flags):
     if changed:
         touch[row.FAST_TIME] = numbers.fast_time
         forget_finger(changed, touch, band, loop)
+        begin_finger(coordinates, state)
         fast = 1.0
     doubt = take_in(tables, state, sensed, flags)
     for t in range(tiles):
@@ -425,12 +425,17 @@ def block_step(tables, state, sensed, position, wanted, drive, target, flags):
         lively = max(fast, slow)
         gain = numbers.adapt + lively * (numbers.adapt_awake - numbers.adapt)
         rest = numbers.rest + lively * (numbers.rest_awake - numbers.rest)
-        adapt_pass(tables.bank, bank, 1.0 / numbers.rate, 0.0, gain, rest, touching)
+        pole = 1.0 - (1.0 - 0.5 * g) ** block
+        for t in range(tiles):
+            show_finger(tables, state, t, pole)
+        adapt_finger(tables, state, gain, rest)
     know(tables, state, touching)
     state.stale[0] = 0
     peak = numbers.peak_decay * numbers.peak_decay * touch[row.PEAK]
     for t in range(tiles):
         command(tables, state, t)
+        if touching:
+            send_finger(tables, state, t)
     peak = max(peak, speak(tables, state, drive))
     touch[row.PEAK] = peak
     scale = 1.0 / root(peak) if peak > 1.0 else 1.0
