@@ -99,7 +99,7 @@ class NaiveBank:
         self.wake((abs(self.fast) ** 2 > p.fast_level).any(), (abs(self.slow) ** 2 > p.slow_level).any())
 
         self.samples += 1
-        if self.contact and p.adapt >= 0 and self.samples % 4 == 0:
+        if self.contact and p.adapt >= 0 and self.samples % 8 == 0:
             lively = max(fast, slow)
             self.adapt(R, inner, move(p.adapt, p.adapt_awake, lively), move(p.rest, p.rest_awake, lively))
         self.know()
@@ -202,7 +202,7 @@ class NaiveBank:
 
     def know(self):
         """The law looks at the finger's place in turn with the adaptation, and at a touch."""
-        due = self.samples % 4 == 0 or self.contact != self.knew_contact
+        due = self.samples % 8 == 0 or self.contact != self.knew_contact
         self.knew_contact = self.contact
         if due:
             self.known_lever = self.lever()
@@ -228,7 +228,7 @@ class NaiveBank:
 
     def adapt(self, R, inner, mu, mu_rest):
         """F: three numbers pooled over bands, weights |y_p|^2/|D|^2, and one stiffness a band."""
-        step = 4 / self.p.rate
+        step = 8 / self.p.rate
         apart, before = self.E - self.v_slow, self.apart
         self.apart = apart
         h = self.lever()
