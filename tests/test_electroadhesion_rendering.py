@@ -170,7 +170,10 @@ def test_a_driver_with_other_channels_is_refused():
 @pytest.mark.parametrize("device", ["electroadhesion", "ultrasonic"])
 @pytest.mark.parametrize("lifted", [False, True])
 def test_a_finger_that_rests_or_is_away_winds_nothing_up(device, lifted):
-    """Slides, rests (or is lifted) for 1.2 s, slides on: nothing saturates, and 0.2 s later the texture is back."""
+    """Slides, rests (or is lifted) for 1.2 s, slides on: nothing saturates.
+
+    0.2 s later the texture is back, within 1 % as the accuracy suite has it.
+    """
     time = np.arange(0.0, 3.2, 1e-3)
     way = np.cumsum(np.where((time < 1.2) | (time > 2.4), 0.08, 0.0)) * 1e-3
     position = abs(way % 0.1 - 0.05) - 0.025
