@@ -54,7 +54,7 @@ def test_the_envelope_of_the_file_is_the_wanted_current(tmp_path):
 def test_the_attraction_of_the_file_is_the_wanted_force(tmp_path):
     """Mean of g I(t)^2 cos^2 over whole turns of the carrier: bias/2 + half of 100 Hz, without harmonics.
 
-    To the rounding of the sums.  A sample of the drive is held for some of the file's: sinc(f/rate)/sinc(f/file's rate).
+    To the rounding of the sums.  A sample of the drive is held for 16 of the file: sinc(f/rate)/sinc(f/file's rate).
     """
     recording, scene, file = played(tmp_path)
     root = ElectroadhesionRenderer().compensation(scene)
