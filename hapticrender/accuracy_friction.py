@@ -4,16 +4,18 @@ Errors are of the friction that a finger feels (N), not of what is sensed, on th
 of 0.4 N that slides at 80 mm/s, unless a case says otherwise.  Those of amplitude are of the ultrasonic mode itself
 (m), at level "carrier"; its loop is that of the device, whatever method makes the friction.
 
-Where a bound is not given by the device's own goals it follows from others:
+Bounds that the device's own goals give: area 3 %, second harmonic 0.1 %, amplitude's response 2.5 ms [Giraud 2013,
+FACTS section 6], AM at 400 Hz 1 dB, amplitude in heat and touch 2 %, unlocked 20 ms, skin velocity 5 %.  The others
+follow from these:
 
 * tones and reversals, 1 %: a tenth of the 10 % that lie below every just noticeable difference (FACTS section 7).
 * comb, -33 dB: if the whole error fell on one of the 20 bands, that one would be off by 10 %, 10 %/sqrt(20) of all.
 * swipes, 2.5 %: the plate's bound for a chirp of 1600 Hz/s; 3 Hz and +-50 mm/s over 0.5 mm sweep up to 1885 Hz/s.
 * touch of an ultrasonic plate, back within 8 ms: the time constant of its 20 Hz lock, 1/(2 pi 20 Hz).
 
-Aims that the goals do not give: what a tone may be off, 1 %, of area, gap and skin velocity; half of the bound of
-tones, reversals, harmonic, modulation and comb; the plate's aim for swipes; 2.5 ms, the amplitude's response, for being
-back, and twice that for being locked.
+Aims that the goals do not give: half of the bound (6 dB of the comb), but of area and skin velocity what a tone may be
+off, 1 %; of swipes the plate's aim for that chirp; of a touch the response of the amplitude, 2.5 ms, for being back,
+and twice that for being locked.
 """
 
 from __future__ import annotations
@@ -252,7 +254,7 @@ def _shared(device: str) -> tuple[Target, ...]:
     """Targets that both friction devices have."""
     return (
         Target(f"{device}: tones", "error", "friction tones, 20-400 Hz, three fingers, rms", "%", 100, 1.0, 0.5),
-        Target(f"{device}: comb", "error", "20 bands, 20-400 Hz, amplitudes", "dB", 1, -33.0, -40.0),
+        Target(f"{device}: comb", "error", "20 bands, 20-400 Hz, amplitudes", "dB", 1, -33.0, -39.0),
         Target(f"{device}: swipe", "swipe", "ridges under swipes of 3 Hz, rms where judged", "%", 100, 2.5, 1.1),
         Target(f"{device}: swipe", "fro", "ridges under a finger that goes to and fro", "%", 100, 1.0, 0.5),
     )
@@ -263,7 +265,7 @@ TARGETS = (
     Target(f"{SCREEN}: harmonic", "second", "second harmonic of friction, with the square root", "%", 100, 0.1, 0.05),
     *_shared(SCREEN),
     *_shared(PLATE),
-    Target(f"{PLATE}: step", "response", "amplitude's response to 5 % (no method's doing)", "ms", 1e3, 2.5, 1.5),
+    Target(f"{PLATE}: step", "response", "amplitude's response to 5 % (no method's doing)", "ms", 1e3, 2.5, 1.25),
     Target(f"{PLATE}: modulation", "gain", "AM at 400 Hz, off by (no method's doing)", "dB", 1, 1.0, 0.5),
     Target(f"{PLATE}: heat", "error", "amplitude while warming by 10 K (no method's doing)", "%", 100, 2.0, 1.0),
     Target(f"{PLATE}: touch", "unlocked", "unlocked after a touch or lift (no method's doing)", "ms", 1e3, 20.0, 5.0),

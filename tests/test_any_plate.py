@@ -9,7 +9,7 @@ import hapticrender as hr
 from hapticrender.plants.vibrotactile import Plate, PlateParameters
 
 SLIDE = hr.Finger.sliding(speed=0.08, normal_load=0.4, mechanics="light")
-A = 10e-6  # m
+A = 50e-6  # m: that of the accuracy suite, 50 times the noise of a sensor
 QUIET = {"sensor_noise": 0.0, "current_bits": 0, "sensor_bits": 0}
 
 
@@ -26,37 +26,45 @@ def amplitudes(recording, frequency):
     return abs(2 * np.mean(late * turn[:, None], axis=0))
 
 
-@pytest.mark.parametrize("gradient", [-12.0, 5.0])
-@pytest.mark.parametrize("frequency", [40.0, 111.0])
-def test_an_amplitude_grows_along_the_plate(frequency, gradient):
-    """1 + gradient x at the middle and at the ends, 55 mm away; a slide is off by 1.5 % of the amplitude at most.
+CENTRE, ENDS = 0.004, 0.015  # of A, rms: what the accuracy suite asks of a slide
 
-    That is the accuracy suite's bound for the ends, of the amplitude in the middle; where little is wanted it is more.
+
+@pytest.mark.parametrize("gradient", [-12.0, 5.0])
+@pytest.mark.parametrize("frequency", [40.0, 111.0, 150.0])
+def test_an_amplitude_grows_along_the_plate(frequency, gradient):
+    """1 + gradient x at the middle and at the ends, 55 mm away, near the rocking mode of 147 Hz as well.
+
+    Noise leaves as many m whatever is wanted, so bounds are of A and not of what little is wanted at the weak end.
     """
     recording = rendered(frequency, gradient)
     wanted = A * (1.0 + gradient * np.array([0.0, -55e-3, 55e-3]))
-    np.testing.assert_allclose(amplitudes(recording, frequency), wanted, rtol=0, atol=0.015 * A)
-    assert recording.summary()["worst"]["value"] < 0.02 * A / wanted.min()  # rms, noise of the windows included
+    (band,) = recording.summary()["bands"]
+    left = wanted * [band[f"rms_error_{place}"] for place in ("centre", "end_1", "end_2")]
+    assert (left < A * np.array([CENTRE, ENDS, ENDS])).all()
+    assert (abs(amplitudes(recording, frequency) - wanted) < A * np.array([CENTRE, ENDS, ENDS])).all()
     assert recording.header.profile == pytest.approx((wanted / A).tolist())
 
 
 def test_without_a_gradient_the_ends_are_like_the_middle():
     """The naive side: a uniform plate misses such a target by the gradient times the reach."""
     found = amplitudes(rendered(40.0), 40.0)
-    assert found[2] / (A * (1.0 + 5.0 * 55e-3)) - 1.0 == pytest.approx(1 / 1.275 - 1.0, abs=0.015)
+    assert found[2] / (A * (1.0 + 5.0 * 55e-3)) - 1.0 == pytest.approx(1 / 1.275 - 1.0, abs=ENDS)
 
 
-def test_one_coil_holds_the_middle_and_leaves_the_ends_to_the_finger():
-    """Heave alone is controlled; a finger off the middle tilts the plate, most near its rocking mode of 147 Hz."""
-    for frequency, within in ((40.0, 0.05), (143.0, None)):
-        recording = rendered(frequency, coils=1)
-        assert recording.drive.shape[1] == 1
-        found = amplitudes(recording, frequency) / A - 1.0
-        assert abs(found[0]) < 0.015
-        if within:
-            assert abs(found[1:]).max() < within
-        else:
-            assert abs(found[1:]).max() > 0.05
+@pytest.mark.parametrize("frequency", [40.0, 143.0])
+def test_one_coil_holds_the_middle_and_leaves_the_ends_to_the_finger(frequency):
+    """Heave alone is controlled; a finger off the middle tilts the plate, most near its rocking mode of 147 Hz.
+
+    The second row of D q = F [1, 0] has no force: q_1 = -D_10/D_11 q_0.
+    """
+    place, plate = 15e-3, PlateParameters()
+    finger = hr.Finger.still(position=place, normal_load=0.4, mechanics="light")
+    stiffness = plate.dynamic_stiffness(frequency, finger.mechanics.impedance(frequency), place)
+    heave_and_rocking = np.array([1.0, -stiffness[1, 0] / stiffness[1, 1]])
+    expected = abs(plate.band_model(plate.rate, plate.delay).place_from_coordinate @ heave_and_rocking)
+    recording = rendered(frequency, finger=finger, coils=1)
+    assert recording.drive.shape[1] == 1
+    np.testing.assert_allclose(amplitudes(recording, frequency) / A, expected, rtol=0, atol=CENTRE)
 
 
 def test_one_coil_in_the_middle_moves_the_plate_as_two_that_share_it():
@@ -90,9 +98,9 @@ def test_a_plate_of_other_numbers_is_identified_and_then_held():
     with SimulatedDriver(Plate(other, hr.Finger.absent(), 3)) as driver:
         found = hr.identify(driver, believed).parameters
     for name in numbers[:4]:
-        assert getattr(found, name) == pytest.approx(getattr(other, name), rel=0.01)
+        assert getattr(found, name) == pytest.approx(getattr(other, name), rel=0.003)  # as the accuracy suite asks
     plant = {name: getattr(found, name) for name in (*numbers, "force_constant")}
     texture = hr.Grating(frequency=111.0, amplitude=A)
     scene = hr.Scene(texture=texture, finger=SLIDE, duration=2.5, plant=plant)
     recording = hr.render(scene, driver=SimulatedDriver(Plate(other, SLIDE, 5)))
-    assert abs(amplitudes(recording, 111.0) / A - 1.0).max() < 0.015
+    assert abs(amplitudes(recording, 111.0) / A - 1.0).max() < ENDS

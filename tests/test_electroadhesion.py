@@ -28,6 +28,7 @@ ROOT = SquareRoot(bias=0.45, floor=0.02, gain=2.2e4)
 ONE_CM2 = 1.0 / 0.72  # area_scale for 1 cm2 at 1 N
 LEVELS = pytest.mark.parametrize("level", ["envelope", "carrier"])
 MU = 0.8
+SUMMED = 2 * RATE * np.finfo(float).eps  # of up to 2 s of samples, a rounding each
 STRONG = {"force_noise": 0.0, "voltage_limit": 1e4}
 
 
@@ -58,7 +59,8 @@ def test_current_drive_does_not_feel_the_gap_and_voltage_drive_does(level):
     np.testing.assert_allclose(volts, [4.5, 2.1, 0.77, 0.40], atol=0.05)
     assert volts[0] / volts[-1] == pytest.approx(11, abs=0.5)
     amperes = [attraction(6e-3, gap_resistance=1e4, gap_thickness=d, **common) for d in gaps]
-    np.testing.assert_allclose(amperes, amperes[0], rtol=1e-6)  # leakage: 1/(w tau)^2 is 1e-7 at 3 um
+    leaks = 1.0 - ElectroadhesionParameters(gap_resistance=1e4, gap_thickness=gaps[-1]).leakage  # the most of any
+    np.testing.assert_allclose(amperes, amperes[0], rtol=leaks + SUMMED)
 
 
 def test_force_falls_with_area_and_leakage():
@@ -104,7 +106,7 @@ def twin(parameters, envelope, load):
 
 @pytest.mark.parametrize("leak", [DRY, NORMAL, MOIST])
 def test_the_circuit_is_integrated_exactly(leak, rng):
-    """Against a twin with 1e-9 a step of some hundred; friction is undone by its own lag."""
+    """Against a twin with 1e-9 of charge a step of some hundred, twice that of force; friction's lag is undone."""
     envelope = 6e-3 * rng.random(30)
     p = ElectroadhesionParameters(
         level="carrier", gap_resistance=leak, current_offset=5e-6, servo_conductance=0.0, unevenness=1.3, **STRONG
@@ -112,7 +114,7 @@ def test_the_circuit_is_integrated_exactly(leak, rng):
     played = ElectroadhesionScreen(p, SLIDE).run(np.r_[envelope, 0.0][:, None])
     kept = np.exp(-0.05 / (RATE * p.memory_length))
     steady = (played.motion[1:, 0] - kept * played.motion[:-1, 0]) / (1 - kept)
-    np.testing.assert_allclose(steady / MU - 1.0, twin(p, envelope, 1.0), rtol=1e-6, atol=1e-7)
+    np.testing.assert_allclose(steady / MU - 1.0, twin(p, envelope, 1.0), rtol=2e-7, atol=SUMMED)
 
 
 @pytest.mark.parametrize("leak", [DRY, NORMAL, MOIST])
@@ -137,14 +139,14 @@ def harmonics(compensation, drive):
 
 
 def test_square_root_takes_the_second_harmonic_away():
-    """(1 + sin)^2 holds 2 sin - cos(2)/2: 25 %; with the root only rounding is left."""
+    """(1 + sin)^2 holds 2 sin - cos(2)/2: 25 %; with the root only rounding is left, where FACTS ask for 0.1 %."""
     wave = np.sin(2 * np.pi * 50 * np.arange(12_000) / RATE)
     first, second = harmonics(None, 3e-3 * (1 + wave))
-    assert second / first == pytest.approx(0.25, rel=1e-6)
+    assert second / first == pytest.approx(0.25, rel=SUMMED)
     first, second = harmonics(ROOT, 0.43 * wave)
-    assert second < 1e-10 * first  # FACTS asks for 0.1 %
+    assert second < SUMMED * first
     ratio = ElectroadhesionParameters().gain(1.0) / ROOT.gain
-    assert first == pytest.approx(MU * 0.43 * ratio * np.sinc(50 / RATE), rel=1e-4)  # the hold, whose images are left
+    assert first == pytest.approx(MU * 0.43 * ratio, rel=SUMMED)
 
 
 def test_the_floor_holds_and_the_square_root_is_its_kernel():
@@ -153,7 +155,7 @@ def test_the_floor_holds_and_the_square_root_is_its_kernel():
     np.testing.assert_allclose(attracted, [0.02, 0.02, 0.45, 0.95], rtol=1e-14)
     for value, expected in zip(drive, ROOT(drive), strict=True):
         assert attraction(float(value), compensation=ROOT) == pytest.approx(
-            ElectroadhesionParameters().gain(1.0) * expected**2, rel=1e-9
+            ElectroadhesionParameters().gain(1.0) * expected**2, rel=SUMMED
         )
 
 
@@ -212,7 +214,7 @@ def test_a_cut_drive_is_flagged(level):
     for share, told in ((0.8, 0), (1.2, hr.Flag.SATURATED)):  # the start swings by some per cent more
         assert screen(level=level, voltage_limit=100.0).run(np.full((2000, 1), share * edge)).flags.max() == told
     cut = screen(level="envelope", voltage_limit=60.0, force_noise=0.0).run(np.full((2000, 1), 6e-3))
-    assert cut.motion[-1, 0] / MU - 1 == pytest.approx(p.gain(1.0) * (60.0 / abs(p.impedance(1.0))) ** 2, rel=1e-9)
+    assert cut.motion[-1, 0] / MU - 1 == pytest.approx(p.gain(1.0) * (60.0 / abs(p.impedance(1.0))) ** 2, rel=SUMMED)
 
 
 @LEVELS
@@ -222,7 +224,7 @@ def test_a_resting_finger_shorts_its_gap_and_a_lifted_one_has_no_friction(level)
     s = screen(path, level=level, force_noise=0.0)
     friction = s.run(np.r_[np.full(4000, 6e-3), np.full(4000, 1e-3)][:, None]).motion[:, 0]
     strong = MU * (1 + s.parameters.attraction(6e-3, 1.0))
-    np.testing.assert_allclose(friction[[3999, 5999]], strong, rtol=1e-6)
+    np.testing.assert_allclose(friction[[3999, 5999]], strong, rtol=SUMMED)
     assert not friction[6001:].any()
     assert not s._state.charge.any()
 
@@ -252,7 +254,7 @@ def test_tribometer_response_is_the_predicted_one(speed):
     sensed = s.run(0.3 * carrier.real[:, None]).sensed[:, 0]
     gain = 2 * np.mean((sensed * carrier.conj())[RATE // 2 :]) / 0.3
     loop = s.parameters.gain(1.0) / ROOT.gain
-    assert gain == pytest.approx(loop * s.parameters.sensed_response(100.0, speed), rel=1e-6)
+    assert gain == pytest.approx(loop * s.parameters.sensed_response(100.0, speed), rel=SUMMED)
 
 
 def test_skin_follows_friction_by_its_mechanics():
@@ -262,7 +264,7 @@ def test_skin_follows_friction_by_its_mechanics():
     carrier = np.exp(2j * np.pi * 100 * np.arange(RATE) / RATE)
     friction = s.run(0.3 * carrier.real[:, None]).motion[:, 0]
     lines = [2 * np.mean((x * carrier.conj())[RATE // 2 :]) for x in (s.skin_velocity, friction)]
-    assert lines[0] / lines[1] == pytest.approx(s.parameters.skin_response(100.0, LIGHT) / 2, rel=1e-5)
+    assert lines[0] / lines[1] == pytest.approx(s.parameters.skin_response(100.0, LIGHT) / 2, rel=SUMMED)
 
 
 def test_speed_is_that_of_the_way_ahead_and_a_touch_knows_no_other():
@@ -290,7 +292,7 @@ def test_a_run_equals_its_pieces_and_noise_its_seed(level, rng):
 @pytest.mark.parametrize("junk", [np.nan, np.inf, -np.inf, 1e308])
 def test_junk_drive_is_silence(level, junk):
     played = screen(level=level, force_noise=0.0).run(np.full((500, 1), junk))
-    assert played.motion[-1, 0] == pytest.approx(MU, rel=1e-6)
+    assert played.motion[-1, 0] == pytest.approx(MU, rel=SUMMED)
     assert np.isfinite(played.sensed).all()
 
 
@@ -367,7 +369,7 @@ def test_a_square_root_of_a_voltage_has_its_gain_in_newtons_per_square_volt(leve
     """As the nominal finger makes the wanted attraction; carrier and envelope agree to the gap's own memory."""
     nominal = ElectroadhesionParameters(drive_kind="voltage")
     root = SquareRoot(bias=0.3, floor=0.01, gain=float(nominal.attraction(1.0, 1.0)))
-    assert attraction(0.1, compensation=root, drive_kind="voltage", level=level) == pytest.approx(0.4, rel=1e-6)
+    assert attraction(0.1, compensation=root, drive_kind="voltage", level=level) == pytest.approx(0.4, rel=SUMMED)
 
 
 def test_the_straight_envelope_has_the_same_peak_and_slope():
@@ -379,7 +381,7 @@ def test_the_straight_envelope_has_the_same_peak_and_slope():
     assert straight(0.45) == pytest.approx(ROOT(0.45), rel=1e-14)
     for value, expected in zip(drive, straight(drive), strict=True):
         assert attraction(float(value), compensation=straight) == pytest.approx(
-            ElectroadhesionParameters().gain(1.0) * expected**2, rel=1e-9
+            ElectroadhesionParameters().gain(1.0) * expected**2, rel=SUMMED
         )
 
 

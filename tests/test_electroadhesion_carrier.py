@@ -52,16 +52,20 @@ def test_the_envelope_of_the_file_is_the_wanted_current(tmp_path):
 
 
 def test_the_attraction_of_the_file_is_the_wanted_force(tmp_path):
-    """Mean of g I(t)^2 cos^2 over whole turns of the carrier: bias/2 + half of 100 Hz, without harmonics."""
+    """Mean of g I(t)^2 cos^2 over whole turns of the carrier: bias/2 + half of 100 Hz, without harmonics.
+
+    To the rounding of the sums.  A sample of the drive is held for 16 of the file: sinc(f/rate)/sinc(f/file's rate).
+    """
     recording, scene, file = played(tmp_path)
     root = ElectroadhesionRenderer().compensation(scene)
     force = 2 * root.gain * file[FAST // 5 :][: FAST // 5] ** 2  # 0.2 s from 0.2 s on
-    line = 2 * np.fft.rfft(force) / len(force)
-    assert abs(line[0]) / 2 == pytest.approx(root.bias, rel=1e-3)
+    line, summed = 2 * np.fft.rfft(force) / len(force), len(force) * np.finfo(float).eps
+    assert abs(line[0]) / 2 == pytest.approx(root.bias, rel=summed)
     last = recording.drive[-round(recording.rate / 10) :, 0]
     wanted = 2 * abs(np.mean(last * np.exp(-2j * np.pi * 100 * np.arange(len(last)) / recording.rate)))
-    assert abs(line[20]) == pytest.approx(wanted * np.sinc(100 / recording.rate), rel=1e-6)  # the hold
-    assert abs(line[40]) < 1e-3 * abs(line[20])
+    hold = np.sinc(100 / recording.rate) / np.sinc(100 / FAST)
+    assert abs(line[20]) == pytest.approx(wanted * hold, rel=summed)
+    assert abs(line[40]) < summed * abs(line[20])
 
 
 def test_the_carrier_starts_at_its_crest_and_keeps_its_phase(tmp_path):

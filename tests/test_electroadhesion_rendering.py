@@ -59,7 +59,10 @@ def test_a_friction_coefficient_that_is_not_the_believed_one_is_made_up_for(mu):
 
 
 def test_a_grating_follows_a_swiping_finger():
-    """The target grows with the speed; the mean is kept to what the changing lag and speed leave, far below 10 %."""
+    """The target grows with the speed v = 0.1 m/s sin(pi t); every window is kept within the scene's tolerance.
+
+    A tracker with a triple pole p lags by 3 v''/p^2; differences tell the speed half a sample later.
+    """
     scene = hr.Scene(
         texture=hr.Grating(wavelength=1e-3, amplitude=20e-6),
         finger=hr.Finger.swiping(frequency=0.5, speed=0.1, normal_load=1.0),
@@ -73,8 +76,8 @@ def test_a_grating_follows_a_swiping_finger():
     speed = abs(np.diff(recording.position, append=recording.position[-1])) * RATE
     expected = 2 * np.pi * speed / 1e-3 * 20e-6 / 0.64  # N: the skin velocity of the grating over v/F
     felt = abs(recording.target[:, 0])
-    fast = (speed > 0.06) & (recording.time > 1.0)  # the speed is known behind a pole of 40 Hz, 4 ms late
-    lost = 0.1 * np.pi / 0.08 * 4e-3  # of the target: relative change of the speed from 0.06 m/s on over 4 ms
+    fast = (speed > 0.06) & (recording.time > 1.0)
+    lost = (3 * 0.1 * np.pi**2 / (2 * np.pi * 60.0) ** 2 + 0.1 * np.pi / (2 * RATE)) / 0.06  # of the target
     np.testing.assert_allclose(felt[fast], expected[fast], rtol=lost)
 
 
@@ -170,7 +173,10 @@ def test_a_driver_with_other_channels_is_refused():
 @pytest.mark.parametrize("device", ["electroadhesion", "ultrasonic"])
 @pytest.mark.parametrize("lifted", [False, True])
 def test_a_finger_that_rests_or_is_away_winds_nothing_up(device, lifted):
-    """Slides, rests (or is lifted) for 1.2 s, slides on: nothing saturates, and 0.2 s later the texture is back."""
+    """Slides, rests (or is lifted) for 1.2 s, slides on: nothing saturates.
+
+    0.2 s later the texture is back, within 1 % as the accuracy suite has it.
+    """
     time = np.arange(0.0, 3.2, 1e-3)
     way = np.cumsum(np.where((time < 1.2) | (time > 2.4), 0.08, 0.0)) * 1e-3
     position = abs(way % 0.1 - 0.05) - 0.025

@@ -12,6 +12,8 @@ SENSORLESS = {"sensor": "impedance", "level": "carrier"}
 REST = 0.2  # s
 REST_THEN_SLIDE = hr.Finger.sampled([0.0, 0.0, 0.1], times=[0.0, REST, REST + 0.1 / SPEED], normal_load=1.0)
 AREAS, GAPS = (0.7, 1.0, 1.3), (0.5e-6, 1.5e-6, 3e-6)
+ISSUE = 0.03  # what the issue allows the force to be off
+BEYOND = 1e-3  # of a force: the law's D ends at s^2
 WANTED = FORCE / MU / abs(ElectroadhesionParameters().lag_response(100.0, SPEED))  # N of attraction at 100 Hz
 
 
@@ -42,7 +44,7 @@ def open_loop(seconds=0.5, **plant):
 def test_the_true_attraction_is_within_3_percent_of_the_wanted_one(leak, area, gap):
     """The issue's bound, over area +-30 % and gaps of 0.5 to 3 um."""
     _, flags, attraction = sensed(gap_resistance=leak, area_scale=area, gap_thickness=gap)
-    assert swing(attraction) == pytest.approx(WANTED, rel=0.03)
+    assert swing(attraction) == pytest.approx(WANTED, rel=ISSUE)
     assert not (flags[int((REST + 0.01) * RATE) :] & hr.Flag.OPEN_LOOP).any()
     assert not (flags & hr.Flag.SATURATED).any()
 
@@ -52,13 +54,13 @@ def test_the_judge_sees_the_same_force_as_friction():
     plant = SENSORLESS | {"area_scale": 0.7}
     figures = band(hr.render(tone(100.0, finger=REST_THEN_SLIDE, **plant)))
     assert figures["target"] == pytest.approx(FORCE, rel=1e-6)
-    assert figures["rms_error_friction"] < 0.03
+    assert figures["rms_error_friction"] < ISSUE
 
 
 @pytest.mark.parametrize("kind", ["current", "voltage"])
 @pytest.mark.parametrize("leak", [DRY, NORMAL], ids=["dry", "normal"])
 def test_open_loop_the_same_cases_spread(kind, leak):
-    """Corners of the same table: a current drive by g, a voltage drive 21 times; D beyond s^2 is off by 0.1 %."""
+    """Corners of the same table: a current drive by g, a voltage drive 21 times; nominal and own by `BEYOND`."""
     ratios = []
     nominal = ElectroadhesionParameters(drive_kind=kind).attraction(1.0, 1.0)
     for area in (AREAS[0], AREAS[2]):
@@ -66,14 +68,14 @@ def test_open_loop_the_same_cases_spread(kind, leak):
             case = {"gap_resistance": leak, "area_scale": area, "gap_thickness": gap}
             found = open_loop(drive_kind=kind, **case)
             expected = ElectroadhesionParameters(drive_kind=kind, **case).attraction(1.0, 1.0) / nominal
-            assert found / WANTED == pytest.approx(expected, rel=2e-3)
+            assert found / WANTED == pytest.approx(expected, rel=2 * BEYOND)
             ratios.append(found / WANTED)
     assert max(ratios) > 1.5
     assert min(ratios) < (0.86 if kind == "current" else 0.5)
 
 
 def test_nothing_winds_up_on_a_finger_that_rests():
-    """A second at rest or a fifth of it: what follows is the same, to the noise; at rest nothing is wanted."""
+    """A second at rest or a fifth of it: what follows is the same, to a tenth of what the issue allows."""
     late = hr.Finger.sampled([0.0, 0.0, 0.1], times=[0.0, 1.0, 1.0 + 0.1 / SPEED], normal_load=1.0)
     ends = []
     for rest, finger in ((REST, REST_THEN_SLIDE), (1.0, late)):
@@ -84,7 +86,7 @@ def test_nothing_winds_up_on_a_finger_that_rests():
         assert not (flags & hr.Flag.SATURATED).any()
         assert abs(drive[still]).max() < 1e-9 * WANTED
         ends.append((swing(drive), swing(attraction)))
-    np.testing.assert_allclose(ends[0], ends[1], rtol=5e-3)
+    np.testing.assert_allclose(ends[0], ends[1], rtol=0.1 * ISSUE)
 
 
 def test_nothing_winds_up_while_the_finger_is_away():
@@ -100,8 +102,8 @@ def test_nothing_winds_up_while_the_finger_is_away():
     assert (flags[7010:11000] == hr.Flag.OPEN_LOOP).all()
     assert not attraction[7000:11000].any()
     assert abs(drive[8000:10900]).max() < 1e-3 * WANTED  # lifted and at rest
-    assert swing(attraction[:6900]) == pytest.approx(WANTED, rel=0.03)
-    assert swing(attraction) == pytest.approx(WANTED, rel=0.03)
+    assert swing(attraction[:6900]) == pytest.approx(WANTED, rel=ISSUE)
+    assert swing(attraction) == pytest.approx(WANTED, rel=ISSUE)
 
 
 def test_a_swipe_shows_its_area_where_it_turns():
@@ -116,11 +118,11 @@ def test_a_swipe_shows_its_area_where_it_turns():
 
 
 def test_a_finger_that_never_rests_is_played_open_loop_and_flagged():
-    """What it makes of the nominal drive is told by its gain; 0.1 % for D beyond s^2."""
+    """What it makes of the nominal drive is told by its gain."""
     drive, flags, attraction = sensed(seconds=0.6, finger=SLIDE, area_scale=0.7)
     assert (flags[1:] == hr.Flag.OPEN_LOOP).all()
-    assert swing(drive) == pytest.approx(WANTED, rel=0.03)
-    assert swing(attraction) / swing(drive) == pytest.approx(1 / 0.7, rel=0.01)
+    assert swing(drive) == pytest.approx(WANTED, rel=ISSUE)
+    assert swing(attraction) / swing(drive) == pytest.approx(1 / 0.7, rel=BEYOND)
 
 
 def test_a_moist_finger_is_flagged_and_played_open_loop():
@@ -128,17 +130,27 @@ def test_a_moist_finger_is_flagged_and_played_open_loop():
     drive, flags, attraction = sensed(gap_resistance=MOIST)
     assert (flags[1:] == hr.Flag.OPEN_LOOP).all()  # nor is it driven to its limit
     ratio = ElectroadhesionParameters(gap_resistance=MOIST).gain(1.0) / ElectroadhesionParameters().gain(1.0)
-    assert swing(drive) == pytest.approx(WANTED, rel=0.03)
-    assert swing(attraction) / swing(drive) == pytest.approx(ratio, rel=0.02)
+    assert swing(drive) == pytest.approx(WANTED, rel=ISSUE)
+    assert swing(attraction) / swing(drive) == pytest.approx(ratio, rel=BEYOND)
     assert ratio < 0.15
+
+
+def estimate(skew):
+    """Attraction of a nominal finger as gap and area show it where V is turned against I by `skew` (s), per I^2."""
+    p = ElectroadhesionParameters()
+    turn = np.exp(1j * p.omega * skew)
+    static, gap = turn * p.impedance(1.0, sliding=False), turn * (p.impedance(1.0) - p.impedance(1.0, sliding=False))
+    return gap.imag**2 / abs(gap) ** 2 * abs(static - p.body_resistance)
 
 
 @pytest.mark.parametrize("skew", [-0.5e-6, 0.5e-6])
 def test_the_loop_makes_true_what_the_estimate_says(skew):
-    """Both channels half a microsecond apart: 5 % of the estimate (FACTS 5), and so of the force, the other way."""
+    """Both channels half a microsecond apart (some 10 % a microsecond, FACTS 5): the force is off the other way."""
     _, flags, attraction = sensed(skew=skew)
     assert not (flags[int((REST + 0.01) * RATE) :]).any()
-    assert abs(swing(attraction) / WANTED - 1) == pytest.approx(0.05, rel=0.2)
+    expected = estimate(0.0) / estimate(skew)
+    assert (expected > 1.05) if skew > 0.0 else (expected < 0.96)
+    assert swing(attraction) / swing(sensed()[2]) == pytest.approx(expected, rel=BEYOND)
 
 
 def test_a_gain_that_the_scene_gives_is_believed():
@@ -146,4 +158,4 @@ def test_a_gain_that_the_scene_gives_is_believed():
     case = {"gap_resistance": MOIST, "open_loop_gain": ElectroadhesionParameters(gap_resistance=MOIST).gain(1.0)}
     _, flags, attraction = sensed(**case, current_limit=20e-3, voltage_limit=400.0)
     assert (flags[1:] == hr.Flag.OPEN_LOOP).all()
-    assert swing(attraction) == pytest.approx(WANTED, rel=0.03)
+    assert swing(attraction) == pytest.approx(WANTED, rel=ISSUE)

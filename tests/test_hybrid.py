@@ -21,6 +21,9 @@ from hapticrender.renderers.hybrid import HybridSettings
 RATE = 10_000
 SLIDE = hr.Finger.sliding(speed=0.08, normal_load=0.4, mechanics="light")
 START = 100.0 / 1.5  # Hz, F of the default crossover
+FELT = 0.01  # a tenth of what lies below every just noticeable difference (FACTS 7), as the accuracy suite asks
+SWEPT = 0.025  # the suite's bound for swipes
+TRACKER = 2 * np.pi * 60.0  # rad/s, of the finger's tracker
 
 
 @pytest.fixture(autouse=True)
@@ -86,9 +89,11 @@ def test_fixed_carriers_are_shared_out_by_their_frequency():
 def test_targets_of_a_carrier_that_follows_the_finger_sum_to_all_of_it():
     """From 30 to 240 Hz under constant acceleration, of which the finger's tracker has no lag.
 
-    It knows the velocity half a sample on.  Its triple pole at 60 Hz has forgotten how it began after 0.2 s: 2e-33,
-    times a polynomial.
+    It knows the velocity half a sample on.  Its triple pole p at 60 Hz has forgotten how it began after 0.2 s: 2e-33,
+    times a polynomial.  Of the rounding of positions up to 0.05 m it makes 3 p in velocities, from 0.03 m/s on, for
+    each of some five operations a sample; the fades have slopes up to 3.
     """
+    rounding = 5 * 3 * TRACKER * np.finfo(float).eps / 2 * 0.05 / 0.03
     amplitude, acceleration, n = 1e-5, 0.3, 8000
     session = loop.prepare(scene(hr.Grating(amplitude=amplitude, wavelength=1e-3), duration=0.8))
     controller, time = session.controller(), np.arange(n) / RATE
@@ -101,10 +106,10 @@ def test_targets_of_a_carrier_that_follows_the_finger_sum_to_all_of_it():
     hertz = (0.01 + acceleration * (time[2000:] + 0.5 / RATE)) / 1e-3
     turn = 2j * np.pi * hertz
     assert hertz[0] < 75.0 < 230.0 < hertz[-1]
-    np.testing.assert_allclose(total, turn * amplitude, rtol=1e-6)
+    np.testing.assert_allclose(total, turn * amplitude, rtol=rounding)
     share = np.array([smoothstep(f / START - 1.0) for f in hertz])
-    np.testing.assert_allclose(0.64 * rubbed / (turn * amplitude), share, atol=1e-6)
-    np.testing.assert_allclose(moved / amplitude, 1.0 - share, atol=1e-6)
+    np.testing.assert_allclose(0.64 * rubbed / (turn * amplitude), share, atol=3 * rounding)
+    np.testing.assert_allclose(moved / amplitude, 1.0 - share, atol=3 * rounding)
 
 
 @pytest.mark.parametrize("frequency", [40.0, 100.0, 250.0])
@@ -115,8 +120,7 @@ def test_a_tone_is_felt_whole(frequency):
     assert figures["unit"] == "m/s"
     (band,) = figures["bands"]
     assert band["target"] == pytest.approx(0.02, rel=1e-6)
-    assert abs(band["error_skin"]) < 0.01
-    assert band["rms_error_skin"] < 0.01
+    assert band["rms_error_skin"] < FELT
     assert not recording.flags.any()
     moved, rubbed = abs(recording.drive[:, :2]).max(), abs(recording.drive[:, 2]).max()
     assert (moved > 0.0) == (frequency < 2 * START)
@@ -124,7 +128,7 @@ def test_a_tone_is_felt_whole(frequency):
 
 
 def test_each_part_gives_its_share_and_no_more():
-    """At 90 Hz the screen gives 28 %; by a fit over 0.5 s, 45 periods, within 1 % of the whole."""
+    """At 90 Hz the screen gives 28 %; by a fit over 0.5 s, 45 periods."""
     session = loop.prepare(scene(tone(90.0)))
     plant, controller = session.driver.plant, session.controller()
     assert plant.closes(controller)
@@ -133,7 +137,7 @@ def test_each_part_gives_its_share_and_no_more():
     parts = abs(2 * np.exp(-2j * np.pi * 90.0 * np.arange(5000) / RATE) @ felt) / 5000
     share = smoothstep(90.0 / START - 1)
     assert share == pytest.approx(0.28175)
-    np.testing.assert_allclose(parts, [0.02 * (1 - share), 0.02 * share], atol=2e-4)
+    np.testing.assert_allclose(parts, [0.02 * (1 - share), 0.02 * share], atol=0.02 * FELT)
 
 
 def session_plant(session):
@@ -146,12 +150,15 @@ def test_partials_on_both_sides_of_the_crossover():
     figures = hr.render(scene(hr.Grating(amplitude=20e-6, frequency=50.0, partials=partials))).summary()
     assert [band["frequency"] for band in figures["bands"]] == [50.0, 100.0, 250.0]
     for band in figures["bands"]:
-        assert abs(band["error_skin"]) < 0.01
-        assert band["rms_error_skin"] < 0.05
+        assert band["rms_error_skin"] < FELT
 
 
 def test_a_grating_swept_through_the_crossover():
-    """From 50 to 170 Hz and back, every window within 5 % of what is wanted there, once the finger is learnt."""
+    """From 50 to 170 Hz and back, every window, once the finger is learnt.
+
+    Where the acceleration jumps by a, at 0.085 m/s, the tracker is off by 0.84 a/p at most, the largest of
+    a (t + p t^2) e^(-p t), and the mean over a window of w by a w/8.
+    """
     finger = moving([(0.0, 0.025), (0.4, 0.025), (0.9, 0.085), (1.0, 0.085), (1.5, 0.025)], mechanics="light")
     recording = hr.render(scene(hr.Grating(amplitude=1e-5, wavelength=0.5e-3), finger, 1.5))
     envelopes = recording.envelopes
@@ -159,10 +166,9 @@ def test_a_grating_swept_through_the_crossover():
     frequency = envelopes.frequency[late, 0]
     assert frequency.min() < 60.0 < 160.0 < frequency.max()
     ratio = abs(envelopes.achieved[late, 0, 0] / envelopes.wanted[late, 0])
-    np.testing.assert_allclose(ratio, 1.0, atol=0.05)
-    np.testing.assert_allclose(
-        abs(envelopes.wanted[late, 0]), 2 * np.pi * frequency * 1e-5, rtol=0.01
-    )  # a window of two periods averages a sweep of 240 Hz/s
+    np.testing.assert_allclose(ratio, 1.0, atol=SWEPT)
+    jump = 0.06 / 0.5 * (0.84 / TRACKER + envelopes.window / 8) / 0.085
+    np.testing.assert_allclose(abs(envelopes.wanted[late, 0]), 2 * np.pi * frequency * 1e-5, rtol=jump)
 
 
 def test_partials_wider_apart_than_the_plate_reaches():
@@ -171,7 +177,7 @@ def test_partials_wider_apart_than_the_plate_reaches():
     texture = hr.Grating(amplitude=12e-6, wavelength=1e-3, partials=partials)
     figures = hr.render(scene(texture, hr.Finger.sliding(speed=0.06, normal_load=0.4, mechanics="light"))).summary()
     for band in figures["bands"]:
-        assert band["rms_error_skin"] < 0.05
+        assert band["rms_error_skin"] < FELT
 
 
 def test_a_recording_over_position_is_shared_out_by_the_fades():
@@ -179,7 +185,7 @@ def test_a_recording_over_position_is_shared_out_by_the_fades():
     figures = hr.render(scene(hr.Synthetic(amplitude=2e-5, speed=0.1, components=3), duration=1.6)).summary()
     assert len(figures["bands"]) == 3
     for band in figures["bands"]:
-        assert band["rms_error_skin"] < 0.1
+        assert band["rms_error_skin"] < FELT
 
 
 def test_the_loop_of_a_bank_that_fades_has_the_poles_of_its_state_matrix():
@@ -201,17 +207,19 @@ def test_the_loop_of_a_bank_that_fades_has_the_poles_of_its_state_matrix():
 def test_plate_and_screen_are_those_of_their_own(rng):
     """What is sensed is that of plate and screen alone; the velocity is the derivative of the displacement.
 
-    Central differences are off by (w T)^2/6 = 4e-4 at 80 Hz.
+    Central differences at w are off by (w T)^2/6; a drive that is held bends the velocity at every sample, there by
+    (w0^2 - w^2) T^2/12 the other way, w0 being the mode (190 Hz at most).  Its ringing is gone by 0.8 s.
     """
-    finger = hr.Finger.sliding(speed=0.03, normal_load=0.4, centre=0.02, span=0.02)
-    parameters, own = PlateParameters(rate=RATE, bending_frequency=1250.0), ElectroadhesionParameters()
+    finger = hr.Finger.sliding(speed=0.03, normal_load=0.4, span=0.1)
+    parameters = PlateParameters(rate=RATE, bending_frequency=1250.0, current_bits=0)
+    own, off = ElectroadhesionParameters(), (2 * np.pi * 190.0 / RATE) ** 2 / 12
 
     def fresh():
         return Plate(parameters, finger, 1), ElectroadhesionScreen(own, finger, 2)
 
     plate, screen = fresh()
     hybrid = HybridPlant(*fresh(), 0.64)
-    time = np.arange(4000) / RATE
+    time = np.arange(10_000) / RATE
     drive = np.column_stack(
         [0.2 * np.sin(2 * np.pi * 80 * time), 0.05 * np.cos(2 * np.pi * 80 * time), 3e-3 * (1 + np.sin(500 * time))]
     )
@@ -229,13 +237,13 @@ def test_plate_and_screen_are_those_of_their_own(rng):
     slope = np.gradient(glass, 1 / RATE) - np.gradient(position, 1 / RATE) * (
         tilt + np.gradient(parameters.bending_shape(position)) / np.gradient(position) * bend
     )  # as the finger's place moves, not its skin
-    steady = slice(1500, -1)
-    np.testing.assert_allclose(hybrid.felt[steady, 0], slope[steady], atol=2e-3 * abs(slope[steady]).max())
+    steady = slice(8000, -1)
+    np.testing.assert_allclose(hybrid.felt[steady, 0], slope[steady], atol=off * abs(slope[steady]).max())
 
 
 @pytest.mark.parametrize("texture", [tone(100.0), hr.Grating(amplitude=1e-5, wavelength=1e-3)], ids=["time", "space"])
 def test_the_compiled_ring_is_the_open_one(texture):
-    """Sample by sample through Python or not, to rounding."""
+    """Sample by sample through Python or not, to a rounding a sample."""
     session = loop.prepare(scene(texture, duration=0.2))
     closed, ring = session_plant(session), session_plant(session)
     first, second = session.controller(), session.controller()
@@ -246,16 +254,16 @@ def test_the_compiled_ring_is_the_open_one(texture):
         heard = ring.run(played)
         rows.append([played[0], heard.motion[0, 0]])
         played, *_ = second.run(heard.sensed, heard.position, np.zeros(1))
-    np.testing.assert_allclose(drive, [row[0] for row in rows], rtol=1e-9, atol=1e-12)
-    np.testing.assert_allclose(sensed.motion[:, 0], [row[1] for row in rows], rtol=1e-9, atol=1e-12)
+    for one, other in ((drive, [row[0] for row in rows]), (sensed.motion[:, 0], [row[1] for row in rows])):
+        np.testing.assert_allclose(one, other, rtol=0, atol=1500 * np.finfo(float).eps * abs(one).max())
     assert target.shape == (1500, 1)
     assert not flags.any()
 
 
 def test_any_method_takes_fixed_carriers():
-    """`stiffness` for both parts: within 5 % like each alone."""
+    """`stiffness` for both parts, as good as the default."""
     figures = hr.render(scene(tone(100.0), duration=0.8), method="stiffness").summary()
-    assert figures["worst"]["value"] < 0.05
+    assert figures["worst"]["value"] < FELT
 
 
 class Bench(BaseDriver):
@@ -283,7 +291,7 @@ def test_a_driver_of_ones_own_gets_currents_and_is_judged_by_its_sensors():
     assert envelope[5000:-1].min() > 0.0  # around a bias
     assert envelope[-1] == 0.0  # closed
     (band,) = recording.summary()["bands"]
-    assert abs(band["error_skin"]) < 0.02
+    assert band["rms_error_skin"] < FELT
 
 
 def test_without_sensors_both_parts_are_driven_open_loop():

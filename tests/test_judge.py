@@ -353,20 +353,24 @@ def test_the_table_shows_every_band_and_the_verdict():
 def test_a_lead_in_time_is_a_lead_whichever_way_the_finger_goes():
     """A motion 0.2 ms early leads by 2 pi f 0.2 ms on both strokes; averaged without regard to them it would be 0.
 
-    One window in eight of a stroke of 25 holds a turn, and there up to a quarter of the other lead.
+    A window with a turn at a share s <= 1/2 from either of its ends shows 1 - 2 s of the lead, half of it on average.
     """
-    speed, wavelength, early = 0.08, 1e-3, 2e-4
+    speed, wavelength, early, stroke = 0.08, 1e-3, 2e-4, 0.625  # strokes of 50 mm
     time = times(4.0)
-    back = (time % 1.25) >= 0.625  # strokes of 50 mm
-    position = np.where(back, 0.05 - speed * (time % 0.625), speed * (time % 0.625)) - 0.025
+    back = (time % (2 * stroke)) >= stroke
+    position = np.where(back, 0.05 - speed * (time % stroke), speed * (time % stroke)) - 0.025
     bands = make_bands(0.0, 1e-5, wavenumber=1 / wavelength)
     lead = 2 * np.pi * speed / wavelength * early
     turned = 1e-5 * np.exp(1j * np.where(back, -lead, lead))[:, None, None]
     recording = make_recording(bands, turned, position=position)
-    band = only(recording)
-    assert band["phase_error"] == pytest.approx(lead, rel=0.02)
-    assert band["complex_error"] == pytest.approx(2 * np.sin(lead / 2), rel=0.02)
-    backward = recording.envelopes.backward[recording.envelopes.judged]
+    band, envelopes = only(recording), recording.envelopes
+    turning = envelopes.window / stroke  # share of the windows that hold one
+    assert band["phase_error"] == pytest.approx(lead, rel=turning / 2)
+    assert band["complex_error"] == pytest.approx(2 * np.sin(lead / 2), rel=turning / 2)
+    whole = envelopes.start % stroke + envelopes.window < stroke
+    ahead = np.where(envelopes.backward[whole, 0], -lead, lead)
+    np.testing.assert_allclose(np.angle(envelopes.achieved[whole, 0, 0]), ahead, rtol=EXACT)
+    backward = envelopes.backward[envelopes.judged]
     assert backward.any()
     assert not backward.all()
 

@@ -149,6 +149,7 @@ def test_one_texture_is_felt_alike_on_every_device(recordings):
     ],
 )
 def test_a_tone_is_felt_alike_on_every_device(kind, frequency):
+    """Within 1 % as the suite asks of tones, a tenth of what no one can tell; the goal is 5 %."""
     scene = hr.Scene(
         texture=hr.Grating(velocity=10e-3, frequency=frequency),
         finger=hr.Finger.sliding(speed=0.08, normal_load=0.4, mechanics="light"),
@@ -156,7 +157,7 @@ def test_a_tone_is_felt_alike_on_every_device(kind, frequency):
         duration=2.0,
     )
     [band] = felt_bands(hr.render(scene))
-    assert band.achieved == pytest.approx(10e-3, rel=0.05)
+    assert band.achieved == pytest.approx(10e-3, rel=0.01)
 
 
 def test_without_the_bridge_devices_would_not_feel_alike(recordings):

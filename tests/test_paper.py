@@ -84,7 +84,7 @@ def changing(controller, rng):
 
 
 def test_passes_follow_targets_that_turn(rng):
-    """Open loop: 1.8e-10 of the magnitude, 2.3e-10 of the angle and 1.2e-10 of the cosine add up to less than 1e-9."""
+    """Open loop: 1.8e-10 of the magnitude, 2.3e-10 of the angle and 1.4e-10 of the cosine add up to less than 1e-9."""
     bands = tones(*((f, 1e-6) for f in np.linspace(20.0, 400.0, 20)), phase=0.2)
     controller = METHODS["paper"].design(PlateParameters().band_model(RATE, 1), bands)
     twin, sensed, nothing = NumpyPolar(controller.tables), 1e-6 * rng.standard_normal((1024, 2)), np.zeros(64)
@@ -100,7 +100,7 @@ def test_passes_follow_targets_that_turn(rng):
 def test_passes_equal_steps_where_a_carrier_comes_and_goes_with_the_finger(rng):
     """A tile leaves its frame when a carrier follows the finger and returns to it; there is silence, too.
 
-    Only the cosine differs, by 1.2e-10, and the order of sums.
+    Only the cosine differs, by 1.4e-10, and the order of sums.
     """
     bands = tones(*((f, 1e-6) for f in np.linspace(20.0, 400.0, 20)), phase=0.2)
     model = PlateParameters().band_model(RATE, 1)

@@ -57,7 +57,8 @@ class Scene:
         Also names files: 1 to 100 printable characters.
     gradient : float, 1/m
         The wanted amplitude grows by this share of itself per metre along the surface, from its middle on; -1000 to
-        1000.  Only a plate with two coils can do so.
+        1000.  Only a plate with two coils can do so.  What noise leaves does not shrink with it: near a mode of the
+        plate it is tenths of a micrometre at a weak end as well.
     plant : mapping of str to number, str or bool
         Parameters of the simulated device that differ from its defaults.
 
