@@ -89,8 +89,8 @@ class NaiveBank:
         if not p.error_observer:
             self.E = self.E - np.outer(t.shape, self.seen_R - self.saw_R)
         spill = p.back * (1 - self.scale)
-        self.dv = -ki * self.E - spill * (self.v + R) - fading * self.v
-        self.v = self.v + T * self.dv
+        self.dv = -ki * self.E - fading * self.v  # S: the law is not told of what the limiter takes back
+        self.v = self.v + T * (self.dv - spill * (self.v + R))
         self.v_slow = self.v_slow + gain / 2 * (self.v - self.v_slow)
         heard = 2 * deviation[:, None] * carrier.conj()
         self.fast = self.fast + p.fast_pole * (heard - self.fast)

@@ -65,12 +65,13 @@ def test_a_method_that_refuses_a_case_misses_it():
     assert len(missed(figures)) == 2
 
 
-def test_an_amplitude_beyond_the_drive_is_seen_to_miss():
-    """0.8 V of the 1.6 V that 1 um needs under 0.4 N leave, to the drive's last digit, what they drive at resonance.
+@pytest.mark.parametrize("limit", [0.8, 1.0, 1.4])
+def test_an_amplitude_beyond_the_drive_is_seen_to_miss(limit):
+    """Less than the 1.6 V that 1 um needs under 0.4 N leave, to the drive's last digit, what they drive at resonance.
 
     N U sinc(f/rate)/|D(j 2 pi f)| with the drive held over samples; a lock off by d takes (d/pole)^2/2 of it.
     """
-    plate = accuracy_friction.surface(0.4, drive_limit=0.8)
+    plate = accuracy_friction.surface(0.4, drive_limit=limit)
     sensed = accuracy_friction.driven(plate, np.full(int(plate.rate / 2), 1e-6), 0.4)
     mode = plate.parameters.carrier_mode
     resonance = float(mode.resonance(0.4))
@@ -80,6 +81,18 @@ def test_an_amplitude_beyond_the_drive_is_seen_to_miss():
     assert plate.amplitude[-100:].mean() == pytest.approx(most, rel=mode.drive_step / mode.drive_limit + off**2 / 2)
     assert most < 0.98e-6  # beyond the bound of 2 %
     assert (sensed.flags[-100:] & Flag.SATURATED).all()
+
+
+def test_a_drive_that_suffices_is_not_held_back():
+    """2 V, 1.65 V needed: an early overload must not last.
+
+    Told of what the limiter takes back as a slope of the command, the law would answer, and the limiter its answer:
+    then three quarters of the amplitude were left.
+    """
+    plate = accuracy_friction.surface(0.4, drive_limit=2.0)
+    sensed = accuracy_friction.driven(plate, np.full(int(plate.rate / 2), 1e-6), 0.4)
+    assert plate.amplitude[-100:].mean() == pytest.approx(1e-6, rel=0.02)  # the bound of the suite
+    assert not (sensed.flags[-100:] & Flag.SATURATED).any()
 
 
 def test_times_until_a_signal_stays_within_are_counted_to_the_sample():

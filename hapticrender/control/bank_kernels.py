@@ -150,8 +150,8 @@ def observer_pass(tables, state, t, c, g, integral, back):
     for r, e in ((0, e_re), (1, e_im)):
         v = lanes(loop, t, base + row.V_RE + r)
         wanted = shape * lanes(band, t, row.R_RE + r)
-        slope = -integral * e - back * (v + wanted) - fading * v
-        v += period * slope
+        slope = -integral * e - fading * v
+        v += period * (slope - back * (v + wanted))  # no part of dV/dt: the law would answer the limiter by itself
         put(loop, t, base + row.V_RE + r, v)
         put(loop, t, base + row.COMMAND_RE + r, v + wanted)
         put(loop, t, base + row.SLOPED_RE + r, slope + shape * lanes(band, t, row.DR_RE + r))

@@ -216,8 +216,8 @@ def update(tables, state, t, c, a, b, g, integral, back):
         v, wanted = lanes(loop, t, base + row.V_RE + r), shape * lanes(band, t, row.R_RE + r)
         heard = e - v + 2.0 / block * found
         e = (1.0 - period * fading) * e + weight * g * found
-        slope = -integral * e - back * (v + wanted) - fading * v
-        v += period * slope
+        slope = -integral * e - fading * v
+        v += period * (slope - back * (v + wanted))
         put(loop, t, base + row.E_RE + r, e)
         put(loop, t, base + row.V_RE + r, v)
         steeper = shape * lanes(band, t, row.DR_RE + r)
