@@ -110,6 +110,10 @@ class BandModel:
         Length by which a sliding contact lags behind what the sensor shows.
     lock : float, Hz
         Bandwidth of the resonance lock, which moves the fixed carriers to where the device is resonant; 0: none.
+    taps : int
+        Of the inner loop where no bending mode is known, >= 3: more of them hear less noise, and answer later.
+    held : bool
+        The inner loop stays on in quiet as well, as its noise costs less than the first moment of a touch.
     unit, drive_unit : str
         Of the coordinates and of the drive.
 
@@ -146,6 +150,8 @@ class BandModel:
     late: float = 0.0
     foresight: float = 0.0
     lock: float = 0.0
+    taps: int = 3
+    held: bool = False
     unit: str = "m"
     drive_unit: str = "A"
 

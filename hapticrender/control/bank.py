@@ -20,6 +20,7 @@ from hapticrender.control.stability import Checked, Limits, checked_bandwidth
 from hapticrender.protocols import Array
 
 RAMP_TIME = 0.05  # s: a target grows this long, so that it does not strike the modes
+LEAST_RAMP = 0.5e-3  # s: and whatever the pace no faster, as drives end somewhere
 FAST_POLE, FAST_SIGMAS = 30.0, 5.5  # Hz, of the sensor noise behind that pole
 SLOW_POLE, SLOW_SIGMAS = 4.0, 5.0
 SETTLED = 0.05  # share of a target below which its error counts as settled
@@ -148,6 +149,8 @@ def design_bank(
     damping = choose_damping(model, bending=model.bending) if any(rules.inner) and feedback and prompt else None
     if damping is None or not damping.margins:
         rules = replace(rules, inner=(0.0, 0.0))
+    elif model.held:
+        rules = replace(rules, inner=(rules.inner[1], rules.inner[1]))
     if (bands.wavenumber > 0.0).any():  # what is left over at one frequency is wrong at the next
         rules = replace(rules, rest=(0.0, 0.0))
     tables = BankTables(
@@ -199,7 +202,7 @@ def _numbers(model: BandModel, bands: Bands, rules: BankRules, feedback: bool) -
         fast_time=rules.awake_time * model.rate,
         slow_time=rules.stirred_time * model.rate,
         release=period / rules.release,
-        ramp=period / RAMP_TIME * model.pace,
+        ramp=period / max(RAMP_TIME / model.pace, LEAST_RAMP),
         lowest=model.lowest_frequency,
         highest=min(model.highest_frequency, 0.4 * model.rate),
         highest_edge=float(model.highest_edge),

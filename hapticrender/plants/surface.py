@@ -15,7 +15,8 @@ import numpy as np
 
 from hapticrender.bands import Bands
 from hapticrender.control.bandmodel import BandModel, FingerRange
-from hapticrender.control.bank import BankController
+from hapticrender.control.bank import PROMPT, BankController
+from hapticrender.control.damping import within_a_turn
 from hapticrender.plants.base import TouchedPlant
 from hapticrender.plants.bounds import check_names, choice, number
 from hapticrender.plants.electroadhesion import finger_rows
@@ -37,8 +38,9 @@ if TYPE_CHECKING:
     from hapticrender.touch.finger import Finger
 
 PLACES = ("friction",)
-PACE = 100.0  # times the rules of a plate: within half a millisecond an amplitude has recovered from a touch
-PACED_DELAY = 1 / 60  # s, most of pace times delay: an amplitude is learnt no faster than the drive can answer
+PACED_DELAY = 3e-3  # s, of pace times the delay and a sample more, where the inner loop takes its share of the phase
+PACED_DELAY_ALONE = 9e-3  # s, of pace times the delay, where there is none: see `resonant` for both
+TAPS = 6  # of the inner loop: half a turn or so; three need a drive seven times as noisy for the same damping
 MOST_DETUNING = 0.015  # of the resonance: as far as the amplitude loop looks for it
 TYPICAL_DETUNING = 1e-3
 MOST_DAMPING = 20.0  # times that of the nominal finger
@@ -83,7 +85,7 @@ class SurfaceParameters(SlidingParameters):
     law: str = choice("fit", *LAWS)
     bias: float = number(0.55, least=0.1, most=0.95)
     lock: float = number(20.0, "Hz", most=100.0)
-    oversampling: int = number(16, "samples", least=1, most=1000)
+    oversampling: int = number(32, "samples", least=1, most=1000)
     envelope_oversampling: int = number(4, "samples", least=1, most=1000)
     mode: UltrasonicParameters = field(default_factory=UltrasonicParameters, metadata={"free": True})
     law_parameters: Mapping[str, float] = field(default_factory=dict, hash=False, metadata={"free": True})
@@ -116,7 +118,7 @@ class SurfaceParameters(SlidingParameters):
     def carrier_mode(self) -> UltrasonicParameters:
         """The mode as it is simulated."""
         if self.level == "carrier":
-            return replace(self.mode, rate=self.rate * self.substeps)
+            return self.mode.sampled(self.rate * self.substeps)
         return self.mode.transposed(self.mode.envelope_frequency, self.rate * self.substeps)
 
     @property
@@ -153,14 +155,20 @@ class SurfaceParameters(SlidingParameters):
 
 
 def resonant(model: BandModel, mode: UltrasonicParameters, lock: float) -> BandModel:
-    """Band model of a mode that is to be found and held where it is resonant, by a lock of `lock` (Hz)."""
+    """Band model of a mode that is to be found and held where it is resonant, by a lock of `lock` (Hz).
+
+    Its pace is as fast as leaves a modulus margin of 0.5 (Ms 2), what is learnt of a finger being part of the loop
+    (`AmplitudeLoop`): observer, integral and learning grow with the pace, their lag with the delay.
+    """
     stiffness, damping = float(model.stiffness[0, 0]), float(model.damping[0, 0])
     detuned = 2 * MOST_DETUNING * stiffness * mode.frequency / mode.carrier  # shifts are kept in Hz at either level
     finger = MOST_DAMPING * mode.finger_damping * mode.frequency / mode.carrier
     return replace(
         model,
-        pace=min(PACE, PACED_DELAY * model.rate / model.delay),
+        pace=_pace(model),
         lock=lock,
+        taps=TAPS,
+        held=True,
         finger=FingerRange(
             mass=(0.0, 0.0),
             damping=(-0.9 * damping, finger),
@@ -171,6 +179,13 @@ def resonant(model: BandModel, mode: UltrasonicParameters, lock: float) -> BandM
             contact=None,
         ),
     )
+
+
+def _pace(model: BandModel) -> float:
+    """How many times as fast as the rules of a plate the amplitude may be followed."""
+    if model.delay <= PROMPT and within_a_turn(model):
+        return PACED_DELAY * model.rate / (model.delay + 1)
+    return PACED_DELAY_ALONE * model.rate / model.delay
 
 
 class UltrasonicSurface(TouchedPlant):
