@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -27,6 +28,8 @@ class FingerRange:
         How far from zero either may be expected, > 0; by these a residue is shared out between them.
     least_motion : float, coordinate's unit
         A smaller motion teaches nothing, > 0.
+    fastest : float, 1/s
+        It is learnt no faster, > 0: what noise teaches grows with the pace.
     contact : (float, float), N, or None
         Loads at which touch begins and ends, as felt by the sag; None: the load is always there.
     presence : bool
@@ -42,6 +45,7 @@ class FingerRange:
     typical_mass: float = 4e-3
     typical_stiffness: float = 300.0
     least_motion: float = 5e-8
+    fastest: float = math.inf
     contact: tuple[float, float] | None = (0.05, 0.03)
     presence: bool = False
     least_speed: float = 0.0

@@ -264,7 +264,7 @@ def _paces(model: BandModel, bands: Bands, rules: BankRules, lowest: float, feed
     wait = model.delay * period  # integrator, observer and delay leave at least PHASE_MARGIN
     pole = [2 * math.pi * min(width, lowest / 2, apart / (2 * math.pi)) for width in rules.observer]
     fastest = [min(2 * math.pi * lowest / 4, PHASE_MARGIN / (wait + 1 / each)) for each in pole]
-    learning = 1 / (2 * wait + LEARNING_TIME / model.pace)
+    learning = min(1 / (2 * wait + LEARNING_TIME / model.pace), model.finger.fastest)
     if model.finger.contact is None:  # what is always there is as large as D: learning closes a loop by the observer
         learning = min(learning, pole[0] / LEARNING_MARGIN)
     level = 2 * math.pi * min(6.0, lowest / rules.level) * period

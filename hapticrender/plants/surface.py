@@ -39,11 +39,12 @@ if TYPE_CHECKING:
 
 PLACES = ("friction",)
 PACED_DELAY = 3e-3  # s, of pace times the delay and a sample more, where the inner loop takes its share of the phase
-PACED_DELAY_ALONE = 9e-3  # s, of pace times the delay, where there is none: see `resonant` for both
+PACED_DELAY_ALONE = 1 / 60  # s, of pace times the delay, where there is none: see `resonant` for both
 TAPS = 6  # of the inner loop: half a turn or so; three need a drive seven times as noisy for the same damping
 MOST_DETUNING = 0.015  # of the resonance: as far as the amplitude loop looks for it
 TYPICAL_DETUNING = 1e-3
 MOST_DAMPING = 20.0  # times that of the nominal finger
+LEARNING = 1.5e3  # 1/s: faster, noise at the least amplitude would feign more damping than a free plate has
 LEAST_AMPLITUDE = 0.05e-6  # m: below it a resonance is not told [FACTS 6]
 
 
@@ -176,6 +177,7 @@ def resonant(model: BandModel, mode: UltrasonicParameters, lock: float) -> BandM
             typical_mass=1e-12,
             typical_stiffness=detuned * TYPICAL_DETUNING / MOST_DETUNING,
             least_motion=LEAST_AMPLITUDE,
+            fastest=LEARNING,
             contact=None,
         ),
     )
