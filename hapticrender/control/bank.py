@@ -211,7 +211,7 @@ def _numbers(model: BandModel, bands: Bands, rules: BankRules, feedback: bool) -
         drive_limit=float(model.drive_limit),
         drive_step=float(model.drive_step),
         peak_decay=math.exp(-period * lowest),
-        back=model.pace / BACK_TIME,
+        back=_back(model),
         sensed_limit=float(model.sensed_limit),
         modulated=bands.modulated,
         differentiated=bands.differentiated,
@@ -235,6 +235,12 @@ def _numbers(model: BandModel, bands: Bands, rules: BankRules, feedback: bool) -
         least_stiffness=finger.stiffness[0],
         most_stiffness=finger.stiffness[1],
     )
+
+
+def _back(model: BandModel) -> float:
+    """Rate (1/s) of the back-calculation; of a held mode no faster than it fades, or drive and loop chase each other."""
+    fade = float((0.5 * model.damping.diagonal() / model.mass.diagonal()).min()) if model.held else math.inf
+    return min(model.pace / BACK_TIME, fade)
 
 
 def _paced(rules: BankRules, pace: float) -> BankRules:

@@ -41,6 +41,7 @@ PLACES = ("friction",)
 PACED_DELAY = 3e-3  # s, of pace times the delay and a sample more, where the inner loop takes its share of the phase
 PACED_DELAY_ALONE = 1 / 60  # s, of pace times the delay, where there is none: see `resonant` for both
 TAPS = 6  # of the inner loop: half a turn or so; three need a drive seven times as noisy for the same damping
+DRIVEN = 0.9  # of the drive's limit: what an amplitude may ask for, as feedback asks for some on top
 MOST_DETUNING = 0.015  # of the resonance: as far as the amplitude loop looks for it
 TYPICAL_DETUNING = 1e-3
 MOST_DAMPING = 20.0  # times that of the nominal finger
@@ -190,6 +191,16 @@ def _pace(model: BandModel) -> float:
     return PACED_DELAY_ALONE * model.rate / model.delay
 
 
+def full_slew(mode: UltrasonicParameters) -> float:
+    """How far the drive, but for what feedback needs of it, moves an amplitude of nothing within a sample (m).
+
+    a' = F/(2 m w) - b/(2 m) a, F behind its hold; see `ultrasonic`.
+    """
+    turn = 2 * np.pi * mode.carrier
+    force = DRIVEN * mode.drive_limit * mode.force_constant * float(np.sinc(mode.carrier / mode.rate))
+    return force / (2 * mode.mass * turn * mode.rate)
+
+
 class UltrasonicSurface(TouchedPlant):
     """The surface in discrete time, behind the `Plant` protocol.
 
@@ -287,6 +298,7 @@ def surface_state(parameters: SurfaceParameters, amplitude: BankController) -> S
         control=amplitude.state,
         sliding=sliding_state(),
         wanted=np.zeros(1),
+        asked=np.full(1, -1.0),
         estimate=np.zeros(1),
         heard=np.zeros(1),
         motion=np.zeros(1),
@@ -308,6 +320,7 @@ def surface_tables(
         least=float(parameters.least_ratio),
         load=float(load),
         speed=float(speed),
+        slew=full_slew(parameters.carrier_mode),
         estimating=parameters.sensor == "amplitude",
         law=numbers,
         mode=ultrasonic_tables(parameters.carrier_mode),
