@@ -66,17 +66,17 @@ def test_a_method_that_refuses_a_case_misses_it():
 
 
 def test_an_amplitude_beyond_the_drive_is_seen_to_miss():
-    """1 V of the 1.6 V that 1 um needs under 0.4 N, at most; the limiter scales by the peaks, noise included.
+    """1 V of the 1.6 V that 1 um needs under 0.4 N, at most; the limiter scales by the peaks, so without noise.
 
-    The hold of 30 kHz at 192 kHz takes 1 - sinc(30/192) = 4 %, a finger's shift of 28 Hz beside a pole of 240 Hz 0.7 %,
-    and at most a tenth of the drive is held back for its own noise.
+    The hold of 30 kHz at 384 kHz takes 1 - sinc(30/384) = 1 %, a finger's shift of 28 Hz beside a pole of 240 Hz 0.7 %,
+    and at most a tenth of the drive is held back while loop and limiter take turns.
     """
-    plate = accuracy_friction.surface(0.4, drive_limit=1.0)
+    plate = accuracy_friction.surface(0.4, drive_limit=1.0, sensor_noise=0.0)
     wanted = np.full(int(plate.rate / 2), 1e-6)
     sensed = accuracy_friction.driven(plate, wanted, 0.4)
     reached = plate.amplitude[-100:].mean() / 1e-6
     most = 1.0 / plate.parameters.mode.drive_for(1e-6, normal_load=0.4)
-    assert 0.95 * 0.9 * most < reached < most
+    assert 0.98 * 0.9 * most < reached < most
     assert reached < 0.98  # beyond the bound of 2 %
     assert (sensed.flags[-100:] & Flag.SATURATED).all()
 

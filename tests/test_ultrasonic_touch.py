@@ -10,6 +10,7 @@ from test_ultrasonic_rendering import Watched, driven, friction_of
 from ultrasonic import ASKED, NOISE, held, inner_share, modulated, ran
 
 import hapticrender as hr
+from hapticrender import accuracy_friction
 from hapticrender.control.stability import STATES, bank_loop
 from hapticrender.loop import prepare
 from hapticrender.loop import run as play
@@ -17,6 +18,7 @@ from hapticrender.plants import surface
 from hapticrender.plants.fidelity_surface import AmplitudeLoop
 from hapticrender.plants.surface import SurfaceParameters
 from hapticrender.plants.ultrasonic import UltrasonicParameters
+from hapticrender.protocols import Flag
 from hapticrender.renderers import resonant
 from hapticrender.renderers.ultrasonic import amplitude_loop
 
@@ -29,6 +31,7 @@ MODULUS = 0.5  # Ms 2
 THIN = 0.25  # Ms 4, where the loop is late and has no inner one
 FELT = 0.1  # an error that lies below every just noticeable difference [FACTS 7]
 SLOWER = 1.5  # times: how much a constant may not be moved
+RESPONSE = 1.5e-3  # s: within which the amplitude is to answer
 SUBSTEPS = 20  # of a sample, in which the twin below is integrated
 
 
@@ -223,3 +226,22 @@ def test_the_longest_delay_is_what_400_hz_bear(monkeypatch):
     assert abs(felt(longest, 400.0)) < FELT
     monkeypatch.setattr(resonant, "LONGEST_DELAY", SLOWER * resonant.LONGEST_DELAY)
     assert abs(felt(round(SLOWER * longest / 16) * 16, 400.0)) > FELT
+
+
+@LOADS
+def test_a_step_that_the_drive_cannot_make_at_once_is_made_as_fast_as_it_can(monkeypatch, load):
+    """Half a micrometre to three and back, and flagged meanwhile.  Naive: at its limit the loop takes its time."""
+
+    def response():
+        plate = accuracy_friction.surface(load)
+        wanted = np.repeat([0.5e-6, 3e-6, 0.5e-6], round(0.1 * plate.rate))
+        flags = np.asarray(accuracy_friction.driven(plate, wanted, load).flags)
+        off = abs(plate.amplitude - wanted).reshape(3, -1)
+        return max(accuracy_friction.back(each, 0.05 * 2.5e-6, plate.rate) for each in off[1:]), flags.reshape(3, -1)
+
+    governed, flags = response()
+    assert governed <= RESPONSE
+    assert (flags[1:, 0] & Flag.SATURATED).all()
+    assert not flags[:, round(RESPONSE * 12e3) :].any()
+    monkeypatch.setattr(surface, "DRIVEN", 1e6)
+    assert response()[0] > RESPONSE

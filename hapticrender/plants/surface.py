@@ -40,12 +40,12 @@ if TYPE_CHECKING:
 PLACES = ("friction",)
 PACED_DELAY = 3e-3  # s, of pace times the delay and a sample more, where the inner loop takes its share of the phase
 PACED_DELAY_ALONE = 1 / 60  # s, of pace times the delay, where there is none: see `resonant` for both
-TAPS = 6  # of the inner loop: half a turn or so; three need a drive seven times as noisy for the same damping
+TAPS = 6  # of the inner loop: at 384 kHz three need a drive eight times as noisy for a sixth more of damping
 DRIVEN = 0.9  # of the drive's limit: what an amplitude may ask for, as feedback asks for some on top
 MOST_DETUNING = 0.015  # of the resonance: as far as the amplitude loop looks for it
 TYPICAL_DETUNING = 1e-3
 MOST_DAMPING = 20.0  # times that of the nominal finger
-LEARNING = 1.5e3  # 1/s: faster, noise at the least amplitude would feign more damping than a free plate has
+LEARNING = 1.5e3  # 1/s: three times as fast, noise at the least amplitude feigns a quarter of a free plate's damping
 LEAST_AMPLITUDE = 0.05e-6  # m: below it a resonance is not told [FACTS 6]
 
 
@@ -78,7 +78,8 @@ class SurfaceParameters(SlidingParameters):
 
     Notes
     -----
-    Bias, lock and oversampling are engineering defaults.
+    Bias, lock and oversampling are engineering defaults.  The mode's sensor keeps the density of its noise whatever the
+    oversampling; see `UltrasonicParameters`.
     """
 
     rate: float = number(12e3, "Hz", least=1e3, most=1e6)
@@ -159,8 +160,10 @@ class SurfaceParameters(SlidingParameters):
 def resonant(model: BandModel, mode: UltrasonicParameters, lock: float) -> BandModel:
     """Band model of a mode that is to be found and held where it is resonant, by a lock of `lock` (Hz).
 
-    Its pace is as fast as leaves a modulus margin of 0.5 (Ms 2), what is learnt of a finger being part of the loop
-    (`AmplitudeLoop`): observer, integral and learning grow with the pace, their lag with the delay.
+    Observer and integral grow with the pace, what they lose by being late with the delay.  With an inner loop the pace
+    leaves 45 degrees of phase, as measured with delays of 1 to 8 samples at 192 and 384 kHz.  Without one (a block
+    device) it leaves a modulus margin of 0.25 (Ms 4), what is learnt of a finger being part of the loop: thin, but at
+    two thirds of it a texture of f Hz behind a delay d is 12 % off at f d = 1/15 in place of 1 %.
     """
     stiffness, damping = float(model.stiffness[0, 0]), float(model.damping[0, 0])
     detuned = 2 * MOST_DETUNING * stiffness * mode.frequency / mode.carrier  # shifts are kept in Hz at either level

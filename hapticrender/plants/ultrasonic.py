@@ -82,7 +82,7 @@ class UltrasonicParameters(Validated):
     sensor_bits, drive_bits : int
         Resolution over `sensor_range` and over +- `drive_limit`; 0 is ideal.
     sensor_noise : float, m rms
-        White noise of each sample, >= 0.
+        White noise of each sample at `rate`, >= 0; at another rate its density stays.
     rate : float, Hz
         Sampling rate of the loop; the default is what a sound card can do.
     delay : int, samples
