@@ -163,7 +163,7 @@ def resonant(model: BandModel, mode: UltrasonicParameters, lock: float) -> BandM
     Observer and integral grow with the pace, what they lose by being late with the delay.  With an inner loop the pace
     leaves 45 degrees of phase, as measured with delays of 1 to 8 samples at 192 and 384 kHz.  Without one (a block
     device) it leaves a modulus margin of 0.25 (Ms 4), what is learnt of a finger being part of the loop: thin, but at
-    two thirds of it a texture of f Hz behind a delay d is 12 % off at f d = 1/15 in place of 1 %.
+    half of it a texture of f Hz behind a delay d is 12 % off at f d = 1/15 in place of 1 %.
     """
     stiffness, damping = float(model.stiffness[0, 0]), float(model.damping[0, 0])
     detuned = 2 * MOST_DETUNING * stiffness * mode.frequency / mode.carrier  # shifts are kept in Hz at either level
