@@ -44,7 +44,10 @@ def test_an_amplitude_responds_in_time(level, load, before, after):
 @LEVELS
 @pytest.mark.parametrize("load", [0.0, 0.5, 1.5])
 def test_modulation_at_400_hz_is_flat_for_the_headroom_that_is_told(level, load):
-    """Within the device's bound of 1 dB; the law leaves out m W^2 of a stiffness near 2 m w W, W/2w of it, and its drive is `drive_for`."""
+    """Within the device's bound of 1 dB, at the drive that `drive_for` tells.
+
+    The law leaves out m W^2 of a stiffness near 2 m w W, W/2w of it.
+    """
     run = ran(modulated(ASKED), 0.21, held(load), level=level).between(0.1, 0.2)
     gain = run.line(run.amplitude, 400.0) / (0.5 * ASKED)
     left = 400.0 / (2 * run.mode.carrier)
