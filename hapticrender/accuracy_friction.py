@@ -32,7 +32,7 @@ from hapticrender.loop import registered, render
 from hapticrender.plants.surface import UltrasonicSurface
 from hapticrender.protocols import Array, Flag, Sensed
 from hapticrender.recording import Recording
-from hapticrender.touch.finger import Finger
+from hapticrender.touch.finger import Finger, LoadCurve
 from hapticrender.touch.grating import Grating
 from hapticrender.touch.perception import VELOCITY_PER_FORCE
 from hapticrender.touch.scene import PlantValue, Scene
@@ -51,6 +51,7 @@ WAVELENGTHS = (0.5e-3, 1e-3)  # m
 AREAS, GAPS = (0.7, 1.0, 1.3), (0.5e-6, 1.5e-6, 3e-6)  # of the nominal area, m
 KEPT = (20.0, 50.0, 120.0, 250.0, 400.0)  # Hz: partials of the texture that every device plays
 LOADS = (0.2, 0.4, 1.0)  # N
+PRESSES, PRESSING = (0.2, 0.5, 1.5), 1e-3  # N, s
 STEPS = ((0.0, 1e-6), (0.5e-6, 1e-6), (1e-6, 2e-6), (0.5e-6, 3e-6), (3e-6, 0.5e-6))  # m
 MODULATION = 400.0  # Hz
 HEAT = 10.0  # K
@@ -138,9 +139,9 @@ def _line(signal: Array, rate: float, frequency: float, start: float) -> complex
 
 
 def surface(
-    load: float, touches: Sequence[tuple[float, float]] | None = None, **plant: PlantValue
+    load: float | LoadCurve, touches: Sequence[tuple[float, float]] | None = None, **plant: PlantValue
 ) -> UltrasonicSurface:
-    """An ultrasonic surface as it comes, but for `plant`, under a finger of so much load (N)."""
+    """An ultrasonic surface as it comes, but for `plant`, under a finger of so much load (N), or over so much time."""
     finger = Finger.sliding(speed=SPEED, normal_load=load, touches=touches, mechanics="light")
     scene = Scene(texture=Grating(frequency=100.0, amplitude=1e-6), finger=finger, device="ultrasonic", duration=2.0)
     made = registered("renderers", "ultrasonic")().plant(replace(scene, plant=plant), 0)
@@ -220,6 +221,18 @@ def touch(_: str) -> dict[str, float]:
     return {"unlocked": unlocked, "back": slowest}
 
 
+def press(_: str) -> dict[str, float]:
+    """Loads that come and go within a millisecond, the amplitude held: largest error in the mean over a sample."""
+    most = 0.0
+    for load in PRESSES:
+        times = (0.0, 0.3, 0.3 + PRESSING, 0.6, 0.6 + PRESSING, 1.0)
+        plate = surface((times, (0.0, 0.0, load, load, 0.0, 0.0)))
+        plate.run(np.zeros((int(0.9 * plate.rate), 1)))
+        wanted = float(plate.parameters.friction_law.amplitude(plate.parameters.bias, load, SPEED))
+        most = max(most, float(abs(plate.amplitude / wanted - 1.0)[int(0.2 * plate.rate) :].max()))
+    return {"peak": most}
+
+
 def velocity(method: str) -> dict[str, float]:
     """Five partials, 20 to 400 Hz, on every device kind: worst error of the mean skin velocity that they predict.
 
@@ -244,10 +257,10 @@ CASES: dict[str, Callable[[str], dict[str, float]]] = {
     f"{SCREEN}: area": area,
     f"{SCREEN}: harmonic": harmonic,
     **{f"{device}: {case.__name__}": _for(device, case) for device in (SCREEN, PLATE) for case in (tones, comb, swipe)},
-    **{f"{PLATE}: {case.__name__}": case for case in (step, modulation, heat, touch)},
+    **{f"{PLATE}: {case.__name__}": case for case in (step, modulation, heat, touch, press)},
     "every device: velocity": velocity,
 }
-METHOD_FREE = tuple(f"{PLATE}: {case.__name__}" for case in (step, modulation, heat, touch))
+METHOD_FREE = tuple(f"{PLATE}: {case.__name__}" for case in (step, modulation, heat, touch, press))
 
 
 def _shared(device: str) -> tuple[Target, ...]:
@@ -269,6 +282,7 @@ TARGETS = (
     Target(f"{PLATE}: modulation", "gain", "AM at 400 Hz, off by (no method's doing)", "dB", 1, 1.0, 0.5),
     Target(f"{PLATE}: heat", "error", "amplitude while warming by 10 K (no method's doing)", "%", 100, 2.0, 1.0),
     Target(f"{PLATE}: touch", "unlocked", "unlocked after a touch or lift (no method's doing)", "ms", 1e3, 20.0, 5.0),
+    Target(f"{PLATE}: press", "peak", "load within 1 ms, peak of amplitude (no method's doing)", "%", 100, 2.0, 1.0),
     Target(f"{PLATE}: touch", "back", "amplitude back within 2 % (no method's doing)", "ms", 1e3, 8.0, 2.5),
     *(
         Target("every device: velocity", device, f"one texture, skin velocity on {device}", "%", 100, 5.0, 1.0)

@@ -18,12 +18,12 @@ from hapticrender.control.bank import BankController
 from hapticrender.control.methods import method_named
 from hapticrender.plants.electroadhesion import finger_rows
 from hapticrender.plants.friction_laws import friction_ratios, wanted_amplitudes
-from hapticrender.plants.surface import SurfaceParameters
-from hapticrender.plants.surface_kernels import LOAD, SPEED, sensed_amplitude
+from hapticrender.plants.surface import SurfaceParameters, full_slew
+from hapticrender.plants.surface_kernels import LOAD, SPEED, amplitude_fade, ask_within_reach, sensed_amplitude
 from hapticrender.protocols import Array, Driver, Flag, Sensed
 from hapticrender.touch.finger import Finger
 
-LONGEST_DELAY = 0.25e-3  # s: at 400 Hz a tenth of a turn
+LONGEST_DELAY = 0.25e-3  # s: a tenth of a turn of 400 Hz, which are 7 % off there, and beyond 10 % half as late again
 
 
 class ResonantDriver:
@@ -79,7 +79,8 @@ class ResonantDriver:
         self._nominal = nominal
         self.loop = amplitude_loop(self.parameters, held=None if driver.sensed_channels else nominal[0])
         self._samples = 0
-        self._wanted = self._heard = 0.0  # m, at the end of the last sample
+        self._wanted = 0.0  # m, at the end of the last sample
+        self._reached = -1.0  # m, alike, by what the drive can do; negative: it starts from rest
         self._friction = 0.0  # N: what was heard of the last sample
         self._drive = np.zeros((driver.block, 1))
         self._next = np.zeros((driver.block, 1))
@@ -98,7 +99,7 @@ class ResonantDriver:
         whole, load, speed = self._contact(rows)
         flags = np.zeros((self.block, self.parameters.oversampling), np.int64)
         asked = self._asked(np.asarray(drive, float)[:, 0], whole, load, speed, flags)
-        heard, played = self._carry(asked.ravel(), flags.ravel())
+        heard, played = self._carry(asked, flags.ravel())
         friction = np.empty(self.block)
         friction_ratios(self.parameters.friction_law.numbers, heard, load, speed, friction)
         felt = np.r_[self._friction, whole * friction]
@@ -123,7 +124,19 @@ class ResonantDriver:
         wanted_amplitudes(p.friction_law.numbers, ratio, load, speed, wanted)
         before = np.r_[self._wanted, wanted[:-1]]
         self._wanted = wanted[-1]
-        return before[:, None] + (wanted - before)[:, None] * np.arange(1, p.oversampling + 1) / p.oversampling
+        lines = before[:, None] + (wanted - before)[:, None] * np.arange(1, p.oversampling + 1) / p.oversampling
+        return self._within_reach(lines, flags)
+
+    def _within_reach(self, lines: Array, flags: Array) -> Array:
+        """Amplitude (m) to which the drive can take the mode at every sample of the device, on its way on `lines`."""
+        asked, first = lines.ravel().copy(), 0
+        if self._reached < 0.0:  # from rest the loop's own ramp is slower
+            first, self._reached = self.parameters.oversampling, lines[0, -1]
+        mode, loop = self.parameters.carrier_mode, self.loop
+        fade = amplitude_fade(loop.tables, loop.state.touch, 1.0 / mode.rate)
+        ask_within_reach(asked[first:], self._reached, full_slew(mode), fade, asked[first:], flags.ravel()[first:])
+        self._reached = asked[-1]
+        return asked
 
     def _carry(self, asked: Array, flags: Array) -> tuple[Array, list[Sensed]]:
         """Take the amplitude along `asked` (m); amplitude heard in each sample of friction, and what was played."""

@@ -143,8 +143,9 @@ def test_the_bound_is_never_below_the_true_error_and_at_most_half_as_much_above(
 
 @pytest.mark.parametrize("name", ["ultrasonic-swiping", "ultrasonic-warming"])
 def test_the_bound_holds_in_noise_that_neither_level_shares(name):
+    """What is bounded is the worst that chance may do: here, of three runs."""
     full = known(name)
-    found, true = bound(full, reduced(full)), true_error(full, seeds=(1, 2))
+    found, true = bound(full, reduced(full)), max(true_error(full, seeds=(k, k + 1)) for k in (1, 3, 5))
     assert true <= found <= 1.5 * true
 
 
@@ -276,8 +277,8 @@ LEAVING = hr.Finger.sliding(0.08, 0.5, touches=[(0.95, 5.0)])
         (scene(SCREEN, 143.0, square_root="off"), "its drive is no attraction"),
         (scene(SCREEN, 143.0, voltage_limit=70.0, gap_thickness=3e-6), "the end of its compliance of 70 V"),
         (scene(SCREEN, 143.0, current_offset=1e-6, servo_conductance=0.0, duration=200.0), "compliance"),
-        (scene(SURFACE, 143.0, finger=LEAVING), "judged less than 0.1 s after its finger last came or went"),
-        (replace(scene(SURFACE, 143.0), settle=0.05), "judged less than 0.1 s after"),
+        (scene(SURFACE, 143.0, finger=LEAVING), "judged less than 0.0796 s after its finger last came or went"),
+        (replace(scene(SURFACE, 143.0), settle=0.05), "judged less than 0.0796 s after"),  # ten times that of the lock
         (scene(SURFACE, 143.0, temperature_rise=5.0, lock=0.0), "its resonance drifts"),
         (scene(SURFACE, 400.0, drive_limit=1.7), "may ask for more than 1.7 V"),
         (

@@ -1,81 +1,23 @@
 """Ultrasonic surfaces in closed loop: the amplitude on its resonance, and the friction that a scene asks for."""
 
 from dataclasses import replace
-from typing import NamedTuple
 
 import numpy as np
 import pytest
 from scipy.signal import hilbert
+from ultrasonic import ASKED, FREE, NOISE, held, inner_share, modulated, ran
 
 import hapticrender as hr
-from hapticrender.control.bank import BankController
 from hapticrender.drivers.simulated import SimulatedDriver
 from hapticrender.drivers.wavefile import WaveFileDriver
 from hapticrender.loop import prepare, run
 from hapticrender.plants.surface import SurfaceParameters, UltrasonicSurface
 from hapticrender.plants.ultrasonic import UltrasonicParameters, UltrasonicPlate
-from hapticrender.protocols import Array, Flag
+from hapticrender.protocols import Flag
 from hapticrender.renderers.resonant import ResonantDriver
 from hapticrender.renderers.ultrasonic import amplitude_loop
 
-FREE = hr.Finger.absent()
 LEVELS = pytest.mark.parametrize("level", ["carrier", "envelope"])
-LOADS = pytest.mark.parametrize("load", [0.2, 0.5, 1.5])
-ASKED = 1e-6  # m
-NOISE = 5e-3  # of 1 um: 2 nm of the sensor, less what the loop averages, at 2.5 sigma
-
-
-class Run(NamedTuple):
-    """What a plate under its amplitude loop did; envelopes by Hilbert's transform, which spoils both ends."""
-
-    time: Array
-    wanted: Array
-    amplitude: Array
-    drive: Array  # V
-    flags: Array
-    loop: BankController
-    mode: UltrasonicParameters
-
-    def between(self, start, end):
-        """The same from `start` to `end` (s)."""
-        part = slice(*(round(each * self.mode.rate) for each in (start, end)))
-        return Run(*(each[part] for each in self[:5]), self.loop, self.mode)
-
-    @property
-    def error(self):
-        """Amplitude error as a share of what is wanted."""
-        return self.amplitude / self.wanted - 1
-
-    def settled_after(self, tolerance):
-        """Time (s) from the first sample to the last one whose error is larger."""
-        wrong = np.flatnonzero(abs(self.error) > tolerance)
-        return (wrong[-1] + 1) / self.mode.rate if wrong.size else 0.0
-
-    @property
-    def longest_unlocked(self):
-        """Longest time (s) without lock."""
-        edges = np.flatnonzero(np.diff(np.r_[0, (self.flags & Flag.UNLOCKED) != 0, 0]))
-        return max(edges[1::2] - edges[::2], default=0) / self.mode.rate
-
-    def line(self, signal, frequency):
-        """Complex amplitude of a signal at a frequency (Hz) that fits the window."""
-        return 2 * np.mean(signal * np.exp(-2j * np.pi * frequency * self.time))
-
-
-def held(load):
-    return hr.Finger.still(normal_load=load) if load else FREE
-
-
-def ran(wanted, seconds, finger=FREE, change=None, **plant):
-    """The plate under its own loop; `wanted` (m) over time (s), `change` of the numbers of the loop."""
-    parameters = SurfaceParameters.with_overrides(plant)
-    mode, loop = parameters.carrier_mode, amplitude_loop(parameters)
-    if change is not None:
-        loop = BankController("changed", loop.tables._replace(numbers=loop.tables.numbers._replace(**change)))
-    time = np.arange(round(seconds * mode.rate)) / mode.rate
-    asked = np.broadcast_to(np.asarray(wanted(time) if callable(wanted) else wanted, float), time.shape).copy()
-    drive, _, flags, sensed = UltrasonicPlate(mode, finger).closed_loop(loop, asked)
-    return Run(time, asked, abs(hilbert(sensed.motion[:, 0])), drive[:, 0], flags, loop, mode)
 
 
 def driven(volts, seconds, finger=FREE, **plant):
@@ -90,23 +32,22 @@ def driven(volts, seconds, finger=FREE, **plant):
 @pytest.mark.parametrize("load", [0.0, 0.2, 0.5, 1.5])
 @pytest.mark.parametrize(("before", "after"), [(0.5e-6, 1e-6), (1e-6, 2e-6)])
 def test_an_amplitude_responds_in_time(level, load, before, after):
-    """From the step to within 5 % of it for good: 1.5 ms at the carrier, and the 2.5 ms of FACTS 6 moved down.
+    """From the step to within 5 % of it for good: the device's aim, 1.5 ms, at the carrier; its bound, 2.5 ms, below.
 
-    There the rate is a quarter, and so is what the inner loop does about a step that the limit has cut.
+    There the rate is an eighth, and so is what the inner loop does about a step that the limit has cut.
     """
     run = ran(lambda t: np.where(t < 0.1, before, after), 0.14, held(load), level=level).between(0.1, 0.135)
     assert run.settled_after(0.05 * (after - before) / after) <= (1.5e-3 if level == "carrier" else 2.5e-3)
     assert not (run.flags & Flag.UNLOCKED).any()
 
 
-def modulated(amplitude, frequency=400.0):
-    return lambda t: amplitude * (1 + 0.5 * np.cos(2 * np.pi * frequency * t))
-
-
 @LEVELS
 @pytest.mark.parametrize("load", [0.0, 0.5, 1.5])
 def test_modulation_at_400_hz_is_flat_for_the_headroom_that_is_told(level, load):
-    """Within 1 dB; the law leaves out m W^2 of a stiffness near 2 m w W, W/2w of it, and its drive is `drive_for`."""
+    """Within the device's bound of 1 dB, at the drive that `drive_for` tells.
+
+    The law leaves out m W^2 of a stiffness near 2 m w W, W/2w of it.
+    """
     run = ran(modulated(ASKED), 0.21, held(load), level=level).between(0.1, 0.2)
     gain = run.line(run.amplitude, 400.0) / (0.5 * ASKED)
     left = 400.0 / (2 * run.mode.carrier)
@@ -115,7 +56,8 @@ def test_modulation_at_400_hz_is_flat_for_the_headroom_that_is_told(level, load)
     swing = abs(hilbert(run.drive))[: 40 * round(run.mode.rate / 400)].reshape(40, -1).mean(axis=0)  # noise averaged
     hold = np.sinc(run.mode.carrier / run.mode.rate)
     need = (run.mode.drive_for(ASKED, 0.0, load) + 0.5 * run.mode.drive_for(ASKED, 400.0, load)) / hold
-    assert swing.max() == pytest.approx(need, rel=left + 0.03)  # and 3 % for the ripple of a drive under noise
+    ripple = np.linalg.norm(run.loop.tables.taps) * run.mode.sensor_noise / run.mode.force_constant
+    assert swing.max() == pytest.approx(need, rel=left, abs=5 * ripple / np.sqrt(40))  # of 960 phases the most, in 5
 
 
 def test_modulation_without_the_loop_is_down_by_the_low_pass_of_the_mode():
@@ -130,64 +72,17 @@ def test_modulation_without_the_loop_is_down_by_the_low_pass_of_the_mode():
 @pytest.mark.parametrize(("share", "flagged"), [(0.85, False), (1.3, True)])
 def test_a_modulation_beyond_the_headroom_is_flagged(share, flagged):
     mode = UltrasonicParameters()
-    most = ASKED * 10.0 / ((mode.drive_for(ASKED) + 0.5 * mode.drive_for(ASKED, 400.0)) / np.sinc(30 / 192))
+    hold = np.sinc(mode.carrier / SurfaceParameters().carrier_mode.rate)
+    most = ASKED * 10.0 / ((mode.drive_for(ASKED) + 0.5 * mode.drive_for(ASKED, 400.0)) / hold)
     run = ran(modulated(share * most), 0.16).between(0.1, 0.15)
     assert ((run.flags & Flag.SATURATED) != 0).any() == flagged
-    assert (abs(20 * np.log10(abs(run.line(run.amplitude, 400.0)) / (0.5 * share * most))) < 0.5) == (not flagged)
-
-
-def inner_share(run, load):
-    """Damping that a finger brings, over what the free plate and the inner loop have: how far a touch pulls."""
-    brought = float(run.mode.damping(load) - run.mode.damping(0.0))
-    return brought / (float(run.mode.damping(0.0)) + float(run.loop.tables.grip[0]))
-
-
-@LEVELS
-@LOADS
-def test_touch_and_lift_within_a_sample(level, load):
-    """Two per cent within 2.5 ms (1 at the carrier), lock not lost for 20 ms; at first the inner loop alone holds.
-
-    What it lets pass is its share of the damping, and a quarter more while its answer is a sample late.
-    """
-    finger = hr.Finger.still(normal_load=load, touches=[(0.1, 0.16)])
-    run = ran(ASKED, 0.22, finger, level=level)
-    for start in (0.1, 0.16):
-        part = run.between(start, start + 0.055)
-        assert part.settled_after(0.02) <= (1e-3 if level == "carrier" else 2.5e-3)
-        assert part.settled_after(0.01) <= 5e-3
-        assert abs(part.error).max() < 1.25 * inner_share(run, load) + NOISE
-    assert run.between(0.1, 0.21).longest_unlocked < 20e-3
-
-
-@LOADS
-def test_a_finger_that_takes_ten_milliseconds_to_press_costs_less_than_two_per_cent(load):
-    """A tap's own rise time; all along it, without any time to settle."""
-    times = (0.0, 0.1, 0.11, 0.16, 0.17, 1.0)
-    run = ran(ASKED, 0.22, hr.Finger.still(normal_load=(times, (0.0, 0.0, load, load, 0.0, 0.0))))
-    part = run.between(0.1, 0.21)
-    assert abs(part.error).max() < 0.02
-    assert part.longest_unlocked == 0.0
-
-
-def test_what_a_touch_costs_without_each_part_of_the_loop():
-    """Naive sides: no inner loop, no learning, and no loop at all: that loses the ratio of the dampings, 3.3."""
-    finger = hr.Finger.still(normal_load=0.5, touches=[(0.1, 0.2)])
-    whole = ran(ASKED, 0.22, finger).between(0.1, 0.19)
-    slack = ran(ASKED, 0.22, finger, {"inner": 0.0, "inner_awake": 0.0}).between(0.1, 0.19)
-    assert abs(slack.error).max() > 2.5 * abs(whole.error).max()
-    assert slack.settled_after(0.02) > 2.5e-3 > whole.settled_after(0.02)
-    for change, learns in ((None, True), ({"adapt": -1.0, "adapt_awake": -1.0}, False)):
-        run = ran(modulated(ASKED), 0.21, held(0.5), change).between(0.1, 0.2)
-        assert (abs(abs(run.line(run.amplitude, 400.0)) / (0.5 * ASKED) - 1) < NOISE) == learns
-    mode = UltrasonicParameters(finger_shift=0.0)
-    time, amplitude = driven(0.5, 0.22, finger, finger_shift=0.0)
-    lost = amplitude[time < 0.095][-1000:].mean() / amplitude[(time > 0.15) & (time < 0.19)].mean()
-    assert lost == pytest.approx(float(mode.damping(0.5) / mode.damping()), rel=0.01)
+    assert (abs(run.line(run.amplitude, 400.0) / (0.5 * share * most) - 1) < 0.06) == (not flagged)  # half a dB
 
 
 @LEVELS
 @pytest.mark.parametrize("load", [0.0, 0.5])
 def test_ten_kelvin_within_a_second_are_not_felt(level, load):
+    """The device's aim, 1 %, of any sample; its bound is 2 %."""
     run = ran(ASKED, 1.1, held(load), level=level, temperature_rise=10.0).between(0.1, 1.09)
     assert abs(run.error).max() < 0.01
     assert run.longest_unlocked == 0.0
@@ -199,7 +94,10 @@ def test_ten_kelvin_within_a_second_are_not_felt(level, load):
 @LEVELS
 @pytest.mark.parametrize("shift", [-30.0, -200.0])
 def test_a_resonance_that_jumps_is_found_again(level, shift):
-    """By 10 K (30 Hz) within a sample, here by a finger without damping; beyond the pole of 75 Hz the lock is lost."""
+    """By 10 K (30 Hz) within a sample, here by a finger without damping; beyond the pole of 75 Hz the lock is lost.
+
+    Never for more than the device's bound of 20 ms; within its 2 % again after 5 ms.
+    """
     finger = hr.Finger.still(normal_load=0.5, touches=[(0.1, 1.0)])
     run = ran(ASKED, 0.26, finger, level=level, finger_damping=0.0, finger_shift=shift).between(0.1, 0.25)
     assert run.longest_unlocked < 20e-3
@@ -210,7 +108,7 @@ def test_a_resonance_that_jumps_is_found_again(level, shift):
 
 def test_without_the_lock_the_drive_rises_and_a_fixed_drive_loses_seven_per_cent():
     """FACTS 6: 10 K at Q 200, sqrt(1 + (30/75)^2) = 1.077 of drive or 0.93 of amplitude."""
-    warm = {"temperature_rise": 10.0, "temperature_time": 1e-3}
+    warm = {"temperature_rise": 10.0, "temperature_time": 1e-3, "sensor_noise": 0.0}
     locked, still = (ran(ASKED, 0.35, lock=lock, **warm).between(0.25, 0.34) for lock in (20.0, 0.0))
     assert abs(still.error).max() < 0.01  # the law learns the detuning
     rise = np.sqrt(np.mean(still.drive**2) / np.mean(locked.drive**2))
@@ -222,11 +120,13 @@ def test_without_the_lock_the_drive_rises_and_a_fixed_drive_loses_seven_per_cent
 @LEVELS
 @pytest.mark.parametrize(("low", "unlocked"), [(0.0, True), (0.04e-6, True), (0.06e-6, False)])
 def test_below_a_twentieth_of_a_micrometre_the_lock_lets_go_and_takes_hold_again(level, low, unlocked):
-    """FACTS 6; meanwhile the plate has warmed by 10 K.  A flag is as old as 64 samples."""
+    """FACTS 6; meanwhile the plate has warmed by 10 K.  A flag is as old as 64 samples.
+
+    The device is to be locked again after 20 ms, also after a fall to hardly more than what tells a resonance.
+    """
     wanted = lambda t: np.where((t >= 0.1) & (t < 0.2), low, ASKED)  # noqa: E731
     run = ran(wanted, 0.26, level=level, temperature_rise=10.0, temperature_time=0.2)
-    delay = 64 / run.mode.rate
-    lost = (run.between(0.1 + delay, 0.2).flags & Flag.UNLOCKED) != 0
+    lost = (run.between(0.1 + (64 / run.mode.rate if unlocked else 20e-3), 0.2).flags & Flag.UNLOCKED) != 0
     assert lost.all() == unlocked
     assert lost.any() == unlocked
     again = run.between(0.2, 0.25)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -27,6 +28,8 @@ class FingerRange:
         How far from zero either may be expected, > 0; by these a residue is shared out between them.
     least_motion : float, coordinate's unit
         A smaller motion teaches nothing, > 0.
+    fastest : float, 1/s
+        It is learnt no faster, > 0: what noise teaches grows with the pace.
     contact : (float, float), N, or None
         Loads at which touch begins and ends, as felt by the sag; None: the load is always there.
     presence : bool
@@ -42,6 +45,7 @@ class FingerRange:
     typical_mass: float = 4e-3
     typical_stiffness: float = 300.0
     least_motion: float = 5e-8
+    fastest: float = math.inf
     contact: tuple[float, float] | None = (0.05, 0.03)
     presence: bool = False
     least_speed: float = 0.0
@@ -110,6 +114,10 @@ class BandModel:
         Length by which a sliding contact lags behind what the sensor shows.
     lock : float, Hz
         Bandwidth of the resonance lock, which moves the fixed carriers to where the device is resonant; 0: none.
+    taps : int
+        Of the inner loop where no bending mode is known, >= 3: more of them hear less noise, and answer later.
+    held : bool
+        The inner loop stays on in quiet as well, as its noise costs less than the first moment of a touch.
     unit, drive_unit : str
         Of the coordinates and of the drive.
 
@@ -146,6 +154,8 @@ class BandModel:
     late: float = 0.0
     foresight: float = 0.0
     lock: float = 0.0
+    taps: int = 3
+    held: bool = False
     unit: str = "m"
     drive_unit: str = "A"
 

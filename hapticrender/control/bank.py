@@ -20,6 +20,7 @@ from hapticrender.control.stability import Checked, Limits, checked_bandwidth
 from hapticrender.protocols import Array
 
 RAMP_TIME = 0.05  # s: a target grows this long, so that it does not strike the modes
+LEAST_RAMP = 0.5e-3  # s: and whatever the pace no faster, as drives end somewhere
 FAST_POLE, FAST_SIGMAS = 30.0, 5.5  # Hz, of the sensor noise behind that pole
 SLOW_POLE, SLOW_SIGMAS = 4.0, 5.0
 SETTLED = 0.05  # share of a target below which its error counts as settled
@@ -148,6 +149,8 @@ def design_bank(
     damping = choose_damping(model, bending=model.bending) if any(rules.inner) and feedback and prompt else None
     if damping is None or not damping.margins:
         rules = replace(rules, inner=(0.0, 0.0))
+    elif model.held:
+        rules = replace(rules, inner=(rules.inner[1], rules.inner[1]))
     if (bands.wavenumber > 0.0).any():  # what is left over at one frequency is wrong at the next
         rules = replace(rules, rest=(0.0, 0.0))
     tables = BankTables(
@@ -199,7 +202,7 @@ def _numbers(model: BandModel, bands: Bands, rules: BankRules, feedback: bool) -
         fast_time=rules.awake_time * model.rate,
         slow_time=rules.stirred_time * model.rate,
         release=period / rules.release,
-        ramp=period / RAMP_TIME * model.pace,
+        ramp=period / max(RAMP_TIME / model.pace, LEAST_RAMP),
         lowest=model.lowest_frequency,
         highest=min(model.highest_frequency, 0.4 * model.rate),
         highest_edge=float(model.highest_edge),
@@ -208,7 +211,7 @@ def _numbers(model: BandModel, bands: Bands, rules: BankRules, feedback: bool) -
         drive_limit=float(model.drive_limit),
         drive_step=float(model.drive_step),
         peak_decay=math.exp(-period * lowest),
-        back=model.pace / BACK_TIME,
+        back=_back(model),
         sensed_limit=float(model.sensed_limit),
         modulated=bands.modulated,
         differentiated=bands.differentiated,
@@ -232,6 +235,12 @@ def _numbers(model: BandModel, bands: Bands, rules: BankRules, feedback: bool) -
         least_stiffness=finger.stiffness[0],
         most_stiffness=finger.stiffness[1],
     )
+
+
+def _back(model: BandModel) -> float:
+    """Rate (1/s) of the back-calculation; of a held mode no faster than it fades, lest it chase the limit."""
+    fade = float((0.5 * model.damping.diagonal() / model.mass.diagonal()).min()) if model.held else math.inf
+    return min(model.pace / BACK_TIME, fade)
 
 
 def _paced(rules: BankRules, pace: float) -> BankRules:
@@ -261,7 +270,7 @@ def _paces(model: BandModel, bands: Bands, rules: BankRules, lowest: float, feed
     wait = model.delay * period  # integrator, observer and delay leave at least PHASE_MARGIN
     pole = [2 * math.pi * min(width, lowest / 2, apart / (2 * math.pi)) for width in rules.observer]
     fastest = [min(2 * math.pi * lowest / 4, PHASE_MARGIN / (wait + 1 / each)) for each in pole]
-    learning = 1 / (2 * wait + LEARNING_TIME / model.pace)
+    learning = min(1 / (2 * wait + LEARNING_TIME / model.pace), model.finger.fastest)
     if model.finger.contact is None:  # what is always there is as large as D: learning closes a loop by the observer
         learning = min(learning, pole[0] / LEARNING_MARGIN)
     level = 2 * math.pi * min(6.0, lowest / rules.level) * period

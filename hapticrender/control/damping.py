@@ -117,7 +117,7 @@ def damping_taps(
     bending : BendingMode, optional
         The taps of the coordinates that it couples to carry a pair of zeros at it.
     count : int, optional
-        How many taps, at least as many as there are equations: 3, or 5 with zeros, which is the default.
+        How many taps, at least as many as there are equations, 3 or 5 with zeros; by default `model.taps` or 5.
 
     Returns
     -------
@@ -136,10 +136,10 @@ def damping_taps(
     Three linear equations (FACTS section 3 A): sum c_i = 0, so that the sag is left alone, and
     sum c_i e^(-j w1 i T) = j w1 grip e^(j w1 (delay + 1/2) T)/sinc(w1 T/2), so that after delay and hold the force is
     that of a damper.  Two more with a bending mode w_b: sum c_i e^(-j w_b i T) = 0.  More taps than equations are the
-    least in sum c_i^2, hence in noise; a coordinate without zeros uses three and leaves the others at zero.
+    least in sum c_i^2, hence in noise; a coordinate without zeros uses `model.taps` and leaves others at zero.
     """
     least = TAPS if bending is None else TAPS + 2
-    count = least if count is None else count
+    count = (model.taps if bending is None else least) if count is None else count
     if not quality > 0:
         raise ValueError(f"{quality=} must be > 0")
     if count < least:
@@ -153,7 +153,7 @@ def damping_taps(
         equations = [(0.0, 0.0), (omega / model.rate, force)]
         if bending is not None and notched:
             equations.append((2 * np.pi * bending.frequency / model.rate, 0.0))
-        reach = count if notched else TAPS
+        reach = count if notched else min(model.taps, count)
         taps[c, :reach] = _least_taps(equations, reach)
     return taps, grip
 
@@ -204,7 +204,7 @@ def choose_damping(
     lag = f"a delay of {model.delay} sample{'s' * (model.delay != 1)} at {model.rate:g} Hz"
     if largest < least:
         return _off(model, f"off: the modes damp themselves (Q {WORTH * largest:.1f})")
-    if (model.delay + 0.5) / model.rate * mode.max() > 2 * np.pi:
+    if not within_a_turn(model):
         return _off(model, f"off: {lag} is longer than a period of the mode at {mode.max() / (2 * np.pi):.0f} Hz")
     complaint = raised = ""
     for step in range(int((largest - least) / QUALITY_STEP) + 1):
@@ -224,10 +224,15 @@ def choose_damping(
     return _off(model, f"off: {lag} leaves {complaint} even at Q {quality:g}")
 
 
+def within_a_turn(model: BandModel) -> bool:
+    """Whether delay and hold are no longer than a period of the fastest mode."""
+    return bool((model.delay + 0.5) / model.rate * modes_of(model)[0].max() <= 2 * np.pi)
+
+
 def _counts(model: BandModel, bending: BendingMode | None) -> list[int]:
     """Numbers of taps worth trying."""
     if bending is None or not any(bending.coupling):
-        return [TAPS if bending is None else TAPS + 2]
+        return [model.taps if bending is None else TAPS + 2]
     return sorted({max(TAPS + 2, 1 + round(span * model.rate / bending.frequency)) for span in REACHES})
 
 

@@ -28,6 +28,7 @@ from hapticrender.plants.ultrasonic_kernels import (
 from hapticrender.protocols import Array
 
 SATURATED = 1  # the flag
+LEAST_SLEW = 0.05  # of the drive's slew: an amplitude beyond what it can hold is asked for, and flagged
 POSITION, LOAD, STRENGTH, SPEED = range(4)  # columns of the finger
 
 
@@ -40,6 +41,7 @@ class SurfaceTables(NamedTuple):
     least: float  # least mu/mu0 that is asked for
     load: float  # N: what the amplitude is held for while no finger is there
     speed: float  # m/s, alike
+    slew: float  # m: by which the drive can change an amplitude of nothing in a sample of the carrier
     estimating: bool  # what is sensed is the friction that the sensed amplitude leaves; else the tribometer's
     law: LawNumbers
     mode: UltrasonicTables
@@ -54,6 +56,7 @@ class SurfaceState(NamedTuple):
     control: BankState
     sliding: SlidingState
     wanted: Array  # (1,) amplitude (m) at the end of the last sample
+    asked: Array  # (1,) amplitude (m) that the drive could reach by then; negative: it starts from rest
     estimate: Array  # (1,) friction (N) by the sensed amplitude
     heard: Array  # (1,) sensor of the carrier (m)
     motion: Array  # (1,) the mode's displacement (m)
@@ -71,20 +74,52 @@ def wanted_ratio(tables, drive, whole):
 
 
 @kernel
+def amplitude_fade(control, touch, period):
+    """Share of its amplitude that the mode loses in a sample of the carrier, by what is known of its finger."""
+    return 0.5 * period * (control.damping[0, 0] + max(touch[row.DAMPING], 0.0)) / control.mass[0, 0]
+
+
+@kernel
+def within_reach(asked, wanted, slew, fade):
+    """Amplitude (m) on the way from `asked` to `wanted` to which the drive can take it within a sample.
+
+    Asked for more, the drive would end up at its limit, with the loop open.  From rest the loop's own ramp is slower.
+    """
+    lost = fade * asked
+    rise = max(slew - lost, LEAST_SLEW * slew)
+    return asked + min(max(wanted - asked, -slew - lost), rise)
+
+
+@kernel
 def amplitude_pass(tables, state, wanted, mode, noise):
     """Carry the amplitude on a straight line to `wanted` (m); mean true amplitude (m) and flags."""
     flags, energy = 0, 0.0
     scale, z = 1.0 / (mode[1] * tables.mode.period), state.mode.z
-    before = state.wanted[0]
+    before, asked = state.wanted[0], state.asked[0]
     state.wanted[0] = wanted
+    fade = amplitude_fade(tables.control, state.control.touch, tables.mode.period)
     for k in range(tables.substeps):
-        asked = before + (wanted - before) * (k + 1) / tables.substeps
+        line = before + (wanted - before) * (k + 1) / tables.substeps
+        asked = within_reach(asked, line, tables.slew, fade) if state.asked[0] >= 0.0 else line
+        if asked != line:
+            flags |= SATURATED
         mode_drive(tables.mode, state.mode, state.drive)
         flags |= mode_sense(tables.mode, state.mode, noise[1 + k : 2 + k], state.heard, state.motion)
         mode_advance(tables.mode, state.mode, mode)
         flags |= bank_step(tables.control, state.control, state.heard, math.nan, asked, state.drive, state.target)
         energy += z[0] * z[0] + scale * scale * z[1] * z[1]
+    state.asked[0] = asked
     return math.sqrt(energy / tables.substeps), flags
+
+
+@kernel
+def ask_within_reach(wanted, before, slew, fade, asked, flags):
+    """The same for every element of `wanted` (m), after `before`; what had to wait is flagged."""
+    for n in range(wanted.shape[0]):
+        before = within_reach(before, wanted[n], slew, fade)
+        if before != wanted[n]:
+            flags[n] |= SATURATED
+        asked[n] = before
 
 
 @kernel

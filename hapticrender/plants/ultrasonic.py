@@ -82,7 +82,7 @@ class UltrasonicParameters(Validated):
     sensor_bits, drive_bits : int
         Resolution over `sensor_range` and over +- `drive_limit`; 0 is ideal.
     sensor_noise : float, m rms
-        White noise of each sample, >= 0.
+        White noise of each sample at `rate`, >= 0; at another rate its density stays.
     rate : float, Hz
         Sampling rate of the loop; the default is what a sound card can do.
     delay : int, samples
@@ -151,14 +151,22 @@ class UltrasonicParameters(Validated):
                     f"must be within {MOST_SHIFT * self.carrier:g} Hz of a carrier of {self.carrier:g} Hz"
                 )
 
+    def sampled(self, rate: float) -> UltrasonicParameters:
+        """Return the same plate at `rate` (Hz); the sensor's noise keeps its density."""
+        return replace(self, rate=rate, sensor_noise=self._noise_at(rate))
+
     def transposed(self, frequency: float, rate: float) -> UltrasonicParameters:
         """Return the same plate at level "envelope": its mode on a carrier of `frequency` (Hz) at `rate` (Hz).
 
         The sensor's noise keeps its density, so that it disturbs the envelope alike; its resolution stays, and with
         it grows the density of rounding.  The delay stays in samples: at a lower rate it is a longer one.
         """
-        noise = self.sensor_noise * math.sqrt(rate / self.rate) if rate > 0.0 else self.sensor_noise
+        noise = self._noise_at(rate)
         return replace(self, level="envelope", envelope_frequency=frequency, rate=rate, sensor_noise=noise)
+
+    def _noise_at(self, rate: float) -> float:
+        """Noise of a sample (m rms) at `rate` (Hz), of the same density."""
+        return self.sensor_noise * math.sqrt(rate / self.rate) if rate > 0.0 else self.sensor_noise
 
     @property
     def carrier(self) -> float:

@@ -1,0 +1,247 @@
+"""What a touch costs an ultrasonic amplitude, against what it may, what theory says, and what no loop can undercut.
+
+The device is to stay within 2 % under touch and lift (aim 1 %), and not to lose its lock for more than 20 ms.
+"""
+
+import numpy as np
+import pytest
+from scipy.signal import hilbert
+from test_ultrasonic_rendering import Watched, driven, friction_of
+from ultrasonic import ASKED, NOISE, held, inner_share, modulated, ran
+
+import hapticrender as hr
+from hapticrender import accuracy_friction
+from hapticrender.control.stability import STATES, bank_loop
+from hapticrender.loop import prepare
+from hapticrender.loop import run as play
+from hapticrender.plants import surface
+from hapticrender.plants.fidelity_surface import AmplitudeLoop
+from hapticrender.plants.surface import SurfaceParameters
+from hapticrender.plants.ultrasonic import UltrasonicParameters
+from hapticrender.protocols import Flag
+from hapticrender.renderers import resonant
+from hapticrender.renderers.ultrasonic import amplitude_loop
+
+LEVELS = pytest.mark.parametrize("level", ["carrier", "envelope"])
+LOADS = pytest.mark.parametrize("load", [0.2, 0.5, 1.5])
+BOUND = 0.02  # of the amplitude, under touch and lift
+UNLOCKED = 20e-3  # s: longest without lock
+PHASE = 45.0  # deg: as the bank's own rule for its integral has it
+MODULUS = 0.5  # Ms 2
+THIN = 0.25  # Ms 4, where the loop is late and has no inner one
+FELT = 0.1  # an error that lies below every just noticeable difference [FACTS 7]
+SLOWER = 1.5  # times: how much a constant may not be moved
+RESPONSE = 1.5e-3  # s: within which the amplitude is to answer
+SUBSTEPS = 20  # of a sample, in which the twin below is integrated
+
+
+def pressed(load, rise, late=0.0):
+    """A finger that presses from 0.1 s on and lets go from 0.16 s, each within `rise` (s), by `late` (s) later."""
+    if rise == 0.0:
+        return hr.Finger.still(normal_load=load, touches=[(0.1 + late, 0.16 + late)])
+    times = (0.0, 0.1 + late, 0.1 + late + rise, 0.16 + late, 0.16 + late + rise, 1.0)
+    return hr.Finger.still(normal_load=(times, (0.0, 0.0, load, load, 0.0, 0.0)))
+
+
+@LEVELS
+@LOADS
+def test_an_amplitude_is_back_after_a_touch_within_a_sample(level, load):
+    """Within 2 % long before the device's 2.5 ms of response have passed, 0.1 ms at the carrier; lock as it is to be.
+
+    At level "envelope" the inner loop alone holds at first.  What it lets pass is its share of the damping, and a
+    quarter more while its answer is a sample late.
+    """
+    run = ran(ASKED, 0.22, pressed(load, 0.0), level=level)
+    for start in (0.1, 0.16):
+        part = run.between(start, start + 0.055)
+        assert part.settled_after(BOUND) <= (0.1e-3 if level == "carrier" else 2.5e-3)
+        assert part.settled_after(BOUND / 2) <= 5e-3
+        assert abs(part.error).max() < 1.25 * inner_share(run, load) + NOISE
+    assert run.between(0.1, 0.21).longest_unlocked < UNLOCKED
+
+
+@LOADS
+@pytest.mark.parametrize(("rise", "bound"), [(1e-3, BOUND), (10e-3, BOUND / 2)])
+def test_a_load_that_takes_its_time_costs_no_more_than_it_may(load, rise, bound):
+    """The peak at the default settings: 2 % where it takes a millisecond, 1 % over ten, a hard tap's own rise time.
+
+    Whatever the phase of the carrier at which it begins: three of them, a seventh of a turn apart or so.
+    """
+    for late in (0.0, 5e-6, 10e-6):
+        run = ran(ASKED, 0.22, pressed(load, rise, late))
+        part = run.between(0.1, 0.21)
+        assert abs(part.error).max() < bound
+        assert part.longest_unlocked == 0.0
+
+
+def test_a_device_of_192_khz_bears_a_load_of_half_a_newton_in_a_millisecond():
+    """Half the rate: the inner loop holds less, the pace is halved."""
+    part = ran(ASKED, 0.22, pressed(0.5, 1e-3), oversampling=16).between(0.1, 0.21)
+    assert abs(part.error).max() < BOUND
+
+
+@pytest.mark.parametrize("load", [0.2, 1.5])
+def test_the_envelope_level_is_not_for_touches(load):
+    """It steps at an eighth of the rate, so a touch has eight times as long before it is answered."""
+    part = ran(ASKED, 0.22, pressed(load, 1e-3), level="envelope").between(0.1, 0.21)
+    assert abs(part.error).max() > 2 * BOUND
+
+
+def dead(mode, tables):
+    """Seconds in which a force answers the envelope: delay and half a hold, and beyond them the taps' group delay."""
+    turn = 2 * np.pi * mode.carrier / mode.rate
+    order, taps = np.arange(tables.taps.shape[1]), tables.taps[0]
+    each = taps * np.exp(-1j * turn * order)
+    return (mode.delay + 0.5) / mode.rate, float(((order * each).sum() / each.sum()).real) / mode.rate
+
+
+def predicted(run, before, after):
+    """Peak error of the envelope under a step of the load (N), without noise, by a twin in a few lines.
+
+    With x the deviation from what is wanted, v the integral's part, s = b/2m, k = grip/2m and the dead times of force
+    (d) and of the inner loop (d + g)::
+
+        x' = (s0 - s) - s x - k (x - v)(t - d - g) + (s0 v + v')(t - d),  v' = -ki E,  E' = p (x - E)
+    """
+    mode, tables = run.mode, run.loop.tables
+    numbers, step = tables.numbers, 1 / (SUBSTEPS * mode.rate)
+    force, taps = dead(mode, tables)
+    late, held_back = round(force / step), round((force + taps) / step)
+    first, then = (float(mode.damping(load)) / (2 * mode.mass) for load in (before, after))
+    inner, pole = float(tables.grip[0]) / (2 * mode.mass), numbers.observer_awake * mode.rate / 2
+    size = round(0.5e-3 / step) + held_back
+    x, v, slope, seen = np.zeros(size), np.zeros(size), np.zeros(size), 0.0
+    for n in range(held_back, size - 1):
+        drive = first * v[n - late] + slope[n - late] - inner * (x[n - held_back] - v[n - held_back])
+        x[n + 1] = x[n] + step * (first - then - then * x[n] + drive)
+        seen += step * pole * (x[n] - seen)
+        slope[n] = -numbers.integral_awake * seen
+        v[n + 1] = v[n] + step * slope[n]
+    return abs(x).max()
+
+
+@LOADS
+@pytest.mark.parametrize("oversampling", [16, 32])
+def test_a_load_within_a_sample_costs_what_theory_says(load, oversampling):
+    """No causal loop can do better than the two samples until its force acts: 1 - e^(-ds 2 T).
+
+    Then the inner loop answers as late as the taps look back, and the integral makes up for the rest: by the twin, to
+    the noise of the amplitude.
+    """
+    run = ran(ASKED, 0.22, pressed(load, 0.0), oversampling=oversampling)
+    for start, before, after in ((0.1, 0.0, load), (0.16, load, 0.0)):
+        peak = abs(run.between(start - 1e-5, start + 0.055).error).max()
+        assert peak == pytest.approx(predicted(run, before, after), abs=NOISE)
+        apart = float(run.mode.damping(before) - run.mode.damping(after)) / (2 * run.mode.mass)
+        assert peak > abs(np.expm1(apart * 2 / run.mode.rate))
+
+
+def test_what_the_least_load_costs_within_a_sample():
+    """0.2 N by the twin, without noise."""
+    run = ran(ASKED, 0.01)
+    assert max(predicted(run, 0.0, 0.2), predicted(run, 0.2, 0.0)) < BOUND
+
+
+def test_what_a_touch_costs_without_each_part_of_the_loop():
+    """Naive sides: no inner loop, with that neither any learning, and no loop at all: the dampings' ratio, 3.3."""
+    finger = hr.Finger.still(normal_load=0.5, touches=[(0.1, 0.2)])
+    whole = ran(ASKED, 0.22, finger).between(0.1, 0.19)
+    without = {"inner": 0.0, "inner_awake": 0.0}
+    slack = ran(ASKED, 0.22, finger, without).between(0.1, 0.19)
+    assert abs(slack.error).max() > 2 * abs(whole.error).max()
+    for change, learns in (({}, True), ({"adapt": -1.0, "adapt_awake": -1.0}, False)):
+        run = ran(modulated(ASKED), 0.21, held(0.5), without | change).between(0.1, 0.2)
+        assert (abs(abs(run.line(run.amplitude, 400.0)) / (0.5 * ASKED) - 1) < NOISE) == learns
+    mode = UltrasonicParameters(finger_shift=0.0)
+    time, amplitude = driven(0.5, 0.22, finger, finger_shift=0.0)
+    lost = amplitude[time < 0.095][-1000:].mean() / amplitude[(time > 0.15) & (time < 0.19)].mean()
+    assert lost == pytest.approx(float(mode.damping(0.5) / mode.damping()), rel=0.01)
+
+
+def test_an_inner_loop_that_is_always_on_costs_two_per_cent_of_the_drive_in_noise():
+    """Taps times the sensor's noise, which the loop's sensitivity colours; the amplitude wavers by 0.1 %."""
+    run = ran(ASKED, 0.3).between(0.1, 0.29)
+    force = float(np.linalg.norm(run.loop.tables.taps)) * run.mode.sensor_noise
+    ripple = np.std(hilbert(run.drive) * np.exp(-2j * np.pi * run.mode.carrier * run.time)) / np.sqrt(2)
+    assert ripple == pytest.approx(force / run.mode.force_constant, rel=0.2)
+    assert ripple < 0.02 * run.mode.drive_limit
+    assert run.error.std() < 1.5e-3
+
+
+def phase_margin(**plant):
+    """Least phase margin (deg) of the amplitude loop as it is awake."""
+    tables = amplitude_loop(SurfaceParameters.with_overrides(plant)).tables
+    return np.degrees(bank_loop(tables, "awake").margins().phase)
+
+
+@pytest.mark.parametrize(("oversampling", "delay"), [(32, 1), (32, 2), (16, 1), (16, 4)])
+def test_the_pace_is_as_fast_as_the_phase_allows_with_an_inner_loop(monkeypatch, oversampling, delay):
+    """`PACED_DELAY`: 45 degrees are left, and no longer if it is half as long again."""
+    assert phase_margin(oversampling=oversampling, delay=delay) >= PHASE
+    monkeypatch.setattr(surface, "PACED_DELAY", SLOWER * surface.PACED_DELAY)
+    assert phase_margin(oversampling=oversampling, delay=delay) < PHASE
+
+
+def modulus(**plant):
+    """Least modulus margin of the amplitude loop over loads and states, what it learns of the finger being part."""
+    parameters = SurfaceParameters.with_overrides(plant)
+    mode, tables = parameters.carrier_mode, amplitude_loop(parameters).tables
+    ends = (-0.98 * mode.carrier, mode.rate / 2 - mode.carrier - 1.0)
+    turn = 2 * np.pi * np.concatenate([np.sign(end) * np.geomspace(0.1, abs(end), 3000) for end in ends])
+    found = []
+    for state in STATES:
+        for load in (0.0, 0.5, 1.5):
+            loop = AmplitudeLoop(parameters=parameters, tables=tables, load=load, rise=0.0, state=state)
+            along, fed_back = loop._round(turn)
+            found.append(abs(1 + along * fed_back).min())
+    return min(found)
+
+
+@pytest.mark.parametrize("plant", [{}, {"oversampling": 16}, {"delay": 4}, {"frequency": 70e3, "oversampling": 38}])
+def test_learning_leaves_the_loop_its_margin(plant):
+    assert modulus(**plant) >= MODULUS
+
+
+def test_the_pace_of_a_late_loop_is_as_fast_as_its_margin_allows(monkeypatch):
+    """`PACED_DELAY_ALONE`, at the longest delay: Ms 4, thin, for the sake of textures of f d = 1/15."""
+    late = {"oversampling": 16, "delay": round(resonant.LONGEST_DELAY * 192e3)}
+    assert modulus(**late) >= THIN
+    monkeypatch.setattr(surface, "PACED_DELAY_ALONE", SLOWER * surface.PACED_DELAY_ALONE)
+    assert modulus(**late) < THIN
+
+
+def felt(delay, frequency):
+    """Error of a friction behind a device of 192 kHz that is `delay` samples late, in blocks of 16."""
+    finger = hr.Finger.sliding(speed=0.08, normal_load=0.4, mechanics="light")
+    texture = hr.Grating(frequency=frequency, velocity=10e-3)
+    scene = hr.Scene(texture=texture, finger=finger, duration=0.42, settle=0.2, device="ultrasonic")
+    device = Watched(UltrasonicParameters(delay=delay), block=16)
+    play(prepare(scene, driver=device))
+    return friction_of(np.concatenate(device.moved), frequency) / (10e-3 / 0.64) - 1
+
+
+def test_the_longest_delay_is_what_400_hz_bear(monkeypatch):
+    """`LONGEST_DELAY`: below what any finger tells, and beyond it if it is half as long again."""
+    longest = round(resonant.LONGEST_DELAY * 192e3)
+    assert abs(felt(longest, 400.0)) < FELT
+    monkeypatch.setattr(resonant, "LONGEST_DELAY", SLOWER * resonant.LONGEST_DELAY)
+    assert abs(felt(round(SLOWER * longest / 16) * 16, 400.0)) > FELT
+
+
+@LOADS
+def test_a_step_that_the_drive_cannot_make_at_once_is_made_as_fast_as_it_can(monkeypatch, load):
+    """Half a micrometre to three and back, and flagged meanwhile.  Naive: at its limit the loop takes its time."""
+
+    def response():
+        plate = accuracy_friction.surface(load)
+        wanted = np.repeat([0.5e-6, 3e-6, 0.5e-6], round(0.1 * plate.rate))
+        flags = np.asarray(accuracy_friction.driven(plate, wanted, load).flags)
+        off = abs(plate.amplitude - wanted).reshape(3, -1)
+        return max(accuracy_friction.back(each, 0.05 * 2.5e-6, plate.rate) for each in off[1:]), flags.reshape(3, -1)
+
+    governed, flags = response()
+    assert governed <= RESPONSE
+    assert (flags[1:, 0] & Flag.SATURATED).all()
+    assert not flags[:, round(RESPONSE * 12e3) :].any()
+    monkeypatch.setattr(surface, "DRIVEN", 1e6)
+    assert response()[0] > RESPONSE
