@@ -238,8 +238,8 @@ def _numbers(model: BandModel, bands: Bands, rules: BankRules, feedback: bool) -
 
 
 def _back(model: BandModel) -> float:
-    """Rate (1/s) of the back-calculation; of a held mode no faster than it fades, lest it chase the limit."""
-    fade = float((0.5 * model.damping.diagonal() / model.mass.diagonal()).min()) if model.held else math.inf
+    """Rate (1/s) of the back-calculation; of a held mode no faster than it loses energy, lest it chase the limit."""
+    fade = float((model.damping.diagonal() / model.mass.diagonal()).min()) if model.held else math.inf
     return min(model.pace / BACK_TIME, fade)
 
 
