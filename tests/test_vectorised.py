@@ -65,6 +65,7 @@ def test_controllers_work_on_whole_registers(kind, precision, suffix):
     assert every > 200
     assert widest > 0.8 * every
     assert not re.search(r"\b(?:sin|cos|atan2)f?\b", assembly)
+    assert re.search(r"and\w?\s+\$-64, %rsp", assembly)  # what does not fit the registers is put aside in whole lines
 
 
 @pytest.mark.skipif(platform.machine() not in ("x86_64", "AMD64"), reason="reads x86-64 assembly")

@@ -38,9 +38,9 @@ REFRESH = 64  # samples between two looks at the tones; a block is cut there, to
 # the last refresh (turns); low-pass states of the wanted waveform
 LIVE, FREQUENCY, WAVENUMBER, PHASE, WANTED_RE, WANTED_IM = range(6)
 TURNS, COS, SIN, TURN_COS, TURN_SIN, FORWARD = range(6, 12)
-TARGET_RE, TARGET_IM, AMOUNT, HEADING_RE, HEADING_IM, FRAME_RE, FRAME_IM, START = range(12, 20)
-REF_RE1, REF_RE2, REF_IM1, REF_IM2 = range(20, 24)
-BAND_ROWS = 24
+TARGET_RE, TARGET_IM, AMOUNT, HEADING_RE, HEADING_IM, FRAME_RE, FRAME_IM, FRAME, START = range(12, 21)
+REF_RE1, REF_RE2, REF_IM1, REF_IM2 = range(21, 25)
+BAND_ROWS = 25
 # rows of PolarState.loop, LOOP_ROWS for each coordinate: low-pass states, states of amplitude and phase loop, X over
 # the frame; drive per metre from the look-up table, and the device's lag (rad)
 RE1, RE2, IM1, IM2, AMPLITUDE1, AMPLITUDE2, THETA1, THETA2, X_RE, X_IM, DRIVE, LAG = range(12)
@@ -184,6 +184,7 @@ def turn_frame(state, t, aimed):
                 put(loop, t, base + IM1 + r, x * by_im + y * by_re)
         put(band, t, FRAME_RE, re)
         put(band, t, FRAME_IM, im)
+        put(band, t, FRAME, (1.0 / TURN) * polar(im, re)[1])
 
 
 @kernel
@@ -201,17 +202,23 @@ def count_on(tables, state, t, count):
 
 @kernel
 def take_tones(tables, state, t):
-    """Tones of a tile, as they are asked for now; their phases, and look-ups where they are new."""
+    """Tones of a tile, as they are asked for now; their phases, and look-ups where they are new.
+
+    Returns whether what is wanted may have changed.
+    """
     tone, band, width, start = tables.tone, state.band, state.band.shape[2], t * state.band.shape[2]
     count, known = min(width, tone.shape[1] - start), state.locked[t] == 0
     if known and count == width:  # at most of the refreshes nothing is new
         now = taken(tone, 0, start, lanes(band, t, FREQUENCY))
         known = not any_of((lanes(band, t, LIVE) <= 0.0) | (size(now - lanes(band, t, FREQUENCY)) > 0.0))
+        re, im = taken(tone, 3, start, now), taken(tone, 4, start, now)
+        off = size(re - lanes(band, t, WANTED_RE)) + size(im - lanes(band, t, WANTED_IM))
+        changed = any_of(off + size(taken(tone, 1, start, now) - lanes(band, t, WAVENUMBER)) > 0.0)
         for r in range(1, tone.shape[0]):
             put(band, t, FREQUENCY + r, taken(tone, r, start, now))
         state.locked[t] = 1 if any_of(lanes(band, t, WAVENUMBER) > 0.0) else 0
     else:
-        state.locked[t] = 0
+        state.locked[t], changed = 0, True
         for i in range(count):
             frequency = band[t, FREQUENCY, i]
             for r in range(tone.shape[0]):
@@ -227,6 +234,7 @@ def take_tones(tables, state, t):
         cos, sin = unit(1.0 / tables.numbers.rate * lanes(band, t, FREQUENCY))
         put(band, t, TURN_COS, cos)
         put(band, t, TURN_SIN, sin)
+    return changed or not known
 
 
 @kernel
@@ -234,18 +242,18 @@ def refresh(tables, state):
     """Take up the tones that are asked for; phases and look-ups of fixed carriers, whose targets stay if constant."""
     numbers, band = tables.numbers, state.band
     for t in range(band.shape[0]):
-        take_tones(tables, state, t)
-        fixed = state.locked[t] == 0
-        if fixed and not numbers.analysed:
+        changed, fixed = take_tones(tables, state, t), state.locked[t] == 0
+        if changed and fixed and not numbers.analysed:
             aim(band, t, lanes(band, t, WANTED_RE), lanes(band, t, WANTED_IM))
-        turn_frame(state, t, fixed and in_frames(numbers, state))
+        if changed or not fixed or numbers.analysed:
+            turn_frame(state, t, fixed and in_frames(numbers, state))
         if fixed:
             live, turns = lanes(band, t, LIVE), lanes(band, t, TURNS) + lanes(band, t, PHASE)
             re, im = lanes(band, t, FRAME_RE), lanes(band, t, FRAME_IM)
             cos, sin = unit(turns)
             put(band, t, COS, live * (cos * re - sin * im))
             put(band, t, SIN, live * (sin * re + cos * im))
-            put(band, t, START, turns + (1.0 / TURN) * polar(im, re)[1])
+            put(band, t, START, turns + lanes(band, t, FRAME))
 
 
 @kernel

@@ -39,7 +39,6 @@ from hapticrender.control.polar_kernels import (
     recall,
     refresh,
     remember,
-    section_step,
     share,
     tile_step,
 )
@@ -88,24 +87,45 @@ def carry_on(state, t, number, rate):
 
 
 @kernel
-def usual_step(tables, state, t, c, cos, sin, wish):
-    """Drive of a tile in coordinate c: `listen` and `answer` where X is counted from what is wanted."""
-    section, law, loop, base = tables.numbers.filter, tables.numbers.law, state.loop, c * LOOP_ROWS
-    gain = 2.0 * section[0] * state.shared[SHARED_ROWS + c, 0]
-    at, wanted = base + RE1, lanes(state.band, t, AMOUNT)
-    re, a1, a2 = section_step(section, lanes(loop, t, at), lanes(loop, t, at + 1), gain, 4.0 * gain, cos)
-    im, b1, b2 = section_step(section, lanes(loop, t, at + 2), lanes(loop, t, at + 3), -gain, -4.0 * gain, sin)
-    for r, value in enumerate((a1, a2, b1, b2)):
-        put(loop, t, at + r, value)
+def heard(numbers, loop, t, base, gain, cos, sin):
+    """Amplitude and phase of X of a tile, counted from what is wanted: `listen` to a coordinate, and eq. 5.
+
+    `gain` is 2 b0 times what it hears.  X has a minus in its sine, which is taken away rather than turned round: of one
+    number less to repeat in every lane.
+    """
+    section, at, four = numbers.filter, base + RE1, 4.0 * gain
+    s1, s2, c1, c2 = lanes(loop, t, at), lanes(loop, t, at + 1), lanes(loop, t, at + 2), lanes(loop, t, at + 3)
+    re, slow = gain * cos + s1, four * cos + s2
+    put(loop, t, at, s1 + slow - (2.0 + section[3]) * re)
+    put(loop, t, at + 1, slow - (1.0 + section[3] + section[4]) * re)
+    im, slow = c1 - gain * sin, c2 - four * sin
+    put(loop, t, at + 2, c1 + slow - (2.0 + section[3]) * im)
+    put(loop, t, at + 3, slow - (1.0 + section[3] + section[4]) * im)
     put(loop, t, base + X_RE, re)
     put(loop, t, base + X_IM, im)
-    found, lag = polar(im, re)
-    at, to, sounds = base + AMPLITUDE1, base + THETA1, select(wanted > QUIET, 1.0, 0.0 * wanted)
-    amount, a1, a2 = clamped_step(law, lanes(loop, t, at), lanes(loop, t, at + 1), wanted - found, tables.numbers.floor)
-    theta, b1, b2 = law_step(law, lanes(loop, t, to), lanes(loop, t, to + 1), sounds, 4.0 * sounds, lag)
-    for r, value in enumerate((a1, a2, b1, b2)):
-        put(loop, t, at + r, value)
+    return polar(im, re)
+
+
+@kernel
+def answered(numbers, loop, t, base, wanted, found, lag, wish):
+    """Drive of a tile in a coordinate: `answer` to an amplitude and a phase."""
+    law, at, to, sounds = numbers.law, base + AMPLITUDE1, base + THETA1, select(wanted > QUIET, 1.0, 0.0 * wanted)
+    amount, s1, s2 = clamped_step(law, lanes(loop, t, at), lanes(loop, t, at + 1), wanted - found, numbers.floor)
+    put(loop, t, at, s1)
+    put(loop, t, at + 1, s2)
+    theta, s1, s2 = law_step(law, lanes(loop, t, to), lanes(loop, t, to + 1), sounds, 4.0 * sounds, lag)
+    put(loop, t, to, s1)
+    put(loop, t, to + 1, s2)
     return law[0] * lanes(loop, t, base + DRIVE) * amount * cosine(wish - (law[0] / TURN) * theta)
+
+
+@kernel
+def usual_step(tables, state, t, c, cos, sin, wish):
+    """Drive of a tile in coordinate c: `listen` and `answer` where X is counted from what is wanted."""
+    numbers, base = tables.numbers, c * LOOP_ROWS
+    gain = 2.0 * numbers.filter[0] * state.shared[SHARED_ROWS + c, 0]
+    found, lag = heard(numbers, state.loop, t, base, gain, cos, sin)
+    return answered(numbers, state.loop, t, base, lanes(state.band, t, AMOUNT), found, lag, wish)
 
 
 @kernel
@@ -123,19 +143,23 @@ def tiles_step(tables, state, target):
 
 
 @kernel
-def gather(state):
-    """Sum the drive of each coordinate over the lanes, as far as it is trusted, and clear the sums for the next."""
+def gather(tables, state, m):
+    """Sum the drive of each coordinate over the lanes, as far as it is trusted, and clear the sums for the next.
+
+    Returns that of the first two.
+    """
     shared, coordinates = state.shared, state.sum.shape[0]
     for c in range(0, coordinates, 2):
         d = min(c + 1, coordinates - 1)
-        one, other = totals(1.0, lanes(state.sum, c, 0), lanes(state.sum, d, 0))
-        shared[SHARED_ROWS + c, 0], shared[SHARED_ROWS + d, 0] = shared[TRUST, 0] * one, shared[TRUST, 0] * other
-        put(state.sum, c, 0, 0.0 * lanes(state.band, 0, LIVE))
-        put(state.sum, d, 0, 0.0 * lanes(state.band, 0, LIVE))
+        one, other = totals(1.0, lanes(state.sum, c, m), lanes(state.sum, d, m))
+        shared[SHARED_ROWS + c, m], shared[SHARED_ROWS + d, m] = shared[TRUST, m] * one, shared[TRUST, m] * other
+        put(state.sum, c, m, 0.0 * lanes(state.band, 0, LIVE))
+        put(state.sum, d, m, 0.0 * lanes(state.band, 0, LIVE))
+    return shared[SHARED_ROWS, m], shared[SHARED_ROWS + min(coordinates - 1, 1), m]
 
 
 @kernel
-def speak(tables, state, one, other, drive):
+def speak(tables, state, m, one, other, drive):
     """Drive of the channels from that of the coordinates, each cut to its limit.  Returns flags."""
     limit, flags, coordinates = tables.numbers.drive_limit, 0, tables.listen.shape[0]
     for i in range(drive.shape[0]):
@@ -143,7 +167,7 @@ def speak(tables, state, one, other, drive):
         if coordinates > 1:
             asked += tables.speak[i, 1] * other
         for c in range(2, coordinates):
-            asked += tables.speak[i, c] * state.shared[SHARED_ROWS + c, 0]
+            asked += tables.speak[i, c] * state.shared[SHARED_ROWS + c, m]
         drive[i] = min(max(asked, -limit), limit)
         if drive[i] != asked:
             flags = 1
@@ -166,8 +190,6 @@ def polar_step(tables, state, sensed, position, wanted, drive, target):
     else:
         for t in range(state.band.shape[0]):
             tile_step(tables, state, t, 0, target)
-        gather(state)
-        last = min(tables.listen.shape[0] - 1, 1)
-        one, other = state.shared[SHARED_ROWS, 0], state.shared[SHARED_ROWS + last, 0]
+        one, other = gather(tables, state, 0)
     state.sample[0] += 1
-    return flags | speak(tables, state, one, other, drive)
+    return flags | speak(tables, state, 0, one, other, drive)

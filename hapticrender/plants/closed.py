@@ -11,6 +11,7 @@ from hapticrender.control.bank_kernels import bank_step
 from hapticrender.control.bank_state import BankTables
 from hapticrender.control.complex_kernels import ComplexTables, complex_step
 from hapticrender.control.polar_kernels import PolarTables
+from hapticrender.control.polar_pair import in_pairs, polar_pair
 from hapticrender.control.polar_steps import polar_step
 from hapticrender.plants.kernels import plate_advance, plate_drive, plate_sense
 
@@ -39,4 +40,24 @@ def closed_plate_run(
         flags[n] |= control_step(control, control_state, sensed[n], finger[n, 0], wanted[n], last, target[n])
 
 
-CLOSED = dict.fromkeys(STEPS, closed_plate_run)
+@kernel
+def closed_polar_run(
+    tables, state, control, control_state, last, finger, noise, wanted, sensed, motion, drive, target, flags
+):
+    """`closed_plate_run` of the paper's controller, whose samples are taken in pairs where they may be."""
+    count, waiting, pairs = sensed.shape[0], False, in_pairs(control, control_state)
+    for n in range(count):
+        flags[n] = plate_sense(tables, state, noise[n], sensed[n], motion[n])
+        if waiting:
+            polar_pair(control, control_state, n - 1, sensed, finger, wanted, drive, last, target, flags)
+            waiting = False
+        else:
+            drive[n, 0], drive[n, 1] = last[0], last[1]
+            waiting = pairs and n + 1 < count and control_state.sample[0] % 2 == 0
+            if not waiting:
+                flags[n] |= polar_step(control, control_state, sensed[n], finger[n, 0], wanted[n], last, target[n])
+        plate_drive(tables, state, drive[n])
+        plate_advance(tables, state, finger[n, 0], finger[n, 1], finger[n, 2])
+
+
+CLOSED = dict.fromkeys(STEPS, closed_plate_run) | {PolarTables: closed_polar_run}

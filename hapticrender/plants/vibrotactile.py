@@ -320,8 +320,8 @@ class Plate(TouchedPlant):
         """Advance plate and controller together, sample by sample, over `wanted` (m, shape (n,))."""
         n = len(wanted)
         finger, noise, flags = self._next(n)
-        sensed, motion, drive = np.zeros((n, 2)), np.zeros((n, 3)), np.zeros((n, 2))
-        target = np.zeros((n, controller.n_bands), complex)
+        sensed, motion, drive = np.empty((n, 2)), np.empty((n, 3)), np.empty((n, 2))
+        target = np.empty((n, controller.n_bands), complex)
         CLOSED[type(controller.tables)](
             self._tables,
             self._state,

@@ -151,6 +151,11 @@ class Finger:
         return np.array(self.touches, float).ravel()
 
     def _in_touch(self, time: Array) -> Array:
+        if time.size == 0:
+            return np.zeros(time.shape, bool)
+        first, last = np.searchsorted(self._edges, (time.min(), time.max()), side="right")
+        if first == last:  # most stretches of time are within one touch
+            return np.full(time.shape, first % 2 == 1)
         return np.searchsorted(self._edges, time, side="right") % 2 == 1
 
     def _typical_load(self, mechanics: Any) -> float:
