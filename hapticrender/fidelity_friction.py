@@ -13,12 +13,14 @@ from itertools import product
 from typing import Any, NamedTuple
 
 import numpy as np
+from scipy.optimize import brentq
 
 from hapticrender._jit import kernel
 from hapticrender.bands import Bands
 from hapticrender.control.gap import VACUUM
-from hapticrender.fidelity_plate import CHUNK_VALUES, HOPS, LOOK_AHEAD, NoBound, Option
-from hapticrender.judge import LARGEST_INFLATION, LOWEST_FREQUENCY, fit, window_length
+from hapticrender.fidelity_plate import LOOK_AHEAD, NoBound, Option
+from hapticrender.fidelity_windows import BETWEEN, Windows, compared_with, ease, fade, look
+from hapticrender.judge import LOWEST_FREQUENCY
 from hapticrender.loop import registered
 from hapticrender.plants.electroadhesion import ElectroadhesionParameters, ElectroadhesionScreen, finger_rows
 from hapticrender.plants.fidelity_screen import attractions
@@ -35,11 +37,11 @@ TAIL = 0.02  # s behind it, in which what an amplitude loop makes of the end die
 GROWTH = 0.05  # s in which a target grows after a touch
 SETTLING = 10.0  # time constants between the last touch and the judgement
 ACCURACY = 5e-5  # relative error below which nothing is told
-BETWEEN = 1.03  # of the error in the windows that are looked at: in those between
 SMALL_SIGNAL = 1.15  # of an amplitude loop's error by its linear model: at large modulation
 HEARD = 0.8  # of a detector's level: a deviation that may open it, as it hears twice the carrier as well
 HEARD_IN_NOISE = 0.25  # the same where there is noise, whose 5 or 5.5 sigma the level is: 4 of them come by chance
-CHANCES = 20.0  # windows for each that there is, of which noise is never worse in one
+CHANCES = 20.0  # runs of which noise makes the error larger than the bound in one, at most
+LEVELS = 64  # of the error in the windows, to each of which noise is added
 DRIVEN = 0.9  # of the drive's limit: what the amplitude may ask for, as feedback asks for some on top
 LOADS = 5  # of a finger that presses more or less, at which an amplitude loop is computed
 PASSED = 8  # frequencies of a carrier that moves with the finger, at which noise is looked at
@@ -100,8 +102,7 @@ def bound(scene: Scene, lesser: Scene) -> float:
     for one, other in product(*(_frictions(each, track, asked) for each in (full, less))):
         apart = np.empty(len(asked))
         follow_friction(one.steady - other.steady, track.kept, apart)
-        found = _worst(scene, bands, track, apart, one.noise + other.noise)
-        worst = np.maximum(worst, margin * found)
+        worst = np.maximum(worst, _worst(scene, bands, track, apart, one.noise + other.noise, margin))
     return float(worst.max()) + ACCURACY
 
 
@@ -153,17 +154,9 @@ def _envelope(bands: Bands, frequency: Array, down: Array, highest: float, rate:
     """Wanted envelopes (N, (n, bands)): they grow after a touch, and fade where a carrier is too slow or too fast."""
     count = np.arange(len(down))
     since = count - np.maximum.accumulate(np.where(down, -1, count))
-    weight = _ease(since / (GROWTH * rate))[:, None] * np.ones_like(frequency)
-    slow, fast = 2 / LOWEST_FREQUENCY * abs(frequency) - 1, 5 - 4 / highest * abs(frequency)
-    weight *= np.where(bands.wavenumber > 0.0, _ease(slow) * _ease(fast), 1.0)
+    weight = ease(since / (GROWTH * rate))[:, None] * fade(bands, frequency, highest, rate)
     envelope = weight * np.asarray(bands.envelope)
     return 2j * np.pi * frequency * envelope if bands.differentiated else envelope
-
-
-def _ease(x: Array) -> Array:
-    """Third-order step from 0 to 1 over 0..1."""
-    x = np.clip(x, 0.0, 1.0)
-    return x * x * (3.0 - 2.0 * x)
 
 
 def _asked(track: _Track) -> Array:
@@ -273,33 +266,39 @@ def _followed(
     return amplitude, heard, noise
 
 
-def _worst(scene: Scene, bands: Bands, track: _Track, apart: Array, noise: Array) -> Array:
+def _worst(scene: Scene, bands: Bands, track: _Track, apart: Array, noise: Array, margin: float) -> Array:
     """Largest envelope of `apart` (N, (n,)) and noise (N2/Hz) in any judged window of each band, by the band's target.
 
-    In a window of T seconds a power density S feigns an envelope with the mean square 2 S/T, Rayleigh distributed.
+    What is computed is taken `margin` times.
     """
     late = track.judged
-    signals = np.column_stack([apart, _waveform(track)])[late]
-    phase, asked = track.phase[late], (track.envelope != 0.0)[late]
-    asked &= abs(track.frequency[late]) >= LOWEST_FREQUENCY * (1 - 1e-6)
-    asked &= track.touched[late, None]
-    window = window_length(bands, track.rate, track.finger[late, POSITION], len(signals) / track.rate / 2)
-    size = max(2, round(window * track.rate))
-    starts = np.arange(0, len(signals) - size + 1, max(1, size // HOPS))
-    worst, square, count = (np.zeros(len(bands)) for _ in range(3))
-    for part in np.array_split(starts, 1 + len(starts) * size * (2 * len(bands) + 2) // CHUNK_VALUES):
-        index = part[:, None] + np.arange(size)
-        envelope, inflation, _ = fit(phase[index], signals[index])
-        told = (inflation <= LARGEST_INFLATION) & asked[index].all(axis=1)
-        size_of = np.where(told[:, None, :], abs(envelope), 0.0)
-        worst = np.maximum(worst, size_of[:, 0].max(axis=0, initial=0.0))
-        square += (size_of[:, 1] ** 2).sum(axis=0)
-        count += told.sum(axis=0)
-    target = np.sqrt(square / np.maximum(count, 1.0))
-    target = np.maximum(target, scene.tolerance * target.max(initial=0.0))
-    chance = math.log(CHANCES * max(len(signals) / size, 1.0))
-    worst += np.sqrt(2 * noise / window * chance) * (count > 0)
-    return worst / np.where(target > 0.0, target, np.inf)
+    asked = (track.envelope != 0.0)[late] & track.touched[late, None]
+    signals = apart[late, None], _waveform(track)[late]
+    seen = look(bands, track.rate, track.finger[late, POSITION], track.phase[late], signals, asked)
+    found = [_in_noise(seen, margin * seen.apart[:, 0, k], float(noise[k]), k) for k in range(len(bands))]
+    return np.array(found) / compared_with(seen.target, scene.tolerance)
+
+
+def _in_noise(seen: Windows, apart: Array, noise: float, band: int) -> float:
+    """Magnitude that `apart` (w,) and noise of power density `noise` pass together in one run of CHANCES at most.
+
+    In a window of T seconds a power density S feigns an envelope with the mean square 2 S/T, Rayleigh distributed, so
+    what comes to d without noise passes L by a chance of exp(-(L - d)^2 T/(2 S)) or less.
+    """
+    read = seen.read[:, band]
+    if not read.any():
+        return 0.0
+    known = np.quantile(apart[read], np.linspace(0.0, 1.0, LEVELS + 1)[1:])  # each stands for those below it
+    size, many = 2 * noise / seen.length, max(seen.lengths * read.mean(), 1.0)
+    if not size:
+        return float(known[-1])
+
+    def too_often(level: float) -> float:
+        with np.errstate(under="ignore"):
+            return float(many * np.exp(-(np.maximum(level - known, 0.0) ** 2) / size).mean() - 1 / CHANCES)
+
+    most = known[-1] + math.sqrt(size * math.log(2 * CHANCES * many))
+    return float(brentq(too_often, 0.0, most, rtol=1e-4))
 
 
 def _carrier_at_once(scene: Scene) -> Scene | str | None:
