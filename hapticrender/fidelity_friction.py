@@ -274,7 +274,7 @@ def _worst(scene: Scene, bands: Bands, track: _Track, apart: Array, noise: Array
     late = track.judged
     asked = (track.envelope != 0.0)[late] & track.touched[late, None]
     signals = apart[late, None], _waveform(track)[late]
-    seen = look(bands, track.rate, track.finger[late, POSITION], track.phase[late], signals, asked)
+    seen = look(bands, (track.rate, track.rate), track.finger[late, POSITION], track.phase[late], signals, asked)
     found = [_in_noise(seen, margin * seen.apart[:, 0, k], float(noise[k]), k) for k in range(len(bands))]
     return np.array(found) / compared_with(seen.target, scene.tolerance)
 

@@ -30,15 +30,15 @@ class Windows(NamedTuple):
 
 
 def look(
-    bands: Bands, rate: float, position: Array, phase: Array, signals: tuple[Array, Array], asked: Array
+    bands: Bands, steps: tuple[float, float], position: Array, phase: Array, signals: tuple[Array, Array], asked: Array
 ) -> Windows:
     """Fit the judge's windows.
 
     Parameters
     ----------
     bands : Bands
-    rate : float, Hz
-        Of what follows; n instants of the judged time.
+    steps : (float, float), Hz
+        Rate of what follows, n instants of the judged time; and of the device, by which the judge counts.
     position : ndarray, shape (n,), m
         Of the finger, NaN while it is up.
     phase : ndarray, shape (n, bands), rad
@@ -46,10 +46,11 @@ def look(
     signals : ndarray, shape (n, places), and ndarray, shape (n,)
         What the models differ by, and the wanted waveform.
     asked : ndarray of bool, shape (n, bands)
-        Where something is wanted of a band that can be read.
+        Where something is wanted of a band.
     """
-    both, many = np.column_stack(signals), len(position)
-    size = min(many, max(2, round(window_length(bands, rate, position, many / rate / 2) * rate)))
+    both, many, (rate, counted) = np.column_stack(signals), len(position), steps
+    samples = round(window_length(bands, rate, position, many / rate / 2) * counted)
+    size = min(many, max(2, round((samples + samples % 2) / counted * rate)))
     starts = np.arange(0, many - size + 1, _hop(bands, rate, position, size))
     apart, wanted, read = [], [], []
     for part in np.array_split(starts, 1 + len(starts) * (2 * len(bands) + 6) ** 2 // CHUNK_VALUES):

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from hapticrender.touch.mechanics import FingerMechanics
 
 PLACE_STEP, GRIP_STEP = 0.1e-3, 0.01  # m, 1: resolution at which A is tabled; zeta_s knows the finger exactly
-IMAGES_SEEN = 50  # places along the path at which the hold's images are looked at
+IMAGES, IMAGES_SEEN = 3, 500  # of the hold on either side; places along the path at which they are looked at
 SERIES = 13  # terms of the exponential of a matrix of norm 1/2 or less: what is left out is below rounding
 
 
@@ -250,7 +250,7 @@ class PlateModel:
         """Displacement (m, shape (n, 3)) of centre and ends in `states` (n, s)."""
         return states[:, : self.places.shape[1]] @ self.places.T
 
-    def _at(self, few: slice) -> PlateModel:
+    def _at(self, few: Array) -> PlateModel:
         """The model at some of the times of its path."""
         return replace(self, path=FingerPath(*(column[few] for column in self.path)))
 
@@ -297,20 +297,21 @@ def stray(full: PlateModel, lesser: PlateModel, omega: Array, weight: Array) -> 
 
 
 def held(full: PlateModel, lesser: PlateModel, omega: Array, weight: Array) -> Array:
-    """How far two models part (3,), per metre of target, for the drive's being held over each sample.
+    """How far two models part (n, 3) besides, per metre of target, for the drive's being held over each sample.
 
-    The hold's images at n w_s -+ w carry w/(n w_s -+ w) of the drive each, and sampling folds them back on w; both
-    first ones are counted twice, for the ones beyond, which the plate's mass lets through with less than 1/n^3.
+    The hold's images at w + n w_s, n = +-1, +-2, ..., carry w/(w + n w_s) of the drive each, and sampling folds them
+    back on w.  The plate's mass lets them through with 1/n^2, and those of either sign nearly cancel.
     """
-    few = slice(None, None, max(1, len(omega) // IMAGES_SEEN))
-    rate = 2 * math.pi * full.parameters.rate
-    apart = np.zeros((len(omega[few]), 3))
-    drive = lesser._at(few).wanted_force(omega[few]) * weight[few, None]
-    for image in (rate - abs(omega[few]), rate + abs(omega[few])):
-        both = (model._at(few) for model in (full, lesser))
-        moved = [model.moved(model.quasi_static(image, model.pushed(drive))) for model in both]
-        apart += 2 * abs(moved[0] - moved[1]) * (abs(omega[few]) / image)[:, None]
-    return apart.max(axis=0)
+    some = np.unique(np.linspace(0, len(omega) - 1, min(len(omega), IMAGES_SEEN)).astype(int))
+    rate, both = 2 * math.pi * full.parameters.rate, (full._at(some), lesser._at(some))
+    drive = both[1].wanted_force(omega[some]) * weight[some, None]
+    apart = np.zeros((len(some), 3), complex)
+    for n in range(1, IMAGES + 1):
+        for image in (omega[some] - n * rate, omega[some] + n * rate):
+            moved = [model.moved(model.quasi_static(image, model.pushed(drive))) for model in both]
+            apart += (moved[0] - moved[1]) * (omega[some] / image)[:, None]
+    place = np.arange(len(omega))
+    return np.stack([np.interp(place, some, column) for column in apart.T], axis=1)
 
 
 def sag(model: PlateModel) -> Array:
