@@ -8,7 +8,9 @@ change no friction, and simpler ones take as long; one that rests feels none.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from itertools import product
 from typing import Any, NamedTuple
 
@@ -41,6 +43,9 @@ SMALL_SIGNAL = 1.15  # of an amplitude loop's error by its linear model: at larg
 HEARD = 0.8  # of a detector's level: a deviation that may open it, as it hears twice the carrier as well
 HEARD_IN_NOISE = 0.25  # the same where there is noise, whose 5 or 5.5 sigma the level is: 4 of them come by chance
 CHANCES = 20.0  # runs of which noise makes the error larger than the bound in one, at most
+TELLING = 10.0  # windows' worth of the largest errors that were played, from which larger ones are foretold
+PLAYED, MOST_RUNS = 12.0, 9  # s of the judged time, and runs
+SEED = 20210617  # of the first of them
 LEVELS = 64  # of the error in the windows, to each of which noise is added
 DRIVEN = 0.9  # of the drive's limit: what the amplitude may ask for, as feedback asks for some on top
 LOADS = 5  # of a finger that presses more or less, at which an amplitude loop is computed
@@ -95,15 +100,56 @@ def bound(scene: Scene, lesser: Scene) -> float:
         raise NoBound("its texture has no constant envelopes, so no tight bound is known")
     if not bands.envelope.any():
         return 0.0
-    track = _track(scene, full.parameters, bands, model.highest_frequency, max(map(_lead, (full, less))))
+    parameters, highest = full.parameters, model.highest_frequency
+    track = _track(scene, parameters, bands, highest, max(map(_lead, (full, less))))
     asked = _asked(track)
+    frictions = [_frictions(each, track, asked) for each in (full, less)]
+    if isinstance(full, UltrasonicSurface) and _noisy(full) and max(map(len, frictions)) > 1:
+        whole = _track(scene, parameters, bands, highest, math.inf)
+        worst = _played(whole, bands, [partial(renderer.plant, each) for each in (scene, lesser)], scene.tolerance)
+        return float(worst.max()) + ACCURACY
     margin = BETWEEN if isinstance(full, ElectroadhesionScreen) else SMALL_SIGNAL
     worst = np.zeros(len(bands))
-    for one, other in product(*(_frictions(each, track, asked) for each in (full, less))):
+    for one, other in product(*frictions):
         apart = np.empty(len(asked))
         follow_friction(one.steady - other.steady, track.kept, apart)
-        worst = np.maximum(worst, _worst(scene, bands, track, apart, one.noise + other.noise, margin))
+        seen = _seen(bands, track, apart)
+        target, noise = compared_with(seen.target, scene.tolerance), one.noise + other.noise
+        found = [_in_noise(seen, margin * seen.apart[:, 0, k], noise[k], k) for k in range(len(bands))]
+        worst = np.maximum(worst, np.array(found) / target)
     return float(worst.max()) + ACCURACY
+
+
+def _noisy(surface: UltrasonicSurface) -> bool:
+    return surface.parameters.mode.sensor_noise > 0.0
+
+
+def _played(track: _Track, bands: Bands, plants: list[Callable[[int], UltrasonicSurface]], tolerance: float) -> Array:
+    """Largest relative error of each band where noise wakes an amplitude loop by chance: played, both levels apart.
+
+    What `plants` make is played from the scene's start on, so often that `PLAYED` seconds are seen of the judged time.
+    """
+    asked, judged = _asked(track)[:, None], (track.judged.stop - track.judged.start) / track.rate
+    runs = []
+    for run in range(min(MOST_RUNS, math.ceil(PLAYED / judged) + 1)):
+        one, other = (make(SEED + 2 * run + i).run(asked).motion[:, 0] for i, make in enumerate(plants))
+        runs.append(_seen(bands, track, one - other))
+    apart, read = np.concatenate([run.apart[:, 0] for run in runs]), np.concatenate([run.read for run in runs])
+    found = [_beyond(apart[read[:, k], k], runs[0].lengths * read[:, k].mean(), len(runs)) for k in range(len(bands))]
+    return np.array(found) / compared_with(runs[0].target, tolerance)
+
+
+def _beyond(seen: Array, many: float, runs: int) -> float:
+    """Magnitude that one run of `many` windows in CHANCES passes, by those `seen` in all windows of some `runs`.
+
+    The excess over a level that some tell is exponential, or has less of a tail.
+    """
+    if not seen.size:
+        return 0.0
+    share = min(TELLING / max(many * runs, 1.0), 0.5)
+    level = np.quantile(seen, 1.0 - share)
+    excess = seen[seen >= level].mean() - level
+    return float(BETWEEN * (level + excess * math.log(max(share * many * CHANCES, 1.0))))
 
 
 def _lead(plant: Any) -> float:
@@ -222,7 +268,7 @@ def _amplitudes(surface: UltrasonicSurface, track: _Track, wanted: Array, load: 
     livelier one does not keep open, opens and closes: then the deviation is hardly above what it hears, which is as
     much of the way from one state to the other.
     """
-    numbers, noisy = surface.loop.tables.numbers, surface.parameters.mode.sensor_noise > 0.0
+    numbers, noisy = surface.loop.tables.numbers, _noisy(surface)
     calm, moved, noise = _followed(surface, track, wanted, load, "quiet")
     found = [(calm, noise)]
     for state, level, time in (
@@ -266,17 +312,12 @@ def _followed(
     return amplitude, heard, noise
 
 
-def _worst(scene: Scene, bands: Bands, track: _Track, apart: Array, noise: Array, margin: float) -> Array:
-    """Largest envelope of `apart` (N, (n,)) and noise (N2/Hz) in any judged window of each band, by the band's target.
-
-    What is computed is taken `margin` times.
-    """
+def _seen(bands: Bands, track: _Track, apart: Array) -> Windows:
+    """What the judge reads of frictions that are `apart` (N, (n,))."""
     late = track.judged
     asked = (track.envelope != 0.0)[late] & track.touched[late, None]
-    signals = apart[late, None], _waveform(track)[late]
-    seen = look(bands, (track.rate, track.rate), track.finger[late, POSITION], track.phase[late], signals, asked)
-    found = [_in_noise(seen, margin * seen.apart[:, 0, k], float(noise[k]), k) for k in range(len(bands))]
-    return np.array(found) / compared_with(seen.target, scene.tolerance)
+    signals, rates = (apart[late, None], _waveform(track)[late]), (track.rate, track.rate)
+    return look(bands, rates, track.finger[late, POSITION], track.phase[late], signals, asked)
 
 
 def _in_noise(seen: Windows, apart: Array, noise: float, band: int) -> float:

@@ -79,10 +79,11 @@ def bound(scene: Scene, lesser: Scene) -> float:
         worst[:, k] = abs(parted[-1] * envelope[k])
     target = abs(envelope)
     if len(path.time) > 2:
-        late = path.time >= times.begin - path.step / 2
-        phase, wanted = bands.carrier_phase(path.time, path.position)[late], (weight * carrier).real.sum(axis=1)
-        signals, steps = (apart[late], wanted[late]), (1 / path.step, plate.rate)
-        seen = look(bands, steps, path.position[late], phase, signals, weight[late] > 0.0)
+        many = max(1, round(1 / (path.step * plate.rate)))  # steps a sample, of which the judge sees one
+        late = np.arange(0, len(path.time), many)[path.time[::many] >= times.begin - path.step / 2]
+        phase, wanted = bands.carrier_phase(path.time[late], path.position[late]), (weight * carrier).real.sum(axis=1)
+        signals, rates = (apart[late], wanted[late]), (1 / (many * path.step), plate.rate)
+        seen = look(bands, rates, path.position[late], phase, signals, weight[late] > 0.0)
         worst, target = BETWEEN * seen.apart.max(axis=0, initial=0.0), seen.target
     target = compared_with(target, scene.tolerance) * abs(1.0 + scene.gradient * _places(plate))[:, None]
     return float((worst / target).max()) + ACCURACY
@@ -139,7 +140,8 @@ def _times(scene: Scene, lesser: Scene, bands: Bands) -> _Times:
     if top > rate / 2:
         raise NoBound(f"it reaches {top:.4g} Hz, more than half the rate of {rate:g} Hz")
     step, first = _step(rate, top), max(begin - 2 * rest, 0.0)
-    steps = step * np.arange(math.floor(first / step), math.ceil(end / step))
+    many = max(1, round(1 / (step * rate)))
+    steps = step * np.arange(math.floor(first / (many * step)) * many, math.ceil(end / step))
     down = np.isfinite(scene.finger.position(steps))
     changed = steps[1:][down[1:] != down[:-1]].max(initial=steps[0])
     if begin - changed < rest:
