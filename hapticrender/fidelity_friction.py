@@ -1,8 +1,10 @@
 """What the models of the surfaces that make friction can leave out for a scene, and the error bound of one that does.
 
 What is compared is the friction under the finger while both levels are driven alike, with what the friction loop has to
-ask for: the target, led by the contact's lag.  Of the finger nothing is left out.  Its mechanics move its skin and
-change no friction, and simpler ones take as long; one that rests feels none.
+ask for: the target, led by the contact's lag.  Without noise that is computed.  In noise an ultrasonic surface's
+amplitude loop wakes by chance, which no formula tells: both levels are played, in noise of their own.  Of the finger
+nothing is left out.  Its mechanics move its skin and change no friction, and simpler ones take as long; one that rests
+feels none.
 """
 
 from __future__ import annotations
@@ -15,14 +17,12 @@ from itertools import product
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.optimize import brentq
 
 from hapticrender._jit import kernel
 from hapticrender.bands import Bands
 from hapticrender.control.gap import VACUUM
 from hapticrender.fidelity_plate import LOOK_AHEAD, NoBound, Option
 from hapticrender.fidelity_windows import BETWEEN, Windows, compared_with, ease, fade, look
-from hapticrender.judge import LOWEST_FREQUENCY
 from hapticrender.loop import registered
 from hapticrender.plants.electroadhesion import ElectroadhesionParameters, ElectroadhesionScreen, finger_rows
 from hapticrender.plants.fidelity_screen import attractions
@@ -41,16 +41,12 @@ SETTLING = 10.0  # time constants between the last touch and the judgement
 ACCURACY = 5e-5  # relative error below which nothing is told
 SMALL_SIGNAL = 1.15  # of an amplitude loop's error by its linear model: at large modulation
 HEARD = 0.8  # of a detector's level: a deviation that may open it, as it hears twice the carrier as well
-HEARD_IN_NOISE = 0.25  # the same where there is noise, whose 5 or 5.5 sigma the level is: 4 of them come by chance
-CHANCES = 20.0  # runs of which noise makes the error larger than the bound in one, at most
+CHANCES = 1000.0  # runs of which noise makes the error larger than the bound in one, as foretold
 TELLING = 10.0  # windows' worth of the largest errors that were played, from which larger ones are foretold
-PLAYED, MOST_RUNS = 12.0, 9  # s of the judged time, and runs
+PLAYED, MOST_RUNS = 16.0, 16  # s of the judged time at least, and runs at most
 SEED = 20210617  # of the first of them
-LEVELS = 64  # of the error in the windows, to each of which noise is added
 DRIVEN = 0.9  # of the drive's limit: what the amplitude may ask for, as feedback asks for some on top
 LOADS = 5  # of a finger that presses more or less, at which an amplitude loop is computed
-PASSED = 8  # frequencies of a carrier that moves with the finger, at which noise is looked at
-SMALL = 1e-4  # relative step of an amplitude
 POSITION, LOAD, _, SPEED = range(4)  # columns of the finger
 
 
@@ -70,13 +66,6 @@ class _Track(NamedTuple):
     def touched(self) -> Array:
         """Where the finger presses (n,)."""
         return np.isfinite(self.finger[:, SPEED]) & (self.finger[:, LOAD] > 0.0)
-
-
-class _Friction(NamedTuple):
-    """What a plant makes of what is asked for."""
-
-    steady: Array  # (n,) N
-    noise: Array  # (bands,) N2/Hz: largest power density where the band is
 
 
 @kernel
@@ -104,24 +93,24 @@ def bound(scene: Scene, lesser: Scene) -> float:
     track = _track(scene, parameters, bands, highest, max(map(_lead, (full, less))))
     asked = _asked(track)
     frictions = [_frictions(each, track, asked) for each in (full, less)]
-    if isinstance(full, UltrasonicSurface) and _noisy(full) and max(map(len, frictions)) > 1:
+    if isinstance(full, UltrasonicSurface) and _noisy(full):
         whole = _track(scene, parameters, bands, highest, math.inf)
         worst = _played(whole, bands, [partial(renderer.plant, each) for each in (scene, lesser)], scene.tolerance)
         return float(worst.max()) + ACCURACY
-    margin = BETWEEN if isinstance(full, ElectroadhesionScreen) else SMALL_SIGNAL
-    worst = np.zeros(len(bands))
+    margin, worst = BETWEEN if isinstance(full, ElectroadhesionScreen) else SMALL_SIGNAL, np.zeros(len(bands))
     for one, other in product(*frictions):
         apart = np.empty(len(asked))
-        follow_friction(one.steady - other.steady, track.kept, apart)
+        follow_friction(one - other, track.kept, apart)
         seen = _seen(bands, track, apart)
-        target, noise = compared_with(seen.target, scene.tolerance), one.noise + other.noise
-        found = [_in_noise(seen, margin * seen.apart[:, 0, k], noise[k], k) for k in range(len(bands))]
-        worst = np.maximum(worst, np.array(found) / target)
+        found = seen.apart[:, 0].max(axis=0, initial=0.0) / compared_with(seen.target, scene.tolerance)
+        worst = np.maximum(worst, margin * found)
     return float(worst.max()) + ACCURACY
 
 
 def _noisy(surface: UltrasonicSurface) -> bool:
-    return surface.parameters.mode.sensor_noise > 0.0
+    """Whether its sensor or its drive adds something that is chance."""
+    mode = surface.parameters.mode
+    return bool(mode.sensor_noise or mode.sensor_bits or mode.drive_bits)
 
 
 def _played(track: _Track, bands: Bands, plants: list[Callable[[int], UltrasonicSurface]], tolerance: float) -> Array:
@@ -131,16 +120,16 @@ def _played(track: _Track, bands: Bands, plants: list[Callable[[int], Ultrasonic
     """
     asked, judged = _asked(track)[:, None], (track.judged.stop - track.judged.start) / track.rate
     runs = []
-    for run in range(min(MOST_RUNS, math.ceil(PLAYED / judged) + 1)):
-        one, other = (make(SEED + 2 * run + i).run(asked).motion[:, 0] for i, make in enumerate(plants))
-        runs.append(_seen(bands, track, one - other))
+    for run in range(min(MOST_RUNS, math.ceil(PLAYED / judged))):
+        one, other = (np.asarray(make(SEED + 2 * run + i).run(asked).motion) for i, make in enumerate(plants))
+        runs.append(_seen(bands, track, (one - other)[:, 0]))
     apart, read = np.concatenate([run.apart[:, 0] for run in runs]), np.concatenate([run.read for run in runs])
     found = [_beyond(apart[read[:, k], k], runs[0].lengths * read[:, k].mean(), len(runs)) for k in range(len(bands))]
     return np.array(found) / compared_with(runs[0].target, tolerance)
 
 
 def _beyond(seen: Array, many: float, runs: int) -> float:
-    """Magnitude that one run of `many` windows in CHANCES passes, by those `seen` in all windows of some `runs`.
+    """Magnitude that one run of `many` windows in CHANCES would pass, by those `seen` in all windows of some `runs`.
 
     The excess over a level that some tell is exponential, or has less of a tail.
     """
@@ -171,7 +160,7 @@ def _track(scene: Scene, parameters: Any, bands: Bands, highest: float, lead: fl
     if end < scene.duration and not isinstance(scene.finger.motion, Sliding | Swiping):
         raise NoBound(f"its finger's path is longer than {LOOK_AHEAD:g} s and no repetition")
     if min(lead, begin) > LOOK_AHEAD:
-        raise NoBound(f"it takes more than {LOOK_AHEAD:g} s to settle")
+        raise NoBound(f"it has to be followed for more than {LOOK_AHEAD:g} s before it is judged")
     rate = float(parameters.rate)
     first, last = math.floor(max(begin - max(lead, LEAD), 0.0) * rate), math.ceil((end + TAIL) * rate)
     finger = finger_rows(scene.finger, first, last - first, rate)
@@ -217,10 +206,10 @@ def _waveform(track: _Track) -> Array:
     return (track.envelope * np.exp(1j * track.phase)).real.sum(axis=1)
 
 
-def _frictions(plant: Any, track: _Track, asked: Array) -> list[_Friction]:
-    """Steady frictions that a plant may make of what is asked for, one for every state that it may be in."""
+def _frictions(plant: Any, track: _Track, asked: Array) -> list[Array]:
+    """Steady frictions (N, (n,)) that a plant may make of what is asked for, one for every state that it may be in."""
     if isinstance(plant, ElectroadhesionScreen):
-        return [_Friction(_screen_friction(plant, track, asked), np.zeros(track.phase.shape[1]))]
+        return [_screen_friction(plant, track, asked)]
     return _surface_frictions(plant, track, asked)
 
 
@@ -238,7 +227,7 @@ def _screen_friction(screen: ElectroadhesionScreen, track: _Track, asked: Array)
     return p.friction_coefficient * (carrier if p.level == "carrier" else envelope)
 
 
-def _surface_frictions(surface: UltrasonicSurface, track: _Track, asked: Array) -> list[_Friction]:
+def _surface_frictions(surface: UltrasonicSurface, track: _Track, asked: Array) -> list[Array]:
     """Frictions of an ultrasonic surface."""
     p, load, speed = surface.parameters, track.finger[:, LOAD], track.finger[:, SPEED]
     rest = _lead(surface)
@@ -252,53 +241,47 @@ def _surface_frictions(surface: UltrasonicSurface, track: _Track, asked: Array) 
     whole = tables.friction * load
     wanted, found = np.empty(len(asked)), []
     wanted_amplitudes(tables.law, np.clip(p.bias + asked / whole, tables.least, 1.0), load, pace, wanted)
-    left, more = np.empty(len(asked)), np.empty(len(asked))
-    for amplitude, noise in _amplitudes(surface, track, wanted, load):
+    for amplitude in _amplitudes(surface, track, wanted, load):
+        left = np.empty(len(asked))
         friction_ratios(tables.law, amplitude, load, pace, left)
-        friction_ratios(tables.law, (1.0 + SMALL) * amplitude, load, pace, more)
-        steep = (whole * (more - left) / (SMALL * amplitude))[track.judged]
-        found.append(_Friction(whole * left, np.mean(steep**2) * noise))
+        found.append(whole * left)
     return found
 
 
-def _amplitudes(surface: UltrasonicSurface, track: _Track, wanted: Array, load: Array) -> list[tuple[Array, Array]]:
-    """Amplitudes (m) that the loop may make of the wanted one, each with its noise in every band (m2/Hz).
+def _amplitudes(surface: UltrasonicSurface, track: _Track, wanted: Array, load: Array) -> list[Array]:
+    """Amplitudes (m) that the loop may make of the wanted one, without noise.
 
     They are its state's, or those between which it changes state.  A detector that the calmer state opens, and that the
     livelier one does not keep open, opens and closes: then the deviation is hardly above what it hears, which is as
     much of the way from one state to the other.
     """
-    numbers, noisy = surface.loop.tables.numbers, _noisy(surface)
-    calm, moved, noise = _followed(surface, track, wanted, load, "quiet")
-    found = [(calm, noise)]
+    numbers = surface.loop.tables.numbers
+    calm, moved = _followed(surface, track, wanted, load, "quiet")
+    found = [calm]
     for state, level, time in (
         ("stirred", math.sqrt(numbers.slow_level), numbers.slow_time),
         ("awake", math.sqrt(numbers.fast_level), numbers.fast_time),
     ):
         heard = float(moved[state].max())
-        if heard < (HEARD_IN_NOISE if noisy else HEARD) * level:
+        if heard < HEARD * level:
             continue
-        lively, moved, noise = _followed(surface, track, wanted, load, state)
+        lively, moved = _followed(surface, track, wanted, load, state)
         span = max(1, int(time / numbers.rate * track.rate))
         least = np.maximum.reduceat(moved[state], np.arange(0, len(moved[state]), span))[:-1].min(initial=math.inf)
-        between = lively + min(level / heard, 1.0) * (calm - lively)
-        found = [(lively, noise)] if least > level else [(lively, noise), (between, noise)]
+        found = [lively] if least > level else [lively, lively + min(level / heard, 1.0) * (calm - lively)]
         calm = lively
     return found
 
 
 def _followed(
     surface: UltrasonicSurface, track: _Track, wanted: Array, load: Array, state: str
-) -> tuple[Array, dict[str, Array], Array]:
-    """Amplitude (m) of a loop in this state, under a finger of changing load, what its detectors hear, and noise."""
+) -> tuple[Array, dict[str, Array]]:
+    """Amplitude (m) of a loop in this state, under a finger of changing load, and what its detectors hear."""
     p, judged = surface.parameters, track.judged
     least, most = float(load[judged].min()), float(load[judged].max())
     tabled = np.linspace(least, most, LOADS if most > least else 1)
     place = np.interp(load, tabled, np.arange(len(tabled))) if len(tabled) > 1 else np.zeros(len(load))
-    amplitude, noise = np.zeros(len(load)), np.zeros(track.phase.shape[1])
-    heard = dict.fromkeys(("stirred", "awake"), np.zeros(len(load[judged])))
-    size = abs(track.frequency[judged])
-    passed = np.maximum(np.linspace(size.min(axis=0), size.max(axis=0), PASSED), LOWEST_FREQUENCY)
+    amplitude, heard = np.zeros(len(load)), dict.fromkeys(("stirred", "awake"), np.zeros(len(load[judged])))
     for k, each in enumerate(tabled):
         loop = AmplitudeLoop(parameters=p, tables=surface.loop.tables, load=float(each), rise=track.rise, state=state)
         if np.max(loop.needed(wanted)[judged]) > DRIVEN * p.mode.drive_limit:
@@ -308,8 +291,7 @@ def _followed(
         amplitude += weight * played
         for state_heard, more in (("stirred", slow), ("awake", fast)):
             heard[state_heard] = heard[state_heard] + (weight * more)[judged]
-        noise = np.maximum(noise, loop.noise(passed.ravel()).reshape(passed.shape).max(axis=0))
-    return amplitude, heard, noise
+    return amplitude, heard
 
 
 def _seen(bands: Bands, track: _Track, apart: Array) -> Windows:
@@ -318,28 +300,6 @@ def _seen(bands: Bands, track: _Track, apart: Array) -> Windows:
     asked = (track.envelope != 0.0)[late] & track.touched[late, None]
     signals, rates = (apart[late, None], _waveform(track)[late]), (track.rate, track.rate)
     return look(bands, rates, track.finger[late, POSITION], track.phase[late], signals, asked)
-
-
-def _in_noise(seen: Windows, apart: Array, noise: float, band: int) -> float:
-    """Magnitude that `apart` (w,) and noise of power density `noise` pass together in one run of CHANCES at most.
-
-    In a window of T seconds a power density S feigns an envelope with the mean square 2 S/T, Rayleigh distributed, so
-    what comes to d without noise passes L by a chance of exp(-(L - d)^2 T/(2 S)) or less.
-    """
-    read = seen.read[:, band]
-    if not read.any():
-        return 0.0
-    known = np.quantile(apart[read], np.linspace(0.0, 1.0, LEVELS + 1)[1:])  # each stands for those below it
-    size, many = 2 * noise / seen.length, max(seen.lengths * read.mean(), 1.0)
-    if not size:
-        return float(known[-1])
-
-    def too_often(level: float) -> float:
-        with np.errstate(under="ignore"):
-            return float(many * np.exp(-(np.maximum(level - known, 0.0) ** 2) / size).mean() - 1 / CHANCES)
-
-    most = known[-1] + math.sqrt(size * math.log(2 * CHANCES * many))
-    return float(brentq(too_often, 0.0, most, rtol=1e-4))
 
 
 def _carrier_at_once(scene: Scene) -> Scene | str | None:

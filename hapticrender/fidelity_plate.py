@@ -67,8 +67,9 @@ def bound(scene: Scene, lesser: Scene) -> float:
     if not envelope.any():
         return 0.0
     times = _times(scene, lesser, bands)
-    path, held_for = _touch(scene, times.steps), 1 / _parameters(scene).rate
-    full, less = (_model(each, _touch(each, times.steps - held_for / 2), times.from_rest) for each in (scene, lesser))
+    path, felt = _touch(scene, times.steps), np.maximum(times.steps - 0.5 / _parameters(scene).rate, 0.0)
+    paths = [_touch(each, felt)._replace(time=times.steps) for each in (scene, lesser)]
+    full, less = (_model(each, on, times.from_rest) for each, on in zip((scene, lesser), paths, strict=True))
     plate, omega = full.parameters, _omega(bands, path)
     weight = fade(bands, omega / (2 * math.pi), _highest(plate), plate.rate)
     carrier = envelope * np.exp(1j * bands.carrier_phase(path.time, path.position))

@@ -22,22 +22,21 @@ FASTEST = 0.4  # of the rate: a carrier that moves with the finger has begun to 
 class Windows(NamedTuple):
     """What the judge would read in its windows of two models' difference, and what it would compare that with."""
 
-    length: float  # s
     lengths: float  # of windows in what was looked at
     apart: Array  # (w, places, bands) magnitude of the envelope, 0 where the judge reads none
     read: Array  # (w, bands)
-    target: Array  # (bands,) rms of the wanted envelope, or the least that counts
+    target: Array  # (bands,) rms of the wanted envelope
 
 
 def look(
-    bands: Bands, steps: tuple[float, float], position: Array, phase: Array, signals: tuple[Array, Array], asked: Array
+    bands: Bands, rates: tuple[float, float], position: Array, phase: Array, signals: tuple[Array, Array], asked: Array
 ) -> Windows:
     """Fit the judge's windows.
 
     Parameters
     ----------
     bands : Bands
-    steps : (float, float), Hz
+    rates : (float, float), Hz
         Rate of what follows, n instants of the judged time; and of the device, by which the judge counts.
     position : ndarray, shape (n,), m
         Of the finger, NaN while it is up.
@@ -48,7 +47,7 @@ def look(
     asked : ndarray of bool, shape (n, bands)
         Where something is wanted of a band.
     """
-    both, many, (rate, counted) = np.column_stack(signals), len(position), steps
+    both, many, (rate, counted) = np.column_stack(signals), len(position), rates
     samples = round(window_length(bands, rate, position, many / rate / 2) * counted)
     size = min(many, max(2, round((samples + samples % 2) / counted * rate)))
     starts = np.arange(0, many - size + 1, _hop(bands, rate, position, size))
@@ -64,7 +63,7 @@ def look(
         wanted.append(found[:, -1])
     told = np.concatenate(read)
     target = np.sqrt((np.concatenate(wanted) ** 2).sum(axis=0) / np.maximum(told.sum(axis=0), 1))
-    return Windows(size / rate, many / size, np.concatenate(apart), told, target)
+    return Windows(many / size, np.concatenate(apart), told, target)
 
 
 def _hop(bands: Bands, rate: float, position: Array, size: int) -> int:
@@ -109,7 +108,7 @@ def _fast(bands: Bands, rate: float, position: Array, starts: Array, size: int) 
     edges = np.linspace(0, size - 1, QUARTERS + 1).round().astype(int)
     moved = np.diff(np.nan_to_num(position[starts[:, None] + edges]), axis=1)
     velocity = moved * rate / np.maximum(np.diff(edges), 1)
-    return (abs(bands.instantaneous_frequency(velocity)) >= LOWEST_FREQUENCY * (1 - 1e-6)).all(axis=1)
+    return np.all(abs(bands.instantaneous_frequency(velocity)) >= LOWEST_FREQUENCY * (1 - 1e-6), axis=1)
 
 
 def compared_with(target: Array, tolerance: float) -> Array:

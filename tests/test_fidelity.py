@@ -108,7 +108,8 @@ def true_error(scene, lesser):
     hop, last = max(1, size // 32), len(time) - size
     coarse = np.arange(first, last + 1, hop)
     size_of, read = windows(coarse)
-    assert read.any()
+    if not read.any():
+        return 0.0
     target = np.sqrt((size_of[:, 3] ** 2).sum(axis=0) / np.maximum(read.sum(axis=0), 1))
     target = np.where(read.any(axis=0), np.maximum(target, scene.tolerance * target.max()), np.inf)
     grown = 1.0 + scene.gradient * plate.glass_length / 2 * np.array([0.0, -1.0, 1.0])

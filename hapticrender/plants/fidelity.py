@@ -172,7 +172,7 @@ class PlateModel:
         many, lever = plate.degrees_of_freedom, self.path.position / plate.half_spacing
         contact = np.stack([np.ones_like(lever), lever], axis=1)[:, :many]
         grip = self.path.strength * self.finger(s)[0]
-        stiffness = grip[:, None, None] * contact[:, :, None] * contact[:, None, :]
+        stiffness: Array = grip[:, None, None] * contact[:, :, None] * contact[:, None, :]
         for matrix, power in zip(self.matrices, (s**2, s, np.ones_like(s)), strict=True):
             stiffness = stiffness + power[:, None, None] * matrix[:many, :many]
         force = np.zeros((len(s), 2), complex)
