@@ -121,8 +121,7 @@ def _bands(scene: Scene) -> Bands:
 
 def _omega(bands: Bands, path: FingerPath) -> Array:
     """Angular frequency (rad/s, shape (n, bands)) of every carrier along the path."""
-    velocity = np.diff(path.position) / path.step
-    return 2 * math.pi * bands.instantaneous_frequency(np.append(velocity, velocity[-1:]))
+    return 2 * math.pi * bands.instantaneous_frequency(np.gradient(path.position, path.step))
 
 
 def _times(scene: Scene, lesser: Scene, bands: Bands) -> _Times:
@@ -147,7 +146,8 @@ def _times(scene: Scene, lesser: Scene, bands: Bands) -> _Times:
     changed = steps[1:][down[1:] != down[:-1]].max(initial=steps[0])
     if begin - changed < rest:
         raise NoBound(late)
-    if abs(np.diff(_omega(bands, _touch(scene, steps)), axis=0)).max(initial=0.0) > 2 * math.pi * LOWEST_FREQUENCY:
+    omega = _omega(bands, _touch(scene, steps))
+    if abs(omega[2:] - omega[:-2]).max(initial=0.0) > 2 * math.pi * LOWEST_FREQUENCY:
         raise NoBound("its finger changes its speed at once, and the texture's frequency with it")
     late_paths = [_touch(each, steps[steps >= max(changed, begin - rest)]) for each in (scene, lesser)]
     if all(path.constant for path in late_paths):
