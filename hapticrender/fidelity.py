@@ -147,8 +147,9 @@ def fidelity(scene: Scene, tolerance: float | None = None) -> Fidelity:
     no more under that drive; that the loop finds it on both is not part of the bound.
     It is at most 1.5 times the error that two played devices show, where that
     is 2e-4 or more.  In noise the error is chance: on an ultrasonic surface both
-    models are played, which takes seconds, and what is told holds for the worst of
-    many runs, of which one in a thousand, as foretold, is worse.
+    models are played, which takes seconds, and what is told is for the worst of
+    many runs, 40 say.  Where noise alone wakes the amplitude loop, in one run of
+    thirty, most runs show a half of it or less.
 
     Examples
     --------

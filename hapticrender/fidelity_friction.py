@@ -10,7 +10,7 @@ feels none.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from itertools import product
@@ -42,8 +42,10 @@ ACCURACY = 5e-5  # relative error below which nothing is told
 SMALL_SIGNAL = 1.15  # of an amplitude loop's error by its linear model: at large modulation
 HEARD = 0.8  # of a detector's level: a deviation that may open it, as it hears twice the carrier as well
 CHANCES = 1000.0  # runs of which noise makes the error larger than the bound in one, as foretold
-TELLING = 10.0  # windows' worth of the largest errors that were played, from which larger ones are foretold
-PLAYED, MOST_RUNS = 16.0, 16  # s of the judged time at least, and runs at most
+TELLING = (2.0, 5.0, 10.0)  # windows' worth of the largest errors that were played, from which larger ones are foretold
+OFTEN, SELDOM = 16.0, 32.0  # s of the judged time that are played where the texture wakes the loop, or noise alone
+MOST_RUNS = 32
+UNSEEN = 1.4  # of what chance adds where noise alone wakes the loop
 SEED = 20210617  # of the first of them
 DRIVEN = 0.9  # of the drive's limit: what the amplitude may ask for, as feedback asks for some on top
 LOADS = 5  # of a finger that presses more or less, at which an amplitude loop is computed
@@ -95,10 +97,12 @@ def bound(scene: Scene, lesser: Scene) -> float:
     frictions = [_frictions(each, track, asked) for each in (full, less)]
     if isinstance(full, UltrasonicSurface) and _noisy(full):
         whole = _track(scene, parameters, bands, highest, math.inf)
-        worst = _played(whole, bands, [partial(renderer.plant, each) for each in (scene, lesser)], scene.tolerance)
+        plants = [partial(renderer.plant, each) for each in (scene, lesser)]
+        seldom = any("quiet" in each for each in frictions)
+        worst = _played(whole, bands, plants, scene.tolerance, seldom)
         return float(worst.max()) + ACCURACY
     margin, worst = BETWEEN if isinstance(full, ElectroadhesionScreen) else SMALL_SIGNAL, np.zeros(len(bands))
-    for one, other in product(*frictions):
+    for one, other in product(*(each.values() for each in frictions)):
         apart = np.empty(len(asked))
         follow_friction(one - other, track.kept, apart)
         seen = _seen(bands, track, apart)
@@ -113,32 +117,40 @@ def _noisy(surface: UltrasonicSurface) -> bool:
     return bool(mode.sensor_noise or mode.sensor_bits or mode.drive_bits)
 
 
-def _played(track: _Track, bands: Bands, plants: list[Callable[[int], UltrasonicSurface]], tolerance: float) -> Array:
+def _played(
+    track: _Track, bands: Bands, plants: Sequence[Callable[[int], Any]], tolerance: float, seldom: bool
+) -> Array:
     """Largest relative error of each band where noise wakes an amplitude loop by chance: played, both levels apart.
 
-    What `plants` make is played from the scene's start on, so often that `PLAYED` seconds are seen of the judged time.
+    What `plants` make is played from the scene's start on, again and again.  Where noise alone wakes it, `seldom`, more
+    runs are played, and what chance adds to the windows' means is taken UNSEEN times: no run may show the worst.
     """
     asked, judged = _asked(track)[:, None], (track.judged.stop - track.judged.start) / track.rate
+    played, rare = (SELDOM, UNSEEN) if seldom else (OFTEN, 1.0)
     runs = []
-    for run in range(min(MOST_RUNS, math.ceil(PLAYED / judged))):
+    for run in range(math.ceil(min(played / judged, MOST_RUNS))):
         one, other = (np.asarray(make(SEED + 2 * run + i).run(asked).motion) for i, make in enumerate(plants))
         runs.append(_seen(bands, track, (one - other)[:, 0]))
-    apart, read = np.concatenate([run.apart[:, 0] for run in runs]), np.concatenate([run.read for run in runs])
-    found = [_beyond(apart[read[:, k], k], runs[0].lengths * read[:, k].mean(), len(runs)) for k in range(len(bands))]
-    return np.array(found) / compared_with(runs[0].target, tolerance)
+    apart, read, found = np.stack([run.apart[:, 0] for run in runs]), runs[0].read, np.zeros(len(bands))
+    for k in np.flatnonzero(read.any(axis=0)):
+        told = apart[:, read[:, k], k]
+        mean = float(told.mean(axis=0).max())
+        found[k] = mean + rare * (_beyond(told.ravel(), runs[0].lengths * read[:, k].mean(), len(runs)) - mean)
+    return BETWEEN * found / compared_with(runs[0].target, tolerance)
 
 
 def _beyond(seen: Array, many: float, runs: int) -> float:
     """Magnitude that one run of `many` windows in CHANCES would pass, by those `seen` in all windows of some `runs`.
 
-    The excess over a level that some tell is exponential, or has less of a tail.
+    The excess over a level that some pass is taken for exponential.
     """
-    if not seen.size:
-        return 0.0
-    share = min(TELLING / max(many * runs, 1.0), 0.5)
-    level = np.quantile(seen, 1.0 - share)
-    excess = seen[seen >= level].mean() - level
-    return float(BETWEEN * (level + excess * math.log(max(share * many * CHANCES, 1.0))))
+    worst = float(seen.max())
+    for telling in TELLING:
+        share = min(telling / max(many * runs, 1.0), 0.5)
+        level = np.quantile(seen, 1.0 - share)
+        excess = seen[seen >= level].mean() - level
+        worst = max(worst, float(level + excess * math.log(max(share * many * CHANCES, 1.0))))
+    return worst
 
 
 def _lead(plant: Any) -> float:
@@ -206,10 +218,10 @@ def _waveform(track: _Track) -> Array:
     return (track.envelope * np.exp(1j * track.phase)).real.sum(axis=1)
 
 
-def _frictions(plant: Any, track: _Track, asked: Array) -> list[Array]:
+def _frictions(plant: Any, track: _Track, asked: Array) -> dict[str, Array]:
     """Steady frictions (N, (n,)) that a plant may make of what is asked for, one for every state that it may be in."""
     if isinstance(plant, ElectroadhesionScreen):
-        return [_screen_friction(plant, track, asked)]
+        return {"": _screen_friction(plant, track, asked)}
     return _surface_frictions(plant, track, asked)
 
 
@@ -227,7 +239,7 @@ def _screen_friction(screen: ElectroadhesionScreen, track: _Track, asked: Array)
     return p.friction_coefficient * (carrier if p.level == "carrier" else envelope)
 
 
-def _surface_frictions(surface: UltrasonicSurface, track: _Track, asked: Array) -> list[Array]:
+def _surface_frictions(surface: UltrasonicSurface, track: _Track, asked: Array) -> dict[str, Array]:
     """Frictions of an ultrasonic surface."""
     p, load, speed = surface.parameters, track.finger[:, LOAD], track.finger[:, SPEED]
     rest = _lead(surface)
@@ -239,16 +251,16 @@ def _surface_frictions(surface: UltrasonicSurface, track: _Track, asked: Array) 
     tables = surface_tables(p, surface.loop, surface.finger, (1.0, 1.0))  # nominal touch: for a finger that is up
     load, pace = np.where(track.touched, load, 1.0), np.maximum(abs(np.nan_to_num(speed)), p.least_speed)
     whole = tables.friction * load
-    wanted, found = np.empty(len(asked)), []
+    wanted, found = np.empty(len(asked)), dict[str, Array]()
     wanted_amplitudes(tables.law, np.clip(p.bias + asked / whole, tables.least, 1.0), load, pace, wanted)
-    for amplitude in _amplitudes(surface, track, wanted, load):
+    for state, amplitude in _amplitudes(surface, track, wanted, load).items():
         left = np.empty(len(asked))
         friction_ratios(tables.law, amplitude, load, pace, left)
-        found.append(whole * left)
+        found[state] = whole * left
     return found
 
 
-def _amplitudes(surface: UltrasonicSurface, track: _Track, wanted: Array, load: Array) -> list[Array]:
+def _amplitudes(surface: UltrasonicSurface, track: _Track, wanted: Array, load: Array) -> dict[str, Array]:
     """Amplitudes (m) that the loop may make of the wanted one, without noise.
 
     They are its state's, or those between which it changes state.  A detector that the calmer state opens, and that the
@@ -257,7 +269,7 @@ def _amplitudes(surface: UltrasonicSurface, track: _Track, wanted: Array, load: 
     """
     numbers = surface.loop.tables.numbers
     calm, moved = _followed(surface, track, wanted, load, "quiet")
-    found = [calm]
+    found = {"quiet": calm}
     for state, level, time in (
         ("stirred", math.sqrt(numbers.slow_level), numbers.slow_time),
         ("awake", math.sqrt(numbers.fast_level), numbers.fast_time),
@@ -268,7 +280,9 @@ def _amplitudes(surface: UltrasonicSurface, track: _Track, wanted: Array, load: 
         lively, moved = _followed(surface, track, wanted, load, state)
         span = max(1, int(time / numbers.rate * track.rate))
         least = np.maximum.reduceat(moved[state], np.arange(0, len(moved[state]), span))[:-1].min(initial=math.inf)
-        found = [lively] if least > level else [lively, lively + min(level / heard, 1.0) * (calm - lively)]
+        found = {state: lively}
+        if least <= level:
+            found["between"] = lively + min(level / heard, 1.0) * (calm - lively)
         calm = lively
     return found
 

@@ -152,6 +152,8 @@ NOISY = [
     (scene(SURFACE, 143.0, velocity=2e-3, sensor_noise=2e-9), 12),
     pytest.param(scene(SURFACE, 143.0, sensor_noise=2e-9), 40, marks=pytest.mark.slow),
     pytest.param(scene(SURFACE, 100.0, velocity=1e-3, sensor_noise=3e-9), 40, marks=pytest.mark.slow),
+    pytest.param(scene(SURFACE, 50.0, velocity=2e-3, sensor_noise=2e-9), 40, marks=pytest.mark.slow),
+    pytest.param(scene(SURFACE, 250.0, velocity=1.5e-3, sensor_noise=2e-9), 40, marks=pytest.mark.slow),
     pytest.param(scene(SURFACE, 72.0, 180.0, 400.0, velocity=4e-3, sensor_noise=2e-9), 40, marks=pytest.mark.slow),
 ]
 
