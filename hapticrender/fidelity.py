@@ -140,16 +140,16 @@ def fidelity(scene: Scene, tolerance: float | None = None) -> Fidelity:
 
     Notes
     -----
-    The error is the largest difference, at any time that is judged, of the
-    envelopes of motion or friction at the judged places, in the worst band,
+    The error is the largest difference, in any window that the judge may read, of
+    the envelopes of motion or friction at the judged places, in the worst band,
     relative to its target, while both models get the drive with which the lesser
     one reaches the target.  The verdict's figure, an rms over time, then differs by
     no more under that drive; that the loop finds it on both is not part of the bound.
     It is at most 1.5 times the error that two played devices show, where that
-    is 2e-4 or more.  On a plate where a carrier that is locked to the finger sweeps
-    through a mode, or the sag under a moving load is much larger than the target, up
-    to 3.2 times was seen; on an ultrasonic surface in whose noise the amplitude loop
-    seldom wakes, 1.6 times.
+    is 2e-4 or more.  In noise the error is chance: on an ultrasonic surface both
+    models are played, which takes seconds, and what is told is for the worst of
+    many runs, 40 say.  Where noise alone wakes the amplitude loop, in one run of
+    thirty, most runs show a half of it or less.
 
     Examples
     --------

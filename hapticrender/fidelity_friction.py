@@ -1,14 +1,18 @@
 """What the models of the surfaces that make friction can leave out for a scene, and the error bound of one that does.
 
 What is compared is the friction under the finger while both levels are driven alike, with what the friction loop has to
-ask for: the target, led by the contact's lag.  Of the finger nothing is left out.  Its mechanics move its skin and
-change no friction, and simpler ones take as long; one that rests feels none.
+ask for: the target, led by the contact's lag.  Without noise that is computed.  In noise an ultrasonic surface's
+amplitude loop wakes by chance, which no formula tells: both levels are played, in noise of their own.  Of the finger
+nothing is left out.  Its mechanics move its skin and change no friction, and simpler ones take as long; one that rests
+feels none.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from itertools import product
 from typing import Any, NamedTuple
 
@@ -17,8 +21,8 @@ import numpy as np
 from hapticrender._jit import kernel
 from hapticrender.bands import Bands
 from hapticrender.control.gap import VACUUM
-from hapticrender.fidelity_plate import CHUNK_VALUES, HOPS, LOOK_AHEAD, NoBound, Option
-from hapticrender.judge import LARGEST_INFLATION, LOWEST_FREQUENCY, fit, window_length
+from hapticrender.fidelity_plate import LOOK_AHEAD, NoBound, Option
+from hapticrender.fidelity_windows import BETWEEN, Windows, compared_with, ease, fade, look
 from hapticrender.loop import registered
 from hapticrender.plants.electroadhesion import ElectroadhesionParameters, ElectroadhesionScreen, finger_rows
 from hapticrender.plants.fidelity_screen import attractions
@@ -35,15 +39,16 @@ TAIL = 0.02  # s behind it, in which what an amplitude loop makes of the end die
 GROWTH = 0.05  # s in which a target grows after a touch
 SETTLING = 10.0  # time constants between the last touch and the judgement
 ACCURACY = 5e-5  # relative error below which nothing is told
-BETWEEN = 1.03  # of the error in the windows that are looked at: in those between
 SMALL_SIGNAL = 1.15  # of an amplitude loop's error by its linear model: at large modulation
 HEARD = 0.8  # of a detector's level: a deviation that may open it, as it hears twice the carrier as well
-HEARD_IN_NOISE = 0.25  # the same where there is noise, whose 5 or 5.5 sigma the level is: 4 of them come by chance
-CHANCES = 20.0  # windows for each that there is, of which noise is never worse in one
+CHANCES = 1000.0  # runs of which noise makes the error larger than the bound in one, as foretold
+TELLING = (2.0, 5.0, 10.0)  # windows' worth of the largest errors that were played, from which larger ones are foretold
+OFTEN, SELDOM = 16.0, 32.0  # s of the judged time that are played where the texture wakes the loop, or noise alone
+MOST_RUNS = 32
+UNSEEN = 1.4  # of what chance adds where noise alone wakes the loop
+SEED = 20210617  # of the first of them
 DRIVEN = 0.9  # of the drive's limit: what the amplitude may ask for, as feedback asks for some on top
 LOADS = 5  # of a finger that presses more or less, at which an amplitude loop is computed
-PASSED = 8  # frequencies of a carrier that moves with the finger, at which noise is looked at
-SMALL = 1e-4  # relative step of an amplitude
 POSITION, LOAD, _, SPEED = range(4)  # columns of the finger
 
 
@@ -63,13 +68,6 @@ class _Track(NamedTuple):
     def touched(self) -> Array:
         """Where the finger presses (n,)."""
         return np.isfinite(self.finger[:, SPEED]) & (self.finger[:, LOAD] > 0.0)
-
-
-class _Friction(NamedTuple):
-    """What a plant makes of what is asked for."""
-
-    steady: Array  # (n,) N
-    noise: Array  # (bands,) N2/Hz: largest power density where the band is
 
 
 @kernel
@@ -93,16 +91,66 @@ def bound(scene: Scene, lesser: Scene) -> float:
         raise NoBound("its texture has no constant envelopes, so no tight bound is known")
     if not bands.envelope.any():
         return 0.0
-    track = _track(scene, full.parameters, bands, model.highest_frequency, max(map(_lead, (full, less))))
+    parameters, highest = full.parameters, model.highest_frequency
+    track = _track(scene, parameters, bands, highest, max(map(_lead, (full, less))))
     asked = _asked(track)
-    margin = BETWEEN if isinstance(full, ElectroadhesionScreen) else SMALL_SIGNAL
-    worst = np.zeros(len(bands))
-    for one, other in product(*(_frictions(each, track, asked) for each in (full, less))):
+    frictions = [_frictions(each, track, asked) for each in (full, less)]
+    if isinstance(full, UltrasonicSurface) and _noisy(full):
+        whole = _track(scene, parameters, bands, highest, math.inf)
+        plants = [partial(renderer.plant, each) for each in (scene, lesser)]
+        seldom = any("quiet" in each for each in frictions)
+        worst = _played(whole, bands, plants, scene.tolerance, seldom)
+        return float(worst.max()) + ACCURACY
+    margin, worst = BETWEEN if isinstance(full, ElectroadhesionScreen) else SMALL_SIGNAL, np.zeros(len(bands))
+    for one, other in product(*(each.values() for each in frictions)):
         apart = np.empty(len(asked))
-        follow_friction(one.steady - other.steady, track.kept, apart)
-        found = _worst(scene, bands, track, apart, one.noise + other.noise)
+        follow_friction(one - other, track.kept, apart)
+        seen = _seen(bands, track, apart)
+        found = seen.apart[:, 0].max(axis=0, initial=0.0) / compared_with(seen.target, scene.tolerance)
         worst = np.maximum(worst, margin * found)
     return float(worst.max()) + ACCURACY
+
+
+def _noisy(surface: UltrasonicSurface) -> bool:
+    """Whether its sensor or its drive adds something that is chance."""
+    mode = surface.parameters.mode
+    return bool(mode.sensor_noise or mode.sensor_bits or mode.drive_bits)
+
+
+def _played(
+    track: _Track, bands: Bands, plants: Sequence[Callable[[int], Any]], tolerance: float, seldom: bool
+) -> Array:
+    """Largest relative error of each band where noise wakes an amplitude loop by chance: played, both levels apart.
+
+    What `plants` make is played from the scene's start on, again and again.  Where noise alone wakes it, `seldom`, more
+    runs are played, and what chance adds to the windows' means is taken UNSEEN times: no run may show the worst.
+    """
+    asked, judged = _asked(track)[:, None], (track.judged.stop - track.judged.start) / track.rate
+    played, rare = (SELDOM, UNSEEN) if seldom else (OFTEN, 1.0)
+    runs = []
+    for run in range(math.ceil(min(played / judged, MOST_RUNS))):
+        one, other = (np.asarray(make(SEED + 2 * run + i).run(asked).motion) for i, make in enumerate(plants))
+        runs.append(_seen(bands, track, (one - other)[:, 0]))
+    apart, read, found = np.stack([run.apart[:, 0] for run in runs]), runs[0].read, np.zeros(len(bands))
+    for k in np.flatnonzero(read.any(axis=0)):
+        told = apart[:, read[:, k], k]
+        mean = float(told.mean(axis=0).max())
+        found[k] = mean + rare * (_beyond(told.ravel(), runs[0].lengths * read[:, k].mean(), len(runs)) - mean)
+    return BETWEEN * found / compared_with(runs[0].target, tolerance)
+
+
+def _beyond(seen: Array, many: float, runs: int) -> float:
+    """Magnitude that one run of `many` windows in CHANCES would pass, by those `seen` in all windows of some `runs`.
+
+    The excess over a level that some pass is taken for exponential.
+    """
+    worst = float(seen.max())
+    for telling in TELLING:
+        share = min(telling / max(many * runs, 1.0), 0.5)
+        level = np.quantile(seen, 1.0 - share)
+        excess = seen[seen >= level].mean() - level
+        worst = max(worst, float(level + excess * math.log(max(share * many * CHANCES, 1.0))))
+    return worst
 
 
 def _lead(plant: Any) -> float:
@@ -124,7 +172,7 @@ def _track(scene: Scene, parameters: Any, bands: Bands, highest: float, lead: fl
     if end < scene.duration and not isinstance(scene.finger.motion, Sliding | Swiping):
         raise NoBound(f"its finger's path is longer than {LOOK_AHEAD:g} s and no repetition")
     if min(lead, begin) > LOOK_AHEAD:
-        raise NoBound(f"it takes more than {LOOK_AHEAD:g} s to settle")
+        raise NoBound(f"it has to be followed for more than {LOOK_AHEAD:g} s before it is judged")
     rate = float(parameters.rate)
     first, last = math.floor(max(begin - max(lead, LEAD), 0.0) * rate), math.ceil((end + TAIL) * rate)
     finger = finger_rows(scene.finger, first, last - first, rate)
@@ -153,17 +201,9 @@ def _envelope(bands: Bands, frequency: Array, down: Array, highest: float, rate:
     """Wanted envelopes (N, (n, bands)): they grow after a touch, and fade where a carrier is too slow or too fast."""
     count = np.arange(len(down))
     since = count - np.maximum.accumulate(np.where(down, -1, count))
-    weight = _ease(since / (GROWTH * rate))[:, None] * np.ones_like(frequency)
-    slow, fast = 2 / LOWEST_FREQUENCY * abs(frequency) - 1, 5 - 4 / highest * abs(frequency)
-    weight *= np.where(bands.wavenumber > 0.0, _ease(slow) * _ease(fast), 1.0)
+    weight = ease(since / (GROWTH * rate))[:, None] * fade(bands, frequency, highest, rate)
     envelope = weight * np.asarray(bands.envelope)
     return 2j * np.pi * frequency * envelope if bands.differentiated else envelope
-
-
-def _ease(x: Array) -> Array:
-    """Third-order step from 0 to 1 over 0..1."""
-    x = np.clip(x, 0.0, 1.0)
-    return x * x * (3.0 - 2.0 * x)
 
 
 def _asked(track: _Track) -> Array:
@@ -178,10 +218,10 @@ def _waveform(track: _Track) -> Array:
     return (track.envelope * np.exp(1j * track.phase)).real.sum(axis=1)
 
 
-def _frictions(plant: Any, track: _Track, asked: Array) -> list[_Friction]:
-    """Steady frictions that a plant may make of what is asked for, one for every state that it may be in."""
+def _frictions(plant: Any, track: _Track, asked: Array) -> dict[str, Array]:
+    """Steady frictions (N, (n,)) that a plant may make of what is asked for, one for every state that it may be in."""
     if isinstance(plant, ElectroadhesionScreen):
-        return [_Friction(_screen_friction(plant, track, asked), np.zeros(track.phase.shape[1]))]
+        return {"": _screen_friction(plant, track, asked)}
     return _surface_frictions(plant, track, asked)
 
 
@@ -199,7 +239,7 @@ def _screen_friction(screen: ElectroadhesionScreen, track: _Track, asked: Array)
     return p.friction_coefficient * (carrier if p.level == "carrier" else envelope)
 
 
-def _surface_frictions(surface: UltrasonicSurface, track: _Track, asked: Array) -> list[_Friction]:
+def _surface_frictions(surface: UltrasonicSurface, track: _Track, asked: Array) -> dict[str, Array]:
     """Frictions of an ultrasonic surface."""
     p, load, speed = surface.parameters, track.finger[:, LOAD], track.finger[:, SPEED]
     rest = _lead(surface)
@@ -211,55 +251,51 @@ def _surface_frictions(surface: UltrasonicSurface, track: _Track, asked: Array) 
     tables = surface_tables(p, surface.loop, surface.finger, (1.0, 1.0))  # nominal touch: for a finger that is up
     load, pace = np.where(track.touched, load, 1.0), np.maximum(abs(np.nan_to_num(speed)), p.least_speed)
     whole = tables.friction * load
-    wanted, found = np.empty(len(asked)), []
+    wanted, found = np.empty(len(asked)), dict[str, Array]()
     wanted_amplitudes(tables.law, np.clip(p.bias + asked / whole, tables.least, 1.0), load, pace, wanted)
-    left, more = np.empty(len(asked)), np.empty(len(asked))
-    for amplitude, noise in _amplitudes(surface, track, wanted, load):
+    for state, amplitude in _amplitudes(surface, track, wanted, load).items():
+        left = np.empty(len(asked))
         friction_ratios(tables.law, amplitude, load, pace, left)
-        friction_ratios(tables.law, (1.0 + SMALL) * amplitude, load, pace, more)
-        steep = (whole * (more - left) / (SMALL * amplitude))[track.judged]
-        found.append(_Friction(whole * left, np.mean(steep**2) * noise))
+        found[state] = whole * left
     return found
 
 
-def _amplitudes(surface: UltrasonicSurface, track: _Track, wanted: Array, load: Array) -> list[tuple[Array, Array]]:
-    """Amplitudes (m) that the loop may make of the wanted one, each with its noise in every band (m2/Hz).
+def _amplitudes(surface: UltrasonicSurface, track: _Track, wanted: Array, load: Array) -> dict[str, Array]:
+    """Amplitudes (m) that the loop may make of the wanted one, without noise.
 
     They are its state's, or those between which it changes state.  A detector that the calmer state opens, and that the
     livelier one does not keep open, opens and closes: then the deviation is hardly above what it hears, which is as
     much of the way from one state to the other.
     """
-    numbers, noisy = surface.loop.tables.numbers, surface.parameters.mode.sensor_noise > 0.0
-    calm, moved, noise = _followed(surface, track, wanted, load, "quiet")
-    found = [(calm, noise)]
+    numbers = surface.loop.tables.numbers
+    calm, moved = _followed(surface, track, wanted, load, "quiet")
+    found = {"quiet": calm}
     for state, level, time in (
         ("stirred", math.sqrt(numbers.slow_level), numbers.slow_time),
         ("awake", math.sqrt(numbers.fast_level), numbers.fast_time),
     ):
         heard = float(moved[state].max())
-        if heard < (HEARD_IN_NOISE if noisy else HEARD) * level:
+        if heard < HEARD * level:
             continue
-        lively, moved, noise = _followed(surface, track, wanted, load, state)
+        lively, moved = _followed(surface, track, wanted, load, state)
         span = max(1, int(time / numbers.rate * track.rate))
         least = np.maximum.reduceat(moved[state], np.arange(0, len(moved[state]), span))[:-1].min(initial=math.inf)
-        between = lively + min(level / heard, 1.0) * (calm - lively)
-        found = [(lively, noise)] if least > level else [(lively, noise), (between, noise)]
+        found = {state: lively}
+        if least <= level:
+            found["between"] = lively + min(level / heard, 1.0) * (calm - lively)
         calm = lively
     return found
 
 
 def _followed(
     surface: UltrasonicSurface, track: _Track, wanted: Array, load: Array, state: str
-) -> tuple[Array, dict[str, Array], Array]:
-    """Amplitude (m) of a loop in this state, under a finger of changing load, what its detectors hear, and noise."""
+) -> tuple[Array, dict[str, Array]]:
+    """Amplitude (m) of a loop in this state, under a finger of changing load, and what its detectors hear."""
     p, judged = surface.parameters, track.judged
     least, most = float(load[judged].min()), float(load[judged].max())
     tabled = np.linspace(least, most, LOADS if most > least else 1)
     place = np.interp(load, tabled, np.arange(len(tabled))) if len(tabled) > 1 else np.zeros(len(load))
-    amplitude, noise = np.zeros(len(load)), np.zeros(track.phase.shape[1])
-    heard = dict.fromkeys(("stirred", "awake"), np.zeros(len(load[judged])))
-    size = abs(track.frequency[judged])
-    passed = np.maximum(np.linspace(size.min(axis=0), size.max(axis=0), PASSED), LOWEST_FREQUENCY)
+    amplitude, heard = np.zeros(len(load)), dict.fromkeys(("stirred", "awake"), np.zeros(len(load[judged])))
     for k, each in enumerate(tabled):
         loop = AmplitudeLoop(parameters=p, tables=surface.loop.tables, load=float(each), rise=track.rise, state=state)
         if np.max(loop.needed(wanted)[judged]) > DRIVEN * p.mode.drive_limit:
@@ -269,37 +305,15 @@ def _followed(
         amplitude += weight * played
         for state_heard, more in (("stirred", slow), ("awake", fast)):
             heard[state_heard] = heard[state_heard] + (weight * more)[judged]
-        noise = np.maximum(noise, loop.noise(passed.ravel()).reshape(passed.shape).max(axis=0))
-    return amplitude, heard, noise
+    return amplitude, heard
 
 
-def _worst(scene: Scene, bands: Bands, track: _Track, apart: Array, noise: Array) -> Array:
-    """Largest envelope of `apart` (N, (n,)) and noise (N2/Hz) in any judged window of each band, by the band's target.
-
-    In a window of T seconds a power density S feigns an envelope with the mean square 2 S/T, Rayleigh distributed.
-    """
+def _seen(bands: Bands, track: _Track, apart: Array) -> Windows:
+    """What the judge reads of frictions that are `apart` (N, (n,))."""
     late = track.judged
-    signals = np.column_stack([apart, _waveform(track)])[late]
-    phase, asked = track.phase[late], (track.envelope != 0.0)[late]
-    asked &= abs(track.frequency[late]) >= LOWEST_FREQUENCY * (1 - 1e-6)
-    asked &= track.touched[late, None]
-    window = window_length(bands, track.rate, track.finger[late, POSITION], len(signals) / track.rate / 2)
-    size = max(2, round(window * track.rate))
-    starts = np.arange(0, len(signals) - size + 1, max(1, size // HOPS))
-    worst, square, count = (np.zeros(len(bands)) for _ in range(3))
-    for part in np.array_split(starts, 1 + len(starts) * size * (2 * len(bands) + 2) // CHUNK_VALUES):
-        index = part[:, None] + np.arange(size)
-        envelope, inflation, _ = fit(phase[index], signals[index])
-        told = (inflation <= LARGEST_INFLATION) & asked[index].all(axis=1)
-        size_of = np.where(told[:, None, :], abs(envelope), 0.0)
-        worst = np.maximum(worst, size_of[:, 0].max(axis=0, initial=0.0))
-        square += (size_of[:, 1] ** 2).sum(axis=0)
-        count += told.sum(axis=0)
-    target = np.sqrt(square / np.maximum(count, 1.0))
-    target = np.maximum(target, scene.tolerance * target.max(initial=0.0))
-    chance = math.log(CHANCES * max(len(signals) / size, 1.0))
-    worst += np.sqrt(2 * noise / window * chance) * (count > 0)
-    return worst / np.where(target > 0.0, target, np.inf)
+    asked = (track.envelope != 0.0)[late] & track.touched[late, None]
+    signals, rates = (apart[late, None], _waveform(track)[late]), (track.rate, track.rate)
+    return look(bands, rates, track.finger[late, POSITION], track.phase[late], signals, asked)
 
 
 def _carrier_at_once(scene: Scene) -> Scene | str | None:

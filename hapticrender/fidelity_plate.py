@@ -11,7 +11,8 @@ import numpy as np
 from scipy.optimize import nnls
 
 from hapticrender.bands import Bands
-from hapticrender.judge import LARGEST_INFLATION, LOWEST_FREQUENCY, fit, window_length
+from hapticrender.fidelity_windows import BETWEEN, compared_with, fade, look
+from hapticrender.judge import LOWEST_FREQUENCY
 from hapticrender.plants.fidelity import FingerPath, PlateModel, forgetting_time, held, sag, stray
 from hapticrender.plants.vibrotactile import PlateParameters
 from hapticrender.protocols import Array
@@ -19,25 +20,24 @@ from hapticrender.touch.mechanics import FingerMechanics
 from hapticrender.touch.motion import Nowhere, Sliding, Still, Swiping
 from hapticrender.touch.scene import Scene
 
-LONGEST_STEP = 0.5e-3  # s: the plate's modes turn by less than 0.6 rad in it
+FASTEST_STEPS = 20e3  # Hz: a plate of a higher rate is followed in steps of several samples
 STEPS_PER_PERIOD = 8
 ACCURACY = 5e-5  # relative error below which nothing is told
+NEGLIGIBLE = ACCURACY / 10  # relative size below which what is left of a touch is not followed
 SETTLING = 10.0  # time constants between the last touch and the judgement, at least
 TOUCHING = 10.0  # a touch rings by less than so many times what it settles to
 LOOK_AHEAD = 60.0  # s of a scene that are followed; what comes later has to be a repetition
 FIT_FREQUENCIES = 50  # at which a lesser finger is fitted, at most
-HOPS = 16  # window starts in a window's length: the worst window is sought, not a mean
 COARSE = 2000  # times at which a path is looked at before it is followed
-CHUNK_VALUES = 2**20  # numbers in one batch of regressors
 NUMBERS = ("mass", "damping", "stiffness", "phalanx_mass", "phalanx_damping", "phalanx_stiffness")
 
 
 class _Times(NamedTuple):
-    """Times (s) to follow the plate at, when the judgement begins (s), and what is left of a touch by then (1)."""
+    """Times (s) to follow the plate at, when the judgement begins (s), and whether the plate is at rest at first."""
 
     steps: Array
     begin: float
-    left: float
+    from_rest: bool
 
 
 class NoBound(Exception):
@@ -59,106 +59,110 @@ class Option(NamedTuple):
 def bound(scene: Scene, lesser: Scene) -> float:
     """Largest relative error (1) of the plate's motion in a lesser model; see `hapticrender.fidelity.fidelity`.
 
-    What it is off by for the length of its steps is added: three times the
-    error that the difference to steps of twice the length foretells (order 2).
+    Both models' difference is put together, sag and all bands, and looked at through the judge's windows.  The plant
+    holds the finger over each sample, so what it does comes half a sample late; of the drive the controller knows that.
     """
-    bands, wanted = _bands(scene)
-    if not (wanted > 0.0).any():
+    bands = _bands(scene)
+    envelope = _envelope(bands)
+    if not envelope.any():
         return 0.0
     times = _times(scene, lesser, bands)
-    fine = _error(scene, lesser, times)
-    if _touch(scene, times.steps).constant:
-        return fine
-    return fine + abs(fine - _error(scene, lesser, times._replace(steps=times.steps[::2])))
+    path, felt = _touch(scene, times.steps), np.maximum(times.steps - 0.5 / _parameters(scene).rate, 0.0)
+    paths = [_touch(each, felt)._replace(time=times.steps) for each in (scene, lesser)]
+    full, less = (_model(each, on, times.from_rest) for each, on in zip((scene, lesser), paths, strict=True))
+    plate, omega = full.parameters, _omega(bands, path)
+    weight = fade(bands, omega / (2 * math.pi), _highest(plate), plate.rate)
+    carrier = envelope * np.exp(1j * bands.carrier_phase(path.time, path.position))
+    apart, worst = np.zeros((len(path.time), 3)) + sag(full) - sag(less), np.zeros((3, len(bands)))
+    for k in np.flatnonzero(envelope):
+        parted = stray(full, less, omega[:, k], weight[:, k]) + held(full, less, omega[:, k], weight[:, k])
+        apart += (parted * carrier[:, k, None]).real
+        worst[:, k] = abs(parted[-1] * envelope[k])
+    target = abs(envelope)
+    if len(path.time) > 2:
+        many = max(1, round(1 / (path.step * plate.rate)))  # steps a sample, of which the judge sees one
+        late = np.arange(0, len(path.time), many)[path.time[::many] >= times.begin - path.step / 2]
+        phase, wanted = bands.carrier_phase(path.time[late], path.position[late]), (weight * carrier).real.sum(axis=1)
+        signals, rates = (apart[late], wanted[late]), (1 / (many * path.step), plate.rate)
+        seen = look(bands, rates, path.position[late], phase, signals, weight[late] > 0.0)
+        worst, target = BETWEEN * seen.apart.max(axis=0, initial=0.0), seen.target
+    target = compared_with(target, scene.tolerance) * abs(1.0 + scene.gradient * _places(plate))[:, None]
+    return float((worst / target).max()) + ACCURACY
 
 
-def _error(scene: Scene, lesser: Scene, times: _Times) -> float:
-    """Largest relative error once the judgement has begun, as found with these steps."""
-    full, less = (_model(each, _touch(each, times.steps)) for each in (scene, lesser))
-    bands, wanted = _bands(scene)
-    omega, judged = _omega(bands, full.path), times.steps >= times.begin
-    window = window_length(bands, 1 / full.path.step, full.path.position[judged], np.ptp(times.steps[judged]) / 2)
-    leak, ring = _leak(full, less, bands, times.begin, window), times.left * _sagging(full, less)
-    worst = 0.0
-    for k in np.flatnonzero(wanted):
-        read = _readable(omega[:, k], full.parameters)[judged]
-        if read.any():
-            parted = stray(full, less, omega[:, k])[judged]
-            apart = _worst_mean(parted, read, round(window / 2 / full.path.step)) + held(full, less, omega[:, k])
-            apart *= abs(bands.envelope[k])  # type: ignore[index]
-            worst = max(worst, times.left + float((apart + leak[:, k] + ring).max() / wanted[k]))
-    return worst + ACCURACY
-
-
-def _worst_mean(values: Array, read: Array, many: int) -> Array:
-    """Largest magnitude (3,) of the mean of envelopes `values` (n, 3) over `many` rows of which one is `read` (n,).
-
-    Half a window of the judge's: the mean over a whole one is never larger than that over its worse half.
-    """
-    many = max(1, min(many, len(values)))
-    running = np.cumsum(np.column_stack([values, read]), axis=0)
-    total = np.vstack([running[many - 1], running[many:] - running[:-many]])
-    return abs(total[total[:, 3].real > 0.5, :3]).max(axis=0) / many
-
-
-def _sagging(*models: PlateModel) -> float:
-    """Displacement (m) of the plate by its finger's load, of all models together, at the worst place."""
-    return sum(float(abs(sag(model)).max()) for model in models)
-
-
-def _model(scene: Scene, path: FingerPath) -> PlateModel:
-    return PlateModel(PlateParameters.with_overrides(scene.plant), scene.finger.mechanics, path)
-
-
-def _bands(scene: Scene) -> tuple[Bands, Array]:
-    """Bands of a scene, and the amplitude (m) that an error of each is compared with, as the verdict does."""
-    bands = scene.texture.bands(PlateParameters.with_overrides(scene.plant).rate)
+def _envelope(bands: Bands) -> Array:
+    """Wanted envelopes (m, (bands,)), which do not change."""
     if bands.envelope is None:
         raise NoBound("its texture has no constant envelopes, so no tight bound is known")
-    wanted = abs(bands.envelope)
-    return bands, np.where(wanted > 0.0, np.maximum(wanted, scene.tolerance * wanted.max(initial=0.0)), 0.0)
+    return bands.envelope
+
+
+def _highest(plate: PlateParameters) -> float:
+    """Frequency (Hz) above which targets fade."""
+    return plate.band_model(plate.rate, plate.delay).highest_frequency
+
+
+def _places(plate: PlateParameters) -> Array:
+    """Where centre and ends are (m)."""
+    return plate.glass_length / 2 * np.array([0.0, -1.0, 1.0])
+
+
+def _parameters(scene: Scene) -> PlateParameters:
+    return PlateParameters.with_overrides(scene.plant)
+
+
+def _model(scene: Scene, path: FingerPath, from_rest: bool = False) -> PlateModel:
+    return PlateModel(_parameters(scene), scene.finger.mechanics, path, scene.gradient, from_rest)
+
+
+def _bands(scene: Scene) -> Bands:
+    return scene.texture.bands(_parameters(scene).rate)
 
 
 def _omega(bands: Bands, path: FingerPath) -> Array:
     """Angular frequency (rad/s, shape (n, bands)) of every carrier along the path."""
-    velocity = np.diff(path.position) / path.step
-    return 2 * math.pi * bands.instantaneous_frequency(np.append(velocity, velocity[-1:]))
-
-
-def _readable(omega: Array, parameters: PlateParameters) -> Array:
-    """Where a carrier is neither too slow to be judged nor faded out."""
-    highest = parameters.band_model(parameters.rate, parameters.delay).highest_frequency
-    frequency = abs(omega) / (2 * math.pi)
-    return (frequency >= LOWEST_FREQUENCY * (1 - 1e-6)) & (frequency <= max(highest, 1.0))
+    return 2 * math.pi * bands.instantaneous_frequency(np.gradient(path.position, path.step))
 
 
 def _times(scene: Scene, lesser: Scene, bands: Bands) -> _Times:
-    """Times to follow the plate at."""
+    """Times to follow the plate at: two of them where nothing changes any more."""
     begin = scene.settle if scene.duration >= 2 * scene.settle else scene.duration / 2
     end = min(scene.duration, begin + LOOK_AHEAD)
     if end < scene.duration and not isinstance(scene.finger.motion, Nowhere | Still | Sliding | Swiping):
         raise NoBound(f"its finger's path is longer than {LOOK_AHEAD:g} s and no repetition")
     coarse = np.linspace(0.0, end, COARSE)
-    forgets = forgetting_time(*(_model(each, _touch(each, coarse)) for each in (scene, lesser)))
-    rest, rate = SETTLING * forgets, PlateParameters.with_overrides(scene.plant).rate
+    models = [_model(each, _touch(each, coarse)) for each in (scene, lesser)]
+    forgets, rate = forgetting_time(*models), models[0].parameters.rate
+    rest, top = SETTLING * forgets, float(abs(_omega(bands, models[0].path)).max(initial=1.0)) / (2 * math.pi)
     late = f"it is judged from {begin:.3g} s on, less than {rest:.3g} s after its finger last came or went"
-    top = float(abs(_omega(bands, _touch(scene, coarse))).max(initial=1.0)) / (2 * math.pi)
     if rest > begin:
         raise NoBound(late)
     if top > rate / 2:
         raise NoBound(f"it reaches {top:.4g} Hz, more than half the rate of {rate:g} Hz")
-    step = min(LONGEST_STEP, 1 / (STEPS_PER_PERIOD * top))
-    steps = begin + step * np.arange(-math.floor(min(begin, 2 * rest) / step), math.ceil((end - begin) / step))
+    step, first = _step(rate, top), max(begin - 2 * rest, 0.0)
+    many = max(1, round(1 / (step * rate)))
+    steps = step * np.arange(math.floor(first / (many * step)) * many, math.ceil(end / step))
     down = np.isfinite(scene.finger.position(steps))
     changed = steps[1:][down[1:] != down[:-1]].max(initial=steps[0])
     if begin - changed < rest:
         raise NoBound(late)
-    steps = steps[steps >= begin - rest]
-    if abs(np.diff(_omega(bands, _touch(scene, steps)), axis=0)).max(initial=0.0) > 2 * math.pi * LOWEST_FREQUENCY:
+    omega = _omega(bands, _touch(scene, steps))
+    if abs(omega[2:] - omega[:-2]).max(initial=0.0) > 2 * math.pi * LOWEST_FREQUENCY:
         raise NoBound("its finger changes its speed at once, and the texture's frequency with it")
-    if all(_touch(each, steps).constant for each in (scene, lesser)):
-        steps = np.array([begin, begin + step])  # one time tells all
-    return _Times(steps, begin, TOUCHING * math.exp(-(begin - changed) / forgets))
+    late_paths = [_touch(each, steps[steps >= max(changed, begin - rest)]) for each in (scene, lesser)]
+    if all(path.constant for path in late_paths):
+        ring = TOUCHING * math.exp(-(begin - changed) / forgets)
+        models = [_model(each, path) for each, path in zip((scene, lesser), late_paths, strict=True)]
+        sagging = sum(float(abs(sag(model)).max()) for model in models)
+        if ring * (1.0 + sagging / abs(_envelope(bands)).max()) < NEGLIGIBLE:
+            return _Times(np.array([begin, begin + step]), begin, False)
+    return _Times(steps, begin, first == 0.0)
+
+
+def _step(rate: float, top: float) -> float:
+    """Step (s) that follows a carrier of `top` (Hz): a whole number of samples, or a whole part of one."""
+    wanted = max(min(rate, FASTEST_STEPS), STEPS_PER_PERIOD * top)
+    return math.floor(rate / wanted) / rate if wanted <= rate else 1 / (math.ceil(wanted / rate) * rate)
 
 
 def _touch(scene: Scene, time: Array) -> FingerPath:
@@ -169,32 +173,12 @@ def _touch(scene: Scene, time: Array) -> FingerPath:
     return FingerPath(time, np.where(down, position, seen), load, strength)
 
 
-def _leak(full: PlateModel, less: PlateModel, bands: Bands, begin: float, window: float) -> Array:
-    """Amplitude (m, shape (3, bands)) that the sag under a moving load feigns in each band, in the worst window."""
-    worst = np.zeros((3, len(bands)))
-    path = full.path
-    apart = np.zeros((1, 3)) if path.constant else sag(full) - sag(less)
-    if not apart.any():
-        return worst
-    late = path.time >= begin
-    time, position, apart = path.time[late], path.position[late], apart[late]
-    size = max(2, round(window / path.step))
-    phase, frequency = bands.carrier_phase(time, position), abs(_omega(bands, path)[late]) / (2 * math.pi)
-    first = np.arange(0, len(time) - size + 1, max(1, size // HOPS))
-    for starts in np.array_split(first, 1 + len(first) * size * len(bands) // CHUNK_VALUES):
-        index = starts[:, None] + np.arange(size)
-        envelope, inflation, _ = fit(phase[index], apart[index])
-        told = (inflation <= LARGEST_INFLATION) & (frequency[index].mean(axis=1) >= LOWEST_FREQUENCY * (1 - 1e-6))
-        worst = np.maximum(worst, np.where(told[:, None, :], abs(envelope), 0.0).max(axis=0, initial=0.0))
-    return worst
-
-
 def _still(scene: Scene) -> Scene | str | None:
     """Rest the finger in the middle of its path."""
     finger = scene.finger
     if isinstance(finger.motion, Nowhere | Still):
         return None
-    if _bands(scene)[0].wavenumber.any():
+    if _bands(scene).wavenumber.any():
         return "the texture is read at the finger's position"
     if finger.normal_load is None:
         return "the finger's load is recorded with its path"
@@ -235,7 +219,7 @@ def _second_order(scene: Scene) -> Scene | str | None:
     if _level(scene) != 4:
         return None
     own = scene.finger.mechanics
-    bands = _bands(scene)[0]
+    bands = _bands(scene)
     path = _touch(scene, np.linspace(0.0, min(scene.duration, LOOK_AHEAD), COARSE))
     frequency = np.unique(abs(_omega(bands, path))) / (2 * math.pi)
     frequency = frequency[frequency >= LOWEST_FREQUENCY * 0.99]
@@ -253,8 +237,10 @@ def _second_order(scene: Scene) -> Scene | str | None:
     return replace(scene, finger=replace(scene.finger, mechanics=mechanics))
 
 
-def _heave_only(scene: Scene) -> Scene | None:
+def _heave_only(scene: Scene) -> Scene | str | None:
     """Lock the rocking."""
+    if scene.gradient:
+        return "its amplitude grows along the plate"
     if scene.plant.get("degrees_of_freedom", 2) == 1:
         return None
     return replace(scene, plant={**scene.plant, "degrees_of_freedom": 1})

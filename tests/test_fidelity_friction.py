@@ -141,7 +141,7 @@ def test_the_bound_is_never_below_the_true_error_and_at_most_half_as_much_above(
     assert true <= found <= 1.5 * true
 
 
-@pytest.mark.parametrize("name", ["ultrasonic-swiping", "ultrasonic-warming"])
+@pytest.mark.parametrize("name", ["one-texture-ultrasonic", "ultrasonic-swiping", "ultrasonic-warming"])
 def test_the_bound_holds_in_noise_that_neither_level_shares(name):
     """What is bounded is the worst that chance may do: here, of three runs."""
     full = known(name)
@@ -149,18 +149,27 @@ def test_the_bound_holds_in_noise_that_neither_level_shares(name):
     assert true <= found <= 1.5 * true
 
 
-@pytest.mark.parametrize("velocity", [8e-3, 2e-3])
-def test_a_weak_texture_may_drown_in_noise_and_the_bound_says_so(velocity):
-    """The rest of a loop that wakes by chance is not known, so this is not tight; noise alone tells up to 4 % here."""
-    noisy = scene(SURFACE, 143.0, velocity=velocity, sensor_noise=2e-9)
-    assert true_error(noisy, seeds=(1, 2)) <= bound(noisy, reduced(noisy))
+NOISY = [
+    (scene(SURFACE, 143.0, velocity=2e-3, sensor_noise=2e-9), 12),
+    pytest.param(scene(SURFACE, 143.0, sensor_noise=2e-9), 40, marks=pytest.mark.slow),
+    pytest.param(scene(SURFACE, 100.0, velocity=1e-3, sensor_noise=3e-9), 40, marks=pytest.mark.slow),
+    pytest.param(scene(SURFACE, 50.0, velocity=2e-3, sensor_noise=2e-9), 40, marks=pytest.mark.slow),
+    pytest.param(scene(SURFACE, 250.0, velocity=1.5e-3, sensor_noise=2e-9), 40, marks=pytest.mark.slow),
+    pytest.param(scene(SURFACE, 72.0, 180.0, 400.0, velocity=4e-3, sensor_noise=2e-9), 40, marks=pytest.mark.slow),
+]
 
 
-def test_three_partials_in_noise_are_bounded():
-    """Nor is it tight where partials share the noise: 1.55 times the true error of these seeds."""
-    full = known("one-texture-ultrasonic")
-    found, true = bound(full, reduced(full)), true_error(full, seeds=(1, 2))
-    assert true <= found <= 2 * true
+@pytest.mark.parametrize(("full", "runs"), NOISY)
+def test_a_weak_texture_may_drown_in_noise_and_the_bound_says_so(full, runs):
+    """Its loop wakes by chance, in some runs and not in others, so the truth is the worst of many."""
+    found, true = bound(full, reduced(full)), max(true_error(full, seeds=(2 * i + 1, 2 * i + 2)) for i in range(runs))
+    assert true <= found <= 1.5 * true
+
+
+def test_a_loop_that_wakes_by_chance_is_not_followed_for_ever():
+    found = fidelity(replace(scene(SURFACE, 143.0, sensor_noise=2e-9), duration=200.0, settle=100.0))
+    assert found.least.plant["level"] == "carrier"
+    assert "followed for more than 60 s before it is judged" in found.text()
 
 
 @pytest.mark.parametrize(

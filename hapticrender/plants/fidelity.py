@@ -18,7 +18,7 @@ loop that is closed round the lesser model ends there.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from hapticrender.touch.mechanics import FingerMechanics
 
 PLACE_STEP, GRIP_STEP = 0.1e-3, 0.01  # m, 1: resolution at which A is tabled; zeta_s knows the finger exactly
-IMAGES_SEEN = 50  # places along the path at which the hold's images are looked at
+IMAGES, IMAGES_SEEN = 3, 500  # of the hold on either side; places along the path at which they are looked at
 SERIES = 13  # terms of the exponential of a matrix of norm 1/2 or less: what is left out is below rounding
 
 
@@ -58,23 +58,24 @@ class FingerPath(NamedTuple):
 
 @kernel
 def follow_run(half, index, turn, settled, out):
-    """Envelope of the states, (n, s): quasi-static answer plus what its change leaves behind, from rest on it."""
+    """Envelope of the states, (n, s): quasi-static answer plus what its change and `out[0]` at first leave behind."""
     many = settled.shape[1]
     left, moved = out[0], out[1]
-    for i in range(many):
-        left[i] = 0.0
     for n in range(settled.shape[0]):
+        for part in range(2 if n > 0 else 0):  # Simpson's rule over the step
+            share = (1 + 3 * part) / 6
+            for i in range(many):
+                left[i] -= share * (settled[n, i] - settled[n - 1, i])
+            for i in range(many):
+                total = 0j
+                for j in range(many):
+                    total += half[index[n - 1], i, j] * left[j]
+                moved[i] = turn[n - 1] * total
+            for i in range(many):
+                left[i] = moved[i]
         if n > 0:
-            for part in range(2):
-                for i in range(many):
-                    total = 0j
-                    for j in range(many):
-                        total += half[index[n - 1], i, j] * left[j]
-                    moved[i] = turn[n - 1] * total
-                    if part == 0:
-                        moved[i] -= settled[n, i] - settled[n - 1, i]
-                for i in range(many):
-                    left[i] = moved[i]
+            for i in range(many):
+                left[i] -= (settled[n, i] - settled[n - 1, i]) / 6
         for i in range(many):
             out[2 + n, i] = settled[n, i] + left[i]
 
@@ -91,11 +92,17 @@ class PlateModel:
         Of the finger.
     path : FingerPath
         Where it is.
+    gradient : float, 1/m
+        By which the wanted amplitude grows along the plate.
+    from_rest : bool
+        Whether the plate is at rest when the path begins; else it has long been driven as at its first entry.
     """
 
     parameters: PlateParameters
     mechanics: FingerMechanics
     path: FingerPath
+    gradient: float = 0.0
+    from_rest: bool = False
 
     @property
     def order(self) -> int:
@@ -156,14 +163,24 @@ class PlateModel:
         return own.mass * s**2 + phalanx * share, share
 
     def wanted_force(self, omega: Array) -> Array:
-        """Common and opposed force (N/m, shape (n, 2)) that heaves the plate, were it rigid, by 1 m at `omega`."""
+        """Common and opposed force (N/m, shape (n, 2)) that makes the target at `omega`, were the plate rigid.
+
+        The target is a heave of 1 m, and a rocking where the amplitude is to grow along the plate.  One coil makes the
+        heave alone, and lets the plate rock as it will.
+        """
         s, plate = 1j * omega, self.parameters
+        many, lever = plate.degrees_of_freedom, self.path.position / plate.half_spacing
+        contact = np.stack([np.ones_like(lever), lever], axis=1)[:, :many]
         grip = self.path.strength * self.finger(s)[0]
+        stiffness: Array = grip[:, None, None] * contact[:, :, None] * contact[:, None, :]
+        for matrix, power in zip(self.matrices, (s**2, s, np.ones_like(s)), strict=True):
+            stiffness = stiffness + power[:, None, None] * matrix[:many, :many]
         force = np.zeros((len(s), 2), complex)
-        for row in range(plate.degrees_of_freedom):
-            lever = self.path.position / plate.half_spacing if row else 1.0
-            mass, damping, stiffness = (matrix[row, 0] for matrix in self.matrices)
-            force[:, row] = mass * s**2 + damping * s + stiffness + grip * lever
+        if plate.coils == 2:
+            force[:, :many] = stiffness @ np.array([1.0, self.gradient * plate.half_spacing])[:many]
+        else:
+            force[:, 0] = stiffness[:, 0, 0]
+            force[:, 0] -= stiffness[:, 0, 1] ** 2 / stiffness[:, 1, 1] if many == 2 else 0.0
         return force
 
     def quasi_static(self, omega: Array, force: Array) -> Array:
@@ -219,11 +236,13 @@ class PlateModel:
     def answer(self, omega: Array, force: Array) -> Array:
         """Envelopes at centre and ends (m, shape (n, 3)) under `force` (N, coordinates); `omega` in rad/s, (n,)."""
         settled = self.quasi_static(omega, force)
-        if not (np.ptp(settled.real, axis=0).any() or np.ptp(settled.imag, axis=0).any()):
+        constant = not (np.ptp(settled.real, axis=0).any() or np.ptp(settled.imag, axis=0).any())
+        if constant and not self.from_rest:
             return self.moved(settled)
         half, index = self._table
         turn = np.exp(-0.25j * self.path.step * (omega[1:] + omega[:-1]))
-        out = np.empty((len(settled) + 2, settled.shape[1]), complex)
+        out = np.zeros((len(settled) + 2, settled.shape[1]), complex)
+        out[0] = -settled[0] if self.from_rest else 0.0
         follow_run(half, index, turn, settled, out)
         return self.moved(out[2:])
 
@@ -231,9 +250,9 @@ class PlateModel:
         """Displacement (m, shape (n, 3)) of centre and ends in `states` (n, s)."""
         return states[:, : self.places.shape[1]] @ self.places.T
 
-    def _at(self, few: slice) -> PlateModel:
+    def _at(self, few: Array) -> PlateModel:
         """The model at some of the times of its path."""
-        return PlateModel(self.parameters, self.mechanics, FingerPath(*(column[few] for column in self.path)))
+        return replace(self, path=FingerPath(*(column[few] for column in self.path)))
 
     @cached_property
     def _table(self) -> tuple[Array, Array]:
@@ -261,7 +280,7 @@ def _exponential(matrix: Array) -> Array:
     return total
 
 
-def stray(full: PlateModel, lesser: PlateModel, omega: Array) -> Array:
+def stray(full: PlateModel, lesser: PlateModel, omega: Array, weight: Array) -> Array:
     """How far two models part at centre and ends (n, 3), per metre of target, under the lesser one's own drive.
 
     Parameters
@@ -270,26 +289,29 @@ def stray(full: PlateModel, lesser: PlateModel, omega: Array) -> Array:
         Both with paths of the same times.
     omega : ndarray, shape (n,), rad/s
         Angular frequency of the carrier along the path; its sign follows the finger.
+    weight : ndarray, shape (n,)
+        Share of the target that is asked for.
     """
-    drive = lesser.wanted_force(omega)
+    drive = lesser.wanted_force(omega) * weight[:, None]
     return full.answer(omega, full.pushed(drive)) - lesser.answer(omega, lesser.pushed(drive))
 
 
-def held(full: PlateModel, lesser: PlateModel, omega: Array) -> Array:
-    """How far two models part (3,), per metre of target, for the drive's being held over each sample.
+def held(full: PlateModel, lesser: PlateModel, omega: Array, weight: Array) -> Array:
+    """How far two models part (n, 3) besides, per metre of target, for the drive's being held over each sample.
 
-    The hold's images at n w_s -+ w carry w/(n w_s -+ w) of the drive each, and sampling folds them back on w; both
-    first ones are counted twice, for the ones beyond, which the plate's mass lets through with less than 1/n^3.
+    The hold's images at w + n w_s, n = +-1, +-2, ..., carry w/(w + n w_s) of the drive each, and sampling folds them
+    back on w.  The plate's mass lets them through with 1/n^2, and those of either sign nearly cancel.
     """
-    few = slice(None, None, max(1, len(omega) // IMAGES_SEEN))
-    rate = 2 * math.pi * full.parameters.rate
-    apart = np.zeros((len(omega[few]), 3))
-    drive = lesser._at(few).wanted_force(omega[few])
-    for image in (rate - abs(omega[few]), rate + abs(omega[few])):
-        both = (model._at(few) for model in (full, lesser))
-        moved = [model.moved(model.quasi_static(image, model.pushed(drive))) for model in both]
-        apart += 2 * abs(moved[0] - moved[1]) * (abs(omega[few]) / image)[:, None]
-    return apart.max(axis=0)
+    some = np.unique(np.linspace(0, len(omega) - 1, min(len(omega), IMAGES_SEEN)).astype(int))
+    rate, both = 2 * math.pi * full.parameters.rate, (full._at(some), lesser._at(some))
+    drive = both[1].wanted_force(omega[some]) * weight[some, None]
+    apart = np.zeros((len(some), 3), complex)
+    for n in range(1, IMAGES + 1):
+        for image in (omega[some] - n * rate, omega[some] + n * rate):
+            moved = [model.moved(model.quasi_static(image, model.pushed(drive))) for model in both]
+            apart += (moved[0] - moved[1]) * (omega[some] / image)[:, None]
+    place = np.arange(len(omega))
+    return np.stack([np.interp(place, some, column) for column in apart.T], axis=1)
 
 
 def sag(model: PlateModel) -> Array:

@@ -109,16 +109,6 @@ class AmplitudeLoop:
         forward = self._ahead * (self.stiffness + slope * (1 - np.exp(-1j * turn * h)) / h)
         return mode * (forward + fed_back) / (1 + mode * fed_back)
 
-    def noise(self, frequency: Array) -> Array:
-        """Power density (m2/Hz) of the amplitude at `frequency` (Hz, > 0), by the sensor's noise and resolution."""
-        mode = self.parameters.carrier_mode
-        density = 2 * (mode.sensor_noise**2 + mode.sensor_step**2 / 12) / mode.rate
-        sides = []
-        for turn in (2 * np.pi * np.asarray(frequency, float), -2 * np.pi * np.asarray(frequency, float)):
-            along, fed_back = self._round(turn)
-            sides.append(abs(along * fed_back / (1 + along * fed_back)) ** 2)
-        return density * (sides[0] + sides[1])
-
     def _round(self, turn: Array) -> tuple[Array, Array]:
         """Mode, delay included (m/N), and feedback (N/m) at `turn` (rad/s) from the carrier."""
         z = np.exp(1j * (self.omega + turn) * self.loop.period)
