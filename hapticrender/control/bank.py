@@ -12,7 +12,7 @@ from hapticrender.bands import Bands
 from hapticrender.control import bank_rows as row
 from hapticrender.control.bandmodel import BandModel
 from hapticrender.control.bank_carriers import REFRESH
-from hapticrender.control.bank_kernels import bank_run
+from hapticrender.control.bank_kernels import ADAPTATION, bank_run
 from hapticrender.control.bank_state import PRECISIONS, BankNumbers, BankState, BankTables, across_bands, bank_state
 from hapticrender.control.damping import choose_damping
 from hapticrender.control.kernels import FREQUENCY, WAVENUMBER
@@ -188,6 +188,7 @@ def _numbers(model: BandModel, bands: Bands, rules: BankRules, feedback: bool) -
         error_observer=rules.error_observer,
         lead=(model.delay + 0.5) * period,
         **_paces(model, bands, rules, lowest, feedback),
+        age=0.5 + model.delay / ADAPTATION,
         rest=rules.rest[0],
         rest_awake=rules.rest[1],
         inner=rules.inner[0],

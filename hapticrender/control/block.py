@@ -16,8 +16,6 @@ from hapticrender.control.block_state import (
     CHANNEL_ROWS,
     EIGHT,
     PHASE_ROWS,
-    SENT_ROWS,
-    SHOWN_ROWS,
     TURN_SIN,
     TURNS,
     BlockState,
@@ -54,7 +52,7 @@ class BlockController:
     -----
     No inner loop: it needs an answer within a sample or few.  The observer is the per-sample one to rounding;
     adaptation, detectors and law act once a block, and the drive runs linearly between them.  The finger is learnt from
-    the force that acted (`block_finger`), awake at `LEARNING` whatever the delay.
+    the force that acted (`bank_learning`), awake at `LEARNING` whatever the delay.
     """
 
     def __init__(self, controller: BankController, block: int, precision: str = "double") -> None:
@@ -78,9 +76,8 @@ class BlockController:
         self.tables = BlockTables(
             bank=tables._replace(numbers=numbers_of_blocks(tables.numbers, block)),
             sample=tables.numbers,
-            age=age_of_drive(tables.numbers, block),
         )
-        self.state = block_state(tables, block, PRECISIONS[precision])
+        self.state = block_state(self.tables.bank, block, PRECISIONS[precision])
 
     @property
     def mismatch(self) -> float:
@@ -166,7 +163,12 @@ def numbers_of_blocks(numbers: BankNumbers, block: int) -> BankNumbers:
     learning = LEARNING if numbers.adapt_awake > 0.0 and numbers.contact_on > ALWAYS else numbers.adapt_awake
     changes |= {"adapt": min(numbers.adapt, most), "adapt_awake": min(learning, most)}
     return numbers._replace(
-        rate=numbers.rate / block, peak_decay=numbers.peak_decay**block, inner=0.0, inner_awake=0.0, **changes
+        age=age_of_drive(numbers, block),
+        rate=numbers.rate / block,
+        peak_decay=numbers.peak_decay**block,
+        inner=0.0,
+        inner_awake=0.0,
+        **changes,
     )
 
 
@@ -192,7 +194,6 @@ def block_state(tables: BankTables, block: int, dtype: type) -> BlockState:
         phase=phase,
         table=aligned((tiles, max(2 * whole, TURN_SIN + 1), width), dtype),
         held=aligned((tiles, 2 * coordinates + CHANNEL_ROWS * (channels + channels % 2), width), dtype),
-        sent=aligned((tiles, SHOWN_ROWS + SENT_ROWS * (int(age_of_drive(tables.numbers, block)) + 2), width), dtype),
         response=np.zeros(whole),
         inverse=np.zeros((2, 2 * whole)),
         error=np.zeros((coordinates + 1, whole)),
