@@ -29,7 +29,8 @@ REMEMBERED = 256  # designs
 _KNOWN: dict[tuple[object, ...], Checked] = {}
 PROMPT = 8  # samples: a longer delay is that of a block device, where the inner loop would act on stale noise
 PHASE_MARGIN = math.pi / 4  # rad: 90 deg less integral gain times (delay + 1/observer pole)
-LEARNING_TIME = 1 / 60  # s: fastest adaptation of the finger; a delay counts twice
+LEARNING_SHARE = 0.5  # of what is found, learnt in a step at most: at 0.8 it swings under a light finger
+LEARNING_TIME = 1 / 60  # s: fastest adaptation to what is always there; a delay counts twice
 LEARNING_MARGIN = 4.0  # of the observer's pole over the adaptation, where that learns all of D
 QUICK_LEVEL = 60.0  # Hz: bandwidth of the DC band while the step of a touch goes into it
 BACK_TIME = 0.02  # s: back-calculation at the limit
@@ -262,9 +263,9 @@ def _paces(model: BandModel, bands: Bands, rules: BankRules, lowest: float, feed
     wait = model.delay * period  # integrator, observer and delay leave at least PHASE_MARGIN
     pole = [2 * math.pi * min(width, lowest / 2, apart / (2 * math.pi)) for width in rules.observer]
     fastest = [min(2 * math.pi * lowest / 4, PHASE_MARGIN / (wait + 1 / each)) for each in pole]
-    learning = 1 / (2 * wait + LEARNING_TIME / model.pace)
-    if model.finger.contact is None:  # what is always there is as large as D: learning closes a loop by the observer
-        learning = min(learning, pole[0] / LEARNING_MARGIN)
+    learning = LEARNING_SHARE * model.rate / ADAPTATION
+    if model.finger.contact is None:  # what is always there is as large as D, and the law far from it while it learns
+        learning = min(1 / (2 * wait + LEARNING_TIME / model.pace), pole[0] / LEARNING_MARGIN)
     level = 2 * math.pi * min(6.0, lowest / rules.level) * period
     paces = {
         "observer": 2 * pole[0] * period,
