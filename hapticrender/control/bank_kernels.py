@@ -328,7 +328,7 @@ def bank_advance(tables, state, sensed, position, wanted, drive, target):
     changed = feel(numbers, coordinates, tables.stiffness, state.level, touch)
     if any_of(changed):
         write(select(changed, numbers.fast_time, read(touch, row.FAST_TIME)), touch, row.FAST_TIME)
-        begin_finger(coordinates, state, changed)
+        begin_finger(tables, state, changed)
     fast, slow = read(touch, row.FAST_OPEN), read(touch, row.SLOW_OPEN)
     integral = numbers.integral + slow * (numbers.integral_stirred - numbers.integral)
     integral += fast * (numbers.integral_awake - integral)

@@ -18,11 +18,12 @@ from hapticrender._jit import kernel
 from hapticrender._lanes import high, low, select, total
 from hapticrender._lanes_memory import lanes, put, read, write
 from hapticrender.control import bank_rows as row
+from hapticrender.control.bank_carriers import memory_damping
 from hapticrender.control.bank_finger import finger_stiffness
 
 
 @kernel
-def begin_finger(coordinates, state, changed):
+def begin_finger(tables, state, changed):
     """A touch, or a lift-off: what was learnt of one finger is not the next; what was commanded knew of none."""
     band, loop, sent, touch = state.band, state.loop, state.sent, state.touch
     for i in (row.MASS, row.DAMPING, row.STIFFNESS):
@@ -33,11 +34,15 @@ def begin_finger(coordinates, state, changed):
         for r in range(sent.shape[1]):
             put(sent, t, r, select(changed, 0.0, lanes(sent, t, r)))
         put(sent, t, row.SHOWN_OMEGA, select(changed, lanes(band, t, row.OMEGA), lanes(sent, t, row.SHOWN_OMEGA)))
-        for c in range(coordinates):
+        for r in range(2):
+            wanted = lanes(band, t, row.R_RE + r)
+            put(sent, t, row.SHOWN_R_RE + r, select(changed, wanted, lanes(sent, t, row.SHOWN_R_RE + r)))
+        for c in range(len(tables.shape)):
             for r in range(2):
                 base = c * row.LOOP_ROWS + r
                 v = lanes(loop, t, base + row.V_RE)
                 apart = lanes(loop, t, base + row.E_RE) - v
+                v += tables.shape[c] * lanes(band, t, row.R_RE + r)
                 put(loop, t, base + row.L_RE, select(changed, v, lanes(loop, t, base + row.L_RE)))
                 put(loop, t, base + row.LAST_RE, select(changed, apart, lanes(loop, t, base + row.LAST_RE)))
                 for at in range(row.SHOWN_ROWS + 2 * c + r, sent.shape[1], row.SENT_ROWS):
@@ -57,11 +62,12 @@ def send_finger(tables, state, t, step):
     re = im = 0.0 * lanes(sent, t, 0)
     for c in range(len(shape)):
         base, place = c * row.LOOP_ROWS, 1.0 if c == 0 else read(touch, row.KNOWN_PLACE)
-        v_re, v_im = lanes(state.loop, t, base + row.V_RE), lanes(state.loop, t, base + row.V_IM)
+        v_re = lanes(state.loop, t, base + row.V_RE) + shape[c] * lanes(state.band, t, row.R_RE)
+        v_im = lanes(state.loop, t, base + row.V_IM) + shape[c] * lanes(state.band, t, row.R_IM)
         put(sent, t, at + 2 * c, v_re)
         put(sent, t, at + 2 * c + 1, v_im)
-        re += place * (shape[c] * lanes(state.band, t, row.R_RE) + v_re)
-        im += place * (shape[c] * lanes(state.band, t, row.R_IM) + v_im)
+        re += place * v_re
+        im += place * v_im
     z_re, z_im = finger_stiffness(touch, state.band, t)
     put(sent, t, at + row.FORCE_RE, z_re * re - z_im * im)
     put(sent, t, at + row.FORCE_IM, z_re * im + z_im * re)
@@ -86,8 +92,10 @@ def show_finger(tables, state, t, step, rate, pole):
         acted += late * (lanes(sent, t, old + row.FORCE_RE + r) - acted)
         shown = lanes(sent, t, row.SHOWN_RE + r)
         put(sent, t, row.SHOWN_RE + r, shown + pole * (acted - shown))
+        wanted, shown = lanes(state.band, t, row.R_RE + r) - 0.5 / rate * lanes(state.band, t, row.DR_RE + r), lanes(sent, t, row.SHOWN_R_RE + r)
+        put(sent, t, row.SHOWN_R_RE + r, shown + pole * (wanted - shown))
     omega = lanes(state.band, t, row.OMEGA) - 0.5 / rate * lanes(state.band, t, row.SWEEP)
-    shown = lanes(sent, t, row.SHOWN_OMEGA)
+    shown = select(lanes(state.band, t, row.SHARE) < 1.0, omega, lanes(sent, t, row.SHOWN_OMEGA))
     put(sent, t, row.SHOWN_OMEGA, shown + pole * (omega - shown))
 
 
@@ -98,17 +106,21 @@ def find_finger(tables, state, t, rate, inner):
     omega, sweep = lanes(sent, t, row.SHOWN_OMEGA), lanes(band, t, row.SWEEP)
     felt_re = felt_im = 0.0 * omega
     re, im = lanes(sent, t, row.SHOWN_RE), lanes(sent, t, row.SHOWN_IM)
+    lag = 0.0 * read(touch, row.TRUST)
+    if tables.numbers.memory > 0.0:
+        lag = memory_damping(tables.numbers, state.track)
     for c in range(len(tables.shape)):
         base, shape, place = c * row.LOOP_ROWS, tables.shape[c], 1.0 if c == 0 else read(touch, row.PLACE)
-        e_re, e_im = lanes(loop, t, base + row.E_RE), lanes(loop, t, base + row.E_IM)
-        felt_re += place * (shape * lanes(band, t, row.SEEN_RE) + e_re)
-        felt_im += place * (shape * lanes(band, t, row.SEEN_IM) + e_im)
-        a_re, a_im = e_re - lanes(loop, t, base + row.L_RE), e_im - lanes(loop, t, base + row.L_IM)
+        x_re = lanes(loop, t, base + row.E_RE) + shape * lanes(sent, t, row.SHOWN_R_RE)
+        x_im = lanes(loop, t, base + row.E_IM) + shape * lanes(sent, t, row.SHOWN_R_IM)
+        felt_re += place * x_re
+        felt_im += place * x_im
+        a_re, a_im = x_re - lanes(loop, t, base + row.L_RE), x_im - lanes(loop, t, base + row.L_IM)
         da_re = rate * (a_re - lanes(loop, t, base + row.LAST_RE))
         da_im = rate * (a_im - lanes(loop, t, base + row.LAST_IM))
         put(loop, t, base + row.LAST_RE, a_re)
         put(loop, t, base + row.LAST_IM, a_im)
-        mass, damping = read(tables.mass, 0, c), read(tables.damping, 0, c)
+        mass, damping = read(tables.mass, 0, c), read(tables.damping, 0, c) + place * lag
         drag, skin = damping + place * read(touch, row.DAMPING), mass + place * read(touch, row.MASS)
         d_re, d_im = read(tables.stiffness, 0, c) - omega * omega * mass, omega * damping + sweep * skin
         if c == 0:

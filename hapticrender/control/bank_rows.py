@@ -15,7 +15,7 @@ SEEN_RE, SEEN_IM = range(24, 26)
 BAND_ROWS = 26
 # what BankState.pace says of a tile: carriers follow the finger; fixed, their targets growing; fixed, and nothing grows
 LOCKED, GROWING, STEADY = range(3)
-# rows of BankState.loop, LOOP_ROWS a coordinate: error; integral part; the same as it acted and the observer shows it;
+# rows of BankState.loop, LOOP_ROWS a coordinate: error; integral part; command V as it acted and the observer shows it;
 # error less that at the last step of learning; fast and slow detector of the deviation; command V and its slope
 E_RE, E_IM, V_RE, V_IM, L_RE, L_IM, LAST_RE, LAST_IM, FAST_RE, FAST_IM, SLOW_RE, SLOW_IM = range(12)
 COMMAND_RE, COMMAND_IM, SLOPED_RE, SLOPED_IM = range(12, 16)
@@ -26,10 +26,10 @@ AHEAD_RE, AHEAD_IM = range(2)
 FIRST_LAW = 2
 LAW_RE, LAW_IM, SLOPE_RE, SLOPE_IM = range(4)
 LAW_ROWS = 4
-# rows of BankState.sent: the finger's force and the carrier's angular frequency as the observer shows them; then,
-# SENT_ROWS a step of the past, integral parts of the coordinates and the finger's force as they were commanded
-SHOWN_RE, SHOWN_IM, SHOWN_OMEGA = range(3)
-SHOWN_ROWS = 3
+# rows of BankState.sent: the finger's force, the target and the carrier's angular frequency as the observer shows them;
+# then, SENT_ROWS a step of the past, commands V of the coordinates and the finger's force
+SHOWN_RE, SHOWN_IM, SHOWN_R_RE, SHOWN_R_IM, SHOWN_OMEGA = range(5)
+SHOWN_ROWS = 5
 FORCE_RE, FORCE_IM = 4, 5
 SENT_ROWS = 6
 # entries of BankState.track: the finger's motion (position as given, smoothed, velocity, acceleration, seen before)

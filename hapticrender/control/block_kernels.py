@@ -391,7 +391,7 @@ def block_step(tables, state, sensed, position, wanted, drive, target, flags):
     changed = feel(numbers, coordinates, tables.bank.stiffness, bank.level, touch)
     if changed:
         touch[row.FAST_TIME] = numbers.fast_time
-        begin_finger(coordinates, bank, changed)
+        begin_finger(tables.bank, bank, changed)
         fast = 1.0
     doubt = take_in(tables, state, sensed, flags)
     for t in range(tiles):
