@@ -31,7 +31,7 @@ PROMPT = 8  # samples: a longer delay is that of a block device, where the inner
 PHASE_MARGIN = math.pi / 4  # rad: 90 deg less integral gain times (delay + 1/observer pole)
 LEARNING_SHARE = 0.5  # of what is found, learnt in a step at most: at 0.8 it swings under a light finger
 LEARNING_TIME = 1 / 60  # s: fastest adaptation to what is always there; a delay counts twice
-LEARNING_MARGIN = 8.0  # of the observer's pole over the adaptation, where that learns all of D
+LEARNING_MARGIN = 6.0  # of the observer's pole over the adaptation, where that learns all of D
 QUICK_LEVEL = 60.0  # Hz: bandwidth of the DC band while the step of a touch goes into it
 BACK_TIME = 0.02  # s: back-calculation at the limit
 LEAST_NOISE = 1e-6  # of the sensors' range: thresholds never fall to nothing
@@ -189,7 +189,7 @@ def _numbers(model: BandModel, bands: Bands, rules: BankRules, feedback: bool) -
         error_observer=rules.error_observer,
         lead=(model.delay + 0.5) * period,
         **_paces(model, bands, rules, lowest, feedback),
-        age=0.5 + model.delay / ADAPTATION,
+        age=(model.delay + 0.5) / ADAPTATION,
         rest=rules.rest[0],
         rest_awake=rules.rest[1],
         inner=rules.inner[0],

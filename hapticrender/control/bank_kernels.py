@@ -365,13 +365,14 @@ def bank_advance(tables, state, sensed, position, wanted, drive, target):
         lively = high(fast, slow)
         gain = numbers.adapt + lively * (numbers.adapt_awake - numbers.adapt)
         rest = numbers.rest + lively * (numbers.rest_awake - numbers.rest)
-        keep = 1.0 - 0.5 * g
+        follow = high(0.5 * g, 1e-4)  # the observer's pole in a sample, then in a step
+        keep = (1.0 - follow) * (1.0 - follow)
         keep *= keep
-        keep *= keep
-        step, pole = state.sample[0] // ADAPTATION, 1.0 - keep * keep  # the observer's, over a step
+        step, pole = state.sample[0] // ADAPTATION, 1.0 - keep * keep
+        middle = (1.0 / follow - 1.0) / ADAPTATION - (1.0 / pole - 1.0)
         for t in range(tiles):
             send_finger(tables, state, t, step)
-        learn_finger(tables, state, step, numbers.rate / ADAPTATION, pole, inner, gain, rest, touching)
+        learn_finger(tables, state, step, numbers.rate / ADAPTATION, pole, middle, inner, gain, rest, touching)
     know_finger(tables, state, touching, turn)
     law_pass(tables, state)
     return speak_pass(tables, state, drive) + high(odd, 2.0 * doubt)

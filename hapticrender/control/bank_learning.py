@@ -74,14 +74,14 @@ def send_finger(tables, state, t, step):
 
 
 @kernel
-def show_finger(tables, state, t, step, rate, pole):
+def show_finger(tables, state, t, step, rate, pole, middle):
     """What was sent of a tile, as it acted in this step (of `rate` a second) and as the observer shows it.
 
     So is the frequency.  Commands run on between the noted ones: in the middle of the step it was between two.
     """
     sent, loop = state.sent, state.loop
-    back = int(tables.numbers.age)
-    late, new, old = tables.numbers.age - back, slot_of(state, step - back), slot_of(state, step - back - 1)
+    back = int(tables.numbers.age + 0.5)
+    late, new, old = tables.numbers.age + middle - back, slot_of(state, step - back), slot_of(state, step - back - 1)
     for r in range(2):
         for c in range(len(tables.shape)):
             acted, base = lanes(sent, t, new + 2 * c + r), c * row.LOOP_ROWS + row.L_RE + r
@@ -92,9 +92,13 @@ def show_finger(tables, state, t, step, rate, pole):
         acted += late * (lanes(sent, t, old + row.FORCE_RE + r) - acted)
         shown = lanes(sent, t, row.SHOWN_RE + r)
         put(sent, t, row.SHOWN_RE + r, shown + pole * (acted - shown))
-        wanted, shown = lanes(state.band, t, row.R_RE + r) - 0.5 / rate * lanes(state.band, t, row.DR_RE + r), lanes(sent, t, row.SHOWN_R_RE + r)
-        put(sent, t, row.SHOWN_R_RE + r, shown + pole * (wanted - shown))
-    omega = lanes(state.band, t, row.OMEGA) - 0.5 / rate * lanes(state.band, t, row.SWEEP)
+        wanted = lanes(state.band, t, row.SEEN_RE + r)  # where the signal is observed, behind its pole as it is
+        if tables.numbers.error_observer:
+            wanted = lanes(state.band, t, row.R_RE + r) - middle / rate * lanes(state.band, t, row.DR_RE + r)
+            shown = lanes(sent, t, row.SHOWN_R_RE + r)
+            wanted = shown + pole * (wanted - shown)
+        put(sent, t, row.SHOWN_R_RE + r, wanted)
+    omega = lanes(state.band, t, row.OMEGA) - middle / rate * lanes(state.band, t, row.SWEEP)
     shown = select(lanes(state.band, t, row.SHARE) < 1.0, omega, lanes(sent, t, row.SHOWN_OMEGA))
     put(sent, t, row.SHOWN_OMEGA, shown + pole * (omega - shown))
 
@@ -169,8 +173,8 @@ def adapt_finger(tables, state, rate, inner, gain, rest, touching):
 
 
 @kernel
-def learn_finger(tables, state, step, rate, pole, inner, gain, rest, touching):
+def learn_finger(tables, state, step, rate, pole, middle, inner, gain, rest, touching):
     """A step of learning: what was sent, as it shows, and what it tells of the finger."""
     for t in range(state.band.shape[0]):
-        show_finger(tables, state, t, step, rate, pole)
+        show_finger(tables, state, t, step, rate, pole, middle)
     adapt_finger(tables, state, rate, inner, gain, rest, touching)

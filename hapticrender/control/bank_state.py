@@ -34,7 +34,7 @@ class BankNumbers(NamedTuple):
     integral: float  # 1/s in quiet
     integral_stirred: float
     integral_awake: float
-    age: float  # steps of learning from a command to the middle of the step in which it acts
+    age: float  # steps of learning from a command to the middle of what it does
     adapt: float  # 1/s in quiet; negative: never
     adapt_awake: float
     rest: float  # 1/s: adaptation of each band's remaining stiffness, in quiet
@@ -128,7 +128,7 @@ def bank_state(tables: BankTables, dtype: type = np.float64) -> BankState:
         band=aligned((tiles, row.BAND_ROWS, width), dtype),
         loop=aligned((tiles, coordinates * row.LOOP_ROWS, width), dtype),
         law=aligned((tiles, row.FIRST_LAW + coordinates**2 * row.LAW_ROWS, width), dtype),
-        sent=aligned((tiles, row.SHOWN_ROWS + row.SENT_ROWS * (int(tables.numbers.age) + 2), width), dtype),
+        sent=aligned((tiles, row.SHOWN_ROWS + row.SENT_ROWS * (int(tables.numbers.age + 0.5) + 2), width), dtype),
         phase=np.zeros(bands, np.uint64),
         pace=np.zeros(tiles, np.int64),
         track=np.zeros(row.TRACK_ROWS),

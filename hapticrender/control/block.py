@@ -163,6 +163,7 @@ def numbers_of_blocks(numbers: BankNumbers, block: int) -> BankNumbers:
     learning = LEARNING if numbers.adapt_awake > 0.0 and numbers.contact_on > ALWAYS else numbers.adapt_awake
     changes |= {"adapt": min(numbers.adapt, most), "adapt_awake": min(learning, most)}
     return numbers._replace(
+        error_observer=True,
         age=age_of_drive(numbers, block),
         rate=numbers.rate / block,
         peak_decay=numbers.peak_decay**block,
@@ -173,8 +174,8 @@ def numbers_of_blocks(numbers: BankNumbers, block: int) -> BankNumbers:
 
 
 def age_of_drive(numbers: BankNumbers, block: int) -> float:
-    """How many blocks before the middle of a block its drive was commanded: the delay and half a block, >= 1.5."""
-    return max((numbers.lead * numbers.rate - 0.5) / block, 1.0) + 0.5
+    """How many blocks after its command a drive acts: the delay, >= 1."""
+    return max((numbers.lead * numbers.rate - 0.5) / block, 1.0)
 
 
 def block_state(tables: BankTables, block: int, dtype: type) -> BlockState:

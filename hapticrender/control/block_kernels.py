@@ -425,7 +425,7 @@ def block_step(tables, state, sensed, position, wanted, drive, target, flags):
         gain = numbers.adapt + lively * (numbers.adapt_awake - numbers.adapt)
         rest = numbers.rest + lively * (numbers.rest_awake - numbers.rest)
         pole = 1.0 - (1.0 - 0.5 * g) ** block
-        learn_finger(tables.bank, bank, bank.sample[0], numbers.rate, pole, 0.0, gain, rest, touching)
+        learn_finger(tables.bank, bank, bank.sample[0], numbers.rate, pole, 0.5, 0.0, gain, rest, touching)
     know(tables, state, touching)
     state.stale[0] = 0
     peak = numbers.peak_decay * numbers.peak_decay * touch[row.PEAK]
