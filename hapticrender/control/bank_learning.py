@@ -21,6 +21,8 @@ from hapticrender.control import bank_rows as row
 from hapticrender.control.bank_carriers import memory_damping
 from hapticrender.control.bank_finger import finger_stiffness
 
+FORGOTTEN = 0.9  # of what was before a carrier was all there, until it teaches
+
 
 @kernel
 def begin_finger(tables, state, changed):
@@ -34,6 +36,7 @@ def begin_finger(tables, state, changed):
         for r in range(sent.shape[1]):
             put(sent, t, r, select(changed, 0.0, lanes(sent, t, r)))
         put(sent, t, row.SHOWN_OMEGA, select(changed, lanes(band, t, row.OMEGA), lanes(sent, t, row.SHOWN_OMEGA)))
+        put(sent, t, row.SHOWN_WHOLE, select(changed, 1.0, lanes(sent, t, row.SHOWN_WHOLE)))
         for r in range(2):
             wanted = lanes(band, t, row.R_RE + r)
             put(sent, t, row.SHOWN_R_RE + r, select(changed, wanted, lanes(sent, t, row.SHOWN_R_RE + r)))
@@ -99,8 +102,11 @@ def show_finger(tables, state, t, step, rate, pole, middle):
             wanted = shown + pole * (wanted - shown)
         put(sent, t, row.SHOWN_R_RE + r, wanted)
     omega = lanes(state.band, t, row.OMEGA) - middle / rate * lanes(state.band, t, row.SWEEP)
-    shown = select(lanes(state.band, t, row.SHARE) < 1.0, omega, lanes(sent, t, row.SHOWN_OMEGA))
-    put(sent, t, row.SHOWN_OMEGA, shown + pole * (omega - shown))
+    whole = (lanes(state.band, t, row.RAMP) >= 1.0) & (lanes(state.band, t, row.SHARE) >= 1.0)
+    shown = lanes(sent, t, row.SHOWN_OMEGA)
+    put(sent, t, row.SHOWN_OMEGA, select(whole, shown + pole * (omega - shown), omega))
+    shown = lanes(sent, t, row.SHOWN_WHOLE)
+    put(sent, t, row.SHOWN_WHOLE, select(whole, shown + pole * (1.0 - shown), 0.0))
 
 
 @kernel
@@ -146,8 +152,8 @@ def adapt_finger(tables, state, rate, inner, gain, rest, touching):
         felt_re, felt_im, re, im = find_finger(tables, state, t, rate, inner)
         omega, size2 = lanes(state.sent, t, row.SHOWN_OMEGA), felt_re * felt_re + felt_im * felt_im
         omega2 = omega * omega
-        counts = (size2 >= numbers.least_motion * numbers.least_motion) & (lanes(band, t, row.RAMP) >= 1.0)
-        counts = counts & (lanes(band, t, row.SHARE) >= 1.0) & touching
+        counts = (size2 >= numbers.least_motion * numbers.least_motion) & touching
+        counts = counts & (lanes(state.sent, t, row.SHOWN_WHOLE) >= FORGOTTEN)
         safe = select(counts, size2, 1.0)
         miss = (re * felt_re + im * felt_im) / safe - read(touch, row.STIFFNESS) + omega2 * read(touch, row.MASS)
         drag = (im * felt_re - re * felt_im) / safe - omega * read(touch, row.DAMPING)
