@@ -39,7 +39,8 @@ class NaiveBank:
         self.E, self.v, self.dv, self.acted, self.apart, self.fast, self.slow = (
             np.zeros((C, K), complex) for _ in range(7)
         )
-        self.sent, self.shown_force, self.shown_R, self.shown_omega = [], np.zeros(K), np.zeros(K), np.zeros(K)
+        self.sent, self.forgotten = [], np.zeros(K)
+        self.shown_force, self.shown_R, self.shown_omega = (np.zeros(K, complex) for _ in range(3))
         self.held = self.place_of_finger = self.velocity = self.acceleration = 0.0
         self.seen = False
         self.dc, self.drift = np.zeros(C), np.zeros(C)
@@ -171,6 +172,7 @@ class NaiveBank:
             V = np.outer(self.t.shape, self.R) + self.v
             self.apart, self.acted, self.sent = self.E - self.v, V, [(V, 0 * self.R)]
             self.shown_force, self.shown_R, self.shown_omega = 0 * self.R, self.R, self.omega
+            self.forgotten = np.ones_like(self.omega)  # what was before the carriers were all there
 
     def believe(self, heard):
         """S: fade out while a sensor cannot be believed; once silent, forget what it said."""
@@ -250,9 +252,10 @@ class NaiveBank:
         self.shown_force = move(self.shown_force, late[-1], settled)
         wanted = move(self.shown_R, self.R - middle / p.rate * self.dR, settled)
         self.shown_R = wanted if p.error_observer else self.seen_R
-        faded = np.minimum(self.weight / np.maximum(self.ramp, 1e-9), 1.0) < 1
+        faded = (np.minimum(self.weight / np.maximum(self.ramp, 1e-9), 1.0) < 1) | (self.ramp < 1)
         omega = self.omega - middle / p.rate * self.sweep
         self.shown_omega = np.where(faded, omega, move(self.shown_omega, omega, settled))
+        self.forgotten = np.where(faded, 0.0, move(self.forgotten, 1.0, settled))
 
     def adapt(self, inner, mu, mu_rest):
         """F: three numbers pooled over bands, weights |y_p|^2/|D|^2, and one stiffness a band."""
@@ -264,7 +267,7 @@ class NaiveBank:
         y_p = h @ X
         sums, total = np.zeros(3), 0.0
         for k, w in enumerate(self.shown_omega):
-            if abs(y_p[k]) < 5e-8 or self.weight[k] < 1:
+            if abs(y_p[k]) < 5e-8 or self.forgotten[k] < 0.9:
                 continue
             D, slope, chirp = self.stiffness_of(k, w)
             slope_skin = slope[0] + (self.b + 2j * w * self.m) * h

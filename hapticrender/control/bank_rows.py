@@ -15,8 +15,8 @@ SEEN_RE, SEEN_IM = range(24, 26)
 BAND_ROWS = 26
 # what BankState.pace says of a tile: carriers follow the finger; fixed, their targets growing; fixed, and nothing grows
 LOCKED, GROWING, STEADY = range(3)
-# rows of BankState.loop, LOOP_ROWS a coordinate: error; integral part; command V as it acted and the observer shows it;
-# error less that at the last step of learning; fast and slow detector of the deviation; command V and its slope
+# rows of BankState.loop, LOOP_ROWS a coordinate: error; integral part; command as it acted and the observer shows it;
+# motion less that at the last step of learning; fast and slow detector of the deviation; command V and its slope
 E_RE, E_IM, V_RE, V_IM, L_RE, L_IM, LAST_RE, LAST_IM, FAST_RE, FAST_IM, SLOW_RE, SLOW_IM = range(12)
 COMMAND_RE, COMMAND_IM, SLOPED_RE, SLOPED_IM = range(12, 16)
 LOOP_ROWS = 16
