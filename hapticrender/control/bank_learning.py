@@ -8,8 +8,8 @@ D_a = D + j w b_a with what the inner loop damps of that,
     z_found h X = <z_sent y> - D_a a - (D' + z' h) da/dt - j dw/dt (M + m_f h) a
 
 so that what the law knew when it commanded is told apart from what has been learnt since: neither delay nor observer
-closes a loop through the adaptation, which does not swing and need not be slow.  It goes in steps: a block, or a few
-samples.
+closes a loop through the adaptation, which does not swing and need not be slow.  It goes in steps: a block, or some
+samples.  A target R that moves is told apart alike: X = <R> + E where the observer watches the error.
 """
 
 from __future__ import annotations

@@ -26,8 +26,9 @@ AHEAD_RE, AHEAD_IM = range(2)
 FIRST_LAW = 2
 LAW_RE, LAW_IM, SLOPE_RE, SLOPE_IM = range(4)
 LAW_ROWS = 4
-# rows of BankState.sent: the finger's force, the target and the carrier's angular frequency as the observer shows them,
-# and how far it has forgotten what was before the carrier was all there; then, SENT_ROWS a step of the past, commands V of the coordinates and the finger's force
+# rows of BankState.sent: as the observer shows them the finger's force, the target and the carrier's angular frequency,
+# and how far it has forgotten what was before the carrier was all there; then, SENT_ROWS a step of the past, commands
+# of the coordinates and the finger's force
 SHOWN_RE, SHOWN_IM, SHOWN_R_RE, SHOWN_R_IM, SHOWN_OMEGA, SHOWN_WHOLE = range(6)
 SHOWN_ROWS = 6
 FORCE_RE, FORCE_IM = 4, 5

@@ -9,7 +9,7 @@ import numpy as np
 from hapticrender._lanes import WIDTH, aligned, padded
 from hapticrender.bands import Bands
 from hapticrender.control import bank_rows as row
-from hapticrender.control.bank import ALWAYS, BankController, settled_share, spacing
+from hapticrender.control.bank import LEARNING_SHARE, BankController, settled_share, spacing
 from hapticrender.control.bank_state import PRECISIONS, BankNumbers, BankTables, bank_state
 from hapticrender.control.block_kernels import block_run
 from hapticrender.control.block_state import (
@@ -27,8 +27,6 @@ MOST_COORDINATES = 2
 PER_SAMPLE = ("release", "ramp")  # steps that grow with the block
 POLES = ("fast_pole", "slow_pole")  # of first order, per sample
 TIMES = ("fast_time", "slow_time")  # samples
-LEARNING = 100.0  # 1/s: adaptation of the finger, awake
-LEARNING_SHARE = 0.5  # of what is found, learnt in a block at most: at 0.8 it swings under a light finger
 
 
 class BlockController:
@@ -52,7 +50,7 @@ class BlockController:
     -----
     No inner loop: it needs an answer within a sample or few.  The observer is the per-sample one to rounding;
     adaptation, detectors and law act once a block, and the drive runs linearly between them.  The finger is learnt from
-    the force that acted (`bank_learning`), awake at `LEARNING` whatever the delay.
+    the force that acted (`bank_learning`), once a block.
     """
 
     def __init__(self, controller: BankController, block: int, precision: str = "double") -> None:
@@ -160,8 +158,7 @@ def numbers_of_blocks(numbers: BankNumbers, block: int) -> BankNumbers:
     changes |= {name: 1.0 - (1.0 - getattr(numbers, name)) ** block for name in POLES}
     changes |= {name: getattr(numbers, name) / block for name in TIMES}
     most = LEARNING_SHARE * numbers.rate / block
-    learning = LEARNING if numbers.adapt_awake > 0.0 and numbers.contact_on > ALWAYS else numbers.adapt_awake
-    changes |= {"adapt": min(numbers.adapt, most), "adapt_awake": min(learning, most)}
+    changes |= {"adapt": min(numbers.adapt, most), "adapt_awake": min(numbers.adapt_awake, most)}
     return numbers._replace(
         error_observer=True,
         age=age_of_drive(numbers, block),
