@@ -11,6 +11,7 @@ SATURATED, NONFINITE = 1, 2
 LEAST_LOAD = 0.03  # N
 FAR, FASTEST, TRUST_TIME = 1e3, 10.0, 0.02  # m, m/s, s
 FINGER_M, FINGER_K = 4e-3, 300.0  # kg, N/m
+STEP = 8  # samples of learning
 
 
 def smooth(x):
@@ -35,9 +36,11 @@ class NaiveBank:
         K, C = len(frequency), len(tables.listen)
         self.turns, self.ramp, self.weight = np.zeros(K), np.zeros(K), np.zeros(K)
         self.raw, self.R, self.dR, self.rest, self.seen_R, self.saw_R = (np.zeros(K, complex) for _ in range(6))
-        self.E, self.v, self.dv, self.v_slow, self.apart, self.fast, self.slow = (
+        self.E, self.v, self.dv, self.acted, self.apart, self.fast, self.slow = (
             np.zeros((C, K), complex) for _ in range(7)
         )
+        self.sent, self.forgotten = [], np.zeros(K)
+        self.shown_force, self.shown_R, self.shown_omega = (np.zeros(K, complex) for _ in range(3))
         self.held = self.place_of_finger = self.velocity = self.acceleration = 0.0
         self.seen = False
         self.dc, self.drift = np.zeros(C), np.zeros(C)
@@ -91,7 +94,6 @@ class NaiveBank:
         spill = p.back * (1 - self.scale)
         self.dv = -ki * self.E - fading * self.v  # S: the law is not told of what the limiter takes back
         self.v = self.v + T * (self.dv - spill * (self.v + R))
-        self.v_slow = self.v_slow + gain / 2 * (self.v - self.v_slow)
         heard = 2 * deviation[:, None] * carrier.conj()
         self.fast = self.fast + p.fast_pole * (heard - self.fast)
         self.slow = self.slow + p.slow_pole * (heard - self.slow)
@@ -99,9 +101,10 @@ class NaiveBank:
         self.wake((abs(self.fast) ** 2 > p.fast_level).any(), (abs(self.slow) ** 2 > p.slow_level).any())
 
         self.samples += 1
-        if self.contact and p.adapt >= 0 and self.samples % 8 == 0:
+        if self.contact and p.adapt >= 0 and self.samples % STEP == 0:
             lively = max(fast, slow)
-            self.adapt(R, inner, move(p.adapt, p.adapt_awake, lively), move(p.rest, p.rest_awake, lively))
+            self.show(R, gain / 2)
+            self.adapt(inner, move(p.adapt, p.adapt_awake, lively), move(p.rest, p.rest_awake, lively))
         self.know()
         turning = (self.force(R, dR) * self.ahead() * carrier).sum(axis=1)
         drive, cut = self.speak(F + turning)
@@ -166,14 +169,17 @@ class NaiveBank:
             self.timers[0] = self.p.fast_time
             self.m = self.b = self.k = 0.0
             self.rest = np.zeros_like(self.rest)
-            self.apart = self.E - self.v_slow
+            V = np.outer(self.t.shape, self.R) + self.v
+            self.apart, self.acted, self.sent = self.E - self.v, V, [(V, 0 * self.R)]
+            self.shown_force, self.shown_R, self.shown_omega = 0 * self.R, self.R, self.omega
+            self.forgotten = np.ones_like(self.omega)  # what was before the carriers were all there
 
     def believe(self, heard):
         """S: fade out while a sensor cannot be believed; once silent, forget what it said."""
         change = 1 / (TRUST_TIME * self.p.rate)
         self.trust = min(self.trust + change, 1.0) if heard else max(self.trust - change, 0.0)
         if self.trust == 0:
-            for state in (self.E, self.v, self.dv, self.v_slow, self.apart, self.fast, self.slow, self.dc, self.drift):
+            for state in (self.E, self.v, self.dv, self.acted, self.apart, self.fast, self.slow, self.dc, self.drift):
                 state[:] = 0
             self.eps[:] = 0
 
@@ -189,9 +195,9 @@ class NaiveBank:
         """h = [1, g]: where the finger stands in the device's coordinates."""
         return np.array([1.0, self.g])[: len(self.dc)]
 
-    def stiffness_of(self, k):
-        """D, D' and j dw/dt M of the bare device at band k."""
-        w, t = self.omega[k], self.t
+    def stiffness_of(self, k, w):
+        """D, D' and j dw/dt M of the bare device at band k, whose carrier turns by w."""
+        t = self.t
         D = t.stiffness - w**2 * t.mass + 1j * w * t.damping
         return D, t.damping + 2j * w * t.mass, 1j * self.sweep[k] * t.mass
 
@@ -202,7 +208,7 @@ class NaiveBank:
 
     def know(self):
         """The law looks at the finger's place in turn with the adaptation, and at a touch."""
-        due = self.samples % 8 == 0 or self.contact != self.knew_contact
+        due = self.samples % STEP == 0 or self.contact != self.knew_contact
         self.knew_contact = self.contact
         if due:
             self.known_lever = self.lever()
@@ -212,7 +218,7 @@ class NaiveBank:
         V, dV = R + self.v, dR + self.dv
         F = np.zeros_like(V)
         for k, w in enumerate(self.omega):
-            D, slope, chirp = self.stiffness_of(k)
+            D, slope, chirp = self.stiffness_of(k, w)
             if self.contact and self.p.adapt >= 0:
                 structure = np.outer(self.known_lever, self.known_lever)
                 D = D + self.finger_at(k) * structure
@@ -226,22 +232,49 @@ class NaiveBank:
         lead, turns = self.p.lead, self.omega / (2 * np.pi * self.p.rate)
         return np.exp(1j * lead * (self.omega + self.sweep * lead / 2)) / np.sinc(turns)
 
-    def adapt(self, R, inner, mu, mu_rest):
+    def show(self, R, pole):
+        """F: what was commanded, in the middle of a step as the observer sees it, behind its pole; so is all else."""
+        p = self.p
+        V = R + self.v
+        finger = np.array([self.finger_at(k) for k in range(len(self.R))])
+        self.sent.append((V, finger * (self.known_lever @ V)))
+        shares = (1 - max(pole, 1e-4)) ** np.arange(STEP)  # of the step's samples, newest first
+        middle = shares @ np.arange(STEP) / shares.sum()  # samples ago
+        age = (p.lead * p.rate + middle) / STEP
+        before = np.arange(len(self.sent))[::-1]  # steps ago; before the touch it was as at the touch
+        steps = np.array([np.concatenate([each[0], each[1][None]]) for each in self.sent])
+        low, ago = steps[0], int(age)
+        newer = steps[before == ago][0] if ago < len(steps) else low
+        older = steps[before == ago + 1][0] if ago + 1 < len(steps) else low
+        late = move(newer, older, age - ago)
+        settled = 1 - (1 - max(pole, 1e-4)) ** STEP
+        self.acted = move(self.acted, late[:-1], settled)
+        self.shown_force = move(self.shown_force, late[-1], settled)
+        wanted = move(self.shown_R, self.R - middle / p.rate * self.dR, settled)
+        self.shown_R = wanted if p.error_observer else self.seen_R
+        faded = (np.minimum(self.weight / np.maximum(self.ramp, 1e-9), 1.0) < 1) | (self.ramp < 1)
+        omega = self.omega - middle / p.rate * self.sweep
+        self.shown_omega = np.where(faded, omega, move(self.shown_omega, omega, settled))
+        self.forgotten = np.where(faded, 0.0, move(self.forgotten, 1.0, settled))
+
+    def adapt(self, inner, mu, mu_rest):
         """F: three numbers pooled over bands, weights |y_p|^2/|D|^2, and one stiffness a band."""
-        step = 8 / self.p.rate
-        apart, before = self.E - self.v_slow, self.apart
+        step = STEP / self.p.rate
+        X = np.outer(self.t.shape, self.shown_R) + self.E
+        apart, before = X - self.acted, self.apart
         self.apart = apart
         h = self.lever()
-        seen = np.outer(self.t.shape, self.seen_R)
-        y_p, commanded = h @ (seen + self.E), h @ (seen + self.v_slow)
+        y_p = h @ X
         sums, total = np.zeros(3), 0.0
-        for k, w in enumerate(self.omega):
-            if abs(y_p[k]) < 5e-8 or self.weight[k] < 1:
+        for k, w in enumerate(self.shown_omega):
+            if abs(y_p[k]) < 5e-8 or self.forgotten[k] < 0.9:
                 continue
-            D, slope, _ = self.stiffness_of(k)
-            away = D[0] @ apart[:, k] + slope[0] @ (apart[:, k] - before[:, k]) / step
+            D, slope, chirp = self.stiffness_of(k, w)
+            slope_skin = slope[0] + (self.b + 2j * w * self.m) * h
+            away = (D[0] + chirp[0] + 1j * self.sweep[k] * self.m * h) @ apart[:, k]
+            away += slope_skin @ (apart[:, k] - before[:, k]) / step
             away += 1j * w * inner * self.t.grip[0] * apart[0, k]
-            z = (self.finger_at(k) * commanded[k] - away) / y_p[k]
+            z = (self.shown_force[k] - away) / y_p[k]
             miss = z.real - (self.k - w**2 * self.m)
             drag = z.imag - w * self.b
             weight = abs(y_p[k]) ** 2 / abs(D[0, 0]) ** 2

@@ -60,7 +60,7 @@ def twin_run(tables, sensed, position, wanted):
         rows.append(twin.step(sensed[n], position[n], wanted[n]))
         events |= {"touch"} if twin.contact else {"free", "left"} if "touch" in events else {"free"}
         events |= {name for name, opening in zip(("fast", "slow"), twin.open, strict=True) if opening == 1}
-        events |= {"adapted"} if twin.b > 0 else set()
+        events |= {"adapted"} if any((twin.m, twin.b, twin.k)) else set()
         events |= {"backwards"} if twin.velocity < -0.05 else {"forwards"} if twin.velocity > 0.05 else set()
         events |= {"scaled"} if twin.scale < 1 else set()
     drive, target, flags = (np.array(column) for column in zip(*rows, strict=True))

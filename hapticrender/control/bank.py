@@ -12,7 +12,7 @@ from hapticrender.bands import Bands
 from hapticrender.control import bank_rows as row
 from hapticrender.control.bandmodel import BandModel
 from hapticrender.control.bank_carriers import REFRESH
-from hapticrender.control.bank_kernels import bank_run
+from hapticrender.control.bank_kernels import ADAPTATION, bank_run
 from hapticrender.control.bank_state import PRECISIONS, BankNumbers, BankState, BankTables, across_bands, bank_state
 from hapticrender.control.damping import choose_damping
 from hapticrender.control.kernels import FREQUENCY, WAVENUMBER
@@ -30,8 +30,9 @@ REMEMBERED = 256  # designs
 _KNOWN: dict[tuple[object, ...], Checked] = {}
 PROMPT = 8  # samples: a longer delay is that of a block device, where the inner loop would act on stale noise
 PHASE_MARGIN = math.pi / 4  # rad: 90 deg less integral gain times (delay + 1/observer pole)
-LEARNING_TIME = 1 / 60  # s: fastest adaptation of the finger; a delay counts twice
-LEARNING_MARGIN = 4.0  # of the observer's pole over the adaptation, where that learns all of D
+LEARNING_SHARE = 0.5  # of what is found, learnt in a step at most: at 0.8 it swings under a light finger
+LEARNING_TIME = 1 / 60  # s: fastest adaptation to what is always there; a delay counts twice
+LEARNING_MARGIN = 6.0  # of the observer's pole over the adaptation, where that learns all of D
 QUICK_LEVEL = 60.0  # Hz: bandwidth of the DC band while the step of a touch goes into it
 BACK_TIME = 0.02  # s: back-calculation at the limit
 LEAST_NOISE = 1e-6  # of the sensors' range: thresholds never fall to nothing
@@ -191,6 +192,7 @@ def _numbers(model: BandModel, bands: Bands, rules: BankRules, feedback: bool) -
         error_observer=rules.error_observer,
         lead=(model.delay + 0.5) * period,
         **_paces(model, bands, rules, lowest, feedback),
+        age=(model.delay + 0.5) / ADAPTATION,
         rest=rules.rest[0],
         rest_awake=rules.rest[1],
         inner=rules.inner[0],
@@ -270,9 +272,9 @@ def _paces(model: BandModel, bands: Bands, rules: BankRules, lowest: float, feed
     wait = model.delay * period  # integrator, observer and delay leave at least PHASE_MARGIN
     pole = [2 * math.pi * min(width, lowest / 2, apart / (2 * math.pi)) for width in rules.observer]
     fastest = [min(2 * math.pi * lowest / 4, PHASE_MARGIN / (wait + 1 / each)) for each in pole]
-    learning = min(1 / (2 * wait + LEARNING_TIME / model.pace), model.finger.fastest)
-    if model.finger.contact is None:  # what is always there is as large as D: learning closes a loop by the observer
-        learning = min(learning, pole[0] / LEARNING_MARGIN)
+    learning = LEARNING_SHARE * model.rate / ADAPTATION
+    if model.finger.contact is None:  # what is always there is as large as D, and the law far from it while it learns
+        learning = min(1 / (2 * wait + LEARNING_TIME / model.pace), model.finger.fastest, pole[0] / LEARNING_MARGIN)
     level = 2 * math.pi * min(6.0, lowest / rules.level) * period
     paces = {
         "observer": 2 * pole[0] * period,

@@ -27,7 +27,8 @@ from hapticrender.control.bank_carriers import (
     shown_pass,
     told_pass,
 )
-from hapticrender.control.bank_finger import adapt_pass, feel, forget_finger, track_finger
+from hapticrender.control.bank_finger import feel, track_finger
+from hapticrender.control.bank_learning import begin_finger, learn_finger, send_finger
 from hapticrender.control.kernels import DOUBT_TIME, FAR
 
 HUGE = 1e300  # stands for infinity, where fast arithmetic is not told of it
@@ -155,8 +156,6 @@ def observer_pass(tables, state, t, c, g, integral, back):
         put(loop, t, base + row.V_RE + r, v)
         put(loop, t, base + row.COMMAND_RE + r, v + wanted)
         put(loop, t, base + row.SLOPED_RE + r, slope + shape * lanes(band, t, row.DR_RE + r))
-        slow = lanes(loop, t, base + row.L_RE + r)
-        put(loop, t, base + row.L_RE + r, slow + 0.5 * g * (v - slow))
 
 
 @kernel
@@ -329,7 +328,7 @@ def bank_advance(tables, state, sensed, position, wanted, drive, target):
     changed = feel(numbers, coordinates, tables.stiffness, state.level, touch)
     if any_of(changed):
         write(select(changed, numbers.fast_time, read(touch, row.FAST_TIME)), touch, row.FAST_TIME)
-        forget_finger(changed, touch, band, state.loop)
+        begin_finger(tables, state, changed)
     fast, slow = read(touch, row.FAST_OPEN), read(touch, row.SLOW_OPEN)
     integral = numbers.integral + slow * (numbers.integral_stirred - numbers.integral)
     integral += fast * (numbers.integral_awake - integral)
@@ -366,7 +365,14 @@ def bank_advance(tables, state, sensed, position, wanted, drive, target):
         lively = high(fast, slow)
         gain = numbers.adapt + lively * (numbers.adapt_awake - numbers.adapt)
         rest = numbers.rest + lively * (numbers.rest_awake - numbers.rest)
-        adapt_pass(tables, state, ADAPTATION / numbers.rate, inner, gain, rest, touching)
+        follow = high(0.5 * g, 1e-4)  # the observer's pole in a sample, then in a step
+        keep = (1.0 - follow) * (1.0 - follow)
+        keep *= keep
+        step, pole = state.sample[0] // ADAPTATION, 1.0 - keep * keep
+        middle = (1.0 / follow - 1.0) / ADAPTATION - (1.0 / pole - 1.0)
+        for t in range(tiles):
+            send_finger(tables, state, t, step)
+        learn_finger(tables, state, step, numbers.rate / ADAPTATION, pole, middle, inner, gain, rest, touching)
     know_finger(tables, state, touching, turn)
     law_pass(tables, state)
     return speak_pass(tables, state, drive) + high(odd, 2.0 * doubt)

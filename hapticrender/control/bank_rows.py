@@ -15,8 +15,8 @@ SEEN_RE, SEEN_IM = range(24, 26)
 BAND_ROWS = 26
 # what BankState.pace says of a tile: carriers follow the finger; fixed, their targets growing; fixed, and nothing grows
 LOCKED, GROWING, STEADY = range(3)
-# rows of BankState.loop, LOOP_ROWS a coordinate: error; integral part; low-passed like the error; error and low-passed
-# integral part at the last adaptation; fast and slow detector of the deviation; command V and its slope
+# rows of BankState.loop, LOOP_ROWS a coordinate: error; integral part; command as it acted and the observer shows it;
+# motion less that at the last step of learning; fast and slow detector of the deviation; command V and its slope
 E_RE, E_IM, V_RE, V_IM, L_RE, L_IM, LAST_RE, LAST_IM, FAST_RE, FAST_IM, SLOW_RE, SLOW_IM = range(12)
 COMMAND_RE, COMMAND_IM, SLOPED_RE, SLOPED_IM = range(12, 16)
 LOOP_ROWS = 16
@@ -26,6 +26,13 @@ AHEAD_RE, AHEAD_IM = range(2)
 FIRST_LAW = 2
 LAW_RE, LAW_IM, SLOPE_RE, SLOPE_IM = range(4)
 LAW_ROWS = 4
+# rows of BankState.sent: as the observer shows them the finger's force, the target and the carrier's angular frequency,
+# and how far it has forgotten what was before the carrier was all there; then, SENT_ROWS a step of the past, commands
+# of the coordinates and the finger's force
+SHOWN_RE, SHOWN_IM, SHOWN_R_RE, SHOWN_R_IM, SHOWN_OMEGA, SHOWN_WHOLE = range(6)
+SHOWN_ROWS = 6
+FORCE_RE, FORCE_IM = 4, 5
+SENT_ROWS = 6
 # entries of BankState.track: the finger's motion (position as given, smoothed, velocity, acceleration, seen before)
 # for how many samples more its coming counts as fresh, and its speed whichever way it goes
 HELD, SMOOTH, VELOCITY, ACCELERATION, SEEN, FRESH, SPEED = range(7)

@@ -34,6 +34,7 @@ class BankNumbers(NamedTuple):
     integral: float  # 1/s in quiet
     integral_stirred: float
     integral_awake: float
+    age: float  # steps of learning from a command to the middle of what it does
     adapt: float  # 1/s in quiet; negative: never
     adapt_awake: float
     rest: float  # 1/s: adaptation of each band's remaining stiffness, in quiet
@@ -102,6 +103,7 @@ class BankState(NamedTuple):
     band: Array  # (tiles, BAND_ROWS, W)
     loop: Array  # (tiles, coordinates * LOOP_ROWS, W)
     law: Array  # (tiles, FIRST_LAW + coordinates^2 * LAW_ROWS, W)
+    sent: Array  # (tiles, SHOWN_ROWS + SENT_ROWS steps, W): what was commanded in the last steps of learning
     phase: Array  # (bands,) uint64: fixed part of each carrier at the next refresh, 2^64 a turn
     pace: Array  # (tiles,) integer: LOCKED, GROWING or STEADY
     track: Array  # (TRACK_ROWS,)
@@ -126,6 +128,7 @@ def bank_state(tables: BankTables, dtype: type = np.float64) -> BankState:
         band=aligned((tiles, row.BAND_ROWS, width), dtype),
         loop=aligned((tiles, coordinates * row.LOOP_ROWS, width), dtype),
         law=aligned((tiles, row.FIRST_LAW + coordinates**2 * row.LAW_ROWS, width), dtype),
+        sent=aligned((tiles, row.SHOWN_ROWS + row.SENT_ROWS * (int(tables.numbers.age + 0.5) + 2), width), dtype),
         phase=np.zeros(bands, np.uint64),
         pace=np.zeros(tiles, np.int64),
         track=np.zeros(row.TRACK_ROWS),

@@ -9,15 +9,13 @@ import numpy as np
 from hapticrender._lanes import WIDTH, aligned, padded
 from hapticrender.bands import Bands
 from hapticrender.control import bank_rows as row
-from hapticrender.control.bank import ALWAYS, BankController, settled_share, spacing
+from hapticrender.control.bank import LEARNING_SHARE, BankController, settled_share, spacing
 from hapticrender.control.bank_state import PRECISIONS, BankNumbers, BankTables, bank_state
 from hapticrender.control.block_kernels import block_run
 from hapticrender.control.block_state import (
     CHANNEL_ROWS,
     EIGHT,
     PHASE_ROWS,
-    SENT_ROWS,
-    SHOWN_ROWS,
     TURN_SIN,
     TURNS,
     BlockState,
@@ -29,8 +27,6 @@ MOST_COORDINATES = 2
 PER_SAMPLE = ("release", "ramp")  # steps that grow with the block
 POLES = ("fast_pole", "slow_pole")  # of first order, per sample
 TIMES = ("fast_time", "slow_time")  # samples
-LEARNING = 100.0  # 1/s: adaptation of the finger, awake
-LEARNING_SHARE = 0.5  # of what is found, learnt in a block at most: at 0.8 it swings under a light finger
 
 
 class BlockController:
@@ -54,7 +50,7 @@ class BlockController:
     -----
     No inner loop: it needs an answer within a sample or few.  The observer is the per-sample one to rounding;
     adaptation, detectors and law act once a block, and the drive runs linearly between them.  The finger is learnt from
-    the force that acted (`block_finger`), awake at `LEARNING` whatever the delay.
+    the force that acted (`bank_learning`), once a block.
     """
 
     def __init__(self, controller: BankController, block: int, precision: str = "double") -> None:
@@ -78,9 +74,8 @@ class BlockController:
         self.tables = BlockTables(
             bank=tables._replace(numbers=numbers_of_blocks(tables.numbers, block)),
             sample=tables.numbers,
-            age=age_of_drive(tables.numbers, block),
         )
-        self.state = block_state(tables, block, PRECISIONS[precision])
+        self.state = block_state(self.tables.bank, block, PRECISIONS[precision])
 
     @property
     def mismatch(self) -> float:
@@ -163,16 +158,21 @@ def numbers_of_blocks(numbers: BankNumbers, block: int) -> BankNumbers:
     changes |= {name: 1.0 - (1.0 - getattr(numbers, name)) ** block for name in POLES}
     changes |= {name: getattr(numbers, name) / block for name in TIMES}
     most = LEARNING_SHARE * numbers.rate / block
-    learning = LEARNING if numbers.adapt_awake > 0.0 and numbers.contact_on > ALWAYS else numbers.adapt_awake
-    changes |= {"adapt": min(numbers.adapt, most), "adapt_awake": min(learning, most)}
+    changes |= {"adapt": min(numbers.adapt, most), "adapt_awake": min(numbers.adapt_awake, most)}
     return numbers._replace(
-        rate=numbers.rate / block, peak_decay=numbers.peak_decay**block, inner=0.0, inner_awake=0.0, **changes
+        error_observer=True,
+        age=age_of_drive(numbers, block),
+        rate=numbers.rate / block,
+        peak_decay=numbers.peak_decay**block,
+        inner=0.0,
+        inner_awake=0.0,
+        **changes,
     )
 
 
 def age_of_drive(numbers: BankNumbers, block: int) -> float:
-    """How many blocks before the middle of a block its drive was commanded: the delay and half a block, >= 1.5."""
-    return max((numbers.lead * numbers.rate - 0.5) / block, 1.0) + 0.5
+    """How many blocks after its command a drive acts: the delay, >= 1."""
+    return max((numbers.lead * numbers.rate - 0.5) / block, 1.0)
 
 
 def block_state(tables: BankTables, block: int, dtype: type) -> BlockState:
@@ -192,7 +192,6 @@ def block_state(tables: BankTables, block: int, dtype: type) -> BlockState:
         phase=phase,
         table=aligned((tiles, max(2 * whole, TURN_SIN + 1), width), dtype),
         held=aligned((tiles, 2 * coordinates + CHANNEL_ROWS * (channels + channels % 2), width), dtype),
-        sent=aligned((tiles, SHOWN_ROWS + SENT_ROWS * (int(age_of_drive(tables.numbers, block)) + 2), width), dtype),
         response=np.zeros(whole),
         inverse=np.zeros((2, 2 * whole)),
         error=np.zeros((coordinates + 1, whole)),

@@ -19,9 +19,9 @@ from hapticrender._lanes_memory import lanes, put, put_pairs
 from hapticrender._polynomials import unit, whole
 from hapticrender.control import bank_rows as row
 from hapticrender.control.bank_carriers import FORGET, derivative, grow_pass, law_tune, look_ahead, motion_pass
-from hapticrender.control.bank_finger import feel, forget_finger, track_finger
+from hapticrender.control.bank_finger import feel, track_finger
 from hapticrender.control.bank_kernels import believe, wake
-from hapticrender.control.block_finger import adapt_finger, begin_finger, send_finger, show_finger
+from hapticrender.control.bank_learning import begin_finger, learn_finger, send_finger
 from hapticrender.control.block_state import (
     CHANNEL_ROWS,
     COSINE,
@@ -391,8 +391,7 @@ def block_step(tables, state, sensed, position, wanted, drive, target, flags):
     changed = feel(numbers, coordinates, tables.bank.stiffness, bank.level, touch)
     if changed:
         touch[row.FAST_TIME] = numbers.fast_time
-        forget_finger(changed, touch, band, loop)
-        begin_finger(coordinates, state)
+        begin_finger(tables.bank, bank, changed)
         fast = 1.0
     doubt = take_in(tables, state, sensed, flags)
     for t in range(tiles):
@@ -426,16 +425,14 @@ def block_step(tables, state, sensed, position, wanted, drive, target, flags):
         gain = numbers.adapt + lively * (numbers.adapt_awake - numbers.adapt)
         rest = numbers.rest + lively * (numbers.rest_awake - numbers.rest)
         pole = 1.0 - (1.0 - 0.5 * g) ** block
-        for t in range(tiles):
-            show_finger(tables, state, t, pole)
-        adapt_finger(tables, state, gain, rest)
+        learn_finger(tables.bank, bank, bank.sample[0], numbers.rate, pole, 0.5, 0.0, gain, rest, touching)
     know(tables, state, touching)
     state.stale[0] = 0
     peak = numbers.peak_decay * numbers.peak_decay * touch[row.PEAK]
     for t in range(tiles):
         command(tables, state, t)
         if touching:
-            send_finger(tables, state, t)
+            send_finger(tables.bank, bank, t, bank.sample[0])
     peak = max(peak, speak(tables, state, drive))
     touch[row.PEAK] = peak
     scale = 1.0 / root(peak) if peak > 1.0 else 1.0

@@ -21,12 +21,6 @@ PHASE_ROWS = 5
 # last block and of this one, and both as this block's tables want them
 LAST_RE, LAST_IM, NOW_RE, NOW_IM, FROM_RE, FROM_IM, STEP_RE, STEP_IM = range(8)
 CHANNEL_ROWS = 8
-# rows of BlockState.sent: the finger's force and the carrier's angular frequency as the observer shows them; then,
-# SENT_ROWS a block of the past, integral parts of the coordinates and the finger's force as they were commanded
-SHOWN_RE, SHOWN_IM, SHOWN_OMEGA = range(3)
-SHOWN_ROWS = 3
-FORCE_RE, FORCE_IM = 4, 5
-SENT_ROWS = 6
 
 
 class BlockTables(NamedTuple):
@@ -34,7 +28,6 @@ class BlockTables(NamedTuple):
 
     bank: BankTables  # its rates are those of a block
     sample: BankNumbers  # the same of a sample
-    age: float  # blocks from a command to the middle of the block in which it acts
 
 
 class BlockState(NamedTuple):
@@ -46,7 +39,6 @@ class BlockState(NamedTuple):
         Array  # (tiles, max(2 M, TURN_SIN + 1), W): see PAIR_COS; where a tile follows, cosine and sine at each sample
     )
     held: Array  # (tiles, 2 coordinates + CHANNEL_ROWS channels, W)
-    sent: Array  # (tiles, SHOWN_ROWS + SENT_ROWS blocks, W): what the last blocks were commanded
     response: Array  # (M,) r: what a residual of 1 adds to the ones after it
     inverse: Array  # (2, 2 M) first column of Q, and of its like for the wanted waveform, behind M zeros
     error: Array  # (coordinates + 1, M) scratch: residuals; the last row that of the wanted waveform

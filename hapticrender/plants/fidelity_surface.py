@@ -4,12 +4,14 @@ In the frame of the carrier w, at the offset W, the amplitude loop is linear for
 z = e^(j (w+W) h) at the carrier's period h, the mode G held over it, the loop's delay d, its feedback K and its law's
 feed-forward::
 
-    Y/R = G z^-d (FF + K + K_z)/(1 + G z^-d (K + K_z)),    FF = rho (D + D' (1 - e^(-j W h))/h)
+    Y/R = G z^-d (FF - K_r + K + K_z)/(1 + G z^-d (K + K_z)),    FF = rho (D + D' (1 - e^(-j W h))/h)
 
-K is that of `bank_loop`.  K_z is what learning adds, which acts like one more integral: the learnt part zeta of D goes
-after the error envelope e less its slow part l, with the pace gamma, and its force zeta R undoes R's division::
+K is that of `bank_loop`.  K_z and K_r are what learning adds (see `bank_learning`): the learnt part zeta of D goes
+after what the command did not do, a, with the pace gamma, and its force zeta R undoes R's division::
 
-    zeta' = -gamma (D e + D'_0 e')/R  for e - l in place of e
+    zeta' = gamma (<zeta> - zeta - (D a + D' a')/R),    a = e - <v> + r
+
+<.> is late and smooth, e the error envelope, v the integral part and r what the target moved while it was late.
 
 The mode at level "envelope" differs in D by `UltrasonicParameters.envelope_error`; but the loop's sample is longer
 there, and lateness and learning tell more of the two levels apart than that.
@@ -106,7 +108,7 @@ class AmplitudeLoop:
         turn, h = 2 * np.pi * np.asarray(offset, float), self.loop.period
         mode, fed_back = self._round(turn)
         slope = self.damping + 2j * self.omega * self.parameters.carrier_mode.mass
-        forward = self._ahead * (self.stiffness + slope * (1 - np.exp(-1j * turn * h)) / h)
+        forward = self._ahead * (self.stiffness + slope * (1 - np.exp(-1j * turn * h)) / h) - self._learning(turn)[1]
         return mode * (forward + fed_back) / (1 + mode * fed_back)
 
     def _round(self, turn: Array) -> tuple[Array, Array]:
@@ -114,7 +116,7 @@ class AmplitudeLoop:
         z = np.exp(1j * (self.omega + turn) * self.loop.period)
         gain, rest = (each[0] for each in self.loop.controller(z))
         mode = self.loop.plant.response(z)[:, 0, 0] * z**-self.loop.delay
-        return mode, gain[:, 0, 0] + self._learning(turn, z) / rest
+        return mode, gain[:, 0, 0] + self._learning(turn)[0] / rest
 
     @property
     def _ahead(self) -> complex:
@@ -122,21 +124,25 @@ class AmplitudeLoop:
         h = self.loop.period
         return complex(np.exp(1j * self.omega * self.tables.numbers.lead) / np.sinc(self.omega * h / (2 * np.pi)))
 
-    def _learning(self, turn: Array, z: Array) -> Array:
-        """Force (N/m) that learning adds, per residual."""
+    def _learning(self, turn: Array) -> tuple[Array, Array]:
+        """Force (N/m) that learning adds, per residual, and that it takes away, per target."""
         known, h = self.tables, self.loop.period
         g, integral, inner = (float(each[0]) for each in (self.loop.observer, self.loop.integral, self.loop.inner))
         lively = max(STATES[self.state])
         pace = known.numbers.adapt + lively * (known.numbers.adapt_awake - known.numbers.adapt)
-        still = z / (z - np.exp(1j * self.omega * h))  # of an integral in the carrier's frame
-        error = 0.5 * g * still
-        slow = -integral * h * still * error * 0.5 * g / (1 - (1 - 0.5 * g) * np.exp(-1j * turn * h))
-        step = ADAPTATION * h
-        change = (1 - np.exp(-1j * turn * step)) / step
+        still = 1 / (1 - np.exp(-1j * turn * h))  # of an integral in the carrier's frame
+        error, step = 0.5 * g * still, ADAPTATION * h
+        last, keep = np.exp(-1j * turn * step), (1 - 0.5 * g) ** ADAPTATION
+        shown, change = (1 - keep) / (1 - keep * last), (1 - last) / step
+        middle = (2 / g - 1) / ADAPTATION - keep / (1 - keep)
+        back = int(known.numbers.age + 0.5)
+        sent = shown * last**back * (1 - (known.numbers.age + middle - back) * (1 - last))
+        away, moved = error * (1 + integral * h * still * sent), shown * (1 - middle * step / (h * still)) - sent
         held = _mean_turn(ADAPTATION, turn * h) * np.exp(-0.5j * (ADAPTATION - 1) * turn * h)
         law = self.stiffness + 1j * self.omega * inner * known.grip[0]
-        slope = known.damping[0, 0] + 2j * self.omega * known.mass[0, 0]
-        return self._ahead * pace * (law + slope * change) * (error - slow) * held / change
+        slope = self.damping + 2j * self.omega * known.mass[0, 0]
+        learnt = self._ahead * pace * (law + slope * change) * held / (change + pace * last * (1 - sent))
+        return learnt * away, learnt * moved
 
     def needed(self, wanted: Array) -> Array:
         """Drive (V, shape (n,)) for a wanted amplitude (m, (n,)): |D a + D' a'| over the modal force of a volt."""

@@ -18,21 +18,21 @@ SIGNAL = BankRules(
     error_observer=False,
     observer=(10.0, 10.0),
     integral=(17.0, 17.0, 17.0),
-    adapt=(60.0, 60.0),
+    adapt=(100.0, 100.0),
     detect=False,
 )
 ERROR = BankRules(
     error_observer=True,
     observer=(10.0, 20.0),
     integral=(2.0, 15.0, 25.0),
-    adapt=(1.0, 60.0),
+    adapt=(1.0, 100.0),
     inner=(0.0, 1.0),
 )
 ERROR_CROWDED = BankRules(
     error_observer=True,
     observer=(20.0, 20.0),
     integral=(1.5, 1.5, 15.0),
-    adapt=(2.0, 40.0),
+    adapt=(2.0, 100.0),
     rest=(0.05, 5.0),
     inner=(0.2, 1.0),
     level=3.5,
