@@ -124,11 +124,12 @@ def test_row_07_unknown_delay():
     """FACTS: 60 deg suffices, "5 samples at 400 Hz".  At 5 kHz a sample of 400 Hz is 28.8 deg: 2.1 samples suffice.
 
     2 more samples (58 deg) are held, 3 (86 deg) are not; 5 are 144 deg.  Put into the inverse, none of them matters.
+    What is not held runs into the limiter, which may keep it near by: ten times as far off at least as what is held.
     """
     for extra, holds in ((2, True), (3, False), (5, False)):
         plate = late(1 + extra)
         for error in (naive(400.0, 6.0, plate, slope=False), ours(400.0, 6.0, "h", plate=plate, known=IDEAL)):
-            assert error < 2e-3 if holds else error > 0.3
+            assert error < 2e-3 if holds else error > 2e-2
         assert naive(400.0, 6.0, plate, plate.band_model(RATE, 1 + extra), slope=False) < 1e-3
         for method in ("h", "h2"):
             assert ours(400.0, 6.0, method, plate=plate) < 1e-4
