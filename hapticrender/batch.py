@@ -202,7 +202,7 @@ def together(scenarios: Sequence[Scenario], controllers: Sequence[Controller], s
 
 
 def _side_by_side(samples: int, widths: Sequence[int]) -> Iterator[Array]:
-    """Arrays (samples, width, LANES) in one piece of memory, not yet written: its pages come together, and cost less."""
+    """Arrays (samples, width, LANES) in one piece of memory, not yet written: its pages come together and cost less."""
     line = ALIGNMENT // 8
     room = np.empty(samples * sum(widths) * LANES + line)
     start = -room.ctypes.data // 8 % line
