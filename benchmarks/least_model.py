@@ -7,7 +7,7 @@ import numpy as np
 from pairing import interleave, keep_to_one_core
 
 import hapticrender as hr
-from hapticrender.fidelity import LADDERS, fidelity
+from hapticrender.fidelity.choice import LADDERS, fidelity
 from hapticrender.touch.builtin import builtin_scenes
 from hapticrender.wording import percent, table
 

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 import hapticrender as hr
-from hapticrender.accuracy import SLIDING
+from hapticrender.accuracy.plate import SLIDING
 from hapticrender.bands import Bands
 from hapticrender.batch import Scenario, together
 from hapticrender.control.block import BlockController

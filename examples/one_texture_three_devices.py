@@ -6,8 +6,8 @@ The figure is the largest error of the predicted skin velocity (1) over all band
 import sys
 
 import hapticrender as hr
+from hapticrender.charts.skin_picture import plot_devices
 from hapticrender.skin import felt_bands
-from hapticrender.skin_picture import plot_devices
 
 DEVICES = ("vt-plate", "electroadhesion", "ultrasonic")
 

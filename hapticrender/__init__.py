@@ -37,7 +37,7 @@ _HOMES = {
     "loop": ("Session", "prepare", "render", "run"),
     "plants.identify": ("Identified", "compare", "identify"),
     "protocols": ("Controller", "Driver", "Flag", "Method", "Motion", "Plant", "Renderer", "Sensed", "Texture"),
-    "recording": ("Recorder", "Recording"),
+    "recordings.recording": ("Recorder", "Recording"),
     "touch.builtin": ("builtin_scenes",),
     "touch.finger": ("Finger",),
     "touch.grating": ("Grating",),
@@ -78,8 +78,8 @@ if _typing.TYPE_CHECKING:
     from hapticrender.protocols import Renderer as Renderer
     from hapticrender.protocols import Sensed as Sensed
     from hapticrender.protocols import Texture as Texture
-    from hapticrender.recording import Recorder as Recorder
-    from hapticrender.recording import Recording as Recording
+    from hapticrender.recordings.recording import Recorder as Recorder
+    from hapticrender.recordings.recording import Recording as Recording
     from hapticrender.touch.builtin import builtin_scenes as builtin_scenes
     from hapticrender.touch.finger import Finger as Finger
     from hapticrender.touch.grating import Grating as Grating

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hapticrender._lanes import ALIGNMENT, aligned
 from hapticrender.bands import Bands
+from hapticrender.compiled.lanes import ALIGNMENT, aligned
 from hapticrender.control.bank import BankController
 from hapticrender.control.bank_batch import LANES, alike, batch_of, side_by_side
 from hapticrender.control.methods import method_named

@@ -197,7 +197,7 @@ def _demo(arguments: argparse.Namespace) -> int:
 
 def _write_page(arguments: argparse.Namespace, scenes: list[Outputs]) -> Path:
     """Write ``summary.json`` of all scenes and the page about them."""
-    from hapticrender.page import write_page
+    from hapticrender.charts.page import write_page
     from hapticrender.validate import as_json
 
     report = {
@@ -211,7 +211,7 @@ def _write_page(arguments: argparse.Namespace, scenes: list[Outputs]) -> Path:
 
 
 def _render(arguments: argparse.Namespace) -> int:
-    from hapticrender.fidelity import fidelity
+    from hapticrender.fidelity.choice import fidelity
     from hapticrender.outputs import run_into
 
     _check_folder("--out", arguments.out)
@@ -268,8 +268,8 @@ def _validate(arguments: argparse.Namespace) -> int:
 
 def _suite(arguments: argparse.Namespace) -> int:
     """Run the accuracy suite: the chosen method beside the paper's; exit 1 where it misses a bound."""
-    from hapticrender.accuracy_figures import as_rows, write_json
-    from hapticrender.accuracy_suite import run_suite
+    from hapticrender.accuracy.figures import as_rows, write_json
+    from hapticrender.accuracy.suite import run_suite
     from hapticrender.control.methods import METHODS
     from hapticrender.wording import table
 
@@ -315,19 +315,19 @@ def _chart(arguments: argparse.Namespace) -> int:
     arguments.out.mkdir(parents=True, exist_ok=True)
     path = arguments.out / f"{arguments.name}.png"
     if arguments.name == "story":
-        from hapticrender.story import draw_story
+        from hapticrender.charts.story import draw_story
 
         draw_story(path)
     elif arguments.name == "pareto":
-        from hapticrender.pareto import pareto
+        from hapticrender.charts.pareto import pareto
 
         pareto(path, progress=lambda what: print(what, file=sys.stderr))
     elif arguments.name == "devices":
-        from hapticrender.device_chart import device_chart
+        from hapticrender.charts.devices import device_chart
 
         device_chart(path, progress=lambda what: print(what, file=sys.stderr))
     else:
-        from hapticrender import chart
+        from hapticrender.charts import stability as chart
 
         chart.stability(path, adapted=arguments.learnt)
     print(path)
@@ -348,7 +348,7 @@ def _paper(arguments: argparse.Namespace) -> int:
 
 
 def _show(arguments: argparse.Namespace) -> int:
-    from hapticrender.recording import Recording
+    from hapticrender.recordings.recording import Recording
 
     path = arguments.path / "recording.au" if arguments.path.is_dir() else arguments.path
     with _blaming(str(path)):
@@ -371,7 +371,7 @@ def _overview(summaries: list[Any]) -> str:
 
 
 def _print_figures(summary: Any) -> None:
-    from hapticrender.judge import text
+    from hapticrender.recordings.judge import text
     from hapticrender.wording import conditions
 
     print(conditions(summary))

@@ -19,7 +19,7 @@ from hapticrender.control.bandmodel import BandModel
 from hapticrender.control.methods import method_named
 from hapticrender.errors import HapticError, PlateMismatch
 from hapticrender.protocols import Array, Controller, Driver, Plant, Renderer, Sensed
-from hapticrender.recording import Recorder, Recording
+from hapticrender.recordings.recording import Recorder, Recording
 from hapticrender.touch.scene import Scene
 
 MISMATCH = 0.03  # largest share of a target that the integral part may have to add on the untouched device

@@ -8,10 +8,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from hapticrender.formats import write_sound
 from hapticrender.loop import Session, run
 from hapticrender.protocols import Array
-from hapticrender.recording import Recording
+from hapticrender.recordings.formats import write_sound
+from hapticrender.recordings.recording import Recording
 from hapticrender.validate import as_json
 
 FILES = ("scene.toml", "recording.au", "drive.wav", "sensed.wav", "picture.png", "summary.json")

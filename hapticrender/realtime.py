@@ -2,7 +2,7 @@
 
 A callback written in Python waits for Python's lock and misses its deadline whenever another thread is busy.  This one
 holds no lock, allocates nothing and never waits: targets and the finger's place reach it through slots that change
-hands in one atomic step (`hapticrender._exchange`)::
+hands in one atomic step (`hapticrender.compiled.exchange`)::
 
     entry = RealtimeEntry(controller, sensed_scale=2e-4, drive_scale=0.5)   # m and 1/A of full scale
     stream = open_audio(callback=entry.address, user_data=entry.user_data, frames=entry.block)
@@ -22,10 +22,10 @@ import numba
 import numpy as np
 from numba import types
 
-from hapticrender._exchange import FRESH, SLOTS, behind, bytes_of, empty, place, swap
-from hapticrender._jit import callback, kernel
-from hapticrender._records import as_record
 from hapticrender.bands import Bands
+from hapticrender.compiled.exchange import FRESH, SLOTS, behind, bytes_of, empty, place, swap
+from hapticrender.compiled.jit import callback, kernel
+from hapticrender.compiled.records import as_record
 from hapticrender.control.bank_rows import TONE_ROWS
 from hapticrender.control.block import BlockController
 from hapticrender.control.block_kernels import block_step

@@ -10,12 +10,12 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from hapticrender.judge import beside_the_bands
 from hapticrender.protocols import Array
+from hapticrender.recordings.judge import beside_the_bands
 from hapticrender.touch.perception import HIGHEST, VELOCITY_PER_FORCE, sensation_level
 
 if TYPE_CHECKING:
-    from hapticrender.recording import Recording
+    from hapticrender.recordings.recording import Recording
 
 
 class Felt(NamedTuple):

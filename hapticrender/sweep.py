@@ -19,8 +19,8 @@ from typing import Any
 import numpy as np
 
 from hapticrender.batch import LANES, Played, Scenario, simulate
-from hapticrender.judge import fit
 from hapticrender.protocols import Array
+from hapticrender.recordings.judge import fit
 
 AT_A_TIME = 4 * LANES  # scenarios a task: enough to be worth sending
 LENGTH = 0.1  # s: of the windows in which envelopes are taken

@@ -12,8 +12,8 @@ from typing import NamedTuple
 import numpy as np
 
 import hapticrender as hr
-from hapticrender._jit import kernel
 from hapticrender.bands import Bands
+from hapticrender.compiled.jit import kernel
 from hapticrender.control.kernels import WANTED_IM, WANTED_RE, biquad_step
 from hapticrender.control.loopshape import butterworth, integrator, reduced_controller
 from hapticrender.control.methods import METHODS

@@ -5,7 +5,7 @@ import math
 import numpy as np
 
 import hapticrender as hr
-from hapticrender.fidelity_plate import OPTIONS
+from hapticrender.fidelity.plate import OPTIONS
 
 DURATION = 4.0  # s
 FREQUENCIES = (20.0, 500.0)  # Hz

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from hapticrender.bands import Bands
-from hapticrender.recording import Recorder, Recording
+from hapticrender.recordings.recording import Recorder, Recording
 from hapticrender.touch.grating import Grating
 from hapticrender.touch.scene import Scene
 

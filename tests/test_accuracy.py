@@ -6,11 +6,14 @@ import numpy as np
 import pytest
 
 import hapticrender as hr
-from hapticrender import accuracy, accuracy_figures, accuracy_suite, defaults
+from hapticrender import defaults
+from hapticrender.accuracy import figures as accuracy_figures
+from hapticrender.accuracy import plate as accuracy
+from hapticrender.accuracy import suite as accuracy_suite
+from hapticrender.charts.story import draw_story
 from hapticrender.drivers.simulated import SimulatedDriver
 from hapticrender.plants.identify import identify, require_delay
 from hapticrender.plants.vibrotactile import Plate, PlateParameters
-from hapticrender.story import draw_story
 from hapticrender.touch.mechanics import FingerMechanics
 
 RANGES = ((1e-4, 5e-4), (0.5, 12.0), (400.0, 12e3), (1e-3, 10e-3), (0.3, 4.0), (60.0, 900.0))  # skin, then phalanx

@@ -3,7 +3,10 @@
 import numpy as np
 import pytest
 
-from hapticrender import accuracy, accuracy_friction, accuracy_suite, defaults
+from hapticrender import defaults
+from hapticrender.accuracy import friction as accuracy_friction
+from hapticrender.accuracy import plate as accuracy
+from hapticrender.accuracy import suite as accuracy_suite
 from hapticrender.protocols import Flag
 
 QUICK = (

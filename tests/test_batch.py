@@ -9,7 +9,7 @@ import pytest
 
 import hapticrender as hr
 from hapticrender import batch
-from hapticrender.accuracy import SLIDING, tones
+from hapticrender.accuracy.plate import SLIDING, tones
 from hapticrender.batch import LANES, Scenario, simulate
 from hapticrender.plants.vibrotactile import PlateParameters
 from hapticrender.sweep import errors, sweep, worst_error

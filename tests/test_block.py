@@ -6,16 +6,16 @@ import numpy as np
 import pytest
 
 import hapticrender as hr
-from hapticrender.accuracy import AMPLITUDE, SLIDING, pressing, rms, tones
+from hapticrender.accuracy.plate import AMPLITUDE, SLIDING, pressing, rms, tones
 from hapticrender.bands import Bands
 from hapticrender.control import bank_rows as row
 from hapticrender.control.bank_state import across_bands
 from hapticrender.control.block import BlockController
 from hapticrender.control.methods import METHODS
 from hapticrender.drivers.simulated import SimulatedDriver
-from hapticrender.judge import fit
 from hapticrender.plants.vibrotactile import Plate, PlateParameters
 from hapticrender.protocols import Flag
+from hapticrender.recordings.judge import fit
 from hapticrender.touch.mechanics import HEAVY, HEAVY_SECOND
 from hapticrender.touch.motion import Sampled
 

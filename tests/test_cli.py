@@ -17,7 +17,7 @@ import soundfile
 from hypothesis import strategies as st
 
 from hapticrender import __version__, cli
-from hapticrender.recording import Recording
+from hapticrender.recordings.recording import Recording
 from hapticrender.touch.builtin import DEVICES, builtin_scenes
 from hapticrender.touch.scene import Scene
 
@@ -90,7 +90,7 @@ def two_tiny_scenes(monkeypatch):
 def no_matplotlib(monkeypatch):
     for name in [name for name in sys.modules if name.partition(".")[0] == "matplotlib"]:
         monkeypatch.delitem(sys.modules, name)
-    monkeypatch.delitem(sys.modules, "hapticrender.picture", raising=False)
+    monkeypatch.delitem(sys.modules, "hapticrender.charts.picture", raising=False)
     monkeypatch.setitem(sys.modules, "matplotlib", None)
 
 

@@ -5,8 +5,9 @@ import json
 import numpy as np
 import pytest
 
-from hapticrender import device_chart, device_picture
-from hapticrender.device_chart import Point, Setting
+from hapticrender.charts import devices as device_chart
+from hapticrender.charts import devices_picture as device_picture
+from hapticrender.charts.devices import Point, Setting
 from hapticrender.touch.grating import Grating
 
 TONE = Grating(frequency=120.0, velocity=10e-3)

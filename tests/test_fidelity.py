@@ -7,10 +7,10 @@ import pytest
 
 import hapticrender as hr
 from hapticrender import cli
-from hapticrender.fidelity import fidelity
-from hapticrender.fidelity_plate import OPTIONS, bound
-from hapticrender.judge import LARGEST_INFLATION, fit, window_length
+from hapticrender.fidelity.choice import fidelity
+from hapticrender.fidelity.plate import OPTIONS, bound
 from hapticrender.plants.vibrotactile import Plate, PlateParameters
+from hapticrender.recordings.judge import LARGEST_INFLATION, fit, window_length
 
 AMPLITUDE = 10e-6  # m
 

@@ -7,9 +7,8 @@ import pytest
 
 import hapticrender as hr
 from hapticrender.control.square_root import SquareRoot
-from hapticrender.fidelity import fidelity
-from hapticrender.fidelity_friction import bound
-from hapticrender.judge import LARGEST_INFLATION, fit, window_length
+from hapticrender.fidelity.choice import fidelity
+from hapticrender.fidelity.friction import bound
 from hapticrender.loop import registered
 from hapticrender.plants.electroadhesion import (
     DRY,
@@ -20,6 +19,7 @@ from hapticrender.plants.electroadhesion import (
 )
 from hapticrender.plants.fidelity_screen import attractions
 from hapticrender.plants.fidelity_surface import AmplitudeLoop
+from hapticrender.recordings.judge import LARGEST_INFLATION, fit, window_length
 from hapticrender.touch.builtin import builtin_scenes
 
 SCREEN, SURFACE = "electroadhesion", "ultrasonic"

@@ -4,9 +4,9 @@ import pytest
 from random_plates import random_case
 from test_fidelity import true_error
 
-from hapticrender.fidelity_plate import NoBound, bound
+from hapticrender.fidelity.plate import NoBound, bound
 
-QUICK, ALL = 24, 744
+QUICK, ALL = 24, 264
 
 
 def ratios(seeds):

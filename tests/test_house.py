@@ -87,22 +87,7 @@ def test_type_checkers_are_told_of_every_public_name():
     assert sorted(alias.asname for node in told.body for alias in node.names) == hapticrender.__all__
 
 
-GROUND = {
-    f"hapticrender.{name}"
-    for name in (
-        "protocols",
-        "errors",
-        "bands",
-        "contract",
-        "defaults",
-        "_records",
-        "_fragments",
-        "_jit",
-        "_lanes",
-        "_lanes_memory",
-        "_polynomials",
-    )
-}
+GROUND = {f"hapticrender.{name}" for name in ("protocols", "errors", "bands", "contract", "defaults")}
 MAY_IMPORT = {  # room: the other rooms that it may look into
     "ground": set(),
     "touch": set(),
@@ -116,9 +101,9 @@ MAY_IMPORT = {  # room: the other rooms that it may look into
 
 
 def room_of(name):
-    if name in GROUND:
-        return "ground"
     parts = name.split(".")
+    if name in GROUND or "compiled" in parts[1:2]:
+        return "ground"
     return parts[1] if len(parts) > 1 and parts[1] in MAY_IMPORT else "core"
 
 

@@ -13,7 +13,7 @@ from conftest import ROOT
 from numba.core import types
 from numba.core.errors import TypingError
 
-from hapticrender._jit import by_types, kernel
+from hapticrender.compiled.jit import by_types, kernel
 
 HELPER = """
 from {jit} import kernel
@@ -40,19 +40,19 @@ kernel = numba.njit(cache=True)
 def toy(request, tmp_path):
     """A package of two kernel files, one calling the other, with our decorator or numba's plain one."""
     package = tmp_path / "toy"
-    package.mkdir()
+    (package / "compiled").mkdir(parents=True)
     (package / "__init__.py").touch()
     if request.param == "ours":
-        shutil.copy(ROOT / "hapticrender" / "_jit.py", package / "_jit.py")
+        shutil.copy(ROOT / "hapticrender" / "compiled" / "jit.py", package / "compiled")
     else:
-        (package / "_jit.py").write_text(NAIVE_JIT)
-    (package / "caller.py").write_text(CALLER.format(jit="toy._jit"))
+        (package / "compiled" / "jit.py").write_text(NAIVE_JIT)
+    (package / "caller.py").write_text(CALLER.format(jit="toy.compiled.jit"))
     return request.param, package
 
 
 def run(package, value):
     """Write the helper, call the caller in a fresh process; returns result and cache hits of the caller."""
-    (package / "helper.py").write_text(HELPER.format(jit="toy._jit", value=value))
+    (package / "helper.py").write_text(HELPER.format(jit="toy.compiled.jit", value=value))
     script = "from toy.caller import scaled; print(scaled(1.0), sum(scaled.stats.cache_hits.values()))"
     environment = {name: text for name, text in os.environ.items() if name != "NUMBA_CACHE_DIR"}
     done = subprocess.run(
@@ -83,7 +83,6 @@ def test_a_read_only_install_with_no_cache_still_runs(tmp_path):
     script = """
 import pathlib, sys
 import hapticrender as hr
-from hapticrender import _jit
 from hapticrender.control.bank_kernels import bank_run
 from numba.core.caching import NullCache
 assert pathlib.Path(hr.__file__).is_relative_to(sys.argv[1]), hr.__file__
@@ -112,13 +111,14 @@ print(len(hr.render(scene).drive))
 def test_numbers_that_are_compiled_in_count(tmp_path):
     """A file of row numbers, which never says what it is for: an edit makes another stamp, one to a page does not."""
     package = tmp_path / "toy"
-    (package / "control").mkdir(parents=True)
-    shutil.copy(ROOT / "hapticrender" / "_jit.py", package / "_jit.py")
+    for room in ("compiled", "control"):
+        (package / room).mkdir(parents=True)
+    shutil.copy(ROOT / "hapticrender" / "compiled" / "jit.py", package / "compiled")
 
     def stamp(rows, page):
         (package / "control" / "rows.py").write_text(rows)
         (package / "page.py").write_text(page)
-        script = "from toy._jit import _STAMP; print(_STAMP)"
+        script = "from toy.compiled.jit import _STAMP; print(_STAMP)"
         return subprocess.run(
             [sys.executable, "-c", script], cwd=tmp_path, capture_output=True, text=True, check=True
         ).stdout

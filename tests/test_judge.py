@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from synthetic import PLACES, RATE, make_bands, make_recorder, make_recording, make_scene, make_signals, times
 
-from hapticrender import judge
 from hapticrender.loop import render
 from hapticrender.protocols import Flag
-from hapticrender.recording import Recorder
+from hapticrender.recordings import judge
+from hapticrender.recordings.recording import Recorder
 from hapticrender.touch.builtin import builtin_scenes
 
 EXACT = 1e-9  # relative: the ridge of 1e-12 times the inverse of the worst inflation, with digits to spare

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from hapticrender._jit import kernel
-from hapticrender._lanes import (
+from hapticrender.compiled.jit import kernel
+from hapticrender.compiled.lanes import (
     ALIGNMENT,
     WIDTH,
     aligned,
@@ -21,7 +21,7 @@ from hapticrender._lanes import (
     size,
     total,
 )
-from hapticrender._lanes_memory import lanes, put, put_stretch, read, row_totals, stretch, write
+from hapticrender.compiled.lanes_memory import lanes, put, put_stretch, read, row_totals, stretch, write
 
 KINDS = [np.float64, np.float32]
 

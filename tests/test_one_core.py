@@ -22,7 +22,7 @@ RENDERERS = sorted((Path(__file__).resolve().parent.parent / "renderers").glob("
 KINDS = ("vt-plate", "electroadhesion", "ultrasonic", "hybrid")
 # What makes a demodulator, a filter, a loop or an oscillator; a renderer may only hand over to the core's.
 FORBIDDEN_PACKAGES = {"numba", "scipy.signal"} | {
-    f"hapticrender.{name}" for name in ("_jit", "_lanes", "_lanes_memory", "_polynomials")
+    f"hapticrender.compiled.{name}" for name in ("jit", "lanes", "lanes_memory", "polynomials")
 }
 CORE_ONLY = {  # of `control`, what a renderer may touch: descriptions, and whole controllers
     "hapticrender.control.bandmodel",
@@ -88,7 +88,7 @@ def test_a_renderer_neither_mixes_nor_filters(path):
         ("from scipy import signal", {"scipy.signal"}, set()),
         ("import hapticrender.control.stdft", {"hapticrender.control.stdft"}, set()),
         ("from numba import njit", {"numba"}, set()),
-        ("from hapticrender._jit import kernel", {"hapticrender._jit"}, set()),
+        ("from hapticrender.compiled.jit import kernel", {"hapticrender.compiled.jit"}, set()),
         ("from hapticrender.control.bandmodel import BandModel\nBandModel(mass=np.sqrt(2.0))", set(), set()),
     ],
 )

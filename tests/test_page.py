@@ -6,8 +6,8 @@ from pathlib import Path
 import pytest
 
 from hapticrender import wording
+from hapticrender.charts.page import page, write_page
 from hapticrender.outputs import Outputs, round_up
-from hapticrender.page import page, write_page
 from hapticrender.touch.builtin import builtin_scenes
 from hapticrender.touch.grating import Grating
 from hapticrender.touch.scene import Scene

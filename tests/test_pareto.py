@@ -5,8 +5,8 @@ import json
 import numpy as np
 import pytest
 
-from hapticrender import pareto
-from hapticrender.accuracy import SLIDING, tones
+from hapticrender.accuracy.plate import SLIDING, tones
+from hapticrender.charts import pareto
 from hapticrender.control.methods import METHODS
 
 
@@ -58,7 +58,7 @@ def test_it_draws_and_writes_what_it_measured(tmp_path, monkeypatch):
     monkeypatch.setattr(pareto, "MAP", np.array([100.0, 178.0]))
     settings = [each for each in pareto.every_setting() if each.what in ("as it comes", "5 Hz")]
     settings = [each for each in settings if each.method in ("paper", "h2")]
-    monkeypatch.setattr("hapticrender.pareto_picture.MAP", pareto.MAP)
+    monkeypatch.setattr("hapticrender.charts.pareto_picture.MAP", pareto.MAP)
     told = []
     points = pareto.pareto(tmp_path / "pareto.png", settings=settings, rounds=1, progress=told.append)
     by_name = {each.setting.method: each for each in points}

@@ -11,9 +11,9 @@ UM = 1e-6
 
 pytest.importorskip("matplotlib", reason="pictures are an extra")
 
-from hapticrender import figures, picture  # noqa: E402
-from hapticrender.formats import MissingExtra  # noqa: E402
-from hapticrender.recording import Recorder  # noqa: E402
+from hapticrender.charts import figures, picture  # noqa: E402
+from hapticrender.recordings.formats import MissingExtra  # noqa: E402
+from hapticrender.recordings.recording import Recorder  # noqa: E402
 
 
 def swiped(**fields):

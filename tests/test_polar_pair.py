@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import hapticrender as hr
-from hapticrender.accuracy import tones
+from hapticrender.accuracy.plate import tones
 from hapticrender.bands import Bands
 from hapticrender.control.methods import METHODS
 from hapticrender.plants.closed import CLOSED, closed_plate_run

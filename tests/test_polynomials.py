@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from remainders import Rounded, of_angle, of_cosine, of_root, of_sine
 
-from hapticrender import _polynomials as polynomials
-from hapticrender._jit import kernel
-from hapticrender._lanes import WIDTH, aligned
-from hapticrender._lanes_memory import lanes, put
-from hapticrender._polynomials import cosine, polar, unit
+from hapticrender.compiled import polynomials
+from hapticrender.compiled.jit import kernel
+from hapticrender.compiled.lanes import WIDTH, aligned
+from hapticrender.compiled.lanes_memory import lanes, put
+from hapticrender.compiled.polynomials import cosine, polar, unit
 
 EIGHTH = tan(pi / 8)
 SIDES = np.linspace(0.0, 1.0, 4097)  # the smaller over the larger of two sides

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from numba import types
 
-from hapticrender._exchange import FRESH, SLOTS, swap
 from hapticrender.bands import Bands
+from hapticrender.compiled.exchange import FRESH, SLOTS, swap
 from hapticrender.control.block import BlockController
 from hapticrender.control.methods import METHODS
 from hapticrender.plants.vibrotactile import PlateParameters
@@ -253,7 +253,7 @@ def test_what_it_refuses():
 def test_a_second_process_finds_it_compiled():
     """The compiled callback comes from the cache: compile, then ask a fresh process whether it had to."""
     code = (
-        "import hapticrender._jit as jit; made = jit.callback\n"
+        "import hapticrender.compiled.jit as jit; made = jit.callback\n"
         "jit.callback = lambda *a: hits.append(made(*a)) or hits[-1]\n"
         "hits = []\n"
         "from tests.test_realtime import controller\n"

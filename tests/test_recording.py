@@ -12,10 +12,10 @@ import pytest
 import soundfile
 from synthetic import RATE, make_bands, make_recorder, make_recording, make_scene, make_signals, times
 
-from hapticrender import formats, journal
-from hapticrender.formats import MissingExtra
-from hapticrender.journal import Header
-from hapticrender.recording import Recorder, Recording
+from hapticrender.recordings import formats, journal
+from hapticrender.recordings.formats import MissingExtra
+from hapticrender.recordings.journal import Header
+from hapticrender.recordings.recording import Recorder, Recording
 
 UM = 1e-6
 SIGNALS = ("drive", "sensed", "motion", "position", "normal_load", "target", "flags")

@@ -7,7 +7,7 @@ import pytest
 from synthetic import RATE, make_bands, make_scene, make_signals, times
 
 import hapticrender as hr
-from hapticrender.recording import Recorder
+from hapticrender.recordings.recording import Recorder
 from hapticrender.skin import felt_bands, residual_velocity, skin_waveform, velocity_per_unit
 from hapticrender.wording import quantity
 
@@ -99,7 +99,7 @@ def test_where_nothing_can_be_judged_nothing_is_said_beside_the_bands():
 
 def test_devices_are_drawn_side_by_side(recordings, tmp_path):
     pytest.importorskip("matplotlib")
-    from hapticrender.skin_picture import draw_devices, plot_devices
+    from hapticrender.charts.skin_picture import draw_devices, plot_devices
 
     figure = draw_devices(recordings)
     assert [axes.get_title(loc="left").split(",")[0] for axes in figure.axes[:2]] == list(recordings)
@@ -113,9 +113,9 @@ def test_devices_are_drawn_side_by_side(recordings, tmp_path):
 
 
 def test_the_page_shows_what_devices_share(tmp_path):
+    from hapticrender.charts.page_devices import devices_section
     from hapticrender.loop import prepare
     from hapticrender.outputs import run_into
-    from hapticrender.page_devices import devices_section
 
     texture = hr.Grating(velocity=8e-3, frequency=60.0)
     outputs = [

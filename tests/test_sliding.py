@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from hapticrender._jit import kernel
+from hapticrender.compiled.jit import kernel
 from hapticrender.plants.sliding import SlidingParameters, sliding_state, sliding_step, sliding_tables
 from hapticrender.touch.mechanics import HEAVY, LIGHT, LIGHT_SECOND, NONE, FingerMechanics
 

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 import hapticrender as hr
-from hapticrender import chart
 from hapticrender.bands import Bands
+from hapticrender.charts import stability as chart
 from hapticrender.control.bank import BankController
 from hapticrender.control.bank_loop import Structure
 from hapticrender.control.margins import Margins, borne_errors, eigenloci

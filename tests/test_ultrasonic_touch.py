@@ -10,7 +10,7 @@ from test_ultrasonic_rendering import Watched, driven, friction_of
 from ultrasonic import ASKED, NOISE, held, inner_share, modulated, ran
 
 import hapticrender as hr
-from hapticrender import accuracy_friction
+from hapticrender.accuracy import friction as accuracy_friction
 from hapticrender.control.stability import STATES, bank_loop
 from hapticrender.loop import prepare
 from hapticrender.loop import run as play

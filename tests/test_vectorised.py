@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hapticrender._lanes import aligned
-from hapticrender.accuracy import SLIDING, tones
+from hapticrender.accuracy.plate import SLIDING, tones
 from hapticrender.batch import LANES, Scenario, batch_state
+from hapticrender.compiled.lanes import aligned
 from hapticrender.control import analyser, bank_kernels, block_kernels, polar_passes
 from hapticrender.control.bank_batch import batch_of
 from hapticrender.control.methods import METHODS

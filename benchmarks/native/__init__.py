@@ -11,8 +11,8 @@ from pathlib import Path
 
 import numpy as np
 
-from hapticrender import _polynomials
-from hapticrender._lanes import WIDTH, aligned
+from hapticrender.compiled import polynomials as _polynomials
+from hapticrender.compiled.lanes import WIDTH, aligned
 from hapticrender.control import bank_rows as row
 from hapticrender.control import block_state
 from hapticrender.control.bank_carriers import FORGET

@@ -13,10 +13,10 @@ from typing import Any
 
 import numpy as np
 
-from hapticrender._jit import kernel
-from hapticrender._lanes import ALIGNMENT, WIDTH, aligned, padded, select, size
-from hapticrender._lanes_memory import lanes, put, put_pairs
-from hapticrender._polynomials import unit
+from hapticrender.compiled.jit import kernel
+from hapticrender.compiled.lanes import ALIGNMENT, WIDTH, aligned, padded, select, size
+from hapticrender.compiled.lanes_memory import lanes, put, put_pairs
+from hapticrender.compiled.polynomials import unit
 from hapticrender.control.bank_state import PRECISIONS
 from hapticrender.control.stdft import StarSTDFT
 from hapticrender.control.transfer import require_positive

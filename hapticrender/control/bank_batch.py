@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from hapticrender._lanes import WIDTH, aligned
+from hapticrender.compiled.lanes import WIDTH, aligned
 from hapticrender.control import bank_rows as row
 from hapticrender.control.bank import BankController
 from hapticrender.control.bank_state import BankState, BankTables

@@ -7,10 +7,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from hapticrender._jit import by_types, kernel
-from hapticrender._lanes import floor, high, low, select, size
-from hapticrender._lanes_memory import lanes, put, read
-from hapticrender._polynomials import unit
+from hapticrender.compiled.jit import by_types, kernel
+from hapticrender.compiled.lanes import floor, high, low, select, size
+from hapticrender.compiled.lanes_memory import lanes, put, read
+from hapticrender.compiled.polynomials import unit
 from hapticrender.control import bank_rows as row
 from hapticrender.control.bank_finger import finger_stiffness
 from hapticrender.control.kernels import TURN

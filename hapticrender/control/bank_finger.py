@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from hapticrender._jit import kernel
-from hapticrender._lanes import any_of, high, low, select, size
-from hapticrender._lanes_memory import lanes, read, write
+from hapticrender.compiled.jit import kernel
+from hapticrender.compiled.lanes import any_of, high, low, select, size
+from hapticrender.compiled.lanes_memory import lanes, read, write
 from hapticrender.control import bank_rows as row
 from hapticrender.control.kernels import FAR, FASTEST, TURN
 

@@ -11,10 +11,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from hapticrender._jit import kernel
-from hapticrender._lanes import any_of, high, low, root, select, size, total, totals
-from hapticrender._lanes_memory import lanes, put, put_pairs, read, write
-from hapticrender._polynomials import whole
+from hapticrender.compiled.jit import kernel
+from hapticrender.compiled.lanes import any_of, high, low, root, select, size, total, totals
+from hapticrender.compiled.lanes_memory import lanes, put, put_pairs, read, write
+from hapticrender.compiled.polynomials import whole
 from hapticrender.control import bank_rows as row
 from hapticrender.control.bank_carriers import (
     FORGET,

@@ -14,9 +14,9 @@ samples.  A target R that moves is told apart alike: X = <R> + E where the obser
 
 from __future__ import annotations
 
-from hapticrender._jit import kernel
-from hapticrender._lanes import high, low, select, total
-from hapticrender._lanes_memory import lanes, put, read, write
+from hapticrender.compiled.jit import kernel
+from hapticrender.compiled.lanes import high, low, select, total
+from hapticrender.compiled.lanes_memory import lanes, put, read, write
 from hapticrender.control import bank_rows as row
 from hapticrender.control.bank_carriers import memory_damping
 from hapticrender.control.bank_finger import finger_stiffness

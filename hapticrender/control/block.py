@@ -6,8 +6,8 @@ import math
 
 import numpy as np
 
-from hapticrender._lanes import WIDTH, aligned, padded
 from hapticrender.bands import Bands
+from hapticrender.compiled.lanes import WIDTH, aligned, padded
 from hapticrender.control import bank_rows as row
 from hapticrender.control.bank import LEARNING_SHARE, BankController, settled_share, spacing
 from hapticrender.control.bank_state import PRECISIONS, BankNumbers, BankTables, bank_state

@@ -13,10 +13,10 @@ per-sample bank's own, called once a block.
 
 from __future__ import annotations
 
-from hapticrender._jit import kernel
-from hapticrender._lanes import any_of, floor, high, root, size, totals
-from hapticrender._lanes_memory import lanes, put, put_pairs
-from hapticrender._polynomials import unit, whole
+from hapticrender.compiled.jit import kernel
+from hapticrender.compiled.lanes import any_of, floor, high, root, size, totals
+from hapticrender.compiled.lanes_memory import lanes, put, put_pairs
+from hapticrender.compiled.polynomials import unit, whole
 from hapticrender.control import bank_rows as row
 from hapticrender.control.bank_carriers import FORGET, derivative, grow_pass, law_tune, look_ahead, motion_pass
 from hapticrender.control.bank_finger import feel, track_finger

@@ -7,9 +7,9 @@ group to group.  Carriers that follow the finger have tables over the whole bloc
 
 from __future__ import annotations
 
-from hapticrender._jit import kernel
-from hapticrender._lanes import totals
-from hapticrender._lanes_memory import lanes, put, put_stretch, stretch
+from hapticrender.compiled.jit import kernel
+from hapticrender.compiled.lanes import totals
+from hapticrender.compiled.lanes_memory import lanes, put, put_stretch, stretch
 from hapticrender.control import bank_rows as row
 from hapticrender.control.block_state import (
     CHANNEL_ROWS,

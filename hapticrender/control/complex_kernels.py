@@ -14,7 +14,7 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-from hapticrender._jit import kernel
+from hapticrender.compiled.jit import kernel
 from hapticrender.control.bank_finger import track_finger
 from hapticrender.control.bank_rows import ACCELERATION, HELD, SEEN, SPEED, VELOCITY
 from hapticrender.control.kernels import (

@@ -29,7 +29,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from hapticrender._jit import kernel
+from hapticrender.compiled.jit import kernel
 from hapticrender.control.kernels import Section, biquad_step
 from hapticrender.control.stdft import StarSTDFT
 from hapticrender.control.transfer import require_positive

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from hapticrender._jit import kernel
+from hapticrender.compiled.jit import kernel
 
 TURN = 2.0 * math.pi
 QUIET = 1e-12  # m: below this a target counts as silence and its phase means nothing

@@ -25,7 +25,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from hapticrender._jit import kernel
+from hapticrender.compiled.jit import kernel
 from hapticrender.control.transfer import require_positive
 from hapticrender.protocols import Array
 

@@ -4,7 +4,7 @@ Symbols: psi carrier phase, X envelope of a coordinate, R wanted envelope, A and
 carrier that runs backwards (the finger reverses) is followed as its mirror image: x = Re X e^{j phi} =
 Re conj(X) e^{-j phi}, so that psi always runs forward and every complex state is conjugated at the reversal.
 
-Everything that a band owns is a column of rows that are named here, W columns to a tile (`hapticrender._lanes`).  What
+Everything that a band owns is a column of rows that are named here, W columns to a tile (`compiled.lanes`).  What
 all tiles share is written down before; blocks are in `polar_passes`.
 """
 
@@ -13,10 +13,10 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-from hapticrender._jit import kernel
-from hapticrender._lanes import any_of, high, low, root, select, size
-from hapticrender._lanes_memory import lanes, put, put_pairs, taken
-from hapticrender._polynomials import polar, unit
+from hapticrender.compiled.jit import kernel
+from hapticrender.compiled.lanes import any_of, high, low, root, select, size
+from hapticrender.compiled.lanes_memory import lanes, put, put_pairs, taken
+from hapticrender.compiled.polynomials import polar, unit
 from hapticrender.control.bank_carriers import advance_of, turns_of
 from hapticrender.control.kernels import (
     DOUBT_TIME,

@@ -8,9 +8,9 @@ hundred cycles long; those of two samples and two sides go on side by side.  It 
 
 from __future__ import annotations
 
-from hapticrender._jit import kernel
-from hapticrender._lanes import size, totals
-from hapticrender._lanes_memory import lanes, put, put_pairs
+from hapticrender.compiled.jit import kernel
+from hapticrender.compiled.lanes import size, totals
+from hapticrender.compiled.lanes_memory import lanes, put, put_pairs
 from hapticrender.control.polar_kernels import (
     AMOUNT,
     COS,

@@ -7,10 +7,10 @@ the processor works on many samples at once.  The arithmetic is that of `polar_k
 
 from __future__ import annotations
 
-from hapticrender._jit import kernel
-from hapticrender._lanes import select
-from hapticrender._lanes_memory import lanes, put, put_pairs, put_stretch, row_totals, taken
-from hapticrender._polynomials import cosine, polar
+from hapticrender.compiled.jit import kernel
+from hapticrender.compiled.lanes import select
+from hapticrender.compiled.lanes_memory import lanes, put, put_pairs, put_stretch, row_totals, taken
+from hapticrender.compiled.polynomials import cosine, polar
 from hapticrender.control.kernels import QUIET, TURN
 from hapticrender.control.polar_kernels import (
     AMOUNT,

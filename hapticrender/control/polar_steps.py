@@ -6,10 +6,10 @@ some hundreds of them only, and what a sample waits for is then hidden behind th
 
 from __future__ import annotations
 
-from hapticrender._jit import kernel
-from hapticrender._lanes import select, totals
-from hapticrender._lanes_memory import lanes, put, put_pairs
-from hapticrender._polynomials import cosine, polar
+from hapticrender.compiled.jit import kernel
+from hapticrender.compiled.lanes import select, totals
+from hapticrender.compiled.lanes_memory import lanes, put, put_pairs
+from hapticrender.compiled.polynomials import cosine, polar
 from hapticrender.control.kernels import QUIET, TURN
 from hapticrender.control.polar_kernels import (
     AMOUNT,

@@ -15,8 +15,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from hapticrender._jit import kernel
 from hapticrender.bands import Bands
+from hapticrender.compiled.jit import kernel
 from hapticrender.control import bank_rows as row
 from hapticrender.control.bandmodel import BandModel
 from hapticrender.control.bank import BankController

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from html import escape
 
 from hapticrender import __version__
-from hapticrender.page import STYLE
+from hapticrender.charts.page import STYLE
 from hapticrender.paper.claims import Claim, Item, Missing, Verdict
 
 _CLASSES: dict[Verdict, str] = {"reproduced": "good", "corrected": "fixed", "not reproducible": "bad"}

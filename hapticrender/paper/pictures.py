@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from hapticrender.figures import BLUE, GREEN, INK, ORANGE, PALE, RED, new_figure, save
+from hapticrender.charts.figures import BLUE, GREEN, INK, ORANGE, PALE, RED, new_figure, save
 from hapticrender.paper.claims import Item, Table
 
 PRINTED: dict[str, Any] = {"color": INK, "lw": 1.1, "ls": (0, (4, 2))}

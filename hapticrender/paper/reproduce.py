@@ -13,10 +13,10 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from hapticrender import __version__
-from hapticrender.formats import MissingExtra, replacing
 from hapticrender.paper import finger, formulas, runs
 from hapticrender.paper.claims import Claim, Item, Missing, Table
 from hapticrender.paper.page import page
+from hapticrender.recordings.formats import MissingExtra, replacing
 from hapticrender.validate import as_json
 
 ITEMS: dict[str, Callable[[], Item]] = {

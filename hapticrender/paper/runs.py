@@ -20,7 +20,7 @@ from hapticrender.paper.claims import Claim, Item, Table
 from hapticrender.paper.formulas import FILTER, FREQUENCIES, LOOP
 from hapticrender.plants.vibrotactile import PLACES, PlateParameters
 from hapticrender.protocols import Array
-from hapticrender.recording import Recording
+from hapticrender.recordings.recording import Recording
 from hapticrender.touch.finger import Finger
 from hapticrender.touch.grating import Grating
 from hapticrender.touch.mechanics import HEAVY

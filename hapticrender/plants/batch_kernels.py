@@ -9,9 +9,9 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from hapticrender._jit import kernel
-from hapticrender._lanes import any_of, select, size
-from hapticrender._lanes_memory import read, write
+from hapticrender.compiled.jit import kernel
+from hapticrender.compiled.lanes import any_of, select, size
+from hapticrender.compiled.lanes_memory import read, write
 from hapticrender.control.bank_kernels import bank_advance
 from hapticrender.plants.kernels import inside, open_window, plate_drive, sense, series_at
 from hapticrender.plants.propagator import (

@@ -6,7 +6,7 @@ handing single samples to each other, without leaving compiled code.
 
 from __future__ import annotations
 
-from hapticrender._jit import by_types, kernel
+from hapticrender.compiled.jit import by_types, kernel
 from hapticrender.control.bank_kernels import bank_step
 from hapticrender.control.bank_state import BankTables
 from hapticrender.control.complex_kernels import ComplexTables, complex_step

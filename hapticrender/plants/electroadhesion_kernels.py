@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-from hapticrender._jit import kernel
+from hapticrender.compiled.jit import kernel
 from hapticrender.control.gap import VACUUM, GapState, GapTables, gap_step
 from hapticrender.control.square_root import SquareRootTables, square_root_step
 from hapticrender.plants.closed import control_step

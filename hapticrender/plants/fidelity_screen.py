@@ -22,7 +22,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hapticrender._jit import kernel
+from hapticrender.compiled.jit import kernel
 from hapticrender.control.gap import VACUUM
 from hapticrender.plants.electroadhesion import BLOCKING, ElectroadhesionParameters
 from hapticrender.protocols import Array

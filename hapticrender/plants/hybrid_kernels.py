@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from hapticrender._jit import kernel
+from hapticrender.compiled.jit import kernel
 from hapticrender.control.together import together_step
 from hapticrender.plants.electroadhesion_kernels import POSITION, ScreenState, ScreenTables, screen_step
 from hapticrender.plants.kernels import PlateState, PlateTables, bent, plate_advance, plate_drive, plate_sense

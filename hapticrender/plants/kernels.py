@@ -16,10 +16,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hapticrender._jit import kernel
-from hapticrender._lanes import high, low, select, size
-from hapticrender._lanes_memory import read, write
-from hapticrender._polynomials import whole
+from hapticrender.compiled.jit import kernel
+from hapticrender.compiled.lanes import high, low, select, size
+from hapticrender.compiled.lanes_memory import read, write
+from hapticrender.compiled.polynomials import whole
 from hapticrender.plants.propagator import (
     GRIP,
     LEAST_STAY,

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from hapticrender._lanes import aligned
+from hapticrender.compiled.lanes import aligned
 from hapticrender.plants.kernels import PlateState, PlateTables, plate_matrix
 from hapticrender.plants.propagator import COLUMNS, NODES, STATES, WIDEST, identity, shifts
 from hapticrender.protocols import Array

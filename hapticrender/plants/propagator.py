@@ -14,9 +14,9 @@ import math
 
 import numpy as np
 
-from hapticrender._jit import kernel
-from hapticrender._lanes import aligned, any_of, size
-from hapticrender._lanes_memory import lanes, put, read, write
+from hapticrender.compiled.jit import kernel
+from hapticrender.compiled.lanes import aligned, any_of, size
+from hapticrender.compiled.lanes_memory import lanes, put, read, write
 from hapticrender.protocols import Array
 
 STATES, RIGID, FORCES = 8, 6, 3  # states; how many of them move where the glass is rigid; columns of Gamma

@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from hapticrender._jit import kernel
+from hapticrender.compiled.jit import kernel
 from hapticrender.plants.bounds import Validated, number
 from hapticrender.plants.kernels import quantise
 from hapticrender.protocols import Array

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-from hapticrender._jit import kernel
+from hapticrender.compiled.jit import kernel
 from hapticrender.control import bank_rows as row
 from hapticrender.control.bank_kernels import bank_step
 from hapticrender.control.bank_state import BankState, BankTables

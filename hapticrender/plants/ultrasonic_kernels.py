@@ -14,7 +14,7 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-from hapticrender._jit import kernel
+from hapticrender.compiled.jit import kernel
 from hapticrender.plants.closed import control_step
 from hapticrender.plants.kernels import HUGE, SENSOR_CLIPPED, quantise
 from hapticrender.protocols import Array

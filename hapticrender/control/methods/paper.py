@@ -14,8 +14,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hapticrender._lanes import WIDTH, aligned, padded
 from hapticrender.bands import Bands
+from hapticrender.compiled.lanes import WIDTH, aligned, padded
 from hapticrender.control.bandmodel import BandModel
 from hapticrender.control.bank_state import PRECISIONS
 from hapticrender.control.envelope_loop import Bandwidths, EnvelopeLoop, envelope_loop

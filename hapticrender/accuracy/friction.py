@@ -27,11 +27,11 @@ from itertools import product
 
 import numpy as np
 
-from hapticrender.accuracy_figures import Target
+from hapticrender.accuracy.figures import Target
 from hapticrender.loop import registered, render
 from hapticrender.plants.surface import UltrasonicSurface
 from hapticrender.protocols import Array, Flag, Sensed
-from hapticrender.recording import Recording
+from hapticrender.recordings.recording import Recording
 from hapticrender.touch.finger import Finger, LoadCurve
 from hapticrender.touch.grating import Grating
 from hapticrender.touch.perception import VELOCITY_PER_FORCE

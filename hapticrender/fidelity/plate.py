@@ -11,11 +11,11 @@ import numpy as np
 from scipy.optimize import nnls
 
 from hapticrender.bands import Bands
-from hapticrender.fidelity_windows import BETWEEN, compared_with, fade, look
-from hapticrender.judge import LOWEST_FREQUENCY
+from hapticrender.fidelity.windows import BETWEEN, compared_with, fade, look
 from hapticrender.plants.fidelity import FingerPath, PlateModel, forgetting_time, held, sag, stray
 from hapticrender.plants.vibrotactile import PlateParameters
 from hapticrender.protocols import Array
+from hapticrender.recordings.judge import LOWEST_FREQUENCY
 from hapticrender.touch.mechanics import FingerMechanics
 from hapticrender.touch.motion import Nowhere, Sliding, Still, Swiping
 from hapticrender.touch.scene import Scene
@@ -57,7 +57,7 @@ class Option(NamedTuple):
 
 
 def bound(scene: Scene, lesser: Scene) -> float:
-    """Largest relative error (1) of the plate's motion in a lesser model; see `hapticrender.fidelity.fidelity`.
+    """Largest relative error (1) of the plate's motion in a lesser model; see `hapticrender.fidelity.choice.fidelity`.
 
     Both models' difference is put together, sag and all bands, and looked at through the judge's windows.  The plant
     holds the finger over each sample, so what it does comes half a sample late; of the drive the controller knows that.

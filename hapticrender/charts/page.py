@@ -10,8 +10,8 @@ from typing import Any
 from urllib.parse import quote
 
 from hapticrender import __version__, wording
+from hapticrender.charts.page_devices import devices_section
 from hapticrender.outputs import Outputs
-from hapticrender.page_devices import devices_section
 
 _MANY_BANDS = 10
 _AXIS = (1e-3, 10.0)  # relative errors at the ends of the little charts, logarithmic

@@ -7,8 +7,9 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from hapticrender import fidelity_friction, fidelity_plate
-from hapticrender.fidelity_plate import NoBound, Option
+from hapticrender.fidelity import friction as fidelity_friction
+from hapticrender.fidelity import plate as fidelity_plate
+from hapticrender.fidelity.plate import NoBound, Option
 from hapticrender.touch.finger import Finger
 from hapticrender.touch.scene import PlantValue, Scene
 from hapticrender.wording import percent

@@ -26,7 +26,7 @@ from numba.core.typed_passes import (
 from numba.core.typing.context import Context
 from numba.core.untyped_passes import FixupArgs, GenericRewrites, IRProcessing, ReconstructSSA, TranslateByteCode
 
-from hapticrender._records import Layout
+from hapticrender.compiled.records import Layout
 
 PASSES = (
     TranslateByteCode,

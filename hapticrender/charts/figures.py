@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from hapticrender.formats import MissingExtra, replacing
+from hapticrender.recordings.formats import MissingExtra, replacing
 
 # Okabe and Ito's colours: told apart by every kind of colour vision, and of different lightness.
 BLUE, ORANGE, GREEN, RED, INK, PALE = "#0072B2", "#E69F00", "#009E73", "#D55E00", "#222222", "#8A8A8A"

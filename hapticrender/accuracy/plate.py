@@ -13,14 +13,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from hapticrender.accuracy_figures import Target
+from hapticrender.accuracy.figures import Target
 from hapticrender.bands import Bands
 from hapticrender.control.methods import method_named
-from hapticrender.judge import fit
 from hapticrender.loop import registered
 from hapticrender.plants.identify import identify
 from hapticrender.plants.vibrotactile import Plate, PlateParameters
 from hapticrender.protocols import Array
+from hapticrender.recordings.judge import fit
 from hapticrender.touch.finger import Finger
 from hapticrender.touch.mechanics import HEAVY, HEAVY_SECOND, LIGHT, LIGHT_SECOND, FingerMechanics
 from hapticrender.touch.motion import Sampled, Sliding, Still

@@ -10,12 +10,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from hapticrender import wording
-from hapticrender.figures import BLUE, GREEN, INK, ORANGE, PALE, RED, new_figure, save
-from hapticrender.judge import RUNAWAY
+from hapticrender.charts.figures import BLUE, GREEN, INK, ORANGE, PALE, RED, new_figure, save
 from hapticrender.protocols import Array, Flag
+from hapticrender.recordings.judge import RUNAWAY
 
 if TYPE_CHECKING:
-    from hapticrender.recording import Recording
+    from hapticrender.recordings.recording import Recording
 
 PLACES = ((BLUE, "o"), (ORANGE, "<"), (GREEN, ">"))
 COILS = (BLUE, ORANGE, GREEN, RED)

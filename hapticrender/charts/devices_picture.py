@@ -1,4 +1,4 @@
-"""The picture of `hapticrender.device_chart`: accuracy against speed of every device kind, and error over frequency."""
+"""The picture of `charts.devices`: accuracy against speed of every device kind, and error over frequency."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from hapticrender import defaults
-from hapticrender.device_chart import SWEEP, Point, fronts
-from hapticrender.figures import BLUE, GREEN, INK, ORANGE, PALE, RED, new_figure
+from hapticrender.charts.devices import SWEEP, Point, fronts
+from hapticrender.charts.figures import BLUE, GREEN, INK, ORANGE, PALE, RED, new_figure
 
 DEVICES = {
     "vt-plate": (BLUE, "vibrotactile plate"),

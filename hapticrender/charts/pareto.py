@@ -17,8 +17,9 @@ from typing import Any
 
 import numpy as np
 
-from hapticrender.accuracy import SLIDING, pressing, rms, tones
+from hapticrender.accuracy.plate import SLIDING, pressing, rms, tones
 from hapticrender.bands import Bands
+from hapticrender.charts.figures import save
 from hapticrender.control.bandmodel import BandModel
 from hapticrender.control.bank import design_bank
 from hapticrender.control.block import BlockController
@@ -29,11 +30,10 @@ from hapticrender.control.methods.paper import CommonMode, PerSide
 from hapticrender.control.methods.resonant import Resonant
 from hapticrender.control.methods.stiffness import ERROR, ERROR_CROWDED, SIGNAL
 from hapticrender.errors import HapticError
-from hapticrender.figures import save
-from hapticrender.formats import replacing
-from hapticrender.judge import fit
 from hapticrender.plants.vibrotactile import Plate, PlateParameters
 from hapticrender.protocols import Array, Controller
+from hapticrender.recordings.formats import replacing
+from hapticrender.recordings.judge import fit
 from hapticrender.touch.finger import Finger
 from hapticrender.touch.mechanics import HEAVY, LIGHT
 
@@ -373,7 +373,7 @@ def pareto(
     path = Path(path)
     with replacing(path.with_suffix(".json")) as scratch:
         scratch.write_text(json.dumps(as_data(points, held), indent=2) + "\n", encoding="utf-8")
-    from hapticrender.pareto_picture import draw
+    from hapticrender.charts.pareto_picture import draw
 
     save(draw(points, held), path)
     return points

@@ -1,4 +1,4 @@
-"""Reading and writing of explicit vectors (`hapticrender._lanes`) in arrays.
+"""Reading and writing of explicit vectors (`hapticrender.compiled.lanes`) in arrays.
 
 `lanes(array, i, j)` reads the row ``array[i, j, :]`` of a C-contiguous array whose last axis is as long as a register
 (`WIDTH`) and `put(array, i, j, value)` writes one; `read` and `write` do it for a scenario's own numbers, which are
@@ -14,8 +14,8 @@ from llvmlite import ir
 from numba.core import cgutils, types
 from numba.core.extending import intrinsic
 
-from hapticrender._lanes import WIDTH, LaneType, number_type
-from hapticrender._records import kept_apart
+from hapticrender.compiled.lanes import WIDTH, LaneType, number_type
+from hapticrender.compiled.records import kept_apart
 
 
 def _parts(context: Any, builder: Any, kind: Any, array: Any) -> Any:

@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from hapticrender.figures import BLUE, GREEN, INK, ORANGE, PALE, new_figure, save
+from hapticrender.charts.figures import BLUE, GREEN, INK, ORANGE, PALE, new_figure, save
 from hapticrender.loop import render
-from hapticrender.recording import Recording
+from hapticrender.recordings.recording import Recording
 from hapticrender.touch.finger import Finger
 from hapticrender.touch.grating import Grating
 from hapticrender.touch.scene import Scene

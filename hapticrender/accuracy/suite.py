@@ -11,8 +11,9 @@ from functools import partial
 
 import numpy as np
 
-from hapticrender import accuracy, accuracy_friction
-from hapticrender.accuracy_figures import Figure, Target
+from hapticrender.accuracy import friction as accuracy_friction
+from hapticrender.accuracy import plate as accuracy
+from hapticrender.accuracy.figures import Figure, Target
 from hapticrender.errors import DesignError
 
 Case = Callable[[str], dict[str, float]]

@@ -1,4 +1,4 @@
-"""The one place that knows what a kernel is and how it is cached; `_fragments` knows how it is compiled.
+"""The one place that knows what a kernel is and how it is cached; `fragments` knows how it is compiled.
 
 numba's disk cache looks only at the file of the kernel itself, so an edit to
 a helper in another file would bring back stale results.  Here every cache
@@ -24,19 +24,18 @@ from numba.core.registry import CPUDispatcher
 from numba.core.sigutils import normalize_signature
 from numba.core.typing.templates import AbstractTemplate, infer_global
 
-from hapticrender._fragments import compiler
-from hapticrender._records import as_record
+from hapticrender.compiled.fragments import compiler
+from hapticrender.compiled.records import as_record
 
-ROOMS = ("control", "plants")  # where kernels and their numbers live, besides files that begin with _
+ROOMS = ("compiled", "control", "plants")  # where kernels and their numbers live
 
 
 def _source_stamp() -> str:
-    home = Path(__file__).parent
+    home = Path(__file__).parent.parent
     stamped = hashlib.sha256()
     for path in sorted(home.rglob("*.py")):
         source = path.read_bytes()
-        below = path.relative_to(home).parts[0] in ROOMS or path.name.startswith("_")
-        if below or b"kernel" in source:
+        if path.relative_to(home).parts[0] in ROOMS or b"kernel" in source:
             stamped.update(source)
     return stamped.hexdigest()
 

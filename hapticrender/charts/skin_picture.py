@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 
 from hapticrender import wording
-from hapticrender.figures import BLUE, GREEN, INK, ORANGE, RED, new_figure, save
-from hapticrender.picture import QUANTITIES
-from hapticrender.recording import Recording
+from hapticrender.charts.figures import BLUE, GREEN, INK, ORANGE, RED, new_figure, save
+from hapticrender.charts.picture import QUANTITIES
+from hapticrender.recordings.recording import Recording
 from hapticrender.skin import felt_bands, residual_velocity, skin_waveform
 from hapticrender.touch.perception import HIGHEST
 

@@ -8,8 +8,8 @@ from typing import NamedTuple
 import numpy as np
 
 from hapticrender.bands import Bands
-from hapticrender.judge import LARGEST_INFLATION, LOWEST_FREQUENCY, QUARTERS, RIDGE, window_length
 from hapticrender.protocols import Array
+from hapticrender.recordings.judge import LARGEST_INFLATION, LOWEST_FREQUENCY, QUARTERS, RIDGE, window_length
 
 HOPS = 16  # window starts in a window's length: the worst window is sought, not a mean
 BETWEEN = 1.03  # of the error in the windows that are looked at: in those between

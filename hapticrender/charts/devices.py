@@ -20,12 +20,12 @@ from typing import Any
 import numpy as np
 
 from hapticrender import defaults
-from hapticrender.accuracy_friction import EACH, FINGER, VELOCITY, texture
+from hapticrender.accuracy.friction import EACH, FINGER, VELOCITY, texture
+from hapticrender.charts.figures import save
 from hapticrender.errors import HapticError
-from hapticrender.figures import save
-from hapticrender.formats import replacing
 from hapticrender.loop import Session, prepare, run
 from hapticrender.protocols import Plant
+from hapticrender.recordings.formats import replacing
 from hapticrender.touch.grating import Grating
 from hapticrender.touch.scene import Scene
 
@@ -237,7 +237,7 @@ def device_chart(
     path = Path(path)
     with replacing(path.with_suffix(".json")) as scratch:
         scratch.write_text(json.dumps(as_data(points, swept), indent=2) + "\n", encoding="utf-8")
-    from hapticrender.device_picture import draw
+    from hapticrender.charts.devices_picture import draw
 
     save(draw(points, swept), path)
     return points

@@ -16,8 +16,8 @@ from typing import Any
 
 from numba.core import types
 
-from hapticrender._jit import by_types, kernel
-from hapticrender._lanes import LaneType, by_size, fraction, select, signed, size
+from hapticrender.compiled.jit import by_types, kernel
+from hapticrender.compiled.lanes import LaneType, by_size, fraction, select, signed, size
 
 S = (
     6.283185307179585,

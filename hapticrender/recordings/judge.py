@@ -18,7 +18,7 @@ from hapticrender.bands import Bands
 from hapticrender.protocols import Array, Flag
 
 if TYPE_CHECKING:
-    from hapticrender.recording import Recording
+    from hapticrender.recordings.recording import Recording
 
 SHORTEST_WINDOW = 20e-3  # s [FACTS 3, standard conditions: max(20 ms, 2/f)]
 PERIODS = 2.0  # of the lowest carrier and of the smallest spacing in a window

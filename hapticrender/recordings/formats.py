@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 
 from hapticrender.errors import HapticError
-from hapticrender.journal import Header, chunks, column, join, read_journal, split, write_journal
 from hapticrender.protocols import Array
+from hapticrender.recordings.journal import Header, chunks, column, join, read_journal, split, write_journal
 
 COMMENT_LIMIT = 4000  # characters; libsndfile drops a longer WAV comment without a word
 FLAC_CHANNELS = 8

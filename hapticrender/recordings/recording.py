@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Any, BinaryIO
 
 import numpy as np
 
-from hapticrender import formats, journal, judge
 from hapticrender.bands import Bands
-from hapticrender.journal import Header
 from hapticrender.protocols import Array
+from hapticrender.recordings import formats, journal, judge
+from hapticrender.recordings.journal import Header
 
 if TYPE_CHECKING:
     from hapticrender.touch.scene import Scene
@@ -298,7 +298,7 @@ class Recording:
 
     def plot(self, path: str | os.PathLike[str]) -> None:
         """Draw target, achieved motion, drive and finger into one PNG; needs matplotlib."""
-        from hapticrender import picture
+        from hapticrender.charts import picture
 
         picture.plot(self, path)
 

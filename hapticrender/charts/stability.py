@@ -9,11 +9,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from hapticrender.figures import INK, ORANGE, PALE, new_figure, save
-from hapticrender.formats import replacing
+from hapticrender.charts.figures import INK, ORANGE, PALE, new_figure, save
 from hapticrender.plants.stability import LOOPS, StabilityMap, stability_map
 from hapticrender.plants.vibrotactile import PlateParameters
 from hapticrender.protocols import Array
+from hapticrender.recordings.formats import replacing
 from hapticrender.touch.mechanics import NAMED
 
 TITLES = {

@@ -7,10 +7,10 @@ from html import escape
 from pathlib import Path
 
 from hapticrender import wording
+from hapticrender.charts.skin_picture import plot_devices
 from hapticrender.outputs import Outputs
-from hapticrender.recording import Recording
+from hapticrender.recordings.recording import Recording
 from hapticrender.skin import felt_bands
-from hapticrender.skin_picture import plot_devices
 
 PICTURE = "devices.png"
 

@@ -18,11 +18,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from hapticrender._jit import kernel
 from hapticrender.bands import Bands
+from hapticrender.compiled.jit import kernel
 from hapticrender.control.gap import VACUUM
-from hapticrender.fidelity_plate import LOOK_AHEAD, NoBound, Option
-from hapticrender.fidelity_windows import BETWEEN, Windows, compared_with, ease, fade, look
+from hapticrender.fidelity.plate import LOOK_AHEAD, NoBound, Option
+from hapticrender.fidelity.windows import BETWEEN, Windows, compared_with, ease, fade, look
 from hapticrender.loop import registered
 from hapticrender.plants.electroadhesion import ElectroadhesionParameters, ElectroadhesionScreen, finger_rows
 from hapticrender.plants.fidelity_screen import attractions
@@ -80,7 +80,7 @@ def follow_friction(steady, kept, friction):
 
 
 def bound(scene: Scene, lesser: Scene) -> float:
-    """Largest relative error (1) of the friction in a lesser model; see `hapticrender.fidelity.fidelity`."""
+    """Largest relative error (1) of the friction in a lesser model; see `hapticrender.fidelity.choice.fidelity`."""
     if lesser == scene:
         return ACCURACY
     renderer = registered("renderers", scene.device)()

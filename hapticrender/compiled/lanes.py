@@ -3,7 +3,7 @@
 Such values read like arithmetic: ``+ - * /``, comparisons, `select`, `root`, `floor`, `low`, `high`, `size`, `any_of`,
 `total`.  Everything takes plain floats as well, and a float meeting a vector is repeated in every lane, so that one
 source serves lanes that are bands and lanes that are scenarios.  `total` sums what lanes of bands share; where the
-scalars of a scenario are themselves lanes, there is nothing to sum.  They come from memory by `_lanes_memory`.
+scalars of a scenario are themselves lanes, there is nothing to sum.  They come from memory by `lanes_memory`.
 
 Auto-vectorised loops reach C only for a few hundred bands; these files are the price of the rest (decision 7).
 """
@@ -72,6 +72,7 @@ class MaskType(types.Type):
 
 
 def number_type(dtype: Any) -> ir.Type:
+    """LLVM's type of a number."""
     return ir.FloatType() if dtype == types.float32 else ir.DoubleType()
 
 

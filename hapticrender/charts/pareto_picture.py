@@ -1,4 +1,4 @@
-"""The picture of `hapticrender.pareto`: two views of accuracy against cost, and where each method holds."""
+"""The picture of `hapticrender.charts.pareto`: two views of accuracy against cost, and where each method holds."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from hapticrender.figures import BLUE, GREEN, INK, ORANGE, PALE, RED, new_figure
-from hapticrender.pareto import LOST, MAP, OFF, RESTLESS, Point, front
+from hapticrender.charts.figures import BLUE, GREEN, INK, ORANGE, PALE, RED, new_figure
+from hapticrender.charts.pareto import LOST, MAP, OFF, RESTLESS, Point, front
 from hapticrender.protocols import Array
 
 COLOURS = {

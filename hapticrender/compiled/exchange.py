@@ -14,7 +14,7 @@ from llvmlite import ir
 from numba.core import cgutils, types
 from numba.extending import intrinsic
 
-from hapticrender._records import RecordType
+from hapticrender.compiled.records import RecordType
 
 SLOTS = 3
 FRESH = 4  # bit beside the number of the slot in the middle: the reader has not had it

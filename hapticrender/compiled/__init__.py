@@ -1,0 +1,1 @@
+"""What makes a kernel, and what it computes with: compilation, vectors, polynomials."""

@@ -1,0 +1,1 @@
+"""The least model of a device that a scene needs."""

@@ -1,0 +1,1 @@
+"""What happened: kept, judged, and written in the formats of others."""
