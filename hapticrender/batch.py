@@ -46,6 +46,8 @@ class Scenario:
     seed: int = 0
 
     def __post_init__(self) -> None:
+        if self.plate.coils != 2:
+            raise ValueError(f"plate.coils={self.plate.coils}: must be 2, or render a scene of it")
         if self.known is not None and self.known.rate != self.plate.rate:
             raise ValueError(f"known.rate={self.known.rate:g} Hz: must be that of the plate, {self.plate.rate:g} Hz")
 

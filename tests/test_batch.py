@@ -191,3 +191,9 @@ def test_a_cluster_gives_the_same():
 def test_a_failure_in_a_task_comes_back():
     with ThreadPoolExecutor(1) as pool, pytest.raises(ValueError, match="must have constant envelopes"):
         sweep([Scenario(bands=replace(BANDS, envelope=None))], 1.0, worst_error, executor=pool)
+
+
+def test_a_plate_with_one_coil_is_refused():
+    """Its coil moves heave alone; side by side there are two."""
+    with pytest.raises(ValueError, match=r"plate.coils=1: must be 2"):
+        Scenario(bands=BANDS, plate=PlateParameters(coils=1))

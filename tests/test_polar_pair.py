@@ -7,6 +7,7 @@ import hapticrender as hr
 from hapticrender.accuracy.plate import tones
 from hapticrender.bands import Bands
 from hapticrender.control.methods import METHODS
+from hapticrender.control.polar_pair import in_pairs
 from hapticrender.plants.closed import CLOSED, closed_plate_run
 from hapticrender.plants.vibrotactile import Plate, PlateParameters
 
@@ -60,6 +61,8 @@ def test_pairs_equal_single_samples(method, bands, spoil):
     assert expected[4].any() == (spoil is disturbed)
     loop = CLOSED[type(METHODS[method].design(FLAWLESS.band_model(5000.0, 1), bands).tables)]
     assert loop is not closed_plate_run
+    fresh = METHODS[method].design(FLAWLESS.band_model(5000.0, 1), bands)
+    assert in_pairs(fresh.tables, fresh.state) == (method == "paper")
     for pieces in ([SAMPLES], [1, 2, 63, 1, 1, 64, 65, 300, 303, 400]):
         found = run(loop, method, bands, iter(pieces), spoil)
         for one, other in zip(found[:4], expected[:4], strict=True):

@@ -32,7 +32,7 @@ def driven(volts, seconds, finger=FREE, **plant):
 @pytest.mark.parametrize("load", [0.0, 0.2, 0.5, 1.5])
 @pytest.mark.parametrize(("before", "after"), [(0.5e-6, 1e-6), (1e-6, 2e-6)])
 def test_an_amplitude_responds_in_time(level, load, before, after):
-    """From the step to within 5 % of it for good: the device's aim, 1.5 ms, at the carrier; its bound, 2.5 ms, below.
+    """From the step to within 5 % of it for good: 1.5 ms at the carrier; its bound, 2.5 ms, below.
 
     There the rate is an eighth, and so is what the inner loop does about a step that the limit has cut.
     """

@@ -50,6 +50,10 @@ class FingerRange:
     presence: bool = False
     least_speed: float = 0.0
 
+    def __post_init__(self) -> None:
+        if not self.fastest > 0.0:
+            raise ValueError(f"fastest = {self.fastest}: must be > 0 (1/s)")
+
 
 @dataclass(frozen=True, kw_only=True)
 class BandModel:

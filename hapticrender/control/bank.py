@@ -35,6 +35,7 @@ LEARNING_TIME = 1 / 60  # s: fastest adaptation to what is always there; a delay
 LEARNING_MARGIN = 6.0  # of the observer's pole over the adaptation, where that learns all of D
 QUICK_LEVEL = 60.0  # Hz: bandwidth of the DC band while the step of a touch goes into it
 BACK_TIME = 0.02  # s: back-calculation at the limit
+TOUCHED_FADE = 1000.0  # 1/s: of a held mode at least
 LEAST_NOISE = 1e-6  # of the sensors' range: thresholds never fall to nothing
 ALWAYS = -1e300  # N: every load is larger
 
@@ -240,9 +241,12 @@ def _numbers(model: BandModel, bands: Bands, rules: BankRules, feedback: bool) -
 
 
 def _back(model: BandModel) -> float:
-    """Rate (1/s) of the back-calculation; of a held mode no faster than it loses energy, lest it chase the limit."""
+    """Rate (1/s) of the back-calculation; of a held mode about as fast as it loses energy, lest it chase the limit.
+
+    However little that is, a finger takes it away within a millisecond.
+    """
     fade = float((model.damping.diagonal() / model.mass.diagonal()).min()) if model.held else math.inf
-    return min(model.pace / BACK_TIME, fade)
+    return min(model.pace / BACK_TIME, max(fade, TOUCHED_FADE))
 
 
 def _paced(rules: BankRules, pace: float) -> BankRules:
@@ -272,9 +276,9 @@ def _paces(model: BandModel, bands: Bands, rules: BankRules, lowest: float, feed
     wait = model.delay * period  # integrator, observer and delay leave at least PHASE_MARGIN
     pole = [2 * math.pi * min(width, lowest / 2, apart / (2 * math.pi)) for width in rules.observer]
     fastest = [min(2 * math.pi * lowest / 4, PHASE_MARGIN / (wait + 1 / each)) for each in pole]
-    learning = LEARNING_SHARE * model.rate / ADAPTATION
+    learning = min(LEARNING_SHARE * model.rate / ADAPTATION, model.finger.fastest)
     if model.finger.contact is None:  # what is always there is as large as D, and the law far from it while it learns
-        learning = min(1 / (2 * wait + LEARNING_TIME / model.pace), model.finger.fastest, pole[0] / LEARNING_MARGIN)
+        learning = min(1 / (2 * wait + LEARNING_TIME / model.pace), learning, pole[0] / LEARNING_MARGIN)
     level = 2 * math.pi * min(6.0, lowest / rules.level) * period
     paces = {
         "observer": 2 * pole[0] * period,

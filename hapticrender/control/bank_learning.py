@@ -61,12 +61,11 @@ def slot_of(state, step):
 @kernel
 def send_finger(tables, state, t, step):
     """Note what is commanded of a tile in a step: the integral parts, and the finger's share of the force."""
-    sent, touch, shape, at = state.sent, state.touch, tables.shape, slot_of(state, step)
+    sent, touch, at = state.sent, state.touch, slot_of(state, step)
     re = im = 0.0 * lanes(sent, t, 0)
-    for c in range(len(shape)):
+    for c in range(len(tables.shape)):
         base, place = c * row.LOOP_ROWS, 1.0 if c == 0 else read(touch, row.KNOWN_PLACE)
-        v_re = lanes(state.loop, t, base + row.V_RE) + shape[c] * lanes(state.band, t, row.R_RE)
-        v_im = lanes(state.loop, t, base + row.V_IM) + shape[c] * lanes(state.band, t, row.R_IM)
+        v_re, v_im = lanes(state.loop, t, base + row.COMMAND_RE), lanes(state.loop, t, base + row.COMMAND_IM)
         put(sent, t, at + 2 * c, v_re)
         put(sent, t, at + 2 * c + 1, v_im)
         re += place * v_re

@@ -38,6 +38,7 @@ LEAD = 0.5  # s of a scene that are followed before its judgement, at least
 TAIL = 0.02  # s behind it, in which what an amplitude loop makes of the end dies away
 GROWTH = 0.05  # s in which a target grows after a touch
 SETTLING = 10.0  # time constants between the last touch and the judgement
+BRIEF, STEADY = 0.125, 0.5  # share of that time within which a load may change by so much of itself
 ACCURACY = 5e-5  # relative error below which nothing is told
 SMALL_SIGNAL = 1.15  # of an amplitude loop's error by its linear model: at large modulation
 HEARD = 0.8  # of a detector's level: a deviation that may open it, as it hears twice the carrier as well
@@ -246,6 +247,7 @@ def _surface_frictions(surface: UltrasonicSurface, track: _Track, asked: Array) 
     first = track.judged.start - math.floor(rest * track.rate)
     if first < 0 or not track.touched[first : track.judged.stop].all():
         raise NoBound(f"it is judged less than {rest:.3g} s after its finger last came or went, or while it is up")
+    _check_load(track.finger[first : track.judged.stop, LOAD], track.rate, rest)
     if p.mode.temperature_rise and not p.lock:
         raise NoBound("its resonance drifts, and nothing follows it")
     tables = surface_tables(p, surface.loop, surface.finger, (1.0, 1.0))  # nominal touch: for a finger that is up
@@ -258,6 +260,14 @@ def _surface_frictions(surface: UltrasonicSurface, track: _Track, asked: Array) 
         friction_ratios(tables.law, amplitude, load, pace, left)
         found[state] = whole * left
     return found
+
+
+def _check_load(load: Array, rate: float, rest: float) -> None:
+    """Refuse a load (N) that changes too fast for a loop to be as it is where it has settled, in `rest` (s)."""
+    span = max(1, math.ceil(BRIEF * rest * rate))
+    least = np.minimum(load[:-span], load[span:])
+    if len(least) and (abs(load[span:] - load[:-span]) > STEADY * least).any():
+        raise NoBound(f"its load changes by more than {STEADY:.0%} within {BRIEF * rest:.3g} s")
 
 
 def _amplitudes(surface: UltrasonicSurface, track: _Track, wanted: Array, load: Array) -> dict[str, Array]:

@@ -160,10 +160,11 @@ class SurfaceParameters(SlidingParameters):
 def resonant(model: BandModel, mode: UltrasonicParameters, lock: float) -> BandModel:
     """Band model of a mode that is to be found and held where it is resonant, by a lock of `lock` (Hz).
 
-    Observer and integral grow with the pace, what they lose by being late with the delay.  With an inner loop the pace
-    leaves 45 degrees of phase, as measured with delays of 1 to 8 samples at 192 and 384 kHz.  Without one (a block
-    device) it leaves a modulus margin of 0.25 (Ms 4), what is learnt of a finger being part of the loop: thin, but at
-    half of it a texture of f Hz behind a delay d is 12 % off at f d = 1/15 in place of 1 %.
+    Observer and integral grow with the pace, what they lose by being late with the delay.  With an inner loop the
+    pace leaves 45 degrees of phase, as measured with delays of 1 to 4 samples at 192 and 384 kHz; where the margins
+    allow none though it would answer in time (96 kHz, 70 kHz at 192 kHz), a touch costs three times as much.
+    Without one (a block device) it leaves a modulus margin of 0.25 (Ms 4), what is learnt of a finger being part of
+    the loop: thin, but at half of it a texture of f Hz behind a delay d is 12 % off at f d = 1/15 in place of 1 %.
     """
     stiffness, damping = float(model.stiffness[0, 0]), float(model.damping[0, 0])
     detuned = 2 * MOST_DETUNING * stiffness * mode.frequency / mode.carrier  # shifts are kept in Hz at either level
