@@ -19,8 +19,8 @@ from scenes import Batch, absent
 
 from hapticrender.batch import LANES, simulate
 from hapticrender.control.analyser import Analyser
-from hapticrender.control.block_kernels import block_run
-from hapticrender.control.polar_passes import polar_run
+from hapticrender.control.blocks.kernels import block_run
+from hapticrender.control.polar.passes import polar_run
 from hapticrender.sweep import sweep, worst_error
 
 FEW = 400  # samples of the numpy loop

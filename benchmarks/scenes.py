@@ -8,7 +8,7 @@ import hapticrender as hr
 from hapticrender.accuracy.plate import SLIDING
 from hapticrender.bands import Bands
 from hapticrender.batch import Scenario, together
-from hapticrender.control.block import BlockController
+from hapticrender.control.blocks.controller import BlockController
 from hapticrender.control.methods import METHODS
 from hapticrender.plants.vibrotactile import Plate, PlateParameters
 from hapticrender.touch.mechanics import HEAVY

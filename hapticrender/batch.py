@@ -9,8 +9,8 @@ import numpy as np
 
 from hapticrender.bands import Bands
 from hapticrender.compiled.lanes import ALIGNMENT, aligned
-from hapticrender.control.bank import BankController
-from hapticrender.control.bank_batch import LANES, alike, batch_of, side_by_side
+from hapticrender.control.bank.batch import LANES, alike, batch_of, side_by_side
+from hapticrender.control.bank.controller import BankController
 from hapticrender.control.methods import method_named
 from hapticrender.plants.batch_kernels import CENTRE, HOLD, SPAN_ROWS, WINDOW, BatchState, closed_batch_run
 from hapticrender.plants.propagator import COLUMNS, NODES, STATES, WIDEST

@@ -26,10 +26,10 @@ from hapticrender.bands import Bands
 from hapticrender.compiled.exchange import FRESH, SLOTS, behind, bytes_of, empty, place, swap
 from hapticrender.compiled.jit import callback, kernel
 from hapticrender.compiled.records import as_record
-from hapticrender.control.bank_rows import TONE_ROWS
-from hapticrender.control.block import BlockController
-from hapticrender.control.block_kernels import block_step
-from hapticrender.control.block_state import BlockState, BlockTables
+from hapticrender.control.bank.rows import TONE_ROWS
+from hapticrender.control.blocks.controller import BlockController
+from hapticrender.control.blocks.kernels import block_step
+from hapticrender.control.blocks.state import BlockState, BlockTables
 from hapticrender.protocols import Array, Flag
 
 HORIZON = 0.05  # s: a finger that is not heard of stays where it was bound for by then

@@ -14,7 +14,7 @@ import numpy as np
 
 from hapticrender import defaults
 from hapticrender.contract import check_driver, check_sensed
-from hapticrender.control.bank import BankController
+from hapticrender.control.bank.controller import BankController
 from hapticrender.control.methods import method_named
 from hapticrender.plants.electroadhesion import finger_rows
 from hapticrender.plants.friction_laws import friction_ratios, wanted_amplitudes

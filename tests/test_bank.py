@@ -8,7 +8,7 @@ from naive_bank import NaiveBank
 
 import hapticrender as hr
 from hapticrender.bands import Bands
-from hapticrender.control.bank_finger import TRACKER_POLE
+from hapticrender.control.bank.finger import TRACKER_POLE
 from hapticrender.control.methods import METHODS
 from hapticrender.plants.vibrotactile import Plate, PlateParameters
 from hapticrender.protocols import Flag

@@ -8,9 +8,9 @@ import pytest
 import hapticrender as hr
 from hapticrender.accuracy.plate import AMPLITUDE, SLIDING, pressing, rms, tones
 from hapticrender.bands import Bands
-from hapticrender.control import bank_rows as row
-from hapticrender.control.bank_state import across_bands
-from hapticrender.control.block import BlockController
+from hapticrender.control.bank import rows as row
+from hapticrender.control.bank.state import across_bands
+from hapticrender.control.blocks.controller import BlockController
 from hapticrender.control.methods import METHODS
 from hapticrender.drivers.simulated import SimulatedDriver
 from hapticrender.plants.vibrotactile import Plate, PlateParameters

@@ -10,7 +10,7 @@ from scipy.linalg import expm
 from test_paper import tones
 
 import hapticrender as hr
-from hapticrender.control.bank import BankController
+from hapticrender.control.bank.controller import BankController
 from hapticrender.control.damping import choose_damping, damping_taps
 from hapticrender.control.damping_margins import BendingMode, damping_margins
 from hapticrender.control.methods import METHODS

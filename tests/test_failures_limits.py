@@ -6,7 +6,7 @@ import scipy.signal
 from naive_methods import amplitude_error, complex_inverse, envelopes, fixed, hold, play, tones
 
 import hapticrender as hr
-from hapticrender.control.bank_rows import FAST_OPEN, SLOW_OPEN
+from hapticrender.control.bank.rows import FAST_OPEN, SLOW_OPEN
 from hapticrender.control.methods import METHODS
 from hapticrender.plants.vibrotactile import Plate, PlateParameters
 from hapticrender.touch.mechanics import HEAVY, LIGHT_SECOND

@@ -83,7 +83,7 @@ def test_a_read_only_install_with_no_cache_still_runs(tmp_path):
     script = """
 import pathlib, sys
 import hapticrender as hr
-from hapticrender.control.bank_kernels import bank_run
+from hapticrender.control.bank.kernels import bank_run
 from numba.core.caching import NullCache
 assert pathlib.Path(hr.__file__).is_relative_to(sys.argv[1]), hr.__file__
 assert isinstance(bank_run._cache, NullCache), bank_run._cache

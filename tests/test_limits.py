@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 
 import hapticrender as hr
 from hapticrender.bands import Bands
-from hapticrender.control.bank_rows import COS, SIN
-from hapticrender.control.bank_state import across_bands
+from hapticrender.control.bank.rows import COS, SIN
+from hapticrender.control.bank.state import across_bands
 from hapticrender.control.methods import METHODS
 from hapticrender.drivers.base import BaseDriver
 from hapticrender.plants.vibrotactile import Plate, PlateParameters

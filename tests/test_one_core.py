@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 import hapticrender as hr
-from hapticrender.control.bank import BankController
-from hapticrender.control.bank_kernels import bank_step
-from hapticrender.control.bank_state import BankTables
+from hapticrender.control.bank.controller import BankController
+from hapticrender.control.bank.kernels import bank_step
+from hapticrender.control.bank.state import BankTables
 from hapticrender.loop import prepare, registered
 from hapticrender.plants.closed import STEPS
 from hapticrender.skin import felt_bands
@@ -26,8 +26,8 @@ FORBIDDEN_PACKAGES = {"numba", "scipy.signal"} | {
 }
 CORE_ONLY = {  # of `control`, what a renderer may touch: descriptions, and whole controllers
     "hapticrender.control.bandmodel",
-    "hapticrender.control.bank",
-    "hapticrender.control.block",
+    "hapticrender.control.bank.controller",
+    "hapticrender.control.blocks.controller",
     "hapticrender.control.methods",
     "hapticrender.control.oscillator",
     "hapticrender.control.square_root",

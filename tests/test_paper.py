@@ -8,12 +8,12 @@ import pytest
 import hapticrender as hr
 from benchmarks.numpy_loop import NumpyPlate, NumpyPolar, run
 from hapticrender.bands import Bands
-from hapticrender.control.bank_state import across_bands
+from hapticrender.control.bank.state import across_bands
 from hapticrender.control.loopshape import TransferFunction, design, margins
 from hapticrender.control.methods import METHODS, method_named
 from hapticrender.control.methods.paper import CommonMode
-from hapticrender.control.polar_kernels import LOOP_ROWS, X_IM, X_RE
-from hapticrender.control.polar_steps import polar_step
+from hapticrender.control.polar.kernels import LOOP_ROWS, X_IM, X_RE
+from hapticrender.control.polar.steps import polar_step
 from hapticrender.control.stdft import StarSTDFT
 from hapticrender.plants.vibrotactile import Plate, PlateParameters
 from hapticrender.touch.mechanics import HEAVY_SECOND

@@ -7,7 +7,7 @@ import hapticrender as hr
 from hapticrender.accuracy.plate import tones
 from hapticrender.bands import Bands
 from hapticrender.control.methods import METHODS
-from hapticrender.control.polar_pair import in_pairs
+from hapticrender.control.polar.pair import in_pairs
 from hapticrender.plants.closed import CLOSED, closed_plate_run
 from hapticrender.plants.vibrotactile import Plate, PlateParameters
 

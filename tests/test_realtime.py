@@ -13,7 +13,7 @@ from numba import types
 
 from hapticrender.bands import Bands
 from hapticrender.compiled.exchange import FRESH, SLOTS, swap
-from hapticrender.control.block import BlockController
+from hapticrender.control.blocks.controller import BlockController
 from hapticrender.control.methods import METHODS
 from hapticrender.plants.vibrotactile import PlateParameters
 from hapticrender.protocols import Flag

@@ -10,11 +10,11 @@ import pytest
 import hapticrender as hr
 from hapticrender.bands import Bands
 from hapticrender.charts import stability as chart
-from hapticrender.control.bank import BankController
-from hapticrender.control.bank_loop import Structure
+from hapticrender.control.bank.controller import BankController
+from hapticrender.control.bank.loop import Structure
 from hapticrender.control.margins import Margins, borne_errors, eigenloci
 from hapticrender.control.methods import METHODS
-from hapticrender.control.polar_loop import PolarLoop
+from hapticrender.control.polar.loop import PolarLoop
 from hapticrender.control.stability import STATES, Limits, bank_loop, checked_bandwidth
 from hapticrender.errors import DesignError
 from hapticrender.plants.stability import (

@@ -10,9 +10,12 @@ import pytest
 from hapticrender.accuracy.plate import SLIDING, tones
 from hapticrender.batch import LANES, Scenario, batch_state
 from hapticrender.compiled.lanes import aligned
-from hapticrender.control import analyser, bank_kernels, block_kernels, polar_passes
-from hapticrender.control.bank_batch import batch_of
+from hapticrender.control import analyser
+from hapticrender.control.bank import kernels as bank_kernels
+from hapticrender.control.bank.batch import batch_of
+from hapticrender.control.blocks import kernels as block_kernels
 from hapticrender.control.methods import METHODS
+from hapticrender.control.polar import passes as polar_passes
 from hapticrender.plants import batch_kernels
 from hapticrender.plants import kernels as plate_kernels
 from hapticrender.plants.vibrotactile import Plate, PlateParameters

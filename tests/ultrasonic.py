@@ -6,7 +6,7 @@ import numpy as np
 from scipy.signal import hilbert
 
 import hapticrender as hr
-from hapticrender.control.bank import BankController
+from hapticrender.control.bank.controller import BankController
 from hapticrender.plants.surface import SurfaceParameters
 from hapticrender.plants.ultrasonic import UltrasonicParameters, UltrasonicPlate
 from hapticrender.protocols import Array, Flag

@@ -13,9 +13,9 @@ import numpy as np
 
 from hapticrender.compiled import polynomials as _polynomials
 from hapticrender.compiled.lanes import WIDTH, aligned
-from hapticrender.control import bank_rows as row
-from hapticrender.control import block_state
-from hapticrender.control.bank_carriers import FORGET
+from hapticrender.control.bank import rows as row
+from hapticrender.control.bank.carriers import FORGET
+from hapticrender.control.blocks import state as block_state
 
 HERE = Path(__file__).parent
 FLAGS = ["-O3", "-march=native", "-ffp-contract=fast", "-fno-math-errno", "-fno-trapping-math", "-fPIC", "-shared"]

@@ -21,8 +21,8 @@ from hapticrender.accuracy.plate import SLIDING, pressing, rms, tones
 from hapticrender.bands import Bands
 from hapticrender.charts.figures import save
 from hapticrender.control.bandmodel import BandModel
-from hapticrender.control.bank import design_bank
-from hapticrender.control.block import BlockController
+from hapticrender.control.bank.controller import design_bank
+from hapticrender.control.blocks.controller import BlockController
 from hapticrender.control.methods import METHODS
 from hapticrender.control.methods.boxcar import Boxcar
 from hapticrender.control.methods.inverse import DynamicStiffness, StaticInverse

@@ -17,7 +17,7 @@ from hapticrender.compiled.jit import kernel
 from hapticrender.compiled.lanes import ALIGNMENT, WIDTH, aligned, padded, select, size
 from hapticrender.compiled.lanes_memory import lanes, put, put_pairs
 from hapticrender.compiled.polynomials import unit
-from hapticrender.control.bank_state import PRECISIONS
+from hapticrender.control.bank.state import PRECISIONS
 from hapticrender.control.stdft import StarSTDFT
 from hapticrender.control.transfer import require_positive
 from hapticrender.protocols import Array

@@ -8,8 +8,8 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from hapticrender.control.bank_loop import BankLoop, KnownFinger, Sampled, Structure
-from hapticrender.control.bank_state import BankNumbers, BankTables
+from hapticrender.control.bank.loop import BankLoop, KnownFinger, Sampled, Structure
+from hapticrender.control.bank.state import BankNumbers, BankTables
 from hapticrender.control.kernels import FREQUENCY, WAVENUMBER
 from hapticrender.control.margins import Margins
 from hapticrender.errors import DesignError

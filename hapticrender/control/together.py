@@ -17,11 +17,11 @@ import numpy as np
 
 from hapticrender.bands import Bands
 from hapticrender.compiled.jit import kernel
-from hapticrender.control import bank_rows as row
 from hapticrender.control.bandmodel import BandModel
-from hapticrender.control.bank import BankController
-from hapticrender.control.bank_kernels import bank_step
-from hapticrender.control.bank_state import BankState, BankTables
+from hapticrender.control.bank import rows as row
+from hapticrender.control.bank.controller import BankController
+from hapticrender.control.bank.kernels import bank_step
+from hapticrender.control.bank.state import BankState, BankTables
 from hapticrender.errors import DesignError
 from hapticrender.protocols import Array, Controller, Method
 

@@ -12,7 +12,7 @@ from typing import NamedTuple
 from hapticrender.compiled.jit import kernel
 from hapticrender.compiled.lanes import any_of, select, size
 from hapticrender.compiled.lanes_memory import read, write
-from hapticrender.control.bank_kernels import bank_advance
+from hapticrender.control.bank.kernels import bank_advance
 from hapticrender.plants.kernels import inside, open_window, plate_drive, sense, series_at
 from hapticrender.plants.propagator import (
     COLUMNS,

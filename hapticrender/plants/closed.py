@@ -7,12 +7,12 @@ handing single samples to each other, without leaving compiled code.
 from __future__ import annotations
 
 from hapticrender.compiled.jit import by_types, kernel
-from hapticrender.control.bank_kernels import bank_step
-from hapticrender.control.bank_state import BankTables
-from hapticrender.control.complex_kernels import ComplexTables, complex_step
-from hapticrender.control.polar_kernels import PolarTables
-from hapticrender.control.polar_pair import in_pairs, polar_pair
-from hapticrender.control.polar_steps import polar_step
+from hapticrender.control.bank.kernels import bank_step
+from hapticrender.control.bank.state import BankTables
+from hapticrender.control.cartesian.kernels import ComplexTables, complex_step
+from hapticrender.control.polar.kernels import PolarTables
+from hapticrender.control.polar.pair import in_pairs, polar_pair
+from hapticrender.control.polar.steps import polar_step
 from hapticrender.plants.kernels import plate_advance, plate_drive, plate_sense
 
 STEPS = {PolarTables: polar_step, ComplexTables: complex_step, BankTables: bank_step}

@@ -6,8 +6,8 @@ feed-forward::
 
     Y/R = G z^-d (FF - K_r + K + K_z)/(1 + G z^-d (K + K_z)),    FF = rho (D + D' (1 - e^(-j W h))/h)
 
-K is that of `bank_loop`.  K_z and K_r are what learning adds (see `bank_learning`): the learnt part zeta of D goes
-after what the command did not do, a, with the pace gamma, and its force zeta R undoes R's division::
+K is that of `control.bank.loop`.  K_z and K_r are what learning adds (`control.bank.learning`): the learnt part zeta of
+D goes after what the command did not do, a, with the pace gamma, and its force zeta R undoes R's division::
 
     zeta' = gamma (<zeta> - zeta - (D a + D' a')/R),    a = e - <v> + r
 
@@ -26,9 +26,9 @@ from functools import cached_property
 import numpy as np
 from scipy.fft import fft, fftfreq, ifft, next_fast_len
 
-from hapticrender.control.bank_kernels import ADAPTATION
-from hapticrender.control.bank_loop import BankLoop, KnownFinger, Structure
-from hapticrender.control.bank_state import BankTables
+from hapticrender.control.bank.kernels import ADAPTATION
+from hapticrender.control.bank.loop import BankLoop, KnownFinger, Structure
+from hapticrender.control.bank.state import BankTables
 from hapticrender.control.kernels import FREQUENCY
 from hapticrender.control.stability import STATES, bank_loop
 from hapticrender.plants.surface import SurfaceParameters

@@ -13,10 +13,10 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from hapticrender.control.bandmodel import FingerRange
-from hapticrender.control.bank_loop import BankLoop, KnownFinger, Structure
+from hapticrender.control.bank.loop import BankLoop, KnownFinger, Structure
 from hapticrender.control.damping import damping_taps
 from hapticrender.control.margins import sensitivity
-from hapticrender.control.polar_loop import PolarLoop
+from hapticrender.control.polar.loop import PolarLoop
 from hapticrender.plants.vibrotactile import Plate, PlateParameters
 from hapticrender.protocols import Array, Controller
 

@@ -15,7 +15,7 @@ import numpy as np
 
 from hapticrender.bands import Bands
 from hapticrender.control.bandmodel import BandModel, FingerRange
-from hapticrender.control.bank import PROMPT, BankController
+from hapticrender.control.bank.controller import PROMPT, BankController
 from hapticrender.control.damping import within_a_turn
 from hapticrender.plants.base import TouchedPlant
 from hapticrender.plants.bounds import check_names, choice, number

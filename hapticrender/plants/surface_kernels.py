@@ -11,9 +11,9 @@ import math
 from typing import NamedTuple
 
 from hapticrender.compiled.jit import kernel
-from hapticrender.control import bank_rows as row
-from hapticrender.control.bank_kernels import bank_step
-from hapticrender.control.bank_state import BankState, BankTables
+from hapticrender.control.bank import rows as row
+from hapticrender.control.bank.kernels import bank_step
+from hapticrender.control.bank.state import BankState, BankTables
 from hapticrender.plants.closed import control_step
 from hapticrender.plants.friction_laws import LawNumbers, friction_ratio, wanted_amplitude
 from hapticrender.plants.kernels import HUGE, SENSOR_CLIPPED

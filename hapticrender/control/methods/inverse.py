@@ -14,7 +14,7 @@ from typing import Literal
 
 from hapticrender.bands import Bands
 from hapticrender.control.bandmodel import BandModel
-from hapticrender.control.complex_loops import ComplexController, ComplexRules, design_complex
+from hapticrender.control.cartesian.loops import ComplexController, ComplexRules, design_complex
 from hapticrender.control.envelope_loop import Bandwidths, envelope_loop
 
 

@@ -17,10 +17,10 @@ import numpy as np
 from hapticrender.bands import Bands
 from hapticrender.compiled.lanes import WIDTH, aligned, padded
 from hapticrender.control.bandmodel import BandModel
-from hapticrender.control.bank_state import PRECISIONS
+from hapticrender.control.bank.state import PRECISIONS
 from hapticrender.control.envelope_loop import Bandwidths, EnvelopeLoop, envelope_loop
 from hapticrender.control.kernels import WAVENUMBER
-from hapticrender.control.polar_kernels import (
+from hapticrender.control.polar.kernels import (
     BAND_ROWS,
     FORWARD,
     FRAME_RE,
@@ -32,7 +32,7 @@ from hapticrender.control.polar_kernels import (
     PolarState,
     PolarTables,
 )
-from hapticrender.control.polar_passes import NUMBER, SCRATCH_ROWS, TOLD_ROWS, polar_run
+from hapticrender.control.polar.passes import NUMBER, SCRATCH_ROWS, TOLD_ROWS, polar_run
 from hapticrender.errors import DesignError
 from hapticrender.protocols import Array
 

@@ -15,7 +15,7 @@ import numpy as np
 
 from hapticrender.bands import Bands
 from hapticrender.control.bandmodel import BandModel
-from hapticrender.control.complex_loops import ComplexController, ComplexRules, design_complex
+from hapticrender.control.cartesian.loops import ComplexController, ComplexRules, design_complex
 from hapticrender.control.envelope_loop import EnvelopeLoop, section
 from hapticrender.control.loopshape import Bounds, integrator, margins
 from hapticrender.control.transfer import TransferFunction

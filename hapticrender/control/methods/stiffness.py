@@ -9,8 +9,8 @@ from __future__ import annotations
 
 from hapticrender.bands import Bands
 from hapticrender.control.bandmodel import BandModel
-from hapticrender.control.bank import PROMPT, BankController, BankRules, design_bank, spacing
-from hapticrender.control.block import BlockController
+from hapticrender.control.bank.controller import PROMPT, BankController, BankRules, design_bank, spacing
+from hapticrender.control.blocks.controller import BlockController
 
 CROWDED = 40.0  # Hz: carriers closer than this share what the detectors see
 

@@ -5,7 +5,7 @@ carrier that runs backwards (the finger reverses) is followed as its mirror imag
 Re conj(X) e^{-j phi}, so that psi always runs forward and every complex state is conjugated at the reversal.
 
 Everything that a band owns is a column of rows that are named here, W columns to a tile (`compiled.lanes`).  What
-all tiles share is written down before; blocks are in `polar_passes`.
+all tiles share is written down before; blocks are in `passes`.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from hapticrender.compiled.jit import kernel
 from hapticrender.compiled.lanes import any_of, high, low, root, select, size
 from hapticrender.compiled.lanes_memory import lanes, put, put_pairs, taken
 from hapticrender.compiled.polynomials import polar, unit
-from hapticrender.control.bank_carriers import advance_of, turns_of
+from hapticrender.control.bank.carriers import advance_of, turns_of
 from hapticrender.control.kernels import (
     DOUBT_TIME,
     FAR,
@@ -95,7 +95,7 @@ class PolarState(NamedTuple):
     sample: Array  # (1,) integer: samples so far
     shared: Array  # (SHARED_ROWS + coordinates, REFRESH) scratch
     told: Array  # (1 + 2 coordinates, REFRESH) scratch of a block's passes, in the precision of the bands
-    scratch: Array  # (1 + 2 coordinates, REFRESH, W) scratch of theirs, see `polar_passes`
+    scratch: Array  # (1 + 2 coordinates, REFRESH, W) scratch of theirs, see `passes`
     sum: Array  # (coordinates, REFRESH, W) scratch, 0: drive of each coordinate, not yet summed over the lanes
     window: Array  # (length, tiles * 2 * coordinates, W) boxcar: what was heard; of length 0 with the STDFT*
     heap: Array  # (2, tiles * 2 * coordinates, W) its running sum, and one summed afresh

@@ -8,9 +8,9 @@ import numpy as np
 
 from hapticrender.bands import Bands
 from hapticrender.control.bandmodel import BandModel
-from hapticrender.control.bank import RAMP_TIME
-from hapticrender.control.bank_rows import TRACK_ROWS
-from hapticrender.control.complex_kernels import (
+from hapticrender.control.bank.controller import RAMP_TIME
+from hapticrender.control.bank.rows import TRACK_ROWS
+from hapticrender.control.cartesian.kernels import (
     CARRIER_ROWS,
     LOOP_ROWS,
     WANTED_ROWS,

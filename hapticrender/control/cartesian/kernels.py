@@ -15,8 +15,8 @@ import math
 from typing import NamedTuple
 
 from hapticrender.compiled.jit import kernel
-from hapticrender.control.bank_finger import track_finger
-from hapticrender.control.bank_rows import ACCELERATION, HELD, SEEN, SPEED, VELOCITY
+from hapticrender.control.bank.finger import track_finger
+from hapticrender.control.bank.rows import ACCELERATION, HELD, SEEN, SPEED, VELOCITY
 from hapticrender.control.kernels import (
     FAR,
     FREQUENCY,

@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 
 from hapticrender.bands import Bands
-from hapticrender.control import bank_rows as row
 from hapticrender.control.bandmodel import BandModel
-from hapticrender.control.bank_carriers import REFRESH
-from hapticrender.control.bank_kernels import ADAPTATION, bank_run
-from hapticrender.control.bank_state import PRECISIONS, BankNumbers, BankState, BankTables, across_bands, bank_state
+from hapticrender.control.bank import rows as row
+from hapticrender.control.bank.carriers import REFRESH
+from hapticrender.control.bank.kernels import ADAPTATION, bank_run
+from hapticrender.control.bank.state import PRECISIONS, BankNumbers, BankState, BankTables, across_bands, bank_state
 from hapticrender.control.damping import choose_damping
 from hapticrender.control.kernels import FREQUENCY, WAVENUMBER
 from hapticrender.control.stability import Checked, Limits, checked_bandwidth

@@ -5,7 +5,7 @@ from __future__ import annotations
 from hapticrender.compiled.jit import kernel
 from hapticrender.compiled.lanes import any_of, high, low, select, size
 from hapticrender.compiled.lanes_memory import lanes, read, write
-from hapticrender.control import bank_rows as row
+from hapticrender.control.bank import rows as row
 from hapticrender.control.kernels import FAR, FASTEST, TURN
 
 TRACKER_POLE = TURN * 60.0  # rad/s: triple pole of the finger's tracker; no lag under constant acceleration

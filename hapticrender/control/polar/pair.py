@@ -3,7 +3,7 @@
 What the plate shows at sample n + 1 it owes to the drive of sample n - 1, at the latest: both samples are sensed before
 either drive is worked out.  A sample is a chain of instructions each of which waits for the one before it, a few
 hundred cycles long; those of two samples and two sides go on side by side.  It is the arithmetic of
-`polar_steps.polar_step`, twice.
+`control.polar.steps.polar_step`, twice.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from __future__ import annotations
 from hapticrender.compiled.jit import kernel
 from hapticrender.compiled.lanes import size, totals
 from hapticrender.compiled.lanes_memory import lanes, put, put_pairs
-from hapticrender.control.polar_kernels import (
+from hapticrender.control.polar.kernels import (
     AMOUNT,
     COS,
     FORWARD,
@@ -32,7 +32,7 @@ from hapticrender.control.polar_kernels import (
     share,
     tile_step,
 )
-from hapticrender.control.polar_steps import answered, gather, heard, hearing, speak
+from hapticrender.control.polar.steps import answered, gather, heard, hearing, speak
 
 
 @kernel

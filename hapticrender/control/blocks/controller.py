@@ -8,11 +8,11 @@ import numpy as np
 
 from hapticrender.bands import Bands
 from hapticrender.compiled.lanes import WIDTH, aligned, padded
-from hapticrender.control import bank_rows as row
-from hapticrender.control.bank import LEARNING_SHARE, BankController, settled_share, spacing
-from hapticrender.control.bank_state import PRECISIONS, BankNumbers, BankTables, bank_state
-from hapticrender.control.block_kernels import block_run
-from hapticrender.control.block_state import (
+from hapticrender.control.bank import rows as row
+from hapticrender.control.bank.controller import LEARNING_SHARE, BankController, settled_share, spacing
+from hapticrender.control.bank.state import PRECISIONS, BankNumbers, BankTables, bank_state
+from hapticrender.control.blocks.kernels import block_run
+from hapticrender.control.blocks.state import (
     CHANNEL_ROWS,
     EIGHT,
     PHASE_ROWS,
@@ -50,7 +50,7 @@ class BlockController:
     -----
     No inner loop: it needs an answer within a sample or few.  The observer is the per-sample one to rounding;
     adaptation, detectors and law act once a block, and the drive runs linearly between them.  The finger is learnt from
-    the force that acted (`bank_learning`), once a block.
+    the force that acted (`control.bank.learning`), once a block.
     """
 
     def __init__(self, controller: BankController, block: int, precision: str = "double") -> None:

@@ -10,8 +10,8 @@ from __future__ import annotations
 from hapticrender.compiled.jit import kernel
 from hapticrender.compiled.lanes import totals
 from hapticrender.compiled.lanes_memory import lanes, put, put_stretch, stretch
-from hapticrender.control import bank_rows as row
-from hapticrender.control.block_state import (
+from hapticrender.control.bank import rows as row
+from hapticrender.control.blocks.state import (
     CHANNEL_ROWS,
     EIGHT,
     FROM_RE,

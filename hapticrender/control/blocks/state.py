@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from hapticrender.control.bank_state import BankNumbers, BankState, BankTables
+from hapticrender.control.bank.state import BankNumbers, BankState, BankTables
 from hapticrender.protocols import Array
 
 EIGHT = 8  # samples of a group, and lanes of double precision: phases are always double

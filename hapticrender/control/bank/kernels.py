@@ -3,7 +3,7 @@
 One step serves the methods that work in the device's coordinates (FACTS
 section 3): the observer watches the error (H2) or the signal (H), the law
 inverts D + D' d/dt, the inner loop damps the deviation at sample rate.  Symbols
-and rows are those of `bank_rows`.  The same source steps one scenario, whose
+and rows are those of `rows`.  The same source steps one scenario, whose
 bands are the lanes, and as many scenarios as there are lanes, side by side.
 """
 
@@ -15,8 +15,8 @@ from hapticrender.compiled.jit import kernel
 from hapticrender.compiled.lanes import any_of, high, low, root, select, size, total, totals
 from hapticrender.compiled.lanes_memory import lanes, put, put_pairs, read, write
 from hapticrender.compiled.polynomials import whole
-from hapticrender.control import bank_rows as row
-from hapticrender.control.bank_carriers import (
+from hapticrender.control.bank import rows as row
+from hapticrender.control.bank.carriers import (
     FORGET,
     REFRESH,
     carrier_pass,
@@ -27,8 +27,8 @@ from hapticrender.control.bank_carriers import (
     shown_pass,
     told_pass,
 )
-from hapticrender.control.bank_finger import feel, track_finger
-from hapticrender.control.bank_learning import begin_finger, learn_finger, send_finger
+from hapticrender.control.bank.finger import feel, track_finger
+from hapticrender.control.bank.learning import begin_finger, learn_finger, send_finger
 from hapticrender.control.kernels import DOUBT_TIME, FAR
 
 HUGE = 1e300  # stands for infinity, where fast arithmetic is not told of it

@@ -7,7 +7,7 @@ related by a unit lower-triangular Toeplitz matrix, e = Q e_h, whatever the numb
 
 Then every envelope is updated once, the law is taken at the block's end for the moment its drive will act, and the
 drive runs linearly from one block's envelope to the next.  Phases at the block's start are counted in double
-precision.  Sums over bands and samples are in `block_sums`; everything that knows of finger, touch and trust is the
+precision.  Sums over bands and samples are in `sums`; everything that knows of finger, touch and trust is the
 per-sample bank's own, called once a block.
 """
 
@@ -17,12 +17,12 @@ from hapticrender.compiled.jit import kernel
 from hapticrender.compiled.lanes import any_of, floor, high, root, size, totals
 from hapticrender.compiled.lanes_memory import lanes, put, put_pairs
 from hapticrender.compiled.polynomials import unit, whole
-from hapticrender.control import bank_rows as row
-from hapticrender.control.bank_carriers import FORGET, derivative, grow_pass, law_tune, look_ahead, motion_pass
-from hapticrender.control.bank_finger import feel, track_finger
-from hapticrender.control.bank_kernels import believe, wake
-from hapticrender.control.bank_learning import begin_finger, learn_finger, send_finger
-from hapticrender.control.block_state import (
+from hapticrender.control.bank import rows as row
+from hapticrender.control.bank.carriers import FORGET, derivative, grow_pass, law_tune, look_ahead, motion_pass
+from hapticrender.control.bank.finger import feel, track_finger
+from hapticrender.control.bank.kernels import believe, wake
+from hapticrender.control.bank.learning import begin_finger, learn_finger, send_finger
+from hapticrender.control.blocks.state import (
     CHANNEL_ROWS,
     COSINE,
     EIGHT,
@@ -43,7 +43,7 @@ from hapticrender.control.block_state import (
     TURNED,
     TURNS,
 )
-from hapticrender.control.block_sums import correlate, respond, solve, sum_bands, sum_drives
+from hapticrender.control.blocks.sums import correlate, respond, solve, sum_bands, sum_drives
 from hapticrender.control.kernels import FAR, TURN
 
 NEAR_LIMIT = 0.5  # share of the drive's limit, from which on its envelope is watched and not its samples alone

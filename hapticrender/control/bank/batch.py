@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 
 from hapticrender.compiled.lanes import WIDTH, aligned
-from hapticrender.control import bank_rows as row
-from hapticrender.control.bank import BankController
-from hapticrender.control.bank_state import BankState, BankTables
+from hapticrender.control.bank import rows as row
+from hapticrender.control.bank.controller import BankController
+from hapticrender.control.bank.state import BankState, BankTables
 from hapticrender.protocols import Array
 
 LANES = WIDTH[np.dtype(float)]

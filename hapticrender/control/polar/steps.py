@@ -11,7 +11,7 @@ from hapticrender.compiled.lanes import select, totals
 from hapticrender.compiled.lanes_memory import lanes, put, put_pairs
 from hapticrender.compiled.polynomials import cosine, polar
 from hapticrender.control.kernels import QUIET, TURN
-from hapticrender.control.polar_kernels import (
+from hapticrender.control.polar.kernels import (
     AMOUNT,
     AMPLITUDE1,
     COS,

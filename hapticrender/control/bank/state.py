@@ -1,6 +1,6 @@
 """Parameters and state of the band bank's compiled step.
 
-Everything a band owns is a column of rows named in `bank_rows`, W columns to a tile (`compiled.lanes`).  What a
+Everything a band owns is a column of rows named in `rows`, W columns to a tile (`compiled.lanes`).  What a
 scenario owns is a plain number, or a row of W scenarios side by side: then a lane of a tile is a scenario, and a tile
 one band of each.
 """
@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from hapticrender.compiled.lanes import WIDTH, aligned, padded
-from hapticrender.control import bank_rows as row
+from hapticrender.control.bank import rows as row
 from hapticrender.protocols import Array
 
 PRECISIONS = {"double": np.float64, "single": np.float32}

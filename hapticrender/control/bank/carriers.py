@@ -11,8 +11,8 @@ from hapticrender.compiled.jit import by_types, kernel
 from hapticrender.compiled.lanes import floor, high, low, select, size
 from hapticrender.compiled.lanes_memory import lanes, put, read
 from hapticrender.compiled.polynomials import unit
-from hapticrender.control import bank_rows as row
-from hapticrender.control.bank_finger import finger_stiffness
+from hapticrender.control.bank import rows as row
+from hapticrender.control.bank.finger import finger_stiffness
 from hapticrender.control.kernels import TURN
 
 FORGET = 50.0  # 1/s: a carrier near 0 Hz is forgotten, not followed

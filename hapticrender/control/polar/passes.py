@@ -2,7 +2,7 @@
 
 Where carriers and targets stay and sensors are believed, nothing of a sample waits for the one before it but two short
 recursions.  In a pass of its own each of them runs beside the other coordinate's, and the rest is free of them, so that
-the processor works on many samples at once.  The arithmetic is that of `polar_kernels.tile_step`, to rounding.
+the processor works on many samples at once.  The arithmetic is that of `control.polar.kernels.tile_step`, to rounding.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from hapticrender.compiled.lanes import select
 from hapticrender.compiled.lanes_memory import lanes, put, put_pairs, put_stretch, row_totals, taken
 from hapticrender.compiled.polynomials import cosine, polar
 from hapticrender.control.kernels import QUIET, TURN
-from hapticrender.control.polar_kernels import (
+from hapticrender.control.polar.kernels import (
     AMOUNT,
     AMPLITUDE1,
     COS,
@@ -43,7 +43,7 @@ from hapticrender.control.polar_kernels import (
     share,
     tile_step,
 )
-from hapticrender.control.polar_steps import usual
+from hapticrender.control.polar.steps import usual
 
 # rows of PolarState.told, one column a sample: whole numbers from 0; then, two a coordinate, b0 of the low pass times
 # twice what it hears, and four times that

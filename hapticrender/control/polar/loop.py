@@ -20,7 +20,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from hapticrender.control.bandmodel import BandModel
-from hapticrender.control.bank_loop import LEAST_POLE, Sampled
+from hapticrender.control.bank.loop import LEAST_POLE, Sampled
 from hapticrender.control.loopshape import reduced_controller
 from hapticrender.control.margins import Margins, borne_errors, halved_within, highest_peak, sensitivity
 from hapticrender.control.transfer import butterworth

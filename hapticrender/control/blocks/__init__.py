@@ -1,0 +1,1 @@
+"""The band bank for devices that take blocks."""

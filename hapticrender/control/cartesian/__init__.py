@@ -1,0 +1,1 @@
+"""Plain complex controllers, for comparison."""

@@ -1,0 +1,1 @@
+"""The paper's controller: magnitude and phase of every band."""
