@@ -23,7 +23,7 @@ from hapticrender.plants.surface_kernels import LOAD, SPEED, amplitude_fade, ask
 from hapticrender.protocols import Array, Driver, Flag, Sensed
 from hapticrender.touch.finger import Finger
 
-LONGEST_DELAY = 0.25e-3  # s: a tenth of a turn of 400 Hz, which are 7 % off there, and beyond 10 % half as late again
+LONGEST_DELAY = 0.25e-3  # s: a tenth of a turn of 400 Hz, 3 % off there, and beyond 10 % half as late again
 
 
 class ResonantDriver:
