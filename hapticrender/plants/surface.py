@@ -162,7 +162,7 @@ def resonant(model: BandModel, mode: UltrasonicParameters, lock: float) -> BandM
 
     Observer and integral grow with the pace, what they lose by being late with the delay.  With an inner loop the
     pace leaves 45 degrees of phase, as measured with delays of 1 to 4 samples at 192 and 384 kHz; where the margins
-    allow none though it would answer in time (96 kHz, 70 kHz at 192 kHz), a touch costs three times as much.
+    allow none though it would answer in time (96 kHz, 70 kHz at 192 kHz), a touch costs several times as much.
     Without one (a block device) it leaves a modulus margin of 0.35 (Ms 2.9), what is learnt of a finger being part
     of the loop: thin, but at two thirds of it a texture of 400 Hz behind the longest delay is 12 % off in place of
     3 %.
