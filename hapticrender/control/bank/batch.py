@@ -51,7 +51,7 @@ def batch_of(controllers: Sequence[BankController]) -> tuple[BankTables, BankSta
         sent=aligned((bands, state.sent.shape[1], LANES)),
         phase=np.zeros(bands * LANES, np.uint64),
         pace=np.zeros(bands, np.int64),
-        follows=np.zeros(1, np.int64),
+        follows=np.zeros(2, np.int64),
         sample=np.zeros(1, np.int64),
         **own,
     )

@@ -109,12 +109,13 @@ def take(tables, state, t):
 def refresh(tables, state):
     """Take up the tones that are asked for, and what stays for the next samples: law, turn, settled targets."""
     numbers, band = tables.numbers, state.band
-    state.follows[0] = 0
+    state.follows[0] = state.follows[1] = 0
     for t in range(band.shape[0]):
         grows, follows = take(tables, state, t)
         if follows:
             state.pace[t] = row.LOCKED
             state.follows[0] += 1
+            state.follows[1] += 1
             continue
         still = not (grows or numbers.analysed or numbers.modulated) and numbers.error_observer
         state.pace[t] = row.STEADY if still else row.GROWING
@@ -131,6 +132,9 @@ def refresh(tables, state):
         if still:
             put(band, t, row.DR_RE, 0.0 * lanes(band, t, row.DR_RE))
             put(band, t, row.DR_IM, 0.0 * lanes(band, t, row.DR_IM))
+            law_wanted(tables, state, t)
+        else:
+            state.follows[1] += 1
 
 
 @kernel
@@ -179,6 +183,22 @@ def law_tune(tables, state, t):
             turn = 2.0 * omega * mass
             put(law, t, at + row.SLOPE_RE, damping * cos - turn * sin)
             put(law, t, at + row.SLOPE_IM, damping * sin + turn * cos)
+
+
+@kernel
+def law_wanted(tables, state, t):
+    """Force that the target of a tile needs: D R for every coordinate."""
+    band, law, coordinates = state.band, state.law, len(tables.shape)
+    r_re, r_im = lanes(band, t, row.R_RE), lanes(band, t, row.R_IM)
+    for c in range(coordinates):
+        re = im = 0.0 * r_re
+        for i in range(coordinates):
+            at, shape = row.FIRST_LAW + row.LAW_ROWS * (c * coordinates + i), tables.shape[i]
+            re += shape * lanes(law, t, at + row.LAW_RE)
+            im += shape * lanes(law, t, at + row.LAW_IM)
+        at = row.FIRST_LAW + row.LAW_ROWS * coordinates * coordinates + 2 * c
+        put(law, t, at, re * r_re - im * r_im)
+        put(law, t, at + 1, re * r_im + im * r_re)
 
 
 @kernel

@@ -17,21 +17,30 @@ from hapticrender.compiled.lanes_memory import lanes, put, put_pairs, read, writ
 from hapticrender.compiled.polynomials import whole
 from hapticrender.control.bank import rows as row
 from hapticrender.control.bank.carriers import (
-    FORGET,
     REFRESH,
     carrier_pass,
     derivative,
     law_tune,
+    law_wanted,
     look_ahead,
     refresh,
     shown_pass,
     told_pass,
 )
+from hapticrender.control.bank.detectors import detect
 from hapticrender.control.bank.finger import feel, track_finger
 from hapticrender.control.bank.learning import begin_finger, learn_finger, send_finger
+from hapticrender.control.bank.observer import level_pass, observer_pass, residual_pass
+from hapticrender.control.bank.settled import (
+    settled,
+    settled_command,
+    settled_law,
+    settled_observer,
+    settled_residual,
+    settled_target,
+)
 from hapticrender.control.kernels import DOUBT_TIME, FAR
 
-HUGE = 1e300  # stands for infinity, where fast arithmetic is not told of it
 ADAPTATION = 8  # samples between two adaptations of the finger
 
 
@@ -93,120 +102,27 @@ def wanted_residual(band, wanted):
 
 
 @kernel
-def residual_pass(tables, state, y, c, inner):
-    """Residual of the observer and deviation from the command, as the limiter has scaled it, in coordinate c."""
-    band, loop, level, past, shape = state.band, state.loop, state.level, state.past, tables.shape[c]
-    base = c * row.LOOP_ROWS
-    observed = commanded = 0.0
-    for t in range(band.shape[0]):
-        cos, sin = lanes(band, t, row.COS), lanes(band, t, row.SIN)
-        observed += (shape * lanes(band, t, row.SEEN_RE) + lanes(loop, t, base + row.E_RE)) * cos
-        observed -= (shape * lanes(band, t, row.SEEN_IM) + lanes(loop, t, base + row.E_IM)) * sin
-        commanded += (shape * lanes(band, t, row.R_RE) + lanes(loop, t, base + row.V_RE)) * cos
-        commanded -= (shape * lanes(band, t, row.R_IM) + lanes(loop, t, base + row.V_IM)) * sin
-    dc = read(level, 0, c)
-    observed, commanded = totals(y, observed, commanded)
-    deviation = y - read(state.touch, row.SCALE) * commanded
-    newer, force = deviation, 0.0 * deviation
-    for i in range(len(state.lags)):  # each value is read before its place is taken
-        older = read(past, c, i)
-        write(newer, past, c, i)
-        if i > 0:
-            force -= read(tables.taps, c, i) * newer
-        newer = older
-    write(inner * (force - read(tables.taps, c, 0) * deviation), state.residual, row.FORCE, c)
-    write(y - observed - dc, state.residual, row.ERROR, c)
-    write(deviation - dc, state.residual, row.DEVIATION, c)
-
-
-@kernel
-def level_pass(numbers, level, error, c, quick):
-    """DC band of type 2, faster where it is `quick`."""
-    drift = read(level, 1, c)
-    dc, bend = numbers.dc, numbers.dc_drift
-    if numbers.presence:
-        dc = select(quick, numbers.dc_quick, dc)
-        bend = select(quick, numbers.dc_drift_quick, bend)
-    write(read(level, 0, c) + dc * error + drift, level, 0, c)
-    write(drift + bend * error, level, 1, c)
-
-
-@kernel
-def observer_pass(tables, state, t, c, g, integral, back):
-    """Error envelopes and integral parts of a tile in coordinate c."""
-    numbers, band, loop, shape = tables.numbers, state.band, state.loop, tables.shape[c]
-    base, period, error = c * row.LOOP_ROWS, 1.0 / tables.numbers.rate, read(state.residual, row.ERROR, c)
-    cos, sin = lanes(band, t, row.COS), lanes(band, t, row.SIN)
-    weight = lanes(band, t, row.SHARE)
-    fading = FORGET * (1.0 - weight)
-    keep, pull = 1.0 - period * fading, weight * (g * error)
-    e_re = keep * lanes(loop, t, base + row.E_RE) + pull * cos
-    e_im = keep * lanes(loop, t, base + row.E_IM) - pull * sin
-    if not numbers.error_observer:  # X goes on by itself; E is its distance to a target that has moved
-        moved = shape * 0.5 * numbers.reference / (1.0 - 0.5 * numbers.reference)
-        e_re -= moved * (lanes(band, t, row.R_RE) - lanes(band, t, row.SEEN_RE))
-        e_im -= moved * (lanes(band, t, row.R_IM) - lanes(band, t, row.SEEN_IM))
-    put(loop, t, base + row.E_RE, e_re)
-    put(loop, t, base + row.E_IM, e_im)
-    for r, e in ((0, e_re), (1, e_im)):
-        v = lanes(loop, t, base + row.V_RE + r)
-        wanted = shape * lanes(band, t, row.R_RE + r)
-        slope = -integral * e - fading * v
-        v += period * (slope - back * (v + wanted))  # no part of dV/dt: the law would answer the limiter by itself
-        put(loop, t, base + row.V_RE + r, v)
-        put(loop, t, base + row.COMMAND_RE + r, v + wanted)
-        put(loop, t, base + row.SLOPED_RE + r, slope + shape * lanes(band, t, row.DR_RE + r))
-
-
-@kernel
-def detector_pass(numbers, state, t, c):
-    """How much of the deviation in coordinate c either detector hears beyond its level, squared, in a tile."""
-    band, loop = state.band, state.loop
-    base, twice = c * row.LOOP_ROWS, 2.0 * read(state.residual, row.DEVIATION, c)
-    re, im = twice * lanes(band, t, row.COS), -twice * lanes(band, t, row.SIN)
-    fast_re, fast_im = lanes(loop, t, base + row.FAST_RE), lanes(loop, t, base + row.FAST_IM)
-    slow_re, slow_im = lanes(loop, t, base + row.SLOW_RE), lanes(loop, t, base + row.SLOW_IM)
-    fast_re, fast_im = fast_re + numbers.fast_pole * (re - fast_re), fast_im + numbers.fast_pole * (im - fast_im)
-    slow_re, slow_im = slow_re + numbers.slow_pole * (re - slow_re), slow_im + numbers.slow_pole * (im - slow_im)
-    put(loop, t, base + row.FAST_RE, fast_re)
-    put(loop, t, base + row.FAST_IM, fast_im)
-    put(loop, t, base + row.SLOW_RE, slow_re)
-    put(loop, t, base + row.SLOW_IM, slow_im)
-    fast = high((fast_re * fast_re - numbers.fast_level) + fast_im * fast_im, 0.0)
-    return fast, high((slow_re * slow_re - numbers.slow_level) + slow_im * slow_im, 0.0)
-
-
-@kernel
-def believe(numbers, state, doubt):
-    """Trust in the sensors: falls to 0 within 20 ms where a sample cannot be believed; then the loop starts anew."""
+def believe(numbers, touch, doubt):
+    """Trust in the sensors: falls to 0 within 20 ms where a sample cannot be believed."""
     step = 1.0 / (DOUBT_TIME * numbers.rate)
-    trust = read(state.touch, row.TRUST)
-    if not any_of((trust < 1.0) | (doubt > 0.0)):
-        return
-    trust = select(doubt > 0.0, high(trust - step, 0.0), low(trust + step, 1.0))
-    write(trust, state.touch, row.TRUST)
-    lost = trust == 0.0
-    if any_of(lost):
-        loop = state.loop
-        for t in range(loop.shape[0]):
-            for r in range(loop.shape[1]):
-                put(loop, t, r, select(lost, 0.0, lanes(loop, t, r)))
-        for array in (state.level, state.past):
-            for i in range(array.shape[0]):
-                for j in range(array.shape[1]):
-                    write(select(lost, 0.0, read(array, i, j)), array, i, j)
+    trust = read(touch, row.TRUST)
+    if any_of((trust < 1.0) | (doubt > 0.0)):
+        write(select(doubt > 0.0, high(trust - step, 0.0), low(trust + step, 1.0)), touch, row.TRUST)
 
 
 @kernel
-def wake(numbers, touch, fast, slow):
-    """Timers of the two detectors and how far each has opened the loop."""
-    for timer, opening, heard, time in (
-        (row.FAST_TIME, row.FAST_OPEN, fast, numbers.fast_time),
-        (row.SLOW_TIME, row.SLOW_OPEN, slow, numbers.slow_time),
-    ):
-        left = select(heard > 0.0, time, read(touch, timer))
-        write(select(left > 0.0, 1.0, high(read(touch, opening) - numbers.release, 0.0)), touch, opening)
-        write(left - 1.0, touch, timer)
+def forget(state):
+    """Start the loop anew where no trust is left."""
+    lost, loop = read(state.touch, row.TRUST) == 0.0, state.loop
+    if not any_of(lost):
+        return
+    for t in range(loop.shape[0]):
+        for r in range(loop.shape[1]):
+            put(loop, t, r, select(lost, 0.0, lanes(loop, t, r)))
+    for array in (state.level, state.past):
+        for i in range(array.shape[0]):
+            for j in range(array.shape[1]):
+                write(select(lost, 0.0, read(array, i, j)), array, i, j)
 
 
 @kernel
@@ -226,6 +142,8 @@ def know_finger(tables, state, touching, turn):
             look_ahead(tables.numbers, state.band, state.law, t)
         if any_of(due) or state.pace[t] == row.LOCKED:
             law_tune(tables, state, t)
+        if state.pace[t] == row.STEADY:
+            law_wanted(tables, state, t)
 
 
 @kernel
@@ -310,7 +228,7 @@ def bank_advance(tables, state, sensed, position, wanted, drive, target):
     sane = size(wanted) <= FAR
     odd = high(select(sane, 0.0, 2.0), select(size(position) > FAR, 2.0, 0.0))
     wanted = select(sane, wanted, 0.0)
-    fresh = state.sample[0] % REFRESH == 0
+    fresh, learnt = state.sample[0] % REFRESH == 0, state.sample[0] % ADAPTATION == 0
     if fresh:
         refresh(tables, state)
     state.sample[0] += 1
@@ -329,6 +247,8 @@ def bank_advance(tables, state, sensed, position, wanted, drive, target):
     if any_of(changed):
         write(select(changed, numbers.fast_time, read(touch, row.FAST_TIME)), touch, row.FAST_TIME)
         begin_finger(tables, state, changed)
+    touching = (read(touch, row.CONTACT) > 0.0) & (numbers.adapt >= 0.0)
+    know_finger(tables, state, touching, learnt)
     fast, slow = read(touch, row.FAST_OPEN), read(touch, row.SLOW_OPEN)
     integral = numbers.integral + slow * (numbers.integral_stirred - numbers.integral)
     integral += fast * (numbers.integral_awake - integral)
@@ -343,25 +263,37 @@ def bank_advance(tables, state, sensed, position, wanted, drive, target):
         idle = quick | (read(state.track, row.SPEED) < numbers.least_speed)  # a finger that rests feels no texture
         g, integral = select(idle, 0.0, g), select(idle, 0.0, integral)
     doubt = 0.0 * scale
-    hears_fast = hears_slow = 0.0 * lanes(band, 0, row.COS)
     for c in range(coordinates):
         y, unbelieved = listen_pass(tables, sensed, c)
+        write(y, state.residual, row.HEARD, c)
         doubt = high(doubt, unbelieved)
-        residual_pass(tables, state, y, c, inner)
+    believe(numbers, touch, doubt)
+    calmly = settled(state)
+    asked = 0.0 * lanes(band, 0, row.COS)
+    if calmly:
+        asked = settled_target(state)
+    for c in range(coordinates):
+        y = read(state.residual, row.HEARD, c)
+        if calmly:
+            settled_residual(tables, state, asked, y, c, inner)
+        else:
+            residual_pass(tables, state, y, c, inner)
         level_pass(numbers, state.level, read(state.residual, row.ERROR, c), c, quick)
         for t in range(tiles):
-            observer_pass(tables, state, t, c, g, integral, back)
-        if numbers.fast_level < HUGE:
-            for t in range(tiles):
-                heard_fast, heard_slow = detector_pass(numbers, state, t, c)
-                hears_fast += heard_fast
-                hears_slow += heard_slow
-    believe(numbers, state, doubt)
-    fast_heard, slow_heard = totals(scale, hears_fast, hears_slow)
-    wake(numbers, touch, fast_heard, slow_heard)
-    touching = (read(touch, row.CONTACT) > 0.0) & (numbers.adapt >= 0.0)
-    turn = state.sample[0] % ADAPTATION == 0
-    if turn and any_of(touching):
+            if calmly:
+                settled_observer(tables, state, t, c, g, integral)
+            else:
+                observer_pass(tables, state, t, c, g, integral, back)
+    learns = state.sample[0] % ADAPTATION == 0
+    if not calmly:
+        forget(state)
+    detect(tables, state, learns)
+    if calmly:
+        settled_law(tables, state, integral)
+    else:
+        law_pass(tables, state)
+    flags = speak_pass(tables, state, drive) + high(odd, 2.0 * doubt)
+    if learns and any_of(touching):
         lively = high(fast, slow)
         gain = numbers.adapt + lively * (numbers.adapt_awake - numbers.adapt)
         rest = numbers.rest + lively * (numbers.rest_awake - numbers.rest)
@@ -371,11 +303,11 @@ def bank_advance(tables, state, sensed, position, wanted, drive, target):
         step, pole = state.sample[0] // ADAPTATION, 1.0 - keep * keep
         middle = (1.0 / follow - 1.0) / ADAPTATION - (1.0 / pole - 1.0)
         for t in range(tiles):
+            if calmly:
+                settled_command(tables, state, t)
             send_finger(tables, state, t, step)
         learn_finger(tables, state, step, numbers.rate / ADAPTATION, pole, middle, inner, gain, rest, touching)
-    know_finger(tables, state, touching, turn)
-    law_pass(tables, state)
-    return speak_pass(tables, state, drive) + high(odd, 2.0 * doubt)
+    return flags
 
 
 @kernel

@@ -102,7 +102,7 @@ class BankState(NamedTuple):
 
     band: Array  # (tiles, BAND_ROWS, W)
     loop: Array  # (tiles, coordinates * LOOP_ROWS, W)
-    law: Array  # (tiles, FIRST_LAW + coordinates^2 * LAW_ROWS, W)
+    law: Array  # (tiles, FIRST_LAW + coordinates^2 * LAW_ROWS + 2 coordinates, W)
     sent: Array  # (tiles, SHOWN_ROWS + SENT_ROWS steps, W): what was commanded in the last steps of learning
     phase: Array  # (bands,) uint64: fixed part of each carrier at the next refresh, 2^64 a turn
     pace: Array  # (tiles,) integer: LOCKED, GROWING or STEADY
@@ -111,9 +111,9 @@ class BankState(NamedTuple):
     level: Array  # (2, coordinates) DC band and its drift
     past: Array  # (coordinates, taps) last deviations, newest first
     lags: tuple[int, ...]  # samples by which each tap looks back; their number is known while compiling
-    residual: Array  # (4, coordinates) scratch
+    residual: Array  # (RESIDUAL_ROWS, coordinates) scratch
     shaper: Array  # (2, channels) last two errors of the command's rounding
-    follows: Array  # (1,) integer: tiles that follow the finger
+    follows: Array  # (2,) integer: tiles that follow the finger; tiles whose targets do not stay
     sample: Array  # (1,) integer: samples so far
     shift: Array  # (2,) resonance lock: shift of the fixed carriers (Hz), and 1 while it is lost
 
@@ -127,7 +127,7 @@ def bank_state(tables: BankTables, dtype: type = np.float64) -> BankState:
     return BankState(
         band=aligned((tiles, row.BAND_ROWS, width), dtype),
         loop=aligned((tiles, coordinates * row.LOOP_ROWS, width), dtype),
-        law=aligned((tiles, row.FIRST_LAW + coordinates**2 * row.LAW_ROWS, width), dtype),
+        law=aligned((tiles, row.FIRST_LAW + coordinates**2 * row.LAW_ROWS + 2 * coordinates, width), dtype),
         sent=aligned((tiles, row.SHOWN_ROWS + row.SENT_ROWS * (int(tables.numbers.age + 0.5) + 2), width), dtype),
         phase=np.zeros(bands, np.uint64),
         pace=np.zeros(tiles, np.int64),
@@ -136,9 +136,9 @@ def bank_state(tables: BankTables, dtype: type = np.float64) -> BankState:
         level=np.zeros((2, coordinates)),
         past=np.zeros(tables.taps.shape),
         lags=tuple(range(tables.taps.shape[1])),
-        residual=np.zeros((4, coordinates)),
+        residual=np.zeros((row.RESIDUAL_ROWS, coordinates)),
         shaper=np.zeros((2, len(tables.speak))),
-        follows=np.zeros(1, np.int64),
+        follows=np.zeros(2, np.int64),
         sample=np.zeros(1, np.int64),
         shift=np.array([0.0, 1.0]),
     )

@@ -19,9 +19,11 @@ from hapticrender.compiled.lanes_memory import lanes, put, put_pairs
 from hapticrender.compiled.polynomials import unit, whole
 from hapticrender.control.bank import rows as row
 from hapticrender.control.bank.carriers import FORGET, derivative, grow_pass, law_tune, look_ahead, motion_pass
+from hapticrender.control.bank.detectors import wake
 from hapticrender.control.bank.finger import feel, track_finger
-from hapticrender.control.bank.kernels import believe, wake
+from hapticrender.control.bank.kernels import believe, forget
 from hapticrender.control.bank.learning import begin_finger, learn_finger, send_finger
+from hapticrender.control.bank.settled import NEAR_LIMIT
 from hapticrender.control.blocks.state import (
     CHANNEL_ROWS,
     COSINE,
@@ -45,8 +47,6 @@ from hapticrender.control.blocks.state import (
 )
 from hapticrender.control.blocks.sums import correlate, respond, solve, sum_bands, sum_drives
 from hapticrender.control.kernels import FAR, TURN
-
-NEAR_LIMIT = 0.5  # share of the drive's limit, from which on its envelope is watched and not its samples alone
 
 
 @kernel
@@ -416,7 +416,8 @@ def block_step(tables, state, sensed, position, wanted, drive, target, flags):
             heard_fast, heard_slow = update(tables, state, t, c, a, b, g, integral, back)
             hears_fast, hears_slow = hears_fast + heard_fast, hears_slow + heard_slow
             a, b = a2, b2
-    believe(numbers, bank, doubt)
+    believe(numbers, touch, doubt)
+    forget(bank)
     heard_fast, heard_slow = totals(1.0, hears_fast, hears_slow)
     wake(numbers, touch, heard_fast, heard_slow)
     touching = touch[row.CONTACT] > 0.0 and numbers.adapt >= 0.0

@@ -1,0 +1,102 @@
+"""A sample of the band bank while little happens: carriers are fixed, targets stay, the drive is far from its limit.
+
+Then no carrier fades and none leaves its band, the target's part of the force is known until the law changes, and the
+drive's own samples tell enough of its envelope.  What is left of the general step (`kernels`) is here, a third of it.
+"""
+
+from __future__ import annotations
+
+from hapticrender.compiled.jit import kernel
+from hapticrender.compiled.lanes import any_of, total, totals
+from hapticrender.compiled.lanes_memory import lanes, put, read, write
+from hapticrender.control.bank import rows as row
+from hapticrender.control.bank.observer import damp
+
+NEAR_LIMIT = 0.5  # share of the drive's limit, from which on its envelope is watched and not its samples alone
+
+
+@kernel
+def settled(state):
+    """Whether every target stays, the drive is far from its limit and the sensors are believed."""
+    touch = state.touch
+    stirs = (read(touch, row.PEAK) > NEAR_LIMIT * NEAR_LIMIT) | (read(touch, row.TRUST) < 1.0)
+    return state.follows[1] == 0 and not any_of(stirs)
+
+
+@kernel
+def settled_target(state):
+    """What is wanted of all bands now."""
+    band, wanted = state.band, 0.0
+    for t in range(band.shape[0]):
+        wanted += lanes(band, t, row.R_RE) * lanes(band, t, row.COS)
+        wanted -= lanes(band, t, row.R_IM) * lanes(band, t, row.SIN)
+    return wanted
+
+
+@kernel
+def settled_residual(tables, state, wanted, y, c, inner):
+    """Residual of the observer and deviation from the command in coordinate c; see `residual_pass`."""
+    band, loop, base = state.band, state.loop, c * row.LOOP_ROWS
+    observed = commanded = tables.shape[c] * wanted
+    for t in range(band.shape[0]):
+        cos, sin = lanes(band, t, row.COS), lanes(band, t, row.SIN)
+        observed += lanes(loop, t, base + row.E_RE) * cos
+        observed -= lanes(loop, t, base + row.E_IM) * sin
+        commanded += lanes(loop, t, base + row.V_RE) * cos
+        commanded -= lanes(loop, t, base + row.V_IM) * sin
+    observed, commanded = totals(y, observed, commanded)
+    damp(tables, state, y, c, inner, observed, commanded)
+
+
+@kernel
+def settled_observer(tables, state, t, c, g, integral):
+    """Error envelopes and integral parts of a tile in coordinate c; see `observer_pass`."""
+    band, loop, base = state.band, state.loop, c * row.LOOP_ROWS
+    pull, fall = g * read(state.residual, row.ERROR, c), integral * (1.0 / tables.numbers.rate)
+    re = lanes(loop, t, base + row.E_RE) + pull * lanes(band, t, row.COS)
+    im = lanes(loop, t, base + row.E_IM) - pull * lanes(band, t, row.SIN)
+    put(loop, t, base + row.E_RE, re)
+    put(loop, t, base + row.E_IM, im)
+    put(loop, t, base + row.V_RE, lanes(loop, t, base + row.V_RE) - fall * re)
+    put(loop, t, base + row.V_IM, lanes(loop, t, base + row.V_IM) - fall * im)
+
+
+@kernel
+def settled_law(tables, state, integral):
+    """F = D (R + v) - ki D' E, turned ahead; adds to the force.  See `law_pass`."""
+    band, loop, law, coordinates = state.band, state.loop, state.law, len(tables.shape)
+    for c in range(coordinates):
+        force = 0.0
+        for t in range(band.shape[0]):
+            at = row.FIRST_LAW + row.LAW_ROWS * coordinates * coordinates + 2 * c
+            re, im = lanes(law, t, at), lanes(law, t, at + 1)
+            sloped_re = sloped_im = 0.0
+            for i in range(coordinates):
+                base, at = i * row.LOOP_ROWS, row.FIRST_LAW + row.LAW_ROWS * (c * coordinates + i)
+                v_re, v_im = lanes(loop, t, base + row.V_RE), lanes(loop, t, base + row.V_IM)
+                d_re, d_im = lanes(law, t, at + row.LAW_RE), lanes(law, t, at + row.LAW_IM)
+                re += d_re * v_re  # term by term: each is one instruction
+                re -= d_im * v_im
+                im += d_re * v_im
+                im += d_im * v_re
+                e_re, e_im = lanes(loop, t, base + row.E_RE), lanes(loop, t, base + row.E_IM)
+                d_re, d_im = lanes(law, t, at + row.SLOPE_RE), lanes(law, t, at + row.SLOPE_IM)
+                sloped_re += d_re * e_re
+                sloped_re -= d_im * e_im
+                sloped_im += d_re * e_im
+                sloped_im += d_im * e_re
+            force += (re - integral * sloped_re) * lanes(band, t, row.COS)
+            force -= (im - integral * sloped_im) * lanes(band, t, row.SIN)
+        along = total(read(state.touch, row.TRUST), force)
+        write(read(state.residual, row.FORCE, c) + along, state.residual, row.FORCE, c)
+        write(0.0 * along, state.residual, row.QUADRATURE, c)
+
+
+@kernel
+def settled_command(tables, state, t):
+    """What is commanded of a tile, where learning looks for it."""
+    band, loop = state.band, state.loop
+    for c in range(len(tables.shape)):
+        for r in range(2):
+            v = lanes(loop, t, c * row.LOOP_ROWS + row.V_RE + r)
+            put(loop, t, c * row.LOOP_ROWS + row.COMMAND_RE + r, v + tables.shape[c] * lanes(band, t, row.R_RE + r))
