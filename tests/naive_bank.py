@@ -65,6 +65,7 @@ class NaiveBank:
         calm = min(abs(self.velocity) / p.crowd_speed, 1.0) if p.crowd_speed > 0 else 1.0
         target = self.reference(carrier, wanted, calm * p.reference)
         self.feel()
+        self.know()
         fast, slow = self.open
         ki = move(move(p.integral, p.integral_stirred, slow), p.integral_awake, fast)
         inner = move(p.inner, p.inner_awake, fast) if self.scale == 1 else 0.0
@@ -96,18 +97,18 @@ class NaiveBank:
         self.v = self.v + T * (self.dv - spill * (self.v + R))
         heard = 2 * deviation[:, None] * carrier.conj()
         self.fast = self.fast + p.fast_pole * (heard - self.fast)
-        self.slow = self.slow + p.slow_pole * (heard - self.slow)
-        self.believe(believed.all())
-        self.wake((abs(self.fast) ** 2 > p.fast_level).any(), (abs(self.slow) ** 2 > p.slow_level).any())
-
         self.samples += 1
-        if self.contact and p.adapt >= 0 and self.samples % STEP == 0:
+        turn = self.samples % STEP == 0
+        if turn:  # the slow detector listens to the fast one
+            self.slow = move(self.slow, self.fast, 1 - (1 - p.slow_pole) ** STEP)
+        self.believe(believed.all())
+        self.wake((abs(self.fast) ** 2 > p.fast_level).any(), turn and (abs(self.slow) ** 2 > p.slow_level).any())
+        turning = (self.force(R, dR) * self.ahead() * carrier).sum(axis=1)
+        drive, cut = self.speak(F + turning)
+        if turn and self.contact and p.adapt >= 0:
             lively = max(fast, slow)
             self.show(R, gain / 2)
             self.adapt(inner, move(p.adapt, p.adapt_awake, lively), move(p.rest, p.rest_awake, lively))
-        self.know()
-        turning = (self.force(R, dR) * self.ahead() * carrier).sum(axis=1)
-        drive, cut = self.speak(F + turning)
         return drive, target, flags | cut | (NONFINITE if far else 0)
 
     def follow(self, position):
