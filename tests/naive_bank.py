@@ -164,7 +164,7 @@ class NaiveBank:
         load, moment = carried[0], carried[1] if len(carried) > 1 else 0.0
         before = self.contact
         self.contact = load > (self.p.contact_off if before else self.p.contact_on)
-        if self.contact:
+        if self.contact and (self.samples % STEP == 0 or not before):
             self.g = min(max(moment / max(load, LEAST_LOAD), -2.0), 2.0)
         if self.contact != before:
             self.timers[0] = self.p.fast_time

@@ -41,8 +41,11 @@ def track_finger(track, rate, position):
 
 
 @kernel
-def feel(numbers, coordinates, stiffness, level, touch):
-    """Load and place of the finger from the sag (the DC band); true where contact has just begun or ended."""
+def feel(numbers, coordinates, stiffness, level, touch, turn):
+    """Load and place of the finger from the sag (the DC band); true where contact has just begun or ended.
+
+    The place is looked at in its turn, and where contact has changed.
+    """
     load = moment = 0.0 * read(level, 0, 0)
     for c in range(coordinates):
         load -= read(stiffness, 0, c) * read(level, 0, c)
@@ -52,9 +55,10 @@ def feel(numbers, coordinates, stiffness, level, touch):
     on = select(load > select(was > 0.0, numbers.contact_off, numbers.contact_on), 1.0, 0.0)
     write(load, touch, row.LOAD)
     write(on, touch, row.CONTACT)
-    if any_of(on > 0.0):
+    changed = size(on - was) > 0.5
+    if turn or any_of(changed):
         write(select(on > 0.0, low(high(moment / high(load, LEAST_LOAD), -2.0), 2.0), place), touch, row.PLACE)
-    return size(on - was) > 0.5
+    return changed
 
 
 @kernel

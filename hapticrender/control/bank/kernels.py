@@ -243,7 +243,7 @@ def bank_advance(tables, state, sensed, position, wanted, drive, target):
         residual = wanted_residual(band, wanted)
     for t in range(tiles):
         target_pass(tables, state, t, calm * numbers.reference, wanted, residual, target)
-    changed = feel(numbers, coordinates, tables.stiffness, state.level, touch)
+    changed = feel(numbers, coordinates, tables.stiffness, state.level, touch, learnt)
     if any_of(changed):
         write(select(changed, numbers.fast_time, read(touch, row.FAST_TIME)), touch, row.FAST_TIME)
         begin_finger(tables, state, changed)

@@ -26,11 +26,12 @@ def settled(state):
 @kernel
 def settled_target(state):
     """What is wanted of all bands now."""
-    band, wanted = state.band, 0.0
+    band = state.band
+    along = across = 0.0
     for t in range(band.shape[0]):
-        wanted += lanes(band, t, row.R_RE) * lanes(band, t, row.COS)
-        wanted -= lanes(band, t, row.R_IM) * lanes(band, t, row.SIN)
-    return wanted
+        along += lanes(band, t, row.R_RE) * lanes(band, t, row.COS)
+        across += lanes(band, t, row.R_IM) * lanes(band, t, row.SIN)
+    return along - across
 
 
 @kernel
@@ -38,13 +39,14 @@ def settled_residual(tables, state, wanted, y, c, inner):
     """Residual of the observer and deviation from the command in coordinate c; see `residual_pass`."""
     band, loop, base = state.band, state.loop, c * row.LOOP_ROWS
     observed = commanded = tables.shape[c] * wanted
+    e_across = v_across = 0.0 * wanted  # sums by themselves: none waits for another
     for t in range(band.shape[0]):
         cos, sin = lanes(band, t, row.COS), lanes(band, t, row.SIN)
         observed += lanes(loop, t, base + row.E_RE) * cos
-        observed -= lanes(loop, t, base + row.E_IM) * sin
+        e_across += lanes(loop, t, base + row.E_IM) * sin
         commanded += lanes(loop, t, base + row.V_RE) * cos
-        commanded -= lanes(loop, t, base + row.V_IM) * sin
-    observed, commanded = totals(y, observed, commanded)
+        v_across += lanes(loop, t, base + row.V_IM) * sin
+    observed, commanded = totals(y, observed - e_across, commanded - v_across)
     damp(tables, state, y, c, inner, observed, commanded)
 
 
@@ -66,7 +68,7 @@ def settled_law(tables, state, integral):
     """F = D (R + v) - ki D' E, turned ahead; adds to the force.  See `law_pass`."""
     band, loop, law, coordinates = state.band, state.loop, state.law, len(tables.shape)
     for c in range(coordinates):
-        force = 0.0
+        force = across = 0.0
         for t in range(band.shape[0]):
             at = row.FIRST_LAW + row.LAW_ROWS * coordinates * coordinates + 2 * c
             re, im = lanes(law, t, at), lanes(law, t, at + 1)
@@ -86,8 +88,8 @@ def settled_law(tables, state, integral):
                 sloped_im += d_re * e_im
                 sloped_im += d_im * e_re
             force += (re - integral * sloped_re) * lanes(band, t, row.COS)
-            force -= (im - integral * sloped_im) * lanes(band, t, row.SIN)
-        along = total(read(state.touch, row.TRUST), force)
+            across += (im - integral * sloped_im) * lanes(band, t, row.SIN)
+        along = total(read(state.touch, row.TRUST), force - across)
         write(read(state.residual, row.FORCE, c) + along, state.residual, row.FORCE, c)
         write(0.0 * along, state.residual, row.QUADRATURE, c)
 

@@ -388,7 +388,7 @@ def block_step(tables, state, sensed, position, wanted, drive, target, flags):
     for t in range(tiles):
         want(tables, state, t, sample.reference, factor)
         put_pairs(target, t, lanes(band, t, row.R_RE), lanes(band, t, row.R_IM))
-    changed = feel(numbers, coordinates, tables.bank.stiffness, bank.level, touch)
+    changed = feel(numbers, coordinates, tables.bank.stiffness, bank.level, touch, True)
     if changed:
         touch[row.FAST_TIME] = numbers.fast_time
         begin_finger(tables.bank, bank, changed)
