@@ -15,7 +15,7 @@ from hapticrender.protocols import Array
 
 LANES = WIDTH[np.dtype(float)]
 _TABLES = ("listen", "speak", "mass", "damping", "stiffness", "taps", "grip")
-_STATE = ("track", "touch", "level", "past", "residual", "shaper")
+_STATE = ("track", "touch", "level", "past", "answer", "residual", "shaper")
 
 
 def side_by_side(arrays: Sequence[Array]) -> Array:

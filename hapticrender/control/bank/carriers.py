@@ -8,8 +8,8 @@ from __future__ import annotations
 import numpy as np
 
 from hapticrender.compiled.jit import by_types, kernel
-from hapticrender.compiled.lanes import floor, high, low, select, size
-from hapticrender.compiled.lanes_memory import lanes, put, read
+from hapticrender.compiled.lanes import floor, high, low, select, size, total
+from hapticrender.compiled.lanes_memory import lanes, put, read, write
 from hapticrender.compiled.polynomials import unit
 from hapticrender.control.bank import rows as row
 from hapticrender.control.bank.finger import finger_stiffness
@@ -132,9 +132,11 @@ def refresh(tables, state):
         if still:
             put(band, t, row.DR_RE, 0.0 * lanes(band, t, row.DR_RE))
             put(band, t, row.DR_IM, 0.0 * lanes(band, t, row.DR_IM))
-            law_wanted(tables, state, t)
+            law_settled(tables, state, t)
         else:
             state.follows[1] += 1
+    if state.follows[1] == 0:
+        answer_settled(tables, state)
 
 
 @kernel
@@ -186,19 +188,39 @@ def law_tune(tables, state, t):
 
 
 @kernel
-def law_wanted(tables, state, t):
-    """Force that the target of a tile needs: D R for every coordinate."""
-    band, law, coordinates = state.band, state.law, len(tables.shape)
+def law_settled(tables, state, t):
+    """What a target that stays makes known of a tile's force: D R, and D' + T D, for what a sample tells.
+
+    With E and v of the last sample the force is D (R + v) - ki (D' + T D) E, and a residual e of this one adds
+    -ki g Re (D' + T D) e, as the carriers are of length 1.
+    """
+    band, law, coordinates, period = state.band, state.law, len(tables.shape), 1.0 / tables.numbers.rate
     r_re, r_im = lanes(band, t, row.R_RE), lanes(band, t, row.R_IM)
     for c in range(coordinates):
         re = im = 0.0 * r_re
+        at = row.FIRST_LAW + row.LAW_ROWS * coordinates * coordinates + c * (2 + 2 * coordinates)
         for i in range(coordinates):
-            at, shape = row.FIRST_LAW + row.LAW_ROWS * (c * coordinates + i), tables.shape[i]
-            re += shape * lanes(law, t, at + row.LAW_RE)
-            im += shape * lanes(law, t, at + row.LAW_IM)
-        at = row.FIRST_LAW + row.LAW_ROWS * coordinates * coordinates + 2 * c
+            base = row.FIRST_LAW + row.LAW_ROWS * (c * coordinates + i)
+            d_re, d_im = lanes(law, t, base + row.LAW_RE), lanes(law, t, base + row.LAW_IM)
+            re += tables.shape[i] * d_re
+            im += tables.shape[i] * d_im
+            put(law, t, at + 2 + 2 * i, lanes(law, t, base + row.SLOPE_RE) + period * d_re)
+            put(law, t, at + 3 + 2 * i, lanes(law, t, base + row.SLOPE_IM) + period * d_im)
         put(law, t, at, re * r_re - im * r_im)
         put(law, t, at + 1, re * r_im + im * r_re)
+
+
+@kernel
+def answer_settled(tables, state):
+    """What the force of all settled tiles answers to a residual, for every pair of coordinates."""
+    band, law, coordinates = state.band, state.law, len(tables.shape)
+    for c in range(coordinates):
+        at = row.FIRST_LAW + row.LAW_ROWS * coordinates * coordinates + c * (2 + 2 * coordinates)
+        for i in range(coordinates):
+            found = 0.0
+            for t in range(band.shape[0]):
+                found += lanes(band, t, row.LIVE) * lanes(law, t, at + 2 + 2 * i)
+            write(total(read(state.touch, row.TRUST), found), state.answer, c, i)
 
 
 @kernel

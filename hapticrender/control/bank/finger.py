@@ -57,7 +57,8 @@ def feel(numbers, coordinates, stiffness, level, touch, turn):
     write(on, touch, row.CONTACT)
     changed = size(on - was) > 0.5
     if turn or any_of(changed):
-        write(select(on > 0.0, low(high(moment / high(load, LEAST_LOAD), -2.0), 2.0), place), touch, row.PLACE)
+        due = on > (0.0 if turn else was)
+        write(select(due, low(high(moment / high(load, LEAST_LOAD), -2.0), 2.0), place), touch, row.PLACE)
     return changed
 
 

@@ -18,10 +18,11 @@ from hapticrender.compiled.polynomials import whole
 from hapticrender.control.bank import rows as row
 from hapticrender.control.bank.carriers import (
     REFRESH,
+    answer_settled,
     carrier_pass,
     derivative,
+    law_settled,
     law_tune,
-    law_wanted,
     look_ahead,
     refresh,
     shown_pass,
@@ -31,14 +32,7 @@ from hapticrender.control.bank.detectors import detect
 from hapticrender.control.bank.finger import feel, track_finger
 from hapticrender.control.bank.learning import begin_finger, learn_finger, send_finger
 from hapticrender.control.bank.observer import level_pass, observer_pass, residual_pass
-from hapticrender.control.bank.settled import (
-    settled,
-    settled_command,
-    settled_law,
-    settled_observer,
-    settled_residual,
-    settled_target,
-)
+from hapticrender.control.bank.settled import settled, settled_command, settled_sample
 from hapticrender.control.kernels import DOUBT_TIME, FAR
 
 ADAPTATION = 8  # samples between two adaptations of the finger
@@ -102,6 +96,16 @@ def wanted_residual(band, wanted):
 
 
 @kernel
+def target_all(tables, state, g, wanted, target):
+    """Targets of all tiles; see `target_pass`."""
+    residual = wanted
+    if tables.numbers.analysed:
+        residual = wanted_residual(state.band, wanted)
+    for t in range(state.band.shape[0]):
+        target_pass(tables, state, t, g, wanted, residual, target)
+
+
+@kernel
 def believe(numbers, touch, doubt):
     """Trust in the sensors: falls to 0 within 20 ms where a sample cannot be believed."""
     step = 1.0 / (DOUBT_TIME * numbers.rate)
@@ -143,7 +147,9 @@ def know_finger(tables, state, touching, turn):
         if any_of(due) or state.pace[t] == row.LOCKED:
             law_tune(tables, state, t)
         if state.pace[t] == row.STEADY:
-            law_wanted(tables, state, t)
+            law_settled(tables, state, t)
+    if state.follows[1] == 0:
+        answer_settled(tables, state)
 
 
 @kernel
@@ -221,10 +227,69 @@ def listen_pass(tables, sensed, c):
 
 
 @kernel
+def gains(numbers, state, calm):
+    """Gains of this sample: observer, integral, inner loop, back-calculation; whether the DC band is to be quick."""
+    touch, track = state.touch, state.track
+    fast, slow, scale = read(touch, row.FAST_OPEN), read(touch, row.SLOW_OPEN), read(touch, row.SCALE)
+    integral = numbers.integral + slow * (numbers.integral_stirred - numbers.integral)
+    integral += fast * (numbers.integral_awake - integral)
+    inner = numbers.inner + fast * (numbers.inner_awake - numbers.inner)
+    inner = select(scale < 1.0, 0.0, inner)  # no room for it
+    g = calm * (numbers.observer + fast * (numbers.observer_awake - numbers.observer))
+    quick = scale < 0.0
+    if numbers.presence:  # the step of a friction is not what the texture does
+        quick = (read(track, row.SEEN) <= 0.0) | (read(track, row.FRESH) > 0.0)
+        idle = quick | (read(track, row.SPEED) < numbers.least_speed)  # a finger that rests feels no texture
+        g, integral = select(idle, 0.0, g), select(idle, 0.0, integral)
+    return g, integral, inner, numbers.back * (1.0 - scale), quick
+
+
+@kernel
+def listen_all(tables, state, sensed):
+    """Every coordinate as the sensors show it; what raises doubt is told."""
+    doubt = 0.0 * read(state.touch, row.TRUST)
+    for c in range(len(tables.shape)):
+        y, unbelieved = listen_pass(tables, sensed, c)
+        write(y, state.residual, row.HEARD, c)
+        doubt = high(doubt, unbelieved)
+    return doubt
+
+
+@kernel
+def stirred_sample(tables, state, g, integral, inner, back, quick):
+    """From what is heard to the force, whatever happens; see `settled_sample`."""
+    for c in range(len(tables.shape)):
+        residual_pass(tables, state, c, inner)
+        level_pass(tables.numbers, state, c, quick)
+        for t in range(state.band.shape[0]):
+            observer_pass(tables, state, t, c, g, integral, back)
+    forget(state)
+    law_pass(tables, state)
+
+
+@kernel
+def learn(tables, state, g, inner, calmly, touching):
+    """The finger's turn to be learnt, from what the observer shows; the next sample's law knows it."""
+    numbers, touch = tables.numbers, state.touch
+    lively = high(read(touch, row.FAST_OPEN), read(touch, row.SLOW_OPEN))
+    gain = numbers.adapt + lively * (numbers.adapt_awake - numbers.adapt)
+    rest = numbers.rest + lively * (numbers.rest_awake - numbers.rest)
+    follow = high(0.5 * g, 1e-4)  # the observer's pole in a sample, then in a step
+    keep = (1.0 - follow) * (1.0 - follow)
+    keep *= keep
+    step, pole = state.sample[0] // ADAPTATION, 1.0 - keep * keep
+    middle = (1.0 / follow - 1.0) / ADAPTATION - (1.0 / pole - 1.0)
+    for t in range(state.band.shape[0]):
+        if calmly:
+            settled_command(tables, state, t)
+        send_finger(tables, state, t, step)
+    learn_finger(tables, state, step, numbers.rate / ADAPTATION, pole, middle, inner, gain, rest, touching)
+
+
+@kernel
 def bank_advance(tables, state, sensed, position, wanted, drive, target):
     """One sample of the whole controller: fills `drive` (channels,) and `target` (bands,), returns flags as a float."""
-    numbers, band, touch = tables.numbers, state.band, state.touch
-    tiles, coordinates = band.shape[0], len(tables.shape)
+    numbers, touch = tables.numbers, state.touch
     sane = size(wanted) <= FAR
     odd = high(select(sane, 0.0, 2.0), select(size(position) > FAR, 2.0, 0.0))
     wanted = select(sane, wanted, 0.0)
@@ -238,75 +303,25 @@ def bank_advance(tables, state, sensed, position, wanted, drive, target):
     if numbers.crowd_speed > 0.0:
         calm = low(size(read(state.track, row.VELOCITY)) * (1.0 / numbers.crowd_speed), 1.0)
     carrier_pass(tables, state, fresh)
-    residual = wanted
-    if numbers.analysed:
-        residual = wanted_residual(band, wanted)
-    for t in range(tiles):
-        target_pass(tables, state, t, calm * numbers.reference, wanted, residual, target)
-    changed = feel(numbers, coordinates, tables.stiffness, state.level, touch, learnt)
+    target_all(tables, state, calm * numbers.reference, wanted, target)
+    changed = feel(numbers, len(tables.shape), tables.stiffness, state.level, touch, learnt)
     if any_of(changed):
         write(select(changed, numbers.fast_time, read(touch, row.FAST_TIME)), touch, row.FAST_TIME)
         begin_finger(tables, state, changed)
     touching = (read(touch, row.CONTACT) > 0.0) & (numbers.adapt >= 0.0)
     know_finger(tables, state, touching, learnt)
-    fast, slow = read(touch, row.FAST_OPEN), read(touch, row.SLOW_OPEN)
-    integral = numbers.integral + slow * (numbers.integral_stirred - numbers.integral)
-    integral += fast * (numbers.integral_awake - integral)
-    inner = numbers.inner + fast * (numbers.inner_awake - numbers.inner)
-    scale = read(touch, row.SCALE)
-    inner = select(scale < 1.0, 0.0, inner)  # no room for it
-    g = calm * (numbers.observer + fast * (numbers.observer_awake - numbers.observer))
-    back = numbers.back * (1.0 - scale)
-    quick = scale < 0.0
-    if numbers.presence:  # the step of a friction is not what the texture does
-        quick = (read(state.track, row.SEEN) <= 0.0) | (read(state.track, row.FRESH) > 0.0)
-        idle = quick | (read(state.track, row.SPEED) < numbers.least_speed)  # a finger that rests feels no texture
-        g, integral = select(idle, 0.0, g), select(idle, 0.0, integral)
-    doubt = 0.0 * scale
-    for c in range(coordinates):
-        y, unbelieved = listen_pass(tables, sensed, c)
-        write(y, state.residual, row.HEARD, c)
-        doubt = high(doubt, unbelieved)
+    g, integral, inner, back, quick = gains(numbers, state, calm)
+    doubt = listen_all(tables, state, sensed)
     believe(numbers, touch, doubt)
-    calmly = settled(state)
-    asked = 0.0 * lanes(band, 0, row.COS)
+    calmly, turn = settled(state), state.sample[0] % ADAPTATION == 0
     if calmly:
-        asked = settled_target(state)
-    for c in range(coordinates):
-        y = read(state.residual, row.HEARD, c)
-        if calmly:
-            settled_residual(tables, state, asked, y, c, inner)
-        else:
-            residual_pass(tables, state, y, c, inner)
-        level_pass(numbers, state.level, read(state.residual, row.ERROR, c), c, quick)
-        for t in range(tiles):
-            if calmly:
-                settled_observer(tables, state, t, c, g, integral)
-            else:
-                observer_pass(tables, state, t, c, g, integral, back)
-    learns = state.sample[0] % ADAPTATION == 0
-    if not calmly:
-        forget(state)
-    detect(tables, state, learns)
-    if calmly:
-        settled_law(tables, state, integral)
+        settled_sample(tables, state, g, integral, inner, quick)
     else:
-        law_pass(tables, state)
+        stirred_sample(tables, state, g, integral, inner, back, quick)
     flags = speak_pass(tables, state, drive) + high(odd, 2.0 * doubt)
-    if learns and any_of(touching):
-        lively = high(fast, slow)
-        gain = numbers.adapt + lively * (numbers.adapt_awake - numbers.adapt)
-        rest = numbers.rest + lively * (numbers.rest_awake - numbers.rest)
-        follow = high(0.5 * g, 1e-4)  # the observer's pole in a sample, then in a step
-        keep = (1.0 - follow) * (1.0 - follow)
-        keep *= keep
-        step, pole = state.sample[0] // ADAPTATION, 1.0 - keep * keep
-        middle = (1.0 / follow - 1.0) / ADAPTATION - (1.0 / pole - 1.0)
-        for t in range(tiles):
-            if calmly:
-                settled_command(tables, state, t)
-            send_finger(tables, state, t, step)
-        learn_finger(tables, state, step, numbers.rate / ADAPTATION, pole, middle, inner, gain, rest, touching)
+    if turn and any_of(touching):
+        learn(tables, state, g, inner, calmly, touching)
+    detect(tables, state, turn)
     return flags
 
 

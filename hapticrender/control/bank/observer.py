@@ -10,9 +10,9 @@ from hapticrender.control.bank.carriers import FORGET
 
 
 @kernel
-def residual_pass(tables, state, y, c, inner):
+def residual_pass(tables, state, c, inner):
     """Residual of the observer and deviation from the command, as the limiter has scaled it, in coordinate c."""
-    band, loop, shape = state.band, state.loop, tables.shape[c]
+    band, loop, shape, y = state.band, state.loop, tables.shape[c], read(state.residual, row.HEARD, c)
     base = c * row.LOOP_ROWS
     observed = commanded = 0.0
     for t in range(band.shape[0]):
@@ -22,13 +22,13 @@ def residual_pass(tables, state, y, c, inner):
         commanded += (shape * lanes(band, t, row.R_RE) + lanes(loop, t, base + row.V_RE)) * cos
         commanded -= (shape * lanes(band, t, row.R_IM) + lanes(loop, t, base + row.V_IM)) * sin
     observed, commanded = totals(y, observed, commanded)
-    damp(tables, state, y, c, inner, observed, read(state.touch, row.SCALE) * commanded)
+    damp(tables, state, c, inner, observed, read(state.touch, row.SCALE) * commanded)
 
 
 @kernel
-def damp(tables, state, y, c, inner, observed, commanded):
+def damp(tables, state, c, inner, observed, commanded):
     """Residual and deviation in coordinate c, and the force of the inner loop."""
-    past, dc = state.past, read(state.level, 0, c)
+    past, dc, y = state.past, read(state.level, 0, c), read(state.residual, row.HEARD, c)
     deviation = y - commanded
     newer, force = deviation, 0.0 * deviation
     for i in range(len(state.lags)):  # each value is read before its place is taken
@@ -43,8 +43,9 @@ def damp(tables, state, y, c, inner, observed, commanded):
 
 
 @kernel
-def level_pass(numbers, level, error, c, quick):
+def level_pass(numbers, state, c, quick):
     """DC band of type 2, faster where it is `quick`."""
+    level, error = state.level, read(state.residual, row.ERROR, c)
     drift = read(level, 1, c)
     dc, bend = numbers.dc, numbers.dc_drift
     if numbers.presence:

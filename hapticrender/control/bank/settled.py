@@ -10,7 +10,7 @@ from hapticrender.compiled.jit import kernel
 from hapticrender.compiled.lanes import any_of, total, totals
 from hapticrender.compiled.lanes_memory import lanes, put, read, write
 from hapticrender.control.bank import rows as row
-from hapticrender.control.bank.observer import damp
+from hapticrender.control.bank.observer import damp, level_pass
 
 NEAR_LIMIT = 0.5  # share of the drive's limit, from which on its envelope is watched and not its samples alone
 
@@ -35,7 +35,7 @@ def settled_target(state):
 
 
 @kernel
-def settled_residual(tables, state, wanted, y, c, inner):
+def settled_residual(tables, state, wanted, c, inner):
     """Residual of the observer and deviation from the command in coordinate c; see `residual_pass`."""
     band, loop, base = state.band, state.loop, c * row.LOOP_ROWS
     observed = commanded = tables.shape[c] * wanted
@@ -46,8 +46,9 @@ def settled_residual(tables, state, wanted, y, c, inner):
         e_across += lanes(loop, t, base + row.E_IM) * sin
         commanded += lanes(loop, t, base + row.V_RE) * cos
         v_across += lanes(loop, t, base + row.V_IM) * sin
+    y = read(state.residual, row.HEARD, c)
     observed, commanded = totals(y, observed - e_across, commanded - v_across)
-    damp(tables, state, y, c, inner, observed, commanded)
+    damp(tables, state, c, inner, observed, commanded)
 
 
 @kernel
@@ -65,13 +66,13 @@ def settled_observer(tables, state, t, c, g, integral):
 
 @kernel
 def settled_law(tables, state, integral):
-    """F = D (R + v) - ki D' E, turned ahead; adds to the force.  See `law_pass`."""
+    """Force before anything of this sample is heard, D (R + v) - ki (D' + T D) E, turned ahead.  See `law_pass`."""
     band, loop, law, coordinates = state.band, state.loop, state.law, len(tables.shape)
     for c in range(coordinates):
         force = across = 0.0
         for t in range(band.shape[0]):
-            at = row.FIRST_LAW + row.LAW_ROWS * coordinates * coordinates + 2 * c
-            re, im = lanes(law, t, at), lanes(law, t, at + 1)
+            first = row.FIRST_LAW + row.LAW_ROWS * coordinates * coordinates + c * (2 + 2 * coordinates)
+            re, im = lanes(law, t, first), lanes(law, t, first + 1)
             sloped_re = sloped_im = 0.0
             for i in range(coordinates):
                 base, at = i * row.LOOP_ROWS, row.FIRST_LAW + row.LAW_ROWS * (c * coordinates + i)
@@ -82,16 +83,26 @@ def settled_law(tables, state, integral):
                 im += d_re * v_im
                 im += d_im * v_re
                 e_re, e_im = lanes(loop, t, base + row.E_RE), lanes(loop, t, base + row.E_IM)
-                d_re, d_im = lanes(law, t, at + row.SLOPE_RE), lanes(law, t, at + row.SLOPE_IM)
+                d_re, d_im = lanes(law, t, first + 2 + 2 * i), lanes(law, t, first + 3 + 2 * i)
                 sloped_re += d_re * e_re
                 sloped_re -= d_im * e_im
                 sloped_im += d_re * e_im
                 sloped_im += d_im * e_re
             force += (re - integral * sloped_re) * lanes(band, t, row.COS)
             across += (im - integral * sloped_im) * lanes(band, t, row.SIN)
-        along = total(read(state.touch, row.TRUST), force - across)
-        write(read(state.residual, row.FORCE, c) + along, state.residual, row.FORCE, c)
-        write(0.0 * along, state.residual, row.QUADRATURE, c)
+        write(total(read(state.touch, row.TRUST), force - across), state.residual, row.QUADRATURE, c)
+
+
+@kernel
+def settled_force(tables, state, gain):
+    """Force of all bands: what was known before, and what the residuals add."""
+    residual = state.residual
+    for c in range(len(tables.shape)):
+        force = read(residual, row.FORCE, c) + read(residual, row.QUADRATURE, c)
+        for i in range(len(tables.shape)):
+            force -= gain * read(residual, row.ERROR, i) * read(state.answer, c, i)
+        write(force, residual, row.FORCE, c)
+        write(0.0 * force, residual, row.QUADRATURE, c)
 
 
 @kernel
@@ -102,3 +113,16 @@ def settled_command(tables, state, t):
         for r in range(2):
             v = lanes(loop, t, c * row.LOOP_ROWS + row.V_RE + r)
             put(loop, t, c * row.LOOP_ROWS + row.COMMAND_RE + r, v + tables.shape[c] * lanes(band, t, row.R_RE + r))
+
+
+@kernel
+def settled_sample(tables, state, g, integral, inner, quick):
+    """From what is heard to the force, while little happens; what needs no sensor comes first."""
+    settled_law(tables, state, integral)
+    wanted = settled_target(state)
+    for c in range(len(tables.shape)):
+        settled_residual(tables, state, wanted, c, inner)
+        level_pass(tables.numbers, state, c, quick)
+        for t in range(state.band.shape[0]):
+            settled_observer(tables, state, t, c, g, integral)
+    settled_force(tables, state, g * integral)
