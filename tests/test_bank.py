@@ -8,7 +8,9 @@ from naive_bank import NaiveBank
 
 import hapticrender as hr
 from hapticrender.bands import Bands
+from hapticrender.control.bank import rows as row
 from hapticrender.control.bank.finger import TRACKER_POLE
+from hapticrender.control.bank.state import across_bands
 from hapticrender.control.methods import METHODS
 from hapticrender.plants.vibrotactile import Plate, PlateParameters
 from hapticrender.protocols import Flag
@@ -100,6 +102,24 @@ def test_the_runs_went_through_the_slow_detector_too():
     assert "slow" in twin_run(tables, sensed.sensed, sensed.position, np.zeros(SAMPLES))[3]
     assert np.isfinite(tables.numbers.slow_level)
     assert np.isinf(closed("h2", "crowded")[0].numbers.slow_level)
+
+
+@pytest.mark.parametrize("scene", ["wide", "rounded to 12 bit"])
+def test_both_detectors_hear_what_the_twin_hears(scene):
+    """Finger-locked carriers, and fixed ones; the slow detector listens to the fast one, every eighth sample."""
+    bands, plate = SCENES[scene]
+    _, (_, _, _, sensed) = closed("h2", scene)
+    controller = METHODS["h2"].design(PlateParameters(**plate).band_model(RATE, 1), bands)
+    controller.run(sensed.sensed, sensed.position, np.zeros(SAMPLES))
+    twin = NaiveBank(controller.tables, TRACKER_POLE)
+    for n in range(SAMPLES):
+        twin.step(sensed.sensed[n], sensed.position[n], 0.0)
+    for at, heard in ((row.FAST_RE, twin.fast), (row.SLOW_RE, twin.slow)):
+        for c in range(2):
+            re, im = (
+                across_bands(controller.state.loop, c * row.LOOP_ROWS + at + r, controller.n_bands) for r in range(2)
+            )
+            agree(re + 1j * im, heard[c])
 
 
 @pytest.mark.parametrize("method", OURS)

@@ -180,11 +180,9 @@ class AmplitudeLoop:
         amplitude = played(asked * late * whole, 1.0)
         amplitude += self._image(known, played, float(wanted.mean()))
         away = asked * (whole - 1.0)
-        slow, fast = (
-            abs(played(away * pole / (1 - (1 - pole) * np.exp(-1j * turn)), 0.0))
-            for pole in (numbers.slow_pole, numbers.fast_pole)
-        )
-        return abs(amplitude), slow, fast
+        fast, slow = (pole / (1 - (1 - pole) * np.exp(-1j * turn)) for pole in (numbers.fast_pole, numbers.slow_pole))
+        slow = slow * fast  # it listens to the fast one
+        return abs(amplitude), abs(played(away * slow, 0.0)), abs(played(away * fast, 0.0))
 
     def _image(self, offset: Array, played: Callable[[Array, float], Array], steady: float) -> Array:
         """What the corners of the straight line between samples leave of it near minus the carrier, and a ripple.
