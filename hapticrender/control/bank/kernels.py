@@ -14,7 +14,6 @@ import numpy as np
 from hapticrender.compiled.jit import kernel
 from hapticrender.compiled.lanes import any_of, high, low, root, select, size, total, totals
 from hapticrender.compiled.lanes_memory import lanes, put, put_pairs, read, write
-from hapticrender.compiled.polynomials import whole
 from hapticrender.control.bank import rows as row
 from hapticrender.control.bank.carriers import (
     REFRESH,
@@ -32,7 +31,8 @@ from hapticrender.control.bank.detectors import detect
 from hapticrender.control.bank.finger import feel, track_finger
 from hapticrender.control.bank.learning import begin_finger, learn_finger, send_finger
 from hapticrender.control.bank.observer import level_pass, observer_pass, residual_pass
-from hapticrender.control.bank.settled import settled, settled_command, settled_sample
+from hapticrender.control.bank.settled import settled, settled_command, settled_sample, settled_speak
+from hapticrender.control.bank.shaper import shape_pass
 from hapticrender.control.kernels import DOUBT_TIME, FAR
 
 ADAPTATION = 8  # samples between two adaptations of the finger
@@ -123,7 +123,7 @@ def forget(state):
     for t in range(loop.shape[0]):
         for r in range(loop.shape[1]):
             put(loop, t, r, select(lost, 0.0, lanes(loop, t, r)))
-    for array in (state.level, state.past):
+    for array in (state.level, state.past, state.shaper):
         for i in range(array.shape[0]):
             for j in range(array.shape[1]):
                 write(select(lost, 0.0, read(array, i, j)), array, i, j)
@@ -181,15 +181,15 @@ def law_pass(tables, state):
 
 @kernel
 def speak_pass(tables, state, drive):
-    """Drive from force: the whole envelope scaled to the limit, the rounding's noise shaped (2nd order).
+    """Drive from force: the whole envelope scaled to the limit, the rounding's noise shaped.
 
     The envelope is that of the analytic signal, force and its quadrature: steady for a steady tone, so that scaling it
     distorts nothing.
     """
-    numbers, touch, shaper = tables.numbers, state.touch, state.shaper
-    trust, limit, step = read(touch, row.TRUST), numbers.drive_limit, numbers.drive_step
+    numbers, touch = tables.numbers, state.touch
+    trust, limit = read(touch, row.TRUST), numbers.drive_limit
     peak = numbers.peak_decay * numbers.peak_decay * read(touch, row.PEAK)
-    for i in range(shaper.shape[1]):
+    for i in range(tables.speak.shape[0]):
         along = across = 0.0 * trust
         for c in range(len(tables.shape)):
             along += read(tables.speak, i, c) * read(state.residual, row.FORCE, c)
@@ -202,15 +202,8 @@ def speak_pass(tables, state, drive):
     if any_of(peak > 1.0):
         scale = select(peak > 1.0, 1.0 / root(peak), 1.0)
     write(scale, touch, row.SCALE)
-    for i in range(shaper.shape[1]):
-        exact = scale * read(drive, i)
-        if step > 0.0:
-            before, last = read(shaper, 1, i), read(shaper, 0, i)
-            shaped = exact + (2.0 * last - before)
-            exact = select(trust == 0.0, exact, step * whole(shaped, 1.0 / step))
-            write(select(trust == 0.0, 0.0, last), shaper, 1, i)
-            write(select(trust == 0.0, 0.0, low(high(shaped - exact, -step), step)), shaper, 0, i)
-        write(low(high(exact, -limit), limit), drive, i)
+    for i in range(tables.speak.shape[0]):
+        shape_pass(numbers, state.shaper, scale * read(drive, i), drive, i)
     return select(scale < 1.0, 1.0, 0.0)
 
 
@@ -318,7 +311,9 @@ def bank_advance(tables, state, sensed, position, wanted, drive, target):
         settled_sample(tables, state, g, integral, inner, quick)
     else:
         stirred_sample(tables, state, g, integral, inner, back, quick)
-    flags = speak_pass(tables, state, drive) + high(odd, 2.0 * doubt)
+    flags = high(odd, 2.0 * doubt)
+    if not (calmly and settled_speak(tables, state, drive)):
+        flags += speak_pass(tables, state, drive)
     if turn and any_of(touching):
         learn(tables, state, g, inner, calmly, touching)
     detect(tables, state, turn)

@@ -7,10 +7,11 @@ drive's own samples tell enough of its envelope.  What is left of the general st
 from __future__ import annotations
 
 from hapticrender.compiled.jit import kernel
-from hapticrender.compiled.lanes import any_of, total, totals
+from hapticrender.compiled.lanes import any_of, high, total, totals
 from hapticrender.compiled.lanes_memory import lanes, put, read, write
 from hapticrender.control.bank import rows as row
 from hapticrender.control.bank.observer import damp, level_pass
+from hapticrender.control.bank.shaper import shape_pass
 
 NEAR_LIMIT = 0.5  # share of the drive's limit, from which on its envelope is watched and not its samples alone
 
@@ -102,7 +103,28 @@ def settled_force(tables, state, gain):
         for i in range(len(tables.shape)):
             force -= gain * read(residual, row.ERROR, i) * read(state.answer, c, i)
         write(force, residual, row.FORCE, c)
-        write(0.0 * force, residual, row.QUADRATURE, c)
+
+
+@kernel
+def settled_speak(tables, state, drive):
+    """Drive from force, see `speak_pass`; false where it leaves the limit all at once, and has not been spoken."""
+    numbers, touch = tables.numbers, state.touch
+    peak, unit_drive = numbers.peak_decay * numbers.peak_decay * read(touch, row.PEAK), 1.0 / numbers.drive_limit
+    for i in range(tables.speak.shape[0]):
+        along = 0.0 * peak
+        for c in range(len(tables.shape)):
+            along += read(tables.speak, i, c) * read(state.residual, row.FORCE, c)
+        write(along, drive, i)
+        along = unit_drive * along
+        peak = high(peak, along * along)
+    if any_of(peak > 1.0):
+        for c in range(len(tables.shape)):
+            write(0.0 * peak, state.residual, row.QUADRATURE, c)
+        return False
+    write(peak, touch, row.PEAK)
+    for i in range(tables.speak.shape[0]):
+        shape_pass(numbers, state.shaper, read(drive, i), drive, i)
+    return True
 
 
 @kernel
