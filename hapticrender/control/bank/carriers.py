@@ -1,4 +1,4 @@
-"""Carriers of the band bank: their tones, phases and weights, and the law that holds at their frequencies.
+"""Carriers of the band bank: their tones, phases and weights.
 
 A tile's lanes are bands of one scenario, or one band of as many scenarios; only taking up the tones differs.
 """
@@ -8,15 +8,13 @@ from __future__ import annotations
 import numpy as np
 
 from hapticrender.compiled.jit import by_types, kernel
-from hapticrender.compiled.lanes import floor, high, low, select, size, total
-from hapticrender.compiled.lanes_memory import lanes, put, read, write
+from hapticrender.compiled.lanes import floor, high, low, select, size
+from hapticrender.compiled.lanes_memory import lanes, put, read
 from hapticrender.compiled.polynomials import unit
 from hapticrender.control.bank import rows as row
-from hapticrender.control.bank.finger import finger_stiffness
+from hapticrender.control.bank.law import answer_settled, law_settled, law_tune, look_ahead
 from hapticrender.control.kernels import TURN
 
-FORGET = 50.0  # 1/s: a carrier near 0 Hz is forgotten, not followed
-SLOWEST = 0.1  # of the typical speed: a slower contact hardly modulates at all
 REFRESH = 64  # samples between two looks at the tones that are asked for
 
 
@@ -137,118 +135,6 @@ def refresh(tables, state):
             state.follows[1] += 1
     if state.follows[1] == 0:
         answer_settled(tables, state)
-
-
-@kernel
-def look_ahead(numbers, band, law, t):
-    """Turn of a tile's force by delay and hold."""
-    omega, sweep = lanes(band, t, row.OMEGA), lanes(band, t, row.SWEEP)
-    cos, sin = unit(numbers.lead / TURN * (omega + 0.5 * numbers.lead * sweep))
-    half = 0.5 / numbers.rate * omega
-    _, chord = unit(half / TURN)
-    straight = size(half) < 1e-9
-    grow = select(straight, 1.0, half / select(straight, 1.0, chord))
-    put(law, t, row.AHEAD_RE, grow * cos)
-    put(law, t, row.AHEAD_IM, grow * sin)
-
-
-@kernel
-def memory_damping(numbers, track):
-    """Damping of a contact that remembers a length of its way, beyond what it is at the typical speed."""
-    speed = read(track, row.SPEED)  # a finger that turns round at once does not slow down
-    return numbers.memory * (1.0 / high(speed, SLOWEST * numbers.typical_speed) - 1.0 / numbers.typical_speed)
-
-
-@kernel
-def law_tune(tables, state, t):
-    """Law of a tile: D + z h h^T and its slope for every pair of coordinates, turned ahead."""
-    band, law, touch, coordinates = state.band, state.law, state.touch, len(tables.shape)
-    omega, sweep = lanes(band, t, row.OMEGA), lanes(band, t, row.SWEEP)
-    cos, sin = lanes(law, t, row.AHEAD_RE), lanes(law, t, row.AHEAD_IM)
-    touching = read(touch, row.KNOWN)  # 1 where the finger is on, else 0
-    place = read(touch, row.KNOWN_PLACE)
-    skin, drag = touching * read(touch, row.MASS), touching * read(touch, row.DAMPING)
-    z_re, z_im = finger_stiffness(touch, band, t)
-    lag = 0.0 * drag
-    if tables.numbers.memory > 0.0:
-        lag = memory_damping(tables.numbers, state.track)
-        drag = drag + lag
-    for c in range(coordinates):
-        for i in range(coordinates):
-            arms = (1.0 if c == 0 else place) * (1.0 if i == 0 else place)
-            mass, damping = read(tables.mass, c, i) + arms * skin, read(tables.damping, c, i) + arms * drag
-            at = row.FIRST_LAW + row.LAW_ROWS * (c * coordinates + i)
-            re = read(tables.stiffness, c, i) - omega * omega * read(tables.mass, c, i) + arms * touching * z_re
-            im = omega * read(tables.damping, c, i) + arms * (touching * z_im + omega * lag) + sweep * mass
-            put(law, t, at + row.LAW_RE, re * cos - im * sin)
-            put(law, t, at + row.LAW_IM, re * sin + im * cos)
-            turn = 2.0 * omega * mass
-            put(law, t, at + row.SLOPE_RE, damping * cos - turn * sin)
-            put(law, t, at + row.SLOPE_IM, damping * sin + turn * cos)
-
-
-@kernel
-def law_settled(tables, state, t):
-    """What a target that stays makes known of a tile's force: D R, and D' + T D, for what a sample tells.
-
-    With E and v of the last sample the force is D (R + v) - ki (D' + T D) E, and a residual e of this one adds
-    -ki g Re (D' + T D) e, as the carriers are of length 1.
-    """
-    band, law, coordinates, period = state.band, state.law, len(tables.shape), 1.0 / tables.numbers.rate
-    r_re, r_im = lanes(band, t, row.R_RE), lanes(band, t, row.R_IM)
-    for c in range(coordinates):
-        re = im = 0.0 * r_re
-        at = row.FIRST_LAW + row.LAW_ROWS * coordinates * coordinates + c * (2 + 2 * coordinates)
-        for i in range(coordinates):
-            base = row.FIRST_LAW + row.LAW_ROWS * (c * coordinates + i)
-            d_re, d_im = lanes(law, t, base + row.LAW_RE), lanes(law, t, base + row.LAW_IM)
-            re += tables.shape[i] * d_re
-            im += tables.shape[i] * d_im
-            put(law, t, at + 2 + 2 * i, lanes(law, t, base + row.SLOPE_RE) + period * d_re)
-            put(law, t, at + 3 + 2 * i, lanes(law, t, base + row.SLOPE_IM) + period * d_im)
-        put(law, t, at, re * r_re - im * r_im)
-        put(law, t, at + 1, re * r_im + im * r_re)
-
-
-@kernel
-def answer_settled(tables, state):
-    """What the force of all settled tiles answers to a residual, for every pair of coordinates."""
-    band, law, coordinates = state.band, state.law, len(tables.shape)
-    for c in range(coordinates):
-        at = row.FIRST_LAW + row.LAW_ROWS * coordinates * coordinates + c * (2 + 2 * coordinates)
-        for i in range(coordinates):
-            found = 0.0
-            for t in range(band.shape[0]):
-                found += lanes(band, t, row.LIVE) * lanes(law, t, at + 2 + 2 * i)
-            write(total(read(state.touch, row.TRUST), found), state.answer, c, i)
-
-
-@kernel
-def derivative(band, t, re, im):
-    """Envelope of the time derivative: j w times that of a tile's carriers."""
-    omega = lanes(band, t, row.OMEGA)
-    return -omega * im, omega * re
-
-
-@kernel
-def shown_pass(numbers, band, track, t, re, im):
-    """What the sensor shows of a wanted envelope of a tile: before the contact's lag, and late."""
-    omega = lanes(band, t, row.OMEGA)
-    lag = numbers.foresight / high(read(track, row.SPEED), SLOWEST * numbers.typical_speed) * omega
-    cos, sin = unit(-numbers.late / TURN * omega)
-    re, im = re - lag * im, im + lag * re
-    return re * cos - im * sin, re * sin + im * cos
-
-
-@kernel
-def told_pass(numbers, band, track, t, re, im):
-    """What is wanted of a tile where the sensor shows re + j im: the inverse of `shown_pass`."""
-    omega = lanes(band, t, row.OMEGA)
-    lag = numbers.foresight / high(read(track, row.SPEED), SLOWEST * numbers.typical_speed) * omega
-    cos, sin = unit(numbers.late / TURN * omega)
-    re, im = re * cos - im * sin, re * sin + im * cos
-    share = 1.0 / (1.0 + lag * lag)
-    return share * (re + lag * im), share * (im - lag * re)
 
 
 @kernel

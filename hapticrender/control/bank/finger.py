@@ -10,6 +10,7 @@ from hapticrender.control.kernels import FAR, FASTEST, TURN
 
 TRACKER_POLE = TURN * 60.0  # rad/s: triple pole of the finger's tracker; no lag under constant acceleration
 FRESH_TIME = 0.03  # s: for so long after a touch a friction is told from its step
+SLOWEST = 0.1  # of the typical speed: a slower contact hardly modulates at all
 LEAST_LOAD = 0.03  # N: a place is not told by less
 
 

@@ -12,97 +12,21 @@ from __future__ import annotations
 import numpy as np
 
 from hapticrender.compiled.jit import kernel
-from hapticrender.compiled.lanes import any_of, high, low, root, select, size, total, totals
-from hapticrender.compiled.lanes_memory import lanes, put, put_pairs, read, write
+from hapticrender.compiled.lanes import any_of, high, low, root, select, size
+from hapticrender.compiled.lanes_memory import lanes, put, read, write
 from hapticrender.control.bank import rows as row
-from hapticrender.control.bank.carriers import (
-    REFRESH,
-    answer_settled,
-    carrier_pass,
-    derivative,
-    law_settled,
-    law_tune,
-    look_ahead,
-    refresh,
-    shown_pass,
-    told_pass,
-)
+from hapticrender.control.bank.carriers import REFRESH, carrier_pass, refresh
 from hapticrender.control.bank.detectors import detect
 from hapticrender.control.bank.finger import feel, track_finger
+from hapticrender.control.bank.law import know_finger, law_pass
 from hapticrender.control.bank.learning import begin_finger, learn_finger, send_finger
 from hapticrender.control.bank.observer import level_pass, observer_pass, residual_pass
 from hapticrender.control.bank.settled import settled, settled_command, settled_sample, settled_speak
 from hapticrender.control.bank.shaper import shape_pass
+from hapticrender.control.bank.targets import target_all
 from hapticrender.control.kernels import DOUBT_TIME, FAR
 
 ADAPTATION = 8  # samples between two adaptations of the finger
-
-
-@kernel
-def target_pass(tables, state, t, g, wanted, residual, target):
-    """Wanted envelope R and its slope: constant, times `wanted`, or what `wanted` holds (through its `residual`)."""
-    numbers, band = tables.numbers, state.band
-    if state.pace[t] == row.STEADY:
-        put_pairs(target, t, lanes(band, t, row.R_RE), lanes(band, t, row.R_IM))
-        return
-    weight = lanes(band, t, row.WEIGHT)
-    old_re, old_im = lanes(band, t, row.R_RE), lanes(band, t, row.R_IM)
-    if numbers.analysed:
-        raw_re = lanes(band, t, row.RAW_RE) + g * residual * lanes(band, t, row.COS)
-        raw_im = lanes(band, t, row.RAW_IM) - g * residual * lanes(band, t, row.SIN)
-        put(band, t, row.RAW_RE, raw_re)
-        put(band, t, row.RAW_IM, raw_im)
-        if numbers.differentiated:
-            raw_re, raw_im = derivative(band, t, raw_re, raw_im)
-        if numbers.shows:
-            raw_re, raw_im = shown_pass(numbers, band, state.track, t, raw_re, raw_im)
-        follow = 0.5 * g
-        re, im = old_re + follow * (weight * raw_re - old_re), old_im + follow * (weight * raw_im - old_im)
-        told_re, told_im = re, im
-        if numbers.shows:
-            told_re, told_im = told_pass(numbers, band, state.track, t, re, im)
-    else:
-        if numbers.modulated:
-            weight = weight * wanted
-        re, im = weight * lanes(band, t, row.WANTED_RE), weight * lanes(band, t, row.WANTED_IM)
-        if numbers.differentiated:
-            re, im = derivative(band, t, re, im)
-        told_re, told_im = re, im
-        if numbers.shows:
-            re, im = shown_pass(numbers, band, state.track, t, re, im)
-    put_pairs(target, t, told_re, told_im)
-    put(band, t, row.R_RE, re)
-    put(band, t, row.R_IM, im)
-    put(band, t, row.DR_RE, numbers.rate * (re - old_re))
-    put(band, t, row.DR_IM, numbers.rate * (im - old_im))
-    if numbers.error_observer:
-        put(band, t, row.SEEN_RE, re)
-        put(band, t, row.SEEN_IM, im)
-    else:
-        pole = 0.5 * numbers.reference
-        seen_re, seen_im = lanes(band, t, row.SEEN_RE), lanes(band, t, row.SEEN_IM)
-        put(band, t, row.SEEN_RE, seen_re + pole * (re - seen_re))
-        put(band, t, row.SEEN_IM, seen_im + pole * (im - seen_im))
-
-
-@kernel
-def wanted_residual(band, wanted):
-    """What the analysis of the target has not explained of the wanted waveform."""
-    explained = 0.0 * wanted
-    for t in range(band.shape[0]):
-        shown = lanes(band, t, row.RAW_RE) * lanes(band, t, row.COS)
-        explained += total(wanted, shown - lanes(band, t, row.RAW_IM) * lanes(band, t, row.SIN))
-    return wanted - explained
-
-
-@kernel
-def target_all(tables, state, g, wanted, target):
-    """Targets of all tiles; see `target_pass`."""
-    residual = wanted
-    if tables.numbers.analysed:
-        residual = wanted_residual(state.band, wanted)
-    for t in range(state.band.shape[0]):
-        target_pass(tables, state, t, g, wanted, residual, target)
 
 
 @kernel
@@ -127,56 +51,6 @@ def forget(state):
         for i in range(array.shape[0]):
             for j in range(array.shape[1]):
                 write(select(lost, 0.0, read(array, i, j)), array, i, j)
-
-
-@kernel
-def know_finger(tables, state, touching, turn):
-    """Take what is known of the finger into the law: where contact changed, and in its turn; at once where it moves."""
-    touch = state.touch
-    known = select(touching, 1.0, 0.0)
-    due = size(known - read(touch, row.KNOWN)) > 0.5
-    if turn:
-        due = due | touching
-    write(known, touch, row.KNOWN)
-    write(select(due, read(touch, row.PLACE), read(touch, row.KNOWN_PLACE)), touch, row.KNOWN_PLACE)
-    if not any_of(due) and state.follows[0] == 0:
-        return
-    for t in range(state.band.shape[0]):
-        if state.pace[t] == row.LOCKED:
-            look_ahead(tables.numbers, state.band, state.law, t)
-        if any_of(due) or state.pace[t] == row.LOCKED:
-            law_tune(tables, state, t)
-        if state.pace[t] == row.STEADY:
-            law_settled(tables, state, t)
-    if state.follows[1] == 0:
-        answer_settled(tables, state)
-
-
-@kernel
-def law_pass(tables, state):
-    """F = D V + D' dV/dt + j dw/dt M V, finger included, turned ahead by delay and hold; adds to the force."""
-    band, loop, law, coordinates = state.band, state.loop, state.law, len(tables.shape)
-    for c in range(coordinates):
-        force = across = 0.0
-        for t in range(band.shape[0]):
-            re = im = 0.0
-            for i in range(coordinates):
-                base, at = i * row.LOOP_ROWS, row.FIRST_LAW + row.LAW_ROWS * (c * coordinates + i)
-                for d, v in ((row.LAW_RE, row.COMMAND_RE), (row.SLOPE_RE, row.SLOPED_RE)):
-                    d_re, d_im = lanes(law, t, at + d), lanes(law, t, at + d + 1)
-                    v_re, v_im = lanes(loop, t, base + v), lanes(loop, t, base + v + 1)
-                    re += d_re * v_re  # term by term: each is one instruction
-                    re -= d_im * v_im
-                    im += d_re * v_im
-                    im += d_im * v_re
-            cos, sin = lanes(band, t, row.COS), lanes(band, t, row.SIN)
-            force += re * cos
-            force -= im * sin
-            across += re * sin
-            across += im * cos
-        along, quarter = totals(read(state.touch, row.TRUST), force, across)
-        write(read(state.residual, row.FORCE, c) + along, state.residual, row.FORCE, c)
-        write(quarter, state.residual, row.QUADRATURE, c)
 
 
 @kernel

@@ -18,8 +18,8 @@ from hapticrender.compiled.jit import kernel
 from hapticrender.compiled.lanes import high, low, select, total
 from hapticrender.compiled.lanes_memory import lanes, put, read, write
 from hapticrender.control.bank import rows as row
-from hapticrender.control.bank.carriers import memory_damping
 from hapticrender.control.bank.finger import finger_stiffness
+from hapticrender.control.bank.law import memory_damping
 
 FORGOTTEN = 0.9  # of what was before a carrier was all there, until it teaches
 

@@ -22,7 +22,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from hapticrender.control.bandmodel import BandModel
-from hapticrender.control.bank.carriers import FORGET
+from hapticrender.control.bank.observer import FORGET
 from hapticrender.control.margins import (
     Margins,
     borne_errors,

@@ -6,7 +6,8 @@ from hapticrender.compiled.jit import kernel
 from hapticrender.compiled.lanes import select, totals
 from hapticrender.compiled.lanes_memory import lanes, put, read, write
 from hapticrender.control.bank import rows as row
-from hapticrender.control.bank.carriers import FORGET
+
+FORGET = 50.0  # 1/s: a carrier near 0 Hz is forgotten, not followed
 
 
 @kernel

@@ -18,12 +18,15 @@ from hapticrender.compiled.lanes import any_of, floor, high, root, size, totals
 from hapticrender.compiled.lanes_memory import lanes, put, put_pairs
 from hapticrender.compiled.polynomials import unit, whole
 from hapticrender.control.bank import rows as row
-from hapticrender.control.bank.carriers import FORGET, derivative, grow_pass, law_tune, look_ahead, motion_pass
+from hapticrender.control.bank.carriers import grow_pass, motion_pass
 from hapticrender.control.bank.detectors import wake
 from hapticrender.control.bank.finger import feel, track_finger
 from hapticrender.control.bank.kernels import believe, forget
+from hapticrender.control.bank.law import law_tune, look_ahead
 from hapticrender.control.bank.learning import begin_finger, learn_finger, send_finger
+from hapticrender.control.bank.observer import FORGET
 from hapticrender.control.bank.settled import NEAR_LIMIT
+from hapticrender.control.bank.targets import derivative
 from hapticrender.control.blocks.state import (
     CHANNEL_ROWS,
     COSINE,
