@@ -4,14 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from types import ModuleType
 
 import numpy as np
 
 from hapticrender.bands import Bands
 from hapticrender.compiled.lanes import ALIGNMENT, aligned
-from hapticrender.control.bank.batch import LANES, alike, batch_of, side_by_side
+from hapticrender.control.bank import batch as bank
+from hapticrender.control.bank.batch import LANES, side_by_side
 from hapticrender.control.bank.controller import BankController
 from hapticrender.control.methods import method_named
+from hapticrender.control.methods.paper import PolarController
+from hapticrender.control.polar import batch as polar
 from hapticrender.plants.batch_kernels import CENTRE, HOLD, SPAN_ROWS, WINDOW, BatchState, closed_batch_run
 from hapticrender.plants.propagator import COLUMNS, NODES, STATES, WIDEST
 from hapticrender.plants.vibrotactile import Plate, PlateParameters
@@ -19,6 +23,7 @@ from hapticrender.protocols import Array, Controller
 from hapticrender.touch.finger import Finger
 
 CHUNK = 1000  # samples: what is handed to and fro stays in the cache
+FAMILIES: dict[type, ModuleType] = {BankController: bank, PolarController: polar}  # how their controllers are stacked
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -92,7 +97,8 @@ def simulate(scenarios: Sequence[Scenario], seconds: float, *, method: str = "h2
         by one.
     seconds : float, > 0
     method : str
-        Name of the control method; the band bank's methods (h, h2) run side by side.
+        Name of the control method; the band bank's (h, h2) and the polar ones (paper, paper-common, boxcar) run side
+        by side.
 
     Returns
     -------
@@ -116,8 +122,8 @@ def simulate(scenarios: Sequence[Scenario], seconds: float, *, method: str = "h2
     controllers = [scenario.design(method) for scenario in scenarios]
     found: dict[int, Played] = {}
     for group in _groups(scenarios, controllers):
-        few, banks = [scenarios[index] for index in group], [controllers[index] for index in group]
-        played = together(few, banks, seconds) if len(few) > 1 else [_alone(few[0], banks[0], seconds)]
+        few, own = [scenarios[index] for index in group], [controllers[index] for index in group]
+        played = together(few, own, seconds) if len(few) > 1 else [_alone(few[0], own[0], seconds)]
         found |= dict(zip(group, played, strict=True))
     return [found[index] for index in range(len(scenarios))]
 
@@ -139,8 +145,8 @@ def _groups(scenarios: Sequence[Scenario], controllers: Sequence[Controller]) ->
 def _fits(one: Scenario, other: Scenario, mine: Controller, yours: Controller) -> bool:
     same = all(getattr(one.plate, name) == getattr(other.plate, name) for name in ("rate", "delay"))
     flexible = (one.plate.bending_frequency > 0.0) == (other.plate.bending_frequency > 0.0)
-    banks = isinstance(mine, BankController) and isinstance(yours, BankController)
-    return same and flexible and banks and alike(mine, yours)  # type: ignore[arg-type]
+    family = FAMILIES.get(type(mine)) if type(mine) is type(yours) else None
+    return same and flexible and family is not None and family.alike(mine, yours)
 
 
 def _alone(scenario: Scenario, controller: Controller, seconds: float) -> Played:
@@ -162,11 +168,11 @@ def together(scenarios: Sequence[Scenario], controllers: Sequence[Controller], s
     """At most `LANES` scenarios that fit each other."""
     plates = [Plate(each.plate, each.finger, each.seed) for each in scenarios]
     samples = int(round(seconds * plates[0].rate))
-    control, bank = batch_of(controllers)  # type: ignore[arg-type]
+    control, control_state = FAMILIES[type(controllers[0])].batch_of(controllers)
     each = tuple(plate._tables for plate in plates)
     each += (each[-1],) * (LANES - len(each))
     state, work, last = batch_state(plates), plates[0]._state, aligned((2, LANES))
-    target, wanted = aligned((control.tone.shape[0], 2, LANES)), aligned((CHUNK, LANES))
+    target, wanted = aligned((controllers[0].n_bands, 2, LANES)), aligned((CHUNK, LANES))
     noise, finger = aligned((CHUNK, 2, LANES)), aligned((CHUNK, 3, LANES))
     motion, sensed, drive, position, flags = _side_by_side(samples, (3, 2, 2, 1, 1))
     for start in range(0, samples, CHUNK):
@@ -179,7 +185,7 @@ def together(scenarios: Sequence[Scenario], controllers: Sequence[Controller], s
             work,
             state,
             control,
-            bank,
+            control_state,
             last,
             finger[:count],
             noise[:count],

@@ -1,4 +1,4 @@
-"""Compiled plates and fingers of as many scenarios as there are lanes, each closed with a bank of its own.
+"""Compiled plates and fingers of as many scenarios as there are lanes, each closed with a controller of its own.
 
 What a sample does to a plate is kept as polynomials in the finger's place, a lane a scenario: those of the finger's
 window while it slides, and constants while it rests.  A lane whose finger leaves them gets new ones from the kernels
@@ -9,10 +9,13 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from hapticrender.compiled.jit import kernel
+from hapticrender.compiled.jit import by_types, kernel
 from hapticrender.compiled.lanes import any_of, select, size
 from hapticrender.compiled.lanes_memory import read, write
 from hapticrender.control.bank.kernels import bank_advance
+from hapticrender.control.bank.state import BankTables
+from hapticrender.control.polar.kernels import PolarTables
+from hapticrender.control.polar.steps import polar_advance
 from hapticrender.plants.kernels import inside, open_window, plate_drive, sense, series_at
 from hapticrender.plants.propagator import (
     COLUMNS,
@@ -160,11 +163,20 @@ def advance(each, work, numbers, state, position, load, strength):
         propagate(kept, state, each[0].flexible, x, common, opposed, weight)
 
 
+ADVANCES = {PolarTables: polar_advance, BankTables: bank_advance}
+
+
+@by_types
+def control_advance(tables, *rest):
+    """Step of the controllers that `tables` belong to."""
+    return ADVANCES[tables.instance_class]
+
+
 @kernel
 def closed_batch_run(
-    each, work, state, control, bank, last, finger, noise, wanted, sensed, motion, drive, target, flags
+    each, work, state, control, control_state, last, finger, noise, wanted, sensed, motion, drive, target, flags
 ):
-    """Plates and banks closed sample by sample; see `closed_plate_run`.  Every array ends in a lane a scenario.
+    """Plates and controllers closed sample by sample; see `closed_plate_run`.  Every array ends in a lane a scenario.
 
     `finger` is (n, 3, W): position, load, strength; `target` holds the last sample's only, (bands, 2, W); `flags` are
     floats.
@@ -177,5 +189,5 @@ def closed_batch_run(
         advance(each, work, numbers, state, position, read(finger, n, 1), read(finger, n, 2))
         write(read(last, 0), drive, n, 0)
         write(read(last, 1), drive, n, 1)
-        raised += bank_advance(control, bank, sensed[n], position, read(wanted, n), last, target)
+        raised += control_advance(control, control_state, sensed[n], position, read(wanted, n), last, target)
         write(raised, flags, n)

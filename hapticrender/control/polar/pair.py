@@ -8,8 +8,10 @@ hundred cycles long; those of two samples and two sides go on side by side.  It 
 
 from __future__ import annotations
 
+import numpy as np
+
 from hapticrender.compiled.jit import kernel
-from hapticrender.compiled.lanes import size, totals
+from hapticrender.compiled.lanes import select, size, totals
 from hapticrender.compiled.lanes_memory import lanes, put, put_pairs
 from hapticrender.control.polar.kernels import (
     AMOUNT,
@@ -103,8 +105,8 @@ def polar_pair(tables, state, n, sensed, finger, wanted, drive, last, target, fl
     known, limit, plain = recall(state), tables.numbers.sensed_limit, state.doubt[0] == 0.0
     for m in range(2):
         fits = (size(sensed[n + m, 0]) <= limit) & (size(sensed[n + m, 1]) <= limit)  # NaN does not
-        found, known = share(tables, state, m, fits, finger[n + m, 0], wanted[n + m], known)
-        flags[n + m] |= found
+        odd, known = share(tables, state, m, select(fits, 0.0, 2.0), finger[n + m, 0], wanted[n + m], known)
+        flags[n + m] |= np.int64(odd)
         plain = plain and fits
     remember(state, known)
     for t in range(state.band.shape[0]):
@@ -120,6 +122,6 @@ def polar_pair(tables, state, n, sensed, finger, wanted, drive, last, target, fl
             for m in range(2):
                 tile_step(tables, state, t, m, target[n + m])
         first, second = gather(tables, state, 0), gather(tables, state, 1)
-        flags[n] |= speak(tables, state, 0, first[0], first[1], drive[n + 1])
-        flags[n + 1] |= speak(tables, state, 1, second[0], second[1], last)
+        flags[n] |= np.int64(speak(tables, state, 0, first[0], first[1], drive[n + 1]))
+        flags[n + 1] |= np.int64(speak(tables, state, 1, second[0], second[1], last))
     state.sample[0] += 2

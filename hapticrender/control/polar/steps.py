@@ -6,9 +6,11 @@ some hundreds of them only, and what a sample waits for is then hidden behind th
 
 from __future__ import annotations
 
+import numpy as np
+
 from hapticrender.compiled.jit import kernel
-from hapticrender.compiled.lanes import select, totals
-from hapticrender.compiled.lanes_memory import lanes, put, put_pairs
+from hapticrender.compiled.lanes import any_of, high, low, select, size, totals
+from hapticrender.compiled.lanes_memory import lanes, put, put_pairs, read, write
 from hapticrender.compiled.polynomials import cosine, polar
 from hapticrender.control.kernels import QUIET, TURN
 from hapticrender.control.polar.kernels import (
@@ -46,21 +48,22 @@ from hapticrender.control.polar.kernels import (
 
 @kernel
 def hearing(tables, shared, m, sensed):
-    """What the coordinates hear; a sensor beyond its limit counts as zero.  Returns whether all are inside.
+    """What the coordinates hear; a sensor beyond its limit counts as zero.  Returns 0, or 2 where one is.
 
     Two sensors are the usual case, and a loop over them costs more than what it does.
     """
     listen, limit, last = tables.listen, tables.numbers.sensed_limit, sensed.shape[0] - 1
-    fits = (abs(sensed[0]) <= limit) & (abs(sensed[last]) <= limit)  # NaN does not
-    first, second = believed(sensed[0], limit), believed(sensed[last], limit) if last > 0 else 0.0
+    first, second = read(sensed, 0), read(sensed, last)
+    fits = (size(first) <= limit) & (size(second) <= limit)  # NaN does not
+    first, second = believed(first, limit), select(last > 0, believed(second, limit), 0.0)
     for s in range(1, last):
-        fits = fits & (abs(sensed[s]) <= limit)
+        fits = fits & (size(read(sensed, s)) <= limit)
     for c in range(listen.shape[0]):
-        y = listen[c, 0] * first + listen[c, last] * second
+        y = read(listen, c, 0) * first + read(listen, c, last) * second
         for s in range(1, last):
-            y += listen[c, s] * believed(sensed[s], limit)
-        shared[SHARED_ROWS + c, m] = y
-    return fits
+            y += read(listen, c, s) * believed(read(sensed, s), limit)
+        write(y, shared, SHARED_ROWS + c, m)
+    return select(fits, 0.0, 2.0)
 
 
 @kernel
@@ -69,7 +72,7 @@ def usual(tables, state, count):
     numbers = tables.numbers
     fit = numbers.feedback and not numbers.analysed and not numbers.subtract and state.window.shape[0] == 0
     for m in range(count):
-        fit = fit and state.shared[TRUST, m] == 1.0
+        fit = fit and not any_of(read(state.shared, TRUST, m) < 1.0)
     return fit and tables.listen.shape[0] <= 2
 
 
@@ -123,7 +126,7 @@ def answered(numbers, loop, t, base, wanted, found, lag, wish):
 def usual_step(tables, state, t, c, cos, sin, wish):
     """Drive of a tile in coordinate c: `listen` and `answer` where X is counted from what is wanted."""
     numbers, base = tables.numbers, c * LOOP_ROWS
-    gain = 2.0 * numbers.filter[0] * state.shared[SHARED_ROWS + c, 0]
+    gain = 2.0 * numbers.filter[0] * read(state.shared, SHARED_ROWS + c, 0)
     found, lag = heard(numbers, state.loop, t, base, gain, cos, sin)
     return answered(numbers, state.loop, t, base, lanes(state.band, t, AMOUNT), found, lag, wish)
 
@@ -139,7 +142,7 @@ def tiles_step(tables, state, target):
         one += usual_step(tables, state, t, 0, cos, sin, wish)
         if last > 0:
             other += usual_step(tables, state, t, last, cos, sin, wish)
-    return totals(1.0, one, other)
+    return totals(read(state.shared, TRUST, 0), one, other)
 
 
 @kernel
@@ -151,36 +154,38 @@ def gather(tables, state, m):
     shared, coordinates = state.shared, state.sum.shape[0]
     for c in range(0, coordinates, 2):
         d = min(c + 1, coordinates - 1)
-        one, other = totals(1.0, lanes(state.sum, c, m), lanes(state.sum, d, m))
-        shared[SHARED_ROWS + c, m], shared[SHARED_ROWS + d, m] = shared[TRUST, m] * one, shared[TRUST, m] * other
+        trust = read(shared, TRUST, m)
+        one, other = totals(trust, lanes(state.sum, c, m), lanes(state.sum, d, m))
+        write(trust * one, shared, SHARED_ROWS + c, m)
+        write(trust * other, shared, SHARED_ROWS + d, m)
         put(state.sum, c, m, 0.0 * lanes(state.band, 0, LIVE))
         put(state.sum, d, m, 0.0 * lanes(state.band, 0, LIVE))
-    return shared[SHARED_ROWS, m], shared[SHARED_ROWS + min(coordinates - 1, 1), m]
+    return read(shared, SHARED_ROWS, m), read(shared, SHARED_ROWS + min(coordinates - 1, 1), m)
 
 
 @kernel
 def speak(tables, state, m, one, other, drive):
-    """Drive of the channels from that of the coordinates, each cut to its limit.  Returns flags."""
-    limit, flags, coordinates = tables.numbers.drive_limit, 0, tables.listen.shape[0]
+    """Drive of the channels from that of the coordinates, each cut to its limit.  Returns flags, as a float."""
+    limit, flags, coordinates = tables.numbers.drive_limit, 0.0 * one, tables.listen.shape[0]
     for i in range(drive.shape[0]):
         asked = tables.speak[i, 0] * one
         if coordinates > 1:
             asked += tables.speak[i, 1] * other
         for c in range(2, coordinates):
-            asked += tables.speak[i, c] * state.shared[SHARED_ROWS + c, m]
-        drive[i] = min(max(asked, -limit), limit)
-        if drive[i] != asked:
-            flags = 1
+            asked += tables.speak[i, c] * read(state.shared, SHARED_ROWS + c, m)
+        cut = low(high(asked, -limit), limit)
+        write(cut, drive, i)
+        flags = select(cut == asked, flags, 1.0)
     return flags
 
 
 @kernel
-def polar_step(tables, state, sensed, position, wanted, drive, target):
-    """One sample of the whole controller: fills `drive` (channels,) and `target` (bands,), returns flags."""
+def polar_advance(tables, state, sensed, position, wanted, drive, target):
+    """One sample of the whole controller: fills `drive` (channels,) and `target` (bands,), returns flags as a float."""
     if state.sample[0] % REFRESH == 0:
         refresh(tables, state)
-    fits = hearing(tables, state.shared, 0, sensed)
-    flags, known = share(tables, state, 0, fits, position, wanted, recall(state))
+    odd = hearing(tables, state.shared, 0, sensed)
+    flags, known = share(tables, state, 0, odd, position, wanted, recall(state))
     remember(state, known)
     plain = usual(tables, state, 1)
     for t in range(state.band.shape[0]):
@@ -192,4 +197,10 @@ def polar_step(tables, state, sensed, position, wanted, drive, target):
             tile_step(tables, state, t, 0, target)
         one, other = gather(tables, state, 0)
     state.sample[0] += 1
-    return flags | speak(tables, state, 0, one, other, drive)
+    return flags + speak(tables, state, 0, one, other, drive)
+
+
+@kernel
+def polar_step(tables, state, sensed, position, wanted, drive, target):
+    """One sample of a single scenario; see `polar_advance`.  Returns flags."""
+    return np.int64(polar_advance(tables, state, sensed, position, wanted, drive, target))
