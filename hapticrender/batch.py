@@ -16,8 +16,9 @@ from hapticrender.control.bank.controller import BankController
 from hapticrender.control.methods import method_named
 from hapticrender.control.methods.paper import PolarController
 from hapticrender.control.polar import batch as polar
-from hapticrender.plants.batch_kernels import CENTRE, HOLD, SPAN_ROWS, WINDOW, BatchState, closed_batch_run
-from hapticrender.plants.propagator import COLUMNS, NODES, STATES, WIDEST
+from hapticrender.plants.batch_kernels import SHARED, BatchState, closed_batch_run
+from hapticrender.plants.kernels import PlateTables
+from hapticrender.plants.propagator import COLUMNS, FORCES, STATES, shifts
 from hapticrender.plants.vibrotactile import Plate, PlateParameters
 from hapticrender.protocols import Array, Controller
 from hapticrender.touch.finger import Finger
@@ -169,9 +170,7 @@ def together(scenarios: Sequence[Scenario], controllers: Sequence[Controller], s
     plates = [Plate(each.plate, each.finger, each.seed) for each in scenarios]
     samples = int(round(seconds * plates[0].rate))
     control, control_state = FAMILIES[type(controllers[0])].batch_of(controllers)
-    each = tuple(plate._tables for plate in plates)
-    each += (each[-1],) * (LANES - len(each))
-    state, work, last = batch_state(plates), plates[0]._state, aligned((2, LANES))
+    (tables, state), last = batch_state(plates), aligned((2, LANES))
     target, wanted = aligned((controllers[0].n_bands, 2, LANES)), aligned((CHUNK, LANES))
     noise, finger = aligned((CHUNK, 2, LANES)), aligned((CHUNK, 3, LANES))
     motion, sensed, drive, position, flags = _side_by_side(samples, (3, 2, 2, 1, 1))
@@ -181,8 +180,7 @@ def together(scenarios: Sequence[Scenario], controllers: Sequence[Controller], s
         _prepare(plates, start, finger[:count], noise[:count])
         position[part] = finger[:count, :1]
         closed_batch_run(
-            each,
-            work,
+            tables,
             state,
             control,
             control_state,
@@ -233,22 +231,20 @@ def _prepare(plates: Sequence[Plate], start: int, finger: Array, noise: Array) -
             noise[..., lane] = plate._rng.standard_normal((len(finger), 2))
 
 
-def batch_state(plates: Sequence[Plate]) -> BatchState:
-    """State of plates at rest, a lane each; no polynomial holds yet."""
+def batch_state(plates: Sequence[Plate]) -> tuple[PlateTables, BatchState]:
+    """What plates have in common, and their state at rest, a lane each."""
     tables = [plate._tables for plate in plates]
-    names = ("lever", "reach", "amplifier", "current_limit", "current_step", "sensor_limit", "sensor_step")
-    numbers = [
-        [*(getattr(each, name) for name in names), each.sensor_noise, *each.sensor_gain, each.centre_shape]
-        for each in tables
-    ]
-    span = aligned((SPAN_ROWS, LANES))
-    span[CENTRE], span[HOLD], span[WINDOW] = np.inf, -1.0, WIDEST
-    return BatchState(
+    own = [name for name in PlateTables._fields if name not in SHARED]
+    system, finger = aligned((STATES, STATES, LANES)), aligned((2, LANES))
+    system[:], finger[:] = shifts()[..., None], np.inf
+    return tables[0]._replace(terms=max(each.terms for each in tables)), BatchState(
         z=aligned((1, STATES, LANES)),
-        after=aligned((STATES, LANES)),
-        powers=aligned((NODES, COLUMNS * STATES, LANES)),
-        span=span,
-        number=side_by_side([np.array(row) for row in numbers]),
+        system=system,
+        push=aligned((FORCES, 3, LANES)),
+        step=aligned((COLUMNS, STATES, LANES)),
+        finger=finger,
+        rest=np.zeros(1, np.int64),
+        number=side_by_side([np.hstack([getattr(each, name) for name in own]) for each in tables]),
         pending=aligned((plates[0].delay - 1, 2, LANES)),
         cursor=np.zeros(1, np.int64),
         current=aligned((2, LANES)),
