@@ -43,9 +43,9 @@ TARGET_RE, TARGET_IM, AMOUNT, HEADING_RE, HEADING_IM, FRAME_RE, FRAME_IM, FRAME,
 REF_RE1, REF_RE2, REF_IM1, REF_IM2, HERTZ = range(21, 26)
 BAND_ROWS = 26
 # rows of PolarState.loop, LOOP_ROWS for each coordinate: low-pass states, states of amplitude and phase loop, X over
-# the frame; drive per metre from the look-up table, and the device's lag (rad)
-RE1, RE2, IM1, IM2, AMPLITUDE1, AMPLITUDE2, THETA1, THETA2, X_RE, X_IM, DRIVE, LAG = range(12)
-LOOP_ROWS = 12
+# the frame; drive per metre from the look-up table, and the device's lag (rad); amplitude and phase of X on their way
+RE1, RE2, IM1, IM2, AMPLITUDE1, AMPLITUDE2, THETA1, THETA2, X_RE, X_IM, DRIVE, LAG, FOUND, BEHIND = range(14)
+LOOP_ROWS = 14
 # entries of PolarState.finger
 HELD, VELOCITY, GATE, SEEN = range(4)
 # rows of PolarState.shared, one column a sample of a block: what all tiles are told; then one row a coordinate

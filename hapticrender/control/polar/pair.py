@@ -13,6 +13,7 @@ import numpy as np
 from hapticrender.compiled.jit import kernel
 from hapticrender.compiled.lanes import select, size, totals
 from hapticrender.compiled.lanes_memory import lanes, put, put_pairs
+from hapticrender.compiled.polynomials import polar
 from hapticrender.control.polar.kernels import (
     AMOUNT,
     COS,
@@ -60,6 +61,13 @@ def carriers(state, t, number, rate):
 
 
 @kernel
+def compared(numbers, loop, t, base, gain, cos, sin):
+    """Amplitude and phase of what is `heard` (eq. 5)."""
+    im, re = heard(numbers, loop, t, base, gain, cos, sin)
+    return polar(im, re)
+
+
+@kernel
 def tiles_pair(tables, state, sensed, n, target):
     """Drives of two sides in samples n and n + 1 where all is usual and no carrier follows the finger."""
     band, loop, numbers, listen = state.band, state.loop, tables.numbers, tables.listen
@@ -72,10 +80,10 @@ def tiles_pair(tables, state, sensed, n, target):
         put_pairs(target[n], t, re, im)
         put_pairs(target[n + 1], t, re, im)
         (cos, sin, wish), (next_cos, next_sin, hope) = carriers(state, t, state.sample[0] % REFRESH, numbers.rate)
-        a, a_lag = heard(numbers, loop, t, 0, g0 * x0 + g1 * x1, cos, sin)
-        b, b_lag = heard(numbers, loop, t, other_side, h0 * x0 + h1 * x1, cos, sin)
-        c, c_lag = heard(numbers, loop, t, 0, g0 * y0 + g1 * y1, next_cos, next_sin)
-        d, d_lag = heard(numbers, loop, t, other_side, h0 * y0 + h1 * y1, next_cos, next_sin)
+        a, a_lag = compared(numbers, loop, t, 0, g0 * x0 + g1 * x1, cos, sin)
+        b, b_lag = compared(numbers, loop, t, other_side, h0 * x0 + h1 * x1, cos, sin)
+        c, c_lag = compared(numbers, loop, t, 0, g0 * y0 + g1 * y1, next_cos, next_sin)
+        d, d_lag = compared(numbers, loop, t, other_side, h0 * y0 + h1 * y1, next_cos, next_sin)
         wanted = lanes(band, t, AMOUNT)
         one += answered(numbers, loop, t, 0, wanted, a, a_lag, wish)
         other += answered(numbers, loop, t, other_side, wanted, b, b_lag, wish)

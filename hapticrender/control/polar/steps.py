@@ -16,9 +16,11 @@ from hapticrender.control.kernels import QUIET, TURN
 from hapticrender.control.polar.kernels import (
     AMOUNT,
     AMPLITUDE1,
+    BEHIND,
     COS,
     DRIVE,
     FORWARD,
+    FOUND,
     FREQUENCY,
     LIVE,
     LOOP_ROWS,
@@ -77,8 +79,8 @@ def usual(tables, state, count):
 
 
 @kernel
-def carry_on(state, t, number, rate):
-    """Fixed carriers of a tile, and the phase of what is wanted (turns), `number` samples after they were set."""
+def carry_on(state, t, number):
+    """Fixed carriers of a tile, `number` samples after they were set."""
     band = state.band
     cos, sin = lanes(band, t, COS), lanes(band, t, SIN)
     if number > 0:
@@ -86,12 +88,12 @@ def carry_on(state, t, number, rate):
         cos, sin = cos * turn_cos - sin * turn_sin, sin * turn_cos + cos * turn_sin
         put(band, t, COS, cos)
         put(band, t, SIN, sin)
-    return cos, sin, lanes(band, t, START) + (number / rate) * lanes(band, t, FREQUENCY)
+    return cos, sin
 
 
 @kernel
 def heard(numbers, loop, t, base, gain, cos, sin):
-    """Amplitude and phase of X of a tile, counted from what is wanted: `listen` to a coordinate, and eq. 5.
+    """Imaginary and real part of X of a tile, counted from what is wanted: `listen` to a coordinate.
 
     `gain` is 2 b0 times what it hears.  X has a minus in its sine, which is taken away rather than turned round: of one
     number less to repeat in every lane.
@@ -106,7 +108,7 @@ def heard(numbers, loop, t, base, gain, cos, sin):
     put(loop, t, at + 3, slow - (1.0 + section[3] + section[4]) * im)
     put(loop, t, base + X_RE, re)
     put(loop, t, base + X_IM, im)
-    return polar(im, re)
+    return im, re
 
 
 @kernel
@@ -123,25 +125,32 @@ def answered(numbers, loop, t, base, wanted, found, lag, wish):
 
 
 @kernel
-def usual_step(tables, state, t, c, cos, sin, wish):
-    """Drive of a tile in coordinate c: `listen` and `answer` where X is counted from what is wanted."""
-    numbers, base = tables.numbers, c * LOOP_ROWS
-    gain = 2.0 * numbers.filter[0] * read(state.shared, SHARED_ROWS + c, 0)
-    found, lag = heard(numbers, state.loop, t, base, gain, cos, sin)
-    return answered(numbers, state.loop, t, base, lanes(state.band, t, AMOUNT), found, lag, wish)
-
-
-@kernel
 def tiles_step(tables, state, target):
-    """Drive of one or two coordinates where all is usual and no carrier follows the finger."""
-    band, last = state.band, tables.listen.shape[0] - 1
-    one = other = 0.0 * lanes(band, 0, LIVE)
+    """Drive of one or two coordinates where all is usual and no carrier follows the finger.
+
+    In three passes over the tiles: short ones, of which a processor works on several at once.
+    """
+    numbers, band, loop, last = tables.numbers, state.band, state.loop, tables.listen.shape[0] - 1
+    number, twice = state.sample[0] % REFRESH, 2.0 * numbers.filter[0]
+    gain, other_gain = twice * read(state.shared, SHARED_ROWS, 0), twice * read(state.shared, SHARED_ROWS + last, 0)
     for t in range(band.shape[0]):
         put_pairs(target, t, lanes(band, t, TARGET_RE), lanes(band, t, FORWARD) * lanes(band, t, TARGET_IM))
-        cos, sin, wish = carry_on(state, t, state.sample[0] % REFRESH, tables.numbers.rate)
-        one += usual_step(tables, state, t, 0, cos, sin, wish)
+        cos, sin = carry_on(state, t, number)
+        heard(numbers, loop, t, 0, gain, cos, sin)
         if last > 0:
-            other += usual_step(tables, state, t, last, cos, sin, wish)
+            heard(numbers, loop, t, LOOP_ROWS, other_gain, cos, sin)
+    for t in range(band.shape[0]):
+        for base in range(0, loop.shape[1], LOOP_ROWS):
+            found, lag = polar(lanes(loop, t, base + X_IM), lanes(loop, t, base + X_RE))  # eq. 5
+            put(loop, t, base + FOUND, found)
+            put(loop, t, base + BEHIND, lag)
+    one = other = 0.0 * lanes(band, 0, LIVE)
+    for t in range(band.shape[0]):
+        wanted, wish = lanes(band, t, AMOUNT), lanes(band, t, START) + (number / numbers.rate) * lanes(band, t, FREQUENCY)
+        one += answered(numbers, loop, t, 0, wanted, lanes(loop, t, FOUND), lanes(loop, t, BEHIND), wish)
+        if last > 0:
+            found, lag = lanes(loop, t, LOOP_ROWS + FOUND), lanes(loop, t, LOOP_ROWS + BEHIND)
+            other += answered(numbers, loop, t, LOOP_ROWS, wanted, found, lag, wish)
     return totals(read(state.shared, TRUST, 0), one, other)
 
 
