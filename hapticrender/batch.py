@@ -23,7 +23,7 @@ from hapticrender.plants.vibrotactile import Plate, PlateParameters
 from hapticrender.protocols import Array, Controller
 from hapticrender.touch.finger import Finger
 
-CHUNK = 1000  # samples: what is handed to and fro stays in the cache
+CHUNK = 2500  # samples: what is handed over stays in the cache
 FAMILIES: dict[type, ModuleType] = {BankController: bank, PolarController: polar}  # how their controllers are stacked
 
 
@@ -226,15 +226,17 @@ def _prepare(plates: Sequence[Plate], start: int, finger: Array, noise: Array) -
     else:
         for lane in range(LANES):
             finger[..., lane] = plates[min(lane, len(plates) - 1)].finger.touch(time)
-    for lane, plate in enumerate(plates):
-        if plate.parameters.sensor_noise > 0.0:
-            noise[..., lane] = plate._rng.standard_normal((len(finger), 2))
+    if any(plate.parameters.sensor_noise > 0.0 for plate in plates):
+        drawn = np.zeros((LANES, *noise.shape[:-1]))
+        for lane, plate in enumerate(plates):
+            if plate.parameters.sensor_noise > 0.0:
+                plate._rng.standard_normal(out=drawn[lane])
+        noise[:] = np.moveaxis(drawn, 0, -1)
 
 
 def batch_state(plates: Sequence[Plate]) -> tuple[PlateTables, BatchState]:
     """What plates have in common, and their state at rest, a lane each."""
     tables = [plate._tables for plate in plates]
-    own = [name for name in PlateTables._fields if name not in SHARED]
     system, finger = aligned((STATES, STATES, LANES)), aligned((2, LANES))
     system[:], finger[:] = shifts()[..., None], np.inf
     return tables[0]._replace(terms=max(each.terms for each in tables)), BatchState(
@@ -244,8 +246,14 @@ def batch_state(plates: Sequence[Plate]) -> tuple[PlateTables, BatchState]:
         step=aligned((COLUMNS, STATES, LANES)),
         finger=finger,
         rest=np.zeros(1, np.int64),
-        number=side_by_side([np.hstack([getattr(each, name) for name in own]) for each in tables]),
+        number=side_by_side([_numbers(each) for each in tables]),
         pending=aligned((plates[0].delay - 1, 2, LANES)),
         cursor=np.zeros(1, np.int64),
         current=aligned((2, LANES)),
     )
+
+
+def _numbers(tables: PlateTables) -> Array:
+    """Those numbers of a plate that others need not share, one after another."""
+    own = [value for name, value in zip(tables._fields, tables, strict=True) if name not in SHARED]
+    return np.array([number for value in own for number in (value if isinstance(value, tuple) else (value,))])

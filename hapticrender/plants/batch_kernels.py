@@ -99,7 +99,7 @@ def keep(z, array, j):
 
 @kernel
 def plus(z, share, more):
-    """z + share * more, state by state."""
+    """State by state z + share * more."""
     return (
         z[0] + share * more[0],
         z[1] + share * more[1],

@@ -10,11 +10,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from hapticrender.compiled.lanes import WIDTH, aligned
-from hapticrender.control.bank.batch import side_by_side
+from hapticrender.compiled.lanes import aligned
+from hapticrender.control.bank.batch import LANES, side_by_side
 from hapticrender.control.methods.paper import PolarController, polar_state
 from hapticrender.control.polar.kernels import PolarState, PolarTables
-from hapticrender.protocols import Array
 
 
 def alike(first: PolarController, other: PolarController) -> bool:
@@ -24,27 +23,23 @@ def alike(first: PolarController, other: PolarController) -> bool:
     heard = first.state.window.shape == other.state.window.shape
     fresh = first.state.sample[0] == other.state.sample[0] == 0
     double = first.state.band.dtype == other.state.band.dtype == np.float64
-    return mine.numbers == yours.numbers and np.array_equal(mine.speak, yours.speak) and shapes and heard and fresh and double
+    numbers = mine.numbers == yours.numbers and np.array_equal(mine.speak, yours.speak)
+    return numbers and shapes and heard and fresh and double
 
 
 def batch_of(controllers: Sequence[PolarController]) -> tuple[PolarTables, PolarState]:
     """Tables and state of at most `LANES` controllers at rest that are `alike`, a lane each."""
-    first = controllers[0]
+    first, every = controllers[0], [*controllers, *[controllers[-1]] * (LANES - len(controllers))]
+    tones = side_by_side([each.tables.tone for each in controllers])  # (TONE_ROWS, bands, W)
     tables = first.tables._replace(
-        tone=_interleaved([each.tables.tone.T for each in controllers]).T.copy(),
+        tone=tones.reshape(len(tones), -1),
         listen=side_by_side([each.tables.listen for each in controllers]),
-        gain=_interleaved([each.tables.gain for each in controllers]),
-        lag=_interleaved([each.tables.lag for each in controllers]),
+        gain=np.concatenate([each.tables.gain for each in every]),
+        lag=np.concatenate([each.tables.lag for each in every]),
     )
-    state, lanes = polar_state(tables, len(first.state.window), float), WIDTH[np.dtype(float)]
+    state = polar_state(tables, len(first.state.window), float)
     return tables, state._replace(
-        finger=aligned((*state.finger.shape, lanes)),
-        doubt=aligned((*state.doubt.shape, lanes)),
-        shared=aligned((len(state.shared), 1, lanes)),
+        finger=aligned((*state.finger.shape, LANES)),
+        doubt=aligned((*state.doubt.shape, LANES)),
+        shared=aligned((len(state.shared), 1, LANES)),
     )
-
-
-def _interleaved(arrays: Sequence[Array]) -> Array:
-    """Rows of as many arrays as there are lanes in turns: the first of each, the second of each."""
-    stacked = np.moveaxis(side_by_side(arrays), -1, 1)
-    return np.ascontiguousarray(stacked.reshape(-1, stacked.shape[-1]))

@@ -78,7 +78,7 @@ class PolarTables(NamedTuple):
     tone: Array  # (5, bands)
     listen: Array  # (coordinates, sensors)
     speak: Array  # (channels, coordinates)
-    gain: Array  # (coordinates, table), m per drive unit; side by side (coordinates * W, table)
+    gain: Array  # (coordinates, table), m per drive unit; scenario by scenario where they are side by side
     lag: Array  # the same, rad: phase of the free device
 
 
@@ -143,7 +143,7 @@ def look_up(tables, state, t, i, frequency):
     coordinates, step = tables.listen.shape[0], tables.numbers.table_step
     many = tables.gain.shape[0] // coordinates
     for c in range(coordinates):
-        at, row = c * LOOP_ROWS, c * many + i % many
+        at, row = c * LOOP_ROWS, i % many * coordinates + c
         state.loop[t, at + DRIVE, i] = 1.0 / lookup(tables.gain, row, step, frequency)
         state.loop[t, at + LAG, i] = lookup(tables.lag, row, step, frequency)
 

@@ -112,6 +112,14 @@ def heard(numbers, loop, t, base, gain, cos, sin):
 
 
 @kernel
+def compare(loop, t, base):
+    """Amplitude and phase of X of a tile, which is counted from what is wanted (eq. 5)."""
+    found, lag = polar(lanes(loop, t, base + X_IM), lanes(loop, t, base + X_RE))
+    put(loop, t, base + FOUND, found)
+    put(loop, t, base + BEHIND, lag)
+
+
+@kernel
 def answered(numbers, loop, t, base, wanted, found, lag, wish):
     """Drive of a tile in a coordinate: `answer` to an amplitude and a phase."""
     law, at, to, sounds = numbers.law, base + AMPLITUDE1, base + THETA1, select(wanted > QUIET, 1.0, 0.0 * wanted)
@@ -128,25 +136,26 @@ def answered(numbers, loop, t, base, wanted, found, lag, wish):
 def tiles_step(tables, state, target):
     """Drive of one or two coordinates where all is usual and no carrier follows the finger.
 
-    In three passes over the tiles: short ones, of which a processor works on several at once.
+    In three passes: of short ones a processor works on several tiles at once.
     """
     numbers, band, loop, last = tables.numbers, state.band, state.loop, tables.listen.shape[0] - 1
     number, twice = state.sample[0] % REFRESH, 2.0 * numbers.filter[0]
     gain, other_gain = twice * read(state.shared, SHARED_ROWS, 0), twice * read(state.shared, SHARED_ROWS + last, 0)
     for t in range(band.shape[0]):
-        put_pairs(target, t, lanes(band, t, TARGET_RE), lanes(band, t, FORWARD) * lanes(band, t, TARGET_IM))
+        if number == 0 or target.ndim == 1:  # scenarios side by side keep the last one's only
+            put_pairs(target, t, lanes(band, t, TARGET_RE), lanes(band, t, FORWARD) * lanes(band, t, TARGET_IM))
         cos, sin = carry_on(state, t, number)
         heard(numbers, loop, t, 0, gain, cos, sin)
         if last > 0:
             heard(numbers, loop, t, LOOP_ROWS, other_gain, cos, sin)
     for t in range(band.shape[0]):
-        for base in range(0, loop.shape[1], LOOP_ROWS):
-            found, lag = polar(lanes(loop, t, base + X_IM), lanes(loop, t, base + X_RE))  # eq. 5
-            put(loop, t, base + FOUND, found)
-            put(loop, t, base + BEHIND, lag)
+        compare(loop, t, 0)
+        if last > 0:
+            compare(loop, t, LOOP_ROWS)
     one = other = 0.0 * lanes(band, 0, LIVE)
+    elapsed = number / numbers.rate
     for t in range(band.shape[0]):
-        wanted, wish = lanes(band, t, AMOUNT), lanes(band, t, START) + (number / numbers.rate) * lanes(band, t, FREQUENCY)
+        wanted, wish = lanes(band, t, AMOUNT), lanes(band, t, START) + elapsed * lanes(band, t, FREQUENCY)
         one += answered(numbers, loop, t, 0, wanted, lanes(loop, t, FOUND), lanes(loop, t, BEHIND), wish)
         if last > 0:
             found, lag = lanes(loop, t, LOOP_ROWS + FOUND), lanes(loop, t, LOOP_ROWS + BEHIND)
