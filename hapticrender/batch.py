@@ -230,7 +230,7 @@ def _prepare(plates: Sequence[Plate], start: int, finger: Array, noise: Array) -
         drawn = np.zeros((LANES, *noise.shape[:-1]))
         for lane, plate in enumerate(plates):
             if plate.parameters.sensor_noise > 0.0:
-                plate._rng.standard_normal(out=drawn[lane])
+                plate._noise.fill(drawn[lane])
         noise[:] = np.moveaxis(drawn, 0, -1)
 
 
