@@ -173,12 +173,16 @@ def together(scenarios: Sequence[Scenario], controllers: Sequence[Controller], s
     (tables, state), last = batch_state(plates), aligned((2, LANES))
     target, wanted = aligned((controllers[0].n_bands, 2, LANES)), aligned((CHUNK, LANES))
     noise, finger = aligned((CHUNK, 2, LANES)), aligned((CHUNK, 3, LANES))
-    motion, sensed, drive, position, flags = _side_by_side(samples, (3, 2, 2, 1, 1))
+    motion, sensed, drive, flags = _side_by_side(samples, (3, 2, 2, 1))
+    fingers = _fingers(plates)
+    position = np.empty((len(fingers), samples))
     for start in range(0, samples, CHUNK):
         part = slice(start, min(start + CHUNK, samples))
         count = part.stop - start
-        _prepare(plates, start, finger[:count], noise[:count])
-        position[part] = finger[:count, :1]
+        time = np.arange(part.start, part.stop) / plates[0].rate
+        touch = np.stack([each.touch(time) for each in fingers])
+        position[:, part], finger[:count] = touch[..., 0], np.moveaxis(touch, 0, -1)
+        _draw(plates, noise[:count])
         closed_batch_run(
             tables,
             state,
@@ -194,14 +198,15 @@ def together(scenarios: Sequence[Scenario], controllers: Sequence[Controller], s
             target,
             flags[part, 0],
         )
+    raised = flags[:, 0].astype(np.int64)
     return [
         Played(
             scenario=scenario,
             motion=motion[..., lane],
-            position=position[:, 0, lane],
+            position=position[min(lane, len(fingers) - 1)],
             drive=drive[..., lane],
             sensed=sensed[..., lane],
-            flags=flags[:, 0, lane].astype(np.int64),
+            flags=raised[:, lane],
         )
         for lane, scenario in enumerate(scenarios)
     ]
@@ -218,14 +223,14 @@ def _side_by_side(samples: int, widths: Sequence[int]) -> Iterator[Array]:
         start += size
 
 
-def _prepare(plates: Sequence[Plate], start: int, finger: Array, noise: Array) -> None:
-    """Fingers and noise of every lane from sample `start` on; a finger that all lanes share is asked once."""
-    time = (start + np.arange(len(finger))) / plates[0].rate
-    if all(plate.finger is plates[0].finger for plate in plates):
-        finger[:] = plates[0].finger.touch(time)[..., None]
-    else:
-        for lane in range(LANES):
-            finger[..., lane] = plates[min(lane, len(plates) - 1)].finger.touch(time)
+def _fingers(plates: Sequence[Plate]) -> list[Finger]:
+    """Fingers of the lanes, or the one that all of them share: it is asked once."""
+    every = [plates[min(lane, len(plates) - 1)].finger for lane in range(LANES)]
+    return every[:1] if all(each is every[0] for each in every) else every
+
+
+def _draw(plates: Sequence[Plate], noise: Array) -> None:
+    """Noise of every lane that has any."""
     if any(plate.parameters.sensor_noise > 0.0 for plate in plates):
         drawn = np.zeros((LANES, *noise.shape[:-1]))
         for lane, plate in enumerate(plates):

@@ -114,13 +114,14 @@ def plus(z, share, more):
 
 @kernel
 def row_times(flexible, system, row, z):
-    """Row of A z."""
-    early = read(system, 0, row) * z[0] + read(system, 1, row) * z[1] + read(system, 2, row) * z[2]
-    late = read(system, 3, row) * z[3] + read(system, 4, row) * z[4] + read(system, 5, row) * z[5]
+    """Row of A z; the rates come last, as in a series they are known last."""
+    value = read(system, 0, row) * z[0] + read(system, 1, row) * z[1] + read(system, 2, row) * z[2]
     if flexible:
-        early += read(system, 6, row) * z[6]
-        late += read(system, 7, row) * z[7]
-    return early + late
+        value += read(system, 6, row) * z[6]
+        value += read(system, 7, row) * z[7]
+    value += read(system, 3, row) * z[3]
+    value += read(system, 4, row) * z[4]
+    return value + read(system, 5, row) * z[5]
 
 
 @kernel
@@ -141,17 +142,20 @@ def forced(push, row, common, opposed, weight):
 
 @kernel
 def grown(tables, state, z, common, opposed, weight):
-    """What a sample makes of z: z + (1 + A/2! + A^2/3! ...) (A z + B f), from the last term on."""
+    """What a sample makes of z: z + (1 + A/2! + A^2/3! ...) (A z + B f)."""
     flexible, system, push = tables.flexible, state.system, state.push
     heave, rocking = forced(push, 0, common, opposed, weight), forced(push, 1, common, opposed, weight)
     bending, nothing = 0.0 * heave, 0.0 * heave
     if flexible:
         bending = forced(push, 2, common, opposed, weight)
     forces = (nothing, nothing, nothing, heave, rocking, nothing, nothing, bending)
-    first = more = plus(forces, 1.0, changes(flexible, system, z))
-    for k in range(tables.terms, 1, -1):
-        more = plus(first, 1.0 / k, changes(flexible, system, more))
-    return plus(z, 1.0, more)
+    term = plus(forces, 1.0, changes(flexible, system, z))
+    value, share = plus(z, 1.0, term), 1.0
+    for k in range(2, tables.terms + 1):
+        term = changes(flexible, system, term)
+        share *= 1.0 / k
+        value = plus(value, share, term)
+    return value
 
 
 @kernel
