@@ -17,7 +17,7 @@ from pairing import CORES, interleave, use
 from peers import Absent, PythonControl, ScipyLockIn, SlidingDFT
 from scenes import Batch, absent
 
-from hapticrender.batch import LANES, simulate
+from hapticrender.batch import LANES
 from hapticrender.control.analyser import Analyser
 from hapticrender.control.blocks.kernels import block_run
 from hapticrender.control.polar.passes import polar_run
@@ -175,18 +175,15 @@ def analysis(bands: int, pairs: int) -> Iterator[Figure]:
 
 def batches(method: str, seconds: float, pairs: int) -> Iterator[Figure]:
     """Scenarios side by side on one core, 8 bands."""
+    samples = int(seconds * scenes.PLATE.rate)
     for what, finger, noise in (
         ("free plate, ideal sensors", absent(), 0.0),
         ("heavy finger at rest, ideal sensors", scenes.RESTING, 0.0),
         ("heavy finger sliding, noise drawn", scenes.TOUCHING, scenes.PLATE.sensor_noise),
     ):
         many = scenes.scenarios(LANES, finger, noise)
-        run = Batch(many, method)
-        paired = interleave(
-            lambda run=run: run.advance(seconds),
-            lambda many=many: simulate(many[:1], seconds, method=method),
-            pairs,
-        )
+        run, one_by_one = Batch(many, method), scenes.closed_loop(method, 8, samples, finger, many[0].plate)
+        paired = interleave(lambda run=run: run.advance(seconds), one_by_one, pairs)
         rate, one = LANES * seconds / paired.candidate, seconds / paired.reference
         name, who = f"batch, 8 bands, {method}, {what}", "scenario-seconds a second and core"
         yield Figure(name, rate, "s/s", 5000.0, True, who, f"{rate / one:.1f}x one by one")
