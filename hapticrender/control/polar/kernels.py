@@ -262,14 +262,13 @@ def refresh(tables, state):
 @kernel
 def follow_finger(rate, held, velocity, gate, seen, position):
     """Hold the position while the finger is away, smooth its velocity, open the gate with contact."""
-    leapt = (seen > 0.0) & (size(position - held) * rate > FASTEST)
-    now = select(leapt, 0.0, select(size(position) <= FAR, 1.0, 0.0))
-    here = now > 0.0
+    stays = (seen <= 0.0) | (size(position - held) * rate <= FASTEST)
+    here = (size(position) <= FAR) & stays
     speed = select(here & (seen > 0.0), (position - held) * rate, 0.0)
     velocity += (1.0 - math.exp(-TURN * VELOCITY_POLE / rate)) * (speed - velocity)
     ramp = 1.0 / (GATE_TIME * rate)
     gate = select(here, low(gate + ramp, 1.0), high(gate - ramp, 0.0))
-    return select(here, position, held), velocity, gate, now
+    return select(here, position, held), velocity, gate, select(here, 1.0, 0.0)
 
 
 @kernel
