@@ -75,6 +75,23 @@ def test_a_lane_is_the_run_of_its_scenario(method, changes):
         assert_alike(found, alone(scenario, 0.5, method))
 
 
+@pytest.mark.parametrize("changes", [{}, {"bending_frequency": 1250.0, "bending_coil": 0.1}], ids=["rigid", "bending"])
+def test_fingers_that_rest_keep_what_a_sample_does(changes):
+    """Each in a place of its own, some lifted and put down again: all rest most of the time."""
+    resting = [
+        hr.Finger.still(place, normal_load=0.5, mechanics=mechanics, touches=touches)
+        for place, mechanics, touches in (
+            (0.0, HEAVY, None),
+            (15e-3, LIGHT_SECOND, ((0.05, 0.2), (0.202, 9.0))),
+            (-20e-3, LIGHT, ((0.1, 9.0),)),
+        )
+    ]
+    plate = replace(IDEAL, **changes)
+    wanted = [Scenario(bands=BANDS, finger=finger, plate=plate) for finger in resting]
+    for scenario, found in zip(wanted, simulate(wanted, 0.4), strict=True):
+        assert_alike(found, alone(scenario, 0.4))
+
+
 @pytest.mark.parametrize("method", ["paper-common", "boxcar"])
 def test_the_other_polar_methods_run_side_by_side(method, monkeypatch):
     """Other targets in every lane, and devices known better or worse: look-ups differ."""
