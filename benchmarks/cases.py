@@ -17,7 +17,7 @@ from pairing import CORES, interleave, use
 from peers import Absent, PythonControl, ScipyLockIn, SlidingDFT
 from scenes import Batch, absent
 
-from hapticrender.batch import LANES, simulate
+from hapticrender.batch import LANES
 from hapticrender.control.analyser import Analyser
 from hapticrender.control.blocks.kernels import block_run
 from hapticrender.control.polar.passes import polar_run
@@ -173,19 +173,24 @@ def analysis(bands: int, pairs: int) -> Iterator[Figure]:
         yield Figure(f"analysis alone, {bands} bands: times faster than", paired.ratio, "x", goal, True, who, note)
 
 
-def batches(seconds: float, pairs: int) -> Iterator[Figure]:
-    """Scenarios side by side on one core, 8 bands, default method; then a sweep on two processes over one."""
+def batches(method: str, seconds: float, pairs: int) -> Iterator[Figure]:
+    """Scenarios side by side on one core, 8 bands."""
+    samples = int(seconds * scenes.PLATE.rate)
     for what, finger, noise in (
         ("free plate, ideal sensors", absent(), 0.0),
         ("heavy finger at rest, ideal sensors", scenes.RESTING, 0.0),
         ("heavy finger sliding, noise drawn", scenes.TOUCHING, scenes.PLATE.sensor_noise),
     ):
         many = scenes.scenarios(LANES, finger, noise)
-        run = Batch(many)
-        paired = interleave(lambda run=run: run.advance(seconds), lambda many=many: simulate(many[:1], seconds), pairs)
+        run, one_by_one = Batch(many, method), scenes.closed_loop(method, 8, samples, finger, many[0].plate)
+        paired = interleave(lambda run=run: run.advance(seconds), one_by_one, pairs)
         rate, one = LANES * seconds / paired.candidate, seconds / paired.reference
-        note = f"{rate / one:.1f}x one by one"
-        yield Figure(f"batch, 8 bands, {what}", rate, "s/s", 5000.0, True, "scenario-seconds a second and core", note)
+        name, who = f"batch, 8 bands, {method}, {what}", "scenario-seconds a second and core"
+        yield Figure(name, rate, "s/s", 5000.0, True, who, f"{rate / one:.1f}x one by one")
+
+
+def on_two_cores(seconds: float, pairs: int) -> Iterator[Figure]:
+    """A sweep of the default method on two processes over one."""
     if len(CORES) < 2:
         return
     many = scenes.scenarios(8 * LANES, scenes.TOUCHING, scenes.PLATE.sensor_noise)
@@ -262,7 +267,9 @@ def every_case(short: bool) -> Iterator[tuple[str, Callable[[], Iterator[Figure]
         yield f"simulation {method}", lambda m=method, g=goal, s=seconds: simulation(m, g, s, pairs)
     for bands in (64,) if short else (8, 64, 512):
         yield f"peers analysis {bands}", lambda b=bands: analysis(b, pairs)
-    yield "batch", lambda: batches(1.0 if short else 2.0, pairs)
+    for method in ("h2", "paper"):
+        yield f"batch {method}", lambda m=method: batches(m, 1.0 if short else 2.0, pairs)
+    yield "batch on two cores", lambda: on_two_cores(1.0 if short else 2.0, pairs)
     yield "linear", lambda: linear_in_bands(pairs)
     yield "hours", lambda: hours_of_play(0.01 if short else 10.0)
     yield "startup", lambda: start_up(1 if short else 5)

@@ -80,9 +80,9 @@ def scenarios(count, finger, noise):
 class Batch:
     """Scenarios side by side, designed already: what `simulate` does a chunk at a time."""
 
-    def __init__(self, many):
+    def __init__(self, many, method):
         self.many = many
-        self.controllers = [each.design("h2") for each in many]
+        self.controllers = [each.design(method) for each in many]
 
     def advance(self, seconds):
         """Play them from the start."""

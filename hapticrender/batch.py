@@ -4,21 +4,27 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from types import ModuleType
 
 import numpy as np
 
 from hapticrender.bands import Bands
 from hapticrender.compiled.lanes import ALIGNMENT, aligned
-from hapticrender.control.bank.batch import LANES, alike, batch_of, side_by_side
+from hapticrender.control.bank import batch as bank
+from hapticrender.control.bank.batch import LANES, side_by_side
 from hapticrender.control.bank.controller import BankController
 from hapticrender.control.methods import method_named
-from hapticrender.plants.batch_kernels import CENTRE, HOLD, SPAN_ROWS, WINDOW, BatchState, closed_batch_run
-from hapticrender.plants.propagator import COLUMNS, NODES, STATES, WIDEST
+from hapticrender.control.methods.paper import PolarController
+from hapticrender.control.polar import batch as polar
+from hapticrender.plants.batch_kernels import SHARED, BatchState, closed_batch_run
+from hapticrender.plants.kernels import PlateTables
+from hapticrender.plants.propagator import COLUMNS, FORCES, STATES, shifts
 from hapticrender.plants.vibrotactile import Plate, PlateParameters
 from hapticrender.protocols import Array, Controller
 from hapticrender.touch.finger import Finger
 
-CHUNK = 1000  # samples: what is handed to and fro stays in the cache
+CHUNK = 2500  # samples: what is handed over stays in the cache
+FAMILIES: dict[type, ModuleType] = {BankController: bank, PolarController: polar}  # how their controllers are stacked
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -92,7 +98,8 @@ def simulate(scenarios: Sequence[Scenario], seconds: float, *, method: str = "h2
         by one.
     seconds : float, > 0
     method : str
-        Name of the control method; the band bank's methods (h, h2) run side by side.
+        Name of the control method; the band bank's (h, h2) and the polar ones (paper, paper-common, boxcar) run side
+        by side.
 
     Returns
     -------
@@ -116,8 +123,8 @@ def simulate(scenarios: Sequence[Scenario], seconds: float, *, method: str = "h2
     controllers = [scenario.design(method) for scenario in scenarios]
     found: dict[int, Played] = {}
     for group in _groups(scenarios, controllers):
-        few, banks = [scenarios[index] for index in group], [controllers[index] for index in group]
-        played = together(few, banks, seconds) if len(few) > 1 else [_alone(few[0], banks[0], seconds)]
+        few, own = [scenarios[index] for index in group], [controllers[index] for index in group]
+        played = together(few, own, seconds) if len(few) > 1 else [_alone(few[0], own[0], seconds)]
         found |= dict(zip(group, played, strict=True))
     return [found[index] for index in range(len(scenarios))]
 
@@ -139,8 +146,8 @@ def _groups(scenarios: Sequence[Scenario], controllers: Sequence[Controller]) ->
 def _fits(one: Scenario, other: Scenario, mine: Controller, yours: Controller) -> bool:
     same = all(getattr(one.plate, name) == getattr(other.plate, name) for name in ("rate", "delay"))
     flexible = (one.plate.bending_frequency > 0.0) == (other.plate.bending_frequency > 0.0)
-    banks = isinstance(mine, BankController) and isinstance(yours, BankController)
-    return same and flexible and banks and alike(mine, yours)  # type: ignore[arg-type]
+    family = FAMILIES.get(type(mine)) if type(mine) is type(yours) else None
+    return same and flexible and family is not None and family.alike(mine, yours)
 
 
 def _alone(scenario: Scenario, controller: Controller, seconds: float) -> Played:
@@ -162,24 +169,25 @@ def together(scenarios: Sequence[Scenario], controllers: Sequence[Controller], s
     """At most `LANES` scenarios that fit each other."""
     plates = [Plate(each.plate, each.finger, each.seed) for each in scenarios]
     samples = int(round(seconds * plates[0].rate))
-    control, bank = batch_of(controllers)  # type: ignore[arg-type]
-    each = tuple(plate._tables for plate in plates)
-    each += (each[-1],) * (LANES - len(each))
-    state, work, last = batch_state(plates), plates[0]._state, aligned((2, LANES))
-    target, wanted = aligned((control.tone.shape[0], 2, LANES)), aligned((CHUNK, LANES))
+    control, control_state = FAMILIES[type(controllers[0])].batch_of(controllers)
+    (tables, state), last = batch_state(plates), aligned((2, LANES))
+    target, wanted = aligned((controllers[0].n_bands, 2, LANES)), aligned((CHUNK, LANES))
     noise, finger = aligned((CHUNK, 2, LANES)), aligned((CHUNK, 3, LANES))
-    motion, sensed, drive, position, flags = _side_by_side(samples, (3, 2, 2, 1, 1))
+    motion, sensed, drive, flags = _side_by_side(samples, (3, 2, 2, 1))
+    fingers = _fingers(plates)
+    position = np.empty((len(fingers), samples))
     for start in range(0, samples, CHUNK):
         part = slice(start, min(start + CHUNK, samples))
         count = part.stop - start
-        _prepare(plates, start, finger[:count], noise[:count])
-        position[part] = finger[:count, :1]
+        time = np.arange(part.start, part.stop) / plates[0].rate
+        touch = np.stack([each.touch(time) for each in fingers])
+        position[:, part], finger[:count] = touch[..., 0], np.moveaxis(touch, 0, -1)
+        _draw(plates, noise[:count])
         closed_batch_run(
-            each,
-            work,
+            tables,
             state,
             control,
-            bank,
+            control_state,
             last,
             finger[:count],
             noise[:count],
@@ -190,14 +198,15 @@ def together(scenarios: Sequence[Scenario], controllers: Sequence[Controller], s
             target,
             flags[part, 0],
         )
+    raised = flags[:, 0].astype(np.int64)
     return [
         Played(
             scenario=scenario,
             motion=motion[..., lane],
-            position=position[:, 0, lane],
+            position=position[min(lane, len(fingers) - 1)],
             drive=drive[..., lane],
             sensed=sensed[..., lane],
-            flags=flags[:, 0, lane].astype(np.int64),
+            flags=raised[:, lane],
         )
         for lane, scenario in enumerate(scenarios)
     ]
@@ -214,36 +223,42 @@ def _side_by_side(samples: int, widths: Sequence[int]) -> Iterator[Array]:
         start += size
 
 
-def _prepare(plates: Sequence[Plate], start: int, finger: Array, noise: Array) -> None:
-    """Fingers and noise of every lane from sample `start` on; a finger that all lanes share is asked once."""
-    time = (start + np.arange(len(finger))) / plates[0].rate
-    if all(plate.finger is plates[0].finger for plate in plates):
-        finger[:] = plates[0].finger.touch(time)[..., None]
-    else:
-        for lane in range(LANES):
-            finger[..., lane] = plates[min(lane, len(plates) - 1)].finger.touch(time)
-    for lane, plate in enumerate(plates):
-        if plate.parameters.sensor_noise > 0.0:
-            noise[..., lane] = plate._rng.standard_normal((len(finger), 2))
+def _fingers(plates: Sequence[Plate]) -> list[Finger]:
+    """Fingers of the lanes, or the one that all of them share: it is asked once."""
+    every = [plates[min(lane, len(plates) - 1)].finger for lane in range(LANES)]
+    return every[:1] if all(each is every[0] for each in every) else every
 
 
-def batch_state(plates: Sequence[Plate]) -> BatchState:
-    """State of plates at rest, a lane each; no polynomial holds yet."""
+def _draw(plates: Sequence[Plate], noise: Array) -> None:
+    """Noise of every lane that has any."""
+    if any(plate.parameters.sensor_noise > 0.0 for plate in plates):
+        drawn = np.zeros((LANES, *noise.shape[:-1]))
+        for lane, plate in enumerate(plates):
+            if plate.parameters.sensor_noise > 0.0:
+                plate._noise.fill(drawn[lane])
+        noise[:] = np.moveaxis(drawn, 0, -1)
+
+
+def batch_state(plates: Sequence[Plate]) -> tuple[PlateTables, BatchState]:
+    """What plates have in common, and their state at rest, a lane each."""
     tables = [plate._tables for plate in plates]
-    names = ("lever", "reach", "amplifier", "current_limit", "current_step", "sensor_limit", "sensor_step")
-    numbers = [
-        [*(getattr(each, name) for name in names), each.sensor_noise, *each.sensor_gain, each.centre_shape]
-        for each in tables
-    ]
-    span = aligned((SPAN_ROWS, LANES))
-    span[CENTRE], span[HOLD], span[WINDOW] = np.inf, -1.0, WIDEST
-    return BatchState(
+    system, finger = aligned((STATES, STATES, LANES)), aligned((2, LANES))
+    system[:], finger[:] = shifts()[..., None], np.inf
+    return tables[0]._replace(terms=max(each.terms for each in tables)), BatchState(
         z=aligned((1, STATES, LANES)),
-        after=aligned((STATES, LANES)),
-        powers=aligned((NODES, COLUMNS * STATES, LANES)),
-        span=span,
-        number=side_by_side([np.array(row) for row in numbers]),
+        system=system,
+        push=aligned((FORCES, 3, LANES)),
+        step=aligned((COLUMNS, STATES, LANES)),
+        finger=finger,
+        rest=np.zeros(1, np.int64),
+        number=side_by_side([_numbers(each) for each in tables]),
         pending=aligned((plates[0].delay - 1, 2, LANES)),
         cursor=np.zeros(1, np.int64),
         current=aligned((2, LANES)),
     )
+
+
+def _numbers(tables: PlateTables) -> Array:
+    """Those numbers of a plate that others need not share, one after another."""
+    own = [value for name, value in zip(tables._fields, tables, strict=True) if name not in SHARED]
+    return np.array([number for value in own for number in (value if isinstance(value, tuple) else (value,))])

@@ -46,7 +46,16 @@ def scenarios(plate=IDEAL, **changes):
     ]
 
 
-@pytest.mark.parametrize("method", ["h", "h2"])
+def assert_alike(found, expected):
+    """Rounding differs, 1e-16 a sample and state, and a loop keeps it small."""
+    np.testing.assert_array_equal(found.position, expected.position)
+    np.testing.assert_array_equal(found.flags, expected.flags)
+    for name in ("motion", "sensed", "drive"):
+        right = getattr(expected, name)
+        np.testing.assert_allclose(getattr(found, name), right, rtol=0, atol=1e-9 * abs(right).max())
+
+
+@pytest.mark.parametrize("method", ["h", "h2", "paper"])
 @pytest.mark.parametrize(
     "changes",
     [
@@ -59,41 +68,83 @@ def scenarios(plate=IDEAL, **changes):
     ids=lambda changes: next(iter(changes), "as it is"),
 )
 def test_a_lane_is_the_run_of_its_scenario(method, changes):
-    """Motion, drive and flags of 0.5 s; rounding differs, 1e-16 a sample and state, and a loop keeps it small."""
+    """Motion, drive and flags of 0.5 s."""
     wanted = scenarios(**changes)
     for scenario, found in zip(wanted, simulate(wanted, 0.5, method=method), strict=True):
-        expected = alone(scenario, 0.5, method)
         assert found.scenario is scenario
-        np.testing.assert_array_equal(found.position, expected.position)
-        np.testing.assert_array_equal(found.flags, expected.flags)
-        for name in ("motion", "sensed", "drive"):
-            right = getattr(expected, name)
-            np.testing.assert_allclose(getattr(found, name), right, rtol=0, atol=1e-9 * abs(right).max())
+        assert_alike(found, alone(scenario, 0.5, method))
 
 
-def test_a_finger_locked_carrier_is_followed_in_its_lane():
+@pytest.mark.parametrize("changes", [{}, {"bending_frequency": 1250.0, "bending_coil": 0.1}], ids=["rigid", "bending"])
+def test_fingers_that_rest_keep_what_a_sample_does(changes):
+    """Each in a place of its own, some lifted and put down again: all rest most of the time."""
+    resting = [
+        hr.Finger.still(place, normal_load=0.5, mechanics=mechanics, touches=touches)
+        for place, mechanics, touches in (
+            (0.0, HEAVY, None),
+            (15e-3, LIGHT_SECOND, ((0.05, 0.2), (0.202, 9.0))),
+            (-20e-3, LIGHT, ((0.1, 9.0),)),
+        )
+    ]
+    plate = replace(IDEAL, **changes)
+    wanted = [Scenario(bands=BANDS, finger=finger, plate=plate) for finger in resting]
+    for scenario, found in zip(wanted, simulate(wanted, 0.4), strict=True):
+        assert_alike(found, alone(scenario, 0.4))
+
+
+@pytest.mark.parametrize("method", ["paper-common", "boxcar"])
+def test_the_other_polar_methods_run_side_by_side(method, monkeypatch):
+    """Other targets in every lane, and devices known better or worse: look-ups differ."""
+    wanted = [
+        replace(each, bands=tones([50.0 + i, 178.0, 261.0], (10 + i) * 1e-6), known=replace(each.plate, mass=0.032))
+        for i, each in enumerate(scenarios())
+    ]
+    expected = [alone(each, 0.5, method) for each in wanted]
+    monkeypatch.setattr(batch, "_alone", None)
+    for found, right in zip(simulate(wanted, 0.5, method=method), expected, strict=True):
+        assert_alike(found, right)
+
+
+@pytest.mark.parametrize("method", ["h2", "paper"])
+def test_a_finger_locked_carrier_is_followed_in_its_lane(method):
     bands = hr.Grating(wavelength=2e-3, amplitude=10e-6).bands(5000.0)
     fingers = [hr.Finger.sliding(speed=speed, normal_load=0.4) for speed in (0.06, 0.08, 0.1)]
+    fingers.append(replace(SLIDING, touches=((0.1, 0.3), (0.35, 9.0))))
     wanted = [Scenario(bands=bands, finger=finger, plate=IDEAL) for finger in fingers]
-    for scenario, found in zip(wanted, simulate(wanted, 0.6), strict=True):
-        right = alone(scenario, 0.6).motion
+    for scenario, found in zip(wanted, simulate(wanted, 0.6, method=method), strict=True):
+        right = alone(scenario, 0.6, method).motion
         assert abs(right).max() > 5e-6
         np.testing.assert_allclose(found.motion, right, rtol=0, atol=1e-9 * abs(right).max())
 
 
-def test_noise_and_rounding_are_those_of_the_scenario():
+@pytest.mark.parametrize("method", ["h2", "paper"])
+def test_a_sensor_is_doubted_in_its_own_lane(method):
+    """A controller that is told of +-65 um: more is not believed, and its loops start anew."""
+    told = replace(IDEAL, sensor_range=130e-6)
+    wanted = [replace(each, known=told) for each in scenarios()]
+    played = simulate(wanted, 0.5, method=method)
+    doubted = [bool((each.flags & 2).any()) for each in played]
+    assert any(doubted)
+    assert not all(doubted)
+    for scenario, found in zip(wanted, played, strict=True):
+        assert_alike(found, alone(scenario, 0.5, method))
+
+
+@pytest.mark.parametrize("method", ["h2", "paper"])
+def test_noise_and_rounding_are_those_of_the_scenario(method):
     """With 1 um of noise and its seed; a step of sensor or drive may fall the other way, and is felt no further."""
     wanted = scenarios(PlateParameters())
-    for scenario, found in zip(wanted, simulate(wanted, 0.5), strict=True):
-        expected = alone(scenario, 0.5)
+    for scenario, found in zip(wanted, simulate(wanted, 0.5, method=method), strict=True):
+        expected = alone(scenario, 0.5, method)
         steps = scenario.plate.sensor_step
         assert abs(found.sensed[:50] - expected.sensed[:50]).max() <= 1e-12
         assert np.sqrt(np.mean((found.motion - expected.motion) ** 2)) < 0.2 * steps
 
 
-def test_overload_saturates_its_own_lane_only():
+@pytest.mark.parametrize("method", ["h2", "paper"])
+def test_overload_saturates_its_own_lane_only(method):
     loud = [replace(each, bands=tones([400.0], 1e-3 if i == 1 else 1e-5)) for i, each in enumerate(scenarios()[:3])]
-    found = simulate(loud, 0.4)
+    found = simulate(loud, 0.4, method=method)
     assert [bool((each.flags & 1).any()) for each in found] == [False, True, False]
     assert all(abs(each.drive).max() <= IDEAL.current_limit for each in found)
 
@@ -117,8 +168,8 @@ def test_what_does_not_fit_runs_on_its_own():
 def test_more_than_the_lanes_and_other_methods():
     many = [Scenario(bands=BANDS, plate=IDEAL, seed=i) for i in range(2 * LANES + 3)]
     assert len(simulate(many, 0.01)) == len(many)
-    (paper,) = simulate([Scenario(bands=tones([50.0], 1e-5), plate=IDEAL)], 0.05, method="paper")
-    assert np.isfinite(paper.motion).all()
+    for one in simulate(many[:2], 0.05, method="stiffness"):
+        np.testing.assert_array_equal(one.motion, alone(one.scenario, 0.05, "stiffness").motion)
 
 
 def test_whole_numbers_are_numbers():

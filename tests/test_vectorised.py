@@ -11,10 +11,11 @@ from hapticrender.accuracy.plate import SLIDING, tones
 from hapticrender.batch import LANES, Scenario, batch_state
 from hapticrender.compiled.lanes import aligned
 from hapticrender.control import analyser
+from hapticrender.control.bank import batch as bank_batch
 from hapticrender.control.bank import kernels as bank_kernels
-from hapticrender.control.bank.batch import batch_of
 from hapticrender.control.blocks import kernels as block_kernels
 from hapticrender.control.methods import METHODS
+from hapticrender.control.polar import batch as polar_batch
 from hapticrender.control.polar import passes as polar_passes
 from hapticrender.plants import batch_kernels
 from hapticrender.plants import kernels as plate_kernels
@@ -82,13 +83,14 @@ def test_the_analyser_works_on_whole_registers():
 
 
 @pytest.mark.skipif(platform.machine() not in ("x86_64", "AMD64"), reason="reads x86-64 assembly")
-def test_a_batch_works_on_whole_registers():
-    """Eight scenarios side by side: bank and plates in one loop."""
+@pytest.mark.parametrize(("method", "batch_of"), [("h2", bank_batch.batch_of), ("paper", polar_batch.batch_of)])
+def test_a_batch_works_on_whole_registers(method, batch_of):
+    """Eight scenarios side by side: controllers and plates in one loop."""
     scenarios = [Scenario(bands=tones([50.0], 1e-6), finger=SLIDING) for _ in range(LANES)]
-    control, bank = batch_of([each.design("h2") for each in scenarios])
+    control, state = batch_of([each.design(method) for each in scenarios])
     plates = [Plate(each.plate, each.finger) for each in scenarios]
     rows = [aligned((2, *shape, LANES)) for shape in ((3,), (2,), (), (2,), (3,), (2,))]
-    arguments = (tuple(plate._tables for plate in plates), plates[0]._state, batch_state(plates), control, bank)
+    arguments = (*batch_state(plates), control, state)
     last, target, flags = aligned((2, LANES)), aligned((1, 2, LANES)), aligned((2, LANES))
     assembly = instructions(batch_kernels.closed_batch_run, *arguments, last, *rows, target, flags)
     every, widest = packed(assembly, "pd")

@@ -1,181 +1,238 @@
-"""Compiled plates and fingers of as many scenarios as there are lanes, each closed with a bank of its own.
+"""Compiled plates and fingers of as many scenarios as there are lanes, each closed with a controller of its own.
 
-What a sample does to a plate is kept as polynomials in the finger's place, a lane a scenario: those of the finger's
-window while it slides, and constants while it rests.  A lane whose finger leaves them gets new ones from the kernels
-of the single plate; that is rare, and the rest of the lanes do not notice.
+While a finger moves, what a sample does to its plate is a series anew, which side by side costs less than to fetch
+eight plates' polynomials in the place (those of the single plate) from memory; while every finger rests, its matrices
+are kept.  Both equal the single plate to rounding.
 """
 
 from __future__ import annotations
 
 from typing import NamedTuple
 
-from hapticrender.compiled.jit import kernel
+from hapticrender.compiled.jit import by_types, kernel
 from hapticrender.compiled.lanes import any_of, select, size
 from hapticrender.compiled.lanes_memory import read, write
 from hapticrender.control.bank.kernels import bank_advance
-from hapticrender.plants.kernels import inside, open_window, plate_drive, sense, series_at
-from hapticrender.plants.propagator import (
-    COLUMNS,
-    GRIP,
-    LEAST_STAY,
-    LEVER,
-    MIDDLE,
-    NODES,
-    RIGID,
-    STATES,
-    STRENGTH,
-    WIDTH,
-    kept,
-    polynomial,
-)
+from hapticrender.control.bank.state import BankTables
+from hapticrender.control.polar.kernels import PolarTables
+from hapticrender.control.polar.steps import polar_advance
+from hapticrender.plants.kernels import PlateTables, plate_drive, plate_system, sense
+from hapticrender.plants.propagator import COLUMNS, RIGID, STATES
 from hapticrender.protocols import Array
 
-# rows of BatchState.span: where a lane's polynomials hold (middle, 1/half the width, half the width, grip), the
-# finger's lever and strength of the last sample and of this one, and how wide its windows are
-CENTRE, SCALE, HALF, HOLD, SEEN_LEVER, SEEN_STRENGTH, LEVER_NOW, STRENGTH_NOW, WINDOW = range(9)
-SPAN_ROWS = 9
-
-
-class LaneNumbers(NamedTuple):
-    """Numbers of the plates that every sample needs, a lane each; names are those of `PlateTables`."""
-
-    lever: Array
-    reach: Array
-    amplifier: Array
-    current_limit: Array
-    current_step: Array
-    sensor_limit: Array
-    sensor_step: Array
-    sensor_noise: Array
-    sensor_gain: tuple[Array, Array]
-    centre_shape: Array
-
-
-NUMBERS = 11  # rows of BatchState.number
+LEAST_REST = 16  # samples that every finger must rest for before its matrices are kept
+LEVER, STRENGTH = range(2)  # rows of BatchState.finger
+SHARED = ("period", "terms", "flexible")  # entries of PlateTables that plates side by side have in common
 
 
 class BatchState(NamedTuple):
     """State of the plates; changed in place."""
 
     z: Array  # (1, STATES, W)
-    after: Array  # (STATES, W) scratch
-    powers: Array  # (NODES, COLUMNS * STATES, W): entry by entry, see `PlateState.powers`
-    span: Array  # (SPAN_ROWS, W)
-    number: Array  # (NUMBERS, W)
+    system: Array  # (STATES, STATES, W) A, column by column
+    push: Array  # (3, 3, W) B, see `PlateState.push`
+    step: Array  # (COLUMNS, STATES, W) Phi and Gamma while the fingers rest
+    finger: Array  # (2, W) lever and strength for which A and B hold
+    rest: Array  # (1,) integer: samples since a finger moved
+    number: Array  # (numbers, W) the others of PlateTables, in their order
     pending: Array  # (latency, 2, W)
     cursor: Array  # (1,) integer
     current: Array  # (2, W)
 
 
 @kernel
-def numbers_of(number):
-    """The plates' numbers as `LaneNumbers`."""
-    return LaneNumbers(
-        read(number, 0),
-        read(number, 1),
-        read(number, 2),
-        read(number, 3),
-        read(number, 4),
-        read(number, 5),
-        read(number, 6),
-        read(number, 7),
-        (read(number, 8), read(number, 9)),
+def three(number, at):
+    """A triple of numbers."""
+    return read(number, at), read(number, at + 1), read(number, at + 2)
+
+
+@kernel
+def tables_of(shared, number):
+    """The plates' tables, a lane each."""
+    return PlateTables(
+        shared.period,
+        shared.terms,
+        three(number, 0),
+        three(number, 3),
+        three(number, 6),
+        read(number, 9),
         read(number, 10),
+        read(number, 11),
+        three(number, 12),
+        three(number, 15),
+        shared.flexible,
+        (read(number, 18), read(number, 19)),
+        read(number, 20),
+        read(number, 21),
+        three(number, 22),
+        read(number, 25),
+        read(number, 26),
+        read(number, 27),
+        read(number, 28),
+        read(number, 29),
+        read(number, 30),
+        (read(number, 31), read(number, 32)),
     )
 
 
 @kernel
-def scatter(source, m, powers, n, i):
-    """Row block m of `source` (columns of 8 states) into power n of lane i; a negative m stands for zeros."""
+def whole(array, j):
+    """Column j of an array, its eight states."""
+    return (
+        read(array, j, 0),
+        read(array, j, 1),
+        read(array, j, 2),
+        read(array, j, 3),
+        read(array, j, 4),
+        read(array, j, 5),
+        read(array, j, 6),
+        read(array, j, 7),
+    )
+
+
+@kernel
+def keep(z, array, j):
+    """Write eight states to column j of an array."""
+    for s, value in enumerate(z):
+        write(value, array, j, s)
+
+
+@kernel
+def plus(z, share, more):
+    """State by state z + share * more."""
+    return (
+        z[0] + share * more[0],
+        z[1] + share * more[1],
+        z[2] + share * more[2],
+        z[3] + share * more[3],
+        z[4] + share * more[4],
+        z[5] + share * more[5],
+        z[6] + share * more[6],
+        z[7] + share * more[7],
+    )
+
+
+@kernel
+def row_times(flexible, system, row, z):
+    """Row of A z; the rates come last, as in a series they are known last."""
+    value = read(system, 0, row) * z[0] + read(system, 1, row) * z[1] + read(system, 2, row) * z[2]
+    if flexible:
+        value += read(system, 6, row) * z[6]
+        value += read(system, 7, row) * z[7]
+    value += read(system, 3, row) * z[3]
+    value += read(system, 4, row) * z[4]
+    return value + read(system, 5, row) * z[5]
+
+
+@kernel
+def changes(flexible, system, z):
+    """A z."""
+    bending = 0.0 * z[7]
+    if flexible:
+        bending = row_times(flexible, system, 7, z)
+    heave, rocking = row_times(flexible, system, 3, z), row_times(flexible, system, 4, z)
+    return z[3], z[4], z[5], heave, rocking, row_times(flexible, system, 5, z), z[7], bending
+
+
+@kernel
+def forced(push, row, common, opposed, weight):
+    """What forces do to the rate of heave, rocking or bending: a row of B f."""
+    return read(push, 0, row) * common + read(push, 1, row) * opposed + read(push, 2, row) * weight
+
+
+@kernel
+def grown(tables, state, z, common, opposed, weight):
+    """What a sample makes of z: z + (1 + A/2! + A^2/3! ...) (A z + B f)."""
+    flexible, system, push = tables.flexible, state.system, state.push
+    heave, rocking = forced(push, 0, common, opposed, weight), forced(push, 1, common, opposed, weight)
+    bending, nothing = 0.0 * heave, 0.0 * heave
+    if flexible:
+        bending = forced(push, 2, common, opposed, weight)
+    forces = (nothing, nothing, nothing, heave, rocking, nothing, nothing, bending)
+    term = plus(forces, 1.0, changes(flexible, system, z))
+    value, share = plus(z, 1.0, term), 1.0
+    for k in range(2, tables.terms + 1):
+        term = changes(flexible, system, term)
+        share *= 1.0 / k
+        value = plus(value, share, term)
+    return value
+
+
+@kernel
+def rest(tables, state):
+    """Keep what a sample makes of each state and of each force."""
     for j in range(COLUMNS):
         for s in range(STATES):
-            powers[n, j * STATES + s, i] = source[m, j, s] if m >= 0 else 0.0
+            write(1.0 if s == j else 0.0, state.step, j, s)
+        common, opposed, weight = 1.0 * (j == STATES), 1.0 * (j == STATES + 1), 1.0 * (j == STATES + 2)
+        keep(grown(tables, state, whole(state.step, j), common, opposed, weight), state.step, j)
 
 
 @kernel
-def lay(tables, work, state, i, lever, strength):
-    """New polynomials for lane i, whose finger has left its own."""
-    span, seen, window = state.span, work.seen, work.window
-    seen[LEVER], seen[STRENGTH] = span[SEEN_LEVER, i], span[SEEN_STRENGTH, i]
-    window[WIDTH], window[GRIP] = span[WINDOW, i], -1.0
-    moved = abs(lever - seen[LEVER])
-    if moved > 0.0 and strength == seen[STRENGTH] and moved * LEAST_STAY < window[WIDTH]:
-        open_window(tables, work, lever, strength)
-        span[WINDOW, i] = window[WIDTH]
-    if inside(window, lever, strength):
-        for n in range(NODES):
-            scatter(work.powers, n, state.powers, n, i)
-        span[CENTRE, i], span[HALF, i], span[SCALE, i] = window[MIDDLE], window[WIDTH], 1.0 / window[WIDTH]
-    else:
-        series_at(tables, work, lever, strength, work.step, 0)
-        for n in range(NODES):
-            scatter(work.step, 0 if n == 0 else -1, state.powers, n, i)
-        span[CENTRE, i], span[HALF, i], span[SCALE, i] = lever, 0.0, 0.0
-    span[HOLD, i] = strength
-
-
-@kernel
-def propagate(entry, state, flexible, x, common, opposed, weight):
-    """Replace z by Phi z + Gamma f, of which `entry(powers, column * STATES + row, x)` gives the entries."""
-    z, powers, after = state.z, state.powers, state.after
+def propagate(flexible, step, z, common, opposed, weight):
+    """Replace z by Phi z + Gamma f."""
+    old = whole(z, 0)
     for s in range(STATES if flexible else RIGID):
-        first = entry(powers, s, x) * read(z, 0, 0) + entry(powers, 4 * STATES + s, x) * read(z, 0, 4)
-        second = entry(powers, STATES + s, x) * read(z, 0, 1) + entry(powers, 5 * STATES + s, x) * read(z, 0, 5)
-        third = entry(powers, 8 * STATES + s, x) * common + entry(powers, 2 * STATES + s, x) * read(z, 0, 2)
-        fourth = entry(powers, 9 * STATES + s, x) * opposed + entry(powers, 10 * STATES + s, x) * weight
-        fourth += entry(powers, 3 * STATES + s, x) * read(z, 0, 3)
+        first = read(step, 0, s) * old[0] + read(step, 4, s) * old[4]
+        second = read(step, 1, s) * old[1] + read(step, 5, s) * old[5]
+        third = read(step, 8, s) * common + read(step, 2, s) * old[2]
+        fourth = read(step, 9, s) * opposed + read(step, 10, s) * weight + read(step, 3, s) * old[3]
         if flexible:
-            third += entry(powers, 6 * STATES + s, x) * read(z, 0, 6)
-            fourth += entry(powers, 7 * STATES + s, x) * read(z, 0, 7)
-        write((first + second) + (third + fourth), after, s)
-    for s in range(STATES if flexible else RIGID):
-        write(read(after, s), z, 0, s)
+            third += read(step, 6, s) * old[6]
+            fourth += read(step, 7, s) * old[7]
+        write((first + second) + (third + fourth), z, 0, s)
 
 
 @kernel
-def advance(each, work, numbers, state, position, load, strength):
+def advance(tables, state, position, load, strength):
     """One sample of motion of every plate under its current."""
-    z, span, current = state.z, state.span, state.current
+    z, finger, current = state.z, state.finger, state.current
     touching = strength > 0.0
-    lever, strength = select(touching, position * numbers.lever, 0.0), select(touching, strength, 0.0)
+    lever, strength = select(touching, position * tables.lever, 0.0), select(touching, strength, 0.0)
     weight = select(touching, load, 0.0)
     if any_of(strength == 0.0):
         for s in (2, 5):
             write(select(touching, read(z, 0, s), 0.0), z, 0, s)
-    write(lever, span, LEVER_NOW)
-    write(strength, span, STRENGTH_NOW)
-    away = (size(lever - read(span, CENTRE)) > read(span, HALF)) | (size(strength - read(span, HOLD)) > 0.0)
-    if any_of(away):
-        for i in range(span.shape[1]):
-            here, grip = span[LEVER_NOW, i], span[STRENGTH_NOW, i]
-            if abs(here - span[CENTRE, i]) > span[HALF, i] or grip != span[HOLD, i]:
-                lay(each[i], work, state, i, here, grip)
-    write(lever, span, SEEN_LEVER)
-    write(strength, span, SEEN_STRENGTH)
+    state.rest[0] += 1
+    if any_of(size(lever - read(finger, LEVER)) + size(strength - read(finger, STRENGTH)) > 0.0):
+        write(lever, finger, LEVER)
+        write(strength, finger, STRENGTH)
+        plate_system(tables, lever, strength, state.system, state.push)
+        state.rest[0] = 0
     common, opposed = read(current, 0) + read(current, 1), read(current, 1) - read(current, 0)
-    x = (lever - read(span, CENTRE)) * read(span, SCALE)
-    if any_of(read(span, HALF) > 0.0):
-        propagate(polynomial, state, each[0].flexible, x, common, opposed, weight)
+    if state.rest[0] == LEAST_REST:
+        rest(tables, state)
+    if state.rest[0] < LEAST_REST:
+        keep(grown(tables, state, whole(z, 0), common, opposed, weight), z, 0)
     else:
-        propagate(kept, state, each[0].flexible, x, common, opposed, weight)
+        propagate(tables.flexible, state.step, z, common, opposed, weight)
+
+
+ADVANCES = {PolarTables: polar_advance, BankTables: bank_advance}
+
+
+@by_types
+def control_advance(tables, *rest):
+    """Step of the controllers that `tables` belong to."""
+    return ADVANCES[tables.instance_class]
 
 
 @kernel
 def closed_batch_run(
-    each, work, state, control, bank, last, finger, noise, wanted, sensed, motion, drive, target, flags
+    shared, state, control, control_state, last, finger, noise, wanted, sensed, motion, drive, target, flags
 ):
-    """Plates and banks closed sample by sample; see `closed_plate_run`.  Every array ends in a lane a scenario.
+    """Plates and controllers closed sample by sample; see `closed_plate_run`.  Every array ends in a lane a scenario.
 
-    `finger` is (n, 3, W): position, load, strength; `target` holds the last sample's only, (bands, 2, W); `flags` are
-    floats.
+    `shared` are the tables of any of the plates, with as many terms as any needs; `finger` is (n, 3, W): position,
+    load, strength; `target` holds the last sample's only, (bands, 2, W); `flags` are floats.
     """
-    numbers = numbers_of(state.number)
+    tables = tables_of(shared, state.number)
     for n in range(sensed.shape[0]):
-        plate_drive(numbers, state, last)
-        raised = sense(numbers, state, noise[n], sensed[n], motion[n])
+        plate_drive(tables, state, last)
+        raised = sense(tables, state, noise[n], sensed[n], motion[n])
         position = read(finger, n, 0)
-        advance(each, work, numbers, state, position, read(finger, n, 1), read(finger, n, 2))
+        advance(tables, state, position, read(finger, n, 1), read(finger, n, 2))
         write(read(last, 0), drive, n, 0)
         write(read(last, 1), drive, n, 1)
-        raised += bank_advance(control, bank, sensed[n], position, read(wanted, n), last, target)
+        raised += control_advance(control, control_state, sensed[n], position, read(wanted, n), last, target)
         write(raised, flags, n)

@@ -5,7 +5,8 @@ carrier that runs backwards (the finger reverses) is followed as its mirror imag
 Re conj(X) e^{-j phi}, so that psi always runs forward and every complex state is conjugated at the reversal.
 
 Everything that a band owns is a column of rows that are named here, W columns to a tile (`compiled.lanes`).  What
-all tiles share is written down before; blocks are in `passes`.
+all tiles share is written down before; blocks are in `passes`.  A tile's columns are bands of one scenario, or one band
+of as many scenarios, of which each has its own share (`batch`).
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from typing import NamedTuple
 
 from hapticrender.compiled.jit import kernel
 from hapticrender.compiled.lanes import any_of, high, low, root, select, size
-from hapticrender.compiled.lanes_memory import lanes, put, put_pairs, taken
+from hapticrender.compiled.lanes_memory import lanes, put, put_pairs, read, taken, write
 from hapticrender.compiled.polynomials import polar, unit
 from hapticrender.control.bank.carriers import advance_of, turns_of
 from hapticrender.control.kernels import (
@@ -35,16 +36,16 @@ REFRESH = 64  # samples between two looks at the tones; a block is cut there, to
 # rows of PolarState.band: what was asked for; fixed part of the carrier (turns) and its turn a sample; its direction
 # (+1, -1); the wanted envelope, its amplitude and direction (that of the last target that was not silence); the frame,
 # a direction that the carrier (COS, SIN) has been turned by, see `turn_frame`; phase of a fixed carrier turned by it at
-# the last refresh (turns); low-pass states of the wanted waveform
+# the last refresh (turns); low-pass states of the wanted waveform; frequency of a carrier that follows the finger (Hz)
 LIVE, FREQUENCY, WAVENUMBER, PHASE, WANTED_RE, WANTED_IM = range(6)
 TURNS, COS, SIN, TURN_COS, TURN_SIN, FORWARD = range(6, 12)
 TARGET_RE, TARGET_IM, AMOUNT, HEADING_RE, HEADING_IM, FRAME_RE, FRAME_IM, FRAME, START = range(12, 21)
-REF_RE1, REF_RE2, REF_IM1, REF_IM2 = range(21, 25)
-BAND_ROWS = 25
+REF_RE1, REF_RE2, REF_IM1, REF_IM2, HERTZ = range(21, 26)
+BAND_ROWS = 26
 # rows of PolarState.loop, LOOP_ROWS for each coordinate: low-pass states, states of amplitude and phase loop, X over
-# the frame; drive per metre from the look-up table, and the device's lag (rad)
-RE1, RE2, IM1, IM2, AMPLITUDE1, AMPLITUDE2, THETA1, THETA2, X_RE, X_IM, DRIVE, LAG = range(12)
-LOOP_ROWS = 12
+# the frame; drive per metre from the look-up table, and the device's lag (rad); amplitude and phase of X on their way
+RE1, RE2, IM1, IM2, AMPLITUDE1, AMPLITUDE2, THETA1, THETA2, X_RE, X_IM, DRIVE, LAG, FOUND, BEHIND = range(14)
+LOOP_ROWS = 14
 # entries of PolarState.finger
 HELD, VELOCITY, GATE, SEEN = range(4)
 # rows of PolarState.shared, one column a sample of a block: what all tiles are told; then one row a coordinate
@@ -77,12 +78,12 @@ class PolarTables(NamedTuple):
     tone: Array  # (5, bands)
     listen: Array  # (coordinates, sensors)
     speak: Array  # (channels, coordinates)
-    gain: Array  # (coordinates, table), m per drive unit
-    lag: Array  # (coordinates, table), rad: phase of the free device
+    gain: Array  # (coordinates, table), m per drive unit; scenario by scenario where they are side by side
+    lag: Array  # the same, rad: phase of the free device
 
 
 class PolarState(NamedTuple):
-    """State of the polar controller; changed in place."""
+    """State of the polar controller; changed in place.  Side by side `finger`, `doubt` and `shared` end in W."""
 
     band: Array  # (tiles, BAND_ROWS, W)
     loop: Array  # (tiles, coordinates * LOOP_ROWS, W)
@@ -129,20 +130,22 @@ def clamped_step(law, state1, state2, x, floor):
 
 
 @kernel
-def lookup(table, c, step, frequency):
+def lookup(table, row, step, frequency):
     """Linear interpolation in a table over frequency."""
     at = min(frequency / step, table.shape[1] - 1.000001)
     i = int(at)
-    return table[c, i] + (at - i) * (table[c, i + 1] - table[c, i])
+    return table[row, i] + (at - i) * (table[row, i + 1] - table[row, i])
 
 
 @kernel
 def look_up(tables, state, t, i, frequency):
-    """What the table says of band i of a tile at `frequency`."""
-    for c in range(tables.listen.shape[0]):
-        at, step = c * LOOP_ROWS, tables.numbers.table_step
-        state.loop[t, at + DRIVE, i] = 1.0 / lookup(tables.gain, c, step, frequency)
-        state.loop[t, at + LAG, i] = lookup(tables.lag, c, step, frequency)
+    """What the table says of band i of a tile at `frequency`; scenarios have tables of their own."""
+    coordinates, step = tables.listen.shape[0], tables.numbers.table_step
+    many = tables.gain.shape[0] // coordinates
+    for c in range(coordinates):
+        at, row = c * LOOP_ROWS, i % many * coordinates + c
+        state.loop[t, at + DRIVE, i] = 1.0 / lookup(tables.gain, row, step, frequency)
+        state.loop[t, at + LAG, i] = lookup(tables.lag, row, step, frequency)
 
 
 @kernel
@@ -259,50 +262,59 @@ def refresh(tables, state):
 @kernel
 def follow_finger(rate, held, velocity, gate, seen, position):
     """Hold the position while the finger is away, smooth its velocity, open the gate with contact."""
-    now = abs(position) <= FAR and not (seen > 0.0 and abs(position - held) * rate > FASTEST)
-    speed = (position - held) * rate if now and seen > 0.0 else 0.0
+    stays = (seen <= 0.0) | (size(position - held) * rate <= FASTEST)
+    here = (size(position) <= FAR) & stays
+    speed = select(here & (seen > 0.0), (position - held) * rate, 0.0)
     velocity += (1.0 - math.exp(-TURN * VELOCITY_POLE / rate)) * (speed - velocity)
     ramp = 1.0 / (GATE_TIME * rate)
-    gate = min(gate + ramp, 1.0) if now else max(gate - ramp, 0.0)
-    return position if now else held, velocity, gate, 1.0 if now else 0.0
+    gate = select(here, low(gate + ramp, 1.0), high(gate - ramp, 0.0))
+    return select(here, position, held), velocity, gate, select(here, 1.0, 0.0)
 
 
 @kernel
 def believed(value, limit):
     """What a sensor tells, or zero where it cannot show that."""
-    return value if abs(value) <= limit else 0.0
+    return select(size(value) <= limit, value, 0.0)
 
 
 @kernel
-def share(tables, state, m, fits, position, wanted, known):
-    """Write down what else all tiles are told of a sample, whose sensors are inside their limits or not.
+def share(tables, state, m, odd, position, wanted, known):
+    """Write down what else all tiles are told of a sample; `odd` is 2 where a sensor is beyond its limit, else 0.
 
-    `known` is what is known of finger and sensors, see `recall`.  Returns flags and what is known now.
+    `known` is what is known of finger and sensors, see `recall`.  Returns flags, as a float, and what is known now.
     """
     numbers, shared = tables.numbers, state.shared
     held, velocity, gate, seen, doubt = known
-    if not fits or doubt > 0.0:
+    if any_of((odd > 0.0) | (doubt > 0.0)):
         step = 1.0 / (DOUBT_TIME * numbers.rate)
-        doubt = max(doubt - step, 0.0) if fits else min(doubt + step, 1.0)
-    sane = abs(wanted) <= FAR
+        doubt = select(odd > 0.0, low(doubt + step, 1.0), high(doubt - step, 0.0))
+    sane = size(wanted) <= FAR
     held, velocity, gate, seen = follow_finger(numbers.rate, held, velocity, gate, seen, position)
-    shared[WANTED, m], shared[TRUST, m] = wanted if sane else 0.0, 1.0 - doubt
-    shared[PLACE, m], shared[SPEED, m], shared[OPENING, m] = held, velocity, gate
-    return 0 if fits and sane and not abs(position) > FAR else 2, (held, velocity, gate, seen, doubt)
+    write(select(sane, wanted, 0.0), shared, WANTED, m)
+    write(1.0 - doubt, shared, TRUST, m)
+    write(held, shared, PLACE, m)
+    write(velocity, shared, SPEED, m)
+    write(gate, shared, OPENING, m)
+    odd = select(size(position) > FAR, 2.0, select(sane, odd, 2.0))
+    return odd, (held, velocity, gate, seen, doubt)
 
 
 @kernel
 def recall(state):
     """What is known of finger and sensors: held position (m), velocity (m/s), gate, whether it was seen; doubt."""
     finger = state.finger
-    return finger[HELD], finger[VELOCITY], finger[GATE], finger[SEEN], state.doubt[0]
+    return read(finger, HELD), read(finger, VELOCITY), read(finger, GATE), read(finger, SEEN), read(state.doubt, 0)
 
 
 @kernel
 def remember(state, known):
     """Keep what is known until the next block."""
-    finger = state.finger
-    finger[HELD], finger[VELOCITY], finger[GATE], finger[SEEN], state.doubt[0] = known
+    held, velocity, gate, seen, doubt = known
+    write(held, state.finger, HELD)
+    write(velocity, state.finger, VELOCITY)
+    write(gate, state.finger, GATE)
+    write(seen, state.finger, SEEN)
+    write(doubt, state.doubt, 0)
 
 
 @kernel
@@ -323,22 +335,22 @@ def follow(tables, state, t, m):
     """Carriers of a tile that follow the finger, their look-ups; returns the weight of their targets."""
     numbers, band, shared = tables.numbers, state.band, state.shared
     wavenumber, frequency = lanes(band, t, WAVENUMBER), lanes(band, t, FREQUENCY)
-    hertz = frequency + wavenumber * shared[SPEED, m]
+    hertz = frequency + wavenumber * read(shared, SPEED, m)
     flip = hertz * lanes(band, t, FORWARD) < 0.0
     if any_of(flip):
         mirror(band, state.loop, t, flip)
     turns, live = lanes(band, t, TURNS), lanes(band, t, LIVE)
-    cos, sin = unit(turns + wavenumber * shared[PLACE, m] + lanes(band, t, PHASE))
+    cos, sin = unit(turns + wavenumber * read(shared, PLACE, m) + lanes(band, t, PHASE))
     put(band, t, TURNS, turns + 1.0 / numbers.rate * frequency)
     put(band, t, COS, live * cos)
     put(band, t, SIN, live * lanes(band, t, FORWARD) * sin)
+    put(band, t, HERTZ, size(hertz))
     for i in range(min(band.shape[2], tables.tone.shape[1] - t * band.shape[2])):
-        speed = band[t, WAVENUMBER, i] * shared[SPEED, m]
-        look_up(tables, state, t, i, abs(band[t, FREQUENCY, i] + speed))
+        look_up(tables, state, t, i, band[t, HERTZ, i])
     inside = low(high(2.0 / numbers.lowest * size(hertz) - 1.0, 0.0), 1.0)
     below = low(high(5.0 - 4.0 / numbers.highest * size(hertz), 0.0), 1.0)
-    weight = inside * inside * (3.0 - 2.0 * inside) * below * below * (3.0 - 2.0 * below) * shared[OPENING, m]
-    return select(wavenumber > 0.0, weight, 1.0)
+    weight = inside * inside * (3.0 - 2.0 * inside) * below * below * (3.0 - 2.0 * below)
+    return select(wavenumber > 0.0, weight * read(shared, OPENING, m), 1.0)
 
 
 @kernel
@@ -355,7 +367,7 @@ def carry(tables, state, t, m, target):
         put(band, t, SIN, sin * turn_cos + cos * turn_sin)
     forward = lanes(band, t, FORWARD)
     if numbers.analysed:
-        twice = 2.0 * numbers.filter[0] * state.shared[WANTED, m]
+        twice = 2.0 * numbers.filter[0] * read(state.shared, WANTED, m)
         section, four = numbers.filter, 4.0 * twice
         re, s1, s2 = section_step(
             section, lanes(band, t, REF_RE1), lanes(band, t, REF_RE2), twice, four, lanes(band, t, COS)
@@ -388,7 +400,7 @@ def slide(window, heap, at, r, x):
 def listen(tables, state, t, m, c):
     """STDFT* (eq. 1, 3, 4), or STDFT (eq. 1-3): envelopes X of coordinate c."""
     band, loop, base, window = state.band, state.loop, c * LOOP_ROWS, state.window
-    twice, section = 2.0 * state.shared[SHARED_ROWS + c, m], tables.numbers.filter
+    twice, section = 2.0 * read(state.shared, SHARED_ROWS + c, m), tables.numbers.filter
     cos, sin = lanes(band, t, COS), lanes(band, t, SIN)
     if window.shape[0] > 0:  # it holds what it hears unmirrored, so that a carrier that turns round need not rewrite it
         at, r = (state.sample[0] + m) % window.shape[0], 2 * (t * tables.listen.shape[0] + c)
@@ -441,10 +453,11 @@ def tile_step(tables, state, t, m, target):
     """One sample of a tile: adds the drive of its bands to each coordinate's sum."""
     numbers, band, loop = tables.numbers, state.band, state.loop
     carry(tables, state, t, m, target)
-    if state.shared[TRUST, m] == 0.0:  # the loops start anew
+    lost = read(state.shared, TRUST, m) == 0.0
+    if any_of(lost):  # the loops start anew
         for base in range(0, loop.shape[1], LOOP_ROWS):
             for r in range(DRIVE):
-                put(loop, t, base + r, 0.0 * lanes(loop, t, base + DRIVE))
+                put(loop, t, base + r, select(lost, 0.0, lanes(loop, t, base + r)))
     cos, sin = lanes(band, t, COS), lanes(band, t, SIN)
     f_re, f_im = lanes(band, t, FRAME_RE), lanes(band, t, FRAME_IM)
     re, im = lanes(band, t, HEADING_RE), lanes(band, t, HEADING_IM)
@@ -455,7 +468,7 @@ def tile_step(tables, state, t, m, target):
             x_re, x_im = listen(tables, state, t, m, c)
             command, theta = answer(numbers, band, loop, t, base, x_re, x_im, h_re, h_im)
         else:  # straight from the look-up table, turned ahead by delay and hold
-            speed = lanes(band, t, WAVENUMBER) * state.shared[SPEED, m]
+            speed = lanes(band, t, WAVENUMBER) * read(state.shared, SPEED, m)
             now = size(lanes(band, t, FREQUENCY) + speed)
             command, theta = lanes(band, t, AMOUNT), TURN * numbers.lead * now - lanes(loop, t, base + LAG)
         u, v = unit((1.0 / TURN) * theta)

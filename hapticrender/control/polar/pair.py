@@ -8,9 +8,12 @@ hundred cycles long; those of two samples and two sides go on side by side.  It 
 
 from __future__ import annotations
 
+import numpy as np
+
 from hapticrender.compiled.jit import kernel
-from hapticrender.compiled.lanes import size, totals
+from hapticrender.compiled.lanes import select, size, totals
 from hapticrender.compiled.lanes_memory import lanes, put, put_pairs
+from hapticrender.compiled.polynomials import polar
 from hapticrender.control.polar.kernels import (
     AMOUNT,
     COS,
@@ -58,6 +61,13 @@ def carriers(state, t, number, rate):
 
 
 @kernel
+def compared(numbers, loop, t, base, gain, cos, sin):
+    """Amplitude and phase of what is `heard` (eq. 5)."""
+    im, re = heard(numbers, loop, t, base, gain, cos, sin)
+    return polar(im, re)
+
+
+@kernel
 def tiles_pair(tables, state, sensed, n, target):
     """Drives of two sides in samples n and n + 1 where all is usual and no carrier follows the finger."""
     band, loop, numbers, listen = state.band, state.loop, tables.numbers, tables.listen
@@ -70,10 +80,10 @@ def tiles_pair(tables, state, sensed, n, target):
         put_pairs(target[n], t, re, im)
         put_pairs(target[n + 1], t, re, im)
         (cos, sin, wish), (next_cos, next_sin, hope) = carriers(state, t, state.sample[0] % REFRESH, numbers.rate)
-        a, a_lag = heard(numbers, loop, t, 0, g0 * x0 + g1 * x1, cos, sin)
-        b, b_lag = heard(numbers, loop, t, other_side, h0 * x0 + h1 * x1, cos, sin)
-        c, c_lag = heard(numbers, loop, t, 0, g0 * y0 + g1 * y1, next_cos, next_sin)
-        d, d_lag = heard(numbers, loop, t, other_side, h0 * y0 + h1 * y1, next_cos, next_sin)
+        a, a_lag = compared(numbers, loop, t, 0, g0 * x0 + g1 * x1, cos, sin)
+        b, b_lag = compared(numbers, loop, t, other_side, h0 * x0 + h1 * x1, cos, sin)
+        c, c_lag = compared(numbers, loop, t, 0, g0 * y0 + g1 * y1, next_cos, next_sin)
+        d, d_lag = compared(numbers, loop, t, other_side, h0 * y0 + h1 * y1, next_cos, next_sin)
         wanted = lanes(band, t, AMOUNT)
         one += answered(numbers, loop, t, 0, wanted, a, a_lag, wish)
         other += answered(numbers, loop, t, other_side, wanted, b, b_lag, wish)
@@ -103,8 +113,8 @@ def polar_pair(tables, state, n, sensed, finger, wanted, drive, last, target, fl
     known, limit, plain = recall(state), tables.numbers.sensed_limit, state.doubt[0] == 0.0
     for m in range(2):
         fits = (size(sensed[n + m, 0]) <= limit) & (size(sensed[n + m, 1]) <= limit)  # NaN does not
-        found, known = share(tables, state, m, fits, finger[n + m, 0], wanted[n + m], known)
-        flags[n + m] |= found
+        odd, known = share(tables, state, m, select(fits, 0.0, 2.0), finger[n + m, 0], wanted[n + m], known)
+        flags[n + m] |= np.int64(odd)
         plain = plain and fits
     remember(state, known)
     for t in range(state.band.shape[0]):
@@ -120,6 +130,6 @@ def polar_pair(tables, state, n, sensed, finger, wanted, drive, last, target, fl
             for m in range(2):
                 tile_step(tables, state, t, m, target[n + m])
         first, second = gather(tables, state, 0), gather(tables, state, 1)
-        flags[n] |= speak(tables, state, 0, first[0], first[1], drive[n + 1])
-        flags[n + 1] |= speak(tables, state, 1, second[0], second[1], last)
+        flags[n] |= np.int64(speak(tables, state, 0, first[0], first[1], drive[n + 1]))
+        flags[n + 1] |= np.int64(speak(tables, state, 1, second[0], second[1], last))
     state.sample[0] += 2

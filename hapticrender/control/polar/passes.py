@@ -7,6 +7,8 @@ the processor works on many samples at once.  The arithmetic is that of `control
 
 from __future__ import annotations
 
+import numpy as np
+
 from hapticrender.compiled.jit import kernel
 from hapticrender.compiled.lanes import select
 from hapticrender.compiled.lanes_memory import lanes, put, put_pairs, put_stretch, row_totals, taken
@@ -181,7 +183,8 @@ def share_all(tables, state, sensed, position, wanted, flags, n, count):
     known = recall(state)
     sense_all(tables, state, sensed, flags, n, count)
     for m in range(count):
-        flags[n + m], known = share(tables, state, m, flags[n + m] == 0, position[n + m], wanted[n + m], known)
+        odd, known = share(tables, state, m, 1.0 * flags[n + m], position[n + m], wanted[n + m], known)
+        flags[n + m] = np.int64(odd)
     remember(state, known)
 
 

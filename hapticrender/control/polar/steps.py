@@ -6,17 +6,21 @@ some hundreds of them only, and what a sample waits for is then hidden behind th
 
 from __future__ import annotations
 
+import numpy as np
+
 from hapticrender.compiled.jit import kernel
-from hapticrender.compiled.lanes import select, totals
-from hapticrender.compiled.lanes_memory import lanes, put, put_pairs
+from hapticrender.compiled.lanes import any_of, high, low, select, size, totals
+from hapticrender.compiled.lanes_memory import lanes, put, put_pairs, read, write
 from hapticrender.compiled.polynomials import cosine, polar
 from hapticrender.control.kernels import QUIET, TURN
 from hapticrender.control.polar.kernels import (
     AMOUNT,
     AMPLITUDE1,
+    BEHIND,
     COS,
     DRIVE,
     FORWARD,
+    FOUND,
     FREQUENCY,
     LIVE,
     LOOP_ROWS,
@@ -46,21 +50,22 @@ from hapticrender.control.polar.kernels import (
 
 @kernel
 def hearing(tables, shared, m, sensed):
-    """What the coordinates hear; a sensor beyond its limit counts as zero.  Returns whether all are inside.
+    """What the coordinates hear; a sensor beyond its limit counts as zero.  Returns 0, or 2 where one is.
 
     Two sensors are the usual case, and a loop over them costs more than what it does.
     """
     listen, limit, last = tables.listen, tables.numbers.sensed_limit, sensed.shape[0] - 1
-    fits = (abs(sensed[0]) <= limit) & (abs(sensed[last]) <= limit)  # NaN does not
-    first, second = believed(sensed[0], limit), believed(sensed[last], limit) if last > 0 else 0.0
+    first, second = read(sensed, 0), read(sensed, last)
+    fits = (size(first) <= limit) & (size(second) <= limit)  # NaN does not
+    first, second = believed(first, limit), select(last > 0, believed(second, limit), 0.0)
     for s in range(1, last):
-        fits = fits & (abs(sensed[s]) <= limit)
+        fits = fits & (size(read(sensed, s)) <= limit)
     for c in range(listen.shape[0]):
-        y = listen[c, 0] * first + listen[c, last] * second
+        y = read(listen, c, 0) * first + read(listen, c, last) * second
         for s in range(1, last):
-            y += listen[c, s] * believed(sensed[s], limit)
-        shared[SHARED_ROWS + c, m] = y
-    return fits
+            y += read(listen, c, s) * believed(read(sensed, s), limit)
+        write(y, shared, SHARED_ROWS + c, m)
+    return select(fits, 0.0, 2.0)
 
 
 @kernel
@@ -69,13 +74,13 @@ def usual(tables, state, count):
     numbers = tables.numbers
     fit = numbers.feedback and not numbers.analysed and not numbers.subtract and state.window.shape[0] == 0
     for m in range(count):
-        fit = fit and state.shared[TRUST, m] == 1.0
+        fit = fit and not any_of(read(state.shared, TRUST, m) < 1.0)
     return fit and tables.listen.shape[0] <= 2
 
 
 @kernel
-def carry_on(state, t, number, rate):
-    """Fixed carriers of a tile, and the phase of what is wanted (turns), `number` samples after they were set."""
+def carry_on(state, t, number):
+    """Fixed carriers of a tile, `number` samples after they were set."""
     band = state.band
     cos, sin = lanes(band, t, COS), lanes(band, t, SIN)
     if number > 0:
@@ -83,12 +88,12 @@ def carry_on(state, t, number, rate):
         cos, sin = cos * turn_cos - sin * turn_sin, sin * turn_cos + cos * turn_sin
         put(band, t, COS, cos)
         put(band, t, SIN, sin)
-    return cos, sin, lanes(band, t, START) + (number / rate) * lanes(band, t, FREQUENCY)
+    return cos, sin
 
 
 @kernel
 def heard(numbers, loop, t, base, gain, cos, sin):
-    """Amplitude and phase of X of a tile, counted from what is wanted: `listen` to a coordinate, and eq. 5.
+    """Imaginary and real part of X of a tile, counted from what is wanted: `listen` to a coordinate.
 
     `gain` is 2 b0 times what it hears.  X has a minus in its sine, which is taken away rather than turned round: of one
     number less to repeat in every lane.
@@ -103,7 +108,15 @@ def heard(numbers, loop, t, base, gain, cos, sin):
     put(loop, t, at + 3, slow - (1.0 + section[3] + section[4]) * im)
     put(loop, t, base + X_RE, re)
     put(loop, t, base + X_IM, im)
-    return polar(im, re)
+    return im, re
+
+
+@kernel
+def compare(loop, t, base):
+    """Amplitude and phase of X of a tile, which is counted from what is wanted (eq. 5)."""
+    found, lag = polar(lanes(loop, t, base + X_IM), lanes(loop, t, base + X_RE))
+    put(loop, t, base + FOUND, found)
+    put(loop, t, base + BEHIND, lag)
 
 
 @kernel
@@ -120,26 +133,34 @@ def answered(numbers, loop, t, base, wanted, found, lag, wish):
 
 
 @kernel
-def usual_step(tables, state, t, c, cos, sin, wish):
-    """Drive of a tile in coordinate c: `listen` and `answer` where X is counted from what is wanted."""
-    numbers, base = tables.numbers, c * LOOP_ROWS
-    gain = 2.0 * numbers.filter[0] * state.shared[SHARED_ROWS + c, 0]
-    found, lag = heard(numbers, state.loop, t, base, gain, cos, sin)
-    return answered(numbers, state.loop, t, base, lanes(state.band, t, AMOUNT), found, lag, wish)
-
-
-@kernel
 def tiles_step(tables, state, target):
-    """Drive of one or two coordinates where all is usual and no carrier follows the finger."""
-    band, last = state.band, tables.listen.shape[0] - 1
-    one = other = 0.0 * lanes(band, 0, LIVE)
+    """Drive of one or two coordinates where all is usual and no carrier follows the finger.
+
+    In three passes: of short ones a processor works on several tiles at once.
+    """
+    numbers, band, loop, last = tables.numbers, state.band, state.loop, tables.listen.shape[0] - 1
+    number, twice = state.sample[0] % REFRESH, 2.0 * numbers.filter[0]
+    gain, other_gain = twice * read(state.shared, SHARED_ROWS, 0), twice * read(state.shared, SHARED_ROWS + last, 0)
     for t in range(band.shape[0]):
-        put_pairs(target, t, lanes(band, t, TARGET_RE), lanes(band, t, FORWARD) * lanes(band, t, TARGET_IM))
-        cos, sin, wish = carry_on(state, t, state.sample[0] % REFRESH, tables.numbers.rate)
-        one += usual_step(tables, state, t, 0, cos, sin, wish)
+        if number == 0 or target.ndim == 1:  # scenarios side by side keep the last one's only
+            put_pairs(target, t, lanes(band, t, TARGET_RE), lanes(band, t, FORWARD) * lanes(band, t, TARGET_IM))
+        cos, sin = carry_on(state, t, number)
+        heard(numbers, loop, t, 0, gain, cos, sin)
         if last > 0:
-            other += usual_step(tables, state, t, last, cos, sin, wish)
-    return totals(1.0, one, other)
+            heard(numbers, loop, t, LOOP_ROWS, other_gain, cos, sin)
+    for t in range(band.shape[0]):
+        compare(loop, t, 0)
+        if last > 0:
+            compare(loop, t, LOOP_ROWS)
+    one = other = 0.0 * lanes(band, 0, LIVE)
+    elapsed = number / numbers.rate
+    for t in range(band.shape[0]):
+        wanted, wish = lanes(band, t, AMOUNT), lanes(band, t, START) + elapsed * lanes(band, t, FREQUENCY)
+        one += answered(numbers, loop, t, 0, wanted, lanes(loop, t, FOUND), lanes(loop, t, BEHIND), wish)
+        if last > 0:
+            found, lag = lanes(loop, t, LOOP_ROWS + FOUND), lanes(loop, t, LOOP_ROWS + BEHIND)
+            other += answered(numbers, loop, t, LOOP_ROWS, wanted, found, lag, wish)
+    return totals(read(state.shared, TRUST, 0), one, other)
 
 
 @kernel
@@ -151,36 +172,38 @@ def gather(tables, state, m):
     shared, coordinates = state.shared, state.sum.shape[0]
     for c in range(0, coordinates, 2):
         d = min(c + 1, coordinates - 1)
-        one, other = totals(1.0, lanes(state.sum, c, m), lanes(state.sum, d, m))
-        shared[SHARED_ROWS + c, m], shared[SHARED_ROWS + d, m] = shared[TRUST, m] * one, shared[TRUST, m] * other
+        trust = read(shared, TRUST, m)
+        one, other = totals(trust, lanes(state.sum, c, m), lanes(state.sum, d, m))
+        write(trust * one, shared, SHARED_ROWS + c, m)
+        write(trust * other, shared, SHARED_ROWS + d, m)
         put(state.sum, c, m, 0.0 * lanes(state.band, 0, LIVE))
         put(state.sum, d, m, 0.0 * lanes(state.band, 0, LIVE))
-    return shared[SHARED_ROWS, m], shared[SHARED_ROWS + min(coordinates - 1, 1), m]
+    return read(shared, SHARED_ROWS, m), read(shared, SHARED_ROWS + min(coordinates - 1, 1), m)
 
 
 @kernel
 def speak(tables, state, m, one, other, drive):
-    """Drive of the channels from that of the coordinates, each cut to its limit.  Returns flags."""
-    limit, flags, coordinates = tables.numbers.drive_limit, 0, tables.listen.shape[0]
+    """Drive of the channels from that of the coordinates, each cut to its limit.  Returns flags, as a float."""
+    limit, flags, coordinates = tables.numbers.drive_limit, 0.0 * one, tables.listen.shape[0]
     for i in range(drive.shape[0]):
         asked = tables.speak[i, 0] * one
         if coordinates > 1:
             asked += tables.speak[i, 1] * other
         for c in range(2, coordinates):
-            asked += tables.speak[i, c] * state.shared[SHARED_ROWS + c, m]
-        drive[i] = min(max(asked, -limit), limit)
-        if drive[i] != asked:
-            flags = 1
+            asked += tables.speak[i, c] * read(state.shared, SHARED_ROWS + c, m)
+        cut = low(high(asked, -limit), limit)
+        write(cut, drive, i)
+        flags = select(cut == asked, flags, 1.0)
     return flags
 
 
 @kernel
-def polar_step(tables, state, sensed, position, wanted, drive, target):
-    """One sample of the whole controller: fills `drive` (channels,) and `target` (bands,), returns flags."""
+def polar_advance(tables, state, sensed, position, wanted, drive, target):
+    """One sample of the whole controller: fills `drive` (channels,) and `target` (bands,), returns flags as a float."""
     if state.sample[0] % REFRESH == 0:
         refresh(tables, state)
-    fits = hearing(tables, state.shared, 0, sensed)
-    flags, known = share(tables, state, 0, fits, position, wanted, recall(state))
+    odd = hearing(tables, state.shared, 0, sensed)
+    flags, known = share(tables, state, 0, odd, position, wanted, recall(state))
     remember(state, known)
     plain = usual(tables, state, 1)
     for t in range(state.band.shape[0]):
@@ -192,4 +215,10 @@ def polar_step(tables, state, sensed, position, wanted, drive, target):
             tile_step(tables, state, t, 0, target)
         one, other = gather(tables, state, 0)
     state.sample[0] += 1
-    return flags | speak(tables, state, 0, one, other, drive)
+    return flags + speak(tables, state, 0, one, other, drive)
+
+
+@kernel
+def polar_step(tables, state, sensed, position, wanted, drive, target):
+    """One sample of a single scenario; see `polar_advance`.  Returns flags."""
+    return np.int64(polar_advance(tables, state, sensed, position, wanted, drive, target))
