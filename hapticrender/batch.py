@@ -235,7 +235,7 @@ def _draw(plates: Sequence[Plate], noise: Array) -> None:
         drawn = np.zeros((LANES, *noise.shape[:-1]))
         for lane, plate in enumerate(plates):
             if plate.parameters.sensor_noise > 0.0:
-                plate._noise.fill(drawn[lane])
+                plate._rng.standard_normal(out=drawn[lane])
         noise[:] = np.moveaxis(drawn, 0, -1)
 
 

@@ -29,7 +29,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hapticrender.compiled.normal import Normals
 from hapticrender.control.bandmodel import BandModel
 from hapticrender.control.damping_margins import BendingMode
 from hapticrender.plants.base import TouchedPlant
@@ -289,7 +288,7 @@ class Plate(TouchedPlant):
         self.delay = parameters.delay
         self.block = block
         self.drive_channels, self.sensed_channels = parameters.coils, 2
-        self.seed = seed
+        self._rng = np.random.default_rng(seed)
         self._tables = plate_tables(parameters, finger)
         self._last = np.zeros(2)
 
@@ -297,15 +296,11 @@ class Plate(TouchedPlant):
     def _state(self) -> PlateState:
         return plate_state(self.delay - self.block)
 
-    @cached_property
-    def _noise(self) -> Normals:
-        return Normals(self.seed)
-
     def _next(self, n: int) -> tuple[Array, Array, Array]:
         """Finger rows, noise and sample flags of the next n samples."""
         time = self._time(n)
         self._samples += n
-        noise = np.zeros((n, 2)) if self._tables.sensor_noise == 0.0 else self._noise.fill(np.empty((n, 2)))
+        noise = self._rng.standard_normal((n, 2)) if self._tables.sensor_noise > 0.0 else np.zeros((n, 2))
         return self.finger.touch(time), noise, np.zeros(n, np.int64)
 
     def closes(self, controller: Controller) -> bool:
