@@ -183,6 +183,7 @@ def block_state(tables: BankTables, block: int, dtype: type) -> BlockState:
     bank.pace[:] = row.GROWING
     bank.band[:, row.LIVE] = (np.arange(tiles * width) < bands).reshape(tiles, width)
     whole = -(-block // EIGHT) * EIGHT
+    rows = max(2 * whole, TURN_SIN + 1) if (tables.tone[1] > 0.0).any() else TURN_SIN + 1
     phase = aligned((tiles * width // 8, PHASE_ROWS, 8))
     turns = np.zeros(tiles * width)
     turns[:bands] = np.mod(tables.tone[2], 1.0)
@@ -190,7 +191,8 @@ def block_state(tables: BankTables, block: int, dtype: type) -> BlockState:
     return BlockState(
         bank=bank,
         phase=phase,
-        table=aligned((tiles, max(2 * whole, TURN_SIN + 1), width), dtype),
+        carrier=aligned((2, tiles * width), dtype),
+        table=aligned((tiles, rows, width), dtype),
         held=aligned((tiles, 2 * coordinates + CHANNEL_ROWS * (channels + channels % 2), width), dtype),
         response=np.zeros(whole),
         inverse=np.zeros((2, 2 * whole)),

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from hapticrender.compiled.jit import kernel
 from hapticrender.compiled.lanes import any_of, floor, high, root, size, totals
-from hapticrender.compiled.lanes_memory import lanes, put, put_pairs
+from hapticrender.compiled.lanes_memory import lanes, put, put_pairs, put_stretch, stretch
 from hapticrender.compiled.polynomials import unit, whole
 from hapticrender.control.bank import rows as row
 from hapticrender.control.bank.carriers import FORGET, derivative, grow_pass, law_tune, look_ahead, motion_pass
@@ -24,7 +24,6 @@ from hapticrender.control.bank.kernels import believe, wake
 from hapticrender.control.bank.learning import begin_finger, learn_finger, send_finger
 from hapticrender.control.blocks.state import (
     CHANNEL_ROWS,
-    COSINE,
     EIGHT,
     FAR_COS,
     FAR_SIN,
@@ -35,7 +34,6 @@ from hapticrender.control.blocks.state import (
     PAIR_ROWS,
     PAIR_SIN,
     PAIRS,
-    SINE,
     STEP_RE,
     TO_MIDDLE,
     TURN_COS,
@@ -52,22 +50,18 @@ NEAR_LIMIT = 0.5  # share of the drive's limit, from which on its envelope is wa
 @kernel
 def count_phases(tables, state):
     """Phasors of the carriers where their tables begin; then their phases at the next block's start."""
-    bank, phase = state.bank, state.phase
+    band, phase, carrier = state.bank.band, state.phase, state.carrier
     for i in range(phase.shape[0]):
         turns = lanes(phase, i, TURNS)
         cos, sin = unit(turns + lanes(phase, i, TO_MIDDLE))
-        put(phase, i, COSINE, cos)
-        put(phase, i, SINE, sin)
+        put_stretch(carrier, 0, i * EIGHT, cos)
+        put_stretch(carrier, 1, i * EIGHT, sin)
         turns += lanes(phase, i, TURNED)
         put(phase, i, TURNS, turns - floor(turns))
-    band, parts = bank.band, bank.band.shape[2] // EIGHT
     for t in range(band.shape[0]):
-        for part in range(parts):
-            for i in range(EIGHT):
-                band[t, row.COS, part * EIGHT + i] = phase[t * parts + part, COSINE, i]
-                band[t, row.SIN, part * EIGHT + i] = phase[t * parts + part, SINE, i]
-        put(band, t, row.COS, lanes(band, t, row.LIVE) * lanes(band, t, row.COS))
-        put(band, t, row.SIN, lanes(band, t, row.LIVE) * lanes(band, t, row.SIN))
+        live, first = lanes(band, t, row.LIVE), t * band.shape[2]
+        put(band, t, row.COS, live * stretch(carrier, 0, first))
+        put(band, t, row.SIN, live * stretch(carrier, 1, first))
 
 
 @kernel

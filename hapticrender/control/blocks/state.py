@@ -13,10 +13,10 @@ PAIRS = 4  # of samples in a group, at +-0.5, 1.5, 2.5 and 3.5 samples about its
 PAIR_COS, PAIR_SIN, FAR_COS, FAR_SIN = range(4)  # at the pair's later sample; the same times its distance over M
 PAIR_ROWS = 4
 TURN_COS, TURN_SIN = PAIRS * PAIR_ROWS, PAIRS * PAIR_ROWS + 1
-# rows of BlockState.phase: turns of the fixed part of each carrier at the block's start, its cosine and sine where the
-# tables begin, turns a block, and turns from the block's start to there: the middle of the first group, if it stays
-TURNS, COSINE, SINE, TURNED, TO_MIDDLE = range(5)
-PHASE_ROWS = 5
+# rows of BlockState.phase: turns of the fixed part of each carrier at the block's start, turns a block, and turns from
+# the block's start to where the tables begin: the middle of the first group, if it stays
+TURNS, TURNED, TO_MIDDLE = range(3)
+PHASE_ROWS = 3
 # rows of BlockState.held, CHANNEL_ROWS a channel after two for each coordinate: the drive's envelope at the end of the
 # last block and of this one, and both as this block's tables want them
 LAST_RE, LAST_IM, NOW_RE, NOW_IM, FROM_RE, FROM_IM, STEP_RE, STEP_IM = range(8)
@@ -35,9 +35,9 @@ class BlockState(NamedTuple):
 
     bank: BankState
     phase: Array  # (tiles of 8, PHASE_ROWS, 8) float64
-    table: (
-        Array  # (tiles, max(2 M, TURN_SIN + 1), W): see PAIR_COS; where a tile follows, cosine and sine at each sample
-    )
+    carrier: Array  # (2, bands) scratch: cosine and sine of the carriers where the tables begin
+    # (tiles, TURN_SIN + 1, W): see PAIR_COS; or 2 M rows where any follow: cosine and sine at each of a tile's samples
+    table: Array
     held: Array  # (tiles, 2 coordinates + CHANNEL_ROWS channels, W)
     response: Array  # (M,) r: what a residual of 1 adds to the ones after it
     inverse: Array  # (2, 2 M) first column of Q, and of its like for the wanted waveform, behind M zeros

@@ -122,10 +122,10 @@ def sum_drives(state, at):
             for i in range(PAIRS):
                 cos, sin, far_cos, far_sin = four(table, t, PAIR_ROWS * i)
                 early, late = q + PAIRS - 1 - i, q + PAIRS + i
-                add(sums, 0, early, re * cos - step_im * far_sin)
-                add(sums, 0, late, step_re * far_cos - im * sin)
-                add(sums, 1, early, up_re * cos - rise_im * far_sin)
-                add(sums, 1, late, rise_re * far_cos - up_im * sin)
+                put(sums, 0, early, lanes(sums, 0, early) + re * cos - step_im * far_sin)
+                put(sums, 0, late, lanes(sums, 0, late) + step_re * far_cos - im * sin)
+                put(sums, 1, early, lanes(sums, 1, early) + up_re * cos - rise_im * far_sin)
+                put(sums, 1, late, lanes(sums, 1, late) + rise_re * far_cos - up_im * sin)
             re, im = turned(turn, on, re, im)
             step_re, step_im = turned(turn, on, step_re, step_im)
             up_re, up_im = turned(turn, on, up_re, up_im)
