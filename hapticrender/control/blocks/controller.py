@@ -14,7 +14,7 @@ from hapticrender.control.bank.state import PRECISIONS, BankNumbers, BankTables,
 from hapticrender.control.blocks.kernels import block_run
 from hapticrender.control.blocks.state import (
     CHANNEL_ROWS,
-    EIGHT,
+    GROUP,
     PHASE_ROWS,
     TURN_SIN,
     TURNS,
@@ -182,7 +182,7 @@ def block_state(tables: BankTables, block: int, dtype: type) -> BlockState:
     tiles, width = padded(bands, dtype), WIDTH[np.dtype(dtype)]
     bank.pace[:] = row.GROWING
     bank.band[:, row.LIVE] = (np.arange(tiles * width) < bands).reshape(tiles, width)
-    whole = -(-block // EIGHT) * EIGHT
+    whole = -(-block // GROUP) * GROUP
     rows = max(2 * whole, TURN_SIN + 1) if (tables.tone[1] > 0.0).any() else TURN_SIN + 1
     phase = aligned((tiles * width // 8, PHASE_ROWS, 8))
     turns = np.zeros(tiles * width)

@@ -28,6 +28,7 @@ from hapticrender.control.blocks.state import (
     FAR_COS,
     FAR_SIN,
     FROM_RE,
+    GROUP,
     NOW_IM,
     NOW_RE,
     PAIR_COS,
@@ -153,7 +154,7 @@ def take_up(tables, state, t):
         put(state.table, t, PAIR_ROWS * i + PAIR_SIN, sin)
         put(state.table, t, PAIR_ROWS * i + FAR_COS, (i + 0.5) / block * cos)
         put(state.table, t, PAIR_ROWS * i + FAR_SIN, (i + 0.5) / block * sin)
-    cos, sin = unit(step * EIGHT)
+    cos, sin = unit(step * GROUP)
     put(state.table, t, TURN_COS, cos)
     put(state.table, t, TURN_SIN, sin)
 

@@ -7,8 +7,9 @@ from typing import NamedTuple
 from hapticrender.control.bank.state import BankNumbers, BankState, BankTables
 from hapticrender.protocols import Array
 
-EIGHT = 8  # samples of a group, and lanes of double precision: phases are always double
-PAIRS = 4  # of samples in a group, at +-0.5, 1.5, 2.5 and 3.5 samples about its middle
+EIGHT = 8  # lanes of double precision: phases are always double
+GROUP = 16  # samples, whose sums over the lanes fill a register of either precision
+PAIRS = GROUP // 2  # of samples in a group, at +-0.5, 1.5, 2.5 ... samples about its middle
 # rows of BlockState.table where a tile's carriers stay: PAIR_ROWS a pair, then the turn from group to group
 PAIR_COS, PAIR_SIN, FAR_COS, FAR_SIN = range(4)  # at the pair's later sample; the same times its distance over M
 PAIR_ROWS = 4
@@ -31,7 +32,7 @@ class BlockTables(NamedTuple):
 
 
 class BlockState(NamedTuple):
-    """State of the bank in blocks; changed in place.  M is the block, rounded up to a multiple of eight in scratch."""
+    """State of the bank in blocks; changed in place.  M is the block, rounded up to a multiple of `GROUP` in scratch."""
 
     bank: BankState
     phase: Array  # (tiles of 8, PHASE_ROWS, 8) float64

@@ -1,6 +1,6 @@
 """Sums over the bands and over the samples of a block, and the exact solve between residuals.
 
-Samples are taken in groups of eight about the group's middle, where a carrier's cosine is even and its sine odd: what a
+Samples are taken in groups of sixteen about the group's middle, where a carrier's cosine is even and its sine odd: what a
 pair of samples has in common and what it differs by cost half of what the samples would.  An envelope is turned from
 group to group.  Carriers that follow the finger have tables over the whole block instead.
 """
@@ -8,13 +8,13 @@ group to group.  Carriers that follow the finger have tables over the whole bloc
 from __future__ import annotations
 
 from hapticrender.compiled.jit import kernel
-from hapticrender.compiled.lanes import totals
-from hapticrender.compiled.lanes_memory import lanes, put, put_stretch, stretch
+from hapticrender.compiled.lanes_memory import lanes, put, put_stretch, row_totals, stretch
 from hapticrender.control.bank import rows as row
 from hapticrender.control.blocks.state import (
     CHANNEL_ROWS,
     EIGHT,
     FROM_RE,
+    GROUP,
     PAIR_COS,
     PAIR_ROWS,
     PAIR_SIN,
@@ -49,20 +49,21 @@ def add(lane_sum, s, m, value):
 def unfold(state):
     """Sums over the lanes, sample by sample."""
     out, lane_sum = state.sum, state.lane_sum
-    for q in range(0, out.shape[1], EIGHT):
-        for i in range(PAIRS):
-            early, late = q + PAIRS - 1 - i, q + PAIRS + i
-            even, even2 = totals(1.0, lanes(lane_sum, 0, early), lanes(lane_sum, 1, early))
-            odd, odd2 = totals(1.0, lanes(lane_sum, 0, late), lanes(lane_sum, 1, late))
-            out[0, early], out[0, late] = even - odd, even + odd
-            out[1, early], out[1, late] = even2 - odd2, even2 + odd2
+    for s in range(out.shape[0]):
+        for m in range(0, out.shape[1], lane_sum.shape[2]):
+            put_stretch(out, s, m, row_totals(lane_sum, s, m))
+        for q in range(0, out.shape[1], GROUP):
+            for i in range(PAIRS):
+                early, late = q + PAIRS - 1 - i, q + PAIRS + i
+                even, odd = out[s, early], out[s, late]
+                out[s, early], out[s, late] = even - odd, even + odd
 
 
 @kernel
 def add_following(state, t, s, re, im, step_re, step_im):
     """Add a tile that follows the finger to sum s: Re (x + (m + 1) step) e^(j phase of m)."""
     table, sums = state.table, state.lane_sum
-    for q in range(0, state.place.shape[0], EIGHT):
+    for q in range(0, state.place.shape[0], GROUP):
         for i in range(PAIRS):
             early, late = q + PAIRS - 1 - i, q + PAIRS + i
             cos, sin = lanes(table, t, 2 * early), lanes(table, t, 2 * early + 1)
@@ -86,7 +87,7 @@ def sum_bands(state, r, s):
             add_following(state, t, 1, at, up, nothing, nothing)
             continue
         turn, on = lanes(table, t, TURN_COS), lanes(table, t, TURN_SIN)
-        for q in range(0, sums.shape[1], EIGHT):
+        for q in range(0, sums.shape[1], GROUP):
             for i in range(PAIRS):
                 cos, sin = lanes(table, t, PAIR_ROWS * i + PAIR_COS), lanes(table, t, PAIR_ROWS * i + PAIR_SIN)
                 early, late = q + PAIRS - 1 - i, q + PAIRS + i
@@ -116,7 +117,7 @@ def sum_drives(state, at):
             add_following(state, t, 1, up_re, up_im, share * rise_re, share * rise_im)
             continue
         turn, on, ahead = lanes(table, t, TURN_COS), lanes(table, t, TURN_SIN), share * (PAIRS + 0.5)
-        for q in range(0, sums.shape[1], EIGHT):
+        for q in range(0, sums.shape[1], GROUP):
             re, im = re + ahead * step_re, im + ahead * step_im
             up_re, up_im = up_re + ahead * rise_re, up_im + ahead * rise_im
             for i in range(PAIRS):
@@ -130,7 +131,7 @@ def sum_drives(state, at):
             step_re, step_im = turned(turn, on, step_re, step_im)
             up_re, up_im = turned(turn, on, up_re, up_im)
             rise_re, rise_im = turned(turn, on, rise_re, rise_im)
-            ahead = share * EIGHT
+            ahead = share * GROUP
     unfold(state)
 
 
@@ -158,7 +159,7 @@ def solve(state, which, c):
         put_stretch(state.error, c, m, (first + second) + (third + fourth))
     for m in range(state.place.shape[0], whole):  # none is heard after the block's end
         state.error[c, m] = 0.0
-    for q in range(0, whole, EIGHT):
+    for q in range(0, whole, GROUP):
         for i in range(PAIRS):
             early, late = q + PAIRS - 1 - i, q + PAIRS + i
             state.heard[c, early] = state.error[c, late] + state.error[c, early]
@@ -171,7 +172,7 @@ def correlate(state, t, c, d):
     table, heard = state.table, state.heard
     re = im = at = up = 0.0 * lanes(table, t, 0)
     if state.bank.pace[t] == row.LOCKED:
-        for q in range(0, state.place.shape[0], EIGHT):
+        for q in range(0, state.place.shape[0], GROUP):
             for i in range(PAIRS):
                 early, late = q + PAIRS - 1 - i, q + PAIRS + i
                 cos, sin = lanes(table, t, 2 * early), lanes(table, t, 2 * early + 1)
@@ -182,7 +183,7 @@ def correlate(state, t, c, d):
                 at, up = at + even * (u + cos) + odd * (u - cos), up - even * (v + sin) - odd * (v - sin)
         return re, im, at, up
     turn, back = lanes(table, t, TURN_COS), -lanes(table, t, TURN_SIN)
-    for q in range(heard.shape[1] - EIGHT, -1, -EIGHT):
+    for q in range(heard.shape[1] - GROUP, -1, -GROUP):
         re, im = turned(turn, back, re, im)
         at, up = turned(turn, back, at, up)
         for i in range(PAIRS):
