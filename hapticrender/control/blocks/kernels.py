@@ -98,7 +98,7 @@ def analyse(state, wanted):
         turn_held(band, state.held, t, 0, lanes(band, t, row.RAW_RE), lanes(band, t, row.RAW_IM))
     sum_bands(state, 0, 0)
     for m in range(wanted.shape[0]):
-        state.raw[last, m] = (wanted[m] if size(wanted[m]) <= FAR else 0.0) - state.sum[0, m]
+        state.raw[last, m] = (wanted[m] if size(wanted[m]) <= FAR else 0.0) - state.sum[m, 0]
     solve(state, 1, last)
 
 
@@ -278,7 +278,7 @@ def speak(tables, state, drive):
         sum_drives(state, at)
         for i in range(pair):
             for m in range(block):
-                drive[m, channel + i] = trust * sums[i, m]
+                drive[m, channel + i] = trust * sums[m, i]
                 peak = max(peak, (unit_drive * drive[m, channel + i]) ** 2)
         if max(peak, state.bank.touch[row.PEAK]) > NEAR_LIMIT * NEAR_LIMIT:
             for i in range(pair):
@@ -286,7 +286,7 @@ def speak(tables, state, drive):
             sum_drives(state, at)
             for i in range(pair):
                 for m in range(block):
-                    across = unit_drive * trust * sums[i, m]
+                    across = unit_drive * trust * sums[m, i]
                     peak = max(peak, (unit_drive * drive[m, channel + i]) ** 2 + across * across)
     return peak
 
@@ -402,7 +402,7 @@ def block_step(tables, state, sensed, position, wanted, drive, target, flags):
     hears_fast = hears_slow = 0.0 * lanes(band, 0, row.COS)
     for c in range(coordinates):
         for m in range(block):
-            state.raw[c, m] -= state.sum[c, m]
+            state.raw[c, m] -= state.sum[m, c]
         solve(state, 0, c)
         settle_level(tables, state, c)
     for t in range(tiles):

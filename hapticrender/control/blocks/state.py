@@ -46,8 +46,8 @@ class BlockState(NamedTuple):
     heard: Array  # the same in the precision of the bands, folded: sums of a group's pairs, then differences
     raw: Array  # (coordinates + 1, M) scratch: residuals as the held envelopes would leave them
     place: Array  # (M,) scratch: position of the finger
-    sum: Array  # (2, M) scratch: sums over the bands
-    lane_sum: Array  # (2, M, W) scratch: the same a lane, and folded
+    sum: Array  # (M, 2) scratch: sums over the bands
+    lane_sum: Array  # (M, 2, W) scratch: the same a lane, and folded; the two side by side, not a multiple of 4 KB apart
     stale: Array  # (1,) integer: 1 where tables and `response` have to be found anew
     news: Array  # (1,) integer: 1 where all tones are to be looked at; otherwise it is one tile a block
     gain: Array  # (1,) gain of the observer that `inverse` holds for

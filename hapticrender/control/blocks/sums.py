@@ -34,29 +34,29 @@ def turned(cos, sin, re, im):
 def clear(state):
     """Begin the sums over the bands."""
     nothing = 0.0 * lanes(state.table, 0, 0)
-    for s in range(2):
-        for m in range(state.lane_sum.shape[1]):
-            put(state.lane_sum, s, m, nothing)
+    for m in range(state.lane_sum.shape[0]):
+        for s in range(2):
+            put(state.lane_sum, m, s, nothing)
 
 
 @kernel
 def add(lane_sum, s, m, value):
     """Add to a sum."""
-    put(lane_sum, s, m, lanes(lane_sum, s, m) + value)
+    put(lane_sum, m, s, lanes(lane_sum, m, s) + value)
 
 
 @kernel
 def unfold(state):
     """Sums over the lanes, sample by sample."""
     out, lane_sum = state.sum, state.lane_sum
-    for s in range(out.shape[0]):
-        for m in range(0, out.shape[1], lane_sum.shape[2]):
-            put_stretch(out, s, m, row_totals(lane_sum, s, m))
-        for q in range(0, out.shape[1], GROUP):
-            for i in range(PAIRS):
-                early, late = q + PAIRS - 1 - i, q + PAIRS + i
-                even, odd = out[s, early], out[s, late]
-                out[s, early], out[s, late] = even - odd, even + odd
+    for m in range(0, out.shape[0], lane_sum.shape[2] // 2):
+        put_stretch(out, m, 0, row_totals(lane_sum, m, 0))
+    for q in range(0, out.shape[0], GROUP):
+        for i in range(PAIRS):
+            early, late = q + PAIRS - 1 - i, q + PAIRS + i
+            for s in range(2):
+                even, odd = out[early, s], out[late, s]
+                out[early, s], out[late, s] = even - odd, even + odd
 
 
 @kernel
@@ -87,7 +87,7 @@ def sum_bands(state, r, s):
             add_following(state, t, 1, at, up, nothing, nothing)
             continue
         turn, on = lanes(table, t, TURN_COS), lanes(table, t, TURN_SIN)
-        for q in range(0, sums.shape[1], GROUP):
+        for q in range(0, sums.shape[0], GROUP):
             for i in range(PAIRS):
                 cos, sin = lanes(table, t, PAIR_ROWS * i + PAIR_COS), lanes(table, t, PAIR_ROWS * i + PAIR_SIN)
                 early, late = q + PAIRS - 1 - i, q + PAIRS + i
@@ -117,16 +117,16 @@ def sum_drives(state, at):
             add_following(state, t, 1, up_re, up_im, share * rise_re, share * rise_im)
             continue
         turn, on, ahead = lanes(table, t, TURN_COS), lanes(table, t, TURN_SIN), share * (PAIRS + 0.5)
-        for q in range(0, sums.shape[1], GROUP):
+        for q in range(0, sums.shape[0], GROUP):
             re, im = re + ahead * step_re, im + ahead * step_im
             up_re, up_im = up_re + ahead * rise_re, up_im + ahead * rise_im
             for i in range(PAIRS):
                 cos, sin, far_cos, far_sin = four(table, t, PAIR_ROWS * i)
                 early, late = q + PAIRS - 1 - i, q + PAIRS + i
-                put(sums, 0, early, lanes(sums, 0, early) + re * cos - step_im * far_sin)
-                put(sums, 0, late, lanes(sums, 0, late) + step_re * far_cos - im * sin)
-                put(sums, 1, early, lanes(sums, 1, early) + up_re * cos - rise_im * far_sin)
-                put(sums, 1, late, lanes(sums, 1, late) + rise_re * far_cos - up_im * sin)
+                put(sums, early, 0, lanes(sums, early, 0) + re * cos - step_im * far_sin)
+                put(sums, late, 0, lanes(sums, late, 0) + step_re * far_cos - im * sin)
+                put(sums, early, 1, lanes(sums, early, 1) + up_re * cos - rise_im * far_sin)
+                put(sums, late, 1, lanes(sums, late, 1) + rise_re * far_cos - up_im * sin)
             re, im = turned(turn, on, re, im)
             step_re, step_im = turned(turn, on, step_re, step_im)
             up_re, up_im = turned(turn, on, up_re, up_im)
@@ -208,7 +208,7 @@ def respond(tables, state, g):
             put(held, t, 1, share * lanes(state.table, t, at + PAIR_SIN))
     sum_bands(state, 0, 0)
     for d in range(state.response.shape[0]):
-        state.response[d] = state.sum[0, d]
+        state.response[d] = state.sum[d, 0]
     invert(state.response, g, tables.sample.dc, tables.sample.dc_drift, state.inverse, 0)
     invert(state.response, tables.sample.reference, 0.0, 0.0, state.inverse, 1)
 
