@@ -8,7 +8,7 @@ group to group.  Carriers that follow the finger have tables over the whole bloc
 from __future__ import annotations
 
 from hapticrender.compiled.jit import kernel
-from hapticrender.compiled.lanes_memory import lanes, put, put_stretch, row_totals, stretch
+from hapticrender.compiled.lanes_memory import lanes, put, put_stretch, read, row_totals, stretch
 from hapticrender.control.bank import rows as row
 from hapticrender.control.blocks.state import (
     CHANNEL_ROWS,
@@ -177,9 +177,9 @@ def correlate(state, t, c, d):
                 early, late = q + PAIRS - 1 - i, q + PAIRS + i
                 cos, sin = lanes(table, t, 2 * early), lanes(table, t, 2 * early + 1)
                 u, v = lanes(table, t, 2 * late), lanes(table, t, 2 * late + 1)
-                even, odd = 0.5 * heard[c, early], 0.5 * heard[c, late]
+                even, odd = 0.5 * read(heard, c, early), 0.5 * read(heard, c, late)
                 re, im = re + even * (u + cos) + odd * (u - cos), im - even * (v + sin) - odd * (v - sin)
-                even, odd = 0.5 * heard[d, early], 0.5 * heard[d, late]
+                even, odd = 0.5 * read(heard, d, early), 0.5 * read(heard, d, late)
                 at, up = at + even * (u + cos) + odd * (u - cos), up - even * (v + sin) - odd * (v - sin)
         return re, im, at, up
     turn, back = lanes(table, t, TURN_COS), -lanes(table, t, TURN_SIN)
@@ -189,8 +189,8 @@ def correlate(state, t, c, d):
         for i in range(PAIRS):
             cos, sin = lanes(table, t, PAIR_ROWS * i + PAIR_COS), lanes(table, t, PAIR_ROWS * i + PAIR_SIN)
             early, late = q + PAIRS - 1 - i, q + PAIRS + i
-            re, im = re + heard[c, early] * cos, im - heard[c, late] * sin
-            at, up = at + heard[d, early] * cos, up - heard[d, late] * sin
+            re, im = re + read(heard, c, early) * cos, im - read(heard, c, late) * sin
+            at, up = at + read(heard, d, early) * cos, up - read(heard, d, late) * sin
     return re, im, at, up
 
 
