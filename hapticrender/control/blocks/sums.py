@@ -184,13 +184,15 @@ def correlate(state, t, c, d):
         return re, im, at, up
     turn, back = lanes(table, t, TURN_COS), -lanes(table, t, TURN_SIN)
     for q in range(heard.shape[1] - GROUP, -1, -GROUP):
-        re, im = turned(turn, back, re, im)
-        at, up = turned(turn, back, at, up)
-        for i in range(PAIRS):
+        even = odd = even2 = odd2 = 0.0 * turn
+        for i in range(PAIRS):  # of this group alone: no sum waits for that of another
             cos, sin = lanes(table, t, PAIR_ROWS * i + PAIR_COS), lanes(table, t, PAIR_ROWS * i + PAIR_SIN)
             early, late = q + PAIRS - 1 - i, q + PAIRS + i
-            re, im = re + read(heard, c, early) * cos, im - read(heard, c, late) * sin
-            at, up = at + read(heard, d, early) * cos, up - read(heard, d, late) * sin
+            even, odd = even + read(heard, c, early) * cos, odd + read(heard, c, late) * sin
+            even2, odd2 = even2 + read(heard, d, early) * cos, odd2 + read(heard, d, late) * sin
+        re, im = turned(turn, back, re, im)
+        at, up = turned(turn, back, at, up)
+        re, im, at, up = re + even, im - odd, at + even2, up - odd2
     return re, im, at, up
 
 
