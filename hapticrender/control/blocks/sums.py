@@ -75,29 +75,52 @@ def add_following(state, t, s, re, im, step_re, step_im):
 
 
 @kernel
+def staying(state, t, r, s):
+    """A tile, and what it holds in rows r, r + 1, s and s + 1: nothing where it follows the finger, or is none."""
+    held, last = state.held, state.held.shape[0] - 1
+    at = min(t, last)
+    counts = 1.0 if t <= last and state.bank.pace[at] != row.LOCKED else 0.0
+    re, im, up, on = lanes(held, at, r), lanes(held, at, r + 1), lanes(held, at, s), lanes(held, at, s + 1)
+    return at, counts * re, counts * im, counts * up, counts * on
+
+
+@kernel
 def sum_bands(state, r, s):
-    """Two sums over the bands at every sample: of Re x e^(j w m), x in rows r, r + 1 and in rows s, s + 1 of `held`."""
+    """Two sums over the bands at every sample: of Re x e^(j w m), x in rows r, r + 1 and in rows s, s + 1 of `held`.
+
+    Tiles go in pairs: what limits this is how often a sum is written.
+    """
     table, held, sums = state.table, state.held, state.lane_sum
     clear(state)
     for t in range(table.shape[0]):
-        re, im, at, up = lanes(held, t, r), lanes(held, t, r + 1), lanes(held, t, s), lanes(held, t, s + 1)
         if state.bank.pace[t] == row.LOCKED:
-            nothing = 0.0 * re
-            add_following(state, t, 0, re, im, nothing, nothing)
-            add_following(state, t, 1, at, up, nothing, nothing)
-            continue
-        turn, on = lanes(table, t, TURN_COS), lanes(table, t, TURN_SIN)
+            nothing = 0.0 * lanes(held, t, r)
+            add_following(state, t, 0, lanes(held, t, r), lanes(held, t, r + 1), nothing, nothing)
+            add_following(state, t, 1, lanes(held, t, s), lanes(held, t, s + 1), nothing, nothing)
+    for pair in range(0, table.shape[0], 2):
+        t, re, im, at, up = staying(state, pair, r, s)
+        n, re2, im2, at2, up2 = staying(state, pair + 1, r, s)
+        (turn, on), (turn2, on2) = both(table, t, TURN_COS), both(table, n, TURN_COS)
         for q in range(0, sums.shape[0], GROUP):
             for i in range(PAIRS):
-                cos, sin = lanes(table, t, PAIR_ROWS * i + PAIR_COS), lanes(table, t, PAIR_ROWS * i + PAIR_SIN)
+                cos, sin = both(table, t, PAIR_ROWS * i + PAIR_COS)
+                cos2, sin2 = both(table, n, PAIR_ROWS * i + PAIR_COS)
                 early, late = q + PAIRS - 1 - i, q + PAIRS + i
-                add(sums, 0, early, re * cos)
-                add(sums, 0, late, -im * sin)
-                add(sums, 1, early, at * cos)
-                add(sums, 1, late, -up * sin)
+                put(sums, early, 0, lanes(sums, early, 0) + re * cos + re2 * cos2)
+                put(sums, late, 0, lanes(sums, late, 0) - im * sin - im2 * sin2)
+                put(sums, early, 1, lanes(sums, early, 1) + at * cos + at2 * cos2)
+                put(sums, late, 1, lanes(sums, late, 1) - up * sin - up2 * sin2)
             re, im = turned(turn, on, re, im)
             at, up = turned(turn, on, at, up)
+            re2, im2 = turned(turn2, on2, re2, im2)
+            at2, up2 = turned(turn2, on2, at2, up2)
     unfold(state)
+
+
+@kernel
+def both(array, t, r):
+    """Rows r and r + 1 of a tile."""
+    return lanes(array, t, r), lanes(array, t, r + 1)
 
 
 @kernel
