@@ -156,9 +156,9 @@ class TunedBlock:
 
     def __init__(self, controller):
         tables, state = controller.tables, controller.state
-        numbers, sample, block = tables.bank.numbers, tables.sample, len(state.place)
-        if block % block_state.GROUP or sample.drive_step <= 0.0 or len(tables.bank.shape) != 2 or len(tables.bank.speak) != 2:
-            raise ValueError(f"{block=}: must be a multiple of {block_state.GROUP}, on two coordinates and two stepped channels")
+        numbers, sample, block, group = tables.bank.numbers, tables.sample, len(state.place), block_state.GROUP
+        if block % group or sample.drive_step <= 0.0 or len(tables.bank.shape) != 2 or len(tables.bank.speak) != 2:
+            raise ValueError(f"{block=}: must be a multiple of {group}, on two coordinates and two stepped channels")
         self.arrays = [
             same(each) for each in (state.bank.band, state.bank.loop, state.bank.law, state.held, state.phase)
         ]

@@ -2,7 +2,7 @@
 
 `lanes(array, i, j)` reads the row ``array[i, j, :]`` of a C-contiguous array whose last axis is as long as a register
 (`WIDTH`) and `put(array, i, j, value)` writes one; `read` and `write` do it for a scenario's own numbers, which are
-plain or lanes; a `stretch` starts anywhere.
+plain or lanes; a `stretch` starts anywhere, a `column` goes down the rows of a plain array.
 """
 
 from __future__ import annotations
@@ -146,7 +146,7 @@ def column(typingctx: Any, array: Any, i: Any, j: Any) -> Any:
 
     def build(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         value = ir.Constant(ir.VectorType(number_type(kind.dtype), kind.width), ir.Undefined)
-        for lane, at in enumerate(_down(context, builder, sig.args[0], *args, kind.width)):
+        for lane, at in enumerate(_down(context, builder, sig.args[0], kind.width, *args)):
             value = builder.insert_element(value, builder.load(at), ir.IntType(32)(lane))
         return value
 
@@ -161,7 +161,7 @@ def put_column(typingctx: Any, array: Any, i: Any, j: Any, value: Any) -> Any:
     kind = _lane(array)
 
     def build(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        rows = _down(context, builder, sig.args[0], *args[:3], kind.width)
+        rows = _down(context, builder, sig.args[0], kind.width, *args[:3])
         for lane in reversed(range(kind.width)):  # the last row's own comes after those that are past it
             builder.store(builder.extract_element(args[3], ir.IntType(32)(lane)), rows[lane])
         return context.get_dummy_value()
@@ -169,7 +169,7 @@ def put_column(typingctx: Any, array: Any, i: Any, j: Any, value: Any) -> Any:
     return types.none(array, types.intp, types.intp, kind), build
 
 
-def _down(context: Any, builder: Any, kind: Any, array: Any, i: Any, j: Any, count: int) -> list[Any]:
+def _down(context: Any, builder: Any, kind: Any, count: int, array: Any, i: Any, j: Any) -> list[Any]:
     """Pointers to array[i, j], array[i + 1, j] ...; past the last row, to that one again."""
     last = builder.sub(_parts(context, builder, kind, array)[1][0], ir.IntType(64)(1))
     rows = [builder.add(i, ir.IntType(64)(k)) for k in range(count)]

@@ -32,7 +32,7 @@ class BlockTables(NamedTuple):
 
 
 class BlockState(NamedTuple):
-    """State of the bank in blocks; changed in place.  M is the block, rounded up to a multiple of `GROUP` in scratch."""
+    """State of the bank in blocks; changed in place.  M is the block, in scratch a multiple of `GROUP`."""
 
     bank: BankState
     phase: Array  # (tiles of 8, PHASE_ROWS, 8) float64
@@ -47,7 +47,7 @@ class BlockState(NamedTuple):
     raw: Array  # (coordinates + 1, M) scratch: residuals as the held envelopes would leave them
     place: Array  # (M,) scratch: position of the finger
     sum: Array  # (M, 2) scratch: sums over the bands
-    lane_sum: Array  # (M, 2, W) scratch: the same a lane, and folded; the two side by side, not a multiple of 4 KB apart
+    lane_sum: Array  # (M, 2, W) scratch: the same a lane, and folded; not 4 KB apart, where stores delay loads
     stale: Array  # (1,) integer: 1 where tables and `response` have to be found anew
     news: Array  # (1,) integer: 1 where all tones are to be looked at; otherwise it is one tile a block
     gain: Array  # (1,) gain of the observer that `inverse` holds for

@@ -1,8 +1,8 @@
 """Sums over the bands and over the samples of a block, and the exact solve between residuals.
 
-Samples are taken in groups of sixteen about the group's middle, where a carrier's cosine is even and its sine odd: what a
-pair of samples has in common and what it differs by cost half of what the samples would.  An envelope is turned from
-group to group.  Carriers that follow the finger have tables over the whole block instead.
+Samples are taken in groups of sixteen about the group's middle, where a carrier's cosine is even and its sine odd:
+what a pair of samples has in common and what it differs by cost half of what the samples would.  An envelope is turned
+from group to group.  Carriers that follow the finger have tables over the whole block instead.
 """
 
 from __future__ import annotations

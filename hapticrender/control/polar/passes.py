@@ -11,7 +11,17 @@ import numpy as np
 
 from hapticrender.compiled.jit import kernel
 from hapticrender.compiled.lanes import WIDTH, any_of, select, size
-from hapticrender.compiled.lanes_memory import column, lanes, put, put_column, put_pairs, put_stretch, row_totals, stretch, taken
+from hapticrender.compiled.lanes_memory import (
+    column,
+    lanes,
+    put,
+    put_column,
+    put_pairs,
+    put_stretch,
+    row_totals,
+    stretch,
+    taken,
+)
 from hapticrender.compiled.polynomials import cosine, polar
 from hapticrender.control.kernels import QUIET, TURN
 from hapticrender.control.polar.kernels import (
