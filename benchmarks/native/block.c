@@ -229,7 +229,7 @@ void NAME(v *bands, v *loops, v *laws, v *helds, v8 *phases, const v *tables, co
                 }
         for (int m = 0; m < block; m++)
             for (int c = 0; c < 2; c++) {
-                double shaped = drive[2 * m + c] + 2 * n->rounding[0][c] - n->rounding[1][c];
+                double shaped = (drive[2 * m + c] - n->rounding[1][c]) + 2 * n->rounding[0][c];
                 double exact = n->step * __builtin_floor(shaped * (1 / n->step) + 0.5), off = shaped - exact;
                 n->rounding[1][c] = n->rounding[0][c];
                 n->rounding[0][c] = off < -n->step ? -n->step : off > n->step ? n->step : off;

@@ -304,7 +304,7 @@ def shape_drive(tables, state, scale, drive):
             if not believed:
                 exact = shaper[0, channel] = shaper[1, channel] = 0.0
             elif step > 0.0:
-                shaped = exact + 2.0 * shaper[0, channel] - shaper[1, channel]
+                shaped = (exact - shaper[1, channel]) + 2.0 * shaper[0, channel]
                 exact = step * whole(shaped, per_step)
                 shaper[1, channel] = shaper[0, channel]
                 shaper[0, channel] = min(max(shaped - exact, -step), step)
