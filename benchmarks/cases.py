@@ -76,7 +76,7 @@ def polar_against_c(bands: int, precision: str, pairs: int) -> Iterator[Figure]:
         (tuned, 1.15, False, "C tuned by hand (native/polar.c)"),
         (naive, {"double": 30.0, "single": 90.0}[precision], True, "naive C, double (native/naive.c)"),
     ):
-        paired = interleave(ours, lambda reference=reference: reference.run(sides), pairs, time.thread_time)
+        paired = interleave(ours, lambda reference=reference: reference.run(sides), pairs, time.thread_time, True)
         each = paired.candidate / samples / bands / 2 * 1e9
         ratio = paired.ratio if at_least else 1 / paired.ratio
         name = f"polar, {bands} bands, {precision}: {'times faster than' if at_least else 'time over that of'}"

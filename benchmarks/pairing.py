@@ -38,22 +38,32 @@ def use(cores: set[int]) -> None:
         os.sched_setaffinity(0, cores)
 
 
-def seconds(run: Run, clock: Callable[[], float] = time.perf_counter) -> float:
-    """Time of one run."""
+def seconds(run: Run, clock: Callable[[], float] = time.perf_counter, settled: bool = False) -> float:
+    """Time of one run, after another that does not count where it is to be settled."""
+    if settled:
+        run()
     start = clock()
     run()
     return clock() - start
 
 
-def interleave(candidate: Run, reference: Run, pairs: int, clock: Callable[[], float] = time.perf_counter) -> Paired:
+def interleave(
+    candidate: Run,
+    reference: Run,
+    pairs: int,
+    clock: Callable[[], float] = time.perf_counter,
+    settled: bool = False,
+) -> Paired:
     """Run both `pairs` times in turns, after one run each that does not count.
 
     On a core that others share, a long run meets them and a short one does not: where one takes many times as long as
-    the other, and both work in this thread only, `clock` should be the thread's own, `time.thread_time`.
+    the other, and both work in this thread only, `clock` should be the thread's own, `time.thread_time`.  The short one
+    also pays for what the long one left, caches and wide registers asleep (0.1 ms were seen): where both are to be seen
+    as they run on and on, each run that counts is `settled` by one of its own before.
     """
     candidate()
     reference()
-    rows = [(seconds(candidate, clock), seconds(reference, clock)) for _ in range(pairs)]
+    rows = [(seconds(candidate, clock, settled), seconds(reference, clock, settled)) for _ in range(pairs)]
     ratios = [reference / candidate for candidate, reference in rows]
     low, middle, high = statistics.quantiles(ratios, n=4, method="inclusive") if pairs > 1 else 3 * ratios
     return Paired(

@@ -122,6 +122,14 @@ def test_pairs_are_taken_in_turns(benchmarks):
     assert found.ratio > 0
 
 
+def test_a_settled_run_follows_one_of_its_own(benchmarks):
+    from pairing import interleave
+
+    order, times = [], iter(range(12))
+    interleave(lambda: order.append("a"), lambda: order.append("b"), 3, lambda: order.append("|") or next(times), True)
+    assert "".join(order) == "ab" + "a|a|b|b|" * 3
+
+
 def test_the_spread_of_pairs_is_that_of_their_quarters(benchmarks):
     from pairing import interleave
 

@@ -21,7 +21,17 @@ from hapticrender.compiled.lanes import (
     size,
     total,
 )
-from hapticrender.compiled.lanes_memory import lanes, put, put_stretch, read, row_totals, stretch, write
+from hapticrender.compiled.lanes_memory import (
+    column,
+    lanes,
+    put,
+    put_column,
+    put_stretch,
+    read,
+    row_totals,
+    stretch,
+    write,
+)
 
 KINDS = [np.float64, np.float32]
 
@@ -169,6 +179,22 @@ def test_a_stretch_starts_anywhere(dtype, rng):
     expected = np.zeros((2, 40), dtype)
     expected[1, 4 : 4 + width] = values[0, 3 : 3 + width] + dtype(1.0)
     np.testing.assert_array_equal(out, expected)
+
+
+@kernel
+def moved_over(values, start, out):
+    put_column(out, start, 1, column(values, start, 0) + 1.0)
+
+
+@pytest.mark.parametrize("dtype", KINDS)
+@pytest.mark.parametrize("start", [0, 3, 18, 19])
+def test_a_column_ends_with_the_rows(dtype, start, rng):
+    """Lanes past the last row change nothing: neither that row, nor what lies behind the array."""
+    values, room = rng.standard_normal((20, 3)).astype(dtype), np.zeros((20 + 16, 2), dtype)
+    expected, stop = room.copy(), min(start + WIDTH[np.dtype(dtype)], 20)
+    expected[start:stop, 1] = values[start:stop, 0] + dtype(1.0)
+    moved_over(values, start, room[:20])
+    np.testing.assert_array_equal(room, expected)
 
 
 @kernel

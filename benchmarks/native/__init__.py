@@ -14,7 +14,7 @@ import numpy as np
 from hapticrender.compiled import polynomials as _polynomials
 from hapticrender.compiled.lanes import WIDTH, aligned
 from hapticrender.control.bank import rows as row
-from hapticrender.control.bank.carriers import FORGET
+from hapticrender.control.bank.observer import FORGET
 from hapticrender.control.blocks import state as block_state
 
 HERE = Path(__file__).parent
@@ -156,9 +156,9 @@ class TunedBlock:
 
     def __init__(self, controller):
         tables, state = controller.tables, controller.state
-        numbers, sample, block = tables.bank.numbers, tables.sample, len(state.place)
-        if block % 8 or sample.drive_step <= 0.0 or len(tables.bank.shape) != 2 or len(tables.bank.speak) != 2:
-            raise ValueError(f"{block=}: must be a multiple of 8, on two coordinates and two stepped channels")
+        numbers, sample, block, group = tables.bank.numbers, tables.sample, len(state.place), block_state.GROUP
+        if block % group or sample.drive_step <= 0.0 or len(tables.bank.shape) != 2 or len(tables.bank.speak) != 2:
+            raise ValueError(f"{block=}: must be a multiple of {group}, on two coordinates and two stepped channels")
         self.arrays = [
             same(each) for each in (state.bank.band, state.bank.loop, state.bank.law, state.held, state.phase)
         ]

@@ -61,7 +61,7 @@ void NAME(v *bands, v *loops, v *laws, v *helds, v8 *phases, const v *tables, co
     for (int b = 0; b < blocks; b++, sensed += 2 * block, drive += 2 * block) {
         double raw[2][MOST], error[2][MOST];
         real folded[2][MOST];
-        v sum[2][MOST], heard_fast = {}, heard_slow = {};
+        v sum[MOST][2], heard_fast = {}, heard_slow = {};
         for (int t = 0; t < tiles; t++) { /* carriers, targets, and what is expected of the block */
             v *band = bands + R_BAND_ROWS * t, *held = helds + R_HELD_ROWS * t;
             const v *loop = loops + 2 * R_LOOP_ROWS * t;
@@ -88,18 +88,29 @@ void NAME(v *bands, v *loops, v *laws, v *helds, v8 *phases, const v *tables, co
                 held[2 * i] = a * c - z * s, held[2 * i + 1] = a * s + z * c;
             }
         }
-        for (int m = 0; m < block; m++) sum[0][m] = sum[1][m] = (v){};
-        for (int t = 0; t < tiles; t++) {
-            const v *held = helds + R_HELD_ROWS * t, *table = tables + R_TABLE_ROWS * t;
-            v re = held[0], im = held[1], at = held[2], up = held[3], turn = table[16], on = table[17];
-            for (int q = 0; q < block; q += 8) {
-                for (int i = 0; i < 4; i++) {
-                    v c = table[4 * i], s = table[4 * i + 1];
-                    sum[0][q + 3 - i] += re * c, sum[0][q + 4 + i] -= im * s;
-                    sum[1][q + 3 - i] += at * c, sum[1][q + 4 + i] -= up * s;
+        for (int m = 0; m < block; m++) sum[m][0] = sum[m][1] = (v){};
+        for (int pair = 0; pair < tiles; pair += 2) {
+            const v *table[2];
+            v re[2], im[2], at[2], up[2];
+            for (int k = 0; k < 2; k++) {
+                int t = MIN(pair + k, tiles - 1);
+                const v *held = helds + R_HELD_ROWS * t;
+                real counts = pair + k < tiles;
+                table[k] = tables + R_TABLE_ROWS * t;
+                re[k] = counts * held[0], im[k] = counts * held[1], at[k] = counts * held[2], up[k] = counts * held[3];
+            }
+            for (int q = 0; q < block; q += R_GROUP) {
+                for (int i = 0; i < R_PAIRS; i++) {
+                    v *early = sum[q + R_PAIRS - 1 - i], *late = sum[q + R_PAIRS + i];
+                    v c = table[0][4 * i], s = table[0][4 * i + 1], c2 = table[1][4 * i], s2 = table[1][4 * i + 1];
+                    early[0] = early[0] + re[0] * c + re[1] * c2, late[0] = late[0] - im[0] * s - im[1] * s2;
+                    early[1] = early[1] + at[0] * c + at[1] * c2, late[1] = late[1] - up[0] * s - up[1] * s2;
                 }
-                TURN(re, im)
-                TURN(at, up)
+                for (int k = 0; k < 2; k++) {
+                    v turn = table[k][R_TURN_COS], on = table[k][R_TURN_SIN];
+                    TURN(re[k], im[k])
+                    TURN(at[k], up[k])
+                }
             }
         }
         for (int c = 0; c < 2; c++) {
@@ -109,10 +120,11 @@ void NAME(v *bands, v *loops, v *laws, v *helds, v8 *phases, const v *tables, co
                     if (fabs(sensed[2 * m + s]) <= n->sensed_limit) y += n->listen[c][s] * sensed[2 * m + s];
                 raw[c][m] = y;
             }
-            for (int q = 0; q < block; q += 8)
-                for (int i = 0; i < 4; i++) {
-                    double even = total(sum[c][q + 3 - i]), odd = total(sum[c][q + 4 + i]);
-                    raw[c][q + 3 - i] -= even - odd, raw[c][q + 4 + i] -= even + odd;
+            for (int q = 0; q < block; q += R_GROUP)
+                for (int i = 0; i < R_PAIRS; i++) {
+                    int early = q + R_PAIRS - 1 - i, late = q + R_PAIRS + i;
+                    double even = total(sum[early][c]), odd = total(sum[late][c]);
+                    raw[c][early] -= even - odd, raw[c][late] -= even + odd;
                 }
             for (int m = 0; m < block; m += 8) {
                 v8 found[4] = {};
@@ -127,24 +139,27 @@ void NAME(v *bands, v *loops, v *laws, v *helds, v8 *phases, const v *tables, co
             }
             level[c] += block * level[2 + c] + gained;
             level[2 + c] += steeper;
-            for (int q = 0; q < block; q += 8)
-                for (int i = 0; i < 4; i++) {
-                    folded[c][q + 3 - i] = error[c][q + 4 + i] + error[c][q + 3 - i];
-                    folded[c][q + 4 + i] = error[c][q + 4 + i] - error[c][q + 3 - i];
+            for (int q = 0; q < block; q += R_GROUP)
+                for (int i = 0; i < R_PAIRS; i++) {
+                    int early = q + R_PAIRS - 1 - i, late = q + R_PAIRS + i;
+                    folded[c][early] = error[c][late] + error[c][early];
+                    folded[c][late] = error[c][late] - error[c][early];
                 }
         }
         for (int t = 0; t < tiles; t++) { /* what the residuals have in common with the carriers; loop; law */
             v *band = bands + R_BAND_ROWS * t, *held = helds + R_HELD_ROWS * t, *loop = loops + 2 * R_LOOP_ROWS * t;
             const v *table = tables + R_TABLE_ROWS * t, *law = laws + R_LAW_TILE_ROWS * t;
-            v turn = table[16], on = -table[17], a[4] = {}, cosine = band[R_COS], sine = band[R_SIN];
-            for (int q = block - 8; q >= 0; q -= 8) {
+            v turn = table[R_TURN_COS], on = -table[R_TURN_SIN], a[4] = {}, cosine = band[R_COS], sine = band[R_SIN];
+            for (int q = block - R_GROUP; q >= 0; q -= R_GROUP) {
+                v even[2] = {}, odd[2] = {};
+                for (int i = 0; i < R_PAIRS; i++)
+                    for (int c = 0; c < 2; c++) {
+                        even[c] += folded[c][q + R_PAIRS - 1 - i] * table[4 * i];
+                        odd[c] += folded[c][q + R_PAIRS + i] * table[4 * i + 1];
+                    }
                 TURN(a[0], a[1])
                 TURN(a[2], a[3])
-                for (int i = 0; i < 4; i++) {
-                    v c = table[4 * i], s = table[4 * i + 1];
-                    a[0] += folded[0][q + 3 - i] * c, a[1] -= folded[0][q + 4 + i] * s;
-                    a[2] += folded[1][q + 3 - i] * c, a[3] -= folded[1][q + 4 + i] * s;
-                }
+                a[0] += even[0], a[1] -= odd[0], a[2] += even[1], a[3] -= odd[1];
             }
             v share = band[R_SHARE], fading = (real)n->forget * (1 - share);
             for (int c = 0; c < 2; c++) {
@@ -181,38 +196,40 @@ void NAME(v *bands, v *loops, v *laws, v *helds, v8 *phases, const v *tables, co
                 now[R_STEP_RE] = step_re * cosine - step_im * sine, now[R_STEP_IM] = step_re * sine + step_im * cosine;
             }
         }
-        for (int m = 0; m < block; m++) sum[0][m] = sum[1][m] = (v){};
+        for (int m = 0; m < block; m++) sum[m][0] = sum[m][1] = (v){};
         for (int t = 0; t < tiles; t++) {
             const v *held = helds + R_HELD_ROWS * t + 4, *table = tables + R_TABLE_ROWS * t;
-            v turn = table[16], on = table[17];
+            v turn = table[R_TURN_COS], on = table[R_TURN_SIN];
             v re[2], im[2], step_re[2], step_im[2];
             for (int c = 0; c < 2; c++, held += R_CHANNEL_ROWS) {
                 re[c] = held[R_FROM_RE], im[c] = held[R_FROM_IM], step_re[c] = held[R_STEP_RE], step_im[c] = held[R_STEP_IM];
             }
-            real ahead = 4.5 / block;
-            for (int q = 0; q < block; q += 8) {
+            real ahead = (R_PAIRS + 0.5) / block;
+            for (int q = 0; q < block; q += R_GROUP) {
                 for (int c = 0; c < 2; c++) re[c] += ahead * step_re[c], im[c] += ahead * step_im[c];
-                for (int i = 0; i < 4; i++)
+                for (int i = 0; i < R_PAIRS; i++)
                     for (int c = 0; c < 2; c++) {
-                        sum[c][q + 3 - i] += re[c] * table[4 * i] - step_im[c] * table[4 * i + 3];
-                        sum[c][q + 4 + i] += step_re[c] * table[4 * i + 2] - im[c] * table[4 * i + 1];
+                        v *early = &sum[q + R_PAIRS - 1 - i][c], *late = &sum[q + R_PAIRS + i][c];
+                        *early = *early + re[c] * table[4 * i] - step_im[c] * table[4 * i + 3];
+                        *late = *late + step_re[c] * table[4 * i + 2] - im[c] * table[4 * i + 1];
                     }
                 for (int c = 0; c < 2; c++) {
                     TURN(re[c], im[c])
                     TURN(step_re[c], step_im[c])
                 }
-                ahead = 8.0 / block;
+                ahead = (double)R_GROUP / block;
             }
         }
         for (int c = 0; c < 2; c++)
-            for (int q = 0; q < block; q += 8)
-                for (int i = 0; i < 4; i++) {
-                    double even = total(sum[c][q + 3 - i]), odd = total(sum[c][q + 4 + i]);
-                    drive[2 * (q + 3 - i) + c] = even - odd, drive[2 * (q + 4 + i) + c] = even + odd;
+            for (int q = 0; q < block; q += R_GROUP)
+                for (int i = 0; i < R_PAIRS; i++) {
+                    int early = q + R_PAIRS - 1 - i, late = q + R_PAIRS + i;
+                    double even = total(sum[early][c]), odd = total(sum[late][c]);
+                    drive[2 * early + c] = even - odd, drive[2 * late + c] = even + odd;
                 }
         for (int m = 0; m < block; m++)
             for (int c = 0; c < 2; c++) {
-                double shaped = drive[2 * m + c] + 2 * n->rounding[0][c] - n->rounding[1][c];
+                double shaped = (drive[2 * m + c] - n->rounding[1][c]) + 2 * n->rounding[0][c];
                 double exact = n->step * __builtin_floor(shaped * (1 / n->step) + 0.5), off = shaped - exact;
                 n->rounding[1][c] = n->rounding[0][c];
                 n->rounding[0][c] = off < -n->step ? -n->step : off > n->step ? n->step : off;

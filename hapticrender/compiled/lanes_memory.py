@@ -2,7 +2,7 @@
 
 `lanes(array, i, j)` reads the row ``array[i, j, :]`` of a C-contiguous array whose last axis is as long as a register
 (`WIDTH`) and `put(array, i, j, value)` writes one; `read` and `write` do it for a scenario's own numbers, which are
-plain or lanes; a `stretch` starts anywhere.
+plain or lanes; a `stretch` starts anywhere, a `column` goes down the rows of a plain array.
 """
 
 from __future__ import annotations
@@ -138,6 +138,46 @@ def put_stretch(typingctx: Any, array: Any, i: Any, j: Any, value: Any) -> Any:
 
 
 @intrinsic
+def column(typingctx: Any, array: Any, i: Any, j: Any) -> Any:
+    """Read as many neighbours as there are lanes down a column, array[i:, j]; past the last row, that one again."""
+    if not _is_numbers(array, 2) or array.dtype not in (types.float64, types.float32):
+        return None
+    kind = _lane(array)
+
+    def build(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        value = ir.Constant(ir.VectorType(number_type(kind.dtype), kind.width), ir.Undefined)
+        for lane, at in enumerate(_down(context, builder, sig.args[0], kind.width, *args)):
+            value = builder.insert_element(value, builder.load(at), ir.IntType(32)(lane))
+        return value
+
+    return kind(array, types.intp, types.intp), build
+
+
+@intrinsic
+def put_column(typingctx: Any, array: Any, i: Any, j: Any, value: Any) -> Any:
+    """Write as many neighbours as there are lanes, or rows, down a column, array[i:, j]."""
+    if not _is_numbers(array, 2) or array.dtype not in (types.float64, types.float32):
+        return None
+    kind = _lane(array)
+
+    def build(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        rows = _down(context, builder, sig.args[0], kind.width, *args[:3])
+        for lane in reversed(range(kind.width)):  # the last row's own comes after those that are past it
+            builder.store(builder.extract_element(args[3], ir.IntType(32)(lane)), rows[lane])
+        return context.get_dummy_value()
+
+    return types.none(array, types.intp, types.intp, kind), build
+
+
+def _down(context: Any, builder: Any, kind: Any, count: int, array: Any, i: Any, j: Any) -> list[Any]:
+    """Pointers to array[i, j], array[i + 1, j] ...; past the last row, to that one again."""
+    last = builder.sub(_parts(context, builder, kind, array)[1][0], ir.IntType(64)(1))
+    rows = [builder.add(i, ir.IntType(64)(k)) for k in range(count)]
+    rows = [builder.select(builder.icmp_signed("<", row, last), row, last) for row in rows]
+    return [_number(context, builder, kind, array, row, j) for row in rows]
+
+
+@intrinsic
 def put_pairs(typingctx: Any, array: Any, i: Any, re: Any, im: Any) -> Any:
     """Write W complex numbers from array[i * W] on, as many as there is room for; or rows array[i, 0] and array[i, 1].
 
@@ -199,12 +239,12 @@ def row_totals(typingctx: Any, array: Any, i: Any, j: Any) -> Any:
         ]
         block = 1
         while len(rows) > 1:  # of two vectors the lanes that belong to the same row, added pair by pair
-            lower = [k + base + b for base in range(0, width, 2 * block) for k in (0, width) for b in range(block)]
-            upper = [at + block for at in lower]
+            straight = [at + (width if at & block else 0) for at in range(width)]  # costs less than what moves lanes
+            crossed = [at ^ block for at in straight]
             rows = [
                 builder.fadd(
-                    builder.shuffle_vector(first, second, ir.Constant(index, lower)),
-                    builder.shuffle_vector(first, second, ir.Constant(index, upper)),
+                    builder.shuffle_vector(first, second, ir.Constant(index, straight)),
+                    builder.shuffle_vector(first, second, ir.Constant(index, crossed)),
                 )
                 for first, second in zip(rows[::2], rows[1::2], strict=True)
             ]

@@ -14,7 +14,7 @@ from hapticrender.control.bank.state import PRECISIONS, BankNumbers, BankTables,
 from hapticrender.control.blocks.kernels import block_run
 from hapticrender.control.blocks.state import (
     CHANNEL_ROWS,
-    EIGHT,
+    GROUP,
     PHASE_ROWS,
     TURN_SIN,
     TURNS,
@@ -182,7 +182,8 @@ def block_state(tables: BankTables, block: int, dtype: type) -> BlockState:
     tiles, width = padded(bands, dtype), WIDTH[np.dtype(dtype)]
     bank.pace[:] = row.GROWING
     bank.band[:, row.LIVE] = (np.arange(tiles * width) < bands).reshape(tiles, width)
-    whole = -(-block // EIGHT) * EIGHT
+    whole = -(-block // GROUP) * GROUP
+    rows = max(2 * whole, TURN_SIN + 1) if (tables.tone[1] > 0.0).any() else TURN_SIN + 1
     phase = aligned((tiles * width // 8, PHASE_ROWS, 8))
     turns = np.zeros(tiles * width)
     turns[:bands] = np.mod(tables.tone[2], 1.0)
@@ -190,7 +191,8 @@ def block_state(tables: BankTables, block: int, dtype: type) -> BlockState:
     return BlockState(
         bank=bank,
         phase=phase,
-        table=aligned((tiles, max(2 * whole, TURN_SIN + 1), width), dtype),
+        carrier=aligned((2, tiles * width), dtype),
+        table=aligned((tiles, rows, width), dtype),
         held=aligned((tiles, 2 * coordinates + CHANNEL_ROWS * (channels + channels % 2), width), dtype),
         response=np.zeros(whole),
         inverse=np.zeros((2, 2 * whole)),
@@ -198,8 +200,8 @@ def block_state(tables: BankTables, block: int, dtype: type) -> BlockState:
         heard=np.zeros((coordinates + 1, whole), dtype),
         raw=np.zeros((coordinates + 1, whole)),
         place=np.zeros(block),
-        sum=np.zeros((2, whole)),
-        lane_sum=aligned((2, whole, width), dtype),
+        sum=np.zeros((whole, 2)),
+        lane_sum=aligned((whole, 2, width), dtype),
         stale=np.ones(1, np.int64),
         news=np.zeros(1, np.int64),
         gain=np.full(1, math.nan),

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from hapticrender.compiled.jit import kernel
 from hapticrender.compiled.lanes import any_of, floor, high, root, size, totals
-from hapticrender.compiled.lanes_memory import lanes, put, put_pairs
+from hapticrender.compiled.lanes_memory import lanes, put, put_pairs, put_stretch, stretch
 from hapticrender.compiled.polynomials import unit, whole
 from hapticrender.control.bank import rows as row
 from hapticrender.control.bank.carriers import grow_pass, motion_pass
@@ -29,18 +29,17 @@ from hapticrender.control.bank.settled import NEAR_LIMIT
 from hapticrender.control.bank.targets import derivative
 from hapticrender.control.blocks.state import (
     CHANNEL_ROWS,
-    COSINE,
     EIGHT,
     FAR_COS,
     FAR_SIN,
     FROM_RE,
+    GROUP,
     NOW_IM,
     NOW_RE,
     PAIR_COS,
     PAIR_ROWS,
     PAIR_SIN,
     PAIRS,
-    SINE,
     STEP_RE,
     TO_MIDDLE,
     TURN_COS,
@@ -55,22 +54,18 @@ from hapticrender.control.kernels import FAR, TURN
 @kernel
 def count_phases(tables, state):
     """Phasors of the carriers where their tables begin; then their phases at the next block's start."""
-    bank, phase = state.bank, state.phase
+    band, phase, carrier = state.bank.band, state.phase, state.carrier
     for i in range(phase.shape[0]):
         turns = lanes(phase, i, TURNS)
         cos, sin = unit(turns + lanes(phase, i, TO_MIDDLE))
-        put(phase, i, COSINE, cos)
-        put(phase, i, SINE, sin)
+        put_stretch(carrier, 0, i * EIGHT, cos)
+        put_stretch(carrier, 1, i * EIGHT, sin)
         turns += lanes(phase, i, TURNED)
         put(phase, i, TURNS, turns - floor(turns))
-    band, parts = bank.band, bank.band.shape[2] // EIGHT
     for t in range(band.shape[0]):
-        for part in range(parts):
-            for i in range(EIGHT):
-                band[t, row.COS, part * EIGHT + i] = phase[t * parts + part, COSINE, i]
-                band[t, row.SIN, part * EIGHT + i] = phase[t * parts + part, SINE, i]
-        put(band, t, row.COS, lanes(band, t, row.LIVE) * lanes(band, t, row.COS))
-        put(band, t, row.SIN, lanes(band, t, row.LIVE) * lanes(band, t, row.SIN))
+        live, first = lanes(band, t, row.LIVE), t * band.shape[2]
+        put(band, t, row.COS, live * stretch(carrier, 0, first))
+        put(band, t, row.SIN, live * stretch(carrier, 1, first))
 
 
 @kernel
@@ -106,7 +101,7 @@ def analyse(state, wanted):
         turn_held(band, state.held, t, 0, lanes(band, t, row.RAW_RE), lanes(band, t, row.RAW_IM))
     sum_bands(state, 0, 0)
     for m in range(wanted.shape[0]):
-        state.raw[last, m] = (wanted[m] if size(wanted[m]) <= FAR else 0.0) - state.sum[0, m]
+        state.raw[last, m] = (wanted[m] if size(wanted[m]) <= FAR else 0.0) - state.sum[m, 0]
     solve(state, 1, last)
 
 
@@ -162,7 +157,7 @@ def take_up(tables, state, t):
         put(state.table, t, PAIR_ROWS * i + PAIR_SIN, sin)
         put(state.table, t, PAIR_ROWS * i + FAR_COS, (i + 0.5) / block * cos)
         put(state.table, t, PAIR_ROWS * i + FAR_SIN, (i + 0.5) / block * sin)
-    cos, sin = unit(step * EIGHT)
+    cos, sin = unit(step * GROUP)
     put(state.table, t, TURN_COS, cos)
     put(state.table, t, TURN_SIN, sin)
 
@@ -286,7 +281,7 @@ def speak(tables, state, drive):
         sum_drives(state, at)
         for i in range(pair):
             for m in range(block):
-                drive[m, channel + i] = trust * sums[i, m]
+                drive[m, channel + i] = trust * sums[m, i]
                 peak = max(peak, (unit_drive * drive[m, channel + i]) ** 2)
         if max(peak, state.bank.touch[row.PEAK]) > NEAR_LIMIT * NEAR_LIMIT:
             for i in range(pair):
@@ -294,7 +289,7 @@ def speak(tables, state, drive):
             sum_drives(state, at)
             for i in range(pair):
                 for m in range(block):
-                    across = unit_drive * trust * sums[i, m]
+                    across = unit_drive * trust * sums[m, i]
                     peak = max(peak, (unit_drive * drive[m, channel + i]) ** 2 + across * across)
     return peak
 
@@ -312,7 +307,7 @@ def shape_drive(tables, state, scale, drive):
             if not believed:
                 exact = shaper[0, channel] = shaper[1, channel] = 0.0
             elif step > 0.0:
-                shaped = exact + 2.0 * shaper[0, channel] - shaper[1, channel]
+                shaped = (exact - shaper[1, channel]) + 2.0 * shaper[0, channel]
                 exact = step * whole(shaped, per_step)
                 shaper[1, channel] = shaper[0, channel]
                 shaper[0, channel] = min(max(shaped - exact, -step), step)
@@ -410,7 +405,7 @@ def block_step(tables, state, sensed, position, wanted, drive, target, flags):
     hears_fast = hears_slow = 0.0 * lanes(band, 0, row.COS)
     for c in range(coordinates):
         for m in range(block):
-            state.raw[c, m] -= state.sum[c, m]
+            state.raw[c, m] -= state.sum[m, c]
         solve(state, 0, c)
         settle_level(tables, state, c)
     for t in range(tiles):

@@ -1,20 +1,20 @@
 """Sums over the bands and over the samples of a block, and the exact solve between residuals.
 
-Samples are taken in groups of eight about the group's middle, where a carrier's cosine is even and its sine odd: what a
-pair of samples has in common and what it differs by cost half of what the samples would.  An envelope is turned from
-group to group.  Carriers that follow the finger have tables over the whole block instead.
+Samples are taken in groups of sixteen about the group's middle, where a carrier's cosine is even and its sine odd:
+what a pair of samples has in common and what it differs by cost half of what the samples would.  An envelope is turned
+from group to group.  Carriers that follow the finger have tables over the whole block instead.
 """
 
 from __future__ import annotations
 
 from hapticrender.compiled.jit import kernel
-from hapticrender.compiled.lanes import totals
-from hapticrender.compiled.lanes_memory import lanes, put, put_stretch, stretch
+from hapticrender.compiled.lanes_memory import lanes, put, put_stretch, read, row_totals, stretch
 from hapticrender.control.bank import rows as row
 from hapticrender.control.blocks.state import (
     CHANNEL_ROWS,
     EIGHT,
     FROM_RE,
+    GROUP,
     PAIR_COS,
     PAIR_ROWS,
     PAIR_SIN,
@@ -34,35 +34,36 @@ def turned(cos, sin, re, im):
 def clear(state):
     """Begin the sums over the bands."""
     nothing = 0.0 * lanes(state.table, 0, 0)
-    for s in range(2):
-        for m in range(state.lane_sum.shape[1]):
-            put(state.lane_sum, s, m, nothing)
+    for m in range(state.lane_sum.shape[0]):
+        for s in range(2):
+            put(state.lane_sum, m, s, nothing)
 
 
 @kernel
 def add(lane_sum, s, m, value):
     """Add to a sum."""
-    put(lane_sum, s, m, lanes(lane_sum, s, m) + value)
+    put(lane_sum, m, s, lanes(lane_sum, m, s) + value)
 
 
 @kernel
 def unfold(state):
     """Sums over the lanes, sample by sample."""
     out, lane_sum = state.sum, state.lane_sum
-    for q in range(0, out.shape[1], EIGHT):
+    for m in range(0, out.shape[0], lane_sum.shape[2] // 2):
+        put_stretch(out, m, 0, row_totals(lane_sum, m, 0))
+    for q in range(0, out.shape[0], GROUP):
         for i in range(PAIRS):
             early, late = q + PAIRS - 1 - i, q + PAIRS + i
-            even, even2 = totals(1.0, lanes(lane_sum, 0, early), lanes(lane_sum, 1, early))
-            odd, odd2 = totals(1.0, lanes(lane_sum, 0, late), lanes(lane_sum, 1, late))
-            out[0, early], out[0, late] = even - odd, even + odd
-            out[1, early], out[1, late] = even2 - odd2, even2 + odd2
+            for s in range(2):
+                even, odd = out[early, s], out[late, s]
+                out[early, s], out[late, s] = even - odd, even + odd
 
 
 @kernel
 def add_following(state, t, s, re, im, step_re, step_im):
     """Add a tile that follows the finger to sum s: Re (x + (m + 1) step) e^(j phase of m)."""
     table, sums = state.table, state.lane_sum
-    for q in range(0, state.place.shape[0], EIGHT):
+    for q in range(0, state.place.shape[0], GROUP):
         for i in range(PAIRS):
             early, late = q + PAIRS - 1 - i, q + PAIRS + i
             cos, sin = lanes(table, t, 2 * early), lanes(table, t, 2 * early + 1)
@@ -74,29 +75,52 @@ def add_following(state, t, s, re, im, step_re, step_im):
 
 
 @kernel
+def staying(state, t, r, s):
+    """A tile, and what it holds in rows r, r + 1, s and s + 1: nothing where it follows the finger, or is none."""
+    held, last = state.held, state.held.shape[0] - 1
+    at = min(t, last)
+    counts = 1.0 if t <= last and state.bank.pace[at] != row.LOCKED else 0.0
+    re, im, up, on = lanes(held, at, r), lanes(held, at, r + 1), lanes(held, at, s), lanes(held, at, s + 1)
+    return at, counts * re, counts * im, counts * up, counts * on
+
+
+@kernel
 def sum_bands(state, r, s):
-    """Two sums over the bands at every sample: of Re x e^(j w m), x in rows r, r + 1 and in rows s, s + 1 of `held`."""
+    """Two sums over the bands at every sample: of Re x e^(j w m), x in rows r, r + 1 and in rows s, s + 1 of `held`.
+
+    Tiles go in pairs: what limits this is how often a sum is written.
+    """
     table, held, sums = state.table, state.held, state.lane_sum
     clear(state)
     for t in range(table.shape[0]):
-        re, im, at, up = lanes(held, t, r), lanes(held, t, r + 1), lanes(held, t, s), lanes(held, t, s + 1)
         if state.bank.pace[t] == row.LOCKED:
-            nothing = 0.0 * re
-            add_following(state, t, 0, re, im, nothing, nothing)
-            add_following(state, t, 1, at, up, nothing, nothing)
-            continue
-        turn, on = lanes(table, t, TURN_COS), lanes(table, t, TURN_SIN)
-        for q in range(0, sums.shape[1], EIGHT):
+            nothing = 0.0 * lanes(held, t, r)
+            add_following(state, t, 0, lanes(held, t, r), lanes(held, t, r + 1), nothing, nothing)
+            add_following(state, t, 1, lanes(held, t, s), lanes(held, t, s + 1), nothing, nothing)
+    for pair in range(0, table.shape[0], 2):
+        t, re, im, at, up = staying(state, pair, r, s)
+        n, re2, im2, at2, up2 = staying(state, pair + 1, r, s)
+        (turn, on), (turn2, on2) = both(table, t, TURN_COS), both(table, n, TURN_COS)
+        for q in range(0, sums.shape[0], GROUP):
             for i in range(PAIRS):
-                cos, sin = lanes(table, t, PAIR_ROWS * i + PAIR_COS), lanes(table, t, PAIR_ROWS * i + PAIR_SIN)
+                cos, sin = both(table, t, PAIR_ROWS * i + PAIR_COS)
+                cos2, sin2 = both(table, n, PAIR_ROWS * i + PAIR_COS)
                 early, late = q + PAIRS - 1 - i, q + PAIRS + i
-                add(sums, 0, early, re * cos)
-                add(sums, 0, late, -im * sin)
-                add(sums, 1, early, at * cos)
-                add(sums, 1, late, -up * sin)
+                put(sums, early, 0, lanes(sums, early, 0) + re * cos + re2 * cos2)
+                put(sums, late, 0, lanes(sums, late, 0) - im * sin - im2 * sin2)
+                put(sums, early, 1, lanes(sums, early, 1) + at * cos + at2 * cos2)
+                put(sums, late, 1, lanes(sums, late, 1) - up * sin - up2 * sin2)
             re, im = turned(turn, on, re, im)
             at, up = turned(turn, on, at, up)
+            re2, im2 = turned(turn2, on2, re2, im2)
+            at2, up2 = turned(turn2, on2, at2, up2)
     unfold(state)
+
+
+@kernel
+def both(array, t, r):
+    """Rows r and r + 1 of a tile."""
+    return lanes(array, t, r), lanes(array, t, r + 1)
 
 
 @kernel
@@ -116,21 +140,21 @@ def sum_drives(state, at):
             add_following(state, t, 1, up_re, up_im, share * rise_re, share * rise_im)
             continue
         turn, on, ahead = lanes(table, t, TURN_COS), lanes(table, t, TURN_SIN), share * (PAIRS + 0.5)
-        for q in range(0, sums.shape[1], EIGHT):
+        for q in range(0, sums.shape[0], GROUP):
             re, im = re + ahead * step_re, im + ahead * step_im
             up_re, up_im = up_re + ahead * rise_re, up_im + ahead * rise_im
             for i in range(PAIRS):
                 cos, sin, far_cos, far_sin = four(table, t, PAIR_ROWS * i)
                 early, late = q + PAIRS - 1 - i, q + PAIRS + i
-                add(sums, 0, early, re * cos - step_im * far_sin)
-                add(sums, 0, late, step_re * far_cos - im * sin)
-                add(sums, 1, early, up_re * cos - rise_im * far_sin)
-                add(sums, 1, late, rise_re * far_cos - up_im * sin)
+                put(sums, early, 0, lanes(sums, early, 0) + re * cos - step_im * far_sin)
+                put(sums, late, 0, lanes(sums, late, 0) + step_re * far_cos - im * sin)
+                put(sums, early, 1, lanes(sums, early, 1) + up_re * cos - rise_im * far_sin)
+                put(sums, late, 1, lanes(sums, late, 1) + rise_re * far_cos - up_im * sin)
             re, im = turned(turn, on, re, im)
             step_re, step_im = turned(turn, on, step_re, step_im)
             up_re, up_im = turned(turn, on, up_re, up_im)
             rise_re, rise_im = turned(turn, on, rise_re, rise_im)
-            ahead = share * EIGHT
+            ahead = share * GROUP
     unfold(state)
 
 
@@ -158,7 +182,7 @@ def solve(state, which, c):
         put_stretch(state.error, c, m, (first + second) + (third + fourth))
     for m in range(state.place.shape[0], whole):  # none is heard after the block's end
         state.error[c, m] = 0.0
-    for q in range(0, whole, EIGHT):
+    for q in range(0, whole, GROUP):
         for i in range(PAIRS):
             early, late = q + PAIRS - 1 - i, q + PAIRS + i
             state.heard[c, early] = state.error[c, late] + state.error[c, early]
@@ -171,25 +195,27 @@ def correlate(state, t, c, d):
     table, heard = state.table, state.heard
     re = im = at = up = 0.0 * lanes(table, t, 0)
     if state.bank.pace[t] == row.LOCKED:
-        for q in range(0, state.place.shape[0], EIGHT):
+        for q in range(0, state.place.shape[0], GROUP):
             for i in range(PAIRS):
                 early, late = q + PAIRS - 1 - i, q + PAIRS + i
                 cos, sin = lanes(table, t, 2 * early), lanes(table, t, 2 * early + 1)
                 u, v = lanes(table, t, 2 * late), lanes(table, t, 2 * late + 1)
-                even, odd = 0.5 * heard[c, early], 0.5 * heard[c, late]
+                even, odd = 0.5 * read(heard, c, early), 0.5 * read(heard, c, late)
                 re, im = re + even * (u + cos) + odd * (u - cos), im - even * (v + sin) - odd * (v - sin)
-                even, odd = 0.5 * heard[d, early], 0.5 * heard[d, late]
+                even, odd = 0.5 * read(heard, d, early), 0.5 * read(heard, d, late)
                 at, up = at + even * (u + cos) + odd * (u - cos), up - even * (v + sin) - odd * (v - sin)
         return re, im, at, up
     turn, back = lanes(table, t, TURN_COS), -lanes(table, t, TURN_SIN)
-    for q in range(heard.shape[1] - EIGHT, -1, -EIGHT):
-        re, im = turned(turn, back, re, im)
-        at, up = turned(turn, back, at, up)
-        for i in range(PAIRS):
+    for q in range(heard.shape[1] - GROUP, -1, -GROUP):
+        even = odd = even2 = odd2 = 0.0 * turn
+        for i in range(PAIRS):  # of this group alone: no sum waits for that of another
             cos, sin = lanes(table, t, PAIR_ROWS * i + PAIR_COS), lanes(table, t, PAIR_ROWS * i + PAIR_SIN)
             early, late = q + PAIRS - 1 - i, q + PAIRS + i
-            re, im = re + heard[c, early] * cos, im - heard[c, late] * sin
-            at, up = at + heard[d, early] * cos, up - heard[d, late] * sin
+            even, odd = even + read(heard, c, early) * cos, odd + read(heard, c, late) * sin
+            even2, odd2 = even2 + read(heard, d, early) * cos, odd2 + read(heard, d, late) * sin
+        re, im = turned(turn, back, re, im)
+        at, up = turned(turn, back, at, up)
+        re, im, at, up = re + even, im - odd, at + even2, up - odd2
     return re, im, at, up
 
 
@@ -207,7 +233,7 @@ def respond(tables, state, g):
             put(held, t, 1, share * lanes(state.table, t, at + PAIR_SIN))
     sum_bands(state, 0, 0)
     for d in range(state.response.shape[0]):
-        state.response[d] = state.sum[0, d]
+        state.response[d] = state.sum[d, 0]
     invert(state.response, g, tables.sample.dc, tables.sample.dc_drift, state.inverse, 0)
     invert(state.response, tables.sample.reference, 0.0, 0.0, state.inverse, 1)
 

@@ -193,14 +193,16 @@ def turn_frame(state, t, aimed):
 @kernel
 def count_on(tables, state, t, count):
     """Phases of a tile's carriers, now, as `count_turns` counts them; how far they go changes with the tones only."""
-    band, phase, advance, start = state.band, state.phase, state.advance, t * state.band.shape[2]
-    for k in range(start, start + count):
-        if tables.tone[0, k] != state.counted[k]:  # in double precision, unlike the bands
-            state.counted[k] = tables.tone[0, k]
-            advance[k] = advance_of(tables.tone[0, k] / tables.numbers.rate)
+    band, start = state.band, t * state.band.shape[2]
+    own = slice(start, start + count)
+    phase, advance, counted, frequency = state.phase[own], state.advance[own], state.counted[own], tables.tone[0, own]
     for i in range(count):
-        band[t, TURNS, i] = turns_of(phase[start + i])
-        phase[start + i] += advance[start + i]
+        if frequency[i] != counted[i]:  # in double precision, unlike the bands
+            counted[i] = frequency[i]
+            advance[i] = advance_of(frequency[i] / tables.numbers.rate)
+    for i in range(count):
+        band[t, TURNS, i] = turns_of(phase[i])
+        phase[i] += advance[i]
 
 
 @kernel

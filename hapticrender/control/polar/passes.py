@@ -10,8 +10,18 @@ from __future__ import annotations
 import numpy as np
 
 from hapticrender.compiled.jit import kernel
-from hapticrender.compiled.lanes import select
-from hapticrender.compiled.lanes_memory import lanes, put, put_pairs, put_stretch, row_totals, taken
+from hapticrender.compiled.lanes import WIDTH, any_of, select, size
+from hapticrender.compiled.lanes_memory import (
+    column,
+    lanes,
+    put,
+    put_column,
+    put_pairs,
+    put_stretch,
+    row_totals,
+    stretch,
+    taken,
+)
 from hapticrender.compiled.polynomials import cosine, polar
 from hapticrender.control.kernels import QUIET, TURN
 from hapticrender.control.polar.kernels import (
@@ -35,7 +45,6 @@ from hapticrender.control.polar.kernels import (
     TURN_SIN,
     X_IM,
     X_RE,
-    believed,
     clamped_step,
     law_step,
     recall,
@@ -47,6 +56,7 @@ from hapticrender.control.polar.kernels import (
 )
 from hapticrender.control.polar.steps import usual
 
+EIGHT = WIDTH[np.dtype(float)]  # lanes of double precision
 # rows of PolarState.told, one column a sample: whole numbers from 0; then, two a coordinate, b0 of the low pass times
 # twice what it hears, and four times that
 NUMBER, TOLD = range(2)
@@ -146,12 +156,12 @@ def decide(tables, state, t, count, c, d):
 
 
 @kernel
-def tile_block(tables, state, t, count, n, target):
-    """`count` samples of a tile, from row n of `target` on, in passes."""
+def tile_block(tables, state, t, count, target):
+    """`count` samples of a tile in passes; `target` has a row for each of them, one or none."""
     band, coordinates = state.band, tables.listen.shape[0]
     re, im = lanes(band, t, TARGET_RE), lanes(band, t, FORWARD) * lanes(band, t, TARGET_IM)
-    for m in range(count if target.shape[0] > 1 else 1):
-        put_pairs(target[n + m if target.shape[0] > 1 else 0], t, re, im)
+    for m in range(target.shape[0]):
+        put_pairs(target[m], t, re, im)
     for c in range(0, coordinates, 2):
         d = min(c + 1, coordinates - 1)
         hear(tables, state, t, count, c, d)
@@ -160,32 +170,35 @@ def tile_block(tables, state, t, count, n, target):
 
 
 @kernel
-def sense_all(tables, state, sensed, flags, n, count):
-    """What the coordinates hear in `count` samples from n on; flags where a sensor is beyond its limit (NaN is)."""
-    listen, limit, last = tables.listen, tables.numbers.sensed_limit, sensed.shape[1] - 1
-    for m in range(count):
-        flags[n + m] = 0 if (abs(sensed[n + m, 0]) <= limit) & (abs(sensed[n + m, last]) <= limit) else 2
-    for c in range(listen.shape[0]):
-        first, second, row = listen[c, 0], listen[c, last] if last > 0 else 0.0, SHARED_ROWS + c
-        for m in range(count):
-            one, other = believed(sensed[n + m, 0], limit), believed(sensed[n + m, last], limit)
-            state.shared[row, m] = first * one + second * other
-    for s in range(1, last):
-        for m in range(count):
-            flags[n + m] |= 0 if abs(sensed[n + m, s]) <= limit else 2
+def sense_all(tables, state, sensed):
+    """What the coordinates hear in every sample, and how many sensors are beyond their limit (NaN is), as `TRUST`."""
+    listen, limit, shared = tables.listen, tables.numbers.sensed_limit, state.shared
+    nothing = 0.0 * stretch(shared, TRUST, 0)
+    for m in range(0, sensed.shape[0], EIGHT):
+        lost = nothing
+        for c in range(listen.shape[0]):
+            put_stretch(shared, SHARED_ROWS + c, m, nothing)
+        for s in range(sensed.shape[1]):
+            value = column(sensed, m, s)
+            fits = size(value) <= limit
+            lost, heard = lost + select(fits, 0.0, 1.0), select(fits, value, 0.0)
             for c in range(listen.shape[0]):
-                state.shared[SHARED_ROWS + c, m] += listen[c, s] * believed(sensed[n + m, s], limit)
+                put_stretch(shared, SHARED_ROWS + c, m, stretch(shared, SHARED_ROWS + c, m) + listen[c, s] * heard)
+        put_stretch(shared, TRUST, m, lost)
 
 
 @kernel
-def share_all(tables, state, sensed, position, wanted, flags, n, count):
-    """Write down what all tiles are told of `count` samples from n on."""
-    known = recall(state)
-    sense_all(tables, state, sensed, flags, n, count)
-    for m in range(count):
-        odd, known = share(tables, state, m, 1.0 * flags[n + m], position[n + m], wanted[n + m], known)
-        flags[n + m] = np.int64(odd)
+def share_all(tables, state, sensed, position, wanted, flags):
+    """Write down what all tiles are told of every sample.  Returns whether sensors are believed all the time."""
+    sense_all(tables, state, sensed)
+    known, trusted = recall(state), True
+    for m in range(sensed.shape[0]):
+        odd = 2.0 if state.shared[TRUST, m] > 0.0 else 0.0
+        odd, known = share(tables, state, m, odd, position[m], wanted[m], known)
+        flags[m] = np.int64(odd)
+        trusted = trusted and known[-1] <= 0.0
     remember(state, known)
+    return trusted
 
 
 @kernel
@@ -200,21 +213,20 @@ def gather_all(state, count):
 
 
 @kernel
-def speak_all(tables, state, drive, flags, n, count):
+def speak_all(tables, state, drive, flags):
     """Drive of the channels from that of the coordinates, each cut to its limit."""
-    shared, limit, coordinates = state.shared, tables.numbers.drive_limit, tables.listen.shape[0]
+    shared, limit, count = state.shared, tables.numbers.drive_limit, drive.shape[0]
     for i in range(drive.shape[1]):
-        first, second = tables.speak[i, 0], tables.speak[i, 1] if coordinates > 1 else 0.0
-        for m in range(count):
-            asked = first * shared[SHARED_ROWS, m]
-            if coordinates > 1:
-                asked += second * shared[SHARED_ROWS + 1, m]
-            for c in range(2, coordinates):
-                asked += tables.speak[i, c] * shared[SHARED_ROWS + c, m]
-            cut = min(max(asked, -limit), limit)
-            drive[n + m, i] = cut
-            if cut != asked:
-                flags[n + m] |= 1
+        for m in range(0, count, EIGHT):
+            asked = tables.speak[i, 0] * stretch(shared, SHARED_ROWS, m)
+            for c in range(1, tables.listen.shape[0]):
+                asked += tables.speak[i, c] * stretch(shared, SHARED_ROWS + c, m)
+            put_column(drive, m, i, asked)
+            if any_of(select(size(asked) <= limit, 0.0, 1.0) > 0.0):
+                for k in range(m, min(m + EIGHT, count)):
+                    cut = min(max(drive[k, i], -limit), limit)
+                    flags[k] |= 1 if cut != drive[k, i] else 0
+                    drive[k, i] = cut
 
 
 @kernel
@@ -228,17 +240,18 @@ def polar_run(tables, state, sensed, position, wanted, drive, target, flags):
         if state.sample[0] % REFRESH == 0:
             refresh(tables, state)
         count = min(REFRESH - state.sample[0] % REFRESH, sensed.shape[0] - n)
-        share_all(tables, state, sensed, position, wanted, flags, n, count)
-        passes = usual(tables, state, count)
+        now = slice(n, n + count)
+        aims = target[now] if target.shape[0] > 1 else target[0 if n + count == sensed.shape[0] else 1 :]
+        passes = share_all(tables, state, sensed[now], position[now], wanted[now], flags[now]) and usual(tables, state)
         if passes:
             tell(tables, state, count)
         for t in range(state.band.shape[0]):
             if passes and state.locked[t] == 0:
-                tile_block(tables, state, t, count, n, target)
+                tile_block(tables, state, t, count, aims)
             else:
                 for m in range(count):
                     tile_step(tables, state, t, m, target[n + m if target.shape[0] > 1 else 0])
         state.sample[0] += count
         gather_all(state, count)
-        speak_all(tables, state, drive, flags, n, count)
+        speak_all(tables, state, drive[now], flags[now])
         n += count

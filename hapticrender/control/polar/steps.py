@@ -39,6 +39,7 @@ from hapticrender.control.polar.kernels import (
     X_RE,
     believed,
     clamped_step,
+    in_frames,
     law_step,
     recall,
     refresh,
@@ -69,13 +70,9 @@ def hearing(tables, shared, m, sensed):
 
 
 @kernel
-def usual(tables, state, count):
-    """Whether the short ways can do `count` samples: two coordinates at most, constant targets, sensors believed."""
-    numbers = tables.numbers
-    fit = numbers.feedback and not numbers.analysed and not numbers.subtract and state.window.shape[0] == 0
-    for m in range(count):
-        fit = fit and not any_of(read(state.shared, TRUST, m) < 1.0)
-    return fit and tables.listen.shape[0] <= 2
+def usual(tables, state):
+    """Whether the short ways can do it where sensors are believed: two coordinates at most, constant targets."""
+    return in_frames(tables.numbers, state) and tables.listen.shape[0] <= 2
 
 
 @kernel
@@ -205,7 +202,7 @@ def polar_advance(tables, state, sensed, position, wanted, drive, target):
     odd = hearing(tables, state.shared, 0, sensed)
     flags, known = share(tables, state, 0, odd, position, wanted, recall(state))
     remember(state, known)
-    plain = usual(tables, state, 1)
+    plain = usual(tables, state) and not any_of(read(state.shared, TRUST, 0) < 1.0)
     for t in range(state.band.shape[0]):
         plain = plain and state.locked[t] == 0
     if plain:
