@@ -48,6 +48,7 @@ def batch_of(controllers: Sequence[BankController]) -> tuple[BankTables, BankSta
         band=aligned((bands, row.BAND_ROWS, LANES)),
         loop=aligned((bands, state.loop.shape[1], LANES)),
         law=aligned((bands, state.law.shape[1], LANES)),
+        ahead=aligned((bands, state.ahead.shape[1], LANES)),
         sent=aligned((bands, state.sent.shape[1], LANES)),
         phase=np.zeros(bands * LANES, np.uint64),
         pace=np.zeros(bands, np.int64),

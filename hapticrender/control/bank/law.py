@@ -69,32 +69,32 @@ def law_settled(tables, state, t):
     With E and v of the last sample the force is D (R + v) - ki (D' + T D) E, and a residual e of this one adds
     -ki g Re (D' + T D) e, as the carriers are of length 1.
     """
-    band, law, coordinates, period = state.band, state.law, len(tables.shape), 1.0 / tables.numbers.rate
+    band, law, ahead = state.band, state.law, state.ahead
+    coordinates, period = len(tables.shape), 1.0 / tables.numbers.rate
     r_re, r_im = lanes(band, t, row.R_RE), lanes(band, t, row.R_IM)
     for c in range(coordinates):
         re = im = 0.0 * r_re
-        at = row.FIRST_LAW + row.LAW_ROWS * coordinates * coordinates + c * (2 + 2 * coordinates)
+        at = c * (2 + 2 * coordinates)
         for i in range(coordinates):
             base = row.FIRST_LAW + row.LAW_ROWS * (c * coordinates + i)
             d_re, d_im = lanes(law, t, base + row.LAW_RE), lanes(law, t, base + row.LAW_IM)
             re += tables.shape[i] * d_re
             im += tables.shape[i] * d_im
-            put(law, t, at + 2 + 2 * i, lanes(law, t, base + row.SLOPE_RE) + period * d_re)
-            put(law, t, at + 3 + 2 * i, lanes(law, t, base + row.SLOPE_IM) + period * d_im)
-        put(law, t, at, re * r_re - im * r_im)
-        put(law, t, at + 1, re * r_im + im * r_re)
+            put(ahead, t, at + 2 + 2 * i, lanes(law, t, base + row.SLOPE_RE) + period * d_re)
+            put(ahead, t, at + 3 + 2 * i, lanes(law, t, base + row.SLOPE_IM) + period * d_im)
+        put(ahead, t, at, re * r_re - im * r_im)
+        put(ahead, t, at + 1, re * r_im + im * r_re)
 
 
 @kernel
 def answer_settled(tables, state):
     """What the force of all settled tiles answers to a residual, for every pair of coordinates."""
-    band, law, coordinates = state.band, state.law, len(tables.shape)
+    band, coordinates = state.band, len(tables.shape)
     for c in range(coordinates):
-        at = row.FIRST_LAW + row.LAW_ROWS * coordinates * coordinates + c * (2 + 2 * coordinates)
         for i in range(coordinates):
             found = 0.0
             for t in range(band.shape[0]):
-                found += lanes(band, t, row.LIVE) * lanes(law, t, at + 2 + 2 * i)
+                found += lanes(band, t, row.LIVE) * lanes(state.ahead, t, (2 + 2 * coordinates) * c + 2 + 2 * i)
             write(total(read(state.touch, row.TRUST), found), state.answer, c, i)
 
 

@@ -21,7 +21,7 @@ E_RE, E_IM, V_RE, V_IM, L_RE, L_IM, LAST_RE, LAST_IM, FAST_RE, FAST_IM, SLOW_RE,
 COMMAND_RE, COMMAND_IM, SLOPED_RE, SLOPED_IM = range(12, 16)
 LOOP_ROWS = 16
 # rows of BankState.law: the turn ahead, by delay and hold; then, LAW_ROWS for each pair of coordinates, D and D' of
-# device and finger, turned ahead; then, for each coordinate, the force that a target needs which stays
+# device and finger, turned ahead
 AHEAD_RE, AHEAD_IM = range(2)
 FIRST_LAW = 2
 LAW_RE, LAW_IM, SLOPE_RE, SLOPE_IM = range(4)

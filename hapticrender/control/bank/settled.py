@@ -68,12 +68,11 @@ def settled_observer(tables, state, t, c, g, integral):
 @kernel
 def settled_law(tables, state, integral):
     """Force before anything of this sample is heard, D (R + v) - ki (D' + T D) E, turned ahead.  See `law_pass`."""
-    band, loop, law, coordinates = state.band, state.loop, state.law, len(tables.shape)
+    band, loop, law, ahead, coordinates = state.band, state.loop, state.law, state.ahead, len(tables.shape)
     for c in range(coordinates):
-        force = across = 0.0
+        force, across, first = 0.0, 0.0, c * (2 + 2 * coordinates)
         for t in range(band.shape[0]):
-            first = row.FIRST_LAW + row.LAW_ROWS * coordinates * coordinates + c * (2 + 2 * coordinates)
-            re, im = lanes(law, t, first), lanes(law, t, first + 1)
+            re, im = lanes(ahead, t, first), lanes(ahead, t, first + 1)
             sloped_re = sloped_im = 0.0
             for i in range(coordinates):
                 base, at = i * row.LOOP_ROWS, row.FIRST_LAW + row.LAW_ROWS * (c * coordinates + i)
@@ -84,7 +83,7 @@ def settled_law(tables, state, integral):
                 im += d_re * v_im
                 im += d_im * v_re
                 e_re, e_im = lanes(loop, t, base + row.E_RE), lanes(loop, t, base + row.E_IM)
-                d_re, d_im = lanes(law, t, first + 2 + 2 * i), lanes(law, t, first + 3 + 2 * i)
+                d_re, d_im = lanes(ahead, t, first + 2 + 2 * i), lanes(ahead, t, first + 3 + 2 * i)
                 sloped_re += d_re * e_re
                 sloped_re -= d_im * e_im
                 sloped_im += d_re * e_im

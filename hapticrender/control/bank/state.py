@@ -102,7 +102,8 @@ class BankState(NamedTuple):
 
     band: Array  # (tiles, BAND_ROWS, W)
     loop: Array  # (tiles, coordinates * LOOP_ROWS, W)
-    law: Array  # (tiles, FIRST_LAW + coordinates^2 * LAW_ROWS + 2 coordinates, W)
+    law: Array  # (tiles, FIRST_LAW + coordinates^2 * LAW_ROWS, W)
+    ahead: Array  # (tiles, 2 coordinates (coordinates + 1), W) of settled targets: D R, and D' + T D
     sent: Array  # (tiles, SHOWN_ROWS + SENT_ROWS steps, W): what was commanded in the last steps of learning
     phase: Array  # (bands,) uint64: fixed part of each carrier at the next refresh, 2^64 a turn
     pace: Array  # (tiles,) integer: LOCKED, GROWING or STEADY
@@ -128,9 +129,8 @@ def bank_state(tables: BankTables, dtype: type = np.float64) -> BankState:
     return BankState(
         band=aligned((tiles, row.BAND_ROWS, width), dtype),
         loop=aligned((tiles, coordinates * row.LOOP_ROWS, width), dtype),
-        law=aligned(
-            (tiles, row.FIRST_LAW + coordinates**2 * row.LAW_ROWS + 2 * coordinates * (coordinates + 1), width), dtype
-        ),
+        law=aligned((tiles, row.FIRST_LAW + coordinates**2 * row.LAW_ROWS, width), dtype),
+        ahead=aligned((tiles, 2 * coordinates * (coordinates + 1), width), dtype),
         sent=aligned((tiles, row.SHOWN_ROWS + row.SENT_ROWS * (int(tables.numbers.age + 0.5) + 2), width), dtype),
         phase=np.zeros(bands, np.uint64),
         pace=np.zeros(tiles, np.int64),
