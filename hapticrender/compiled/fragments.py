@@ -213,8 +213,8 @@ class _WholeLibrary(_Library):
         super().add_ir_module(ir_module)
 
     def _optimize_final_module(self) -> None:
-        """Optimise once: the parts are in order already, and what pays as vectors is written as vectors."""
-        passes, builder = self._codegen._module_pass_manager(opt=2)
+        """Optimise lightly: the parts are in order already, and what pays as vectors is written as vectors."""
+        passes, builder = self._codegen._module_pass_manager(opt=1)
         passes.run(self._final_module, builder)
 
 
