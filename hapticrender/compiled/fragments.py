@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import copy
 import operator
+from contextlib import nullcontext
 from functools import lru_cache
 from typing import Any
 
@@ -19,15 +20,24 @@ from numba.core.compiler_machinery import PassManager
 from numba.core.cpu import CPUContext
 from numba.core.dispatcher import _FunctionCompiler  # type: ignore[attr-defined]
 from numba.core.errors import NumbaError
+from numba.core.interpreter import Interpreter, peep_hole_delete_with_exit
 from numba.core.ir_utils import build_definitions
 from numba.core.lowering import Lower
+from numba.core.rewrites.registry import RewriteRegistry
+from numba.core.rewrites.static_binop import DetectStaticBinops
+from numba.core.rewrites.static_getitem import RewriteConstGetitems
 from numba.core.ssa import reconstruct_ssa
 from numba.core.transforms import canonicalize_cfg
-from numba.core.typed_passes import NativeLowering, NoPythonBackend, NopythonTypeInference, PreLowerStripPhis
+from numba.core.typed_passes import NativeLowering, NoPythonBackend, PreLowerStripPhis
+from numba.core.typeinfer import TypeInferer
 from numba.core.typing.context import Context
-from numba.core.untyped_passes import FixupArgs, GenericRewrites, TranslateByteCode
+from numba.core.untyped_passes import FixupArgs
 
 from hapticrender.compiled.records import Layout
+
+REWRITES = RewriteRegistry()  # entries of tuples whose index is known, powers whose exponent is
+REWRITES.register("before-inference")(RewriteConstGetitems)
+REWRITES.register("before-inference")(DetectStaticBinops)
 
 LINE = 64  # bytes of a cache line, and of the widest register
 
@@ -35,8 +45,11 @@ LINE = 64  # bytes of a cache line, and of the widest register
 class _KernelLower(Lower):
     """Numba's step to LLVM's code for what kernels consist of: nothing is counted, so nothing has to be given back."""
 
-    def pre_block(self, block: Any) -> None:
-        """Start a block: there is nothing to prepare."""
+    def lower_block(self, block: Any) -> None:
+        """Write the code of a block."""
+        for each in block.body:
+            self.loc = each.loc
+            self.lower_inst(each)
 
     def lower_inst(self, inst: Any) -> None:
         """Write the code of a statement."""
@@ -96,20 +109,47 @@ class _KernelLowering(NativeLowering):
         return _KernelLower
 
 
+class _Interpreter(Interpreter):
+    """Numba's step from Python's code to its own."""
+
+    def post_process(self, peepholes: Any, func_ir: Any) -> Any:
+        """Mend what needs it, and look for no `with`."""
+        return super().post_process([each for each in peepholes if each is not peep_hole_delete_with_exit], func_ir)
+
+
+class _Warnings:
+    """Numba holds back the warnings of each statement, to tell where they come from; here they just pass."""
+
+    def catch_warnings(self, **where: Any) -> Any:
+        """Pass them."""
+        return nullcontext()
+
+
 class _Passes(PassManager):
     """What numba has to do for a kernel: it has no closures, comprehensions, array expressions or objects."""
 
     def run(self, state: Any) -> None:
         """Do it."""
-        TranslateByteCode().run_pass(state)
+        state.func_ir = _Interpreter(state.func_id).interpret(state.bc)
         FixupArgs().run_pass(state)
         state.func_ir.blocks, state.func_ir.generator_info = canonicalize_cfg(state.func_ir.blocks), None
-        GenericRewrites().run_pass(state)  # entries of tuples whose index is known
+        REWRITES.apply("before-inference", state)
         self.defined(state, reconstruct_ssa(state.func_ir))
-        NopythonTypeInference().run_pass(state)
+        self.infer(state)
         self.defined(state, PreLowerStripPhis()._strip_phi_nodes(state.func_ir))
         _KernelLowering().run_pass(state)
         NoPythonBackend().run_pass(state)
+
+    def infer(self, state: Any) -> None:
+        """Find the type of every variable."""
+        context, func_ir = state.typingctx, state.func_ir
+        inferer = TypeInferer(context, func_ir, _Warnings())
+        with context.callstack.register(state.targetctx.target, inferer, state.func_id, state.args):
+            for i, (name, kind) in enumerate(zip(func_ir.arg_names, state.args, strict=True)):
+                inferer.seed_argument(name, i, kind)
+            inferer.build_constraint()
+            inferer.propagate()
+            state.typemap, state.return_type, state.calltypes = inferer.unify()
 
     def defined(self, state: Any, func_ir: Any) -> None:
         """Take over what has been rewritten."""
@@ -163,6 +203,8 @@ class _KernelTarget(CPUContext):
 
     def get_function(self, fn: Any, sig: Any, _firstcall: bool = True) -> Any:
         """How a function is lowered for these arguments."""
+        if fn == "__array__":  # nothing but an array is one, yet numba asks of each, and then looks for news
+            raise NotImplementedError
         key = id(fn), sig
         if key not in self.found:  # type: ignore[attr-defined]
             self.found[key] = fn, super().get_function(fn, sig, _firstcall=_firstcall)  # type: ignore[attr-defined]
