@@ -8,64 +8,206 @@ fragment each), and the root links them all, is optimised as a whole and made to
 from __future__ import annotations
 
 import copy
+import operator
+from contextlib import nullcontext
 from functools import lru_cache
 from typing import Any
 
-from numba.core import types
+from numba.core import cgutils, ir, types
 from numba.core.codegen import JITCodeLibrary
 from numba.core.compiler import CompilerBase
 from numba.core.compiler_machinery import PassManager
+from numba.core.cpu import CPUContext
 from numba.core.dispatcher import _FunctionCompiler  # type: ignore[attr-defined]
-from numba.core.typed_passes import (
-    IRLegalization,
-    NativeLowering,
-    NoPythonBackend,
-    NopythonTypeInference,
-    PreLowerStripPhis,
-)
+from numba.core.errors import NumbaError
+from numba.core.interpreter import Interpreter, peep_hole_delete_with_exit
+from numba.core.ir_utils import build_definitions
+from numba.core.lowering import Lower
+from numba.core.rewrites.registry import RewriteRegistry
+from numba.core.rewrites.static_binop import DetectStaticBinops
+from numba.core.rewrites.static_getitem import RewriteConstGetitems
+from numba.core.ssa import reconstruct_ssa
+from numba.core.transforms import canonicalize_cfg
+from numba.core.typed_passes import NativeLowering, NoPythonBackend, PreLowerStripPhis
+from numba.core.typeinfer import TypeInferer
 from numba.core.typing.context import Context
-from numba.core.untyped_passes import FixupArgs, GenericRewrites, IRProcessing, ReconstructSSA, TranslateByteCode
+from numba.core.untyped_passes import FixupArgs
 
 from hapticrender.compiled.records import Layout
 
-PASSES = (
-    TranslateByteCode,
-    FixupArgs,
-    IRProcessing,
-    GenericRewrites,  # entries of tuples whose index is known
-    ReconstructSSA,
-    NopythonTypeInference,
-    PreLowerStripPhis,
-    IRLegalization,
-    NativeLowering,
-    NoPythonBackend,
-)
+REWRITES = RewriteRegistry()  # entries of tuples whose index is known, powers whose exponent is
+REWRITES.register("before-inference")(RewriteConstGetitems)
+REWRITES.register("before-inference")(DetectStaticBinops)
 
 LINE = 64  # bytes of a cache line, and of the widest register
 
 
-class _KernelPipeline(CompilerBase):
-    """The passes of numba that a kernel needs: it has no closures, comprehensions, array expressions or objects."""
+class _KernelLower(Lower):
+    """Numba's step to LLVM's code for what kernels consist of: nothing is counted, so nothing has to be given back."""
 
+    def lower_block(self, block: Any) -> None:
+        """Write the code of a block."""
+        for each in block.body:
+            self.loc = each.loc
+            self.lower_inst(each)
+
+    def lower_inst(self, inst: Any) -> None:
+        """Write the code of a statement."""
+        if isinstance(inst, ir.Assign):
+            name = inst.target.name
+            self.storevar(self.lower_assign(self.typeof(name), inst), name)
+        else:
+            super().lower_inst(inst)
+
+    def lower_call(self, resty: Any, expr: Any) -> Any:
+        """Write the code of a call."""
+        kind, signature = self.typeof(expr.func.name), self.fndesc.calltypes[expr]
+        args = self.fold_call_args(kind, signature, expr.args, expr.vararg, expr.kws)
+        if signature.recvr:
+            args = [self.loadvar(expr.func.name), *args]
+        found = self.context.get_function(kind, signature)(self.builder, args, self.loc)
+        if found is None:
+            found = self.context.get_dummy_value()
+        return self.context.cast(self.builder, found, signature.return_type, resty)
+
+    def lower_binop(self, resty: Any, expr: Any, op: Any) -> Any:
+        """Write the code of an operator."""
+        if expr.static_lhs is not ir.UNDEFINED or expr.static_rhs is not ir.UNDEFINED:  # a power that is known
+            return super().lower_binop(resty, expr, op)
+        return self.operated(op, self.fndesc.calltypes[expr], (expr.lhs, expr.rhs), resty)
+
+    def lower_getitem(self, resty: Any, expr: Any, value: Any, index: Any, signature: Any) -> Any:
+        """Write the code that takes an item."""
+        return self.operated(operator.getitem, signature, (value, index), resty)
+
+    def operated(self, op: Any, signature: Any, operands: Any, resty: Any) -> Any:
+        """Return what an operator makes of its operands."""
+        values = [self._cast_var(each, kind) for each, kind in zip(operands, signature.args, strict=True)]
+        typing = self.context.typing_context
+        known = typing.resolve_value_type(op)
+        exact = typing.resolve_function_type(known, signature.args, {})
+        found = self.context.get_function(known, exact)(self.builder, values)
+        return self.context.cast(self.builder, found, signature.return_type, resty)
+
+    def storevar(self, value: Any, name: str, argidx: Any = None) -> None:
+        """Keep a value."""
+        self._alloca_var(name, self.typeof(name))
+        if name in self._singly_assigned_vars:
+            self._blk_local_varmap[name] = value
+        else:
+            self.builder.store(value, self.getvar(name))
+
+    def alloca_lltype(self, name: str, lltype: Any, datamodel: Any = None) -> Any:
+        """Make room for a variable."""
+        return cgutils.alloca_once(self.builder, lltype, name=name)
+
+
+class _KernelLowering(NativeLowering):
+    @property
+    def lowering_class(self) -> Any:
+        """What lowers a kernel."""
+        return _KernelLower
+
+
+class _Interpreter(Interpreter):
+    """Numba's step from Python's code to its own."""
+
+    def post_process(self, peepholes: Any, func_ir: Any) -> Any:
+        """Mend what needs it, and look for no `with`."""
+        return super().post_process([each for each in peepholes if each is not peep_hole_delete_with_exit], func_ir)
+
+
+class _Warnings:
+    """Numba holds back the warnings of each statement, to tell where they come from; here they just pass."""
+
+    def catch_warnings(self, **where: Any) -> Any:
+        """Pass them."""
+        return nullcontext()
+
+
+class _Passes(PassManager):
+    """What numba has to do for a kernel: it has no closures, comprehensions, array expressions or objects."""
+
+    def run(self, state: Any) -> None:
+        """Do it."""
+        state.func_ir = _Interpreter(state.func_id).interpret(state.bc)
+        FixupArgs().run_pass(state)
+        state.func_ir.blocks, state.func_ir.generator_info = canonicalize_cfg(state.func_ir.blocks), None
+        REWRITES.apply("before-inference", state)
+        self.defined(state, reconstruct_ssa(state.func_ir))
+        self.infer(state)
+        self.defined(state, PreLowerStripPhis()._strip_phi_nodes(state.func_ir))
+        _KernelLowering().run_pass(state)
+        NoPythonBackend().run_pass(state)
+
+    def infer(self, state: Any) -> None:
+        """Find the type of every variable."""
+        context, func_ir = state.typingctx, state.func_ir
+        inferer = TypeInferer(context, func_ir, _Warnings())
+        with context.callstack.register(state.targetctx.target, inferer, state.func_id, state.args):
+            for i, (name, kind) in enumerate(zip(func_ir.arg_names, state.args, strict=True)):
+                inferer.seed_argument(name, i, kind)
+            inferer.build_constraint()
+            inferer.propagate()
+            state.typemap, state.return_type, state.calltypes = inferer.unify()
+
+    def defined(self, state: Any, func_ir: Any) -> None:
+        """Take over what has been rewritten."""
+        func_ir._definitions, func_ir.generator_info = build_definitions(func_ir.blocks), None
+        state.func_ir = func_ir
+
+
+class _KernelPipeline(CompilerBase):
     def define_pipelines(self) -> list[PassManager]:
-        """Return the passes in their order."""
-        passes = PassManager("kernel")
-        for each in PASSES:
-            passes.add_pass(each, each.__name__)
-        passes.finalize()
-        return [passes]
+        """Return the one there is."""
+        return [_Passes("kernel")]
 
 
 class _KernelTyping(Context):
     """Numba's typing, which remembers what it found: it tries every meaning of `+` anew at each `+`."""
 
-    def _resolve_user_function_type(self, func: Any, args: Any, kws: Any, literals: Any = None) -> Any:
-        known, plain = self._lookup_global(func) or func, tuple(types.unliteral(each) for each in args)
-        if kws or not isinstance(known, types.Function):
-            return super()._resolve_user_function_type(func, args, kws, literals)
-        key = id(known), plain  # of an object that is kept beside
+    def resolve_function_type(self, func: Any, args: Any, kws: Any) -> Any:
+        """Type of a call."""
+        func = self._lookup_global(func) or func
+        if kws or not isinstance(func, types.Function | types.Dispatcher):
+            return super().resolve_function_type(func, args, kws)
+        plain = tuple(types.unliteral(each) for each in args)
+        key = id(func), plain  # of an object that is kept beside
         if key not in self.found:  # type: ignore[attr-defined]
-            self.found[key] = known, super()._resolve_user_function_type(func, plain, kws)  # type: ignore[attr-defined]
+            self.found[key] = func, self.first_match(func, plain)  # type: ignore[attr-defined]
+        return self.found[key][1]  # type: ignore[attr-defined]
+
+    def resolve_getattr(self, typ: Any, attr: str) -> Any:
+        """Type of an attribute."""
+        key = typ, attr
+        if key not in self.found:  # type: ignore[attr-defined]
+            self.found[key] = super().resolve_getattr(typ, attr)  # type: ignore[attr-defined]
+        return self.found[key]  # type: ignore[attr-defined]
+
+    def first_match(self, func: Any, args: Any) -> Any:
+        """Return the first signature that fits; numba's own way tells what is wrong where none does."""
+        for each in getattr(func, "templates", ()):
+            try:
+                template = each(self)
+                signature = template.apply(args, {})
+            except NumbaError:
+                continue
+            if signature is not None:
+                func._impl_keys[signature.args] = template.get_impl_key(signature)
+                return signature
+        return super().resolve_function_type(func, args, {})
+
+
+class _KernelTarget(CPUContext):
+    """Numba's knowledge of how to lower what, which remembers, too."""
+
+    def get_function(self, fn: Any, sig: Any, _firstcall: bool = True) -> Any:
+        """How a function is lowered for these arguments."""
+        if fn == "__array__":  # nothing but an array is one, yet numba asks of each, and then looks for news
+            raise NotImplementedError
+        key = id(fn), sig
+        if key not in self.found:  # type: ignore[attr-defined]
+            self.found[key] = fn, super().get_function(fn, sig, _firstcall=_firstcall)  # type: ignore[attr-defined]
         return self.found[key][1]  # type: ignore[attr-defined]
 
 
@@ -113,8 +255,8 @@ class _WholeLibrary(_Library):
         super().add_ir_module(ir_module)
 
     def _optimize_final_module(self) -> None:
-        """Optimise once: the parts are in order already, and what pays as vectors is written as vectors."""
-        passes, builder = self._codegen._module_pass_manager(opt=2)
+        """Optimise lightly: the parts are in order already, and what pays as vectors is written as vectors."""
+        passes, builder = self._codegen._module_pass_manager(opt=1)
         passes.run(self._final_module, builder)
 
 
@@ -141,7 +283,10 @@ class _Target:
         self.options, self.typing_context = target.options, _typing(target)
         codegen = copy.copy(target.target_context.codegen())
         codegen._library_class = library
-        self.target_context = target.target_context.subtarget(_internal_codegen=codegen)
+        self.target_context = target.target_context.subtarget(
+            _internal_codegen=codegen, typing_context=self.typing_context
+        )
+        self.target_context.__class__, self.target_context.found = _KernelTarget, {}
 
 
 @lru_cache
