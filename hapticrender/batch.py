@@ -172,16 +172,16 @@ def together(scenarios: Sequence[Scenario], controllers: Sequence[Controller], s
     control, control_state = FAMILIES[type(controllers[0])].batch_of(controllers)
     (tables, state), last = batch_state(plates), aligned((2, LANES))
     target, wanted = aligned((controllers[0].n_bands, 2, LANES)), aligned((CHUNK, LANES))
-    noise, finger = aligned((CHUNK, 2, LANES)), aligned((CHUNK, 3, LANES))
     motion, sensed, drive, flags = _side_by_side(samples, (3, 2, 2, 1))
     fingers = _fingers(plates)
+    noise, finger = aligned((CHUNK, 2, LANES)), aligned((CHUNK, 3, len(fingers)))
     position = np.empty((len(fingers), samples))
     for start in range(0, samples, CHUNK):
         part = slice(start, min(start + CHUNK, samples))
         count = part.stop - start
         time = np.arange(part.start, part.stop) / plates[0].rate
-        touch = np.stack([each.touch(time) for each in fingers])
-        position[:, part], finger[:count] = touch[..., 0], np.moveaxis(touch, 0, -1)
+        touch = np.stack([each.touch(time) for each in fingers], axis=-1)
+        position[:, part], finger[:count] = touch[:, 0].T, touch
         _draw(plates, noise[:count])
         closed_batch_run(
             tables,

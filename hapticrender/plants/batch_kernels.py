@@ -218,20 +218,28 @@ def control_advance(tables, *rest):
 
 
 @kernel
+def finger_of(finger, n, r, like):
+    """Entry r of the fingers in sample n: of each lane, or of the one that all share."""
+    if finger.shape[2] == 1:
+        return 0.0 * like + finger[n, r, 0]
+    return read(finger, n, r)
+
+
+@kernel
 def closed_batch_run(
     shared, state, control, control_state, last, finger, noise, wanted, sensed, motion, drive, target, flags
 ):
     """Plates and controllers closed sample by sample; see `closed_plate_run`.  Every array ends in a lane a scenario.
 
     `shared` are the tables of any of the plates, with as many terms as any needs; `finger` is (n, 3, W): position,
-    load, strength; `target` holds the last sample's only, (bands, 2, W); `flags` are floats.
+    load, strength, or (n, 3, 1) where all share one; `target` holds the last sample's only, (bands, 2, W); `flags` are floats.
     """
     tables = tables_of(shared, state.number)
     for n in range(sensed.shape[0]):
         plate_drive(tables, state, last)
         raised = sense(tables, state, noise[n], sensed[n], motion[n])
-        position = read(finger, n, 0)
-        advance(tables, state, position, read(finger, n, 1), read(finger, n, 2))
+        position = finger_of(finger, n, 0, raised)
+        advance(tables, state, position, finger_of(finger, n, 1, raised), finger_of(finger, n, 2, raised))
         write(read(last, 0), drive, n, 0)
         write(read(last, 1), drive, n, 1)
         raised += control_advance(control, control_state, sensed[n], position, read(wanted, n), last, target)
