@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import hapticrender as hr
+from hapticrender.control.methods import METHODS
 from hapticrender.plants.vibrotactile import Plate, PlateParameters
 
 SLIDE = hr.Finger.sliding(speed=0.08, normal_load=0.4, mechanics="light")
@@ -104,3 +105,18 @@ def test_a_plate_of_other_numbers_is_identified_and_then_held():
     scene = hr.Scene(texture=texture, finger=SLIDE, duration=2.5, plant=plant)
     recording = hr.render(scene, driver=SimulatedDriver(Plate(other, SLIDE, 5)))
     assert abs(amplitudes(recording, 111.0) / A - 1.0).max() < ENDS
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_one_coil_is_driven_by_its_own_row_alone(method):
+    """What lies behind the only row of drives per force is no drive: the plate's second channel stays empty."""
+    plate = PlateParameters(coils=1, **QUIET)
+    bands = hr.Grating(frequency=50.0, amplitude=1e-6).bands(plate.rate)
+    controller = METHODS[method].design(plate.band_model(plate.rate, plate.delay), bands)
+    room = np.full(2, 1e9)
+    room[0] = controller.tables.speak[0, 0]
+    controller.tables = controller.tables._replace(speak=room[:1].reshape(1, 1))
+    drive, _, flags, _ = Plate(plate, hr.Finger.absent()).closed_loop(controller, np.zeros(500))
+    assert drive[:, 0].any()
+    assert not drive[:, 1:].any()
+    assert not flags.any()

@@ -128,6 +128,11 @@ def test_numbers_that_are_compiled_in_count(tmp_path):
     assert stamp("IM, RE = 0, 1", "b") != first
 
 
+@kernel
+def mass_of(pair):
+    return pair.mass
+
+
 class Inner(NamedTuple):
     gain: float
     steps: tuple
@@ -205,3 +210,11 @@ def test_plain_numba_calls_a_kernel_with_all_its_parts():
 
     assert caller(np.array([3.0]), 4.0) == 11.0
     assert numba.njit(lambda x: louder(x))(3.0 + 4.0j) == 10.0
+
+
+def test_records_of_one_name_are_told_apart_by_their_fields():
+    """Two named tuples called alike, of the same types in another order of names."""
+    one = NamedTuple("Pair", [("mass", float), ("damping", float)])
+    other = NamedTuple("Pair", [("damping", float), ("mass", float)])
+    for pair in (one, other):
+        assert mass_of(pair(mass=1.0, damping=2.0)) == 1.0

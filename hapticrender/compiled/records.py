@@ -20,7 +20,9 @@ class RecordType(types.NamedTuple):
 
     def __init__(self, plain: Any) -> None:
         super().__init__([as_record(each) for each in plain], plain.instance_class)
-        self.name = f"{plain.instance_class.__name__}.{hashlib.sha256(self.name.encode()).hexdigest()[:16]}"
+        own = plain.instance_class
+        said = f"{own.__module__} {own.__qualname__} {own._fields} {self.name}"  # numba's name knows the types only
+        self.name = f"{own.__name__}.{hashlib.sha256(said.encode()).hexdigest()[:16]}"
 
     @property
     def key(self) -> str:

@@ -70,7 +70,7 @@ def doubt_pass(numbers, doubt, loop, flags):
 def speak_pass(numbers, speak, coordinate, trust, drive):
     """Drive of the channels from that of the coordinates, each cut to its limit.  Returns flags."""
     flags = 0
-    for i in range(drive.shape[0]):
+    for i in range(speak.shape[0]):
         total = 0.0
         for c in range(coordinate.shape[0]):
             total += trust * speak[i, c] * coordinate[c]

@@ -232,7 +232,8 @@ def closed_batch_run(
     """Plates and controllers closed sample by sample; see `closed_plate_run`.  Every array ends in a lane a scenario.
 
     `shared` are the tables of any of the plates, with as many terms as any needs; `finger` is (n, 3, W): position,
-    load, strength, or (n, 3, 1) where all share one; `target` holds the last sample's only, (bands, 2, W); `flags` are floats.
+    load, strength, or (n, 3, 1) where all share one; `target` holds the last sample's only, (bands, 2, W); `flags`
+    are floats.
     """
     tables = tables_of(shared, state.number)
     for n in range(sensed.shape[0]):

@@ -26,7 +26,7 @@ from functools import cached_property
 import numpy as np
 from scipy.fft import fft, fftfreq, ifft, next_fast_len
 
-from hapticrender.control.bank.kernels import ADAPTATION
+from hapticrender.control.bank.learning import ADAPTATION
 from hapticrender.control.bank.loop import BankLoop, KnownFinger, Structure
 from hapticrender.control.bank.state import BankTables
 from hapticrender.control.kernels import FREQUENCY

@@ -61,6 +61,13 @@ def follow_resonance(tables, state):
 
 
 @kernel
+def still_grows(band, t, i):
+    """Whether a band's target is not yet what is asked for."""
+    apart = band[t, row.R_RE, i] != band[t, row.WANTED_RE, i] or band[t, row.R_IM, i] != band[t, row.WANTED_IM, i]
+    return apart or band[t, row.RAMP, i] < 1.0
+
+
+@kernel
 def take_bands(tables, state, t):
     """Tones of a tile whose lanes are bands; returns whether a target still grows, and whether one follows a finger."""
     tone, band, width = tables.tone, state.band, state.band.shape[2]
@@ -75,8 +82,7 @@ def take_bands(tables, state, t):
             band[t, row.FREQUENCY + r, i] = tone[r, k]
         band[t, row.FREQUENCY, i] += state.shift[0]
         band[t, row.TURNS, i] = count_turns(state.phase, k, (tone[0, k] + state.shift[0]) / tables.numbers.rate)
-        if band[t, row.RAMP, i] < 1.0 or band[t, row.R_RE, i] != tone[3, k] or band[t, row.R_IM, i] != tone[4, k]:
-            grows = True
+        grows = grows or still_grows(band, t, i)
         follows = follows or tone[1, k] > 0.0 or tables.numbers.presence
     return grows, follows
 
@@ -91,8 +97,7 @@ def take_scenarios(tables, state, t):
         for r in range(row.TONE_ROWS):
             band[t, row.FREQUENCY + r, i] = tone[t, r, i]
         band[t, row.TURNS, i] = count_turns(state.phase, t * width + i, tone[t, 0, i] / tables.numbers.rate)
-        if band[t, row.RAMP, i] < 1.0 or band[t, row.R_RE, i] != tone[t, 3, i] or band[t, row.R_IM, i] != tone[t, 4, i]:
-            grows = True
+        grows = grows or still_grows(band, t, i)
         follows = follows or tone[t, 1, i] > 0.0 or tables.numbers.presence
     return grows, follows
 

@@ -12,7 +12,8 @@ from hapticrender.bands import Bands
 from hapticrender.control.bandmodel import BandModel
 from hapticrender.control.bank import rows as row
 from hapticrender.control.bank.carriers import REFRESH
-from hapticrender.control.bank.kernels import ADAPTATION, bank_run
+from hapticrender.control.bank.kernels import bank_run
+from hapticrender.control.bank.learning import ADAPTATION
 from hapticrender.control.bank.state import PRECISIONS, BankNumbers, BankState, BankTables, across_bands, bank_state
 from hapticrender.control.damping import choose_damping
 from hapticrender.control.kernels import FREQUENCY, WAVENUMBER

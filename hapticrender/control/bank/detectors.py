@@ -6,6 +6,7 @@ from hapticrender.compiled.jit import kernel
 from hapticrender.compiled.lanes import high, select, total
 from hapticrender.compiled.lanes_memory import lanes, put, read, write
 from hapticrender.control.bank import rows as row
+from hapticrender.control.bank.learning import in_a_turn
 
 HUGE = 1e300  # stands for infinity, where fast arithmetic is not told of it
 
@@ -27,10 +28,7 @@ def fast_pass(numbers, state, t, c):
 def slow_pass(numbers, state, t, c):
     """The same of the slow detector, which listens to the fast one, once in a turn."""
     loop, base, heard = state.loop, c * row.LOOP_ROWS, 0.0
-    keep = 1.0 - numbers.slow_pole
-    keep *= keep
-    keep *= keep
-    pole = 1.0 - keep * keep  # of TURN samples
+    pole = in_a_turn(numbers.slow_pole)
     for r in range(2):
         slow = lanes(loop, t, base + row.SLOW_RE + r)
         slow += pole * (lanes(loop, t, base + row.FAST_RE + r) - slow)

@@ -19,14 +19,12 @@ from hapticrender.control.bank.carriers import REFRESH, carrier_pass, refresh
 from hapticrender.control.bank.detectors import detect
 from hapticrender.control.bank.finger import feel, track_finger
 from hapticrender.control.bank.law import know_finger, law_pass
-from hapticrender.control.bank.learning import begin_finger, learn_finger, send_finger
+from hapticrender.control.bank.learning import ADAPTATION, begin_finger, in_a_turn, learn_finger, send_finger
 from hapticrender.control.bank.observer import level_pass, observer_pass, residual_pass
-from hapticrender.control.bank.settled import settled, settled_command, settled_sample, settled_speak
+from hapticrender.control.bank.settled import settled, settled_command, settled_sample
 from hapticrender.control.bank.shaper import shape_pass
 from hapticrender.control.bank.targets import target_all
 from hapticrender.control.kernels import DOUBT_TIME, FAR
-
-ADAPTATION = 8  # samples between two adaptations of the finger
 
 
 @kernel
@@ -142,9 +140,7 @@ def learn(tables, state, g, inner, calmly, touching):
     gain = numbers.adapt + lively * (numbers.adapt_awake - numbers.adapt)
     rest = numbers.rest + lively * (numbers.rest_awake - numbers.rest)
     follow = high(0.5 * g, 1e-4)  # the observer's pole in a sample, then in a step
-    keep = (1.0 - follow) * (1.0 - follow)
-    keep *= keep
-    step, pole = state.sample[0] // ADAPTATION, 1.0 - keep * keep
+    step, pole = state.sample[0] // ADAPTATION, in_a_turn(follow)
     middle = (1.0 / follow - 1.0) / ADAPTATION - (1.0 / pole - 1.0)
     for t in range(state.band.shape[0]):
         if calmly:
@@ -182,12 +178,10 @@ def bank_advance(tables, state, sensed, position, wanted, drive, target):
     believe(numbers, touch, doubt)
     calmly, turn = settled(state), state.sample[0] % ADAPTATION == 0
     if calmly:
-        settled_sample(tables, state, g, integral, inner, quick)
+        settled_sample(tables, state, g, integral, inner)
     else:
         stirred_sample(tables, state, g, integral, inner, back, quick)
-    flags = high(odd, 2.0 * doubt)
-    if not (calmly and settled_speak(tables, state, drive)):
-        flags += speak_pass(tables, state, drive)
+    flags = speak_pass(tables, state, drive) + high(odd, 2.0 * doubt)
     if turn and any_of(touching):
         learn(tables, state, g, inner, calmly, touching)
     detect(tables, state, turn)

@@ -6,7 +6,7 @@ D is tuned to the carriers when they are taken up or move, and to the finger in 
 from __future__ import annotations
 
 from hapticrender.compiled.jit import kernel
-from hapticrender.compiled.lanes import any_of, high, select, size, total, totals
+from hapticrender.compiled.lanes import any_of, high, select, size, totals
 from hapticrender.compiled.lanes_memory import lanes, put, read, write
 from hapticrender.compiled.polynomials import unit
 from hapticrender.control.bank import rows as row
@@ -88,14 +88,18 @@ def law_settled(tables, state, t):
 
 @kernel
 def answer_settled(tables, state):
-    """What the force of all settled tiles answers to a residual, for every pair of coordinates."""
+    """What the force of all settled tiles answers to a residual, and a quarter turn ahead, for each two coordinates."""
     band, coordinates = state.band, len(tables.shape)
     for c in range(coordinates):
         for i in range(coordinates):
-            found = 0.0
+            force = quarter = 0.0
             for t in range(band.shape[0]):
-                found += lanes(band, t, row.LIVE) * lanes(state.ahead, t, (2 + 2 * coordinates) * c + 2 + 2 * i)
-            write(total(read(state.touch, row.TRUST), found), state.answer, c, i)
+                at, live = (2 + 2 * coordinates) * c + 2 + 2 * i, lanes(band, t, row.LIVE)
+                force += live * lanes(state.ahead, t, at)
+                quarter += live * lanes(state.ahead, t, at + 1)
+            force, quarter = totals(read(state.touch, row.TRUST), force, quarter)
+            write(force, state.answer, c, i)
+            write(quarter, state.answer, coordinates + c, i)
 
 
 @kernel
@@ -115,7 +119,7 @@ def know_finger(tables, state, touching, turn):
             look_ahead(tables.numbers, state.band, state.law, t)
         if any_of(due) or state.pace[t] == row.LOCKED:
             law_tune(tables, state, t)
-        if state.pace[t] == row.STEADY:
+        if state.follows[1] == 0:
             law_settled(tables, state, t)
     if state.follows[1] == 0:
         answer_settled(tables, state)

@@ -21,7 +21,17 @@ from hapticrender.control.bank import rows as row
 from hapticrender.control.bank.finger import finger_stiffness
 from hapticrender.control.bank.law import memory_damping
 
+ADAPTATION = 8  # samples of a turn, in which the finger is learnt once
 FORGOTTEN = 0.9  # of what was before a carrier was all there, until it teaches
+
+
+@kernel
+def in_a_turn(pole):
+    """Pole of first order for a turn of samples, of that for one."""
+    keep = left = 1.0 - pole
+    for _ in range(ADAPTATION - 1):
+        left = left * keep
+    return 1.0 - left
 
 
 @kernel

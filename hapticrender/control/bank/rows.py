@@ -16,7 +16,8 @@ BAND_ROWS = 26
 # what BankState.pace says of a tile: carriers follow the finger; fixed, their targets growing; fixed, and nothing grows
 LOCKED, GROWING, STEADY = range(3)
 # rows of BankState.loop, LOOP_ROWS a coordinate: error; integral part; command as it acted and the observer shows it;
-# motion less that at the last step of learning; fast and slow detector of the deviation; command V and its slope
+# motion less that at the last step of learning; fast and slow detector of the deviation, the slow one sample by sample
+# behind the fast one; command V and its slope
 E_RE, E_IM, V_RE, V_IM, L_RE, L_IM, LAST_RE, LAST_IM, FAST_RE, FAST_IM, SLOW_RE, SLOW_IM = range(12)
 COMMAND_RE, COMMAND_IM, SLOPED_RE, SLOPED_IM = range(12, 16)
 LOOP_ROWS = 16
@@ -46,6 +47,6 @@ LOAD, PLACE, CONTACT, MASS, DAMPING, STIFFNESS, FAST_TIME, SLOW_TIME, FAST_OPEN,
 KNOWN, KNOWN_PLACE = 13, 14
 TOUCH_ROWS = 15
 # rows of BankState.residual: a coordinate as heard, residual of the observer, deviation, force, force a quarter turn
-# ahead
-HEARD, ERROR, DEVIATION, FORCE, QUADRATURE = range(5)
-RESIDUAL_ROWS = 5
+# ahead, force as it is known before anything is heard
+HEARD, ERROR, DEVIATION, FORCE, QUADRATURE, KNOWN_FORCE = range(6)
+RESIDUAL_ROWS = 6

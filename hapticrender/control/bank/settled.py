@@ -1,26 +1,22 @@
-"""A sample of the band bank while little happens: carriers are fixed, targets stay, the drive is far from its limit.
+"""A sample of the band bank while little happens: carriers are fixed, targets stay, the drive is inside its limit.
 
-Then no carrier fades and none leaves its band, the target's part of the force is known until the law changes, and the
-drive's own samples tell enough of its envelope.  What is left of the general step (`kernels`) is here, a third of it.
+Then no carrier fades and none leaves its band, and the target's part of the force is known until the law changes; so
+is what the force answers to a residual.  What is left of the general step (`kernels`) is here, half of it.
 """
 
 from __future__ import annotations
 
 from hapticrender.compiled.jit import kernel
-from hapticrender.compiled.lanes import any_of, high, total, totals
+from hapticrender.compiled.lanes import any_of, totals
 from hapticrender.compiled.lanes_memory import lanes, put, read, write
 from hapticrender.control.bank import rows as row
 from hapticrender.control.bank.observer import damp, level_pass
-from hapticrender.control.bank.shaper import shape_pass
-
-NEAR_LIMIT = 0.5  # share of the drive's limit, from which on its envelope is watched and not its samples alone
 
 
 @kernel
 def settled(state):
-    """Whether every target stays, the drive is far from its limit and the sensors are believed."""
-    touch = state.touch
-    stirs = (read(touch, row.PEAK) > NEAR_LIMIT * NEAR_LIMIT) | (read(touch, row.TRUST) < 1.0)
+    """Whether every target stays, the limiter is idle and the sensors are believed."""
+    stirs = (read(state.touch, row.SCALE) < 1.0) | (read(state.touch, row.TRUST) < 1.0)
     return state.follows[1] == 0 and not any_of(stirs)
 
 
@@ -71,6 +67,7 @@ def settled_law(tables, state, integral):
     band, loop, law, ahead, coordinates = state.band, state.loop, state.law, state.ahead, len(tables.shape)
     for c in range(coordinates):
         force, across, first = 0.0, 0.0, c * (2 + 2 * coordinates)
+        quarter = leaning = 0.0
         for t in range(band.shape[0]):
             re, im = lanes(ahead, t, first), lanes(ahead, t, first + 1)
             sloped_re = sloped_im = 0.0
@@ -88,42 +85,30 @@ def settled_law(tables, state, integral):
                 sloped_re -= d_im * e_im
                 sloped_im += d_re * e_im
                 sloped_im += d_im * e_re
-            force += (re - integral * sloped_re) * lanes(band, t, row.COS)
-            across += (im - integral * sloped_im) * lanes(band, t, row.SIN)
-        write(total(read(state.touch, row.TRUST), force - across), state.residual, row.QUADRATURE, c)
+            cos, sin = lanes(band, t, row.COS), lanes(band, t, row.SIN)
+            re, im = re - integral * sloped_re, im - integral * sloped_im
+            force += re * cos
+            across += im * sin
+            quarter += re * sin
+            leaning += im * cos
+        known, turned = totals(read(state.touch, row.TRUST), force - across, quarter + leaning)
+        write(known, state.residual, row.KNOWN_FORCE, c)
+        write(turned, state.residual, row.QUADRATURE, c)
 
 
 @kernel
 def settled_force(tables, state, gain):
-    """Force of all bands: what was known before, and what the residuals add."""
-    residual = state.residual
-    for c in range(len(tables.shape)):
-        force = read(residual, row.FORCE, c) + read(residual, row.QUADRATURE, c)
-        for i in range(len(tables.shape)):
-            force -= gain * read(residual, row.ERROR, i) * read(state.answer, c, i)
+    """Force of all bands, and a quarter turn ahead: what was known before, and what the residuals add."""
+    residual, answer, coordinates = state.residual, state.answer, len(tables.shape)
+    for c in range(coordinates):
+        force = read(residual, row.FORCE, c) + read(residual, row.KNOWN_FORCE, c)
+        quarter = read(residual, row.QUADRATURE, c)
+        for i in range(coordinates):
+            heard = gain * read(residual, row.ERROR, i)
+            force -= heard * read(answer, c, i)
+            quarter -= heard * read(answer, coordinates + c, i)
         write(force, residual, row.FORCE, c)
-
-
-@kernel
-def settled_speak(tables, state, drive):
-    """Drive from force, see `speak_pass`; false where it leaves the limit all at once, and has not been spoken."""
-    numbers, touch = tables.numbers, state.touch
-    peak, unit_drive = numbers.peak_decay * numbers.peak_decay * read(touch, row.PEAK), 1.0 / numbers.drive_limit
-    for i in range(tables.speak.shape[0]):
-        along = 0.0 * peak
-        for c in range(len(tables.shape)):
-            along += read(tables.speak, i, c) * read(state.residual, row.FORCE, c)
-        write(along, drive, i)
-        along = unit_drive * along
-        peak = high(peak, along * along)
-    if any_of(peak > 1.0):
-        for c in range(len(tables.shape)):
-            write(0.0 * peak, state.residual, row.QUADRATURE, c)
-        return False
-    write(peak, touch, row.PEAK)
-    for i in range(tables.speak.shape[0]):
-        shape_pass(numbers, state.shaper, read(drive, i), drive, i)
-    return True
+        write(quarter, residual, row.QUADRATURE, c)
 
 
 @kernel
@@ -137,13 +122,13 @@ def settled_command(tables, state, t):
 
 
 @kernel
-def settled_sample(tables, state, g, integral, inner, quick):
+def settled_sample(tables, state, g, integral, inner):
     """From what is heard to the force, while little happens; what needs no sensor comes first."""
     settled_law(tables, state, integral)
     wanted = settled_target(state)
     for c in range(len(tables.shape)):
         settled_residual(tables, state, wanted, c, inner)
-        level_pass(tables.numbers, state, c, quick)
+        level_pass(tables.numbers, state, c, False)
         for t in range(state.band.shape[0]):
             settled_observer(tables, state, t, c, g, integral)
     settled_force(tables, state, g * integral)

@@ -112,7 +112,7 @@ class BankState(NamedTuple):
     level: Array  # (2, coordinates) DC band and its drift
     past: Array  # (coordinates, taps) last deviations, newest first
     lags: tuple[int, ...]  # samples by which each tap looks back; their number is known while compiling
-    answer: Array  # (coordinates, coordinates) force in c of all settled bands per residual in i, N/m
+    answer: Array  # (2 coordinates, coordinates) of settled bands: force, then a quarter ahead, per residual, N/m
     residual: Array  # (RESIDUAL_ROWS, coordinates) scratch
     shaper: Array  # (2, channels) last two errors of the command's rounding
     follows: Array  # (2,) integer: tiles that follow the finger; tiles whose targets do not stay
@@ -139,7 +139,7 @@ def bank_state(tables: BankTables, dtype: type = np.float64) -> BankState:
         level=np.zeros((2, coordinates)),
         past=np.zeros(tables.taps.shape),
         lags=tuple(range(tables.taps.shape[1])),
-        answer=np.zeros((coordinates, coordinates)),
+        answer=np.zeros((2 * coordinates, coordinates)),
         residual=np.zeros((row.RESIDUAL_ROWS, coordinates)),
         shaper=np.zeros((2, len(tables.speak))),
         follows=np.zeros(2, np.int64),

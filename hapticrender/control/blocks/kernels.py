@@ -25,7 +25,6 @@ from hapticrender.control.bank.kernels import believe, forget
 from hapticrender.control.bank.law import law_tune, look_ahead
 from hapticrender.control.bank.learning import begin_finger, learn_finger, send_finger
 from hapticrender.control.bank.observer import FORGET
-from hapticrender.control.bank.settled import NEAR_LIMIT
 from hapticrender.control.bank.targets import derivative
 from hapticrender.control.blocks.state import (
     CHANNEL_ROWS,
@@ -49,6 +48,8 @@ from hapticrender.control.blocks.state import (
 )
 from hapticrender.control.blocks.sums import correlate, respond, solve, sum_bands, sum_drives
 from hapticrender.control.kernels import FAR, TURN
+
+NEAR_LIMIT = 0.5  # share of the drive's limit, from which on its envelope is watched and not its samples alone
 
 
 @kernel

@@ -182,7 +182,7 @@ def gather(tables, state, m):
 def speak(tables, state, m, one, other, drive):
     """Drive of the channels from that of the coordinates, each cut to its limit.  Returns flags, as a float."""
     limit, flags, coordinates = tables.numbers.drive_limit, 0.0 * one, tables.listen.shape[0]
-    for i in range(drive.shape[0]):
+    for i in range(tables.speak.shape[0]):
         asked = tables.speak[i, 0] * one
         if coordinates > 1:
             asked += tables.speak[i, 1] * other
