@@ -4,6 +4,7 @@ import os
 import shutil
 import subprocess
 import sys
+from collections import namedtuple
 from typing import NamedTuple
 
 import numba
@@ -214,7 +215,5 @@ def test_plain_numba_calls_a_kernel_with_all_its_parts():
 
 def test_records_of_one_name_are_told_apart_by_their_fields():
     """Two named tuples called alike, of the same types in another order of names."""
-    one = NamedTuple("Pair", [("mass", float), ("damping", float)])
-    other = NamedTuple("Pair", [("damping", float), ("mass", float)])
-    for pair in (one, other):
+    for pair in (namedtuple("Pair", "mass damping"), namedtuple("Pair", "damping mass")):
         assert mass_of(pair(mass=1.0, damping=2.0)) == 1.0
