@@ -1,6 +1,7 @@
 """The kernel cache: hit when nothing changed, stale as soon as any kernel source did (where numba's own is not)."""
 
 import os
+import pickle
 import shutil
 import subprocess
 import sys
@@ -14,7 +15,7 @@ from conftest import ROOT
 from numba.core import types
 from numba.core.errors import TypingError
 
-from hapticrender.compiled.jit import by_types, kernel
+from hapticrender.compiled.jit import CacheFile, by_types, kernel
 
 HELPER = """
 from {jit} import kernel
@@ -217,3 +218,15 @@ def test_records_of_one_name_are_told_apart_by_their_fields():
     """Two named tuples called alike, of the same types in another order of names."""
     for pair in (namedtuple("Pair", "mass damping"), namedtuple("Pair", "damping mass")):
         assert mass_of(pair(mass=1.0, damping=2.0)) == 1.0
+
+
+def test_what_a_version_with_other_modules_cached_counts_as_nothing(tmp_path):
+    """An index whose entries name a module that is no more: not loaded, and written anew."""
+    cached = CacheFile(str(tmp_path), "kernel", "stamp")
+    cached.save("key", 1)
+    assert cached.load("key") == 1
+    (index,) = tmp_path.glob("*.nbi")
+    index.write_bytes(pickle.dumps(numba.__version__) + b"cno_such_module\nThing\n.")
+    assert cached.load("key") is None
+    cached.save("key", 2)
+    assert cached.load("key") == 2

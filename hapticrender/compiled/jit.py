@@ -44,13 +44,23 @@ _STAMP = _source_stamp()
 OPTIONS: Any = {"error_model": "numpy", "fastmath": {"contract"}, "nogil": True, "forceinline": True, "_nrt": False}
 
 
+class CacheFile(IndexDataCacheFile):
+    """Numba's index of what is cached; what another version wrote, of modules that are no more, counts as nothing."""
+
+    def _load_index(self) -> Any:
+        try:
+            return super()._load_index()  # type: ignore[misc]
+        except (ImportError, AttributeError):
+            return {}
+
+
 class _StampedCache(FunctionCache):
     """A function cache that is stale as soon as any kernel file has changed."""
 
     def __init__(self, function: Any) -> None:
         super().__init__(function)
         stamp = (self._impl.locator.get_source_stamp(), _STAMP)
-        self._cache_file = IndexDataCacheFile(
+        self._cache_file = CacheFile(
             cache_path=self._cache_path, filename_base=self._impl.filename_base, source_stamp=stamp
         )
 
