@@ -14,42 +14,36 @@ per-sample bank's own, called once a block.
 from __future__ import annotations
 
 from hapticrender.compiled.jit import kernel
-from hapticrender.compiled.lanes import any_of, floor, high, root, size, totals
+from hapticrender.compiled.lanes import any_of, floor, high, size, totals
 from hapticrender.compiled.lanes_memory import lanes, put, put_pairs, put_stretch, stretch
-from hapticrender.compiled.polynomials import unit, whole
+from hapticrender.compiled.polynomials import unit
 from hapticrender.control.bank import rows as row
 from hapticrender.control.bank.carriers import grow_pass, motion_pass
 from hapticrender.control.bank.detectors import wake
 from hapticrender.control.bank.finger import feel, track_finger
 from hapticrender.control.bank.kernels import believe, forget
 from hapticrender.control.bank.law import law_tune, look_ahead
-from hapticrender.control.bank.learning import begin_finger, learn_finger, send_finger
+from hapticrender.control.bank.learning import begin_finger, learn_finger
 from hapticrender.control.bank.observer import FORGET
 from hapticrender.control.bank.targets import derivative
+from hapticrender.control.blocks.drive import answer
 from hapticrender.control.blocks.state import (
-    CHANNEL_ROWS,
     EIGHT,
     FAR_COS,
     FAR_SIN,
-    FROM_RE,
     GROUP,
-    NOW_IM,
-    NOW_RE,
     PAIR_COS,
     PAIR_ROWS,
     PAIR_SIN,
     PAIRS,
-    STEP_RE,
     TO_MIDDLE,
     TURN_COS,
     TURN_SIN,
     TURNED,
     TURNS,
 )
-from hapticrender.control.blocks.sums import correlate, respond, solve, sum_bands, sum_drives
+from hapticrender.control.blocks.sums import correlate, respond, solve, sum_bands, turn_held
 from hapticrender.control.kernels import FAR, TURN
-
-NEAR_LIMIT = 0.5  # share of the drive's limit, from which on its envelope is watched and not its samples alone
 
 
 @kernel
@@ -84,14 +78,6 @@ def follow_pass(tables, state, t):
     put(band, t, row.COS, lanes(band, t, row.LIVE))
     put(band, t, row.SIN, 0.0 * sin)
     motion_pass(tables.bank.numbers, band, bank.track, t)
-
-
-@kernel
-def turn_held(band, held, t, r, re, im):
-    """Envelope of a tile as this block's tables want it, into rows r and r + 1."""
-    cos, sin = lanes(band, t, row.COS), lanes(band, t, row.SIN)
-    put(held, t, r, re * cos - im * sin)
-    put(held, t, r + 1, re * sin + im * cos)
 
 
 @kernel
@@ -234,88 +220,6 @@ def update(tables, state, t, c, a, b, g, integral, back):
 
 
 @kernel
-def command(tables, state, t):
-    """Drive envelope of every channel from the law, at the end of the last block and of this one."""
-    bank, held, coordinates = state.bank, state.held, len(tables.bank.shape)
-    law, loop = bank.law, bank.loop
-    for channel in range(tables.bank.speak.shape[0]):
-        re = im = 0.0 * lanes(law, t, 0)
-        for c in range(coordinates):
-            share = tables.bank.speak[channel, c]
-            for i in range(coordinates):
-                base, at = i * row.LOOP_ROWS, row.FIRST_LAW + row.LAW_ROWS * (c * coordinates + i)
-                v_re, v_im = lanes(loop, t, base + row.COMMAND_RE), lanes(loop, t, base + row.COMMAND_IM)
-                dv_re, dv_im = lanes(loop, t, base + row.SLOPED_RE), lanes(loop, t, base + row.SLOPED_IM)
-                d_re, d_im = lanes(law, t, at + row.LAW_RE), lanes(law, t, at + row.LAW_IM)
-                s_re, s_im = lanes(law, t, at + row.SLOPE_RE), lanes(law, t, at + row.SLOPE_IM)
-                re += share * (d_re * v_re - d_im * v_im + s_re * dv_re - s_im * dv_im)
-                im += share * (d_re * v_im + d_im * v_re + s_re * dv_im + s_im * dv_re)
-        at = 2 * coordinates + CHANNEL_ROWS * channel
-        last_re, last_im = lanes(held, t, at + NOW_RE), lanes(held, t, at + NOW_IM)
-        put(held, t, at + NOW_RE, re)
-        put(held, t, at + NOW_IM, im)
-        turn_held(bank.band, held, t, at + FROM_RE, last_re, last_im)
-        turn_held(bank.band, held, t, at + STEP_RE, re - last_re, im - last_im)
-
-
-@kernel
-def quarter_ahead(held, at):
-    """Turn the drives' envelopes of all tiles a quarter ahead: x becomes -j x."""
-    for t in range(held.shape[0]):
-        for r in (at + FROM_RE, at + STEP_RE):
-            re, im = lanes(held, t, r), lanes(held, t, r + 1)
-            put(held, t, r, im)
-            put(held, t, r + 1, -re)
-
-
-@kernel
-def speak(tables, state, drive):
-    """Drive of every channel, linear from the last block's envelope to this one's; returns its largest envelope.
-
-    Near the limit the envelope is that of the analytic signal, the drive and its quadrature; far from it the drive's
-    own samples do.
-    """
-    sums, block, first = state.sum, drive.shape[0], 2 * len(tables.bank.shape)
-    trust, unit_drive, peak = state.bank.touch[row.TRUST], 1.0 / tables.sample.drive_limit, 0.0
-    for channel in range(0, drive.shape[1], 2):
-        at, pair = first + CHANNEL_ROWS * channel, min(drive.shape[1] - channel, 2)
-        sum_drives(state, at)
-        for i in range(pair):
-            for m in range(block):
-                drive[m, channel + i] = trust * sums[m, i]
-                peak = max(peak, (unit_drive * drive[m, channel + i]) ** 2)
-        if max(peak, state.bank.touch[row.PEAK]) > NEAR_LIMIT * NEAR_LIMIT:
-            for i in range(pair):
-                quarter_ahead(state.held, at + CHANNEL_ROWS * i)
-            sum_drives(state, at)
-            for i in range(pair):
-                for m in range(block):
-                    across = unit_drive * trust * sums[m, i]
-                    peak = max(peak, (unit_drive * drive[m, channel + i]) ** 2 + across * across)
-    return peak
-
-
-@kernel
-def shape_drive(tables, state, scale, drive):
-    """Scale every channel into its limit and shape the noise of its rounding (2nd order)."""
-    numbers, shaper, touch = tables.sample, state.bank.shaper, state.bank.touch
-    limit, step, block, before = numbers.drive_limit, numbers.drive_step, drive.shape[0], touch[row.SCALE]
-    believed, per_step = touch[row.TRUST] > 0.0, 1.0 / step if step > 0.0 else 0.0
-    for m in range(block):
-        share = before + (scale - before) * (m + 1.0) / block
-        for channel in range(tables.bank.speak.shape[0]):  # side by side: each waits for its own last sample
-            exact = share * drive[m, channel]
-            if not believed:
-                exact = shaper[0, channel] = shaper[1, channel] = 0.0
-            elif step > 0.0:
-                shaped = (exact - shaper[1, channel]) + 2.0 * shaper[0, channel]
-                exact = step * whole(shaped, per_step)
-                shaper[1, channel] = shaper[0, channel]
-                shaper[0, channel] = min(max(shaped - exact, -step), step)
-            drive[m, channel] = min(max(exact, -limit), limit)
-
-
-@kernel
 def take_in(tables, state, sensed, flags):
     """Coordinates of every sample less the DC band as it would go on; returns whether a sensor was not believed."""
     listen, level, raw = tables.bank.listen, state.bank.level, state.raw
@@ -347,11 +251,22 @@ def settle_level(tables, state, c):
 
 
 @kernel
-def block_step(tables, state, sensed, position, wanted, drive, target, flags):
-    """One block of the whole controller: fills `drive` (M, channels), `target` (bands,) and `flags` (M,)."""
-    bank, numbers, sample = state.bank, tables.bank.numbers, tables.sample
-    band, loop, touch, track = bank.band, bank.loop, bank.touch, bank.track
-    tiles, block, coordinates = band.shape[0], sensed.shape[0], len(tables.bank.shape)
+def look_at_finger(tables, state, position, wanted, flags):
+    """Follow the finger through a block; say where it, or what is wanted, is beyond all sense."""
+    track, follows = state.bank.track, state.bank.follows[0] > 0
+    for m in range(position.shape[0]):
+        flags[m] = 0
+        if size(position[m]) > FAR or not size(wanted[m]) <= FAR:
+            flags[m] = 2
+        if follows:
+            track_finger(track, tables.sample.rate, position[m])
+            state.place[m] = track[row.HELD]
+
+
+@kernel
+def take_up_tones(tables, state):
+    """Take up tones: all of them where there is news, else a tile's in its turn."""
+    bank, tiles = state.bank, state.bank.band.shape[0]
     if state.stale[0] > 0 or state.news[0] > 0:
         state.news[0] = 0
         for t in range(tiles):
@@ -359,88 +274,111 @@ def block_step(tables, state, sensed, position, wanted, drive, target, flags):
     else:
         take_up(tables, state, bank.sample[0] % tiles)
     bank.sample[0] += 1
-    for m in range(block):
-        flags[m] = 0
-        if size(position[m]) > FAR or not size(wanted[m]) <= FAR:
-            flags[m] = 2
-        if bank.follows[0] > 0:
-            track_finger(track, sample.rate, position[m])
-            state.place[m] = track[row.HELD]
+
+
+@kernel
+def weigh_carriers(tables, state):
+    """Phases and weights of all carriers."""
+    bank = state.bank
     count_phases(tables, state)
-    for t in range(tiles):
+    for t in range(bank.band.shape[0]):
         if bank.pace[t] == row.LOCKED:
             follow_pass(tables, state, t)
         else:
             grow_pass(tables.bank, bank, t)
-            put(band, t, row.SHARE, lanes(band, t, row.LIVE))
-    calm = 1.0
-    if numbers.crowd_speed > 0.0:
-        calm = min(abs(track[row.VELOCITY]) / numbers.crowd_speed, 1.0)
-    fast, slow = touch[row.FAST_OPEN], touch[row.SLOW_OPEN]
-    g = calm * (sample.observer + fast * (sample.observer_awake - sample.observer))
-    if state.stale[0] > 0 or bank.follows[0] > 0 or state.gain[0] != g:
-        respond(tables, state, g)
-        state.gain[0] = g
-    if numbers.analysed:
+            put(bank.band, t, row.SHARE, lanes(bank.band, t, row.LIVE))
+
+
+@kernel
+def aim(tables, state, wanted, target):
+    """Targets at the block's end."""
+    band, last = state.bank.band, wanted[wanted.shape[0] - 1]
+    if tables.bank.numbers.analysed:
         analyse(state, wanted)
-    factor = wanted[block - 1] if size(wanted[block - 1]) <= FAR else 0.0
-    for t in range(tiles):
-        want(tables, state, t, sample.reference, factor)
+    factor = last if size(last) <= FAR else 0.0
+    for t in range(band.shape[0]):
+        want(tables, state, t, tables.sample.reference, factor)
         put_pairs(target, t, lanes(band, t, row.R_RE), lanes(band, t, row.R_IM))
-    changed = feel(numbers, coordinates, tables.bank.stiffness, bank.level, touch, True)
-    if changed:
-        touch[row.FAST_TIME] = numbers.fast_time
-        begin_finger(tables.bank, bank, changed)
-        fast = 1.0
-    doubt = take_in(tables, state, sensed, flags)
-    for t in range(tiles):
+
+
+@kernel
+def find_residuals(tables, state):
+    """Residuals of the observer in every sample, exact; the DC band after them."""
+    bank, coordinates = state.bank, len(tables.bank.shape)
+    band, loop = bank.band, bank.loop
+    for t in range(band.shape[0]):
         for c in range(coordinates):
             shape, base = tables.bank.shape[c], c * row.LOOP_ROWS
             re = shape * lanes(band, t, row.SEEN_RE) + lanes(loop, t, base + row.E_RE)
             im = shape * lanes(band, t, row.SEEN_IM) + lanes(loop, t, base + row.E_IM)
             turn_held(band, state.held, t, 2 * c, re, im)
     sum_bands(state, 0, 2 * (coordinates - 1))
-    integral = numbers.integral + slow * (numbers.integral_stirred - numbers.integral)
-    integral += fast * (numbers.integral_awake - integral)
-    back = numbers.back * (1.0 - touch[row.SCALE])
-    hears_fast = hears_slow = 0.0 * lanes(band, 0, row.COS)
     for c in range(coordinates):
-        for m in range(block):
+        for m in range(state.place.shape[0]):
             state.raw[c, m] -= state.sum[m, c]
         solve(state, 0, c)
         settle_level(tables, state, c)
-    for t in range(tiles):
+
+
+@kernel
+def observe(tables, state, g, integral, back):
+    """Take the residuals into every band; returns how much either detector hears."""
+    band, coordinates = state.bank.band, len(tables.bank.shape)
+    hears_fast = hears_slow = 0.0 * lanes(band, 0, row.COS)
+    for t in range(band.shape[0]):
         a, b, a2, b2 = correlate(state, t, 0, coordinates - 1)
         for c in range(coordinates):
             heard_fast, heard_slow = update(tables, state, t, c, a, b, g, integral, back)
             hears_fast, hears_slow = hears_fast + heard_fast, hears_slow + heard_slow
             a, b = a2, b2
+    return totals(1.0, hears_fast, hears_slow)
+
+
+@kernel
+def learn(tables, state, g, lively):
+    """The finger, from what the observer shows of this block."""
+    bank, numbers = state.bank, tables.bank.numbers
+    gain = numbers.adapt + lively * (numbers.adapt_awake - numbers.adapt)
+    rest = numbers.rest + lively * (numbers.rest_awake - numbers.rest)
+    pole = 1.0 - (1.0 - 0.5 * g) ** state.place.shape[0]
+    learn_finger(tables.bank, bank, bank.sample[0], numbers.rate, pole, 0.5, 0.0, gain, rest, True)
+
+
+@kernel
+def block_step(tables, state, sensed, position, wanted, drive, target, flags):
+    """One block of the whole controller: fills `drive` (M, channels), `target` (bands,) and `flags` (M,)."""
+    bank, numbers, sample, touch = state.bank, tables.bank.numbers, tables.sample, state.bank.touch
+    take_up_tones(tables, state)
+    look_at_finger(tables, state, position, wanted, flags)
+    weigh_carriers(tables, state)
+    calm = 1.0
+    if numbers.crowd_speed > 0.0:
+        calm = min(abs(bank.track[row.VELOCITY]) / numbers.crowd_speed, 1.0)
+    fast, slow = touch[row.FAST_OPEN], touch[row.SLOW_OPEN]
+    g = calm * (sample.observer + fast * (sample.observer_awake - sample.observer))
+    if state.stale[0] > 0 or bank.follows[0] > 0 or state.gain[0] != g:
+        respond(tables, state, g)
+        state.gain[0] = g
+    aim(tables, state, wanted, target)
+    changed = feel(numbers, len(tables.bank.shape), tables.bank.stiffness, bank.level, touch, True)
+    if changed:
+        touch[row.FAST_TIME] = numbers.fast_time
+        begin_finger(tables.bank, bank, changed)
+        fast = 1.0
+    doubt = take_in(tables, state, sensed, flags)
+    find_residuals(tables, state)
+    integral = numbers.integral + slow * (numbers.integral_stirred - numbers.integral)
+    integral += fast * (numbers.integral_awake - integral)
+    heard_fast, heard_slow = observe(tables, state, g, integral, numbers.back * (1.0 - touch[row.SCALE]))
     believe(numbers, touch, doubt)
     forget(bank)
-    heard_fast, heard_slow = totals(1.0, hears_fast, hears_slow)
     wake(numbers, touch, heard_fast, heard_slow)
     touching = touch[row.CONTACT] > 0.0 and numbers.adapt >= 0.0
     if touching:
-        lively = max(fast, slow)
-        gain = numbers.adapt + lively * (numbers.adapt_awake - numbers.adapt)
-        rest = numbers.rest + lively * (numbers.rest_awake - numbers.rest)
-        pole = 1.0 - (1.0 - 0.5 * g) ** block
-        learn_finger(tables.bank, bank, bank.sample[0], numbers.rate, pole, 0.5, 0.0, gain, rest, touching)
+        learn(tables, state, g, max(fast, slow))
     know(tables, state, touching)
     state.stale[0] = 0
-    peak = numbers.peak_decay * numbers.peak_decay * touch[row.PEAK]
-    for t in range(tiles):
-        command(tables, state, t)
-        if touching:
-            send_finger(tables.bank, bank, t, bank.sample[0])
-    peak = max(peak, speak(tables, state, drive))
-    touch[row.PEAK] = peak
-    scale = 1.0 / root(peak) if peak > 1.0 else 1.0
-    shape_drive(tables, state, scale, drive)
-    touch[row.SCALE] = scale
-    if scale < 1.0:
-        for m in range(block):
-            flags[m] |= 1
+    answer(tables, state, touching, drive, flags)
 
 
 @kernel

@@ -31,6 +31,14 @@ def turned(cos, sin, re, im):
 
 
 @kernel
+def turn_held(band, held, t, r, re, im):
+    """Envelope of a tile as this block's tables want it, into rows r and r + 1."""
+    cos, sin = lanes(band, t, row.COS), lanes(band, t, row.SIN)
+    put(held, t, r, re * cos - im * sin)
+    put(held, t, r + 1, re * sin + im * cos)
+
+
+@kernel
 def clear(state):
     """Begin the sums over the bands."""
     nothing = 0.0 * lanes(state.table, 0, 0)
