@@ -59,8 +59,8 @@ def closed_loop(method, bands, samples, finger=TOUCHING, parameters=PLATE):
     plate, piece = Plate(parameters, finger), np.zeros(min(int(PIECE * parameters.rate), samples))
 
     def run():
-        for _ in range(samples // len(piece)):
-            plate.closed_loop(controller, piece)
+        for start in range(0, samples, len(piece)):
+            plate.closed_loop(controller, piece[: samples - start])
 
     return run
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Hashable, Iterator, Sequence
 from dataclasses import dataclass
 from types import ModuleType
 
@@ -16,6 +16,7 @@ from hapticrender.control.bank.controller import BankController
 from hapticrender.control.methods import method_named
 from hapticrender.control.methods.paper import PolarController
 from hapticrender.control.polar import batch as polar
+from hapticrender.control.remembered import contents
 from hapticrender.plants.batch_kernels import SHARED, BatchState, closed_batch_run
 from hapticrender.plants.kernels import PlateTables
 from hapticrender.plants.propagator import COLUMNS, FORCES, STATES, shifts
@@ -23,7 +24,7 @@ from hapticrender.plants.vibrotactile import Plate, PlateParameters
 from hapticrender.protocols import Array, Controller
 from hapticrender.touch.finger import Finger
 
-CHUNK = 2500  # samples: what is handed over stays in the cache
+CHUNK = 5000  # samples: what is handed over stays in the cache
 FAMILIES: dict[type, ModuleType] = {BankController: bank, PolarController: polar}  # how their controllers are stacked
 
 
@@ -120,13 +121,23 @@ def simulate(scenarios: Sequence[Scenario], seconds: float, *, method: str = "h2
     for index, scenario in enumerate(scenarios):
         if scenario.bands.envelope is None:
             raise ValueError(f"scenarios[{index}].bands: must have constant envelopes")
-    controllers = [scenario.design(method) for scenario in scenarios]
+    controllers = _designs(scenarios, method)
     found: dict[int, Played] = {}
     for group in _groups(scenarios, controllers):
         few, own = [scenarios[index] for index in group], [controllers[index] for index in group]
-        played = together(few, own, seconds) if len(few) > 1 else [_alone(few[0], own[0], seconds)]
+        played = together(few, own, seconds) if len(few) > 1 else [_alone(few[0], few[0].design(method), seconds)]
         found |= dict(zip(group, played, strict=True))
     return [found[index] for index in range(len(scenarios))]
+
+
+def _designs(scenarios: Sequence[Scenario], method: str) -> list[Controller]:
+    """Controllers of the scenarios; those that know the same device and want the same are one."""
+    made: dict[Hashable, Controller] = {}
+    keys = [contents((each.known or each.plate, each.bands)) for each in scenarios]
+    for key, scenario in zip(keys, scenarios, strict=True):
+        if key not in made:
+            made[key] = scenario.design(method)
+    return [made[key] for key in keys]
 
 
 def _groups(scenarios: Sequence[Scenario], controllers: Sequence[Controller]) -> Iterator[list[int]]:

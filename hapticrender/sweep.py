@@ -87,16 +87,21 @@ def errors(played: Played, start: float = 0.5) -> Array:
     """
     scenario, rate = played.scenario, played.scenario.plate.rate
     size = int(round(LENGTH * rate))
-    first = np.arange(int(start * rate), len(played.motion) - size + 1, size)
-    if not len(first):
+    first = int(start * rate)
+    count = (len(played.motion) - first) // size
+    if count < 1:
         raise ValueError(f"{len(played.motion) / rate:g} s: must be >= {start + LENGTH:g} s to be judged")
-    index = first[:, None] + np.arange(size)
+    part = slice(first, first + count * size)
+    motion = played.motion[part].reshape(count, size, -1)
     if (scenario.bands.wavenumber > 0.0).any():
-        index = index[np.isfinite(played.position[index]).all(axis=1)]
-        if not len(index):
+        there = np.isfinite(played.position[part]).reshape(count, size).all(axis=1)
+        if not there.any():
             raise ValueError(f"the finger is never there for {LENGTH:g} s after {start:g} s")
-    phase = scenario.bands.carrier_phase(np.arange(len(played.motion)) / rate, played.position)
-    found = fit(phase[index], played.motion[index])[0]
+        phase = scenario.bands.carrier_phase(np.arange(part.stop) / rate, played.position[: part.stop])[part]
+        found = fit(phase.reshape(count, size, -1)[there], motion[there])[0]
+    else:  # an amplitude is the same wherever its carrier begins: all windows are signals of one
+        phase = scenario.bands.carrier_phase(np.arange(size) / rate, np.zeros(size))
+        found = fit(phase[None], motion.transpose(1, 0, 2).reshape(1, size, -1))[0].reshape(count, 3, -1)
     wanted = abs(np.asarray(scenario.bands.envelope))
     off = abs(found) / np.where(wanted > 0.0, wanted, np.nan) - 1.0
     return np.sqrt(np.mean(off**2, axis=0))

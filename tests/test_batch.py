@@ -12,6 +12,7 @@ from hapticrender import batch
 from hapticrender.accuracy.plate import SLIDING, tones
 from hapticrender.batch import LANES, Scenario, simulate
 from hapticrender.plants.vibrotactile import PlateParameters
+from hapticrender.recordings.judge import fit
 from hapticrender.sweep import errors, sweep, worst_error
 from hapticrender.touch.mechanics import HEAVY, HEAVY_SECOND, LIGHT, LIGHT_SECOND
 
@@ -170,6 +171,31 @@ def test_more_than_the_lanes_and_other_methods():
     assert len(simulate(many, 0.01)) == len(many)
     for one in simulate(many[:2], 0.05, method="stiffness"):
         np.testing.assert_array_equal(one.motion, alone(one.scenario, 0.05, "stiffness").motion)
+
+
+@pytest.mark.parametrize("method", ["h2", "paper", "stiffness"])
+def test_the_same_device_and_targets_are_designed_for_once(method, monkeypatch):
+    """And yet every scenario starts at rest; who knows another device, or wants something else, has its own design."""
+    many = [Scenario(bands=tones([50.0], 1e-5), finger=finger, plate=IDEAL) for finger in FINGERS[:4]]
+    many.append(Scenario(bands=tones([50.0], 2e-5), plate=IDEAL))
+    many.append(Scenario(bands=tones([50.0], 1e-5), plate=IDEAL, known=replace(IDEAL, mass=0.033)))
+    expected, made, design = [alone(each, 0.1, method) for each in many], [], Scenario.design
+    monkeypatch.setattr(Scenario, "design", lambda self, name: made.append(self) or design(self, name))
+    batch._designs(many, method)
+    assert made == [many[0], many[4], many[5]]
+    monkeypatch.undo()
+    for found, right in zip(simulate(many, 0.1, method=method), expected, strict=True):
+        assert_alike(found, right)
+
+
+def test_errors_are_those_of_windows_with_phases_of_their_own():
+    """Fixed carriers are fitted in all windows at once, as the first one's: to rounding, times the carriers' number."""
+    (played,) = simulate([replace(scenarios()[1], plate=PlateParameters(), known=None)], 1.1)
+    first, size = np.arange(2500, 5500, 500), 500
+    index = first[:, None] + np.arange(size)
+    phase = BANDS.carrier_phase(np.arange(5500) / 5000.0, np.zeros(5500))[index]
+    off = abs(fit(phase, played.motion[index])[0]) / abs(BANDS.envelope) - 1.0
+    np.testing.assert_allclose(errors(played), np.sqrt(np.mean(off**2, axis=0)), rtol=0, atol=1e-10)
 
 
 def test_whole_numbers_are_numbers():

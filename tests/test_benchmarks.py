@@ -1,6 +1,7 @@
 """The benchmarks' own parts: C references agree with the library, pairing counts right, verdicts go the right way."""
 
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -105,6 +106,7 @@ def test_a_peer_that_is_not_there_is_left_out(benchmarks, monkeypatch, capsys):
     for name in ("sdft", "control"):
         monkeypatch.setitem(sys.modules, name, None)
     monkeypatch.setattr(run, "keep_to_one_core", lambda: None)
+    monkeypatch.setattr(run, "core_pace", lambda pairs: 1.0)
     monkeypatch.setattr(run, "every_case", lambda short: [("peers analysis 8", lambda: cases.analysis(8, 1))])
     monkeypatch.setattr(sys, "argv", ["run.py"])
     assert run.main() == 0
@@ -152,3 +154,37 @@ def test_verdicts(benchmarks, measured, at_least, met, within):
     figure = Figure("each", measured, "x", 1.2 if not at_least else 1.0, at_least, "other")
     assert figure.met == met
     assert figure.within(2.0) == within
+
+
+def test_what_does_not_decide_is_told_so(benchmarks):
+    from cases import Figure
+
+    share = Figure("share", 1.1, "% of a core", 1.0, False, "", decides=False)
+    assert (share.verdict, replace(share, measured=0.9).verdict) == ("(missed)", "(met)")
+    assert replace(share, decides=True).verdict == "MISSED"
+
+
+def test_what_goes_with_the_core_is_told_for_a_faster_one_as_well(benchmarks):
+    """A core that takes 1.5 times as long: more seconds a second on theirs, a smaller share, and the same ratio."""
+    from cases import Figure
+
+    assert "1.5e+03 s/s" in Figure("loop", 1000.0, "s/s", 1500.0, True, "").on_their_core(1.5)
+    assert "2 % of a core" in Figure("share", 3.0, "% of a core", 2.0, False, "").on_their_core(1.5)
+    assert Figure("ratio", 3.0, "x", 2.0, False, "").on_their_core(1.5) == ""
+
+
+def test_the_pace_of_a_core_is_that_of_naive_c(benchmarks, monkeypatch):
+    import cases
+
+    monkeypatch.setattr(cases, "time_of", lambda run, clock, settled: 55e-9 * 1.25 * 4000 * 64 * 2)
+    assert cases.core_pace(3) == pytest.approx(1.25)
+
+
+def test_a_closed_loop_plays_all_that_it_is_asked_for(benchmarks, monkeypatch):
+    """Also where the last piece is a shorter one."""
+    import scenes
+
+    played = []
+    monkeypatch.setattr(scenes.Plate, "closed_loop", lambda self, controller, wanted: played.append(len(wanted)))
+    scenes.closed_loop("paper", 1, 25_000)()
+    assert played == [20_000, 5000]

@@ -14,6 +14,7 @@ import numpy as np
 
 from hapticrender.control.bandmodel import BandModel
 from hapticrender.control.damping_margins import LEAST_RATIO, BendingMode, DampingMargins, damping_margins, modes_of
+from hapticrender.control.remembered import remembered
 from hapticrender.protocols import Array
 
 TAPS = 3
@@ -169,6 +170,7 @@ def _least_taps(equations: Iterable[tuple[float, complex]], count: int) -> Array
     return np.linalg.lstsq(np.array(rows), np.array(values), rcond=None)[0]
 
 
+@remembered
 def choose_damping(
     model: BandModel, *, bending: BendingMode | None = None, bounds: DampingBounds | None = None
 ) -> Damping:

@@ -17,6 +17,7 @@ from hapticrender.control.bank.learning import ADAPTATION
 from hapticrender.control.bank.state import PRECISIONS, BankNumbers, BankState, BankTables, across_bands, bank_state
 from hapticrender.control.damping import choose_damping
 from hapticrender.control.kernels import FREQUENCY, WAVENUMBER
+from hapticrender.control.remembered import remembered
 from hapticrender.control.stability import Checked, Limits, checked_bandwidth
 from hapticrender.protocols import Array
 
@@ -27,8 +28,6 @@ SLOW_POLE, SLOW_SIGMAS = 4.0, 5.0
 SETTLED = 0.05  # share of a target below which its error counts as settled
 LEAST_WANTED = 3e-3  # of the sensors' range: below it the noise makes up for more than the device
 LIMITS = Limits(modulus=0.29, gain=1.4)  # crowded bands share one residual: 20 Hz apart they leave 0.30 and 1.42
-REMEMBERED = 256  # designs
-_KNOWN: dict[tuple[object, ...], Checked] = {}
 PROMPT = 8  # samples: a longer delay is that of a block device, where the inner loop would act on stale noise
 PHASE_MARGIN = math.pi / 4  # rad: 90 deg less integral gain times (delay + 1/observer pole)
 LEARNING_SHARE = 0.5  # of what is found, learnt in a step at most: at 0.8 it swings under a light finger
@@ -297,14 +296,10 @@ def _paces(model: BandModel, bands: Bands, rules: BankRules, lowest: float, feed
     return paces | {"reference": 2 * pole[0] * period, "crowd_speed": crowd_speed(bands, max(pole))}
 
 
+@remembered
 def _checked(tables: BankTables) -> Checked:
-    """Check the bandwidth; a design that was checked before, as a run repeats its own, is remembered."""
-    key = (tables.numbers, *(np.asarray(each).tobytes() for each in tables[1:]))
-    if key not in _KNOWN:
-        if len(_KNOWN) >= REMEMBERED:
-            _KNOWN.clear()
-        _KNOWN[key] = checked_bandwidth(tables, LIMITS)
-    return _KNOWN[key]
+    """Check the bandwidth."""
+    return checked_bandwidth(tables, LIMITS)
 
 
 def _threshold(sigmas: float, noise: float, pole: float, period: float) -> float:
