@@ -121,6 +121,38 @@ def test_passes_equal_steps_where_a_carrier_comes_and_goes_with_the_finger(rng):
         assert abs(drive - stepped).max() <= 1e-9 * abs(stepped).max()
 
 
+@pytest.mark.parametrize("event", ["none", "lift", "jump", "far", "sensor", "nan sensor", "target", "waveform"])
+def test_blocks_tell_all_tiles_what_single_samples_tell(event, rng):
+    """Of a finger that stays in one sweep, of anything else sample by sample: place, speed, gate, trust and flags.
+
+    A carrier follows the finger, so that all of them are heard; the cosine is good to 1.4e-10.
+    """
+    bands = tones(*((f, 1e-6) for f in np.linspace(20.0, 400.0, 9)))
+    if event in ("waveform", "target"):
+        bands = dataclasses.replace(bands, envelope=None)
+    model = PlateParameters().band_model(RATE, 1)
+    blocks, steps = (METHODS["paper"].design(model, bands) for _ in range(2))
+    for controller in (blocks, steps):
+        controller.tables.tone[1, 5] = 1000.0
+    count = 960
+    sensed, place, wanted = 1e-6 * rng.standard_normal((count, 2)), np.linspace(0.0, 20e-3, count), np.zeros(count)
+    changed = {"lift": place, "jump": place, "far": place, "target": wanted}.get(event, sensed[:, 0])
+    value = {"lift": np.nan, "jump": 15e-3, "far": 2e3, "target": 2e3, "sensor": 1.0, "nan sensor": np.nan}
+    if event == "waveform":
+        wanted[:] = 1e-6 * rng.standard_normal(count)
+    elif event != "none":
+        changed[429:447] = value[event]
+    stepped, flags, target = np.zeros((count, 2)), np.zeros(count, np.int64), np.zeros(9, complex)
+    for m in range(count):
+        flags[m] = polar_step(steps.tables, steps.state, sensed[m], place[m], wanted[m], stepped[m], target)
+    drive, _, raised = blocks.run(sensed, place, wanted)
+    assert ((raised & 2) > 0).any() == (event not in ("none", "lift", "jump", "waveform"))
+    np.testing.assert_array_equal(raised, flags)
+    np.testing.assert_allclose(drive, stepped, rtol=0, atol=1e-9 * abs(stepped).max())
+    for name in ("finger", "doubt"):
+        np.testing.assert_allclose(getattr(blocks.state, name), getattr(steps.state, name), rtol=1e-12, atol=1e-15)
+
+
 @pytest.mark.parametrize("rate", [2000.0, 5000.0, 48000.0])
 def test_sections_have_the_form_that_the_kernels_take_for_granted(rate):
     """Both zeros at half the rate, and the law's pole at 1, to the rounding of the bilinear transform."""

@@ -262,12 +262,18 @@ def refresh(tables, state):
 
 
 @kernel
+def smoothed(rate, velocity, speed):
+    """Velocity (m/s) of a finger a sample later, behind its low pass."""
+    return velocity + (1.0 - math.exp(-TURN * VELOCITY_POLE / rate)) * (speed - velocity)
+
+
+@kernel
 def follow_finger(rate, held, velocity, gate, seen, position):
     """Hold the position while the finger is away, smooth its velocity, open the gate with contact."""
     stays = (seen <= 0.0) | (size(position - held) * rate <= FASTEST)
     here = (size(position) <= FAR) & stays
     speed = select(here & (seen > 0.0), (position - held) * rate, 0.0)
-    velocity += (1.0 - math.exp(-TURN * VELOCITY_POLE / rate)) * (speed - velocity)
+    velocity = smoothed(rate, velocity, speed)
     ramp = 1.0 / (GATE_TIME * rate)
     gate = select(here, low(gate + ramp, 1.0), high(gate - ramp, 0.0))
     return select(here, position, held), velocity, gate, select(here, 1.0, 0.0)

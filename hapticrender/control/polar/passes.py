@@ -29,20 +29,26 @@ from hapticrender.control.polar.kernels import (
     AMPLITUDE1,
     COS,
     DRIVE,
+    FAR,
+    FASTEST,
     FORWARD,
     FREQUENCY,
     LIVE,
     LOOP_ROWS,
+    OPENING,
+    PLACE,
     RE1,
     REFRESH,
     SHARED_ROWS,
     SIN,
+    SPEED,
     START,
     TARGET_IM,
     TARGET_RE,
     TRUST,
     TURN_COS,
     TURN_SIN,
+    WANTED,
     X_IM,
     X_RE,
     clamped_step,
@@ -52,6 +58,7 @@ from hapticrender.control.polar.kernels import (
     remember,
     section_step,
     share,
+    smoothed,
     tile_step,
 )
 from hapticrender.control.polar.steps import usual
@@ -188,9 +195,40 @@ def sense_all(tables, state, sensed):
 
 
 @kernel
+def stays(tables, state, position, wanted):
+    """Whether a finger that was there stays all through a block, and all sensors and targets can be believed.
+
+    One that has just been lifted has left the gate ajar.
+    """
+    held, _, gate, _, doubt = recall(state)
+    good, rate = (gate >= 1.0) & (doubt <= 0.0), tables.numbers.rate
+    for m in range(position.shape[0]):
+        there, sane = size(position[m]) <= FAR, size(wanted[m]) <= FAR
+        good = good & there & sane & (size(position[m] - held) * rate <= FASTEST) & (state.shared[TRUST, m] <= 0.0)
+        held = position[m]
+    return good
+
+
+@kernel
+def share_stay(tables, state, position, wanted, flags):
+    """What `share` writes down, sample after sample, of a finger that stays."""
+    shared, rate = state.shared, tables.numbers.rate
+    held, velocity, gate, seen, doubt = recall(state)
+    for m in range(position.shape[0]):
+        velocity = smoothed(rate, velocity, (position[m] - held) * rate)
+        held = position[m]
+        shared[WANTED, m], shared[TRUST, m], shared[OPENING, m] = wanted[m], 1.0, 1.0
+        shared[PLACE, m], shared[SPEED, m], flags[m] = held, velocity, 0
+    remember(state, (held, velocity, gate, seen, doubt))
+
+
+@kernel
 def share_all(tables, state, sensed, position, wanted, flags):
     """Write down what all tiles are told of every sample.  Returns whether sensors are believed all the time."""
     sense_all(tables, state, sensed)
+    if stays(tables, state, position, wanted):
+        share_stay(tables, state, position, wanted, flags)
+        return True
     known, trusted = recall(state), True
     for m in range(sensed.shape[0]):
         odd = 2.0 if state.shared[TRUST, m] > 0.0 else 0.0
