@@ -26,6 +26,7 @@ from hapticrender.control.blocks.kernels import block_run
 from hapticrender.control.polar.passes import polar_run
 from hapticrender.sweep import sweep, worst_error
 
+TASKS = 16  # of a sweep on two cores: enough that neither waits long for the other at the end
 FEW = 400  # samples of the numpy loop
 THEIRS = 55.0  # ns a band-sample and channel: naive C on the core that the targets in s/s and % come from [FACTS 10]
 DTYPES = {"double": np.float64, "single": np.float32}
@@ -220,7 +221,7 @@ def on_two_cores(seconds: float, pairs: int) -> Iterator[Figure]:
     """A sweep of the default method on two processes over one."""
     if len(CORES) < 2:
         return
-    many = scenes.scenarios(8 * LANES, scenes.TOUCHING, scenes.PLATE.sensor_noise)
+    many = scenes.scenarios(TASKS * LANES, scenes.TOUCHING, scenes.PLATE.sensor_noise)
     runs = []
     pools = [ProcessPoolExecutor(workers, get_context("spawn"), use, (CORES,)) for workers in (2, 1)]
     try:
