@@ -1,7 +1,8 @@
 """Measure every figure that the library claims about its speed, beside its target.
 
 Ratios are the verdict: candidate and reference run in turns in this process, on one core, and the figure is the median
-of the pairs' ratios.  Absolute figures depend on the machine and are shown beside them.
+of the pairs' ratios.  Absolute figures depend on the machine and are shown beside them, as measured and as they would
+be on a core as fast as that of the targets, by what naive C takes on either.
 
 Run: python benchmarks/run.py [--short] [--only WORD ...] [--margin 2] [--json FILE]
 """
@@ -17,23 +18,23 @@ from cases import THEIRS, Absent, Figure, NoCompiler, core_pace, every_case
 from pairing import keep_to_one_core
 
 
-def show(figure: Figure, slower: float) -> None:
+def show(figure: Figure, slower: float | None) -> None:
     sign = ">=" if figure.at_least else "<="
     told = f"{figure.measured:.3g} {figure.unit}"
     line = f"{figure.name:<76} {told:>18} {sign} {figure.target:<7g} {figure.verdict:<8} {figure.reference}"
-    print(f"{line} {figure.note}{figure.on_their_core(slower)}")
+    print(f"{line} {figure.note}".rstrip() + (figure.on_their_core(slower) if slower else ""))
 
 
-def told_pace(short: bool) -> float:
-    """How many times as long naive C takes here as on the core that targets come from, which is printed, too."""
+def told_pace(short: bool) -> float | None:
+    """How many times as long naive C takes here as on the core that absolute targets come from; it is printed, too."""
     try:
         slower = core_pace(3 if short else 9)
     except NoCompiler as missing:
-        print(f"{missing}: taken for as fast as the core that the targets in s/s and % come from")
-        return 1.0
+        print(f"the pace of this core: left out: {missing}")
+        return None
     print(
-        f"naive C takes {slower * THEIRS:.0f} ns a band-sample and channel here, and {THEIRS:.0f} on the core that the "
-        f"targets in s/s and % come from: they are judged as they are, and told for a core of that pace as well"
+        f"naive C takes {slower * THEIRS:.0f} ns a band-sample and channel here, and some {THEIRS:.0f} on the core "
+        f"that the targets in s/s and % come from: figures are judged as they are, and told for that pace as well"
     )
     return slower
 
@@ -59,7 +60,8 @@ def main() -> int:
         except (Absent, NoCompiler) as missing:
             print(f"{name}: left out: {missing}")
     if arguments.json:
-        arguments.json.write_text(json.dumps([asdict(each) | {"met": each.met} for each in figures], indent=2) + "\n")
+        rows = [asdict(each) | {"met": each.met, "slower": slower} for each in figures]
+        arguments.json.write_text(json.dumps(rows, indent=2) + "\n")
     beyond = [each.name for each in figures if not each.within(arguments.margin)]
     if arguments.short and beyond:
         print(f"beyond {arguments.margin:g} times the target: {'; '.join(beyond)}", file=sys.stderr)

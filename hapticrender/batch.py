@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Hashable, Iterator, Sequence
 from dataclasses import dataclass
 from types import ModuleType
@@ -123,9 +124,14 @@ def simulate(scenarios: Sequence[Scenario], seconds: float, *, method: str = "h2
             raise ValueError(f"scenarios[{index}].bands: must have constant envelopes")
     controllers = _designs(scenarios, method)
     found: dict[int, Played] = {}
+    left = Counter(id(each) for each in controllers)
     for group in _groups(scenarios, controllers):
         few, own = [scenarios[index] for index in group], [controllers[index] for index in group]
-        played = together(few, own, seconds) if len(few) > 1 else [_alone(few[0], few[0].design(method), seconds)]
+        left.subtract(id(each) for each in own)
+        if len(few) > 1:
+            played = together(few, own, seconds)
+        else:  # a controller that others are still to start from stays at rest
+            played = [_alone(few[0], few[0].design(method) if left[id(own[0])] else own[0], seconds)]
         found |= dict(zip(group, played, strict=True))
     return [found[index] for index in range(len(scenarios))]
 

@@ -81,10 +81,12 @@ def _judged(part: list[Scenario], seconds: float, method: str, judge: Callable[[
 
 
 def errors(played: Played, start: float = 0.5) -> Array:
-    """Relative amplitude error of every band from `start` (s) on, rms over windows of 0.1 s, shape (3, bands).
+    """Relative amplitude error of every band from `start` (s) on, rms over windows of 0.1 s, shape (places, bands).
 
     NaN for a band of which nothing is wanted.  Where carriers follow the finger, windows without it do not count.
     """
+    if start < 0.0:
+        raise ValueError(f"{start=}: must be >= 0 s")
     scenario, rate = played.scenario, played.scenario.plate.rate
     size = int(round(LENGTH * rate))
     first = int(start * rate)
@@ -101,7 +103,7 @@ def errors(played: Played, start: float = 0.5) -> Array:
         found = fit(phase.reshape(count, size, -1)[there], motion[there])[0]
     else:  # an amplitude is the same wherever its carrier begins: all windows are signals of one
         phase = scenario.bands.carrier_phase(np.arange(size) / rate, np.zeros(size))
-        found = fit(phase[None], motion.transpose(1, 0, 2).reshape(1, size, -1))[0].reshape(count, 3, -1)
+        found = fit(phase[None], motion.transpose(1, 0, 2).reshape(1, size, -1))[0].reshape(*motion.shape[::2], -1)
     wanted = abs(np.asarray(scenario.bands.envelope))
     off = abs(found) / np.where(wanted > 0.0, wanted, np.nan) - 1.0
     return np.sqrt(np.mean(off**2, axis=0))

@@ -173,29 +173,43 @@ def test_more_than_the_lanes_and_other_methods():
         np.testing.assert_array_equal(one.motion, alone(one.scenario, 0.05, "stiffness").motion)
 
 
-@pytest.mark.parametrize("method", ["h2", "paper", "stiffness"])
-def test_the_same_device_and_targets_are_designed_for_once(method, monkeypatch):
-    """And yet every scenario starts at rest; who knows another device, or wants something else, has its own design."""
+@pytest.mark.parametrize(("method", "designs"), [("h2", 3), ("paper", 3), ("stiffness", 6)])
+def test_the_same_device_and_targets_are_designed_for_once(method, designs, monkeypatch):
+    """Where they run side by side; every scenario starts at rest, and one that runs alone has a design of its own.
+
+    Who knows another device, or wants something else, is designed for as well.
+    """
     many = [Scenario(bands=tones([50.0], 1e-5), finger=finger, plate=IDEAL) for finger in FINGERS[:4]]
     many.append(Scenario(bands=tones([50.0], 2e-5), plate=IDEAL))
     many.append(Scenario(bands=tones([50.0], 1e-5), plate=IDEAL, known=replace(IDEAL, mass=0.033)))
     expected, made, design = [alone(each, 0.1, method) for each in many], [], Scenario.design
     monkeypatch.setattr(Scenario, "design", lambda self, name: made.append(self) or design(self, name))
-    batch._designs(many, method)
-    assert made == [many[0], many[4], many[5]]
-    monkeypatch.undo()
-    for found, right in zip(simulate(many, 0.1, method=method), expected, strict=True):
+    played = simulate(many, 0.1, method=method)
+    assert len(made) == designs
+    for found, right in zip(played, expected, strict=True):
         assert_alike(found, right)
 
 
-def test_errors_are_those_of_windows_with_phases_of_their_own():
-    """Fixed carriers are fitted in all windows at once, as the first one's: to rounding, times the carriers' number."""
-    (played,) = simulate([replace(scenarios()[1], plate=PlateParameters(), known=None)], 1.1)
-    first, size = np.arange(2500, 5500, 500), 500
-    index = first[:, None] + np.arange(size)
-    phase = BANDS.carrier_phase(np.arange(5500) / 5000.0, np.zeros(5500))[index]
-    off = abs(fit(phase, played.motion[index])[0]) / abs(BANDS.envelope) - 1.0
+def test_one_that_runs_alone_leaves_the_design_at_rest_for_others():
+    """The first plate bends and has to run by itself, with what is known of the others."""
+    bends = replace(IDEAL, bending_frequency=1250.0, bending_coil=0.1)
+    many = [Scenario(bands=BANDS, plate=plate, known=IDEAL) for plate in (bends, IDEAL, IDEAL, bends, bends)]
+    for found, scenario in zip(simulate(many, 0.1), many, strict=True):
+        assert_alike(found, alone(scenario, 0.1))
+
+
+@pytest.mark.parametrize("locked", [False, True])
+def test_errors_are_those_of_windows_with_phases_of_their_own(locked):
+    """Fixed carriers are fitted in all windows at once, as the first one's: phases of 300 turns know 1e-13 of one."""
+    bands = hr.Grating(wavelength=2e-3, amplitude=10e-6).bands(5000.0) if locked else BANDS
+    finger = hr.Finger.sliding(speed=0.1, normal_load=0.4)
+    (played,) = simulate([Scenario(bands=bands, finger=finger, plate=IDEAL)], 1.13)
+    index = np.arange(2500, 5500, 500)[:, None] + np.arange(500)
+    phase = bands.carrier_phase(np.arange(5650) / 5000.0, played.position)[index]
+    off = abs(fit(phase, played.motion[index])[0]) / abs(bands.envelope) - 1.0
     np.testing.assert_allclose(errors(played), np.sqrt(np.mean(off**2, axis=0)), rtol=0, atol=1e-10)
+    few = replace(played, motion=played.motion[:, :2])
+    np.testing.assert_allclose(errors(few), errors(played)[:2], rtol=1e-9)
 
 
 def test_whole_numbers_are_numbers():
@@ -230,6 +244,8 @@ def test_what_it_refuses():
         simulate([Scenario(bands=replace(BANDS, envelope=None))], 1.0)
     with pytest.raises(ValueError, match="at_a_time=0: must be >= 1"):
         sweep([], 1.0, worst_error, at_a_time=0)
+    with pytest.raises(ValueError, match="start=-0.1: must be >= 0 s"):
+        errors(alone(scenarios()[0], 0.3), -0.1)
     with pytest.raises(ValueError, match="must be >= 0.6 s to be judged"):
         errors(alone(scenarios()[0], 0.3))
 

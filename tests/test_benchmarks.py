@@ -164,20 +164,41 @@ def test_what_does_not_decide_is_told_so(benchmarks):
     assert replace(share, decides=True).verdict == "MISSED"
 
 
-def test_what_goes_with_the_core_is_told_for_a_faster_one_as_well(benchmarks):
-    """A core that takes 1.5 times as long: more seconds a second on theirs, a smaller share, and the same ratio."""
+@pytest.mark.parametrize("slower", [1.5, None])
+def test_what_goes_with_the_core_is_told_for_a_faster_one_as_well(benchmarks, capsys, slower):
+    """A core that takes 1.5 times as long: more seconds a second on theirs, a smaller share, the same ratio."""
+    import run
     from cases import Figure
 
-    assert "1.5e+03 s/s" in Figure("loop", 1000.0, "s/s", 1500.0, True, "").on_their_core(1.5)
-    assert "2 % of a core" in Figure("share", 3.0, "% of a core", 2.0, False, "").on_their_core(1.5)
-    assert Figure("ratio", 3.0, "x", 2.0, False, "").on_their_core(1.5) == ""
+    for measured, unit, at_least in ((1000.0, "s/s", True), (3.0, "% of a core", False), (3.0, "x", False)):
+        run.show(Figure("each", measured, unit, 2.0, at_least, "who"), slower)
+    loop, share, ratio = capsys.readouterr().out.splitlines()
+    told = "some {} on a core of the targets' pace" if slower else "who"
+    assert "1e+03 s/s" in loop
+    assert loop.endswith(told.format("1.5e+03 s/s"))
+    assert "3 % of" in share
+    assert share.endswith(told.format("2 % of a core"))
+    assert ratio.endswith("who")
 
 
 def test_the_pace_of_a_core_is_that_of_naive_c(benchmarks, monkeypatch):
+    """The median run, 1.25 times as long as on the other core, whatever else meets the others."""
     import cases
 
-    monkeypatch.setattr(cases, "time_of", lambda run, clock, settled: 55e-9 * 1.25 * 4000 * 64 * 2)
+    spent = iter([factor * 55e-9 * 4000 * 64 * 2 for factor in (1.25, 9.0, 1.2)])
+    monkeypatch.setattr(cases, "time_of", lambda run, clock, settled: next(spent) if settled else 0.0)
     assert cases.core_pace(3) == pytest.approx(1.25)
+
+
+def test_a_machine_without_a_compiler_has_no_pace(benchmarks, monkeypatch, capsys):
+    import run
+
+    def missing(pairs):
+        raise run.NoCompiler("no C compiler")
+
+    monkeypatch.setattr(run, "core_pace", missing)
+    assert run.told_pace(short=True) is None
+    assert "left out: no C compiler" in capsys.readouterr().out
 
 
 def test_a_closed_loop_plays_all_that_it_is_asked_for(benchmarks, monkeypatch):

@@ -9,9 +9,11 @@ import hapticrender as hr
 from benchmarks.numpy_loop import NumpyPlate, NumpyPolar, run
 from hapticrender.bands import Bands
 from hapticrender.control.bank.state import across_bands
+from hapticrender.control.kernels import FAR
 from hapticrender.control.loopshape import TransferFunction, design, margins
 from hapticrender.control.methods import METHODS, method_named
 from hapticrender.control.methods.paper import CommonMode
+from hapticrender.control.polar import passes
 from hapticrender.control.polar.kernels import LOOP_ROWS, X_IM, X_RE
 from hapticrender.control.polar.steps import polar_step
 from hapticrender.control.stdft import StarSTDFT
@@ -151,6 +153,26 @@ def test_blocks_tell_all_tiles_what_single_samples_tell(event, rng):
     np.testing.assert_allclose(drive, stepped, rtol=0, atol=1e-9 * abs(stepped).max())
     for name in ("finger", "doubt"):
         np.testing.assert_allclose(getattr(blocks.state, name), getattr(steps.state, name), rtol=1e-12, atol=1e-15)
+
+
+@pytest.mark.parametrize(
+    ("event", "steady"),
+    [("none", True), ("fast", True), ("lift", False), ("jump", False), ("far", False), ("sensor", False)],
+)
+def test_a_block_is_told_in_one_sweep_where_the_finger_stays(event, steady):
+    """A finger may be fast, as long as it is in one piece: 1 m/s in 64 samples is a jump for none but the last."""
+    controller = METHODS["paper"].design(PlateParameters().band_model(RATE, 1), tones((47.0, 1e-6)))
+    sensed, place, nothing = np.zeros((64, 2)), np.full(64, FAR - 1e-3), np.zeros(64)
+    for _ in range(4):
+        controller.run(sensed, place, nothing)
+    if event == "fast":
+        place -= np.arange(64) / RATE
+    elif event == "sensor":
+        sensed[40, 0] = 1.0
+    elif event != "none":
+        place[40:] = {"lift": np.nan, "jump": 0.0, "far": FAR + 5e-4}[event]
+    passes.sense_all(controller.tables, controller.state, sensed)
+    assert passes.steady(controller.tables, controller.state, place, nothing) == steady
 
 
 @pytest.mark.parametrize("rate", [2000.0, 5000.0, 48000.0])

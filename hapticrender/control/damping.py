@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -170,7 +170,6 @@ def _least_taps(equations: Iterable[tuple[float, complex]], count: int) -> Array
     return np.linalg.lstsq(np.array(rows), np.array(values), rcond=None)[0]
 
 
-@remembered
 def choose_damping(
     model: BandModel, *, bending: BendingMode | None = None, bounds: DampingBounds | None = None
 ) -> Damping:
@@ -196,7 +195,13 @@ def choose_damping(
     more loosely, at both ends of its spread.  Where even a damper of four times the modes' own damping would break
     them, the loop is off.  Notched taps reach back 0.6 to 1 bending period; the reach with the least noise is taken.
     """
-    bounds = bounds or DampingBounds()
+    found = _chosen(model, bending, bounds or DampingBounds())
+    return replace(found, taps=found.taps.copy(), grip=found.grip.copy())
+
+
+@remembered
+def _chosen(model: BandModel, bending: BendingMode | None, bounds: DampingBounds) -> Damping:
+    """Design of `choose_damping`."""
     if not (model.mass.diagonal() > 0.0).all():
         return _off(model, "off: the device has no mode")
     mode, ratio = modes_of(model)

@@ -32,11 +32,14 @@ def remembered(function: Callable[P, T]) -> Callable[P, T]:
 
 
 def contents(value: Any) -> Hashable:
-    """What a value holds, to be found again: numbers, arrays, and tuples and data classes of such."""
+    """What a value holds, to be found again: numbers, arrays, and sequences and data classes of such.
+
+    What cannot be told from others of its kind is never found again.
+    """
     if isinstance(value, np.ndarray):
         return value.shape, value.dtype.str, value.tobytes()
     if is_dataclass(value):
         return type(value), *(contents(getattr(value, each.name)) for each in fields(value))
-    if isinstance(value, tuple):
+    if isinstance(value, tuple | list):
         return type(value), *(contents(each) for each in value)
-    return type(value), value
+    return type(value), value if isinstance(value, Hashable) else object()

@@ -125,12 +125,15 @@ class Finger:
     def touch(self, time: Array) -> Array:
         """Position, load and strength side by side, shape (n, 3), for a plant that wants all three."""
         time = np.asarray(time, float)
-        position, pressed = self.position(time), self._pressed(time)
-        strength = self.mechanics.load_factor(pressed) if self.load_scaling else np.ones(time.shape)
-        away = np.isnan(position)
+        touch = np.empty((time.size, 3))
+        touch[:, 0] = self.position(time)
+        touch[:, 1] = self._pressed(time)
+        touch[:, 2] = self.mechanics.load_factor(touch[:, 1]) if self.load_scaling else 1.0
+        away = np.isnan(touch[:, 0])
         if away.any():
-            pressed, strength = np.where(away, 0.0, pressed), np.where(away, 0.0, strength)
-        return np.stack([position, pressed, strength], axis=1)
+            for column in (1, 2):
+                np.copyto(touch[:, column], 0.0, where=away)
+        return touch
 
     def _pressed(self, time: Array) -> Array:
         if self.normal_load is None:

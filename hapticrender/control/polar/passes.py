@@ -195,7 +195,7 @@ def sense_all(tables, state, sensed):
 
 
 @kernel
-def stays(tables, state, position, wanted):
+def steady(tables, state, position, wanted):
     """Whether a finger that was there stays all through a block, and all sensors and targets can be believed.
 
     One that has just been lifted has left the gate ajar.
@@ -210,7 +210,7 @@ def stays(tables, state, position, wanted):
 
 
 @kernel
-def share_stay(tables, state, position, wanted, flags):
+def share_steady(tables, state, position, wanted, flags):
     """What `share` writes down, sample after sample, of a finger that stays."""
     shared, rate = state.shared, tables.numbers.rate
     held, velocity, gate, seen, doubt = recall(state)
@@ -226,8 +226,8 @@ def share_stay(tables, state, position, wanted, flags):
 def share_all(tables, state, sensed, position, wanted, flags):
     """Write down what all tiles are told of every sample.  Returns whether sensors are believed all the time."""
     sense_all(tables, state, sensed)
-    if stays(tables, state, position, wanted):
-        share_stay(tables, state, position, wanted, flags)
+    if steady(tables, state, position, wanted):
+        share_steady(tables, state, position, wanted, flags)
         return True
     known, trusted = recall(state), True
     for m in range(sensed.shape[0]):
