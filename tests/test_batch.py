@@ -202,7 +202,7 @@ def test_one_that_runs_alone_leaves_the_design_at_rest_for_others():
 def test_errors_are_those_of_windows_with_phases_of_their_own(locked):
     """Fixed carriers are fitted in all windows at once, as the first one's: phases of 300 turns know 1e-13 of one."""
     bands = hr.Grating(wavelength=2e-3, amplitude=10e-6).bands(5000.0) if locked else BANDS
-    finger = hr.Finger.sliding(speed=0.1, normal_load=0.4)
+    finger = hr.Finger.swiping(frequency=1.3, speed=0.12, normal_load=0.4)
     (played,) = simulate([Scenario(bands=bands, finger=finger, plate=IDEAL)], 1.13)
     index = np.arange(2500, 5500, 500)[:, None] + np.arange(500)
     phase = bands.carrier_phase(np.arange(5650) / 5000.0, played.position)[index]

@@ -61,6 +61,8 @@ def test_whatever_differs_is_told(other):
 @dataclass(frozen=True)
 class Other:
     mass: np.ndarray
+    name: str = "plate"
+    inner: None = None
 
 
 Pair = namedtuple("Pair", "first second")
