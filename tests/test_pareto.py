@@ -92,3 +92,11 @@ def test_blocks_are_played_as_blocks():
     motion = pareto.play(setting, bands, SLIDING, 3.0)
     assert len(motion) == 15_000
     assert pareto.found_error(motion, bands, 5000.0, ((1.6, 3.0),)) < 0.0075
+
+
+def test_a_second_of_the_comb_is_like_any_other():
+    """So a controller may be shown the same one again and again while it is timed."""
+    frequency, time = pareto.scenes()["8 bands"].frequency, np.linspace(0.0, 0.99, 100)
+    np.testing.assert_array_equal(frequency, np.round(frequency))
+    position = SLIDING.motion.position
+    np.testing.assert_allclose(position(time + 1.0), position(time), rtol=0, atol=1e-15)
