@@ -86,13 +86,13 @@ def _scatter(axes: Any, points: Sequence[Point], cost: Callable[[Point], float],
     stairs = sorted(((abs(cost(each)), max(100 * each.error, FOOT)) for each in best), key=lambda each: each[0])
     steps = "steps-post" if cost(best[0]) > 0 else "steps-pre"
     axes.plot(*zip(*stairs, strict=True), color=INK, lw=1.1, drawstyle=steps, zorder=2)
+    at, side, away = (0.99, "right", -8) if cost(best[0]) > 0 else (0.02, "left", 8)  # where there are no points
     for number, point in enumerate(best, start=1):
         axes.annotate(
             str(number),
             (abs(cost(point)), max(100 * point.error, FOOT)),
-            xytext=(-8, -3), textcoords="offset points", ha="right", va="top", fontsize=9, fontweight="bold",
+            xytext=(away, -3), textcoords="offset points", ha=side, va="top", fontsize=9, fontweight="bold",
         )  # fmt: skip
-    at, side = (0.99, "right") if cost(best[0]) > 0 else (0.02, "left")  # where there are no points
     lines = [f"{number}  {each.setting.method}, {each.setting.what}" for number, each in enumerate(best, start=1)]
     axes.text(
         at, 0.97, "the front:\n" + "\n".join(lines), transform=axes.transAxes, ha=side, va="top", fontsize=8,
