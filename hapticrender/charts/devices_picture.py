@@ -86,9 +86,8 @@ def _staircase(axes: Any, best: Sequence[Point], colour: str, dashes: str) -> No
         place: Any = {"xytext": (0, -8), "ha": "center", "va": "top"}
         if point is not best[-1]:  # another stands below it
             place = {"xytext": (9, 0), "ha": "left", "va": "center"}
-        level = f", {point.setting.level}" if point.setting.level else ""
         axes.annotate(
-            f"{point.setting.method}{level}", (point.speed, 100 * point.error), **place,
+            point.setting.method, (point.speed, 100 * point.error), **place,
             textcoords="offset points", fontsize=8, fontweight="bold", color=colour,
         )  # fmt: skip
 
