@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from hapticrender.bands import Bands
-from hapticrender.control.bandmodel import BandModel
+from hapticrender.control.bandmodel import BandModel, FingerRange
 from hapticrender.control.bank import rows as row
 from hapticrender.control.bank.carriers import REFRESH
 from hapticrender.control.bank.kernels import bank_run
@@ -178,15 +178,7 @@ def design_bank(
 
 def _numbers(model: BandModel, bands: Bands, rules: BankRules, feedback: bool) -> BankNumbers:
     """Numbers of the compiled step: what the rules allow on this device for these bands."""
-    period = 1.0 / model.rate
-    noise = np.sqrt((model.coordinate_from_sensed**2).sum(axis=1).max()) * max(
-        model.sensed_noise, LEAST_NOISE * model.sensed_limit
-    )
-    lowest = _lowest(model, bands)
-    finger = model.finger
-    contact_on, contact_off = finger.contact or (ALWAYS, ALWAYS)
-    quick = 2 * math.pi * QUICK_LEVEL * period
-    fast, slow = FAST_POLE * model.pace, SLOW_POLE * model.pace
+    period, lowest, quick = 1.0 / model.rate, _lowest(model, bands), 2 * math.pi * QUICK_LEVEL / model.rate
     return BankNumbers(
         rate=float(model.rate),
         analysed=bands.envelope is None,
@@ -198,19 +190,11 @@ def _numbers(model: BandModel, bands: Bands, rules: BankRules, feedback: bool) -
         rest_awake=rules.rest[1],
         inner=rules.inner[0],
         inner_awake=rules.inner[1],
-        fast_pole=-math.expm1(-2 * math.pi * fast * period),
-        slow_pole=-math.expm1(-2 * math.pi * slow * period),
-        fast_level=_threshold(FAST_SIGMAS, noise, fast, period) if rules.detect else math.inf,
-        slow_level=_threshold(SLOW_SIGMAS, noise, slow, period) if rules.detect else math.inf,
-        fast_time=rules.awake_time * model.rate,
-        slow_time=rules.stirred_time * model.rate,
-        release=period / rules.release,
+        **_detectors(model, rules),
         ramp=period / max(RAMP_TIME / model.pace, LEAST_RAMP),
         lowest=model.lowest_frequency,
         highest=min(model.highest_frequency, 0.4 * model.rate),
         highest_edge=float(model.highest_edge),
-        contact_on=contact_on,
-        contact_off=contact_off,
         drive_limit=float(model.drive_limit),
         drive_step=float(model.drive_step),
         peak_decay=math.exp(-period * lowest),
@@ -218,8 +202,7 @@ def _numbers(model: BandModel, bands: Bands, rules: BankRules, feedback: bool) -
         sensed_limit=float(model.sensed_limit),
         modulated=bands.modulated,
         differentiated=bands.differentiated,
-        presence=finger.presence,
-        least_speed=finger.least_speed,
+        presence=model.finger.presence,
         dc_quick=1.6 * quick,
         dc_drift_quick=quick**2,
         shows=bands.shown is None and (model.late != 0.0 or model.foresight != 0.0),
@@ -228,16 +211,41 @@ def _numbers(model: BandModel, bands: Bands, rules: BankRules, feedback: bool) -
         memory=model.memory,
         typical_speed=model.typical_speed,
         lock=2 * math.pi * model.lock,
-        least_motion=finger.least_motion,
-        typical_mass=finger.typical_mass,
-        typical_stiffness=finger.typical_stiffness,
-        least_mass=finger.mass[0],
-        most_mass=finger.mass[1],
-        least_damping=finger.damping[0],
-        most_damping=finger.damping[1],
-        least_stiffness=finger.stiffness[0],
-        most_stiffness=finger.stiffness[1],
+        **_finger(model.finger),
     )
+
+
+def _detectors(model: BandModel, rules: BankRules) -> dict[str, float]:
+    """What wakes the loop, and for how long."""
+    noise = np.sqrt((model.coordinate_from_sensed**2).sum(axis=1).max()) * max(
+        model.sensed_noise, LEAST_NOISE * model.sensed_limit
+    )
+    period, fast, slow = 1.0 / model.rate, FAST_POLE * model.pace, SLOW_POLE * model.pace
+    return {
+        "fast_pole": -math.expm1(-2 * math.pi * fast * period),
+        "slow_pole": -math.expm1(-2 * math.pi * slow * period),
+        "fast_level": _threshold(FAST_SIGMAS, noise, fast, period) if rules.detect else math.inf,
+        "slow_level": _threshold(SLOW_SIGMAS, noise, slow, period) if rules.detect else math.inf,
+        "fast_time": rules.awake_time * model.rate,
+        "slow_time": rules.stirred_time * model.rate,
+        "release": period / rules.release,
+    }
+
+
+def _finger(finger: FingerRange) -> dict[str, float]:
+    """How contact is felt, and what may be learnt of it."""
+    contact_on, contact_off = finger.contact or (ALWAYS, ALWAYS)
+    ranges = {name: getattr(finger, name) for name in ("mass", "damping", "stiffness")}
+    return {
+        "contact_on": contact_on,
+        "contact_off": contact_off,
+        "least_speed": finger.least_speed,
+        "least_motion": finger.least_motion,
+        "typical_mass": finger.typical_mass,
+        "typical_stiffness": finger.typical_stiffness,
+        **{f"least_{name}": least for name, (least, _) in ranges.items()},
+        **{f"most_{name}": most for name, (_, most) in ranges.items()},
+    }
 
 
 def _back(model: BandModel) -> float:
