@@ -207,9 +207,9 @@ def test_errors_are_those_of_windows_with_phases_of_their_own(locked):
     index = np.arange(2500, 5500, 500)[:, None] + np.arange(500)
     phase = bands.carrier_phase(np.arange(5650) / 5000.0, played.position)[index]
     off = abs(fit(phase, played.motion[index])[0]) / abs(bands.envelope) - 1.0
-    np.testing.assert_allclose(errors(played), np.sqrt(np.mean(off**2, axis=0)), rtol=0, atol=1e-10)
+    np.testing.assert_allclose(errors(played), np.sqrt(np.mean(off**2, axis=0)), rtol=0, atol=1e-12)
     few = replace(played, motion=played.motion[:, :2])
-    np.testing.assert_allclose(errors(few), errors(played)[:2], rtol=1e-9)
+    np.testing.assert_allclose(errors(few), errors(played)[:2], rtol=0, atol=1e-12)
 
 
 def test_whole_numbers_are_numbers():
