@@ -79,6 +79,7 @@ Pair = namedtuple("Pair", "first second")
         ((1.0, 2.0), Pair(1.0, 2.0)),
         ((1.0, 2.0), [1.0, 2.0]),
         ([1.0, [2.0]], [1.0, [3.0]]),
+        (Device, Other),
     ],
 )
 def test_what_looks_alike_is_told_apart(one, other):

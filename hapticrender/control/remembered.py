@@ -38,7 +38,7 @@ def contents(value: Any) -> Hashable:
     """
     if isinstance(value, np.ndarray):
         return value.shape, value.dtype.str, value.tobytes()
-    if is_dataclass(value):
+    if is_dataclass(value) and not isinstance(value, type):
         return type(value), *(contents(getattr(value, each.name)) for each in fields(value))
     if isinstance(value, tuple | list):
         return type(value), *(contents(each) for each in value)
