@@ -7,7 +7,7 @@ import numpy as np
 import hapticrender as hr
 from hapticrender.accuracy.plate import SLIDING
 from hapticrender.bands import Bands
-from hapticrender.batch import Scenario, together
+from hapticrender.batch import Scenario, designs, together
 from hapticrender.control.blocks.controller import BlockController
 from hapticrender.control.methods import METHODS
 from hapticrender.plants.vibrotactile import Plate, PlateParameters
@@ -82,7 +82,7 @@ class Batch:
 
     def __init__(self, many, method):
         self.many = many
-        self.controllers = [each.design(method) for each in many]
+        self.controllers = designs(many, method)
 
     def advance(self, seconds):
         """Play them from the start."""

@@ -122,7 +122,7 @@ def simulate(scenarios: Sequence[Scenario], seconds: float, *, method: str = "h2
     for index, scenario in enumerate(scenarios):
         if scenario.bands.envelope is None:
             raise ValueError(f"scenarios[{index}].bands: must have constant envelopes")
-    controllers = _designs(scenarios, method)
+    controllers = designs(scenarios, method)
     found: dict[int, Played] = {}
     left = Counter(id(each) for each in controllers)
     for group in _groups(scenarios, controllers):
@@ -136,7 +136,7 @@ def simulate(scenarios: Sequence[Scenario], seconds: float, *, method: str = "h2
     return [found[index] for index in range(len(scenarios))]
 
 
-def _designs(scenarios: Sequence[Scenario], method: str) -> list[Controller]:
+def designs(scenarios: Sequence[Scenario], method: str) -> list[Controller]:
     """Controllers of the scenarios; those that know the same device and want the same are one."""
     made: dict[Hashable, Controller] = {}
     keys = [contents((each.known or each.plate, each.bands)) for each in scenarios]
@@ -188,17 +188,21 @@ def together(scenarios: Sequence[Scenario], controllers: Sequence[Controller], s
     samples = int(round(seconds * plates[0].rate))
     control, control_state = FAMILIES[type(controllers[0])].batch_of(controllers)
     (tables, state), last = batch_state(plates), aligned((2, LANES))
-    target, wanted = aligned((controllers[0].n_bands, 2, LANES)), aligned((CHUNK, LANES))
+    target, nothing = aligned((controllers[0].n_bands, 2, LANES)), aligned((1, LANES))
     motion, sensed, drive, flags = _side_by_side(samples, (3, 2, 2, 1))
+    raised = flags[:, 0].view(np.int64)
     fingers = _fingers(plates)
-    noise, finger = aligned((CHUNK, 2, LANES)), aligned((CHUNK, 3, len(fingers)))
+    noisy = any(each.parameters.sensor_noise > 0.0 for each in plates)
+    noise, finger = aligned((CHUNK if noisy else 1, 2, LANES)), aligned((CHUNK, 3, len(fingers)))
     position = np.empty((len(fingers), samples))
     for start in range(0, samples, CHUNK):
         part = slice(start, min(start + CHUNK, samples))
         count = part.stop - start
-        time = np.arange(part.start, part.stop) / plates[0].rate
-        touch = np.stack([each.touch(time) for each in fingers], axis=-1)
-        position[:, part], finger[:count] = touch[:, 0].T, touch
+        if start == 0 or not all(each.constant for each in fingers):
+            time = np.arange(part.start, part.stop) / plates[0].rate
+            for lane, each in enumerate(fingers):
+                finger[:count, :, lane] = each.touch(time)
+        position[:, part] = finger[:count, 0].T
         _draw(plates, noise[:count])
         closed_batch_run(
             tables,
@@ -208,14 +212,13 @@ def together(scenarios: Sequence[Scenario], controllers: Sequence[Controller], s
             last,
             finger[:count],
             noise[:count],
-            wanted[:count],
+            nothing,
             sensed[part],
             motion[part],
             drive[part],
             target,
-            flags[part, 0],
+            raised[part],
         )
-    raised = flags[:, 0].astype(np.int64)
     return [
         Played(
             scenario=scenario,
@@ -272,6 +275,7 @@ def batch_state(plates: Sequence[Plate]) -> tuple[PlateTables, BatchState]:
         pending=aligned((plates[0].delay - 1, 2, LANES)),
         cursor=np.zeros(1, np.int64),
         current=aligned((2, LANES)),
+        shown=aligned((2, LANES)),
     )
 
 

@@ -93,6 +93,17 @@ def test_fingers_that_rest_keep_what_a_sample_does(changes):
         assert_alike(found, alone(scenario, 0.4))
 
 
+@pytest.mark.parametrize("fingers", [FINGERS, FINGERS[:1] * 2, FINGERS[3:5]], ids=["all", "absent", "resting"])
+def test_the_length_of_a_piece_does_not_matter(fingers, monkeypatch):
+    """What is handed over piece by piece: fingers, those that stay at once, and noise."""
+    wanted = [Scenario(bands=BANDS, finger=finger, seed=i) for i, finger in enumerate(fingers)]
+    expected = simulate(wanted, 0.5)
+    monkeypatch.setattr(batch, "CHUNK", 700)
+    for found, right in zip(simulate(wanted, 0.5), expected, strict=True):
+        for name in ("position", "motion", "drive", "sensed", "flags"):
+            np.testing.assert_array_equal(getattr(found, name), getattr(right, name))
+
+
 @pytest.mark.parametrize("method", ["paper-common", "boxcar"])
 def test_the_other_polar_methods_run_side_by_side(method, monkeypatch):
     """Other targets in every lane, and devices known better or worse: look-ups differ."""

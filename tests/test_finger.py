@@ -142,6 +142,32 @@ def test_touch_is_half_open_and_lifts_everything():
     assert set(finger.load(time)) == {0.0, 0.6}
 
 
+@pytest.mark.parametrize(
+    ("finger", "constant"),
+    [
+        (Finger.absent(), True),
+        (Finger.still(0.01, normal_load=0.5), True),
+        (Finger.still(normal_load=1, mechanics="heavy", load_scaling=True), True),
+        (Finger.still(touches=((0.1, 0.2),)), False),
+        (Finger.still(normal_load=((0.0, 0.5), (0.1, 1.0))), False),
+        (Finger.sliding(0.1), False),
+        (Finger.swiping(2.0, stroke=0.02), False),
+    ],
+)
+def test_a_finger_is_constant_where_nothing_of_its_touch_changes(finger, constant):
+    touch = finger.touch(np.linspace(0.0, 1.0, 50))
+    np.testing.assert_equal(finger.constant, constant)
+    np.testing.assert_equal(np.array_equal(touch, touch[:1] + 0.0 * touch, equal_nan=True), constant)
+
+
+def test_a_finger_of_another_kind_may_do_anything():
+    class Blinking(Finger):
+        def position(self, time):
+            return np.where(np.mod(time, 2.0) < 1.0, super().position(time), np.nan)
+
+    assert not Blinking.still(normal_load=0.5).constant
+
+
 def test_an_absent_finger_never_touches():
     time = np.linspace(0, 10, 11)
     finger = Finger.absent()

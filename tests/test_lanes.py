@@ -28,6 +28,8 @@ from hapticrender.compiled.lanes_memory import (
     put_column,
     put_stretch,
     read,
+    record,
+    record_whole,
     row_totals,
     stretch,
     write,
@@ -147,6 +149,29 @@ def test_a_scenarios_own_numbers_are_plain_or_lanes(rng):
     moved(many, 0.25)
     assert alone[1] == 0.75
     np.testing.assert_allclose(many[1], many[0] + 0.25, rtol=1e-15)
+
+
+@kernel
+def recorded(shared, out):
+    record(2.0 * read(shared, 0), out, 1, 0)
+
+
+@kernel
+def recorded_whole(shared, out):
+    record_whole(read(shared, 0), out, 1)
+
+
+def test_what_is_recorded_is_written():
+    """Past the caches or not: numbers, rows of lanes, and rows of whole numbers."""
+    alone, many = np.array([1.5]), aligned((1, 8))
+    many[0] = np.arange(8.0) - 3.0
+    numbers, rows, whole = np.zeros((2, 1)), aligned((2, 1, 8)), aligned((2, 8)).view(np.int64)
+    recorded(alone, numbers)
+    recorded(many, rows)
+    recorded_whole(many, whole)
+    np.testing.assert_array_equal(numbers, [[0.0], [3.0]])
+    np.testing.assert_array_equal(rows, [[0.0 * many[0]], [2.0 * many[0]]])
+    np.testing.assert_array_equal(whole, [[0] * 8, np.arange(8) - 3])
 
 
 @kernel

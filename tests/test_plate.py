@@ -108,6 +108,17 @@ def test_a_window_that_is_too_wide_shrinks_until_its_polynomial_is_exact():
     assert NARROWEST < widths[1] < WIDEST
 
 
+def test_a_plate_of_another_kind_need_not_be_told_from_others():
+    """Numbers of plates are remembered by what they are equal by; one that is not goes without."""
+
+    class Odd(PlateParameters):
+        __hash__ = None
+
+    assert plate_tables(Odd(), hr.Finger.absent()) == plate_tables(PlateParameters(), hr.Finger.absent())
+    with pytest.raises(TypeError):
+        Plate(PlateParameters(sensor_noise=0.0), hr.Finger.absent(), "x")
+
+
 def propagator(parameters, mechanics, place, strength):
     """Phi and Gamma (n, n + 3) that the plate uses for a finger, and by scipy's exponential of the same A and B."""
     state = plate_state(0)

@@ -22,6 +22,7 @@ from hapticrender.plants import kernels as plate_kernels
 from hapticrender.plants.vibrotactile import Plate, PlateParameters
 
 PACKED = re.compile(r"\bv?(?:fn?m(?:add|sub)\d*|mul|add|sub)(p[sd])\b.*%([xyz])mm")
+RECORDED = 3 + 2 + 2 + 1  # rows a sample: motion, sensors, drive, flags
 WIDEST = {"x": 16, "y": 32, "z": 64}  # bytes of a register
 
 
@@ -91,11 +92,13 @@ def test_a_batch_works_on_whole_registers(method, batch_of):
     plates = [Plate(each.plate, each.finger) for each in scenarios]
     rows = [aligned((2, *shape, LANES)) for shape in ((3,), (2,), (), (2,), (3,), (2,))]
     arguments = (*batch_state(plates), control, state)
-    last, target, flags = aligned((2, LANES)), aligned((1, 2, LANES)), aligned((2, LANES))
+    last, target, flags = aligned((2, LANES)), aligned((1, 2, LANES)), aligned((2, LANES)).view(np.int64)
     assembly = instructions(batch_kernels.closed_batch_run, *arguments, last, *rows, target, flags)
     every, widest = packed(assembly, "pd")
     assert every > 500
     assert widest > 0.8 * every
+    past_caches = re.findall(r"\bv?movnt\w+\s+%([xyz])mm", assembly)
+    assert sum(WIDEST[register] for register in past_caches) == LANES * 8 * RECORDED
 
 
 @pytest.mark.skipif(platform.machine() not in ("x86_64", "AMD64"), reason="reads x86-64 assembly")

@@ -46,13 +46,14 @@ def _load(context: Any, builder: Any, kind: Any, array: Any, where: Any, count: 
     return value
 
 
-def _store(context: Any, builder: Any, kind: Any, array: Any, where: Any, count: int, value: Any) -> None:
+def _store(context: Any, builder: Any, kind: Any, array: Any, where: Any, count: int, value: Any) -> Any:
     """Write a row of lanes or a number at `where`."""
     if _is_rows(kind, count):
         access = builder.store(value, _address(context, builder, kind, array, *where), align=_wide(kind))
     else:
         access = builder.store(value, _number(context, builder, kind, array, *where))
     kept_apart(builder, access, "tile" if kind.ndim == 3 and _is_rows(kind, count) else "own")
+    return access
 
 
 def _is_rows(kind: Any, indices: int) -> bool:
@@ -269,16 +270,51 @@ def read(typingctx: Any, array: Any, *index: Any) -> Any:
 @intrinsic
 def write(typingctx: Any, value: Any, array: Any, *index: Any) -> Any:
     """Write a scenario's own number array[i, ...], or the row array[i, ..., :] where every lane is a scenario."""
+    return _written(array, index, soon=True)
+
+
+@intrinsic
+def record(typingctx: Any, value: Any, array: Any, *index: Any) -> Any:
+    """`write` what is not read soon: a row of lanes goes past the caches, and leaves in them what is."""
+    return _written(array, index, soon=False)
+
+
+def _written(array: Any, index: Any, *, soon: bool) -> Any:
     count = _count(index)
-    if not _is_rows(array, count) and not _is_numbers(array, count):
+    rows = _is_rows(array, count)
+    if not rows and not _is_numbers(array, count):
         return None
 
     def build(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        _store(context, builder, sig.args[1], args[1], cgutils.unpack_tuple(builder, args[2]), count, args[0])
+        access = _store(context, builder, sig.args[1], args[1], cgutils.unpack_tuple(builder, args[2]), count, args[0])
+        if rows and not soon:
+            _past_caches(builder, access)
         return context.get_dummy_value()
 
-    kind = _lane(array) if _is_rows(array, count) else array.dtype
+    kind = _lane(array) if rows else array.dtype
     return types.none(kind, array, types.StarArgTuple.from_types([types.intp] * count)), build
+
+
+@intrinsic
+def record_whole(typingctx: Any, value: Any, array: Any, i: Any) -> Any:
+    """`record` whole numbers in a row array[i, :] of an array of 64-bit integers."""
+    whole = isinstance(array, types.Array) and array.dtype == types.int64 and array.layout == "C" and array.ndim == 2
+    if not whole or not isinstance(value, LaneType) or value.dtype != types.float64:
+        return None
+
+    def build(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        vector = ir.VectorType(ir.IntType(64), value.width)
+        data, _ = _parts(context, builder, sig.args[1], args[1])
+        at = builder.gep(builder.bitcast(data, vector.as_pointer()), [args[2]])
+        _past_caches(builder, builder.store(builder.fptosi(args[0], vector), at, align=_wide(value)))
+        return context.get_dummy_value()
+
+    return types.none(value, array, types.intp), build
+
+
+def _past_caches(builder: Any, access: Any) -> None:
+    """Tell a store that what it writes is not read soon."""
+    access.set_metadata("nontemporal", builder.module.add_metadata([ir.IntType(32)(1)]))
 
 
 def _count(index: Any) -> int:

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 from hapticrender.compiled.jit import by_types, kernel
 from hapticrender.compiled.lanes import any_of, select, size
-from hapticrender.compiled.lanes_memory import read, write
+from hapticrender.compiled.lanes_memory import read, record, record_whole, write
 from hapticrender.control.bank.kernels import bank_advance
 from hapticrender.control.bank.state import BankTables
 from hapticrender.control.polar.kernels import PolarTables
@@ -38,6 +38,7 @@ class BatchState(NamedTuple):
     pending: Array  # (latency, 2, W)
     cursor: Array  # (1,) integer
     current: Array  # (2, W)
+    shown: Array  # (2, W) what the sensors show now
 
 
 @kernel
@@ -232,16 +233,19 @@ def closed_batch_run(
     """Plates and controllers closed sample by sample; see `closed_plate_run`.  Every array ends in a lane a scenario.
 
     `shared` are the tables of any of the plates, with as many terms as any needs; `finger` is (n, 3, W): position,
-    load, strength, or (n, 3, 1) where all share one; `target` holds the last sample's only, (bands, 2, W); `flags`
-    are floats.
+    load, strength, or (n, 3, 1) where all share one; `noise` and `wanted` may have one row, which then is every
+    sample's; `target` is scratch, (bands, 2, W); `flags` are integers.
     """
     tables = tables_of(shared, state.number)
     for n in range(sensed.shape[0]):
         plate_drive(tables, state, last)
-        raised = sense(tables, state, noise[n], sensed[n], motion[n])
+        heard, asked = min(n, noise.shape[0] - 1), min(n, wanted.shape[0] - 1)
+        raised = sense(tables, state, noise[heard], state.shown, motion[n])
+        record(read(state.shown, 0), sensed, n, 0)
+        record(read(state.shown, 1), sensed, n, 1)
         position = finger_of(finger, n, 0, raised)
         advance(tables, state, position, finger_of(finger, n, 1, raised), finger_of(finger, n, 2, raised))
-        write(read(last, 0), drive, n, 0)
-        write(read(last, 1), drive, n, 1)
-        raised += control_advance(control, control_state, sensed[n], position, read(wanted, n), last, target)
-        write(raised, flags, n)
+        record(read(last, 0), drive, n, 0)
+        record(read(last, 1), drive, n, 1)
+        raised += control_advance(control, control_state, state.shown, position, read(wanted, asked), last, target)
+        record_whole(raised, flags, n)

@@ -18,7 +18,7 @@ import numpy as np
 
 from hapticrender.compiled.jit import kernel
 from hapticrender.compiled.lanes import high, low, select, size
-from hapticrender.compiled.lanes_memory import read, write
+from hapticrender.compiled.lanes_memory import read, record, write
 from hapticrender.compiled.polynomials import whole
 from hapticrender.plants.propagator import (
     GRIP,
@@ -291,11 +291,11 @@ def sense(tables, state, noise, sensed, motion):
     """Hall sensors at the glass ends and the true motion at centre, end 1, end 2; returns flags as a float."""
     z = state.z
     heave, tilt, bend = read(z, 0, 0), tables.reach * read(z, 0, 1), read(z, 0, 6)
-    write(heave + tables.centre_shape * bend, motion, 0)
+    record(heave + tables.centre_shape * bend, motion, 0)
     clipped = 0.0 * heave
     for i in range(2):
         end = heave - tilt + bend if i == 0 else heave + tilt + bend
-        write(end, motion, 1 + i)
+        record(end, motion, 1 + i)
         value = end * tables.sensor_gain[i] + tables.sensor_noise * read(noise, i)
         clipped = select(size(value) > tables.sensor_limit, 1.0 * SENSOR_CLIPPED, clipped)
         write(quantise(value, tables.sensor_step, tables.sensor_limit), sensed, i)

@@ -17,6 +17,7 @@ from hapticrender.protocols import Array
 if TYPE_CHECKING:
     from hapticrender.plants.vibrotactile import PlateParameters
     from hapticrender.touch.finger import Finger
+    from hapticrender.touch.mechanics import FingerMechanics
 
 MOST_LOAD = 20.0  # N: hardest that a finger presses
 NOMINAL_AMPLIFIER = (1 - 2e3 / 1.0) / 10e3  # A/V: the gain that a drive in A is turned into volts with
@@ -46,8 +47,14 @@ def plate_state(latency: int) -> PlateState:
 
 
 def plate_tables(parameters: PlateParameters, finger: Finger) -> PlateTables:
-    """Numbers of the compiled plate with this finger on it."""
-    mechanics = finger.mechanics
+    """Numbers of the compiled plate with this finger on it; a sweep plays the same plate again and again."""
+    plain = all(type(each).__module__.startswith("hapticrender.") for each in (parameters, finger.mechanics))
+    make = _tables_of if plain else _tables_of.__wrapped__  # what others derive may hold more than it is equal by
+    return make(parameters, finger.mechanics, finger.load_scaling)
+
+
+@lru_cache(maxsize=1024)
+def _tables_of(parameters: PlateParameters, mechanics: FingerMechanics, load_scaling: bool) -> PlateTables:
     order = mechanics.order if parameters.finger_dynamics else 0
     rocking = parameters.degrees_of_freedom == 2
     flexible = parameters.bending_frequency > 0.0
@@ -88,7 +95,7 @@ def plate_tables(parameters: PlateParameters, finger: Finger) -> PlateTables:
         sensor_gain=(float(parameters.sensor_gain_1), float(parameters.sensor_gain_2)),
     )
     tables = PlateTables(*(_as_float(value) for value in tables))  # else every mix of types compiles anew
-    strongest = float(mechanics.load_factor(np.array(MOST_LOAD))) if finger.load_scaling else 1.0
+    strongest = float(mechanics.load_factor(np.array(MOST_LOAD))) if load_scaling else 1.0
     return tables._replace(terms=_taylor_terms(tables._replace(terms=0), strongest))
 
 

@@ -122,6 +122,12 @@ class Finger:
         factor = self.mechanics.load_factor(self._pressed(time)) if self.load_scaling else np.ones(time.shape)
         return np.where(np.isfinite(self.position(time)), factor, 0.0)
 
+    @cached_property
+    def constant(self) -> bool:
+        """Whether position and load are the same at all times."""
+        known = type(self) is Finger and type(self.motion) in (Nowhere, Still)
+        return known and self.touches is None and isinstance(self.normal_load, float)
+
     def touch(self, time: Array) -> Array:
         """Position, load and strength side by side, shape (n, 3), for a plant that wants all three."""
         time = np.asarray(time, float)

@@ -22,7 +22,10 @@ def side_by_side(arrays: Sequence[Array]) -> Array:
     """Stack arrays of one shape along a last axis of `LANES`; the last one fills what is left."""
     filled = [*arrays, *[arrays[-1]] * (LANES - len(arrays))]
     stacked = aligned((*np.shape(arrays[0]), LANES))
-    stacked[:] = np.stack([np.asarray(each, float) for each in filled], axis=-1)
+    if all(each is arrays[0] for each in arrays):
+        stacked[:] = np.asarray(arrays[0], float)[..., None]
+    else:
+        stacked[:] = np.stack([np.asarray(each, float) for each in filled], axis=-1)
     return stacked
 
 

@@ -14,6 +14,7 @@ from hapticrender.compiled.lanes import aligned
 from hapticrender.control.bank.batch import LANES, side_by_side
 from hapticrender.control.methods.paper import PolarController, polar_state
 from hapticrender.control.polar.kernels import PolarState, PolarTables
+from hapticrender.protocols import Array
 
 
 def alike(first: PolarController, other: PolarController) -> bool:
@@ -34,8 +35,8 @@ def batch_of(controllers: Sequence[PolarController]) -> tuple[PolarTables, Polar
     tables = first.tables._replace(
         tone=tones.reshape(len(tones), -1),
         listen=side_by_side([each.tables.listen for each in controllers]),
-        gain=np.concatenate([each.tables.gain for each in every]),
-        lag=np.concatenate([each.tables.lag for each in every]),
+        gain=_in_turn([each.tables.gain for each in every]),
+        lag=_in_turn([each.tables.lag for each in every]),
     )
     state = polar_state(tables, len(first.state.window), float)
     return tables, state._replace(
@@ -43,3 +44,8 @@ def batch_of(controllers: Sequence[PolarController]) -> tuple[PolarTables, Polar
         doubt=aligned((*state.doubt.shape, LANES)),
         shared=aligned((len(state.shared), 1, LANES)),
     )
+
+
+def _in_turn(tables: Sequence[Array]) -> Array:
+    """Tables of one scenario after another, or the one that all of them share."""
+    return tables[0] if all(each is tables[0] for each in tables) else np.concatenate(tables)
