@@ -1,5 +1,7 @@
 """A sample in which little happens is left out of nothing: what is spared there changes no drive."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -102,6 +104,43 @@ def test_a_lane_beside_one_at_its_limit_is_its_own_run():
     assert not alone.flags.any()
     np.testing.assert_array_equal(found.flags, alone.flags)
     np.testing.assert_allclose(found.drive, alone.drive, rtol=0, atol=ROUNDING * abs(alone.drive).max())
+
+
+def three_coordinates():
+    """A plate whose glass bends, sensed and driven on its own, coupled to heave through mass."""
+
+    def grown(matrix, own, coupled=0.0):
+        whole = np.zeros((3, 3))
+        whole[:2, :2], whole[2, 2], whole[0, 2], whole[2, 0] = matrix, own, coupled, coupled
+        return whole
+
+    place = np.pad(MODEL.place_from_coordinate, ((0, 0), (0, 1)))
+    return replace(
+        MODEL,
+        mass=grown(MODEL.mass, 0.03, 0.002),
+        damping=grown(MODEL.damping, 1.5),
+        stiffness=grown(MODEL.stiffness, 4e4),
+        force_from_drive=grown(MODEL.force_from_drive, 5.0),
+        coordinate_from_sensed=grown(MODEL.coordinate_from_sensed, 1.0),
+        side_from_coordinate=grown(MODEL.side_from_coordinate, 1.0),
+        place_from_coordinate=place,
+        shape=(1.0, 0.2, -0.5),
+    )
+
+
+def test_a_third_coordinate_is_known_as_well(rng):
+    """Nothing is moved by the drive: what the sensors show is the same for both."""
+    bands = tones((47.0, 150.0, 261.0), 1e-6 * np.exp(0.4j * np.arange(3)))
+    sensed, nowhere = 1e-7 * rng.standard_normal((1500, 3)), np.full(1500, np.nan)
+    drives = []
+    for modulated in (False, True):
+        controller = METHODS["h2"].design(three_coordinates(), bands)
+        numbers = controller.tables.numbers._replace(modulated=modulated, drive_step=0.0)
+        controller.tables = controller.tables._replace(numbers=numbers)
+        drives.append(controller.run(sensed, nowhere, np.ones(1500))[0])
+        assert settled(controller.state) != modulated
+    np.testing.assert_allclose(drives[0], drives[1], rtol=0, atol=ROUNDING * abs(drives[1]).max())
+    assert (abs(drives[0][-500:]).max(axis=0) > 1e-3 * abs(drives[0]).max()).all()
 
 
 @pytest.mark.parametrize("precision", ["double", "single"])

@@ -150,13 +150,14 @@ def ease(x):
 
 
 @kernel
-def turn_pass(tables, state, t):
-    """Turn the fixed carriers of a tile on to this sample; `refresh` keeps them exact."""
-    band = state.band
+def turn_pass(band, t):
+    """Turn the fixed carriers of a tile on to this sample and return them; `refresh` keeps them exact."""
     cos, sin = lanes(band, t, row.COS), lanes(band, t, row.SIN)
     turn_cos, turn_sin = lanes(band, t, row.TURN_COS), lanes(band, t, row.TURN_SIN)
-    put(band, t, row.COS, cos * turn_cos - sin * turn_sin)
-    put(band, t, row.SIN, sin * turn_cos + cos * turn_sin)
+    cos, sin = cos * turn_cos - sin * turn_sin, sin * turn_cos + cos * turn_sin
+    put(band, t, row.COS, cos)
+    put(band, t, row.SIN, sin)
+    return cos, sin
 
 
 @kernel
@@ -215,6 +216,6 @@ def carrier_pass(tables, state, fresh):
             locked_pass(tables, state, t)
         else:
             if not fresh:
-                turn_pass(tables, state, t)
+                turn_pass(state.band, t)
             if state.pace[t] == row.GROWING:
                 grow_pass(tables, state, t)

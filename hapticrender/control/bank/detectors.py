@@ -50,20 +50,24 @@ def wake(numbers, touch, fast, slow):
 
 
 @kernel
-def detect(tables, state, turn):
-    """Wake the loop by what its detectors hear; the slow one listens in its turn."""
-    numbers, touch, band = tables.numbers, state.touch, state.band
-    fast = slow = 0.0 * read(touch, row.TRUST)
-    if numbers.fast_level < HUGE:
+def fast_all(tables, state):
+    """What the fast detector hears in all bands; see `fast_pass`."""
+    heard = 0.0
+    for c in range(len(tables.shape)):
+        for t in range(state.band.shape[0]):
+            heard += fast_pass(tables.numbers, state, t, c)
+    return total(read(state.touch, row.TRUST), heard)
+
+
+@kernel
+def detect(tables, state, fast, turn):
+    """Wake the loop by what its detectors hear: the fast one now, the slow one in its turn."""
+    numbers, touch = tables.numbers, state.touch
+    slow = 0.0 * read(touch, row.TRUST)
+    if turn and numbers.fast_level < HUGE:
         heard = 0.0
         for c in range(len(tables.shape)):
-            for t in range(band.shape[0]):
-                heard += fast_pass(numbers, state, t, c)
-        fast = total(fast, heard)
-        if turn:
-            heard = 0.0
-            for c in range(len(tables.shape)):
-                for t in range(band.shape[0]):
-                    heard += slow_pass(numbers, state, t, c)
-            slow = total(slow, heard)
+            for t in range(state.band.shape[0]):
+                heard += slow_pass(numbers, state, t, c)
+        slow = total(slow, heard)
     wake(numbers, touch, fast, slow)

@@ -16,12 +16,12 @@ from hapticrender.compiled.lanes import any_of, high, low, root, select, size
 from hapticrender.compiled.lanes_memory import lanes, put, read, write
 from hapticrender.control.bank import rows as row
 from hapticrender.control.bank.carriers import REFRESH, carrier_pass, refresh
-from hapticrender.control.bank.detectors import detect
+from hapticrender.control.bank.detectors import HUGE, detect, fast_all
 from hapticrender.control.bank.finger import feel, track_finger
 from hapticrender.control.bank.law import know_finger, law_pass
 from hapticrender.control.bank.learning import ADAPTATION, begin_finger, in_a_turn, learn_finger, send_finger
 from hapticrender.control.bank.observer import level_pass, observer_pass, residual_pass
-from hapticrender.control.bank.settled import settled, settled_command, settled_sample
+from hapticrender.control.bank.settled import settled, settled_command, settled_follow, settled_sample
 from hapticrender.control.bank.shaper import shape_pass
 from hapticrender.control.bank.targets import target_all
 from hapticrender.control.kernels import DOUBT_TIME, FAR
@@ -59,7 +59,8 @@ def speak_pass(tables, state, drive):
     distorts nothing.
     """
     numbers, touch = tables.numbers, state.touch
-    trust, limit = read(touch, row.TRUST), numbers.drive_limit
+    trust = read(touch, row.TRUST)
+    share = trust * (1.0 / numbers.drive_limit)
     peak = numbers.peak_decay * numbers.peak_decay * read(touch, row.PEAK)
     for i in range(tables.speak.shape[0]):
         along = across = 0.0 * trust
@@ -67,7 +68,7 @@ def speak_pass(tables, state, drive):
             along += read(tables.speak, i, c) * read(state.residual, row.FORCE, c)
             across += read(tables.speak, i, c) * read(state.residual, row.QUADRATURE, c)
         write(trust * along, drive, i)
-        along, across = trust / limit * along, trust / limit * across
+        along, across = share * along, share * across
         peak = high(peak, along * along + across * across)
     write(peak, touch, row.PEAK)
     scale = 1.0 + 0.0 * trust
@@ -165,8 +166,12 @@ def bank_advance(tables, state, sensed, position, wanted, drive, target):
     calm = 1.0 + 0.0 * read(touch, row.TRUST)
     if numbers.crowd_speed > 0.0:
         calm = low(size(read(state.track, row.VELOCITY)) * (1.0 / numbers.crowd_speed), 1.0)
-    carrier_pass(tables, state, fresh)
-    target_all(tables, state, calm * numbers.reference, wanted, target)
+    doubt = listen_all(tables, state, sensed)
+    believe(numbers, touch, doubt)
+    calmly, turn = settled(state), state.sample[0] % ADAPTATION == 0
+    if not calmly:
+        carrier_pass(tables, state, fresh)
+        target_all(tables, state, calm * numbers.reference, wanted, target)
     changed = feel(numbers, len(tables.shape), tables.stiffness, state.level, touch, learnt)
     if any_of(changed):
         write(select(changed, numbers.fast_time, read(touch, row.FAST_TIME)), touch, row.FAST_TIME)
@@ -174,17 +179,19 @@ def bank_advance(tables, state, sensed, position, wanted, drive, target):
     touching = (read(touch, row.CONTACT) > 0.0) & (numbers.adapt >= 0.0)
     know_finger(tables, state, touching, learnt)
     g, integral, inner, back, quick = gains(numbers, state, calm)
-    doubt = listen_all(tables, state, sensed)
-    believe(numbers, touch, doubt)
-    calmly, turn = settled(state), state.sample[0] % ADAPTATION == 0
     if calmly:
-        settled_sample(tables, state, g, integral, inner)
+        settled_sample(tables, state, fresh, g, integral, inner, target)
     else:
         stirred_sample(tables, state, g, integral, inner, back, quick)
     flags = speak_pass(tables, state, drive) + high(odd, 2.0 * doubt)
+    fast = 0.0 * doubt
+    if calmly:
+        fast = settled_follow(tables, state, g, integral)
+    elif numbers.fast_level < HUGE:
+        fast = fast_all(tables, state)
     if turn and any_of(touching):
         learn(tables, state, g, inner, calmly, touching)
-    detect(tables, state, turn)
+    detect(tables, state, fast, turn)
     return flags
 
 

@@ -163,9 +163,9 @@ def adapt_finger(tables, state, rate, inner, gain, rest, touching):
         omega2 = omega * omega
         counts = (size2 >= numbers.least_motion * numbers.least_motion) & touching
         counts = counts & (lanes(state.sent, t, row.SHOWN_WHOLE) >= FORGOTTEN)
-        safe = select(counts, size2, 1.0)
-        miss = (re * felt_re + im * felt_im) / safe - read(touch, row.STIFFNESS) + omega2 * read(touch, row.MASS)
-        drag = (im * felt_re - re * felt_im) / safe - omega * read(touch, row.DAMPING)
+        share = 1.0 / select(counts, size2, 1.0)
+        miss = share * (re * felt_re + im * felt_im) - read(touch, row.STIFFNESS) + omega2 * read(touch, row.MASS)
+        drag = share * (im * felt_re - re * felt_im) - omega * read(touch, row.DAMPING)
         along = stiffness - omega2 * mass
         weight = select(counts, size2 / (along * along + omega2 * damping * damping), 0.0)
         scale = weight / (stiff2 + omega2 * omega2 * mass2)

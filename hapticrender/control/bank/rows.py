@@ -47,6 +47,6 @@ LOAD, PLACE, CONTACT, MASS, DAMPING, STIFFNESS, FAST_TIME, SLOW_TIME, FAST_OPEN,
 KNOWN, KNOWN_PLACE = 13, 14
 TOUCH_ROWS = 15
 # rows of BankState.residual: a coordinate as heard, residual of the observer, deviation, force, force a quarter turn
-# ahead, force as it is known before anything is heard
-HEARD, ERROR, DEVIATION, FORCE, QUADRATURE, KNOWN_FORCE = range(6)
-RESIDUAL_ROWS = 6
+# ahead; force, and what is observed and commanded, as they are known before anything is heard
+HEARD, ERROR, DEVIATION, FORCE, QUADRATURE, KNOWN_FORCE, OBSERVED, COMMANDED = range(8)
+RESIDUAL_ROWS = 8
