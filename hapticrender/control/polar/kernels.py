@@ -36,16 +36,18 @@ REFRESH = 64  # samples between two looks at the tones; a block is cut there, to
 # rows of PolarState.band: what was asked for; fixed part of the carrier (turns) and its turn a sample; its direction
 # (+1, -1); the wanted envelope, its amplitude and direction (that of the last target that was not silence); the frame,
 # a direction that the carrier (COS, SIN) has been turned by, see `turn_frame`; phase of a fixed carrier turned by it at
-# the last refresh (turns); low-pass states of the wanted waveform; frequency of a carrier that follows the finger (Hz)
+# the last refresh (turns); low-pass states of the wanted waveform; frequency of a carrier that follows the finger (Hz);
+# 1 where something is wanted, else 0, and four times that, as of a fixed carrier's last refresh
 LIVE, FREQUENCY, WAVENUMBER, PHASE, WANTED_RE, WANTED_IM = range(6)
 TURNS, COS, SIN, TURN_COS, TURN_SIN, FORWARD = range(6, 12)
 TARGET_RE, TARGET_IM, AMOUNT, HEADING_RE, HEADING_IM, FRAME_RE, FRAME_IM, FRAME, START = range(12, 21)
-REF_RE1, REF_RE2, REF_IM1, REF_IM2, HERTZ = range(21, 26)
-BAND_ROWS = 26
+REF_RE1, REF_RE2, REF_IM1, REF_IM2, HERTZ, SOUNDS, FOUR_SOUNDS = range(21, 28)
+BAND_ROWS = 28
 # rows of PolarState.loop, LOOP_ROWS for each coordinate: low-pass states, states of amplitude and phase loop, X over
-# the frame; drive per metre from the look-up table, and the device's lag (rad); amplitude and phase of X on their way
-RE1, RE2, IM1, IM2, AMPLITUDE1, AMPLITUDE2, THETA1, THETA2, X_RE, X_IM, DRIVE, LAG, FOUND, BEHIND = range(14)
-LOOP_ROWS = 14
+# the frame; drive per metre from the look-up table, and the device's lag (rad); amplitude and phase of X on their way;
+# drive per command where the carrier is fixed, b0 of the law times that per metre
+RE1, RE2, IM1, IM2, AMPLITUDE1, AMPLITUDE2, THETA1, THETA2, X_RE, X_IM, DRIVE, LAG, FOUND, BEHIND, VOICE = range(15)
+LOOP_ROWS = 15
 # entries of PolarState.finger
 HELD, VELOCITY, GATE, SEEN = range(4)
 # rows of PolarState.shared, one column a sample of a block: what all tiles are told; then one row a coordinate
@@ -243,6 +245,16 @@ def take_tones(tables, state, t):
 
 
 @kernel
+def stay(law, band, loop, t):
+    """What the law of a tile takes from a target that stays: whether it sounds, and drive per command."""
+    sounds = select(lanes(band, t, AMOUNT) > QUIET, 1.0, 0.0 * lanes(band, t, AMOUNT))
+    put(band, t, SOUNDS, sounds)
+    put(band, t, FOUR_SOUNDS, 4.0 * sounds)
+    for base in range(0, loop.shape[1], LOOP_ROWS):
+        put(loop, t, base + VOICE, law[0] * lanes(loop, t, base + DRIVE))
+
+
+@kernel
 def refresh(tables, state):
     """Take up the tones that are asked for; phases and look-ups of fixed carriers, whose targets stay if constant."""
     numbers, band = tables.numbers, state.band
@@ -259,6 +271,7 @@ def refresh(tables, state):
             put(band, t, COS, live * (cos * re - sin * im))
             put(band, t, SIN, live * (sin * re + cos * im))
             put(band, t, START, turns + lanes(band, t, FRAME))
+            stay(numbers.law, band, state.loop, t)
 
 
 @kernel

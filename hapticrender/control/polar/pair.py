@@ -15,7 +15,6 @@ from hapticrender.compiled.lanes import select, size, totals
 from hapticrender.compiled.lanes_memory import lanes, put, put_pairs
 from hapticrender.compiled.polynomials import polar
 from hapticrender.control.polar.kernels import (
-    AMOUNT,
     COS,
     FORWARD,
     FREQUENCY,
@@ -84,11 +83,10 @@ def tiles_pair(tables, state, sensed, n, target):
         b, b_lag = compared(numbers, loop, t, other_side, h0 * x0 + h1 * x1, cos, sin)
         c, c_lag = compared(numbers, loop, t, 0, g0 * y0 + g1 * y1, next_cos, next_sin)
         d, d_lag = compared(numbers, loop, t, other_side, h0 * y0 + h1 * y1, next_cos, next_sin)
-        wanted = lanes(band, t, AMOUNT)
-        one += answered(numbers, loop, t, 0, wanted, a, a_lag, wish)
-        other += answered(numbers, loop, t, other_side, wanted, b, b_lag, wish)
-        early += answered(numbers, loop, t, 0, wanted, c, c_lag, hope)
-        late += answered(numbers, loop, t, other_side, wanted, d, d_lag, hope)
+        one += answered(numbers, band, loop, t, 0, a, a_lag, wish)
+        other += answered(numbers, band, loop, t, other_side, b, b_lag, wish)
+        early += answered(numbers, band, loop, t, 0, c, c_lag, hope)
+        late += answered(numbers, band, loop, t, other_side, d, d_lag, hope)
     return totals(1.0, one, other), totals(1.0, early, late)
 
 

@@ -23,15 +23,15 @@ from hapticrender.compiled.lanes_memory import (
     taken,
 )
 from hapticrender.compiled.polynomials import cosine, polar
-from hapticrender.control.kernels import QUIET, TURN
+from hapticrender.control.kernels import TURN
 from hapticrender.control.polar.kernels import (
     AMOUNT,
     AMPLITUDE1,
     COS,
-    DRIVE,
     FAR,
     FASTEST,
     FORWARD,
+    FOUR_SOUNDS,
     FREQUENCY,
     LIVE,
     LOOP_ROWS,
@@ -41,6 +41,7 @@ from hapticrender.control.polar.kernels import (
     REFRESH,
     SHARED_ROWS,
     SIN,
+    SOUNDS,
     SPEED,
     START,
     TARGET_IM,
@@ -48,6 +49,7 @@ from hapticrender.control.polar.kernels import (
     TRUST,
     TURN_COS,
     TURN_SIN,
+    VOICE,
     WANTED,
     X_IM,
     X_RE,
@@ -142,12 +144,11 @@ def decide(tables, state, t, count, c, d):
     A Re e^j(theta + psi + arg R) is one cosine, worked out while the loops wait for themselves.
     """
     loop, scratch, law, floor, sums = state.loop, state.scratch, tables.numbers.law, tables.numbers.floor, state.sum
-    at, to, wanted = c * LOOP_ROWS + AMPLITUDE1, d * LOOP_ROWS + AMPLITUDE1, lanes(state.band, t, AMOUNT)
+    at, to = c * LOOP_ROWS + AMPLITUDE1, d * LOOP_ROWS + AMPLITUDE1
     a1, a2, p1, p2 = lanes(loop, t, at), lanes(loop, t, at + 1), lanes(loop, t, at + 2), lanes(loop, t, at + 3)
     e1, e2, q1, q2 = lanes(loop, t, to), lanes(loop, t, to + 1), lanes(loop, t, to + 2), lanes(loop, t, to + 3)
-    gain, strength = law[0] * lanes(loop, t, c * LOOP_ROWS + DRIVE), law[0] * lanes(loop, t, d * LOOP_ROWS + DRIVE)
-    sounds = select(wanted > QUIET, 1.0, 0.0 * wanted)
-    four = 4.0 * sounds
+    gain, strength = lanes(loop, t, c * LOOP_ROWS + VOICE), lanes(loop, t, d * LOOP_ROWS + VOICE)
+    sounds, four = lanes(state.band, t, SOUNDS), lanes(state.band, t, FOUR_SOUNDS)
     for m in range(count):
         wish, one, two = lanes(scratch, WISH, m), lanes(sums, c, m), lanes(sums, d, m)
         amount, a1, a2 = clamped_step(law, a1, a2, lanes(scratch, FIRST + 2 * c, m), floor)

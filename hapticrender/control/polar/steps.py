@@ -12,15 +12,15 @@ from hapticrender.compiled.jit import kernel
 from hapticrender.compiled.lanes import any_of, high, low, select, size, totals
 from hapticrender.compiled.lanes_memory import lanes, put, put_pairs, read, write
 from hapticrender.compiled.polynomials import cosine, polar
-from hapticrender.control.kernels import QUIET, TURN
+from hapticrender.control.kernels import TURN
 from hapticrender.control.polar.kernels import (
     AMOUNT,
     AMPLITUDE1,
     BEHIND,
     COS,
-    DRIVE,
     FORWARD,
     FOUND,
+    FOUR_SOUNDS,
     FREQUENCY,
     LIVE,
     LOOP_ROWS,
@@ -28,6 +28,7 @@ from hapticrender.control.polar.kernels import (
     REFRESH,
     SHARED_ROWS,
     SIN,
+    SOUNDS,
     START,
     TARGET_IM,
     TARGET_RE,
@@ -35,6 +36,7 @@ from hapticrender.control.polar.kernels import (
     TRUST,
     TURN_COS,
     TURN_SIN,
+    VOICE,
     X_IM,
     X_RE,
     believed,
@@ -117,16 +119,17 @@ def compare(loop, t, base):
 
 
 @kernel
-def answered(numbers, loop, t, base, wanted, found, lag, wish):
+def answered(numbers, band, loop, t, base, found, lag, wish):
     """Drive of a tile in a coordinate: `answer` to an amplitude and a phase."""
-    law, at, to, sounds = numbers.law, base + AMPLITUDE1, base + THETA1, select(wanted > QUIET, 1.0, 0.0 * wanted)
-    amount, s1, s2 = clamped_step(law, lanes(loop, t, at), lanes(loop, t, at + 1), wanted - found, numbers.floor)
+    law, at, to = numbers.law, base + AMPLITUDE1, base + THETA1
+    error, sounds, four = lanes(band, t, AMOUNT) - found, lanes(band, t, SOUNDS), lanes(band, t, FOUR_SOUNDS)
+    amount, s1, s2 = clamped_step(law, lanes(loop, t, at), lanes(loop, t, at + 1), error, numbers.floor)
     put(loop, t, at, s1)
     put(loop, t, at + 1, s2)
-    theta, s1, s2 = law_step(law, lanes(loop, t, to), lanes(loop, t, to + 1), sounds, 4.0 * sounds, lag)
+    theta, s1, s2 = law_step(law, lanes(loop, t, to), lanes(loop, t, to + 1), sounds, four, lag)
     put(loop, t, to, s1)
     put(loop, t, to + 1, s2)
-    return law[0] * lanes(loop, t, base + DRIVE) * amount * cosine(wish - (law[0] / TURN) * theta)
+    return lanes(loop, t, base + VOICE) * amount * cosine(wish - (law[0] / TURN) * theta)
 
 
 @kernel
@@ -139,7 +142,7 @@ def tiles_step(tables, state, target):
     number, twice = state.sample[0] % REFRESH, 2.0 * numbers.filter[0]
     gain, other_gain = twice * read(state.shared, SHARED_ROWS, 0), twice * read(state.shared, SHARED_ROWS + last, 0)
     for t in range(band.shape[0]):
-        if number == 0 or target.ndim == 1:  # scenarios side by side keep the last one's only
+        if target.ndim == 1:  # scenarios side by side are not asked for theirs
             put_pairs(target, t, lanes(band, t, TARGET_RE), lanes(band, t, FORWARD) * lanes(band, t, TARGET_IM))
         cos, sin = carry_on(state, t, number)
         heard(numbers, loop, t, 0, gain, cos, sin)
@@ -152,11 +155,11 @@ def tiles_step(tables, state, target):
     one = other = 0.0 * lanes(band, 0, LIVE)
     elapsed = number / numbers.rate
     for t in range(band.shape[0]):
-        wanted, wish = lanes(band, t, AMOUNT), lanes(band, t, START) + elapsed * lanes(band, t, FREQUENCY)
-        one += answered(numbers, loop, t, 0, wanted, lanes(loop, t, FOUND), lanes(loop, t, BEHIND), wish)
+        wish = lanes(band, t, START) + elapsed * lanes(band, t, FREQUENCY)
+        one += answered(numbers, band, loop, t, 0, lanes(loop, t, FOUND), lanes(loop, t, BEHIND), wish)
         if last > 0:
             found, lag = lanes(loop, t, LOOP_ROWS + FOUND), lanes(loop, t, LOOP_ROWS + BEHIND)
-            other += answered(numbers, loop, t, LOOP_ROWS, wanted, found, lag, wish)
+            other += answered(numbers, band, loop, t, LOOP_ROWS, found, lag, wish)
     return totals(read(state.shared, TRUST, 0), one, other)
 
 
