@@ -85,12 +85,12 @@ def test_a_read_only_install_with_no_cache_still_runs(tmp_path):
     script = """
 import pathlib, sys
 import hapticrender as hr
-from hapticrender.control.bank.kernels import bank_run
+from hapticrender.plants.closed import closed_plate_run
 from numba.core.caching import NullCache
 assert pathlib.Path(hr.__file__).is_relative_to(sys.argv[1]), hr.__file__
-assert isinstance(bank_run._cache, NullCache), bank_run._cache
 scene = hr.Scene(texture=hr.Grating(frequency=47.0, amplitude=10e-6), duration=0.01)
 print(len(hr.render(scene).drive))
+assert closed_plate_run.signatures and isinstance(closed_plate_run._cache, NullCache), closed_plate_run._cache
 """
     for path in sorted((tmp_path / "site").rglob("*"), reverse=True):
         path.chmod(0o555 if path.is_dir() else 0o444)

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from numba.core import types
-from numba.core.caching import FunctionCache, IndexDataCacheFile
+from numba.core.caching import FunctionCache, IndexDataCacheFile, NullCache
 from numba.core.ccallback import CFunc
 from numba.core.compiler_lock import global_compiler_lock
 from numba.core.imputils import lower_builtin
@@ -65,6 +65,13 @@ class _StampedCache(FunctionCache):
         )
 
 
+def _cache_of(function: Any) -> Any:
+    try:
+        return _StampedCache(function)
+    except RuntimeError:  # numba: no writable cache location
+        return NullCache()
+
+
 class _Fragment(CPUDispatcher):
     """A kernel as its callers see it: typed and lowered once for each of its types, compiled inside of them."""
 
@@ -95,9 +102,16 @@ class _Kernel(CPUDispatcher):
         super().__init__(function, targetoptions=targetoptions or dict(OPTIONS, nopython=True))
         self.fragment = _Fragment(function)
         self._compiler: Any = compiler(function, self.targetdescr, self.targetoptions, whole=True)
+        self._cache: Any = NullCache()
+        self.cached = False
 
     def compile(self, sig: Any) -> Any:
-        """Compile for these arguments, without a look for garbage at every step."""
+        """Compile for these arguments, without a look for garbage at every step.
+
+        Most kernels are parts of others and never come here: to look for a cache takes longer than to make the kernel.
+        """
+        if self.cached and isinstance(self._cache, NullCache):
+            self._cache = _cache_of(self.py_func)
         collects = gc.isenabled()
         gc.disable()
         try:
@@ -122,10 +136,7 @@ def kernel(function: Any) -> Any:
     than the arithmetic), and it becomes part of its caller, so that named tuples cost nothing to pass.
     """
     compiled = _Kernel(function)
-    try:
-        compiled._cache = _StampedCache(function)  # type: ignore[attr-defined]
-    except RuntimeError:  # numba: no writable cache location
-        pass
+    compiled.cached = True
     return compiled
 
 
@@ -154,9 +165,6 @@ def by_types(choose: Any) -> Any:
 def callback(function: Any, returned: Any, *taken: Any) -> Any:
     """Compile `function` for callers in C, cached on disk: a `CFunc` with `address` and `ctypes`."""
     compiled: Any = CFunc(function, (taken, returned), {}, OPTIONS)
-    try:
-        compiled._cache = _StampedCache(function)
-    except RuntimeError:
-        pass
+    compiled._cache = _cache_of(function)
     compiled.compile()
     return compiled
