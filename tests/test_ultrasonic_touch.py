@@ -258,10 +258,14 @@ def test_an_overload_leaves_nothing_behind_on_a_plate_that_rings_long(monkeypatc
     load = ((0.0, 0.15, 0.151, 0.25, 0.251, 1.0), (0.2, 0.2, 1.5, 1.5, 0.2, 0.2))
 
     def settled():
-        finger = hr.Finger.still(normal_load=load)
-        run = ran(ASKED, 0.45, finger, quality=quality, drive_limit=1.5, sensor_noise=0.0)
-        assert (run.between(0.2, 0.25).flags & Flag.SATURATED).any()
-        return 1e3 * run.between(0.251, 0.44).settled_after(BOUND)
+        """Middle of five plates: the drive is rounded, and when an error crosses the bound last is a chance."""
+        after = []
+        for similar in quality * np.linspace(0.96, 1.0, 5):
+            finger = hr.Finger.still(normal_load=load)
+            run = ran(ASKED, 0.45, finger, quality=similar, drive_limit=1.5, sensor_noise=0.0)
+            assert (run.between(0.2, 0.25).flags & Flag.SATURATED).any()
+            after.append(1e3 * run.between(0.251, 0.44).settled_after(BOUND))
+        return np.median(after)
 
     assert settled() <= back
     monkeypatch.setattr(controller, "TOUCHED_FADE", 0.0)
