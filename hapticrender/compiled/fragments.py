@@ -8,12 +8,11 @@ fragment each), and the root links them all, is optimised as a whole and made to
 from __future__ import annotations
 
 import copy
-import operator
 from contextlib import nullcontext
 from functools import lru_cache
 from typing import Any
 
-from numba.core import cgutils, ir, types
+from numba.core import types
 from numba.core.codegen import JITCodeLibrary
 from numba.core.compiler import CompilerBase
 from numba.core.compiler_machinery import PassManager
@@ -22,7 +21,6 @@ from numba.core.dispatcher import _FunctionCompiler  # type: ignore[attr-defined
 from numba.core.errors import NumbaError
 from numba.core.interpreter import Interpreter, peep_hole_delete_with_exit
 from numba.core.ir_utils import build_definitions
-from numba.core.lowering import Lower
 from numba.core.rewrites.registry import RewriteRegistry
 from numba.core.rewrites.static_binop import DetectStaticBinops
 from numba.core.rewrites.static_getitem import RewriteConstGetitems
@@ -33,6 +31,7 @@ from numba.core.typeinfer import TypeInferer
 from numba.core.typing.context import Context
 from numba.core.untyped_passes import FixupArgs
 
+from hapticrender.compiled.lowering import KernelLower
 from hapticrender.compiled.records import Layout
 
 REWRITES = RewriteRegistry()  # entries of tuples whose index is known, powers whose exponent is
@@ -42,71 +41,11 @@ REWRITES.register("before-inference")(DetectStaticBinops)
 LINE = 64  # bytes of a cache line, and of the widest register
 
 
-class _KernelLower(Lower):
-    """Numba's step to LLVM's code for what kernels consist of: nothing is counted, so nothing has to be given back."""
-
-    def lower_block(self, block: Any) -> None:
-        """Write the code of a block."""
-        for each in block.body:
-            self.loc = each.loc
-            self.lower_inst(each)
-
-    def lower_inst(self, inst: Any) -> None:
-        """Write the code of a statement."""
-        if isinstance(inst, ir.Assign):
-            name = inst.target.name
-            self.storevar(self.lower_assign(self.typeof(name), inst), name)
-        else:
-            super().lower_inst(inst)
-
-    def lower_call(self, resty: Any, expr: Any) -> Any:
-        """Write the code of a call."""
-        kind, signature = self.typeof(expr.func.name), self.fndesc.calltypes[expr]
-        args = self.fold_call_args(kind, signature, expr.args, expr.vararg, expr.kws)
-        if signature.recvr:
-            args = [self.loadvar(expr.func.name), *args]
-        found = self.context.get_function(kind, signature)(self.builder, args, self.loc)
-        if found is None:
-            found = self.context.get_dummy_value()
-        return self.context.cast(self.builder, found, signature.return_type, resty)
-
-    def lower_binop(self, resty: Any, expr: Any, op: Any) -> Any:
-        """Write the code of an operator."""
-        if expr.static_lhs is not ir.UNDEFINED or expr.static_rhs is not ir.UNDEFINED:  # a power that is known
-            return super().lower_binop(resty, expr, op)
-        return self.operated(op, self.fndesc.calltypes[expr], (expr.lhs, expr.rhs), resty)
-
-    def lower_getitem(self, resty: Any, expr: Any, value: Any, index: Any, signature: Any) -> Any:
-        """Write the code that takes an item."""
-        return self.operated(operator.getitem, signature, (value, index), resty)
-
-    def operated(self, op: Any, signature: Any, operands: Any, resty: Any) -> Any:
-        """Return what an operator makes of its operands."""
-        values = [self._cast_var(each, kind) for each, kind in zip(operands, signature.args, strict=True)]
-        typing = self.context.typing_context
-        known = typing.resolve_value_type(op)
-        exact = typing.resolve_function_type(known, signature.args, {})
-        found = self.context.get_function(known, exact)(self.builder, values)
-        return self.context.cast(self.builder, found, signature.return_type, resty)
-
-    def storevar(self, value: Any, name: str, argidx: Any = None) -> None:
-        """Keep a value."""
-        self._alloca_var(name, self.typeof(name))
-        if name in self._singly_assigned_vars:
-            self._blk_local_varmap[name] = value
-        else:
-            self.builder.store(value, self.getvar(name))
-
-    def alloca_lltype(self, name: str, lltype: Any, datamodel: Any = None) -> Any:
-        """Make room for a variable."""
-        return cgutils.alloca_once(self.builder, lltype, name=name)
-
-
 class _KernelLowering(NativeLowering):
     @property
     def lowering_class(self) -> Any:
         """What lowers a kernel."""
-        return _KernelLower
+        return KernelLower
 
 
 class _Interpreter(Interpreter):

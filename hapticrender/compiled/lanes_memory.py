@@ -18,19 +18,21 @@ from hapticrender.compiled.lanes import WIDTH, LaneType, number_type
 from hapticrender.compiled.records import kept_apart
 
 
-def _parts(context: Any, builder: Any, kind: Any, array: Any) -> Any:
-    """Pointer to an array's numbers, and its shape."""
-    model = context.data_model_manager[kind]
-    data, shape = (builder.extract_value(array, model.get_field_position(name)) for name in ("data", "shape"))
-    return data, cgutils.unpack_tuple(builder, shape, kind.ndim)
+def _length(context: Any, builder: Any, kind: Any, array: Any, axis: int) -> Any:
+    """Length of an array along an axis."""
+    return builder.extract_value(array, [context.data_model_manager[kind].get_field_position("shape"), axis])
+
+
+def _data(context: Any, builder: Any, kind: Any, array: Any) -> Any:
+    """Pointer to an array's numbers."""
+    return builder.extract_value(array, context.data_model_manager[kind].get_field_position("data"))
 
 
 def _address(context: Any, builder: Any, kind: Any, array: Any, *where: Any) -> Any:
     """Pointer to a row of lanes: array[where], each where counted in rows of the last axis but one."""
-    data, shape = _parts(context, builder, kind, array)
-    row = where[0]
+    data, row = _data(context, builder, kind, array), where[0]
     for axis, index in enumerate(where[1:], 1):
-        row = builder.add(builder.mul(row, shape[axis]), index)
+        row = builder.add(builder.mul(row, _length(context, builder, kind, array, axis)), index)
     width = WIDTH[np.dtype(str(kind.dtype))]
     vector = ir.VectorType(number_type(kind.dtype), width)
     return builder.gep(builder.bitcast(data, vector.as_pointer()), [row])
@@ -172,7 +174,7 @@ def put_column(typingctx: Any, array: Any, i: Any, j: Any, value: Any) -> Any:
 
 def _down(context: Any, builder: Any, kind: Any, count: int, array: Any, i: Any, j: Any) -> list[Any]:
     """Pointers to array[i, j], array[i + 1, j] ...; past the last row, to that one again."""
-    last = builder.sub(_parts(context, builder, kind, array)[1][0], ir.IntType(64)(1))
+    last = builder.sub(_length(context, builder, kind, array, 0), ir.IntType(64)(1))
     rows = [builder.add(i, ir.IntType(64)(k)) for k in range(count)]
     rows = [builder.select(builder.icmp_signed("<", row, last), row, last) for row in rows]
     return [_number(context, builder, kind, array, row, j) for row in rows]
@@ -194,11 +196,11 @@ def put_pairs(typingctx: Any, array: Any, i: Any, re: Any, im: Any) -> Any:
                 at = _address(context, builder, kind, where, index, ir.IntType(64)(j))
                 builder.store(value, at, align=_wide(kind))
             return context.get_dummy_value()
-        data, shape = _parts(context, builder, kind, where)
+        data = _data(context, builder, kind, where)
         element = number_type(kind.dtype.underlying_float)
         first, second = (_converted(builder, value, element) for value in (first, second))
         start = builder.mul(index, ir.IntType(64)(width))
-        room = builder.sub(shape[0], start)
+        room = builder.sub(_length(context, builder, kind, where, 0), start)
         numbers = builder.gep(builder.bitcast(data, element.as_pointer()), [builder.shl(start, ir.IntType(64)(1))])
         with builder.if_else(builder.icmp_signed(">=", room, ir.IntType(64)(width))) as (whole, part):
             with whole:
@@ -304,7 +306,7 @@ def record_whole(typingctx: Any, value: Any, array: Any, i: Any) -> Any:
 
     def build(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         vector = ir.VectorType(ir.IntType(64), value.width)
-        data, _ = _parts(context, builder, sig.args[1], args[1])
+        data = _data(context, builder, sig.args[1], args[1])
         at = builder.gep(builder.bitcast(data, vector.as_pointer()), [args[2]])
         _past_caches(builder, builder.store(builder.fptosi(args[0], vector), at, align=_wide(value)))
         return context.get_dummy_value()
@@ -328,8 +330,7 @@ def _is_numbers(kind: Any, indices: int) -> bool:
 
 def _number(context: Any, builder: Any, kind: Any, array: Any, *where: Any) -> Any:
     """Pointer to one number of an array."""
-    data, shape = _parts(context, builder, kind, array)
     at = where[0]
     for axis, index in enumerate(where[1:], 1):
-        at = builder.add(builder.mul(at, shape[axis]), index)
-    return builder.gep(data, [at])
+        at = builder.add(builder.mul(at, _length(context, builder, kind, array, axis)), index)
+    return builder.gep(_data(context, builder, kind, array), [at])
