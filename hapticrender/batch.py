@@ -188,7 +188,7 @@ def together(scenarios: Sequence[Scenario], controllers: Sequence[Controller], s
     samples = int(round(seconds * plates[0].rate))
     control, control_state = FAMILIES[type(controllers[0])].batch_of(controllers)
     (tables, state), last = batch_state(plates), aligned((2, LANES))
-    target, nothing = aligned((controllers[0].n_bands, 2, LANES)), aligned((1, LANES))
+    target, nothing = np.zeros((0, 0, 0)), aligned((1, LANES))
     motion, sensed, drive, flags = _side_by_side(samples, (3, 2, 2, 1))
     raised = flags[:, 0].view(np.int64)
     fingers = _fingers(plates)

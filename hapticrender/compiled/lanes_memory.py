@@ -15,45 +15,34 @@ from numba.core import cgutils, types
 from numba.core.extending import intrinsic
 
 from hapticrender.compiled.lanes import WIDTH, LaneType, number_type
+from hapticrender.compiled.lowering import data_of, flat, length_of
 from hapticrender.compiled.records import kept_apart
 
 
-def _length(context: Any, builder: Any, kind: Any, array: Any, axis: int) -> Any:
-    """Length of an array along an axis."""
-    return builder.extract_value(array, [context.data_model_manager[kind].get_field_position("shape"), axis])
-
-
-def _data(context: Any, builder: Any, kind: Any, array: Any) -> Any:
-    """Pointer to an array's numbers."""
-    return builder.extract_value(array, context.data_model_manager[kind].get_field_position("data"))
-
-
-def _address(context: Any, builder: Any, kind: Any, array: Any, *where: Any) -> Any:
+def _address(builder: Any, kind: Any, array: Any, *where: Any) -> Any:
     """Pointer to a row of lanes: array[where], each where counted in rows of the last axis but one."""
-    data, row = _data(context, builder, kind, array), where[0]
-    for axis, index in enumerate(where[1:], 1):
-        row = builder.add(builder.mul(row, _length(context, builder, kind, array, axis)), index)
     width = WIDTH[np.dtype(str(kind.dtype))]
     vector = ir.VectorType(number_type(kind.dtype), width)
-    return builder.gep(builder.bitcast(data, vector.as_pointer()), [row])
+    rows = builder.bitcast(data_of(builder, array), vector.as_pointer())
+    return builder.gep(rows, [flat(builder, array, where)])
 
 
-def _load(context: Any, builder: Any, kind: Any, array: Any, where: Any, count: int) -> Any:
+def _load(builder: Any, kind: Any, array: Any, where: Any, count: int) -> Any:
     """Value at `where`: a row of lanes or a number."""
     if _is_rows(kind, count):
-        value = builder.load(_address(context, builder, kind, array, *where), align=_wide(kind))
+        value = builder.load(_address(builder, kind, array, *where), align=_wide(kind))
     else:
-        value = builder.load(_number(context, builder, kind, array, *where))
+        value = builder.load(_number(builder, kind, array, *where))
     kept_apart(builder, value, "tile" if kind.ndim == 3 and _is_rows(kind, count) else "own")
     return value
 
 
-def _store(context: Any, builder: Any, kind: Any, array: Any, where: Any, count: int, value: Any) -> Any:
+def _store(builder: Any, kind: Any, array: Any, where: Any, count: int, value: Any) -> Any:
     """Write a row of lanes or a number at `where`."""
     if _is_rows(kind, count):
-        access = builder.store(value, _address(context, builder, kind, array, *where), align=_wide(kind))
+        access = builder.store(value, _address(builder, kind, array, *where), align=_wide(kind))
     else:
-        access = builder.store(value, _number(context, builder, kind, array, *where))
+        access = builder.store(value, _number(builder, kind, array, *where))
     kept_apart(builder, access, "tile" if kind.ndim == 3 and _is_rows(kind, count) else "own")
     return access
 
@@ -77,7 +66,7 @@ def lanes(typingctx: Any, array: Any, i: Any, j: Any) -> Any:
     if not _is_rows(array, 2):
         return None
     return _lane(array)(array, types.intp, types.intp), lambda context, builder, sig, args: _load(
-        context, builder, sig.args[0], args[0], args[1:], 2
+        builder, sig.args[0], args[0], args[1:], 2
     )
 
 
@@ -88,7 +77,7 @@ def put(typingctx: Any, array: Any, i: Any, j: Any, value: Any) -> Any:
         return None
 
     def build(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        _store(context, builder, sig.args[0], args[0], args[1:3], 2, args[3])
+        _store(builder, sig.args[0], args[0], args[1:3], 2, args[3])
         return context.get_dummy_value()
 
     return types.none(array, types.intp, types.intp, _lane(array)), build
@@ -102,7 +91,7 @@ def stretch(typingctx: Any, array: Any, i: Any, j: Any) -> Any:
     kind = _lane(array)
 
     def build(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        at = _number(context, builder, sig.args[0], *args)
+        at = _number(builder, sig.args[0], *args)
         vector = ir.VectorType(number_type(kind.dtype), kind.width)
         return builder.load(builder.bitcast(at, vector.as_pointer()), align=kind.dtype.bitwidth // 8)
 
@@ -116,7 +105,7 @@ def taken(typingctx: Any, array: Any, i: Any, j: Any, like: Any) -> Any:
         return None
 
     def build(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        at = _number(context, builder, sig.args[0], *args[:3])
+        at = _number(builder, sig.args[0], *args[:3])
         vector = ir.VectorType(number_type(array.dtype), like.width)
         value = builder.load(builder.bitcast(at, vector.as_pointer()), align=array.dtype.bitwidth // 8)
         return _converted(builder, value, number_type(like.dtype))
@@ -132,7 +121,7 @@ def put_stretch(typingctx: Any, array: Any, i: Any, j: Any, value: Any) -> Any:
     kind = value if isinstance(value, LaneType) else _lane(array)
 
     def build(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        at = _number(context, builder, sig.args[0], *args[:3])
+        at = _number(builder, sig.args[0], *args[:3])
         given = _converted(builder, args[3], number_type(array.dtype))
         builder.store(given, builder.bitcast(at, given.type.as_pointer()), align=array.dtype.bitwidth // 8)
         return context.get_dummy_value()
@@ -149,7 +138,7 @@ def column(typingctx: Any, array: Any, i: Any, j: Any) -> Any:
 
     def build(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         value = ir.Constant(ir.VectorType(number_type(kind.dtype), kind.width), ir.Undefined)
-        for lane, at in enumerate(_down(context, builder, sig.args[0], kind.width, *args)):
+        for lane, at in enumerate(_down(builder, sig.args[0], kind.width, *args)):
             value = builder.insert_element(value, builder.load(at), ir.IntType(32)(lane))
         return value
 
@@ -164,7 +153,7 @@ def put_column(typingctx: Any, array: Any, i: Any, j: Any, value: Any) -> Any:
     kind = _lane(array)
 
     def build(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        rows = _down(context, builder, sig.args[0], kind.width, *args[:3])
+        rows = _down(builder, sig.args[0], kind.width, *args[:3])
         for lane in reversed(range(kind.width)):  # the last row's own comes after those that are past it
             builder.store(builder.extract_element(args[3], ir.IntType(32)(lane)), rows[lane])
         return context.get_dummy_value()
@@ -172,19 +161,19 @@ def put_column(typingctx: Any, array: Any, i: Any, j: Any, value: Any) -> Any:
     return types.none(array, types.intp, types.intp, kind), build
 
 
-def _down(context: Any, builder: Any, kind: Any, count: int, array: Any, i: Any, j: Any) -> list[Any]:
+def _down(builder: Any, kind: Any, count: int, array: Any, i: Any, j: Any) -> list[Any]:
     """Pointers to array[i, j], array[i + 1, j] ...; past the last row, to that one again."""
-    last = builder.sub(_length(context, builder, kind, array, 0), ir.IntType(64)(1))
+    last = builder.sub(length_of(builder, array, 0), ir.IntType(64)(1))
     rows = [builder.add(i, ir.IntType(64)(k)) for k in range(count)]
     rows = [builder.select(builder.icmp_signed("<", row, last), row, last) for row in rows]
-    return [_number(context, builder, kind, array, row, j) for row in rows]
+    return [_number(builder, kind, array, row, j) for row in rows]
 
 
 @intrinsic
 def put_pairs(typingctx: Any, array: Any, i: Any, re: Any, im: Any) -> Any:
-    """Write W complex numbers from array[i * W] on, as many as there is room for; or rows array[i, 0] and array[i, 1].
+    """Write W complex numbers from array[i * W] on, as many as there is room for.
 
-    The first form is for a complex array of bands, the second for scenarios side by side, shape (bands, 2, W).
+    Scenarios side by side are not asked for theirs: nothing is written where the array has three axes.
     """
     if not (isinstance(array, types.Array) and isinstance(re, LaneType) and re == im):
         return None
@@ -192,15 +181,12 @@ def put_pairs(typingctx: Any, array: Any, i: Any, re: Any, im: Any) -> Any:
     def build(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         kind, (where, index, first, second), width = sig.args[0], args, re.width
         if kind.ndim == 3:
-            for j, value in enumerate((first, second)):
-                at = _address(context, builder, kind, where, index, ir.IntType(64)(j))
-                builder.store(value, at, align=_wide(kind))
             return context.get_dummy_value()
-        data = _data(context, builder, kind, where)
+        data = data_of(builder, where)
         element = number_type(kind.dtype.underlying_float)
         first, second = (_converted(builder, value, element) for value in (first, second))
         start = builder.mul(index, ir.IntType(64)(width))
-        room = builder.sub(_length(context, builder, kind, where, 0), start)
+        room = builder.sub(length_of(builder, where, 0), start)
         numbers = builder.gep(builder.bitcast(data, element.as_pointer()), [builder.shl(start, ir.IntType(64)(1))])
         with builder.if_else(builder.icmp_signed(">=", room, ir.IntType(64)(width))) as (whole, part):
             with whole:
@@ -237,7 +223,7 @@ def row_totals(typingctx: Any, array: Any, i: Any, j: Any) -> Any:
     def build(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         width, index = sig.return_type.width, ir.VectorType(ir.IntType(32), sig.return_type.width)
         rows = [
-            _load(context, builder, sig.args[0], args[0], (args[1], builder.add(args[2], ir.IntType(64)(k))), 2)
+            _load(builder, sig.args[0], args[0], (args[1], builder.add(args[2], ir.IntType(64)(k))), 2)
             for k in range(width)
         ]
         block = 1
@@ -265,7 +251,7 @@ def read(typingctx: Any, array: Any, *index: Any) -> Any:
         return None
     kind = _lane(array) if _is_rows(array, count) else array.dtype
     return kind(array, types.StarArgTuple.from_types([types.intp] * count)), lambda context, builder, sig, args: _load(
-        context, builder, sig.args[0], args[0], cgutils.unpack_tuple(builder, args[1]), count
+        builder, sig.args[0], args[0], cgutils.unpack_tuple(builder, args[1]), count
     )
 
 
@@ -288,7 +274,7 @@ def _written(array: Any, index: Any, *, soon: bool) -> Any:
         return None
 
     def build(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        access = _store(context, builder, sig.args[1], args[1], cgutils.unpack_tuple(builder, args[2]), count, args[0])
+        access = _store(builder, sig.args[1], args[1], cgutils.unpack_tuple(builder, args[2]), count, args[0])
         if rows and not soon:
             _past_caches(builder, access)
         return context.get_dummy_value()
@@ -306,7 +292,7 @@ def record_whole(typingctx: Any, value: Any, array: Any, i: Any) -> Any:
 
     def build(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         vector = ir.VectorType(ir.IntType(64), value.width)
-        data = _data(context, builder, sig.args[1], args[1])
+        data = data_of(builder, args[1])
         at = builder.gep(builder.bitcast(data, vector.as_pointer()), [args[2]])
         _past_caches(builder, builder.store(builder.fptosi(args[0], vector), at, align=_wide(value)))
         return context.get_dummy_value()
@@ -328,9 +314,6 @@ def _is_numbers(kind: Any, indices: int) -> bool:
     return isinstance(kind, types.Array) and kind.layout == "C" and kind.ndim == indices
 
 
-def _number(context: Any, builder: Any, kind: Any, array: Any, *where: Any) -> Any:
+def _number(builder: Any, kind: Any, array: Any, *where: Any) -> Any:
     """Pointer to one number of an array."""
-    at = where[0]
-    for axis, index in enumerate(where[1:], 1):
-        at = builder.add(builder.mul(at, _length(context, builder, kind, array, axis)), index)
-    return builder.gep(_data(context, builder, kind, array), [at])
+    return builder.gep(data_of(builder, array), [flat(builder, array, where)])

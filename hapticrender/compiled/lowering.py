@@ -113,21 +113,32 @@ def is_entry(kind: Any, at: Any) -> bool:
     return plain and all(types.unliteral(each) == types.intp for each in indices)
 
 
+def data_of(builder: Any, array: Any) -> Any:
+    """Pointer to an array's numbers."""
+    return builder.extract_value(array, DATA)
+
+
+def length_of(builder: Any, array: Any, axis: int) -> Any:
+    """Length of an array along an axis."""
+    return builder.extract_value(array, [SHAPE, axis])
+
+
+def flat(builder: Any, array: Any, where: Any) -> Any:
+    """Place of array[where], one axis after another, counted in what the axes left out hold."""
+    place = where[0]
+    for axis, index in enumerate(where[1:], 1):
+        place = builder.add(builder.mul(place, length_of(builder, array, axis)), index)
+    return place
+
+
 def entry(builder: Any, kind: Any, array: Any, at: Any, index: Any) -> Any:
     """Pointer to a number in an array; indices below 0 count from its end."""
-    many = isinstance(at, types.BaseTuple)
-    place = None
-    for axis in range(kind.ndim):
-        one, length = builder.extract_value(index, axis) if many else index, None
+    where = cgutils.unpack_tuple(builder, index, kind.ndim) if isinstance(at, types.BaseTuple) else [index]
+    for axis, one in enumerate(where):
         if not isinstance(one, llvm.Constant) or one.constant < 0:
-            length = builder.extract_value(array, [SHAPE, axis])
             below = builder.icmp_signed("<", one, one.type(0))
-            one = builder.select(below, builder.add(one, length), one)
-        if place is not None:
-            length = length or builder.extract_value(array, [SHAPE, axis])
-            one = builder.add(builder.mul(place, length), one)
-        place = one
-    return builder.gep(builder.extract_value(array, DATA), [place])
+            where[axis] = builder.select(below, builder.add(one, length_of(builder, array, axis)), one)
+    return builder.gep(data_of(builder, array), [flat(builder, array, where)])
 
 
 def span(builder: Any, args: Any, kind: Any) -> Any:

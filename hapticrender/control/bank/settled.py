@@ -81,7 +81,7 @@ def settled_tile(tables, state, t, c, integral, cos, sin, before):
 def settled_sums(tables, state, c, d, integral, turn, target):
     """What is known of coordinates c and d before they are heard; the bands are looked at once for both.
 
-    Carriers are to `turn` on to this sample unless they have been set for it.  Fills `target` of a single scenario.
+    Carriers are to `turn` on to this sample unless they have been set for it.  Fills `target`.
     """
     band = state.band
     wanted = 0.0 * lanes(band, 0, row.COS)
@@ -89,8 +89,7 @@ def settled_sums(tables, state, c, d, integral, turn, target):
     for t in range(band.shape[0]):
         cos, sin = turn_pass(band, t) if turn else (lanes(band, t, row.COS), lanes(band, t, row.SIN))
         re, im = lanes(band, t, row.R_RE), lanes(band, t, row.R_IM)
-        if target.ndim == 1:  # scenarios side by side are not asked for theirs
-            put_pairs(target, t, re, im)
+        put_pairs(target, t, re, im)
         wanted = along(re, im, cos, sin, wanted)
         one = settled_tile(tables, state, t, c, integral, cos, sin, one)
         if d > c:

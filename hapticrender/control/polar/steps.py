@@ -142,8 +142,7 @@ def tiles_step(tables, state, target):
     number, twice = state.sample[0] % REFRESH, 2.0 * numbers.filter[0]
     gain, other_gain = twice * read(state.shared, SHARED_ROWS, 0), twice * read(state.shared, SHARED_ROWS + last, 0)
     for t in range(band.shape[0]):
-        if target.ndim == 1:  # scenarios side by side are not asked for theirs
-            put_pairs(target, t, lanes(band, t, TARGET_RE), lanes(band, t, FORWARD) * lanes(band, t, TARGET_IM))
+        put_pairs(target, t, lanes(band, t, TARGET_RE), lanes(band, t, FORWARD) * lanes(band, t, TARGET_IM))
         cos, sin = carry_on(state, t, number)
         heard(numbers, loop, t, 0, gain, cos, sin)
         if last > 0:
