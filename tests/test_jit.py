@@ -53,12 +53,20 @@ def toy(request, tmp_path):
 
 
 def run(package, value):
-    """Write the helper, call the caller in a fresh process; returns result and cache hits of the caller."""
+    """Write the helper, call the caller in a fresh process; returns result and cache hits of the caller.
+
+    Python itself would take a helper for the last one that is as long and was written in the same second: no byte code.
+    """
     (package / "helper.py").write_text(HELPER.format(jit="toy.compiled.jit", value=value))
     script = "from toy.caller import scaled; print(scaled(1.0), sum(scaled.stats.cache_hits.values()))"
     environment = {name: text for name, text in os.environ.items() if name != "NUMBA_CACHE_DIR"}
     done = subprocess.run(
-        [sys.executable, "-c", script], cwd=package.parent, env=environment, capture_output=True, text=True, check=True
+        [sys.executable, "-B", "-c", script],
+        cwd=package.parent,
+        env=environment,
+        capture_output=True,
+        text=True,
+        check=True,
     )
     result, hits = done.stdout.split()
     return float(result), int(hits)
@@ -164,6 +172,38 @@ def test_named_tuples_reach_a_kernel_and_its_parts():
     np.testing.assert_array_equal(record.out, 10.0 + 3.0 * x + 7.0)
     with pytest.raises(TypingError):
         fill(record._replace(offset="10"), x)
+
+
+class Mixed(NamedTuple):
+    a: float
+    b: float
+    count: int
+    on: bool
+    c: float
+    three: tuple
+    two: tuple
+    out: np.ndarray
+    inner: Inner
+    whole: np.ndarray
+    d: float
+
+
+@kernel
+def spread(mixed):
+    out, inner = mixed.out, mixed.inner
+    out[0], out[1], out[2], out[3], out[4] = mixed.a, mixed.b, mixed.count, mixed.on, mixed.c
+    for i in range(3):
+        out[5 + i] = mixed.three[i]
+    out[8], out[9] = mixed.two[0], mixed.two[1]
+    out[10], out[11], out[12] = inner.gain, inner.steps[0], inner.steps[1]
+    out[13], out[14], out[15] = mixed.whole[0], mixed.whole[1], mixed.d
+
+
+def test_every_kind_of_field_arrives_where_it_belongs():
+    """Runs of floats between other numbers, tuples of one kind, arrays of two kinds, a record inside."""
+    out, whole = np.zeros(16), np.array([13, 14])
+    spread(Mixed(0.5, 1.0, 2, True, 4.0, (5.0, 6.0, 7.0), (8, 9), out, Inner(10.0, (11.0, 12.0)), whole, 15.0))
+    np.testing.assert_array_equal(out, [0.5, 1, 2, 1, *range(4, 16)])
 
 
 @kernel

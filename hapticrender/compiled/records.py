@@ -89,14 +89,63 @@ def _unboxed(kind: RecordType, source: Any, c: Any) -> NativeValue:
 
 def _fill(kind: RecordType, source: Any, record: Any, wrong: Any, c: Any) -> None:
     """Copy field by field; a number that is none is noticed once, at the end."""
-    for i, each in enumerate(kind.types):
-        found, at = c.pyapi.tuple_getitem(source, i), cgutils.gep_inbounds(c.builder, record, 0, i)
-        if isinstance(each, RecordType):
-            _fill(each, found, at, wrong, c)
-        elif each == types.float64:
-            c.builder.store(c.pyapi.float_as_double(found), at)
+    kinds, done = list(kind.types), 0
+    for i, each in enumerate(kinds):
+        if i < done:
+            continue
+        at = cgutils.gep_inbounds(c.builder, record, 0, i)
+        if each == types.float64:
+            done = next((j for j in range(i, len(kinds)) if kinds[j] != each), len(kinds))
+            _take_numbers(c, source, i, done - i, at)
+        elif isinstance(each, types.Array):
+            _take_array(c, source, i, at)
+        elif isinstance(each, RecordType):
+            _fill(each, c.pyapi.tuple_getitem(source, i), at, wrong, c)
+        elif isinstance(each, types.UniTuple) and each.dtype == types.float64:
+            _take_numbers(c, c.pyapi.tuple_getitem(source, i), 0, each.count, cgutils.gep_inbounds(c.builder, at, 0, 0))
         else:
-            native = c.unbox(each, found)
+            native = c.unbox(each, c.pyapi.tuple_getitem(source, i))
             with c.builder.if_then(native.is_error, likely=False):
                 c.builder.store(cgutils.true_bit, wrong)
             c.builder.store(native.value, at)
+
+
+def _helper(c: Any, name: str, taken: list[Any], write: Any) -> Any:
+    """Function of the wrapper's module, written once: in line it would be most of what there is to compile."""
+    module, python = c.builder.module, c.pyapi
+    found = module.globals.get(name)
+    if found is None:
+        kind = ir.FunctionType(python.pyobj, [python.pyobj, python.py_ssize_t])
+        item = cgutils.get_or_insert_function(module, kind, "PyTuple_GetItem")
+        found = ir.Function(module, ir.FunctionType(ir.VoidType(), taken), name)
+        found.linkage = "internal"
+        found.attributes.add("noinline")
+        builder = ir.IRBuilder(found.append_basic_block())
+        write(builder, c.context.get_python_api(builder), lambda *at: builder.call(item, at), *found.args)
+        builder.ret_void()
+    return found
+
+
+def _take_numbers(c: Any, source: Any, first: int, count: int, at: Any) -> None:
+    """Copy some floats of a tuple."""
+
+    def write(builder: Any, python: Any, item: Any, items: Any, start: Any, stop: Any, to: Any) -> None:
+        with cgutils.for_range_slice(builder, start, stop, start.type(1)) as (i, _):
+            builder.store(python.float_as_double(item(items, i)), builder.gep(to, [builder.sub(i, start)]))
+
+    size = c.pyapi.py_ssize_t
+    take = _helper(c, "take_numbers", [c.pyapi.pyobj, size, size, ir.DoubleType().as_pointer()], write)
+    c.builder.call(take, [source, size(first), size(first + count), at])
+
+
+def _take_array(c: Any, source: Any, index: int, at: Any) -> None:
+    """Copy where an array of a tuple lies, and how."""
+
+    def write(builder: Any, python: Any, item: Any, items: Any, i: Any, to: Any) -> None:
+        failed = python.numba_array_adaptor(item(items, i), to)
+        with cgutils.if_unlikely(builder, cgutils.is_not_null(builder, failed)):
+            python.err_set_string("PyExc_TypeError", "a field of a named tuple is no array any more")
+
+    size = c.pyapi.py_ssize_t
+    take = _helper(c, "take_array", [c.pyapi.pyobj, size, c.pyapi.voidptr], write)
+    c.builder.call(take, [source, size(index), c.builder.bitcast(at, c.pyapi.voidptr)])
