@@ -10,6 +10,7 @@ import pytest
 from hapticrender.accuracy.plate import SLIDING, tones
 from hapticrender.batch import LANES, Scenario, batch_state
 from hapticrender.compiled.lanes import aligned
+from hapticrender.compiled.late import cells, wanted
 from hapticrender.control import analyser
 from hapticrender.control.bank import batch as bank_batch
 from hapticrender.control.bank import kernels as bank_kernels
@@ -26,11 +27,25 @@ RECORDED = 3 + 2 + 2 + 1  # rows a sample: motion, sensors, drive, flags
 WIDEST = {"x": 16, "y": 32, "z": 64}  # bytes of a register
 
 
-def instructions(run, *arguments):
-    """Assembly of a kernel for the types of these arguments, compiled anew, as what comes from the cache shows none."""
-    fresh = type(run)(run.py_func, targetoptions=run.targetoptions.copy())
+def compiled(run, *arguments):
+    """Code of a kernel for the types of these arguments, compiled anew, as what comes from the cache shows none."""
+    fresh = type(run)(run.py_func, cached=False)
     fresh(*arguments)
-    return next(iter(fresh.inspect_asm().values()))
+    (made,) = fresh.overloads.values()
+    return made.library
+
+
+def instructions(run, *arguments):
+    """Assembly of a kernel."""
+    return compiled(run, *arguments).get_asm_str()
+
+
+def late_instructions(kernel, run, *arguments):
+    """Assembly of a late part of a kernel."""
+    (args,) = [args for late, args in (wanted(text) for _, text in cells(compiled(run, *arguments))) if late is kernel]
+    fresh = type(run)(kernel.part.py_func, "part", cached=False)
+    fresh.compile(args)
+    return fresh.overloads[args].library.get_asm_str()
 
 
 def packed(assembly, suffix):
@@ -71,6 +86,20 @@ def test_controllers_work_on_whole_registers(kind, precision, suffix):
     assert widest > 0.8 * every
     assert not re.search(r"\b(?:sin|cos|atan2)f?\b", assembly)
     assert re.search(r"and\w?\s+\$-64, %rsp", assembly)  # what does not fit the registers is put aside in whole lines
+
+
+@pytest.mark.skipif(platform.machine() not in ("x86_64", "AMD64"), reason="reads x86-64 assembly")
+@pytest.mark.parametrize(("precision", "suffix"), [("double", "pd"), ("single", "ps")])
+def test_a_settled_sample_works_on_whole_registers(precision, suffix):
+    """It is compiled apart."""
+    run, controller, target = a_bank(precision)
+    arguments = (np.zeros((2, 2)), np.zeros(2), np.zeros(2), np.zeros((2, 2)), target, np.zeros(2, np.int64))
+    tables, state = controller.tables, controller.state
+    assembly = late_instructions(bank_kernels.settled_sample, run, tables, state, *arguments)
+    every, widest = packed(assembly, suffix)
+    assert every > 100
+    assert widest > 0.8 * every
+    assert re.search(r"and\w?\s+\$-64, %rsp", assembly)
 
 
 @pytest.mark.skipif(platform.machine() not in ("x86_64", "AMD64"), reason="reads x86-64 assembly")

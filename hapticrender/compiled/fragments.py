@@ -21,8 +21,6 @@ from numba.core.dispatcher import _FunctionCompiler  # type: ignore[attr-defined
 from numba.core.errors import NumbaError
 from numba.core.interpreter import Interpreter, peep_hole_delete_with_exit
 from numba.core.ir_utils import build_definitions
-from numba.core.rewrites.registry import RewriteRegistry
-from numba.core.rewrites.static_binop import DetectStaticBinops
 from numba.core.rewrites.static_getitem import RewriteConstGetitems
 from numba.core.ssa import reconstruct_ssa
 from numba.core.transforms import canonicalize_cfg
@@ -33,10 +31,6 @@ from numba.core.untyped_passes import FixupArgs
 
 from hapticrender.compiled.lowering import KernelLower
 from hapticrender.compiled.records import Layout
-
-REWRITES = RewriteRegistry()  # entries of tuples whose index is known, powers whose exponent is
-REWRITES.register("before-inference")(RewriteConstGetitems)
-REWRITES.register("before-inference")(DetectStaticBinops)
 
 LINE = 64  # bytes of a cache line, and of the widest register
 
@@ -72,12 +66,19 @@ class _Passes(PassManager):
         state.func_ir = _Interpreter(state.func_id).interpret(state.bc)
         FixupArgs().run_pass(state)
         state.func_ir.blocks, state.func_ir.generator_info = canonicalize_cfg(state.func_ir.blocks), None
-        REWRITES.apply("before-inference", state)
+        self.name_entries(state)
         self.defined(state, reconstruct_ssa(state.func_ir))
         self.infer(state)
         self.defined(state, PreLowerStripPhis()._strip_phi_nodes(state.func_ir))
         _KernelLowering().run_pass(state)
         NoPythonBackend().run_pass(state)
+
+    def name_entries(self, state: Any) -> None:
+        """Take entries whose index is known, of tuples above all, by what it is."""
+        blocks, rewrite = state.func_ir.blocks, RewriteConstGetitems(state)
+        for key, block in blocks.items():
+            if rewrite.match(state.func_ir, block, None, None):
+                blocks[key] = rewrite.apply()
 
     def infer(self, state: Any) -> None:
         """Find the type of every variable."""
@@ -160,10 +161,25 @@ class _Library(JITCodeLibrary):
             for each in library._linking_libraries:
                 self.add_linking_library(each)
 
+    def _optimize_functions(self, ll_module: Any) -> None:
+        """Simplify what is written in this module, not what is only named."""
+        ll_module.data_layout = self._codegen._data_layout
+        passes, builder = _passes(self._codegen)
+        for function in ll_module.functions:
+            if not function.is_declaration:
+                passes.run(function, builder)
+
     @property
     def parts(self) -> list[Any]:
         """Itself and everything that it calls."""
         return [self, *self._linking_libraries]
+
+
+@lru_cache
+def _passes(codegen: Any) -> Any:
+    """Passes over a function; nothing in a kernel counts references, so none looks for counts to spare."""
+    builder = codegen._pass_builder()
+    return builder.getFunctionPassManager(), builder
 
 
 class _FragmentLibrary(_Library):
@@ -207,6 +223,14 @@ class _WholeCompiler(_FunctionCompiler):
         return flags
 
 
+class _PartCompiler(_FunctionCompiler):
+    """No wrappers: it is called by its address."""
+
+    def _customize_flags(self, flags: Any) -> Any:
+        flags.no_cpython_wrapper = flags.no_cfunc_wrapper = True
+        return flags
+
+
 class _FragmentCompiler(_FunctionCompiler):
     """Neither wrappers nor machine code."""
 
@@ -239,7 +263,14 @@ def _typing(target: Any) -> Any:
 _target = lru_cache(_Target)
 
 
-def compiler(function: Any, target: Any, options: Any, *, whole: bool) -> Any:
+KINDS = {
+    "whole": (_WholeCompiler, _WholeLibrary),
+    "part": (_PartCompiler, _WholeLibrary),
+    "fragment": (_FragmentCompiler, _FragmentLibrary),
+}
+
+
+def compiler(function: Any, target: Any, options: Any, kind: str) -> Any:
     """Compile `function` as a whole, or as a part of others."""
-    kind, library = (_WholeCompiler, _WholeLibrary) if whole else (_FragmentCompiler, _FragmentLibrary)
-    return kind(function, _target(target, library), options, {}, _KernelPipeline)
+    made, library = KINDS[kind]
+    return made(function, _target(target, library), options, {}, _KernelPipeline)

@@ -12,7 +12,10 @@ from __future__ import annotations
 
 import gc
 import hashlib
+from contextlib import suppress
+from functools import cached_property
 from pathlib import Path
+from pickle import UnpicklingError
 from typing import Any
 
 from numba.core import types
@@ -25,6 +28,7 @@ from numba.core.sigutils import normalize_signature
 from numba.core.typing.templates import AbstractTemplate, infer_global
 
 from hapticrender.compiled.fragments import compiler
+from hapticrender.compiled.late import Late, complete
 from hapticrender.compiled.records import as_record
 
 ROOMS = ("compiled", "control", "plants")  # where kernels and their numbers live
@@ -43,31 +47,50 @@ def _source_stamp() -> str:
 _STAMP = _source_stamp()
 OPTIONS: Any = {"error_model": "numpy", "fastmath": {"contract"}, "nogil": True, "forceinline": True, "_nrt": False}
 
+# what reading a file that is not whole may raise
+TORN = (OSError, EOFError, UnpicklingError, ValueError, LookupError, AttributeError, ImportError)
+
 
 class CacheFile(IndexDataCacheFile):
-    """Numba's index of what is cached; what another version wrote, of modules that are no more, counts as nothing."""
+    """Numba's index of what is cached.
+
+    What another version wrote, of modules that are no more, or a killed process left unfinished counts as nothing.
+    """
 
     def _load_index(self) -> Any:
         try:
             return super()._load_index()  # type: ignore[misc]
-        except (ImportError, AttributeError):
+        except TORN:
             return {}
 
 
 class _StampedCache(FunctionCache):
     """A function cache that is stale as soon as any kernel file has changed."""
 
-    def __init__(self, function: Any) -> None:
+    def __init__(self, function: Any, kind: str) -> None:
         super().__init__(function)
         stamp = (self._impl.locator.get_source_stamp(), _STAMP)
         self._cache_file = CacheFile(
-            cache_path=self._cache_path, filename_base=self._impl.filename_base, source_stamp=stamp
+            cache_path=self._cache_path, filename_base=f"{self._impl.filename_base}.{kind}", source_stamp=stamp
         )
 
+    def load_overload(self, sig: Any, target_context: Any) -> Any:
+        """Return what is cached; what cannot be read, or is of other types, counts as nothing."""
+        try:
+            found = super().load_overload(sig, target_context)
+        except TORN:
+            return None
+        return found if found is None or tuple(found.signature.args) == normalize_signature(sig)[0] else None
 
-def _cache_of(function: Any) -> Any:
+    def save_overload(self, sig: Any, data: Any) -> None:
+        """Keep what has been compiled; where there is no room for it any more, it serves this process only."""
+        with suppress(OSError):
+            super().save_overload(sig, data)
+
+
+def _cache_of(function: Any, kind: str) -> Any:
     try:
-        return _StampedCache(function)
+        return _StampedCache(function, kind)
     except RuntimeError:  # numba: no writable cache location
         return NullCache()
 
@@ -77,7 +100,7 @@ class _Fragment(CPUDispatcher):
 
     def __init__(self, function: Any) -> None:
         super().__init__(function, targetoptions=dict(OPTIONS, nopython=True))
-        self._compiler: Any = compiler(function, self.targetdescr, self.targetoptions, whole=False)
+        self._compiler: Any = compiler(function, self.targetdescr, self.targetoptions, "fragment")
 
     def compile(self, sig: Any) -> Any:
         """Type and lower the kernel for these arguments."""
@@ -96,14 +119,17 @@ class _Fragment(CPUDispatcher):
 
 
 class _Kernel(CPUDispatcher):
-    """A kernel as Python sees it: whole, and cached; other kernels get its fragment."""
+    """A kernel as Python sees it, whole; other kernels get its fragment.
 
-    def __init__(self, function: Any, targetoptions: Any = None) -> None:
-        super().__init__(function, targetoptions=targetoptions or dict(OPTIONS, nopython=True))
-        self.fragment = _Fragment(function)
-        self._compiler: Any = compiler(function, self.targetdescr, self.targetoptions, whole=True)
+    Of kind "part" it has no way in for Python and is called by its address.  A `live` one has compiled its late parts
+    before it runs.
+    """
+
+    def __init__(self, function: Any, kind: str = "whole", *, live: bool = True, cached: bool = True) -> None:
+        super().__init__(function, targetoptions=dict(OPTIONS, nopython=True))
+        self.kind, self.live, self.cached = kind, live, cached
+        self._compiler: Any = compiler(function, self.targetdescr, self.targetoptions, kind)
         self._cache: Any = NullCache()
-        self.cached = False
 
     def compile(self, sig: Any) -> Any:
         """Compile for these arguments, without a look for garbage at every step.
@@ -111,7 +137,7 @@ class _Kernel(CPUDispatcher):
         Most kernels are parts of others and never come here: to look for a cache takes longer than to make the kernel.
         """
         if self.cached and isinstance(self._cache, NullCache):
-            self._cache = _cache_of(self.py_func)
+            self._cache = _cache_of(self.py_func, self.kind)
         collects = gc.isenabled()
         gc.disable()
         try:
@@ -120,9 +146,20 @@ class _Kernel(CPUDispatcher):
             if collects:
                 gc.enable()
 
+    def add_overload(self, cres: Any) -> None:
+        """Let calls find what has been compiled, or came from the cache."""
+        if self.live:
+            complete(cres.library)
+        super().add_overload(cres)
+
     def typeof_pyval(self, val: Any) -> Any:
         """Numba's type of an argument: named tuples go by address."""
         return as_record(super().typeof_pyval(val))  # type: ignore[misc]
+
+    @cached_property
+    def fragment(self) -> _Fragment:
+        """What its callers compile in."""
+        return _Fragment(self.py_func)
 
     @property
     def _numba_type_(self) -> Any:
@@ -135,9 +172,21 @@ def kernel(function: Any) -> Any:
     A kernel allocates nothing, so arrays need no counting of references inside it (a call of the counter costs more
     than the arithmetic), and it becomes part of its caller, so that named tuples cost nothing to pass.
     """
-    compiled = _Kernel(function)
-    compiled.cached = True
-    return compiled
+    return _Kernel(function)
+
+
+def simulation(function: Any) -> Any:
+    """Make a `kernel` in which nothing is live: its late parts may be compiled while it runs."""
+    return _Kernel(function, live=False)
+
+
+def late(function: Any) -> Any:
+    """Make a `kernel` that does not become part of its caller, but is compiled when it is first called.
+
+    It is for what many scenes do not need, and returns nothing.  Only a `simulation` waits for it; every other kernel
+    that Python or C calls has compiled its late parts beforehand.
+    """
+    return Late(function, _Kernel(function, "part", live=False), simulation(function))
 
 
 def by_types(choose: Any) -> Any:
@@ -165,6 +214,7 @@ def by_types(choose: Any) -> Any:
 def callback(function: Any, returned: Any, *taken: Any) -> Any:
     """Compile `function` for callers in C, cached on disk: a `CFunc` with `address` and `ctypes`."""
     compiled: Any = CFunc(function, (taken, returned), {}, OPTIONS)
-    compiled._cache = _cache_of(function)
+    compiled._cache = _cache_of(function, "callback")
     compiled.compile()
+    complete(compiled._library)
     return compiled

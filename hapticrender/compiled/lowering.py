@@ -72,8 +72,6 @@ class KernelLower(Lower):
 
     def lower_binop(self, resty: Any, expr: Any, op: Any) -> Any:
         """Write the code of an operator."""
-        if expr.static_lhs is not ir.UNDEFINED or expr.static_rhs is not ir.UNDEFINED:  # a power that is known
-            return super().lower_binop(resty, expr, op)
         return self.operated(op, self.fndesc.calltypes[expr], (expr.lhs, expr.rhs), resty)
 
     def lower_getitem(self, resty: Any, expr: Any, value: Any, index: Any, signature: Any) -> Any:

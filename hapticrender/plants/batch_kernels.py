@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from hapticrender.compiled.jit import by_types, kernel
+from hapticrender.compiled.jit import by_types, kernel, simulation
 from hapticrender.compiled.lanes import any_of, select, size
 from hapticrender.compiled.lanes_memory import read, record, record_whole, write
 from hapticrender.control.bank.kernels import bank_advance
@@ -226,7 +226,7 @@ def finger_of(finger, n, r, like):
     return read(finger, n, r)
 
 
-@kernel
+@simulation
 def closed_batch_run(
     shared, state, control, control_state, last, finger, noise, wanted, sensed, motion, drive, target, flags
 ):

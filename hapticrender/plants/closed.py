@@ -6,7 +6,7 @@ handing single samples to each other, without leaving compiled code.
 
 from __future__ import annotations
 
-from hapticrender.compiled.jit import by_types, kernel
+from hapticrender.compiled.jit import by_types, simulation
 from hapticrender.control.bank.kernels import bank_step
 from hapticrender.control.bank.state import BankTables
 from hapticrender.control.cartesian.kernels import ComplexTables, complex_step
@@ -24,7 +24,7 @@ def control_step(tables, *rest):
     return STEPS[tables.instance_class]
 
 
-@kernel
+@simulation
 def closed_plate_run(
     tables, state, control, control_state, last, finger, noise, wanted, sensed, motion, drive, target, flags
 ):
@@ -40,7 +40,7 @@ def closed_plate_run(
         flags[n] |= control_step(control, control_state, sensed[n], finger[n, 0], wanted[n], last, target[n])
 
 
-@kernel
+@simulation
 def closed_polar_run(
     tables, state, control, control_state, last, finger, noise, wanted, sensed, motion, drive, target, flags
 ):

@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-from hapticrender.compiled.jit import kernel
+from hapticrender.compiled.jit import kernel, simulation
 from hapticrender.control.gap import VACUUM, GapState, GapTables, gap_step
 from hapticrender.control.square_root import SquareRootTables, square_root_step
 from hapticrender.plants.closed import control_step
@@ -246,14 +246,14 @@ def screen_step(tables, state, drive, finger, noise, sensed, motion, felt):
     return flags | cut
 
 
-@kernel
+@simulation
 def screen_run(tables, state, drive, finger, noise, sensed, motion, felt, flags):
     """A block of the screen alone; columns of `finger` are position, load, strength, speed."""
     for n in range(drive.shape[0]):
         flags[n] = screen_step(tables, state, drive[n, 0], finger[n], noise[n], sensed[n], motion[n], felt[n])
 
 
-@kernel
+@simulation
 def closed_screen_run(
     tables, state, control, control_state, last, finger, noise, wanted, sensed, motion, felt, drive, target, flags
 ):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from hapticrender.compiled.jit import kernel
+from hapticrender.compiled.jit import kernel, simulation
 from hapticrender.control.together import together_step
 from hapticrender.plants.electroadhesion_kernels import POSITION, ScreenState, ScreenTables, screen_step
 from hapticrender.plants.kernels import PlateState, PlateTables, bent, plate_advance, plate_drive, plate_sense
@@ -66,14 +66,14 @@ def hybrid_step(tables, state, drive, finger, noise, sensed, motion, felt):
     return flags
 
 
-@kernel
+@simulation
 def hybrid_run(tables, state, drive, finger, noise, sensed, motion, felt, flags):
     """A block of the hybrid alone; columns of `finger` are position, load, strength, speed."""
     for n in range(drive.shape[0]):
         flags[n] = hybrid_step(tables, state, drive[n], finger[n], noise[n], sensed[n], motion[n], felt[n])
 
 
-@kernel
+@simulation
 def closed_hybrid_run(
     tables, state, control, control_state, last, finger, noise, wanted, sensed, motion, felt, drive, target, flags
 ):

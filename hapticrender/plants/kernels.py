@@ -16,7 +16,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hapticrender.compiled.jit import kernel
+from hapticrender.compiled.jit import kernel, late, simulation
 from hapticrender.compiled.lanes import high, low, select, size
 from hapticrender.compiled.lanes_memory import read, record, write
 from hapticrender.compiled.polynomials import whole
@@ -220,7 +220,7 @@ def series_at(tables, state, lever, strength, out, at):
     sum_series(tables.terms, tables.flexible, state, out, at)
 
 
-@kernel
+@late
 def open_window(tables, state, lever, strength):
     """Lay nodes ahead of the finger, where it slides to; where its polynomial is not exact, a narrower one."""
     window, ahead = state.window, 1.0 if lever > state.seen[LEVER] else -1.0
@@ -324,7 +324,7 @@ def plate_drive(tables, state, drive):
         cursor[0] = row + 1 if row + 1 < latency else 0
 
 
-@kernel
+@simulation
 def plate_run(tables, state, drive, finger, noise, sensed, motion, flags):
     """A block of the plate alone; `finger` rows are position, load, strength."""
     for n in range(drive.shape[0]):

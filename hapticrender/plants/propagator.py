@@ -14,7 +14,7 @@ import math
 
 import numpy as np
 
-from hapticrender.compiled.jit import kernel
+from hapticrender.compiled.jit import kernel, late
 from hapticrender.compiled.lanes import aligned, any_of, size
 from hapticrender.compiled.lanes_memory import lanes, put, read, write
 from hapticrender.protocols import Array
@@ -141,7 +141,7 @@ def polynomial(powers, j, x):
     return value
 
 
-@kernel
+@late
 def interpolate(flexible, powers, x, out):
     """Phi and Gamma at `x`; rigid glass leaves the columns of its bending as they are."""
     for j in range(RIGID):

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-from hapticrender.compiled.jit import kernel
+from hapticrender.compiled.jit import kernel, simulation
 from hapticrender.control.bank import rows as row
 from hapticrender.control.bank.kernels import bank_step
 from hapticrender.control.bank.state import BankState, BankTables
@@ -157,7 +157,7 @@ def surface_step(tables, state, drive, finger, mode, noise, sensed, motion, skin
     return flags | (SENSOR_CLIPPED if abs(shown) >= tables.sliding.force_range else 0)
 
 
-@kernel
+@simulation
 def surface_run(tables, state, drive, finger, mode, noise, sensed, motion, skin, amplitude, flags):
     """A block of the surface alone."""
     for n in range(drive.shape[0]):
@@ -166,7 +166,7 @@ def surface_run(tables, state, drive, finger, mode, noise, sensed, motion, skin,
         )
 
 
-@kernel
+@simulation
 def closed_surface_run(
     tables, state, control, control_state, last, finger, mode, noise, wanted, outputs, drive, target, flags
 ):

@@ -14,7 +14,7 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-from hapticrender.compiled.jit import kernel
+from hapticrender.compiled.jit import kernel, simulation
 from hapticrender.plants.closed import control_step
 from hapticrender.plants.kernels import HUGE, SENSOR_CLIPPED, quantise
 from hapticrender.protocols import Array
@@ -97,7 +97,7 @@ def mode_sense(tables, state, noise, sensed, motion):
     return SENSOR_CLIPPED if abs(value) > tables.sensor_limit else 0
 
 
-@kernel
+@simulation
 def ultrasonic_run(tables, state, drive, mode, noise, sensed, motion, flags):
     """A block of the mode alone."""
     for n in range(drive.shape[0]):
@@ -106,7 +106,7 @@ def ultrasonic_run(tables, state, drive, mode, noise, sensed, motion, flags):
         mode_advance(tables, state, mode[n])
 
 
-@kernel
+@simulation
 def closed_ultrasonic_run(
     tables, state, control, control_state, last, position, mode, noise, wanted, sensed, motion, drive, target, flags
 ):

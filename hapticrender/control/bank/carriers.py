@@ -7,12 +7,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from hapticrender.compiled.jit import by_types, kernel
+from hapticrender.compiled.jit import by_types, kernel, late
 from hapticrender.compiled.lanes import floor, high, low, select, size
 from hapticrender.compiled.lanes_memory import lanes, put, read
 from hapticrender.compiled.polynomials import unit
 from hapticrender.control.bank import rows as row
-from hapticrender.control.bank.law import answer_settled, law_settled, law_tune, look_ahead
+from hapticrender.control.bank.finger import track_finger
+from hapticrender.control.bank.law import law_tune, look_ahead, settle_law
 from hapticrender.control.kernels import TURN
 
 REFRESH = 64  # samples between two looks at the tones that are asked for
@@ -39,7 +40,7 @@ def advance_of(step):
     return np.uint64((advance - floor(advance)) * 2.0**63) << np.uint64(1)
 
 
-@kernel
+@late
 def follow_resonance(tables, state):
     """Move the shift of the carriers towards the resonance, where Re D = 0: force and motion are a quarter turn apart.
 
@@ -135,11 +136,10 @@ def refresh(tables, state):
         if still:
             put(band, t, row.DR_RE, 0.0 * lanes(band, t, row.DR_RE))
             put(band, t, row.DR_IM, 0.0 * lanes(band, t, row.DR_IM))
-            law_settled(tables, state, t)
         else:
             state.follows[1] += 1
     if state.follows[1] == 0:
-        answer_settled(tables, state)
+        settle_law(tables, state)
 
 
 @kernel
@@ -208,14 +208,20 @@ def locked_pass(tables, state, t):
     motion_pass(numbers, band, track, t)
 
 
-@kernel
-def carrier_pass(tables, state, fresh):
-    """Phase, frequency, sweep and weight of every carrier; carriers that are `fresh` stand where they belong."""
+@late
+def follow_finger(tables, state, position):
+    """The finger's motion, and the carriers that follow it."""
+    track_finger(state.track, tables.numbers.rate, position)
     for t in range(state.band.shape[0]):
         if state.pace[t] == row.LOCKED:
             locked_pass(tables, state, t)
-        else:
-            if not fresh:
-                turn_pass(state.band, t)
-            if state.pace[t] == row.GROWING:
-                grow_pass(tables, state, t)
+
+
+@kernel
+def carrier_pass(tables, state, fresh):
+    """Phase and weight of every fixed carrier; carriers that are `fresh` stand where they belong."""
+    for t in range(state.band.shape[0]):
+        if state.pace[t] != row.LOCKED and not fresh:
+            turn_pass(state.band, t)
+        if state.pace[t] == row.GROWING:
+            grow_pass(tables, state, t)

@@ -11,17 +11,17 @@ from __future__ import annotations
 
 import numpy as np
 
-from hapticrender.compiled.jit import kernel
+from hapticrender.compiled.jit import kernel, late
 from hapticrender.compiled.lanes import any_of, high, low, root, select, size
 from hapticrender.compiled.lanes_memory import lanes, put, read, write
 from hapticrender.control.bank import rows as row
-from hapticrender.control.bank.carriers import REFRESH, carrier_pass, refresh
+from hapticrender.control.bank.carriers import REFRESH, carrier_pass, follow_finger, refresh
 from hapticrender.control.bank.detectors import HUGE, detect, fast_all
-from hapticrender.control.bank.finger import feel, track_finger
+from hapticrender.control.bank.finger import feel
 from hapticrender.control.bank.law import know_finger, law_pass
 from hapticrender.control.bank.learning import ADAPTATION, begin_finger, in_a_turn, learn_finger, send_finger
 from hapticrender.control.bank.observer import level_pass, observer_pass, residual_pass
-from hapticrender.control.bank.settled import settled, settled_command, settled_follow, settled_sample
+from hapticrender.control.bank.settled import settled, settled_command, settled_follow, settled_loop
 from hapticrender.control.bank.shaper import shape_pass
 from hapticrender.control.bank.targets import target_all
 from hapticrender.control.kernels import DOUBT_TIME, FAR
@@ -77,7 +77,7 @@ def speak_pass(tables, state, drive):
     write(scale, touch, row.SCALE)
     for i in range(tables.speak.shape[0]):
         shape_pass(numbers, state.shaper, scale * read(drive, i), drive, i)
-    return select(scale < 1.0, 1.0, 0.0)
+    write(select(scale < 1.0, 1.0, 0.0), touch, row.LIMITED)
 
 
 @kernel
@@ -93,7 +93,16 @@ def listen_pass(tables, sensed, c):
 
 
 @kernel
-def gains(numbers, state, calm):
+def calmness(numbers, state):
+    """Share of the observer's gain that is left to a slow finger, whose bands lie close together."""
+    calm = 1.0 + 0.0 * read(state.touch, row.TRUST)
+    if numbers.crowd_speed > 0.0:
+        calm = low(size(read(state.track, row.VELOCITY)) * (1.0 / numbers.crowd_speed), 1.0)
+    return calm
+
+
+@kernel
+def gains(numbers, state):
     """Gains of this sample: observer, integral, inner loop, back-calculation; whether the DC band is to be quick."""
     touch, track = state.touch, state.track
     fast, slow, scale = read(touch, row.FAST_OPEN), read(touch, row.SLOW_OPEN), read(touch, row.SCALE)
@@ -101,7 +110,7 @@ def gains(numbers, state, calm):
     integral += fast * (numbers.integral_awake - integral)
     inner = numbers.inner + fast * (numbers.inner_awake - numbers.inner)
     inner = select(scale < 1.0, 0.0, inner)  # no room for it
-    g = calm * (numbers.observer + fast * (numbers.observer_awake - numbers.observer))
+    g = calmness(numbers, state) * (numbers.observer + fast * (numbers.observer_awake - numbers.observer))
     quick = scale < 0.0
     if numbers.presence:  # the step of a friction is not what the texture does
         quick = (read(track, row.SEEN) <= 0.0) | (read(track, row.FRESH) > 0.0)
@@ -121,19 +130,19 @@ def listen_all(tables, state, sensed):
     return doubt
 
 
-@kernel
-def stirred_sample(tables, state, g, integral, inner, back, quick):
-    """From what is heard to the force, whatever happens; see `settled_sample`."""
-    for c in range(len(tables.shape)):
-        residual_pass(tables, state, c, inner)
-        level_pass(tables.numbers, state, c, quick)
-        for t in range(state.band.shape[0]):
-            observer_pass(tables, state, t, c, g, integral, back)
+@late
+def begin_anew(state):
+    """What no trust is left in; see `forget`."""
     forget(state)
-    law_pass(tables, state)
 
 
-@kernel
+@late
+def meet_finger(tables, state, changed):
+    """What a touch or a lift-off changes; see `begin_finger`."""
+    begin_finger(tables, state, changed)
+
+
+@late
 def learn(tables, state, g, inner, calmly, touching):
     """The finger's turn to be learnt, from what the observer shows; the next sample's law knows it."""
     numbers, touch = tables.numbers, state.touch
@@ -151,48 +160,74 @@ def learn(tables, state, g, inner, calmly, touching):
 
 
 @kernel
-def bank_advance(tables, state, sensed, position, wanted, drive, target):
-    """One sample of the whole controller: fills `drive` (channels,) and `target` (bands,), returns flags as a float."""
-    numbers, touch = tables.numbers, state.touch
-    sane = size(wanted) <= FAR
-    odd = high(select(sane, 0.0, 2.0), select(size(position) > FAR, 2.0, 0.0))
-    wanted = select(sane, wanted, 0.0)
-    fresh, learnt = state.sample[0] % REFRESH == 0, state.sample[0] % ADAPTATION == 0
-    if fresh:
-        refresh(tables, state)
-    state.sample[0] += 1
-    if state.follows[0] > 0:
-        track_finger(state.track, numbers.rate, position)
-    calm = 1.0 + 0.0 * read(touch, row.TRUST)
-    if numbers.crowd_speed > 0.0:
-        calm = low(size(read(state.track, row.VELOCITY)) * (1.0 / numbers.crowd_speed), 1.0)
-    doubt = listen_all(tables, state, sensed)
-    believe(numbers, touch, doubt)
-    calmly, turn = settled(state), state.sample[0] % ADAPTATION == 0
-    if not calmly:
-        carrier_pass(tables, state, fresh)
-        target_all(tables, state, calm * numbers.reference, wanted, target)
+def meet(tables, state):
+    """Whether a finger is on, and the law that knows it."""
+    numbers, touch, learnt = tables.numbers, state.touch, state.sample[0] % ADAPTATION == 1
     changed = feel(numbers, len(tables.shape), tables.stiffness, state.level, touch, learnt)
     if any_of(changed):
         write(select(changed, numbers.fast_time, read(touch, row.FAST_TIME)), touch, row.FAST_TIME)
-        begin_finger(tables, state, changed)
+        meet_finger(tables, state, changed)
     touching = (read(touch, row.CONTACT) > 0.0) & (numbers.adapt >= 0.0)
     know_finger(tables, state, touching, learnt)
-    g, integral, inner, back, quick = gains(numbers, state, calm)
-    if calmly:
-        settled_sample(tables, state, fresh, g, integral, inner, target)
-    else:
-        stirred_sample(tables, state, g, integral, inner, back, quick)
-    flags = speak_pass(tables, state, drive) + high(odd, 2.0 * doubt)
-    fast = 0.0 * doubt
-    if calmly:
-        fast = settled_follow(tables, state, g, integral)
-    elif numbers.fast_level < HUGE:
+    return touching
+
+
+@kernel
+def stirred_sample(tables, state, fresh, position, wanted, drive, target):
+    """What `settled_sample` does, whatever happens."""
+    numbers = tables.numbers
+    if state.follows[0] > 0:
+        follow_finger(tables, state, position)
+    carrier_pass(tables, state, fresh)
+    target_all(tables, state, calmness(numbers, state) * numbers.reference, wanted, target)
+    touching = meet(tables, state)
+    g, integral, inner, back, quick = gains(numbers, state)
+    for c in range(len(tables.shape)):
+        residual_pass(tables, state, c, inner)
+        level_pass(numbers, state, c, quick)
+        for t in range(state.band.shape[0]):
+            observer_pass(tables, state, t, c, g, integral, back)
+    if any_of(read(state.touch, row.TRUST) == 0.0):
+        begin_anew(state)
+    law_pass(tables, state)
+    speak_pass(tables, state, drive)
+    fast = 0.0 * g
+    if numbers.fast_level < HUGE:
         fast = fast_all(tables, state)
-    if turn and any_of(touching):
-        learn(tables, state, g, inner, calmly, touching)
-    detect(tables, state, fast, turn)
-    return flags
+    if state.sample[0] % ADAPTATION == 0 and any_of(touching):
+        learn(tables, state, g, inner, False, touching)
+    detect(tables, state, fast, state.sample[0] % ADAPTATION == 0)
+
+
+@late
+def settled_sample(tables, state, fresh, drive, target):
+    """From what is heard to the drive, and what is learnt, while little happens; what needs no sensor comes first."""
+    touching = meet(tables, state)
+    g, integral, inner, _, _ = gains(tables.numbers, state)
+    settled_loop(tables, state, fresh, g, integral, inner, target)
+    speak_pass(tables, state, drive)
+    fast = settled_follow(tables, state, g, integral)
+    if state.sample[0] % ADAPTATION == 0 and any_of(touching):
+        learn(tables, state, g, inner, True, touching)
+    detect(tables, state, fast, state.sample[0] % ADAPTATION == 0)
+
+
+@kernel
+def bank_advance(tables, state, sensed, position, wanted, drive, target):
+    """One sample of the whole controller: fills `drive` (channels,) and `target` (bands,), returns flags as a float."""
+    sane = size(wanted) <= FAR
+    odd = high(select(sane, 0.0, 2.0), select(size(position) > FAR, 2.0, 0.0))
+    fresh = state.sample[0] % REFRESH == 0
+    if fresh:
+        refresh(tables, state)
+    state.sample[0] += 1
+    doubt = listen_all(tables, state, sensed)
+    believe(tables.numbers, state.touch, doubt)
+    if settled(state):
+        settled_sample(tables, state, fresh, drive, target)
+    else:
+        stirred_sample(tables, state, fresh, position, select(sane, wanted, 0.0), drive, target)
+    return read(state.touch, row.LIMITED) + high(odd, 2.0 * doubt)
 
 
 @kernel

@@ -5,7 +5,7 @@ D is tuned to the carriers when they are taken up or move, and to the finger in 
 
 from __future__ import annotations
 
-from hapticrender.compiled.jit import kernel
+from hapticrender.compiled.jit import kernel, late
 from hapticrender.compiled.lanes import any_of, high, select, size, totals
 from hapticrender.compiled.lanes_memory import lanes, put, read, write
 from hapticrender.compiled.polynomials import unit
@@ -102,6 +102,14 @@ def answer_settled(tables, state):
             write(quarter, state.answer, coordinates + c, i)
 
 
+@late
+def settle_law(tables, state):
+    """What settled samples need of the law; see `law_settled`."""
+    for t in range(state.band.shape[0]):
+        law_settled(tables, state, t)
+    answer_settled(tables, state)
+
+
 @kernel
 def know_finger(tables, state, touching, turn):
     """Take what is known of the finger into the law: where contact changed, and in its turn; at once where it moves."""
@@ -112,17 +120,20 @@ def know_finger(tables, state, touching, turn):
         due = due | touching
     write(known, touch, row.KNOWN)
     write(select(due, read(touch, row.PLACE), read(touch, row.KNOWN_PLACE)), touch, row.KNOWN_PLACE)
-    if not any_of(due) and state.follows[0] == 0:
-        return
+    if any_of(due) or state.follows[0] > 0:
+        retune(tables, state, due)
+
+
+@late
+def retune(tables, state, due):
+    """Law of the tiles that follow the finger, and of all where it is `due`."""
     for t in range(state.band.shape[0]):
         if state.pace[t] == row.LOCKED:
             look_ahead(tables.numbers, state.band, state.law, t)
         if any_of(due) or state.pace[t] == row.LOCKED:
             law_tune(tables, state, t)
-        if state.follows[1] == 0:
-            law_settled(tables, state, t)
     if state.follows[1] == 0:
-        answer_settled(tables, state)
+        settle_law(tables, state)
 
 
 @kernel

@@ -40,12 +40,12 @@ HELD, SMOOTH, VELOCITY, ACCELERATION, SEEN, FRESH, SPEED = range(7)
 TRACK_ROWS = 7
 # entries of BankState.touch: the finger's load (N), place g, contact, its three numbers; timers and openings of the two
 # detectors; limiter (peak of the drive over its limit, squared, and the scale that answers it); trust in the sensors;
-# contact and place as the law knows them
+# contact and place as the law knows them; 1 where the limiter acts
 LOAD, PLACE, CONTACT, MASS, DAMPING, STIFFNESS, FAST_TIME, SLOW_TIME, FAST_OPEN, SLOW_OPEN, PEAK, SCALE, TRUST = range(
     13
 )
-KNOWN, KNOWN_PLACE = 13, 14
-TOUCH_ROWS = 15
+KNOWN, KNOWN_PLACE, LIMITED = 13, 14, 15
+TOUCH_ROWS = 16
 # rows of BankState.residual: a coordinate as heard, residual of the observer, deviation, force, force a quarter turn
 # ahead; force, and what is observed and commanded, as they are known before anything is heard
 HEARD, ERROR, DEVIATION, FORCE, QUADRATURE, KNOWN_FORCE, OBSERVED, COMMANDED = range(8)

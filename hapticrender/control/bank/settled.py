@@ -156,7 +156,7 @@ def settled_command(tables, state, t):
 
 
 @kernel
-def settled_sample(tables, state, fresh, g, integral, inner, target):
+def settled_loop(tables, state, fresh, g, integral, inner, target):
     """From what is heard to the force, while little happens; what needs no sensor comes first."""
     coordinates = len(tables.shape)
     for c in range(0, coordinates, 2):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from hapticrender.compiled.jit import kernel
+from hapticrender.compiled.jit import kernel, late
 from hapticrender.compiled.lanes import high, total
 from hapticrender.compiled.lanes_memory import lanes, put, put_pairs, read
 from hapticrender.compiled.polynomials import unit
@@ -40,42 +40,12 @@ def told_pass(numbers, band, track, t, re, im):
 
 
 @kernel
-def target_pass(tables, state, t, g, wanted, residual, target):
-    """Wanted envelope R and its slope: constant, times `wanted`, or what `wanted` holds (through its `residual`)."""
-    numbers, band = tables.numbers, state.band
-    if state.pace[t] == row.STEADY:
-        put_pairs(target, t, lanes(band, t, row.R_RE), lanes(band, t, row.R_IM))
-        return
-    weight = lanes(band, t, row.WEIGHT)
-    old_re, old_im = lanes(band, t, row.R_RE), lanes(band, t, row.R_IM)
-    if numbers.analysed:
-        raw_re = lanes(band, t, row.RAW_RE) + g * residual * lanes(band, t, row.COS)
-        raw_im = lanes(band, t, row.RAW_IM) - g * residual * lanes(band, t, row.SIN)
-        put(band, t, row.RAW_RE, raw_re)
-        put(band, t, row.RAW_IM, raw_im)
-        if numbers.differentiated:
-            raw_re, raw_im = derivative(band, t, raw_re, raw_im)
-        if numbers.shows:
-            raw_re, raw_im = shown_pass(numbers, band, state.track, t, raw_re, raw_im)
-        follow = 0.5 * g
-        re, im = old_re + follow * (weight * raw_re - old_re), old_im + follow * (weight * raw_im - old_im)
-        told_re, told_im = re, im
-        if numbers.shows:
-            told_re, told_im = told_pass(numbers, band, state.track, t, re, im)
-    else:
-        if numbers.modulated:
-            weight = weight * wanted
-        re, im = weight * lanes(band, t, row.WANTED_RE), weight * lanes(band, t, row.WANTED_IM)
-        if numbers.differentiated:
-            re, im = derivative(band, t, re, im)
-        told_re, told_im = re, im
-        if numbers.shows:
-            re, im = shown_pass(numbers, band, state.track, t, re, im)
-    put_pairs(target, t, told_re, told_im)
+def set_target(numbers, band, t, re, im):
+    """Put the target R of a tile, its slope, and R as the observer sees it."""
+    put(band, t, row.DR_RE, numbers.rate * (re - lanes(band, t, row.R_RE)))
+    put(band, t, row.DR_IM, numbers.rate * (im - lanes(band, t, row.R_IM)))
     put(band, t, row.R_RE, re)
     put(band, t, row.R_IM, im)
-    put(band, t, row.DR_RE, numbers.rate * (re - old_re))
-    put(band, t, row.DR_IM, numbers.rate * (im - old_im))
     if numbers.error_observer:
         put(band, t, row.SEEN_RE, re)
         put(band, t, row.SEEN_IM, im)
@@ -84,6 +54,36 @@ def target_pass(tables, state, t, g, wanted, residual, target):
         seen_re, seen_im = lanes(band, t, row.SEEN_RE), lanes(band, t, row.SEEN_IM)
         put(band, t, row.SEEN_RE, seen_re + pole * (re - seen_re))
         put(band, t, row.SEEN_IM, seen_im + pole * (im - seen_im))
+
+
+@kernel
+def given_pass(numbers, band, t, wanted):
+    """Wanted envelope of a tile that is constant, or times `wanted`."""
+    weight = lanes(band, t, row.WEIGHT)
+    if numbers.modulated:
+        weight = weight * wanted
+    return weight * lanes(band, t, row.WANTED_RE), weight * lanes(band, t, row.WANTED_IM)
+
+
+@kernel
+def analysed_pass(tables, state, t, g, residual):
+    """Wanted envelope of a tile as the analysis of a waveform finds it by its `residual`; and as it is told."""
+    numbers, band = tables.numbers, state.band
+    raw_re = lanes(band, t, row.RAW_RE) + g * residual * lanes(band, t, row.COS)
+    raw_im = lanes(band, t, row.RAW_IM) - g * residual * lanes(band, t, row.SIN)
+    put(band, t, row.RAW_RE, raw_re)
+    put(band, t, row.RAW_IM, raw_im)
+    if numbers.differentiated:
+        raw_re, raw_im = derivative(band, t, raw_re, raw_im)
+    if numbers.shows:
+        raw_re, raw_im = shown_pass(numbers, band, state.track, t, raw_re, raw_im)
+    follow, weight = 0.5 * g, lanes(band, t, row.WEIGHT)
+    old_re, old_im = lanes(band, t, row.R_RE), lanes(band, t, row.R_IM)
+    re, im = old_re + follow * (weight * raw_re - old_re), old_im + follow * (weight * raw_im - old_im)
+    told_re, told_im = re, im
+    if numbers.shows:
+        told_re, told_im = told_pass(numbers, band, state.track, t, re, im)
+    return re, im, told_re, told_im
 
 
 @kernel
@@ -96,11 +96,38 @@ def wanted_residual(band, wanted):
     return wanted - explained
 
 
+@late
+def found_targets(tables, state, g, wanted, target):
+    """Targets that a waveform holds, or that sensors show as something else."""
+    numbers, band, residual = tables.numbers, state.band, wanted
+    if numbers.analysed:
+        residual = wanted_residual(band, wanted)
+    for t in range(band.shape[0]):
+        if state.pace[t] == row.STEADY:
+            put_pairs(target, t, lanes(band, t, row.R_RE), lanes(band, t, row.R_IM))
+            continue
+        if numbers.analysed:
+            re, im, told_re, told_im = analysed_pass(tables, state, t, g, residual)
+        else:
+            re, im = given_pass(numbers, band, t, wanted)
+            if numbers.differentiated:
+                re, im = derivative(band, t, re, im)
+            told_re, told_im = re, im
+            if numbers.shows:
+                re, im = shown_pass(numbers, band, state.track, t, re, im)
+        put_pairs(target, t, told_re, told_im)
+        set_target(numbers, band, t, re, im)
+
+
 @kernel
 def target_all(tables, state, g, wanted, target):
-    """Targets of all tiles; see `target_pass`."""
-    residual = wanted
-    if tables.numbers.analysed:
-        residual = wanted_residual(state.band, wanted)
-    for t in range(state.band.shape[0]):
-        target_pass(tables, state, t, g, wanted, residual, target)
+    """Wanted envelope R of every tile and its slope: constant, times `wanted`, or what that holds."""
+    numbers, band = tables.numbers, state.band
+    if numbers.analysed or numbers.differentiated or numbers.shows:
+        found_targets(tables, state, g, wanted, target)
+        return
+    for t in range(band.shape[0]):
+        if state.pace[t] != row.STEADY:
+            re, im = given_pass(numbers, band, t, wanted)
+            set_target(numbers, band, t, re, im)
+        put_pairs(target, t, lanes(band, t, row.R_RE), lanes(band, t, row.R_IM))
