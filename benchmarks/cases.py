@@ -278,8 +278,8 @@ def _turns(frequency: float, samples: int):
 
 def start_up(pairs: int) -> Iterator[Figure]:
     """Fresh processes: import, first sample warm and cold."""
-    for name, spent, goal in startup.measure(pairs):
-        yield Figure(name, spent, "s", goal, False, "fresh process")
+    for name, spent, goal, note in startup.measure(pairs):
+        yield Figure(name, spent, "s", goal, False, "fresh process", note)
 
 
 def every_case(short: bool) -> Iterator[tuple[str, Callable[[], Iterator[Figure]]]]:

@@ -17,22 +17,27 @@ scene = hr.Scene(texture=hr.Grating(frequency=47.0, amplitude=10e-6), duration=0
 hr.render(scene)
 print(time.perf_counter() - start)
 """
+TOUCHED = FIRST.replace("duration=0.001", "finger=hr.Finger.sliding(0.05), duration=1.0")
 
 
 def _spent(code: str, cache: str | None = None) -> float:
     environment = dict(os.environ) | ({"NUMBA_CACHE_DIR": cache} if cache else {})
+    environment.pop("PYTHONDONTWRITEBYTECODE", None)  # Python keeps the byte code of modules, unless it is told not to
     found = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True)
     return float(found.stdout)
 
 
-def measure(times: int) -> Iterator[tuple[str, float, float]]:
-    """Name, seconds (median) and bound of each."""
+def _cold(code: str) -> float:
+    with tempfile.TemporaryDirectory() as empty:
+        return _spent(code, empty)
+
+
+def measure(times: int) -> Iterator[tuple[str, float, float, str]]:
+    """Name, seconds (median) and bound of each, and a note."""
     with tempfile.TemporaryDirectory() as kept:
         _spent(FIRST, kept)
-        rows = []
-        for _ in range(times):
-            with tempfile.TemporaryDirectory() as empty:
-                rows.append((_spent(IMPORT), _spent(FIRST, kept), _spent(FIRST, empty)))
-    names = (("import, over numpy's", 0.25), ("first sample, caches warm", 0.7), ("first sample, caches cold", 2.5))
-    for (name, bound), column in zip(names, zip(*rows, strict=True), strict=True):
-        yield name, statistics.median(column), bound
+        rows = [(_spent(IMPORT), _spent(FIRST, kept), _cold(FIRST), _cold(TOUCHED)) for _ in range(times)]
+    imported, warm, cold, touched = (statistics.median(column) for column in zip(*rows, strict=True))
+    yield "import, over numpy's", imported, 0.25, ""
+    yield "first sample, caches warm", warm, 0.7, ""
+    yield "first sample, caches cold", cold, 2.5, f"{touched:.2f} s for a second under a sliding finger"
