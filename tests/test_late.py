@@ -122,6 +122,7 @@ caller(x, 3); print(found()); caller(x, 4); print(found(), x)
 
 INTERRUPT = """
 import os, signal, threading, time
+signal.signal(signal.SIGINT, signal.default_int_handler)  # who started the tests may ignore it
 made = k.deeper.compiled
 def compiled(args):
     for _ in range(3):
