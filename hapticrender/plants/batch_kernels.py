@@ -234,8 +234,7 @@ def closed_batch_run(
 
     `shared` are the tables of any of the plates, with as many terms as any needs; `finger` is (n, 3, W): position,
     load, strength, or (n, 3, 1) where all share one; `noise` and `wanted` may have one row, which then is every
-    sample's; `target` has three axes, by which it is known that none is
-    wanted; `flags` are integers.
+    sample's; `target` has three axes, by which it is known that none is wanted; `flags` are integers.
     """
     tables = tables_of(shared, state.number)
     for n in range(sensed.shape[0]):

@@ -173,6 +173,15 @@ def meet(tables, state):
 
 
 @kernel
+def conclude(tables, state, g, inner, calmly, touching, fast):
+    """What is learnt in its turn, and what the detectors wake, once the drive is out."""
+    turn = state.sample[0] % ADAPTATION == 0
+    if turn and any_of(touching):
+        learn(tables, state, g, inner, calmly, touching)
+    detect(tables, state, fast, turn)
+
+
+@kernel
 def stirred_sample(tables, state, fresh, position, wanted, drive, target):
     """What `settled_sample` does, whatever happens."""
     numbers = tables.numbers
@@ -194,9 +203,7 @@ def stirred_sample(tables, state, fresh, position, wanted, drive, target):
     fast = 0.0 * g
     if numbers.fast_level < HUGE:
         fast = fast_all(tables, state)
-    if state.sample[0] % ADAPTATION == 0 and any_of(touching):
-        learn(tables, state, g, inner, False, touching)
-    detect(tables, state, fast, state.sample[0] % ADAPTATION == 0)
+    conclude(tables, state, g, inner, False, touching, fast)
 
 
 @late
@@ -207,9 +214,7 @@ def settled_sample(tables, state, fresh, drive, target):
     settled_loop(tables, state, fresh, g, integral, inner, target)
     speak_pass(tables, state, drive)
     fast = settled_follow(tables, state, g, integral)
-    if state.sample[0] % ADAPTATION == 0 and any_of(touching):
-        learn(tables, state, g, inner, True, touching)
-    detect(tables, state, fast, state.sample[0] % ADAPTATION == 0)
+    conclude(tables, state, g, inner, True, touching, fast)
 
 
 @kernel
