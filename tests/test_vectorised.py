@@ -10,7 +10,7 @@ import pytest
 from hapticrender.accuracy.plate import SLIDING, tones
 from hapticrender.batch import LANES, Scenario, batch_state
 from hapticrender.compiled.lanes import aligned
-from hapticrender.compiled.late import cells, wanted
+from hapticrender.compiled.late import cells, code_of, wanted
 from hapticrender.control import analyser
 from hapticrender.control.bank import batch as bank_batch
 from hapticrender.control.bank import kernels as bank_kernels
@@ -32,7 +32,7 @@ def compiled(run, *arguments):
     fresh = type(run)(run.py_func, cached=False)
     fresh(*arguments)
     (made,) = fresh.overloads.values()
-    return made.library
+    return code_of(made)
 
 
 def instructions(run, *arguments):
@@ -45,7 +45,7 @@ def late_instructions(kernel, run, *arguments):
     (args,) = [args for late, args in (wanted(text) for _, text in cells(compiled(run, *arguments))) if late is kernel]
     fresh = type(run)(kernel.part.py_func, "part", cached=False)
     fresh.compile(args)
-    return fresh.overloads[args].library.get_asm_str()
+    return code_of(fresh.overloads[args]).get_asm_str()
 
 
 def packed(assembly, suffix):

@@ -28,7 +28,7 @@ from numba.core.sigutils import normalize_signature
 from numba.core.typing.templates import AbstractTemplate, infer_global
 
 from hapticrender.compiled.fragments import compiler
-from hapticrender.compiled.late import Late, complete
+from hapticrender.compiled.late import Late, code_of, complete
 from hapticrender.compiled.records import as_record
 
 ROOMS = ("compiled", "control", "plants")  # where kernels and their numbers live
@@ -112,8 +112,7 @@ class _Fragment(CPUDispatcher):
                 key = object()
                 lowered: Any = self._compiler.compile(args, returned)
                 known = lowered._replace(entry_point=key)
-                part = known._asdict()
-                self.targetctx.insert_user_function(key, part["fndesc"], part["library"].parts)
+                self.targetctx.insert_user_function(key, known.fndesc, code_of(known).parts)
                 self.overloads[tuple(args)] = known
         return known.entry_point
 
@@ -149,7 +148,7 @@ class _Kernel(CPUDispatcher):
     def add_overload(self, cres: Any) -> None:
         """Let calls find what has been compiled, or came from the cache."""
         if self.live:
-            complete(cres.library)
+            complete(code_of(cres))
         super().add_overload(cres)
 
     def typeof_pyval(self, val: Any) -> Any:
@@ -186,7 +185,7 @@ def late(function: Any) -> Any:
     It is for what many scenes do not need, and returns nothing.  Only a `simulation` waits for it; every other kernel
     that Python or C calls has compiled its late parts beforehand.
     """
-    return Late(function, _Kernel(function, "part", live=False), simulation(function))
+    return Late(function, _Kernel(function, "part", live=False))
 
 
 def by_types(choose: Any) -> Any:
