@@ -1,1 +1,0 @@
-"""What makes a kernel, and what it computes with: compilation, vectors, polynomials."""

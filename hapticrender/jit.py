@@ -1,0 +1,162 @@
+"""Compile kernels: numba's options in one place, and kernels as C functions that call each other by address.
+
+Every kernel of the loop, of a controller or of a plant, has one C signature::
+
+    int64_t step(int64_t state, int64_t signals, int64_t start, int64_t count)
+
+`state` is the address of the owner's record, `signals` that of a `SIGNALS` record, which holds the addresses of the
+signals' arrays (C-contiguous, time first); the step reads and writes their rows `start` to `start + count - 1`.
+A plant, a controller and an audio callback therefore meet without knowing each other's types: a loop over two
+addresses closes any plant with any controller, and a third party may give a step written in C.
+"""
+
+from __future__ import annotations
+
+import sys
+import threading
+from collections.abc import Callable
+from functools import cached_property
+from typing import Any
+
+import numba
+import numpy as np
+from llvmlite import ir
+from numba import types
+from numba.extending import intrinsic
+
+OPTIONS: dict[str, Any] = {"error_model": "numpy", "fastmath": {"contract", "reassoc", "nsz"}, "nogil": True}
+PATIENCE = 1.0  # s: a compilation that takes longer is announced
+ANNOUNCED = threading.Event()
+F8, I8, C16 = types.float64, types.int64, types.complex128
+STEP = types.int64(types.int64, types.int64, types.int64, types.int64)
+
+SIGNALS = np.dtype(
+    [
+        (name, np.int64)
+        for name in ("drive", "inputs", "noise", "sensed", "motion", "position", "wanted", "target", "flags")
+    ]
+)
+"""Addresses of float64 arrays with a row a sample; `flags` is int64, `target` complex128 with a row a block."""
+SIGNALS_T = numba.from_dtype(SIGNALS)
+
+
+def kernel(function: Callable[..., Any]) -> Any:
+    """Compile a function on its first call; the machine code is cached on disk where a place for it can be written."""
+    try:
+        return numba.njit(function, cache=True, **OPTIONS)
+    except RuntimeError:  # neither the package nor the user's cache folder can be written
+        return numba.njit(function, **OPTIONS)
+
+
+def announce() -> None:
+    """Print once a process that something is being compiled."""
+    if not ANNOUNCED.is_set():
+        ANNOUNCED.set()
+        print("compiling for this machine (once)", file=sys.stderr, flush=True)
+
+
+class CFunction:
+    """A kernel as a C function, compiled (or loaded from the cache) when its address is first needed.
+
+    Parameters
+    ----------
+    function : callable
+        Of scalars and addresses; nothing else crosses a C interface.
+    signature : numba signature
+        By default that of a step.
+    """
+
+    def __init__(self, function: Callable[..., Any], signature: Any = STEP) -> None:
+        self.function, self.signature = function, signature
+        self.__doc__ = function.__doc__
+
+    @cached_property
+    def _compiled(self) -> Any:
+        note = threading.Timer(PATIENCE, announce)
+        note.daemon = True
+        note.start()
+        try:
+            return numba.cfunc(self.signature, cache=True, **OPTIONS)(self.function)
+        except RuntimeError:
+            return numba.cfunc(self.signature, **OPTIONS)(self.function)
+        finally:
+            note.cancel()
+
+    @property
+    def address(self) -> int:
+        """Address of the machine code."""
+        return int(self._compiled.address)
+
+    def __call__(self, *values: int) -> int:
+        """Call the machine code from Python, without its lock."""
+        return int(self._compiled.ctypes(*values))
+
+
+def step(function: Callable[..., Any]) -> CFunction:
+    """Make a C function of a step; see the module."""
+    return CFunction(function)
+
+
+@intrinsic
+def pointer(typingctx: Any, address: Any, dtype: Any) -> Any:
+    """Pointer to numbers or records of `dtype` (a numba type) at an address; `numba.carray` makes an array of it."""
+    result = types.CPointer(dtype.instance_type)
+
+    def build(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+        return builder.inttoptr(values[0], context.get_value_type(signature.return_type))
+
+    return result(types.int64, dtype), build
+
+
+@intrinsic
+def record(typingctx: Any, address: Any, dtype: Any, index: Any) -> Any:
+    """Record of `dtype` (a numba type) number `index` of those that lie at an address; reads and writes go there.
+
+    Kernels hand each other addresses, not arrays of records: a call then costs no more than its numbers.
+    """
+    kind = dtype.instance_type
+
+    def build(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+        size = ir.Constant(ir.IntType(64), kind.size)
+        address = builder.add(values[0], builder.mul(values[2], size))
+        return builder.inttoptr(address, context.get_value_type(kind))
+
+    return kind(types.int64, dtype, types.int64), build
+
+
+@intrinsic
+def call(typingctx: Any, function: Any, values: Any) -> Any:
+    """Call the C function at an address with a tuple of numbers; it returns an int64."""
+
+    def build(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        items = [builder.extract_value(arguments[1], i) for i in range(len(signature.args[1]))]
+        kind = ir.FunctionType(ir.IntType(64), [item.type for item in items])
+        return builder.call(builder.inttoptr(arguments[0], ir.PointerType(kind)), items)
+
+    return types.int64(types.int64, values), build
+
+
+def addresses(**arrays: np.ndarray[Any, Any] | None) -> np.ndarray[Any, Any]:
+    """Record of the addresses of some signals, shape (1,); the caller keeps the arrays alive.
+
+    Raises
+    ------
+    ValueError
+        An array is not C-contiguous.
+    """
+    record = np.zeros(1, SIGNALS)
+    for name, array in arrays.items():
+        if array is None:
+            continue
+        if not array.flags.c_contiguous:
+            raise ValueError(f"{name} of shape {array.shape}: must be C-contiguous (use numpy.ascontiguousarray)")
+        record[name] = array.ctypes.data
+    return record
+
+
+@kernel
+def close_loop(plant, control, count, block):
+    """Advance plant and controller in turns of `block` samples; each is (step, state, signals), as addresses."""
+    for start in range(0, count, block):
+        call(plant[0], (plant[1], plant[2], start, block))
+        call(control[0], (control[1], control[2], start, block))

@@ -1,0 +1,148 @@
+"""Mathematics that several packages need: design-time functions in numpy, and their compiled counterparts."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from hapticrender.jit import kernel
+from hapticrender.protocols import Array
+
+# design time: numpy and scipy
+
+
+def zoh(a: Array, b: Array, period: float) -> tuple[Array, Array]:
+    """Discretise x' = a x + b u with the input held over each sample.
+
+    Parameters
+    ----------
+    a : ndarray, shape (n, n), 1/s
+    b : ndarray, shape (n, m)
+        Input matrix.
+    period : float, s
+        Sampling period, > 0.
+
+    Returns
+    -------
+    ndarray, shape (n, n), and ndarray, shape (n, m)
+        Matrices of x[k+1] = ad x[k] + bd u[k], exact.
+
+    References
+    ----------
+    Van Loan, Computing integrals involving the matrix exponential, IEEE Transactions on Automatic Control 23, 1978.
+    """
+    from scipy.linalg import expm  # only designs need it
+
+    n, m = b.shape
+    augmented = np.zeros((n + m, n + m))
+    augmented[:n] = np.hstack([a, b])
+    held = expm(augmented * period)[:n]
+    return held[:, :n], held[:, n:]
+
+
+def zero_crossings(values: Array) -> Array:
+    """Find the fractional indices at which `values`, shape (n,), change sign, by linear interpolation."""
+    before = np.flatnonzero(np.signbit(values[:-1]) != np.signbit(values[1:]))
+    return before + values[before] / (values[before] - values[before + 1])
+
+
+def smoothstep(x: Array) -> Array:
+    """Third-order step from 0 to 1 over 0..1: x^2 (3 - 2 x), x clipped to that range."""
+    x = np.clip(x, 0.0, 1.0)
+    return np.asarray(x * x * (3.0 - 2.0 * x))
+
+
+# compiled functions; each is written so that a loop over bands vectorises around it
+
+TURN = 2.0 * math.pi
+SIN = (  # in x^2, of sin(2 pi x)/x for |x| <= 1/4, by interpolation at Chebyshev nodes: good to 2.8e-15
+    6.283185307179585,
+    -41.341702240398284,
+    81.60524927557972,
+    -76.70585968962543,
+    42.05868995380649,
+    -15.094506137312086,
+    3.8173655924824907,
+    -0.6925065068391115,
+)
+COS = (  # in x^2, of cos(2 pi x) for |x| <= 1/4
+    0.9999999999999981,
+    -19.739208802174744,
+    64.93939402133272,
+    -85.45681703563243,
+    60.244630608149656,
+    -26.425888742714854,
+    7.896555728040881,
+    -1.645223312598949,
+)
+
+
+ATAN = (  # in t^2, of atan(t)/t for |t| <= tan(pi/8), by interpolation at Chebyshev nodes: the angle is good to 2.3e-10
+    0.9999999993712274,
+    -0.33333306893036774,
+    0.1999818304075261,
+    -0.1423953266624381,
+    0.10569828793087244,
+    -0.060263052137509994,
+)
+CHORD = (  # in t^2, of cos(pi/8) sqrt(1 + t^2) in the same range: the magnitude is good to 1.8e-10 of itself
+    0.9238795326722804,
+    0.4619396985700442,
+    -0.115480295049026,
+    0.05762462199042945,
+    -0.034713385758947064,
+    0.01753980290023211,
+)
+EIGHTH = math.sqrt(2.0) - 1.0  # tan(pi/8)
+LEAST = 1e-150  # added to the real part: the angle of 0 is 0
+
+
+@kernel
+def round_to_integer(value):
+    """Nearest integer, as a float."""
+    return np.rint(value)
+
+
+@kernel
+def frac(turns):
+    """Part of `turns` that is not a whole turn, within +-1/2."""
+    return turns - np.rint(turns)
+
+
+@kernel
+def sincos_turns(turns):
+    """Sine and cosine of 2 pi `turns`."""
+    x = turns - np.rint(turns)
+    far = abs(x) > 0.25
+    x = (math.copysign(0.5, x) - x) if far else x
+    u = x * x
+    s = SIN[0] + u * (SIN[1] + u * (SIN[2] + u * (SIN[3] + u * (SIN[4] + u * (SIN[5] + u * (SIN[6] + u * SIN[7]))))))
+    c = COS[0] + u * (COS[1] + u * (COS[2] + u * (COS[3] + u * (COS[4] + u * (COS[5] + u * (COS[6] + u * COS[7]))))))
+    return s * x, (-c if far else c)
+
+
+@kernel
+def polar(re, im):
+    """Magnitude of re + j im and its angle (rad), above -3/2 pi up to pi/2.
+
+    An octant, turned back by half of it, leaves |t| <= tan(pi/8) to the polynomials.
+    """
+    re = re + LEAST
+    x, y = abs(re), abs(im)
+    larger, smaller = (y if y > x else x), (x if y > x else y)
+    base = larger + EIGHTH * smaller
+    t = (smaller - EIGHTH * larger) / base
+    u = t * t
+    size = CHORD[0] + u * (CHORD[1] + u * (CHORD[2] + u * (CHORD[3] + u * (CHORD[4] + u * CHORD[5]))))
+    angle = ATAN[0] + u * (ATAN[1] + u * (ATAN[2] + u * (ATAN[3] + u * (ATAN[4] + u * ATAN[5]))))
+    angle = TURN / 16.0 + t * angle
+    angle = math.copysign((0.25 * TURN - angle) if y > x else angle, im)
+    return base * size, ((-0.5 * TURN - angle) if re < 0.0 else angle)
+
+
+@kernel
+def smoothstep_kernel(x):
+    """Third-order step from 0 to 1 over 0..1: x^2 (3 - 2 x)."""
+    x = min(max(x, 0.0), 1.0)
+    return x * x * (3.0 - 2.0 * x)

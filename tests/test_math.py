@@ -1,0 +1,77 @@
+"""Mathematics that several packages need: accuracy of the compiled functions, and of the design-time ones."""
+
+import math
+
+import numba
+import numpy as np
+import pytest
+import scipy.linalg
+
+from hapticrender import mathx
+
+RATE = 5000.0
+
+
+@numba.njit
+def played(turns, out):
+    """Sine, cosine, fraction and step of many numbers, as kernels take them."""
+    for i in range(turns.shape[0]):
+        out[0, i], out[1, i] = mathx.sincos_turns(turns[i])
+        out[2, i] = mathx.frac(turns[i])
+        out[3, i] = mathx.smoothstep_kernel(turns[i])
+
+
+def kernels_of(turns):
+    out = np.empty((4, len(turns)))
+    played(turns, out)
+    return out
+
+
+def test_sine_and_cosine_of_turns(rng):
+    """To 3e-15 within half a turn, quarter turns included; beyond it the whole turns go without a rounding."""
+    quarters = np.arange(-8, 9) / 4
+    beside = [quarters, quarters + 2e-16, quarters - 2e-16]
+    turns = np.concatenate([rng.uniform(-0.5, 0.5, 100_000), *beside, rng.uniform(-1e6, 1e6, 1000)])
+    sin, cos, part, _ = kernels_of(turns)
+    exact = turns - np.rint(turns)
+    angle = 2 * np.longdouble(math.pi) * exact.astype(np.longdouble) + np.longdouble(2.4492935982947064e-16) * exact
+    np.testing.assert_allclose(sin, np.sin(angle).astype(float), rtol=0, atol=3e-15)
+    np.testing.assert_allclose(cos, np.cos(angle).astype(float), rtol=0, atol=3e-15)
+    np.testing.assert_array_equal(part, exact)
+    assert abs(part).max() <= 0.5
+
+
+def test_smoothstep_is_the_same_compiled_or_not():
+    x = np.linspace(-0.5, 1.5, 2001)
+    step = mathx.smoothstep(x)
+    np.testing.assert_allclose(kernels_of(x)[3], step, rtol=0, atol=2**-51)
+    assert (step[x <= 0] == 0).all()
+    assert (step[x >= 1] == 1).all()
+    assert (np.diff(step) >= 0).all()
+    np.testing.assert_allclose(step + mathx.smoothstep(1 - x), 1.0, atol=2**-51)
+    assert mathx.smoothstep(0.25) == 0.15625
+
+
+def test_zero_order_hold_is_the_solution_of_the_equation():
+    """A damped oscillator under a held force, in closed form; two inputs, one of them without effect."""
+    w, damping = 2 * math.pi * 189.0, 30.0  # rad/s, 1/s
+    a, b = np.array([[0.0, 1.0], [-(w**2), -2 * damping]]), np.array([[0.0, 0.0], [w**2, 0.0]])
+    ad, bd = mathx.zoh(a, b, 1 / RATE)
+    wd, t = math.sqrt(w**2 - damping**2), 1 / RATE
+    decay, s, c = math.exp(-damping * t), math.sin(wd * t), math.cos(wd * t)
+    free = decay * np.array([[c + damping / wd * s, s / wd], [-(w**2) / wd * s, c - damping / wd * s]])
+    np.testing.assert_allclose(ad, free, rtol=1e-12)
+    np.testing.assert_allclose(bd[:, 0], [1 - free[0, 0], -free[1, 0]], rtol=1e-9)
+    np.testing.assert_array_equal(bd[:, 1], 0.0)
+    np.testing.assert_allclose(mathx.zoh(a, b, 2 / RATE)[0], ad @ ad, rtol=1e-12)
+    np.testing.assert_allclose(ad, scipy.linalg.expm(a / RATE), rtol=1e-12)
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_zero_crossings_are_found_between_samples(sign):
+    """Of straight lines exactly; of a sine to the chord's error, w^2 t (1 - t) (1 - 2 t)/6 <= w^2/(36 sqrt 3)."""
+    np.testing.assert_allclose(mathx.zero_crossings(sign * np.array([1.0, -3.0, -1.0, 1.0])), [0.25, 2.5])
+    w = 2 * math.pi / 50
+    found = mathx.zero_crossings(sign * np.sin(w * np.arange(500) - 0.3))
+    np.testing.assert_allclose(found, (0.3 + math.pi * np.arange(20)) / w, atol=1.1 * w**2 / (36 * math.sqrt(3)))
+    assert mathx.zero_crossings(np.ones(5)).size == 0

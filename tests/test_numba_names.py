@@ -1,0 +1,135 @@
+"""What the shipped code takes from numba and llvmlite: documented names only, so that a new release breaks nothing."""
+
+import ast
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parent.parent
+SHIPPED = sorted(path for folder in ("hapticrender", "renderers", "drivers") for path in (ROOT / folder).rglob("*.py"))
+PACKAGES = ("numba", "llvmlite")
+TYPES = ("int32", "int64", "uint32", "uint64", "float32", "float64", "complex128", "CPointer")
+ALLOWED = {  # numba's user manual and extension manual, llvmlite's manual of its IR layer
+    *("numba.njit", "numba.cfunc", "numba.carray", "numba.from_dtype", "numba.types", "numba.extending.intrinsic"),
+    *(f"numba.types.{name}" for name in TYPES),
+    *(f"llvmlite.ir{name}" for name in ("", ".Constant", ".FunctionType", ".IntType", ".PointerType")),
+}
+IN_INTRINSICS = {  # attributes of what numba hands to a code generator, and of its types
+    "context": {"get_value_type"},
+    "builder": {"inttoptr", "add", "mul", "call", "atomic_rmw", "extract_value"},
+    "signature": {"args", "return_type"},
+    "typingctx": set(),
+}
+OPTIONS = {"cache", "error_model", "fastmath", "nogil", "_nrt"}  # of njit and cfunc
+
+
+def bound_names(tree):
+    """Name in a module -> dotted name of what it stands for in numba or llvmlite."""
+    names = {}
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            for alias in node.names:
+                package = alias.name.split(".")[0]
+                if package in PACKAGES:
+                    names |= {alias.name: alias.name, alias.asname or package: alias.name if alias.asname else package}
+        elif isinstance(node, ast.ImportFrom) and (node.module or "").split(".")[0] in PACKAGES and not node.level:
+            names.update({alias.asname or alias.name: f"{node.module}.{alias.name}" for alias in node.names})
+    return names
+
+
+def dotted(node):
+    """Dotted name of a chain of attributes on a name, or None."""
+    if isinstance(node, ast.Name):
+        return node.id
+    base = dotted(node.value) if isinstance(node, ast.Attribute) else None
+    return f"{base}.{node.attr}" if base else None
+
+
+def is_intrinsic(node, names):
+    return isinstance(node, ast.FunctionDef) and any(
+        names.get(str(dotted(each)).split(".")[0], "") == "numba.extending.intrinsic" for each in node.decorator_list
+    )
+
+
+def outside(source):
+    """All that a module takes from numba and llvmlite and that is not on the list."""
+    tree = ast.parse(source)
+    names = bound_names(tree)
+    found = set(names.values()) - {"numba", "llvmlite", "numba.extending"} - ALLOWED
+    for node in ast.walk(tree):
+        chain = dotted(node) if isinstance(node, ast.Attribute) else None
+        if chain and chain.split(".")[0] in names:
+            first, _, rest = chain.partition(".")
+            full = f"{names[first]}.{rest}"
+            if not any(full == each or each.startswith(f"{full}.") for each in ALLOWED):
+                found.add(full)
+        if is_intrinsic(node, names):
+            found |= set(handed_out(node))
+    return found | private_attributes(tree) | options(tree, names)
+
+
+def handed_out(function):
+    """Attributes of context, builder and signature in an intrinsic that are not on the list."""
+    for node in ast.walk(function):
+        if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id in IN_INTRINSICS:
+            if node.attr not in IN_INTRINSICS[node.value.id]:
+                yield f"{node.value.id}.{node.attr}"
+
+
+def private_attributes(tree):
+    """Attributes with a leading underscore of anything but `self`, `cls`, a class of ours or a module's own name."""
+    own = {node.name for node in ast.walk(tree) if isinstance(node, ast.ClassDef)} | {"self", "cls"}
+    return {
+        f"{ast.unparse(node.value)}.{node.attr}"
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Attribute) and node.attr.startswith("_") and not node.attr.startswith("__")
+        if ast.unparse(node.value).split(".")[0] not in own
+    }
+
+
+def options(tree, names):
+    """Options of njit and cfunc that are not on the list; those of `jit.OPTIONS` are in the dictionary of that name."""
+    found = set()
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Call):
+            func = dotted(node.func) or ""
+            first, _, rest = func.partition(".")
+            if f"{names.get(first, '')}{'.' if rest else ''}{rest}" in ("numba.njit", "numba.cfunc"):
+                found |= {f"option {each.arg}" for each in node.keywords if each.arg and each.arg not in OPTIONS}
+        elif isinstance(node, ast.AnnAssign | ast.Assign) and isinstance(node.value, ast.Dict):
+            target = node.target if isinstance(node, ast.AnnAssign) else node.targets[0]
+            if getattr(target, "id", "") == "OPTIONS":
+                found |= {f"option {key.value}" for key in node.value.keys} - {f"option {each}" for each in OPTIONS}
+    return found
+
+
+def uses_numba(source):
+    return bool(bound_names(ast.parse(source)))
+
+
+def test_shipped_code_uses_documented_names_only():
+    sources = {path.relative_to(ROOT).as_posix(): path.read_text(encoding="utf-8") for path in SHIPPED}
+    users = {name: outside(source) for name, source in sources.items() if uses_numba(source)}
+    assert {"hapticrender/jit.py", "hapticrender/realtime.py", "hapticrender/control/kernel.py"} <= set(users)
+    assert not {name: found for name, found in users.items() if found}
+
+
+@pytest.mark.parametrize(
+    ("source", "found"),
+    [
+        ("from numba import njit, carray, types\nf = njit(types.int64)", set()),
+        ("import numba\nnumba.core.config.DEBUG = 1", {"numba.core", "numba.core.config", "numba.core.config.DEBUG"}),
+        ("from numba.core.dispatcher import Dispatcher", {"numba.core.dispatcher.Dispatcher"}),
+        ("import numba.core.typing", {"numba.core.typing"}),
+        ("import llvmlite.binding as llvm\nllvm.initialize()", {"llvmlite.binding", "llvmlite.binding.initialize"}),
+        ("import numba\nnumba.njit(nopython=True)", {"option nopython"}),
+        ("from numba import njit\n@njit\ndef f(): pass\nf._cache.flush()", {"f._cache"}),
+        (
+            "from numba.extending import intrinsic\n@intrinsic\ndef f(typingctx):\n"
+            "    def build(context, builder, signature, values):\n        return context.call_conv\n    return build",
+            {"context.call_conv"},
+        ),
+    ],
+)
+def test_the_list_fails_on(source, found):
+    assert outside(source) == found
