@@ -1,80 +1,207 @@
 """The compiled real-time entry: a controller as a C function and one pointer, for an audio library to call.
 
 A callback written in Python waits for Python's lock and misses its deadline whenever another thread is busy.  This one
-holds no lock, allocates nothing and never waits: targets and the finger's place reach it through slots that change
-hands in one atomic step (`hapticrender.compiled.exchange`)::
+holds no lock, allocates nothing and never waits: targets and the finger's position reach it through a triple buffer,
+whose slots change hands in one atomic step::
 
     entry = RealtimeEntry(controller, sensed_scale=2e-4, drive_scale=0.5)   # m and 1/A of full scale
     stream = open_audio(callback=entry.address, user_data=entry.user_data, frames=entry.block)
     entry.send(bands)                  # other targets, from any thread of the application, one at a time
-    entry.finger(0.01, velocity=0.05)  # m, m/s; it is followed at this speed until the next word
+    entry.finger(0.01, velocity=0.05)  # m, m/s; extrapolated at this speed until the next call
     entry.samples, entry.flags         # what has happened
     entry.silence()                    # zero drive, before the stream is closed
+
+Three slots, one writer and one reader: the writer fills its own slot and swaps it for the one in the middle, the reader
+swaps its own for that where it is fresh.  Neither ever waits, and no slot is read while it is written.
 """
 
 from __future__ import annotations
 
 import sys
 from functools import cached_property
-from typing import NamedTuple
+from typing import Any
 
 import numba
 import numpy as np
-from numba import types
+from llvmlite import ir
+from numba import carray, types
+from numba.extending import intrinsic
 
 from hapticrender.bands import Bands
-from hapticrender.compiled.exchange import FRESH, SLOTS, behind, bytes_of, empty, place, swap
-from hapticrender.compiled.jit import callback, kernel
-from hapticrender.compiled.records import as_record
-from hapticrender.control.bank.rows import TONE_ROWS
-from hapticrender.control.blocks.controller import BlockController
-from hapticrender.control.blocks.kernels import block_step
-from hapticrender.control.blocks.state import BlockState, BlockTables
+from hapticrender.control.records import SETPOINT_ROWS
+from hapticrender.jit import F8, I8, CFunction, addresses, call, kernel, pointer, record
 from hapticrender.protocols import Array, Flag
 
-HORIZON = 0.05  # s: a finger that is not heard of stays where it was bound for by then
-CONTINUE, ABORT = 0, 2  # what PortAudio takes for an answer
+HORIZON = 0.05  # s: without a new position the finger stays where it was bound for by then
+CONTINUE, ABORT = 0, 2  # PortAudio's answers
 OVERRUN = int(Flag.OVERRUN)
 LOST = 0b1111  # PortAudio's status: input or output under- or overflow
 UNSIGNED_LONG = types.uint32 if sys.platform == "win32" else types.uint64
-# entries of a slot: the finger's place and speed, whether anything is played, how often finger and tones have changed,
-# then the tones, row by row
-POSITION, VELOCITY, PLAYING, FINGER_NEWS, TONE_NEWS = range(5)
+F4 = types.float32
+SLOTS, FRESH = 3, 4  # slots; bit beside the number of the slot in the middle: not yet read
+# entries of a slot: the finger's position and speed, whether anything is played, how often finger and setpoints have
+# changed, then the setpoints row by row
+POSITION, VELOCITY, PLAYING, FINGER_CHANGES, SETPOINT_CHANGES = range(5)
 HEAD = 5
-# entries of RealtimeParts.meter: samples, flags of all of them, blocks refused, and what was last taken up: slot, age
-# of the finger in samples, news of finger and tones
-SAMPLES, FLAGS, REFUSED, SLOT, AGE, FINGER_HEARD, TONE_HEARD = range(7)
-METERS = 7
+
+ENTRY = np.dtype(
+    [
+        *((name, np.int64) for name in ("step", "controller", "signals", "block", "sensors", "channels", "setpoints")),
+        *((name, np.int64) for name in ("setpoints_at", "slots_at", "middle", "slot", "age")),
+        *((name, np.float64) for name in ("finger_changes", "setpoint_changes", "rate", "sensed_scale", "drive_scale")),
+        *((name, np.int64) for name in ("sensed_at", "drive_at", "position_at", "wanted_at", "flags_at")),
+        *((name, np.int64) for name in ("samples", "flags", "refused", "waveform_at", "waveform_length", "spatial")),
+        ("period", np.float64),
+    ]
+)
+ENTRY_T = numba.from_dtype(ENTRY)
+MIDDLE_AT = ENTRY.fields["middle"][1] if ENTRY.fields else 0
 
 
-class RealtimeParts(NamedTuple):
-    """All that the compiled entry reads and writes; the user data points to it."""
+@intrinsic
+def swap(typingctx: Any, address: Any, value: Any) -> Any:
+    """Store an int64 at an address and return what was there, in one indivisible step that orders memory."""
 
-    tables: BlockTables
-    state: BlockState
-    slot: Array  # (SLOTS, HEAD + TONE_ROWS * bands)
-    middle: Array  # (1,) integer: number of the slot in the middle, and FRESH
-    meter: Array  # (METERS,) integer
-    scale: Array  # (2,) m of full scale sensed; full scale of A driven
-    sensed: Array  # scratch of a block: (M, sensors)
-    position: Array  # (M,)
-    wanted: Array  # (M,), zero
-    drive: Array  # (M, channels)
-    target: Array  # (bands,)
-    flags: Array  # (M,)
+    def build(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+        place = builder.inttoptr(values[0], ir.PointerType(ir.IntType(64)))
+        return builder.atomic_rmw("xchg", place, values[1], "acq_rel")
+
+    return types.int64(types.int64, types.int64), build
+
+
+@kernel
+def publish(entry, back):
+    """Swap the writer's slot `back` for the one in the middle; returns the writer's next slot."""
+    return swap(entry + MIDDLE_AT, back | FRESH) & (FRESH - 1)
+
+
+@kernel
+def receive(entry):
+    """Take up what the application has handed over: setpoints, and the finger's position during the block."""
+    e = record(entry, ENTRY_T, 0)
+    if e.middle & FRESH:
+        e.slot = swap(entry + MIDDLE_AT, e.slot) & (FRESH - 1)
+    width = HEAD + e.setpoints
+    slot = carray(pointer(e.slots_at + 8 * width * e.slot, F8), width)
+    if slot[SETPOINT_CHANGES] != e.setpoint_changes:
+        e.setpoint_changes = slot[SETPOINT_CHANGES]
+        setpoints = carray(pointer(e.setpoints_at, F8), e.setpoints)
+        for i in range(e.setpoints):
+            setpoints[i] = slot[HEAD + i]
+    if slot[FINGER_CHANGES] != e.finger_changes:
+        e.finger_changes, e.age = slot[FINGER_CHANGES], 0
+    position, wanted = carray(pointer(e.position_at, F8), e.block), carray(pointer(e.wanted_at, F8), e.block)
+    waveform = carray(pointer(e.waveform_at, F8), e.waveform_length)
+    for m in range(e.block):
+        age = min((e.age + m) / e.rate, HORIZON)
+        position[m] = slot[POSITION] + age * slot[VELOCITY]
+        if e.waveform_length > 0:
+            at = position[m] if e.spatial > 0 else (e.samples + m) / e.rate
+            turns = at / e.period
+            if turns != turns:
+                wanted[m] = 0.0
+            else:
+                place = (turns - np.floor(turns)) * e.waveform_length
+                i = int(place) % e.waveform_length
+                after = waveform[(i + 1) % e.waveform_length]
+                wanted[m] = waveform[i] + (place - int(place)) * (after - waveform[i])
+    e.age += e.block
+    return slot[PLAYING] > 0.0
+
+
+@kernel
+def advance(entry):
+    """Advance the controller by the block that is in its `sensed`; returns all flags of the block."""
+    e = record(entry, ENTRY_T, 0)
+    flags, drive = carray(pointer(e.flags_at, I8), e.block), carray(pointer(e.drive_at, F8), e.block * e.channels)
+    playing, raised = receive(entry), 0
+    if playing:
+        for m in range(e.block):
+            flags[m] = 0
+        call(e.step, (e.controller, e.signals, 0, e.block))
+        for m in range(e.block):
+            raised |= flags[m]
+    else:
+        for i in range(e.block * e.channels):
+            drive[i] = 0.0
+    e.flags |= raised
+    e.samples += e.block
+    return raised
+
+
+def _plain(sensed, drive, frames, entry):
+    """Advance by blocks of double samples in SI units; returns the flags, or -1 where it refuses."""
+    e = record(entry, ENTRY_T, 0)
+    count, raised = int(frames), 0
+    if count % e.block or sensed == 0 or drive == 0:
+        e.refused += 1
+        if drive != 0:
+            silent = carray(pointer(drive, F8), count * e.channels)
+            for i in range(count * e.channels):
+                silent[i] = 0.0
+        return -1
+    given, out = carray(pointer(sensed, F8), count * e.sensors), carray(pointer(drive, F8), count * e.channels)
+    own, result = (
+        carray(pointer(e.sensed_at, F8), e.block * e.sensors),
+        carray(pointer(e.drive_at, F8), e.block * e.channels),
+    )
+    for start in range(0, count, e.block):
+        for i in range(e.block * e.sensors):
+            own[i] = given[start * e.sensors + i]
+        raised |= advance(entry)
+        for i in range(e.block * e.channels):
+            out[start * e.channels + i] = result[i]
+    return raised
+
+
+def _audio(sensed, drive, frames, time, status, entry):
+    """Advance by blocks of interleaved float samples at full scale: PortAudio's callback."""
+    e = record(entry, ENTRY_T, 0)
+    count = int(frames)
+    if status & LOST:
+        e.flags |= OVERRUN
+    if count % e.block or sensed == 0 or drive == 0:
+        e.refused += 1
+        if drive != 0:
+            silent = carray(pointer(drive, F4), count * e.channels)
+            for i in range(count * e.channels):
+                silent[i] = F4(0.0)
+        return ABORT
+    given, out = carray(pointer(sensed, F4), count * e.sensors), carray(pointer(drive, F4), count * e.channels)
+    own, result = (
+        carray(pointer(e.sensed_at, F8), e.block * e.sensors),
+        carray(pointer(e.drive_at, F8), e.block * e.channels),
+    )
+    for start in range(0, count, e.block):
+        for i in range(e.block * e.sensors):
+            own[i] = e.sensed_scale * given[start * e.sensors + i]
+        advance(entry)
+        for i in range(e.block * e.channels):
+            out[start * e.channels + i] = e.drive_scale * result[i]
+    return CONTINUE
+
+
+PLAIN = CFunction(_plain, types.int32(I8, I8, types.uint64, I8))
+AUDIO = CFunction(_audio, types.int32(I8, I8, UNSIGNED_LONG, I8, UNSIGNED_LONG, I8))
 
 
 class RealtimeEntry:
-    """A controller in blocks behind a C function with one user-data pointer.
+    """A controller of any device and method behind a C function with one user-data pointer.
 
     Parameters
     ----------
-    controller : BlockController
-        Its state goes on here; do not run it elsewhere meanwhile.
+    controller : Controller
+        With a compiled step; its state goes on here, so do not run it elsewhere meanwhile.
     sensed_scale : float, m of full scale, > 0
-        What a float sample of 1.0 means at the input.
+        Unit of a float sample of 1.0 at the input.
     drive_scale : float, 1/A of full scale, > 0
         Float sample at the output for a drive of 1 A.
+    waveform : ndarray, shape (n,), m, optional
+        Of a texture whose bands are analysed (a recording): one period of it, repeated.
+    period : float, s or m
+        Length of the waveform, > 0: in time, or along the surface where it is `spatial`.
+    spatial : bool
+        Whether the waveform lies along the surface.
 
     Attributes
     ----------
@@ -93,65 +220,96 @@ class RealtimeEntry:
     Raises
     ------
     TypeError
-        The controller does not run in blocks.
+        The controller has no compiled step.
     ValueError
-        A scale is out of its bound, or the targets are no constant envelopes: a waveform cannot be handed over.
+        A scale is out of its bound, or a waveform is missing or not asked for.
     """
 
-    def __init__(self, controller: BlockController, *, sensed_scale: float = 1.0, drive_scale: float = 1.0) -> None:
-        if not isinstance(controller, BlockController):
-            raise TypeError(f"controller of type {type(controller).__name__}: must be a BlockController")
-        for name, value in (("sensed_scale (m)", sensed_scale), ("drive_scale (1/A)", drive_scale)):
+    def __init__(
+        self,
+        controller: Any,
+        *,
+        sensed_scale: float = 1.0,
+        drive_scale: float = 1.0,
+        waveform: Array | None = None,
+        period: float = 1.0,
+        spatial: bool = False,
+    ) -> None:
+        if not isinstance(getattr(controller, "step", None), CFunction):
+            raise TypeError(f"controller of type {type(controller).__name__}: must have a compiled step")
+        for name, value in (("sensed_scale (m)", sensed_scale), ("drive_scale (1/A)", drive_scale), ("period", period)):
             if not 0 < value < np.inf:
                 raise ValueError(f"{name}={value!r}: must be finite and > 0")
-        if controller.tables.bank.numbers.analysed:
-            raise ValueError("the targets are a waveform: must be constant envelopes (`Bands.envelope`)")
-        self.controller, self.block = controller, controller.block
-        self.rate = float(controller.tables.sample.rate)
-        tone, sensors = controller.tables.bank.tone, controller.tables.bank.listen.shape[1]
-        channels = len(controller.tables.bank.speak)
-        self._now = np.concatenate([[np.nan, 0.0, 1.0, 0.0, 0.0], tone.ravel()])
+        analysed = controller.bands.envelope is None
+        if analysed != (waveform is not None):
+            need = (
+                "must be given for targets that are a waveform"
+                if analysed
+                else "must be left out: targets are envelopes"
+            )
+            raise ValueError(f"waveform: {need}")
+        self.controller, self.block, self.rate = controller, controller.block, float(controller.rate)
+        setpoints = getattr(controller, "setpoints", np.zeros((SETPOINT_ROWS, 0)))
+        self._slot = np.concatenate([[np.nan, 0.0, 1.0, 0.0, 0.0], setpoints.ravel()])
         self._back = 0
-        self._parts = RealtimeParts(
-            tables=controller.tables,
-            state=controller.state,
-            slot=np.tile(self._now, (SLOTS, 1)),
-            middle=np.array([1]),
-            meter=np.array([0, 0, 0, 2, 0, 0, 0]),
-            scale=np.array([sensed_scale, drive_scale], float),
-            sensed=np.zeros((self.block, sensors)),
-            position=np.zeros(self.block),
-            wanted=np.zeros(self.block),
-            drive=np.zeros((self.block, channels)),
-            target=np.zeros(controller.n_bands, complex),
-            flags=np.zeros(self.block, np.int64),
-        )
-        self._memory = np.zeros(_size(self._parts) // 8 + 8)
-        self.user_data = int(self._memory.ctypes.data) // 64 * 64 + 64
-        _settle(self.user_data, self._parts)
-        self._pointer = types.CPointer(as_record(numba.typeof(self._parts)))
+        waveform = np.zeros(0) if waveform is None else np.ascontiguousarray(waveform, float)
+        arrays = {
+            "sensed": np.zeros((self.block, controller.sensors)),
+            "drive": np.zeros((self.block, controller.channels)),
+            "position": np.zeros(self.block),
+            "wanted": np.zeros(self.block),
+            "flags": np.zeros(self.block, np.int64),
+        }
+        target = np.zeros((self.block, controller.n_bands), complex)
+        signals = addresses(**arrays, target=target)
+        self._slots = np.tile(self._slot, (SLOTS, 1))
+        self._keep = (arrays, target, signals, waveform, setpoints)
+        self._entry = np.zeros(1, ENTRY)
+        values = {
+            "step": controller.step.address,
+            "controller": controller.state.ctypes.data,
+            "signals": signals.ctypes.data,
+            "block": self.block,
+            "sensors": controller.sensors,
+            "channels": controller.channels,
+            "setpoints": setpoints.size,
+            "setpoints_at": setpoints.ctypes.data,
+            "slots_at": self._slots.ctypes.data,
+            "middle": 1,
+            "slot": 2,
+            "rate": self.rate,
+            "sensed_scale": sensed_scale,
+            "drive_scale": drive_scale,
+            "waveform_at": waveform.ctypes.data,
+            "waveform_length": len(waveform),
+            "spatial": spatial,
+            "period": period,
+            **{f"{name}_at": array.ctypes.data for name, array in arrays.items()},
+        }
+        for name, value in values.items():
+            self._entry[name] = value
+        self.user_data = int(self._entry.ctypes.data)
 
     @cached_property
     def address(self) -> int:
-        """Address of the callback for PortAudio; compiled when first asked for."""
-        floats = types.CPointer(types.float32)
-        taken = (floats, floats, UNSIGNED_LONG, types.voidptr, UNSIGNED_LONG, self._pointer)
-        return int(callback(_audio, types.int32, *taken).address)
+        """Address of the callback for PortAudio; compiled when it is first read."""
+        return AUDIO.address
 
     @cached_property
     def plain_address(self) -> int:
-        """Address of the plain function; compiled when first asked for."""
-        doubles = types.CPointer(types.float64)
-        return int(callback(_plain, types.int32, doubles, doubles, types.uint64, self._pointer).address)
+        """Address of the plain function; compiled when it is first read."""
+        return PLAIN.address
 
     def send(self, bands: Bands) -> None:
-        """Hand over other targets, for the next block; see `BlockController.fitting` for the errors."""
-        self._now[HEAD:] = self.controller.fitting(bands).ravel()
-        self._now[TONE_NEWS] += 1
+        """Hand over other targets, for the next block; see `BankController.fitting` for the errors."""
+        if not hasattr(self.controller, "fitting"):
+            raise TypeError(f"controller of type {type(self.controller).__name__}: takes no other targets under way")
+        self._slot[HEAD:] = self.controller.fitting(bands).ravel()
+        self._slot[SETPOINT_CHANGES] += 1
         self._hand_over()
 
     def finger(self, position: float, velocity: float = 0.0) -> None:
-        """Tell where the finger is (m, NaN: lifted) and how fast it moves (m/s), at the start of the next block.
+        """Set the finger's position (m, NaN: lifted) and velocity (m/s) at the start of the next block.
 
         Raises
         ------
@@ -160,140 +318,33 @@ class RealtimeEntry:
         """
         if np.isinf(position) or not np.isfinite(velocity):
             raise ValueError(f"{position=} m, {velocity=} m/s: must be finite (position may be NaN: lifted)")
-        self._now[[POSITION, VELOCITY]] = position, velocity
-        self._now[FINGER_NEWS] += 1
+        self._slot[[POSITION, VELOCITY]] = position, velocity
+        self._slot[FINGER_CHANGES] += 1
         self._hand_over()
 
     def silence(self, quiet: bool = True) -> None:
-        """Drive nothing from the next block on, whatever is sensed.
+        """Set zero drive from the next block on, whatever is sensed.
 
         With ``quiet=False`` the controller goes on where it was, at once; its carriers have waited meanwhile.
         """
-        self._now[PLAYING] = 0.0 if quiet else 1.0
+        self._slot[PLAYING] = 0.0 if quiet else 1.0
         self._hand_over()
 
     @property
     def samples(self) -> int:
         """Samples that have been answered, silent ones included."""
-        return int(self._parts.meter[SAMPLES])
+        return int(self._entry["samples"][0])
 
     @property
     def flags(self) -> Flag:
         """Everything that was ever raised."""
-        return Flag(int(self._parts.meter[FLAGS]))
+        return Flag(int(self._entry["flags"][0]))
 
     @property
     def refused(self) -> int:
         """Calls that were answered with zeros because they did not fit."""
-        return int(self._parts.meter[REFUSED])
+        return int(self._entry["refused"][0])
 
     def _hand_over(self) -> None:
-        self._parts.slot[self._back] = self._now
-        self._back = _publish(self._parts.middle, self._back)
-
-
-@kernel
-def _size(parts):
-    return bytes_of(parts)
-
-
-@kernel
-def _settle(address, parts):
-    place(address, parts)
-
-
-@kernel
-def _publish(middle, back):
-    return swap(middle, back | FRESH) & (FRESH - 1)
-
-
-@kernel
-def take_over(parts):
-    """Take up what the application has handed over, and say where the finger is during the block."""
-    tables, meter, tone = parts.tables, parts.meter, parts.tables.bank.tone
-    if parts.middle[0] & FRESH:
-        meter[SLOT] = swap(parts.middle, meter[SLOT]) & (FRESH - 1)
-    slot, block = parts.slot[meter[SLOT]], parts.position.shape[0]
-    if slot[TONE_NEWS] != meter[TONE_HEARD]:
-        meter[TONE_HEARD] = int(slot[TONE_NEWS])
-        for r in range(TONE_ROWS):
-            for k in range(tone.shape[1]):
-                tone[r, k] = slot[HEAD + r * tone.shape[1] + k]
-        parts.state.news[0] = 1
-    if slot[FINGER_NEWS] != meter[FINGER_HEARD]:
-        meter[FINGER_HEARD], meter[AGE] = int(slot[FINGER_NEWS]), 0
-    for m in range(block):
-        age = min((meter[AGE] + m) / tables.sample.rate, HORIZON)
-        parts.position[m] = slot[POSITION] + age * slot[VELOCITY]
-    meter[AGE] += block
-    return slot[PLAYING] > 0.0
-
-
-@kernel
-def answer(parts):
-    """Drive and flags of one block from what has been put into `sensed`; returns all its flags."""
-    raised = 0
-    if take_over(parts):
-        block_step(
-            parts.tables,
-            parts.state,
-            parts.sensed,
-            parts.position,
-            parts.wanted,
-            parts.drive,
-            parts.target,
-            parts.flags,
-        )
-        for m in range(parts.flags.shape[0]):
-            raised |= parts.flags[m]
-    else:
-        for m in range(parts.drive.shape[0]):
-            for i in range(parts.drive.shape[1]):
-                parts.drive[m, i] = 0.0
-    parts.meter[FLAGS] |= raised
-    parts.meter[SAMPLES] += parts.drive.shape[0]
-    return raised
-
-
-def _plain(sensed, drive, frames, user_data):
-    """Blocks of double samples in SI units."""
-    parts = behind(user_data)
-    block, sensors = parts.sensed.shape
-    channels, samples, raised = parts.drive.shape[1], int(frames), 0
-    if samples % block or empty(sensed) or empty(drive):
-        parts.meter[REFUSED] += 1
-        for i in range(0 if empty(drive) else samples * channels):
-            drive[i] = 0.0
-        return -1
-    for start in range(0, samples, block):
-        for m in range(block):
-            for i in range(sensors):
-                parts.sensed[m, i] = sensed[(start + m) * sensors + i]
-        raised |= answer(parts)
-        for m in range(block):
-            for i in range(channels):
-                drive[(start + m) * channels + i] = parts.drive[m, i]
-    return raised
-
-
-def _audio(sensed, drive, frames, time, status, user_data):
-    """Blocks of float samples at full scale, as PortAudio hands them."""
-    parts = behind(user_data)
-    block, sensors = parts.sensed.shape
-    channels, samples = parts.drive.shape[1], int(frames)
-    if status & LOST:
-        parts.meter[FLAGS] |= OVERRUN
-    if samples % block or empty(sensed) or empty(drive):
-        parts.meter[REFUSED] += 1
-        for i in range(0 if empty(drive) else samples * channels):
-            drive[i] = 0.0
-        return ABORT
-    for start in range(0, samples, block):
-        for m in range(block):
-            for i in range(sensors):
-                parts.sensed[m, i] = parts.scale[0] * sensed[(start + m) * sensors + i]
-        answer(parts)
-        for m in range(block):
-            for i in range(channels):
-                drive[(start + m) * channels + i] = parts.scale[1] * parts.drive[m, i]
-    return CONTINUE
+        self._slots[self._back] = self._slot
+        self._back = int(publish(self.user_data, self._back))

@@ -8,13 +8,18 @@ from naive import envelope_loop
 
 import hapticrender as hr
 from hapticrender.bands import Bands
+from hapticrender.control.estimators import BoxcarSTDFT, StarSTDFT
 from hapticrender.control.loopshape import design
-from hapticrender.control.methods import METHODS
-from hapticrender.control.methods.inverse import DynamicStiffness, StaticInverse
-from hapticrender.control.methods.paper import CommonMode, PerSide
-from hapticrender.control.methods.resonant import Resonant, least_decay
-from hapticrender.control.stdft import BoxcarSTDFT, StarSTDFT
-from hapticrender.plants.vibrotactile import Plate, PlateParameters
+from hapticrender.control.methods import (
+    METHODS,
+    CommonMode,
+    DynamicStiffness,
+    PerSide,
+    Resonant,
+    StaticInverse,
+    least_decay,
+)
+from hapticrender.plants.plate import Plate, PlateParameters
 
 RATE = 5000.0
 WANTED = 10e-6

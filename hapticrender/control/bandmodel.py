@@ -11,7 +11,7 @@ import numpy as np
 from hapticrender.protocols import Array
 
 if TYPE_CHECKING:
-    from hapticrender.control.damping_margins import BendingMode
+    from hapticrender.control.damping import BendingMode
 
 
 @dataclass(frozen=True, kw_only=True)

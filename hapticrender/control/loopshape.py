@@ -1,26 +1,28 @@
-"""Loop shaping: from the wanted closed loop T and the estimator's low pass L to a controller C and its margins.
+"""Loop shaping: from a given closed loop T and the estimator's low pass L to a controller C.
 
-The loop is the paper's: the error between the reference and L times the
-amplitude (or phase) drives C, and C drives the plant, whose look-up table
-makes it 1.  So ``T = C/(1 + L C)`` and ``C = T/(1 - L T)``; the sensitivity is
-``S = 1/(1 + L C) = 1 - L T``.  (The paper calls T the sensitivity function; it
-is the response from reference to output.)
+The loop is that of Grigorii et al. 2021: the error between the reference and L times the amplitude (or phase) drives C,
+and C drives the plant, whose look-up table makes it 1 (docs/theory.md, "Loop shaping").  So ``T = C/(1 + L C)`` and
+``C = T/(1 - L T)``; the sensitivity is ``S = 1/(1 + L C) = 1 - L T``.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from math import degrees, inf, radians, sqrt
+from math import inf, sqrt
 from typing import Any, Literal
 
 import numpy as np
 
+from hapticrender.control.margins import LEAST, LeastMargins, Margins, margins_of, unstable_poles
 from hapticrender.control.transfer import TransferFunction, butterworth, require_positive
 from hapticrender.errors import DesignError
+from hapticrender.mathx import zero_crossings
 from hapticrender.protocols import Array
 
 FORMS = ("exact", "reduced", "integrator")
+BESIDE = 1e-6  # 1/s: distance of Nyquist's contour from the imaginary axis, right of the integrator
+RIPPLE = 0.005  # largest ripple of the drive at the lowest carrier (Grigorii et al. 2021)
 
 
 def exact_controller(loop_bandwidth: float, filter_bandwidth: float) -> TransferFunction:
@@ -31,22 +33,16 @@ def exact_controller(loop_bandwidth: float, filter_bandwidth: float) -> Transfer
     loop_bandwidth, filter_bandwidth : float
         Bandwidths of the Butterworth T and L, Hz.
 
-    Returns
-    -------
-    TransferFunction
-        ``C = l/(l t - 1)`` with l and t the denominators of L and T scaled to
-        1 at s = 0.  One pole lies at 0.
-
     Notes
     -----
-    The paper's sixth order comes from polynomial arithmetic on T/(1 - L T),
-    which carries the poles of T along as an uncancelled pair.
+    ``C = l/(l t - 1)`` with l and t the denominators of L and T, 1 at s = 0; one pole lies at 0.  Polynomial arithmetic
+    on T/(1 - L T) gives order six, of which the poles of T cancel.
     """
-    low_pass, wanted = (
+    low_pass, target = (
         np.divide(block.denominator, block.denominator[-1])
         for block in (butterworth(filter_bandwidth), butterworth(loop_bandwidth))
     )
-    return TransferFunction(tuple(low_pass), tuple(np.polysub(np.polymul(low_pass, wanted), [1.0])))
+    return TransferFunction(tuple(low_pass), tuple(np.polysub(np.polymul(low_pass, target), [1.0])))
 
 
 def reduced_controller(loop_bandwidth: float, filter_bandwidth: float) -> TransferFunction:
@@ -57,11 +53,6 @@ def reduced_controller(loop_bandwidth: float, filter_bandwidth: float) -> Transf
     loop_bandwidth, filter_bandwidth : float
         Bandwidths of the Butterworth T and L, Hz; the loop's must be the smaller.
 
-    Returns
-    -------
-    TransferFunction
-        With ``ki = wT wL/(sqrt2 (wT + wL))`` and ``p = sqrt2 wT wL/(wL - wT)``.
-
     Raises
     ------
     DesignError
@@ -69,8 +60,7 @@ def reduced_controller(loop_bandwidth: float, filter_bandwidth: float) -> Transf
 
     Notes
     -----
-    It matches three moments of s C at s = 0; for any Butterworth pair that
-    reduction has no zero, hence the closed form.
+    ``ki = wT wL/(sqrt2 (wT + wL))``, ``p = sqrt2 wT wL/(wL - wT)``: three moments of s C match at s = 0.
     """
     require_positive(loop_bandwidth=loop_bandwidth, filter_bandwidth=filter_bandwidth)
     if filter_bandwidth <= loop_bandwidth:
@@ -90,39 +80,29 @@ def integrator(gain: float) -> TransferFunction:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Margins:
-    """What a loop can bear and how it answers a step; `margins` computes it.
+class Design:
+    """A controller with the low pass of its estimator, and what the loop of the two does; `analyse` computes it.
 
     Attributes
     ----------
-    stable : bool
-        Whether the closed loop is stable (Nyquist count).
-    phase_margin : float, rad
-        Smallest phase left to -180 degrees where |L C| = 1.
-    gain_margin : float
-        Smallest factor on the gain that makes the loop unstable.
-    peak_sensitivity : float
-        Ms, the largest |S|: the inverse distance of L C from -1.
-    delay_margin : float, s
-        Smallest further delay that makes the loop unstable.
+    controller, low_pass : TransferFunction
+        C and L.
+    margins : Margins
     overshoot : float
         Of a unit step, relative.
     settling_time : float, s
-        After which a unit step stays within 2 %.  Both are inf where the loop
-        is unstable or still rings after 30 periods of its crossover.
+        After which a unit step stays within 2 %.  Both are inf where the loop is unstable or still rings after 30
+        periods of its crossover.
     bandwidth : float, Hz
         -3 dB frequency of the closed loop T.
     ripple : float
-        ``|C L/(1 + C L P)|`` at twice the lowest carrier frequency, P plant and
-        delay: the demodulator's image that reaches the drive amplitude,
-        relative to it.  With P = 1 this is |T L|.
+        ``|C L/(1 + C L P)|`` at twice the lowest carrier frequency, P plant and delay: the demodulator's image that
+        reaches the drive amplitude, relative to it.  With P = 1 this is |T L|.
     """
 
-    stable: bool
-    phase_margin: float
-    gain_margin: float
-    peak_sensitivity: float
-    delay_margin: float
+    controller: TransferFunction
+    low_pass: TransferFunction
+    margins: Margins
     overshoot: float
     settling_time: float
     bandwidth: float
@@ -130,22 +110,20 @@ class Margins:
 
     def __str__(self) -> str:
         return (
-            f"{'stable' if self.stable else 'unstable'}: phase margin {degrees(self.phase_margin):.1f} deg, "
-            f"gain margin {self.gain_margin:.2f}, Ms {self.peak_sensitivity:.3f}, "
-            f"delay margin {1e3 * self.delay_margin:.1f} ms, overshoot {100 * self.overshoot:.1f} %, "
-            f"settling {self.settling_time:.3f} s, bandwidth {self.bandwidth:.2f} Hz, ripple {100 * self.ripple:.3f} %"
+            f"{self.margins}, overshoot {100 * self.overshoot:.1f} %, settling {self.settling_time:.3f} s, "
+            f"bandwidth {self.bandwidth:.2f} Hz, ripple {100 * self.ripple:.3f} %"
         )
 
 
-def margins(
+def analyse(
     controller: TransferFunction,
     low_pass: TransferFunction,
     *,
     delay: float = 0.0,
     amplitude_pole: float | None = None,
     lowest_frequency: float = 20.0,
-) -> Margins:
-    """Margins and step response of the amplitude (or phase) loop.
+) -> Design:
+    """Compute margins and step response of the amplitude (or phase) loop.
 
     Parameters
     ----------
@@ -154,26 +132,20 @@ def margins(
     delay : float
         Known delay of the loop beside them, s, >= 0.
     amplitude_pole : float, optional
-        Pole of the plant's amplitude, Hz: f0/2Q of a mode driven at its
-        resonance f0.  By default the amplitude follows the drive at once.
+        Pole of the plant's amplitude, Hz: f0/2Q of a mode driven at its resonance f0.  By default the amplitude follows
+        the drive at once.
     lowest_frequency : float
         Lowest carrier, Hz: where the ripple is largest.
-
-    Returns
-    -------
-    Margins
 
     Raises
     ------
     ValueError
-        For an argument out of bounds, and where |L C| never crosses 1 (a
-        controller without integrator may have no margins).
+        For an argument out of bounds, and where |L C| never crosses 1.
 
     Notes
     -----
-    Everything is read off one logarithmic grid of 20001 frequencies; linear
-    interpolation between them errs by less than 1e-6.  The step is summed
-    from harmonics: exact to 5e-5 where T falls off with one pole only.
+    Margins come from a logarithmic grid of 20001 frequencies; linear interpolation between them errs by less than 1e-6.
+    The step is summed from harmonics: exact to 5e-5 where T falls off with one pole only.
     """
     require_positive(lowest_frequency=lowest_frequency)
     if not (np.isfinite(delay) and delay >= 0):
@@ -181,40 +153,40 @@ def margins(
     plant = TransferFunction((1.0,), (1.0,)) if amplitude_pole is None else _one_pole(amplitude_pole)
     rational = controller * low_pass * plant
 
+    def loop(s: Array) -> Any:
+        return rational(s) * np.exp(-delay * s)
+
     def closed(frequency: Any) -> Any:
-        forward = (controller * plant).frequency_response(frequency) * np.exp(-2j * np.pi * delay * frequency)
-        return forward / (1 + forward * low_pass.frequency_response(frequency))
+        s = 2j * np.pi * np.asarray(frequency, float)
+        forward = (controller * plant)(s) * np.exp(-delay * s)
+        return forward / (1 + forward * low_pass(s))
 
     frequency = _grid(rational)
-    loop = rational.frequency_response(frequency)
-    phase = np.unwrap(np.angle(loop)) - 2 * np.pi * delay * frequency
-    difference = 1 + np.abs(loop) * np.exp(1j * phase)
-    index = np.arange(frequency.size)
-
-    crossover = _crossings(np.log(np.abs(loop)))
+    gain = np.abs(rational.frequency_response(frequency))
+    crossover = zero_crossings(np.log(gain))
     if crossover.size == 0:
-        raise ValueError(f"the loop gain never crosses 1 (largest {np.abs(loop).max():.3g}): no margins to speak of")
-    crossover_frequency = np.interp(crossover, index, frequency)
-    phase_margin = np.pi + np.interp(crossover, index, phase)
-    reversal = _crossings(np.sin(phase))
-    reversal = reversal[np.cos(phase[reversal.astype(int)]) < 0]
-    reversal_gain = np.exp(np.interp(reversal, index, np.log(np.abs(loop))))
-    edge = _crossings(np.abs(closed(frequency)) - sqrt(0.5))
-
-    stable = _unstable_poles(rational, difference) == 0
-    overshoot, settling_time = _step_figures(closed, 40 / crossover_frequency.min()) if stable else (inf, inf)
+        raise ValueError(f"the loop gain never crosses 1 (largest {gain.max():.3g}): the loop has no margins")
+    index = np.arange(frequency.size)
+    outside = int(np.sum(rational.poles().real > BESIDE))
+    if unstable_poles(lambda f: 1 + loop(BESIDE + 2j * np.pi * f), np.append(0.0, frequency), outside):
+        found, overshoot, settling_time = Margins.unstable(), inf, inf
+    else:
+        found = margins_of(lambda f: loop(2j * np.pi * f)[:, None, None], frequency)
+        overshoot, settling_time = _step_figures(closed, 40 / np.interp(crossover.min(), index, frequency))
+    edge = zero_crossings(np.abs(closed(frequency)) - sqrt(0.5))
     image = 2 * lowest_frequency
-    return Margins(
-        stable=stable,
-        phase_margin=float(phase_margin.min()),
-        gain_margin=float(np.min(1 / reversal_gain, initial=inf)),
-        peak_sensitivity=float(np.max(1 / np.abs(difference))),
-        delay_margin=float(np.min(phase_margin / (2 * np.pi * crossover_frequency))),
+    return Design(
+        controller=controller,
+        low_pass=low_pass,
+        margins=found,
         overshoot=overshoot,
         settling_time=settling_time,
         bandwidth=float(np.min(np.interp(edge, index, frequency), initial=inf)),
         ripple=float(np.abs(closed(image) * low_pass.frequency_response(image) / plant.frequency_response(image))),
     )
+
+
+margins = analyse  # removed with the old kernels
 
 
 def _one_pole(frequency: float) -> TransferFunction:
@@ -231,27 +203,11 @@ def _grid(loop: TransferFunction) -> Array:
     return np.geomspace(1e-3 * corners.min(), 1e3 * corners.max(), 20001)
 
 
-def _crossings(values: Array) -> Array:
-    """Fractional indices at which `values` cross zero."""
-    before = np.flatnonzero(np.signbit(values[:-1]) != np.signbit(values[1:]))
-    return before + values[before] / (values[before] - values[before + 1])
-
-
-def _unstable_poles(loop: TransferFunction, difference: Array) -> int:
-    """Closed-loop poles in the right half plane, by Nyquist's count on `difference` = 1 + L C over all frequencies."""
-    poles = loop.poles()
-    at_zero = np.abs(poles) <= 1e-9 * np.abs(poles).max()
-    angle = np.unwrap(np.angle(difference))
-    turned = angle[-1] - angle[0]
-    return int(np.round(np.sum(poles[~at_zero].real > 0) + at_zero.sum() / 2 - turned / np.pi))
-
-
 def _step_figures(closed: Callable[[Array], Array], duration: float) -> tuple[float, float]:
     """Overshoot and 2 % settling time (s) of the unit step response of `closed` within `duration` (s).
 
-    The step is half a period of a square wave from -1 to 1, summed from its
-    harmonics, so that a delay costs nothing.  Both figures are inf where the
-    last quarter of that half period still leaves the 2 %.
+    The step is half a period of a square wave from -1 to 1, summed from its harmonics, so that a delay costs nothing.
+    Both figures are inf where the last quarter of that half period still leaves the 2 %.
     """
     samples = 2**17
     harmonic = np.arange(1, samples // 2, 2)
@@ -261,64 +217,8 @@ def _step_figures(closed: Callable[[Array], Array], duration: float) -> tuple[fl
     outside = np.abs(response - 1) - 0.02
     if outside[-samples // 8 :].max() > 0:
         return inf, inf
-    return float(max(0.0, response.max() - 1)), float(np.max(_crossings(outside), initial=0.0) * 2 * duration / samples)
-
-
-@dataclass(frozen=True, kw_only=True)
-class Bounds:
-    """Margins that `design` insists on.
-
-    Parameters
-    ----------
-    phase_margin : float, rad
-        Least phase margin, by default 45 degrees.
-    gain_margin : float
-        Least gain margin, by default 2.5.
-    peak_sensitivity : float
-        Largest Ms, by default 1.8.
-    ripple : float
-        Largest ripple of the drive at the lowest carrier; the paper's 0.5 %.
-    """
-
-    phase_margin: float = radians(45)
-    gain_margin: float = 2.5
-    peak_sensitivity: float = 1.8
-    ripple: float = 0.005
-
-    def check(self, found: Margins, remedy: str) -> None:
-        """Raise `DesignError`, naming the margin and the `remedy`, at the first bound that `found` breaks."""
-        image = "lower filter_bandwidth or loop_bandwidth, or raise lowest_frequency"
-        rules = (
-            (found.stable, "the closed loop is unstable", remedy),
-            (
-                found.phase_margin >= self.phase_margin,
-                f"phase margin {degrees(found.phase_margin):.1f} deg is below {degrees(self.phase_margin):.1f} deg",
-                remedy,
-            ),
-            (
-                found.gain_margin >= self.gain_margin,
-                f"gain margin {found.gain_margin:.2f} is below {self.gain_margin:.2f}",
-                remedy,
-            ),
-            (
-                found.peak_sensitivity <= self.peak_sensitivity,
-                f"peak sensitivity Ms {found.peak_sensitivity:.2f} is above {self.peak_sensitivity:.2f}",
-                remedy,
-            ),
-            (found.ripple <= self.ripple, f"ripple {found.ripple:.2%} is above {self.ripple:.2%}", image),
-        )
-        for kept, complaint, cure in rules:
-            if not kept:
-                raise DesignError(f"{complaint}: {cure}")
-
-
-@dataclass(frozen=True, kw_only=True)
-class Design:
-    """A controller, the low pass that it was designed for, and the margins of the two."""
-
-    controller: TransferFunction
-    low_pass: TransferFunction
-    margins: Margins
+    last = np.max(zero_crossings(outside), initial=0.0)
+    return float(max(0.0, response.max() - 1)), float(last * 2 * duration / samples)
 
 
 def design(
@@ -329,7 +229,7 @@ def design(
     *,
     delay: float = 0.0,
     amplitude_pole: float | None = None,
-    bounds: Bounds | None = None,
+    least: LeastMargins = LEAST["envelope"],
 ) -> Design:
     """Design the amplitude (or phase) loop and refuse it where its margins are too small.
 
@@ -340,37 +240,23 @@ def design(
     filter_bandwidth : float
         Bandwidth of the estimator's low pass L, Hz, at most half of `lowest_frequency`.
     form : {"exact", "reduced", "integrator"}
-        Fourth-order C, its second-order reduction, or a plain integrator of
-        gain 3.4 loop_bandwidth (17 1/s at 5 Hz: with L at 10 Hz the largest
-        whole gain whose step does not overshoot).
+        Fourth-order C, its second-order reduction, or a plain integrator of gain 3.4 loop_bandwidth (17 1/s at 5 Hz:
+        with L at 10 Hz the largest whole gain whose step does not overshoot).
     lowest_frequency : float
         Lowest carrier of the scene, Hz.
     delay : float
         Known delay of the loop, s.
     amplitude_pole : float, optional
-        Pole of the plant's amplitude, Hz (f0/2Q at a resonance f0); C then
-        carries the zero that cancels it.
-    bounds : Bounds, optional
-        What margins to insist on.
-
-    Returns
-    -------
-    Design
+        Pole of the plant's amplitude, Hz (f0/2Q at a resonance f0); C then carries the zero that cancels it.
+    least : LeastMargins
 
     Raises
     ------
     DesignError
-        Where a bandwidth breaks the paper's rule or a margin its bound: names
-        it, its value and bound, and what to change.
+        Where a bandwidth breaks the paper's rule, or a margin or the ripple its bound: names it, its value and bound,
+        and what to change.
     ValueError
         For an argument that no design could accept.
-
-    Notes
-    -----
-    The rules on the bandwidths ("Computing filter and control dynamics") keep
-    the image of the demodulator at 2 f0 out of the drive: with both low
-    passes far below it the ripple is ``(rL rT/4)^2``, rL = fL/f0, rT = fT/f0.
-    The paper's 0.5 % alone would allow rL rT < 0.283; its rules allow 0.125.
     """
     if form not in FORMS:
         raise ValueError(f"{form=} must be one of {', '.join(FORMS)}")
@@ -386,13 +272,24 @@ def design(
     if amplitude_pole is not None:
         inverse = np.divide(_one_pole(amplitude_pole).denominator, 2 * np.pi * amplitude_pole)
         controller = TransferFunction(tuple(np.polymul(controller.numerator, inverse)), controller.denominator)
-    low_pass = butterworth(filter_bandwidth)
-    found = margins(controller, low_pass, delay=delay, amplitude_pole=amplitude_pole, lowest_frequency=lowest_frequency)
+    found = analyse(
+        controller,
+        butterworth(filter_bandwidth),
+        delay=delay,
+        amplitude_pole=amplitude_pole,
+        lowest_frequency=lowest_frequency,
+    )
     remedies = [f"lower {loop_bandwidth=} Hz"]
     remedies += [f"raise {filter_bandwidth=} Hz"] if form == "integrator" else []
     remedies += [f"lower {delay=} s"] if delay else []
-    (bounds or Bounds()).check(found, " or ".join(remedies))
-    return Design(controller=controller, low_pass=low_pass, margins=found)
+    if complaint := least.complaint(found.margins):
+        raise DesignError(f"{complaint}: {' or '.join(remedies)}")
+    if found.ripple > RIPPLE:
+        raise DesignError(
+            f"ripple {found.ripple:.2%} is above {RIPPLE:.2%}: lower filter_bandwidth or loop_bandwidth, or raise "
+            "lowest_frequency"
+        )
+    return found
 
 
 def _check_share(name: str, bandwidth: float, lowest_frequency: float, share: int) -> None:

@@ -1,4 +1,13 @@
-"""Margins of a loop over several coordinates, read off its frequency response at sample rate."""
+"""Margins of a feedback loop from its frequency response, and the least margins that each design has to keep.
+
+L is the loop's frequency response, a number or a matrix (c, c) over the coordinates at which it is broken, and
+S = (I + L)^-1 its sensitivity.  The same functions serve sampled loops (z = e^(j 2 pi f/rate)) and continuous ones
+(s = j 2 pi f): they see frequencies only.
+
+References
+----------
+Astrom and Murray, Feedback Systems, 2nd ed., 2021, chapters 10 and 13.
+"""
 
 from __future__ import annotations
 
@@ -6,32 +15,31 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import permutations
-from typing import Any
 
 import numpy as np
 
+from hapticrender.mathx import zero_crossings
 from hapticrender.protocols import Array
 
-SLOWEST = 0.02  # 1/s: a loop that grows more slowly than this counts as stable in Nyquist's count
+SLOWEST = 0.02  # 1/s: a pole that grows more slowly than this counts as stable
 NARROWEST = 2e-3  # Hz: closest that a grid comes to a carrier
 PER_DECADE = 12  # points of a grid on either side of a carrier
 UNIFORM = 400  # points of a grid over the whole spectrum
-ZOOMS, NEARLY = 3, 0.7  # how often peaks are looked at closer, and which: those above so much of the highest
+ZOOMS, NEARLY = 3, 0.7  # refinements of a peak search, and which peaks are refined: above this share of the highest
 CONTINUOUS = 2.0  # rad: a locus that turns by more between two points has passed through infinity, at a carrier
-ROUNDS = 24  # bisections of a grid where the return difference turns too fast
+BISECTIONS = 24  # of a grid where the return difference turns by more than a radian
 
 
 @dataclass(frozen=True, kw_only=True)
 class Margins:
-    """How far a loop stands from its boundary; every margin of an unstable loop is 0.
+    """Distances of a loop from instability; every margin of an unstable loop is 0, and its gain margin 1.
 
     Parameters
     ----------
     stable : bool
         All closed-loop poles decay, or grow by less than 0.02 1/s.
     modulus : float
-        1/max over frequency of the largest singular value of S, 0..1: the distance of I + L from being singular; Ms
-        is its inverse.
+        1/Ms, 0..1, Ms being the maximum over frequency of the largest singular value of S.
     worst_frequency : float, Hz
         Where S peaks.
     delay : float, s
@@ -41,7 +49,7 @@ class Margins:
     gain : float
         Largest error of the plant's gain, as a factor >= 1: the loop bears the plant times it and divided by it.
     bandwidth : float, Hz
-        Within this distance of the carrier every deviation is at least halved in power.
+        Within this distance of every carrier S stays below 1/sqrt 2; inf where the loop has no carrier.
     """
 
     stable: bool
@@ -50,18 +58,81 @@ class Margins:
     delay: float
     phase: float
     gain: float
-    bandwidth: float
+    bandwidth: float = math.inf
+
+    @classmethod
+    def unstable(cls) -> Margins:
+        """Return the margins of a loop with a growing pole."""
+        return cls(stable=False, modulus=0.0, worst_frequency=math.nan, delay=0.0, phase=0.0, gain=1.0, bandwidth=0.0)
+
+    @property
+    def peak_sensitivity(self) -> float:
+        """Ms = 1/modulus."""
+        return 1.0 / self.modulus if self.modulus else math.inf
 
     def __str__(self) -> str:
+        if not self.stable:
+            return "unstable"
+        bandwidth = f", bandwidth {self.bandwidth:.2f} Hz" if math.isfinite(self.bandwidth) else ""
         return (
             f"modulus margin {self.modulus:.2f} at {self.worst_frequency:.0f} Hz, gain margin {self.gain:.3g}, "
-            f"phase margin {math.degrees(self.phase):.0f} deg, delay margin {1e3 * self.delay:.2f} ms, "
-            f"bandwidth {self.bandwidth:.2f} Hz"
+            f"phase margin {math.degrees(self.phase):.0f} deg, delay margin {1e3 * self.delay:.2f} ms{bandwidth}"
         )
 
 
+@dataclass(frozen=True, kw_only=True)
+class LeastMargins:
+    """Least margins of a design.
+
+    Parameters
+    ----------
+    modulus : float
+        1/Ms, 0..1; 0.5 is Ms = 2.
+    delay : float, samples
+        At most the time in which the highest carrier turns by `phase` is required: above 400 Hz a sample at 5 kHz is a
+        larger angle than any loop that follows a carrier bears.
+    phase : float, rad
+    gain : float
+        Factor, >= 1.
+    """
+
+    modulus: float = 0.5
+    delay: float = 1.0
+    phase: float = math.radians(30.0)
+    gain: float = 2.0
+
+    def complaint(self, found: Margins, rate: float = 1.0, highest: float = 0.0) -> str:
+        """Name the first margin that falls short, with value, bound and unit; empty where all hold.
+
+        `rate` and the `highest` carrier are in Hz.
+        """
+        delay = min(self.delay, self.phase * rate / (2 * math.pi * max(highest, 1.0)))
+        checks = (
+            (found.stable, "the loop is unstable"),
+            (
+                found.modulus >= self.modulus,
+                f"modulus margin {found.modulus:.2f} at {found.worst_frequency:.4g} Hz is below {self.modulus:.2f}",
+            ),
+            (found.delay * rate >= delay, f"delay margin {found.delay * rate:.2f} samples is below {delay:.2f}"),
+            (
+                found.phase >= self.phase,
+                f"phase margin {math.degrees(found.phase):.1f} deg is below {math.degrees(self.phase):.1f} deg",
+            ),
+            (found.gain >= self.gain, f"gain margin {found.gain:.2f} is below {self.gain:.2f}"),
+        )
+        return next((text for kept, text in checks if not kept), "")
+
+
+LEAST = {
+    "law": LeastMargins(modulus=0.29, gain=1.4),  # bands share one residual: 20 Hz apart they leave 0.30 and 1.42
+    "damper": LeastMargins(modulus=1 / 1.7, gain=2.5, phase=math.radians(60.0)),
+    "envelope": LeastMargins(modulus=1 / 1.8, gain=2.5, phase=math.radians(45.0), delay=0.0),
+}
+"""Least margins by use: the error observer's law, the inner damper, the low-pass loop of one envelope."""
+
+
 def carrier_grid(carriers: Array, widths: Array, rate: float, narrowest: float = NARROWEST) -> Array:
-    """Frequencies (Hz) from 0 to half the rate, ever denser towards the carriers, none of them on one.
+    """Frequencies (Hz) from 0 to half the rate, denser towards the carriers, none of them on one.
 
     Parameters
     ----------
@@ -88,40 +159,61 @@ def carrier_grid(carriers: Array, widths: Array, rate: float, narrowest: float =
     return grid[apart > 0.5 * narrowest]
 
 
-def unstable_poles(difference: Callable[[Array], Array], grid: Array, carriers: Array, rate: float) -> int:
-    """Closed-loop poles that grow, by Nyquist's count on a circle just outside the unit circle.
+def unstable_poles(difference: Callable[[Array], Array], grid: Array, open_loop: int = 0) -> int:
+    """Count the closed-loop poles outside a contour, by Nyquist's criterion.
 
     Parameters
     ----------
     difference : callable
-        Closed-loop over open-loop characteristic polynomial at complex z (shape (n,)), 1 at infinity, with all its
-        poles on or inside the unit circle.
+        Return difference det(I + L) at frequencies (Hz, shape (n,)) along the contour, real at both its ends.
     grid : ndarray, Hz
-        Where to begin; halved wherever the difference turns by more than one radian.
-    carriers : ndarray, shape (n,), Hz
-        Where it turns within less than the grid resolves.
-    rate : float, Hz
-        Sampling rate.
+        Where to begin, from 0 to half the rate (or far beyond every corner); bisected wherever the difference turns by
+        more than one radian.
+    open_loop : int
+        Poles of L outside the contour.
 
     Notes
     -----
-    On ``|z| = exp(SLOWEST/rate)`` every open-loop pole lies inside, carriers and integrators included, so no
-    indentation is needed: the difference winds minus once for each closed-loop pole outside.
+    Take the contour just outside the boundary, such as ``|z| = exp(SLOWEST/rate)``: carriers and integrators then lie
+    inside and no indentation is needed.  Half the contour turns by -pi for each pole more that
+    is outside in closed loop.
     """
-    radius = math.exp(SLOWEST / rate)
-    close = np.append(carriers, 0.0)[:, None] + np.linspace(-NARROWEST, NARROWEST, 9)
-    grid = np.unique(np.concatenate([grid, close.ravel(), [0.0, rate / 2]]))
-    grid = grid[(grid >= 0.0) & (grid <= rate / 2)]
-    values = difference(radius * np.exp(2j * np.pi * grid / rate))
-    for _ in range(ROUNDS):
-        turn = np.angle(values[1:] / values[:-1])
-        rough = np.flatnonzero(np.abs(turn) > 1.0)
+    values = difference(grid)
+    for _ in range(BISECTIONS):
+        rough = np.flatnonzero(np.abs(np.angle(values[1:] / values[:-1])) > 1.0)
         if not rough.size:
             break
         between = 0.5 * (grid[rough] + grid[rough + 1])
         grid = np.insert(grid, rough + 1, between)
-        values = np.insert(values, rough + 1, difference(radius * np.exp(2j * np.pi * between / rate)))
-    return round(-np.angle(values[1:] / values[:-1]).sum() / np.pi)
+        values = np.insert(values, rough + 1, difference(between))
+    return open_loop + round(-np.angle(values[1:] / values[:-1]).sum() / np.pi)
+
+
+def margins_of(loop: Callable[[Array], Array], grid: Array, carriers: Array | None = None) -> Margins:
+    """Read every margin of a stable loop off its frequency response.
+
+    Parameters
+    ----------
+    loop : callable
+        L at frequencies (Hz, shape (n,)), complex, shape (n, c, c).
+    grid : ndarray, Hz
+        Ascending, > 0, dense where L changes fast; S is searched more finely around its peaks.
+    carriers : ndarray, Hz, optional
+        Frequencies about which `bandwidth` is measured.
+    """
+    values = loop(grid)
+    peak = sensitivity(values)
+    highest, where = highest_peak(lambda frequency: sensitivity(loop(frequency)), grid, peak)
+    delay, phase, gain = borne_errors(grid, values)
+    return Margins(
+        stable=True,
+        modulus=1.0 / highest,
+        worst_frequency=where,
+        delay=delay,
+        phase=phase,
+        gain=gain,
+        bandwidth=math.inf if carriers is None else min(_halved_within(grid - carrier, peak) for carrier in carriers),
+    )
 
 
 def sensitivity(loop: Array) -> Array:
@@ -135,7 +227,7 @@ def sensitivity(loop: Array) -> Array:
 
 
 def highest_peak(height: Callable[[Array], Array], grid: Array, values: Array) -> tuple[float, float]:
-    """Highest value of `height` (at Hz, shape (n,)), and where, looked for ever closer around what `grid` shows."""
+    """Search for the highest value of `height` (at Hz, shape (n,)) and its place, around the peaks on `grid`."""
     for _ in range(ZOOMS):
         inner = np.flatnonzero((values[1:-1] >= values[:-2]) & (values[1:-1] >= values[2:])) + 1
         inner = np.append(inner[values[inner] > NEARLY * values.max()], values.argmax())
@@ -147,6 +239,8 @@ def highest_peak(height: Callable[[Array], Array], grid: Array, values: Array) -
 
 def eigenloci(loop: Array) -> Array:
     """Eigenvalues of `loop` (n, c, c) along its first axis, shape (n, c), each column continuous."""
+    if loop.shape[1] == 1:
+        return loop[:, :, 0].copy()
     loci = np.linalg.eigvals(loop)
     ways = np.array(list(permutations(range(loci.shape[1]))))
     moved = np.abs(loci[1:, ways] - loci[:-1, None, :]).sum(axis=2).argmin(axis=1)
@@ -155,12 +249,6 @@ def eigenloci(loop: Array) -> Array:
         order = way[order]
         loci[n] = loci[n, order]
     return loci
-
-
-def crossings(values: Array) -> Array:
-    """Fractional indices at which `values` (n,) change sign."""
-    before = np.flatnonzero(np.signbit(values[:-1]) != np.signbit(values[1:]))
-    return before + values[before] / (values[before] - values[before + 1])
 
 
 def borne_errors(frequency: Array, loop: Array) -> tuple[float, float, float]:
@@ -174,20 +262,20 @@ def borne_errors(frequency: Array, loop: Array) -> tuple[float, float, float]:
 
     Notes
     -----
-    The common factor q = exp(-j w tau), exp(-j theta) or kappa puts a pole on the circle where det(I + q L) = 0, that
-    is where an eigenvalue of L equals -1/q: the first such q on the way from 1 is the boundary, exactly.
+    A common factor q = exp(-j w tau), exp(-j theta) or kappa puts a pole on the boundary where det(I + q L) = 0, that
+    is where an eigenvalue of L equals -1/q: the first such q on the way from 1 is the margin, exactly.
     """
     delay = phase = math.inf
     more, less = math.inf, 0.0
     index = np.arange(frequency.size)
     for locus in eigenloci(loop).T:
         size, angle = np.log(np.maximum(np.abs(locus), 1e-300)), np.unwrap(np.angle(-locus))
-        at = crossings(size)
+        at = zero_crossings(size)
         lag = np.interp(at, index, angle)
         where = np.maximum(np.interp(at, index, frequency), 1e-12)
-        phase = min(phase, np.abs(_wrapped(lag)).min(initial=np.inf))
+        phase = min(phase, np.abs(np.mod(lag + np.pi, 2 * np.pi) - np.pi).min(initial=np.inf))
         delay = min(delay, (np.mod(lag, 2 * np.pi) / (2 * np.pi * where)).min(initial=np.inf))
-        at = crossings(np.sin(angle))
+        at = zero_crossings(np.sin(angle))
         jump = np.abs(np.diff(angle, append=angle[-1]))[at.astype(int)]
         at = at[(np.cos(np.interp(at, index, angle)) > 0) & (jump < CONTINUOUS)]
         factor = np.exp(-np.interp(at, index, size))
@@ -196,12 +284,6 @@ def borne_errors(frequency: Array, loop: Array) -> tuple[float, float, float]:
     return float(delay), float(min(phase, np.pi)), float(min(more, 1 / less if less else np.inf))
 
 
-def _wrapped(angle: Any) -> Any:
-    """Angle (rad) in [-pi, pi)."""
-    return np.mod(angle + np.pi, 2 * np.pi) - np.pi
-
-
-def halved_within(offset: Array, peak: Array) -> float:
+def _halved_within(offset: Array, peak: Array) -> float:
     """Smallest |offset| (Hz) at which `peak`, the largest singular value of S there, reaches 1/sqrt 2."""
-    outside = np.abs(offset)[peak >= math.sqrt(0.5)]
-    return float(outside.min(initial=np.inf))
+    return float(np.abs(offset)[peak >= math.sqrt(0.5)].min(initial=np.inf))

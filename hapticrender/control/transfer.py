@@ -33,8 +33,8 @@ class TransferFunction:
     Parameters
     ----------
     numerator, denominator : sequence of float
-        Coefficients in descending powers of s (rad/s).  They are kept as
-        tuples, scaled so that the denominator is monic; common factors stay.
+        Coefficients in descending powers of s (rad/s).  They are kept as tuples, scaled so that the denominator is
+        monic; common factors stay.
 
     Raises
     ------
@@ -82,8 +82,8 @@ class TransferFunction:
         rate : float
             Sampling rate, Hz.
         prewarp : float, optional
-            Frequency (Hz, below rate/2) at which the discrete response shall
-            equal the continuous one exactly; by default that is only 0 Hz.
+            Frequency (Hz, below rate/2) at which the discrete response shall equal the continuous one exactly; by
+            default that is only 0 Hz.
 
         Returns
         -------
@@ -92,11 +92,9 @@ class TransferFunction:
 
         Notes
         -----
-        ``s = K (1 - z^-1)/(1 + z^-1)`` with K = 2 rate, or
-        ``2 pi prewarp/tan(pi prewarp/rate)``.  Poles far below the rate crowd
-        at z = 1, and a direct form of order n loses about n log10(rate/|pole|)
-        of the 16 digits: the fourth-order C leaks 1e-7 of its integrator at
-        5 kHz, 2e-4 at 48 kHz and 0.2 at 192 kHz; order 2 leaks nothing.
+        ``s = K (1 - z^-1)/(1 + z^-1)`` with K = 2 rate, or ``2 pi prewarp/tan(pi prewarp/rate)``.  Poles far below the
+        rate crowd at z = 1, and a direct form of order n loses about n log10(rate/|pole|) of the 16 digits: the
+        fourth-order C leaks 1e-7 of its integrator at 5 kHz, 2e-4 at 48 kHz and 0.2 at 192 kHz; order 2 leaks nothing.
         Reduce before discretising.
         """
         require_positive(rate=rate)

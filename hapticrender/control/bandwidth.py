@@ -1,0 +1,322 @@
+"""Check the margins of the error observer's law at each level of the gain schedule, and lower its bandwidth."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+
+from hapticrender.control.bandmodel import BandModel
+from hapticrender.control.linear import FORGET, ErrorLoop, FingerEstimate, Sampled, Structure
+from hapticrender.control.margins import LEAST, LeastMargins, Margins
+from hapticrender.errors import DesignError
+from hapticrender.mathx import smoothstep
+from hapticrender.protocols import Array
+
+SPEEDS = 5  # of the finger, at which carriers locked to it are checked
+STEPS = 2.0 ** (-np.arange(25) / 4)  # of the bandwidth tried, in turn: each a quarter octave lower, down to 1/64
+SOFTER = (*STEPS[1:9].tolist(), 0.0)  # of the inner damper: down to a quarter, then off
+ROOM = 0.25  # of the bandwidth of the rule: the inner damper is softened until this much holds
+SCHEDULE = {"low": (0.0, 0.0), "medium": (0.0, 1.0), "high": (1.0, 0.0)}
+"""Levels of the gain schedule: how far the fast and the slow detector have raised the gains."""
+SMALLEST = ("delay", "phase", "gain", "bandwidth")  # margins of which the smallest counts, each for itself
+GROUPS = (  # levels that share an observer, and what is lowered for them
+    (("low", "medium"), ("observer", "integral_low", "integral_medium"), "inner"),
+    (("high",), ("observer_high", "integral_high"), "inner_high"),
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class BankGains:
+    """Gains of the error observer, its law and the inner damper at every level of the gain schedule.
+
+    Parameters
+    ----------
+    rate : float, Hz
+        Sampling rate.
+    delay : int, samples
+        From a sensed sample to the moment its force acts, >= 1.
+    lead : float, s
+        By which the law turns forces ahead: delay and half the hold.
+    observer, observer_high : float, per sample
+        Gain g of the observer, at low and medium, and at high.
+    integral_low, integral_medium, integral_high : float, 1/s
+    dc, dc_drift : float, per sample
+        Gains of the DC estimate, 1.6 w/rate and (w/rate)^2.
+    inner, inner_high : float
+        Factor on the inner damper, 0..1, at low and medium, and at high.
+    crowd_speed : float, m/s
+        Finger speed below which the observer's gain falls in proportion, as finger-locked carriers crowd; 0: none.
+    lowest, highest : float, Hz
+        Range of finger-locked carriers.
+    highest_edge : float
+        Times `highest`, where finger-locked carriers have faded out.
+    forget : float, 1/s
+        Decay of the states of a carrier that is faded out.
+    """
+
+    rate: float
+    delay: int
+    lead: float
+    observer: float
+    observer_high: float
+    integral_low: float
+    integral_medium: float
+    integral_high: float
+    dc: float
+    dc_drift: float
+    inner: float
+    inner_high: float
+    crowd_speed: float
+    lowest: float
+    highest: float
+    highest_edge: float
+    forget: float = FORGET
+
+    def at(self, level: str) -> tuple[float, float, float]:
+        """Return observer gain, integral gain and inner damper at a level of the schedule."""
+        if level not in SCHEDULE:
+            raise ValueError(f"{level=} must be one of {', '.join(SCHEDULE)}")
+        fast, slow = SCHEDULE[level]
+        integral = self.integral_low + slow * (self.integral_medium - self.integral_low)
+        return (
+            self.observer + fast * (self.observer_high - self.observer),
+            integral + fast * (self.integral_high - integral),
+            self.inner + fast * (self.inner_high - self.inner),
+        )
+
+    def scaled(self, names: tuple[str, ...], factor: float) -> BankGains:
+        """Return the gains with some of them times `factor`."""
+        return replace(self, **{name: factor * getattr(self, name) for name in names})
+
+    def share(self, frequency: Array) -> Array:
+        """Factor on the observer's gain of finger-locked carriers at `frequency` (Hz): they fade out of their range."""
+        below = smoothstep(2.0 * frequency / self.lowest - 1.0)
+        return below * smoothstep(4.0 * (self.highest_edge - frequency / self.highest))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Checked:
+    """Gains whose margins hold.
+
+    Parameters
+    ----------
+    gains : BankGains
+        As given, or with lower bandwidths.
+    margins : dict of Margins
+        The smallest of every margin, by level: "low", "medium", "high".
+    notes : tuple of str
+        What was lowered and why; empty where nothing was.
+    """
+
+    gains: BankGains
+    margins: dict[str, Margins]
+    notes: tuple[str, ...]
+
+
+def error_loop(
+    model: BandModel | Structure,
+    frequency: Array,
+    gains: BankGains,
+    level: str = "high",
+    *,
+    wavenumber: Array | None = None,
+    taps: Array | None = None,
+    speed: float = 0.0,
+    plant: Structure | Sampled | None = None,
+    delay: int | None = None,
+    finger: FingerEstimate | None = None,
+) -> ErrorLoop:
+    """Linear loop of a design at one level of its gain schedule.
+
+    Parameters
+    ----------
+    model : BandModel or Structure
+        The free device that the law inverts.
+    frequency, wavenumber : ndarray, shape (K,), Hz and 1/m
+        Fixed and finger-locked part of every carrier; no wavenumber: all fixed.
+    gains : BankGains
+    level : {"low", "medium", "high"}
+    taps : ndarray, shape (c, t), N/m, optional
+        Of the inner damper.
+    speed : float, m/s
+        Of the finger, for finger-locked carriers.
+    plant : Structure or Sampled, optional
+        What the loop closes on; by default the free device.
+    delay : int, optional
+        Samples that the loop really has; by default those of the design.
+    finger : FingerEstimate, optional
+        Finger estimate in the law.
+    """
+    known = model if isinstance(model, Structure) else Structure.of(model)
+    wavenumber = np.zeros(len(frequency)) if wavenumber is None else wavenumber
+    observer, integral, inner = gains.at(level)
+    calm = min(abs(speed) / gains.crowd_speed, 1.0) if gains.crowd_speed > 0 else 1.0
+    frequency = np.abs(frequency + speed * wavenumber)
+    share = np.where(wavenumber > 0.0, gains.share(frequency), 1.0)
+    order = np.argsort(frequency)
+    return ErrorLoop.on(
+        plant if isinstance(plant, Sampled) else (plant or known).sampled(gains.rate),
+        known,
+        frequency[None, order],
+        delay=gains.delay if delay is None else delay,
+        lead=gains.lead,
+        observer=calm * observer,
+        integral=integral,
+        dc=gains.dc,
+        dc_drift=gains.dc_drift,
+        inner=inner,
+        taps=np.zeros((len(known.mass), 1)) if taps is None else taps,
+        finger=finger,
+        share=share[None, order],
+        forget=gains.forget,
+    )
+
+
+def checked_gains(
+    model: BandModel | Structure,
+    frequency: Array,
+    gains: BankGains,
+    *,
+    wavenumber: Array | None = None,
+    taps: Array | None = None,
+    least: LeastMargins = LEAST["law"],
+    plants: tuple[Structure, ...] = (),
+) -> Checked:
+    """Lower the bandwidth until the margins hold at every level of the gain schedule.
+
+    Parameters
+    ----------
+    model : BandModel or Structure
+        The free device that the law inverts.
+    frequency, wavenumber : ndarray, shape (K,), Hz and 1/m
+        Fixed and finger-locked part of every carrier; no wavenumber: all fixed.
+    gains : BankGains
+        As the rules of the method have them.
+    taps : ndarray, shape (c, t), N/m, optional
+        Of the inner damper.
+    least : LeastMargins
+    plants : tuple of Structure
+        Devices to hold on (fingers, errors of the model); by default the free device.
+
+    Returns
+    -------
+    Checked
+
+    Raises
+    ------
+    DesignError
+        Where even 1/64 of the bandwidth leaves a margin too small: names margin, value and bound.
+
+    Notes
+    -----
+    Observer and integral are lowered together, a quarter octave at a time; low and medium share their observer and go
+    down together.  Where not even a quarter of the bandwidth would hold, the inner damper is softened first.  Carriers
+    locked to the finger are checked at five of its speeds, frozen.
+    """
+    known = model if isinstance(model, Structure) else Structure.of(model)
+    wavenumber = np.zeros(len(frequency)) if wavenumber is None else wavenumber
+    taps = np.zeros((len(known.mass), 1)) if taps is None else taps
+    arrays = [np.array(a, float) for a in (known.mass, known.damping, known.stiffness, frequency, wavenumber, taps)]
+    return _checked(tuple((each.shape, each.tobytes()) for each in arrays), gains, least, plants)
+
+
+@lru_cache(maxsize=256)
+def _checked(
+    arrays: tuple[tuple[tuple[int, ...], bytes], ...],
+    gains: BankGains,
+    least: LeastMargins,
+    plants: tuple[Structure, ...],
+) -> Checked:
+    """Lower the bandwidth; mass, damping, stiffness, frequency, wavenumber and taps by their contents."""
+    mass, damping, stiffness, frequency, wavenumber, taps = (np.frombuffer(b).reshape(shape) for shape, b in arrays)
+    known, locked = Structure.free(mass, damping, stiffness), wavenumber[wavenumber > 0]
+    trials = _Trials(
+        least=least,
+        loop={"model": known, "frequency": frequency, "wavenumber": wavenumber, "taps": taps},
+        plants=[plant.sampled(gains.rate) for plant in plants or (known,)],
+        speeds=_speeds(gains, locked),
+        highest=float(max(frequency.max(), gains.highest) if locked.size else frequency.max()),
+    )
+    notes: list[str] = []
+    for levels, rates, inner in GROUPS:
+        gains, said = _lowered(trials, gains, levels, rates, inner)
+        notes += said
+    return Checked(gains=gains, margins={level: trials.worst(gains, level) for level in SCHEDULE}, notes=tuple(notes))
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Trials:
+    """Margins of all gains that were tried, each computed once."""
+
+    least: LeastMargins
+    loop: dict[str, Any]
+    plants: list[Sampled]
+    speeds: Array
+    highest: float
+    known: dict[tuple[float, float, float], Margins] = field(default_factory=dict)
+
+    def worst(self, gains: BankGains, level: str) -> Margins:
+        """Smallest of every margin at a level over all plants and speeds of the finger."""
+        key = gains.at(level)
+        if key not in self.known:
+            found = [
+                error_loop(gains=gains, level=level, speed=speed, plant=plant, **self.loop).margins()
+                for plant in self.plants
+                for speed in self.speeds
+            ]
+            self.known[key] = replace(
+                min(found, key=lambda margins: margins.modulus),
+                stable=all(margins.stable for margins in found),
+                **{name: min(getattr(margins, name) for margins in found) for name in SMALLEST},
+            )
+        return self.known[key]
+
+    def complaint(self, gains: BankGains, levels: tuple[str, ...]) -> str:
+        """Name the first margin that falls short at these levels; empty where all hold."""
+        found = (self.least.complaint(self.worst(gains, level), gains.rate, self.highest) for level in levels)
+        return next((text for text in found if text), "")
+
+
+def _lowered(
+    trials: _Trials, gains: BankGains, levels: tuple[str, ...], rates: tuple[str, ...], inner: str
+) -> tuple[BankGains, list[str]]:
+    """Lower the gains of a group of levels until their margins hold; say what was lowered."""
+    first = trials.complaint(gains, levels)
+    if not first:
+        return gains, []
+    name, notes = " and ".join(levels), []
+    cramped = trials.complaint(gains.scaled(rates, ROOM), levels)
+    if cramped and getattr(gains, inner) > 0.0:
+        for soft in SOFTER:
+            softer = gains.scaled((inner,), soft)
+            if not trials.complaint(softer.scaled(rates, ROOM), levels):
+                gains = softer
+                notes.append(
+                    f"inner damper ({name}) softened to {soft:.0%}: even at {ROOM:.0%} of the bandwidth {cramped}"
+                )
+                break
+    for step in STEPS.tolist():
+        tried = gains.scaled(rates, step)
+        complaint = trials.complaint(tried, levels)
+        if not complaint:
+            if step < 1.0:
+                notes.append(f"bandwidth ({name}) lowered to {step:.0%} of the rule: at the rule {first}")
+            return tried, notes
+    raise DesignError(
+        f"{complaint} ({name}) even at 1/64 of the bandwidth of the rule: lower the delay, leave the highest or "
+        "closest carriers out, or allow a smaller margin"
+    )
+
+
+def _speeds(gains: BankGains, locked: Array) -> Array:
+    """Speeds (m/s) from which on all finger-locked carriers are in range, to where the fastest leaves it.
+
+    In a range that never holds all of them at once, to where the slowest leaves it.
+    """
+    if not locked.size:
+        return np.zeros(1)
+    first, last = gains.lowest / locked.min(), gains.highest / locked.max()
+    return np.geomspace(first, last if last >= first else gains.highest / locked.min(), SPEEDS)

@@ -1,1 +1,0 @@
-"""The band bank for devices that take blocks."""

@@ -1,1 +1,0 @@
-"""Plain complex controllers, for comparison."""

@@ -1,0 +1,207 @@
+"""Two controllers as one, for a device whose two parts add up to one skin velocity: a plate and a friction device.
+
+Each part has a controller of its own, of the same method, for its own bands; their channels lie side by side, and
+their targets add up to the target of the skin's velocity, V = j w X + (v/F) F.  Nothing is estimated or closed here.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numba
+import numpy as np
+from numba import carray
+
+from hapticrender.bands import Bands
+from hapticrender.control.bandmodel import BandModel
+from hapticrender.control.controller import BankController
+from hapticrender.control.records import CONTROLLER_T, TILE_T, W
+from hapticrender.jit import C16, F8, I8, SIGNALS_T, addresses, call, pointer, record, step
+from hapticrender.protocols import Array, Method
+
+
+@dataclass(frozen=True, kw_only=True)
+class CombinedModel(BandModel):
+    """Device model of a device of two parts, which have a model and a controller each.
+
+    Parameters
+    ----------
+    plate : BandModel
+        Of the part that moves the skin (m).
+    friction : BandModel or None
+        Of the part that rubs it (N); None: it has no target.
+    velocity_per_force : float, m/(N s)
+        Skin velocity that feels as strong as a newton of friction.
+    """
+
+    plate: BandModel
+    friction: BandModel | None
+    velocity_per_force: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class CombinedBands(Bands):
+    """Bands of a device of two parts, their envelopes the target displacement (m), and the share of each part.
+
+    Parameters
+    ----------
+    plate, friction : Bands
+        Targets of the two parts (m, N).
+    plate_index, friction_index : ndarray of int
+        Which of all bands each of those is.
+    """
+
+    plate: Bands
+    friction: Bands
+    plate_index: Array
+    friction_index: Array
+
+
+PART = np.dtype(
+    [
+        *((name, np.int64) for name in ("step", "state", "signals", "sensors", "channels", "bands", "index")),
+        ("scale", np.complex128),  # target of the skin's velocity per target of the part; 0: j w
+        ("wanted", np.float64),  # of the part per wanted waveform
+        *((name, np.int64) for name in ("sensed_at", "drive_at", "wanted_at", "target_at", "flags_at", "position_at")),
+    ]
+)
+COMBINED = np.dtype(
+    [("bands", np.int64), ("channels", np.int64), ("sensors", np.int64), ("block", np.int64), ("parts", PART, (2,))]
+)
+COMBINED_T, PART_T = numba.from_dtype(COMBINED), numba.from_dtype(PART)
+
+
+@step
+def combined_step(state, signals, start, count):
+    """Advance both controllers by `count` samples, block by block; their targets add up to a skin velocity (m/s)."""
+    c, io = record(state, COMBINED_T, 0), record(signals, SIGNALS_T, 0)
+    block, stop = c.block, start + count
+    sensed, drive = carray(pointer(io.sensed, F8), (stop, c.sensors)), carray(pointer(io.drive, F8), (stop, c.channels))
+    position, wanted = carray(pointer(io.position, F8), stop), carray(pointer(io.wanted, F8), stop)
+    target, flags = carray(pointer(io.target, C16), (stop // block, c.bands)), carray(pointer(io.flags, I8), stop)
+    for first in range(start, stop, block):
+        sensor = channel = 0
+        row = first // block
+        for k in range(c.bands):
+            target[row, k] = 0.0
+        for i in range(2):
+            p = c.parts[i]
+            own, out = (
+                carray(pointer(p.sensed_at, F8), (block, p.sensors)),
+                carray(pointer(p.drive_at, F8), (block, p.channels)),
+            )
+            place, waveform = carray(pointer(p.position_at, F8), block), carray(pointer(p.wanted_at, F8), block)
+            goal, raised = carray(pointer(p.target_at, C16), (1, p.bands)), carray(pointer(p.flags_at, I8), block)
+            index = carray(pointer(p.index, I8), p.bands)
+            for m in range(block):
+                for s in range(p.sensors):
+                    own[m, s] = sensed[first + m, sensor + s]
+                place[m], waveform[m], raised[m] = position[first + m], p.wanted * wanted[first + m], 0
+            if p.bands > 0:
+                call(p.step, (p.state, p.signals, 0, block))
+            for m in range(block):
+                for k in range(p.channels):
+                    drive[first + m, channel + k] = out[m, k]
+                flags[first + m] |= raised[m]
+            for k in range(p.bands):
+                scale = p.scale
+                if scale == 0.0:
+                    scale = complex(0.0, record(record(p.state, CONTROLLER_T, 0).tiles_at, TILE_T, k // W).omega[k % W])
+                target[row, index[k]] += scale * goal[0, k]
+            sensor, channel = sensor + p.sensors, channel + p.channels
+    return 0
+
+
+class CombinedController:
+    """Two controllers behind the `Controller` protocol; `design_combined` makes one.
+
+    Parameters
+    ----------
+    parts : (BankController or None, BankController or None)
+        Of plate and friction device; None where a part has no target and stays without drive.
+    bands : CombinedBands
+    velocity_per_force : float, m/(N s)
+    sensors, channels : (int, int)
+        Of each part.
+    method : str
+    """
+
+    def __init__(
+        self,
+        parts: tuple[BankController | None, BankController | None],
+        bands: CombinedBands,
+        velocity_per_force: float,
+        sensors: tuple[int, int],
+        channels: tuple[int, int],
+        method: str,
+    ) -> None:
+        self.method, self.parts, self.bands, self.n_bands = method, parts, bands, len(bands)
+        self.step, self.channels, self.sensors = combined_step, sum(channels), sum(sensors)
+        self.rate = next((part.rate for part in parts if part is not None), 0.0)
+        self.block = max(part.block if part is not None else 1 for part in parts)
+        self.state = np.zeros(1, COMBINED)
+        self.state[0]["bands"], self.state[0]["channels"] = len(bands), sum(channels)
+        self.state[0]["sensors"], self.state[0]["block"] = sum(sensors), self.block
+        self._buffers: list[Array] = []
+        analysed = bands.envelope is None
+        shares = ((bands.plate_index, 0.0, 1.0), (bands.friction_index, velocity_per_force, 1.0 / velocity_per_force))
+        for i, (part, (index, scale, wanted)) in enumerate(zip(parts, shares, strict=True)):
+            own = self.state[0]["parts"][i]
+            bands_of = 0 if part is None else part.n_bands
+            arrays = {
+                "sensed": np.zeros((self.block, sensors[i])),
+                "drive": np.zeros((self.block, channels[i])),
+                "wanted": np.zeros(self.block),
+                "target": np.zeros((1, bands_of), complex),
+                "flags": np.zeros(self.block, np.int64),
+                "position": np.zeros(self.block),
+            }
+            indices, signals = np.ascontiguousarray(index, np.int64), addresses(**arrays)
+            self._buffers += [*arrays.values(), indices, signals]
+            for name, array in arrays.items():
+                own[f"{name}_at"] = array.ctypes.data
+            own["signals"], own["index"], own["bands"] = signals.ctypes.data, indices.ctypes.data, bands_of
+            own["sensors"], own["channels"], own["scale"] = sensors[i], channels[i], scale
+            own["wanted"] = wanted if analysed else 1.0
+            if part is not None:
+                own["step"], own["state"] = part.step.address, part.state.ctypes.data
+
+    @property
+    def note(self) -> str:
+        """What the two designs chose and why."""
+        names = zip(("plate", "friction"), self.parts, strict=True)
+        return "\n".join(f"{name}: {'no target' if part is None else part.note}" for name, part in names)
+
+    @property
+    def mismatch(self) -> float:
+        """Share of a target that the integral parts add on the untouched device; see `BankController.mismatch`."""
+        return max((part.mismatch for part in self.parts if part is not None), default=0.0)
+
+    run = BankController.run
+
+
+def design_combined(
+    method: Method, model: CombinedModel, bands: CombinedBands, *, feedback: bool = True
+) -> CombinedController:
+    """Design a controller of `method` for each part, with its share of the targets.
+
+    Parameters
+    ----------
+    method : Method
+    model : CombinedModel
+    bands : CombinedBands
+    feedback : bool
+        False: nothing is sensed, both parts are driven open loop.
+    """
+    models, shares = (model.plate, model.friction), (bands.plate, bands.friction)
+    parts: tuple[Any, ...] = tuple(
+        method.design(each, own, feedback=feedback) if each is not None and len(own) else None
+        for each, own in zip(models, shares, strict=True)
+    )
+    sensors = (model.plate.coordinate_from_sensed.shape[1], 1)
+    channels = (model.plate.force_from_drive.shape[1], 1)
+    listened = sensors if feedback else (0, 0)
+    return CombinedController(
+        (parts[0], parts[1]), bands, model.velocity_per_force, listened, channels, getattr(method, "name", "")
+    )

@@ -1,0 +1,230 @@
+"""A bank of bands behind the `Controller` protocol: settings, state and a compiled step."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+from hapticrender.bands import Bands
+from hapticrender.control.carriers import REFRESH
+from hapticrender.control.records import (
+    COMMAND,
+    CONTROLLER,
+    FADING,
+    SETPOINT_ROWS,
+    TILE,
+    W,
+    aligned,
+    lanes,
+)
+from hapticrender.control.sums import SAMPLE_ROWS
+from hapticrender.jit import CFunction, addresses
+from hapticrender.protocols import Array
+
+SETTLED = 0.05  # of a target: below it an error counts as settled
+LEAST_TARGET = 3e-3  # of the sensors' range: below it noise adds more than a wrong device model
+
+
+class BankController:
+    """A bank of bands behind the `Controller` protocol: settings, state and a compiled step.
+
+    Parameters
+    ----------
+    method : str
+        Name of the method that designed it.
+    step : CFunction
+        Advances the state; one of `hapticrender.control`.
+    settings : dict
+        Fields of `records.SETTINGS`; what is left out is zero.
+    bands : Bands
+        Carriers and targets.
+    history : int
+        Steps of adaptation whose commands are kept.
+    note : str
+        What the design chose and why.
+    arrays : dict, optional
+        Further arrays of the step by the name of their address, or others in place of `loops`.
+
+    Attributes
+    ----------
+    state : ndarray of `records.CONTROLLER`, shape (1,)
+        Settings and state; `tiles`, `setpoints` are arrays that it points to.
+    block : int
+        Samples that `step` takes at once; `run` takes any multiple.
+    """
+
+    def __init__(
+        self,
+        method: str,
+        step: CFunction,
+        settings: dict[str, Any],
+        bands: Bands,
+        *,
+        history: int = 1,
+        note: str = "",
+        arrays: dict[str, Array] | None = None,
+    ) -> None:
+        self.method, self.step, self.bands, self.note = method, step, bands, note
+        self.n_bands, self.block = len(bands), int(settings["block"])
+        self.channels, self.sensors = int(settings["channels"]), int(settings["sensors"])
+        self.rate = float(settings["rate"])
+        tiles = max(-(-self.n_bands // W), 1)
+        self.tiles = aligned(tiles, TILE)
+        self.tiles["mode"] = FADING
+        self.setpoints = setpoint_rows(bands)
+        self.state = np.zeros(1, CONTROLLER)
+        for name, value in settings.items():
+            self.state["p"][name][0] = value
+        memory = {
+            "tiles": self.tiles,
+            "commands": aligned(history * tiles, COMMAND),
+            "setpoints": self.setpoints,
+            "work": aligned((8, tiles * W)),
+            "tables": aligned(4 * self.block * tiles * W),
+            "samples": np.zeros((SAMPLE_ROWS, self.block)),
+        } | (arrays or {})
+        self._arrays = memory
+        for name, array in memory.items():
+            self.state[f"{name}_at"] = array.ctypes.data
+        start: dict[str, float] = {"tiles": tiles, "bands": self.n_bands, "history": history, "stale": 1, "moving": 1}
+        start |= {"scale": 1.0, "confidence": 1.0, "unlocked": 1.0, "response_gain": math.nan}
+        for name, number in start.items():
+            self.state[name] = number
+
+    @property
+    def settings(self) -> Any:
+        """Settings as designed (a record; see `records.SETTINGS`)."""
+        return self.state["p"][0]
+
+    def field(self, name: str) -> Array:
+        """Copy of a field of every band's tile, shape (bands,)."""
+        return lanes(self.tiles, name, self.n_bands)
+
+    def reference(self) -> Array:
+        """Reference envelope R of every band, complex, shape (bands,)."""
+        return self.field("r_re") + 1j * self.field("r_im")
+
+    def largest(self, name: str) -> Array:
+        """Largest magnitude over the coordinates of a complex field of the loops, shape (bands,)."""
+        return np.max([np.hypot(self.field(f"{name}{i}_re"), self.field(f"{name}{i}_im")) for i in (0, 1)], axis=0)
+
+    @property
+    def turns(self) -> Array:
+        """Fixed part of each carrier's phase at the next sample (turns, 0 to 1, shape (bands,))."""
+        samples = self.block if self.block > 1 else 1
+        left = 0 if samples > 1 else -int(self.state["sample"][0]) % REFRESH
+        return np.mod(self.field("turns") - left * self.setpoints[0] / self.settings["rate"], 1.0)
+
+    @property
+    def mismatch(self) -> float:
+        """Largest share of a settled, fixed target that the integral part adds on the untouched device, else 0.
+
+        There the law alone should do: what the integral has to make up for is what the device model lacks.
+        """
+        state = self.state[0]
+        if state["contact"] != 0.0:
+            return 0.0
+        if state["confidence"] < 1.0 or state["scale"] < 1.0 or not self.settings["observer"] > 0.0:
+            return 0.0
+        size = np.where(self.setpoints[1] == 0.0, abs(self.reference()), 0.0)
+        error = self.largest("e")
+        integral = self.largest("v")
+        counts = (size > LEAST_TARGET * self.settings["sensor_limit"]) & (error < SETTLED * size)
+        return float((integral[counts] / size[counts]).max(initial=0.0))
+
+    def run(self, sensed: Array, position: Array, wanted: Array) -> tuple[Array, Array, Array]:
+        """Advance by n samples; see `Controller`.
+
+        Raises
+        ------
+        ValueError
+            n is no multiple of the block.
+        """
+        n = len(sensed)
+        if n % self.block:
+            raise ValueError(f"{n} samples: must be a multiple of the block of {self.block} samples")
+        drive, target = np.zeros((n, self.channels)), np.zeros((n // self.block, self.n_bands), complex)
+        flags = np.zeros(n, np.int64)
+        arrays = {
+            "sensed": np.ascontiguousarray(sensed, float),
+            "position": np.ascontiguousarray(position, float),
+            "wanted": np.ascontiguousarray(wanted, float),
+        }
+        signals = addresses(drive=drive, target=target, flags=flags, **arrays)
+        self.step(self.state.ctypes.data, signals.ctypes.data, 0, n)
+        return drive, np.repeat(target, self.block, axis=0), flags
+
+    def send(self, bands: Bands) -> None:
+        """Take up other targets at the next look at the setpoints; see `fitting` for the errors."""
+        self.setpoints[:] = self.fitting(bands)
+
+    def fitting(self, bands: Bands) -> Array:
+        """Return the setpoints of other targets, if this design holds for them: its bandwidths rest on the carriers.
+
+        Raises
+        ------
+        ValueError
+            Their number differs from the design's; they are a waveform where it was none, or the other way round;
+            others follow the finger; a carrier is lower, or two are closer, than any of the design's; or one is higher
+            than the device's highest.
+        """
+        designed = self.bands
+        if len(bands) != self.n_bands:
+            raise ValueError(f"{len(bands)} bands: must be {self.n_bands}, as designed for")
+        if (bands.envelope is None) != (designed.envelope is None):
+            raise ValueError("the targets are a waveform: must be constant envelopes, as designed for")
+        follows, followed = ((each.wavenumber > 0.0) for each in (bands, designed))
+        if (follows != followed).any():
+            raise ValueError(f"bands {np.flatnonzero(follows != followed)}: must follow the finger as designed for")
+        for what, now, then in (
+            ("lowest fixed carrier", lowest_fixed(bands), lowest_fixed(designed)),
+            ("least spacing", spacing(bands), spacing(designed)),
+            ("least spacing of ridges per metre", ridge_spacing(bands), ridge_spacing(designed)),
+        ):
+            if now < then * (1.0 - 1e-9):
+                raise ValueError(f"{what} of {now:g}: must be >= {then:g}, as designed for (Hz, or 1/m)")
+        highest = max(float(self.settings["highest"]), float(designed.frequency.max(initial=0.0)))
+        if bands.frequency.max(initial=0.0) > highest:
+            raise ValueError(f"carrier of {bands.frequency.max():g} Hz: must be <= {highest:g} Hz")
+        return setpoint_rows(bands)
+
+
+def setpoint_rows(bands: Bands) -> Array:
+    """Setpoints of a compiled step: frequency, wavenumber, phase (turns), target and sensor response (re, im)."""
+    rows = np.zeros((SETPOINT_ROWS, len(bands)))
+    target = np.zeros(len(bands), complex) if bands.envelope is None else bands.envelope
+    shown = np.ones(len(bands), complex) if bands.shown is None else np.asarray(bands.shown, complex)
+    rows[:] = (
+        bands.frequency,
+        bands.wavenumber,
+        bands.phase / (2 * np.pi),
+        target.real,
+        target.imag,
+        shown.real,
+        shown.imag,
+    )
+    return rows
+
+
+def spacing(bands: Bands) -> float:
+    """Least distance between two fixed carriers (Hz); infinite where there is one or none."""
+    return float(np.diff(np.sort(bands.frequency[bands.wavenumber == 0.0])).min(initial=np.inf))
+
+
+def ridge_spacing(bands: Bands) -> float:
+    """Least distance between two carriers that follow the finger (1/m); infinite where there is one or none."""
+    return float(np.diff(np.sort(bands.wavenumber[bands.wavenumber > 0.0])).min(initial=math.inf))
+
+
+def lowest_fixed(bands: Bands) -> float:
+    """Lowest carrier that does not follow the finger (Hz); infinite where all do."""
+    return float(np.min(bands.frequency[bands.wavenumber == 0.0], initial=math.inf))
+
+
+def padded(matrix: Array, rows: int, columns: int) -> Array:
+    """Matrix with zeros below and beside it."""
+    out = np.zeros((rows, columns))
+    out[: matrix.shape[0], : matrix.shape[1]] = matrix
+    return out

@@ -1,0 +1,336 @@
+"""Design of the default controller: from a device model, bands and a method's rules to the settings of its kernel.
+
+Bandwidths follow carriers, spacing and delay: observer <= f0/2 and spacing/2 pi, integral <= f0/4 and what delay and
+observer leave of the phase, DC estimate <= f0/8.  Thresholds follow the noise.  The inner damper is chosen by its
+margins; then all of it is lowered until the margins of the sampled loop hold (`bandwidth`).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from hapticrender.bands import Bands
+from hapticrender.control.adaptation import TURN_SAMPLES
+from hapticrender.control.bandmodel import BandModel, FingerRange
+from hapticrender.control.bandwidth import BankGains, checked_gains
+from hapticrender.control.controller import BankController, padded, ridge_spacing, spacing
+from hapticrender.control.damping import Damping, choose_damping
+from hapticrender.control.kernel import block_step, error_step
+from hapticrender.control.records import MOST_CHANNELS, MOST_SENSORS, MOST_TAPS
+
+FADE_IN = 0.05  # s: a target fades in this slowly, so that it does not excite the modes
+LEAST_FADE_IN = 0.5e-3  # s: however fast the device, as drives are finite
+FAST_POLE, FAST_SIGMAS = 30.0, 5.5  # Hz, of the sensor noise behind that pole
+SLOW_POLE, SLOW_SIGMAS = 4.0, 5.0
+PROMPT = 8  # samples: a longer delay is that of a block device, where the inner damper would act on stale noise
+PHASE_MARGIN = math.pi / 4  # rad: 90 deg less integral gain times (delay + 1/observer pole)
+ADAPTATION_SHARE = 0.5  # of a residual, learnt in a step at most: at 0.8 it swings under a light finger
+ADAPTATION_TIME = 1 / 60  # s: fastest adaptation to what is always there; a delay counts twice
+ADAPTATION_MARGIN = 5.0  # of the observer's pole over the adaptation, where that estimates all of D
+FAST_DC = 60.0  # Hz: bandwidth of the DC estimate while the step of a contact goes into it
+BACK_TIME = 0.02  # s: back-calculation at the limit
+TOUCHED_DECAY = 1000.0  # 1/s: of an always damped mode at least
+LEAST_NOISE = 1e-6  # of the sensors' range: thresholds never fall to nothing
+ALWAYS = -1e300  # N: every load is larger
+CROWDED = 40.0  # Hz: carriers closer than this share what the detectors see
+
+
+@dataclass(frozen=True, kw_only=True)
+class Rules:
+    """How a method sets up the controller; rates in 1/s, bandwidths in Hz, times in s.
+
+    Each pair is (low, high) gain: a detector of the deviation, or contact, raises the gains for `high_time`.
+    `integral` has a medium gain between them, for the slow detector; `dc` is the least ratio of the lowest carrier to
+    the bandwidth of the DC estimate; `rest` adapts what each band's stiffness leaves over; `damper` is a factor on the
+    inner damper.
+    """
+
+    observer: tuple[float, float]
+    integral: tuple[float, float, float]
+    adaptation: tuple[float, float]
+    rest: tuple[float, float] = (0.0, 0.0)
+    damper: tuple[float, float] = (0.0, 0.0)
+    dc: float = 8.0
+    detects: bool = True
+    high_time: float = 0.15
+    medium_time: float = 0.4
+    release: float = 0.05
+
+    def scaled(self, factor: float) -> Rules:
+        """Return the rules for a device that is to be followed `factor` times as fast."""
+        rates: dict[str, Any] = {
+            name: tuple(factor * each for each in getattr(self, name))
+            for name in ("observer", "integral", "adaptation", "rest")
+        }
+        times = {name: getattr(self, name) / factor for name in ("high_time", "medium_time", "release")}
+        return replace(self, **rates, **times)
+
+
+ONE_SPEED = Rules(observer=(10.0, 10.0), integral=(17.0, 17.0, 17.0), adaptation=(100.0, 100.0), detects=False)
+TWO_SPEEDS = Rules(observer=(10.0, 20.0), integral=(2.0, 15.0, 25.0), adaptation=(1.0, 100.0), damper=(0.0, 1.0))
+TWO_SPEEDS_CROWDED = Rules(
+    observer=(20.0, 20.0),
+    integral=(1.5, 1.5, 15.0),
+    adaptation=(2.0, 100.0),
+    rest=(0.05, 5.0),
+    damper=(0.2, 1.0),
+    dc=3.5,
+    detects=False,
+    high_time=0.4,
+    release=0.3,
+)
+
+
+def rules_for(bands: Bands) -> Rules:
+    """Two speeds; carriers nearer than 40 Hz, or that may come so near, are watched without detectors."""
+    crowded = spacing(bands) < CROWDED or (bands.wavenumber > 0.0).sum() > 1
+    return TWO_SPEEDS_CROWDED if crowded else TWO_SPEEDS
+
+
+def design_error(method: str, model: BandModel, bands: Bands, rules: Rules, *, feedback: bool = True) -> BankController:
+    """Design the default controller for a device and its bands.
+
+    Parameters
+    ----------
+    method : str
+        Name to carry.
+    model : BandModel
+        All that the controller is given of the device; 1 or 2 coordinates.
+    bands : Bands
+        Carriers and targets.
+    rules : Rules
+        Of the method.
+    feedback : bool
+        False: nothing is sensed, the law drives open loop.
+
+    Returns
+    -------
+    BankController
+        In blocks where the device's delay is that of a block device (more than 8 samples), else sample by sample.
+
+    Raises
+    ------
+    DesignError
+        No bandwidth keeps the least margins.
+    ValueError
+        Two carriers are equal, or the device has too many coordinates, channels or sensors.
+    """
+    for name, number, most in (
+        ("coordinates", len(model.mass), 2),
+        ("drive channels", model.force_from_drive.shape[1], MOST_CHANNELS),
+        ("sensors", model.coordinate_from_sensed.shape[1], MOST_SENSORS),
+    ):
+        if number > most:
+            raise ValueError(f"the device model has {number} {name}: must be <= {most}")
+    rules = rules.scaled(model.pace)
+    prompt = model.delay <= PROMPT
+    damping = choose_damping(model, bending=model.bending) if any(rules.damper) and feedback and prompt else None
+    if damping is None or not damping.margins:
+        rules = replace(rules, damper=(0.0, 0.0))
+    elif model.held:
+        rules = replace(rules, damper=(rules.damper[1], rules.damper[1]))
+    if (bands.wavenumber > 0.0).any():  # what is left over at one frequency is wrong at the next
+        rules = replace(rules, rest=(0.0, 0.0))
+    block = model.block if model.block > 1 and not prompt else 1
+    gains = _gains(model, bands, rules, feedback)
+    why = "the method has none" if prompt else f"a delay of {model.delay} samples is that of a block device"
+    notes = [damping.text() if damping else f"inner damper off: {why}"]
+    if feedback:
+        checked = checked_gains(
+            model, bands.frequency, gains, wavenumber=bands.wavenumber, taps=damping.taps if damping else None
+        )
+        gains = checked.gains
+        notes += [*checked.notes, *(f"{level}: {margins}" for level, margins in checked.margins.items())]
+    settings = _settings(model, bands, rules, gains, damping, feedback)
+    if block > 1:
+        settings = _in_blocks(settings, block, model.rate)
+        notes.append(f"in blocks of {block} samples")
+    history = int(settings["age"] + 0.5) + 2
+    step = block_step if block > 1 else error_step
+    return BankController(method, step, settings, bands, history=history, note="\n".join(notes))
+
+
+def _gains(model: BandModel, bands: Bands, rules: Rules, feedback: bool) -> BankGains:
+    """How fast observer, integral and DC estimate may run, by lowest carrier (Hz), spacing and delay."""
+    lowest, apart, period = _lowest(model, bands), spacing(bands), 1.0 / model.rate
+    if apart == 0.0:
+        twice = np.sort(bands.frequency[bands.wavenumber == 0.0])
+        raise ValueError(
+            f"duplicate carrier frequency {twice[:-1][np.diff(twice) == 0.0][0]:g} Hz: merge the two partials"
+        )
+    pole = [2 * math.pi * min(width, lowest / 2, apart / (2 * math.pi)) for width in rules.observer]
+    wait = model.delay * period  # integrator, observer and delay leave at least PHASE_MARGIN
+    fastest = [min(2 * math.pi * lowest / 4, PHASE_MARGIN / (wait + 1 / each)) for each in pole]
+    dc = 2 * math.pi * min(6.0, lowest / rules.dc) * period
+    ridges = ridge_spacing(bands)
+    on = 1.0 if feedback else 0.0
+    return BankGains(
+        rate=float(model.rate),
+        delay=model.delay,
+        lead=(model.delay + 0.5) * period,
+        observer=on * 2 * pole[0] * period,
+        observer_high=on * 2 * pole[1] * period,
+        integral_low=on * min(rules.integral[0], fastest[0]),
+        integral_medium=on * min(rules.integral[1], fastest[0]),
+        integral_high=on * min(rules.integral[2], fastest[1]),
+        dc=on * 1.6 * dc,
+        dc_drift=on * dc**2,
+        inner=rules.damper[0],
+        inner_high=rules.damper[1],
+        crowd_speed=max(pole) / ridges if math.isfinite(ridges) else 0.0,
+        lowest=float(model.lowest_frequency),
+        highest=float(min(model.highest_frequency, 0.4 * model.rate)),
+        highest_edge=float(model.highest_edge),
+    )
+
+
+def _lowest(model: BandModel, bands: Bands) -> float:
+    """Lowest carrier (Hz): of the fixed ones, and of what a moving finger makes of the others."""
+    locked = bands.wavenumber > 0.0
+    return float(bands.frequency[~locked].min(initial=model.lowest_frequency if locked.any() else np.inf))
+
+
+def _settings(
+    model: BandModel, bands: Bands, rules: Rules, gains: BankGains, damping: Damping | None, feedback: bool
+) -> dict[str, Any]:
+    """Settings of the kernel, sample by sample."""
+    period, fast = 1.0 / model.rate, 2 * math.pi * FAST_DC / model.rate
+    lowest, matrices = _lowest(model, bands), ("mass", "damping", "stiffness")
+    observer = min(rules.observer[0], lowest / 2, spacing(bands) / (2 * math.pi))
+    taps = damping.taps if damping else np.zeros((len(model.mass), 1))
+    listening = model.coordinate_from_sensed[:, : None if feedback else 0]
+    return {
+        **{name: padded(getattr(model, name), 2, 2) for name in matrices},
+        **_adaptation(model, rules, 2 * math.pi * observer, feedback),
+        **_detectors(model, rules),
+        **_finger(model.finger),
+        "coordinates": len(model.mass),
+        "block": 1,
+        "sensors": listening.shape[1],
+        "channels": model.force_from_drive.shape[1],
+        "n_taps": taps.shape[1],
+        "taps": padded(taps, 2, MOST_TAPS),
+        "added_damping": np.resize(np.append(damping.added_damping if damping else 0.0, [0.0, 0.0]), 2),
+        "shape": np.append(model.pattern, [0.0])[:2],
+        "coordinate_from_sensor": padded(listening, 2, MOST_SENSORS),
+        "drive_from_force": padded(np.linalg.pinv(model.force_from_drive), MOST_CHANNELS, 2),
+        "rate": gains.rate,
+        "lead": gains.lead,
+        "reference": 2 * 2 * math.pi * observer * period,
+        "seen": 1.0,
+        "extrapolation": 0.0,
+        "fade_in": period / max(FADE_IN / model.pace, LEAST_FADE_IN),
+        "lowest": gains.lowest,
+        "highest": gains.highest,
+        "highest_edge": gains.highest_edge,
+        "analysed": bands.envelope is None,
+        "modulated": bands.modulated,
+        "differentiated": bands.differentiated,
+        "needs_contact": model.finger.presence,
+        "least_speed": model.finger.least_speed,
+        "corrected": bands.shown is None and (model.late != 0.0 or model.foresight != 0.0),
+        "sensor_delay": model.late,
+        "contact_lag": model.foresight,
+        "contact_damping": model.memory,
+        "typical_speed": model.typical_speed,
+        "lock": 2 * math.pi * model.lock,
+        "sensor_limit": float(model.sensed_limit),
+        "drive_limit": float(model.drive_limit),
+        "drive_step": float(model.drive_step),
+        "peak_decay": math.exp(-period * lowest),
+        "back_calculation": _back_calculation(model),
+        "observer": gains.observer,
+        "observer_high": gains.observer_high,
+        "crowd_speed": gains.crowd_speed,
+        "dc": gains.dc,
+        "dc_drift": gains.dc_drift,
+        "dc_fast": 1.6 * fast,
+        "dc_drift_fast": fast**2,
+        "integral": gains.integral_low,
+        "integral_medium": gains.integral_medium,
+        "integral_high": gains.integral_high,
+        "damper": gains.inner,
+        "damper_high": gains.inner_high,
+        "age": (model.delay + 0.5) / TURN_SAMPLES,
+    }
+
+
+def _adaptation(model: BandModel, rules: Rules, observer: float, feedback: bool) -> dict[str, float]:
+    """How fast the finger is estimated, by the observer's pole (1/s) and the delay; negative: never."""
+    most = min(ADAPTATION_SHARE * model.rate / TURN_SAMPLES, model.finger.fastest)
+    if model.finger.contact is None:  # what is always there is as large as D, and the law far from it while it adapts
+        wait = model.delay / model.rate
+        most = min(1 / (2 * wait + ADAPTATION_TIME / model.pace), most, observer / ADAPTATION_MARGIN)
+    low, high = (min(each, most) if feedback else -1.0 for each in rules.adaptation)
+    return {"adaptation": low, "adaptation_high": high, "rest": rules.rest[0], "rest_high": rules.rest[1]}
+
+
+def _detectors(model: BandModel, rules: Rules) -> dict[str, float]:
+    """What raises the gains, and for how long (samples)."""
+    noise = np.sqrt((model.coordinate_from_sensed**2).sum(axis=1).max()) * max(
+        model.sensed_noise, LEAST_NOISE * model.sensed_limit
+    )
+    period, fast, slow = 1.0 / model.rate, FAST_POLE * model.pace, SLOW_POLE * model.pace
+    return {
+        "detects": rules.detects,
+        "fast_pole": -math.expm1(-2 * math.pi * fast * period),
+        "slow_pole": -math.expm1(-2 * math.pi * slow * period),
+        "fast_level": _threshold(FAST_SIGMAS, noise, fast, period),
+        "slow_level": _threshold(SLOW_SIGMAS, noise, slow, period),
+        "fast_time": rules.high_time * model.rate,
+        "slow_time": rules.medium_time * model.rate,
+        "release": period / rules.release,
+    }
+
+
+def _threshold(sigmas: float, noise: float, pole: float, period: float) -> float:
+    """Square (m2) of so many sigmas of 2 eps e^(-j phi) behind a pole (Hz), eps white of rms `noise` (m)."""
+    return (sigmas * noise * math.sqrt(2 * math.pi * pole * period)) ** 2
+
+
+def _finger(finger: FingerRange) -> dict[str, float]:
+    """How contact is detected, and what may be estimated of it."""
+    on, off = finger.contact or (ALWAYS, ALWAYS)
+    bounds = {
+        f"{which}_{name}": getattr(finger, name)[i]
+        for name in ("mass", "damping", "stiffness")
+        for i, which in enumerate(("least", "most"))
+    }
+    typical = {name: getattr(finger, name) for name in ("least_motion", "typical_mass", "typical_stiffness")}
+    return {"contact_on": on, "contact_off": off, **typical, **bounds}
+
+
+def _back_calculation(model: BandModel) -> float:
+    """Rate (1/s) of the back-calculation; of an always damped mode about as fast as it loses energy.
+
+    However little that is, a finger takes it away within a millisecond.
+    """
+    decay = float((model.damping.diagonal() / model.mass.diagonal()).min()) if model.held else math.inf
+    return min(model.pace / BACK_TIME, max(decay, TOUCHED_DECAY))
+
+
+def _in_blocks(settings: dict[str, Any], block: int, rate: float) -> dict[str, Any]:
+    """Settings of the kernel for blocks: what is stated per sample becomes per block; no inner damper, no lock."""
+    most = ADAPTATION_SHARE * rate / block
+    changes = {name: 1.0 - (1.0 - settings[name]) ** block for name in ("fast_pole", "slow_pole")}
+    changes |= {name: settings[name] / block for name in ("fast_time", "slow_time")}
+    changes |= {name: min(settings[name], most) for name in ("adaptation", "adaptation_high")}
+    return (
+        settings
+        | changes
+        | {
+            "block": block,
+            "seen": 0.5,
+            "extrapolation": settings["lead"],
+            "release": min(settings["release"] * block, 1.0),
+            "peak_decay": settings["peak_decay"] ** block,
+            "age": max((settings["lead"] * rate - 0.5) / block, 1.0),
+            "damper": 0.0,
+            "damper_high": 0.0,
+            "lock": 0.0,
+        }
+    )

@@ -1,0 +1,93 @@
+"""Compiled ends of every controller: sensors into coordinates, plausibility, and the drive inside its limits."""
+
+from __future__ import annotations
+
+import math
+
+from hapticrender.control.records import CONTROLLER_T
+from hapticrender.jit import kernel, record
+from hapticrender.mathx import round_to_integer
+
+FADE_OUT = 0.02  # s: within this the drive fades out while a sensor's samples are implausible
+NEAR_LIMIT = 0.25  # of the limit, squared: from here on the envelope of the drive counts, not its samples alone
+SATURATED, NONFINITE, UNLOCKED = 1, 2, 32  # Flag bits
+
+
+@kernel
+def sense(controller, sensed, row, column, y):
+    """Coordinates of a sample, into a column of `y`; returns 1 where a sensor shows what none can, counted as zero."""
+    c = record(controller, CONTROLLER_T, 0)
+    implausible = 0
+    y[0, column] = y[1, column] = 0.0
+    for s in range(c.p.sensors):
+        value = sensed[row, s]
+        if abs(value) <= c.p.sensor_limit:
+            y[0, column] += c.p.coordinate_from_sensor[0, s] * value
+            y[1, column] += c.p.coordinate_from_sensor[1, s] * value
+        else:  # NaN included
+            implausible = 1
+    return implausible
+
+
+@kernel
+def update_confidence(controller, implausible):
+    """Fade the confidence in the sensors out within 20 ms while samples are implausible, and in again; True at zero."""
+    c = record(controller, CONTROLLER_T, 0)
+    step = c.p.block / (FADE_OUT * c.p.rate)
+    c.confidence = max(c.confidence - step, 0.0) if implausible > 0 else min(c.confidence + step, 1.0)
+    return c.confidence == 0.0
+
+
+@kernel
+def shape_noise(controller, exact, i):
+    """Round a drive to the converter's steps, the rounding noise shaped by (1 - 1/z)^2."""
+    c = record(controller, CONTROLLER_T, 0)
+    step, last = c.p.drive_step, c.shaper[0, i]
+    shaped = exact + (2.0 * last - c.shaper[1, i])
+    rounded = step * round_to_integer(shaped / step)
+    c.shaper[1, i] = last
+    c.shaper[0, i] = min(max(shaped - rounded, -step), step)
+    return rounded
+
+
+@kernel
+def drive_of(controller, samples, row, m, i):
+    """Drive of channel i for the forces in two rows of a column m."""
+    c = record(controller, CONTROLLER_T, 0)
+    return c.p.drive_from_force[i, 0] * samples[row, m] + c.p.drive_from_force[i, 1] * samples[row + 1, m]
+
+
+@kernel
+def largest_drive(controller, samples, force, quadrature, with_quadrature):
+    """Largest drive of a block over its limit, squared: of the samples, or of the analytic signal's envelope."""
+    c = record(controller, CONTROLLER_T, 0)
+    peak = 0.0
+    scale = c.confidence / c.p.drive_limit
+    for i in range(c.p.channels):
+        for m in range(c.p.block):
+            along = scale * drive_of(controller, samples, force, m, i)
+            across = scale * drive_of(controller, samples, quadrature, m, i) if with_quadrature else 0.0
+            peak = max(peak, along * along + across * across)
+    return peak
+
+
+@kernel
+def limit_drive(controller, samples, force, peak, drive, flags, first):
+    """Scale the whole envelope into the limit, round, and write the drive of a block."""
+    c = record(controller, CONTROLLER_T, 0)
+    before, after, limit = c.scale, 1.0, c.p.drive_limit
+    c.peak = peak
+    if peak > 1.0:
+        after = 1.0 / math.sqrt(peak)
+    for m in range(c.p.block):
+        scale = c.confidence * (before + (after - before) * (m + 1.0) / c.p.block)
+        for i in range(c.p.channels):
+            exact = scale * drive_of(controller, samples, force, m, i)
+            if c.confidence == 0.0:
+                c.shaper[0, i] = c.shaper[1, i] = exact = 0.0
+            elif c.p.drive_step > 0.0:
+                exact = shape_noise(controller, exact, i)
+            drive[first + m, i] = min(max(exact, -limit), limit)
+        if after < 1.0:
+            flags[first + m] |= SATURATED
+    c.scale = after

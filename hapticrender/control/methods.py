@@ -1,0 +1,356 @@
+"""Control methods: one table of rows, each with its name, its options and the design of its controller.
+
+=============== =======================================================================================================
+h, h2           error envelopes by a residual observer, law through the device's dynamic stiffness, finger included
+paper           Grigorii et al. 2021: amplitude and phase loops on the STDFT* at each transducer; the baseline
+paper-common    the same on the mean displacement only; all transducers get the same drive
+boxcar          the paper's loops, per transducer, on a running mean as long as a period of the lowest carrier
+static          complex loops in the device's coordinates, then the static inverse D(jw) of the free device
+stiffness       the same, then D V + D' dV/dt
+resonant        one integrator a band and coordinate, no low pass; then D V + D' dV/dt
+=============== =======================================================================================================
+
+A look-up table of the free device over frequency turns the polar methods' amplitude into a drive; their command never
+goes negative, and their phase error is cut at -270/90 degrees.  Two sides controlled apart are unstable on the paper's
+plate between 129 and 189 Hz.  The static inverse takes every envelope for constant and fails within a few Hz of a mode,
+where the device's own envelope is slower than the loop; with the slope D' the inverse is exact up to m W^2/|D| for
+changes of W rad/s.  All but h and h2 leave the finger out.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any, ClassVar, Literal
+
+import numpy as np
+
+from hapticrender.bands import Bands
+from hapticrender.control.bandmodel import BandModel
+from hapticrender.control.controller import BankController, padded, ridge_spacing, spacing
+from hapticrender.control.envelope_loop import Bandwidths, EnvelopeLoop, envelope_loop, section
+from hapticrender.control.error_design import FADE_IN, ONE_SPEED, Rules, design_error, rules_for
+from hapticrender.control.loopshape import analyse, integrator
+from hapticrender.control.low_pass import low_pass_step
+from hapticrender.control.margins import LEAST
+from hapticrender.control.records import LOW_PASS, MOST_CHANNELS, MOST_SENSORS, W, aligned
+from hapticrender.control.transfer import TransferFunction
+from hapticrender.errors import DesignError
+from hapticrender.protocols import Array, Method
+
+TABLE_STEP = 0.5  # Hz, resolution of the look-up table
+CONTACT_FADE = 0.02  # s: targets of the polar methods that follow the finger fade in and out with contact
+HIGHEST_EDGE = 1.25  # of the highest frequency, where position-locked carriers have faded out
+ALL_PASS = (1.0, 0.0, 0.0, 0.0, 0.0)
+
+
+@dataclass(frozen=True)
+class ErrorObserver:
+    """The default method: an error observer and the device's dynamic stiffness, finger included.
+
+    Parameters
+    ----------
+    name : str
+    rules : Rules, optional
+        How fast it is; by default at two speeds, by the carriers' spacing.
+    """
+
+    name: str = "h2"
+    rules: Rules | None = None
+
+    def design(self, model: BandModel, bands: Bands, *, feedback: bool = True) -> BankController:
+        """Design the controller; see `design_error`."""
+        return design_error(self.name, model, bands, self.rules or rules_for(bands), feedback=feedback)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Polar:
+    """Options of the polar methods; they show what each precaution is good for.
+
+    Parameters
+    ----------
+    clamp : bool
+        Keep the command amplitude from going negative.
+    subtract : bool
+        Naive phase error arg X - arg R, with a seam at -270/90 degrees in each, instead of arg(X conj R).
+    bandwidths : (float, float), Hz, optional
+        Of loop and low pass, unchecked; by default the paper's rule, a quarter and half of the lowest carrier.
+
+    References
+    ----------
+    Grigorii, Li, Peshkin and Colgate, IEEE Transactions on Haptics, 2021, eqs. 1-5.
+    """
+
+    clamp: bool = True
+    subtract: bool = False
+    bandwidths: Bandwidths | None = None
+    name: ClassVar[str]
+    common: ClassVar[bool] = False
+    boxcar: ClassVar[bool] = False
+
+    def design(self, model: BandModel, bands: Bands, *, feedback: bool = True) -> BankController:
+        """Design loops on the displacements at the transducers, or on their mean.
+
+        Raises
+        ------
+        DesignError
+            A target is modulated or differentiated, or no loop has the margins with the device's delay.
+        """
+        if bands.modulated or bands.differentiated:
+            raise DesignError(f"method {self.name!r} cannot modulate or differentiate targets: use 'h2' or 'stiffness'")
+        loop = envelope_loop(model, bands, boxcar=self.boxcar, bandwidths=self.bandwidths, feedback=feedback)
+        sides = model.side_from_coordinate
+        channels = len(sides)
+        watched, spread = (
+            (sides.mean(axis=0)[None], np.ones((channels, 1))) if self.common else (sides, np.eye(channels))
+        )
+        table = frequency_table(model, watched, spread, feedback)
+        settings = {
+            **low_pass_settings(model, bands, loop, watched @ model.coordinate_from_sensed, spread, feedback),
+            "polar": True,
+            "clamped": self.clamp,
+            "subtracted": self.subtract,
+            "window": loop.boxcar,
+            "table": table.shape[1],
+            "table_step": TABLE_STEP,
+            "fade_in": 1.0 / (CONTACT_FADE * model.rate),
+        }
+        arrays = {"gains": table}
+        if loop.boxcar:
+            arrays["window"] = aligned((loop.boxcar, len(watched) * tiles_of(bands), 2, W))
+        controller = low_pass_controller(self.name, settings, bands, arrays)
+        fixed = np.zeros(controller.tiles["fade"].shape)
+        fixed.reshape(-1)[: len(bands)] = bands.wavenumber == 0.0
+        controller.tiles["fade"] = fixed  # a constant target is there from the start
+        return controller
+
+
+class PerSide(Polar):
+    """The paper's controller: each transducer with its own amplitude and phase loops."""
+
+    name = "paper"
+
+
+class CommonMode(Polar):
+    """The same loops on the mean displacement only; all transducers get the same drive."""
+
+    name = "paper-common"
+    common = True
+
+
+class Boxcar(Polar):
+    """The paper's loops, per transducer, on a running mean as long as a period of the lowest carrier."""
+
+    name = "boxcar"
+    boxcar = True
+
+
+@dataclass(frozen=True, kw_only=True)
+class Inverse:
+    """Complex loops and the inverse of the free device; the options show what each precaution is good for.
+
+    Parameters
+    ----------
+    form : {"reduced", "integrator"}
+        Second-order controller of loop shaping, or a plain integrator of 17 1/s at 5 Hz.
+    feed_forward : bool
+        Command the reference plus what the loop adds; by default the loop alone commands.
+    filtered : bool
+        With feed-forward, pass the reference through the estimator's low pass before it is compared; naive without.
+    bandwidths : (float, float), Hz, optional
+        Of loop and low pass, unchecked; by default the paper's rule.
+    """
+
+    form: Literal["reduced", "integrator"] = "reduced"
+    feed_forward: bool = False
+    filtered: bool = True
+    bandwidths: Bandwidths | None = None
+    name: ClassVar[str]
+    dynamic: ClassVar[bool]
+
+    def design(self, model: BandModel, bands: Bands, *, feedback: bool = True) -> BankController:
+        """Design loops in the device's coordinates; raises `DesignError` where its delay leaves no margin."""
+        loop = envelope_loop(model, bands, form=self.form, bandwidths=self.bandwidths, feedback=feedback)
+        settings = complex_settings(model, bands, loop, self.feed_forward, feedback)
+        settings |= {"dynamic": self.dynamic, "deviation": self.feed_forward and self.filtered}
+        return low_pass_controller(self.name, settings, bands)
+
+
+class StaticInverse(Inverse):
+    """Loop controller, then the static inverse D(jw) of the free device."""
+
+    name = "static"
+    dynamic = False
+
+
+class DynamicStiffness(Inverse):
+    """Loop controller, then D V + D' dV/dt of the free device."""
+
+    name = "stiffness"
+    dynamic = True
+
+
+@dataclass(frozen=True, kw_only=True)
+class Resonant:
+    """Adaptive feed-forward cancellation (proportional-resonant control): one integrator a band and coordinate.
+
+    Parameters
+    ----------
+    gain : float, 1/s
+        Sum of ki over the bands, > 0, below the decay rate of the device's least damped mode.
+    feed_forward : bool
+        Command the reference plus what the loop adds; by default the loop alone commands.
+    checked : bool
+        Refuse a gain or a delay beyond its bound; naive without.
+
+    Notes
+    -----
+    From motion to force an integrator is ``-ki [D(jw)/(s - jw) + D'(jw) + conj. at -jw]``.  At a mode w1 of mass m and
+    stiffness m w1^2 that is ``+j w1 2 ki m``: negative damping of 2 ki m from every band.  All together must stay below
+    the mode's own m w1/Q, that is, sum ki < w1/2Q, its decay rate: 16.1 1/s for the rocking of the paper's plate.
+    Delay and hold leave 3 % more for low carriers and take the limit away for those above the modes.
+    """
+
+    gain: float = 15.0
+    feed_forward: bool = False
+    checked: bool = True
+    name: ClassVar[str] = "resonant"
+
+    def design(self, model: BandModel, bands: Bands, *, feedback: bool = True) -> BankController:
+        """Design integrators in the device's coordinates.
+
+        Raises
+        ------
+        DesignError
+            The gain drives a mode, or the device's delay leaves no margin.
+        """
+        controller = integrator(self.gain / max(len(bands), 1))
+        if feedback and self.checked:
+            least = least_decay(model)
+            if self.gain >= least:
+                raise DesignError(
+                    f"gain={self.gain:g} 1/s must be below {least:.3g} 1/s, the decay rate of the least damped mode, "
+                    f"which it takes away: lower gain"
+                )
+            found = analyse(controller, TransferFunction((1.0,), (1.0,)), delay=model.delay / model.rate)
+            if complaint := LEAST["envelope"].complaint(found.margins):
+                raise DesignError(f"{complaint}: lower gain={self.gain:g} 1/s or the loop's delay")
+        loop = EnvelopeLoop(ALL_PASS, section(controller.tustin(model.rate)), 0, model.lowest_frequency / 4)
+        settings = complex_settings(model, bands, loop, self.feed_forward, feedback)
+        return low_pass_controller(self.name, settings | {"dynamic": True, "deviation": True}, bands)
+
+
+def least_decay(model: BandModel) -> float:
+    """Decay rate of the least damped mode of the free device, 1/s."""
+    n = len(model.mass)
+    inverse = np.linalg.inv(model.mass)
+    rates = np.block([[np.zeros((n, n)), np.eye(n)], [-inverse @ model.stiffness, -inverse @ model.damping]])
+    return float(-np.linalg.eigvals(rates).real.max())
+
+
+def frequency_table(model: BandModel, watched: Array, spread: Array, feedback: bool) -> Array:
+    """Gain (m per drive unit) and lag (rad) of the free device and its hold by coordinate, shape (2 coordinates, n).
+
+    `watched` rows are the controlled displacements, `spread` columns their drive channels.  With feedback it is what
+    each coordinate does while all are driven alike, as a sweep of the device shows it; without, what makes all of them
+    do the same.
+    """
+    frequency = np.arange(0.0, model.rate / 2 + TABLE_STEP, TABLE_STEP)
+    response = watched @ model.response(frequency) @ spread  # (n, coordinates, coordinates)
+    alike = np.ones(len(watched))
+    each = response @ alike if feedback else 1.0 / np.linalg.solve(response, alike[None, :, None])[..., 0]
+    each = each.T * np.sinc(frequency / model.rate)
+    return np.ascontiguousarray(np.concatenate([abs(each), np.unwrap(np.angle(each), axis=1)]))
+
+
+def low_pass_settings(
+    model: BandModel, bands: Bands, loop: EnvelopeLoop, sensor_map: Array, drive_map: Array, feedback: bool
+) -> dict[str, Any]:
+    """Settings that every method with a low pass shares; the maps are those of sensors to coordinates and back."""
+    sensor_map = sensor_map[:, : None if feedback else 0]
+    for name, number, most in (
+        ("coordinates", len(sensor_map), 2),
+        ("drive channels", len(drive_map), MOST_CHANNELS),
+        ("sensors", sensor_map.shape[1], MOST_SENSORS),
+    ):
+        if number > most:
+            raise ValueError(f"the device model has {number} {name}: must be <= {most}")
+    # a waveform's envelopes pass two poles, with the delay of the low pass's two
+    analysis = 2 * math.pi * min(math.sqrt(2.0) * 2.0 * loop.bandwidth, spacing(bands) / (2 * math.pi))
+    ridges = ridge_spacing(bands)
+    return {
+        "coordinates": len(sensor_map),
+        "block": 1,
+        "sensors": sensor_map.shape[1],
+        "channels": len(drive_map),
+        "coordinate_from_sensor": padded(sensor_map, 2, MOST_SENSORS),
+        "drive_from_force": padded(drive_map, MOST_CHANNELS, 2),
+        "low_pass": loop.filter,
+        "loop": loop.law,
+        "rate": float(model.rate),
+        "lead": (model.delay + 0.5) / model.rate,
+        "reference": 2 * analysis / model.rate,
+        "crowd_speed": analysis / ridges if math.isfinite(ridges) else 0.0,
+        "seen": 1.0,
+        "lowest": float(model.lowest_frequency),
+        "highest": min(model.highest_frequency, 0.4 * model.rate),
+        "highest_edge": HIGHEST_EDGE,
+        "analysed": bands.envelope is None,
+        "modulated": bands.modulated,
+        "differentiated": bands.differentiated,
+        "feedback": feedback,
+        "sensor_limit": float(model.sensed_limit),
+        "drive_limit": float(model.drive_limit),
+    }
+
+
+def complex_settings(
+    model: BandModel, bands: Bands, loop: EnvelopeLoop, feed_forward: bool, feedback: bool
+) -> dict[str, Any]:
+    """Settings of the complex methods; without feedback the reference alone is inverted."""
+    forward = feed_forward or not feedback
+    drive_map = np.linalg.pinv(model.force_from_drive)
+    return {
+        **low_pass_settings(model, bands, loop, model.coordinate_from_sensed, drive_map, feedback),
+        **{name: padded(getattr(model, name), 2, 2) for name in ("mass", "damping", "stiffness")},
+        "shape": (1.0, 0.0),
+        "needs_contact": model.finger.presence,
+        "least_speed": model.finger.least_speed,
+        "forward": forward,
+        "fade_in": 1.0 / (FADE_IN * model.rate) if forward else 1.0,
+    }
+
+
+def tiles_of(bands: Bands) -> int:
+    """Number of tiles that hold the bands."""
+    return max(-(-len(bands) // W), 1)
+
+
+def low_pass_controller(
+    name: str, settings: dict[str, Any], bands: Bands, arrays: dict[str, Array] | None = None
+) -> BankController:
+    """Controller of a method with a low pass."""
+    loops = aligned(settings["coordinates"] * tiles_of(bands), LOW_PASS)
+    controller = BankController(name, low_pass_step, settings, bands, arrays={"loops": loops} | (arrays or {}))
+    controller.tiles["heading_re"] = controller.tiles["direction"] = 1.0
+    return controller
+
+
+_ALL: tuple[Any, ...] = (
+    PerSide(),
+    CommonMode(),
+    Boxcar(),
+    StaticInverse(),
+    DynamicStiffness(),
+    Resonant(),
+    ErrorObserver("h", ONE_SPEED),
+    ErrorObserver("h2"),
+)
+METHODS = {method.name: method for method in _ALL}
+
+
+def method_named(name: str) -> Method:
+    """Return the method called `name`; a ValueError lists those there are."""
+    if name not in METHODS:
+        raise ValueError(f"method = {name!r}: must be one of {', '.join(METHODS)}")
+    return METHODS[name]

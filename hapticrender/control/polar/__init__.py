@@ -1,1 +1,0 @@
-"""The paper's controller: magnitude and phase of every band."""

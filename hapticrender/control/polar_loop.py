@@ -1,0 +1,175 @@
+"""Linear model of the paper's polar loop about its steady state: amplitude and phase of one carrier, as a real system.
+
+In the frame of the carrier (angular frequency w) the plant takes the drive's envelope U to the measured one X by
+P(e^(j (w + W) T)).  About the steady state X = R, U = A e^(j theta) the law takes a deviation x of the estimate to
+
+    u = -C [Re x + j r Im x],  dU = e^(j theta)/table u,  r = A/|R|,
+
+C the loop controller: amplitude and phase errors are real numbers, so a complex deviation and its conjugate mix, and c
+coordinates make a real loop of size 2 c.  r is 1 where the look-up table is true, as on the free plate.  Neglected: the
+demodulator's image at 2 w, (rL rT/4)^2 with rL = fL/f0, rT = fT/f0, which the paper's rule keeps below 0.1 %; the clamp
+at 0, the phase cut and the drive's limit, which a small deviation does not reach.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from hapticrender.control.bandmodel import BandModel
+from hapticrender.control.linear import Sampled, StateSpace, closed_loop, continuous_poles, delayed
+from hapticrender.control.loopshape import reduced_controller
+from hapticrender.control.transfer import butterworth
+from hapticrender.protocols import Array
+
+
+@dataclass(frozen=True, kw_only=True)
+class PolarLoop:
+    """Small-signal loop of a stack of B carriers, each alone, in c measured coordinates.
+
+    Parameters
+    ----------
+    plant : Sampled
+        What the loop closes on.
+    delay : int, samples
+    frequency : ndarray, shape (B,), Hz
+    measured : ndarray, shape (c, n)
+        Measured displacements from the device's coordinates.
+    force : ndarray, shape (n, c)
+        Forces in the device's coordinates per unit of the controller's drives.
+    table : ndarray, shape (B, c)
+        Look-up table of each, m per drive unit.
+    low_pass, law : ndarray, shape (B, 5)
+        Sections b0 b1 b2 a1 a2 of the estimator and of the loop controller.
+    gain : float
+        Error of the plant's gain; 1 is none.
+    """
+
+    plant: Sampled
+    delay: int
+    frequency: Array
+    measured: Array
+    force: Array
+    table: Array
+    low_pass: Array
+    law: Array
+    gain: float = 1.0
+
+    @classmethod
+    def on(
+        cls,
+        plant: Sampled,
+        model: BandModel,
+        frequency: Array,
+        bandwidth: Array,
+        *,
+        common: bool,
+        delay: int | None = None,
+    ) -> PolarLoop:
+        """Loop of the paper's controller, per side or in common mode.
+
+        Parameters
+        ----------
+        plant : Sampled
+        model : BandModel
+            The free device, of which the look-up table is made.
+        frequency, bandwidth : ndarray, shape (B,), Hz
+            Carriers, and bandwidths fT of their loops; the estimator's is 2 fT.
+        common : bool
+            One loop on the mean of the sides, or one for each side.
+        delay : int, optional
+            Samples that the loop really has; by default the model's.
+        """
+        frequency, sides = np.asarray(frequency, float), model.side_from_coordinate
+        measured = sides.mean(axis=0, keepdims=True) if common else sides
+        spread = np.ones((len(sides), 1)) if common else np.eye(len(sides))
+        alike = model.response(frequency) @ np.ones(len(sides)) @ measured.T
+        widths, which = np.unique(bandwidth, return_inverse=True)
+        filters = [butterworth(2 * b).tustin(model.rate, prewarp=2 * b) for b in widths]
+        laws = [reduced_controller(b, 2 * b).tustin(model.rate) for b in widths]
+        return cls(
+            plant=plant,
+            delay=model.delay if delay is None else delay,
+            frequency=frequency,
+            measured=measured,
+            force=model.force_from_drive @ spread,
+            table=np.abs(alike * model.hold_and_delay(frequency)[:, None]),
+            low_pass=np.array([[*b, *a[1:]] for b, a in filters])[which],
+            law=np.array([[*b, *a[1:]] for b, a in laws])[which],
+        )
+
+    def envelope_response(self, offset: Array) -> Array:
+        """Measured envelope per drive envelope at `offset` (Hz, shape (B, N)) from the carrier: (B, N, c, c)."""
+        z = np.exp(2j * np.pi * (self.frequency[:, None] + offset) / self.plant.rate)
+        response = self.measured @ self.plant.response(z) @ self.force
+        return self.gain * response * z[..., None, None] ** -self.delay
+
+    def steady(self) -> tuple[Array, Array]:
+        """Unit vector e^(j theta) of each drive and r = A/|R|, both (B, c), where X = R in every coordinate."""
+        response = self.envelope_response(np.zeros((len(self.frequency), 1)))[:, 0]
+        drive = np.linalg.solve(response, np.ones((*response.shape[:-1], 1), complex))[..., 0]
+        return drive / np.abs(drive), np.abs(drive) * self.table
+
+    def loop(self, offset: Array) -> Array:
+        """L (B, N, 2 c, 2 c) at `offset` (Hz, > 0, (N,) or (B, N)), in real and imaginary parts."""
+        turn, ratio = self.steady()
+        scale = (turn / self.table)[:, None, None, :]
+        offset = np.broadcast_to(offset, (len(self.frequency), np.shape(offset)[-1]))
+        above = self.envelope_response(offset) * scale
+        below = (self.envelope_response(-offset) * scale).conj()
+        mean, half = 0.5 * (above + below), 0.5j * (above - below)
+        plant = np.concatenate([np.concatenate([mean, half], axis=-1), np.concatenate([-half, mean], axis=-1)], axis=-2)
+        z = np.exp(2j * np.pi * offset / self.plant.rate)
+        shared = (_section_response(self.low_pass, z) * _section_response(self.law, z))[..., None, None]
+        return shared * plant * np.concatenate([np.ones_like(ratio), ratio], axis=1)[:, None, None, :]
+
+    def matrix(self) -> Array:
+        """State matrix of the closed loop at sample rate in the carrier's frame, real, shape (B, s, s)."""
+        turn, ratio = self.steady()
+        pushed, seen = self.plant.b @ self.force * self.gain, self.measured @ self.plant.c
+        a, b, c, d = delayed(StateSpace(self.plant.a, pushed, seen, np.zeros(0)), self.delay)
+        back = np.exp(-2j * np.pi * self.frequency / self.plant.rate)[:, None, None]
+        plant = StateSpace(_real(back * a), _real(back * b * (turn / self.table)[:, None, :]), _real(c + 0 * back), d)
+        a1, b1, c1, d1 = _section_states(self.low_pass)
+        a2, b2, c2, d2 = _section_states(self.law)
+        series = StateSpace(
+            np.block([[a1, np.zeros_like(a1)], [b2 @ c1, a2]]),
+            np.concatenate([b1, b2 * d1], axis=1),
+            np.concatenate([d2 * c1, c2], axis=2),
+            d2 * d1,
+        )
+        gains = np.concatenate([np.ones_like(ratio), ratio], axis=1)
+        same, diagonal = np.eye(gains.shape[1]), -gains[:, :, None] * np.eye(gains.shape[1])
+        controller = StateSpace(
+            np.kron(same, series.a), np.kron(same, series.b), diagonal @ np.kron(same, series.c), diagonal * series.d
+        )
+        return closed_loop(plant, controller)
+
+    def poles(self) -> Array:
+        """Closed-loop poles in the frame of the carrier (1/s, complex, shape (B, s))."""
+        return continuous_poles(self.matrix(), self.plant.rate)
+
+    def growth(self) -> Array:
+        """Growth of the slowest-decaying pole (1/s, shape (B,)), < 0 for a stable loop."""
+        return self.poles().real.max(axis=-1)
+
+
+def _real(matrix: Array) -> Array:
+    """Matrix of real and imaginary parts, [[Re, -Im], [Im, Re]]."""
+    upper = np.concatenate([matrix.real, -matrix.imag], axis=-1)
+    return np.concatenate([upper, np.concatenate([matrix.imag, matrix.real], axis=-1)], axis=-2)
+
+
+def _section_response(sections: Array, z: Array) -> Array:
+    """Response of second-order sections (B, 5) at `z` (B, N)."""
+    b0, b1, b2, a1, a2 = (column[:, None] for column in sections.T)
+    return (b0 + b1 / z + b2 / z**2) / (1.0 + a1 / z + a2 / z**2)
+
+
+def _section_states(sections: Array) -> StateSpace:
+    """Second-order sections (B, 5) as state space, transposed direct form II."""
+    b0, b1, b2, a1, a2 = sections.T
+    a = np.stack([np.stack([-a1, np.ones_like(a1)], -1), np.stack([-a2, np.zeros_like(a2)], -1)], axis=-2)
+    b = np.stack([b1 - a1 * b0, b2 - a2 * b0], axis=-1)[:, :, None]
+    return StateSpace(a, b, np.broadcast_to([[1.0, 0.0]], (len(sections), 1, 2)), b0[:, None, None])

@@ -1,0 +1,184 @@
+"""Margins and bandwidths of the error observer's law: as recorded for every device; both sides of bounds."""
+
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hapticrender.control.bandwidth import SCHEDULE, STEPS, BankGains, checked_gains, error_loop
+from hapticrender.control.damping import damping_taps
+from hapticrender.control.linear import FingerEstimate, Structure
+from hapticrender.control.margins import LeastMargins
+from hapticrender.errors import DesignError
+from hapticrender.plants.plate import PlateParameters
+
+RECORDED = json.loads((Path(__file__).parent / "data" / "checked_gains.json").read_text())
+RATE = 5000.0
+MODEL = PlateParameters().band_model(RATE, 1)
+TAPS = damping_taps(MODEL, 1.4)[0]
+USUAL = LeastMargins()
+GAINS = BankGains(
+    rate=RATE,
+    delay=1,
+    lead=1.5 / RATE,
+    observer=2 * 2 * math.pi * 10.0 / RATE,
+    observer_high=2 * 2 * math.pi * 20.0 / RATE,
+    integral_low=2.0,
+    integral_medium=15.0,
+    integral_high=25.0,
+    dc=1.6 * 2 * math.pi * 6.0 / RATE,
+    dc_drift=(2 * math.pi * 6.0 / RATE) ** 2,
+    inner=0.0,
+    inner_high=1.0,
+    crowd_speed=0.0,
+    lowest=20.0,
+    highest=1000.0,
+    highest_edge=1.25,
+)
+
+
+def at(*frequencies):
+    return np.array(frequencies, float)
+
+
+@pytest.mark.parametrize("case", RECORDED, ids=[case["name"] for case in RECORDED])
+def test_gains_and_margins_are_the_recorded_ones(case):
+    """Recorded with the loop written down a second time, sample by sample, and by numpy's eigenvalues: to rounding."""
+    known = Structure.free(*(np.array(case[name]) for name in ("mass", "damping", "stiffness")))
+    frequency, gains = np.array(case["frequency"]), BankGains(**case["gains"])
+    options = {"wavenumber": np.array(case["wavenumber"]), "taps": np.array(case["taps"])}
+    checked = checked_gains(known, frequency, gains, least=LeastMargins(**case["least"]), **options)
+    for name, value in case["checked"].items():
+        assert getattr(checked.gains, name) == pytest.approx(value, rel=1e-12)
+    for level, margins in case["margins"].items():
+        for name, value in margins.items():
+            assert getattr(checked.margins[level], name) == pytest.approx(value, rel=1e-9)
+        growth = error_loop(known, frequency, gains, level, speed=0.1, **options).growth()[0]
+        assert growth == pytest.approx(case["growth"][level], rel=1e-6, abs=1e-6)
+
+
+def test_a_sound_design_is_left_alone():
+    checked = checked_gains(MODEL, at(170.0), GAINS, taps=TAPS, least=USUAL)
+    assert checked.gains == GAINS
+    assert checked.notes == ()
+    assert set(checked.margins) == set(SCHEDULE)
+    assert all(margins.stable and margins.modulus >= 0.5 for margins in checked.margins.values())
+
+
+def test_a_bandwidth_too_wide_is_lowered_no_further_than_need_be():
+    """An observer of 60 Hz on 20 Hz: unstable; lowered by quarter octaves until Ms <= 2."""
+    wide = replace(GAINS, observer_high=2 * 2 * math.pi * 60.0 / RATE, integral_high=204.0)
+    assert error_loop(MODEL, at(20.0), wide).growth()[0] > 0
+    checked = checked_gains(MODEL, at(20.0), wide, least=USUAL)
+    assert "bandwidth (high) lowered" in checked.notes[-1]
+    assert "unstable" in checked.notes[-1]
+    assert checked.margins["high"].modulus >= 0.5
+    step = checked.gains.observer_high / wide.observer_high
+    assert np.abs(STEPS - step).min() < 1e-12
+    assert checked.gains.integral_high == pytest.approx(step * wide.integral_high)
+    wider = checked.gains.scaled(("observer_high", "integral_high"), 2**0.25)
+    assert error_loop(MODEL, at(20.0), wider).margins().modulus < 0.5
+
+
+def test_an_inner_damper_too_strong_is_softened_first():
+    """Gain margin 2.7 at full strength, at any bandwidth, where 4 is required."""
+    checked = checked_gains(MODEL, at(170.0), GAINS, taps=TAPS, least=LeastMargins(gain=4.0))
+    assert "inner damper (high) softened to" in checked.notes[0]
+    assert "gain margin 2.7" in checked.notes[0]
+    assert checked.margins["high"].gain >= 4.0
+    assert 0.5 < checked.gains.inner_high < 1.0
+    assert checked.gains.observer_high == GAINS.observer_high
+
+
+def test_a_design_that_no_bandwidth_saves_is_refused():
+    """Observer and integral in a fixed ratio peak alike at any speed: modulus below 0.9 where 0.9 is required."""
+    same = replace(GAINS, integral_low=17.0, integral_medium=17.0, integral_high=17.0, observer_high=GAINS.observer)
+    with pytest.raises(DesignError, match=r"modulus margin 0\.8\d at 1\d\d(\.\d)? Hz is below 0\.90 \(low"):
+        checked_gains(MODEL, at(170.0), same, least=LeastMargins(modulus=0.9))
+
+
+def test_a_design_is_checked_on_every_plant_that_is_given():
+    """A plate twice as heavy is out of phase above its mode."""
+    heavy = Structure.free(2 * MODEL.mass, MODEL.damping, MODEL.stiffness)
+    assert not checked_gains(MODEL, at(160.0), GAINS, least=USUAL).notes
+    with pytest.raises(DesignError, match=r"(unstable|margin)"):
+        checked_gains(MODEL, at(160.0), GAINS, least=USUAL, plants=(Structure.of(MODEL), heavy))
+
+
+def test_carriers_locked_to_the_finger_are_checked_at_its_speeds():
+    """A grating and its third: their loops at five speeds, and the smallest of every margin."""
+    wavenumber, zero = np.array([1000.0, 3000.0]), np.zeros(2)
+    slow = replace(GAINS, observer_high=GAINS.observer, integral_high=GAINS.integral_medium)
+    checked = checked_gains(MODEL, zero, slow, wavenumber=wavenumber, least=LeastMargins(modulus=0.1, gain=1.1))
+    assert checked.notes == ()
+    loops = [
+        error_loop(MODEL, zero, slow, wavenumber=wavenumber, speed=speed)
+        for speed in np.geomspace(20.0 / 1000.0, 1000.0 / 3000.0, 5)
+    ]
+    assert loops[0].frequency.tolist() == [[20.0, 60.0]]
+    assert checked.margins["high"].modulus == pytest.approx(min(loop.margins().modulus for loop in loops), rel=1e-9)
+    assert checked.margins["high"].delay == pytest.approx(min(loop.margins().delay for loop in loops), rel=1e-9)
+
+
+def test_a_carrier_out_of_range_fades_out_and_crowded_ones_slow_down():
+    def observer(speed, **changes):
+        loop = error_loop(MODEL, at(0.0), replace(GAINS, **changes), wavenumber=at(1000.0), speed=speed)
+        return loop.observer[0], loop.share[0, 0]
+
+    assert observer(0.1) == (GAINS.observer_high, 1.0)
+    assert observer(0.009)[1] == 0.0
+    assert observer(0.015)[1] == pytest.approx(0.5)
+    assert observer(1.125)[1] == pytest.approx(0.5)
+    assert observer(0.1, crowd_speed=0.4)[0] == pytest.approx(GAINS.observer_high / 4)
+
+
+@pytest.mark.parametrize("level", list(SCHEDULE))
+@pytest.mark.parametrize("frequencies", [(20.0,), (143.0,), (400.0,), (100.0, 150.0, 170.0)])
+def test_nyquists_count_agrees_with_the_poles(frequencies, level):
+    for delay in (1, 4, 8, 16):
+        loop = error_loop(MODEL, at(*frequencies), GAINS, level, taps=TAPS, delay=delay)
+        assert loop.margins().stable == (loop.growth()[0] < 0.02), delay
+
+
+def test_poles_and_frequency_response_are_of_one_loop():
+    """The return difference vanishes at every closed-loop pole, relative to its size 1 1/s beside it."""
+    finger = FingerEstimate(4e-3, 1.0, 200.0, 0.5)
+    loop = error_loop(MODEL, at(100.0, 150.0, 170.0), GAINS, taps=TAPS, delay=3, finger=finger)
+    poles = loop.poles()[0]
+    poles = poles[(poles.imag > 1.0) & (poles.real > -200.0)]
+    assert len(poles) >= 8
+    here, beside = (abs(loop.difference(np.exp((poles + away) / RATE))[0]) for away in (0.0, 1.0))
+    assert (here < 1e-5 * beside).all()
+
+
+def test_the_margin_of_a_loop_is_that_of_a_brute_force_search():
+    """Grid of 0.01 Hz over the whole spectrum: the margins' own search finds the same peak within 0.1 %."""
+    loop = error_loop(MODEL, at(143.0, 160.0), GAINS, "low")
+    fine = np.arange(0.005, RATE / 2, 0.01)
+    values = np.linalg.inv(np.eye(2) + loop.loop(np.exp(2j * np.pi * fine / RATE))[0])
+    peak = np.linalg.norm(values, 2, axis=(1, 2)).max()
+    assert loop.margins().peak_sensitivity == pytest.approx(peak, rel=1e-3)
+
+
+def test_the_gain_margin_is_where_a_pole_crosses():
+    loop = error_loop(MODEL, at(170.0), GAINS, taps=TAPS)
+    edge = loop.margins().gain
+    for factor, grows in ((0.995, False), (1.005, True)):
+        plant = Structure.of(MODEL).stronger(factor * edge)
+        assert (error_loop(MODEL, at(170.0), GAINS, taps=TAPS, plant=plant).growth()[0] > 0) == grows
+
+
+def test_the_inner_damper_has_its_own_margins_inside_the_whole_loop():
+    """Q 1.4, 5 kHz, one sample: Ms 1.59, gain 2.7, delay 0.86 ms; the outer loop hardly adds to them."""
+    margins = error_loop(MODEL, at(170.0), GAINS, taps=TAPS).margins()
+    assert margins.peak_sensitivity == pytest.approx(1.59, abs=0.005)
+    assert margins.gain == pytest.approx(2.7, abs=0.05)
+    assert margins.delay == pytest.approx(0.86e-3, abs=0.005e-3)
+
+
+def test_an_unknown_level_is_refused():
+    with pytest.raises(ValueError, match="level='quiet' must be one of low, medium, high"):
+        error_loop(MODEL, at(170.0), GAINS, "quiet")

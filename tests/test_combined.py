@@ -1,0 +1,112 @@
+"""The controller of a device of two parts: each part's own controller, side by side, targets of one skin velocity."""
+
+import numpy as np
+import pytest
+from test_kernel import IDEAL, RATE, friction_controller, plate_controller, tones
+
+from hapticrender.bands import Bands
+from hapticrender.control.combined import CombinedBands, CombinedController, CombinedModel, design_combined
+from hapticrender.control.error_design import ONE_SPEED, design_error
+from hapticrender.realtime import RealtimeEntry
+
+VELOCITY_PER_FORCE = 0.64  # m/(N s)
+PLATE, FRICTION = tones([0.0, 0.0], wavenumber=[500.0, 900.0]), tones([0.0, 0.0], 1e-6, wavenumber=[900.0, 2000.0])
+PLATE_INDEX, FRICTION_INDEX = np.array([0, 1]), np.array([1, 2])
+
+
+def combined_bands():
+    zero = np.zeros(3)
+    return CombinedBands(
+        frequency=zero,
+        wavenumber=np.array([500.0, 900.0, 2000.0]),
+        phase=zero,
+        envelope=zero + 1e-5,
+        plate=PLATE,
+        friction=FRICTION,
+        plate_index=PLATE_INDEX,
+        friction_index=FRICTION_INDEX,
+    )
+
+
+def combined(parts):
+    return CombinedController(parts, combined_bands(), VELOCITY_PER_FORCE, (2, 2), (2, parts[1].channels), "h")
+
+
+def parts():
+    return plate_controller(PLATE, rules=ONE_SPEED), friction_controller(FRICTION)
+
+
+def samples(rng, n=2000):
+    position = 0.05 * np.arange(n) / RATE
+    return 1e-6 * rng.standard_normal((n, 4)), position, np.zeros(n)
+
+
+def test_each_part_is_driven_as_on_its_own(rng):
+    """Drives bit for bit; the target of the skin is j w X + 0.64 F, at the frequency that the speed makes."""
+    sensed, position, wanted = samples(rng)
+    drive, target, flags = combined(parts()).run(sensed, position, wanted)
+    plate, friction = parts()
+    moved, x, _ = plate.run(sensed[:, :2], position, wanted)
+    rubbed, force, _ = friction.run(sensed[:, 2:], position, wanted)
+    np.testing.assert_array_equal(drive, np.hstack([moved, rubbed]))
+    assert (abs(drive).max(axis=0) > 0).all()
+    assert not flags.any()
+    w = 2 * np.pi * PLATE.wavenumber * 0.05
+    expected = np.zeros(3, complex)
+    expected[PLATE_INDEX] += 1j * w * x[-1]
+    expected[FRICTION_INDEX] += VELOCITY_PER_FORCE * force[-1]
+    np.testing.assert_allclose(target[-1], expected, rtol=1e-9)  # the tracker's speed, after 0.4 s at 60 Hz
+
+
+def test_a_part_without_targets_stays_without_drive(rng):
+    none = np.zeros(0)
+    nothing = Bands(frequency=none, wavenumber=none, phase=none, envelope=none + 0j)
+    model = IDEAL.band_model(RATE, 1)
+
+    class Method:
+        name = "h"
+
+        def design(self, model, bands, *, feedback=True):
+            return design_error("h", model, bands, ONE_SPEED, feedback=feedback)
+
+    names = ("rate", "delay", "mass", "damping", "stiffness", "force_from_drive", "coordinate_from_sensed")
+    names += ("side_from_coordinate", "place_from_coordinate", "places", "drive_limit", "sensed_limit", "drive_step")
+    both = CombinedModel(
+        **{name: getattr(model, name) for name in names},
+        plate=model,
+        friction=None,
+        velocity_per_force=VELOCITY_PER_FORCE,
+    )
+    fixed = tones([70.0])
+    bands = CombinedBands(
+        frequency=fixed.frequency,
+        wavenumber=fixed.wavenumber,
+        phase=fixed.phase,
+        envelope=fixed.envelope,
+        plate=fixed,
+        friction=nothing,
+        plate_index=np.array([0]),
+        friction_index=np.zeros(0, int),
+    )
+    controller = design_combined(Method(), both, bands)
+    drive, target, _ = controller.run(1e-7 * rng.standard_normal((1000, 3)), np.zeros(1000), np.zeros(1000))
+    assert abs(drive[:, :2]).max() > 0
+    assert (drive[:, 2] == 0).all()
+    assert target[-1, 0] == pytest.approx(2j * np.pi * 70.0 * 10e-6, rel=1e-12)
+    assert "friction: no target" in controller.note
+
+
+def test_it_plays_through_the_real_time_entry(rng):
+    import ctypes
+
+    sensed, _, wanted = samples(rng, 500)
+    entry = RealtimeEntry(combined(parts()))
+    drive = np.zeros((500, entry.controller.channels))
+    plain = ctypes.CFUNCTYPE(ctypes.c_int32, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_uint64, ctypes.c_void_p)
+    entry.finger(0.0, 0.05)
+    assert plain(entry.plain_address)(sensed.ctypes.data, drive.ctypes.data, 500, entry.user_data) == 0
+    position = 0.05 * np.minimum(np.arange(500) / RATE, 0.05)
+    expected = combined(parts()).run(sensed, position, wanted)[0]
+    np.testing.assert_allclose(drive, expected, rtol=0, atol=1e-10 * abs(expected).max())
+    with pytest.raises(TypeError, match="takes no other targets under way"):
+        entry.send(PLATE)

@@ -1,0 +1,178 @@
+"""The compiled step of the methods with low passes against its equations, and what it looks up."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from naive_low_pass import NaiveLowPass
+
+import hapticrender as hr
+from hapticrender.bands import Bands
+from hapticrender.control.methods import (
+    METHODS,
+    Boxcar,
+    CommonMode,
+    DynamicStiffness,
+    PerSide,
+    Resonant,
+    StaticInverse,
+    frequency_table,
+)
+from hapticrender.mathx import polar
+from hapticrender.plants.plate import PlateParameters
+
+RATE, COUNT = 5000.0, 1500
+MODEL = PlateParameters().band_model(RATE, 1)
+LOW_PASS = ("paper", "paper-common", "boxcar", "static", "stiffness", "resonant")
+# of the largest drive: angles are good to 2.3e-10 rad and magnitudes to 1.8e-10 of themselves, which both loops
+# integrate, and products of 64 turns to 64 roundings
+CLOSE = 3e-9
+
+
+def bands_of(frequency, wavenumber=None, envelope=1e-6, **options):
+    """Carriers with odd phases and envelopes."""
+    count = len(frequency)
+    turn = None if envelope is None else envelope * np.exp(1j * np.arange(count)) / np.arange(1, count + 1)
+    return Bands(
+        frequency=np.array(frequency, float),
+        wavenumber=np.zeros(count) if wavenumber is None else np.array(wavenumber, float),
+        phase=0.3 * np.arange(count),
+        envelope=turn,
+        **options,
+    )
+
+
+MIXED = bands_of([47.0, 0.0, 111.3, 0.0], [0.0, 1000.0, 0.0, 2500.0])
+MANY = bands_of(np.linspace(20.0, 400.0, 19))  # more than a tile holds
+
+
+def signals(rng):
+    """Noise, a finger that lifts and turns round, and a waveform."""
+    time = np.arange(COUNT) / RATE
+    position = np.where((time > 0.14) & (time < 0.15), np.nan, 0.02 * np.sin(20 * time))
+    return 1e-6 * rng.standard_normal((COUNT, 2)), position, 1e-6 * np.sin(2 * np.pi * 61.0 * time)
+
+
+def check(method, bands, columns, feedback=True):
+    """Compare a run with its equations, sample by sample."""
+    controller = method.design(MODEL, bands, feedback=feedback)
+    drive, target, flags = controller.run(*columns)
+    naive = NaiveLowPass(controller.settings, bands, controller._arrays.get("gains"))
+    expected, aims = (
+        np.array(each) for each in zip(*(naive.step(*row) for row in zip(*columns, strict=True)), strict=True)
+    )
+    assert abs(expected).max() > 1e-4
+    np.testing.assert_allclose(drive, expected, rtol=0, atol=CLOSE * abs(expected).max())
+    np.testing.assert_allclose(target, aims, rtol=0, atol=1e-12 * abs(aims).max())
+    return drive, flags
+
+
+@pytest.mark.parametrize("bands", [MANY, MIXED], ids=["fixed", "following the finger"])
+@pytest.mark.parametrize("name", LOW_PASS)
+def test_a_run_is_its_equations(name, bands, rng):
+    """The finger reverses at 79 and 236 ms, where a mirror image is followed, and is away for 10 ms."""
+    check(METHODS[name], bands, signals(rng))
+
+
+@pytest.mark.parametrize(
+    "method",
+    [
+        PerSide(clamp=False),
+        PerSide(subtract=True),
+        CommonMode(bandwidths=(3.0, 9.0)),
+        Boxcar(subtract=True),
+        StaticInverse(form="integrator"),
+        DynamicStiffness(feed_forward=True),
+        DynamicStiffness(feed_forward=True, filtered=False),
+        Resonant(gain=3.0, feed_forward=True),
+    ],
+    ids=str,
+)
+def test_options_are_their_equations(method, rng):
+    check(method, MIXED, signals(rng))
+
+
+@pytest.mark.parametrize("name", LOW_PASS)
+def test_targets_of_a_waveform_come_through_the_residual_analysis(name, rng):
+    check(METHODS[name], dataclasses.replace(MIXED, envelope=None), signals(rng))
+
+
+@pytest.mark.parametrize("name", LOW_PASS)
+def test_a_faulty_sensor_fades_the_drive_out_and_resets_the_loops(name, rng):
+    """30 ms of NaN from sample 700 on: no drive after 20 ms, and it comes back within 20 ms of good samples."""
+    sensed, position, wanted = signals(rng)
+    sensed[700:850, 1] = np.nan
+    drive, flags = check(METHODS[name], MIXED, (sensed, position, wanted))
+    assert not drive[800:850].any()
+    assert drive[851:].any(axis=1).all()
+    assert np.array_equal(flags & hr.Flag.NONFINITE > 0, np.isnan(sensed[:, 1]))
+
+
+@pytest.mark.parametrize("name", LOW_PASS)
+def test_without_feedback_it_drives_from_the_model_alone(name, rng):
+    _, position, wanted = signals(rng)
+    check(METHODS[name], MIXED, (np.zeros((COUNT, 0)), position, wanted), feedback=False)
+
+
+@pytest.mark.parametrize("name", ["static", "stiffness", "resonant"])
+@pytest.mark.parametrize("option", ["modulated", "differentiated"])
+def test_complex_methods_modulate_and_differentiate_targets(name, option, rng):
+    sensed, position, _ = signals(rng)
+    check(
+        METHODS[name], dataclasses.replace(MIXED, **{option: True}), (sensed, position, np.sin(0.02 * np.arange(COUNT)))
+    )
+
+
+@pytest.mark.parametrize("name", ["paper", "paper-common", "boxcar"])
+@pytest.mark.parametrize("option", ["modulated", "differentiated"])
+def test_polar_methods_refuse_to_modulate_and_differentiate(name, option):
+    with pytest.raises(hr.DesignError, match=f"method '{name}' cannot modulate"):
+        METHODS[name].design(MODEL, dataclasses.replace(MIXED, **{option: True}))
+
+
+def test_every_channel_is_cut_to_its_limit_and_flagged(rng):
+    bands, sensed = bands_of([47.0, 111.0], envelope=1e-3), 1e-6 * rng.standard_normal((COUNT, 2))
+    drive, flags = check(METHODS["paper"], bands, (sensed, np.full(COUNT, np.nan), np.zeros(COUNT)))
+    limit = PlateParameters().current_limit
+    assert abs(drive).max() == limit
+    assert np.array_equal(flags & hr.Flag.SATURATED > 0, (abs(drive) == limit).any(axis=1))
+
+
+def test_silence_keeps_the_phase_and_a_new_target_is_taken_up():
+    """A target below 1e-12 m has no direction: the command fades with the last one; sent anew, it is there again."""
+    bands = bands_of([47.0])
+    controller = METHODS["paper-common"].design(MODEL, bands)
+    nothing = np.zeros((640, 2)), np.full(640, np.nan), np.zeros(640)
+    controller.run(*nothing)
+    controller.send(dataclasses.replace(bands, envelope=np.array([1e-13 + 0j])))
+    controller.run(*nothing)
+    assert controller.field("heading_re")[0] == pytest.approx(1.0, abs=1e-12)
+    assert controller.field("sounds")[0] == 0.0
+    controller.send(dataclasses.replace(bands, envelope=np.array([2e-6j])))
+    _, target, _ = controller.run(*nothing)
+    assert target[-1, 0] == 2e-6j
+    assert controller.field("heading_im")[0] == pytest.approx(1.0, abs=1e-12)
+
+
+def test_the_table_is_the_free_device_behind_its_hold():
+    """Heave of the plate is one mode: 1/(k + j w b - w^2 m) by the force of both coils, and the hold's sin(x)/x."""
+    sides = MODEL.side_from_coordinate
+    gain, lag = frequency_table(MODEL, sides.mean(axis=0)[None], np.ones((2, 1)), True)
+    frequency = np.array([20.0, 47.0, 189.0, 400.0])
+    w, at = 2 * np.pi * frequency, (frequency / 0.5).astype(int)
+    force = MODEL.force_from_drive.sum(axis=1)
+    stiffness = MODEL.stiffness - MODEL.mass * w[:, None, None] ** 2 + 1j * MODEL.damping * w[:, None, None]
+    motion = np.linalg.solve(stiffness, np.broadcast_to(force[:, None], (4, 2, 1)))[..., 0] @ sides.mean(axis=0)
+    x = w / RATE / 2
+    np.testing.assert_allclose(gain[at], abs(motion) * np.sin(x) / x, rtol=1e-9)
+    np.testing.assert_allclose(lag[at], np.angle(motion), rtol=1e-9)
+
+
+def test_magnitude_and_angle_are_good_to_2e_10(rng):
+    """The interpolations err by 2.3e-10 rad and 1.8e-10 of the magnitude; the cut is at 90 degrees."""
+    points = 10.0 ** rng.uniform(-12, 3, 2000) * np.exp(2j * np.pi * rng.uniform(size=2000))
+    found = np.array([polar(z.real, z.imag) for z in points])
+    assert abs(found[:, 0] / abs(points) - 1.0).max() < 2e-10
+    assert abs(found[:, 1] - NaiveLowPass.cut(points)).max() < 2.4e-10
+    assert polar(0.0, 0.0)[0] < 1e-140
+    assert abs(polar(0.0, 0.0)[1]) < 2.4e-10
