@@ -4,14 +4,18 @@ In series, per area: insulator, stratum corneum (C || R), sliding gap (C = eps0/
 charge q of the gap under a contact of area A::
 
     F_e = kappa q^2/(2 eps0 A)
-    friction F: see `sliding`, with the steady friction mu (W + F_e)
+    friction F: see `contact`, with the steady friction mu (W + F_e)
 
 Under a current of peak I at the carrier w the attraction is, on average, ``g I^2`` with::
 
     g = kappa L/(4 w^2 eps0 A),   L = (w tau)^2/(1 + (w tau)^2),   tau = R_g C
 
 whatever the gap's thickness: the reason for driving current.  Under a voltage it goes as (Z_gap/Z)^2/d^2, and the same
-finger spreads 11 times over gaps of 0.5 to 3 um.  A finger that rests shorts its gap with sweat and is not attracted.
+finger spreads 11 times over gaps of 0.5 to 3 um.  A resting finger shorts its gap with sweat and is not attracted.
+
+A stray capacitance C_s across the source (cable, electrode) takes a part of its current, so that a finger of impedance
+Z gets ``I/(1 + j w C_s Z)``, which depends on the gap again: 50 pF cost a nominal finger 24 % of its attraction.  It is
+taken in steady state at the carrier.  The current that is measured is that of the source.
 
 Two levels: "carrier" integrates the circuit over every substep exactly, with the offset of the current source, its
 servo and its compliance; "envelope" takes ``g I^2``.  They agree but for what a step of the envelope leaves in the gap
@@ -31,36 +35,73 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from hapticrender.control.gap import VACUUM, GapEstimator, gap_state
-from hapticrender.control.square_root import SquareRoot, SquareRootTables
-from hapticrender.plants.base import TouchedPlant
-from hapticrender.plants.bounds import choice, number
-from hapticrender.plants.electroadhesion_kernels import (
-    LOAD,
-    POSITION,
-    SPEED,
-    Element,
-    ScreenState,
-    ScreenTables,
-    closed_screen_run,
-    element,
-    screen_run,
-)
-from hapticrender.plants.sliding import SlidingParameters, sliding_state, sliding_tables
-from hapticrender.protocols import Array, Controller, Sensed
+from hapticrender.checks import option, parameter
+from hapticrender.plants.compiled import CompiledPlant, finger_inputs
+from hapticrender.plants.contact import SlidingParameters, new_record, sliding_record
+from hapticrender.plants.electroadhesion_kernels import ATTRACTION, SCREEN, SKIN_VELOCITY, element, screen_step
+from hapticrender.plants.gap import VACUUM, GapEstimator
+from hapticrender.protocols import Array
 
 if TYPE_CHECKING:
     from hapticrender.touch.finger import Finger
 
-PLACES = ("friction",)
 DRY, NORMAL, MOIST = 100.0, 4.0, 0.5  # ohm m2: leakage of the gap (engineering defaults: L = 1.0, 0.90, 0.12)
 BLOCKING = 1e6  # s: time constant of a capacitor that does not leak
 LEAST_SUBSTEPS = 4  # in a turn of the carrier
+finger_rows = finger_inputs  # removed when all import the new name
+
+
+@dataclass(frozen=True, kw_only=True)
+class SquareRoot:
+    """Square root that makes an attraction, which goes with current squared, linear in the drive.
+
+    An attraction u around a bias takes the current envelope ``I = sqrt(max(bias + u, floor)/g)``.  Without it the
+    envelope is linear, ``I = sqrt(2 bias/g) (1 + u/bias)/2``, and ``g I^2 = bias/2 + u + u^2/(2 bias)`` has a second
+    harmonic of 25 % at u = bias sin(2 pi f t); Grigorii et al. 2021 drive 6 mA sqrt((sin(2 pi f t) + 1)/2).  That
+    envelope has cusps where it touches zero; the floor rounds them off.
+
+    Parameters
+    ----------
+    bias : float, N
+        Attraction at zero drive, > `floor`; the drive can reduce it by bias - floor.
+    floor : float, N
+        Least attraction, >= 0.  The slope of the current is at most 1/(2 sqrt(floor gain)), unbounded at a floor of 0.
+    gain : float, N/A^2 (or N/V^2)
+        g of ``F = g I^2``, > 0.
+    straight : bool
+        Omit the square root, for comparison: the envelope is linear in the drive, with the same peak at a drive of
+        `bias` and the same slope of attraction at zero drive.
+
+    Examples
+    --------
+    >>> SquareRoot(bias=0.32, floor=0.01, gain=17.8e3)(np.array([0.0, 0.32])).round(5).tolist()
+    [0.00424, 0.006]
+    """
+
+    bias: float
+    floor: float
+    gain: float
+    straight: bool = False
+
+    def __post_init__(self) -> None:
+        for name, bound, unit in (("bias", self.floor, "N"), ("gain", 0.0, "N/A^2")):
+            value = getattr(self, name)
+            if not (math.isfinite(value) and value > bound):
+                raise ValueError(f"{name} = {value!r}: must be > {bound:g} {unit}")
+        if not (math.isfinite(self.floor) and self.floor >= 0.0):
+            raise ValueError(f"floor = {self.floor!r}: must be >= 0 N")
+
+    def __call__(self, drive: Any) -> Any:
+        """Current envelope (A, peak) for a `drive` (N of attraction around the bias)."""
+        wanted = np.maximum(self.bias + np.asarray(drive, float), self.floor)
+        if self.straight:
+            return wanted / np.sqrt(2 * self.bias * self.gain)
+        return np.sqrt(wanted / self.gain)
 
 
 @dataclass(frozen=True, kw_only=True)
 class ElectroadhesionParameters(SlidingParameters):
-    """Everything that describes the screen, a finger's electrical side, and how finely they are modelled.
+    """Parameters of the screen, of the finger's electrical side, and of the model's level.
 
     Parameters
     ----------
@@ -72,7 +113,7 @@ class ElectroadhesionParameters(SlidingParameters):
     drive_kind : {"current", "voltage"}
         Drive in A or V, peak of the carrier; a voltage is turned into the current that it drives in steady state.
     sensor : {"tribometer", "impedance"}
-        Friction (N), or the attraction (N) that `control.gap` reads from voltage and current; level "carrier" only.
+        Friction (N), or the attraction (N) that `GapEstimator` reads from voltage and current; level "carrier" only.
     carrier_frequency : float, Hz
         A whole multiple of `rate`.
     oversampling : int
@@ -106,60 +147,63 @@ class ElectroadhesionParameters(SlidingParameters):
     unevenness : float
         kappa = <d^-2>/<d^-1>^2 of the gap, 1 to 10 (1-3).
     current_limit : float, A
-        Largest peak that is asked of the source, where its drive is a current, > 0.
+        Largest peak of the source where the drive is a current, > 0.
     voltage_limit : float, V
         Its compliance, peak, > 0 (150-300); also the largest drive where that is a voltage.
     current_offset : float, A
         Direct current that the source leaks, -1 to 1 mA.
     servo_conductance : float, S
         The source bleeds this times the mean voltage of the last sample, >= 0; 0: no servo.
+    stray_capacitance : float, F
+        Across the source, >= 0.
     voltage_noise, current_noise : float, V and A rms
         White noise of the two channels at every substep, >= 0.
     skew : float, s
         The current's channel is late by this, -10 to 10 us.
     estimator_bandwidth, estimator_smoothing : float, Hz and s
-        See `control.gap.GapEstimator`.
+        See `GapEstimator`.
     least_leakage : float
-        L below which a finger counts as moist and is not sensed, 0 to 1.
+        L below which a gap leaks too much to be measured, 0 to 1.
     open_loop_gain : float, N/A^2
-        g of a finger that is not sensed, > 0; a renderer takes that of a nominal finger, unless its scene tells.
+        g of a finger whose gap cannot be measured, > 0; renderers set that of a nominal finger unless the scene has it.
 
     Notes
     -----
-    Electrical defaults: FACTS section 5 with its sources [M], [E]; per m2 where it tabulates per cm2.  Offset and
-    servo act at the level "carrier" only.
+    Electrical defaults per m2 from the sources above and docs/theory.md; gap, leakage and body are engineering values.
+    Offset and servo act at the level "carrier" only.
     """
 
-    level: str = choice("envelope", "envelope", "carrier")
-    drive_kind: str = choice("current", "current", "voltage")
-    sensor: str = choice("tribometer", "tribometer", "impedance")
-    carrier_frequency: float = number(20e3, "Hz", above=0.0)
-    oversampling: int = number(20, "substeps", least=1, most=10_000)
-    contact_area: float = number(1.2e-4, "m2", above=0.0)
-    area_exponent: float = number(0.5, most=1.0)
-    electrical_share: float = number(0.6, above=0.0, most=1.0)
-    area_scale: float = number(1.0, above=0.0)
-    insulator_capacitance: float = number(3.45e-5, "F/m2", above=0.0)
-    corneum_capacitance: float = number(2.95e-5, "F/m2", above=0.0)
-    corneum_resistance: float = number(1.2, "ohm m2", above=0.0)
-    gap_thickness: float = number(1.5e-6, "m", above=0.0)
-    gap_resistance: float = number(NORMAL, "ohm m2", above=0.0)
-    gap_short: float = number(0.0, "ohm m2", most=0.1)
-    ripple: float = number(0.0, most=0.9)
-    ripple_wavelength: float = number(0.5e-3, "m", above=0.0)
-    body_resistance: float = number(1e3, "ohm")
-    unevenness: float = number(1.0, least=1.0, most=10.0)
-    current_limit: float = number(10e-3, "A", above=0.0)
-    voltage_limit: float = number(300.0, "V", above=0.0)
-    current_offset: float = number(0.0, "A", least=-1e-3, most=1e-3)
-    servo_conductance: float = number(1e-7, "S")
-    voltage_noise: float = number(0.5, "V")
-    current_noise: float = number(20e-6, "A")
-    skew: float = number(0.0, "s", least=-1e-5, most=1e-5)
-    estimator_bandwidth: float = number(1500.0, "Hz", above=0.0)
-    estimator_smoothing: float = number(5e-3, "s", above=0.0)
-    least_leakage: float = number(0.5, most=1.0)
-    open_loop_gain: float = number(2.2e4, "N/A^2", above=0.0)
+    level: str = option("envelope", "envelope", "carrier")
+    drive_kind: str = option("current", "current", "voltage")
+    sensor: str = option("tribometer", "tribometer", "impedance")
+    carrier_frequency: float = parameter(20e3, "Hz", above=0.0)
+    oversampling: int = parameter(20, "substeps", least=1, most=10_000)
+    contact_area: float = parameter(1.2e-4, "m2", above=0.0)
+    area_exponent: float = parameter(0.5, most=1.0)
+    electrical_share: float = parameter(0.6, above=0.0, most=1.0)
+    area_scale: float = parameter(1.0, above=0.0)
+    insulator_capacitance: float = parameter(3.45e-5, "F/m2", above=0.0)
+    corneum_capacitance: float = parameter(2.95e-5, "F/m2", above=0.0)
+    corneum_resistance: float = parameter(1.2, "ohm m2", above=0.0)
+    gap_thickness: float = parameter(1.5e-6, "m", above=0.0)
+    gap_resistance: float = parameter(NORMAL, "ohm m2", above=0.0)
+    gap_short: float = parameter(0.0, "ohm m2", most=0.1)
+    ripple: float = parameter(0.0, most=0.9)
+    ripple_wavelength: float = parameter(0.5e-3, "m", above=0.0)
+    body_resistance: float = parameter(1e3, "ohm")
+    unevenness: float = parameter(1.0, least=1.0, most=10.0)
+    current_limit: float = parameter(10e-3, "A", above=0.0)
+    voltage_limit: float = parameter(300.0, "V", above=0.0)
+    current_offset: float = parameter(0.0, "A", least=-1e-3, most=1e-3)
+    servo_conductance: float = parameter(1e-7, "S")
+    stray_capacitance: float = parameter(0.0, "F")
+    voltage_noise: float = parameter(0.5, "V")
+    current_noise: float = parameter(20e-6, "A")
+    skew: float = parameter(0.0, "s", least=-1e-5, most=1e-5)
+    estimator_bandwidth: float = parameter(1500.0, "Hz", above=0.0)
+    estimator_smoothing: float = parameter(5e-3, "s", above=0.0)
+    least_leakage: float = parameter(0.5, most=1.0)
+    open_loop_gain: float = parameter(2.2e4, "N/A^2", above=0.0)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -221,13 +265,14 @@ class ElectroadhesionParameters(SlidingParameters):
         return complex(self.body_resistance + (self.series_impedance + gap) / self.area(normal_load))
 
     def gain(self, normal_load: float) -> float:
-        """Return g of ``F_e = g I^2`` while sliding (N/A^2, I the peak) under `normal_load` (N)."""
+        """Return g of ``F_e = g I^2`` while sliding (N/A^2, I the finger's peak) under `normal_load` (N)."""
         return float(self.unevenness * self.leakage / (4 * self.omega**2 * VACUUM * self.area(normal_load)))
 
     def attraction(self, drive: Any, normal_load: float) -> Any:
         """Steady attraction (N) while sliding under `drive` (A, or V where that is driven), peak; no limits."""
-        drive = np.asarray(drive, float)
-        current = drive / abs(self.impedance(normal_load)) if self.drive_kind == "voltage" else drive
+        impedance = self.impedance(normal_load)
+        shunted = 1 + 1j * self.omega * self.stray_capacitance * impedance
+        current = np.asarray(drive, float) / abs(impedance if self.drive_kind == "voltage" else shunted)
         return self.gain(normal_load) * current**2
 
     def sensed_response(self, frequency: Any, speed: float) -> Any:
@@ -237,19 +282,19 @@ class ElectroadhesionParameters(SlidingParameters):
         return self.estimator.frequency_response(frequency) / self._shift(frequency)
 
     def sensor_response(self, frequency: Any, speed: float) -> Any:
-        """Return what is sensed, as friction, per friction (complex) at `frequency` (Hz), finger at `speed` (m/s)."""
+        """Sensed friction per friction (complex) at `frequency` (Hz), finger at `speed` (m/s)."""
         if self.sensor == "tribometer":
             return self.tribometer_response(frequency)
         return self.sensed_response(frequency, speed) / self.lag_response(frequency, speed)
 
 
-class ElectroadhesionScreen(TouchedPlant):
+class ElectroadhesionScreen(CompiledPlant):
     """The screen in discrete time, behind the `Plant` protocol.
 
     Parameters
     ----------
     parameters : ElectroadhesionParameters
-        The screen and its levels of modelling.
+        The screen and its level of modelling.
     finger : Finger
         Where the finger is, how hard it presses, and its lateral mechanics.
     seed : int
@@ -257,17 +302,10 @@ class ElectroadhesionScreen(TouchedPlant):
     compensation : SquareRoot, optional
         Makes the drive an attraction around its bias (N), by a gain in N/A^2, or N/V^2 where a voltage is driven; by
         default the drive is the peak of the carrier (A or V).
-
-    Attributes
-    ----------
-    skin_velocity : ndarray, shape (n,), m/s
-        Of the skin under friction, against the motion, over the samples of the last run.
-    attraction : ndarray, shape (n,), N
-        Mean over each of those samples.
     """
 
-    delay = block = 1
-    drive_channels = sensed_channels = 1
+    step = screen_step
+    motion_channels = 3
 
     def __init__(
         self,
@@ -276,131 +314,44 @@ class ElectroadhesionScreen(TouchedPlant):
         seed: int = 0,
         compensation: SquareRoot | None = None,
     ) -> None:
-        super().__init__(finger, parameters.rate)
-        self.parameters = parameters
-        self.compensation = compensation
-        self.skin_velocity = self.attraction = np.zeros(0)
-        self._rng = np.random.default_rng(seed)
-        self._tables = screen_tables(parameters, finger, compensation)
-        self._state = screen_state()
-        self._last = np.zeros(1)
+        super().__init__(finger, parameters.rate, seed=seed)
+        self.parameters, self.compensation = parameters, compensation
+        self.noise_channels = 1 + 2 * parameters.oversampling if parameters.sensor == "impedance" else 1
+        self.state = screen_record(parameters, finger, compensation)
 
-    def _next(self, n: int) -> tuple[Array, Array, Array]:
-        """Finger rows, noise and sample flags of the next n samples."""
-        finger = finger_rows(self.finger, self._samples, n, self.rate)
-        self._samples += n
-        width = 1 + 2 * self.parameters.oversampling if self._tables.sensing else 1
-        return finger, self._rng.standard_normal((n, width)), np.zeros(n, np.int64)
+    @property
+    def skin_velocity(self) -> Array:
+        """Velocity of the skin under friction (m/s, shape (n,)), against the motion, over the last run."""
+        return self.motion[:, SKIN_VELOCITY]
 
-    def run(self, drive: Array) -> Sensed:
-        """Advance by n samples under `drive` (shape (n, 1)); row i acts from sample i on, sensed at its start."""
-        n = len(drive)
-        finger, noise, flags = self._next(n)
-        sensed, motion, felt = np.zeros((n, 1)), np.zeros((n, 1)), np.zeros((n, 2))
-        drive = np.ascontiguousarray(drive, float)
-        screen_run(self._tables, self._state, drive, finger, noise, sensed, motion, felt, flags)
-        self.skin_velocity, self.attraction = felt.T
-        return Sensed(sensed, finger[:, POSITION], motion, finger[:, LOAD], flags)
-
-    def closed_loop(self, controller: Controller, wanted: Array) -> tuple[Array, Array, Array, Sensed]:
-        """Advance screen and controller together, sample by sample, over `wanted` (N, shape (n,))."""
-        n = len(wanted)
-        finger, noise, flags = self._next(n)
-        sensed, motion, drive = (np.zeros((n, 1)) for _ in range(3))
-        felt = np.zeros((n, 2))
-        target = np.zeros((n, controller.n_bands), complex)
-        closed_screen_run(
-            self._tables,
-            self._state,
-            controller.tables,
-            controller.state,
-            self._last,
-            finger,
-            noise,
-            wanted,
-            sensed,
-            motion,
-            felt,
-            drive,
-            target,
-            flags,
-        )
-        self.skin_velocity, self.attraction = felt.T
-        return drive, target, flags, Sensed(sensed, finger[:, POSITION], motion, finger[:, LOAD], flags)
+    @property
+    def attraction(self) -> Array:
+        """Mean attraction in each sample of the last run (N, shape (n,))."""
+        return self.motion[:, ATTRACTION]
 
 
-def finger_rows(finger: Finger, first: int, n: int, rate: float) -> Array:
-    """Position (m), load (N), strength and speed (m/s) of samples `first` to `first` + n - 1, shape (n, 4).
-
-    The speed over a sample is the way to the next one; a finger that is lifted there keeps that of the sample before,
-    one that touches for a single sample rests.  NaN while lifted, as a finger without load is.
-    """
-    touch = finger.touch(np.arange(max(first - 1, 0), first + n + 1) / rate)
-    touch[~(touch[:, 1] > 0.0), 0] = np.nan
-    way = rate * np.diff(touch[:, 0])
-    if first == 0:
-        way = np.r_[np.nan, way]
-    rows = np.empty((n, 4))
-    rows[:, :SPEED] = touch[-n - 1 : -1]
-    after, before = way[1:], way[:-1]
-    speed = np.where(np.isfinite(after), after, np.where(np.isfinite(before), before, 0.0))
-    rows[:, SPEED] = np.where(np.isfinite(rows[:, POSITION]), speed, np.nan)
-    return rows
-
-
-def screen_state() -> ScreenState:
-    """A screen at rest, the carrier at its crest."""
-    return ScreenState(np.zeros(3), np.zeros(1), np.zeros(3), np.zeros(6), gap_state(), sliding_state())
-
-
-def screen_tables(
-    parameters: ElectroadhesionParameters, finger: Finger, compensation: SquareRoot | None
-) -> ScreenTables:
-    """Numbers of the compiled screen with this finger on it."""
-    p = parameters
-    substep = 1.0 / (p.rate * p.oversampling)
-    series = p.series_impedance
-    return ScreenTables(
+def screen_record(parameters: ElectroadhesionParameters, finger: Finger, compensation: SquareRoot | None) -> Array:
+    """Return the record (`SCREEN`, shape (1,)) of a screen at rest with this finger on it."""
+    p, substep = parameters, 1.0 / (parameters.rate * parameters.oversampling)
+    turn, corneum = np.exp(1j * p.omega * substep), p.corneum_resistance * p.corneum_capacitance
+    elements = [element.py_func(tau, substep, p.omega, turn) for tau in (BLOCKING, corneum, corneum)]
+    return new_record(
+        SCREEN,
+        p,
+        compensation,
         carrier=p.level == "carrier",
         voltage=p.drive_kind == "voltage",
         sensing=p.sensor == "impedance",
         compensated=compensation is not None,
-        compensation=SquareRootTables(0.0, 0.0, 1.0, False) if compensation is None else compensation.tables,
-        substeps=int(p.oversampling),
         substep=substep,
-        omega=p.omega,
-        turn=_turn(p.omega * substep),
-        skew=_turn(p.omega * p.skew),
-        turns=float(p.carrier_frequency / p.rate),
-        current_limit=float(p.current_limit),
-        voltage_limit=float(p.voltage_limit),
-        offset=float(p.current_offset),
-        servo=float(p.servo_conductance),
-        insulator=_element(p, substep, BLOCKING),
-        corneum=_element(p, substep, p.corneum_resistance * p.corneum_capacitance),
-        capacitance=(float(p.insulator_capacitance), float(p.corneum_capacitance)),
-        series=(series.real, series.imag),
-        body=float(p.body_resistance),
-        gap=float(p.gap_thickness),
-        gap_resistance=float(p.gap_resistance),
-        gap_short=float(p.gap_short),
-        ripple=float(p.ripple),
+        turn=turn,
+        skew=np.exp(-1j * p.omega * p.skew),
         wavenumber=2 * math.pi / p.ripple_wavelength,
-        kappa=float(p.unevenness),
-        area=float(p.area(1.0)),
-        exponent=float(p.area_exponent),
-        voltage_noise=float(p.voltage_noise),
-        current_noise=float(p.current_noise),
-        friction=float(p.friction_coefficient),
-        estimator=p.estimator.tables,
-        sliding=sliding_tables(p, finger.mechanics),
+        area=p.area(1.0),
+        capacitance=(p.insulator_capacitance, p.corneum_capacitance, VACUUM / p.gap_thickness),
+        retention=[each[0] for each in elements],
+        alternating=[each[1] for each in elements],
+        direct=[each[2] for each in elements],
+        gap=p.estimator.start()[0],
+        sliding=sliding_record(p, finger.mechanics)[0],
     )
-
-
-def _turn(angle: float) -> tuple[float, float]:
-    return math.cos(angle), math.sin(angle)
-
-
-def _element(parameters: ElectroadhesionParameters, substep: float, tau: float) -> Element:
-    """What a substep does to a capacitor that leaks with the time constant `tau` (s)."""
-    return element.py_func(tau, substep, parameters.omega, _turn(parameters.omega * substep))

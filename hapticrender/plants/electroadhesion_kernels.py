@@ -1,93 +1,77 @@
-"""Compiled screen with a finger on it: the circuit at the carrier, or its envelope, and friction behind it.
+"""Compiled electroadhesive screen with a finger on it: the circuit at the carrier, or its envelope, and friction.
 
 Charges q_k of the insulator, the stratum corneum and the gap obey q' = i - q/tau with tau = R C, which does not depend
 on the contact area.  Over a substep h the current is I cos(theta + w u) plus a direct part, and exactly::
 
     q+ = a q + I Re(e^{j theta} (e^{j w h} - a)/(j w + 1/tau)) + i_dc tau (1 - a),  a = e^{-h/tau}
+
+The carrier turns a whole number of times in a sample, so every sample starts at theta = 0.
 """
 
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
 
-from hapticrender.compiled.jit import kernel, simulation
-from hapticrender.control.gap import VACUUM, GapState, GapTables, gap_step
-from hapticrender.control.square_root import SquareRootTables, square_root_step
-from hapticrender.plants.closed import control_step
-from hapticrender.plants.sliding import SlidingState, SlidingTables, sliding_step
-from hapticrender.protocols import Array
+import numba
+import numpy as np
 
-SATURATED, SENSOR_CLIPPED, OPEN_LOOP = 1, 4, 16  # Flag
-HUGE = 1e300  # a drive beyond it is no number
-POSITION, LOAD, STRENGTH, SPEED = range(4)  # columns of the finger
-SERVO, FORCE, UNSENSED = range(3)  # entries of ScreenState.held
-Element = tuple[float, float, float, float]  # a; real and imaginary gain of the carrier; gain of a direct current (s)
+from hapticrender.jit import F8, I8, SIGNALS_T, kernel, pointer, step
+from hapticrender.plants.compiled import HUGE, LOAD, POSITION, SENSOR_CLIPPED, SPEED, STRENGTH
+from hapticrender.plants.contact import SLIDING, sliding_step
+from hapticrender.plants.gap import GAP, VACUUM, gap_step
+from hapticrender.protocols import Flag
 
+SATURATED, OPEN_LOOP = int(Flag.SATURATED), int(Flag.OPEN_LOOP)
+FRICTION, SKIN_VELOCITY, ATTRACTION = range(3)  # columns of `motion`
+INPUTS = 4  # columns of the inputs
 
-class ScreenTables(NamedTuple):
-    """Numbers of the compiled screen."""
-
-    carrier: bool  # level: every substep of the carrier, else its envelope
-    voltage: bool  # the drive is a voltage
-    sensing: bool  # the sensor is the gap's impedance, else the tribometer
-    compensated: bool
-    compensation: SquareRootTables
-    substeps: int
-    substep: float  # h, s
-    omega: float  # w, rad/s
-    turn: tuple[float, float]  # cosine and sine of w h
-    skew: tuple[float, float]  # cosine and sine of w times what the current's channel is late
-    turns: float  # of the carrier in a sample
-    current_limit: float  # A
-    voltage_limit: float  # V
-    offset: float  # A
-    servo: float  # S
-    insulator: Element
-    corneum: Element
-    capacitance: tuple[float, float]  # of insulator and stratum corneum, F/m2
-    series: tuple[float, float]  # impedance of the two, ohm m2
-    body: float  # ohm
-    gap: float  # m
-    gap_resistance: float  # ohm m2
-    gap_short: float  # ohm m2
-    ripple: float
-    wavenumber: float  # of the ripple, rad/m
-    kappa: float
-    area: float  # m2 at 1 N
-    exponent: float
-    voltage_noise: float  # V rms
-    current_noise: float  # A rms
-    friction: float  # mu
-    estimator: GapTables
-    sliding: SlidingTables
-
-
-class ScreenState(NamedTuple):
-    """State of the screen; changed in place."""
-
-    charge: Array  # (3,) C: insulator, stratum corneum, gap
-    carrier: Array  # (1,) phase in turns
-    held: Array  # (3,) current of the servo (A); attraction sensed (N) and whether it is a guess, for the next sample
-    sums: Array  # (6,) over a sample: q^2, voltage, V re im, I re im
-    estimator: GapState
-    sliding: SlidingState
+FLAGS = ("carrier", "voltage", "sensing", "compensated", "straight")  # level, kind of drive, sensor, square root
+NUMBERS = (  # named as in `ElectroadhesionParameters` and `SquareRoot`
+    *("bias", "floor", "gain", "omega", "current_limit", "voltage_limit", "current_offset", "servo_conductance"),
+    *("stray_capacitance", "body_resistance", "gap_thickness", "gap_resistance", "gap_short", "ripple", "unevenness"),
+    *("area_exponent", "voltage_noise", "current_noise", "friction_coefficient"),
+)
+SCREEN = np.dtype(
+    [(name, "i8") for name in (*FLAGS, "oversampling")]
+    + [(name, "f8") for name in NUMBERS]
+    + [
+        ("series_impedance", "c16"),  # ohm m2
+        ("wavenumber", "f8"),  # of the ripple, rad/m
+        ("area", "f8"),  # m2 at 1 N
+        ("substep", "f8"),  # h, s
+        ("turn", "c16"),  # e^{j w h}
+        ("skew", "c16"),  # e^{-j w skew}: delay of the current's channel
+        ("capacitance", "f8", (3,)),  # F/m2 of insulator, stratum corneum, gap (set sample by sample)
+        ("retention", "f8", (3,)),  # a of their charges in a substep
+        ("alternating", "c16", (3,)),  # (e^{j w h} - a)/(j w + 1/tau), s
+        ("direct", "f8", (3,)),  # tau (1 - a), s
+        ("charge", "f8", (3,)),  # state: C
+        ("envelopes", "c16", (2,)),  # state: V and A of the last sample
+        ("bleed", "f8"),  # state: current of the servo, A
+        ("reading", "f8"),  # state: estimated attraction (N), output at the next sample
+        ("open_loop", "i8"),  # state: whether it is the nominal one
+        ("gap", GAP),
+        ("sliding", SLIDING),
+    ],
+    align=True,
+)
+SCREEN_T = numba.from_dtype(SCREEN)
 
 
 @kernel
 def element(tau, substep, omega, turn):
-    """What a substep does to the charge of a leaky capacitor."""
-    kept = math.exp(-substep / tau)
-    re, im = turn[0] - kept, turn[1]
-    share = tau / (1.0 + (omega * tau) ** 2)
-    lag = omega * tau
-    return kept, share * (re + lag * im), share * (im - lag * re), -tau * math.expm1(-substep / tau)
+    """Share of its charge that an element with the time constant `tau` (s) keeps in a substep, and its gains (s).
+
+    The gains are those of a current at the carrier, whose phase is e^{j theta} at the start, and of a direct one.
+    """
+    a, lag = math.exp(-substep / tau), omega * tau
+    return a, (turn - a) * complex(1.0, -lag) * (tau / (1.0 + lag * lag)), -tau * math.expm1(-substep / tau)
 
 
 @kernel
-def within(start, swing, current, limit):
-    """Share of `current` that keeps the voltage start + current swing inside +-limit."""
-    rise = current * swing
+def within(start, change, current, limit):
+    """Largest part of `current` that keeps the voltage start + current change inside +-limit."""
+    rise = current * change
     if rise > 0.0 and start + rise > limit:
         return current * max(limit - start, 0.0) / rise
     if rise < 0.0 and start + rise < -limit:
@@ -96,169 +80,106 @@ def within(start, swing, current, limit):
 
 
 @kernel
-def gap_leak(tables, gap, resistance):
-    """Leakage factor Lk and the gap's impedance (ohm m2)."""
-    lag = tables.omega * resistance * VACUUM / gap
-    small = 1.0 / (1.0 + lag * lag)
-    return lag * lag * small, resistance * small, -resistance * lag * small
+def substep_pass(s, area, peak, direct, phasor):
+    """Advance the charges by a substep under a current of `peak` and a `direct` part (A), from e^{j theta} = `phasor`.
 
-
-@kernel
-def magnitude(tables, area, gap_re, gap_im):
-    """Modulus of the whole impedance at the carrier (ohm)."""
-    return math.hypot(tables.body + (tables.series[0] + gap_re) / area, (tables.series[1] + gap_im) / area)
-
-
-@kernel
-def substep_pass(tables, state, gap, area, envelope, direct, cosine, sine):
-    """One substep of the circuit; returns the voltage at its end and the envelope that the compliance let through."""
-    q, next_cosine = state.charge, cosine * tables.turn[0] - sine * tables.turn[1]
-    elements = (tables.insulator, tables.corneum, gap[0])
-    capacitance = (area * tables.capacitance[0], area * tables.capacitance[1], area * gap[1])
-    present = later = tables.body * direct
-    swing = tables.body * next_cosine
-    for k in range(3):
-        kept, re, im, rise = elements[k]
-        present += q[k] / capacitance[k]
-        later += (kept * q[k] + direct * rise) / capacitance[k]
-        swing += (re * cosine - im * sine) / capacitance[k]
-    envelope = within(present, tables.body * cosine, envelope, tables.voltage_limit)
-    envelope = within(later, swing, envelope, tables.voltage_limit)
-    for k in range(3):
-        kept, re, im, rise = elements[k]
-        q[k] = kept * q[k] + envelope * (re * cosine - im * sine) + direct * rise
-    return later + envelope * swing, envelope
-
-
-@kernel
-def listen(tables, sums, voltage, envelope, direct, carrier, noise, k):
-    """Add a substep's voltage and current, as their channels show them, to their envelopes."""
-    cosine, sine = carrier
-    late = cosine * tables.skew[0] + sine * tables.skew[1]
-    current = envelope * late + direct + tables.current_noise * noise[2 + 2 * k]
-    voltage += tables.voltage_noise * noise[1 + 2 * k]
-    sums[2] += voltage * cosine
-    sums[3] -= voltage * sine
-    sums[4] += current * cosine
-    sums[5] -= current * sine
-
-
-@kernel
-def carrier_pass(tables, state, gap, area, envelope, speed, noise):
-    """A sample of the carrier: mean attraction (N) and flags; the servo and the estimator learn from it."""
-    sums, held = state.sums, state.held
-    flags, direct = 0, tables.offset + held[SERVO]
-    angle = 2.0 * math.pi * state.carrier[0]
-    cosine, sine = math.cos(angle), math.sin(angle)
-    for i in range(6):
-        sums[i] = 0.0
-    for k in range(tables.substeps):
-        voltage, passed = substep_pass(tables, state, gap, area, envelope, direct, cosine, sine)
-        if passed != envelope:
-            flags = SATURATED
-        cosine, sine = (
-            cosine * tables.turn[0] - sine * tables.turn[1],
-            sine * tables.turn[0] + cosine * tables.turn[1],
-        )
-        sums[0] += state.charge[2] * state.charge[2]
-        sums[1] += voltage
-        if tables.sensing:
-            listen(tables, sums, voltage, passed, direct, (cosine, sine), noise, k)
-    turns = state.carrier[0] + tables.turns
-    state.carrier[0] = turns - math.floor(turns)
-    held[SERVO] = -tables.servo * sums[1] / tables.substeps
-    if tables.sensing:
-        share = 2.0 / tables.substeps
-        held[FORCE], guessed = gap_step(
-            tables.estimator, state.estimator, share * sums[2], share * sums[3], share * sums[4], share * sums[5], speed
-        )
-        held[UNSENSED] = 1.0 if guessed else 0.0
-    return tables.kappa * sums[0] / (tables.substeps * 2.0 * VACUUM * area), flags
-
-
-@kernel
-def lift(tables, state, envelope):
-    """Let a finger go: no charge, no voltage; the source's own word for the current is all that there is to sense."""
-    held = state.held
-    for k in range(3):
-        state.charge[k] = 0.0
-    held[SERVO] = 0.0
-    turns = state.carrier[0] + tables.turns
-    state.carrier[0] = turns - math.floor(turns)
-    if tables.sensing:
-        current = 0.0 if tables.voltage else envelope
-        held[FORCE], _ = gap_step(tables.estimator, state.estimator, 0.0, 0.0, current, 0.0, math.nan)
-        held[UNSENSED] = 1.0
-
-
-@kernel
-def asked(tables, drive):
-    """Drive inside its limit, as an envelope in its own unit, and flags."""
-    drive = drive if abs(drive) < HUGE else 0.0
-    envelope = square_root_step(tables.compensation, drive) if tables.compensated else drive
-    limit = tables.voltage_limit if tables.voltage else tables.current_limit
-    return min(max(envelope, -limit), limit), SATURATED if abs(envelope) > limit else 0
-
-
-@kernel
-def attract(tables, state, drive, finger, noise):
-    """Mean attraction (N) over a sample, and flags."""
-    load, speed = finger[LOAD], finger[SPEED]
-    envelope, flags = asked(tables, drive)
-    if math.isnan(speed) or load <= 0.0:
-        lift(tables, state, envelope)
-        return 0.0, 0
-    area = tables.area * load**tables.exponent
-    thickness = tables.gap * (1.0 + tables.ripple * math.cos(tables.wavenumber * finger[POSITION]))
-    resistance = tables.gap_short if abs(speed) < tables.sliding.least_speed else tables.gap_resistance
-    leak, gap_re, gap_im = gap_leak(tables, thickness, resistance)
-    impedance = magnitude(tables, area, gap_re, gap_im)
-    if tables.voltage:
-        envelope /= impedance
-    if tables.carrier:
-        part = element(resistance * VACUUM / thickness, tables.substep, tables.omega, tables.turn)
-        force, cut = carrier_pass(tables, state, (part, VACUUM / thickness), area, envelope, speed, noise)
-        return force, flags | cut
-    passed = within(0.0, impedance, envelope, tables.voltage_limit)
-    force = tables.kappa * passed * passed * leak / (4.0 * tables.omega * tables.omega * VACUUM * area)
-    return force, flags | (SATURATED if passed != envelope else 0)
-
-
-@kernel
-def screen_step(tables, state, drive, finger, noise, sensed, motion, felt):
-    """What is sensed at the start of a sample, which then passes under `drive`; returns flags.
-
-    `felt` is the skin velocity (m/s) at the start and the attraction (N) over the sample.
+    Returns the voltage (V) at its end and the peak that the source's compliance leaves.
     """
-    held = state.held
-    reading, flags = held[FORCE], OPEN_LOOP if held[UNSENSED] > 0.0 else 0
-    attraction, cut = attract(tables, state, drive, finger, noise)
-    steady = tables.friction * (finger[LOAD] + attraction)
-    friction, shown, skin_velocity = sliding_step(tables.sliding, state.sliding, steady, finger[SPEED], noise[0])
-    motion[0] = friction
-    felt[0] = skin_velocity / finger[STRENGTH] if finger[STRENGTH] > 0.0 else 0.0
-    felt[1] = attraction
-    if not tables.sensing:
-        reading = shown
-        if abs(shown) >= tables.sliding.force_range:
-            flags |= SENSOR_CLIPPED
-    sensed[0] = reading
-    return flags | cut
+    q = s.charge
+    start = end = s.body_resistance * direct
+    at_start, at_end = s.body_resistance * phasor.real, s.body_resistance * (phasor * s.turn).real
+    for k in range(3):
+        inverse = 1.0 / (area * s.capacitance[k])
+        start += q[k] * inverse
+        end += (s.retention[k] * q[k] + s.direct[k] * direct) * inverse
+        at_end += (s.alternating[k] * phasor).real * inverse
+    peak = within(start, at_start, peak, s.voltage_limit)
+    peak = within(end, at_end, peak, s.voltage_limit)
+    for k in range(3):
+        q[k] = s.retention[k] * q[k] + (s.alternating[k] * phasor).real * peak + s.direct[k] * direct
+    return end + at_end * peak, peak
 
 
-@simulation
-def screen_run(tables, state, drive, finger, noise, sensed, motion, felt, flags):
-    """A block of the screen alone; columns of `finger` are position, load, strength, speed."""
-    for n in range(drive.shape[0]):
-        flags[n] = screen_step(tables, state, drive[n, 0], finger[n], noise[n], sensed[n], motion[n], felt[n])
+@kernel
+def carrier_pass(s, area, peak, source, noise):
+    """Advance the circuit by a sample of the carrier; return the mean attraction (N) and flags.
+
+    `source` is the current that the current's channel shows per current through the finger.
+    """
+    flags, direct, phasor = 0, s.current_offset + s.bleed, 1.0 + 0.0j
+    squares, total, voltages, currents = 0.0, 0.0, 0j, 0j
+    for k in range(s.oversampling):
+        voltage, passed = substep_pass(s, area, peak, direct, phasor)
+        if passed != peak:
+            flags = SATURATED
+        phasor *= s.turn
+        squares += s.charge[2] * s.charge[2]
+        total += voltage
+        if s.sensing:
+            current = passed * (source * phasor).real + direct + s.current_noise * noise[2 + 2 * k]
+            voltages += (voltage + s.voltage_noise * noise[1 + 2 * k]) * phasor.conjugate()
+            currents += current * phasor.conjugate()
+    share = 1.0 / s.oversampling
+    s.bleed = -s.servo_conductance * total * share
+    s.envelopes[0], s.envelopes[1] = 2.0 * share * voltages, 2.0 * share * currents
+    return s.unevenness * squares * share / (2.0 * VACUUM * area), flags
 
 
-@simulation
-def closed_screen_run(
-    tables, state, control, control_state, last, finger, noise, wanted, sensed, motion, felt, drive, target, flags
-):
-    """Screen and controller closed sample by sample; `last` (1,) is the drive computed one sample ago."""
-    for n in range(sensed.shape[0]):
-        drive[n, 0] = last[0]
-        flags[n] = screen_step(tables, state, last[0], finger[n], noise[n], sensed[n], motion[n], felt[n])
-        flags[n] |= control_step(control, control_state, sensed[n], finger[n, POSITION], wanted[n], last, target[n])
+@kernel
+def attract(s, drive, x, noise):
+    """Mean attraction (N) over a sample under `drive`, and flags; `x` is a row of inputs."""
+    load, speed = x[LOAD], x[SPEED]
+    peak = drive if abs(drive) < HUGE else 0.0
+    if s.compensated:
+        force = max(s.bias + peak, s.floor)
+        peak = force / math.sqrt(2.0 * s.bias * s.gain) if s.straight else math.sqrt(force / s.gain)
+    limit = s.voltage_limit if s.voltage else s.current_limit
+    flags = SATURATED if abs(peak) > limit else 0
+    peak = min(max(peak, -limit), limit)
+    if math.isnan(speed):  # lifted: no charge is left, and only the source's current can be measured
+        s.charge[0] = s.charge[1] = s.charge[2] = s.bleed = 0.0
+        s.envelopes[0], s.envelopes[1] = 0j, complex(0.0 if s.voltage else peak, 0.0)
+        return 0.0, 0
+    area = s.area * load**s.area_exponent
+    thickness = s.gap_thickness * (1.0 + s.ripple * math.cos(s.wavenumber * x[POSITION]))
+    resistance = s.gap_short if abs(speed) < s.sliding.least_speed else s.gap_resistance
+    lag = s.omega * resistance * VACUUM / thickness
+    gap = complex(1.0, -lag) * (resistance / (1.0 + lag * lag))  # ohm m2
+    impedance = s.body_resistance + (s.series_impedance + gap) * (1.0 / area)
+    source = (
+        1.0 + complex(0.0, s.omega * s.stray_capacitance) * impedance
+    )  # current of the source per current of the finger
+    peak /= abs(impedance) if s.voltage else abs(source)
+    if s.carrier:
+        s.capacitance[2] = VACUUM / thickness
+        tau = resistance * VACUUM / thickness
+        s.retention[2], s.alternating[2], s.direct[2] = element(tau, s.substep, s.omega, s.turn)
+        force, cut = carrier_pass(s, area, peak, source * s.skew, noise)
+        return force, flags | cut
+    passed = within(0.0, abs(impedance), peak, s.voltage_limit)
+    force = s.unevenness * passed * passed * (lag * lag / (1.0 + lag * lag)) / (4.0 * s.omega * s.omega * VACUUM * area)
+    return force, flags | (SATURATED if passed != peak else 0)
+
+
+@step
+def screen_step(state, signals, start, count):
+    """Advance the screen by `count` samples; see `hapticrender.jit`."""
+    s = numba.carray(pointer(state, SCREEN_T), 1)[0]
+    io = numba.carray(pointer(signals, SIGNALS_T), 1)[0]
+    end, channels = start + count, 1 + 2 * s.oversampling if s.sensing else 1
+    drive, inputs = numba.carray(pointer(io.drive, F8), end), numba.carray(pointer(io.inputs, F8), (end, INPUTS))
+    noise, sensed = numba.carray(pointer(io.noise, F8), (end, channels)), numba.carray(pointer(io.sensed, F8), end)
+    motion, flags = numba.carray(pointer(io.motion, F8), (end, 3)), numba.carray(pointer(io.flags, I8), end)
+    for n in range(start, end):
+        x, reading, raised = inputs[n], s.reading, OPEN_LOOP if s.open_loop else 0
+        attraction, cut = attract(s, drive[n], x, noise[n])
+        if s.sensing:
+            s.reading, s.open_loop = gap_step(s.gap, s.envelopes[0], s.envelopes[1], x[SPEED])
+        steady = s.friction_coefficient * (x[LOAD] + attraction)
+        friction, measured, skin_velocity = sliding_step(s.sliding, steady, x[SPEED], noise[n, 0])
+        if not s.sensing:
+            reading, raised = measured, SENSOR_CLIPPED if abs(measured) >= s.sliding.force_range else 0
+        sensed[n], flags[n] = reading, raised | cut
+        motion[n, FRICTION], motion[n, ATTRACTION] = friction, attraction
+        motion[n, SKIN_VELOCITY] = skin_velocity / x[STRENGTH] if x[STRENGTH] > 0.0 else 0.0
+    return 0

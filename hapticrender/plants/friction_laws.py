@@ -1,67 +1,65 @@
-"""How much of its friction a finger keeps on a surface that vibrates at ultrasonic frequency: three laws.
+"""Friction of a finger on a surface that vibrates at ultrasonic frequency, as a function of amplitude: three laws.
 
 mu/mu0 as a function of the amplitude a (m, peak) of the surface, the normal load W (N) and the sliding speed v (m/s):
 
 * `FitLaw`: ``r + (1 - r) exp(-(a/a0)^p)``, whatever the load and the speed.
-* `LoadSharing`: asperities and a squeeze film of mean gap u carry the load together,
+* `LoadSharing`: asperities and a squeeze film of mean gap u share the load,
   ``W/A = pc exp(-u/u0) + 1.25 p0 (a/u)^2`` and ``mu/mu0 = pc exp(-u/u0) A/W``: loses authority with load.
 * `IntermittentContact`: the skin bounces, ``exp(-c mu0 a f/v)``: depends on speed, not on load.
 
-The literature does not agree on one of them, so the law is a parameter.  Inside kernels a law is its `LawNumbers`.
+The literature does not agree on one of them, so the law is a parameter.  Inside kernels a law is a record of `LAW`.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any, NamedTuple, Protocol
+from typing import Any
 
 import numpy as np
 
-from hapticrender.compiled.jit import kernel
-from hapticrender.plants.bounds import Validated, number
+from hapticrender.checks import Validated, parameter
+from hapticrender.jit import kernel
 from hapticrender.protocols import Array
 
 FIT, FILM, BOUNCE = 0, 1, 2  # kinds of law
-LEAST_SHARE = 1e-6  # of the friction that amplitude can take away: less is never asked for, as laws end in exp(-...)
-SETTLED = 1e-15  # relative step at which Newton's iteration ends
+LEAST_SHARE = 1e-6  # of the friction that amplitude can remove: the least that is asked for, as laws end in exp(-...)
+CONVERGED = 1e-15  # relative step at which Newton's iteration ends
 
-
-class LawNumbers(NamedTuple):
-    """A law as kernels take it; what a kind does not use is 1 (0 for `floor`)."""
-
-    kind: int
-    floor: float  # r
-    scale: float  # a0 or u0, m; 1/(c mu0 f), s
-    exponent: float  # p
-    contact: float  # pc A, N
-    film: float  # 1.25 p0 A, N
+LAW = np.dtype(
+    [
+        ("kind", "i8"),
+        ("floor", "f8"),  # r
+        ("scale", "f8"),  # a0 or u0, m; 1/(c mu0 f), s
+        ("exponent", "f8"),  # p
+        ("contact", "f8"),  # pc A, N
+        ("film", "f8"),  # 1.25 p0 A, N
+    ],
+    align=True,
+)
+"""A law as kernels take it; what a kind does not use is 1 (0 for `floor`)."""
 
 
 @kernel
-def film_fall(flat, lift):
-    """Fall y = -ln(mu/mu0): the root of ``e^-y + lift/(flat + y)^2 = 1``, the gap being ``flat + y`` in u0.
+def _film_exponent(gap_0, lift):
+    """Y = -ln(mu/mu0) on a squeeze film: the root of ``e^-y + lift/(gap_0 + y)^2 = 1``, the gap being gap_0 + y in u0.
 
     The left side is convex and falls, so Newton's steps from where the film alone would carry all never pass the root.
     """
-    fall = math.sqrt(lift) - flat
-    if not fall > 0.0:
-        fall = 0.0
+    y = max(math.sqrt(lift) - gap_0, 0.0)
     for _ in range(50):
-        gap = flat + fall
+        gap = gap_0 + y
         film = lift / (gap * gap)
-        excess = math.expm1(-fall) + film
-        step = excess / (math.exp(-fall) + 2.0 * film / gap)
-        if not step > SETTLED * gap:
+        step = (math.expm1(-y) + film) / (math.exp(-y) + 2.0 * film / gap)
+        if not step > CONVERGED * gap:
             break
-        fall += step
-    return fall
+        y += step
+    return y
 
 
 @kernel
-def friction_ratio(law_numbers, amplitude, load, speed):
+def friction_ratio(law, amplitude, load, speed):
     """mu/mu0 at an `amplitude` (m); 1 without load on a film, or beyond what its asperities carry."""
-    law = law_numbers
     if amplitude <= 0.0:
         return 1.0
     if law.kind == FIT:
@@ -71,68 +69,58 @@ def friction_ratio(law_numbers, amplitude, load, speed):
     if not 0.0 < load < law.contact:
         return 1.0
     gap = amplitude / law.scale
-    return math.exp(-film_fall(math.log(law.contact / load), law.film / load * gap * gap))
+    return math.exp(-_film_exponent(math.log(law.contact / load), law.film / load * gap * gap))
 
 
 @kernel
-def wanted_amplitude(law_numbers, ratio, load, speed):
-    """Amplitude (m) that leaves `ratio` of the friction; beyond what a law reaches, the nearest; NaN asks for 0."""
-    law = law_numbers
+def reference_amplitude(law, ratio, load, speed):
+    """Amplitude (m) that leaves `ratio` of the friction: the nearest that a law reaches; 0 for NaN."""
     share = (ratio - law.floor) / (1.0 - law.floor)
     if not share < 1.0:
         return 0.0
-    fall = -math.log(share if share > LEAST_SHARE else LEAST_SHARE)
+    y = -math.log(max(share, LEAST_SHARE))
     if law.kind == FIT:
-        return law.scale * fall ** (1.0 / law.exponent)
+        return law.scale * y ** (1.0 / law.exponent)
     if law.kind == BOUNCE:
-        return law.scale * abs(speed) * fall
+        return law.scale * abs(speed) * y
     if not 0.0 < load < law.contact:
         return 0.0
-    gap = math.log(law.contact / load) + fall
-    return law.scale * gap * math.sqrt(-math.expm1(-fall) * load / law.film)
+    gap = math.log(law.contact / load) + y
+    return law.scale * gap * math.sqrt(-math.expm1(-y) * load / law.film)
 
 
 @kernel
-def friction_ratios(law_numbers, amplitude, load, speed, ratio):
-    """`friction_ratio` for every element of flat arrays."""
+def friction_ratios(law, amplitude, load, speed, ratio):
+    """`friction_ratio` for every element of flat arrays, into `ratio`."""
     for n in range(ratio.size):
-        ratio[n] = friction_ratio(law_numbers, amplitude[n], load[n], speed[n])
+        ratio[n] = friction_ratio(law, amplitude[n], load[n], speed[n])
 
 
 @kernel
-def wanted_amplitudes(law_numbers, ratio, load, speed, amplitude):
-    """`wanted_amplitude` for every element of flat arrays."""
+def reference_amplitudes(law, ratio, load, speed, amplitude):
+    """`reference_amplitude` for every element of flat arrays, into `amplitude`."""
     for n in range(ratio.size):
-        amplitude[n] = wanted_amplitude(law_numbers, ratio[n], load[n], speed[n])
+        amplitude[n] = reference_amplitude(law, ratio[n], load[n], speed[n])
 
 
-class FrictionLaw(Protocol):
-    """What a law of friction reduction offers."""
-
-    @property
-    def numbers(self) -> LawNumbers:
-        """The law as kernels take it."""
-        ...
-
-    def ratio(self, amplitude: Any, load: Any, speed: Any) -> Array:
-        """mu/mu0, from 0 to 1, at an amplitude (m), normal load (N) and sliding speed (m/s)."""
-        ...
-
-    def amplitude(self, ratio: Any, load: Any, speed: Any) -> Array:
-        """Amplitude (m) that leaves `ratio` of the friction."""
-        ...
+wanted_amplitudes = reference_amplitudes  # removed when all import the new name
 
 
-class _Law(Validated):
-    """Checks and broadcasts for the kernels above; laws add their numbers."""
+class FrictionLaw(Validated):
+    """Base of the laws: checks arguments and broadcasts them over the kernels; a law adds its values."""
 
-    _heaviest = math.inf  # N: a law holds below this load
+    floor = 0.0
+    _heaviest = math.inf  # N: a law holds up to this load
     _unloaded = True  # whether a law holds without load
 
-    @property
-    def numbers(self) -> LawNumbers:
-        """The law as kernels take it."""
+    def _values(self) -> tuple[float, ...]:
+        """Values of the fields of `LAW`."""
         raise NotImplementedError
+
+    @property
+    def numbers(self) -> Any:
+        """The law as kernels take it: a record of `LAW`."""
+        return np.array(self._values(), LAW)[()]
 
     def ratio(self, amplitude: Any, load: Any, speed: Any) -> Array:
         """mu/mu0 at an `amplitude` (m, >= 0), a normal `load` (N) and a sliding `speed` (m/s, its sign ignored)."""
@@ -141,8 +129,8 @@ class _Law(Validated):
 
     def amplitude(self, ratio: Any, load: Any, speed: Any) -> Array:
         """Amplitude (m) that leaves `ratio` of the friction, which must be in the law's reach, at most 1."""
-        least = self.numbers.floor + LEAST_SHARE * (1.0 - self.numbers.floor)
-        return self._each(wanted_amplitudes, _checked("ratio", ratio, least, 1.0), load, speed)
+        least = self.floor + LEAST_SHARE * (1.0 - self.floor)
+        return self._each(reference_amplitudes, _checked("ratio", ratio, least, 1.0), load, speed)
 
     def _each(self, kernel_of_arrays: Any, first: Array, load: Any, speed: Any) -> Array:
         load = _checked("load", load, 0.0, self._heaviest, "N")
@@ -156,7 +144,7 @@ class _Law(Validated):
 
 
 @dataclass(frozen=True, kw_only=True)
-class FitLaw(_Law):
+class FitLaw(FrictionLaw):
     """mu/mu0 = floor + (1 - floor) exp(-(a/scale)^exponent).
 
     Parameters
@@ -170,8 +158,7 @@ class FitLaw(_Law):
 
     Notes
     -----
-    Engineering defaults for 30 kHz and 0.5 N; the spread over devices is that of the ranges.  With p from 1.5 to 2
-    the law mimics `LoadSharing` at 0.5 to 1 N down to the floor.
+    Engineering defaults for 30 kHz and 0.5 N.  With p from 1.5 to 2 the law is close to `LoadSharing` at 0.5 to 1 N.
 
     Examples
     --------
@@ -179,26 +166,24 @@ class FitLaw(_Law):
     [1.0, 0.48, 0.11]
     """
 
-    floor: float = number(0.10, most=0.999)
-    scale: float = number(1.1e-6, "m", above=0.0)
-    exponent: float = number(1.5, above=0.0)
+    floor: float = parameter(0.10, most=0.999)
+    scale: float = parameter(1.1e-6, "m", above=0.0)
+    exponent: float = parameter(1.5, above=0.0)
 
-    @property
-    def numbers(self) -> LawNumbers:
-        """The law as kernels take it."""
-        return LawNumbers(FIT, float(self.floor), float(self.scale), float(self.exponent), 1.0, 1.0)
+    def _values(self) -> tuple[float, ...]:
+        return FIT, self.floor, self.scale, self.exponent, 1.0, 1.0
 
 
 @dataclass(frozen=True, kw_only=True)
-class LoadSharing(_Law):
+class LoadSharing(FrictionLaw):
     """Asperities and a squeeze film carry the load together: W/A = pc exp(-u/u0) + 1.25 p0 (a/u)^2.
 
     Parameters
     ----------
     contact_pressure : float, Pa
-        Of the asperities at no gap, pc; the load must stay below pc A.
+        Of the asperities at zero gap, pc; the load must stay below pc A.
     decay : float, m
-        Gap u0 over which they let go; about the height of their roughness.
+        Gap u0 over which their share falls by 1/e; about the height of their roughness.
     pressure : float, Pa
         Of the air around, p0.
     area : float, m2
@@ -206,34 +191,26 @@ class LoadSharing(_Law):
 
     Notes
     -----
-    Film: Salbu's limit of a large squeeze number; asperities after Wiertlewski et al. 2016 [recalled, not read].
-
-    Examples
-    --------
-    >>> LoadSharing().ratio(1e-6, load=[0.25, 0.5, 1.0], speed=0.05).round(2).tolist()
-    [0.29, 0.45, 0.56]
+    Film: Salbu's limit of a large squeeze number; asperities after Wiertlewski et al. 2016.
     """
 
-    contact_pressure: float = number(200e3, "Pa", above=0.0)
-    decay: float = number(1.5e-6, "m", above=0.0)
-    pressure: float = number(101e3, "Pa", above=0.0)
-    area: float = number(1e-4, "m2", above=0.0)
+    contact_pressure: float = parameter(200e3, "Pa", above=0.0)
+    decay: float = parameter(1.5e-6, "m", above=0.0)
+    pressure: float = parameter(101e3, "Pa", above=0.0)
+    area: float = parameter(1e-4, "m2", above=0.0)
 
     _unloaded = False
 
     @property
     def _heaviest(self) -> float:  # type: ignore[override]
-        return math.nextafter(self.numbers.contact, 0.0)
+        return math.nextafter(self.contact_pressure * self.area, 0.0)
 
-    @property
-    def numbers(self) -> LawNumbers:
-        """The law as kernels take it."""
-        contact, film = self.contact_pressure * self.area, 1.25 * self.pressure * self.area
-        return LawNumbers(FILM, 0.0, float(self.decay), 1.0, float(contact), float(film))
+    def _values(self) -> tuple[float, ...]:
+        return FILM, 0.0, self.decay, 1.0, self.contact_pressure * self.area, 1.25 * self.pressure * self.area
 
 
 @dataclass(frozen=True, kw_only=True)
-class IntermittentContact(_Law):
+class IntermittentContact(FrictionLaw):
     """mu/mu0 = exp(-c mu0 a f/v): a bouncing skin touches for a part of each cycle.
 
     Parameters
@@ -247,26 +224,19 @@ class IntermittentContact(_Law):
 
     Notes
     -----
-    After Vezzoli et al. 2017 [recalled: the form of the group is uncertain].  A finger that stands has no friction
+    After Vezzoli et al. 2017; the form of the group is uncertain.  A finger that stands has no friction
     left at any amplitude > 0, so the law holds while it slides.
-
-    Examples
-    --------
-    >>> IntermittentContact().ratio(1e-6, load=0.5, speed=[0.025, 0.05, 0.1]).round(2).tolist()
-    [0.15, 0.38, 0.62]
     """
 
-    coefficient: float = number(2.0, above=0.0)
-    friction: float = number(0.8, above=0.0)
-    frequency: float = number(30e3, "Hz", above=0.0)
+    coefficient: float = parameter(2.0, above=0.0)
+    friction: float = parameter(0.8, above=0.0)
+    frequency: float = parameter(30e3, "Hz", above=0.0)
 
-    @property
-    def numbers(self) -> LawNumbers:
-        """The law as kernels take it."""
-        return LawNumbers(BOUNCE, 0.0, 1.0 / (self.coefficient * self.friction * self.frequency), 1.0, 1.0, 1.0)
+    def _values(self) -> tuple[float, ...]:
+        return BOUNCE, 0.0, 1.0 / (self.coefficient * self.friction * self.frequency), 1.0, 1.0, 1.0
 
 
-LAWS: dict[str, type[_Law]] = {"fit": FitLaw, "load-sharing": LoadSharing, "intermittent": IntermittentContact}
+LAWS: dict[str, type[FrictionLaw]] = {"fit": FitLaw, "load-sharing": LoadSharing, "intermittent": IntermittentContact}
 
 
 def _checked(name: str, value: Any, least: float, most: float, unit: str = "") -> Array:
@@ -275,6 +245,6 @@ def _checked(name: str, value: Any, least: float, most: float, unit: str = "") -
     wrong = ~(np.isfinite(array) & (array >= least) & (array <= most))
     if wrong.any():
         bounds = [f"{sign} {bound:g}" for sign, bound in ((">=", least), ("<=", most)) if math.isfinite(bound)]
-        told = " and ".join(bounds) or "finite"
-        raise ValueError(f"{name} = {array[wrong].flat[0]:g}: must be {told} {unit}".rstrip())
+        bound = " and ".join(bounds) or "finite"
+        raise ValueError(f"{name} = {array[wrong].flat[0]:g}: must be {bound} {unit}".rstrip())
     return array

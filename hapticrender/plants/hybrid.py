@@ -1,11 +1,11 @@
-"""A screen laminated on a plate: the plate moves the finger, the screen rubs it, and it feels one skin velocity.
+"""A screen laminated on a plate: the plate moves the finger, the screen rubs it, and both add to one skin velocity.
 
 Velocities that feel alike add, in phase [Grigorii et al. 2021]::
 
     v = d/dt (displacement of the glass under the finger) + (v/F) (friction),   v/F = 0.64 m/(N s)
 
-The finger's load bends both: the plate sags under it, and friction grows with it.  Attraction is a force between skin
-and glass: it presses one on the other as much as it pulls, so that the plate feels the load alone, but for the motion
+The finger's load acts on both: the plate sags under it, and friction grows with it.  Attraction is a force between skin
+and glass: it presses one on the other as much as it pulls, so that the plate carries the load alone, but for the motion
 of the gap, which is left out.  Friction acts along the plate and does not move it.  What the plate's own vibration
 makes of the normal force, and so of friction, is left out as well: the match v/F was found by fingers that slid over a
 vibrating plate, so it is part of what a plate's velocity feels like.
@@ -13,44 +13,82 @@ vibrating plate, so it is part of what a plate's velocity feels like.
 
 from __future__ import annotations
 
+import numba
 import numpy as np
+from numba import carray
 
-from hapticrender.control.together import TogetherTables
-from hapticrender.plants.base import TouchedPlant
-from hapticrender.plants.electroadhesion import ElectroadhesionScreen, finger_rows
-from hapticrender.plants.electroadhesion_kernels import LOAD, POSITION
-from hapticrender.plants.hybrid_kernels import (
-    COILS,
-    HybridState,
-    HybridTables,
-    closed_hybrid_run,
-    hybrid_run,
-)
-from hapticrender.plants.vibrotactile import Plate
-from hapticrender.protocols import Array, Controller, Sensed
+from hapticrender.jit import F8, I8, SIGNALS, SIGNALS_T, call, pointer, step
+from hapticrender.plants.compiled import CompiledPlant, aligned_record
+from hapticrender.plants.plate import Plate
+from hapticrender.protocols import Array
 
 PLACES = ("skin",)
+COILS = SENSORS = 2  # channels of the plate, before those of the screen
+VELOCITY = 3  # column of the plate's motion: of the glass under the finger
+
+SCREEN_SIGNALS = SIGNALS.itemsize  # bytes from the plate's record of signals to the screen's
+
+HYBRID = np.dtype(
+    [
+        ("velocity_per_force", "f8"),
+        ("plate", "i8", (2,)),  # addresses of step and state
+        ("screen", "i8", (2,)),
+        ("parts", "i8"),  # address of a `SIGNALS` record of the plate, then of one of the screen
+        ("input_channels", "i8"),
+        ("noise_channels", "i8"),
+        ("plate_motion", "i8"),  # address of a row of the plate's motion
+        ("screen_motion", "i8"),
+    ],
+    align=True,
+)
+HYBRID_T = numba.from_dtype(HYBRID)
 
 
-class HybridPlant(TouchedPlant):
+@step
+def hybrid_step(state, signals, start, count):
+    """Advance plate and screen sample by sample; motion is the skin's velocity (m/s), then each part's share of it."""
+    s = carray(pointer(state, HYBRID_T), 1)[0]
+    io = carray(pointer(signals, SIGNALS_T), 1)[0]
+    parts = carray(pointer(s.parts, SIGNALS_T), 2)
+    plate, screen = parts[0], parts[1]
+    stop = start + count
+    motion = carray(pointer(io.motion, F8), (stop, 3))
+    flags = carray(pointer(io.flags, I8), stop)
+    moved = carray(pointer(s.plate_motion, F8), VELOCITY + 1)
+    friction = carray(pointer(s.screen_motion, F8), 1)
+    for n in range(start, stop):
+        plate.drive = io.drive + 8 * (COILS + 1) * n
+        plate.noise = io.noise + 8 * s.noise_channels * n
+        plate.sensed = io.sensed + 8 * (SENSORS + 1) * n
+        plate.inputs = screen.inputs = io.inputs + 8 * s.input_channels * n
+        plate.flags = screen.flags = io.flags + 8 * n
+        screen.drive = plate.drive + 8 * COILS
+        screen.noise = plate.noise + 8 * SENSORS
+        screen.sensed = plate.sensed + 8 * SENSORS
+        call(s.plate[0], (s.plate[1], s.parts, 0, 1))
+        raised = flags[n]
+        call(s.screen[0], (s.screen[1], s.parts + SCREEN_SIGNALS, 0, 1))
+        flags[n] |= raised
+        motion[n, 1], motion[n, 2] = moved[VELOCITY], s.velocity_per_force * friction[0]
+        motion[n, 0] = motion[n, 1] + motion[n, 2]
+    return 0
+
+
+class HybridPlant(CompiledPlant):
     """Plate and screen in discrete time, behind the `Plant` protocol.
 
     Drive: a current for each coil (A), then the screen's; sensed: both ends of the plate (m), then what the screen
-    senses (N).
+    senses (N); `motion`: the skin's velocity (m/s), then what plate and screen add to it.
 
     Parameters
     ----------
     plate : Plate
         With both coils.
     screen : ElectroadhesionScreen
-        At the same rate, under the same finger.
+        At the same rate, under the same finger; any compiled plant of one drive channel and one sensor, whose motion
+        starts with friction (N), will do.
     velocity_per_force : float, m/(N s)
         Skin velocity that feels as strong as a newton of friction, > 0.
-
-    Attributes
-    ----------
-    felt : ndarray, shape (n, 2), m/s
-        What plate and screen add to the skin's velocity, over the samples of the last run.
 
     Raises
     ------
@@ -58,11 +96,11 @@ class HybridPlant(TouchedPlant):
         Plate and screen differ in rate, delay or finger, or the plate has a single coil.
     """
 
-    closed_with = (TogetherTables,)
-    sensed_channels = drive_channels = 3
-    delay = block = 1
+    step = hybrid_step
+    sensed_channels = drive_channels = SENSORS + 1
+    motion_channels = 3
 
-    def __init__(self, plate: Plate, screen: ElectroadhesionScreen, velocity_per_force: float) -> None:
+    def __init__(self, plate: Plate, screen: CompiledPlant, velocity_per_force: float) -> None:
         for name, found, needed in (
             ("rate", plate.rate, screen.rate),
             ("delay", plate.delay, screen.delay),
@@ -75,45 +113,28 @@ class HybridPlant(TouchedPlant):
             raise ValueError(f"{velocity_per_force=}: must be > 0 m/(N s)")
         super().__init__(screen.finger, screen.rate)
         self.plate, self.screen = plate, screen
-        self.felt = np.zeros((0, 2))
-        self._tables = HybridTables(plate._tables, screen._tables, float(velocity_per_force))
-        self._state = HybridState(plate._state, screen._state, np.zeros(3), np.zeros(1), np.zeros(1))
-        self._last = np.zeros(self.drive_channels)
+        self.noise_channels = plate.noise_channels + screen.noise_channels
+        rows = [np.zeros(part.motion_channels) for part in (plate, screen)]
+        parts = np.zeros(2, SIGNALS)
+        parts["motion"] = [row.ctypes.data for row in rows]
+        self.buffers = (parts, *rows)
+        self.state = aligned_record(HYBRID)
+        self.state["velocity_per_force"], self.state["parts"] = velocity_per_force, parts.ctypes.data
+        for name, part, row in zip(("plate", "screen"), (plate, screen), rows, strict=True):
+            self.state[name] = part.step.address, part.state.ctypes.data
+            self.state[f"{name}_motion"] = row.ctypes.data
+        self.state["noise_channels"] = self.noise_channels
+        self.state["input_channels"] = screen.inputs(0, 1).shape[1]
 
-    def _next(self, n: int) -> tuple[Array, Array, tuple[Array, Array, Array, Array]]:
-        """Finger rows and noise of the next n samples, and their columns to fill: sensed, motion, felt, flags."""
-        noise = np.hstack([self.plate._next(n)[1], self.screen._next(n)[1]])
-        finger = finger_rows(self.finger, self._samples, n, self.rate)
-        self._samples += n
-        self.felt = np.zeros((n, 2))
-        return finger, noise, (np.zeros((n, 3)), np.zeros((n, 1)), self.felt, np.zeros(n, np.int64))
+    @property
+    def felt(self) -> Array:
+        """What plate and screen add to the skin's velocity (m/s, shape (n, 2)), over the samples of the last run."""
+        return self.motion[:, 1:]
 
-    def run(self, drive: Array) -> Sensed:
-        """Advance by n samples under `drive` (shape (n, 3)); row i acts from sample i on, sensed at its start."""
-        finger, noise, columns = self._next(len(drive))
-        hybrid_run(self._tables, self._state, np.ascontiguousarray(drive, float), finger, noise, *columns)
-        sensed, motion, _, flags = columns
-        return Sensed(sensed, finger[:, POSITION], motion, finger[:, LOAD], flags)
+    def inputs(self, first: int, n: int) -> Array:
+        """Finger and whatever else the screen takes, sample by sample."""
+        return self.screen.inputs(first, n)
 
-    def closed_loop(self, controller: Controller, wanted: Array) -> tuple[Array, Array, Array, Sensed]:
-        """Advance hybrid and controller together, sample by sample, over `wanted` (shape (n,))."""
-        n = len(wanted)
-        finger, noise, (sensed, motion, felt, flags) = self._next(n)
-        drive, target = np.zeros((n, self.drive_channels)), np.zeros((n, controller.n_bands), complex)
-        closed_hybrid_run(
-            self._tables,
-            self._state,
-            controller.tables,
-            controller.state,
-            self._last,
-            finger,
-            noise,
-            wanted,
-            sensed,
-            motion,
-            felt,
-            drive,
-            target,
-            flags,
-        )
-        return drive, target, flags, Sensed(sensed, finger[:, POSITION], motion, finger[:, LOAD], flags)
+    def noise(self, n: int) -> Array:
+        """Noise of the plate's sensors, then of the screen's."""
+        return np.hstack([self.plate.noise(n), self.screen.noise(n)])

@@ -1,37 +1,36 @@
-"""The sound that a plate is known by: lines of equal motion, alternately heave and rocking, of low crest."""
+"""Multi-sine that excites a plate for identification: lines of equal motion, alternately heave and rocking."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
-from hapticrender.plants.vibrotactile import PlateParameters
+from hapticrender.plants.plate import PlateParameters
 from hapticrender.protocols import Array
 
 GRID = 12.0  # Hz between lines
-DENSE = 3.0  # Hz between lines around a mode
-AROUND = 12.0  # Hz on either side of a mode that count as around it
-REACH_UP = 2.1  # the highest line over the highest mode
-HIGHEST_SHARE = 0.4  # of the sampling rate, where the highest line must lie below
+DENSE = 3.0  # Hz between lines within AROUND of a mode
+AROUND = 12.0  # Hz
+REACH_UP = 2.1  # highest line over highest mode
+HIGHEST_SHARE = 0.4  # of the sampling rate: bound of the highest line
 PATTERNS = np.array([[1.0, -1.0], [1.0, 1.0]])  # coil currents (rows) that drive heave and rocking (columns)
 CREST_ROUNDS = 200
-CREST_CLIP = 0.6  # of the peak: deep clips, falling behind the peak as it falls
+CREST_CLIP = 0.6  # of the peak
 
 
-@dataclass(frozen=True, kw_only=True)
-class Multisine:
-    """One period of drive and the lines that are in it.
+class Multisine(NamedTuple):
+    """One period of drive, and its lines.
 
-    Parameters
+    Attributes
     ----------
     bins : ndarray of int, shape (n,)
         Lines, in periods a record, ascending.
     coordinate : ndarray of int, shape (n,)
-        What each line drives: 0 heave, 1 rocking.
+        Coordinate that each line drives: 0 heave, 1 rocking.
     drive : ndarray, shape (samples, 2), A
-        One period, on the steps of the command.
+        One period, rounded to the steps of the command.
     motion : float, m
         Amplitude of every line at the ends of the glass, on the plate that it was designed for.
     """
@@ -43,23 +42,18 @@ class Multisine:
 
 
 def design_multisine(parameters: PlateParameters, rate: float, samples: int, amplitude: float) -> Multisine:
-    """Lines on a 12 Hz grid and 3 Hz around both modes, every second one rocking, `amplitude` (m) at the worst end.
+    """Design lines on a 12 Hz grid, and 3 Hz apart around both modes, that move the glass ends by `amplitude`.
 
     Parameters
     ----------
     parameters : PlateParameters
-        The plate as it is believed to be.
+        Expected plate.
     rate : float, Hz
         Sampling rate.
     samples : int
         Length of a period; lines are whole multiples of rate/samples.
     amplitude : float, m, > 0
         Largest displacement of a glass end on that plate.
-
-    Returns
-    -------
-    Multisine
-        Its drive, one period, quantised as the command is.
 
     Raises
     ------
@@ -75,31 +69,36 @@ def design_multisine(parameters: PlateParameters, rate: float, samples: int, amp
     _check(parameters, rate, samples, amplitude, modes, ratios)
     bins = _lines(modes, rate, samples)
     coordinate = np.arange(len(bins)) % 2
-    drive, ends = _played(parameters, rate, samples, bins, coordinate)
-    motion = amplitude / float(abs(ends).max())
-    drive *= motion
-    step = parameters.current_step
-    if step:
-        drive = step * np.round(drive / step)
+    model = parameters.band_model(rate, parameters.delay)
+    frequency = bins * (rate / samples)
+    moved = model.response(frequency) * model.hold_and_delay(frequency)[:, None, None]
+    ends = model.place_from_coordinate[1:] @ moved
+    own = np.diagonal(moved @ PATTERNS, axis1=1, axis2=2)[np.arange(len(bins)), coordinate]
+    at_end = own * model.place_from_coordinate[2, coordinate]
+    current = (np.exp(1j * _phases(bins, coordinate, samples)) / at_end)[:, None] * PATTERNS.T[coordinate]
+    motion = amplitude / float(abs(_period(bins, (ends @ current[:, :, None])[..., 0], samples)).max())
+    drive = motion * _period(bins, current, samples)
+    if parameters.current_step:
+        drive = parameters.current_step * np.round(drive / parameters.current_step)
     peak = float(abs(drive).max())
     if peak > parameters.current_limit:
         raise ValueError(
             f"amplitude = {amplitude:g} m: needs {peak:.3g} A, must be <= {parameters.current_limit:g} A; "
             f"the drive allows {amplitude * parameters.current_limit / peak:.3g} m"
         )
-    return Multisine(bins=bins, coordinate=coordinate, drive=drive, motion=motion)
+    return Multisine(bins, coordinate, drive, motion)
 
 
 def _check(
     parameters: PlateParameters, rate: float, samples: int, amplitude: float, modes: Array, ratios: Array
 ) -> None:
-    """Refuse what cannot be played or would not tell enough."""
-    if not (math.isfinite(amplitude) and 0.0 < amplitude <= parameters.sensor_range / 2):
-        bound = parameters.sensor_range / 2
+    """Refuse an excitation that cannot be played, or that resolves too little."""
+    bound = parameters.sensor_range / 2
+    if not 0.0 < amplitude <= bound:
         raise ValueError(f"amplitude = {amplitude!r}: must be > 0 and <= {bound:g} m, the sensors' range")
-    if REACH_UP * modes.max() > HIGHEST_SHARE * rate:
-        bound = REACH_UP * modes.max() / HIGHEST_SHARE
-        raise ValueError(f"rate = {rate:g} Hz: must be >= {bound:.4g} Hz for a mode at {modes.max():.4g} Hz")
+    least = REACH_UP * modes.max() / HIGHEST_SHARE
+    if rate < least:
+        raise ValueError(f"rate = {rate:g} Hz: must be >= {least:.4g} Hz for a mode at {modes.max():.4g} Hz")
     width = max(float((ratios * modes).min()), GRID / 6)
     if samples < rate / width:
         raise ValueError(f"seconds = {samples / rate:g}: must be >= {1 / width:.3g} s to resolve the narrowest mode")
@@ -110,8 +109,7 @@ def _lines(modes: Array, rate: float, samples: int) -> Array:
     base = rate / samples
 
     def spaced(first: float, last: float, spacing: float) -> Array:
-        stride = max(round(spacing / base), 1)
-        return np.arange(math.ceil(first / base), math.floor(last / base) + 1, stride)
+        return np.arange(math.ceil(first / base), math.floor(last / base) + 1, max(round(spacing / base), 1))
 
     dense = np.concatenate([spaced(mode - AROUND, mode + AROUND, DENSE) for mode in modes])
     grid = spaced(GRID, REACH_UP * modes.max(), GRID)
@@ -120,15 +118,18 @@ def _lines(modes: Array, rate: float, samples: int) -> Array:
 
 
 def _phases(bins: Array, coordinate: Array, samples: int) -> Array:
-    """Phases (rad) of low crest at both ends: Schroeder's, then clipped and given their amplitudes back in turn."""
+    """Phases (rad) of low crest at both ends: Schroeder's, then alternately clipped and set back to equal amplitudes.
+
+    Van der Ouderaa, Schoukens & Renneboog 1988, IEEE Trans. Instrum. Meas. 37, 145.
+    """
     count = np.arange(len(bins))
     phase = -math.pi * count * (count - 1) / len(bins)
+    signs = PATTERNS.T[coordinate]
     for _ in range(CREST_ROUNDS):
-        line = np.exp(1j * phase)
-        ends = _period(bins, np.stack([np.where(coordinate == 0, line, -line), line], axis=1), samples)
+        ends = _period(bins, np.exp(1j * phase)[:, None] * signs, samples)
         bound = CREST_CLIP * abs(ends).max()
-        first, second = np.fft.rfft(np.clip(ends, -bound, bound), axis=0)[bins].T
-        phase = np.angle(np.where(coordinate == 0, second + first, second - first))
+        clipped = np.fft.rfft(np.clip(ends, -bound, bound), axis=0)[bins]
+        phase = np.angle((clipped * signs).sum(axis=1))
     return phase
 
 
@@ -137,22 +138,3 @@ def _period(bins: Array, lines: Array, samples: int) -> Array:
     spectrum = np.zeros((samples // 2 + 1, 2), complex)
     spectrum[bins] = lines
     return np.fft.irfft(spectrum * (samples / 2), samples, axis=0)
-
-
-def _played(
-    parameters: PlateParameters, rate: float, samples: int, bins: Array, coordinate: Array
-) -> tuple[Array, Array]:
-    """Drive (A) that gives every line an amplitude of 1 m at the ends, and how both ends then move (m).
-
-    Lines of heave rock the plate a little, and the other way round, where its two sides differ.
-    """
-    model = parameters.band_model(rate, parameters.delay)
-    frequency = bins * (rate / samples)
-    moved = model.response(frequency) * model.hold_and_delay(frequency)[:, None, None]
-    reach = parameters.glass_length / parameters.coil_spacing
-    of_pattern = moved @ PATTERNS
-    at_end = np.where(coordinate == 0, of_pattern[:, 0, 0], reach * of_pattern[:, 1, 1])
-    current = (np.exp(1j * _phases(bins, coordinate, samples)) / at_end)[:, None] * PATTERNS.T[coordinate]
-    heave, rocking = (moved @ current[:, :, None])[..., 0].T
-    ends = np.stack([heave - reach * rocking, heave + reach * rocking], axis=1)
-    return _period(bins, current, samples), _period(bins, ends, samples)

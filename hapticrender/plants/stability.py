@@ -1,31 +1,25 @@
-"""Where each method is stable: a finger on the plate as a structure, growth by simulation, and the map of both."""
+"""Map where each method is stable on the plate with a finger, from the linear models of its loop."""
 
 from __future__ import annotations
 
-import json
 import math
-import os
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, fields
-from pathlib import Path
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from hapticrender.control.bandmodel import FingerRange
-from hapticrender.control.bank.loop import BankLoop, KnownFinger, Structure
 from hapticrender.control.damping import damping_taps
+from hapticrender.control.linear import ErrorLoop, FingerEstimate, Structure
 from hapticrender.control.margins import sensitivity
-from hapticrender.control.polar.loop import PolarLoop
-from hapticrender.plants.vibrotactile import Plate, PlateParameters
-from hapticrender.protocols import Array, Controller
+from hapticrender.control.polar_loop import PolarLoop
+from hapticrender.plants.plate import PlateParameters
+from hapticrender.protocols import Array
 
 if TYPE_CHECKING:
     from hapticrender.touch.mechanics import FingerMechanics
 
-KICK = 1e-20  # A, in one sample, half of it on the second coil: small, so that growth has room
-WINDOW = 0.02  # s
-LEAST_MOTION, MOST_MOTION = 1e-200, 1e-3  # m: what a growth is fitted to
 OFFSETS = 60  # frequencies around a carrier at which a map looks for the peak of S
 MODE_OFFSETS = np.linspace(-6.0, 6.0, 9)  # Hz: and around each mode of the plant
 INTEGRAL = 3.4  # 1/s per Hz of bandwidth: 17 1/s at 5 Hz
@@ -51,30 +45,30 @@ def loaded_plate(
     strength : float
         Factor on the finger's impedance, >= 0; 0 is no finger.
     """
-    place = np.array([1.0, position / parameters.half_spacing])
+    arms = np.array([1.0, position / parameters.half_spacing])
     mass, damping, stiffness = parameters.mass_matrix, parameters.damping_matrix, parameters.stiffness_matrix
-    push = watch = np.eye(2)
+    inputs = outputs = np.eye(2)
     if parameters.bending_frequency > 0:
         omega, modal = 2 * math.pi * parameters.bending_frequency, parameters.bending_mass
-        place = np.append(place, parameters.bending_shape(position))
+        arms = np.append(arms, parameters.bending_shape(position))
         mass = _joined(mass, modal)
         damping = _joined(damping, 2 * parameters.bending_damping * omega * modal)
         stiffness = _joined(stiffness, omega**2 * modal)
-        push, watch = np.vstack([push, [parameters.bending_coil, 0.0]]), np.column_stack([watch, [1.0, 0.0]])
+        inputs, outputs = np.vstack([inputs, [parameters.bending_coil, 0.0]]), np.column_stack([outputs, [1.0, 0.0]])
     if mechanics is not None and mechanics.order and strength > 0:
-        felt = place
+        across = arms
         if mechanics.order == 4:
             if not mechanics.phalanx_mass > 0:
                 raise ValueError(f"phalanx_mass = {mechanics.phalanx_mass!r} kg: must be > 0")
             mass = _joined(mass, strength * mechanics.phalanx_mass)
             damping = _joined(damping, strength * mechanics.phalanx_damping)
             stiffness = _joined(stiffness, strength * mechanics.phalanx_stiffness)
-            place, felt = np.append(place, 0.0), np.append(place, -1.0)
-            push, watch = np.pad(push, ((0, 1), (0, 0))), np.pad(watch, ((0, 0), (0, 1)))
-        mass = mass + strength * mechanics.mass * np.outer(place, place)
-        damping = damping + strength * mechanics.damping * np.outer(felt, felt)
-        stiffness = stiffness + strength * mechanics.stiffness * np.outer(felt, felt)
-    return Structure(mass=mass, damping=damping, stiffness=stiffness, push=push, watch=watch)
+            arms, across = np.append(arms, 0.0), np.append(arms, -1.0)
+            inputs, outputs = np.pad(inputs, ((0, 1), (0, 0))), np.pad(outputs, ((0, 0), (0, 1)))
+        mass = mass + strength * mechanics.mass * np.outer(arms, arms)
+        damping = damping + strength * mechanics.damping * np.outer(across, across)
+        stiffness = stiffness + strength * mechanics.stiffness * np.outer(across, across)
+    return Structure(mass=mass, damping=damping, stiffness=stiffness, input=inputs, output=outputs)
 
 
 def _joined(matrix: Array, value: float) -> Array:
@@ -82,37 +76,6 @@ def _joined(matrix: Array, value: float) -> Array:
     larger = np.pad(matrix, (0, 1))
     larger[-1, -1] = value
     return larger
-
-
-def simulated_growth(plate: Plate, controller: Controller, seconds: float) -> float:
-    """Growth (1/s) of a kicked plate under a controller that wants silence: the boundary by simulation.
-
-    Parameters
-    ----------
-    plate : Plate
-        Just made, without noise, of ideal resolution and with wide limits.
-    controller : Controller
-        Of constant envelopes that are all 0.
-    seconds : float
-        The last two thirds of what is neither rounding nor run away are fitted.
-    """
-    plate.run(np.array([[KICK, 0.5 * KICK]]))
-    motion = plate.closed_loop(controller, np.zeros(round(seconds * plate.rate)))[3].motion
-    if motion is None:
-        raise TypeError("the plate tells no motion")
-    return fitted_growth(np.abs(motion).max(axis=1), plate.rate)
-
-
-def fitted_growth(size: Array, rate: float, least: float = LEAST_MOTION) -> float:
-    """Growth (1/s) of `size` (m, shape (n,)) sampled at `rate` (Hz), from its peaks in windows of 20 ms."""
-    width = round(WINDOW * rate)
-    peaks = size[: len(size) // width * width].reshape(-1, width).max(axis=1)
-    used = np.cumprod((peaks > least) & (peaks < MOST_MOTION)).astype(bool)
-    used[: used.sum() // 3] = False
-    if used.sum() < 2:
-        raise ValueError(f"{used.sum()} windows of {WINDOW} s between {least} and {MOST_MOTION} m: must be at least 2")
-    slope, _ = np.polyfit(np.flatnonzero(used) * WINDOW, np.log(peaks[used]), 1)
-    return float(slope)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -126,7 +89,7 @@ class StabilityMap:
         Their names.
     loads, positions, frequencies, bandwidths : ndarray, N, m, Hz, Hz
     adapted : bool
-        Whether the law has learnt the finger.
+        Whether the law has the settled finger estimate.
     growth : ndarray, shape (fingers, loads, positions, frequencies, bandwidths), 1/s
         Of the slowest-decaying pole; >= 0 is unstable.
     modulus : ndarray, same shape
@@ -151,17 +114,6 @@ class StabilityMap:
         held = (self.growth < 0) & (self.modulus >= least)
         count = np.cumprod(held, axis=-1).sum(axis=-1)
         return np.concatenate([[0.0], self.bandwidths[:-1], [np.inf]])[count]
-
-    def save(self, path: str | os.PathLike[str]) -> None:
-        """Write as .npz (all arrays) or .json (the same as lists)."""
-        path = Path(path)
-        values = {field.name: np.asarray(getattr(self, field.name)) for field in fields(self)}
-        if path.suffix == ".npz":
-            np.savez(path, **values)  # type: ignore[arg-type]
-        elif path.suffix == ".json":
-            path.write_text(json.dumps({name: value.tolist() for name, value in values.items()}), encoding="utf-8")
-        else:
-            raise ValueError(f"{path}: suffix {path.suffix!r} must be .npz or .json")
 
 
 class _Touch(NamedTuple):
@@ -193,10 +145,10 @@ def stability_map(
     Parameters
     ----------
     method : {"paper", "paper-common", "h", "h2"}
-        The paper's polar loops, per side or in common mode; the bank without and with its inner loop.
+        The paper's polar loops, per side or in common mode; the error observer without and with its inner damper.
     frequencies, bandwidths : ndarray, Hz
-        Carriers, and loop bandwidths b: the paper's fT with fL = 2 b; for the bank an observer pole at 2 b and an
-        integral of 3.4 b 1/s, so that b = 5 Hz is H.  No rule lowers them here.
+        Carriers, and loop bandwidths b: the paper's fT with fL = 2 b; for the error observer a pole at 2 b and an
+        integral of 3.4 b 1/s.  No rule lowers them here.
     fingers : mapping of str to FingerMechanics
         Such as ``touch.mechanics.NAMED``, Table 1 and no finger.
     loads : tuple of float, N
@@ -205,7 +157,7 @@ def stability_map(
         Of the finger.
     parameters : PlateParameters, optional
     adapted : bool
-        The bank's law knows the finger's three numbers as its adaptation would leave them; otherwise none.
+        The law has the finger estimate at which its adaptation comes to rest; otherwise none.
 
     Returns
     -------
@@ -254,15 +206,15 @@ def _polar(touch: _Touch, carrier: Array, width: Array, common: bool) -> tuple[A
     return growth, np.where(growth < 0, 1 / peak, 0.0)
 
 
-def _bank(touch: _Touch, carrier: Array, width: Array, inner: float) -> tuple[Array, Array]:
-    """Growth and modulus margin of the bank for every carrier and bandwidth."""
-    loop = scaled_bank(
+def _error_loop(touch: _Touch, carrier: Array, width: Array, inner: float) -> tuple[Array, Array]:
+    """Growth and modulus margin of the error observer's loop for every carrier and bandwidth."""
+    loop = scaled_loop(
         touch.parameters,
         touch.structure(),
         carrier,
         width,
         inner=inner,
-        finger=learnt_finger(touch.parameters, touch.mechanics, carrier, touch.position, touch.strength)
+        finger=settled_estimate(touch.parameters, touch.mechanics, carrier, touch.position, touch.strength)
         if touch.adapted
         else None,
     )
@@ -279,33 +231,22 @@ def _bank(touch: _Touch, carrier: Array, width: Array, inner: float) -> tuple[Ar
     return growth, np.where(growth < 0, 1 / peak, 0.0)
 
 
-def scaled_bank(
+def scaled_loop(
     parameters: PlateParameters,
     plant: Structure,
     carrier: Array,
     width: Array,
     *,
     inner: float,
-    finger: KnownFinger | None = None,
-) -> BankLoop:
-    """Stack of banks of one band each on one plant, scaled by bandwidth as `stability_map` says.
+    finger: FingerEstimate | None = None,
+) -> ErrorLoop:
+    """Stack of loops of one band each on one plant, for `carrier` and bandwidth `width` (Hz, shape (B,)).
 
-    Parameters
-    ----------
-    parameters : PlateParameters
-        The free plate that the law knows.
-    plant : Structure
-        What it meets.
-    carrier, width : ndarray, shape (B,), Hz
-        Carriers and bandwidths.
-    inner : float
-        Share of the inner loop, 0..1.
-    finger : KnownFinger, optional
-        What the law knows of the finger.
+    `parameters` are those of the free plate that the law inverts, `inner` (0..1) is the factor on the inner damper.
     """
     model = parameters.band_model(parameters.rate, parameters.delay)
     level = 2 * math.pi * np.minimum(6.0, carrier / 8) / model.rate
-    return BankLoop.on(
+    return ErrorLoop.on(
         plant.sampled(model.rate),
         Structure.of(model),
         carrier[:, None],
@@ -321,24 +262,13 @@ def scaled_bank(
     )
 
 
-def learnt_finger(
+def settled_estimate(
     parameters: PlateParameters, mechanics: FingerMechanics, frequency: Array, position: float, strength: float = 1.0
-) -> KnownFinger | None:
-    """The three numbers at which the bank's adaptation comes to rest on a single carrier; None without a finger.
+) -> FingerEstimate | None:
+    """Finger estimate at which the adaptation settles on a single carrier (Hz, shape (B,)); None without a finger.
 
-    Parameters
-    ----------
-    parameters : PlateParameters
-    mechanics : FingerMechanics
-    frequency : ndarray, shape (B,), Hz
-    position : float, m
-    strength : float
-        Factor on the finger's impedance.
-
-    Notes
-    -----
-    With z = j w Z_f(j w): Re z is shared between stiffness and mass by how far each may be expected from zero, which
-    is where the update of FACTS section 3.5 settles from zero; the imaginary part is damping.
+    With z = j w Z_f(j w): Re z is shared between stiffness and mass by how far each may be expected from zero; the
+    imaginary part is damping.  `strength` is a factor on the finger's impedance.
     """
     if not mechanics.order or strength == 0.0:
         return None
@@ -353,12 +283,12 @@ def learnt_finger(
         np.clip(known.typical_stiffness**2 * share, *known.stiffness),
     )
     mass, damping, stiffness = (number[:, None, None, None] for number in numbers)
-    return KnownFinger(mass, damping, stiffness, position / parameters.half_spacing)
+    return FingerEstimate(mass, damping, stiffness, position / parameters.half_spacing)
 
 
 LOOPS: dict[str, Callable[[_Touch, Array, Array], tuple[Array, Array]]] = {
     "paper": lambda touch, carrier, width: _polar(touch, carrier, width, False),
     "paper-common": lambda touch, carrier, width: _polar(touch, carrier, width, True),
-    "h": lambda touch, carrier, width: _bank(touch, carrier, width, 0.0),
-    "h2": lambda touch, carrier, width: _bank(touch, carrier, width, 1.0),
+    "h": lambda touch, carrier, width: _error_loop(touch, carrier, width, 0.0),
+    "h2": lambda touch, carrier, width: _error_loop(touch, carrier, width, 1.0),
 }

@@ -1,11 +1,11 @@
-"""An ultrasonic plate: one flexural mode, driven through its resonance, whose amplitude takes friction away.
+"""An ultrasonic plate: one flexural mode, driven at its resonance, whose amplitude reduces friction.
 
 Equation, with the modal displacement q and the drive u::
 
     m q'' + (b + b_f) q' + m w^2 q = N u
 
-The finger adds the damping b_f and shifts the resonance, both with the cube root of its load.  What is judged is the
-mode's displacement; the friction that it leaves is that of `friction_laws`.
+The finger adds the damping b_f and shifts the resonance, both with the cube root of its load.  Its
+displacement is evaluated here; the friction that it leaves is that of `surface`.
 
 The carrier need not be simulated where it is.  With x = Re a e^(j w_d t) and u alike, the complex envelope obeys::
 
@@ -24,35 +24,29 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from hapticrender.checks import Validated, option, parameter
 from hapticrender.control.bandmodel import BandModel
-from hapticrender.plants.base import TouchedPlant
-from hapticrender.plants.bounds import Validated, choice, number
-from hapticrender.plants.ultrasonic_kernels import (
-    STEP,
-    UltrasonicState,
-    UltrasonicTables,
-    closed_ultrasonic_run,
-    ultrasonic_run,
-)
-from hapticrender.protocols import Array, Controller, Sensed
+from hapticrender.plants.compiled import LOAD, STRENGTH, CompiledPlant
+from hapticrender.plants.contact import new_record
+from hapticrender.plants.ultrasonic_kernels import MODE, ultrasonic_step
+from hapticrender.protocols import Array
 
 if TYPE_CHECKING:
     from hapticrender.touch.finger import Finger
 
-PLACES = ("amplitude",)
 LEVELS = ("carrier", "envelope")
 NOMINAL_LOAD = 0.5  # N: at which `finger_damping` and `finger_shift` hold
-NOMINAL_AMPLITUDE = 3e-6  # m: what `headroom` is told against
-MOST_LOAD = 20.0  # N: hardest that a finger presses
-MOST_DAMPING_RATIO = 0.5  # beyond it a mode is none
+NOMINAL_AMPLITUDE = 3e-6  # m: at which `headroom` is stated
+MOST_LOAD = 20.0  # N: largest load
+MOST_DAMPING_RATIO = 0.5
 MOST_SHIFT = 0.25  # of the carrier
 NYQUIST_MARGIN = 0.45  # of the rate: the carrier must lie below
-RAMPS = 1000  # steps a second in which the temperature rises
+WARMING = 1000  # steps a second in which the temperature rises
 
 
 @dataclass(frozen=True, kw_only=True)
 class UltrasonicParameters(Validated):
-    """Everything that describes the mode, its electronics and how finely it is modelled.
+    """Parameters of the mode, of its electronics and of the model's level.
 
     Parameters
     ----------
@@ -71,12 +65,12 @@ class UltrasonicParameters(Validated):
     temperature_rise : float, K
         That the plate reaches, within +-100.
     temperature_time : float, s
-        In which it does, linearly (in steps of 1 ms); > 0.
+        In which it does so, linearly (in steps of 1 ms); > 0.
     drive_limit : float, V
         Largest drive, > 0.
     force_constant : float, N/V
-        Modal force per drive, > 0.  The default drives the plate under a 0.5 N finger to twice 3 um (peak) at its
-        resonance, F = b w a: 2 * 3 um * 15.7 N s/m * 2 pi 30 kHz / 10 V; see `headroom`.
+        Modal force per drive, > 0.  The default drives the plate under a 0.5 N finger to 6 um (peak) at its
+        resonance, F = b w a: 6 um * 15.7 N s/m * 2 pi 30 kHz / 10 V; see `headroom`.
     sensor_range : float, m
         Full range of the sensor.
     sensor_bits, drive_bits : int
@@ -94,7 +88,7 @@ class UltrasonicParameters(Validated):
 
     Notes
     -----
-    Engineering defaults throughout (FACTS section 6): none is a measurement.
+    The defaults are engineering values (docs/theory.md), not measurements.
 
     Examples
     --------
@@ -103,24 +97,24 @@ class UltrasonicParameters(Validated):
     ([75.0, 250.1], 2.0)
     """
 
-    frequency: float = number(30e3, "Hz", least=20e3, most=70e3)
-    modal_mass: float = number(5e-3, "kg", above=0.0)
-    quality: float = number(200.0, least=5.0, most=1e5)
-    finger_damping: float = number(11.0, "N s/m")
-    finger_shift: float = number(-30.0, "Hz", least=-1e4, most=1e4)
-    temperature_coefficient: float = number(-100e-6, "1/K", least=-1e-3, most=1e-3)
-    temperature_rise: float = number(0.0, "K", least=-100.0, most=100.0)
-    temperature_time: float = number(1.0, "s", above=0.0)
-    drive_limit: float = number(10.0, "V", above=0.0)
-    force_constant: float = number(1.777, "N/V", above=0.0)
-    sensor_range: float = number(50e-6, "m", above=0.0)
-    sensor_bits: int = number(16, least=0, most=24)
-    drive_bits: int = number(16, least=0, most=24)
-    sensor_noise: float = number(2e-9, "m")
-    rate: float = number(192e3, "Hz", least=500.0, most=1e7)
-    delay: int = number(1, "samples", least=1, most=100_000)
-    level: str = choice("carrier", *LEVELS)
-    envelope_frequency: float = number(6e3, "Hz", least=500.0)
+    frequency: float = parameter(30e3, "Hz", least=20e3, most=70e3)
+    modal_mass: float = parameter(5e-3, "kg", above=0.0)
+    quality: float = parameter(200.0, least=5.0, most=1e5)
+    finger_damping: float = parameter(11.0, "N s/m")
+    finger_shift: float = parameter(-30.0, "Hz", least=-1e4, most=1e4)
+    temperature_coefficient: float = parameter(-100e-6, "1/K", least=-1e-3, most=1e-3)
+    temperature_rise: float = parameter(0.0, "K", least=-100.0, most=100.0)
+    temperature_time: float = parameter(1.0, "s", above=0.0)
+    drive_limit: float = parameter(10.0, "V", above=0.0)
+    force_constant: float = parameter(1.777, "N/V", above=0.0)
+    sensor_range: float = parameter(50e-6, "m", above=0.0)
+    sensor_bits: int = parameter(16, least=0, most=24)
+    drive_bits: int = parameter(16, least=0, most=24)
+    sensor_noise: float = parameter(2e-9, "m")
+    rate: float = parameter(192e3, "Hz", least=500.0, most=1e7)
+    delay: int = parameter(1, "samples", least=1, most=100_000)
+    level: str = option("carrier", *LEVELS)
+    envelope_frequency: float = parameter(6e3, "Hz", least=500.0)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -128,10 +122,6 @@ class UltrasonicParameters(Validated):
             raise ValueError(
                 f"envelope_frequency = {self.envelope_frequency!r}: must be < frequency = {self.frequency:g} Hz"
             )
-        self._check_carrier()
-
-    def _check_carrier(self) -> None:
-        """Refuse a carrier that the rate cannot carry, or that a finger or the heat leaves nothing of."""
         if self.carrier > NYQUIST_MARGIN * self.rate:
             raise ValueError(
                 f"rate = {self.rate!r}: must be >= {self.carrier / NYQUIST_MARGIN:g} Hz for a carrier of "
@@ -181,12 +171,12 @@ class UltrasonicParameters(Validated):
     def damping(self, normal_load: Array | float = 0.0) -> Array:
         """Damping of the mode as simulated (N s/m) under a finger of `normal_load` (N); 0: free."""
         free = 2 * math.pi * self.frequency * self.modal_mass / self.quality
-        return (free + self.finger_damping * _grip(normal_load)) * (self.frequency / self.carrier)
+        return (free + self.finger_damping * _finger_scale(normal_load)) * (self.frequency / self.carrier)
 
     def resonance(self, normal_load: Array | float = 0.0, temperature_rise: Array | float = 0.0) -> Array:
         """Undamped resonance of the mode as simulated (Hz)."""
         drift = self.frequency * self.temperature_coefficient * np.asarray(temperature_rise, float)
-        return self.carrier + self.finger_shift * _grip(normal_load) + drift
+        return self.carrier + self.finger_shift * _finger_scale(normal_load) + drift
 
     def pole(self, normal_load: Array | float = 0.0) -> Array:
         """Corner of the envelope's low pass, s0/(2 pi) = b/(4 pi m) (Hz), at either level."""
@@ -201,21 +191,11 @@ class UltrasonicParameters(Validated):
         return self.mass * (resonance - omega) * (resonance + omega) + 1j * omega * self.damping(normal_load)
 
     def envelope_error(self, frequency_offset: Array | float, normal_load: Array | float = 0.0) -> Array:
-        """Relative difference of the transposed D_i(j(w_i + W)) against D(j(w + W)), complex.
+        """Relative difference of the transposed D_i(j(w_i + W)) against D(j(w + W)) at W/(2 pi) (Hz), complex.
 
-        Parameters
-        ----------
-        frequency_offset : float or ndarray, Hz
-            W/(2 pi): where in the envelope's spectrum.
-        normal_load : float or ndarray, N
-            Of the finger.
-
-        Notes
-        -----
-        With S the resonance's shift under the finger,
-        ``D(j(w + W)) = -m (W - S)(2 w + W + S) + j b (w + W)``, so that far beyond the pole the difference is
-        ``(W + S)(1/w_i - 1/w)/2``, and at the carrier itself ``W (1/w_i - 1/w)``.  The target and the drive being the
-        same, the amplitudes differ by as much.
+        With S the resonance's shift under the finger, ``D(j(w + W)) = -m (W - S)(2 w + W + S) + j b (w + W)``: far
+        beyond the pole the difference is ``(W + S)(1/w_i - 1/w)/2``, at the carrier ``W (1/w_i - 1/w)``.  For the same
+        target and drive the amplitudes differ by as much.
         """
         low = replace(self, level="envelope", rate=max(self.rate, self.envelope_frequency / NYQUIST_MARGIN))
         high = replace(self, level="carrier", rate=max(self.rate, self.frequency / NYQUIST_MARGIN))
@@ -247,7 +227,7 @@ class UltrasonicParameters(Validated):
         return self.sensor_range / 2**self.sensor_bits if self.sensor_bits else 0.0
 
     def band_model(self, rate: float, delay: int) -> BandModel:
-        """What the controller may know of this plate, free and cold, in a loop of `rate` (Hz) and `delay` (samples)."""
+        """Device model of the free, cold plate in a loop of `rate` (Hz) and `delay` (samples)."""
         omega = 2 * math.pi * self.carrier
         return BandModel(
             rate=rate,
@@ -259,7 +239,7 @@ class UltrasonicParameters(Validated):
             coordinate_from_sensed=np.eye(1),
             side_from_coordinate=np.eye(1),
             place_from_coordinate=np.eye(1),
-            places=PLACES,
+            places=("amplitude",),
             drive_limit=self.drive_limit,
             sensed_limit=self.sensor_range / 2,
             drive_step=self.drive_step,
@@ -268,12 +248,12 @@ class UltrasonicParameters(Validated):
         )
 
 
-def _grip(normal_load: Array | float) -> Array:
-    """(W/0.5 N)^(1/3), 0 without load: how much of the nominal finger is on the plate."""
+def _finger_scale(normal_load: Array | float) -> Array:
+    """(W/0.5 N)^(1/3): damping and shift of a finger over those of the nominal one; 0 without load."""
     return np.cbrt(np.maximum(np.asarray(normal_load, float), 0.0) / NOMINAL_LOAD)
 
 
-class UltrasonicPlate(TouchedPlant):
+class UltrasonicPlate(CompiledPlant):
     """The mode in discrete time, behind the `Plant` protocol.
 
     Parameters
@@ -281,97 +261,37 @@ class UltrasonicPlate(TouchedPlant):
     parameters : UltrasonicParameters
         The plate and its level of modelling.
     finger : Finger
-        Where the finger is and how hard it presses; its own mechanics are too slow for the mode to feel.
+        Where the finger is and how hard it presses; its own mechanics are too slow to matter.
     seed : int
         Of the sensor noise.
     block : int
-        Samples a `run` call plays before the controller can answer; the rest of the delay is queued inside.
+        Samples a call of `run`; the rest of the delay is queued inside.
     """
 
+    step = ultrasonic_step
+
     def __init__(self, parameters: UltrasonicParameters, finger: Finger, seed: int = 0, block: int = 1) -> None:
-        if not 1 <= block <= parameters.delay:
-            raise ValueError(f"block = {block}: must be between 1 and the loop's delay of {parameters.delay} samples")
-        super().__init__(finger, parameters.rate)
+        super().__init__(finger, parameters.rate, delay=parameters.delay, block=block, seed=seed)
         self.parameters = parameters
-        self.delay = parameters.delay
-        self.block = block
-        self.drive_channels = self.sensed_channels = 1
-        self._rng = np.random.default_rng(seed)
-        self._tables = ultrasonic_tables(parameters)
-        self._state = ultrasonic_state(parameters.delay - block)
-        self._last = np.zeros(1)
+        self.state, queue = mode_record(parameters, parameters.delay - block)
+        self.buffers = (queue,)
 
-    def _next(self, n: int) -> tuple[Array, Array, Array, Array]:
-        """Finger rows, mode rows, noise and sample flags of the next n samples."""
-        time = self._time(n)
-        self._samples += n
-        finger = self.finger.touch(time)
-        load = np.where(finger[:, 2] > 0.0, finger[:, 1], 0.0)
-        noise = self._rng.standard_normal((n, 1)) if self._tables.sensor_noise > 0.0 else np.zeros((n, 1))
-        return finger, mode_rows(self.parameters, time, load), noise, np.zeros(n, np.int64)
-
-    def run(self, drive: Array) -> Sensed:
-        """Advance by n samples under `drive` (V, shape (n, 1)); row i acts from sample i on, sensed at its start."""
-        n = len(drive)
-        finger, mode, noise, flags = self._next(n)
-        sensed, motion = np.zeros((n, 1)), np.zeros((n, 1))
-        drive = np.ascontiguousarray(drive, float)
-        ultrasonic_run(self._tables, self._state, drive, mode, noise, sensed, motion, flags)
-        return Sensed(sensed, finger[:, 0], motion, finger[:, 1], flags)
-
-    def closed_loop(self, controller: Controller, wanted: Array) -> tuple[Array, Array, Array, Sensed]:
-        """Advance plate and controller together, sample by sample, over `wanted` (m, shape (n,))."""
-        n = len(wanted)
-        finger, mode, noise, flags = self._next(n)
-        sensed, motion, drive = np.zeros((n, 1)), np.zeros((n, 1)), np.zeros((n, 1))
-        target = np.zeros((n, controller.n_bands), complex)
-        closed_ultrasonic_run(
-            self._tables,
-            self._state,
-            controller.tables,
-            controller.state,
-            self._last,
-            np.ascontiguousarray(finger[:, 0]),
-            mode,
-            noise,
-            wanted,
-            sensed,
-            motion,
-            drive,
-            target,
-            flags,
-        )
-        return drive, target, flags, Sensed(sensed, finger[:, 0], motion, finger[:, 1], flags)
+    def inputs(self, first: int, n: int) -> Array:
+        """Inputs of the finger, then damping (N s/m) and resonance (rad/s) of the mode, shape (n, 6)."""
+        return mode_inputs(self.parameters, super().inputs(first, n), first, self.rate)
 
 
-def mode_rows(parameters: UltrasonicParameters, time: Array, load: Array) -> Array:
-    """Damping (N s/m) and resonance (rad/s) at each `time` (s) under a `load` (N), shape (n, 2)."""
-    steps = np.floor(time * RAMPS * (1 + 1e-12)) / RAMPS
-    rise = parameters.temperature_rise * np.minimum(steps / parameters.temperature_time, 1.0)
-    return np.stack([parameters.damping(load), 2 * np.pi * parameters.resonance(load, rise)], axis=1)
+def mode_inputs(parameters: UltrasonicParameters, finger: Array, first: int, rate: float) -> Array:
+    """Append damping (N s/m) and resonance (rad/s) under load and heat to inputs of the finger, from sample `first`."""
+    time = (first + np.arange(len(finger))) / rate
+    load = np.where(finger[:, STRENGTH] > 0.0, finger[:, LOAD], 0.0)
+    warming = np.floor(time * WARMING * (1 + 1e-12)) / WARMING
+    rise = parameters.temperature_rise * np.minimum(warming / parameters.temperature_time, 1.0)
+    return np.column_stack([finger, parameters.damping(load), 2 * np.pi * parameters.resonance(load, rise)])
 
 
-def ultrasonic_state(latency: int) -> UltrasonicState:
-    """A mode at rest whose drive takes `latency` samples to act."""
-    return UltrasonicState(
-        z=np.zeros(2),
-        step=np.zeros(STEP),
-        frozen=np.full(2, np.nan),
-        pending=np.zeros(latency),
-        cursor=np.zeros(1, np.int64),
-        force=np.zeros(1),
-    )
-
-
-def ultrasonic_tables(parameters: UltrasonicParameters) -> UltrasonicTables:
-    """Numbers of the compiled mode."""
-    return UltrasonicTables(
-        period=float(1.0 / parameters.rate),
-        mass=float(parameters.mass),
-        force_constant=float(parameters.force_constant),
-        drive_limit=float(parameters.drive_limit),
-        drive_step=float(parameters.drive_step),
-        sensor_limit=float(parameters.sensor_range / 2),
-        sensor_step=float(parameters.sensor_step),
-        sensor_noise=float(parameters.sensor_noise),
-    )
+def mode_record(parameters: UltrasonicParameters, latency: int) -> tuple[Array, Array]:
+    """Return the record (`MODE`, shape (1,)) of a mode at rest, and the queue (latency, 1) of its drive."""
+    queue, limit = np.zeros((latency, 1)), parameters.sensor_range / 2
+    values = {"period": 1.0 / parameters.rate, "sensor_limit": limit, "queue": queue.ctypes.data, "latency": latency}
+    return new_record(MODE, parameters, damping=np.nan, **values), queue  # no propagator yet

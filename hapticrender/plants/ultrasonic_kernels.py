@@ -1,4 +1,4 @@
-"""Compiled ultrasonic mode with a finger on it.
+"""Compiled ultrasonic mode, and the surface that it makes: an amplitude loop inside, sliding friction outside.
 
 ``m q'' + b q' + m w^2 q = N u`` with the drive u, the damping b and the resonance w held over a sample, integrated in
 closed form: with s = b/2m, w_d = sqrt(w^2 - s^2), and e the distance to where the drive's force would hold the mode::
@@ -7,116 +7,207 @@ closed form: with s = b/2m, w_d = sqrt(w^2 - s^2), and e the distance to where t
     e'(T) = E [(c - s/w_d S) e' - w^2/w_d S e]    c, S = cos, sin(w_d T)
 
 Velocities are scaled by the sample period, so that all states are in m.
+
+A sample of the surface is a few samples of the carrier.  The reference of friction becomes one of amplitude by the
+inverse of the friction law; the amplitude's own controller follows it along a straight line; and the amplitude leaves
+a friction by the law itself.
 """
 
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
 
-from hapticrender.compiled.jit import kernel, simulation
-from hapticrender.plants.closed import control_step
-from hapticrender.plants.kernels import HUGE, SENSOR_CLIPPED, quantise
-from hapticrender.protocols import Array
+import numba
+import numpy as np
 
-STEP = 5  # numbers of the propagator
+from hapticrender.control.kernel import finger_damping, observed_envelope
+from hapticrender.jit import F8, I8, SIGNALS, SIGNALS_T, call, kernel, pointer, step
+from hapticrender.plants.compiled import HUGE, LOAD, SENSOR_CLIPPED, SPEED, STRENGTH, quantise, queue_drive
+from hapticrender.plants.contact import SLIDING, sliding_step
+from hapticrender.plants.friction_laws import LAW, friction_ratio, reference_amplitude
+from hapticrender.protocols import Flag
 
+SATURATED = int(Flag.SATURATED)
+DAMPING, RESONANCE, INPUTS = 4, 5, 6  # columns of the inputs beside the finger's (N s/m, rad/s), and their number
+FRICTION, SKIN_VELOCITY, AMPLITUDE = range(3)  # columns of the surface's `motion`
+LEAST_SLEW = 0.05  # of the drive's slew: an amplitude beyond what it can hold is still approached, and flagged
 
-class UltrasonicTables(NamedTuple):
-    """Parameters of the mode and its electronics."""
+ELECTRONICS = ("mass", "force_constant", "drive_limit", "drive_step", "sensor_step", "sensor_noise")
+MODE = np.dtype(
+    [(name, "f8") for name in ELECTRONICS]  # as in `UltrasonicParameters`
+    + [
+        ("sensor_limit", "f8"),  # m
+        ("period", "f8"),  # s
+        ("queue", "i8"),  # address of the drive on its way, (latency, 1)
+        ("latency", "i8"),  # samples
+        ("oldest", "i8"),  # state: row of the queue
+        ("due", "f8", (1,)),  # V that acts now
+        ("z", "f8", (2,)),  # state: displacement (m) and velocity times the period (m)
+        ("propagator", "f8", (4,)),  # of e, row by row
+        ("compliance", "f8"),  # m/N
+        ("damping", "f8"),  # N s/m for which the propagator holds
+        ("resonance", "f8"),  # rad/s, alike
+    ],
+    align=True,
+)
+MODE_T = numba.from_dtype(MODE)
 
-    period: float  # s
-    mass: float  # kg
-    force_constant: float  # N/V
-    drive_limit: float  # V
-    drive_step: float  # V, 0: not quantised
-    sensor_limit: float  # m
-    sensor_step: float  # m, 0: not quantised
-    sensor_noise: float  # m rms
-
-
-class UltrasonicState(NamedTuple):
-    """State of the mode; changed in place."""
-
-    z: Array  # (2,) displacement (m) and velocity times the period (m)
-    step: Array  # (STEP,) propagator of e, row by row, and the compliance (m/N)
-    frozen: Array  # (2,) damping and resonance for which `step` holds
-    pending: Array  # (latency,) drive on its way
-    cursor: Array  # (1,) integer: oldest entry of `pending`
-    force: Array  # (1,) N: on the mode
-
-
-@kernel
-def renew_mode(tables, state, damping, resonance):
-    """Propagator of an underdamped mode of this `damping` (N s/m) and `resonance` (rad/s)."""
-    period, step = tables.period, state.step
-    s = 0.5 * damping / tables.mass
-    turn = math.sqrt(resonance * resonance - s * s)
-    fade = math.exp(-s * period)
-    cosine, sine = fade * math.cos(turn * period), fade * math.sin(turn * period) / turn
-    step[0] = cosine + s * sine
-    step[1] = sine / period
-    step[2] = -resonance * resonance * sine * period
-    step[3] = cosine - s * sine
-    step[4] = 1.0 / (tables.mass * resonance * resonance)
-    state.frozen[0], state.frozen[1] = damping, resonance
-
-
-@kernel
-def mode_advance(tables, state, mode):
-    """One sample of motion under the force, exact for the frozen `mode`: (2,) damping (N s/m), resonance (rad/s)."""
-    z, step, frozen = state.z, state.step, state.frozen
-    if mode[0] != frozen[0] or mode[1] != frozen[1]:
-        renew_mode(tables, state, mode[0], mode[1])
-    rest = step[4] * state.force[0]
-    away, rate = z[0] - rest, z[1]
-    z[0] = rest + step[0] * away + step[1] * rate
-    z[1] = step[2] * away + step[3] * rate
-
-
-@kernel
-def mode_drive(tables, state, drive):
-    """Queue a drive sample (V) and put the one now due on the mode, quantised and limited."""
-    pending, cursor = state.pending, state.cursor
-    latency, row, due = pending.shape[0], cursor[0], drive[0]
-    if latency > 0:
-        newest = due
-        due = pending[row]
-        pending[row] = newest
-        cursor[0] = row + 1 if row + 1 < latency else 0
-    asked = quantise(due, tables.drive_step, tables.drive_limit) if abs(due) < HUGE else 0.0
-    state.force[0] = tables.force_constant * asked
+SURFACE = np.dtype(
+    [
+        ("substeps", "i8"),  # samples of the carrier in one of the surface
+        ("friction_coefficient", "f8"),  # mu0, of the surface at rest
+        ("bias", "f8"),  # mu/mu0 without drive
+        ("least_ratio", "f8"),  # least mu/mu0 of the reference
+        ("load", "f8"),  # N that the amplitude is held for while no finger is there
+        ("speed", "f8"),  # m/s, alike
+        ("slew", "f8"),  # m by which the drive can change a zero amplitude in a sample of the carrier
+        ("free_damping", "f8"),  # N s/m of the mode without a finger
+        ("estimating", "i8"),  # the sensor is the friction that the sensed amplitude leaves; else the tribometer
+        ("controller", "i8"),  # address of the amplitude controller's step
+        ("controller_state", "i8"),
+        ("signals", SIGNALS),  # of the amplitude loop: addresses of the six fields below
+        ("signals_at", "i8"),  # its own address
+        ("drive", "f8", (1,)),  # V
+        ("sensed", "f8"),  # m
+        ("position", "f8"),  # NaN
+        ("wanted", "f8"),  # m: amplitude within reach
+        ("target", "c16"),  # m
+        ("flags", "i8"),
+        ("reference", "f8"),  # state: amplitude (m) at the end of the last sample
+        ("reached", "f8"),  # state: amplitude (m) that the drive could reach by then; negative: starts from rest
+        ("reading", "f8"),  # state: friction (N) by the sensed amplitude, output at the next sample
+        ("law", LAW),
+        ("mode", MODE),
+        ("sliding", SLIDING),
+    ],
+    align=True,
+)
+SURFACE_T = numba.from_dtype(SURFACE)
 
 
 @kernel
-def mode_sense(tables, state, noise, sensed, motion):
-    """Sensor and true displacement (m); returns flags."""
-    motion[0] = state.z[0]
-    value = state.z[0] + tables.sensor_noise * noise[0]
-    sensed[0] = quantise(value, tables.sensor_step, tables.sensor_limit)
-    return SENSOR_CLIPPED if abs(value) > tables.sensor_limit else 0
+def mode_step(m, drive, damping, resonance, noise):
+    """Advance the mode by a sample under `drive` (1,); return sensed and true displacement (m) at its start, and flags.
 
-
-@simulation
-def ultrasonic_run(tables, state, drive, mode, noise, sensed, motion, flags):
-    """A block of the mode alone."""
-    for n in range(drive.shape[0]):
-        mode_drive(tables, state, drive[n])
-        flags[n] = mode_sense(tables, state, noise[n], sensed[n], motion[n])
-        mode_advance(tables, state, mode[n])
-
-
-@simulation
-def closed_ultrasonic_run(
-    tables, state, control, control_state, last, position, mode, noise, wanted, sensed, motion, drive, target, flags
-):
-    """Mode and controller closed sample by sample; `last` (1,) is the drive computed one sample ago.
-
-    Row n of `drive` is what the mode was handed for interval n, so it is computed from sample n - 1.
+    The step is exact for a `damping` (N s/m) and `resonance` (rad/s) that hold over the sample.
     """
-    for n in range(sensed.shape[0]):
-        mode_drive(tables, state, last)
-        flags[n] = mode_sense(tables, state, noise[n], sensed[n], motion[n])
-        mode_advance(tables, state, mode[n])
-        drive[n, 0] = last[0]
-        flags[n] |= control_step(control, control_state, sensed[n], position[n], wanted[n], last, target[n])
+    z, phi = m.z, m.propagator
+    m.oldest = queue_drive(numba.carray(pointer(m.queue, F8), (m.latency, 1)), m.oldest, drive, m.due)
+    displacement = z[0]
+    value = displacement + m.sensor_noise * noise
+    if damping != m.damping or resonance != m.resonance:
+        m.damping, m.resonance = damping, resonance
+        s = 0.5 * damping / m.mass
+        turn = math.sqrt(resonance * resonance - s * s)
+        decay = math.exp(-s * m.period)
+        cosine, sine = decay * math.cos(turn * m.period), decay * math.sin(turn * m.period) / turn
+        phi[0], phi[1] = cosine + s * sine, sine / m.period
+        phi[2], phi[3] = -resonance * resonance * sine * m.period, cosine - s * sine
+        m.compliance = 1.0 / (m.mass * resonance * resonance)
+    rest = m.compliance * m.force_constant * quantise(m.due[0], m.drive_step, m.drive_limit)
+    e, rate = z[0] - rest, z[1]
+    z[0] = rest + phi[0] * e + phi[1] * rate
+    z[1] = phi[2] * e + phi[3] * rate
+    flags = SENSOR_CLIPPED if abs(value) > m.sensor_limit else 0
+    return quantise(value, m.sensor_step, m.sensor_limit), displacement, flags
+
+
+@step
+def ultrasonic_step(state, signals, start, count):
+    """Advance the mode by `count` samples; see `hapticrender.jit`."""
+    m = numba.carray(pointer(state, MODE_T), 1)[0]
+    io = numba.carray(pointer(signals, SIGNALS_T), 1)[0]
+    end = start + count
+    drive, inputs = numba.carray(pointer(io.drive, F8), (end, 1)), numba.carray(pointer(io.inputs, F8), (end, INPUTS))
+    noise, sensed = numba.carray(pointer(io.noise, F8), end), numba.carray(pointer(io.sensed, F8), end)
+    motion, flags = numba.carray(pointer(io.motion, F8), end), numba.carray(pointer(io.flags, I8), end)
+    for n in range(start, end):
+        x = inputs[n]
+        sensed[n], motion[n], flags[n] = mode_step(m, drive[n], x[DAMPING], x[RESONANCE], noise[n])
+    return 0
+
+
+@kernel
+def amplitude_decay(damping, finger, mass, period):
+    """Part of its amplitude that the mode loses in a sample, by its free `damping` and that estimated of the finger."""
+    return 0.5 * period * (damping + max(finger, 0.0)) / mass
+
+
+@kernel
+def within_reach(reached, reference, slew, decay):
+    """Amplitude (m) on the way from `reached` to `reference` to which the drive can take it within a sample.
+
+    With a faster reference the drive would saturate, and the loop would be open.
+    """
+    lost = decay * reached
+    rise = max(slew - lost, LEAST_SLEW * slew)
+    return reached + min(max(reference - reached, -slew - lost), rise)
+
+
+@kernel
+def references_within_reach(references, reached, slew, decay, result, flags):
+    """`within_reach` for every element of `references` (m), after `reached`; what is delayed is flagged."""
+    for n in range(references.shape[0]):
+        reached = within_reach(reached, references[n], slew, decay)
+        if reached != references[n]:
+            flags[n] |= SATURATED
+        result[n] = reached
+
+
+@kernel
+def amplitude_pass(s, reference, x, noise):
+    """Carry the amplitude on a straight line to `reference` (m); return the mean true amplitude (m) and flags.
+
+    The controller is called by address, with the signals of one sample, which are fields of the record.
+    """
+    m, flags, squares = s.mode, 0, 0.0
+    scale, z, drive = 1.0 / (x[RESONANCE] * m.period), m.z, s.drive
+    before, from_rest = s.reference, s.reached < 0.0
+    reached = s.reached
+    decay = amplitude_decay(s.free_damping, finger_damping(s.controller_state), m.mass, m.period)
+    for k in range(s.substeps):
+        line = before + (reference - before) * (k + 1) / s.substeps
+        reached = line if from_rest else within_reach(reached, line, s.slew, decay)  # from rest the fade-in is slower
+        if reached != line:
+            flags |= SATURATED
+        s.sensed, _, s.flags = mode_step(m, drive, x[DAMPING], x[RESONANCE], noise[1 + k])
+        s.wanted = reached
+        call(s.controller, (s.controller_state, s.signals_at, 0, 1))
+        flags |= s.flags
+        squares += z[0] * z[0] + scale * scale * z[1] * z[1]
+    s.reference, s.reached = reference, reached
+    return math.sqrt(squares / s.substeps), flags
+
+
+@step
+def surface_step(state, signals, start, count):
+    """Advance the surface by `count` samples; see `hapticrender.jit`.  Noise: of tribometer, then carrier."""
+    s = numba.carray(pointer(state, SURFACE_T), 1)[0]
+    io = numba.carray(pointer(signals, SIGNALS_T), 1)[0]
+    end = start + count
+    drive, inputs = numba.carray(pointer(io.drive, F8), end), numba.carray(pointer(io.inputs, F8), (end, INPUTS))
+    noise, sensed = (
+        numba.carray(pointer(io.noise, F8), (end, 1 + s.substeps)),
+        numba.carray(pointer(io.sensed, F8), end),
+    )
+    motion, flags = numba.carray(pointer(io.motion, F8), (end, 3)), numba.carray(pointer(io.flags, I8), end)
+    for n in range(start, end):
+        x = inputs[n]
+        load, speed, touching = x[LOAD], x[SPEED], not math.isnan(x[SPEED]) and x[LOAD] > 0.0
+        whole = s.friction_coefficient * load if touching else 0.0
+        pace = max(abs(speed), s.sliding.least_speed) if touching else s.speed
+        ratio = s.bias + (drive[n] / whole if touching and abs(drive[n]) < HUGE else 0.0)
+        inside = min(max(ratio, s.least_ratio), 1.0)
+        reference = reference_amplitude(s.law, inside, load if touching else s.load, pace)
+        amplitude, raised = amplitude_pass(s, reference, x, noise[n])
+        steady = whole * friction_ratio(s.law, amplitude, load, pace)
+        friction, reading, skin_velocity = sliding_step(s.sliding, steady, speed, noise[n, 0])
+        if s.estimating:
+            reading, (re, im) = s.reading, observed_envelope(s.controller_state)
+            s.reading = whole * friction_ratio(s.law, math.hypot(re, im), load, pace)
+        elif abs(reading) >= s.sliding.force_range:
+            raised |= SENSOR_CLIPPED
+        sensed[n], flags[n] = reading, raised if inside == ratio else raised | SATURATED
+        motion[n, FRICTION], motion[n, AMPLITUDE] = friction, amplitude
+        motion[n, SKIN_VELOCITY] = skin_velocity / x[STRENGTH] if x[STRENGTH] > 0.0 else 0.0
+    return 0

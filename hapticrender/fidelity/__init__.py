@@ -1,1 +1,0 @@
-"""The least model of a device that a scene needs."""

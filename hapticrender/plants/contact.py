@@ -1,0 +1,232 @@
+"""The sliding contact that every friction device shares, the skin that friction moves, and a tribometer.
+
+A device sets the steady friction force F_s.  The friction F on a finger sliding at speed v follows it over the
+contact's memory length delta (Balasubramanian, Pool and Vardar 2025), the tribometer under the surface measures F
+through its own resonance (F_t), and F drives the skin, whose impedance is Z_f::
+
+    (delta/|v|) F' + F = F_s
+    F_t'' + 2 zeta w0 F_t' + w0^2 F_t = w0^2 F
+    v_skin = F/Z_f(s)
+
+Below `least_speed` the contact sticks and keeps its friction; a lifted finger has none.  Friction is positive against
+the motion, in either direction.  A step outputs the state at the start of a sample, then advances: exactly for a steady
+friction and a speed that are constant over the sample; skin and tribometer are exact for a friction that changes
+linearly within it.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from hapticrender.checks import Validated, parameter
+from hapticrender.jit import kernel
+from hapticrender.plants.compiled import quantise
+from hapticrender.protocols import Array
+
+if TYPE_CHECKING:
+    from hapticrender.touch.mechanics import FingerMechanics
+
+SKIN_VELOCITY = 2  # entry of the skin's state: displacements of skin and phalanx (m), then their velocities (m/s)
+
+SLIDING = np.dtype(
+    [(name, "f8") for name in ("least_speed", "force_noise", "force_step", "force_range")]  # as in `SlidingParameters`
+    + [
+        ("renewal", "f8"),  # T/delta, s/m: share of the contact's memory that is renewed in a sample, per speed
+        ("skin_step", "f8", (4, 6)),  # of a sample: Phi, then the input columns of friction at its start and its end
+        ("tribometer_step", "f8", (2, 4)),  # the same for the tribometer's force and its rate
+        ("friction", "f8"),  # state: N
+        ("skin", "f8", (4,)),  # state: m, m, m/s, m/s
+        ("tribometer", "f8", (2,)),  # state: force (N) and its rate over w0 (N)
+    ],
+    align=True,
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class SlidingParameters(Validated):
+    """Parameters of the sliding contact and of the tribometer under it.
+
+    Parameters
+    ----------
+    rate : float, Hz
+        Sampling rate of the surface, 1000 to 1e6.
+    friction_coefficient : float
+        mu, friction over normal force, > 0 (dry to moist glass: 0.3 to 2).
+    memory_length : float, m
+        delta, sliding distance over which the contact is renewed, > 0.
+    least_speed : float, m/s
+        Slower than this the contact sticks, > 0.
+    tribometer_frequency : float, Hz
+        Resonance f0 of the tribometer, > 0 and at most half the rate.
+    tribometer_damping : float
+        Damping ratio zeta, > 0; with 0.44 or more it is flat within 0.5 dB up to 400 Hz.
+    force_noise : float, N rms
+        White noise of the tribometer, >= 0.
+    force_range : float, N
+        It measures forces within +- this, > 0.
+    force_bits : int
+        Resolution over +- force_range; 0 is ideal.
+
+    Notes
+    -----
+    delta is 11.5 um where the cut-off v/(2 pi delta) grows by 13.8 Hz per mm/s, as measured over 20-100 mm/s and
+    0.2-0.6 N (Balasubramanian, Pool and Vardar 2025).  The tribometer is that of Grigorii et al. 2021: resonance at
+    1.3 kHz, flat within +-0.5 dB over 20-400 Hz.  Friction coefficient, damping, noise and range are engineering
+    defaults.
+    """
+
+    rate: float = parameter(10e3, "Hz", least=1e3, most=1e6)
+    friction_coefficient: float = parameter(0.8, above=0.0)
+    memory_length: float = parameter(11.5e-6, "m", above=0.0)
+    least_speed: float = parameter(1e-3, "m/s", above=0.0)
+    tribometer_frequency: float = parameter(1300.0, "Hz", above=0.0)
+    tribometer_damping: float = parameter(0.65, above=0.0)
+    force_noise: float = parameter(1e-3, "N")
+    force_range: float = parameter(20.0, "N", above=0.0)
+    force_bits: int = parameter(0, least=0, most=24)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.tribometer_frequency > self.rate / 2:
+            raise ValueError(
+                f"tribometer_frequency = {self.tribometer_frequency!r}: must be <= {self.rate / 2:g} Hz, half the rate"
+            )
+
+    @property
+    def force_step(self) -> float:
+        """Resolution of the tribometer (N); 0 is ideal."""
+        return 2 * self.force_range / 2**self.force_bits if self.force_bits else 0.0
+
+    def cutoff(self, speed: Any) -> Any:
+        """Cut-off of the friction's lag at `speed` (m/s), Hz: |v|/(2 pi delta)."""
+        return np.abs(speed) / (2 * np.pi * self.memory_length)
+
+    def lag_response(self, frequency: Any, speed: float) -> Any:
+        """Friction per steady friction (complex) at `frequency` (Hz), the hold and the sampling included.
+
+        (1 - a)/(z - a) with a = exp(-|v| T/delta); 0 where the contact sticks.
+        """
+        kept = math.exp(-abs(speed) / (self.rate * self.memory_length)) if abs(speed) >= self.least_speed else 1.0
+        return (1 - kept) / (self._shift(frequency) - kept)
+
+    def tribometer_response(self, frequency: Any) -> Any:
+        """Sensed friction per friction (complex) at `frequency` (Hz)."""
+        return _ramp_response(_tribometer_step(self), 0, self._shift(frequency))
+
+    def skin_response(self, frequency: Any, mechanics: FingerMechanics) -> Any:
+        """Skin velocity per friction (complex, m/(N s)) at `frequency` (Hz)."""
+        return _ramp_response(_skin_step(self, mechanics), SKIN_VELOCITY, self._shift(frequency))
+
+    def frequency_response(self, frequency: Any, speed: float) -> Any:
+        """Sensed friction per steady friction (complex) at `frequency` (Hz) for a finger at `speed` (m/s)."""
+        return self.lag_response(frequency, speed) * self.tribometer_response(frequency)
+
+    def _shift(self, frequency: Any) -> Any:
+        """Return z = exp(j w T)."""
+        return np.exp(2j * np.pi * np.asarray(frequency, float) / self.rate)
+
+
+def new_record(dtype: np.dtype[Any], *sources: object, **values: Any) -> Array:
+    """Return a record (shape (1,)) with numbers of the same name from `sources`, or from `values`; the rest is zero."""
+    record = np.zeros(1, dtype)
+    for name in dtype.names or ():
+        for source in sources:
+            value = getattr(source, name, None)
+            if isinstance(value, (int, float, complex)):
+                record[name] = value
+        if name in values:
+            record[name] = values[name]
+    return record
+
+
+def sliding_record(parameters: SlidingParameters, mechanics: FingerMechanics) -> Array:
+    """Return the record (`SLIDING`, shape (1,)) of a contact at rest, without friction, of a finger with `mechanics`.
+
+    The masses that the order of the mechanics (0, 2 or 4) uses must be > 0.
+    """
+    return new_record(
+        SLIDING,
+        parameters,
+        renewal=1.0 / (parameters.rate * parameters.memory_length),
+        skin_step=_skin_step(parameters, mechanics),
+        tribometer_step=_tribometer_step(parameters),
+    )
+
+
+def _skin_step(parameters: SlidingParameters, mechanics: FingerMechanics) -> Array:
+    """One sample of the skin under friction, shape (4, 6); states that the order leaves out stay at zero."""
+    system, force = np.zeros((4, 4)), np.zeros(4)
+    if mechanics.order:
+        k, b, m = mechanics.stiffness, mechanics.damping, _mass("mass", mechanics.mass, mechanics.order)
+        system[0, 2], force[2] = 1.0, 1 / m
+        system[2] = np.array([-k, k, -b, b]) / m
+        if mechanics.order == 4:
+            m = _mass("phalanx_mass", mechanics.phalanx_mass, 4)
+            system[1, 3] = 1.0
+            system[3] = np.array([k, -k - mechanics.phalanx_stiffness, b, -b - mechanics.phalanx_damping]) / m
+    return _ramp_step(system, force, 1 / parameters.rate)
+
+
+def _mass(name: str, value: float, order: int) -> float:
+    if not value > 0.0:
+        raise ValueError(f"mechanics.{name} = {value!r}: must be > 0 kg where order = {order}")
+    return value
+
+
+def _tribometer_step(parameters: SlidingParameters) -> Array:
+    """One sample of the tribometer's force and of its rate over w0, shape (2, 4)."""
+    w = 2 * math.pi * parameters.tribometer_frequency
+    system = w * np.array([[0.0, 1.0], [-1.0, -2 * parameters.tribometer_damping]])
+    return _ramp_step(system, np.array([0.0, w]), 1 / parameters.rate)
+
+
+def _ramp_step(system: Array, inputs: Array, period: float) -> Array:
+    """Discretise a linear system with a first-order hold: Phi, then the columns of its input before and after.
+
+    From the exponential of [[A T, B T, 0], [0, 0, 1], [0, 0, 0]]: Phi, and the parts of the start and of the rise.
+    """
+    from scipy.linalg import expm
+
+    n = len(inputs)
+    whole = np.zeros((n + 2, n + 2))
+    whole[:n, :n], whole[:n, n], whole[n, n + 1] = system * period, inputs * period, 1.0
+    step = expm(whole)[:n]
+    step[:, n] -= step[:, n + 1]
+    return step
+
+
+def _ramp_response(step: Array, row: int, z: Any) -> Any:
+    """Response of state `row` to the input of a `_ramp_step` at complex `z`: (z - Phi)^-1 (G_0 + z G_1)."""
+    n = len(step)
+    z = np.asarray(z)[..., None, None]
+    return np.linalg.solve(z * np.eye(n) - step[:, :n], step[:, n : n + 1] + z * step[:, n + 1 :])[..., row, 0]
+
+
+@kernel
+def sliding_step(s, steady_friction, speed, noise):
+    """Advance the contact by a sample; return friction, measured friction (N) and skin velocity (m/s) at its start.
+
+    `s` is a record of `SLIDING`; `steady_friction` (N) and `speed` (m/s, NaN: lifted) hold over the sample; `noise` is
+    of unit variance.
+    """
+    before = after = s.friction
+    if math.isnan(speed):
+        after = 0.0
+    elif abs(speed) >= s.least_speed:
+        after = steady_friction + (before - steady_friction) * math.exp(-abs(speed) * s.renewal)
+    s.friction = after
+    phi, x = s.tribometer_step, s.tribometer
+    x0, x1 = x[0], x[1]
+    measured = quantise(x0 + s.force_noise * noise, s.force_step, s.force_range)
+    for i in range(2):
+        x[i] = phi[i, 0] * x0 + phi[i, 1] * x1 + phi[i, 2] * before + phi[i, 3] * after
+    phi, x = s.skin_step, s.skin
+    x0, x1, x2, x3 = x[0], x[1], x[2], x[3]
+    for i in range(4):
+        free = phi[i, 0] * x0 + phi[i, 1] * x1 + phi[i, 2] * x2 + phi[i, 3] * x3
+        x[i] = free + phi[i, 4] * before + phi[i, 5] * after
+    return before, measured, x2

@@ -1,0 +1,419 @@
+"""The vibrotactile plate of Grigorii et al. 2021: two coils, a sheet of glass, Hall sensors at its ends, a finger.
+
+Equations, with q = [x_c, a theta], a = coil_spacing/2, side 1 at -a, finger at p::
+
+    (M s^2 + C s + K) q = force_constant [[1, 1], [-1, 1]] i - F_f [1, p/a]
+    M = diag(m, I/a^2), K = [[k1+k2, k2-k1], [k2-k1, k1+k2]], C alike
+    F_f = W + Z_f(s) s (x_c + p theta)
+
+The paper's own force equations carry (m/2) x_i'' -+ (I/2) theta'', which is dimensionally wrong; the form above is
+(m/2) x_c'' -+ (I/d) theta''.
+
+As a further level the glass bends: a displacement e of the sensors in the first free-free bending mode, of shape phi
+(1 at the sensors), adds phi(x) e at x and obeys, with the damping ratio zeta and m_b its modal mass::
+
+    m_b (e'' + 2 zeta w_b e' + w_b^2 e) = phi_coil force_constant (i_1 + i_2) - phi(p) F_f
+
+and the finger moves with x_c + p theta + phi(p) e.  Frequency and damping are those measured on the free plate, its
+suspension included, so that the finger alone couples the mode to heave and rocking.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from scipy.linalg import block_diag, expm
+
+from hapticrender.checks import Validated, parameter
+from hapticrender.control.bandmodel import BandModel
+from hapticrender.control.damping import BendingMode
+from hapticrender.plants.compiled import CompiledPlant, aligned_record
+from hapticrender.plants.plate_kernels import COLUMNS, FUNCTIONS, NODES, PLATE, plate_step
+from hapticrender.protocols import Array
+from hapticrender.touch.mechanics import NONE, FingerMechanics
+
+if TYPE_CHECKING:
+    from hapticrender.touch.finger import Finger
+
+PLACES = ("centre", "end 1", "end 2")
+EXPECTED_BENDING = BendingMode(  # estimate for a plate that was not measured: 1.1-1.4 kHz, either sign
+    frequency=1250.0, damping=0.01, coupling=(0.1 / 9.5e-3, 0.0), spread=150.0, measured=False
+)
+FREE_FREE = 2.365020372431352  # half of the first root of cos(x) cosh(x) = 1: the first even mode of a free bar
+NOMINAL_AMPLIFIER = (1 - 2e3 / 1.0) / 10e3  # A/V: gain of the default parts, by which a drive in A becomes volts
+
+
+@dataclass(frozen=True, kw_only=True)
+class PlateParameters(Validated):
+    """Everything that describes the plate, its electronics and how finely it is modelled.
+
+    Parameters
+    ----------
+    mass, inertia : float, kg, kg m2
+        Moving mass and its inertia about the middle, > 0.
+    stiffness_1, stiffness_2 : float, N/m
+        Coil suspensions, > 0.
+    damping_1, damping_2 : float, N s/m
+        Coil dampings, >= 0.
+    force_constant : float, N/A
+        Of each coil, > 0.
+    coil_spacing, glass_length : float, m
+        Distance between the coils; length of the glass, the sensors sit at its ends.
+    amplifier_r1, amplifier_r2, amplifier_rp : float, ohm
+        Transconductance amplifier, i = V/R1 (1 - R2/Rp).  The drive is the current (A) that the default parts give;
+        other parts give another current.
+    current_limit : float, A
+        Of each coil, > 0 (engineering default).
+    current_bits : int
+        Resolution of the command over +- current_limit; 0 is ideal.
+    sensor_range : float, m
+        Full range of a sensor.
+    sensor_bits : int
+        Resolution over sensor_range; 0 is ideal.
+    sensor_noise : float, m rms
+        White noise of each sensor, >= 0.
+    sensor_gain_1, sensor_gain_2 : float
+        Reading per displacement of each sensor, > 0; the controller assumes 1.
+    rate : float, Hz
+        Sampling rate of the embedded loop.
+    delay : int, samples
+        Loop delay, >= 1: from a sensed sample to the drive computed from it.
+    coils : int
+        2: each at its suspension; 1: in the middle, which moves heave alone.
+    degrees_of_freedom : int
+        2: heave and rocking; 1: heave only.
+    finger_dynamics : int
+        1: the finger's mechanics act on the plate; 0: only its static load.
+    bending_frequency : float, Hz
+        First bending mode of the glass, at most `rate`; 0: the glass is rigid.
+    bending_damping : float
+        Damping ratio of that mode, >= 0.
+    bending_mass : float, kg
+        Its modal mass, the shape being 1 at the sensors; > 0.
+    bending_coil : float
+        Its shape at the coils, -1 to 1.  The coils sit near its nodes, so the sign has to be measured.
+
+    Notes
+    -----
+    Defaults are the printed values of Grigorii et al. 2021; the limits of current and sensors are engineering
+    defaults, the numbers of the bending mode are estimates for such a sheet of glass (1.1-1.4 kHz, 9.5 g, 0.01, +-0.1).
+    """
+
+    mass: float = parameter(32e-3, "kg", above=0.0)
+    inertia: float = parameter(4e-5, "kg m2", above=0.0)
+    stiffness_1: float = parameter(22.4e3, "N/m", above=0.0)
+    stiffness_2: float = parameter(22.9e3, "N/m", above=0.0)
+    damping_1: float = parameter(0.85, "N s/m")
+    damping_2: float = parameter(0.85, "N s/m")
+    force_constant: float = parameter(7.4, "N/A", above=0.0)
+    coil_spacing: float = parameter(55e-3, "m", above=0.0)
+    glass_length: float = parameter(110e-3, "m", above=0.0)
+    amplifier_r1: float = parameter(10e3, "ohm", above=0.0)
+    amplifier_r2: float = parameter(2e3, "ohm", above=0.0)
+    amplifier_rp: float = parameter(1.0, "ohm", above=0.0)
+    current_limit: float = parameter(3.0, "A", above=0.0)
+    current_bits: int = parameter(12, most=24)
+    sensor_range: float = parameter(2e-3, "m", above=0.0)
+    sensor_bits: int = parameter(14, most=24)
+    sensor_noise: float = parameter(1e-6, "m")
+    sensor_gain_1: float = parameter(1.0, above=0.0)
+    sensor_gain_2: float = parameter(1.0, above=0.0)
+    rate: float = parameter(5000.0, "Hz", least=500.0, most=1000000.0)
+    delay: int = parameter(1, "samples", least=1, most=100_000)
+    coils: int = parameter(2, least=1, most=2)
+    degrees_of_freedom: int = parameter(2, least=1, most=2)
+    finger_dynamics: int = parameter(1, most=1)
+    bending_frequency: float = parameter(0.0, "Hz")
+    bending_damping: float = parameter(0.01)
+    bending_mass: float = parameter(9.5e-3, "kg", above=0.0)
+    bending_coil: float = parameter(-0.1, least=-1.0, most=1.0)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.bending_frequency > self.rate:
+            raise ValueError(f"bending_frequency = {self.bending_frequency!r}: must be <= rate = {self.rate:g} Hz")
+
+    @property
+    def half_spacing(self) -> float:
+        """Half the coil spacing a (m)."""
+        return self.coil_spacing / 2
+
+    @property
+    def amplifier_gain(self) -> float:
+        """Coil current per command voltage (A/V): (1 - R2/Rp)/R1, about -1/5."""
+        return (1 - self.amplifier_r2 / self.amplifier_rp) / self.amplifier_r1
+
+    @property
+    def current_step(self) -> float:
+        """Resolution of the coil current (A); 0 is ideal."""
+        return 2 * self.current_limit / 2**self.current_bits if self.current_bits else 0.0
+
+    @property
+    def sensor_step(self) -> float:
+        """Resolution of a sensor (m); 0 is ideal."""
+        return self.sensor_range / 2**self.sensor_bits if self.sensor_bits else 0.0
+
+    @property
+    def mass_matrix(self) -> Array:
+        """M (kg, shape (2, 2)) in heave and rocking."""
+        return np.diag([self.mass, self.inertia / self.half_spacing**2])
+
+    @property
+    def damping_matrix(self) -> Array:
+        """C (N s/m, shape (2, 2))."""
+        return _pair(self.damping_1, self.damping_2)
+
+    @property
+    def stiffness_matrix(self) -> Array:
+        """K (N/m, shape (2, 2))."""
+        return _pair(self.stiffness_1, self.stiffness_2)
+
+    @property
+    def force_from_drive(self) -> Array:
+        """Generalised forces per coil current (N/A, shape (2, coils))."""
+        if self.coils == 1:
+            return self.force_constant * np.array([[1.0], [0.0]])
+        return self.force_constant * np.array([[1.0, 1.0], [-1.0, 1.0]])
+
+    @property
+    def bending(self) -> BendingMode | None:
+        """The bending mode as the sensors and coils see it, in heave and rocking; None where the glass is rigid."""
+        if self.bending_frequency == 0.0:
+            return None
+        return BendingMode(
+            frequency=self.bending_frequency,
+            damping=self.bending_damping,
+            coupling=(self.bending_coil / self.bending_mass, 0.0),
+        )
+
+    def bending_shape(self, position: Array | float) -> Array:
+        """Shape of the bending mode at `position` (m from the middle), that of a free bar: 1 at the ends, -0.61 there.
+
+        The coils have a number of their own, `bending_coil`: a free bar would give -0.099 at the quarter points.
+        """
+        wavenumber, grow, wave = self.bending_bar
+        angle = wavenumber * np.asarray(position, float)
+        return grow * np.cosh(angle) + wave * np.cos(angle)
+
+    @property
+    def bending_bar(self) -> tuple[float, float, float]:
+        """Wavenumber (rad/m) of the bending mode and the weights of its cosh and cos."""
+        return 2 * FREE_FREE / self.glass_length, 0.5 / math.cosh(FREE_FREE), 0.5 / math.cos(FREE_FREE)
+
+    def modes(self) -> tuple[Array, Array]:
+        """Undamped-equivalent frequencies (Hz, ascending) and damping ratios of the free, rigid plate's two modes."""
+        inverse = np.linalg.inv(self.mass_matrix)
+        system = np.block(
+            [[np.zeros((2, 2)), np.eye(2)], [-inverse @ self.stiffness_matrix, -inverse @ self.damping_matrix]]
+        )
+        poles = np.linalg.eigvals(system)
+        poles = poles[poles.imag > 0]
+        poles = poles[np.argsort(abs(poles))]
+        return abs(poles) / (2 * np.pi), -poles.real / abs(poles)
+
+    def static_load(self, side_1: float, side_2: float) -> tuple[float, float]:
+        """Normal load (N) and finger position (m from the middle, towards side 2) from the slow sag of the sides (m).
+
+        W = -(k1 x1 + k2 x2); the distance from transducer 2 towards 1 is d k1 x1/(k1 x1 + k2 x2), which the
+        paper prints as d (k2 x2/(k1 x1) + 1)^-1 and so divides by zero where side 1 does not sag.
+        """
+        carried_1, carried_2 = self.stiffness_1 * side_1, self.stiffness_2 * side_2
+        load = -(carried_1 + carried_2)
+        if load == 0.0:
+            raise ValueError(f"{side_1=}, {side_2=}: the sides carry no net load, so it has no position")
+        return load, self.half_spacing + self.coil_spacing * carried_1 / load
+
+    def dynamic_stiffness(self, frequency: Array, finger: Array | complex = 0.0, position: float = 0.0) -> Array:
+        """D(j w) in heave and rocking (N/m, shape (..., 2, 2)) under a finger impedance (N s/m) at `position` (m).
+
+        The glass counts as rigid, also where it bends: near and above `bending_frequency` this is no longer the plate.
+        """
+        s = 2j * np.pi * np.asarray(frequency, float)[..., None, None]
+        lever = np.array([1.0, position / self.half_spacing])
+        load = np.asarray(finger, complex)[..., None, None] * s * np.outer(lever, lever)
+        return self.mass_matrix * s**2 + self.damping_matrix * s + self.stiffness_matrix + load
+
+    def band_model(self, rate: float, delay: int) -> BandModel:
+        """What the controller may know of this plate, in a loop of `rate` (Hz) and `delay` (samples)."""
+        reach, n = self.glass_length / self.coil_spacing, self.coils  # one coil moves one coordinate
+        ends_from_coordinate = np.array([[1.0, -reach], [1.0, reach]])
+        return BandModel(
+            rate=rate,
+            delay=delay,
+            mass=self.mass_matrix[:n, :n],
+            damping=self.damping_matrix[:n, :n],
+            stiffness=self.stiffness_matrix[:n, :n],
+            force_from_drive=self.force_from_drive[:n],
+            coordinate_from_sensed=np.linalg.inv(ends_from_coordinate)[:n] / (self.sensor_gain_1, self.sensor_gain_2),
+            side_from_coordinate=np.array([[1.0, -1.0], [1.0, 1.0]])[:n, :n],
+            place_from_coordinate=np.array([[1.0, 0.0], [1.0, -reach], [1.0, reach]])[:, :n],
+            places=PLACES,
+            drive_limit=self.current_limit,
+            sensed_limit=self.sensor_range / 2,
+            drive_step=self.current_step,
+            sensed_noise=self.sensor_noise,
+            bending=self.bending,
+            rigid=self.bending is None,
+        )
+
+
+def _pair(side_1: float, side_2: float) -> Array:
+    """Two equal-kind elements at the coils, in heave and rocking."""
+    return np.array([[side_1 + side_2, side_2 - side_1], [side_2 - side_1, side_1 + side_2]])
+
+
+class Structure(NamedTuple):
+    """Plate and finger as M q'' + C q' + K q = inputs u, y = outputs q.
+
+    The coordinates q (m) are heave, rocking (displacement at the coils; unless it is locked), bending (displacement of
+    the sensors; where the glass bends) and the phalanx (under a finger of order 4), n in all.
+
+    Attributes
+    ----------
+    mass, damping, stiffness : ndarray, shape (n, n), kg, N s/m, N/m
+    inputs : ndarray, shape (n, coils + 1)
+        Forces per coil current (N/A), and per normal load of the finger.
+    outputs : ndarray, shape (4, n)
+        Displacements at centre, end 1, end 2 and of the glass under the finger; its rows give velocities from q'.
+    """
+
+    mass: Array
+    damping: Array
+    stiffness: Array
+    inputs: Array
+    outputs: Array
+
+    def zero_order_hold(self, rate: float) -> tuple[Array, Array]:
+        """Phi (2n, 2n) and Gamma (2n, inputs) of [q, q'] from sample to sample (Hz) under held inputs, exactly."""
+        n, m = self.inputs.shape
+        generator = np.zeros((2 * n + m, 2 * n + m))
+        generator[:n, n : 2 * n] = np.eye(n)
+        generator[n : 2 * n] = np.linalg.solve(self.mass, np.hstack([-self.stiffness, -self.damping, self.inputs]))
+        held = expm(generator / rate)[: 2 * n]
+        return held[:, : 2 * n], held[:, 2 * n :]
+
+
+def structure(
+    parameters: PlateParameters, mechanics: FingerMechanics = NONE, position: float = 0.0, strength: float = 1.0
+) -> Structure:
+    """Assemble mass, damping and stiffness matrices of the plate with a finger on it.
+
+    Parameters
+    ----------
+    parameters : PlateParameters
+    mechanics : FingerMechanics
+        Order 0 adds nothing but the normal load, 2 its impedance, 4 the phalanx as a coordinate of its own.
+    position : float, m
+        Of the finger, from the middle.
+    strength : float
+        Factor on the finger's impedance, >= 0; 0: the finger is lifted.
+
+    Raises
+    ------
+    ValueError
+        A finger of order 4 has a phalanx without mass.
+    """
+    order = mechanics.order if parameters.finger_dynamics and strength > 0.0 else 0
+    if order == 4 and not mechanics.phalanx_mass > 0.0:
+        raise ValueError(f"phalanx_mass = {mechanics.phalanx_mass!r} kg: must be > 0")
+    omega, modal = 2 * math.pi * parameters.bending_frequency, parameters.bending_mass
+    reach, centre, bend = (
+        parameters.glass_length / parameters.coil_spacing,
+        *parameters.bending_shape(np.array([0.0, position])),
+    )
+    diagonals = (
+        (parameters.mass_matrix, modal, mechanics.phalanx_mass),
+        (parameters.damping_matrix, 2 * parameters.bending_damping * omega * modal, mechanics.phalanx_damping),
+        (parameters.stiffness_matrix, omega**2 * modal, mechanics.phalanx_stiffness),
+    )
+    matrices = [block_diag(rigid, bent, strength * phalanx) for rigid, bent, phalanx in diagonals]
+    glass = np.array([1.0, position / parameters.half_spacing, bend, 0.0])  # its displacement under the finger
+    tissue = glass - [0.0, 0.0, 0.0, order == 4]
+    if order:
+        for matrix, value, acting in zip(
+            matrices, (mechanics.mass, mechanics.damping, mechanics.stiffness), (glass, tissue, tissue), strict=True
+        ):
+            matrix += strength * value * np.outer(acting, acting)
+    coils = parameters.force_from_drive
+    bending_force = np.full((1, parameters.coils), parameters.force_constant * parameters.bending_coil)
+    inputs = np.column_stack([np.vstack([coils, bending_force, 0 * bending_force]), -glass])
+    outputs = np.array([[1.0, 0.0, centre, 0.0], [1.0, -reach, 1.0, 0.0], [1.0, reach, 1.0, 0.0], glass])
+    kept = np.flatnonzero([True, parameters.degrees_of_freedom == 2, omega > 0.0, order == 4])
+    mass, damping, stiffness = (matrix[np.ix_(kept, kept)] for matrix in matrices)
+    return Structure(mass, damping, stiffness, inputs[kept], outputs[:, kept])
+
+
+class Plate(CompiledPlant):
+    """The plate in discrete time, behind the `Plant` protocol.
+
+    `motion` holds the displacements at `PLACES` (m) and, in a fourth column, the velocity of the glass under the
+    finger (m/s).
+
+    Parameters
+    ----------
+    parameters : PlateParameters
+        The plate and its levels of modelling.
+    finger : Finger
+        Its position, normal load and mechanics.
+    seed : int
+        Of the sensor noise.
+    block : int, samples
+        Samples of a `run` call; the rest of the delay is queued inside.
+    """
+
+    step = plate_step
+    sensed_channels = noise_channels = 2
+    motion_channels, places = 4, len(PLACES)
+
+    def __init__(self, parameters: PlateParameters, finger: Finger, seed: int = 0, block: int = 1) -> None:
+        self.drive_channels = parameters.coils
+        super().__init__(finger, parameters.rate, delay=parameters.delay, block=block, seed=seed)
+        self.parameters = parameters
+        queue = np.zeros((self.delay - block, parameters.coils))
+        self.buffers = (queue,)
+        self.state = _record(parameters, finger.mechanics)
+        self.state["queue"], self.state["latency"] = queue.ctypes.data, len(queue)
+
+    def inputs(self, first: int, n: int) -> Array:
+        """Position (m), load (N) and strength of the finger, and a column that the plate does not use."""
+        inputs = np.zeros((n, 4))
+        inputs[:, :3] = self.finger.touch((first + np.arange(n)) / self.rate)
+        return inputs
+
+
+def _record(parameters: PlateParameters, mechanics: FingerMechanics) -> Array:
+    """State of the compiled plate at rest, its drive not queued."""
+    s, period = aligned_record(PLATE), 1.0 / parameters.rate
+    free, loaded = structure(parameters), structure(parameters, mechanics)
+    many, scales = len(free.mass), (-(period**2), -period, period**2)
+    kept = np.flatnonzero([True, parameters.degrees_of_freedom == 2, parameters.bending_frequency > 0.0])
+    for first, matrix, scale in zip((0, 4), (free.stiffness, free.damping), scales, strict=False):
+        s["free"][0, first + kept[:, None], kept] = scale * matrix
+    s["free"][0, 8 : 8 + parameters.coils][:, kept] = scales[2] * free.inputs[:, :-1].T
+    s["inverse_mass"][0, kept] = 1.0 / free.mass.diagonal()
+    if parameters.finger_dynamics and mechanics.order:
+        s["skin"] = period**2 * mechanics.stiffness, period * mechanics.damping, mechanics.mass
+    if len(loaded.mass) > many:
+        s["inverse_mass"][0, 3] = 1.0 / loaded.mass[-1, -1]
+        s["phalanx"] = period**2 * mechanics.phalanx_stiffness, period * mechanics.phalanx_damping
+    s["outputs"][0][:, kept] = free.outputs[:3]
+    s["system"][0, 4:8, :4] = np.eye(4)
+    s["held"] = s["bent_at"] = s["lever"] = s["strength"] = np.nan
+    if parameters.bending_frequency > 0.0:
+        wavenumber, *weights = parameters.bending_bar
+        s["shape"] = wavenumber * parameters.half_spacing, *weights
+    s["lever_per_metre"], s["period"], s["rate"] = 1.0 / parameters.half_spacing, period, parameters.rate
+    s["reach"] = parameters.glass_length / parameters.coil_spacing
+    s["nodes_per_lever"] = (NODES - 1) / (2.0 * s["reach"])
+    s["amplifier"] = parameters.amplifier_gain / NOMINAL_AMPLIFIER
+    for name in ("current_limit", "current_step", "sensor_step", "sensor_noise"):
+        s[name] = getattr(parameters, name)
+    s["sensor_limit"] = parameters.sensor_range / 2
+    s["sensor_gain"] = parameters.sensor_gain_1, parameters.sensor_gain_2
+    s["channels"], s["columns"] = parameters.coils, COLUMNS
+    for name, function in FUNCTIONS.items():
+        s[name] = function.address
+    return s
