@@ -1,4 +1,4 @@
-"""What a driver is, in a page, and the duties that every driver shares.
+"""The driver protocol in a page, and the part that every driver shares.
 
 A driver carries samples to a device, a file or a plant model, and back.  Any
 object is one that has
@@ -15,6 +15,10 @@ object is one that has
     plays a block, float64 of shape (block, drive_channels), in A, and returns `Sensed` of as many samples
 ``__enter__``, ``__exit__``
     makes the device ready, and leaves it at rest with zero drive whatever has happened
+``zero_on_exit`` (optional)
+    True where ``__exit__`` plays zeros by itself; otherwise the loop plays them before it leaves
+``exchange(controller)`` (optional)
+    a whole closed loop of its own, sample by sample; see ``protocols.Exchange``
 
 Sample i of the drive is held during interval i; sample i of what `play`
 returns was taken at the *start* of interval i, before that drive could act.
@@ -76,7 +80,7 @@ from typing import Self
 
 import numpy as np
 
-from hapticrender.contract import check_driver as check_driver
+from hapticrender.driver_checks import check_driver as check_driver
 from hapticrender.errors import DriverError
 from hapticrender.protocols import Array, Sensed
 
@@ -127,7 +131,7 @@ class BaseDriver:
     drive_channels : int, >= 1
         Columns of drive.
     sensed_channels : int, >= 0
-        Columns of what is sensed.
+        Columns of the measurements.
     block : int, >= 1
         Samples a call of `play`.
     delay : int, >= block, optional
@@ -138,6 +142,8 @@ class BaseDriver:
     ValueError
         A number is out of its bound.
     """
+
+    zero_on_exit = True
 
     def __init__(
         self, *, rate: float, drive_channels: int, sensed_channels: int, block: int = 1, delay: int | None = None

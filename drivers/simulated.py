@@ -1,17 +1,18 @@
-"""The embedded default: a plant model behind the driver protocol."""
+"""The default driver: a plant model behind the driver protocol."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 from hapticrender.drivers.base import BaseDriver
-from hapticrender.protocols import Array, Controller, Plant, Sensed
+from hapticrender.protocols import Array, Controller, Exchange, Plant, Sensed
 
 
 class SimulatedDriver(BaseDriver):
     """Plays on a plant model instead of hardware.
 
-    Where the plant can be closed with a controller inside compiled code, the
-    loop does so (`plant.closed_loop`); `play` gives the same samples one block
-    at a time.
+    Where the plant can run in closed loop with a controller inside compiled
+    code, `exchange` does so; `play` gives the same samples one block at a time.
 
     Parameters
     ----------
@@ -30,16 +31,21 @@ class SimulatedDriver(BaseDriver):
             delay=plant.delay,
         )
 
-    def compiled_with(self, controller: Controller) -> Plant | None:
-        """Return the plant where it can be closed with `controller` in compiled code, sample by sample.
+    def exchange(self, controller: Controller) -> Exchange | None:
+        """Return the compiled exchange of plant and controller; None where they have to run block by block.
 
-        A subclass that plays in its own way is taken at its word: it gets its blocks.
+        A subclass that plays in its own way gets its blocks.
         """
-        whole = type(self) is SimulatedDriver and self.block == 1
-        return self.plant if whole and self.plant.closes(controller) else None
+        if type(self) is not SimulatedDriver or self.block != 1 or not self.plant.closes(controller):
+            return None
+
+        def advance(count: int, reference: Callable[[Array], Array]) -> tuple[Array, Array, Array, Sensed]:
+            return self.plant.closed_loop(controller, reference(self.plant.finger_position(count)))
+
+        return advance
 
     def close(self) -> None:
-        """Play zeros as any driver does, where anything was played: a plant closed in compiled code is no device."""
+        """Play zeros as any driver does, where anything was played block by block."""
         if self._played:
             super().close()
         self._state = "closed"

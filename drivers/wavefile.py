@@ -98,7 +98,7 @@ class WaveFileDriver(BaseDriver):
     full_scale : float, A, > 0
         Drive that stands in the file as 1.0.  An integer format ends one step short of it upwards.
     subtype : {"PCM_16", "PCM_24", "PCM_32", "FLOAT", "DOUBLE"}, optional
-        Form of a sample; FLOAT unless given, for FLAC PCM_24 (it knows integers of 16 and 24 bits only).
+        Form of a sample; FLOAT unless given, for FLAC PCM_24 (which holds integers of 16 and 24 bits only).
     drive_channels : int, >= 1, optional
         Columns of drive, 2 unless given; comes from `through` where there is one.
     block : int, >= 1, optional
@@ -192,7 +192,7 @@ class WaveFileDriver(BaseDriver):
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
-        """Close; the device behind hears of the error with which the body failed."""
+        """Close; pass the error with which the body failed on to the device behind."""
         self._leaving = kind, error, traceback
         try:
             super().__exit__(kind, error, traceback)

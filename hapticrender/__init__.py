@@ -19,10 +19,11 @@ _here = _Path(__file__).parent
 if not (_here / "renderers").is_dir():
     __path__.append(str(_here.parent))
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 
 _HOMES = {
     "bands": ("Bands",),
+    "control.demodulator": ("Demodulator",),
     "errors": (
         "DesignError",
         "DeviceLost",
@@ -34,16 +35,28 @@ _HOMES = {
         "ProtocolError",
         "SceneError",
     ),
-    "loop": ("Session", "prepare", "render", "run"),
+    "loop": ("prepare", "render", "run"),
     "plants.identify": ("Identified", "compare", "identify"),
-    "protocols": ("Controller", "Driver", "Flag", "Method", "Motion", "Plant", "Renderer", "Sensed", "Texture"),
+    "protocols": (
+        "Controller",
+        "Driver",
+        "Flag",
+        "Method",
+        "Motion",
+        "Plant",
+        "Renderer",
+        "Rendering",
+        "Sensed",
+        "Texture",
+    ),
     "recordings.recording": ("Recorder", "Recording"),
     "touch.builtin": ("builtin_scenes",),
     "touch.finger": ("Finger",),
     "touch.grating": ("Grating",),
     "touch.mechanics": ("FingerMechanics",),
-    "touch.motion": ("Sampled", "Sliding", "Still", "Swiping", "Tracked"),
+    "touch.motion": ("Sampled", "TriangleMotion", "Still", "SineMotion", "RecordedMotion"),
     "touch.perception": ("detection_threshold", "roughness", "sensation_level"),
+    "touch.profile": ("strongest_carriers",),
     "touch.recorded": ("Recorded", "Swipe", "Synthetic"),
     "touch.scene": ("Scene",),
 }
@@ -53,6 +66,7 @@ __all__ = sorted(_HOME_OF)
 
 if _typing.TYPE_CHECKING:
     from hapticrender.bands import Bands as Bands
+    from hapticrender.control.demodulator import Demodulator as Demodulator
     from hapticrender.errors import DesignError as DesignError
     from hapticrender.errors import DeviceLost as DeviceLost
     from hapticrender.errors import DeviceNotFound as DeviceNotFound
@@ -62,7 +76,6 @@ if _typing.TYPE_CHECKING:
     from hapticrender.errors import PlateMismatch as PlateMismatch
     from hapticrender.errors import ProtocolError as ProtocolError
     from hapticrender.errors import SceneError as SceneError
-    from hapticrender.loop import Session as Session
     from hapticrender.loop import prepare as prepare
     from hapticrender.loop import render as render
     from hapticrender.loop import run as run
@@ -76,6 +89,7 @@ if _typing.TYPE_CHECKING:
     from hapticrender.protocols import Motion as Motion
     from hapticrender.protocols import Plant as Plant
     from hapticrender.protocols import Renderer as Renderer
+    from hapticrender.protocols import Rendering as Rendering
     from hapticrender.protocols import Sensed as Sensed
     from hapticrender.protocols import Texture as Texture
     from hapticrender.recordings.recording import Recorder as Recorder
@@ -84,14 +98,15 @@ if _typing.TYPE_CHECKING:
     from hapticrender.touch.finger import Finger as Finger
     from hapticrender.touch.grating import Grating as Grating
     from hapticrender.touch.mechanics import FingerMechanics as FingerMechanics
+    from hapticrender.touch.motion import RecordedMotion as RecordedMotion
     from hapticrender.touch.motion import Sampled as Sampled
-    from hapticrender.touch.motion import Sliding as Sliding
+    from hapticrender.touch.motion import SineMotion as SineMotion
     from hapticrender.touch.motion import Still as Still
-    from hapticrender.touch.motion import Swiping as Swiping
-    from hapticrender.touch.motion import Tracked as Tracked
+    from hapticrender.touch.motion import TriangleMotion as TriangleMotion
     from hapticrender.touch.perception import detection_threshold as detection_threshold
     from hapticrender.touch.perception import roughness as roughness
     from hapticrender.touch.perception import sensation_level as sensation_level
+    from hapticrender.touch.profile import strongest_carriers as strongest_carriers
     from hapticrender.touch.recorded import Recorded as Recorded
     from hapticrender.touch.recorded import Swipe as Swipe
     from hapticrender.touch.recorded import Synthetic as Synthetic

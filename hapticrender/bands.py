@@ -1,8 +1,10 @@
-"""Bands: carriers with their phases, and the complex envelopes that ride on them."""
+"""Bands: carriers with their phases, and the complex target envelopes on them."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -36,9 +38,9 @@ def _check(name: str, column: Array, shape: tuple[int, ...], unit: str, least: f
 
 @dataclass(frozen=True, kw_only=True)
 class Bands:
-    """Carriers of a texture, one entry a band, and what is wanted on each.
+    """Carriers of a texture, one entry a band, and the target envelope of each.
 
-    The wanted displacement is ``Re sum_k envelope_k exp(j phi_k)`` with
+    The target displacement is ``Re sum_k envelope_k exp(j phi_k)`` with
     ``phi_k = 2 pi (frequency_k t + wavenumber_k x) + phase_k``: a fixed carrier
     has wavenumber 0, a carrier locked to the finger has frequency 0.
 
@@ -51,17 +53,16 @@ class Bands:
     phase : ndarray, shape (n,), rad
         Carrier phase at t = 0, x = 0; finite.
     envelope : ndarray of complex, shape (n,), m, or None
-        Constant wanted envelopes, finite; None where the wanted waveform has
-        to be analysed by the bank that listens to the device (recordings).
+        Constant target envelopes, finite; None where the controller has to
+        estimate them from the target waveform (recordings).
     modulated : bool
-        The wanted waveform is a factor of every envelope, which is then constant but for it.
+        The waveform is a factor of every envelope, which is otherwise constant.
     differentiated : bool
-        Wanted is the time derivative of what the envelopes say, whatever the carriers' frequencies come to be.
+        The target is the time derivative of the envelopes' signal, at whatever frequency a carrier comes to be.
     shown : ndarray of complex, shape (n,), or None
-        What the device's sensor shows of each band, as a multiple of it, > 0; None: all of it.  The controller is asked
-        for what will be shown.
+        Response of the device's sensor to each band, not 0; None: 1.  `tone` refers the targets to the sensor.
     unfelt : tuple of str
-        Which bands were left out because no one could feel them, and why, one sentence each.
+        Which bands were left out because they cannot be felt, and why, one sentence each.
 
     Raises
     ------
@@ -94,11 +95,27 @@ class Bands:
     def __len__(self) -> int:
         return len(self.frequency)
 
-    def tone(self) -> Array:
-        """Rows of a compiled controller: frequency, wavenumber, phase (turns), wanted real and imaginary part (m)."""
-        wanted = np.zeros(len(self), complex) if self.envelope is None else self.envelope
-        wanted = wanted if self.shown is None else wanted * self.shown
-        return np.array([self.frequency, self.wavenumber, self.phase / (2 * np.pi), wanted.real, wanted.imag], float)
+    def checked(self, name: str, waveform: Callable[[Array, Array], Any], time: Array, position: Array) -> Array:
+        """Target waveform at `time` (s) and `position` (m); the texture `name` must return finite numbers.
+
+        0 while the finger is away, where every carrier is locked to it.
+
+        Raises
+        ------
+        ValueError
+            The first sample that is wrong, with its time and position.
+        """
+        values = waveform(time, position)
+        if np.shape(values) != np.shape(position) or np.asarray(values).dtype.kind not in "iuf":
+            found = f"shape {values.shape}" if isinstance(values, np.ndarray) else type(values).__name__
+            raise ValueError(f"{name}.waveform returned {found}: must be {len(position)} numbers, one a sample")
+        away = np.isnan(position) if (self.wavenumber > 0.0).all() else np.zeros(len(position), bool)
+        values = np.where(away, 0.0, np.asarray(values, float))
+        bad = np.flatnonzero(~np.isfinite(values))
+        if bad.size:
+            at = f"t = {time[bad[0]]:g} s, x = {position[bad[0]]:g} m"
+            raise ValueError(f"{name}.waveform returned {values[bad[0]]} at {at}: must be finite")
+        return values
 
     def carrier_phase(self, time: Array, position: Array) -> Array:
         """Phase of every carrier (rad, in [0, 2 pi), shape (n_samples, n_bands)); `position` NaN holds the phase."""

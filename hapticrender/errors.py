@@ -38,4 +38,4 @@ class ProtocolError(DriverError):
 
 
 class PlateMismatch(UserWarning):
-    """The plate that was met is not the one that a controller was designed for: says which numbers, and by how much."""
+    """The device differs from the model that a controller is designed for; names the quantities and by how much."""

@@ -1,24 +1,24 @@
-"""The ring: scene -> renderer -> controller -> driver -> device, file or plant, and back; it counts samples."""
+"""The loop: scene -> renderer -> controller -> driver -> device, file or plant, and back; it counts samples."""
 
 from __future__ import annotations
 
+import inspect
+import os
+import signal
+import threading
 import warnings
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
-from functools import partial
+from contextlib import contextmanager
+from dataclasses import replace
 from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from hapticrender import defaults
-from hapticrender.bands import Bands
-from hapticrender.contract import check_driver, check_sensed
-from hapticrender.control.bandmodel import BandModel
-from hapticrender.control.methods import method_named
+from hapticrender.driver_checks import check_sensed
 from hapticrender.errors import HapticError, PlateMismatch
-from hapticrender.protocols import Array, Controller, Driver, Plant, Renderer, Sensed
+from hapticrender.protocols import Array, Controller, Driver, Exchange, Renderer, Rendering, Sensed
 from hapticrender.recordings.recording import Recorder, Recording
 from hapticrender.touch.scene import Scene
 
@@ -26,29 +26,6 @@ MISMATCH = 0.03  # largest share of a target that the integral part may have to 
 CHUNK = 0.25  # s of signal between two writes of the journal
 
 Progress = Callable[[float, float], None]
-
-
-@dataclass(frozen=True, kw_only=True)
-class Session:
-    """Everything that a run needs, designed and checked; nothing has been played yet."""
-
-    scene: Scene
-    method: str
-    seed: int
-    driver: Driver
-    model: BandModel
-    bands: Bands
-    design: Callable[..., Controller]
-    waveform: Callable[[Array, Array], Array]
-
-    def controller(self) -> Controller:
-        """Return a controller at rest, designed for this session."""
-        return self.design(self.model, self.bands, feedback=self.driver.sensed_channels > 0)
-
-    @property
-    def samples(self) -> int:
-        """Length of the run in samples."""
-        return max(int(round(self.scene.duration * self.driver.rate)), 1)
 
 
 def registered(group: str, name: str) -> Any:
@@ -65,46 +42,39 @@ def registered(group: str, name: str) -> Any:
 
 
 def prepare(
-    scene: Scene,
+    scene: Scene | str | os.PathLike[str],
     *,
     driver: Driver | None = None,
-    method: str = defaults.METHOD,
-    seed: int = 0,
+    method: str | None = None,
+    seed: int | None = None,
     renderer: Renderer | None = None,
-) -> Session:
+) -> Rendering:
     """Do all the design-time work of a run and check it; see `render` for the parameters and errors."""
-    if isinstance(seed, bool) or not isinstance(seed, (int, np.integer)) or seed < 0:
-        raise ValueError(f"seed = {seed!r}: must be an integer >= 0")
-    chosen = method_named(method)
-    renderer = renderer or registered("renderers", scene.device)()
-    if driver is None:
-        driver = registered("drivers", "simulated")(renderer.plant(scene, seed))
-    else:
-        check_driver(driver)
-        driver = renderer.connect(scene, driver)
-    check_driver(driver)
-    model = renderer.band_model(scene, driver)
-    bands = renderer.bands(scene, model)
-    session = Session(
-        scene=scene,
-        method=method,
-        seed=int(seed),
-        driver=driver,
-        model=model,
-        bands=bands,
-        design=partial(renderer.design, chosen),
-        waveform=renderer.waveform(scene),
-    )
-    _warm_up(session)
-    return session
+    if isinstance(scene, str | os.PathLike):
+        scene = Scene.from_toml(scene)
+    if not isinstance(scene, Scene):
+        raise TypeError(f"scene: must be a Scene or the name of a scene file, not {type(scene).__name__}")
+    changes: dict[str, Any] = {"method": method, "seed": seed}
+    scene = replace(scene, **{key: value for key, value in changes.items() if value is not None})
+    renderer = registered("renderers", scene.device)() if renderer is None else renderer
+    if inspect.isclass(renderer) or not callable(getattr(renderer, "open", None)):
+        kind = f"class {renderer.__name__}" if inspect.isclass(renderer) else type(renderer).__name__
+        raise TypeError(f"renderer: must be an object with open(scene, driver), such as a BaseRenderer(), not {kind}")
+    rendering = renderer.open(scene, driver)
+    if not isinstance(rendering, Rendering):
+        raise TypeError(
+            f"{type(renderer).__name__}.open returned {type(rendering).__name__}: must be hapticrender.Rendering"
+        )
+    _warm_up(rendering)
+    return rendering
 
 
 def render(
-    scene: Scene,
+    scene: Scene | str | os.PathLike[str],
     *,
     driver: Driver | None = None,
-    method: str = defaults.METHOD,
-    seed: int = 0,
+    method: str | None = None,
+    seed: int | None = None,
     renderer: Renderer | None = None,
     journal: str | Path | None = None,
     progress: Progress | None = None,
@@ -113,14 +83,14 @@ def render(
 
     Parameters
     ----------
-    scene : Scene
-        What is touched, by what, on which kind of device.
+    scene : Scene or path
+        What is touched, by what, on which kind of device; or the name of a scene file (TOML).
     driver : Driver, optional
         Any object that follows the protocol of `hapticrender.drivers.base`; the simulated device by default.
-    method : str
-        Name of the control method (`hapticrender.control.methods.METHODS`).
-    seed : int
-        Of the simulated sensor noise, >= 0.
+    method : str, optional
+        Name of the control method (`hapticrender.control.methods.METHODS`); default: that of the scene.
+    seed : int, optional
+        Of the simulated sensor noise, >= 0; default: that of the scene.
     renderer : Renderer, optional
         Of the device's kind; by default the installed one that `scene.device` names.
     journal : path, optional
@@ -142,54 +112,94 @@ def render(
     DriverError
         The device failed; it was left at zero drive, and the journal holds what happened until then.
     """
-    session = prepare(scene, driver=driver, method=method, seed=seed, renderer=renderer)
-    return run(session, journal=journal, progress=progress)
+    rendering = prepare(scene, driver=driver, method=method, seed=seed, renderer=renderer)
+    return run(rendering, journal=journal, progress=progress)
 
 
-def run(session: Session, *, journal: str | Path | None = None, progress: Progress | None = None) -> Recording:
-    """Play a prepared session to its end; see `render`."""
-    driver = session.driver
-    total = session.samples
+def run(rendering: Rendering, *, journal: str | Path | None = None, progress: Progress | None = None) -> Recording:
+    """Play a prepared rendering to its end; see `render`.
+
+    However it ends (an error, Ctrl-C, SIGTERM), every sample played is recorded and the device is left at zero drive.
+    """
+    driver, model, total = rendering.driver, rendering.model, rendering.samples
     recorder = Recorder(
         journal,
-        scene=session.scene,
-        method=session.method,
-        seed=session.seed,
+        scene=rendering.scene,
+        method=rendering.scene.method,
+        seed=rendering.scene.seed,
         rate=driver.rate,
-        bands=session.bands,
+        bands=rendering.bands,
         drive_channels=driver.drive_channels,
         sensed_channels=driver.sensed_channels,
-        places=session.model.places,
-        drive_limit=session.model.drive_limit if np.isfinite(session.model.drive_limit) else None,
-        unit=session.model.unit,
-        drive_unit=session.model.drive_unit,
-        profile=session.model.profile,
+        places=model.places,
+        drive_limit=model.drive_limit if np.isfinite(model.drive_limit) else None,
+        unit=model.unit,
+        drive_unit=model.drive_unit,
+        profile=model.profile,
     )
-    with recorder, driver:
-        done = 0
-        for block in _blocks(session, total):
-            recorder.append(**block._asdict())
-            done += len(block.drive)
+    with recorder, _stopped_by_sigterm(), driver, _zero_drive_after(rendering.device):
+        loop = _Loop(rendering)
+        for start in range(0, total, loop.step):
+            recorder.append(**loop.advance(start, min(loop.step, total - start))._asdict())
             if progress is not None:
-                progress(done / driver.rate, total / driver.rate)
-    return recorder.finish()
+                progress(min(start + loop.step, total) / driver.rate, total / driver.rate)
+    recording = recorder.finish()
+    _compare(rendering, loop.controller, recording)
+    return recording
 
 
-def _warm_up(session: Session) -> None:
+def _warm_up(rendering: Rendering) -> None:
     """Compile before the device is live: a block through a controller that is thrown away.
 
-    Where controller and plant are closed in compiled code nothing is live, and nothing would use what was compiled.
+    Where controller and plant are closed in compiled code nothing is live, and what was compiled would not be used.
     """
-    closes = getattr(session.driver, "compiled_with", None)
-    if closes is not None and closes(session.controller()) is not None:
+    controller = rendering.controller()
+    if _exchange(rendering.driver, controller) is None:
+        block = rendering.driver.block
+        nothing = np.zeros(block)
+        controller.run(np.zeros((block, rendering.driver.sensed_channels)), nothing, nothing)
+
+
+@contextmanager
+def _stopped_by_sigterm() -> Iterator[None]:
+    """Turn SIGTERM into SystemExit in the main thread, so that the device is left at rest."""
+    main = threading.current_thread() is threading.main_thread()
+    if not main or signal.getsignal(signal.SIGTERM) is not signal.SIG_DFL:
+        yield
         return
-    block = session.driver.block
-    nothing = np.zeros(block)
-    session.controller().run(np.zeros((block, session.driver.sensed_channels)), nothing, nothing)
+
+    def stop(number: int, frame: object) -> None:
+        raise SystemExit(128 + number)
+
+    signal.signal(signal.SIGTERM, stop)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, signal.SIG_DFL)
 
 
-class _Block(NamedTuple):
-    """What happened over some samples, complete: the columns of a recording; `drive` as handed to the device."""
+@contextmanager
+def _zero_drive_after(device: Driver) -> Iterator[None]:
+    """Play zeros until they have come through, whatever happened, unless the device does so itself on leaving."""
+
+    def rest() -> None:
+        if not getattr(device, "zero_on_exit", False):
+            for _ in range(-(-device.delay // device.block)):
+                device.play(np.zeros((device.block, device.drive_channels)))
+
+    try:
+        yield
+    except BaseException as error:
+        try:
+            rest()
+        except Exception as late:
+            error.add_note(f"and while the drive was set to zero: {late}")
+        raise
+    rest()
+
+
+class _Columns(NamedTuple):
+    """What happened over some samples: the columns of a recording; `drive` as handed to the device."""
 
     drive: Array
     sensed: Array
@@ -198,109 +208,107 @@ class _Block(NamedTuple):
     normal_load: Array
     target: Array
     flags: Array
+    motion_source: str = "true"
 
 
-def _blocks(session: Session, total: int) -> Iterator[_Block]:
-    """Everything that happens in a run, about `CHUNK` seconds at a time."""
-    block = session.driver.block
-    size = block * max(int(CHUNK * session.driver.rate / block), 1)
-    controller = session.controller()
-    compiled_with = getattr(session.driver, "compiled_with", None)
-    plant = compiled_with(controller) if compiled_with is not None else None
-    ring = _Ring(session, controller) if plant is None else _CompiledRing(session, controller, plant)
-    for start in range(0, total, size):
-        yield ring.advance(start, min(size, total - start))
-    _compare(controller)
+def _exchange(driver: Driver, controller: Controller) -> Exchange | None:
+    """Exchange of a driver that runs this controller itself, sample by sample; None where it takes blocks only."""
+    offered = getattr(driver, "exchange", None)
+    return None if offered is None else offered(controller)
 
 
-def _wanted(session: Session, start: int, position: Array) -> Array:
-    """Waveform of the texture over a block, where the controller has to analyse it."""
-    if session.bands.envelope is not None:
-        return np.zeros(len(position))
-    wanted = np.asarray(session.waveform(_time(session, start, len(position)), position), float)
-    if wanted.shape != position.shape:
-        kind = type(session.scene.texture).__name__
-        raise ValueError(f"{kind}.waveform returned shape {wanted.shape}: must be {position.shape}, one a sample")
-    away = np.isnan(position) if (session.bands.wavenumber > 0.0).all() else False
-    return np.where(away, 0.0, wanted)  # nothing is wanted of a finger that is away
+class _Loop:
+    """Driver and controller in closed loop, `step` samples a call."""
+
+    def __init__(self, rendering: Rendering) -> None:
+        self.rendering, self.controller = rendering, rendering.controller()
+        driver = rendering.driver
+        exchange = _exchange(driver, self.controller)
+        self._exchange = self._block if exchange is None else exchange
+        self.step = driver.block * (max(int(CHUNK * driver.rate / driver.block), 1) if exchange is not None else 1)
+        self._start = 0
+        self._drive = np.zeros((driver.block, driver.drive_channels))
+
+    def advance(self, start: int, count: int) -> _Columns:
+        """Advance by `count` samples from sample `start` on; a last block is cut in the record, not on the device."""
+        self._start = start
+        drive, target, flags, sensed = self._exchange(count, self._reference)
+        values, time = sensed.sensed, self._time(len(sensed.sensed))
+        finger = self.rendering.scene.finger
+        position = finger.position(time) if sensed.position is None else sensed.position
+        load = finger.load(time) if sensed.normal_load is None else sensed.normal_load
+        motion, source = self._motion(sensed)
+        drive, values, motion = drive[:count], values[:count], motion[:count]
+        return _Columns(drive, values, motion, position[:count], load[:count], target[:count], flags[:count], source)
+
+    def _block(self, count: int, reference: Callable[[Array], Array]) -> tuple[Array, Array, Array, Sensed]:
+        """Exchange a block with the driver; the drive computed from it is played with the next one."""
+        driver, played = self.rendering.driver, self._drive
+        sensed = check_sensed(driver, driver.play(played), len(self.rendering.model.places))
+        position = sensed.position
+        if position is None:
+            position = self.rendering.scene.finger.position(self._time(driver.block))
+        sensed = sensed._replace(position=position)
+        self._drive, target, flags = self.controller.run(sensed.sensed, position, reference(position))
+        return played, target, flags if sensed.flags is None else flags | sensed.flags, sensed
+
+    def _reference(self, position: Array) -> Array:
+        return self.rendering.reference(self._time(len(position)), position)
+
+    def _time(self, count: int) -> Array:
+        return (self._start + np.arange(count)) / self.rendering.driver.rate
+
+    def _motion(self, sensed: Sensed) -> tuple[Array, str]:
+        """Motion at the evaluation points, and its source: the device itself, its sensors, or none (NaN)."""
+        model, values = self.rendering.model, sensed.sensed
+        if sensed.motion is not None:
+            return sensed.motion, "true"
+        if not values.shape[1]:
+            return np.full((len(values), len(model.places)), np.nan), "unknown"
+        with np.errstate(invalid="ignore"):  # a faulty sensor is the controller's to flag
+            return values @ (model.place_from_coordinate @ model.coordinate_from_sensed).T, "sensors"
 
 
-def _asked(session: Session, target: Array) -> Array:
-    """Return what is wanted of the device, from what its sensors are to show."""
-    shown = session.bands.shown
-    return target if shown is None else target / shown
-
-
-def _time(session: Session, start: int, count: int) -> Array:
-    return (start + np.arange(count)) / session.driver.rate
-
-
-def _compare(controller: Controller) -> None:
-    """Warn where a controller that can tell has met another device than it was designed for."""
+def _compare(rendering: Rendering, controller: Controller, recording: Recording) -> None:
+    """Warn where the device differs from the model that the controller was designed for."""
     mismatch = getattr(controller, "mismatch", 0.0)
     if mismatch > MISMATCH:
+        found = ", ".join(
+            f"{100 * off:+.1f} % at {hertz:g} Hz" for hertz, off in _stiffness_errors(rendering, recording)
+        )
+        cure = "correct [device]"
+        if rendering.scene.device == "vt-plate":
+            cure = (
+                "remove the finger and replace [device] by what `hapticrender identify --driver ... --scene ...` writes"
+            )
         warnings.warn(
-            f"the device is not the one designed for: the integral part makes up for {100 * mismatch:.1f} % of a "
-            f"target (bound {100 * MISMATCH:g} %); identify it (hapticrender.plants.identify)",
+            f"the device differs from its model: the integral part adds {100 * mismatch:.1f} % of a target "
+            f"(bound {100 * MISMATCH:g} %)"
+            + (f"; dynamic stiffness against the model: {found}" if found else "")
+            + f"; {cure}",
             PlateMismatch,
-            stacklevel=2,
+            stacklevel=3,
         )
 
 
-class _CompiledRing:
-    """Plant and controller closed in compiled code, sample by sample."""
+def _stiffness_errors(rendering: Rendering, recording: Recording) -> list[tuple[float, float]]:
+    """Relative error of the model's dynamic stiffness |D_11| at every fixed carrier (Hz), without a finger.
 
-    def __init__(self, session: Session, controller: Controller, plant: Plant) -> None:
-        self.session, self.controller, self.plant = session, controller, plant
-
-    def advance(self, start: int, count: int) -> _Block:
-        """Play `count` samples."""
-        wanted = _wanted(self.session, start, self.plant.finger_position(count))
-        drive, target, flags, sensed = self.plant.closed_loop(self.controller, wanted)
-        target = _asked(self.session, target)
-        return _complete(self.session, start, sensed)._replace(drive=drive, target=target, flags=flags)
-
-
-class _Ring:
-    """Driver and controller handing blocks to each other."""
-
-    def __init__(self, session: Session, controller: Controller) -> None:
-        self.session, self.controller = session, controller
-        self.drive = np.zeros((session.driver.block, session.driver.drive_channels))
-
-    def advance(self, start: int, count: int) -> _Block:
-        """Play as many blocks as `count` samples need; the last one is cut in the record, not on the device."""
-        step = self.session.driver.block
-        blocks = [self._turn(at) for at in range(start, start + count, step)]
-        return _Block(*(np.concatenate(column)[:count] for column in zip(*blocks, strict=True)))
-
-    def _turn(self, at: int) -> _Block:
-        """One block round the ring."""
-        session, played = self.session, self.drive
-        sensed = check_sensed(session.driver, session.driver.play(played), len(session.model.places))
-        block = _complete(session, at, sensed)
-        wanted = _wanted(session, at, block.position)
-        self.drive, target, flags = self.controller.run(block.sensed, block.position, wanted)
-        return block._replace(drive=played, target=_asked(session, target), flags=flags | block.flags)
-
-
-def _complete(session: Session, at: int, sensed: Sensed) -> _Block:
-    """Fill in what the device cannot tell: the scene's finger, and motion as the sensors see it."""
-    finger, model = session.scene.finger, session.model
-    values = sensed.sensed
-    time = _time(session, at, len(values))
-    motion = sensed.motion
-    if motion is None and session.driver.sensed_channels:
-        with np.errstate(invalid="ignore"):  # a sensor gone mad is the controller's to judge
-            motion = values @ (model.place_from_coordinate @ model.coordinate_from_sensed).T
-    elif motion is None:
-        motion = np.full((len(time), len(model.places)), np.nan)
-    return _Block(
-        drive=values[:, :0],
-        sensed=values,
-        motion=motion,
-        position=finger.position(time) if sensed.position is None else sensed.position,
-        normal_load=finger.load(time) if sensed.normal_load is None else sensed.normal_load,
-        target=values[:, :0],
-        flags=np.zeros(len(time), np.int64) if sensed.flags is None else sensed.flags,
-    )
+    Least squares of all carriers over the last `CHUNK` seconds; D_11 = (F_1 - sum_j D_1j q_j)/q_1.
+    """
+    model, bands = rendering.model, rendering.bands
+    hertz = np.unique(bands.frequency[(bands.wavenumber == 0.0) & (bands.frequency > 0.0)])
+    start = max(len(recording) - round(CHUNK * recording.rate), 0)
+    position, drive, sensed = (recording.read(name, start) for name in ("position", "drive", "sensed"))
+    if not hertz.size or np.isfinite(position).any() or len(drive) < 8 * len(hertz):
+        return []
+    phase = 2 * np.pi / model.rate * np.multiply.outer(np.arange(len(drive)), hertz)
+    waves = np.hstack([np.cos(phase), -np.sin(phase)])
+    found = np.linalg.lstsq(waves, np.hstack([drive, sensed]), rcond=None)[0]
+    drive, sensed = np.hsplit(found[: len(hertz)] + 1j * found[len(hertz) :], [drive.shape[1]])
+    drive *= (model.hold_and_delay(hertz) * np.exp(2j * np.pi * hertz / model.rate))[:, None]  # row n: from n - 1
+    q, stiffness = sensed @ model.coordinate_from_sensed.T, model.dynamic_stiffness(hertz)
+    force = drive @ model.force_from_drive[0] - (stiffness[:, 0, 1:] * q[:, 1:]).sum(axis=1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        off = abs(force / q[:, 0] / stiffness[:, 0, 0]) - 1.0
+    return [(float(at), float(value)) for at, value in zip(hertz, off, strict=True) if np.isfinite(value)]

@@ -1,4 +1,4 @@
-"""What the rooms of this house promise each other; read this file first.
+"""Interfaces between the packages; start here.
 
 Data flows one way round::
 
@@ -14,6 +14,7 @@ the band (or channel) last.
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from enum import IntFlag
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, runtime_checkable
 
@@ -28,23 +29,23 @@ Array = np.ndarray[Any, np.dtype[Any]]
 
 
 class Flag(IntFlag):
-    """Trouble at run time is data: one status word a sample."""
+    """Status bits of a sample: faults at run time are data."""
 
     SATURATED = 1  # a drive channel was cut to its limit
-    NONFINITE = 2  # a sensed value that no sensor can show (NaN, infinite, out of all range) was replaced by zero
-    SENSOR_CLIPPED = 4  # a sensor stood at the end of its range
+    NONFINITE = 2  # a sensed value was NaN, infinite or out of range, and was replaced by zero
+    SENSOR_CLIPPED = 4  # a sensor was at the end of its range
     OVERRUN = 8  # the driver lost samples
     OPEN_LOOP = 16  # a force could not be sensed and is driven open loop
-    UNLOCKED = 32  # a carrier is off its resonance, or the motion too small to tell
+    UNLOCKED = 32  # a carrier is off its resonance, or the motion is too small to measure it
 
 
 class Sensed(NamedTuple):
-    """What a driver returns for a block of n samples.
+    """A driver's measurements over a block of n samples.
 
     `sensed` (n, sensed_channels), in the sensors' unit (m on a plate).
-    `position` (n,), m from the middle of the surface, NaN while no finger is seen; None where the device cannot tell.
-    `motion` (n, places), m: the true motion at the judged places; only simulated devices know it.
-    `normal_load` (n,), N; None where the device cannot tell.
+    `position` (n,), m from the middle of the surface, NaN while no finger touches; None where it is not measured.
+    `motion` (n, places), m: the true motion at the judged places; only simulated devices have it.
+    `normal_load` (n,), N; None where it is not measured.
     `flags` (n,), `Flag` bits raised by the device; None where it raises none.
     """
 
@@ -57,14 +58,19 @@ class Sensed(NamedTuple):
 
 @runtime_checkable
 class Texture(Protocol):
-    """What the surface says: a function of time (s) or of position (m)."""
+    """A reference waveform: a function of time (s) or of the finger's position (m)."""
 
     def bands(self, rate: float) -> Bands:
-        """Carriers, and constant envelopes where the texture has them, for sampling at `rate` (Hz)."""
+        """Carriers, and constant envelopes where the texture has them, for sampling at `rate` (Hz).
+
+        Two carriers must differ.  Envelopes are estimated with a bandwidth of at most spacing/(2 pi): carriers 40 Hz
+        or more apart are followed at full speed, closer ones more slowly.  `hapticrender.strongest_carriers` chooses
+        the carriers of a signal.
+        """
         ...
 
     def waveform(self, time: Array, position: Array) -> Array:
-        """Wanted displacement (m, shape (n,)) at `time` (s) with the finger at `position` (m, NaN: lifted)."""
+        """Target displacement (m, shape (n,), finite) at `time` (s) with the finger at `position` (m, NaN: lifted)."""
         ...
 
 
@@ -79,7 +85,11 @@ class Motion(Protocol):
 
 @runtime_checkable
 class Driver(Protocol):
-    """Carries samples to a device, a file or a plant model, and back (see ``hapticrender.drivers.base``)."""
+    """Carries samples to a device, a file or a plant model, and back (see ``hapticrender.drivers.base``).
+
+    A driver may have an `exchange` too: ``exchange(controller)`` returns an `Exchange`, or None where this controller
+    has to be run block by block.
+    """
 
     rate: float  # Hz
     drive_channels: int
@@ -94,6 +104,11 @@ class Driver(Protocol):
     def play(self, drive: Array) -> Sensed:
         """Play a block (block, drive_channels) and return what was sensed while it played."""
         ...
+
+
+# Advance device and controller together by `count` samples: exchange(count, reference) -> drive as played, target,
+# flags, sensed; `reference(position)` gives the texture's waveform at the finger's next positions.
+Exchange = Callable[[int, Callable[[Array], Array]], "tuple[Array, Array, Array, Sensed]"]
 
 
 @runtime_checkable
@@ -137,53 +152,84 @@ class Controller(Protocol):
     state: Any
 
     def run(self, sensed: Array, position: Array, wanted: Array) -> tuple[Array, Array, Array]:
-        """Digest n samples; return drive (n, channels), target envelopes (n, bands) and flags (n,).
+        """Advance by n samples; return drive (n, channels), target envelopes (n, bands) and flags (n,).
 
         `wanted` (n,) is the texture's waveform, read only where the bands have no constant envelope.
         """
         ...
 
 
+@dataclass(frozen=True, kw_only=True)
+class Rendering:
+    """A scene opened on a device: all that a run needs, designed and checked; nothing has been played yet.
+
+    Parameters
+    ----------
+    scene : Scene
+        With the method and the seed that are used.
+    device : Driver
+        As handed over, or the simulated one.
+    driver : Driver
+        The same, as the controller sees it: behind a square root, a resonance or nothing.
+    plant : Plant, optional
+        The simulated device.
+    model : BandModel
+        Device model for which the controller is designed.
+    bands : Bands
+        Carriers and targets, in the device's quantity.
+    waveform : callable
+        Target waveform over time (s) and position (m), in the device's quantity.
+    controller : callable
+        Returns a new controller at rest.
+    """
+
+    scene: Scene
+    device: Driver
+    driver: Driver
+    plant: Plant | None = None
+    model: BandModel
+    bands: Bands
+    waveform: Callable[[Array, Array], Array]
+    controller: Callable[[], Controller]
+
+    @property
+    def samples(self) -> int:
+        """Length of the run in samples."""
+        return max(int(round(self.scene.duration * self.driver.rate)), 1)
+
+    def reference(self, time: Array, position: Array) -> Array:
+        """Texture's waveform that the controller analyses; 0 where every band has a constant envelope."""
+        if self.bands.envelope is not None:
+            return np.zeros(len(position))
+        return self.bands.checked(type(self.scene.texture).__name__, self.waveform, time, position)
+
+
 @runtime_checkable
 class Renderer(Protocol):
-    """Knows one kind of device and turns a scene into bands and a band model."""
+    """Opens scenes on one kind of device (see ``hapticrender.renderers.base`` for what is shared)."""
 
     name: str
     needs: str  # what a real device of this kind takes, in a few words
 
-    def band_model(self, scene: Scene, driver: Driver) -> BandModel:
-        """All that the controller ever knows of the device behind `driver`."""
-        ...
+    def open(self, scene: Scene, driver: Driver | None = None) -> Rendering:
+        """Open a scene on the device behind `driver`, or on the simulated one; read its tables once, check everything.
 
-    def bands(self, scene: Scene, model: BandModel) -> Bands:
-        """Carriers and targets of a scene; refuses with a ValueError what the device cannot do."""
-        ...
-
-    def plant(self, scene: Scene, seed: int) -> Plant:
-        """The simulated device with the scene's finger on it."""
-        ...
-
-    def connect(self, scene: Scene, driver: Driver) -> Driver:
-        """A driver of the user's as the controller is to see it; where nothing is in between, `driver` itself."""
-        ...
-
-    def waveform(self, scene: Scene) -> Callable[[Array, Array], Array]:
-        """Wanted waveform over time (s) and position (m), in the device's quantity."""
-        ...
-
-    def design(self, method: Method, model: BandModel, bands: Bands, *, feedback: bool = True) -> Controller:
-        """A controller of `method` for the whole device."""
+        Raises
+        ------
+        ValueError, TypeError
+            The scene asks for what the device cannot do.
+        """
         ...
 
 
 class Method(Protocol):
-    """A control method: designs a controller from a band model."""
+    """A control method: designs a controller from a device model."""
 
     name: str
 
     def design(self, model: BandModel, bands: Bands, *, feedback: bool = True) -> Controller:
         """Validate, choose bandwidths, build tables; may raise `DesignError`.
 
-        Without `feedback` nothing is sensed: the controller drives from what it knows of the device.
+        Without `feedback` nothing is measured: the drive is computed from the device model alone.
         """
         ...

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from hapticrender.protocols import Array
-from hapticrender.recordings.judge import beside_the_bands
+from hapticrender.recordings.envelopes import amplitude_error, beside_the_bands
 from hapticrender.touch.perception import HIGHEST, VELOCITY_PER_FORCE, sensation_level
 
 if TYPE_CHECKING:
@@ -29,7 +29,7 @@ class Felt(NamedTuple):
     @property
     def error(self) -> float:
         """Relative error of the achieved velocity."""
-        return self.achieved / self.wanted - 1.0
+        return float(amplitude_error(self.achieved, self.wanted))
 
 
 def velocity_per_unit(recording: Recording, frequency: Any) -> Array:
@@ -40,7 +40,7 @@ def velocity_per_unit(recording: Recording, frequency: Any) -> Array:
         return 2j * np.pi * hertz
     if unit == "m/s":
         return np.ones_like(hertz, complex)
-    share = float(recording.scene.plant.get("velocity_per_force", VELOCITY_PER_FORCE))  # type: ignore[arg-type]
+    share = float(recording.scene.rendering.get("velocity_per_force", VELOCITY_PER_FORCE))  # type: ignore[arg-type]
     if share:
         return share * np.ones_like(hertz, complex)
     return recording.scene.finger.mechanics.skin_velocity_per_force(hertz)
@@ -110,7 +110,7 @@ def residual_velocity(recording: Recording, highest: float = HIGHEST) -> float:
     -----
     Welch's estimate over the windows of the judge: the spectrum of the residual waveform, Hann-windowed, times
     `velocity_per_unit` at each frequency (a spectral derivative where the device makes displacement), summed by
-    Parseval.  A window of T adds 1/(6 (f T)^2) to the rms of a tone at f that is differentiated.  It hardly hears the
+    Parseval.  A window of T adds 1/(6 (f T)^2) to the rms of a tone at f that is differentiated.  It hardly counts the
     window's edges, where most of an envelope's drift is left, so it can be below the judge's `residual_rms`.
     """
     mean_squares = []

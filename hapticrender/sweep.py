@@ -1,115 +1,129 @@
-"""A sweep over scenarios: side by side in the lanes of a core, and on as many cores or machines as an executor has.
+"""Render many scenes, in this thread or on any executor: a pool of processes, or a cluster.
 
-Anything that follows `concurrent.futures.Executor` will do: a pool of processes on this machine, or a cluster::
+::
 
     from concurrent.futures import ProcessPoolExecutor
     with ProcessPoolExecutor() as pool:
-        worst = sweep(scenarios, 2.0, worst_error, executor=pool)
+        worst = sweep(scenes, worst_error, executor=pool)
 
     from dask.distributed import Client
-    worst = sweep(scenarios, 2.0, worst_error, executor=Client(address).get_executor())
+    worst = sweep(scenes, worst_error, executor=Client(address).get_executor())
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable
 from concurrent.futures import Executor
-from typing import Any
+from typing import Any, NamedTuple
 
-import numpy as np
+from hapticrender import checks
+from hapticrender.errors import HapticError
+from hapticrender.loop import render
+from hapticrender.recordings.recording import Recording
+from hapticrender.touch.scene import Scene
 
-from hapticrender.batch import LANES, Played, Scenario, simulate
-from hapticrender.protocols import Array
-from hapticrender.recordings.judge import fit
+AT_A_TIME = 16  # scenes a task: enough to be worth sending
 
-AT_A_TIME = 4 * LANES  # scenarios a task: enough to be worth sending
-LENGTH = 0.1  # s: of the windows in which envelopes are taken
+
+class SweepError(HapticError):
+    """A scene of a sweep failed; its number, its name and the cause are in the message."""
+
+
+class Failure(NamedTuple):
+    """A scene that could not be rendered or judged: its number in the sweep (from 0), its name, the error as text."""
+
+    number: int
+    name: str
+    error: str
+
+    def __str__(self) -> str:
+        return f"scenes[{self.number}] ({self.name!r}): {self.error}"
 
 
 def sweep(
-    scenarios: Sequence[Scenario],
-    seconds: float,
-    judge: Callable[[Played], Any],
+    scenes: Iterable[Scene],
+    judge: Callable[[Recording], Any] | None = None,
     *,
-    method: str = "h2",
+    method: str | None = None,
     executor: Executor | None = None,
     at_a_time: int = AT_A_TIME,
+    failures: bool = False,
 ) -> list[Any]:
-    """Play every scenario and keep what `judge` makes of it.
+    """Render every scene on its simulated device and return what `judge` makes of each recording.
 
     Parameters
     ----------
-    scenarios : sequence of Scenario
-        Those that differ in finger, plate, seed or amplitude only run side by side; see `simulate`.
-    seconds : float, > 0
-        Of each.
-    judge : callable
-        From `Played` to what is kept; a function of a module, where the executor has to send it to other processes.
-    method : str
-        Name of the control method.
+    scenes : iterable of Scene
+        Of any device.
+    judge : callable, optional
+        From a `Recording` to what is kept; runs where the scene was rendered, so it must be a function of a module for
+        an executor of other processes.  Default: the recording's summary.
+    method : str, optional
+        Name of the control method; default: that of each scene.
     executor : concurrent.futures.Executor, optional
-        Who does the work; by default this thread.
-    at_a_time : int, >= 1
-        Scenarios a task.
+        Where the work is done; default: this thread.
+    at_a_time : int
+        Scenes a task of the executor, >= 1.
+    failures : bool
+        Whether a scene that fails gives a `Failure` in the list; otherwise it raises.
 
     Returns
     -------
     list
-        In the order of the scenarios.
+        In the order of the scenes.
 
     Raises
     ------
-    ValueError
-        A number is out of its bound, or a target is no constant envelope.
+    SweepError
+        A scene failed: its number, its name and the cause.  Tasks that have not begun are cancelled.
+
+    Examples
+    --------
+    >>> import hapticrender as hr
+    >>> scenes = [hr.Scene(texture=hr.Grating(frequency=f, amplitude=1e-5), duration=1.0) for f in (47.0, 111.0)]
+    >>> [worst < 0.02 for worst in sweep(scenes, worst_error)]
+    [True, True]
     """
-    if at_a_time < 1:
-        raise ValueError(f"{at_a_time=}: must be >= 1 scenario")
-    parts = [list(scenarios[start : start + at_a_time]) for start in range(0, len(scenarios), at_a_time)]
+    at_a_time = checks.integer("at_a_time", at_a_time, "scenes", least=1)
+    numbered = list(enumerate(scenes))
+    parts = [numbered[start : start + at_a_time] for start in range(0, len(numbered), at_a_time)]
     if executor is None:
-        return [found for part in parts for found in _judged(part, seconds, method, judge)]
-    futures = [executor.submit(_judged, part, seconds, method, judge) for part in parts]
+        return [each for part in parts for each in _rendered(_run(part, judge, method, failures))]
+    tasks = [executor.submit(_run, part, judge, method, failures) for part in parts]
     try:
-        return [found for future in futures for found in future.result()]
+        return [each for task in tasks for each in _rendered(task.result())]
     except BaseException:
-        for future in futures:
-            future.cancel()
+        for task in tasks:
+            task.cancel()
         raise
 
 
-def _judged(part: list[Scenario], seconds: float, method: str, judge: Callable[[Played], Any]) -> list[Any]:
-    return [judge(played) for played in simulate(part, seconds, method=method)]
+def worst_error(recording: Recording) -> float:
+    """Largest rms error of any band over its target; infinite where nothing can be judged."""
+    value = recording.summary()["worst"]["value"]
+    return float("inf") if value is None else float(value)
 
 
-def errors(played: Played, start: float = 0.5) -> Array:
-    """Relative amplitude error of every band from `start` (s) on, rms over windows of 0.1 s, shape (places, bands).
-
-    NaN for a band of which nothing is wanted.  Where carriers follow the finger, windows without it do not count.
-    """
-    if start < 0.0:
-        raise ValueError(f"{start=}: must be >= 0 s")
-    scenario, rate = played.scenario, played.scenario.plate.rate
-    size = int(round(LENGTH * rate))
-    first = int(start * rate)
-    count = (len(played.motion) - first) // size
-    if count < 1:
-        raise ValueError(f"{len(played.motion) / rate:g} s: must be >= {start + LENGTH:g} s to be judged")
-    part = slice(first, first + count * size)
-    motion = played.motion[part].reshape(count, size, -1)
-    if (scenario.bands.wavenumber > 0.0).any():
-        there = np.isfinite(played.position[part]).reshape(count, size).all(axis=1)
-        if not there.any():
-            raise ValueError(f"the finger is never there for {LENGTH:g} s after {start:g} s")
-        phase = scenario.bands.carrier_phase(np.arange(part.stop) / rate, played.position[: part.stop])[part]
-        found = fit(phase.reshape(count, size, -1)[there], motion[there])[0]
-    else:  # an amplitude is the same wherever its carrier begins: all windows are signals of one
-        phase = scenario.bands.carrier_phase(np.arange(size) / rate, np.zeros(size))
-        found = fit(phase[None], motion.transpose(1, 0, 2).reshape(1, size, -1))[0].reshape(*motion.shape[::2], -1)
-    wanted = abs(np.asarray(scenario.bands.envelope))
-    off = abs(found) / np.where(wanted > 0.0, wanted, np.nan) - 1.0
-    return np.sqrt(np.mean(off**2, axis=0))
+def _run(
+    part: list[tuple[int, Scene]], judge: Callable[[Recording], Any] | None, method: str | None, failures: bool
+) -> tuple[list[Any], Failure | None]:
+    """Results of a few scenes, up to the first that fails unless `failures` are kept; and that failure."""
+    found: list[Any] = []
+    for index, scene in part:
+        try:
+            recording = render(scene, method=method)
+            found.append(recording.summary() if judge is None else judge(recording))
+        except Exception as error:
+            name = getattr(scene, "name", type(scene).__name__)
+            failure = Failure(index, name, f"{type(error).__name__}: {error}")
+            if not failures:
+                return found, failure
+            found.append(failure)
+    return found, None
 
 
-def worst_error(played: Played) -> float:
-    """Largest of `errors` at the centre, of bands of which something is wanted."""
-    found = errors(played)[0]
-    return float(found[np.isfinite(found)].max(initial=0.0)) if np.isfinite(played.motion).all() else np.inf
+def _rendered(result: tuple[list[Any], Failure | None]) -> list[Any]:
+    found, failure = result
+    if failure is not None:
+        raise SweepError(str(failure))
+    return found

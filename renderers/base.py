@@ -1,30 +1,131 @@
-"""What renderers share where a device kind has nothing to say of its own."""
+"""Base of the renderers: opens a scene on a device, and reads its tables."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection, Mapping
+from functools import partial
+from typing import Any, Generic, TypeVar
 
+from hapticrender import checks
 from hapticrender.bands import Bands
 from hapticrender.control.bandmodel import BandModel
-from hapticrender.protocols import Array, Controller, Driver, Method
+from hapticrender.control.methods import method_named
+from hapticrender.driver_checks import check_driver
+from hapticrender.drivers.simulated import SimulatedDriver
+from hapticrender.protocols import Array, Controller, Driver, Method, Plant, Rendering
 from hapticrender.touch.scene import Scene
 
 Waveform = Callable[[Array, Array], Array]
+Setup = TypeVar("Setup")
 
 
-class BaseRenderer:
-    """Renderer of a device that takes and gives what its controller does; see ``protocols.Renderer``."""
+class BaseRenderer(Generic[Setup]):
+    """Renderer made of parts: `read` the scene once, then give its setup to every other part.
 
+    A subclass fills in `plant`, `band_model` and `bands`.  Where it leaves `read` as it is, the setup is the scene.
+    """
+
+    name = ""
     needs = "a driver"  # of a real device of this kind, in a few words
 
-    def connect(self, scene: Scene, driver: Driver) -> Driver:
+    def open(self, scene: Scene, driver: Driver | None = None) -> Rendering:
+        """Open a scene on the device behind `driver`, or on the simulated one; see ``protocols.Renderer``."""
+        method = method_named(scene.method)
+        if driver is not None:
+            check_driver(driver)
+        setup = self.read(scene, driver)
+        if driver is None:
+            plant = self.plant(setup, scene.seed)
+            device = shown = SimulatedDriver(plant)
+        else:
+            plant, device, shown = None, driver, self.connect(setup, driver)
+        check_driver(shown)
+        model = self.band_model(setup, shown)
+        bands = self.bands(setup, model)
+        return Rendering(
+            scene=scene,
+            device=device,
+            driver=shown,
+            plant=plant,
+            model=model,
+            bands=bands,
+            waveform=self.waveform(setup),
+            controller=partial(self.design, method, model, bands, feedback=shown.sensed_channels > 0),
+        )
+
+    def read(self, scene: Scene, driver: Driver | None) -> Setup:
+        """Return the setup: what the scene's tables say, in the form that the other parts take."""
+        return scene  # type: ignore[return-value]
+
+    def plant(self, setup: Setup, seed: int) -> Plant:
+        """Return the simulated device with the scene's finger on it."""
+        raise NotImplementedError
+
+    def connect(self, setup: Setup, driver: Driver) -> Driver:
         """Return `driver` as the controller is to see it."""
         return driver
 
-    def waveform(self, scene: Scene) -> Waveform:
-        """Return the wanted waveform over time (s) and position (m), in the device's quantity."""
-        return scene.texture.waveform
+    def band_model(self, setup: Setup, driver: Driver) -> BandModel:
+        """Return the device model of the device behind `driver`."""
+        raise NotImplementedError
+
+    def bands(self, setup: Setup, model: BandModel) -> Bands:
+        """Carriers and targets; refuses with a ValueError what the device cannot do."""
+        raise NotImplementedError
+
+    def waveform(self, setup: Setup) -> Waveform:
+        """Return the target waveform over time (s) and position (m), in the device's quantity."""
+        return getattr(setup, "scene", setup).texture.waveform
 
     def design(self, method: Method, model: BandModel, bands: Bands, *, feedback: bool = True) -> Controller:
         """Return a controller of `method` for the whole device."""
         return method.design(model, bands, feedback=feedback)
+
+
+def check_tables(
+    scene: Scene, device: Collection[str], settings: Collection[str] = (), level: Collection[str] = ()
+) -> None:
+    """Refuse a key that stands in the wrong table of a scene, or in none.
+
+    Parameters
+    ----------
+    scene : Scene
+    device : collection of str
+        Names of all parameters of the device, those of its model level included.
+    settings : collection of str
+        Names of the renderer's settings.
+    level : collection of str
+        Parameters that say how finely the device is modelled: for the simulation only.
+    """
+    simulated = set(device) - {"rate"}
+    tables: dict[str, tuple[Mapping[str, Any], Collection[str]]] = {
+        "device": (scene.profile, set(device) - set(level)),
+        "simulation": (scene.simulation, simulated),
+        "render": (scene.rendering, set(settings)),
+    }
+    for table, (values, known) in tables.items():
+        for key in values:
+            if key not in known:
+                others = " or ".join(f"[{name}]" for name, (_, names) in tables.items() if key in names)
+                right = f"belongs in {others}" if others else f"no such parameter; known: {', '.join(sorted(known))}"
+                raise ValueError(f"{table}.{key}: {right}")
+
+
+def read_devices(scene: Scene, kind: type[checks.Validated], level: Collection[str] = ()) -> tuple[Any, Any]:
+    """Parameters of the device as assumed by the controller (profile), and as simulated; both at one model level."""
+    common = {key: value for key, value in scene.simulation.items() if key in level}
+    with checks.inside("device"):
+        assumed = kind.with_overrides({**common, **scene.profile})
+    if not scene.simulation:
+        return assumed, assumed
+    with checks.inside("simulation"):
+        return assumed, kind.with_overrides({**scene.profile, **scene.simulation})
+
+
+def check_channels(driver: Driver, drive: Mapping[int, str], sensed: Mapping[int, str]) -> None:
+    """Refuse a driver whose numbers of channels are not among those in `drive` and `sensed`, each with its meaning."""
+    for name, known in (("drive_channels", drive), ("sensed_channels", sensed)):
+        found = getattr(driver, name)
+        if found not in known:
+            bound = " or ".join(f"{count} ({meaning})" if meaning else str(count) for count, meaning in known.items())
+            raise ValueError(f"driver.{name} = {found}: must be {bound}")

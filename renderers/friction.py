@@ -1,38 +1,37 @@
-"""What friction devices share: textures as lateral forces, and the sliding contact between a drive and what is felt.
+"""Common part of friction devices: textures as lateral forces, and the device model of a sliding contact.
 
-A texture says how the skin is to move (m); friction moves it with a force (N).
-One feels as strong as the other where skin velocities match, F = V/(v/F), with
-v/F = 0.64 m/(N s) over 20-400 Hz [Grigorii et al. 2021], or the finger's own
-admittance.  The force of a carrier that follows the finger grows with the
-speed, as the skin velocity of a real grating does.
+A texture says how the skin is to move (m); friction moves it with a force (N).  One feels as strong as the other where
+skin velocities match, F = V/(v/F), with v/F = 0.64 m/(N s) over 20-400 Hz [Grigorii et al. 2021], or the finger's own
+admittance.  The force of a carrier that follows the finger grows with the speed, as the skin velocity of a real grating
+does.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any
+from functools import cached_property
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 
 from hapticrender.bands import Bands
+from hapticrender.checks import Validated, option, parameter
 from hapticrender.control.bandmodel import BandModel, FingerRange
-from hapticrender.plants.bounds import Validated, choice, number
-from hapticrender.plants.sliding import SlidingParameters
-from hapticrender.protocols import Array
+from hapticrender.plants.contact import SlidingParameters
+from hapticrender.protocols import Array, Driver
 from hapticrender.renderers.base import BaseRenderer, Waveform
-from hapticrender.renderers.limits import check_carriers, felt, looked_at, needed_drive, speeds, wanted_amplitude
+from hapticrender.renderers.limits import Need, check_carriers, examined, felt, needed, speeds, top_speed
 from hapticrender.touch.perception import VELOCITY_PER_FORCE
 from hapticrender.touch.scene import Scene
 
-LEAST_FORCE = 1e-3  # N: a smaller friction teaches nothing of the contact
+LEAST_FORCE = 1e-3  # N: a smaller friction is too small to estimate the contact from
 ROOM = 2.0  # of the drive that the free device needs: half is left to the feedback
 PLACES = ("friction",)
 
 
 @dataclass(frozen=True, kw_only=True)
 class FrictionSettings(Validated):
-    """How a texture becomes a friction; set in a scene's `plant` table beside the device's own parameters.
+    """Conversion of a texture to friction; set in a scene's [render] table.
 
     Parameters
     ----------
@@ -40,85 +39,118 @@ class FrictionSettings(Validated):
         Skin velocity that feels as strong as a newton of friction; 0: the finger's own |V_s/F|, for carriers that do
         not follow it.
     square_root : {"on", "off"}
-        Whether a screen's drive is an attraction (N), or the current's envelope itself, naively.
+        Whether a screen's drive is an attraction (N), or the current's envelope itself.
     """
 
-    velocity_per_force: float = number(VELOCITY_PER_FORCE, "m/(N s)", most=100.0)
-    square_root: str = choice("on", "on", "off")
-
-    @classmethod
-    def split(cls, plant: Mapping[str, Any]) -> tuple[FrictionSettings, dict[str, Any]]:
-        """Settings, and what is left of a scene's `plant` table for the device."""
-        own = cls.names()
-        settings = cls.with_overrides({key: value for key, value in plant.items() if key in own})
-        return settings, {key: value for key, value in plant.items() if key not in own}
+    velocity_per_force: float = parameter(VELOCITY_PER_FORCE, "m/(N s)", most=100.0)
+    square_root: str = option("on", "on", "off")
 
 
-class FrictionRenderer(BaseRenderer):
-    """Base of the renderers whose target quantity is friction (N) against the motion of a sliding finger."""
+Parameters = TypeVar("Parameters", bound=SlidingParameters)
+Settings = TypeVar("Settings", bound=FrictionSettings)
 
-    def waveform(self, scene: Scene) -> Waveform:
-        """Return the waveform whose time derivative is the wanted friction: displacement over v/F (N s)."""
-        settings, _ = FrictionSettings.split(scene.plant)
-        share = settings.velocity_per_force or VELOCITY_PER_FORCE
-        return lambda time, position: np.asarray(scene.texture.waveform(time, position), float) / share
 
-    def wanted(self, scene: Scene, model: BandModel) -> Bands:
-        """Carriers and targets of a scene as friction (N)."""
+@dataclass(frozen=True)
+class FrictionSetup(Generic[Settings, Parameters]):
+    """A scene, its settings, the surface that its controller assumes, and the one that is simulated."""
+
+    scene: Scene
+    settings: Settings
+    assumed: Parameters
+    simulated: Parameters
+
+    @cached_property
+    def speed(self) -> float:
+        """Median speed (m/s) of the finger while it slides; friction is felt only then."""
+        speed, least = speeds(self.scene), self.assumed.least_speed
+        sliding = speed[speed >= least]  # NaN, lifted, is none
+        if not sliding.size:
+            raise ValueError(
+                f"finger: must slide faster than {least:g} m/s, friction is not felt by one that rests or is lifted"
+            )
+        return float(np.median(sliding))
+
+    @cached_property
+    def load(self) -> float:
+        """Mean normal load (N) of the finger while it touches."""
+        time = examined(self.scene)
+        load = self.scene.finger.load(time)[np.isfinite(self.scene.finger.position(time))]
+        mean = float(load.mean()) if load.size else 0.0
+        if not mean > 0.0:
+            raise ValueError("finger.normal_load = 0: must be > 0 N, friction needs a load")
+        return mean
+
+    @cached_property
+    def largest_load(self) -> float:
+        """Largest normal load (N) of the finger."""
+        return float(np.max(self.scene.finger.load(examined(self.scene)), initial=0.0))
+
+    @property
+    def waveform(self) -> Waveform:
+        """Waveform whose time derivative is the target friction: displacement over v/F (N s)."""
+        factor = 1.0 / (self.settings.velocity_per_force or VELOCITY_PER_FORCE)
+
+        def impulse(time: Array, position: Array) -> Any:
+            values = self.scene.texture.waveform(time, position)
+            return factor * np.asarray(values) if np.shape(values) else values  # no array: refused by its user
+
+        return impulse
+
+    def targets(self, model: BandModel) -> Bands:
+        """Carriers and targets of the scene as friction (N)."""
+        scene, share = self.scene, self.settings.velocity_per_force
         if scene.gradient:
             raise ValueError(f"gradient = {scene.gradient:g} 1/m: must be 0, friction is made under the finger alone")
-        settings, _ = FrictionSettings.split(scene.plant)
         bands = felt(scene, scene.texture.bands(model.rate), model)
         check_carriers(scene, model, bands)
         if bands.envelope is None:
-            if not settings.velocity_per_force:
-                raise ValueError("plant.velocity_per_force = 0: must be > 0 m/(N s) for a recording")
+            if not share:
+                raise ValueError("render.velocity_per_force = 0: must be > 0 m/(N s) for a recording")
             return replace(bands, differentiated=True)
-        return replace(bands, **_as_friction(scene, bands, settings))
+        return replace(bands, **_as_friction(scene, bands, share))
 
-    def sensor_response(self, scene: Scene, frequency: Array) -> Array:
-        """Return what is sensed per friction (complex) at `frequency` (Hz)."""
-        raise NotImplementedError
+    def needed(self, model: BandModel) -> Need:
+        """Amplitude and drive (N) that the scene needs of `model`."""
+        return needed(self.scene, model, self.targets(model), self.waveform)
 
-    def bands(self, scene: Scene, model: BandModel) -> Bands:
-        """Carriers and targets of a scene; `band_model` has refused what is beyond the device.
+    def check_speed(self, model: BandModel, bands: Bands) -> None:
+        """Refuse a skin velocity that the finger's own speed makes impossible, where the skin is modelled."""
+        if self.scene.finger.mechanics.order == 0:
+            return
+        need = needed(self.scene, model, bands, self.waveform)
+        locked = bool((bands.wavenumber > 0.0).any())
+        speed = top_speed(self.scene) if locked else self.speed
+        velocity = need.amplitude * self.settings.velocity_per_force
+        if velocity > speed * (1 + 1e-9):  # up to rounding
+            raise ValueError(
+                f"texture.amplitude asks for a skin velocity of {velocity:.3g} m/s: must be <= {speed:.3g} m/s, the "
+                f"{'top' if locked else 'median'} speed of the finger, for friction cannot move the skin faster"
+            )
 
-        What the sensor makes of a fixed carrier is known, and taken into account; of one that follows the finger the
-        controller knows how late it is shown.
-        """
-        bands = self.wanted(scene, model)
-        deaf = model.late == model.foresight == 0.0
-        if deaf or bands.envelope is None or (bands.wavenumber > 0.0).any():
-            return bands
-        return replace(bands, shown=self.sensor_response(scene, bands.frequency))
+    def check_range(self, model: BandModel, steady: float) -> None:
+        """Refuse a friction, `steady` (N) for the most part, that a tribometer cannot measure."""
+        most = steady + self.needed(model).amplitude
+        bound = self.assumed.force_range
+        if most > bound:
+            raise ValueError(f"friction of {most:.3g} N: must be <= {bound:g} N, the tribometer's range")
 
-    def contact(
-        self,
-        scene: Scene,
-        sliding: SlidingParameters,
-        *,
-        rate: float,
-        delay: int,
-        block: int,
-        friction_per_drive: float,
-        listening: bool = True,
-    ) -> BandModel:
-        """Band model of a sliding contact whose drive makes `friction_per_drive` (N per N), seen by a tribometer.
+    def contact(self, driver: Driver, friction_per_drive: float) -> BandModel:
+        """Device model of a sliding contact whose drive makes `friction_per_drive` (N per N), seen by a tribometer.
 
         ``(1 + s delta/v) (1 + 2 zeta s/w0 + s^2/w0^2) F = friction_per_drive u`` up to s^2, at the scene's median
-        speed; without the tribometer's part where nothing is `listening`.  The drive limit is not set.
+        speed; without the tribometer's part where `driver` senses nothing.  The drive limit is not set.
         """
-        speed = typical_speed(scene, sliding.least_speed)
+        sliding, speed, sensed = self.assumed, self.speed, driver.sensed_channels > 0
         lag = sliding.memory_length / speed
         w0 = 2 * np.pi * sliding.tribometer_frequency
-        ring = 2 * sliding.tribometer_damping / w0 if listening else 0.0
+        ring = 2 * sliding.tribometer_damping / w0 if sensed else 0.0
         own = 1.0 / friction_per_drive
         one = np.eye(1)
         return BandModel(
-            rate=rate,
-            delay=delay,
-            block=block,
-            mass=own * (1 / w0**2 + ring * lag if listening else 0.0) * one,
+            rate=driver.rate,
+            delay=driver.delay,
+            block=driver.block,
+            mass=own * (1 / w0**2 + ring * lag if sensed else 0.0) * one,
             late=ring,
             damping=own * (lag + ring) * one,
             stiffness=own * one,
@@ -148,54 +180,41 @@ class FrictionRenderer(BaseRenderer):
             ),
         )
 
-    def check_range(self, scene: Scene, model: BandModel, sliding: SlidingParameters, steady: float) -> None:
-        """Refuse a friction, `steady` (N) for the most part, that a tribometer cannot show."""
-        most = steady + wanted_amplitude(scene, model, self.wanted(scene, model), self.waveform(scene))
-        if most > sliding.force_range:
-            raise ValueError(f"friction of {most:.3g} N: must be <= {sliding.force_range:g} N, the tribometer's range")
 
-    def needed(self, scene: Scene, model: BandModel) -> float:
-        """Largest drive (N) that the scene needs of `model`, the finger as assumed there."""
-        return needed_drive(scene, model, self.wanted(scene, model), self.waveform(scene))
+Setup = TypeVar("Setup", bound=FrictionSetup[Any, Any])
 
 
-def typical_speed(scene: Scene, least: float) -> float:
-    """Median speed (m/s) of the finger while it slides; friction is felt only then."""
-    speed = speeds(scene)
-    sliding = speed[speed >= least]  # NaN, lifted, is none
-    if not sliding.size:
-        raise ValueError(
-            f"finger: must slide faster than {least:g} m/s, friction is not felt by one that rests or is lifted"
-        )
-    return float(np.median(sliding))
+class FrictionRenderer(BaseRenderer[Setup]):
+    """Base of the renderers whose target quantity is friction (N) against the motion of a sliding finger."""
+
+    def waveform(self, setup: Setup) -> Waveform:
+        """Return the waveform whose time derivative is the target friction: displacement over v/F (N s)."""
+        return setup.waveform
+
+    def bands(self, setup: Setup, model: BandModel) -> Bands:
+        """Carriers and targets of a scene; `band_model` has refused what is beyond the device.
+
+        The sensor's response to a fixed carrier is taken into account here; of one that follows the finger the
+        controller computes it from the model's delays.
+        """
+        bands = setup.targets(model)
+        setup.check_speed(model, bands)
+        direct = model.late == model.foresight == 0.0
+        if direct or bands.envelope is None or (bands.wavenumber > 0.0).any():
+            return bands
+        return replace(bands, shown=setup.assumed.sensor_response(bands.frequency, setup.speed))
 
 
-def typical_load(scene: Scene) -> float:
-    """Mean normal load (N) of the finger while it touches."""
-    time = looked_at(scene)
-    load = scene.finger.load(time)[np.isfinite(scene.finger.position(time))]
-    mean = float(load.mean()) if load.size else 0.0
-    if not mean > 0.0:
-        raise ValueError("finger.normal_load = 0: must be > 0 N, friction needs a load")
-    return mean
-
-
-def largest_load(scene: Scene) -> float:
-    """Largest normal load (N) of the finger."""
-    return float(np.max(scene.finger.load(looked_at(scene)), initial=0.0))
-
-
-def _as_friction(scene: Scene, bands: Bands, settings: FrictionSettings) -> dict[str, Any]:
+def _as_friction(scene: Scene, bands: Bands, velocity_per_force: float) -> dict[str, Any]:
     """Envelopes of displacement (m) as friction (N): j w X/(v/F), w left to a carrier that follows the finger."""
     locked = bool((bands.wavenumber > 0.0).any())
-    if settings.velocity_per_force:
-        share: Array | float = settings.velocity_per_force
-    elif locked:
-        raise ValueError("plant.velocity_per_force = 0: must be > 0 m/(N s) for a texture over position")
-    else:
+    share: Array | float = velocity_per_force
+    if not velocity_per_force:
+        if locked:
+            raise ValueError("render.velocity_per_force = 0: must be > 0 m/(N s) for a texture over position")
         if scene.finger.mechanics.order == 0:
             raise ValueError(
-                "plant.velocity_per_force = 0: must be > 0 m/(N s), or finger.mechanics one that moves: it has none"
+                "render.velocity_per_force = 0: must be > 0 m/(N s), or finger.mechanics one that moves: it has none"
             )
         share = scene.finger.mechanics.skin_velocity_per_force(bands.frequency)
     if locked:

@@ -1,4 +1,4 @@
-"""Hybrid: low bands move the finger, on a vibrotactile plate; high bands rub it, by the friction of a screen on it.
+"""Hybrid: low bands on a vibrotactile plate, high bands by the friction of an electroadhesion screen on it.
 
 The target quantity is the velocity of the skin (m/s), to which both add [Grigorii et al. 2021, who propose it].  Both
 parts take a share of every band, and the shares sum to one at every frequency: the screen's is
@@ -18,18 +18,18 @@ from typing import Any
 import numpy as np
 
 from hapticrender.bands import Bands
+from hapticrender.checks import Validated, check_names, inside, parameter
 from hapticrender.control.bandmodel import BandModel
-from hapticrender.control.together import TogetherController, TwoBands, TwoModels, design_together
-from hapticrender.plants.bounds import Validated, check_names, number
+from hapticrender.control.combined import CombinedBands, CombinedController, CombinedModel, design_combined
 from hapticrender.plants.electroadhesion import ElectroadhesionParameters, ElectroadhesionScreen
 from hapticrender.plants.hybrid import PLACES, HybridPlant
-from hapticrender.plants.vibrotactile import PlateParameters
+from hapticrender.plants.plate import PlateParameters
 from hapticrender.protocols import Array, Driver, Method, Sensed, Texture
-from hapticrender.renderers.base import BaseRenderer
-from hapticrender.renderers.electroadhesion import ElectroadhesionRenderer
-from hapticrender.renderers.friction import FrictionSettings
+from hapticrender.renderers.base import BaseRenderer, check_channels
+from hapticrender.renderers.electroadhesion import ElectroadhesionRenderer, ElectroadhesionSettings, ScreenSetup
 from hapticrender.renderers.limits import check_carriers, felt
-from hapticrender.renderers.vibrotactile import VibrotactileRenderer
+from hapticrender.renderers.shaped import Port, WrappedDriver
+from hapticrender.renderers.vibrotactile import PlateSetup, VibrotactileRenderer
 from hapticrender.touch.scene import Scene
 
 BOTH = "rate"  # the parameter that plate and screen share
@@ -38,7 +38,7 @@ COILS = SENSORS = 2  # channels of the plate, which come first
 
 @dataclass(frozen=True, kw_only=True)
 class HybridSettings(Validated):
-    """How bands are shared out; set in a scene's `plant` table beside the parameters of both devices.
+    """How bands are shared out; set in a scene's [render] table beside the settings of the screen.
 
     Parameters
     ----------
@@ -46,7 +46,7 @@ class HybridSettings(Validated):
         Where plate and screen take half of a band each, 40 to 400; both work from 2/3 to 4/3 of it.
     """
 
-    crossover: float = number(100.0, "Hz", least=40.0, most=400.0)
+    crossover: float = parameter(100.0, "Hz", least=40.0, most=400.0)
 
     @property
     def start(self) -> float:
@@ -75,17 +75,8 @@ class Shared:
         return self.texture.waveform(time, position)
 
 
-class _View:
-    """A driver as one part of the device sees it."""
-
-    def __init__(self, driver: Driver, drive: int, sensed: int, part: str) -> None:
-        self.rate, self.delay, self.block = driver.rate, driver.delay, driver.block
-        self.drive_channels, self.sensed_channels = drive, sensed if driver.sensed_channels else 0
-        self.plant = getattr(getattr(driver, "plant", None), part, None)
-
-
-class HybridDriver:
-    """A user's driver with the square root before the screen, which tells what the sensors say of the skin's velocity.
+class HybridDriver(WrappedDriver):
+    """A user's driver with the square root before the screen, and the skin's velocity computed from its sensors.
 
     Parameters
     ----------
@@ -105,18 +96,10 @@ class HybridDriver:
     """
 
     def __init__(self, driver: Driver, shape: Any, displacement: Array, velocity_per_force: float) -> None:
-        self.driver, self.shape = driver, shape
-        self.rate, self.block, self.delay = driver.rate, driver.block, driver.delay
-        self.drive_channels, self.sensed_channels = driver.drive_channels, driver.sensed_channels
+        super().__init__(driver)
+        self.shape = shape
         self.displacement, self.velocity_per_force = displacement, velocity_per_force
         self._last = np.zeros(2)
-
-    def __enter__(self) -> HybridDriver:
-        self.driver.__enter__()
-        return self
-
-    def __exit__(self, *exc: object) -> None:
-        self.driver.__exit__(*exc)
 
     def play(self, drive: Array) -> Sensed:
         """Play a block, the screen's drive as a current."""
@@ -125,7 +108,7 @@ class HybridDriver:
         sensed = self.driver.play(drive)
         if sensed.motion is not None or not self.sensed_channels:
             return sensed
-        with np.errstate(invalid="ignore"):  # a sensor gone mad is the controller's to judge
+        with np.errstate(invalid="ignore"):  # a faulty sensor is the controller's to flag
             values = np.asarray(sensed.sensed, float)
             glass = values[:, :SENSORS] @ self.displacement.T
             rates = self.rate * np.diff(glass, axis=0, prepend=self._last[None])
@@ -135,7 +118,20 @@ class HybridDriver:
         return sensed._replace(motion=skin[:, None])
 
 
-class HybridRenderer(BaseRenderer):
+@dataclass(frozen=True)
+class HybridSetup:
+    """A scene shared out: settings, the bands of both parts, and the setup of each part."""
+
+    scene: Scene
+    settings: HybridSettings
+    velocity_per_force: float
+    bands: CombinedBands
+    plate: PlateSetup
+    screen: ScreenSetup
+    friction: ScreenSetup | None  # None: no band has a share of the screen
+
+
+class HybridRenderer(BaseRenderer[HybridSetup]):
     """Renderer for a plate on two coils with a current-driven electroadhesion screen laminated on it."""
 
     name = "hybrid"
@@ -144,96 +140,102 @@ class HybridRenderer(BaseRenderer):
     def __init__(self) -> None:
         self._plate, self._screen = VibrotactileRenderer(), ElectroadhesionRenderer()
 
-    def plant(self, scene: Scene, seed: int) -> HybridPlant:
-        """Return the simulated device, with the scene's overrides and finger."""
-        parts = _Parts(scene)
-        plate = self._plate.plant(parts.moved, seed)
-        own = seed + 2**32  # noise of its own
-        if len(parts.bands.rubbed):
-            screen = self._screen.plant(parts.rubbed, own)
-        else:
-            screen = ElectroadhesionScreen(parts.screen, scene.finger, own)
-        return HybridPlant(plate, screen, parts.velocity_per_force)
-
-    def connect(self, scene: Scene, driver: Driver) -> Driver:
-        """Return `driver` behind the square root, with the skin's velocity as its sensors tell it."""
-        _check_channels(driver)
-        parts = _Parts(scene)
-        model = parts.plate.band_model(driver.rate, driver.delay)
-        lever = np.array([1.0, 1.0 / parts.plate.half_spacing])
-        shape = self._screen.compensation(parts.rubbed) if len(parts.bands.rubbed) else np.zeros_like
-        return HybridDriver(driver, shape, lever[:, None] * model.coordinate_from_sensed, parts.velocity_per_force)
-
-    def band_model(self, scene: Scene, driver: Driver) -> TwoModels:
-        """Return what the controllers may know of the two parts behind `driver`."""
-        _check_channels(driver)
-        parts = _Parts(scene)
-        moved = self._plate.band_model(parts.moved, _View(driver, COILS, SENSORS, "plate"))  # type: ignore[arg-type]
-        rubbed = None
-        if len(parts.bands.rubbed):
-            rubbed = self._screen.band_model(parts.rubbed, _View(driver, 1, 1, "screen"))  # type: ignore[arg-type]
-        if rubbed is not None and (parts.bands.wavenumber > 0.0).any():  # fixed carriers have their share for good
-            start = parts.settings.start
-            moved = replace(moved, highest_frequency=start, highest_edge=2.0)
-            rubbed = replace(rubbed, lowest_frequency=2 * start)
-        return _side_by_side(moved, rubbed, parts.velocity_per_force)
-
-    def bands(self, scene: Scene, model: BandModel) -> TwoBands:
-        """Carriers and targets of a scene, shared out; refused where a part cannot do its share."""
-        parts = _Parts(scene, model.rate)
-        bands = parts.bands
-        check_carriers(scene, model, bands)
-        if not isinstance(model, TwoModels):
-            raise TypeError(f"model: must be the TwoModels of band_model, not {type(model).__name__}")
-        if len(bands.moved):
-            bands = replace(bands, moved=self._plate.bands(parts.moved, model.moved))
-        if model.rubbed is not None:
-            bands = replace(bands, rubbed=self._screen.bands(parts.rubbed, model.rubbed))
-        return bands
-
-    def design(self, method: Method, model: BandModel, bands: Bands, *, feedback: bool = True) -> TogetherController:
-        """Return two controllers of `method`, one a part, as one."""
-        if not (isinstance(model, TwoModels) and isinstance(bands, TwoBands)):
-            raise TypeError("model, bands: must be those of band_model and bands")
-        return design_together(method, model, bands, feedback=feedback)
-
-
-class _Parts:
-    """A scene taken apart: settings, parameters of both devices, and the scene of each."""
-
-    def __init__(self, scene: Scene, rate: float | None = None) -> None:
+    def read(self, scene: Scene, driver: Driver | None) -> HybridSetup:
+        """Read the tables of a scene and share out its bands."""
         if scene.gradient:
             raise ValueError(f"gradient = {scene.gradient:g} 1/m: must be 0, friction is made under the finger alone")
-        own, plate, screen = _split(scene.plant)
-        self.settings = HybridSettings.with_overrides(own)
-        friction, of_screen = FrictionSettings.split(screen)
-        self.velocity_per_force = friction.velocity_per_force
-        if not self.velocity_per_force > 0.0:
-            raise ValueError("plant.velocity_per_force = 0: must be > 0 m/(N s), by it velocity and friction add up")
-        self.screen = ElectroadhesionParameters.with_overrides(of_screen)
-        plate = {BOTH: self.screen.rate} | plate
-        self.plate = PlateParameters.with_overrides(plate)
+        settings, plate, screen = _split(scene)
+        of_screen = self._screen.read(screen, driver)
+        velocity_per_force = of_screen.settings.velocity_per_force
+        if not velocity_per_force > 0.0:
+            raise ValueError("render.velocity_per_force = 0: must be > 0 m/(N s), by it velocity and friction add up")
+        plate = replace(plate, profile={BOTH: of_screen.assumed.rate, **plate.profile})
+        of_plate = self._plate.read(plate, driver)
         for name, needed in (("coils", COILS), ("delay", 1)):
-            found = getattr(self.plate, name)
-            if found != needed:
-                raise ValueError(f"plant.{name} = {found}: must be {needed} on a hybrid")
-        self.bands = _share_out(scene, self.settings, self.plate, self.screen.rate if rate is None else rate)
-        self.moved = _part(scene, self.bands.moved, plate)
-        self.rubbed = _part(scene, self.bands.rubbed, screen)
+            for table, device in (("device", of_plate.assumed), ("simulation", of_plate.simulated)):
+                if getattr(device, name) != needed:
+                    raise ValueError(f"{table}.{name} = {getattr(device, name)}: must be {needed} on a hybrid")
+        rate = of_screen.assumed.rate if driver is None else driver.rate
+        bands = _share_out(scene, settings, of_plate.assumed, rate)
+        return HybridSetup(
+            scene,
+            settings,
+            velocity_per_force,
+            bands,
+            replace(of_plate, scene=_part(plate, bands.plate)),
+            of_screen,
+            replace(of_screen, scene=_part(screen, bands.friction)) if len(bands.friction) else None,
+        )
+
+    def plant(self, setup: HybridSetup, seed: int) -> HybridPlant:
+        """Return the simulated device with the scene's finger on it."""
+        plate = self._plate.plant(setup.plate, seed)
+        own = seed + 2**32  # noise of its own
+        if setup.friction is None:
+            screen = ElectroadhesionScreen(setup.screen.simulated, setup.scene.finger, own)
+        else:
+            screen = self._screen.plant(setup.friction, own)
+        return HybridPlant(plate, screen, setup.velocity_per_force)
+
+    def connect(self, setup: HybridSetup, driver: Driver) -> Driver:
+        """Return `driver` behind the square root, with the skin's velocity computed from its sensors."""
+        _check_channels(driver)
+        plate = setup.plate.assumed
+        model = plate.band_model(driver.rate, driver.delay)
+        lever = np.array([1.0, 1.0 / plate.half_spacing])
+        shape = np.zeros_like if setup.friction is None else setup.friction.compensation
+        return HybridDriver(driver, shape, lever[:, None] * model.coordinate_from_sensed, setup.velocity_per_force)
+
+    def band_model(self, setup: HybridSetup, driver: Driver) -> CombinedModel:
+        """Return the device models of the two parts behind `driver`."""
+        _check_channels(driver)
+        plate = self._plate.band_model(setup.plate, _part_of(driver, COILS, SENSORS, "plate"))
+        friction = None
+        if setup.friction is not None:
+            friction = self._screen.band_model(setup.friction, _part_of(driver, 1, 1, "screen"))
+        if friction is not None and (setup.bands.wavenumber > 0.0).any():  # fixed carriers have their share for good
+            start = setup.settings.start
+            plate = replace(plate, highest_frequency=start, highest_edge=2.0)
+            friction = replace(friction, lowest_frequency=2 * start)
+        return _side_by_side(plate, friction, setup.velocity_per_force)
+
+    def bands(self, setup: HybridSetup, model: BandModel) -> CombinedBands:
+        """Carriers and targets of a scene, shared out; refused where a part cannot do its share."""
+        bands = setup.bands
+        check_carriers(setup.scene, model, bands)
+        if not isinstance(model, CombinedModel):
+            raise TypeError(f"model: must be the CombinedModel of band_model, not {type(model).__name__}")
+        if len(bands.plate):
+            bands = replace(bands, plate=self._plate.bands(setup.plate, model.plate))
+        if model.friction is not None and setup.friction is not None:
+            bands = replace(bands, friction=self._screen.bands(setup.friction, model.friction))
+        return bands
+
+    def design(self, method: Method, model: BandModel, bands: Bands, *, feedback: bool = True) -> CombinedController:
+        """Return two controllers of `method`, one a part, as one."""
+        if not (isinstance(model, CombinedModel) and isinstance(bands, CombinedBands)):
+            raise TypeError("model, bands: must be those of band_model and bands")
+        return design_combined(method, model, bands, feedback=feedback)
 
 
-def _part(scene: Scene, bands: Bands, plant: Mapping[str, Any]) -> Scene:
-    """Scene of one part of the device; what no one can feel of the whole has been left out already."""
-    return replace(scene, texture=Shared(bands, scene.texture), keep_unfelt=True, plant=plant)
+def _part_of(driver: Driver, drive: int, sensed: int, name: str) -> Driver:
+    """Numbers of a driver as one part of the device has them."""
+    plant = getattr(getattr(driver, "plant", None), name, None)
+    return Port(driver.rate, driver.delay, driver.block, drive, sensed if driver.sensed_channels else 0, plant)  # type: ignore[return-value]
 
 
-def _share_out(scene: Scene, settings: HybridSettings, plate: PlateParameters, rate: float) -> TwoBands:
+def _part(scene: Scene, bands: Bands) -> Scene:
+    """Scene of one part of the device; bands of the whole that cannot be felt have been left out already."""
+    return replace(scene, texture=Shared(bands, scene.texture), keep_unfelt=True)
+
+
+def _share_out(scene: Scene, settings: HybridSettings, plate: PlateParameters, rate: float) -> CombinedBands:
     """Bands of a scene, and the share of each part as displacement (m)."""
     whole = felt(scene, scene.texture.bands(rate), plate.band_model(rate, 1))
     locked = whole.wavenumber > 0.0
     if whole.envelope is None and not locked.all():
         raise ValueError(
-            "texture: must be a grating, or go over position, on a hybrid: a recording over time is not shared out"
+            "texture: time-domain recordings are not supported on a hybrid; use a grating or a texture over position"
         )
     high = settings.share_of_screen(whole.frequency)
     shares = np.where(locked, 1.0, 1.0 - high), np.where(locked, 1.0, high)  # locked: the fades of the banks share
@@ -250,67 +252,79 @@ def _share_out(scene: Scene, settings: HybridSettings, plate: PlateParameters, r
         for share, which in zip(shares, index, strict=True)
     ]
     common = {each.name: getattr(whole, each.name) for each in fields(Bands)}
-    return TwoBands(**common, moved=own[0], rubbed=own[1], of_moved=index[0], of_rubbed=index[1])
+    return CombinedBands(**common, plate=own[0], friction=own[1], plate_index=index[0], friction_index=index[1])
 
 
-def _split(plant: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any], dict[str, Any]]:
-    """Settings of the hybrid, parameters of the plate and of the screen; `plate_` or `screen_` tells which is meant."""
-    own, plate = HybridSettings.names(), PlateParameters.names()
-    screen = FrictionSettings.names() | ElectroadhesionParameters.names()
+def _split(scene: Scene) -> tuple[HybridSettings, Scene, Scene]:
+    """Settings of the hybrid, and the scene with the tables of the plate, and of the screen.
+
+    A parameter that both have goes by `plate_` or `screen_` before its name, but for the rate that they share.
+    """
+    with inside("render"):
+        own = HybridSettings.names()
+        check_names(scene.rendering, own | ElectroadhesionSettings.names())
+        settings = HybridSettings(**{key: value for key, value in scene.rendering.items() if key in own})
+    screen_settings = {key: value for key, value in scene.rendering.items() if key not in own}
+    tables: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {}
+    for field, table in (("profile", "device"), ("simulation", "simulation")):
+        with inside(table):
+            tables[field] = _split_table(getattr(scene, field), own | ElectroadhesionSettings.names())
+    plate, screen = ({field: table[part] for field, table in tables.items()} for part in (0, 1))
+    return settings, replace(scene, **plate, rendering={}), replace(scene, **screen, rendering=screen_settings)
+
+
+def _split_table(values: Mapping[str, Any], settings: set[str]) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Parameters of the plate and of the screen."""
+    plate, screen = PlateParameters.names(), ElectroadhesionParameters.names()
     double = plate & screen - {BOTH}
-    known = own | (plate | screen) - double | {f"{of}_{each}" for each in double for of in ("plate", "screen")}
-    check_names([key for key in plant if key not in double], known)
-    found: tuple[dict[str, Any], ...] = ({}, {}, {})
-    for key, value in plant.items():
+    found: tuple[dict[str, Any], dict[str, Any]] = {}, {}
+    for key, value in values.items():
         if key in double:
-            raise ValueError(f"plant.{key} = {value!r}: must be plate_{key} or screen_{key}: both have one")
-        whose = [
-            (table, name)
-            for table, names, name in zip(
-                found, (own, plate, screen), (key, key.removeprefix("plate_"), key.removeprefix("screen_")), strict=True
-            )
-            if name in names and (name == key or name in double)
-        ]
-        for table, name in whose:
-            table[name] = value
-    return found[0], found[1], found[2]
+            raise ValueError(f"{key} = {value!r}: must be plate_{key} or screen_{key}: both have one")
+        if key in settings:
+            raise ValueError(f"{key}: belongs in [render]")
+        for table, names, part in ((found[0], plate, "plate_"), (found[1], screen, "screen_")):
+            name = key.removeprefix(part)
+            if name in names and (name == key or name in double):
+                table[name] = value
+        if not any(key.removeprefix(part) in table for table, part in zip(found, ("plate_", "screen_"), strict=True)):
+            prefixed = {f"{part}_{each}" for each in double for part in ("plate", "screen")}
+            known = ", ".join(sorted((plate | screen) - double | prefixed))
+            raise ValueError(f"{key}: no such parameter; known: {known}")
+    return found
 
 
-def _side_by_side(moved: BandModel, rubbed: BandModel | None, velocity_per_force: float) -> TwoModels:
+def _side_by_side(plate: BandModel, friction: BandModel | None, velocity_per_force: float) -> CombinedModel:
     """Band model of both, block by block; what is judged is a velocity, no multiple of the coordinates."""
-    parts = [moved] if rubbed is None else [moved, rubbed]
+    parts = [plate] if friction is None else [plate, friction]
+
+    from scipy.linalg import block_diag
 
     def blocks(name: str) -> Array:
-        from scipy.linalg import block_diag
-
         return np.asarray(block_diag(*(getattr(part, name) for part in parts)))
 
     names = ("mass", "damping", "stiffness", "force_from_drive", "coordinate_from_sensed", "side_from_coordinate")
     matrices = {name: blocks(name) for name in names}
-    return TwoModels(
-        rate=moved.rate,
-        delay=moved.delay,
-        block=moved.block,
+    return CombinedModel(
+        rate=plate.rate,
+        delay=plate.delay,
+        block=plate.block,
         **matrices,
         place_from_coordinate=np.zeros((len(PLACES), len(matrices["mass"]))),
         places=PLACES,
         drive_limit=np.inf,
         sensed_limit=np.inf,
-        lowest_frequency=moved.lowest_frequency,
-        highest_frequency=moved.highest_frequency if rubbed is None else rubbed.highest_frequency,
+        lowest_frequency=plate.lowest_frequency,
+        highest_frequency=plate.highest_frequency if friction is None else friction.highest_frequency,
         unit="m/s",
         drive_unit="A, A, N",
-        moved=moved,
-        rubbed=rubbed,
+        plate=plate,
+        friction=friction,
         velocity_per_force=velocity_per_force,
     )
 
 
 def _check_channels(driver: Driver) -> None:
     """Refuse a driver that cannot be that of a hybrid."""
-    if driver.drive_channels != COILS + 1:
-        raise ValueError(f"driver.drive_channels = {driver.drive_channels}: must be 3 (both coils, then the screen)")
-    if driver.sensed_channels not in (0, SENSORS + 1):
-        raise ValueError(
-            f"driver.sensed_channels = {driver.sensed_channels}: must be 3 (both ends of the plate, then friction) or 0"
-        )
+    meaning = {SENSORS + 1: "both ends of the plate, then friction", 0: "open loop"}
+    check_channels(driver, {COILS + 1: "both coils, then the screen"}, meaning)

@@ -1,4 +1,4 @@
-"""What every device refuses before it plays: carriers that it cannot carry, and targets beyond its drive or sensors."""
+"""Limits common to all devices: carriers beyond the rate, targets beyond drive or sensors, fingers off the surface."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from hapticrender.touch.scene import Scene
 
 NYQUIST_MARGIN = 0.45  # of the rate: above this the hold's image cannot be told from the carrier
 CHECK_STEP = 1e-3  # s: resolution at which the finger's path is checked against the surface
-LOOK_AHEAD = 30.0  # s of a scene that are looked at for the finger's speed and the drive that a waveform needs
+LOOK_AHEAD = 30.0  # s of a scene that are examined for the finger's speed and the drive that a waveform needs
 FASTEST = 10.0  # m/s: no finger is faster
 
 
@@ -29,16 +29,16 @@ def check_path(scene: Scene, half: float, surface: str) -> None:
         raise ValueError(f"finger.position reaches {reach:g} m: must stay within {half:g} m of the {surface}'s middle")
 
 
-def speeds(scene: Scene) -> Array:
-    """Speed of the finger (m/s) every millisecond, NaN while it is lifted."""
-    return abs(np.diff(scene.finger.position(looked_at(scene)))) / CHECK_STEP
-
-
-def looked_at(scene: Scene) -> Array:
-    """Times (s) at which the finger is looked at: every millisecond of the first `LOOK_AHEAD` in which it touches."""
+def examined(scene: Scene) -> Array:
+    """Times (s) at which the finger is examined: every millisecond of the first `LOOK_AHEAD` in which it touches."""
     touches = scene.finger.touches
     start = min((on for on, _ in touches), default=0.0) if touches else 0.0
     return np.arange(start, min(scene.duration, start + LOOK_AHEAD) + 2 * CHECK_STEP, CHECK_STEP)
+
+
+def speeds(scene: Scene) -> Array:
+    """Speed of the finger (m/s) every millisecond, NaN while it is lifted."""
+    return abs(np.diff(scene.finger.position(examined(scene)))) / CHECK_STEP
 
 
 def top_speed(scene: Scene) -> float:
@@ -47,7 +47,10 @@ def top_speed(scene: Scene) -> float:
 
 
 def felt(scene: Scene, bands: Bands, model: BandModel) -> Bands:
-    """Leave out the bands that no one can feel, unless the scene keeps them, and note which and why."""
+    """Leave out the bands that cannot be felt, unless the scene keeps them, and note which and why."""
+    if not isinstance(bands, Bands):
+        kind = type(scene.texture).__name__
+        raise TypeError(f"{kind}.bands returned {type(bands).__name__}: must be hapticrender.Bands")
     if scene.keep_unfelt:
         return bands
     left, dropped = drop_unfelt(
@@ -62,12 +65,11 @@ def felt(scene: Scene, bands: Bands, model: BandModel) -> Bands:
 def check_carriers(scene: Scene, model: BandModel, bands: Bands) -> None:
     """Refuse carriers that the rate cannot carry, at the finger's top speed too."""
     highest = NYQUIST_MARGIN * model.rate
-    for frequency in bands.frequency:
-        if not 0.0 <= frequency <= highest:
-            raise ValueError(
-                f"texture.frequency = {frequency:g}: must be <= {highest:g} Hz, "
-                f"{NYQUIST_MARGIN} of the rate of {model.rate:g} Hz"
-            )
+    if bands.frequency.max(initial=0.0) > highest:
+        raise ValueError(
+            f"texture.frequency = {bands.frequency.max():g}: must be <= {highest:g} Hz, "
+            f"{NYQUIST_MARGIN} of the rate of {model.rate:g} Hz"
+        )
     fastest = top_speed(scene) * bands.wavenumber.max(initial=0.0)
     if fastest > highest:
         raise ValueError(
@@ -78,7 +80,7 @@ def check_carriers(scene: Scene, model: BandModel, bands: Bands) -> None:
 
 def check_targets(scene: Scene, model: BandModel, bands: Bands, waveform: Waveform) -> None:
     """Refuse targets that the free device cannot reach within its drive, or that its sensors cannot follow."""
-    need = _need(scene, model, bands, waveform)
+    need = needed(scene, model, bands, waveform)
     if need.amplitude > model.sensed_limit:
         raise ValueError(
             f"{_named(need.amplitude, model)}: must be <= {model.sensed_limit:g} {model.unit}, the sensors' range"
@@ -91,70 +93,60 @@ def check_targets(scene: Scene, model: BandModel, bands: Bands, waveform: Wavefo
         )
 
 
-def needed_drive(scene: Scene, model: BandModel, bands: Bands, waveform: Waveform) -> float:
-    """Largest drive that the free device needs for the targets."""
-    return _need(scene, model, bands, waveform).drive
+class Need(NamedTuple):
+    """Demand of a scene's targets on the free device."""
+
+    amplitude: float  # largest sum of the targets, in the device's quantity
+    drive: float  # that they need
+    worst: float  # target of the band that needs most of it (of a waveform: its peak)
+    frequency: float  # Hz, of that band
 
 
-def wanted_amplitude(scene: Scene, model: BandModel, bands: Bands, waveform: Waveform) -> float:
-    """Largest sum of the targets, in the device's quantity."""
-    return _need(scene, model, bands, waveform).amplitude
-
-
-class _Need(NamedTuple):
-    """What targets ask for: their sum, the drive for it, and the band (or peak) that takes most of it."""
-
-    amplitude: float
-    drive: float
-    worst: float
-    frequency: float  # Hz
-
-
-def _need(scene: Scene, model: BandModel, bands: Bands, waveform: Waveform) -> _Need:
+def needed(scene: Scene, model: BandModel, bands: Bands, waveform: Waveform) -> Need:
+    """Amplitude and drive that a scene's targets need of the free device."""
     if bands.envelope is None:
         return _need_of_waveform(scene, model, bands, waveform)
     return _need_of_envelopes(scene, model, bands)
 
 
-def _need_of_envelopes(scene: Scene, model: BandModel, bands: Bands) -> _Need:
+def _need_of_envelopes(scene: Scene, model: BandModel, bands: Bands) -> Need:
     """Constant targets: a finger-locked carrier passes every frequency up to that of the finger's top speed."""
     sweep = np.minimum(top_speed(scene) * bands.wavenumber, model.highest_edge * model.highest_frequency)
     top = bands.frequency + sweep
     low = np.where(bands.wavenumber > 0.0, np.minimum(model.lowest_frequency, top), top)
     passed = low + np.linspace(0.0, 1.0, 400)[:, None] * (top - low)
-    wanted = abs(bands.envelope) * (2 * np.pi * passed if bands.differentiated else np.ones_like(passed))
-    drive = wanted / common_gain(model, passed)
+    target = abs(bands.envelope) * (2 * np.pi * passed if bands.differentiated else np.ones_like(passed))
+    drive = target / common_gain(model, passed)
     worst = int(drive.max(axis=0).argmax())
     at = int(drive[:, worst].argmax())
-    return _Need(
-        float(wanted.max(axis=0).sum()),
+    return Need(
+        float(target.max(axis=0).sum()),
         float(drive.max(axis=0).sum()),
-        float(wanted[at, worst]),
+        float(target[at, worst]),
         float(passed[at, worst]),
     )
 
 
-def _need_of_waveform(scene: Scene, model: BandModel, bands: Bands, waveform: Waveform) -> _Need:
-    """A wanted waveform, over all the frequencies that are felt."""
+def _need_of_waveform(scene: Scene, model: BandModel, bands: Bands, waveform: Waveform) -> Need:
+    """A target waveform, over all the frequencies that are rendered."""
     time = np.arange(int(min(scene.duration, LOOK_AHEAD) * model.rate) + 2) / model.rate
-    wanted = np.nan_to_num(waveform(time, scene.finger.position(time)))
+    target = bands.checked(type(scene.texture).__name__, waveform, time, scene.finger.position(time))
     frequency = np.fft.rfftfreq(len(time), 1.0 / model.rate)
-    heard = (frequency >= model.lowest_frequency / 2) & (frequency <= min(model.highest_frequency, 0.4 * model.rate))
+    kept = (frequency >= model.lowest_frequency / 2) & (frequency <= min(model.highest_frequency, 0.4 * model.rate))
     turn = 2j * np.pi * frequency if bands.differentiated else 1.0
-    spectrum = np.where(heard, turn * np.fft.rfft(wanted), 0.0)
+    spectrum = np.where(kept, turn * np.fft.rfft(target), 0.0)
     if bands.differentiated:
-        wanted = np.fft.irfft(spectrum, len(time))
+        target = np.fft.irfft(spectrum, len(time))
     gain = model.response(frequency).sum(axis=-1)[:, 0]
     drive = abs(np.fft.irfft(spectrum / gain, len(time))).max()
-    amplitude = float(abs(wanted).max())
-    return _Need(amplitude, float(drive), amplitude, float(frequency[abs(spectrum).argmax()]))
+    amplitude = float(abs(target).max())
+    return Need(amplitude, float(drive), amplitude, float(frequency[abs(spectrum).argmax()]))
 
 
 def _named(amplitude: float, model: BandModel) -> str:
     """Name a target in the device's quantity."""
-    return (
-        f"{'texture.amplitude =' if model.unit == 'm' else 'texture.amplitude asks for'} {amplitude:.3g} {model.unit}"
-    )
+    verb = "=" if model.unit == "m" else "asks for"
+    return f"texture.amplitude {verb} {amplitude:.3g} {model.unit}"
 
 
 def common_gain(model: BandModel, frequency: Array) -> Array:

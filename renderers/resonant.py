@@ -1,8 +1,8 @@
-"""A user's resonant plate as a driver of friction: the law, and the amplitude's own controller, in between.
+"""A user's resonant plate as a driver of friction, through the friction law and the amplitude's own controller.
 
-The device plays volts and senses the displacement of its mode, both at the carrier's rate.  What the friction loop
-sees of it is the interface of the simulated surface: friction (N) in, and the friction that the sensed amplitude must
-leave out, at a fraction of that rate.
+The device plays volts and senses the displacement of its mode, both at the carrier's rate.  The friction loop has the
+interface of the simulated surface: friction (N) in, and the friction that follows from the sensed amplitude out, at a
+fraction of that rate.
 """
 
 from __future__ import annotations
@@ -13,20 +13,23 @@ from typing import Any
 import numpy as np
 
 from hapticrender import defaults
-from hapticrender.contract import check_driver, check_sensed
-from hapticrender.control.bank.controller import BankController
+from hapticrender.control.controller import BankController
+from hapticrender.control.kernel import finger_damping, observed_envelope
 from hapticrender.control.methods import method_named
-from hapticrender.plants.electroadhesion import finger_rows
-from hapticrender.plants.friction_laws import friction_ratios, wanted_amplitudes
+from hapticrender.driver_checks import check_sensed
+from hapticrender.plants.compiled import LOAD, SPEED, finger_inputs
+from hapticrender.plants.friction_laws import friction_ratios, reference_amplitudes
 from hapticrender.plants.surface import SurfaceParameters, full_slew
-from hapticrender.plants.surface_kernels import LOAD, SPEED, amplitude_fade, ask_within_reach, sensed_amplitude
+from hapticrender.plants.ultrasonic_kernels import amplitude_decay, references_within_reach
 from hapticrender.protocols import Array, Driver, Flag, Sensed
+from hapticrender.renderers.base import check_channels
+from hapticrender.renderers.shaped import WrappedDriver
 from hapticrender.touch.finger import Finger
 
 LONGEST_DELAY = 0.25e-3  # s: a tenth of a turn of 400 Hz, 3 % off there, and beyond 10 % half as late again
 
 
-class ResonantDriver:
+class ResonantDriver(WrappedDriver):
     """A driver of friction (N) on a device that vibrates: its drive in V, its sensor in m of the mode.
 
     Parameters
@@ -36,9 +39,9 @@ class ResonantDriver:
         then it is driven open loop, by what a finger of nominal load makes of the mode.
         Its block is a whole multiple of that multiple, or divides it.
     parameters : SurfaceParameters
-        What is known of the surface; its rate is that of the friction.
+        The surface as assumed; its rate is that of the friction.
     finger : Finger
-        Where the finger is, and how hard it presses where the device does not tell.
+        Where the finger is, and how hard it presses where the device does not measure it.
     nominal : (float, float), N and m/s
         Load and speed that the amplitude is held for while no finger is there.
 
@@ -54,54 +57,44 @@ class ResonantDriver:
 
     Notes
     -----
-    A friction that is asked for acts a block of the device after it was handed over, and is felt as amplitude within
-    the device's own delay: `delay` is their sum.  The loop steps with every sample, its resonance lock as well, however
-    long the device's blocks are; but what it learns of a finger it learns no faster than the device answers, and it
-    takes what is late for wrong: a texture of f Hz behind a delay d is up to 1 % off at f d = 1/15 and 7 % at 1/10.
+    A friction acts a block of the device after it was handed over, and appears as amplitude within the device's own
+    delay: `delay` is their sum.  The amplitude loop steps with every sample, its resonance lock as well, however long
+    the device's blocks are; its finger estimate is limited by the delay, and takes a late response for a finger: a
+    texture of f Hz behind a delay d is up to 1 % off at f d = 1/15 and 7 % at 1/10.
     """
-
-    drive_channels = 1
 
     def __init__(
         self, driver: Driver, parameters: SurfaceParameters, finger: Finger, nominal: tuple[float, float]
     ) -> None:
-        check_driver(driver)
         many = _multiple(driver, parameters)
-        self.driver, self.finger = driver, finger
+        super().__init__(driver)
+        self.drive_channels, self.finger = 1, finger
         self.parameters = replace(
             parameters, level="carrier", oversampling=many, mode=replace(parameters.mode, delay=driver.delay)
         )
         self.rate = float(parameters.rate)
         self.block = max(driver.block // many, 1)
         self.delay = max(self.block, round((driver.block + driver.delay) / many))
-        self.sensed_channels = driver.sensed_channels
         self._piece = min(driver.block, many)
         self._nominal = nominal
         self.loop = amplitude_loop(self.parameters, held=None if driver.sensed_channels else nominal[0])
         self._samples = 0
-        self._wanted = 0.0  # m, at the end of the last sample
+        self._target = 0.0  # m, at the end of the last sample
         self._reached = -1.0  # m, alike, by what the drive can do; negative: it starts from rest
-        self._friction = 0.0  # N: what was heard of the last sample
+        self._friction = 0.0  # N: measured in the last sample
         self._drive = np.zeros((driver.block, 1))
         self._next = np.zeros((driver.block, 1))
 
-    def __enter__(self) -> ResonantDriver:
-        self.driver.__enter__()
-        return self
-
-    def __exit__(self, *exc: object) -> None:
-        self.driver.__exit__(*exc)
-
     def play(self, drive: Array) -> Sensed:
         """Play a block of friction (N); sample i of what is sensed was there at the start of interval i."""
-        rows = finger_rows(self.finger, self._samples, self.block, self.rate)
+        rows = finger_inputs(self.finger, self._samples, self.block, self.rate)
         self._samples += self.block
         whole, load, speed = self._contact(rows)
         flags = np.zeros((self.block, self.parameters.oversampling), np.int64)
-        asked = self._asked(np.asarray(drive, float)[:, 0], whole, load, speed, flags)
-        heard, played = self._carry(asked, flags.ravel())
+        target = self._amplitudes(np.asarray(drive, float)[:, 0], whole, load, speed, flags)
+        measured, played = self._carry(target, flags.ravel())
         friction = np.empty(self.block)
-        friction_ratios(self.parameters.friction_law.numbers, heard, load, speed, friction)
+        friction_ratios(self.parameters.friction_law.numbers, measured, load, speed, friction)
         felt = np.r_[self._friction, whole * friction]
         self._friction = felt[-1]
         return self._sensed(felt[:-1, None], played, np.bitwise_or.reduce(flags, axis=1))
@@ -114,17 +107,17 @@ class ResonantDriver:
         whole = np.where(there, self.parameters.friction_coefficient * load, 0.0)
         return whole, load, np.where(there, pace, self._nominal[1])
 
-    def _asked(self, drive: Array, whole: Array, load: Array, speed: Array, flags: Array) -> Array:
+    def _amplitudes(self, drive: Array, whole: Array, load: Array, speed: Array, flags: Array) -> Array:
         """Amplitude (m) at every sample of the device, on straight lines; shape (block, oversampling)."""
         p = self.parameters
         change = np.divide(np.nan_to_num(drive), whole, out=np.zeros(len(drive)), where=whole > 0.0)
         ratio = np.clip(p.bias + change, p.least_ratio, 1.0)
         flags[ratio != p.bias + change] |= Flag.SATURATED
-        wanted = np.empty(self.block)
-        wanted_amplitudes(p.friction_law.numbers, ratio, load, speed, wanted)
-        before = np.r_[self._wanted, wanted[:-1]]
-        self._wanted = wanted[-1]
-        lines = before[:, None] + (wanted - before)[:, None] * np.arange(1, p.oversampling + 1) / p.oversampling
+        target = np.empty(self.block)
+        reference_amplitudes(p.friction_law.numbers, ratio, load, speed, target)
+        before = np.r_[self._target, target[:-1]]
+        self._target = target[-1]
+        lines = before[:, None] + (target - before)[:, None] * np.arange(1, p.oversampling + 1) / p.oversampling
         return self._within_reach(lines, flags)
 
     def _within_reach(self, lines: Array, flags: Array) -> Array:
@@ -133,32 +126,34 @@ class ResonantDriver:
         if self._reached < 0.0:  # from rest the loop's own ramp is slower
             first, self._reached = self.parameters.oversampling, lines[0, -1]
         mode, loop = self.parameters.carrier_mode, self.loop
-        fade = amplitude_fade(loop.tables, loop.state.touch, 1.0 / mode.rate)
-        ask_within_reach(asked[first:], self._reached, full_slew(mode), fade, asked[first:], flags.ravel()[first:])
+        finger = finger_damping(loop.state.ctypes.data)
+        decay = amplitude_decay(float(mode.damping()), finger, mode.mass, 1.0 / mode.rate)
+        rest = asked[first:]
+        references_within_reach(rest, self._reached, full_slew(mode), decay, rest, flags.ravel()[first:])
         self._reached = asked[-1]
         return asked
 
     def _carry(self, asked: Array, flags: Array) -> tuple[Array, list[Sensed]]:
-        """Take the amplitude along `asked` (m); amplitude heard in each sample of friction, and what was played."""
+        """Take the amplitude along `asked` (m); amplitude measured in each sample of friction, and what was played."""
         step, many, long = self._piece, self.parameters.oversampling, self.driver.block
-        heard, played = np.empty(self.block), []
-        away, deaf = np.full(step, np.nan), np.zeros((step, 1))
+        measured, played = np.empty(self.block), []
+        away, silent = np.full(step, np.nan), np.zeros((step, 1))
         for start in range(0, len(asked), step):
             at = start % long
             if at == 0:
                 played.append(check_sensed(self.driver, self.driver.play(self._drive), 1))
             here = slice(at, at + step)
-            sensed = played[-1].sensed[here] if self.sensed_channels else deaf
+            sensed = played[-1].sensed[here] if self.sensed_channels else silent
             self._next[here], _, raised = self.loop.run(sensed, away, asked[start : start + step])
             flags[start : start + step] |= raised
             if at + step == long:
                 self._drive = self._next.copy()
             if (start + step) % many == 0:
-                heard[start // many] = sensed_amplitude(self.loop.state.band, self.loop.state.loop)
-        return heard, played
+                measured[start // many] = abs(complex(*observed_envelope(self.loop.state.ctypes.data)))
+        return measured, played
 
     def _sensed(self, friction: Array, played: list[Sensed], flags: Array) -> Sensed:
-        """What the device tells of the finger, once a sample of friction; where its motion is no friction, nothing."""
+        """Measurements of the finger and flags, once a sample of friction; the mode's motion is left out."""
         many = self.parameters.oversampling
         columns: dict[str, Any] = {}
         for name in ("position", "normal_load", "flags"):
@@ -166,24 +161,22 @@ class ResonantDriver:
             columns[name] = None if any(each is None for each in parts) else np.concatenate(parts)
         if columns["flags"] is not None:
             flags |= np.bitwise_or.reduce(columns["flags"].reshape(-1, many), axis=1)
-        told = {name: columns[name][::many] for name in ("position", "normal_load") if columns[name] is not None}
-        return Sensed(friction if self.sensed_channels else np.empty((self.block, 0)), flags=flags, **told)
+        finger = {name: columns[name][::many] for name in ("position", "normal_load") if columns[name] is not None}
+        return Sensed(friction if self.sensed_channels else np.empty((self.block, 0)), flags=flags, **finger)
 
 
 def _multiple(driver: Driver, parameters: SurfaceParameters) -> int:
     """Samples of the device in one of the friction; refuses a device that has none."""
-    for name, value, known in (("drive", driver.drive_channels, (1,)), ("sensed", driver.sensed_channels, (0, 1))):
-        if value not in known:
-            raise ValueError(f"driver.{name}_channels = {value}: must be {' or '.join(map(str, known))}")
+    check_channels(driver, {1: ""}, {0: "", 1: ""})
     many = round(driver.rate / parameters.rate)
     if many < 1 or abs(driver.rate - many * parameters.rate) > 1e-9 * driver.rate:
         raise ValueError(
-            f"driver.rate = {driver.rate:g}: must be a whole multiple of plant.rate = {parameters.rate:g} Hz"
+            f"driver.rate = {driver.rate:g}: must be a whole multiple of device.rate = {parameters.rate:g} Hz"
         )
     if driver.block % many and many % driver.block:
         raise ValueError(
-            f"driver.block = {driver.block}: must be a multiple of {many} samples, {driver.rate:g} Hz over plant.rate, "
-            "or divide them"
+            f"driver.block = {driver.block}: must be a multiple of {many} samples, {driver.rate:g} Hz over "
+            "device.rate, or divide them"
         )
     late = driver.delay / driver.rate
     if driver.sensed_channels and late > LONGEST_DELAY * (1 + 1e-9):
@@ -192,7 +185,7 @@ def _multiple(driver: Driver, parameters: SurfaceParameters) -> int:
             "follow a texture in closed loop; a driver without sensed channels is driven open loop"
         )
     if parameters.sensor != "amplitude":
-        raise ValueError(f"plant.sensor = {parameters.sensor!r}: must be 'amplitude', all that a driver can sense")
+        raise ValueError(f"device.sensor = {parameters.sensor!r}: must be 'amplitude', the only one for a driver")
     return many
 
 
@@ -210,7 +203,4 @@ def amplitude_loop(parameters: SurfaceParameters, *, held: float | None = None) 
     if held is not None:
         stiffness = mode.mass * (2 * np.pi * float(mode.resonance(held))) ** 2
         model = replace(model, damping=np.array([[float(mode.damping(held))]]), stiffness=np.array([[stiffness]]))
-    loop = method_named(defaults.METHOD).design(model, parameters.amplitude_bands(), feedback=held is None)
-    if not isinstance(loop, BankController):
-        raise TypeError(f"method {defaults.METHOD!r}: must step sample by sample on a carrier")
-    return loop
+    return method_named(defaults.METHOD).design(model, parameters.amplitude_bands(), feedback=held is None)

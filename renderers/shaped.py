@@ -1,21 +1,59 @@
-"""Drivers behind a static shape of their drive, which a renderer puts between the controller and a user's device."""
+"""Drivers behind a static characteristic of their drive, which a renderer puts before a user's device."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, Self
 
 import numpy as np
 
-from hapticrender.control.oscillator import Oscillator
 from hapticrender.protocols import Array, Driver, Sensed
 
 LEAST_SAMPLES = 4  # in a turn of a carrier
 
 
-class ShapedDriver:
-    """A driver that is handed `shape` of what it is asked to play.
+@dataclass(frozen=True)
+class Port:
+    """Numbers of a driver, or of a part of one, on which a device model depends."""
+
+    rate: float  # Hz
+    delay: int  # samples
+    block: int  # samples
+    drive_channels: int = 1
+    sensed_channels: int = 1
+    plant: Any = None  # what is simulated behind it
+
+
+class WrappedDriver:
+    """A driver whose drive or measurements are converted on the way; a subclass fills in `play`.
+
+    Parameters
+    ----------
+    driver : Driver
+        The device.
+    """
+
+    def __init__(self, driver: Driver) -> None:
+        self.driver = driver
+        self.rate, self.block, self.delay = driver.rate, driver.block, driver.delay
+        self.drive_channels, self.sensed_channels = driver.drive_channels, driver.sensed_channels
+
+    def __enter__(self) -> Self:
+        self.driver.__enter__()
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        self.driver.__exit__(*exc)
+
+    def play(self, drive: Array) -> Sensed:
+        """Play a block."""
+        raise NotImplementedError
+
+
+class ShapedDriver(WrappedDriver):
+    """A driver that plays `shape` of its drive.
 
     Parameters
     ----------
@@ -26,16 +64,8 @@ class ShapedDriver:
     """
 
     def __init__(self, driver: Driver, shape: Callable[[Array], Any]) -> None:
-        self.driver, self.shape = driver, shape
-        self.rate, self.block, self.delay = driver.rate, driver.block, driver.delay
-        self.drive_channels, self.sensed_channels = driver.drive_channels, driver.sensed_channels
-
-    def __enter__(self) -> ShapedDriver:
-        self.driver.__enter__()
-        return self
-
-    def __exit__(self, *exc: object) -> None:
-        self.driver.__exit__(*exc)
+        super().__init__(driver)
+        self.shape = shape
 
     def play(self, drive: Array) -> Sensed:
         """Play `shape` of a block."""
@@ -43,9 +73,9 @@ class ShapedDriver:
 
 
 class CarrierDriver(ShapedDriver):
-    """A driver without sensors that is handed the carrier itself: ``shape(drive) cos(2 pi frequency t)``.
+    """A driver without sensors that plays the carrier itself: ``shape(drive) cos(2 pi frequency t)``.
 
-    The controller sees a device at a whole part of the driver's rate, whose drive is held from sample to sample.
+    To the controller it is a device at a whole part of the driver's rate, whose drive is held from sample to sample.
 
     Parameters
     ----------
@@ -69,7 +99,7 @@ class CarrierDriver(ShapedDriver):
         if driver.sensed_channels:
             raise ValueError(
                 f"driver.sensed_channels = {driver.sensed_channels}: must be 0 where output = 'carrier'; "
-                "a driver that senses is handed the envelope"
+                "a driver that senses gets the envelope"
             )
         if driver.rate < LEAST_SAMPLES * frequency:
             raise ValueError(
@@ -82,17 +112,20 @@ class CarrierDriver(ShapedDriver):
         self.hold = max(each for each in range(1, min(whole, most) + 1) if whole % each == 0)
         self.rate = driver.rate / self.hold
         self.block, self.delay = driver.block // self.hold, driver.delay // self.hold
-        self._carrier = Oscillator(frequency, driver.rate)
+        self._step, self._turns = frequency / driver.rate, 0.0  # turns a sample; phase of the next one
+        self._droop = float(np.sinc(self._step))  # of the carrier behind the device's hold
 
     def play(self, drive: Array) -> Sensed:
         """Play the carrier under `shape` of a block."""
-        carrier = self._carrier.take(len(drive) * self.hold)
+        count = len(drive) * self.hold
+        carrier = np.cos(2 * np.pi * (self._turns + self._step * np.arange(count))) / self._droop
+        self._turns = (self._turns + self._step * count) % 1.0
         sensed = self.driver.play(np.repeat(self.shape(drive), self.hold, axis=0) * carrier[:, None])
         return self._thinned(sensed)
 
     def _thinned(self, sensed: Sensed) -> Sensed:
-        """Return what the device tells, once a sample of the envelope; flags of all of its samples."""
-        told = Sensed(*(None if column is None else column[:: self.hold] for column in sensed))
+        """Return what was measured, once a sample of the envelope; flags of all of its samples."""
+        thinned = Sensed(*(None if column is None else column[:: self.hold] for column in sensed))
         if sensed.flags is None:
-            return told
-        return told._replace(flags=np.bitwise_or.reduce(np.reshape(sensed.flags, (-1, self.hold)), axis=1))
+            return thinned
+        return thinned._replace(flags=np.bitwise_or.reduce(np.reshape(sensed.flags, (-1, self.hold)), axis=1))

@@ -1,10 +1,8 @@
-"""Ultrasonic surface: turns a scene into friction bands, the surface's band model, and the surface itself.
+"""Ultrasonic surface: turns a scene into friction bands, the surface's device model, and the simulated surface.
 
-The target quantity is friction (N), as a change around a bias below that of
-the surface at rest.  The inverse of the friction law makes it an amplitude of
-the plate's mode, which the same controller holds on the resonant carrier.  A
-driver of your own gets that carrier (V) at its own rate, and senses the mode's
-displacement (m), or nothing.
+The target quantity is friction (N), as a change around a bias below that of the surface at rest.  The inverse of the
+friction law makes it an amplitude of the plate's mode, which the same controller holds on the resonant carrier.  A
+driver of your own gets that carrier (V) at its own rate, and senses the mode's displacement (m), or nothing.
 """
 
 from __future__ import annotations
@@ -14,69 +12,68 @@ from dataclasses import replace
 import numpy as np
 
 from hapticrender.bands import Bands
+from hapticrender.checks import inside
 from hapticrender.control.bandmodel import BandModel
+from hapticrender.plants.friction_laws import LAWS
 from hapticrender.plants.surface import SurfaceParameters, UltrasonicSurface
-from hapticrender.protocols import Array, Driver
-from hapticrender.renderers.friction import (
-    FrictionRenderer,
-    FrictionSettings,
-    largest_load,
-    typical_load,
-    typical_speed,
-)
+from hapticrender.plants.ultrasonic import UltrasonicParameters
+from hapticrender.protocols import Driver
+from hapticrender.renderers.base import check_channels, check_tables, read_devices
+from hapticrender.renderers.friction import FrictionRenderer, FrictionSettings, FrictionSetup
 from hapticrender.renderers.resonant import ResonantDriver, amplitude_loop
 from hapticrender.touch.scene import Scene
 
-LEAST_NOISE = 1e-6  # of the range: of a friction that is worked out from the amplitude
+LEAST_NOISE = 1e-6  # of the range: of a friction that is computed from the amplitude
+LEVEL = ("level", "oversampling", "envelope_oversampling", "envelope_frequency")  # how finely a surface is modelled
+
+SurfaceSetup = FrictionSetup[FrictionSettings, SurfaceParameters]
 
 
-class UltrasonicRenderer(FrictionRenderer):
-    """Renderer for plates that take friction away by ultrasonic vibration."""
+class UltrasonicRenderer(FrictionRenderer[SurfaceSetup]):
+    """Renderer for plates that reduce friction by ultrasonic vibration."""
 
     name = "ultrasonic"
     needs = "a drive at the carrier's rate (V), the vibration sensed (m), or open loop"
 
-    def plant(self, scene: Scene, seed: int) -> UltrasonicSurface:
-        """Return the simulated surface, with the scene's overrides and finger."""
-        _, parameters = _read(scene)
-        nominal = typical_load(scene), typical_speed(scene, parameters.least_speed)
-        return UltrasonicSurface(parameters, amplitude_loop(parameters), scene.finger, seed, nominal)
+    def read(self, scene: Scene, driver: Driver | None) -> SurfaceSetup:
+        """Read the tables of a scene."""
+        law = LAWS.get(str({**scene.profile, **scene.simulation}.get("law")), LAWS["fit"])
+        names = SurfaceParameters.names() | UltrasonicParameters.names() | law.names()
+        check_tables(scene, names, FrictionSettings.names(), LEVEL)
+        with inside("render"):
+            settings = FrictionSettings(**scene.rendering)
+        return FrictionSetup(scene, settings, *read_devices(scene, SurfaceParameters, LEVEL))
 
-    def connect(self, scene: Scene, driver: Driver) -> Driver:
+    def plant(self, setup: SurfaceSetup, seed: int) -> UltrasonicSurface:
+        """Return the simulated surface with the scene's finger on it."""
+        loop = amplitude_loop(setup.assumed)
+        return UltrasonicSurface(setup.simulated, loop, setup.scene.finger, seed, (setup.load, setup.speed))
+
+    def connect(self, setup: SurfaceSetup, driver: Driver) -> Driver:
         """Return a device at the carrier's rate as a driver of friction; see `ResonantDriver`."""
-        _, parameters = _read(scene)
-        nominal = typical_load(scene), typical_speed(scene, parameters.least_speed)
-        return ResonantDriver(driver, parameters, scene.finger, nominal)
+        return ResonantDriver(driver, setup.assumed, setup.scene.finger, (setup.load, setup.speed))
 
-    def band_model(self, scene: Scene, driver: Driver) -> BandModel:
-        """Return what the controller may know of the surface behind `driver`.
-
-        Raises
-        ------
-        ValueError
-            The scene asks for more friction than the law can add to the bias or take from it.
-        """
-        for name, value, known in (("drive", driver.drive_channels, (1,)), ("sensed", driver.sensed_channels, (0, 1))):
-            if value not in known:
-                raise ValueError(f"driver.{name}_channels = {value}: must be {' or '.join(map(str, known))}")
-        _, parameters = _read(scene)
-        model = self._model(scene, parameters, driver)
-        whole = parameters.friction_coefficient * typical_load(scene)
-        room = whole * min(1.0 - parameters.bias, parameters.bias - parameters.friction_law.numbers.floor)
-        need = self.needed(scene, model)
+    def band_model(self, setup: SurfaceSetup, driver: Driver) -> BandModel:
+        """Return the device model of the surface behind `driver`; refuses what the law or the drive cannot do."""
+        check_channels(driver, {1: ""}, {0: "", 1: ""})
+        assumed, load = setup.assumed, setup.load
+        model = _model(setup, driver)
+        whole = assumed.friction_coefficient * load
+        room = whole * min(1.0 - assumed.bias, assumed.bias - assumed.friction_law.floor)
+        need = setup.needed(model).drive
         if need > room:
             raise ValueError(
                 f"texture.amplitude asks for {need:.3g} N of friction: must be <= {room:.3g} N, what amplitude can "
-                f"change around {parameters.bias:g} of the friction of a finger of {typical_load(scene):.3g} N"
+                f"change around {assumed.bias:g} of the friction of a finger of {load:.3g} N"
             )
-        if driver.sensed_channels and parameters.sensor == "tribometer":
-            self.check_range(scene, model, parameters, parameters.friction_coefficient * largest_load(scene))
-        _check_amplitude(parameters, need / whole, typical_load(scene), typical_speed(scene, parameters.least_speed))
+        if driver.sensed_channels and assumed.sensor == "tribometer":
+            setup.check_range(model, assumed.friction_coefficient * setup.largest_load)
+        _check_amplitude(assumed, need / whole, load, setup.speed)
         return replace(model, drive_limit=room)
 
-    def bands(self, scene: Scene, model: BandModel) -> Bands:
+    def bands(self, setup: SurfaceSetup, model: BandModel) -> Bands:
         """Carriers and targets of a scene, refused where the amplitude could not follow."""
-        bands = super().bands(scene, model)
+        bands = super().bands(setup, model)
         if bands.frequency.max(initial=0.0) > model.highest_frequency:
             raise ValueError(
                 f"texture.frequency = {bands.frequency.max():g}: must be <= {model.highest_frequency:g} Hz, "
@@ -84,51 +81,34 @@ class UltrasonicRenderer(FrictionRenderer):
             )
         return bands
 
-    def sensor_response(self, scene: Scene, frequency: Array) -> Array:
-        """Return what the tribometer shows of friction, or what the sensed amplitude says of it before it lags."""
-        _, parameters = _read(scene)
-        return parameters.sensor_response(frequency, typical_speed(scene, parameters.least_speed))
 
-    def _model(self, scene: Scene, parameters: SurfaceParameters, driver: Driver) -> BandModel:
-        """Band model without its drive limit: what carries the amplitude along takes half a sample more than a hold."""
-        listening, late = driver.sensed_channels > 0, 0.5 / driver.rate
-        model = self.contact(
-            scene,
-            parameters,
-            rate=driver.rate,
-            delay=driver.delay,
-            block=driver.block,
-            friction_per_drive=1.0,
-            listening=listening,
+def _model(setup: SurfaceSetup, driver: Driver) -> BandModel:
+    """Device model without its drive limit; the amplitude's interpolation adds half a sample to that of a hold."""
+    assumed, late = setup.assumed, 0.5 / driver.rate
+    model = setup.contact(driver, 1.0)
+    if driver.sensed_channels and assumed.sensor == "amplitude":  # no contact and no tribometer between
+        return replace(
+            model,
+            mass=late**2 / 2 * np.eye(1),
+            damping=late * np.eye(1),
+            stiffness=np.eye(1),
+            memory=0.0,
+            late=0.0,
+            foresight=assumed.memory_length,
+            sensed_noise=LEAST_NOISE * model.sensed_limit,
         )
-        if listening and parameters.sensor == "amplitude":  # no contact and no tribometer between
-            return replace(
-                model,
-                mass=late**2 / 2 * np.eye(1),
-                damping=late * np.eye(1),
-                stiffness=np.eye(1),
-                memory=0.0,
-                late=0.0,
-                foresight=parameters.memory_length,
-                sensed_noise=LEAST_NOISE * model.sensed_limit,
-            )
-        mass = model.mass + late * model.damping + late**2 / 2 * model.stiffness
-        return replace(model, mass=mass, damping=model.damping + late * model.stiffness)
+    mass = model.mass + late * model.damping + late**2 / 2 * model.stiffness
+    return replace(model, mass=mass, damping=model.damping + late * model.stiffness)
 
 
-def _check_amplitude(parameters: SurfaceParameters, swing: float, load: float, speed: float) -> None:
+def _check_amplitude(surface: SurfaceParameters, swing: float, load: float, speed: float) -> None:
     """Refuse a `swing` of the friction (1) around the bias for which the drive is too weak, however slow it is."""
-    least = max(parameters.bias - swing, parameters.least_ratio)
-    amplitude = float(parameters.friction_law.amplitude(least, load, speed))
-    mode = parameters.mode
+    least = max(surface.bias - swing, surface.least_ratio)
+    amplitude = float(surface.friction_law.amplitude(least, load, speed))
+    mode = surface.mode
     volts = mode.drive_for(amplitude, normal_load=load)
     if volts > mode.drive_limit:
         raise ValueError(
             f"texture.amplitude asks for a vibration of {amplitude:.3g} m, which takes {volts:.3g} V under "
             f"{load:.3g} N: must be <= {mode.drive_limit:g} V"
         )
-
-
-def _read(scene: Scene) -> tuple[FrictionSettings, SurfaceParameters]:
-    settings, rest = FrictionSettings.split(scene.plant)
-    return settings, SurfaceParameters.with_overrides(rest, settings.names())

@@ -1,6 +1,9 @@
-"""The scenes that the library brings along; the demo renders them and ``validate`` judges by them."""
+"""The built-in scenes: the demo renders them and ``validate`` judges by them."""
 
 from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
 
 from hapticrender.touch.finger import Finger
 from hapticrender.touch.grating import Grating
@@ -8,52 +11,12 @@ from hapticrender.touch.recorded import Synthetic
 from hapticrender.touch.scene import Scene
 
 DEVICES = ("vt-plate", "electroadhesion", "ultrasonic", "hybrid")
-PAPER_FREQUENCIES = (20.0, 31.0, 47.0, 72.0, 111.0, 170.0, 261.0, 400.0)  # Hz, of the paper's eight gratings
+PAPER_FREQUENCIES = (20.0, 31.0, 47.0, 72.0, 111.0, 170.0, 261.0, 400.0)  # Hz: the gratings of Grigorii et al. 2021
 
 
 def builtin_scenes() -> dict[str, Scene]:
     """Every built-in scene under its name."""
-    scenes = [*map(_grating, PAPER_FREQUENCIES), _spatial(), _recorded(), _sliding(), _pressing(), _swiping()]
-    scenes += [*one_texture().values(), _screen(), _screen_recorded(), _ultrasonic(), _warming()]
-    return {scene.name: scene for scene in scenes}
-
-
-def _grating(frequency: float) -> Scene:
-    """Return one of the paper's gratings on the free plate."""
-    texture = Grating(amplitude=10e-6, frequency=frequency)
-    return Scene(texture=texture, duration=5.0, tolerance=0.02, name=f"grating-{frequency:g}")
-
-
-def _spatial() -> Scene:
-    """Return ridges of 1 mm under a finger that slides, reverses, lifts and touches again: 80 Hz while it moves."""
-    finger = Finger.sliding(speed=0.08, normal_load=0.6, span=0.08, touches=[(0.5, 3.4), (3.8, 6.0)], mechanics="heavy")
-    return Scene(texture=Grating(amplitude=10e-6, wavelength=1e-3), finger=finger, duration=6.0, name="spatial-grating")
-
-
-def _recorded() -> Scene:
-    """Return a texture as if recorded at 80 mm/s, under a light finger that sweeps to and fro at up to that speed."""
-    finger = Finger.swiping(frequency=0.5, speed=0.08, normal_load=0.3, mechanics="light")
-    texture = Synthetic(amplitude=20e-6, speed=0.08)
-    return Scene(texture=texture, finger=finger, duration=5.0, name="recorded-texture")
-
-
-def _sliding() -> Scene:
-    """Return a grating near the rocking mode, under a heavy finger that wanders over the plate."""
-    finger = Finger.sliding(speed=0.1, normal_load=0.8, span=0.05, mechanics="heavy")
-    return Scene(texture=Grating(amplitude=50e-6, frequency=143.0), finger=finger, duration=5.0, name="sliding")
-
-
-def _pressing() -> Scene:
-    """Return a small slow grating, too small to be felt, under a press whose sag is many times larger."""
-    finger = Finger.still(normal_load=0.5, touches=[(0.5, 5.0)], mechanics="auto")
-    texture = Grating(amplitude=1e-6, frequency=20.0)
-    return Scene(texture=texture, finger=finger, duration=5.0, keep_unfelt=True, name="pressing")
-
-
-def _swiping() -> Scene:
-    """Return ridges of 1 mm under fast swipes: up to 940 Hz/s, and through 0 Hz at each reversal."""
-    finger = Finger.swiping(frequency=3.0, speed=0.05, normal_load=0.4, mechanics="light")
-    return Scene(texture=Grating(amplitude=10e-6, wavelength=1e-3), finger=finger, duration=5.0, name="swiping")
+    return {scene.name: scene for scene in (*_on_the_plate(), *one_texture().values(), *_by_friction())}
 
 
 def one_texture() -> dict[str, Scene]:
@@ -62,40 +25,51 @@ def one_texture() -> dict[str, Scene]:
     texture = Grating(velocity=8e-3, frequency=50.0, partials=partials)
     finger = Finger.sliding(speed=0.08, normal_load=0.4, mechanics="light")
     return {
-        device: Scene(
-            texture=texture, finger=finger, device=device, duration=3.0, tolerance=0.05, name=f"one-texture-{device}"
-        )
+        device: _scene(f"one-texture-{device}", texture, finger, 3.0, device=device, tolerance=0.05)
         for device in DEVICES
     }
 
 
-def _screen() -> Scene:
-    """Return ridges of 1 mm on an electroadhesion screen, under a finger that slides, reverses, lifts and returns."""
-    finger = Finger.sliding(speed=0.08, normal_load=0.6, span=0.08, touches=[(0.5, 3.4), (3.8, 6.0)], mechanics="heavy")
-    texture = Grating(velocity=8e-3, wavelength=1e-3, speed=0.08)
-    return Scene(texture=texture, finger=finger, device="electroadhesion", duration=6.0, name="screen-spatial")
+def _scene(name: str, texture: Any, finger: Finger, duration: float, **fields: Any) -> Scene:
+    return Scene(name=name, texture=texture, finger=finger, duration=duration, **fields)
 
 
-def _screen_recorded() -> Scene:
-    """Return a texture as if recorded, on an electroadhesion screen under a sweeping finger."""
-    finger = Finger.swiping(frequency=0.5, speed=0.08, normal_load=0.3, mechanics="light")
-    texture = Synthetic(amplitude=40e-6, speed=0.08)
-    return Scene(texture=texture, finger=finger, device="electroadhesion", duration=5.0, name="screen-recorded")
+def _lifting() -> Finger:
+    """Finger that slides, reverses, lifts and touches again."""
+    return Finger.sliding(speed=0.08, normal_load=0.6, span=0.08, touches=[(0.5, 3.4), (3.8, 6.0)], mechanics="heavy")
 
 
-def _ultrasonic() -> Scene:
-    """Return ridges of 1 mm on an ultrasonic plate, under swipes that pass through 0 Hz at each reversal."""
-    finger = Finger.swiping(frequency=1.0, speed=0.15, normal_load=0.5, mechanics="light")
-    texture = Grating(velocity=8e-3, wavelength=1e-3, speed=0.1)
-    return Scene(texture=texture, finger=finger, device="ultrasonic", duration=4.0, name="ultrasonic-swiping")
+def _sweeping() -> Finger:
+    """Light finger that sweeps to and fro at up to 80 mm/s."""
+    return Finger.swiping(frequency=0.5, speed=0.08, normal_load=0.3, mechanics="light")
 
 
-def _warming() -> Scene:
-    """Return a grating on an ultrasonic plate that warms up by 10 K, which takes its resonance 30 Hz away."""
-    finger = Finger.sliding(speed=0.08, normal_load=0.5, mechanics="light")
+def _on_the_plate() -> Iterator[Scene]:
+    """The paper's gratings on the free plate, ridges of 1 mm, a recording, a slide, a press, and fast swipes."""
+    for frequency in PAPER_FREQUENCIES:
+        texture = Grating(amplitude=10e-6, frequency=frequency)
+        yield _scene(f"grating-{frequency:g}", texture, Finger.absent(), 5.0, tolerance=0.02)
+    ridges = Grating(amplitude=10e-6, wavelength=1e-3)  # 80 Hz at 80 mm/s
+    yield _scene("spatial-grating", ridges, _lifting(), 6.0)
+    yield _scene("recorded-texture", Synthetic(amplitude=20e-6, speed=0.08), _sweeping(), 5.0)
+    wandering = Finger.sliding(speed=0.1, normal_load=0.8, span=0.05, mechanics="heavy")
+    yield _scene("sliding", Grating(amplitude=50e-6, frequency=143.0), wandering, 5.0)  # near the rocking mode
+    press = Finger.still(normal_load=0.5, touches=[(0.5, 5.0)], mechanics="auto")  # its sag is many times the target
+    yield _scene("pressing", Grating(amplitude=1e-6, frequency=20.0), press, 5.0, keep_unfelt=True)
+    swipes = Finger.swiping(frequency=3.0, speed=0.05, normal_load=0.4, mechanics="light")  # up to 940 Hz/s
+    yield _scene("swiping", ridges, swipes, 5.0)
+
+
+def _by_friction() -> Iterator[Scene]:
+    """Ridges and a recording on a screen, swipes on an ultrasonic plate, and one that warms up."""
+    ridges = Grating(velocity=8e-3, wavelength=1e-3, speed=0.08)
+    yield _scene("screen-spatial", ridges, _lifting(), 6.0, device="electroadhesion")
+    recorded = Synthetic(amplitude=40e-6, speed=0.08)
+    yield _scene("screen-recorded", recorded, _sweeping(), 5.0, device="electroadhesion")
+    swipes = Finger.swiping(frequency=1.0, speed=0.15, normal_load=0.5, mechanics="light")
+    slower = Grating(velocity=8e-3, wavelength=1e-3, speed=0.1)
+    yield _scene("ultrasonic-swiping", slower, swipes, 4.0, device="ultrasonic")
+    heat = {"temperature_rise": 10.0, "temperature_time": 3.0}  # takes the resonance 30 Hz away
+    sliding = Finger.sliding(speed=0.08, normal_load=0.5, mechanics="light")
     texture = Grating(velocity=10e-3, frequency=111.0)
-    plant = {"temperature_rise": 10.0, "temperature_time": 3.0}
-    return Scene(
-        texture=texture, finger=finger, device="ultrasonic", duration=4.0, tolerance=0.02, name="ultrasonic-warming",
-        plant=plant,
-    )  # fmt: skip
+    yield _scene("ultrasonic-warming", texture, sliding, 4.0, device="ultrasonic", tolerance=0.02, simulation=heat)

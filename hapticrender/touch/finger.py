@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
+from hapticrender import checks
 from hapticrender.protocols import Array, Motion
-from hapticrender.touch import checks
 from hapticrender.touch.mechanics import NONE, FingerMechanics, read_mechanics
-from hapticrender.touch.motion import LONGEST_TIME, Nowhere, Sampled, Sliding, Still, Swiping, Tracked
+from hapticrender.touch.motion import LONGEST_TIME, Nowhere, RecordedMotion, Sampled, SineMotion, Still, TriangleMotion
 
 MOST_LOAD = 20.0  # N
 
@@ -27,11 +27,11 @@ class Finger:
     Parameters
     ----------
     motion : Motion
-        `Still`, `Sliding`, `Swiping`, `Sampled`, `Tracked`, `Nowhere`, or any
+        `Still`, `TriangleMotion`, `SineMotion`, `Sampled`, `RecordedMotion`, `Nowhere`, or any
         object with ``position(time)``; NaN means lifted.
     normal_load : float, N, or (times in s, loads in N), or None
         >= 0 and <= 20; a curve is joined by straight lines and held at both
-        ends.  None: as recorded, for a motion that knows its load (`Tracked`).
+        ends.  None: as recorded, for a motion that has a load (`RecordedMotion`).
     touches : sequence of (on, off), s, or None
         The finger touches while on <= t < off; None: whenever its motion says.
     mechanics : FingerMechanics, or a name, or a table of its numbers
@@ -76,7 +76,7 @@ class Finger:
         cls, speed: float, normal_load: Any = 0.4, span: float = 0.05, centre: float = 0.0, **touch: Any
     ) -> Finger:
         """Return a finger that moves at `speed` (m/s), back and forth over `span` (m) around `centre` (m)."""
-        return cls(Sliding(speed, span, centre), normal_load, **touch)
+        return cls(TriangleMotion(speed, span, centre), normal_load, **touch)
 
     @classmethod
     def swiping(
@@ -89,7 +89,7 @@ class Finger:
         **touch: Any,
     ) -> Finger:
         """Return a finger that swipes sinusoidally, by peak `speed` (m/s) or by `stroke` (m)."""
-        return cls(Swiping(frequency, speed, stroke, centre), normal_load, **touch)
+        return cls(SineMotion(frequency, speed, stroke, centre), normal_load, **touch)
 
     @classmethod
     def sampled(
@@ -103,7 +103,7 @@ class Finger:
         cls, file: str | os.PathLike[str], start: float = 0.0, normal_load: Any = None, **touch: Any
     ) -> Finger:
         """Return the finger of a tribometer recording, from `start` (s) on, with its own load unless given."""
-        return cls(Tracked(os.fspath(file), start), normal_load, **touch)
+        return cls(RecordedMotion(os.fspath(file), start), normal_load, **touch)
 
     def position(self, time: Array) -> Array:
         """Position (m from the middle of the surface, shape (n,)), NaN while lifted."""

@@ -8,9 +8,10 @@ from typing import Any, ClassVar, cast
 
 import numpy as np
 
+from hapticrender import checks
 from hapticrender.bands import Bands
 from hapticrender.protocols import Array
-from hapticrender.touch import checks, perception
+from hapticrender.touch import perception
 
 MOST_AMPLITUDE = 0.01  # m: ten times the travel of any plate, so it catches a wrong unit
 MOST_PARTIALS = 4096

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
+from hapticrender import checks
 from hapticrender.protocols import Array
-from hapticrender.touch import checks
 
 LIGHT_BELOW = 0.5  # N: Table 1 parts its two columns here
 LIGHT_LOAD, HEAVY_LOAD = 0.3, 0.8  # N: engineering defaults for what "light" and "heavy" were measured at

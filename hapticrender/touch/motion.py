@@ -8,11 +8,11 @@ from typing import ClassVar
 
 import numpy as np
 
+from hapticrender import checks
 from hapticrender.protocols import Array
-from hapticrender.touch import checks
 from hapticrender.touch.tribometer import SwipeRecording, load_swipe
 
-FARTHEST = 1.0  # m from the middle; each renderer knows its own surface
+FARTHEST = 1.0  # m from the middle; each renderer checks its own surface
 MOST_SPEED = 10.0  # m/s
 LONGEST_TIME = 360_000.0  # s: 100 h
 
@@ -51,7 +51,7 @@ class Still:
 
 
 @dataclass(frozen=True)
-class Sliding:
+class TriangleMotion:
     """Constant speed, back and forth between two ends; starts at the centre, towards the positive end.
 
     Parameters
@@ -65,7 +65,7 @@ class Sliding:
 
     Examples
     --------
-    >>> Sliding(speed=0.1, span=0.05).position(np.array([0.0, 0.25, 0.5, 0.75])).round(9).tolist()
+    >>> TriangleMotion(speed=0.1, span=0.05).position(np.array([0.0, 0.25, 0.5, 0.75])).round(9).tolist()
     [0.0, 0.025, 0.0, -0.025]
     """
 
@@ -89,7 +89,7 @@ class Sliding:
 
 
 @dataclass(frozen=True)
-class Swiping:
+class SineMotion:
     """Sinusoidal swipes, ``centre + stroke/2 sin(2 pi frequency t)``.
 
     Parameters
@@ -176,7 +176,7 @@ class Sampled:
 
 
 @dataclass(frozen=True)
-class Tracked:
+class RecordedMotion:
     """A finger recorded by a tribometer: unwrapped encoder, NaN while lifted, with its normal load.
 
     Parameters
@@ -187,7 +187,7 @@ class Tracked:
         Where in the recording t = 0 lies, >= 0.
     """
 
-    kind: ClassVar[str] = "swipe"
+    kind: ClassVar[str] = "recorded"
 
     file: str
     start: float = 0.0

@@ -1,4 +1,4 @@
-"""What a finger can feel: detection threshold, level, force for a wanted motion, and the bands that no one can feel.
+"""Perception: detection threshold, sensation level, equivalent force, roughness, and bands too weak to be felt.
 
 Amplitudes are peaks (m, m/s, N) of sinusoids; levels are dB above the classic detection threshold.
 """
@@ -10,9 +10,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from hapticrender import checks
 from hapticrender.bands import Bands
 from hapticrender.protocols import Array
-from hapticrender.touch import checks
 from hapticrender.touch.mechanics import FingerMechanics
 
 # Classic threshold (um peak at Hz), large contactor (2.9 cm2), about 1 s: Bolanowski, Gescheider, Verrillo and

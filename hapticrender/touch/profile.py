@@ -7,13 +7,16 @@ Everything here runs in *recorded* seconds.  A spatial recording is read at
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
+from hapticrender import checks
 from hapticrender.protocols import Array
 
 ROLL_OFF = 1.5  # the passband falls to zero within this factor of its edges
 POINTS = 32  # of the table in the shortest period that it holds
+MOST_WINDOW = 1 << 23  # samples of a Welch window
 FAINTEST = 1e-4  # a peak below this share of the strongest one's power is no carrier
 
 
@@ -36,6 +39,11 @@ class Profile:
         """From the first to the last value, s."""
         return (self.values.size - 1) * self.step
 
+    @staticmethod
+    def size(count: int, step: float, high: float) -> int:
+        """Points of the table that `band_limited` makes of `count` values."""
+        return int(np.ceil(POINTS * ROLL_OFF * high * (count - 1) * step)) + 2
+
     @classmethod
     def band_limited(cls, values: Array, step: float, low: float, high: float) -> Profile:
         """Keep `low` to `high` (Hz) of `values`, on a table fine enough for `at`.
@@ -50,7 +58,7 @@ class Profile:
         spectrum = dct(values, type=1)
         spectrum *= _passband(np.arange(count + 1) / (2 * length), low, high)
         spectrum[-1] /= 2  # the last term of a DCT-I stands alone, the others for a pair
-        fine = int(np.ceil(POINTS * ROLL_OFF * high * length)) + 2
+        fine = cls.size(values.size, step, high)
         padded = np.zeros(fine + 1)
         kept = min(fine, count + 1)
         padded[:kept] = spectrum[:kept] * (fine / count)
@@ -67,36 +75,82 @@ class Profile:
         inner = (u + 1) * (2 - u) / 2 * ((1 - u) * b + u * c)
         return inner - u * (1 - u) / 6 * ((2 - u) * a + (u + 1) * d)
 
-    def strongest(self, count: int, spacing: float, low: float, high: float) -> Array:
-        """Frequencies (Hz, rising) of up to `count` peaks of the spectrum in [low, high], `spacing` (Hz) apart."""
-        frequency, power = self._spectrum(spacing / 16)
-        peak = np.zeros(power.size, bool)
-        peak[1:-1] = (power[1:-1] >= power[:-2]) & (power[1:-1] > power[2:])
-        inside = (frequency >= low) & (frequency <= high)
-        candidates = np.flatnonzero(peak & inside)
-        if not candidates.size:
-            candidates = np.flatnonzero(inside)
-        candidates = candidates[np.argsort(-power[candidates], kind="stable")]
-        chosen: list[float] = []
-        for index in candidates:
-            middle = min(max(_refined(frequency, power, int(index)), low), high)
-            clear = all(abs(middle - other) >= spacing for other in chosen)
-            if clear and power[index] >= FAINTEST * power[candidates[0]]:
-                chosen.append(middle)
-            if len(chosen) == count:
-                break
-        return np.sort(np.array(chosen))
 
-    def _spectrum(self, resolution: float) -> tuple[Array, Array]:
-        """Power averaged over half-overlapping Hann windows of 1/resolution seconds (Welch's method)."""
-        window_size = round(1 / (resolution * self.step))
-        size = min(window_size, self.values.size)
-        window = np.hanning(size)
-        starts = range(0, self.values.size - size + 1, max(size // 2, 1))
-        power = np.zeros(window_size // 2 + 1)
-        for start in starts:
-            power += np.abs(np.fft.rfft(self.values[start : start + size] * window, window_size)) ** 2
-        return np.arange(power.size) / (window_size * self.step), power
+def strongest_carriers(
+    signal: Any, rate: float, *, count: int = 8, spacing: float = 40.0, passband: tuple[float, float] = (20.0, 400.0)
+) -> Array:
+    """Choose carriers for a signal: the strongest peaks of its power spectrum, no two closer than `spacing`.
+
+    Parameters
+    ----------
+    signal : array_like, shape (n,), n >= 2
+        Waveform over time, or over position at the speed at which it was recorded.
+    rate : float, Hz
+        Of its samples, > 0.
+    count : int
+        Most carriers, >= 1.
+    spacing : float, Hz
+        Least distance of two carriers, > 0.  Carriers 40 Hz or more apart are followed at full speed; the bandwidth
+        of closer ones falls in proportion to their distance.
+    passband : (float, float), Hz
+        Where to look for them, 0 <= low < high.
+
+    Returns
+    -------
+    ndarray, shape (k,), k <= count, Hz
+        Rising.  Peaks below 1e-4 of the strongest one's power are left out.
+
+    Raises
+    ------
+    ValueError
+        The signal is no row of finite numbers, or a number is out of its bound.
+
+    Examples
+    --------
+    >>> time = np.arange(0, 2, 1e-3)
+    >>> signal = np.sin(2 * np.pi * 72 * time) + 0.5 * np.sin(2 * np.pi * 190 * time)
+    >>> strongest_carriers(signal, 1000.0).round(1).tolist()
+    [72.0, 190.0]
+    """
+    values = np.asarray(signal, float)
+    if values.ndim != 1 or values.size < 2 or not np.isfinite(values).all():
+        raise ValueError(f"signal has shape {values.shape}: must be a row of >= 2 finite numbers")
+    rate = checks.number("rate", rate, "Hz", above=0)
+    count = checks.integer("count", count, least=1)
+    spacing = checks.number("spacing", spacing, "Hz", above=0)
+    low, high = checks.numbers("passband", passband, "Hz", least=0, most=1e6, count=2)[:2]
+    frequency, power = _spectrum(values, rate, spacing / 16)
+    peak = np.zeros(power.size, bool)
+    peak[1:-1] = (power[1:-1] >= power[:-2]) & (power[1:-1] > power[2:])
+    inside = (frequency >= low) & (frequency <= high)
+    candidates = np.flatnonzero(peak & inside)
+    if not candidates.size:
+        candidates = np.flatnonzero(inside)
+    candidates = candidates[np.argsort(-power[candidates], kind="stable")]
+    chosen: list[float] = []
+    for index in candidates:
+        middle = min(max(_refined(frequency, power, int(index)), low), high)
+        clear = all(abs(middle - other) >= spacing for other in chosen)
+        if clear and power[index] >= FAINTEST * power[candidates[0]]:
+            chosen.append(middle)
+        if len(chosen) == count:
+            break
+    return np.sort(np.array(chosen))
+
+
+def _spectrum(values: Array, rate: float, resolution: float) -> tuple[Array, Array]:
+    """Power averaged over half-overlapping Hann windows of 1/resolution seconds (Welch's method)."""
+    window_size = max(round(rate / resolution), 2)
+    if window_size > MOST_WINDOW:
+        raise ValueError(
+            f"spacing = {16 * resolution:g} Hz: must be >= {16 * rate / MOST_WINDOW:.3g} Hz at {rate:g} samples/s"
+        )
+    size = min(window_size, values.size)
+    window = np.hanning(size)
+    power = np.zeros(window_size // 2 + 1)
+    for start in range(0, values.size - size + 1, max(size // 2, 1)):
+        power += np.abs(np.fft.rfft(values[start : start + size] * window, window_size)) ** 2
+    return np.arange(power.size) * (rate / window_size), power
 
 
 def _passband(frequency: Array, low: float, high: float) -> Array:

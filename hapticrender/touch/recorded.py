@@ -3,24 +3,29 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from pathlib import Path
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 
+from hapticrender import checks
 from hapticrender.bands import Bands
 from hapticrender.errors import SceneError
 from hapticrender.protocols import Array
-from hapticrender.touch import checks
 from hapticrender.touch.grating import MOST_AMPLITUDE
-from hapticrender.touch.profile import Profile
-from hapticrender.touch.tribometer import load_swipe
+from hapticrender.touch.profile import Profile, strongest_carriers
+from hapticrender.touch.tribometer import MOST_SPEED, load_swipe
 
-MOST_SPEED = 10.0  # m/s
 MOST_FRAMES = 1 << 24
+MOST_SAMPLES = 1 << 26  # in all channels: what is decoded
+MOST_RATE = 768e3  # Hz
+LOUDEST = 1e6  # times full scale
+BLOCK = 1 << 16  # frames read at once
 MOST_CARRIERS = 512
+MOST_POINTS = 1 << 24  # of a profile
 WHOLE = 0.99  # of a sound file: the length that a header gives for compressed sound may be an estimate
 STREAMED = 2**31 - 2**16  # bytes: a length from here on was not known when the header was written
 _PART = re.compile(r"^ *(?:RIFF|riff|Riff size|data|FORM|SSND|Data Size) *: (\d+) \(should be (\d+)\)", re.MULTILINE)
@@ -62,7 +67,14 @@ class _Playback:
         low, high = self.passband
         if 0.5 / step <= low:
             raise SceneError(f"passband = {self.passband} Hz: must start < {0.5 / step:g} Hz, half the file's rate")
-        profile = Profile.band_limited(values, step, low, min(high, 0.5 / step))
+        high = min(high, 0.5 / step)
+        size = Profile.size(values.size, step, high)
+        if size > MOST_POINTS:
+            raise SceneError(
+                f"passband = {self.passband} Hz: {values.size * step:.3g} s up to {high:g} Hz take {size} points: must "
+                f"be <= {MOST_POINTS}; shorten the recording or lower the passband"
+            )
+        profile = Profile.band_limited(values, step, low, high)
         return Profile(profile.values * self._scale(np.abs(profile.values).max(), np.abs(values).max()), profile.step)
 
     def _scale(self, peak: float, whole: float) -> float:
@@ -101,8 +113,13 @@ class _Playback:
 
     def bands(self, rate: float) -> Bands:
         """Carriers at the strongest peaks of the spectrum below rate/2 (`rate` in Hz); envelopes are to be analysed."""
-        low, high = self.passband
-        found = self.profile.strongest(self.carriers, self.spacing, low, high)
+        found = strongest_carriers(
+            self.profile.values,
+            1 / self.profile.step,
+            count=self.carriers,
+            spacing=self.spacing,
+            passband=self.passband,
+        )
         return _carriers(found, self._speed(), rate)
 
     def waveform(self, time: Array, position: Array) -> Array:
@@ -183,7 +200,7 @@ class Recorded(_Playback):
 
 
 def _read_sound(file: str, channel: int) -> tuple[Array, float]:
-    """One channel of a sound file, and its step (s); raises `SceneError`."""
+    """One channel of a sound file, and its step (s); memory is bounded by the channel's length; raises `SceneError`."""
     import soundfile
 
     name = f"file = {checks.show(file)}"
@@ -191,16 +208,12 @@ def _read_sound(file: str, channel: int) -> tuple[Array, float]:
         raise SceneError(f"{name}: must be an existing sound file")
     try:
         with soundfile.SoundFile(file) as sound:
-            if not 2 <= sound.frames <= MOST_FRAMES:
-                raise SceneError(f"{name}: has {sound.frames} samples: must be >= 2 and <= {MOST_FRAMES} samples")
-            if channel >= sound.channels:
-                raise SceneError(
-                    f"channel = {channel}: must be < {sound.channels}, the channels of {checks.show(file)}"
-                )
-            values, rate = sound.read(dtype="float64", always_2d=True)[:, channel], sound.samplerate
+            _check_sound(name, sound, file, channel)
+            blocks = list(_channel(sound, channel))
             held, promised = min(
-                [(len(values), sound.frames), *_sizes(sound.extra_info)], key=lambda pair: pair[0] / pair[1]
+                [(sum(map(len, blocks)), sound.frames), *_sizes(sound.extra_info)], key=lambda pair: pair[0] / pair[1]
             )
+            rate = sound.samplerate
             if held < WHOLE * promised:
                 raise SceneError(
                     f"{name}: ends after {100 * held / promised:.3g} % of what its header says: must be whole"
@@ -209,12 +222,37 @@ def _read_sound(file: str, channel: int) -> tuple[Array, float]:
         if isinstance(problem, SceneError):
             raise
         raise SceneError(f"{name}: must be a readable sound file ({checks.show(str(problem))})") from problem
-    bad = np.flatnonzero(~np.isfinite(values))
+    values = np.concatenate([*blocks, np.zeros(0)])
+    bad = np.flatnonzero(~(np.abs(values) <= LOUDEST))  # NaN included
     if bad.size:
-        raise SceneError(f"{name}: sample {bad[0]} of channel {channel} = {values[bad[0]]}: must be a finite number")
+        raise SceneError(
+            f"{name}: sample {bad[0]} of channel {channel} = {values[bad[0]]}: "
+            f"must be a finite number within {LOUDEST:g} times full scale"
+        )
     if values.size < 2:
         raise SceneError(f"{name}: has {values.size} readable samples: must be >= 2 samples")
     return values, 1 / rate
+
+
+def _check_sound(name: str, sound: Any, file: str, channel: int) -> None:
+    """Refuse by its header a file that is too long or too fast, before anything is read."""
+    if not 2 <= sound.frames <= MOST_FRAMES:
+        raise SceneError(f"{name}: has {sound.frames} samples: must be >= 2 and <= {MOST_FRAMES} samples")
+    if sound.frames * sound.channels > MOST_SAMPLES:
+        total = f"{sound.frames} samples in each of {sound.channels} channels"
+        raise SceneError(f"{name}: has {total}: must be <= {MOST_SAMPLES} samples together")
+    if not 1 <= sound.samplerate <= MOST_RATE:
+        raise SceneError(f"{name}: has a rate of {sound.samplerate} Hz: must be >= 1 and <= {MOST_RATE:g} Hz")
+    if channel >= sound.channels:
+        raise SceneError(f"channel = {channel}: must be < {sound.channels}, the channels of {checks.show(file)}")
+
+
+def _channel(sound: Any, channel: int) -> Iterator[Array]:
+    """Blocks of one channel, until the file ends."""
+    block = sound.read(BLOCK, dtype="float64", always_2d=True)
+    while len(block):
+        yield block[:, channel].copy()
+        block = sound.read(BLOCK, dtype="float64", always_2d=True)
 
 
 def _sizes(log: str) -> list[tuple[int, int]]:

@@ -3,36 +3,57 @@
 from __future__ import annotations
 
 import os
+import stat
 import tomllib
-from collections.abc import Mapping
+from collections import Counter
+from collections.abc import Iterable, Mapping
 from dataclasses import MISSING, dataclass, field, fields
+from itertools import count
 from numbers import Integral
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from hapticrender import checks, defaults
 from hapticrender.errors import SceneError
 from hapticrender.protocols import Texture
-from hapticrender.touch import checks, toml
+from hapticrender.touch import toml
+from hapticrender.touch.custom import CustomMotion, CustomTexture
 from hapticrender.touch.finger import Finger
-from hapticrender.touch.foreign import ForeignMotion, ForeignTexture
 from hapticrender.touch.grating import Grating
 from hapticrender.touch.mechanics import NAMED, FingerMechanics
-from hapticrender.touch.motion import LONGEST_TIME, Nowhere, Sampled, Sliding, Still, Swiping, Tracked
+from hapticrender.touch.motion import (
+    LONGEST_TIME,
+    Nowhere,
+    RecordedMotion,
+    Sampled,
+    SineMotion,
+    Still,
+    TriangleMotion,
+)
 from hapticrender.touch.recorded import Recorded, Swipe, Synthetic
 
-TEXTURES: dict[str, type[Any]] = {kind.kind: kind for kind in (Grating, Recorded, Swipe, Synthetic, ForeignTexture)}
+TEXTURES: dict[str, type[Any]] = {kind.kind: kind for kind in (Grating, Recorded, Swipe, Synthetic, CustomTexture)}
 MOTIONS: dict[str, type[Any]] = {
-    kind.kind: kind for kind in (Nowhere, Still, Sliding, Swiping, Sampled, Tracked, ForeignMotion)
+    kind.kind: kind for kind in (Nowhere, Still, TriangleMotion, SineMotion, Sampled, RecordedMotion, CustomMotion)
 }
 LARGEST_FILE = 1 << 26  # bytes of TOML
-PlantValue = float | int | str | bool
+TABLES = {"profile": "device", "simulation": "simulation", "rendering": "render"}  # field of a scene: table of a file
+OWN = {  # keys of these tables that are fields of a scene: table, key, field
+    ("device", "kind"): "device",
+    ("simulation", "seed"): "seed",
+    **{("render", key): key for key in ("method", "tolerance", "settle", "keep_unfelt", "gradient")},
+}
+Value = float | int | str | bool
 
 
 @dataclass(frozen=True, kw_only=True)
 class Scene:
     """Everything that a rendering depends on, in SI; frozen, compared by value, TOML in and out.
+
+    In TOML, ``[device]`` holds `device` (as ``kind``) and `profile`, ``[simulation]`` holds `simulation` and `seed`,
+    ``[render]`` holds `rendering`, `method`, `tolerance`, `settle`, `keep_unfelt` and `gradient`.
 
     Parameters
     ----------
@@ -41,9 +62,17 @@ class Scene:
     finger : Finger
         Default: none; a texture that is read at the finger's position needs one.
     device : str
-        Name of a renderer.
+        Kind of device: name of a renderer.
+    profile : mapping of str to number, str or bool
+        Parameters of the device for which the controller is designed, where they differ from the kind's defaults.
+    simulation : mapping of str to number, str or bool
+        Parameters of the simulated device that differ from the profile, and how finely it is modelled.
+    rendering : mapping of str to number, str or bool
+        Settings of the renderer, such as ``velocity_per_force`` or ``crossover``.
     duration : float, s
         > 0 and <= 360 000 (100 h).
+    method : str
+        Name of the control method.
     tolerance : float
         Relative amplitude error to be judged by, > 0 and <= 10.  Default 0.1:
         errors up to 10 % lie under every just noticeable difference.
@@ -53,19 +82,19 @@ class Scene:
     keep_unfelt : bool
         Whether bands below the safe detection threshold are rendered all the
         same; default: they are left out.
-    name : str
-        Also names files: 1 to 100 printable characters.
     gradient : float, 1/m
-        The wanted amplitude grows by this share of itself per metre along the surface, from its middle on; -1000 to
+        The target amplitude grows by this share of itself per metre along the surface, from its middle on; -1000 to
         1000.  Only a plate with two coils can do so.  What noise leaves does not shrink with it: near a mode of the
         plate it is tenths of a micrometre at a weak end as well.
-    plant : mapping of str to number, str or bool
-        Parameters of the simulated device that differ from its defaults.
+    seed : int
+        Of the simulated sensor noise, >= 0.
+    name : str
+        Also names files: 1 to 100 printable characters.
 
     Examples
     --------
     >>> from hapticrender.touch.grating import Grating
-    >>> scene = Scene(texture=Grating(amplitude=1e-05, frequency=100.0), duration=2.0)
+    >>> scene = Scene(texture=Grating(amplitude=1e-05, frequency=100.0), duration=2.0, simulation={"mass": 0.035})
     >>> Scene.from_toml_text(scene.to_toml()) == scene
     True
     """
@@ -73,23 +102,31 @@ class Scene:
     texture: Texture
     finger: Finger = field(default_factory=Finger.absent)
     device: str = "vt-plate"
+    profile: Mapping[str, Value] = field(default_factory=dict, hash=False)
+    simulation: Mapping[str, Value] = field(default_factory=dict, hash=False)
+    rendering: Mapping[str, Value] = field(default_factory=dict, hash=False)
     duration: float
+    method: str = defaults.METHOD
     tolerance: float = 0.1
     settle: float = 1.0
     keep_unfelt: bool = False
     gradient: float = 0.0
+    seed: int = 0
     name: str = "scene"
-    plant: Mapping[str, PlantValue] = field(default_factory=dict, hash=False)
 
     def __post_init__(self) -> None:
-        checks.word("name", self.name)
-        checks.word("device", self.device)
-        duration = checks.number("duration", self.duration, "s", above=0, most=LONGEST_TIME)
-        tolerance = checks.number("tolerance", self.tolerance, "", above=0, most=10)
-        settle = checks.number("settle", self.settle, "s", least=0, most=LONGEST_TIME)
-        checks.keep(self, keep_unfelt=checks.flag("keep_unfelt", self.keep_unfelt))
-        checks.keep(self, gradient=checks.number("gradient", self.gradient, "1/m", least=-1e3, most=1e3))
-        checks.keep(self, duration=duration, tolerance=tolerance, settle=settle, plant=_read_plant(self.plant))
+        for key in ("name", "device", "method"):
+            checks.word(key, getattr(self, key))
+        checks.keep(
+            self,
+            duration=checks.number("duration", self.duration, "s", above=0, most=LONGEST_TIME),
+            tolerance=checks.number("tolerance", self.tolerance, "", above=0, most=10),
+            settle=checks.number("settle", self.settle, "s", least=0, most=LONGEST_TIME),
+            keep_unfelt=checks.flag("keep_unfelt", self.keep_unfelt),
+            gradient=checks.number("gradient", self.gradient, "1/m", least=-1e3, most=1e3),
+            seed=checks.integer("seed", self.seed, least=0),
+            **{key: _read_table(key, getattr(self, key)) for key in TABLES},
+        )
         if not isinstance(self.texture, Texture):
             checks.refuse("texture", self.texture, "a texture with bands(rate) and waveform(time, position)", TypeError)
         if not isinstance(self.finger, Finger):
@@ -108,9 +145,11 @@ class Scene:
         """
         where = " ".join(str(path).split())
         try:
-            size = Path(path).stat().st_size
-            if size > LARGEST_FILE:
-                raise SceneError(f"{where}: has {size} bytes: must be <= {LARGEST_FILE} bytes")
+            found = Path(path).stat()
+            if not stat.S_ISREG(found.st_mode):
+                raise SceneError(f"{where}: must be a regular file")
+            if found.st_size > LARGEST_FILE:
+                raise SceneError(f"{where}: has {found.st_size} bytes: must be <= {LARGEST_FILE} bytes")
             text = Path(path).read_bytes().decode("utf-8")
         except UnicodeDecodeError as problem:
             raise SceneError(f"{where}: byte {problem.start}: must be UTF-8 text") from problem
@@ -129,53 +168,76 @@ class Scene:
         folder: str | os.PathLike[str] = "",
         name: str = "scene",
     ) -> Scene:
-        """Read a scene from TOML; `where` begins every complaint, `folder` holds the files, `name` is the default."""
+        """Read a scene from TOML; `where` begins every message, `folder` holds the files, `name` is the default."""
         try:
             table = tomllib.loads(text)
         except (ValueError, RecursionError) as problem:
             raise SceneError(f"{where}: must be TOML ({_reason(problem)})") from problem
         try:
             scene = _read_scene(table, Path(folder), name)
-            _check_files(scene)
+            for key, part in (("texture", scene.texture), ("finger", scene.finger.motion)):
+                if hasattr(part, "check"):
+                    with checks.inside(key):
+                        part.check()
         except (ValueError, TypeError) as problem:
             raise SceneError(f"{where}: {problem}") from problem
         return scene
 
     def to_toml(self) -> str:
         """TOML text that `from_toml_text` reads back to an equal scene (textures of your own: by description only)."""
-        keys = ("name", "device", "duration", "tolerance", "settle", "keep_unfelt", "gradient")
-        head = {key: getattr(self, key) for key in keys}
-        texture: Any = self.texture if type(self.texture) in TEXTURES.values() else ForeignTexture(repr(self.texture))
+        texture: Any = self.texture if type(self.texture) in TEXTURES.values() else CustomTexture(repr(self.texture))
+        tables: dict[str, dict[str, Any]] = {table: {} for table in TABLES.values()}
+        for (table, key), own in OWN.items():
+            tables[table][key] = getattr(self, own)
+        for own, table in TABLES.items():
+            tables[table] |= getattr(self, own)
         return toml.dumps(
-            head
+            {"name": self.name, "duration": self.duration}
             | {"texture": {"kind": texture.kind} | _write_fields(texture), "finger": _write_finger(self.finger)}
-            | ({"plant": dict(self.plant)} if self.plant else {})
+            | tables
         )
 
 
+def distinct_names(names: Iterable[str]) -> list[str]:
+    """Number the names of scenes that occur more than once: "a", "b (1)", "b (2)".
+
+    Examples
+    --------
+    >>> distinct_names(["b", "a", "b", "b (1)"])
+    ['b (2)', 'a', 'b (3)', 'b (1)']
+    """
+    names = list(names)
+    total, taken = Counter(names), set(names)
+    for index, name in enumerate(names):
+        if total[name] > 1:
+            names[index] = next(numbered for n in count(1) if (numbered := f"{name} ({n})") not in taken)
+            taken.add(names[index])
+    return names
+
+
 def _reason(problem: Exception) -> str:
-    """Return the first words of somebody else's message, in one line."""
+    """Return the first words of another library's message, in one line."""
     return " ".join(str(getattr(problem, "strerror", None) or problem).split())[:200]
 
 
-def _read_plant(plant: Any) -> dict[str, PlantValue]:
-    if not isinstance(plant, Mapping):
-        checks.refuse("plant", plant, "a table of the device's parameters", TypeError)
-    for key, value in plant.items():
+def _read_table(name: str, values: Any) -> dict[str, Value]:
+    """Return a table of numbers, words and booleans in Python's own types, so that TOML can hold them."""
+    if not isinstance(values, Mapping):
+        checks.refuse(name, values, "a table of parameters", TypeError)
+    found: dict[str, Value] = {}
+    for key, value in values.items():
         if not isinstance(key, str):
-            checks.refuse("plant", key, "a table with texts as keys", TypeError)
-        if not isinstance(value, str | bool | np.bool_):
-            checks.number(f"plant.{_plain(key)}", value)
-    return {key: _simple(value) for key, value in plant.items()}
-
-
-def _simple(value: Any) -> PlantValue:
-    """Return a number or a word in Python's own type, so that TOML can hold it."""
-    if isinstance(value, bool | np.bool_):
-        return bool(value)
-    if isinstance(value, str):
-        return value
-    return int(value) if isinstance(value, Integral) else float(value)
+            checks.refuse(name, key, "a table with texts as keys", TypeError)
+        if (TABLES[name], key) in OWN:
+            raise ValueError(f"{name}.{key}: is not part of this table: give it to Scene as {OWN[TABLES[name], key]}")
+        if isinstance(value, bool | np.bool_):
+            found[key] = bool(value)
+        elif isinstance(value, str):
+            found[key] = value
+        else:
+            checks.number(f"{name}.{_plain(key)}", value)
+            found[key] = int(value) if isinstance(value, Integral) else float(value)
+    return found
 
 
 def _plain(key: str) -> str:
@@ -183,13 +245,34 @@ def _plain(key: str) -> str:
 
 
 def _read_scene(table: dict[str, Any], folder: Path, name: str) -> Scene:
-    _only_known("", table, [entry.name for entry in fields(Scene)])
+    _check_places(table)
+    values: dict[str, Any] = {"duration": table.get("duration"), "name": table.get("name", _usable(name))}
+    for own, where in TABLES.items():
+        rest = dict(table.get(where, {}))
+        values |= {OWN[where, key]: rest.pop(key) for key in list(rest) if (where, key) in OWN}
+        values[own] = rest
     texture = _read_kind(table.get("texture"), "texture", "kind", TEXTURES, folder)
     finger = _read_finger(table["finger"], folder) if "finger" in table else Finger.absent()
-    rest = {key: value for key, value in table.items() if key not in ("texture", "finger")}
-    rest.setdefault("duration", None)
-    rest.setdefault("name", _usable(name))
-    return Scene(texture=texture, finger=finger, **rest)
+    return Scene(texture=texture, finger=finger, **values)
+
+
+def _check_places(table: dict[str, Any]) -> None:
+    """Refuse a key that is not at the top level of a scene; say where it is now, if it once was there."""
+    moved = {key: where for where, key in OWN}
+    for key, value in table.items():
+        said = f"{_plain(key)} = {checks.show(value)}"
+        if key == "plant":
+            raise ValueError(
+                "plant: is three tables now: parameters of the device go into [device], how the simulated device "
+                "differs from them into [simulation], settings of the renderer into [render]"
+            )
+        if key == "device" and isinstance(value, str):
+            raise ValueError(f"{said}: must be a table now: [device] with kind = {checks.show(value)}")
+        if key in moved:
+            raise ValueError(f"{said}: must stand in the table [{moved[key]}]")
+        if key in TABLES.values() and not isinstance(value, dict):
+            checks.refuse(key, value, "a table", TypeError)
+    _only_known("", table, ["name", "duration", "texture", "finger", *TABLES.values()])
 
 
 def _usable(name: str) -> str:
@@ -227,18 +310,10 @@ def _read_finger(table: Any, folder: Path) -> Finger:
     own = [entry.name for entry in fields(Finger) if entry.name != "motion"]
     motion = _read_kind(table, "finger", "motion", MOTIONS, folder, extra=own)
     values = {key: table[key] for key in own if key in table}
-    if isinstance(motion, Tracked):
+    if isinstance(motion, RecordedMotion):
         values.setdefault("normal_load", None)
     with checks.inside("finger"):
         return Finger(motion, **values)
-
-
-def _check_files(scene: Scene) -> None:
-    for key, part in (("texture", scene.texture), ("finger", scene.finger.motion)):
-        check = getattr(part, "check", None)
-        if check is not None:
-            with checks.inside(key):
-                check()
 
 
 def _write_fields(part: Any) -> dict[str, Any]:
@@ -248,7 +323,7 @@ def _write_fields(part: Any) -> dict[str, Any]:
 
 
 def _write_finger(finger: Finger) -> dict[str, Any]:
-    motion: Any = finger.motion if type(finger.motion) in MOTIONS.values() else ForeignMotion(repr(finger.motion))
+    motion: Any = finger.motion if type(finger.motion) in MOTIONS.values() else CustomMotion(repr(finger.motion))
     own = _write_fields(finger)
     own["mechanics"] = _write_mechanics(finger.mechanics)
     del own["motion"]

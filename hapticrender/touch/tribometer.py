@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import zipfile
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -9,12 +11,14 @@ from typing import Any
 
 import numpy as np
 
+from hapticrender import checks
 from hapticrender.errors import SceneError
 from hapticrender.protocols import Array
-from hapticrender.touch import checks
 
 KEYS = ("encoder", "metre_per_count", "lateral_force", "normal_force", "rate")
 MOST_SAMPLES = 1 << 24
+MOST_TRAVEL = 10.0  # m in contact
+MOST_SPEED = 10.0  # m/s
 SMOOTHING = 0.02  # s, of force and velocity before a threshold is applied
 UNLOADED = 0.5  # s at the beginning during which nothing touches
 TOUCH, RELEASE = 0.2, 0.1  # N of normal load
@@ -108,18 +112,29 @@ def _load_swipe(file: str, changed: int) -> SwipeRecording:
             f"file = {checks.show(file)}: normal_force departs by {np.abs(load).max():.3g} N from its level before: "
             f"must be > {TOUCH} N for {SHORTEST_TOUCH} s to be a touch"
         )
-    position = position - (position[touching].min() + position[touching].max()) / 2
+    first, last = position[touching].min(), position[touching].max()
+    if last - first > MOST_TRAVEL:
+        raise SceneError(
+            f"file = {checks.show(file)}: travels {last - first:.3g} m in contact: must be <= {MOST_TRAVEL:g} m; "
+            "is metre_per_count right?"
+        )
+    position = position - (first + last) / 2
     lateral = lateral - np.median(lateral[~touching])
     sliding, speed = _sliding(position, lateral, touching, rate)
+    if speed > MOST_SPEED:
+        raise SceneError(f"file = {checks.show(file)}: slides at {speed:.3g} m/s: must be <= {MOST_SPEED:g} m/s")
     return SwipeRecording(rate, position, np.where(touching, load, 0.0), lateral, touching, sliding, speed)
 
 
 def _read(file: str) -> dict[str, Array]:
-    """Load every array that is needed; a file of unknown making may fail in any way numpy and zipfile know."""
+    """Read every array that is needed; a file of unknown making may fail in any way that numpy and zipfile know."""
     try:
-        with np.load(file, allow_pickle=False) as archive:
-            missing = [key for key in KEYS if key not in archive]
-            raw = {} if missing else {key: np.asarray(archive[key]) for key in KEYS}
+        with zipfile.ZipFile(file) as archive:
+            names = archive.namelist()
+            missing = [key for key in KEYS if f"{key}.npy" not in names]
+            raw = {} if missing else {key: _read_array(archive, key) for key in KEYS}
+    except SceneError as problem:
+        raise SceneError(f"file = {checks.show(file)}: {problem}") from None
     except Exception as problem:
         raise SceneError(
             f"file = {checks.show(file)}: must be a readable .npz file ({checks.show(problem)})"
@@ -127,6 +142,21 @@ def _read(file: str) -> dict[str, Array]:
     if missing:
         raise SceneError(f"file = {checks.show(file)}: {missing[0]} is missing: must hold {', '.join(KEYS)}")
     return raw
+
+
+def _read_array(archive: zipfile.ZipFile, key: str) -> Array:
+    """Read one array, no more than its header says; refuse by that header one that is too long."""
+    with archive.open(f"{key}.npy") as stream:
+        version = np.lib.format.read_magic(stream)
+        header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+        shape, _, kind = header(stream)
+        count = math.prod(shape)
+        if kind.hasobject:
+            raise ValueError(f"{key} holds Python objects")
+        if len(shape) > 1 or not 0 <= count <= MOST_SAMPLES:
+            raise SceneError(f"{key} has shape {shape} and type {kind}: must be a row of <= {MOST_SAMPLES} numbers")
+        data = stream.read(count * kind.itemsize)
+    return np.frombuffer(data, kind, count).reshape(shape)
 
 
 def _scalar(file: str, raw: dict[str, Array], key: str, unit: str, most: float) -> float:

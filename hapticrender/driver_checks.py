@@ -1,8 +1,10 @@
-"""What is asked of a driver and of every block that it returns, checked before either can do harm."""
+"""Checks of a driver and of every block that it returns."""
 
 from __future__ import annotations
 
+import inspect
 import math
+from numbers import Integral, Real
 from typing import Any
 
 import numpy as np
@@ -20,7 +22,7 @@ def check_driver(driver: Any) -> None:
     Parameters
     ----------
     driver : object
-        What should follow the page above.
+        Has to follow ``protocols.Driver``.
 
     Raises
     ------
@@ -29,16 +31,19 @@ def check_driver(driver: Any) -> None:
     ValueError
         A count or the rate is out of its bound.
     """
+    if inspect.isclass(driver):
+        raise TypeError(f"driver = {driver.__name__}: must be an instance, not the class: {driver.__name__}(...)")
     kind = type(driver).__name__
     missing = [name for name in _MEMBERS if not hasattr(driver, name)]
     if missing:
         raise TypeError(f"{kind} is no driver: it lacks {', '.join(missing)}")
-    if not (math.isfinite(driver.rate) and driver.rate > 0):
-        raise ValueError(f"{kind}: rate={driver.rate!r} must be finite and > 0 Hz")
-    for name, least in (_LEAST | {"delay": driver.block}).items():
+    rate = driver.rate
+    if not isinstance(rate, Real) or not 0.0 < float(rate) < math.inf:
+        raise ValueError(f"{kind}: rate={rate!r} must be finite and > 0 Hz")
+    for name, least in (*_LEAST.items(), ("delay", driver.block)):
         value = getattr(driver, name)
-        if value != int(value) or value < least:
-            raise ValueError(f"{kind}: {name}={value!r} must be a whole number >= {least}")
+        if not isinstance(value, Integral) or isinstance(value, bool) or value < least:
+            raise ValueError(f"{kind}: {name}={value!r} must be a whole number >= {least}, an int")
 
 
 def check_sensed(driver: Any, sensed: Sensed, places: int) -> Sensed:
@@ -47,9 +52,9 @@ def check_sensed(driver: Any, sensed: Sensed, places: int) -> Sensed:
     Parameters
     ----------
     driver : Driver
-        Who returned it.
+        The driver that returned it.
     sensed : Sensed
-        What `play` returned.
+        Return value of `play`.
     places : int
         Judged places, the columns of `motion`.
 

@@ -6,7 +6,7 @@ from importlib.metadata import entry_points
 from importlib.util import find_spec
 from typing import Any
 
-from hapticrender.wording import table
+from hapticrender.formatting import table
 
 EXTRAS = (  # package, extra, what it is good for
     ("matplotlib", "plot", "pictures"),

@@ -1,13 +1,15 @@
-"""Checks of what a user hands over: each failure says key, value, bound and unit in one line."""
+"""Validation of arguments and parameters: an error names key, value, bound and unit in one line."""
 
 from __future__ import annotations
 
+import math
 import os
 import reprlib
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import field, fields
 from numbers import Integral, Real
-from typing import Any, NoReturn
+from typing import Any, NoReturn, Self
 
 import numpy as np
 
@@ -18,7 +20,7 @@ _short.maxlong = 30
 
 
 def show(value: object) -> str:
-    """One short line for any value."""
+    """Format any value as one short line."""
     if isinstance(value, int) and abs(value) >= 10**30:
         return "an integer beyond 1e30"
     if isinstance(value, Mapping | list | tuple | np.ndarray) and len(value) > 4:
@@ -29,7 +31,7 @@ def show(value: object) -> str:
 
 
 def refuse(key: str, value: object, bound: str, error: type[Exception] = ValueError) -> NoReturn:
-    """Raise `error` with the house's one line; a value of None reads as missing."""
+    """Raise `error` as "key = value: must be bound"; a value of None reads as missing."""
     if value is None:
         raise error(f"{key} is missing: must be {bound}")
     raise error(f"{key} = {show(value)}: must be {bound}")
@@ -65,17 +67,17 @@ def number(
     inside = (
         (above is None or result > above) and (least is None or result >= least) and (most is None or result <= most)
     )
-    if not (np.isfinite(result) and inside):
+    if not (math.isfinite(result) and inside):
         refuse(key, value, bound)
     return result
 
 
-def integer(key: str, value: Any, *, least: int, most: int) -> int:
+def integer(key: str, value: Any, unit: str = "", *, least: float, most: float | None = None) -> int:
     """Return `value` as int, if it is an integer (no bool) inside its bounds."""
-    bound = f"an integer >= {least} and <= {most}"
+    bound = _bound("an integer", unit, None, least, most)
     if not isinstance(value, Integral) or isinstance(value, bool):
         refuse(key, value, bound, TypeError)
-    if not least <= int(value) <= most:
+    if not least <= int(value) <= (math.inf if most is None else most):
         refuse(key, value, bound)
     return int(value)
 
@@ -104,6 +106,14 @@ def _array(key: str, value: Any, bound: str) -> np.ndarray[Any, Any]:
         return np.array([float(entry) for entry in value])
     except OverflowError:
         refuse(key, value, bound)
+
+
+def rising(key: str, value: Any, count: int) -> tuple[float, ...]:
+    """Return `count` rising times (s) from 0 to 100 h as a tuple of floats."""
+    times = numbers(key, value, "s", least=0, most=360_000)
+    if len(times) != count or any(later <= sooner for sooner, later in zip(times, times[1:], strict=False)):
+        refuse(key, value, f"{count} rising times in s")
+    return times
 
 
 def flag(key: str, value: Any) -> bool:
@@ -157,14 +167,6 @@ def keep(instance: object, **values: Any) -> None:
         object.__setattr__(instance, key, value)
 
 
-def rising(key: str, value: Any, count: int) -> tuple[float, ...]:
-    """Return `count` times (s), each later than the one before, from 0 to 100 h."""
-    times = numbers(key, value, "s", least=0, most=360_000)
-    if len(times) != count or any(later <= sooner for sooner, later in zip(times, times[1:], strict=False)):
-        refuse(key, value, f"{count} rising times in s")
-    return times
-
-
 @contextmanager
 def inside(table: str) -> Iterator[None]:
     """Put the name of a table before the key of whatever is refused within."""
@@ -174,3 +176,46 @@ def inside(table: str) -> Iterator[None]:
         raise TypeError(f"{table}.{problem}") from None
     except ValueError as problem:
         raise ValueError(f"{table}.{problem}") from None
+
+
+def parameter(
+    default: float, unit: str = "", *, above: float | None = None, least: float = 0.0, most: float | None = None
+) -> Any:
+    """Field of a `Validated` class: a number > `above`, or >= `least`, and <= `most`, in `unit`."""
+    low = {"least": least} if above is None else {"above": above}
+    return field(default=default, metadata={"unit": unit, "most": most, **low})
+
+
+def option(default: str, *known: str) -> Any:
+    """Field of a `Validated` class: one of the words in `known`."""
+    return field(default=default, metadata={"known": known})
+
+
+class Validated:
+    """Base of parameter classes whose fields are made by `parameter` and `option` and checked when one is made."""
+
+    def __post_init__(self) -> None:
+        for each in fields(self):  # type: ignore[arg-type]
+            bounds, value = each.metadata, getattr(self, each.name)
+            if "known" in bounds:
+                choice(each.name, value, bounds["known"])
+            elif "unit" in bounds:
+                (integer if each.type in (int, "int") else number)(each.name, value, **bounds)
+
+    @classmethod
+    def names(cls) -> set[str]:
+        """Names of the parameters that `parameter` and `option` made."""
+        return {each.name for each in fields(cls) if not {"known", "unit"}.isdisjoint(each.metadata)}  # type: ignore[arg-type]
+
+    @classmethod
+    def with_overrides(cls, overrides: Mapping[str, Any]) -> Self:
+        """Defaults with the parameters in `overrides` replaced; a name that is unknown is a ValueError."""
+        check_names(overrides, cls.names())
+        return cls(**overrides)
+
+
+def check_names(given: Iterable[str], known: Iterable[str]) -> None:
+    """Refuse a name that is not `known`; the message lists those that are."""
+    for name in given:
+        if name not in known:
+            raise ValueError(f"{name}: no such parameter; known: {', '.join(sorted(known))}")
