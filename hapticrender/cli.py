@@ -1,8 +1,8 @@
-"""The command line: one thin face over the library.
+"""The command line.
 
-Everything that can be wrong with what was asked is found before anything is
-written.  Exit status: 0 done, 1 a scene misses its tolerance (``validate``),
-2 bad input or nowhere to write, 130 interrupted; each trouble gets one line.
+Arguments and scenes are checked before anything is written.  Exit status: 0
+done, 1 a scene misses its tolerance (``validate``), 2 bad input or no
+permission to write, 130 interrupted; each error is one line.
 """
 
 from __future__ import annotations
@@ -12,16 +12,18 @@ import os
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
 from hapticrender import __version__, defaults
 from hapticrender.errors import HapticError, SceneError
+from hapticrender.formatting import printable
 
 if TYPE_CHECKING:
-    from hapticrender.loop import Session
-    from hapticrender.outputs import Outputs
-    from hapticrender.progress import Progress
+    from hapticrender.protocols import Rendering
+    from hapticrender.report.outputs import Outputs
+    from hapticrender.report.progress import Progress
     from hapticrender.touch.scene import Scene
 
 PICTURES_HINT = 'no pictures without matplotlib; to get them: pip install "hapticrender[plot]"'
@@ -39,7 +41,7 @@ start here:
 
 
 class _Parser(argparse.ArgumentParser):
-    """An argument parser whose complaints are errors like all others: one line, status 2."""
+    """An argument parser whose errors are raised like all others: one line, status 2."""
 
     def error(self, message: str) -> NoReturn:
         raise ValueError(message)
@@ -55,23 +57,22 @@ def main(argv: Sequence[str] | None = None) -> int:
         status = arguments.run(arguments)
         sys.stdout.flush()
         return status
-    except BrokenPipeError:  # whoever read our output has had enough, as in `hapticrender scenes | head -1`
+    except BrokenPipeError:  # the reader of our output has closed it, as in `hapticrender scenes | head -1`
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
     except KeyboardInterrupt:
-        return _complain("interrupted; what is written so far can be read", 130)
+        return _fail("interrupted; what is written so far can be read", 130)
     except MemoryError as error:
-        return _complain(f"not enough memory: {error}", 2)
+        return _fail(f"not enough memory: {error}", 2)
     except OSError as error:
-        return _complain(f"{error.filename}: {error.strerror}" if error.filename else str(error), 2)
+        return _fail(f"{error.filename}: {error.strerror}" if error.filename else str(error), 2)
     except (ValueError, HapticError) as error:
-        return _complain(str(error), 2)
+        return _fail(str(error), 2)
 
 
-def _complain(message: str, status: int) -> int:
+def _fail(message: str, status: int) -> int:
     """Write exactly one line to standard error and return the exit status."""
-    line = "".join(c if c.isprintable() else "?" for c in " ".join(message.split()))
-    print(f"hapticrender: {line}", file=sys.stderr)
+    print(f"hapticrender: {printable(' '.join(message.split()))}", file=sys.stderr)
     return status
 
 
@@ -83,7 +84,7 @@ def _parser() -> argparse.ArgumentParser:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("--version", action="version", version=f"hapticrender {__version__}")
-    parser.set_defaults(run=lambda _: _help(parser))
+    parser.set_defaults(run=lambda _: print(parser.format_help(), end="") or 0)
     verbs = parser.add_subparsers(title="verbs", metavar="VERB")
 
     demo = _add_verb(verbs, "demo", _demo, "render the built-in scenes and make a page of sounds, pictures and figures")
@@ -94,11 +95,11 @@ def _parser() -> argparse.ArgumentParser:
     render.add_argument("scene", metavar="SCENE", help="a TOML file, or the name of a built-in scene")
     _add_out(render, None)
     _add_method(render)
+    _add_driver(render)
     render.add_argument("--least-model", action="store_true", help="leave out of the model what a scene does not need")
+    render.add_argument("--verbose", "-v", action="store_true", help="print all figures and notes on the controller")
 
-    scenes = _add_verb(
-        verbs, "scenes", _scenes, "list the built-in scenes, or print one as TOML to start your own from"
-    )
+    scenes = _add_verb(verbs, "scenes", _scenes, "list the built-in scenes, or print one as TOML")
     scenes.add_argument("scene", metavar="NAME", nargs="?", help="the scene to print")
 
     validate = _add_verb(verbs, "validate", _validate, "render scenes and exit 1 when one misses its tolerance")
@@ -108,38 +109,27 @@ def _parser() -> argparse.ArgumentParser:
     )
     validate.add_argument("--json", metavar="FILE", type=_path, help="write all figures as JSON")
     validate.add_argument("--junit", metavar="FILE", type=_path, help="write the JUnit XML that CI systems read")
+    text = "folder for recording, picture and sounds of each scene that does not pass"
+    validate.add_argument("--out", "-o", metavar="DIR", type=_path, help=text)
+    validate.add_argument("--jobs", "-j", metavar="N", type=_whole(1, 999), default=1, help="processes (default: 1)")
     _add_method(validate)
 
     show = _add_verb(verbs, "show", _show, "print the figures of a recording, finished or cut off by a crash")
     show.add_argument("path", metavar="PATH", type=_path, help="a recording, or the folder of a rendered scene")
 
-    identify = _add_verb(verbs, "identify", _identify, "find what the plate is made of, while no finger is on it")
-    identify.add_argument("--out", "-o", metavar="FILE", type=_path, help="write it as the [plant] table of a scene")
-    identify.add_argument("--seed", metavar="N", type=_seed, default=0, help="seed of the noise (default: %(default)s)")
-
-    chart = _add_verb(verbs, "chart", _chart, "draw accuracy against cost, stability, or two methods")
-    chart.add_argument(
-        "name",
-        metavar="NAME",
-        choices=["pareto", "stability", "story", "devices"],
-        help="pareto, stability, story, devices",
-    )
-    chart.add_argument("--learnt", action="store_true", help="the finger already learnt, not the moment of touch")
-    _add_out(chart, Path("out/chart"))
-
-    paper = _add_verb(
-        verbs, "paper", _paper, "compute the paper's tables and figures again, those without participants"
-    )
-    _add_out(paper, Path("out/paper"))
+    identify = _add_verb(verbs, "identify", _identify, "identify the parameters of a plate while no finger is on it")
+    _add_driver(identify)
+    text = "scene whose [device] is the expected plate, and [simulation] the simulated one (default: the paper's plate)"
+    identify.add_argument("--scene", metavar="SCENE", help=text)
+    text = "largest displacement of a glass end (default: 100e-6)"
+    identify.add_argument("--amplitude", metavar="M", type=float, default=100e-6, help=text)
+    identify.add_argument("--seconds", metavar="S", type=float, default=1.0, help="length of the record (default: 1)")
+    text = "write the result as a [device] table (TOML) to paste into a scene"
+    identify.add_argument("--out", "-o", metavar="FILE", type=_path, help=text)
+    _add_seed(identify, None)
 
     _add_verb(verbs, "devices", _devices, "list the kinds of device, what each needs, and whether it is there")
     return parser
-
-
-def _help(parser: argparse.ArgumentParser) -> int:
-    """Help whoever came without a verb."""
-    parser.print_help()
-    return 0
 
 
 def _add_verb(verbs: Any, name: str, run: Any, text: str) -> argparse.ArgumentParser:
@@ -151,11 +141,23 @@ def _add_verb(verbs: Any, name: str, run: Any, text: str) -> argparse.ArgumentPa
 def _add_out(verb: argparse.ArgumentParser, default: Path | None) -> None:
     text = "folder to write into; made if it is not there" + (f" (default: {default})" if default else "")
     verb.add_argument("--out", "-o", metavar="DIR", type=_path, default=default, required=default is None, help=text)
+    verb.add_argument("--force", action="store_true", help="overwrite files that are not from an earlier run")
 
 
 def _add_method(verb: argparse.ArgumentParser) -> None:
-    verb.add_argument("--method", metavar="NAME", default=defaults.METHOD, help="control method (default: %(default)s)")
-    verb.add_argument("--seed", metavar="N", type=_seed, default=0, help="seed of the noise (default: %(default)s)")
+    text = f"control method: one of {', '.join(defaults.METHODS)} (default: the scene's, or {defaults.METHOD})"
+    verb.add_argument("--method", metavar="NAME", help=text)
+    _add_seed(verb, None)
+
+
+def _add_driver(verb: argparse.ArgumentParser) -> None:
+    text = "driver of the device, with its argument (default: a simulated device; see `hapticrender devices`)"
+    verb.add_argument("--driver", metavar="NAME[:ARG]", default="simulated", help=text)
+
+
+def _add_seed(verb: argparse.ArgumentParser, default: int | None) -> None:
+    text = "seed of the noise (default: " + ("the scene's)" if default is None else f"{default})")
+    verb.add_argument("--seed", metavar="N", type=_whole(0, 10**18 - 1), default=default, help=text)
 
 
 def _path(text: str) -> Path:
@@ -165,75 +167,78 @@ def _path(text: str) -> Path:
     return Path(text)
 
 
-def _seed(text: str) -> int:
-    """Read a seed, a whole number >= 0."""
-    if not (text.isascii() and text.isdigit() and len(text) <= 18):
-        raise argparse.ArgumentTypeError(f"{text!r}: must be a whole number from 0 to 10^18 - 1")
-    return int(text)
+def _whole(least: int, most: int) -> Any:
+    """Reader of a whole number from `least` to `most`."""
+
+    def read(text: str) -> int:
+        if not (text.isascii() and text.isdigit() and len(text) <= 18 and least <= int(text) <= most):
+            raise argparse.ArgumentTypeError(f"{text!r}: must be a whole number from {least} to {most}")
+        return int(text)
+
+    return read
 
 
 def _demo(arguments: argparse.Namespace) -> int:
-    from hapticrender.outputs import run_into
+    from hapticrender.report import outputs
+    from hapticrender.report.page import refuse_foreign_page, write_page
+    from hapticrender.report.text import overview
     from hapticrender.touch.builtin import builtin_scenes
 
     scenes = builtin_scenes()
     for name in scenes:
-        _check_folder("--out", arguments.out / name)
-    sessions = _prepare(scenes, arguments)
-    progress = _progress(sessions)
+        outputs.check_folder("--out", arguments.out / name)
+        if not arguments.force:
+            outputs.refuse_to_overwrite(arguments.out / name)
+            refuse_foreign_page(arguments.out)
+    renderings = _prepare(scenes, arguments)
+    progress = _progress(renderings)
     finished: list[Outputs] = []
     try:
-        for name, session in zip(scenes, sessions, strict=True):
+        for name, rendering in zip(scenes, renderings, strict=True):
             with progress.scene(name) as tick:
-                finished.append(run_into(arguments.out / name, session, progress=tick))
+                finished.append(outputs.run_into(arguments.out / name, rendering, progress=tick))
     finally:
         if finished:
-            page = _write_page(arguments, finished)
-    print(_overview([scene.summary for scene in finished]))
-    _hint_at_pictures(finished)
+            page = write_page(arguments.out, finished)
+    print(printable(overview([scene.summary for scene in finished])))
     print(f"page: {page}")
     return 0
 
 
-def _write_page(arguments: argparse.Namespace, scenes: list[Outputs]) -> Path:
-    """Write ``summary.json`` of all scenes and the page about them."""
-    from hapticrender.charts.page import write_page
-    from hapticrender.validate import as_json
-
-    report = {
-        "hapticrender": __version__,
-        "method": arguments.method,
-        "seed": arguments.seed,
-        "scenes": [scene.summary for scene in scenes],
-    }
-    (arguments.out / "summary.json").write_text(as_json(report), encoding="utf-8")
-    return write_page(arguments.out, scenes)
-
-
 def _render(arguments: argparse.Namespace) -> int:
-    from hapticrender.fidelity.choice import fidelity
-    from hapticrender.outputs import run_into
+    from hapticrender.report.outputs import check_folder, refuse_to_overwrite, run_into
+    from hapticrender.report.text import verdict
 
-    _check_folder("--out", arguments.out)
-    scene, used = _scene(arguments.scene), arguments.least_model
-    sessions = _prepare({arguments.scene: scene}, arguments)
-    with _blaming(arguments.scene):
-        found = fidelity(scene)
-    if used:
-        sessions = _prepare({arguments.scene: found.least}, arguments)
-    with _progress(sessions).scene(arguments.scene) as tick:
-        outputs = run_into(arguments.out, sessions[0], progress=tick)
-    _print_figures(outputs.summary)
-    if note := getattr(sessions[0].controller(), "note", ""):
-        print(f"\n{note}")
-    print(f"\n{found.text(used)}")
-    _hint_at_pictures([outputs])
+    check_folder("--out", arguments.out)
+    scene = _scene(arguments.scene)
+    if not arguments.force:
+        refuse_to_overwrite(arguments.out, Path(arguments.scene))
+    notes = ""
+    if arguments.least_model:
+        from hapticrender.plants.levels import least_model
+
+        with _naming(arguments.scene):
+            found = least_model(scene)
+        scene, notes = found.scene, found.text
+    [rendering] = renderings = _prepare({arguments.scene: scene}, arguments, _driver(arguments.driver))
+    with _progress(renderings).scene(arguments.scene) as tick:
+        outputs = run_into(arguments.out, rendering, progress=tick)
+    if arguments.verbose:
+        _print_figures(outputs.summary)
+        notes = "\n".join(filter(None, [getattr(rendering.controller(), "note", ""), notes]))
+    else:
+        lines = [f"{scene.name} on {scene.device}: {verdict(outputs.summary)}", *outputs.summary["notes"]]
+        print(printable("\n".join(lines)))
+    print("wrote " + "\n      ".join(map(str, outputs.files)))
+    if notes:
+        print(notes)
     return 0
 
 
 def _scenes(arguments: argparse.Namespace) -> int:
+    from hapticrender.formatting import table
+    from hapticrender.report.text import describe
     from hapticrender.touch.builtin import builtin_scenes
-    from hapticrender.wording import describe, table
 
     scenes = builtin_scenes()
     if arguments.scene is None:
@@ -248,102 +253,88 @@ def _scenes(arguments: argparse.Namespace) -> int:
 def _validate(arguments: argparse.Namespace) -> int:
     if arguments.suite:
         return _suite(arguments)
+    from hapticrender.report.outputs import check_file, check_folder
+    from hapticrender.report.text import overview
     from hapticrender.touch.builtin import builtin_scenes
-    from hapticrender.validate import run_and_judge, write_json, write_junit
+    from hapticrender.validate import exit_status, validate, write_json, write_junit
 
-    wishes = (("--json", arguments.json, write_json), ("--junit", arguments.junit, write_junit))
-    reports = [(path, write) for _, path, write in wishes if path]
-    for option, path, _ in wishes:
+    reports = [("--json", arguments.json, write_json), ("--junit", arguments.junit, write_junit)]
+    references = arguments.scenes or list(builtin_scenes())
+    _check_method(arguments.method)
+    for option, path, _ in reports:
         if path:
-            _check_file(option, path)
-    scenes = {reference: _scene(reference) for reference in arguments.scenes or builtin_scenes()}
-    sessions = _prepare(scenes, arguments)
-    verdicts = run_and_judge(sessions, _progress(sessions))
-    for path, write in reports:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        write(path, verdicts)
-    print(_overview([verdict.summary for verdict in verdicts]))
-    return 0 if all(verdict.passed for verdict in verdicts) else 1
+            check_file(option, path)
+            if path.exists() and any(Path(other).exists() and path.samefile(other) for other in references):
+                raise ValueError(f"{option} = {str(path)!r}: is a scene, must be another file")
+    if arguments.out:
+        check_folder("--out", arguments.out)
+    options = {"method": arguments.method, "seed": arguments.seed, "jobs": arguments.jobs, "out": arguments.out}
+    verdicts = validate(references, **options, progress=sys.stderr)
+    for _, path, write in reports:
+        if path:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            write(path, verdicts)
+    if rendered := [verdict.summary for verdict in verdicts if verdict.summary]:
+        print(printable(overview(rendered)))
+    for verdict in verdicts:
+        if verdict.verdict == "error":
+            _fail(str(verdict), 2)
+    return exit_status(verdicts)
 
 
 def _suite(arguments: argparse.Namespace) -> int:
-    """Run the accuracy suite: the chosen method beside the paper's; exit 1 where it misses a bound."""
+    """Run the accuracy suite with the chosen method and with "paper"; exit status 1 where it misses a bound."""
     from hapticrender.accuracy.figures import as_rows, write_json
     from hapticrender.accuracy.suite import run_suite
-    from hapticrender.control.methods import METHODS
-    from hapticrender.wording import table
+    from hapticrender.formatting import table
+    from hapticrender.report.outputs import check_file
 
-    if arguments.method not in METHODS:
-        raise ValueError(f"--method = {arguments.method!r}: must be one of {', '.join(METHODS)}")
-    if arguments.scenes or arguments.junit:
+    _check_method(arguments.method)
+    chosen = arguments.method or defaults.METHOD
+    if arguments.scenes or arguments.junit or arguments.out or arguments.jobs > 1:
         raise ValueError("--suite runs no scenes and writes --json only")
     if arguments.json:
-        _check_file("--json", arguments.json)
-    methods = list(dict.fromkeys((arguments.method, "paper")))
+        check_file("--json", arguments.json)
+    methods = list(dict.fromkeys((chosen, "paper")))
     figures = run_suite(methods, progress=lambda line: print(line, file=sys.stderr))
     print(table(as_rows(figures, methods)))
     if arguments.json:
         arguments.json.parent.mkdir(parents=True, exist_ok=True)
         write_json(arguments.json, figures)
-    return 0 if all(figure.passed for figure in figures if figure.method == arguments.method) else 1
+    return 0 if all(figure.passed for figure in figures if figure.method == chosen) else 1
 
 
 def _identify(arguments: argparse.Namespace) -> int:
     from hapticrender.loop import registered
-    from hapticrender.plants.identify import MECHANICAL, compare, identify
-    from hapticrender.plants.vibrotactile import Plate, PlateParameters
+    from hapticrender.plants.identify import identify
+    from hapticrender.plants.plate import Plate
+    from hapticrender.report.outputs import check_file
     from hapticrender.touch.finger import Finger
-    from hapticrender.touch.toml import dumps
+    from hapticrender.touch.grating import Grating
+    from hapticrender.touch.scene import Scene
 
     if arguments.out:
-        _check_file("--out", arguments.out)
-    believed = PlateParameters()
-    with registered("drivers", "simulated")(Plate(believed, Finger.absent(), arguments.seed)) as driver:
-        found = identify(driver, believed)
+        check_file("--out", arguments.out)
+    where = arguments.scene or "identify"
+    unnamed = Scene(texture=Grating(frequency=100.0, amplitude=1e-6), duration=1.0)
+    scene = _scene(where) if arguments.scene else unnamed
+    with _naming(where):
+        if scene.device != "vt-plate":
+            raise ValueError(f"device.kind = {scene.device!r}: must be 'vt-plate' to be identified")
+        setup = registered("renderers", "vt-plate")().read(scene, None)
+        seed = scene.seed if arguments.seed is None else arguments.seed
+        driver = _driver(arguments.driver)
+        if driver is None:
+            driver = registered("drivers", "simulated")(Plate(setup.simulated, Finger.absent(), seed))
+        with driver:
+            found = identify(driver, setup.assumed, seconds=arguments.seconds, amplitude=arguments.amplitude)
     print(found.text())
-    for difference in compare(found, believed):
-        print(f"differs from the design: {difference}")
+    for difference in found.differences(setup.assumed):
+        print(f"differs from [device]: {difference}")
     if arguments.out:
         arguments.out.parent.mkdir(parents=True, exist_ok=True)
-        plant = {name: getattr(found.parameters, name) for name in (*MECHANICAL, "delay")}
-        arguments.out.write_text(dumps({"plant": plant}), encoding="utf-8")
-    return 0
-
-
-def _chart(arguments: argparse.Namespace) -> int:
-    _check_folder("--out", arguments.out)
-    arguments.out.mkdir(parents=True, exist_ok=True)
-    path = arguments.out / f"{arguments.name}.png"
-    if arguments.name == "story":
-        from hapticrender.charts.story import draw_story
-
-        draw_story(path)
-    elif arguments.name == "pareto":
-        from hapticrender.charts.pareto import pareto
-
-        pareto(path, progress=lambda what: print(what, file=sys.stderr))
-    elif arguments.name == "devices":
-        from hapticrender.charts.devices import device_chart
-
-        device_chart(path, progress=lambda what: print(what, file=sys.stderr))
-    else:
-        from hapticrender.charts import stability as chart
-
-        chart.stability(path, adapted=arguments.learnt)
-    print(path)
-    return 0
-
-
-def _paper(arguments: argparse.Namespace) -> int:
-    from hapticrender.paper.reproduce import reproduce
-    from hapticrender.wording import table
-
-    _check_folder("--out", arguments.out)
-    found = reproduce(arguments.out, progress=lambda name: print(name, file=sys.stderr))
-    print(table(found.rows()))
-    if not found.pictures:
-        print(PICTURES_HINT)
-    print(f"page: {found.page}")
+        arguments.out.write_text(found.to_toml(), encoding="utf-8")
+        print(f"wrote {arguments.out}")
     return 0
 
 
@@ -351,74 +342,78 @@ def _show(arguments: argparse.Namespace) -> int:
     from hapticrender.recordings.recording import Recording
 
     path = arguments.path / "recording.au" if arguments.path.is_dir() else arguments.path
-    with _blaming(str(path)):
+    with _naming(str(path)):
         summary = Recording.load(path).summary()
     _print_figures(summary)
     return 0
 
 
 def _devices(arguments: argparse.Namespace) -> int:
-    from hapticrender.inventory import text
+    from hapticrender.devices import text
 
     print(text())
     return 0
 
 
-def _overview(summaries: list[Any]) -> str:
-    from hapticrender.wording import overview
-
-    return overview(summaries)
-
-
 def _print_figures(summary: Any) -> None:
-    from hapticrender.recordings.judge import text
-    from hapticrender.wording import conditions
+    from hapticrender.report.text import conditions, figures
 
-    print(conditions(summary))
-    print(text(summary))
-
-
-def _hint_at_pictures(scenes: list[Outputs]) -> None:
-    if not all(scene.picture for scene in scenes):
-        print(PICTURES_HINT)
+    print(printable(f"{conditions(summary)}\n{figures(summary)}"))
 
 
 def _scene(reference: str) -> Scene:
     """Read a scene: a built-in one by its name, any other from its file."""
-    from hapticrender.touch.builtin import builtin_scenes
-    from hapticrender.touch.scene import Scene
+    from hapticrender.validate import open_scene
 
-    if reference in (scenes := builtin_scenes()):
-        return scenes[reference]
-    if not Path(reference).exists():
-        raise ValueError(f"{reference}: no such file, nor a built-in scene (see `hapticrender scenes`)")
-    with _blaming(reference):
-        return Scene.from_toml(reference)
+    with _naming(reference):
+        return open_scene(reference)
 
 
-def _prepare(scenes: dict[str, Scene], arguments: argparse.Namespace) -> list[Session]:
-    """Design all that will run; the renderer refuses here what the device cannot do, before anything is written."""
+def _check_method(method: str | None) -> None:
     from hapticrender.control.methods import METHODS
+
+    if method not in (None, *METHODS):
+        raise ValueError(f"--method = {method!r}: must be one of {', '.join(METHODS)}")
+
+
+def _prepare(scenes: dict[str, Scene], arguments: argparse.Namespace, driver: Any = None) -> list[Rendering]:
+    """Design everything that will run; the renderer refuses here what the device cannot do."""
     from hapticrender.loop import prepare
 
-    if arguments.method not in METHODS:
-        raise ValueError(f"--method = {arguments.method!r}: must be one of {', '.join(METHODS)}")
-    sessions = []
+    _check_method(arguments.method)
+    renderings = []
     for reference, scene in scenes.items():
-        with _blaming(reference):
-            sessions.append(prepare(scene, method=arguments.method, seed=arguments.seed))
-    return sessions
+        with _naming(reference):
+            renderings.append(prepare(scene, driver=driver, method=arguments.method, seed=arguments.seed))
+    return renderings
 
 
-def _progress(sessions: list[Session]) -> Progress:
-    from hapticrender.progress import Progress
+def _driver(text: str) -> Any:
+    """Make the driver of ``--driver NAME[:ARG]``; None for the simulated device."""
+    from hapticrender.loop import registered
 
-    return Progress([session.scene.duration for session in sessions])
+    name, colon, argument = text.partition(":")
+    if text == "simulated":
+        return None
+    factory = registered("drivers", name)
+    try:
+        return factory(argument) if colon else factory()
+    except TypeError as error:
+        raise ValueError(f"--driver = {text!r}: {error}; give the driver's argument as {name}:ARG") from error
+
+
+def _progress(renderings: list[Rendering]) -> Progress:
+    """Make the progress bar of what will run, and say before it runs that there will be no pictures."""
+    from hapticrender.report.progress import Progress
+
+    if find_spec("matplotlib") is None:
+        print(PICTURES_HINT, file=sys.stderr)
+    return Progress([rendering.scene.duration for rendering in renderings])
 
 
 @contextmanager
-def _blaming(where: str) -> Iterator[None]:
-    """Name the file, or the scene, in every complaint about it."""
+def _naming(where: str) -> Iterator[None]:
+    """Name the file, or the scene, in every error about it."""
     try:
         yield
     except OSError:
@@ -426,22 +421,3 @@ def _blaming(where: str) -> Iterator[None]:
     except (ValueError, TypeError, ArithmeticError, RecursionError, HapticError) as error:
         message = str(error)
         raise SceneError(message if message.startswith(where) else f"{where}: {message}") from error
-
-
-def _check_folder(option: str, folder: Path, told: Path | None = None) -> None:
-    """Refuse a folder that could not be made or written into, without making it; `told` is what `option` was given."""
-    nearest = next(path for path in (folder, *folder.absolute().parents) if path.exists() or path.is_symlink())
-    given = f"{option} = {str(told or folder)!r}"
-    if not nearest.is_dir():
-        raise ValueError(f"{given}: {str(nearest)!r} is a file, must be a folder")
-    if not os.access(nearest, os.W_OK | os.X_OK):
-        raise ValueError(f"{given}: no permission to write into {str(nearest)!r}")
-
-
-def _check_file(option: str, path: Path) -> None:
-    """Refuse a report file that could not be written."""
-    if path.is_dir():
-        raise ValueError(f"{option} = {str(path)!r}: is a folder, must be a file")
-    if path.exists() and not os.access(path, os.W_OK):
-        raise ValueError(f"{option} = {str(path)!r}: no permission to write it")
-    _check_folder(option, path.parent, told=path)

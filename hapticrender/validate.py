@@ -1,29 +1,42 @@
-"""A renderer against its plant: whether every scene stays inside its tolerance, and by which figure it is judged."""
+"""Render scenes against the device models and judge each: within its tolerance or not, and by which figure."""
 
 from __future__ import annotations
 
-import json
-import math
+import multiprocessing
 import re
+import tempfile
 import time
-from collections.abc import Iterable, Mapping, Sequence
-from contextlib import nullcontext
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import Future, ProcessPoolExecutor
 from dataclasses import asdict, dataclass, field
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TextIO
 from xml.etree import ElementTree
 
-from hapticrender import __version__, defaults, wording
-from hapticrender.loop import Session, prepare, run
-from hapticrender.progress import Progress
-from hapticrender.touch.scene import Scene
+from hapticrender import __version__, defaults
+from hapticrender.control.methods import method_named
+from hapticrender.errors import HapticError, SceneError
+from hapticrender.formatting import as_json
+from hapticrender.loop import prepare, run
+from hapticrender.protocols import Rendering
+from hapticrender.report.outputs import JOURNAL, begin_outputs, refuse_to_overwrite, remove_outputs, write_outputs
+from hapticrender.report.progress import Progress
+from hapticrender.report.text import verdict as sentence
+from hapticrender.touch.builtin import builtin_scenes
+from hapticrender.touch.scene import Scene, distinct_names
 
+IN_MEMORY = 2**26  # bytes: a longer run goes through a journal in a temporary folder
+BAD_SCENE = (ValueError, TypeError, ArithmeticError, RecursionError, HapticError)
+_NO_NAME = re.compile(r"[^\w.-]+|^\.+")
 _NOT_XML = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
+Tick = Callable[[float, float], None]
 
 
 @dataclass(frozen=True, kw_only=True)
 class Verdict:
-    """What a scene's recording came to.
+    """Verdict on one scene.
 
     Parameters
     ----------
@@ -31,101 +44,215 @@ class Verdict:
         What was rendered, on what, and how.
     seed : int
         Seed of the plant's noise.
-    passed : bool
-        Whether the worst figure stays inside the tolerance.
-    tolerance : float
+    verdict : str
+        "passed", "failed", "not judged" (no figure can be given) or "error" (the scene cannot be rendered).
+    reason : str
+        Why there is no figure.
+    tolerance : float or None
         Bound on the figure (relative error, 1).
     figure, band, place : str
-        The worst figure: its name, the band and the place on the surface where it stood.
+        The worst figure: its name, the band and the evaluation point.
     value : float or None
-        The worst figure (relative error, 1); None where nothing could be judged.
+        The worst figure (relative error, 1); None where there is none.
     elapsed : float
         Time that the rendering took (s).
     summary : dict
-        Everything that ``Recording.summary()`` says.
+        ``Recording.summary()``; empty after an error.
     """
 
     scene: str
-    device: str
+    device: str = ""
     method: str
     seed: int
-    passed: bool
-    tolerance: float
-    figure: str
-    band: str
-    place: str
-    value: float | None
-    elapsed: float
-    summary: Mapping[str, Any] = field(repr=False)
+    verdict: str
+    reason: str = ""
+    tolerance: float | None = None
+    figure: str = "rms_error"
+    band: str = "any"
+    place: str = "any"
+    value: float | None = None
+    elapsed: float = 0.0
+    summary: Mapping[str, Any] = field(default_factory=dict, repr=False)
 
     @classmethod
     def of(cls, summary: Mapping[str, Any], elapsed: float) -> Verdict:
-        """Read the verdict off ``Recording.summary()``; `elapsed` is in s."""
-        shared = {key: summary[key] for key in ("scene", "device", "method", "seed", "passed", "tolerance")}
+        """Take the verdict from ``Recording.summary()``; `elapsed` is in s."""
+        keys = ("scene", "device", "method", "seed", "verdict", "reason", "tolerance")
         worst = {key: summary["worst"][key] for key in ("figure", "value", "band", "place")}
-        return cls(**shared, **worst, elapsed=elapsed, summary=summary)
+        return cls(**{key: summary[key] for key in keys}, **worst, elapsed=elapsed, summary=summary)
+
+    @property
+    def passed(self) -> bool:
+        """Whether the worst figure is within the tolerance."""
+        return self.verdict == "passed"
 
     def __str__(self) -> str:
-        return f"{self.scene} {wording.verdict(self.summary)}"
+        return f"{self.scene} {sentence(self.summary)}" if self.summary else f"{self.scene}: {self.reason}"
 
 
-def validate(
-    scenes: Iterable[Scene],
-    *,
-    method: str = defaults.METHOD,
-    seed: int = 0,
-    progress: Progress | None = None,
-) -> list[Verdict]:
-    """Render scenes in closed loop against the plant model and judge each.
-
-    Parameters
-    ----------
-    scenes : iterable of Scene
-        What to render; all are prepared before the first sample of any runs.
-    method : str
-        Name of the control method.
-    seed : int, >= 0
-        Seed of the plant's noise.
-    progress : Progress, optional
-        Shows how far the work has come.
-
-    Returns
-    -------
-    list of Verdict
-        In the order of the scenes.
+def open_scene(reference: str | Path) -> Scene:
+    """Read a scene: a built-in one by its name, any other from its TOML file.
 
     Raises
     ------
     ValueError
-        For a scene that the device cannot render, or an unknown method.
+        No such file, or not a scene.
+    """
+    scenes = builtin_scenes()
+    if str(reference) in scenes:
+        return scenes[str(reference)]
+    if not Path(reference).exists():
+        raise ValueError(f"{reference}: no such file, nor a built-in scene (see `hapticrender scenes`)")
+    if not Path(reference).is_file():
+        raise SceneError(f"{reference}: must be a regular file")
+    return Scene.from_toml(reference)
+
+
+def validate(
+    scenes: Iterable[Scene | str | Path],
+    *,
+    method: str | None = None,
+    seed: int | None = None,
+    jobs: int = 1,
+    out: str | Path | None = None,
+    progress: TextIO | None = None,
+) -> list[Verdict]:
+    """Render scenes in closed loop against the plant models and judge each.
+
+    Parameters
+    ----------
+    scenes : iterable of Scene, str or Path
+        Scenes, names of built-in ones, or TOML files.
+    method : str, optional
+        Name of the control method; default: that of each scene.
+    seed : int, optional
+        Seed of the plants' noise, >= 0; default: that of each scene.
+    jobs : int, >= 1
+        Processes that render scenes side by side.
+    out : path, optional
+        Folder that gets journal, sounds, picture and figures of each scene that does not pass, in a folder of its name.
+    progress : file, optional
+        Where to show progress.
+
+    Returns
+    -------
+    list of Verdict
+        In the order of the scenes; a scene that cannot be rendered has the verdict "error" and stops no other.
+
+    Raises
+    ------
+    ValueError
+        The method is unknown, or a number out of its bound.
 
     Examples
     --------
-    >>> from hapticrender.touch.builtin import builtin_scenes
-    >>> [verdict] = validate([builtin_scenes()["grating-20"]], seed=1)
+    >>> [verdict] = validate(["grating-20"], seed=1)
     >>> verdict.passed
     True
     """
-    return run_and_judge([prepare(scene, method=method, seed=seed) for scene in scenes], progress)
+    if method is not None:
+        method_named(method)
+    if jobs < 1:
+        raise ValueError(f"{jobs=}: must be >= 1 process")
+    tasks = list(_tasks(scenes, method, seed, None if out is None else Path(out)))
+    shown = Progress([task.scene.duration for task in tasks if task.scene], progress) if progress else None
+    if jobs == 1:
+        return [_with_progress(shown, task, task.verdict) for task in tasks]
+    with ProcessPoolExecutor(jobs, multiprocessing.get_context("spawn")) as pool:
+        futures = [pool.submit(task.verdict) for task in tasks]
+        try:
+            pairs = zip(tasks, futures, strict=True)
+            return [_with_progress(shown, task, partial(_result, future)) for task, future in pairs]
+        except BaseException:
+            pool.shutdown(cancel_futures=True)
+            raise
 
 
-def run_and_judge(sessions: Iterable[Session], progress: Progress | None = None) -> list[Verdict]:
-    """Run prepared sessions to their ends and judge each."""
-    verdicts = []
-    for session in sessions:
-        start = time.perf_counter()
-        with nullcontext() if progress is None else progress.scene(session.scene.name) as tick:
-            summary = run(session, progress=tick).summary()
-        verdicts.append(Verdict.of(summary, time.perf_counter() - start))
-    return verdicts
+@dataclass(frozen=True)
+class _Task:
+    """A scene to be judged, or why it cannot be read."""
+
+    label: str
+    scene: Scene | None
+    problem: str
+    method: str | None
+    seed: int | None
+    out: Path | None
+
+    def verdict(self, tick: Tick | None = None) -> Verdict:
+        """Render and judge the scene."""
+        problem, start = self.problem, time.perf_counter()
+        device, method, seed = "", self.method or defaults.METHOD, self.seed or 0
+        if self.scene is not None:
+            device, method = self.scene.device, self.method or self.scene.method
+            seed = self.scene.seed if self.seed is None else self.seed
+            try:
+                rendering = prepare(self.scene, method=self.method, seed=self.seed)
+                summary = _summary(rendering, self.out and self.out / _NO_NAME.sub("_", self.label), tick)
+                return Verdict.of({**summary, "scene": self.label}, time.perf_counter() - start)
+            except BAD_SCENE as error:
+                problem = str(error)
+        reason = problem.removeprefix(f"{self.label}: ")
+        return Verdict(scene=self.label, device=device, method=method, seed=seed, verdict="error", reason=reason)
+
+
+def _tasks(
+    scenes: Iterable[Scene | str | Path], method: str | None, seed: int | None, out: Path | None
+) -> Iterator[_Task]:
+    """Read all scenes; one that cannot be read has the name of its file, and those of one name are numbered."""
+    read: list[tuple[str, Scene | None, str]] = []
+    for reference in scenes:
+        try:
+            scene = reference if isinstance(reference, Scene) else open_scene(reference)
+            read.append((scene.name, scene, ""))
+        except BAD_SCENE as error:
+            read.append((str(reference), None, str(error)))
+    labels = distinct_names(name for name, _, _ in read)
+    for label, (_, found, problem) in zip(labels, read, strict=True):
+        yield _Task(label, found, problem, method, seed, out)
+
+
+def _result(future: Future[Verdict], _: Tick | None) -> Verdict:
+    return future.result()
+
+
+def _with_progress(progress: Progress | None, task: _Task, judge: Callable[[Tick | None], Verdict]) -> Verdict:
+    if progress is None or task.scene is None:
+        return judge(None)
+    with progress.scene(task.label) as tick:
+        return judge(tick)
+
+
+def _summary(rendering: Rendering, folder: Path | None, tick: Tick | None) -> dict[str, Any]:
+    """Run a rendering and judge it; only what does not pass stays in `folder`."""
+    if folder is None:
+        size = 8 * rendering.samples * (2 * len(rendering.bands) + 12)
+        if size < IN_MEMORY:
+            return run(rendering, progress=tick).summary()
+        with tempfile.TemporaryDirectory() as scratch:
+            return run(rendering, journal=Path(scratch) / JOURNAL, progress=tick).summary()
+    refuse_to_overwrite(folder)
+    recording = run(rendering, journal=begin_outputs(folder, rendering), progress=tick)
+    summary = recording.summary()
+    if not summary["passed"]:
+        return dict(write_outputs(folder, recording).summary)
+    del recording  # closes its journal
+    remove_outputs(folder)
+    return summary
+
+
+def exit_status(verdicts: Sequence[Verdict]) -> int:
+    """2 where a scene cannot be rendered, else 1 where one misses its tolerance, else 0."""
+    found = {verdict.verdict for verdict in verdicts}
+    return 2 if "error" in found else int("failed" in found)
 
 
 def write_json(path: str | Path, verdicts: Sequence[Verdict]) -> None:
     """Write verdicts, with their whole summaries, as JSON to `path`; a figure that is not finite becomes null."""
     report = {
         "hapticrender": __version__,
-        "passed": all(verdict.passed for verdict in verdicts),
-        "scenes": [asdict(verdict) for verdict in verdicts],
+        "passed": exit_status(verdicts) == 0,
+        "scenes": [asdict(verdict) | {"passed": verdict.passed} for verdict in verdicts],
     }
     Path(path).write_text(as_json(report), encoding="utf-8")
 
@@ -135,15 +262,16 @@ def write_junit(path: str | Path, verdicts: Sequence[Verdict]) -> None:
 
     Notes
     -----
-    The schema is that of the Apache Ant JUnit task: ``testsuites/testsuite/testcase/failure``, times in s.
+    The schema is that of the Apache Ant JUnit task: ``testsuites/testsuite/testcase`` with ``failure``, ``error`` or
+    ``skipped`` (not judged); times in s.
     """
-    failures = sum(not verdict.passed for verdict in verdicts)
+    counts = Counter(verdict.verdict for verdict in verdicts)
     totals = {
         "name": "hapticrender",
         "tests": str(len(verdicts)),
-        "failures": str(failures),
-        "errors": "0",
-        "skipped": "0",
+        "failures": str(counts["failed"]),
+        "errors": str(counts["error"]),
+        "skipped": str(counts["not judged"]),
         "time": f"{sum(verdict.elapsed for verdict in verdicts):.3f}",
     }
     suites = ElementTree.Element("testsuites", {key: totals[key] for key in totals if key != "skipped"})
@@ -154,34 +282,23 @@ def write_junit(path: str | Path, verdicts: Sequence[Verdict]) -> None:
     ElementTree.ElementTree(suites).write(path, encoding="utf-8", xml_declaration=True)
 
 
-def as_json(report: Any) -> str:
-    """Strict JSON text of `report`, with null for every figure that is not finite."""
-    return json.dumps(_finite(report), indent=2, ensure_ascii=False, allow_nan=False) + "\n"
-
-
 def _add_case(suite: ElementTree.Element, verdict: Verdict) -> None:
-    """Add one scene as a test case, with its failure where it missed its tolerance."""
+    """Add one scene as a test case, with its failure, error or reason for being skipped."""
     case = {
         "classname": _xml(f"hapticrender.{verdict.device}.{verdict.method}"),
         "name": _xml(verdict.scene),
         "time": f"{verdict.elapsed:.3f}",
     }
     element = ElementTree.SubElement(suite, "testcase", case)
-    if not verdict.passed:
-        attributes = {"message": _xml(wording.verdict(verdict.summary)), "type": "tolerance"}
-        failure = ElementTree.SubElement(element, "failure", attributes)
-        failure.text = _xml(as_json(verdict.summary["bands"]))
-
-
-def _finite(value: Any) -> Any:
-    """Replace every float that JSON cannot hold by None."""
-    if isinstance(value, Mapping):
-        return {key: _finite(entry) for key, entry in value.items()}
-    if isinstance(value, list | tuple):
-        return [_finite(entry) for entry in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
+    if verdict.verdict == "failed":
+        attributes = {"message": _xml(sentence(verdict.summary)), "type": "tolerance"}
+        ElementTree.SubElement(element, "failure", attributes).text = _xml(as_json(verdict.summary["bands"]))
+    elif verdict.verdict == "error":
+        ElementTree.SubElement(element, "error", {"message": _xml(verdict.reason), "type": "scene"})
+    elif verdict.verdict == "not judged":
+        ElementTree.SubElement(element, "skipped", {"message": _xml(verdict.reason)})
 
 
 def _xml(text: str) -> str:
-    """`text` without the characters that XML 1.0 (section 2.2) forbids."""
+    """Replace the characters that XML 1.0 (section 2.2) forbids."""
     return _NOT_XML.sub("\ufffd", text)

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -18,12 +19,12 @@ from hapticrender.bands import Bands
 from hapticrender.control.methods import method_named
 from hapticrender.loop import registered
 from hapticrender.plants.identify import identify
-from hapticrender.plants.vibrotactile import Plate, PlateParameters
+from hapticrender.plants.plate import Plate, PlateParameters
 from hapticrender.protocols import Array
-from hapticrender.recordings.judge import fit
+from hapticrender.recordings.envelopes import amplitude_error, fit
 from hapticrender.touch.finger import Finger
 from hapticrender.touch.mechanics import HEAVY, HEAVY_SECOND, LIGHT, LIGHT_SECOND, FingerMechanics
-from hapticrender.touch.motion import Sampled, Sliding, Still
+from hapticrender.touch.motion import Sampled, Still, TriangleMotion
 
 RATE = 5000.0
 FREQUENCIES = (20.0, 31.0, 47.0, 72.0, 111.0, 143.0, 170.0, 178.0, 189.0, 261.0, 400.0)
@@ -32,7 +33,7 @@ AMPLITUDE = 50e-6  # m
 TABLE_1 = ((LIGHT_SECOND, 0.3), (HEAVY_SECOND, 0.8), (LIGHT, 0.3), (HEAVY, 0.8))  # mechanics, load in N
 PLACES = (0.0, 15e-3, 27.5e-3)  # m
 IDENTIFIED = {"m, I, k": ("mass", "inertia", "stiffness_1", "stiffness_2"), "b": ("damping_1", "damping_2")}
-SLIDING = Finger(Sliding(0.1, 0.05), normal_load=0.8, touches=((1.0, 1000.0),), mechanics=HEAVY)
+SLIDING = Finger(TriangleMotion(0.1, 0.05), normal_load=0.8, touches=((1.0, 1000.0),), mechanics=HEAVY)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -79,7 +80,7 @@ class Run:
         slowest = float(self.bands.frequency[0]) or np.inf
         length = max(0.02, 2 / slowest)
         time, envelope = self.envelopes(length, length / 2)
-        return time, abs(envelope[:, :, 0]) / wanted - 1.0
+        return time, amplitude_error(envelope[:, :, 0], wanted)
 
 
 def tones(frequencies: Iterable[float], amplitude: float, phase: Array | float = 0.0) -> Bands:
@@ -96,10 +97,10 @@ def rms(values: Array) -> Array:
 
 
 def mean_amplitude(run: Run, frequency: float, start: float) -> Array:
-    """Amplitude (m) of each place, averaged coherently over whole periods from `start` (s) on."""
-    first = int(start * RATE)
-    n = np.arange(first, first + int(round(int((len(run.motion) - first) / RATE * frequency) / frequency * RATE)))
-    return abs(2 * np.mean(run.motion[n] * np.exp(-2j * np.pi * frequency * n / RATE)[:, None], axis=0))
+    """Amplitude (m) of each place by one least-squares fit from `start` (s) on."""
+    n = np.arange(int(start * RATE), len(run.motion))
+    phase = 2 * np.pi * np.mod(frequency * n / RATE, 1.0)[:, None]
+    return abs(fit(phase[None], run.motion[None, n])[0][0, :, 0])
 
 
 def free(bench: Bench, amplitude: float = AMPLITUDE) -> dict[str, float]:
@@ -107,7 +108,7 @@ def free(bench: Bench, amplitude: float = AMPLITUDE) -> dict[str, float]:
     worst = np.zeros(3)
     for frequency in FREQUENCIES:
         run = bench.play(tones([frequency], amplitude), 22.0)
-        worst = np.maximum(worst, abs(mean_amplitude(run, frequency, 2.0) / amplitude - 1.0))
+        worst = np.maximum(worst, abs(amplitude_error(mean_amplitude(run, frequency, 2.0), amplitude)))
     return {"error": float(worst.max()), "centre": float(worst[0])}
 
 
@@ -187,7 +188,8 @@ def press(bench: Bench) -> dict[str, float]:
     finger = Finger.still(normal_load=0.5, mechanics=HEAVY)
     held = mean_amplitude(bench.play(tones([20.0], 1e-6), 82.0, finger), 20.0, 2.0)[0]
     small = [mean_amplitude(bench.play(tones([f], 1e-7), 402.0), f, 2.0)[0] for f in (20.0, 72.0, 261.0)]
-    return {"pressed": abs(held / 1e-6 - 1.0), "0.1 um": max(abs(value / 1e-7 - 1.0) for value in small)}
+    errors = abs(amplitude_error([held, *small], [1e-6, 1e-7, 1e-7, 1e-7]))
+    return {"pressed": float(errors[0]), "0.1 um": float(errors[1:].max())}
 
 
 def wobble(bench: Bench) -> dict[str, float]:
@@ -206,8 +208,8 @@ def wobble(bench: Bench) -> dict[str, float]:
         carrier = np.exp(2j * np.pi * frequency * time)[:, None]
         at, envelope = run.envelopes(size / RATE, size / RATE / 2)
         sought = replace(run, motion=(run.target * carrier).real).envelopes(size / RATE, size / RATE / 2)[1]
-        error = abs(envelope[at > 2.0, 0, 0]) - abs(sought[at > 2.0, 0, 0])
-        tracking = max(tracking, float(rms(error) / AMPLITUDE))
+        late = at > 2.0
+        tracking = max(tracking, float(amplitude_error(envelope[late, 0, 0], sought[late, 0, 0], axis=0)))
     return {"held": worst, "AM": tracking}
 
 
@@ -240,7 +242,7 @@ def late(bench: Bench) -> dict[str, float]:
     worst = 0.0
     for frequency in FREQUENCIES:
         run = slow.play(tones([frequency], AMPLITUDE), 12.0)
-        worst = max(worst, float(abs(mean_amplitude(run, frequency, 8.0)[0] / AMPLITUDE - 1.0)))
+        worst = max(worst, float(abs(amplitude_error(mean_amplitude(run, frequency, 8.0)[0], AMPLITUDE))))
     return {"error": worst}
 
 
@@ -248,13 +250,13 @@ def overload(bench: Bench) -> dict[str, float]:
     """2 s of 1 mm at 400 Hz (10.6 A of 3 A), then 100 um: time until within 5 %, third harmonic before."""
     count = int(4 * RATE)
     known = bench.known or bench.plate
-    controllers = [
+    controllers: list[Any] = [
         method_named(bench.method).design(known.band_model(RATE, known.delay), tones([400.0], wanted))
         for wanted in (1e-3, 100e-6)
     ]
     plate = Plate(bench.plate, Finger.absent())
     loud = plate.closed_loop(controllers[0], np.zeros(count // 2))[3]
-    controllers[0].tables.tone[:] = controllers[1].tables.tone
+    controllers[0].setpoints[:] = controllers[1].setpoints
     soft = plate.closed_loop(controllers[0], np.zeros(count))[3]
     n = np.arange(count // 2)[-int(RATE) :]
     harmonic = abs(2 * np.mean(np.asarray(loud.motion)[n, 0] * np.exp(-2j * np.pi * 1200.0 * n / RATE)))

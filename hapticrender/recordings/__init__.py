@@ -1,1 +1,1 @@
-"""What happened: kept, judged, and written in the formats of others."""
+"""Recordings: written while a run happens, judged, and read and written in several formats."""

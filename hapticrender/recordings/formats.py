@@ -1,10 +1,13 @@
-"""The formats in which a recording leaves the house, and comes back."""
+"""Read and write recordings in several formats."""
 
 from __future__ import annotations
 
+import itertools
 import json
+import math
 import os
 import tempfile
+import zipfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -16,55 +19,63 @@ from hapticrender.errors import HapticError
 from hapticrender.protocols import Array
 from hapticrender.recordings.journal import Header, chunks, column, join, read_journal, split, write_journal
 
-COMMENT_LIMIT = 4000  # characters; libsndfile drops a longer WAV comment without a word
+COMMENT_LIMIT = 4000  # characters; libsndfile drops a longer WAV comment silently
 FLAC_CHANNELS = 8
+NPY_HEADS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
 
 
 class MissingExtra(HapticError, ImportError):
     """An optional part is not installed: says which extra brings it."""
 
 
-def read(path: str | os.PathLike[str]) -> tuple[Header, Array]:
-    """Header and frames of a recording in any format that can be read back.
+def read(path: str | os.PathLike[str]) -> tuple[Header, Any]:
+    """Read header and frames of a recording.
 
     Parameters
     ----------
     path : path-like
-        A file whose name ends in .au, .npz, .h5 or .hdf5.
+        A file whose name ends in .au, .npz, .h5, .hdf5, .mat or .csv.
 
     Returns
     -------
     header : Header
-    frames : ndarray, shape (n, columns)
-        Mapped from the file where it is a journal.
+    frames : ndarray, shape (n, columns), or JournalFrames
+        Those of a journal are read from the file at every access.
 
     Raises
     ------
     OSError
         The file is not there or may not be read.
     ValueError
-        It is damaged, or no recording of this library.
+        It is damaged, compressed, or no recording of this library.
     MissingExtra
         Reading it takes an optional part that is not installed.
     """
     path = Path(path)
-    reader = _known(path, READERS, "read")
-    with path.open("rb"):  # what is not there is told in the same words for every format
+    if path.suffix.lower() in SOUND_CONTAINERS:
+        raise ValueError(
+            f"{path}: a sound file cannot be loaded as a recording, because its rate is rounded and its header may be "
+            f"cut: load one saved as {', '.join(READERS)}"
+        )
+    reader = _by_suffix(path, READERS, "read")
+    if path.exists() and not path.is_file() and not path.is_dir():
+        raise ValueError(f"{path}: must be a regular file")
+    with path.open("rb"):  # a missing file is the same OSError for every format
         return reader(path)
 
 
-def write(path: str | os.PathLike[str], header: Header, frames: Array) -> None:
-    """Write a recording in the format that the suffix of `path` names; an older file goes only when this one is whole.
+def write(path: str | os.PathLike[str], header: Header, frames: Any) -> None:
+    """Write a recording in the format of the suffix of `path`; an older file is replaced when the new one is whole.
 
     Parameters
     ----------
     path : path-like
         Suffix .au (journal), .npz, .h5 or .hdf5, .mat, .csv, .wav, .w64, .rf64 or .flac.
     header : Header
-    frames : ndarray, shape (n, columns)
+    frames : ndarray, shape (n, columns), or JournalFrames
     """
     path = Path(path)
-    writer = _known(path, WRITERS, "written")
+    writer = _by_suffix(path, WRITERS, "written")
     with replacing(path) as scratch:
         writer(scratch, header, frames)
 
@@ -78,7 +89,7 @@ def write_sound(
     unit: str = "",
     bits: int = 16,
 ) -> float:
-    """Write a signal as PCM sound for a person to listen to; the comment of the file states the scale.
+    """Write a signal as PCM sound; the comment of the file states the scale.
 
     Parameters
     ----------
@@ -101,7 +112,7 @@ def write_sound(
         The full scale that was used, in `unit`.
     """
     path = Path(path)
-    container = _known(path, SOUND_CONTAINERS, "written as sound")
+    container = _by_suffix(path, SOUND_CONTAINERS, "written as sound")
     if bits not in (16, 24):
         raise ValueError(f"{bits=} must be 16 or 24")
     signal = np.nan_to_num(np.asarray(signal, float), nan=0.0, posinf=0.0, neginf=0.0)
@@ -115,7 +126,7 @@ def write_sound(
     return full_scale
 
 
-def _known(path: Path, table: dict[str, Any], verb: str) -> Any:
+def _by_suffix(path: Path, table: dict[str, Any], verb: str) -> Any:
     suffix = path.suffix.lower()
     if suffix not in table:
         raise ValueError(f"{path}: suffix {suffix!r} cannot be {verb}, known are {', '.join(sorted(table))}")
@@ -124,7 +135,7 @@ def _known(path: Path, table: dict[str, Any], verb: str) -> Any:
 
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """Give a scratch file beside `path` that takes its place only if the block succeeds."""
+    """Provide a scratch file beside `path` that takes its place only if the block succeeds."""
     handle, name = tempfile.mkstemp(path.suffix.lower(), f".{path.stem}-", path.parent)
     os.close(handle)
     scratch = Path(name)
@@ -142,34 +153,58 @@ def _umask() -> int:
     return mask
 
 
-def _write_npz(path: Path, header: Header, frames: Array) -> None:
-    signals: dict[str, Any] = split(header, frames)
-    np.savez(path, header=np.array(header.to_json()), **signals)
+def _values(header: Header, frames: Any) -> dict[str, Any]:
+    """All signals by name, with header, time and rate."""
+    signals = split(header, frames[:])
+    return {"header": header.to_json(), "rate": header.rate, "time": np.arange(len(frames)) / header.rate, **signals}
 
 
-def _read_npz(path: Path) -> tuple[Header, Array]:
-    with path.open("rb") as raw, _blaming(path), np.load(raw) as file:
-        header = str(file["header"])
-        signals = {name: file[name] for name in file if name != "header"}
-    return _assembled(path, header, signals)
-
-
-def _assembled(path: Path, text: str, signals: dict[str, Any]) -> tuple[Header, Array]:
+def _assembled(path: Path, load: Callable[[str], Any]) -> tuple[Header, Array]:
+    """Header and frames from ``load(name)`` for the header and each signal."""
+    with _naming(path):
+        text = str(np.asarray(load("header")).ravel()[0])
     header = Header.from_json(text, str(path))
-    with _blaming(path):
-        return header, join(header, signals)
+    with _naming(path):
+        return header, join(header, {name: load(name) for name in header.slices})
 
 
 @contextmanager
-def _blaming(path: Path) -> Iterator[None]:
-    """Name the file, whatever a damaged one makes numpy, zipfile or h5py raise."""
+def _naming(path: Path) -> Iterator[None]:
+    """Name the file in whatever a damaged one makes numpy, zipfile, scipy or h5py raise."""
     try:
         yield
-    except (MemoryError, HapticError):
+    except HapticError:
         raise
     except Exception as error:
+        if str(error).startswith(f"{path}: "):
+            raise
         reason = " ".join(str(error).split()) or type(error).__name__
         raise ValueError(f"{path}: not a recording ({reason})") from error
+
+
+def _check_size(path: Path, name: str, shape: tuple[int, ...], item: int) -> None:
+    """Refuse an array that is larger than its file: `save` never compresses."""
+    size, most = math.prod(shape) * item, path.stat().st_size
+    if size > most:
+        raise ValueError(f"{name} has {size} bytes, the file {most}: compressed recordings are not read")
+
+
+def _write_npz(path: Path, header: Header, frames: Any) -> None:
+    np.savez(path, **_values(header, frames))
+
+
+def _read_npz(path: Path) -> tuple[Header, Array]:
+    with _naming(path), zipfile.ZipFile(path) as archive, np.load(path) as file:
+
+        def load(name: str) -> Any:
+            with archive.open(f"{name}.npy") as member:
+                version = np.lib.format.read_magic(member)
+                read_head = NPY_HEADS[version]
+                shape, _, dtype = read_head(member)
+            _check_size(path, name, shape, dtype.itemsize)
+            return file[name]
+
+        return _assembled(path, load)
 
 
 def _h5py() -> Any:
@@ -180,41 +215,79 @@ def _h5py() -> Any:
     return h5py
 
 
-def _write_h5(path: Path, header: Header, frames: Array) -> None:
-    units = {"drive": header.drive_unit, "position": "m", "normal_load": "N", "flags": "1"}
+def _write_h5(path: Path, header: Header, frames: Any) -> None:
+    units = {"drive": header.drive_unit, "position": "m", "normal_load": "N", "flags": "1", "time": "s", "rate": "Hz"}
     with _h5py().File(path, "w") as file:
-        file["header"] = header.to_json()
-        for name, values in split(header, frames).items():
+        for name, values in _values(header, frames).items():
             file[name] = values
-            file[name].attrs["unit"] = units.get(name, header.unit)
+            if name != "header":
+                file[name].attrs["unit"] = units.get(name, header.unit)
 
 
 def _read_h5(path: Path) -> tuple[Header, Array]:
     h5py = _h5py()
-    with _blaming(path), h5py.File(path, "r") as file:
-        header = file["header"].asstr()[()]
-        signals = {name: entry[()] for name, entry in file.items() if name != "header"}
-    return _assembled(path, header, signals)
+    with _naming(path), h5py.File(path, "r") as file:
+
+        def load(name: str) -> Any:
+            entry = file[name] if isinstance(file.get(name, getlink=True), h5py.HardLink) else None
+            if not isinstance(entry, h5py.Dataset) or entry.external or entry.is_virtual:
+                raise ValueError(f"{name}: is missing, or no data set of this file")
+            _check_size(path, name, entry.shape, entry.dtype.itemsize)
+            return entry.asstr()[()] if name == "header" else entry[()]
+
+        return _assembled(path, load)
 
 
-def _write_mat(path: Path, header: Header, frames: Array) -> None:
+def _write_mat(path: Path, header: Header, frames: Any) -> None:
     from scipy.io import savemat
 
-    savemat(path, {"header": header.to_json(), "rate": header.rate, **split(header, frames)}, oned_as="column")
+    savemat(path, _values(header, frames), oned_as="column")
 
 
-def _write_csv(path: Path, header: Header, frames: Array) -> None:
+def _read_mat(path: Path) -> tuple[Header, Array]:
+    from scipy.io import loadmat, whosmat
+
+    with _naming(path):
+        shapes = {name: shape for name, shape, _ in whosmat(path, appendmat=False)}
+
+    def load(name: str) -> Any:
+        if name not in shapes:
+            raise ValueError(f"{name}: is missing")
+        _check_size(path, name, shapes[name], 1 if name == "header" else 8)
+        return loadmat(path, appendmat=False, variable_names=[name])[name]
+
+    return _assembled(path, load)
+
+
+def _write_csv(path: Path, header: Header, frames: Any) -> None:
+    """A comment line with the header, a line of titles, and a line a sample with ten digits."""
     titles = ["time (s)", *(f"{name} ({unit})" for name, unit in header.channels)]
     with path.open("w", encoding="utf-8") as file:
-        file.write(",".join(titles) + "\n")
+        file.write(f"# {header.to_json()}\n" + ",".join(titles) + "\n")
         done = 0
-        for block in chunks(frames):
+        for block in chunks(frames, len(header.channels)):
             time = np.arange(done, done + len(block)) / header.rate
             np.savetxt(file, np.column_stack([time, block]), "%.10g", ",")
             done += len(block)
 
 
-def _write_doubles(path: Path, header: Header, frames: Array) -> None:
+def _read_csv(path: Path) -> tuple[Header, Array]:
+    with _naming(path), path.open(encoding="utf-8") as file:
+        comment, _, first = (file.readline() for _ in range(3))
+        if not comment.startswith("# "):
+            raise ValueError("the first line is no comment with a header")
+        lines = itertools.chain([first], file)
+        numbers = np.loadtxt(lines, delimiter=",", ndmin=2) if first else None
+    header = Header.from_json(comment[2:], str(path))
+    columns = len(header.channels)
+    if numbers is None:
+        return header, np.empty((0, columns))
+    if numbers.shape[1] != 1 + columns:
+        raise ValueError(f"{path}: {numbers.shape[1]} columns, expected {1 + columns}")
+    return header, numbers[:, 1:]
+
+
+def _write_doubles(path: Path, header: Header, frames: Any) -> None:
     """All columns as 64-bit float channels; the comment, where the format has one, is the header if it fits."""
     container = SOUND_CONTAINERS[path.suffix]
     comment = header.to_json()
@@ -223,8 +296,9 @@ def _write_doubles(path: Path, header: Header, frames: Array) -> None:
     _write_audio(path, container, "DOUBLE", frames, header.rate, comment)
 
 
-def _write_flac(path: Path, header: Header, frames: Array) -> None:
+def _write_flac(path: Path, header: Header, frames: Any) -> None:
     """Drive, sensed and motion as 24-bit channels (FLAC holds eight, and no floats); the comment states the scales."""
+    frames = frames[:]
     signals = {name: column(header, frames, name) for name in ("drive", "sensed", "motion")}
     width = sum(signal.shape[1] for signal in signals.values())
     if width > FLAC_CHANNELS:
@@ -238,33 +312,33 @@ def _write_flac(path: Path, header: Header, frames: Array) -> None:
     _write_audio(path, "FLAC", "PCM_24", np.nan_to_num(scaled), header.rate, comment)
 
 
-def _write_audio(path: Path, container: str, subtype: str, frames: Array, rate: float, comment: str) -> None:
+def _write_audio(path: Path, container: str, subtype: str, frames: Any, rate: float, comment: str) -> None:
     import soundfile
 
-    channels = 1 if frames.ndim == 1 else frames.shape[1]
+    channels = 1 if len(frames[:1].shape) == 1 else frames[:1].shape[1]
     with soundfile.SoundFile(path, "w", max(1, round(rate)), channels, subtype, format=container) as file:
         if container != "W64":  # has no room for text
             file.comment = comment
-        for block in chunks(frames):
+        for block in chunks(frames, channels):
             file.write(block)
 
 
 SOUND_CONTAINERS = {".wav": "WAV", ".w64": "W64", ".rf64": "RF64", ".flac": "FLAC"}
-READERS: dict[str, Callable[[Path], tuple[Header, Array]]] = {
+READERS: dict[str, Callable[[Path], tuple[Header, Any]]] = {
     ".au": read_journal,
     ".npz": _read_npz,
     ".h5": _read_h5,
     ".hdf5": _read_h5,
+    ".mat": _read_mat,
+    ".csv": _read_csv,
 }
-WRITERS: dict[str, Callable[[Path, Header, Array], None]] = {
+WRITERS: dict[str, Callable[[Path, Header, Any], None]] = {
     ".au": write_journal,
     ".npz": _write_npz,
     ".h5": _write_h5,
     ".hdf5": _write_h5,
     ".mat": _write_mat,
     ".csv": _write_csv,
-    ".wav": _write_doubles,
-    ".w64": _write_doubles,
-    ".rf64": _write_doubles,
+    **dict.fromkeys((".wav", ".w64", ".rf64"), _write_doubles),
     ".flac": _write_flac,
 }

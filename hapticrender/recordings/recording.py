@@ -1,8 +1,10 @@
-"""What happened: kept while it happens, then saved, judged and drawn."""
+"""Recordings of runs: written while a run happens, then saved, judged and drawn."""
 
 from __future__ import annotations
 
 import os
+import warnings
+from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO
@@ -12,20 +14,25 @@ import numpy as np
 from hapticrender.bands import Bands
 from hapticrender.protocols import Array
 from hapticrender.recordings import formats, journal, judge
+from hapticrender.recordings.envelopes import Envelopes, analyse
+from hapticrender.recordings.formats import MissingExtra
 from hapticrender.recordings.journal import Header
 
 if TYPE_CHECKING:
     from hapticrender.touch.scene import Scene
 
 
-class Recorder:
-    """Keeps a run while it happens.
+FLUSH = 0.25  # s of signal: the most that a killed process loses
 
-    With a path, every block goes to the operating system the moment it is
-    appended: a killed process loses nothing that was appended.  The file is
-    made at the first block, so that a run which never starts leaves an older
-    journal of that name untouched; a run that starts replaces it.  Without a
-    path, blocks are kept in memory.
+
+class Recorder:
+    """Write a run while it happens, into a journal or into memory.
+
+    With a path, the file is made at the first block, so that a run which never
+    starts leaves an older journal of that name untouched.  Later blocks are
+    collected and handed to the operating system every 0.25 s of signal, and
+    when the recorder closes, also after an exception: a killed process loses
+    0.25 s at most, a failing one nothing.
 
     Parameters
     ----------
@@ -36,26 +43,28 @@ class Recorder:
     method : str
         Name of the control method.
     seed : int
-        Seed of the run.
+        Seed of the run, >= 0.
     rate : float
-        Sampling rate (Hz), > 0.
+        Sampling rate (Hz), 1e-3 to 1e9.
     bands : Bands
         Carriers of the run.
     drive_channels, sensed_channels : int
         Channels of the device.
     places : tuple of str
-        Names of the judged places, the centre first; one column of motion each.
+        Names of the evaluation points, the centre first; one column of motion each.
     drive_limit : float or None
         Largest drive that the device takes, where it is known.
     unit, drive_unit : str
         Of sensors, motion and targets; of the drive.
     profile : tuple of float, or None
-        What is wanted at each place, as a multiple of the target; None: the same everywhere.
+        Target at each place, as a multiple of the target at the first; None: the same everywhere.
+    motion_source : str
+        Where `motion` comes from: "true", "sensors" or "unknown"; the first block may state another one.
 
     Raises
     ------
     ValueError
-        The path does not end in .au, or the rate is not positive.
+        The path does not end in .au, or a number is out of its bounds.
     """
 
     def __init__(
@@ -74,12 +83,11 @@ class Recorder:
         unit: str = "m",
         drive_unit: str = "A",
         profile: tuple[float, ...] | None = None,
+        motion_source: str = "true",
     ) -> None:
         self.path = None if path is None else Path(path)
         if self.path is not None and self.path.suffix.lower() != ".au":
             raise ValueError(f"{self.path}: a journal is a Sun AU file, its name must end in .au")
-        if not 0 < rate < np.inf:
-            raise ValueError(f"{rate=} Hz must be finite and > 0")
         self.header = Header.of(
             scene,
             method=method,
@@ -92,11 +100,13 @@ class Recorder:
             drive_limit=None if drive_limit is None else float(drive_limit),
             unit=unit,
             drive_unit=drive_unit,
-            profile=profile,
+            profile=None if profile is None else tuple(map(float, profile)),
+            motion_source=motion_source,
         )
         self._scene = scene
         self._file: BinaryIO | None = None
-        self._blocks: list[Array] = []
+        self._blocks: list[Array] = []  # what is not in the file yet; without a path, everything
+        self._waiting = 0  # samples in them
 
     def __enter__(self) -> Recorder:
         return self
@@ -113,24 +123,30 @@ class Recorder:
         normal_load: Array,
         target: Array,
         flags: Array,
+        *,
+        motion_source: str | None = None,
     ) -> None:
-        """Keep the next n samples.
+        """Append n samples.
 
         Parameters
         ----------
-        drive : ndarray, shape (n, drive_channels), A
-            What the device was handed for each interval.
-        sensed : ndarray, shape (n, sensed_channels), m
-        motion : ndarray, shape (n, places), m
-            True motion, or what comes nearest where the device knows no truth.
+        drive : ndarray, shape (n, drive_channels), drive unit
+            Commanded drive of each interval.
+        sensed : ndarray, shape (n, sensed_channels), unit
+        motion : ndarray, shape (n, places), unit
+            True motion, or the best estimate where the device has no independent measurement.
         position : ndarray, shape (n,), m
             Finger from the middle of the surface, NaN while it is lifted.
         normal_load : ndarray, shape (n,), N
-        target : ndarray of complex, shape (n, n_bands), m
-            Wanted envelopes.
+        target : ndarray of complex, shape (n, n_bands), unit
+            Reference envelopes.
         flags : ndarray of int, shape (n,)
             Status words (``protocols.Flag``).
+        motion_source : str, optional
+            Read at the first block only: replaces the one of the constructor.
         """
+        if motion_source is not None and self._file is None and not self._blocks:
+            self.header = replace(self.header, motion_source=motion_source)
         signals = {
             "drive": drive,
             "sensed": sensed,
@@ -140,65 +156,72 @@ class Recorder:
             "target": target,
             "flags": flags,
         }
-        if self.path is None:
-            self._blocks.append(journal.join(self.header, signals))
+        self._blocks.append(journal.join(self.header, signals))
+        self._waiting += len(drive)
+        if self._file is None or self._waiting >= FLUSH * self.header.rate:
+            self.flush()
+
+    def flush(self) -> None:
+        """Hand everything appended so far to the operating system; without a path, do nothing."""
+        if self.path is None or not self._blocks:
             return
-        frames = journal.join(self.header, signals, journal.JOURNAL_DTYPE)
+        blocks, self._blocks, self._waiting = self._blocks, [], 0
         if self._file is None:
             self._file = self._create(self.path)
-        self._file.write(frames.data)
+        self._file.write(np.concatenate(blocks).astype(journal.JOURNAL_DTYPE).data)
         self._file.flush()
 
     def close(self) -> None:
-        """Close the journal; what was appended stays."""
-        if self._file is not None:
-            self._file.close()
+        """Write what is left and close the journal."""
+        try:
+            self.flush()
+        finally:
+            if self._file is not None:
+                self._file.close()
 
     def finish(self) -> Recording:
-        """Close the journal and return what was kept; with a path it is mapped from the file, not held in memory."""
+        """Close the journal and return the recording; with a path it is read from the file, not held in memory."""
         if self.path is None:
             frames = np.concatenate(self._blocks) if self._blocks else np.empty((0, len(self.header.channels)))
             self._blocks = [frames]
             return Recording(self.header, frames, self._scene)
-        if self._file is None:
-            self._file = self._create(self.path)
         self.close()
+        if self._file is None:
+            self._create(self.path).close()
         return Recording(*journal.read_journal(self.path), self._scene)
 
     def _create(self, path: Path) -> BinaryIO:
-        path.unlink(missing_ok=True)  # a recording may still map the old file: replace it, never write into it
+        path.unlink(missing_ok=True)  # a recording may still read the old file: replace it, never write into it
         file = path.open("xb")
         file.write(journal.journal_head(self.header))
         return file
 
 
+def _of_header(name: str, doc: str) -> Any:
+    return property(lambda self: getattr(self.header, name), doc=doc)
+
+
+def _signal(name: str, doc: str) -> Any:
+    return property(lambda self: self.read(name), doc=doc)
+
+
 class Recording:
-    """What happened in a run, with all signals on one clock.
+    """The result of a run, with all signals on one clock.
+
+    `drive`, `sensed`, `motion`, `position`, `normal_load`, `target` and `flags` read a whole signal, `read` a part of
+    one; units are `header.unit` and `header.drive_unit`, and `header.motion_source` says where the motion comes from.
 
     Parameters
     ----------
     header : Header
         What the columns mean and where they come from.
-    frames : ndarray, shape (n, columns)
-        The signals, possibly mapped from a file: then every access to a signal reads it afresh.
+    frames : ndarray, shape (n, columns), or JournalFrames
+        The signals; those of a journal are read from its file at every access.
     scene : Scene or None
-        The scene; None parses it from the header when it is asked for.
-
-    Attributes
-    ----------
-    method, seed, rate, bands
-        As given to `Recorder`; `rate` in Hz.
-    time : ndarray, shape (n,), s
-    drive : ndarray, shape (n, drive_channels), A
-    sensed : ndarray, shape (n, sensed_channels), m
-    motion : ndarray, shape (n, places), m
-    position : ndarray, shape (n,), m; NaN while the finger is lifted
-    normal_load : ndarray, shape (n,), N
-    target : ndarray of complex, shape (n, n_bands), m
-    flags : ndarray of int, shape (n,)
+        The scene; None parses it from the header at the first access.
     """
 
-    def __init__(self, header: Header, frames: Array, scene: Scene | None = None) -> None:
+    def __init__(self, header: Header, frames: Array | journal.JournalFrames, scene: Scene | None = None) -> None:
         self.header = header
         self.frames = frames
         if scene is not None:
@@ -219,94 +242,82 @@ class Recording:
 
         return Scene.from_toml_text(self.header.scene, where="recording")
 
-    @property
-    def method(self) -> str:
-        """Name of the control method."""
-        return self.header.method
-
-    @property
-    def seed(self) -> int:
-        """Seed of the run."""
-        return self.header.seed
-
-    @property
-    def rate(self) -> float:
-        """Sampling rate (Hz)."""
-        return self.header.rate
-
-    @property
-    def bands(self) -> Bands:
-        """Carriers of the run."""
-        return self.header.bands
+    method: str = _of_header("method", "Name of the control method.")
+    seed: int = _of_header("seed", "Seed of the run.")
+    rate: float = _of_header("rate", "Sampling rate (Hz).")
+    bands: Bands = _of_header("bands", "Carriers of the run.")
+    drive: Array = _signal("drive", "Commanded drive (drive unit, shape (n, drive_channels)).")
+    sensed: Array = _signal("sensed", "Sensed signals (unit, shape (n, sensed_channels)).")
+    motion: Array = _signal("motion", "Motion at the evaluation points (unit, shape (n, places)).")
+    position: Array = _signal("position", "Finger from the middle of the surface (m, shape (n,)), NaN while lifted.")
+    normal_load: Array = _signal("normal_load", "Load of the finger (N, shape (n,)).")
+    target: Array = _signal("target", "Reference envelopes (unit, complex, shape (n, n_bands)).")
+    flags: Array = _signal("flags", "Status words (int, shape (n,)), see ``protocols.Flag``.")
 
     @property
     def time(self) -> Array:
         """Time since the start (s, shape (n,))."""
         return np.arange(len(self)) / self.rate
 
-    @property
-    def drive(self) -> Array:
-        """What was sent (A, shape (n, drive_channels))."""
-        return self.read("drive")
+    def read(self, name: str, start: int = 0, stop: int | None = None, step: int = 1) -> Array:
+        """Read every `step`-th sample of one signal from `start` to `stop`, a bounded number at a time.
 
-    @property
-    def sensed(self) -> Array:
-        """What the sensors said (m, shape (n, sensed_channels))."""
-        return self.read("sensed")
-
-    @property
-    def motion(self) -> Array:
-        """True motion at the judged places (m, shape (n, places))."""
-        return self.read("motion")
-
-    @property
-    def position(self) -> Array:
-        """Finger from the middle of the surface (m, shape (n,)), NaN while lifted."""
-        return self.read("position")
-
-    @property
-    def normal_load(self) -> Array:
-        """Load of the finger (N, shape (n,))."""
-        return self.read("normal_load")
-
-    @property
-    def target(self) -> Array:
-        """Wanted envelopes (m, complex, shape (n, n_bands))."""
-        return self.read("target")
-
-    @property
-    def flags(self) -> Array:
-        """Status words (int, shape (n,)), see ``protocols.Flag``."""
-        return self.read("flags")
-
-    def read(self, name: str, start: int = 0, stop: int | None = None) -> Array:
-        """Read samples `start` to `stop` of one signal, so that a long run need not fit into memory."""
-        return journal.column(self.header, self.frames[start:stop], name)
+        Parameters
+        ----------
+        name : str
+            "drive", "sensed", "motion", "position", "normal_load", "target" or "flags".
+        start, stop : int
+            Samples, as in a slice; `stop` None: to the end.
+        step : int
+            >= 1.
+        """
+        if isinstance(self.frames, np.ndarray):
+            return journal.column(self.header, self.frames[start:stop:step], name)
+        columns = len(self.header.channels)
+        blocks = journal.chunks(self.frames, columns, start, stop, step)
+        parts = [journal.column(self.header, block, name).copy() for block in blocks]  # not a view of all columns
+        return np.concatenate(parts) if parts else journal.column(self.header, np.empty((0, columns)), name)
 
     @cached_property
-    def envelopes(self) -> judge.Envelopes:
-        """Wanted and achieved envelopes over time (computed once)."""
-        return judge.analyse(self)
+    def envelopes(self) -> Envelopes:
+        """Reference and achieved envelopes over time (computed once)."""
+        return analyse(self)
 
     def summary(self) -> dict[str, Any]:
         """Figures and verdict as plain numbers, ready for JSON (see ``judge.summary``)."""
         return judge.summary(self)
 
     def text(self) -> str:
-        """Write the summary as a table for the terminal."""
-        return judge.text(self.summary())
+        """Summary as a table for the terminal."""
+        from hapticrender.report.text import figures
 
-    def plot(self, path: str | os.PathLike[str]) -> None:
-        """Draw target, achieved motion, drive and finger into one PNG; needs matplotlib."""
-        from hapticrender.charts import picture
+        return figures(self.summary())
 
-        picture.plot(self, path)
+    def plot(self, path: str | os.PathLike[str]) -> bool:
+        """Draw target, achieved motion, drive and finger into one .png, .svg or .pdf.
+
+        Without matplotlib a warning says how to install it, nothing is drawn and False is returned, so that a script
+        goes on to save the run.
+
+        Raises
+        ------
+        ValueError
+            The file's ending is none of these.
+        """
+        from hapticrender.report import picture
+
+        try:
+            picture.plot(self, path)
+        except MissingExtra as error:
+            warnings.warn(f"{path} is not drawn: {error}; the recording can be saved", stacklevel=2)
+            return False
+        return True
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write to .au, .npz, .h5 or .hdf5 (these can be loaded again), .mat, .csv, .wav, .w64, .rf64 or .flac."""
+        """Write to .au, .npz, .h5, .hdf5, .mat or .csv (these can be loaded again), .wav, .w64, .rf64 or .flac."""
         formats.write(path, self.header, self.frames)
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Recording:
-        """Open a recording (.au, .npz, .h5, .hdf5); a journal is mapped, also while another process writes it."""
+        """Open a recording (.au, .npz, .h5, .hdf5, .mat, .csv); a journal also while another process writes it."""
         return cls(*formats.read(path))

@@ -1,18 +1,30 @@
-"""One picture of a recording: wanted and achieved, the waveform near by, the drive, the finger, the verdict."""
+"""Draw a recording: target and achieved amplitude, a waveform close-up, errors, drive, finger and verdict."""
 
 from __future__ import annotations
 
 import os
 import textwrap
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from hapticrender import wording
-from hapticrender.charts.figures import BLUE, GREEN, INK, ORANGE, PALE, RED, new_figure, save
-from hapticrender.protocols import Array, Flag
-from hapticrender.recordings.judge import RUNAWAY
+from hapticrender.formatting import band_label, percent
+from hapticrender.protocols import Array
+from hapticrender.recordings.envelopes import RUNAWAY
+from hapticrender.report.figure import (
+    BLUE,
+    GREEN,
+    INK,
+    ORANGE,
+    PALE,
+    RED,
+    check_format,
+    legend,
+    new_figure,
+    save,
+)  # fmt: skip
+from hapticrender.report.text import verdict
 
 if TYPE_CHECKING:
     from hapticrender.recordings.recording import Recording
@@ -23,35 +35,45 @@ COLUMNS = 1400  # points that a full-width panel can show
 QUANTITIES = {"m": "displacement", "N": "friction", "m/s": "skin velocity"}
 PERIODS = 4  # of the strongest carrier in the close-up
 LANE = 0.95  # inch: a lane of drive beyond the two of a plate
-MOST_LABELS = 10
+MOST_LABELS = 8
 MOST_NOTES = 3  # lines
+GROUP = 64  # stretches of an outline that are read at once
+VERDICTS = {"passed": ("✓", "#00694E"), "failed": ("✗", "#A84300"), "not judged": ("–", "#555555")}
 FLOOR = 1e-5  # relative error below which a dot stands at the foot of its panel
 
 
 def plot(recording: Recording, path: str | os.PathLike[str]) -> None:
-    """Draw a recording into one PNG.
-
-    Parameters
-    ----------
-    recording : Recording
-    path : path-like
-        File to write; an older one is replaced when the new one is whole.
+    """Draw a recording into one .png, .svg or .pdf; an older file is replaced when the new one is whole.
 
     Raises
     ------
+    ValueError
+        The file's ending is none of these.
     MissingExtra
         matplotlib is not installed.
     """
+    path = check_format(path)
     save(draw(recording), path)
 
 
 def draw(recording: Recording) -> Any:
     """Draw a recording into a new ``matplotlib.figure.Figure``, apart from pyplot and its global state; see `plot`."""
-    touched = bool(np.isfinite(recording.position).any())
+    touched = bool(np.isfinite(outline(recording, "position")[1]).any())
     height = (10.2 if touched else 8.6) + LANE * max(0, recording.header.drive_channels - 2)
     with new_figure((11, height), pads=(0.12, 0.07)) as figure:
         _draw(figure, recording, touched)
     return figure
+
+
+def drawn(unit: str) -> tuple[float, str]:
+    """Scale and unit in which a quantity of `unit` (SI) is drawn.
+
+    Examples
+    --------
+    >>> drawn("m")
+    (1000000.0, 'µm')
+    """
+    return (1e6, "µm") if unit == "m" else (1e3, f"m{unit}")
 
 
 def _draw(figure: Any, recording: Recording, touched: bool) -> None:
@@ -67,7 +89,7 @@ def _draw(figure: Any, recording: Recording, touched: bool) -> None:
     _close_up(figure.add_subplot(grid[2, 0]), recording)
     _errors(figure.add_subplot(grid[2, 1]), recording, summary)
     below = [figure.add_subplot(grid[3 + i, :], sharex=amplitude) for i in range(len(lanes))]
-    _drive(below[:coils], recording)
+    _drive(below[:coils], recording, summary)
     if touched:
         _finger(below[-2], below[-1], recording)
     for axes in below[:-1]:
@@ -84,13 +106,21 @@ def _draw(figure: Any, recording: Recording, touched: bool) -> None:
 def _head(axes: Any, summary: dict[str, Any], touched: bool) -> None:
     """Name of the scene, how it was made, and the verdict in words."""
     axes.axis("off")
-    passed, finger = summary["passed"], "" if touched else " · no finger"
-    axes.text(0, 1.0, summary["scene"] or "(no name)", fontsize=15, fontweight="bold", va="top")
+    finger = "" if touched else " · no finger"
+    finger += " · motion from the sensors" if summary["motion_source"] == "sensors" else ""
+    axes.text(
+        0,
+        1.0,
+        textwrap.shorten(summary["scene"], 50, placeholder=" …") or "(no name)",
+        fontsize=15,
+        fontweight="bold",
+        va="top",
+    )
     how = f"{summary['device']} · method {summary['method']} · seed {summary['seed']} · {summary['rate']:g} Hz{finger}"
     axes.text(1, 0.92, how, color="#555555", ha="right", va="top")
-    sentence = textwrap.shorten(wording.verdict(summary), 150, placeholder=" …")
-    mark = "✓ " if passed else "✗ "
-    axes.text(0, 0.02, mark + sentence, color="#00694E" if passed else "#A84300", fontweight="bold", va="bottom")
+    sentence = textwrap.shorten(verdict(summary), 150, placeholder=" …")
+    mark, colour = VERDICTS[summary["verdict"]]
+    axes.text(0, 0.02, f"{mark} {sentence}", color=colour, fontweight="bold", va="bottom")
     axes.set(xlim=(0, 1), ylim=(0, 1))
 
 
@@ -103,7 +133,7 @@ def _amplitude(axes: Any, recording: Recording, summary: dict[str, Any]) -> None
     achieved[~readable] = np.nan
     time, wanted = _target(recording, shown)
     tolerance, profile = recording.header.tolerance, recording.header.profile
-    scale, unit = wording.drawn(recording.header.unit)
+    scale, unit = drawn(recording.header.unit)
     achieved = scale * achieved / np.array(profile or 1.0)
     axes.fill_between(
         time, (1 - tolerance) * wanted, (1 + tolerance) * wanted, color=PALE, alpha=0.2, lw=0, label="tolerance"
@@ -112,9 +142,11 @@ def _amplitude(axes: Any, recording: Recording, summary: dict[str, Any]) -> None
     for i in reversed(range(len(names))):
         colour = PLACES[i % len(PLACES)][0]
         style = {"color": colour, "lw": 1.8 if i == 0 else 1.1, "marker": "." if len(achieved) < 500 else "", "ms": 3}
-        axes.plot(envelopes.time, achieved[:, i], label=names[i], **style)
+        if np.isfinite(achieved[:, i]).any():
+            axes.plot(envelopes.time, achieved[:, i], label=names[i], **style)
     axes.plot(time, wanted, color=INK, lw=1.1, ls=(0, (4, 2)), label="target")
-    axes.axvline(summary["judged_from"], color=PALE, lw=0.9, ls=":", label="judged from here")
+    if summary["verdict"] != "not judged":
+        axes.axvline(summary["judged_from"], color=PALE, lw=0.9, ls=":", label="judged from here")
     several = "" if shown.sum() <= 1 else f" ({int(shown.sum())} bands: root of the sum of squares)"
     axes.set(title=f"Peak amplitude{several}", ylabel=f"amplitude ({unit})")
     axes.set_ylim(0, 1.25 * max(np.nanmax(achieved, initial=0), (1 + tolerance) * wanted.max(initial=0)) or 1)
@@ -122,7 +154,7 @@ def _amplitude(axes: Any, recording: Recording, summary: dict[str, Any]) -> None
     order = sorted(
         range(len(labels)), key=lambda i: [*names, "target", "tolerance", "judged from here"].index(labels[i])
     )
-    _legend(axes, [handles[i] for i in order], [labels[i] for i in order])
+    legend(axes, [handles[i] for i in order], [labels[i] for i in order])
 
 
 def _bounded(values: Array) -> Array:
@@ -131,16 +163,11 @@ def _bounded(values: Array) -> Array:
 
 
 def _target(recording: Recording, shown: Array) -> tuple[Array, Array]:
-    """Time (s) and wanted amplitude (as drawn), all shown bands together, thinned to what the panel can show."""
-    step = max(1, len(recording) // COLUMNS)
-    target = np.concatenate(
-        [
-            recording.read("target", start, start + step * COLUMNS)[::step, shown]
-            for start in range(0, len(recording), step * COLUMNS)
-        ]
-        or [np.empty((0, int(shown.sum())), complex)]
+    """Time (s) and reference amplitude (as drawn), all shown bands together: means over what a pixel shows."""
+    time, _, _, mean = _stretches(
+        lambda start, stop: _together(recording.read("target", start, stop)[:, shown]), len(recording), recording.rate
     )
-    return np.arange(len(target)) * step / recording.rate, wording.drawn(recording.header.unit)[0] * _together(target)
+    return time, drawn(recording.header.unit)[0] * mean
 
 
 def _together(envelope: Array) -> Array:
@@ -148,11 +175,11 @@ def _together(envelope: Array) -> Array:
 
 
 def _close_up(axes: Any, recording: Recording) -> None:
-    """Show a few periods of the wanted and the true waveform at the centre, late in the judged time."""
+    """Draw a few periods of the reference and of the true waveform at the centre, late in the judged time."""
     start, stop = _close_span(recording)
     time = np.arange(start, stop) / recording.rate
     phase = recording.bands.carrier_phase(time, recording.read("position", start, stop))
-    scale, unit = wording.drawn(recording.header.unit)
+    scale, unit = drawn(recording.header.unit)
     wanted = scale * (recording.read("target", start, stop) * np.exp(1j * phase)).real.sum(axis=1)
     motion = scale * _bounded(recording.read("motion", start, stop)[:, 0])
     offset = np.nan_to_num(np.mean(motion - wanted)) if motion.size else 0.0  # a stretch holds parts of periods
@@ -167,7 +194,7 @@ def _close_up(axes: Any, recording: Recording) -> None:
         ylabel=f"{QUANTITIES.get(recording.header.unit, 'motion')} ({unit})",
     )
     axes.margins(x=0, y=0.12)
-    _legend(axes)
+    legend(axes)
 
 
 def _close_span(recording: Recording) -> tuple[int, int]:
@@ -199,53 +226,51 @@ def _errors(axes: Any, recording: Recording, summary: dict[str, Any]) -> None:
         known = [(k + shift, 100 * max(value, FLOOR)) for k, value in enumerate(values) if value is not None]
         if known:
             axes.plot(*zip(*known, strict=True), marker, color=colour, ms=6 if len(bands) <= 10 else 3.5, label=name)
-    axes.axhline(100 * recording.header.tolerance, color=INK, lw=1, ls=(0, (4, 2)), label="tolerance")
+    allowed = 100 * recording.header.tolerance
+    axes.axhline(allowed, color=INK, lw=1, ls=(0, (4, 2)), label="tolerance")
     axes.set_yscale("log")
     low, high = axes.get_ylim()
-    allowed = 100 * recording.header.tolerance
-    low, high = min(low, allowed / 30) / 1.5, max(high, allowed)
-    high *= (high / low) ** 0.22  # room for the legend
+    low, high = min(low, allowed / 30) / 1.5, 1.5 * max(high, allowed)
     axes.axhspan(allowed, high, color=RED, alpha=0.08, lw=0)
     axes.set_ylim(low, high)
+    axes.text(0.01, allowed, f"{allowed:.3g} %", fontsize=8, va="bottom", transform=axes.get_yaxis_transform())
     axes.yaxis.set_major_formatter(lambda value, _: f"{value:g}")
     axes.minorticks_off()
     every = -(-len(bands) // MOST_LABELS)
     shown = range(0, len(bands), every)
-    axes.set_xticks(list(shown), [wording.band_label(bands[k]) for k in shown], rotation=30 if len(shown) > 5 else 0)
-    if len(shown) > 5:
-        for label in axes.get_xticklabels():
-            label.set(ha="right", rotation_mode="anchor")
+    small = {"fontsize": 7.5} if len(shown) > 5 else {}
+    axes.set_xticks(list(shown), [band_label(bands[k], "\n", "") for k in shown], **small)
     axes.set_xlim(-0.6, len(bands) - 0.4)
     axes.grid(axis="x", visible=False)
-    axes.set(title="Rms error of the judged amplitude", ylabel="error (%)")
-    _legend(axes, columns=4)
+    axes.set(title="Rms error", ylabel="error of the amplitude (%)")
+    legend(axes, columns=4)
 
 
-def _drive(lanes: list[Any], recording: Recording) -> None:
-    """Drive of every channel in its lane; a long run as the range that each column of pixels covers."""
-    header, drive = recording.header, _bounded(recording.drive)
-    units = header.drive_units
-    limit: Any = header.drive_limit if len(set(units)) == 1 else None
-    peaks = {unit: np.nanmax(np.abs(drive[:, [each == unit for each in units]]), initial=0.0) or 1e-3 for unit in units}
+def _drive(lanes: list[Any], recording: Recording, summary: dict[str, Any]) -> None:
+    """Draw the drive of every channel in its lane; a long run as the range that each column of pixels covers."""
+    units = recording.header.drive_units
+    time, lows, highs = outline(recording, "drive")
+    lows, highs = _bounded(lows), _bounded(highs)
+    limit: Any = recording.header.drive_limit if len(set(units)) == 1 else None
+    largest = np.nanmax(np.maximum(np.abs(lows), np.abs(highs)), axis=0, initial=0.0)
+    peaks = {unit: max(largest[[each == unit for each in units]]) or 1e-3 for unit in units}
     near = limit is not None and peaks[units[0]] > 0.4 * limit
     for i, (axes, unit, name) in enumerate(zip(lanes, units, _lane_names(units), strict=True)):
         reach = 1.12 * (max(peaks[unit], limit) if near else peaks[unit])
-        time, low, high = outline(drive[:, i], recording.rate)
-        axes.fill_between(time, low, high, color=COILS[i % len(COILS)], lw=0.5)
+        axes.fill_between(time, lows[:, i], highs[:, i], color=COILS[i % len(COILS)], lw=0.5)
         for sign in (-1, 1) if near else ():
             axes.axhline(sign * limit, color=INK, lw=1, ls=(0, (4, 2)))
         axes.set(ylabel=f"{name} ({unit})", ylim=(-reach, reach))
         if near:
-            axes.set_yticks([-limit, 0, limit])
-    stated = "" if limit is None else f", limit ±{limit:g} {units[0]}" + (" (dashed)" if near else "")
-    saturated = float(np.mean((recording.flags & Flag.SATURATED) != 0)) if len(recording) else 0.0
-    if saturated:
-        stated += f", saturated in {wording.percent(saturated)} of the samples"
+            axes.set_yticks([-limit, 0, limit], [f"{tick:.3g}" for tick in (-limit, 0, limit)])
+    stated = "" if limit is None else f", limit ±{limit:.3g} {units[0]}" + (" (dashed)" if near else "")
+    if summary["saturated_share"]:
+        stated += f", saturated in {percent(summary['saturated_share'])} of the samples"
     lanes[0].set_title(f"Drive{stated}")
 
 
 def _lane_names(units: Sequence[str]) -> list[str]:
-    """Names of the drive's lanes; where units differ, what takes newtons is a screen."""
+    """Names of the drive's lanes; where units differ, a channel in newtons is a screen."""
     if len(units) == 1:
         return ["drive"]
     known = {"A": "coil"} if len(set(units)) == 1 else {"A": "coil", "N": "screen"}
@@ -254,36 +279,40 @@ def _lane_names(units: Sequence[str]) -> list[str]:
 
 
 def _finger(upper: Any, lower: Any, recording: Recording) -> None:
-    """Position and load of the finger; a lifted finger is a gap."""
-    time, low, high = outline(1e3 * recording.position, recording.rate)
-    upper.plot(time, (low + high) / 2, color=INK, lw=1.3)
+    """Draw position and load of the finger; a lifted finger is a gap."""
+    time, low, high = outline(recording, "position")
+    upper.plot(time, 1e3 * (low + high) / 2, color=INK, lw=1.3)
     upper.set(title="Finger", ylabel="position (mm)")
-    time, low, high = outline(recording.normal_load, recording.rate)
+    time, low, high = outline(recording, "normal_load")
     lower.fill_between(time, 0, (low + high) / 2, color=GREEN, alpha=0.25, lw=0)
     lower.plot(time, (low + high) / 2, color=GREEN, lw=1.3)
     lower.set(ylabel="load (N)", ylim=(0, 1.15 * np.nanmax(high, initial=0.0) or 1))
 
 
-def outline(values: Array, rate: float) -> tuple[Array, Array, Array]:
-    """Time (s), least and greatest value in each of at most `COLUMNS` stretches of a signal sampled at `rate` (Hz).
-
-    Parameters
-    ----------
-    values : ndarray, shape (n,)
-        A stretch that holds a NaN is NaN.
-    rate : float
+def outline(recording: Recording, name: str) -> tuple[Array, Array, Array]:
+    """Least and greatest value of a signal in each of at most `COLUMNS` stretches.
 
     Returns
     -------
-    time, low, high : ndarray
-        `time` is the middle of each stretch.
+    time : ndarray, shape (w,), s
+        Middle of each stretch.
+    low, high : ndarray, shape (w,) or (w, channels)
+        A stretch that holds a NaN is NaN.
     """
-    if not values.size:
-        return np.empty(0), np.empty(0), np.empty(0)
-    starts = np.linspace(0, values.size, min(COLUMNS, values.size), endpoint=False).astype(int)
-    time = (starts + np.append(starts[1:], values.size) - 1) / (2 * rate)
-    return time, np.minimum.reduceat(values, starts), np.maximum.reduceat(values, starts)
+    return _stretches(lambda start, stop: recording.read(name, start, stop), len(recording), recording.rate)[:3]
 
 
-def _legend(axes: Any, *entries: Any, columns: int = 6) -> None:
-    axes.legend(*entries, loc="upper right", ncols=columns, borderaxespad=0.1, handlelength=1.6, columnspacing=1.2)
+def _stretches(read: Callable[[int, int], Array], count: int, rate: float) -> tuple[Array, Array, Array, Array]:
+    """Middle (s), least, greatest and mean value of ``read(start, stop)`` in each stretch, `GROUP` read at once."""
+    edges = np.linspace(0, count, min(COLUMNS, count) + 1).astype(int)
+    found = []
+    for i in range(0, len(edges) - 1, GROUP):
+        part = edges[i : i + GROUP + 1]
+        values, starts = read(part[0], part[-1]), part[:-1] - part[0]
+        sums = np.add.reduceat(values, starts).T / np.diff(part)
+        found.append((np.minimum.reduceat(values, starts), np.maximum.reduceat(values, starts), sums.T))
+    if not found:
+        empty = read(0, 0)
+        return np.empty(0), empty, empty, empty
+    low, high, mean = (np.concatenate(each) for each in zip(*found, strict=True))
+    return (edges[:-1] + edges[1:] - 1) / (2 * rate), low, high, mean

@@ -1,4 +1,4 @@
-"""One texture on several devices, side by side in skin velocity: the waveform, and every band against its target."""
+"""Draw one texture on several devices in skin velocity: the waveform, and the error of every band."""
 
 from __future__ import annotations
 
@@ -8,20 +8,20 @@ from typing import Any
 
 import numpy as np
 
-from hapticrender import wording
-from hapticrender.charts.figures import BLUE, GREEN, INK, ORANGE, RED, new_figure, save
-from hapticrender.charts.picture import QUANTITIES
+from hapticrender.formatting import quantity, short
 from hapticrender.recordings.recording import Recording
+from hapticrender.report.figure import BLUE, GREEN, INK, ORANGE, RED, legend, new_figure, save
+from hapticrender.report.picture import FLOOR, QUANTITIES
 from hapticrender.skin import felt_bands, residual_velocity, skin_waveform
 from hapticrender.touch.perception import HIGHEST
 
-COLOURS = (BLUE, ORANGE, GREEN, RED)
+COLOURS, MARKERS = (BLUE, ORANGE, GREEN, RED), "os^D"
 PERIODS = 3.0  # of the lowest band
 BOUND = 5.0  # %: how far devices may differ
 
 
 def plot_devices(recordings: Mapping[str, Recording], path: str | os.PathLike[str]) -> None:
-    """Draw recordings of one texture, by the name of their device, into a PNG.
+    """Draw recordings of one texture, by the name of their device, into a .png, .svg or .pdf.
 
     Raises
     ------
@@ -42,10 +42,11 @@ def draw_devices(recordings: Mapping[str, Recording]) -> Any:
             _waveform(axes, recording, device, COLOURS[i % len(COLOURS)])
             axes.set_ylabel("skin velocity (mm/s)" if i == 0 else "")
             axes.tick_params(labelleft=i == 0)
+        figure.legend(*first.get_legend_handles_labels(), loc="outside upper right", ncols=2)
         _bands(figure.add_subplot(grid[1, :]), recordings)
         name = next(iter(recordings.values())).scene.texture
         figure.suptitle(
-            f"One texture on {len(recordings)} devices, as the skin is predicted to feel it ({_said(name)})",
+            f"Predicted skin velocity up to {short(HIGHEST, 'Hz')} on {len(recordings)} devices ({_said(name)})",
             x=0.01, ha="left", fontsize=12.5, fontweight="bold",
         )  # fmt: skip
     return figure
@@ -65,39 +66,34 @@ def _waveform(axes: Any, recording: Recording, device: str, colour: str) -> None
     start = np.ceil(start * lowest) / lowest  # the same phase on every device
     time, wanted, achieved = skin_waveform(recording, start, seconds)
     milliseconds = 1e3 * (time - time[0])
-    axes.plot(milliseconds, 1e3 * achieved, color=colour, lw=2.0, label="achieved")
-    axes.plot(milliseconds, 1e3 * wanted, color=INK, lw=1.0, ls=(0, (4, 2)), label="wanted")
-    quantity = QUANTITIES.get(recording.header.unit, "motion")
-    axes.set(title=f"{device}, by {quantity}:\nits bands, from their envelopes", xlabel="time (ms)")
-    beside = wording.quantity(residual_velocity(recording), "m/s")
-    axes.text(
-        0.98, 0.02, f"beside them {beside} rms, up to {wording.short(HIGHEST, 'Hz')}",
-        transform=axes.transAxes, ha="right", va="bottom", fontsize=8,
-    )  # fmt: skip
-    axes.margins(x=0, y=0.18)
-    axes.legend(loc="upper right", ncols=2, borderaxespad=0.1)
+    axes.plot(milliseconds, 1e3 * achieved, color=colour, lw=2.0, label="achieved (from the envelopes)")
+    axes.plot(milliseconds, 1e3 * wanted, color=INK, lw=1.0, ls=(0, (4, 2)), label="target")
+    axes.set(title=f"{device}, by {QUANTITIES.get(recording.header.unit, 'motion')}", xlabel="time (ms)")
+    beside = f"outside the bands {quantity(residual_velocity(recording), 'm/s')} rms"
+    axes.text(0.98, 0.02, beside, transform=axes.transAxes, ha="right", va="bottom", fontsize=8)
+    axes.set_ymargin(0.12)
+    axes.set_xlim(0, milliseconds[-1])
 
 
 def _bands(axes: Any, recordings: Mapping[str, Recording]) -> None:
-    """Error of every band's skin velocity on every device."""
-    width = 0.8 / len(recordings)
-    ticks: list[str] = []
+    """Draw the magnitude of the error of every band's skin velocity on every device, with its sign as text."""
+    width, ticks = 0.8 / len(recordings), []
     for i, (device, recording) in enumerate(recordings.items()):
         bands = felt_bands(recording)
-        ticks = [f"{band.frequency:.4g} Hz\n{1e3 * band.wanted:.3g} mm/s" for band in bands]
+        ticks = [f"{band.frequency:.4g} Hz, target {1e3 * band.wanted:.3g} mm/s" for band in bands]
         place = np.arange(len(bands)) + (i - (len(recordings) - 1) / 2) * width
         error = np.array([100 * band.error for band in bands])
-        axes.bar(place, error, 0.92 * width, color=COLOURS[i % len(COLOURS)], label=device, zorder=3)
-        for x, value in zip(place, error, strict=True):
-            axes.annotate(
-                f"{value:+.2f}", (x, value), xytext=(0, 3 if value >= 0 else -3), textcoords="offset points",
-                ha="center", va="bottom" if value >= 0 else "top", fontsize=8,
-            )  # fmt: skip
-    for sign in (-1, 1):
-        axes.axhline(sign * BOUND, color=INK, lw=1, ls=(0, (4, 2)))
-    axes.axhline(0.0, color=INK, lw=0.8)
+        size, colour = np.maximum(np.abs(error), FLOOR), COLOURS[i % len(COLOURS)]
+        axes.plot(place, size, MARKERS[i % len(MARKERS)], color=colour, ms=8, label=device)
+        for x, y, value in zip(place, size, error, strict=True):
+            axes.annotate(f"{value:+.2f} %", (x, y), xytext=(8, 0), textcoords="offset points", va="center", fontsize=8)
+    axes.axhline(BOUND, color=INK, lw=1, ls=(0, (4, 2)), label=f"{BOUND:g} %")
+    axes.set_yscale("log")
+    low, high = axes.get_ylim()
+    axes.set(ylim=(min(low, BOUND / 100) / 1.5, 1.5 * max(high, BOUND)), xlim=(-0.6, len(ticks) - 0.4))
+    axes.yaxis.set_major_formatter(lambda value, _: f"{value:g}")
+    axes.minorticks_off()
     axes.set_xticks(range(len(ticks)), ticks)
     axes.grid(axis="x", visible=False)
-    axes.set(ylim=(-1.35 * BOUND, 1.5 * BOUND), ylabel="error (%)")
-    axes.set_title("Skin velocity of each band against the wanted one; dashed: how far devices may differ")
-    axes.legend(loc="upper right", ncols=len(recordings), borderaxespad=0.1)
+    axes.set(ylabel="error (%)", title="Error of the skin velocity of each band")
+    legend(axes)

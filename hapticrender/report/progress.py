@@ -1,4 +1,4 @@
-"""A progress bar in few lines: one bar on a terminal, a line per scene elsewhere."""
+"""Show progress: one bar on a terminal, a line per scene elsewhere."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ _WIDTH = 30  # characters
 
 
 class Progress:
-    """Shows how far a list of scenes has come.
+    """Show how much of a list of scenes is done.
 
     Parameters
     ----------
@@ -40,7 +40,7 @@ class Progress:
 
     @contextmanager
     def scene(self, name: str) -> Iterator[Callable[[float, float], None]]:
-        """Hand out ``tick(done_seconds, total_seconds)`` for a scene, which counts as done unless it raises."""
+        """Yield ``tick(done_seconds, total_seconds)`` for a scene, which counts as done unless it raises."""
         tick = partial(self._show, name)
         tick(0.0, 1.0)
         try:

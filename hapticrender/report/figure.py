@@ -1,4 +1,4 @@
-"""What all pictures share: colours, style, a figure apart from pyplot, and how it is written."""
+"""Share among all pictures: colours, style, a figure apart from pyplot, its legend and its file."""
 
 from __future__ import annotations
 
@@ -12,8 +12,9 @@ import numpy as np
 
 from hapticrender.recordings.formats import MissingExtra, replacing
 
-# Okabe and Ito's colours: told apart by every kind of colour vision, and of different lightness.
+# Okabe and Ito's colours: distinct for every kind of colour vision, and of different lightness.
 BLUE, ORANGE, GREEN, RED, INK, PALE = "#0072B2", "#E69F00", "#009E73", "#D55E00", "#222222", "#8A8A8A"
+FORMATS = (".png", ".svg", ".pdf")
 STYLE: Any = {
     "font.size": 9,
     "axes.titlesize": 9.5,
@@ -35,7 +36,7 @@ STYLE: Any = {
 def new_figure(
     size: tuple[float, float], *, pads: tuple[float, float] | None = None, style: Mapping[str, Any] | None = None
 ) -> Iterator[Any]:
-    """Make a ``matplotlib.figure.Figure``, apart from pyplot and its global state, and draw into it in our style.
+    """Make a ``matplotlib.figure.Figure``, apart from pyplot and its global state, with the style of this package.
 
     Parameters
     ----------
@@ -66,7 +67,24 @@ def new_figure(
         yield figure
 
 
+def check_format(path: str | os.PathLike[str]) -> Path:
+    """Return `path` if its ending names a picture format; a ValueError lists the known ones."""
+    path = Path(path)
+    if path.suffix.lower() not in FORMATS:
+        raise ValueError(f"{path}: suffix {path.suffix!r} is no picture format: must be one of {', '.join(FORMATS)}")
+    return path
+
+
 def save(figure: Any, path: str | os.PathLike[str], dpi: int = 110) -> None:
-    """Write a figure into a PNG; an older file is replaced when the new one is whole."""
-    with np.errstate(all="ignore"), replacing(Path(path)) as scratch:
-        figure.savefig(scratch, dpi=dpi, format="png")
+    """Write a figure in the format of the ending of `path`; an older file is replaced when the new one is whole."""
+    path = check_format(path)
+    with np.errstate(all="ignore"), replacing(path) as scratch:
+        figure.savefig(scratch, dpi=dpi, format=path.suffix[1:].lower())
+
+
+def legend(axes: Any, *entries: Any, columns: int = 6) -> None:
+    """Put the legend above the panel, right of its title, where no curve runs."""
+    axes.legend(
+        *entries, loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=columns, borderaxespad=0.1, handlelength=1.6,
+        columnspacing=0.9,
+    )  # fmt: skip

@@ -1,1 +1,0 @@
-"""Pictures for people, and the data behind them."""

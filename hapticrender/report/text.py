@@ -1,0 +1,173 @@
+"""Verdicts, scenes and summaries as text, the same on the command line, in reports and on pages."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+from hapticrender.formatting import band_label, degrees, percent, quantity, short, table
+
+if TYPE_CHECKING:
+    from hapticrender.touch.scene import Scene
+
+PLACES = ("centre", "end_1", "end_2")
+MEASURED = {"friction": "friction", "skin": "skin velocity"}  # places that name a quantity, not a position
+
+
+def places_of(summary: Mapping[str, Any]) -> list[str]:
+    """Evaluation points that a summary has errors of."""
+    first = (summary["bands"] or [{}])[0]
+    return [key.removeprefix("rms_error_") for key in first if key.startswith("rms_error_")]
+
+
+def columns_of(summary: Mapping[str, Any]) -> tuple[str, ...]:
+    """Places whose errors stand in the columns of a table: the first one that the device has, and the ends."""
+    return ((places_of(summary) or PLACES)[0], *PLACES[1:])
+
+
+def titles(summaries: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Titles of those columns; the first is the place's own name where all devices agree on it."""
+    first = {columns_of(summary)[0].replace("_", " ") for summary in summaries}
+    return [first.pop() if len(first) == 1 else "at the finger", "end 1", "end 2"]
+
+
+def at(places: Sequence[str]) -> str:
+    """Say where errors are taken, or of which quantity.
+
+    Examples
+    --------
+    >>> at(["centre", "end_1", "end_2"]), at(["end_1"]), at(["skin"])
+    ('at centre and ends', 'at end 1', 'of skin velocity')
+    """
+    names = [place.replace("_", " ") for place in places]
+    if names and set(names) <= MEASURED.keys():
+        return f"of {' and '.join(MEASURED[name] for name in names)}"
+    ends = len(names) > 1
+    return "at " + " and ".join(dict.fromkeys("ends" if ends and name.startswith("end ") else name for name in names))
+
+
+def worst_at(bands: Sequence[Mapping[str, Any]], place: str) -> float | None:
+    """Find the largest abs(rms error) (1) of all bands at "centre", "end_1" or "end_2"; None without figures."""
+    errors = [band.get(f"rms_error_{place}") for band in bands]
+    known = [abs(error) for error in errors if error is not None and math.isfinite(error)]
+    return max(known, default=None)
+
+
+def total(bands: Sequence[Mapping[str, Any]], key: str) -> float | None:
+    """Combine `key` ("target" or "achieved", SI) of the judged bands: the root of the sum of squares."""
+    values = [band[key] for band in bands if band["target"] is not None and band["achieved"] is not None]
+    return math.hypot(*values) if values else None
+
+
+def verdict(summary: Mapping[str, Any]) -> str:
+    """Say in one sentence whether a run is within its tolerance, and by which figure.
+
+    Parameters
+    ----------
+    summary : mapping
+        What ``Recording.summary()`` returns.
+    """
+    if summary["verdict"] == "not judged":
+        return f"not judged: {summary['reason']}"
+    if summary["worst"]["value"] is None:
+        return f"misses its tolerance: {summary['reason']}"
+    start = "within its tolerance" if summary["passed"] else "misses its tolerance"
+    return f"{start}: worst figure {worst_figure(summary)}, tolerance {100 * summary['tolerance']:.4g} %"
+
+
+def brief(summary: Mapping[str, Any]) -> str:
+    """Say the verdict of a run in a table's cell: short where all is well."""
+    return f"within {100 * summary['tolerance']:.4g} %" if summary["passed"] else verdict(summary)
+
+
+def worst_figure(summary: Mapping[str, Any]) -> str:
+    """Say which figure decides the verdict: its name, band, place or quantity, and value."""
+    worst = summary["worst"]
+    place, figure = (str(worst[key]).replace("_", " ") for key in ("place", "figure"))
+    name, where = figure.removesuffix(f" {place}"), at([place])
+    band = f"the {worst['band']} band"
+    said = f"{where} in {band}" if place in MEASURED else f"of {band} {where}"
+    return f"{name} {said} = {percent(worst['value'])}"
+
+
+def amplitudes(summaries: Sequence[Mapping[str, Any]]) -> list[tuple[str, str]]:
+    """Target and achieved amplitude of every summary; one prefix for all that have the same unit."""
+    values = [tuple(total(summary["bands"], key) for key in ("target", "achieved")) for summary in summaries]
+    largest: dict[str, float] = {}
+    for summary, pair in zip(summaries, values, strict=True):
+        unit = summary["unit"]
+        largest[unit] = max(largest.get(unit, 0.0), pair[0] or 0.0)
+    written = [
+        [quantity(value, summary["unit"], like=largest[summary["unit"]]) for value in pair]
+        for summary, pair in zip(summaries, values, strict=True)
+    ]
+    return [(target, achieved) for target, achieved in written]
+
+
+def overview(summaries: Sequence[Mapping[str, Any]]) -> str:
+    """Tabulate scenes, a line each: amplitudes, the largest rms error at each place, the verdict."""
+    rows = [["scene", "target", "achieved", *titles(summaries), "verdict"]]
+    for summary, pair in zip(summaries, amplitudes(summaries), strict=True):
+        errors = [percent(worst_at(summary["bands"], place)) for place in columns_of(summary)]
+        rows.append([summary["scene"], *pair, *errors, brief(summary)])
+    return table(rows)
+
+
+def figures(summary: Mapping[str, Any]) -> str:
+    """Tabulate all figures of a run, a line a band, with notes and verdict."""
+    places, unit = places_of(summary), summary["unit"]
+    rows = [["band", "target", "achieved", *(place.replace("_", " ") for place in places), "phase", "settled"]]
+    for band in summary["bands"]:
+        errors = [percent(band[f"rms_error_{place}"]) for place in places]
+        sizes = [quantity(band[key], unit) for key in ("target", "achieved")]
+        settled = quantity(band["settling_time"], "s")
+        rows.append([band_label(band), *sizes, *errors, degrees(band["phase_error"]), settled])
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    lines = ["  ".join(cell.rjust(width) for cell, width in zip(row, widths, strict=True)) for row in rows]
+    wobble, residual = (quantity(summary[key], unit) for key in ("wobble", "residual_rms"))
+    saturated = percent(summary["saturated_share"])
+    lines.append(f"rms errors {at(places)}; wobble {wobble}, beside the bands {residual}, saturated {saturated}")
+    return "\n".join([*lines, *summary["notes"], f"{summary['scene']} {verdict(summary)}"])
+
+
+def conditions(summary: Mapping[str, Any]) -> str:
+    """Say in a line what was rendered, how, for how long, and which flags were set."""
+    return (
+        f"{summary['scene']} on {summary['device']}, method {summary['method']}, seed {summary['seed']}: "
+        f"{short(summary['duration'], 's')}, judged from {short(summary['judged_from'], 's')}, "
+        f"flagged samples: {flags(summary)}"
+    )
+
+
+def flags(summary: Mapping[str, Any]) -> str:
+    """Say in how many samples each status flag was set."""
+    return ", ".join(f"{name.lower()} {count}" for name, count in summary["flags"].items() if count) or "none"
+
+
+def describe(scene: Scene) -> str:
+    """Describe a scene in a few words: its texture, its finger, its length and its device."""
+    texture, motion = scene.texture, scene.finger.motion
+    sizes = [
+        short(size, unit)
+        for key, unit in (("amplitude", "m"), ("wavelength", "m"), ("frequency", "Hz"))
+        if (size := getattr(texture, key, None)) is not None
+    ]
+    count = _partials(texture)
+    what = f"{_kind(texture)} {' '.join(sizes)}{f', {count} partials' if count > 1 else ''}"
+    speed = getattr(motion, "speed", None)
+    finger = [f"{_kind(motion)} finger", *([] if speed is None else [short(speed, "m/s")])]
+    return f"{what}; {' '.join(finger)}; {short(scene.duration, 's')} on {scene.device}"
+
+
+def _partials(texture: Any) -> int:
+    """Count the partials that a texture has by its own parameters; 1 where it does not say."""
+    if partials := getattr(texture, "partials", None):
+        return len(partials)
+    return getattr(texture, "harmonics", 1) if getattr(texture, "shape", "sine") != "sine" else 1
+
+
+def _kind(thing: Any) -> str:
+    """Name the kind of a texture or a motion, or its class where it has no kind."""
+    kind = str(getattr(thing, "kind", type(thing).__name__))
+    return "no" if kind == "none" else kind
