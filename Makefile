@@ -1,7 +1,7 @@
 # Every verb works from a fresh clone: the environment is made, and made anew only when pyproject.toml changes.
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test lint bench picture clean
+.PHONY: help demo test test-oldest lint bench charts paper docs clean
 .DELETE_ON_ERROR:
 
 # The first interpreter that runs, is new enough and can make an environment; override with PYTHON=/path/to/python.
@@ -9,10 +9,17 @@ PROBE := import ensurepip, sys; sys.exit(sys.version_info < (3, 11))
 PYTHON = $(shell for candidate in python3 python3.13 python3.12 python3.11; do \
 	"$$candidate" -c '$(PROBE)' 2>/dev/null && { echo "$$candidate"; break; }; done)
 RUN := .venv/bin/python
+# numba's cache does not see an edit to a function called from another file: a folder for each state of the sources
+SOURCES = $(shell cat hapticrender/*.py hapticrender/control/*.py hapticrender/plants/*.py | cksum | cut -d ' ' -f 1)
+export NUMBA_CACHE_DIR ?= $(CURDIR)/.venv/numba/$(SOURCES)
 OUT := out/demo
+OLDEST = $(shell sed -n 's/^dependencies = \[\(.*\)\]/\1/p' pyproject.toml | tr -d '",' | sed 's/>=/==/g')
+OLDEST_TESTS := $(addprefix tests/test_,$(addsuffix .py,math kernel blocks plate contact low_pass realtime combined))
+API := hapticrender $(addprefix hapticrender.,loop sweep realtime skin validate protocols bands errors touch recordings \
+	control plants renderers drivers)
 
 help: ## list the verbs
-	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "make %-8s %s\n", $$1, $$2 }' Makefile
+	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "make %-12s %s\n", $$1, $$2 }' Makefile
 
 demo: .venv/demo.stamp ## render the built-in scenes on simulated devices into out/demo
 	@.venv/bin/hapticrender demo --out $(OUT)
@@ -20,27 +27,42 @@ demo: .venv/demo.stamp ## render the built-in scenes on simulated devices into o
 test: .venv/test.stamp ## run every test (PYTEST_ARGS="-m 'not slow'" leaves out the long ones)
 	@MPLBACKEND=Agg $(RUN) -m pytest $(PYTEST_ARGS)
 
+test-oldest: .venv-oldest/made.stamp ## run the kernels' tests on the oldest numba, numpy and scipy that pyproject.toml allows
+	@MPLBACKEND=Agg .venv-oldest/bin/python -m pytest $(wildcard $(OLDEST_TESTS)) $(PYTEST_ARGS)
+
 lint: .venv/test.stamp ## check style, formatting and types
 	@$(RUN) -m ruff check .
 	@$(RUN) -m ruff format --check .
 	@$(RUN) -m mypy
 
 bench: .venv/bench.stamp ## measure every figure of speed beside its target (BENCH_ARGS="--short" as CI does)
-	@$(RUN) benchmarks/run.py $(BENCH_ARGS)
+	@$(RUN) -m benchmarks.run $(BENCH_ARGS)
 
-picture: .venv/demo.stamp ## draw the pictures in README.md anew
-	@.venv/bin/hapticrender chart story --out out/chart
-	@.venv/bin/hapticrender chart pareto --out out/chart
-	@cp out/chart/story.png docs/picture.png
-	@cp out/chart/pareto.png docs/pareto.png
+charts: .venv/bench.stamp ## draw every chart and every picture in docs/ (CHARTS_ARGS="pareto" draws one)
+	@$(RUN) -m benchmarks.charts $(CHARTS_ARGS)
+
+paper: .venv/demo.stamp ## recompute the figures of Grigorii et al. 2021 into out/paper
+	@$(RUN) -m examples.grigorii2021 --out out/paper
+
+# A warning fails, but for those about types that pdoc looks up in the wrong module (named tuples, inherited fields).
+docs: .venv/docs.stamp ## build the API reference from the docstrings into out/api
+	@$(RUN) -W error::UserWarning -W "ignore:Error parsing type annotation" -m pdoc -d numpy -o out/api $(API)
+	@echo "API reference: out/api/index.html"
 
 clean: ## remove the environment and everything that was built or written
-	@rm -rf .venv build dist out *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	@rm -rf .venv .venv-oldest build dist out *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis
 	@find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
 .venv/made.stamp:
 	@test -n "$(PYTHON)" || { echo "hapticrender needs Python >= 3.11 with the venv module; none of python3, python3.13, python3.12, python3.11 is one" >&2; exit 1; }
 	@"$(PYTHON)" -m venv .venv
+	@touch $@
+
+# Not installed itself: tests import the checkout.  The oldest Python has wheels of the oldest packages.
+.venv-oldest/made.stamp: pyproject.toml
+	@echo "installing $(OLDEST) into .venv-oldest"
+	@"$$(command -v python3.11 || echo "$(PYTHON)")" -m venv .venv-oldest
+	@.venv-oldest/bin/python -m pip install --quiet --disable-pip-version-check $(OLDEST) pytest pytest-timeout hypothesis
 	@touch $@
 
 .venv/demo.stamp: .venv/made.stamp pyproject.toml
@@ -56,4 +78,9 @@ clean: ## remove the environment and everything that was built or written
 .venv/bench.stamp: .venv/test.stamp
 	@echo "installing what the benchmarks compare with into .venv"
 	@$(RUN) -m pip install --quiet --disable-pip-version-check --editable '.[all,test,bench]'
+	@touch $@
+
+.venv/docs.stamp: .venv/demo.stamp
+	@echo "installing pdoc into .venv"
+	@$(RUN) -m pip install --quiet --disable-pip-version-check --editable '.[all,docs]'
 	@touch $@

@@ -1,4 +1,4 @@
-"""What others offer for a part of the work; where a package is not installed its case is left out."""
+"""A lock-in on scipy's filters, the reference of demodulation."""
 
 import numpy as np
 from scipy.signal import butter, sosfilt
@@ -6,14 +6,10 @@ from scipy.signal import butter, sosfilt
 BLOCK = 64  # samples
 
 
-class Absent(RuntimeError):
-    """A peer is not installed."""
-
-
 class ScipyLockIn:
     """Heterodyne and `scipy.signal.sosfilt`, all bands and channels at once, states carried from block to block.
 
-    At its best: a block's carriers are a table made beforehand, turned by where the block starts.
+    At its best: a block's carriers are a table made beforehand, turned by the phase at which the block starts.
     """
 
     def __init__(self, frequency, bandwidth, rate, channels):
@@ -31,45 +27,3 @@ class ScipyLockIn:
         np.multiply(signal[:, :, None], carrier[:, None], out=self.turned)
         found, self.state = sosfilt(self.sections, self.turned, axis=0, zi=self.state)
         return found
-
-
-class SlidingDFT:
-    """The `sdft` package: as many bins as bands, a transform a channel, with its cheapest window."""
-
-    def __init__(self, bands, channels):
-        try:
-            from sdft import SDFT
-        except ImportError as error:
-            raise Absent("the package sdft is not installed: pip install 'hapticrender[bench]'") from error
-        self.each = [SDFT(bands, window="boxcar") for _ in range(channels)]
-
-    def run(self, signal):
-        """Bins (n, bands) of every channel of a block (n, channels)."""
-        return [one.sdft(signal[:, c]) for c, one in enumerate(self.each)]
-
-
-class PythonControl:
-    """Open loop of the free plate in python-control, currents held: not even a controller, and no finger."""
-
-    def __init__(self, parameters):
-        try:
-            import control
-        except ImportError as error:
-            raise Absent("the package control is not installed: pip install 'hapticrender[bench]'") from error
-        self.control, self.rate = control, parameters.rate
-        inverse = np.linalg.inv(parameters.mass_matrix)
-        zero, one = np.zeros((2, 2)), np.eye(2)
-        a = np.block([[zero, one], [-inverse @ parameters.stiffness_matrix, -inverse @ parameters.damping_matrix]])
-        b = np.vstack([zero, inverse @ parameters.force_from_drive])
-        self.system = control.ss(a, b, np.hstack([one, zero]), zero).sample(1 / parameters.rate)
-
-    def forced(self, current):
-        """Displacements (samples, 2) under `current`, by `forced_response`."""
-        return self.control.forced_response(self.system, self._time(current), current.T).outputs.T
-
-    def stepped(self, current):
-        """The same by `input_output_response`, which takes nonlinear systems as well."""
-        return self.control.input_output_response(self.system, self._time(current), current.T).outputs.T
-
-    def _time(self, current):
-        return np.arange(len(current)) / self.rate

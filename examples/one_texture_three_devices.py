@@ -6,7 +6,7 @@ The figure is the largest error of the predicted skin velocity (1) over all band
 import sys
 
 import hapticrender as hr
-from hapticrender.charts.skin_picture import plot_devices
+from hapticrender.report.devices_picture import plot_devices
 from hapticrender.skin import felt_bands
 
 DEVICES = ("vt-plate", "electroadhesion", "ultrasonic")

@@ -12,7 +12,7 @@ import numpy as np
 
 import hapticrender as hr
 from hapticrender.control.methods import METHODS
-from hapticrender.plants.vibrotactile import Plate, PlateParameters
+from hapticrender.plants.plate import Plate, PlateParameters
 from hapticrender.realtime import RealtimeEntry
 
 RATE, BLOCK = 48_000.0, 64  # Hz, samples

@@ -20,11 +20,11 @@ def main() -> float:
         finger=hr.Finger.sliding(speed=0.08, normal_load=0.4, touches=TOUCHES, mechanics="light"),
         device="ultrasonic",
         duration=3.0,
-        plant={"temperature_rise": 10.0, "temperature_time": 2.5},  # K, s
+        simulation={"temperature_rise": 10.0, "temperature_time": 2.5},  # K, s
     )
-    session = prepare(scene)
-    recording = run(session)
-    shift = session.driver.plant.loop.state.shift[0]
+    rendering = prepare(scene)
+    recording = run(rendering)
+    shift = rendering.plant.loop.state["shift"][0]
     (band,) = recording.summary()["bands"]
     unlocked = np.count_nonzero(recording.flags & Flag.UNLOCKED) / recording.rate
     print(f"wanted {1e3 * band['target']:.2f} mN of friction, made {1e3 * band['achieved']:.2f} mN")

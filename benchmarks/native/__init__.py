@@ -11,21 +11,28 @@ from pathlib import Path
 
 import numpy as np
 
-from hapticrender.compiled import polynomials as _polynomials
-from hapticrender.compiled.lanes import WIDTH, aligned
-from hapticrender.control.bank import rows as row
-from hapticrender.control.bank.observer import FORGET
-from hapticrender.control.blocks import state as block_state
+from benchmarks.timing import Absent
+from hapticrender.control.kernel import FORGET
+from hapticrender.control.records import W, aligned
+from hapticrender.control.sums import INVERSE, SAMPLE_ROWS
+from hapticrender.mathx import COS, SIN
 
 HERE = Path(__file__).parent
 FLAGS = ["-O3", "-march=native", "-ffp-contract=fast", "-fno-math-errno", "-fno-trapping-math", "-fPIC", "-shared"]
 WIDE = "-mprefer-vector-width=512"  # gcc and clang for x86 only
-NAMES = {np.float64: "double", np.float32: "single"}
 DOUBLES = ctypes.POINTER(ctypes.c_double)
-
-
-class NoCompiler(RuntimeError):
-    """The machine has no C compiler."""
+GROUP = 16  # samples, whose sums over the lanes fill a register
+PAIRS = GROUP // 2  # of samples in a group, at +-0.5, 1.5, 2.5 ... samples about its middle
+ROWS = {  # of the arrays that block.c works on: (tiles, rows, 8 lanes)
+    "BAND": "LIVE COS SIN RAMP WEIGHT SHARE WANTED_RE WANTED_IM R_RE R_IM DR_RE DR_IM SEEN_RE SEEN_IM",
+    "LOOP": "E_RE E_IM V_RE V_IM FAST_RE FAST_IM SLOW_RE SLOW_IM COMMAND_RE COMMAND_IM SLOPED_RE SLOPED_IM",
+    "CHANNEL": "NOW_RE NOW_IM FROM_RE FROM_IM STEP_RE STEP_IM",
+    "PHASE": "TURNS TURNED TO_MIDDLE",
+}
+AT = {name: i for names in ROWS.values() for i, name in enumerate(names.split())}
+AT |= {f"{array}_ROWS": len(names.split()) for array, names in ROWS.items()}
+AT |= {"GROUP": GROUP, "PAIRS": PAIRS, "TURN_COS": 4 * PAIRS, "TURN_SIN": 4 * PAIRS + 1, "TABLE_ROWS": 4 * PAIRS + 2}
+AT |= {"HELD_ROWS": 4 + 2 * AT["CHANNEL_ROWS"], "FIRST_LAW": 0, "LAW_ROWS": 4, "LAW_TILE_ROWS": 16}
 
 
 def compiler() -> str:
@@ -33,7 +40,7 @@ def compiler() -> str:
     for name in (os.environ.get("CC", ""), "cc", "gcc", "clang"):
         if name and shutil.which(name):
             return name
-    raise NoCompiler("no C compiler: none of $CC, cc, gcc, clang is there")
+    raise Absent("no C compiler: none of $CC, cc, gcc, clang is there")
 
 
 @cache
@@ -57,134 +64,74 @@ def library(source: str, *options: str) -> ctypes.CDLL:
     return ctypes.CDLL(str(built))
 
 
-def _coefficients() -> list[str]:
-    names = [name + short for short in ("", "_SHORT") for name in ("S", "C", "A", "R", "W")]
-    return [f"-DPOLY_{name}={','.join(map(repr, getattr(_polynomials, name)))}" for name in names]
-
-
 def _pointer(array: np.ndarray) -> DOUBLES:
     return array.ctypes.data_as(DOUBLES)
 
 
-def in_delta(section: tuple[float, ...]) -> np.ndarray:
-    """Second-order section in powers of z - 1."""
-    b0, b1, b2, a1, a2 = section
-    return np.array([b0, 2 * b0 + b1, b0 + b1 + b2, 2 + a1, 1 + a1 + a2])
-
-
 class NaivePolar:
-    """`naive.c` with the parameters of a polar controller on two coordinates, fixed carriers and constant targets."""
+    """`naive.c` with the numbers of a `NumpyPolar`."""
 
     band = np.dtype(
         [(name, float) for name in ("frequency", "turns", "amplitude", "re", "im")] + [("channel", float, (2, 9))]
     )
 
-    def __init__(self, controller):
-        tables = controller.tables
-        self.numbers, count = tables.numbers, tables.tone.shape[1]
-        self.bands = np.zeros(count, self.band)
-        frequency, _, phase, re, im = tables.tone
-        self.bands["frequency"], self.bands["turns"] = frequency, np.mod(phase, 1.0)
-        self.bands["amplitude"] = np.hypot(re, im)
-        self.bands["re"], self.bands["im"] = re / np.hypot(re, im), im / np.hypot(re, im)
-        self.bands["channel"][:, :, 0] = drive_per_metre(tables).T
-        self.run_c = library("naive.c").naive_run
+    def __init__(self, twin):
+        self.bands = np.zeros(len(twin.frequency), self.band)
+        for name, values in zip(self.band.names, (twin.frequency, np.mod(twin.turns, 1.0), twin.wanted, twin.unit.real,
+                                                  twin.unit.imag), strict=False):  # fmt: skip
+            self.bands[name] = values
+        self.bands["channel"][:, :, 0] = (1.0 / twin.gain).T
+        self.rate, self.sections = twin.rate, [np.array([*b, *a[1:]]) for b, a in (twin.filter, twin.law)]
+        self.listen, self.run_c = twin.listen, library("naive.c").naive_run
 
-    def run(self, sides):
-        """Drive (samples, 2) from the watched displacements (samples, 2), before any limit."""
+    def run(self, sensed):
+        """Drive (samples, 2) from sensed displacements (samples, 2), before any limit."""
+        sides = np.ascontiguousarray(sensed @ self.listen.T)
         drive = np.zeros_like(sides)
-        self.run_c(
-            self.bands.ctypes.data_as(ctypes.c_void_p),
-            len(self.bands),
-            ctypes.c_double(self.numbers.rate),
-            _pointer(np.array(self.numbers.filter)),
-            _pointer(np.array(self.numbers.law)),
-            _pointer(sides),
-            _pointer(drive),
-            len(sides),
-        )
-        return drive
-
-
-class TunedPolar:
-    """`polar.c`, of double or single precision."""
-
-    def __init__(self, controller, dtype):
-        tables, width = controller.tables, WIDTH[np.dtype(dtype)]
-        self.numbers, count = tables.numbers, tables.tone.shape[1]
-        self.tiles = -(-count // width)
-        fields = [("frequency", float, width), ("turns", float, width)]
-        fields += [(name, dtype, width) for name in ("amplitude", "re", "im")] + [("channel", dtype, (2, 9, width))]
-        kind = np.dtype(fields)
-        self.memory = aligned((self.tiles * kind.itemsize // 8,))
-        self.state = self.memory.view(kind)
-        frequency, _, phase, re, im = tables.tone
-        amplitude = np.hypot(re, im)
-        gains = drive_per_metre(tables)
-        rows = {"frequency": frequency, "turns": np.mod(phase, 1.0), "amplitude": amplitude}
-        rows |= {"re": re / amplitude, "im": im / amplitude}
-        for name, values in rows.items():
-            self.state[name] = np.pad(values, (0, self.tiles * width - count)).reshape(self.tiles, width)
-        for c in range(2):
-            padded = np.pad(gains[c], (0, self.tiles * width - count)).reshape(self.tiles, width)
-            self.state["channel"][:, c, 0] = padded
-        options = [*_coefficients(), *(["-DSINGLE"] if dtype == np.float32 else [])]
-        self.run_c = getattr(library("polar.c", *options), f"polar_{NAMES[dtype]}")
-        self.filter, self.law = in_delta(self.numbers.filter), in_delta(self.numbers.law)
-
-    def run(self, sides):
-        """Drive (samples, 2) from the watched displacements (samples, 2), before any limit."""
-        drive = np.zeros_like(sides)
-        self.run_c(
-            self.memory.ctypes.data_as(ctypes.c_void_p),
-            self.tiles,
-            ctypes.c_double(self.numbers.rate),
-            _pointer(self.filter),
-            _pointer(self.law),
-            _pointer(sides),
-            _pointer(drive),
-            len(sides),
-        )
+        self.run_c(self.bands.ctypes.data_as(ctypes.c_void_p), len(self.bands), ctypes.c_double(self.rate),
+                   *map(_pointer, self.sections), _pointer(sides), _pointer(drive), len(sides))  # fmt: skip
         return drive
 
 
 class TunedBlock:
-    """`block.c` on a copy of what a `BlockController` holds, from its state of the moment on."""
+    """`block.c` on a copy of what a controller in blocks holds, from its present state on.
+
+    The only place of the benchmarks that reads the internals of a controller: C has to start from the same numbers.
+    """
 
     names = ("rate", "block_rate", "g", "dc", "dc_drift", "lead", "integral", "back", "forget", "ramp", "fast_pole")
     names += ("slow_pole", "fast_level", "slow_level", "limit", "sensed_limit", "step")
 
     def __init__(self, controller):
-        tables, state = controller.tables, controller.state
-        numbers, sample, block, group = tables.bank.numbers, tables.sample, len(state.place), block_state.GROUP
-        if block % group or sample.drive_step <= 0.0 or len(tables.bank.shape) != 2 or len(tables.bank.speak) != 2:
-            raise ValueError(f"{block=}: must be a multiple of {group}, on two coordinates and two stepped channels")
-        self.arrays = [
-            same(each) for each in (state.bank.band, state.bank.loop, state.bank.law, state.held, state.phase)
-        ]
-        self.arrays += [same(state.table), state.inverse[0].copy(), state.bank.level.copy()]
-        values = {
-            **{name: getattr(sample, name) for name in ("rate", "dc", "dc_drift", "lead", "sensed_limit")},
-            **{name: getattr(numbers, name) for name in ("fast_pole", "slow_pole", "integral", "ramp")},
-            **{name: max(min(getattr(numbers, name), 1e30), -1e30) for name in ("fast_level", "slow_level")},
-            "block_rate": numbers.rate,
-            "g": float(state.gain[0]),
+        p, state, tiles = controller.settings, controller.state[0], controller.tiles
+        self.tiles, self.block = len(tiles), controller.block
+        if self.block % GROUP or (p["coordinates"], p["channels"], p["sensors"]) != (2, 2, 2) or p["drive_step"] <= 0:
+            raise ValueError(f"block={self.block}: must be a multiple of {GROUP}, on two stepped channels")
+        if max(state["fast_open"], state["slow_open"]) > 0.0 or not (tiles["wavenumber"] == 0.0).all():
+            raise ValueError("carriers must be fixed, and the controller in quiet")
+        speak, q = p["drive_from_force"][:2], samples_of(controller)[INVERSE]
+        levels = np.array([*state["dc"], *state["dc_drift"]])
+        self.arrays = [_bands(tiles), _loops(tiles), _laws(tiles), _held(tiles, speak)]
+        self.arrays += [_phases(tiles, p["rate"], self.block)]
+        self.arrays += [_tables(tiles, p["rate"], self.block), np.concatenate([np.zeros(self.block), q]), levels]
+        values = {name: float(p[name]) for name in self.names if name in p.dtype.names}
+        values |= {
+            "block_rate": p["rate"] / self.block,
+            "g": state["response_gain"],
+            "lead": p["extrapolation"],
             "back": 0.0,
             "forget": FORGET,
-            "limit": sample.drive_limit,
-            "step": sample.drive_step,
+            "ramp": p["fade_in"] * self.block,
+            "limit": p["drive_limit"],
+            "sensed_limit": p["sensor_limit"],
+            "step": p["drive_step"],
         }
-        rest = [tables.bank.listen.ravel(), tables.bank.speak.ravel(), tables.bank.shape, np.zeros(4)]
-        self.numbers = np.concatenate([[values[name] for name in self.names], *rest]).astype(float)
-        self.tiles, self.block = len(state.bank.band), block
-        rows = {name: getattr(row, name) for name in dir(row) if name.isupper()}
-        rows |= {name: getattr(block_state, name) for name in dir(block_state) if name.isupper()}
-        rows |= {"TABLE_ROWS": state.table.shape[1], "HELD_ROWS": state.held.shape[1]}
-        rows["LAW_TILE_ROWS"] = state.bank.law.shape[1]
-        dtype = state.table.dtype.type
-        options = [f"-DR_{name}={value}" for name, value in sorted(rows.items()) if isinstance(value, int)]
-        options += [*_coefficients(), *(["-DSINGLE"] if dtype == np.float32 else [])]
-        self.run_c = getattr(library("block.c", *options), f"block_{NAMES[dtype]}")
+        rest = [p["coordinate_from_sensor"][:, :2], speak, p["shape"], state["shaper"][:, :2]]
+        numbers = [[values[name] for name in self.names], *(each.ravel() for each in rest)]
+        self.numbers = np.concatenate(numbers).astype(float)
+        options = [f"-DR_{name}={value}" for name, value in sorted(AT.items())]
+        options += [f"-DPOLY_{name}={','.join(map(repr, each))}" for name, each in (("S", SIN), ("C", COS))]
+        self.run_c = library("block.c", *options).block_run
 
     def run(self, sensed):
         """Drive (samples, 2) from whole blocks of the sensors (samples, 2)."""
@@ -201,14 +148,71 @@ class TunedBlock:
         return drive
 
 
-def same(array):
-    """Copy of an array of vectors, aligned like it."""
-    copy = aligned(array.shape, array.dtype)
-    copy[:] = array
-    return copy
+def _rows(count, rows, **fields):
+    """Array (count, rows, 8 lanes) with some of its rows set."""
+    found = aligned((count, rows, W))
+    for name, values in fields.items():
+        found[:, AT[name.upper()]] = values
+    return found
 
 
-def drive_per_metre(tables):
-    """Of every coordinate and band, from the look-up table, shape (coordinates, bands)."""
-    at = tables.tone[0] / tables.numbers.table_step
-    return 1.0 / np.array([np.interp(at, np.arange(each.size), each) for each in tables.gain])
+def samples_of(controller):
+    """The controller's work array of a block's samples, shape (rows, block)."""
+    address = int(controller.state["samples_at"][0])
+    memory = (ctypes.c_double * (SAMPLE_ROWS * controller.block)).from_address(address)
+    return np.array(memory).reshape(SAMPLE_ROWS, controller.block)
+
+
+def _bands(tiles):
+    same = {name: tiles[name] for name in ("live", "weight", "share", "r_re", "r_im")}
+    wanted = {"ramp": tiles["fade"], "wanted_re": tiles["set_re"], "wanted_im": tiles["set_im"]}
+    return _rows(len(tiles), AT["BAND_ROWS"], **same, **wanted)
+
+
+def _loops(tiles):
+    """Loops of both coordinates of each tile in turn."""
+    names = [f"{name}_{part}" for name in ("e", "v", "fast", "slow") for part in ("re", "im")]
+    each = [
+        _rows(len(tiles), AT["LOOP_ROWS"], **{name: tiles[name.replace("_", f"{i}_")] for name in names})
+        for i in (0, 1)
+    ]
+    found = aligned((len(tiles), 2, AT["LOOP_ROWS"], W))
+    found[:, 0], found[:, 1] = each
+    return found
+
+
+def _laws(tiles):
+    """D and D' of each pair of coordinates."""
+    found = aligned((len(tiles), 16, W))
+    names = (f"{name}{i}{j}_{part}" for i in (0, 1) for j in (0, 1) for name in "ds" for part in ("re", "im"))
+    for row, name in enumerate(names):
+        found[:, row] = tiles[name]
+    return found
+
+
+def _held(tiles, speak):
+    """Envelopes of the drive at the end of the last block, two rows for each coordinate before them."""
+    found = aligned((len(tiles), AT["HELD_ROWS"], W))
+    for channel in (0, 1):
+        for part in ("re", "im"):
+            row = 4 + AT["CHANNEL_ROWS"] * channel + AT[f"NOW_{part.upper()}"]
+            found[:, row] = speak[channel, 0] * tiles[f"now0_{part}"] + speak[channel, 1] * tiles[f"now1_{part}"]
+    return found
+
+
+def _phases(tiles, rate, block):
+    """Turns at the block's start, turns a block, and turns to the middle of the first group."""
+    turn = tiles["frequency"] / rate
+    values = {"turns": tiles["turns"] + tiles["phase"], "turned": block * turn, "to_middle": (PAIRS - 0.5) * turn}
+    return _rows(len(tiles), AT["PHASE_ROWS"], **{name: np.mod(each, 1.0) for name, each in values.items()})
+
+
+def _tables(tiles, rate, block):
+    """Carriers of each pair of a group about its middle, the same times their distance, and the turn of a group."""
+    found, angle = aligned((len(tiles), AT["TABLE_ROWS"], W)), 2 * np.pi * tiles["frequency"] / rate
+    for i in range(PAIRS):
+        cos, sin = np.cos((i + 0.5) * angle), np.sin((i + 0.5) * angle)
+        for row, values in enumerate((cos, sin, (i + 0.5) / block * cos, (i + 0.5) / block * sin)):
+            found[:, 4 * i + row] = values
+    found[:, AT["TURN_COS"]], found[:, AT["TURN_SIN"]] = np.cos(GROUP * angle), np.sin(GROUP * angle)
+    return found

@@ -1,26 +1,13 @@
-/* The default method in blocks, tuned by hand: the same arithmetic on the library's own arrays, for carriers that stay,
- * two coordinates, two channels, and a controller in quiet that no finger touches.  The rows R_* are the library's own
- * (-D); -DSINGLE keeps what a band owns in float. */
+/* The default method in blocks, tuned by hand: the same arithmetic on arrays of its own, for fixed carriers,
+ * two coordinates, two channels, and a controller in quiet that no finger touches.  The rows R_* come
+ * from native/__init__.py (-D). */
 #include <math.h>
 
-#ifdef SINGLE
-typedef float real;
-#define W 16
-#define NAME block_single
-typedef int mask_element;
-#else
-typedef double real;
+typedef double v __attribute__((vector_size(64)));
+typedef double v_anywhere __attribute__((vector_size(64), aligned(8)));
+typedef long mask __attribute__((vector_size(64)));
 #define W 8
-#define NAME block_double
-typedef long mask_element;
-#endif
-typedef real v __attribute__((vector_size(64)));
-typedef double v8 __attribute__((vector_size(64)));
-typedef mask_element mask __attribute__((vector_size(64)));
-typedef long mask8 __attribute__((vector_size(64)));
-typedef double v8_anywhere __attribute__((vector_size(64), aligned(8)));
 #define MOST 64 /* samples of a block */
-#define PART (W / 8)
 #define MIN(a, b) ((a) < (b) ? (a) : (b))
 
 typedef struct {
@@ -32,59 +19,56 @@ typedef struct {
 static const double S[] = {POLY_S}, C[] = {POLY_C};
 
 static inline v pick(mask m, v a, v b) { return (v)(((mask)a & m) | ((mask)b & ~m)); }
-static inline v least(v a, real b) { return pick(a < b, a, b - (v){}); }
-static inline v most(v a, real b) { return pick(a > b, a, b - (v){}); }
+static inline v least(v a, double b) { return pick(a < b, a, b - (v){}); }
+static inline v most(v a, double b) { return pick(a > b, a, b - (v){}); }
 
 static inline double total(v a) {
-    real sum = 0;
+    double sum = 0;
     for (int i = 0; i < W; i++) sum += a[i];
     return sum;
 }
 
-static inline void unit(v8 turns, v8 *cosine, v8 *sine) {
-    v8 x;
+static inline void unit(v turns, v *cosine, v *sine) {
+    v x;
     for (int i = 0; i < 8; i++) x[i] = turns[i] - __builtin_rint(turns[i]);
-    mask8 up = x > 0.25, down = x < -0.25, far = up | down;
-    v8 y = (v8)(((mask8)(0.5 - x) & up) | ((mask8)(-0.5 - x) & down) | ((mask8)x & ~far));
-    v8 u = y * y, u2 = u * u;
-    v8 s = (S[0] + S[1] * u) + (S[2] + S[3] * u) * u2 + ((S[4] + S[5] * u) + (S[6] + S[7] * u) * u2) * (u2 * u2);
-    v8 c = (C[0] + C[1] * u) + (C[2] + C[3] * u) * u2 + ((C[4] + C[5] * u) + (C[6] + C[7] * u) * u2) * (u2 * u2);
-    *cosine = (v8)(((mask8)-c & far) | ((mask8)c & ~far));
+    mask up = x > 0.25, down = x < -0.25, far = up | down;
+    v y = (v)(((mask)(0.5 - x) & up) | ((mask)(-0.5 - x) & down) | ((mask)x & ~far));
+    v u = y * y, u2 = u * u;
+    v s = (S[0] + S[1] * u) + (S[2] + S[3] * u) * u2 + ((S[4] + S[5] * u) + (S[6] + S[7] * u) * u2) * (u2 * u2);
+    v c = (C[0] + C[1] * u) + (C[2] + C[3] * u) * u2 + ((C[4] + C[5] * u) + (C[6] + C[7] * u) * u2) * (u2 * u2);
+    *cosine = (v)(((mask)-c & far) | ((mask)c & ~far));
     *sine = s * y;
 }
 
 #define TURN(re, im) { v turned = re * turn - im * on; im = re * on + im * turn; re = turned; }
 
-void NAME(v *bands, v *loops, v *laws, v *helds, v8 *phases, const v *tables, const double *inverse, double *level,
+void block_run(v *bands, v *loops, v *laws, v *helds, v *phases, const v *tables, const double *inverse, double *level,
           Numbers *n, int tiles, int block, const double *sensed, double *drive, int blocks) {
     const double period = 1 / n->block_rate;
     for (int b = 0; b < blocks; b++, sensed += 2 * block, drive += 2 * block) {
         double raw[2][MOST], error[2][MOST];
-        real folded[2][MOST];
+        double folded[2][MOST];
         v sum[MOST][2], heard_fast = {}, heard_slow = {};
         for (int t = 0; t < tiles; t++) { /* carriers, targets, and what is expected of the block */
             v *band = bands + R_BAND_ROWS * t, *held = helds + R_HELD_ROWS * t;
             const v *loop = loops + 2 * R_LOOP_ROWS * t;
-            for (int part = 0; part < PART; part++) {
-                v8 *phase = phases + R_PHASE_ROWS * (PART * t + part), cosine, sine;
-                unit(phase[R_TURNS] + phase[R_TO_MIDDLE], &cosine, &sine);
-                for (int i = 0; i < 8; i++) {
-                    band[R_COS][8 * part + i] = cosine[i], band[R_SIN][8 * part + i] = sine[i];
-                    double turns = phase[R_TURNS][i] + phase[R_TURNED][i];
-                    phase[R_TURNS][i] = turns - __builtin_floor(turns);
-                }
+            v *phase = phases + R_PHASE_ROWS * t;
+            unit(phase[R_TURNS] + phase[R_TO_MIDDLE], &band[R_COS], &band[R_SIN]);
+            for (int i = 0; i < W; i++) {
+                double turns = phase[R_TURNS][i] + phase[R_TURNED][i];
+                phase[R_TURNS][i] = turns - __builtin_floor(turns);
             }
             v live = band[R_LIVE], c = live * band[R_COS], s = live * band[R_SIN];
-            v ramp = least(band[R_RAMP] + (real)n->ramp, 1), weight = live * ramp * ramp * (3 - 2 * ramp);
+            v ramp = least(band[R_RAMP] + n->ramp, 1), weight = live * ramp * ramp * (3 - 2 * ramp);
             v re = weight * band[R_WANTED_RE], im = weight * band[R_WANTED_IM];
             band[R_COS] = c, band[R_SIN] = s, band[R_RAMP] = ramp, band[R_WEIGHT] = weight, band[R_SHARE] = live;
-            band[R_DR_RE] = (real)n->block_rate * (re - band[R_R_RE]);
-            band[R_DR_IM] = (real)n->block_rate * (im - band[R_R_IM]);
-            band[R_SEEN_RE] = (real)0.5 * (re + band[R_R_RE]), band[R_SEEN_IM] = (real)0.5 * (im + band[R_R_IM]);
+            band[R_DR_RE] = n->block_rate * (re - band[R_R_RE]);
+            band[R_DR_IM] = n->block_rate * (im - band[R_R_IM]);
+            band[R_SEEN_RE] = 0.5 * (re + band[R_R_RE]), band[R_SEEN_IM] = 0.5 * (im + band[R_R_IM]);
             band[R_R_RE] = re, band[R_R_IM] = im;
             for (int i = 0; i < 2; i++, loop += R_LOOP_ROWS) {
-                v a = (real)n->shape[i] * band[R_SEEN_RE] + loop[R_E_RE];
-                v z = (real)n->shape[i] * band[R_SEEN_IM] + loop[R_E_IM];
+                v a = n->shape[i] * band[R_SEEN_RE] + loop[R_E_RE];
+                v z = n->shape[i] * band[R_SEEN_IM] + loop[R_E_IM];
                 held[2 * i] = a * c - z * s, held[2 * i + 1] = a * s + z * c;
             }
         }
@@ -95,7 +79,7 @@ void NAME(v *bands, v *loops, v *laws, v *helds, v8 *phases, const v *tables, co
             for (int k = 0; k < 2; k++) {
                 int t = MIN(pair + k, tiles - 1);
                 const v *held = helds + R_HELD_ROWS * t;
-                real counts = pair + k < tiles;
+                double counts = pair + k < tiles;
                 table[k] = tables + R_TABLE_ROWS * t;
                 re[k] = counts * held[0], im[k] = counts * held[1], at[k] = counts * held[2], up[k] = counts * held[3];
             }
@@ -127,10 +111,10 @@ void NAME(v *bands, v *loops, v *laws, v *helds, v8 *phases, const v *tables, co
                     raw[c][early] -= even - odd, raw[c][late] -= even + odd;
                 }
             for (int m = 0; m < block; m += 8) {
-                v8 found[4] = {};
+                v found[4] = {};
                 for (int j = 0; j < m + 8; j += 4)
-                    for (int i = 0; i < 4; i++) found[i] += raw[c][j + i] * *(v8_anywhere *)(inverse + block + m - j - i);
-                *(v8_anywhere *)(error[c] + m) = (found[0] + found[1]) + (found[2] + found[3]);
+                    for (int i = 0; i < 4; i++) found[i] += raw[c][j + i] * *(v_anywhere *)(inverse + block + m - j - i);
+                *(v_anywhere *)(error[c] + m) = (found[0] + found[1]) + (found[2] + found[3]);
             }
             double gained = 0, steeper = 0;
             for (int m = 0; m < block; m++) {
@@ -161,25 +145,25 @@ void NAME(v *bands, v *loops, v *laws, v *helds, v8 *phases, const v *tables, co
                 TURN(a[2], a[3])
                 a[0] += even[0], a[1] -= odd[0], a[2] += even[1], a[3] -= odd[1];
             }
-            v share = band[R_SHARE], fading = (real)n->forget * (1 - share);
+            v share = band[R_SHARE], fading = n->forget * (1 - share);
             for (int c = 0; c < 2; c++) {
                 v *own = loop + R_LOOP_ROWS * c, fast2 = {}, slow2 = {};
                 v found[2] = {a[2 * c] * cosine + a[2 * c + 1] * sine, a[2 * c + 1] * cosine - a[2 * c] * sine};
                 for (int r = 0; r < 2; r++) {
-                    v e = own[R_E_RE + r], x = own[R_V_RE + r], wanted = (real)n->shape[c] * band[R_R_RE + r];
-                    v heard = e - x + (real)(2.0 / block) * found[r];
-                    e = (1 - (real)period * fading) * e + share * (real)n->g * found[r];
-                    v slope = -(real)n->integral * e - (real)n->back * (x + wanted) - fading * x;
-                    v steeper = (real)n->shape[c] * band[R_DR_RE + r];
-                    x += (real)period * slope;
+                    v e = own[R_E_RE + r], x = own[R_V_RE + r], wanted = n->shape[c] * band[R_R_RE + r];
+                    v heard = e - x + (2.0 / block) * found[r];
+                    e = (1 - period * fading) * e + share * n->g * found[r];
+                    v slope = -n->integral * e - n->back * (x + wanted) - fading * x;
+                    v steeper = n->shape[c] * band[R_DR_RE + r];
+                    x += period * slope;
                     own[R_E_RE + r] = e, own[R_V_RE + r] = x;
-                    own[R_COMMAND_RE + r] = x + wanted + (real)n->lead * steeper;
+                    own[R_COMMAND_RE + r] = x + wanted + n->lead * steeper;
                     own[R_SLOPED_RE + r] = slope + steeper;
-                    own[R_FAST_RE + r] += (real)n->fast_pole * (heard - own[R_FAST_RE + r]);
-                    own[R_SLOW_RE + r] += (real)n->slow_pole * (heard - own[R_SLOW_RE + r]);
+                    own[R_FAST_RE + r] += n->fast_pole * (heard - own[R_FAST_RE + r]);
+                    own[R_SLOW_RE + r] += n->slow_pole * (own[R_FAST_RE + r] - own[R_SLOW_RE + r]);
                     fast2 += own[R_FAST_RE + r] * own[R_FAST_RE + r], slow2 += own[R_SLOW_RE + r] * own[R_SLOW_RE + r];
                 }
-                heard_fast += most(fast2 - (real)n->fast_level, 0), heard_slow += most(slow2 - (real)n->slow_level, 0);
+                heard_fast += most(fast2 - n->fast_level, 0), heard_slow += most(slow2 - n->slow_level, 0);
             }
             for (int channel = 0; channel < 2; channel++, held += R_CHANNEL_ROWS) {
                 v re = {}, im = {}, *now = held + 4;
@@ -187,8 +171,8 @@ void NAME(v *bands, v *loops, v *laws, v *helds, v8 *phases, const v *tables, co
                     for (int i = 0; i < 2; i++) {
                         const v *own = loop + R_LOOP_ROWS * i, *d = law + R_FIRST_LAW + R_LAW_ROWS * (2 * c + i);
                         v x = own[R_COMMAND_RE], y = own[R_COMMAND_IM], dx = own[R_SLOPED_RE], dy = own[R_SLOPED_IM];
-                        re += (real)n->speak[channel][c] * (d[0] * x - d[1] * y + d[2] * dx - d[3] * dy);
-                        im += (real)n->speak[channel][c] * (d[0] * y + d[1] * x + d[2] * dy + d[3] * dx);
+                        re += n->speak[channel][c] * (d[0] * x - d[1] * y + d[2] * dx - d[3] * dy);
+                        im += n->speak[channel][c] * (d[0] * y + d[1] * x + d[2] * dy + d[3] * dx);
                     }
                 v last_re = now[R_NOW_RE], last_im = now[R_NOW_IM], step_re = re - last_re, step_im = im - last_im;
                 now[R_NOW_RE] = re, now[R_NOW_IM] = im;
@@ -204,7 +188,7 @@ void NAME(v *bands, v *loops, v *laws, v *helds, v8 *phases, const v *tables, co
             for (int c = 0; c < 2; c++, held += R_CHANNEL_ROWS) {
                 re[c] = held[R_FROM_RE], im[c] = held[R_FROM_IM], step_re[c] = held[R_STEP_RE], step_im[c] = held[R_STEP_IM];
             }
-            real ahead = (R_PAIRS + 0.5) / block;
+            double ahead = (R_PAIRS + 0.5) / block;
             for (int q = 0; q < block; q += R_GROUP) {
                 for (int c = 0; c < 2; c++) re[c] += ahead * step_re[c], im[c] += ahead * step_im[c];
                 for (int i = 0; i < R_PAIRS; i++)

@@ -1,0 +1,91 @@
+"""Draw every chart and renew the pictures in docs/.
+
+Run: python -m benchmarks.charts [story pareto devices stability demo] [--out docs]
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks.charts import draw, measure, stability, story
+
+ROOT = Path(__file__).parents[2]
+
+
+def draw_story(out: Path) -> None:
+    """Two methods under the same finger."""
+    story.draw().savefig(out / "picture.png", dpi=110)
+
+
+def draw_pareto(out: Path) -> None:
+    """Methods and settings on the plate."""
+    points = measure.measure(measure.methods_and_settings())
+    swept = measure.over_frequency([each.setting for each in points if each.setting.what == "default"])
+    _write(out / "pareto", draw.pareto(points, swept), measure.as_data(points, swept))
+
+
+def draw_devices(out: Path) -> None:
+    """Methods and levels on every simulated device."""
+    points = measure.measure(measure.devices_and_levels())
+    swept = measure.over_frequency([measure.Setting(method="h2", device=device) for device in measure.LEVELS])
+    _write(out / "device-chart", draw.devices(points, swept), measure.as_data(points, swept))
+
+
+def draw_stability(_: Path) -> None:
+    """Stability over carrier and bandwidth, picture and data into out/charts."""
+    rows = stability.measure()
+    stability.draw(rows).savefig(_data() / "stability.png", dpi=90)
+    arrays = {name: np.array([each.modulus[0, 0, 0] for each in row]) for name, row in rows.items()}
+    np.savez(_data() / "stability.npz", **arrays)
+
+
+def draw_demo(out: Path) -> None:
+    """The picture of one texture on every device, from the demonstration."""
+    subprocess.run([sys.executable, "-m", "hapticrender", "demo", "--out", str(_data() / "demo")], cwd=ROOT, check=True)
+    shutil.copy(_data() / "demo" / "devices.png", out / "devices.png")
+
+
+CHARTS: dict[str, Callable[[Path], None]] = {
+    "story": draw_story, "pareto": draw_pareto, "devices": draw_devices, "stability": draw_stability,
+    "demo": draw_demo,
+}  # fmt: skip
+
+
+def _data() -> Path:
+    folder = ROOT / "out" / "charts"
+    folder.mkdir(parents=True, exist_ok=True)
+    return folder
+
+
+def _write(path: Path, figure: object, data: object) -> None:
+    """Write a picture, and its data into out/charts."""
+    figure.savefig(path.with_suffix(".png"), dpi=110)  # type: ignore[attr-defined]
+    (_data() / f"{path.name}.json").write_text(json.dumps(data, indent=2) + "\n", encoding="utf-8")
+
+
+def main() -> int:
+    """Run the command line."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("charts", nargs="*", metavar="CHART", help=f"of {', '.join(CHARTS)}; all by default")
+    parser.add_argument("--out", type=Path, default=ROOT / "docs", help="folder of the pictures")
+    chosen = parser.parse_args()
+    unknown = [name for name in chosen.charts if name not in CHARTS]
+    if unknown:
+        parser.error(f"{unknown[0]!r}: must be one of {', '.join(CHARTS)}")
+    chosen.out.mkdir(parents=True, exist_ok=True)
+    for name in chosen.charts or CHARTS:
+        print(f"chart: {name}", flush=True)
+        CHARTS[name](chosen.out)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
