@@ -1,6 +1,12 @@
-"""What every test may lean on: seeded randomness, loud arithmetic, the recorded finger where it is at hand."""
+"""Set up every test: a cache of compiled kernels that is never stale, seeded randomness, loud arithmetic."""
 
+import hashlib
+import os
+import shutil
+import sys
+import time
 from collections.abc import Iterator
+from importlib.metadata import version
 from pathlib import Path
 
 import hypothesis
@@ -8,6 +14,32 @@ import numpy as np
 import pytest
 
 ROOT = Path(__file__).resolve().parent.parent
+KEPT = 86_400.0  # s: caches of older sources are deleted after a day
+
+
+def fresh_cache(root: Path) -> Path:
+    """Folder of compiled kernels named by a hash of all sources and of numba's version.
+
+    numba compiles a cached kernel anew when its own file changes, but not when a kernel that it calls, in another
+    file, does.
+    """
+    digest = hashlib.sha256(version("numba").encode())
+    for folder in ("hapticrender", "renderers", "drivers", "tests"):
+        for path in sorted((root / folder).rglob("*.py")):
+            digest.update(path.read_bytes())
+    caches = root / ".pytest_cache" / "numba"
+    for old in caches.glob("*"):
+        if time.time() - old.stat().st_mtime > KEPT:
+            shutil.rmtree(old, ignore_errors=True)
+    cache = caches / digest.hexdigest()[:16]
+    cache.mkdir(parents=True, exist_ok=True)
+    os.utime(cache)
+    return cache
+
+
+if "numba" in sys.modules:
+    raise RuntimeError("numba is imported before tests/conftest.py: NUMBA_CACHE_DIR would come too late")
+os.environ["NUMBA_CACHE_DIR"] = str(fresh_cache(ROOT))
 
 hypothesis.settings.register_profile("house", derandomize=True, deadline=None, max_examples=25, database=None)
 hypothesis.settings.load_profile("house")

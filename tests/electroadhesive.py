@@ -1,6 +1,7 @@
 """Scenes and devices that the tests of electroadhesion share."""
 
 import numpy as np
+from tables import tables
 
 import hapticrender as hr
 from hapticrender.drivers.simulated import SimulatedDriver
@@ -15,7 +16,7 @@ def tone(frequency, force=FORCE, finger=SLIDE, duration=2.0, **plant):
     """A friction of `force` (N) at `frequency` (Hz): a displacement of 0.64 m/(N s) of it over w."""
     texture = hr.Grating(frequency=frequency, amplitude=0.64 * force / (2 * np.pi * frequency))
     return hr.Scene(
-        texture=texture, finger=finger, device="electroadhesion", duration=duration, plant=plant, keep_unfelt=True
+        texture=texture, finger=finger, device="electroadhesion", duration=duration, **tables(plant), keep_unfelt=True
     )
 
 

@@ -5,7 +5,7 @@ import math
 import numpy as np
 
 import hapticrender as hr
-from hapticrender.fidelity.plate import OPTIONS
+from hapticrender.plants.levels import REDUCTIONS
 
 DURATION = 4.0  # s
 FREQUENCIES = (20.0, 500.0)  # Hz
@@ -28,11 +28,12 @@ def random_case(seed):
 def _lesser(rng, scene):
     """Leave out one thing, or two or three one after another."""
     lesser, names = scene, []
-    for i in sorted(rng.permutation(len(OPTIONS))[: rng.choice([1, 1, 2, 3])]):
-        found = OPTIONS[i].reduced(lesser)
+    options = list(REDUCTIONS["vt-plate"].items())
+    for i in sorted(rng.permutation(len(options))[: rng.choice([1, 1, 2, 3])]):
+        found = options[i][1](lesser)
         if isinstance(found, hr.Scene):
             lesser = found
-            names.append(f"{OPTIONS[i].name} {OPTIONS[i].value}")
+            names.append(options[i][0])
     return lesser, names
 
 
@@ -51,7 +52,7 @@ def _scene(rng):
         texture=hr.Grating(amplitude=amplitude, partials=partials, **shape),
         finger=_finger(rng, motion),
         duration=DURATION,
-        plant=_plant(rng),
+        profile=_plant(rng),
         gradient=rng.uniform(-14.0, 14.0) if rng.random() < 0.1 else 0.0,
     )
 

@@ -62,8 +62,8 @@ def make_signals(
 
 
 def make_recording(
-    bands: Bands, motion_envelope: Any, *, scene: dict[str, Any] | None = None, **rest: Any
+    bands: Bands, motion_envelope: Any, *, scene: dict[str, Any] | None = None, motion_source: str = "true", **rest: Any
 ) -> Recording:
     recorder = make_recorder(None, bands, **({"duration": rest.get("duration", 4.0)} | (scene or {})))
-    recorder.append(**make_signals(bands, motion_envelope, **rest))
+    recorder.append(**make_signals(bands, motion_envelope, **rest), motion_source=motion_source)
     return recorder.finish()

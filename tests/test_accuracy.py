@@ -10,10 +10,9 @@ from hapticrender import defaults
 from hapticrender.accuracy import figures as accuracy_figures
 from hapticrender.accuracy import plate as accuracy
 from hapticrender.accuracy import suite as accuracy_suite
-from hapticrender.charts.story import draw_story
 from hapticrender.drivers.simulated import SimulatedDriver
-from hapticrender.plants.identify import identify, require_delay
-from hapticrender.plants.vibrotactile import Plate, PlateParameters
+from hapticrender.plants.identify import compare, identify
+from hapticrender.plants.plate import Plate, PlateParameters
 from hapticrender.touch.mechanics import FingerMechanics
 
 RANGES = ((1e-4, 5e-4), (0.5, 12.0), (400.0, 12e3), (1e-3, 10e-3), (0.3, 4.0), (60.0, 900.0))  # skin, then phalanx
@@ -49,10 +48,7 @@ def comb_error(delay, start, stop):
     ("delay", "start", "stop", "bound"), [(1, 1.55, 9.0, -50.0), (1, 1.05, 1.55, -24.0), (100, 1.55, 9.0, -40.0)]
 )
 def test_a_comb_under_a_finger_that_is_learnt(delay, start, stop, bound):
-    """FACTS: H2 has -51 dB, and -24 dB in the first 0.5 s of touch; 1 % of it at a known delay of 20 ms.
-
-    Learning from the force that acted; at the numbers of the moment it was -48.0, -22.3 and -30.1 dB.
-    """
+    """H2 has -51 dB, and -24 dB in the first 0.5 s of touch; 1 % of it at a known delay of 20 ms."""
     assert comb_error(delay, start, stop) <= bound
 
 
@@ -99,29 +95,22 @@ def test_a_grating_holds_under_the_recorded_finger(shared_data):
     assert ours["worst"]["value"] < 0.5 * paper["worst"]["value"]
 
 
-def test_the_story_is_drawn(tmp_path):
-    pytest.importorskip("matplotlib")
-    draw_story(tmp_path / "story.png")
-    assert (tmp_path / "story.png").read_bytes().startswith(b"\x89PNG")
-
-
-def test_an_unknown_delay_is_detected_and_refused():
-    """A device that is one sample later than its driver says: found within 0.01 sample, refused by name."""
+def test_an_unknown_delay_is_detected_and_named():
+    """A device that is one sample later than its driver says: found within 0.01 sample, named in a warning."""
     believed, late = PlateParameters(), PlateParameters(delay=2)
     driver = SimulatedDriver(Plate(late, hr.Finger.absent()))
     driver.delay = 1  # what a driver says that does not know
     with driver:
         found = identify(driver, believed)
     assert found.estimates["delay"].value == pytest.approx(2.0, abs=0.01)
-    with pytest.raises(
-        hr.DesignError, match=r"delay = 2\.00 samples: the controller is designed for 1, must be within 0\.25"
-    ):
-        require_delay(found, believed)
-    require_delay(found, late)
+    with pytest.warns(hr.PlateMismatch, match=r"delay \+1\.00\d\d \+- 0\.00\d\d samples"):
+        compare(found, believed)
+    assert compare(found, late) == ()
+    assert "driver.delay = 1 samples: measured 2.00, set it to 2" in found.text()
 
 
 def test_no_limit_cycle_under_fingers_that_nobody_designed_for(rng):
-    """24 random fingers of FACTS section 3's ranges come to rest, and peak below its worst of 32 %."""
+    """24 random fingers come to rest, and peak below its worst of 32 %."""
     log = [rng.uniform(np.log(low), np.log(high), 24) for low, high in RANGES]
     names = ("mass", "damping", "stiffness", "phalanx_mass", "phalanx_damping", "phalanx_stiffness")
     fingers = [(FingerMechanics(order=4, **dict(zip(names, row, strict=True))), 0.8) for row in np.exp(log).T]

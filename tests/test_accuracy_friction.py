@@ -81,7 +81,7 @@ def test_an_amplitude_beyond_the_drive_is_seen_to_miss(limit):
     resonance = float(mode.resonance(0.4))
     force = mode.force_constant * mode.drive_limit * np.sinc(resonance / mode.rate)
     most = force / abs(complex(mode.dynamic_stiffness(resonance, 0.4)))
-    off = (mode.carrier + plate.loop.state.shift[0] - resonance) / float(mode.pole(0.4))
+    off = (mode.carrier + plate.loop.state["shift"][0] - resonance) / float(mode.pole(0.4))
     reached, rounding = plate.amplitude[-100:].mean(), mode.drive_step / mode.drive_limit + off**2 / 2
     assert 0.98 * most < reached < (1 + rounding) * most
     assert most < 0.98e-6  # beyond the bound of 2 %

@@ -4,19 +4,18 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from tables import tables
 
 import hapticrender as hr
-from hapticrender.control.methods import METHODS
-from hapticrender.plants.vibrotactile import Plate, PlateParameters
+from hapticrender.plants.plate import Plate, PlateParameters
 
 SLIDE = hr.Finger.sliding(speed=0.08, normal_load=0.4, mechanics="light")
 A = 50e-6  # m: that of the accuracy suite, 50 times the noise of a sensor
-QUIET = {"sensor_noise": 0.0, "current_bits": 0, "sensor_bits": 0}
 
 
 def rendered(frequency=72.0, gradient=0.0, finger=SLIDE, **plant):
     texture = hr.Grating(frequency=frequency, amplitude=A)
-    return hr.render(hr.Scene(texture=texture, finger=finger, duration=2.5, gradient=gradient, plant=plant))
+    return hr.render(hr.Scene(texture=texture, finger=finger, duration=2.5, gradient=gradient, **tables(plant)))
 
 
 def amplitudes(recording, frequency):
@@ -68,20 +67,12 @@ def test_one_coil_holds_the_middle_and_leaves_the_ends_to_the_finger(frequency):
     np.testing.assert_allclose(amplitudes(recording, frequency) / A, expected, rtol=0, atol=CENTRE)
 
 
-def test_one_coil_in_the_middle_moves_the_plate_as_two_that_share_it():
-    """The same force at the middle, sample for sample."""
-    drive = 0.3 * np.random.default_rng(0).standard_normal((500, 1))
-    one = Plate(PlateParameters(coils=1, **QUIET), hr.Finger.absent()).run(drive)
-    two = Plate(PlateParameters(**QUIET), hr.Finger.absent()).run(np.repeat(0.5 * drive, 2, axis=1))
-    np.testing.assert_allclose(one.motion, two.motion, rtol=0, atol=1e-12 * abs(two.motion).max())
-
-
 @pytest.mark.parametrize(
     ("gradient", "plant", "message"),
     [
         (2.0, {"coils": 1}, "gradient = 2 1/m: must be 0, a plate with one coil moves as a whole"),
         (19.0, {}, "gradient = 19 1/m: must be <= 18.1818 1/m"),
-        (0.0, {"coils": 3}, "plant.coils = 3: must be <= 2"),
+        (0.0, {"coils": 3}, "device.coils = 3: must be .* <= 2"),
     ],
 )
 def test_what_a_plate_cannot_do_is_refused(gradient, plant, message):
@@ -102,21 +93,6 @@ def test_a_plate_of_other_numbers_is_identified_and_then_held():
         assert getattr(found, name) == pytest.approx(getattr(other, name), rel=0.003)  # as the accuracy suite asks
     plant = {name: getattr(found, name) for name in (*numbers, "force_constant")}
     texture = hr.Grating(frequency=111.0, amplitude=A)
-    scene = hr.Scene(texture=texture, finger=SLIDE, duration=2.5, plant=plant)
+    scene = hr.Scene(texture=texture, finger=SLIDE, duration=2.5, **tables(plant))
     recording = hr.render(scene, driver=SimulatedDriver(Plate(other, SLIDE, 5)))
     assert abs(amplitudes(recording, 111.0) / A - 1.0).max() < ENDS
-
-
-@pytest.mark.parametrize("method", METHODS)
-def test_one_coil_is_driven_by_its_own_row_alone(method):
-    """What lies behind the only row of drives per force is no drive: the plate's second channel stays empty."""
-    plate = PlateParameters(coils=1, **QUIET)
-    bands = hr.Grating(frequency=50.0, amplitude=1e-6).bands(plate.rate)
-    controller = METHODS[method].design(plate.band_model(plate.rate, plate.delay), bands)
-    room = np.full(2, 1e9)
-    room[0] = controller.tables.speak[0, 0]
-    controller.tables = controller.tables._replace(speak=room[:1].reshape(1, 1))
-    drive, _, flags, _ = Plate(plate, hr.Finger.absent()).closed_loop(controller, np.zeros(500))
-    assert drive[:, 0].any()
-    assert not drive[:, 1:].any()
-    assert not flags.any()

@@ -17,7 +17,6 @@ from hapticrender.drivers.simulated import SimulatedDriver
 from hapticrender.drivers.wavefile import FORMATS, SUBTYPES, WaveFileDriver, read_back
 from hapticrender.errors import DeviceLost, DeviceNotFound, DriverError
 from hapticrender.protocols import Driver, Flag, Sensed
-from hapticrender.renderers.vibrotactile import VibrotactileRenderer
 
 FULL_SCALE = 2.5  # A
 FORMS = [
@@ -348,7 +347,7 @@ SCENE = hr.Scene(texture=hr.Grating(frequency=47.0, amplitude=10e-6), duration=0
 
 def test_a_run_through_a_tee_is_the_run_without_it(tmp_path):
     plain = hr.render(SCENE, seed=3)
-    plant = VibrotactileRenderer().plant(SCENE, 3)
+    plant = hr.prepare(SCENE, seed=3).plant
     driver = WaveFileDriver(tmp_path / "a.w64", through=SimulatedDriver(plant), subtype="DOUBLE", full_scale=1.0)
     through = hr.render(SCENE, driver=driver)
     for name in ("drive", "sensed", "motion"):

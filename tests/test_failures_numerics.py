@@ -1,15 +1,15 @@
-"""FACTS 2, rows 13-16: integration, rounding of the command, time as a growing number, one coordinate too few."""
+"""Failures of numerics: integration, rounding of the command, time as a growing number, one coordinate too few."""
 
 from fractions import Fraction
 
 import numpy as np
 import pytest
 import scipy.linalg
-from naive_methods import fixed, hold, play
+from held import fixed, hold, play
 
 import hapticrender as hr
 from hapticrender.control.methods import METHODS
-from hapticrender.plants.vibrotactile import Plate, PlateParameters
+from hapticrender.plants.plate import Plate, PlateParameters
 from hapticrender.touch.mechanics import HEAVY
 
 RATE = 5000.0
@@ -71,7 +71,7 @@ def least_rate(scheme, system):
     ],
     ids=["plate, Euler", "skin, Euler", "skin, RK4", "skin, semi-implicit"],
 )
-def test_row_13_explicit_integration(scheme, system, kilohertz):
+def test_explicit_integration(scheme, system, kilohertz):
     """Least stable rates to the printed digit; "heavy skin alone" is the skin on its phalanx, off the plate.
 
     Without the phalanx it would be 19.5, 14.0 and 20.5 kHz: b/m = 40 000 /s instead of 41 000.
@@ -81,7 +81,7 @@ def test_row_13_explicit_integration(scheme, system, kilohertz):
     assert abs(np.linalg.eigvals(exact(system, 1 / RATE))).max() < 1
 
 
-def test_row_13_the_plate_is_stable_at_any_rate():
+def test_the_plate_is_stable_at_any_rate():
     """The library's own step, struck once: it has rung out after 1 s at 500 Hz as at 5 kHz, with the skin on it."""
     for rate in (500.0, RATE):
         finger = hr.Finger.still(10e-3, normal_load=0.0, mechanics=HEAVY)
@@ -92,8 +92,8 @@ def test_row_13_the_plate_is_stable_at_any_rate():
         assert motion[-50:].max() < 1e-5 * motion.max()
 
 
-def test_row_13_accuracy_of_stable_schemes_at_189_hz():
-    """Heave at 189 Hz from a held force.  FACTS: Tustin 12 deg, semi-implicit 19 deg, backward Euler -84 %.
+def test_accuracy_of_stable_schemes_at_189_hz():
+    """Heave at 189 Hz from a held force.  expected: Tustin 12 deg, semi-implicit 19 deg, backward Euler -84 %.
 
     Tustin is 12.1 deg off the continuous plate and 5.3 deg off the held one; semi-implicit 12.4 and 19.2.  The exact
     step is the continuous plate times the hold, sinc(f T) e^(-j pi f T), and its first images (f T)^2 ~ 1e-3 down.
@@ -131,8 +131,8 @@ def spur(method, bits_known):
 
 
 @pytest.mark.parametrize("method", ["h", "h2"])
-def test_row_14_rounding_of_the_command(method):
-    """12 bits, 1 um at 20 Hz: harmonics of the stairs meet the mode at 189 Hz.  FACTS: 0.24-0.31 um, shaped 0.011.
+def test_rounding_of_the_command(method):
+    """12 bits, 1 um at 20 Hz: harmonics of the stairs meet the mode at 189 Hz.  expected: 0.24-0.31 um, shaped 0.011.
 
     Paper 0.40 um, H 0.33, H2 0.24, above the threshold of 0.1 um; noise shaping leaves 0.003.  Rounding is unshaped
     where the controller is not told of the step.
@@ -143,7 +143,7 @@ def test_row_14_rounding_of_the_command(method):
         assert 0.20e-6 < spur("paper", True) < 0.45e-6
 
 
-def test_row_15_phase_from_a_growing_time():
+def test_phase_from_a_growing_time():
     """400 Hz after an hour: float32 seconds have a grain of 0.24 ms, 35 deg; the error grows with time.
 
     Phase kept modulo one turn only gathers rounding, sqrt(n) to n times 2^-53 turns after n samples.
@@ -167,7 +167,7 @@ def test_row_15_phase_from_a_growing_time():
     assert abs(off) < samples * 2.0**-53
 
 
-def test_row_16_heave_alone_misses_the_ends():
+def test_heave_alone_misses_the_ends():
     """Complex error of the ends, per true end, under a heavy finger at 15 mm: 37 % at 170 Hz, 231 % at 147 Hz."""
     lever = np.array([1.0, 15e-3 / IDEAL.half_spacing])
     for frequency, expected in ((47.0, 0.026), (170.0, 0.37), (147.0, 2.31)):
@@ -180,7 +180,7 @@ def test_row_16_heave_alone_misses_the_ends():
         assert lever[1] == pytest.approx(15 / 27.5)
 
 
-def test_row_16_controlling_both_coordinates_holds_the_ends():
+def test_controlling_both_coordinates_holds_the_ends():
     """Common mode leaves the ends to the plate, 30 % and more near the rocking mode; heave and rocking hold them."""
     finger = hr.Finger.still(15e-3, normal_load=0.8, mechanics=HEAVY)
     errors = {}

@@ -5,7 +5,7 @@ import pytest
 
 from hapticrender.touch.finger import Finger
 from hapticrender.touch.mechanics import HEAVY, HEAVY_SECOND, LIGHT, LIGHT_SECOND, NONE, FingerMechanics
-from hapticrender.touch.motion import Sliding
+from hapticrender.touch.motion import TriangleMotion
 
 PAPER = np.array([20.0, 31.0, 47.0, 72.0, 111.0, 170.0, 261.0, 400.0])
 GRID = np.arange(20.0, 401.0)
@@ -219,7 +219,9 @@ def test_a_finger_needs_a_motion():
 @pytest.mark.parametrize("touches", [None, ((0.1, 0.2), (0.35, 0.5))])
 @pytest.mark.parametrize("scaled", [False, True])
 def test_touch_is_position_load_and_strength_side_by_side(load, touches, scaled):
-    finger = Finger(Sliding(0.1, 0.05), normal_load=load, touches=touches, mechanics="heavy", load_scaling=scaled)
+    finger = Finger(
+        TriangleMotion(0.1, 0.05), normal_load=load, touches=touches, mechanics="heavy", load_scaling=scaled
+    )
     time = np.linspace(0.0, 0.7, 71)
     expected = np.column_stack([finger.position(time), finger.load(time), finger.strength(time)])
     np.testing.assert_array_equal(finger.touch(time), expected)

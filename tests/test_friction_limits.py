@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from tables import tables
 
 import hapticrender as hr
 
@@ -11,7 +12,7 @@ TONE = hr.Grating(frequency=100.0, velocity=10e-3)
 
 def scene(device, texture=TONE, finger=SLIDE, duration=1.0, keep_unfelt=False, **plant):
     return hr.Scene(
-        texture=texture, finger=finger, device=device, duration=duration, keep_unfelt=keep_unfelt, plant=plant
+        texture=texture, finger=finger, device=device, duration=duration, keep_unfelt=keep_unfelt, **tables(plant)
     )
 
 
@@ -19,8 +20,12 @@ def scene(device, texture=TONE, finger=SLIDE, duration=1.0, keep_unfelt=False, *
     ("device", "fields", "message"),
     [
         ("electroadhesion", {"force_range": 1e-3}, "friction of 0.3.. N: must be <= 0.001 N, the tribometer's range"),
-        ("electroadhesion", {"friction_coefficient": 0.0}, "plant.friction_coefficient = 0.0: must be > 0"),
-        ("ultrasonic", {"bias": 0.1}, r"plant.bias = 0.1: must be > 0.109, the least that the law leaves"),
+        (
+            "electroadhesion",
+            {"friction_coefficient": 0.0},
+            "device.friction_coefficient = 0.0: must be .* > 0",
+        ),
+        ("ultrasonic", {"bias": 0.1}, r"device.bias = 0.1: must be > 0.109, the least that the law leaves"),
         ("ultrasonic", {"scale": 1e-4}, "texture.amplitude asks for a vibration of .* V under 0.4 N: must be <= 10 V"),
         ("ultrasonic", {"velocity_per_force": 0.0}, None),
     ],
@@ -80,7 +85,7 @@ def test_a_device_in_blocks_knows_of_fingers_that_leave(block):
 
     lifted = hr.Finger.sliding(speed=0.05, normal_load=0.4, mechanics="light", touches=[(0.0, 1.0), (1.6, 2.4)])
     wanted = scene("electroadhesion", finger=lifted, duration=2.4)
-    screen = prepare(wanted).driver.plant
+    screen = prepare(wanted).plant
 
     class Blocks:
         rate, drive_channels, sensed_channels = screen.rate, 1, 1
@@ -97,7 +102,7 @@ def test_a_device_in_blocks_knows_of_fingers_that_leave(block):
         def play(self, drive):
             from hapticrender.renderers.electroadhesion import ElectroadhesionRenderer
 
-            shape = ElectroadhesionRenderer().compensation(wanted)
+            shape = ElectroadhesionRenderer().read(wanted, None).compensation
             undone = shape.gain * np.asarray(drive) ** 2 - shape.bias  # the simulated screen takes its own root
             return screen.run(undone)
 
@@ -107,3 +112,12 @@ def test_a_device_in_blocks_knows_of_fingers_that_leave(block):
     back = recording.motion[recording.time >= 2.0, 0]
     line = 2 * np.mean(back * np.exp(-2j * np.pi * 100.0 * np.arange(len(back)) / recording.rate))
     assert abs(line) == pytest.approx(10e-3 / 0.64, rel=0.05)
+
+
+@pytest.mark.parametrize("device", ["electroadhesion", "ultrasonic"])
+def test_a_skin_faster_than_the_finger_is_refused(device):
+    """10.1 mm/s of skin velocity under a finger of 10 mm/s, against 10 mm/s."""
+    finger = hr.Finger.sliding(speed=0.01, normal_load=0.4, mechanics="light")
+    with pytest.raises(ValueError, match=r"skin velocity of 0.0101 m/s: must be <= 0.01 m/s, the median speed"):
+        hr.prepare(scene(device, hr.Grating(velocity=1.01e-2, frequency=100.0), finger))
+    hr.prepare(scene(device, hr.Grating(velocity=10e-3, frequency=100.0), finger))

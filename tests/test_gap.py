@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 import hapticrender as hr
-from hapticrender.control.gap import GapEstimator
 from hapticrender.plants.electroadhesion import DRY, MOIST, NORMAL, ElectroadhesionParameters, ElectroadhesionScreen
+from hapticrender.plants.gap import GapEstimator
 
 RATE = 10_000
 REST_THEN_SLIDE = hr.Finger.sampled([0.0, 0.0, 0.06], times=[0.0, 0.1, 1.3], normal_load=1.0)
@@ -56,19 +56,9 @@ def test_a_small_change_of_the_current_is_followed_as_predicted():
     assert slope == pytest.approx(p.estimator.delay, rel=1e-6)
 
 
-def test_the_screen_senses_as_its_parameters_say():
-    """The same through the carrier: a sample later, and what the gap itself does (0.5 %)."""
-    p = clean(level="carrier", sensor="impedance", gap_resistance=DRY, voltage_limit=1e3)
-    turn = np.exp(2j * np.pi * 200 * np.arange(6000) / RATE)
-    drive = CURRENT * np.sqrt(1 + 1e-2 * turn.real)
-    played = ElectroadhesionScreen(p, REST_THEN_SLIDE).run(drive[:, None]).sensed[:, 0]
-    swing = 2 * np.mean((played * turn.conj())[SETTLED:]) / (1e-2 * p.attraction(CURRENT, 1.0))
-    assert swing == pytest.approx(p.sensed_response(200.0, 0.05), rel=5e-3)
-
-
 @pytest.mark.parametrize("leak", [DRY, NORMAL])
 def test_force_is_sensed_within_3_percent_where_open_loop_voltage_spreads(leak):
-    """FACTS 5: bias 2 %, sd 1.3 % over areas +-30 % and gaps of 0.5-3 um; beside it the force of 100 V, open loop."""
+    """Bias 2 %, sd 1.3 % over areas +-30 % and gaps of 0.5-3 um; beside it the force of 100 V, open loop."""
     driven = []
     for area in AREAS:
         for gap in GAPS:
@@ -97,28 +87,21 @@ def test_moist_finger_is_flagged_and_taken_open_loop():
     assert (flags & hr.Flag.OPEN_LOOP).all()
     p = ElectroadhesionParameters(gap_resistance=MOIST)
     assert np.mean(ratio) == pytest.approx(p.open_loop_gain / p.gain(1.0), rel=1e-2)
-    bare, flags = sensed(gap_resistance=MOIST, least_leakage=0.0)  # told to trust it, it does
+    bare, flags = sensed(gap_resistance=MOIST, least_leakage=0.0)  # without the bound it is estimated
     assert not flags.any()
     assert np.mean(bare) == pytest.approx(1.0, abs=0.03)
 
 
 def test_a_finger_that_was_never_at_rest_is_taken_open_loop():
-    """Also after it was lifted: another finger, another area."""
     ratio, flags = sensed(finger=hr.Finger.sliding(speed=0.05, normal_load=1.0))
     assert (flags & hr.Flag.OPEN_LOOP).all()
     p = ElectroadhesionParameters()
     assert np.mean(ratio) == pytest.approx(p.open_loop_gain / p.gain(1.0), rel=1e-2)
-    again = hr.Finger.sampled(
-        [0.0, 0.0, 0.06], times=[0.0, 0.1, 1.3], normal_load=1.0, touches=[(0.0, 0.3), (0.32, 0.6)]
-    )
-    _, flags = sensed(finger=again)
-    assert not (flags[:1000] & hr.Flag.OPEN_LOOP).any()
-    assert (flags[1202:] & hr.Flag.OPEN_LOOP).all()
 
 
 @pytest.mark.parametrize("skew", [-1e-6, 0.5e-6, 1e-6])
 def test_skew_between_the_channels_costs_ten_percent_a_microsecond(skew):
-    """FACTS 5: about 10 %/us, 5 % at 0.5 us."""
+    """About 10 %/us, 5 % at 0.5 us: it turns Z."""
     ratio, _ = sensed(skew=skew)
     assert abs(np.mean(ratio) - 1) == pytest.approx(0.10 * abs(skew) / 1e-6, rel=0.2)
 
@@ -134,25 +117,27 @@ def test_noise_is_what_the_low_pass_lets_through():
     assert found == pytest.approx(expected, rel=0.06)
 
 
-@pytest.mark.parametrize("junk", [np.nan, np.inf, complex(0.0, np.nan)])
-def test_junk_counts_as_zero_and_is_forgotten(junk):
-    """Fifty samples later the low pass has lost exp(-33) of it, 0.2 s later the average exp(-40)."""
+def test_a_driver_reads_it_block_by_block():
+    """With a state, blocks continue each other; junk counts as zero and has decayed by exp(-40) after 0.2 s."""
     p = clean()
     voltage, current, speed = rest_then_slide(p, np.full(4500, CURRENT))
-    voltage[2000] = current[1500] = junk
-    force, _ = p.estimator.run(voltage, current, speed)
-    assert np.isfinite(force).all()
-    assert force[-1] == pytest.approx(p.attraction(CURRENT, 1.0), rel=1e-9)
+    voltage[2000] = current[1500] = complex(0.0, np.nan)
+    whole = p.estimator.run(voltage, current, speed)
+    state = p.estimator.start()
+    parts = (slice(0, 1), slice(1, 1700), slice(1700, 4500))
+    blocks = [p.estimator.run(voltage[part], current[part], speed[part], state) for part in parts]
+    for k in range(2):
+        np.testing.assert_array_equal(np.concatenate([block[k] for block in blocks]), whole[k])
+    assert np.isfinite(whole[0]).all()
+    assert whole[0][-1] == pytest.approx(p.attraction(CURRENT, 1.0), rel=1e-9)
 
 
 @pytest.mark.parametrize(
     ("wrong", "message"),
     [
-        ({"rate": 0.0}, r"rate=0.0 must be positive"),
         ({"bandwidth": 5e3}, r"bandwidth=5000.0 Hz must lie between 0 and half the rate"),
-        ({"smoothing": 1e-5}, r"smoothing = 1e-05: must be >= 0.0001 s"),
-        ({"least_share": 1.5}, r"least_share = 1.5: must be >= 0 and <= 1"),
-        ({"unevenness": 0.5}, r"unevenness = 0.5: must be >= 1"),
+        ({"smoothing": 1e-5}, r"smoothing = 1e-05: must be .*>= 0.0001 .*s"),
+        ({"least_share": 1.5}, r"least_share = 1.5: must be .*>= 0 .*and <= 1"),
         ({"series_impedance": 0j}, r"series_impedance = 0j: must be finite and not 0 ohm m2"),
     ],
 )

@@ -6,15 +6,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from tables import tables
 
 import hapticrender as hr
 from hapticrender import loop
 from hapticrender.control.methods import method_named
-from hapticrender.control.stability import bank_loop
 from hapticrender.drivers.base import BaseDriver
 from hapticrender.plants.electroadhesion import ElectroadhesionParameters, ElectroadhesionScreen
 from hapticrender.plants.hybrid import HybridPlant
-from hapticrender.plants.vibrotactile import Plate, PlateParameters
+from hapticrender.plants.plate import Plate, PlateParameters
 from hapticrender.protocols import Sensed
 from hapticrender.renderers.hybrid import HybridSettings
 
@@ -39,7 +39,13 @@ def devices_of_the_project(monkeypatch):
 
 def scene(texture, finger=SLIDE, duration=1.2, **plant):
     return hr.Scene(
-        texture=texture, finger=finger, device="hybrid", duration=duration, settle=0.6, keep_unfelt=True, plant=plant
+        texture=texture,
+        finger=finger,
+        device="hybrid",
+        duration=duration,
+        settle=0.6,
+        keep_unfelt=True,
+        **tables(plant),
     )
 
 
@@ -77,13 +83,13 @@ def test_shares_sum_to_one():
 def test_fixed_carriers_are_shared_out_by_their_frequency():
     partials = [(1, 1.0, 0.3), (2, 0.5, 1.0), (5, 0.2, 2.0)]  # 50, 100 and 250 Hz
     bands = loop.prepare(scene(hr.Grating(amplitude=8e-6, frequency=50.0, partials=partials))).bands
-    assert bands.of_moved.tolist() == [0, 1]
-    assert bands.of_rubbed.tolist() == [1, 2]
+    assert bands.plate_index.tolist() == [0, 1]
+    assert bands.friction_index.tolist() == [1, 2]
     total = np.zeros(3, complex)
-    total[bands.of_moved] += 2j * np.pi * bands.moved.frequency * bands.moved.envelope
-    total[bands.of_rubbed] += 0.64 * bands.rubbed.envelope
+    total[bands.plate_index] += 2j * np.pi * bands.plate.frequency * bands.plate.envelope
+    total[bands.friction_index] += 0.64 * bands.friction.envelope
     np.testing.assert_allclose(total, 2j * np.pi * bands.frequency * bands.envelope, rtol=1e-12)
-    np.testing.assert_allclose(abs(bands.moved.envelope), [8e-6, 2e-6], rtol=1e-12)
+    np.testing.assert_allclose(abs(bands.plate.envelope), [8e-6, 2e-6], rtol=1e-12)
 
 
 def test_targets_of_a_carrier_that_follows_the_finger_sum_to_all_of_it():
@@ -101,7 +107,8 @@ def test_targets_of_a_carrier_that_follows_the_finger_sum_to_all_of_it():
     parts = []
     for k in range(n):
         _, target, _ = controller.run(np.zeros((1, 3)), position[k : k + 1], np.zeros(1))
-        parts.append([target[0, 0], controller.state.displacement[0], controller.state.friction[0]])
+        own = [part.tiles["target_re"][0, 0] + 1j * part.tiles["target_im"][0, 0] for part in controller.parts]
+        parts.append([target[0, 0], *own])
     total, moved, rubbed = np.array(parts[2000:]).T
     hertz = (0.01 + acceleration * (time[2000:] + 0.5 / RATE)) / 1e-3
     turn = 2j * np.pi * hertz
@@ -142,7 +149,7 @@ def test_each_part_gives_its_share_and_no_more():
 
 def session_plant(session):
     """A fresh plant of a session's scene."""
-    return loop.registered("renderers", "hybrid")().plant(session.scene, 0)
+    return loop.prepare(session.scene).plant
 
 
 def test_partials_on_both_sides_of_the_crossover():
@@ -186,59 +193,6 @@ def test_a_recording_over_position_is_shared_out_by_the_fades():
     assert len(figures["bands"]) == 3
     for band in figures["bands"]:
         assert band["rms_error_skin"] < 0.05  # what devices may differ by in skin velocity; sensor noise is in it
-
-
-def test_the_loop_of_a_bank_that_fades_has_the_poles_of_its_state_matrix():
-    """Zeros of the closed over the open characteristic polynomial are eigenvalues, to rounding of the matrix."""
-    partials = [(1, 1.0, 0.0), (2, 0.5, 1.0), (5, 0.2, 2.0)]
-    session = loop.prepare(scene(hr.Grating(amplitude=8e-6, wavelength=1e-3, partials=partials)))
-    tables = session.controller().parts[0].tables
-    found = bank_loop(tables, "awake", speed=0.015)  # 15, 30 and 75 Hz
-    assert 0.4 < found.share[0, 0] < 0.6
-    assert found.share[0, 1] == 1.0
-    poles = np.linalg.eigvals(found.matrix()[0])
-    slow = poles[abs(abs(np.angle(poles)) * RATE / (2 * np.pi) - 15.0) < 5.0]
-    assert slow.size >= 4  # the carrier's two, and their images
-    at, beside = (abs(found.difference(z[None])[0]) for z in (slow, slow * np.exp(2j * np.pi * 1.0 / RATE)))
-    assert (at < 1e-6 * beside.max()).all()
-    assert abs(poles).max() < 1.0
-
-
-def test_plate_and_screen_are_those_of_their_own(rng):
-    """What is sensed is that of plate and screen alone; the velocity is the derivative of the displacement.
-
-    Central differences at w are off by (w T)^2/6; a drive that is held bends the velocity at every sample, there by
-    (w0^2 - w^2) T^2/12 the other way, w0 being the mode (190 Hz at most).  Its ringing is gone by 0.8 s.
-    """
-    finger = hr.Finger.sliding(speed=0.03, normal_load=0.4, span=0.1)
-    parameters = PlateParameters(rate=RATE, bending_frequency=1250.0, current_bits=0)
-    own, off = ElectroadhesionParameters(), (2 * np.pi * 190.0 / RATE) ** 2 / 12
-
-    def fresh():
-        return Plate(parameters, finger, 1), ElectroadhesionScreen(own, finger, 2)
-
-    plate, screen = fresh()
-    hybrid = HybridPlant(*fresh(), 0.64)
-    time = np.arange(10_000) / RATE
-    drive = np.column_stack(
-        [0.2 * np.sin(2 * np.pi * 80 * time), 0.05 * np.cos(2 * np.pi * 80 * time), 3e-3 * (1 + np.sin(500 * time))]
-    )
-    both = hybrid.run(drive)
-    moved, rubbed = plate.run(drive[:, :2]), screen.run(drive[:, 2:])
-    np.testing.assert_array_equal(both.sensed, np.hstack([moved.sensed, rubbed.sensed]))
-    np.testing.assert_allclose(hybrid.felt[:, 1], 0.64 * rubbed.motion[:, 0], rtol=1e-14)
-    np.testing.assert_allclose(both.motion[:, 0], hybrid.felt.sum(axis=1), rtol=1e-12)
-    centre, one, other = moved.motion.T
-    position, bend = both.position, (one + other) / 2 - centre  # of a rigid plate nothing
-    tilt = (other - one) / parameters.glass_length
-    shape = parameters.bending_shape(position) - parameters.bending_shape(0.0)
-    bend = bend / (1.0 - parameters.bending_shape(0.0))
-    glass = centre + position * tilt + shape * bend
-    slope = np.gradient(glass, 1 / RATE) - np.gradient(position, 1 / RATE) * (
-        tilt + np.gradient(parameters.bending_shape(position)) / np.gradient(position) * bend
-    )  # as the finger's place moves, not its skin
-    steady = slice(8000, -1)
-    np.testing.assert_allclose(hybrid.felt[steady, 0], slope[steady], atol=off * abs(slope[steady]).max())
 
 
 @pytest.mark.parametrize("texture", [tone(100.0), hr.Grating(amplitude=1e-5, wavelength=1e-3)], ids=["time", "space"])
@@ -311,14 +265,14 @@ BOTH_HAVE = r"must be plate_current_limit or screen_current_limit"
 @pytest.mark.parametrize(
     ("plant", "message"),
     [
-        ({"crossover": 30.0}, r"plant.crossover = 30.0: must be >= 40 Hz"),
+        ({"crossover": 30.0}, r"render.crossover = 30.0: must be .* >= 40 and <= 400 Hz"),
         ({"current_limit": 2.0}, BOTH_HAVE),
         ({"plate_current_limit": 0.01}, r"must be <= 0.01 A in each coil"),
-        ({"coils": 1}, r"plant.coils = 1: must be 2 on a hybrid"),
-        ({"delay": 2}, r"plant.delay = 2: must be 1 on a hybrid"),
-        ({"velocity_per_force": 0.0}, r"plant.velocity_per_force = 0: must be > 0"),
-        ({"mas": 1.0}, r"plant.mas: no such parameter; known: .*crossover.*mass.*plate_current_limit"),
-        ({"plate_rate": 1e4}, r"plant.plate_rate: no such parameter"),
+        ({"coils": 1}, r"device.coils = 1: must be 2 on a hybrid"),
+        ({"delay": 2}, r"device.delay = 2: must be 1 on a hybrid"),
+        ({"velocity_per_force": 0.0}, r"render.velocity_per_force = 0: must be > 0"),
+        ({"mas": 1.0}, r"device.mas: no such parameter; known: .*mass.*plate_current_limit"),
+        ({"plate_rate": 1e4}, r"device.plate_rate: no such parameter"),
     ],
 )
 def test_parameters_are_refused(plant, message):
@@ -327,14 +281,12 @@ def test_parameters_are_refused(plant, message):
 
 
 def test_scenes_are_refused():
-    with pytest.raises(ValueError, match="a recording over time is not shared out"):
+    with pytest.raises(ValueError, match="time-domain recordings are not supported"):
         loop.prepare(scene(hr.Synthetic(amplitude=1e-5)))
     with pytest.raises(ValueError, match="finger: must slide faster"):
         loop.prepare(scene(tone(100.0), hr.Finger.still()))
     with pytest.raises(ValueError, match="texture.amplitude asks for an attraction of"):
         loop.prepare(scene(tone(250.0, 1.5)))
-    with pytest.raises(hr.DesignError, match="must be 'h' or 'h2' for a texture over position"):
-        loop.prepare(scene(hr.Grating(amplitude=8e-6, wavelength=1e-3)), method="stiffness")
 
 
 @pytest.mark.parametrize("channels", [{"drive_channels": 2}, {"sensed_channels": 1}])
@@ -344,18 +296,10 @@ def test_drivers_are_refused(channels):
         loop.prepare(scene(tone(100.0)), driver=driver)
 
 
-def test_parts_that_do_not_fit_are_refused():
-    screen = ElectroadhesionScreen(ElectroadhesionParameters(), SLIDE)
-    with pytest.raises(ValueError, match="plate.rate = 5000.0: must be 10000.0"):
-        HybridPlant(Plate(PlateParameters(), SLIDE), screen, 0.64)
-    with pytest.raises(ValueError, match="velocity_per_force=0.0: must be > 0"):
-        HybridPlant(Plate(PlateParameters(rate=RATE), SLIDE), screen, 0.0)
-
-
 def test_a_part_of_which_nothing_is_wanted_is_left_alone():
     session = loop.prepare(scene(tone(40.0)))
     drive, target, _ = session.controller().run(np.zeros((5, 3)), np.zeros(5), np.zeros(5))
-    assert session.model.rubbed is None
+    assert session.model.friction is None
     assert not drive[:, 2].any()
     assert method_named("h2").name == session.controller().method
     assert target.shape == (5, 1)

@@ -1,6 +1,8 @@
-"""The ring: block by block equals sample by sample, refusals come before anything is played, crashes end at rest."""
+"""The loop: block by block equals sample by sample, refusals come before anything is played, crashes end at rest."""
 
 import dataclasses
+import os
+import signal
 
 import numpy as np
 import pytest
@@ -8,7 +10,7 @@ import pytest
 import hapticrender as hr
 from hapticrender import loop
 from hapticrender.drivers.simulated import SimulatedDriver
-from hapticrender.plants.vibrotactile import Plate, PlateParameters
+from hapticrender.plants.plate import Plate, PlateParameters
 
 SPATIAL = hr.Scene(
     texture=hr.Grating(wavelength=1e-3, amplitude=10e-6),
@@ -135,8 +137,8 @@ def test_a_lost_device_ends_at_rest_and_keeps_what_happened(tmp_path):
     driver = Faulty(inner, 2000, lose)
     with pytest.raises(hr.DeviceLost, match="unplugged"):
         hr.render(TONE, driver=driver, journal=tmp_path / "run.au")
-    assert len(hr.Recording.load(tmp_path / "run.au").time) == 1250  # whole chunks of 0.25 s
-    assert not inner.plant._state.current.any()
+    assert len(hr.Recording.load(tmp_path / "run.au").time) == 2000  # every sample played
+    assert not inner.plant.state["current"].any()
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, 1e30])
@@ -151,6 +153,115 @@ def test_a_sensor_gone_mad_leaves_the_drive_finite_limited_and_flagged(bad):
     assert not recording.flags[:1000].any()
 
 
+class Bare(Blocks):
+    """A driver whose exit leaves the device as it is."""
+
+    def __enter__(self):
+        self._driver.__enter__()
+        return self
+
+    def __exit__(self, *exc):
+        pass
+
+
+@pytest.mark.parametrize("fails_at", [None, 40])
+def test_the_loop_itself_ends_with_zero_drive(fails_at):
+    def interrupt(_):
+        raise KeyboardInterrupt
+
+    driver = Bare(simulated(TONE, block=4, delay=8))
+    if fails_at is None:
+        hr.render(TONE, driver=driver)
+    else:
+        play = driver.play
+        driver.play = lambda drive: interrupt(0) if len(driver.played) == fails_at else play(drive)
+        with pytest.raises(KeyboardInterrupt):
+            hr.render(TONE, driver=driver)
+        driver.play = play
+    if fails_at is None:  # the failing play fails again: its zeros cannot come through
+        assert not np.any(driver.played[-2:])
+        assert np.any(driver.played[-3])
+
+
+@pytest.mark.skipif(not hasattr(os, "kill") or os.name == "nt", reason="no SIGTERM on this system")
+def test_sigterm_leaves_the_device_at_rest_and_the_journal_whole(tmp_path):
+    def stop(sensed):
+        os.kill(os.getpid(), signal.SIGTERM)
+        return sensed
+
+    inner = simulated(TONE)
+    with pytest.raises(SystemExit) as ended:
+        hr.render(TONE, driver=Faulty(inner, 700, stop), journal=tmp_path / "run.au")
+    assert ended.value.code == 128 + signal.SIGTERM
+    assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
+    assert len(hr.Recording.load(tmp_path / "run.au").time) in (700, 701)
+    assert not inner.plant.state["current"].any()
+
+
+def test_a_texture_that_returns_nan_is_named_with_its_first_bad_sample():
+    class Broken:
+        def bands(self, rate):
+            return hr.Bands(frequency=[100.0], wavenumber=[0.0], phase=[0.0])
+
+        def waveform(self, time, position):
+            return np.where(np.asarray(time) < 0.3, 1e-6, np.nan)
+
+    with pytest.raises(ValueError, match=r"^Broken.waveform returned nan at t = 0.3 s, x = nan m: must be finite"):
+        hr.render(hr.Scene(texture=Broken(), duration=0.5))
+
+
+def own(bands=lambda rate: hr.Bands(frequency=[100.0], wavenumber=[0.0], phase=[0.0]), waveform=np.zeros_like):
+    """A texture made of two functions."""
+    kind = type("Own", (), {"bands": lambda _, rate: bands(rate), "waveform": lambda _, t, x: waveform(t)})
+    return hr.Scene(texture=kind(), duration=0.1)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "error", "message"),
+    [
+        ({"scene": 3}, TypeError, "scene: must be a Scene or the name of a scene file, not int"),
+        ({"scene": "absent.toml"}, hr.SceneError, "absent.toml: must be a readable file"),
+        ({"driver": SimulatedDriver}, TypeError, r"driver = SimulatedDriver: must be an instance, not the class"),
+        ({"renderer": object()}, TypeError, r"renderer: must be an object with open\(scene, driver\).*not object"),
+        ({"scene": own(lambda rate: None)}, TypeError, "Own.bands returned NoneType: must be hapticrender.Bands"),
+        (
+            {"scene": own(waveform=lambda t: None)},
+            ValueError,
+            "Own.waveform returned NoneType: must be",
+        ),
+        ({"scene": own(waveform=lambda t: t[:-1])}, ValueError, r"Own.waveform returned shape \(\d+,\): must be"),
+    ],
+)
+def test_what_is_handed_over_by_mistake_is_named(arguments, error, message):
+    with pytest.raises(error, match=message):
+        hr.render(**{"scene": TONE, **arguments})
+
+
+def test_a_block_is_a_whole_number():
+    driver = Blocks(simulated(TONE))
+    driver.block = 50.0
+    with pytest.raises(ValueError, match=r"Blocks: block=50.0 must be a whole number >= 1, an int"):
+        hr.render(TONE, driver=driver)
+
+
+def test_a_scene_file_is_rendered_by_its_name_with_its_own_method_and_seed(tmp_path):
+    (tmp_path / "mine.toml").write_text(scene_with(method="paper", seed=4, duration=0.2).to_toml())
+    recording = hr.render(tmp_path / "mine.toml")
+    equal(recording, hr.render(scene_with(duration=0.2), method="paper", seed=4))
+    assert hr.render(str(tmp_path / "mine.toml"), seed=0).scene.seed == 0
+
+
+def test_a_scene_may_state_a_plate_that_the_controller_does_not_assume():
+    """The profile alone, or the same plate simulated behind a wrong profile: the second is noticed."""
+    stiff = {"stiffness_1": 1.05 * 22.4e3, "stiffness_2": 1.05 * 22.9e3}
+    scene = scene_with(duration=3.0, profile=stiff)
+    hr.render(scene)
+    with pytest.warns(hr.PlateMismatch, match=r"dynamic stiffness against the model: \+\d"):
+        hr.render(scene_with(duration=3.0, simulation=stiff))
+    late = loop.prepare(scene_with(simulation={"delay": 5}))
+    assert (late.plant.parameters.delay, late.model.delay) == (5, 1)
+
+
 def scene_with(**changes):
     return dataclasses.replace(TONE, **changes)
 
@@ -162,7 +273,7 @@ def scene_with(**changes):
         (scene_with(texture=hr.Grating(frequency=400.0, amplitude=1e-3)), r"0.001 m at 400 Hz needs 10.6 A.*<= 3 A"),
         (scene_with(finger=hr.Finger.still(position=0.06)), r"finger.position reaches 0.06 m.*0.055 m"),
         (scene_with(device="vt-plat"), r"renderer 'vt-plat' is not installed: must be one of .*vt-plate"),
-        (scene_with(plant={"mas": 1.0}), r"plant.mas: no such parameter"),
+        (scene_with(profile={"mas": 1.0}), r"device.mas: no such parameter"),
     ],
     ids=["nyquist", "current", "glass", "device", "plant"],
 )
@@ -189,7 +300,10 @@ def test_a_plate_that_is_not_the_one_designed_for_is_noticed(frequency):
     """5 % of stiffness asks 3-8 % of the integral part, the plate designed for 0.2 % (noise)."""
     scene = hr.Scene(texture=hr.Grating(frequency=frequency, amplitude=30e-6), duration=3.0)
     hr.render(scene, driver=simulated(scene))
-    with pytest.warns(hr.PlateMismatch, match=r"integral part makes up for [3-8]\.\d % of a target \(bound 3 %\)"):
+    with pytest.warns(
+        hr.PlateMismatch,
+        match=rf"adds [3-8]\.\d % .* \(bound 3 %\).* at {frequency:g} Hz; .*identify",
+    ):
         hr.render(scene, driver=simulated(scene, stiffness_1=1.05 * 22.4e3, stiffness_2=1.05 * 22.9e3))
 
 

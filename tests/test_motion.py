@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from hapticrender.touch.motion import Nowhere, Sampled, Sliding, Still, Swiping
+from hapticrender.touch.motion import Nowhere, Sampled, SineMotion, Still, TriangleMotion
 
 TIME = np.arange(0, 4, 1e-3)
 
@@ -14,7 +14,7 @@ def test_a_still_finger_stays_and_no_finger_is_nowhere():
 
 
 def test_sliding_keeps_its_speed_and_its_ends():
-    motion = Sliding(speed=0.08, span=0.05, centre=0.01)
+    motion = TriangleMotion(speed=0.08, span=0.05, centre=0.01)
     position = motion.position(TIME)
     speed = np.abs(np.diff(position)) / 1e-3
     assert position[0] == pytest.approx(0.01, abs=1e-15)
@@ -26,15 +26,15 @@ def test_sliding_keeps_its_speed_and_its_ends():
 
 
 def test_sliding_is_exact_late_in_a_long_run():
-    motion = Sliding(speed=0.1, span=0.05)
+    motion = TriangleMotion(speed=0.1, span=0.05)
     np.testing.assert_allclose(motion.position(3600.0 + TIME), motion.position(TIME), atol=1e-12)
 
 
 def test_swiping_reaches_its_peak_speed():
-    motion = Swiping(frequency=3.0, speed=0.05)
+    motion = SineMotion(frequency=3.0, speed=0.05)
     speed = np.abs(np.diff(motion.position(TIME))) / 1e-3
     assert speed.max() == pytest.approx(0.05, rel=(np.pi * 3 * 1e-3) ** 2)
-    by_stroke = Swiping(frequency=3.0, stroke=0.05 / (np.pi * 3.0))
+    by_stroke = SineMotion(frequency=3.0, stroke=0.05 / (np.pi * 3.0))
     np.testing.assert_allclose(by_stroke.position(TIME), motion.position(TIME), atol=1e-15)
 
 
@@ -48,12 +48,12 @@ def test_sampled_positions_are_joined_and_held():
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: Sliding(speed=-0.1), r"speed = -0.1: must be .* > 0 and <= 10 m/s"),
-        (lambda: Sliding(speed=80), r"speed = 80: must be .* m/s"),
-        (lambda: Sliding(speed=0.1, span=0.0), r"span = 0.0: must be .* m"),
+        (lambda: TriangleMotion(speed=-0.1), r"speed = -0.1: must be .* > 0 and <= 10 m/s"),
+        (lambda: TriangleMotion(speed=80), r"speed = 80: must be .* m/s"),
+        (lambda: TriangleMotion(speed=0.1, span=0.0), r"span = 0.0: must be .* m"),
         (lambda: Still(2.0), r"at = 2.0: must be .* <= 1 m"),
-        (lambda: Swiping(frequency=0.0, speed=0.1), r"frequency = 0.0: must be .* Hz"),
-        (lambda: Swiping(frequency=3.0), r"speed, stroke: exactly one must be given"),
+        (lambda: SineMotion(frequency=0.0, speed=0.1), r"frequency = 0.0: must be .* Hz"),
+        (lambda: SineMotion(frequency=3.0), r"speed, stroke: exactly one must be given"),
         (lambda: Sampled(positions=[], rate=1.0), r"positions = \[\]: must be a list of 1"),
         (lambda: Sampled(positions=[0.0, np.nan], rate=1.0), r"positions\[1\] = nan: must be a finite number"),
         (lambda: Sampled(positions=[0.0, True], rate=1.0), r"positions = .*: must be a list"),

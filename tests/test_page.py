@@ -1,13 +1,14 @@
 """The page: opens from a file with nothing but itself and the files beside it, and says plainly what missed."""
 
+import json
 from html.parser import HTMLParser
-from pathlib import Path
 
 import pytest
 
-from hapticrender import wording
-from hapticrender.charts.page import page, write_page
-from hapticrender.outputs import Outputs, round_up
+from hapticrender import formatting
+from hapticrender.report import text as wording
+from hapticrender.report.outputs import Outputs, round_up
+from hapticrender.report.page import page, refuse_foreign_page, write_page
 from hapticrender.touch.builtin import builtin_scenes
 from hapticrender.touch.grating import Grating
 from hapticrender.touch.scene import Scene
@@ -56,7 +57,7 @@ def band(errors, frequency=170.0, wavelength=None, target=1e-5):
 
 def summary(bands, name="grating", notes=()):
     value, place, label = max(
-        (abs(b[f"rms_error_{p}"]), p, wording.band_label(b)) for b in bands for p in wording.PLACES
+        (abs(b[f"rms_error_{p}"]), p, formatting.band_label(b)) for b in bands for p in wording.PLACES
     )
     return {
         "scene": name,
@@ -68,7 +69,10 @@ def summary(bands, name="grating", notes=()):
         "duration": 4.0,
         "judged_from": 1.0,
         "tolerance": 0.1,
+        "verdict": "passed" if value <= 0.1 else "failed",
         "passed": value <= 0.1,
+        "reason": "",
+        "motion_source": "true",
         "worst": {"figure": f"rms_error_{place}", "value": value, "band": label, "place": place},
         "bands": bands,
         "wobble": 4.1e-8,
@@ -91,6 +95,13 @@ BAD = band((1.29, 0.5, 4.19))
 def test_the_page_needs_nothing_but_the_files_beside_it(tmp_path):
     scenes = [outputs(tmp_path, [GOOD], "good one"), outputs(tmp_path, [BAD], "bad")]
     path = write_page(tmp_path, scenes)
+    report = json.loads((tmp_path / "summary.json").read_text(encoding="utf-8"), parse_constant=pytest.fail)
+    assert [scene["scene"] for scene in report["scenes"]] == ["good one", "bad"]
+    refuse_foreign_page(tmp_path)
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other" / "index.html").write_text("<p>mine</p>")
+    with pytest.raises(ValueError, match="from no earlier run"):
+        refuse_foreign_page(tmp_path / "other")
     for scene in scenes:
         scene.folder.mkdir()
         for name in FILES:
@@ -98,7 +109,7 @@ def test_the_page_needs_nothing_but_the_files_beside_it(tmp_path):
     read = Reader(path.read_text(encoding="utf-8"))
     assert path == tmp_path / "index.html"
     assert not read.tags & {"script", "link", "iframe"}
-    assert len(read.addresses) == 2 * (1 + 2 + 2 + 5)  # a row's link, picture and its link, two players, five files
+    assert len(read.addresses) == 2 * (2 + 2 + 2 + 5)  # row and contents, picture and its link, players, files
     for address in read.addresses:
         if address.startswith("#"):
             assert address[1:] in (scene_id.replace(" ", "%20") for scene_id in read.ids)
@@ -110,8 +121,8 @@ def test_a_miss_is_said_with_its_figure(tmp_path):
     text = Reader(page(tmp_path, [outputs(tmp_path, [GOOD], "a"), outputs(tmp_path, [BAD], "b")])).text
     sentence = "misses its tolerance: worst figure rms error of the 170 Hz band at end 2 = 419 %, tolerance 10 %"
     assert text.replace("\xa0", " ").lower().count(sentence.lower()) == 2  # in the table and in its section
-    assert "1 of 2 here does." in text
-    assert "within 10 %" in text
+    assert "1 of 2\nare within their tolerance, 1 miss it." in text
+    assert "within 10\xa0%" in text
     assert "158 nm rms" in text
 
 
@@ -121,6 +132,13 @@ def test_nothing_in_a_scene_becomes_markup(tmp_path):
     read = Reader(html)
     assert "script" not in read.tags
     assert read.text.count(nasty) == 2
+
+
+def test_amplitudes_of_one_unit_share_one_prefix(tmp_path):
+    large, small = band((0.0, 0.0, 0.0), target=2e-3), band((0.0, 0.0, 0.0), target=1e-6)
+    html = page(tmp_path, [outputs(tmp_path, [large], "a"), outputs(tmp_path, [small, large], "b")])
+    assert html.count("<td>2.00 mm</td>") == 8  # overview and bands, target and achieved
+    assert html.count("<td>0.00100 mm</td>") == 2
 
 
 def test_without_a_picture_the_page_says_why(tmp_path):
@@ -139,49 +157,12 @@ def test_many_bands_fold_and_add_up(tmp_path):
 def test_missing_figures_are_dashes(tmp_path):
     empty = {key: None for key in GOOD} | {"frequency": 20.0}
     scene = outputs(tmp_path, [GOOD])
-    scene.summary.update(bands=[empty], passed=False, worst=dict.fromkeys(("figure", "value", "band", "place")))
+    why = {"verdict": "not judged", "passed": False, "reason": "no band has a target"}
+    scene.summary.update(bands=[empty], worst=dict.fromkeys(("figure", "value", "band", "place")), **why)
     text = Reader(page(tmp_path, [scene])).text
-    assert "cannot be judged" in text
+    assert text.lower().count("not judged: no band has a target") == 2
+    assert "0 of 1\nare within their tolerance, 0 miss it, 1 cannot be judged." in text
     assert "None" not in text
-
-
-@pytest.mark.parametrize(
-    ("value", "written"),
-    [
-        (1.0016e-5, "10.0 µm"),
-        (9.996e-6, "10.0 µm"),
-        (9.994e-6, "9.99 µm"),
-        (99.96e-6, "100 µm"),
-        (999.6e-6, "1.00 mm"),
-        (4.13e-8, "41.3 nm"),
-        (0.0, "0 m"),
-        (-2.5e-6, "-2.50 µm"),
-        (float("nan"), "–"),
-        (None, "–"),
-    ],
-)
-def test_quantities_have_three_digits(value, written):
-    assert wording.quantity(value, "m") == written
-
-
-@pytest.mark.parametrize(
-    ("ratio", "written"), [(4.19, "419 %"), (0.0951, "9.51 %"), (-0.00012, "-0.0120 %"), (0.0, "0 %")]
-)
-def test_errors_have_three_digits(ratio, written):
-    assert wording.percent(ratio) == written
-
-
-def test_angles_are_in_degrees():
-    assert wording.degrees(-0.00001) == "0.0°"
-    assert wording.degrees(-1.0) == "-57.3°"
-
-
-def test_bands_are_called_by_what_they_hold_fast():
-    assert wording.band_label({"frequency": 62.5, "wavelength": None}) == "62.5 Hz"
-    assert wording.band_label({"frequency": None, "wavelength": 1e-3}) == "1 mm"
-    assert wording.band_label({"frequency": 171.3, "wavelength": 468.3e-6}) == "468.3 µm (171 Hz)"
-    assert wording.band_label({"frequency": 1234.0, "wavelength": 1e-3}) == "1 mm (1230 Hz)"
-    assert wording.band_label({"frequency": 0.0, "wavelength": None}) == "0 Hz"
 
 
 @pytest.mark.parametrize("peak", [1e-9, 1.0, 1.01, 2.0, 4.99, 9.99, 3.7e-5])
@@ -190,30 +171,6 @@ def test_full_scale_is_round_and_just_above_the_peak(peak):
     assert peak <= full_scale * (1 + 1e-12)
     assert full_scale <= 2.5 * peak * (1 + 1e-12)  # the widest step of 1, 2, 5, 10 is from 2 to 5
     assert f"{full_scale:e}"[0] in "125"
-
-
-def test_the_page_links_only_below_itself(tmp_path):
-    with pytest.raises(ValueError, match="is not in the subpath"):
-        page(tmp_path / "elsewhere", [outputs(Path("/somewhere"), [GOOD])])
-
-
-def test_a_device_that_judges_a_quantity_says_so():
-    worst = {"figure": "rms_error_friction", "value": 0.002, "band": "50 Hz", "place": "friction"}
-    assert wording.worst_figure({"worst": worst}) == "rms error of friction in the 50 Hz band = 0.200 %"
-    worst = {"figure": "rms_error_end_2", "value": 0.5, "band": "50 Hz", "place": "end 2"}
-    assert wording.worst_figure({"worst": worst}) == "rms error of the 50 Hz band at end 2 = 50.0 %"
-
-
-@pytest.mark.parametrize(
-    ("places", "title"),
-    [(["centre"], "centre"), (["skin", "skin"], "skin"), (["centre", "friction", "skin"], "at the finger"),
-     (["friction", "centre"], "at the finger")],
-)  # fmt: skip
-def test_the_first_column_is_headed_by_what_all_devices_share(places, title):
-    """A scene with no figures counts as a plate."""
-    summaries = [{"bands": [{f"rms_error_{place}": 0.1}]} for place in places]
-    assert wording.titles(summaries) == [title, "end 1", "end 2"]
-    assert wording.titles([*summaries, {"bands": []}])[0] == ("centre" if title == "centre" else "at the finger")
 
 
 def test_a_scene_is_described_with_its_partials_and_its_device():

@@ -6,18 +6,11 @@ import numpy as np
 import pytest
 
 import hapticrender as hr
-from benchmarks.numpy_loop import NumpyPlate, NumpyPolar, run
+from benchmarks.numpy_loop import NumpyPolar
 from hapticrender.bands import Bands
-from hapticrender.control.bank.state import across_bands
-from hapticrender.control.kernels import FAR
 from hapticrender.control.loopshape import TransferFunction, design, margins
-from hapticrender.control.methods import METHODS, method_named
-from hapticrender.control.methods.paper import CommonMode
-from hapticrender.control.polar import passes
-from hapticrender.control.polar.kernels import LOOP_ROWS, X_IM, X_RE
-from hapticrender.control.polar.steps import polar_step
-from hapticrender.control.stdft import StarSTDFT
-from hapticrender.plants.vibrotactile import Plate, PlateParameters
+from hapticrender.control.methods import METHODS, CommonMode, PerSide, method_named
+from hapticrender.plants.plate import Plate, PlateParameters
 from hapticrender.touch.mechanics import HEAVY_SECOND
 
 RATE = 5000.0
@@ -60,143 +53,17 @@ def envelope(motion, frequency, window=0.05):
     return abs(np.convolve(product, np.ones(width) / width, mode="valid"))
 
 
-@pytest.mark.parametrize("method", ["paper", "paper-common"])
-def test_the_kernel_equals_its_naive_twin(method, rng):
-    """Three bands with odd phases; both run the same arithmetic in another order, for 2000 samples."""
-    parameters = PlateParameters(**IDEAL)
-    bands = dataclasses.replace(
-        tones((47.0, 1e-5), (111.0, 3e-6), (261.0, 1e-6), phase=0.7), envelope=np.array([1e-5, 3e-6j, -1e-6 + 2e-7j])
-    )
-    controller = METHODS[method].design(parameters.band_model(RATE, 1), bands)
-    plate = Plate(parameters, hr.Finger.absent())
-    expected, sensed = run(NumpyPolar(controller.tables), NumpyPlate(parameters), 2000, np.zeros((2000, 2)))
-    drive, target, _, measured = plate.closed_loop(controller, np.zeros(2000))
-    assert abs(drive).max() > 1e-3
-    np.testing.assert_allclose(measured.sensed, sensed, rtol=0, atol=1e-9 * abs(sensed).max())
-    np.testing.assert_allclose(drive, expected, rtol=0, atol=1e-9 * abs(expected).max())
-    np.testing.assert_allclose(target, np.broadcast_to(bands.envelope, target.shape), rtol=1e-12)
-
-
-def changing(controller, rng):
-    """Ask for other amplitudes and directions from now on."""
-    count = controller.n_bands
-    wanted = 1e-6 * (rng.standard_normal(count) + 1j * rng.standard_normal(count))
-    controller.tables.tone[3], controller.tables.tone[4] = wanted.real, wanted.imag
-    return wanted
-
-
-def test_passes_follow_targets_that_turn(rng):
-    """Open loop: 1.8e-10 of the magnitude, 2.3e-10 of the angle and 1.4e-10 of the cosine add up to less than 1e-9."""
-    bands = tones(*((f, 1e-6) for f in np.linspace(20.0, 400.0, 20)), phase=0.2)
-    controller = METHODS["paper"].design(PlateParameters().band_model(RATE, 1), bands)
-    twin, sensed, nothing = NumpyPolar(controller.tables), 1e-6 * rng.standard_normal((1024, 2)), np.zeros(64)
-    for start in range(0, 1024, 64):
-        wanted = changing(controller, rng)
-        twin.wanted, twin.unit = abs(wanted), np.exp(1j * np.angle(wanted))
-        drive, target, _ = controller.run(sensed[start : start + 64], nothing, nothing)
-        expected = np.array([twin.step(each) for each in sensed[start : start + 64]])
-        assert abs(drive - expected).max() <= 1e-9 * abs(expected).max()
-        np.testing.assert_allclose(target[-1], wanted, rtol=1e-14)
-
-
-def test_passes_equal_steps_where_a_carrier_comes_and_goes_with_the_finger(rng):
-    """A tile leaves its frame when a carrier follows the finger and returns to it; there is silence, too.
-
-    Only the cosine differs, by 1.4e-10, and the order of sums.
-    """
-    bands = tones(*((f, 1e-6) for f in np.linspace(20.0, 400.0, 20)), phase=0.2)
-    model = PlateParameters().band_model(RATE, 1)
-    blocks, steps = (METHODS["paper"].design(model, bands) for _ in range(2))
-    sensed, place, nothing = 1e-6 * rng.standard_normal((960, 2)), np.linspace(0.0, 2e-3, 960), np.zeros(48)
-    stepped, seed = np.zeros((48, 2)), rng.integers(2**32)
-    target = np.zeros(20, complex)
-    for start in range(0, 960, 48):
-        for controller in (blocks, steps):
-            wanted = changing(controller, np.random.default_rng(seed + start))
-            if start // 48 % 4 == 3:
-                controller.tables.tone[3:] = 0.0 * wanted.real
-            controller.tables.tone[1, 5] = 1000.0 if start // 48 % 5 == 2 else 0.0
-        drive, _, _ = blocks.run(sensed[start : start + 48], place[start : start + 48], nothing)
-        for m in range(48):
-            polar_step(steps.tables, steps.state, sensed[start + m], place[start + m], 0.0, stepped[m], target)
-        assert abs(drive).max() > 0.0
-        assert abs(drive - stepped).max() <= 1e-9 * abs(stepped).max()
-
-
-@pytest.mark.parametrize("event", ["none", "lift", "jump", "far", "sensor", "nan sensor", "target", "waveform"])
-def test_blocks_tell_all_tiles_what_single_samples_tell(event, rng):
-    """Of a finger that stays in one sweep, of anything else sample by sample: place, speed, gate, trust and flags.
-
-    A carrier follows the finger, so that all of them are heard; the cosine is good to 1.4e-10.
-    """
-    bands = tones(*((f, 1e-6) for f in np.linspace(20.0, 400.0, 9)))
-    if event in ("waveform", "target"):
-        bands = dataclasses.replace(bands, envelope=None)
-    model = PlateParameters().band_model(RATE, 1)
-    blocks, steps = (METHODS["paper"].design(model, bands) for _ in range(2))
-    for controller in (blocks, steps):
-        controller.tables.tone[1, 5] = 1000.0
-    count = 960
-    sensed, place, wanted = 1e-6 * rng.standard_normal((count, 2)), np.linspace(0.0, 20e-3, count), np.zeros(count)
-    changed = {"lift": place, "jump": place, "far": place, "target": wanted}.get(event, sensed[:, 0])
-    value = {"lift": np.nan, "jump": 15e-3, "far": 2e3, "target": 2e3, "sensor": 1.0, "nan sensor": np.nan}
-    if event == "waveform":
-        wanted[:] = 1e-6 * rng.standard_normal(count)
-    elif event != "none":
-        changed[429:447] = value[event]
-    stepped, flags, target = np.zeros((count, 2)), np.zeros(count, np.int64), np.zeros(9, complex)
-    for m in range(count):
-        flags[m] = polar_step(steps.tables, steps.state, sensed[m], place[m], wanted[m], stepped[m], target)
-    drive, _, raised = blocks.run(sensed, place, wanted)
-    assert ((raised & 2) > 0).any() == (event not in ("none", "lift", "jump", "waveform"))
-    np.testing.assert_array_equal(raised, flags)
-    np.testing.assert_allclose(drive, stepped, rtol=0, atol=1e-9 * abs(stepped).max())
-    for name in ("finger", "doubt"):
-        np.testing.assert_allclose(getattr(blocks.state, name), getattr(steps.state, name), rtol=1e-12, atol=1e-15)
-
-
-@pytest.mark.parametrize(
-    ("event", "steady"),
-    [("none", True), ("fast", True), ("lift", False), ("jump", False), ("far", False), ("sensor", False)],
-)
-def test_a_block_is_told_in_one_sweep_where_the_finger_stays(event, steady):
-    """A finger may be fast, as long as it is in one piece: 1 m/s in 64 samples is a jump for none but the last."""
-    controller = METHODS["paper"].design(PlateParameters().band_model(RATE, 1), tones((47.0, 1e-6)))
-    sensed, place, nothing = np.zeros((64, 2)), np.full(64, FAR - 1e-3), np.zeros(64)
-    for _ in range(4):
-        controller.run(sensed, place, nothing)
-    if event == "fast":
-        place -= np.arange(64) / RATE
-    elif event == "sensor":
-        sensed[40, 0] = 1.0
-    elif event != "none":
-        place[40:] = {"lift": np.nan, "jump": 0.0, "far": FAR + 5e-4}[event]
-    passes.sense_all(controller.tables, controller.state, sensed)
-    assert passes.steady(controller.tables, controller.state, place, nothing) == steady
-
-
-@pytest.mark.parametrize("rate", [2000.0, 5000.0, 48000.0])
-def test_sections_have_the_form_that_the_kernels_take_for_granted(rate):
-    """Both zeros at half the rate, and the law's pole at 1, to the rounding of the bilinear transform."""
-    controller = METHODS["paper"].design(PlateParameters().band_model(rate, 1), tones((47.0, 1e-5)))
-    for section in (controller.tables.numbers.filter, controller.tables.numbers.law):
-        np.testing.assert_allclose(np.array(section[1:3]) / section[0], [2.0, 1.0], rtol=4e-16)
-    assert abs(1.0 + sum(controller.tables.numbers.law[3:])) <= 4e-16
-
-
-def test_it_listens_through_the_documented_estimator(rng):
-    """X of each side and band is what `StarSTDFT`, whose response is proven, makes of the same samples."""
-    parameters = PlateParameters(**IDEAL)
-    bands = tones((47.0, 1e-5), (111.0, 1e-5))
-    controller = METHODS["paper"].design(parameters.band_model(RATE, 1), bands)
-    sensed = 1e-5 * rng.standard_normal((400, 2))
-    controller.run(sensed, np.zeros(400), np.zeros(400))
-    phase = bands.carrier_phase(np.arange(400) / RATE, np.zeros(400))
-    sides = sensed @ controller.tables.listen.T
-    heard = StarSTDFT(bandwidth=10.0, rate=RATE).start(channels=2, bands=2).run(sides, phase)[-1]
-    for side in range(2):
-        re, im = (across_bands(controller.state.loop, side * LOOP_ROWS + part, 2) for part in (X_RE, X_IM))
-        np.testing.assert_allclose(re + 1j * im, heard[side], rtol=1e-9)
+def test_the_kernel_equals_its_naive_twin(rng):
+    """Open loop on random samples, three bands with odd phases: the cosine's 2e-10 and the order of sums differ."""
+    frequency, phase, target = np.array([47.0, 111.0, 261.0]), np.array([0.7, 0.1, 1.0]), np.array([1e-5, 3e-6j, -1e-6])
+    bands = Bands(frequency=frequency, wavenumber=np.zeros(3), phase=phase, envelope=target)
+    controller = PerSide(bandwidths=(5.0, 10.0)).design(PlateParameters().band_model(RATE, 1), bands)
+    sensed = 1e-6 * rng.standard_normal((2000, 2))
+    drive, found, _ = controller.run(sensed, np.zeros(2000), np.zeros(2000))
+    twin = NumpyPolar(frequency, phase, target)
+    expected = np.array([twin.step(each) for each in sensed])
+    np.testing.assert_allclose(drive, expected, rtol=0, atol=2e-9 * abs(expected).max())
+    np.testing.assert_allclose(found[-1], target, rtol=1e-12)
 
 
 BASELINE = [20.0, 31.0, 47.0, 72.0, 111.0, 261.0, 400.0]
@@ -205,7 +72,7 @@ BASELINE = [20.0, 31.0, 47.0, 72.0, 111.0, 261.0, 400.0]
 @pytest.mark.parametrize("frequency", BASELINE)
 @pytest.mark.parametrize("wanted", [10e-6, 100e-6])
 def test_baseline_holds_on_the_free_plate(frequency, wanted):
-    """Issue A: <= 0.3 % with noise and <= 0.15 % without, centre and ends, 14-bit sensing and 12-bit command included.
+    """<= 0.3 % with noise and <= 0.15 % without, centre and ends, 14-bit sensing and 12-bit command included.
 
     Averaged over 20 s: the loop follows the noise of the mean, sqrt(2/N) um = 0.045 % of 10 um, 3 sigma < 0.14 %.
     """
@@ -216,7 +83,7 @@ def test_baseline_holds_on_the_free_plate(frequency, wanted):
 
 
 def test_two_sides_apart_fail_at_170_hz_and_common_mode_does_not():
-    """FACTS 2 row 4: centre +129 %, far end +419 %, one side stuck at zero; off-diagonal gain 1294 against 347 um/A."""
+    """centre +129 %, far end +419 %, one side stuck at zero; off-diagonal gain 1294 against 347 um/A."""
     model = PlateParameters().band_model(RATE, 1)
     sides = abs(model.side_from_coordinate @ model.response(170.0)) * 1e6
     np.testing.assert_allclose([sides[0, 1], sides[0, 0]], [1294, 347], rtol=0.01)
@@ -228,19 +95,19 @@ def test_two_sides_apart_fail_at_170_hz_and_common_mode_does_not():
     _, sensed, _ = close(tones((170.0, 10e-6)), 6.0, overrides=QUIET, method="paper-common")
     error = amplitude(sensed.motion, 170.0, 1.0) / 10e-6 - 1.0
     assert abs(error[0]) < 0.005
-    assert abs(error[1:]).max() == pytest.approx(0.066, abs=0.001)  # reports/control.md, "6.6 @170"
+    assert abs(error[1:]).max() == pytest.approx(0.066, abs=0.001)  # "6.6 @170"
 
 
 @pytest.mark.parametrize(("frequency", "stable"), [(125, True), (131, False), (147, False), (188, False), (192, True)])
 def test_two_sides_apart_are_unstable_between_129_and_189_hz(frequency, stable):
-    """From the eigen-loops rho = rocking/heave receptance (FACTS 2 row 4); 2 and 3 Hz outside, growth is slow."""
+    """From the eigen-loops rho = rocking/heave receptance ; 2 and 3 Hz outside, growth is slow."""
     _, sensed, _ = close(tones((float(frequency), 10e-6)), 41.0, overrides=IDEAL)
     error = abs(amplitude(sensed.motion, frequency, 1.0) / 10e-6 - 1.0).max()
     assert error < 0.01 if stable else error > 0.1
 
 
 def test_common_mode_leaves_the_ends_off_by_30_percent_at_143_hz():
-    """FACTS 3: worst end error of the polar common mode on the free plate, 29.7 %."""
+    """worst end error of the polar common mode on the free plate, 29.7 %."""
     _, sensed, _ = close(tones((143.0, 10e-6)), 8.0, overrides=QUIET, method="paper-common")
     error = abs(amplitude(sensed.motion, 143.0, 2.0) / 10e-6 - 1.0)
     assert error[0] < 0.005
@@ -257,11 +124,11 @@ def test_common_mode_leaves_the_ends_off_by_30_percent_at_143_hz():
     ],
 )
 def test_a_press_blinds_it_at_low_frequency(frequency, wanted, position, expected, within):
-    """FACTS 1: 0.5 N sags 11 um, which leaks through L; the paper says that it ignores the load.
+    """0.5 N sags 11 um, which leaks through L; the paper says that it ignores the load.
 
     The sag adds a phasor of 2 * 11.04 um * |L(20 Hz)| = 5.35 um that turns at 20 Hz, so that the mean of |X| is
     A + 5.35^2/(4 A): it is 10 um at A = 9.22 um, and the 2f image takes another 0.12 %.  That is with the finger in
-    the middle; the -9.8 % of FACTS is found with the finger 10 mm to one side, and 27.5 mm to one side gives -50 %.
+    the middle; -9.8 % is found with the finger 10 mm to one side, and 27.5 mm to one side gives -50 %.
     """
     finger = hr.Finger.still(position=position, normal_load=0.5, mechanics="none")
     _, sensed, _ = close(tones((frequency, wanted)), 14.0, overrides=QUIET, finger=finger)
@@ -270,10 +137,10 @@ def test_a_press_blinds_it_at_low_frequency(frequency, wanted, position, expecte
 
 
 def test_an_equal_load_halves_the_bandwidth_only_at_resonance():
-    """FACTS 1: 3.98 to 2.06 Hz at 189 Hz, against the paper's "50 % decrease" anywhere.
+    """3.98 to 2.06 Hz at 189 Hz, against the paper's "50 % decrease" anywhere.
 
     At the mode the load's damping halves the gain and doubles the amplitude's pole f0/2Q.  At 20 Hz the same damper
-    is 1/270 of the plate's stiffness: gain and bandwidth stay.  FACTS rounds a simulation: within 0.03 Hz.
+    is 1/270 of the plate's stiffness: gain and bandwidth stay.  Rounded from a simulation: within 0.03 Hz.
     """
     plate = PlateParameters()
     mode, damping = (float(values[1]) for values in plate.modes())
@@ -290,7 +157,7 @@ def test_an_equal_load_halves_the_bandwidth_only_at_resonance():
 
 
 def test_a_table_of_the_loaded_plate_limit_cycles_at_lift_off():
-    """FACTS 1: at 189 Hz the free plate has 3.9 x the gain of the loaded one, above the gain margin of 3.5."""
+    """at 189 Hz the free plate has 3.9 x the gain of the loaded one, above the gain margin of 3.5."""
     parameters = PlateParameters(**IDEAL)
     free = parameters.band_model(RATE, 1)
     finger = np.diag([1.0, 0.0])
@@ -309,7 +176,7 @@ def test_a_table_of_the_loaded_plate_limit_cycles_at_lift_off():
 
 
 def test_wobble_with_sensor_noise_is_that_of_the_facts():
-    """FACTS 3: 0.033-0.045 um rms of true motion under 1 um of sensor noise, not the paper's 0.01 um."""
+    """0.033-0.045 um rms of true motion under 1 um of sensor noise, not the paper's 0.01 um."""
     wobble = []
     for frequency in (47.0, 111.0, 261.0):
         _, sensed, _ = close(tones((frequency, 10e-6)), 21.0, overrides={"current_bits": 0})
@@ -401,7 +268,7 @@ def test_drive_stays_finite_and_inside_its_limit_whatever_is_sensed(method, bad,
 
 
 def test_a_long_delay_slows_the_loop_down_until_its_margins_hold():
-    """FACTS 2 row 7: at 5 Hz polar loops bear 30-42 ms; slowed down they hold at 60 ms, and 5 s are refused."""
+    """at 5 Hz polar loops bear 30-42 ms; slowed down they hold at 60 ms, and 5 s are refused."""
     _, sensed, _ = close(tones((111.0, 1e-5)), 12.0, overrides=dict(IDEAL, delay=300), method="paper-common")
     assert amplitude(sensed.motion, 111.0, 2.0)[0] == pytest.approx(1e-5, rel=2e-3)
     naive = CommonMode(bandwidths=(5.0, 10.0))
@@ -417,25 +284,6 @@ def test_a_long_delay_slows_the_loop_down_until_its_margins_hold():
 def test_an_unknown_method_is_refused_with_the_known_ones():
     with pytest.raises(ValueError, match=r"method = 'papper': must be one of paper, paper-common"):
         method_named("papper")
-
-
-@pytest.mark.parametrize("method", ["paper", "paper-common", "boxcar"])
-def test_single_precision_follows_double(method):
-    """FACTS 10: 3.4e-4 of the motion after a few seconds, in delta form; the direct form would be 3 % off."""
-    parameters = PlateParameters(**IDEAL)
-    model = parameters.band_model(RATE, 1)
-    bands = tones((47.0, 1e-5), (111.0, 1e-5), (261.0, 1e-5))
-    motions = []
-    for precision in ("double", "single"):
-        controller = METHODS[method].design(model, bands, precision=precision)
-        motions.append(Plate(parameters, hr.Finger.absent()).closed_loop(controller, np.zeros(20_000))[3].motion)
-    apart = abs(motions[1] - motions[0])[15_000:].max() / abs(motions[0]).max()
-    assert 0 < apart < 3.4e-4
-
-
-def test_a_precision_that_is_none_is_refused():
-    with pytest.raises(ValueError, match="precision='half': must be one of double, single"):
-        METHODS["paper"].design(PlateParameters().band_model(RATE, 1), tones((47.0, 1e-5)), precision="half")
 
 
 def test_blocks_of_any_length_give_the_same(rng):

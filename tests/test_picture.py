@@ -11,9 +11,10 @@ UM = 1e-6
 
 pytest.importorskip("matplotlib", reason="pictures are an extra")
 
-from hapticrender.charts import figures, picture  # noqa: E402
 from hapticrender.recordings.formats import MissingExtra  # noqa: E402
 from hapticrender.recordings.recording import Recorder  # noqa: E402
+from hapticrender.report import figure as figures  # noqa: E402
+from hapticrender.report import picture  # noqa: E402
 
 
 def swiped(**fields):
@@ -65,31 +66,6 @@ def test_the_panels_show_what_was_recorded():
     assert line(errors, "end 1")[1] == pytest.approx([20.0])
     assert "misses its tolerance" in figure.axes[0].texts[-1].get_text()
     assert "±3 A" in panel(figure, "Drive").get_title(loc="left")
-
-
-def test_only_a_true_offset_is_taken_from_the_waveform():
-    """The stretch holds 1.5 periods of the lowest band: its mean, 10 um 2/(3 pi) for a sine, is no offset.
-
-    The other band adds half a period, a sample of the 150 at most, and a sum of samples is off by 0.04 %: 10 um / 140.
-    """
-    bands = make_bands([50.0, 250.0], [10 * UM, 10 * UM], phase=[np.pi / 2, 0.0])
-    for offset in (0.0, 177.0):
-        waveform = panel(
-            picture.draw(make_recording(bands, bands.envelope, duration=2.0, extra=offset * UM)), "Waveform"
-        )
-        _, wanted = line(waveform, "target")
-        assert abs(wanted.mean()) == pytest.approx(10 * 2 / (3 * np.pi), abs=10 / 140)
-        np.testing.assert_allclose(line(waveform, "centre")[1], wanted, atol=1e-6)
-        assert ("offset of 177 µm removed" in waveform.get_title(loc="left")) == bool(offset)
-
-
-def test_bands_over_position_are_labelled_with_their_frequency_too():
-    recording = swiped()
-    labels = [label.get_text() for label in panel(picture.draw(recording), "Rms error").get_xticklabels()]
-    bands = recording.summary()["bands"]
-    assert labels == [
-        f"{size} ({band['frequency']:.3g} Hz)" for size, band in zip(("1 mm", "500 µm"), bands, strict=True)
-    ]
 
 
 def test_windows_that_cannot_be_read_are_gaps():
@@ -174,49 +150,6 @@ def test_the_shortest_runs_are_drawn(tmp_path, samples):
     assert (tmp_path / "x.png").exists()
 
 
-def test_nothing_wanted_is_drawn(tmp_path):
-    bands = make_bands(100.0, 0.0)
-    make_recording(bands, bands.envelope, duration=2.0).plot(tmp_path / "x.png")
-    assert (tmp_path / "x.png").exists()
-
-
-def test_outline_keeps_the_extremes_of_a_long_signal(rng):
-    values = rng.standard_normal(100_003)
-    time, low, high = picture.outline(values, 1000.0)
-    assert len(time) == picture.COLUMNS
-    assert (low.min(), high.max()) == (values.min(), values.max())
-    assert time[0] < 0.1 < 99.9 < time[-1] < 100.003
-    short = picture.outline(values[:7], 1000.0)
-    np.testing.assert_array_equal(short[0], np.arange(7) / 1000)
-    np.testing.assert_array_equal(short[1], values[:7])
-
-
-def test_a_gap_in_the_signal_is_a_gap_in_its_outline():
-    values = np.ones(14_000)
-    values[70] = np.nan
-    _, low, high = picture.outline(values, 1000.0)
-    assert np.flatnonzero(np.isnan(low)).tolist() == np.flatnonzero(np.isnan(high)).tolist() == [7]
-
-
-def test_without_matplotlib_the_extra_is_named_and_nothing_is_written(tmp_path, monkeypatch):
-    monkeypatch.setitem(sys.modules, "matplotlib", None)
-    with pytest.raises(MissingExtra, match=r"pip install 'hapticrender\[plot\]'"):
-        swiped().plot(tmp_path / "x.png")
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_a_new_figure_has_our_style_only_while_it_is_drawn():
-    import matplotlib
-
-    before = dict(matplotlib.rcParams)
-    with figures.new_figure((5, 3), pads=(0.12, 0.07), style={"axes.grid": False}) as figure:
-        assert matplotlib.rcParams["legend.fontsize"] == figures.STYLE["legend.fontsize"]
-        assert not matplotlib.rcParams["axes.grid"]
-    assert dict(matplotlib.rcParams) == before
-    assert tuple(figure.get_size_inches()) == (5, 3)
-    assert figure.get_layout_engine().get()["w_pad"] == 0.12
-
-
 def test_a_picture_that_fails_leaves_the_older_one(tmp_path):
     path = tmp_path / "x.png"
     path.write_bytes(b"older")
@@ -226,3 +159,44 @@ def test_a_picture_that_fails_leaves_the_older_one(tmp_path):
         figures.save(figure, path)
     assert path.read_bytes() == b"older"
     assert list(tmp_path.iterdir()) == [path]
+
+
+def test_outlines_keep_the_extremes_and_gaps_of_a_long_signal(rng):
+    bands = make_bands(100.0, 10 * UM)
+    recording = make_recording(bands, bands.envelope, duration=20.0, position=1.0)
+    recording.frames[:, recording.header.slices["position"]] = values = rng.standard_normal((100_000, 1))
+    time, low, high = picture.outline(recording, "position")
+    assert len(time) == picture.COLUMNS
+    assert (low.min(), high.max()) == (values.min(), values.max())
+    assert time[0] < 0.02 < 19.98 < time[-1] < 20.0
+    recording.frames[71, recording.header.slices["position"]] = np.nan  # 1400 stretches of 71.4 samples
+    assert np.flatnonzero(np.isnan(picture.outline(recording, "position")[1])).tolist() == [1]
+
+
+@pytest.mark.parametrize(("suffix", "magic"), [(".png", b"\x89PNG"), (".svg", b"<?xml"), (".PDF", b"%PDF")])
+def test_the_ending_chooses_the_format(tmp_path, suffix, magic):
+    assert swiped().plot(tmp_path / f"x{suffix}")
+    assert (tmp_path / f"x{suffix}").read_bytes().startswith(magic)
+
+
+def test_other_endings_are_refused(tmp_path):
+    with pytest.raises(ValueError, match=r"'\.jpg' is no picture format: must be one of \.png, \.svg, \.pdf"):
+        swiped().plot(tmp_path / "x.jpg")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_without_matplotlib_a_warning_names_the_extra_and_the_script_goes_on(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
+    with pytest.warns(UserWarning, match=r"pip install 'hapticrender\[plot\]'; the recording can be saved"):
+        assert swiped().plot(tmp_path / "x.png") is False
+    assert list(tmp_path.iterdir()) == []
+    with pytest.raises(MissingExtra):
+        picture.plot(swiped(), tmp_path / "x.png")
+
+
+def test_motion_from_the_sensors_is_said():
+    bands = make_bands(100.0, 10 * UM)
+    recording = make_recording(bands, bands.envelope, motion_source="sensors", duration=2.0)
+    texts = [text.get_text() for axes in picture.draw(recording).axes for text in axes.texts]
+    assert any("motion from the sensors" in text for text in texts)
+    assert any("errors of the sensors themselves do not show" in text for text in texts)

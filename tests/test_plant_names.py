@@ -1,8 +1,9 @@
-"""A misspelt name in a scene's [plant] table is refused, and every name that would do is listed."""
+"""A misspelt name in a scene's tables is refused, and every name that would do is listed."""
 
 import re
 
 import pytest
+from tables import LEVEL
 
 import hapticrender as hr
 from hapticrender.loop import prepare
@@ -17,26 +18,34 @@ ONE_EACH = {  # of every class of parameters that a kind of device reads from th
 }
 
 
+def opened(device, **fields):
+    return prepare(hr.Scene(texture=TEXTURE, finger=FINGER, device=device, duration=2.0, **fields))
+
+
 def known_of(device):
-    """Names that the refusal of a misspelt one lists."""
-    with pytest.raises(ValueError, match=r"^plant.mispelt: no such parameter; known: ") as refused:
-        prepare(hr.Scene(texture=TEXTURE, finger=FINGER, device=device, duration=2.0, plant={"mispelt": 1.0}))
-    return re.sub(r".*known: ", "", str(refused.value)).split(", ")
+    """Names that the refusals of a misspelt one list."""
+    known = []
+    for field, table in (("simulation", "simulation"), ("rendering", "render")):
+        with pytest.raises(ValueError, match=rf"^{table}.mispelt: no such parameter; known: ") as refused:
+            opened(device, **{field: {"mispelt": 1.0}})
+        names = re.sub(r".*known: ", "", str(refused.value)).split(", ")
+        assert names == sorted(set(names))
+        known += [(name, table) for name in names if name]
+    return {**dict(known), "rate": "device"}
 
 
 @pytest.mark.parametrize("device", ONE_EACH)
 def test_every_name_that_would_do_is_listed_once_and_in_order(device):
-    known = known_of(device)
-    assert set(known) >= ONE_EACH[device]
-    assert known == sorted(set(known))
+    assert set(known_of(device)) >= ONE_EACH[device]
 
 
 @pytest.mark.parametrize("device", ONE_EACH)
 def test_every_name_listed_is_accepted(device):
     """A word is refused for what it is, never for its name: all parameters are numbers or words of a few."""
-    for name in known_of(device):
+    for name, table in known_of(device).items():
+        field = "rendering" if table == "render" else "simulation" if name in LEVEL else "profile"
         with pytest.raises((TypeError, ValueError), match="must be") as refused:
-            prepare(hr.Scene(texture=TEXTURE, finger=FINGER, device=device, duration=2.0, plant={name: "no such word"}))
+            opened(device, **{field: {name: "no such word"}})
         assert re.search(rf"\b{re.sub('^(plate|screen)_', '', name)} = 'no such word'", str(refused.value))
 
 
@@ -47,3 +56,18 @@ def test_the_numbers_of_the_law_are_those_of_the_one_that_is_chosen():
         return str(refused.value)
 
     assert known("fit") != known("load-sharing")
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"rendering": {"mass": 0.03}}, r"render.mass: belongs in \[device\] or \[simulation\]"),
+        ({"profile": {"finger_dynamics": 0}}, r"device.finger_dynamics: belongs in \[simulation\]"),
+        ({"simulation": {"rate": 1e4}}, r"simulation.rate: belongs in \[device\]"),
+        ({"device": "electroadhesion", "profile": {"headroom": 2.0}}, r"device.headroom: belongs in \[render\]"),
+        ({"device": "hybrid", "simulation": {"crossover": 90.0}}, r"simulation.crossover: belongs in \[render\]"),
+    ],
+)
+def test_a_parameter_in_the_wrong_table_is_sent_to_the_right_one(fields, message):
+    with pytest.raises(ValueError, match=message):
+        opened(**{"device": "vt-plate", **fields})

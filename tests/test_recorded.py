@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 import soundfile
 
+import hapticrender as hr
 from hapticrender.errors import SceneError
+from hapticrender.touch import recorded
 from hapticrender.touch.finger import Finger
 from hapticrender.touch.recorded import Recorded, Swipe, Synthetic
 from hapticrender.touch.tribometer import load_swipe, unwrap_counts
@@ -374,3 +376,49 @@ def test_synthetic_components_wax_and_wane():
     texture = Synthetic(amplitude=1e-6, components=1)
     loudness = np.abs(texture.waveform(np.arange(0, 6, 1e-4), np.zeros(60000))).reshape(60, 1000).max(axis=1)
     assert loudness.max() / loudness.min() == pytest.approx(3.0, rel=0.05)  # (1 + 1/2)/(1 - 1/2)
+
+
+def test_a_file_is_bounded_before_it_is_read(tmp_path, monkeypatch):
+    """Headers of a few bytes that would make gigabytes: rate, length and channels are bounded together."""
+    cases = [
+        ("fast.wav", np.zeros(100), 2_000_000_000, {}, "has a rate of 2000000000 Hz: must be"),
+        ("wide.wav", np.zeros((100, 1000), np.int16), 48_000, {}, "1000 channels: must be <= 65536 samples"),
+        ("long.wav", np.zeros(3_000_000), 1000, {"passband": (20.0, 400.0)}, "take 57.* points: must be <= 16777216"),
+        ("loud.wav", np.full(100, 1e300), 8000, {}, "must be a finite number within 1e\\+06 times full scale"),
+    ]
+    for name, values, rate, fields, message in cases:
+        subtype = "DOUBLE" if values.dtype == float else None
+        monkeypatch.setattr(recorded, "MOST_SAMPLES", 1 << 16 if name == "wide.wav" else 1 << 26)
+        soundfile.write(tmp_path / name, values, rate, subtype=subtype)
+        with pytest.raises(SceneError, match=message):
+            Recorded(file=tmp_path / name, amplitude=1e-5, **fields).bands(5000.0)
+
+
+def test_an_archive_is_bounded_by_its_headers_and_by_how_far_its_finger_goes(tmp_path):
+    rate, count = 1000.0, 4000
+    time = np.arange(count) / rate
+    pressed = (time > 1.0) * 1.0
+    good = {"metre_per_count": 1e-6, "lateral_force": pressed * np.sin(400 * time) * 0.1 + pressed * 0.3, "rate": rate}
+    good |= {"normal_force": pressed, "encoder": (time * 50_000).astype(np.int64)}
+    np.savez(tmp_path / "good.npz", **good)
+    assert Swipe(file=tmp_path / "good.npz", amplitude=1e-5).bands(5000.0).wavenumber.size
+    for changes, message in (
+        ({"lateral_force": np.zeros(1 << 25, np.int8)}, r"must be a row of <= 16777216"),
+        ({"metre_per_count": 1e-3}, r"travels 150 m in contact: must be <= 10 m"),
+    ):
+        np.savez_compressed(tmp_path / "bad.npz", **{**good, **changes})
+        with pytest.raises(SceneError, match=message):
+            Swipe(file=tmp_path / "bad.npz", amplitude=1e-5).bands(5000.0)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (([1.0], 100.0), r"signal has shape \(1,\): must be a row of >= 2 finite numbers"),
+        (([1.0, np.nan], 100.0), r"must be a row of >= 2 finite numbers"),
+        (([1.0, 2.0], 0.0), r"rate = 0.0: must be a finite number > 0 Hz"),
+    ],
+)
+def test_carriers_of_what_is_no_signal_are_refused(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        hr.strongest_carriers(*arguments)

@@ -1,21 +1,26 @@
 """What happened is kept while it happens, and leaves in formats that other tools open."""
 
+import contextlib
 import json
 import os
+import pickle
+import re
 import signal
 import subprocess
 import sys
 from pathlib import Path
 
+import hypothesis
 import numpy as np
 import pytest
 import soundfile
+from hypothesis import strategies as st
 from synthetic import RATE, make_bands, make_recorder, make_recording, make_scene, make_signals, times
 
 from hapticrender.recordings import formats, journal
 from hapticrender.recordings.formats import MissingExtra
 from hapticrender.recordings.journal import Header
-from hapticrender.recordings.recording import Recorder, Recording
+from hapticrender.recordings.recording import Recording
 
 UM = 1e-6
 SIGNALS = ("drive", "sensed", "motion", "position", "normal_load", "target", "flags")
@@ -50,15 +55,6 @@ def assert_same(one, other, names=SIGNALS):
     assert one.header.to_json() == other.header.to_json()
 
 
-def test_signals_come_back_as_they_went_in(recording, signals):
-    for name in SIGNALS:
-        np.testing.assert_array_equal(getattr(recording, name), signals[name], err_msg=name)
-        assert getattr(recording, name).dtype.isnative
-    np.testing.assert_array_equal(recording.time, np.arange(2500) / RATE)
-    assert recording.flags.dtype.kind == "i"
-    np.testing.assert_array_equal(recording.read("drive", 10, 20), signals["drive"][10:20])
-
-
 @pytest.mark.parametrize("journal", [None, "run.au"])
 def test_any_split_into_blocks_gives_the_same_recording(recording, bands, signals, tmp_path, rng, journal):
     with make_recorder(journal and tmp_path / journal, bands) as recorder:
@@ -68,16 +64,8 @@ def test_any_split_into_blocks_gives_the_same_recording(recording, bands, signal
         assert_same(recorder.finish(), recording)
 
 
-def test_a_journal_is_mapped_not_held(bands, signals, tmp_path):
-    with make_recorder(tmp_path / "run.au", bands) as recorder:
-        recorder.append(**signals)
-    finished = recorder.finish()
-    assert isinstance(finished.frames, np.memmap)
-    assert recorder._blocks == []
-
-
 def test_the_header_survives_to_the_last_bit(bands, tmp_path):
-    rate = 4009.8 + 1 / 3  # FACTS 1: the authors' loop ran at 4009.8 Hz
+    rate = 4009.8 + 1 / 3  # not a whole number of Hz
     scene = make_scene(name="Grüße ☃", tolerance=0.1 + 0.2, settle=1 / 3)
     with make_recorder(
         tmp_path / "run.au", bands, rate=rate, name="Grüße ☃", tolerance=0.1 + 0.2, settle=1 / 3
@@ -112,23 +100,6 @@ def test_the_annotation_is_json_that_names_every_column(bands, signals, tmp_path
     assert (note["method"], note["seed"], note["drive_limit"]) == ("paper", 7, 3.0)
 
 
-def test_bands_without_constant_envelopes_survive(tmp_path):
-    bands = make_bands(100.0, 1 * UM)
-    object.__setattr__(bands, "envelope", None)
-    recorder = make_recorder(tmp_path / "run.au", bands)
-    recorder.append(**make_signals(bands, 0.0, target=1 * UM, duration=0.1))
-    assert recorder.finish().bands.envelope is None
-
-
-def test_soundfile_reads_a_journal(bands, signals, tmp_path):
-    with make_recorder(tmp_path / "run.au", bands) as recorder:
-        recorder.append(**signals)
-    frames, rate = soundfile.read(tmp_path / "run.au")
-    assert rate == 5000
-    np.testing.assert_array_equal(frames[:, :2], signals["drive"])
-    np.testing.assert_array_equal(frames[:, 7], signals["position"])  # NaN stays NaN
-
-
 @pytest.mark.parametrize("cut", [1, 8, 111, 112, 113])
 def test_a_frame_cut_short_is_left_out(bands, signals, tmp_path, cut):
     path = tmp_path / "run.au"
@@ -159,7 +130,7 @@ while True:
 
 
 @pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="this system has no SIGKILL")
-def test_a_killed_process_leaves_all_but_its_last_second(tmp_path):
+def test_a_killed_process_leaves_all_but_its_last_quarter_second(tmp_path):
     path = tmp_path / "run.au"
     command = [sys.executable, "-c", CHILD, str(path), str(Path(__file__).parent)]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as child:
@@ -170,20 +141,13 @@ def test_a_killed_process_leaves_all_but_its_last_second(tmp_path):
             appended = int(line)
         child.kill()
     loaded = Recording.load(path)
-    assert len(loaded) >= appended - RATE
+    assert len(loaded) > appended - RATE / 4
     np.testing.assert_array_equal(loaded.drive[:, 0], np.arange(len(loaded)))
     heard, _ = soundfile.read(path)
     np.testing.assert_array_equal(heard[:, 0], np.arange(len(heard)))
     assert len(heard) == len(loaded)
     assert loaded.summary()["bands"][0]["target"] == pytest.approx(1e-5)
     assert loaded.summary()["notes"][0].startswith("the run ended after ")
-
-
-def test_all_that_was_appended_is_readable_at_once(bands, signals, tmp_path):
-    recorder = make_recorder(tmp_path / "run.au", bands)
-    with recorder:
-        recorder.append(**signals)
-        assert len(Recording.load(tmp_path / "run.au")) == 2500
 
 
 def test_an_older_journal_stays_until_a_run_has_begun(bands, signals, tmp_path):
@@ -228,14 +192,7 @@ def test_a_run_without_a_sample_is_a_recording_of_none(bands, tmp_path, journal)
     assert empty.target.shape == (0, 2)
 
 
-def test_a_journal_is_named_au_and_a_rate_is_positive(bands, tmp_path):
-    with pytest.raises(ValueError, match=r"run\.wav: a journal .* must end in \.au"):
-        make_recorder(tmp_path / "run.wav", bands)
-    with pytest.raises(ValueError, match=r"rate=0\.0 Hz must be finite and > 0"):
-        make_recorder(None, bands, rate=0.0)
-
-
-@pytest.mark.parametrize("suffix", [".au", ".npz", ".h5", ".hdf5", ".AU", ".HDF5"])
+@pytest.mark.parametrize("suffix", [".au", ".npz", ".h5", ".hdf5", ".mat", ".AU", ".HDF5"])
 def test_what_is_saved_loads_the_same(recording, tmp_path, suffix):
     if suffix.lower() in (".h5", ".hdf5"):
         pytest.importorskip("h5py", reason="HDF5 is an extra")
@@ -243,15 +200,6 @@ def test_what_is_saved_loads_the_same(recording, tmp_path, suffix):
     loaded = Recording.load(tmp_path / f"run{suffix}")
     assert_same(loaded, recording)
     assert loaded.summary() == recording.summary()
-
-
-def test_a_recording_saves_over_the_file_that_it_maps(recording, tmp_path):
-    path = tmp_path / "run.au"
-    recording.save(path)
-    loaded = Recording.load(path)
-    loaded.save(path)
-    assert_same(loaded, recording)
-    assert_same(Recording.load(path), recording)
 
 
 @pytest.mark.parametrize("suffix", [".wav", ".w64", ".rf64"])
@@ -286,41 +234,6 @@ def test_flac_states_its_scales(recording, tmp_path):
     np.testing.assert_allclose(frames[:, 4:] * peak, recording.motion, atol=peak * 2.0**-23)  # 24 bit
 
 
-def test_flac_refuses_more_channels_than_it_holds_and_keeps_the_older_file(tmp_path, recording):
-    wide = Header(
-        **{name: getattr(recording.header, name) for name in Header.__dataclass_fields__} | {"drive_channels": 4}
-    )
-    path = tmp_path / "run.flac"
-    path.write_bytes(b"older")
-    with pytest.raises(ValueError, match=r"9 channels, but FLAC holds at most 8: choose \.w64 or \.au"):
-        formats.write(path, wide, np.zeros((10, len(wide.channels))))
-    assert path.read_bytes() == b"older"
-    assert list(tmp_path.iterdir()) == [path]
-
-
-def test_mat_files_hold_every_signal_by_name(recording, tmp_path):
-    from scipy.io import loadmat
-
-    recording.save(tmp_path / "run.mat")
-    loaded = loadmat(tmp_path / "run.mat")
-    for name in SIGNALS:
-        np.testing.assert_array_equal(np.squeeze(loaded[name]), np.squeeze(getattr(recording, name)))
-    assert loaded["rate"].item() == RATE
-    assert Header.from_json(str(loaded["header"][0])).to_json() == recording.header.to_json()
-
-
-def test_csv_has_names_units_and_every_number(recording, tmp_path, monkeypatch):
-    monkeypatch.setattr(journal, "CHUNK", 999)
-    recording.save(tmp_path / "run.csv")
-    with (tmp_path / "run.csv").open(encoding="utf-8") as file:
-        titles = file.readline().rstrip("\n").split(",")
-    assert titles[:3] == ["time (s)", "drive 1 (A)", "drive 2 (A)"]
-    assert titles[9] == "normal load (N)"
-    numbers = np.loadtxt(tmp_path / "run.csv", delimiter=",", skiprows=1)
-    np.testing.assert_allclose(numbers[:, 1:], recording.frames, rtol=1e-9)  # ten digits
-    np.testing.assert_allclose(numbers[:, 0], recording.time, rtol=1e-9)
-
-
 @pytest.mark.parametrize("verb", ["save", "load"])
 def test_an_unknown_suffix_lists_the_known_ones(recording, tmp_path, verb):
     with pytest.raises(ValueError, match=r"'\.mp3' cannot be .*, known are \.au,.* \.npz"):
@@ -350,33 +263,6 @@ def test_a_truncated_file_is_refused_by_name(recording, tmp_path, suffix, left):
     assert len(str(refused.value).splitlines()) == 1
 
 
-@pytest.mark.parametrize(
-    ("changed", "message"),
-    [
-        ({"motion": np.zeros((5, 3))}, r"run\.npz: not a recording \(motion has shape"),
-        ({"drive": None}, r"run\.npz: not a recording \('drive'"),
-        ({"drive": np.array(1.0)}, r"run\.npz: not a recording \("),
-        ({"flags": np.array(["a"] * 2500)}, r"run\.npz: not a recording \("),
-        ({"header": None}, r"run\.npz: not a recording \('header"),
-        ({"header": np.array("{}")}, r"run\.npz: not a recording of this library \('format'"),
-    ],
-)
-def test_signals_that_do_not_fit_their_header_are_refused_by_name(recording, tmp_path, changed, message):
-    signals = journal.split(recording.header, recording.frames) | {"header": np.array(recording.header.to_json())}
-    np.savez(tmp_path / "run.npz", **{name: value for name, value in (signals | changed).items() if value is not None})
-    with pytest.raises(ValueError, match=message):
-        Recording.load(tmp_path / "run.npz")
-
-
-def test_a_header_takes_the_numbers_of_numpy(bands):
-    scene, rest = make_scene(), {"method": "paper", "rate": np.float32(5000), "bands": bands}
-    recorder = Recorder(
-        None, scene=scene, seed=np.int64(3), drive_channels=np.int32(2), drive_limit=np.float64(3), **rest
-    )
-    again = Header.from_json(recorder.header.to_json())
-    assert (again.seed, again.rate, again.drive_channels, again.drive_limit) == (3, 5000.0, 2, 3.0)
-
-
 def test_files_of_others_are_refused_by_name(tmp_path):
     (tmp_path / "a.au").write_bytes(b"RIFFxxxxxxxx")
     soundfile.write(tmp_path / "b.au", np.zeros((10, 2)), 5000, subtype="DOUBLE")
@@ -388,12 +274,6 @@ def test_files_of_others_are_refused_by_name(tmp_path):
         with pytest.raises(FileNotFoundError) as absent:
             Recording.load(tmp_path / f"none{suffix}")
         assert Path(absent.value.filename) == tmp_path / f"none{suffix}"
-
-
-def test_a_header_of_another_version_is_refused(recording):
-    text = recording.header.to_json().replace('"version": 1', '"version": 99')
-    with pytest.raises(ValueError, match="version=99 of the header is unknown"):
-        Header.from_json(text)
 
 
 @pytest.mark.parametrize("bits", [16, 24])
@@ -416,17 +296,174 @@ def test_sound_is_cut_at_full_scale_and_silent_where_it_is_no_number(tmp_path):
     np.testing.assert_allclose(heard, [0.5, -1, 1, 0, 0, 0], atol=2.0**-23)
 
 
-@pytest.mark.parametrize(("wave", "expected"), [([0.0, -0.25], 0.25), ([0.0, 0.0], 1.0), ([], 1.0), ([np.nan], 1.0)])
-def test_the_scale_of_a_sound_defaults_to_its_peak(tmp_path, wave, expected):
-    assert formats.write_sound(tmp_path / "x.wav", np.array(wave), 5000.0) == expected
+def test_csv_has_a_header_names_units_and_ten_digits(recording, tmp_path, monkeypatch):
+    monkeypatch.setattr(journal, "CHUNK_VALUES", 999)
+    recording.save(tmp_path / "run.csv")
+    comment, titles = (tmp_path / "run.csv").read_text(encoding="utf-8").splitlines()[:2]
+    assert Header.from_json(comment[2:]).to_json() == recording.header.to_json()
+    assert titles.split(",")[:3] == ["time (s)", "drive 1 (A)", "drive 2 (A)"]
+    loaded = Recording.load(tmp_path / "run.csv")
+    np.testing.assert_allclose(loaded.frames, recording.frames, rtol=1e-9)
+    assert loaded.scene == recording.scene
 
 
-def test_bad_wishes_for_a_sound_leave_the_older_file(tmp_path):
-    path = tmp_path / "x.wav"
-    path.write_bytes(b"older")
-    for wish in ({"full_scale": 0.0}, {"full_scale": np.nan}, {"bits": 8}):
-        with pytest.raises(ValueError, match=next(iter(wish))):
-            formats.write_sound(path, np.zeros(5), 5000.0, **wish)
-    with pytest.raises(ValueError, match=r"known are \.flac, \.rf64, \.w64, \.wav"):
-        formats.write_sound(tmp_path / "x.mp3", np.zeros(5), 5000.0)
-    assert path.read_bytes() == b"older"
+def test_foreign_tools_find_time_and_rate(recording, tmp_path):
+    h5py = pytest.importorskip("h5py", reason="HDF5 is an extra")
+    from scipy.io import loadmat
+
+    recording.save(tmp_path / "run.mat")
+    mat = loadmat(tmp_path / "run.mat")
+    recording.save(tmp_path / "run.h5")
+    with h5py.File(tmp_path / "run.h5") as file:
+        assert (file["time"].attrs["unit"], file["rate"].attrs["unit"]) == ("s", "Hz")
+        for found in (mat, file):
+            np.testing.assert_array_equal(np.ravel(found["time"]), recording.time)
+            assert np.ravel(found["rate"])[0] == RATE
+            for name in SIGNALS:
+                np.testing.assert_array_equal(np.squeeze(found[name]), np.squeeze(getattr(recording, name)))
+
+
+@pytest.mark.parametrize("suffix", [".wav", ".w64", ".rf64", ".flac"])
+def test_sound_is_not_loaded_and_says_why(tmp_path, suffix):
+    with pytest.raises(ValueError, match="a sound file cannot be loaded as a recording, because its rate is rounded"):
+        Recording.load(tmp_path / f"run{suffix}")
+
+
+def test_every_block_is_in_the_file_when_an_exception_leaves(bands, signals, tmp_path):
+    path, done = tmp_path / "run.au", 0
+
+    def append(recorder, count):
+        nonlocal done
+        recorder.append(**{name: values[done : done + count] for name, values in signals.items()})
+        done += count
+
+    with contextlib.suppress(RuntimeError), make_recorder(path, bands) as recorder:
+        append(recorder, 25)
+        assert len(Recording.load(path)) == 25  # from the first block on
+        for _ in range(60):
+            append(recorder, 25)
+            assert done - len(Recording.load(path)) < RATE / 4
+        assert len(Recording.load(path)) < done
+        raise RuntimeError("device")
+    loaded = Recording.load(path)
+    assert len(loaded) == done
+    np.testing.assert_array_equal(loaded.drive, signals["drive"][:done])
+
+
+def test_a_journal_cut_while_it_is_open_is_an_error_not_a_crash(bands, signals, tmp_path):
+    with make_recorder(tmp_path / "run.au", bands) as recorder:
+        recorder.append(**signals)
+    recording = recorder.finish()
+    os.truncate(tmp_path / "run.au", 5000)
+    with pytest.raises(ValueError, match=r"run\.au: was cut to fewer than 2500 samples while it was open"):
+        recording.drive  # noqa: B018
+
+
+@pytest.mark.parametrize("start", [0, 7, 2400, 3000])
+@pytest.mark.parametrize("step", [1, 3, 900])
+def test_pieces_of_a_journal_are_those_of_memory(recording, tmp_path, monkeypatch, start, step):
+    monkeypatch.setattr(journal, "CHUNK_VALUES", 1400)
+    recording.save(tmp_path / "run.au")
+    loaded = Recording.load(tmp_path / "run.au")
+    for name in SIGNALS:
+        for stop in (None, 2450, 9999):
+            expected = getattr(recording, name)[start:stop:step]
+            np.testing.assert_array_equal(loaded.read(name, start, stop, step), expected)
+            np.testing.assert_array_equal(recording.read(name, start, stop, step), expected)
+    assert_same(pickle.loads(pickle.dumps(loaded)), recording)
+
+
+def test_the_first_block_states_where_motion_comes_from(bands, signals, tmp_path):
+    with make_recorder(tmp_path / "run.au", bands) as recorder:
+        recorder.append(**signals, motion_source="sensors")
+        recorder.append(**signals, motion_source="true")
+    assert Recording.load(tmp_path / "run.au").header.motion_source == "sensors"
+
+
+CHANGES = [
+    ({"drive_channels": 2**31}, "drive_channels = 2147483648: must be a whole number from 0 to 1024"),
+    ({"drive_unit": 7}, "drive_unit = 7: must be a text"),
+    ({"rate": 0}, "rate = 0"),
+    ({"rate": 1e400}, "rate = inf: must be a number from 0.001 to 1e+09 Hz"),
+    ({"rate": True}, "rate = True"),
+    ({"scene": 5}, "scene = 5: must be TOML text"),
+    ({"seed": -1}, "seed = -1"),
+    ({"name": "a\x1b[2J"}, "name = 'a\\x1b[2J': must be a text of printable characters"),
+    ({"places": ["a", "a", "b"]}, "must be different names"),
+    ({"places": 3}, "places = 3"),
+    ({"profile": [1.0]}, "profile = (1.0,): must be one number a place"),
+    ({"motion_source": "guess"}, "motion_source = 'guess'"),
+    ({"tolerance": None}, "tolerance = None"),
+    ({"bands": {"frequency": ["1"], "wavenumber": [0], "phase": [0]}}, "bands.frequency = '1'"),
+    ({"bands": {"frequency": [1], "wavenumber": [0, 1], "phase": [0]}}, "wavenumber has shape (2,)"),
+    ({"bands": {"frequency": [1], "wavenumber": [0], "phase": [0], "envelope": [1]}}, "bands.envelope"),
+    ({"version": 99}, "version = 99: must be 1"),
+    ({"format": "x"}, "format"),
+    ({"colour": 1}, "fields = ['colour']: must be known to this version"),
+]
+
+
+@pytest.mark.parametrize(("change", "message"), CHANGES, ids=[message[:30] for _, message in CHANGES])
+def test_every_field_of_a_header_is_checked(recording, change, message):
+    values = json.loads(recording.header.to_json()) | change
+    with pytest.raises(ValueError, match=re.escape(message)) as refused:
+        Header.from_json(json.dumps(values), "x.au")
+    assert str(refused.value).startswith("x.au: not a recording of this library (")
+    assert len(str(refused.value)) < 300
+
+
+junk = st.one_of(
+    st.none(), st.booleans(), st.integers(), st.floats(), st.text(max_size=5), st.lists(st.integers(), max_size=3),
+    st.dictionaries(st.text(max_size=3), st.integers(), max_size=2),
+)  # fmt: skip
+
+
+@hypothesis.settings(max_examples=300, suppress_health_check=[hypothesis.HealthCheck.function_scoped_fixture])
+@hypothesis.given(data=st.data())
+def test_no_header_makes_anything_but_a_header_or_a_value_error(recording, data):
+    values = json.loads(recording.header.to_json())
+    place = values if data.draw(st.booleans()) else values["bands"]
+    place[data.draw(st.sampled_from(sorted(place)))] = data.draw(junk)
+    try:
+        header = Header.from_json(json.dumps(values))
+    except ValueError:
+        return
+    assert Header.from_json(header.to_json()).to_json() == header.to_json()
+
+
+@pytest.mark.parametrize(
+    ("changed", "message"),
+    [
+        ({"motion": np.zeros((5, 3))}, r"run\.npz: not a recording \(motion has shape"),
+        ({"drive": None}, r"run\.npz: not a recording \(.*drive"),
+        ({"flags": np.array(["a"] * 2500)}, r"run\.npz: not a recording \("),
+        ({"header": None}, r"run\.npz: not a recording \(.*header"),
+        ({"header": np.array("{}")}, r"run\.npz: not a recording of this library \(format"),
+    ],
+)
+def test_signals_that_do_not_fit_their_header_are_refused_by_name(recording, tmp_path, changed, message):
+    signals = journal.split(recording.header, recording.frames) | {"header": np.array(recording.header.to_json())}
+    np.savez(tmp_path / "run.npz", **{name: value for name, value in (signals | changed).items() if value is not None})
+    with pytest.raises(ValueError, match=message):
+        Recording.load(tmp_path / "run.npz")
+
+
+def test_files_that_would_grow_in_memory_are_refused(recording, tmp_path):
+    h5py = pytest.importorskip("h5py", reason="HDF5 is an extra")
+    header = recording.header.to_json()
+    np.savez_compressed(tmp_path / "bomb.npz", header=np.array(header), drive=np.zeros((1_000_000, 2)))
+    with h5py.File(tmp_path / "bomb.h5", "w") as file:
+        file["header"] = header
+        file.create_dataset("drive", (10**8, 2), "f8", chunks=(1000, 2), compression="gzip")  # 1.6 GB of nothing
+        file["unasked"] = np.zeros(3)
+    with h5py.File(tmp_path / "link.h5", "w") as file:
+        file["header"] = header
+        file["drive"] = h5py.ExternalLink("bomb.h5", "/unasked")
+    from scipy.io import savemat
+
+    savemat(tmp_path / "bomb.mat", {"header": header, "drive": np.zeros((1_000_000, 2))}, do_compression=True)
+    for name, message in (("bomb.npz", "bytes, the file"), ("bomb.h5", "bytes, the file"), ("bomb.mat", "bytes, the")):
+        with pytest.raises(ValueError, match=f"{name}: not a recording .drive has .* {message}"):
+            Recording.load(tmp_path / name)
+    with pytest.raises(ValueError, match="drive: is missing, or no data set of this file"):
+        Recording.load(tmp_path / "link.h5")

@@ -1,5 +1,6 @@
 """Scenes: TOML in and out without loss, and one clear line for whatever is wrong."""
 
+import os
 import pickle
 
 import numpy as np
@@ -16,7 +17,7 @@ from hapticrender.touch.finger import Finger
 from hapticrender.touch.grating import Grating
 from hapticrender.touch.mechanics import FingerMechanics
 from hapticrender.touch.recorded import Recorded, Swipe, Synthetic
-from hapticrender.touch.scene import MOTIONS, TEXTURES, Scene
+from hapticrender.touch.scene import MOTIONS, TEXTURES, Scene, distinct_names
 
 GOOD = """
 duration = 2.0
@@ -28,8 +29,14 @@ wavelength = 1e-3
 motion = "sliding"
 speed = 0.08
 normal_load = 0.4
-[plant]
+[device]
+kind = "vt-plate"
+mass = 0.035
+[simulation]
+seed = 3
 sensor_noise = 0.0
+[render]
+tolerance = 0.05
 """
 
 TONE = Grating(amplitude=1 / 3 * 1e-5, frequency=np.pi * 20)
@@ -67,7 +74,7 @@ def test_the_built_in_scenes_are_those_of_the_demo():
 
 
 def test_built_in_fingers_stay_on_the_glass():
-    """The glass reaches from -55 to 55 mm (FACTS section 1)."""
+    """The glass reaches from -55 to 55 mm (Grigorii et al. 2021)."""
     for scene in builtin_scenes().values():
         position = scene.finger.position(np.arange(0, scene.duration, 1e-3))
         assert not (np.abs(position[np.isfinite(position)]) > 0.055).any()
@@ -92,7 +99,12 @@ def test_every_scene_survives_toml_to_the_last_bit(texture, finger):
         settle=0.0,
         keep_unfelt=texture == "tone",
         name='π "quoted" \x20name',
-        plant={"sensor_noise": 1e-300, "shaped": True, "count": 3, "level of\x7f\n": 'a "b"\x7f\n\\'},
+        method="paper",
+        seed=2**40,
+        gradient=-1 / 7,
+        profile={"sensor_noise": 1e-300, "shaped": True, "count": 3, "level of\x7f\n": 'a "b"\x7f\n\\'},
+        simulation={"mass": 1 / 3},
+        rendering={"crossover": 120.0},
     )
     again = Scene.from_toml_text(scene.to_toml())
     assert again == scene
@@ -120,7 +132,7 @@ def test_an_amplitude_may_be_written_as_velocity_or_level():
 
 def test_bands_that_no_one_feels_are_left_out_unless_the_scene_says_so():
     assert not Scene.from_toml_text(GOOD).keep_unfelt
-    assert Scene.from_toml_text("keep_unfelt = true\n" + GOOD).keep_unfelt
+    assert Scene.from_toml_text(GOOD + "keep_unfelt = true\n").keep_unfelt
     kept = [name for name, scene in builtin_scenes().items() if scene.keep_unfelt]
     assert kept == ["pressing"]
 
@@ -171,9 +183,9 @@ def test_a_texture_over_position_needs_a_finger(texture):
 
 def test_numbers_of_numpy_are_numbers():
     texture = Grating(amplitude=np.float64(1e-6), frequency=np.float32(20), shape="square", harmonics=np.int64(3))
-    plant = {"current_bits": np.int64(14), "sensor_noise": np.float64(0), "on": np.bool_(True)}
-    scene = Scene(texture=texture, duration=np.int32(2), plant=plant)
-    assert [type(value) for value in scene.plant.values()] == [int, float, bool]
+    profile = {"current_bits": np.int64(14), "sensor_noise": np.float64(0), "on": np.bool_(True)}
+    scene = Scene(texture=texture, duration=np.int32(2), profile=profile)
+    assert [type(value) for value in scene.profile.values()] == [int, float, bool]
     assert Scene.from_toml_text(scene.to_toml()) == scene
     assert Synthetic(amplitude=1e-6, seed=np.uint8(3)) == Synthetic(amplitude=1e-6, seed=3)
 
@@ -190,10 +202,7 @@ REFUSED = {
         ("duration = 2.0", "duration = 1979-05-27", r"duration = datetime.date\(1979, 5, 27\): must be"),
         ("duration = 2.0", "duration = 0x" + "f" * 6000, r"duration = an integer beyond 1e30: must be"),
         ("duration = 2.0", "duration = " + "9" * 6000, r"must be TOML"),
-        ("duration = 2.0", "duration = 2.0\ntolerance = nan", r"tolerance = nan: must be a finite number > 0"),
-        ("duration = 2.0", "duration = 2.0\nsettle = -1", r"settle = -1: must be .* >= 0 .* s"),
-        ("duration = 2.0", "duration = 2.0\nkeep_unfelt = 1", r"keep_unfelt = 1: must be true or false"),
-        ("duration = 2.0", "duration = 2.0\nlength = 1", r"length = 1: unknown key; known: texture, finger, device"),
+        ("duration = 2.0", "duration = 2.0\nlength = 1", r"length = 1: unknown key; known: name, duration, texture"),
         ("duration = 2.0", 'duration = 2.0\nname = "../up"', r"name = '../up': must be 1 to 100 printable"),
         ("duration = 2.0", 'duration = 2.0\n"\\n" = 1', r"'\\n' = 1: unknown key"),
     ],
@@ -231,10 +240,23 @@ REFUSED = {
         ("normal_load = 0.4", "mechanics = {order = 2, mas = 1}", r"finger.mechanics.'mas': unknown key"),
         ("normal_load = 0.4", "mechanics = {order = 2, mass = 4}", r"finger.mechanics.mass = 4: must be .* kg"),
     ],
-    "plant": [
-        ("sensor_noise = 0.0", "sensor_noise = nan", r"plant.sensor_noise = nan: must be a finite number"),
-        ("sensor_noise = 0.0", "sensor_noise = [1]", r"plant.sensor_noise = \[1\]: must be a finite number"),
-        ("[plant]\nsensor_noise = 0.0", "plant = 3", r"finger.plant = 3: unknown key"),
+    "device, simulation, render": [
+        ("mass = 0.035", "mass = nan", r"profile.mass = nan: must be a finite number"),
+        ("sensor_noise = 0.0", "sensor_noise = [1]", r"simulation.sensor_noise = \[1\]: must be a finite number"),
+        ("seed = 3", "seed = -1", r"seed = -1: must be an integer >= 0"),
+        ("tolerance = 0.05", "tolerance = nan", r"tolerance = nan: must be a finite number > 0"),
+        ("tolerance = 0.05", "settle = -1", r"settle = -1: must be .* >= 0 .* s"),
+        ("tolerance = 0.05", "keep_unfelt = 1", r"keep_unfelt = 1: must be true or false"),
+    ],
+    "keys of old": [
+        ("[device]", "[plant]", r"plant: is three tables now: .*\[device\].*\[simulation\].*\[render\]"),
+        ("duration = 2.0", "duration = 2.0\ntolerance = 0.1", r"tolerance = 0.1: must stand in the table \[render\]"),
+        ("duration = 2.0", "duration = 2.0\nseed = 1", r"seed = 1: must stand in the table \[simulation\]"),
+        (
+            GOOD,
+            'duration = 1.0\ndevice = "vt-plate"',
+            r"device = 'vt-plate': must be a table now: \[device\] with kind = 'vt-plate'",
+        ),
     ],
 }
 CASES = [case for cases in REFUSED.values() for case in cases]
@@ -250,7 +272,8 @@ def test_a_malformed_scene_is_refused_in_one_line(good, bad, message):
 
 def test_the_text_that_the_cases_spoil_is_good():
     scene = Scene.from_toml_text(GOOD)
-    assert scene.plant == {"sensor_noise": 0.0}
+    assert (scene.profile, scene.simulation, scene.rendering) == ({"mass": 0.035}, {"sensor_noise": 0.0}, {})
+    assert (scene.seed, scene.tolerance) == (3, 0.05)
     assert scene.finger == Finger.sliding(0.08, normal_load=0.4)
 
 
@@ -268,7 +291,7 @@ def test_the_text_that_the_cases_spoil_is_good():
         ),
         (
             b'duration = 1\n[texture]\nkind = "grating"\namplitude = 1e-6\nfrequency = 9\n'
-            b'[finger]\nmotion = "swipe"\nfile = "none.npz"',
+            b'[finger]\nmotion = "recorded"\nfile = "none.npz"',
             r"finger.file = '.*none.npz': must be an existing .npz file",
         ),
     ],
@@ -281,9 +304,21 @@ def test_a_bad_file_is_refused_in_one_line(tmp_path, content, message):
     assert len(str(refused.value).splitlines()) == 1
 
 
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no FIFO on this system")
+def test_a_fifo_is_refused_at_once(tmp_path):
+    os.mkfifo(tmp_path / "pipe")
+    with pytest.raises(SceneError, match="must be a regular file"):
+        Scene.from_toml(tmp_path / "pipe")
+
+
+def test_scenes_of_one_name_are_told_apart_by_number():
+    assert distinct_names(["a", "b", "a"]) == ["a (1)", "b", "a (2)"]
+    assert distinct_names(["a", "a (1)", "a"]) == ["a (2)", "a (1)", "a (3)"]
+
+
 @pytest.mark.parametrize("name", ["absent.toml", ".", "a\0b", "x" * 5000])
 def test_what_is_no_file_is_refused(tmp_path, name):
-    with pytest.raises(SceneError, match=r"must be a readable file"):
+    with pytest.raises(SceneError, match=r"must be a (readable|regular) file"):
         Scene.from_toml(f"{tmp_path}/{name}")
 
 
@@ -293,8 +328,9 @@ def test_what_is_no_file_is_refused(tmp_path, name):
         ({"texture": 3}, r"texture = 3: must be a texture"),
         ({"finger": None}, r"finger is missing: must be a Finger"),
         ({"duration": None}, r"duration is missing"),
-        ({"plant": [1]}, r"plant = \[1\]: must be a table"),
-        ({"plant": {1: 2}}, r"plant = 1: must be a table with texts as keys"),
+        ({"profile": [1]}, r"profile = \[1\]: must be a table"),
+        ({"rendering": {1: 2}}, r"rendering = 1: must be a table with texts as keys"),
+        ({"rendering": {"settle": 2}}, r"rendering.settle: .* give it to Scene as settle"),
         ({"device": ""}, r"device = '': must be 1 to 100"),
     ],
 )
@@ -314,13 +350,17 @@ KEYS = st.sampled_from(
     "touches mechanics load_scaling description order mass damping".split()
 )
 VALUES = st.recursive(LEAVES, lambda inner: st.lists(inner, max_size=4) | st.dictionaries(KEYS, inner, max_size=3))
+OWN = st.sampled_from(["kind", "seed", "method", "tolerance", "settle", "keep_unfelt", "gradient"])
 SCENES = st.fixed_dictionaries(
     {"texture": st.dictionaries(KEYS, VALUES, max_size=5) | VALUES},
     optional={
         "duration": NUMBERS | VALUES,
         "finger": st.dictionaries(KEYS, VALUES, max_size=6) | VALUES,
-        "plant": st.dictionaries(st.text(st.characters(exclude_categories=["Cs"])), VALUES, max_size=2) | VALUES,
-        **{key: VALUES for key in ("tolerance", "settle", "keep_unfelt", "name", "device", "other")},
+        **{
+            key: st.dictionaries(st.text(st.characters(exclude_categories=["Cs"])) | OWN, VALUES, max_size=2) | VALUES
+            for key in ("device", "simulation", "render")
+        },
+        **{key: VALUES for key in ("tolerance", "plant", "name", "other")},
     },
 )
 
@@ -364,7 +404,7 @@ GOOD_TEXTURES = [
     {"kind": "grating", "velocity": 0.01, "wavelength": 1e-3, "speed": 0.1},
     {"kind": "grating", "level": 20, "frequency": 70.0},
     {"kind": "synthetic", "amplitude": 1e-6, "speed": 0.1},
-    {"kind": "foreign", "description": "own"},
+    {"kind": "custom", "description": "own"},
     {"kind": "recorded", "amplitude": 1e-6, "file": "absent.wav"},
 ]
 GOOD_FINGERS = [
@@ -373,7 +413,7 @@ GOOD_FINGERS = [
     {"motion": "sliding", "speed": 0.1, "mechanics": "heavy"},
     {"motion": "swiping", "frequency": 3.0, "stroke": 0.05, "load_scaling": True, "mechanics": "light"},
     {"motion": "sampled", "positions": [0.0, 0.1], "times": [0.0, 1.0], "mechanics": "auto"},
-    {"motion": "swipe", "file": "absent.npz"},
+    {"motion": "recorded", "file": "absent.npz"},
 ]
 
 

@@ -7,9 +7,9 @@ import pytest
 from synthetic import RATE, make_bands, make_scene, make_signals, times
 
 import hapticrender as hr
+from hapticrender.formatting import quantity
 from hapticrender.recordings.recording import Recorder
 from hapticrender.skin import felt_bands, residual_velocity, skin_waveform, velocity_per_unit
-from hapticrender.wording import quantity
 
 FINGER = hr.Finger.sliding(speed=0.08, normal_load=0.4, mechanics="light")
 
@@ -37,7 +37,7 @@ def test_a_friction_moves_it_by_the_fingers_admittance_where_the_scene_says_so()
         finger=FINGER,
         device="electroadhesion",
         duration=1.5,
-        plant={"velocity_per_force": 0.0},
+        rendering={"velocity_per_force": 0.0},
     )
     recording = hr.render(scene)
     share = velocity_per_unit(recording, 111.0)
@@ -99,23 +99,22 @@ def test_where_nothing_can_be_judged_nothing_is_said_beside_the_bands():
 
 def test_devices_are_drawn_side_by_side(recordings, tmp_path):
     pytest.importorskip("matplotlib")
-    from hapticrender.charts.skin_picture import draw_devices, plot_devices
+    from hapticrender.report.devices_picture import draw_devices, plot_devices
 
     figure = draw_devices(recordings)
     assert [axes.get_title(loc="left").split(",")[0] for axes in figure.axes[:2]] == list(recordings)
     for axes, recording in zip(figure.axes, recordings.values(), strict=False):
         assert f"{recording.scene.device}, by " in axes.get_title(loc="left")
-        assert "its bands" in axes.get_title(loc="left")
         beside = quantity(residual_velocity(recording), "m/s")
-        assert axes.texts[0].get_text() == f"beside them {beside} rms, up to 1000 Hz"
+        assert axes.texts[0].get_text() == f"outside the bands {beside} rms"
     plot_devices(recordings, tmp_path / "devices.png")
     assert (tmp_path / "devices.png").read_bytes()[:4] == b"\x89PNG"
 
 
 def test_the_page_shows_what_devices_share(tmp_path):
-    from hapticrender.charts.page_devices import devices_section
     from hapticrender.loop import prepare
-    from hapticrender.outputs import run_into
+    from hapticrender.report.devices_page import devices_section
+    from hapticrender.report.outputs import run_into
 
     texture = hr.Grating(velocity=8e-3, frequency=60.0)
     outputs = [
@@ -127,5 +126,5 @@ def test_the_page_shows_what_devices_share(tmp_path):
     ]
     section = devices_section(tmp_path, outputs)
     assert "One texture, 2 devices" in section
-    assert section.count("<td>8.00 mm/s</td>") == 1
+    assert section.count("<td>8.000</td>") == 1
     assert devices_section(tmp_path, outputs[:1]) == ""

@@ -1,14 +1,10 @@
 """The ultrasonic mode: exact at its carrier, the same envelope when moved down, and what detuning costs."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from scipy.linalg import expm
-from synthetic import make_bands
 
 import hapticrender as hr
-from hapticrender.control.methods import METHODS
 from hapticrender.plants.ultrasonic import UltrasonicParameters, UltrasonicPlate
 from hapticrender.protocols import Flag, Plant
 
@@ -36,32 +32,24 @@ def twin(parameters, drive, load):
     return motion
 
 
-@pytest.mark.parametrize("rate", [192e3, 80e3], ids=["6.4 a cycle", "2.7 a cycle"])
-def test_the_mode_is_integrated_exactly_however_few_samples_a_cycle_has(rng, rate):
+@pytest.mark.parametrize(("rate", "level"), [(192e3, "carrier"), (80e3, "carrier"), (48e3, "envelope")])
+def test_the_mode_is_integrated_exactly_however_few_samples_a_cycle_has(rng, rate, level):
     """Heat and a finger that comes, presses harder and leaves, against scipy: some 4 roundings of each of n steps."""
     load = ((0.0, 0.004, 0.006), (0.2, 0.2, 1.4))
     finger = hr.Finger.still(normal_load=load, touches=((0.0025, 0.0080),))
-    parameters = UltrasonicParameters(temperature_rise=10.0, temperature_time=0.005, rate=rate, **IDEAL)
+    parameters = UltrasonicParameters(temperature_rise=10.0, temperature_time=0.005, rate=rate, level=level, **IDEAL)
     n = round(0.01 * rate)
     drive = rng.uniform(-12.0, 12.0, n)
     pressed = finger.load(np.arange(n) / rate)
-    assert len(set(pressed)) > 50
+    assert len(set(pressed)) > 10
     expected = twin(parameters, drive, pressed)
     motion = UltrasonicPlate(parameters, finger).run(drive[:, None]).motion[:, 0]
     np.testing.assert_allclose(motion, expected, rtol=0, atol=n * 4 * ROUNDING * abs(expected).max())
 
 
-def test_the_transposed_mode_is_integrated_exactly(rng):
-    parameters = UltrasonicParameters(**IDEAL, temperature_rise=10.0, temperature_time=0.02).transposed(6e3, 48e3)
-    drive = rng.uniform(-8.0, 8.0, 1500)
-    expected = twin(parameters, drive, np.full(1500, 0.5))
-    motion = UltrasonicPlate(parameters, HELD).run(drive[:, None]).motion[:, 0]
-    np.testing.assert_allclose(motion, expected, rtol=0, atol=1500 * 4 * ROUNDING * abs(expected).max())
-
-
 @pytest.mark.parametrize(("load", "pole", "settling", "quality"), [(0.0, 75.0, 2.1e-3, 200), (0.5, 250.0, 0.64e-3, 60)])
-def test_poles_of_the_facts(load, pole, settling, quality):
-    """FACTS 6: 75 Hz free (2.1 ms, Q 200) and 250 Hz (0.64 ms, Q 60) with a finger, to the printed digits."""
+def test_poles(load, pole, settling, quality):
+    """75 Hz free (2.1 ms, Q 200) and 250 Hz (0.64 ms, Q 60) with a finger, to the digits printed in docs/theory.md."""
     parameters = UltrasonicParameters()
     measured = float(parameters.pole(load))
     assert abs(measured - pole) < 0.5
@@ -82,13 +70,12 @@ def test_the_finger_grips_with_the_cube_root_of_its_load():
     [
         (0.0, 10.0, -0.9, 7.6, 1),
         (0.0, 30.0, -7, 22, 0),
-        (0.0, 60.0, -22, 39, 0),
         (0.0, 150.0, -55, 63, 0),
         (0.5, 60.0, -3, 13, 0),
     ],
 )
-def test_detuning_costs_what_the_facts_say(load, offset, percent, degrees, digits):
-    """physics.md 2.2, detuning at Q 200 and Q 60, to the last printed digit."""
+def test_what_detuning_costs(load, offset, percent, degrees, digits):
+    """1/(1 + j 2 Q df/f) at Q 200 and Q 60, to the last printed digit."""
     parameters = UltrasonicParameters()
     tuned = float(parameters.resonance(load))
     ratio = parameters.dynamic_stiffness(tuned, load) / parameters.dynamic_stiffness(tuned + offset, load)
@@ -129,17 +116,9 @@ def test_measured_response_is_the_predicted_one(level, finger, load, offset):
     assert abs(respond(parameters, frequency, finger) / expected - 1) < 2 * SETTLED + 4e-9
 
 
-def test_ten_kelvin_cost_seven_percent_and_twenty_two_degrees():
-    """FACTS 6, from runs: cold and warm at the frequency of the cold plate; images add less than 1e-4."""
-    cold = UltrasonicParameters(temperature_time=1e-3, **IDEAL)
-    ratio = respond(replace(cold, temperature_rise=10.0), 30e3) / respond(cold, 30e3)
-    assert abs(100 * (abs(ratio) - 1) + 7) < 0.5
-    assert abs(np.angle(ratio, deg=True) + 22) < 0.5  # the displacement lags more where the resonance falls
-
-
 @pytest.mark.parametrize(("load", "times"), [(0.0, 5.4), (0.5, 1.9)])
 def test_flat_modulation_at_400_hz_needs_headroom(load, times):
-    """FACTS 6; the sidebands say the same: a drive that is AM makes |a(W)| smaller by |D(w + W)|/|D(w)|."""
+    """hypot(1, f/pole); the sidebands give the same: AM of the drive makes |a(W)| smaller by |D(w + W)|/|D(w)|."""
     parameters = UltrasonicParameters(finger_shift=0.0)
     need = parameters.drive_for(1e-6, 400.0, load) / parameters.drive_for(1e-6, 0.0, load)
     assert abs(need - times) < 0.05
@@ -148,7 +127,7 @@ def test_flat_modulation_at_400_hz_needs_headroom(load, times):
     assert abs((stiffness[0] + stiffness[2]) / (2 * stiffness[1]) / need - 1) < (400 / 30e3) ** 2
 
 
-def test_the_default_drive_has_the_headroom_that_is_told():
+def test_the_default_drive_has_its_stated_headroom():
     """Twice 3 um under a finger at resonance, to the four digits of the force constant; measured on a run as well."""
     parameters = UltrasonicParameters(finger_shift=0.0, **IDEAL)
     assert abs(parameters.headroom - 2) < 0.0005 / 1.777 * 2
@@ -157,7 +136,7 @@ def test_the_default_drive_has_the_headroom_that_is_told():
     assert abs(gain * 10.0 / (parameters.headroom * 3e-6) - 1) < image + 2 * SETTLED
 
 
-def test_transposing_keeps_what_the_envelope_feels():
+def test_transposing_keeps_the_envelope():
     parameters = UltrasonicParameters(modal_mass=4e-3, quality=150.0, frequency=40e3)
     moved = parameters.transposed(5e3, 48e3)
     assert (moved.carrier, moved.rate, moved.level) == (5e3, 48e3, "envelope")
@@ -186,22 +165,8 @@ def test_the_envelope_error_is_that_of_the_two_stiffnesses():
     error = UltrasonicParameters().transposed(6e3, 48e3).envelope_error(OFFSETS)
     # differences of m w^2, 3e8 of a rounding of which are left in D >= b w
     np.testing.assert_allclose(error, low / high - 1, rtol=0, atol=8 * 200 * ROUNDING)
-    np.testing.assert_array_equal(error, UltrasonicParameters().envelope_error(OFFSETS))
-
-
-def test_the_envelope_error_is_between_half_and_all_of_the_offset_over_the_carrier():
-    """W/(2 w_i) - W/(2 w) far beyond the pole, twice that well below; in between no more than the larger."""
-    parameters = UltrasonicParameters()
-    span = 1 / 6e3 - 1 / 30e3
-    assert abs(parameters.envelope_error(0.0)) < 200 * ROUNDING
-    error = abs(parameters.envelope_error(OFFSETS)) / (abs(OFFSETS) * span)
-    # a second order W/w_i < 7 % of it: the quotient of two first orders
-    assert ((error > 0.5 * 0.93) & (error < 1.07)).all()
-    for offset, share in ((0.75, 1.0), (2000.0, 0.5)):  # pole/100: the pole's part is 1 - 1e-2; 2000/75: 7e-4
-        told = abs(parameters.envelope_error(offset)) / (offset * span)
-        assert abs(told / share - 1) < max(1e-2, 2000 / (2 * 30e3) + 1e-3)
-    doubled = parameters.transposed(12e3, 96e3).envelope_error(OFFSETS)
-    assert (abs(doubled) < 0.5 * abs(parameters.envelope_error(OFFSETS))).all()
+    far = UltrasonicParameters().envelope_error(2000.0)  # beyond the pole: half of W (1/w_i - 1/w), to W/2w
+    assert abs(far) / (2000.0 * (1 / 6e3 - 1 / 30e3)) == pytest.approx(0.5, abs=2000 / (2 * 30e3) + 1e-3)
 
 
 @pytest.mark.parametrize("offset", [-100.0, 0.0, 75.0, 400.0])
@@ -215,7 +180,7 @@ def test_runs_of_carrier_and_envelope_differ_by_the_envelope_error(finger, load,
         base, images = held(parameters, frequency, load)
         turns = frequency / parameters.rate
         gain.append(respond(parameters, frequency, finger) / (np.sinc(turns) * np.exp(-1j * np.pi * turns)))
-        left += abs(images / base) * 1.1  # of the other's size, which differs by the error told
+        left += abs(images / base) * 1.1  # of the other's size, which differs by the error predicted
     error = complex(carrier.envelope_error(offset, load))
     assert abs(gain[0] / gain[1] - 1 - error) < left
     assert abs(gain[0] / gain[1] - 1) <= abs(error) + left
@@ -223,97 +188,17 @@ def test_runs_of_carrier_and_envelope_differ_by_the_envelope_error(finger, load,
         assert abs(error) > 5 * left  # so the comparison says something
 
 
-def envelope_twin(parameters, drive, rise):
-    """a' = -(s0 - j dw) a + N/(2 j m w) u, stepped exactly for an envelope u (V) that is held over a sample."""
-    p, omega, period = parameters, 2 * np.pi * parameters.frequency, 1 / parameters.rate
-    pole = -omega / (2 * p.quality) + 2j * np.pi * p.frequency * p.temperature_coefficient * rise
-    push = p.force_constant / (2j * p.modal_mass * omega)
-    turn, envelope = np.exp(pole * period), np.zeros(len(drive), complex)
-    for n in range(1, len(drive)):
-        envelope[n] = turn * envelope[n - 1] + (turn - 1) / pole * push * drive[n - 1]
-    return envelope
-
-
-def test_the_plain_envelope_equation_follows_a_modulated_detuned_start():
-    """From rest, 100 Hz AM, 10 K too warm: off by 1/(4 Q) for the pole at -w, 1.5 W/w, and half a sample of W."""
-    parameters = UltrasonicParameters(temperature_rise=10.0, temperature_time=1e-9, **IDEAL)
-    n = np.arange(5000)
-    time = n / parameters.rate
-    drive = 4.0 * (1 + np.sin(2 * np.pi * 100.0 * time))
-    # the first millisecond is cold
-    lead = round(0.001 * parameters.rate)
-    carrier = np.exp(2j * np.pi * 30e3 * np.arange(-lead, 5000) / parameters.rate)
-    full = np.concatenate([np.zeros(lead), drive]) * carrier
-    runs = [UltrasonicPlate(parameters, FREE).run(part[:, None]).motion[lead:, 0] for part in (full.real, full.imag)]
-    turns = 30e3 / parameters.rate
-    measured = (runs[0] + 1j * runs[1]) / carrier[lead:] / (np.sinc(turns) * np.exp(-1j * np.pi * turns))
-    expected = envelope_twin(parameters, drive, 10.0)
-    bound = 1 / (4 * 200) + 1.5 * 100 / 30e3 + np.pi * 100 / parameters.rate
-    off = abs(measured - expected).max() / abs(expected).max()
-    assert off < bound
-    mirrored = envelope_twin(parameters, drive, -10.0)  # the sign of the detuning is not lost in it
-    assert abs(measured - mirrored).max() / abs(expected).max() > 10 * bound
-
-
 def test_a_run_equals_its_pieces(rng):
     load = ((0.0, 0.01), (0.2, 0.9))
     finger = hr.Finger.still(normal_load=load, touches=((0.003, 0.008), (0.009, 0.02)))
     parameters = UltrasonicParameters(temperature_rise=5.0, temperature_time=0.004, delay=4)
     drive = rng.uniform(-10.0, 10.0, (2000, 1))
+    assert isinstance(UltrasonicPlate(parameters, finger), Plant)
     whole = UltrasonicPlate(parameters, finger, seed=3).run(drive)
     pieces = UltrasonicPlate(parameters, finger, seed=3)
     parts = [pieces.run(part) for part in np.split(drive, [1, 7, 191, 192, 500, 501, 1537])]
     for name in ("sensed", "motion", "flags", "position", "normal_load"):
         np.testing.assert_array_equal(getattr(whole, name), np.concatenate([getattr(part, name) for part in parts]))
-
-
-def designed(parameters):
-    """A controller of the house for the transposed mode, at 1 um."""
-    model = parameters.band_model(parameters.rate, parameters.delay)
-    return METHODS["stiffness"].design(model, make_bands(parameters.carrier, 1e-6))
-
-
-@pytest.mark.parametrize("delay", [1, 3])
-def test_the_compiled_loop_is_plant_and_controller_in_turn(delay):
-    parameters = UltrasonicParameters(delay=delay).transposed(6e3, 48e3)
-    n, wanted = 600, np.zeros(600)
-    finger = hr.Finger.sliding(speed=0.1, normal_load=0.5, touches=((0.005, 1.0),))
-    plant, controller = UltrasonicPlate(parameters, finger, seed=5), designed(parameters)
-    assert plant.closes(controller)
-    drive, target, flags, sensed = plant.closed_loop(controller, wanted)
-    plant, controller = UltrasonicPlate(parameters, finger, seed=5), designed(parameters)
-    last = np.zeros((1, 1))
-    for i in range(n):
-        np.testing.assert_array_equal(last[0], drive[i])
-        heard = plant.run(last)
-        np.testing.assert_array_equal(heard.sensed[0], sensed.sensed[i])
-        last, wished, flag = controller.run(heard.sensed, heard.position, wanted[i : i + 1])
-        np.testing.assert_array_equal(wished[0], target[i])
-        assert flag[0] | heard.flags[0] == flags[i]
-    assert abs(sensed.motion[-50:]).max() > 10 * parameters.sensor_noise  # it has begun to move
-    # in two calls as in one
-    plant, controller = UltrasonicPlate(parameters, finger, seed=5), designed(parameters)
-    halves = [plant.closed_loop(controller, part)[3].motion for part in (wanted[:251], wanted[251:])]
-    np.testing.assert_array_equal(np.concatenate(halves), sensed.motion)
-
-
-def test_it_is_a_plant_and_closes_only_what_is_compiled():
-    plant = UltrasonicPlate(UltrasonicParameters(), HELD)
-    assert isinstance(plant, Plant)
-    assert not plant.closes(object())
-    assert (plant.rate, plant.drive_channels, plant.sensed_channels, plant.block, plant.delay) == (192e3, 1, 1, 1, 1)
-
-
-def test_finger_positions_come_before_their_samples():
-    finger = hr.Finger.sliding(speed=0.1, normal_load=0.4, touches=((0.0, 0.001),))
-    plant = UltrasonicPlate(UltrasonicParameters(), finger)
-    plant.run(np.zeros((100, 1)))
-    told = plant.finger_position(200)
-    sensed = plant.run(np.zeros((200, 1)))
-    np.testing.assert_array_equal(told, sensed.position)
-    assert np.isnan(told[92:]).all()
-    assert not np.isnan(told[:92]).any()
-    np.testing.assert_array_equal(sensed.normal_load, np.where(np.arange(200) < 92, 0.4, 0.0))
 
 
 @pytest.mark.parametrize(("delay", "block"), [(1, 1), (4, 1), (4, 3)])
@@ -325,13 +210,12 @@ def test_drive_acts_after_its_delay(delay, block):
     assert np.flatnonzero(motion)[0] == 2 + delay - block + 1
 
 
-@pytest.mark.parametrize("block", [0, 2])
-def test_a_block_longer_than_the_delay_is_refused(block):
-    with pytest.raises(ValueError, match=rf"block = {block}: must be between 1 and the loop's delay of 1 samples"):
-        UltrasonicPlate(UltrasonicParameters(), FREE, block=block)
+def test_a_block_longer_than_the_delay_is_refused():
+    with pytest.raises(ValueError, match=r"block = 2: must be between 1 and the loop's delay of 1 samples"):
+        UltrasonicPlate(UltrasonicParameters(), FREE, block=2)
 
 
-def test_the_sensor_rounds_clips_and_is_as_noisy_as_told():
+def test_the_sensor_rounds_clips_and_has_its_noise():
     parameters = UltrasonicParameters(sensor_range=4e-6, sensor_bits=8, sensor_noise=0.0)
     drive = 10.0 * np.cos(2 * np.pi * 30e3 * np.arange(1500) / 192e3)[:, None]
     read = UltrasonicPlate(parameters, FREE).run(drive)
@@ -377,37 +261,22 @@ def test_the_band_model_is_the_free_cold_plate(level):
 @pytest.mark.parametrize(
     ("overrides", "message"),
     [
-        ({"frequency": 10e3}, r"plant.frequency = 10000.0: must be >= 20000 Hz"),
-        ({"frequency": 90e3}, r"plant.frequency = 90000.0: must be <= 70000 Hz"),
-        ({"modal_mass": 0.0}, r"plant.modal_mass = 0.0: must be > 0 kg"),
-        ({"modal_mass": True}, r"plant.modal_mass = True: must be a number"),
-        ({"quality": 1.0}, r"plant.quality = 1.0: must be >= 5"),
-        ({"finger_damping": -1.0}, r"plant.finger_damping = -1.0: must be >= 0 N s/m"),
-        ({"temperature_time": 0.0}, r"plant.temperature_time = 0.0: must be > 0 s"),
-        ({"drive_limit": float("inf")}, r"plant.drive_limit = inf: must be > 0 V"),
-        ({"force_constant": -1.0}, r"plant.force_constant = -1.0: must be > 0 N/V"),
-        ({"sensor_bits": 2.5}, r"plant.sensor_bits = 2.5: must be an integer"),
-        ({"drive_bits": 25}, r"plant.drive_bits = 25: must be <= 24"),
-        ({"sensor_noise": -1e-9}, r"plant.sensor_noise = -1e-09: must be >= 0 m"),
-        ({"delay": 0}, r"plant.delay = 0: must be >= 1 samples"),
-        ({"rate": 48e3}, r"plant.rate = 48000.0: must be >= 66666.7 Hz for a carrier of 30000 Hz"),
-        ({"level": "slow"}, r"plant.level = 'slow': must be one of carrier, envelope"),
-        ({"level": 1}, r"plant.level = 1: must be one of carrier, envelope"),
-        ({"envelope_frequency": 30e3}, r"plant.envelope_frequency = 30000.0: must be < frequency = 30000 Hz"),
-        ({"finger_damping": 2000.0}, r"plant.finger_damping = 2000.0: damping ratio 3.63 at 20 N .* must be <= 0.5"),
-        ({"finger_shift": -3000.0}, r"plant.finger_shift = -3000.0: shifts the resonance by up to -10259.9 Hz"),
+        ({"frequency": 10e3}, r"frequency = 10000.0: must be .*>= 20000 .*Hz"),
+        ({"modal_mass": True}, r"modal_mass = True: must be .* number"),
+        ({"sensor_bits": 2.5}, r"sensor_bits = 2.5: must be an integer"),
+        ({"delay": 0}, r"delay = 0: must be .*>= 1 .*samples"),
+        ({"rate": 48e3}, r"rate = 48000.0: must be .*>= 66666.7 .*Hz for a carrier of 30000 Hz"),
+        ({"level": "slow"}, r"level = 'slow': must be one of carrier, envelope"),
+        ({"envelope_frequency": 30e3}, r"envelope_frequency = 30000.0: must be < frequency = 30000 Hz"),
+        ({"finger_damping": 2000.0}, r"finger_damping = 2000.0: damping ratio 3.63 at 20 N .* must be .*<= 0.5"),
+        ({"finger_shift": -3000.0}, r"finger_shift = -3000.0: shifts the resonance by up to -10259.9 Hz"),
         (
             {"level": "envelope", "temperature_rise": 100.0, "temperature_coefficient": -600e-6, "rate": 48e3},
-            r"plant.temperature_rise = 100.0: shifts the resonance by up to -1800 Hz, must be within 1500 Hz",
+            r"temperature_rise = 100.0: shifts the resonance by up to -1800 Hz, must be within 1500 Hz",
         ),
-        ({"qualty": 1.0}, r"plant.qualty: no such parameter; known: .*quality"),
+        ({"qualty": 1.0}, r"qualty: no such parameter; known: .*quality"),
     ],
 )
 def test_bad_parameters_are_refused_with_value_bound_and_unit(overrides, message):
     with pytest.raises((ValueError, TypeError), match=message):
         UltrasonicParameters.with_overrides(overrides)
-
-
-def test_good_overrides_are_kept():
-    parameters = UltrasonicParameters.with_overrides({"level": "envelope", "rate": 48e3, "quality": 120})
-    assert (parameters.carrier, parameters.quality, parameters.rate) == (6e3, 120, 48e3)

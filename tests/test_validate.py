@@ -2,27 +2,30 @@
 
 import json
 import re
+import sys
 from dataclasses import replace
 from xml.etree import ElementTree
 
 import pytest
 
-from hapticrender.progress import Progress
+from hapticrender.report.progress import Progress
 from hapticrender.touch.builtin import builtin_scenes
-from hapticrender.validate import Verdict, validate, write_json, write_junit
+from hapticrender.touch.grating import Grating
+from hapticrender.touch.scene import Scene
+from hapticrender.validate import Verdict, exit_status, validate, write_json, write_junit
 
 
 @pytest.fixture(scope="module")
 def verdicts():
     scenes = builtin_scenes()
-    return validate([scenes["grating-47"], scenes["grating-170"]], method="paper", seed=4)
+    return validate(["grating-47", scenes["grating-170"]], method="paper", seed=4)
 
 
 def test_the_paper_holds_47_hz_and_fails_at_170_hz(verdicts):
     good, bad = verdicts
     assert good.passed
     assert good.value <= good.tolerance
-    assert not bad.passed  # FACTS 2, row 4: two sides controlled apart, 129-189 Hz
+    assert not bad.passed  # Grigorii et al. 2021: two sides controlled apart fail between 129 and 189 Hz
     assert bad.value > 0.5
     assert bad.figure.startswith("rms_error_")
     assert str(bad).startswith("grating-170 misses its tolerance: worst figure rms error of the 170 Hz band at ")
@@ -37,26 +40,49 @@ def test_a_verdict_turns_with_the_tolerance(verdicts):
         assert validate([replace(scene, tolerance=tolerance)], method="paper", seed=4)[0].passed is passed
 
 
-def test_the_seed_decides_the_noise(verdicts):
-    scene = builtin_scenes()["grating-47"]
-    again, other = (validate([scene], method="paper", seed=seed)[0] for seed in (4, 5))
-    assert again.summary == verdicts[0].summary
-    assert other.summary != verdicts[0].summary
+SLOW = Scene(texture=Grating(amplitude=10e-6, frequency=10.0), duration=1.0, name="slow")
+SHORT = Scene(texture=Grating(amplitude=10e-6, frequency=47.0), duration=0.5, name="short")
 
 
-def test_all_scenes_are_prepared_before_any_runs(monkeypatch):
-    monkeypatch.setattr("hapticrender.validate.run", lambda *a, **k: pytest.fail("a sample was run"))
-    scene = builtin_scenes()["grating-47"]
-    with pytest.raises(ValueError, match="renderer 'no-such-plate' is not installed"):
-        validate([scene, replace(scene, device="no-such-plate")])
+@pytest.mark.parametrize("jobs", [1, 2])
+def test_a_bad_scene_stops_no_other(tmp_path, capsys, jobs):
+    bad = tmp_path / "bad.toml"
+    bad.write_text(SHORT.to_toml().replace("47.0", "-47.0"))
+    plate = replace(SHORT, device="no-such-plate", name="plateless")
+    found = validate([bad, SHORT, plate, SLOW], jobs=jobs, progress=sys.stderr)
+    assert [verdict.verdict for verdict in found] == ["error", "passed", "error", "not judged"]
+    assert "texture.frequency = -47.0" in found[0].reason
+    assert found[3].reason.startswith("no carrier is faster than 20 Hz")
+    assert exit_status(found) == 2
+    assert exit_status(found[1:2] + found[3:]) == 0
+    assert capsys.readouterr().err == "1/3 short\n2/3 plateless\n3/3 slow\n"
+    write_json(tmp_path / "r.json", found)
+    assert len(json.loads((tmp_path / "r.json").read_text(encoding="utf-8"))["scenes"]) == 4
+    write_junit(tmp_path / "r.xml", found)
+    suite = ElementTree.parse(tmp_path / "r.xml").getroot().find("testsuite")
+    assert [suite.get(key) for key in ("tests", "failures", "errors", "skipped")] == ["4", "0", "2", "1"]
+    assert suite.findall("testcase")[3].find("skipped").get("message") == found[3].reason
+
+
+def test_scenes_of_one_name_are_told_apart(tmp_path):
+    (tmp_path / "copy.toml").write_text(SHORT.to_toml())
+    found = validate([SHORT, str(tmp_path / "copy.toml")])
+    assert [verdict.scene for verdict in found] == ["short (1)", "short (2)"]
+
+
+def test_only_what_does_not_pass_leaves_its_files(tmp_path):
+    strict = replace(SHORT, tolerance=1e-6, name="a strict one")
+    validate([SHORT, strict], out=tmp_path / "out")
+    (folder,) = (tmp_path / "out").iterdir()
+    assert folder.name == "a_strict_one"
+    assert {"recording.au", "summary.json", "scene.toml", "drive.wav"} <= {path.name for path in folder.iterdir()}
+
+
+def test_bad_arguments_are_refused():
     with pytest.raises(ValueError, match="must be one of paper"):
-        validate([scene], method="magic")
-
-
-def test_progress_is_shown(capsys):
-    scene = replace(builtin_scenes()["grating-47"], duration=0.1)
-    validate([scene, scene], progress=Progress([0.1, 0.1]))
-    assert capsys.readouterr().err == "1/2 grating-47\n2/2 grating-47\n"
+        validate([SHORT], method="magic")
+    with pytest.raises(ValueError, match="jobs=0"):
+        validate([SHORT], jobs=0)
 
 
 def test_json_holds_everything(verdicts, tmp_path):

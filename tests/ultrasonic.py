@@ -6,7 +6,7 @@ import numpy as np
 from scipy.signal import hilbert
 
 import hapticrender as hr
-from hapticrender.control.bank.controller import BankController
+from hapticrender.control.controller import BankController
 from hapticrender.plants.surface import SurfaceParameters
 from hapticrender.plants.ultrasonic import UltrasonicParameters, UltrasonicPlate
 from hapticrender.protocols import Array, Flag
@@ -58,12 +58,12 @@ def held(load):
     return hr.Finger.still(normal_load=load) if load else FREE
 
 
-def ran(wanted, seconds, finger=FREE, change=None, **plant):
-    """The plate under its own loop; `wanted` (m) over time (s), `change` of the numbers of the loop."""
+def ran(wanted, seconds, finger=FREE, settings=None, **plant):
+    """The plate under its own loop; `wanted` (m) over time (s); `settings` of the loop that differ."""
     parameters = SurfaceParameters.with_overrides(plant)
     mode, loop = parameters.carrier_mode, amplitude_loop(parameters)
-    if change is not None:
-        loop = BankController("changed", loop.tables._replace(numbers=loop.tables.numbers._replace(**change)))
+    for name, value in (settings or {}).items():
+        loop.state["p"][name] = value
     time = np.arange(round(seconds * mode.rate)) / mode.rate
     asked = np.broadcast_to(np.asarray(wanted(time) if callable(wanted) else wanted, float), time.shape).copy()
     drive, _, flags, sensed = UltrasonicPlate(mode, finger).closed_loop(loop, asked)
@@ -77,4 +77,4 @@ def modulated(amplitude, frequency=400.0):
 def inner_share(run, load):
     """Damping that a finger brings, over what the free plate and the inner loop have: how far a touch pulls."""
     brought = float(run.mode.damping(load) - run.mode.damping(0.0))
-    return brought / (float(run.mode.damping(0.0)) + float(run.loop.tables.grip[0]))
+    return brought / (float(run.mode.damping(0.0)) + float(run.loop.settings["added_damping"][0]))

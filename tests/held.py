@@ -1,0 +1,50 @@
+"""Run methods of the library on the simulated plate, and measure amplitudes."""
+
+import numpy as np
+
+import hapticrender as hr
+from hapticrender.bands import Bands
+from hapticrender.control.methods import METHODS
+from hapticrender.plants.plate import Plate, PlateParameters
+
+
+def fixed(*pairs):
+    """Bands of fixed carriers from (frequency, envelope) pairs."""
+    frequency, zero = np.array([pair[0] for pair in pairs], float), np.zeros(len(pairs))
+    envelope = np.array([pair[1] for pair in pairs], complex)
+    return Bands(frequency=frequency, wavenumber=zero, phase=zero, envelope=envelope)
+
+
+def play(controller, seconds, plate=None, finger=None, seed=0):
+    """Drive (A) and true motion (m: centre, end 1, end 2) of a controller on the plate."""
+    plate = Plate(plate or PlateParameters(), finger or hr.Finger.absent(), seed)
+    drive, _, _, sensed = plate.closed_loop(controller, np.zeros(round(seconds * plate.rate)))
+    return drive, sensed.motion
+
+
+def hold(method, bands, seconds, plate=None, known=None, **scene):
+    """Drive and motion under a method of the library; `known` is the plate that it was designed for."""
+    plate = plate or PlateParameters()
+    known = known or plate
+    controller = METHODS[method].design(known.band_model(plate.rate, known.delay), bands)
+    return play(controller, seconds, plate, **scene)
+
+
+def envelopes(motion, phase, rate, window, hop=None):
+    """Centre times (s) and complex envelopes (windows, columns) by least squares with offset and slope."""
+    width = round(window * rate)
+    starts = np.arange(0, len(motion) - width + 1, round((hop or window / 4) * rate))
+    ramp, found = np.linspace(-1, 1, width), []
+    for start in starts:
+        piece = slice(start, start + width)
+        basis = np.column_stack([np.cos(phase[piece]), -np.sin(phase[piece]), np.ones(width), ramp])
+        fit = np.linalg.lstsq(basis, motion[piece], rcond=None)[0]
+        found.append(fit[0] + 1j * fit[1])
+    return (starts + width / 2) / rate, np.array(found)
+
+
+def amplitude_error(motion, frequency, wanted, rate=5000.0, seconds=1.0):
+    """Relative error of the mean amplitude of each column over the last `seconds`, which hold whole periods."""
+    n = np.arange(len(motion))[-round(seconds * rate) :]
+    found = 2 * np.mean(motion[n] * np.exp(-2j * np.pi * frequency * n / rate)[:, None], axis=0)
+    return abs(found) / wanted - 1.0

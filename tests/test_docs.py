@@ -1,0 +1,36 @@
+"""The pages in docs/: every function that they name exists, and every link leads somewhere."""
+
+import re
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+PAGES = sorted((ROOT / "docs").rglob("*.md"))
+NAMED = re.compile(r"`([\w/]+\.py)`(?::((?: `[\w.]+`,?)+))?")
+
+
+def test_functions_in_the_theory_exist():
+    named = NAMED.findall((ROOT / "docs" / "theory.md").read_text(encoding="utf-8"))
+    assert len(named) > 30
+    missing = []
+    for file, names in named:
+        path = next((each for each in (ROOT / "hapticrender" / file, ROOT / file) if each.exists()), None)
+        source = path.read_text(encoding="utf-8") if path else ""
+        found = [re.search(rf"(?:def|class) {name.split('.')[-1]}\b", source) for name in re.findall(r"[\w.]+", names)]
+        if path is None or not all(found):
+            missing.append(f"{file}: {names}")
+    assert not missing
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_links_lead_somewhere(page):
+    text = page.read_text(encoding="utf-8")
+    for target, anchor in re.findall(r"\]\(([^)#]*)(?:#([^)]*))?\)", text):
+        if "://" in target:
+            continue
+        path = page.parent / target if target else page
+        assert path.exists(), target
+        if anchor:
+            headings = re.findall(r"^#+ (.*)$", path.read_text(encoding="utf-8"), re.MULTILINE)
+            assert anchor in {re.sub(r"[^\w -]", "", each).lower().replace(" ", "-") for each in headings}, anchor

@@ -1,0 +1,105 @@
+"""The ultrasonic surface against its parts: mode, amplitude loop, friction law and contact, sample by sample."""
+
+import numpy as np
+import pytest
+from proportional import Proportional
+
+import hapticrender as hr
+from hapticrender.plants.contact import sliding_record, sliding_step
+from hapticrender.plants.friction_laws import friction_ratio, reference_amplitude
+from hapticrender.plants.surface import SurfaceParameters, UltrasonicSurface, full_slew
+from hapticrender.plants.ultrasonic import UltrasonicParameters, UltrasonicPlate
+from hapticrender.protocols import Flag
+
+QUIET = UltrasonicParameters(sensor_noise=0.0, sensor_bits=0, drive_bits=0)
+SLIDE = hr.Finger.sliding(speed=0.08, normal_load=0.4, mechanics="light")
+NOMINAL = (0.5, 0.05)
+BUMPS = 0.06 * np.sin(np.arange(300) / 9.0)
+
+
+def parameters(**changes):
+    return SurfaceParameters(level="envelope", sensor="tribometer", force_noise=0.0, mode=QUIET, **changes)
+
+
+def loop(p):
+    """A proportional amplitude loop on the mode's carrier, in the direction of the mode's velocity at resonance."""
+    return Proportional(2e5, pulse=p.carrier_mode.carrier / p.carrier_mode.rate)
+
+
+def twin(p, drive, whole, load, speed):
+    """Sensed friction, true friction, skin velocity, amplitude and flags by the parts' own public steps."""
+    mode, law, contact = p.carrier_mode, p.friction_law.numbers, sliding_record(p, SLIDE.mechanics)
+    plate, controller = UltrasonicPlate(mode, SLIDE), loop(p)
+    decay, slew = 0.5 * float(mode.damping()) / mode.mass / mode.rate, full_slew(mode)
+    before, reached, volts, rows = 0.0, -1.0, np.zeros((1, 1)), []
+    for force in drive:
+        ratio = p.bias + force / whole
+        inside = min(max(ratio, p.least_ratio), 1.0)
+        wanted, flags, squares = reference_amplitude(law, inside, load, speed), 0, []
+        start = reached
+        for k in range(p.substeps):
+            line = before + (wanted - before) * (k + 1) / p.substeps
+            rise = max(slew - decay * reached, 0.05 * slew)
+            change = min(max(line - reached, -slew - decay * reached), rise)
+            reached = reached + change if start >= 0.0 else line
+            flags |= Flag.SATURATED if reached != line else 0
+            played = plate.run(volts)
+            volts = controller.run(played.sensed, np.array([reached]))
+            q, rate = plate.state["z"][0]
+            squares.append(q**2 + (rate * mode.rate / (2 * np.pi * float(mode.resonance(load)))) ** 2)
+        before, amplitude = wanted, np.sqrt(np.mean(squares))
+        steady = whole * friction_ratio(law, amplitude, load, speed)
+        rows.append((*sliding_step(contact[0], steady, speed, 0.0), amplitude, flags | (inside != ratio)))
+    return np.array(rows)
+
+
+@pytest.mark.parametrize("law", ["fit", "load-sharing", "intermittent"])
+def test_a_surface_is_its_parts(law):
+    """Sample by sample, to the rounding of 1200 steps; what is beyond the law's reach is flagged."""
+    p = parameters(law=law)
+    surface = UltrasonicSurface(p, loop(p), SLIDE, nominal=NOMINAL)
+    drive = np.r_[BUMPS, 0.5]  # N: more than all of the friction
+    played = surface.run(drive[:, None])
+    friction, sensed, skin, amplitude, flags = twin(p, drive, p.friction_coefficient * 0.4, 0.4, 0.08).T
+    columns = (played.motion[:, 0], played.sensed[:, 0], surface.skin_velocity, surface.amplitude)
+    for found, expected in zip(columns, (friction, sensed, skin, amplitude), strict=True):
+        np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-12 * abs(expected).max())
+    np.testing.assert_array_equal(played.flags, flags)
+    assert int(flags[-1]) & Flag.SATURATED
+    assert np.ptp(amplitude[100:]) > 0.2 * amplitude.mean()  # it is modulated
+
+
+def test_a_run_equals_its_pieces_and_noise_its_seed():
+    p = SurfaceParameters(level="envelope", sensor="tribometer")
+    finger = hr.Finger.swiping(frequency=20.0, speed=0.1, normal_load=0.7, touches=[(0.0, 0.01), (0.014, 0.06)])
+    whole, cut, other = (UltrasonicSurface(p, loop(p), finger, seed, NOMINAL) for seed in (3, 3, 4))
+    once = whole.run(BUMPS[:, None])
+    pieces = [cut.run(BUMPS[part, None]) for part in (slice(0, 1), slice(1, 99), slice(99, 300))]
+    for name in ("sensed", "motion", "flags", "position", "normal_load"):
+        joined = np.concatenate([getattr(piece, name) for piece in pieces])
+        assert np.array_equal(joined, getattr(once, name), equal_nan=True), name
+    assert not np.array_equal(other.run(BUMPS[:, None]).sensed, once.sensed)
+
+
+def test_a_lifted_finger_leaves_no_friction_and_the_amplitude_of_the_nominal_one():
+    p = parameters()
+    surface = UltrasonicSurface(p, loop(p), hr.Finger.absent(), nominal=NOMINAL)
+    played = surface.run(np.zeros((300, 1)))
+    assert not played.motion.any()
+    assert surface.state["reference"][0] == pytest.approx(float(p.friction_law.amplitude(p.bias, *NOMINAL)), rel=1e-12)
+
+
+def test_a_clipped_tribometer_is_flagged():
+    p = parameters(force_range=0.05)
+    played = UltrasonicSurface(p, loop(p), SLIDE, nominal=NOMINAL).run(np.zeros((300, 1)))
+    clipped = played.sensed[:, 0] >= 0.05
+    assert 0 < clipped.sum() < 300
+    np.testing.assert_array_equal((played.flags & Flag.SENSOR_CLIPPED) != 0, clipped)
+
+
+def test_a_surface_closes_with_a_controller_of_its_own():
+    p = parameters()
+    joined, apart = (UltrasonicSurface(p, loop(p), SLIDE, nominal=NOMINAL) for _ in range(2))
+    drive, _, _, sensed = joined.closed_loop(Proportional(0.1, 0.01), BUMPS)
+    np.testing.assert_array_equal(apart.run(drive).sensed, sensed.sensed)
+    assert abs(drive).max() > 0.005
