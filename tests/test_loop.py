@@ -311,7 +311,7 @@ def test_a_block_device_has_no_inner_loop_and_holds_without():
     """Blocks of 64 at 48 kHz: taps on stale noise would drive the coils to their limit; the rest of h2 keeps 10 %."""
     scene = dataclasses.replace(hr.builtin_scenes()["sliding"], duration=2.0)
     session = loop.prepare(scene, driver=simulated(scene, block=64, rate=48_000.0, delay=64))
-    assert session.controller().note.startswith("inner loop off: a delay of 64 samples is that of a block device")
+    assert session.controller().note.startswith("inner damper off: a delay of 64 samples is that of a block device")
     recording = loop.run(session)
     assert recording.summary()["passed"]
     assert abs(recording.drive).max() < 0.1
