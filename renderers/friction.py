@@ -149,7 +149,7 @@ class FrictionSetup(Generic[Settings, Parameters]):
         return BandModel(
             rate=driver.rate,
             delay=driver.delay,
-            block=driver.block,
+            block=1,  # held over a block, the envelopes saturate at touch: the friction answers within a sample
             mass=own * (1 / w0**2 + ring * lag if sensed else 0.0) * one,
             late=ring,
             damping=own * (lag + ring) * one,
