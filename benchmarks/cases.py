@@ -51,7 +51,7 @@ def in_blocks(bands: int) -> BankController:
     Designed for 8 bands and then given as many as asked for: the design's checks take minutes with 512 bands, and are
     not what is measured.
     """
-    model = replace(PlateParameters(rate=CARD, delay=BLOCK).band_model(CARD, BLOCK), block=BLOCK, drive_step=1e-12)
+    model = replace(PlateParameters(rate=CARD, delay=BLOCK).device_model(CARD, BLOCK), block=BLOCK, drive_step=1e-12)
     few: Any = METHODS["h2"].design(model, comb(8, 1e-6))
     settings = {name: few.settings[name] for name in few.settings.dtype.names} | {"observer": 1e-4}
     return BankController("h2", few.step, settings, comb(bands, 1e-9, 1000.0), history=int(few.state["history"][0]))
@@ -80,7 +80,7 @@ def closed_loop(what: str, seconds: float, pairs: int) -> Iterator[Figure]:
     finger, noise, target, floor = FINGERS[what]
     parameters = PlateParameters(sensor_noise=noise)
     bands = comb(8, 1e-6)
-    controller = METHODS["h2"].design(parameters.band_model(parameters.rate, parameters.delay), bands)
+    controller = METHODS["h2"].design(parameters.device_model(parameters.rate, parameters.delay), bands)
     plate, silence = Plate(parameters, finger), np.zeros(int(seconds * parameters.rate))
     loop, free = NumpyPolar(bands.frequency, bands.phase, bands.envelope), NumpyPlate()
     ours, theirs, _ = compare(lambda: plate.closed_loop(controller, silence), lambda: numpy_run(loop, free, FEW), pairs)
@@ -93,7 +93,7 @@ def paper(pairs: int) -> Iterator[Figure]:
     """The paper's method, 64 bands, times faster than naive C in double; outputs are compared."""
     bands, parameters, samples = comb(64, 1e-6), PlateParameters(), 4096
     bands = replace(bands, frequency=np.round(2 * bands.frequency) / 2)  # the look-up table has a grid of 0.5 Hz
-    model = replace(parameters.band_model(parameters.rate, 1), drive_limit=1e9)
+    model = replace(parameters.device_model(parameters.rate, 1), drive_limit=1e9)
     controller = PerSide(bandwidths=(5.0, 10.0)).design(model, bands)
     naive = NaivePolar(NumpyPolar(bands.frequency, bands.phase, bands.envelope))
     sensed, nothing = 1e-6 * np.random.default_rng(0).standard_normal((samples, 2)), np.zeros(samples)

@@ -8,7 +8,7 @@ import numpy as np
 from scipy.linalg import expm
 
 import hapticrender as hr
-from hapticrender.control.bandmodel import BandModel
+from hapticrender.control.device_model import DeviceModel
 from hapticrender.renderers.base import BaseRenderer
 from hapticrender.renderers.limits import check_carriers, check_targets, felt
 
@@ -54,9 +54,9 @@ class ShakerRenderer(BaseRenderer):
     def plant(self, scene, seed):
         return Shaker(scene.finger, seed)
 
-    def band_model(self, scene, driver):
+    def device_model(self, scene, driver):
         one = np.eye(1)
-        return BandModel(
+        return DeviceModel(
             rate=driver.rate, delay=driver.delay, block=driver.block, mass=MASS * one, damping=DAMPING * one,
             stiffness=STIFFNESS * one, force_from_drive=FORCE * one, coordinate_from_sensed=one, rigid=True,
             side_from_coordinate=one, place_from_coordinate=one, places=("top",), drive_limit=2.0,

@@ -34,7 +34,7 @@ def play(entry: RealtimeEntry, plate: Plate, motion: list[np.ndarray], stop: thr
 
 def main() -> float:
     parameters = replace(PlateParameters(), rate=RATE, delay=BLOCK)
-    model = replace(parameters.band_model(RATE, BLOCK), block=BLOCK)
+    model = replace(parameters.device_model(RATE, BLOCK), block=BLOCK)
     bands = hr.Grating(frequency=80.0, amplitude=5e-6).bands(RATE)
     entry = RealtimeEntry(METHODS["h2"].design(model, bands), sensed_scale=FULL_SCALE)
     motion: list[np.ndarray] = []

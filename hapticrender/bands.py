@@ -59,7 +59,7 @@ class Bands:
         The waveform is a factor of every envelope, which is otherwise constant.
     differentiated : bool
         The target is the time derivative of the envelopes' signal, at whatever frequency a carrier comes to be.
-    shown : ndarray of complex, shape (n,), or None
+    sensor_response : ndarray of complex, shape (n,), or None
         Response of the device's sensor to each band, not 0; None: 1.  `tone` refers the targets to the sensor.
     unfelt : tuple of str
         Which bands were left out because they cannot be felt, and why, one sentence each.
@@ -82,7 +82,7 @@ class Bands:
     envelope: Array | None = None
     modulated: bool = False
     differentiated: bool = False
-    shown: Array | None = None
+    sensor_response: Array | None = None
     unfelt: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:

@@ -33,7 +33,7 @@ STEP = types.int64(types.int64, types.int64, types.int64, types.int64)
 SIGNALS = np.dtype(
     [
         (name, np.int64)
-        for name in ("drive", "inputs", "noise", "sensed", "motion", "position", "wanted", "target", "flags")
+        for name in ("drive", "inputs", "noise", "sensed", "motion", "position", "waveform", "target", "flags")
     ]
 )
 """Addresses of float64 arrays with a row a sample; `flags` is int64, `target` complex128 with a row a block."""

@@ -22,7 +22,7 @@ import numpy as np
 
 if TYPE_CHECKING:
     from hapticrender.bands import Bands
-    from hapticrender.control.bandmodel import BandModel
+    from hapticrender.control.device_model import DeviceModel
     from hapticrender.touch.scene import Scene
 
 Array = np.ndarray[Any, np.dtype[Any]]
@@ -129,7 +129,7 @@ class Plant(Protocol):
         """Whether `closed_loop` can take this controller."""
         ...
 
-    def closed_loop(self, controller: Controller, wanted: Array) -> tuple[Array, Array, Array, Sensed]:
+    def closed_loop(self, controller: Controller, waveform: Array) -> tuple[Array, Array, Array, Sensed]:
         """Advance plant and controller together, sample by sample; returns drive (as played), target, flags, sensed."""
         ...
 
@@ -151,10 +151,10 @@ class Controller(Protocol):
     tables: Any
     state: Any
 
-    def run(self, sensed: Array, position: Array, wanted: Array) -> tuple[Array, Array, Array]:
+    def run(self, sensed: Array, position: Array, waveform: Array) -> tuple[Array, Array, Array]:
         """Advance by n samples; return drive (n, channels), target envelopes (n, bands) and flags (n,).
 
-        `wanted` (n,) is the texture's waveform, read only where the bands have no constant envelope.
+        `waveform` (n,) is the texture's waveform, read only where the bands have no constant envelope.
         """
         ...
 
@@ -173,7 +173,7 @@ class Rendering:
         The same, as the controller sees it: behind a square root, a resonance or nothing.
     plant : Plant, optional
         The simulated device.
-    model : BandModel
+    model : DeviceModel
         Device model for which the controller is designed.
     bands : Bands
         Carriers and targets, in the device's quantity.
@@ -187,7 +187,7 @@ class Rendering:
     device: Driver
     driver: Driver
     plant: Plant | None = None
-    model: BandModel
+    model: DeviceModel
     bands: Bands
     waveform: Callable[[Array, Array], Array]
     controller: Callable[[], Controller]
@@ -227,7 +227,7 @@ class Method(Protocol):
 
     name: str
 
-    def design(self, model: BandModel, bands: Bands, *, feedback: bool = True) -> Controller:
+    def design(self, model: DeviceModel, bands: Bands, *, feedback: bool = True) -> Controller:
         """Validate, choose bandwidths, build tables; may raise `DesignError`.
 
         Without `feedback` nothing is measured: the drive is computed from the device model alone.

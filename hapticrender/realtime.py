@@ -49,8 +49,8 @@ ENTRY = np.dtype(
         *((name, np.int64) for name in ("step", "controller", "signals", "block", "sensors", "channels", "setpoints")),
         *((name, np.int64) for name in ("setpoints_at", "slots_at", "middle", "slot", "age")),
         *((name, np.float64) for name in ("finger_changes", "setpoint_changes", "rate", "sensed_scale", "drive_scale")),
-        *((name, np.int64) for name in ("sensed_at", "drive_at", "position_at", "wanted_at", "flags_at")),
-        *((name, np.int64) for name in ("samples", "flags", "refused", "waveform_at", "waveform_length", "spatial")),
+        *((name, np.int64) for name in ("sensed_at", "drive_at", "position_at", "waveform_at", "flags_at")),
+        *((name, np.int64) for name in ("samples", "flags", "refused", "texture_at", "texture_length", "spatial")),
         ("period", np.float64),
     ]
 )
@@ -90,21 +90,21 @@ def receive(entry):
             setpoints[i] = slot[HEAD + i]
     if slot[FINGER_CHANGES] != e.finger_changes:
         e.finger_changes, e.age = slot[FINGER_CHANGES], 0
-    position, wanted = carray(pointer(e.position_at, F8), e.block), carray(pointer(e.wanted_at, F8), e.block)
-    waveform = carray(pointer(e.waveform_at, F8), e.waveform_length)
+    position, waveform = carray(pointer(e.position_at, F8), e.block), carray(pointer(e.waveform_at, F8), e.block)
+    texture = carray(pointer(e.texture_at, F8), e.texture_length)
     for m in range(e.block):
         age = min((e.age + m) / e.rate, HORIZON)
         position[m] = slot[POSITION] + age * slot[VELOCITY]
-        if e.waveform_length > 0:
+        if e.texture_length > 0:
             at = position[m] if e.spatial > 0 else (e.samples + m) / e.rate
             turns = at / e.period
             if turns != turns:
-                wanted[m] = 0.0
+                waveform[m] = 0.0
             else:
-                place = (turns - np.floor(turns)) * e.waveform_length
-                i = int(place) % e.waveform_length
-                after = waveform[(i + 1) % e.waveform_length]
-                wanted[m] = waveform[i] + (place - int(place)) * (after - waveform[i])
+                place = (turns - np.floor(turns)) * e.texture_length
+                i = int(place) % e.texture_length
+                after = texture[(i + 1) % e.texture_length]
+                waveform[m] = texture[i] + (place - int(place)) * (after - texture[i])
     e.age += e.block
     return slot[PLAYING] > 0.0
 
@@ -257,7 +257,7 @@ class RealtimeEntry:
             "sensed": np.zeros((self.block, controller.sensors)),
             "drive": np.zeros((self.block, controller.channels)),
             "position": np.zeros(self.block),
-            "wanted": np.zeros(self.block),
+            "waveform": np.zeros(self.block),
             "flags": np.zeros(self.block, np.int64),
         }
         target = np.zeros((self.block, controller.n_bands), complex)
@@ -280,8 +280,8 @@ class RealtimeEntry:
             "rate": self.rate,
             "sensed_scale": sensed_scale,
             "drive_scale": drive_scale,
-            "waveform_at": waveform.ctypes.data,
-            "waveform_length": len(waveform),
+            "texture_at": waveform.ctypes.data,
+            "texture_length": len(waveform),
             "spatial": spatial,
             "period": period,
             **{f"{name}_at": array.ctypes.data for name, array in arrays.items()},

@@ -8,7 +8,7 @@ from typing import Any, Generic, TypeVar
 
 from hapticrender import checks
 from hapticrender.bands import Bands
-from hapticrender.control.bandmodel import BandModel
+from hapticrender.control.device_model import DeviceModel
 from hapticrender.control.methods import method_named
 from hapticrender.driver_checks import check_driver
 from hapticrender.drivers.simulated import SimulatedDriver
@@ -22,7 +22,7 @@ Setup = TypeVar("Setup")
 class BaseRenderer(Generic[Setup]):
     """Renderer made of parts: `read` the scene once, then give its setup to every other part.
 
-    A subclass fills in `plant`, `band_model` and `bands`.  Where it leaves `read` as it is, the setup is the scene.
+    A subclass fills in `plant`, `device_model` and `bands`.  Where it leaves `read` as it is, the setup is the scene.
     """
 
     name = ""
@@ -40,7 +40,7 @@ class BaseRenderer(Generic[Setup]):
         else:
             plant, device, shown = None, driver, self.connect(setup, driver)
         check_driver(shown)
-        model = self.band_model(setup, shown)
+        model = self.device_model(setup, shown)
         bands = self.bands(setup, model)
         return Rendering(
             scene=scene,
@@ -65,11 +65,11 @@ class BaseRenderer(Generic[Setup]):
         """Return `driver` as the controller is to see it."""
         return driver
 
-    def band_model(self, setup: Setup, driver: Driver) -> BandModel:
+    def device_model(self, setup: Setup, driver: Driver) -> DeviceModel:
         """Return the device model of the device behind `driver`."""
         raise NotImplementedError
 
-    def bands(self, setup: Setup, model: BandModel) -> Bands:
+    def bands(self, setup: Setup, model: DeviceModel) -> Bands:
         """Carriers and targets; refuses with a ValueError what the device cannot do."""
         raise NotImplementedError
 
@@ -77,7 +77,7 @@ class BaseRenderer(Generic[Setup]):
         """Return the target waveform over time (s) and position (m), in the device's quantity."""
         return getattr(setup, "scene", setup).texture.waveform
 
-    def design(self, method: Method, model: BandModel, bands: Bands, *, feedback: bool = True) -> Controller:
+    def design(self, method: Method, model: DeviceModel, bands: Bands, *, feedback: bool = True) -> Controller:
         """Return a controller of `method` for the whole device."""
         return method.design(model, bands, feedback=feedback)
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 from hapticrender.checks import inside, option, parameter
-from hapticrender.control.bandmodel import BandModel
+from hapticrender.control.device_model import DeviceModel
 from hapticrender.plants.electroadhesion import NORMAL, ElectroadhesionParameters, ElectroadhesionScreen, SquareRoot
 from hapticrender.protocols import Driver
 from hapticrender.renderers.base import check_channels, check_tables, read_devices
@@ -81,7 +81,7 @@ class ScreenSetup(FrictionSetup[ElectroadhesionSettings, ElectroadhesionParamete
             )
         return SquareRoot(bias=bias, floor=settings.floor * bias, gain=gain, straight=settings.square_root == "off")
 
-    def model(self, driver: Driver) -> BandModel:
+    def model(self, driver: Driver) -> DeviceModel:
         """Device model of the screen behind `driver`, without its drive limit."""
         assumed, mu = self.assumed, self.assumed.friction_coefficient
         model = self.contact(driver, mu)
@@ -92,9 +92,9 @@ class ScreenSetup(FrictionSetup[ElectroadhesionSettings, ElectroadhesionParamete
                 mass=lag**2 / 2 / mu * model.force_from_drive,
                 damping=lag / mu * model.force_from_drive,
                 coordinate_from_sensed=mu * model.coordinate_from_sensed,
-                memory=0.0,
-                late=lag,
-                foresight=assumed.memory_length,
+                contact_damping=0.0,
+                sensor_delay=lag,
+                contact_lag=assumed.memory_length,
             )
         return model
 
@@ -128,7 +128,7 @@ class ElectroadhesionRenderer(FrictionRenderer[ScreenSetup]):
             envelope_rate=setup.assumed.rate,
         )
 
-    def band_model(self, setup: ScreenSetup, driver: Driver) -> BandModel:
+    def device_model(self, setup: ScreenSetup, driver: Driver) -> DeviceModel:
         """Return the device model of the screen behind `driver`."""
         check_channels(driver, {1: ""}, {0: "", 1: ""})
         model, assumed, compensation = setup.model(driver), setup.assumed, setup.compensation

@@ -16,7 +16,7 @@ import numpy as np
 
 from hapticrender.bands import Bands
 from hapticrender.checks import Validated, option, parameter
-from hapticrender.control.bandmodel import BandModel, FingerRange
+from hapticrender.control.device_model import DeviceModel, FingerRange
 from hapticrender.plants.contact import SlidingParameters
 from hapticrender.protocols import Array, Driver
 from hapticrender.renderers.base import BaseRenderer, Waveform
@@ -96,7 +96,7 @@ class FrictionSetup(Generic[Settings, Parameters]):
 
         return impulse
 
-    def targets(self, model: BandModel) -> Bands:
+    def targets(self, model: DeviceModel) -> Bands:
         """Carriers and targets of the scene as friction (N)."""
         scene, share = self.scene, self.settings.velocity_per_force
         if scene.gradient:
@@ -109,11 +109,11 @@ class FrictionSetup(Generic[Settings, Parameters]):
             return replace(bands, differentiated=True)
         return replace(bands, **_as_friction(scene, bands, share))
 
-    def needed(self, model: BandModel) -> Need:
+    def needed(self, model: DeviceModel) -> Need:
         """Amplitude and drive (N) that the scene needs of `model`."""
         return needed(self.scene, model, self.targets(model), self.waveform)
 
-    def check_speed(self, model: BandModel, bands: Bands) -> None:
+    def check_speed(self, model: DeviceModel, bands: Bands) -> None:
         """Refuse a skin velocity that the finger's own speed makes impossible, where the skin is modelled."""
         if self.scene.finger.mechanics.order == 0:
             return
@@ -127,14 +127,14 @@ class FrictionSetup(Generic[Settings, Parameters]):
                 f"{'top' if locked else 'median'} speed of the finger, for friction cannot move the skin faster"
             )
 
-    def check_range(self, model: BandModel, steady: float) -> None:
+    def check_range(self, model: DeviceModel, steady: float) -> None:
         """Refuse a friction, `steady` (N) for the most part, that a tribometer cannot measure."""
         most = steady + self.needed(model).amplitude
         bound = self.assumed.force_range
         if most > bound:
             raise ValueError(f"friction of {most:.3g} N: must be <= {bound:g} N, the tribometer's range")
 
-    def contact(self, driver: Driver, friction_per_drive: float) -> BandModel:
+    def contact(self, driver: Driver, friction_per_drive: float) -> DeviceModel:
         """Device model of a sliding contact whose drive makes `friction_per_drive` (N per N), seen by a tribometer.
 
         ``(1 + s delta/v) (1 + 2 zeta s/w0 + s^2/w0^2) F = friction_per_drive u`` up to s^2, at the scene's median
@@ -146,12 +146,12 @@ class FrictionSetup(Generic[Settings, Parameters]):
         ring = 2 * sliding.tribometer_damping / w0 if sensed else 0.0
         own = 1.0 / friction_per_drive
         one = np.eye(1)
-        return BandModel(
+        return DeviceModel(
             rate=driver.rate,
             delay=driver.delay,
             block=1,  # held over a block, the envelopes saturate at touch: the friction answers within a sample
             mass=own * (1 / w0**2 + ring * lag if sensed else 0.0) * one,
-            late=ring,
+            sensor_delay=ring,
             damping=own * (lag + ring) * one,
             stiffness=own * one,
             force_from_drive=one,
@@ -163,7 +163,7 @@ class FrictionSetup(Generic[Settings, Parameters]):
             sensed_limit=sliding.force_range,
             sensed_noise=sliding.force_noise,
             rigid=True,
-            memory=own * sliding.memory_length,
+            contact_damping=own * sliding.memory_length,
             typical_speed=speed,
             unit="N",
             drive_unit="N",
@@ -175,7 +175,7 @@ class FrictionSetup(Generic[Settings, Parameters]):
                 typical_stiffness=0.5 * own,
                 least_motion=LEAST_FORCE,
                 contact=None,
-                presence=True,
+                needs_contact=True,
                 least_speed=sliding.least_speed,
             ),
         )
@@ -191,18 +191,18 @@ class FrictionRenderer(BaseRenderer[Setup]):
         """Return the waveform whose time derivative is the target friction: displacement over v/F (N s)."""
         return setup.waveform
 
-    def bands(self, setup: Setup, model: BandModel) -> Bands:
-        """Carriers and targets of a scene; `band_model` has refused what is beyond the device.
+    def bands(self, setup: Setup, model: DeviceModel) -> Bands:
+        """Carriers and targets of a scene; `device_model` has refused what is beyond the device.
 
         The sensor's response to a fixed carrier is taken into account here; of one that follows the finger the
         controller computes it from the model's delays.
         """
         bands = setup.targets(model)
         setup.check_speed(model, bands)
-        direct = model.late == model.foresight == 0.0
+        direct = model.sensor_delay == model.contact_lag == 0.0
         if direct or bands.envelope is None or (bands.wavenumber > 0.0).any():
             return bands
-        return replace(bands, shown=setup.assumed.sensor_response(bands.frequency, setup.speed))
+        return replace(bands, sensor_response=setup.assumed.sensor_response(bands.frequency, setup.speed))
 
 
 def _as_friction(scene: Scene, bands: Bands, velocity_per_force: float) -> dict[str, Any]:

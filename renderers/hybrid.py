@@ -19,8 +19,8 @@ import numpy as np
 
 from hapticrender.bands import Bands
 from hapticrender.checks import Validated, check_names, inside, parameter
-from hapticrender.control.bandmodel import BandModel
 from hapticrender.control.combined import CombinedBands, CombinedController, CombinedModel, design_combined
+from hapticrender.control.device_model import DeviceModel
 from hapticrender.plants.electroadhesion import ElectroadhesionParameters, ElectroadhesionScreen
 from hapticrender.plants.hybrid import PLACES, HybridPlant
 from hapticrender.plants.plate import PlateParameters
@@ -181,40 +181,40 @@ class HybridRenderer(BaseRenderer[HybridSetup]):
         """Return `driver` behind the square root, with the skin's velocity computed from its sensors."""
         _check_channels(driver)
         plate = setup.plate.assumed
-        model = plate.band_model(driver.rate, driver.delay)
+        model = plate.device_model(driver.rate, driver.delay)
         lever = np.array([1.0, 1.0 / plate.half_spacing])
         shape = np.zeros_like if setup.friction is None else setup.friction.compensation
         return HybridDriver(driver, shape, lever[:, None] * model.coordinate_from_sensed, setup.velocity_per_force)
 
-    def band_model(self, setup: HybridSetup, driver: Driver) -> CombinedModel:
+    def device_model(self, setup: HybridSetup, driver: Driver) -> CombinedModel:
         """Return the device models of the two parts behind `driver`."""
         _check_channels(driver)
-        plate = self._plate.band_model(setup.plate, _part_of(driver, COILS, SENSORS, "plate"))
+        plate = self._plate.device_model(setup.plate, _part_of(driver, COILS, SENSORS, "plate"))
         friction = None
         if setup.friction is not None:
-            friction = self._screen.band_model(setup.friction, _part_of(driver, 1, 1, "screen"))
+            friction = self._screen.device_model(setup.friction, _part_of(driver, 1, 1, "screen"))
         if friction is not None and (setup.bands.wavenumber > 0.0).any():  # fixed carriers have their share for good
             start = setup.settings.start
             plate = replace(plate, highest_frequency=start, highest_edge=2.0)
             friction = replace(friction, lowest_frequency=2 * start)
         return _side_by_side(plate, friction, setup.velocity_per_force)
 
-    def bands(self, setup: HybridSetup, model: BandModel) -> CombinedBands:
+    def bands(self, setup: HybridSetup, model: DeviceModel) -> CombinedBands:
         """Carriers and targets of a scene, shared out; refused where a part cannot do its share."""
         bands = setup.bands
         check_carriers(setup.scene, model, bands)
         if not isinstance(model, CombinedModel):
-            raise TypeError(f"model: must be the CombinedModel of band_model, not {type(model).__name__}")
+            raise TypeError(f"model: must be the CombinedModel of device_model, not {type(model).__name__}")
         if len(bands.plate):
             bands = replace(bands, plate=self._plate.bands(setup.plate, model.plate))
         if model.friction is not None and setup.friction is not None:
             bands = replace(bands, friction=self._screen.bands(setup.friction, model.friction))
         return bands
 
-    def design(self, method: Method, model: BandModel, bands: Bands, *, feedback: bool = True) -> CombinedController:
+    def design(self, method: Method, model: DeviceModel, bands: Bands, *, feedback: bool = True) -> CombinedController:
         """Return two controllers of `method`, one a part, as one."""
         if not (isinstance(model, CombinedModel) and isinstance(bands, CombinedBands)):
-            raise TypeError("model, bands: must be those of band_model and bands")
+            raise TypeError("model, bands: must be those of device_model and bands")
         return design_combined(method, model, bands, feedback=feedback)
 
 
@@ -231,7 +231,7 @@ def _part(scene: Scene, bands: Bands) -> Scene:
 
 def _share_out(scene: Scene, settings: HybridSettings, plate: PlateParameters, rate: float) -> CombinedBands:
     """Bands of a scene, and the share of each part as displacement (m)."""
-    whole = felt(scene, scene.texture.bands(rate), plate.band_model(rate, 1))
+    whole = felt(scene, scene.texture.bands(rate), plate.device_model(rate, 1))
     locked = whole.wavenumber > 0.0
     if whole.envelope is None and not locked.all():
         raise ValueError(
@@ -294,7 +294,7 @@ def _split_table(values: Mapping[str, Any], settings: set[str]) -> tuple[dict[st
     return found
 
 
-def _side_by_side(plate: BandModel, friction: BandModel | None, velocity_per_force: float) -> CombinedModel:
+def _side_by_side(plate: DeviceModel, friction: DeviceModel | None, velocity_per_force: float) -> CombinedModel:
     """Band model of both, block by block; what is judged is a velocity, no multiple of the coordinates."""
     parts = [plate] if friction is None else [plate, friction]
 

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from hapticrender.bands import Bands
-from hapticrender.control.bandmodel import BandModel
+from hapticrender.control.device_model import DeviceModel
 from hapticrender.protocols import Array
 from hapticrender.renderers.base import Waveform
 from hapticrender.touch.perception import drop_unfelt
@@ -46,7 +46,7 @@ def top_speed(scene: Scene) -> float:
     return float(np.nanmax(speeds(scene), initial=0.0))
 
 
-def felt(scene: Scene, bands: Bands, model: BandModel) -> Bands:
+def felt(scene: Scene, bands: Bands, model: DeviceModel) -> Bands:
     """Leave out the bands that cannot be felt, unless the scene keeps them, and note which and why."""
     if not isinstance(bands, Bands):
         kind = type(scene.texture).__name__
@@ -62,7 +62,7 @@ def felt(scene: Scene, bands: Bands, model: BandModel) -> Bands:
     return replace(left, unfelt=tuple(each.text() for each in dropped))
 
 
-def check_carriers(scene: Scene, model: BandModel, bands: Bands) -> None:
+def check_carriers(scene: Scene, model: DeviceModel, bands: Bands) -> None:
     """Refuse carriers that the rate cannot carry, at the finger's top speed too."""
     highest = NYQUIST_MARGIN * model.rate
     if bands.frequency.max(initial=0.0) > highest:
@@ -78,7 +78,7 @@ def check_carriers(scene: Scene, model: BandModel, bands: Bands) -> None:
         )
 
 
-def check_targets(scene: Scene, model: BandModel, bands: Bands, waveform: Waveform) -> None:
+def check_targets(scene: Scene, model: DeviceModel, bands: Bands, waveform: Waveform) -> None:
     """Refuse targets that the free device cannot reach within its drive, or that its sensors cannot follow."""
     need = needed(scene, model, bands, waveform)
     if need.amplitude > model.sensed_limit:
@@ -102,14 +102,14 @@ class Need(NamedTuple):
     frequency: float  # Hz, of that band
 
 
-def needed(scene: Scene, model: BandModel, bands: Bands, waveform: Waveform) -> Need:
+def needed(scene: Scene, model: DeviceModel, bands: Bands, waveform: Waveform) -> Need:
     """Amplitude and drive that a scene's targets need of the free device."""
     if bands.envelope is None:
         return _need_of_waveform(scene, model, bands, waveform)
     return _need_of_envelopes(scene, model, bands)
 
 
-def _need_of_envelopes(scene: Scene, model: BandModel, bands: Bands) -> Need:
+def _need_of_envelopes(scene: Scene, model: DeviceModel, bands: Bands) -> Need:
     """Constant targets: a finger-locked carrier passes every frequency up to that of the finger's top speed."""
     sweep = np.minimum(top_speed(scene) * bands.wavenumber, model.highest_edge * model.highest_frequency)
     top = bands.frequency + sweep
@@ -127,7 +127,7 @@ def _need_of_envelopes(scene: Scene, model: BandModel, bands: Bands) -> Need:
     )
 
 
-def _need_of_waveform(scene: Scene, model: BandModel, bands: Bands, waveform: Waveform) -> Need:
+def _need_of_waveform(scene: Scene, model: DeviceModel, bands: Bands, waveform: Waveform) -> Need:
     """A target waveform, over all the frequencies that are rendered."""
     time = np.arange(int(min(scene.duration, LOOK_AHEAD) * model.rate) + 2) / model.rate
     target = bands.checked(type(scene.texture).__name__, waveform, time, scene.finger.position(time))
@@ -143,12 +143,12 @@ def _need_of_waveform(scene: Scene, model: BandModel, bands: Bands, waveform: Wa
     return Need(amplitude, float(drive), amplitude, float(frequency[abs(spectrum).argmax()]))
 
 
-def _named(amplitude: float, model: BandModel) -> str:
+def _named(amplitude: float, model: DeviceModel) -> str:
     """Name a target in the device's quantity."""
     verb = "=" if model.unit == "m" else "asks for"
     return f"texture.amplitude {verb} {amplitude:.3g} {model.unit}"
 
 
-def common_gain(model: BandModel, frequency: Array) -> Array:
+def common_gain(model: DeviceModel, frequency: Array) -> Array:
     """First coordinate of the free device per drive, all channels driven alike (shape of `frequency`)."""
     return abs(model.response(frequency).sum(axis=-1)[..., 0])

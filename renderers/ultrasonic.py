@@ -13,7 +13,7 @@ import numpy as np
 
 from hapticrender.bands import Bands
 from hapticrender.checks import inside
-from hapticrender.control.bandmodel import BandModel
+from hapticrender.control.device_model import DeviceModel
 from hapticrender.plants.friction_laws import LAWS
 from hapticrender.plants.surface import SurfaceParameters, UltrasonicSurface
 from hapticrender.plants.ultrasonic import UltrasonicParameters
@@ -53,7 +53,7 @@ class UltrasonicRenderer(FrictionRenderer[SurfaceSetup]):
         """Return a device at the carrier's rate as a driver of friction; see `ResonantDriver`."""
         return ResonantDriver(driver, setup.assumed, setup.scene.finger, (setup.load, setup.speed))
 
-    def band_model(self, setup: SurfaceSetup, driver: Driver) -> BandModel:
+    def device_model(self, setup: SurfaceSetup, driver: Driver) -> DeviceModel:
         """Return the device model of the surface behind `driver`; refuses what the law or the drive cannot do."""
         check_channels(driver, {1: ""}, {0: "", 1: ""})
         assumed, load = setup.assumed, setup.load
@@ -71,7 +71,7 @@ class UltrasonicRenderer(FrictionRenderer[SurfaceSetup]):
         _check_amplitude(assumed, need / whole, load, setup.speed)
         return replace(model, drive_limit=room)
 
-    def bands(self, setup: SurfaceSetup, model: BandModel) -> Bands:
+    def bands(self, setup: SurfaceSetup, model: DeviceModel) -> Bands:
         """Carriers and targets of a scene, refused where the amplitude could not follow."""
         bands = super().bands(setup, model)
         if bands.frequency.max(initial=0.0) > model.highest_frequency:
@@ -82,7 +82,7 @@ class UltrasonicRenderer(FrictionRenderer[SurfaceSetup]):
         return bands
 
 
-def _model(setup: SurfaceSetup, driver: Driver) -> BandModel:
+def _model(setup: SurfaceSetup, driver: Driver) -> DeviceModel:
     """Device model without its drive limit; the amplitude's interpolation adds half a sample to that of a hold."""
     assumed, late = setup.assumed, 0.5 / driver.rate
     model = setup.contact(driver, 1.0)
@@ -92,9 +92,9 @@ def _model(setup: SurfaceSetup, driver: Driver) -> BandModel:
             mass=late**2 / 2 * np.eye(1),
             damping=late * np.eye(1),
             stiffness=np.eye(1),
-            memory=0.0,
-            late=0.0,
-            foresight=assumed.memory_length,
+            contact_damping=0.0,
+            sensor_delay=0.0,
+            contact_lag=assumed.memory_length,
             sensed_noise=LEAST_NOISE * model.sensed_limit,
         )
     mass = model.mass + late * model.damping + late**2 / 2 * model.stiffness

@@ -10,7 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 from hapticrender.bands import Bands
-from hapticrender.control.bandmodel import BandModel
+from hapticrender.control.device_model import DeviceModel
 from hapticrender.plants.plate import EXPECTED_BENDING, Plate, PlateParameters
 from hapticrender.protocols import Driver
 from hapticrender.renderers.base import BaseRenderer, check_channels, check_tables, read_devices
@@ -50,21 +50,21 @@ class VibrotactileRenderer(BaseRenderer[PlateSetup]):
         check_path(setup.scene, setup.simulated.glass_length / 2, "glass")
         return Plate(setup.simulated, setup.scene.finger, seed)
 
-    def band_model(self, setup: PlateSetup, driver: Driver) -> BandModel:
+    def device_model(self, setup: PlateSetup, driver: Driver) -> DeviceModel:
         """Return the device model of the plate behind `driver`."""
         assumed, coils = setup.assumed, setup.assumed.coils
         check_channels(driver, {coils: "one a coil"}, {2: "one an end", 0: "open loop"})
         plate = getattr(driver, "plant", None)
         own = isinstance(plate, Plate) and plate.parameters is setup.simulated
         delay = assumed.delay if own else driver.delay  # that of a simulated plate may differ from what is assumed
-        model = replace(assumed.band_model(driver.rate, delay), block=driver.block)
+        model = replace(assumed.device_model(driver.rate, delay), block=driver.block)
         if setup.scene.gradient:
             model = replace(model, shape=_pattern(setup.scene, assumed))
         if model.rigid and not isinstance(plate, Plate):
             return replace(model, bending=EXPECTED_BENDING, rigid=False)  # only a model of a plate is rigid
         return model
 
-    def bands(self, setup: PlateSetup, model: BandModel) -> Bands:
+    def bands(self, setup: PlateSetup, model: DeviceModel) -> Bands:
         """Carriers and targets of a scene, refused where they pass Nyquist or the current limit."""
         scene = setup.scene
         bands = felt(scene, scene.texture.bands(model.rate), model)

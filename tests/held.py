@@ -26,7 +26,7 @@ def hold(method, bands, seconds, plate=None, known=None, **scene):
     """Drive and motion under a method of the library; `known` is the plate that it was designed for."""
     plate = plate or PlateParameters()
     known = known or plate
-    controller = METHODS[method].design(known.band_model(plate.rate, known.delay), bands)
+    controller = METHODS[method].design(known.device_model(plate.rate, known.delay), bands)
     return play(controller, seconds, plate, **scene)
 
 

@@ -61,7 +61,7 @@ def test_one_coil_holds_the_middle_and_leaves_the_ends_to_the_finger(frequency):
     finger = hr.Finger.still(position=place, normal_load=0.4, mechanics="light")
     stiffness = plate.dynamic_stiffness(frequency, finger.mechanics.impedance(frequency), place)
     heave_and_rocking = np.array([1.0, -stiffness[1, 0] / stiffness[1, 1]])
-    expected = abs(plate.band_model(plate.rate, plate.delay).place_from_coordinate @ heave_and_rocking)
+    expected = abs(plate.device_model(plate.rate, plate.delay).place_from_coordinate @ heave_and_rocking)
     recording = rendered(frequency, finger=finger, coils=1)
     assert recording.drive.shape[1] == 1
     np.testing.assert_allclose(amplitudes(recording, frequency) / A, expected, rtol=0, atol=CENTRE)

@@ -17,7 +17,7 @@ from hapticrender.plants.plate import PlateParameters
 
 RECORDED = json.loads((Path(__file__).parent / "data" / "checked_gains.json").read_text())
 RATE = 5000.0
-MODEL = PlateParameters().band_model(RATE, 1)
+MODEL = PlateParameters().device_model(RATE, 1)
 TAPS = damping_taps(MODEL, 1.4)[0]
 USUAL = LeastMargins()
 GAINS = BankGains(

@@ -144,7 +144,7 @@ def test_an_ultrasonic_amplitude_loop_in_blocks_follows_its_waveform(block):
     """
     surface = SurfaceParameters()
     mode = replace(surface.carrier_mode, delay=block)
-    model = replace(resonant(mode.band_model(mode.rate, block), mode, 0.0), block=block)
+    model = replace(resonant(mode.device_model(mode.rate, block), mode, 0.0), block=block)
     controller = design_error("h2", model, surface.amplitude_bands(), ONE_SPEED)
     assert controller.block == block
     n = round(0.4 * mode.rate) // block * block

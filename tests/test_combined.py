@@ -61,7 +61,7 @@ def test_each_part_is_driven_as_on_its_own(rng):
 def test_a_part_without_targets_stays_without_drive(rng):
     none = np.zeros(0)
     nothing = Bands(frequency=none, wavenumber=none, phase=none, envelope=none + 0j)
-    model = IDEAL.band_model(RATE, 1)
+    model = IDEAL.device_model(RATE, 1)
 
     class Method:
         name = "h"

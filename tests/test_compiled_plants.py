@@ -48,14 +48,14 @@ CONTROL_T = numba.from_dtype(CONTROL)
 
 @step
 def proportional_step(state, signals, start, count):
-    """Drive every channel by gain (wanted - first sensor) + offset."""
+    """Drive every channel by gain (waveform - first sensor) + offset."""
     s, io = carray(pointer(state, CONTROL_T), 1)[0], carray(pointer(signals, SIGNALS_T), 1)[0]
     stop = start + count
     drive, sensed = carray(pointer(io.drive, F8), (stop, s.channels)), carray(pointer(io.sensed, F8), (stop, s.sensors))
-    wanted, flags = carray(pointer(io.wanted, F8), stop), carray(pointer(io.flags, I8), stop)
+    waveform, flags = carray(pointer(io.waveform, F8), stop), carray(pointer(io.flags, I8), stop)
     for n in range(start, stop):
         for i in range(s.channels):
-            drive[n, i] = s.gain * (wanted[n] - sensed[n, 0]) + s.offset
+            drive[n, i] = s.gain * (waveform[n] - sensed[n, 0]) + s.offset
         flags[n] |= 16
     return 0
 

@@ -18,7 +18,7 @@ MODAL_MASS = 9.5e-3
 
 
 def model_of(rate, delay=1):
-    return replace(PLATE.band_model(float(rate), delay), rigid=False)  # a plate that was not measured
+    return replace(PLATE.device_model(float(rate), delay), rigid=False)  # a plate that was not measured
 
 
 def bending(coil, frequency=1150.0, **more):
@@ -275,12 +275,12 @@ def test_a_slow_or_late_loop_raises_the_quality_or_switches_off():
     assert not off.added_damping.any()
     late = choose_damping(model_of(48000, 256))
     assert late.note == "off: a delay of 256 samples at 48000 Hz is longer than a period of the mode at 189 Hz"
-    viscous = PlateParameters(damping_1=20.0, damping_2=20.0).band_model(5000.0, 1)
+    viscous = PlateParameters(damping_1=20.0, damping_2=20.0).device_model(5000.0, 1)
     assert choose_damping(viscous).note.startswith("off: the modes damp themselves")
 
 
 def test_an_undamped_plate_can_be_designed_for():
-    ideal = PlateParameters(damping_1=0.0, damping_2=0.0).band_model(5000.0, 1)
+    ideal = PlateParameters(damping_1=0.0, damping_2=0.0).device_model(5000.0, 1)
     assert choose_damping(ideal).quality == 1.4
     assert choose_damping(replace(ideal, rigid=False)).quality == 2.0
 

@@ -36,13 +36,13 @@ def comb_error(controller, seconds, plate, finger=None):
 @pytest.mark.parametrize("method", ["h", "h2"])
 def test_the_design_rules_keep_a_comb_of_20_hz_spacing(method):
     """The observer stays below spacing/5, where a comb diverges."""
-    assert comb_error(METHODS[method].design(IDEAL.band_model(RATE, 1), comb()), 6.0, IDEAL) < -100
+    assert comb_error(METHODS[method].design(IDEAL.device_model(RATE, 1), comb()), 6.0, IDEAL) < -100
 
 
 def test_h_and_h2_on_a_comb_under_a_sliding_heavy_finger():
     """H -45 dB without noise, H2 -48 to -51 dB with it."""
     finger = hr.Finger.sliding(speed=0.1, normal_load=0.8, mechanics=HEAVY, touches=((0.5, 100.0),))
-    quiet, noisy = (plate.band_model(RATE, 1) for plate in (IDEAL, PlateParameters()))
+    quiet, noisy = (plate.device_model(RATE, 1) for plate in (IDEAL, PlateParameters()))
     assert -47 < comb_error(METHODS["h"].design(quiet, comb()), 6.0, IDEAL, finger) < -42
     assert comb_error(METHODS["h2"].design(noisy, comb()), 9.0, PlateParameters(), finger) < -48
 

@@ -160,7 +160,7 @@ def test_phase_from_a_growing_time():
     assert np.all(np.diff(grown) > 0)
     assert grown[-1] > 15.0
     samples = 500_000
-    controller = METHODS["h2"].design(IDEAL.band_model(RATE, 1), fixed((float(frequency), 1e-6)))
+    controller = METHODS["h2"].design(IDEAL.device_model(RATE, 1), fixed((float(frequency), 1e-6)))
     play(controller, samples / RATE, IDEAL)
     true = Fraction(float(frequency) / RATE) * samples % 1
     off = float((Fraction(controller.turns[0]) - true + Fraction(1, 2)) % 1 - Fraction(1, 2))

@@ -126,7 +126,7 @@ def test_the_sampled_plate_is_stiffness_hold_and_delay_with_all_images():
     turn = images / 5000.0
     hold = np.sinc(turn) * np.exp(-2j * np.pi * turn * (late + 0.5))
     reach = REACH / (SPACING / 2)
-    response = np.array([[1.0, -reach], [1.0, reach]]) @ PAPER.band_model(5000.0, 1).response(images)
+    response = np.array([[1.0, -reach], [1.0, reach]]) @ PAPER.device_model(5000.0, 1).response(images)
     each = hold[..., None, None] * response
     driven, _ = sampled_response(PAPER, 5000.0, late, frequency / 5000.0)
     scale = abs(driven).max(axis=(1, 2))
@@ -157,7 +157,7 @@ def test_a_profile_is_the_device_table_of_a_scene(twelve):
     reach = REACH / (SPACING / 2)
     sensed = plate["gains"] * (np.array([[1.0, -reach], [1.0, reach]]) @ true)
     error = 2 * identified.estimates["gain_difference"].interval * 3e-5
-    np.testing.assert_allclose(identified.band_model().coordinate_from_sensed @ sensed, true, atol=error)
+    np.testing.assert_allclose(identified.device_model().coordinate_from_sensed @ sensed, true, atol=error)
 
 
 def amplitude(scene, recording):

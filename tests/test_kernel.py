@@ -10,8 +10,8 @@ from naive_error import NaiveError
 
 import hapticrender as hr
 from hapticrender.bands import Bands
-from hapticrender.control.bandmodel import FingerRange
 from hapticrender.control.controller import setpoint_rows
+from hapticrender.control.device_model import FingerRange
 from hapticrender.control.error_design import ONE_SPEED, design_error, rules_for
 from hapticrender.plants.plate import Plate, PlateParameters
 from hapticrender.protocols import Flag
@@ -33,7 +33,7 @@ def waveform_of(bands):
 
 
 def plate_controller(bands, *, parameters=IDEAL, delay=1, block=1, rules=None, feedback=True, **settings):
-    model = replace(parameters, delay=delay).band_model(parameters.rate, delay)
+    model = replace(parameters, delay=delay).device_model(parameters.rate, delay)
     rules = rules or rules_for(bands)
     controller = design_error("h2", replace(model, block=block), bands, rules, feedback=feedback)
     for name, value in settings.items():
@@ -43,16 +43,16 @@ def plate_controller(bands, *, parameters=IDEAL, delay=1, block=1, rules=None, f
 
 def friction_controller(bands):
     """Of a device that is there only under a sliding finger, with a sensor that is late and a contact that lags."""
-    finger = FingerRange(presence=True, contact=None, least_speed=5e-3)
+    finger = FingerRange(needs_contact=True, contact=None, least_speed=5e-3)
     changes = {
         "finger": finger,
-        "late": 1e-4,
-        "foresight": 2e-5,
-        "memory": 0.05,
+        "sensor_delay": 1e-4,
+        "contact_lag": 2e-5,
+        "contact_damping": 0.05,
         "typical_speed": 0.1,
         "drive_limit": 9.0,
     }
-    model = replace(replace(IDEAL, coils=1).band_model(RATE, 1), **changes)
+    model = replace(replace(IDEAL, coils=1).device_model(RATE, 1), **changes)
     return design_error("h2", model, bands, ONE_SPEED)
 
 

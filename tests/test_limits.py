@@ -43,7 +43,7 @@ def grating(wavelength, amplitude):
 
 def design(method, bands, parameters=None, **changes):
     parameters = parameters or PlateParameters()
-    model = parameters.band_model(parameters.rate, parameters.delay)
+    model = parameters.device_model(parameters.rate, parameters.delay)
     return METHODS[method].design(dataclasses.replace(model, **changes), bands)
 
 
@@ -75,7 +75,7 @@ def test_overload_is_cut_as_a_whole_and_left_in_a_quarter_of_a_second(method):
     assert peak.min() > 0.99 * limit  # both coils; their springs differ by 2 %
     assert np.mean(flags[500:10_000] & Flag.SATURATED != 0) > 0.5
     # what 3 A in each coil can do at 400 Hz is 0.279 mm
-    reach = limit * abs(PlateParameters().band_model(RATE, 1).response(400.0).sum(axis=-1)[0])
+    reach = limit * abs(PlateParameters().device_model(RATE, 1).response(400.0).sum(axis=-1)[0])
     assert line(motion[9000:10_000], 400.0)[0] == pytest.approx(reach, rel=0.15)
     period = 25  # samples: two turns of the carrier
     blocks = motion[10_000:, :].reshape(-1, period, 3)
@@ -246,7 +246,7 @@ def test_after_ten_hours_it_plays_as_in_the_first_second(method, samples):
     A growing time in float32 is by then good to 2 ms, half a turn.
     """
     late = design(method, tones(*((f, 1e-6) for f in PITCHES)))
-    late.tiles["live"][0, : len(PITCHES)] = 1.0
+    late.tiles["active"][0, : len(PITCHES)] = 1.0
     late.tiles["turns"][0, : len(PITCHES)] = [turns_after(samples, f) for f in PITCHES]
     early = design(
         method,
@@ -347,7 +347,7 @@ def test_without_sensors_it_drives_from_what_it_knows(method, analysed):
     """Open loop on the plate of the design: the law alone is right."""
     parameters = PlateParameters(**IDEAL)
     bands = dataclasses.replace(tones((47.0, 1e-5)), **({"envelope": None} if analysed else {}))
-    model = parameters.band_model(RATE, 1)
+    model = parameters.device_model(RATE, 1)
     controller = METHODS[method].design(model, bands, feedback=False)
     wanted = 1e-5 * np.cos(2 * np.pi * 47.0 * np.arange(15_000) / RATE)
     drive, _, _ = controller.run(np.zeros((15_000, 0)), np.full(15_000, np.nan), wanted)

@@ -22,7 +22,7 @@ from hapticrender.mathx import polar
 from hapticrender.plants.plate import PlateParameters
 
 RATE, COUNT = 5000.0, 1500
-MODEL = PlateParameters().band_model(RATE, 1)
+MODEL = PlateParameters().device_model(RATE, 1)
 LOW_PASS = ("paper", "paper-common", "boxcar", "static", "stiffness", "resonant")
 # of the largest drive: angles are good to 2.3e-10 rad and magnitudes to 1.8e-10 of themselves, which both loops
 # integrate, and products of 64 turns to 64 roundings

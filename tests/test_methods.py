@@ -51,7 +51,7 @@ def mixed():
 
 def designed(method, bands, overrides=None, **options):
     method = METHODS[method] if isinstance(method, str) else method
-    return method.design(PlateParameters(**(overrides or {})).band_model(RATE, 1), bands, **options)
+    return method.design(PlateParameters(**(overrides or {})).device_model(RATE, 1), bands, **options)
 
 
 def hold(method, bands, seconds, overrides=IDEAL, wanted=None, finger=None):
@@ -262,7 +262,7 @@ def test_integrators_without_a_low_pass_take_the_damping_of_a_mode(gain, holds, 
     That is a limit of 16.07 1/s for carriers far below the mode; delay and hold, 0.3 ms, turn the force by 16 degrees
     and leave 3 % more.
     """
-    assert least_decay(PlateParameters().band_model(RATE, 1)) == pytest.approx(16.07, abs=0.01)
+    assert least_decay(PlateParameters().device_model(RATE, 1)) == pytest.approx(16.07, abs=0.01)
     finger = hr.Finger.still(position=27.5e-3, normal_load=0.01, mechanics="none")  # something to start rocking
     _, sensed = hold(Resonant(gain=gain, checked=False), tones(*frequency), 30.0, finger=finger)
     rocking = sensed.motion[:, 1] - sensed.motion[:, 2]
@@ -278,7 +278,7 @@ def test_the_resonant_method_refuses_a_gain_that_drives_a_mode():
 @pytest.mark.parametrize("name", ["boxcar", "static", "stiffness", "resonant"])
 def test_too_long_a_delay_is_refused(name):
     with pytest.raises(hr.DesignError, match="margin|unstable|sensitivity"):
-        METHODS[name].design(PlateParameters(delay=25_000).band_model(RATE, 25_000), tones(47.0))
+        METHODS[name].design(PlateParameters(delay=25_000).device_model(RATE, 25_000), tones(47.0))
 
 
 def test_the_boxcar_is_deaf_to_the_image_of_whole_half_periods():

@@ -32,7 +32,7 @@ def tones(*pairs, phase=0.0):
 def close(bands, seconds, *, method="paper", overrides=None, finger=None, table=None, seed=0):
     """Run plate and controller; `table` is another band model to fill the look-up table from."""
     parameters = PlateParameters(**(overrides or {}))
-    model = table or parameters.band_model(RATE, parameters.delay)
+    model = table or parameters.device_model(RATE, parameters.delay)
     controller = METHODS[method].design(model, bands)
     plate = Plate(parameters, finger or hr.Finger.absent(), seed)
     drive, _, flags, sensed = plate.closed_loop(controller, np.zeros(int(seconds * RATE)))
@@ -57,7 +57,7 @@ def test_the_kernel_equals_its_naive_twin(rng):
     """Open loop on random samples, three bands with odd phases: the cosine's 2e-10 and the order of sums differ."""
     frequency, phase, target = np.array([47.0, 111.0, 261.0]), np.array([0.7, 0.1, 1.0]), np.array([1e-5, 3e-6j, -1e-6])
     bands = Bands(frequency=frequency, wavenumber=np.zeros(3), phase=phase, envelope=target)
-    controller = PerSide(bandwidths=(5.0, 10.0)).design(PlateParameters().band_model(RATE, 1), bands)
+    controller = PerSide(bandwidths=(5.0, 10.0)).design(PlateParameters().device_model(RATE, 1), bands)
     sensed = 1e-6 * rng.standard_normal((2000, 2))
     drive, found, _ = controller.run(sensed, np.zeros(2000), np.zeros(2000))
     twin = NumpyPolar(frequency, phase, target)
@@ -84,7 +84,7 @@ def test_baseline_holds_on_the_free_plate(frequency, wanted):
 
 def test_two_sides_apart_fail_at_170_hz_and_common_mode_does_not():
     """centre +129 %, far end +419 %, one side stuck at zero; off-diagonal gain 1294 against 347 um/A."""
-    model = PlateParameters().band_model(RATE, 1)
+    model = PlateParameters().device_model(RATE, 1)
     sides = abs(model.side_from_coordinate @ model.response(170.0)) * 1e6
     np.testing.assert_allclose([sides[0, 1], sides[0, 0]], [1294, 347], rtol=0.01)
     drive, sensed, _ = close(tones((170.0, 10e-6)), 6.0, overrides=QUIET)
@@ -159,7 +159,7 @@ def test_an_equal_load_halves_the_bandwidth_only_at_resonance():
 def test_a_table_of_the_loaded_plate_limit_cycles_at_lift_off():
     """at 189 Hz the free plate has 3.9 x the gain of the loaded one, above the gain margin of 3.5."""
     parameters = PlateParameters(**IDEAL)
-    free = parameters.band_model(RATE, 1)
+    free = parameters.device_model(RATE, 1)
     finger = np.diag([1.0, 0.0])
     loaded = dataclasses.replace(
         free,
@@ -229,7 +229,7 @@ def test_analysed_targets_of_a_steady_tone_are_its_envelope():
     """The wanted waveform passes the STDFT* that listens to the device; its 2f image of (10/94)^2 is left."""
     parameters = PlateParameters(**IDEAL)
     bands = dataclasses.replace(tones((47.0, 1.0), phase=0.3), envelope=None)
-    controller = METHODS["paper"].design(parameters.band_model(RATE, 1), bands)
+    controller = METHODS["paper"].design(parameters.device_model(RATE, 1), bands)
     wanted = 1e-5 * np.cos(2 * np.pi * 47.0 * np.arange(15_000) / RATE + 1.0)
     plate = Plate(parameters, hr.Finger.absent())
     _, target, _, sensed = plate.closed_loop(controller, wanted)
@@ -244,7 +244,7 @@ def test_without_sensors_it_drives_open_loop_from_the_table():
     """Free plate, so the table is right: the error left is the table's 0.5 Hz grid, on which 47 and 400 Hz lie."""
     parameters = PlateParameters(**IDEAL)
     bands = tones((47.0, 1e-5), (400.0, 1e-6))
-    controller = METHODS["paper"].design(parameters.band_model(RATE, 1), bands, feedback=False)
+    controller = METHODS["paper"].design(parameters.device_model(RATE, 1), bands, feedback=False)
     drive, _, _ = controller.run(np.zeros((15_000, 0)), np.full(15_000, np.nan), np.zeros(15_000))
     played = np.vstack([np.zeros((1, 2)), drive[:-1]])
     motion = Plate(parameters, hr.Finger.absent()).run(played).motion
@@ -257,7 +257,7 @@ def test_without_sensors_it_drives_open_loop_from_the_table():
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf, 1e30])
 @pytest.mark.parametrize("method", list(METHODS))
 def test_drive_stays_finite_and_inside_its_limit_whatever_is_sensed(method, bad, rng):
-    model = PlateParameters().band_model(RATE, 1)
+    model = PlateParameters().device_model(RATE, 1)
     controller = METHODS[method].design(model, tones((47.0, 1e-5), (261.0, 1e-5)))
     sensed = 1e-5 * rng.standard_normal((500, 2))
     sensed[100:110] = bad
@@ -274,11 +274,11 @@ def test_a_long_delay_slows_the_loop_down_until_its_margins_hold():
     naive = CommonMode(bandwidths=(5.0, 10.0))
     parameters = PlateParameters(delay=300, **IDEAL)
     plate = Plate(parameters, hr.Finger.absent())
-    controller = naive.design(parameters.band_model(RATE, 300), tones((111.0, 1e-5)))
+    controller = naive.design(parameters.device_model(RATE, 300), tones((111.0, 1e-5)))
     sensed = plate.closed_loop(controller, np.zeros(60_000))[3]
     assert abs(amplitude(sensed.motion, 111.0, 2.0)[0] / 1e-5 - 1) > 0.05
     with pytest.raises(hr.DesignError, match="unstable|margin|sensitivity"):
-        METHODS["paper"].design(parameters.band_model(RATE, 25_000), tones((111.0, 1e-5)))
+        METHODS["paper"].design(parameters.device_model(RATE, 25_000), tones((111.0, 1e-5)))
 
 
 def test_an_unknown_method_is_refused_with_the_known_ones():
@@ -293,7 +293,7 @@ def test_blocks_of_any_length_give_the_same(rng):
     sensed, nothing = 1e-5 * rng.standard_normal((300, 2)), np.zeros(300)
     outputs = []
     for edges in ([0, 300], [0, 1, 2, 63, 64, 65, 200, 300], range(301)):
-        controller = METHODS["paper"].design(parameters.band_model(RATE, 1), bands)
+        controller = METHODS["paper"].design(parameters.device_model(RATE, 1), bands)
         pieces = [
             controller.run(sensed[a:b], nothing[a:b], nothing[a:b])[0] for a, b in zip(edges, edges[1:], strict=False)
         ]

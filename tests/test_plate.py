@@ -183,7 +183,7 @@ def test_measured_response_is_the_predicted_one(frequency):
     The transient has decayed by exp(-2 pi 2.56 * 6); images past the 50th hold less than (f/rate)^3/(2 50^2) < 1e-6.
     """
     parameters = PlateParameters(**IDEAL)
-    model = parameters.band_model(RATE, 1)
+    model = parameters.device_model(RATE, 1)
     carrier = np.exp(2j * np.pi * frequency * np.arange(40_000) / RATE)
     plate = Plate(parameters, hr.Finger.absent())
     motion = plate.run(0.01 * np.stack([carrier.real, 0.5 * carrier.real], axis=1)).motion

@@ -19,7 +19,7 @@ class Bench:
     def __init__(self, method, bands, finger=None):
         parameters = PlateParameters()
         self.plate = Plate(parameters, finger or hr.Finger.absent())
-        self.controller = METHODS[method].design(parameters.band_model(RATE, 1), bands)
+        self.controller = METHODS[method].design(parameters.device_model(RATE, 1), bands)
 
     def run(self, count):
         drive, _, flags, sensed = self.plate.closed_loop(self.controller, np.zeros(count))
@@ -78,7 +78,7 @@ def test_phase_is_right_again_soon_after_a_reversal(method):
     ridges = Bands(frequency=np.zeros(1), wavenumber=np.array([4e3]), phase=np.zeros(1), envelope=np.array([1e-6 + 0j]))
     parameters = PlateParameters(sensor_noise=0.0, sensor_bits=0, current_bits=0)
     finger = hr.Finger.sliding(speed=0.08, span=0.08, normal_load=0.0, mechanics="none")
-    controller = METHODS[method].design(parameters.band_model(RATE, 1), ridges)
+    controller = METHODS[method].design(parameters.device_model(RATE, 1), ridges)
     plate = Plate(parameters, finger)
     sensed = plate.closed_loop(controller, np.zeros(12_500))[3]  # turns at 0.5, 1.5, 2.5 s
     n = np.arange(8250, 9000)  # 150 to 300 ms after a turn

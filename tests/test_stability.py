@@ -17,7 +17,7 @@ from hapticrender.touch.mechanics import HEAVY, LIGHT, NAMED, NONE
 RATE = 5000.0
 IDEAL = {"sensor_noise": 0.0, "sensor_bits": 0, "current_bits": 0, "current_limit": 1e6, "sensor_range": 1e3}
 PLATE = PlateParameters(**IDEAL)
-MODEL = PLATE.band_model(RATE, 1)
+MODEL = PLATE.device_model(RATE, 1)
 COMB = tuple(np.arange(20.0, 401.0, 20.0))
 SCHEDULED = (("observer",), ("integral", "integral_medium"), ("damper",))  # settings at low and medium, beside "_high"
 

@@ -247,7 +247,7 @@ def test_the_band_model_is_the_free_cold_plate(level):
     parameters = UltrasonicParameters(temperature_rise=10.0)
     if level == "envelope":
         parameters = parameters.transposed(6e3, 48e3)
-    model = parameters.band_model(parameters.rate, 2)
+    model = parameters.device_model(parameters.rate, 2)
     frequency = parameters.carrier + np.array([-200.0, 0.0, 50.0])
     stiffness = model.dynamic_stiffness(frequency)[:, 0, 0]
     # differences of m w^2, of which Q roundings are left

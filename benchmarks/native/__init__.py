@@ -164,8 +164,9 @@ def samples_of(controller):
 
 
 def _bands(tiles):
-    same = {name: tiles[name] for name in ("live", "weight", "share", "r_re", "r_im")}
-    wanted = {"ramp": tiles["fade"], "wanted_re": tiles["set_re"], "wanted_im": tiles["set_im"]}
+    same = {name: tiles[name] for name in ("weight", "r_re", "r_im")}
+    same |= {"live": tiles["active"], "share": tiles["feedback"]}
+    wanted = {"ramp": tiles["fade"], "wanted_re": tiles["setpoint_re"], "wanted_im": tiles["setpoint_im"]}
     return _rows(len(tiles), AT["BAND_ROWS"], **same, **wanted)
 
 
@@ -196,7 +197,9 @@ def _held(tiles, speak):
     for channel in (0, 1):
         for part in ("re", "im"):
             row = 4 + AT["CHANNEL_ROWS"] * channel + AT[f"NOW_{part.upper()}"]
-            found[:, row] = speak[channel, 0] * tiles[f"now0_{part}"] + speak[channel, 1] * tiles[f"now1_{part}"]
+            found[:, row] = (
+                speak[channel, 0] * tiles[f"last_force0_{part}"] + speak[channel, 1] * tiles[f"last_force1_{part}"]
+            )
     return found
 
 

@@ -147,7 +147,7 @@ def frequencies() -> Item:
 def _one_sided(frequency: float) -> float:
     """Error of the centre (%) where one coil alone holds its own side at the target, the stronger of the two."""
     parameters = PlateParameters()
-    model = parameters.band_model(parameters.rate, parameters.delay)
+    model = parameters.device_model(parameters.rate, parameters.delay)
     motion = np.linalg.solve(parameters.dynamic_stiffness(np.array(frequency)), parameters.force_from_drive)
     own = np.abs(np.diag(model.side_from_coordinate @ motion))
     return float(100 * (np.abs(motion[0]) / own - 1).max())
@@ -241,7 +241,7 @@ def _extract(recording: Recording, frequency: float) -> tuple[Array, Array, Arra
     The current acts half a sample late on average, being held over the sample that follows its command.
     """
     p, w, section = PlateParameters(), 2 * pi * frequency, butter(2, FILTER, fs=recording.rate)
-    model = p.band_model(recording.rate, p.delay)
+    model = p.device_model(recording.rate, p.delay)
     coordinates = recording.sensed @ model.coordinate_from_sensed.T
     turn = 2 * np.exp(-1j * w * recording.time)[:, None]
     slow = lfilter(*section, coordinates, axis=0)

@@ -50,7 +50,7 @@ class Bench:
         """Close the loop for so many seconds; `wanted` (m) where the bands have no constant envelopes."""
         known = self.known or self.plate
         samples = int(round(seconds * RATE))
-        controller = method_named(self.method).design(known.band_model(RATE, known.delay), bands)
+        controller = method_named(self.method).design(known.device_model(RATE, known.delay), bands)
         plate = Plate(self.plate, finger or Finger.absent(), seed)
         drive, target, _, sensed = plate.closed_loop(controller, np.zeros(samples) if wanted is None else wanted)
         position = np.zeros(samples) if sensed.position is None else sensed.position
@@ -251,7 +251,7 @@ def overload(bench: Bench) -> dict[str, float]:
     count = int(4 * RATE)
     known = bench.known or bench.plate
     controllers: list[Any] = [
-        method_named(bench.method).design(known.band_model(RATE, known.delay), tones([400.0], wanted))
+        method_named(bench.method).design(known.device_model(RATE, known.delay), tones([400.0], wanted))
         for wanted in (1e-3, 100e-6)
     ]
     plate = Plate(bench.plate, Finger.absent())

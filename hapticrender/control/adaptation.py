@@ -54,14 +54,16 @@ def reset_finger(controller):
         b = record(c.tiles_at, TILE_T, t)
         for k in range(W):
             re, im = b.r_re[k], b.r_im[k]
-            b.rest_re[k] = b.rest_im[k] = b.force_re[k] = b.force_im[k] = b.sent_re[k] = b.sent_im[k] = 0.0
-            b.reference_re[k], b.reference_im[k], b.seen_omega[k], b.complete[k] = re, im, b.omega[k], 1.0
+            b.remainder_re[k] = b.remainder_im[k] = b.finger_force_re[k] = b.finger_force_im[k] = b.command_force_re[
+                k
+            ] = b.command_force_im[k] = 0.0
+            b.filtered_r_re[k], b.filtered_r_im[k], b.filtered_omega[k], b.complete[k] = re, im, b.omega[k], 1.0
             b.last0_re[k], b.last0_im[k] = b.e0_re[k] - b.v0_re[k], b.e0_im[k] - b.v0_im[k]
             b.last1_re[k], b.last1_im[k] = b.e1_re[k] - b.v1_re[k], b.e1_im[k] - b.v1_im[k]
-            b.sent0_re[k], b.sent0_im[k] = b.v0_re[k] + shape0 * re, b.v0_im[k] + shape0 * im
-            b.sent1_re[k], b.sent1_im[k] = b.v1_re[k] + shape1 * re, b.v1_im[k] + shape1 * im
-            b.acted0_re[k], b.acted0_im[k] = b.sent0_re[k], b.sent0_im[k]
-            b.acted1_re[k], b.acted1_im[k] = b.sent1_re[k], b.sent1_im[k]
+            b.command0_re[k], b.command0_im[k] = b.v0_re[k] + shape0 * re, b.v0_im[k] + shape0 * im
+            b.command1_re[k], b.command1_im[k] = b.v1_re[k] + shape1 * re, b.v1_im[k] + shape1 * im
+            b.filtered0_re[k], b.filtered0_im[k] = b.command0_re[k], b.command0_im[k]
+            b.filtered1_re[k], b.filtered1_im[k] = b.command1_re[k], b.command1_im[k]
         for h in range(c.history):
             store_commands(controller, t, h)
 
@@ -72,13 +74,13 @@ def store_commands(controller, t, h):
     c = record(controller, CONTROLLER_T, 0)
     b, s = record(c.tiles_at, TILE_T, t), record(c.commands_at, COMMAND_T, h * c.tiles + t)
     for k in range(W):
-        s.sent0_re[k], s.sent0_im[k], s.sent1_re[k], s.sent1_im[k] = (
-            b.sent0_re[k],
-            b.sent0_im[k],
-            b.sent1_re[k],
-            b.sent1_im[k],
+        s.command0_re[k], s.command0_im[k], s.command1_re[k], s.command1_im[k] = (
+            b.command0_re[k],
+            b.command0_im[k],
+            b.command1_re[k],
+            b.command1_im[k],
         )
-        s.sent_re[k], s.sent_im[k] = b.sent_re[k], b.sent_im[k]
+        s.command_force_re[k], s.command_force_im[k] = b.command_force_re[k], b.command_force_im[k]
 
 
 @kernel
@@ -91,11 +93,11 @@ def note_commands(controller):
         b = record(c.tiles_at, TILE_T, t)
         for k in range(W):
             w, re, im = b.omega[k], b.v0_re[k] + shape0 * b.r_re[k], b.v0_im[k] + shape0 * b.r_im[k]
-            b.sent0_re[k], b.sent0_im[k] = re, im
-            b.sent1_re[k], b.sent1_im[k] = b.v1_re[k] + shape1 * b.r_re[k], b.v1_im[k] + shape1 * b.r_im[k]
-            re, im = re + lever * b.sent1_re[k], im + lever * b.sent1_im[k]
-            z_re, z_im = stiffness - w * w * mass + b.rest_re[k], w * damping + b.rest_im[k]
-            b.sent_re[k], b.sent_im[k] = z_re * re - z_im * im, z_re * im + z_im * re
+            b.command0_re[k], b.command0_im[k] = re, im
+            b.command1_re[k], b.command1_im[k] = b.v1_re[k] + shape1 * b.r_re[k], b.v1_im[k] + shape1 * b.r_im[k]
+            re, im = re + lever * b.command1_re[k], im + lever * b.command1_im[k]
+            z_re, z_im = stiffness - w * w * mass + b.remainder_re[k], w * damping + b.remainder_im[k]
+            b.command_force_re[k], b.command_force_im[k] = z_re * re - z_im * im, z_re * im + z_im * re
         store_commands(controller, t, step)
 
 
@@ -106,12 +108,12 @@ def recall_commands(controller, t, newer, older, share):
     b = record(c.tiles_at, TILE_T, t)
     new, old = record(c.commands_at, COMMAND_T, newer + t), record(c.commands_at, COMMAND_T, older + t)
     for k in range(W):
-        b.sent0_re[k] = new.sent0_re[k] + share * (old.sent0_re[k] - new.sent0_re[k])
-        b.sent0_im[k] = new.sent0_im[k] + share * (old.sent0_im[k] - new.sent0_im[k])
-        b.sent1_re[k] = new.sent1_re[k] + share * (old.sent1_re[k] - new.sent1_re[k])
-        b.sent1_im[k] = new.sent1_im[k] + share * (old.sent1_im[k] - new.sent1_im[k])
-        b.sent_re[k] = new.sent_re[k] + share * (old.sent_re[k] - new.sent_re[k])
-        b.sent_im[k] = new.sent_im[k] + share * (old.sent_im[k] - new.sent_im[k])
+        b.command0_re[k] = new.command0_re[k] + share * (old.command0_re[k] - new.command0_re[k])
+        b.command0_im[k] = new.command0_im[k] + share * (old.command0_im[k] - new.command0_im[k])
+        b.command1_re[k] = new.command1_re[k] + share * (old.command1_re[k] - new.command1_re[k])
+        b.command1_im[k] = new.command1_im[k] + share * (old.command1_im[k] - new.command1_im[k])
+        b.command_force_re[k] = new.command_force_re[k] + share * (old.command_force_re[k] - new.command_force_re[k])
+        b.command_force_im[k] = new.command_force_im[k] + share * (old.command_force_im[k] - new.command_force_im[k])
 
 
 @kernel
@@ -121,17 +123,17 @@ def filter_commands(controller, t, pole, middle):
     b = record(c.tiles_at, TILE_T, t)
     behind = middle * max(c.p.block, TURN_SAMPLES) / c.p.rate
     for k in range(W):
-        b.acted0_re[k] += pole * (b.sent0_re[k] - b.acted0_re[k])
-        b.acted0_im[k] += pole * (b.sent0_im[k] - b.acted0_im[k])
-        b.acted1_re[k] += pole * (b.sent1_re[k] - b.acted1_re[k])
-        b.acted1_im[k] += pole * (b.sent1_im[k] - b.acted1_im[k])
-        b.force_re[k] += pole * (b.sent_re[k] - b.force_re[k])
-        b.force_im[k] += pole * (b.sent_im[k] - b.force_im[k])
-        b.reference_re[k] += pole * (b.r_re[k] - behind * b.slope_re[k] - b.reference_re[k])
-        b.reference_im[k] += pole * (b.r_im[k] - behind * b.slope_im[k] - b.reference_im[k])
+        b.filtered0_re[k] += pole * (b.command0_re[k] - b.filtered0_re[k])
+        b.filtered0_im[k] += pole * (b.command0_im[k] - b.filtered0_im[k])
+        b.filtered1_re[k] += pole * (b.command1_re[k] - b.filtered1_re[k])
+        b.filtered1_im[k] += pole * (b.command1_im[k] - b.filtered1_im[k])
+        b.finger_force_re[k] += pole * (b.command_force_re[k] - b.finger_force_re[k])
+        b.finger_force_im[k] += pole * (b.command_force_im[k] - b.finger_force_im[k])
+        b.filtered_r_re[k] += pole * (b.r_re[k] - behind * b.slope_re[k] - b.filtered_r_re[k])
+        b.filtered_r_im[k] += pole * (b.r_im[k] - behind * b.slope_im[k] - b.filtered_r_im[k])
         w = b.omega[k] - behind * b.sweep[k]
-        whole = b.fade[k] >= 1.0 and b.share[k] >= 1.0
-        b.seen_omega[k] = b.seen_omega[k] + pole * (w - b.seen_omega[k]) if whole else w
+        whole = b.fade[k] >= 1.0 and b.feedback[k] >= 1.0
+        b.filtered_omega[k] = b.filtered_omega[k] + pole * (w - b.filtered_omega[k]) if whole else w
         b.complete[k] = b.complete[k] + pole * (1.0 - b.complete[k]) if whole else 0.0
 
 
@@ -155,23 +157,23 @@ def add_residual(controller, t, rate, damper):
     drag0, drag1 = b0 + c.finger_damping, b1 + g * c.finger_damping
     skin0, skin1, b0 = m0 + c.finger_mass, m1 + g * c.finger_mass, b0 + damper * p.added_damping[0]
     for k in range(W):
-        w, sweep, re, im = b.seen_omega[k], b.sweep[k], b.reference_re[k], b.reference_im[k]
+        w, sweep, re, im = b.filtered_omega[k], b.sweep[k], b.filtered_r_re[k], b.filtered_r_im[k]
         x0r, x0i, x1r, x1i = (
             b.e0_re[k] + shape0 * re,
             b.e0_im[k] + shape0 * im,
             b.e1_re[k] + shape1 * re,
             b.e1_im[k] + shape1 * im,
         )
-        b.felt_re[k], b.felt_im[k] = x0r + g * x1r, x0i + g * x1i
-        ar, ai = x0r - b.acted0_re[k], x0i - b.acted0_im[k]
+        b.contact_motion_re[k], b.contact_motion_im[k] = x0r + g * x1r, x0i + g * x1i
+        ar, ai = x0r - b.filtered0_re[k], x0i - b.filtered0_im[k]
         slope = rate * (ar - b.last0_re[k]), rate * (ai - b.last0_im[k])
         b.last0_re[k], b.last0_im[k] = ar, ai
         re, im = taken_force(k0, b0, drag0, skin0, m0, w, sweep, (ar, ai), slope)
-        ar, ai = x1r - b.acted1_re[k], x1i - b.acted1_im[k]
+        ar, ai = x1r - b.filtered1_re[k], x1i - b.filtered1_im[k]
         slope = rate * (ar - b.last1_re[k]), rate * (ai - b.last1_im[k])
         b.last1_re[k], b.last1_im[k] = ar, ai
         more, turn = taken_force(k1, b1, drag1, skin1, m1, w, sweep, (ar, ai), slope)
-        b.residual_re[k], b.residual_im[k] = b.force_re[k] - re - more, b.force_im[k] - im - turn
+        b.residual_re[k], b.residual_im[k] = b.finger_force_re[k] - re - more, b.finger_force_im[k] - im - turn
 
 
 @kernel
@@ -185,7 +187,13 @@ def pool(controller, t, rest):
     least2 = p.least_motion * p.least_motion
     sum_k = sum_m = sum_b = weights = 0.0
     for k in range(W):
-        w, yr, yi, fr, fi = b.seen_omega[k], b.felt_re[k], b.felt_im[k], b.residual_re[k], b.residual_im[k]
+        w, yr, yi, fr, fi = (
+            b.filtered_omega[k],
+            b.contact_motion_re[k],
+            b.contact_motion_im[k],
+            b.residual_re[k],
+            b.residual_im[k],
+        )
         w2, size2 = w * w, yr * yr + yi * yi
         counts = 1.0 if size2 >= least2 and b.complete[k] >= COMPLETE else 0.0
         share = counts / max(size2, 1e-300)
@@ -198,8 +206,8 @@ def pool(controller, t, rest):
         sum_m += scale * w2 * mass2 * miss
         sum_b += weight * drag * w / max(w2, 1e-18)  # w < 0 where the finger moves backwards
         weights += weight
-        b.rest_re[k] += rest * (miss - counts * b.rest_re[k])
-        b.rest_im[k] += rest * (drag - counts * b.rest_im[k])
+        b.remainder_re[k] += rest * (miss - counts * b.remainder_re[k])
+        b.remainder_im[k] += rest * (drag - counts * b.remainder_im[k])
     return sum_k, sum_m, sum_b, weights
 
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from hapticrender.control.bandmodel import BandModel
+from hapticrender.control.device_model import DeviceModel
 from hapticrender.control.linear import FORGET, ErrorLoop, FingerEstimate, Sampled, Structure
 from hapticrender.control.margins import LEAST, LeastMargins, Margins
 from hapticrender.errors import DesignError
@@ -117,7 +117,7 @@ class Checked:
 
 
 def error_loop(
-    model: BandModel | Structure,
+    model: DeviceModel | Structure,
     frequency: Array,
     gains: BankGains,
     level: str = "high",
@@ -133,7 +133,7 @@ def error_loop(
 
     Parameters
     ----------
-    model : BandModel or Structure
+    model : DeviceModel or Structure
         The free device that the law inverts.
     frequency, wavenumber : ndarray, shape (K,), Hz and 1/m
         Fixed and finger-locked part of every carrier; no wavenumber: all fixed.
@@ -176,7 +176,7 @@ def error_loop(
 
 
 def checked_gains(
-    model: BandModel | Structure,
+    model: DeviceModel | Structure,
     frequency: Array,
     gains: BankGains,
     *,
@@ -189,7 +189,7 @@ def checked_gains(
 
     Parameters
     ----------
-    model : BandModel or Structure
+    model : DeviceModel or Structure
         The free device that the law inverts.
     frequency, wavenumber : ndarray, shape (K,), Hz and 1/m
         Fixed and finger-locked part of every carrier; no wavenumber: all fixed.

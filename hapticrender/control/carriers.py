@@ -58,13 +58,15 @@ def take_setpoints(controller):
         for k in range(min(W, c.bands - W * t)):
             i = W * t + k
             frequency = setpoints[0, i] + c.shift
-            changed = changed or b.frequency[k] != frequency or b.wavenumber[k] != setpoints[1, i] or b.live[k] == 0.0
-            if b.live[k] == 0.0:
+            changed = changed or b.frequency[k] != frequency or b.wavenumber[k] != setpoints[1, i] or b.active[k] == 0.0
+            if b.active[k] == 0.0:
                 b.turns[k] = 0.0
-            b.live[k], b.frequency[k], b.wavenumber[k], b.phase[k] = 1.0, frequency, setpoints[1, i], setpoints[2, i]
-            b.set_re[k], b.set_im[k] = setpoints[3, i], setpoints[4, i]
-            b.shown_re[k], b.shown_im[k] = setpoints[5, i], setpoints[6, i]
-            growing = growing or b.fade[k] < 1.0 or b.target_re[k] != b.set_re[k] or b.target_im[k] != b.set_im[k]
+            b.active[k], b.frequency[k], b.wavenumber[k], b.phase[k] = 1.0, frequency, setpoints[1, i], setpoints[2, i]
+            b.setpoint_re[k], b.setpoint_im[k] = setpoints[3, i], setpoints[4, i]
+            b.response_re[k], b.response_im[k] = setpoints[5, i], setpoints[6, i]
+            growing = (
+                growing or b.fade[k] < 1.0 or b.target_re[k] != b.setpoint_re[k] or b.target_im[k] != b.setpoint_im[k]
+            )
             locked = locked or b.wavenumber[k] > 0.0
         steady = not (growing or changed or c.p.analysed > 0.0 or c.p.modulated > 0.0)
         b.mode[0] = LOCKED if locked else (FIXED if steady else FADING)
@@ -85,7 +87,7 @@ def set_carriers(controller, t, count):
     b, rate = record(c.tiles_at, TILE_T, t), c.p.rate
     for k in range(W):
         sin, cos = sincos_turns(b.turns[k] + b.phase[k])
-        b.cos[k], b.sin[k] = b.live[k] * cos, b.live[k] * sin
+        b.cos[k], b.sin[k] = b.active[k] * cos, b.active[k] * sin
         b.turns[k] = frac(b.turns[k] + count * b.frequency[k] / rate)
 
 
@@ -107,7 +109,7 @@ def lock_carriers(controller, t, position):
     b, rate = record(c.tiles_at, TILE_T, t), c.p.rate
     for k in range(W):
         sin, cos = sincos_turns(b.turns[k] + b.wavenumber[k] * position + b.phase[k])
-        b.cos[k], b.sin[k] = b.live[k] * cos, b.live[k] * sin
+        b.cos[k], b.sin[k] = b.active[k] * cos, b.active[k] * sin
         b.turns[k] = frac(b.turns[k] + b.frequency[k] / rate)
 
 
@@ -120,8 +122,8 @@ def fade_fixed(controller, t):
     for k in range(W):
         fade = min(b.fade[k] + step, 1.0)
         b.fade[k] = fade
-        b.weight[k] = b.live[k] * fade * fade * (3.0 - 2.0 * fade)
-        b.share[k] = b.live[k] * (1.0 if whole else min(fade * (3.0 - 2.0 * fade), 1.0))
+        b.weight[k] = b.active[k] * fade * fade * (3.0 - 2.0 * fade)
+        b.feedback[k] = b.active[k] * (1.0 if whole else min(fade * (3.0 - 2.0 * fade), 1.0))
 
 
 @kernel
@@ -148,10 +150,10 @@ def fade_locked(controller, t):
         heard = smoothstep_kernel(4.0 * (edge - hertz * per_highest))
         above = smoothstep_kernel(2.0 * hertz * per_lowest - 1.0)
         locked = number > 0.0
-        grown = b.live[k] * smoothstep_kernel(fade) * (above if locked else 1.0)
+        grown = b.active[k] * smoothstep_kernel(fade) * (above if locked else 1.0)
         b.fade[k] = fade
         b.weight[k] = grown * (below if locked else 1.0)
-        b.share[k] = min(grown * (heard if locked else 1.0) / max(fade, 1e-9), 1.0)
+        b.feedback[k] = min(grown * (heard if locked else 1.0) / max(fade, 1e-9), 1.0)
 
 
 @kernel
@@ -164,7 +166,7 @@ def sensor_response(controller, t):
     for k in range(W):
         sin, cos = sincos_turns(-delay * b.omega[k])
         behind = lag * b.omega[k]
-        b.shown_re[k], b.shown_im[k] = cos - behind * sin, sin + behind * cos
+        b.response_re[k], b.response_im[k] = cos - behind * sin, sin + behind * cos
 
 
 @kernel
@@ -183,7 +185,7 @@ def given_target(controller, t, factor):
     b = record(c.tiles_at, TILE_T, t)
     differentiated = c.p.differentiated > 0.0
     for k in range(W):
-        re, im = factor * b.weight[k] * b.set_re[k], factor * b.weight[k] * b.set_im[k]
+        re, im = factor * b.weight[k] * b.setpoint_re[k], factor * b.weight[k] * b.setpoint_im[k]
         b.target_re[k] = -b.omega[k] * im if differentiated else re
         b.target_im[k] = b.omega[k] * re if differentiated else im
 
@@ -208,13 +210,13 @@ def set_reference(controller, t):
     """Reference envelope of a tile, its slope, and its value in the block's middle."""
     c = record(controller, CONTROLLER_T, 0)
     b = record(c.tiles_at, TILE_T, t)
-    rate, seen = c.p.rate / c.p.block, c.p.seen
+    rate, middle = c.p.rate / c.p.block, c.p.middle
     for k in range(W):
-        re = b.shown_re[k] * b.target_re[k] - b.shown_im[k] * b.target_im[k]
-        im = b.shown_re[k] * b.target_im[k] + b.shown_im[k] * b.target_re[k]
+        re = b.response_re[k] * b.target_re[k] - b.response_im[k] * b.target_im[k]
+        im = b.response_re[k] * b.target_im[k] + b.response_im[k] * b.target_re[k]
         b.slope_re[k], b.slope_im[k] = rate * (re - b.r_re[k]), rate * (im - b.r_im[k])
-        b.seen_re[k] = b.r_re[k] + seen * (re - b.r_re[k])
-        b.seen_im[k] = b.r_im[k] + seen * (im - b.r_im[k])
+        b.expected_re[k] = b.r_re[k] + middle * (re - b.r_re[k])
+        b.expected_im[k] = b.r_im[k] + middle * (im - b.r_im[k])
         b.r_re[k], b.r_im[k] = re, im
 
 
@@ -225,7 +227,7 @@ def hold_reference(controller, t):
     b = record(c.tiles_at, TILE_T, t)
     for k in range(W):
         b.slope_re[k] = b.slope_im[k] = 0.0
-        b.seen_re[k], b.seen_im[k] = b.r_re[k], b.r_im[k]
+        b.expected_re[k], b.expected_im[k] = b.r_re[k], b.r_im[k]
 
 
 @kernel

@@ -14,29 +14,29 @@ import numpy as np
 from numba import carray
 
 from hapticrender.bands import Bands
-from hapticrender.control.bandmodel import BandModel
 from hapticrender.control.controller import BankController
+from hapticrender.control.device_model import DeviceModel
 from hapticrender.control.records import CONTROLLER_T, TILE_T, W
 from hapticrender.jit import C16, F8, I8, SIGNALS_T, addresses, call, pointer, record, step
 from hapticrender.protocols import Array, Method
 
 
 @dataclass(frozen=True, kw_only=True)
-class CombinedModel(BandModel):
+class CombinedModel(DeviceModel):
     """Device model of a device of two parts, which have a model and a controller each.
 
     Parameters
     ----------
-    plate : BandModel
+    plate : DeviceModel
         Of the part that moves the skin (m).
-    friction : BandModel or None
+    friction : DeviceModel or None
         Of the part that rubs it (N); None: it has no target.
     velocity_per_force : float, m/(N s)
         Skin velocity that feels as strong as a newton of friction.
     """
 
-    plate: BandModel
-    friction: BandModel | None
+    plate: DeviceModel
+    friction: DeviceModel | None
     velocity_per_force: float
 
 
@@ -62,8 +62,11 @@ PART = np.dtype(
     [
         *((name, np.int64) for name in ("step", "state", "signals", "sensors", "channels", "bands", "index")),
         ("scale", np.complex128),  # target of the skin's velocity per target of the part; 0: j w
-        ("wanted", np.float64),  # of the part per wanted waveform
-        *((name, np.int64) for name in ("sensed_at", "drive_at", "wanted_at", "target_at", "flags_at", "position_at")),
+        ("scale_waveform", np.float64),  # of the part per waveform of both
+        *(
+            (name, np.int64)
+            for name in ("sensed_at", "drive_at", "waveform_at", "target_at", "flags_at", "position_at")
+        ),
     ]
 )
 COMBINED = np.dtype(
@@ -78,7 +81,7 @@ def combined_step(state, signals, start, count):
     c, io = record(state, COMBINED_T, 0), record(signals, SIGNALS_T, 0)
     block, stop = c.block, start + count
     sensed, drive = carray(pointer(io.sensed, F8), (stop, c.sensors)), carray(pointer(io.drive, F8), (stop, c.channels))
-    position, wanted = carray(pointer(io.position, F8), stop), carray(pointer(io.wanted, F8), stop)
+    position, waveform = carray(pointer(io.position, F8), stop), carray(pointer(io.waveform, F8), stop)
     target, flags = carray(pointer(io.target, C16), (stop // block, c.bands)), carray(pointer(io.flags, I8), stop)
     for first in range(start, stop, block):
         sensor = channel = 0
@@ -91,13 +94,13 @@ def combined_step(state, signals, start, count):
                 carray(pointer(p.sensed_at, F8), (block, p.sensors)),
                 carray(pointer(p.drive_at, F8), (block, p.channels)),
             )
-            place, waveform = carray(pointer(p.position_at, F8), block), carray(pointer(p.wanted_at, F8), block)
+            place, part_waveform = carray(pointer(p.position_at, F8), block), carray(pointer(p.waveform_at, F8), block)
             goal, raised = carray(pointer(p.target_at, C16), (1, p.bands)), carray(pointer(p.flags_at, I8), block)
             index = carray(pointer(p.index, I8), p.bands)
             for m in range(block):
                 for s in range(p.sensors):
                     own[m, s] = sensed[first + m, sensor + s]
-                place[m], waveform[m], raised[m] = position[first + m], p.wanted * wanted[first + m], 0
+                place[m], part_waveform[m], raised[m] = position[first + m], p.scale_waveform * waveform[first + m], 0
             if p.bands > 0:
                 call(p.step, (p.state, p.signals, 0, block))
             for m in range(block):
@@ -146,13 +149,13 @@ class CombinedController:
         self._buffers: list[Array] = []
         analysed = bands.envelope is None
         shares = ((bands.plate_index, 0.0, 1.0), (bands.friction_index, velocity_per_force, 1.0 / velocity_per_force))
-        for i, (part, (index, scale, wanted)) in enumerate(zip(parts, shares, strict=True)):
+        for i, (part, (index, scale, per_target)) in enumerate(zip(parts, shares, strict=True)):
             own = self.state[0]["parts"][i]
             bands_of = 0 if part is None else part.n_bands
             arrays = {
                 "sensed": np.zeros((self.block, sensors[i])),
                 "drive": np.zeros((self.block, channels[i])),
-                "wanted": np.zeros(self.block),
+                "waveform": np.zeros(self.block),
                 "target": np.zeros((1, bands_of), complex),
                 "flags": np.zeros(self.block, np.int64),
                 "position": np.zeros(self.block),
@@ -163,7 +166,7 @@ class CombinedController:
                 own[f"{name}_at"] = array.ctypes.data
             own["signals"], own["index"], own["bands"] = signals.ctypes.data, indices.ctypes.data, bands_of
             own["sensors"], own["channels"], own["scale"] = sensors[i], channels[i], scale
-            own["wanted"] = wanted if analysed else 1.0
+            own["scale_waveform"] = per_target if analysed else 1.0
             if part is not None:
                 own["step"], own["state"] = part.step.address, part.state.ctypes.data
 

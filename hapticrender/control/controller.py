@@ -134,7 +134,7 @@ class BankController:
         counts = (size > LEAST_TARGET * self.settings["sensor_limit"]) & (error < SETTLED * size)
         return float((integral[counts] / size[counts]).max(initial=0.0))
 
-    def run(self, sensed: Array, position: Array, wanted: Array) -> tuple[Array, Array, Array]:
+    def run(self, sensed: Array, position: Array, waveform: Array) -> tuple[Array, Array, Array]:
         """Advance by n samples; see `Controller`.
 
         Raises
@@ -150,7 +150,7 @@ class BankController:
         arrays = {
             "sensed": np.ascontiguousarray(sensed, float),
             "position": np.ascontiguousarray(position, float),
-            "wanted": np.ascontiguousarray(wanted, float),
+            "waveform": np.ascontiguousarray(waveform, float),
         }
         signals = addresses(drive=drive, target=target, flags=flags, **arrays)
         self.step(self.state.ctypes.data, signals.ctypes.data, 0, n)
@@ -195,15 +195,17 @@ def setpoint_rows(bands: Bands) -> Array:
     """Setpoints of a compiled step: frequency, wavenumber, phase (turns), target and sensor response (re, im)."""
     rows = np.zeros((SETPOINT_ROWS, len(bands)))
     target = np.zeros(len(bands), complex) if bands.envelope is None else bands.envelope
-    shown = np.ones(len(bands), complex) if bands.shown is None else np.asarray(bands.shown, complex)
+    response = (
+        np.ones(len(bands), complex) if bands.sensor_response is None else np.asarray(bands.sensor_response, complex)
+    )
     rows[:] = (
         bands.frequency,
         bands.wavenumber,
         bands.phase / (2 * np.pi),
         target.real,
         target.imag,
-        shown.real,
-        shown.imag,
+        response.real,
+        response.imag,
     )
     return rows
 

@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hapticrender.control.bandmodel import BandModel
+from hapticrender.control.device_model import DeviceModel
 from hapticrender.control.margins import LEAST, LeastMargins, Margins, margins_of, unstable_poles
 from hapticrender.protocols import Array
 
@@ -121,7 +121,7 @@ class Oscillator(NamedTuple):
     sensor_gain: float  # rms of the coordinate per rms of each sensor
 
 
-def oscillators(model: BandModel) -> tuple[Oscillator, ...]:
+def oscillators(model: DeviceModel) -> tuple[Oscillator, ...]:
     """Coordinates of a device, each taken alone."""
     mass, damping, stiffness = (part.diagonal() for part in (model.mass, model.damping, model.stiffness))
     omega = np.sqrt(stiffness / mass)
@@ -131,13 +131,13 @@ def oscillators(model: BandModel) -> tuple[Oscillator, ...]:
 
 
 def damping_taps(
-    model: BandModel, quality: float, *, bending: BendingMode | None = None, count: int | None = None
+    model: DeviceModel, quality: float, *, bending: BendingMode | None = None, count: int | None = None
 ) -> tuple[Array, Array]:
     """Solve for the taps of the inner damper and the damping that they add.
 
     Parameters
     ----------
-    model : BandModel
+    model : DeviceModel
         The free device with its rate and delay.
     quality : float
         Q that the damper alone gives each mode, > 0; 1.4 wherever the bending mode of the surface is spared.
@@ -186,12 +186,12 @@ def _taps(part: Oscillator, quality: float, bending: BendingMode | None, c: int,
     return taps
 
 
-def damping_margins(model: BandModel, taps: Array, *, bending: BendingMode | None = None) -> tuple[Margins, ...]:
+def damping_margins(model: DeviceModel, taps: Array, *, bending: BendingMode | None = None) -> tuple[Margins, ...]:
     """Margins of the inner damper, one for each coordinate.
 
     Parameters
     ----------
-    model : BandModel
+    model : DeviceModel
         The free device.
     taps : ndarray, shape (coordinates, n), N/m
         Of `damping_taps`.
@@ -201,7 +201,7 @@ def damping_margins(model: BandModel, taps: Array, *, bending: BendingMode | Non
     return tuple(_DamperLoop(part, taps[c], bending, c).margins() for c, part in enumerate(oscillators(model)))
 
 
-def damping_noise(model: BandModel, taps: Array, *, bending: BendingMode | None = None) -> tuple[float, ...]:
+def damping_noise(model: DeviceModel, taps: Array, *, bending: BendingMode | None = None) -> tuple[float, ...]:
     """Motion that white sensor noise causes through the damper, rms of each coordinate per rms of each sensor."""
     return tuple(_DamperLoop(part, taps[c], bending, c).noise() for c, part in enumerate(oscillators(model)))
 
@@ -260,13 +260,13 @@ def _held_mode(z: Array, rate: float, omega: float, ratio: float, gain: float) -
 
 
 def choose_damping(
-    model: BandModel, *, bending: BendingMode | None = None, least: LeastMargins = LEAST["damper"]
+    model: DeviceModel, *, bending: BendingMode | None = None, least: LeastMargins = LEAST["damper"]
 ) -> Damping:
     """Design the inner damper: the most damping whose margins hold, or none, and why.
 
     Parameters
     ----------
-    model : BandModel
+    model : DeviceModel
         The free device with its rate and delay.
     bending : BendingMode, optional
         The bending mode of the surface, which the taps then spare; once it is measured Q may go down to 1.4.
@@ -313,7 +313,7 @@ def choose_damping(
     return _off(len(parts), f"off: with {lag}, {complaint} even at Q {quality:g}")
 
 
-def within_a_turn(model: BandModel) -> bool:
+def within_a_turn(model: DeviceModel) -> bool:
     """Whether delay and hold are no longer than a period of the fastest mode."""
     return bool(max(part.omega for part in oscillators(model)) * (model.delay + 0.5) / model.rate <= 2 * np.pi)
 

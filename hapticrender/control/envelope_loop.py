@@ -7,7 +7,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from hapticrender.bands import Bands
-from hapticrender.control.bandmodel import BandModel
+from hapticrender.control.device_model import DeviceModel
 from hapticrender.control.estimators import StarSTDFT
 from hapticrender.control.loopshape import TransferFunction, design, integrator, reduced_controller
 from hapticrender.errors import DesignError
@@ -32,7 +32,7 @@ class EnvelopeLoop(NamedTuple):
 
 
 def envelope_loop(
-    model: BandModel,
+    model: DeviceModel,
     bands: Bands,
     *,
     form: Literal["reduced", "integrator"] = "reduced",
@@ -44,7 +44,7 @@ def envelope_loop(
 
     Parameters
     ----------
-    model : BandModel
+    model : DeviceModel
         Gives the rate, the known delay and the lowest carrier that a moving finger may make.
     bands : Bands
         Gives the fixed carriers.

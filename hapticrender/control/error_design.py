@@ -15,10 +15,10 @@ import numpy as np
 
 from hapticrender.bands import Bands
 from hapticrender.control.adaptation import TURN_SAMPLES
-from hapticrender.control.bandmodel import BandModel, FingerRange
 from hapticrender.control.bandwidth import BankGains, checked_gains
 from hapticrender.control.controller import BankController, padded, ridge_spacing, spacing
 from hapticrender.control.damping import Damping, choose_damping
+from hapticrender.control.device_model import DeviceModel, FingerRange
 from hapticrender.control.kernel import block_step, error_step
 from hapticrender.control.records import MOST_CHANNELS, MOST_SENSORS, MOST_TAPS
 
@@ -91,14 +91,16 @@ def rules_for(bands: Bands) -> Rules:
     return TWO_SPEEDS_CROWDED if crowded else TWO_SPEEDS
 
 
-def design_error(method: str, model: BandModel, bands: Bands, rules: Rules, *, feedback: bool = True) -> BankController:
+def design_error(
+    method: str, model: DeviceModel, bands: Bands, rules: Rules, *, feedback: bool = True
+) -> BankController:
     """Design the default controller for a device and its bands.
 
     Parameters
     ----------
     method : str
         Name to carry.
-    model : BandModel
+    model : DeviceModel
         All that the controller is given of the device; 1 or 2 coordinates.
     bands : Bands
         Carriers and targets.
@@ -131,7 +133,7 @@ def design_error(method: str, model: BandModel, bands: Bands, rules: Rules, *, f
     damping = choose_damping(model, bending=model.bending) if any(rules.damper) and feedback and prompt else None
     if damping is None or not damping.margins:
         rules = replace(rules, damper=(0.0, 0.0))
-    elif model.held:
+    elif model.always_damped:
         rules = replace(rules, damper=(rules.damper[1], rules.damper[1]))
     if (bands.wavenumber > 0.0).any():  # what is left over at one frequency is wrong at the next
         rules = replace(rules, rest=(0.0, 0.0))
@@ -154,7 +156,7 @@ def design_error(method: str, model: BandModel, bands: Bands, rules: Rules, *, f
     return BankController(method, step, settings, bands, history=history, note="\n".join(notes))
 
 
-def _gains(model: BandModel, bands: Bands, rules: Rules, feedback: bool) -> BankGains:
+def _gains(model: DeviceModel, bands: Bands, rules: Rules, feedback: bool) -> BankGains:
     """How fast observer, integral and DC estimate may run, by lowest carrier (Hz), spacing and delay."""
     lowest, apart, period = _lowest(model, bands), spacing(bands), 1.0 / model.rate
     if apart == 0.0:
@@ -188,14 +190,14 @@ def _gains(model: BandModel, bands: Bands, rules: Rules, feedback: bool) -> Bank
     )
 
 
-def _lowest(model: BandModel, bands: Bands) -> float:
+def _lowest(model: DeviceModel, bands: Bands) -> float:
     """Lowest carrier (Hz): of the fixed ones, and of what a moving finger makes of the others."""
     locked = bands.wavenumber > 0.0
     return float(bands.frequency[~locked].min(initial=model.lowest_frequency if locked.any() else np.inf))
 
 
 def _settings(
-    model: BandModel, bands: Bands, rules: Rules, gains: BankGains, damping: Damping | None, feedback: bool
+    model: DeviceModel, bands: Bands, rules: Rules, gains: BankGains, damping: Damping | None, feedback: bool
 ) -> dict[str, Any]:
     """Settings of the kernel, sample by sample."""
     period, fast = 1.0 / model.rate, 2 * math.pi * FAST_DC / model.rate
@@ -221,7 +223,7 @@ def _settings(
         "rate": gains.rate,
         "lead": gains.lead,
         "reference": 2 * 2 * math.pi * observer * period,
-        "seen": 1.0,
+        "middle": 1.0,
         "extrapolation": 0.0,
         "fade_in": period / max(FADE_IN / model.pace, LEAST_FADE_IN),
         "lowest": gains.lowest,
@@ -230,12 +232,12 @@ def _settings(
         "analysed": bands.envelope is None,
         "modulated": bands.modulated,
         "differentiated": bands.differentiated,
-        "needs_contact": model.finger.presence,
+        "needs_contact": model.finger.needs_contact,
         "least_speed": model.finger.least_speed,
-        "corrected": bands.shown is None and (model.late != 0.0 or model.foresight != 0.0),
-        "sensor_delay": model.late,
-        "contact_lag": model.foresight,
-        "contact_damping": model.memory,
+        "corrected": bands.sensor_response is None and (model.sensor_delay != 0.0 or model.contact_lag != 0.0),
+        "sensor_delay": model.sensor_delay,
+        "contact_lag": model.contact_lag,
+        "contact_damping": model.contact_damping,
         "typical_speed": model.typical_speed,
         "lock": 2 * math.pi * model.lock,
         "sensor_limit": float(model.sensed_limit),
@@ -259,7 +261,7 @@ def _settings(
     }
 
 
-def _adaptation(model: BandModel, rules: Rules, observer: float, feedback: bool) -> dict[str, float]:
+def _adaptation(model: DeviceModel, rules: Rules, observer: float, feedback: bool) -> dict[str, float]:
     """How fast the finger is estimated, by the observer's pole (1/s) and the delay; negative: never."""
     most = min(ADAPTATION_SHARE * model.rate / TURN_SAMPLES, model.finger.fastest)
     if model.finger.contact is None:  # what is always there is as large as D, and the law far from it while it adapts
@@ -269,7 +271,7 @@ def _adaptation(model: BandModel, rules: Rules, observer: float, feedback: bool)
     return {"adaptation": low, "adaptation_high": high, "rest": rules.rest[0], "rest_high": rules.rest[1]}
 
 
-def _detectors(model: BandModel, rules: Rules) -> dict[str, float]:
+def _detectors(model: DeviceModel, rules: Rules) -> dict[str, float]:
     """What raises the gains, and for how long (samples)."""
     noise = np.sqrt((model.coordinate_from_sensed**2).sum(axis=1).max()) * max(
         model.sensed_noise, LEAST_NOISE * model.sensed_limit
@@ -304,12 +306,12 @@ def _finger(finger: FingerRange) -> dict[str, float]:
     return {"contact_on": on, "contact_off": off, **typical, **bounds}
 
 
-def _back_calculation(model: BandModel) -> float:
+def _back_calculation(model: DeviceModel) -> float:
     """Rate (1/s) of the back-calculation; of an always damped mode about as fast as it loses energy.
 
     However little that is, a finger takes it away within a millisecond.
     """
-    decay = float((model.damping.diagonal() / model.mass.diagonal()).min()) if model.held else math.inf
+    decay = float((model.damping.diagonal() / model.mass.diagonal()).min()) if model.always_damped else math.inf
     return min(model.pace / BACK_TIME, max(decay, TOUCHED_DECAY))
 
 
@@ -324,7 +326,7 @@ def _in_blocks(settings: dict[str, Any], block: int, rate: float) -> dict[str, A
         | changes
         | {
             "block": block,
-            "seen": 0.5,
+            "middle": 0.5,
             "extrapolation": settings["lead"],
             "release": min(settings["release"] * block, 1.0),
             "peak_decay": settings["peak_decay"] ** block,

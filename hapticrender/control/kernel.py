@@ -69,7 +69,7 @@ def sense_block(controller, signals, first):
     p, block = c.p, c.p.block
     rows, implausible = first + block, 0
     sensed, flags = carray(pointer(io.sensed, F8), (rows, p.sensors)), carray(pointer(io.flags, I8), rows)
-    position, waveform = carray(pointer(io.position, F8), rows), carray(pointer(io.wanted, F8), rows)
+    position, waveform = carray(pointer(io.position, F8), rows), carray(pointer(io.waveform, F8), rows)
     reads = p.analysed > 0.0 or p.modulated > 0.0
     for m in range(block):
         n = first + m
@@ -88,7 +88,7 @@ def sense_block(controller, signals, first):
 
 @kernel
 def analyse_sample(controller):
-    """Update the envelopes of the wanted waveform by the residual observer."""
+    """Update the envelopes of the target's waveform by the residual observer."""
     c = record(controller, CONTROLLER_T, 0)
     error = samples_of(controller)[WAVEFORM, 0]
     for t in range(c.tiles):
@@ -105,14 +105,14 @@ def analyse_sample(controller):
 
 @kernel
 def analyse_block(controller):
-    """Update the envelopes of the wanted waveform as exactly as those of the sensors."""
+    """Update the envelopes of the target's waveform as exactly as those of the sensors."""
     c = record(controller, CONTROLLER_T, 0)
     samples, g = samples_of(controller), c.p.reference
     for t in range(c.tiles):
         b = record(c.tiles_at, TILE_T, t)
         for k in range(W):
-            b.held0_re[k] = b.raw_re[k] * b.cos[k] - b.raw_im[k] * b.sin[k]
-            b.held0_im[k] = b.raw_re[k] * b.sin[k] + b.raw_im[k] * b.cos[k]
+            b.work0_re[k] = b.raw_re[k] * b.cos[k] - b.raw_im[k] * b.sin[k]
+            b.work0_im[k] = b.raw_re[k] * b.sin[k] + b.raw_im[k] * b.cos[k]
         gather(controller, t)
     sum_bands(controller)
     for m in range(c.p.block):
@@ -123,8 +123,8 @@ def analyse_block(controller):
         b = record(c.tiles_at, TILE_T, t)
         scatter(controller, t)
         for k in range(W):
-            b.raw_re[k] += g * (b.held0_re[k] * b.cos[k] - b.held0_im[k] * b.sin[k])
-            b.raw_im[k] -= g * (b.held0_re[k] * b.sin[k] + b.held0_im[k] * b.cos[k])
+            b.raw_re[k] += g * (b.work0_re[k] * b.cos[k] - b.work0_im[k] * b.sin[k])
+            b.raw_im[k] -= g * (b.work0_re[k] * b.sin[k] + b.work0_im[k] * b.cos[k])
 
 
 @kernel
@@ -155,7 +155,7 @@ def predict(controller):
         b = record(c.tiles_at, TILE_T, t)
         for k in range(W):
             cos, sin = b.cos[k], b.sin[k]
-            reference = b.seen_re[k] * cos - b.seen_im[k] * sin
+            reference = b.expected_re[k] * cos - b.expected_im[k] * sin
             seen0 += shape0 * reference + b.e0_re[k] * cos - b.e0_im[k] * sin
             seen1 += shape1 * reference + b.e1_re[k] * cos - b.e1_im[k] * sin
             reference = b.r_re[k] * cos - b.r_im[k] * sin
@@ -173,10 +173,10 @@ def predict_block(controller):
         b = record(c.tiles_at, TILE_T, t)
         for k in range(W):
             cos, sin = b.cos[k], b.sin[k]
-            re, im = shape0 * b.seen_re[k] + b.e0_re[k], shape0 * b.seen_im[k] + b.e0_im[k]
-            b.held0_re[k], b.held0_im[k] = re * cos - im * sin, re * sin + im * cos
-            re, im = shape1 * b.seen_re[k] + b.e1_re[k], shape1 * b.seen_im[k] + b.e1_im[k]
-            b.held1_re[k], b.held1_im[k] = re * cos - im * sin, re * sin + im * cos
+            re, im = shape0 * b.expected_re[k] + b.e0_re[k], shape0 * b.expected_im[k] + b.e0_im[k]
+            b.work0_re[k], b.work0_im[k] = re * cos - im * sin, re * sin + im * cos
+            re, im = shape1 * b.expected_re[k] + b.e1_re[k], shape1 * b.expected_im[k] + b.e1_im[k]
+            b.work1_re[k], b.work1_im[k] = re * cos - im * sin, re * sin + im * cos
         gather(controller, t)
     sum_bands(controller)
 
@@ -204,9 +204,9 @@ def innovate_block(controller):
         b = record(c.tiles_at, TILE_T, t)
         scatter(controller, t)
         for k in range(W):
-            cos, sin, r0, i0, r1, i1 = b.cos[k], b.sin[k], b.held0_re[k], b.held0_im[k], b.held1_re[k], b.held1_im[k]
-            b.held0_re[k], b.held0_im[k] = r0 * cos - i0 * sin, -r0 * sin - i0 * cos
-            b.held1_re[k], b.held1_im[k] = r1 * cos - i1 * sin, -r1 * sin - i1 * cos
+            cos, sin, r0, i0, r1, i1 = b.cos[k], b.sin[k], b.work0_re[k], b.work0_im[k], b.work1_re[k], b.work1_im[k]
+            b.work0_re[k], b.work0_im[k] = r0 * cos - i0 * sin, -r0 * sin - i0 * cos
+            b.work1_re[k], b.work1_im[k] = r1 * cos - i1 * sin, -r1 * sin - i1 * cos
 
 
 @kernel
@@ -236,8 +236,8 @@ def innovate_sample(controller):
         b = record(c.tiles_at, TILE_T, t)
         for k in range(W):
             cos, sin = b.cos[k], b.sin[k]
-            b.held0_re[k], b.held0_im[k] = one0 * cos, -one0 * sin
-            b.held1_re[k], b.held1_im[k] = one1 * cos, -one1 * sin
+            b.work0_re[k], b.work0_im[k] = one0 * cos, -one0 * sin
+            b.work1_re[k], b.work1_im[k] = one1 * cos, -one1 * sin
 
 
 @kernel
@@ -261,15 +261,15 @@ def detect(controller):
     for t in range(c.tiles):
         b = record(c.tiles_at, TILE_T, t)
         for k in range(W):
-            re = whole * (b.e0_re[k] - b.v0_re[k]) + share * b.held0_re[k] + twice0 * b.cos[k]
-            im = whole * (b.e0_im[k] - b.v0_im[k]) + share * b.held0_im[k] - twice0 * b.sin[k]
+            re = whole * (b.e0_re[k] - b.v0_re[k]) + share * b.work0_re[k] + twice0 * b.cos[k]
+            im = whole * (b.e0_im[k] - b.v0_im[k]) + share * b.work0_im[k] - twice0 * b.sin[k]
             fr, fi = low_passed(b.fast0_re[k], re, fast), low_passed(b.fast0_im[k], im, fast)
             sr, si = low_passed(b.slow0_re[k], fr, slow), low_passed(b.slow0_im[k], fi, slow)
             b.fast0_re[k], b.fast0_im[k], b.slow0_re[k], b.slow0_im[k] = fr, fi, sr, si
             over += max(fr * fr + fi * fi - fast_level, 0.0)
             above += max(sr * sr + si * si - slow_level, 0.0)
-            re = whole * (b.e1_re[k] - b.v1_re[k]) + share * b.held1_re[k] + twice1 * b.cos[k]
-            im = whole * (b.e1_im[k] - b.v1_im[k]) + share * b.held1_im[k] - twice1 * b.sin[k]
+            re = whole * (b.e1_re[k] - b.v1_re[k]) + share * b.work1_re[k] + twice1 * b.cos[k]
+            im = whole * (b.e1_im[k] - b.v1_im[k]) + share * b.work1_im[k] - twice1 * b.sin[k]
             fr, fi = low_passed(b.fast1_re[k], re, fast), low_passed(b.fast1_im[k], im, fast)
             sr, si = low_passed(b.slow1_re[k], fr, slow), low_passed(b.slow1_im[k], fi, slow)
             b.fast1_re[k], b.fast1_im[k], b.slow1_re[k], b.slow1_im[k] = fr, fi, sr, si
@@ -296,20 +296,20 @@ def update_envelopes(controller, g, integral, back):
     for t in range(c.tiles):
         b = record(c.tiles_at, TILE_T, t)
         for k in range(W):
-            share, r, slope = b.share[k], b.r_re[k], b.slope_re[k]
-            fading = FORGET * (b.live[k] - share)
+            share, r, slope = b.feedback[k], b.r_re[k], b.slope_re[k]
+            fading = FORGET * (b.active[k] - share)
             b.e0_re[k], b.v0_re[k], b.slope0_re[k] = updated(
-                b.e0_re[k], b.held0_re[k], b.v0_re[k], shape0 * r, shape0 * slope, fading, share, gains
+                b.e0_re[k], b.work0_re[k], b.v0_re[k], shape0 * r, shape0 * slope, fading, share, gains
             )
             b.e1_re[k], b.v1_re[k], b.slope1_re[k] = updated(
-                b.e1_re[k], b.held1_re[k], b.v1_re[k], shape1 * r, shape1 * slope, fading, share, gains
+                b.e1_re[k], b.work1_re[k], b.v1_re[k], shape1 * r, shape1 * slope, fading, share, gains
             )
             r, slope = b.r_im[k], b.slope_im[k]
             b.e0_im[k], b.v0_im[k], b.slope0_im[k] = updated(
-                b.e0_im[k], b.held0_im[k], b.v0_im[k], shape0 * r, shape0 * slope, fading, share, gains
+                b.e0_im[k], b.work0_im[k], b.v0_im[k], shape0 * r, shape0 * slope, fading, share, gains
             )
             b.e1_im[k], b.v1_im[k], b.slope1_im[k] = updated(
-                b.e1_im[k], b.held1_im[k], b.v1_im[k], shape1 * r, shape1 * slope, fading, share, gains
+                b.e1_im[k], b.work1_im[k], b.v1_im[k], shape1 * r, shape1 * slope, fading, share, gains
             )
 
 
@@ -330,13 +330,13 @@ def synthesise_block(controller):
             for k in range(W):
                 cos = b.sin[k] if quarter else b.cos[k]
                 sin = -b.cos[k] if quarter else b.sin[k]
-                re, im = b.now0_re[k], b.now0_im[k]
-                up, on = b.push0_re[k] - re, b.push0_im[k] - im
-                b.held0_re[k], b.held0_im[k] = re * cos - im * sin, re * sin + im * cos
+                re, im = b.last_force0_re[k], b.last_force0_im[k]
+                up, on = b.force0_re[k] - re, b.force0_im[k] - im
+                b.work0_re[k], b.work0_im[k] = re * cos - im * sin, re * sin + im * cos
                 b.rise0_re[k], b.rise0_im[k] = up * cos - on * sin, up * sin + on * cos
-                re, im = b.now1_re[k], b.now1_im[k]
-                up, on = b.push1_re[k] - re, b.push1_im[k] - im
-                b.held1_re[k], b.held1_im[k] = re * cos - im * sin, re * sin + im * cos
+                re, im = b.last_force1_re[k], b.last_force1_im[k]
+                up, on = b.force1_re[k] - re, b.force1_im[k] - im
+                b.work1_re[k], b.work1_im[k] = re * cos - im * sin, re * sin + im * cos
                 b.rise1_re[k], b.rise1_im[k] = up * cos - on * sin, up * sin + on * cos
             gather(controller, t)
         sum_bands(controller)
@@ -347,8 +347,8 @@ def synthesise_block(controller):
     for t in range(c.tiles):
         b = record(c.tiles_at, TILE_T, t)
         for k in range(W):
-            b.now0_re[k], b.now0_im[k] = b.push0_re[k], b.push0_im[k]
-            b.now1_re[k], b.now1_im[k] = b.push1_re[k], b.push1_im[k]
+            b.last_force0_re[k], b.last_force0_im[k] = b.force0_re[k], b.force0_im[k]
+            b.last_force1_re[k], b.last_force1_im[k] = b.force1_re[k], b.force1_im[k]
             b.rise0_re[k] = b.rise0_im[k] = b.rise1_re[k] = b.rise1_im[k] = 0.0
     return peak
 

@@ -63,7 +63,7 @@ def tune(controller, t):
     k10, k11 = p.stiffness[1, 0] + g * stiffness, p.stiffness[1, 1] + g * g * stiffness
     for k in range(W):
         w, cos, sin, sweep = b.omega[k], b.ahead_re[k], b.ahead_im[k], b.sweep[k]
-        re, im = on * b.rest_re[k], on * b.rest_im[k]
+        re, im = on * b.remainder_re[k], on * b.remainder_im[k]
         b.d00_re[k], b.d00_im[k], b.s00_re[k], b.s00_im[k] = tune_entry(
             k00 + re, b00, m00, w, im + sweep * m00, cos, sin
         )
@@ -150,11 +150,11 @@ def apply_law(controller):
             re, im = force_part(b.d00_re[k], b.d00_im[k], b.s00_re[k], b.s00_im[k], v0r, v0i, s0r, s0i)
             more, turn = force_part(b.d01_re[k], b.d01_im[k], b.s01_re[k], b.s01_im[k], v1r, v1i, s1r, s1i)
             re, im, cos, sin = re + more, im + turn, b.cos[k], b.sin[k]
-            b.push0_re[k], b.push0_im[k] = re, im
+            b.force0_re[k], b.force0_im[k] = re, im
             along0, across0 = along0 + re * cos - im * sin, across0 + re * sin + im * cos
             re, im = force_part(b.d10_re[k], b.d10_im[k], b.s10_re[k], b.s10_im[k], v0r, v0i, s0r, s0i)
             more, turn = force_part(b.d11_re[k], b.d11_im[k], b.s11_re[k], b.s11_im[k], v1r, v1i, s1r, s1i)
             re, im = re + more, im + turn
-            b.push1_re[k], b.push1_im[k] = re, im
+            b.force1_re[k], b.force1_im[k] = re, im
             along1, across1 = along1 + re * cos - im * sin, across1 + re * sin + im * cos
     return along0, along1, across0, across1

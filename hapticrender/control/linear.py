@@ -23,7 +23,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from hapticrender.control.bandmodel import BandModel
+from hapticrender.control.device_model import DeviceModel
 from hapticrender.control.margins import NARROWEST, SLOWEST, Margins, carrier_grid, margins_of, unstable_poles
 from hapticrender.mathx import zoh
 from hapticrender.protocols import Array
@@ -60,7 +60,7 @@ class Structure:
         return cls(mass=mass, damping=damping, stiffness=stiffness, input=same, output=same)
 
     @classmethod
-    def of(cls, model: BandModel) -> Structure:
+    def of(cls, model: DeviceModel) -> Structure:
         """Return the free device that a controller is designed for."""
         return cls.free(model.mass, model.damping, model.stiffness)
 

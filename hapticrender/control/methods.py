@@ -26,8 +26,8 @@ from typing import Any, ClassVar, Literal
 import numpy as np
 
 from hapticrender.bands import Bands
-from hapticrender.control.bandmodel import BandModel
 from hapticrender.control.controller import BankController, padded, ridge_spacing, spacing
+from hapticrender.control.device_model import DeviceModel
 from hapticrender.control.envelope_loop import Bandwidths, EnvelopeLoop, envelope_loop, section
 from hapticrender.control.error_design import FADE_IN, ONE_SPEED, Rules, design_error, rules_for
 from hapticrender.control.loopshape import analyse, integrator
@@ -58,7 +58,7 @@ class ErrorObserver:
     name: str = "h2"
     rules: Rules | None = None
 
-    def design(self, model: BandModel, bands: Bands, *, feedback: bool = True) -> BankController:
+    def design(self, model: DeviceModel, bands: Bands, *, feedback: bool = True) -> BankController:
         """Design the controller; see `design_error`."""
         return design_error(self.name, model, bands, self.rules or rules_for(bands), feedback=feedback)
 
@@ -88,7 +88,7 @@ class Polar:
     common: ClassVar[bool] = False
     boxcar: ClassVar[bool] = False
 
-    def design(self, model: BandModel, bands: Bands, *, feedback: bool = True) -> BankController:
+    def design(self, model: DeviceModel, bands: Bands, *, feedback: bool = True) -> BankController:
         """Design loops on the displacements at the transducers, or on their mean.
 
         Raises
@@ -168,7 +168,7 @@ class Inverse:
     name: ClassVar[str]
     dynamic: ClassVar[bool]
 
-    def design(self, model: BandModel, bands: Bands, *, feedback: bool = True) -> BankController:
+    def design(self, model: DeviceModel, bands: Bands, *, feedback: bool = True) -> BankController:
         """Design loops in the device's coordinates; raises `DesignError` where its delay leaves no margin."""
         loop = envelope_loop(model, bands, form=self.form, bandwidths=self.bandwidths, feedback=feedback)
         settings = complex_settings(model, bands, loop, self.feed_forward, feedback)
@@ -216,7 +216,7 @@ class Resonant:
     checked: bool = True
     name: ClassVar[str] = "resonant"
 
-    def design(self, model: BandModel, bands: Bands, *, feedback: bool = True) -> BankController:
+    def design(self, model: DeviceModel, bands: Bands, *, feedback: bool = True) -> BankController:
         """Design integrators in the device's coordinates.
 
         Raises
@@ -240,7 +240,7 @@ class Resonant:
         return low_pass_controller(self.name, settings | {"dynamic": True, "deviation": True}, bands)
 
 
-def least_decay(model: BandModel) -> float:
+def least_decay(model: DeviceModel) -> float:
     """Decay rate of the least damped mode of the free device, 1/s."""
     n = len(model.mass)
     inverse = np.linalg.inv(model.mass)
@@ -248,7 +248,7 @@ def least_decay(model: BandModel) -> float:
     return float(-np.linalg.eigvals(rates).real.max())
 
 
-def frequency_table(model: BandModel, watched: Array, spread: Array, feedback: bool) -> Array:
+def frequency_table(model: DeviceModel, watched: Array, spread: Array, feedback: bool) -> Array:
     """Gain (m per drive unit) and lag (rad) of the free device and its hold by coordinate, shape (2 coordinates, n).
 
     `watched` rows are the controlled displacements, `spread` columns their drive channels.  With feedback it is what
@@ -264,7 +264,7 @@ def frequency_table(model: BandModel, watched: Array, spread: Array, feedback: b
 
 
 def low_pass_settings(
-    model: BandModel, bands: Bands, loop: EnvelopeLoop, sensor_map: Array, drive_map: Array, feedback: bool
+    model: DeviceModel, bands: Bands, loop: EnvelopeLoop, sensor_map: Array, drive_map: Array, feedback: bool
 ) -> dict[str, Any]:
     """Settings that every method with a low pass shares; the maps are those of sensors to coordinates and back."""
     sensor_map = sensor_map[:, : None if feedback else 0]
@@ -291,7 +291,7 @@ def low_pass_settings(
         "lead": (model.delay + 0.5) / model.rate,
         "reference": 2 * analysis / model.rate,
         "crowd_speed": analysis / ridges if math.isfinite(ridges) else 0.0,
-        "seen": 1.0,
+        "middle": 1.0,
         "lowest": float(model.lowest_frequency),
         "highest": min(model.highest_frequency, 0.4 * model.rate),
         "highest_edge": HIGHEST_EDGE,
@@ -305,7 +305,7 @@ def low_pass_settings(
 
 
 def complex_settings(
-    model: BandModel, bands: Bands, loop: EnvelopeLoop, feed_forward: bool, feedback: bool
+    model: DeviceModel, bands: Bands, loop: EnvelopeLoop, feed_forward: bool, feedback: bool
 ) -> dict[str, Any]:
     """Settings of the complex methods; without feedback the reference alone is inverted."""
     forward = feed_forward or not feedback
@@ -314,7 +314,7 @@ def complex_settings(
         **low_pass_settings(model, bands, loop, model.coordinate_from_sensed, drive_map, feedback),
         **{name: padded(getattr(model, name), 2, 2) for name in ("mass", "damping", "stiffness")},
         "shape": (1.0, 0.0),
-        "needs_contact": model.finger.presence,
+        "needs_contact": model.finger.needs_contact,
         "least_speed": model.finger.least_speed,
         "forward": forward,
         "fade_in": 1.0 / (FADE_IN * model.rate) if forward else 1.0,

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hapticrender.control.bandmodel import BandModel
+from hapticrender.control.device_model import DeviceModel
 from hapticrender.control.linear import Sampled, StateSpace, closed_loop, continuous_poles, delayed
 from hapticrender.control.loopshape import reduced_controller
 from hapticrender.control.transfer import butterworth
@@ -60,7 +60,7 @@ class PolarLoop:
     def on(
         cls,
         plant: Sampled,
-        model: BandModel,
+        model: DeviceModel,
         frequency: Array,
         bandwidth: Array,
         *,
@@ -72,7 +72,7 @@ class PolarLoop:
         Parameters
         ----------
         plant : Sampled
-        model : BandModel
+        model : DeviceModel
             The free device, of which the look-up table is made.
         frequency, bandwidth : ndarray, shape (B,), Hz
             Carriers, and bandwidths fT of their loops; the estimator's is 2 fT.

@@ -30,32 +30,41 @@ def _complex(*names: str) -> list[str]:
 
 
 TILE_FIELDS = [
-    "live",  # 1, or 0 in a lane without a band
+    "active",  # 1, or 0 in a lane without a band
     "frequency",  # Hz, the fixed part
     "wavenumber",  # 1/m
     "phase",  # turns
-    *_complex("set", "shown"),  # setpoint; what the sensor shows per target
+    *_complex("setpoint", "response"),  # setpoint; what the sensor shows per target
     "turns",  # fixed part of the phase; of fixed carriers at the next refresh
     *("cos", "sin"),  # the carrier at the sample, or at the block's start
     *("turn_cos", "turn_sin"),  # its turn a sample
     "omega",  # rad/s
     "sweep",  # rad/s^2
     "fade",  # 0..1: how far its target has faded in
-    "weight",  # of its target
-    "share",  # of the feedback
-    *_complex("target", "r", "seen", "slope", "raw"),  # seen: R in the block's middle; raw: envelope of the waveform
+    "weight",  # 0..1: weight of the target
+    "feedback",  # 0..1: weight of the feedback
+    *_complex(
+        "target", "r", "expected", "slope", "raw"
+    ),  # expected: R in the block's middle; raw: envelope of the waveform
     *_complex("ahead"),  # rho: the turn by delay and hold
-    *_complex("rest"),  # stiffness of the finger beyond its three numbers
-    *_complex("force", "reference"),  # adaptation: the finger's force and R, delayed and filtered like the observer
-    *("seen_omega", "complete"),
-    *_complex("felt", "residual"),  # adaptation: motion at the finger, force that the finger takes
+    *_complex("remainder"),  # stiffness of the finger beyond its three numbers
+    # adaptation: the finger's force, R and omega, delayed and filtered like the observer
+    *_complex("finger_force", "filtered_r"),
+    *("filtered_omega", "complete"),
+    *_complex("contact_motion", "residual"),  # adaptation: motion at the finger, force that the finger takes
     *("amount", "sounds", "direction"),  # polar law: |R|, whether that is no silence, sign of the carrier's frequency
     *_complex("heading"),  # R/|R|, the last one in silence
-    # of each coordinate: slope0 is dV/dt; fast, slow the detectors' low passes; held, rise: what a block sums up, and
-    # its rise over the block
-    # now, push: the force envelope at the end of the last block and of this one; sent, acted, last: see `adaptation`
-    *_complex(*(f"{n}{i}" for i in (0, 1) for n in "e v slope fast slow held rise now push sent acted last".split())),
-    *_complex("sent"),  # the finger's part of the force
+    # of each coordinate: slope0 is dV/dt; fast, slow the detectors' low passes; work, rise: what a block sums up, and
+    # its rise over the block; last_force, force: envelopes at the end of the last block and of this one; command,
+    # filtered (command), last (deviation): see `adaptation`
+    *_complex(
+        *(
+            f"{n}{i}"
+            for i in (0, 1)
+            for n in "e v slope fast slow work rise last_force force command filtered last".split()
+        )
+    ),
+    *_complex("command_force"),  # the finger's part of the force
     *_complex(*(f"{n}{i}{j}" for i in (0, 1) for j in (0, 1) for n in "ds")),  # the law, to and from a coordinate
 ]
 LOW_PASS_FIELDS = [
@@ -65,7 +74,7 @@ LOW_PASS_FIELDS = [
 """Of a tile in a coordinate of a method with low passes: envelope X; states of low pass and loop controller, of which
 the polar law has amplitude (re) and phase (im); V and dV/dt; drive per metre and lag (rad) of the free device;
 amplitude and phase (rad), of X and then commanded."""
-COMMAND_FIELDS = _complex("sent0", "sent1", "sent")
+COMMAND_FIELDS = _complex("command0", "command1", "command_force")
 
 
 def _record(names: list[str]) -> np.dtype:
@@ -77,7 +86,7 @@ LOW_PASS, COMMAND = _record(LOW_PASS_FIELDS), _record(COMMAND_FIELDS)
 """Commands are ordered [step, tile]."""
 
 _SETTINGS = """
-rate lead reference seen extrapolation fade_in lowest highest highest_edge modulated differentiated analysed
+rate lead reference middle extrapolation fade_in lowest highest highest_edge modulated differentiated analysed
 needs_contact least_speed sensor_delay contact_lag corrected sensor_limit drive_limit drive_step peak_decay
 back_calculation observer observer_high crowd_speed dc dc_drift dc_fast dc_drift_fast
 integral integral_medium integral_high damper damper_high

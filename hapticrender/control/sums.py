@@ -53,8 +53,8 @@ def gather(controller, t):
     c = record(controller, CONTROLLER_T, 0)
     w, b, at = envelopes_of(controller), record(c.tiles_at, TILE_T, t), t * W
     for k in range(W):
-        w[0, at + k], w[1, at + k] = b.held0_re[k], b.held0_im[k]
-        w[2, at + k], w[3, at + k] = b.held1_re[k], b.held1_im[k]
+        w[0, at + k], w[1, at + k] = b.work0_re[k], b.work0_im[k]
+        w[2, at + k], w[3, at + k] = b.work1_re[k], b.work1_im[k]
         w[4, at + k], w[5, at + k] = b.rise0_re[k], b.rise0_im[k]
         w[6, at + k], w[7, at + k] = b.rise1_re[k], b.rise1_im[k]
 
@@ -65,8 +65,8 @@ def scatter(controller, t):
     c = record(controller, CONTROLLER_T, 0)
     w, b, at = envelopes_of(controller), record(c.tiles_at, TILE_T, t), t * W
     for k in range(W):
-        b.held0_re[k], b.held0_im[k] = w[0, at + k], w[1, at + k]
-        b.held1_re[k], b.held1_im[k] = w[2, at + k], w[3, at + k]
+        b.work0_re[k], b.work0_im[k] = w[0, at + k], w[1, at + k]
+        b.work1_re[k], b.work1_im[k] = w[2, at + k], w[3, at + k]
 
 
 @kernel
@@ -142,7 +142,7 @@ def invert(controller, g):
     for t in range(c.tiles):
         b, at = record(c.tiles_at, TILE_T, t), t * W
         for k in range(W):  # relative to the block's first sample
-            w[0, at + k], w[1, at + k] = b.share[k] * tables[0, 0, at + k], -b.share[k] * tables[0, 1, at + k]
+            w[0, at + k], w[1, at + k] = b.feedback[k] * tables[0, 0, at + k], -b.feedback[k] * tables[0, 1, at + k]
             for row in range(2, 8):
                 w[row, at + k] = 0.0
     sum_bands(controller)

@@ -130,15 +130,15 @@ class CompiledPlant:
         compiled = isinstance(getattr(controller, "step", None), CFunction)
         return compiled and getattr(controller, "block", 1) in (1, self.block)
 
-    def closed_loop(self, controller: Any, wanted: Array) -> tuple[Array, Array, Array, Sensed]:
-        """Advance plant and controller together over `wanted` (n,); returns drive as played, target, flags, sensed.
+    def closed_loop(self, controller: Any, waveform: Array) -> tuple[Array, Array, Array, Sensed]:
+        """Advance plant and controller together over `waveform` (n,); returns drive as played, target, flags, sensed.
 
         Row n of the drive is computed from samples before n: the plant queues the rest of the loop's delay.
         """
-        wanted = np.ascontiguousarray(wanted, float)  # a name keeps a copy alive while its address is used
-        asked, block = len(wanted), self.block
+        waveform = np.ascontiguousarray(waveform, float)  # a name keeps a copy alive while its address is used
+        asked, block = len(waveform), self.block
         n = -(-asked // block) * block  # whole blocks; what is beyond the end is played and not returned
-        wanted = np.append(wanted, np.zeros(n - asked))
+        waveform = np.append(waveform, np.zeros(n - asked))
         signals = self._signals(n)
         drive = np.zeros((n + block, self.drive_channels))
         drive[:block] = self._last
@@ -150,7 +150,7 @@ class CompiledPlant:
             drive=drive[block:],
             sensed=signals["sensed"],
             position=position,
-            wanted=wanted,
+            waveform=waveform,
             target=target,
             flags=signals["flags"],
         )

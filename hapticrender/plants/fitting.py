@@ -171,7 +171,7 @@ def equation_error(expected: PlateParameters, record: Record, latest: int) -> tu
     """
     line, turn = record.on_line, record.turn[record.on_line]
     s = 2j * np.pi * record.rate * turn
-    sensors = expected.band_model(record.rate, 1).coordinate_from_sensed
+    sensors = expected.device_model(record.rate, 1).coordinate_from_sensed
     motion = record.sensed[line] @ sensors.T
     masses, springs = expected.mass_matrix.diagonal(), expected.stiffness_matrix.diagonal()
     weight = 1 / (masses * abs(s[:, None]) ** 2 + springs)
@@ -261,7 +261,7 @@ def _real(values: Array) -> Array:
 
 def static_load(fit: Fit) -> float:
     """Compute the load (N) from the static displacement of the identified plate."""
-    sensors = fit.plate.band_model(fit.plate.rate, 1).coordinate_from_sensed
+    sensors = fit.plate.device_model(fit.plate.rate, 1).coordinate_from_sensed
     return -float((fit.plate.stiffness_matrix @ sensors @ fit.left[0].real)[0] / 2)
 
 

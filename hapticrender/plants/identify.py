@@ -18,7 +18,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hapticrender.control.bandmodel import BandModel
+from hapticrender.control.device_model import DeviceModel
 from hapticrender.driver_checks import check_driver, check_sensed
 from hapticrender.errors import DesignError, PlateMismatch
 from hapticrender.plants.fitting import (
@@ -126,9 +126,9 @@ class Identified:
         """Whether the model leaves no more than noise."""
         return self.misfit <= self.misfit_bound
 
-    def band_model(self) -> BandModel:
+    def device_model(self) -> DeviceModel:
         """Return the device model of the identified plate, sensor gains included."""
-        return self.parameters.band_model(self.parameters.rate, self.parameters.delay)
+        return self.parameters.device_model(self.parameters.rate, self.parameters.delay)
 
     def profile(self) -> dict[str, float]:
         """Return the identified parameters, and the others that differ from the defaults, for `Scene.profile`."""

@@ -69,7 +69,7 @@ def design_multisine(parameters: PlateParameters, rate: float, samples: int, amp
     _check(parameters, rate, samples, amplitude, modes, ratios)
     bins = _lines(modes, rate, samples)
     coordinate = np.arange(len(bins)) % 2
-    model = parameters.band_model(rate, parameters.delay)
+    model = parameters.device_model(rate, parameters.delay)
     frequency = bins * (rate / samples)
     moved = model.response(frequency) * model.hold_and_delay(frequency)[:, None, None]
     ends = model.place_from_coordinate[1:] @ moved

@@ -28,8 +28,8 @@ import numpy as np
 from scipy.linalg import block_diag, expm
 
 from hapticrender.checks import Validated, parameter
-from hapticrender.control.bandmodel import BandModel
 from hapticrender.control.damping import BendingMode
+from hapticrender.control.device_model import DeviceModel
 from hapticrender.plants.compiled import CompiledPlant, aligned_record
 from hapticrender.plants.plate_kernels import COLUMNS, FUNCTIONS, NODES, PLATE, plate_step
 from hapticrender.protocols import Array
@@ -236,11 +236,11 @@ class PlateParameters(Validated):
         load = np.asarray(finger, complex)[..., None, None] * s * np.outer(lever, lever)
         return self.mass_matrix * s**2 + self.damping_matrix * s + self.stiffness_matrix + load
 
-    def band_model(self, rate: float, delay: int) -> BandModel:
+    def device_model(self, rate: float, delay: int) -> DeviceModel:
         """What the controller may know of this plate, in a loop of `rate` (Hz) and `delay` (samples)."""
         reach, n = self.glass_length / self.coil_spacing, self.coils  # one coil moves one coordinate
         ends_from_coordinate = np.array([[1.0, -reach], [1.0, reach]])
-        return BandModel(
+        return DeviceModel(
             rate=rate,
             delay=delay,
             mass=self.mass_matrix[:n, :n],

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from hapticrender.control.bandmodel import FingerRange
 from hapticrender.control.damping import damping_taps
+from hapticrender.control.device_model import FingerRange
 from hapticrender.control.linear import ErrorLoop, FingerEstimate, Structure
 from hapticrender.control.margins import sensitivity
 from hapticrender.control.polar_loop import PolarLoop
@@ -196,7 +196,7 @@ def stability_map(
 def _polar(touch: _Touch, carrier: Array, width: Array, common: bool) -> tuple[Array, Array]:
     """Growth and modulus margin of the paper's loop for every carrier and bandwidth."""
     parameters = touch.parameters
-    model = parameters.band_model(parameters.rate, parameters.delay)
+    model = parameters.device_model(parameters.rate, parameters.delay)
     loop = PolarLoop.on(touch.structure().sampled(parameters.rate), model, carrier, width, common=common)
     poles = loop.poles()
     near = width[:, None] * np.geomspace(0.02, 50.0, OFFSETS)
@@ -244,7 +244,7 @@ def scaled_loop(
 
     `parameters` are those of the free plate that the law inverts, `inner` (0..1) is the factor on the inner damper.
     """
-    model = parameters.band_model(parameters.rate, parameters.delay)
+    model = parameters.device_model(parameters.rate, parameters.delay)
     level = 2 * math.pi * np.minimum(6.0, carrier / 8) / model.rate
     return ErrorLoop.on(
         plant.sampled(model.rate),

@@ -15,8 +15,8 @@ import numpy as np
 
 from hapticrender.bands import Bands
 from hapticrender.checks import check_names, option, parameter
-from hapticrender.control.bandmodel import BandModel, FingerRange
 from hapticrender.control.damping import within_a_turn
+from hapticrender.control.device_model import DeviceModel, FingerRange
 from hapticrender.plants.compiled import CompiledPlant
 from hapticrender.plants.contact import SlidingParameters, new_record, sliding_record
 from hapticrender.plants.friction_laws import LAWS, FrictionLaw
@@ -132,10 +132,10 @@ class SurfaceParameters(SlidingParameters):
             return self.tribometer_response(frequency)
         return 1.0 / (self.lag_response(frequency, speed) * self._shift(np.asarray(frequency, float) / 2))
 
-    def amplitude_model(self) -> BandModel:
+    def amplitude_model(self) -> DeviceModel:
         """Device model of the mode for its amplitude loop, with the range of fingers and temperatures."""
         mode = self.carrier_mode
-        return resonant(mode.band_model(mode.rate, mode.delay), mode, self.lock)
+        return resonant(mode.device_model(mode.rate, mode.delay), mode, self.lock)
 
     def amplitude_bands(self) -> Bands:
         """Return the band of the carrier, whose amplitude (m) is the waveform of the reference."""
@@ -144,7 +144,7 @@ class SurfaceParameters(SlidingParameters):
         return Bands(frequency=carrier, wavenumber=none, phase=none, envelope=none + 1.0, modulated=True)
 
 
-def resonant(model: BandModel, mode: UltrasonicParameters, lock: float) -> BandModel:
+def resonant(model: DeviceModel, mode: UltrasonicParameters, lock: float) -> DeviceModel:
     """Device model of a mode whose carrier is locked to its resonance with a bandwidth of `lock` (Hz).
 
     Observer and integral grow with the pace, what they lose by being late with the delay.  With an inner loop the
@@ -162,7 +162,7 @@ def resonant(model: BandModel, mode: UltrasonicParameters, lock: float) -> BandM
         pace=_pace(model),
         lock=lock,
         taps=TAPS,
-        held=True,
+        always_damped=True,
         finger=FingerRange(
             mass=(0.0, 0.0),
             damping=(-0.9 * damping, finger),
@@ -176,7 +176,7 @@ def resonant(model: BandModel, mode: UltrasonicParameters, lock: float) -> BandM
     )
 
 
-def _pace(model: BandModel) -> float:
+def _pace(model: DeviceModel) -> float:
     """Bandwidth of the amplitude loop over that of a plate's rules."""
     if model.delay <= PROMPT and within_a_turn(model):
         return PACED_DELAY * model.rate / (model.delay + 1)

@@ -25,7 +25,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from hapticrender.checks import Validated, option, parameter
-from hapticrender.control.bandmodel import BandModel
+from hapticrender.control.device_model import DeviceModel
 from hapticrender.plants.compiled import LOAD, STRENGTH, CompiledPlant
 from hapticrender.plants.contact import new_record
 from hapticrender.plants.ultrasonic_kernels import MODE, ultrasonic_step
@@ -226,10 +226,10 @@ class UltrasonicParameters(Validated):
         """Resolution of the sensor (m); 0 is ideal."""
         return self.sensor_range / 2**self.sensor_bits if self.sensor_bits else 0.0
 
-    def band_model(self, rate: float, delay: int) -> BandModel:
+    def device_model(self, rate: float, delay: int) -> DeviceModel:
         """Device model of the free, cold plate in a loop of `rate` (Hz) and `delay` (samples)."""
         omega = 2 * math.pi * self.carrier
-        return BandModel(
+        return DeviceModel(
             rate=rate,
             delay=delay,
             mass=np.array([[self.mass]]),

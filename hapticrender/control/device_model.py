@@ -32,11 +32,11 @@ class FingerRange:
         It is learnt no faster, > 0: what noise teaches grows with the pace.
     contact : (float, float), N, or None
         Loads at which touch begins and ends, as felt by the sag; None: the load is always there.
-    presence : bool
+    needs_contact : bool
         Targets are wanted, and learnt from, only while the finger's position is known: what it does not touch it does
         not feel.
     least_speed : float, m/s
-        And only while it slides at least so fast, where `presence` holds.
+        And only while it slides at least so fast, where `needs_contact` holds.
     """
 
     mass: tuple[float, float] = (-2e-3, 12e-3)
@@ -47,7 +47,7 @@ class FingerRange:
     least_motion: float = 5e-8
     fastest: float = math.inf
     contact: tuple[float, float] | None = (0.05, 0.03)
-    presence: bool = False
+    needs_contact: bool = False
     least_speed: float = 0.0
 
     def __post_init__(self) -> None:
@@ -56,7 +56,7 @@ class FingerRange:
 
 
 @dataclass(frozen=True, kw_only=True)
-class BandModel:
+class DeviceModel:
     """All that the controller ever knows of a device.
 
     In the controlled coordinates q the device obeys ``D(s) q = force_from_drive @ drive``
@@ -107,20 +107,20 @@ class BandModel:
     pace : float
         Factor on every bandwidth of a method's rules, which are meant for carriers from 20 Hz on; > 0.  Limits that
         delay, carriers and spacing set stay as they are.
-    memory : float, N s/m times m/s
+    contact_damping : float, N s/m times m/s
         Part of the first damping that goes as 1/|v| with the finger's speed, times that speed; it is in `damping` as it
         is at `typical_speed`.  0: none.
     typical_speed : float, m/s
         Of the finger, > 0.
-    late : float, s
+    sensor_delay : float, s
         How much later than the judged place the sensor shows a band; negative: earlier.
-    foresight : float, m
+    contact_lag : float, m
         Length by which a sliding contact lags behind what the sensor shows.
     lock : float, Hz
         Bandwidth of the resonance lock, which moves the fixed carriers to where the device is resonant; 0: none.
     taps : int
         Of the inner loop where no bending mode is known, >= 3: more of them hear less noise, and answer later.
-    held : bool
+    always_damped : bool
         The inner loop stays on in quiet as well, as its noise costs less than the first moment of a touch.
     unit, drive_unit : str
         Of the coordinates and of the drive.
@@ -153,13 +153,13 @@ class BandModel:
     shape: tuple[float, ...] | None = None
     finger: FingerRange = FingerRange()
     pace: float = 1.0
-    memory: float = 0.0
+    contact_damping: float = 0.0
     typical_speed: float = 1.0
-    late: float = 0.0
-    foresight: float = 0.0
+    sensor_delay: float = 0.0
+    contact_lag: float = 0.0
     lock: float = 0.0
     taps: int = 3
-    held: bool = False
+    always_damped: bool = False
     unit: str = "m"
     drive_unit: str = "A"
 
