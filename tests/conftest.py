@@ -18,7 +18,7 @@ KEPT = 86_400.0  # s: caches of older sources are deleted after a day
 
 
 def fresh_cache(root: Path) -> Path:
-    """Folder of compiled kernels named by a hash of all sources and of numba's version.
+    """Folder of compiled kernels named by numba's version and a hash of all sources that compile something.
 
     numba compiles a cached kernel anew when its own file changes, but not when a kernel that it calls, in another
     file, does.
@@ -26,7 +26,9 @@ def fresh_cache(root: Path) -> Path:
     digest = hashlib.sha256(version("numba").encode())
     for folder in ("hapticrender", "renderers", "drivers", "tests"):
         for path in sorted((root / folder).rglob("*.py")):
-            digest.update(path.read_bytes())
+            source = path.read_bytes()
+            if b"numba" in source or b"hapticrender.jit" in source:
+                digest.update(source)
     caches = root / ".pytest_cache" / "numba"
     for old in caches.glob("*"):
         if time.time() - old.stat().st_mtime > KEPT:
