@@ -58,7 +58,7 @@ def friction_controller(bands):
 
 def played_by_twin(controller, sensed, position, wanted):
     p = {name: controller.settings[name] for name in controller.settings.dtype.names}
-    twin = NaiveError(p, setpoint_rows(controller.bands))
+    twin = NaiveError(p, setpoint_rows(controller.bands)[:, : controller.n_bands])
     rows = [twin.step(*row) for row in zip(sensed, position, wanted, strict=True)]
     return twin, *(np.array(column) for column in zip(*rows, strict=True))
 

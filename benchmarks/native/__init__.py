@@ -13,8 +13,7 @@ import numpy as np
 
 from benchmarks.timing import Absent
 from hapticrender.control.kernel import FORGET
-from hapticrender.control.records import W, aligned
-from hapticrender.control.sums import INVERSE, SAMPLE_ROWS
+from hapticrender.control.records import INVERSE, SAMPLE_ROWS, W, aligned
 from hapticrender.mathx import COS, SIN
 
 HERE = Path(__file__).parent

@@ -13,16 +13,19 @@ from hapticrender.control.records import (
     COMMAND,
     CONTROLLER,
     FADING,
+    PAIR,
+    SAMPLE_ROWS,
     SETPOINT_ROWS,
     TILE,
+    WORK,
     W,
     aligned,
     lanes,
 )
-from hapticrender.control.sums import SAMPLE_ROWS
 from hapticrender.jit import CFunction, addresses
 from hapticrender.protocols import Array
 
+LARGEST_GROUP = 16  # samples, of a block: carriers turn by products from group to group
 SETTLED = 0.05  # of a target: below it an error counts as settled
 LEAST_TARGET = 3e-3  # of the sensors' range: below it noise adds more than a wrong device model
 
@@ -73,16 +76,20 @@ class BankController:
         tiles = max(-(-self.n_bands // W), 1)
         self.tiles = aligned(tiles, TILE)
         self.tiles["mode"] = FADING
+        self.tiles["turn_re"] = 1.0
+        self.tiles["active"] = (np.arange(tiles * W) < self.n_bands).reshape(tiles, W)
         self.setpoints = setpoint_rows(bands)
         self.state = np.zeros(1, CONTROLLER)
-        for name, value in settings.items():
+        group = max(each for each in range(1, LARGEST_GROUP + 1) if self.block % each == 0)
+        for name, value in (settings | {"group": group}).items():
             self.state["p"][name][0] = value
         memory = {
             "tiles": self.tiles,
             "commands": aligned(history * tiles, COMMAND),
             "setpoints": self.setpoints,
-            "work": aligned((8, tiles * W)),
-            "tables": aligned(4 * self.block * tiles * W),
+            "work": aligned(tiles, WORK),
+            "table": aligned((group + 1) // 2 * tiles, PAIR),
+            "phasors": aligned(self.block // group * tiles, PAIR),
             "samples": np.zeros((SAMPLE_ROWS, self.block)),
         } | (arrays or {})
         self._arrays = memory
@@ -115,7 +122,7 @@ class BankController:
         """Fixed part of each carrier's phase at the next sample (turns, 0 to 1, shape (bands,))."""
         samples = self.block if self.block > 1 else 1
         left = 0 if samples > 1 else -int(self.state["sample"][0]) % REFRESH
-        return np.mod(self.field("turns") - left * self.setpoints[0] / self.settings["rate"], 1.0)
+        return np.mod(self.field("turns") - left * self.setpoints[0, : self.n_bands] / self.settings["rate"], 1.0)
 
     @property
     def mismatch(self) -> float:
@@ -128,7 +135,7 @@ class BankController:
             return 0.0
         if state["confidence"] < 1.0 or state["scale"] < 1.0 or not self.settings["observer"] > 0.0:
             return 0.0
-        size = np.where(self.setpoints[1] == 0.0, abs(self.reference()), 0.0)
+        size = np.where(self.setpoints[1, : self.n_bands] == 0.0, abs(self.reference()), 0.0)
         error = self.largest("e")
         integral = self.largest("v")
         counts = (size > LEAST_TARGET * self.settings["sensor_limit"]) & (error < SETTLED * size)
@@ -192,13 +199,16 @@ class BankController:
 
 
 def setpoint_rows(bands: Bands) -> Array:
-    """Setpoints of a compiled step: frequency, wavenumber, phase (turns), target and sensor response (re, im)."""
-    rows = np.zeros((SETPOINT_ROWS, len(bands)))
+    """Setpoints of a compiled step: frequency, wavenumber, phase (turns), target and sensor response (re, im).
+
+    The shape is (7, lanes), with zeros in lanes beyond the bands.
+    """
+    rows = aligned((SETPOINT_ROWS, max(-(-len(bands) // W), 1) * W))
     target = np.zeros(len(bands), complex) if bands.envelope is None else bands.envelope
     response = (
         np.ones(len(bands), complex) if bands.sensor_response is None else np.asarray(bands.sensor_response, complex)
     )
-    rows[:] = (
+    rows[:, : len(bands)] = (
         bands.frequency,
         bands.wavenumber,
         bands.phase / (2 * np.pi),

@@ -21,59 +21,57 @@ from hapticrender.control.carriers import (
     FARTHEST,
     REFRESH,
     advance_carriers,
-    analysed_target,
     crowding,
-    given_target,
-    put_targets,
-    set_reference,
     track_finger,
+    update_targets,
 )
 from hapticrender.control.laws import apply_law, follow_resonance, update_law
-from hapticrender.control.limiter import (
-    NEAR_LIMIT,
-    NONFINITE,
-    UNLOCKED,
-    largest_drive,
-    limit_drive,
-    sense,
-    update_confidence,
-)
-from hapticrender.control.records import CONTROLLER_T, FIXED, TILE_T, W
-from hapticrender.control.sums import (
+from hapticrender.control.limiter import NEAR_LIMIT, NONFINITE, UNLOCKED, largest_drive, limit_drive
+from hapticrender.control.records import (
     ANALYSIS,
+    CONTROLLER_T,
     INVERSE,
     POSITION,
     STEP,
     SUM,
+    TILE_T,
     WAVEFORM,
+    WORK_T,
     Y,
-    correlate,
-    gather,
-    invert,
     samples_of,
-    scatter,
-    solve,
-    sum_bands,
-    turn_tables,
 )
-from hapticrender.jit import C16, F8, I8, SIGNALS_T, kernel, pointer, record, step
+from hapticrender.control.sums import correlate, invert, solve, sum_bands, turn_tables
+from hapticrender.jit import F8, I8, SIGNALS_T, kernel, pointer, record, step
+from hapticrender.vectors import conj, get, maximum, pair, put, square, total, zeros
 
 FORGET = 50.0  # 1/s: error and integral of a carrier that has faded out decay at this rate
+FADE_OUT = 0.02  # s: within this the drive fades out while a sensor's samples are implausible
 
 
 @kernel
 def sense_block(controller, signals, first):
-    """Coordinates of every sample, the finger's positions, and flags of what is no number; 1 where a sensor is not."""
+    """Coordinates of every sample, the finger's positions, and flags of what is no number; 1 where a sensor is not.
+
+    Samples beyond what a sensor can show count as zero.
+    """
     c = record(controller, CONTROLLER_T, 0)
     io, samples = record(signals, SIGNALS_T, 0), samples_of(controller)
     p, block = c.p, c.p.block
-    rows, implausible = first + block, 0
-    sensed, flags = carray(pointer(io.sensed, F8), (rows, p.sensors)), carray(pointer(io.flags, I8), rows)
-    position, waveform = carray(pointer(io.position, F8), rows), carray(pointer(io.waveform, F8), rows)
-    reads = p.analysed > 0.0 or p.modulated > 0.0
+    sensed, flags = pointer(io.sensed, F8), pointer(io.flags, I8)
+    position, waveform = pointer(io.position, F8), pointer(io.waveform, F8)
+    reads, implausible = p.analysed > 0.0 or p.modulated > 0.0, 0
     for m in range(block):
         n = first + m
-        raised = sense(controller, sensed, n, m, samples)
+        raised = 0
+        y0 = y1 = 0.0
+        for s in range(p.sensors):
+            value = sensed[n * p.sensors + s]
+            if abs(value) <= p.sensor_limit:
+                y0 += p.coordinate_from_sensor[0, s] * value
+                y1 += p.coordinate_from_sensor[1, s] * value
+            else:  # NaN included
+                raised = 1
+        samples[Y, m], samples[Y + 1, m] = y0, y1
         implausible |= raised
         value = waveform[n] if reads else 0.0
         sane = abs(value) <= FARTHEST
@@ -87,62 +85,45 @@ def sense_block(controller, signals, first):
 
 
 @kernel
+def update_confidence(controller, implausible):
+    """Fade the confidence in the sensors out within 20 ms while samples are implausible, and in again; True at zero."""
+    c = record(controller, CONTROLLER_T, 0)
+    change = c.p.block / (FADE_OUT * c.p.rate)
+    c.confidence = max(c.confidence - change, 0.0) if implausible > 0 else min(c.confidence + change, 1.0)
+    return c.confidence == 0.0
+
+
+@kernel
 def analyse_sample(controller):
     """Update the envelopes of the target's waveform by the residual observer."""
     c = record(controller, CONTROLLER_T, 0)
-    error = samples_of(controller)[WAVEFORM, 0]
+    found = zeros()
     for t in range(c.tiles):
         b = record(c.tiles_at, TILE_T, t)
-        for k in range(W):
-            error -= b.raw_re[k] * b.cos[k] - b.raw_im[k] * b.sin[k]
-    error *= c.p.reference * crowding(controller)
+        found = found + (get(b, "raw") * get(b, "carrier")).real
+    gain = c.p.reference * crowding(controller) * (samples_of(controller)[WAVEFORM, 0] - total(found))
     for t in range(c.tiles):
         b = record(c.tiles_at, TILE_T, t)
-        for k in range(W):
-            b.raw_re[k] += error * b.cos[k]
-            b.raw_im[k] -= error * b.sin[k]
+        put(b, "raw", get(b, "raw") + gain * conj(get(b, "carrier")))
 
 
 @kernel
 def analyse_block(controller):
     """Update the envelopes of the target's waveform as exactly as those of the sensors."""
     c = record(controller, CONTROLLER_T, 0)
-    samples, g = samples_of(controller), c.p.reference
+    samples = samples_of(controller)
     for t in range(c.tiles):
-        b = record(c.tiles_at, TILE_T, t)
-        for k in range(W):
-            b.work0_re[k] = b.raw_re[k] * b.cos[k] - b.raw_im[k] * b.sin[k]
-            b.work0_im[k] = b.raw_re[k] * b.sin[k] + b.raw_im[k] * b.cos[k]
-        gather(controller, t)
-    sum_bands(controller)
+        b, w = record(c.tiles_at, TILE_T, t), record(c.work_at, WORK_T, t)
+        put(w, "x0", get(b, "raw") * get(b, "carrier"))
+        put(w, "x1", 0.0)
+    sum_bands(controller, False)
     for m in range(c.p.block):
         samples[WAVEFORM, m] -= samples[SUM, m]
     solve(controller, WAVEFORM, ANALYSIS)
     correlate(controller, WAVEFORM)
     for t in range(c.tiles):
-        b = record(c.tiles_at, TILE_T, t)
-        scatter(controller, t)
-        for k in range(W):
-            b.raw_re[k] += g * (b.work0_re[k] * b.cos[k] - b.work0_im[k] * b.sin[k])
-            b.raw_im[k] -= g * (b.work0_re[k] * b.sin[k] + b.work0_im[k] * b.cos[k])
-
-
-@kernel
-def update_targets(controller, signals, first):
-    """Targets and references of all bands for a block; a row of the log a block."""
-    c = record(controller, CONTROLLER_T, 0)
-    p, samples, io = c.p, samples_of(controller), record(signals, SIGNALS_T, 0)
-    factor, row = samples[WAVEFORM, p.block - 1] if p.modulated > 0.0 else 1.0, first // p.block
-    for t in range(c.tiles):
-        b = record(c.tiles_at, TILE_T, t)
-        if b.mode[0] == FIXED:
-            continue
-        if p.analysed > 0.0:
-            analysed_target(controller, t)
-        else:
-            given_target(controller, t, factor)
-        set_reference(controller, t)
-    put_targets(controller, carray(pointer(io.target, C16), (row + 1, c.bands)), row)
+        b, w = record(c.tiles_at, TILE_T, t), record(c.work_at, WORK_T, t)
+        put(b, "raw", get(b, "raw") + c.p.reference * conj(get(w, "x0") * get(b, "carrier")))
 
 
 @kernel
@@ -150,45 +131,55 @@ def predict(controller):
     """Sums over the bands of both coordinates: what the sensors should show, and the commanded motion."""
     c = record(controller, CONTROLLER_T, 0)
     shape0, shape1 = c.p.shape[0], c.p.shape[1]
-    seen0 = seen1 = command0 = command1 = 0.0
+    sum0, sum1, command0, command1 = zeros(), zeros(), zeros(), zeros()
     for t in range(c.tiles):
         b = record(c.tiles_at, TILE_T, t)
-        for k in range(W):
-            cos, sin = b.cos[k], b.sin[k]
-            reference = b.expected_re[k] * cos - b.expected_im[k] * sin
-            seen0 += shape0 * reference + b.e0_re[k] * cos - b.e0_im[k] * sin
-            seen1 += shape1 * reference + b.e1_re[k] * cos - b.e1_im[k] * sin
-            reference = b.r_re[k] * cos - b.r_im[k] * sin
-            command0 += shape0 * reference + b.v0_re[k] * cos - b.v0_im[k] * sin
-            command1 += shape1 * reference + b.v1_re[k] * cos - b.v1_im[k] * sin
-    return seen0, seen1, command0, command1
+        carrier, expected, reference = get(b, "carrier"), get(b, "expected"), get(b, "r")
+        sum0 = sum0 + ((shape0 * expected + get(b, "e0")) * carrier).real
+        sum1 = sum1 + ((shape1 * expected + get(b, "e1")) * carrier).real
+        command0 = command0 + ((shape0 * reference + get(b, "v0")) * carrier).real
+        command1 = command1 + ((shape1 * reference + get(b, "v1")) * carrier).real
+    return total(sum0), total(sum1), total(command0), total(command1)
 
 
 @kernel
-def predict_block(controller):
-    """What the sensors should show in every sample of a block, into the rows SUM of `samples`."""
+def innovate_sample(controller):
+    """Innovation of a sample, DC estimates of type 2, and the inner damper's force into the row STEP.
+
+    The damper is F = -sum taps eps[n - j]; `past` is a ring of 16 deviations eps from the command.
+    """
     c = record(controller, CONTROLLER_T, 0)
-    shape0, shape1 = c.p.shape[0], c.p.shape[1]
-    for t in range(c.tiles):
-        b = record(c.tiles_at, TILE_T, t)
-        for k in range(W):
-            cos, sin = b.cos[k], b.sin[k]
-            re, im = shape0 * b.expected_re[k] + b.e0_re[k], shape0 * b.expected_im[k] + b.e0_im[k]
-            b.work0_re[k], b.work0_im[k] = re * cos - im * sin, re * sin + im * cos
-            re, im = shape1 * b.expected_re[k] + b.e1_re[k], shape1 * b.expected_im[k] + b.e1_im[k]
-            b.work1_re[k], b.work1_im[k] = re * cos - im * sin, re * sin + im * cos
-        gather(controller, t)
-    sum_bands(controller)
+    samples, now, p = samples_of(controller), c.sample & 15, c.p
+    samples[SUM, 0], samples[SUM + 1, 0], command0, command1 = predict(controller)
+    gain = p.dc_fast if c.quick > 0.0 else p.dc
+    drift = p.dc_drift_fast if c.quick > 0.0 else p.dc_drift
+    for i in range(2):
+        deviation = samples[Y + i, 0] - c.scale * (command0 if i == 0 else command1)
+        c.past[i, now], c.deviation[i] = deviation, deviation - c.dc[i]
+        force = 0.0
+        if c.damping_gain > 0.0:
+            for j in range(p.n_taps):
+                force -= p.taps[i, j] * c.past[i, (now - j) & 15]
+        samples[STEP + i, 0] = c.damping_gain * force
+        error = samples[Y + i, 0] - samples[SUM + i, 0] - c.dc[i]
+        samples[Y + i, 0] = error
+        c.dc[i] += c.dc_drift[i] + gain * error
+        c.dc_drift[i] += drift * error
 
 
 @kernel
 def innovate_block(controller):
-    """Innovations of every sample of a block, solved exactly; the DC estimates of type 2 after it; correlations."""
+    """Innovations of every sample of a block, solved exactly; the DC estimates of type 2 after it; correlations x."""
     c = record(controller, CONTROLLER_T, 0)
-    samples, block = samples_of(controller), c.p.block
-    predict_block(controller)
-    gain = c.p.dc_fast if c.quick > 0.0 else c.p.dc
-    drift = c.p.dc_drift_fast if c.quick > 0.0 else c.p.dc_drift
+    samples, block, p = samples_of(controller), c.p.block, c.p
+    for t in range(c.tiles):
+        b, w = record(c.tiles_at, TILE_T, t), record(c.work_at, WORK_T, t)
+        carrier, expected = get(b, "carrier"), get(b, "expected")
+        put(w, "x0", (p.shape[0] * expected + get(b, "e0")) * carrier)
+        put(w, "x1", (p.shape[1] * expected + get(b, "e1")) * carrier)
+    sum_bands(controller, False)
+    gain = p.dc_fast if c.quick > 0.0 else p.dc
+    drift = p.dc_drift_fast if c.quick > 0.0 else p.dc_drift
     for i in range(2):
         for m in range(block):
             samples[Y + i, m] -= samples[SUM + i, m] + c.dc[i] + m * c.dc_drift[i]
@@ -201,116 +192,70 @@ def innovate_block(controller):
         c.dc_drift[i] += steeper
     correlate(controller, Y)
     for t in range(c.tiles):
-        b = record(c.tiles_at, TILE_T, t)
-        scatter(controller, t)
-        for k in range(W):
-            cos, sin, r0, i0, r1, i1 = b.cos[k], b.sin[k], b.work0_re[k], b.work0_im[k], b.work1_re[k], b.work1_im[k]
-            b.work0_re[k], b.work0_im[k] = r0 * cos - i0 * sin, -r0 * sin - i0 * cos
-            b.work1_re[k], b.work1_im[k] = r1 * cos - i1 * sin, -r1 * sin - i1 * cos
+        w, carrier = record(c.work_at, WORK_T, t), get(record(c.tiles_at, TILE_T, t), "carrier")
+        put(w, "x0", conj(get(w, "x0") * carrier))
+        put(w, "x1", conj(get(w, "x1") * carrier))
 
 
 @kernel
-def innovate_sample(controller):
-    """Innovation of a sample, DC estimates of type 2, correlations, and the inner damper's force into the row STEP.
-
-    The damper is F = -sum taps eps[n - j]; `past` is a ring of 16 deviations eps from the command.
-    """
-    c = record(controller, CONTROLLER_T, 0)
-    samples, now, scale, damper = samples_of(controller), c.sample & 15, c.scale, c.damping_gain
-    samples[SUM, 0], samples[SUM + 1, 0], command0, command1 = predict(controller)
-    gain = c.p.dc_fast if c.quick > 0.0 else c.p.dc
-    drift = c.p.dc_drift_fast if c.quick > 0.0 else c.p.dc_drift
-    for i in range(2):
-        deviation = samples[Y + i, 0] - scale * (command0 if i == 0 else command1)
-        c.past[i, now], c.deviation[i] = deviation, deviation - c.dc[i]
-        force = 0.0
-        for j in range(c.p.n_taps):
-            force -= c.p.taps[i, j] * c.past[i, (now - j) & 15]
-        samples[STEP + i, 0] = damper * force
-        error = samples[Y + i, 0] - samples[SUM + i, 0] - c.dc[i]
-        samples[Y + i, 0] = error
-        c.dc[i] += c.dc_drift[i] + gain * error
-        c.dc_drift[i] += drift * error
-    one0, one1 = samples[Y, 0], samples[Y + 1, 0]
-    for t in range(c.tiles):
-        b = record(c.tiles_at, TILE_T, t)
-        for k in range(W):
-            cos, sin = b.cos[k], b.sin[k]
-            b.work0_re[k], b.work0_im[k] = one0 * cos, -one0 * sin
-            b.work1_re[k], b.work1_im[k] = one1 * cos, -one1 * sin
-
-
-@kernel
-def low_passed(low, value, pole):
-    """Next value of a low pass of first order."""
-    return low + pole * (value - low)
-
-
-@kernel
-def detect(controller):
-    """Low-pass the demodulated deviations; returns what exceeds the levels of the fast and of the slow detector.
-
-    Sample by sample the deviation itself is demodulated.  In blocks it is E - v and what the innovations add to it;
-    `held` is their correlation with the carrier.
-    """
-    c = record(controller, CONTROLLER_T, 0)
-    p, over, above = c.p, 0.0, 0.0
-    whole, share = (1.0, 2.0 / p.block) if p.block > 1 else (0.0, 0.0)
-    twice0, twice1 = (1.0 - whole) * 2.0 * c.deviation[0], (1.0 - whole) * 2.0 * c.deviation[1]
-    fast, slow, fast_level, slow_level = p.fast_pole, p.slow_pole, p.fast_level, p.slow_level
-    for t in range(c.tiles):
-        b = record(c.tiles_at, TILE_T, t)
-        for k in range(W):
-            re = whole * (b.e0_re[k] - b.v0_re[k]) + share * b.work0_re[k] + twice0 * b.cos[k]
-            im = whole * (b.e0_im[k] - b.v0_im[k]) + share * b.work0_im[k] - twice0 * b.sin[k]
-            fr, fi = low_passed(b.fast0_re[k], re, fast), low_passed(b.fast0_im[k], im, fast)
-            sr, si = low_passed(b.slow0_re[k], fr, slow), low_passed(b.slow0_im[k], fi, slow)
-            b.fast0_re[k], b.fast0_im[k], b.slow0_re[k], b.slow0_im[k] = fr, fi, sr, si
-            over += max(fr * fr + fi * fi - fast_level, 0.0)
-            above += max(sr * sr + si * si - slow_level, 0.0)
-            re = whole * (b.e1_re[k] - b.v1_re[k]) + share * b.work1_re[k] + twice1 * b.cos[k]
-            im = whole * (b.e1_im[k] - b.v1_im[k]) + share * b.work1_im[k] - twice1 * b.sin[k]
-            fr, fi = low_passed(b.fast1_re[k], re, fast), low_passed(b.fast1_im[k], im, fast)
-            sr, si = low_passed(b.slow1_re[k], fr, slow), low_passed(b.slow1_im[k], fi, slow)
-            b.fast1_re[k], b.fast1_im[k], b.slow1_re[k], b.slow1_im[k] = fr, fi, sr, si
-            over += max(fr * fr + fi * fi - fast_level, 0.0)
-            above += max(sr * sr + si * si - slow_level, 0.0)
-    return over, above
-
-
-@kernel
-def updated(error, held, part, r, rise, fading, share, gains):
-    """Error e, integral part v and dV/dt after a step, of one component (re or im) of an envelope."""
-    g, integral, back, period = gains
-    error = (1.0 - period * fading) * error + g * share * held
-    slope = -integral * error - fading * part
+def update_coordinate(e, v, innovation, reference, rise, gain, fading, gains):
+    """Error E, integral part v and dV/dt of a coordinate after a block."""
+    integral, back, period = gains
+    e = (1.0 - period * fading) * e + gain * innovation
+    slope = -1.0 * (integral * e + fading * v)
     # back-calculation is no part of dV/dt: the law would answer the limiter by itself
-    return error, part + period * (slope - back * (part + r)), slope + rise
+    return e, v + period * (slope - back * (v + reference)), slope + rise
 
 
 @kernel
-def update_envelopes(controller, g, integral, back):
-    """Update error envelopes, integral parts and slopes of the commands of all bands."""
+def update_envelopes(controller, integral):
+    """Update error envelopes, integral parts and slopes of the commands of all bands, and run the detectors.
+
+    Returns what the demodulated deviations, low-passed, exceed the levels of the fast and the slow detector by.  Sample
+    by sample the deviation itself is demodulated; in blocks it is E - v and what the innovations add to it.
+    """
     c = record(controller, CONTROLLER_T, 0)
-    shape0, shape1, gains = c.p.shape[0], c.p.shape[1], (g, integral, back, c.p.block / c.p.rate)
+    p, samples, shape0, shape1 = c.p, samples_of(controller), c.p.shape[0], c.p.shape[1]
+    in_blocks, gains = p.block > 1, (integral, p.back_calculation * (1.0 - c.scale), p.block / p.rate)
+    one0, one1 = samples[Y, 0], samples[Y + 1, 0]
+    twice0, twice1, share = 2.0 * c.deviation[0], 2.0 * c.deviation[1], 2.0 / p.block
+    over, above = zeros(), zeros()
     for t in range(c.tiles):
         b = record(c.tiles_at, TILE_T, t)
-        for k in range(W):
-            share, r, slope = b.feedback[k], b.r_re[k], b.slope_re[k]
-            fading = FORGET * (b.active[k] - share)
-            b.e0_re[k], b.v0_re[k], b.slope0_re[k] = updated(
-                b.e0_re[k], b.work0_re[k], b.v0_re[k], shape0 * r, shape0 * slope, fading, share, gains
-            )
-            b.e1_re[k], b.v1_re[k], b.slope1_re[k] = updated(
-                b.e1_re[k], b.work1_re[k], b.v1_re[k], shape1 * r, shape1 * slope, fading, share, gains
-            )
-            r, slope = b.r_im[k], b.slope_im[k]
-            b.e0_im[k], b.v0_im[k], b.slope0_im[k] = updated(
-                b.e0_im[k], b.work0_im[k], b.v0_im[k], shape0 * r, shape0 * slope, fading, share, gains
-            )
-            b.e1_im[k], b.v1_im[k], b.slope1_im[k] = updated(
-                b.e1_im[k], b.work1_im[k], b.v1_im[k], shape1 * r, shape1 * slope, fading, share, gains
-            )
+        carrier, e0, e1, v0, v1 = conj(get(b, "carrier")), get(b, "e0"), get(b, "e1"), get(b, "v0"), get(b, "v1")
+        if in_blocks:
+            w = record(c.work_at, WORK_T, t)
+            found0, found1 = get(w, "x0"), get(w, "x1")
+            deviation0, deviation1 = e0 - v0 + share * found0, e1 - v1 + share * found1
+        else:
+            found0, found1 = one0 * carrier, one1 * carrier
+            deviation0, deviation1 = twice0 * carrier, twice1 * carrier
+        if p.detects > 0.0:
+            fast, slow = get(b, "fast0"), get(b, "slow0")
+            fast = fast + p.fast_pole * (deviation0 - fast)
+            slow = slow + p.slow_pole * (fast - slow)
+            put(b, "fast0", fast)
+            put(b, "slow0", slow)
+            over = over + maximum(square(fast) - p.fast_level, 0.0)
+            above = above + maximum(square(slow) - p.slow_level, 0.0)
+            fast, slow = get(b, "fast1"), get(b, "slow1")
+            fast = fast + p.fast_pole * (deviation1 - fast)
+            slow = slow + p.slow_pole * (fast - slow)
+            put(b, "fast1", fast)
+            put(b, "slow1", slow)
+            over = over + maximum(square(fast) - p.fast_level, 0.0)
+            above = above + maximum(square(slow) - p.slow_level, 0.0)
+        feedback, reference, rise = get(b, "feedback"), get(b, "r"), get(b, "slope")
+        gain, fading = c.gain * feedback, FORGET * (get(b, "active") - feedback)
+        e, v, slope = update_coordinate(e0, v0, found0, shape0 * reference, shape0 * rise, gain, fading, gains)
+        put(b, "e0", e)
+        put(b, "v0", v)
+        put(b, "slope0", slope)
+        e, v, slope = update_coordinate(e1, v1, found1, shape1 * reference, shape1 * rise, gain, fading, gains)
+        put(b, "e1", e)
+        put(b, "v1", v)
+        put(b, "slope1", slope)
+    return total(over), total(above)
 
 
 @kernel
@@ -320,36 +265,29 @@ def synthesise_block(controller):
     Returns the largest drive over its limit, squared; of the samples, and of their envelope where the limit is near.
     """
     c = record(controller, CONTROLLER_T, 0)
-    samples, block = samples_of(controller), c.p.block
+    samples = samples_of(controller)
     peak = c.p.peak_decay * c.p.peak_decay * c.peak
     for quarter in range(2):
         if quarter > 0 and peak <= NEAR_LIMIT:
             break
         for t in range(c.tiles):
-            b = record(c.tiles_at, TILE_T, t)
-            for k in range(W):
-                cos = b.sin[k] if quarter else b.cos[k]
-                sin = -b.cos[k] if quarter else b.sin[k]
-                re, im = b.last_force0_re[k], b.last_force0_im[k]
-                up, on = b.force0_re[k] - re, b.force0_im[k] - im
-                b.work0_re[k], b.work0_im[k] = re * cos - im * sin, re * sin + im * cos
-                b.rise0_re[k], b.rise0_im[k] = up * cos - on * sin, up * sin + on * cos
-                re, im = b.last_force1_re[k], b.last_force1_im[k]
-                up, on = b.force1_re[k] - re, b.force1_im[k] - im
-                b.work1_re[k], b.work1_im[k] = re * cos - im * sin, re * sin + im * cos
-                b.rise1_re[k], b.rise1_im[k] = up * cos - on * sin, up * sin + on * cos
-            gather(controller, t)
-        sum_bands(controller)
-        if not quarter:
-            for m in range(block):
+            b, w = record(c.tiles_at, TILE_T, t), record(c.work_at, WORK_T, t)
+            carrier, force0, force1 = get(b, "carrier"), get(b, "last_force0"), get(b, "last_force1")
+            if quarter > 0:
+                carrier = pair(carrier.imag, -1.0 * carrier.real)
+            put(w, "x0", force0 * carrier)
+            put(w, "x1", force1 * carrier)
+            put(w, "rise0", (get(b, "force0") - force0) * carrier)
+            put(w, "rise1", (get(b, "force1") - force1) * carrier)
+        sum_bands(controller, True)
+        if quarter == 0:
+            for m in range(c.p.block):
                 samples[Y, m], samples[Y + 1, m] = samples[SUM, m], samples[SUM + 1, m]
         peak = max(peak, largest_drive(controller, samples, Y, SUM, quarter > 0))
     for t in range(c.tiles):
         b = record(c.tiles_at, TILE_T, t)
-        for k in range(W):
-            b.last_force0_re[k], b.last_force0_im[k] = b.force0_re[k], b.force0_im[k]
-            b.last_force1_re[k], b.last_force1_im[k] = b.force1_re[k], b.force1_im[k]
-            b.rise0_re[k] = b.rise0_im[k] = b.rise1_re[k] = b.rise1_im[k] = 0.0
+        put(b, "last_force0", get(b, "force0"))
+        put(b, "last_force1", get(b, "force1"))
     return peak
 
 
@@ -359,11 +297,16 @@ def reset_loop(controller):
     c = record(controller, CONTROLLER_T, 0)
     for t in range(c.tiles):
         b = record(c.tiles_at, TILE_T, t)
-        for k in range(W):
-            b.e0_re[k] = b.e0_im[k] = b.v0_re[k] = b.v0_im[k] = b.slope0_re[k] = b.slope0_im[k] = 0.0
-            b.e1_re[k] = b.e1_im[k] = b.v1_re[k] = b.v1_im[k] = b.slope1_re[k] = b.slope1_im[k] = 0.0
-            b.fast0_re[k] = b.fast0_im[k] = b.slow0_re[k] = b.slow0_im[k] = 0.0
-            b.fast1_re[k] = b.fast1_im[k] = b.slow1_re[k] = b.slow1_im[k] = 0.0
+        put(b, "e0", 0.0)
+        put(b, "e1", 0.0)
+        put(b, "v0", 0.0)
+        put(b, "v1", 0.0)
+        put(b, "slope0", 0.0)
+        put(b, "slope1", 0.0)
+        put(b, "fast0", 0.0)
+        put(b, "fast1", 0.0)
+        put(b, "slow0", 0.0)
+        put(b, "slow1", 0.0)
     for i in range(2):
         c.dc[i] = c.dc_drift[i] = 0.0
         for j in range(16):
@@ -386,7 +329,7 @@ def begin(controller, signals, first):
 
 @kernel
 def find_contact(controller, turn):
-    """Contact by the DC estimate, which opens the loop for a while, and the gain of the inner damper."""
+    """Contact by the DC estimate, which raises the gains for a while, and the gain of the inner damper."""
     c = record(controller, CONTROLLER_T, 0)
     p = c.p
     if detect_contact(controller, turn):
@@ -400,14 +343,13 @@ def find_contact(controller, turn):
 def close_block(controller, touching, turn):
     """Envelopes from the innovations, adaptation, law, and the gain schedule.
 
-    A detector over its level opens the loop for a while; then it closes slowly.
+    A detector over its level raises the gains for a while; then they fall slowly.
     """
     c = record(controller, CONTROLLER_T, 0)
     p, block = c.p, c.p.block
     integral = p.integral + c.slow_open * (p.integral_medium - p.integral)
     integral = (integral + c.fast_open * (p.integral_high - integral)) * (1.0 - c.idle)
-    fast, slow = detect(controller) if p.detects > 0.0 else (0.0, 0.0)
-    update_envelopes(controller, c.gain, integral, p.back_calculation * (1.0 - c.scale))
+    fast, slow = update_envelopes(controller, integral)
     if update_confidence(controller, c.implausible):
         reset_loop(controller)
     if touching and turn:

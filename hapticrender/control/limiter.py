@@ -1,4 +1,4 @@
-"""Compiled ends of every controller: sensors into coordinates, plausibility, and the drive inside its limits."""
+"""Compiled end of every controller: the drive inside its limits."""
 
 from __future__ import annotations
 
@@ -8,34 +8,8 @@ from hapticrender.control.records import CONTROLLER_T
 from hapticrender.jit import kernel, record
 from hapticrender.mathx import round_to_integer
 
-FADE_OUT = 0.02  # s: within this the drive fades out while a sensor's samples are implausible
 NEAR_LIMIT = 0.25  # of the limit, squared: from here on the envelope of the drive counts, not its samples alone
 SATURATED, NONFINITE, UNLOCKED = 1, 2, 32  # Flag bits
-
-
-@kernel
-def sense(controller, sensed, row, column, y):
-    """Coordinates of a sample, into a column of `y`; returns 1 where a sensor shows what none can, counted as zero."""
-    c = record(controller, CONTROLLER_T, 0)
-    implausible = 0
-    y[0, column] = y[1, column] = 0.0
-    for s in range(c.p.sensors):
-        value = sensed[row, s]
-        if abs(value) <= c.p.sensor_limit:
-            y[0, column] += c.p.coordinate_from_sensor[0, s] * value
-            y[1, column] += c.p.coordinate_from_sensor[1, s] * value
-        else:  # NaN included
-            implausible = 1
-    return implausible
-
-
-@kernel
-def update_confidence(controller, implausible):
-    """Fade the confidence in the sensors out within 20 ms while samples are implausible, and in again; True at zero."""
-    c = record(controller, CONTROLLER_T, 0)
-    step = c.p.block / (FADE_OUT * c.p.rate)
-    c.confidence = max(c.confidence - step, 0.0) if implausible > 0 else min(c.confidence + step, 1.0)
-    return c.confidence == 0.0
 
 
 @kernel

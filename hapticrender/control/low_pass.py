@@ -21,12 +21,11 @@ import math
 
 from numba import carray
 
-from hapticrender.control.carriers import advance_carriers
-from hapticrender.control.kernel import FORGET, analyse_sample, sense_block, update_targets
+from hapticrender.control.carriers import advance_carriers, update_targets
+from hapticrender.control.kernel import FORGET, analyse_sample, sense_block, update_confidence
 from hapticrender.control.laws import turn_ahead
-from hapticrender.control.limiter import SATURATED, drive_of, update_confidence
-from hapticrender.control.records import CONTROLLER_T, FIXED, LOCKED, LOW_PASS_T, TILE_T, W
-from hapticrender.control.sums import SUM, Y, samples_of
+from hapticrender.control.limiter import SATURATED, drive_of
+from hapticrender.control.records import CONTROLLER_T, FIXED, LOCKED, LOW_PASS_T, SUM, TILE_T, W, Y, samples_of
 from hapticrender.jit import F8, I8, SIGNALS_T, kernel, pointer, record, step
 from hapticrender.mathx import TURN, polar, sincos_turns
 
@@ -44,7 +43,7 @@ def low_pass(controller, t, i, y):
     b0, b1, b2 = 2.0 * y * c.p.low_pass[0], 2.0 * y * c.p.low_pass[1], 2.0 * y * c.p.low_pass[2]
     a1, a2 = c.p.low_pass[3], c.p.low_pass[4]
     for k in range(W):
-        cos, sin = b.cos[k], -b.sin[k]
+        cos, sin = b.carrier_re[k], -b.carrier_im[k]
         re, im = b0 * cos + x.low1_re[k], b0 * sin + x.low1_im[k]
         x.low1_re[k] = b1 * cos - a1 * re + x.low2_re[k]
         x.low1_im[k] = b1 * sin - a1 * im + x.low2_im[k]
@@ -64,7 +63,7 @@ def window_mean(controller, t, i, y):
     window = carray(pointer(c.window_at, F8), (length, c.p.coordinates * c.tiles, 2, W))[place, i * c.tiles + t]
     last, share, twice = place == length - 1, 1.0 / length, 2.0 * y
     for k in range(W):
-        re, im = twice * b.cos[k], -twice * b.sin[k]
+        re, im = twice * b.carrier_re[k], -twice * b.carrier_im[k]
         fresh_re, fresh_im = x.low2_re[k] + re, x.low2_im[k] + im
         sum_re = fresh_re if last else x.low1_re[k] + (re - window[0, k])
         sum_im = fresh_im if last else x.low1_im[k] + (im - window[1, k])
@@ -172,8 +171,8 @@ def sum_drives(controller, t, i):
     x, total = record(c.loops_at, LOW_PASS_T, i * c.tiles + t), 0.0
     for k in range(W):
         sin, cos = sincos_turns(x.theta[k] / TURN)
-        along = b.heading_re[k] * b.cos[k] - b.heading_im[k] * b.sin[k]
-        across = b.heading_re[k] * b.sin[k] + b.heading_im[k] * b.cos[k]
+        along = b.heading_re[k] * b.carrier_re[k] - b.heading_im[k] * b.carrier_im[k]
+        across = b.heading_re[k] * b.carrier_im[k] + b.heading_im[k] * b.carrier_re[k]
         total += x.drive[k] * x.amplitude[k] * (along * cos - b.direction[k] * across * sin)
     return total
 
@@ -220,7 +219,7 @@ def reference_motion(controller):
     for t in range(c.tiles):
         b = record(c.tiles_at, TILE_T, t)
         for k in range(W):
-            total += b.r_re[k] * b.cos[k] - b.r_im[k] * b.sin[k]
+            total += b.r_re[k] * b.carrier_re[k] - b.r_im[k] * b.carrier_im[k]
     return total
 
 
@@ -257,8 +256,8 @@ def device_force(controller, t, i, j):
         along, across, turn = s - w * w * m, w * d + dynamic * b.sweep[k] * m, 2.0 * w * m
         re = along * vr - across * vi + d * sr - turn * si
         im = along * vi + across * vr + d * si + turn * sr
-        cos = b.ahead_re[k] * b.cos[k] - b.ahead_im[k] * b.sin[k]
-        sin = b.ahead_re[k] * b.sin[k] + b.ahead_im[k] * b.cos[k]
+        cos = b.ahead_re[k] * b.carrier_re[k] - b.ahead_im[k] * b.carrier_im[k]
+        sin = b.ahead_re[k] * b.carrier_im[k] + b.ahead_im[k] * b.carrier_re[k]
         total += re * cos - im * sin
     return total
 

@@ -1,7 +1,7 @@
-"""Records that the compiled controllers work on: tiles of sixteen bands, settings, and state.
+"""Records that the compiled controllers work on: tiles of eight bands, settings, and state.
 
-A band's numbers are lanes of a *tile*: every field of a tile is `W` bands wide and lies at a constant offset, so that a
-plain loop over ``range(W)`` becomes vector instructions.  Symbols, for a band with the carrier e^(j phi):
+A band's numbers are lanes of a *tile*: every field of a tile is `W` bands wide, so that `hapticrender.vectors` works
+on eight bands at a time.  Symbols, for a band with the carrier e^(j phi):
 
     r        reference envelope R as the sensors show it; target: the same in the device's unit
     e        error envelope E, estimated minus reference         v        integral part v of the command V = R + v
@@ -15,10 +15,12 @@ from __future__ import annotations
 
 import numba
 import numpy as np
+from numba import carray
 
+from hapticrender.jit import F8, kernel, pointer, record
 from hapticrender.protocols import Array
+from hapticrender.vectors import W
 
-W = 8  # bands a tile
 MOST_SENSORS = MOST_CHANNELS = 8
 MOST_TAPS = 16
 FIXED, FADING, LOCKED = range(3)  # modes of a tile: nothing changes; its targets do; its carriers follow the finger
@@ -34,39 +36,30 @@ TILE_FIELDS = [
     "frequency",  # Hz, the fixed part
     "wavenumber",  # 1/m
     "phase",  # turns
-    *_complex("setpoint", "response"),  # setpoint; what the sensor shows per target
+    *_complex("setpoint", "response"),  # target that is asked for; what the sensor shows per target
     "turns",  # fixed part of the phase; of fixed carriers at the next refresh
-    *("cos", "sin"),  # the carrier at the sample, or at the block's start
-    *("turn_cos", "turn_sin"),  # its turn a sample
+    *_complex("carrier"),  # e^(j phi) at the sample, or at the block's start without the finger's part
+    *_complex("turn"),  # of the carrier a sample
     "omega",  # rad/s
     "sweep",  # rad/s^2
-    "fade",  # 0..1: how far its target has faded in
-    "weight",  # 0..1: weight of the target
+    "fade",  # 0..1: how far the target has faded in
+    "weight",  # 0..1, of the target
     "feedback",  # 0..1: weight of the feedback
-    *_complex(
-        "target", "r", "expected", "slope", "raw"
-    ),  # expected: R in the block's middle; raw: envelope of the waveform
+    *_complex("target", "r", "slope"),  # target; reference R and its slope
+    *_complex("expected", "raw"),  # R in the block's middle; envelope of the waveform
     *_complex("ahead"),  # rho: the turn by delay and hold
     *_complex("remainder"),  # stiffness of the finger beyond its three numbers
-    # adaptation: the finger's force, R and omega, delayed and filtered like the observer
-    *_complex("finger_force", "filtered_r"),
-    *("filtered_omega", "complete"),
-    *_complex("contact_motion", "residual"),  # adaptation: motion at the finger, force that the finger takes
+    *_complex("finger_force", "filtered_r"),  # adaptation: the finger's force, R and omega, delayed and filtered like
+    *("filtered_omega", "complete"),  # the observer; share of a carrier's own history in them
     *("amount", "sounds", "direction"),  # polar law: |R|, whether that is no silence, sign of the carrier's frequency
     *_complex("heading"),  # R/|R|, the last one in silence
-    # of each coordinate: slope0 is dV/dt; fast, slow the detectors' low passes; work, rise: what a block sums up, and
-    # its rise over the block; last_force, force: envelopes at the end of the last block and of this one; command,
-    # filtered (command), last (deviation): see `adaptation`
-    *_complex(
-        *(
-            f"{n}{i}"
-            for i in (0, 1)
-            for n in "e v slope fast slow work rise last_force force command filtered last".split()
-        )
-    ),
-    *_complex("command_force"),  # the finger's part of the force
-    *_complex(*(f"{n}{i}{j}" for i in (0, 1) for j in (0, 1) for n in "ds")),  # the law, to and from a coordinate
+    # of each coordinate: error and integral envelopes, dV/dt; low passes of the detectors; force envelopes at the end
+    # of the last block and of this one; command and deviation, see `adaptation`
+    *_complex(*(f"{name}{i}" for i in (0, 1) for name in "e v slope fast slow last_force force filtered last".split())),
+    *_complex(*(f"{name}{i}{j}" for i in (0, 1) for j in (0, 1) for name in "ds")),  # D and D' of the law
 ]
+WORK_FIELDS = _complex(*(f"{name}{i}" for i in (0, 1) for name in ("x", "rise", "y", "up")))
+"""Of a tile in a block: envelopes of both coordinates and their rises over the block; the same turned to a group."""
 LOW_PASS_FIELDS = [
     *_complex("x", "low1", "low2", "law1", "law2", "v", "slope"),
     *("drive", "lag", "amplitude", "theta"),
@@ -74,7 +67,7 @@ LOW_PASS_FIELDS = [
 """Of a tile in a coordinate of a method with low passes: envelope X; states of low pass and loop controller, of which
 the polar law has amplitude (re) and phase (im); V and dV/dt; drive per metre and lag (rad) of the free device;
 amplitude and phase (rad), of X and then commanded."""
-COMMAND_FIELDS = _complex("command0", "command1", "command_force")
+COMMAND_FIELDS = _complex("command0", "command1", "force")
 
 
 def _record(names: list[str]) -> np.dtype:
@@ -82,8 +75,8 @@ def _record(names: list[str]) -> np.dtype:
 
 
 TILE = np.dtype([("mode", np.int64, (8,)), *((name, np.float64, (W,)) for name in TILE_FIELDS)])
-LOW_PASS, COMMAND = _record(LOW_PASS_FIELDS), _record(COMMAND_FIELDS)
-"""Commands are ordered [step, tile]."""
+LOW_PASS, COMMAND, WORK, PAIR = map(_record, (LOW_PASS_FIELDS, COMMAND_FIELDS, WORK_FIELDS, _complex("z")))
+"""Commands are ordered [step, tile]; a pair is a complex number for each band of a tile."""
 
 _SETTINGS = """
 rate lead reference middle extrapolation fade_in lowest highest highest_edge modulated differentiated analysed
@@ -107,14 +100,17 @@ SETTINGS = np.dtype(
         ("drive_from_force", np.float64, (MOST_CHANNELS, 2)),
         ("low_pass", np.float64, (5,)),
         ("loop", np.float64, (5,)),
-        *((name, np.int64) for name in ("coordinates", "block", "sensors", "channels", "n_taps", "window", "table")),
+        *(
+            (name, np.int64)
+            for name in ("coordinates", "block", "group", "sensors", "channels", "n_taps", "window", "table")
+        ),
     ]
 )
 """Settings of a controller, as its design derived them; `hapticrender.control.controller` says what each is."""
 
 _STATE = """
 held_position smooth_position velocity acceleration finger_seen fresh speed table_velocity
-load lever contact known_contact known_lever finger_mass finger_damping finger_stiffness
+load lever contact law_contact law_lever finger_mass finger_damping finger_stiffness
 fast_timer slow_timer fast_open slow_open peak scale confidence shift unlocked response_gain
 gain damping_gain quick idle
 """.split()
@@ -134,7 +130,8 @@ CONTROLLER = np.dtype(
                 "commands_at",
                 "setpoints_at",
                 "work_at",
-                "tables_at",
+                "table_at",
+                "phasors_at",
                 "samples_at",
                 "window_at",
                 "gains_at",
@@ -143,7 +140,21 @@ CONTROLLER = np.dtype(
     ]
 )
 """Settings and state of a controller, and the addresses of its arrays."""
-CONTROLLER_T, TILE_T, LOW_PASS_T, COMMAND_T = map(numba.from_dtype, (CONTROLLER, TILE, LOW_PASS, COMMAND))
+CONTROLLER_T, TILE_T, LOW_PASS_T = map(numba.from_dtype, (CONTROLLER, TILE, LOW_PASS))
+COMMAND_T, WORK_T, PAIR_T = map(numba.from_dtype, (COMMAND, WORK, PAIR))
+
+# rows of the samples' work array (rows, M): coordinates, then innovations; sums over the bands and their steps; finger
+# position; waveform; response r, first columns of Q for the innovation and for the waveform; what was solved; sums and
+# differences of samples at equal distances from a group's middle, of two rows
+Y, SUM, STEP, POSITION, WAVEFORM, RESPONSE, INVERSE, ANALYSIS, SOLVED, FOLDED = 0, 2, 4, 6, 7, 8, 9, 10, 11, 12
+SAMPLE_ROWS = 16
+
+
+@kernel
+def samples_of(controller):
+    """Work array of the samples, shape (rows, M)."""
+    c = record(controller, CONTROLLER_T, 0)
+    return carray(pointer(c.samples_at, F8), (SAMPLE_ROWS, c.p.block))
 
 
 def aligned(shape: int | tuple[int, ...], dtype: type | np.dtype = np.float64) -> Array:

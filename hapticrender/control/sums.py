@@ -1,133 +1,125 @@
-"""Sums over bands and samples in blocks: carriers in tables, several samples or bands for each load.
+"""Sums over bands and samples in blocks, in groups of samples about whose middle carriers turn symmetrically.
 
-A block's carriers relative to its start lie in two tables, sample by sample (for sums over bands) and band by band
-(for sums over samples), so that both are plain reductions along the last axis, which vectorise.
+In a group of g samples with its middle at s, the carriers of samples s - d and s + d are z_s conj(z_d) and z_s z_d, so
+that with y = x z_s::
+
+    Re(x z[s +- d]) = Re y cos(w d) -+ Im y sin(w d)
+
+and one pair of products serves two samples.  `table` holds z_d for the pairs, `phasors` z_s for the groups; where a
+carrier follows the finger, z_s has the finger's mean position in the group, and z_d its mean velocity in the block.
 """
 
 from __future__ import annotations
 
-from numba import carray
-
-from hapticrender.control.records import CONTROLLER_T, LOCKED, TILE_T, W
-from hapticrender.jit import F8, kernel, pointer, record
-from hapticrender.mathx import sincos_turns
-
-# rows of the samples' work array (rows, M): coordinates, then innovations; sums over the bands and their steps; finger
-# position; waveform; response r, first columns of Q for the innovation and for the waveform; what was solved
-Y, SUM, STEP, POSITION, WAVEFORM, RESPONSE, INVERSE, ANALYSIS, SOLVED = 0, 2, 4, 6, 7, 8, 9, 10, 11
-SAMPLE_ROWS = 12
-
-
-@kernel
-def samples_of(controller):
-    """Work array of the samples, shape (rows, M)."""
-    c = record(controller, CONTROLLER_T, 0)
-    return carray(pointer(c.samples_at, F8), (SAMPLE_ROWS, c.p.block))
-
-
-@kernel
-def envelopes_of(controller):
-    """Work array of two envelopes of every band, re, im, re, im, and of their rises over the block; shape (8, K)."""
-    c = record(controller, CONTROLLER_T, 0)
-    return carray(pointer(c.work_at, F8), (8, c.tiles * W))
-
-
-@kernel
-def by_sample(controller):
-    """Table of the carriers' cosines and sines for sums over bands, shape (M, 2, K)."""
-    c = record(controller, CONTROLLER_T, 0)
-    return carray(pointer(c.tables_at, F8), (c.p.block, 2, c.tiles * W))
-
-
-@kernel
-def by_band(controller):
-    """Table of the carriers' cosines and sines for sums over samples, shape (K, 2, M)."""
-    c = record(controller, CONTROLLER_T, 0)
-    size = 8 * 2 * c.p.block * c.tiles * W
-    return carray(pointer(c.tables_at + size, F8), (c.tiles * W, 2, c.p.block))
-
-
-@kernel
-def gather(controller, t):
-    """Copy the held envelopes of a tile, and their rises over the block, into the rows of `w`."""
-    c = record(controller, CONTROLLER_T, 0)
-    w, b, at = envelopes_of(controller), record(c.tiles_at, TILE_T, t), t * W
-    for k in range(W):
-        w[0, at + k], w[1, at + k] = b.work0_re[k], b.work0_im[k]
-        w[2, at + k], w[3, at + k] = b.work1_re[k], b.work1_im[k]
-        w[4, at + k], w[5, at + k] = b.rise0_re[k], b.rise0_im[k]
-        w[6, at + k], w[7, at + k] = b.rise1_re[k], b.rise1_im[k]
-
-
-@kernel
-def scatter(controller, t):
-    """Copy four rows of `w` into the held envelopes of a tile."""
-    c = record(controller, CONTROLLER_T, 0)
-    w, b, at = envelopes_of(controller), record(c.tiles_at, TILE_T, t), t * W
-    for k in range(W):
-        b.work0_re[k], b.work0_im[k] = w[0, at + k], w[1, at + k]
-        b.work1_re[k], b.work1_im[k] = w[2, at + k], w[3, at + k]
-
-
-@kernel
-def sum_bands(controller):
-    """Sum Re(x e^(j w m)) over the bands for two envelopes x that rise linearly over the block; into the rows SUM."""
-    c = record(controller, CONTROLLER_T, 0)
-    w, tables, samples, last = envelopes_of(controller), by_sample(controller), samples_of(controller), c.p.block - 1
-    re0, im0, re1, im1, up0, on0, up1, on1 = w[0], w[1], w[2], w[3], w[4], w[5], w[6], w[7]
-    for m in range(0, c.p.block, 2):
-        n = min(m + 1, last)
-        cos, sin, cos_n, sin_n = tables[m, 0], tables[m, 1], tables[n, 0], tables[n, 1]
-        a0 = a1 = b0 = b1 = 0.0
-        share, share_n = (m + 1.0) / c.p.block, (n + 1.0) / c.p.block
-        for k in range(c.tiles * W):
-            x, y, u, v, dx, dy, du, dv = re0[k], im0[k], re1[k], im1[k], up0[k], on0[k], up1[k], on1[k]
-            a0 += (x + share * dx) * cos[k] - (y + share * dy) * sin[k]
-            b0 += (u + share * du) * cos[k] - (v + share * dv) * sin[k]
-            a1 += (x + share_n * dx) * cos_n[k] - (y + share_n * dy) * sin_n[k]
-            b1 += (u + share_n * du) * cos_n[k] - (v + share_n * dv) * sin_n[k]
-        samples[SUM, m], samples[SUM, n], samples[SUM + 1, m], samples[SUM + 1, n] = a0, a1, b0, b1
-
-
-@kernel
-def correlate(controller, row):
-    """Sums over the block of two rows of `samples` times cosine and sine of every band, two bands a pass."""
-    c = record(controller, CONTROLLER_T, 0)
-    w, tables, samples = envelopes_of(controller), by_band(controller), samples_of(controller)
-    x, y = samples[row], samples[row + 1]
-    for k in range(0, c.tiles * W, 2):
-        cos, sin, cos_n, sin_n = tables[k, 0], tables[k, 1], tables[k + 1, 0], tables[k + 1, 1]
-        a0 = a1 = a2 = a3 = b0 = b1 = b2 = b3 = 0.0
-        for m in range(c.p.block):
-            e, f = x[m], y[m]
-            a0 += e * cos[m]
-            a1 += e * sin[m]
-            a2 += f * cos[m]
-            a3 += f * sin[m]
-            b0 += e * cos_n[m]
-            b1 += e * sin_n[m]
-            b2 += f * cos_n[m]
-            b3 += f * sin_n[m]
-        w[0, k], w[1, k], w[2, k], w[3, k] = a0, a1, a2, a3
-        w[0, k + 1], w[1, k + 1], w[2, k + 1], w[3, k + 1] = b0, b1, b2, b3
+from hapticrender.control.carriers import FASTEST
+from hapticrender.control.records import (
+    ANALYSIS,
+    CONTROLLER_T,
+    FOLDED,
+    INVERSE,
+    LOCKED,
+    PAIR_T,
+    POSITION,
+    RESPONSE,
+    SOLVED,
+    SUM,
+    TILE_T,
+    WORK_T,
+    samples_of,
+)
+from hapticrender.jit import kernel, record
+from hapticrender.vectors import conj, get, pair, put, total, unit, zeros
 
 
 @kernel
 def turn_tables(controller):
-    """Fill the tables of the carriers relative to the block's start, with the finger's positions in `samples`."""
+    """Fill table and phasors of the carriers relative to the block's start, with the positions in `samples`."""
     c = record(controller, CONTROLLER_T, 0)
-    over_bands, over_samples, samples = by_sample(controller), by_band(controller), samples_of(controller)
+    p, samples, group = c.p, samples_of(controller), c.p.group
+    middle, pairs = 0.5 * (group - 1), (group + 1) // 2
+    speed = (samples[POSITION, p.block - 1] - samples[POSITION, 0]) / max(p.block - 1, 1)
+    speed = speed if abs(speed) * p.rate <= FASTEST else 0.0
     for t in range(c.tiles):
         b = record(c.tiles_at, TILE_T, t)
         if b.mode[0] != LOCKED and c.stale == 0:
             continue
-        for m in range(c.p.block):
-            place = samples[POSITION, m]
-            for k in range(W):
-                sin, cos = sincos_turns(b.frequency[k] / c.p.rate * m + b.wavenumber[k] * place)
-                i = t * W + k
-                over_bands[m, 0, i], over_bands[m, 1, i] = cos, sin
-                over_samples[i, 0, m], over_samples[i, 1, m] = cos, sin
+        frequency, wavenumber = get(b, "frequency") / p.rate, get(b, "wavenumber")
+        for i in range(pairs):
+            distance = middle - (pairs - 1 - i)
+            put(record(c.table_at, PAIR_T, i * c.tiles + t), "z", unit((frequency + speed * wavenumber) * distance))
+        for q in range(p.block // group):
+            place = 0.0
+            for m in range(q * group, (q + 1) * group):
+                place += samples[POSITION, m] / group
+            turns = frequency * (q * group + middle) + place * wavenumber
+            put(record(c.phasors_at, PAIR_T, q * c.tiles + t), "z", unit(turns))
+
+
+@kernel
+def sum_bands(controller, rising):
+    """Sum Re(x z[m]) over the bands for two envelopes x, which rise linearly over the block; into the rows SUM."""
+    c = record(controller, CONTROLLER_T, 0)
+    samples, group, block, tiles = samples_of(controller), c.p.group, c.p.block, c.tiles
+    middle, pairs = 0.5 * (group - 1), (group + 1) // 2
+    for q in range(block // group):
+        share = (q * group + middle + 1.0) / block
+        for t in range(tiles):
+            w, z = record(c.work_at, WORK_T, t), get(record(c.phasors_at, PAIR_T, q * tiles + t), "z")
+            x0, x1 = get(w, "x0"), get(w, "x1")
+            if rising:
+                rise0, rise1 = get(w, "rise0"), get(w, "rise1")
+                x0, x1 = x0 + share * rise0, x1 + share * rise1
+                put(w, "up0", rise0 * z * (1.0 / block))
+                put(w, "up1", rise1 * z * (1.0 / block))
+            put(w, "y0", x0 * z)
+            put(w, "y1", x1 * z)
+        for i in range(pairs):
+            even0, odd0, even1, odd1 = zeros(), zeros(), zeros(), zeros()
+            up_even0, up_odd0, up_even1, up_odd1 = zeros(), zeros(), zeros(), zeros()
+            for t in range(tiles):
+                w, z = record(c.work_at, WORK_T, t), get(record(c.table_at, PAIR_T, i * tiles + t), "z")
+                y0, y1 = get(w, "y0"), get(w, "y1")
+                even0, odd0 = even0 + y0.real * z.real, odd0 + y0.imag * z.imag
+                even1, odd1 = even1 + y1.real * z.real, odd1 + y1.imag * z.imag
+                if rising:
+                    up0, up1 = get(w, "up0"), get(w, "up1")
+                    up_even0, up_odd0 = up_even0 + up0.real * z.real, up_odd0 + up0.imag * z.imag
+                    up_even1, up_odd1 = up_even1 + up1.real * z.real, up_odd1 + up1.imag * z.imag
+            distance = middle - (pairs - 1 - i)
+            early, late = q * group + pairs - 1 - i, q * group + group - pairs + i
+            samples[SUM, early] = total(even0 + odd0 - distance * (up_even0 + up_odd0))
+            samples[SUM, late] = total(even0 - odd0 + distance * (up_even0 - up_odd0))
+            samples[SUM + 1, early] = total(even1 + odd1 - distance * (up_even1 + up_odd1))
+            samples[SUM + 1, late] = total(even1 - odd1 + distance * (up_even1 - up_odd1))
+
+
+@kernel
+def correlate(controller, row):
+    """Sums over the block of two rows of `samples` times z[m] of every band, into the envelopes x."""
+    c = record(controller, CONTROLLER_T, 0)
+    samples, group, tiles = samples_of(controller), c.p.group, c.tiles
+    pairs = (group + 1) // 2
+    for start in range(0, c.p.block, group):
+        for i in range(pairs):
+            early, late = start + pairs - 1 - i, start + group - pairs + i
+            twice = 0.5 if early == late else 1.0  # the middle of an odd group
+            for k in range(2):
+                one, other = samples[row + k, early], samples[row + k, late]
+                samples[FOLDED + 2 * k, start + i] = twice * (other + one)
+                samples[FOLDED + 2 * k + 1, start + i] = twice * (other - one)
+    for t in range(tiles):
+        x0 = x1 = pair(zeros(), zeros())
+        for q in range(c.p.block // group):
+            even0, odd0, even1, odd1 = zeros(), zeros(), zeros(), zeros()
+            for i in range(pairs):
+                z, m = get(record(c.table_at, PAIR_T, i * tiles + t), "z"), q * group + i
+                even0, odd0 = even0 + samples[FOLDED, m] * z.real, odd0 + samples[FOLDED + 1, m] * z.imag
+                even1, odd1 = even1 + samples[FOLDED + 2, m] * z.real, odd1 + samples[FOLDED + 3, m] * z.imag
+            z = get(record(c.phasors_at, PAIR_T, q * tiles + t), "z")
+            x0, x1 = x0 + pair(even0, odd0) * z, x1 + pair(even1, odd1) * z
+        w = record(c.work_at, WORK_T, t)
+        put(w, "x0", x0)
+        put(w, "x1", x1)
 
 
 @kernel
@@ -137,15 +129,16 @@ def invert(controller, g):
     L[m, j] = g_dc + (m - j - 1) g_drift + g r[m - j] for m > j.
     """
     c = record(controller, CONTROLLER_T, 0)
-    w, tables, samples = envelopes_of(controller), by_sample(controller), samples_of(controller)
-    block, p = c.p.block, c.p
+    samples, block, p = samples_of(controller), c.p.block, c.p
+    last = (p.group + 1) // 2 - 1
     for t in range(c.tiles):
-        b, at = record(c.tiles_at, TILE_T, t), t * W
-        for k in range(W):  # relative to the block's first sample
-            w[0, at + k], w[1, at + k] = b.feedback[k] * tables[0, 0, at + k], -b.feedback[k] * tables[0, 1, at + k]
-            for row in range(2, 8):
-                w[row, at + k] = 0.0
-    sum_bands(controller)
+        w, b = record(c.work_at, WORK_T, t), record(c.tiles_at, TILE_T, t)
+        first = get(record(c.phasors_at, PAIR_T, t), "z") * conj(
+            get(record(c.table_at, PAIR_T, last * c.tiles + t), "z")
+        )
+        put(w, "x0", get(b, "feedback") * conj(first))  # relative to the block's first sample
+        put(w, "x1", 0.0)
+    sum_bands(controller, False)
     for m in range(block):
         samples[RESPONSE, m] = samples[SUM, m]
     for row in range(INVERSE, ANALYSIS + 1):
