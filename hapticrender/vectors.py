@@ -24,7 +24,7 @@ from numba.extending import (
 )
 
 from hapticrender.jit import kernel
-from hapticrender.mathx import COS, SIN
+from hapticrender.mathx import ATAN, CHORD, COS, EIGHTH, LEAST, SIN, TURN
 
 W = 8  # bands a vector
 DOUBLE, INDEX = ir.DoubleType(), ir.IntType(32)
@@ -361,3 +361,23 @@ def smooth(x):
     """Third-order step from 0 to 1 over 0..1: x^2 (3 - 2 x)."""
     x = minimum(maximum(x, 0.0), 1.0)
     return x * x * (3.0 - 2.0 * x)
+
+
+@kernel
+def polar(z):
+    """Magnitude of a complex vector and its angle (rad), above -3/2 pi up to pi/2.
+
+    An octant, turned back by half of it, leaves |t| <= tan(pi/8) to the polynomials.
+    """
+    re = z.real + LEAST
+    x, y = magnitude(re), magnitude(z.imag)
+    larger, smaller = maximum(x, y), minimum(x, y)
+    base = larger + EIGHTH * smaller
+    t = (smaller - EIGHTH * larger) / base
+    u = t * t
+    size = CHORD[0] + u * (CHORD[1] + u * (CHORD[2] + u * (CHORD[3] + u * (CHORD[4] + u * CHORD[5]))))
+    angle = ATAN[0] + u * (ATAN[1] + u * (ATAN[2] + u * (ATAN[3] + u * (ATAN[4] + u * ATAN[5]))))
+    angle = TURN / 16.0 + t * angle
+    angle = where(y > x, 0.25 * TURN - angle, angle)
+    angle = where(z.imag < 0.0, -1.0 * angle, angle)
+    return base * size, where(re < 0.0, -0.5 * TURN - angle, angle)

@@ -25,52 +25,64 @@ from hapticrender.control.carriers import advance_carriers, update_targets
 from hapticrender.control.kernel import FORGET, analyse_sample, sense_block, update_confidence
 from hapticrender.control.laws import turn_ahead
 from hapticrender.control.limiter import SATURATED, drive_of
-from hapticrender.control.records import CONTROLLER_T, FIXED, LOCKED, LOW_PASS_T, SUM, TILE_T, W, Y, samples_of
+from hapticrender.control.records import (
+    CONTROLLER_T,
+    FIXED,
+    LOCKED,
+    LOW_PASS_T,
+    PAIR_T,
+    SUM,
+    TILE_T,
+    W,
+    Y,
+    samples_of,
+)
 from hapticrender.jit import F8, I8, SIGNALS_T, kernel, pointer, record, step
-from hapticrender.mathx import TURN, polar, sincos_turns
+from hapticrender.mathx import TURN
+from hapticrender.vectors import (
+    conj,
+    get,
+    magnitude,
+    maximum,
+    pair,
+    polar,
+    put,
+    sqrt,
+    square,
+    total,
+    unit,
+    where,
+    zeros,
+)
 
 SILENCE = 1e-12  # m: the phase of a smaller target means nothing
-TABLE_POLE = (
-    TURN * 40.0
-)  # rad/s: of the velocity at which the table is looked up; the tracker's overshoots at a reversal
+TABLE_POLE = TURN * 40.0  # rad/s: of the velocity by which the table is read; the tracker's overshoots at a reversal
 
 
 @kernel
-def low_pass(controller, t, i, y):
-    """Update the envelopes of a tile in coordinate i: a second-order section, transposed direct form II."""
-    c = record(controller, CONTROLLER_T, 0)
-    b, x = record(c.tiles_at, TILE_T, t), record(c.loops_at, LOW_PASS_T, i * c.tiles + t)
-    b0, b1, b2 = 2.0 * y * c.p.low_pass[0], 2.0 * y * c.p.low_pass[1], 2.0 * y * c.p.low_pass[2]
-    a1, a2 = c.p.low_pass[3], c.p.low_pass[4]
-    for k in range(W):
-        cos, sin = b.carrier_re[k], -b.carrier_im[k]
-        re, im = b0 * cos + x.low1_re[k], b0 * sin + x.low1_im[k]
-        x.low1_re[k] = b1 * cos - a1 * re + x.low2_re[k]
-        x.low1_im[k] = b1 * sin - a1 * im + x.low2_im[k]
-        x.low2_re[k], x.low2_im[k] = b2 * cos - a2 * re, b2 * sin - a2 * im
-        x.x_re[k], x.x_im[k] = re, im
+def estimate(controller, t, i, y):
+    """Update the envelopes X of a tile in coordinate i; returns them.
 
-
-@kernel
-def window_mean(controller, t, i, y):
-    """Update the envelopes of a tile in coordinate i: the mean over a window, its sum renewed against rounding.
-
-    `low1` is the running sum, `low2` one from the window's first place on, which replaces it once a window.
+    The low pass is a second-order section in transposed direct form II.  The mean over a window has a running sum,
+    `low1`, which one from the window's first place on, `low2`, replaces once a window against rounding.
     """
     c = record(controller, CONTROLLER_T, 0)
-    b, x = record(c.tiles_at, TILE_T, t), record(c.loops_at, LOW_PASS_T, i * c.tiles + t)
-    length, place = c.p.window, c.sample % c.p.window
-    window = carray(pointer(c.window_at, F8), (length, c.p.coordinates * c.tiles, 2, W))[place, i * c.tiles + t]
-    last, share, twice = place == length - 1, 1.0 / length, 2.0 * y
-    for k in range(W):
-        re, im = twice * b.carrier_re[k], -twice * b.carrier_im[k]
-        fresh_re, fresh_im = x.low2_re[k] + re, x.low2_im[k] + im
-        sum_re = fresh_re if last else x.low1_re[k] + (re - window[0, k])
-        sum_im = fresh_im if last else x.low1_im[k] + (im - window[1, k])
-        window[0, k], window[1, k] = re, im
-        x.low1_re[k], x.low1_im[k] = sum_re, sum_im
-        x.low2_re[k], x.low2_im[k] = (0.0 if last else fresh_re), (0.0 if last else fresh_im)
-        x.x_re[k], x.x_im[k] = share * sum_re, share * sum_im
+    x, p = record(c.loops_at, LOW_PASS_T, i * c.tiles + t), c.p
+    found, low2 = 2.0 * y * conj(get(record(c.tiles_at, TILE_T, t), "carrier")), get(x, "low2")
+    if p.window > 0:
+        place = c.sample % p.window
+        entry = record(c.window_at, PAIR_T, (place * p.coordinates + i) * c.tiles + t)
+        renewed, running = low2 + found, get(x, "low1") + (found - get(entry, "z"))
+        put(entry, "z", found)
+        if place == p.window - 1:
+            running, renewed = renewed, 0.0 * renewed
+        put(x, "low1", running)
+        put(x, "low2", renewed)
+        return (1.0 / p.window) * running
+    envelope = p.low_pass[0] * found + get(x, "low1")
+    put(x, "low1", p.low_pass[1] * found - p.low_pass[3] * envelope + low2)
+    put(x, "low2", p.low_pass[2] * found - p.low_pass[4] * envelope)
+    return envelope
 
 
 @kernel
@@ -104,185 +116,123 @@ def smooth_velocity(controller, seen, held):
 
 
 @kernel
-def aim(controller, t):
+def set_heading(controller, t):
     """Set amplitude and direction of the reference of a tile; in silence the last direction stays."""
     c = record(controller, CONTROLLER_T, 0)
     b = record(c.tiles_at, TILE_T, t)
-    for k in range(W):
-        re, im, w = b.r_re[k], b.r_im[k], b.omega[k]
-        amount = math.sqrt(re * re + im * im)
-        sounds = amount > SILENCE
-        per = 1.0 / (amount if sounds else 1.0)
-        b.amount[k], b.sounds[k] = amount, (1.0 if sounds else 0.0)
-        b.heading_re[k] = re * per if sounds else b.heading_re[k]
-        b.heading_im[k] = im * per if sounds else b.heading_im[k]
-        b.direction[k] = math.copysign(1.0, w) if w != 0.0 else b.direction[k]
+    reference, omega = get(b, "r"), get(b, "omega")
+    amount = sqrt(square(reference))
+    sounds = amount > SILENCE
+    put(b, "amount", amount)
+    put(b, "sounds", where(sounds, 1.0, 0.0))
+    put(b, "heading", where(sounds, reference / maximum(amount, SILENCE), get(b, "heading")))
+    put(b, "direction", where(omega > 0.0, 1.0, where(omega < 0.0, -1.0, get(b, "direction"))))
 
 
 @kernel
-def compare(controller, t, i):
-    """Set amplitude and phase error of the envelopes of a tile, in `amplitude` and `theta`."""
+def loop_controller(controller, x, error, floor):
+    """Output of the loop controller C, a second-order section; its real part is kept above a floor."""
+    p = record(controller, CONTROLLER_T, 0).p
+    out = p.loop[0] * error + get(x, "law1")
+    out = pair(maximum(out.real, floor), out.imag)
+    put(x, "law1", p.loop[1] * error - p.loop[3] * out + get(x, "law2"))
+    put(x, "law2", p.loop[2] * error - p.loop[4] * out)
+    return out
+
+
+@kernel
+def polar_loops(controller, t, i, envelope):
+    """Command (amplitude, phase) of a tile in coordinate i from the errors of amplitude and phase."""
     c = record(controller, CONTROLLER_T, 0)
     b, x = record(c.tiles_at, TILE_T, t), record(c.loops_at, LOW_PASS_T, i * c.tiles + t)
+    heading, direction = get(b, "heading"), get(b, "direction")
     if c.p.subtracted > 0.0:  # each angle with a seam of its own
-        for k in range(W):
-            size, angle = polar(x.x_re[k], b.direction[k] * x.x_im[k])
-            _, aimed = polar(b.heading_re[k], b.direction[k] * b.heading_im[k])
-            x.amplitude[k], x.theta[k] = size, angle - aimed
-        return
-    for k in range(W):
-        re, im, hr, hi = x.x_re[k], x.x_im[k], b.heading_re[k], b.heading_im[k]
-        x.amplitude[k], x.theta[k] = polar(re * hr + im * hi, b.direction[k] * (im * hr - re * hi))
-
-
-@kernel
-def polar_loops(controller, t, i):
-    """Update commanded amplitude and phase of a tile in coordinate i from their errors."""
-    c = record(controller, CONTROLLER_T, 0)
-    b, x = record(c.tiles_at, TILE_T, t), record(c.loops_at, LOW_PASS_T, i * c.tiles + t)
-    b0, b1, b2, a1, a2 = c.p.loop[0], c.p.loop[1], c.p.loop[2], c.p.loop[3], c.p.loop[4]
-    floor = 0.0 if c.p.clamped > 0.0 else -math.inf
-    for k in range(W):
-        error, lag = b.amount[k] - x.amplitude[k], b.sounds[k] * x.theta[k]
-        command = b0 * error + x.law1_re[k]
-        command = command if command > floor else floor  # a negative one would be positive feedback
-        phase = b0 * lag + x.law1_im[k]
-        x.law1_re[k] = b1 * error - a1 * command + x.law2_re[k]
-        x.law1_im[k] = b1 * lag - a1 * phase + x.law2_im[k]
-        x.law2_re[k], x.law2_im[k] = b2 * error - a2 * command, b2 * lag - a2 * phase
-        x.amplitude[k], x.theta[k] = command, -phase
-
-
-@kernel
-def open_loop(controller, t, i):
-    """Set commanded amplitude and phase of a tile without feedback: the device's lag, delay and hold made up for."""
-    c = record(controller, CONTROLLER_T, 0)
-    b = record(c.tiles_at, TILE_T, t)
-    x, lead = record(c.loops_at, LOW_PASS_T, i * c.tiles + t), c.p.lead
-    for k in range(W):
-        x.amplitude[k], x.theta[k] = b.amount[k], lead * abs(b.omega[k]) - x.lag[k]
-
-
-@kernel
-def sum_drives(controller, t, i):
-    """Drive of a tile in coordinate i."""
-    c = record(controller, CONTROLLER_T, 0)
-    b = record(c.tiles_at, TILE_T, t)
-    x, total = record(c.loops_at, LOW_PASS_T, i * c.tiles + t), 0.0
-    for k in range(W):
-        sin, cos = sincos_turns(x.theta[k] / TURN)
-        along = b.heading_re[k] * b.carrier_re[k] - b.heading_im[k] * b.carrier_im[k]
-        across = b.heading_re[k] * b.carrier_im[k] + b.heading_im[k] * b.carrier_re[k]
-        total += x.drive[k] * x.amplitude[k] * (along * cos - b.direction[k] * across * sin)
-    return total
-
-
-@kernel
-def estimate(controller, t, i, y):
-    """Update the envelopes of a tile in coordinate i by the method's estimator."""
-    c = record(controller, CONTROLLER_T, 0)
-    if c.p.window > 0:
-        window_mean(controller, t, i, y)
+        size, angle = polar(pair(envelope.real, direction * envelope.imag))
+        _, aimed = polar(pair(heading.real, direction * heading.imag))
+        angle = angle - aimed
     else:
-        low_pass(controller, t, i, y)
+        turned = envelope * conj(heading)
+        size, angle = polar(pair(turned.real, direction * turned.imag))
+    # a negative amplitude would be positive feedback
+    floor = 0.0 if c.p.clamped > 0.0 else -math.inf
+    out = loop_controller(controller, x, pair(get(b, "amount") - size, get(b, "sounds") * angle), floor)
+    return out.real, -1.0 * out.imag
 
 
 @kernel
 def polar_law(controller):
-    """Drive of every coordinate by the polar law, into the rows SUM of `samples`."""
+    """Drive of every coordinate by the polar law, into the rows SUM of `samples`.
+
+    Without feedback the device's lag, delay and hold are made up for.
+    """
     c = record(controller, CONTROLLER_T, 0)
     samples = samples_of(controller)
     for i in range(c.p.coordinates):
-        samples[SUM + i, 0] = 0.0
-    for t in range(c.tiles):
-        b = record(c.tiles_at, TILE_T, t)
-        if c.stale > 0 or b.mode[0] == LOCKED:
-            look_up(controller, t)
-        if c.stale > 0 or b.mode[0] != FIXED:
-            aim(controller, t)
-        for i in range(c.p.coordinates):
+        drive = zeros()
+        for t in range(c.tiles):
+            b, x = record(c.tiles_at, TILE_T, t), record(c.loops_at, LOW_PASS_T, i * c.tiles + t)
+            if i == 0 and (c.stale > 0 or b.mode[0] == LOCKED):
+                look_up(controller, t)
+            if i == 0 and (c.stale > 0 or b.mode[0] != FIXED):
+                set_heading(controller, t)
             if c.p.feedback > 0.0:
-                estimate(controller, t, i, samples[Y + i, 0])
-                compare(controller, t, i)
-                polar_loops(controller, t, i)
+                amplitude, angle = polar_loops(controller, t, i, estimate(controller, t, i, samples[Y + i, 0]))
             else:
-                open_loop(controller, t, i)
-            samples[SUM + i, 0] += sum_drives(controller, t, i)
+                amplitude, angle = get(b, "amount"), c.p.lead * magnitude(get(b, "omega")) - get(x, "lag")
+            turn, wave = unit((1.0 / TURN) * angle), get(b, "heading") * get(b, "carrier")
+            wave = wave.real * turn.real - get(b, "direction") * wave.imag * turn.imag
+            drive = drive + get(x, "drive") * amplitude * wave
+        samples[SUM + i, 0] = total(drive)
     c.stale = 0
 
 
 @kernel
-def reference_motion(controller):
-    """Sum of the reference waveforms of all bands."""
-    c = record(controller, CONTROLLER_T, 0)
-    total = 0.0
-    for t in range(c.tiles):
-        b = record(c.tiles_at, TILE_T, t)
-        for k in range(W):
-            total += b.r_re[k] * b.carrier_re[k] - b.r_im[k] * b.carrier_im[k]
-    return total
-
-
-@kernel
-def complex_loops(controller, t, i):
+def complex_loops(controller, t, i, envelope):
     """Update V and dV/dt of a tile in coordinate i; without feedback V is the reference."""
     c = record(controller, CONTROLLER_T, 0)
-    b, x = record(c.tiles_at, TILE_T, t), record(c.loops_at, LOW_PASS_T, i * c.tiles + t)
-    b0, b1, b2, a1, a2 = c.p.loop[0], c.p.loop[1], c.p.loop[2], c.p.loop[3], c.p.loop[4]
-    rate, forward = c.p.rate, c.p.shape[i] * c.p.forward
-    against, on, fading = (0.0 if c.p.deviation > 0.0 else c.p.shape[i]), c.p.feedback, FORGET / c.p.rate
-    for k in range(W):
-        weight, rr, ri = b.weight[k], b.r_re[k], b.r_im[k]
-        keep, pull = 1.0 - fading * (1.0 - weight), on * weight
-        er, ei = pull * (against * rr - x.x_re[k]), pull * (against * ri - x.x_im[k])
-        re, im = b0 * er + x.law1_re[k], b0 * ei + x.law1_im[k]
-        x.law1_re[k] = keep * (b1 * er - a1 * re + x.law2_re[k])
-        x.law1_im[k] = keep * (b1 * ei - a1 * im + x.law2_im[k])
-        x.law2_re[k], x.law2_im[k] = keep * (b2 * er - a2 * re), keep * (b2 * ei - a2 * im)
-        re, im = re + forward * rr, im + forward * ri
-        x.slope_re[k], x.slope_im[k] = rate * (re - x.v_re[k]), rate * (im - x.v_im[k])
-        x.v_re[k], x.v_im[k] = re, im
-
-
-@kernel
-def device_force(controller, t, i, j):
-    """Force of a tile in coordinate i for V in coordinate j, through the free device's dynamic stiffness."""
-    c = record(controller, CONTROLLER_T, 0)
-    b, x, total = record(c.tiles_at, TILE_T, t), record(c.loops_at, LOW_PASS_T, j * c.tiles + t), 0.0
-    m, d, s, dynamic = c.p.mass[i, j], c.p.damping[i, j], c.p.stiffness[i, j], c.p.dynamic
-    for k in range(W):
-        w, vr, vi = b.omega[k], x.v_re[k], x.v_im[k]
-        sr, si = dynamic * x.slope_re[k], dynamic * x.slope_im[k]
-        along, across, turn = s - w * w * m, w * d + dynamic * b.sweep[k] * m, 2.0 * w * m
-        re = along * vr - across * vi + d * sr - turn * si
-        im = along * vi + across * vr + d * si + turn * sr
-        cos = b.ahead_re[k] * b.carrier_re[k] - b.ahead_im[k] * b.carrier_im[k]
-        sin = b.ahead_re[k] * b.carrier_im[k] + b.ahead_im[k] * b.carrier_re[k]
-        total += re * cos - im * sin
-    return total
+    b, x, p = record(c.tiles_at, TILE_T, t), record(c.loops_at, LOW_PASS_T, i * c.tiles + t), c.p
+    reference, weight = p.shape[i] * get(b, "r"), get(b, "weight")
+    against = 0.0 if p.deviation > 0.0 else 1.0
+    out = loop_controller(controller, x, p.feedback * weight * (against * reference - envelope), -math.inf)
+    keep = 1.0 - FORGET / p.rate * (1.0 - weight)
+    put(x, "law1", keep * get(x, "law1"))
+    put(x, "law2", keep * get(x, "law2"))
+    v = out + p.forward * reference
+    put(x, "slope", p.rate * (v - get(x, "v")))
+    put(x, "v", v)
 
 
 @kernel
 def complex_law(controller):
-    """Force of every coordinate by the complex law, into the rows SUM of `samples`."""
+    """Force of every coordinate by the complex law and the free device's D, into the rows SUM of `samples`."""
     c = record(controller, CONTROLLER_T, 0)
-    samples, n = samples_of(controller), c.p.coordinates
-    if c.p.deviation > 0.0:
-        total = reference_motion(controller)
+    samples, n, p = samples_of(controller), c.p.coordinates, c.p
+    if p.deviation > 0.0:
+        reference = zeros()
+        for t in range(c.tiles):
+            b = record(c.tiles_at, TILE_T, t)
+            reference = reference + (get(b, "r") * get(b, "carrier")).real
         for i in range(n):
-            samples[Y + i, 0] -= c.p.shape[i] * total
+            samples[Y + i, 0] -= p.shape[i] * total(reference)
     for i in range(n):
         samples[SUM + i, 0] = 0.0
     for t in range(c.tiles):
-        if c.stale > 0 or record(c.tiles_at, TILE_T, t).mode[0] == LOCKED:
+        b = record(c.tiles_at, TILE_T, t)
+        if c.stale > 0 or b.mode[0] == LOCKED:
             turn_ahead(controller, t)
         for i in range(n):
-            if c.p.feedback > 0.0:
-                estimate(controller, t, i, samples[Y + i, 0])
-            complex_loops(controller, t, i)
+            envelope = pair(zeros(), zeros())
+            if p.feedback > 0.0:
+                envelope = estimate(controller, t, i, samples[Y + i, 0])
+            complex_loops(controller, t, i, envelope)
+        omega, wave = get(b, "omega"), get(b, "ahead") * get(b, "carrier")
         for i in range(n):
             for j in range(n):
-                samples[SUM + i, 0] += device_force(controller, t, i, j)
+                x, mass, damping = record(c.loops_at, LOW_PASS_T, j * c.tiles + t), p.mass[i, j], p.damping[i, j]
+                across = damping * omega + p.dynamic * mass * get(b, "sweep")
+                force = pair(p.stiffness[i, j] - mass * omega * omega, across) * get(x, "v")
+                force = force + p.dynamic * pair(damping, 2.0 * mass * omega) * get(x, "slope")
+                samples[SUM + i, 0] += total((force * wave).real)
     c.stale = 0
 
 
@@ -290,14 +240,14 @@ def complex_law(controller):
 def reset_loops(controller):
     """Reset the loops: no confidence in the sensors is left.  A window keeps its samples, which leave it in time."""
     c = record(controller, CONTROLLER_T, 0)
-    keep = 1.0 if c.p.window > 0 else 0.0
     for i in range(c.p.coordinates * c.tiles):
         x = record(c.loops_at, LOW_PASS_T, i)
-        for k in range(W):
-            x.low1_re[k], x.low1_im[k] = keep * x.low1_re[k], keep * x.low1_im[k]
-            x.low2_re[k], x.low2_im[k] = keep * x.low2_re[k], keep * x.low2_im[k]
-            x.law1_re[k] = x.law1_im[k] = x.law2_re[k] = x.law2_im[k] = 0.0
-            x.v_re[k] = x.v_im[k] = 0.0
+        if c.p.window == 0:
+            put(x, "low1", 0.0)
+            put(x, "low2", 0.0)
+        put(x, "law1", 0.0)
+        put(x, "law2", 0.0)
+        put(x, "v", 0.0)
 
 
 @kernel

@@ -61,12 +61,11 @@ TILE_FIELDS = [
 WORK_FIELDS = _complex(*(f"{name}{i}" for i in (0, 1) for name in ("x", "rise", "y", "up")))
 """Of a tile in a block: envelopes of both coordinates and their rises over the block; the same turned to a group."""
 LOW_PASS_FIELDS = [
-    *_complex("x", "low1", "low2", "law1", "law2", "v", "slope"),
-    *("drive", "lag", "amplitude", "theta"),
+    *_complex("low1", "low2", "law1", "law2", "v", "slope"),
+    *("drive", "lag"),
 ]
-"""Of a tile in a coordinate of a method with low passes: envelope X; states of low pass and loop controller, of which
-the polar law has amplitude (re) and phase (im); V and dV/dt; drive per metre and lag (rad) of the free device;
-amplitude and phase (rad), of X and then commanded."""
+"""Of a tile in a coordinate of a method with low passes: states of low pass and loop controller, of which the polar
+law has amplitude (re) and phase (im); V and dV/dt; drive per metre and lag (rad) of the free device."""
 COMMAND_FIELDS = _complex("command0", "command1", "force")
 
 
