@@ -41,7 +41,15 @@ SIGNALS_T = numba.from_dtype(SIGNALS)
 
 
 def kernel(function: Callable[..., Any]) -> Any:
-    """Compile a function on its first call; the machine code is cached on disk where a place for it can be written."""
+    """Compile a function on its first call, as a part of the kernels and steps that call it."""
+    return numba.njit(function, **OPTIONS)
+
+
+def entry(function: Callable[..., Any]) -> Any:
+    """Compile a kernel that Python calls; the machine code is cached on disk where a place for it can be written.
+
+    A part is not: it lies in the code of all that call it, and storing each took a third of a cold start.
+    """
     try:
         return numba.njit(function, cache=True, **OPTIONS)
     except RuntimeError:  # neither the package nor the user's cache folder can be written
@@ -154,7 +162,7 @@ def addresses(**arrays: np.ndarray[Any, Any] | None) -> np.ndarray[Any, Any]:
     return record
 
 
-@kernel
+@entry
 def close_loop(plant, control, count, block):
     """Advance plant and controller in turns of `block` samples; each is (step, state, signals), as addresses."""
     for start in range(0, count, block):

@@ -8,6 +8,7 @@ import numpy as np
 
 from hapticrender.jit import kernel
 from hapticrender.protocols import Array
+from hapticrender.vectors import imag, magnitude, maximum, minimum, nearest, pair, real, where
 
 # design time: numpy and scipy
 
@@ -99,12 +100,6 @@ LEAST = 1e-150  # added to the real part: the angle of 0 is 0
 
 
 @kernel
-def round_to_integer(value):
-    """Nearest integer, as a float."""
-    return np.rint(value)
-
-
-@kernel
 def frac(turns):
     """Part of `turns` that is not a whole turn, within +-1/2."""
     return turns - np.rint(turns)
@@ -123,26 +118,39 @@ def sincos_turns(turns):
 
 
 @kernel
-def polar(re, im):
-    """Magnitude of re + j im and its angle (rad), above -3/2 pi up to pi/2.
+def unit(turns):
+    """e^(2 pi j turns) of a vector."""
+    x = turns - nearest(turns)
+    far = magnitude(x) > 0.25
+    x = where(far, where(x > 0.0, 0.5, -0.5) - x, x)
+    u = x * x
+    s = SIN[0] + u * (SIN[1] + u * (SIN[2] + u * (SIN[3] + u * (SIN[4] + u * (SIN[5] + u * (SIN[6] + u * SIN[7]))))))
+    c = COS[0] + u * (COS[1] + u * (COS[2] + u * (COS[3] + u * (COS[4] + u * (COS[5] + u * (COS[6] + u * COS[7]))))))
+    return pair(where(far, -1.0 * c, c), s * x)
+
+
+@kernel
+def polar(z):
+    """Magnitude of a complex vector and its angle (rad), above -3/2 pi up to pi/2.
 
     An octant, turned back by half of it, leaves |t| <= tan(pi/8) to the polynomials.
     """
-    re = re + LEAST
-    x, y = abs(re), abs(im)
-    larger, smaller = (y if y > x else x), (x if y > x else y)
+    re = real(z) + LEAST
+    x, y = magnitude(re), magnitude(imag(z))
+    larger, smaller = maximum(x, y), minimum(x, y)
     base = larger + EIGHTH * smaller
     t = (smaller - EIGHTH * larger) / base
     u = t * t
     size = CHORD[0] + u * (CHORD[1] + u * (CHORD[2] + u * (CHORD[3] + u * (CHORD[4] + u * CHORD[5]))))
     angle = ATAN[0] + u * (ATAN[1] + u * (ATAN[2] + u * (ATAN[3] + u * (ATAN[4] + u * ATAN[5]))))
     angle = TURN / 16.0 + t * angle
-    angle = math.copysign((0.25 * TURN - angle) if y > x else angle, im)
-    return base * size, ((-0.5 * TURN - angle) if re < 0.0 else angle)
+    angle = where(y > x, 0.25 * TURN - angle, angle)
+    angle = where(imag(z) < 0.0, -1.0 * angle, angle)
+    return base * size, where(re < 0.0, -0.5 * TURN - angle, angle)
 
 
 @kernel
-def smoothstep_kernel(x):
-    """Third-order step from 0 to 1 over 0..1: x^2 (3 - 2 x)."""
-    x = min(max(x, 0.0), 1.0)
+def smooth(x):
+    """Third-order step of a vector from 0 to 1 over 0..1: x^2 (3 - 2 x)."""
+    x = minimum(maximum(x, 0.0), 1.0)
     return x * x * (3.0 - 2.0 * x)

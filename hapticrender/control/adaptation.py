@@ -16,7 +16,7 @@ from __future__ import annotations
 from hapticrender.control.laws import contact_damping
 from hapticrender.control.records import COMMAND_T, CONTROLLER_T, TILE_T
 from hapticrender.jit import kernel, record
-from hapticrender.vectors import conj, get, maximum, pair, put, square, total, where, zeros
+from hapticrender.vectors import conj, get, imag, maximum, pair, put, real, square, total, where, zeros
 
 TURN_SAMPLES = 8  # samples of a step of adaptation, sample by sample
 COMPLETE = 0.9  # of a carrier's own history, from which on its band counts
@@ -157,9 +157,9 @@ def adapt_finger(controller, observer, damper):
         along = k0 - w2 * m0
         weight = counts * size2 / (along * along + p.damping[0, 0] * p.damping[0, 0] * w2 + 1e-300)
         scale = weight / (spring2 + mass2 * w2 * w2)
-        sum_k = sum_k + spring2 * scale * left.real
-        sum_m = sum_m + mass2 * w2 * scale * left.real
-        sum_b = sum_b + weight * left.imag * w / maximum(w2, 1e-18)  # w < 0 where the finger moves backwards
+        sum_k = sum_k + spring2 * scale * real(left)
+        sum_m = sum_m + mass2 * w2 * scale * real(left)
+        sum_b = sum_b + weight * imag(left) * w / maximum(w2, 1e-18)  # w < 0 where the finger moves backwards
         weights = weights + weight
         remainder = get(b, "remainder")
         put(b, "remainder", remainder + rest * (left - counts * remainder))

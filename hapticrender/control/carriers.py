@@ -11,9 +11,10 @@ from numba import carray
 
 from hapticrender.control.records import CONTROLLER_T, FADING, FIXED, LOCKED, TILE_T, WAVEFORM, W, samples_of
 from hapticrender.jit import C16, SIGNALS_T, kernel, pointer, record
-from hapticrender.mathx import TURN
+from hapticrender.mathx import TURN, smooth, unit
 from hapticrender.vectors import (
     get,
+    imag,
     load,
     magnitude,
     maximum,
@@ -21,10 +22,9 @@ from hapticrender.vectors import (
     nearest,
     pair,
     put,
-    smooth,
+    real,
     some,
     square,
-    unit,
     where,
 )
 
@@ -183,7 +183,7 @@ def update_targets(controller, signals, first):
         if b.mode[0] != FIXED:
             envelope = get(b, "raw") if p.analysed > 0.0 else factor * get(b, "setpoint")
             if p.differentiated > 0.0:
-                envelope = get(b, "omega") * pair(-1.0 * envelope.imag, envelope.real)
+                envelope = get(b, "omega") * pair(-1.0 * imag(envelope), real(envelope))
             target = get(b, "weight") * envelope
             if p.analysed > 0.0:
                 target = get(b, "target") + follow * (target - get(b, "target"))

@@ -42,7 +42,7 @@ from hapticrender.control.records import (
 )
 from hapticrender.control.sums import correlate, invert, solve, sum_bands, turn_tables
 from hapticrender.jit import F8, I8, SIGNALS_T, kernel, pointer, record, step
-from hapticrender.vectors import conj, get, maximum, pair, put, square, total, zeros
+from hapticrender.vectors import conj, get, imag, maximum, pair, put, real, square, total, zeros
 
 FORGET = 50.0  # 1/s: error and integral of a carrier that has faded out decay at this rate
 FADE_OUT = 0.02  # s: within this the drive fades out while a sensor's samples are implausible
@@ -100,7 +100,7 @@ def analyse_sample(controller):
     found = zeros()
     for t in range(c.tiles):
         b = record(c.tiles_at, TILE_T, t)
-        found = found + (get(b, "raw") * get(b, "carrier")).real
+        found = found + real(get(b, "raw") * get(b, "carrier"))
     gain = c.p.reference * crowding(controller) * (samples_of(controller)[WAVEFORM, 0] - total(found))
     for t in range(c.tiles):
         b = record(c.tiles_at, TILE_T, t)
@@ -135,10 +135,10 @@ def predict(controller):
     for t in range(c.tiles):
         b = record(c.tiles_at, TILE_T, t)
         carrier, expected, reference = get(b, "carrier"), get(b, "expected"), get(b, "r")
-        sum0 = sum0 + ((shape0 * expected + get(b, "e0")) * carrier).real
-        sum1 = sum1 + ((shape1 * expected + get(b, "e1")) * carrier).real
-        command0 = command0 + ((shape0 * reference + get(b, "v0")) * carrier).real
-        command1 = command1 + ((shape1 * reference + get(b, "v1")) * carrier).real
+        sum0 = sum0 + real((shape0 * expected + get(b, "e0")) * carrier)
+        sum1 = sum1 + real((shape1 * expected + get(b, "e1")) * carrier)
+        command0 = command0 + real((shape0 * reference + get(b, "v0")) * carrier)
+        command1 = command1 + real((shape1 * reference + get(b, "v1")) * carrier)
     return total(sum0), total(sum1), total(command0), total(command1)
 
 
@@ -274,7 +274,7 @@ def synthesise_block(controller):
             b, w = record(c.tiles_at, TILE_T, t), record(c.work_at, WORK_T, t)
             carrier, force0, force1 = get(b, "carrier"), get(b, "last_force0"), get(b, "last_force1")
             if quarter > 0:
-                carrier = pair(carrier.imag, -1.0 * carrier.real)
+                carrier = pair(imag(carrier), -1.0 * real(carrier))
             put(w, "x0", force0 * carrier)
             put(w, "x1", force1 * carrier)
             put(w, "rise0", (get(b, "force0") - force0) * carrier)

@@ -13,8 +13,8 @@ import math
 from hapticrender.control.carriers import SLOWEST
 from hapticrender.control.records import CONTROLLER_T, LOCKED, TILE_T
 from hapticrender.jit import kernel, record
-from hapticrender.mathx import TURN
-from hapticrender.vectors import get, magnitude, pair, put, total, unit, where, zeros
+from hapticrender.mathx import TURN, unit
+from hapticrender.vectors import get, imag, magnitude, pair, put, real, total, where, zeros
 
 
 @kernel
@@ -34,7 +34,7 @@ def turn_ahead(controller, t):
     b, lead = record(c.tiles_at, TILE_T, t), c.p.lead
     omega = get(b, "omega")
     x = (0.5 / c.p.rate) * omega
-    chord = unit(x * (1.0 / TURN)).imag
+    chord = imag(unit(x * (1.0 / TURN)))
     turn = unit((lead / TURN) * (omega + 0.5 * lead * get(b, "sweep")))
     put(b, "ahead", where(magnitude(x) > 1e-9, x / chord, 1.0) * turn)
 
@@ -132,4 +132,4 @@ def apply_law(controller):
         force = get(b, "d10") * v0 + get(b, "s10") * slope0 + get(b, "d11") * v1 + get(b, "s11") * slope1
         put(b, "force1", force)
         sum1 = sum1 + force * carrier
-    return total(sum0.real), total(sum1.real), total(sum0.imag), total(sum1.imag)
+    return total(real(sum0)), total(real(sum1)), total(imag(sum0)), total(imag(sum1))

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
+
 from hapticrender.control.records import CONTROLLER_T
 from hapticrender.jit import kernel, record
-from hapticrender.mathx import round_to_integer
 
 NEAR_LIMIT = 0.25  # of the limit, squared: from here on the envelope of the drive counts, not its samples alone
 SATURATED, NONFINITE, UNLOCKED = 1, 2, 32  # Flag bits
@@ -18,7 +19,7 @@ def shape_noise(controller, exact, i):
     c = record(controller, CONTROLLER_T, 0)
     step, last = c.p.drive_step, c.shaper[0, i]
     shaped = exact + (2.0 * last - c.shaper[1, i])
-    rounded = step * round_to_integer(shaped / step)
+    rounded = step * np.rint(shaped / step)
     c.shaper[1, i] = last
     c.shaper[0, i] = min(max(shaped - rounded, -step), step)
     return rounded

@@ -38,22 +38,8 @@ from hapticrender.control.records import (
     samples_of,
 )
 from hapticrender.jit import F8, I8, SIGNALS_T, kernel, pointer, record, step
-from hapticrender.mathx import TURN
-from hapticrender.vectors import (
-    conj,
-    get,
-    magnitude,
-    maximum,
-    pair,
-    polar,
-    put,
-    sqrt,
-    square,
-    total,
-    unit,
-    where,
-    zeros,
-)
+from hapticrender.mathx import TURN, polar, unit
+from hapticrender.vectors import conj, get, imag, magnitude, maximum, pair, put, real, sqrt, square, total, where, zeros
 
 SILENCE = 1e-12  # m: the phase of a smaller target means nothing
 TABLE_POLE = TURN * 40.0  # rad/s: of the velocity by which the table is read; the tracker's overshoots at a reversal
@@ -134,7 +120,7 @@ def loop_controller(controller, x, error, floor):
     """Output of the loop controller C, a second-order section; its real part is kept above a floor."""
     p = record(controller, CONTROLLER_T, 0).p
     out = p.loop[0] * error + get(x, "law1")
-    out = pair(maximum(out.real, floor), out.imag)
+    out = pair(maximum(real(out), floor), imag(out))
     put(x, "law1", p.loop[1] * error - p.loop[3] * out + get(x, "law2"))
     put(x, "law2", p.loop[2] * error - p.loop[4] * out)
     return out
@@ -147,16 +133,16 @@ def polar_loops(controller, t, i, envelope):
     b, x = record(c.tiles_at, TILE_T, t), record(c.loops_at, LOW_PASS_T, i * c.tiles + t)
     heading, direction = get(b, "heading"), get(b, "direction")
     if c.p.subtracted > 0.0:  # each angle with a seam of its own
-        size, angle = polar(pair(envelope.real, direction * envelope.imag))
-        _, aimed = polar(pair(heading.real, direction * heading.imag))
+        size, angle = polar(pair(real(envelope), direction * imag(envelope)))
+        _, aimed = polar(pair(real(heading), direction * imag(heading)))
         angle = angle - aimed
     else:
         turned = envelope * conj(heading)
-        size, angle = polar(pair(turned.real, direction * turned.imag))
+        size, angle = polar(pair(real(turned), direction * imag(turned)))
     # a negative amplitude would be positive feedback
     floor = 0.0 if c.p.clamped > 0.0 else -math.inf
     out = loop_controller(controller, x, pair(get(b, "amount") - size, get(b, "sounds") * angle), floor)
-    return out.real, -1.0 * out.imag
+    return real(out), -1.0 * imag(out)
 
 
 @kernel
@@ -180,7 +166,7 @@ def polar_law(controller):
             else:
                 amplitude, angle = get(b, "amount"), c.p.lead * magnitude(get(b, "omega")) - get(x, "lag")
             turn, wave = unit((1.0 / TURN) * angle), get(b, "heading") * get(b, "carrier")
-            wave = wave.real * turn.real - get(b, "direction") * wave.imag * turn.imag
+            wave = real(wave) * real(turn) - get(b, "direction") * imag(wave) * imag(turn)
             drive = drive + get(x, "drive") * amplitude * wave
         samples[SUM + i, 0] = total(drive)
     c.stale = 0
@@ -211,7 +197,7 @@ def complex_law(controller):
         reference = zeros()
         for t in range(c.tiles):
             b = record(c.tiles_at, TILE_T, t)
-            reference = reference + (get(b, "r") * get(b, "carrier")).real
+            reference = reference + real(get(b, "r") * get(b, "carrier"))
         for i in range(n):
             samples[Y + i, 0] -= p.shape[i] * total(reference)
     for i in range(n):
@@ -232,7 +218,7 @@ def complex_law(controller):
                 across = damping * omega + p.dynamic * mass * get(b, "sweep")
                 force = pair(p.stiffness[i, j] - mass * omega * omega, across) * get(x, "v")
                 force = force + p.dynamic * pair(damping, 2.0 * mass * omega) * get(x, "slope")
-                samples[SUM + i, 0] += total((force * wave).real)
+                samples[SUM + i, 0] += total(real(force * wave))
     c.stale = 0
 
 

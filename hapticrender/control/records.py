@@ -19,7 +19,7 @@ from numba import carray
 
 from hapticrender.jit import F8, kernel, pointer, record
 from hapticrender.protocols import Array
-from hapticrender.vectors import W
+from hapticrender.vectors import W, tile_type
 
 MOST_SENSORS = MOST_CHANNELS = 8
 MOST_TAPS = 16
@@ -139,8 +139,8 @@ CONTROLLER = np.dtype(
     ]
 )
 """Settings and state of a controller, and the addresses of its arrays."""
-CONTROLLER_T, TILE_T, LOW_PASS_T = map(numba.from_dtype, (CONTROLLER, TILE, LOW_PASS))
-COMMAND_T, WORK_T, PAIR_T = map(numba.from_dtype, (COMMAND, WORK, PAIR))
+CONTROLLER_T = numba.from_dtype(CONTROLLER)
+TILE_T, LOW_PASS_T, COMMAND_T, WORK_T, PAIR_T = map(tile_type, (TILE, LOW_PASS, COMMAND, WORK, PAIR))
 
 # rows of the samples' work array (rows, M): coordinates, then innovations; sums over the bands and their steps; finger
 # position; waveform; response r, first columns of Q for the innovation and for the waveform; what was solved; sums and

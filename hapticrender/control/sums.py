@@ -28,7 +28,8 @@ from hapticrender.control.records import (
     samples_of,
 )
 from hapticrender.jit import kernel, record
-from hapticrender.vectors import conj, get, pair, put, total, unit, zeros
+from hapticrender.mathx import unit
+from hapticrender.vectors import conj, get, imag, pair, put, real, total, zeros
 
 
 @kernel
@@ -79,12 +80,12 @@ def sum_bands(controller, rising):
             for t in range(tiles):
                 w, z = record(c.work_at, WORK_T, t), get(record(c.table_at, PAIR_T, i * tiles + t), "z")
                 y0, y1 = get(w, "y0"), get(w, "y1")
-                even0, odd0 = even0 + y0.real * z.real, odd0 + y0.imag * z.imag
-                even1, odd1 = even1 + y1.real * z.real, odd1 + y1.imag * z.imag
+                even0, odd0 = even0 + real(y0) * real(z), odd0 + imag(y0) * imag(z)
+                even1, odd1 = even1 + real(y1) * real(z), odd1 + imag(y1) * imag(z)
                 if rising:
                     up0, up1 = get(w, "up0"), get(w, "up1")
-                    up_even0, up_odd0 = up_even0 + up0.real * z.real, up_odd0 + up0.imag * z.imag
-                    up_even1, up_odd1 = up_even1 + up1.real * z.real, up_odd1 + up1.imag * z.imag
+                    up_even0, up_odd0 = up_even0 + real(up0) * real(z), up_odd0 + imag(up0) * imag(z)
+                    up_even1, up_odd1 = up_even1 + real(up1) * real(z), up_odd1 + imag(up1) * imag(z)
             distance = middle - (pairs - 1 - i)
             early, late = q * group + pairs - 1 - i, q * group + group - pairs + i
             samples[SUM, early] = total(even0 + odd0 - distance * (up_even0 + up_odd0))
@@ -113,8 +114,8 @@ def correlate(controller, row):
             even0, odd0, even1, odd1 = zeros(), zeros(), zeros(), zeros()
             for i in range(pairs):
                 z, m = get(record(c.table_at, PAIR_T, i * tiles + t), "z"), q * group + i
-                even0, odd0 = even0 + samples[FOLDED, m] * z.real, odd0 + samples[FOLDED + 1, m] * z.imag
-                even1, odd1 = even1 + samples[FOLDED + 2, m] * z.real, odd1 + samples[FOLDED + 3, m] * z.imag
+                even0, odd0 = even0 + samples[FOLDED, m] * real(z), odd0 + samples[FOLDED + 1, m] * imag(z)
+                even1, odd1 = even1 + samples[FOLDED + 2, m] * real(z), odd1 + samples[FOLDED + 3, m] * imag(z)
             z = get(record(c.phasors_at, PAIR_T, q * tiles + t), "z")
             x0, x1 = x0 + pair(even0, odd0) * z, x1 + pair(even1, odd1) * z
         w = record(c.work_at, WORK_T, t)
