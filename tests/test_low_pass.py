@@ -18,7 +18,6 @@ from hapticrender.control.methods import (
     StaticInverse,
     frequency_table,
 )
-from hapticrender.mathx import polar
 from hapticrender.plants.plate import PlateParameters
 
 RATE, COUNT = 5000.0, 1500
@@ -166,13 +165,3 @@ def test_the_table_is_the_free_device_behind_its_hold():
     x = w / RATE / 2
     np.testing.assert_allclose(gain[at], abs(motion) * np.sin(x) / x, rtol=1e-9)
     np.testing.assert_allclose(lag[at], np.angle(motion), rtol=1e-9)
-
-
-def test_magnitude_and_angle_are_good_to_2e_10(rng):
-    """The interpolations err by 2.3e-10 rad and 1.8e-10 of the magnitude; the cut is at 90 degrees."""
-    points = 10.0 ** rng.uniform(-12, 3, 2000) * np.exp(2j * np.pi * rng.uniform(size=2000))
-    found = np.array([polar(z.real, z.imag) for z in points])
-    assert abs(found[:, 0] / abs(points) - 1.0).max() < 2e-10
-    assert abs(found[:, 1] - NaiveLowPass.cut(points)).max() < 2.4e-10
-    assert polar(0.0, 0.0)[0] < 1e-140
-    assert abs(polar(0.0, 0.0)[1]) < 2.4e-10

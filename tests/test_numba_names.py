@@ -8,15 +8,21 @@ import pytest
 ROOT = Path(__file__).resolve().parent.parent
 SHIPPED = sorted(path for folder in ("hapticrender", "renderers", "drivers") for path in (ROOT / folder).rglob("*.py"))
 PACKAGES = ("numba", "llvmlite")
-TYPES = ("int32", "int64", "uint32", "uint64", "float32", "float64", "complex128", "CPointer")
+TYPES = "int32 int64 uint32 uint64 float32 float64 complex128 boolean Float Integer Type CPointer".split()
+EXTENSION = "intrinsic lower_builtin models models.PrimitiveModel register_model type_callable".split()
+IR = "Constant DoubleType Function FunctionType IntType LiteralStructType PointerType Undefined VectorType".split()
 ALLOWED = {  # numba's user manual and extension manual, llvmlite's manual of its IR layer
-    *("numba.njit", "numba.cfunc", "numba.carray", "numba.from_dtype", "numba.types", "numba.extending.intrinsic"),
+    *("numba.njit", "numba.cfunc", "numba.carray", "numba.from_dtype", "numba.types"),
+    *(f"numba.extending.{name}" for name in EXTENSION),
     *(f"numba.types.{name}" for name in TYPES),
-    *(f"llvmlite.ir{name}" for name in ("", ".Constant", ".FunctionType", ".IntType", ".PointerType")),
+    *("llvmlite.ir", *(f"llvmlite.ir.{name}" for name in IR)),
 }
 IN_INTRINSICS = {  # attributes of what numba hands to a code generator, and of its types
     "context": {"get_value_type"},
-    "builder": {"inttoptr", "add", "mul", "call", "atomic_rmw", "extract_value"},
+    "builder": set(
+        "inttoptr add mul call atomic_rmw extract_value insert_value extract_element insert_element shuffle_vector "
+        "sitofp fadd fsub fmul fdiv fneg fcmp_ordered icmp_unsigned select bitcast gep load store module".split()
+    ),
     "signature": {"args", "return_type"},
     "typingctx": set(),
 }
@@ -45,10 +51,9 @@ def dotted(node):
     return f"{base}.{node.attr}" if base else None
 
 
-def is_intrinsic(node, names):
-    return isinstance(node, ast.FunctionDef) and any(
-        names.get(str(dotted(each)).split(".")[0], "") == "numba.extending.intrinsic" for each in node.decorator_list
-    )
+def generates_code(node):
+    """Whether a function is handed a builder of machine code."""
+    return isinstance(node, ast.FunctionDef | ast.Lambda) and any(each.arg == "builder" for each in node.args.args)
 
 
 def outside(source):
@@ -63,7 +68,7 @@ def outside(source):
             full = f"{names[first]}.{rest}"
             if not any(full == each or each.startswith(f"{full}.") for each in ALLOWED):
                 found.add(full)
-        if is_intrinsic(node, names):
+        if generates_code(node):
             found |= set(handed_out(node))
     return found | private_attributes(tree) | options(tree, names)
 
