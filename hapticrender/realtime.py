@@ -29,7 +29,7 @@ from numba.extending import intrinsic
 
 from hapticrender.bands import Bands
 from hapticrender.control.records import SETPOINT_ROWS
-from hapticrender.jit import F8, I8, CFunction, addresses, call, kernel, pointer, record
+from hapticrender.jit import F8, I8, CFunction, addresses, call, entry, kernel, pointer, record
 from hapticrender.protocols import Array, Flag
 
 HORIZON = 0.05  # s: without a new position the finger stays where it was bound for by then
@@ -69,7 +69,7 @@ def swap(typingctx: Any, address: Any, value: Any) -> Any:
     return types.int64(types.int64, types.int64), build
 
 
-@kernel
+@entry
 def publish(entry, back):
     """Swap the writer's slot `back` for the one in the middle; returns the writer's next slot."""
     return swap(entry + MIDDLE_AT, back | FRESH) & (FRESH - 1)

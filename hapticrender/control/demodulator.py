@@ -10,7 +10,7 @@ import numpy as np
 
 from hapticrender.control.estimators import StarSTDFT
 from hapticrender.control.records import W, aligned
-from hapticrender.jit import kernel, record
+from hapticrender.jit import entry, kernel, record
 from hapticrender.mathx import frac, sincos_turns
 from hapticrender.protocols import Array
 
@@ -45,7 +45,7 @@ def filter_tile(tile, t, sections, i, x, coefficients, turn):
         b.sin[k] = sin * b.turn_cos[k] + cos * b.turn_sin[k] if turn else sin
 
 
-@kernel
+@entry
 def demodulate(coefficients, tiles, sections, first, samples, envelopes):
     """Write the envelopes of every sample, channel and band, real and imaginary parts in turns."""
     channels, bands = samples.shape[1], envelopes.shape[2] // 2
