@@ -5,7 +5,7 @@ that with y = x z_s::
 
     Re(x z[s +- d]) = Re y cos(w d) -+ Im y sin(w d)
 
-and one pair of products serves two samples.  `table` holds z_d for the pairs, `phasors` z_s for the groups; where a
+and one pair of products serves two samples, as it does with envelopes that rise linearly.  `table` holds z_d for the pairs, `phasors` z_s for the groups; where a
 carrier follows the finger, z_s has the finger's mean position in the group, and z_d its mean velocity in the block.
 """
 
@@ -76,22 +76,19 @@ def sum_bands(controller, rising):
             put(w, "y1", x1 * z)
         for i in range(pairs):
             even0, odd0, even1, odd1 = zeros(), zeros(), zeros(), zeros()
-            up_even0, up_odd0, up_even1, up_odd1 = zeros(), zeros(), zeros(), zeros()
+            distance = middle - (pairs - 1 - i)
             for t in range(tiles):
                 w, z = record(c.work_at, WORK_T, t), get(record(c.table_at, PAIR_T, i * tiles + t), "z")
-                y0, y1 = get(w, "y0"), get(w, "y1")
-                even0, odd0 = even0 + real(y0) * real(z), odd0 + imag(y0) * imag(z)
-                even1, odd1 = even1 + real(y1) * real(z), odd1 + imag(y1) * imag(z)
+                cos, sin, y0, y1 = real(z), imag(z), get(w, "y0"), get(w, "y1")
+                even0, odd0 = even0 + real(y0) * cos, odd0 + imag(y0) * sin
+                even1, odd1 = even1 + real(y1) * cos, odd1 + imag(y1) * sin
                 if rising:
-                    up0, up1 = get(w, "up0"), get(w, "up1")
-                    up_even0, up_odd0 = up_even0 + real(up0) * real(z), up_odd0 + imag(up0) * imag(z)
-                    up_even1, up_odd1 = up_even1 + real(up1) * real(z), up_odd1 + imag(up1) * imag(z)
-            distance = middle - (pairs - 1 - i)
+                    cos, sin, y0, y1 = distance * cos, distance * sin, get(w, "up0"), get(w, "up1")
+                    even0, odd0 = even0 - imag(y0) * sin, odd0 - real(y0) * cos
+                    even1, odd1 = even1 - imag(y1) * sin, odd1 - real(y1) * cos
             early, late = q * group + pairs - 1 - i, q * group + group - pairs + i
-            samples[SUM, early] = total(even0 + odd0 - distance * (up_even0 + up_odd0))
-            samples[SUM, late] = total(even0 - odd0 + distance * (up_even0 - up_odd0))
-            samples[SUM + 1, early] = total(even1 + odd1 - distance * (up_even1 + up_odd1))
-            samples[SUM + 1, late] = total(even1 - odd1 + distance * (up_even1 - up_odd1))
+            samples[SUM, early], samples[SUM, late] = total(even0 + odd0), total(even0 - odd0)
+            samples[SUM + 1, early], samples[SUM + 1, late] = total(even1 + odd1), total(even1 - odd1)
 
 
 @kernel
