@@ -5,8 +5,9 @@ that with y = x z_s::
 
     Re(x z[s +- d]) = Re y cos(w d) -+ Im y sin(w d)
 
-and one pair of products serves two samples, as it does with envelopes that rise linearly.  `table` holds z_d for the pairs, `phasors` z_s for the groups; where a
-carrier follows the finger, z_s has the finger's mean position in the group, and z_d its mean velocity in the block.
+and one pair of products serves two samples, also of envelopes that rise linearly.  `table` holds z_d for the pairs,
+`phasors` z_s for the groups; where a carrier follows the finger, z_s has the finger's mean position in the group, and
+z_d its mean velocity in the block.
 """
 
 from __future__ import annotations
