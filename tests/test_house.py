@@ -88,7 +88,10 @@ def test_type_checkers_are_told_of_every_public_name():
     assert sorted(alias.asname for node in told.body for alias in node.names) == hapticrender.__all__
 
 
-GROUND = {f"hapticrender.{name}" for name in ("protocols", "errors", "bands", "checks", "formatting", "jit", "mathx")}
+GROUND = {
+    f"hapticrender.{name}"
+    for name in ("protocols", "errors", "bands", "checks", "formatting", "jit", "vectors", "mathx")
+}
 GROUND |= {f"hapticrender.{name}" for name in ("defaults", "driver_checks")}
 DEVICES = {"touch", "control", "plants"}
 MAY_IMPORT = {  # package: the others that it may import; renderers and drivers are found by their entry points
