@@ -9,7 +9,7 @@ from naive import envelope_loop
 import hapticrender as hr
 from hapticrender.bands import Bands
 from hapticrender.control.estimators import BoxcarSTDFT, StarSTDFT
-from hapticrender.control.loopshape import design
+from hapticrender.control.loopshape import controller_of
 from hapticrender.control.methods import (
     METHODS,
     CommonMode,
@@ -231,8 +231,7 @@ def test_dynamic_stiffness_settles_as_its_loop_alone_at_every_frequency(form, pr
     FACTS, reports: 0.15 s with C2, as here; 0.077 s with the integrator, half a window of 20 ms early.  The amplitude
     is read over a window of whole periods, which rounds C2's overshoot of just 5.0 % off by at most half of it.
     """
-    shaped = design(form=form)
-    expected = step_settling(shaped.controller, shaped.low_pass)
+    expected = step_settling(controller_of(form, 5.0, 10.0), butterworth(10.0))
     assert expected == pytest.approx(printed, abs=0.0005)
     for frequency in LOW[1:] if form == "reduced" else LOW:  # at 20 Hz the window hides that overshoot
         _, sensed = hold(DynamicStiffness(form=form), tones(frequency), 1.0)

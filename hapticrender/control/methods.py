@@ -21,20 +21,26 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar
 
 import numpy as np
 
 from hapticrender.bands import Bands
 from hapticrender.control.controller import BankController, padded, ridge_spacing, spacing
 from hapticrender.control.device_model import DeviceModel
-from hapticrender.control.envelope_loop import Bandwidths, EnvelopeLoop, envelope_loop, section
 from hapticrender.control.error_design import FADE_IN, ONE_SPEED, Rules, design_error, rules_for
-from hapticrender.control.loopshape import analyse, integrator
+from hapticrender.control.loopshape import (
+    Bandwidths,
+    EnvelopeLoop,
+    Form,
+    envelope_loop,
+    integrator,
+    loop_margins,
+    section,
+)
 from hapticrender.control.low_pass import low_pass_step
 from hapticrender.control.margins import LEAST
 from hapticrender.control.records import LOW_PASS, MOST_CHANNELS, MOST_SENSORS, W, aligned
-from hapticrender.control.transfer import TransferFunction
 from hapticrender.errors import DesignError
 from hapticrender.protocols import Array, Method
 
@@ -161,7 +167,7 @@ class Inverse:
         Of loop and low pass, unchecked; by default the paper's rule.
     """
 
-    form: Literal["reduced", "integrator"] = "reduced"
+    form: Form = "reduced"
     feed_forward: bool = False
     filtered: bool = True
     bandwidths: Bandwidths | None = None
@@ -232,8 +238,8 @@ class Resonant:
                     f"gain={self.gain:g} 1/s must be below {least:.3g} 1/s, the decay rate of the least damped mode, "
                     f"which it takes away: lower gain"
                 )
-            found = analyse(controller, TransferFunction((1.0,), (1.0,)), delay=model.delay / model.rate)
-            if complaint := LEAST["envelope"].complaint(found.margins):
+            found = loop_margins(controller, model.delay / model.rate)
+            if complaint := LEAST["envelope"].complaint(found):
                 raise DesignError(f"{complaint}: lower gain={self.gain:g} 1/s or the loop's delay")
         loop = EnvelopeLoop(ALL_PASS, section(controller.tustin(model.rate)), 0, model.lowest_frequency / 4)
         settings = complex_settings(model, bands, loop, self.feed_forward, feedback)
