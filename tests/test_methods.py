@@ -19,6 +19,7 @@ from hapticrender.control.methods import (
     StaticInverse,
     least_decay,
 )
+from hapticrender.control.transfer import butterworth
 from hapticrender.plants.plate import Plate, PlateParameters
 
 RATE = 5000.0
