@@ -16,11 +16,18 @@ import numpy as np
 from hapticrender.bands import Bands
 from hapticrender.control.adaptation import TURN_SAMPLES
 from hapticrender.control.bandwidth import BankGains, checked_gains
-from hapticrender.control.controller import BankController, padded, ridge_spacing, spacing
+from hapticrender.control.controller import (
+    BankController,
+    device_settings,
+    lowest_carrier,
+    ridge_spacing,
+    shared_settings,
+    spacing,
+)
 from hapticrender.control.damping import Damping, choose_damping
 from hapticrender.control.device_model import DeviceModel, FingerRange
 from hapticrender.control.kernel import block_step, error_step
-from hapticrender.control.records import MOST_CHANNELS, MOST_SENSORS, MOST_TAPS
+from hapticrender.control.records import MOST_TAPS
 
 FADE_IN = 0.05  # s: a target fades in this slowly, so that it does not excite the modes
 LEAST_FADE_IN = 0.5e-3  # s: however fast the device, as drives are finite
@@ -86,7 +93,7 @@ TWO_SPEEDS_CROWDED = Rules(
 
 
 def rules_for(bands: Bands) -> Rules:
-    """Two speeds; carriers nearer than 40 Hz, or that may come so near, are watched without detectors."""
+    """Two speeds; carriers nearer than 40 Hz, or that may come so near, have no detectors."""
     crowded = spacing(bands) < CROWDED or (bands.wavenumber > 0.0).sum() > 1
     return TWO_SPEEDS_CROWDED if crowded else TWO_SPEEDS
 
@@ -121,13 +128,6 @@ def design_error(
     ValueError
         Two carriers are equal, or the device has too many coordinates, channels or sensors.
     """
-    for name, number, most in (
-        ("coordinates", len(model.mass), 2),
-        ("drive channels", model.force_from_drive.shape[1], MOST_CHANNELS),
-        ("sensors", model.coordinate_from_sensed.shape[1], MOST_SENSORS),
-    ):
-        if number > most:
-            raise ValueError(f"the device model has {number} {name}: must be <= {most}")
     rules = rules.scaled(model.pace)
     prompt = model.delay <= PROMPT
     damping = choose_damping(model, bending=model.bending) if any(rules.damper) and feedback and prompt else None
@@ -158,7 +158,7 @@ def design_error(
 
 def _gains(model: DeviceModel, bands: Bands, rules: Rules, feedback: bool) -> BankGains:
     """How fast observer, integral and DC estimate may run, by lowest carrier (Hz), spacing and delay."""
-    lowest, apart, period = _lowest(model, bands), spacing(bands), 1.0 / model.rate
+    lowest, apart, period = lowest_carrier(model, bands), spacing(bands), 1.0 / model.rate
     if apart == 0.0:
         twice = np.sort(bands.frequency[bands.wavenumber == 0.0])
         raise ValueError(
@@ -190,58 +190,34 @@ def _gains(model: DeviceModel, bands: Bands, rules: Rules, feedback: bool) -> Ba
     )
 
 
-def _lowest(model: DeviceModel, bands: Bands) -> float:
-    """Lowest carrier (Hz): of the fixed ones, and of what a moving finger makes of the others."""
-    locked = bands.wavenumber > 0.0
-    return float(bands.frequency[~locked].min(initial=model.lowest_frequency if locked.any() else np.inf))
-
-
 def _settings(
     model: DeviceModel, bands: Bands, rules: Rules, gains: BankGains, damping: Damping | None, feedback: bool
 ) -> dict[str, Any]:
     """Settings of the kernel, sample by sample."""
     period, fast = 1.0 / model.rate, 2 * math.pi * FAST_DC / model.rate
-    lowest, matrices = _lowest(model, bands), ("mass", "damping", "stiffness")
+    lowest = lowest_carrier(model, bands)
     observer = min(rules.observer[0], lowest / 2, spacing(bands) / (2 * math.pi))
     taps = damping.taps if damping else np.zeros((len(model.mass), 1))
-    listening = model.coordinate_from_sensed[:, : None if feedback else 0]
+    sensor_map, drive_map = model.coordinate_from_sensed, np.linalg.pinv(model.force_from_drive)
     return {
-        **{name: padded(getattr(model, name), 2, 2) for name in matrices},
+        **shared_settings(model, bands, sensor_map, drive_map, feedback),
+        **device_settings(model),
         **_adaptation(model, rules, 2 * math.pi * observer, feedback),
         **_detectors(model, rules),
         **_finger(model.finger),
-        "coordinates": len(model.mass),
-        "block": 1,
-        "sensors": listening.shape[1],
-        "channels": model.force_from_drive.shape[1],
         "n_taps": taps.shape[1],
-        "taps": padded(taps, 2, MOST_TAPS),
+        "taps": np.pad(taps, ((0, 2 - len(taps)), (0, MOST_TAPS - taps.shape[1]))),
         "added_damping": np.resize(np.append(damping.added_damping if damping else 0.0, [0.0, 0.0]), 2),
-        "shape": np.append(model.pattern, [0.0])[:2],
-        "coordinate_from_sensor": padded(listening, 2, MOST_SENSORS),
-        "drive_from_force": padded(np.linalg.pinv(model.force_from_drive), MOST_CHANNELS, 2),
-        "rate": gains.rate,
-        "lead": gains.lead,
         "reference": 2 * 2 * math.pi * observer * period,
-        "middle": 1.0,
         "extrapolation": 0.0,
         "fade_in": period / max(FADE_IN / model.pace, LEAST_FADE_IN),
-        "lowest": gains.lowest,
-        "highest": gains.highest,
         "highest_edge": gains.highest_edge,
-        "analysed": bands.envelope is None,
-        "modulated": bands.modulated,
-        "differentiated": bands.differentiated,
-        "needs_contact": model.finger.needs_contact,
-        "least_speed": model.finger.least_speed,
         "corrected": bands.sensor_response is None and (model.sensor_delay != 0.0 or model.contact_lag != 0.0),
         "sensor_delay": model.sensor_delay,
         "contact_lag": model.contact_lag,
         "contact_damping": model.contact_damping,
         "typical_speed": model.typical_speed,
         "lock": 2 * math.pi * model.lock,
-        "sensor_limit": float(model.sensed_limit),
-        "drive_limit": float(model.drive_limit),
         "drive_step": float(model.drive_step),
         "peak_decay": math.exp(-period * lowest),
         "back_calculation": _back_calculation(model),
