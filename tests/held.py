@@ -15,18 +15,24 @@ def fixed(*pairs):
     return Bands(frequency=frequency, wavenumber=zero, phase=zero, envelope=envelope)
 
 
-def play(controller, seconds, plate=None, finger=None, seed=0):
+def play(controller, seconds, plate=None, finger=None, seed=0, waveform=None):
     """Drive (A) and true motion (m: centre, end 1, end 2) of a controller on the plate."""
     plate = Plate(plate or PlateParameters(), finger or hr.Finger.absent(), seed)
-    drive, _, _, sensed = plate.closed_loop(controller, np.zeros(round(seconds * plate.rate)))
+    waveform = np.zeros(round(seconds * plate.rate)) if waveform is None else waveform
+    drive, _, _, sensed = plate.closed_loop(controller, waveform)
     return drive, sensed.motion
 
 
-def hold(method, bands, seconds, plate=None, known=None, **scene):
-    """Drive and motion under a method of the library; `known` is the plate that it was designed for."""
+def hold(method, bands, seconds, plate=None, known=None, ahead=0.0, **scene):
+    """Drive and motion under a method of the library, or the name of one.
+
+    `known` is the plate that it was designed for; its law turns forces by `ahead` (s) more than it should.
+    """
     plate = plate or PlateParameters()
     known = known or plate
-    controller = METHODS[method].design(known.device_model(plate.rate, known.delay), bands)
+    method = METHODS[method] if isinstance(method, str) else method
+    controller = method.design(known.device_model(plate.rate, known.delay), bands)
+    controller.state["p"]["lead"] += ahead
     return play(controller, seconds, plate, **scene)
 
 
