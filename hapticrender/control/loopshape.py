@@ -71,7 +71,7 @@ def loop_margins(rational: TransferFunction, delay: float = 0.0) -> Margins:
     Parameters
     ----------
     rational : TransferFunction
-        Everything in the loop but its delay.
+        Everything in the loop but its delay; stable, but for integrators.
     delay : float, s
         Known delay, >= 0.
 
@@ -94,8 +94,7 @@ def loop_margins(rational: TransferFunction, delay: float = 0.0) -> Margins:
     gain = np.abs(rational.frequency_response(frequency))
     if not zero_crossings(np.log(gain)).size:
         raise ValueError(f"the loop gain never crosses 1 (largest {gain.max():.3g}): the loop has no margins")
-    outside = int(np.sum(rational.poles().real > BESIDE))
-    if unstable_poles(lambda f: 1 + loop(BESIDE + 2j * np.pi * f), np.append(0.0, frequency), outside):
+    if unstable_poles(lambda f: 1 + loop(BESIDE + 2j * np.pi * f), np.append(0.0, frequency)):
         return Margins.unstable()
     return margins_of(lambda f: loop(2j * np.pi * f)[:, None, None], frequency)
 

@@ -139,7 +139,7 @@ LEAST = {
 """Least margins by use: the error observer's law, the inner damper, the low-pass loop of one envelope."""
 
 
-def carrier_grid(carriers: Array, widths: Array, rate: float, narrowest: float = NARROWEST) -> Array:
+def carrier_grid(carriers: Array, widths: Array, rate: float) -> Array:
     """Frequencies (Hz) from 0 to half the rate, denser towards the carriers, none of them on one.
 
     Parameters
@@ -150,12 +150,10 @@ def carrier_grid(carriers: Array, widths: Array, rate: float, narrowest: float =
         Widths that the loop is known to have; points crowd around carriers plus and minus these.
     rate : float, Hz
         Sampling rate.
-    narrowest : float, Hz
-        Distance of the closest point.
     """
     carriers = np.unique(carriers)
-    count = math.ceil(PER_DECADE * math.log10(rate / narrowest))
-    away = np.concatenate([np.geomspace(narrowest, rate / 2, count), widths])
+    count = math.ceil(PER_DECADE * math.log10(rate / NARROWEST))
+    away = np.concatenate([np.geomspace(NARROWEST, rate / 2, count), widths])
     points = [np.linspace(0.0, rate / 2, UNIFORM)]
     middles = 0.5 * (carriers[1:] + carriers[:-1])
     for carrier, below, above in zip(carriers, [0.0, *middles], [*middles, rate / 2], strict=True):
@@ -164,10 +162,10 @@ def carrier_grid(carriers: Array, widths: Array, rate: float, narrowest: float =
     grid = np.unique(np.concatenate(points))
     at = np.clip(np.searchsorted(carriers, grid), 1, max(len(carriers) - 1, 1))
     apart = np.minimum(np.abs(grid - carriers[at - 1]), np.abs(grid - carriers[np.minimum(at, len(carriers) - 1)]))
-    return grid[apart > 0.5 * narrowest]
+    return grid[apart > 0.5 * NARROWEST]
 
 
-def unstable_poles(difference: Callable[[Array], Array], grid: Array, open_loop: int = 0) -> int:
+def unstable_poles(difference: Callable[[Array], Array], grid: Array) -> int:
     """Count the closed-loop poles outside a contour, by Nyquist's criterion.
 
     Parameters
@@ -177,14 +175,12 @@ def unstable_poles(difference: Callable[[Array], Array], grid: Array, open_loop:
     grid : ndarray, Hz
         Where to begin, from 0 to half the rate (or far beyond every corner); bisected wherever the difference turns by
         more than one radian.
-    open_loop : int
-        Poles of L outside the contour.
 
     Notes
     -----
-    Take the contour just outside the boundary, such as ``|z| = exp(SLOWEST/rate)``: carriers and integrators then lie
-    inside and no indentation is needed.  Half the contour turns by -pi for each pole more that
-    is outside in closed loop.
+    L has no pole outside the contour.  Take it just outside the boundary, such as ``|z| = exp(SLOWEST/rate)``: carriers
+    and integrators then lie inside and no indentation is needed.  Half the contour turns by -pi for each pole that is
+    outside in closed loop.
     """
     values = difference(grid)
     for _ in range(BISECTIONS):
@@ -194,7 +190,7 @@ def unstable_poles(difference: Callable[[Array], Array], grid: Array, open_loop:
         between = 0.5 * (grid[rough] + grid[rough + 1])
         grid = np.insert(grid, rough + 1, between)
         values = np.insert(values, rough + 1, difference(between))
-    return open_loop + round(-np.angle(values[1:] / values[:-1]).sum() / np.pi)
+    return round(-np.angle(values[1:] / values[:-1]).sum() / np.pi)
 
 
 def margins_of(loop: Callable[[Array], Array], grid: Array, carriers: Array | None = None) -> Margins:
