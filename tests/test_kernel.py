@@ -102,7 +102,7 @@ BANKS = {
 }
 
 
-@pytest.mark.parametrize(("name", "coils"), [*((name, 2) for name in BANKS), ("1", 1), ("8", 1), ("locked", 1)])
+@pytest.mark.parametrize(("name", "coils"), [*((name, 2) for name in BANKS), ("8", 1)])
 def test_the_kernel_is_its_twin(name, coils, rng):
     """Noise, a finger that comes, goes and turns back, samples that are no numbers, a drive at its limit."""
     bands, n = BANKS[name], 3000

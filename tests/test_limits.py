@@ -10,7 +10,6 @@ from hypothesis import strategies as st
 import hapticrender as hr
 from hapticrender.bands import Bands
 from hapticrender.control.methods import METHODS
-from hapticrender.drivers.base import BaseDriver
 from hapticrender.plants.plate import Plate, PlateParameters
 from hapticrender.protocols import Flag
 
@@ -140,42 +139,6 @@ def test_drive_is_finite_and_inside_its_limit_whatever_comes_in(method, analysed
         unread = np.isnan(value) if name == "position" else name == "wanted" and not analysed  # NaN there: no finger
         absurd = not abs(value) <= 1e3 and not unread
         assert not absurd or flags[n] & Flag.NONFINITE, (n, name, value)
-
-
-class Listening(BaseDriver):
-    """A plate behind a driver of two samples a block, which keeps what it is played and may break down."""
-
-    def __init__(self, parameters, breaks_after=None):
-        super().__init__(rate=RATE, drive_channels=2, sensed_channels=2, block=2)
-        self.plate = Plate(parameters, hr.Finger.absent(), block=2)
-        self.played, self.breaks_after = [], breaks_after
-
-    def _play(self, drive):
-        self.played.append(drive.copy())
-        if len(self.played) == self.breaks_after:
-            raise hr.DriverError("listening: play: it broke")
-        return self.plate.run(drive)
-
-
-@OURS
-@pytest.mark.parametrize("breaks_after", [None, 500])
-def test_a_run_ends_in_zero_drive(method, breaks_after):
-    """Also where it ends in the middle: the delay is two samples, so the block that leaving plays reaches the coils."""
-    scene = hr.Scene(
-        texture=hr.Grating(frequency=111.0, amplitude=1e-5),
-        finger=hr.Finger.absent(),
-        device="vt-plate",
-        duration=0.3,
-        profile={"delay": 2},
-    )
-    driver = Listening(PlateParameters(delay=2), breaks_after)
-    if breaks_after is None:
-        hr.render(scene, driver=driver, method=method)
-    else:
-        with pytest.raises(hr.DriverError, match="it broke"):
-            hr.render(scene, driver=driver, method=method)
-    assert abs(driver.played[-2]).max() > 0
-    assert not driver.played[-1].any()
 
 
 SPEED, SWIPES = 50e-3, 3.0  # m/s at most, swipes there and back a second
