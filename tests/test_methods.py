@@ -277,26 +277,3 @@ def test_a_chirp_tells_the_methods_apart():
         assert chirped(name, 800.0, "heavy") > 0.2
     assert chirped("static", 800.0, "none") > 2 * chirped("stiffness", 800.0, "none")
     assert chirped("h", 800.0, "heavy") < 0.04
-
-
-def slid(method, frequency):
-    """Amplitude rms error (relative) of centre and worse end, heavy finger sliding +-25 mm at 100 mm/s, from 1 s on."""
-    finger = hr.Finger.sliding(speed=0.1, normal_load=0.8, mechanics="heavy")
-    _, sensed = hold(method, tones(frequency), 5.0, finger=finger)
-    window = round(round(0.04 * frequency) * RATE / frequency)
-    turned = 2 * sensed.motion * np.exp(-2j * np.pi * frequency * np.arange(len(sensed.motion)) / RATE)[:, None]
-    total = np.cumsum(turned, axis=0)[5000:]
-    rms = np.sqrt(np.mean((abs(total[window:] - total[:-window]) / window / WANTED - 1.0) ** 2, axis=0))
-    return rms[0], rms[1:].max()
-
-
-def test_a_sliding_heavy_finger_tells_the_methods_apart():
-    """FACTS 3: centre 84 % per side, 5.2 % polar common mode, diverged static, 1.4 % H; ends 93 % against 10 %."""
-    assert slid("paper", 143.0)[0] > 0.5
-    centre, end = slid("paper-common", 178.0)
-    assert centre == pytest.approx(0.052, abs=0.006)
-    assert slid("static", 178.0)[0] > 1.0
-    assert slid("paper-common", 143.0)[1] > 0.7
-    centre, end = slid("h", 143.0)
-    assert centre < 0.014
-    assert end < 0.10
