@@ -4,6 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+from held import amplitude_error
 from naive import envelope_loop
 
 import hapticrender as hr
@@ -61,8 +62,7 @@ def hold(method, bands, seconds, overrides=IDEAL, wanted=None, finger=None):
 
 def error(motion, frequency, seconds=1.0):
     """Relative error of the amplitude at each place over the last `seconds`, which hold whole periods."""
-    n = np.arange(len(motion))[-round(seconds * RATE) :]
-    return abs(2 * np.mean(motion[n] * np.exp(-2j * np.pi * frequency * n / RATE)[:, None], axis=0)) / WANTED - 1.0
+    return amplitude_error(motion, frequency, WANTED, seconds)
 
 
 def settled(motion, frequency):

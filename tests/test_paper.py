@@ -4,10 +4,10 @@ import dataclasses
 
 import numpy as np
 import pytest
+from held import amplitude, fixed, grating
 
 import hapticrender as hr
 from examples.grigorii2021.shaping import analyse
-from hapticrender.bands import Bands
 from hapticrender.control.loopshape import reduced_controller
 from hapticrender.control.methods import METHODS, CommonMode, method_named
 from hapticrender.control.transfer import TransferFunction, butterworth
@@ -19,17 +19,6 @@ IDEAL = {"sensor_noise": 0.0, "sensor_bits": 0, "current_bits": 0}
 QUIET = {"sensor_noise": 0.0}
 
 
-def tones(*pairs, phase=0.0):
-    """Fixed carriers from (frequency, amplitude) pairs."""
-    frequency, amplitude = np.array(pairs, float).T
-    return Bands(
-        frequency=frequency,
-        wavenumber=np.zeros(len(pairs)),
-        phase=np.full(len(pairs), phase),
-        envelope=amplitude.astype(complex),
-    )
-
-
 def close(bands, seconds, *, method="paper", overrides=None, finger=None, table=None, seed=0):
     """Run plate and controller; `table` is another band model to fill the look-up table from."""
     parameters = PlateParameters(**(overrides or {}))
@@ -38,12 +27,6 @@ def close(bands, seconds, *, method="paper", overrides=None, finger=None, table=
     plate = Plate(parameters, finger or hr.Finger.absent(), seed)
     drive, _, flags, sensed = plate.closed_loop(controller, np.zeros(int(seconds * RATE)))
     return drive, sensed, flags
-
-
-def amplitude(motion, frequency, seconds):
-    """Mean amplitude (m) of each column over the last `seconds`, which hold whole periods."""
-    n = np.arange(len(motion))[-round(seconds * RATE) :]
-    return abs(2 * np.mean(motion[n] * np.exp(-2j * np.pi * frequency * n / RATE)[:, None], axis=0))
 
 
 def envelope(motion, frequency, window=0.05):
@@ -61,7 +44,7 @@ def test_baseline_holds_on_the_free_plate(frequency, wanted):
     Averaged over 20 s: the loop follows the noise of the mean, sqrt(2/N) um = 0.045 % of 10 um, 3 sigma < 0.14 %.
     """
     for overrides, bound in ((None, 3e-3), (QUIET, 1.5e-3)):
-        _, sensed, _ = close(tones((frequency, wanted)), 21.0, overrides=overrides)
+        _, sensed, _ = close(fixed((frequency, wanted)), 21.0, overrides=overrides)
         error = amplitude(sensed.motion, frequency, 20.0) / wanted - 1.0
         assert abs(error).max() <= bound
 
@@ -69,14 +52,14 @@ def test_baseline_holds_on_the_free_plate(frequency, wanted):
 @pytest.mark.parametrize(("frequency", "stable"), [(125, True), (131, False), (147, False), (188, False), (192, True)])
 def test_two_sides_apart_are_unstable_between_129_and_189_hz(frequency, stable):
     """From the eigen-loops rho = rocking/heave receptance ; 2 and 3 Hz outside, growth is slow."""
-    _, sensed, _ = close(tones((float(frequency), 10e-6)), 41.0, overrides=IDEAL)
+    _, sensed, _ = close(fixed((float(frequency), 10e-6)), 41.0, overrides=IDEAL)
     error = abs(amplitude(sensed.motion, frequency, 1.0) / 10e-6 - 1.0).max()
     assert error < 0.01 if stable else error > 0.1
 
 
 def test_common_mode_leaves_the_ends_off_by_30_percent_at_143_hz():
     """worst end error of the polar common mode on the free plate, 29.7 %."""
-    _, sensed, _ = close(tones((143.0, 10e-6)), 8.0, overrides=QUIET, method="paper-common")
+    _, sensed, _ = close(fixed((143.0, 10e-6)), 8.0, overrides=QUIET, method="paper-common")
     error = abs(amplitude(sensed.motion, 143.0, 2.0) / 10e-6 - 1.0)
     assert error[0] < 0.005
     assert error.max() == pytest.approx(0.297, abs=0.0005)
@@ -99,7 +82,7 @@ def test_a_press_blinds_it_at_low_frequency(frequency, wanted, position, expecte
     the middle; -9.8 % is found with the finger 10 mm to one side, and 27.5 mm to one side gives -50 %.
     """
     finger = hr.Finger.still(position=position, normal_load=0.5, mechanics="none")
-    _, sensed, _ = close(tones((frequency, wanted)), 14.0, overrides=QUIET, finger=finger)
+    _, sensed, _ = close(fixed((frequency, wanted)), 14.0, overrides=QUIET, finger=finger)
     error = amplitude(sensed.motion, frequency, 10.0)[0] / wanted - 1.0
     assert error == pytest.approx(expected, abs=within)
 
@@ -137,7 +120,7 @@ def test_a_table_of_the_loaded_plate_limit_cycles_at_lift_off():
     )
     spread = {}
     for name, table in (("free", free), ("loaded", loaded)):
-        _, sensed, _ = close(tones((189.0, 10e-6)), 10.0, overrides=IDEAL, table=table, method="paper-common")
+        _, sensed, _ = close(fixed((189.0, 10e-6)), 10.0, overrides=IDEAL, table=table, method="paper-common")
         spread[name] = envelope(sensed.motion, 189.0)[-10_000:].std() / 10e-6
     assert spread["free"] < 0.01  # the window is no whole number of periods: 1/(4 pi 189 0.05) of ripple
     assert spread["loaded"] > 0.3
@@ -147,8 +130,8 @@ def test_wobble_with_sensor_noise_is_that_of_the_facts():
     """0.033-0.045 um rms of true motion under 1 um of sensor noise, not the paper's 0.01 um."""
     wobble = []
     for frequency in (47.0, 111.0, 261.0):
-        _, sensed, _ = close(tones((frequency, 10e-6)), 21.0, overrides={"current_bits": 0})
-        quiet = close(tones((frequency, 10e-6)), 21.0, overrides=IDEAL)[1]
+        _, sensed, _ = close(fixed((frequency, 10e-6)), 21.0, overrides={"current_bits": 0})
+        quiet = close(fixed((frequency, 10e-6)), 21.0, overrides=IDEAL)[1]
         late = slice(5000, None)
         wobble.append((sensed.motion[late, 0] - quiet.motion[late, 0]).std())
     assert 0.030e-6 < min(wobble)
@@ -161,35 +144,26 @@ def moving(bands, position, seconds=4.0, touches=None):
     return close(bands, seconds, overrides=IDEAL, finger=finger)
 
 
-def locked(wavelength, wanted):
-    return Bands(
-        frequency=np.zeros(1),
-        wavenumber=np.array([1 / wavelength]),
-        phase=np.zeros(1),
-        envelope=np.array([wanted + 0j]),
-    )
-
-
 def test_a_grating_under_a_steady_finger_is_the_tone_of_its_passing():
     """10 mm/s over 0.2 mm is 50 Hz: after contact has faded in, the same loop as a 50 Hz carrier."""
-    _, spatial, _ = moving(locked(2e-4, 1e-5), lambda t: 0.01 * t)
-    _, temporal, _ = close(tones((50.0, 1e-5)), 4.0, overrides=IDEAL)
+    _, spatial, _ = moving(grating(2e-4, 1e-5), lambda t: 0.01 * t)
+    _, temporal, _ = close(fixed((50.0, 1e-5)), 4.0, overrides=IDEAL)
     np.testing.assert_allclose(amplitude(spatial.motion, 50.0, 1.0), amplitude(temporal.motion, 50.0, 1.0), rtol=2e-4)
 
 
 def test_a_resting_or_lifted_finger_lets_the_grating_fade():
     """Position decides: at 0 Hz there is nothing to feel, and the drive goes to rest."""
-    drive, _, _ = moving(locked(2e-4, 1e-5), lambda t: 0.01 * np.minimum(t, 1.0), seconds=6.0)
+    drive, _, _ = moving(grating(2e-4, 1e-5), lambda t: 0.01 * np.minimum(t, 1.0), seconds=6.0)
     assert abs(drive[4000:5000]).max() > 0.02
     assert abs(drive[-1000:]).max() < 1e-4
-    drive, _, _ = moving(locked(2e-4, 1e-5), lambda t: 0.01 * t, seconds=6.0, touches=((0.0, 1.0),))
+    drive, _, _ = moving(grating(2e-4, 1e-5), lambda t: 0.01 * t, seconds=6.0, touches=((0.0, 1.0),))
     assert abs(drive[-1000:]).max() < 1e-4
 
 
 def test_analysed_targets_of_a_steady_tone_are_its_envelope():
     """The wanted waveform passes the STDFT* that listens to the device; its 2f image of (10/94)^2 is left."""
     parameters = PlateParameters(**IDEAL)
-    bands = dataclasses.replace(tones((47.0, 1.0), phase=0.3), envelope=None)
+    bands = dataclasses.replace(dataclasses.replace(fixed((47.0, 1.0)), phase=np.full(1, 0.3)), envelope=None)
     controller = METHODS["paper"].design(parameters.device_model(RATE, 1), bands)
     wanted = 1e-5 * np.cos(2 * np.pi * 47.0 * np.arange(15_000) / RATE + 1.0)
     plate = Plate(parameters, hr.Finger.absent())
@@ -203,12 +177,12 @@ def test_analysed_targets_of_a_steady_tone_are_its_envelope():
 
 def test_a_long_delay_slows_the_loop_down_until_its_margins_hold():
     """at 5 Hz polar loops bear 30-42 ms; slowed down they hold at 60 ms."""
-    _, sensed, _ = close(tones((111.0, 1e-5)), 12.0, overrides=dict(IDEAL, delay=300), method="paper-common")
+    _, sensed, _ = close(fixed((111.0, 1e-5)), 12.0, overrides=dict(IDEAL, delay=300), method="paper-common")
     assert amplitude(sensed.motion, 111.0, 2.0)[0] == pytest.approx(1e-5, rel=2e-3)
     naive = CommonMode(bandwidths=(5.0, 10.0))
     parameters = PlateParameters(delay=300, **IDEAL)
     plate = Plate(parameters, hr.Finger.absent())
-    controller = naive.design(parameters.device_model(RATE, 300), tones((111.0, 1e-5)))
+    controller = naive.design(parameters.device_model(RATE, 300), fixed((111.0, 1e-5)))
     sensed = plate.closed_loop(controller, np.zeros(60_000))[3]
     assert abs(amplitude(sensed.motion, 111.0, 2.0)[0] / 1e-5 - 1) > 0.05
 
