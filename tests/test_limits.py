@@ -84,7 +84,9 @@ JUNK = st.one_of(
 SPOILT = st.lists(st.tuples(st.integers(0, 599), st.sampled_from(["sensed", "position", "wanted"]), JUNK), max_size=30)
 
 
-@pytest.mark.parametrize(("method", "analysed", "block"), [("h", True, 1), ("h2", False, 1), ("h2", True, 10)])
+@pytest.mark.parametrize(
+    ("method", "analysed", "block"), [("h", True, 1), ("h2", True, 10), ("paper", False, 1), ("static", True, 1)]
+)
 @given(spoilt=SPOILT)
 def test_drive_is_finite_and_inside_its_limit_whatever_comes_in(method, analysed, block, spoilt):
     """Any number at any sample of any input: the implausible ones that are read raise a flag, and no state is lost."""

@@ -57,14 +57,6 @@ def test_two_sides_apart_are_unstable_between_129_and_189_hz(frequency, stable):
     assert error < 0.01 if stable else error > 0.1
 
 
-def test_common_mode_leaves_the_ends_off_by_30_percent_at_143_hz():
-    """worst end error of the polar common mode on the free plate, 29.7 %."""
-    _, sensed, _ = close(fixed((143.0, 10e-6)), 8.0, overrides=QUIET, method="paper-common")
-    error = abs(amplitude(sensed.motion, 143.0, 2.0) / 10e-6 - 1.0)
-    assert error[0] < 0.005
-    assert error.max() == pytest.approx(0.297, abs=0.0005)
-
-
 @pytest.mark.parametrize(
     ("frequency", "wanted", "position", "expected", "within"),
     [
