@@ -97,12 +97,11 @@ BANKS = {
     "crowded": tones([100.0, 120.0, 140.0]),
     "locked": tones([0.0, 0.0, 70.0], wavenumber=[500.0, 1000.0, 0.0]),
     "analysed": waveform_of(tones([47.0, 150.0])),
-    "modulated": tones([47.0, 150.0], modulated=True),
-    "differentiated": tones([47.0, 150.0], differentiated=True),
+    "modulated and differentiated": tones([47.0, 150.0], 1e-8, modulated=True, differentiated=True),
 }
 
 
-@pytest.mark.parametrize(("name", "coils"), [*((name, 2) for name in BANKS), ("8", 1)])
+@pytest.mark.parametrize(("name", "coils"), [*((name, 1 if name == "8" else 2) for name in BANKS)])
 def test_the_kernel_is_its_twin(name, coils, rng):
     """Noise, a finger that comes, goes and turns back, samples that are no numbers, a drive at its limit."""
     bands, n = BANKS[name], 3000
