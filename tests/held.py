@@ -15,18 +15,30 @@ def fixed(*pairs):
     return Bands(frequency=frequency, wavenumber=zero, phase=zero, envelope=envelope)
 
 
-def play(controller, seconds, plate=None, finger=None, seed=0):
+def grating(wavelength, amplitude):
+    """One carrier that follows the finger."""
+    one = np.ones(1)
+    return Bands(frequency=0 * one, wavenumber=one / wavelength, phase=0 * one, envelope=amplitude * one + 0j)
+
+
+def play(controller, seconds, plate=None, finger=None, seed=0, waveform=None):
     """Drive (A) and true motion (m: centre, end 1, end 2) of a controller on the plate."""
     plate = Plate(plate or PlateParameters(), finger or hr.Finger.absent(), seed)
-    drive, _, _, sensed = plate.closed_loop(controller, np.zeros(round(seconds * plate.rate)))
+    waveform = np.zeros(round(seconds * plate.rate)) if waveform is None else waveform
+    drive, _, _, sensed = plate.closed_loop(controller, waveform)
     return drive, sensed.motion
 
 
-def hold(method, bands, seconds, plate=None, known=None, **scene):
-    """Drive and motion under a method of the library; `known` is the plate that it was designed for."""
+def hold(method, bands, seconds, plate=None, known=None, ahead=0.0, **scene):
+    """Drive and motion under a method of the library, or the name of one.
+
+    `known` is the plate that it was designed for; its law turns forces by `ahead` (s) more than it should.
+    """
     plate = plate or PlateParameters()
     known = known or plate
-    controller = METHODS[method].design(known.device_model(plate.rate, known.delay), bands)
+    method = METHODS[method] if isinstance(method, str) else method
+    controller = method.design(known.device_model(plate.rate, known.delay), bands)
+    controller.state["p"]["lead"] += ahead
     return play(controller, seconds, plate, **scene)
 
 
@@ -43,8 +55,12 @@ def envelopes(motion, phase, rate, window, hop=None):
     return (starts + width / 2) / rate, np.array(found)
 
 
-def amplitude_error(motion, frequency, wanted, rate=5000.0, seconds=1.0):
-    """Relative error of the mean amplitude of each column over the last `seconds`, which hold whole periods."""
+def amplitude(motion, frequency, seconds, rate=5000.0):
+    """Mean amplitude (m) of each column over the last `seconds`, which hold whole periods."""
     n = np.arange(len(motion))[-round(seconds * rate) :]
-    found = 2 * np.mean(motion[n] * np.exp(-2j * np.pi * frequency * n / rate)[:, None], axis=0)
-    return abs(found) / wanted - 1.0
+    return abs(2 * np.mean(motion[n] * np.exp(-2j * np.pi * frequency * n / rate)[:, None], axis=0))
+
+
+def amplitude_error(motion, frequency, wanted, seconds=1.0):
+    """Relative error of the mean amplitude of each column over the last `seconds`, which hold whole periods."""
+    return amplitude(motion, frequency, seconds) / wanted - 1.0

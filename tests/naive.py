@@ -7,35 +7,6 @@ import numpy as np
 import scipy.linalg
 
 
-def boxcar_stdft(signal, carrier_phase, length):
-    """Eq. 1-3, the window summed afresh at every sample."""
-    y = signal[:, :, None] * np.exp(-1j * carrier_phase)[:, None, :]
-    padded = np.concatenate([np.zeros((length - 1, *y.shape[1:])), y])
-    return np.array([2 / length * padded[n : n + length].sum(axis=0) for n in range(len(y))])
-
-
-def star_stdft(signal, carrier_phase, b, a):
-    """Eq. 1, 3 and 4 as printed, with M = 2 and a[0] = 1."""
-    y = signal[:, :, None] * np.exp(-1j * carrier_phase)[:, None, :]
-    estimate = np.zeros_like(y)
-    for n in range(len(y)):
-        for m in range(min(n, 2) + 1):
-            estimate[n] += b[m] * y[n - m]
-        for m in range(1, min(n, 2) + 1):
-            estimate[n] -= a[m] * estimate[n - m]
-    return 2 * estimate
-
-
-def cut_phase(value, cut):
-    """Angle moved by whole turns, one at a time, into (cut - 2 pi, cut]."""
-    angle = cmath.phase(value)
-    while angle > cut:
-        angle -= 2 * math.pi
-    while angle <= cut - 2 * math.pi:
-        angle += 2 * math.pi
-    return angle
-
-
 class Recursion:
     """``y[n] = sum b[k] x[n-k] - sum_(k>0) a[k] y[n-k]``, one sample a call."""
 

@@ -28,7 +28,7 @@ def observer(p, y, carriers):
     return envelope, dc
 
 
-@pytest.mark.parametrize("block", [2, 3, 5, 25, 64])
+@pytest.mark.parametrize("block", [3, 64])
 @pytest.mark.parametrize("moves", [False, True])
 def test_the_observer_in_blocks_is_that_of_single_samples(block, moves, rng):
     """The triangular solve is exact: only roundings differ, some K of them a sample, each forgotten at the pole."""
@@ -48,7 +48,7 @@ def test_the_observer_in_blocks_is_that_of_single_samples(block, moves, rng):
     np.testing.assert_allclose(controller.state[0]["dc"], dc, rtol=0, atol=1e-12 * abs(dc).max())
 
 
-@pytest.mark.parametrize("block", [2, 25, 64])
+@pytest.mark.parametrize("block", [2, 25])
 def test_a_recorded_waveform_is_analysed_in_blocks_as_sample_by_sample(block, rng):
     """The envelopes found in the waveform are those of the observer; the target follows them once a block."""
     bands, n = waveform_of(tones([47.0, 130.0, 261.0])), 40 * block

@@ -59,8 +59,7 @@ def touch(method, frequency, wanted, mechanics, position):
     return error[(time > 0.985) & (time < 1.9)].max(), error[(time > 1.985) & (time < 2.9)].max()
 
 
-@pytest.mark.parametrize("frequency", [185.0, 189.0])
-@pytest.mark.parametrize("position", [0.0, 15e-3, 27.5e-3])
+@pytest.mark.parametrize(("frequency", "position"), [(185.0, 0.0), (189.0, 27.5e-3)])
 def test_an_instant_touch_shakes_h_but_not_h2(frequency, position):
     """40-70 % with H at 185-189 Hz, the finger learnt at 60 /s; H2 <= 13 %.
 
@@ -74,7 +73,7 @@ def test_an_instant_touch_shakes_h_but_not_h2(frequency, position):
 @pytest.mark.parametrize(
     ("wanted", "least", "most"), [(5e-5, 0.0, 0.13), (2e-5, 0.1, 0.2), (1e-5, 0.2, 0.4), (3e-6, 0.6, 1.0)]
 )
-@pytest.mark.parametrize("frequency", [143.0, 170.0, 189.0])
+@pytest.mark.parametrize("frequency", [143.0, 189.0])
 def test_h2_lets_a_sudden_release_ring_below_10_um(frequency, wanted, least, most):
     """24-92 % below ~10 um, 0.8 N: 24-33 % at 10 um, 76-90 at 3 um.  The 18 um of the sag ring out themselves.
 
@@ -117,8 +116,9 @@ def test_a_wrong_stiffness_slows_h_and_not_h2(stiffness, frequency):
     assert settled(hold("h2", fixed((frequency, 5e-5)), 4.0, IDEAL, known)[1], frequency) < 0.08
 
 
-@pytest.mark.parametrize("frequency", [143.0, 189.0])
-@pytest.mark.parametrize(("stiffness", "mass"), [(1.05, 0.95), (0.95, 1.05), (1.1, 1.0), (0.9, 1.0)])
+@pytest.mark.parametrize(
+    ("frequency", "stiffness", "mass"), [(143.0, 1.05, 0.95), (189.0, 0.95, 1.05), (189.0, 1.1, 1.0)]
+)
 def test_h_diverges_on_a_plate_off_by_10_percent_and_h2_does_not(frequency, stiffness, mass):
     """k and m 5 % apart, or k 10 %, shift the mode by 5 %: H diverges; the inner loop adds j w b_a to D."""
     known = wrong(stiffness, mass, **IDEAL_SENSORS)
@@ -136,17 +136,3 @@ def test_h2_holds_quietly_at_189_hz_only_on_the_plate_of_the_design():
         turned = 2 * motion * np.exp(-1j * TURN * 189.0 * np.arange(len(motion)) / RATE)
         near = scipy.signal.sosfiltfilt(scipy.signal.butter(2, 20, fs=RATE, output="sos"), turned.real)
         assert least < near[10_000:-2500].std() < most
-
-
-@pytest.mark.parametrize("method", ["h", "h2"])
-@pytest.mark.parametrize("frequency", [170.0, 178.0, 189.0])
-def test_plain_rounding_shakes_a_small_amplitude_near_the_modes(method, frequency):
-    """0.13-0.46 um at 170-189 Hz from 12 bits alone, 1 um wanted; the shaped command leaves 0.01.
-
-    Against the same run (same noise) with an ideal drive, over 5 s, all frequencies.
-    """
-    plate, smooth = PlateParameters(), PlateParameters(current_bits=0)
-    ideal = hold(method, fixed((frequency, 1e-6)), 8.0, smooth)[1][-25_000:, 0]
-    for known, least, most in ((smooth, 0.13e-6, 0.46e-6), (plate, 0.0, 0.02e-6)):
-        motion = hold(method, fixed((frequency, 1e-6)), 8.0, plate, known)[1][-25_000:, 0]
-        assert least < (motion - ideal).std() < most

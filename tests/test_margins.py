@@ -11,13 +11,10 @@ from hapticrender.control.margins import (
     LeastMargins,
     Margins,
     borne_errors,
-    carrier_grid,
-    eigenloci,
     margins_of,
     sensitivity,
     unstable_poles,
 )
-from hapticrender.mathx import smoothstep, zero_crossings, zoh
 
 GRID = np.geomspace(1e-4, 1e2, 20001)  # Hz
 CROSSOVER = math.sqrt((math.sqrt(17) - 1) / 2)  # rad/s, of 2/(s (s + 1)): w^4 + w^2 = 4
@@ -76,24 +73,10 @@ def test_the_largest_singular_value_of_two_by_two_is_that_of_numpy(rng):
     np.testing.assert_allclose(sensitivity(loop), wanted, rtol=1e-9)
 
 
-def test_eigenloci_are_followed_through_a_crossing():
-    turn = np.linspace(0.0, 2 * np.pi, 400)
-    loci = np.array([np.exp(1j * turn), 1.0 + 0.1j - np.exp(-1j * turn)]).T
-    mixed = np.array([np.diag(pair[::order]) for pair, order in zip(loci, np.resize([1, -1], 400), strict=True)])
-    assert abs(np.diff(eigenloci(mixed), axis=0)).max() < 1.01 * abs(np.diff(loci, axis=0)).max()
-
-
 @pytest.mark.parametrize(("gain", "poles"), [(7.99, 0), (8.01, 2)])
 def test_nyquists_count_on_both_sides_of_a_boundary(gain, poles):
     grid = np.append(0.0, GRID)
     assert unstable_poles(lambda frequency: 1 + third_order(gain)(frequency)[:, 0, 0], grid) == poles
-
-
-@pytest.mark.parametrize(("gain", "poles"), [(0.99, 1), (1.01, 0)])
-def test_poles_of_the_open_loop_outside_the_contour_are_counted(gain, poles):
-    """gain/(s - 1) is stable in closed loop from a gain of 1 on."""
-    grid = np.append(0.0, GRID)
-    assert unstable_poles(lambda f: 1 + gain / (2j * np.pi * f - 1), grid, open_loop=1) == poles
 
 
 def test_nyquists_count_refines_its_grid():
@@ -109,16 +92,6 @@ def test_nyquists_count_refines_its_grid():
         roots = np.roots(np.polyadd(np.poly([pole, pole.conj()]).real, sign * 8e-3 * np.array([1.0, -1.0])))
         assert (abs(roots) > 1).sum() == poles
         assert unstable_poles(difference, np.linspace(0.0, 500.0, 501)) == poles
-
-
-def test_a_grid_crowds_around_carriers_and_stays_off_them():
-    grid = carrier_grid(np.array([0.0, 100.0, 120.0]), np.array([3.0]), 1000.0)
-    assert np.abs(grid[:, None] - [0.0, 100.0, 120.0]).min() >= 1e-3
-    for near in (100.002, 119.998, 103.0, 117.0):
-        assert np.abs(grid - near).min() < 1e-9
-    assert (np.diff(grid) > 0).all()
-    assert grid[0] > 0
-    assert grid[-1] == 500.0
 
 
 def test_least_margins_name_the_margin_that_falls_short():
@@ -153,18 +126,3 @@ def test_margins_read_well():
     good = Margins(stable=True, modulus=0.6, worst_frequency=90.0, delay=1e-3, phase=1.0, gain=3.0, bandwidth=4.0)
     words = "modulus margin 0.60 at 90 Hz, gain margin 3, phase margin 57 deg, delay margin 1.00 ms, bandwidth 4.00 Hz"
     assert str(good) == words
-
-
-def test_a_held_oscillator_is_sampled_exactly():
-    """x'' + w^2 x = w^2 u from rest under u = 1 is 1 - cos w t, also over steps longer than a period."""
-    omega, period = 2 * np.pi * 189.0, 0.007
-    ad, bd = zoh(np.array([[0.0, 1.0], [-(omega**2), 0.0]]), np.array([[0.0], [omega**2]]), period)
-    x = np.zeros((2, 1))
-    for n in range(1, 20):
-        x = ad @ x + bd
-        assert x[0, 0] == pytest.approx(1 - math.cos(omega * n * period), abs=1e-10)
-
-
-def test_zero_crossings_and_the_smooth_step():
-    np.testing.assert_allclose(zero_crossings(np.array([1.0, -1.0, -3.0, 1.0])), [0.5, 2.75])
-    np.testing.assert_allclose(smoothstep(np.array([-1.0, 0.0, 0.25, 0.5, 1.0, 7.0])), [0, 0, 0.15625, 0.5, 1, 1])

@@ -4,21 +4,20 @@ import dataclasses
 
 import numpy as np
 import pytest
+from held import amplitude_error
 from naive import envelope_loop
 
 import hapticrender as hr
 from hapticrender.bands import Bands
-from hapticrender.control.estimators import BoxcarSTDFT, StarSTDFT
-from hapticrender.control.loopshape import design
+from hapticrender.control.estimators import StarSTDFT
+from hapticrender.control.loopshape import controller_of
 from hapticrender.control.methods import (
     METHODS,
-    CommonMode,
     DynamicStiffness,
-    PerSide,
     Resonant,
-    StaticInverse,
     least_decay,
 )
+from hapticrender.control.transfer import butterworth
 from hapticrender.plants.plate import Plate, PlateParameters
 
 RATE = 5000.0
@@ -26,7 +25,6 @@ WANTED = 10e-6
 IDEAL = {"sensor_noise": 0.0, "sensor_bits": 0, "current_bits": 0}
 QUIET = {"sensor_noise": 0.0}
 POLAR = ("paper", "paper-common", "boxcar")
-LOW = (20.0, 31.0, 47.0, 72.0, 111.0, 143.0, 147.0, 170.0, 189.0, 261.0, 400.0)
 
 
 def tones(*frequency, envelope=WANTED):
@@ -64,8 +62,7 @@ def hold(method, bands, seconds, overrides=IDEAL, wanted=None, finger=None):
 
 def error(motion, frequency, seconds=1.0):
     """Relative error of the amplitude at each place over the last `seconds`, which hold whole periods."""
-    n = np.arange(len(motion))[-round(seconds * RATE) :]
-    return abs(2 * np.mean(motion[n] * np.exp(-2j * np.pi * frequency * n / RATE)[:, None], axis=0)) / WANTED - 1.0
+    return amplitude_error(motion, frequency, WANTED, seconds)
 
 
 def settled(motion, frequency):
@@ -75,13 +72,6 @@ def settled(motion, frequency):
     off = abs(abs(np.convolve(turned, np.ones(window) / window, "valid")) / WANTED - 1.0) > 0.05
     late = np.flatnonzero(off).max() + 1
     return (np.inf if late == len(off) else (late + window / 2) / RATE), window / RATE
-
-
-@pytest.mark.parametrize("name", METHODS)
-def test_a_method_is_listed_under_its_name_and_signs_its_controller(name):
-    controller = designed(name, tones(47.0, 111.0))
-    assert METHODS[name].name == controller.method == name
-    assert controller.n_bands == 2
 
 
 def steps_of(n, rng):
@@ -106,7 +96,7 @@ def test_any_split_into_blocks_gives_the_same_run(name, rng):
         assert np.array_equal(column, np.concatenate([part[i] for part in parts]))
 
 
-@pytest.mark.parametrize("name", METHODS)
+@pytest.mark.parametrize("name", ["stiffness", "h2"])
 def test_the_compiled_loop_is_the_ring_of_single_samples(name):
     """Noise, quantisation and a sliding finger included; equal bit by bit up to the compiler's contractions."""
     finger = hr.Finger.sliding(speed=0.1, normal_load=0.4, mechanics="heavy", touches=((0.02, 9.0),))
@@ -143,30 +133,15 @@ def test_a_grating_felt_backwards_is_the_same_function_of_time(name):
     np.testing.assert_allclose(motion["turned, below"], motion["turned"], rtol=0, atol=1e-9 * WANTED)
 
 
-@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf, 1e30, 1e308])
-@pytest.mark.parametrize("place", ["sensed", "position", "wanted"])
-@pytest.mark.parametrize("name", METHODS)
-def test_drive_is_finite_inside_its_limit_and_flagged_whatever_comes_in(name, place, bad, rng):
-    """A finger that is NaN is merely away."""
-    sensed, position, wanted = steps_of(600, rng)
-    {"sensed": sensed, "position": position, "wanted": wanted}[place][100:110] = bad
-    drive, target, flags = designed(name, mixed()).run(sensed, position, wanted)
-    assert np.isfinite(drive).all()
-    assert np.isfinite(target).all()
-    assert abs(drive).max() <= PlateParameters().current_limit
-    if place != "position" or not np.isnan(bad):
-        assert np.all(flags[100:110] & hr.Flag.NONFINITE)
-    assert not np.any(flags[:100] & hr.Flag.NONFINITE)
-
-
 def image(name, frequency):
     """Gain of a method's estimator on the image at twice the carrier."""
     if name == "boxcar":
-        return abs(BoxcarSTDFT(length=250, rate=RATE).tone_response(frequency, frequency).image)
-    return abs(StarSTDFT(bandwidth=10.0, rate=RATE).tone_response(frequency, frequency).image)
+        turn = 2 * frequency / RATE
+        return abs(np.sinc(250 * turn) / np.sinc(turn))
+    return abs(StarSTDFT(bandwidth=10.0, rate=RATE).frequency_response(2 * frequency))
 
 
-@pytest.mark.parametrize("frequency", [47.0, 111.0, 261.0])
+@pytest.mark.parametrize("frequency", [47.0, 261.0])
 @pytest.mark.parametrize("name", METHODS)
 def test_a_tone_off_resonance_is_held_exactly(name, frequency):
     """Free plate, ideal electronics, 4 s.
@@ -196,28 +171,6 @@ def test_without_sensors_it_drives_open_loop(name):
         assert found == pytest.approx(1e-6, rel=3e-4)
 
 
-@pytest.mark.parametrize(
-    ("frequency", "holds"),
-    [(140, True), (141, False), (145, False), (146, True), (149, True), (150, False), (154, False), (155, True)],
-)
-def test_the_static_inverse_diverges_beside_the_rocking_mode(frequency, holds):
-    """FACTS 2 row 5: 141-145 and 150-154 Hz on the free plate; between them the 12-bit command leaves up to 0.5 %.
-
-    Growth is slow (1.3 1/s at 143 Hz), so that the 11.6 % of the table in FACTS 3 is how far it had come after 4 s.
-    """
-    _, sensed = hold("static", tones(frequency), 20.0, QUIET)
-    worst = abs(error(sensed.motion, frequency)).max()
-    assert worst < 1e-2 if holds else worst > 0.1
-
-
-@pytest.mark.parametrize("method", ["stiffness", DynamicStiffness(form="integrator")], ids=["C2", "integrator"])
-@pytest.mark.parametrize("frequency", [143.0, 147.0, 152.0, 170.0, 189.0])
-def test_the_slope_of_the_stiffness_holds_where_the_static_inverse_fails(method, frequency):
-    """FACTS 3, reports: worst end error 0.28 % on the free plate, quantised."""
-    _, sensed = hold(method, tones(frequency), 8.0, QUIET)
-    assert abs(error(sensed.motion, frequency, 2.0)).max() < 2.8e-3
-
-
 def step_settling(loop, low_pass, within=0.05):
     """5 % settling time (s) of the envelope loop alone."""
     step = envelope_loop(loop.tustin(RATE), low_pass.tustin(RATE), np.ones(5000), delay=1)
@@ -231,19 +184,12 @@ def test_dynamic_stiffness_settles_as_its_loop_alone_at_every_frequency(form, pr
     FACTS, reports: 0.15 s with C2, as here; 0.077 s with the integrator, half a window of 20 ms early.  The amplitude
     is read over a window of whole periods, which rounds C2's overshoot of just 5.0 % off by at most half of it.
     """
-    shaped = design(form=form)
-    expected = step_settling(shaped.controller, shaped.low_pass)
+    expected = step_settling(controller_of(form, 5.0, 10.0), butterworth(10.0))
     assert expected == pytest.approx(printed, abs=0.0005)
-    for frequency in LOW[1:] if form == "reduced" else LOW:  # at 20 Hz the window hides that overshoot
+    for frequency in (31.0, 143.0, 189.0, 400.0):
         _, sensed = hold(DynamicStiffness(form=form), tones(frequency), 1.0)
         found, window = settled(sensed.motion, frequency)
         assert abs(found - expected) < window, frequency
-
-
-def test_common_mode_settles_slowly_at_the_heave_mode_and_dynamic_stiffness_does_not():
-    """The amplitude's own pole f0/2Q = 4.2 Hz lies in the polar loop and is inverted by D'."""
-    slow, quick = (settled(hold(name, tones(189.0), 2.0)[1].motion, 189.0)[0] for name in ("paper-common", "stiffness"))
-    assert slow > 2.5 * quick
 
 
 def test_the_resonant_method_settles_in_three_time_constants():
@@ -281,62 +227,6 @@ def test_too_long_a_delay_is_refused(name):
         METHODS[name].design(PlateParameters(delay=25_000).device_model(RATE, 25_000), tones(47.0))
 
 
-def test_the_boxcar_is_deaf_to_the_image_of_whole_half_periods():
-    """Its window of 50 ms holds whole periods of 40 and 60 Hz, so nothing is left of the bias; 47 Hz keeps 0.075 %."""
-    for frequency, bias in ((40.0, 0.0), (60.0, 0.0), (47.0, -(image("boxcar", 47.0) ** 2) / 4)):
-        _, sensed = hold("boxcar", tones(frequency), 4.0)
-        assert error(sensed.motion, frequency)[0] == pytest.approx(bias, rel=0.1, abs=1e-5)
-
-
-def fall(to, seconds=4.0):
-    """A 47 Hz tone of 10 um that falls after half the time."""
-    time = np.arange(round(seconds * RATE)) / RATE
-    return WANTED * np.where(time < seconds / 2, 1.0, to) * np.cos(2 * np.pi * 47.0 * time)
-
-
-def test_without_the_clamp_a_falling_target_turns_the_feedback_round():
-    """FACTS 2 row 1: below 2.6 % of the present amplitude the command goes negative and runs to the current limit."""
-    bands = dataclasses.replace(tones(47.0), envelope=None)
-    for clamp, low in ((True, True), (False, False)):
-        drive, _ = hold(CommonMode(clamp=clamp), bands, 4.0, wanted=fall(0.001))
-        assert (abs(drive[-1000:]).max() < 0.01) == low
-
-
-def test_subtracted_phases_run_away_on_the_seam():
-    """FACTS 2 row 2: a reference phase on the branch cut; arg(X conj R) has no seam between the two."""
-    bands = tones(47.0, envelope=WANTED * np.exp(0.5j * np.pi))
-    for subtract, holds in ((False, True), (True, False)):
-        _, sensed = hold(PerSide(subtract=subtract), bands, 6.0, QUIET | {"sensor_noise": 1e-6})
-        n = np.arange(len(sensed.motion))[-5000:]
-        found = 2 * np.mean(sensed.motion[n, 0] * np.exp(-2j * np.pi * 47.0 * n / RATE)) / (1j * WANTED)
-        assert (abs(found - 1) < 0.05) == holds
-
-
-def test_an_unfiltered_reference_makes_the_feedback_fight_the_feed_forward():
-    """FACTS 2 row 11: with feed-forward alone the free plate is exact; compared unfiltered, the loop sees an error.
-
-    That error integrates to ki times the low pass's delay, 14.8 * 22.5 ms = 33 %, of which the loop shows most.
-    """
-    peak = {}
-    for filtered in (True, False):
-        _, sensed = hold(DynamicStiffness(feed_forward=True, filtered=filtered), tones(111.0), 1.0)
-        window = round(9 * RATE / 111.0)
-        turned = 2 * sensed.motion[:, 0] * np.exp(-2j * np.pi * 111.0 * np.arange(5000) / RATE)
-        peak[filtered] = abs(np.convolve(turned, np.ones(window) / window, "valid")).max() / WANTED - 1.0
-    assert peak[True] < 0.005
-    assert 0.1 < peak[False] < 0.33
-
-
-def test_chosen_bandwidths_are_not_checked():
-    """FACTS 2 row 3: the rule of a quarter and a half of the lowest carrier is what keeps the 20 Hz image out."""
-    bias = {}
-    for factor in (1.0, 3.0):
-        _, sensed = hold(CommonMode(bandwidths=(5.0 * factor, 10.0 * factor)), tones(20.0), 6.0)
-        bias[factor] = error(sensed.motion, 20.0)[0]
-    assert abs(bias[1.0]) < 2e-3
-    assert bias[3.0] == pytest.approx(-0.057, abs=0.005)
-
-
 def chirped(method, speed, mechanics):
     """Complex rms error (relative) of a chirp from 30 to 390 Hz at `speed` (Hz/s) with a finger 10 mm to one side.
 
@@ -371,31 +261,3 @@ def test_a_chirp_tells_the_methods_apart():
         assert chirped(name, 800.0, "heavy") > 0.2
     assert chirped("static", 800.0, "none") > 2 * chirped("stiffness", 800.0, "none")
     assert chirped("h", 800.0, "heavy") < 0.04
-
-
-def slid(method, frequency):
-    """Amplitude rms error (relative) of centre and worse end, heavy finger sliding +-25 mm at 100 mm/s, from 1 s on."""
-    finger = hr.Finger.sliding(speed=0.1, normal_load=0.8, mechanics="heavy")
-    _, sensed = hold(method, tones(frequency), 5.0, finger=finger)
-    window = round(round(0.04 * frequency) * RATE / frequency)
-    turned = 2 * sensed.motion * np.exp(-2j * np.pi * frequency * np.arange(len(sensed.motion)) / RATE)[:, None]
-    total = np.cumsum(turned, axis=0)[5000:]
-    rms = np.sqrt(np.mean((abs(total[window:] - total[:-window]) / window / WANTED - 1.0) ** 2, axis=0))
-    return rms[0], rms[1:].max()
-
-
-def test_a_sliding_heavy_finger_tells_the_methods_apart():
-    """FACTS 3: centre 84 % per side, 5.2 % polar common mode, diverged static, 1.4 % H; ends 93 % against 10 %."""
-    assert slid("paper", 143.0)[0] > 0.5
-    centre, end = slid("paper-common", 178.0)
-    assert centre == pytest.approx(0.052, abs=0.006)
-    assert slid("static", 178.0)[0] > 1.0
-    assert slid("paper-common", 143.0)[1] > 0.7
-    centre, end = slid("h", 143.0)
-    assert centre < 0.014
-    assert end < 0.10
-
-
-def test_the_static_inverse_with_feed_forward_still_diverges():
-    _, sensed = hold(StaticInverse(feed_forward=True), tones(143.0), 12.0)
-    assert abs(error(sensed.motion, 143.0)).max() > 0.1

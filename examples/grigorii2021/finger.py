@@ -13,7 +13,8 @@ import numpy as np
 
 from examples.grigorii2021.claims import Array, Claim, Curve, Item, Panel
 from examples.grigorii2021.formulas import FILTER, FREQUENCIES, FREQUENCY, GRID, LOOP
-from hapticrender.control.loopshape import margins, reduced_controller
+from examples.grigorii2021.shaping import analyse
+from hapticrender.control.loopshape import reduced_controller
 from hapticrender.control.transfer import TransferFunction, butterworth
 from hapticrender.plants.plate import PlateParameters
 from hapticrender.touch.mechanics import HEAVY, HEAVY_SECOND, LIGHT, LIGHT_SECOND, FingerMechanics
@@ -74,7 +75,7 @@ def _bandwidth_lost(parameters: PlateParameters, frequency: float) -> tuple[floa
     law, low_pass = reduced_controller(LOOP, FILTER), butterworth(FILTER)
     weak = TransferFunction(tuple(gain * each for each in law.numerator), law.denominator)
     free, held = (
-        margins(each, low_pass, amplitude_pole=width * mode * ratio if resonant else None).bandwidth
+        analyse(each, low_pass, amplitude_pole=width * mode * ratio if resonant else None).bandwidth
         for each, width in ((law, 1), (weak, 2))
     )
     return 100 * (1 - held / free), 100 * (1 - gain)

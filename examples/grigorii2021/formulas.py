@@ -14,7 +14,8 @@ from scipy.signal import butter, freqz, lfilter
 from scipy.special import stdtr
 
 from examples.grigorii2021.claims import Array, Claim, Curve, Item, Panel
-from hapticrender.control.loopshape import exact_controller, margins, reduced_controller
+from examples.grigorii2021.shaping import analyse, exact_controller
+from hapticrender.control.loopshape import reduced_controller
 from hapticrender.control.transfer import TransferFunction, butterworth
 from hapticrender.plants.plate import PlateParameters
 
@@ -51,7 +52,7 @@ def controller() -> Item:
     frequency = np.geomspace(0.1, 100.0, 301)
     magnitude, phase = [], []
     for name, law in laws.items():
-        loop = margins(law, low_pass, lowest_frequency=LOWEST)
+        loop = analyse(law, low_pass, lowest_frequency=LOWEST)
         claims += [
             Claim(f"bandwidth of T, C {name}", LOOP, loop.bandwidth, 0.5, "Hz"),
             Claim(f"sensing error in the drive at 20 Hz, C {name}", 0.5, 100 * loop.ripple, 0, "%", "<="),

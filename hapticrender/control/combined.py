@@ -58,21 +58,17 @@ class CombinedBands(Bands):
     friction_index: Array
 
 
+BUFFERS = ("sensed", "drive", "waveform", "target", "flags", "position")
 PART = np.dtype(
     [
         *((name, np.int64) for name in ("step", "state", "signals", "sensors", "channels", "bands", "index")),
         ("scale", np.complex128),  # target of the skin's velocity per target of the part; 0: j w
         ("scale_waveform", np.float64),  # of the part per waveform of both
-        *(
-            (name, np.int64)
-            for name in ("sensed_at", "drive_at", "waveform_at", "target_at", "flags_at", "position_at")
-        ),
+        *((f"{name}_at", np.int64) for name in BUFFERS),
     ]
 )
-COMBINED = np.dtype(
-    [("bands", np.int64), ("channels", np.int64), ("sensors", np.int64), ("block", np.int64), ("parts", PART, (2,))]
-)
-COMBINED_T, PART_T = numba.from_dtype(COMBINED), numba.from_dtype(PART)
+COMBINED = np.dtype([*((name, np.int64) for name in ("bands", "channels", "sensors", "block")), ("parts", PART, (2,))])
+COMBINED_T = numba.from_dtype(COMBINED)
 
 
 @step
@@ -144,19 +140,16 @@ class CombinedController:
         self.rate = next((part.rate for part in parts if part is not None), 0.0)
         self.block = max(part.block if part is not None else 1 for part in parts)
         self.state = np.zeros(1, COMBINED)
-        self.state[0]["bands"], self.state[0]["channels"] = len(bands), sum(channels)
-        self.state[0]["sensors"], self.state[0]["block"] = sum(sensors), self.block
+        self.state[0] = (len(bands), self.channels, self.sensors, self.block, self.state[0]["parts"])
         self._buffers: list[Array] = []
-        analysed = bands.envelope is None
         shares = ((bands.plate_index, 0.0, 1.0), (bands.friction_index, velocity_per_force, 1.0 / velocity_per_force))
         for i, (part, (index, scale, per_target)) in enumerate(zip(parts, shares, strict=True)):
-            own = self.state[0]["parts"][i]
-            bands_of = 0 if part is None else part.n_bands
+            own, count = self.state[0]["parts"][i], 0 if part is None else part.n_bands
             arrays = {
                 "sensed": np.zeros((self.block, sensors[i])),
                 "drive": np.zeros((self.block, channels[i])),
                 "waveform": np.zeros(self.block),
-                "target": np.zeros((1, bands_of), complex),
+                "target": np.zeros((1, count), complex),
                 "flags": np.zeros(self.block, np.int64),
                 "position": np.zeros(self.block),
             }
@@ -164,9 +157,9 @@ class CombinedController:
             self._buffers += [*arrays.values(), indices, signals]
             for name, array in arrays.items():
                 own[f"{name}_at"] = array.ctypes.data
-            own["signals"], own["index"], own["bands"] = signals.ctypes.data, indices.ctypes.data, bands_of
+            own["signals"], own["index"], own["bands"] = signals.ctypes.data, indices.ctypes.data, count
             own["sensors"], own["channels"], own["scale"] = sensors[i], channels[i], scale
-            own["scale_waveform"] = per_target if analysed else 1.0
+            own["scale_waveform"] = per_target if bands.envelope is None else 1.0
             if part is not None:
                 own["step"], own["state"] = part.step.address, part.state.ctypes.data
 
@@ -202,9 +195,8 @@ def design_combined(
         method.design(each, own, feedback=feedback) if each is not None and len(own) else None
         for each, own in zip(models, shares, strict=True)
     )
-    sensors = (model.plate.coordinate_from_sensed.shape[1], 1)
+    sensors = (model.plate.coordinate_from_sensed.shape[1], 1) if feedback else (0, 0)
     channels = (model.plate.force_from_drive.shape[1], 1)
-    listened = sensors if feedback else (0, 0)
     return CombinedController(
-        (parts[0], parts[1]), bands, model.velocity_per_force, listened, channels, getattr(method, "name", "")
+        (parts[0], parts[1]), bands, model.velocity_per_force, sensors, channels, getattr(method, "name", "")
     )

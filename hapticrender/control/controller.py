@@ -9,10 +9,13 @@ import numpy as np
 
 from hapticrender.bands import Bands
 from hapticrender.control.carriers import REFRESH
+from hapticrender.control.device_model import DeviceModel
 from hapticrender.control.records import (
     COMMAND,
     CONTROLLER,
     FADING,
+    MOST_CHANNELS,
+    MOST_SENSORS,
     PAIR,
     SAMPLE_ROWS,
     SETPOINT_ROWS,
@@ -109,10 +112,6 @@ class BankController:
         """Copy of a field of every band's tile, shape (bands,)."""
         return lanes(self.tiles, name, self.n_bands)
 
-    def reference(self) -> Array:
-        """Reference envelope R of every band, complex, shape (bands,)."""
-        return self.field("r_re") + 1j * self.field("r_im")
-
     def largest(self, name: str) -> Array:
         """Largest magnitude over the coordinates of a complex field of the loops, shape (bands,)."""
         return np.max([np.hypot(self.field(f"{name}{i}_re"), self.field(f"{name}{i}_im")) for i in (0, 1)], axis=0)
@@ -120,8 +119,7 @@ class BankController:
     @property
     def turns(self) -> Array:
         """Fixed part of each carrier's phase at the next sample (turns, 0 to 1, shape (bands,))."""
-        samples = self.block if self.block > 1 else 1
-        left = 0 if samples > 1 else -int(self.state["sample"][0]) % REFRESH
+        left = 0 if self.block > 1 else -int(self.state["sample"][0]) % REFRESH
         return np.mod(self.field("turns") - left * self.setpoints[0, : self.n_bands] / self.settings["rate"], 1.0)
 
     @property
@@ -131,13 +129,13 @@ class BankController:
         There the law alone should do: what the integral has to make up for is what the device model lacks.
         """
         state = self.state[0]
-        if state["contact"] != 0.0:
+        touched = state["contact"] != 0.0 or state["confidence"] < 1.0 or state["scale"] < 1.0
+        if touched or not self.settings["observer"] > 0.0:
             return 0.0
-        if state["confidence"] < 1.0 or state["scale"] < 1.0 or not self.settings["observer"] > 0.0:
-            return 0.0
-        size = np.where(self.setpoints[1, : self.n_bands] == 0.0, abs(self.reference()), 0.0)
-        error = self.largest("e")
-        integral = self.largest("v")
+        size = np.where(
+            self.setpoints[1, : self.n_bands] == 0.0, abs(self.field("r_re") + 1j * self.field("r_im")), 0.0
+        )
+        error, integral = self.largest("e"), self.largest("v")
         counts = (size > LEAST_TARGET * self.settings["sensor_limit"]) & (error < SETTLED * size)
         return float((integral[counts] / size[counts]).max(initial=0.0))
 
@@ -203,20 +201,18 @@ def setpoint_rows(bands: Bands) -> Array:
 
     The shape is (7, lanes), with zeros in lanes beyond the bands.
     """
-    rows = aligned((SETPOINT_ROWS, max(-(-len(bands) // W), 1) * W))
-    target = np.zeros(len(bands), complex) if bands.envelope is None else bands.envelope
-    response = (
-        np.ones(len(bands), complex) if bands.sensor_response is None else np.asarray(bands.sensor_response, complex)
-    )
-    rows[:, : len(bands)] = (
+    n = len(bands)
+    rows = aligned((SETPOINT_ROWS, max(-(-n // W), 1) * W))
+    rows[0, :n], rows[1, :n], rows[2, :n], rows[5, :n] = (
         bands.frequency,
         bands.wavenumber,
         bands.phase / (2 * np.pi),
-        target.real,
-        target.imag,
-        response.real,
-        response.imag,
+        1.0,
     )
+    if bands.envelope is not None:
+        rows[3, :n], rows[4, :n] = bands.envelope.real, bands.envelope.imag
+    if bands.sensor_response is not None:
+        rows[5, :n], rows[6, :n] = np.real(bands.sensor_response), np.imag(bands.sensor_response)
     return rows
 
 
@@ -235,8 +231,65 @@ def lowest_fixed(bands: Bands) -> float:
     return float(np.min(bands.frequency[bands.wavenumber == 0.0], initial=math.inf))
 
 
-def padded(matrix: Array, rows: int, columns: int) -> Array:
+def lowest_carrier(model: DeviceModel, bands: Bands) -> float:
+    """Lowest carrier (Hz): of the fixed ones, and of what a moving finger makes of the others."""
+    return min(lowest_fixed(bands), model.lowest_frequency if (bands.wavenumber > 0.0).any() else math.inf)
+
+
+def shared_settings(
+    model: DeviceModel, bands: Bands, sensor_map: Array, drive_map: Array, feedback: bool
+) -> dict[str, Any]:
+    """Settings that every method has, sample by sample.
+
+    Parameters
+    ----------
+    model : DeviceModel
+    bands : Bands
+    sensor_map : ndarray, shape (c, s)
+        Controlled coordinates from sensors.
+    drive_map : ndarray, shape (d, c)
+        Drive channels from what the law commands in each coordinate.
+    feedback : bool
+        False: nothing is sensed.
+
+    Raises
+    ------
+    ValueError
+        The device has too many coordinates, channels or sensors.
+    """
+    sensor_map = sensor_map[:, : None if feedback else 0]
+    counts = {"coordinates": len(sensor_map), "channels": len(drive_map), "sensors": sensor_map.shape[1]}
+    for (name, count), most in zip(counts.items(), (2, MOST_CHANNELS, MOST_SENSORS), strict=True):
+        if count > most:
+            raise ValueError(f"the device model has {count} {name}: must be <= {most}")
+    return {
+        **counts,
+        "block": 1,
+        "coordinate_from_sensor": _padded(sensor_map, 2, MOST_SENSORS),
+        "drive_from_force": _padded(drive_map, MOST_CHANNELS, 2),
+        "rate": float(model.rate),
+        "lead": (model.delay + 0.5) / model.rate,
+        "middle": 1.0,
+        "lowest": float(model.lowest_frequency),
+        "highest": float(min(model.highest_frequency, 0.4 * model.rate)),
+        "analysed": bands.envelope is None,
+        "modulated": bands.modulated,
+        "differentiated": bands.differentiated,
+        "sensor_limit": float(model.sensed_limit),
+        "drive_limit": float(model.drive_limit),
+    }
+
+
+def device_settings(model: DeviceModel) -> dict[str, Any]:
+    """Settings of the methods that invert the device's dynamic stiffness."""
+    return {
+        **{name: _padded(getattr(model, name), 2, 2) for name in ("mass", "damping", "stiffness")},
+        "shape": np.append(model.pattern, [0.0])[:2],
+        "needs_contact": model.finger.needs_contact,
+        "least_speed": model.finger.least_speed,
+    }
+
+
+def _padded(matrix: Array, rows: int, columns: int) -> Array:
     """Matrix with zeros below and beside it."""
-    out = np.zeros((rows, columns))
-    out[: matrix.shape[0], : matrix.shape[1]] = matrix
-    return out
+    return np.pad(matrix, ((0, rows - matrix.shape[0]), (0, columns - matrix.shape[1])))

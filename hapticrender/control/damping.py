@@ -96,11 +96,6 @@ class Damping:
     noise: tuple[float, ...]
     note: str
 
-    @property
-    def grip(self) -> Array:  # removed with the old kernels
-        """Return `added_damping`."""
-        return self.added_damping
-
     def text(self) -> str:
         """Return the note and a line of margins for each coordinate."""
         lines = [
@@ -166,48 +161,28 @@ def damping_taps(
     if count < least:
         raise ValueError(f"{count=} taps: must be >= {least}, one for each equation")
     parts = oscillators(model)
-    taps = [_taps(part, quality, bending, c, count, min(model.taps, count)) for c, part in enumerate(parts)]
-    return np.array(taps), np.array([part.mass * part.omega / quality for part in parts])
+    return _taps(parts, quality, bending, count, model.taps), np.array([p.mass * p.omega / quality for p in parts])
 
 
-def _taps(part: Oscillator, quality: float, bending: BendingMode | None, c: int, count: int, plain: int) -> Array:
-    """Taps of one coordinate; as many as `plain` where the bending mode does not couple into it."""
-    angle = part.omega / part.rate
-    hold_and_delay = np.sinc(angle / (2 * np.pi)) * np.exp(-1j * angle * (part.delay + 0.5))
-    equations = [(0.0, 0.0), (angle, 1j * part.omega * part.mass * part.omega / quality / hold_and_delay)]
-    if bending is not None and bending.coupling[c] != 0.0:
-        equations.append((2 * np.pi * bending.frequency / part.rate, 0.0))
-        plain = count
-    turns = np.exp(-1j * np.outer([each[0] for each in equations], np.arange(plain)))
-    values = np.array([each[1] for each in equations])
-    rows = np.stack([turns.real, turns.imag], axis=1).reshape(-1, plain)
-    taps = np.zeros(count)
-    taps[:plain] = np.linalg.lstsq(rows, np.stack([values.real, values.imag], axis=1).ravel(), rcond=None)[0]
+def _taps(parts: tuple[Oscillator, ...], quality: float, bending: BendingMode | None, count: int, plain: int) -> Array:
+    """Taps of every coordinate; as many as `plain` where the bending mode does not couple into it."""
+    taps = np.zeros((len(parts), count))
+    for c, part in enumerate(parts):
+        angle, used = part.omega / part.rate, min(plain, count)
+        hold_and_delay = np.sinc(angle / (2 * np.pi)) * np.exp(-1j * angle * (part.delay + 0.5))
+        equations = [(0.0, 0.0), (angle, 1j * part.omega * part.mass * part.omega / quality / hold_and_delay)]
+        if bending is not None and bending.coupling[c] != 0.0:
+            equations.append((2 * np.pi * bending.frequency / part.rate, 0.0))
+            used = count
+        angles, values = np.array(equations).T
+        turns = np.exp(-1j * np.outer(angles.real, np.arange(used)))
+        rows = np.stack([turns.real, turns.imag], axis=1).reshape(-1, used)
+        taps[c, :used] = np.linalg.lstsq(rows, np.stack([values.real, values.imag], axis=1).ravel(), rcond=None)[0]
     return taps
 
 
-def damping_margins(model: DeviceModel, taps: Array, *, bending: BendingMode | None = None) -> tuple[Margins, ...]:
-    """Margins of the inner damper, one for each coordinate.
-
-    Parameters
-    ----------
-    model : DeviceModel
-        The free device.
-    taps : ndarray, shape (coordinates, n), N/m
-        Of `damping_taps`.
-    bending : BendingMode, optional
-        A mode of the surface in the loop, at its `frequency`.
-    """
-    return tuple(_DamperLoop(part, taps[c], bending, c).margins() for c, part in enumerate(oscillators(model)))
-
-
-def damping_noise(model: DeviceModel, taps: Array, *, bending: BendingMode | None = None) -> tuple[float, ...]:
-    """Motion that white sensor noise causes through the damper, rms of each coordinate per rms of each sensor."""
-    return tuple(_DamperLoop(part, taps[c], bending, c).noise() for c, part in enumerate(oscillators(model)))
-
-
-class _DamperLoop:
-    """Loop of one coordinate with its damper, exact in discrete time."""
+class DamperLoop:
+    """Loop of one coordinate with its damper, exact in discrete time; a bending mode lies at its `frequency`."""
 
     def __init__(self, part: Oscillator, taps: Array, bending: BendingMode | None, c: int) -> None:
         self.part, self.taps = part, taps
@@ -239,12 +214,19 @@ class _DamperLoop:
         return margins_of(self.response, grid[grid > 0])
 
     def noise(self) -> float:
-        """Rms of the coordinate per rms of each sensor."""
+        """Motion that white sensor noise causes through the damper, rms of the coordinate per rms of each sensor."""
         grid = self.grid()
         loop = self.response(grid)[:, 0, 0]
         power = np.abs(loop / (1 + loop)) ** 2
         mean = np.sum((power[1:] + power[:-1]) / 2 * np.diff(grid)) / (self.part.rate / 2)
-        return self.part.sensor_gain * math.sqrt(mean)
+        return float(self.part.sensor_gain * math.sqrt(mean))
+
+
+def damper_loops(
+    parts: tuple[Oscillator, ...], taps: Array, bending: BendingMode | None = None
+) -> tuple[DamperLoop, ...]:
+    """Loops of all coordinates with their taps (N/m, shape (coordinates, n))."""
+    return tuple(DamperLoop(part, taps[c], bending, c) for c, part in enumerate(parts))
 
 
 def _held_mode(z: Array, rate: float, omega: float, ratio: float, gain: float) -> Array:
@@ -273,63 +255,63 @@ def choose_damping(
         Without it Q stays at 2 or above, unless the model is known to be rigid.
     least : LeastMargins
 
-    Returns
-    -------
-    Damping
-
     Notes
     -----
     Q rises in steps of 0.1 until every coordinate keeps `least`, with the bending mode where it was measured, and Ms
-    stays below 5 with that mode at both ends of its spread.  Where even a damper of four times the modes' own damping
-    would not, the damper is off.  Notched taps reach back 0.6 to 1 bending period; the reach with the least noise is
-    taken.
+    stays below 5 with that mode at both ends of its tolerance.  Where even a damper of four times the modes' own
+    damping would not, the damper is off.  Notched taps reach back 0.6 to 1 bending period; the reach with the least
+    noise is taken.
     """
     if not (model.mass.diagonal() > 0.0).all():
-        return _off(len(model.mass), "off: the device has no mode")
+        return _off(len(model.mass), "the device has no mode")
     known = model.rigid if bending is None else bending.measured
-    parts, least_quality = oscillators(model), QUALITY if known else QUALITY_UNMEASURED
-    largest = 1 / (2 * WORTH * max(*(part.ratio for part in parts), LEAST_RATIO))
-    lag = f"a delay of {model.delay} sample{'s' * (model.delay != 1)} at {model.rate:g} Hz"
-    if largest < least_quality:
-        return _off(len(parts), f"off: the modes damp themselves (Q {WORTH * largest:.1f})")
-    if not within_a_turn(model):
-        fastest = max(part.omega for part in parts) / (2 * np.pi)
-        return _off(len(parts), f"off: {lag} is longer than a period of the mode at {fastest:.0f} Hz")
-    complaint = raised = ""
-    for step in range(int((largest - least_quality) / QUALITY_STEP) + 1):
-        quality = round(least_quality + step * QUALITY_STEP, 1)
-        count, complaint = _quietest(parts, quality, bending, model.taps, least)
-        if not complaint:
-            taps, added = damping_taps(model, quality, bending=bending, count=count)
-            return Damping(
-                taps=taps,
-                added_damping=added,
-                quality=quality,
-                margins=damping_margins(model, taps, bending=bending),
-                noise=damping_noise(model, taps, bending=bending),
-                note=f"on: Q {quality:g}{raised}; {_spared(count, bending)}",
-            )
-        raised = f" (at Q {quality:g}, with {lag}, {complaint})"
-    return _off(len(parts), f"off: with {lag}, {complaint} even at Q {quality:g}")
+    return _chosen(oscillators(model), QUALITY if known else QUALITY_UNMEASURED, bending, model.taps, least)
 
 
 def within_a_turn(model: DeviceModel) -> bool:
     """Whether delay and hold are no longer than a period of the fastest mode."""
-    return bool(max(part.omega for part in oscillators(model)) * (model.delay + 0.5) / model.rate <= 2 * np.pi)
+    return _turns(oscillators(model)) <= 1.0
 
 
-@lru_cache(maxsize=4096)
-def _quietest(
-    parts: tuple[Oscillator, ...], quality: float, bending: BendingMode | None, plain: int, least: LeastMargins
-) -> tuple[int, str]:
-    """Number of taps that keeps `least` with the least noise; or the last complaint where none does."""
-    kept, complaint = [], ""
-    for count in _counts(parts[0].rate, bending, plain):
-        taps = [_taps(part, quality, bending, c, count, min(plain, count)) for c, part in enumerate(parts)]
-        complaint = _complaint(parts, taps, bending, least)
-        if not complaint:
-            kept.append((max(_DamperLoop(part, taps[c], bending, c).noise() for c, part in enumerate(parts)), count))
-    return (min(kept)[1], "") if kept else (0, complaint)
+def _turns(parts: tuple[Oscillator, ...]) -> float:
+    """Periods of the fastest mode in delay and hold."""
+    return max(part.omega * (part.delay + 0.5) / (2 * np.pi * part.rate) for part in parts)
+
+
+@lru_cache(maxsize=256)
+def _chosen(
+    parts: tuple[Oscillator, ...], least_quality: float, bending: BendingMode | None, plain: int, least: LeastMargins
+) -> Damping:
+    """Raise Q until the margins hold; `plain` taps where no bending mode is known."""
+    rate, delay = parts[0].rate, parts[0].delay
+    largest = 1 / (2 * WORTH * max(*(part.ratio for part in parts), LEAST_RATIO))
+    lag = f"a delay of {delay} sample{'s' * (delay != 1)} at {rate:g} Hz"
+    if largest < least_quality:
+        return _off(len(parts), f"the modes damp themselves (Q {WORTH * largest:.1f})")
+    if _turns(parts) > 1.0:
+        fastest = max(part.omega for part in parts) / (2 * np.pi)
+        return _off(len(parts), f"{lag} is longer than a period of the mode at {fastest:.0f} Hz")
+    complaint = raised = ""
+    for step in range(int((largest - least_quality) / QUALITY_STEP) + 1):
+        quality = round(least_quality + step * QUALITY_STEP, 1)
+        kept = []
+        for count in _counts(rate, bending, plain):
+            taps = _taps(parts, quality, bending, count, plain)
+            complaint = _complaint(parts, taps, bending, least)
+            if not complaint:
+                kept.append((tuple(loop.noise() for loop in damper_loops(parts, taps, bending)), taps))
+        if kept:
+            noise, taps = min(kept, key=lambda each: max(each[0]))
+            return Damping(
+                taps=taps,
+                added_damping=np.array([part.mass * part.omega / quality for part in parts]),
+                quality=quality,
+                margins=tuple(loop.margins() for loop in damper_loops(parts, taps, bending)),
+                noise=noise,
+                note=f"on: Q {quality:g}{raised}; {_spared(taps.shape[1], bending)}",
+            )
+        raised = f" (at Q {quality:g}, with {lag}, {complaint})"
+    return _off(len(parts), f"with {lag}, {complaint} even at Q {quality:g}")
 
 
 def _counts(rate: float, bending: BendingMode | None, plain: int) -> list[int]:
@@ -339,16 +321,14 @@ def _counts(rate: float, bending: BendingMode | None, plain: int) -> list[int]:
     return sorted({max(TAPS + 2, 1 + round(span * rate / bending.frequency)) for span in REACHES})
 
 
-def _complaint(
-    parts: tuple[Oscillator, ...], taps: list[Array], bending: BendingMode | None, least: LeastMargins
-) -> str:
-    """First margin that falls short, with the bending mode at its place and at the ends of its spread."""
+def _complaint(parts: tuple[Oscillator, ...], taps: Array, bending: BendingMode | None, least: LeastMargins) -> str:
+    """First margin that falls short, with the bending mode at its place and at the ends of its tolerance."""
     cases = [(bending, least, "")]
     if bending is not None:
         cases += [(corner, LOOSE, f" with the bending mode at {corner.frequency:g} Hz") for corner in bending.corners()]
     for mode, bound, where in cases:
-        for c, part in enumerate(parts):
-            if complaint := bound.complaint(_DamperLoop(part, taps[c], mode, c).margins(), part.rate):
+        for loop in damper_loops(parts, taps, mode):
+            if complaint := bound.complaint(loop.margins(), loop.part.rate):
                 return complaint + where
     return ""
 
@@ -361,13 +341,7 @@ def _spared(count: int, bending: BendingMode | None) -> str:
     return f"{count} taps spare the bending mode {known} at {bending.frequency:.0f} +-{bending.spread:.0f} Hz"
 
 
-def _off(coordinates: int, note: str) -> Damping:
+def _off(coordinates: int, reason: str) -> Damping:
     """No damper."""
-    return Damping(
-        taps=np.zeros((coordinates, TAPS)),
-        added_damping=np.zeros(coordinates),
-        quality=math.inf,
-        margins=(),
-        noise=(),
-        note=note,
-    )
+    taps, none = np.zeros((coordinates, TAPS)), np.zeros(coordinates)
+    return Damping(taps=taps, added_damping=none, quality=math.inf, margins=(), noise=(), note=f"off: {reason}")

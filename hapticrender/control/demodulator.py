@@ -5,61 +5,66 @@ from __future__ import annotations
 import math
 from typing import Any
 
-import numba
 import numpy as np
 
 from hapticrender.control.estimators import StarSTDFT
 from hapticrender.control.records import W, aligned
 from hapticrender.jit import entry, kernel, record
-from hapticrender.mathx import frac, sincos_turns
+from hapticrender.mathx import unit
 from hapticrender.protocols import Array
+from hapticrender.vectors import conj, get, nearest, put, tile_type
 
 REFRESH = 64  # samples between two settings of the carriers from their phases
-TILE = np.dtype([(name, np.float64, (W,)) for name in ("turns", "step", "cos", "sin", "turn_cos", "turn_sin")])
-SECTION = np.dtype([(name, np.float64, (W,)) for name in ("re", "im", "re1", "re2", "im1", "im2")])
-TILE_T, SECTION_T = numba.from_dtype(TILE), numba.from_dtype(SECTION)
+NAMES = (
+    "turns",
+    "step",
+    *(f"{name}_{part}" for name in ("turn", "carrier", "x", "low1", "low2") for part in ("re", "im")),
+)
+TILE = np.dtype([(name, np.float64, (W,)) for name in NAMES])
+TILE_T = tile_type(TILE)
 
 
 @kernel
-def set_carriers(tile, t):
-    """Set the carriers of a tile from their phases, counted in turns, which then go on to the next refresh."""
-    b = record(tile, TILE_T, t)
-    for k in range(W):
-        b.sin[k], b.cos[k] = sincos_turns(b.turns[k])
-        b.turns[k] = frac(b.turns[k] + REFRESH * b.step[k])
+def filter_tile(tiles, i, x, coefficients, refresh):
+    """Update the envelopes L[2 x e^(-j phi)] of a tile, L a section in transposed direct form II; turn its carriers.
 
-
-@kernel
-def filter_tile(tile, t, sections, i, x, coefficients, turn):
-    """Update the envelopes L[2 x e^(-j phi)] of a tile, L a section in transposed direct form II; turn its carriers."""
-    b, s = record(tile, TILE_T, t), record(sections, SECTION_T, i)
-    x0, x1, x2 = 2.0 * x * coefficients[0], 2.0 * x * coefficients[1], 2.0 * x * coefficients[2]
-    a1, a2 = coefficients[3], coefficients[4]
-    for k in range(W):
-        cos, sin = b.cos[k], b.sin[k]
-        re, im = x0 * cos + s.re1[k], s.im1[k] - x0 * sin
-        s.re1[k], s.im1[k] = x1 * cos - a1 * re + s.re2[k], s.im2[k] - x1 * sin - a1 * im
-        s.re2[k], s.im2[k] = x2 * cos - a2 * re, -x2 * sin - a2 * im
-        s.re[k], s.im[k] = re, im
-        b.cos[k] = cos * b.turn_cos[k] - sin * b.turn_sin[k] if turn else cos
-        b.sin[k] = sin * b.turn_cos[k] + cos * b.turn_sin[k] if turn else sin
+    At a refresh the carriers are set from their phases, counted in turns, which then go on to the next one.
+    """
+    b = record(tiles, TILE_T, i)
+    carrier = get(b, "carrier")
+    if refresh:
+        turns = get(b, "turns")
+        carrier = unit(turns)
+        turns = turns + float(REFRESH) * get(b, "step")
+        put(b, "turns", turns - nearest(turns))
+    found = 2.0 * x * conj(carrier)
+    envelope = coefficients[0] * found + get(b, "low1")
+    put(b, "low1", coefficients[1] * found - coefficients[3] * envelope + get(b, "low2"))
+    put(b, "low2", coefficients[2] * found - coefficients[4] * envelope)
+    put(b, "x", envelope)
+    put(b, "carrier", carrier * get(b, "turn"))
 
 
 @entry
-def demodulate(coefficients, tiles, sections, first, samples, envelopes):
-    """Write the envelopes of every sample, channel and band, real and imaginary parts in turns."""
-    channels, bands = samples.shape[1], envelopes.shape[2] // 2
+def demodulate(coefficients, tiles, first, samples, envelopes):
+    """Write the envelopes of every sample, channel and band; each channel has carriers of its own beside its filters.
+
+    Only the last tile of a channel may be filled in part; loops over whole ones vectorise.
+    """
+    channels, bands = samples.shape[1], envelopes.shape[2]
     count = -(-bands // W)
     for n in range(samples.shape[0]):
-        for t in range(count):
-            if (first + n) % REFRESH == 0:
-                set_carriers(tiles, t)
-            for c in range(channels):
-                x = samples[n, c] if math.isfinite(samples[n, c]) else 0.0
-                filter_tile(tiles, t, sections, c * count + t, x, coefficients, c == channels - 1)
-                s = record(sections, SECTION_T, c * count + t)
-                for k in range(min(W, bands - W * t)):
-                    envelopes[n, c, 2 * (W * t + k)], envelopes[n, c, 2 * (W * t + k) + 1] = s.re[k], s.im[k]
+        for c in range(channels):
+            x = samples[n, c] if math.isfinite(samples[n, c]) else 0.0
+            for t in range(count):
+                filter_tile(tiles, c * count + t, x, coefficients, (first + n) % REFRESH == 0)
+                b = record(tiles, TILE_T, c * count + t)
+                if W * t + W <= bands:
+                    for k in range(W):
+                        envelopes[n, c, W * t + k] = complex(b.x_re[k], b.x_im[k])
+                else:
+                    for k in range(bands - W * t):
+                        envelopes[n, c, W * t + k] = complex(b.x_re[k], b.x_im[k])
 
 
 class Demodulator:
@@ -83,8 +88,8 @@ class Demodulator:
 
     Notes
     -----
-    Delay and frequency response are those of `hapticrender.control.estimators.StarSTDFT`, whose `demodulate` takes
-    carriers that move.  At 0 Hz and half the rate the envelope is doubled.
+    Delay and frequency response are those of `hapticrender.control.estimators.StarSTDFT`.  At 0 Hz and half the rate
+    the envelope is doubled.
 
     Examples
     --------
@@ -104,11 +109,15 @@ class Demodulator:
         self.frequency, self.channels, self._sample = frequency, int(channels), 0
         self._coefficients = tuple(float(each) for each in (*b, *a[1:]))
         count = -(-frequency.size // W)
-        self._tiles, self._sections = aligned(count, TILE), aligned(self.channels * count, SECTION)
         step = np.zeros((count, W))
         step.reshape(-1)[: frequency.size] = frequency / rate
-        self._tiles["step"] = step
-        self._tiles["turn_cos"], self._tiles["turn_sin"] = np.cos(2 * np.pi * step), np.sin(2 * np.pi * step)
+        self._tiles = aligned(self.channels * count, TILE)
+        for name, value in (
+            ("step", step),
+            ("turn_re", np.cos(2 * np.pi * step)),
+            ("turn_im", np.sin(2 * np.pi * step)),
+        ):
+            self._tiles[name] = np.tile(value, (self.channels, 1))
 
     def run(self, samples: Array, out: Array | None = None) -> Array:
         """Estimate the envelopes of the next n samples; any split into blocks gives the same.
@@ -132,7 +141,6 @@ class Demodulator:
         out = np.empty(shape, complex) if out is None else out
         if out.shape != shape or out.dtype != complex or not out.flags.carray:
             raise ValueError(f"out of shape {out.shape}, {out.dtype}: must be {shape}, complex128, C-contiguous")
-        tiles, sections = self._tiles.ctypes.data, self._sections.ctypes.data
-        demodulate(self._coefficients, tiles, sections, self._sample, samples, out.view(float))
+        demodulate(self._coefficients, self._tiles.ctypes.data, self._sample, samples, out)
         self._sample += len(samples)
         return out

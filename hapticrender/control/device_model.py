@@ -25,16 +25,15 @@ class FingerRange:
     mass, damping, stiffness : (float, float)
         Least and most of each number; in kg, N s/m, N/m where the coordinate is a displacement.
     typical_mass, typical_stiffness : float
-        How far from zero either may be expected, > 0; by these a residue is shared out between them.
+        How far from zero either may be expected, > 0; a residue is divided between them in this proportion.
     least_motion : float, coordinate's unit
-        A smaller motion teaches nothing, > 0.
+        Bands that move less do not count in the adaptation, > 0.
     fastest : float, 1/s
-        It is learnt no faster, > 0: what noise teaches grows with the pace.
+        Fastest adaptation, > 0: the effect of noise grows with its rate.
     contact : (float, float), N, or None
-        Loads at which touch begins and ends, as felt by the sag; None: the load is always there.
+        Loads of contact onset and loss, measured by the sag; None: the finger is always in contact.
     needs_contact : bool
-        Targets are wanted, and learnt from, only while the finger's position is known: what it does not touch it does
-        not feel.
+        Targets and adaptation run only while the finger's position is known.
     least_speed : float, m/s
         And only while it slides at least so fast, where `needs_contact` holds.
     """
@@ -57,7 +56,7 @@ class FingerRange:
 
 @dataclass(frozen=True, kw_only=True)
 class DeviceModel:
-    """All that the controller ever knows of a device.
+    """All that the controller is given of a device.
 
     In the controlled coordinates q the device obeys ``D(s) q = force_from_drive @ drive``
     with the dynamic stiffness ``D(s) = mass s^2 + damping s + stiffness``.  Coordinates are displacements (m) on a
@@ -80,48 +79,48 @@ class DeviceModel:
     side_from_coordinate : ndarray, shape (d, c)
         Displacement at each transducer from the coordinates.
     place_from_coordinate : ndarray, shape (p, c)
-        Displacement at each judged place from the coordinates.
+        Displacement at each evaluation point from the coordinates.
     places : tuple of str
-        Names of the judged places.
+        Names of the evaluation points.
     drive_limit : float, drive unit
         Largest magnitude of each drive channel, > 0.
     sensed_limit : float, sensor unit
-        Largest magnitude that a sensor can show, > 0; beyond it a sample is not believed, and no target is accepted.
+        Largest magnitude that a sensor can show, > 0; a larger sample is a sensor fault, a larger target is refused.
     drive_step : float, drive unit
         Resolution of the command; 0 is ideal.
     sensed_noise : float, sensor unit rms
         White noise of each sensor.
     bending : BendingMode or None
-        What is known of the surface's own first mode, which the inner loop has to spare; None: nothing.
+        The surface's own first mode, which the inner damper must not drive; None: unknown.
     rigid : bool
         The surface is known to have no mode of its own in reach.
     lowest_frequency, highest_frequency : float, Hz
         Finger-locked carriers fade out beyond these.
     highest_edge : float
         Times `highest_frequency`, where they have faded out, > 1.  Feedback stays on until the last quarter of
-        `highest_frequency`.  Methods without a bank know 1.25 alone.
+        `highest_frequency`.  Methods with a low pass use 1.25.
     shape : tuple of float, or None
         Pattern of the target over the coordinates; None: all of it in the first one.
     finger : FingerRange
         What a finger can add to D.
     pace : float
-        Factor on every bandwidth of a method's rules, which are meant for carriers from 20 Hz on; > 0.  Limits that
-        delay, carriers and spacing set stay as they are.
+        Factor on every rate of a method's rules, which are meant for carriers from 20 Hz on; > 0.  Limits by delay,
+        carriers and spacing stay as they are.
     contact_damping : float, N s/m times m/s
         Part of the first damping that goes as 1/|v| with the finger's speed, times that speed; it is in `damping` as it
         is at `typical_speed`.  0: none.
     typical_speed : float, m/s
         Of the finger, > 0.
     sensor_delay : float, s
-        How much later than the judged place the sensor shows a band; negative: earlier.
+        Delay of the sensor against the evaluation point; negative: a lead.
     contact_lag : float, m
         Length by which a sliding contact lags behind what the sensor shows.
     lock : float, Hz
         Bandwidth of the resonance lock, which moves the fixed carriers to where the device is resonant; 0: none.
     taps : int
-        Of the inner loop where no bending mode is known, >= 3: more of them hear less noise, and answer later.
+        Of the inner damper where no bending mode is known, >= 3: more taps pass less noise and add delay.
     always_damped : bool
-        The inner loop stays on in quiet as well, as its noise costs less than the first moment of a touch.
+        The inner damper stays on at low gains as well, as its noise costs less than the onset of a contact.
     unit, drive_unit : str
         Of the coordinates and of the drive.
 
@@ -170,7 +169,7 @@ class DeviceModel:
 
     @property
     def profile(self) -> tuple[float, ...] | None:
-        """What the pattern asks for at each judged place, as a multiple of the target; None: the same everywhere."""
+        """Target at each evaluation point per target of the pattern; None: the same everywhere."""
         return None if self.shape is None else tuple((self.place_from_coordinate @ self.shape).tolist())
 
     def dynamic_stiffness(self, frequency: Array) -> Array:
@@ -183,10 +182,7 @@ class DeviceModel:
 
         Hold and delay are not in it; see `hold_and_delay`.
         """
-        stiffness = self.dynamic_stiffness(frequency)
-        return np.linalg.solve(
-            stiffness, np.broadcast_to(self.force_from_drive, (*stiffness.shape[:-2], *self.force_from_drive.shape))
-        )
+        return np.linalg.inv(self.dynamic_stiffness(frequency)) @ self.force_from_drive
 
     def hold_and_delay(self, frequency: Array) -> Array:
         """Response of the zero-order hold and the known delay, complex, shape (...)."""

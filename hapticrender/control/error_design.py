@@ -16,11 +16,18 @@ import numpy as np
 from hapticrender.bands import Bands
 from hapticrender.control.adaptation import TURN_SAMPLES
 from hapticrender.control.bandwidth import BankGains, checked_gains
-from hapticrender.control.controller import BankController, padded, ridge_spacing, spacing
+from hapticrender.control.controller import (
+    BankController,
+    device_settings,
+    lowest_carrier,
+    ridge_spacing,
+    shared_settings,
+    spacing,
+)
 from hapticrender.control.damping import Damping, choose_damping
 from hapticrender.control.device_model import DeviceModel, FingerRange
 from hapticrender.control.kernel import block_step, error_step
-from hapticrender.control.records import MOST_CHANNELS, MOST_SENSORS, MOST_TAPS
+from hapticrender.control.records import MOST_TAPS
 
 FADE_IN = 0.05  # s: a target fades in this slowly, so that it does not excite the modes
 LEAST_FADE_IN = 0.5e-3  # s: however fast the device, as drives are finite
@@ -28,7 +35,7 @@ FAST_POLE, FAST_SIGMAS = 30.0, 5.5  # Hz, of the sensor noise behind that pole
 SLOW_POLE, SLOW_SIGMAS = 4.0, 5.0
 PROMPT = 8  # samples: a longer delay is that of a block device, where the inner damper would act on stale noise
 PHASE_MARGIN = math.pi / 4  # rad: 90 deg less integral gain times (delay + 1/observer pole)
-ADAPTATION_SHARE = 0.5  # of a residual, learnt in a step at most: at 0.8 it swings under a light finger
+ADAPTATION_SHARE = 0.5  # of a residual, adapted in a step at most: at 0.8 it swings under a light finger
 ADAPTATION_TIME = 1 / 60  # s: fastest adaptation to what is always there; a delay counts twice
 ADAPTATION_MARGIN = 5.0  # of the observer's pole over the adaptation, where that estimates all of D
 FAST_DC = 60.0  # Hz: bandwidth of the DC estimate while the step of a contact goes into it
@@ -36,6 +43,11 @@ BACK_TIME = 0.02  # s: back-calculation at the limit
 TOUCHED_DECAY = 1000.0  # 1/s: of an always damped mode at least
 LEAST_NOISE = 1e-6  # of the sensors' range: thresholds never fall to nothing
 ALWAYS = -1e300  # N: every load is larger
+FROM_GAINS = (
+    *("observer", "observer_high", "integral_medium", "integral_high", "dc", "dc_drift", "crowd_speed"),
+    "highest_edge",
+)
+FROM_MODEL = ("sensor_delay", "contact_lag", "contact_damping", "typical_speed", "drive_step")
 CROWDED = 40.0  # Hz: carriers closer than this share what the detectors see
 
 
@@ -86,7 +98,7 @@ TWO_SPEEDS_CROWDED = Rules(
 
 
 def rules_for(bands: Bands) -> Rules:
-    """Two speeds; carriers nearer than 40 Hz, or that may come so near, are watched without detectors."""
+    """Two speeds; carriers nearer than 40 Hz, or that may come so near, have no detectors."""
     crowded = spacing(bands) < CROWDED or (bands.wavenumber > 0.0).sum() > 1
     return TWO_SPEEDS_CROWDED if crowded else TWO_SPEEDS
 
@@ -121,13 +133,6 @@ def design_error(
     ValueError
         Two carriers are equal, or the device has too many coordinates, channels or sensors.
     """
-    for name, number, most in (
-        ("coordinates", len(model.mass), 2),
-        ("drive channels", model.force_from_drive.shape[1], MOST_CHANNELS),
-        ("sensors", model.coordinate_from_sensed.shape[1], MOST_SENSORS),
-    ):
-        if number > most:
-            raise ValueError(f"the device model has {number} {name}: must be <= {most}")
     rules = rules.scaled(model.pace)
     prompt = model.delay <= PROMPT
     damping = choose_damping(model, bending=model.bending) if any(rules.damper) and feedback and prompt else None
@@ -158,7 +163,7 @@ def design_error(
 
 def _gains(model: DeviceModel, bands: Bands, rules: Rules, feedback: bool) -> BankGains:
     """How fast observer, integral and DC estimate may run, by lowest carrier (Hz), spacing and delay."""
-    lowest, apart, period = _lowest(model, bands), spacing(bands), 1.0 / model.rate
+    lowest, apart, period = lowest_carrier(model, bands), spacing(bands), 1.0 / model.rate
     if apart == 0.0:
         twice = np.sort(bands.frequency[bands.wavenumber == 0.0])
         raise ValueError(
@@ -190,71 +195,36 @@ def _gains(model: DeviceModel, bands: Bands, rules: Rules, feedback: bool) -> Ba
     )
 
 
-def _lowest(model: DeviceModel, bands: Bands) -> float:
-    """Lowest carrier (Hz): of the fixed ones, and of what a moving finger makes of the others."""
-    locked = bands.wavenumber > 0.0
-    return float(bands.frequency[~locked].min(initial=model.lowest_frequency if locked.any() else np.inf))
-
-
 def _settings(
     model: DeviceModel, bands: Bands, rules: Rules, gains: BankGains, damping: Damping | None, feedback: bool
 ) -> dict[str, Any]:
     """Settings of the kernel, sample by sample."""
     period, fast = 1.0 / model.rate, 2 * math.pi * FAST_DC / model.rate
-    lowest, matrices = _lowest(model, bands), ("mass", "damping", "stiffness")
+    lowest = lowest_carrier(model, bands)
     observer = min(rules.observer[0], lowest / 2, spacing(bands) / (2 * math.pi))
     taps = damping.taps if damping else np.zeros((len(model.mass), 1))
-    listening = model.coordinate_from_sensed[:, : None if feedback else 0]
+    sensor_map, drive_map = model.coordinate_from_sensed, np.linalg.pinv(model.force_from_drive)
     return {
-        **{name: padded(getattr(model, name), 2, 2) for name in matrices},
+        **shared_settings(model, bands, sensor_map, drive_map, feedback),
+        **device_settings(model),
         **_adaptation(model, rules, 2 * math.pi * observer, feedback),
         **_detectors(model, rules),
         **_finger(model.finger),
-        "coordinates": len(model.mass),
-        "block": 1,
-        "sensors": listening.shape[1],
-        "channels": model.force_from_drive.shape[1],
+        **{name: getattr(gains, name) for name in FROM_GAINS},
+        **{name: getattr(model, name) for name in FROM_MODEL},
         "n_taps": taps.shape[1],
-        "taps": padded(taps, 2, MOST_TAPS),
+        "taps": np.pad(taps, ((0, 2 - len(taps)), (0, MOST_TAPS - taps.shape[1]))),
         "added_damping": np.resize(np.append(damping.added_damping if damping else 0.0, [0.0, 0.0]), 2),
-        "shape": np.append(model.pattern, [0.0])[:2],
-        "coordinate_from_sensor": padded(listening, 2, MOST_SENSORS),
-        "drive_from_force": padded(np.linalg.pinv(model.force_from_drive), MOST_CHANNELS, 2),
-        "rate": gains.rate,
-        "lead": gains.lead,
         "reference": 2 * 2 * math.pi * observer * period,
-        "middle": 1.0,
         "extrapolation": 0.0,
         "fade_in": period / max(FADE_IN / model.pace, LEAST_FADE_IN),
-        "lowest": gains.lowest,
-        "highest": gains.highest,
-        "highest_edge": gains.highest_edge,
-        "analysed": bands.envelope is None,
-        "modulated": bands.modulated,
-        "differentiated": bands.differentiated,
-        "needs_contact": model.finger.needs_contact,
-        "least_speed": model.finger.least_speed,
         "corrected": bands.sensor_response is None and (model.sensor_delay != 0.0 or model.contact_lag != 0.0),
-        "sensor_delay": model.sensor_delay,
-        "contact_lag": model.contact_lag,
-        "contact_damping": model.contact_damping,
-        "typical_speed": model.typical_speed,
         "lock": 2 * math.pi * model.lock,
-        "sensor_limit": float(model.sensed_limit),
-        "drive_limit": float(model.drive_limit),
-        "drive_step": float(model.drive_step),
         "peak_decay": math.exp(-period * lowest),
         "back_calculation": _back_calculation(model),
-        "observer": gains.observer,
-        "observer_high": gains.observer_high,
-        "crowd_speed": gains.crowd_speed,
-        "dc": gains.dc,
-        "dc_drift": gains.dc_drift,
         "dc_fast": 1.6 * fast,
         "dc_drift_fast": fast**2,
         "integral": gains.integral_low,
-        "integral_medium": gains.integral_medium,
-        "integral_high": gains.integral_high,
         "damper": gains.inner,
         "damper_high": gains.inner_high,
         "age": (model.delay + 0.5) / TURN_SAMPLES,
@@ -281,17 +251,13 @@ def _detectors(model: DeviceModel, rules: Rules) -> dict[str, float]:
         "detects": rules.detects,
         "fast_pole": -math.expm1(-2 * math.pi * fast * period),
         "slow_pole": -math.expm1(-2 * math.pi * slow * period),
-        "fast_level": _threshold(FAST_SIGMAS, noise, fast, period),
-        "slow_level": _threshold(SLOW_SIGMAS, noise, slow, period),
+        # square (m2) of so many sigmas of 2 eps e^(-j phi) behind a pole (Hz), eps white of rms `noise` (m)
+        "fast_level": 2 * math.pi * fast * period * (FAST_SIGMAS * noise) ** 2,
+        "slow_level": 2 * math.pi * slow * period * (SLOW_SIGMAS * noise) ** 2,
         "fast_time": rules.high_time * model.rate,
         "slow_time": rules.medium_time * model.rate,
         "release": period / rules.release,
     }
-
-
-def _threshold(sigmas: float, noise: float, pole: float, period: float) -> float:
-    """Square (m2) of so many sigmas of 2 eps e^(-j phi) behind a pole (Hz), eps white of rms `noise` (m)."""
-    return (sigmas * noise * math.sqrt(2 * math.pi * pole * period)) ** 2
 
 
 def _finger(finger: FingerRange) -> dict[str, float]:
@@ -318,21 +284,18 @@ def _back_calculation(model: DeviceModel) -> float:
 def _in_blocks(settings: dict[str, Any], block: int, rate: float) -> dict[str, Any]:
     """Settings of the kernel for blocks: what is stated per sample becomes per block; no inner damper, no lock."""
     most = ADAPTATION_SHARE * rate / block
-    changes = {name: 1.0 - (1.0 - settings[name]) ** block for name in ("fast_pole", "slow_pole")}
-    changes |= {name: settings[name] / block for name in ("fast_time", "slow_time")}
-    changes |= {name: min(settings[name], most) for name in ("adaptation", "adaptation_high")}
-    return (
-        settings
-        | changes
-        | {
-            "block": block,
-            "middle": 0.5,
-            "extrapolation": settings["lead"],
-            "release": min(settings["release"] * block, 1.0),
-            "peak_decay": settings["peak_decay"] ** block,
-            "age": max((settings["lead"] * rate - 0.5) / block, 1.0),
-            "damper": 0.0,
-            "damper_high": 0.0,
-            "lock": 0.0,
-        }
-    )
+    return {
+        **settings,
+        **{name: 1.0 - (1.0 - settings[name]) ** block for name in ("fast_pole", "slow_pole")},
+        **{name: settings[name] / block for name in ("fast_time", "slow_time")},
+        **{name: min(settings[name], most) for name in ("adaptation", "adaptation_high")},
+        "block": block,
+        "middle": 0.5,
+        "extrapolation": settings["lead"],
+        "release": min(settings["release"] * block, 1.0),
+        "peak_decay": settings["peak_decay"] ** block,
+        "age": max((settings["lead"] * rate - 0.5) / block, 1.0),
+        "damper": 0.0,
+        "damper_high": 0.0,
+        "lock": 0.0,
+    }

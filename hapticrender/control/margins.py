@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import permutations
 
 import numpy as np
@@ -27,6 +27,7 @@ PER_DECADE = 12  # points of a grid on either side of a carrier
 UNIFORM = 400  # points of a grid over the whole spectrum
 ZOOMS, NEARLY = 3, 0.7  # refinements of a peak search, and which peaks are refined: above this share of the highest
 CONTINUOUS = 2.0  # rad: a locus that turns by more between two points has passed through infinity, at a carrier
+SMALLEST = ("delay", "phase", "gain", "bandwidth")  # margins of which the smallest counts, each for itself
 BISECTIONS = 24  # of a grid where the return difference turns by more than a radian
 
 
@@ -64,6 +65,13 @@ class Margins:
     def unstable(cls) -> Margins:
         """Return the margins of a loop with a growing pole."""
         return cls(stable=False, modulus=0.0, worst_frequency=math.nan, delay=0.0, phase=0.0, gain=1.0, bandwidth=0.0)
+
+    @classmethod
+    def smallest(cls, found: list[Margins]) -> Margins:
+        """Return the smallest of every margin, each for itself."""
+        smallest = {name: min(getattr(margins, name) for margins in found) for name in SMALLEST}
+        least = min(found, key=lambda margins: margins.modulus)
+        return replace(least, stable=all(margins.stable for margins in found), **smallest)
 
     @property
     def peak_sensitivity(self) -> float:
@@ -131,7 +139,7 @@ LEAST = {
 """Least margins by use: the error observer's law, the inner damper, the low-pass loop of one envelope."""
 
 
-def carrier_grid(carriers: Array, widths: Array, rate: float, narrowest: float = NARROWEST) -> Array:
+def carrier_grid(carriers: Array, widths: Array, rate: float) -> Array:
     """Frequencies (Hz) from 0 to half the rate, denser towards the carriers, none of them on one.
 
     Parameters
@@ -142,12 +150,10 @@ def carrier_grid(carriers: Array, widths: Array, rate: float, narrowest: float =
         Widths that the loop is known to have; points crowd around carriers plus and minus these.
     rate : float, Hz
         Sampling rate.
-    narrowest : float, Hz
-        Distance of the closest point.
     """
     carriers = np.unique(carriers)
-    count = math.ceil(PER_DECADE * math.log10(rate / narrowest))
-    away = np.concatenate([np.geomspace(narrowest, rate / 2, count), widths])
+    count = math.ceil(PER_DECADE * math.log10(rate / NARROWEST))
+    away = np.concatenate([np.geomspace(NARROWEST, rate / 2, count), widths])
     points = [np.linspace(0.0, rate / 2, UNIFORM)]
     middles = 0.5 * (carriers[1:] + carriers[:-1])
     for carrier, below, above in zip(carriers, [0.0, *middles], [*middles, rate / 2], strict=True):
@@ -156,10 +162,10 @@ def carrier_grid(carriers: Array, widths: Array, rate: float, narrowest: float =
     grid = np.unique(np.concatenate(points))
     at = np.clip(np.searchsorted(carriers, grid), 1, max(len(carriers) - 1, 1))
     apart = np.minimum(np.abs(grid - carriers[at - 1]), np.abs(grid - carriers[np.minimum(at, len(carriers) - 1)]))
-    return grid[apart > 0.5 * narrowest]
+    return grid[apart > 0.5 * NARROWEST]
 
 
-def unstable_poles(difference: Callable[[Array], Array], grid: Array, open_loop: int = 0) -> int:
+def unstable_poles(difference: Callable[[Array], Array], grid: Array) -> int:
     """Count the closed-loop poles outside a contour, by Nyquist's criterion.
 
     Parameters
@@ -169,14 +175,12 @@ def unstable_poles(difference: Callable[[Array], Array], grid: Array, open_loop:
     grid : ndarray, Hz
         Where to begin, from 0 to half the rate (or far beyond every corner); bisected wherever the difference turns by
         more than one radian.
-    open_loop : int
-        Poles of L outside the contour.
 
     Notes
     -----
-    Take the contour just outside the boundary, such as ``|z| = exp(SLOWEST/rate)``: carriers and integrators then lie
-    inside and no indentation is needed.  Half the contour turns by -pi for each pole more that
-    is outside in closed loop.
+    L has no pole outside the contour.  Take it just outside the boundary, such as ``|z| = exp(SLOWEST/rate)``: carriers
+    and integrators then lie inside and no indentation is needed.  Half the contour turns by -pi for each pole that is
+    outside in closed loop.
     """
     values = difference(grid)
     for _ in range(BISECTIONS):
@@ -186,7 +190,7 @@ def unstable_poles(difference: Callable[[Array], Array], grid: Array, open_loop:
         between = 0.5 * (grid[rough] + grid[rough + 1])
         grid = np.insert(grid, rough + 1, between)
         values = np.insert(values, rough + 1, difference(between))
-    return open_loop + round(-np.angle(values[1:] / values[:-1]).sum() / np.pi)
+    return round(-np.angle(values[1:] / values[:-1]).sum() / np.pi)
 
 
 def margins_of(loop: Callable[[Array], Array], grid: Array, carriers: Array | None = None) -> Margins:

@@ -21,20 +21,33 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar
 
 import numpy as np
 
 from hapticrender.bands import Bands
-from hapticrender.control.controller import BankController, padded, ridge_spacing, spacing
+from hapticrender.control.controller import (
+    BankController,
+    device_settings,
+    ridge_spacing,
+    shared_settings,
+    spacing,
+)
 from hapticrender.control.device_model import DeviceModel
-from hapticrender.control.envelope_loop import Bandwidths, EnvelopeLoop, envelope_loop, section
 from hapticrender.control.error_design import FADE_IN, ONE_SPEED, Rules, design_error, rules_for
-from hapticrender.control.loopshape import analyse, integrator
+from hapticrender.control.linear import Sampled
+from hapticrender.control.loopshape import (
+    Bandwidths,
+    EnvelopeLoop,
+    Form,
+    envelope_loop,
+    integrator,
+    loop_margins,
+    section,
+)
 from hapticrender.control.low_pass import low_pass_step
 from hapticrender.control.margins import LEAST
-from hapticrender.control.records import LOW_PASS, MOST_CHANNELS, MOST_SENSORS, W, aligned
-from hapticrender.control.transfer import TransferFunction
+from hapticrender.control.records import LOW_PASS, W, aligned
 from hapticrender.errors import DesignError
 from hapticrender.protocols import Array, Method
 
@@ -99,14 +112,12 @@ class Polar:
         if bands.modulated or bands.differentiated:
             raise DesignError(f"method {self.name!r} cannot modulate or differentiate targets: use 'h2' or 'stiffness'")
         loop = envelope_loop(model, bands, boxcar=self.boxcar, bandwidths=self.bandwidths, feedback=feedback)
-        sides = model.side_from_coordinate
-        channels = len(sides)
-        watched, spread = (
-            (sides.mean(axis=0)[None], np.ones((channels, 1))) if self.common else (sides, np.eye(channels))
-        )
-        table = frequency_table(model, watched, spread, feedback)
+        sensor_map, drive_map = model.side_from_coordinate, np.eye(len(model.side_from_coordinate))
+        if self.common:
+            sensor_map, drive_map = sensor_map.mean(axis=0)[None], np.ones((len(sensor_map), 1))
+        table = frequency_table(model, sensor_map, drive_map, feedback)
         settings = {
-            **low_pass_settings(model, bands, loop, watched @ model.coordinate_from_sensed, spread, feedback),
+            **low_pass_settings(model, bands, loop, sensor_map @ model.coordinate_from_sensed, drive_map, feedback),
             "polar": True,
             "clamped": self.clamp,
             "subtracted": self.subtract,
@@ -117,7 +128,7 @@ class Polar:
         }
         arrays = {"gains": table}
         if loop.boxcar:
-            arrays["window"] = aligned((loop.boxcar, len(watched) * tiles_of(bands), 2, W))
+            arrays["window"] = aligned((loop.boxcar, len(sensor_map) * tiles_of(bands), 2, W))
         controller = low_pass_controller(self.name, settings, bands, arrays)
         fixed = np.zeros(controller.tiles["fade"].shape)
         fixed.reshape(-1)[: len(bands)] = bands.wavenumber == 0.0
@@ -161,7 +172,7 @@ class Inverse:
         Of loop and low pass, unchecked; by default the paper's rule.
     """
 
-    form: Literal["reduced", "integrator"] = "reduced"
+    form: Form = "reduced"
     feed_forward: bool = False
     filtered: bool = True
     bandwidths: Bandwidths | None = None
@@ -232,8 +243,8 @@ class Resonant:
                     f"gain={self.gain:g} 1/s must be below {least:.3g} 1/s, the decay rate of the least damped mode, "
                     f"which it takes away: lower gain"
                 )
-            found = analyse(controller, TransferFunction((1.0,), (1.0,)), delay=model.delay / model.rate)
-            if complaint := LEAST["envelope"].complaint(found.margins):
+            found = loop_margins(controller, model.delay / model.rate)
+            if complaint := LEAST["envelope"].complaint(found):
                 raise DesignError(f"{complaint}: lower gain={self.gain:g} 1/s or the loop's delay")
         loop = EnvelopeLoop(ALL_PASS, section(controller.tustin(model.rate)), 0, model.lowest_frequency / 4)
         settings = complex_settings(model, bands, loop, self.feed_forward, feedback)
@@ -242,65 +253,40 @@ class Resonant:
 
 def least_decay(model: DeviceModel) -> float:
     """Decay rate of the least damped mode of the free device, 1/s."""
-    n = len(model.mass)
-    inverse = np.linalg.inv(model.mass)
-    rates = np.block([[np.zeros((n, n)), np.eye(n)], [-inverse @ model.stiffness, -inverse @ model.damping]])
-    return float(-np.linalg.eigvals(rates).real.max())
+    poles = np.linalg.eigvals(Sampled.free(model.mass, model.damping, model.stiffness, model.rate).a)
+    return float(-model.rate * np.log(abs(poles)).max())
 
 
-def frequency_table(model: DeviceModel, watched: Array, spread: Array, feedback: bool) -> Array:
+def frequency_table(model: DeviceModel, sensor_map: Array, drive_map: Array, feedback: bool) -> Array:
     """Gain (m per drive unit) and lag (rad) of the free device and its hold by coordinate, shape (2 coordinates, n).
 
-    `watched` rows are the controlled displacements, `spread` columns their drive channels.  With feedback it is what
-    each coordinate does while all are driven alike, as a sweep of the device shows it; without, what makes all of them
-    do the same.
+    `sensor_map` rows are the controlled displacements from the device's coordinates, `drive_map` columns their drive
+    channels.  With feedback it is what each coordinate does while all are driven alike, as a sweep of the device shows
+    it; without, what makes all of them do the same.
     """
     frequency = np.arange(0.0, model.rate / 2 + TABLE_STEP, TABLE_STEP)
-    response = watched @ model.response(frequency) @ spread  # (n, coordinates, coordinates)
-    alike = np.ones(len(watched))
-    each = response @ alike if feedback else 1.0 / np.linalg.solve(response, alike[None, :, None])[..., 0]
-    each = each.T * np.sinc(frequency / model.rate)
-    return np.ascontiguousarray(np.concatenate([abs(each), np.unwrap(np.angle(each), axis=1)]))
+    response = sensor_map @ model.response(frequency) @ drive_map  # (n, coordinates, coordinates)
+    alike = np.ones(len(sensor_map))
+    gain = response @ alike if feedback else 1.0 / np.linalg.solve(response, alike[None, :, None])[..., 0]
+    gain = gain.T * np.sinc(frequency / model.rate)
+    return np.ascontiguousarray(np.concatenate([abs(gain), np.unwrap(np.angle(gain), axis=1)]))
 
 
 def low_pass_settings(
     model: DeviceModel, bands: Bands, loop: EnvelopeLoop, sensor_map: Array, drive_map: Array, feedback: bool
 ) -> dict[str, Any]:
     """Settings that every method with a low pass shares; the maps are those of sensors to coordinates and back."""
-    sensor_map = sensor_map[:, : None if feedback else 0]
-    for name, number, most in (
-        ("coordinates", len(sensor_map), 2),
-        ("drive channels", len(drive_map), MOST_CHANNELS),
-        ("sensors", sensor_map.shape[1], MOST_SENSORS),
-    ):
-        if number > most:
-            raise ValueError(f"the device model has {number} {name}: must be <= {most}")
     # a waveform's envelopes pass two poles, with the delay of the low pass's two
-    analysis = 2 * math.pi * min(math.sqrt(2.0) * 2.0 * loop.bandwidth, spacing(bands) / (2 * math.pi))
+    analysis = min(2 * math.pi * math.sqrt(2.0) * 2.0 * loop.bandwidth, spacing(bands))
     ridges = ridge_spacing(bands)
     return {
-        "coordinates": len(sensor_map),
-        "block": 1,
-        "sensors": sensor_map.shape[1],
-        "channels": len(drive_map),
-        "coordinate_from_sensor": padded(sensor_map, 2, MOST_SENSORS),
-        "drive_from_force": padded(drive_map, MOST_CHANNELS, 2),
+        **shared_settings(model, bands, sensor_map, drive_map, feedback),
         "low_pass": loop.filter,
         "loop": loop.law,
-        "rate": float(model.rate),
-        "lead": (model.delay + 0.5) / model.rate,
         "reference": 2 * analysis / model.rate,
         "crowd_speed": analysis / ridges if math.isfinite(ridges) else 0.0,
-        "middle": 1.0,
-        "lowest": float(model.lowest_frequency),
-        "highest": min(model.highest_frequency, 0.4 * model.rate),
         "highest_edge": HIGHEST_EDGE,
-        "analysed": bands.envelope is None,
-        "modulated": bands.modulated,
-        "differentiated": bands.differentiated,
         "feedback": feedback,
-        "sensor_limit": float(model.sensed_limit),
-        "drive_limit": float(model.drive_limit),
     }
 
 
@@ -312,10 +298,8 @@ def complex_settings(
     drive_map = np.linalg.pinv(model.force_from_drive)
     return {
         **low_pass_settings(model, bands, loop, model.coordinate_from_sensed, drive_map, feedback),
-        **{name: padded(getattr(model, name), 2, 2) for name in ("mass", "damping", "stiffness")},
+        **device_settings(model),
         "shape": (1.0, 0.0),
-        "needs_contact": model.finger.needs_contact,
-        "least_speed": model.finger.least_speed,
         "forward": forward,
         "fade_in": 1.0 / (FADE_IN * model.rate) if forward else 1.0,
     }

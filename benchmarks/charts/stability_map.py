@@ -5,20 +5,19 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
+from benchmarks.charts.polar_loop import PolarLoop
+from hapticrender.control.bandwidth import BankGains, error_loop
 from hapticrender.control.damping import damping_taps
-from hapticrender.control.device_model import FingerRange
-from hapticrender.control.linear import ErrorLoop, FingerEstimate, Structure
+from hapticrender.control.device_model import DeviceModel, FingerRange
+from hapticrender.control.linear import FingerEstimate, Sampled
 from hapticrender.control.margins import sensitivity
-from hapticrender.control.polar_loop import PolarLoop
-from hapticrender.plants.plate import PlateParameters
+from hapticrender.plants.plate import PlateParameters, structure
 from hapticrender.protocols import Array
-
-if TYPE_CHECKING:
-    from hapticrender.touch.mechanics import FingerMechanics
+from hapticrender.touch.mechanics import NONE, FingerMechanics
 
 OFFSETS = 60  # frequencies around a carrier at which a map looks for the peak of S
 MODE_OFFSETS = np.linspace(-6.0, 6.0, 9)  # Hz: and around each mode of the plant
@@ -28,54 +27,34 @@ QUALITY = 1.4  # of the modes under the inner loop
 
 def loaded_plate(
     parameters: PlateParameters,
-    mechanics: FingerMechanics | None = None,
+    model: DeviceModel,
+    mechanics: FingerMechanics = NONE,
     *,
     position: float = 0.0,
     strength: float = 1.0,
-) -> Structure:
-    """Structure of the plate, both its coordinates and its bending mode, with a finger resting on it.
+) -> Sampled:
+    """Plate with a finger resting on it, in the coordinates of the controller and per force that it asks for.
 
     Parameters
     ----------
     parameters : PlateParameters
-    mechanics : FingerMechanics, optional
-        Order 0, 2 or 4; none is order 0.  A phalanx becomes a coordinate of its own and needs a mass.
+    model : DeviceModel
+        What the controller is designed for; it may differ from the plate.
+    mechanics : FingerMechanics
     position : float, m
         Of the finger, from the middle.
     strength : float
         Factor on the finger's impedance, >= 0; 0 is no finger.
     """
-    arms = np.array([1.0, position / parameters.half_spacing])
-    mass, damping, stiffness = parameters.mass_matrix, parameters.damping_matrix, parameters.stiffness_matrix
-    inputs = outputs = np.eye(2)
-    if parameters.bending_frequency > 0:
-        omega, modal = 2 * math.pi * parameters.bending_frequency, parameters.bending_mass
-        arms = np.append(arms, parameters.bending_shape(position))
-        mass = _joined(mass, modal)
-        damping = _joined(damping, 2 * parameters.bending_damping * omega * modal)
-        stiffness = _joined(stiffness, omega**2 * modal)
-        inputs, outputs = np.vstack([inputs, [parameters.bending_coil, 0.0]]), np.column_stack([outputs, [1.0, 0.0]])
-    if mechanics is not None and mechanics.order and strength > 0:
-        across = arms
-        if mechanics.order == 4:
-            if not mechanics.phalanx_mass > 0:
-                raise ValueError(f"phalanx_mass = {mechanics.phalanx_mass!r} kg: must be > 0")
-            mass = _joined(mass, strength * mechanics.phalanx_mass)
-            damping = _joined(damping, strength * mechanics.phalanx_damping)
-            stiffness = _joined(stiffness, strength * mechanics.phalanx_stiffness)
-            arms, across = np.append(arms, 0.0), np.append(arms, -1.0)
-            inputs, outputs = np.pad(inputs, ((0, 1), (0, 0))), np.pad(outputs, ((0, 0), (0, 1)))
-        mass = mass + strength * mechanics.mass * np.outer(arms, arms)
-        damping = damping + strength * mechanics.damping * np.outer(across, across)
-        stiffness = stiffness + strength * mechanics.stiffness * np.outer(across, across)
-    return Structure(mass=mass, damping=damping, stiffness=stiffness, input=inputs, output=outputs)
-
-
-def _joined(matrix: Array, value: float) -> Array:
-    """Matrix with one more, independent coordinate."""
-    larger = np.pad(matrix, (0, 1))
-    larger[-1, -1] = value
-    return larger
+    loaded = structure(parameters, mechanics, position, strength)
+    a, b = loaded.zero_order_hold(parameters.rate)
+    shown = model.coordinate_from_sensed @ loaded.outputs[1:3]
+    return Sampled(
+        rate=parameters.rate,
+        a=a,
+        b=b[:, :-1] @ np.linalg.pinv(model.force_from_drive),
+        c=np.pad(shown, ((0, 0), (0, shown.shape[1]))),
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -125,8 +104,13 @@ class _Touch(NamedTuple):
     strength: float
     adapted: bool
 
-    def structure(self) -> Structure:
-        return loaded_plate(self.parameters, self.mechanics, position=self.position, strength=self.strength)
+    def plant(self) -> Sampled:
+        return loaded_plate(
+            self.parameters, self.model(), self.mechanics, position=self.position, strength=self.strength
+        )
+
+    def model(self) -> DeviceModel:
+        return self.parameters.device_model(self.parameters.rate, self.parameters.delay)
 
 
 def stability_map(
@@ -195,77 +179,63 @@ def stability_map(
 
 def _polar(touch: _Touch, carrier: Array, width: Array, common: bool) -> tuple[Array, Array]:
     """Growth and modulus margin of the paper's loop for every carrier and bandwidth."""
-    parameters = touch.parameters
-    model = parameters.device_model(parameters.rate, parameters.delay)
-    loop = PolarLoop.on(touch.structure().sampled(parameters.rate), model, carrier, width, common=common)
+    loop = PolarLoop.on(touch.plant(), touch.model(), carrier, width, common=common)
     poles = loop.poles()
     near = width[:, None] * np.geomspace(0.02, 50.0, OFFSETS)
     offset = np.concatenate([near, np.abs(poles.imag) / (2 * np.pi)], axis=1)
-    peak = sensitivity(loop.loop(np.clip(offset, 1e-3, 0.49 * parameters.rate))).max(axis=1)
+    peak = sensitivity(loop.loop(np.clip(offset, 1e-3, 0.49 * loop.plant.rate))).max(axis=1)
     growth = poles.real.max(axis=1)
     return growth, np.where(growth < 0, 1 / peak, 0.0)
 
 
 def _error_loop(touch: _Touch, carrier: Array, width: Array, inner: float) -> tuple[Array, Array]:
     """Growth and modulus margin of the error observer's loop for every carrier and bandwidth."""
-    loop = scaled_loop(
-        touch.parameters,
-        touch.structure(),
-        carrier,
-        width,
-        inner=inner,
-        finger=settled_estimate(touch.parameters, touch.mechanics, carrier, touch.position, touch.strength)
-        if touch.adapted
-        else None,
-    )
-    rate, poles = touch.parameters.rate, loop.poles()
+    plant, model = touch.plant(), touch.model()
     near = np.geomspace(0.02, 20.0, OFFSETS // 2)
-    beside = np.concatenate([-near[::-1], near]) * width[:, None] + carrier[:, None]
-    modes = (loop.plant.modes()[:, None] + MODE_OFFSETS).ravel()
-    afar = np.append(np.linspace(1.0, 0.499 * rate, OFFSETS), modes) * np.ones((len(carrier), 1))
-    peak = np.zeros(len(carrier))
-    for grid in (beside, afar, np.abs(poles.imag) / (2 * np.pi)):
-        z = np.exp(2j * np.pi * np.clip(grid, 0.1, 0.499 * rate) / rate)
-        peak = np.maximum(peak, sensitivity(loop.loop(z)).max(axis=1))
-    growth = poles.real.max(axis=1)
-    return growth, np.where(growth < 0, 1 / peak, 0.0)
+    modes = (plant.modes()[:, None] + MODE_OFFSETS).ravel()
+    afar, taps = np.append(np.linspace(1.0, 0.499 * plant.rate, OFFSETS), modes), damping_taps(model, QUALITY)[0]
+    growths, margins = [], []
+    for f, b in zip(carrier.tolist(), width.tolist(), strict=True):
+        finger = None
+        if touch.adapted:
+            finger = settled_estimate(touch.parameters, touch.mechanics, f, touch.position, touch.strength)
+        loop = error_loop(model, np.array([f]), gains_of(model, f, b, inner), taps=taps, plant=plant, finger=finger)
+        poles = loop.poles()
+        grid = np.concatenate([f - b * near, f + b * near, afar, np.abs(poles.imag) / (2 * np.pi)])
+        peak = sensitivity(loop.loop(np.exp(2j * np.pi * np.clip(grid, 0.1, 0.499 * plant.rate) / plant.rate))).max()
+        growths.append(poles.real.max())
+        margins.append(1 / peak if growths[-1] < 0 else 0.0)
+    return np.array(growths), np.array(margins)
 
 
-def scaled_loop(
-    parameters: PlateParameters,
-    plant: Structure,
-    carrier: Array,
-    width: Array,
-    *,
-    inner: float,
-    finger: FingerEstimate | None = None,
-) -> ErrorLoop:
-    """Stack of loops of one band each on one plant, for `carrier` and bandwidth `width` (Hz, shape (B,)).
-
-    `parameters` are those of the free plate that the law inverts, `inner` (0..1) is the factor on the inner damper.
-    """
-    model = parameters.device_model(parameters.rate, parameters.delay)
-    level = 2 * math.pi * np.minimum(6.0, carrier / 8) / model.rate
-    return ErrorLoop.on(
-        plant.sampled(model.rate),
-        Structure.of(model),
-        carrier[:, None],
+def gains_of(model: DeviceModel, carrier: float, width: float, inner: float) -> BankGains:
+    """Gains of one band of bandwidth `width` (Hz) at every level, `inner` (0..1) the factor on the inner damper."""
+    observer, integral = 2 * 2 * math.pi * 2 * width / model.rate, INTEGRAL * width
+    dc = 2 * math.pi * min(6.0, carrier / 8) / model.rate
+    return BankGains(
+        rate=model.rate,
         delay=model.delay,
         lead=(model.delay + 0.5) / model.rate,
-        observer=2 * 2 * math.pi * 2 * width / model.rate,
-        integral=INTEGRAL * width,
-        dc=1.6 * level,
-        dc_drift=level**2,
-        inner=np.full(len(width), inner),
-        taps=damping_taps(model, QUALITY)[0],
-        finger=finger,
+        observer=observer,
+        observer_high=observer,
+        integral_low=integral,
+        integral_medium=integral,
+        integral_high=integral,
+        dc=1.6 * dc,
+        dc_drift=dc**2,
+        inner=inner,
+        inner_high=inner,
+        crowd_speed=0.0,
+        lowest=model.lowest_frequency,
+        highest=model.highest_frequency,
+        highest_edge=model.highest_edge,
     )
 
 
 def settled_estimate(
-    parameters: PlateParameters, mechanics: FingerMechanics, frequency: Array, position: float, strength: float = 1.0
+    parameters: PlateParameters, mechanics: FingerMechanics, frequency: float, position: float, strength: float = 1.0
 ) -> FingerEstimate | None:
-    """Finger estimate at which the adaptation settles on a single carrier (Hz, shape (B,)); None without a finger.
+    """Finger estimate at which the adaptation settles on a single carrier (Hz); None without a finger.
 
     With z = j w Z_f(j w): Re z is shared between stiffness and mass by how far each may be expected from zero; the
     imaginary part is damping.  `strength` is a factor on the finger's impedance.
@@ -273,17 +243,16 @@ def settled_estimate(
     if not mechanics.order or strength == 0.0:
         return None
     omega = 2 * np.pi * frequency
-    z = 1j * omega * mechanics.impedance(frequency) * strength
+    z = complex(1j * omega * mechanics.impedance(frequency) * strength)
     known = FingerRange()
     heavy = omega**2 * known.typical_mass**2
     share = z.real / (known.typical_stiffness**2 + omega**2 * heavy)
-    numbers = (
-        np.clip(-heavy * share, *known.mass),
-        np.clip(z.imag / omega, *known.damping),
-        np.clip(known.typical_stiffness**2 * share, *known.stiffness),
+    return FingerEstimate(
+        float(np.clip(-heavy * share, *known.mass)),
+        float(np.clip(z.imag / omega, *known.damping)),
+        float(np.clip(known.typical_stiffness**2 * share, *known.stiffness)),
+        position / parameters.half_spacing,
     )
-    mass, damping, stiffness = (number[:, None, None, None] for number in numbers)
-    return FingerEstimate(mass, damping, stiffness, position / parameters.half_spacing)
 
 
 LOOPS: dict[str, Callable[[_Touch, Array, Array], tuple[Array, Array]]] = {
