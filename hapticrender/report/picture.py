@@ -209,7 +209,7 @@ def _close_span(recording: Recording) -> tuple[int, int]:
     position = recording.read("position", first, first + size)
     velocity = (position[-1] - position[0]) * rate / (size - 1)
     frequency = np.abs(recording.bands.instantaneous_frequency(np.nan_to_num(velocity)))
-    strength = np.where(envelopes.judged[chosen], np.abs(envelopes.wanted[chosen]), 0)
+    strength = np.where(envelopes.judged[chosen], np.abs(envelopes.target[chosen]), 0)
     slowest = frequency[strength >= 0.1 * strength.max()].min()
     seconds = max(PERIODS / frequency[strength.argmax()], 1.5 / slowest)
     stop = min(len(recording), first + size)
