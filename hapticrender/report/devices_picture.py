@@ -11,7 +11,7 @@ import numpy as np
 from hapticrender.formatting import quantity, short
 from hapticrender.recordings.recording import Recording
 from hapticrender.report.figure import BLUE, GREEN, INK, ORANGE, RED, legend, new_figure, save
-from hapticrender.report.picture import FLOOR, QUANTITIES
+from hapticrender.report.picture import DASHED, FLOOR, QUANTITIES, error_axis
 from hapticrender.skin import residual_velocity, skin_bands, skin_waveform
 from hapticrender.touch.perception import HIGHEST
 
@@ -61,7 +61,7 @@ def _waveform(axes: Any, recording: Recording, device: str, colour: str) -> None
     time, target, achieved = skin_waveform(recording, start, seconds)
     milliseconds = 1e3 * (time - time[0])
     axes.plot(milliseconds, 1e3 * achieved, color=colour, lw=2.0, label="achieved (from the envelopes)")
-    axes.plot(milliseconds, 1e3 * target, color=INK, lw=1.0, ls=(0, (4, 2)), label="target")
+    axes.plot(milliseconds, 1e3 * target, color=INK, lw=1.0, ls=DASHED, label="target")
     axes.set(title=f"{device}, by {QUANTITIES.get(recording.header.unit, 'motion')}", xlabel="time (ms)")
     beside = f"outside the bands {quantity(residual_velocity(recording), 'm/s')} rms"
     axes.text(0.98, 0.02, beside, transform=axes.transAxes, ha="right", va="bottom", fontsize=8)
@@ -81,13 +81,8 @@ def _bands(axes: Any, recordings: Mapping[str, Recording]) -> None:
         axes.plot(place, size, MARKERS[i % len(MARKERS)], color=colour, ms=8, label=device)
         for x, y, value in zip(place, size, error, strict=True):
             axes.annotate(f"{value:+.2f} %", (x, y), xytext=(8, 0), textcoords="offset points", va="center", fontsize=8)
-    axes.axhline(BOUND, color=INK, lw=1, ls=(0, (4, 2)), label=f"{BOUND:g} %")
-    axes.set_yscale("log")
-    low, high = axes.get_ylim()
-    axes.set(ylim=(min(low, BOUND / 100) / 1.5, 1.5 * max(high, BOUND)), xlim=(-0.6, len(ticks) - 0.4))
-    axes.yaxis.set_major_formatter(lambda value, _: f"{value:g}")
-    axes.minorticks_off()
+    axes.axhline(BOUND, color=INK, lw=1, ls=DASHED, label=f"{BOUND:g} %")
+    axes.set(ylim=error_axis(axes, BOUND), xlim=(-0.6, len(ticks) - 0.4))
     axes.set_xticks(range(len(ticks)), ticks)
-    axes.grid(axis="x", visible=False)
     axes.set(ylabel="error (%)", title="Error of the skin velocity of each band")
     legend(axes)
