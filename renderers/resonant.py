@@ -175,12 +175,7 @@ def _multiple(driver: Driver, parameters: SurfaceParameters) -> int:
 def amplitude_loop(parameters: SurfaceParameters, *, held: float | None = None) -> BankController:
     """Return the amplitude's own controller, of the default method, at rest.
 
-    Parameters
-    ----------
-    parameters : SurfaceParameters
-        The surface, with the delay of its mode.
-    held : float, N, or None
-        Load of the finger that is taken to hold the mode where nothing is sensed; None: there is feedback.
+    `held` is the finger's load (N) on the mode where nothing is sensed; None: there is feedback.
     """
     model, mode = parameters.amplitude_model(), parameters.carrier_mode
     if held is not None:

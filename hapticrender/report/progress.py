@@ -12,14 +12,7 @@ _WIDTH = 30  # characters
 
 
 class Progress:
-    """Show how much of a list of scenes is done.
-
-    Parameters
-    ----------
-    durations : sequence of float
-        Duration of each scene (s, > 0), in order: a long scene takes a longer part of the bar.
-    stream : file, optional
-        Where to write; standard error by default.
+    """Show how much of a list of scenes of given durations (s, > 0) is done, by default on standard error.
 
     Examples
     --------
