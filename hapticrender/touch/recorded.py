@@ -236,16 +236,8 @@ class Swipe(_Playback):
 
     Only samples in contact, sliding in the main direction, averaged in cells of 10 micrometres.
 
-    Parameters
-    ----------
-    file : str or Path
-        ``.npz`` with encoder, metre_per_count, lateral_force, normal_force, rate.
-    amplitude : float, m, or None
-        Target peak; > 0 and <= 0.01.  Exactly one of `amplitude` and `gain`.
-    gain : float, m/N, or None
-        > 0; the peak that it makes must be <= 0.01 m.
-    carriers, spacing, passband
-        As for `Recorded`, in Hz at the recorded speed.
+    `file` is an ``.npz`` with encoder, metre_per_count, lateral_force, normal_force and rate; `gain` is in m/N; all else
+    is as for `Recorded`, in Hz at the recorded speed.
     """
 
     kind: ClassVar[str] = "swipe"

@@ -160,10 +160,9 @@ def _row(raw: dict[str, Array], key: str, kinds: str, bound: str) -> Array:
 
 def _smooth(values: Array, rate: float) -> Array:
     """Mean over `SMOOTHING` seconds around each sample, the ends held."""
-    half = max(round(SMOOTHING * rate / 2), 1)
-    total = np.cumsum(np.concatenate([[0.0], np.pad(values, half, mode="edge")]))
-    width = 2 * half + 1
-    return (total[width:] - total[:-width]) / width
+    from scipy.ndimage import uniform_filter1d
+
+    return uniform_filter1d(values, 2 * max(round(SMOOTHING * rate / 2), 1) + 1, mode="nearest")
 
 
 def _load(normal_force: Array, rate: float) -> Array:
