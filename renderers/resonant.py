@@ -21,7 +21,7 @@ from hapticrender.renderers.base import check_channels
 from hapticrender.renderers.shaped import WrappedDriver, thinned
 from hapticrender.touch.finger import Finger
 
-LONGEST_DELAY = 0.25e-3  # s: a tenth of a turn of 400 Hz, 3 % off there, and beyond 10 % half as late again
+LONGEST_DELAY = 0.25e-3  # s: a tenth of a turn of 400 Hz, 3 % off there, and beyond 10 % at half as much again
 
 
 class ResonantDriver(WrappedDriver):
@@ -87,9 +87,9 @@ class ResonantDriver(WrappedDriver):
         measured, played = self._carry(target, flags.ravel())
         friction = np.empty(self.block)
         friction_ratios(self.parameters.friction_law.numbers, measured, load, speed, friction)
-        felt = np.r_[self._friction, whole * friction]
-        self._friction = felt[-1]
-        return self._sensed(felt[:-1, None], played, np.bitwise_or.reduce(flags, axis=1))
+        measured_friction = np.r_[self._friction, whole * friction]
+        self._friction = measured_friction[-1]
+        return self._sensed(measured_friction[:-1, None], played, np.bitwise_or.reduce(flags, axis=1))
 
     def _contact(self, rows: Array) -> tuple[Array, Array, Array]:
         """Whole friction (N, 0 where no finger slides), load (N) and speed (m/s) that the amplitude is held for."""

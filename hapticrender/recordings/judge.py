@@ -189,7 +189,7 @@ def _notes(recording: Recording, bands: list[dict[str, Any]], settled: Array) ->
         share = f"{shares[0]:.0f} %" if shares[-1] - shares[0] < 1 else f"{shares[0]:.0f} to {shares[-1]:.0f} %"
         notes.append(
             f"{bands_label([bands[k] for k in partly])}: {share} of the windows judged; in the others the target is "
-            "zero, the finger is up, or the carrier is slower than 20 Hz, beyond the device's range or too close to another"
+            "zero, the finger is up, or the carrier is slower than 20 Hz, out of range, or too close to another"
         )
     return notes
 

@@ -236,8 +236,8 @@ class Swipe(_Playback):
 
     Only samples in contact, sliding in the main direction, averaged in cells of 10 micrometres.
 
-    `file` is an ``.npz`` with encoder, metre_per_count, lateral_force, normal_force and rate; `gain` is in m/N; all else
-    is as for `Recorded`, in Hz at the recorded speed.
+    `file` is an ``.npz`` with encoder, metre_per_count, lateral_force, normal_force and rate; `gain` is in m/N; all
+    else is as for `Recorded`, in Hz at the recorded speed.
     """
 
     kind: ClassVar[str] = "swipe"
