@@ -86,35 +86,10 @@ def test_journal_chunks_change_nothing(monkeypatch):
     equal(expected, hr.render(RECORDED))
 
 
-def test_the_seed_is_the_noise():
-    equal(hr.render(TONE, seed=1), hr.render(TONE, seed=1))
-    assert not np.array_equal(hr.render(TONE, seed=1).sensed, hr.render(TONE, seed=2).sensed)
-
-
-def test_progress_reaches_the_end_in_seconds():
-    seen = []
-    hr.render(TONE, progress=lambda done, total: seen.append((done, total)))
-    assert seen == sorted(seen)
-    assert seen[-1] == (0.5, 0.5)
-
-
 def test_an_odd_duration_is_rounded_to_samples_whatever_the_block():
     scene = dataclasses.replace(TONE, duration=0.1003)
     assert hr.render(scene).drive.shape == (502, 2)  # 501.5 rounds to even
     assert hr.render(scene, driver=simulated(scene, block=7, delay=7)).drive.shape == (502, 2)
-
-
-def test_a_texture_of_ones_own_needs_no_base_class():
-    class Beat:
-        def bands(self, rate):
-            two = np.array([100.0, 110.0])
-            return hr.Bands(frequency=two, wavenumber=0 * two, phase=0 * two, envelope=np.array([1e-5, 1e-5j]))
-
-        def waveform(self, time, position):
-            return np.zeros_like(time)
-
-    recording = hr.render(hr.Scene(texture=Beat(), duration=0.2), method="paper")
-    np.testing.assert_array_equal(recording.target, np.broadcast_to([1e-5, 1e-5j], (1000, 2)))
 
 
 class Faulty(Blocks):
@@ -198,18 +173,6 @@ def test_sigterm_leaves_the_device_at_rest_and_the_journal_whole(tmp_path):
     assert not inner.plant.state["current"].any()
 
 
-def test_a_texture_that_returns_nan_is_named_with_its_first_bad_sample():
-    class Broken:
-        def bands(self, rate):
-            return hr.Bands(frequency=[100.0], wavenumber=[0.0], phase=[0.0])
-
-        def waveform(self, time, position):
-            return np.where(np.asarray(time) < 0.3, 1e-6, np.nan)
-
-    with pytest.raises(ValueError, match=r"^Broken.waveform returned nan at t = 0.3 s, x = nan m: must be finite"):
-        hr.render(hr.Scene(texture=Broken(), duration=0.5))
-
-
 def own(bands=lambda rate: hr.Bands(frequency=[100.0], wavenumber=[0.0], phase=[0.0]), waveform=np.zeros_like):
     """A texture made of two functions."""
     kind = type("Own", (), {"bands": lambda _, rate: bands(rate), "waveform": lambda _, t, x: waveform(t)})
@@ -235,13 +198,6 @@ def own(bands=lambda rate: hr.Bands(frequency=[100.0], wavenumber=[0.0], phase=[
 def test_what_is_handed_over_by_mistake_is_named(arguments, error, message):
     with pytest.raises(error, match=message):
         hr.render(**{"scene": TONE, **arguments})
-
-
-def test_a_block_is_a_whole_number():
-    driver = Blocks(simulated(TONE))
-    driver.block = 50.0
-    with pytest.raises(ValueError, match=r"Blocks: block=50.0 must be a whole number >= 1, an int"):
-        hr.render(TONE, driver=driver)
 
 
 def test_a_scene_file_is_rendered_by_its_name_with_its_own_method_and_seed(tmp_path):
@@ -281,18 +237,6 @@ def test_what_the_device_cannot_do_is_refused_before_anything_is_written(scene, 
     with pytest.raises(ValueError, match=message):
         hr.render(scene, journal=tmp_path / "run.au")
     assert not list(tmp_path.iterdir())
-
-
-def test_bad_arguments_are_refused():
-    with pytest.raises(ValueError, match=r"method = 'pid': must be one of paper, paper-common"):
-        hr.render(TONE, method="pid")
-    with pytest.raises(ValueError, match=r"seed = -1: must be an integer >= 0"):
-        hr.render(TONE, seed=-1)
-
-    mono = Blocks(simulated(TONE))
-    mono.drive_channels = 1
-    with pytest.raises(ValueError, match=r"driver.drive_channels = 1: must be 2"):
-        hr.render(TONE, driver=mono)
 
 
 @pytest.mark.parametrize("frequency", [47.0, 143.0, 261.0])
