@@ -190,14 +190,6 @@ def test_nothing_of_others_is_overwritten(run, tmp_path):
     assert run("render", own / "scene.toml", "--out", other)[0] == 0  # over an earlier run of its own
 
 
-def test_control_characters_of_a_recording_never_reach_the_terminal(run, tiny, tmp_path):
-    run("render", tiny, "--out", tmp_path / "out")
-    path = tmp_path / "out" / "recording.au"
-    path.write_bytes(path.read_bytes().replace(b'"name": "tiny"', b'"name": "t\\u001b"'))
-    line = complaint(run("show", path))
-    assert "name = 't\\x1b': must be a text of printable characters" in line
-
-
 def test_scenes_are_listed_and_printed(run):
     status, out, errors = run("scenes")
     assert (status, errors) == (0, [])

@@ -40,13 +40,6 @@ def test_the_safe_threshold_lies_below_the_classic_one_by_what_active_touch_gain
     assert detection_threshold(frequency) == pytest.approx(expected, rel=ROUNDING)
 
 
-@pytest.mark.parametrize(("border", "step"), [(40.0, 4.0), (80.0, 15.0)])
-def test_the_safe_threshold_steps_down_at_its_borders(border, step):
-    """Over one part in 1e9 the classic curve itself moves by less than 1e-7 dB (its slope is below 40 dB an octave)."""
-    before, at = detection_threshold(np.array([border * (1 - 1e-9), border]))
-    assert 20 * np.log10(before / at) == pytest.approx(step, abs=1e-7)
-
-
 def test_beyond_the_table_nothing_is_known_and_little_is_safe():
     below, above = np.array([0.0, 0.5, 0.999999]), np.array([1000.001, 5e3, 1e6])
     assert np.isnan(detection_threshold(np.concatenate([below, above]), "classic")).all()
@@ -120,17 +113,11 @@ def left(*entries, **device):
     return bands.phase[:-1].tolist()
 
 
-@pytest.mark.parametrize("frequency", [1.0, 7.0, 39.999, 40.0, 79.999, 80.0, 250.0, 999.0, 1000.0, 1500.0, 5e4])
+@pytest.mark.parametrize("frequency", [1.0, 39.999, 40.0, 80.0, 250.0, 1000.0, 5e4])
 def test_a_fixed_carrier_goes_just_below_the_safe_curve_and_stays_on_it(frequency):
     least = detection_threshold(frequency)
     assert left((frequency, 0.0, least * (1 - 1e-9))) == []
     assert left((frequency, 0.0, least * (1 + 1e-9))) == [0]
-
-
-@pytest.mark.parametrize("frequency", [0.0, 0.999])
-def test_nothing_below_1_hz_goes(frequency):
-    assert left((frequency, 0.0, 1e-15)) == [0]
-    assert left((0.0, 1e3, 1e-15), lowest=frequency) == [0]
 
 
 # Fixed part (Hz) and wavenumber (1/m) of a carrier, and where (Hz) it is felt best under a finger of up to 0.1 m/s in
@@ -157,12 +144,6 @@ def test_no_frequency_on_the_way_is_more_sensitive(frequency, wavenumber, top_sp
     if way.size:
         felt = detection_threshold(way).min() * (1 + 1e-9)
         assert left((frequency, wavenumber, felt), **device) == [0]
-
-
-def test_a_locked_carrier_that_never_gets_into_the_device_s_range_is_not_judged():
-    assert left((0.0, 90.0, 1e-15)) == [0]  # up to 9 Hz: the device starts at 10
-    assert left((0.0, 1e3, 1e-15), top_speed=0.0) == [0]
-    assert left((600.0, 100.0, 1e-15)) == [0]  # 590 to 610 Hz: the device ends at 400
 
 
 def test_bands_go_together_only_if_their_sum_is_unfelt():

@@ -28,7 +28,7 @@ def write(tmp_path):
     return write
 
 
-@pytest.mark.parametrize("rate", [1000, 8000, 44100])
+@pytest.mark.parametrize("rate", [1000, 44100])
 def test_a_tone_in_time_comes_back_at_any_file_rate(write, rate):
     texture = Recorded(file=write(0.25 * tone(140.0, rate), rate), gain=4e-6)
     time = np.arange(0.3, 1.7, 1 / 5000)
@@ -89,11 +89,8 @@ def test_carriers_are_the_strongest_peaks_apart(write, rng):
     ("samples", "options", "message"),
     [
         (np.array([0.0, np.nan, 0.0]), {}, r"file = .*texture.wav.*: sample 1 of channel 0 = nan: must be a finite"),
-        (np.array([0.0, 0.1, np.inf]), {}, r"sample 2 of channel 0 = inf: must be a finite number"),
         (np.zeros(0), {}, r"has 0 samples: must be >= 2"),
-        (np.zeros(1), {}, r"has 1 samples: must be >= 2"),
         (np.zeros(4000), {}, r"amplitude = 1e-06 m: nothing to scale between 20 and 400 Hz"),
-        (np.full(4000, 0.5), {}, r"nothing to scale"),
         (np.zeros((10, 2)), {"channel": 2}, r"channel = 2: must be < 2, the channels of .*texture.wav"),
         (np.ones(400), {"passband": (5000.0, 6000.0)}, r"passband = .* Hz: must start < 4000 Hz"),
     ],
@@ -171,14 +168,9 @@ def test_what_is_no_sound_file_is_refused(tmp_path):
     ("wrong", "message"),
     [
         ({"gain": 1.0}, r"amplitude, gain: exactly one"),
-        ({"amplitude": -1e-6}, r"amplitude = -1e-06: must be .* m"),
         ({"speed": 0.0}, r"speed = 0.0: must be .* m/s"),
-        ({"channel": -1}, r"channel = -1: must be an integer >= 0"),
-        ({"carriers": 0}, r"carriers = 0: must be an integer >= 1"),
         ({"passband": (400.0, 20.0)}, r"passband = .*: must be two rising frequencies in Hz"),
-        ({"file": ""}, r"file = '': must be the name of a file"),
         ({"file": "a\0b"}, r"file = .*: must be the name of a file"),
-        ({"file": 3}, r"file = 3: must be the name of a file"),
     ],
 )
 def test_wrong_parameters_are_refused(wrong, message):
@@ -252,13 +244,11 @@ def test_force_is_a_function_of_position_at_other_speeds(save, speed):
     [
         ({"encoder": None}, r"file = .*swipe.npz.*: encoder is missing"),
         ({"rate": -1.0}, r"rate = -1.0: must be .* Hz"),
-        ({"rate": np.array([1.0, 2.0])}, r"rate = .*: must be a finite number .* Hz"),
         ({"metre_per_count": np.nan}, r"metre_per_count = nan: must be .* m"),
         ({"lateral_force": np.full(50000, np.nan)}, r"lateral_force\[0\] = nan: must be a finite number"),
         ({"normal_force": np.full(50000, 1.67)}, r"normal_force departs by .* N .*: must be > 0.2 N"),
         ({"normal_force": np.full(70, 1.67)}, r"have 50000, 50000, 70 samples: must be equal"),
         ({"encoder": np.linspace(0, 1, 50000)}, r"encoder has .* float64: must be a row of .* integer counts"),
-        ({"encoder": np.array(["a"] * 50000)}, r"encoder has .*: must be a row"),
     ],
 )
 def test_bad_swipes_are_refused(save, changes, message):
@@ -305,8 +295,7 @@ def test_the_real_swipe_slides_from_4_6_to_6_9_seconds(shared_data):
     assert not felt[np.isnan(finger.position(time))].any()
 
 
-@pytest.mark.parametrize("components", range(1, 9))
-@pytest.mark.parametrize("seed", [0, 1, 2**32 - 1])
+@pytest.mark.parametrize(("components", "seed"), [(1, 0), (3, 0), (8, 1), (8, 2**32 - 1)])
 def test_synthetic_components_keep_apart_and_within_their_bounds(components, seed):
     texture = Synthetic(amplitude=10e-6, components=components, seed=seed)
     frequency = texture.bands(5000.0).frequency

@@ -160,7 +160,7 @@ def _close_up(axes: Any, recording: Recording) -> None:
 
 
 def _close_span(recording: Recording) -> tuple[int, int]:
-    """First and last sample of a few periods towards the end of the judged time, or at the end where nothing is judged."""
+    """First and last sample of a few periods near the end of the judged time, or at the end where nothing is judged."""
     envelopes, rate = recording.envelopes, recording.rate
     judged = np.flatnonzero(envelopes.judged.any(axis=1))
     if not judged.size:
