@@ -34,19 +34,13 @@ class ResonantDriver(WrappedDriver):
     ----------
     driver : Driver
         The device, at a whole multiple of `parameters.rate`, with one drive channel and one sensed channel, or none:
-        then it is driven open loop, by what a finger of nominal load makes of the mode.
-        Its block is a whole multiple of that multiple, or divides it.
+        then it is driven open loop.  Its block is a whole multiple of that multiple, or divides it.
     parameters : SurfaceParameters
         The surface as assumed; its rate is that of the friction.
     finger : Finger
         Where the finger is, and how hard it presses where the device does not measure it.
     nominal : (float, float), N and m/s
         Load and speed that the amplitude is held for while no finger is there.
-
-    Raises
-    ------
-    ValueError
-        Rate, block or channels of the device do not fit.
 
     Notes
     -----

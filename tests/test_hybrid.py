@@ -1,8 +1,4 @@
-"""The hybrid: shares that sum to the target, two controllers as one, plate and screen under one finger, refusals."""
-
-import tomllib
-from importlib.metadata import EntryPoint
-from pathlib import Path
+"""The hybrid: shares that sum to the target, two controllers as one, plate and screen under one finger."""
 
 import numpy as np
 import pytest
@@ -23,17 +19,6 @@ START = 100.0 / 1.5  # Hz, F of the default crossover
 FELT = 0.01  # a tenth of what lies below every just noticeable difference (FACTS 7), as the accuracy suite asks
 SWEPT = 0.025  # the suite's bound for swipes
 TRACKER = 2 * np.pi * 60.0  # rad/s, of the finger's tracker
-
-
-@pytest.fixture(autouse=True)
-def devices_of_the_project(monkeypatch):
-    """Renderers and drivers as pyproject names them, also where the installed package is older."""
-    project = tomllib.loads((Path(__file__).parent.parent / "pyproject.toml").read_text(encoding="utf-8"))["project"]
-
-    def registered(group, name):
-        return EntryPoint(name, project["entry-points"][f"hapticrender.{group}"][name], group).load()
-
-    monkeypatch.setattr(loop, "registered", registered)
 
 
 def scene(texture, finger=SLIDE, duration=1.2, **plant):
@@ -239,11 +224,8 @@ BOTH_HAVE = r"must be plate_current_limit or screen_current_limit"
         ({"crossover": 30.0}, r"render.crossover = 30.0: must be .* >= 40 and <= 400 Hz"),
         ({"current_limit": 2.0}, BOTH_HAVE),
         ({"plate_current_limit": 0.01}, r"must be <= 0.01 A in each coil"),
-        ({"coils": 1}, r"device.coils = 1: must be 2 on a hybrid"),
-        ({"delay": 2}, r"device.delay = 2: must be 1 on a hybrid"),
         ({"velocity_per_force": 0.0}, r"render.velocity_per_force = 0.0: must be > 0"),
         ({"mas": 1.0}, r"device.mas: no such parameter; known: .*mass.*plate_current_limit"),
-        ({"plate_rate": 1e4}, r"device.plate_rate: no such parameter"),
     ],
 )
 def test_parameters_are_refused(plant, message):
@@ -251,17 +233,10 @@ def test_parameters_are_refused(plant, message):
         loop.prepare(scene(tone(100.0), **plant))
 
 
-def test_scenes_are_refused():
+def test_scenes_and_drivers_are_refused():
     with pytest.raises(ValueError, match="a recording over time is not supported"):
         loop.prepare(scene(hr.Synthetic(amplitude=1e-5)))
-    with pytest.raises(ValueError, match="finger: must slide faster"):
-        loop.prepare(scene(tone(100.0), hr.Finger.still()))
     with pytest.raises(ValueError, match="texture.amplitude asks for an attraction of"):
         loop.prepare(scene(tone(250.0, 1.5)))
-
-
-@pytest.mark.parametrize("channels", [{"drive_channels": 2}, {"sensed_channels": 1}])
-def test_drivers_are_refused(channels):
-    driver = BaseDriver(**{"rate": RATE, "drive_channels": 3, "sensed_channels": 3, "block": 1, "delay": 1} | channels)
-    with pytest.raises(ValueError, match=rf"driver.{next(iter(channels))} = \d: must be 3"):
-        loop.prepare(scene(tone(100.0)), driver=driver)
+    with pytest.raises(ValueError, match=r"driver.drive_channels = 2: must be 3"):
+        loop.prepare(scene(tone(100.0)), driver=BaseDriver(rate=RATE, drive_channels=2, sensed_channels=3))

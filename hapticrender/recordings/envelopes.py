@@ -86,19 +86,15 @@ def _window(recording: Recording, longest: float) -> float:
 def window_length(bands: Bands, rate: float, position: Array, longest: float) -> float:
     """Length of the analysis window (s): max(20 ms, 2/lowest frequency, 2/spacing), cut to `longest` (s).
 
-    A carrier that is locked to the finger counts with its lowest frequency
-    while the finger is down; frequencies below 20 Hz are not judged and do
-    not count.
+    A finger-locked carrier counts with its lowest frequency while the finger (`position`, m, at `rate`, Hz) is down;
+    frequencies below 20 Hz are not judged and do not count.
     """
     step = max(1, round(SHORTEST_WINDOW / QUARTERS * rate))
-    coarse = position[::step]
+    frequency, coarse = bands.frequency[None, :], position[::step]
     if bands.wavenumber.any() and coarse.size > 1:
         velocity = np.diff(coarse) * rate / step
         frequency = np.abs(bands.instantaneous_frequency(velocity[np.isfinite(velocity)]))
-    else:
-        frequency = bands.frequency[None, :]
-    lowest = max(LOWEST_FREQUENCY, frequency.min(initial=np.inf))
-    window = max(SHORTEST_WINDOW, PERIODS / lowest if np.isfinite(lowest) else 0.0)
+    window = max(SHORTEST_WINDOW, PERIODS / max(LOWEST_FREQUENCY, frequency.min(initial=np.inf)))
     fast = np.sort(frequency[(frequency >= LOWEST_FREQUENCY).all(axis=1)], axis=1)
     if len(bands) > 1 and len(fast):
         spacing = np.quantile(np.diff(fast, axis=1).min(axis=1), 0.05)
