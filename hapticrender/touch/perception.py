@@ -33,8 +33,8 @@ def detection_threshold(frequency: float | Array, curve: str = "safe") -> Array:
 
     `curve` "classic" is the published one for a large contactor, log-log between its table's entries, for levels; NaN
     beyond 1 to 1000 Hz.  "safe" is what may be left out: 6 dB below it under 40 Hz, 10 dB from 40 Hz on, 25 dB from
-    80 Hz on (at a border the lower value), since active touch of a flat plate is that much more sensitive; 0 below 1 Hz,
-    and above 1 kHz as there, but never above the motion that `REALISTIC_FORCE` makes.
+    80 Hz on (at a border the lower value), since active touch of a flat plate is that much more sensitive; 0 below
+    1 Hz, and above 1 kHz as there, but never above the motion that `REALISTIC_FORCE` makes.
 
     References
     ----------
@@ -87,8 +87,8 @@ def roughness(displacement: float | Array, frequency: float | Array) -> float:
     """Roughness of a fine texture of partials at `frequency` (Hz, >= 0): its power as the Pacinian channel weighs it.
 
     ``sum |X(f)|^2/T_P(f)^2`` of the `displacement` X (m peak, may be complex) with the threshold T_P of that channel:
-    the classic one from 40 Hz on, rising by 12 dB an octave below.  Partials above 1 kHz add nothing [Bensmaia, Hollins:
-    The vibrations of texture, Somatosens. Mot. Res. 20, 2003].
+    the classic one from 40 Hz on, rising by 12 dB an octave below.  Partials above 1 kHz add nothing [Bensmaia,
+    Hollins: The vibrations of texture, Somatosens. Mot. Res. 20, 2003].
     """
     hertz = _frequency(frequency)
     threshold = detection_threshold(np.clip(hertz, PACINIAN_FROM, HIGHEST), "classic")
