@@ -34,7 +34,7 @@ CHUNK_VALUES = 2**20  # numbers read at once
 LONGEST_NOTE = 2**26  # bytes of header
 MOTION_SOURCES = ("true", "sensors", "unknown")
 _COLUMNS = ("frequency", "wavenumber", "phase")  # of bands
-_NUMBER = {"least": -1e12, "most": 1e12}
+_NUMBER: dict[str, Any] = {"least": -1e12, "most": 1e12}
 
 
 def _places(key: str, value: Any) -> tuple[str, ...]:
@@ -59,7 +59,9 @@ def _bands(key: str, value: Any) -> Bands:
         require(good, f"{key}.envelope", pairs, "pairs of real and imaginary part")
         parts = [[number(f"{key}.envelope", part, **_NUMBER) for part in pair] for pair in pairs]
         envelope = np.array([complex(*pair) for pair in parts], complex)
-    marks = {name: flag(f"{key}.{name}", value.get(name, False)) for name in ("modulated", "differentiated")}
+    marks: dict[str, Any] = {
+        name: flag(f"{key}.{name}", value.get(name, False)) for name in ("modulated", "differentiated")
+    }
     unfelt = tuple(text(f"{key}.unfelt", each, 1000) for each in value.get("unfelt", ()))
     arrays: dict[str, Any] = {name: np.array(column, float) for name, column in columns.items()}
     return Bands(**arrays, envelope=envelope, **marks, unfelt=unfelt)

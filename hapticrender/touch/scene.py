@@ -273,7 +273,9 @@ def _read_kind(table: Any, key: str, choice: str, kinds: dict[str, type[Any]], f
         kind = kinds[checks.choice(choice, table.get(choice), kinds)]
         entries = fields(kind)
         _only_known(table, [choice, *(entry.name for entry in entries), *extra])
-        values = {entry.name: None for entry in entries if entry.default is entry.default_factory is MISSING}
+        values: dict[str, Any] = {
+            entry.name: None for entry in entries if entry.default is entry.default_factory is MISSING
+        }
         values |= {entry.name: table[entry.name] for entry in entries if entry.name in table}
         if isinstance(values.get("file"), str) and values["file"].isprintable():
             values["file"] = str(folder / values["file"]) if values["file"] else ""
