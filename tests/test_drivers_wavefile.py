@@ -242,20 +242,3 @@ def test_a_run_through_a_tee_is_the_run_without_it(tmp_path):
     held = driver.read_back()
     assert len(held) == len(plain.drive) + 1  # and a sample of rest
     np.testing.assert_array_equal(held[:-1], plain.drive)
-
-
-def test_alone_it_is_driven_from_the_look_up_table(tmp_path):
-    driver = WaveFileDriver(tmp_path / "a.wav", rate=5000, block=5, subtype="DOUBLE", full_scale=1.0)
-    recording = hr.render(SCENE, driver=driver, method="paper")
-    np.testing.assert_array_equal(driver.read_back()[:-5], recording.drive)
-    s = 2j * np.pi * 47.0
-    stiffness = np.array([[45.3e3, 0.5e3], [0.5e3, 45.3e3]])  # heave and rocking [FACTS 1], N/m
-    plate = np.diag([32e-3, 4e-5 / 27.5e-3**2]) * s**2 + 1.7 * np.eye(2) * s + stiffness
-    coils = 7.4 * np.array([[1.0, 1.0], [-1.0, 1.0]])  # N/A
-    current = np.abs(np.linalg.solve(coils, plate @ [10e-6, 0.0]))  # what heaves the plate and does not rock it
-    current /= np.sinc(47.0 / 5000)  # held for a sample
-    time = np.arange(2000, 2500) / 5000  # 0.1 s holds 4.7 periods: fit cosine and sine rather than average
-    basis = np.column_stack([np.cos(2 * np.pi * 47 * time), np.sin(2 * np.pi * 47 * time)])
-    parts, *_ = np.linalg.lstsq(basis, recording.drive[2000:2500], rcond=None)
-    # The table's steps of 0.5 Hz hold 47 Hz itself, so the drive is the table's to rounding.
-    np.testing.assert_allclose(np.hypot(*parts), current, rtol=1e-9)

@@ -118,19 +118,6 @@ def test_a_tone_is_felt_whole(frequency):
     assert (rubbed > 0.0) == (frequency > START)
 
 
-def test_each_part_gives_its_share_and_no_more():
-    """At 90 Hz the screen gives 28 %; by a fit over 0.5 s, 45 periods."""
-    session = loop.prepare(scene(tone(90.0)))
-    plant, controller = session.driver.plant, session.controller()
-    assert plant.closes(controller)
-    plant.closed_loop(controller, np.zeros(12_000))
-    felt = plant.felt[7000:] - plant.felt[7000:].mean(axis=0)
-    parts = abs(2 * np.exp(-2j * np.pi * 90.0 * np.arange(5000) / RATE) @ felt) / 5000
-    share = smoothstep(90.0 / START - 1)
-    assert share == pytest.approx(0.28175)
-    np.testing.assert_allclose(parts, [0.02 * (1 - share), 0.02 * share], atol=0.02 * FELT)
-
-
 def test_a_grating_swept_through_the_crossover():
     """From 50 to 170 Hz and back, every window, once the finger is learnt.
 

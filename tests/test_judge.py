@@ -6,7 +6,7 @@ import tracemalloc
 
 import numpy as np
 import pytest
-from synthetic import PLACES, RATE, make_bands, make_recorder, make_recording, make_signals, times
+from synthetic import RATE, make_bands, make_recorder, make_recording, make_signals, times
 
 from hapticrender.protocols import Flag
 from hapticrender.recordings import envelopes, judge
@@ -104,16 +104,6 @@ def test_wobble_is_the_rms_of_the_waveform_that_modulation_adds(turn):
     recording = make_recording(bands, swing * bands.envelope)
     added = 10 * UM * depth / 2 * np.sinc(2.0 * recording.envelopes.window)
     assert recording.summary()["wobble"] == pytest.approx(added, rel=2e-3)  # the ends of the judged time
-
-
-def test_wobble_of_white_noise(rng):
-    """Variance of a complex envelope fitted to m samples of white noise: 4 sigma^2/m, half of it in the waveform."""
-    bands = make_bands(400.0, 10 * UM)
-    noise = UM * rng.standard_normal((50000, len(PLACES)))
-    recording = make_recording(bands, bands.envelope, extra=noise, duration=10.0)
-    samples = recording.envelopes.window * RATE
-    # 900 windows that overlap by half: about 600 independent ones of two parts, standard deviation 2 %
-    assert recording.summary()["wobble"] == pytest.approx(UM * math.sqrt(2 / samples), rel=0.06)
 
 
 def test_fit_equals_least_squares_window_by_window(rng):
@@ -264,13 +254,3 @@ def test_a_long_journal_is_judged_without_being_loaded(tmp_path):
         tracemalloc.stop()
     assert summary["bands"][1]["rms_error_centre"] == pytest.approx(0.01, rel=1e-6)
     assert peak < 5 * 8 * envelopes.CHUNK_VALUES + 150 * 59_998 * 2
-
-
-def test_windows_of_very_long_runs_do_not_overlap(monkeypatch):
-    bands = make_bands(100.0, 10 * UM)
-    whole = make_recording(bands, 1.1 * bands.envelope)
-    assert np.diff(whole.envelopes.start) == pytest.approx(0.01)  # half of a window of 20 ms
-    monkeypatch.setattr(envelopes, "MOST_WINDOWS", 10)
-    sparse = make_recording(bands, 1.1 * bands.envelope)
-    assert np.diff(sparse.envelopes.start) == pytest.approx(0.02)
-    assert only(sparse)["rms_error_centre"] == pytest.approx(only(whole)["rms_error_centre"], rel=EXACT)

@@ -118,7 +118,7 @@ def test_outlines_keep_the_extremes_and_gaps_of_a_long_signal(rng):
     assert np.flatnonzero(np.isnan(picture.outline(recording, "position")[1])).tolist() == [1]
 
 
-@pytest.mark.parametrize(("suffix", "magic"), [(".png", b"\x89PNG"), (".svg", b"<?xml"), (".PDF", b"%PDF")])
+@pytest.mark.parametrize(("suffix", "magic"), [(".png", b"\x89PNG"), (".PDF", b"%PDF")])
 def test_the_ending_chooses_the_format(tmp_path, suffix, magic):
     assert swiped().plot(tmp_path / f"x{suffix}")
     assert (tmp_path / f"x{suffix}").read_bytes().startswith(magic)

@@ -74,22 +74,3 @@ def test_devices_are_drawn_side_by_side(recordings, tmp_path):
         assert f"{recording.scene.device}, by " in axes.get_title(loc="left")
     plot_devices(recordings, tmp_path / "devices.png")
     assert (tmp_path / "devices.png").read_bytes()[:4] == b"\x89PNG"
-
-
-def test_the_page_shows_what_devices_share(tmp_path):
-    from hapticrender.loop import prepare
-    from hapticrender.report.outputs import run_into
-    from hapticrender.report.page import devices_section
-
-    texture = hr.Grating(velocity=8e-3, frequency=60.0)
-    outputs = [
-        run_into(
-            tmp_path / device,
-            prepare(hr.Scene(texture=texture, finger=FINGER, device=device, duration=1.0, name=device)),
-        )
-        for device in ("vt-plate", "ultrasonic")
-    ]
-    section = devices_section(tmp_path, outputs)
-    assert "One texture, 2 devices" in section
-    assert section.count("<td>8.000</td>") == 1
-    assert devices_section(tmp_path, outputs[:1]) == ""

@@ -118,10 +118,3 @@ def test_the_bar_grows_by_duration_and_ends_its_line():
     assert shares == [0, 12, 25, 25, 62, 100]  # halves of a quarter, then of three quarters
     assert terminal.text.endswith("100 %  long\x1b[K\n")
     assert terminal.text.count("\n") == 1
-
-
-def test_a_broken_off_bar_ends_its_line_too():
-    terminal = Terminal()
-    with pytest.raises(KeyboardInterrupt), Progress([1.0], stream=terminal).scene("only"):
-        raise KeyboardInterrupt
-    assert terminal.text.endswith("\n")
