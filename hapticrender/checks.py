@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import MISSING, field, fields
 from numbers import Integral, Real
-from typing import Any, NoReturn, Self
+from typing import IO, Any, NoReturn, Self
 
 import numpy as np
 
@@ -153,6 +153,14 @@ def file_name(key: str, value: Any) -> str:
     name = os.fspath(value)
     require(isinstance(name, str) and name.isprintable() and name != "", key, value, bound)
     return os.path.abspath(name)
+
+
+def npy_header(stream: IO[bytes]) -> tuple[tuple[int, ...], np.dtype[Any]]:
+    """Shape and type of an array in the NPY format, read from its header alone."""
+    first = np.lib.format.read_magic(stream) == (1, 0)
+    read = np.lib.format.read_array_header_1_0 if first else np.lib.format.read_array_header_2_0
+    shape, _, kind = read(stream)
+    return shape, kind
 
 
 def exactly_one(**values: Any) -> str:

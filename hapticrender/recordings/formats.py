@@ -6,7 +6,7 @@ import itertools
 import json
 import math
 import os
-import tempfile
+import uuid
 import zipfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -15,13 +15,13 @@ from typing import Any
 
 import numpy as np
 
+from hapticrender.checks import npy_header
 from hapticrender.errors import HapticError
 from hapticrender.protocols import Array
 from hapticrender.recordings.journal import Header, chunks, column, join, read_journal, split, write_journal
 
 COMMENT_LIMIT = 4000  # characters; libsndfile drops a longer WAV comment silently
 FLAC_CHANNELS = 8
-NPY_HEADS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
 
 
 class MissingExtra(HapticError, ImportError):
@@ -98,21 +98,15 @@ def _by_suffix(path: Path, table: dict[str, Any], verb: str) -> Any:
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
     """Provide a scratch file beside `path` that takes its place only if the block succeeds."""
-    handle, name = tempfile.mkstemp(path.suffix.lower(), f".{path.stem}-", path.parent)
-    os.close(handle)
-    scratch = Path(name)
+    scratch = path.with_name(f".{path.stem}-{uuid.uuid4().hex}{path.suffix.lower()}")
+    scratch.touch()
     try:
         yield scratch
-        scratch.chmod(path.stat().st_mode if path.exists() else 0o666 & ~_umask())
+        if path.exists():
+            scratch.chmod(path.stat().st_mode)
         scratch.replace(path)
     finally:
         scratch.unlink(missing_ok=True)
-
-
-def _umask() -> int:
-    mask = os.umask(0)
-    os.umask(mask)
-    return mask
 
 
 def _values(header: Header, frames: Any) -> dict[str, Any]:
@@ -160,9 +154,7 @@ def _read_npz(path: Path) -> tuple[Header, Array]:
 
         def load(name: str) -> Any:
             with archive.open(f"{name}.npy") as member:
-                version = np.lib.format.read_magic(member)
-                read_head = NPY_HEADS[version]
-                shape, _, dtype = read_head(member)
+                shape, dtype = npy_header(member)
             _check_size(path, name, shape, dtype.itemsize)
             return file[name]
 

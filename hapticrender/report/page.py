@@ -25,38 +25,32 @@ GENERATOR = '<meta name="generator" content="hapticrender">'
 CLASSES = {"passed": "good", "failed": "bad", "not judged": "note"}
 
 STYLE = """
-:root { color-scheme: light dark; --ink: #22303c; --soft: #5f6d78; --line: #dfe4e8; --wash: #f6f8f9; --paper: #fff;
-  --good: #2b6f77; --bad: #b3432b; }
-@media (prefers-color-scheme: dark) { :root { --ink: #dde4ea; --soft: #98a5b0; --line: #37424c; --wash: #1e262d;
-  --paper: #14191e; --good: #6fc3cc; --bad: #f08a6e; } section img { filter: invert(1) hue-rotate(180deg); } }
-body { margin: 0 auto; max-width: 70rem; padding: 3rem 1.5rem 5rem; color: var(--ink); background: var(--paper);
-  font: 16px/1.55 system-ui, sans-serif; }
+:root { color-scheme: light dark; --soft: #6d7c87; --line: #8884; --good: #2b8f97; --bad: #c8553b; }
+@media (prefers-color-scheme: dark) { section img { filter: invert(1) hue-rotate(180deg); } }
+body { margin: 0 auto; max-width: 70rem; padding: 3rem 1.5rem 5rem; font: 16px/1.55 system-ui, sans-serif; }
 h1, h2 { font-family: Georgia, serif; line-height: 1.2; }
 a { color: var(--good); }
-nav { columns: 14rem; margin: 1.5rem 0; font-size: 0.9rem; }
+nav { columns: 14rem; }
 nav a { display: block; }
 .scroll { overflow-x: auto; margin: 1.5rem 0; }
 table { border-collapse: collapse; width: 100%; font-size: 0.9rem; font-variant-numeric: tabular-nums; }
-caption { text-align: left; color: var(--soft); }
-th, td { text-align: right; padding: 0.4rem 0.7rem; }
+th, td { text-align: right; padding: 0.4rem 0.7rem; white-space: nowrap; }
 th { color: var(--soft); vertical-align: bottom; }
-td { border-top: 1px solid var(--line); white-space: nowrap; }
+td { border-top: 1px solid var(--line); }
 th.text, td.text { text-align: left; }
 td.wide { white-space: normal; min-width: 9rem; }
 th.group { text-align: center; border-bottom: 1px solid var(--line); }
 .good { color: var(--good); }
 .bad { color: var(--bad); }
-.note { color: var(--soft); font-size: 0.9rem; }
-section { border-top: 2px solid var(--ink); margin-top: 3.5rem; }
-section img { display: block; width: 100%; height: auto; }
+.note, dt { color: var(--soft); }
+section { border-top: 2px solid; margin-top: 3.5rem; }
+section img, audio { display: block; width: 100%; height: auto; }
+audio { height: 2.2rem; }
 .halves { display: grid; grid-template-columns: repeat(auto-fit, minmax(min(22rem, 100%), 1fr)); gap: 0.5rem 3rem; }
 dl { display: grid; grid-template-columns: max-content 1fr; gap: 0.35rem 1.2rem; font-size: 0.9rem; }
-dt { color: var(--soft); }
 dd { margin: 0; }
-audio { width: 100%; height: 2.2rem; display: block; }
-pre { padding: 1rem 1.2rem; background: var(--wash); overflow: auto; max-height: 34rem; font-size: 0.8rem; }
-@media print { body { max-width: none; padding: 0; font-size: 10pt; background: #fff; } audio, nav { display: none; }
-  .scroll { overflow: visible; } table { font-size: 7.5pt; } section { break-before: page; } }
+pre { padding: 1rem; background: var(--line); overflow: auto; max-height: 34rem; font-size: 0.8rem; }
+@media print { audio, nav { display: none; } .scroll { overflow: visible; } section { break-before: page; } }
 """
 
 

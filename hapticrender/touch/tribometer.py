@@ -132,9 +132,7 @@ def _read(file: str) -> dict[str, Array]:
 def _read_array(archive: zipfile.ZipFile, key: str) -> Array:
     """Read one array, no more than its header says; refuse by that header one that is too long."""
     with archive.open(f"{key}.npy") as stream:
-        version = np.lib.format.read_magic(stream)
-        header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
-        shape, _, kind = header(stream)
+        shape, kind = checks.npy_header(stream)
         count = math.prod(shape)
         if kind.hasobject:
             raise ValueError(f"{key} holds Python objects")
