@@ -156,6 +156,12 @@ def _add_run(verb: argparse.ArgumentParser, *, method: bool = True, driver: bool
     verb.add_argument("--seed", metavar="N", type=seed, help="seed of the noise (default: the scene's)")
 
 
+def _made(path: Path) -> Path:
+    """Return `path`, its folder made."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    return path
+
+
 def _path(text: str) -> Path:
     """Read the name of a file or folder; an empty one would silently mean the folder that one stands in."""
     if not text:
@@ -267,8 +273,7 @@ def _validate(arguments: argparse.Namespace) -> int:
     verdicts = validate(references, **options, progress=sys.stderr)
     for _, path, write in reports:
         if path:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            write(path, verdicts)
+            write(_made(path), verdicts)
     if rendered := [verdict.summary for verdict in verdicts if verdict.summary]:
         print(printable(overview(rendered)))
     for verdict in verdicts:
@@ -293,8 +298,7 @@ def _suite(arguments: argparse.Namespace) -> int:
     figures = run_suite(methods, progress=lambda line: print(line, file=sys.stderr))
     print(table(as_rows(figures, methods)))
     if arguments.json:
-        arguments.json.parent.mkdir(parents=True, exist_ok=True)
-        write_json(arguments.json, figures)
+        write_json(_made(arguments.json), figures)
     return 0 if all(figure.passed for figure in figures if figure.method == chosen) else 1
 
 
@@ -326,8 +330,7 @@ def _identify(arguments: argparse.Namespace) -> int:
     for difference in found.differences(setup.assumed):
         print(f"differs from [device]: {difference}")
     if arguments.out:
-        arguments.out.parent.mkdir(parents=True, exist_ok=True)
-        arguments.out.write_text(found.to_toml(), encoding="utf-8")
+        _made(arguments.out).write_text(found.to_toml(), encoding="utf-8")
         print(f"wrote {arguments.out}")
     return 0
 

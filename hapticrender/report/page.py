@@ -14,7 +14,7 @@ from hapticrender.formatting import as_json, band_label, bands_label, degrees, p
 from hapticrender.recordings.recording import Recording
 from hapticrender.report.devices_picture import plot_devices
 from hapticrender.report.outputs import JOURNAL, Outputs
-from hapticrender.report.text import amplitudes, brief, columns_of, flags, titles, verdict, worst_at
+from hapticrender.report.text import amplitudes, brief, flags, places_of, verdict
 from hapticrender.skin import skin_bands
 from hapticrender.touch.scene import distinct_names
 
@@ -121,20 +121,15 @@ def _overview(scenes: Sequence[Outputs]) -> str:
     rows = []
     for scene, (target, achieved) in zip(scenes, amplitudes([scene.summary for scene in scenes]), strict=True):
         summary = scene.summary
-        errors = [worst_at(summary["bands"], place) for place in columns_of(summary)]
-        cells = "".join(_error_cell(error, summary["tolerance"]) for error in errors)
         rows.append(
             f'<tr><td class="text"><a href="#{quote(scene.name)}">{escape(scene.name)}</a></td>'
             f'<td class="text wide {CLASSES[summary["verdict"]]}">{_whole(brief(summary))}</td>'
-            f"<td>{target}</td><td>{achieved}</td>{cells}</tr>"
+            f"<td>{target}</td><td>{achieved}</td>{_error_cell(summary['worst']['value'], summary['tolerance'])}</tr>"
         )
-    heads = "".join(f"<th>{title}</th>" for title in titles([scene.summary for scene in scenes]))
-    head = f"""<tr><th class="text" rowspan="2">Scene</th><th class="text" rowspan="2">Verdict</th>
-<th rowspan="2">Target</th><th rowspan="2">Achieved</th><th class="group" colspan="3">rms error</th></tr>
-<tr>{heads}</tr>"""
-    return f"""{html_table(head, rows)}
+    heads = "".join(f"<th>{title}</th>" for title in ("Target", "Achieved", "rms error"))
+    return f"""{html_table(f'<tr><th class="text">Scene</th><th class="text">Verdict</th>{heads}</tr>', rows)}
 <p class="note">Amplitudes are peak values, achieved ones at the centre. A scene of several bands shows the root of the
-sum of their squares, and the largest error of any.</p>"""
+sum of their squares, and the largest error of any band at any place.</p>"""
 
 
 def _alike(scenes: Sequence[Outputs]) -> dict[str, Recording]:
@@ -210,8 +205,7 @@ def _section(scene: Outputs, folder: str) -> str:
 
 def _bands(summary: Mapping[str, Any]) -> str:
     """Table of a scene's bands, amplitudes with one prefix; folded where there are many."""
-    bands, tolerance = summary["bands"], summary["tolerance"]
-    places = [place for place in columns_of(summary) if f"error_{place}" in (bands or [{}])[0]]
+    bands, tolerance, places = summary["bands"], summary["tolerance"], places_of(summary)
     largest = max((band["target"] for band in bands if band["target"] is not None), default=1.0)
     rows = []
     for band in bands:

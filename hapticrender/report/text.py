@@ -11,7 +11,6 @@ from hapticrender.formatting import band_label, degrees, percent, quantity, shor
 if TYPE_CHECKING:
     from hapticrender.touch.scene import Scene
 
-PLACES = ("centre", "end_1", "end_2")
 MEASURED = {"friction": "friction", "skin": "skin velocity"}  # places that name a quantity, not a position
 
 
@@ -19,17 +18,6 @@ def places_of(summary: Mapping[str, Any]) -> list[str]:
     """Evaluation points that a summary has errors of."""
     first = (summary["bands"] or [{}])[0]
     return [key.removeprefix("rms_error_") for key in first if key.startswith("rms_error_")]
-
-
-def columns_of(summary: Mapping[str, Any]) -> tuple[str, ...]:
-    """Places whose errors stand in the columns of a table: the first one that the device has, and the ends."""
-    return ((places_of(summary) or PLACES)[0], *PLACES[1:])
-
-
-def titles(summaries: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Titles of those columns; the first is the place's own name where all devices agree on it."""
-    first = {columns_of(summary)[0].replace("_", " ") for summary in summaries}
-    return [first.pop() if len(first) == 1 else "at the finger", "end 1", "end 2"]
 
 
 def at(places: Sequence[str]) -> str:
@@ -45,13 +33,6 @@ def at(places: Sequence[str]) -> str:
         return f"of {' and '.join(MEASURED[name] for name in names)}"
     ends = len(names) > 1
     return "at " + " and ".join(dict.fromkeys("ends" if ends and name.startswith("end ") else name for name in names))
-
-
-def worst_at(bands: Sequence[Mapping[str, Any]], place: str) -> float | None:
-    """Find the largest abs(rms error) (1) of all bands at "centre", "end_1" or "end_2"; None without figures."""
-    errors = [band.get(f"rms_error_{place}") for band in bands]
-    known = [abs(error) for error in errors if error is not None and math.isfinite(error)]
-    return max(known, default=None)
 
 
 def total(bands: Sequence[Mapping[str, Any]], key: str) -> float | None:
@@ -99,11 +80,10 @@ def amplitudes(summaries: Sequence[Mapping[str, Any]]) -> list[tuple[str, str]]:
 
 
 def overview(summaries: Sequence[Mapping[str, Any]]) -> str:
-    """Tabulate scenes, a line each: amplitudes, the largest rms error at each place, the verdict."""
-    rows = [["scene", "target", "achieved", *titles(summaries), "verdict"]]
+    """Tabulate scenes, a line each: amplitudes, the worst rms error of any band at any place, the verdict."""
+    rows = [["scene", "target", "achieved", "rms error", "verdict"]]
     for summary, pair in zip(summaries, amplitudes(summaries), strict=True):
-        errors = [percent(worst_at(summary["bands"], place)) for place in columns_of(summary)]
-        rows.append([summary["scene"], *pair, *errors, brief(summary)])
+        rows.append([summary["scene"], *pair, percent(summary["worst"]["value"]), brief(summary)])
     return table(rows)
 
 
