@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import multiprocessing
 import re
 import tempfile
@@ -120,14 +121,14 @@ def validate(
     judge = partial(_judge, method=method, seed=seed, out=None if out is None else Path(out))
     entries = _read(scenes)
     durations = [scene.duration for _, scene in entries if isinstance(scene, Scene)]
-    shown = Progress(durations, progress) if progress else None
+    bar = Progress(durations, progress or io.StringIO())
     if jobs == 1:
-        return [_with_progress(shown, *entry, partial(judge, *entry)) for entry in entries]
+        return [_with_progress(bar, *entry, partial(judge, *entry)) for entry in entries]
     with ProcessPoolExecutor(jobs, multiprocessing.get_context("spawn")) as pool:
         futures = [pool.submit(judge, *entry) for entry in entries]
         try:
             pairs = zip(entries, futures, strict=True)
-            return [_with_progress(shown, *entry, partial(_result, future)) for entry, future in pairs]
+            return [_with_progress(bar, *entry, partial(_result, future)) for entry, future in pairs]
         except BaseException:
             pool.shutdown(cancel_futures=True)
             raise
@@ -169,9 +170,9 @@ def _result(future: Future[Verdict], _: Tick | None) -> Verdict:
 
 
 def _with_progress(
-    progress: Progress | None, label: str, scene: Scene | str, judge: Callable[[Tick | None], Verdict]
+    progress: Progress, label: str, scene: Scene | str, judge: Callable[[Tick | None], Verdict]
 ) -> Verdict:
-    if progress is None or isinstance(scene, str):
+    if isinstance(scene, str):
         return judge(None)
     with progress.scene(label) as tick:
         return judge(tick)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping
 from functools import partial
-from typing import Any, Generic, TypeVar
+from typing import Any
 
 from hapticrender import checks
 from hapticrender.bands import Bands
@@ -16,10 +16,10 @@ from hapticrender.protocols import Array, Controller, Driver, Method, Plant, Ren
 from hapticrender.touch.scene import Scene
 
 Waveform = Callable[[Array, Array], Array]
-Setup = TypeVar("Setup")
+Setup = Any  # what `read` returns: a class of each renderer's own
 
 
-class BaseRenderer(Generic[Setup]):
+class BaseRenderer:
     """Renderer made of parts: `read` the scene once, then give its setup to every other part.
 
     A subclass fills in `plant`, `device_model` and `bands`.  Where it leaves `read` as it is, the setup is the scene.
@@ -55,7 +55,7 @@ class BaseRenderer(Generic[Setup]):
 
     def read(self, scene: Scene, driver: Driver | None) -> Setup:
         """Return the setup: what the scene's tables say, in the form that the other parts take."""
-        return scene  # type: ignore[return-value]
+        return scene
 
     def plant(self, setup: Setup, seed: int) -> Plant:
         """Return the simulated device with the scene's finger on it."""

@@ -37,8 +37,13 @@ class ElectroadhesionSettings(FrictionSettings):
     output: str = option("envelope", "envelope", "carrier")
 
 
-class ScreenSetup(FrictionSetup[ElectroadhesionSettings, ElectroadhesionParameters]):
+@dataclass(frozen=True)
+class ScreenSetup(FrictionSetup):
     """A scene on a screen, with the square root for it."""
+
+    settings: ElectroadhesionSettings
+    assumed: ElectroadhesionParameters
+    simulated: ElectroadhesionParameters
 
     @property
     def nominal(self) -> ElectroadhesionParameters:
@@ -86,7 +91,7 @@ class ScreenSetup(FrictionSetup[ElectroadhesionSettings, ElectroadhesionParamete
         return model
 
 
-class ElectroadhesionRenderer(FrictionRenderer[ScreenSetup]):
+class ElectroadhesionRenderer(FrictionRenderer):
     """Renderer for current-driven electroadhesion screens."""
 
     name = "electroadhesion"

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, Generic, TypeVar
+from typing import Any
 
 import numpy as np
 
@@ -40,18 +40,14 @@ class FrictionSettings(Validated):
     square_root: str = option("on", "on", "off")
 
 
-Parameters = TypeVar("Parameters", bound=SlidingParameters)
-Settings = TypeVar("Settings", bound=FrictionSettings)
-
-
 @dataclass(frozen=True)
-class FrictionSetup(Generic[Settings, Parameters]):
+class FrictionSetup:
     """A scene, its settings, the surface that its controller assumes, and the one that is simulated."""
 
     scene: Scene
-    settings: Settings
-    assumed: Parameters
-    simulated: Parameters
+    settings: FrictionSettings
+    assumed: SlidingParameters
+    simulated: SlidingParameters
 
     @cached_property
     def speed(self) -> float:
@@ -169,17 +165,14 @@ class FrictionSetup(Generic[Settings, Parameters]):
         )
 
 
-Setup = TypeVar("Setup", bound=FrictionSetup[Any, Any])
-
-
-class FrictionRenderer(BaseRenderer[Setup]):
+class FrictionRenderer(BaseRenderer):
     """Base of the renderers whose target quantity is friction (N) against the motion of a sliding finger."""
 
-    def waveform(self, setup: Setup) -> Waveform:
+    def waveform(self, setup: FrictionSetup) -> Waveform:
         """Return the waveform whose time derivative is the target friction: displacement over v/F (N s)."""
         return setup.waveform
 
-    def bands(self, setup: Setup, model: DeviceModel) -> Bands:
+    def bands(self, setup: FrictionSetup, model: DeviceModel) -> Bands:
         """Carriers and targets of a scene; `device_model` has refused what is beyond the device.
 
         The sensor's response to a fixed carrier is taken into account here; of one that follows the finger the

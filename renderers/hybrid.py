@@ -120,7 +120,7 @@ class HybridSetup:
     friction: ScreenSetup | None  # None: no band has a share of the screen
 
 
-class HybridRenderer(BaseRenderer[HybridSetup]):
+class HybridRenderer(BaseRenderer):
     """Renderer for a plate on two coils with a current-driven electroadhesion screen laminated on it."""
 
     name = "hybrid"

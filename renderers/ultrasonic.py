@@ -7,7 +7,7 @@ driver of your own gets that carrier (V) at its own rate, and senses the mode's 
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -26,10 +26,16 @@ from hapticrender.touch.scene import Scene
 LEAST_NOISE = 1e-6  # of the range: of a friction that is computed from the amplitude
 LEVEL = ("level", "oversampling", "envelope_oversampling", "envelope_frequency")  # how finely a surface is modelled
 
-SurfaceSetup = FrictionSetup[FrictionSettings, SurfaceParameters]
+
+@dataclass(frozen=True)
+class SurfaceSetup(FrictionSetup):
+    """A scene on an ultrasonic plate."""
+
+    assumed: SurfaceParameters
+    simulated: SurfaceParameters
 
 
-class UltrasonicRenderer(FrictionRenderer[SurfaceSetup]):
+class UltrasonicRenderer(FrictionRenderer):
     """Renderer for plates that reduce friction by ultrasonic vibration."""
 
     name = "ultrasonic"
@@ -42,7 +48,7 @@ class UltrasonicRenderer(FrictionRenderer[SurfaceSetup]):
         check_tables(scene, names, FrictionSettings.names(), LEVEL)
         with inside("render"):
             settings = FrictionSettings(**scene.rendering)
-        return FrictionSetup(scene, settings, *read_devices(scene, SurfaceParameters, LEVEL))
+        return SurfaceSetup(scene, settings, *read_devices(scene, SurfaceParameters, LEVEL))
 
     def plant(self, setup: SurfaceSetup, seed: int) -> UltrasonicSurface:
         """Return the simulated surface with the scene's finger on it."""

@@ -31,7 +31,7 @@ class PlateSetup:
     simulated: PlateParameters
 
 
-class VibrotactileRenderer(BaseRenderer[PlateSetup]):
+class VibrotactileRenderer(BaseRenderer):
     """Renderer for plates on one or two coils, like that of Grigorii et al. 2021."""
 
     name = "vt-plate"
