@@ -1,7 +1,6 @@
 """The driver protocol in a page, and the part that every driver shares.
 
-A driver carries samples to a device, a file or a plant model, and back.  Any
-object is one that has
+A driver carries samples to a device, a file or a plant model, and back.  Any object is one that has
 
 ``rate``
     sampling rate, Hz
@@ -20,20 +19,14 @@ object is one that has
 ``exchange(controller)`` (optional)
     a whole closed loop of its own, sample by sample; see ``protocols.Exchange``
 
-Sample i of the drive is held during interval i; sample i of what `play`
-returns was taken at the *start* of interval i, before that drive could act.
-With ``block = 1`` the next drive acts one interval after the sensing:
-``delay = 1``; a device that buffers further has a larger `delay`.  Where the
-finger's position (m from the middle, NaN while lifted) or load (N) is measured,
-it comes with the block.
+Sample i of the drive is held during interval i; sample i of `Sensed` was taken at the *start* of interval i, before
+that drive could act: with ``block = 1`` the next drive acts one interval after the sensing, ``delay = 1``.  The
+finger's position (m from the middle, NaN while lifted) or load (N) comes with the block where it is measured.
 
-A wrong argument (a shape, a NaN) is a ``ValueError`` before anything is played;
-a device that is absent, too slow or gone is a `DriverError` that names device
-and operation; samples lost or cut while playing are `Flag` bits in
-``Sensed.flags``.
+A wrong argument (a shape, a NaN) is a ``ValueError`` before anything is played; a device that is absent, too slow or
+gone is a `DriverError` that names device and operation; samples lost or cut are `Flag` bits in ``Sensed.flags``.
 
-Nothing has to be inherited.  Here is a whole driver, a plate on two coils with
-a sensor at each end of its glass, and a grating rendered on it:
+Nothing has to be inherited.  Here is a whole driver, a plate on two coils with a sensor at each end of its glass:
 
 >>> import numpy as np
 >>> from scipy.linalg import expm

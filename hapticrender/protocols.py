@@ -40,20 +40,13 @@ class Flag(IntFlag):
 
 
 class Sensed(NamedTuple):
-    """A driver's measurements over a block of n samples.
+    """A driver's measurements over a block of n samples; None where something is not measured."""
 
-    `sensed` (n, sensed_channels), in the sensors' unit (m on a plate).
-    `position` (n,), m from the middle of the surface, NaN while no finger touches; None where it is not measured.
-    `motion` (n, places), m: the true motion at the judged places; only simulated devices have it.
-    `normal_load` (n,), N; None where it is not measured.
-    `flags` (n,), `Flag` bits raised by the device; None where it raises none.
-    """
-
-    sensed: Array
-    position: Array | None = None
-    motion: Array | None = None
-    normal_load: Array | None = None
-    flags: Array | None = None
+    sensed: Array  # (n, sensed_channels), in the sensors' unit (m on a plate)
+    position: Array | None = None  # (n,), m from the middle of the surface, NaN while no finger touches
+    motion: Array | None = None  # (n, places), m: the true motion at the evaluation points, of simulated devices only
+    normal_load: Array | None = None  # (n,), N
+    flags: Array | None = None  # (n,), `Flag` bits raised by the device
 
 
 @runtime_checkable

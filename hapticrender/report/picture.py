@@ -166,15 +166,10 @@ def _close_span(recording: Recording) -> tuple[int, int]:
     if not judged.size:
         return max(0, len(recording) - round(0.1 * rate)), len(recording)
     chosen = judged[int(0.8 * judged.size)]
-    first = round(envelopes.start[chosen] * rate)
-    size = round(envelopes.window * rate)
-    position = recording.read("position", first, first + size)
-    velocity = (position[-1] - position[0]) * rate / (size - 1)
-    frequency = np.abs(recording.bands.instantaneous_frequency(np.nan_to_num(velocity)))
+    frequency = envelopes.frequency[chosen]
     strength = np.where(envelopes.judged[chosen], np.abs(envelopes.target[chosen]), 0)
-    slowest = frequency[strength >= 0.1 * strength.max()].min()
-    seconds = max(PERIODS / frequency[strength.argmax()], 1.5 / slowest)
-    stop = min(len(recording), first + size)
+    seconds = max(PERIODS / frequency[strength.argmax()], 1.5 / frequency[strength >= 0.1 * strength.max()].min())
+    stop = min(len(recording), round((envelopes.start[chosen] + envelopes.window) * rate))
     return max(0, stop - round(seconds * rate)), stop
 
 
