@@ -8,7 +8,6 @@ import sys
 import time
 import tomllib
 from dataclasses import replace
-from xml.etree import ElementTree
 
 import hypothesis
 import numpy as np
@@ -201,18 +200,6 @@ def test_scenes_are_listed_and_printed(run):
         assert tomllib.loads(out)["duration"] == scene.duration
 
 
-def test_validate_says_which_figure_missed_and_exits_1(run, tmp_path):
-    reports = tmp_path / "reports"
-    wishes = ("--method", "paper", "--json", reports / "r.json", "--junit", reports / "r.xml")
-    status, out, _ = run("validate", "grating-47", "grating-170", *wishes)
-    assert status == 1
-    good, bad = out.splitlines()[1:]
-    assert good.endswith("within 2 %")
-    assert "misses its tolerance: worst figure rms error of the 170 Hz band at " in bad
-    assert json.loads((reports / "r.json").read_text(encoding="utf-8"))["passed"] is False
-    assert ElementTree.parse(reports / "r.xml").find("testsuite").get("failures") == "1"
-
-
 def test_devices_are_listed_with_what_each_needs(run):
     status, out, errors = run("devices")
     assert (status, errors) == (0, [])
@@ -308,21 +295,6 @@ def test_bad_arguments_get_one_line_and_nothing_is_written(run, tiny, tmp_path, 
     assert words.format(**places) in complaint(run(*(argument.format(**places) for argument in arguments)))
     assert sorted(tmp_path.rglob("*")) == before
     assert tiny.read_text() == TINY
-
-
-def test_an_interrupted_demo_keeps_what_it_has(run, two_tiny_scenes, tmp_path, monkeypatch):
-    def interrupted(folder, session, **options):
-        if session.scene.name == "two":
-            raise KeyboardInterrupt
-        return run_into(folder, session, **options)
-
-    from hapticrender.report.outputs import run_into
-
-    monkeypatch.setattr("hapticrender.report.outputs.run_into", interrupted)
-    status, out, errors = run("demo", "--out", tmp_path / "out")
-    assert (status, out) == (130, "")
-    assert errors == ["1/2 one", "hapticrender: interrupted; what is written so far can be read"]
-    assert 'id="one"' in (tmp_path / "out" / "index.html").read_text(encoding="utf-8")
 
 
 def test_an_interrupted_run_leaves_its_journal(tmp_path, tiny):

@@ -181,31 +181,6 @@ def test_a_tee_adds_its_flags_to_those_of_the_device(tmp_path):
     assert driver.clipped == 9
 
 
-@pytest.mark.skipif(not hasattr(signal, "SIGXFSZ"), reason="no limit on file sizes on this system")
-@pytest.mark.parametrize("ending", [".wav"])
-def test_a_full_disk_is_a_lost_device(tmp_path, ending):
-    script = f"""
-        import resource, signal
-        import numpy as np
-        from hapticrender.drivers.wavefile import WaveFileDriver
-        from hapticrender.errors import DeviceLost
-        signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-        resource.setrlimit(resource.RLIMIT_FSIZE, (4096, 4096))
-        rng = np.random.default_rng(1)
-        try:
-            with WaveFileDriver({str(tmp_path / "a")!r} + {ending!r}) as driver:
-                for _ in range(10):
-                    driver.play(rng.uniform(-1, 1, (1024, 2)))
-        except DeviceLost as error:
-            print(error, *error.__notes__, sep="\\n")
-    """
-    done = run_script(script, stdout=subprocess.PIPE, text=True)
-    assert done.returncode == 0
-    first, note = done.stdout.splitlines()
-    assert f"a{ending}: write: " in first
-    assert f"a{ending}: write: " in note
-
-
 @pytest.mark.parametrize(
     ("name", "options", "message"),
     [

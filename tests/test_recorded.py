@@ -36,16 +36,6 @@ def test_a_tone_in_time_comes_back_at_any_file_rate(write, rate):
     np.testing.assert_allclose(played, 1e-6 * np.cos(2 * np.pi * 140.0 * time), atol=2e-3 * 1e-6)
 
 
-@pytest.mark.parametrize(("name", "subtype"), [("a.wav", "FLOAT"), ("a.flac", "PCM_24"), ("a.w64", "PCM_32")])
-def test_any_channel_of_any_format(write, name, subtype):
-    channels = np.stack([tone(60.0, 8000), tone(90.0, 8000), tone(150.0, 8000)], axis=1) / 2
-    file = write(channels, name=name, subtype=subtype)
-    for channel, frequency in enumerate((60.0, 90.0, 150.0)):
-        bands = Recorded(file=file, amplitude=1e-6, channel=channel).bands(5000.0)
-        assert bands.frequency == pytest.approx([frequency], abs=0.1)
-        assert bands.envelope is None
-
-
 @pytest.mark.parametrize("speed", [0.02, 0.11])
 def test_a_spatial_recording_is_read_at_the_position_at_any_speed(write, speed):
     """Recorded at 50 mm/s a tone of 100 Hz is a wavelength of 0.5 mm."""

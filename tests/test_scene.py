@@ -203,23 +203,6 @@ def test_what_is_no_file_is_refused_at_once(tmp_path, name):
         Scene.from_toml(f"{tmp_path}/{name}")
 
 
-@pytest.mark.parametrize(
-    ("wrong", "message"),
-    [
-        ({"texture": 3}, r"texture = 3: must be a texture"),
-        ({"finger": None}, r"finger is missing: must be a Finger"),
-        ({"duration": None}, r"duration is missing"),
-        ({"profile": [1]}, r"profile = \[1\]: must be a table"),
-        ({"rendering": {1: 2}}, r"rendering = 1: must be a table with texts as keys"),
-        ({"rendering": {"settle": 2}}, r"rendering.settle: .* give it to Scene as settle"),
-        ({"device": ""}, r"device = '': must be 1 to 100"),
-    ],
-)
-def test_wrong_python_arguments_are_refused_alike(wrong, message):
-    with pytest.raises((ValueError, TypeError), match=f"^{message}"):
-        Scene(**({"texture": TONE, "duration": 1.0} | wrong))
-
-
 NUMBERS = st.one_of(
     st.floats(), st.integers(), st.floats(0, 1), st.sampled_from([0.0, -0.0, 5e-324, 1e308, 1e-9, 0.5, 2, 2**70])
 )
