@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -46,15 +46,12 @@ class Bands:
 
     Parameters
     ----------
-    frequency : ndarray, shape (n,), Hz
-        Fixed part of each carrier, finite and >= 0.
-    wavenumber : ndarray, shape (n,), 1/m
-        Finger-locked part, 1/wavelength, finite and >= 0.
+    frequency, wavenumber : ndarray, shape (n,), Hz, 1/m
+        Fixed and finger-locked (1/wavelength) part of each carrier, finite and >= 0.
     phase : ndarray, shape (n,), rad
         Carrier phase at t = 0, x = 0; finite.
     envelope : ndarray of complex, shape (n,), m, or None
-        Constant target envelopes, finite; None where the controller has to
-        estimate them from the target waveform (recordings).
+        Constant target envelopes, finite; None where the controller estimates them from the waveform (recordings).
     modulated : bool
         The waveform is a factor of every envelope, which is otherwise constant.
     differentiated : bool
@@ -62,12 +59,7 @@ class Bands:
     sensor_response : ndarray of complex, shape (n,), or None
         Response of the device's sensor to each band, not 0; None: 1.  `tone` refers the targets to the sensor.
     unfelt : tuple of str
-        Which bands were left out because they cannot be felt, and why, one sentence each.
-
-    Raises
-    ------
-    ValueError
-        A number is out of its bound, or a length differs from that of `frequency`.
+        Bands left out below the detection threshold, and why, one sentence each.
 
     Examples
     --------
@@ -94,6 +86,11 @@ class Bands:
 
     def __len__(self) -> int:
         return len(self.frequency)
+
+    def select(self, which: Array, **changes: Any) -> Bands:
+        """Bands at the indices, or where the mask, `which`, with `changes` of other fields."""
+        columns = {name: column[which] for name in _COLUMNS if (column := getattr(self, name)) is not None}
+        return replace(self, **{**columns, **changes})
 
     def checked(self, name: str, waveform: Callable[[Array, Array], Any], time: Array, position: Array) -> Array:
         """Target waveform at `time` (s) and `position` (m); the texture `name` must return finite numbers.

@@ -40,20 +40,13 @@ class Flag(IntFlag):
 
 
 class Sensed(NamedTuple):
-    """A driver's measurements over a block of n samples.
+    """A driver's measurements over a block of n samples; None where something is not measured."""
 
-    `sensed` (n, sensed_channels), in the sensors' unit (m on a plate).
-    `position` (n,), m from the middle of the surface, NaN while no finger touches; None where it is not measured.
-    `motion` (n, places), m: the true motion at the judged places; only simulated devices have it.
-    `normal_load` (n,), N; None where it is not measured.
-    `flags` (n,), `Flag` bits raised by the device; None where it raises none.
-    """
-
-    sensed: Array
-    position: Array | None = None
-    motion: Array | None = None
-    normal_load: Array | None = None
-    flags: Array | None = None
+    sensed: Array  # (n, sensed_channels), in the sensors' unit (m on a plate)
+    position: Array | None = None  # (n,), m from the middle of the surface, NaN while no finger touches
+    motion: Array | None = None  # (n, places), m: the true motion at the evaluation points, of simulated devices only
+    normal_load: Array | None = None  # (n,), N
+    flags: Array | None = None  # (n,), `Flag` bits raised by the device
 
 
 @runtime_checkable
@@ -63,9 +56,8 @@ class Texture(Protocol):
     def bands(self, rate: float) -> Bands:
         """Carriers, and constant envelopes where the texture has them, for sampling at `rate` (Hz).
 
-        Two carriers must differ.  Envelopes are estimated with a bandwidth of at most spacing/(2 pi): carriers 40 Hz
-        or more apart are followed at full speed, closer ones more slowly.  `hapticrender.strongest_carriers` chooses
-        the carriers of a signal.
+        Two carriers must differ: envelopes are estimated with a bandwidth of at most spacing/(2 pi).
+        `hapticrender.strongest_carriers` chooses the carriers of a signal.
         """
         ...
 
@@ -161,36 +153,16 @@ class Controller(Protocol):
 
 @dataclass(frozen=True, kw_only=True)
 class Rendering:
-    """A scene opened on a device: all that a run needs, designed and checked; nothing has been played yet.
+    """A scene opened on a device: all that a run needs, designed and checked; nothing has been played yet."""
 
-    Parameters
-    ----------
-    scene : Scene
-        With the method and the seed that are used.
-    device : Driver
-        As handed over, or the simulated one.
-    driver : Driver
-        The same, as the controller sees it: behind a square root, a resonance or nothing.
-    plant : Plant, optional
-        The simulated device.
-    model : DeviceModel
-        Device model for which the controller is designed.
-    bands : Bands
-        Carriers and targets, in the device's quantity.
-    waveform : callable
-        Target waveform over time (s) and position (m), in the device's quantity.
-    controller : callable
-        Returns a new controller at rest.
-    """
-
-    scene: Scene
-    device: Driver
-    driver: Driver
-    plant: Plant | None = None
-    model: DeviceModel
-    bands: Bands
-    waveform: Callable[[Array, Array], Array]
-    controller: Callable[[], Controller]
+    scene: Scene  # with the method and the seed that are used
+    device: Driver  # as handed over, or the simulated one
+    driver: Driver  # the same, as the controller sees it: behind a square root, a resonance or nothing
+    plant: Plant | None = None  # the simulated device
+    model: DeviceModel  # for which the controller is designed
+    bands: Bands  # carriers and targets, in the device's quantity
+    waveform: Callable[[Array, Array], Array]  # target over time (s) and position (m), in the device's quantity
+    controller: Callable[[], Controller]  # a new one at rest
 
     @property
     def samples(self) -> int:

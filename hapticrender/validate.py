@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import io
 import multiprocessing
 import re
 import tempfile
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor
 from dataclasses import asdict, dataclass, field
 from functools import partial
@@ -38,26 +39,7 @@ Tick = Callable[[float, float], None]
 class Verdict:
     """Verdict on one scene.
 
-    Parameters
-    ----------
-    scene, device, method : str
-        What was rendered, on what, and how.
-    seed : int
-        Seed of the plant's noise.
-    verdict : str
-        "passed", "failed", "not judged" (no figure can be given) or "error" (the scene cannot be rendered).
-    reason : str
-        Why there is no figure.
-    tolerance : float or None
-        Bound on the figure (relative error, 1).
-    figure, band, place : str
-        The worst figure: its name, the band and the evaluation point.
-    value : float or None
-        The worst figure (relative error, 1); None where there is none.
-    elapsed : float
-        Time that the rendering took (s).
-    summary : dict
-        ``Recording.summary()``; empty after an error.
+    "passed", "failed", "not judged" (no figure can be given, for the reason) or "error" (it cannot be rendered).
     """
 
     scene: str
@@ -65,14 +47,14 @@ class Verdict:
     method: str
     seed: int
     verdict: str
-    reason: str = ""
-    tolerance: float | None = None
-    figure: str = "rms_error"
+    reason: str = ""  # where there is no figure
+    tolerance: float | None = None  # bound on the figure (relative error, 1)
+    figure: str = "rms_error"  # the worst one
     band: str = "any"
     place: str = "any"
-    value: float | None = None
-    elapsed: float = 0.0
-    summary: Mapping[str, Any] = field(default_factory=dict, repr=False)
+    value: float | None = None  # of the worst figure (relative error, 1)
+    elapsed: float = 0.0  # s
+    summary: Mapping[str, Any] = field(default_factory=dict, repr=False)  # ``Recording.summary()``
 
     @classmethod
     def of(cls, summary: Mapping[str, Any], elapsed: float) -> Verdict:
@@ -91,13 +73,7 @@ class Verdict:
 
 
 def open_scene(reference: str | Path) -> Scene:
-    """Read a scene: a built-in one by its name, any other from its TOML file.
-
-    Raises
-    ------
-    ValueError
-        No such file, or not a scene.
-    """
+    """Read a scene: a built-in one by its name, any other from its TOML file; a ValueError where there is none."""
     scenes = builtin_scenes()
     if str(reference) in scenes:
         return scenes[str(reference)]
@@ -117,32 +93,20 @@ def validate(
     out: str | Path | None = None,
     progress: TextIO | None = None,
 ) -> list[Verdict]:
-    """Render scenes in closed loop against the plant models and judge each.
+    """Render scenes in closed loop against the plant models and judge each, in their order.
 
     Parameters
     ----------
     scenes : iterable of Scene, str or Path
-        Scenes, names of built-in ones, or TOML files.
-    method : str, optional
-        Name of the control method; default: that of each scene.
-    seed : int, optional
-        Seed of the plants' noise, >= 0; default: that of each scene.
+        Scenes, names of built-in ones, or TOML files.  One that cannot be rendered stops no other.
+    method, seed
+        Of the control, and of the plants' noise (>= 0); default: those of each scene.
     jobs : int, >= 1
         Processes that render scenes side by side.
     out : path, optional
-        Folder that gets journal, sounds, picture and figures of each scene that does not pass, in a folder of its name.
+        Folder for the files of each scene that does not pass, in a folder of its name.
     progress : file, optional
         Where to show progress.
-
-    Returns
-    -------
-    list of Verdict
-        In the order of the scenes; a scene that cannot be rendered has the verdict "error" and stops no other.
-
-    Raises
-    ------
-    ValueError
-        The method is unknown, or a number out of its bound.
 
     Examples
     --------
@@ -154,72 +118,63 @@ def validate(
         method_named(method)
     if jobs < 1:
         raise ValueError(f"{jobs=}: must be >= 1 process")
-    tasks = list(_tasks(scenes, method, seed, None if out is None else Path(out)))
-    shown = Progress([task.scene.duration for task in tasks if task.scene], progress) if progress else None
+    judge = partial(_judge, method=method, seed=seed, out=None if out is None else Path(out))
+    entries = _read(scenes)
+    durations = [scene.duration for _, scene in entries if isinstance(scene, Scene)]
+    bar = Progress(durations, progress or io.StringIO())
     if jobs == 1:
-        return [_with_progress(shown, task, task.verdict) for task in tasks]
+        return [_with_progress(bar, *entry, partial(judge, *entry)) for entry in entries]
     with ProcessPoolExecutor(jobs, multiprocessing.get_context("spawn")) as pool:
-        futures = [pool.submit(task.verdict) for task in tasks]
+        futures = [pool.submit(judge, *entry) for entry in entries]
         try:
-            pairs = zip(tasks, futures, strict=True)
-            return [_with_progress(shown, task, partial(_result, future)) for task, future in pairs]
+            pairs = zip(entries, futures, strict=True)
+            return [_with_progress(bar, *entry, partial(_result, future)) for entry, future in pairs]
         except BaseException:
             pool.shutdown(cancel_futures=True)
             raise
 
 
-@dataclass(frozen=True)
-class _Task:
-    """A scene to be judged, or why it cannot be read."""
-
-    label: str
-    scene: Scene | None
-    problem: str
-    method: str | None
-    seed: int | None
-    out: Path | None
-
-    def verdict(self, tick: Tick | None = None) -> Verdict:
-        """Render and judge the scene."""
-        problem, start = self.problem, time.perf_counter()
-        device, method, seed = "", self.method or defaults.METHOD, self.seed or 0
-        if self.scene is not None:
-            device, method = self.scene.device, self.method or self.scene.method
-            seed = self.scene.seed if self.seed is None else self.seed
-            try:
-                rendering = prepare(self.scene, method=self.method, seed=self.seed)
-                summary = _summary(rendering, self.out and self.out / _NO_NAME.sub("_", self.label), tick)
-                return Verdict.of({**summary, "scene": self.label}, time.perf_counter() - start)
-            except BAD_SCENE as error:
-                problem = str(error)
-        reason = problem.removeprefix(f"{self.label}: ")
-        return Verdict(scene=self.label, device=device, method=method, seed=seed, verdict="error", reason=reason)
-
-
-def _tasks(
-    scenes: Iterable[Scene | str | Path], method: str | None, seed: int | None, out: Path | None
-) -> Iterator[_Task]:
-    """Read all scenes; one that cannot be read has the name of its file, and those of one name are numbered."""
-    read: list[tuple[str, Scene | None, str]] = []
+def _read(scenes: Iterable[Scene | str | Path]) -> list[tuple[str, Scene | str]]:
+    """Labels and scenes, or why one cannot be read; those of one name are numbered."""
+    found: list[tuple[str, Scene | str]] = []
     for reference in scenes:
         try:
             scene = reference if isinstance(reference, Scene) else open_scene(reference)
-            read.append((scene.name, scene, ""))
+            found.append((scene.name, scene))
         except BAD_SCENE as error:
-            read.append((str(reference), None, str(error)))
-    labels = distinct_names(name for name, _, _ in read)
-    for label, (_, found, problem) in zip(labels, read, strict=True):
-        yield _Task(label, found, problem, method, seed, out)
+            found.append((str(reference), str(error)))
+    return list(zip(distinct_names(name for name, _ in found), (scene for _, scene in found), strict=True))
+
+
+def _judge(
+    label: str, scene: Scene | str, tick: Tick | None = None, *, method: str | None, seed: int | None, out: Path | None
+) -> Verdict:
+    """Render and judge a scene; `scene` may be why it cannot be read."""
+    start, device = time.perf_counter(), ""
+    problem = scene if isinstance(scene, str) else ""
+    if isinstance(scene, Scene):
+        device, method = scene.device, method or scene.method
+        seed = scene.seed if seed is None else seed
+        try:
+            rendering = prepare(scene, method=method, seed=seed)
+            summary = _summary(rendering, out and out / _NO_NAME.sub("_", label), tick)
+            return Verdict.of({**summary, "scene": label}, time.perf_counter() - start)
+        except BAD_SCENE as error:
+            problem = str(error)
+    reason, method = problem.removeprefix(f"{label}: "), method or defaults.METHOD
+    return Verdict(scene=label, device=device, method=method, seed=seed or 0, verdict="error", reason=reason)
 
 
 def _result(future: Future[Verdict], _: Tick | None) -> Verdict:
     return future.result()
 
 
-def _with_progress(progress: Progress | None, task: _Task, judge: Callable[[Tick | None], Verdict]) -> Verdict:
-    if progress is None or task.scene is None:
+def _with_progress(
+    progress: Progress, label: str, scene: Scene | str, judge: Callable[[Tick | None], Verdict]
+) -> Verdict:
+    if isinstance(scene, str):
         return judge(None)
-    with progress.scene(task.label) as tick:
+    with progress.scene(label) as tick:
         return judge(tick)
 
 
@@ -258,13 +213,7 @@ def write_json(path: str | Path, verdicts: Sequence[Verdict]) -> None:
 
 
 def write_junit(path: str | Path, verdicts: Sequence[Verdict]) -> None:
-    """Write verdicts to `path` as the JUnit XML that continuous-integration systems read: a test case per scene.
-
-    Notes
-    -----
-    The schema is that of the Apache Ant JUnit task: ``testsuites/testsuite/testcase`` with ``failure``, ``error`` or
-    ``skipped`` (not judged); times in s.
-    """
+    """Write verdicts to `path` as JUnit XML (schema of the Apache Ant task): a test case per scene, times in s."""
     counts = Counter(verdict.verdict for verdict in verdicts)
     totals = {
         "name": "hapticrender",
@@ -284,19 +233,15 @@ def write_junit(path: str | Path, verdicts: Sequence[Verdict]) -> None:
 
 def _add_case(suite: ElementTree.Element, verdict: Verdict) -> None:
     """Add one scene as a test case, with its failure, error or reason for being skipped."""
-    case = {
-        "classname": _xml(f"hapticrender.{verdict.device}.{verdict.method}"),
-        "name": _xml(verdict.scene),
-        "time": f"{verdict.elapsed:.3f}",
-    }
+    name = f"hapticrender.{verdict.device}.{verdict.method}"
+    case = {"classname": _xml(name), "name": _xml(verdict.scene), "time": f"{verdict.elapsed:.3f}"}
     element = ElementTree.SubElement(suite, "testcase", case)
     if verdict.verdict == "failed":
         attributes = {"message": _xml(sentence(verdict.summary)), "type": "tolerance"}
         ElementTree.SubElement(element, "failure", attributes).text = _xml(as_json(verdict.summary["bands"]))
-    elif verdict.verdict == "error":
-        ElementTree.SubElement(element, "error", {"message": _xml(verdict.reason), "type": "scene"})
-    elif verdict.verdict == "not judged":
-        ElementTree.SubElement(element, "skipped", {"message": _xml(verdict.reason)})
+    elif verdict.verdict != "passed":
+        tag = "error" if verdict.verdict == "error" else "skipped"
+        ElementTree.SubElement(element, tag, {"message": _xml(verdict.reason), "type": "scene"})
 
 
 def _xml(text: str) -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping
 from functools import partial
-from typing import Any, Generic, TypeVar
+from typing import Any
 
 from hapticrender import checks
 from hapticrender.bands import Bands
@@ -16,10 +16,10 @@ from hapticrender.protocols import Array, Controller, Driver, Method, Plant, Ren
 from hapticrender.touch.scene import Scene
 
 Waveform = Callable[[Array, Array], Array]
-Setup = TypeVar("Setup")
+Setup = Any  # what `read` returns: a class of each renderer's own
 
 
-class BaseRenderer(Generic[Setup]):
+class BaseRenderer:
     """Renderer made of parts: `read` the scene once, then give its setup to every other part.
 
     A subclass fills in `plant`, `device_model` and `bands`.  Where it leaves `read` as it is, the setup is the scene.
@@ -36,26 +36,26 @@ class BaseRenderer(Generic[Setup]):
         setup = self.read(scene, driver)
         if driver is None:
             plant = self.plant(setup, scene.seed)
-            device = shown = SimulatedDriver(plant)
+            device = facing = SimulatedDriver(plant)
         else:
-            plant, device, shown = None, driver, self.connect(setup, driver)
-        check_driver(shown)
-        model = self.device_model(setup, shown)
+            plant, device, facing = None, driver, self.connect(setup, driver)
+        check_driver(facing)
+        model = self.device_model(setup, facing)
         bands = self.bands(setup, model)
         return Rendering(
             scene=scene,
             device=device,
-            driver=shown,
+            driver=facing,
             plant=plant,
             model=model,
             bands=bands,
             waveform=self.waveform(setup),
-            controller=partial(self.design, method, model, bands, feedback=shown.sensed_channels > 0),
+            controller=partial(self.design, method, model, bands, feedback=facing.sensed_channels > 0),
         )
 
     def read(self, scene: Scene, driver: Driver | None) -> Setup:
         """Return the setup: what the scene's tables say, in the form that the other parts take."""
-        return scene  # type: ignore[return-value]
+        return scene
 
     def plant(self, setup: Setup, seed: int) -> Plant:
         """Return the simulated device with the scene's finger on it."""
@@ -87,15 +87,8 @@ def check_tables(
 ) -> None:
     """Refuse a key that stands in the wrong table of a scene, or in none.
 
-    Parameters
-    ----------
-    scene : Scene
-    device : collection of str
-        Names of all parameters of the device, those of its model level included.
-    settings : collection of str
-        Names of the renderer's settings.
-    level : collection of str
-        Parameters that say how finely the device is modelled: for the simulation only.
+    `device` names all parameters of the device, those of its model `level` (of the simulation only) included;
+    `settings` those of the renderer.
     """
     simulated = set(device) - {"rate"}
     tables: dict[str, tuple[Mapping[str, Any], Collection[str]]] = {
@@ -105,10 +98,11 @@ def check_tables(
     }
     for table, (values, known) in tables.items():
         for key in values:
-            if key not in known:
-                others = " or ".join(f"[{name}]" for name, (_, names) in tables.items() if key in names)
-                right = f"belongs in {others}" if others else f"no such parameter; known: {', '.join(sorted(known))}"
-                raise ValueError(f"{table}.{key}: {right}")
+            others = " or ".join(f"[{name}]" for name, (_, names) in tables.items() if key in names)
+            if key not in known and others:
+                raise ValueError(f"{table}.{key}: belongs in {others}")
+        with checks.inside(table):
+            checks.check_names(values, known)
 
 
 def read_devices(scene: Scene, kind: type[checks.Validated], level: Collection[str] = ()) -> tuple[Any, Any]:
@@ -126,6 +120,5 @@ def check_channels(driver: Driver, drive: Mapping[int, str], sensed: Mapping[int
     """Refuse a driver whose numbers of channels are not among those in `drive` and `sensed`, each with its meaning."""
     for name, known in (("drive_channels", drive), ("sensed_channels", sensed)):
         found = getattr(driver, name)
-        if found not in known:
-            bound = " or ".join(f"{count} ({meaning})" if meaning else str(count) for count, meaning in known.items())
-            raise ValueError(f"driver.{name} = {found}: must be {bound}")
+        bound = " or ".join(f"{count} ({meaning})" if meaning else str(count) for count, meaning in known.items())
+        checks.require(found in known, f"driver.{name}", found, bound)

@@ -28,7 +28,7 @@ def eigenfrequencies(plate):
 def naive(drive, finger, parameters):
     """Motion of the naive twin under the same drive and finger."""
     time = np.arange(len(drive)) / RATE
-    touch = finger.position(time), finger.load(time), finger.strength(time)
+    touch = tuple(finger.touch(time).T)
     return simulate(drive, finger.mechanics, *touch, RATE, parameters.bending_frequency)
 
 
@@ -67,7 +67,7 @@ def test_table_is_the_exponential(levels, mechanics):
     plate = Plate(parameters, finger)
     plate.run(np.zeros((800, plate.drive_channels)))
     state, period = plate.state[0], 1 / RATE
-    strength = float(finger.strength(np.zeros(1))[0])
+    strength = float(finger.touch(np.zeros(1))[0, 2])
     nodes = np.flatnonzero(state["held"][:NODES] == strength)
     assert len(nodes) > 0.75 * NODES
     for node in nodes[::10]:
@@ -132,7 +132,7 @@ def test_finger_that_slides_presses_and_lifts(rng, scaled, bending):
     expected = naive(drive, finger, parameters)
     motion = Plate(parameters, finger).run(drive).motion
     np.testing.assert_allclose(motion, expected, rtol=0, atol=1e-5 * expected.std())
-    assert len(set(finger.strength(np.arange(500) / RATE))) > (100 if scaled else 1)
+    assert len(set(finger.touch(np.arange(500) / RATE)[:, 2])) > (100 if scaled else 1)
 
 
 def stop_and_go(time):

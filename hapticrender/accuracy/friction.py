@@ -106,7 +106,7 @@ def comb(device: str, method: str) -> dict[str, float]:
     late = (seen.start >= 1.0) & seen.finite
     if not late.any():
         return {}
-    return {"error": float(amplitude_error(seen.achieved[late, 0].ravel(), seen.wanted[late].ravel(), axis=0))}
+    return {"error": float(amplitude_error(seen.achieved[late, 0].ravel(), seen.target[late].ravel(), axis=0))}
 
 
 def swipe(device: str, method: str) -> dict[str, float]:

@@ -132,9 +132,7 @@ class BankController:
         touched = state["contact"] != 0.0 or state["confidence"] < 1.0 or state["scale"] < 1.0
         if touched or not self.settings["observer"] > 0.0:
             return 0.0
-        size = np.where(
-            self.setpoints[1, : self.n_bands] == 0.0, abs(self.field("r_re") + 1j * self.field("r_im")), 0.0
-        )
+        size = np.hypot(self.field("r_re"), self.field("r_im")) * (self.field("wavenumber") == 0.0)
         error, integral = self.largest("e"), self.largest("v")
         counts = (size > LEAST_TARGET * self.settings["sensor_limit"]) & (error < SETTLED * size)
         return float((integral[counts] / size[counts]).max(initial=0.0))
@@ -203,12 +201,8 @@ def setpoint_rows(bands: Bands) -> Array:
     """
     n = len(bands)
     rows = aligned((SETPOINT_ROWS, max(-(-n // W), 1) * W))
-    rows[0, :n], rows[1, :n], rows[2, :n], rows[5, :n] = (
-        bands.frequency,
-        bands.wavenumber,
-        bands.phase / (2 * np.pi),
-        1.0,
-    )
+    rows[0, :n], rows[1, :n], rows[2, :n] = bands.frequency, bands.wavenumber, bands.phase / (2 * np.pi)
+    rows[5, :n] = 1.0
     if bands.envelope is not None:
         rows[3, :n], rows[4, :n] = bands.envelope.real, bands.envelope.imag
     if bands.sensor_response is not None:

@@ -15,12 +15,8 @@ from hapticrender.protocols import Array
 from hapticrender.vectors import conj, get, nearest, put, tile_type
 
 REFRESH = 64  # samples between two settings of the carriers from their phases
-NAMES = (
-    "turns",
-    "step",
-    *(f"{name}_{part}" for name in ("turn", "carrier", "x", "low1", "low2") for part in ("re", "im")),
-)
-TILE = np.dtype([(name, np.float64, (W,)) for name in NAMES])
+COMPLEX = [f"{name}_{part}" for name in ("turn", "carrier", "x", "low1", "low2") for part in ("re", "im")]
+TILE = np.dtype([(name, np.float64, (W,)) for name in ("turns", "step", *COMPLEX)])
 TILE_T = tile_type(TILE)
 
 

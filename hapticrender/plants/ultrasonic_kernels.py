@@ -70,7 +70,7 @@ SURFACE = np.dtype(
         ("drive", "f8", (1,)),  # V
         ("sensed", "f8"),  # m
         ("position", "f8"),  # NaN
-        ("waveform", "f8"),  # m: reference amplitude within reach
+        ("waveform", "f8"),  # m: amplitude within reach
         ("target", "c16"),  # m
         ("flags", "i8"),
         ("reference", "f8"),  # state: amplitude (m) at the end of the last sample

@@ -6,7 +6,7 @@ import itertools
 import json
 import math
 import os
-import tempfile
+import uuid
 import zipfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -15,13 +15,13 @@ from typing import Any
 
 import numpy as np
 
+from hapticrender.checks import npy_header
 from hapticrender.errors import HapticError
 from hapticrender.protocols import Array
 from hapticrender.recordings.journal import Header, chunks, column, join, read_journal, split, write_journal
 
 COMMENT_LIMIT = 4000  # characters; libsndfile drops a longer WAV comment silently
 FLAC_CHANNELS = 8
-NPY_HEADS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
 
 
 class MissingExtra(HapticError, ImportError):
@@ -29,18 +29,7 @@ class MissingExtra(HapticError, ImportError):
 
 
 def read(path: str | os.PathLike[str]) -> tuple[Header, Any]:
-    """Read header and frames of a recording.
-
-    Parameters
-    ----------
-    path : path-like
-        A file whose name ends in .au, .npz, .h5, .hdf5, .mat or .csv.
-
-    Returns
-    -------
-    header : Header
-    frames : ndarray, shape (n, columns), or JournalFrames
-        Those of a journal are read from the file at every access.
+    """Read header and frames (n, columns) of a recording: .au, .npz, .h5, .hdf5, .mat or .csv.
 
     Raises
     ------
@@ -53,10 +42,8 @@ def read(path: str | os.PathLike[str]) -> tuple[Header, Any]:
     """
     path = Path(path)
     if path.suffix.lower() in SOUND_CONTAINERS:
-        raise ValueError(
-            f"{path}: a sound file cannot be loaded as a recording, because its rate is rounded and its header may be "
-            f"cut: load one saved as {', '.join(READERS)}"
-        )
+        cause = "because its rate is rounded and its header may be cut"
+        raise ValueError(f"{path}: a sound file cannot be loaded, {cause}: load one saved as {', '.join(READERS)}")
     reader = _by_suffix(path, READERS, "read")
     if path.exists() and not path.is_file() and not path.is_dir():
         raise ValueError(f"{path}: must be a regular file")
@@ -65,65 +52,40 @@ def read(path: str | os.PathLike[str]) -> tuple[Header, Any]:
 
 
 def write(path: str | os.PathLike[str], header: Header, frames: Any) -> None:
-    """Write a recording in the format of the suffix of `path`; an older file is replaced when the new one is whole.
-
-    Parameters
-    ----------
-    path : path-like
-        Suffix .au (journal), .npz, .h5 or .hdf5, .mat, .csv, .wav, .w64, .rf64 or .flac.
-    header : Header
-    frames : ndarray, shape (n, columns), or JournalFrames
-    """
+    """Write a recording in the format of the suffix of `path`; an older file is replaced when the new one is whole."""
     path = Path(path)
     writer = _by_suffix(path, WRITERS, "written")
     with replacing(path) as scratch:
         writer(scratch, header, frames)
 
 
-def write_sound(
-    path: str | os.PathLike[str],
-    signal: Array,
-    rate: float,
-    full_scale: float | None = None,
-    *,
-    unit: str = "",
-    bits: int = 16,
-) -> float:
-    """Write a signal as PCM sound; the comment of the file states the scale.
+def write_sound(path: Path, signal: Array, rate: float, unit: str) -> float:
+    """Write a signal (n, channels) as 24-bit sound; return its full scale, which the file's comment states.
 
-    Parameters
-    ----------
-    path : path-like
-        Suffix .wav, .w64, .rf64 or .flac.
-    signal : ndarray, shape (n,) or (n, channels)
-        In `unit`; what is not finite becomes silence.
-    rate : float
-        Sampling rate (Hz), > 0; sound files hold it rounded.
-    full_scale : float or None
-        Value that becomes digital full scale, > 0; larger ones are cut.  None: the signal's largest magnitude.
-    unit : str
-        Unit of the signal, for the comment.
-    bits : int
-        16 or 24.
-
-    Returns
-    -------
-    float
-        The full scale that was used, in `unit`.
+    That is 1, 2 or 5 times a power of ten above the peak, in `unit`; what is not finite becomes silence.  Sound files
+    hold the `rate` (Hz) rounded.
     """
-    path = Path(path)
-    container = _by_suffix(path, SOUND_CONTAINERS, "written as sound")
-    if bits not in (16, 24):
-        raise ValueError(f"{bits=} must be 16 or 24")
     signal = np.nan_to_num(np.asarray(signal, float), nan=0.0, posinf=0.0, neginf=0.0)
-    if full_scale is None:
-        full_scale = float(np.abs(signal).max(initial=0.0)) or 1.0
-    if not 0 < full_scale < np.inf:
-        raise ValueError(f"{full_scale=} {unit} must be finite and > 0")
-    comment = f"full scale = {full_scale:.6g} {unit}".rstrip()
+    full_scale = round_up(float(np.abs(signal).max(initial=0.0)))
+    comment = f"full scale = {full_scale:.6g} {unit}"
+    container = _by_suffix(path, SOUND_CONTAINERS, "written as sound")
     with replacing(path) as scratch:
-        _write_audio(scratch, container, f"PCM_{bits}", np.clip(signal / full_scale, -1, 1), rate, comment)
+        _write_audio(scratch, container, "PCM_24", signal / full_scale, rate, comment)
     return full_scale
+
+
+def round_up(peak: float) -> float:
+    """Round up to 1, 2 or 5 times a power of ten; 1 for silence.
+
+    Examples
+    --------
+    >>> round_up(1.3), round_up(0.5), round_up(0.0)
+    (2.0, 0.5, 1.0)
+    """
+    if not 1e-12 < peak < 1e12:
+        return 1.0
+    decade = 10.0 ** math.floor(math.log10(peak))
+    return float(next(step * decade for step in (1, 2, 5, 10) if step * decade >= peak))
 
 
 def _by_suffix(path: Path, table: dict[str, Any], verb: str) -> Any:
@@ -136,21 +98,15 @@ def _by_suffix(path: Path, table: dict[str, Any], verb: str) -> Any:
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
     """Provide a scratch file beside `path` that takes its place only if the block succeeds."""
-    handle, name = tempfile.mkstemp(path.suffix.lower(), f".{path.stem}-", path.parent)
-    os.close(handle)
-    scratch = Path(name)
+    scratch = path.with_name(f".{path.stem}-{uuid.uuid4().hex}{path.suffix.lower()}")
+    scratch.touch()
     try:
         yield scratch
-        scratch.chmod(path.stat().st_mode if path.exists() else 0o666 & ~_umask())
+        if path.exists():
+            scratch.chmod(path.stat().st_mode)
         scratch.replace(path)
     finally:
         scratch.unlink(missing_ok=True)
-
-
-def _umask() -> int:
-    mask = os.umask(0)
-    os.umask(mask)
-    return mask
 
 
 def _values(header: Header, frames: Any) -> dict[str, Any]:
@@ -198,9 +154,7 @@ def _read_npz(path: Path) -> tuple[Header, Array]:
 
         def load(name: str) -> Any:
             with archive.open(f"{name}.npy") as member:
-                version = np.lib.format.read_magic(member)
-                read_head = NPY_HEADS[version]
-                shape, _, dtype = read_head(member)
+                shape, dtype = npy_header(member)
             _check_size(path, name, shape, dtype.itemsize)
             return file[name]
 
@@ -315,12 +269,15 @@ def _write_flac(path: Path, header: Header, frames: Any) -> None:
 def _write_audio(path: Path, container: str, subtype: str, frames: Any, rate: float, comment: str) -> None:
     import soundfile
 
-    channels = 1 if len(frames[:1].shape) == 1 else frames[:1].shape[1]
-    with soundfile.SoundFile(path, "w", max(1, round(rate)), channels, subtype, format=container) as file:
-        if container != "W64":  # has no room for text
-            file.comment = comment
-        for block in chunks(frames, channels):
-            file.write(block)
+    channels = frames[:1].shape[1]
+    try:
+        with soundfile.SoundFile(path, "w", max(1, round(rate)), channels, subtype, format=container) as file:
+            if container != "W64":  # has no room for text
+                file.comment = comment
+            for block in chunks(frames, channels):
+                file.write(block)
+    except soundfile.SoundFileError as error:
+        raise OSError(f"{path}: {error}") from error
 
 
 SOUND_CONTAINERS = {".wav": "WAV", ".w64": "W64", ".rf64": "RF64", ".flac": "FLAC"}

@@ -1,4 +1,4 @@
-"""Verdicts, scenes and summaries as text, the same on the command line, in reports and on pages."""
+"""Verdicts, scenes and summaries as text for the command line, reports and pages."""
 
 from __future__ import annotations
 
@@ -11,7 +11,6 @@ from hapticrender.formatting import band_label, degrees, percent, quantity, shor
 if TYPE_CHECKING:
     from hapticrender.touch.scene import Scene
 
-PLACES = ("centre", "end_1", "end_2")
 MEASURED = {"friction": "friction", "skin": "skin velocity"}  # places that name a quantity, not a position
 
 
@@ -21,19 +20,8 @@ def places_of(summary: Mapping[str, Any]) -> list[str]:
     return [key.removeprefix("rms_error_") for key in first if key.startswith("rms_error_")]
 
 
-def columns_of(summary: Mapping[str, Any]) -> tuple[str, ...]:
-    """Places whose errors stand in the columns of a table: the first one that the device has, and the ends."""
-    return ((places_of(summary) or PLACES)[0], *PLACES[1:])
-
-
-def titles(summaries: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Titles of those columns; the first is the place's own name where all devices agree on it."""
-    first = {columns_of(summary)[0].replace("_", " ") for summary in summaries}
-    return [first.pop() if len(first) == 1 else "at the finger", "end 1", "end 2"]
-
-
 def at(places: Sequence[str]) -> str:
-    """Say where errors are taken, or of which quantity.
+    """Name where errors are taken, or of which quantity.
 
     Examples
     --------
@@ -47,13 +35,6 @@ def at(places: Sequence[str]) -> str:
     return "at " + " and ".join(dict.fromkeys("ends" if ends and name.startswith("end ") else name for name in names))
 
 
-def worst_at(bands: Sequence[Mapping[str, Any]], place: str) -> float | None:
-    """Find the largest abs(rms error) (1) of all bands at "centre", "end_1" or "end_2"; None without figures."""
-    errors = [band.get(f"rms_error_{place}") for band in bands]
-    known = [abs(error) for error in errors if error is not None and math.isfinite(error)]
-    return max(known, default=None)
-
-
 def total(bands: Sequence[Mapping[str, Any]], key: str) -> float | None:
     """Combine `key` ("target" or "achieved", SI) of the judged bands: the root of the sum of squares."""
     values = [band[key] for band in bands if band["target"] is not None and band["achieved"] is not None]
@@ -61,13 +42,7 @@ def total(bands: Sequence[Mapping[str, Any]], key: str) -> float | None:
 
 
 def verdict(summary: Mapping[str, Any]) -> str:
-    """Say in one sentence whether a run is within its tolerance, and by which figure.
-
-    Parameters
-    ----------
-    summary : mapping
-        What ``Recording.summary()`` returns.
-    """
+    """State in one sentence whether a run (``Recording.summary()``) is within its tolerance, and by which figure."""
     if summary["verdict"] == "not judged":
         return f"not judged: {summary['reason']}"
     if summary["worst"]["value"] is None:
@@ -77,12 +52,12 @@ def verdict(summary: Mapping[str, Any]) -> str:
 
 
 def brief(summary: Mapping[str, Any]) -> str:
-    """Say the verdict of a run in a table's cell: short where all is well."""
+    """Verdict of a run for a table's cell: short where it passed."""
     return f"within {100 * summary['tolerance']:.4g} %" if summary["passed"] else verdict(summary)
 
 
 def worst_figure(summary: Mapping[str, Any]) -> str:
-    """Say which figure decides the verdict: its name, band, place or quantity, and value."""
+    """Name the figure that decides the verdict: its name, band, place or quantity, and value."""
     worst = summary["worst"]
     place, figure = (str(worst[key]).replace("_", " ") for key in ("place", "figure"))
     name, where = figure.removesuffix(f" {place}"), at([place])
@@ -93,24 +68,22 @@ def worst_figure(summary: Mapping[str, Any]) -> str:
 
 def amplitudes(summaries: Sequence[Mapping[str, Any]]) -> list[tuple[str, str]]:
     """Target and achieved amplitude of every summary; one prefix for all that have the same unit."""
-    values = [tuple(total(summary["bands"], key) for key in ("target", "achieved")) for summary in summaries]
-    largest: dict[str, float] = {}
-    for summary, pair in zip(summaries, values, strict=True):
-        unit = summary["unit"]
-        largest[unit] = max(largest.get(unit, 0.0), pair[0] or 0.0)
-    written = [
-        [quantity(value, summary["unit"], like=largest[summary["unit"]]) for value in pair]
-        for summary, pair in zip(summaries, values, strict=True)
+    pairs = [[total(summary["bands"], key) for key in ("target", "achieved")] for summary in summaries]
+    units = [summary["unit"] for summary in summaries]
+    largest = {
+        unit: max(pair[0] or 0.0 for pair, own in zip(pairs, units, strict=True) if own == unit) for unit in units
+    }
+    return [
+        (quantity(target, unit, like=largest[unit]), quantity(achieved, unit, like=largest[unit]))
+        for (target, achieved), unit in zip(pairs, units, strict=True)
     ]
-    return [(target, achieved) for target, achieved in written]
 
 
 def overview(summaries: Sequence[Mapping[str, Any]]) -> str:
-    """Tabulate scenes, a line each: amplitudes, the largest rms error at each place, the verdict."""
-    rows = [["scene", "target", "achieved", *titles(summaries), "verdict"]]
+    """Tabulate scenes, a line each: amplitudes, the worst rms error of any band at any place, the verdict."""
+    rows = [["scene", "target", "achieved", "rms error", "verdict"]]
     for summary, pair in zip(summaries, amplitudes(summaries), strict=True):
-        errors = [percent(worst_at(summary["bands"], place)) for place in columns_of(summary)]
-        rows.append([summary["scene"], *pair, *errors, brief(summary)])
+        rows.append([summary["scene"], *pair, percent(summary["worst"]["value"]), brief(summary)])
     return table(rows)
 
 
@@ -123,8 +96,7 @@ def figures(summary: Mapping[str, Any]) -> str:
         sizes = [quantity(band[key], unit) for key in ("target", "achieved")]
         settled = quantity(band["settling_time"], "s")
         rows.append([band_label(band), *sizes, *errors, degrees(band["phase_error"]), settled])
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    lines = ["  ".join(cell.rjust(width) for cell, width in zip(row, widths, strict=True)) for row in rows]
+    lines = [table(rows)]
     wobble, residual = (quantity(summary[key], unit) for key in ("wobble", "residual_rms"))
     saturated = percent(summary["saturated_share"])
     lines.append(f"rms errors {at(places)}; wobble {wobble}, beside the bands {residual}, saturated {saturated}")
@@ -132,7 +104,7 @@ def figures(summary: Mapping[str, Any]) -> str:
 
 
 def conditions(summary: Mapping[str, Any]) -> str:
-    """Say in a line what was rendered, how, for how long, and which flags were set."""
+    """State in a line what was rendered, how, for how long, and which flags were set."""
     return (
         f"{summary['scene']} on {summary['device']}, method {summary['method']}, seed {summary['seed']}: "
         f"{short(summary['duration'], 's')}, judged from {short(summary['judged_from'], 's')}, "
@@ -141,7 +113,7 @@ def conditions(summary: Mapping[str, Any]) -> str:
 
 
 def flags(summary: Mapping[str, Any]) -> str:
-    """Say in how many samples each status flag was set."""
+    """State in how many samples each status flag was set."""
     return ", ".join(f"{name.lower()} {count}" for name, count in summary["flags"].items() if count) or "none"
 
 
@@ -153,18 +125,12 @@ def describe(scene: Scene) -> str:
         for key, unit in (("amplitude", "m"), ("wavelength", "m"), ("frequency", "Hz"))
         if (size := getattr(texture, key, None)) is not None
     ]
-    count = _partials(texture)
+    series = getattr(texture, "harmonics", 1) if getattr(texture, "shape", "sine") != "sine" else 1
+    count = len(getattr(texture, "partials", None) or range(series))
     what = f"{_kind(texture)} {' '.join(sizes)}{f', {count} partials' if count > 1 else ''}"
     speed = getattr(motion, "speed", None)
     finger = [f"{_kind(motion)} finger", *([] if speed is None else [short(speed, "m/s")])]
     return f"{what}; {' '.join(finger)}; {short(scene.duration, 's')} on {scene.device}"
-
-
-def _partials(texture: Any) -> int:
-    """Count the partials that a texture has by its own parameters; 1 where it does not say."""
-    if partials := getattr(texture, "partials", None):
-        return len(partials)
-    return getattr(texture, "harmonics", 1) if getattr(texture, "shape", "sine") != "sine" else 1
 
 
 def _kind(thing: Any) -> str:
