@@ -22,14 +22,15 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.linalg import block_diag, expm
+from scipy.linalg import block_diag
 
 from hapticrender.checks import Validated, parameter
 from hapticrender.control.damping import BendingMode
 from hapticrender.control.device_model import DeviceModel
+from hapticrender.control.linear import Structure
 from hapticrender.plants.compiled import CompiledPlant, aligned_record
 from hapticrender.plants.plate_kernels import COLUMNS, FUNCTIONS, NODES, PLATE, plate_step
 from hapticrender.protocols import Array
@@ -39,6 +40,7 @@ if TYPE_CHECKING:
     from hapticrender.touch.finger import Finger
 
 PLACES = ("centre", "end 1", "end 2")
+SIDES = np.array([[1.0, -1.0], [1.0, 1.0]])  # displacement of sides 1 and 2 per heave and rocking
 EXPECTED_BENDING = BendingMode(  # estimate for a plate that was not measured: 1.1-1.4 kHz, either sign
     frequency=1250.0, damping=0.01, coupling=(0.1 / 9.5e-3, 0.0), spread=150.0, measured=False
 )
@@ -164,19 +166,22 @@ class PlateParameters(Validated):
     @property
     def damping_matrix(self) -> Array:
         """C (N s/m, shape (2, 2))."""
-        return _pair(self.damping_1, self.damping_2)
+        return SIDES.T @ np.diag([self.damping_1, self.damping_2]) @ SIDES
 
     @property
     def stiffness_matrix(self) -> Array:
         """K (N/m, shape (2, 2))."""
-        return _pair(self.stiffness_1, self.stiffness_2)
+        return SIDES.T @ np.diag([self.stiffness_1, self.stiffness_2]) @ SIDES
 
     @property
     def force_from_drive(self) -> Array:
         """Generalised forces per coil current (N/A, shape (2, coils))."""
-        if self.coils == 1:
-            return self.force_constant * np.array([[1.0], [0.0]])
-        return self.force_constant * np.array([[1.0, 1.0], [-1.0, 1.0]])
+        return self.force_constant * (SIDES.T if self.coils == 2 else np.eye(2)[:, :1])
+
+    @property
+    def ends(self) -> tuple[float, float]:
+        """Positions of the sensors (m from the middle)."""
+        return -self.glass_length / 2, self.glass_length / 2
 
     @property
     def bending(self) -> BendingMode | None:
@@ -189,14 +194,16 @@ class PlateParameters(Validated):
             coupling=(self.bending_coil / self.bending_mass, 0.0),
         )
 
-    def bending_shape(self, position: Array | float) -> Array:
-        """Shape of the bending mode at `position` (m from the middle), that of a free bar: 1 at the ends, -0.61 there.
+    def displacement(self, position: Array | float) -> Array:
+        """Displacement of the glass at `position` (m) per heave, rocking and bending, shape (..., 3).
 
-        The coils have a number of their own, `bending_coil`: a free bar would give -0.099 at the quarter points.
+        The bending mode has the shape of a free bar: 1 at the ends, -0.61 in the middle.  The coils have a number of
+        their own, `bending_coil`: a free bar would give -0.099 at the quarter points.
         """
-        wavenumber, grow, wave = self.bending_bar
-        angle = wavenumber * np.asarray(position, float)
-        return grow * np.cosh(angle) + wave * np.cos(angle)
+        position = np.asarray(position, float)
+        wavenumber, of_cosh, of_cos = self.bending_bar
+        bending = of_cosh * np.cosh(wavenumber * position) + of_cos * np.cos(wavenumber * position)
+        return np.stack([np.ones_like(position), position / self.half_spacing, bending], axis=-1)
 
     @property
     def bending_bar(self) -> tuple[float, float, float]:
@@ -214,32 +221,22 @@ class PlateParameters(Validated):
         poles = poles[np.argsort(abs(poles))]
         return abs(poles) / (2 * np.pi), -poles.real / abs(poles)
 
-    def static_load(self, side_1: float, side_2: float) -> tuple[float, float]:
-        """Normal load (N) and finger position (m from the middle, towards side 2) from the slow sag of the sides (m).
-
-        W = -(k1 x1 + k2 x2); the distance from transducer 2 towards 1 is d k1 x1/(k1 x1 + k2 x2), which the
-        paper prints as d (k2 x2/(k1 x1) + 1)^-1 and so divides by zero where side 1 does not sag.
-        """
-        carried_1, carried_2 = self.stiffness_1 * side_1, self.stiffness_2 * side_2
-        load = -(carried_1 + carried_2)
-        if load == 0.0:
-            raise ValueError(f"{side_1=}, {side_2=}: the sides carry no net load, so it has no position")
-        return load, self.half_spacing + self.coil_spacing * carried_1 / load
-
-    def dynamic_stiffness(self, frequency: Array, finger: Array | complex = 0.0, position: float = 0.0) -> Array:
+    def dynamic_stiffness(
+        self, frequency: Array, finger: Array | complex = 0.0, position: Array | float = 0.0
+    ) -> Array:
         """D(j w) in heave and rocking (N/m, shape (..., 2, 2)) under a finger impedance (N s/m) at `position` (m).
 
         The glass counts as rigid, also where it bends: near and above `bending_frequency` this is no longer the plate.
         """
         s = 2j * np.pi * np.asarray(frequency, float)[..., None, None]
-        lever = np.array([1.0, position / self.half_spacing])
-        load = np.asarray(finger, complex)[..., None, None] * s * np.outer(lever, lever)
+        lever = self.displacement(position)[..., :2]
+        load = np.asarray(finger)[..., None, None] * s * lever[..., :, None] * lever[..., None, :]
         return self.mass_matrix * s**2 + self.damping_matrix * s + self.stiffness_matrix + load
 
     def device_model(self, rate: float, delay: int) -> DeviceModel:
-        """What the controller may know of this plate, in a loop of `rate` (Hz) and `delay` (samples)."""
-        reach, n = self.glass_length / self.coil_spacing, self.coils  # one coil moves one coordinate
-        ends_from_coordinate = np.array([[1.0, -reach], [1.0, reach]])
+        """Device model of this plate without a finger, in a loop of `rate` (Hz) and `delay` (samples)."""
+        n = self.coils  # one coil moves one coordinate
+        places = self.displacement([0.0, *self.ends])[:, :2]
         return DeviceModel(
             rate=rate,
             delay=delay,
@@ -247,9 +244,9 @@ class PlateParameters(Validated):
             damping=self.damping_matrix[:n, :n],
             stiffness=self.stiffness_matrix[:n, :n],
             force_from_drive=self.force_from_drive[:n],
-            coordinate_from_sensed=np.linalg.inv(ends_from_coordinate)[:n] / (self.sensor_gain_1, self.sensor_gain_2),
-            side_from_coordinate=np.array([[1.0, -1.0], [1.0, 1.0]])[:n, :n],
-            place_from_coordinate=np.array([[1.0, 0.0], [1.0, -reach], [1.0, reach]])[:, :n],
+            coordinate_from_sensed=np.linalg.inv(places[1:])[:n] / (self.sensor_gain_1, self.sensor_gain_2),
+            side_from_coordinate=SIDES[:n, :n],
+            place_from_coordinate=places[:, :n],
             places=PLACES,
             drive_limit=self.current_limit,
             sensed_limit=self.sensor_range / 2,
@@ -258,42 +255,6 @@ class PlateParameters(Validated):
             bending=self.bending,
             rigid=self.bending is None,
         )
-
-
-def _pair(side_1: float, side_2: float) -> Array:
-    """Two equal-kind elements at the coils, in heave and rocking."""
-    return np.array([[side_1 + side_2, side_2 - side_1], [side_2 - side_1, side_1 + side_2]])
-
-
-class Structure(NamedTuple):
-    """Plate and finger as M q'' + C q' + K q = inputs u, y = outputs q.
-
-    The coordinates q (m) are heave, rocking (displacement at the coils; unless it is locked), bending (displacement of
-    the sensors; where the glass bends) and the phalanx (under a finger of order 4), n in all.
-
-    Attributes
-    ----------
-    mass, damping, stiffness : ndarray, shape (n, n), kg, N s/m, N/m
-    inputs : ndarray, shape (n, coils + 1)
-        Forces per coil current (N/A), and per normal load of the finger.
-    outputs : ndarray, shape (4, n)
-        Displacements at centre, end 1, end 2 and of the glass under the finger; its rows give velocities from q'.
-    """
-
-    mass: Array
-    damping: Array
-    stiffness: Array
-    inputs: Array
-    outputs: Array
-
-    def zero_order_hold(self, rate: float) -> tuple[Array, Array]:
-        """Phi (2n, 2n) and Gamma (2n, inputs) of [q, q'] from sample to sample (Hz) under held inputs, exactly."""
-        n, m = self.inputs.shape
-        generator = np.zeros((2 * n + m, 2 * n + m))
-        generator[:n, n : 2 * n] = np.eye(n)
-        generator[n : 2 * n] = np.linalg.solve(self.mass, np.hstack([-self.stiffness, -self.damping, self.inputs]))
-        held = expm(generator / rate)[: 2 * n]
-        return held[:, : 2 * n], held[:, 2 * n :]
 
 
 def structure(
@@ -311,39 +272,37 @@ def structure(
     strength : float
         Factor on the finger's impedance, >= 0; 0: the finger is lifted.
 
+    Returns
+    -------
+    Structure
+        Coordinates (m): heave, rocking (displacement at the coils; unless it is locked), bending (displacement of the
+        sensors; where the glass bends) and the phalanx (of order 4).  Inputs: coil currents (A), normal load (N).
+        Outputs (m): displacement of centre, end 1, end 2 and of the glass under the finger.
+
     Raises
     ------
     ValueError
         A finger of order 4 has a phalanx without mass.
     """
-    order = mechanics.order if parameters.finger_dynamics and strength > 0.0 else 0
+    p, order = parameters, mechanics.order if parameters.finger_dynamics and strength > 0.0 else 0
     if order == 4 and not mechanics.phalanx_mass > 0.0:
         raise ValueError(f"phalanx_mass = {mechanics.phalanx_mass!r} kg: must be > 0")
-    omega, modal = 2 * math.pi * parameters.bending_frequency, parameters.bending_mass
-    reach, centre, bend = (
-        parameters.glass_length / parameters.coil_spacing,
-        *parameters.bending_shape(np.array([0.0, position])),
-    )
-    diagonals = (
-        (parameters.mass_matrix, modal, mechanics.phalanx_mass),
-        (parameters.damping_matrix, 2 * parameters.bending_damping * omega * modal, mechanics.phalanx_damping),
-        (parameters.stiffness_matrix, omega**2 * modal, mechanics.phalanx_stiffness),
-    )
-    matrices = [block_diag(rigid, bent, strength * phalanx) for rigid, bent, phalanx in diagonals]
-    glass = np.array([1.0, position / parameters.half_spacing, bend, 0.0])  # its displacement under the finger
-    tissue = glass - [0.0, 0.0, 0.0, order == 4]
-    if order:
-        for matrix, value, acting in zip(
-            matrices, (mechanics.mass, mechanics.damping, mechanics.stiffness), (glass, tissue, tissue), strict=True
-        ):
-            matrix += strength * value * np.outer(acting, acting)
-    coils = parameters.force_from_drive
-    bending_force = np.full((1, parameters.coils), parameters.force_constant * parameters.bending_coil)
-    inputs = np.column_stack([np.vstack([coils, bending_force, 0 * bending_force]), -glass])
-    outputs = np.array([[1.0, 0.0, centre, 0.0], [1.0, -reach, 1.0, 0.0], [1.0, reach, 1.0, 0.0], glass])
-    kept = np.flatnonzero([True, parameters.degrees_of_freedom == 2, omega > 0.0, order == 4])
+    omega, modal = 2 * math.pi * p.bending_frequency, p.bending_mass
+    output = np.pad(p.displacement([0.0, *p.ends, position]), ((0, 0), (0, 1)))
+    tissue = output[-1] - [0.0, 0.0, 0.0, order == 4]
+    matrices = []
+    for plate, bending, phalanx, finger, acting in (
+        (p.mass_matrix, modal, mechanics.phalanx_mass, mechanics.mass, output[-1]),
+        (p.damping_matrix, 2 * p.bending_damping * omega * modal, mechanics.phalanx_damping, mechanics.damping, tissue),
+        (p.stiffness_matrix, omega**2 * modal, mechanics.phalanx_stiffness, mechanics.stiffness, tissue),
+    ):
+        matrix = block_diag(plate, bending, strength * phalanx)
+        matrices.append(matrix + strength * finger * np.outer(acting, acting) if order else matrix)
+    forces = np.vstack([p.force_from_drive, np.full(p.coils, p.force_constant * p.bending_coil), np.zeros(p.coils)])
+    kept = np.flatnonzero([True, p.degrees_of_freedom == 2, omega > 0.0, order == 4])
     mass, damping, stiffness = (matrix[np.ix_(kept, kept)] for matrix in matrices)
-    return Structure(mass, damping, stiffness, inputs[kept], outputs[:, kept])
+    inputs = np.column_stack([forces, -output[-1]])[kept]
+    return Structure(mass=mass, damping=damping, stiffness=stiffness, input=inputs, output=output[:, kept])
 
 
 class Plate(CompiledPlant):
@@ -392,14 +351,14 @@ def _record(parameters: PlateParameters, mechanics: FingerMechanics) -> Array:
     kept = np.flatnonzero([True, parameters.degrees_of_freedom == 2, parameters.bending_frequency > 0.0])
     for first, matrix, scale in zip((0, 4), (free.stiffness, free.damping), scales, strict=False):
         s["free"][0, first + kept[:, None], kept] = scale * matrix
-    s["free"][0, 8 : 8 + parameters.coils][:, kept] = scales[2] * free.inputs[:, :-1].T
+    s["free"][0, 8 : 8 + parameters.coils][:, kept] = scales[2] * free.input[:, :-1].T
     s["inverse_mass"][0, kept] = 1.0 / free.mass.diagonal()
     if parameters.finger_dynamics and mechanics.order:
         s["skin"] = period**2 * mechanics.stiffness, period * mechanics.damping, mechanics.mass
     if len(loaded.mass) > many:
         s["inverse_mass"][0, 3] = 1.0 / loaded.mass[-1, -1]
         s["phalanx"] = period**2 * mechanics.phalanx_stiffness, period * mechanics.phalanx_damping
-    s["outputs"][0][:, kept] = free.outputs[:3]
+    s["outputs"][0][:, kept] = free.output[:3]
     s["system"][0, 4:8, :4] = np.eye(4)
     s["held"] = s["bent_at"] = s["lever"] = s["strength"] = np.nan
     if parameters.bending_frequency > 0.0:

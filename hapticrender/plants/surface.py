@@ -265,7 +265,7 @@ def surface_record(
         mode=inner[0],
         sliding=sliding_record(p, finger.mechanics)[0],
     )
-    for name in ("drive", "sensed", "position", "wanted", "target", "flags"):
+    for name in ("drive", "sensed", "position", "waveform", "target", "flags"):
         record["signals"][name] = record[name].ctypes.data
     record["signals_at"] = record["signals"].ctypes.data
     return record, queue

@@ -70,7 +70,7 @@ SURFACE = np.dtype(
         ("drive", "f8", (1,)),  # V
         ("sensed", "f8"),  # m
         ("position", "f8"),  # NaN
-        ("wanted", "f8"),  # m: amplitude within reach
+        ("waveform", "f8"),  # m: reference amplitude within reach
         ("target", "c16"),  # m
         ("flags", "i8"),
         ("reference", "f8"),  # state: amplitude (m) at the end of the last sample
@@ -171,7 +171,7 @@ def amplitude_pass(s, reference, x, noise):
         if reached != line:
             flags |= SATURATED
         s.sensed, _, s.flags = mode_step(m, drive, x[DAMPING], x[RESONANCE], noise[1 + k])
-        s.wanted = reached
+        s.waveform = reached
         call(s.controller, (s.controller_state, s.signals_at, 0, 1))
         flags |= s.flags
         squares += z[0] * z[0] + scale * scale * z[1] * z[1]
