@@ -65,11 +65,6 @@ class LeastModel:
     tolerance: float
 
     @property
-    def difference(self) -> float:
-        """Predicted relative difference (1) of the least model from the full one; 0 where they are the same."""
-        return max((level.difference for level in self.levels if level.taken), default=0.0)
-
-    @property
     def left_out(self) -> tuple[str, ...]:
         """Names of the levels taken."""
         return tuple(level.name for level in self.levels if level.taken)
@@ -90,17 +85,6 @@ def least_model(scene: Scene, tolerance: float | None = None) -> LeastModel:
         The scene with the full model.
     tolerance : float, optional
         Largest relative difference, > 0 and <= 10; a tenth of the scene's tolerance by default.
-
-    Raises
-    ------
-    ValueError
-        For a tolerance outside its bounds.
-
-    Examples
-    --------
-    >>> from hapticrender.touch.builtin import builtin_scenes
-    >>> least_model(builtin_scenes()["grating-20"]).left_out
-    ()
     """
     allowed = SHARE * scene.tolerance if tolerance is None else float(tolerance)
     if not 0.0 < allowed <= 10.0:
@@ -222,11 +206,6 @@ def _no_finger(scene: Scene) -> Scene | str | None:
     return replace(scene, finger=Finger.absent())
 
 
-def _static_finger(scene: Scene) -> Scene | None:
-    """Keep only the load of the finger."""
-    return _changed(scene, finger_dynamics=0) if _mechanics(scene).order else None
-
-
 def _second_order(scene: Scene) -> Scene | str | None:
     """Replace a finger of 4th order by the nearest one of 2nd order at the scene's carriers."""
     mechanics = _mechanics(scene)
@@ -256,11 +235,6 @@ def _one_coordinate(scene: Scene) -> Scene | str | None:
     if not isinstance(scene.finger.motion, Nowhere | Still):
         return "the load of a moving finger tilts the plate"
     return _changed(scene, degrees_of_freedom=1)
-
-
-def _rigid_glass(scene: Scene) -> Scene | None:
-    """Leave out the bending mode."""
-    return _changed(scene, bending_frequency=0.0) if _plate(scene).bending_frequency else None
 
 
 def _envelope(scene: Scene) -> Scene | str | None:
@@ -300,22 +274,22 @@ def _surface_difference(scene: Scene) -> float:
     p = SurfaceParameters.with_overrides(_numbers(scene))
     carrier, envelope = (replace(p, level=level).carrier_mode for level in ("carrier", "envelope"))
     _, load, frequency = _path(scene, scene.texture.bands(p.rate))
-    offset = np.unique(frequency[frequency > 0.0].round(1))
-    if not offset.size:
-        return 0.0
+    offset = np.unique(frequency.round(1))
     late = abs((envelope.delay + 0.5) / envelope.rate - (carrier.delay + 0.5) / carrier.rate)
     both = np.concatenate([-offset, offset])
-    moved = max(float(np.abs(carrier.envelope_error(both, each)).max()) for each in (load.min(), load.max()))
-    return moved + 2 * np.pi * float(offset.max()) * late
+    moved = max(float(np.abs(carrier.envelope_error(both, each)).max(initial=0.0)) for each in (load.min(), load.max()))
+    return moved + 2 * np.pi * float(offset.max(initial=0.0)) * late
 
 
 REDUCTIONS: Mapping[str, Mapping[str, Callable[[Scene], Scene | str | None]]] = {
     "vt-plate": {
         "no finger": _no_finger,
-        "finger's load only": _static_finger,
+        "finger's load only": lambda scene: _changed(scene, finger_dynamics=0) if _mechanics(scene).order else None,
         "finger of 2nd order": _second_order,
         "one coordinate (heave)": _one_coordinate,
-        "rigid glass": _rigid_glass,
+        "rigid glass": lambda scene: (
+            _changed(scene, bending_frequency=0.0) if _plate(scene).bending_frequency else None
+        ),
     },
     "electroadhesion": {"envelope of the carrier": _envelope},
     "ultrasonic": {"envelope of the carrier": _envelope},
