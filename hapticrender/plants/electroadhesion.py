@@ -36,10 +36,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from hapticrender.checks import option, parameter
-from hapticrender.plants.compiled import CompiledPlant, finger_inputs
+from hapticrender.control.estimators import StarSTDFT
+from hapticrender.plants.compiled import CompiledPlant
 from hapticrender.plants.contact import SlidingParameters, new_record, sliding_record
 from hapticrender.plants.electroadhesion_kernels import ATTRACTION, SCREEN, SKIN_VELOCITY, element, screen_step
-from hapticrender.plants.gap import VACUUM, GapEstimator
+from hapticrender.plants.gap import VACUUM, gap_record
 from hapticrender.protocols import Array
 
 if TYPE_CHECKING:
@@ -48,7 +49,6 @@ if TYPE_CHECKING:
 DRY, NORMAL, MOIST = 100.0, 4.0, 0.5  # ohm m2: leakage of the gap (engineering defaults: L = 1.0, 0.90, 0.12)
 BLOCKING = 1e6  # s: time constant of a capacitor that does not leak
 LEAST_SUBSTEPS = 4  # in a turn of the carrier
-finger_rows = finger_inputs  # removed when all import the new name
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -93,10 +93,10 @@ class SquareRoot:
 
     def __call__(self, drive: Any) -> Any:
         """Current envelope (A, peak) for a `drive` (N of attraction around the bias)."""
-        wanted = np.maximum(self.bias + np.asarray(drive, float), self.floor)
+        attraction = np.maximum(self.bias + np.asarray(drive, float), self.floor)
         if self.straight:
-            return wanted / np.sqrt(2 * self.bias * self.gain)
-        return np.sqrt(wanted / self.gain)
+            return attraction / np.sqrt(2 * self.bias * self.gain)
+        return np.sqrt(attraction / self.gain)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -105,15 +105,11 @@ class ElectroadhesionParameters(SlidingParameters):
 
     Parameters
     ----------
-    rate, friction_coefficient, memory_length, least_speed : float
-        See `SlidingParameters`; `rate` is that of the drive's envelope.
-    tribometer_frequency, tribometer_damping, force_noise, force_range, force_bits : float or int
-        See `SlidingParameters`.
     level : {"envelope", "carrier"}
     drive_kind : {"current", "voltage"}
         Drive in A or V, peak of the carrier; a voltage is turned into the current that it drives in steady state.
     sensor : {"tribometer", "impedance"}
-        Friction (N), or the attraction (N) that `GapEstimator` reads from voltage and current; level "carrier" only.
+        Friction (N), or the attraction (N) estimated from voltage and current (see `gap`); level "carrier" only.
     carrier_frequency : float, Hz
         A whole multiple of `rate`.
     oversampling : int
@@ -160,8 +156,10 @@ class ElectroadhesionParameters(SlidingParameters):
         White noise of the two channels at every substep, >= 0.
     skew : float, s
         The current's channel is late by this, -10 to 10 us.
-    estimator_bandwidth, estimator_smoothing : float, Hz and s
-        See `GapEstimator`.
+    estimator_bandwidth : float, Hz
+        Of the estimator's STDFT*, > 0 and < rate/2.
+    estimator_smoothing : float, s
+        Time constant over which it averages the impedance, at least a sample.
     least_leakage : float
         L below which a gap leaks too much to be measured, 0 to 1.
     open_loop_gain : float, N/A^2
@@ -219,7 +217,9 @@ class ElectroadhesionParameters(SlidingParameters):
             )
         if self.sensor == "impedance" and self.level == "envelope":
             raise ValueError("sensor = 'impedance': must be 'tribometer' where level = 'envelope': no carrier")
-        _ = self.estimator  # refuses a bad bandwidth or smoothing
+        if self.estimator_smoothing * self.rate < 1.0:
+            raise ValueError(f"estimator_smoothing = {self.estimator_smoothing!r}: must be >= {1 / self.rate:g} s")
+        _ = self.estimator_filter  # refuses a bad bandwidth
 
     @property
     def omega(self) -> float:
@@ -239,20 +239,9 @@ class ElectroadhesionParameters(SlidingParameters):
         return 1 / (1j * self.omega * self.insulator_capacitance) + corneum
 
     @property
-    def estimator(self) -> GapEstimator:
-        """Estimator of the attraction for a finger with these numbers, its area aside."""
-        return GapEstimator(
-            rate=self.rate,
-            carrier_frequency=self.carrier_frequency,
-            series_impedance=self.series_impedance,
-            open_loop_gain=self.open_loop_gain,
-            bandwidth=self.estimator_bandwidth,
-            smoothing=self.estimator_smoothing,
-            body_resistance=self.body_resistance,
-            unevenness=self.unevenness,
-            least_speed=self.least_speed,
-            least_share=self.least_leakage,
-        )
+    def estimator_filter(self) -> StarSTDFT:
+        """The STDFT* of the estimator, which is also its response to a small change of |I|^2."""
+        return StarSTDFT(bandwidth=self.estimator_bandwidth, rate=self.rate)
 
     def area(self, normal_load: Any) -> Any:
         """Electrical contact area (m2) under `normal_load` (N)."""
@@ -279,7 +268,7 @@ class ElectroadhesionParameters(SlidingParameters):
         """Change of what is sensed per change of attraction (complex) at `frequency` (Hz), finger at `speed` (m/s)."""
         if self.sensor == "tribometer":
             return self.friction_coefficient * self.frequency_response(frequency, speed)
-        return self.estimator.frequency_response(frequency) / self._shift(frequency)
+        return self.estimator_filter.frequency_response(frequency) / self._shift(frequency)
 
     def sensor_response(self, frequency: Any, speed: float) -> Any:
         """Sensed friction per friction (complex) at `frequency` (Hz), finger at `speed` (m/s)."""
@@ -352,6 +341,6 @@ def screen_record(parameters: ElectroadhesionParameters, finger: Finger, compens
         retention=[each[0] for each in elements],
         alternating=[each[1] for each in elements],
         direct=[each[2] for each in elements],
-        gap=p.estimator.start()[0],
+        gap=gap_record(p)[0],
         sliding=sliding_record(p, finger.mechanics)[0],
     )

@@ -103,9 +103,6 @@ def reference_amplitudes(law, ratio, load, speed, amplitude):
         amplitude[n] = reference_amplitude(law, ratio[n], load[n], speed[n])
 
 
-wanted_amplitudes = reference_amplitudes  # removed when all import the new name
-
-
 class FrictionLaw(Validated):
     """Base of the laws: checks arguments and broadcasts them over the kernels; a law adds its values."""
 

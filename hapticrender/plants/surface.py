@@ -45,10 +45,6 @@ class SurfaceParameters(SlidingParameters):
 
     Parameters
     ----------
-    rate, friction_coefficient, memory_length, least_speed : float
-        See `SlidingParameters`; `rate` is that of the friction.
-    tribometer_frequency, tribometer_damping, force_noise, force_range, force_bits : float or int
-        See `SlidingParameters`.
     level : {"carrier", "envelope"}
         Whether the mode is simulated where it is.
     sensor : {"amplitude", "tribometer"}
