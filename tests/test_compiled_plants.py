@@ -107,10 +107,6 @@ def test_a_third_partys_plant_obeys_its_equation():
     assert 1 / period == pytest.approx(np.sqrt(4050.0 / 0.01) / (2 * np.pi), rel=0.01)
 
 
-def test_a_controller_without_a_compiled_step_does_not_close():
-    assert not MassOnSpring().closes(object())
-
-
 def test_drive_queue_hands_on_after_its_latency():
     queue, due, oldest, seen = np.zeros((3, 2)), np.zeros(2), 0, []
     for n in range(8):

@@ -75,14 +75,6 @@ class Still(BaseDriver):
         return hr.Sensed(np.zeros((len(drive), 0)), **self.told)
 
 
-@pytest.mark.parametrize(("block", "delay", "hold"), [(96, None, 16), (100, 150, 10), (97, None, 1)])
-def test_the_controller_sees_a_whole_part_of_the_rate(block, delay, hold):
-    """The largest that divides block and delay and leaves 10 kHz; 19 would be the most."""
-    driver = CarrierDriver(Still(block=block, delay=delay), abs, frequency=CARRIER, envelope_rate=10e3)
-    assert (driver.hold, driver.rate, driver.block) == (hold, FAST / hold, block // hold)
-    assert driver.delay == (delay or block) // hold
-
-
 def test_what_the_device_tells_is_thinned_and_its_flags_are_gathered():
     flags = np.zeros(96, int)
     flags[[17, 40, 41]] = 1, 8, 4

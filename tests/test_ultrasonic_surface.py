@@ -87,19 +87,3 @@ def test_a_lifted_finger_leaves_no_friction_and_the_amplitude_of_the_nominal_one
     played = surface.run(np.zeros((300, 1)))
     assert not played.motion.any()
     assert surface.state["reference"][0] == pytest.approx(float(p.friction_law.amplitude(p.bias, *NOMINAL)), rel=1e-12)
-
-
-def test_a_clipped_tribometer_is_flagged():
-    p = parameters(force_range=0.05)
-    played = UltrasonicSurface(p, loop(p), SLIDE, nominal=NOMINAL).run(np.zeros((300, 1)))
-    clipped = played.sensed[:, 0] >= 0.05
-    assert 0 < clipped.sum() < 300
-    np.testing.assert_array_equal((played.flags & Flag.SENSOR_CLIPPED) != 0, clipped)
-
-
-def test_a_surface_closes_with_a_controller_of_its_own():
-    p = parameters()
-    joined, apart = (UltrasonicSurface(p, loop(p), SLIDE, nominal=NOMINAL) for _ in range(2))
-    drive, _, _, sensed = joined.closed_loop(Proportional(0.1, 0.01), BUMPS)
-    np.testing.assert_array_equal(apart.run(drive).sensed, sensed.sensed)
-    assert abs(drive).max() > 0.005

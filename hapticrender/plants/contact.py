@@ -30,8 +30,6 @@ from hapticrender.protocols import Array
 if TYPE_CHECKING:
     from hapticrender.touch.mechanics import FingerMechanics
 
-SKIN_VELOCITY = 2  # entry of the skin's state: displacements of skin and phalanx (m), then their velocities (m/s)
-
 SLIDING = np.dtype(
     [(name, "f8") for name in ("least_speed", "force_noise", "force_step", "force_range")]  # as in `SlidingParameters`
     + [
@@ -39,7 +37,7 @@ SLIDING = np.dtype(
         ("skin_step", "f8", (4, 6)),  # of a sample: Phi, then the input columns of friction at its start and its end
         ("tribometer_step", "f8", (2, 4)),  # the same for the tribometer's force and its rate
         ("friction", "f8"),  # state: N
-        ("skin", "f8", (4,)),  # state: m, m, m/s, m/s
+        ("skin", "f8", (4,)),  # state: displacements of skin and phalanx (m), then their velocities (m/s)
         ("tribometer", "f8", (2,)),  # state: force (N) and its rate over w0 (N)
     ],
     align=True,
@@ -101,10 +99,6 @@ class SlidingParameters(Validated):
         """Resolution of the tribometer (N); 0 is ideal."""
         return 2 * self.force_range / 2**self.force_bits if self.force_bits else 0.0
 
-    def cutoff(self, speed: Any) -> Any:
-        """Cut-off of the friction's lag at `speed` (m/s), Hz: |v|/(2 pi delta)."""
-        return np.abs(speed) / (2 * np.pi * self.memory_length)
-
     def lag_response(self, frequency: Any, speed: float) -> Any:
         """Friction per steady friction (complex) at `frequency` (Hz), the hold and the sampling included.
 
@@ -114,12 +108,9 @@ class SlidingParameters(Validated):
         return (1 - kept) / (self._shift(frequency) - kept)
 
     def tribometer_response(self, frequency: Any) -> Any:
-        """Sensed friction per friction (complex) at `frequency` (Hz)."""
-        return _ramp_response(_tribometer_step(self), 0, self._shift(frequency))
-
-    def skin_response(self, frequency: Any, mechanics: FingerMechanics) -> Any:
-        """Skin velocity per friction (complex, m/(N s)) at `frequency` (Hz)."""
-        return _ramp_response(_skin_step(self, mechanics), SKIN_VELOCITY, self._shift(frequency))
+        """Sensed friction per friction (complex) at `frequency` (Hz): (z - Phi)^-1 (G_0 + z G_1)."""
+        step, z = _tribometer_step(self), self._shift(frequency)[..., None, None]
+        return np.linalg.solve(z * np.eye(2) - step[:, :2], step[:, 2:3] + z * step[:, 3:])[..., 0, 0]
 
     def frequency_response(self, frequency: Any, speed: float) -> Any:
         """Sensed friction per steady friction (complex) at `frequency` (Hz) for a finger at `speed` (m/s)."""
@@ -197,13 +188,6 @@ def _ramp_step(system: Array, inputs: Array, period: float) -> Array:
     step = expm(whole)[:n]
     step[:, n] -= step[:, n + 1]
     return step
-
-
-def _ramp_response(step: Array, row: int, z: Any) -> Any:
-    """Response of state `row` to the input of a `_ramp_step` at complex `z`: (z - Phi)^-1 (G_0 + z G_1)."""
-    n = len(step)
-    z = np.asarray(z)[..., None, None]
-    return np.linalg.solve(z * np.eye(n) - step[:, :n], step[:, n : n + 1] + z * step[:, n + 1 :])[..., row, 0]
 
 
 @kernel

@@ -36,7 +36,6 @@ if TYPE_CHECKING:
 
 LEVELS = ("carrier", "envelope")
 NOMINAL_LOAD = 0.5  # N: at which `finger_damping` and `finger_shift` hold
-NOMINAL_AMPLITUDE = 3e-6  # m: at which `headroom` is stated
 MOST_LOAD = 20.0  # N: largest load
 MOST_DAMPING_RATIO = 0.5
 MOST_SHIFT = 0.25  # of the carrier
@@ -70,7 +69,7 @@ class UltrasonicParameters(Validated):
         Largest drive, > 0.
     force_constant : float, N/V
         Modal force per drive, > 0.  The default drives the plate under a 0.5 N finger to 6 um (peak) at its
-        resonance, F = b w a: 6 um * 15.7 N s/m * 2 pi 30 kHz / 10 V; see `headroom`.
+        resonance, F = b w a: 6 um * 15.7 N s/m * 2 pi 30 kHz / 10 V.
     sensor_range : float, m
         Full range of the sensor.
     sensor_bits, drive_bits : int
@@ -93,8 +92,8 @@ class UltrasonicParameters(Validated):
     Examples
     --------
     >>> plate = UltrasonicParameters()
-    >>> [round(float(plate.pole(load)), 1) for load in (0.0, 0.5)], round(plate.headroom, 2)
-    ([75.0, 250.1], 2.0)
+    >>> [round(float(plate.pole(load)), 1) for load in (0.0, 0.5)]
+    [75.0, 250.1]
     """
 
     frequency: float = parameter(30e3, "Hz", least=20e3, most=70e3)
@@ -143,7 +142,8 @@ class UltrasonicParameters(Validated):
 
     def sampled(self, rate: float) -> UltrasonicParameters:
         """Return the same plate at `rate` (Hz); the sensor's noise keeps its density."""
-        return replace(self, rate=rate, sensor_noise=self._noise_at(rate))
+        noise = self.sensor_noise * math.sqrt(rate / self.rate) if rate > 0.0 else self.sensor_noise
+        return replace(self, rate=rate, sensor_noise=noise)
 
     def transposed(self, frequency: float, rate: float) -> UltrasonicParameters:
         """Return the same plate at level "envelope": its mode on a carrier of `frequency` (Hz) at `rate` (Hz).
@@ -151,12 +151,8 @@ class UltrasonicParameters(Validated):
         The sensor's noise keeps its density, so that it disturbs the envelope alike; its resolution stays, and with
         it grows the density of rounding.  The delay stays in samples: at a lower rate it is a longer one.
         """
-        noise = self._noise_at(rate)
+        noise = self.sensor_noise * math.sqrt(rate / self.rate) if rate > 0.0 else self.sensor_noise
         return replace(self, level="envelope", envelope_frequency=frequency, rate=rate, sensor_noise=noise)
-
-    def _noise_at(self, rate: float) -> float:
-        """Noise of a sample (m rms) at `rate` (Hz), of the same density."""
-        return self.sensor_noise * math.sqrt(rate / self.rate) if rate > 0.0 else self.sensor_noise
 
     @property
     def carrier(self) -> float:
@@ -210,11 +206,6 @@ class UltrasonicParameters(Validated):
         """
         tuned = amplitude * float(self.damping(normal_load)) * 2 * math.pi * self.carrier / self.force_constant
         return tuned * math.hypot(1.0, modulation / float(self.pole(normal_load)))
-
-    @property
-    def headroom(self) -> float:
-        """Amplitude at full drive under a 0.5 N finger, over 3 um."""
-        return self.drive_limit / self.drive_for(NOMINAL_AMPLITUDE, normal_load=NOMINAL_LOAD)
 
     @property
     def drive_step(self) -> float:
