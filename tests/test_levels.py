@@ -63,8 +63,7 @@ def true_error(scene, lesser):
 
 
 def random_case(seed):
-    """Draw a scene of fixed carriers, a lesser one and what is left out of it, by name; a carrier that sweeps is not
-    predicted."""
+    """Draw a scene of fixed carriers (one that sweeps is not predicted), a lesser one and what it leaves out."""
     rng = np.random.default_rng(seed)
     frequencies = 20.0 * 25.0 ** rng.random() * np.sort(rng.uniform(1.0, 3.0, rng.choice([1, 1, 2, 3])))
     scene = temporal(random_finger(rng), *frequencies, profile=random_plate(rng))
