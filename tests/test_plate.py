@@ -17,7 +17,7 @@ RATE = 5000.0
 
 def eigenfrequencies(plate):
     """Frequencies (Hz, ascending) and damping ratios of a structure's oscillating modes."""
-    poles = RATE * np.log(np.linalg.eigvals(plate.sampled(RATE).a).astype(complex))
+    poles = RATE * np.log(np.linalg.eigvals(plate.zero_order_hold(RATE)[0]).astype(complex))
     poles = poles[poles.imag > 0]
     poles = poles[np.argsort(abs(poles))]
     return abs(poles) / (2 * np.pi), -poles.real / abs(poles)

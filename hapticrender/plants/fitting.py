@@ -140,10 +140,12 @@ def sampled_response(plate: PlateParameters, rate: float, late: float, turn: Arr
     count = len(body.mass)
     whole = math.floor(late)
     share = max(late - whole, 1e-12)  # of a period, in which the drive before is still held
-    first, second = body.sampled(rate / share), body.sampled(rate / (1 - share))
+    first, push_first = body.zero_order_hold(rate / share)
+    second, push_second = body.zero_order_hold(rate / (1 - share))
     z = np.exp(2j * np.pi * turn)[:, None, None]
-    free = first.c[1:3] @ np.linalg.inv(z * np.eye(2 * count) - second.a @ first.a)
-    driven = free @ (second.b + second.a @ first.b / z)[..., :2] * z**-whole
+    ends = np.hstack([body.outputs[1:3], np.zeros((2, count))])
+    free = ends @ np.linalg.inv(z * np.eye(2 * count) - second @ first)
+    driven = free @ (push_second + second @ push_first / z)[..., :2] * z**-whole
     return driven, free * z * np.repeat([1.0, rate], count)
 
 

@@ -150,9 +150,9 @@ def _motion(scene: Scene, frequency: Array, position: Array, load: Array, force:
     body, s = structure(plate), 2j * np.pi * frequency[:, None, None]
     lever = plate.displacement(position)[:, [True, plate.degrees_of_freedom == 2, plate.bending_frequency > 0.0]]
     finger = s * _impedance(scene, frequency, load)[:, None, None] * lever[:, :, None] * lever[:, None, :]
-    inputs = body.input[:, :-1] @ np.linalg.pinv(plate.force_from_drive)
+    inputs = body.inputs[:, :-1] @ np.linalg.pinv(plate.force_from_drive)
     stiffness = body.mass * s**2 + body.damping * s + body.stiffness + finger
-    return np.linalg.solve(stiffness, (force @ inputs.T)[:, :, None])[:, :, 0] @ body.output[:3].T
+    return np.linalg.solve(stiffness, (force @ inputs.T)[:, :, None])[:, :, 0] @ body.outputs[:3].T
 
 
 def _impedance(scene: Scene, frequency: Array, load: Array) -> Array:

@@ -22,7 +22,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from scipy.linalg import block_diag
@@ -30,7 +30,7 @@ from scipy.linalg import block_diag
 from hapticrender.checks import Validated, parameter
 from hapticrender.control.damping import BendingMode
 from hapticrender.control.device_model import DeviceModel
-from hapticrender.control.linear import Structure
+from hapticrender.mathx import zoh
 from hapticrender.plants.compiled import CompiledPlant, aligned_record
 from hapticrender.plants.plate_kernels import COLUMNS, FUNCTIONS, NODES, PLATE, plate_step
 from hapticrender.protocols import Array
@@ -257,6 +257,27 @@ class PlateParameters(Validated):
         )
 
 
+class Structure(NamedTuple):
+    """Plate and finger as M q'' + C q' + K q = inputs u, y = outputs q.
+
+    Coordinates q (m): heave, rocking (displacement at the coils; unless it is locked), bending (displacement of the
+    sensors; where the glass bends) and the phalanx (of order 4).  Inputs u: coil currents (A), normal load (N).
+    Outputs y (m): displacement of centre, end 1, end 2 and of the glass under the finger.
+    """
+
+    mass: Array
+    damping: Array
+    stiffness: Array
+    inputs: Array
+    outputs: Array
+
+    def zero_order_hold(self, rate: float) -> tuple[Array, Array]:
+        """Phi (2n, 2n) and Gamma (2n, inputs) of [q, q'] from sample to sample (Hz) under held inputs, exactly."""
+        n, zero = len(self.mass), np.zeros_like(self.mass)
+        a = np.block([[zero, np.eye(n)], [-np.linalg.solve(self.mass, np.hstack([self.stiffness, self.damping]))]])
+        return zoh(a, np.vstack([0 * self.inputs, np.linalg.solve(self.mass, self.inputs)]), 1.0 / rate)
+
+
 def structure(
     parameters: PlateParameters, mechanics: FingerMechanics = NONE, position: float = 0.0, strength: float = 1.0
 ) -> Structure:
@@ -271,13 +292,6 @@ def structure(
         Of the finger, from the middle.
     strength : float
         Factor on the finger's impedance, >= 0; 0: the finger is lifted.
-
-    Returns
-    -------
-    Structure
-        Coordinates (m): heave, rocking (displacement at the coils; unless it is locked), bending (displacement of the
-        sensors; where the glass bends) and the phalanx (of order 4).  Inputs: coil currents (A), normal load (N).
-        Outputs (m): displacement of centre, end 1, end 2 and of the glass under the finger.
 
     Raises
     ------
@@ -302,7 +316,7 @@ def structure(
     kept = np.flatnonzero([True, p.degrees_of_freedom == 2, omega > 0.0, order == 4])
     mass, damping, stiffness = (matrix[np.ix_(kept, kept)] for matrix in matrices)
     inputs = np.column_stack([forces, -output[-1]])[kept]
-    return Structure(mass=mass, damping=damping, stiffness=stiffness, input=inputs, output=output[:, kept])
+    return Structure(mass, damping, stiffness, inputs, output[:, kept])
 
 
 class Plate(CompiledPlant):
@@ -351,14 +365,14 @@ def _record(parameters: PlateParameters, mechanics: FingerMechanics) -> Array:
     kept = np.flatnonzero([True, parameters.degrees_of_freedom == 2, parameters.bending_frequency > 0.0])
     for first, matrix, scale in zip((0, 4), (free.stiffness, free.damping), scales, strict=False):
         s["free"][0, first + kept[:, None], kept] = scale * matrix
-    s["free"][0, 8 : 8 + parameters.coils][:, kept] = scales[2] * free.input[:, :-1].T
+    s["free"][0, 8 : 8 + parameters.coils][:, kept] = scales[2] * free.inputs[:, :-1].T
     s["inverse_mass"][0, kept] = 1.0 / free.mass.diagonal()
     if parameters.finger_dynamics and mechanics.order:
         s["skin"] = period**2 * mechanics.stiffness, period * mechanics.damping, mechanics.mass
     if len(loaded.mass) > many:
         s["inverse_mass"][0, 3] = 1.0 / loaded.mass[-1, -1]
         s["phalanx"] = period**2 * mechanics.phalanx_stiffness, period * mechanics.phalanx_damping
-    s["outputs"][0][:, kept] = free.output[:3]
+    s["outputs"][0][:, kept] = free.outputs[:3]
     s["system"][0, 4:8, :4] = np.eye(4)
     s["held"] = s["bent_at"] = s["lever"] = s["strength"] = np.nan
     if parameters.bending_frequency > 0.0:
