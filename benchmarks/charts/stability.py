@@ -6,9 +6,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from benchmarks.charts.stability_map import StabilityMap, stability_map
 from benchmarks.charts.style import INK, ORANGE, PALE, new_figure
 from hapticrender.plants.plate import PlateParameters
-from hapticrender.plants.stability import StabilityMap, stability_map
 from hapticrender.touch.mechanics import NAMED, FingerMechanics
 
 METHODS = {

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
 
 from hapticrender.control.device_model import DeviceModel
-from hapticrender.control.linear import FORGET, ErrorLoop, FingerEstimate, Sampled, Structure
+from hapticrender.control.linear import ErrorLoop, FingerEstimate, Sampled
 from hapticrender.control.margins import LEAST, LeastMargins, Margins
 from hapticrender.errors import DesignError
 from hapticrender.mathx import smoothstep
@@ -21,11 +22,18 @@ SOFTER = (*STEPS[1:9].tolist(), 0.0)  # of the inner damper: down to a quarter, 
 ROOM = 0.25  # of the bandwidth of the rule: the inner damper is softened until this much holds
 SCHEDULE = {"low": (0.0, 0.0), "medium": (0.0, 1.0), "high": (1.0, 0.0)}
 """Levels of the gain schedule: how far the fast and the slow detector have raised the gains."""
-SMALLEST = ("delay", "phase", "gain", "bandwidth")  # margins of which the smallest counts, each for itself
 GROUPS = (  # levels that share an observer, and what is lowered for them
     (("low", "medium"), ("observer", "integral_low", "integral_medium"), "inner"),
     (("high",), ("observer_high", "integral_high"), "inner_high"),
 )
+
+
+class FreeDevice(NamedTuple):
+    """Matrices of a free device, kg, N s/m, N/m."""
+
+    mass: Array
+    damping: Array
+    stiffness: Array
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,8 +61,6 @@ class BankGains:
         Range of finger-locked carriers.
     highest_edge : float
         Times `highest`, where finger-locked carriers have faded out.
-    forget : float, 1/s
-        Decay of the states of a carrier that is faded out.
     """
 
     rate: float
@@ -73,7 +79,6 @@ class BankGains:
     lowest: float
     highest: float
     highest_edge: float
-    forget: float = FORGET
 
     def at(self, level: str) -> tuple[float, float, float]:
         """Return observer gain, integral gain and inner damper at a level of the schedule."""
@@ -97,11 +102,10 @@ class BankGains:
         return below * smoothstep(4.0 * (self.highest_edge - frequency / self.highest))
 
 
-@dataclass(frozen=True, kw_only=True)
-class Checked:
+class Checked(NamedTuple):
     """Gains whose margins hold.
 
-    Parameters
+    Attributes
     ----------
     gains : BankGains
         As given, or with lower bandwidths.
@@ -117,7 +121,7 @@ class Checked:
 
 
 def error_loop(
-    model: DeviceModel | Structure,
+    model: DeviceModel | FreeDevice,
     frequency: Array,
     gains: BankGains,
     level: str = "high",
@@ -125,7 +129,7 @@ def error_loop(
     wavenumber: Array | None = None,
     taps: Array | None = None,
     speed: float = 0.0,
-    plant: Structure | Sampled | None = None,
+    plant: Sampled | None = None,
     delay: int | None = None,
     finger: FingerEstimate | None = None,
 ) -> ErrorLoop:
@@ -133,7 +137,7 @@ def error_loop(
 
     Parameters
     ----------
-    model : DeviceModel or Structure
+    model : DeviceModel or FreeDevice
         The free device that the law inverts.
     frequency, wavenumber : ndarray, shape (K,), Hz and 1/m
         Fixed and finger-locked part of every carrier; no wavenumber: all fixed.
@@ -143,67 +147,62 @@ def error_loop(
         Of the inner damper.
     speed : float, m/s
         Of the finger, for finger-locked carriers.
-    plant : Structure or Sampled, optional
+    plant : Sampled, optional
         What the loop closes on; by default the free device.
     delay : int, optional
         Samples that the loop really has; by default those of the design.
     finger : FingerEstimate, optional
         Finger estimate in the law.
     """
-    known = model if isinstance(model, Structure) else Structure.of(model)
-    wavenumber = np.zeros(len(frequency)) if wavenumber is None else wavenumber
     observer, integral, inner = gains.at(level)
-    calm = min(abs(speed) / gains.crowd_speed, 1.0) if gains.crowd_speed > 0 else 1.0
+    if gains.crowd_speed > 0.0:
+        observer *= min(abs(speed) / gains.crowd_speed, 1.0)
+    wavenumber = np.zeros(len(frequency)) if wavenumber is None else wavenumber
     frequency = np.abs(frequency + speed * wavenumber)
-    share = np.where(wavenumber > 0.0, gains.share(frequency), 1.0)
     order = np.argsort(frequency)
-    return ErrorLoop.on(
-        plant if isinstance(plant, Sampled) else (plant or known).sampled(gains.rate),
-        known,
-        frequency[None, order],
+    frequency, share = frequency[order], np.where(wavenumber > 0.0, gains.share(frequency), 1.0)[order]
+    jw = 2j * np.pi * frequency[:, None, None]
+    law, slope = model.mass * jw**2 + model.damping * jw + model.stiffness, model.damping + 2 * jw * model.mass
+    if finger is not None:
+        arms = np.array([1.0, finger.lever])[: len(model.mass)]
+        touched = np.outer(arms, arms)
+        law = law + (finger.mass * jw**2 + finger.damping * jw + finger.stiffness) * touched
+        slope = slope + (finger.damping + 2 * jw * finger.mass) * touched
+    rho = np.exp(jw * gains.lead) / np.sinc(frequency / gains.rate)[:, None, None]
+    return ErrorLoop(
+        plant=plant or Sampled.free(model.mass, model.damping, model.stiffness, gains.rate),
         delay=gains.delay if delay is None else delay,
-        lead=gains.lead,
-        observer=calm * observer,
+        frequency=frequency,
+        observer=observer,
         integral=integral,
         dc=gains.dc,
         dc_drift=gains.dc_drift,
         inner=inner,
-        taps=np.zeros((len(known.mass), 1)) if taps is None else taps,
-        finger=finger,
-        share=share[None, order],
-        forget=gains.forget,
+        taps=np.zeros((len(model.mass), 1)) if taps is None else taps,
+        law=rho * law,
+        slope=rho * slope,
+        share=share,
     )
 
 
 def checked_gains(
-    model: DeviceModel | Structure,
+    model: DeviceModel | FreeDevice,
     frequency: Array,
     gains: BankGains,
     *,
     wavenumber: Array | None = None,
     taps: Array | None = None,
     least: LeastMargins = LEAST["law"],
-    plants: tuple[Structure, ...] = (),
 ) -> Checked:
-    """Lower the bandwidth until the margins hold at every level of the gain schedule.
+    """Lower the bandwidth until the margins on the free device hold at every level of the gain schedule.
 
     Parameters
     ----------
-    model : DeviceModel or Structure
-        The free device that the law inverts.
-    frequency, wavenumber : ndarray, shape (K,), Hz and 1/m
-        Fixed and finger-locked part of every carrier; no wavenumber: all fixed.
+    model, frequency, wavenumber, taps
+        See `error_loop`.
     gains : BankGains
         As the rules of the method have them.
-    taps : ndarray, shape (c, t), N/m, optional
-        Of the inner damper.
     least : LeastMargins
-    plants : tuple of Structure
-        Devices to hold on (fingers, errors of the model); by default the free device.
-
-    Returns
-    -------
-    Checked
 
     Raises
     ------
@@ -216,83 +215,59 @@ def checked_gains(
     down together.  Where not even a quarter of the bandwidth would hold, the inner damper is softened first.  Carriers
     locked to the finger are checked at five of its speeds, frozen.
     """
-    known = model if isinstance(model, Structure) else Structure.of(model)
     wavenumber = np.zeros(len(frequency)) if wavenumber is None else wavenumber
-    taps = np.zeros((len(known.mass), 1)) if taps is None else taps
-    arrays = [np.array(a, float) for a in (known.mass, known.damping, known.stiffness, frequency, wavenumber, taps)]
-    return _checked(tuple((each.shape, each.tobytes()) for each in arrays), gains, least, plants)
+    taps = np.zeros((len(model.mass), 1)) if taps is None else taps
+    arrays = [np.array(a, float) for a in (model.mass, model.damping, model.stiffness, frequency, wavenumber, taps)]
+    return _checked(tuple((each.shape, each.tobytes()) for each in arrays), gains, least)
 
 
 @lru_cache(maxsize=256)
-def _checked(
-    arrays: tuple[tuple[tuple[int, ...], bytes], ...],
-    gains: BankGains,
-    least: LeastMargins,
-    plants: tuple[Structure, ...],
-) -> Checked:
+def _checked(arrays: tuple[tuple[tuple[int, ...], bytes], ...], gains: BankGains, least: LeastMargins) -> Checked:
     """Lower the bandwidth; mass, damping, stiffness, frequency, wavenumber and taps by their contents."""
     mass, damping, stiffness, frequency, wavenumber, taps = (np.frombuffer(b).reshape(shape) for shape, b in arrays)
-    known, locked = Structure.free(mass, damping, stiffness), wavenumber[wavenumber > 0]
-    trials = _Trials(
-        least=least,
-        loop={"model": known, "frequency": frequency, "wavenumber": wavenumber, "taps": taps},
-        plants=[plant.sampled(gains.rate) for plant in plants or (known,)],
-        speeds=_speeds(gains, locked),
-        highest=float(max(frequency.max(), gains.highest) if locked.size else frequency.max()),
-    )
+    model, locked = FreeDevice(mass, damping, stiffness), wavenumber[wavenumber > 0]
+    plant, speeds = Sampled.free(*model, gains.rate), _speeds(gains, locked)
+    highest = float(frequency.max(initial=gains.highest if locked.size else 0.0))
+    known: dict[tuple[float, float, float], Margins] = {}
+
+    def worst(gains: BankGains, level: str) -> Margins:
+        """Smallest of every margin at a level over all speeds of the finger."""
+        key = gains.at(level)
+        if key not in known:
+            options = {"wavenumber": wavenumber, "taps": taps, "plant": plant}
+            loops = [error_loop(model, frequency, gains, level, speed=speed, **options) for speed in speeds]
+            known[key] = Margins.smallest([loop.margins() for loop in loops])
+        return known[key]
+
+    def complaint(gains: BankGains, levels: tuple[str, ...]) -> str:
+        """Name the first margin that falls short at these levels; empty where all hold."""
+        found = (least.complaint(worst(gains, level), gains.rate, highest) for level in levels)
+        return next((text for text in found if text), "")
+
     notes: list[str] = []
     for levels, rates, inner in GROUPS:
-        gains, said = _lowered(trials, gains, levels, rates, inner)
-        notes += said
-    return Checked(gains=gains, margins={level: trials.worst(gains, level) for level in SCHEDULE}, notes=tuple(notes))
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Trials:
-    """Margins of all gains that were tried, each computed once."""
-
-    least: LeastMargins
-    loop: dict[str, Any]
-    plants: list[Sampled]
-    speeds: Array
-    highest: float
-    known: dict[tuple[float, float, float], Margins] = field(default_factory=dict)
-
-    def worst(self, gains: BankGains, level: str) -> Margins:
-        """Smallest of every margin at a level over all plants and speeds of the finger."""
-        key = gains.at(level)
-        if key not in self.known:
-            found = [
-                error_loop(gains=gains, level=level, speed=speed, plant=plant, **self.loop).margins()
-                for plant in self.plants
-                for speed in self.speeds
-            ]
-            self.known[key] = replace(
-                min(found, key=lambda margins: margins.modulus),
-                stable=all(margins.stable for margins in found),
-                **{name: min(getattr(margins, name) for margins in found) for name in SMALLEST},
-            )
-        return self.known[key]
-
-    def complaint(self, gains: BankGains, levels: tuple[str, ...]) -> str:
-        """Name the first margin that falls short at these levels; empty where all hold."""
-        found = (self.least.complaint(self.worst(gains, level), gains.rate, self.highest) for level in levels)
-        return next((text for text in found if text), "")
+        gains, lowered = _lowered(complaint, gains, levels, rates, inner)
+        notes += lowered
+    return Checked(gains, {level: worst(gains, level) for level in SCHEDULE}, tuple(notes))
 
 
 def _lowered(
-    trials: _Trials, gains: BankGains, levels: tuple[str, ...], rates: tuple[str, ...], inner: str
+    complaint: Callable[[BankGains, tuple[str, ...]], str],
+    gains: BankGains,
+    levels: tuple[str, ...],
+    rates: tuple[str, ...],
+    inner: str,
 ) -> tuple[BankGains, list[str]]:
     """Lower the gains of a group of levels until their margins hold; say what was lowered."""
-    first = trials.complaint(gains, levels)
+    first = complaint(gains, levels)
     if not first:
         return gains, []
     name, notes = " and ".join(levels), []
-    cramped = trials.complaint(gains.scaled(rates, ROOM), levels)
+    cramped = complaint(gains.scaled(rates, ROOM), levels)
     if cramped and getattr(gains, inner) > 0.0:
         for soft in SOFTER:
             softer = gains.scaled((inner,), soft)
-            if not trials.complaint(softer.scaled(rates, ROOM), levels):
+            if not complaint(softer.scaled(rates, ROOM), levels):
                 gains = softer
                 notes.append(
                     f"inner damper ({name}) softened to {soft:.0%}: even at {ROOM:.0%} of the bandwidth {cramped}"
@@ -300,13 +275,13 @@ def _lowered(
                 break
     for step in STEPS.tolist():
         tried = gains.scaled(rates, step)
-        complaint = trials.complaint(tried, levels)
-        if not complaint:
+        short = complaint(tried, levels)
+        if not short:
             if step < 1.0:
                 notes.append(f"bandwidth ({name}) lowered to {step:.0%} of the rule: at the rule {first}")
             return tried, notes
     raise DesignError(
-        f"{complaint} ({name}) even at 1/64 of the bandwidth of the rule: lower the delay, leave the highest or "
+        f"{short} ({name}) even at 1/64 of the bandwidth of the rule: lower the delay, leave the highest or "
         "closest carriers out, or allow a smaller margin"
     )
 

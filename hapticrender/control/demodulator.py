@@ -15,51 +15,62 @@ from hapticrender.mathx import frac, sincos_turns
 from hapticrender.protocols import Array
 
 REFRESH = 64  # samples between two settings of the carriers from their phases
-TILE = np.dtype([(name, np.float64, (W,)) for name in ("turns", "step", "cos", "sin", "turn_cos", "turn_sin")])
-SECTION = np.dtype([(name, np.float64, (W,)) for name in ("re", "im", "re1", "re2", "im1", "im2")])
-TILE_T, SECTION_T = numba.from_dtype(TILE), numba.from_dtype(SECTION)
+TILE = np.dtype(
+    [
+        (name, np.float64, (W,))
+        for name in ("turns", "step", "turn_cos", "turn_sin", "cos", "sin", "re", "im", "re1", "re2", "im1", "im2")
+    ]
+)
+TILE_T = numba.from_dtype(TILE)
 
 
 @kernel
-def set_carriers(tile, t):
+def set_carriers(tiles, i):
     """Set the carriers of a tile from their phases, counted in turns, which then go on to the next refresh."""
-    b = record(tile, TILE_T, t)
+    b = record(tiles, TILE_T, i)
     for k in range(W):
         b.sin[k], b.cos[k] = sincos_turns(b.turns[k])
         b.turns[k] = frac(b.turns[k] + REFRESH * b.step[k])
 
 
 @kernel
-def filter_tile(tile, t, sections, i, x, coefficients, turn):
+def filter_tile(tiles, i, x, coefficients):
     """Update the envelopes L[2 x e^(-j phi)] of a tile, L a section in transposed direct form II; turn its carriers."""
-    b, s = record(tile, TILE_T, t), record(sections, SECTION_T, i)
+    b = record(tiles, TILE_T, i)
     x0, x1, x2 = 2.0 * x * coefficients[0], 2.0 * x * coefficients[1], 2.0 * x * coefficients[2]
     a1, a2 = coefficients[3], coefficients[4]
     for k in range(W):
         cos, sin = b.cos[k], b.sin[k]
-        re, im = x0 * cos + s.re1[k], s.im1[k] - x0 * sin
-        s.re1[k], s.im1[k] = x1 * cos - a1 * re + s.re2[k], s.im2[k] - x1 * sin - a1 * im
-        s.re2[k], s.im2[k] = x2 * cos - a2 * re, -x2 * sin - a2 * im
-        s.re[k], s.im[k] = re, im
-        b.cos[k] = cos * b.turn_cos[k] - sin * b.turn_sin[k] if turn else cos
-        b.sin[k] = sin * b.turn_cos[k] + cos * b.turn_sin[k] if turn else sin
+        re, im = x0 * cos + b.re1[k], b.im1[k] - x0 * sin
+        b.re1[k], b.im1[k] = x1 * cos - a1 * re + b.re2[k], b.im2[k] - x1 * sin - a1 * im
+        b.re2[k], b.im2[k] = x2 * cos - a2 * re, -x2 * sin - a2 * im
+        b.re[k], b.im[k] = re, im
+        b.cos[k] = cos * b.turn_cos[k] - sin * b.turn_sin[k]
+        b.sin[k] = sin * b.turn_cos[k] + cos * b.turn_sin[k]
 
 
 @kernel
-def demodulate(coefficients, tiles, sections, first, samples, envelopes):
-    """Write the envelopes of every sample, channel and band, real and imaginary parts in turns."""
-    channels, bands = samples.shape[1], envelopes.shape[2] // 2
+def demodulate(coefficients, tiles, first, samples, envelopes):
+    """Write the envelopes of every sample, channel and band; each channel has carriers of its own beside its filters.
+
+    The loops over all bands of a tile vectorise; only the last tile of a channel may be filled in part.
+    """
+    channels, bands = samples.shape[1], envelopes.shape[2]
     count = -(-bands // W)
     for n in range(samples.shape[0]):
-        for t in range(count):
-            if (first + n) % REFRESH == 0:
-                set_carriers(tiles, t)
-            for c in range(channels):
-                x = samples[n, c] if math.isfinite(samples[n, c]) else 0.0
-                filter_tile(tiles, t, sections, c * count + t, x, coefficients, c == channels - 1)
-                s = record(sections, SECTION_T, c * count + t)
-                for k in range(min(W, bands - W * t)):
-                    envelopes[n, c, 2 * (W * t + k)], envelopes[n, c, 2 * (W * t + k) + 1] = s.re[k], s.im[k]
+        for c in range(channels):
+            x = samples[n, c] if math.isfinite(samples[n, c]) else 0.0
+            for t in range(count):
+                if (first + n) % REFRESH == 0:
+                    set_carriers(tiles, c * count + t)
+                filter_tile(tiles, c * count + t, x, coefficients)
+                b = record(tiles, TILE_T, c * count + t)
+                if W * t + W <= bands:
+                    for k in range(W):
+                        envelopes[n, c, W * t + k] = complex(b.re[k], b.im[k])
+                else:
+                    for k in range(bands - W * t):
+                        envelopes[n, c, W * t + k] = complex(b.re[k], b.im[k])
 
 
 class Demodulator:
@@ -83,8 +94,8 @@ class Demodulator:
 
     Notes
     -----
-    Delay and frequency response are those of `hapticrender.control.estimators.StarSTDFT`, whose `demodulate` takes
-    carriers that move.  At 0 Hz and half the rate the envelope is doubled.
+    Delay and frequency response are those of `hapticrender.control.estimators.StarSTDFT`.  At 0 Hz and half the rate
+    the envelope is doubled.
 
     Examples
     --------
@@ -104,11 +115,15 @@ class Demodulator:
         self.frequency, self.channels, self._sample = frequency, int(channels), 0
         self._coefficients = tuple(float(each) for each in (*b, *a[1:]))
         count = -(-frequency.size // W)
-        self._tiles, self._sections = aligned(count, TILE), aligned(self.channels * count, SECTION)
         step = np.zeros((count, W))
         step.reshape(-1)[: frequency.size] = frequency / rate
-        self._tiles["step"] = step
-        self._tiles["turn_cos"], self._tiles["turn_sin"] = np.cos(2 * np.pi * step), np.sin(2 * np.pi * step)
+        self._tiles = aligned(self.channels * count, TILE)
+        for name, value in (
+            ("step", step),
+            ("turn_cos", np.cos(2 * np.pi * step)),
+            ("turn_sin", np.sin(2 * np.pi * step)),
+        ):
+            self._tiles[name] = np.tile(value, (self.channels, 1))
 
     def run(self, samples: Array, out: Array | None = None) -> Array:
         """Estimate the envelopes of the next n samples; any split into blocks gives the same.
@@ -132,7 +147,6 @@ class Demodulator:
         out = np.empty(shape, complex) if out is None else out
         if out.shape != shape or out.dtype != complex or not out.flags.carray:
             raise ValueError(f"out of shape {out.shape}, {out.dtype}: must be {shape}, complex128, C-contiguous")
-        tiles, sections = self._tiles.ctypes.data, self._sections.ctypes.data
-        demodulate(self._coefficients, tiles, sections, self._sample, samples, out.view(float))
+        demodulate(self._coefficients, self._tiles.ctypes.data, self._sample, samples, out)
         self._sample += len(samples)
         return out

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import permutations
 
 import numpy as np
@@ -27,6 +27,7 @@ PER_DECADE = 12  # points of a grid on either side of a carrier
 UNIFORM = 400  # points of a grid over the whole spectrum
 ZOOMS, NEARLY = 3, 0.7  # refinements of a peak search, and which peaks are refined: above this share of the highest
 CONTINUOUS = 2.0  # rad: a locus that turns by more between two points has passed through infinity, at a carrier
+SMALLEST = ("delay", "phase", "gain", "bandwidth")  # margins of which the smallest counts, each for itself
 BISECTIONS = 24  # of a grid where the return difference turns by more than a radian
 
 
@@ -64,6 +65,13 @@ class Margins:
     def unstable(cls) -> Margins:
         """Return the margins of a loop with a growing pole."""
         return cls(stable=False, modulus=0.0, worst_frequency=math.nan, delay=0.0, phase=0.0, gain=1.0, bandwidth=0.0)
+
+    @classmethod
+    def smallest(cls, found: list[Margins]) -> Margins:
+        """Return the smallest of every margin, each for itself."""
+        smallest = {name: min(getattr(margins, name) for margins in found) for name in SMALLEST}
+        least = min(found, key=lambda margins: margins.modulus)
+        return replace(least, stable=all(margins.stable for margins in found), **smallest)
 
     @property
     def peak_sensitivity(self) -> float:

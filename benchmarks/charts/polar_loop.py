@@ -14,14 +14,54 @@ at 0, the phase cut and the drive's limit, which a small deviation does not reac
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
 from hapticrender.control.device_model import DeviceModel
-from hapticrender.control.linear import Sampled, StateSpace, closed_loop, continuous_poles, delayed
+from hapticrender.control.linear import LEAST_POLE, Sampled
 from hapticrender.control.loopshape import reduced_controller
 from hapticrender.control.transfer import butterworth
 from hapticrender.protocols import Array
+
+
+class StateSpace(NamedTuple):
+    """Matrices of x[n+1] = a x[n] + b u[n], y[n] = c x[n] + d u[n]; a stack of them along leading axes."""
+
+    a: Array
+    b: Array
+    c: Array
+    d: Array
+
+
+def delayed(plant: StateSpace, delay: int) -> StateSpace:
+    """Put `delay` >= 1 samples before the input of a plant without feedthrough; its outputs stay."""
+    n, m = plant.b.shape[-2:]
+    states = n + delay * m
+    shape = plant.a.shape[:-2]
+    a, b = np.zeros((*shape, states, states), plant.a.dtype), np.zeros((*shape, states, m), plant.a.dtype)
+    a[..., :n, :n], a[..., :n, -m:] = plant.a, plant.b
+    a[..., n + m :, n:-m] = np.eye((delay - 1) * m)
+    b[..., n : n + m, :] = np.eye(m)
+    c = np.concatenate([plant.c, np.zeros((*plant.c.shape[:-1], delay * m))], axis=-1)
+    return StateSpace(a, b, c, plant.d)
+
+
+def closed_loop(plant: StateSpace, controller: StateSpace) -> Array:
+    """State matrix of a plant (without feedthrough) whose input is the controller's output, shape (..., s, s)."""
+    return np.concatenate(
+        [
+            np.concatenate([plant.a + plant.b @ controller.d @ plant.c, plant.b @ controller.c], axis=-1),
+            np.concatenate([controller.b @ plant.c, controller.a], axis=-1),
+        ],
+        axis=-2,
+    )
+
+
+def continuous_poles(matrix: Array, rate: float) -> Array:
+    """Poles (1/s, complex: growth and angular frequency) of a sampled state matrix, shape (..., s)."""
+    z = np.linalg.eigvals(matrix).astype(complex)
+    return rate * np.log(np.where(z == 0, LEAST_POLE, z))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,8 +82,6 @@ class PolarLoop:
         Look-up table of each, m per drive unit.
     low_pass, law : ndarray, shape (B, 5)
         Sections b0 b1 b2 a1 a2 of the estimator and of the loop controller.
-    gain : float
-        Error of the plant's gain; 1 is none.
     """
 
     plant: Sampled
@@ -54,7 +92,6 @@ class PolarLoop:
     table: Array
     low_pass: Array
     law: Array
-    gain: float = 1.0
 
     @classmethod
     def on(
@@ -65,7 +102,6 @@ class PolarLoop:
         bandwidth: Array,
         *,
         common: bool,
-        delay: int | None = None,
     ) -> PolarLoop:
         """Loop of the paper's controller, per side or in common mode.
 
@@ -78,22 +114,20 @@ class PolarLoop:
             Carriers, and bandwidths fT of their loops; the estimator's is 2 fT.
         common : bool
             One loop on the mean of the sides, or one for each side.
-        delay : int, optional
-            Samples that the loop really has; by default the model's.
         """
         frequency, sides = np.asarray(frequency, float), model.side_from_coordinate
         measured = sides.mean(axis=0, keepdims=True) if common else sides
-        spread = np.ones((len(sides), 1)) if common else np.eye(len(sides))
+        drive_map = np.ones((len(sides), 1)) if common else np.eye(len(sides))
         alike = model.response(frequency) @ np.ones(len(sides)) @ measured.T
         widths, which = np.unique(bandwidth, return_inverse=True)
         filters = [butterworth(2 * b).tustin(model.rate, prewarp=2 * b) for b in widths]
         laws = [reduced_controller(b, 2 * b).tustin(model.rate) for b in widths]
         return cls(
             plant=plant,
-            delay=model.delay if delay is None else delay,
+            delay=model.delay,
             frequency=frequency,
             measured=measured,
-            force=model.force_from_drive @ spread,
+            force=model.force_from_drive @ drive_map,
             table=np.abs(alike * model.hold_and_delay(frequency)[:, None]),
             low_pass=np.array([[*b, *a[1:]] for b, a in filters])[which],
             law=np.array([[*b, *a[1:]] for b, a in laws])[which],
@@ -103,7 +137,7 @@ class PolarLoop:
         """Measured envelope per drive envelope at `offset` (Hz, shape (B, N)) from the carrier: (B, N, c, c)."""
         z = np.exp(2j * np.pi * (self.frequency[:, None] + offset) / self.plant.rate)
         response = self.measured @ self.plant.response(z) @ self.force
-        return self.gain * response * z[..., None, None] ** -self.delay
+        return response * z[..., None, None] ** -self.delay
 
     def steady(self) -> tuple[Array, Array]:
         """Unit vector e^(j theta) of each drive and r = A/|R|, both (B, c), where X = R in every coordinate."""
@@ -127,7 +161,7 @@ class PolarLoop:
     def matrix(self) -> Array:
         """State matrix of the closed loop at sample rate in the carrier's frame, real, shape (B, s, s)."""
         turn, ratio = self.steady()
-        pushed, seen = self.plant.b @ self.force * self.gain, self.measured @ self.plant.c
+        pushed, seen = self.plant.b @ self.force, self.measured @ self.plant.c
         a, b, c, d = delayed(StateSpace(self.plant.a, pushed, seen, np.zeros(0)), self.delay)
         back = np.exp(-2j * np.pi * self.frequency / self.plant.rate)[:, None, None]
         plant = StateSpace(_real(back * a), _real(back * b * (turn / self.table)[:, None, :]), _real(c + 0 * back), d)
@@ -149,10 +183,6 @@ class PolarLoop:
     def poles(self) -> Array:
         """Closed-loop poles in the frame of the carrier (1/s, complex, shape (B, s))."""
         return continuous_poles(self.matrix(), self.plant.rate)
-
-    def growth(self) -> Array:
-        """Growth of the slowest-decaying pole (1/s, shape (B,)), < 0 for a stable loop."""
-        return self.poles().real.max(axis=-1)
 
 
 def _real(matrix: Array) -> Array:
