@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -62,7 +62,7 @@ class Bands:
     sensor_response : ndarray of complex, shape (n,), or None
         Response of the device's sensor to each band, not 0; None: 1.  `tone` refers the targets to the sensor.
     unfelt : tuple of str
-        Which bands were left out because they cannot be felt, and why, one sentence each.
+        Bands left out below the detection threshold, and why, one sentence each.
 
     Raises
     ------
@@ -94,6 +94,11 @@ class Bands:
 
     def __len__(self) -> int:
         return len(self.frequency)
+
+    def select(self, which: Array, **changes: Any) -> Bands:
+        """Bands at the indices, or where the mask, `which`, with `changes` of other fields."""
+        columns = {name: column[which] for name in _COLUMNS if (column := getattr(self, name)) is not None}
+        return replace(self, **{**columns, **changes})
 
     def checked(self, name: str, waveform: Callable[[Array, Array], Any], time: Array, position: Array) -> Array:
         """Target waveform at `time` (s) and `position` (m); the texture `name` must return finite numbers.

@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 import os
 import reprlib
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import field, fields
+from dataclasses import MISSING, field, fields
 from numbers import Integral, Real
 from typing import Any, NoReturn, Self
 
@@ -30,11 +30,22 @@ def show(value: object) -> str:
     return " ".join(_short.repr(value).split())
 
 
+def plain(key: object) -> str:
+    """Format a key of a table for a message."""
+    return key if isinstance(key, str) and key.isidentifier() else show(key)
+
+
 def refuse(key: str, value: object, bound: str, error: type[Exception] = ValueError) -> NoReturn:
     """Raise `error` as "key = value: must be bound"; a value of None reads as missing."""
     if value is None:
         raise error(f"{key} is missing: must be {bound}")
     raise error(f"{key} = {show(value)}: must be {bound}")
+
+
+def require(good: bool, key: str, value: object, bound: str, error: type[Exception] = ValueError) -> None:
+    """Refuse `value` unless `good`."""
+    if not good:
+        refuse(key, value, bound, error)
 
 
 def _is_number(value: object) -> bool:
@@ -58,107 +69,98 @@ def number(
 ) -> float:
     """Return `value` as float, if it is a finite real number (no bool) inside its bounds."""
     bound = _bound("a finite number", unit, above, least, most)
-    if not _is_number(value):
-        refuse(key, value, bound, TypeError)
+    require(_is_number(value), key, value, bound, TypeError)
     try:
         result = float(value)
     except OverflowError:
         refuse(key, value, bound)
-    inside = (
-        (above is None or result > above) and (least is None or result >= least) and (most is None or result <= most)
-    )
-    if not (math.isfinite(result) and inside):
-        refuse(key, value, bound)
+    low = result > above if above is not None else least is None or result >= least
+    require(math.isfinite(result) and low and (most is None or result <= most), key, value, bound)
     return result
 
 
 def integer(key: str, value: Any, unit: str = "", *, least: float, most: float | None = None) -> int:
     """Return `value` as int, if it is an integer (no bool) inside its bounds."""
     bound = _bound("an integer", unit, None, least, most)
-    if not isinstance(value, Integral) or isinstance(value, bool):
-        refuse(key, value, bound, TypeError)
-    if not least <= int(value) <= (math.inf if most is None else most):
-        refuse(key, value, bound)
+    require(isinstance(value, Integral) and not isinstance(value, bool), key, value, bound, TypeError)
+    require(least <= int(value) <= (math.inf if most is None else most), key, value, bound)
     return int(value)
 
 
-def numbers(key: str, value: Any, unit: str = "", *, least: float, most: float, count: int = 1) -> tuple[float, ...]:
-    """Return a list or array of at least `count` finite real numbers inside their bounds as a tuple of floats."""
-    bound = f"a list of {count} to {LONGEST_LIST} finite numbers >= {least:g} and <= {most:g} {unit}".strip()
-    array = _array(key, value, bound)
-    if not count <= array.size <= LONGEST_LIST:
-        refuse(key, value, bound)
-    wrong = ~((array >= least) & (array <= most))
-    if wrong.any():
-        first = int(np.argmax(wrong))
-        refuse(f"{key}[{first}]", array[first], _bound("a finite number", unit, None, least, most))
-    return tuple(array.tolist())
-
-
-def _array(key: str, value: Any, bound: str) -> np.ndarray[Any, Any]:
+def numbers(
+    key: str, value: Any, unit: str = "", *, least: float, most: float, count: int | None = None
+) -> tuple[float, ...]:
+    """Return a list or array of finite real numbers (exactly `count`, or any) inside their bounds as floats."""
+    size = f"1 to {LONGEST_LIST}" if count is None else f"{count}"
+    bound = f"a list of {size} finite numbers >= {least:g} and <= {most:g} {unit}".strip()
     if isinstance(value, np.ndarray):
-        if value.ndim != 1 or value.dtype.kind not in "iuf":
-            refuse(key, value, bound, TypeError)
-        return value.astype(float)
-    if not isinstance(value, list | tuple) or not all(map(_is_number, value)):
-        refuse(key, value, bound, TypeError)
+        require(value.ndim == 1 and value.dtype.kind in "iuf", key, value, bound, TypeError)
+    else:
+        require(isinstance(value, list | tuple) and all(map(_is_number, value)), key, value, bound, TypeError)
+    require(1 <= len(value) <= LONGEST_LIST and count in (None, len(value)), key, value, bound)
     try:
-        return np.array([float(entry) for entry in value])
+        found = np.array([float(entry) for entry in value])
     except OverflowError:
         refuse(key, value, bound)
+    for first in np.flatnonzero(~((found >= least) & (found <= most)))[:1]:
+        refuse(f"{key}[{first}]", found[first], _bound("a finite number", unit, None, least, most))
+    return tuple(found.tolist())
 
 
 def rising(key: str, value: Any, count: int) -> tuple[float, ...]:
     """Return `count` rising times (s) from 0 to 100 h as a tuple of floats."""
     times = numbers(key, value, "s", least=0, most=360_000)
-    if len(times) != count or any(later <= sooner for sooner, later in zip(times, times[1:], strict=False)):
-        refuse(key, value, f"{count} rising times in s")
+    good = len(times) == count and all(np.diff(times) > 0)
+    require(good, key, value, f"{count} rising times in s")
     return times
 
 
 def flag(key: str, value: Any) -> bool:
     """Return `value`, if it is true or false."""
-    if not isinstance(value, bool | np.bool_):
-        refuse(key, value, "true or false", TypeError)
+    require(isinstance(value, bool | np.bool_), key, value, "true or false", TypeError)
     return bool(value)
 
 
 def choice(key: str, value: Any, options: Iterable[str]) -> str:
     """Return `value`, if it is one of the words in `options`."""
     bound = "one of " + ", ".join(options)
-    if not isinstance(value, str):
-        refuse(key, value, bound, TypeError)
-    if value not in options:
-        refuse(key, value, bound)
+    require(isinstance(value, str), key, value, bound, TypeError)
+    require(value in options, key, value, bound)
+    return value
+
+
+def text(key: str, value: Any, longest: int = 200) -> str:
+    """Return `value`, if it is a text of at most `longest` printable characters."""
+    bound = f"a text of printable characters, at most {longest}"
+    require(isinstance(value, str) and value.isprintable() and len(value) <= longest, key, value, bound)
     return value
 
 
 def word(key: str, value: Any) -> str:
     """Return `value`, if it can be a name and part of a file name: 1 to 100 printable characters, no path."""
     bound = "1 to 100 printable characters without / \\ : and not starting with a dot"
-    if not isinstance(value, str):
-        refuse(key, value, bound, TypeError)
-    if not (1 <= len(value) <= 100 and value.isprintable() and value[0] != "." and not set(value) & set("/\\:")):
-        refuse(key, value, bound)
+    require(isinstance(value, str), key, value, bound, TypeError)
+    good = 1 <= len(value) <= 100 and value.isprintable() and value[0] != "." and not set(value) & set("/\\:")
+    require(good, key, value, bound)
     return value
 
 
 def file_name(key: str, value: Any) -> str:
     """Return a path as absolute text, so that a scene means the same file wherever it is read again."""
     bound = "the name of a file, without control characters"
-    if not isinstance(value, str | os.PathLike):
-        refuse(key, value, bound, TypeError)
+    require(isinstance(value, str | os.PathLike), key, value, bound, TypeError)
     name = os.fspath(value)
-    if not isinstance(name, str) or not name or not name.isprintable():
-        refuse(key, value, bound)
+    require(isinstance(name, str) and name.isprintable() and name != "", key, value, bound)
     return os.path.abspath(name)
 
 
-def one_of_two(first: str, one: object, second: str, other: object) -> None:
-    """Refuse unless exactly one of two values is given."""
-    if (one is None) == (other is None):
-        given = "neither is" if one is None else f"{first} = {show(one)} and {second} = {show(other)} are"
-        raise ValueError(f"{first}, {second}: exactly one must be given; {given}")
+def exactly_one(**values: Any) -> str:
+    """Return the name of the only value that is not None; refuse none and several."""
+    given = {key: value for key, value in values.items() if value is not None}
+    if len(given) != 1:
+        found = " and ".join(f"{key} = {show(value)}" for key, value in given.items())
+        raise ValueError(f"{', '.join(values)}: exactly one must be given; {f'{found} are' if given else 'none is'}")
+    return next(iter(given))
 
 
 def keep(instance: object, **values: Any) -> None:
@@ -178,34 +180,44 @@ def inside(table: str) -> Iterator[None]:
         raise ValueError(f"{table}.{problem}") from None
 
 
+def checked(check: Callable[..., Any], default: Any = MISSING, **bounds: Any) -> Any:
+    """Field of a `Validated` class: keeps what ``check(name, value, **bounds)`` returns; a default of None stays."""
+    return field(default=default, metadata={"check": check, "bounds": bounds})
+
+
 def parameter(
-    default: float, unit: str = "", *, above: float | None = None, least: float = 0.0, most: float | None = None
+    default: Any = MISSING,
+    unit: str = "",
+    *,
+    above: float | None = None,
+    least: float = 0.0,
+    most: float | None = None,
 ) -> Any:
-    """Field of a `Validated` class: a number > `above`, or >= `least`, and <= `most`, in `unit`."""
+    """Field of a `Validated` class: a number (integer where annotated so) > `above` or >= `least`, <= `most`."""
     low = {"least": least} if above is None else {"above": above}
-    return field(default=default, metadata={"unit": unit, "most": most, **low})
+    return checked(number, default, unit=unit, most=most, **low)
 
 
 def option(default: str, *known: str) -> Any:
     """Field of a `Validated` class: one of the words in `known`."""
-    return field(default=default, metadata={"known": known})
+    return checked(choice, default, options=known)
 
 
 class Validated:
-    """Base of parameter classes whose fields are made by `parameter` and `option` and checked when one is made."""
+    """Base of dataclasses with fields made by `checked`, `parameter` and `option`, and checked when one is made."""
 
     def __post_init__(self) -> None:
         for each in fields(self):  # type: ignore[arg-type]
-            bounds, value = each.metadata, getattr(self, each.name)
-            if "known" in bounds:
-                choice(each.name, value, bounds["known"])
-            elif "unit" in bounds:
-                (integer if each.type in (int, "int") else number)(each.name, value, **bounds)
+            check, value = each.metadata.get("check"), getattr(self, each.name)
+            if check is None or (value is None and each.default is None):
+                continue
+            check = integer if check is number and each.type in (int, "int") else check
+            keep(self, **{each.name: check(each.name, value, **each.metadata["bounds"])})
 
     @classmethod
     def names(cls) -> set[str]:
-        """Names of the parameters that `parameter` and `option` made."""
-        return {each.name for each in fields(cls) if not {"known", "unit"}.isdisjoint(each.metadata)}  # type: ignore[arg-type]
+        """Names of the fields that are checked."""
+        return {each.name for each in fields(cls) if "check" in each.metadata}  # type: ignore[arg-type]
 
     @classmethod
     def with_overrides(cls, overrides: Mapping[str, Any]) -> Self:
@@ -218,4 +230,4 @@ def check_names(given: Iterable[str], known: Iterable[str]) -> None:
     """Refuse a name that is not `known`; the message lists those that are."""
     for name in given:
         if name not in known:
-            raise ValueError(f"{name}: no such parameter; known: {', '.join(sorted(known))}")
+            raise ValueError(f"{plain(name)}: no such parameter; known: {', '.join(sorted(known))}")

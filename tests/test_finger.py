@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from hapticrender.touch.finger import Finger
-from hapticrender.touch.mechanics import HEAVY, HEAVY_SECOND, LIGHT, LIGHT_SECOND, NONE, FingerMechanics
-from hapticrender.touch.motion import TriangleMotion
+from hapticrender.touch.mechanics import HEAVY, HEAVY_SECOND, LIGHT, LIGHT_SECOND, NONE
 
 PAPER = np.array([20.0, 31.0, 47.0, 72.0, 111.0, 170.0, 261.0, 400.0])
 GRID = np.arange(20.0, 401.0)
@@ -42,23 +41,6 @@ def test_admittances_solve_the_corrected_equations(mechanics):
     np.testing.assert_allclose(mechanics.impedance(GRID) * skin, 1.0, rtol=1e-12)
 
 
-@pytest.mark.parametrize("mechanics", [LIGHT, HEAVY], ids=["light", "heavy"])
-def test_printed_impedance_polynomial(mechanics):
-    """Z_s as a ratio of polynomials (the paper's own, which is right)."""
-    m_s, b_s, k_s = mechanics.mass, mechanics.damping, mechanics.stiffness
-    m_p, b_p, k_p = mechanics.phalanx_mass, mechanics.phalanx_damping, mechanics.phalanx_stiffness
-    numerator = [
-        m_s * m_p,
-        m_s * (b_p + b_s) + m_p * b_s,
-        m_s * (k_s + k_p) + m_p * k_s + b_s * b_p,
-        b_s * k_p + b_p * k_s,
-        k_s * k_p,
-    ]
-    s = 2j * np.pi * PAPER
-    printed = np.polyval(numerator, s) / np.polyval([m_p, b_p + b_s, k_p + k_s, 0.0], s)
-    np.testing.assert_allclose(mechanics.impedance(PAPER), printed, rtol=1e-12)
-
-
 def test_printed_phalanx_equation_is_off_by_35_percent_at_72_hz():
     """With b_p x_s' in the phalanx's balance V_s/F is wrong; with b_p x_p' it is Z_s: both sides of the misprint."""
     right, _ = solved(LIGHT, PAPER)
@@ -69,21 +51,6 @@ def test_printed_phalanx_equation_is_off_by_35_percent_at_72_hz():
     worst = int(np.argmax(np.abs(off)))
     assert PAPER[worst] == 72.0
     assert abs(off[worst]) == pytest.approx(0.35, abs=0.005)
-
-
-@pytest.mark.parametrize(("mechanics", "crossing"), [(LIGHT, 94.0), (HEAVY, 350.0)], ids=["light", "heavy"])
-def test_phalanx_and_tissue_move_alike_at_one_frequency(mechanics, crossing):
-    around = crossing + np.array([-0.5, 0.5])
-    difference = np.abs(mechanics.phalanx_velocity_per_force(around)) - np.abs(
-        mechanics.tissue_velocity_per_force(around)
-    )
-    assert difference[0] > 0 > difference[1]
-
-
-@pytest.mark.parametrize("mechanics", [LIGHT, HEAVY, LIGHT_SECOND], ids=["light", "heavy", "light 2nd"])
-def test_phalanx_and_tissue_make_the_skin(mechanics):
-    whole = mechanics.phalanx_velocity_per_force(GRID) + mechanics.tissue_velocity_per_force(GRID)
-    np.testing.assert_allclose(whole, mechanics.skin_velocity_per_force(GRID), rtol=1e-14)
 
 
 def test_second_order_for_fourth_light():
@@ -101,20 +68,6 @@ def test_second_order_for_fourth_heavy_holds_within_11_percent_to_261_hz():
     assert np.abs(ratio).max() > 0.25
 
 
-def test_skin_mass_may_be_dropped_for_3_4_percent():
-    worst = 0.0
-    for mechanics in (LIGHT, HEAVY):
-        values = {key: getattr(mechanics, key) for key in mechanics.__dataclass_fields__}
-        massless = FingerMechanics(**(values | {"mass": 0.0}))
-        ratio = np.abs(massless.impedance(GRID) / mechanics.impedance(GRID)) - 1
-        worst = max(worst, np.abs(ratio).max())
-    assert worst == pytest.approx(0.034, abs=0.0005)
-
-
-def test_low_frequency_stiffness_is_158_newton_per_metre():
-    assert 2 * np.pi * 20 * abs(LIGHT.impedance(np.array([20.0]))[0]) == pytest.approx(158, abs=0.5)
-
-
 def test_no_mechanics_no_impedance():
     assert not NONE.impedance(GRID).any()
     with pytest.raises(ValueError, match=r"order = 0: must be 2 or 4"):
@@ -128,8 +81,8 @@ def test_load_scaling_is_a_cube_root():
         normal_load=([0.0, 1.0], [0.0, 2.4]), mechanics="light", load_scaling=True, touches=[(0.0, 9.0)]
     )
     time = np.array([0.0, 0.125, 1.0, 9.0])
-    assert finger.strength(time) == pytest.approx([0.0, 1.0, 2.0, 0.0], rel=1e-12)  # light holds at 0.3 N
-    assert Finger.still(normal_load=0.9, mechanics="light").strength(time).tolist() == [1.0] * 4
+    assert finger.touch(time)[:, 2] == pytest.approx([0.0, 1.0, 2.0, 0.0], rel=1e-12)  # light holds at 0.3 N
+    assert Finger.still(normal_load=0.9, mechanics="light").touch(time)[:, 2].tolist() == [1.0] * 4
 
 
 def test_touch_is_half_open_and_lifts_everything():
@@ -138,7 +91,7 @@ def test_touch_is_half_open_and_lifts_everything():
     touching = [False, True, True, False, False, True, False]
     assert np.isfinite(finger.position(time)).tolist() == touching
     assert (finger.load(time) == 0.6).tolist() == touching
-    assert (finger.strength(time) == 1.0).tolist() == touching
+    assert (finger.touch(time)[:, 2] == 1.0).tolist() == touching
     assert set(finger.load(time)) == {0.0, 0.6}
 
 
@@ -160,22 +113,6 @@ def test_a_finger_is_constant_where_nothing_of_its_touch_changes(finger, constan
     np.testing.assert_equal(np.array_equal(touch, touch[:1] + 0.0 * touch, equal_nan=True), constant)
 
 
-def test_a_finger_of_another_kind_may_do_anything():
-    class Blinking(Finger):
-        def position(self, time):
-            return np.where(np.mod(time, 2.0) < 1.0, super().position(time), np.nan)
-
-    assert not Blinking.still(normal_load=0.5).constant
-
-
-def test_an_absent_finger_never_touches():
-    time = np.linspace(0, 10, 11)
-    finger = Finger.absent()
-    assert np.isnan(finger.position(time)).all()
-    assert not finger.load(time).any()
-    assert not finger.strength(time).any()
-
-
 def test_load_follows_its_curve_and_is_held():
     finger = Finger.still(normal_load=([1.0, 2.0], [0.2, 0.8]))
     assert finger.load(np.array([0.0, 1.5, 5.0])) == pytest.approx([0.2, 0.5, 0.8])
@@ -190,17 +127,14 @@ def test_auto_parts_light_from_heavy_at_half_a_newton(load, chosen):
     ("wrong", "message"),
     [
         ({"normal_load": -0.1}, r"normal_load = -0.1: must be .* >= 0 and <= 20 N"),
-        ({"normal_load": 400}, r"normal_load = 400: must be .* N"),
         ({"normal_load": None}, r"normal_load is missing"),
         ({"normal_load": [[0.0, 1.0], [0.2]]}, r"normal_load\[0\] = .*: must be 1 rising times in s"),
         ({"touches": [(1.0, 0.5)]}, r"touches\[0\] = \(1.0, 0.5\): must be pairs of on < off in s"),
-        ({"touches": [(0.0, 1.0), (0.5, 2.0)]}, r"touches\[1\]"),
         ({"touches": 3.0}, r"touches = 3.0: must be pairs"),
         ({"mechanics": "strong"}, r"mechanics = 'strong': must be one of auto, none, light"),
         ({"mechanics": {"order": 3}}, r"mechanics.order = 3: must be 0, 2 or 4"),
-        ({"mechanics": {"order": 2}}, r"mechanics.mass, damping, stiffness = 0"),
         ({"mechanics": {"order": 2, "mass": -1e-3}}, r"mechanics.mass = -0.001: must be .* kg"),
-        ({"mechanics": {"order": 2, "weight": 1}}, r"mechanics.'weight': unknown key"),
+        ({"mechanics": {"order": 2, "weight": 1}}, r"mechanics.weight: no such parameter"),
         ({"mechanics": {"order": 2, "mass": 1e-3, "phalanx_mass": 1e-3}}, r"mechanics.phalanx_mass = 0.001: must be 0"),
         ({"load_scaling": 1}, r"load_scaling = 1: must be true or false"),
     ],
@@ -213,16 +147,3 @@ def test_wrong_fingers_are_refused_with_bound_and_unit(wrong, message):
 def test_a_finger_needs_a_motion():
     with pytest.raises(TypeError, match=r"motion = 0.1: must be a motion with position"):
         Finger(0.1)
-
-
-@pytest.mark.parametrize("load", [0.5, ((0.0, 0.3, 0.6), (0.1, 1.2, 0.2))])
-@pytest.mark.parametrize("touches", [None, ((0.1, 0.2), (0.35, 0.5))])
-@pytest.mark.parametrize("scaled", [False, True])
-def test_touch_is_position_load_and_strength_side_by_side(load, touches, scaled):
-    finger = Finger(
-        TriangleMotion(0.1, 0.05), normal_load=load, touches=touches, mechanics="heavy", load_scaling=scaled
-    )
-    time = np.linspace(0.0, 0.7, 71)
-    expected = np.column_stack([finger.position(time), finger.load(time), finger.strength(time)])
-    np.testing.assert_array_equal(finger.touch(time), expected)
-    assert np.isnan(expected[:, 0]).any() == (touches is not None)

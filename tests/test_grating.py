@@ -1,7 +1,7 @@
 """Gratings: waveform, bands and refusals."""
 
 import pickle
-from dataclasses import fields, replace
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -19,12 +19,6 @@ GRATINGS = {
     "triangle in space": Grating(amplitude=1e-6, wavelength=2e-3, shape="triangle", harmonics=3, phase=1.0),
     "inharmonic": Grating(amplitude=5e-6, frequency=20.0, partials=((1, 1.0, 0.0), (2.7, -0.5, 1.2))),
 }
-
-
-def test_a_tone_is_a_cosine_of_its_peak():
-    tone = Grating(amplitude=10e-6, frequency=72.0, phase=0.4)
-    expected = 10e-6 * np.cos(2 * np.pi * 72.0 * TIME + 0.4)
-    np.testing.assert_allclose(tone.waveform(TIME, NOWHERE), expected, atol=1e-6 * 1e-9)
 
 
 def test_a_spatial_grating_is_read_at_the_position_only():
@@ -49,11 +43,6 @@ def test_bands_carry_the_waveform(name):
     bands = grating.bands(rate=5000.0)
     summed = (bands.envelope * np.exp(1j * bands.carrier_phase(TIME, position))).real.sum(axis=1)
     np.testing.assert_allclose(grating.waveform(TIME, position), summed, atol=1e-9 * grating.amplitude)
-
-
-def test_the_felt_frequency_is_speed_over_wavelength():
-    bands = Grating(amplitude=1e-6, wavelength=1e-3).bands(5000.0)
-    assert bands.instantaneous_frequency(np.array([0.08, -0.05]))[:, 0] == pytest.approx([80.0, -50.0], rel=1e-12)
 
 
 @pytest.mark.parametrize(("shape", "order"), [("square", 1), ("triangle", 3)])
@@ -102,86 +91,50 @@ def test_gratings_are_equal_however_they_were_stated(stated):
     assert {type(value) for value in (grating.amplitude, grating.frequency or grating.wavelength)} == {float}
 
 
-def test_positional_arguments_keep_their_places():
-    names = [entry.name for entry in fields(Grating)]
-    assert names[:7] == ["amplitude", "frequency", "wavelength", "shape", "harmonics", "partials", "phase"]
+IN_SPACE = {"frequency": None, "wavelength": 1e-3, "amplitude": None}
+REFUSED = [
+    ({"level": 20}, r"amplitude, velocity, level: exactly .* amplitude = 1e-06 and level = 20.0 are"),
+    ({"amplitude": None}, r"amplitude, velocity, level: exactly one must be given; none is"),
+    (
+        {"amplitude": None, "velocity": 2.0},
+        r"velocity = 2.0: must be <= 0.01 m as an amplitude; at 20 Hz it is 0.0159 m",
+    ),
+    ({"amplitude": None, "velocity": 1.0, "frequency": 5e-324}, r"velocity = 1.0: must be <= 0.01 m .* it is inf m"),
+    ({"amplitude": None, "level": "loud"}, r"level = 'loud': must be a finite number .* dB"),
+    (
+        {"amplitude": None, "level": 20, "frequency": 1001},
+        r"level = 20.0: must be stated at 1 to 1000 Hz, .* at 1001 Hz",
+    ),
+    ({"amplitude": None, "level": 20, "speed": 0.1}, r"speed = 0.1: must be left out but where velocity or level"),
+    (IN_SPACE | {"level": 20}, r"speed is missing: must be .* m/s"),
+    ({"amplitude": -1e-6}, r"amplitude = -1e-06: must be a finite number > 0 and <= 0.01 m"),
+    ({"amplitude": 10.0}, r"amplitude = 10.0: must be .* <= 0.01 m"),
+    ({"amplitude": True}, r"amplitude = True: must be a finite number"),
+    ({"amplitude": np.array([1e-6, 2e-6])}, r"amplitude = .*: must be a finite number"),
+    ({"frequency": float("inf")}, r"frequency = inf: must be a finite number"),
+    ({"frequency": None}, r"frequency, wavelength: exactly one must be given; none is"),
+    ({"wavelength": 1e-3}, r"frequency, wavelength: exactly one must be given; frequency = 20.0"),
+    ({"frequency": None, "wavelength": 1.0}, r"wavelength = 1.0: must be .* <= 0.5 m"),
+    ({"shape": "sawtooth"}, r"shape = 'sawtooth': must be one of sine, square, triangle"),
+    ({"harmonics": 0}, r"harmonics = 0: must be an integer >= 1"),
+    ({"partials": []}, r"partials = \[\]: must be 1 to 4096 entries"),
+    ({"partials": [(0, 1, 0)]}, r"partials\[0\].order = 0: must be .* > 0"),
+    ({"partials": [{"order": 1, "amplitude": 1, "phse": 0}]}, r"partials\[0\].phse"),
+    ({"phase": 10**400}, r"phase = an integer beyond 1e30: must be .* rad"),
+]
 
 
-@pytest.mark.parametrize(
-    ("stated", "message"),
-    [
-        (
-            {"amplitude": 1e-6, "level": 20},
-            r"amplitude, velocity, level: exactly .* amplitude = 1e-06 and level = 20 are",
-        ),
-        ({"velocity": 0.0}, r"velocity = 0.0: must be a finite number >= 1e-09 and <= 10 m/s"),
-        ({"velocity": np.inf}, r"velocity = inf: must be a finite number .* m/s"),
-        ({"velocity": 2.0}, r"velocity = 2.0: must be <= 0.01 m as an amplitude; at 20 Hz it is 0.0159 m"),
-        (
-            {"velocity": 1.0, "frequency": 5e-324},
-            r"velocity = 1.0: must be <= 0.01 m as an amplitude; at .* it is inf m",
-        ),
-        ({"level": 101}, r"level = 101: must be a finite number >= -100 and <= 100 dB"),
-        ({"level": "loud"}, r"level = 'loud': must be a finite number .* dB"),
-        ({"level": 70}, r"level = 70.0: must be <= 0.01 m as an amplitude; at 20 Hz it is 0.0199 m"),
-        ({"level": 20, "frequency": 0.99}, r"level = 20.0: must be stated at 1 to 1000 Hz, .*; it is at 0.99 Hz"),
-        ({"level": 20, "frequency": 1001}, r"level = 20.0: must be stated at 1 to 1000 Hz, .*; it is at 1001 Hz"),
-        ({"level": 20, "speed": 0.1}, r"speed = 0.1: must be left out but where velocity or level"),
-        (
-            {"amplitude": 1e-6, "frequency": None, "wavelength": 1e-3, "speed": 0.1},
-            r"speed = 0.1: must be left out but",
-        ),
-        ({"level": 20, "frequency": None, "wavelength": 1e-3}, r"speed is missing: must be .* >= 1e-06 and <= 10 m/s"),
-        ({"level": 20, "frequency": None, "wavelength": 1e-3, "speed": 0}, r"speed = 0: must be .* m/s"),
-    ],
-)
-def test_amplitudes_stated_wrongly_are_refused_with_bound_and_unit(stated, message):
-    with pytest.raises((ValueError, TypeError), match=f"^{message}"):
-        Grating(**({"frequency": 20.0} | stated))
-
-
-def test_the_bounds_of_velocity_and_level_are_accepted():
-    assert Grating(level=99, frequency=250.0).amplitude == pytest.approx(0.11e-6 * 10**4.95, rel=1e-12)
-    assert Grating(level=-100, frequency=1.0).amplitude == pytest.approx(28e-11, rel=1e-12)
-    assert Grating(level=0, frequency=1000.0).amplitude == pytest.approx(5e-6, rel=1e-12)
-    assert Grating(velocity=1e-9, frequency=1e6).amplitude == pytest.approx(1e-15 / (2 * np.pi), rel=1e-12)
-
-
-@pytest.mark.parametrize(
-    ("wrong", "message"),
-    [
-        ({"amplitude": -1e-6}, r"amplitude = -1e-06: must be a finite number > 0 and <= 0.01 m"),
-        ({"amplitude": 10.0}, r"amplitude = 10.0: must be .* <= 0.01 m"),
-        ({"amplitude": float("nan")}, r"amplitude = nan: must be a finite number"),
-        ({"amplitude": None}, r"amplitude, velocity, level: exactly one must be given; none is"),
-        ({"frequency": 0.0}, r"frequency = 0.0: must be .* > 0 .* Hz"),
-        ({"frequency": float("inf")}, r"frequency = inf: must be a finite number"),
-        ({"frequency": None}, r"frequency, wavelength: exactly one must be given; neither"),
-        ({"wavelength": 1e-3}, r"frequency, wavelength: exactly one must be given; frequency = 20.0"),
-        ({"frequency": None, "wavelength": 0.0}, r"wavelength = 0.0: must be .* m"),
-        ({"frequency": None, "wavelength": 1.0}, r"wavelength = 1.0: must be .* <= 0.5 m"),
-        ({"shape": "sawtooth"}, r"shape = 'sawtooth': must be one of sine, square, triangle"),
-        ({"harmonics": 0}, r"harmonics = 0: must be an integer >= 1"),
-        ({"partials": []}, r"partials = \[\]: must be 1 to 4096 entries"),
-        ({"partials": [(0, 1, 0)]}, r"partials\[0\].order = 0: must be .* > 0"),
-        ({"partials": [{"order": 1, "amplitude": 1, "phse": 0}]}, r"partials\[0\].phse"),
-        ({"phase": 10**400}, r"phase = an integer beyond 1e30: must be .* rad"),
-    ],
-)
+@pytest.mark.parametrize(("wrong", "message"), REFUSED, ids=range(len(REFUSED)))
 def test_wrong_values_are_refused_with_bound_and_unit(wrong, message):
-    with pytest.raises((ValueError, TypeError), match=message):
+    with pytest.raises((ValueError, TypeError), match=f"^{message}"):
         Grating(**({"amplitude": 1e-6, "frequency": 20.0} | wrong))
-
-
-@pytest.mark.parametrize("wrong", [True, "10 um", [1e-6], np.array([1e-6, 2e-6])])
-def test_only_numbers_are_numbers(wrong):
-    with pytest.raises(TypeError, match=r"^amplitude = .*: must be a finite number > 0 and <= 0.01 m$"):
-        Grating(amplitude=wrong, frequency=20.0)
 
 
 def test_the_bounds_themselves_are_accepted():
     assert Grating(amplitude=0.01, wavelength=0.5).wavelength == 0.5
-    assert Grating(amplitude=0.01, wavelength=1e-6).amplitude == 0.01
+    assert Grating(level=99, frequency=250.0).amplitude == pytest.approx(0.11e-6 * 10**4.95, rel=1e-12)
+    assert Grating(level=-100, frequency=1.0).amplitude == pytest.approx(28e-11, rel=1e-12)
+    assert Grating(velocity=1e-9, frequency=1e6).amplitude == pytest.approx(1e-15 / (2 * np.pi), rel=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -189,14 +142,10 @@ def test_the_bounds_themselves_are_accepted():
     [
         ({"frequency": [np.nan, 1.0]}, r"frequency\[0\] = nan: must be finite and >= 0 \(Hz\)"),
         ({"frequency": [1.0, -20.0]}, r"frequency\[1\] = -20.0: must be finite and >= 0 \(Hz\)"),
-        ({"frequency": 20.0}, r"frequency has shape \(\): must be one number a band"),
-        ({"wavenumber": [np.inf, 1.0]}, r"wavenumber\[0\] = inf: must be finite and >= 0 \(1/m\)"),
         ({"wavenumber": [0.0, -1.0]}, r"wavenumber\[1\] = -1.0: must be finite and >= 0 \(1/m\)"),
         ({"wavenumber": [0.0]}, r"wavenumber has shape \(1,\): must be .* as many as frequency has"),
         ({"phase": [0.0, -np.inf]}, r"phase\[1\] = -inf: must be finite \(rad\)"),
-        ({"phase": [[0.0, 0.0]]}, r"phase has shape \(1, 2\): must be one number a band"),
         ({"envelope": [np.nan, 0.0]}, r"envelope\[0\] = \(nan\+0j\): must be finite \(m\)"),
-        ({"envelope": [0.0, complex(0, np.inf)]}, r"envelope\[1\] = infj: must be finite \(m\)"),
         ({"envelope": [1e-6] * 3}, r"envelope has shape \(3,\): must be .* as many as frequency has"),
     ],
 )
@@ -205,8 +154,3 @@ def test_bands_that_cannot_be_are_refused_with_value_and_bound(wrong, message):
     assert len(Bands(**good)) == len(Bands(**good | {"envelope": None})) == 2
     with pytest.raises(ValueError, match=f"^{message}"):
         Bands(**good | wrong)
-
-
-def test_no_bands_at_all_are_bands():
-    none = np.zeros(0)
-    assert len(Bands(frequency=none, wavenumber=none, phase=none)) == 0

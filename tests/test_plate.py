@@ -26,7 +26,7 @@ def eigenfrequencies(plate):
 def naive(drive, finger, parameters):
     """Motion of the naive twin under the same drive and finger."""
     time = np.arange(len(drive)) / RATE
-    touch = finger.position(time), finger.load(time), finger.strength(time)
+    touch = tuple(finger.touch(time).T)
     return simulate(drive, finger.mechanics, *touch, RATE, parameters.bending_frequency)
 
 
@@ -79,7 +79,7 @@ def test_finger_that_slides_presses_and_lifts(rng, scaled, bending):
     expected = naive(drive, finger, parameters)
     motion = Plate(parameters, finger).run(drive).motion
     np.testing.assert_allclose(motion, expected, rtol=0, atol=1e-5 * expected.std())
-    assert len(set(finger.strength(np.arange(500) / RATE))) > (100 if scaled else 1)
+    assert len(set(finger.touch(np.arange(500) / RATE)[:, 2])) > (100 if scaled else 1)
 
 
 def stop_and_go(time):

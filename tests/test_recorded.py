@@ -266,7 +266,7 @@ def test_the_recorded_finger_moves_presses_and_lifts(save):
     time = np.array([0.5, 1.2, 2.25, 3.2, 3.9, 50.0])
     assert finger.position(time) == pytest.approx([np.nan, -0.03, 0.0, 0.03, np.nan, np.nan], abs=1e-6, nan_ok=True)
     assert finger.load(time) == pytest.approx([0, 0.5, 0.5, 0.5, 0, 0], abs=1e-5)
-    assert finger.strength(time).tolist() == [0, 1, 1, 1, 0, 0]
+    assert finger.touch(time)[:, 2].tolist() == [0, 1, 1, 1, 0, 0]
 
 
 @pytest.mark.parametrize("speed", [0.025, 0.07])

@@ -17,7 +17,7 @@ from hapticrender.touch.finger import Finger
 from hapticrender.touch.grating import Grating
 from hapticrender.touch.mechanics import FingerMechanics
 from hapticrender.touch.recorded import Recorded, Swipe, Synthetic
-from hapticrender.touch.scene import MOTIONS, TEXTURES, Scene, distinct_names
+from hapticrender.touch.scene import MOTIONS, TEXTURES, Scene
 
 GOOD = """
 duration = 2.0
@@ -50,10 +50,8 @@ FINGERS = {
 TEXTURE_CASES = {
     "tone": TONE,
     "partials": Grating(amplitude=1e-6, wavelength=1e-3, partials=[(1, 1, 0), (2.5, -1 / 3, 0.1)]),
-    "square": Grating(amplitude=1e-6, frequency=20.0, shape="square", harmonics=7, phase=-0.3),
-    "by velocity": Grating(velocity=1 / 30, wavelength=1e-3, speed=0.07),
-    "by level": Grating(level=20.0, frequency=70.0),
-    "synthetic": Synthetic(amplitude=1e-6, speed=0.08, seed=5),
+    "by velocity": Grating(velocity=np.float64(1 / 30), wavelength=1e-3, speed=0.07, shape="square", phase=-0.3),
+    "synthetic": Synthetic(amplitude=1e-6, speed=0.08, seed=np.uint8(5)),
 }
 
 
@@ -62,15 +60,6 @@ def test_built_in_scenes_survive_toml(name):
     scene = builtin_scenes()[name]
     assert scene.name == name
     assert Scene.from_toml_text(scene.to_toml()) == scene
-
-
-def test_the_built_in_scenes_are_those_of_the_demo():
-    assert list(builtin_scenes()) == [
-        *(f"grating-{frequency}" for frequency in (20, 31, 47, 72, 111, 170, 261, 400)),
-        *("spatial-grating", "recorded-texture", "sliding", "pressing", "swiping"),
-        *(f"one-texture-{device}" for device in ("vt-plate", "electroadhesion", "ultrasonic", "hybrid")),
-        *("screen-spatial", "screen-recorded", "ultrasonic-swiping", "ultrasonic-warming"),
-    ]
 
 
 def test_built_in_fingers_stay_on_the_glass():
@@ -123,20 +112,6 @@ def test_a_scene_file_has_its_stem_for_a_name_and_finds_files_beside_it(tmp_path
     assert Scene.from_toml_text(scene.to_toml()) == scene
 
 
-def test_an_amplitude_may_be_written_as_velocity_or_level():
-    level = GOOD.replace("amplitude = 1e-5", "level = 20\nspeed = 0.08")
-    velocity = GOOD.replace("amplitude = 1e-5", "velocity = 0.01\nspeed = 0.08")
-    assert Scene.from_toml_text(level).texture == Grating(level=20, wavelength=1e-3, speed=0.08)
-    assert Scene.from_toml_text(velocity).texture.amplitude == pytest.approx(0.01 / (2 * np.pi * 80), rel=1e-12)
-
-
-def test_bands_that_no_one_feels_are_left_out_unless_the_scene_says_so():
-    assert not Scene.from_toml_text(GOOD).keep_unfelt
-    assert Scene.from_toml_text(GOOD + "keep_unfelt = true\n").keep_unfelt
-    kept = [name for name, scene in builtin_scenes().items() if scene.keep_unfelt]
-    assert kept == ["pressing"]
-
-
 def test_the_real_finger_survives_toml(shared_data):
     file = shared_data / "swipe_40mm_s.npz"
     scene = Scene(texture=TONE, finger=Finger.recorded(file, start=4.0, mechanics="auto"), duration=3.0)
@@ -159,7 +134,7 @@ class Own:
 def test_a_texture_of_ones_own_is_described_but_not_played_again():
     again = Scene.from_toml_text(Scene(texture=Own(), duration=1.0).to_toml())
     assert again.texture.description == "Own (3)"
-    with pytest.raises(SceneError, match=r"description = 'Own \(3\)': a texture made in Python cannot be played"):
+    with pytest.raises(SceneError, match=r"description = 'Own \(3\)': what was made in Python cannot be played"):
         again.texture.bands(5000.0)
 
 
@@ -181,100 +156,41 @@ def test_a_texture_over_position_needs_a_finger(texture):
     assert Scene(texture=texture, finger=Finger.still(), duration=1.0).texture.spatial
 
 
-def test_numbers_of_numpy_are_numbers():
-    texture = Grating(amplitude=np.float64(1e-6), frequency=np.float32(20), shape="square", harmonics=np.int64(3))
-    profile = {"current_bits": np.int64(14), "sensor_noise": np.float64(0), "on": np.bool_(True)}
-    scene = Scene(texture=texture, duration=np.int32(2), profile=profile)
-    assert [type(value) for value in scene.profile.values()] == [int, float, bool]
-    assert Scene.from_toml_text(scene.to_toml()) == scene
-    assert Synthetic(amplitude=1e-6, seed=np.uint8(3)) == Synthetic(amplitude=1e-6, seed=3)
+REFUSED = [  # text of GOOD, what stands there instead, message
+    ("duration = 2.0", "", r"duration is missing: must be a finite number > 0 and <= 360000 s"),
+    ("duration = 2.0", "duration = -1.0", r"duration = -1.0: must be .* > 0 .* s"),
+    ("duration = 2.0", "duration = inf", r"duration = inf: must be a finite number"),
+    ("duration = 2.0", 'duration = "2 s"', r"duration = '2 s': must be a finite number .* s"),
+    ("duration = 2.0", "duration = 0x" + "f" * 6000, r"duration = an integer beyond 1e30: must be"),
+    ("duration = 2.0", "duration = " + "9" * 6000, r"must be TOML"),
+    ("duration = 2.0", "duration = 2.0\nlength = 1", r"length = 1: unknown key; known: name, duration, texture"),
+    ("duration = 2.0", 'duration = 2.0\nname = "../up"', r"name = '../up': must be 1 to 100 printable"),
+    ("duration = 2.0", 'duration = 2.0\n"\\n" = 1', r"'\\n' = 1: unknown key"),
+    ('kind = "grating"', 'kind = "gratin"', r"texture.kind = 'gratin': must be one of grating"),
+    ("amplitude = 1e-5", "", r"texture.amplitude, velocity, level: exactly one must be given; none is"),
+    ("amplitude = 1e-5", "level = 20", r"texture.speed is missing: must be .* m/s"),
+    ("wavelength = 1e-3", "wavelenght = 1e-3", r"texture.wavelenght = 0.001: unknown key; known: kind, amplitude"),
+    ("wavelength = 1e-3", "wavelength = 1e-3\npartials = [{order = 1}]", r"texture.partials\[0\].amplitude is miss"),
+    ("speed = 0.08", "speed = 80", r"finger.speed = 80: must be .* <= 10 m/s"),
+    ('motion = "sliding"\nspeed = 0.08', 'motion = "none"', r"finger.motion = 'none': a texture over position needs"),
+    ("normal_load = 0.4", "touches = [[1.0, 0.5]]", r"finger.touches\[0\] = \[1.0, 0.5\]: must be pairs .* s"),
+    ("normal_load = 0.4", "mechanics = {order = 2, mas = 1}", r"finger.mechanics.mas: no such parameter"),
+    ("mass = 0.035", "mass = nan", r"profile.mass = nan: must be a finite number"),
+    ("seed = 3", "seed = -1", r"seed = -1: must be an integer >= 0"),
+    ("tolerance = 0.05", "keep_unfelt = 1", r"keep_unfelt = 1: must be true or false"),
+    ("[device]", "[plant]", r"plant: is three tables now: .*\[device\].*\[simulation\].*\[render\]"),
+    ("duration = 2.0", "duration = 2.0\ntolerance = 0.1", r"tolerance = 0.1: must stand in the table \[render\]"),
+    (GOOD, 'duration = 1.0\ndevice = "vt-plate"', r"device = 'vt-plate': must be a table now: \[device\] with kind ="),
+]
 
 
-REFUSED = {
-    "duration": [
-        ("duration = 2.0", "", r"duration is missing: must be a finite number > 0 and <= 360000 s"),
-        ("duration = 2.0", "duration = 0", r"duration = 0: must be .* > 0 .* s"),
-        ("duration = 2.0", "duration = -1.0", r"duration = -1.0: must be .* > 0 .* s"),
-        ("duration = 2.0", "duration = inf", r"duration = inf: must be a finite number"),
-        ("duration = 2.0", "duration = 1e9", r"duration = 1000000000.0: must be .* <= 360000 s"),
-        ("duration = 2.0", 'duration = "2 s"', r"duration = '2 s': must be a finite number .* s"),
-        ("duration = 2.0", "duration = true", r"duration = True: must be a finite number .* s"),
-        ("duration = 2.0", "duration = 1979-05-27", r"duration = datetime.date\(1979, 5, 27\): must be"),
-        ("duration = 2.0", "duration = 0x" + "f" * 6000, r"duration = an integer beyond 1e30: must be"),
-        ("duration = 2.0", "duration = " + "9" * 6000, r"must be TOML"),
-        ("duration = 2.0", "duration = 2.0\nlength = 1", r"length = 1: unknown key; known: name, duration, texture"),
-        ("duration = 2.0", 'duration = 2.0\nname = "../up"', r"name = '../up': must be 1 to 100 printable"),
-        ("duration = 2.0", 'duration = 2.0\n"\\n" = 1', r"'\\n' = 1: unknown key"),
-    ],
-    "texture": [
-        ("[texture]", "[texture_]", r"texture_ = .*: unknown key"),
-        ('kind = "grating"', "", r"texture.kind is missing: must be one of grating, recorded, swipe"),
-        ('kind = "grating"', 'kind = "gratin"', r"texture.kind = 'gratin': must be one of grating"),
-        ('kind = "grating"', "kind = [1]", r"texture.kind = \[1\]: must be one of grating"),
-        ("amplitude = 1e-5", "", r"texture.amplitude, velocity, level: exactly one must be given; none is"),
-        ("amplitude = 1e-5", "level = 20", r"texture.speed is missing: must be .* m/s"),
-        ("amplitude = 1e-5", "velocity = 0\nspeed = 0.1", r"texture.velocity = 0: must be .* m/s"),
-        ("amplitude = 1e-5", "amplitude = 10", r"texture.amplitude = 10: must be .* > 0 and <= 0.01 m"),
-        ("wavelength = 1e-3", "wavelength = 0.0", r"texture.wavelength = 0.0: must be .* m"),
-        ("wavelength = 1e-3", "wavelenght = 1e-3", r"texture.wavelenght = 0.001: unknown key; known: kind, amplitude"),
-        ("wavelength = 1e-3", "wavelength = 1e-3\nfrequency = 20", r"texture.frequency, wavelength: exactly one"),
-        (
-            "wavelength = 1e-3",
-            "wavelength = 1e-3\npartials = [{order = 1}]",
-            r"texture.partials\[0\].amplitude is miss",
-        ),
-    ],
-    "finger": [
-        ('motion = "sliding"', "", r"finger.motion is missing: must be one of none, still"),
-        ("speed = 0.08", "", r"finger.speed is missing: must be .* m/s"),
-        ("speed = 0.08", "speed = -0.08", r"finger.speed = -0.08: must be .* > 0 .* m/s"),
-        ("speed = 0.08", "speed = 80", r"finger.speed = 80: must be .* <= 10 m/s"),
-        ("speed = 0.08", "speed = 0.08\nfrequency = 3", r"finger.frequency = 3: unknown key; known: motion, speed"),
-        (
-            'motion = "sliding"\nspeed = 0.08',
-            'motion = "none"',
-            r"finger.motion = 'none': a texture over position needs",
-        ),
-        ("normal_load = 0.4", "normal_load = -0.4", r"finger.normal_load = -0.4: must be .* >= 0 and <= 20 N"),
-        ("normal_load = 0.4", "touches = [[1.0, 0.5]]", r"finger.touches\[0\] = \[1.0, 0.5\]: must be pairs .* s"),
-        ("normal_load = 0.4", "mechanics = {order = 2, mas = 1}", r"finger.mechanics.'mas': unknown key"),
-        ("normal_load = 0.4", "mechanics = {order = 2, mass = 4}", r"finger.mechanics.mass = 4: must be .* kg"),
-    ],
-    "device, simulation, render": [
-        ("mass = 0.035", "mass = nan", r"profile.mass = nan: must be a finite number"),
-        ("sensor_noise = 0.0", "sensor_noise = [1]", r"simulation.sensor_noise = \[1\]: must be a finite number"),
-        ("seed = 3", "seed = -1", r"seed = -1: must be an integer >= 0"),
-        ("tolerance = 0.05", "tolerance = nan", r"tolerance = nan: must be a finite number > 0"),
-        ("tolerance = 0.05", "settle = -1", r"settle = -1: must be .* >= 0 .* s"),
-        ("tolerance = 0.05", "keep_unfelt = 1", r"keep_unfelt = 1: must be true or false"),
-    ],
-    "keys of old": [
-        ("[device]", "[plant]", r"plant: is three tables now: .*\[device\].*\[simulation\].*\[render\]"),
-        ("duration = 2.0", "duration = 2.0\ntolerance = 0.1", r"tolerance = 0.1: must stand in the table \[render\]"),
-        ("duration = 2.0", "duration = 2.0\nseed = 1", r"seed = 1: must stand in the table \[simulation\]"),
-        (
-            GOOD,
-            'duration = 1.0\ndevice = "vt-plate"',
-            r"device = 'vt-plate': must be a table now: \[device\] with kind = 'vt-plate'",
-        ),
-    ],
-}
-CASES = [case for cases in REFUSED.values() for case in cases]
-
-
-@pytest.mark.parametrize(("good", "bad", "message"), CASES, ids=[f"{i}" for i in range(len(CASES))])
+@pytest.mark.parametrize(("good", "bad", "message"), REFUSED, ids=range(len(REFUSED)))
 def test_a_malformed_scene_is_refused_in_one_line(good, bad, message):
     assert good in GOOD
+    assert Scene.from_toml_text(GOOD).finger == Finger.sliding(0.08, normal_load=0.4)
     with pytest.raises(SceneError, match=f"^scene.toml: ({message})") as refused:
         Scene.from_toml_text(GOOD.replace(good, bad), "scene.toml")
     assert len(str(refused.value).splitlines()) == 1
-
-
-def test_the_text_that_the_cases_spoil_is_good():
-    scene = Scene.from_toml_text(GOOD)
-    assert (scene.profile, scene.simulation, scene.rendering) == ({"mass": 0.035}, {"sensor_noise": 0.0}, {})
-    assert (scene.seed, scene.tolerance) == (3, 0.05)
-    assert scene.finger == Finger.sliding(0.08, normal_load=0.4)
 
 
 @pytest.mark.parametrize(
@@ -284,7 +200,6 @@ def test_the_text_that_the_cases_spoil_is_good():
         (b"\xff\xfe\x00", r"byte 0: must be UTF-8 text"),
         (b"", r"texture is missing: must be a table with kind = one of"),
         (b"a = " + b"[" * 5000, r"must be TOML \("),
-        (b'[texture]\nkind = "recorded"\nfile = "none.wav"\namplitude = 1e-6', r"duration is missing"),
         (
             b'duration = 1\n[texture]\nkind = "recorded"\nfile = "none.wav"\namplitude = 1e-6',
             r"texture.file = '.*none.wav': must be an existing sound file",
@@ -304,20 +219,10 @@ def test_a_bad_file_is_refused_in_one_line(tmp_path, content, message):
     assert len(str(refused.value).splitlines()) == 1
 
 
-@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no FIFO on this system")
-def test_a_fifo_is_refused_at_once(tmp_path):
-    os.mkfifo(tmp_path / "pipe")
-    with pytest.raises(SceneError, match="must be a regular file"):
-        Scene.from_toml(tmp_path / "pipe")
-
-
-def test_scenes_of_one_name_are_told_apart_by_number():
-    assert distinct_names(["a", "b", "a"]) == ["a (1)", "b", "a (2)"]
-    assert distinct_names(["a", "a (1)", "a"]) == ["a (2)", "a (1)", "a (3)"]
-
-
-@pytest.mark.parametrize("name", ["absent.toml", ".", "a\0b", "x" * 5000])
-def test_what_is_no_file_is_refused(tmp_path, name):
+@pytest.mark.parametrize("name", ["absent.toml", ".", "a\0b", "x" * 5000, "pipe"])
+def test_what_is_no_file_is_refused_at_once(tmp_path, name):
+    if name == "pipe" and hasattr(os, "mkfifo"):
+        os.mkfifo(tmp_path / "pipe")
     with pytest.raises(SceneError, match=r"must be a (readable|regular) file"):
         Scene.from_toml(f"{tmp_path}/{name}")
 
@@ -386,7 +291,7 @@ def play(scene):
     with np.errstate(under="ignore"):
         try:
             position = scene.finger.position(time)
-            curves = [scene.finger.load(time), scene.finger.strength(time), scene.texture.waveform(time, position)]
+            curves = [*scene.finger.touch(time)[:, 1:].T, scene.texture.waveform(time, position)]
         except SceneError as refused:
             curves = [0.0 if "made in Python" in str(refused) else np.nan]
     assert np.isfinite(curves).all()
@@ -438,14 +343,6 @@ def test_no_nearly_good_scene_is_a_traceback(texture, finger):
 @example('a = "\\uD800"')
 def test_no_random_text_is_a_traceback(text):
     accept_or_refuse(text)
-
-
-@given(st.binary(max_size=60))
-def test_no_random_file_is_a_traceback(tmp_path_factory, content):
-    path = tmp_path_factory.getbasetemp() / "random.toml"
-    path.write_bytes(content)
-    with pytest.raises(SceneError, match=r"random.toml: "):
-        Scene.from_toml(path)
 
 
 @given(st.dictionaries(st.text(st.characters(exclude_categories=["Cs"])), LEAVES | st.lists(LEAVES)))

@@ -1,59 +1,30 @@
-"""Stand-ins for textures and motions made in Python, which a scene file can describe but not hold."""
+"""Stand-in for a texture or motion made in Python, which a scene file can describe but not hold."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar, NoReturn
+from typing import Any, ClassVar
 
-from hapticrender.bands import Bands
+from hapticrender import checks
 from hapticrender.errors import SceneError
-from hapticrender.protocols import Array
 
 LONGEST = 500  # characters
 
 
+def _one_line(key: str, value: Any) -> str:
+    return "".join(filter(str.isprintable, " ".join(str(value).split())))[:LONGEST]
+
+
 @dataclass(frozen=True)
-class _Description:
+class Custom(checks.Validated):
     """One printable line about an object made in Python: keeps recordings readable, refuses to play."""
 
     kind: ClassVar[str] = "custom"
-    what: ClassVar[str]
 
-    description: str
+    description: str = checks.checked(_one_line)
 
-    def __post_init__(self) -> None:
-        text = " ".join(str(self.description).split())
-        object.__setattr__(self, "description", "".join(filter(str.isprintable, text))[:LONGEST])
+    def bands(self, *arguments: Any) -> Any:
+        """Raise a `SceneError`: of the object there is only this line."""
+        raise SceneError(f"description = {self.description!r}: what was made in Python cannot be played from a file")
 
-    def _refuse(self) -> NoReturn:
-        raise SceneError(
-            f"description = {self.description!r}: a {self.what} made in Python cannot be played from its description"
-        )
-
-
-class CustomTexture(_Description):
-    """Description of a texture of the user's own."""
-
-    what = "texture"
-
-    def bands(self, rate: float) -> Bands:
-        """Refuse."""
-        self._refuse()
-
-    def waveform(self, time: Array, position: Array) -> Array:
-        """Refuse."""
-        self._refuse()
-
-
-class CustomMotion(_Description):
-    """Description of a motion of the user's own."""
-
-    what = "motion"
-
-    def position(self, time: Array) -> Array:
-        """Refuse."""
-        self._refuse()
-
-    def load(self, time: Array) -> Array:
-        """Refuse."""
-        self._refuse()
+    waveform = position = load = bands

@@ -1,4 +1,4 @@
-"""The finger: where it is, how hard it presses, when it touches, and what it is made of."""
+"""The finger: trajectory, normal load, touches and mechanics."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from hapticrender import checks
+from hapticrender.checks import Validated, checked
 from hapticrender.protocols import Array, Motion
 from hapticrender.touch.mechanics import NONE, FingerMechanics, read_mechanics
 from hapticrender.touch.motion import LONGEST_TIME, Nowhere, RecordedMotion, Sampled, SineMotion, Still, TriangleMotion
@@ -20,8 +21,32 @@ Touches = tuple[tuple[float, float], ...]
 LoadCurve = tuple[tuple[float, ...], tuple[float, ...]]
 
 
+def _read_touches(key: str, value: Any) -> Touches:
+    bound = "pairs of on < off in s, each after the one before"
+    checks.require(isinstance(value, list | tuple), key, value, bound, TypeError)
+    last, touches = 0.0, []
+    for index, pair in enumerate(value):
+        on, off = checks.numbers(f"{key}[{index}]", pair, "s", least=0, most=LONGEST_TIME, count=2)
+        checks.require(last <= on < off, f"{key}[{index}]", pair, bound)
+        touches.append((on, off))
+        last = off
+    return tuple(touches)
+
+
+def _read_load(value: Any, motion: Motion) -> float | LoadCurve | None:
+    if value is None:
+        known = callable(getattr(motion, "load", None))
+        checks.require(known, "normal_load", None, "a finite number >= 0 and <= 20 N, as this motion records none")
+        return None
+    if not isinstance(value, list | tuple):
+        return checks.number("normal_load", value, "N", least=0, most=MOST_LOAD)
+    checks.require(len(value) == 2, "normal_load", value, "two lists: times in s, loads in N")
+    loads = checks.numbers("normal_load[1]", value[1], "N", least=0, most=MOST_LOAD)
+    return checks.rising("normal_load[0]", value[0], len(loads)), loads
+
+
 @dataclass(frozen=True)
-class Finger:
+class Finger(Validated):
     """A finger on the surface.
 
     Parameters
@@ -49,17 +74,17 @@ class Finger:
 
     motion: Motion
     normal_load: float | LoadCurve | None = 0.0
-    touches: Touches | None = None
+    touches: Touches | None = checked(_read_touches, None)
     mechanics: FingerMechanics = NONE
-    load_scaling: bool = False
+    load_scaling: bool = checked(checks.flag, False)
 
     def __post_init__(self) -> None:
-        if not isinstance(self.motion, Motion):
-            checks.refuse("motion", self.motion, "a motion with position(time)", TypeError)
+        checks.require(
+            isinstance(self.motion, Motion), "motion", self.motion, "a motion with position(time)", TypeError
+        )
         checks.keep(self, normal_load=_read_load(self.normal_load, self.motion))
-        checks.keep(self, touches=None if self.touches is None else _read_touches(self.touches))
-        checks.keep(self, mechanics=read_mechanics(self.mechanics, self._typical_load(self.mechanics)))
-        checks.keep(self, load_scaling=checks.flag("load_scaling", self.load_scaling))
+        super().__post_init__()
+        checks.keep(self, mechanics=read_mechanics(self.mechanics, self._typical_load))
 
     @classmethod
     def absent(cls) -> Finger:
@@ -109,37 +134,33 @@ class Finger:
         """Position (m from the middle of the surface, shape (n,)), NaN while lifted."""
         time = np.asarray(time, float)
         position = np.asarray(self.motion.position(time), float)
-        return position if self.touches is None else np.where(self._in_touch(time), position, np.nan)
+        if self.touches is None:
+            return position
+        inside = np.searchsorted(np.ravel(self.touches), time, side="right") % 2 == 1
+        return np.where(inside, position, np.nan)
 
     def load(self, time: Array) -> Array:
         """Return the normal load (N, shape (n,)), 0 while lifted."""
-        time = np.asarray(time, float)
-        return np.where(np.isfinite(self.position(time)), self._pressed(time), 0.0)
+        return self.touch(time)[:, 1]
 
-    def strength(self, time: Array) -> Array:
-        """Factor on the finger's impedance (shape (n,)): 0 while lifted, 1 nominal, (W/W_ref)**(1/3) with scaling."""
+    def touch(self, time: Array) -> Array:
+        """Position (m), load (N) and factor on the impedance, shape (n, 3); NaN, 0 and 0 while lifted.
+
+        The factor is 1 nominally, (W/W_ref)**(1/3) where it scales with the load.
+        """
         time = np.asarray(time, float)
-        factor = self.mechanics.load_factor(self._pressed(time)) if self.load_scaling else np.ones(time.shape)
-        return np.where(np.isfinite(self.position(time)), factor, 0.0)
+        touch = np.empty((time.size, 3))
+        touch[:, 0] = self.position(time)
+        touch[:, 1] = self._pressed(time)
+        touch[:, 2] = self.mechanics.load_factor(touch[:, 1]) if self.load_scaling else 1.0
+        touch[np.isnan(touch[:, 0]), 1:] = 0.0
+        return touch
 
     @cached_property
     def constant(self) -> bool:
         """Whether position and load are the same at all times."""
         known = type(self) is Finger and type(self.motion) in (Nowhere, Still)
         return known and self.touches is None and isinstance(self.normal_load, float)
-
-    def touch(self, time: Array) -> Array:
-        """Position, load and strength side by side, shape (n, 3), for a plant that wants all three."""
-        time = np.asarray(time, float)
-        touch = np.empty((time.size, 3))
-        touch[:, 0] = self.position(time)
-        touch[:, 1] = self._pressed(time)
-        touch[:, 2] = self.mechanics.load_factor(touch[:, 1]) if self.load_scaling else 1.0
-        away = np.isnan(touch[:, 0])
-        if away.any():
-            for column in (1, 2):
-                np.copyto(touch[:, column], 0.0, where=away)
-        return touch
 
     def _pressed(self, time: Array) -> Array:
         if self.normal_load is None:
@@ -153,60 +174,11 @@ class Finger:
         times, loads = self.normal_load  # type: ignore[misc]
         return np.array(times), np.array(loads)
 
-    @cached_property
-    def _edges(self) -> Array:
-        return np.array(self.touches, float).ravel()
-
-    def _in_touch(self, time: Array) -> Array:
-        if time.size == 0:
-            return np.zeros(time.shape, bool)
-        first, last = np.searchsorted(self._edges, (time.min(), time.max()), side="right")
-        if first == last:  # most stretches of time are within one touch
-            return np.full(time.shape, first % 2 == 1)
-        return np.searchsorted(self._edges, time, side="right") % 2 == 1
-
-    def _typical_load(self, mechanics: Any) -> float:
-        """Mean load (N) while something presses; looked up only where "auto" asks for it."""
-        if not (isinstance(mechanics, str) and mechanics == "auto"):
-            return 0.0
+    def _typical_load(self) -> float:
+        """Mean load (N) while something presses."""
         if self.normal_load is None:
             loads = self.motion.load(np.arange(0.0, 60.0, 0.01))  # type: ignore[attr-defined]
         else:
             loads = np.atleast_1d(self.normal_load[1] if isinstance(self.normal_load, tuple) else self.normal_load)
         pressing = np.asarray(loads)[np.asarray(loads) > 0]
         return float(pressing.mean()) if pressing.size else 0.0
-
-
-def _read_load(value: Any, motion: Motion) -> float | LoadCurve | None:
-    if value is None:
-        if not callable(getattr(motion, "load", None)):
-            checks.refuse("normal_load", None, "a finite number >= 0 and <= 20 N, as this motion records none")
-        return None
-    if not isinstance(value, list | tuple):
-        return checks.number("normal_load", value, "N", least=0, most=MOST_LOAD)
-    if len(value) != 2:
-        checks.refuse("normal_load", value, "two lists: times in s, loads in N")
-    loads = checks.numbers("normal_load[1]", value[1], "N", least=0, most=MOST_LOAD)
-    return checks.rising("normal_load[0]", value[0], len(loads)), loads
-
-
-def _read_touches(value: Any) -> Touches:
-    bound = "pairs of on < off in s, each after the one before"
-    if not isinstance(value, list | tuple):
-        checks.refuse("touches", value, bound, TypeError)
-    last = 0.0
-    touches = []
-    for index, pair in enumerate(value):
-        on, off = _read_pair(f"touches[{index}]", pair)
-        if not last <= on < off:
-            checks.refuse(f"touches[{index}]", pair, bound)
-        touches.append((on, off))
-        last = off
-    return tuple(touches)
-
-
-def _read_pair(key: str, pair: Any) -> tuple[float, float]:
-    pair = checks.numbers(key, pair, "s", least=0, most=LONGEST_TIME, count=2)
-    if len(pair) != 2:
-        checks.refuse(key, pair, "on and off in s")
-    return pair

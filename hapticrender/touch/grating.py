@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
-from typing import Any, ClassVar, cast
+from dataclasses import dataclass
+from typing import Any, ClassVar
 
 import numpy as np
 
 from hapticrender import checks
 from hapticrender.bands import Bands
+from hapticrender.checks import Validated, checked, option, parameter
 from hapticrender.protocols import Array
 from hapticrender.touch import perception
 
@@ -36,22 +37,38 @@ def _triangle(count: int) -> tuple[Partial, ...]:
 SHAPES: dict[str, Callable[[int], tuple[Partial, ...]]] = {"sine": _sine, "square": _square, "triangle": _triangle}
 
 
+def _read_partials(key: str, partials: Any) -> tuple[Partial, ...]:
+    bound = f"1 to {MOST_PARTIALS} entries of order, amplitude, phase"
+    checks.require(isinstance(partials, list | tuple | np.ndarray), key, partials, bound, TypeError)
+    checks.require(1 <= len(partials) <= MOST_PARTIALS, key, partials, bound)
+    return tuple(_read_partial(f"{key}[{index}]", entry) for index, entry in enumerate(partials))
+
+
+def _read_partial(key: str, entry: Any) -> Partial:
+    if isinstance(entry, Mapping):
+        for unknown in set(entry) - {"order", "amplitude", "phase"}:
+            checks.refuse(f"{key}.{checks.plain(unknown)}", entry, "one of the keys order, amplitude, phase")
+        entry = (entry.get("order"), entry.get("amplitude"), entry.get("phase", 0.0))
+    good = isinstance(entry, list | tuple | np.ndarray) and len(entry) == 3
+    checks.require(good, key, entry, "order, amplitude, phase", TypeError)
+    return (
+        checks.number(f"{key}.order", entry[0], "", above=0, most=1e4),
+        checks.number(f"{key}.amplitude", entry[1], "times the grating's", least=-100, most=100),
+        checks.number(f"{key}.phase", entry[2], "rad", least=-1e6, most=1e6),
+    )
+
+
 @dataclass(frozen=True)
-class Grating:
+class Grating(Validated):
     """A periodic texture, ``amplitude * sum_n a_n cos(n p + phase_n)``.
 
-    In time ``p = 2 pi frequency t + phase``; in space ``p = 2 pi x / wavelength
-    + phase`` with x the finger's position, so that the felt frequency follows
-    the finger's speed by itself and a reversal costs nothing.
+    In time ``p = 2 pi frequency t + phase``, in space ``p = 2 pi x / wavelength + phase`` at the finger's position x.
 
     Parameters
     ----------
     amplitude : float, m
         Peak of a sine, height of a square or triangle; > 0 and <= 0.01 m.
-        It may be stated as `velocity` or `level` instead, which become
-        `amplitude` at once: a grating keeps metres only, so that gratings
-        are equal however they were stated, and stay what they are if the
-        threshold is ever measured anew.
+        Stated as `velocity` or `level` instead, it is converted at once: a grating keeps metres only.
     frequency : float, Hz, or None
         Of the fundamental, > 0 and <= 1e6; exactly one of `frequency` and
         `wavelength` is given.
@@ -60,11 +77,9 @@ class Grating:
     shape : {"sine", "square", "triangle"}
         Square and triangle are made of their odd Fourier partials.
     harmonics : int
-        How many partials a square or triangle has, 1 to 4096.  What a device
-        does with those above its range is the renderer's business.
+        Partials of a square or triangle, 1 to 4096.
     partials : sequence of (order, relative amplitude, phase in rad), or None
-        The partials themselves instead of a shape; also mappings with the
-        keys ``order``, ``amplitude``, ``phase``.  Orders need not be whole.
+        Instead of a shape; also mappings with these keys.  Orders need not be whole.
     phase : float, rad
         Of the fundamental at t = 0, x = 0.
     velocity : float, m/s
@@ -93,50 +108,29 @@ class Grating:
 
     kind: ClassVar[str] = "grating"
 
-    amplitude: float = cast(float, None)  # never None once it is made
-    frequency: float | None = None
-    wavelength: float | None = None
-    shape: str = "sine"
-    harmonics: int = 5
-    partials: tuple[Partial, ...] | None = None
-    phase: float = 0.0
-    velocity: float | None = field(default=None, repr=False)
-    level: float | None = field(default=None, repr=False)
-    speed: float | None = field(default=None, repr=False)
+    amplitude: float = parameter(None, "m", above=0, most=MOST_AMPLITUDE)  # never None once it is made
+    frequency: float | None = parameter(None, "Hz", above=0, most=1e6)
+    wavelength: float | None = parameter(None, "m", least=1e-6, most=0.5)
+    shape: str = option("sine", *SHAPES)
+    harmonics: int = parameter(5, least=1, most=MOST_PARTIALS)
+    partials: tuple[Partial, ...] | None = checked(_read_partials, None)
+    phase: float = parameter(0.0, "rad", least=-1e6, most=1e6)
+    velocity: float | None = parameter(None, "m/s", least=1e-9, most=10)
+    level: float | None = parameter(None, "dB", least=-100, most=100)
+    speed: float | None = parameter(None, "m/s", least=1e-6, most=10)
 
     def __post_init__(self) -> None:
-        checks.one_of_two("frequency", self.frequency, "wavelength", self.wavelength)
-        if self.frequency is not None:
-            checks.keep(self, frequency=checks.number("frequency", self.frequency, "Hz", above=0, most=1e6))
-        else:
-            checks.keep(self, wavelength=checks.number("wavelength", self.wavelength, "m", least=1e-6, most=0.5))
-        checks.choice("shape", self.shape, SHAPES)
-        harmonics = checks.integer("harmonics", self.harmonics, least=1, most=MOST_PARTIALS)
-        phase = checks.number("phase", self.phase, "rad", least=-1e6, most=1e6)
-        partials = None if self.partials is None else _read_partials(self.partials)
-        checks.keep(self, harmonics=harmonics, phase=phase, partials=partials)
-        checks.keep(self, amplitude=self._stated_amplitude(), velocity=None, level=None, speed=None)
-
-    def _stated_amplitude(self) -> float:
-        """Amplitude (m), from whichever of amplitude, velocity and level is given."""
-        given = {key: value for key in _WAYS if (value := getattr(self, key)) is not None}
-        if len(given) != 1:
-            said = " and ".join(f"{key} = {checks.show(value)}" for key, value in given.items())
-            raise ValueError(f"{', '.join(_WAYS)}: exactly one must be given; {f'{said} are' if given else 'none is'}")
-        ((key, value),) = given.items()
-        if self.speed is not None and not (self.spatial and key != "amplitude"):
-            checks.refuse("speed", self.speed, "left out but where velocity or level of a grating in space is given")
-        if key == "amplitude":
-            return checks.number("amplitude", value, "m", above=0, most=MOST_AMPLITUDE)
-        unit, least, most = _WAYS[key]
-        number = checks.number(key, value, unit, least=least, most=most)
-        return _in_metres(key, number, self._stated_frequency())
-
-    def _stated_frequency(self) -> float:
-        """Frequency (Hz) of the fundamental, at the stated speed in space."""
-        if self.frequency is not None:
-            return self.frequency
-        return checks.number("speed", self.speed, "m/s", least=1e-6, most=10) / cast(float, self.wavelength)
+        super().__post_init__()
+        checks.exactly_one(frequency=self.frequency, wavelength=self.wavelength)
+        key = checks.exactly_one(amplitude=self.amplitude, velocity=self.velocity, level=self.level)
+        usable = self.spatial and key != "amplitude"
+        bound = "left out but where velocity or level of a grating in space is given"
+        checks.require(usable or self.speed is None, "speed", self.speed, bound)
+        if key != "amplitude":
+            checks.require(not self.spatial or self.speed is not None, "speed", None, "a finite number >= 1e-06 m/s")
+            frequency = self.frequency or self.speed / self.wavelength  # type: ignore[operator]
+            amplitude = _in_metres(key, getattr(self, key), frequency)
+            checks.keep(self, amplitude=amplitude, velocity=None, level=None, speed=None)
 
     @property
     def spatial(self) -> bool:
@@ -158,7 +152,7 @@ class Grating:
         return Bands(frequency=frequency, wavenumber=wavenumber, phase=none.copy(), envelope=envelope)
 
     def waveform(self, time: Array, position: Array) -> Array:
-        """Wanted displacement (m, shape (n,)); a spatial grating is still where `position` (m) is NaN."""
+        """Target displacement (m, shape (n,)); a spatial grating is still where `position` (m) is NaN."""
         if self.frequency is not None:
             turns = np.asarray(time, float) * self.frequency
         else:
@@ -169,44 +163,14 @@ class Grating:
         return np.where(np.isfinite(turns), total, 0.0)
 
 
-# Unit and bounds of the three ways to state an amplitude.
-_WAYS = {"amplitude": ("m", 0.0, MOST_AMPLITUDE), "velocity": ("m/s", 1e-9, 10.0), "level": ("dB", -100.0, 100.0)}
-
-
 def _in_metres(key: str, value: float, frequency: float) -> float:
     """Amplitude (m) of a velocity (m/s) or level (dB) at `frequency` (Hz)."""
-    if key == "level" and not perception.LOWEST <= frequency <= perception.HIGHEST:
-        bound = f"stated at {perception.LOWEST:g} to {perception.HIGHEST:g} Hz, where the threshold is known"
-        checks.refuse(key, value, f"{bound}; it is at {frequency:.4g} Hz")
+    low, high = perception.LOWEST, perception.HIGHEST
+    bound = f"stated at {low:g} to {high:g} Hz, where the threshold is known; it is at {frequency:.4g} Hz"
+    checks.require(key == "velocity" or low <= frequency <= high, key, value, bound)
     convert = perception.from_velocity if key == "velocity" else perception.displacement
     with np.errstate(over="ignore", under="ignore"):
         amplitude = float(convert(value, frequency))
-    if not amplitude <= MOST_AMPLITUDE:
-        checks.refuse(
-            key, value, f"<= {MOST_AMPLITUDE} m as an amplitude; at {frequency:.4g} Hz it is {amplitude:.3g} m"
-        )
+    bound = f"<= {MOST_AMPLITUDE} m as an amplitude; at {frequency:.4g} Hz it is {amplitude:.3g} m"
+    checks.require(amplitude <= MOST_AMPLITUDE, key, value, bound)
     return amplitude
-
-
-def _read_partials(partials: Any) -> tuple[Partial, ...]:
-    bound = f"1 to {MOST_PARTIALS} entries of order, amplitude, phase"
-    if not isinstance(partials, list | tuple | np.ndarray):
-        checks.refuse("partials", partials, bound, TypeError)
-    if not 1 <= len(partials) <= MOST_PARTIALS:
-        checks.refuse("partials", partials, bound)
-    return tuple(_read_partial(f"partials[{index}]", entry) for index, entry in enumerate(partials))
-
-
-def _read_partial(key: str, entry: Any) -> Partial:
-    if isinstance(entry, Mapping):
-        unknown = set(entry) - {"order", "amplitude", "phase"}
-        if unknown:
-            checks.refuse(f"{key}.{min(unknown, key=str)}", entry, "one of the keys order, amplitude, phase")
-        entry = (entry.get("order"), entry.get("amplitude"), entry.get("phase", 0.0))
-    if not isinstance(entry, list | tuple | np.ndarray) or len(entry) != 3:
-        checks.refuse(key, entry, "order, amplitude, phase", TypeError)
-    return (
-        checks.number(f"{key}.order", entry[0], "", above=0, most=1e4),
-        checks.number(f"{key}.amplitude", entry[1], "times the grating's", least=-100, most=100),
-        checks.number(f"{key}.phase", entry[2], "rad", least=-1e6, most=1e6),
-    )

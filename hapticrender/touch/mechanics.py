@@ -1,22 +1,32 @@
-"""What a fingertip's pulp and phalanx do to a surface that moves under it: impedance, and who moves how much."""
+"""Mechanical impedance of a fingertip on a moving surface, and how its skin and phalanx share the motion."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, fields, replace
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from hapticrender import checks
+from hapticrender.checks import Validated, checked, parameter
 from hapticrender.protocols import Array
 
 LIGHT_BELOW = 0.5  # N: Table 1 parts its two columns here
 LIGHT_LOAD, HEAVY_LOAD = 0.3, 0.8  # N: engineering defaults for what "light" and "heavy" were measured at
 
 
+_PARTS = ("mass", "damping", "stiffness", "phalanx_mass", "phalanx_damping", "phalanx_stiffness")
+
+
+def _read_order(key: str, value: Any) -> int:
+    order = checks.integer(key, value, least=0, most=4)
+    checks.require(order in (0, 2, 4), key, order, "0, 2 or 4")
+    return order
+
+
 @dataclass(frozen=True, kw_only=True)
-class FingerMechanics:
+class FingerMechanics(Validated):
     """Lumped mechanics of a finger on a surface.
 
     With s = 2 pi j f and ``Z(m, b, k) = m s + b + k/s``:
@@ -57,30 +67,21 @@ class FingerMechanics:
     [0.545]
     """
 
-    order: int = 0
-    mass: float = 0.0
-    damping: float = 0.0
-    stiffness: float = 0.0
-    phalanx_mass: float = 0.0
-    phalanx_damping: float = 0.0
-    phalanx_stiffness: float = 0.0
-    reference_load: float = LIGHT_BELOW
+    order: int = checked(_read_order, 0)
+    mass: float = parameter(0.0, "kg", most=1.0)
+    damping: float = parameter(0.0, "N s/m", most=1e4)
+    stiffness: float = parameter(0.0, "N/m", most=1e6)
+    phalanx_mass: float = parameter(0.0, "kg", most=1.0)
+    phalanx_damping: float = parameter(0.0, "N s/m", most=1e4)
+    phalanx_stiffness: float = parameter(0.0, "N/m", most=1e6)
+    reference_load: float = parameter(LIGHT_BELOW, "N", above=0, most=20)
 
     def __post_init__(self) -> None:
-        order = checks.integer("order", self.order, least=0, most=4)
-        if order not in (0, 2, 4):
-            checks.refuse("order", order, "0, 2 or 4")
-        checks.keep(self, order=order)
-        for key, (unit, most) in _BOUNDS.items():
-            checks.keep(self, **{key: checks.number(key, getattr(self, key), unit, least=0, most=most)})
-        load = checks.number("reference_load", self.reference_load, "N", above=0, most=20)
-        checks.keep(self, reference_load=load)
-        unused = tuple(_BOUNDS) if order == 0 else tuple(_BOUNDS)[3:] if order == 2 else ()
-        for key in unused:
-            if getattr(self, key) != 0.0:
-                checks.refuse(key, getattr(self, key), f"0 where order = {order}")
-        if order and not any(getattr(self, key) for key in ("mass", "damping", "stiffness")):
-            raise ValueError(f"mass, damping, stiffness = 0: one must be > 0 where order = {order}")
+        super().__post_init__()
+        for key in _PARTS[{0: 0, 2: 3, 4: 6}[self.order] :]:
+            checks.require(getattr(self, key) == 0.0, key, getattr(self, key), f"0 where order = {self.order}")
+        if self.order and not any(getattr(self, key) for key in _PARTS[:3]):
+            raise ValueError(f"mass, damping, stiffness = 0: one must be > 0 where order = {self.order}")
 
     def impedance(self, frequency: Array) -> Array:
         """Z_f = F/V_s (complex, N s/m) at `frequency` (Hz, > 0)."""
@@ -93,7 +94,8 @@ class FingerMechanics:
 
     def skin_velocity_per_force(self, frequency: Array) -> Array:
         """V_s/F (complex, m/(N s)): the surface, and the skin on it, per newton."""
-        self._refuse_none()
+        bound = "2 or 4: a finger without mechanics gives no velocity per force"
+        checks.require(self.order != 0, "order", self.order, bound)
         return 1 / self.impedance(frequency)
 
     def phalanx_velocity_per_force(self, frequency: Array) -> Array:
@@ -113,23 +115,10 @@ class FingerMechanics:
         phalanx = self.phalanx_mass * s + self.phalanx_damping + self.phalanx_stiffness / s
         return phalanx / (phalanx + self._tissue(s))
 
-    def _refuse_none(self) -> None:
-        if self.order == 0:
-            checks.refuse("order", self.order, "2 or 4: a finger without mechanics gives no velocity per force")
-
     def load_factor(self, normal_load: Array) -> Array:
         """(W/W_ref)**(1/3), the growth of |Z_f| with `normal_load` W (N), 0 without load."""
         return np.cbrt(np.maximum(np.asarray(normal_load, float), 0.0) / self.reference_load)
 
-
-_BOUNDS = {
-    "mass": ("kg", 1.0),
-    "damping": ("N s/m", 1e4),
-    "stiffness": ("N/m", 1e6),
-    "phalanx_mass": ("kg", 1.0),
-    "phalanx_damping": ("N s/m", 1e4),
-    "phalanx_stiffness": ("N/m", 1e6),
-}
 
 # Table 1 of the paper: whole finger, and skin with the phalanx at the whole finger's numbers.
 NONE = FingerMechanics()
@@ -140,23 +129,15 @@ HEAVY_SECOND = FingerMechanics(order=2, mass=4e-3, damping=1.5, stiffness=300.0,
 def _laplace(frequency: Array) -> Array:
     """Laplace variable 2 pi j f (rad/s)."""
     frequency = np.asarray(frequency, float)
-    if not (np.isfinite(frequency) & (frequency > 0)).all():
-        checks.refuse("frequency", frequency, "finite numbers > 0 Hz")
+    good = (np.isfinite(frequency) & (frequency > 0)).all()
+    checks.require(bool(good), "frequency", frequency, "finite numbers > 0 Hz")
     return 2j * np.pi * frequency
 
 
-def _fourth(whole: FingerMechanics, skin_mass: float, skin_damping: float, skin_stiffness: float) -> FingerMechanics:
+def _fourth(whole: FingerMechanics, mass: float, damping: float, stiffness: float) -> FingerMechanics:
     """Skin in series with a phalanx that has the numbers of the whole finger."""
-    return replace(
-        whole,
-        order=4,
-        mass=skin_mass,
-        damping=skin_damping,
-        stiffness=skin_stiffness,
-        phalanx_mass=whole.mass,
-        phalanx_damping=whole.damping,
-        phalanx_stiffness=whole.stiffness,
-    )
+    phalanx = {f"phalanx_{key}": getattr(whole, key) for key in _PARTS[:3]}
+    return replace(whole, order=4, mass=mass, damping=damping, stiffness=stiffness, **phalanx)
 
 
 LIGHT = _fourth(LIGHT_SECOND, 2e-4, 1.5, 1e3)
@@ -165,18 +146,14 @@ HEAVY = _fourth(HEAVY_SECOND, 2e-4, 8.0, 8e3)
 NAMED = {"none": NONE, "light": LIGHT, "heavy": HEAVY, "light-2nd-order": LIGHT_SECOND, "heavy-2nd-order": HEAVY_SECOND}
 
 
-def read_mechanics(value: Any, normal_load: float) -> FingerMechanics:
+def read_mechanics(value: Any, normal_load: Callable[[], float]) -> FingerMechanics:
     """Mechanics from a name, a table of numbers, or mechanics; "auto" chooses by `normal_load` (N)."""
     if isinstance(value, FingerMechanics):
         return value
     if isinstance(value, Mapping):
-        known = [field.name for field in fields(FingerMechanics)]
-        for key in value:
-            if key not in known:
-                raise ValueError(f"mechanics.{checks.show(key)}: unknown key; known: {', '.join(known)}")
         with checks.inside("mechanics"):
-            return FingerMechanics(**value)
+            return FingerMechanics.with_overrides(value)
     checks.choice("mechanics", value, ("auto", *NAMED))
     if value == "auto":
-        return LIGHT if normal_load < LIGHT_BELOW else HEAVY
+        return LIGHT if normal_load() < LIGHT_BELOW else HEAVY
     return NAMED[value]

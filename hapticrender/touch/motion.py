@@ -1,4 +1,4 @@
-"""Where the finger is: a pure function of time."""
+"""Finger trajectories: position as a pure function of time."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from typing import ClassVar
 import numpy as np
 
 from hapticrender import checks
+from hapticrender.checks import Validated, checked, parameter
 from hapticrender.protocols import Array
-from hapticrender.touch.tribometer import SwipeRecording, load_swipe
+from hapticrender.touch.tribometer import MOST_SPEED, SwipeRecording, load_swipe
 
 FARTHEST = 1.0  # m from the middle; each renderer checks its own surface
-MOST_SPEED = 10.0  # m/s
 LONGEST_TIME = 360_000.0  # s: 100 h
 
 
@@ -29,21 +29,12 @@ class Nowhere:
 
 
 @dataclass(frozen=True)
-class Still:
-    """A finger that rests.
-
-    Parameters
-    ----------
-    at : float, m
-        From the middle of the surface.
-    """
+class Still(Validated):
+    """A finger that rests `at` a position (m from the middle of the surface)."""
 
     kind: ClassVar[str] = "still"
 
-    at: float = 0.0
-
-    def __post_init__(self) -> None:
-        checks.keep(self, at=checks.number("at", self.at, "m", least=-FARTHEST, most=FARTHEST))
+    at: float = parameter(0.0, "m", least=-FARTHEST, most=FARTHEST)
 
     def position(self, time: Array) -> Array:
         """Position (m, shape (n,))."""
@@ -51,7 +42,7 @@ class Still:
 
 
 @dataclass(frozen=True)
-class TriangleMotion:
+class TriangleMotion(Validated):
     """Constant speed, back and forth between two ends; starts at the centre, towards the positive end.
 
     Parameters
@@ -59,9 +50,9 @@ class TriangleMotion:
     speed : float, m/s
         > 0 and <= 10.
     span : float, m
-        Between the ends, >= 1e-4 and <= 1; default 0.05.
+        Between the ends, >= 1e-4 and <= 1.
     centre : float, m
-        Between the ends, from the middle of the surface.
+        Of the span, from the middle of the surface.
 
     Examples
     --------
@@ -71,15 +62,9 @@ class TriangleMotion:
 
     kind: ClassVar[str] = "sliding"
 
-    speed: float
-    span: float = 0.05
-    centre: float = 0.0
-
-    def __post_init__(self) -> None:
-        speed = checks.number("speed", self.speed, "m/s", above=0, most=MOST_SPEED)
-        span = checks.number("span", self.span, "m", least=1e-4, most=FARTHEST)
-        centre = checks.number("centre", self.centre, "m", least=-FARTHEST, most=FARTHEST)
-        checks.keep(self, speed=speed, span=span, centre=centre)
+    speed: float = parameter(unit="m/s", above=0, most=MOST_SPEED)
+    span: float = parameter(0.05, "m", least=1e-4, most=FARTHEST)
+    centre: float = parameter(0.0, "m", least=-FARTHEST, most=FARTHEST)
 
     def position(self, time: Array) -> Array:
         """Position (m, shape (n,)): a triangle wave."""
@@ -89,13 +74,13 @@ class TriangleMotion:
 
 
 @dataclass(frozen=True)
-class SineMotion:
+class SineMotion(Validated):
     """Sinusoidal swipes, ``centre + stroke/2 sin(2 pi frequency t)``.
 
     Parameters
     ----------
     frequency : float, Hz
-        Of whole back-and-forth swipes, > 0 and <= 100.
+        Of whole back-and-forth swipes, >= 1e-3 and <= 100.
     speed : float, m/s, or None
         Peak speed, ``pi frequency stroke``; exactly one of `speed` and `stroke`.
     stroke : float, m, or None
@@ -106,32 +91,24 @@ class SineMotion:
 
     kind: ClassVar[str] = "swiping"
 
-    frequency: float
-    speed: float | None = None
-    stroke: float | None = None
-    centre: float = 0.0
+    frequency: float = parameter(unit="Hz", least=1e-3, most=100)
+    speed: float | None = parameter(None, "m/s", above=0, most=MOST_SPEED)
+    stroke: float | None = parameter(None, "m", above=0, most=FARTHEST)
+    centre: float = parameter(0.0, "m", least=-FARTHEST, most=FARTHEST)
 
     def __post_init__(self) -> None:
-        checks.keep(self, frequency=checks.number("frequency", self.frequency, "Hz", least=1e-3, most=100))
-        checks.one_of_two("speed", self.speed, "stroke", self.stroke)
-        if self.speed is not None:
-            checks.keep(self, speed=checks.number("speed", self.speed, "m/s", above=0, most=MOST_SPEED))
-        else:
-            checks.keep(self, stroke=checks.number("stroke", self.stroke, "m", above=0, most=FARTHEST))
-        checks.keep(self, centre=checks.number("centre", self.centre, "m", least=-FARTHEST, most=FARTHEST))
-
-    @property
-    def _stroke(self) -> float:
-        return self.stroke if self.speed is None else self.speed / (np.pi * self.frequency)  # type: ignore[return-value]
+        super().__post_init__()
+        checks.exactly_one(speed=self.speed, stroke=self.stroke)
 
     def position(self, time: Array) -> Array:
         """Position (m, shape (n,))."""
+        stroke = self.stroke if self.speed is None else self.speed / (np.pi * self.frequency)
         turns = np.mod(np.asarray(time, float) * self.frequency, 1.0)
-        return self.centre + self._stroke / 2 * np.sin(2 * np.pi * turns)
+        return self.centre + stroke / 2 * np.sin(2 * np.pi * turns)  # type: ignore[operator]
 
 
 @dataclass(frozen=True)
-class Sampled:
+class Sampled(Validated):
     """Positions measured or made elsewhere, joined by straight lines and held at both ends.
 
     Parameters
@@ -151,18 +128,15 @@ class Sampled:
 
     kind: ClassVar[str] = "sampled"
 
-    positions: tuple[float, ...]
-    rate: float | None = None
+    positions: tuple[float, ...] = checked(checks.numbers, unit="m", least=-FARTHEST, most=FARTHEST)
+    rate: float | None = parameter(None, "Hz", least=1e-3, most=1e7)
     times: tuple[float, ...] | None = None
 
     def __post_init__(self) -> None:
-        positions = checks.numbers("positions", self.positions, "m", least=-FARTHEST, most=FARTHEST)
-        checks.keep(self, positions=positions)
-        checks.one_of_two("rate", self.rate, "times", self.times)
-        if self.rate is not None:
-            checks.keep(self, rate=checks.number("rate", self.rate, "Hz", least=1e-3, most=1e7))
-        else:
-            checks.keep(self, times=checks.rising("times", self.times, len(positions)))
+        super().__post_init__()
+        checks.exactly_one(rate=self.rate, times=self.times)
+        if self.times is not None:
+            checks.keep(self, times=checks.rising("times", self.times, len(self.positions)))
 
     @cached_property
     def _curve(self) -> tuple[Array, Array]:
@@ -176,7 +150,7 @@ class Sampled:
 
 
 @dataclass(frozen=True)
-class RecordedMotion:
+class RecordedMotion(Validated):
     """A finger recorded by a tribometer: unwrapped encoder, NaN while lifted, with its normal load.
 
     Parameters
@@ -189,39 +163,31 @@ class RecordedMotion:
 
     kind: ClassVar[str] = "recorded"
 
-    file: str
-    start: float = 0.0
-
-    def __post_init__(self) -> None:
-        checks.keep(self, file=checks.file_name("file", self.file))
-        checks.keep(self, start=checks.number("start", self.start, "s", least=0, most=LONGEST_TIME))
+    file: str = checked(checks.file_name)
+    start: float = parameter(0.0, "s", most=LONGEST_TIME)
 
     @property
     def recording(self) -> SwipeRecording:
-        """What was recorded; read at the first use."""
+        """The recording; read at the first use."""
         return load_swipe(self.file)
 
     def check(self) -> None:
         """Read the file, so that a bad one is refused before anything plays."""
-        if self.start > self.recording.duration:
-            checks.refuse("start", self.start, f"<= {self.recording.duration:g} s, the end of the recording")
+        end = self.recording.duration
+        checks.require(self.start <= end, "start", self.start, f"<= {end:g} s, the end of the recording")
 
     def position(self, time: Array) -> Array:
         """Position (m, shape (n,)), NaN while lifted and outside the recording."""
-        return np.where(self._touching(time), self._at(time, self.recording.position), np.nan)
+        return self._at(time, self.recording.position, np.nan)
 
     def load(self, time: Array) -> Array:
         """Return the normal load (N, shape (n,)), 0 while lifted."""
-        return np.where(self._touching(time), self._at(time, self.recording.normal_load), 0.0)
+        return self._at(time, self.recording.normal_load, 0.0)
 
-    def _place(self, time: Array) -> Array:
-        return (np.asarray(time, float) + self.start) * self.recording.rate
-
-    def _at(self, time: Array, curve: Array) -> Array:
-        return np.interp(self._place(time), np.arange(curve.size), curve)
-
-    def _touching(self, time: Array) -> Array:
-        touching = self.recording.touching
-        nearest = np.rint(self._place(time)).astype(np.int64)
+    def _at(self, time: Array, curve: Array, lifted: float) -> Array:
+        """Values of a curve of the recording, `lifted` where the nearest sample does not touch."""
+        sample, touching = (np.asarray(time, float) + self.start) * self.recording.rate, self.recording.touching
+        nearest = np.rint(sample).astype(np.int64)
         inside = (nearest >= 0) & (nearest < touching.size)
-        return inside & touching[np.clip(nearest, 0, touching.size - 1)]
+        touched = inside & touching[np.clip(nearest, 0, touching.size - 1)]
+        return np.where(touched, np.interp(sample, np.arange(curve.size), curve), lifted)

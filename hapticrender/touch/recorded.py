@@ -13,6 +13,7 @@ import numpy as np
 
 from hapticrender import checks
 from hapticrender.bands import Bands
+from hapticrender.checks import Validated, checked, parameter
 from hapticrender.errors import SceneError
 from hapticrender.protocols import Array
 from hapticrender.touch.grating import MOST_AMPLITUDE
@@ -34,31 +35,39 @@ GRID = 10e-6  # m: cells of a force profile; a wavelength of 0.1 mm loses 1.6 % 
 Passband = tuple[float, float]
 
 
+def _read_passband(key: str, value: Any) -> Passband:
+    low, high = checks.numbers(key, value, "Hz", least=1.0, most=1e5, count=2)
+    checks.require(low < high, key, value, "two rising frequencies in Hz")
+    return low, high
+
+
+def _carriers(frequency: Array, speed: float | None, rate: float) -> Bands:
+    """Bands whose envelopes are to be analysed: over position, or over time below rate/2."""
+    if speed is None:
+        frequency = frequency[frequency < rate / 2]
+    none = np.zeros(frequency.size)
+    if speed is None:
+        return Bands(frequency=frequency, wavenumber=none, phase=none.copy())
+    return Bands(frequency=none, wavenumber=frequency / speed, phase=none.copy())
+
+
 @dataclass(frozen=True, kw_only=True)
-class _Playback:
+class _Playback(Validated):
     """What every recording shares: scale, carriers, and how it is read.
 
-    Its profile lives in recorded seconds; a spatial one is read at (position - start) / speed.
+    Its profile is over recorded seconds; a spatial one is read at (position - start) / speed.
     """
 
-    amplitude: float | None = None
-    gain: float | None = None
-    carriers: int = 8
-    spacing: float = 40.0
-    passband: Passband = (20.0, 400.0)
+    amplitude: float | None = parameter(None, "m", above=0, most=MOST_AMPLITUDE)
+    gain: float | None = parameter(None, "m per unit of the file", above=0, most=1e3)
+    carriers: int = parameter(8, least=1, most=MOST_CARRIERS)
+    spacing: float = parameter(40.0, "Hz", least=0.1, most=1e5)
+    passband: Passband = checked(_read_passband, (20.0, 400.0))
+    file: str = checked(checks.file_name)
 
     def __post_init__(self) -> None:
-        checks.one_of_two("amplitude", self.amplitude, "gain", self.gain)
-        if self.amplitude is not None:
-            checks.keep(self, amplitude=checks.number("amplitude", self.amplitude, "m", above=0, most=MOST_AMPLITUDE))
-        else:
-            checks.keep(self, gain=checks.number("gain", self.gain, "m per unit of the file", above=0, most=1e3))
-        checks.keep(self, carriers=checks.integer("carriers", self.carriers, least=1, most=MOST_CARRIERS))
-        checks.keep(self, spacing=checks.number("spacing", self.spacing, "Hz", least=0.1, most=1e5))
-        passband = checks.numbers("passband", self.passband, "Hz", least=1.0, most=1e5, count=2)
-        if len(passband) != 2 or not passband[0] < passband[1]:
-            checks.refuse("passband", self.passband, "two rising frequencies in Hz")
-        checks.keep(self, passband=passband)
+        super().__post_init__()
+        checks.exactly_one(amplitude=self.amplitude, gain=self.gain)
 
     @cached_property
     def profile(self) -> Profile:
@@ -75,27 +84,24 @@ class _Playback:
                 f"be <= {MOST_POINTS}; shorten the recording or lower the passband"
             )
         profile = Profile.band_limited(values, step, low, high)
-        return Profile(profile.values * self._scale(np.abs(profile.values).max(), np.abs(values).max()), profile.step)
-
-    def _scale(self, peak: float, whole: float) -> float:
-        """Metres per unit of the file, given the peak inside the passband and that of the whole recording."""
+        peak = float(np.abs(profile.values).max())
         if self.amplitude is None:
             scale = float(self.gain or 0.0)
+            bound = f"m per unit of the file makes a peak of {scale * peak:.3g} m: must be <= {MOST_AMPLITUDE} m"
             if scale * peak > MOST_AMPLITUDE:
-                raise SceneError(
-                    f"gain = {scale:g} m per unit of the file makes a peak of {scale * peak:.3g} m: "
-                    f"must be <= {MOST_AMPLITUDE} m"
-                )
-            return scale
-        if peak <= 1e-9 * max(whole, 1e-300):
-            low, high = self.passband
+                raise SceneError(f"gain = {scale:g} {bound}")
+        elif peak <= 1e-9 * max(np.abs(values).max(), 1e-300):
             raise SceneError(f"amplitude = {self.amplitude} m: nothing to scale between {low:g} and {high:g} Hz")
-        return self.amplitude / float(peak)
+        else:
+            scale = self.amplitude / peak
+        return Profile(profile.values * scale, profile.step)
 
     def _recorded(self) -> tuple[Array, float]:
+        """Values of the file, and their step (s)."""
         raise NotImplementedError
 
     def _speed(self) -> float | None:
+        """Speed (m/s) at which the finger recorded it; None: it is played in time."""
         raise NotImplementedError
 
     def _start(self) -> float:
@@ -108,22 +114,16 @@ class _Playback:
         return self._speed() is not None
 
     def check(self) -> None:
-        """Read what has to be read, so that a bad file is refused before anything plays."""
+        """Read the file, so that a bad one is refused before anything plays."""
         self.bands(rate=np.inf)
 
     def bands(self, rate: float) -> Bands:
         """Carriers at the strongest peaks of the spectrum below rate/2 (`rate` in Hz); envelopes are to be analysed."""
-        found = strongest_carriers(
-            self.profile.values,
-            1 / self.profile.step,
-            count=self.carriers,
-            spacing=self.spacing,
-            passband=self.passband,
-        )
-        return _carriers(found, self._speed(), rate)
+        profile, chosen = self.profile, {"count": self.carriers, "spacing": self.spacing, "passband": self.passband}
+        return _carriers(strongest_carriers(profile.values, 1 / profile.step, **chosen), self._speed(), rate)  # type: ignore[arg-type]
 
     def waveform(self, time: Array, position: Array) -> Array:
-        """Wanted displacement (m, shape (n,)); a spatial recording is still where `position` (m) is NaN."""
+        """Target displacement (m, shape (n,)); a spatial recording is still where `position` (m) is NaN."""
         speed = self._speed()
         if speed is None:
             return self.profile.at(time)
@@ -132,36 +132,19 @@ class _Playback:
         return np.where(touching, self.profile.at(recorded), 0.0)
 
 
-def _carriers(frequency: Array, speed: float | None, rate: float) -> Bands:
-    none = np.zeros(frequency.size)
-    if speed is None:
-        frequency = frequency[frequency < rate / 2]
-        none = none[: frequency.size]
-        return Bands(frequency=frequency, wavenumber=none, phase=none.copy())
-    return Bands(frequency=none, wavenumber=frequency / speed, phase=none.copy())
-
-
-def _speed_or_time(speed: object) -> float | None:
-    return None if speed is None else checks.number("speed", speed, "m/s", above=1e-6, most=MOST_SPEED)
-
-
 @dataclass(frozen=True, kw_only=True)
 class Recorded(_Playback):
-    """A sound file as a texture, in time or in space.
-
-    The part inside `passband` is played; beyond its ends the recording runs
-    back and forth (reflection), so that it never jumps.
+    """A sound file as a texture, in time or in space; beyond its ends it runs back and forth (reflection).
 
     Parameters
     ----------
     file : str or Path
         Whatever soundfile reads: WAV, FLAC, W64, ...; at most 2**24 frames.
     amplitude : float, m, or None
-        Wanted peak; > 0 and <= 0.01.  Exactly one of `amplitude` and `gain`.
+        Target peak; > 0 and <= 0.01.  Exactly one of `amplitude` and `gain`.
     gain : float, m per full scale of the file, or None
-        Displacement that full scale stands for, > 0; the peak that it makes
-        must be <= 0.01 m.  The gain that plays a recording exactly is often
-        felt too weak: about 3 times as much suits fine textures, 5 times coarse ones.
+        > 0; the peak that it makes must be <= 0.01 m.  The gain that plays a recording exactly often feels too weak:
+        about 3 times as much suits fine textures, 5 times coarse ones.
     channel : int
         Counted from 0.
     speed : float, m/s, or None
@@ -170,9 +153,9 @@ class Recorded(_Playback):
     carriers : int
         How many of the strongest peaks of its spectrum are followed, 1 to 512.
     spacing : float, Hz
-        Least distance of the carriers (at the recorded speed), default 40.
+        Least distance of the carriers (at the recorded speed).
     passband : (float, float), Hz
-        Kept range (at the recorded speed), default (20, 400).
+        What is played of it (at the recorded speed).
 
     Examples
     --------
@@ -183,14 +166,8 @@ class Recorded(_Playback):
 
     kind: ClassVar[str] = "recorded"
 
-    file: str
-    channel: int = 0
-    speed: float | None = None
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        checks.keep(self, file=checks.file_name("file", self.file), speed=_speed_or_time(self.speed))
-        checks.keep(self, channel=checks.integer("channel", self.channel, least=0, most=1023))
+    channel: int = parameter(0, least=0, most=1023)
+    speed: float | None = parameter(None, "m/s", above=1e-6, most=MOST_SPEED)
 
     def _speed(self) -> float | None:
         return self.speed
@@ -209,26 +186,19 @@ def _read_sound(file: str, channel: int) -> tuple[Array, float]:
     try:
         with soundfile.SoundFile(file) as sound:
             _check_sound(name, sound, file, channel)
-            blocks = list(_channel(sound, channel))
-            held, promised = min(
-                [(sum(map(len, blocks)), sound.frames), *_sizes(sound.extra_info)], key=lambda pair: pair[0] / pair[1]
-            )
+            values = np.concatenate([*_channel(sound, channel), np.zeros(0)])
+            lengths = [(values.size, sound.frames), *_sizes(sound.extra_info)]
             rate = sound.samplerate
-            if held < WHOLE * promised:
-                raise SceneError(
-                    f"{name}: ends after {100 * held / promised:.3g} % of what its header says: must be whole"
-                )
+    except SceneError:
+        raise
     except (soundfile.SoundFileError, OSError, ValueError, TypeError) as problem:
-        if isinstance(problem, SceneError):
-            raise
         raise SceneError(f"{name}: must be a readable sound file ({checks.show(str(problem))})") from problem
-    values = np.concatenate([*blocks, np.zeros(0)])
-    bad = np.flatnonzero(~(np.abs(values) <= LOUDEST))  # NaN included
-    if bad.size:
-        raise SceneError(
-            f"{name}: sample {bad[0]} of channel {channel} = {values[bad[0]]}: "
-            f"must be a finite number within {LOUDEST:g} times full scale"
-        )
+    share = min(held / promised for held, promised in lengths)
+    if share < WHOLE:
+        raise SceneError(f"{name}: ends after {100 * share:.3g} % of what its header says: must be whole")
+    for bad in np.flatnonzero(~(np.abs(values) <= LOUDEST))[:1]:  # NaN included
+        bound = f"must be a finite number within {LOUDEST:g} times full scale"
+        raise SceneError(f"{name}: sample {bad} of channel {channel} = {values[bad]}: {bound}")
     if values.size < 2:
         raise SceneError(f"{name}: has {values.size} readable samples: must be >= 2 samples")
     return values, 1 / rate
@@ -236,23 +206,22 @@ def _read_sound(file: str, channel: int) -> tuple[Array, float]:
 
 def _check_sound(name: str, sound: Any, file: str, channel: int) -> None:
     """Refuse by its header a file that is too long or too fast, before anything is read."""
-    if not 2 <= sound.frames <= MOST_FRAMES:
-        raise SceneError(f"{name}: has {sound.frames} samples: must be >= 2 and <= {MOST_FRAMES} samples")
-    if sound.frames * sound.channels > MOST_SAMPLES:
-        total = f"{sound.frames} samples in each of {sound.channels} channels"
+    frames, channels = sound.frames, sound.channels
+    if not 2 <= frames <= MOST_FRAMES:
+        raise SceneError(f"{name}: has {frames} samples: must be >= 2 and <= {MOST_FRAMES} samples")
+    if frames * channels > MOST_SAMPLES:
+        total = f"{frames} samples in each of {channels} channels"
         raise SceneError(f"{name}: has {total}: must be <= {MOST_SAMPLES} samples together")
     if not 1 <= sound.samplerate <= MOST_RATE:
         raise SceneError(f"{name}: has a rate of {sound.samplerate} Hz: must be >= 1 and <= {MOST_RATE:g} Hz")
-    if channel >= sound.channels:
-        raise SceneError(f"channel = {channel}: must be < {sound.channels}, the channels of {checks.show(file)}")
+    if channel >= channels:
+        raise SceneError(f"channel = {channel}: must be < {channels}, the channels of {checks.show(file)}")
 
 
 def _channel(sound: Any, channel: int) -> Iterator[Array]:
     """Blocks of one channel, until the file ends."""
-    block = sound.read(BLOCK, dtype="float64", always_2d=True)
-    while len(block):
+    while len(block := sound.read(BLOCK, dtype="float64", always_2d=True)):
         yield block[:, channel].copy()
-        block = sound.read(BLOCK, dtype="float64", always_2d=True)
 
 
 def _sizes(log: str) -> list[tuple[int, int]]:
@@ -263,18 +232,16 @@ def _sizes(log: str) -> list[tuple[int, int]]:
 
 @dataclass(frozen=True, kw_only=True)
 class Swipe(_Playback):
-    """The lateral force of a recorded swipe as a texture over position.
+    """The lateral force of a recorded swipe as a texture over position (see ``tribometer.load_swipe``).
 
-    Taken from a tribometer recording (see ``tribometer.load_swipe``): only
-    samples in contact, sliding in the main direction, averaged in cells of 10
-    micrometres; replayed at the finger's position at whatever speed it moves.
+    Only samples in contact, sliding in the main direction, averaged in cells of 10 micrometres.
 
     Parameters
     ----------
     file : str or Path
         ``.npz`` with encoder, metre_per_count, lateral_force, normal_force, rate.
     amplitude : float, m, or None
-        Wanted peak; > 0 and <= 0.01.  Exactly one of `amplitude` and `gain`.
+        Target peak; > 0 and <= 0.01.  Exactly one of `amplitude` and `gain`.
     gain : float, m/N, or None
         > 0; the peak that it makes must be <= 0.01 m.
     carriers, spacing, passband
@@ -282,24 +249,13 @@ class Swipe(_Playback):
     """
 
     kind: ClassVar[str] = "swipe"
-
-    file: str
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        checks.keep(self, file=checks.file_name("file", self.file))
-
-    @property
-    def spatial(self) -> bool:
-        """Always read at the finger's position."""
-        return True
+    spatial: ClassVar[bool] = True  # type: ignore[misc]  # known without reading the file
 
     def _speed(self) -> float:
         speed = load_swipe(self.file).speed
         if speed == 0.0:
-            raise SceneError(
-                f"file = {checks.show(self.file)}: the finger never slides in contact: must be > 0.001 m/s"
-            )
+            name = f"file = {checks.show(self.file)}"
+            raise SceneError(f"{name}: the finger never slides in contact: must be > 0.001 m/s")
         return speed
 
     def _start(self) -> float:
@@ -313,9 +269,13 @@ class Swipe(_Playback):
         return values, GRID / speed
 
 
+DEPTH = 0.5  # of the slow modulation
+LEAST_GAP = 40.0  # Hz
+
+
 @dataclass(frozen=True, kw_only=True)
-class Synthetic:
-    """A texture that sounds recorded but needs no file: a few components, each waxing and waning slowly.
+class Synthetic(Validated):
+    """A texture like a recorded one that needs no file: a few components with slowly varying amplitudes.
 
     Parameters
     ----------
@@ -337,47 +297,33 @@ class Synthetic:
 
     kind: ClassVar[str] = "synthetic"
 
-    amplitude: float
-    speed: float | None = None
-    components: int = 6
-    seed: int = 0
-
-    def __post_init__(self) -> None:
-        checks.keep(self, amplitude=checks.number("amplitude", self.amplitude, "m", above=0, most=MOST_AMPLITUDE))
-        checks.keep(self, speed=_speed_or_time(self.speed))
-        checks.keep(self, components=checks.integer("components", self.components, least=1, most=8))
-        checks.keep(self, seed=checks.integer("seed", self.seed, least=0, most=2**32 - 1))
+    amplitude: float = parameter(unit="m", above=0, most=MOST_AMPLITUDE)
+    speed: float | None = parameter(None, "m/s", above=1e-6, most=MOST_SPEED)
+    components: int = parameter(6, least=1, most=8)
+    seed: int = parameter(0, least=0, most=2**32 - 1)
 
     @property
     def spatial(self) -> bool:
         """Whether it is read at the finger's position."""
         return self.speed is not None
 
-    @cached_property
-    def _drawn(self) -> Array:
-        """Per component: frequency (Hz), weight (1), swell (Hz), and two phases (turns)."""
-        return _draw(self.components, self.seed)
-
     def bands(self, rate: float) -> Bands:
         """Carriers at the components (below rate/2, `rate` in Hz); envelopes are to be analysed."""
-        return _carriers(self._drawn[0], self.speed, rate)
+        return _carriers(_draw(self.components, self.seed)[0], self.speed, rate)
 
     def waveform(self, time: Array, position: Array) -> Array:
-        """Wanted displacement (m, shape (n,)); a spatial texture is still where `position` (m) is NaN."""
+        """Target displacement (m, shape (n,)); a spatial texture is still where `position` (m) is NaN."""
         recorded = np.asarray(time, float) if self.speed is None else np.asarray(position, float) / self.speed
         total = np.zeros(recorded.shape)
-        for frequency, weight, swell, phase, start in self._drawn.T:
+        for frequency, weight, swell, phase, start in _draw(self.components, self.seed).T:
             envelope = weight * (1 + DEPTH * np.cos(2 * np.pi * (swell * recorded + start)))
             total += envelope * np.cos(2 * np.pi * (frequency * recorded + phase))
         return np.where(np.isfinite(recorded), self.amplitude * total, 0.0)
 
 
-DEPTH = 0.5  # of the slow modulation
-LEAST_GAP = 40.0  # Hz
-
-
 @lru_cache(maxsize=16)
 def _draw(components: int, seed: int) -> Array:
+    """Per component: frequency (Hz), weight (1), frequency of its modulation (Hz), and two phases (turns)."""
     rng = np.random.default_rng(seed)
     middle = np.linspace(40.0, 390.0, components) if components > 1 else np.array([200.0])
     gap = 350.0 / max(components - 1, 1)

@@ -1,4 +1,4 @@
-"""The scene: what is touched, by what, on which device, for how long; the unit of reproducibility."""
+"""The scene: texture, finger, device and duration; the unit of reproducibility."""
 
 from __future__ import annotations
 
@@ -16,13 +16,14 @@ from typing import Any
 import numpy as np
 
 from hapticrender import checks, defaults
+from hapticrender.checks import Validated, checked, parameter
 from hapticrender.errors import SceneError
 from hapticrender.protocols import Texture
 from hapticrender.touch import toml
-from hapticrender.touch.custom import CustomMotion, CustomTexture
+from hapticrender.touch.custom import Custom
 from hapticrender.touch.finger import Finger
 from hapticrender.touch.grating import Grating
-from hapticrender.touch.mechanics import NAMED, FingerMechanics
+from hapticrender.touch.mechanics import NAMED
 from hapticrender.touch.motion import (
     LONGEST_TIME,
     Nowhere,
@@ -34,9 +35,9 @@ from hapticrender.touch.motion import (
 )
 from hapticrender.touch.recorded import Recorded, Swipe, Synthetic
 
-TEXTURES: dict[str, type[Any]] = {kind.kind: kind for kind in (Grating, Recorded, Swipe, Synthetic, CustomTexture)}
+TEXTURES: dict[str, type[Any]] = {kind.kind: kind for kind in (Grating, Recorded, Swipe, Synthetic, Custom)}
 MOTIONS: dict[str, type[Any]] = {
-    kind.kind: kind for kind in (Nowhere, Still, TriangleMotion, SineMotion, Sampled, RecordedMotion, CustomMotion)
+    kind.kind: kind for kind in (Nowhere, Still, TriangleMotion, SineMotion, Sampled, RecordedMotion, Custom)
 }
 LARGEST_FILE = 1 << 26  # bytes of TOML
 TABLES = {"profile": "device", "simulation": "simulation", "rendering": "render"}  # field of a scene: table of a file
@@ -48,8 +49,30 @@ OWN = {  # keys of these tables that are fields of a scene: table, key, field
 Value = float | int | str | bool
 
 
+def _read_table(name: str, values: Any) -> dict[str, Value]:
+    """Return a table of numbers, words and booleans in Python's own types, so that TOML can hold them."""
+    checks.require(isinstance(values, Mapping), name, values, "a table of parameters", TypeError)
+    found: dict[str, Value] = {}
+    for key, value in values.items():
+        checks.require(isinstance(key, str), name, key, "a table with texts as keys", TypeError)
+        if (TABLES[name], key) in OWN:
+            raise ValueError(f"{name}.{key}: is not part of this table: give it to Scene as {OWN[TABLES[name], key]}")
+        if isinstance(value, bool | np.bool_):
+            found[key] = bool(value)
+        elif isinstance(value, str):
+            found[key] = value
+        else:
+            checks.number(f"{name}.{checks.plain(key)}", value)
+            found[key] = int(value) if isinstance(value, Integral) else float(value)
+    return found
+
+
+def _table() -> Any:
+    return field(default_factory=dict, hash=False, metadata={"check": _read_table, "bounds": {}})
+
+
 @dataclass(frozen=True, kw_only=True)
-class Scene:
+class Scene(Validated):
     """Everything that a rendering depends on, in SI; frozen, compared by value, TOML in and out.
 
     In TOML, ``[device]`` holds `device` (as ``kind``) and `profile`, ``[simulation]`` holds `simulation` and `seed`,
@@ -75,7 +98,7 @@ class Scene:
         Name of the control method.
     tolerance : float
         Relative amplitude error to be judged by, > 0 and <= 10.  Default 0.1:
-        errors up to 10 % lie under every just noticeable difference.
+        errors up to 10 % lie under every just noticeable difference (2.2 dB of amplitude, Israr et al. 2006).
     settle : float, s
         Left out of the judgement at the beginning, >= 0; of a scene shorter
         than twice this the last half is judged.
@@ -101,36 +124,24 @@ class Scene:
 
     texture: Texture
     finger: Finger = field(default_factory=Finger.absent)
-    device: str = "vt-plate"
-    profile: Mapping[str, Value] = field(default_factory=dict, hash=False)
-    simulation: Mapping[str, Value] = field(default_factory=dict, hash=False)
-    rendering: Mapping[str, Value] = field(default_factory=dict, hash=False)
-    duration: float
-    method: str = defaults.METHOD
-    tolerance: float = 0.1
-    settle: float = 1.0
-    keep_unfelt: bool = False
-    gradient: float = 0.0
-    seed: int = 0
-    name: str = "scene"
+    device: str = checked(checks.word, "vt-plate")
+    profile: Mapping[str, Value] = _table()
+    simulation: Mapping[str, Value] = _table()
+    rendering: Mapping[str, Value] = _table()
+    duration: float = parameter(unit="s", above=0, most=LONGEST_TIME)
+    method: str = checked(checks.word, defaults.METHOD)
+    tolerance: float = parameter(0.1, above=0, most=10)
+    settle: float = parameter(1.0, "s", most=LONGEST_TIME)
+    keep_unfelt: bool = checked(checks.flag, False)
+    gradient: float = parameter(0.0, "1/m", least=-1e3, most=1e3)
+    seed: int = parameter(0)
+    name: str = checked(checks.word, "scene")
 
     def __post_init__(self) -> None:
-        for key in ("name", "device", "method"):
-            checks.word(key, getattr(self, key))
-        checks.keep(
-            self,
-            duration=checks.number("duration", self.duration, "s", above=0, most=LONGEST_TIME),
-            tolerance=checks.number("tolerance", self.tolerance, "", above=0, most=10),
-            settle=checks.number("settle", self.settle, "s", least=0, most=LONGEST_TIME),
-            keep_unfelt=checks.flag("keep_unfelt", self.keep_unfelt),
-            gradient=checks.number("gradient", self.gradient, "1/m", least=-1e3, most=1e3),
-            seed=checks.integer("seed", self.seed, least=0),
-            **{key: _read_table(key, getattr(self, key)) for key in TABLES},
-        )
-        if not isinstance(self.texture, Texture):
-            checks.refuse("texture", self.texture, "a texture with bands(rate) and waveform(time, position)", TypeError)
-        if not isinstance(self.finger, Finger):
-            checks.refuse("finger", self.finger, "a Finger", TypeError)
+        super().__post_init__()
+        bound = "a texture with bands(rate) and waveform(time, position)"
+        checks.require(isinstance(self.texture, Texture), "texture", self.texture, bound, TypeError)
+        checks.require(isinstance(self.finger, Finger), "finger", self.finger, "a Finger", TypeError)
         if isinstance(self.finger.motion, Nowhere) and getattr(self.texture, "spatial", False):
             raise ValueError("finger.motion = 'none': a texture over position needs a finger")
 
@@ -146,17 +157,14 @@ class Scene:
         where = " ".join(str(path).split())
         try:
             found = Path(path).stat()
-            if not stat.S_ISREG(found.st_mode):
-                raise SceneError(f"{where}: must be a regular file")
-            if found.st_size > LARGEST_FILE:
-                raise SceneError(f"{where}: has {found.st_size} bytes: must be <= {LARGEST_FILE} bytes")
-            text = Path(path).read_bytes().decode("utf-8")
+            usable = stat.S_ISREG(found.st_mode) and found.st_size <= LARGEST_FILE
+            text = Path(path).read_bytes().decode("utf-8") if usable else ""
         except UnicodeDecodeError as problem:
             raise SceneError(f"{where}: byte {problem.start}: must be UTF-8 text") from problem
-        except SceneError:
-            raise
         except (OSError, ValueError) as problem:
             raise SceneError(f"{where}: must be a readable file ({_reason(problem)})") from problem
+        if not usable:
+            raise SceneError(f"{where}: must be a regular file of at most {LARGEST_FILE} bytes")
         return cls.from_toml_text(text, where, folder=Path(path).parent, name=Path(path).stem)
 
     @classmethod
@@ -185,17 +193,14 @@ class Scene:
 
     def to_toml(self) -> str:
         """TOML text that `from_toml_text` reads back to an equal scene (textures of your own: by description only)."""
-        texture: Any = self.texture if type(self.texture) in TEXTURES.values() else CustomTexture(repr(self.texture))
+        texture: Any = self.texture if type(self.texture) in TEXTURES.values() else Custom(repr(self.texture))
         tables: dict[str, dict[str, Any]] = {table: {} for table in TABLES.values()}
         for (table, key), own in OWN.items():
             tables[table][key] = getattr(self, own)
         for own, table in TABLES.items():
             tables[table] |= getattr(self, own)
-        return toml.dumps(
-            {"name": self.name, "duration": self.duration}
-            | {"texture": {"kind": texture.kind} | _write_fields(texture), "finger": _write_finger(self.finger)}
-            | tables
-        )
+        parts = {"texture": {"kind": texture.kind} | _write_fields(texture), "finger": _write_finger(self.finger)}
+        return toml.dumps({"name": self.name, "duration": self.duration} | parts | tables)
 
 
 def distinct_names(names: Iterable[str]) -> list[str]:
@@ -220,32 +225,8 @@ def _reason(problem: Exception) -> str:
     return " ".join(str(getattr(problem, "strerror", None) or problem).split())[:200]
 
 
-def _read_table(name: str, values: Any) -> dict[str, Value]:
-    """Return a table of numbers, words and booleans in Python's own types, so that TOML can hold them."""
-    if not isinstance(values, Mapping):
-        checks.refuse(name, values, "a table of parameters", TypeError)
-    found: dict[str, Value] = {}
-    for key, value in values.items():
-        if not isinstance(key, str):
-            checks.refuse(name, key, "a table with texts as keys", TypeError)
-        if (TABLES[name], key) in OWN:
-            raise ValueError(f"{name}.{key}: is not part of this table: give it to Scene as {OWN[TABLES[name], key]}")
-        if isinstance(value, bool | np.bool_):
-            found[key] = bool(value)
-        elif isinstance(value, str):
-            found[key] = value
-        else:
-            checks.number(f"{name}.{_plain(key)}", value)
-            found[key] = int(value) if isinstance(value, Integral) else float(value)
-    return found
-
-
-def _plain(key: str) -> str:
-    return key if key.isidentifier() else checks.show(key)
-
-
 def _read_scene(table: dict[str, Any], folder: Path, name: str) -> Scene:
-    _check_places(table)
+    _check_keys(table)
     values: dict[str, Any] = {"duration": table.get("duration"), "name": table.get("name", _usable(name))}
     for own, where in TABLES.items():
         rest = dict(table.get(where, {}))
@@ -256,23 +237,22 @@ def _read_scene(table: dict[str, Any], folder: Path, name: str) -> Scene:
     return Scene(texture=texture, finger=finger, **values)
 
 
-def _check_places(table: dict[str, Any]) -> None:
+def _check_keys(table: dict[str, Any]) -> None:
     """Refuse a key that is not at the top level of a scene; say where it is now, if it once was there."""
     moved = {key: where for where, key in OWN}
     for key, value in table.items():
-        said = f"{_plain(key)} = {checks.show(value)}"
+        entry = f"{checks.plain(key)} = {checks.show(value)}"
         if key == "plant":
             raise ValueError(
                 "plant: is three tables now: parameters of the device go into [device], how the simulated device "
                 "differs from them into [simulation], settings of the renderer into [render]"
             )
         if key == "device" and isinstance(value, str):
-            raise ValueError(f"{said}: must be a table now: [device] with kind = {checks.show(value)}")
+            raise ValueError(f"{entry}: must be a table now: [device] with kind = {checks.show(value)}")
         if key in moved:
-            raise ValueError(f"{said}: must stand in the table [{moved[key]}]")
-        if key in TABLES.values() and not isinstance(value, dict):
-            checks.refuse(key, value, "a table", TypeError)
-    _only_known("", table, ["name", "duration", "texture", "finger", *TABLES.values()])
+            raise ValueError(f"{entry}: must stand in the table [{moved[key]}]")
+        checks.require(key not in TABLES.values() or isinstance(value, dict), key, value, "a table", TypeError)
+    _only_known(table, ["name", "duration", "texture", "finger", *TABLES.values()])
 
 
 def _usable(name: str) -> str:
@@ -283,24 +263,22 @@ def _usable(name: str) -> str:
         return "scene"
 
 
-def _only_known(prefix: str, table: Mapping[str, Any], known: list[str]) -> None:
+def _only_known(table: Mapping[str, Any], known: list[str]) -> None:
     for key, value in table.items():
         if key not in known:
-            raise ValueError(f"{prefix}{_plain(key)} = {checks.show(value)}: unknown key; known: {', '.join(known)}")
+            raise ValueError(f"{checks.plain(key)} = {checks.show(value)}: unknown key; known: {', '.join(known)}")
 
 
 def _read_kind(table: Any, key: str, choice: str, kinds: dict[str, type[Any]], folder: Path, extra: Any = ()) -> Any:
     """Make the object that `table[choice]` names from the keys that are its fields; `extra` keys are left alone."""
-    if not isinstance(table, dict):
-        checks.refuse(key, table, f"a table with {choice} = one of {', '.join(kinds)}", TypeError)
+    bound = f"a table with {choice} = one of {', '.join(kinds)}"
+    checks.require(isinstance(table, dict), key, table, bound, TypeError)
     with checks.inside(key):
         kind = kinds[checks.choice(choice, table.get(choice), kinds)]
         entries = fields(kind)
-        _only_known("", table, [choice, *(entry.name for entry in entries), *extra])
-        values = {entry.name: table[entry.name] for entry in entries if entry.name in table}
-        for entry in entries:
-            if entry.default is MISSING and entry.default_factory is MISSING:
-                values.setdefault(entry.name, None)
+        _only_known(table, [choice, *(entry.name for entry in entries), *extra])
+        values = {entry.name: None for entry in entries if entry.default is entry.default_factory is MISSING}
+        values |= {entry.name: table[entry.name] for entry in entries if entry.name in table}
         if isinstance(values.get("file"), str) and values["file"].isprintable():
             values["file"] = str(folder / values["file"]) if values["file"] else ""
         return kind(**values)
@@ -323,15 +301,9 @@ def _write_fields(part: Any) -> dict[str, Any]:
 
 
 def _write_finger(finger: Finger) -> dict[str, Any]:
-    motion: Any = finger.motion if type(finger.motion) in MOTIONS.values() else CustomMotion(repr(finger.motion))
+    motion: Any = finger.motion if type(finger.motion) in MOTIONS.values() else Custom(repr(finger.motion))
     own = _write_fields(finger)
-    own["mechanics"] = _write_mechanics(finger.mechanics)
+    names = [name for name, known in NAMED.items() if known == finger.mechanics]
+    own["mechanics"] = names[0] if names else _write_fields(finger.mechanics)
     del own["motion"]
     return {"motion": motion.kind} | _write_fields(motion) | own
-
-
-def _write_mechanics(mechanics: FingerMechanics) -> str | dict[str, Any]:
-    for name, known in NAMED.items():
-        if mechanics == known:
-            return name
-    return _write_fields(mechanics)
