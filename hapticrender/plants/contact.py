@@ -48,27 +48,6 @@ SLIDING = np.dtype(
 class SlidingParameters(Validated):
     """Parameters of the sliding contact and of the tribometer under it.
 
-    Parameters
-    ----------
-    rate : float, Hz
-        Sampling rate of the surface, 1000 to 1e6.
-    friction_coefficient : float
-        mu, friction over normal force, > 0 (dry to moist glass: 0.3 to 2).
-    memory_length : float, m
-        delta, sliding distance over which the contact is renewed, > 0.
-    least_speed : float, m/s
-        Slower than this the contact sticks, > 0.
-    tribometer_frequency : float, Hz
-        Resonance f0 of the tribometer, > 0 and at most half the rate.
-    tribometer_damping : float
-        Damping ratio zeta, > 0; with 0.44 or more it is flat within 0.5 dB up to 400 Hz.
-    force_noise : float, N rms
-        White noise of the tribometer, >= 0.
-    force_range : float, N
-        It measures forces within +- this, > 0.
-    force_bits : int
-        Resolution over +- force_range; 0 is ideal.
-
     Notes
     -----
     delta is 11.5 um where the cut-off v/(2 pi delta) grows by 13.8 Hz per mm/s, as measured over 20-100 mm/s and
@@ -77,15 +56,15 @@ class SlidingParameters(Validated):
     defaults.
     """
 
-    rate: float = parameter(10e3, "Hz", least=1e3, most=1e6)
-    friction_coefficient: float = parameter(0.8, above=0.0)
-    memory_length: float = parameter(11.5e-6, "m", above=0.0)
-    least_speed: float = parameter(1e-3, "m/s", above=0.0)
-    tribometer_frequency: float = parameter(1300.0, "Hz", above=0.0)
-    tribometer_damping: float = parameter(0.65, above=0.0)
-    force_noise: float = parameter(1e-3, "N")
-    force_range: float = parameter(20.0, "N", above=0.0)
-    force_bits: int = parameter(0, least=0, most=24)
+    rate: float = parameter(10e3, "Hz", "sampling rate of the surface", least=1e3, most=1e6)
+    friction_coefficient: float = parameter(0.8, about="mu; dry to moist glass: 0.3 to 2", above=0.0)
+    memory_length: float = parameter(11.5e-6, "m", "delta, sliding distance that renews the contact", above=0.0)
+    least_speed: float = parameter(1e-3, "m/s", "a slower contact sticks", above=0.0)
+    tribometer_frequency: float = parameter(1300.0, "Hz", "resonance f0, at most half the rate", above=0.0)
+    tribometer_damping: float = parameter(0.65, about="damping ratio; >= 0.44: flat within 0.5 dB to 400 Hz", above=0.0)
+    force_noise: float = parameter(1e-3, "N", "white noise of the tribometer, rms")
+    force_range: float = parameter(20.0, "N", "it measures forces within +- this", above=0.0)
+    force_bits: int = parameter(0, about="resolution over +- force_range, 0 is ideal", least=0, most=24)
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -103,105 +103,47 @@ class SquareRoot:
 class ElectroadhesionParameters(SlidingParameters):
     """Parameters of the screen, of the finger's electrical side, and of the model's level.
 
-    Parameters
-    ----------
-    level : {"envelope", "carrier"}
-    drive_kind : {"current", "voltage"}
-        Drive in A or V, peak of the carrier; a voltage is turned into the current that it drives in steady state.
-    sensor : {"tribometer", "impedance"}
-        Friction (N), or the attraction (N) estimated from voltage and current (see `gap`); level "carrier" only.
-    carrier_frequency : float, Hz
-        A whole multiple of `rate`.
-    oversampling : int
-        Substeps a sample, at least 4 a turn of the carrier.
-    contact_area : float, m2
-        Apparent area at 1 N, > 0; grows with the load to the power `area_exponent` (0.33-0.67).
-    area_exponent : float
-        0 to 1.
-    electrical_share : float
-        Of the apparent area, > 0 and <= 1.
-    area_scale : float
-        Of this finger against the nominal one, > 0.
-    insulator_capacitance : float, F/m2
-        > 0 (1-3.5e-5).
-    corneum_capacitance : float, F/m2
-        Of the stratum corneum, > 0.
-    corneum_resistance : float, ohm m2
-        > 0.
-    gap_thickness : float, m
-        While sliding, > 0 (0.5-3 um).
-    gap_resistance : float, ohm m2
-        Leakage of the sliding gap, > 0: `DRY`, `NORMAL` or `MOIST`.
-    gap_short : float, ohm m2
-        The same while the finger rests, >= 0 (to 0.1).
-    ripple : float
-        The gap varies by this share of its thickness with the position, 0 to 0.9.
-    ripple_wavelength : float, m
-        > 0.
-    body_resistance : float, ohm
-        Body and return, >= 0 (0.5-2 kohm).
-    unevenness : float
-        kappa = <d^-2>/<d^-1>^2 of the gap, 1 to 10 (1-3).
-    current_limit : float, A
-        Largest peak of the source where the drive is a current, > 0.
-    voltage_limit : float, V
-        Its compliance, peak, > 0 (150-300); also the largest drive where that is a voltage.
-    current_offset : float, A
-        Direct current that the source leaks, -1 to 1 mA.
-    servo_conductance : float, S
-        The source bleeds this times the mean voltage of the last sample, >= 0; 0: no servo.
-    stray_capacitance : float, F
-        Across the source, >= 0.
-    voltage_noise, current_noise : float, V and A rms
-        White noise of the two channels at every substep, >= 0.
-    skew : float, s
-        The current's channel is late by this, -10 to 10 us.
-    estimator_bandwidth : float, Hz
-        Of the estimator's STDFT*, > 0 and < rate/2.
-    estimator_smoothing : float, s
-        Time constant over which it averages the impedance, at least a sample.
-    least_leakage : float
-        L below which a gap leaks too much to be measured, 0 to 1.
-    open_loop_gain : float, N/A^2
-        g of a finger whose gap cannot be measured, > 0; renderers set that of a nominal finger unless the scene has it.
-
     Notes
     -----
     Electrical defaults per m2 from the sources above and docs/theory.md; gap, leakage and body are engineering values.
     Offset and servo act at the level "carrier" only.
     """
 
-    level: str = option("envelope", "envelope", "carrier")
-    drive_kind: str = option("current", "current", "voltage")
-    sensor: str = option("tribometer", "tribometer", "impedance")
-    carrier_frequency: float = parameter(20e3, "Hz", above=0.0)
-    oversampling: int = parameter(20, "substeps", least=1, most=10_000)
-    contact_area: float = parameter(1.2e-4, "m2", above=0.0)
-    area_exponent: float = parameter(0.5, most=1.0)
-    electrical_share: float = parameter(0.6, above=0.0, most=1.0)
-    area_scale: float = parameter(1.0, above=0.0)
-    insulator_capacitance: float = parameter(3.45e-5, "F/m2", above=0.0)
-    corneum_capacitance: float = parameter(2.95e-5, "F/m2", above=0.0)
-    corneum_resistance: float = parameter(1.2, "ohm m2", above=0.0)
-    gap_thickness: float = parameter(1.5e-6, "m", above=0.0)
-    gap_resistance: float = parameter(NORMAL, "ohm m2", above=0.0)
-    gap_short: float = parameter(0.0, "ohm m2", most=0.1)
-    ripple: float = parameter(0.0, most=0.9)
-    ripple_wavelength: float = parameter(0.5e-3, "m", above=0.0)
-    body_resistance: float = parameter(1e3, "ohm")
-    unevenness: float = parameter(1.0, least=1.0, most=10.0)
-    current_limit: float = parameter(10e-3, "A", above=0.0)
-    voltage_limit: float = parameter(300.0, "V", above=0.0)
-    current_offset: float = parameter(0.0, "A", least=-1e-3, most=1e-3)
-    servo_conductance: float = parameter(1e-7, "S")
-    stray_capacitance: float = parameter(0.0, "F")
-    voltage_noise: float = parameter(0.5, "V")
-    current_noise: float = parameter(20e-6, "A")
-    skew: float = parameter(0.0, "s", least=-1e-5, most=1e-5)
-    estimator_bandwidth: float = parameter(1500.0, "Hz", above=0.0)
-    estimator_smoothing: float = parameter(5e-3, "s", above=0.0)
-    least_leakage: float = parameter(0.5, most=1.0)
-    open_loop_gain: float = parameter(2.2e4, "N/A^2", above=0.0)
+    level: str = option("envelope", "envelope", "carrier", about="of the model")
+    drive_kind: str = option("current", "current", "voltage", about="peak of the carrier (A or V)")
+    sensor: str = option(
+        "tribometer", "tribometer", "impedance", about='of friction, or of attraction (level "carrier")'
+    )
+    carrier_frequency: float = parameter(20e3, "Hz", "a whole multiple of `rate`", above=0.0)
+    oversampling: int = parameter(20, "substeps", "a sample, at least 4 a turn of the carrier", least=1, most=10_000)
+    contact_area: float = parameter(1.2e-4, "m2", "apparent area at 1 N", above=0.0)
+    area_exponent: float = parameter(0.5, about="of the load, with which the area grows (0.33-0.67)", most=1.0)
+    electrical_share: float = parameter(0.6, about="of the apparent area", above=0.0, most=1.0)
+    area_scale: float = parameter(1.0, about="of this finger against the nominal one", above=0.0)
+    insulator_capacitance: float = parameter(3.45e-5, "F/m2", "per area (1-3.5e-5)", above=0.0)
+    corneum_capacitance: float = parameter(2.95e-5, "F/m2", "of the stratum corneum", above=0.0)
+    corneum_resistance: float = parameter(1.2, "ohm m2", "of the stratum corneum", above=0.0)
+    gap_thickness: float = parameter(1.5e-6, "m", "while sliding (0.5-3 um)", above=0.0)
+    gap_resistance: float = parameter(NORMAL, "ohm m2", "leakage of the sliding gap: DRY, NORMAL or MOIST", above=0.0)
+    gap_short: float = parameter(0.0, "ohm m2", "the same while the finger rests", most=0.1)
+    ripple: float = parameter(0.0, about="share by which the gap varies with the position", most=0.9)
+    ripple_wavelength: float = parameter(0.5e-3, "m", "of that", above=0.0)
+    body_resistance: float = parameter(1e3, "ohm", "body and return (0.5-2 kohm)")
+    unevenness: float = parameter(1.0, about="kappa = <d^-2>/<d^-1>^2 of the gap (1-3)", least=1.0, most=10.0)
+    current_limit: float = parameter(10e-3, "A", "largest peak of the source where the drive is a current", above=0.0)
+    voltage_limit: float = parameter(300.0, "V", "its compliance, peak (150-300); largest drive in V", above=0.0)
+    current_offset: float = parameter(0.0, "A", "direct current that the source leaks", least=-1e-3, most=1e-3)
+    servo_conductance: float = parameter(1e-7, "S", "the source bleeds this times its mean voltage, 0: no servo")
+    stray_capacitance: float = parameter(0.0, "F", "across the source")
+    voltage_noise: float = parameter(0.5, "V", "white noise at every substep, rms")
+    current_noise: float = parameter(20e-6, "A", "white noise at every substep, rms")
+    skew: float = parameter(0.0, "s", "delay of the current's channel", least=-1e-5, most=1e-5)
+    estimator_bandwidth: float = parameter(1500.0, "Hz", "of the estimator's STDFT*, < rate/2", above=0.0)
+    estimator_smoothing: float = parameter(5e-3, "s", "for the impedance's average, at least a sample", above=0.0)
+    least_leakage: float = parameter(0.5, about="L below which a gap leaks too much to be measured", most=1.0)
+    open_loop_gain: float = parameter(
+        2.2e4, "N/A^2", "g where the gap cannot be measured; by default a nominal finger's", above=0.0
+    )
 
     def __post_init__(self) -> None:
         super().__post_init__()

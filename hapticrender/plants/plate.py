@@ -52,86 +52,40 @@ NOMINAL_AMPLIFIER = (1 - 2e3 / 1.0) / 10e3  # A/V: gain of the default parts, by
 class PlateParameters(Validated):
     """Everything that describes the plate, its electronics and how finely it is modelled.
 
-    Parameters
-    ----------
-    mass, inertia : float, kg, kg m2
-        Moving mass and its inertia about the middle, > 0.
-    stiffness_1, stiffness_2 : float, N/m
-        Coil suspensions, > 0.
-    damping_1, damping_2 : float, N s/m
-        Coil dampings, >= 0.
-    force_constant : float, N/A
-        Of each coil, > 0.
-    coil_spacing, glass_length : float, m
-        Distance between the coils; length of the glass, the sensors sit at its ends.
-    amplifier_r1, amplifier_r2, amplifier_rp : float, ohm
-        Transconductance amplifier, i = V/R1 (1 - R2/Rp).  The drive is the current (A) that the default parts give;
-        other parts give another current.
-    current_limit : float, A
-        Of each coil, > 0 (engineering default).
-    current_bits : int
-        Resolution of the command over +- current_limit; 0 is ideal.
-    sensor_range : float, m
-        Full range of a sensor.
-    sensor_bits : int
-        Resolution over sensor_range; 0 is ideal.
-    sensor_noise : float, m rms
-        White noise of each sensor, >= 0.
-    sensor_gain_1, sensor_gain_2 : float
-        Reading per displacement of each sensor, > 0; the controller assumes 1.
-    rate : float, Hz
-        Sampling rate of the embedded loop.
-    delay : int, samples
-        Loop delay, >= 1: from a sensed sample to the drive computed from it.
-    coils : int
-        2: each at its suspension; 1: in the middle, which moves heave alone.
-    degrees_of_freedom : int
-        2: heave and rocking; 1: heave only.
-    finger_dynamics : int
-        1: the finger's mechanics act on the plate; 0: only its static load.
-    bending_frequency : float, Hz
-        First bending mode of the glass, at most `rate`; 0: the glass is rigid.
-    bending_damping : float
-        Damping ratio of that mode, >= 0.
-    bending_mass : float, kg
-        Its modal mass, the shape being 1 at the sensors; > 0.
-    bending_coil : float
-        Its shape at the coils, -1 to 1.  The coils sit near its nodes, so the sign has to be measured.
-
     Notes
     -----
     Defaults are the printed values of Grigorii et al. 2021; the limits of current and sensors are engineering
     defaults, the numbers of the bending mode are estimates for such a sheet of glass (1.1-1.4 kHz, 9.5 g, 0.01, +-0.1).
     """
 
-    mass: float = parameter(32e-3, "kg", above=0.0)
-    inertia: float = parameter(4e-5, "kg m2", above=0.0)
-    stiffness_1: float = parameter(22.4e3, "N/m", above=0.0)
-    stiffness_2: float = parameter(22.9e3, "N/m", above=0.0)
-    damping_1: float = parameter(0.85, "N s/m")
-    damping_2: float = parameter(0.85, "N s/m")
-    force_constant: float = parameter(7.4, "N/A", above=0.0)
-    coil_spacing: float = parameter(55e-3, "m", above=0.0)
-    glass_length: float = parameter(110e-3, "m", above=0.0)
-    amplifier_r1: float = parameter(10e3, "ohm", above=0.0)
-    amplifier_r2: float = parameter(2e3, "ohm", above=0.0)
-    amplifier_rp: float = parameter(1.0, "ohm", above=0.0)
-    current_limit: float = parameter(3.0, "A", above=0.0)
-    current_bits: int = parameter(12, most=24)
-    sensor_range: float = parameter(2e-3, "m", above=0.0)
-    sensor_bits: int = parameter(14, most=24)
-    sensor_noise: float = parameter(1e-6, "m")
-    sensor_gain_1: float = parameter(1.0, above=0.0)
-    sensor_gain_2: float = parameter(1.0, above=0.0)
-    rate: float = parameter(5000.0, "Hz", least=500.0, most=1000000.0)
-    delay: int = parameter(1, "samples", least=1, most=100_000)
-    coils: int = parameter(2, least=1, most=2)
-    degrees_of_freedom: int = parameter(2, least=1, most=2)
-    finger_dynamics: int = parameter(1, most=1)
-    bending_frequency: float = parameter(0.0, "Hz")
-    bending_damping: float = parameter(0.01)
-    bending_mass: float = parameter(9.5e-3, "kg", above=0.0)
-    bending_coil: float = parameter(-0.1, least=-1.0, most=1.0)
+    mass: float = parameter(32e-3, "kg", "moving mass", above=0.0)
+    inertia: float = parameter(4e-5, "kg m2", "about the middle", above=0.0)
+    stiffness_1: float = parameter(22.4e3, "N/m", "coil suspension", above=0.0)
+    stiffness_2: float = parameter(22.9e3, "N/m", "coil suspension", above=0.0)
+    damping_1: float = parameter(0.85, "N s/m", "of a coil")
+    damping_2: float = parameter(0.85, "N s/m", "of a coil")
+    force_constant: float = parameter(7.4, "N/A", "of each coil", above=0.0)
+    coil_spacing: float = parameter(55e-3, "m", "distance between the coils", above=0.0)
+    glass_length: float = parameter(110e-3, "m", "the sensors sit at its ends", above=0.0)
+    amplifier_r1: float = parameter(10e3, "ohm", "R1; the drive is the current that the default parts give", above=0.0)
+    amplifier_r2: float = parameter(2e3, "ohm", "R2; i = V/R1 (1 - R2/Rp)", above=0.0)
+    amplifier_rp: float = parameter(1.0, "ohm", "Rp", above=0.0)
+    current_limit: float = parameter(3.0, "A", "of each coil", above=0.0)
+    current_bits: int = parameter(12, about="resolution over +- current_limit, 0 is ideal", most=24)
+    sensor_range: float = parameter(2e-3, "m", "full range of a sensor", above=0.0)
+    sensor_bits: int = parameter(14, about="resolution over sensor_range, 0 is ideal", most=24)
+    sensor_noise: float = parameter(1e-6, "m", "white noise of a sensor, rms")
+    sensor_gain_1: float = parameter(1.0, about="reading per displacement", above=0.0)
+    sensor_gain_2: float = parameter(1.0, about="reading per displacement", above=0.0)
+    rate: float = parameter(5000.0, "Hz", "of the embedded loop", least=500.0, most=1000000.0)
+    delay: int = parameter(1, "samples", "from a sensed sample to the drive computed from it", least=1, most=100_000)
+    coils: int = parameter(2, about="2: at the suspensions, 1: in the middle, for heave alone", least=1, most=2)
+    degrees_of_freedom: int = parameter(2, about="2: heave and rocking, 1: heave only", least=1, most=2)
+    finger_dynamics: int = parameter(1, about="1: the finger's mechanics act, 0: only its static load", most=1)
+    bending_frequency: float = parameter(0.0, "Hz", "of the first bending mode, at most rate; 0: rigid glass")
+    bending_damping: float = parameter(0.01, about="damping ratio of that mode")
+    bending_mass: float = parameter(9.5e-3, "kg", "modal mass, the shape being 1 at the sensors", above=0.0)
+    bending_coil: float = parameter(-0.1, about="shape at the coils; its sign must be measured", least=-1.0, most=1.0)
 
     def __post_init__(self) -> None:
         super().__post_init__()

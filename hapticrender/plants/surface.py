@@ -43,41 +43,26 @@ LEAST_AMPLITUDE = 0.05e-6  # m: below it a resonance cannot be detected
 class SurfaceParameters(SlidingParameters):
     """Parameters of the surface, of its mode and friction law, and of the model's level.
 
-    Parameters
-    ----------
-    level : {"carrier", "envelope"}
-        Whether the mode is simulated where it is.
-    sensor : {"amplitude", "tribometer"}
-        What is sensed: the friction that the sensed amplitude leaves by the law, or that of a tribometer.
-    law : {"fit", "load-sharing", "intermittent"}
-        Of friction over amplitude; its own numbers are those of `friction_laws`.
-    bias : float
-        Friction without a texture, mu/mu0: 0.1 to 0.95.
-    lock : float, Hz
-        Bandwidth of the resonance lock, 0 to 100 (1-20); 0: none.
-    oversampling, envelope_oversampling : int
-        Samples of the carrier in one of the friction, at either level.
-    mode : UltrasonicParameters
-        The plate; its rate and level follow from those above.
-    law_parameters : mapping
-        Numbers of the law that differ from its defaults.
-
     Notes
     -----
     Bias, lock and oversampling are engineering defaults.  The mode's sensor keeps the density of its noise whatever the
     oversampling; see `UltrasonicParameters`.
     """
 
-    rate: float = parameter(12e3, "Hz", least=1e3, most=1e6)
-    level: str = option("carrier", *LEVELS)
-    sensor: str = option("amplitude", "amplitude", "tribometer")
-    law: str = option("fit", *LAWS)
-    bias: float = parameter(0.55, least=0.1, most=0.95)
-    lock: float = parameter(20.0, "Hz", most=100.0)
-    oversampling: int = parameter(32, "samples", least=1, most=1000)
-    envelope_oversampling: int = parameter(4, "samples", least=1, most=1000)
-    mode: UltrasonicParameters = field(default_factory=UltrasonicParameters, metadata={"free": True})
-    law_parameters: Mapping[str, float] = field(default_factory=dict, hash=False, metadata={"free": True})
+    rate: float = parameter(12e3, "Hz", "of the friction", least=1e3, most=1e6)
+    level: str = option("carrier", *LEVELS, about="whether the mode is simulated where it is")
+    sensor: str = option("amplitude", "amplitude", "tribometer", about="what gives friction")
+    law: str = option("fit", *LAWS, about="of friction over amplitude, see `friction_laws`")
+    bias: float = parameter(0.55, about="friction without a texture, mu/mu0", least=0.1, most=0.95)
+    lock: float = parameter(20.0, "Hz", "bandwidth of the resonance lock (1-20), 0: none", most=100.0)
+    oversampling: int = parameter(32, "samples", "samples of the carrier in one of the friction", least=1, most=1000)
+    envelope_oversampling: int = parameter(4, "samples", 'the same at level "envelope"', least=1, most=1000)
+    mode: UltrasonicParameters = field(
+        default_factory=UltrasonicParameters, metadata={"about": "rate and level are set"}
+    )
+    law_parameters: Mapping[str, float] = field(
+        default_factory=dict, hash=False, metadata={"about": "that differ from defaults"}
+    )
 
     def __post_init__(self) -> None:
         super().__post_init__()
