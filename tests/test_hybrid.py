@@ -140,7 +140,7 @@ def test_each_part_gives_its_share_and_no_more():
     plant, controller = session.driver.plant, session.controller()
     assert plant.closes(controller)
     plant.closed_loop(controller, np.zeros(12_000))
-    felt = plant.felt[7000:] - plant.felt[7000:].mean(axis=0)
+    felt = plant.motion[7000:, 1:] - plant.motion[7000:, 1:].mean(axis=0)
     parts = abs(2 * np.exp(-2j * np.pi * 90.0 * np.arange(5000) / RATE) @ felt) / 5000
     share = smoothstep(90.0 / START - 1)
     assert share == pytest.approx(0.28175)

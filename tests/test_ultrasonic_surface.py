@@ -61,7 +61,7 @@ def test_a_surface_is_its_parts(law):
     drive = np.r_[BUMPS, 0.5]  # N: more than all of the friction
     played = surface.run(drive[:, None])
     friction, sensed, skin, amplitude, flags = twin(p, drive, p.friction_coefficient * 0.4, 0.4, 0.08).T
-    columns = (played.motion[:, 0], played.sensed[:, 0], surface.skin_velocity, surface.amplitude)
+    columns = (played.motion[:, 0], played.sensed[:, 0], surface.motion[:, 1], surface.amplitude)
     for found, expected in zip(columns, (friction, sensed, skin, amplitude), strict=True):
         np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-12 * abs(expected).max())
     np.testing.assert_array_equal(played.flags, flags)

@@ -7,7 +7,7 @@ that slides at 80 mm/s, unless a case says otherwise.  Those of amplitude are of
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from itertools import product
@@ -50,7 +50,7 @@ def play(
     touched: Grating,
     finger: Finger = FINGER,
     seconds: float = 2.0,
-    **tables: dict[str, Value],
+    **tables: Mapping[str, Value],
 ) -> Recording:
     """Render every band of the texture on the simulated device, with further tables of the scene."""
     scene = Scene(texture=touched, finger=finger, device=device, duration=seconds, keep_unfelt=True, **tables)  # type: ignore[arg-type]

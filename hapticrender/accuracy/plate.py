@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from itertools import product
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -87,7 +87,7 @@ class Bench:
         plate = Plate(self.plate, finger or Finger.absent(), seed)
         zero = np.zeros(samples)
         _, target, _, sensed = plate.closed_loop(self.design(bands), zero if waveform is None else waveform)
-        return Run(bands, sensed.motion, zero if sensed.position is None else sensed.position, target)
+        return Run(bands, plate.motion[:, :3], zero if sensed.position is None else sensed.position, target)
 
 
 def window(frequency: float) -> float:
@@ -219,8 +219,8 @@ def wrong(bench: Bench) -> dict[str, float]:
     """The plate is not the one designed for: k +5, m -5, b -20 %, gains +-2 %, delay +1 sample, all together."""
     factors = {"stiffness": 1.05, "mass": 0.95, "inertia": 0.95, "damping": 0.8}
     names = ("stiffness_1", "stiffness_2", "mass", "inertia", "damping_1", "damping_2")
-    changed = {name: factors[name.partition("_")[0]] * getattr(bench.plate, name) for name in names}
-    gains = {"sensor_gain_1": 1.02, "sensor_gain_2": 0.98}
+    changed: dict[str, Any] = {name: factors[name.partition("_")[0]] * getattr(bench.plate, name) for name in names}
+    gains: dict[str, Any] = {"sensor_gain_1": 1.02, "sensor_gain_2": 0.98}
     other = replace(
         bench, plate=replace(bench.plate, delay=bench.plate.delay + 1, **gains, **changed), known=bench.plate
     )
@@ -232,12 +232,13 @@ def overload(bench: Bench) -> dict[str, float]:
     """2 s of 1 mm at 400 Hz (10.6 A of 3 A), then 100 um: time until within 5 %, third harmonic before."""
     zero, plate = np.zeros(int(4 * RATE)), Plate(bench.plate, Finger.absent())
     controller, softer = (bench.design(tones([400.0], amplitude)) for amplitude in (1e-3, 100e-6))
-    loud = plate.closed_loop(controller, zero[: len(zero) // 2])[3].motion
+    plate.closed_loop(controller, zero[: len(zero) // 2])
+    loud = plate.motion[:, :3]
     controller.setpoints[:] = softer.setpoints  # type: ignore[attr-defined]
-    soft = plate.closed_loop(controller, zero)[3].motion
+    plate.closed_loop(controller, zero)
     n = np.arange(len(loud))[-int(RATE) :]
     third = abs(2 * np.mean(loud[n, 0] * np.exp(-2j * np.pi * 1200.0 * n / RATE)))
-    time, error = Run(tones([400.0], 1.0), soft, zero, zero).errors(100e-6)
+    time, error = Run(tones([400.0], 1.0), plate.motion[:, :3], zero, zero).errors(100e-6)
     return {"back": float(time[abs(error[:, 0]) > 0.05].max(initial=0.0)), "third": float(third)}
 
 

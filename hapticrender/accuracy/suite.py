@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
+from functools import partial
 
 import numpy as np
 
@@ -10,8 +11,13 @@ from hapticrender.accuracy import friction, plate
 from hapticrender.accuracy.figures import TARGETS, Figure
 from hapticrender.errors import DesignError
 
+
+def _on_the_plate(case: Callable[[plate.Bench], dict[str, float]], method: str) -> dict[str, float]:
+    return case(plate.Bench(method=method))
+
+
 CASES: dict[str, Callable[[str], dict[str, float]]] = {
-    **{name: lambda method, case=case: case(plate.Bench(method=method)) for name, case in plate.CASES.items()},
+    **{name: partial(_on_the_plate, case) for name, case in plate.CASES.items()},
     **friction.CASES,
 }
 METHOD_FREE = frozenset(("identified", *friction.METHOD_FREE))  # cases that do not depend on the method

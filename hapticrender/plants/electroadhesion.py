@@ -39,7 +39,7 @@ from hapticrender.checks import option, parameter
 from hapticrender.control.estimators import StarSTDFT
 from hapticrender.plants.compiled import CompiledPlant
 from hapticrender.plants.contact import SlidingParameters, new_record, sliding_record
-from hapticrender.plants.electroadhesion_kernels import ATTRACTION, SCREEN, SKIN_VELOCITY, element, screen_step
+from hapticrender.plants.electroadhesion_kernels import SCREEN, element, screen_step
 from hapticrender.plants.gap import VACUUM, gap_record
 from hapticrender.protocols import Array
 
@@ -249,16 +249,6 @@ class ElectroadhesionScreen(CompiledPlant):
         self.parameters, self.compensation = parameters, compensation
         self.noise_channels = 1 + 2 * parameters.oversampling if parameters.sensor == "impedance" else 1
         self.state = screen_record(parameters, finger, compensation)
-
-    @property
-    def skin_velocity(self) -> Array:
-        """Velocity of the skin under friction (m/s, shape (n,)), against the motion, over the last run."""
-        return self.motion[:, SKIN_VELOCITY]
-
-    @property
-    def attraction(self) -> Array:
-        """Mean attraction in each sample of the last run (N, shape (n,))."""
-        return self.motion[:, ATTRACTION]
 
 
 def screen_record(parameters: ElectroadhesionParameters, finger: Finger, compensation: SquareRoot | None) -> Array:

@@ -126,11 +126,6 @@ class HybridPlant(CompiledPlant):
         self.state["noise_channels"] = self.noise_channels
         self.state["input_channels"] = screen.inputs(0, 1).shape[1]
 
-    @property
-    def felt(self) -> Array:
-        """What plate and screen add to the skin's velocity (m/s, shape (n, 2)), over the samples of the last run."""
-        return self.motion[:, 1:]
-
     def inputs(self, first: int, n: int) -> Array:
         """Finger and whatever else the screen takes, sample by sample."""
         return self.screen.inputs(first, n)

@@ -25,6 +25,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.linalg import block_diag
 
 from hapticrender.checks import Validated, parameter
@@ -148,7 +149,7 @@ class PlateParameters(Validated):
             coupling=(self.bending_coil / self.bending_mass, 0.0),
         )
 
-    def displacement(self, position: Array | float) -> Array:
+    def displacement(self, position: ArrayLike) -> Array:
         """Displacement of the glass at `position` (m) per heave, rocking and bending, shape (..., 3).
 
         The bending mode has the shape of a free bar: 1 at the ends, -0.61 in the middle.  The coils have a number of
@@ -175,9 +176,7 @@ class PlateParameters(Validated):
         poles = poles[np.argsort(abs(poles))]
         return abs(poles) / (2 * np.pi), -poles.real / abs(poles)
 
-    def dynamic_stiffness(
-        self, frequency: Array, finger: Array | complex = 0.0, position: Array | float = 0.0
-    ) -> Array:
+    def dynamic_stiffness(self, frequency: Array, finger: Array | complex = 0.0, position: ArrayLike = 0.0) -> Array:
         """D(j w) in heave and rocking (N/m, shape (..., 2, 2)) under a finger impedance (N s/m) at `position` (m).
 
         The glass counts as rigid, also where it bends: near and above `bending_frequency` this is no longer the plate.

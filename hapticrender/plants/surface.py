@@ -21,7 +21,7 @@ from hapticrender.plants.compiled import CompiledPlant
 from hapticrender.plants.contact import SlidingParameters, new_record, sliding_record
 from hapticrender.plants.friction_laws import LAWS, FrictionLaw
 from hapticrender.plants.ultrasonic import LEVELS, UltrasonicParameters, mode_inputs, mode_record
-from hapticrender.plants.ultrasonic_kernels import AMPLITUDE, SKIN_VELOCITY, SURFACE, surface_step
+from hapticrender.plants.ultrasonic_kernels import AMPLITUDE, SURFACE, surface_step
 from hapticrender.protocols import Array
 
 if TYPE_CHECKING:
@@ -212,11 +212,6 @@ class UltrasonicSurface(CompiledPlant):
     def inputs(self, first: int, n: int) -> Array:
         """Inputs of the finger, then damping (N s/m) and resonance (rad/s) of the mode, shape (n, 6)."""
         return mode_inputs(self.parameters.carrier_mode, super().inputs(first, n), first, self.rate)
-
-    @property
-    def skin_velocity(self) -> Array:
-        """Velocity of the skin under friction (m/s, shape (n,)), against the motion, over the last run."""
-        return self.motion[:, SKIN_VELOCITY]
 
     @property
     def amplitude(self) -> Array:
