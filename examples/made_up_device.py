@@ -10,7 +10,7 @@ from scipy.linalg import expm
 import hapticrender as hr
 from hapticrender.control.device_model import DeviceModel
 from hapticrender.renderers.base import BaseRenderer
-from hapticrender.renderers.limits import check_carriers, check_targets, felt
+from hapticrender.renderers.limits import check_carriers, check_targets, perceptible
 
 MASS, DAMPING, STIFFNESS, FORCE, RATE, NOISE = 0.05, 2.0, 20e3, 5.0, 5000.0, 1e-6  # kg N s/m N/m N/A Hz m
 
@@ -64,7 +64,7 @@ class ShakerRenderer(BaseRenderer):
         )  # fmt: skip
 
     def bands(self, scene, model):
-        bands = felt(scene, scene.texture.bands(model.rate), model)
+        bands = perceptible(scene, scene.texture.bands(model.rate), model)
         check_carriers(scene, model, bands)
         check_targets(scene, model, bands, scene.texture.waveform)
         return bands

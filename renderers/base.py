@@ -87,15 +87,8 @@ def check_tables(
 ) -> None:
     """Refuse a key that stands in the wrong table of a scene, or in none.
 
-    Parameters
-    ----------
-    scene : Scene
-    device : collection of str
-        Names of all parameters of the device, those of its model level included.
-    settings : collection of str
-        Names of the renderer's settings.
-    level : collection of str
-        Parameters that say how finely the device is modelled: for the simulation only.
+    `device` names all parameters of the device, those of its model `level` (of the simulation only) included;
+    `settings` those of the renderer.
     """
     simulated = set(device) - {"rate"}
     tables: dict[str, tuple[Mapping[str, Any], Collection[str]]] = {
@@ -105,10 +98,11 @@ def check_tables(
     }
     for table, (values, known) in tables.items():
         for key in values:
-            if key not in known:
-                others = " or ".join(f"[{name}]" for name, (_, names) in tables.items() if key in names)
-                right = f"belongs in {others}" if others else f"no such parameter; known: {', '.join(sorted(known))}"
-                raise ValueError(f"{table}.{key}: {right}")
+            others = " or ".join(f"[{name}]" for name, (_, names) in tables.items() if key in names)
+            if key not in known and others:
+                raise ValueError(f"{table}.{key}: belongs in {others}")
+        with checks.inside(table):
+            checks.check_names(values, known)
 
 
 def read_devices(scene: Scene, kind: type[checks.Validated], level: Collection[str] = ()) -> tuple[Any, Any]:
@@ -126,6 +120,5 @@ def check_channels(driver: Driver, drive: Mapping[int, str], sensed: Mapping[int
     """Refuse a driver whose numbers of channels are not among those in `drive` and `sensed`, each with its meaning."""
     for name, known in (("drive_channels", drive), ("sensed_channels", sensed)):
         found = getattr(driver, name)
-        if found not in known:
-            bound = " or ".join(f"{count} ({meaning})" if meaning else str(count) for count, meaning in known.items())
-            raise ValueError(f"driver.{name} = {found}: must be {bound}")
+        bound = " or ".join(f"{count} ({meaning})" if meaning else str(count) for count, meaning in known.items())
+        checks.require(found in known, f"driver.{name}", found, bound)

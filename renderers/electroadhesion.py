@@ -35,12 +35,11 @@ class ElectroadhesionSettings(FrictionSettings):
     square_root : {"on", "off"}
         Whether the envelope is the root of the target attraction, or proportional to it.
     headroom : float
-        Swing of the drive over what a nominal finger needs, >= 1: what is more is left to the feedback.
+        Swing of the drive over what a nominal finger needs, >= 1.
     floor : float
         Least attraction as a share of the bias, 0 to 0.5; rounds off the cusps of the square root.
     output : {"envelope", "carrier"}
-        What a driver of your own gets: the peak of the carrier, or the carrier itself; that takes a driver
-        without sensors whose rate is at least 4 times the carrier's frequency.
+        Drive of your own driver: the carrier's peak, or the carrier itself (no sensors, rate >= 4 times its frequency).
     """
 
     headroom: float = parameter(ROOM, least=1.0, most=100.0)
@@ -75,10 +74,8 @@ class ScreenSetup(FrictionSetup[ElectroadhesionSettings, ElectroadhesionParamete
         swing = settings.headroom * self.needed(self.model(Port(assumed.rate, 1, 1))).drive
         bias = swing / (1.0 - settings.floor)
         if bias + swing > most:
-            raise ValueError(
-                f"texture.amplitude asks for an attraction of {bias + swing:.3g} N: must be <= {most:.3g} N, "
-                f"what {limit:.3g} {unit} make of a nominal finger of {load:.3g} N"
-            )
+            bound = f"must be <= {most:.3g} N, at {limit:.3g} {unit} under a nominal finger of {load:.3g} N"
+            raise ValueError(f"texture.amplitude asks for an attraction of {bias + swing:.3g} N: {bound}")
         return SquareRoot(bias=bias, floor=settings.floor * bias, gain=gain, straight=settings.square_root == "off")
 
     def model(self, driver: Driver) -> DeviceModel:
@@ -121,12 +118,8 @@ class ElectroadhesionRenderer(FrictionRenderer[ScreenSetup]):
         """Return `driver` behind the square root: it gets the current's envelope (A, peak), or the carrier."""
         if setup.settings.output == "envelope":
             return ShapedDriver(driver, setup.compensation)
-        return CarrierDriver(
-            driver,
-            setup.compensation,
-            frequency=setup.assumed.carrier_frequency,
-            envelope_rate=setup.assumed.rate,
-        )
+        carrier, rate = setup.assumed.carrier_frequency, setup.assumed.rate
+        return CarrierDriver(driver, setup.compensation, frequency=carrier, envelope_rate=rate)
 
     def device_model(self, setup: ScreenSetup, driver: Driver) -> DeviceModel:
         """Return the device model of the screen behind `driver`."""

@@ -1,9 +1,7 @@
 """Common part of friction devices: textures as lateral forces, and the device model of a sliding contact.
 
-A texture says how the skin is to move (m); friction moves it with a force (N).  One feels as strong as the other where
-skin velocities match, F = V/(v/F), with v/F = 0.64 m/(N s) over 20-400 Hz [Grigorii et al. 2021], or the finger's own
-admittance.  The force of a carrier that follows the finger grows with the speed, as the skin velocity of a real grating
-does.
+A texture is a displacement of the skin (m); friction moves it with a force (N).  They match where skin velocities do,
+F = V/(v/F), with v/F = 0.64 m/(N s) over 20-400 Hz [Grigorii et al. 2021], or the finger's own admittance.
 """
 
 from __future__ import annotations
@@ -15,15 +13,16 @@ from typing import Any, Generic, TypeVar
 import numpy as np
 
 from hapticrender.bands import Bands
-from hapticrender.checks import Validated, option, parameter
+from hapticrender.checks import Validated, option, parameter, require
 from hapticrender.control.device_model import DeviceModel, FingerRange
 from hapticrender.plants.contact import SlidingParameters
 from hapticrender.protocols import Array, Driver
 from hapticrender.renderers.base import BaseRenderer, Waveform
-from hapticrender.renderers.limits import Need, check_carriers, examined, felt, needed, speeds, top_speed
+from hapticrender.renderers.limits import Need, check_carriers, examined, needed, perceptible, speeds, top_speed
 from hapticrender.touch.perception import VELOCITY_PER_FORCE
 from hapticrender.touch.scene import Scene
 
+RATIO = "render.velocity_per_force"
 LEAST_FORCE = 1e-3  # N: a smaller friction is too small to estimate the contact from
 ROOM = 2.0  # of the drive that the free device needs: half is left to the feedback
 PLACES = ("friction",)
@@ -36,8 +35,7 @@ class FrictionSettings(Validated):
     Parameters
     ----------
     velocity_per_force : float, m/(N s)
-        Skin velocity that feels as strong as a newton of friction; 0: the finger's own |V_s/F|, for carriers that do
-        not follow it.
+        Skin velocity matched to a newton of friction; 0: the finger's own |V_s/F|, for fixed carriers.
     square_root : {"on", "off"}
         Whether a screen's drive is an attraction (N), or the current's envelope itself.
     """
@@ -61,13 +59,11 @@ class FrictionSetup(Generic[Settings, Parameters]):
 
     @cached_property
     def speed(self) -> float:
-        """Median speed (m/s) of the finger while it slides; friction is felt only then."""
+        """Median speed (m/s) of the finger while it slides."""
         speed, least = speeds(self.scene), self.assumed.least_speed
         sliding = speed[speed >= least]  # NaN, lifted, is none
         if not sliding.size:
-            raise ValueError(
-                f"finger: must slide faster than {least:g} m/s, friction is not felt by one that rests or is lifted"
-            )
+            raise ValueError(f"finger: must slide faster than {least:g} m/s: friction needs a sliding finger")
         return float(np.median(sliding))
 
     @cached_property
@@ -99,13 +95,11 @@ class FrictionSetup(Generic[Settings, Parameters]):
     def targets(self, model: DeviceModel) -> Bands:
         """Carriers and targets of the scene as friction (N)."""
         scene, share = self.scene, self.settings.velocity_per_force
-        if scene.gradient:
-            raise ValueError(f"gradient = {scene.gradient:g} 1/m: must be 0, friction is made under the finger alone")
-        bands = felt(scene, scene.texture.bands(model.rate), model)
+        require(not scene.gradient, "gradient", scene.gradient, "0 1/m: friction is made under the finger alone")
+        bands = perceptible(scene, scene.texture.bands(model.rate), model)
         check_carriers(scene, model, bands)
         if bands.envelope is None:
-            if not share:
-                raise ValueError("render.velocity_per_force = 0: must be > 0 m/(N s) for a recording")
+            require(share > 0, RATIO, share, "> 0 m/(N s) for a recording")
             return replace(bands, differentiated=True)
         return replace(bands, **_as_friction(scene, bands, share))
 
@@ -122,10 +116,8 @@ class FrictionSetup(Generic[Settings, Parameters]):
         speed = top_speed(self.scene) if locked else self.speed
         velocity = need.amplitude * self.settings.velocity_per_force
         if velocity > speed * (1 + 1e-9):  # up to rounding
-            raise ValueError(
-                f"texture.amplitude asks for a skin velocity of {velocity:.3g} m/s: must be <= {speed:.3g} m/s, the "
-                f"{'top' if locked else 'median'} speed of the finger, for friction cannot move the skin faster"
-            )
+            bound = f"must be <= {speed:.3g} m/s, the {'top' if locked else 'median'} speed of the finger"
+            raise ValueError(f"texture.amplitude asks for a skin velocity of {velocity:.3g} m/s: {bound}")
 
     def check_range(self, model: DeviceModel, steady: float) -> None:
         """Refuse a friction, `steady` (N) for the most part, that a tribometer cannot measure."""
@@ -210,12 +202,9 @@ def _as_friction(scene: Scene, bands: Bands, velocity_per_force: float) -> dict[
     locked = bool((bands.wavenumber > 0.0).any())
     share: Array | float = velocity_per_force
     if not velocity_per_force:
-        if locked:
-            raise ValueError("render.velocity_per_force = 0: must be > 0 m/(N s) for a texture over position")
-        if scene.finger.mechanics.order == 0:
-            raise ValueError(
-                "render.velocity_per_force = 0: must be > 0 m/(N s), or finger.mechanics one that moves: it has none"
-            )
+        require(not locked, RATIO, velocity_per_force, "> 0 m/(N s) for a texture over position")
+        moves = scene.finger.mechanics.order > 0
+        require(moves, RATIO, velocity_per_force, "> 0 m/(N s), or finger.mechanics not 'none'")
         share = scene.finger.mechanics.skin_velocity_per_force(bands.frequency)
     if locked:
         return {"envelope": bands.envelope / share, "differentiated": True}

@@ -1,7 +1,7 @@
 """Hybrid: low bands on a vibrotactile plate, high bands by the friction of an electroadhesion screen on it.
 
-The target quantity is the velocity of the skin (m/s), to which both add [Grigorii et al. 2021, who propose it].  Both
-parts take a share of every band, and the shares sum to one at every frequency: the screen's is
+The target quantity is the velocity of the skin (m/s), to which both add [Grigorii et al. 2021, who propose it].  The
+shares of both sum to one at every frequency: the screen's is
 
     s(f) = e(f/F - 1),   e(x) = x^2 (3 - 2 x) from 0 to 1,
 
@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from hapticrender.bands import Bands
-from hapticrender.checks import Validated, check_names, inside, parameter
+from hapticrender.checks import Validated, check_names, inside, parameter, require
 from hapticrender.control.combined import CombinedBands, CombinedController, CombinedModel, design_combined
 from hapticrender.control.device_model import DeviceModel
 from hapticrender.plants.electroadhesion import ElectroadhesionParameters, ElectroadhesionScreen
@@ -27,7 +27,8 @@ from hapticrender.plants.plate import PlateParameters
 from hapticrender.protocols import Array, Driver, Method, Sensed, Texture
 from hapticrender.renderers.base import BaseRenderer, check_channels
 from hapticrender.renderers.electroadhesion import ElectroadhesionRenderer, ElectroadhesionSettings, ScreenSetup
-from hapticrender.renderers.limits import check_carriers, felt
+from hapticrender.renderers.friction import RATIO
+from hapticrender.renderers.limits import check_carriers, perceptible
 from hapticrender.renderers.shaped import Port, WrappedDriver
 from hapticrender.renderers.vibrotactile import PlateSetup, VibrotactileRenderer
 from hapticrender.touch.scene import Scene
@@ -78,21 +79,9 @@ class Shared:
 class HybridDriver(WrappedDriver):
     """A user's driver with the square root before the screen, and the skin's velocity computed from its sensors.
 
-    Parameters
-    ----------
-    driver : Driver
-        Drive: both coils (A), then the envelope of the screen's current (A, peak).  Sensed: both ends of the plate (m),
-        then friction (N); or nothing.
-    shape : callable
-        The screen's drive from that of the controller.
-    displacement : ndarray, shape (2, 2)
-        Heave (m) and tilt (rad) of the plate per sensor.
-    velocity_per_force : float, m/(N s)
-        Skin velocity that feels as strong as a newton of friction.
-
-    Notes
-    -----
-    Velocity is the difference to the sample before, half a sample late.
+    The driver takes both coils' drive (A), then the envelope of the screen's current (A, peak): `shape` of the
+    controller's.  It senses both ends of the plate (m), then friction (N); or nothing.  `displacement` (2, 2) is heave
+    (m) and tilt (rad) per sensor; velocity is the difference to the sample before, delayed by half a sample.
     """
 
     def __init__(self, driver: Driver, shape: Any, displacement: Array, velocity_per_force: float) -> None:
@@ -142,19 +131,17 @@ class HybridRenderer(BaseRenderer[HybridSetup]):
 
     def read(self, scene: Scene, driver: Driver | None) -> HybridSetup:
         """Read the tables of a scene and share out its bands."""
-        if scene.gradient:
-            raise ValueError(f"gradient = {scene.gradient:g} 1/m: must be 0, friction is made under the finger alone")
+        require(not scene.gradient, "gradient", scene.gradient, "0 1/m: friction is made under the finger alone")
         settings, plate, screen = _split(scene)
         of_screen = self._screen.read(screen, driver)
         velocity_per_force = of_screen.settings.velocity_per_force
-        if not velocity_per_force > 0.0:
-            raise ValueError("render.velocity_per_force = 0: must be > 0 m/(N s), by it velocity and friction add up")
+        require(velocity_per_force > 0.0, RATIO, velocity_per_force, "> 0 m/(N s): it adds velocity and friction")
         plate = replace(plate, profile={BOTH: of_screen.assumed.rate, **plate.profile})
         of_plate = self._plate.read(plate, driver)
         for name, needed in (("coils", COILS), ("delay", 1)):
             for table, device in (("device", of_plate.assumed), ("simulation", of_plate.simulated)):
-                if getattr(device, name) != needed:
-                    raise ValueError(f"{table}.{name} = {getattr(device, name)}: must be {needed} on a hybrid")
+                found = getattr(device, name)
+                require(found == needed, f"{table}.{name}", found, f"{needed} on a hybrid")
         rate = of_screen.assumed.rate if driver is None else driver.rate
         bands = _share_out(scene, settings, of_plate.assumed, rate)
         return HybridSetup(
@@ -203,8 +190,7 @@ class HybridRenderer(BaseRenderer[HybridSetup]):
         """Carriers and targets of a scene, shared out; refused where a part cannot do its share."""
         bands = setup.bands
         check_carriers(setup.scene, model, bands)
-        if not isinstance(model, CombinedModel):
-            raise TypeError(f"model: must be the CombinedModel of device_model, not {type(model).__name__}")
+        require(isinstance(model, CombinedModel), "model", model, "the CombinedModel of device_model", TypeError)
         if len(bands.plate):
             bands = replace(bands, plate=self._plate.bands(setup.plate, model.plate))
         if model.friction is not None and setup.friction is not None:
@@ -213,9 +199,7 @@ class HybridRenderer(BaseRenderer[HybridSetup]):
 
     def design(self, method: Method, model: DeviceModel, bands: Bands, *, feedback: bool = True) -> CombinedController:
         """Return two controllers of `method`, one a part, as one."""
-        if not (isinstance(model, CombinedModel) and isinstance(bands, CombinedBands)):
-            raise TypeError("model, bands: must be those of device_model and bands")
-        return design_combined(method, model, bands, feedback=feedback)
+        return design_combined(method, model, bands, feedback=feedback)  # type: ignore[arg-type]
 
 
 def _part_of(driver: Driver, drive: int, sensed: int, name: str) -> Driver:
@@ -231,67 +215,57 @@ def _part(scene: Scene, bands: Bands) -> Scene:
 
 def _share_out(scene: Scene, settings: HybridSettings, plate: PlateParameters, rate: float) -> CombinedBands:
     """Bands of a scene, and the share of each part as displacement (m)."""
-    whole = felt(scene, scene.texture.bands(rate), plate.device_model(rate, 1))
+    whole = perceptible(scene, scene.texture.bands(rate), plate.device_model(rate, 1))
     locked = whole.wavenumber > 0.0
     if whole.envelope is None and not locked.all():
-        raise ValueError(
-            "texture: time-domain recordings are not supported on a hybrid; use a grating or a texture over position"
-        )
+        raise ValueError("texture: a recording over time is not supported on a hybrid: use one over position")
     high = settings.share_of_screen(whole.frequency)
     shares = np.where(locked, 1.0, 1.0 - high), np.where(locked, 1.0, high)  # locked: the fades of the banks share
     index = [np.flatnonzero(share > 0.0) for share in shares]
-    own = [
-        replace(
-            whole,
-            frequency=whole.frequency[which],
-            wavenumber=whole.wavenumber[which],
-            phase=whole.phase[which],
-            envelope=None if whole.envelope is None else (share * whole.envelope)[which],
-            unfelt=(),
-        )
-        for share, which in zip(shares, index, strict=True)
-    ]
+    changes = [{} if whole.envelope is None else {"envelope": (share * whole.envelope)} for share in shares]
+    plate_bands, friction_bands = (
+        replace(whole, **change).select(which, unfelt=()) for change, which in zip(changes, index, strict=True)
+    )
     common = {each.name: getattr(whole, each.name) for each in fields(Bands)}
-    return CombinedBands(**common, plate=own[0], friction=own[1], plate_index=index[0], friction_index=index[1])
+    return CombinedBands(
+        **common, plate=plate_bands, friction=friction_bands, plate_index=index[0], friction_index=index[1]
+    )
 
 
 def _split(scene: Scene) -> tuple[HybridSettings, Scene, Scene]:
-    """Settings of the hybrid, and the scene with the tables of the plate, and of the screen.
-
-    A parameter that both have goes by `plate_` or `screen_` before its name, but for the rate that they share.
-    """
+    """Settings of the hybrid, and the scene with the tables of the plate, and of the screen."""
+    own, of_screen = HybridSettings.names(), ElectroadhesionSettings.names()
     with inside("render"):
-        own = HybridSettings.names()
-        check_names(scene.rendering, own | ElectroadhesionSettings.names())
+        check_names(scene.rendering, own | of_screen)
         settings = HybridSettings(**{key: value for key, value in scene.rendering.items() if key in own})
-    screen_settings = {key: value for key, value in scene.rendering.items() if key not in own}
-    tables: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {}
+    tables: list[dict[str, Any]] = [{}, {}]
     for field, table in (("profile", "device"), ("simulation", "simulation")):
         with inside(table):
-            tables[field] = _split_table(getattr(scene, field), own | ElectroadhesionSettings.names())
-    plate, screen = ({field: table[part] for field, table in tables.items()} for part in (0, 1))
-    return settings, replace(scene, **plate, rendering={}), replace(scene, **screen, rendering=screen_settings)
+            for part, values in zip(tables, _split_table(getattr(scene, field), own | of_screen), strict=True):
+                part[field] = values
+    tables[0]["rendering"] = {}
+    tables[1]["rendering"] = {key: value for key, value in scene.rendering.items() if key not in own}
+    return settings, replace(scene, **tables[0]), replace(scene, **tables[1])
 
 
-def _split_table(values: Mapping[str, Any], settings: set[str]) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Parameters of the plate and of the screen."""
+def _split_table(values: Mapping[str, Any], settings: set[str]) -> list[dict[str, Any]]:
+    """Parameters of the plate and of the screen.
+
+    A parameter that both have has `plate_` or `screen_` before its name, but for the rate that they share.
+    """
     plate, screen = PlateParameters.names(), ElectroadhesionParameters.names()
     double = plate & screen - {BOTH}
-    found: tuple[dict[str, Any], dict[str, Any]] = {}, {}
+    known = [
+        {prefix + name if name in double else name: name for name in names}
+        for prefix, names in (("plate_", plate), ("screen_", screen))
+    ]
     for key, value in values.items():
         if key in double:
             raise ValueError(f"{key} = {value!r}: must be plate_{key} or screen_{key}: both have one")
         if key in settings:
             raise ValueError(f"{key}: belongs in [render]")
-        for table, names, part in ((found[0], plate, "plate_"), (found[1], screen, "screen_")):
-            name = key.removeprefix(part)
-            if name in names and (name == key or name in double):
-                table[name] = value
-        if not any(key.removeprefix(part) in table for table, part in zip(found, ("plate_", "screen_"), strict=True)):
-            prefixed = {f"{part}_{each}" for each in double for part in ("plate", "screen")}
-            known = ", ".join(sorted((plate | screen) - double | prefixed))
-            raise ValueError(f"{key}: no such parameter; known: {known}")
-    return found
+    check_names(values, known[0] | known[1])
+    return [{names[key]: value for key, value in values.items() if key in names} for names in known]
 
 
 def _side_by_side(plate: DeviceModel, friction: DeviceModel | None, velocity_per_force: float) -> CombinedModel:

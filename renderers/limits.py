@@ -1,8 +1,7 @@
-"""Limits common to all devices: carriers beyond the rate, targets beyond drive or sensors, fingers off the surface."""
+"""Limits common to all devices: of carriers by the rate, of targets by drive and sensors, of the finger's path."""
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -46,51 +45,44 @@ def top_speed(scene: Scene) -> float:
     return float(np.nanmax(speeds(scene), initial=0.0))
 
 
-def felt(scene: Scene, bands: Bands, model: DeviceModel) -> Bands:
-    """Leave out the bands that cannot be felt, unless the scene keeps them, and note which and why."""
+def perceptible(scene: Scene, bands: Bands, model: DeviceModel) -> Bands:
+    """Leave out the bands below the detection threshold, unless the scene keeps them; note which and why."""
     if not isinstance(bands, Bands):
         kind = type(scene.texture).__name__
         raise TypeError(f"{kind}.bands returned {type(bands).__name__}: must be hapticrender.Bands")
     if scene.keep_unfelt:
         return bands
-    left, dropped = drop_unfelt(
+    return drop_unfelt(
         bands,
         top_speed=min(top_speed(scene), FASTEST),
         lowest=max(model.lowest_frequency / 2, 1.0),
         highest=model.highest_edge * model.highest_frequency,
     )
-    return replace(left, unfelt=tuple(each.text() for each in dropped))
 
 
 def check_carriers(scene: Scene, model: DeviceModel, bands: Bands) -> None:
     """Refuse carriers that the rate cannot carry, at the finger's top speed too."""
-    highest = NYQUIST_MARGIN * model.rate
-    if bands.frequency.max(initial=0.0) > highest:
-        raise ValueError(
-            f"texture.frequency = {bands.frequency.max():g}: must be <= {highest:g} Hz, "
-            f"{NYQUIST_MARGIN} of the rate of {model.rate:g} Hz"
-        )
-    fastest = top_speed(scene) * bands.wavenumber.max(initial=0.0)
-    if fastest > highest:
-        raise ValueError(
-            f"texture.wavelength = {1 / bands.wavenumber.max():g} m passes at {fastest:g} Hz at the finger's "
-            f"{top_speed(scene):g} m/s: must be <= {highest:g} Hz"
-        )
+    highest, frequency = NYQUIST_MARGIN * model.rate, bands.frequency.max(initial=0.0)
+    if frequency > highest:
+        bound = f"must be <= {highest:g} Hz, {NYQUIST_MARGIN} of the rate of {model.rate:g} Hz"
+        raise ValueError(f"texture.frequency = {frequency:g}: {bound}")
+    speed, wavenumber = top_speed(scene), bands.wavenumber.max(initial=0.0)
+    if speed * wavenumber > highest:
+        passing = f"passes at {speed * wavenumber:g} Hz at the finger's {speed:g} m/s"
+        raise ValueError(f"texture.wavelength = {1 / wavenumber:g} m {passing}: must be <= {highest:g} Hz")
 
 
 def check_targets(scene: Scene, model: DeviceModel, bands: Bands, waveform: Waveform) -> None:
     """Refuse targets that the free device cannot reach within its drive, or that its sensors cannot follow."""
-    need = needed(scene, model, bands, waveform)
+    need, unit, drive_unit = needed(scene, model, bands, waveform), model.unit, model.drive_unit
+    verb = "=" if unit == "m" else "asks for"
     if need.amplitude > model.sensed_limit:
-        raise ValueError(
-            f"{_named(need.amplitude, model)}: must be <= {model.sensed_limit:g} {model.unit}, the sensors' range"
-        )
+        bound = f"must be <= {model.sensed_limit:g} {unit}, the sensors' range"
+        raise ValueError(f"texture.amplitude {verb} {need.amplitude:.3g} {unit}: {bound}")
     if need.drive > model.drive_limit:
-        each = " in each coil" if model.drive_unit == "A" else ""
-        raise ValueError(
-            f"{_named(need.worst, model)} at {need.frequency:.3g} Hz needs {need.drive:.3g} {model.drive_unit}: "
-            f"must be <= {model.drive_limit:g} {model.drive_unit}{each}"
-        )
+        bound = f"must be <= {model.drive_limit:g} {drive_unit}{' in each coil' if drive_unit == 'A' else ''}"
+        needs = f"at {need.frequency:.3g} Hz needs {need.drive:.3g} {drive_unit}"
+        raise ValueError(f"texture.amplitude {verb} {need.worst:.3g} {unit} {needs}: {bound}")
 
 
 class Need(NamedTuple):
@@ -103,14 +95,12 @@ class Need(NamedTuple):
 
 
 def needed(scene: Scene, model: DeviceModel, bands: Bands, waveform: Waveform) -> Need:
-    """Amplitude and drive that a scene's targets need of the free device."""
+    """Amplitude and drive that a scene's targets need of the free device.
+
+    A finger-locked carrier of a constant target passes every frequency up to that of the finger's top speed.
+    """
     if bands.envelope is None:
         return _need_of_waveform(scene, model, bands, waveform)
-    return _need_of_envelopes(scene, model, bands)
-
-
-def _need_of_envelopes(scene: Scene, model: DeviceModel, bands: Bands) -> Need:
-    """Constant targets: a finger-locked carrier passes every frequency up to that of the finger's top speed."""
     sweep = np.minimum(top_speed(scene) * bands.wavenumber, model.highest_edge * model.highest_frequency)
     top = bands.frequency + sweep
     low = np.where(bands.wavenumber > 0.0, np.minimum(model.lowest_frequency, top), top)
@@ -118,13 +108,9 @@ def _need_of_envelopes(scene: Scene, model: DeviceModel, bands: Bands) -> Need:
     target = abs(bands.envelope) * (2 * np.pi * passed if bands.differentiated else np.ones_like(passed))
     drive = target / common_gain(model, passed)
     worst = int(drive.max(axis=0).argmax())
-    at = int(drive[:, worst].argmax())
-    return Need(
-        float(target.max(axis=0).sum()),
-        float(drive.max(axis=0).sum()),
-        float(target[at, worst]),
-        float(passed[at, worst]),
-    )
+    at = int(drive[:, worst].argmax()), worst
+    sums = (float(each.max(axis=0).sum()) for each in (target, drive))
+    return Need(*sums, float(target[at]), float(passed[at]))
 
 
 def _need_of_waveform(scene: Scene, model: DeviceModel, bands: Bands, waveform: Waveform) -> Need:
@@ -141,12 +127,6 @@ def _need_of_waveform(scene: Scene, model: DeviceModel, bands: Bands, waveform: 
     drive = abs(np.fft.irfft(spectrum / gain, len(time))).max()
     amplitude = float(abs(target).max())
     return Need(amplitude, float(drive), amplitude, float(frequency[abs(spectrum).argmax()]))
-
-
-def _named(amplitude: float, model: DeviceModel) -> str:
-    """Name a target in the device's quantity."""
-    verb = "=" if model.unit == "m" else "asks for"
-    return f"texture.amplitude {verb} {amplitude:.3g} {model.unit}"
 
 
 def common_gain(model: DeviceModel, frequency: Array) -> Array:

@@ -1,18 +1,13 @@
-"""A user's resonant plate as a driver of friction, through the friction law and the amplitude's own controller.
-
-The device plays volts and senses the displacement of its mode, both at the carrier's rate.  The friction loop has the
-interface of the simulated surface: friction (N) in, and the friction that follows from the sensed amplitude out, at a
-fraction of that rate.
-"""
+"""A user's resonant plate as a driver of friction, through the friction law and the amplitude's own controller."""
 
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
 from hapticrender import defaults
+from hapticrender.checks import require
 from hapticrender.control.controller import BankController
 from hapticrender.control.kernel import finger_damping, observed_envelope
 from hapticrender.control.methods import method_named
@@ -23,7 +18,7 @@ from hapticrender.plants.surface import SurfaceParameters, full_slew
 from hapticrender.plants.ultrasonic_kernels import amplitude_decay, references_within_reach
 from hapticrender.protocols import Array, Driver, Flag, Sensed
 from hapticrender.renderers.base import check_channels
-from hapticrender.renderers.shaped import WrappedDriver
+from hapticrender.renderers.shaped import WrappedDriver, thinned
 from hapticrender.touch.finger import Finger
 
 LONGEST_DELAY = 0.25e-3  # s: a tenth of a turn of 400 Hz, 3 % off there, and beyond 10 % half as late again
@@ -31,6 +26,9 @@ LONGEST_DELAY = 0.25e-3  # s: a tenth of a turn of 400 Hz, 3 % off there, and be
 
 class ResonantDriver(WrappedDriver):
     """A driver of friction (N) on a device that vibrates: its drive in V, its sensor in m of the mode.
+
+    The device works at the carrier's rate; friction (N) goes in, and what follows from the sensed amplitude comes out,
+    at a fraction of that rate.
 
     Parameters
     ----------
@@ -45,11 +43,6 @@ class ResonantDriver(WrappedDriver):
     nominal : (float, float), N and m/s
         Load and speed that the amplitude is held for while no finger is there.
 
-    Attributes
-    ----------
-    loop : BankController
-        The amplitude's own controller, on the device's samples.
-
     Raises
     ------
     ValueError
@@ -57,10 +50,9 @@ class ResonantDriver(WrappedDriver):
 
     Notes
     -----
-    A friction acts a block of the device after it was handed over, and appears as amplitude within the device's own
-    delay: `delay` is their sum.  The amplitude loop steps with every sample, its resonance lock as well, however long
-    the device's blocks are; its finger estimate is limited by the delay, and takes a late response for a finger: a
-    texture of f Hz behind a delay d is up to 1 % off at f d = 1/15 and 7 % at 1/10.
+    `delay` is a block of the device plus its own delay.  The amplitude loop (`loop`) and its resonance lock step with
+    every sample of the device, however long its blocks are.  The finger estimate takes the delay d for a finger: a
+    texture of f Hz is up to 1 % off at f d = 1/15 and 7 % at 1/10.
     """
 
     def __init__(
@@ -122,29 +114,29 @@ class ResonantDriver(WrappedDriver):
 
     def _within_reach(self, lines: Array, flags: Array) -> Array:
         """Amplitude (m) to which the drive can take the mode at every sample of the device, on its way on `lines`."""
-        asked, first = lines.ravel().copy(), 0
+        target, first = lines.ravel().copy(), 0
         if self._reached < 0.0:  # from rest the loop's own ramp is slower
             first, self._reached = self.parameters.oversampling, lines[0, -1]
         mode, loop = self.parameters.carrier_mode, self.loop
         finger = finger_damping(loop.state.ctypes.data)
         decay = amplitude_decay(float(mode.damping()), finger, mode.mass, 1.0 / mode.rate)
-        rest = asked[first:]
+        rest = target[first:]
         references_within_reach(rest, self._reached, full_slew(mode), decay, rest, flags.ravel()[first:])
-        self._reached = asked[-1]
-        return asked
+        self._reached = target[-1]
+        return target
 
-    def _carry(self, asked: Array, flags: Array) -> tuple[Array, list[Sensed]]:
-        """Take the amplitude along `asked` (m); amplitude measured in each sample of friction, and what was played."""
+    def _carry(self, target: Array, flags: Array) -> tuple[Array, list[Sensed]]:
+        """Take the amplitude along `target` (m); amplitude measured in each sample of friction, and what was played."""
         step, many, long = self._piece, self.parameters.oversampling, self.driver.block
         measured, played = np.empty(self.block), []
         away, silent = np.full(step, np.nan), np.zeros((step, 1))
-        for start in range(0, len(asked), step):
+        for start in range(0, len(target), step):
             at = start % long
             if at == 0:
                 played.append(check_sensed(self.driver, self.driver.play(self._drive), 1))
             here = slice(at, at + step)
             sensed = played[-1].sensed[here] if self.sensed_channels else silent
-            self._next[here], _, raised = self.loop.run(sensed, away, asked[start : start + step])
+            self._next[here], _, raised = self.loop.run(sensed, away, target[start : start + step])
             flags[start : start + step] |= raised
             if at + step == long:
                 self._drive = self._next.copy()
@@ -154,38 +146,29 @@ class ResonantDriver(WrappedDriver):
 
     def _sensed(self, friction: Array, played: list[Sensed], flags: Array) -> Sensed:
         """Measurements of the finger and flags, once a sample of friction; the mode's motion is left out."""
-        many = self.parameters.oversampling
-        columns: dict[str, Any] = {}
-        for name in ("position", "normal_load", "flags"):
-            parts = [getattr(each, name) for each in played]
-            columns[name] = None if any(each is None for each in parts) else np.concatenate(parts)
-        if columns["flags"] is not None:
-            flags |= np.bitwise_or.reduce(columns["flags"].reshape(-1, many), axis=1)
-        finger = {name: columns[name][::many] for name in ("position", "normal_load") if columns[name] is not None}
-        return Sensed(friction if self.sensed_channels else np.empty((self.block, 0)), flags=flags, **finger)
+        columns = zip(*played, strict=True)
+        whole = Sensed(*(None if any(part is None for part in parts) else np.concatenate(parts) for parts in columns))
+        device = thinned(whole, self.parameters.oversampling)
+        flags = flags if device.flags is None else flags | device.flags
+        return device._replace(sensed=friction if self.sensed_channels else friction[:, :0], motion=None, flags=flags)
 
 
 def _multiple(driver: Driver, parameters: SurfaceParameters) -> int:
     """Samples of the device in one of the friction; refuses a device that has none."""
     check_channels(driver, {1: ""}, {0: "", 1: ""})
-    many = round(driver.rate / parameters.rate)
-    if many < 1 or abs(driver.rate - many * parameters.rate) > 1e-9 * driver.rate:
-        raise ValueError(
-            f"driver.rate = {driver.rate:g}: must be a whole multiple of device.rate = {parameters.rate:g} Hz"
-        )
-    if driver.block % many and many % driver.block:
-        raise ValueError(
-            f"driver.block = {driver.block}: must be a multiple of {many} samples, {driver.rate:g} Hz over "
-            "device.rate, or divide them"
-        )
-    late = driver.delay / driver.rate
-    if driver.sensed_channels and late > LONGEST_DELAY * (1 + 1e-9):
-        raise ValueError(
-            f"driver.delay = {driver.delay} samples, {late:.3g} s: must be <= {LONGEST_DELAY:g} s for an amplitude to "
-            "follow a texture in closed loop; a driver without sensed channels is driven open loop"
-        )
-    if parameters.sensor != "amplitude":
-        raise ValueError(f"device.sensor = {parameters.sensor!r}: must be 'amplitude', the only one for a driver")
+    rate, block, delay = driver.rate, driver.block, driver.delay / driver.rate
+    many = round(rate / parameters.rate)
+    whole = many >= 1 and abs(rate - many * parameters.rate) <= 1e-9 * rate
+    require(whole, "driver.rate", rate, f"a whole multiple of device.rate = {parameters.rate:g} Hz")
+    bound = f"a multiple of {many} samples, {rate:g} Hz over device.rate, or divide them"
+    require(not (block % many and many % block), "driver.block", block, bound)
+    bound = (
+        f"<= {LONGEST_DELAY * rate:g} samples, {LONGEST_DELAY:g} s, for an amplitude to follow a texture in closed "
+        "loop; a driver without sensed channels is driven open loop"
+    )
+    close = not driver.sensed_channels or delay <= LONGEST_DELAY * (1 + 1e-9)
+    require(close, "driver.delay", driver.delay, bound)
+    require(parameters.sensor == "amplitude", "device.sensor", parameters.sensor, "'amplitude' for a driver")
     return many
 
 

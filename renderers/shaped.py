@@ -9,6 +9,7 @@ from typing import Any, Self
 
 import numpy as np
 
+from hapticrender.checks import require
 from hapticrender.protocols import Array, Driver, Sensed
 
 LEAST_SAMPLES = 4  # in a turn of a carrier
@@ -27,13 +28,7 @@ class Port:
 
 
 class WrappedDriver:
-    """A driver whose drive or measurements are converted on the way; a subclass fills in `play`.
-
-    Parameters
-    ----------
-    driver : Driver
-        The device.
-    """
+    """A driver whose drive or measurements are converted on the way; a subclass fills in `play`."""
 
     def __init__(self, driver: Driver) -> None:
         self.driver = driver
@@ -52,16 +47,16 @@ class WrappedDriver:
         raise NotImplementedError
 
 
-class ShapedDriver(WrappedDriver):
-    """A driver that plays `shape` of its drive.
+def thinned(sensed: Sensed, hold: int) -> Sensed:
+    """Measurements once in `hold` samples; flags of all of them."""
+    first = Sensed(*(None if column is None else column[::hold] for column in sensed))
+    if sensed.flags is None:
+        return first
+    return first._replace(flags=np.bitwise_or.reduce(np.reshape(sensed.flags, (-1, hold)), axis=1))
 
-    Parameters
-    ----------
-    driver : Driver
-        The device.
-    shape : callable
-        Drive of the device from that of the controller, sample by sample, of one shape (n, channels).
-    """
+
+class ShapedDriver(WrappedDriver):
+    """A driver that plays `shape` of its drive: the device's from the controller's, sample by sample (n, channels)."""
 
     def __init__(self, driver: Driver, shape: Callable[[Array], Any]) -> None:
         super().__init__(driver)
@@ -96,16 +91,11 @@ class CarrierDriver(ShapedDriver):
     def __init__(
         self, driver: Driver, shape: Callable[[Array], Any], *, frequency: float, envelope_rate: float
     ) -> None:
-        if driver.sensed_channels:
-            raise ValueError(
-                f"driver.sensed_channels = {driver.sensed_channels}: must be 0 where output = 'carrier'; "
-                "a driver that senses gets the envelope"
-            )
-        if driver.rate < LEAST_SAMPLES * frequency:
-            raise ValueError(
-                f"driver.rate = {driver.rate:g} Hz: must be >= {LEAST_SAMPLES * frequency:g} Hz where output = "
-                f"'carrier', {LEAST_SAMPLES} samples a turn of {frequency:g} Hz"
-            )
+        senses, least = driver.sensed_channels, LEAST_SAMPLES * frequency
+        bound = "0 where output = 'carrier'; a driver that senses gets the envelope"
+        require(not senses, "driver.sensed_channels", senses, bound)
+        bound = f">= {least:g} Hz where output = 'carrier', {LEAST_SAMPLES} samples a turn of {frequency:g} Hz"
+        require(driver.rate >= least, "driver.rate", driver.rate, bound)
         super().__init__(driver, shape)
         whole = math.gcd(driver.block, driver.delay)
         most = max(int(driver.rate / envelope_rate), 1)
@@ -121,11 +111,4 @@ class CarrierDriver(ShapedDriver):
         carrier = np.cos(2 * np.pi * (self._turns + self._step * np.arange(count))) / self._droop
         self._turns = (self._turns + self._step * count) % 1.0
         sensed = self.driver.play(np.repeat(self.shape(drive), self.hold, axis=0) * carrier[:, None])
-        return self._thinned(sensed)
-
-    def _thinned(self, sensed: Sensed) -> Sensed:
-        """Return what was measured, once a sample of the envelope; flags of all of its samples."""
-        thinned = Sensed(*(None if column is None else column[:: self.hold] for column in sensed))
-        if sensed.flags is None:
-            return thinned
-        return thinned._replace(flags=np.bitwise_or.reduce(np.reshape(sensed.flags, (-1, self.hold)), axis=1))
+        return thinned(sensed, self.hold)

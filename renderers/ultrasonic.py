@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 
 from hapticrender.bands import Bands
-from hapticrender.checks import inside
+from hapticrender.checks import inside, require
 from hapticrender.control.device_model import DeviceModel
 from hapticrender.plants.friction_laws import LAWS
 from hapticrender.plants.surface import SurfaceParameters, UltrasonicSurface
@@ -62,10 +62,8 @@ class UltrasonicRenderer(FrictionRenderer[SurfaceSetup]):
         room = whole * min(1.0 - assumed.bias, assumed.bias - assumed.friction_law.floor)
         need = setup.needed(model).drive
         if need > room:
-            raise ValueError(
-                f"texture.amplitude asks for {need:.3g} N of friction: must be <= {room:.3g} N, what amplitude can "
-                f"change around {assumed.bias:g} of the friction of a finger of {load:.3g} N"
-            )
+            bound = f"must be <= {room:.3g} N, around {assumed.bias:g} of the friction of a finger of {load:.3g} N"
+            raise ValueError(f"texture.amplitude asks for {need:.3g} N of friction: {bound}")
         if driver.sensed_channels and assumed.sensor == "tribometer":
             setup.check_range(model, assumed.friction_coefficient * setup.largest_load)
         _check_amplitude(assumed, need / whole, load, setup.speed)
@@ -73,32 +71,29 @@ class UltrasonicRenderer(FrictionRenderer[SurfaceSetup]):
 
     def bands(self, setup: SurfaceSetup, model: DeviceModel) -> Bands:
         """Carriers and targets of a scene, refused where the amplitude could not follow."""
-        bands = super().bands(setup, model)
-        if bands.frequency.max(initial=0.0) > model.highest_frequency:
-            raise ValueError(
-                f"texture.frequency = {bands.frequency.max():g}: must be <= {model.highest_frequency:g} Hz, "
-                "which the amplitude can follow"
-            )
+        bands, highest = super().bands(setup, model), model.highest_frequency
+        frequency = float(bands.frequency.max(initial=0.0))
+        require(frequency <= highest, "texture.frequency", frequency, f"<= {highest:g} Hz, as fast as the amplitude is")
         return bands
 
 
 def _model(setup: SurfaceSetup, driver: Driver) -> DeviceModel:
     """Device model without its drive limit; the amplitude's interpolation adds half a sample to that of a hold."""
-    assumed, late = setup.assumed, 0.5 / driver.rate
+    assumed, lag = setup.assumed, 0.5 / driver.rate
     model = setup.contact(driver, 1.0)
     if driver.sensed_channels and assumed.sensor == "amplitude":  # no contact and no tribometer between
         return replace(
             model,
-            mass=late**2 / 2 * np.eye(1),
-            damping=late * np.eye(1),
+            mass=lag**2 / 2 * np.eye(1),
+            damping=lag * np.eye(1),
             stiffness=np.eye(1),
             contact_damping=0.0,
             sensor_delay=0.0,
             contact_lag=assumed.memory_length,
             sensed_noise=LEAST_NOISE * model.sensed_limit,
         )
-    mass = model.mass + late * model.damping + late**2 / 2 * model.stiffness
-    return replace(model, mass=mass, damping=model.damping + late * model.stiffness)
+    mass = model.mass + lag * model.damping + lag**2 / 2 * model.stiffness
+    return replace(model, mass=mass, damping=model.damping + lag * model.stiffness)
 
 
 def _check_amplitude(surface: SurfaceParameters, swing: float, load: float, speed: float) -> None:
@@ -108,7 +103,5 @@ def _check_amplitude(surface: SurfaceParameters, swing: float, load: float, spee
     mode = surface.mode
     volts = mode.drive_for(amplitude, normal_load=load)
     if volts > mode.drive_limit:
-        raise ValueError(
-            f"texture.amplitude asks for a vibration of {amplitude:.3g} m, which takes {volts:.3g} V under "
-            f"{load:.3g} N: must be <= {mode.drive_limit:g} V"
-        )
+        needs = f"{amplitude:.3g} m, which takes {volts:.3g} V under {load:.3g} N"
+        raise ValueError(f"texture.amplitude asks for a vibration of {needs}: must be <= {mode.drive_limit:g} V")

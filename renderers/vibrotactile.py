@@ -10,11 +10,12 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 from hapticrender.bands import Bands
+from hapticrender.checks import require
 from hapticrender.control.device_model import DeviceModel
 from hapticrender.plants.plate import EXPECTED_BENDING, Plate, PlateParameters
 from hapticrender.protocols import Driver
 from hapticrender.renderers.base import BaseRenderer, check_channels, check_tables, read_devices
-from hapticrender.renderers.limits import check_carriers, check_path, check_targets, felt
+from hapticrender.renderers.limits import check_carriers, check_path, check_targets, perceptible
 from hapticrender.touch.scene import Scene
 
 STEEPEST = 1.0  # change of the amplitude from the middle to an end
@@ -43,10 +44,8 @@ class VibrotactileRenderer(BaseRenderer[PlateSetup]):
 
     def plant(self, setup: PlateSetup, seed: int) -> Plate:
         """Return the simulated plate with the scene's finger on it."""
-        if setup.simulated.coils != setup.assumed.coils:
-            raise ValueError(
-                f"simulation.coils = {setup.simulated.coils}: must be {setup.assumed.coils}, as in [device]"
-            )
+        coils, assumed = setup.simulated.coils, setup.assumed.coils
+        require(coils == assumed, "simulation.coils", coils, f"{assumed}, as in [device]")
         check_path(setup.scene, setup.simulated.glass_length / 2, "glass")
         return Plate(setup.simulated, setup.scene.finger, seed)
 
@@ -67,7 +66,7 @@ class VibrotactileRenderer(BaseRenderer[PlateSetup]):
     def bands(self, setup: PlateSetup, model: DeviceModel) -> Bands:
         """Carriers and targets of a scene, refused where they pass Nyquist or the current limit."""
         scene = setup.scene
-        bands = felt(scene, scene.texture.bands(model.rate), model)
+        bands = perceptible(scene, scene.texture.bands(model.rate), model)
         check_carriers(scene, model, bands)
         check_targets(scene, model, bands, scene.texture.waveform)
         return bands
@@ -75,11 +74,8 @@ class VibrotactileRenderer(BaseRenderer[PlateSetup]):
 
 def _pattern(scene: Scene, plate: PlateParameters) -> tuple[float, float]:
     """Heave and rocking of an amplitude 1 + gradient x: displacement at x is x_c + (x/a) a theta."""
-    if plate.coils == 1:
-        raise ValueError(f"gradient = {scene.gradient:g} 1/m: must be 0, a plate with one coil moves as a whole")
-    if abs(scene.gradient) * plate.glass_length / 2 > STEEPEST:
-        raise ValueError(
-            f"gradient = {scene.gradient:g} 1/m: must be <= {2 * STEEPEST / plate.glass_length:g} 1/m, "
-            "where the amplitude at one end of the plate comes to nothing"
-        )
+    gradient, steepest = scene.gradient, 2 * STEEPEST / plate.glass_length
+    require(plate.coils > 1, "gradient", gradient, "0 1/m: a plate with one coil moves as a whole")
+    bound = f"<= {steepest:g} 1/m, where the amplitude at one end of the plate is 0"
+    require(abs(gradient) <= steepest, "gradient", gradient, bound)
     return 1.0, scene.gradient * plate.half_spacing

@@ -289,7 +289,7 @@ def test_force_is_a_function_of_position_at_other_speeds(save, speed):
         ({"rate": -1.0}, r"rate = -1.0: must be .* Hz"),
         ({"rate": np.array([1.0, 2.0])}, r"rate = .*: must be a finite number .* Hz"),
         ({"metre_per_count": np.nan}, r"metre_per_count = nan: must be .* m"),
-        ({"lateral_force": np.full(50000, np.nan)}, r"lateral_force\[0\] = nan: must be a finite number of N"),
+        ({"lateral_force": np.full(50000, np.nan)}, r"lateral_force\[0\] = nan: must be a finite number"),
         ({"normal_force": np.full(50000, 1.67)}, r"normal_force departs by .* N .*: must be > 0.2 N"),
         ({"normal_force": np.full(70, 1.67)}, r"have 50000, 50000, 70 samples: must be equal"),
         ({"encoder": np.linspace(0, 1, 50000)}, r"encoder has .* float64: must be a row of .* integer counts"),

@@ -90,8 +90,7 @@ def strongest_carriers(
     count : int
         Most carriers, >= 1.
     spacing : float, Hz
-        Least distance of two carriers, > 0.  Carriers 40 Hz or more apart are followed at full speed; the bandwidth
-        of closer ones falls in proportion to their distance.
+        Least distance of two carriers, > 0.  Below 40 Hz the bandwidth falls in proportion to it.
     passband : (float, float), Hz
         Where to look for them, 0 <= low < high.
 
@@ -118,7 +117,7 @@ def strongest_carriers(
     rate = checks.number("rate", rate, "Hz", above=0)
     count = checks.integer("count", count, least=1)
     spacing = checks.number("spacing", spacing, "Hz", above=0)
-    low, high = checks.numbers("passband", passband, "Hz", least=0, most=1e6, count=2)[:2]
+    low, high = checks.numbers("passband", passband, "Hz", least=0, most=1e6, count=2)
     frequency, power = _spectrum(values, rate, spacing / 16)
     peak = np.zeros(power.size, bool)
     peak[1:-1] = (power[1:-1] >= power[:-2]) & (power[1:-1] > power[2:])
@@ -128,14 +127,11 @@ def strongest_carriers(
         candidates = np.flatnonzero(inside)
     candidates = candidates[np.argsort(-power[candidates], kind="stable")]
     chosen: list[float] = []
-    for index in candidates:
+    for index in candidates[power[candidates] >= FAINTEST * power[candidates].max(initial=0.0)]:
         middle = min(max(_refined(frequency, power, int(index)), low), high)
-        clear = all(abs(middle - other) >= spacing for other in chosen)
-        if clear and power[index] >= FAINTEST * power[candidates[0]]:
+        if all(abs(middle - other) >= spacing for other in chosen):
             chosen.append(middle)
-        if len(chosen) == count:
-            break
-    return np.sort(np.array(chosen))
+    return np.sort(np.array(chosen[:count]))
 
 
 def _spectrum(values: Array, rate: float, resolution: float) -> tuple[Array, Array]:

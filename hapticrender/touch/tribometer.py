@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 import zipfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -48,10 +50,8 @@ class SwipeRecording:
 
     Notes
     -----
-    Contact is read from the normal force: more than 0.2 N away from the median
-    of the first 0.5 s, until less than 0.1 N.  Presses may count up or down.
-    A carriage that homes without a finger moves but is not touching; a finger
-    that rests touches but does not slide.
+    Contact is read from the normal force: more than 0.2 N away from the median of the first 0.5 s (up or down), until
+    less than 0.1 N.  A carriage that homes moves but does not touch; a finger that rests touches but does not slide.
     """
 
     rate: float
@@ -86,43 +86,47 @@ def unwrap_counts(counts: Array) -> Array:
 
 def load_swipe(file: str) -> SwipeRecording:
     """Read a tribometer recording: an ``.npz`` with the arrays named in `KEYS`; raises `SceneError`."""
-    if not Path(file).is_file():
-        raise SceneError(f"file = {checks.show(file)}: must be an existing .npz file")
-    return _load_swipe(file, Path(file).stat().st_mtime_ns)
+    with _naming(file):
+        if not Path(file).is_file():
+            raise SceneError("must be an existing .npz file")
+        return _load_swipe(file, Path(file).stat().st_mtime_ns)
+
+
+@contextmanager
+def _naming(file: str) -> Iterator[None]:
+    """Begin every refusal with the name of the file."""
+    try:
+        yield
+    except (TypeError, ValueError) as problem:
+        raise SceneError(f"file = {checks.show(file)}: {problem}") from problem
 
 
 @lru_cache(maxsize=4)
 def _load_swipe(file: str, changed: int) -> SwipeRecording:
-    """As `load_swipe`, remembered until the file changes."""
+    """As `load_swipe`, cached until the file changes."""
     raw = _read(file)
-    rate = _scalar(file, raw, "rate", "Hz", 1e6)
-    metre_per_count = _scalar(file, raw, "metre_per_count", "m", 1e-3)
-    lateral, normal = (_curve(file, raw, key, "N") for key in ("lateral_force", "normal_force"))
-    position = unwrap_counts(_counts(file, raw["encoder"])) * metre_per_count
+    rate = checks.number("rate", _scalar(raw["rate"]), "Hz", above=0, most=1e6)
+    metre_per_count = checks.number("metre_per_count", _scalar(raw["metre_per_count"]), "m", above=0, most=1e-3)
+    lateral, normal = (_row(raw, key, "iuf", "numbers in N").astype(float) for key in ("lateral_force", "normal_force"))
+    position = unwrap_counts(_row(raw, "encoder", "iu", "integer counts")) * metre_per_count
     if not position.size == lateral.size == normal.size > UNLOADED * rate + 1:
         sizes = f"{position.size}, {lateral.size}, {normal.size}"
-        raise SceneError(
-            f"file = {checks.show(file)}: encoder, lateral_force, normal_force have {sizes} samples: "
-            f"must be equal and more than {UNLOADED} s at {rate:g} Hz"
-        )
+        bound = f"must be equal and more than {UNLOADED} s at {rate:g} Hz"
+        raise SceneError(f"encoder, lateral_force, normal_force have {sizes} samples: {bound}")
     load = _load(normal, rate)
     touching = _touching(load, rate)
     if not touching.any():
-        raise SceneError(
-            f"file = {checks.show(file)}: normal_force departs by {np.abs(load).max():.3g} N from its level before: "
-            f"must be > {TOUCH} N for {SHORTEST_TOUCH} s to be a touch"
-        )
+        bound = f"must be > {TOUCH} N for {SHORTEST_TOUCH} s to be a touch"
+        raise SceneError(f"normal_force departs by {np.abs(load).max():.3g} N from its level before: {bound}")
     first, last = position[touching].min(), position[touching].max()
     if last - first > MOST_TRAVEL:
-        raise SceneError(
-            f"file = {checks.show(file)}: travels {last - first:.3g} m in contact: must be <= {MOST_TRAVEL:g} m; "
-            "is metre_per_count right?"
-        )
+        bound = f"must be <= {MOST_TRAVEL:g} m; is metre_per_count right?"
+        raise SceneError(f"travels {last - first:.3g} m in contact: {bound}")
     position = position - (first + last) / 2
     lateral = lateral - np.median(lateral[~touching])
     sliding, speed = _sliding(position, lateral, touching, rate)
     if speed > MOST_SPEED:
-        raise SceneError(f"file = {checks.show(file)}: slides at {speed:.3g} m/s: must be <= {MOST_SPEED:g} m/s")
+        raise SceneError(f"slides at {speed:.3g} m/s: must be <= {MOST_SPEED:g} m/s")
     return SwipeRecording(rate, position, np.where(touching, load, 0.0), lateral, touching, sliding, speed)
 
 
@@ -133,14 +137,12 @@ def _read(file: str) -> dict[str, Array]:
             names = archive.namelist()
             missing = [key for key in KEYS if f"{key}.npy" not in names]
             raw = {} if missing else {key: _read_array(archive, key) for key in KEYS}
-    except SceneError as problem:
-        raise SceneError(f"file = {checks.show(file)}: {problem}") from None
+    except SceneError:
+        raise
     except Exception as problem:
-        raise SceneError(
-            f"file = {checks.show(file)}: must be a readable .npz file ({checks.show(problem)})"
-        ) from problem
+        raise SceneError(f"must be a readable .npz file ({checks.show(problem)})") from problem
     if missing:
-        raise SceneError(f"file = {checks.show(file)}: {missing[0]} is missing: must hold {', '.join(KEYS)}")
+        raise SceneError(f"{missing[0]} is missing: must hold {', '.join(KEYS)}")
     return raw
 
 
@@ -159,37 +161,18 @@ def _read_array(archive: zipfile.ZipFile, key: str) -> Array:
     return np.frombuffer(data, kind, count).reshape(shape)
 
 
-def _scalar(file: str, raw: dict[str, Array], key: str, unit: str, most: float) -> float:
-    value: Any = raw[key].item() if raw[key].size == 1 else raw[key]
-    try:
-        return checks.number(key, value, unit, above=0, most=most)
-    except (TypeError, ValueError) as problem:
-        raise SceneError(f"file = {checks.show(file)}: {problem}") from problem
+def _scalar(array: Array) -> Any:
+    return array.item() if array.size == 1 else array
 
 
-def _curve(file: str, raw: dict[str, Array], key: str, unit: str) -> Array:
-    curve = raw[key]
-    if curve.ndim != 1 or curve.dtype.kind not in "iuf" or not 2 <= curve.size <= MOST_SAMPLES:
-        raise SceneError(
-            f"file = {checks.show(file)}: {key} has shape {curve.shape} and type {curve.dtype}: "
-            f"must be a row of 2 to {MOST_SAMPLES} numbers in {unit}"
-        )
-    curve = curve.astype(float)
-    bad = np.flatnonzero(~np.isfinite(curve))
-    if bad.size:
-        raise SceneError(
-            f"file = {checks.show(file)}: {key}[{bad[0]}] = {curve[bad[0]]}: must be a finite number of {unit}"
-        )
-    return curve
-
-
-def _counts(file: str, counts: Array) -> Array:
-    if counts.ndim != 1 or counts.dtype.kind not in "iu" or not 2 <= counts.size <= MOST_SAMPLES:
-        raise SceneError(
-            f"file = {checks.show(file)}: encoder has shape {counts.shape} and type {counts.dtype}: "
-            f"must be a row of 2 to {MOST_SAMPLES} integer counts"
-        )
-    return counts
+def _row(raw: dict[str, Array], key: str, kinds: str, bound: str) -> Array:
+    """Return an array that is a row of finite numbers of the dtype `kinds`."""
+    row = raw[key]
+    if row.ndim != 1 or row.dtype.kind not in kinds or row.size < 2:
+        raise SceneError(f"{key} has shape {row.shape} and type {row.dtype}: must be a row of >= 2 {bound}")
+    for bad in np.flatnonzero(~np.isfinite(row))[:1]:
+        raise SceneError(f"{key}[{bad}] = {row[bad]}: must be a finite number")
+    return row
 
 
 def _smooth(values: Array, rate: float) -> Array:
