@@ -22,19 +22,18 @@ object is one that has
 
 Sample i of the drive is held during interval i; sample i of what `play`
 returns was taken at the *start* of interval i, before that drive could act.
-With ``block = 1`` a loop computes its next drive from the sample just
-returned, so it acts one interval after the sensing: ``delay = 1``.  A device
-that buffers further says so by a larger `delay`, and the controller turns its
-phases by it.  Where the device knows the finger's position (m from the middle,
-NaN while lifted) or load (N), it gives them with the block.
+With ``block = 1`` the next drive acts one interval after the sensing:
+``delay = 1``; a device that buffers further has a larger `delay`.  Where the
+finger's position (m from the middle, NaN while lifted) or load (N) is measured,
+it comes with the block.
 
-Trouble is of three kinds.  What the caller did wrong (a shape, a NaN) is a
-``ValueError`` before anything is played; a device that is absent, late or gone
-is a `DriverError` that names device and operation; samples lost or cut while
-playing are data, `Flag` bits in ``Sensed.flags``.
+A wrong argument (a shape, a NaN) is a ``ValueError`` before anything is played;
+a device that is absent, too slow or gone is a `DriverError` that names device
+and operation; samples lost or cut while playing are `Flag` bits in
+``Sensed.flags``.
 
 Nothing has to be inherited.  Here is a whole driver, a plate on two coils with
-a sensor at each end of its glass, and a grating that is felt on it:
+a sensor at each end of its glass, and a grating rendered on it:
 
 >>> import numpy as np
 >>> from scipy.linalg import expm
@@ -86,27 +85,7 @@ from hapticrender.protocols import Array, Sensed
 
 
 def checked_drive(drive: Array, block: int, drive_channels: int) -> Array:
-    """Return a block of drive as float64 in C order, or refuse it before any of it is played.
-
-    Parameters
-    ----------
-    drive : array_like, shape (block, drive_channels), A
-        The block.
-    block : int
-        Samples that the driver takes a call.
-    drive_channels : int
-        Columns that the driver takes.
-
-    Returns
-    -------
-    ndarray of float64, shape (block, drive_channels), A
-        The same numbers.
-
-    Raises
-    ------
-    ValueError
-        The shape differs, or a sample is NaN or infinite.
-    """
+    """Return a block of drive (block, drive_channels) as float64 in C order; a ValueError before it is played."""
     checked = np.ascontiguousarray(drive, dtype=np.float64)
     if checked.shape != (block, drive_channels):
         raise ValueError(f"drive has shape {checked.shape}, must be {(block, drive_channels)} (block, drive_channels)")
@@ -120,9 +99,8 @@ def checked_drive(drive: Array, block: int, drive_channels: int) -> Array:
 class BaseDriver:
     """A driver whose kinds differ only in how they open, play and close.
 
-    A subclass fills in `_play`, and `_open` and `_close` where it has something
-    to acquire.  It is used once: opened (again and again, if need be, to no
-    effect), played, closed for good.
+    A subclass fills in `_play`, and `_open` and `_close` where it has something to acquire.  It is used once: opened,
+    played, closed for good.
 
     Parameters
     ----------
@@ -136,11 +114,6 @@ class BaseDriver:
         Samples a call of `play`.
     delay : int, >= block, optional
         Samples from sensing to the drive computed from it; `block` unless given.
-
-    Raises
-    ------
-    ValueError
-        A number is out of its bound.
     """
 
     zero_on_exit = True
@@ -167,13 +140,7 @@ class BaseDriver:
         """Release what `_open` acquired."""
 
     def open(self) -> Self:
-        """Make the device ready; does nothing where it is open already.
-
-        Raises
-        ------
-        DriverError
-            It has been closed, or cannot be opened.
-        """
+        """Make the device ready, unless it is open already; a DriverError where it has been closed, or cannot be."""
         if self._state == "closed":
             raise DriverError(f"{self}: open: it has been closed; make a new one")
         if self._state == "new":
@@ -182,17 +149,7 @@ class BaseDriver:
         return self
 
     def play(self, drive: Array) -> Sensed:
-        """Play a block and return what was sensed while it played.
-
-        Parameters
-        ----------
-        drive : ndarray of float64, shape (block, drive_channels), A
-            Sample i is held during interval i.
-
-        Returns
-        -------
-        Sensed
-            Sample i was taken at the start of interval i.
+        """Play a block (block, drive_channels) and return what was sensed; sample i at the start of interval i.
 
         Raises
         ------
@@ -224,23 +181,17 @@ class BaseDriver:
         """Close; where the body has failed already, a failure to close is noted on the body's error."""
         try:
             self.close()
-        except Exception as late:
+        except Exception as second:
             if error is None:
                 raise
-            error.add_note(f"and while closing: {late}")
+            error.add_note(f"and while closing: {second}")
 
     def __str__(self) -> str:
         return type(self).__name__
 
 
 def carry_through(*steps: Callable[[], object]) -> None:
-    """Call every step, whatever the others do; then raise the first failure, with the later ones noted on it.
-
-    Parameters
-    ----------
-    *steps : callable
-        What has to be tried, in this order.
-    """
+    """Call every step, whatever the others do; then raise the first failure, with the later ones noted on it."""
     failures: list[Exception] = []
     for step in steps:
         try:
@@ -248,6 +199,6 @@ def carry_through(*steps: Callable[[], object]) -> None:
         except Exception as error:
             failures.append(error)
     if failures:
-        for late in failures[1:]:
-            failures[0].add_note(f"and then: {late}")
+        for other in failures[1:]:
+            failures[0].add_note(f"and then: {other}")
         raise failures[0]

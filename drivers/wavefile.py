@@ -11,7 +11,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 from pathlib import Path
 from types import TracebackType
-from typing import Any
 
 import numpy as np
 import soundfile
@@ -25,24 +24,12 @@ UNKNOWN = 2**63 - 1  # frames, as libsndfile says of a FLAC file that was never 
 BLOCK = 65536  # frames read at once
 SUBTYPES = {"PCM_16": 16, "PCM_24": 24, "PCM_32": 32, "FLOAT": None, "DOUBLE": None}  # bits of the integers
 _Leaving = tuple[type[BaseException] | None, BaseException | None, TracebackType | None]
-_CALM: _Leaving = (None, None, None)
+_NO_ERROR: _Leaving = (None, None, None)
 _WORD = 32  # soundfile takes integers of any width left-justified in 32 bits
 
 
 def read_back(path: str | Path, *, full_scale: float = 3.0) -> Array:
-    """Drive as a file holds it: integers and floats are scaled, never dithered or rounded.
-
-    Parameters
-    ----------
-    path : str or Path
-        A file that `WaveFileDriver` wrote, or any that soundfile reads.
-    full_scale : float, A, > 0
-        Drive that stands in the file as 1.0; files do not say it themselves.
-
-    Returns
-    -------
-    ndarray of float64, shape (n, channels), A
-        Every sample that the file gives; what a killed process leaves is said at `WaveFileDriver`.
+    """Drive (A, shape (n, channels)) as a file holds it: scaled by `full_scale` (A), never dithered or rounded.
 
     Raises
     ------
@@ -77,12 +64,9 @@ def _blocks(file: soundfile.SoundFile) -> Iterator[Array]:
 class WaveFileDriver(BaseDriver):
     """Writes every block of drive to a WAV, FLAC, W64, RF64 or AIFF file while it plays.
 
-    A NaN or an infinity is refused with everything else that `BaseDriver`
-    refuses.  A killed process leaves all that was played in WAV and W64, and
-    all but the last 4096 samples at most in FLAC, whose encoder works in
-    blocks of them; RF64 and AIFF then report 0 frames.  Drive beyond `full_scale` is held exactly by FLOAT and DOUBLE;
-    integers cut it to their range, `clipped` counts the samples, and
-    ``Sensed.flags`` says `Flag.SATURATED`; what `through` plays is not cut.
+    A killed process leaves all that was played in WAV and W64, all but the last 4096 samples at most in FLAC; RF64 and
+    AIFF then report 0 frames.  Drive beyond `full_scale` is held exactly by FLOAT and DOUBLE; integers cut it to their
+    range, `clipped` counts the samples, and ``Sensed.flags`` has `Flag.SATURATED`; what `through` plays is not cut.
 
     Parameters
     ----------
@@ -125,12 +109,21 @@ class WaveFileDriver(BaseDriver):
         self.full_scale = full_scale
         self.clipped = 0  # samples that the file holds cut to its range
         self._through = through
-        self._leaving: _Leaving = _CALM
+        self._leaving: _Leaving = _NO_ERROR
         self._format, self._subtype = _file_form(self.path, subtype)
         if not (np.isfinite(full_scale) and full_scale > 0):
             raise ValueError(f"{full_scale=} must be finite and > 0 A")
         own = {"rate": rate, "drive_channels": drive_channels, "block": block}
-        super().__init__(**(_alone(own) if through is None else _beside(through, own)))
+        given = {name: value for name, value in own.items() if value is not None}
+        if through is None:
+            numbers = {"rate": 48000.0, "drive_channels": 2, "block": 1024, "sensed_channels": 0} | given
+        else:
+            check_driver(through)
+            for name, value in given.items():
+                raise ValueError(f"{name}={value!r} cannot be given beside through=, which has its own")
+            names = ("rate", "drive_channels", "sensed_channels", "block", "delay")
+            numbers = {name: getattr(through, name) for name in names}
+        super().__init__(**numbers)
 
     def _open(self) -> None:
         if not self.path.parent.is_dir():
@@ -140,10 +133,8 @@ class WaveFileDriver(BaseDriver):
                 self.path, "w", round(self.rate), self.drive_channels, self._subtype, format=self._format
             )
         except (OSError, soundfile.SoundFileError) as error:
-            raise DriverError(
-                f"{self.path}: open: {_reason(error)} ({self._format} {self._subtype}, {self.drive_channels} channels, "
-                f"{self.rate:g} Hz)"
-            ) from error
+            form = f"{self._format} {self._subtype}, {self.drive_channels} channels, {self.rate:g} Hz"
+            raise DriverError(f"{self.path}: open: {_reason(error)} ({form})") from error
         if self._through is not None:
             try:
                 self._through.__enter__()
@@ -153,9 +144,9 @@ class WaveFileDriver(BaseDriver):
 
     def _play(self, drive: Array) -> Sensed:
         samples = drive / self.full_scale
-        answer: list[Sensed] = []
-        carry_through(lambda: answer.append(self._sense(drive)), lambda: self._write(samples))
-        return self._flagged(answer[0], samples)
+        found: list[Sensed] = []
+        carry_through(lambda: found.append(self._sense(drive)), lambda: self._write(samples))
+        return self._flagged(found[0], samples)
 
     def _sense(self, drive: Array) -> Sensed:
         return Sensed(np.empty((len(drive), 0))) if self._through is None else self._through.play(drive)
@@ -197,37 +188,16 @@ class WaveFileDriver(BaseDriver):
         try:
             super().__exit__(kind, error, traceback)
         finally:
-            self._leaving = _CALM
+            self._leaving = _NO_ERROR
 
     def read_back(self) -> Array:
-        """Drive as the closed file holds it (A, shape (n, drive_channels)), the closing block of zeros included.
-
-        Raises
-        ------
-        DriverError
-            The driver is not closed yet, or has written nothing.
-        """
+        """Drive as the closed file holds it (A, shape (n, drive_channels)), the closing block of zeros included."""
         if self._state != "closed":
             raise DriverError(f"{self}: read: it is {self._state}; close it first")
         return read_back(self.path, full_scale=self.full_scale)
 
     def __str__(self) -> str:
         return str(self.path)
-
-
-def _alone(own: dict[str, Any]) -> dict[str, Any]:
-    """Numbers of a file on its own: what was given, and defaults."""
-    given = {name: value for name, value in own.items() if value is not None}
-    return {"rate": 48000.0, "drive_channels": 2, "block": 1024, "sensed_channels": 0} | given
-
-
-def _beside(through: Driver, own: dict[str, Any]) -> dict[str, Any]:
-    """Numbers of a tee: those of the device, none of its own."""
-    check_driver(through)
-    for name, value in own.items():
-        if value is not None:
-            raise ValueError(f"{name}={value!r} cannot be given beside through=, which has its own")
-    return {name: getattr(through, name) for name in ("rate", "drive_channels", "sensed_channels", "block", "delay")}
 
 
 def _file_form(path: Path, subtype: str | None) -> tuple[str, str]:
@@ -244,5 +214,5 @@ def _file_form(path: Path, subtype: str | None) -> tuple[str, str]:
 
 
 def _reason(error: Exception) -> object:
-    """Say what libsndfile says, without the path that it repeats."""
+    """Message of libsndfile, without the path that it repeats."""
     return getattr(error, "error_string", str(error)) or "not every sample was written"

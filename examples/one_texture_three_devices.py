@@ -7,7 +7,7 @@ import sys
 
 import hapticrender as hr
 from hapticrender.report.devices_picture import plot_devices
-from hapticrender.skin import felt_bands
+from hapticrender.skin import skin_bands
 
 DEVICES = ("vt-plate", "electroadhesion", "ultrasonic")
 
@@ -19,12 +19,12 @@ def main(picture: str | None = None) -> float:
         device: hr.render(hr.Scene(texture=texture, finger=finger, device=device, duration=2.0)) for device in DEVICES
     }
     for device, recording in recordings.items():
-        bands = felt_bands(recording)
+        bands = skin_bands(recording)
         told = [f"{band.frequency:g} Hz {1e3 * band.achieved:.3f} mm/s ({band.level:.1f} dB)" for band in bands]
         print(f"{device}: {', '.join(told)}")
     if picture:
         plot_devices(recordings, picture)
-    return max(abs(band.error) for recording in recordings.values() for band in felt_bands(recording))
+    return max(abs(band.error) for recording in recordings.values() for band in skin_bands(recording))
 
 
 if __name__ == "__main__":

@@ -131,10 +131,11 @@ def choice(key: str, value: Any, options: Iterable[str]) -> str:
     return value
 
 
-def text(key: str, value: Any, longest: int = 200) -> str:
-    """Return `value`, if it is a text of at most `longest` printable characters."""
-    bound = f"a text of printable characters, at most {longest}"
-    require(isinstance(value, str) and value.isprintable() and len(value) <= longest, key, value, bound)
+def text(key: str, value: Any, longest: int = 200, lines: bool = False) -> str:
+    """Return `value`, if it is a text of at most `longest` printable characters, or of `lines` of any."""
+    bound = f"a text of{'' if lines else ' printable'} characters, at most {longest}"
+    good = isinstance(value, str) and (lines or value.isprintable()) and len(value) <= longest
+    require(good, key, value, bound)
     return value
 
 

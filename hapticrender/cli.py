@@ -54,6 +54,9 @@ def main(argv: Sequence[str] | None = None) -> int:
             stream.reconfigure(errors="replace")
     try:
         arguments = _parser().parse_args(argv)
+        method = getattr(arguments, "method", None)
+        if method not in (None, *defaults.METHODS):
+            raise ValueError(f"--method = {method!r}: must be one of {', '.join(defaults.METHODS)}")
         status = arguments.run(arguments)
         sys.stdout.flush()
         return status
@@ -89,13 +92,12 @@ def _parser() -> argparse.ArgumentParser:
 
     demo = _add_verb(verbs, "demo", _demo, "render the built-in scenes and make a page of sounds, pictures and figures")
     _add_out(demo, Path("out/demo"))
-    _add_method(demo)
+    _add_run(demo)
 
     render = _add_verb(verbs, "render", _render, "render one scene into a folder")
     render.add_argument("scene", metavar="SCENE", help="a TOML file, or the name of a built-in scene")
     _add_out(render, None)
-    _add_method(render)
-    _add_driver(render)
+    _add_run(render, driver=True)
     render.add_argument("--least-model", action="store_true", help="leave out of the model what a scene does not need")
     render.add_argument("--verbose", "-v", action="store_true", help="print all figures and notes on the controller")
 
@@ -109,24 +111,23 @@ def _parser() -> argparse.ArgumentParser:
     )
     validate.add_argument("--json", metavar="FILE", type=_path, help="write all figures as JSON")
     validate.add_argument("--junit", metavar="FILE", type=_path, help="write the JUnit XML that CI systems read")
-    text = "folder for recording, picture and sounds of each scene that does not pass"
+    text = "folder for the files of each scene that does not pass"
     validate.add_argument("--out", "-o", metavar="DIR", type=_path, help=text)
     validate.add_argument("--jobs", "-j", metavar="N", type=_whole(1, 999), default=1, help="processes (default: 1)")
-    _add_method(validate)
+    _add_run(validate)
 
     show = _add_verb(verbs, "show", _show, "print the figures of a recording, finished or cut off by a crash")
     show.add_argument("path", metavar="PATH", type=_path, help="a recording, or the folder of a rendered scene")
 
     identify = _add_verb(verbs, "identify", _identify, "identify the parameters of a plate while no finger is on it")
-    _add_driver(identify)
     text = "scene whose [device] is the expected plate, and [simulation] the simulated one (default: the paper's plate)"
     identify.add_argument("--scene", metavar="SCENE", help=text)
-    text = "largest displacement of a glass end (default: 100e-6)"
+    text = "of a glass end (default: 100e-6)"
     identify.add_argument("--amplitude", metavar="M", type=float, default=100e-6, help=text)
     identify.add_argument("--seconds", metavar="S", type=float, default=1.0, help="length of the record (default: 1)")
     text = "write the result as a [device] table (TOML) to paste into a scene"
     identify.add_argument("--out", "-o", metavar="FILE", type=_path, help=text)
-    _add_seed(identify, None)
+    _add_run(identify, method=False, driver=True)
 
     _add_verb(verbs, "devices", _devices, "list the kinds of device, what each needs, and whether it is there")
     return parser
@@ -144,20 +145,15 @@ def _add_out(verb: argparse.ArgumentParser, default: Path | None) -> None:
     verb.add_argument("--force", action="store_true", help="overwrite files that are not from an earlier run")
 
 
-def _add_method(verb: argparse.ArgumentParser) -> None:
-    text = f"control method: one of {', '.join(defaults.METHODS)} (default: the scene's, or {defaults.METHOD})"
-    verb.add_argument("--method", metavar="NAME", help=text)
-    _add_seed(verb, None)
-
-
-def _add_driver(verb: argparse.ArgumentParser) -> None:
-    text = "driver of the device, with its argument (default: a simulated device; see `hapticrender devices`)"
-    verb.add_argument("--driver", metavar="NAME[:ARG]", default="simulated", help=text)
-
-
-def _add_seed(verb: argparse.ArgumentParser, default: int | None) -> None:
-    text = "seed of the noise (default: " + ("the scene's)" if default is None else f"{default})")
-    verb.add_argument("--seed", metavar="N", type=_whole(0, 10**18 - 1), default=default, help=text)
+def _add_run(verb: argparse.ArgumentParser, *, method: bool = True, driver: bool = False) -> None:
+    if method:
+        text = f"control method: one of {', '.join(defaults.METHODS)} (default: the scene's, or {defaults.METHOD})"
+        verb.add_argument("--method", metavar="NAME", help=text)
+    if driver:
+        text = "driver of the device, with its argument (default: a simulated device; see `hapticrender devices`)"
+        verb.add_argument("--driver", metavar="NAME[:ARG]", default="simulated", help=text)
+    seed = _whole(0, 10**18 - 1)
+    verb.add_argument("--seed", metavar="N", type=seed, help="seed of the noise (default: the scene's)")
 
 
 def _path(text: str) -> Path:
@@ -260,7 +256,6 @@ def _validate(arguments: argparse.Namespace) -> int:
 
     reports = [("--json", arguments.json, write_json), ("--junit", arguments.junit, write_junit)]
     references = arguments.scenes or list(builtin_scenes())
-    _check_method(arguments.method)
     for option, path, _ in reports:
         if path:
             check_file(option, path)
@@ -289,7 +284,6 @@ def _suite(arguments: argparse.Namespace) -> int:
     from hapticrender.formatting import table
     from hapticrender.report.outputs import check_file
 
-    _check_method(arguments.method)
     chosen = arguments.method or defaults.METHOD
     if arguments.scenes or arguments.junit or arguments.out or arguments.jobs > 1:
         raise ValueError("--suite runs no scenes and writes --json only")
@@ -369,18 +363,10 @@ def _scene(reference: str) -> Scene:
         return open_scene(reference)
 
 
-def _check_method(method: str | None) -> None:
-    from hapticrender.control.methods import METHODS
-
-    if method not in (None, *METHODS):
-        raise ValueError(f"--method = {method!r}: must be one of {', '.join(METHODS)}")
-
-
 def _prepare(scenes: dict[str, Scene], arguments: argparse.Namespace, driver: Any = None) -> list[Rendering]:
     """Design everything that will run; the renderer refuses here what the device cannot do."""
     from hapticrender.loop import prepare
 
-    _check_method(arguments.method)
     renderings = []
     for reference, scene in scenes.items():
         with _naming(reference):

@@ -17,20 +17,7 @@ _LEAST = {"drive_channels": 1, "sensed_channels": 0, "block": 1}
 
 
 def check_driver(driver: Any) -> None:
-    """Refuse an object that is no driver, naming what it lacks or which number is out of its bound.
-
-    Parameters
-    ----------
-    driver : object
-        Has to follow ``protocols.Driver``.
-
-    Raises
-    ------
-    TypeError
-        A member is missing.
-    ValueError
-        A count or the rate is out of its bound.
-    """
+    """Refuse an object that is no ``protocols.Driver``: a member is missing, or a number is out of its bound."""
     if inspect.isclass(driver):
         raise TypeError(f"driver = {driver.__name__}: must be an instance, not the class: {driver.__name__}(...)")
     kind = type(driver).__name__
@@ -47,25 +34,9 @@ def check_driver(driver: Any) -> None:
 
 
 def check_sensed(driver: Any, sensed: Sensed, places: int) -> Sensed:
-    """Return a block with its columns as contiguous float64, or refuse it where a shape is not the driver's.
+    """Return a block that `driver` returned with its columns as contiguous float64 (flags int64).
 
-    Parameters
-    ----------
-    driver : Driver
-        The driver that returned it.
-    sensed : Sensed
-        Return value of `play`.
-    places : int
-        Judged places, the columns of `motion`.
-
-    Returns
-    -------
-    Sensed
-
-    Raises
-    ------
-    ProtocolError
-        A column has another shape, or is no number.
+    A `ProtocolError` says which column has no numbers, or not the driver's shape; `motion` has `places` columns.
     """
     block = driver.block
     shapes = {

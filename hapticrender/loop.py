@@ -12,7 +12,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 from importlib.metadata import entry_points
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -32,9 +32,7 @@ def registered(group: str, name: str) -> Any:
     """Load what the entry-point `group` (renderers, drivers) registers under `name`."""
     found = {point.name: point for point in entry_points(group=f"hapticrender.{group}")}
     if name not in found:
-        raise ValueError(
-            f"{group[:-1]} {name!r} is not installed: must be one of {', '.join(sorted(found)) or '(none)'}"
-        )
+        raise ValueError(f"{group[:-1]} {name!r} is not installed: must be one of {', '.join(sorted(found)) or 'none'}")
     try:
         return found[name].load()
     except Exception as error:
@@ -62,9 +60,8 @@ def prepare(
         raise TypeError(f"renderer: must be an object with open(scene, driver), such as a BaseRenderer(), not {kind}")
     rendering = renderer.open(scene, driver)
     if not isinstance(rendering, Rendering):
-        raise TypeError(
-            f"{type(renderer).__name__}.open returned {type(rendering).__name__}: must be hapticrender.Rendering"
-        )
+        kinds = type(renderer).__name__, type(rendering).__name__
+        raise TypeError(f"{kinds[0]}.open returned {kinds[1]}: must be hapticrender.Rendering")
     _warm_up(rendering)
     return rendering
 
@@ -122,6 +119,7 @@ def run(rendering: Rendering, *, journal: str | Path | None = None, progress: Pr
     However it ends (an error, Ctrl-C, SIGTERM), every sample played is recorded and the device is left at zero drive.
     """
     driver, model, total = rendering.driver, rendering.model, rendering.samples
+    names = ("places", "unit", "drive_unit", "profile")
     recorder = Recorder(
         journal,
         scene=rendering.scene,
@@ -131,16 +129,13 @@ def run(rendering: Rendering, *, journal: str | Path | None = None, progress: Pr
         bands=rendering.bands,
         drive_channels=driver.drive_channels,
         sensed_channels=driver.sensed_channels,
-        places=model.places,
         drive_limit=model.drive_limit if np.isfinite(model.drive_limit) else None,
-        unit=model.unit,
-        drive_unit=model.drive_unit,
-        profile=model.profile,
+        **{name: getattr(model, name) for name in names},
     )
     with recorder, _stopped_by_sigterm(), driver, _zero_drive_after(rendering.device):
         loop = _Loop(rendering)
         for start in range(0, total, loop.step):
-            recorder.append(**loop.advance(start, min(loop.step, total - start))._asdict())
+            recorder.append(**loop.advance(start, min(loop.step, total - start)))
             if progress is not None:
                 progress(min(start + loop.step, total) / driver.rate, total / driver.rate)
     recording = recorder.finish()
@@ -192,23 +187,10 @@ def _zero_drive_after(device: Driver) -> Iterator[None]:
     except BaseException as error:
         try:
             rest()
-        except Exception as late:
-            error.add_note(f"and while the drive was set to zero: {late}")
+        except Exception as second:
+            error.add_note(f"and while the drive was set to zero: {second}")
         raise
     rest()
-
-
-class _Columns(NamedTuple):
-    """What happened over some samples: the columns of a recording; `drive` as handed to the device."""
-
-    drive: Array
-    sensed: Array
-    motion: Array
-    position: Array
-    normal_load: Array
-    target: Array
-    flags: Array
-    motion_source: str = "true"
 
 
 def _exchange(driver: Driver, controller: Controller) -> Exchange | None:
@@ -229,7 +211,7 @@ class _Loop:
         self._start = 0
         self._drive = np.zeros((driver.block, driver.drive_channels))
 
-    def advance(self, start: int, count: int) -> _Columns:
+    def advance(self, start: int, count: int) -> dict[str, Any]:
         """Advance by `count` samples from sample `start` on; a last block is cut in the record, not on the device."""
         self._start = start
         drive, target, flags, sensed = self._exchange(count, self._reference)
@@ -238,8 +220,9 @@ class _Loop:
         position = finger.position(time) if sensed.position is None else sensed.position
         load = finger.load(time) if sensed.normal_load is None else sensed.normal_load
         motion, source = self._motion(sensed)
-        drive, values, motion = drive[:count], values[:count], motion[:count]
-        return _Columns(drive, values, motion, position[:count], load[:count], target[:count], flags[:count], source)
+        signals = {"drive": drive, "sensed": values, "motion": motion, "position": position, "normal_load": load}
+        signals |= {"target": target, "flags": flags}
+        return {"motion_source": source} | {name: signal[:count] for name, signal in signals.items()}
 
     def _block(self, count: int, reference: Callable[[Array], Array]) -> tuple[Array, Array, Array, Sensed]:
         """Exchange a block with the driver; the drive computed from it is played with the next one."""
@@ -272,23 +255,18 @@ class _Loop:
 def _compare(rendering: Rendering, controller: Controller, recording: Recording) -> None:
     """Warn where the device differs from the model that the controller was designed for."""
     mismatch = getattr(controller, "mismatch", 0.0)
-    if mismatch > MISMATCH:
-        found = ", ".join(
-            f"{100 * off:+.1f} % at {hertz:g} Hz" for hertz, off in _stiffness_errors(rendering, recording)
-        )
-        cure = "correct [device]"
-        if rendering.scene.device == "vt-plate":
-            cure = (
-                "remove the finger and replace [device] by what `hapticrender identify --driver ... --scene ...` writes"
-            )
-        warnings.warn(
-            f"the device differs from its model: the integral part adds {100 * mismatch:.1f} % of a target "
-            f"(bound {100 * MISMATCH:g} %)"
-            + (f"; dynamic stiffness against the model: {found}" if found else "")
-            + f"; {cure}",
-            PlateMismatch,
-            stacklevel=3,
-        )
+    if mismatch <= MISMATCH:
+        return
+    errors = _stiffness_errors(rendering, recording)
+    found = ", ".join(f"{100 * error:+.1f} % at {hertz:g} Hz" for hertz, error in errors)
+    cure = "correct [device]"
+    if rendering.scene.device == "vt-plate":
+        cure = "remove the finger and replace [device] by what `hapticrender identify --driver ... --scene ...` writes"
+    message = (
+        f"the device differs from its model: the integral part adds {100 * mismatch:.1f} % of a target "
+        f"(bound {100 * MISMATCH:g} %){f'; dynamic stiffness against the model: {found}' if found else ''}; {cure}"
+    )
+    warnings.warn(message, PlateMismatch, stacklevel=3)
 
 
 def _stiffness_errors(rendering: Rendering, recording: Recording) -> list[tuple[float, float]]:

@@ -63,9 +63,8 @@ class Texture(Protocol):
     def bands(self, rate: float) -> Bands:
         """Carriers, and constant envelopes where the texture has them, for sampling at `rate` (Hz).
 
-        Two carriers must differ.  Envelopes are estimated with a bandwidth of at most spacing/(2 pi): carriers 40 Hz
-        or more apart are followed at full speed, closer ones more slowly.  `hapticrender.strongest_carriers` chooses
-        the carriers of a signal.
+        Two carriers must differ: envelopes are estimated with a bandwidth of at most spacing/(2 pi).
+        `hapticrender.strongest_carriers` chooses the carriers of a signal.
         """
         ...
 
@@ -161,36 +160,16 @@ class Controller(Protocol):
 
 @dataclass(frozen=True, kw_only=True)
 class Rendering:
-    """A scene opened on a device: all that a run needs, designed and checked; nothing has been played yet.
+    """A scene opened on a device: all that a run needs, designed and checked; nothing has been played yet."""
 
-    Parameters
-    ----------
-    scene : Scene
-        With the method and the seed that are used.
-    device : Driver
-        As handed over, or the simulated one.
-    driver : Driver
-        The same, as the controller sees it: behind a square root, a resonance or nothing.
-    plant : Plant, optional
-        The simulated device.
-    model : DeviceModel
-        Device model for which the controller is designed.
-    bands : Bands
-        Carriers and targets, in the device's quantity.
-    waveform : callable
-        Target waveform over time (s) and position (m), in the device's quantity.
-    controller : callable
-        Returns a new controller at rest.
-    """
-
-    scene: Scene
-    device: Driver
-    driver: Driver
-    plant: Plant | None = None
-    model: DeviceModel
-    bands: Bands
-    waveform: Callable[[Array, Array], Array]
-    controller: Callable[[], Controller]
+    scene: Scene  # with the method and the seed that are used
+    device: Driver  # as handed over, or the simulated one
+    driver: Driver  # the same, as the controller sees it: behind a square root, a resonance or nothing
+    plant: Plant | None = None  # the simulated device
+    model: DeviceModel  # for which the controller is designed
+    bands: Bands  # carriers and targets, in the device's quantity
+    waveform: Callable[[Array, Array], Array]  # target over time (s) and position (m), in the device's quantity
+    controller: Callable[[], Controller]  # a new one at rest
 
     @property
     def samples(self) -> int:

@@ -1,4 +1,4 @@
-"""What the skin is predicted to feel of a recording, whatever the device: its velocity, band by band and over time.
+"""Predicted skin velocity of a recording on any device, band by band and over time.
 
 A plate moves the skin with it, V = j w X; friction moves it by V = (v/F) F, with v/F as the scene has it.
 """
@@ -11,29 +11,29 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from hapticrender.protocols import Array
-from hapticrender.recordings.envelopes import amplitude_error, beside_the_bands
+from hapticrender.recordings.envelopes import amplitude_error, residuals
 from hapticrender.touch.perception import HIGHEST, VELOCITY_PER_FORCE, sensation_level
 
 if TYPE_CHECKING:
     from hapticrender.recordings.recording import Recording
 
 
-class Felt(NamedTuple):
+class SkinBand(NamedTuple):
     """Skin velocity of a band (m/s peak), and its level above the classic detection threshold."""
 
     frequency: float  # Hz: the median while it is judged
-    wanted: float
+    target: float
     achieved: float
     level: float  # dB; NaN where the threshold is not known
 
     @property
     def error(self) -> float:
         """Relative error of the achieved velocity."""
-        return float(amplitude_error(self.achieved, self.wanted))
+        return float(amplitude_error(self.achieved, self.target))
 
 
 def velocity_per_unit(recording: Recording, frequency: Any) -> Array:
-    """Skin velocity (m/s, complex) per unit of what the device makes, at `frequency` (Hz, > 0)."""
+    """Skin velocity (m/s, complex) per unit of the device's quantity, at `frequency` (Hz, > 0; any on a plate)."""
     hertz = np.asarray(frequency, float)
     unit = recording.header.unit
     if unit == "m":
@@ -43,18 +43,18 @@ def velocity_per_unit(recording: Recording, frequency: Any) -> Array:
     share = float(recording.scene.rendering.get("velocity_per_force", VELOCITY_PER_FORCE))  # type: ignore[arg-type]
     if share:
         return share * np.ones_like(hertz, complex)
-    return recording.scene.finger.mechanics.skin_velocity_per_force(hertz)
+    return recording.scene.finger.mechanics.skin_velocity_per_force(np.maximum(abs(hertz), 1e-9))
 
 
-def felt_bands(recording: Recording) -> list[Felt]:
+def skin_bands(recording: Recording) -> list[SkinBand]:
     """Predicted skin velocity of every judged band, at the device's first place.
 
     Examples
     --------
     >>> import hapticrender as hr
     >>> scene = hr.Scene(texture=hr.Grating(velocity=5e-3, frequency=100.0), duration=1.5)
-    >>> [band] = felt_bands(hr.render(scene))
-    >>> f"{1e3 * band.wanted:.2f} mm/s, {band.level:.0f} dB above threshold"
+    >>> [band] = skin_bands(hr.render(scene))
+    >>> f"{1e3 * band.target:.2f} mm/s, {band.level:.0f} dB above threshold"
     '5.00 mm/s, 22 dB above threshold'
     """
     found = []
@@ -64,57 +64,38 @@ def felt_bands(recording: Recording) -> list[Felt]:
         share = float(abs(velocity_per_unit(recording, band["frequency"])))
         achieved = share * band["achieved"]
         level = float(sensation_level(achieved / (2 * math.pi * band["frequency"]), band["frequency"]))
-        found.append(Felt(band["frequency"], share * band["target"], achieved, level))
+        found.append(SkinBand(band["frequency"], share * band["target"], achieved, level))
     return found
 
 
 def skin_waveform(recording: Recording, start: float, seconds: float) -> tuple[Array, Array, Array]:
-    """Time (s), wanted and achieved skin velocity (m/s) of the bands over a stretch.
+    """Time (s), target and achieved skin velocity (m/s) of the bands over `seconds` (s) from `start` (s).
 
-    The achieved one is rebuilt from the envelopes of the windows around: what is beside the bands is not in it,
-    and `residual_velocity` says how large that is.
-
-    Parameters
-    ----------
-    recording : Recording
-    start, seconds : float, s
-        Where the stretch begins, and how long it is.
+    The achieved one is rebuilt from the envelopes of the windows around; `residual_velocity` is the size of the rest.
     """
     envelopes, rate, bands = recording.envelopes, recording.rate, recording.bands
     first, last = round(start * rate), min(round((start + seconds) * rate), len(recording))
-    count = np.arange(first, last)
-    time, position = count / rate, recording.read("position", first, last)
-    velocity = np.gradient(position) * rate if len(count) > 1 else np.zeros(len(count))
-    frequency = bands.instantaneous_frequency(np.nan_to_num(velocity))
-    share = velocity_per_unit(recording, np.maximum(abs(frequency), 1e-9))
-    if recording.header.unit == "m":
-        share = 2j * np.pi * frequency
+    time, position = np.arange(first, last) / rate, recording.read("position", first, last)
+    velocity = np.gradient(position) * rate if len(time) > 1 else np.zeros(len(time))
+    share = velocity_per_unit(recording, bands.instantaneous_frequency(np.nan_to_num(velocity)))
     turned = share * np.exp(1j * bands.carrier_phase(time, position))
     target = recording.read("target", first, last)
-    nearest = np.abs(envelopes.time[None, :] - time[:, None]).argmin(axis=1) if len(envelopes.start) else None
-    achieved = np.zeros_like(target) if nearest is None else envelopes.achieved[nearest, 0]
-    achieved = achieved / (recording.header.profile or (1.0,))[0]
+    achieved = np.zeros_like(target)
+    if len(envelopes.start):
+        nearest = np.abs(envelopes.time[None, :] - time[:, None]).argmin(axis=1)
+        achieved = envelopes.achieved[nearest, 0] / (recording.header.profile or (1.0,))[0]
     return time, (turned * target).real.sum(axis=1), (turned * achieved).real.sum(axis=1)
 
 
 def residual_velocity(recording: Recording, highest: float = HIGHEST) -> float:
-    """Rms skin velocity (m/s) at the first place of what is beside the bands, in the judged time; NaN without any.
+    """Rms skin velocity (m/s) beside the bands up to `highest` (Hz), at the first place; NaN where nothing is judged.
 
-    Parameters
-    ----------
-    recording : Recording
-    highest : float, Hz
-        What is faster does not count; by default as far as thresholds are known.
-
-    Notes
-    -----
-    Welch's estimate over the windows of the judge: the spectrum of the residual waveform, Hann-windowed, times
-    `velocity_per_unit` at each frequency (a spectral derivative where the device makes displacement), summed by
-    Parseval.  A window of T adds 1/(6 (f T)^2) to the rms of a tone at f that is differentiated.  It hardly counts the
-    window's edges, where most of an envelope's drift is left, so it can be below the judge's `residual_rms`.
+    Welch's estimate over the windows of the judge: the Hann-windowed spectrum of the residual times
+    `velocity_per_unit`, summed by Parseval.  A window of T adds 1/(6 (f T)^2) to the rms of a tone at f that is
+    differentiated; the windows' edges, where most of an envelope's drift is left, hardly count.
     """
     mean_squares = []
-    for rest in beside_the_bands(recording):
+    for rest in residuals(recording):
         size = rest.shape[1]
         window = np.hanning(size)
         frequency = np.fft.rfftfreq(size, 1 / recording.rate)
@@ -122,4 +103,5 @@ def residual_velocity(recording: Recording, highest: float = HIGHEST) -> float:
         share = np.abs(velocity_per_unit(recording, frequency[counted]))
         spectrum = np.abs(np.fft.rfft(rest * window, axis=1)[:, counted])
         mean_squares.append(2 * ((share * spectrum) ** 2).sum(axis=1) / (size * (window**2).sum()))
-    return math.sqrt(np.concatenate(mean_squares).mean()) if mean_squares else math.nan
+    power = np.concatenate(mean_squares)
+    return math.sqrt(power.mean()) if power.size else math.nan

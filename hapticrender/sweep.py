@@ -1,19 +1,13 @@
-"""Render many scenes, in this thread or on any executor: a pool of processes, or a cluster.
+"""Render many scenes, in this thread or on any executor.
 
-::
-
-    from concurrent.futures import ProcessPoolExecutor
-    with ProcessPoolExecutor() as pool:
-        worst = sweep(scenes, worst_error, executor=pool)
-
-    from dask.distributed import Client
-    worst = sweep(scenes, worst_error, executor=Client(address).get_executor())
+``ProcessPoolExecutor()`` of `concurrent.futures` is one, ``Client(address).get_executor()`` of dask another.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from concurrent.futures import Executor
+from functools import partial
 from typing import Any, NamedTuple
 
 from hapticrender import checks
@@ -87,11 +81,12 @@ def sweep(
     at_a_time = checks.integer("at_a_time", at_a_time, "scenes", least=1)
     numbered = list(enumerate(scenes))
     parts = [numbered[start : start + at_a_time] for start in range(0, len(numbered), at_a_time)]
+    run = partial(_run, judge=judge, method=method, failures=failures)
     if executor is None:
-        return [each for part in parts for each in _rendered(_run(part, judge, method, failures))]
-    tasks = [executor.submit(_run, part, judge, method, failures) for part in parts]
+        return [each for part in parts for each in run(part)]
+    tasks = [executor.submit(run, part) for part in parts]
     try:
-        return [each for task in tasks for each in _rendered(task.result())]
+        return [each for task in tasks for each in task.result()]
     except BaseException:
         for task in tasks:
             task.cancel()
@@ -106,8 +101,8 @@ def worst_error(recording: Recording) -> float:
 
 def _run(
     part: list[tuple[int, Scene]], judge: Callable[[Recording], Any] | None, method: str | None, failures: bool
-) -> tuple[list[Any], Failure | None]:
-    """Results of a few scenes, up to the first that fails unless `failures` are kept; and that failure."""
+) -> list[Any]:
+    """Results of a few scenes; raises at the first that fails, unless `failures` are kept."""
     found: list[Any] = []
     for index, scene in part:
         try:
@@ -117,13 +112,6 @@ def _run(
             name = getattr(scene, "name", type(scene).__name__)
             failure = Failure(index, name, f"{type(error).__name__}: {error}")
             if not failures:
-                return found, failure
+                raise SweepError(str(failure)) from None  # a cause might not be pickled
             found.append(failure)
-    return found, None
-
-
-def _rendered(result: tuple[list[Any], Failure | None]) -> list[Any]:
-    found, failure = result
-    if failure is not None:
-        raise SweepError(str(failure))
     return found

@@ -7,8 +7,8 @@ import re
 import tempfile
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import Future, ProcessPoolExecutor
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass, field
 from functools import partial
 from pathlib import Path
@@ -154,72 +154,59 @@ def validate(
         method_named(method)
     if jobs < 1:
         raise ValueError(f"{jobs=}: must be >= 1 process")
-    tasks = list(_tasks(scenes, method, seed, None if out is None else Path(out)))
-    shown = Progress([task.scene.duration for task in tasks if task.scene], progress) if progress else None
+    judge = partial(_judge, method=method, seed=seed, out=None if out is None else Path(out))
+    entries = _read(scenes)
+    durations = [scene.duration for _, scene in entries if isinstance(scene, Scene)]
+    shown = Progress(durations, progress) if progress else None
     if jobs == 1:
-        return [_with_progress(shown, task, task.verdict) for task in tasks]
+        return [_with_progress(shown, *entry, partial(judge, *entry)) for entry in entries]
     with ProcessPoolExecutor(jobs, multiprocessing.get_context("spawn")) as pool:
-        futures = [pool.submit(task.verdict) for task in tasks]
+        futures = [pool.submit(judge, *entry) for entry in entries]
         try:
-            pairs = zip(tasks, futures, strict=True)
-            return [_with_progress(shown, task, partial(_result, future)) for task, future in pairs]
+            pairs = zip(entries, futures, strict=True)
+            return [_with_progress(shown, *entry, lambda _, future=future: future.result()) for entry, future in pairs]
         except BaseException:
             pool.shutdown(cancel_futures=True)
             raise
 
 
-@dataclass(frozen=True)
-class _Task:
-    """A scene to be judged, or why it cannot be read."""
-
-    label: str
-    scene: Scene | None
-    problem: str
-    method: str | None
-    seed: int | None
-    out: Path | None
-
-    def verdict(self, tick: Tick | None = None) -> Verdict:
-        """Render and judge the scene."""
-        problem, start = self.problem, time.perf_counter()
-        device, method, seed = "", self.method or defaults.METHOD, self.seed or 0
-        if self.scene is not None:
-            device, method = self.scene.device, self.method or self.scene.method
-            seed = self.scene.seed if self.seed is None else self.seed
-            try:
-                rendering = prepare(self.scene, method=self.method, seed=self.seed)
-                summary = _summary(rendering, self.out and self.out / _NO_NAME.sub("_", self.label), tick)
-                return Verdict.of({**summary, "scene": self.label}, time.perf_counter() - start)
-            except BAD_SCENE as error:
-                problem = str(error)
-        reason = problem.removeprefix(f"{self.label}: ")
-        return Verdict(scene=self.label, device=device, method=method, seed=seed, verdict="error", reason=reason)
-
-
-def _tasks(
-    scenes: Iterable[Scene | str | Path], method: str | None, seed: int | None, out: Path | None
-) -> Iterator[_Task]:
-    """Read all scenes; one that cannot be read has the name of its file, and those of one name are numbered."""
-    read: list[tuple[str, Scene | None, str]] = []
+def _read(scenes: Iterable[Scene | str | Path]) -> list[tuple[str, Scene | str]]:
+    """Labels and scenes, or why one cannot be read; those of one name are numbered."""
+    found: list[tuple[str, Scene | str]] = []
     for reference in scenes:
         try:
             scene = reference if isinstance(reference, Scene) else open_scene(reference)
-            read.append((scene.name, scene, ""))
+            found.append((scene.name, scene))
         except BAD_SCENE as error:
-            read.append((str(reference), None, str(error)))
-    labels = distinct_names(name for name, _, _ in read)
-    for label, (_, found, problem) in zip(labels, read, strict=True):
-        yield _Task(label, found, problem, method, seed, out)
+            found.append((str(reference), str(error)))
+    return list(zip(distinct_names(name for name, _ in found), (scene for _, scene in found), strict=True))
 
 
-def _result(future: Future[Verdict], _: Tick | None) -> Verdict:
-    return future.result()
+def _judge(
+    label: str, scene: Scene | str, tick: Tick | None = None, *, method: str | None, seed: int | None, out: Path | None
+) -> Verdict:
+    """Render and judge a scene; `scene` may be why it cannot be read."""
+    start, device = time.perf_counter(), ""
+    problem = scene if isinstance(scene, str) else ""
+    if isinstance(scene, Scene):
+        device, method = scene.device, method or scene.method
+        seed = scene.seed if seed is None else seed
+        try:
+            rendering = prepare(scene, method=method, seed=seed)
+            summary = _summary(rendering, out and out / _NO_NAME.sub("_", label), tick)
+            return Verdict.of({**summary, "scene": label}, time.perf_counter() - start)
+        except BAD_SCENE as error:
+            problem = str(error)
+    reason, method = problem.removeprefix(f"{label}: "), method or defaults.METHOD
+    return Verdict(scene=label, device=device, method=method, seed=seed or 0, verdict="error", reason=reason)
 
 
-def _with_progress(progress: Progress | None, task: _Task, judge: Callable[[Tick | None], Verdict]) -> Verdict:
-    if progress is None or task.scene is None:
+def _with_progress(
+    progress: Progress | None, label: str, scene: Scene | str, judge: Callable[[Tick | None], Verdict]
+) -> Verdict:
+    if progress is None or isinstance(scene, str):
         return judge(None)
-    with progress.scene(task.label) as tick:
+    with progress.scene(label) as tick:
         return judge(tick)
 
 
@@ -284,19 +271,15 @@ def write_junit(path: str | Path, verdicts: Sequence[Verdict]) -> None:
 
 def _add_case(suite: ElementTree.Element, verdict: Verdict) -> None:
     """Add one scene as a test case, with its failure, error or reason for being skipped."""
-    case = {
-        "classname": _xml(f"hapticrender.{verdict.device}.{verdict.method}"),
-        "name": _xml(verdict.scene),
-        "time": f"{verdict.elapsed:.3f}",
-    }
+    name = f"hapticrender.{verdict.device}.{verdict.method}"
+    case = {"classname": _xml(name), "name": _xml(verdict.scene), "time": f"{verdict.elapsed:.3f}"}
     element = ElementTree.SubElement(suite, "testcase", case)
     if verdict.verdict == "failed":
         attributes = {"message": _xml(sentence(verdict.summary)), "type": "tolerance"}
         ElementTree.SubElement(element, "failure", attributes).text = _xml(as_json(verdict.summary["bands"]))
-    elif verdict.verdict == "error":
-        ElementTree.SubElement(element, "error", {"message": _xml(verdict.reason), "type": "scene"})
-    elif verdict.verdict == "not judged":
-        ElementTree.SubElement(element, "skipped", {"message": _xml(verdict.reason)})
+    elif verdict.verdict != "passed":
+        tag = "error" if verdict.verdict == "error" else "skipped"
+        ElementTree.SubElement(element, tag, {"message": _xml(verdict.reason), "type": "scene"})
 
 
 def _xml(text: str) -> str:

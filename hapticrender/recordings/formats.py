@@ -29,18 +29,7 @@ class MissingExtra(HapticError, ImportError):
 
 
 def read(path: str | os.PathLike[str]) -> tuple[Header, Any]:
-    """Read header and frames of a recording.
-
-    Parameters
-    ----------
-    path : path-like
-        A file whose name ends in .au, .npz, .h5, .hdf5, .mat or .csv.
-
-    Returns
-    -------
-    header : Header
-    frames : ndarray, shape (n, columns), or JournalFrames
-        Those of a journal are read from the file at every access.
+    """Read header and frames (n, columns) of a recording: .au, .npz, .h5, .hdf5, .mat or .csv.
 
     Raises
     ------
@@ -53,10 +42,8 @@ def read(path: str | os.PathLike[str]) -> tuple[Header, Any]:
     """
     path = Path(path)
     if path.suffix.lower() in SOUND_CONTAINERS:
-        raise ValueError(
-            f"{path}: a sound file cannot be loaded as a recording, because its rate is rounded and its header may be "
-            f"cut: load one saved as {', '.join(READERS)}"
-        )
+        cause = "because its rate is rounded and its header may be cut"
+        raise ValueError(f"{path}: a sound file cannot be loaded, {cause}: load one saved as {', '.join(READERS)}")
     reader = _by_suffix(path, READERS, "read")
     if path.exists() and not path.is_file() and not path.is_dir():
         raise ValueError(f"{path}: must be a regular file")
@@ -65,65 +52,40 @@ def read(path: str | os.PathLike[str]) -> tuple[Header, Any]:
 
 
 def write(path: str | os.PathLike[str], header: Header, frames: Any) -> None:
-    """Write a recording in the format of the suffix of `path`; an older file is replaced when the new one is whole.
-
-    Parameters
-    ----------
-    path : path-like
-        Suffix .au (journal), .npz, .h5 or .hdf5, .mat, .csv, .wav, .w64, .rf64 or .flac.
-    header : Header
-    frames : ndarray, shape (n, columns), or JournalFrames
-    """
+    """Write a recording in the format of the suffix of `path`; an older file is replaced when the new one is whole."""
     path = Path(path)
     writer = _by_suffix(path, WRITERS, "written")
     with replacing(path) as scratch:
         writer(scratch, header, frames)
 
 
-def write_sound(
-    path: str | os.PathLike[str],
-    signal: Array,
-    rate: float,
-    full_scale: float | None = None,
-    *,
-    unit: str = "",
-    bits: int = 16,
-) -> float:
-    """Write a signal as PCM sound; the comment of the file states the scale.
+def write_sound(path: Path, signal: Array, rate: float, unit: str) -> float:
+    """Write a signal (n, channels) as 24-bit sound; return its full scale, which the file's comment states.
 
-    Parameters
-    ----------
-    path : path-like
-        Suffix .wav, .w64, .rf64 or .flac.
-    signal : ndarray, shape (n,) or (n, channels)
-        In `unit`; what is not finite becomes silence.
-    rate : float
-        Sampling rate (Hz), > 0; sound files hold it rounded.
-    full_scale : float or None
-        Value that becomes digital full scale, > 0; larger ones are cut.  None: the signal's largest magnitude.
-    unit : str
-        Unit of the signal, for the comment.
-    bits : int
-        16 or 24.
-
-    Returns
-    -------
-    float
-        The full scale that was used, in `unit`.
+    That is 1, 2 or 5 times a power of ten above the peak, in `unit`; what is not finite becomes silence.  Sound files
+    hold the `rate` (Hz) rounded.
     """
-    path = Path(path)
-    container = _by_suffix(path, SOUND_CONTAINERS, "written as sound")
-    if bits not in (16, 24):
-        raise ValueError(f"{bits=} must be 16 or 24")
     signal = np.nan_to_num(np.asarray(signal, float), nan=0.0, posinf=0.0, neginf=0.0)
-    if full_scale is None:
-        full_scale = float(np.abs(signal).max(initial=0.0)) or 1.0
-    if not 0 < full_scale < np.inf:
-        raise ValueError(f"{full_scale=} {unit} must be finite and > 0")
-    comment = f"full scale = {full_scale:.6g} {unit}".rstrip()
+    full_scale = round_up(float(np.abs(signal).max(initial=0.0)))
+    comment = f"full scale = {full_scale:.6g} {unit}"
+    container = _by_suffix(path, SOUND_CONTAINERS, "written as sound")
     with replacing(path) as scratch:
-        _write_audio(scratch, container, f"PCM_{bits}", np.clip(signal / full_scale, -1, 1), rate, comment)
+        _write_audio(scratch, container, "PCM_24", signal / full_scale, rate, comment)
     return full_scale
+
+
+def round_up(peak: float) -> float:
+    """Round up to 1, 2 or 5 times a power of ten; 1 for silence.
+
+    Examples
+    --------
+    >>> round_up(1.3), round_up(0.5), round_up(0.0)
+    (2.0, 0.5, 1.0)
+    """
+    if not 1e-12 < peak < 1e12:
+        return 1.0
+    decade = 10.0 ** math.floor(math.log10(peak))
+    return float(next(step * decade for step in (1, 2, 5, 10) if step * decade >= peak))
 
 
 def _by_suffix(path: Path, table: dict[str, Any], verb: str) -> Any:
@@ -315,12 +277,15 @@ def _write_flac(path: Path, header: Header, frames: Any) -> None:
 def _write_audio(path: Path, container: str, subtype: str, frames: Any, rate: float, comment: str) -> None:
     import soundfile
 
-    channels = 1 if len(frames[:1].shape) == 1 else frames[:1].shape[1]
-    with soundfile.SoundFile(path, "w", max(1, round(rate)), channels, subtype, format=container) as file:
-        if container != "W64":  # has no room for text
-            file.comment = comment
-        for block in chunks(frames, channels):
-            file.write(block)
+    channels = frames[:1].shape[1]
+    try:
+        with soundfile.SoundFile(path, "w", max(1, round(rate)), channels, subtype, format=container) as file:
+            if container != "W64":  # has no room for text
+                file.comment = comment
+            for block in chunks(frames, channels):
+                file.write(block)
+    except soundfile.SoundFileError as error:
+        raise OSError(f"{path}: {error}") from error
 
 
 SOUND_CONTAINERS = {".wav": "WAV", ".w64": "W64", ".rf64": "RF64", ".flac": "FLAC"}

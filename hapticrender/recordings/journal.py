@@ -1,15 +1,12 @@
-"""The journal of a run: its header, and how its columns lie in the file.
+"""The journal of a run: an append-only Sun AU file with its header as JSON in the annotation field.
 
-The journal is an append-only Sun AU file: 64-bit big-endian floats, one column
-a signal, data size "unknown, read to the end", so that every audio tool opens
-it even if the process that wrote it was killed (libsndfile up to 1024 columns,
-507 bands on a plate).  The header stands as JSON in the annotation field.
+64-bit big-endian floats, one column a signal, data size "unknown, read to the end": every audio tool opens it, also
+after the process that wrote it was killed (libsndfile up to 1024 columns, 507 bands on a plate).
 """
 
 from __future__ import annotations
 
 import json
-import math
 import os
 import struct
 import threading
@@ -22,6 +19,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from hapticrender.bands import Bands
+from hapticrender.checks import Validated, check_names, checked, flag, number, numbers, option, parameter, require, text
 from hapticrender.protocols import Array
 
 if TYPE_CHECKING:
@@ -35,22 +33,41 @@ JOURNAL_DTYPE = np.dtype(">f8")
 CHUNK_VALUES = 2**20  # numbers read at once
 LONGEST_NOTE = 2**26  # bytes of header
 MOTION_SOURCES = ("true", "sensors", "unknown")
-NUMBERS: dict[str, tuple[type, float, float, str]] = {  # type, least, largest, unit
-    "seed": (int, 0, 2**63 - 1, ""),
-    "rate": (float, 1e-3, 1e9, "Hz"),
-    "duration": (float, 0, 1e9, "s"),
-    "tolerance": (float, 0, 1e3, "1"),
-    "settle": (float, 0, 1e9, "s"),
-    "drive_channels": (int, 0, 1024, ""),
-    "sensed_channels": (int, 0, 1024, ""),
-    "drive_limit": (float, 0, 1e12, ""),
-}
-WORDS = ("name", "device", "method", "unit", "drive_unit", "motion_source")
+_COLUMNS = ("frequency", "wavenumber", "phase")  # of bands
+_NUMBER = {"least": -1e12, "most": 1e12}
+
+
+def _places(key: str, value: Any) -> tuple[str, ...]:
+    """Return the names of 1 to 1024 evaluation points."""
+    require(isinstance(value, list | tuple) and 1 <= len(value) <= 1024, key, value, "1 to 1024 names")
+    names = tuple(text(key, name) for name in value)
+    require(len(set(names)) == len(names), key, names, "different names")
+    return names
+
+
+def _bands(key: str, value: Any) -> Bands:
+    """Return bands, also from their JSON object."""
+    if isinstance(value, Bands):
+        return value
+    require(isinstance(value, dict), key, value, "an object")
+    for name in (*_COLUMNS, "unfelt"):
+        require(isinstance(value.get(name, []), list), f"{key}.{name}", value.get(name), "a list")
+    columns = {name: [number(f"{key}.{name}", each, **_NUMBER) for each in value.get(name, ())] for name in _COLUMNS}
+    pairs, envelope = value.get("envelope"), None
+    if pairs is not None:
+        good = isinstance(pairs, list) and all(isinstance(pair, list) and len(pair) == 2 for pair in pairs)
+        require(good, f"{key}.envelope", pairs, "pairs of real and imaginary part")
+        parts = [[number(f"{key}.envelope", part, **_NUMBER) for part in pair] for pair in pairs]
+        envelope = np.array([complex(*pair) for pair in parts], complex)
+    marks = {name: flag(f"{key}.{name}", value.get(name, False)) for name in ("modulated", "differentiated")}
+    unfelt = tuple(text(f"{key}.unfelt", each, 1000) for each in value.get("unfelt", ()))
+    arrays: dict[str, Any] = {name: np.array(column, float) for name, column in columns.items()}
+    return Bands(**arrays, envelope=envelope, **marks, unfelt=unfelt)
 
 
 @dataclass(frozen=True, kw_only=True)
-class Header:
-    """What the columns of a recording mean, and where they come from.
+class Header(Validated):
+    """Meaning and origin of the columns of a recording.
 
     Parameters
     ----------
@@ -81,65 +98,44 @@ class Header:
     profile : tuple of float, or None
         Target at each place, as a multiple of the target at the first; None: the same everywhere.
     motion_source : str
-        "true" (known by a simulation or an independent instrument), "sensors" (computed from the sensed signals,
-        so that errors of the sensors do not show), or "unknown" (no sensors).
+        "true" (of a simulation or an independent instrument), "sensors" (computed from the sensed signals, so that
+        errors of the sensors do not show), or "unknown" (no sensors).
 
     Raises
     ------
-    ValueError
+    ValueError, TypeError
         A field has another type, or lies outside its bounds.
     """
 
-    scene: str
-    name: str
-    device: str
-    method: str
-    seed: int
-    rate: float
-    duration: float
-    tolerance: float
-    settle: float
-    bands: Bands
-    drive_channels: int = 2
-    sensed_channels: int = 2
-    places: tuple[str, ...] = ("centre", "end 1", "end 2")
-    drive_limit: float | None = None
-    unit: str = "m"
-    drive_unit: str = "A"
-    profile: tuple[float, ...] | None = None
-    motion_source: str = "true"
+    scene: str = checked(text, longest=2**26, lines=True)
+    name: str = checked(text)
+    device: str = checked(text)
+    method: str = checked(text)
+    seed: int = parameter(most=2**63 - 1)
+    rate: float = parameter(unit="Hz", least=1e-3, most=1e9)
+    duration: float = parameter(unit="s", most=1e9)
+    tolerance: float = parameter(most=1e3)
+    settle: float = parameter(unit="s", most=1e9)
+    bands: Bands = checked(_bands)
+    drive_channels: int = parameter(2, most=1024)
+    sensed_channels: int = parameter(2, most=1024)
+    places: tuple[str, ...] = checked(_places, ("centre", "end 1", "end 2"))
+    drive_limit: float | None = parameter(None, most=1e12)
+    unit: str = checked(text, "m")
+    drive_unit: str = checked(text, "A")
+    profile: tuple[float, ...] | None = checked(numbers, None, least=-1e6, most=1e6)
+    motion_source: str = option("true", *MOTION_SOURCES)
 
     def __post_init__(self) -> None:
-        for name, (kind, least, most, unit) in NUMBERS.items():
-            value = getattr(self, name)
-            if value is not None or name != "drive_limit":
-                _check_number(name, value, kind, least, most, unit)
-        _require(isinstance(self.scene, str), "scene", self.scene, "TOML text")
-        for name in WORDS:
-            _check_word(name, getattr(self, name))
-        _require(self.motion_source in MOTION_SOURCES, "motion_source", self.motion_source, str(MOTION_SOURCES))
-        _require(isinstance(self.places, tuple) and 1 <= len(self.places) <= 1024, "places", self.places, "1 to 1024")
-        for name in self.places:
-            _check_word("places", name)
-        _require(len(set(self.places)) == len(self.places), "places", self.places, "different names")
-        if self.profile is not None:
-            fits = isinstance(self.profile, tuple) and len(self.profile) == len(self.places)
-            _require(fits, "profile", self.profile, "one number a place")
-            for value in self.profile:
-                _check_number("profile", value, float, -1e6, 1e6, "1")
+        super().__post_init__()
+        fits = self.profile is None or len(self.profile) == len(self.places)
+        require(fits, "profile", self.profile, "one number a place")
 
     @classmethod
     def of(cls, scene: Scene, **rest: Any) -> Header:
         """Take name, device, duration, tolerance and settling time from a scene."""
-        return cls(
-            scene=scene.to_toml(),
-            name=scene.name,
-            device=scene.device,
-            duration=float(scene.duration),
-            tolerance=float(scene.tolerance),
-            settle=float(scene.settle),
-            **rest,
-        )
+        own = {name: getattr(scene, name) for name in ("name", "device", "duration", "tolerance", "settle")}
+        return cls(scene=scene.to_toml(), **own, **rest)
 
     @property
     def widths(self) -> dict[str, int]:
@@ -183,84 +179,25 @@ class Header:
         """Write all fields as one JSON object; numbers keep every digit."""
         values = {name: getattr(self, name) for name in self.__dataclass_fields__ if name != "bands"}
         envelope = self.bands.envelope
-        bands = {name: getattr(self.bands, name).tolist() for name in ("frequency", "wavenumber", "phase")}
+        bands = {name: getattr(self.bands, name).tolist() for name in _COLUMNS}
         bands |= {name: getattr(self.bands, name) for name in ("modulated", "differentiated", "unfelt")}
         bands["envelope"] = None if envelope is None else [[z.real, z.imag] for z in envelope.tolist()]
         channels = [{"name": name, "unit": unit} for name, unit in self.channels]
         return json.dumps({"format": FORMAT, "version": VERSION, **values, "bands": bands, "channels": channels})
 
     @classmethod
-    def from_json(cls, text: str, where: str = "header") -> Header:
+    def from_json(cls, note: str, where: str = "header") -> Header:
         """Read what `to_json` wrote, checking every field; `where` names the file in an error."""
         try:
-            values = json.loads(text)
-            _require(isinstance(values, dict) and values.get("format") == FORMAT, "format", text[:40], repr(FORMAT))
-            version = values.get("version")
-            _require(version == VERSION, "version", version, f"{VERSION}, the one that this library reads")
+            values = json.loads(note)
+            require(isinstance(values, dict) and values.get("format") == FORMAT, "format", note[:40], repr(FORMAT))
+            require(values.get("version") == VERSION, "version", values.get("version"), f"{VERSION}")
             own = {name: value for name, value in values.items() if name not in ("format", "version", "channels")}
-            return cls(**_named_fields(own))
-        except (ValueError, RecursionError) as error:
+            required = {entry.name: None for entry in fields(cls) if entry.default is MISSING}
+            check_names(own, cls.names())
+            return cls(**{**required, **own})
+        except (ValueError, TypeError, RecursionError) as error:
             raise ValueError(f"{where}: not a recording of this library ({error})") from error
-
-
-def _named_fields(values: dict[str, Any]) -> dict[str, Any]:
-    """Keyword arguments of `Header` from the values of its JSON object."""
-    known = {entry.name: entry.default is MISSING for entry in fields(Header)}
-    _require(values.keys() <= known.keys(), "fields", sorted(values.keys() - known.keys()), "known to this version")
-    missing = [name for name, required in known.items() if required and name not in values]
-    _require(not missing, "fields", missing, "present")
-    for name in ("places", "profile"):
-        if isinstance(values.get(name), list):
-            values[name] = tuple(values[name])
-    for name, (kind, *_) in NUMBERS.items():
-        if kind is float and type(values.get(name)) is int and abs(values[name]) < 2**53:
-            values[name] = float(values[name])
-    return values | {"bands": _bands(values["bands"])}
-
-
-def _bands(values: Any) -> Bands:
-    """Bands from their JSON object."""
-    _require(isinstance(values, dict), "bands", values, "an object")
-    columns = {name: values.get(name) for name in ("frequency", "wavenumber", "phase")}
-    for name, column in columns.items():
-        _require(isinstance(column, list), f"bands.{name}", column, "a list of numbers")
-        for value in column or ():
-            _check_number(f"bands.{name}", value, float, -1e12, 1e12, "")
-    envelope = values.get("envelope")
-    if envelope is not None:
-        pairs = isinstance(envelope, list) and all(isinstance(pair, list) and len(pair) == 2 for pair in envelope)
-        _require(pairs, "bands.envelope", envelope, "pairs of real and imaginary part")
-        for value in (part for pair in envelope for part in pair):
-            _check_number("bands.envelope", value, float, -1e12, 1e12, "")
-        envelope = np.array([complex(*pair) for pair in envelope], complex)
-    marks = {name: values.get(name, False) for name in ("modulated", "differentiated")}
-    for name, mark in marks.items():
-        _require(isinstance(mark, bool), f"bands.{name}", mark, "true or false")
-    unfelt = values.get("unfelt", [])
-    _require(isinstance(unfelt, list), "bands.unfelt", unfelt, "a list of texts")
-    for text in unfelt:
-        _check_word("bands.unfelt", text, 1000)
-    arrays: dict[str, Any] = {name: np.array(column, float) for name, column in columns.items()}
-    return Bands(**arrays, envelope=envelope, **marks, unfelt=tuple(unfelt))
-
-
-def _require(good: bool, name: str, value: Any, bound: str) -> None:
-    if not good:
-        shown = repr(value)
-        raise ValueError(f"{name} = {shown if len(shown) <= 60 else shown[:57] + '...'}: must be {bound}")
-
-
-def _check_number(name: str, value: Any, kind: type, least: float, most: float, unit: str) -> None:
-    numeric = type(value) is int or (kind is float and type(value) is float)
-    good = numeric and math.isfinite(value) and least <= value <= most
-    _require(
-        good, name, value, f"{'a whole' if kind is int else 'a'} number from {least:g} to {most:g} {unit}".rstrip()
-    )
-
-
-def _check_word(name: str, value: Any, longest: int = 200) -> None:
-    good = isinstance(value, str) and value.isprintable() and len(value) <= longest
-    _require(good, name, value, f"a text of printable characters, at most {longest}")
 
 
 def journal_head(header: Header) -> bytes:
@@ -273,15 +210,7 @@ def journal_head(header: Header) -> bytes:
 
 
 class JournalFrames:
-    """Frames of a journal, read from its file at every access: nothing is held, and a file cut meanwhile is an error.
-
-    Parameters
-    ----------
-    path : Path
-    offset : int
-        Bytes before the first frame.
-    columns : int
-    """
+    """Frames of a journal after `offset` bytes, read at every access; a file that is cut meanwhile is an error."""
 
     def __init__(self, path: Path, offset: int, columns: int) -> None:
         self.path, self._offset, self._columns = path, offset, columns
@@ -297,16 +226,13 @@ class JournalFrames:
     def __getitem__(self, rows: slice) -> Array:
         """Read a slice of the rows as native floats (n, columns)."""
         start, stop, step = rows.indices(self._count)
-        data = bytearray(max(0, stop - start) * self._row)
-        view, done = memoryview(data), 0
+        count = max(0, stop - start) * self._columns
         with self._lock:
             self._file.seek(self._offset + start * self._row)
-            while done < len(data):
-                count = self._file.readinto(view[done:])
-                if not count:
-                    raise ValueError(f"{self.path}: was cut to fewer than {self._count} samples while it was open")
-                done += count
-        return np.frombuffer(data, JOURNAL_DTYPE).reshape(-1, self._columns)[::step].astype(float)
+            data = np.fromfile(self._file, JOURNAL_DTYPE, count)
+        if len(data) < count:
+            raise ValueError(f"{self.path}: was cut to fewer than {self._count} samples while it was open")
+        return data.reshape(-1, self._columns)[::step].astype(float)
 
     def __reduce__(self) -> Any:
         """Pickle as an array."""
@@ -344,6 +270,8 @@ def column(header: Header, frames: Array, name: str) -> Array:
 
 def join(header: Header, signals: dict[str, Array]) -> Array:
     """Frames (n, columns) from signals by name; the inverse of `split`, and it checks every shape."""
+    for name in header.slices:
+        require(name in signals, name, None, "an array with a row a sample")
     count = len(signals["drive"])
     frames = np.empty((count, len(header.channels)))
     for name, columns in header.slices.items():

@@ -28,11 +28,9 @@ FLUSH = 0.25  # s of signal: the most that a killed process loses
 class Recorder:
     """Write a run while it happens, into a journal or into memory.
 
-    With a path, the file is made at the first block, so that a run which never
-    starts leaves an older journal of that name untouched.  Later blocks are
-    collected and handed to the operating system every 0.25 s of signal, and
-    when the recorder closes, also after an exception: a killed process loses
-    0.25 s at most, a failing one nothing.
+    With a path, the file is made at the first block, so that a run which never starts leaves an older journal of that
+    name untouched.  Later blocks are collected and handed to the operating system every 0.25 s of signal, and when the
+    recorder closes, also after an exception: a killed process loses 0.25 s at most, a failing one nothing.
 
     Parameters
     ----------
@@ -40,69 +38,21 @@ class Recorder:
         Journal to write, suffix .au; None keeps the run in memory.
     scene : Scene
         What is rendered.
-    method : str
-        Name of the control method.
-    seed : int
-        Seed of the run, >= 0.
-    rate : float
-        Sampling rate (Hz), 1e-3 to 1e9.
-    bands : Bands
-        Carriers of the run.
-    drive_channels, sensed_channels : int
-        Channels of the device.
-    places : tuple of str
-        Names of the evaluation points, the centre first; one column of motion each.
-    drive_limit : float or None
-        Largest drive that the device takes, where it is known.
-    unit, drive_unit : str
-        Of sensors, motion and targets; of the drive.
-    profile : tuple of float, or None
-        Target at each place, as a multiple of the target at the first; None: the same everywhere.
-    motion_source : str
-        Where `motion` comes from: "true", "sensors" or "unknown"; the first block may state another one.
+    **header
+        The other fields of `journal.Header`: method, seed, rate (Hz) and bands, and whatever differs from two coils
+        (A) and two sensors (m) with places "centre", "end 1" and "end 2" of known motion.
 
     Raises
     ------
-    ValueError
-        The path does not end in .au, or a number is out of its bounds.
+    ValueError, TypeError
+        The path does not end in .au, or a field is out of its bounds.
     """
 
-    def __init__(
-        self,
-        path: str | os.PathLike[str] | None,
-        *,
-        scene: Scene,
-        method: str,
-        seed: int,
-        rate: float,
-        bands: Bands,
-        drive_channels: int = 2,
-        sensed_channels: int = 2,
-        places: tuple[str, ...] = ("centre", "end 1", "end 2"),
-        drive_limit: float | None = None,
-        unit: str = "m",
-        drive_unit: str = "A",
-        profile: tuple[float, ...] | None = None,
-        motion_source: str = "true",
-    ) -> None:
+    def __init__(self, path: str | os.PathLike[str] | None, *, scene: Scene, **header: Any) -> None:
         self.path = None if path is None else Path(path)
         if self.path is not None and self.path.suffix.lower() != ".au":
             raise ValueError(f"{self.path}: a journal is a Sun AU file, its name must end in .au")
-        self.header = Header.of(
-            scene,
-            method=method,
-            seed=int(seed),
-            rate=float(rate),
-            bands=bands,
-            drive_channels=int(drive_channels),
-            sensed_channels=int(sensed_channels),
-            places=tuple(places),
-            drive_limit=None if drive_limit is None else float(drive_limit),
-            unit=unit,
-            drive_unit=drive_unit,
-            profile=None if profile is None else tuple(map(float, profile)),
-            motion_source=motion_source,
-        )
+        self.header = Header.of(scene, **header)
         self._scene = scene
         self._file: BinaryIO | None = None
         self._blocks: list[Array] = []  # what is not in the file yet; without a path, everything
@@ -114,50 +64,18 @@ class Recorder:
     def __exit__(self, *exc: object) -> None:
         self.close()
 
-    def append(
-        self,
-        drive: Array,
-        sensed: Array,
-        motion: Array,
-        position: Array,
-        normal_load: Array,
-        target: Array,
-        flags: Array,
-        *,
-        motion_source: str | None = None,
-    ) -> None:
-        """Append n samples.
+    def append(self, *, motion_source: str | None = None, **signals: Array) -> None:
+        """Append n samples of every signal.
 
-        Parameters
-        ----------
-        drive : ndarray, shape (n, drive_channels), drive unit
-            Commanded drive of each interval.
-        sensed : ndarray, shape (n, sensed_channels), unit
-        motion : ndarray, shape (n, places), unit
-            True motion, or the best estimate where the device has no independent measurement.
-        position : ndarray, shape (n,), m
-            Finger from the middle of the surface, NaN while it is lifted.
-        normal_load : ndarray, shape (n,), N
-        target : ndarray of complex, shape (n, n_bands), unit
-            Reference envelopes.
-        flags : ndarray of int, shape (n,)
-            Status words (``protocols.Flag``).
-        motion_source : str, optional
-            Read at the first block only: replaces the one of the constructor.
+        `drive` (n, channels) as commanded in each interval; `sensed` (n, channels); `motion` (n, places), true or the
+        best estimate; finger `position` (n,), m, NaN while lifted; `normal_load` (n,), N; `target` (n, n_bands), the
+        complex reference envelopes; `flags` (n,), ``protocols.Flag``.  Units are those of the header.  The first
+        block's `motion_source` replaces that of the header.
         """
         if motion_source is not None and self._file is None and not self._blocks:
             self.header = replace(self.header, motion_source=motion_source)
-        signals = {
-            "drive": drive,
-            "sensed": sensed,
-            "motion": motion,
-            "position": position,
-            "normal_load": normal_load,
-            "target": target,
-            "flags": flags,
-        }
         self._blocks.append(journal.join(self.header, signals))
-        self._waiting += len(drive)
+        self._waiting += len(signals["drive"])
         if self._file is None or self._waiting >= FLUSH * self.header.rate:
             self.flush()
 
@@ -214,7 +132,7 @@ class Recording:
     Parameters
     ----------
     header : Header
-        What the columns mean and where they come from.
+        Meaning and origin of the columns.
     frames : ndarray, shape (n, columns), or JournalFrames
         The signals; those of a journal are read from its file at every access.
     scene : Scene or None
@@ -260,16 +178,9 @@ class Recording:
         return np.arange(len(self)) / self.rate
 
     def read(self, name: str, start: int = 0, stop: int | None = None, step: int = 1) -> Array:
-        """Read every `step`-th sample of one signal from `start` to `stop`, a bounded number at a time.
+        """Read every `step`-th sample (>= 1) of a signal from `start` to `stop`, a bounded number at a time.
 
-        Parameters
-        ----------
-        name : str
-            "drive", "sensed", "motion", "position", "normal_load", "target" or "flags".
-        start, stop : int
-            Samples, as in a slice; `stop` None: to the end.
-        step : int
-            >= 1.
+        `name` is "drive", "sensed", "motion", "position", "normal_load", "target" or "flags".
         """
         if isinstance(self.frames, np.ndarray):
             return journal.column(self.header, self.frames[start:stop:step], name)
@@ -294,15 +205,9 @@ class Recording:
         return figures(self.summary())
 
     def plot(self, path: str | os.PathLike[str]) -> bool:
-        """Draw target, achieved motion, drive and finger into one .png, .svg or .pdf.
+        """Draw target, achieved motion, drive and finger into one .png, .svg or .pdf; False without matplotlib.
 
-        Without matplotlib a warning says how to install it, nothing is drawn and False is returned, so that a script
-        goes on to save the run.
-
-        Raises
-        ------
-        ValueError
-            The file's ending is none of these.
+        Then a warning says how to install it, so that a script goes on to save the run.
         """
         from hapticrender.report import picture
 

@@ -11,8 +11,8 @@ import numpy as np
 from hapticrender.formatting import quantity, short
 from hapticrender.recordings.recording import Recording
 from hapticrender.report.figure import BLUE, GREEN, INK, ORANGE, RED, legend, new_figure, save
-from hapticrender.report.picture import FLOOR, QUANTITIES
-from hapticrender.skin import felt_bands, residual_velocity, skin_waveform
+from hapticrender.report.picture import DASHED, FLOOR, QUANTITIES, error_axis
+from hapticrender.skin import residual_velocity, skin_bands, skin_waveform
 from hapticrender.touch.perception import HIGHEST
 
 COLOURS, MARKERS = (BLUE, ORANGE, GREEN, RED), "os^D"
@@ -21,13 +21,7 @@ BOUND = 5.0  # %: how far devices may differ
 
 
 def plot_devices(recordings: Mapping[str, Recording], path: str | os.PathLike[str]) -> None:
-    """Draw recordings of one texture, by the name of their device, into a .png, .svg or .pdf.
-
-    Raises
-    ------
-    MissingExtra
-        matplotlib is not installed.
-    """
+    """Draw recordings of one texture, by the name of their device, into a .png, .svg or .pdf."""
     save(draw_devices(recordings), path)
 
 
@@ -44,30 +38,30 @@ def draw_devices(recordings: Mapping[str, Recording]) -> Any:
             axes.tick_params(labelleft=i == 0)
         figure.legend(*first.get_legend_handles_labels(), loc="outside upper right", ncols=2)
         _bands(figure.add_subplot(grid[1, :]), recordings)
-        name = next(iter(recordings.values())).scene.texture
+        texture = next(iter(recordings.values())).scene.texture
         figure.suptitle(
-            f"Predicted skin velocity up to {short(HIGHEST, 'Hz')} on {len(recordings)} devices ({_said(name)})",
+            f"Predicted skin velocity up to {short(HIGHEST, 'Hz')} on {len(recordings)} devices ({_name(texture)})",
             x=0.01, ha="left", fontsize=12.5, fontweight="bold",
         )  # fmt: skip
     return figure
 
 
-def _said(texture: Any) -> str:
+def _name(texture: Any) -> str:
     kind = getattr(texture, "kind", type(texture).__name__)
     partials = getattr(texture, "partials", None)
     return f"{kind}, {len(partials)} partials" if partials else str(kind)
 
 
 def _waveform(axes: Any, recording: Recording, device: str, colour: str) -> None:
-    """Show a few periods of the bands' wanted and achieved skin velocity, late in the run, and what is beside them."""
-    lowest = min(band.frequency for band in felt_bands(recording))
+    """Draw a few periods of the bands' target and achieved skin velocity at the end of the run."""
+    lowest = min(band.frequency for band in skin_bands(recording))
     seconds = PERIODS / lowest
     start = len(recording) / recording.rate - 0.2 - seconds
     start = np.ceil(start * lowest) / lowest  # the same phase on every device
-    time, wanted, achieved = skin_waveform(recording, start, seconds)
+    time, target, achieved = skin_waveform(recording, start, seconds)
     milliseconds = 1e3 * (time - time[0])
     axes.plot(milliseconds, 1e3 * achieved, color=colour, lw=2.0, label="achieved (from the envelopes)")
-    axes.plot(milliseconds, 1e3 * wanted, color=INK, lw=1.0, ls=(0, (4, 2)), label="target")
+    axes.plot(milliseconds, 1e3 * target, color=INK, lw=1.0, ls=DASHED, label="target")
     axes.set(title=f"{device}, by {QUANTITIES.get(recording.header.unit, 'motion')}", xlabel="time (ms)")
     beside = f"outside the bands {quantity(residual_velocity(recording), 'm/s')} rms"
     axes.text(0.98, 0.02, beside, transform=axes.transAxes, ha="right", va="bottom", fontsize=8)
@@ -79,21 +73,16 @@ def _bands(axes: Any, recordings: Mapping[str, Recording]) -> None:
     """Draw the magnitude of the error of every band's skin velocity on every device, with its sign as text."""
     width, ticks = 0.8 / len(recordings), []
     for i, (device, recording) in enumerate(recordings.items()):
-        bands = felt_bands(recording)
-        ticks = [f"{band.frequency:.4g} Hz, target {1e3 * band.wanted:.3g} mm/s" for band in bands]
+        bands = skin_bands(recording)
+        ticks = [f"{band.frequency:.4g} Hz, target {1e3 * band.target:.3g} mm/s" for band in bands]
         place = np.arange(len(bands)) + (i - (len(recordings) - 1) / 2) * width
         error = np.array([100 * band.error for band in bands])
         size, colour = np.maximum(np.abs(error), FLOOR), COLOURS[i % len(COLOURS)]
         axes.plot(place, size, MARKERS[i % len(MARKERS)], color=colour, ms=8, label=device)
         for x, y, value in zip(place, size, error, strict=True):
             axes.annotate(f"{value:+.2f} %", (x, y), xytext=(8, 0), textcoords="offset points", va="center", fontsize=8)
-    axes.axhline(BOUND, color=INK, lw=1, ls=(0, (4, 2)), label=f"{BOUND:g} %")
-    axes.set_yscale("log")
-    low, high = axes.get_ylim()
-    axes.set(ylim=(min(low, BOUND / 100) / 1.5, 1.5 * max(high, BOUND)), xlim=(-0.6, len(ticks) - 0.4))
-    axes.yaxis.set_major_formatter(lambda value, _: f"{value:g}")
-    axes.minorticks_off()
+    axes.axhline(BOUND, color=INK, lw=1, ls=DASHED, label=f"{BOUND:g} %")
+    axes.set(ylim=error_axis(axes, BOUND), xlim=(-0.6, len(ticks) - 0.4))
     axes.set_xticks(range(len(ticks)), ticks)
-    axes.grid(axis="x", visible=False)
     axes.set(ylabel="error (%)", title="Error of the skin velocity of each band")
     legend(axes)

@@ -36,21 +36,9 @@ STYLE: Any = {
 def new_figure(
     size: tuple[float, float], *, pads: tuple[float, float] | None = None, style: Mapping[str, Any] | None = None
 ) -> Iterator[Any]:
-    """Make a ``matplotlib.figure.Figure``, apart from pyplot and its global state, with the style of this package.
+    """Make a ``matplotlib.figure.Figure`` of `size` (inch), apart from pyplot, in `STYLE` with `style` over it.
 
-    Parameters
-    ----------
-    size : tuple of float, inch
-        Width and height.
-    pads : tuple of float, inch, optional
-        Room around every panel, beside it and above; by default as matplotlib has it.
-    style : mapping, optional
-        What differs from `STYLE`.
-
-    Raises
-    ------
-    MissingExtra
-        matplotlib is not installed.
+    `pads` (inch) is the room beside and above every panel.  Raises `MissingExtra` without matplotlib.
     """
     try:
         import matplotlib

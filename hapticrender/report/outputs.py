@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-import math
 import os
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from hapticrender.formatting import as_json
 from hapticrender.loop import run
-from hapticrender.protocols import Array, Rendering
+from hapticrender.protocols import Rendering
 from hapticrender.recordings.formats import MissingExtra, write_sound
 from hapticrender.recordings.journal import read_journal
 from hapticrender.recordings.recording import Recording
@@ -23,27 +23,15 @@ FILES = ("scene.toml", JOURNAL, "drive.wav", "sensed.wav", "picture.png", "summa
 
 @dataclass(frozen=True, kw_only=True)
 class Outputs:
-    """A folder with one rendered scene.
+    """A folder with one rendered scene: its name, its files, its figures and its TOML.
 
-    Parameters
-    ----------
-    name : str
-        Name of the scene.
-    folder : Path
-        Folder with its files.
-    summary : mapping
-        ``Recording.summary()`` and, under "sound", the full scale (SI) of each WAV.
-    toml : str
-        The scene as TOML.
-    picture : bool
-        Whether there is a picture; it takes the ``plot`` extra.
+    `summary` is ``Recording.summary()`` and, under "sound", the full scale (SI) of each WAV.
     """
 
     name: str
     folder: Path
     summary: Mapping[str, Any]
     toml: str
-    picture: bool
 
     @property
     def files(self) -> list[Path]:
@@ -54,11 +42,11 @@ class Outputs:
 def check_folder(option: str, folder: Path, given: Path | None = None) -> None:
     """Refuse a folder that could not be made or written into, without making it; `given` is the option's value."""
     nearest = next(path for path in (folder, *folder.absolute().parents) if path.exists() or path.is_symlink())
-    named = f"{option} = {str(given or folder)!r}"
+    entry = f"{option} = {str(given or folder)!r}"
     if not nearest.is_dir():
-        raise ValueError(f"{named}: {str(nearest)!r} is a file, must be a folder")
+        raise ValueError(f"{entry}: {str(nearest)!r} is a file, must be a folder")
     if not os.access(nearest, os.W_OK | os.X_OK):
-        raise ValueError(f"{named}: no permission to write into {str(nearest)!r}")
+        raise ValueError(f"{entry}: no permission to write into {str(nearest)!r}")
 
 
 def check_file(option: str, path: Path) -> None:
@@ -71,50 +59,23 @@ def check_file(option: str, path: Path) -> None:
 
 
 def refuse_to_overwrite(folder: Path, source: Path | None = None) -> None:
-    """Refuse a folder in which files would be overwritten that no earlier run has written.
-
-    Parameters
-    ----------
-    folder : Path
-        Where a scene is to be rendered; it need not exist.
-    source : Path, optional
-        File of the scene, which must not be overwritten either.
-
-    Raises
-    ------
-    ValueError
-        Names the first such file.
-    """
+    """Refuse a folder in which files would be overwritten that no earlier run has written, or the scene `source`."""
     present = [folder / name for name in FILES if (folder / name).exists()]
     for path in present:
         if source is not None and source.exists() and path.samefile(source):
             raise ValueError(f"{str(path)!r}: would overwrite the scene itself: choose another folder")
-    if present and not _earlier_run(folder):
-        raise ValueError(
-            f"{str(present[0])!r}: is there and from no earlier run: choose another folder, or add --force"
-        )
-
-
-def _earlier_run(folder: Path) -> bool:
-    """Whether a folder holds the journal of an earlier run."""
-    try:
-        read_journal(folder / JOURNAL)
-    except (OSError, ValueError):
-        return False
-    return True
+    if present:
+        try:
+            read_journal(folder / JOURNAL)
+        except (OSError, ValueError):
+            cure = "is there and from no earlier run: choose another folder, or add --force"
+            raise ValueError(f"{str(present[0])!r}: {cure}") from None
 
 
 def run_into(folder: Path, rendering: Rendering, *, progress: Callable[[float, float], None] | None = None) -> Outputs:
     """Run a prepared `rendering` and write everything about it into `folder`, which is made where it is not there.
 
     Files of an earlier run are removed first, so that all files are of this run, also after an interruption.
-
-    Raises
-    ------
-    OSError
-        The folder cannot be written.
-    DriverError
-        The device failed.
     """
     return write_outputs(folder, run(rendering, journal=begin_outputs(folder, rendering), progress=progress))
 
@@ -141,48 +102,13 @@ def _remove_files(folder: Path) -> None:
 
 def write_outputs(folder: Path, recording: Recording) -> Outputs:
     """Write sounds, picture and figures of a recording whose scene and journal are in `folder`."""
-    header = recording.header
-    sound = {
-        f"{name}.wav": {"full_scale": _write_sound(folder / f"{name}.wav", recording.read(name), header.rate, unit)}
-        | {"unit": unit}
-        for name, unit in (("drive", header.drive_unit), ("sensed", header.unit))
-        if header.widths[name]
-    }
-    drawn = _plot(recording, folder / "picture.png")
+    header, sound = recording.header, {}
+    for name, unit in (("drive", header.drive_unit), ("sensed", header.unit)):
+        if header.widths[name]:
+            full_scale = write_sound(folder / f"{name}.wav", recording.read(name), header.rate, unit)
+            sound[f"{name}.wav"] = {"full_scale": full_scale, "unit": unit}
+    with suppress(MissingExtra):
+        picture.plot(recording, folder / "picture.png")
     summary = {**recording.summary(), "sound": sound}
     (folder / "summary.json").write_text(as_json(summary), encoding="utf-8")
-    return Outputs(name=header.name, folder=folder, summary=summary, toml=header.scene, picture=drawn)
-
-
-def _write_sound(path: Path, samples: Array, rate: float, unit: str) -> float:
-    """Write `samples` as 24-bit sound, with a round full scale above their peak, and return that."""
-    import soundfile
-
-    full_scale = round_up(max(abs(samples.min(initial=0.0)), samples.max(initial=0.0)))
-    try:
-        return write_sound(path, samples, rate, full_scale, unit=unit, bits=24)
-    except soundfile.SoundFileError as error:
-        raise OSError(f"{path}: {error}") from error
-
-
-def round_up(peak: float) -> float:
-    """Round up to 1, 2 or 5 times a power of ten; 1 for silence.
-
-    Examples
-    --------
-    >>> round_up(1.3), round_up(0.5), round_up(0.0)
-    (2.0, 0.5, 1.0)
-    """
-    if not 1e-12 < peak < 1e12:
-        return 1.0
-    decade = 10.0 ** math.floor(math.log10(peak))
-    return float(next(step * decade for step in (1, 2, 5, 10) if step * decade >= peak))
-
-
-def _plot(recording: Recording, path: Path) -> bool:
-    """Draw the picture where matplotlib is installed."""
-    try:
-        picture.plot(recording, path)
-    except MissingExtra:
-        return False
-    return True
+    return Outputs(name=header.name, folder=folder, summary=summary, toml=header.scene)

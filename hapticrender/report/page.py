@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from html import escape
@@ -12,14 +11,16 @@ from urllib.parse import quote
 
 from hapticrender import __version__
 from hapticrender.formatting import as_json, band_label, bands_label, degrees, percent, quantity, short
-from hapticrender.report.devices_page import devices_section
-from hapticrender.report.outputs import Outputs
+from hapticrender.recordings.recording import Recording
+from hapticrender.report.devices_picture import plot_devices
+from hapticrender.report.outputs import JOURNAL, Outputs
 from hapticrender.report.text import amplitudes, brief, columns_of, flags, titles, verdict, worst_at
+from hapticrender.skin import skin_bands
 from hapticrender.touch.scene import distinct_names
 
 _MANY_BANDS = 10
-_AXIS = (1e-3, 10.0)  # relative errors at the ends of the little charts, logarithmic
-_CHART = (150, 22)  # px
+DEVICES = "devices.png"
+NO_PICTURE = '<p class="note">No picture: matplotlib is not installed.</p>'
 GENERATOR = '<meta name="generator" content="hapticrender">'
 CLASSES = {"passed": "good", "failed": "bad", "not judged": "note"}
 
@@ -28,52 +29,34 @@ STYLE = """
   --good: #2b6f77; --bad: #b3432b; }
 @media (prefers-color-scheme: dark) { :root { --ink: #dde4ea; --soft: #98a5b0; --line: #37424c; --wash: #1e262d;
   --paper: #14191e; --good: #6fc3cc; --bad: #f08a6e; } section img { filter: invert(1) hue-rotate(180deg); } }
-* { box-sizing: border-box; }
 body { margin: 0 auto; max-width: 70rem; padding: 3rem 1.5rem 5rem; color: var(--ink); background: var(--paper);
-  font: 16px/1.55 system-ui, -apple-system, "Segoe UI", "Noto Sans", sans-serif; }
-h1, h2 { font-family: Charter, "Iowan Old Style", Georgia, "Noto Serif", serif; font-weight: 600; line-height: 1.2; }
-h1 { font-size: 2.4rem; margin: 0 0 1rem; }
-h2 { font-size: 1.6rem; margin: 0; }
-p { max-width: 46rem; }
-a { color: var(--good); text-underline-offset: 0.15em; }
+  font: 16px/1.55 system-ui, sans-serif; }
+h1, h2 { font-family: Georgia, serif; line-height: 1.2; }
+a { color: var(--good); }
 nav { columns: 14rem; margin: 1.5rem 0; font-size: 0.9rem; }
 nav a { display: block; }
 .scroll { overflow-x: auto; margin: 1.5rem 0; }
 table { border-collapse: collapse; width: 100%; font-size: 0.9rem; font-variant-numeric: tabular-nums; }
 caption { text-align: left; color: var(--soft); }
-th { text-align: right; font-weight: 600; color: var(--soft); padding: 0.3rem 0.7rem; vertical-align: bottom; }
-td { text-align: right; padding: 0.45rem 0.7rem; border-top: 1px solid var(--line); white-space: nowrap; }
+th, td { text-align: right; padding: 0.4rem 0.7rem; }
+th { color: var(--soft); vertical-align: bottom; }
+td { border-top: 1px solid var(--line); white-space: nowrap; }
 th.text, td.text { text-align: left; }
-td.wide { white-space: normal; min-width: 9rem; line-height: 1.35; }
+td.wide { white-space: normal; min-width: 9rem; }
 th.group { text-align: center; border-bottom: 1px solid var(--line); }
-tbody tr:hover { background: var(--wash); }
 .good { color: var(--good); }
 .bad { color: var(--bad); }
 .note { color: var(--soft); font-size: 0.9rem; }
-svg { display: block; fill: var(--soft); stroke: none; }
-svg .axis { stroke: var(--line); } svg .bound { stroke: var(--soft); }
-svg .disc.good { fill: var(--good); } svg .disc.bad { fill: var(--bad); }
-svg .ring { fill: none; stroke-width: 1.5; }
-svg .ring.good { stroke: var(--good); } svg .ring.bad { stroke: var(--bad); }
-section { border-top: 2px solid var(--ink); margin-top: 3.5rem; padding-top: 1.2rem; }
-section > p { margin: 0.3rem 0 1.2rem; max-width: none; }
+section { border-top: 2px solid var(--ink); margin-top: 3.5rem; }
 section img { display: block; width: 100%; height: auto; }
 .halves { display: grid; grid-template-columns: repeat(auto-fit, minmax(min(22rem, 100%), 1fr)); gap: 0.5rem 3rem; }
-dl { display: grid; grid-template-columns: max-content 1fr; gap: 0.35rem 1.2rem; margin: 1rem 0; font-size: 0.9rem; }
+dl { display: grid; grid-template-columns: max-content 1fr; gap: 0.35rem 1.2rem; font-size: 0.9rem; }
 dt { color: var(--soft); }
 dd { margin: 0; }
-audio { width: 100%; height: 2.2rem; display: block; margin-top: 0.25rem; }
-pre { margin: 1rem 0; padding: 1rem 1.2rem; background: var(--wash); border-radius: 4px; overflow: auto;
-  max-height: 34rem; align-self: start; font: 0.8rem/1.5 ui-monospace, "DejaVu Sans Mono", monospace; }
-summary { cursor: pointer; color: var(--good); font-size: 0.9rem; }
-footer { margin-top: 4rem; }
-@media (max-width: 45rem) { body { padding: 1.5rem 0.8rem; } .overview .more { display: none; }
-  th, td { padding: 0.35rem 0.4rem; } }
-@media print { body { max-width: none; padding: 0; font-size: 10pt; background: #fff; }
-  audio, nav, .chart { display: none; } td.wide { min-width: 0; }
-  .scroll { overflow: visible; } table { font-size: 7.5pt; } th, td { padding: 0.15rem 0.3rem; }
-  tr, img { break-inside: avoid; } h2, h2 + p { break-after: avoid; } section { break-before: page; }
-  pre { max-height: none; white-space: pre-wrap; } }
+audio { width: 100%; height: 2.2rem; display: block; }
+pre { padding: 1rem 1.2rem; background: var(--wash); overflow: auto; max-height: 34rem; font-size: 0.8rem; }
+@media print { body { max-width: none; padding: 0; font-size: 10pt; background: #fff; } audio, nav { display: none; }
+  .scroll { overflow: visible; } table { font-size: 7.5pt; } section { break-before: page; } }
 """
 
 
@@ -85,13 +68,7 @@ def refuse_foreign_page(folder: Path) -> None:
 
 
 def write_page(folder: Path, scenes: Sequence[Outputs]) -> Path:
-    """Write ``index.html`` and ``summary.json`` into `folder`, with relative links to the scenes' folders below it.
-
-    Returns
-    -------
-    Path
-        The page.
-    """
+    """Write ``index.html`` and ``summary.json`` into `folder`, with links to the scenes' folders below it."""
     labels = distinct_names(scene.name for scene in scenes)
     scenes = [
         replace(scene, name=label, summary={**scene.summary, "scene": label})
@@ -105,7 +82,13 @@ def write_page(folder: Path, scenes: Sequence[Outputs]) -> Path:
 
 
 def page(folder: Path, scenes: Sequence[Outputs], devices: str = "") -> str:
-    """HTML of the page: introduction, contents, table of all scenes, the `devices` section, and a section a scene."""
+    """HTML of the page: introduction, table of all scenes, contents, the `devices` section, and a section a scene."""
+    counts = {kind: sum(scene.summary["verdict"] == kind for scene in scenes) for kind in CLASSES}
+    methods = " and ".join(sorted({f"“{scene.summary['method']}”" for scene in scenes}))
+    number = f"{len(scenes)} scene{'' if len(scenes) == 1 else 's'}"
+    apart = f", {counts['not judged']} cannot be judged" if counts["not judged"] else ""
+    links = ['<a href="#devices">One texture on several devices</a>'] if devices else []
+    links += [f'<a href="#{quote(scene.name)}">{escape(scene.name)}</a>' for scene in scenes]
     sections = "\n".join(_section(scene, quote(scene.folder.relative_to(folder).as_posix())) for scene in scenes)
     return f"""<!DOCTYPE html>
 <html lang="en">
@@ -113,14 +96,18 @@ def page(folder: Path, scenes: Sequence[Outputs], devices: str = "") -> str:
 <meta charset="utf-8">
 <meta name="viewport" content="width=device-width, initial-scale=1">
 {GENERATOR}
-<title>hapticrender: {_scenes(len(scenes))} in closed loop</title>
+<title>hapticrender: {number} in closed loop</title>
 <style>{STYLE}</style>
 </head>
 <body>
 <h1>Textures, rendered in closed loop</h1>
-{_introduction(scenes)}
+<p>hapticrender renders a texture for a bare finger: it vibrates a glass plate, or changes the friction of a screen,
+measures the motion, and corrects the drive until the motion follows its target. Here {number} ran in closed loop on
+models of the devices with the method {escape(methods)}. A scene misses its tolerance where the worst rms error of any
+band, at any of its places, is larger: {counts["passed"]} of {len(scenes)} are within their tolerance,
+{counts["failed"]} miss it{apart}.</p>
 {_overview(scenes)}
-{_contents(scenes, bool(devices))}
+<nav>{"".join(links)}</nav>
 {devices}
 {sections}
 <footer class="note">Made by hapticrender {escape(__version__)}.</footer>
@@ -129,60 +116,69 @@ def page(folder: Path, scenes: Sequence[Outputs], devices: str = "") -> str:
 """
 
 
-def _introduction(scenes: Sequence[Outputs]) -> str:
-    """Three sentences for a reader who is new to the subject."""
-    counts = {kind: sum(scene.summary["verdict"] == kind for scene in scenes) for kind in CLASSES}
-    methods = " and ".join(sorted({f"“{scene.summary['method']}”" for scene in scenes}))
-    apart = f", {counts['not judged']} cannot be judged" if counts["not judged"] else ""
-    return f"""<p>hapticrender makes a finger feel a texture on a surface: it vibrates a glass plate, or changes the
-friction of a screen, measures the motion, and corrects the drive until the motion follows its target. Here
-{_scenes(len(scenes))} ran in closed loop on models of the devices with the method {escape(methods)}; each shows the
-target, the motion or friction achieved (on a plate at its centre and at both ends), and the drive. A scene misses its
-tolerance where the worst rms error of any band, at any of its places, is larger: {counts["passed"]} of {len(scenes)}
-are within their tolerance, {counts["failed"]} miss it{apart}.</p>"""
-
-
-def _contents(scenes: Sequence[Outputs], devices: bool) -> str:
-    """List of links to the sections."""
-    links = ['<a href="#devices">One texture on several devices</a>'] if devices else []
-    links += [f'<a href="#{quote(scene.name)}">{escape(scene.name)}</a>' for scene in scenes]
-    return f"<nav>{''.join(links)}</nav>"
-
-
-def _scenes(count: int) -> str:
-    return f"{count} scene" if count == 1 else f"{count} scenes"
+def html_table(head: str, rows: Sequence[str]) -> str:
+    """HTML of a table from the rows of its head and of its body."""
+    body = "\n".join(rows)
+    return f'<div class="scroll"><table>\n<thead>\n{head}\n</thead>\n<tbody>\n{body}\n</tbody>\n</table></div>'
 
 
 def _overview(scenes: Sequence[Outputs]) -> str:
-    """Table of all scenes, a row each, with a little chart of the errors."""
-    pairs = amplitudes([scene.summary for scene in scenes])
-    rows = "\n".join(_row(scene, pair) for scene, pair in zip(scenes, pairs, strict=True))
-    heads = "".join(f'<th class="more">{title}</th>' for title in titles([scene.summary for scene in scenes]))
-    return f"""<div class="scroll"><table class="overview">
-<thead>
-<tr><th class="text" rowspan="2">Scene</th><th class="text" rowspan="2">Verdict</th>
-<th rowspan="2">Target</th><th rowspan="2">Achieved</th>
-<th class="group more" colspan="3">rms error</th><th class="text more chart" rowspan="2">{_axis()}</th></tr>
-<tr>{heads}</tr>
-</thead>
-<tbody>
-{rows}
-</tbody>
-</table></div>
+    """Table of all scenes, a row each."""
+    rows = []
+    for scene, (target, achieved) in zip(scenes, amplitudes([scene.summary for scene in scenes]), strict=True):
+        summary = scene.summary
+        errors = [worst_at(summary["bands"], place) for place in columns_of(summary)]
+        cells = "".join(_error_cell(error, summary["tolerance"]) for error in errors)
+        rows.append(
+            f'<tr><td class="text"><a href="#{quote(scene.name)}">{escape(scene.name)}</a></td>'
+            f'<td class="text wide {CLASSES[summary["verdict"]]}">{_whole(brief(summary))}</td>'
+            f"<td>{target}</td><td>{achieved}</td>{cells}</tr>"
+        )
+    heads = "".join(f"<th>{title}</th>" for title in titles([scene.summary for scene in scenes]))
+    head = f"""<tr><th class="text" rowspan="2">Scene</th><th class="text" rowspan="2">Verdict</th>
+<th rowspan="2">Target</th><th rowspan="2">Achieved</th><th class="group" colspan="3">rms error</th></tr>
+<tr>{heads}</tr>"""
+    return f"""{html_table(head, rows)}
 <p class="note">Amplitudes are peak values, achieved ones at the centre. A scene of several bands shows the root of the
-sum of their squares, and the largest error of any. In the charts the disc is the centre, the rings are the ends, and
-the line is the tolerance.</p>"""
+sum of their squares, and the largest error of any.</p>"""
 
 
-def _row(scene: Outputs, pair: tuple[str, str]) -> str:
-    """One scene in the table of all, with its target and achieved amplitude."""
-    summary = scene.summary
-    errors = [worst_at(summary["bands"], place) for place in columns_of(summary)]
-    cells = "".join(_error_cell(error, summary["tolerance"], " more") for error in errors)
-    return f"""<tr><td class="text"><a href="#{quote(scene.name)}">{escape(scene.name)}</a></td>
-<td class="text wide {CLASSES[summary["verdict"]]}">{_whole(brief(summary))}</td>
-<td>{pair[0]}</td><td>{pair[1]}</td>{cells}
-<td class="text more chart">{_chart(errors, summary["tolerance"])}</td></tr>"""
+def _alike(scenes: Sequence[Outputs]) -> dict[str, Recording]:
+    """Recordings of the texture that most devices share, by the device's name; empty where no two share one."""
+    groups: dict[str, dict[str, Recording]] = {}
+    for scene in scenes:
+        if (scene.folder / JOURNAL).exists():
+            recording = Recording.load(scene.folder / JOURNAL)
+            key = f"{recording.scene.texture!r}; {recording.scene.finger!r}"
+            groups.setdefault(key, {}).setdefault(scene.summary["device"], recording)
+    best = max(groups.values(), key=len, default={})
+    return best if len(best) > 1 else {}
+
+
+def devices_section(folder: Path, scenes: Sequence[Outputs]) -> str:
+    """HTML about one texture on several devices, its picture drawn into `folder`; empty where no two share one."""
+    recordings = _alike(scenes)
+    if not recordings:
+        return ""
+    try:
+        plot_devices(recordings, folder / DEVICES)
+        picture = f'<a href="{DEVICES}"><img src="{DEVICES}" alt="Skin velocity of one texture on every device"></a>'
+    except ImportError:
+        picture = NO_PICTURE
+    rows = []
+    for each in zip(*(skin_bands(recording) for recording in recordings.values()), strict=True):
+        cells = "".join(f"<td>{1e3 * band.achieved:.3f}</td><td>{100 * band.error:+.2f} %</td>" for band in each)
+        name, target = short(each[0].frequency, "Hz"), f"{1e3 * each[0].target:.3f}"
+        rows.append(f'<tr><td class="text">{name}</td><td>{target}</td><td>{each[0].level:.0f} dB</td>{cells}</tr>')
+    heads = "".join(f"<th>{escape(device)}</th><th>error</th>" for device in recordings)
+    head = f'<tr><th class="text">Band (mm/s peak)</th><th>Target</th><th>Above threshold</th>{heads}</tr>'
+    return f"""<section id="devices">
+<h2>One texture, {len(recordings)} devices</h2>
+<p>A plate moves the skin, friction pulls at it. The velocity of the skin is predicted from each recording; it should be
+the same on all devices.</p>
+{picture}
+{html_table(head, rows)}
+</section>"""
 
 
 def _whole(text: str) -> str:
@@ -190,122 +186,72 @@ def _whole(text: str) -> str:
     return escape(text).replace(" %", "&nbsp;%").replace(" Hz", "&nbsp;Hz")
 
 
-def _error_cell(error: float | None, tolerance: float, kind: str = "") -> str:
+def _error_cell(error: float | None, tolerance: float) -> str:
     """Format a relative error, marked where it is beyond the tolerance."""
-    mark = "bad" if error is not None and abs(error) > tolerance else ""
-    return f'<td class="{mark}{kind}">{percent(error)}</td>'
-
-
-def _along(error: float) -> float:
-    """Where a relative error stands on a chart's logarithmic axis (px)."""
-    low, high = (math.log10(end) for end in _AXIS)
-    share = (math.log10(max(abs(error), _AXIS[0])) - low) / (high - low)
-    return 8 + (_CHART[0] - 16) * min(share, 1.0)
-
-
-def _chart(errors: Sequence[float | None], tolerance: float) -> str:
-    """Errors at the centre (disc) and the ends (rings) beside the tolerance (line)."""
-    width, height = _CHART
-    middle = height / 2
-    known = [(i, error) for i, error in enumerate(errors) if error is not None]
-    marks = "".join(
-        f'<circle cx="{_along(error):.1f}" cy="{middle}" r="{5.5 if i else 4}" '
-        f'class="{"ring" if i else "disc"} {"bad" if error > tolerance else "good"}"/>'
-        for i, error in known
-    )
-    line = _along(tolerance)
-    return f"""<svg width="{width}" height="{height}" role="img" aria-label="errors against the tolerance">
-<path class="axis" d="M8 {middle}H{width - 8}"/><path class="bound" d="M{line:.1f} 2V{height - 2}"/>
-{marks}</svg>"""
-
-
-def _axis() -> str:
-    """Labels of the charts' axis, for the head of their column."""
-    width, _ = _CHART
-    labels = "".join(
-        f'<text x="{_along(error):.1f}" y="12" text-anchor="middle">{100 * error:g}</text>'
-        for error in (1e-3, 1e-2, 1e-1, 1.0)
-    )
-    return f'<svg width="{width}" height="16" font-size="10">{labels}<text x="{width}" y="12" \
-text-anchor="end">%</text></svg>'
+    mark = ' class="bad"' if error is not None and abs(error) > tolerance else ""
+    return f"<td{mark}>{percent(error)}</td>"
 
 
 def _section(scene: Outputs, folder: str) -> str:
     """Everything about one scene; `folder` is its address relative to the page."""
-    summary = scene.summary
-    name = escape(scene.name)
-    picture = (
-        f'<a href="{folder}/picture.png"><img src="{folder}/picture.png" '
-        f'alt="Target, achieved motion, drive and finger over time: {name}"></a>'
-        if scene.picture
-        else '<p class="note">No picture: matplotlib is not installed.</p>'
-    )
+    summary, name, sentence = scene.summary, escape(scene.name), _whole(verdict(scene.summary))
+    picture = NO_PICTURE
+    if (scene.folder / "picture.png").exists():
+        alt = f"Target, achieved motion, drive and finger over time: {name}"
+        picture = f'<a href="{folder}/picture.png"><img src="{folder}/picture.png" alt="{alt}"></a>'
+    files = ["scene.toml", "summary.json", "recording.au", *summary["sound"]]
+    links = " · ".join(f'<a href="{folder}/{file}">{file}</a>' for file in files)
     return f"""<section id="{name}">
 <h2>{name}</h2>
-<p class="{CLASSES[summary["verdict"]]}">{_capital(_whole(verdict(summary)))}.</p>
+<p class="{CLASSES[summary["verdict"]]}">{sentence[:1].upper()}{sentence[1:]}.</p>
 {picture}
 {_bands(summary)}
 <div class="halves">
 <div>{_figures(summary)}{_sounds(summary, folder)}
-<p class="note">{_links(scene, folder)}</p></div>
+<p class="note">{links}</p></div>
 <pre>{escape(scene.toml.strip())}</pre>
 </div>
 </section>"""
 
 
-def _capital(text: str) -> str:
-    return text[:1].upper() + text[1:]
-
-
 def _bands(summary: Mapping[str, Any]) -> str:
-    """Table of a scene's bands; folded where there are many."""
-    bands = summary["bands"]
+    """Table of a scene's bands, amplitudes with one prefix; folded where there are many."""
+    bands, tolerance = summary["bands"], summary["tolerance"]
     places = [place for place in columns_of(summary) if f"error_{place}" in (bands or [{}])[0]]
     largest = max((band["target"] for band in bands if band["target"] is not None), default=1.0)
-    rows = "\n".join(_band_row(band, places, summary, largest) for band in bands)
+    rows = []
+    for band in bands:
+        cells = [f"<td>{quantity(band[key], summary['unit'], like=largest)}</td>" for key in ("target", "achieved")]
+        cells += [f"<td>{percent(band[f'error_{place}'])}</td>" for place in places]
+        cells += [_error_cell(band[f"rms_error_{place}"], tolerance) for place in places]
+        cells += [f"<td>{degrees(band['phase_error'])}</td>", f"<td>{quantity(band['settling_time'], 's')}</td>"]
+        rows.append(f'<tr><td class="text">{band_label(band)}</td>{"".join(cells)}</tr>')
     heads = "".join(f"<th>{place.replace('_', ' ')}</th>" for place in places)
-    table = f"""<div class="scroll"><table>
-<thead>
-<tr><th class="text" rowspan="2">Band</th><th rowspan="2">Target</th><th rowspan="2">Achieved</th>
+    head = f"""<tr><th class="text" rowspan="2">Band</th><th rowspan="2">Target</th><th rowspan="2">Achieved</th>
 <th class="group" colspan="{len(places)}">error of the mean</th>
 <th class="group" colspan="{len(places)}">rms error</th>
 <th rowspan="2">Phase error</th><th rowspan="2">Settles in</th></tr>
-<tr>{heads}{heads}</tr>
-</thead>
-<tbody>
-{rows}
-</tbody>
-</table></div>"""
+<tr>{heads}{heads}</tr>"""
+    table = html_table(head, rows)
     if len(bands) <= _MANY_BANDS:
         return table
     return f"<details><summary>{escape(bands_label(bands))}</summary>{table}</details>"
 
 
-def _band_row(band: Mapping[str, Any], places: Sequence[str], summary: Mapping[str, Any], largest: float) -> str:
-    """One band of a scene; amplitudes with the prefix that fits the `largest` target (SI)."""
-    means = "".join(f"<td>{percent(band.get(f'error_{place}'))}</td>" for place in places)
-    spreads = "".join(_error_cell(band.get(f"rms_error_{place}"), summary["tolerance"]) for place in places)
-    sizes = "".join(f"<td>{quantity(band[key], summary['unit'], like=largest)}</td>" for key in ("target", "achieved"))
-    settled = "–" if band["settling_time"] is None else f"{band['settling_time']:.3f} s"
-    return f"""<tr><td class="text">{band_label(band)}</td>{sizes}{means}{spreads}
-<td>{degrees(band["phase_error"])}</td><td>{settled}</td></tr>"""
-
-
 def _figures(summary: Mapping[str, Any]) -> str:
-    """List what concerns the whole scene."""
-    entries = {
-        "Duration": short(summary["duration"], "s"),
-        "Judged from": short(summary["judged_from"], "s"),
-        "Sampling rate": short(summary["rate"], "Hz"),
-        "Method": f"{summary['method']}, seed {summary['seed']}",
-        "Wobble of the bands": quantity(summary["wobble"], summary["unit"]),
-        "Beside the bands": f"{quantity(summary['residual_rms'], summary['unit'])} rms",
-        "Drive at its limit": f"{percent(summary['saturated_share'])} of the time",
-        "Flagged samples": flags(summary),
-    }
-    rows = "".join(f"<dt>{key}</dt><dd>{escape(value)}</dd>" for key, value in entries.items())
-    notes = "".join(f"<dt>Note</dt><dd>{escape(note)}</dd>" for note in summary["notes"])
-    return f"<dl>{rows}{notes}</dl>"
+    """List of the figures of the whole scene."""
+    entries = [
+        ("Duration", short(summary["duration"], "s")),
+        ("Judged from", short(summary["judged_from"], "s")),
+        ("Sampling rate", short(summary["rate"], "Hz")),
+        ("Method", f"{summary['method']}, seed {summary['seed']}"),
+        ("Wobble of the bands", quantity(summary["wobble"], summary["unit"])),
+        ("Beside the bands", f"{quantity(summary['residual_rms'], summary['unit'])} rms"),
+        ("Drive at its limit", f"{percent(summary['saturated_share'])} of the time"),
+        ("Flagged samples", flags(summary)),
+        *(("Note", note) for note in summary["notes"]),
+    ]
+    return f"<dl>{''.join(f'<dt>{key}</dt><dd>{escape(value)}</dd>' for key, value in entries)}</dl>"
 
 
 def _sounds(summary: Mapping[str, Any], folder: str) -> str:
@@ -316,9 +262,3 @@ def _sounds(summary: Mapping[str, Any], folder: str) -> str:
         f'<audio controls preload="none" src="{folder}/{name}"></audio></p>'
         for name, sound in summary["sound"].items()
     )
-
-
-def _links(scene: Outputs, folder: str) -> str:
-    """Links to the scene's files."""
-    names = ["scene.toml", "summary.json", "recording.au", *scene.summary["sound"]]
-    return " · ".join(f'<a href="{folder}/{name}">{name}</a>' for name in names)

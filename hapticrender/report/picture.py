@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import os
 import textwrap
 from collections.abc import Callable, Sequence
@@ -12,18 +13,8 @@ import numpy as np
 from hapticrender.formatting import band_label, percent
 from hapticrender.protocols import Array
 from hapticrender.recordings.envelopes import RUNAWAY
-from hapticrender.report.figure import (
-    BLUE,
-    GREEN,
-    INK,
-    ORANGE,
-    PALE,
-    RED,
-    check_format,
-    legend,
-    new_figure,
-    save,
-)  # fmt: skip
+from hapticrender.report import figure as look
+from hapticrender.report.figure import BLUE, GREEN, INK, ORANGE, PALE, RED, check_format, legend, new_figure
 from hapticrender.report.text import verdict
 
 if TYPE_CHECKING:
@@ -31,6 +22,7 @@ if TYPE_CHECKING:
 
 PLACES = ((BLUE, "o"), (ORANGE, "<"), (GREEN, ">"))
 COILS = (BLUE, ORANGE, GREEN, RED)
+DASHED = (0, (4, 2))
 COLUMNS = 1400  # points that a full-width panel can show
 QUANTITIES = {"m": "displacement", "N": "friction", "m/s": "skin velocity"}
 PERIODS = 4  # of the strongest carrier in the close-up
@@ -43,17 +35,9 @@ FLOOR = 1e-5  # relative error below which a dot stands at the foot of its panel
 
 
 def plot(recording: Recording, path: str | os.PathLike[str]) -> None:
-    """Draw a recording into one .png, .svg or .pdf; an older file is replaced when the new one is whole.
-
-    Raises
-    ------
-    ValueError
-        The file's ending is none of these.
-    MissingExtra
-        matplotlib is not installed.
-    """
+    """Draw a recording into one .png, .svg or .pdf; an older file is replaced when the new one is whole."""
     path = check_format(path)
-    save(draw(recording), path)
+    look.save(draw(recording), path)
 
 
 def draw(recording: Recording) -> Any:
@@ -106,68 +90,49 @@ def _draw(figure: Any, recording: Recording, touched: bool) -> None:
 def _head(axes: Any, summary: dict[str, Any], touched: bool) -> None:
     """Name of the scene, how it was made, and the verdict in words."""
     axes.axis("off")
+    axes.set(xlim=(0, 1), ylim=(0, 1))
     finger = "" if touched else " · no finger"
     finger += " · motion from the sensors" if summary["motion_source"] == "sensors" else ""
-    axes.text(
-        0,
-        1.0,
-        textwrap.shorten(summary["scene"], 50, placeholder=" …") or "(no name)",
-        fontsize=15,
-        fontweight="bold",
-        va="top",
-    )
+    name = textwrap.shorten(summary["scene"], 50, placeholder=" …") or "(no name)"
+    axes.text(0, 1.0, name, fontsize=15, fontweight="bold", va="top")
     how = f"{summary['device']} · method {summary['method']} · seed {summary['seed']} · {summary['rate']:g} Hz{finger}"
     axes.text(1, 0.92, how, color="#555555", ha="right", va="top")
-    sentence = textwrap.shorten(verdict(summary), 150, placeholder=" …")
     mark, colour = VERDICTS[summary["verdict"]]
+    sentence = textwrap.shorten(verdict(summary), 150, placeholder=" …")
     axes.text(0, 0.02, f"{mark} {sentence}", color=colour, fontweight="bold", va="bottom")
-    axes.set(xlim=(0, 1), ylim=(0, 1))
 
 
 def _amplitude(axes: Any, recording: Recording, summary: dict[str, Any]) -> None:
     """Target and achieved amplitude over time, all bands together."""
-    envelopes = recording.envelopes
+    envelopes, header = recording.envelopes, recording.header
     shown = np.any(envelopes.readable, axis=0)
     readable = envelopes.readable[:, shown].all(axis=1) & envelopes.finite
-    achieved = _together(envelopes.achieved[:, :, shown])
+    scale, unit = drawn(header.unit)
+    achieved = scale * _together(envelopes.achieved[:, :, shown]) / np.array(header.profile or 1.0)
     achieved[~readable] = np.nan
-    time, wanted = _target(recording, shown)
-    tolerance, profile = recording.header.tolerance, recording.header.profile
-    scale, unit = drawn(recording.header.unit)
-    achieved = scale * achieved / np.array(profile or 1.0)
-    axes.fill_between(
-        time, (1 - tolerance) * wanted, (1 + tolerance) * wanted, color=PALE, alpha=0.2, lw=0, label="tolerance"
+    time, _, _, target = _stretches(
+        lambda start, stop: scale * _together(recording.read("target", start, stop)[:, shown]),
+        len(recording),
+        recording.rate,
     )
-    names = recording.header.places
-    for i in reversed(range(len(names))):
-        colour = PLACES[i % len(PLACES)][0]
-        style = {"color": colour, "lw": 1.8 if i == 0 else 1.1, "marker": "." if len(achieved) < 500 else "", "ms": 3}
+    low, high = (1 - header.tolerance) * target, (1 + header.tolerance) * target
+    for i, (name, (colour, _)) in enumerate(zip(header.places, itertools.cycle(PLACES), strict=False)):
+        style = {"color": colour, "lw": 1.1 if i else 1.8, "marker": "." if len(achieved) < 500 else "", "ms": 3}
         if np.isfinite(achieved[:, i]).any():
-            axes.plot(envelopes.time, achieved[:, i], label=names[i], **style)
-    axes.plot(time, wanted, color=INK, lw=1.1, ls=(0, (4, 2)), label="target")
+            axes.plot(envelopes.time, achieved[:, i], label=name, zorder=4 - i, **style)
+    axes.plot(time, target, color=INK, lw=1.1, ls=DASHED, label="target", zorder=5)
+    axes.fill_between(time, low, high, color=PALE, alpha=0.2, lw=0, label="tolerance", zorder=0)
     if summary["verdict"] != "not judged":
         axes.axvline(summary["judged_from"], color=PALE, lw=0.9, ls=":", label="judged from here")
     several = "" if shown.sum() <= 1 else f" ({int(shown.sum())} bands: root of the sum of squares)"
     axes.set(title=f"Peak amplitude{several}", ylabel=f"amplitude ({unit})")
-    axes.set_ylim(0, 1.25 * max(np.nanmax(achieved, initial=0), (1 + tolerance) * wanted.max(initial=0)) or 1)
-    handles, labels = axes.get_legend_handles_labels()
-    order = sorted(
-        range(len(labels)), key=lambda i: [*names, "target", "tolerance", "judged from here"].index(labels[i])
-    )
-    legend(axes, [handles[i] for i in order], [labels[i] for i in order])
+    axes.set_ylim(0, 1.25 * max(np.nanmax(achieved, initial=0), high.max(initial=0)) or 1)
+    legend(axes)
 
 
 def _bounded(values: Array) -> Array:
-    """Values (SI) with a gap where they are no numbers, or so large that they ran away."""
+    """Values (SI) with a gap where they are no numbers, or beyond `RUNAWAY`."""
     return np.where(np.abs(values) < RUNAWAY, values, np.nan)
-
-
-def _target(recording: Recording, shown: Array) -> tuple[Array, Array]:
-    """Time (s) and reference amplitude (as drawn), all shown bands together: means over what a pixel shows."""
-    time, _, _, mean = _stretches(
-        lambda start, stop: _together(recording.read("target", start, stop)[:, shown]), len(recording), recording.rate
-    )
-    return time, drawn(recording.header.unit)[0] * mean
 
 
 def _together(envelope: Array) -> Array:
@@ -180,19 +145,16 @@ def _close_up(axes: Any, recording: Recording) -> None:
     time = np.arange(start, stop) / recording.rate
     phase = recording.bands.carrier_phase(time, recording.read("position", start, stop))
     scale, unit = drawn(recording.header.unit)
-    wanted = scale * (recording.read("target", start, stop) * np.exp(1j * phase)).real.sum(axis=1)
+    target = scale * (recording.read("target", start, stop) * np.exp(1j * phase)).real.sum(axis=1)
     motion = scale * _bounded(recording.read("motion", start, stop)[:, 0])
-    offset = np.nan_to_num(np.mean(motion - wanted)) if motion.size else 0.0  # a stretch holds parts of periods
+    offset = np.nan_to_num(np.mean(motion - target)) if motion.size else 0.0  # a stretch holds parts of periods
     milliseconds = 1e3 * (time - time[:1])
     axes.plot(milliseconds, motion - offset, color=BLUE, lw=1.8, label=recording.header.places[0])
-    axes.plot(milliseconds, wanted, color=INK, lw=1.1, ls=(0, (4, 2)), label="target")
+    axes.plot(milliseconds, target, color=INK, lw=1.1, ls=DASHED, label="target")
     begin = f"{time[0]:.2f} s" if time.size else "the start"
-    level = f", offset of {offset:.3g} {unit} removed" if abs(offset) > 0.05 * np.abs(wanted).max(initial=0) else ""
-    axes.set(
-        title=f"Waveform from {begin}{level}",
-        xlabel="time (ms)",
-        ylabel=f"{QUANTITIES.get(recording.header.unit, 'motion')} ({unit})",
-    )
+    level = f", offset of {offset:.3g} {unit} removed" if abs(offset) > 0.05 * np.abs(target).max(initial=0) else ""
+    quantity = QUANTITIES.get(recording.header.unit, "motion")
+    axes.set(title=f"Waveform from {begin}{level}", xlabel="time (ms)", ylabel=f"{quantity} ({unit})")
     axes.margins(x=0, y=0.12)
     legend(axes)
 
@@ -209,7 +171,7 @@ def _close_span(recording: Recording) -> tuple[int, int]:
     position = recording.read("position", first, first + size)
     velocity = (position[-1] - position[0]) * rate / (size - 1)
     frequency = np.abs(recording.bands.instantaneous_frequency(np.nan_to_num(velocity)))
-    strength = np.where(envelopes.judged[chosen], np.abs(envelopes.wanted[chosen]), 0)
+    strength = np.where(envelopes.judged[chosen], np.abs(envelopes.target[chosen]), 0)
     slowest = frequency[strength >= 0.1 * strength.max()].min()
     seconds = max(PERIODS / frequency[strength.argmax()], 1.5 / slowest)
     stop = min(len(recording), first + size)
@@ -227,23 +189,28 @@ def _errors(axes: Any, recording: Recording, summary: dict[str, Any]) -> None:
         if known:
             axes.plot(*zip(*known, strict=True), marker, color=colour, ms=6 if len(bands) <= 10 else 3.5, label=name)
     allowed = 100 * recording.header.tolerance
-    axes.axhline(allowed, color=INK, lw=1, ls=(0, (4, 2)), label="tolerance")
-    axes.set_yscale("log")
-    low, high = axes.get_ylim()
-    low, high = min(low, allowed / 30) / 1.5, 1.5 * max(high, allowed)
+    axes.axhline(allowed, color=INK, lw=1, ls=DASHED, label="tolerance")
+    low, high = error_axis(axes, allowed)
     axes.axhspan(allowed, high, color=RED, alpha=0.08, lw=0)
     axes.set_ylim(low, high)
     axes.text(0.01, allowed, f"{allowed:.3g} %", fontsize=8, va="bottom", transform=axes.get_yaxis_transform())
-    axes.yaxis.set_major_formatter(lambda value, _: f"{value:g}")
-    axes.minorticks_off()
     every = -(-len(bands) // MOST_LABELS)
     shown = range(0, len(bands), every)
     small = {"fontsize": 7.5} if len(shown) > 5 else {}
     axes.set_xticks(list(shown), [band_label(bands[k], "\n", "") for k in shown], **small)
     axes.set_xlim(-0.6, len(bands) - 0.4)
-    axes.grid(axis="x", visible=False)
     axes.set(title="Rms error", ylabel="error of the amplitude (%)")
     legend(axes, columns=4)
+
+
+def error_axis(axes: Any, bound: float) -> tuple[float, float]:
+    """Make the y axis one of errors in percent, logarithmic, and return limits that show `bound`."""
+    axes.set_yscale("log")
+    low, high = axes.get_ylim()
+    axes.yaxis.set_major_formatter(lambda value, _: f"{value:g}")
+    axes.minorticks_off()
+    axes.grid(axis="x", visible=False)
+    return min(low, bound / 30) / 1.5, 1.5 * max(high, bound)
 
 
 def _drive(lanes: list[Any], recording: Recording, summary: dict[str, Any]) -> None:
@@ -259,7 +226,7 @@ def _drive(lanes: list[Any], recording: Recording, summary: dict[str, Any]) -> N
         reach = 1.12 * (max(peaks[unit], limit) if near else peaks[unit])
         axes.fill_between(time, lows[:, i], highs[:, i], color=COILS[i % len(COILS)], lw=0.5)
         for sign in (-1, 1) if near else ():
-            axes.axhline(sign * limit, color=INK, lw=1, ls=(0, (4, 2)))
+            axes.axhline(sign * limit, color=INK, lw=1, ls=DASHED)
         axes.set(ylabel=f"{name} ({unit})", ylim=(-reach, reach))
         if near:
             axes.set_yticks([-limit, 0, limit], [f"{tick:.3g}" for tick in (-limit, 0, limit)])
@@ -290,15 +257,7 @@ def _finger(upper: Any, lower: Any, recording: Recording) -> None:
 
 
 def outline(recording: Recording, name: str) -> tuple[Array, Array, Array]:
-    """Least and greatest value of a signal in each of at most `COLUMNS` stretches.
-
-    Returns
-    -------
-    time : ndarray, shape (w,), s
-        Middle of each stretch.
-    low, high : ndarray, shape (w,) or (w, channels)
-        A stretch that holds a NaN is NaN.
-    """
+    """Middle (s), least and greatest value of a signal in each of at most `COLUMNS` stretches; NaN with a NaN in it."""
     return _stretches(lambda start, stop: recording.read(name, start, stop), len(recording), recording.rate)[:3]
 
 

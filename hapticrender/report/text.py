@@ -1,4 +1,4 @@
-"""Verdicts, scenes and summaries as text, the same on the command line, in reports and on pages."""
+"""Verdicts, scenes and summaries as text for the command line, reports and pages."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def titles(summaries: Sequence[Mapping[str, Any]]) -> list[str]:
 
 
 def at(places: Sequence[str]) -> str:
-    """Say where errors are taken, or of which quantity.
+    """Name where errors are taken, or of which quantity.
 
     Examples
     --------
@@ -61,13 +61,7 @@ def total(bands: Sequence[Mapping[str, Any]], key: str) -> float | None:
 
 
 def verdict(summary: Mapping[str, Any]) -> str:
-    """Say in one sentence whether a run is within its tolerance, and by which figure.
-
-    Parameters
-    ----------
-    summary : mapping
-        What ``Recording.summary()`` returns.
-    """
+    """State in one sentence whether a run (``Recording.summary()``) is within its tolerance, and by which figure."""
     if summary["verdict"] == "not judged":
         return f"not judged: {summary['reason']}"
     if summary["worst"]["value"] is None:
@@ -77,12 +71,12 @@ def verdict(summary: Mapping[str, Any]) -> str:
 
 
 def brief(summary: Mapping[str, Any]) -> str:
-    """Say the verdict of a run in a table's cell: short where all is well."""
+    """Verdict of a run for a table's cell: short where it passed."""
     return f"within {100 * summary['tolerance']:.4g} %" if summary["passed"] else verdict(summary)
 
 
 def worst_figure(summary: Mapping[str, Any]) -> str:
-    """Say which figure decides the verdict: its name, band, place or quantity, and value."""
+    """Name the figure that decides the verdict: its name, band, place or quantity, and value."""
     worst = summary["worst"]
     place, figure = (str(worst[key]).replace("_", " ") for key in ("place", "figure"))
     name, where = figure.removesuffix(f" {place}"), at([place])
@@ -93,16 +87,15 @@ def worst_figure(summary: Mapping[str, Any]) -> str:
 
 def amplitudes(summaries: Sequence[Mapping[str, Any]]) -> list[tuple[str, str]]:
     """Target and achieved amplitude of every summary; one prefix for all that have the same unit."""
-    values = [tuple(total(summary["bands"], key) for key in ("target", "achieved")) for summary in summaries]
-    largest: dict[str, float] = {}
-    for summary, pair in zip(summaries, values, strict=True):
-        unit = summary["unit"]
-        largest[unit] = max(largest.get(unit, 0.0), pair[0] or 0.0)
-    written = [
-        [quantity(value, summary["unit"], like=largest[summary["unit"]]) for value in pair]
-        for summary, pair in zip(summaries, values, strict=True)
+    pairs = [[total(summary["bands"], key) for key in ("target", "achieved")] for summary in summaries]
+    units = [summary["unit"] for summary in summaries]
+    largest = {
+        unit: max(pair[0] or 0.0 for pair, own in zip(pairs, units, strict=True) if own == unit) for unit in units
+    }
+    return [
+        (quantity(target, unit, like=largest[unit]), quantity(achieved, unit, like=largest[unit]))
+        for (target, achieved), unit in zip(pairs, units, strict=True)
     ]
-    return [(target, achieved) for target, achieved in written]
 
 
 def overview(summaries: Sequence[Mapping[str, Any]]) -> str:
@@ -132,7 +125,7 @@ def figures(summary: Mapping[str, Any]) -> str:
 
 
 def conditions(summary: Mapping[str, Any]) -> str:
-    """Say in a line what was rendered, how, for how long, and which flags were set."""
+    """State in a line what was rendered, how, for how long, and which flags were set."""
     return (
         f"{summary['scene']} on {summary['device']}, method {summary['method']}, seed {summary['seed']}: "
         f"{short(summary['duration'], 's')}, judged from {short(summary['judged_from'], 's')}, "
@@ -141,7 +134,7 @@ def conditions(summary: Mapping[str, Any]) -> str:
 
 
 def flags(summary: Mapping[str, Any]) -> str:
-    """Say in how many samples each status flag was set."""
+    """State in how many samples each status flag was set."""
     return ", ".join(f"{name.lower()} {count}" for name, count in summary["flags"].items() if count) or "none"
 
 
@@ -153,18 +146,12 @@ def describe(scene: Scene) -> str:
         for key, unit in (("amplitude", "m"), ("wavelength", "m"), ("frequency", "Hz"))
         if (size := getattr(texture, key, None)) is not None
     ]
-    count = _partials(texture)
+    series = getattr(texture, "harmonics", 1) if getattr(texture, "shape", "sine") != "sine" else 1
+    count = len(getattr(texture, "partials", None) or range(series))
     what = f"{_kind(texture)} {' '.join(sizes)}{f', {count} partials' if count > 1 else ''}"
     speed = getattr(motion, "speed", None)
     finger = [f"{_kind(motion)} finger", *([] if speed is None else [short(speed, "m/s")])]
     return f"{what}; {' '.join(finger)}; {short(scene.duration, 's')} on {scene.device}"
-
-
-def _partials(texture: Any) -> int:
-    """Count the partials that a texture has by its own parameters; 1 where it does not say."""
-    if partials := getattr(texture, "partials", None):
-        return len(partials)
-    return getattr(texture, "harmonics", 1) if getattr(texture, "shape", "sine") != "sine" else 1
 
 
 def _kind(thing: Any) -> str:
