@@ -55,22 +55,11 @@ LEAST_SUBSTEPS = 4  # in a turn of the carrier
 class SquareRoot:
     """Square root that makes an attraction, which goes with current squared, linear in the drive.
 
-    An attraction u around a bias takes the current envelope ``I = sqrt(max(bias + u, floor)/g)``.  Without it the
-    envelope is linear, ``I = sqrt(2 bias/g) (1 + u/bias)/2``, and ``g I^2 = bias/2 + u + u^2/(2 bias)`` has a second
-    harmonic of 25 % at u = bias sin(2 pi f t); Grigorii et al. 2021 drive 6 mA sqrt((sin(2 pi f t) + 1)/2).  That
-    envelope has cusps where it touches zero; the floor rounds them off.
-
-    Parameters
-    ----------
-    bias : float, N
-        Attraction at zero drive, > `floor`; the drive can reduce it by bias - floor.
-    floor : float, N
-        Least attraction, >= 0.  The slope of the current is at most 1/(2 sqrt(floor gain)), unbounded at a floor of 0.
-    gain : float, N/A^2 (or N/V^2)
-        g of ``F = g I^2``, > 0.
-    straight : bool
-        Omit the square root, for comparison: the envelope is linear in the drive, with the same peak at a drive of
-        `bias` and the same slope of attraction at zero drive.
+    An attraction u (N) around a bias takes the current envelope ``I = sqrt(max(bias + u, floor)/g)``.  `straight` omits
+    the square root, for comparison: ``I = sqrt(2 bias/g) (1 + u/bias)/2``, with the same peak at u = bias and the same
+    slope of attraction at zero, and ``g I^2 = bias/2 + u + u^2/(2 bias)`` has a second harmonic of 25 % at u = bias
+    sin(2 pi f t).  Grigorii et al. 2021 drive 6 mA sqrt((sin(2 pi f t) + 1)/2), which has cusps where it touches zero;
+    the floor rounds them off: the slope of the current is at most 1/(2 sqrt(floor gain)).
 
     Examples
     --------
@@ -78,9 +67,9 @@ class SquareRoot:
     [0.00424, 0.006]
     """
 
-    bias: float
-    floor: float
-    gain: float
+    bias: float  # N, > floor: attraction at zero drive
+    floor: float  # N, >= 0: least attraction
+    gain: float  # N/A^2 (or N/V^2), > 0: g of F = g I^2
     straight: bool = False
 
     def __post_init__(self) -> None:
@@ -222,17 +211,9 @@ class ElectroadhesionParameters(SlidingParameters):
 class ElectroadhesionScreen(CompiledPlant):
     """The screen in discrete time, behind the `Plant` protocol.
 
-    Parameters
-    ----------
-    parameters : ElectroadhesionParameters
-        The screen and its level of modelling.
-    finger : Finger
-        Where the finger is, how hard it presses, and its lateral mechanics.
-    seed : int
-        Of the noise.
-    compensation : SquareRoot, optional
-        Makes the drive an attraction around its bias (N), by a gain in N/A^2, or N/V^2 where a voltage is driven; by
-        default the drive is the peak of the carrier (A or V).
+    The drive is the peak of the carrier (A or V); a `compensation` makes it an attraction around its bias (N), by a
+    gain in N/A^2, or N/V^2 where a voltage is driven.  `motion`: friction (N), the skin's velocity under it (m/s,
+    against the motion), and the mean attraction of each sample (N).
     """
 
     step = screen_step

@@ -78,17 +78,9 @@ class HybridPlant(CompiledPlant):
     """Plate and screen in discrete time, behind the `Plant` protocol.
 
     Drive: a current for each coil (A), then the screen's; sensed: both ends of the plate (m), then what the screen
-    senses (N); `motion`: the skin's velocity (m/s), then what plate and screen add to it.
-
-    Parameters
-    ----------
-    plate : Plate
-        With both coils.
-    screen : ElectroadhesionScreen
-        At the same rate, under the same finger; any compiled plant of one drive channel and one sensor, whose motion
-        starts with friction (N), will do.
-    velocity_per_force : float, m/(N s)
-        Skin velocity that feels as strong as a newton of friction, > 0.
+    senses (N); `motion`: the skin's velocity (m/s), then what plate and screen add to it.  The screen is any compiled
+    plant of one drive channel and one sensor, whose motion starts with friction (N); `velocity_per_force` (m/(N s)) is
+    the skin velocity that matches a newton of friction, > 0.
 
     Raises
     ------

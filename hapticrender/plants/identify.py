@@ -195,12 +195,10 @@ def identify(
     driver : Driver
         Any driver of a plate: two coils, two sensors.
     parameters : PlateParameters
-        Expected plate, for which the drive is designed; electronics, geometry, the mean of the sensor gains and the
-        bending of the glass are taken as given.
-    seconds : float, s
-        Length of the record, enough to resolve the narrowest mode.
-    wait : float, s, >= 2 * 0.05
-        From the first drive to the record; delays up to wait - 0.05 s are identified.
+        Expected plate; electronics, geometry, the mean of the sensor gains and the bending mode are taken as given.
+    seconds, wait : float, s
+        Length of the record, enough to resolve the narrowest mode; and from the first drive to the record, >= 0.1 s:
+        delays up to wait - 0.05 s are identified.
     amplitude : float, m, > 0
         Largest displacement of a glass end, on the expected plate.
     contact : float, N, > 0

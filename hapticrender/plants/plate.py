@@ -234,22 +234,10 @@ class Structure(NamedTuple):
 def structure(
     parameters: PlateParameters, mechanics: FingerMechanics = NONE, position: float = 0.0, strength: float = 1.0
 ) -> Structure:
-    """Assemble mass, damping and stiffness matrices of the plate with a finger on it.
+    """Assemble mass, damping and stiffness matrices of the plate with a finger at `position` (m from the middle).
 
-    Parameters
-    ----------
-    parameters : PlateParameters
-    mechanics : FingerMechanics
-        Order 0 adds nothing but the normal load, 2 its impedance, 4 the phalanx as a coordinate of its own.
-    position : float, m
-        Of the finger, from the middle.
-    strength : float
-        Factor on the finger's impedance, >= 0; 0: the finger is lifted.
-
-    Raises
-    ------
-    ValueError
-        A finger of order 4 has a phalanx without mass.
+    `mechanics` of order 0 add nothing but the normal load, of 2 their impedance, of 4 the phalanx as a coordinate of
+    its own, which needs a mass (ValueError).  `strength` is a factor on the impedance, >= 0; 0: the finger is lifted.
     """
     p, order = parameters, mechanics.order if parameters.finger_dynamics and strength > 0.0 else 0
     if order == 4 and not mechanics.phalanx_mass > 0.0:
@@ -273,21 +261,10 @@ def structure(
 
 
 class Plate(CompiledPlant):
-    """The plate in discrete time, behind the `Plant` protocol.
+    """The plate in discrete time, behind the `Plant` protocol; `block` samples a call of `run`, the rest queued inside.
 
     `motion` holds the displacements at `PLACES` (m) and, in a fourth column, the velocity of the glass under the
     finger (m/s).
-
-    Parameters
-    ----------
-    parameters : PlateParameters
-        The plate and its levels of modelling.
-    finger : Finger
-        Its position, normal load and mechanics.
-    seed : int
-        Of the sensor noise.
-    block : int, samples
-        Samples of a `run` call; the rest of the delay is queued inside.
     """
 
     step = plate_step

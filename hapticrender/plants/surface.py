@@ -128,12 +128,10 @@ class SurfaceParameters(SlidingParameters):
 def resonant(model: DeviceModel, mode: UltrasonicParameters, lock: float) -> DeviceModel:
     """Device model of a mode whose carrier is locked to its resonance with a bandwidth of `lock` (Hz).
 
-    Observer and integral grow with the pace, what they lose by being late with the delay.  With an inner loop the
-    pace leaves 45 degrees of phase, as measured with delays of 1 to 4 samples at 192 and 384 kHz; where the margins
-    allow none though it would answer in time (96 kHz, 70 kHz at 192 kHz), a touch costs several times as much.
-    Without one (a block device) it leaves a modulus margin of 0.35 (Ms 2.9), what is learnt of a finger being part
-    of the loop: thin, but at two thirds of it a texture of 400 Hz behind the longest delay is 12 % off in place of
-    3 %.
+    Observer and integral grow with the pace, what they lose by delay with the delay.  With an inner loop the pace
+    leaves 45 degrees of phase, as measured with delays of 1 to 4 samples at 192 and 384 kHz.  Without one (a block
+    device) it leaves a modulus margin of 0.35 (Ms 2.9), the finger estimate being part of the loop: thin, but at two
+    thirds of it a texture of 400 Hz behind the longest delay is 12 % off in place of 3 %.
     """
     stiffness, damping = float(model.stiffness[0, 0]), float(model.damping[0, 0])
     detuned = 2 * MOST_DETUNING * stiffness * mode.frequency / mode.carrier  # shifts are kept in Hz at either level
@@ -177,19 +175,9 @@ def full_slew(mode: UltrasonicParameters) -> float:
 class UltrasonicSurface(CompiledPlant):
     """The surface in discrete time, behind the `Plant` protocol.
 
-    Parameters
-    ----------
-    parameters : SurfaceParameters
-        The surface and its level of modelling.
-    amplitude : Controller
-        The amplitude loop, designed for `parameters.amplitude_model()` and `parameters.amplitude_bands()`, with a
-        compiled step that takes single samples.
-    finger : Finger
-        Where the finger is, how hard it presses, and its lateral mechanics.
-    seed : int
-        Of the noise.
-    nominal : (float, float), N and m/s
-        Load and speed that the amplitude is held for while no finger is there.
+    `amplitude` is the amplitude loop, designed for `parameters.amplitude_model()` and `parameters.amplitude_bands()`,
+    with a compiled step that takes single samples; it holds the `nominal` load (N) and speed (m/s) while no finger is
+    there.  `motion`: friction (N), the skin's velocity under it (m/s, against the motion), and the amplitude (m).
     """
 
     step = surface_step

@@ -209,18 +209,9 @@ def _finger_scale(normal_load: Array | float) -> Array:
 
 
 class UltrasonicPlate(CompiledPlant):
-    """The mode in discrete time, behind the `Plant` protocol.
+    """The mode in discrete time, behind the `Plant` protocol; `block` samples a call of `run`, the rest queued inside.
 
-    Parameters
-    ----------
-    parameters : UltrasonicParameters
-        The plate and its level of modelling.
-    finger : Finger
-        Where the finger is and how hard it presses; its own mechanics are too slow to matter.
-    seed : int
-        Of the sensor noise.
-    block : int
-        Samples a call of `run`; the rest of the delay is queued inside.
+    Of the finger only the load acts; its own mechanics are too slow to matter.
     """
 
     step = ultrasonic_step
