@@ -14,7 +14,6 @@ from hapticrender.plants.electroadhesion import (
     SquareRoot,
 )
 from hapticrender.plants.gap import VACUUM
-from hapticrender.touch.mechanics import LIGHT
 
 RATE = 10_000
 SLIDE = hr.Finger.sliding(speed=0.05, normal_load=1.0)
@@ -199,18 +198,6 @@ def test_tribometer_response_is_the_predicted_one():
     gain = 2 * np.mean((sensed * carrier.conj())[RATE // 2 :]) / 0.3
     loop = s.parameters.gain(1.0) / ROOT.gain
     assert gain == pytest.approx(loop * s.parameters.sensed_response(100.0, speed), rel=SUMMED)
-
-
-def test_skin_follows_friction_by_its_mechanics():
-    """Twice the strength halves the motion."""
-    finger = hr.Finger.sliding(speed=0.05, normal_load=2.4, mechanics=LIGHT, load_scaling=True)
-    s = screen(finger, ROOT, force_noise=0.0)
-    carrier = np.exp(2j * np.pi * 100 * np.arange(RATE) / RATE)
-    friction = s.run(0.3 * carrier.real[:, None]).motion[:, 0]
-    lines = [2 * np.mean((x * carrier.conj())[RATE // 2 :]) for x in (s.motion[:, 1], friction)]
-    assert lines[0] / lines[1] == pytest.approx(
-        LIGHT.skin_velocity_per_force(np.array(100.0)) / 2, rel=4e-4
-    )  # (w T)^2/12
 
 
 @LEVELS

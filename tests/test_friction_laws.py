@@ -64,16 +64,6 @@ def test_the_way_back_is_the_way_there(name, load, speed):
     assert tolerance.max() < 1e-6
 
 
-@pytest.mark.parametrize("name", LAWS)
-def test_no_amplitude_no_reduction_and_ever_less_friction(name):
-    law = LAWS[name]()
-    ratio = law.ratio(np.linspace(0.0, 6e-6, 300), 0.5, 0.05)
-    assert ratio[0] == 1.0
-    assert (np.diff(ratio) < 0).all()
-    assert (ratio > law.floor).all()
-    assert float(law.amplitude(1.0, 0.5, 0.05)) == 0.0
-
-
 def test_intermittent_contact_is_the_formula():
     law = IntermittentContact(coefficient=1.3, friction=0.6, frequency=40e3)
     expected = np.exp(-1.3 * 0.6 * AMPLITUDES * 40e3 / 0.08)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import hapticrender as hr
-from hapticrender.plants.electroadhesion import DRY, MOIST, NORMAL, ElectroadhesionParameters, ElectroadhesionScreen
+from hapticrender.plants.electroadhesion import DRY, NORMAL, ElectroadhesionParameters, ElectroadhesionScreen
 from hapticrender.plants.gap import estimate_attraction, gap_record
 
 RATE = 10_000
@@ -79,16 +79,6 @@ def test_a_short_that_is_not_perfect_costs_area():
     force, _ = estimate_attraction(gap_record(p), *rest_then_slide(p, np.full(2000, CURRENT)))
     assert force[-1] / p.attraction(CURRENT, 1.0) == pytest.approx(share / area, rel=1e-9)
     assert 1.05 < share / area < 1.25
-
-
-def test_moist_finger_is_flagged_and_taken_open_loop():
-    ratio, flags = sensed(gap_resistance=MOIST)
-    assert (flags & hr.Flag.OPEN_LOOP).all()
-    p = ElectroadhesionParameters(gap_resistance=MOIST)
-    assert np.mean(ratio) == pytest.approx(p.open_loop_gain / p.gain(1.0), rel=1e-2)
-    bare, flags = sensed(gap_resistance=MOIST, least_leakage=0.0)  # without the bound it is estimated
-    assert not flags.any()
-    assert np.mean(bare) == pytest.approx(1.0, abs=0.03)
 
 
 def test_noise_is_what_the_low_pass_lets_through():

@@ -133,14 +133,6 @@ def test_the_sampled_plate_is_stiffness_hold_and_delay_with_all_images():
     assert 6e-4 < (abs(driven - each[:, 400]).max(axis=(1, 2)) / scale)[-1] < 8e-4
 
 
-def test_a_gain_error_of_both_sensors_is_a_scale(one):
-    """Gains of 1.02: the six 1/1.02 of themselves."""
-    scaled = found(gains=(1.02, 1.02))
-    for name in MECHANICAL:
-        value, interval = one.estimates[name]
-        assert scaled.estimates[name].value / value == pytest.approx(1 / 1.02, abs=0.2 * interval / value)
-
-
 def test_a_profile_is_the_device_table_of_a_scene(eight):
     """Written, read and given to a scene, the profile makes the identified plate, gains included."""
     plate, identified = eight[3]

@@ -109,50 +109,6 @@ def test_measured_response_is_the_predicted_one(level, finger, load, offset):
     assert abs(respond(parameters, frequency, finger) / expected - 1) < 2 * SETTLED + 4e-9
 
 
-@pytest.mark.parametrize(("load", "times"), [(0.0, 5.4), (0.5, 1.9)])
-def test_flat_modulation_at_400_hz_needs_headroom(load, times):
-    """hypot(1, f/pole); the sidebands give the same: AM of the drive makes |a(W)| smaller by |D(w + W)|/|D(w)|."""
-    parameters = UltrasonicParameters(finger_shift=0.0)
-    need = parameters.drive_for(1e-6, 400.0, load) / parameters.drive_for(1e-6, 0.0, load)
-    assert abs(need - times) < 0.05
-    stiffness = abs(parameters.dynamic_stiffness(np.array([29.6e3, 30e3, 30.4e3]), load))
-    # (W/w)/2 either way, and it cancels in the mean up to (W/w)^2
-    assert abs((stiffness[0] + stiffness[2]) / (2 * stiffness[1]) / need - 1) < (400 / 30e3) ** 2
-
-
-def test_transposing_keeps_the_envelope():
-    parameters = UltrasonicParameters(modal_mass=4e-3, quality=150.0, frequency=40e3)
-    moved = parameters.transposed(5e3, 48e3)
-    assert (moved.carrier, moved.rate, moved.level) == (5e3, 48e3, "envelope")
-    for load in (0.0, 0.3, 2.0):
-        near = {"rtol": 16 * ROUNDING}
-        np.testing.assert_allclose(moved.pole(load), parameters.pole(load), **near)
-        np.testing.assert_allclose(moved.damping(load) * 5e3, parameters.damping(load) * 40e3, **near)
-        shifts = moved.resonance(load, 7.0) - 5e3, parameters.resonance(load, 7.0) - 40e3
-        np.testing.assert_allclose(*shifts, rtol=0, atol=40e3 * ROUNDING)
-    assert abs(moved.mass * 5e3 / (parameters.mass * 40e3) - 1) <= 4 * ROUNDING
-    assert moved.force_constant == parameters.force_constant
-    assert abs(moved.sensor_noise**2 / 48e3 / (parameters.sensor_noise**2 / 192e3) - 1) <= 8 * ROUNDING
-    assert moved.transposed(5e3, 48e3) == moved
-
-
-OFFSETS = np.array([-400.0, -100.0, -10.0, 10.0, 75.0, 100.0, 250.0, 400.0])
-
-
-def test_the_envelope_error_is_that_of_the_two_stiffnesses():
-    """Written out for the free plate: b = m w/Q and, moved down, m_i = m w/w_i, b_i = b w/w_i, k_i = m_i w_i^2."""
-    mass, w, wi = 5e-3, 2 * np.pi * 30e3, 2 * np.pi * 6e3
-    damping, offset = 5e-3 * w / 200, 2 * np.pi * OFFSETS
-    high = mass * w**2 - mass * (w + offset) ** 2 + 1j * damping * (w + offset)
-    low_mass, low_damping = mass * w / wi, damping * w / wi
-    low = low_mass * wi**2 - low_mass * (wi + offset) ** 2 + 1j * low_damping * (wi + offset)
-    error = UltrasonicParameters().transposed(6e3, 48e3).envelope_error(OFFSETS)
-    # differences of m w^2, 3e8 of a rounding of which are left in D >= b w
-    np.testing.assert_allclose(error, low / high - 1, rtol=0, atol=8 * 200 * ROUNDING)
-    far = UltrasonicParameters().envelope_error(2000.0)  # beyond the pole: half of W (1/w_i - 1/w), to W/2w
-    assert abs(far) / (2000.0 * (1 / 6e3 - 1 / 30e3)) == pytest.approx(0.5, abs=2000 / (2 * 30e3) + 1e-3)
-
-
 @pytest.mark.parametrize(("finger", "load", "offset"), [(FREE, 0.0, 75.0), (HELD, 0.5, -100.0), (HELD, 0.5, 400.0)])
 def test_runs_of_carrier_and_envelope_differ_by_the_envelope_error(finger, load, offset):
     """Each divided by its own hold; the images, which each rate has its own of, are all that is left."""

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.signal import hilbert
 from tables import tables
-from ultrasonic import ASKED, FREE, NOISE, held, inner_share, modulated, ran
+from ultrasonic import ASKED, FREE, NOISE, held, modulated, ran
 
 import hapticrender as hr
 from hapticrender.drivers.simulated import SimulatedDriver
@@ -17,14 +17,6 @@ from hapticrender.renderers.resonant import ResonantDriver
 from hapticrender.renderers.ultrasonic import amplitude_loop
 
 LEVELS = pytest.mark.parametrize("level", ["carrier", "envelope"])
-
-
-def driven(volts, seconds, finger=FREE, **plant):
-    """Amplitude (m) of the plate on a fixed frequency without any loop."""
-    mode = UltrasonicParameters(**plant)
-    time = np.arange(round(seconds * mode.rate)) / mode.rate
-    drive = np.asarray(volts(time) if callable(volts) else volts) * np.cos(2 * np.pi * mode.carrier * time)
-    return time, abs(hilbert(UltrasonicPlate(mode, finger).run(drive[:, None]).motion[:, 0]))
 
 
 @pytest.mark.parametrize(("level", "load"), [("carrier", 0.0), ("carrier", 1.5), ("envelope", 0.5)])
@@ -59,17 +51,6 @@ def test_a_resonance_that_jumps_is_found_again(level, shift):
     assert run.loop.state["shift"][0] == pytest.approx(shift, abs=NOISE * 75.0)
 
 
-def test_without_the_lock_the_drive_rises_and_a_fixed_drive_loses_seven_per_cent():
-    """10 K at Q 200, sqrt(1 + (30/75)^2) = 1.077 of drive or 0.93 of amplitude."""
-    warm = {"temperature_rise": 10.0, "temperature_time": 1e-3, "sensor_noise": 0.0}
-    locked, still = (ran(ASKED, 0.35, lock=lock, **warm).between(0.25, 0.34) for lock in (20.0, 0.0))
-    assert abs(still.error).max() < 0.01  # the law learns the detuning
-    rise = np.sqrt(np.mean(still.drive**2) / np.mean(locked.drive**2))
-    assert rise == pytest.approx(np.hypot(1, 30 / 75), rel=2 * NOISE)
-    (_, warmed), (_, cold) = (driven(0.5, 0.1, **each) for each in (warm, {}))
-    assert warmed[15000] / cold[15000] == pytest.approx(0.93, abs=0.005)
-
-
 @LEVELS
 @pytest.mark.parametrize(("low", "unlocked"), [(0.04e-6, True), (0.06e-6, False)])
 def test_below_a_twentieth_of_a_micrometre_the_lock_lets_go_and_takes_hold_again(level, low, unlocked):
@@ -86,21 +67,6 @@ def test_below_a_twentieth_of_a_micrometre_the_lock_lets_go_and_takes_hold_again
     assert again.longest_unlocked < 20e-3
     assert again.settled_after(0.02) < 20e-3
     assert not (again.flags[-100:] & Flag.UNLOCKED).any()
-
-
-@pytest.mark.parametrize(("frequency", "oversampling", "quality"), [(20e3, 16, 400.0), (70e3, 38, 100.0)])
-def test_other_plates(frequency, oversampling, quality):
-    """The ends of the range, each with about six samples a cycle; half a micrometre, for which 10 V are enough."""
-    plate = {"frequency": frequency, "oversampling": oversampling, "quality": quality}
-    finger = hr.Finger.still(normal_load=0.5, touches=[(0.1, 0.14)])
-    run = ran(0.5e-6, 0.18, finger, **plate)
-    for start in (0.1, 0.14):
-        part = run.between(start, start + 0.035)
-        assert part.settled_after(0.02) <= 1e-3
-        assert abs(part.error).max() < 1.25 * inner_share(run, 0.5) + 2 * NOISE
-        assert part.longest_unlocked == 0.0
-    run = ran(modulated(0.5e-6), 0.16, **plate).between(0.1, 0.15)
-    assert abs(abs(run.line(run.amplitude, 400.0)) / 0.25e-6 - 1) < 400.0 / (2 * frequency) + NOISE
 
 
 SLIDE = hr.Finger.sliding(speed=0.08, normal_load=0.4, mechanics="light")
@@ -142,17 +108,6 @@ def test_a_grating_under_swipes_and_under_a_finger_that_comes_and_goes():
     assert not (recording.flags[100:] & Flag.UNLOCKED).any()
     away = (recording.time > 0.7) & (recording.time < 0.749)
     assert not recording.motion[away, 0].any()
-
-
-def test_the_levels_agree():
-    """As far as the mode's own model does when it is moved down, and 0.2 % of noise of two runs."""
-    frequency = 400.0
-    achieved = [
-        hr.render(scene(frequency=frequency, level=level)).summary()["bands"][0]["achieved"]
-        for level in ("carrier", "envelope")
-    ]
-    moved = UltrasonicParameters().transposed(6e3, 48e3)
-    assert abs(achieved[1] / achieved[0] - 1) < abs(moved.envelope_error(frequency, 0.4)) + 2e-3
 
 
 @pytest.mark.parametrize(
