@@ -72,12 +72,8 @@ class Bench:
 
     def design(self, bands: Bands) -> Controller:
         """Design the controller of the method for the plate that it is given."""
-        return method_named(self.method).design((self.known or self.plate).device_model(RATE, self.delay), bands)
-
-    @property
-    def delay(self) -> int:
-        """Loop delay (samples) that the controller is given."""
-        return (self.known or self.plate).delay
+        known = self.known or self.plate
+        return method_named(self.method).design(known.device_model(RATE, known.delay), bands)
 
     def play(
         self, bands: Bands, seconds: float, finger: Finger | None = None, waveform: Array | None = None, seed: int = 0

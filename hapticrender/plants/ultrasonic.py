@@ -106,8 +106,7 @@ class UltrasonicParameters(Validated):
 
     def sampled(self, rate: float) -> UltrasonicParameters:
         """Return the same plate at `rate` (Hz); the sensor's noise keeps its density."""
-        noise = self.sensor_noise * math.sqrt(rate / self.rate) if rate > 0.0 else self.sensor_noise
-        return replace(self, rate=rate, sensor_noise=noise)
+        return replace(self, rate=rate, sensor_noise=self.sensor_noise * math.sqrt(max(rate, 0.0) / self.rate))
 
     def transposed(self, frequency: float, rate: float) -> UltrasonicParameters:
         """Return the same plate at level "envelope": its mode on a carrier of `frequency` (Hz) at `rate` (Hz).
@@ -115,7 +114,7 @@ class UltrasonicParameters(Validated):
         The sensor's noise keeps its density, so that it disturbs the envelope alike; its resolution stays, and with
         it grows the density of rounding.  The delay stays in samples: at a lower rate it is a longer one.
         """
-        noise = self.sensor_noise * math.sqrt(rate / self.rate) if rate > 0.0 else self.sensor_noise
+        noise = self.sensor_noise * math.sqrt(max(rate, 0.0) / self.rate)
         return replace(self, level="envelope", envelope_frequency=frequency, rate=rate, sensor_noise=noise)
 
     @property
