@@ -27,7 +27,7 @@ def sensed(seconds=1.2, finger=REST_THEN_SLIDE, **plant):
     session = loop.prepare(tone(100.0, finger=finger, duration=seconds, **SENSORLESS, **plant))
     screen = session.driver.plant
     drive, _, flags, _ = screen.closed_loop(session.controller(), np.zeros(session.samples))
-    return drive[:, 0], flags, screen.motion[:, 2]
+    return drive[:, 0], flags, screen.motion[:, 1]
 
 
 def open_loop(seconds=0.5, **plant):

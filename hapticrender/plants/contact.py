@@ -1,24 +1,23 @@
-"""The sliding contact that every friction device shares, the skin that friction moves, and a tribometer.
+"""The sliding contact that every friction device shares, and a tribometer.
 
 A device sets the steady friction force F_s.  The friction F on a finger sliding at speed v follows it over the
-contact's memory length delta (Balasubramanian, Pool and Vardar 2025), the tribometer under the surface measures F
-through its own resonance (F_t), and F drives the skin, whose impedance is Z_f::
+contact's memory length delta (Balasubramanian, Pool and Vardar 2025), and the tribometer under the surface measures F
+through its own resonance (F_t)::
 
     (delta/|v|) F' + F = F_s
     F_t'' + 2 zeta w0 F_t' + w0^2 F_t = w0^2 F
-    v_skin = F/Z_f(s)
 
 Below `least_speed` the contact sticks and keeps its friction; a lifted finger has none.  Friction is positive against
 the motion, in either direction.  A step outputs the state at the start of a sample, then advances: exactly for a steady
-friction and a speed that are constant over the sample; skin and tribometer are exact for a friction that changes
-linearly within it.
+friction and a speed that are constant over the sample; the tribometer is exact for a friction that changes linearly
+within it.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -27,17 +26,12 @@ from hapticrender.jit import kernel
 from hapticrender.plants.compiled import quantise
 from hapticrender.protocols import Array
 
-if TYPE_CHECKING:
-    from hapticrender.touch.mechanics import FingerMechanics
-
 SLIDING = np.dtype(
     [(name, "f8") for name in ("least_speed", "force_noise", "force_step", "force_range")]  # as in `SlidingParameters`
     + [
         ("renewal", "f8"),  # T/delta, s/m: share of the contact's memory that is renewed in a sample, per speed
-        ("skin_step", "f8", (4, 6)),  # of a sample: Phi, then the input columns of friction at its start and its end
-        ("tribometer_step", "f8", (2, 4)),  # the same for the tribometer's force and its rate
+        ("tribometer_step", "f8", (2, 4)),  # of a sample: Phi, then the input columns of friction at its start and end
         ("friction", "f8"),  # state: N
-        ("skin", "f8", (4,)),  # state: displacements of skin and phalanx (m), then their velocities (m/s)
         ("tribometer", "f8", (2,)),  # state: force (N) and its rate over w0 (N)
     ],
     align=True,
@@ -113,65 +107,31 @@ def new_record(dtype: np.dtype[Any], *sources: object, **values: Any) -> Array:
     return record
 
 
-def sliding_record(parameters: SlidingParameters, mechanics: FingerMechanics) -> Array:
-    """Return the record (`SLIDING`, shape (1,)) of a contact at rest, without friction, of a finger with `mechanics`.
-
-    The masses that the order of the mechanics (0, 2 or 4) uses must be > 0.
-    """
-    return new_record(
-        SLIDING,
-        parameters,
-        renewal=1.0 / (parameters.rate * parameters.memory_length),
-        skin_step=_skin_step(parameters, mechanics),
-        tribometer_step=_tribometer_step(parameters),
-    )
-
-
-def _skin_step(parameters: SlidingParameters, mechanics: FingerMechanics) -> Array:
-    """One sample of the skin under friction, shape (4, 6); states that the order leaves out stay at zero."""
-    system, force = np.zeros((4, 4)), np.zeros(4)
-    if mechanics.order:
-        k, b, m = mechanics.stiffness, mechanics.damping, _mass("mass", mechanics.mass, mechanics.order)
-        system[0, 2], force[2] = 1.0, 1 / m
-        system[2] = np.array([-k, k, -b, b]) / m
-        if mechanics.order == 4:
-            m = _mass("phalanx_mass", mechanics.phalanx_mass, 4)
-            system[1, 3] = 1.0
-            system[3] = np.array([k, -k - mechanics.phalanx_stiffness, b, -b - mechanics.phalanx_damping]) / m
-    return _ramp_step(system, force, 1 / parameters.rate)
-
-
-def _mass(name: str, value: float, order: int) -> float:
-    if not value > 0.0:
-        raise ValueError(f"mechanics.{name} = {value!r}: must be > 0 kg where order = {order}")
-    return value
+def sliding_record(parameters: SlidingParameters) -> Array:
+    """Return the record (`SLIDING`, shape (1,)) of a contact at rest, without friction."""
+    renewal = 1.0 / (parameters.rate * parameters.memory_length)
+    return new_record(SLIDING, parameters, renewal=renewal, tribometer_step=_tribometer_step(parameters))
 
 
 def _tribometer_step(parameters: SlidingParameters) -> Array:
-    """One sample of the tribometer's force and of its rate over w0, shape (2, 4)."""
-    w = 2 * math.pi * parameters.tribometer_frequency
-    system = w * np.array([[0.0, 1.0], [-1.0, -2 * parameters.tribometer_damping]])
-    return _ramp_step(system, np.array([0.0, w]), 1 / parameters.rate)
-
-
-def _ramp_step(system: Array, inputs: Array, period: float) -> Array:
-    """Discretise a linear system with a first-order hold: Phi, then the columns of its input before and after.
+    """One sample of the tribometer's force and of its rate over w0 (first-order hold), shape (2, 4).
 
     From the exponential of [[A T, B T, 0], [0, 0, 1], [0, 0, 0]]: Phi, and the parts of the start and of the rise.
     """
     from scipy.linalg import expm
 
-    n = len(inputs)
-    whole = np.zeros((n + 2, n + 2))
-    whole[:n, :n], whole[:n, n], whole[n, n + 1] = system * period, inputs * period, 1.0
-    step = expm(whole)[:n]
-    step[:, n] -= step[:, n + 1]
+    w = 2 * math.pi * parameters.tribometer_frequency
+    system = np.zeros((4, 4))
+    system[:2, :3] = w / parameters.rate * np.array([[0.0, 1.0, 0.0], [-1.0, -2 * parameters.tribometer_damping, 1.0]])
+    system[2, 3] = 1.0
+    step = expm(system)[:2]
+    step[:, 2] -= step[:, 3]
     return step
 
 
 @kernel
 def sliding_step(s, steady_friction, speed, noise):
-    """Advance the contact by a sample; return friction, measured friction (N) and skin velocity (m/s) at its start.
+    """Advance the contact by a sample; return friction and measured friction (N) at its start.
 
     `s` is a record of `SLIDING`; `steady_friction` (N) and `speed` (m/s, NaN: lifted) hold over the sample; `noise` is
     of unit variance.
@@ -187,9 +147,4 @@ def sliding_step(s, steady_friction, speed, noise):
     measured = quantise(x0 + s.force_noise * noise, s.force_step, s.force_range)
     for i in range(2):
         x[i] = phi[i, 0] * x0 + phi[i, 1] * x1 + phi[i, 2] * before + phi[i, 3] * after
-    phi, x = s.skin_step, s.skin
-    x0, x1, x2, x3 = x[0], x[1], x[2], x[3]
-    for i in range(4):
-        free = phi[i, 0] * x0 + phi[i, 1] * x1 + phi[i, 2] * x2 + phi[i, 3] * x3
-        x[i] = free + phi[i, 4] * before + phi[i, 5] * after
-    return before, measured, x2
+    return before, measured

@@ -35,7 +35,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from hapticrender.checks import option, parameter
+from hapticrender.checks import Validated, option, parameter
 from hapticrender.control.estimators import StarSTDFT
 from hapticrender.plants.compiled import CompiledPlant
 from hapticrender.plants.contact import SlidingParameters, new_record, sliding_record
@@ -52,7 +52,7 @@ LEAST_SUBSTEPS = 4  # in a turn of the carrier
 
 
 @dataclass(frozen=True, kw_only=True)
-class SquareRoot:
+class SquareRoot(Validated):
     """Square root that makes an attraction, which goes with current squared, linear in the drive.
 
     An attraction u (N) around a bias takes the current envelope ``I = sqrt(max(bias + u, floor)/g)``.  `straight` omits
@@ -67,18 +67,15 @@ class SquareRoot:
     [0.00424, 0.006]
     """
 
-    bias: float  # N, > floor: attraction at zero drive
-    floor: float  # N, >= 0: least attraction
-    gain: float  # N/A^2 (or N/V^2), > 0: g of F = g I^2
+    bias: float = parameter(unit="N", above=0.0)  # attraction at zero drive, > floor
+    floor: float = parameter(unit="N")  # least attraction
+    gain: float = parameter(unit="N/A^2", above=0.0)  # g of F = g I^2; N/V^2 where a voltage is driven
     straight: bool = False
 
     def __post_init__(self) -> None:
-        for name, bound, unit in (("bias", self.floor, "N"), ("gain", 0.0, "N/A^2")):
-            value = getattr(self, name)
-            if not (math.isfinite(value) and value > bound):
-                raise ValueError(f"{name} = {value!r}: must be > {bound:g} {unit}")
-        if not (math.isfinite(self.floor) and self.floor >= 0.0):
-            raise ValueError(f"floor = {self.floor!r}: must be >= 0 N")
+        super().__post_init__()
+        if self.bias <= self.floor:
+            raise ValueError(f"bias = {self.bias!r}: must be > floor = {self.floor:g} N")
 
     def __call__(self, drive: Any) -> Any:
         """Current envelope (A, peak) for a `drive` (N of attraction around the bias)."""
@@ -212,12 +209,12 @@ class ElectroadhesionScreen(CompiledPlant):
     """The screen in discrete time, behind the `Plant` protocol.
 
     The drive is the peak of the carrier (A or V); a `compensation` makes it an attraction around its bias (N), by a
-    gain in N/A^2, or N/V^2 where a voltage is driven.  `motion`: friction (N), the skin's velocity under it (m/s,
-    against the motion), and the mean attraction of each sample (N).
+    gain in N/A^2, or N/V^2 where a voltage is driven.  `motion`: friction (N), and the mean
+    attraction of each sample (N).
     """
 
     step = screen_step
-    motion_channels = 3
+    motion_channels = 2
 
     def __init__(
         self,
@@ -229,11 +226,11 @@ class ElectroadhesionScreen(CompiledPlant):
         super().__init__(finger, parameters.rate, seed=seed)
         self.parameters, self.compensation = parameters, compensation
         self.noise_channels = 1 + 2 * parameters.oversampling if parameters.sensor == "impedance" else 1
-        self.state = screen_record(parameters, finger, compensation)
+        self.state = screen_record(parameters, compensation)
 
 
-def screen_record(parameters: ElectroadhesionParameters, finger: Finger, compensation: SquareRoot | None) -> Array:
-    """Return the record (`SCREEN`, shape (1,)) of a screen at rest with this finger on it."""
+def screen_record(parameters: ElectroadhesionParameters, compensation: SquareRoot | None) -> Array:
+    """Return the record (`SCREEN`, shape (1,)) of a screen at rest."""
     p, substep = parameters, 1.0 / (parameters.rate * parameters.oversampling)
     turn, corneum = np.exp(1j * p.omega * substep), p.corneum_resistance * p.corneum_capacitance
     elements = [element.py_func(tau, substep, p.omega, turn) for tau in (BLOCKING, corneum, corneum)]
@@ -255,5 +252,5 @@ def screen_record(parameters: ElectroadhesionParameters, finger: Finger, compens
         alternating=[each[1] for each in elements],
         direct=[each[2] for each in elements],
         gap=gap_record(p)[0],
-        sliding=sliding_record(p, finger.mechanics)[0],
+        sliding=sliding_record(p)[0],
     )

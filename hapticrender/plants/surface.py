@@ -177,11 +177,11 @@ class UltrasonicSurface(CompiledPlant):
 
     `amplitude` is the amplitude loop, designed for `parameters.amplitude_model()` and `parameters.amplitude_bands()`,
     with a compiled step that takes single samples; it holds the `nominal` load (N) and speed (m/s) while no finger is
-    there.  `motion`: friction (N), the skin's velocity under it (m/s, against the motion), and the amplitude (m).
+    there.  `motion`: friction (N), and the amplitude (m).
     """
 
     step = surface_step
-    motion_channels = 3
+    motion_channels = 2
 
     def __init__(
         self,
@@ -194,7 +194,7 @@ class UltrasonicSurface(CompiledPlant):
         super().__init__(finger, parameters.rate, seed=seed)
         self.parameters, self.loop = parameters, amplitude
         self.noise_channels = 1 + parameters.substeps
-        self.state, queue = surface_record(parameters, amplitude, finger, nominal)
+        self.state, queue = surface_record(parameters, amplitude, nominal)
         self.buffers = (queue,)
 
     def inputs(self, first: int, n: int) -> Array:
@@ -207,10 +207,8 @@ class UltrasonicSurface(CompiledPlant):
         return self.motion[:, AMPLITUDE]
 
 
-def surface_record(
-    parameters: SurfaceParameters, amplitude: Any, finger: Finger, nominal: tuple[float, float]
-) -> tuple[Array, Array]:
-    """Return the record (`SURFACE`, shape (1,)) of a surface at rest with this finger on it, and its drive's queue."""
+def surface_record(parameters: SurfaceParameters, amplitude: Any, nominal: tuple[float, float]) -> tuple[Array, Array]:
+    """Return the record (`SURFACE`, shape (1,)) of a surface at rest, and its drive's queue."""
     p, mode = parameters, parameters.carrier_mode
     inner, queue = mode_record(mode, mode.delay - 1)
     record = new_record(
@@ -227,7 +225,7 @@ def surface_record(
         reached=-1.0,
         law=p.friction_law.numbers,
         mode=inner[0],
-        sliding=sliding_record(p, finger.mechanics)[0],
+        sliding=sliding_record(p)[0],
     )
     for name in ("drive", "sensed", "position", "waveform", "target", "flags"):
         record["signals"][name] = record[name].ctypes.data
