@@ -4,11 +4,10 @@ Velocities that feel alike add, in phase [Grigorii et al. 2021]::
 
     v = d/dt (displacement of the glass under the finger) + (v/F) (friction),   v/F = 0.64 m/(N s)
 
-The finger's load acts on both: the plate sags under it, and friction grows with it.  Attraction is a force between skin
-and glass: it presses one on the other as much as it pulls, so that the plate carries the load alone, but for the motion
-of the gap, which is left out.  Friction acts along the plate and does not move it.  What the plate's own vibration
-makes of the normal force, and so of friction, is left out as well: the match v/F was found by fingers that slid over a
-vibrating plate, so it is part of what a plate's velocity feels like.
+The finger's load acts on both: the plate sags under it, and friction grows with it.  Attraction presses skin and glass
+on each other as much as it pulls, so that the plate carries the load alone; friction acts along the plate and does not
+move it.  Left out are the motion of the gap, and what the plate's vibration makes of friction: the match v/F was
+measured by fingers that slid over a vibrating plate.
 """
 
 from __future__ import annotations
