@@ -121,11 +121,11 @@ def figures(played: Played, window: float, settle: float) -> dict[str, float | N
         centre.  `drive_rms`, `drive_peak` in the unit of the drive.
     """
     found = envelopes(played, window)
-    level = _rms(np.where(found.judged, abs(found.target), np.nan), 0)
+    level = _rms(np.where(found.judged, abs(found.wanted), np.nan), 0)
     late = found.judged & (found.time >= settle)[:, None]
-    off = (abs(found.achieved) - abs(found.target)[:, None]) / level
+    off = (abs(found.achieved) - abs(found.wanted)[:, None]) / level
     off = np.where(late[:, None], off, np.nan)
-    turned = np.where(late, (found.achieved[:, 0] - found.target) / level, np.nan)
+    turned = np.where(late, (found.achieved[:, 0] - found.wanted) / level, np.nan)
     values = {
         "worst": _rms(off, 0).max(),
         "rms": _rms(off[:, 0], None),
@@ -148,14 +148,14 @@ def _rms(values, axis):
 def _wobble(found, late):
     power = 0.0
     for k in range(late.shape[1]):
-        wanted, achieved = found.target[late[:, k], k], found.achieved[late[:, k], 0, k]
+        wanted, achieved = found.wanted[late[:, k], k], found.achieved[late[:, k], 0, k]
         multiple = np.vdot(wanted, achieved) / np.vdot(wanted, wanted)
         power += np.mean(abs(achieved - multiple * wanted) ** 2) / 2
     return np.sqrt(power)
 
 
 def _settled(found):
-    outside = found.judged & (abs(found.achieved[:, 0] - found.target) > SETTLED * abs(found.target))
+    outside = found.judged & (abs(found.achieved[:, 0] - found.wanted) > SETTLED * abs(found.wanted))
     first = np.flatnonzero(outside.any(axis=1)).max(initial=-1) + 1
     return found.time[first] if first < len(found.time) else None
 
