@@ -217,11 +217,14 @@ def option(default: str, *known: str, about: str = "") -> Any:
 class Validated:
     """Base of dataclasses with fields made by `checked`, `parameter` and `option`, and checked when one is made.
 
-    Where a docstring has no section Parameters and every field says what it is about, the fields make that section.
+    Where a docstring has no section Parameters and every field says what it is about, the fields that no base class has
+    make that section.
     """
 
     def __init_subclass__(cls) -> None:
-        about = {name: getattr(vars(cls).get(name), "metadata", {}) for name in vars(cls).get("__annotations__", ())}
+        above = {name for base in cls.__mro__[1:] for name in vars(base).get("__annotations__", ())}
+        own = [name for name in vars(cls).get("__annotations__", ()) if name not in above]
+        about = {name: getattr(vars(cls).get(name), "metadata", {}) for name in own}
         text = inspect.cleandoc(cls.__doc__ or "")
         if about and "Parameters\n---" not in text and all("about" in each for each in about.values()):
             heads = (f"{name} : {cls.__annotations__[name]}, {each.get('unit', '')}" for name, each in about.items())
