@@ -105,11 +105,7 @@ class BaseDriver:
     Parameters
     ----------
     rate : float, Hz, > 0
-        Sampling rate.
-    drive_channels : int, >= 1
-        Columns of drive.
-    sensed_channels : int, >= 0
-        Columns of the measurements.
+    drive_channels, sensed_channels : int, >= 1 and >= 0
     block : int, >= 1
         Samples a call of `play`.
     delay : int, >= block, optional

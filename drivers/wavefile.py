@@ -74,24 +74,16 @@ class WaveFileDriver(BaseDriver):
         File to write, anew; its ending chooses the format: .wav, .flac, .w64, .rf64, .aiff, .aif.
         W64 and RF64 hold more than 4 GB.
     rate : float, Hz, > 0, optional
-        Sampling rate, 48 kHz unless given; comes from `through` where there is one.
-        The file's header holds the nearest whole number of Hz.
+        48 kHz unless given; the file's header holds the nearest whole number of Hz.
     through : Driver, optional
         A device that plays and senses; rate, channels, block and delay are its own.
         It is opened and closed together with the file.
     full_scale : float, A, > 0
         Drive that stands in the file as 1.0.  An integer format ends one step short of it upwards.
     subtype : {"PCM_16", "PCM_24", "PCM_32", "FLOAT", "DOUBLE"}, optional
-        Form of a sample; FLOAT unless given, for FLAC PCM_24 (which holds integers of 16 and 24 bits only).
-    drive_channels : int, >= 1, optional
-        Columns of drive, 2 unless given; comes from `through` where there is one.
-    block : int, >= 1, optional
-        Samples a call, 1024 unless given; comes from `through` where there is one.
-
-    Raises
-    ------
-    ValueError
-        An ending, a subtype or a number that does not fit.
+        FLOAT unless given, for FLAC PCM_24 (which holds integers of 16 and 24 bits only).
+    drive_channels, block : int, >= 1, optional
+        Columns of drive (2) and samples a call (1024).
     """
 
     def __init__(

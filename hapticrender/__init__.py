@@ -1,4 +1,4 @@
-"""hapticrender: makes a bare finger feel a texture on a surface, in closed loop.
+"""hapticrender: renders textures for a bare finger on a surface, in closed loop.
 
 >>> import hapticrender as hr
 >>> scene = hr.Scene(texture=hr.Grating(frequency=72.0, amplitude=10e-6), duration=2.0)
@@ -22,45 +22,25 @@ if not (_here / "renderers").is_dir():
 __version__ = "0.2.0"
 
 _HOMES = {
-    "bands": ("Bands",),
-    "control.demodulator": ("Demodulator",),
-    "errors": (
-        "DesignError",
-        "DeviceLost",
-        "DeviceNotFound",
-        "DeviceTimeout",
-        "DriverError",
-        "HapticError",
-        "PlateMismatch",
-        "ProtocolError",
-        "SceneError",
-    ),
-    "loop": ("prepare", "render", "run"),
-    "plants.identify": ("Identified", "compare", "identify"),
-    "protocols": (
-        "Controller",
-        "Driver",
-        "Flag",
-        "Method",
-        "Motion",
-        "Plant",
-        "Renderer",
-        "Rendering",
-        "Sensed",
-        "Texture",
-    ),
-    "recordings.recording": ("Recorder", "Recording"),
-    "touch.builtin": ("builtin_scenes",),
-    "touch.finger": ("Finger",),
-    "touch.grating": ("Grating",),
-    "touch.mechanics": ("FingerMechanics",),
-    "touch.motion": ("Sampled", "TriangleMotion", "Still", "SineMotion", "RecordedMotion"),
-    "touch.perception": ("detection_threshold", "roughness", "sensation_level"),
-    "touch.profile": ("strongest_carriers",),
-    "touch.recorded": ("Recorded", "Swipe", "Synthetic"),
-    "touch.scene": ("Scene",),
+    "bands": "Bands",
+    "control.demodulator": "Demodulator",
+    "errors": "DesignError DeviceLost DeviceNotFound DeviceTimeout DriverError HapticError PlateMismatch ProtocolError "
+    "SceneError",
+    "loop": "prepare render run",
+    "plants.identify": "Identified compare identify",
+    "protocols": "Controller Driver Flag Method Motion Plant Renderer Rendering Sensed Texture",
+    "recordings.recording": "Recorder Recording",
+    "touch.builtin": "builtin_scenes",
+    "touch.finger": "Finger",
+    "touch.grating": "Grating",
+    "touch.mechanics": "FingerMechanics",
+    "touch.motion": "Sampled TriangleMotion Still SineMotion RecordedMotion",
+    "touch.perception": "detection_threshold roughness sensation_level",
+    "touch.profile": "strongest_carriers",
+    "touch.recorded": "Recorded Swipe Synthetic",
+    "touch.scene": "Scene",
 }
-_HOME_OF = {name: home for home, names in _HOMES.items() for name in names}
+_HOME_OF = {name: home for home, names in _HOMES.items() for name in names.split()}
 
 __all__ = sorted(_HOME_OF)
 

@@ -46,15 +46,12 @@ class Bands:
 
     Parameters
     ----------
-    frequency : ndarray, shape (n,), Hz
-        Fixed part of each carrier, finite and >= 0.
-    wavenumber : ndarray, shape (n,), 1/m
-        Finger-locked part, 1/wavelength, finite and >= 0.
+    frequency, wavenumber : ndarray, shape (n,), Hz, 1/m
+        Fixed and finger-locked (1/wavelength) part of each carrier, finite and >= 0.
     phase : ndarray, shape (n,), rad
         Carrier phase at t = 0, x = 0; finite.
     envelope : ndarray of complex, shape (n,), m, or None
-        Constant target envelopes, finite; None where the controller has to
-        estimate them from the target waveform (recordings).
+        Constant target envelopes, finite; None where the controller estimates them from the waveform (recordings).
     modulated : bool
         The waveform is a factor of every envelope, which is otherwise constant.
     differentiated : bool
@@ -63,11 +60,6 @@ class Bands:
         Response of the device's sensor to each band, not 0; None: 1.  `tone` refers the targets to the sensor.
     unfelt : tuple of str
         Bands left out below the detection threshold, and why, one sentence each.
-
-    Raises
-    ------
-    ValueError
-        A number is out of its bound, or a length differs from that of `frequency`.
 
     Examples
     --------

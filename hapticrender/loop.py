@@ -81,7 +81,7 @@ def render(
     Parameters
     ----------
     scene : Scene or path
-        What is touched, by what, on which kind of device; or the name of a scene file (TOML).
+        A scene, or the name of a scene file (TOML).
     driver : Driver, optional
         Any object that follows the protocol of `hapticrender.drivers.base`; the simulated device by default.
     method : str, optional
@@ -89,16 +89,11 @@ def render(
     seed : int, optional
         Of the simulated sensor noise, >= 0; default: that of the scene.
     renderer : Renderer, optional
-        Of the device's kind; by default the installed one that `scene.device` names.
+        By default the installed one that `scene.device` names.
     journal : path, optional
         File (.au) that keeps every sample while it happens; a killed process leaves it readable.
     progress : callable, optional
         Called as ``progress(done, total)`` in seconds of signal.
-
-    Returns
-    -------
-    Recording
-        Drive (A), sensed and true motion (m), position (m), targets (m) and flags, sample by sample.
 
     Raises
     ------

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from hapticrender.protocols import Array
-from hapticrender.recordings.envelopes import amplitude_error, residuals
-from hapticrender.touch.perception import HIGHEST, VELOCITY_PER_FORCE, sensation_level
+from hapticrender.recordings.envelopes import amplitude_error
+from hapticrender.touch.perception import VELOCITY_PER_FORCE, sensation_level
 
 if TYPE_CHECKING:
     from hapticrender.recordings.recording import Recording
@@ -71,7 +71,7 @@ def skin_bands(recording: Recording) -> list[SkinBand]:
 def skin_waveform(recording: Recording, start: float, seconds: float) -> tuple[Array, Array, Array]:
     """Time (s), target and achieved skin velocity (m/s) of the bands over `seconds` (s) from `start` (s).
 
-    The achieved one is rebuilt from the envelopes of the windows around; `residual_velocity` is the size of the rest.
+    The achieved one is rebuilt from the envelopes of the windows around.
     """
     envelopes, rate, bands = recording.envelopes, recording.rate, recording.bands
     first, last = round(start * rate), min(round((start + seconds) * rate), len(recording))
@@ -85,23 +85,3 @@ def skin_waveform(recording: Recording, start: float, seconds: float) -> tuple[A
         nearest = np.abs(envelopes.time[None, :] - time[:, None]).argmin(axis=1)
         achieved = envelopes.achieved[nearest, 0] / (recording.header.profile or (1.0,))[0]
     return time, (turned * target).real.sum(axis=1), (turned * achieved).real.sum(axis=1)
-
-
-def residual_velocity(recording: Recording, highest: float = HIGHEST) -> float:
-    """Rms skin velocity (m/s) beside the bands up to `highest` (Hz), at the first place; NaN where nothing is judged.
-
-    Welch's estimate over the windows of the judge: the Hann-windowed spectrum of the residual times
-    `velocity_per_unit`, summed by Parseval.  A window of T adds 1/(6 (f T)^2) to the rms of a tone at f that is
-    differentiated; the windows' edges, where most of an envelope's drift is left, hardly count.
-    """
-    mean_squares = []
-    for rest in residuals(recording):
-        size = rest.shape[1]
-        window = np.hanning(size)
-        frequency = np.fft.rfftfreq(size, 1 / recording.rate)
-        counted = (frequency > 0) & (frequency <= highest) & (frequency < recording.rate / 2)
-        share = np.abs(velocity_per_unit(recording, frequency[counted]))
-        spectrum = np.abs(np.fft.rfft(rest * window, axis=1)[:, counted])
-        mean_squares.append(2 * ((share * spectrum) ** 2).sum(axis=1) / (size * (window**2).sum()))
-    power = np.concatenate(mean_squares)
-    return math.sqrt(power.mean()) if power.size else math.nan

@@ -48,23 +48,18 @@ def sweep(
     Parameters
     ----------
     scenes : iterable of Scene
-        Of any device.
+        Of any device; results come in their order.
     judge : callable, optional
-        From a `Recording` to what is kept; runs where the scene was rendered, so it must be a function of a module for
-        an executor of other processes.  Default: the recording's summary.
+        From a `Recording` to what is kept; a function of a module for an executor of other processes.  Default: the
+        recording's summary.
     method : str, optional
         Name of the control method; default: that of each scene.
     executor : concurrent.futures.Executor, optional
-        Where the work is done; default: this thread.
+        Default: this thread.
     at_a_time : int
         Scenes a task of the executor, >= 1.
     failures : bool
         Whether a scene that fails gives a `Failure` in the list; otherwise it raises.
-
-    Returns
-    -------
-    list
-        In the order of the scenes.
 
     Raises
     ------

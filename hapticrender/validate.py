@@ -8,7 +8,7 @@ import tempfile
 import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures import Future, ProcessPoolExecutor
 from dataclasses import asdict, dataclass, field
 from functools import partial
 from pathlib import Path
@@ -38,26 +38,7 @@ Tick = Callable[[float, float], None]
 class Verdict:
     """Verdict on one scene.
 
-    Parameters
-    ----------
-    scene, device, method : str
-        What was rendered, on what, and how.
-    seed : int
-        Seed of the plant's noise.
-    verdict : str
-        "passed", "failed", "not judged" (no figure can be given) or "error" (the scene cannot be rendered).
-    reason : str
-        Why there is no figure.
-    tolerance : float or None
-        Bound on the figure (relative error, 1).
-    figure, band, place : str
-        The worst figure: its name, the band and the evaluation point.
-    value : float or None
-        The worst figure (relative error, 1); None where there is none.
-    elapsed : float
-        Time that the rendering took (s).
-    summary : dict
-        ``Recording.summary()``; empty after an error.
+    "passed", "failed", "not judged" (no figure can be given, for the reason) or "error" (it cannot be rendered).
     """
 
     scene: str
@@ -65,14 +46,14 @@ class Verdict:
     method: str
     seed: int
     verdict: str
-    reason: str = ""
-    tolerance: float | None = None
-    figure: str = "rms_error"
+    reason: str = ""  # where there is no figure
+    tolerance: float | None = None  # bound on the figure (relative error, 1)
+    figure: str = "rms_error"  # the worst one
     band: str = "any"
     place: str = "any"
-    value: float | None = None
-    elapsed: float = 0.0
-    summary: Mapping[str, Any] = field(default_factory=dict, repr=False)
+    value: float | None = None  # of the worst figure (relative error, 1)
+    elapsed: float = 0.0  # s
+    summary: Mapping[str, Any] = field(default_factory=dict, repr=False)  # ``Recording.summary()``
 
     @classmethod
     def of(cls, summary: Mapping[str, Any], elapsed: float) -> Verdict:
@@ -91,13 +72,7 @@ class Verdict:
 
 
 def open_scene(reference: str | Path) -> Scene:
-    """Read a scene: a built-in one by its name, any other from its TOML file.
-
-    Raises
-    ------
-    ValueError
-        No such file, or not a scene.
-    """
+    """Read a scene: a built-in one by its name, any other from its TOML file; a ValueError where there is none."""
     scenes = builtin_scenes()
     if str(reference) in scenes:
         return scenes[str(reference)]
@@ -117,32 +92,20 @@ def validate(
     out: str | Path | None = None,
     progress: TextIO | None = None,
 ) -> list[Verdict]:
-    """Render scenes in closed loop against the plant models and judge each.
+    """Render scenes in closed loop against the plant models and judge each, in their order.
 
     Parameters
     ----------
     scenes : iterable of Scene, str or Path
-        Scenes, names of built-in ones, or TOML files.
-    method : str, optional
-        Name of the control method; default: that of each scene.
-    seed : int, optional
-        Seed of the plants' noise, >= 0; default: that of each scene.
+        Scenes, names of built-in ones, or TOML files.  One that cannot be rendered stops no other.
+    method, seed
+        Of the control, and of the plants' noise (>= 0); default: those of each scene.
     jobs : int, >= 1
         Processes that render scenes side by side.
     out : path, optional
-        Folder that gets journal, sounds, picture and figures of each scene that does not pass, in a folder of its name.
+        Folder for the files of each scene that does not pass, in a folder of its name.
     progress : file, optional
         Where to show progress.
-
-    Returns
-    -------
-    list of Verdict
-        In the order of the scenes; a scene that cannot be rendered has the verdict "error" and stops no other.
-
-    Raises
-    ------
-    ValueError
-        The method is unknown, or a number out of its bound.
 
     Examples
     --------
@@ -164,7 +127,7 @@ def validate(
         futures = [pool.submit(judge, *entry) for entry in entries]
         try:
             pairs = zip(entries, futures, strict=True)
-            return [_with_progress(shown, *entry, lambda _, future=future: future.result()) for entry, future in pairs]
+            return [_with_progress(shown, *entry, partial(_result, future)) for entry, future in pairs]
         except BaseException:
             pool.shutdown(cancel_futures=True)
             raise
@@ -199,6 +162,10 @@ def _judge(
             problem = str(error)
     reason, method = problem.removeprefix(f"{label}: "), method or defaults.METHOD
     return Verdict(scene=label, device=device, method=method, seed=seed or 0, verdict="error", reason=reason)
+
+
+def _result(future: Future[Verdict], _: Tick | None) -> Verdict:
+    return future.result()
 
 
 def _with_progress(
@@ -245,13 +212,7 @@ def write_json(path: str | Path, verdicts: Sequence[Verdict]) -> None:
 
 
 def write_junit(path: str | Path, verdicts: Sequence[Verdict]) -> None:
-    """Write verdicts to `path` as the JUnit XML that continuous-integration systems read: a test case per scene.
-
-    Notes
-    -----
-    The schema is that of the Apache Ant JUnit task: ``testsuites/testsuite/testcase`` with ``failure``, ``error`` or
-    ``skipped`` (not judged); times in s.
-    """
+    """Write verdicts to `path` as JUnit XML (schema of the Apache Ant task): a test case per scene, times in s."""
     counts = Counter(verdict.verdict for verdict in verdicts)
     totals = {
         "name": "hapticrender",

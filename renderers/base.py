@@ -36,21 +36,21 @@ class BaseRenderer(Generic[Setup]):
         setup = self.read(scene, driver)
         if driver is None:
             plant = self.plant(setup, scene.seed)
-            device = shown = SimulatedDriver(plant)
+            device = facing = SimulatedDriver(plant)
         else:
-            plant, device, shown = None, driver, self.connect(setup, driver)
-        check_driver(shown)
-        model = self.device_model(setup, shown)
+            plant, device, facing = None, driver, self.connect(setup, driver)
+        check_driver(facing)
+        model = self.device_model(setup, facing)
         bands = self.bands(setup, model)
         return Rendering(
             scene=scene,
             device=device,
-            driver=shown,
+            driver=facing,
             plant=plant,
             model=model,
             bands=bands,
             waveform=self.waveform(setup),
-            controller=partial(self.design, method, model, bands, feedback=shown.sensed_channels > 0),
+            controller=partial(self.design, method, model, bands, feedback=facing.sensed_channels > 0),
         )
 
     def read(self, scene: Scene, driver: Driver | None) -> Setup:

@@ -28,22 +28,12 @@ LEVEL = ("level", "oversampling")  # how finely a screen is modelled
 class ElectroadhesionSettings(FrictionSettings):
     """Settings of the drive; set in a scene's [render] table.
 
-    Parameters
-    ----------
-    velocity_per_force : float, m/(N s)
-        See `FrictionSettings`.
-    square_root : {"on", "off"}
-        Whether the envelope is the root of the target attraction, or proportional to it.
-    headroom : float
-        Swing of the drive over what a nominal finger needs, >= 1.
-    floor : float
-        Least attraction as a share of the bias, 0 to 0.5; rounds off the cusps of the square root.
-    output : {"envelope", "carrier"}
-        Drive of your own driver: the carrier's peak, or the carrier itself (no sensors, rate >= 4 times its frequency).
+    `output` is what a driver of your own gets: the carrier's peak, or the carrier itself (no sensors, rate >= 4 times
+    its frequency).
     """
 
-    headroom: float = parameter(ROOM, least=1.0, most=100.0)
-    floor: float = parameter(0.05, most=0.5)
+    headroom: float = parameter(ROOM, least=1.0, most=100.0)  # swing of the drive over what a nominal finger needs
+    floor: float = parameter(0.05, most=0.5)  # least attraction over the bias; rounds off the cusps of the square root
     output: str = option("envelope", "envelope", "carrier")
 
 

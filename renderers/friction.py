@@ -32,12 +32,8 @@ PLACES = ("friction",)
 class FrictionSettings(Validated):
     """Conversion of a texture to friction; set in a scene's [render] table.
 
-    Parameters
-    ----------
-    velocity_per_force : float, m/(N s)
-        Skin velocity matched to a newton of friction; 0: the finger's own |V_s/F|, for fixed carriers.
-    square_root : {"on", "off"}
-        Whether a screen's drive is an attraction (N), or the current's envelope itself.
+    `velocity_per_force` is the skin velocity matched to a newton of friction; 0: the finger's own |V_s/F|, for fixed
+    carriers.  `square_root` says whether a screen's drive is an attraction (N), or the current's envelope itself.
     """
 
     velocity_per_force: float = parameter(VELOCITY_PER_FORCE, "m/(N s)", most=100.0)

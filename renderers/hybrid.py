@@ -209,7 +209,7 @@ def _part_of(driver: Driver, drive: int, sensed: int, name: str) -> Driver:
 
 
 def _part(scene: Scene, bands: Bands) -> Scene:
-    """Scene of one part of the device; bands of the whole that cannot be felt have been left out already."""
+    """Scene of one part of the device; bands below the threshold have been left out already."""
     return replace(scene, texture=Shared(bands, scene.texture), keep_unfelt=True)
 
 

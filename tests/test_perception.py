@@ -33,27 +33,11 @@ def test_the_classic_threshold_is_the_published_one(frequency):
     assert 20 * np.log10(found / 1e-6) == pytest.approx(DECIBELS[frequency], abs=0.5)
 
 
-def test_between_entries_the_threshold_is_straight_in_logarithms():
-    assert detection_threshold(np.sqrt(5 * 10.0), "classic") == pytest.approx(1e-6 * np.sqrt(18 * 11), rel=ROUNDING)
-
-
 @pytest.mark.parametrize(("frequency", "below"), [(1, 6), (20, 6), (40, 10), (63, 10), (80, 25), (500, 25), (1000, 25)])
 def test_the_safe_threshold_lies_below_the_classic_one_by_what_active_touch_gains(frequency, below):
     """FACTS section 7: -6 dB below 40 Hz, -10 dB from 40, -25 dB from 80; a border belongs to the lower side."""
     expected = 1e-6 * TABLE[frequency] * 10 ** (-below / 20)
     assert detection_threshold(frequency) == pytest.approx(expected, rel=ROUNDING)
-
-
-@pytest.mark.parametrize(("border", "step"), [(40.0, 4.0), (80.0, 15.0)])
-def test_the_safe_threshold_steps_down_at_its_borders(border, step):
-    """Over one part in 1e9 the classic curve itself moves by less than 1e-7 dB (its slope is below 40 dB an octave)."""
-    before, at = detection_threshold(np.array([border * (1 - 1e-9), border]))
-    assert 20 * np.log10(before / at) == pytest.approx(step, abs=1e-7)
-
-
-@given(FREQUENCIES)
-def test_safe_never_exceeds_classic(frequency):
-    assert 0 < detection_threshold(frequency) < detection_threshold(frequency, "classic")
 
 
 def test_beyond_the_table_nothing_is_known_and_little_is_safe():
@@ -129,17 +113,11 @@ def left(*entries, **device):
     return bands.phase[:-1].tolist()
 
 
-@pytest.mark.parametrize("frequency", [1.0, 7.0, 39.999, 40.0, 79.999, 80.0, 250.0, 999.0, 1000.0, 1500.0, 5e4])
+@pytest.mark.parametrize("frequency", [1.0, 39.999, 40.0, 80.0, 250.0, 1000.0, 5e4])
 def test_a_fixed_carrier_goes_just_below_the_safe_curve_and_stays_on_it(frequency):
     least = detection_threshold(frequency)
     assert left((frequency, 0.0, least * (1 - 1e-9))) == []
     assert left((frequency, 0.0, least * (1 + 1e-9))) == [0]
-
-
-@pytest.mark.parametrize("frequency", [0.0, 0.999])
-def test_nothing_below_1_hz_goes(frequency):
-    assert left((frequency, 0.0, 1e-15)) == [0]
-    assert left((0.0, 1e3, 1e-15), lowest=frequency) == [0]
 
 
 # Fixed part (Hz) and wavenumber (1/m) of a carrier, and where (Hz) it is felt best under a finger of up to 0.1 m/s in
@@ -166,12 +144,6 @@ def test_no_frequency_on_the_way_is_more_sensitive(frequency, wavenumber, top_sp
     if way.size:
         felt = detection_threshold(way).min() * (1 + 1e-9)
         assert left((frequency, wavenumber, felt), **device) == [0]
-
-
-def test_a_locked_carrier_that_never_gets_into_the_device_s_range_is_not_judged():
-    assert left((0.0, 90.0, 1e-15)) == [0]  # up to 9 Hz: the device starts at 10
-    assert left((0.0, 1e3, 1e-15), top_speed=0.0) == [0]
-    assert left((600.0, 100.0, 1e-15)) == [0]  # 590 to 610 Hz: the device ends at 400
 
 
 def test_bands_go_together_only_if_their_sum_is_unfelt():

@@ -6,12 +6,11 @@ import numpy as np
 import pytest
 import soundfile
 
-import hapticrender as hr
 from hapticrender.errors import SceneError
 from hapticrender.touch import recorded
 from hapticrender.touch.finger import Finger
 from hapticrender.touch.recorded import Recorded, Swipe, Synthetic
-from hapticrender.touch.tribometer import load_swipe, unwrap_counts
+from hapticrender.touch.tribometer import load_swipe
 
 INSIDE = slice(500, -500)  # away from the ends, where reflection bends a tone
 
@@ -29,7 +28,7 @@ def write(tmp_path):
     return write
 
 
-@pytest.mark.parametrize("rate", [1000, 8000, 44100])
+@pytest.mark.parametrize("rate", [1000, 44100])
 def test_a_tone_in_time_comes_back_at_any_file_rate(write, rate):
     texture = Recorded(file=write(0.25 * tone(140.0, rate), rate), gain=4e-6)
     time = np.arange(0.3, 1.7, 1 / 5000)
@@ -47,19 +46,6 @@ def test_any_channel_of_any_format(write, name, subtype):
         assert bands.envelope is None
 
 
-def test_amplitude_is_the_peak_without_the_mean(write):
-    texture = Recorded(file=write(0.5 + 0.01 * tone(100.0, 8000)), amplitude=10e-6)
-    time = np.arange(0, 2, 1 / 20000)
-    assert np.abs(texture.waveform(time, time)).max() == pytest.approx(10e-6, rel=2e-3)
-
-
-def test_what_lies_outside_the_passband_is_left_out(write):
-    samples = tone(100.0, 8000) + tone(5.0, 8000) + tone(1000.0, 8000)
-    time = np.arange(0.5, 1.5, 1 / 5000)
-    played = Recorded(file=write(samples / 4), gain=4e-6).waveform(time, time)
-    np.testing.assert_allclose(played, 1e-6 * np.cos(2 * np.pi * 100.0 * time), atol=2e-3 * 1e-6)
-
-
 @pytest.mark.parametrize("speed", [0.02, 0.11])
 def test_a_spatial_recording_is_read_at_the_position_at_any_speed(write, speed):
     """Recorded at 50 mm/s a tone of 100 Hz is a wavelength of 0.5 mm."""
@@ -71,13 +57,6 @@ def test_a_spatial_recording_is_read_at_the_position_at_any_speed(write, speed):
     bands = texture.bands(5000.0)
     assert bands.wavenumber == pytest.approx([2000.0], rel=1e-3)
     assert bands.instantaneous_frequency(np.array([speed]))[0] == pytest.approx([speed / 0.5e-3], rel=1e-3)
-
-
-def test_a_spatial_recording_is_still_while_lifted(write):
-    texture = Recorded(file=write(tone(100.0, 8000)), amplitude=10e-6, speed=0.05)
-    played = texture.waveform(np.zeros(3), np.array([np.nan, 0.0, np.nan]))
-    assert played[0] == played[2] == 0.0
-    assert played[1] != 0.0
 
 
 def test_beyond_its_ends_a_recording_runs_back_without_a_jump(write, rng):
@@ -106,23 +85,12 @@ def test_carriers_are_the_strongest_peaks_apart(write, rng):
     assert Recorded(file=file, amplitude=1e-6).bands(500.0).frequency.max() < 250.0
 
 
-def test_noise_fills_the_band_with_carriers_apart(write, rng):
-    bands = Recorded(file=write(rng.uniform(-1, 1, 16000)), amplitude=1e-6).bands(5000.0)
-    assert 6 <= len(bands) <= 8
-    assert np.diff(bands.frequency).min() >= 40.0
-    assert bands.frequency.min() >= 20.0
-    assert bands.frequency.max() <= 400.0
-
-
 @pytest.mark.parametrize(
     ("samples", "options", "message"),
     [
         (np.array([0.0, np.nan, 0.0]), {}, r"file = .*texture.wav.*: sample 1 of channel 0 = nan: must be a finite"),
-        (np.array([0.0, 0.1, np.inf]), {}, r"sample 2 of channel 0 = inf: must be a finite number"),
         (np.zeros(0), {}, r"has 0 samples: must be >= 2"),
-        (np.zeros(1), {}, r"has 1 samples: must be >= 2"),
         (np.zeros(4000), {}, r"amplitude = 1e-06 m: nothing to scale between 20 and 400 Hz"),
-        (np.full(4000, 0.5), {}, r"nothing to scale"),
         (np.zeros((10, 2)), {"channel": 2}, r"channel = 2: must be < 2, the channels of .*texture.wav"),
         (np.ones(400), {"passband": (5000.0, 6000.0)}, r"passband = .* Hz: must start < 4000 Hz"),
     ],
@@ -200,14 +168,9 @@ def test_what_is_no_sound_file_is_refused(tmp_path):
     ("wrong", "message"),
     [
         ({"gain": 1.0}, r"amplitude, gain: exactly one"),
-        ({"amplitude": -1e-6}, r"amplitude = -1e-06: must be .* m"),
         ({"speed": 0.0}, r"speed = 0.0: must be .* m/s"),
-        ({"channel": -1}, r"channel = -1: must be an integer >= 0"),
-        ({"carriers": 0}, r"carriers = 0: must be an integer >= 1"),
         ({"passband": (400.0, 20.0)}, r"passband = .*: must be two rising frequencies in Hz"),
-        ({"file": ""}, r"file = '': must be the name of a file"),
         ({"file": "a\0b"}, r"file = .*: must be the name of a file"),
-        ({"file": 3}, r"file = 3: must be the name of a file"),
     ],
 )
 def test_wrong_parameters_are_refused(wrong, message):
@@ -241,12 +204,6 @@ def save(tmp_path):
         return tmp_path / "swipe.npz"
 
     return save
-
-
-def test_a_counter_unwraps_both_ways(rng):
-    true = np.cumsum(rng.integers(-(2**30), 2**30, 2000))
-    true = np.concatenate([true, true[::-1]])
-    assert unwrap_counts((true % 2**32).astype(np.uint32)).tolist() == (true - true[0]).tolist()
 
 
 def test_contact_and_slide_are_told_from_homing(save):
@@ -287,13 +244,11 @@ def test_force_is_a_function_of_position_at_other_speeds(save, speed):
     [
         ({"encoder": None}, r"file = .*swipe.npz.*: encoder is missing"),
         ({"rate": -1.0}, r"rate = -1.0: must be .* Hz"),
-        ({"rate": np.array([1.0, 2.0])}, r"rate = .*: must be a finite number .* Hz"),
         ({"metre_per_count": np.nan}, r"metre_per_count = nan: must be .* m"),
         ({"lateral_force": np.full(50000, np.nan)}, r"lateral_force\[0\] = nan: must be a finite number"),
         ({"normal_force": np.full(50000, 1.67)}, r"normal_force departs by .* N .*: must be > 0.2 N"),
         ({"normal_force": np.full(70, 1.67)}, r"have 50000, 50000, 70 samples: must be equal"),
         ({"encoder": np.linspace(0, 1, 50000)}, r"encoder has .* float64: must be a row of .* integer counts"),
-        ({"encoder": np.array(["a"] * 50000)}, r"encoder has .*: must be a row"),
     ],
 )
 def test_bad_swipes_are_refused(save, changes, message):
@@ -318,11 +273,6 @@ def test_what_is_no_swipe_is_refused(tmp_path):
             load_swipe(str(tmp_path / name))
 
 
-def test_a_changed_file_is_read_again(save):
-    assert load_swipe(str(save())).speed == pytest.approx(0.04, rel=1e-3)
-    assert load_swipe(str(save(metre_per_count=1e-6))).speed == pytest.approx(0.08, rel=1e-3)
-
-
 def test_the_real_swipe_slides_from_4_6_to_6_9_seconds(shared_data):
     """FACTS section 9: contact and slide from about 4.6 s to 6.9 s at 40 mm/s, after homing without contact."""
     file = shared_data / "swipe_40mm_s.npz"
@@ -345,13 +295,7 @@ def test_the_real_swipe_slides_from_4_6_to_6_9_seconds(shared_data):
     assert not felt[np.isnan(finger.position(time))].any()
 
 
-def test_a_synthetic_texture_is_the_same_everywhere():
-    texture = Synthetic(amplitude=10e-6, components=3)
-    assert texture.bands(5000.0).frequency == pytest.approx([42.7392, 210.3957, 380.8195], abs=1e-4)
-
-
-@pytest.mark.parametrize("components", range(1, 9))
-@pytest.mark.parametrize("seed", [0, 1, 2**32 - 1])
+@pytest.mark.parametrize(("components", "seed"), [(1, 0), (3, 0), (8, 1), (8, 2**32 - 1)])
 def test_synthetic_components_keep_apart_and_within_their_bounds(components, seed):
     texture = Synthetic(amplitude=10e-6, components=components, seed=seed)
     frequency = texture.bands(5000.0).frequency
@@ -370,12 +314,6 @@ def test_a_synthetic_texture_over_position_is_the_one_over_time_at_its_speed():
     )
     np.testing.assert_allclose(in_space.bands(5e3).wavenumber, in_time.bands(5e3).frequency / 0.08, rtol=1e-12)
     assert not in_space.waveform(time, np.full(time.size, np.nan)).any()
-
-
-def test_synthetic_components_wax_and_wane():
-    texture = Synthetic(amplitude=1e-6, components=1)
-    loudness = np.abs(texture.waveform(np.arange(0, 6, 1e-4), np.zeros(60000))).reshape(60, 1000).max(axis=1)
-    assert loudness.max() / loudness.min() == pytest.approx(3.0, rel=0.05)  # (1 + 1/2)/(1 - 1/2)
 
 
 def test_a_file_is_bounded_before_it_is_read(tmp_path, monkeypatch):
@@ -409,16 +347,3 @@ def test_an_archive_is_bounded_by_its_headers_and_by_how_far_its_finger_goes(tmp
         np.savez_compressed(tmp_path / "bad.npz", **{**good, **changes})
         with pytest.raises(SceneError, match=message):
             Swipe(file=tmp_path / "bad.npz", amplitude=1e-5).bands(5000.0)
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (([1.0], 100.0), r"signal has shape \(1,\): must be a row of >= 2 finite numbers"),
-        (([1.0, np.nan], 100.0), r"must be a row of >= 2 finite numbers"),
-        (([1.0, 2.0], 0.0), r"rate = 0.0: must be a finite number > 0 Hz"),
-    ],
-)
-def test_carriers_of_what_is_no_signal_are_refused(arguments, message):
-    with pytest.raises(ValueError, match=message):
-        hr.strongest_carriers(*arguments)

@@ -159,20 +159,12 @@ def test_a_new_run_leaves_an_open_recording_of_the_old_one_alone(bands, signals,
     np.testing.assert_array_equal(old.drive, signals["drive"])
 
 
-@pytest.mark.parametrize("name", SIGNALS)
-def test_a_signal_of_the_wrong_length_is_refused(bands, signals, name):
+def test_a_signal_of_the_wrong_length_or_none_is_refused(bands, signals):
     recorder = make_recorder(None, bands)
-    cut = signals[name][:-1] if name != "drive" else signals[name][:1]
-    with pytest.raises(ValueError, match="has shape"):
-        recorder.append(**signals | {name: cut})
-
-
-@pytest.mark.parametrize("journal", [None, "run.au"])
-def test_a_run_without_a_sample_is_a_recording_of_none(bands, tmp_path, journal):
-    recorder = make_recorder(journal and tmp_path / journal, bands)
-    empty = recorder.finish()
-    assert len(empty) == 0
-    assert empty.target.shape == (0, 2)
+    with pytest.raises(ValueError, match="motion has shape"):
+        recorder.append(**signals | {"motion": signals["motion"][:-1]})
+    with pytest.raises(ValueError, match="flags is missing"):
+        recorder.append(**{name: signal for name, signal in signals.items() if name != "flags"})
 
 
 @pytest.mark.parametrize("suffix", [".au", ".npz", ".h5", ".mat", ".HDF5"])
@@ -196,16 +188,6 @@ def test_sound_files_hold_every_column_as_doubles(recording, tmp_path, suffix):
     if suffix != ".w64":  # has no room for text
         with soundfile.SoundFile(path) as file:
             assert Header.from_json(file.comment).to_json() == recording.header.to_json()
-
-
-def test_flac_states_its_scales(recording, tmp_path):
-    recording.save(tmp_path / "run.flac")
-    with soundfile.SoundFile(tmp_path / "run.flac") as file:
-        comment, frames = file.comment, file.read()
-    peak = np.abs(recording.motion).max()
-    assert f"motion {peak:.6g} m" in comment
-    assert "rate = 5000.0 Hz" in comment
-    np.testing.assert_allclose(frames[:, 4:] * peak, recording.motion, atol=peak * 2.0**-23)  # 24 bit
 
 
 @pytest.mark.parametrize("verb", ["save", "load"])
@@ -237,19 +219,6 @@ def test_a_truncated_file_is_refused_by_name(recording, tmp_path, suffix, left):
     with pytest.raises(ValueError, match=rf"run\{suffix}: not a recording \(\S") as refused:
         Recording.load(path)
     assert len(str(refused.value).splitlines()) == 1
-
-
-def test_files_of_others_are_refused_by_name(tmp_path):
-    (tmp_path / "a.au").write_bytes(b"RIFFxxxxxxxx")
-    soundfile.write(tmp_path / "b.au", np.zeros((10, 2)), 5000, subtype="DOUBLE")
-    np.savez(tmp_path / "c.npz", x=np.zeros(3))
-    for name in ("a.au", "b.au", "c.npz"):
-        with pytest.raises(ValueError, match=name.replace(".", r"\.")):
-            Recording.load(tmp_path / name)
-    for suffix in formats.READERS:
-        with pytest.raises(FileNotFoundError) as absent:
-            Recording.load(tmp_path / f"none{suffix}")
-        assert Path(absent.value.filename) == tmp_path / f"none{suffix}"
 
 
 @pytest.mark.parametrize("suffix", [".wav", ".flac"])
@@ -332,13 +301,6 @@ def test_pieces_of_a_journal_are_those_of_memory(recording, tmp_path, monkeypatc
     assert_same(pickle.loads(pickle.dumps(loaded)), recording)
 
 
-def test_the_first_block_states_where_motion_comes_from(bands, signals, tmp_path):
-    with make_recorder(tmp_path / "run.au", bands) as recorder:
-        recorder.append(**signals, motion_source="sensors")
-        recorder.append(**signals, motion_source="true")
-    assert Recording.load(tmp_path / "run.au").header.motion_source == "sensors"
-
-
 CHANGES = [
     ({"drive_channels": 2**31}, "drive_channels = 2147483648: must be an integer >= 0 and <= 1024"),
     ({"drive_unit": 7}, "drive_unit = 7: must be a text"),
@@ -392,8 +354,6 @@ def test_no_header_makes_anything_but_a_header_or_a_value_error(recording, data)
     [
         ({"motion": np.zeros((5, 3))}, r"run\.npz: not a recording \(motion has shape"),
         ({"drive": None}, r"run\.npz: not a recording \(.*drive"),
-        ({"flags": np.array(["a"] * 2500)}, r"run\.npz: not a recording \("),
-        ({"header": None}, r"run\.npz: not a recording \(.*header"),
         ({"header": np.array("{}")}, r"run\.npz: not a recording of this library \(format"),
     ],
 )

@@ -138,21 +138,10 @@ def test_a_texture_of_ones_own_is_described_but_not_played_again():
         again.texture.bands(5000.0)
 
 
-@pytest.mark.parametrize(
-    "texture",
-    [
-        Grating(amplitude=1e-6, wavelength=1e-3),
-        Synthetic(amplitude=1e-6, speed=0.08),
-        Recorded(file="a.wav", amplitude=1e-6, speed=0.05),
-        Swipe(file="a.npz", amplitude=1e-6),
-    ],
-)
+@pytest.mark.parametrize("texture", [TEXTURE_CASES["partials"], Swipe(file="a.npz", amplitude=1e-6)])
 def test_a_texture_over_position_needs_a_finger(texture):
-    message = "^finger.motion = 'none': a texture over position needs a finger$"
-    with pytest.raises(ValueError, match=message):
+    with pytest.raises(ValueError, match="^finger.motion = 'none': a texture over position needs a finger$"):
         Scene(texture=texture, duration=1.0)
-    with pytest.raises(ValueError, match=message):
-        Scene(texture=texture, finger=Finger.absent(), duration=1.0)
     assert Scene(texture=texture, finger=Finger.still(), duration=1.0).texture.spatial
 
 
@@ -255,19 +244,6 @@ KEYS = st.sampled_from(
     "touches mechanics load_scaling description order mass damping".split()
 )
 VALUES = st.recursive(LEAVES, lambda inner: st.lists(inner, max_size=4) | st.dictionaries(KEYS, inner, max_size=3))
-OWN = st.sampled_from(["kind", "seed", "method", "tolerance", "settle", "keep_unfelt", "gradient"])
-SCENES = st.fixed_dictionaries(
-    {"texture": st.dictionaries(KEYS, VALUES, max_size=5) | VALUES},
-    optional={
-        "duration": NUMBERS | VALUES,
-        "finger": st.dictionaries(KEYS, VALUES, max_size=6) | VALUES,
-        **{
-            key: st.dictionaries(st.text(st.characters(exclude_categories=["Cs"])) | OWN, VALUES, max_size=2) | VALUES
-            for key in ("device", "simulation", "render")
-        },
-        **{key: VALUES for key in ("tolerance", "plant", "name", "other")},
-    },
-)
 
 
 def accept_or_refuse(text):
@@ -295,11 +271,6 @@ def play(scene):
         except SceneError as refused:
             curves = [0.0 if "made in Python" in str(refused) else np.nan]
     assert np.isfinite(curves).all()
-
-
-@given(SCENES)
-def test_no_random_scene_is_a_traceback(table):
-    accept_or_refuse(toml.dumps(table))
 
 
 POSITIVE = st.floats(0, 1e-2) | st.floats(0, 10) | NUMBERS
@@ -330,7 +301,7 @@ def spoiled(tables):
             lambda new: table | dict([new])
         )
 
-    return st.sampled_from(tables).flatmap(spoil) | st.sampled_from(tables)
+    return st.sampled_from(tables).flatmap(spoil) | st.sampled_from(tables) | VALUES
 
 
 @given(spoiled(GOOD_TEXTURES), spoiled(GOOD_FINGERS))

@@ -35,39 +35,17 @@ DIVERGING: Any = {"over": "ignore", "invalid": "ignore", "under": "ignore"}  # a
 
 @dataclass(frozen=True, kw_only=True)
 class Envelopes:
-    """Envelopes in the windows of the analysis.
+    """Peak amplitudes with phase, of the waveform ``Re sum_k X_k exp(j phi_k)``, in w windows of n bands."""
 
-    Window w runs from `start[w]` over `window` seconds; `target` and `achieved` are peak amplitudes with phase, of the
-    waveform ``Re sum_k X_k exp(j phi_k)``.
-
-    Parameters
-    ----------
-    start : ndarray, shape (w,), s
-    window : float, s
-    target : ndarray of complex, shape (w, n_bands), m
-        Of the reference waveform.
-    achieved : ndarray of complex, shape (w, places, n_bands), m
-    readable : ndarray of bool, shape (w, n_bands)
-        The window separates the band's carrier from its neighbours and from the offset.
-    has_target : ndarray of bool, shape (w, n_bands)
-        The band's target is not zero all through the window.
-    frequency : ndarray, shape (w, n_bands), Hz
-        Mean magnitude of the carrier's frequency; 0 for a finger-locked one while the finger is up.
-    backward : ndarray of bool, shape (w, n_bands)
-        The carrier runs backwards, as a finger-locked one does on the way back.
-    residual : ndarray, shape (w,), m^2
-        Mean square of the motion at the first place that neither the carriers nor an offset and a slope explain.
-    """
-
-    start: Array
-    window: float
-    target: Array
-    achieved: Array
-    readable: Array
-    has_target: Array
-    frequency: Array
-    backward: Array
-    residual: Array
+    start: Array  # (w,), s
+    window: float  # s
+    target: Array  # complex (w, n), m: of the reference waveform
+    achieved: Array  # complex (w, places, n), m
+    readable: Array  # bool (w, n): the window separates the carrier from its neighbours and from the offset
+    has_target: Array  # bool (w, n): the target is not zero all through the window
+    frequency: Array  # (w, n), Hz: mean magnitude; 0 for a finger-locked carrier while the finger is up
+    backward: Array  # bool (w, n): the carrier runs backwards, as a finger-locked one does on the way back
+    residual: Array  # (w,), m^2: mean square of the motion at the first place beside carriers, offset and slope
 
     @property
     def time(self) -> Array:
@@ -108,19 +86,15 @@ def _window(recording: Recording, longest: float) -> float:
 def window_length(bands: Bands, rate: float, position: Array, longest: float) -> float:
     """Length of the analysis window (s): max(20 ms, 2/lowest frequency, 2/spacing), cut to `longest` (s).
 
-    A carrier that is locked to the finger counts with its lowest frequency
-    while the finger is down; frequencies below 20 Hz are not judged and do
-    not count.
+    A finger-locked carrier counts with its lowest frequency while the finger (`position`, m, at `rate`, Hz) is down;
+    frequencies below 20 Hz are not judged and do not count.
     """
     step = max(1, round(SHORTEST_WINDOW / QUARTERS * rate))
-    coarse = position[::step]
+    frequency, coarse = bands.frequency[None, :], position[::step]
     if bands.wavenumber.any() and coarse.size > 1:
         velocity = np.diff(coarse) * rate / step
         frequency = np.abs(bands.instantaneous_frequency(velocity[np.isfinite(velocity)]))
-    else:
-        frequency = bands.frequency[None, :]
-    lowest = max(LOWEST_FREQUENCY, frequency.min(initial=np.inf))
-    window = max(SHORTEST_WINDOW, PERIODS / lowest if np.isfinite(lowest) else 0.0)
+    window = max(SHORTEST_WINDOW, PERIODS / max(LOWEST_FREQUENCY, frequency.min(initial=np.inf)))
     fast = np.sort(frequency[(frequency >= LOWEST_FREQUENCY).all(axis=1)], axis=1)
     if len(bands) > 1 and len(fast):
         spacing = np.quantile(np.diff(fast, axis=1).min(axis=1), 0.05)
@@ -186,33 +160,11 @@ def _fit_windows(recording: Recording, first: Array, size: int) -> tuple[Array, 
     return envelope, inflation, residual, (target != 0)[index].all(axis=1), position[index]
 
 
-def residuals(recording: Recording) -> Iterator[Array]:
-    """Motion (w windows, m samples) at the first place beside the bands, in batches of the judged windows."""
-    envelopes, rate = recording.envelopes, recording.rate
-    size = round(envelopes.window * rate)
-    judged = (envelopes.start >= judged_from(recording) * (1 - 1e-9)) & envelopes.finite
-    first = np.rint(envelopes.start[judged] * rate).astype(int)
-    for starts in _batches(first, size, len(recording.bands)):
-        yield _fit_windows(recording, starts, size)[2]
-
-
 def fit(phase: Array, signals: Array) -> tuple[Array, Array, Array]:
-    """Least-squares envelopes of all carriers at once, with an offset and a slope.
+    """Least-squares envelopes of all carriers at once, with an offset and a slope, in w windows of m samples.
 
-    Parameters
-    ----------
-    phase : ndarray, shape (w, m, n_bands), rad
-        Carrier phases in each window of m samples.
-    signals : ndarray, shape (w, m, s)
-
-    Returns
-    -------
-    envelope : ndarray of complex, shape (w, s, n_bands)
-        In the unit of the signals.
-    inflation : ndarray, shape (w, n_bands)
-        Variance of an envelope's worse part relative to that of a lone carrier, >= 1 or nearly so.
-    rest : ndarray, shape (w, m, s)
-        What is left of the signals.
+    From the carriers' `phase` (w, m, n_bands), rad, and `signals` (w, m, s): envelopes (complex, (w, s, n_bands)), the
+    variance of an envelope's worse part over that of a lone carrier (w, n_bands), and the residual (w, m, s).
     """
     windows, size, n_bands = phase.shape
     regressors = np.empty((windows, size, 2 * n_bands + 2))
@@ -256,18 +208,8 @@ def _quarterly(bands: Bands, rate: float, finger: Array) -> Array:
 def amplitude_error(achieved: ArrayLike, target: ArrayLike, axis: int | None = None) -> Array:
     """Relative error of amplitudes, phase left out.
 
-    Parameters
-    ----------
-    achieved, target : ndarray of complex or float
-        Envelopes in one unit; shapes that broadcast.
-    axis : int or None
-        None: ``|X|/|target| - 1`` of every element.  Otherwise the rms of |X| - |target| along this axis over the rms
-        of |target|, >= 0.
-
-    Returns
-    -------
-    ndarray of float
-        NaN where the target is zero.
+    ``|X|/|target| - 1`` of every element; with an `axis` the rms of |X| - |target| along it over the rms of |target|.
+    Envelopes (complex) or amplitudes in one unit, of shapes that broadcast; NaN where the target is zero.
 
     Examples
     --------

@@ -34,7 +34,7 @@ CHUNK_VALUES = 2**20  # numbers read at once
 LONGEST_NOTE = 2**26  # bytes of header
 MOTION_SOURCES = ("true", "sensors", "unknown")
 _COLUMNS = ("frequency", "wavenumber", "phase")  # of bands
-_NUMBER = {"least": -1e12, "most": 1e12}
+_NUMBER: dict[str, Any] = {"least": -1e12, "most": 1e12}
 
 
 def _places(key: str, value: Any) -> tuple[str, ...]:
@@ -59,7 +59,9 @@ def _bands(key: str, value: Any) -> Bands:
         require(good, f"{key}.envelope", pairs, "pairs of real and imaginary part")
         parts = [[number(f"{key}.envelope", part, **_NUMBER) for part in pair] for pair in pairs]
         envelope = np.array([complex(*pair) for pair in parts], complex)
-    marks = {name: flag(f"{key}.{name}", value.get(name, False)) for name in ("modulated", "differentiated")}
+    marks: dict[str, Any] = {
+        name: flag(f"{key}.{name}", value.get(name, False)) for name in ("modulated", "differentiated")
+    }
     unfelt = tuple(text(f"{key}.unfelt", each, 1000) for each in value.get("unfelt", ()))
     arrays: dict[str, Any] = {name: np.array(column, float) for name, column in columns.items()}
     return Bands(**arrays, envelope=envelope, **marks, unfelt=unfelt)
@@ -67,63 +69,29 @@ def _bands(key: str, value: Any) -> Bands:
 
 @dataclass(frozen=True, kw_only=True)
 class Header(Validated):
-    """Meaning and origin of the columns of a recording.
+    """Meaning and origin of the columns of a recording; a field out of its bounds is a ValueError or TypeError.
 
-    Parameters
-    ----------
-    scene : str
-        The scene as TOML.
-    name, device, method : str
-        Names of the scene, of the device and of the control method.
-    seed : int
-        Seed of the run, >= 0.
-    rate : float
-        Exact sampling rate (Hz), 1e-3 to 1e9; the AU header holds it rounded.
-    duration : float
-        Duration of the scene (s), >= 0; a killed run is shorter.
-    tolerance : float
-        Largest relative amplitude error of the scene, 0 to 1000.
-    settle : float
-        Settling time of the scene before it is judged (s), >= 0.
-    bands : Bands
-        Carriers, and constant envelopes where the texture has them.
-    drive_channels, sensed_channels : int
-        Columns of drive and of sensed signals, 0 to 1024.
-    places : tuple of str
-        Names of the evaluation points, one column of motion each, 1 to 1024.
-    drive_limit : float or None
-        Largest drive (either sign) that the device takes; None where unknown.
-    unit, drive_unit : str
-        Of the sensors, motion and targets; of the drive.
-    profile : tuple of float, or None
-        Target at each place, as a multiple of the target at the first; None: the same everywhere.
-    motion_source : str
-        "true" (of a simulation or an independent instrument), "sensors" (computed from the sensed signals, so that
-        errors of the sensors do not show), or "unknown" (no sensors).
-
-    Raises
-    ------
-    ValueError, TypeError
-        A field has another type, or lies outside its bounds.
+    `motion_source` is "true" (of a simulation or an independent instrument), "sensors" (computed from the sensed
+    signals, so that errors of the sensors do not show), or "unknown" (no sensors).
     """
 
-    scene: str = checked(text, longest=2**26, lines=True)
-    name: str = checked(text)
+    scene: str = checked(text, longest=2**26, lines=True)  # as TOML
+    name: str = checked(text)  # of the scene
     device: str = checked(text)
     method: str = checked(text)
     seed: int = parameter(most=2**63 - 1)
-    rate: float = parameter(unit="Hz", least=1e-3, most=1e9)
-    duration: float = parameter(unit="s", most=1e9)
-    tolerance: float = parameter(most=1e3)
-    settle: float = parameter(unit="s", most=1e9)
+    rate: float = parameter(unit="Hz", least=1e-3, most=1e9)  # exact; the AU header holds it rounded
+    duration: float = parameter(unit="s", most=1e9)  # of the scene; a killed run is shorter
+    tolerance: float = parameter(most=1e3)  # largest relative amplitude error of the scene
+    settle: float = parameter(unit="s", most=1e9)  # before the scene is judged
     bands: Bands = checked(_bands)
     drive_channels: int = parameter(2, most=1024)
     sensed_channels: int = parameter(2, most=1024)
-    places: tuple[str, ...] = checked(_places, ("centre", "end 1", "end 2"))
-    drive_limit: float | None = parameter(None, most=1e12)
-    unit: str = checked(text, "m")
+    places: tuple[str, ...] = checked(_places, ("centre", "end 1", "end 2"))  # evaluation points, columns of motion
+    drive_limit: float | None = parameter(None, most=1e12)  # of either sign; None where unknown
+    unit: str = checked(text, "m")  # of sensors, motion and targets
     drive_unit: str = checked(text, "A")
-    profile: tuple[float, ...] | None = checked(numbers, None, least=-1e6, most=1e6)
+    profile: tuple[float, ...] | None = checked(numbers, None, least=-1e6, most=1e6)  # target at each place over first
     motion_source: str = option("true", *MOTION_SOURCES)
 
     def __post_init__(self) -> None:

@@ -26,7 +26,6 @@ READ_AT_ONCE = 2**18  # samples
 SETTLED = 0.05  # of the target
 SETTLED_FOR = 0.5  # s, or
 SETTLED_SHARE = 0.1  # of the judged time where that is shorter: inside for so long at the end, a band has settled
-SILENT = 1e-6  # of the strongest reference envelope: what the fit leaves of a zero target beside other bands
 UNJUDGED: dict[str, Any] = {"figure": "rms_error", "value": None, "band": "any", "place": "any"}
 
 
@@ -188,24 +187,11 @@ def _notes(recording: Recording, bands: list[dict[str, Any]], settled: Array) ->
     if header.motion_source != "unknown" and partly:
         shares = sorted(100 * bands[k]["judged_windows"] / windows.sum() for k in partly)
         share = f"{shares[0]:.0f} %" if shares[-1] - shares[0] < 1 else f"{shares[0]:.0f} to {shares[-1]:.0f} %"
-        beyond = ", faster than the device's range" if _beyond_range(recording, windows, partly) else ""
         notes.append(
             f"{bands_label([bands[k] for k in partly])}: {share} of the windows judged; in the others the target is "
-            f"zero, the finger is up, or the carrier is slower than 20 Hz{beyond} or too close to another"
+            "zero, the finger is up, or the carrier is slower than 20 Hz, out of range, or too close to another"
         )
     return notes
-
-
-def _beyond_range(recording: Recording, windows: Array, partly: list[int]) -> bool:
-    """Whether the target of a finger-locked carrier is 0 in a window where it runs faster than where it is not."""
-    envelopes, bands = recording.envelopes, recording.bands
-    meant = bands.wavenumber != 0 if bands.envelope is None else (bands.wavenumber != 0) & (bands.envelope != 0)
-    strength = np.abs(envelopes.target)
-    silent = strength <= SILENT * strength.max(initial=0.0)
-    fastest = np.where(envelopes.has_target, envelopes.frequency, LOWEST_FREQUENCY).max(
-        axis=0, initial=LOWEST_FREQUENCY
-    )
-    return bool((meant & silent & (envelopes.frequency > fastest))[windows][:, partly].any())
 
 
 def _mean(values: Array) -> float | None:

@@ -8,12 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from hapticrender.formatting import quantity, short
+from hapticrender.formatting import quantity
 from hapticrender.recordings.recording import Recording
 from hapticrender.report.figure import BLUE, GREEN, INK, ORANGE, RED, legend, new_figure, save
 from hapticrender.report.picture import DASHED, FLOOR, QUANTITIES, error_axis
-from hapticrender.skin import residual_velocity, skin_bands, skin_waveform
-from hapticrender.touch.perception import HIGHEST
+from hapticrender.skin import skin_bands, skin_waveform
 
 COLOURS, MARKERS = (BLUE, ORANGE, GREEN, RED), "os^D"
 PERIODS = 3.0  # of the lowest band
@@ -40,7 +39,7 @@ def draw_devices(recordings: Mapping[str, Recording]) -> Any:
         _bands(figure.add_subplot(grid[1, :]), recordings)
         texture = next(iter(recordings.values())).scene.texture
         figure.suptitle(
-            f"Predicted skin velocity up to {short(HIGHEST, 'Hz')} on {len(recordings)} devices ({_name(texture)})",
+            f"Predicted skin velocity on {len(recordings)} devices ({_name(texture)})",
             x=0.01, ha="left", fontsize=12.5, fontweight="bold",
         )  # fmt: skip
     return figure
@@ -63,7 +62,7 @@ def _waveform(axes: Any, recording: Recording, device: str, colour: str) -> None
     axes.plot(milliseconds, 1e3 * achieved, color=colour, lw=2.0, label="achieved (from the envelopes)")
     axes.plot(milliseconds, 1e3 * target, color=INK, lw=1.0, ls=DASHED, label="target")
     axes.set(title=f"{device}, by {QUANTITIES.get(recording.header.unit, 'motion')}", xlabel="time (ms)")
-    beside = f"outside the bands {quantity(residual_velocity(recording), 'm/s')} rms"
+    beside = f"beside the bands {quantity(recording.summary()['residual_rms'], recording.header.unit)} rms"
     axes.text(0.98, 0.02, beside, transform=axes.transAxes, ha="right", va="bottom", fontsize=8)
     axes.set_ymargin(0.12)
     axes.set_xlim(0, milliseconds[-1])

@@ -140,7 +140,7 @@ def _together(envelope: Array) -> Array:
 
 
 def _close_up(axes: Any, recording: Recording) -> None:
-    """Draw a few periods of the reference and of the true waveform at the centre, late in the judged time."""
+    """Draw a few periods of the reference and of the true waveform at the centre, at the end of the judged time."""
     start, stop = _close_span(recording)
     time = np.arange(start, stop) / recording.rate
     phase = recording.bands.carrier_phase(time, recording.read("position", start, stop))
@@ -160,7 +160,7 @@ def _close_up(axes: Any, recording: Recording) -> None:
 
 
 def _close_span(recording: Recording) -> tuple[int, int]:
-    """First and last sample of a few periods in a late judged window, or at the end where nothing is judged."""
+    """First and last sample of a few periods near the end of the judged time, or at the end where nothing is judged."""
     envelopes, rate = recording.envelopes, recording.rate
     judged = np.flatnonzero(envelopes.judged.any(axis=1))
     if not judged.size:

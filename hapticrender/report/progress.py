@@ -12,14 +12,7 @@ _WIDTH = 30  # characters
 
 
 class Progress:
-    """Show how much of a list of scenes is done.
-
-    Parameters
-    ----------
-    durations : sequence of float
-        Duration of each scene (s, > 0), in order: a long scene takes a longer part of the bar.
-    stream : file, optional
-        Where to write; standard error by default.
+    """Show how much of a list of scenes of given durations (s, > 0) is done, by default on standard error.
 
     Examples
     --------
@@ -36,7 +29,7 @@ class Progress:
         self._stream = sys.stderr if stream is None else stream
         self._bar = self._stream.isatty()
         self._finished = 0
-        self._shown = ""
+        self._drawn = ""
 
     @contextmanager
     def scene(self, name: str) -> Iterator[Callable[[float, float], None]]:
@@ -60,9 +53,9 @@ class Progress:
         past, now = sum(self._durations[: self._finished]), self._durations[self._finished]
         share = (past + now * min(done / total, 1.0)) / sum(self._durations)
         bar = f"[{'#' * int(_WIDTH * share):.<{_WIDTH}}] {100 * share:3.0f} %  {name}"
-        if self._bar and bar != self._shown:
+        if self._bar and bar != self._drawn:
             self._write(f"\r{bar}\x1b[K")
-            self._shown = bar
+            self._drawn = bar
 
     def _write(self, text: str) -> None:
         self._stream.write(text)

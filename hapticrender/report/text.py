@@ -116,8 +116,7 @@ def figures(summary: Mapping[str, Any]) -> str:
         sizes = [quantity(band[key], unit) for key in ("target", "achieved")]
         settled = quantity(band["settling_time"], "s")
         rows.append([band_label(band), *sizes, *errors, degrees(band["phase_error"]), settled])
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    lines = ["  ".join(cell.rjust(width) for cell, width in zip(row, widths, strict=True)) for row in rows]
+    lines = [table(rows)]
     wobble, residual = (quantity(summary[key], unit) for key in ("wobble", "residual_rms"))
     saturated = percent(summary["saturated_share"])
     lines.append(f"rms errors {at(places)}; wobble {wobble}, beside the bands {residual}, saturated {saturated}")

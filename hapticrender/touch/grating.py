@@ -69,28 +69,22 @@ class Grating(Validated):
     amplitude : float, m
         Peak of a sine, height of a square or triangle; > 0 and <= 0.01 m.
         Stated as `velocity` or `level` instead, it is converted at once: a grating keeps metres only.
-    frequency : float, Hz, or None
-        Of the fundamental, > 0 and <= 1e6; exactly one of `frequency` and
-        `wavelength` is given.
-    wavelength : float, m, or None
-        Of the fundamental, >= 1e-6 and <= 0.5.
+    frequency, wavelength : float, Hz, m, or None
+        Of the fundamental, > 0 and <= 1e6, or >= 1e-6 and <= 0.5; exactly one is given.
     shape : {"sine", "square", "triangle"}
-        Square and triangle are made of their odd Fourier partials.
+        Square and triangle are made of `harmonics` odd Fourier partials.
     harmonics : int
-        Partials of a square or triangle, 1 to 4096.
+        1 to 4096.
     partials : sequence of (order, relative amplitude, phase in rad), or None
         Instead of a shape; also mappings with these keys.  Orders need not be whole.
     phase : float, rad
         Of the fundamental at t = 0, x = 0.
     velocity : float, m/s
-        Peak skin velocity V of a sine at the fundamental's frequency f, >= 1e-9
-        and <= 10: amplitude V/(2 pi f).
+        Peak skin velocity V of a sine at the fundamental's frequency f, >= 1e-9 and <= 10: amplitude V/(2 pi f).
     level : float, dB
-        Of a sine at the fundamental's frequency (1 to 1000 Hz) above the
-        classic detection threshold, >= -100 and <= 100.
+        Of a sine at f (1 to 1000 Hz) above the classic detection threshold, >= -100 and <= 100.
     speed : float, m/s
-        Of the finger at which `velocity` or `level` hold, >= 1e-6 and <= 10;
-        given with them for a grating in space (f = speed/wavelength), only then.
+        Of the finger at which `velocity` or `level` hold for a grating in space (f = speed/wavelength), only there.
 
     Examples
     --------

@@ -38,16 +38,9 @@ class FingerMechanics(Validated):
       ``Z_f = m_s s + Z_t Z_p/(Z_t + Z_p)``, ``Z_t = b_s + k_s/s``,
       ``Z_p = Z(phalanx_mass, phalanx_damping, phalanx_stiffness)``.
 
-    Parameters
-    ----------
-    order : {0, 2, 4}
-    mass, damping, stiffness : float, kg, N s/m, N/m
-        Of the part that is rigidly at the surface: the skin, or for order 2
-        the whole finger; >= 0.
-    phalanx_mass, phalanx_damping, phalanx_stiffness : float, kg, N s/m, N/m
-        For order 4 only; >= 0.
-    reference_load : float, N
-        Normal load at which these numbers hold, for scaling with W**(1/3).
+    `mass`, `damping` and `stiffness` (kg, N s/m, N/m, >= 0) are of the part that is rigidly at the surface: the skin,
+    or for order 2 the whole finger; those of the phalanx are for order 4 only.  They hold at `reference_load` (N), for
+    scaling with W**(1/3).
 
     Notes
     -----

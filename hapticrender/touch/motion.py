@@ -45,15 +45,6 @@ class Still(Validated):
 class TriangleMotion(Validated):
     """Constant speed, back and forth between two ends; starts at the centre, towards the positive end.
 
-    Parameters
-    ----------
-    speed : float, m/s
-        > 0 and <= 10.
-    span : float, m
-        Between the ends, >= 1e-4 and <= 1.
-    centre : float, m
-        Of the span, from the middle of the surface.
-
     Examples
     --------
     >>> TriangleMotion(speed=0.1, span=0.05).position(np.array([0.0, 0.25, 0.5, 0.75])).round(9).tolist()
@@ -63,8 +54,8 @@ class TriangleMotion(Validated):
     kind: ClassVar[str] = "sliding"
 
     speed: float = parameter(unit="m/s", above=0, most=MOST_SPEED)
-    span: float = parameter(0.05, "m", least=1e-4, most=FARTHEST)
-    centre: float = parameter(0.0, "m", least=-FARTHEST, most=FARTHEST)
+    span: float = parameter(0.05, "m", least=1e-4, most=FARTHEST)  # between the ends
+    centre: float = parameter(0.0, "m", least=-FARTHEST, most=FARTHEST)  # from the middle of the surface
 
     def position(self, time: Array) -> Array:
         """Position (m, shape (n,)): a triangle wave."""
@@ -75,26 +66,14 @@ class TriangleMotion(Validated):
 
 @dataclass(frozen=True)
 class SineMotion(Validated):
-    """Sinusoidal swipes, ``centre + stroke/2 sin(2 pi frequency t)``.
-
-    Parameters
-    ----------
-    frequency : float, Hz
-        Of whole back-and-forth swipes, >= 1e-3 and <= 100.
-    speed : float, m/s, or None
-        Peak speed, ``pi frequency stroke``; exactly one of `speed` and `stroke`.
-    stroke : float, m, or None
-        From end to end, > 0 and <= 1.
-    centre : float, m
-        From the middle of the surface.
-    """
+    """Sinusoidal swipes, ``centre + stroke/2 sin(2 pi frequency t)``."""
 
     kind: ClassVar[str] = "swiping"
 
-    frequency: float = parameter(unit="Hz", least=1e-3, most=100)
-    speed: float | None = parameter(None, "m/s", above=0, most=MOST_SPEED)
-    stroke: float | None = parameter(None, "m", above=0, most=FARTHEST)
-    centre: float = parameter(0.0, "m", least=-FARTHEST, most=FARTHEST)
+    frequency: float = parameter(unit="Hz", least=1e-3, most=100)  # of whole back-and-forth swipes
+    speed: float | None = parameter(None, "m/s", above=0, most=MOST_SPEED)  # peak, pi frequency stroke; or else
+    stroke: float | None = parameter(None, "m", above=0, most=FARTHEST)  # from end to end
+    centre: float = parameter(0.0, "m", least=-FARTHEST, most=FARTHEST)  # from the middle of the surface
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -111,15 +90,6 @@ class SineMotion(Validated):
 class Sampled(Validated):
     """Positions measured or made elsewhere, joined by straight lines and held at both ends.
 
-    Parameters
-    ----------
-    positions : sequence of float, m
-        From the middle of the surface.
-    rate : float, Hz, or None
-        Of the samples, the first at t = 0; exactly one of `rate` and `times`.
-    times : sequence of float, s, or None
-        Of each sample, rising, >= 0.
-
     Examples
     --------
     >>> Sampled(positions=[0.0, 0.01], times=[1.0, 2.0]).position(np.array([0.0, 1.5, 9.0])).tolist()
@@ -129,8 +99,8 @@ class Sampled(Validated):
     kind: ClassVar[str] = "sampled"
 
     positions: tuple[float, ...] = checked(checks.numbers, unit="m", least=-FARTHEST, most=FARTHEST)
-    rate: float | None = parameter(None, "Hz", least=1e-3, most=1e7)
-    times: tuple[float, ...] | None = None
+    rate: float | None = parameter(None, "Hz", least=1e-3, most=1e7)  # of the samples, the first at t = 0; or else
+    times: tuple[float, ...] | None = None  # s, of each sample, rising, >= 0
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -151,20 +121,12 @@ class Sampled(Validated):
 
 @dataclass(frozen=True)
 class RecordedMotion(Validated):
-    """A finger recorded by a tribometer: unwrapped encoder, NaN while lifted, with its normal load.
-
-    Parameters
-    ----------
-    file : str or Path
-        ``.npz`` as for `Swipe`.
-    start : float, s
-        Where in the recording t = 0 lies, >= 0.
-    """
+    """A finger recorded by a tribometer: unwrapped encoder, NaN while lifted, with its normal load."""
 
     kind: ClassVar[str] = "recorded"
 
-    file: str = checked(checks.file_name)
-    start: float = parameter(0.0, "s", most=LONGEST_TIME)
+    file: str = checked(checks.file_name)  # .npz as for `Swipe`
+    start: float = parameter(0.0, "s", most=LONGEST_TIME)  # where in the recording t = 0 lies
 
     @property
     def recording(self) -> SwipeRecording:

@@ -29,23 +29,12 @@ REALISTIC_FORCE = 0.05  # N: lateral force of a texture up to which motion above
 
 
 def detection_threshold(frequency: float | Array, curve: str = "safe") -> Array:
-    """Detection threshold of a sinusoid.
+    """Detection threshold (m peak) of a sinusoid at `frequency` (Hz, >= 0, scalar or array).
 
-    Parameters
-    ----------
-    frequency : float or ndarray, Hz
-        Finite and >= 0.
-    curve : {"safe", "classic"}
-        "classic" is the published one for a large contactor, log-log between its table's entries, for levels.
-        "safe" is what may be left out: 6 dB below it under 40 Hz, 10 dB from 40 Hz on, 25 dB from 80 Hz on (at a
-        border the lower value), since active touch of a flat plate is that much more sensitive.
-
-    Returns
-    -------
-    float or ndarray, m peak
-        Beyond 1 to 1000 Hz the classic threshold is unknown: NaN.  The safe one is
-        0 below 1 Hz (nothing can be left out); above 1 kHz it stays as it is
-        at 1 kHz, but never above the motion that `REALISTIC_FORCE` makes.
+    `curve` "classic" is the published one for a large contactor, log-log between its table's entries, for levels; NaN
+    beyond 1 to 1000 Hz.  "safe" is what may be left out: 6 dB below it under 40 Hz, 10 dB from 40 Hz on, 25 dB from
+    80 Hz on (at a border the lower value), since active touch of a flat plate is that much more sensitive; 0 below
+    1 Hz, and above 1 kHz as there, but never above the motion that `REALISTIC_FORCE` makes.
 
     References
     ----------
@@ -95,25 +84,11 @@ def from_velocity(velocity: float | Array, frequency: float | Array) -> Array:
 
 
 def roughness(displacement: float | Array, frequency: float | Array) -> float:
-    """Roughness of a fine texture: its power as the Pacinian channel weighs it.
+    """Roughness of a fine texture of partials at `frequency` (Hz, >= 0): its power as the Pacinian channel weighs it.
 
-    Parameters
-    ----------
-    displacement : float or ndarray, m peak
-        Of every partial; may be complex.
-    frequency : float or ndarray, Hz
-        Of every partial, >= 0.
-
-    Returns
-    -------
-    float
-        ``sum |X(f)|^2/T_P(f)^2`` with the threshold T_P of the Pacinian
-        channel: the classic one from 40 Hz on, rising by 12 dB an octave below.
-        Partials above 1 kHz, where T_P is unknown, add nothing.
-
-    References
-    ----------
-    Bensmaia, Hollins: The vibrations of texture, Somatosens. Mot. Res. 20, 2003.
+    ``sum |X(f)|^2/T_P(f)^2`` of the `displacement` X (m peak, may be complex) with the threshold T_P of that channel:
+    the classic one from 40 Hz on, rising by 12 dB an octave below.  Partials above 1 kHz add nothing [Bensmaia,
+    Hollins: The vibrations of texture, Somatosens. Mot. Res. 20, 2003].
     """
     hertz = _frequency(frequency)
     threshold = detection_threshold(np.clip(hertz, PACINIAN_FROM, HIGHEST), "classic")

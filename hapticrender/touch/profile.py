@@ -88,21 +88,11 @@ def strongest_carriers(
     rate : float, Hz
         Of its samples, > 0.
     count : int
-        Most carriers, >= 1.
+        Most carriers, >= 1; peaks below 1e-4 of the strongest one's power are left out.
     spacing : float, Hz
         Least distance of two carriers, > 0.  Below 40 Hz the bandwidth falls in proportion to it.
     passband : (float, float), Hz
         Where to look for them, 0 <= low < high.
-
-    Returns
-    -------
-    ndarray, shape (k,), k <= count, Hz
-        Rising.  Peaks below 1e-4 of the strongest one's power are left out.
-
-    Raises
-    ------
-    ValueError
-        The signal is no row of finite numbers, or a number is out of its bound.
 
     Examples
     --------

@@ -140,11 +140,9 @@ class Recorded(_Playback):
     ----------
     file : str or Path
         Whatever soundfile reads: WAV, FLAC, W64, ...; at most 2**24 frames.
-    amplitude : float, m, or None
-        Target peak; > 0 and <= 0.01.  Exactly one of `amplitude` and `gain`.
-    gain : float, m per full scale of the file, or None
-        > 0; the peak that it makes must be <= 0.01 m.  The gain that plays a recording exactly often feels too weak:
-        about 3 times as much suits fine textures, 5 times coarse ones.
+    amplitude, gain : float, m, or m per full scale of the file
+        Target peak, or scale; exactly one, > 0; the peak must be <= 0.01 m.  The gain that plays a recording exactly
+        often feels too weak: about 3 times as much suits fine textures, 5 times coarse ones.
     channel : int
         Counted from 0.
     speed : float, m/s, or None
@@ -152,10 +150,8 @@ class Recorded(_Playback):
         its middle at the middle of the surface.  None: played in time.
     carriers : int
         How many of the strongest peaks of its spectrum are followed, 1 to 512.
-    spacing : float, Hz
-        Least distance of the carriers (at the recorded speed).
-    passband : (float, float), Hz
-        What is played of it (at the recorded speed).
+    spacing, passband : float, (float, float), Hz
+        Least distance of the carriers, and what is played, at the recorded speed.
 
     Examples
     --------
@@ -236,16 +232,8 @@ class Swipe(_Playback):
 
     Only samples in contact, sliding in the main direction, averaged in cells of 10 micrometres.
 
-    Parameters
-    ----------
-    file : str or Path
-        ``.npz`` with encoder, metre_per_count, lateral_force, normal_force, rate.
-    amplitude : float, m, or None
-        Target peak; > 0 and <= 0.01.  Exactly one of `amplitude` and `gain`.
-    gain : float, m/N, or None
-        > 0; the peak that it makes must be <= 0.01 m.
-    carriers, spacing, passband
-        As for `Recorded`, in Hz at the recorded speed.
+    `file` is an ``.npz`` with encoder, metre_per_count, lateral_force, normal_force and rate; `gain` is in m/N; all
+    else is as for `Recorded`, in Hz at the recorded speed.
     """
 
     kind: ClassVar[str] = "swipe"
@@ -282,8 +270,7 @@ class Synthetic(Validated):
     amplitude : float, m
         Bound of the sum of all components, never exceeded; > 0 and <= 0.01.
     speed : float, m/s, or None
-        At which the components lie at 30 to 400 Hz, for a texture over
-        position; None for one over time.
+        At which the components lie at 30 to 400 Hz; None: over time.
     components : int
         1 to 8, at least 40 Hz apart.
     seed : int

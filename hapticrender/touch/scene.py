@@ -86,10 +86,9 @@ class Scene(Validated):
         Default: none; a texture that is read at the finger's position needs one.
     device : str
         Kind of device: name of a renderer.
-    profile : mapping of str to number, str or bool
-        Parameters of the device for which the controller is designed, where they differ from the kind's defaults.
-    simulation : mapping of str to number, str or bool
-        Parameters of the simulated device that differ from the profile, and how finely it is modelled.
+    profile, simulation : mapping of str to number, str or bool
+        Parameters of the device for which the controller is designed, where they differ from the kind's defaults; of
+        the simulated device, where they differ from the profile, and how finely it is modelled.
     rendering : mapping of str to number, str or bool
         Settings of the renderer, such as ``velocity_per_force`` or ``crossover``.
     duration : float, s
@@ -97,18 +96,15 @@ class Scene(Validated):
     method : str
         Name of the control method.
     tolerance : float
-        Relative amplitude error to be judged by, > 0 and <= 10.  Default 0.1:
-        errors up to 10 % lie under every just noticeable difference (2.2 dB of amplitude, Israr et al. 2006).
+        Relative amplitude error to be judged by, > 0 and <= 10.  The default of 0.1 lies under every just noticeable
+        difference (2.2 dB of amplitude, Israr et al. 2006).
     settle : float, s
-        Left out of the judgement at the beginning, >= 0; of a scene shorter
-        than twice this the last half is judged.
+        Left out of the judgement at the beginning, >= 0; of a scene shorter than twice this the last half is judged.
     keep_unfelt : bool
-        Whether bands below the safe detection threshold are rendered all the
-        same; default: they are left out.
+        Whether bands below the safe detection threshold are rendered all the same; default: they are left out.
     gradient : float, 1/m
-        The target amplitude grows by this share of itself per metre along the surface, from its middle on; -1000 to
-        1000.  Only a plate with two coils can do so.  What noise leaves does not shrink with it: near a mode of the
-        plate it is tenths of a micrometre at a weak end as well.
+        Growth of the target amplitude along the surface, as a share of itself, from its middle on; -1000 to 1000.
+        Only on a plate with two coils.
     seed : int
         Of the simulated sensor noise, >= 0.
     name : str
@@ -277,7 +273,9 @@ def _read_kind(table: Any, key: str, choice: str, kinds: dict[str, type[Any]], f
         kind = kinds[checks.choice(choice, table.get(choice), kinds)]
         entries = fields(kind)
         _only_known(table, [choice, *(entry.name for entry in entries), *extra])
-        values = {entry.name: None for entry in entries if entry.default is entry.default_factory is MISSING}
+        values: dict[str, Any] = {
+            entry.name: None for entry in entries if entry.default is entry.default_factory is MISSING
+        }
         values |= {entry.name: table[entry.name] for entry in entries if entry.name in table}
         if isinstance(values.get("file"), str) and values["file"].isprintable():
             values["file"] = str(folder / values["file"]) if values["file"] else ""

@@ -31,36 +31,19 @@ LEAST_SPEED = 1e-3  # m/s
 
 @dataclass(frozen=True, eq=False)
 class SwipeRecording:
-    """A finger's motion and forces, in SI, offsets removed.
+    """A finger's motion and forces over n samples, offsets removed.
 
-    Parameters
-    ----------
-    rate : float, Hz
-    position : ndarray, shape (n,), m
-        Unwrapped, with 0 in the middle of what was travelled in contact.
-    normal_load : ndarray, shape (n,), N
-        Above the unloaded level, smoothed over 20 ms, 0 while lifted.
-    lateral_force : ndarray, shape (n,), N
-        As measured, above its unloaded level.
-    touching : ndarray of bool, shape (n,)
-    sliding : ndarray of bool, shape (n,)
-        Touching, moving in the main direction at more than half the main speed, and rubbing.
-    speed : float, m/s
-        Median speed while sliding; 0 where the finger never slides.
-
-    Notes
-    -----
     Contact is read from the normal force: more than 0.2 N away from the median of the first 0.5 s (up or down), until
     less than 0.1 N.  A carriage that homes moves but does not touch; a finger that rests touches but does not slide.
     """
 
-    rate: float
-    position: Array
-    normal_load: Array
-    lateral_force: Array
-    touching: Array
-    sliding: Array
-    speed: float
+    rate: float  # Hz
+    position: Array  # m: unwrapped, with 0 in the middle of the travel in contact
+    normal_load: Array  # N above the unloaded level, smoothed over 20 ms, 0 while lifted
+    lateral_force: Array  # N above its unloaded level
+    touching: Array  # bool
+    sliding: Array  # bool: touching, and faster than half the main speed in the main direction, with friction
+    speed: float  # m/s: median while sliding; 0 where the finger never slides
 
     @property
     def duration(self) -> float:
@@ -177,10 +160,9 @@ def _row(raw: dict[str, Array], key: str, kinds: str, bound: str) -> Array:
 
 def _smooth(values: Array, rate: float) -> Array:
     """Mean over `SMOOTHING` seconds around each sample, the ends held."""
-    half = max(round(SMOOTHING * rate / 2), 1)
-    total = np.cumsum(np.concatenate([[0.0], np.pad(values, half, mode="edge")]))
-    width = 2 * half + 1
-    return (total[width:] - total[:-width]) / width
+    from scipy.ndimage import uniform_filter1d
+
+    return uniform_filter1d(values, 2 * max(round(SMOOTHING * rate / 2), 1) + 1, mode="nearest")
 
 
 def _load(normal_force: Array, rate: float) -> Array:
