@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -234,7 +234,7 @@ def _checked(arrays: tuple[tuple[tuple[int, ...], bytes], ...], gains: BankGains
         """Smallest of every margin at a level over all speeds of the finger."""
         key = gains.at(level)
         if key not in known:
-            options = {"wavenumber": wavenumber, "taps": taps, "plant": plant}
+            options: dict[str, Any] = {"wavenumber": wavenumber, "taps": taps, "plant": plant}
             loops = [error_loop(model, frequency, gains, level, speed=speed, **options) for speed in speeds]
             known[key] = Margins.smallest([loop.margins() for loop in loops])
         return known[key]
