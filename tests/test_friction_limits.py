@@ -65,42 +65,6 @@ def test_a_finger_without_load_counts_as_lifted(device):
     assert abs(line) == pytest.approx(10e-3 / 0.64, rel=0.01)
 
 
-def test_a_device_in_blocks_knows_of_fingers_that_leave():
-    """The bank steps through the blocks: while the finger is away nothing is driven, as sample by sample."""
-    block = 64
-    from hapticrender.loop import prepare
-
-    lifted = hr.Finger.sliding(speed=0.05, normal_load=0.4, mechanics="light", touches=[(0.0, 1.0), (1.6, 2.4)])
-    wanted = scene("electroadhesion", finger=lifted, duration=2.4)
-    screen = prepare(wanted).plant
-
-    class Blocks:
-        rate, drive_channels, sensed_channels = screen.rate, 1, 1
-
-        def __init__(self):
-            self.block = self.delay = block
-
-        def __enter__(self):
-            return self
-
-        def __exit__(self, *exc):
-            pass
-
-        def play(self, drive):
-            from hapticrender.renderers.electroadhesion import ElectroadhesionRenderer
-
-            shape = ElectroadhesionRenderer().read(wanted, None).compensation
-            undone = shape.gain * np.asarray(drive) ** 2 - shape.bias  # the simulated screen takes its own root
-            return screen.run(undone)
-
-    recording = hr.render(wanted, driver=Blocks())
-    away = (recording.time > 1.2) & (recording.time < 1.55)
-    assert abs(recording.drive[away]).max() < 1e-3 * abs(recording.drive).max()
-    back = recording.motion[recording.time >= 2.0, 0]
-    line = 2 * np.mean(back * np.exp(-2j * np.pi * 100.0 * np.arange(len(back)) / recording.rate))
-    assert abs(line) == pytest.approx(10e-3 / 0.64, rel=0.05)
-
-
 @pytest.mark.parametrize("device", ["electroadhesion", "ultrasonic"])
 def test_a_skin_faster_than_the_finger_is_refused(device):
     """10.1 mm/s of skin velocity under a finger of 10 mm/s, against 10 mm/s."""

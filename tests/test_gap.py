@@ -81,17 +81,6 @@ def test_a_short_that_is_not_perfect_costs_area():
     assert 1.05 < share / area < 1.25
 
 
-def test_noise_is_what_the_low_pass_lets_through():
-    """Of |I|^2: 2 sqrt(2/20) sigma/I, times the low pass's share of white noise.
-
-    4000 samples hold some 1200 that are independent: three standard deviations of the spread are 6 %.
-    """
-    found = np.std(sensed(gap_resistance=DRY)[0])
-    response = abs(ElectroadhesionParameters().estimator_filter.frequency_response(np.arange(RATE // 2))) ** 2
-    expected = 2 * np.sqrt(2 / 20) * 20e-6 / CURRENT * np.sqrt(response.mean())
-    assert found == pytest.approx(expected, rel=0.06)
-
-
 def test_a_driver_reads_it_block_by_block():
     """With a state, blocks continue each other; junk counts as zero and has decayed by exp(-40) after 0.2 s."""
     p = clean()

@@ -161,37 +161,6 @@ def test_wobble_with_sensor_noise_is_that_of_the_facts():
     assert max(wobble) < 0.050e-6
 
 
-def moving(bands, position, seconds=4.0, touches=None):
-    time = np.arange(round(seconds * RATE) + 1) / RATE
-    finger = hr.Finger.sampled(position(time), rate=RATE, normal_load=0.0, touches=touches, mechanics="none")
-    return close(bands, seconds, overrides=IDEAL, finger=finger)
-
-
-def locked(wavelength, wanted):
-    return Bands(
-        frequency=np.zeros(1),
-        wavenumber=np.array([1 / wavelength]),
-        phase=np.zeros(1),
-        envelope=np.array([wanted + 0j]),
-    )
-
-
-def test_a_grating_under_a_steady_finger_is_the_tone_of_its_passing():
-    """10 mm/s over 0.2 mm is 50 Hz: after contact has faded in, the same loop as a 50 Hz carrier."""
-    _, spatial, _ = moving(locked(2e-4, 1e-5), lambda t: 0.01 * t)
-    _, temporal, _ = close(tones((50.0, 1e-5)), 4.0, overrides=IDEAL)
-    np.testing.assert_allclose(amplitude(spatial.motion, 50.0, 1.0), amplitude(temporal.motion, 50.0, 1.0), rtol=2e-4)
-
-
-def test_a_resting_or_lifted_finger_lets_the_grating_fade():
-    """Position decides: at 0 Hz there is nothing to feel, and the drive goes to rest."""
-    drive, _, _ = moving(locked(2e-4, 1e-5), lambda t: 0.01 * np.minimum(t, 1.0), seconds=6.0)
-    assert abs(drive[4000:5000]).max() > 0.02
-    assert abs(drive[-1000:]).max() < 1e-4
-    drive, _, _ = moving(locked(2e-4, 1e-5), lambda t: 0.01 * t, seconds=6.0, touches=((0.0, 1.0),))
-    assert abs(drive[-1000:]).max() < 1e-4
-
-
 def test_without_sensors_it_drives_open_loop_from_the_table():
     """Free plate, so the table is right: the error left is the table's 0.5 Hz grid, on which 47 and 400 Hz lie."""
     parameters = PlateParameters(**IDEAL)

@@ -85,14 +85,6 @@ def friction_errors(recording):
     return np.array([[band["error_friction"], band["rms_error_friction"]] for band in recording.summary()["bands"]])
 
 
-@pytest.mark.parametrize(("level", "frequency"), [("carrier", 20.0), ("envelope", 400.0)])
-def test_tones_are_right_within_a_per_cent(level, frequency):
-    recording = hr.render(scene(frequency=frequency, level=level))
-    assert abs(friction_errors(recording)).max() < PER_CENT
-    assert not (recording.flags & ~Flag.UNLOCKED).any()
-    assert not (recording.flags[100:] & Flag.UNLOCKED).any()
-
-
 @pytest.mark.parametrize(("law", "sensor"), [("load-sharing", "amplitude"), ("intermittent", "tribometer")])
 def test_other_laws_and_the_other_sensor(law, sensor):
     assert abs(friction_errors(hr.render(scene(law=law, sensor=sensor)))).max() < PER_CENT
