@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import inspect
 import math
 import os
+import re
 import reprlib
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
@@ -197,23 +199,48 @@ def checked(check: Callable[..., Any], default: Any = MISSING, **bounds: Any) ->
 def parameter(
     default: Any = MISSING,
     unit: str = "",
+    about: str = "",
     *,
     above: float | None = None,
     least: float = 0.0,
     most: float | None = None,
 ) -> Any:
-    """Field of a `Validated` class: a number (integer where annotated so) > `above` or >= `least`, <= `most`."""
+    """Field of a `Validated` class: a number (integer where annotated so) > `above` or >= `least`, <= `most`.
+
+    `about` is its line in the docstring of the class.
+    """
     low = {"least": least} if above is None else {"above": above}
-    return checked(number, default, unit=unit, most=most, **low)
+    made = checked(number, default, unit=unit, most=most, **low)
+    described = {"about": f"{about}; {_bound('', '', above, least, most)}", "unit": unit} if about else {}
+    return field(default=default, metadata={**made.metadata, **described})
 
 
-def option(default: str, *known: str) -> Any:
-    """Field of a `Validated` class: one of the words in `known`."""
-    return checked(choice, default, options=known)
+def option(default: str, *known: str, about: str = "") -> Any:
+    """Field of a `Validated` class: one of the words in `known`; `about` is its line in the docstring of the class."""
+    made = checked(choice, default, options=known)
+    described = {"about": f"{about}: {' or '.join(known)}"} if about else {}
+    return field(default=default, metadata={**made.metadata, **described})
 
 
 class Validated:
-    """Base of dataclasses with fields made by `checked`, `parameter` and `option`, and checked when one is made."""
+    """Base of dataclasses with fields made by `checked`, `parameter` and `option`, and checked when one is made.
+
+    Where a docstring has no section Parameters and every field says what it is about, the fields that no base class has
+    make that section.
+    """
+
+    def __init_subclass__(cls) -> None:
+        above = {name for base in cls.__mro__[1:] for name in vars(base).get("__annotations__", ())}
+        own = [name for name in vars(cls).get("__annotations__", ()) if name not in above]
+        about = {name: getattr(vars(cls).get(name), "metadata", {}) for name in own}
+        text = inspect.cleandoc(cls.__doc__ or "")
+        if about and "Parameters\n---" not in text and all("about" in each for each in about.values()):
+            heads = (f"{name} : {cls.__annotations__[name]}, {each.get('unit', '')}" for name, each in about.items())
+            rows = [
+                f"{head.rstrip(', ')}\n    {each['about']}." for head, each in zip(heads, about.values(), strict=True)
+            ]
+            summary, *rest = re.split(r"\n\n(?=\w+\n-{3,}\n)", text, maxsplit=1)
+            cls.__doc__ = "\n\n".join([summary, "\n".join(["Parameters", "-" * 10, *rows]), *rest])
 
     def __post_init__(self) -> None:
         for each in fields(self):  # type: ignore[arg-type]

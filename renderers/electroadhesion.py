@@ -78,7 +78,7 @@ class ScreenSetup(FrictionSetup):
         assumed, mu = self.assumed, self.assumed.friction_coefficient
         model = self.contact(driver, mu)
         if driver.sensed_channels and assumed.sensor == "impedance":  # attraction, behind the estimator's low pass
-            lag = assumed.estimator.delay
+            lag = assumed.estimator_filter.delay
             return replace(
                 model,
                 mass=lag**2 / 2 / mu * model.force_from_drive,

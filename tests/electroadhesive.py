@@ -31,7 +31,7 @@ class Screen(SimulatedDriver):
 
     def _play(self, drive):
         played = super()._play(drive)
-        self.attraction.append(self.plant.attraction)
+        self.attraction.append(self.plant.motion[:, 1])
         return played if self.sensed_channels else played._replace(sensed=np.zeros((len(drive), 0)))
 
 

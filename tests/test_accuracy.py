@@ -1,4 +1,4 @@
-"""The accuracy suite is met by the default method, its table tells, and gratings hold under a real finger."""
+"""The accuracy suite is met by the default method, its figures can miss their bounds, and gratings hold."""
 
 import json
 
@@ -7,18 +7,22 @@ import pytest
 
 import hapticrender as hr
 from hapticrender import defaults
-from hapticrender.accuracy import figures as accuracy_figures
-from hapticrender.accuracy import plate as accuracy
-from hapticrender.accuracy import suite as accuracy_suite
-from hapticrender.drivers.simulated import SimulatedDriver
-from hapticrender.plants.identify import compare, identify
-from hapticrender.plants.plate import Plate, PlateParameters
+from hapticrender.accuracy import friction, plate
+from hapticrender.accuracy.figures import TARGETS, as_rows, write_json
+from hapticrender.accuracy.suite import CASES, METHOD_FREE, run_suite
+from hapticrender.plants.plate import PlateParameters
+from hapticrender.protocols import Flag
 from hapticrender.touch.mechanics import FingerMechanics
 
 RANGES = ((1e-4, 5e-4), (0.5, 12.0), (400.0, 12e3), (1e-3, 10e-3), (0.3, 4.0), (60.0, 900.0))  # skin, then phalanx
-
-QUICK = ("slide", "touch", "chirp", "comb", "overload")
-LONG = tuple(case for case in accuracy.CASES if case not in QUICK)
+LONG = {"free", "touch", "press", "wobble", "wrong", "late", "identified", "every device: velocity"}
+LONG |= {
+    "electroadhesion: tones",
+    "electroadhesion: comb",
+    "ultrasonic: tones",
+    "ultrasonic: comb",
+    "ultrasonic: swipe",
+}
 
 
 def missed(figures):
@@ -26,53 +30,54 @@ def missed(figures):
 
 
 def test_every_case_has_its_targets_and_every_target_its_case():
-    assert {target.case for target in accuracy.TARGETS} == set(accuracy.CASES)
-    assert all(target.aim <= target.bound for target in accuracy.TARGETS)
+    assert {target.case for target in TARGETS} == set(CASES)
+    assert all(target.aim <= target.bound for target in TARGETS)
+    assert set(CASES) > METHOD_FREE
+    assert set(CASES) > LONG
 
 
-def test_the_default_method_meets_every_bound_in_motion():
-    assert not missed(accuracy_suite.run_suite([defaults.METHOD], QUICK))
-
-
-def comb_error(delay, start, stop):
-    """Error of 20 bands under the sliding heavy finger, which comes at 1 s, over the comb: dB, at the centre."""
-    bench = accuracy.Bench(method=defaults.METHOD, plate=PlateParameters(delay=delay))
-    frequency = np.arange(20.0, 401.0, 20.0)
-    bands = accuracy.tones(frequency, 10e-6, np.random.default_rng(1).uniform(0, 2 * np.pi, frequency.size))
-    time, found = bench.play(bands, stop + 0.1, accuracy.SLIDING).envelopes(0.1, 0.05)
-    error = found[(time > start) & (time < stop), 0] - bands.envelope
-    return 20 * np.log10(accuracy.rms(error.ravel()) / 10e-6)
-
-
-@pytest.mark.parametrize(
-    ("delay", "start", "stop", "bound"), [(1, 1.55, 9.0, -50.0), (1, 1.05, 1.55, -24.0), (100, 1.55, 9.0, -40.0)]
-)
-def test_a_comb_under_a_finger_that_is_learnt(delay, start, stop, bound):
-    """H2 has -51 dB, and -24 dB in the first 0.5 s of touch; 1 % of it at a known delay of 20 ms."""
-    assert comb_error(delay, start, stop) <= bound
+def test_the_default_method_meets_the_bounds():
+    assert not missed(run_suite([defaults.METHOD], sorted(set(CASES) - LONG)))
 
 
 @pytest.mark.slow
-def test_the_default_method_meets_every_bound_at_rest():
-    assert not missed(accuracy_suite.run_suite([defaults.METHOD], LONG))
+def test_the_default_method_meets_every_other_bound():
+    """But for identification, which test_identify holds to the same bounds."""
+    assert not missed(run_suite([defaults.METHOD], sorted(LONG - {"identified"})))
+
+
+def test_a_comb_under_a_finger_that_is_adapted_to():
+    """H2 has -24 dB in the first 0.5 s of touch (-51 dB after it: the suite's comb)."""
+    frequency = np.arange(20.0, 401.0, 20.0)
+    bands = plate.tones(frequency, 10e-6, np.random.default_rng(1).uniform(0, 2 * np.pi, frequency.size))
+    time, found = plate.Bench(method=defaults.METHOD).play(bands, 1.65, plate.SLIDING).envelopes(0.1, 0.05)
+    error = found[(time > 1.05) & (time < 1.55), 0] - bands.envelope
+    assert 20 * np.log10(plate.rms(error.ravel()) / 10e-6) <= -24.0
 
 
 def test_the_papers_method_misses_and_the_report_says_so(tmp_path):
-    figures = accuracy_suite.run_suite(["paper"], ["chirp"])
+    figures = run_suite(["paper"], ["chirp"])
     assert len(missed(figures)) == 4
-    accuracy_figures.write_json(tmp_path / "a.json", figures)
+    write_json(tmp_path / "a.json", figures)
     report = json.loads((tmp_path / "a.json").read_text(encoding="utf-8"))
     assert [row["passed"] for row in report["figures"]] == [False] * 4
-    assert "MISSED" in accuracy_figures.as_rows(figures, ["paper"])[1][-1]
+    assert "MISSED" in as_rows(figures, ["paper"])[1][-1]
 
 
-@pytest.mark.parametrize("wavelength", [0.5e-3, 1e-3, 2e-3])
-@pytest.mark.parametrize("mechanics", ["light", "heavy"])
+def test_what_does_not_depend_on_the_method_is_run_once_and_a_refused_case_is_missed():
+    """A polar method has no targets that grow with the finger's speed."""
+    lines = []
+    figures = run_suite(["h2", "h"], ["ultrasonic: modulation"], progress=lines.append)
+    assert lines == ["ultrasonic: modulation"]
+    assert figures[0].value == figures[1].value
+    assert [each.value for each in run_suite(["paper"], ["ultrasonic: swipe"])] == [np.inf, np.inf]
+
+
+@pytest.mark.parametrize(("wavelength", "mechanics"), [(0.5e-3, "heavy"), (1e-3, "light"), (2e-3, "heavy")])
 def test_swipes_through_zero_speed_hold_where_they_are_judged(wavelength, mechanics):
     """3 Hz, +-50 mm/s: sweeps of 470 to 1900 Hz/s between 0 Hz and 25 to 100 Hz; judged above 20 Hz, within 10 %.
 
-    At 2 mm the carrier never passes 25 Hz and is there for 40 ms at a time: it has no window to be judged in.  That
-    the drive has no step is tested without noise in test_limits.
+    At 2 mm the carrier never passes 25 Hz and is there for 40 ms at a time: it has no window to be judged in.
     """
     scene = hr.Scene(
         texture=hr.Grating(wavelength=wavelength, amplitude=10e-6),
@@ -95,25 +100,45 @@ def test_a_grating_holds_under_the_recorded_finger(shared_data):
     assert ours["worst"]["value"] < 0.5 * paper["worst"]["value"]
 
 
-def test_an_unknown_delay_is_detected_and_named():
-    """A device that is one sample later than its driver says: found within 0.01 sample, named in a warning."""
-    believed, late = PlateParameters(), PlateParameters(delay=2)
-    driver = SimulatedDriver(Plate(late, hr.Finger.absent()))
-    driver.delay = 1  # what a driver says that does not know
-    with driver:
-        found = identify(driver, believed)
-    assert found.estimates["delay"].value == pytest.approx(2.0, abs=0.01)
-    with pytest.warns(hr.PlateMismatch, match=r"delay \+1\.00\d\d \+- 0\.00\d\d samples"):
-        compare(found, believed)
-    assert compare(found, late) == ()
-    assert "driver.delay = 1 samples: measured 2.00, set it to 2" in found.text()
-
-
-def test_no_limit_cycle_under_fingers_that_nobody_designed_for(rng):
-    """24 random fingers come to rest, and peak below its worst of 32 %."""
-    log = [rng.uniform(np.log(low), np.log(high), 24) for low, high in RANGES]
+def test_no_limit_cycle_under_random_fingers(rng):
+    """12 of 24 random fingers come to rest, and peak below the worst of them, 32 %."""
+    log = [rng.uniform(np.log(low), np.log(high), 24)[:12] for low, high in RANGES]
     names = ("mass", "damping", "stiffness", "phalanx_mass", "phalanx_damping", "phalanx_stiffness")
     fingers = [(FingerMechanics(order=4, **dict(zip(names, row, strict=True))), 0.8) for row in np.exp(log).T]
-    found = accuracy.touch(accuracy.Bench(method=defaults.METHOD), fingers, (15e-3,))
+    found = plate.touch(plate.Bench(method=defaults.METHOD, plate=PlateParameters()), fingers, (15e-3,))
     assert found["left"] < 0.05
     assert found["peak"] < 0.32
+
+
+def test_without_the_square_root_the_second_harmonic_is_that_of_a_square():
+    """(1 + s sin)^2 has s/4 of its first harmonic in the second, s = 0.95/headroom; feedback adds below a tenth."""
+    naive = friction.harmonic(defaults.METHOD, square_root="off")["second"]
+    assert naive == pytest.approx((1.0 - 0.05) / 2.0 / 4.0, rel=0.1)
+
+
+@pytest.mark.parametrize("limit", [0.8, 1.4])
+def test_an_amplitude_beyond_the_drive_misses(limit):
+    """Less than the 1.6 V that 1 um needs under 0.4 N leave what they drive at resonance, to the suite's bound of 2 %.
+
+    N U sinc(f/rate)/|D(j 2 pi f)| with the drive held over samples; a lock off by d takes (d/pole)^2/2 of it.  The
+    inner loop, which is open while the limiter acts, opens and closes at the edge: that costs what is missing.
+    """
+    surface = friction.surface(0.4, drive_limit=limit, sensor_noise=0.0)
+    sensed = friction.driven(surface, np.full(int(surface.rate / 2), 1e-6), 0.4)
+    mode = surface.parameters.carrier_mode
+    resonance = float(mode.resonance(0.4))
+    force = mode.force_constant * mode.drive_limit * np.sinc(resonance / mode.rate)
+    most = force / abs(complex(mode.dynamic_stiffness(resonance, 0.4)))
+    off = (mode.carrier + surface.loop.state["shift"][0] - resonance) / float(mode.pole(0.4))
+    reached, rounding = surface.amplitude[-100:].mean(), mode.drive_step / mode.drive_limit + off**2 / 2
+    assert 0.98 * most < reached < (1 + rounding) * most
+    assert most < 0.98e-6  # beyond the bound of 2 %
+    assert (sensed.flags[-100:] & Flag.SATURATED).all()
+
+
+def test_an_early_overload_does_not_last():
+    """2 V, 1.65 V needed.  If the law took what the limiter cuts as a slope, a quarter of the amplitude was missing."""
+    surface = friction.surface(0.4, drive_limit=2.0, sensor_noise=0.0)
+    sensed = friction.driven(surface, np.full(int(surface.rate / 2), 1e-6), 0.4)
+    assert surface.amplitude[-100:].mean() == pytest.approx(1e-6, rel=0.02)  # the bound of the suite
+    assert not (sensed.flags[-100:] & Flag.SATURATED).any()

@@ -1,13 +1,11 @@
 """Plates other than the paper's: one coil, amplitudes that grow along the plate, and numbers that were identified."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from tables import tables
 
 import hapticrender as hr
-from hapticrender.plants.plate import Plate, PlateParameters
+from hapticrender.plants.plate import PlateParameters
 
 SLIDE = hr.Finger.sliding(speed=0.08, normal_load=0.4, mechanics="light")
 A = 50e-6  # m: that of the accuracy suite, 50 times the noise of a sensor
@@ -29,8 +27,7 @@ def amplitudes(recording, frequency):
 CENTRE, ENDS = 0.004, 0.015  # of A, rms: what the accuracy suite asks of a slide
 
 
-@pytest.mark.parametrize("gradient", [-12.0, 5.0])
-@pytest.mark.parametrize("frequency", [40.0, 111.0, 150.0])
+@pytest.mark.parametrize(("frequency", "gradient"), [(40.0, 5.0), (150.0, -12.0)])
 def test_an_amplitude_grows_along_the_plate(frequency, gradient):
     """1 + gradient x at the middle and at the ends, 55 mm away, near the rocking mode of 147 Hz as well.
 
@@ -45,18 +42,12 @@ def test_an_amplitude_grows_along_the_plate(frequency, gradient):
     assert recording.header.profile == pytest.approx((wanted / A).tolist())
 
 
-def test_without_a_gradient_the_ends_are_like_the_middle():
-    """The naive side: a uniform plate misses such a target by the gradient times the reach."""
-    found = amplitudes(rendered(40.0), 40.0)
-    assert found[2] / (A * (1.0 + 5.0 * 55e-3)) - 1.0 == pytest.approx(1 / 1.275 - 1.0, abs=ENDS)
-
-
-@pytest.mark.parametrize("frequency", [40.0, 143.0])
-def test_one_coil_holds_the_middle_and_leaves_the_ends_to_the_finger(frequency):
+def test_one_coil_holds_the_middle_and_leaves_the_ends_to_the_finger():
     """Heave alone is controlled; a finger off the middle tilts the plate, most near its rocking mode of 147 Hz.
 
     The second row of D q = F [1, 0] has no force: q_1 = -D_10/D_11 q_0.
     """
+    frequency = 143.0
     place, plate = 15e-3, PlateParameters()
     finger = hr.Finger.still(position=place, normal_load=0.4, mechanics="light")
     stiffness = plate.dynamic_stiffness(frequency, finger.mechanics.impedance(frequency), place)
@@ -78,21 +69,3 @@ def test_one_coil_holds_the_middle_and_leaves_the_ends_to_the_finger(frequency):
 def test_what_a_plate_cannot_do_is_refused(gradient, plant, message):
     with pytest.raises(ValueError, match=message):
         rendered(gradient=gradient, **plant)
-
-
-def test_a_plate_of_other_numbers_is_identified_and_then_held():
-    """Twice the glass on stiffer springs: what was found makes the scene's plant table, and the free plate holds."""
-    other = replace(PlateParameters(), mass=60e-3, inertia=8e-5, stiffness_1=50e3, stiffness_2=47e3, force_constant=9.0)
-    numbers = ("mass", "inertia", "stiffness_1", "stiffness_2", "damping_1", "damping_2")
-    from hapticrender.drivers.simulated import SimulatedDriver
-
-    believed = replace(other, **{name: 1.15 * getattr(other, name) for name in numbers})
-    with SimulatedDriver(Plate(other, hr.Finger.absent(), 3)) as driver:
-        found = hr.identify(driver, believed).parameters
-    for name in numbers[:4]:
-        assert getattr(found, name) == pytest.approx(getattr(other, name), rel=0.003)  # as the accuracy suite asks
-    plant = {name: getattr(found, name) for name in (*numbers, "force_constant")}
-    texture = hr.Grating(frequency=111.0, amplitude=A)
-    scene = hr.Scene(texture=texture, finger=SLIDE, duration=2.5, **tables(plant))
-    recording = hr.render(scene, driver=SimulatedDriver(Plate(other, SLIDE, 5)))
-    assert abs(amplitudes(recording, 111.0) / A - 1.0).max() < ENDS

@@ -96,21 +96,6 @@ def test_closed_loop_is_the_open_one_sample_by_sample(pair, rng):
     assert abs(motion).max() > 1e-6
 
 
-def test_a_third_partys_plant_obeys_its_equation():
-    """Under P control of a mass on a spring, x_mean = gain r/(k + gain); the loop rings at sqrt((k + gain)/m)."""
-    plant = MassOnSpring()
-    _, _, _, sensed = plant.closed_loop(Proportional(plant, 50.0), np.full(20_000, 1e-3))
-    x = sensed.motion[:, 0]
-    assert x[:5000].mean() == pytest.approx(50.0 * 1e-3 / 4050.0, rel=0.05)
-    crossings = np.flatnonzero(np.diff(np.sign(x[:1000] - 50e-3 / 4050.0)) > 0)
-    period = np.diff(crossings).mean() / 5000.0
-    assert 1 / period == pytest.approx(np.sqrt(4050.0 / 0.01) / (2 * np.pi), rel=0.01)
-
-
-def test_a_controller_without_a_compiled_step_does_not_close():
-    assert not MassOnSpring().closes(object())
-
-
 def test_drive_queue_hands_on_after_its_latency():
     queue, due, oldest, seen = np.zeros((3, 2)), np.zeros(2), 0, []
     for n in range(8):

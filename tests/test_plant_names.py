@@ -49,15 +49,6 @@ def test_every_name_listed_is_accepted(device):
         assert re.search(rf"\b{re.sub('^(plate|screen)_', '', name)} = 'no such word'", str(refused.value))
 
 
-def test_the_numbers_of_the_law_are_those_of_the_one_that_is_chosen():
-    def known(law):
-        with pytest.raises(ValueError, match="no such parameter") as refused:
-            hr.plants.surface.SurfaceParameters.with_overrides({"law": law, "mispelt": 1.0})
-        return str(refused.value)
-
-    assert known("fit") != known("load-sharing")
-
-
 @pytest.mark.parametrize(
     ("fields", "message"),
     [

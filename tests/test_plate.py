@@ -5,9 +5,8 @@ import pytest
 from naive_plate import simulate
 
 import hapticrender as hr
-from hapticrender.plants.plate import EXPECTED_BENDING, Plate, PlateParameters, structure
-from hapticrender.plants.plate_kernels import NODES
-from hapticrender.touch.mechanics import HEAVY, HEAVY_SECOND, LIGHT, LIGHT_SECOND, NONE
+from hapticrender.plants.plate import Plate, PlateParameters, structure
+from hapticrender.touch.mechanics import HEAVY, HEAVY_SECOND, LIGHT, NONE
 
 IDEAL = {"sensor_noise": 0.0, "sensor_bits": 0, "current_bits": 0}
 FINGERS = pytest.mark.parametrize(
@@ -18,8 +17,7 @@ RATE = 5000.0
 
 def eigenfrequencies(plate):
     """Frequencies (Hz, ascending) and damping ratios of a structure's oscillating modes."""
-    phi, _ = plate.zero_order_hold(RATE)
-    poles = RATE * np.log(np.linalg.eigvals(phi).astype(complex))
+    poles = RATE * np.log(np.linalg.eigvals(plate.zero_order_hold(RATE)[0]).astype(complex))
     poles = poles[poles.imag > 0]
     poles = poles[np.argsort(abs(poles))]
     return abs(poles) / (2 * np.pi), -poles.real / abs(poles)
@@ -58,57 +56,7 @@ def test_structure_has_the_dynamic_stiffness_of_plate_and_finger(mechanics):
     np.testing.assert_array_equal(lifted.mass, parameters.mass_matrix)
 
 
-@pytest.mark.parametrize("levels", [{}, {"degrees_of_freedom": 1}, {"bending_frequency": 1200.0}, {"coils": 1}])
-@FINGERS
-def test_table_is_the_exponential(levels, mechanics):
-    """Every node that a slide has computed: matrices, their inverse and the series, to 1e-12 of a column's largest."""
-    parameters = PlateParameters(**levels, **IDEAL)
-    finger = hr.Finger.sliding(speed=1.0, span=0.09, normal_load=2.0, mechanics=mechanics, load_scaling=True)
-    plate = Plate(parameters, finger)
-    plate.run(np.zeros((800, plate.drive_channels)))
-    state, period = plate.state[0], 1 / RATE
-    strength = float(finger.touch(np.zeros(1))[0, 2])
-    nodes = np.flatnonzero(state["held"][:NODES] == strength)
-    assert len(nodes) > 0.75 * NODES
-    for node in nodes[::10]:
-        loaded = structure(parameters, mechanics, (node - NODES // 2) * 2 * 55e-3 / (NODES - 1), strength)
-        phi, gamma = loaded.zero_order_hold(RATE)
-        n = len(loaded.mass)
-        scale = np.r_[np.ones(n), np.full(n, period)]
-        kept = np.flatnonzero(
-            [True, "degrees_of_freedom" not in levels, "bending_frequency" in levels, mechanics.order == 4]
-        )
-        kept = np.r_[kept, 4 + kept]
-        expected = np.hstack([scale[:, None] * phi / scale, scale[:, None] * gamma])
-        columns = np.r_[kept, 8 : 8 + parameters.coils, 10]
-        found = state["table"][node][np.ix_(columns, kept)].T
-        assert (abs(found - expected).max(axis=0) <= 1e-12 * abs(expected).max(axis=0)).all()
-
-
-def test_interpolation_error_is_that_of_the_formula():
-    """Quadratic through three nodes h apart: at most h^3/(9 sqrt 3) of the third derivative (here by differences)."""
-    parameters = PlateParameters(bending_frequency=1200.0)
-    h = 2 * 55e-3 / (NODES - 1)  # m
-
-    def phi(position):
-        return structure(parameters, HEAVY_SECOND, position).zero_order_hold(RATE)[0]
-
-    for centre in (0.0, 20e-3, 53e-3):
-        a, b, c = (phi(centre + k * h) for k in (-1, 0, 1))
-        third = abs(phi(centre + 2 * h) - 2 * c + 2 * a - phi(centre - 2 * h)) / 2  # h^3 d3Phi
-        error = max(
-            (
-                abs(0.5 * x * (x - 1) * a + (1 - x * x) * b + 0.5 * x * (x + 1) * c - phi(centre + x * h))
-                / abs(b).max()
-            ).max()
-            for x in (-0.5, -0.25, 0.25, 0.5)
-        )
-        assert error <= 1.5 * (third / (9 * np.sqrt(3)) / abs(b).max()).max() + 1e-9
-        assert error < 1e-5
-
-
-@pytest.mark.parametrize("bending", [0.0, 1200.0], ids=["rigid", "bending"])
-@pytest.mark.parametrize("position", [0.0, 15e-3, -55e-3])
+@pytest.mark.parametrize(("position", "bending"), [(15e-3, 1200.0), (-55e-3, 0.0)])
 @FINGERS
 def test_resting_finger(rng, mechanics, position, bending):
     """Zero-order hold against scipy's exponential: exact but for the first samples of a touch, within 1e-6."""
@@ -120,8 +68,7 @@ def test_resting_finger(rng, mechanics, position, bending):
     np.testing.assert_allclose(motion, expected, rtol=0, atol=1e-6 * expected.std())
 
 
-@pytest.mark.parametrize("bending", [0.0, 1200.0], ids=["rigid", "bending"])
-@pytest.mark.parametrize("scaled", [False, True], ids=["nominal", "scaled"])
+@pytest.mark.parametrize(("scaled", "bending"), [(False, 0.0), (True, 1200.0)])
 def test_finger_that_slides_presses_and_lifts(rng, scaled, bending):
     """By scipy's exponential of every sample's place and strength, within 1e-5; a new touch starts at rest."""
     load = ((0.0, 0.05, 0.1), (0.2, 1.4, 0.5))
@@ -140,11 +87,10 @@ def stop_and_go(time):
     return 0.01 * np.sin(4 * np.pi * np.clip(time, 0.0, 0.1)) + np.where((0.15 < time) & (time < 0.2), 0.05, 0.0)
 
 
-@pytest.mark.parametrize("bending", [0.0, 1150.0], ids=["rigid", "bending"])
-def test_stop_and_go_is_exact_and_a_run_equals_its_pieces(rng, bending):
+def test_stop_and_go_is_exact_and_a_run_equals_its_pieces(rng):
     positions = tuple(stop_and_go(np.arange(1500) / RATE))
     finger = hr.Finger.sampled(positions, rate=RATE, normal_load=0.8, mechanics=HEAVY)
-    parameters = PlateParameters(bending_frequency=bending, **IDEAL)
+    parameters = PlateParameters(bending_frequency=1150.0, **IDEAL)
     drive = rng.uniform(-2, 2, (1500, 2))
     whole = Plate(parameters, finger, seed=3).run(drive)
     expected = naive(drive, finger, parameters)
@@ -155,28 +101,7 @@ def test_stop_and_go_is_exact_and_a_run_equals_its_pieces(rng, bending):
         assert np.array_equal(getattr(whole, name), np.concatenate([getattr(part, name) for part in parts]))
 
 
-@pytest.mark.parametrize("damping", [0.0, 0.85])
-def test_energy_of_the_free_plate(damping):
-    """Kept without damping, to rounding; with equal damping c of both coils it falls by 2 c (x_1'^2 + x_2'^2) only."""
-    parameters = PlateParameters(damping_1=damping, damping_2=damping, **IDEAL)
-    plate, energies = Plate(parameters, hr.Finger.absent()), []
-    plate.run(np.eye(2))
-    plate.run(np.zeros((1, 2)))
-    for _ in range(200):
-        plate.run(np.zeros((10, 2)))
-        w = plate.state["w"][0]
-        q, v = w[:2], w[4:6] * RATE
-        energies.append(v @ parameters.mass_matrix @ v / 2 + q @ parameters.stiffness_matrix @ q / 2)
-    if damping:
-        _, ratios = parameters.modes()
-        slowest, fastest = 4 * np.pi * np.array([147.27 * ratios[0], 189.38 * ratios[1]])  # 1/s
-        fallen = -np.log(energies[-1] / energies[0]) / (199 * 10 / RATE)
-        assert slowest * 0.95 < fallen < fastest * 1.05
-    else:
-        np.testing.assert_allclose(energies, energies[0], rtol=2000 * 2**-50)
-
-
-@pytest.mark.parametrize("frequency", [20.0, 147.0, 189.0, 400.0])
+@pytest.mark.parametrize("frequency", [20.0, 189.0])
 def test_measured_response_is_the_predicted_one(frequency):
     """Hold, its half-sample delay and its images k rate + f included.
 
@@ -203,21 +128,11 @@ def test_velocity_under_the_finger(rng, bending):
     plate = Plate(parameters, hr.Finger.still(position=position, normal_load=0.5, mechanics=HEAVY))
     plate.run(0.2 * np.sin(2 * np.pi * 80 * np.arange(10_000) / rate)[:, None] * [1.0, 0.4])
     centre, one, other, velocity = plate.motion.T
-    at = parameters.bending_shape(position)
-    bend = ((one + other) / 2 - centre) / (1 - parameters.bending_shape(0.0))
+    at = parameters.displacement(position)[2]
+    bend = ((one + other) / 2 - centre) / (1 - parameters.displacement(0.0)[2])
     glass = (one + other) / 2 - bend + (other - one) / 2 * position / 55e-3 + at * bend
     way = np.cumsum((velocity[1:] + velocity[:-1]) / 2) / rate
     np.testing.assert_allclose(way, glass[1:] - glass[0], rtol=0, atol=2e-4 * np.ptp(glass))
-
-
-def test_a_locked_rocking_mode_leaves_heave_alone():
-    drive = np.zeros((2000, 2))
-    drive[:, 0] = np.sin(np.arange(2000) * 0.1)
-    motion = Plate(PlateParameters(degrees_of_freedom=1, **IDEAL), hr.Finger.absent()).run(drive).motion
-    assert abs(motion[:, 0]).max() > 1e-6
-    np.testing.assert_array_equal(motion[:, 1], motion[:, 0])
-    two = Plate(PlateParameters(**IDEAL), hr.Finger.absent()).run(drive).motion
-    assert abs(two[:, 1] - two[:, 0]).max() > 1e-6
 
 
 def test_one_coil_in_the_middle_moves_the_plate_as_two_that_share_it(rng):
@@ -272,54 +187,6 @@ def test_loop_delay_is_the_stated_number_of_samples():
         Plate(PlateParameters(delay=2), hr.Finger.absent(), block=3)
 
 
-def test_static_load_and_position_from_the_sag():
-    """0.5 N sags 11 um; the printed P divides by zero where side 1 does not sag, the right form gives the position."""
-    parameters = PlateParameters(**IDEAL)
-    for position in (0.0, 10e-3, -20e-3):
-        finger = hr.Finger.still(position=position, normal_load=0.5, mechanics=NONE)
-        centre, end_1, end_2 = Plate(parameters, finger).run(np.zeros((50_000, 2))).motion[-1]
-        tilt = (end_2 - end_1) / 4  # a theta
-        load, found = parameters.static_load(centre - tilt, centre + tilt)
-        assert load == pytest.approx(0.5, rel=1e-6)
-        assert found == pytest.approx(position, abs=1e-8)
-    assert centre == pytest.approx(-11e-6, rel=0.05)
-    load, found = parameters.static_load(0.0, -1e-5)
-    assert found == pytest.approx(parameters.half_spacing)
-    with pytest.raises(ValueError, match="no net load"):
-        parameters.static_load(0.0, 0.0)
-
-
-def test_printed_force_equations_put_the_rocking_mode_at_185_hz():
-    """As printed, (m/2) x_i'' -+ (I/2) theta''; with I/d but x_i'' kept; and right, (m/2) x_c'' -+ (I/d) theta''."""
-
-    def modes_of(mass):
-        return np.sqrt(np.sort(np.linalg.eigvals(np.linalg.solve(mass, stiffness)).real)) / (2 * np.pi)
-
-    p = PlateParameters()
-    d, stiffness = p.coil_spacing, np.diag([p.stiffness_1, p.stiffness_2])
-    twist = np.array([[1.0, -1.0], [-1.0, 1.0]]) / d  # -+ theta'' from x_i''
-    own, mean = p.mass / 2 * np.eye(2), p.mass / 4 * np.ones((2, 2))
-    assert modes_of(own + p.inertia / 2 * twist).min() == pytest.approx(185.0, abs=0.05)
-    assert modes_of(own + p.inertia / d * twist).min() == pytest.approx(116.2, abs=0.05)
-    np.testing.assert_allclose(modes_of(mean + p.inertia / d * twist), eigenfrequencies(structure(p))[0], rtol=3e-4)
-
-
-def test_a_finger_does_not_always_lower_the_gain():
-    """Against the paper's "the finger always adds impedance": a light one raises heave between the modes."""
-
-    def gain(frequency, mechanics):
-        stiffness = plate.dynamic_stiffness(frequency, mechanics.impedance(frequency))
-        return abs(2 * plate.force_constant * np.linalg.inv(stiffness)[..., 0, 0])
-
-    plate, frequency = PlateParameters(), np.arange(20.0, 401.0)
-    free = gain(frequency, NONE)
-    light = gain(frequency, LIGHT_SECOND) / free
-    raised = frequency[light > 1.0]
-    assert (raised.min(), raised.max()) == (pytest.approx(36, abs=1), pytest.approx(182, abs=1))
-    assert light.max() == pytest.approx(1.94, abs=0.01)
-    assert gain(np.array([189.0]), HEAVY)[0] / free[frequency == 189][0] == pytest.approx(0.26, abs=0.01)
-
-
 def test_amplifier_parts_scale_the_current():
     """i = V/R1 (1 - R2/Rp), about -V/5: half of R1 gives twice the current."""
     assert PlateParameters().amplifier_gain == pytest.approx(-0.1999, abs=5e-5)
@@ -333,24 +200,15 @@ def test_amplifier_parts_scale_the_current():
 def test_shape_is_that_of_a_free_bar():
     """Textbook numbers of the first free-free mode: middle -0.6078, nodes 0.2242 of the length from the ends."""
     plate = PlateParameters()
-    np.testing.assert_allclose(plate.bending_shape([-55e-3, 0.0, 55e-3]), [1.0, -0.6078, 1.0], atol=5e-5)
+    np.testing.assert_allclose(plate.displacement([-55e-3, 0.0, 55e-3])[:, 2], [1.0, -0.6078, 1.0], atol=5e-5)
     half = np.linspace(0.0, 55e-3, 100_001)
-    node = half[abs(plate.bending_shape(half)).argmin()]
+    node = half[abs(plate.displacement(half)[:, 2]).argmin()]
     assert (55e-3 - node) / 110e-3 == pytest.approx(0.2242, abs=5e-5)
 
 
-def test_opposed_coils_do_not_bend_the_glass(rng):
-    drive = rng.uniform(-1, 1, (500, 1)) * np.array([1.0, -1.0])
-    bent, rigid = (
-        Plate(PlateParameters(bending_frequency=f, **IDEAL), hr.Finger.absent()).run(drive).motion
-        for f in (1150.0, 0.0)
-    )
-    np.testing.assert_allclose(bent, rigid, rtol=0, atol=500 * 2**-50 * abs(rigid).max())
-
-
-@pytest.mark.parametrize("frequency", [1150.0, 5000.0])
-def test_bending_mode_alone(frequency, rng):
+def test_bending_mode_alone(rng):
     """Common drive: the ends minus the rigid ones are an oscillator of 9.5 g, up to the highest frequency allowed."""
+    frequency = 5000.0
     parameters = PlateParameters(bending_frequency=frequency, bending_coil=0.1, **IDEAL)
     drive = rng.uniform(-1, 1, (500, 1)) * np.ones(2)
     motion, rigid = (
@@ -364,34 +222,18 @@ def test_bending_mode_alone(frequency, rng):
         state = np.exp(pole / RATE) * state + (np.exp(pole / RATE) - 1) / pole * force
     atol = 1e-11 * abs(motion).max()  # terms of the series reach e^(2 pi) = 535 before they fall
     np.testing.assert_allclose(motion[:, 1] - rigid[:, 1], alone, rtol=0, atol=atol)
-    middle = float(parameters.bending_shape(0.0))
+    middle = parameters.displacement(0.0)[2]
     np.testing.assert_allclose(motion[:, 0] - rigid[:, 0], middle * np.array(alone), rtol=0, atol=atol)
-
-
-def test_the_mode_as_the_loop_sees_it():
-    assert PlateParameters().bending is None
-    bending = PlateParameters(bending_frequency=1200.0, bending_coil=0.08).bending
-    assert bending.frequency == 1200.0
-    assert bending.coupling == (pytest.approx(0.08 / 9.5e-3), 0.0)
-    assert bending.measured
-    assert not EXPECTED_BENDING.measured
 
 
 @pytest.mark.parametrize(
     ("overrides", "message"),
     [
         ({"mass": 0.0}, r"mass = 0.0: must be .*> 0 .*kg"),
-        ({"mass": True}, r"mass = True: must be .* number"),
         ({"delay": 0}, r"delay = 0: must be .*>= 1 .*samples"),
-        ({"delay": 1.5}, r"delay = 1.5: must be an integer"),
-        ({"sensor_noise": -1e-6}, r"sensor_noise = -1e-06: must be .*>= 0 .*m"),
-        ({"rate": 10.0}, r"rate = 10.0: must be .*>= 500 .*Hz"),
         ({"degrees_of_freedom": 3}, r"degrees_of_freedom = 3: must be .*<= 2"),
         ({"masss": 1.0}, r"masss: no such parameter; known: .*mass"),
-        ({"stiffness_1": float("nan")}, r"stiffness_1 = nan: must be .*> 0 .*N/m"),
         ({"bending_frequency": 6000.0}, r"bending_frequency = 6000.0: must be <= rate = 5000 Hz"),
-        ({"bending_mass": 0.0}, r"bending_mass = 0.0: must be .*> 0 .*kg"),
-        ({"bending_coil": -1.5}, r"bending_coil = -1.5: must be .*>= -1"),
     ],
 )
 def test_bad_parameters_are_refused_with_value_bound_and_unit(overrides, message):

@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 
 import hapticrender as hr
-from benchmarks.charts.stability_map import loaded_plate, settled_estimate
+from benchmarks.charts.stability_map import loaded_plate
 from hapticrender.bands import Bands
 from hapticrender.control.bandwidth import BankGains, error_loop
 from hapticrender.control.error_design import ONE_SPEED, design_error, rules_for
 from hapticrender.plants.plate import Plate, PlateParameters
-from hapticrender.touch.mechanics import HEAVY, LIGHT, NAMED, NONE
+from hapticrender.touch.mechanics import HEAVY, NAMED, NONE
 
 RATE = 5000.0
 IDEAL = {"sensor_noise": 0.0, "sensor_bits": 0, "current_bits": 0, "current_limit": 1e6, "sensor_range": 1e3}
@@ -78,11 +78,9 @@ def simulated(controller, parameters, mechanics=NONE, position=0.0, seconds=4.0)
 
 
 WRONG = [
-    ("h", (72.0,), {}),
     ("h", (189.0,), {"mass": 30.4e-3}),
     ("h", (170.0,), {"delay": 8}),
     ("h", (100.0, 120.0, 140.0, 160.0), {}),
-    ("h2", (170.0,), {"delay": 5}),
     ("h2", (400.0,), {"force_constant": 2.5 * 7.4}),
     ("h2", COMB, {}),
 ]
@@ -96,7 +94,7 @@ def test_growth_of_the_loop_is_the_predicted_one(method, frequencies, wrong):
     assert simulated(controller, parameters) == pytest.approx(expected, abs=0.1, rel=0.01)
 
 
-@pytest.mark.parametrize(("mechanics", "position"), [(LIGHT, 0.0), (HEAVY, 15e-3), (NAMED["light-2nd-order"], 0.02)])
+@pytest.mark.parametrize(("mechanics", "position"), [(HEAVY, 15e-3), (NAMED["light-2nd-order"], 0.02)])
 def test_growth_under_a_resting_finger_is_the_predicted_one(mechanics, position):
     """Contact without load, so that neither adaptation nor gain schedule starts."""
     controller = frozen("h", 178.0)
@@ -114,7 +112,7 @@ def test_growth_with_bending_glass_is_the_predicted_one():
     assert predicted(controller, replace(bending, bending_coil=-0.1)).growth() < 0
 
 
-@pytest.mark.parametrize(("method", "frequency"), [("h", 20.0), ("h2", 72.0), ("h2", 400.0)])
+@pytest.mark.parametrize(("method", "frequency"), [("h", 20.0), ("h2", 400.0)])
 def test_the_boundary_lies_where_the_margins_say(method, frequency):
     """Gain: 1 % either side.  Delay: the last whole sample inside and the first outside, by simulation."""
     margins = predicted(frozen(method, frequency)).margins()
@@ -129,12 +127,12 @@ def test_the_boundary_lies_where_the_margins_say(method, frequency):
         assert (found > 0) == grows
 
 
-@pytest.mark.parametrize("frequency", [72.0, 261.0])
-def test_the_phase_error_that_is_borne_is_the_simulated_one(frequency):
+def test_the_phase_error_that_is_borne_is_the_simulated_one():
     """The law of a single band turned ahead is the plant turned ahead, short of the image at minus f0: 0.5 deg of room.
 
     Half a degree away the growth is 0.13 1/s, which a run of 8 s tells from none.
     """
+    frequency = 72.0
     phase, growths = predicted(frozen("h", frequency)).margins().phase, []
     for error in (phase - np.radians(0.5), phase + np.radians(0.5)):
         controller = frozen("h", frequency)
@@ -142,10 +140,3 @@ def test_the_phase_error_that_is_borne_is_the_simulated_one(frequency):
         growths.append(simulated(controller, PLATE, seconds=8.0))
     assert growths[0] < -0.05
     assert growths[1] > 0.05
-
-
-def test_a_settled_estimate_is_the_impedance_at_the_carrier():
-    for frequency in (50.0, 170.0, 300.0):
-        finger, jw = settled_estimate(PLATE, LIGHT, frequency, 0.01), 2j * np.pi * frequency
-        known = finger.mass * jw + finger.damping + finger.stiffness / jw
-        assert known == pytest.approx(complex(LIGHT.impedance(frequency)), rel=1e-9)

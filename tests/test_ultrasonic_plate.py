@@ -32,7 +32,7 @@ def twin(parameters, drive, load):
     return motion
 
 
-@pytest.mark.parametrize(("rate", "level"), [(192e3, "carrier"), (80e3, "carrier"), (48e3, "envelope")])
+@pytest.mark.parametrize(("rate", "level"), [(80e3, "carrier"), (48e3, "envelope")])
 def test_the_mode_is_integrated_exactly_however_few_samples_a_cycle_has(rng, rate, level):
     """Heat and a finger that comes, presses harder and leaves, against scipy: some 4 roundings of each of n steps."""
     load = ((0.0, 0.004, 0.006), (0.2, 0.2, 1.4))
@@ -55,14 +55,6 @@ def test_poles(load, pole, settling, quality):
     assert abs(measured - pole) < 0.5
     assert abs(1 / (2 * np.pi * measured) - settling) < 0.5 * (1e-4 if load == 0 else 1e-5)
     assert abs(parameters.frequency / (2 * measured) - quality) < 0.5
-
-
-def test_the_finger_grips_with_the_cube_root_of_its_load():
-    parameters = UltrasonicParameters()
-    grip = parameters.damping([0.0, 0.5, 4.0]) - parameters.damping()
-    np.testing.assert_allclose(grip, [0.0, 11.0, 22.0], rtol=8 * ROUNDING, atol=0)
-    shift = parameters.resonance([0.0, 0.5, 4.0]) - 30e3
-    np.testing.assert_allclose(shift, [0.0, -30.0, -60.0], rtol=0, atol=30e3 * ROUNDING)
 
 
 @pytest.mark.parametrize(
@@ -103,9 +95,10 @@ def held(parameters, frequency, load=0.0, rise=0.0):
     return response[300], response.sum() - response[300]
 
 
-@pytest.mark.parametrize("offset", [-400.0, 0.0, 100.0])
-@pytest.mark.parametrize(("finger", "load"), [(FREE, 0.0), (HELD, 0.5)], ids=["free", "finger"])
-@pytest.mark.parametrize("level", ["carrier", "envelope"])
+@pytest.mark.parametrize(
+    ("level", "finger", "load", "offset"),
+    [("carrier", FREE, 0.0, 100.0), ("carrier", HELD, 0.5, -400.0), ("envelope", HELD, 0.5, 0.0)],
+)
 def test_measured_response_is_the_predicted_one(level, finger, load, offset):
     """Images past the 300th hold less than 2 f^2 F/(300^2 rate^3) < 4e-9 of it, with F the offset or the pole."""
     parameters = UltrasonicParameters(temperature_time=1e-3, **IDEAL)
@@ -116,61 +109,7 @@ def test_measured_response_is_the_predicted_one(level, finger, load, offset):
     assert abs(respond(parameters, frequency, finger) / expected - 1) < 2 * SETTLED + 4e-9
 
 
-@pytest.mark.parametrize(("load", "times"), [(0.0, 5.4), (0.5, 1.9)])
-def test_flat_modulation_at_400_hz_needs_headroom(load, times):
-    """hypot(1, f/pole); the sidebands give the same: AM of the drive makes |a(W)| smaller by |D(w + W)|/|D(w)|."""
-    parameters = UltrasonicParameters(finger_shift=0.0)
-    need = parameters.drive_for(1e-6, 400.0, load) / parameters.drive_for(1e-6, 0.0, load)
-    assert abs(need - times) < 0.05
-    stiffness = abs(parameters.dynamic_stiffness(np.array([29.6e3, 30e3, 30.4e3]), load))
-    # (W/w)/2 either way, and it cancels in the mean up to (W/w)^2
-    assert abs((stiffness[0] + stiffness[2]) / (2 * stiffness[1]) / need - 1) < (400 / 30e3) ** 2
-
-
-def test_the_default_drive_has_its_stated_headroom():
-    """Twice 3 um under a finger at resonance, to the four digits of the force constant; measured on a run as well."""
-    parameters = UltrasonicParameters(finger_shift=0.0, **IDEAL)
-    assert abs(parameters.headroom - 2) < 0.0005 / 1.777 * 2
-    gain = abs(respond(parameters, 30e3, HELD) / np.sinc(30 / 192))
-    image = abs(held(parameters, 30e3, 0.5)[1] / held(parameters, 30e3, 0.5)[0])
-    assert abs(gain * 10.0 / (parameters.headroom * 3e-6) - 1) < image + 2 * SETTLED
-
-
-def test_transposing_keeps_the_envelope():
-    parameters = UltrasonicParameters(modal_mass=4e-3, quality=150.0, frequency=40e3)
-    moved = parameters.transposed(5e3, 48e3)
-    assert (moved.carrier, moved.rate, moved.level) == (5e3, 48e3, "envelope")
-    for load in (0.0, 0.3, 2.0):
-        near = {"rtol": 16 * ROUNDING}
-        np.testing.assert_allclose(moved.pole(load), parameters.pole(load), **near)
-        np.testing.assert_allclose(moved.damping(load) * 5e3, parameters.damping(load) * 40e3, **near)
-        shifts = moved.resonance(load, 7.0) - 5e3, parameters.resonance(load, 7.0) - 40e3
-        np.testing.assert_allclose(*shifts, rtol=0, atol=40e3 * ROUNDING)
-    assert abs(moved.mass * 5e3 / (parameters.mass * 40e3) - 1) <= 4 * ROUNDING
-    assert moved.force_constant == parameters.force_constant
-    assert abs(moved.sensor_noise**2 / 48e3 / (parameters.sensor_noise**2 / 192e3) - 1) <= 8 * ROUNDING
-    assert moved.transposed(5e3, 48e3) == moved
-
-
-OFFSETS = np.array([-400.0, -100.0, -10.0, 10.0, 75.0, 100.0, 250.0, 400.0])
-
-
-def test_the_envelope_error_is_that_of_the_two_stiffnesses():
-    """Written out for the free plate: b = m w/Q and, moved down, m_i = m w/w_i, b_i = b w/w_i, k_i = m_i w_i^2."""
-    mass, w, wi = 5e-3, 2 * np.pi * 30e3, 2 * np.pi * 6e3
-    damping, offset = 5e-3 * w / 200, 2 * np.pi * OFFSETS
-    high = mass * w**2 - mass * (w + offset) ** 2 + 1j * damping * (w + offset)
-    low_mass, low_damping = mass * w / wi, damping * w / wi
-    low = low_mass * wi**2 - low_mass * (wi + offset) ** 2 + 1j * low_damping * (wi + offset)
-    error = UltrasonicParameters().transposed(6e3, 48e3).envelope_error(OFFSETS)
-    # differences of m w^2, 3e8 of a rounding of which are left in D >= b w
-    np.testing.assert_allclose(error, low / high - 1, rtol=0, atol=8 * 200 * ROUNDING)
-    far = UltrasonicParameters().envelope_error(2000.0)  # beyond the pole: half of W (1/w_i - 1/w), to W/2w
-    assert abs(far) / (2000.0 * (1 / 6e3 - 1 / 30e3)) == pytest.approx(0.5, abs=2000 / (2 * 30e3) + 1e-3)
-
-
-@pytest.mark.parametrize("offset", [-100.0, 0.0, 75.0, 400.0])
-@pytest.mark.parametrize(("finger", "load"), [(FREE, 0.0), (HELD, 0.5)], ids=["free", "finger"])
+@pytest.mark.parametrize(("finger", "load", "offset"), [(FREE, 0.0, 75.0), (HELD, 0.5, -100.0), (HELD, 0.5, 400.0)])
 def test_runs_of_carrier_and_envelope_differ_by_the_envelope_error(finger, load, offset):
     """Each divided by its own hold; the images, which each rate has its own of, are all that is left."""
     carrier = UltrasonicParameters(temperature_time=1e-3, **IDEAL)
@@ -210,11 +149,6 @@ def test_drive_acts_after_its_delay(delay, block):
     assert np.flatnonzero(motion)[0] == 2 + delay - block + 1
 
 
-def test_a_block_longer_than_the_delay_is_refused():
-    with pytest.raises(ValueError, match=r"block = 2: must be between 1 and the loop's delay of 1 samples"):
-        UltrasonicPlate(UltrasonicParameters(), FREE, block=2)
-
-
 def test_the_sensor_rounds_clips_and_has_its_noise():
     parameters = UltrasonicParameters(sensor_range=4e-6, sensor_bits=8, sensor_noise=0.0)
     drive = 10.0 * np.cos(2 * np.pi * 30e3 * np.arange(1500) / 192e3)[:, None]
@@ -242,31 +176,11 @@ def test_the_drive_is_limited_rounded_and_safe_against_nonsense():
     assert [first(each) for each in (np.nan, np.inf, -np.inf)] == [0.0, 0.0, 0.0]
 
 
-@pytest.mark.parametrize("level", ["carrier", "envelope"])
-def test_the_band_model_is_the_free_cold_plate(level):
-    parameters = UltrasonicParameters(temperature_rise=10.0)
-    if level == "envelope":
-        parameters = parameters.transposed(6e3, 48e3)
-    model = parameters.device_model(parameters.rate, 2)
-    frequency = parameters.carrier + np.array([-200.0, 0.0, 50.0])
-    stiffness = model.dynamic_stiffness(frequency)[:, 0, 0]
-    # differences of m w^2, of which Q roundings are left
-    np.testing.assert_allclose(stiffness, parameters.dynamic_stiffness(frequency), rtol=8 * 200 * ROUNDING)
-    assert model.force_from_drive.tolist() == [[1.777]]
-    assert (model.places, model.rate, model.delay) == (("amplitude",), parameters.rate, 2)
-    assert (model.drive_limit, model.sensed_limit, model.sensed_noise) == (10.0, 25e-6, parameters.sensor_noise)
-    assert model.drive_step == 20 / 2**16
-
-
 @pytest.mark.parametrize(
     ("overrides", "message"),
     [
         ({"frequency": 10e3}, r"frequency = 10000.0: must be .*>= 20000 .*Hz"),
-        ({"modal_mass": True}, r"modal_mass = True: must be .* number"),
-        ({"sensor_bits": 2.5}, r"sensor_bits = 2.5: must be an integer"),
-        ({"delay": 0}, r"delay = 0: must be .*>= 1 .*samples"),
         ({"rate": 48e3}, r"rate = 48000.0: must be .*>= 66666.7 .*Hz for a carrier of 30000 Hz"),
-        ({"level": "slow"}, r"level = 'slow': must be one of carrier, envelope"),
         ({"envelope_frequency": 30e3}, r"envelope_frequency = 30000.0: must be < frequency = 30000 Hz"),
         ({"finger_damping": 2000.0}, r"finger_damping = 2000.0: damping ratio 3.63 at 20 N .* must be .*<= 0.5"),
         ({"finger_shift": -3000.0}, r"finger_shift = -3000.0: shifts the resonance by up to -10259.9 Hz"),

@@ -72,9 +72,3 @@ def ran(wanted, seconds, finger=FREE, settings=None, **plant):
 
 def modulated(amplitude, frequency=400.0):
     return lambda t: amplitude * (1 + 0.5 * np.cos(2 * np.pi * frequency * t))
-
-
-def inner_share(run, load):
-    """Damping that a finger brings, over what the free plate and the inner loop have: how far a touch pulls."""
-    brought = float(run.mode.damping(load) - run.mode.damping(0.0))
-    return brought / (float(run.mode.damping(0.0)) + float(run.loop.settings["added_damping"][0]))

@@ -44,35 +44,18 @@ def queue_drive(queue, oldest, drive, due):
 class CompiledPlant:
     """Base of the plants behind the `Plant` protocol; a subclass gives a step, a state and the widths of its signals.
 
-    That is all that a plant of one's own needs: ``tests/test_compiled_plants.py`` has one in 25 lines.
-
-    Parameters
-    ----------
-    finger : Finger
-    rate : float, Hz
-        Sampling rate.
-    delay, block : int, samples
-        Of the loop: from a sensed sample to the drive computed from it; samples a call of `run`.
-    seed : int
-        Of the noise.
-
-    Attributes
-    ----------
-    step : CFunction
-        One signature for all: see `hapticrender.jit`.  At the start of a sample the step senses, then advances under
-        the drive; it writes `sensed`, `motion` and `flags` of each row.
-    state : ndarray of a record type, shape (1,)
-        All that the step reads and writes; arrays that it points to are kept in `buffers`.
-    drive_channels, sensed_channels, motion_channels, noise_channels : int
-        Widths of the signals; `motion` holds the evaluated places first, then whatever else the plant tells.
+    That is all that a plant of one's own needs: ``tests/test_compiled_plants.py`` has one in 25 lines.  At the start of
+    a sample the step senses, then advances under the drive; it writes `sensed`, `motion` and `flags` of each row (see
+    `hapticrender.jit`).  `delay` (samples) is that of the loop, from a sensed sample to the drive computed from it;
+    `block` samples are a call of `run`.
     """
 
     step: CFunction
-    state: Array
-    buffers: tuple[Array, ...] = ()
+    state: Array  # a record, shape (1,): all that the step reads and writes
+    buffers: tuple[Array, ...] = ()  # arrays that it points to
     drive_channels = 1
     sensed_channels = 1
-    motion_channels = 1
+    motion_channels = 1  # the evaluated places first
     noise_channels = 1
     places = 1  # columns of `motion` that are evaluated
 

@@ -1,24 +1,23 @@
-"""The sliding contact that every friction device shares, the skin that friction moves, and a tribometer.
+"""The sliding contact that every friction device shares, and a tribometer.
 
 A device sets the steady friction force F_s.  The friction F on a finger sliding at speed v follows it over the
-contact's memory length delta (Balasubramanian, Pool and Vardar 2025), the tribometer under the surface measures F
-through its own resonance (F_t), and F drives the skin, whose impedance is Z_f::
+contact's memory length delta (Balasubramanian, Pool and Vardar 2025), and the tribometer under the surface measures F
+through its own resonance (F_t)::
 
     (delta/|v|) F' + F = F_s
     F_t'' + 2 zeta w0 F_t' + w0^2 F_t = w0^2 F
-    v_skin = F/Z_f(s)
 
 Below `least_speed` the contact sticks and keeps its friction; a lifted finger has none.  Friction is positive against
 the motion, in either direction.  A step outputs the state at the start of a sample, then advances: exactly for a steady
-friction and a speed that are constant over the sample; skin and tribometer are exact for a friction that changes
-linearly within it.
+friction and a speed that are constant over the sample; the tribometer is exact for a friction that changes linearly
+within it.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -27,19 +26,12 @@ from hapticrender.jit import kernel
 from hapticrender.plants.compiled import quantise
 from hapticrender.protocols import Array
 
-if TYPE_CHECKING:
-    from hapticrender.touch.mechanics import FingerMechanics
-
-SKIN_VELOCITY = 2  # entry of the skin's state: displacements of skin and phalanx (m), then their velocities (m/s)
-
 SLIDING = np.dtype(
     [(name, "f8") for name in ("least_speed", "force_noise", "force_step", "force_range")]  # as in `SlidingParameters`
     + [
         ("renewal", "f8"),  # T/delta, s/m: share of the contact's memory that is renewed in a sample, per speed
-        ("skin_step", "f8", (4, 6)),  # of a sample: Phi, then the input columns of friction at its start and its end
-        ("tribometer_step", "f8", (2, 4)),  # the same for the tribometer's force and its rate
+        ("tribometer_step", "f8", (2, 4)),  # of a sample: Phi, then the input columns of friction at its start and end
         ("friction", "f8"),  # state: N
-        ("skin", "f8", (4,)),  # state: m, m, m/s, m/s
         ("tribometer", "f8", (2,)),  # state: force (N) and its rate over w0 (N)
     ],
     align=True,
@@ -50,27 +42,6 @@ SLIDING = np.dtype(
 class SlidingParameters(Validated):
     """Parameters of the sliding contact and of the tribometer under it.
 
-    Parameters
-    ----------
-    rate : float, Hz
-        Sampling rate of the surface, 1000 to 1e6.
-    friction_coefficient : float
-        mu, friction over normal force, > 0 (dry to moist glass: 0.3 to 2).
-    memory_length : float, m
-        delta, sliding distance over which the contact is renewed, > 0.
-    least_speed : float, m/s
-        Slower than this the contact sticks, > 0.
-    tribometer_frequency : float, Hz
-        Resonance f0 of the tribometer, > 0 and at most half the rate.
-    tribometer_damping : float
-        Damping ratio zeta, > 0; with 0.44 or more it is flat within 0.5 dB up to 400 Hz.
-    force_noise : float, N rms
-        White noise of the tribometer, >= 0.
-    force_range : float, N
-        It measures forces within +- this, > 0.
-    force_bits : int
-        Resolution over +- force_range; 0 is ideal.
-
     Notes
     -----
     delta is 11.5 um where the cut-off v/(2 pi delta) grows by 13.8 Hz per mm/s, as measured over 20-100 mm/s and
@@ -79,15 +50,15 @@ class SlidingParameters(Validated):
     defaults.
     """
 
-    rate: float = parameter(10e3, "Hz", least=1e3, most=1e6)
-    friction_coefficient: float = parameter(0.8, above=0.0)
-    memory_length: float = parameter(11.5e-6, "m", above=0.0)
-    least_speed: float = parameter(1e-3, "m/s", above=0.0)
-    tribometer_frequency: float = parameter(1300.0, "Hz", above=0.0)
-    tribometer_damping: float = parameter(0.65, above=0.0)
-    force_noise: float = parameter(1e-3, "N")
-    force_range: float = parameter(20.0, "N", above=0.0)
-    force_bits: int = parameter(0, least=0, most=24)
+    rate: float = parameter(10e3, "Hz", "sampling rate of the surface", least=1e3, most=1e6)
+    friction_coefficient: float = parameter(0.8, about="mu; dry to moist glass: 0.3 to 2", above=0.0)
+    memory_length: float = parameter(11.5e-6, "m", "delta, sliding distance that renews the contact", above=0.0)
+    least_speed: float = parameter(1e-3, "m/s", "a slower contact sticks", above=0.0)
+    tribometer_frequency: float = parameter(1300.0, "Hz", "resonance f0, at most half the rate", above=0.0)
+    tribometer_damping: float = parameter(0.65, about="damping ratio; >= 0.44: flat within 0.5 dB to 400 Hz", above=0.0)
+    force_noise: float = parameter(1e-3, "N", "white noise of the tribometer, rms")
+    force_range: float = parameter(20.0, "N", "it measures forces within +- this", above=0.0)
+    force_bits: int = parameter(0, about="resolution over +- force_range, 0 is ideal", least=0, most=24)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -101,10 +72,6 @@ class SlidingParameters(Validated):
         """Resolution of the tribometer (N); 0 is ideal."""
         return 2 * self.force_range / 2**self.force_bits if self.force_bits else 0.0
 
-    def cutoff(self, speed: Any) -> Any:
-        """Cut-off of the friction's lag at `speed` (m/s), Hz: |v|/(2 pi delta)."""
-        return np.abs(speed) / (2 * np.pi * self.memory_length)
-
     def lag_response(self, frequency: Any, speed: float) -> Any:
         """Friction per steady friction (complex) at `frequency` (Hz), the hold and the sampling included.
 
@@ -114,12 +81,9 @@ class SlidingParameters(Validated):
         return (1 - kept) / (self._shift(frequency) - kept)
 
     def tribometer_response(self, frequency: Any) -> Any:
-        """Sensed friction per friction (complex) at `frequency` (Hz)."""
-        return _ramp_response(_tribometer_step(self), 0, self._shift(frequency))
-
-    def skin_response(self, frequency: Any, mechanics: FingerMechanics) -> Any:
-        """Skin velocity per friction (complex, m/(N s)) at `frequency` (Hz)."""
-        return _ramp_response(_skin_step(self, mechanics), SKIN_VELOCITY, self._shift(frequency))
+        """Sensed friction per friction (complex) at `frequency` (Hz): (z - Phi)^-1 (G_0 + z G_1)."""
+        step, z = _tribometer_step(self), self._shift(frequency)[..., None, None]
+        return np.linalg.solve(z * np.eye(2) - step[:, :2], step[:, 2:3] + z * step[:, 3:])[..., 0, 0]
 
     def frequency_response(self, frequency: Any, speed: float) -> Any:
         """Sensed friction per steady friction (complex) at `frequency` (Hz) for a finger at `speed` (m/s)."""
@@ -143,72 +107,31 @@ def new_record(dtype: np.dtype[Any], *sources: object, **values: Any) -> Array:
     return record
 
 
-def sliding_record(parameters: SlidingParameters, mechanics: FingerMechanics) -> Array:
-    """Return the record (`SLIDING`, shape (1,)) of a contact at rest, without friction, of a finger with `mechanics`.
-
-    The masses that the order of the mechanics (0, 2 or 4) uses must be > 0.
-    """
-    return new_record(
-        SLIDING,
-        parameters,
-        renewal=1.0 / (parameters.rate * parameters.memory_length),
-        skin_step=_skin_step(parameters, mechanics),
-        tribometer_step=_tribometer_step(parameters),
-    )
-
-
-def _skin_step(parameters: SlidingParameters, mechanics: FingerMechanics) -> Array:
-    """One sample of the skin under friction, shape (4, 6); states that the order leaves out stay at zero."""
-    system, force = np.zeros((4, 4)), np.zeros(4)
-    if mechanics.order:
-        k, b, m = mechanics.stiffness, mechanics.damping, _mass("mass", mechanics.mass, mechanics.order)
-        system[0, 2], force[2] = 1.0, 1 / m
-        system[2] = np.array([-k, k, -b, b]) / m
-        if mechanics.order == 4:
-            m = _mass("phalanx_mass", mechanics.phalanx_mass, 4)
-            system[1, 3] = 1.0
-            system[3] = np.array([k, -k - mechanics.phalanx_stiffness, b, -b - mechanics.phalanx_damping]) / m
-    return _ramp_step(system, force, 1 / parameters.rate)
-
-
-def _mass(name: str, value: float, order: int) -> float:
-    if not value > 0.0:
-        raise ValueError(f"mechanics.{name} = {value!r}: must be > 0 kg where order = {order}")
-    return value
+def sliding_record(parameters: SlidingParameters) -> Array:
+    """Return the record (`SLIDING`, shape (1,)) of a contact at rest, without friction."""
+    renewal = 1.0 / (parameters.rate * parameters.memory_length)
+    return new_record(SLIDING, parameters, renewal=renewal, tribometer_step=_tribometer_step(parameters))
 
 
 def _tribometer_step(parameters: SlidingParameters) -> Array:
-    """One sample of the tribometer's force and of its rate over w0, shape (2, 4)."""
-    w = 2 * math.pi * parameters.tribometer_frequency
-    system = w * np.array([[0.0, 1.0], [-1.0, -2 * parameters.tribometer_damping]])
-    return _ramp_step(system, np.array([0.0, w]), 1 / parameters.rate)
-
-
-def _ramp_step(system: Array, inputs: Array, period: float) -> Array:
-    """Discretise a linear system with a first-order hold: Phi, then the columns of its input before and after.
+    """One sample of the tribometer's force and of its rate over w0 (first-order hold), shape (2, 4).
 
     From the exponential of [[A T, B T, 0], [0, 0, 1], [0, 0, 0]]: Phi, and the parts of the start and of the rise.
     """
     from scipy.linalg import expm
 
-    n = len(inputs)
-    whole = np.zeros((n + 2, n + 2))
-    whole[:n, :n], whole[:n, n], whole[n, n + 1] = system * period, inputs * period, 1.0
-    step = expm(whole)[:n]
-    step[:, n] -= step[:, n + 1]
+    w = 2 * math.pi * parameters.tribometer_frequency
+    system = np.zeros((4, 4))
+    system[:2, :3] = w / parameters.rate * np.array([[0.0, 1.0, 0.0], [-1.0, -2 * parameters.tribometer_damping, 1.0]])
+    system[2, 3] = 1.0
+    step = expm(system)[:2]
+    step[:, 2] -= step[:, 3]
     return step
-
-
-def _ramp_response(step: Array, row: int, z: Any) -> Any:
-    """Response of state `row` to the input of a `_ramp_step` at complex `z`: (z - Phi)^-1 (G_0 + z G_1)."""
-    n = len(step)
-    z = np.asarray(z)[..., None, None]
-    return np.linalg.solve(z * np.eye(n) - step[:, :n], step[:, n : n + 1] + z * step[:, n + 1 :])[..., row, 0]
 
 
 @kernel
 def sliding_step(s, steady_friction, speed, noise):
-    """Advance the contact by a sample; return friction, measured friction (N) and skin velocity (m/s) at its start.
+    """Advance the contact by a sample; return friction and measured friction (N) at its start.
 
     `s` is a record of `SLIDING`; `steady_friction` (N) and `speed` (m/s, NaN: lifted) hold over the sample; `noise` is
     of unit variance.
@@ -224,9 +147,4 @@ def sliding_step(s, steady_friction, speed, noise):
     measured = quantise(x0 + s.force_noise * noise, s.force_step, s.force_range)
     for i in range(2):
         x[i] = phi[i, 0] * x0 + phi[i, 1] * x1 + phi[i, 2] * before + phi[i, 3] * after
-    phi, x = s.skin_step, s.skin
-    x0, x1, x2, x3 = x[0], x[1], x[2], x[3]
-    for i in range(4):
-        free = phi[i, 0] * x0 + phi[i, 1] * x1 + phi[i, 2] * x2 + phi[i, 3] * x3
-        x[i] = free + phi[i, 4] * before + phi[i, 5] * after
-    return before, measured, x2
+    return before, measured

@@ -35,11 +35,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from hapticrender.checks import option, parameter
-from hapticrender.plants.compiled import CompiledPlant, finger_inputs
+from hapticrender.checks import Validated, option, parameter
+from hapticrender.control.estimators import StarSTDFT
+from hapticrender.plants.compiled import CompiledPlant
 from hapticrender.plants.contact import SlidingParameters, new_record, sliding_record
-from hapticrender.plants.electroadhesion_kernels import ATTRACTION, SCREEN, SKIN_VELOCITY, element, screen_step
-from hapticrender.plants.gap import VACUUM, GapEstimator
+from hapticrender.plants.electroadhesion_kernels import SCREEN, element, screen_step
+from hapticrender.plants.gap import VACUUM, gap_record
 from hapticrender.protocols import Array
 
 if TYPE_CHECKING:
@@ -48,29 +49,17 @@ if TYPE_CHECKING:
 DRY, NORMAL, MOIST = 100.0, 4.0, 0.5  # ohm m2: leakage of the gap (engineering defaults: L = 1.0, 0.90, 0.12)
 BLOCKING = 1e6  # s: time constant of a capacitor that does not leak
 LEAST_SUBSTEPS = 4  # in a turn of the carrier
-finger_rows = finger_inputs  # removed when all import the new name
 
 
 @dataclass(frozen=True, kw_only=True)
-class SquareRoot:
+class SquareRoot(Validated):
     """Square root that makes an attraction, which goes with current squared, linear in the drive.
 
-    An attraction u around a bias takes the current envelope ``I = sqrt(max(bias + u, floor)/g)``.  Without it the
-    envelope is linear, ``I = sqrt(2 bias/g) (1 + u/bias)/2``, and ``g I^2 = bias/2 + u + u^2/(2 bias)`` has a second
-    harmonic of 25 % at u = bias sin(2 pi f t); Grigorii et al. 2021 drive 6 mA sqrt((sin(2 pi f t) + 1)/2).  That
-    envelope has cusps where it touches zero; the floor rounds them off.
-
-    Parameters
-    ----------
-    bias : float, N
-        Attraction at zero drive, > `floor`; the drive can reduce it by bias - floor.
-    floor : float, N
-        Least attraction, >= 0.  The slope of the current is at most 1/(2 sqrt(floor gain)), unbounded at a floor of 0.
-    gain : float, N/A^2 (or N/V^2)
-        g of ``F = g I^2``, > 0.
-    straight : bool
-        Omit the square root, for comparison: the envelope is linear in the drive, with the same peak at a drive of
-        `bias` and the same slope of attraction at zero drive.
+    An attraction u (N) around a bias takes the current envelope ``I = sqrt(max(bias + u, floor)/g)``.  `straight` omits
+    the square root, for comparison: ``I = sqrt(2 bias/g) (1 + u/bias)/2``, with the same peak at u = bias and the same
+    slope of attraction at zero, and ``g I^2 = bias/2 + u + u^2/(2 bias)`` has a second harmonic of 25 % at u = bias
+    sin(2 pi f t).  Grigorii et al. 2021 drive 6 mA sqrt((sin(2 pi f t) + 1)/2), which has cusps where it touches zero;
+    the floor rounds them off: the slope of the current is at most 1/(2 sqrt(floor gain)).
 
     Examples
     --------
@@ -78,94 +67,27 @@ class SquareRoot:
     [0.00424, 0.006]
     """
 
-    bias: float
-    floor: float
-    gain: float
+    bias: float = parameter(unit="N", above=0.0)  # attraction at zero drive, > floor
+    floor: float = parameter(unit="N")  # least attraction
+    gain: float = parameter(unit="N/A^2", above=0.0)  # g of F = g I^2; N/V^2 where a voltage is driven
     straight: bool = False
 
     def __post_init__(self) -> None:
-        for name, bound, unit in (("bias", self.floor, "N"), ("gain", 0.0, "N/A^2")):
-            value = getattr(self, name)
-            if not (math.isfinite(value) and value > bound):
-                raise ValueError(f"{name} = {value!r}: must be > {bound:g} {unit}")
-        if not (math.isfinite(self.floor) and self.floor >= 0.0):
-            raise ValueError(f"floor = {self.floor!r}: must be >= 0 N")
+        super().__post_init__()
+        if self.bias <= self.floor:
+            raise ValueError(f"bias = {self.bias!r}: must be > floor = {self.floor:g} N")
 
     def __call__(self, drive: Any) -> Any:
         """Current envelope (A, peak) for a `drive` (N of attraction around the bias)."""
-        wanted = np.maximum(self.bias + np.asarray(drive, float), self.floor)
+        attraction = np.maximum(self.bias + np.asarray(drive, float), self.floor)
         if self.straight:
-            return wanted / np.sqrt(2 * self.bias * self.gain)
-        return np.sqrt(wanted / self.gain)
+            return attraction / np.sqrt(2 * self.bias * self.gain)
+        return np.sqrt(attraction / self.gain)
 
 
 @dataclass(frozen=True, kw_only=True)
 class ElectroadhesionParameters(SlidingParameters):
     """Parameters of the screen, of the finger's electrical side, and of the model's level.
-
-    Parameters
-    ----------
-    rate, friction_coefficient, memory_length, least_speed : float
-        See `SlidingParameters`; `rate` is that of the drive's envelope.
-    tribometer_frequency, tribometer_damping, force_noise, force_range, force_bits : float or int
-        See `SlidingParameters`.
-    level : {"envelope", "carrier"}
-    drive_kind : {"current", "voltage"}
-        Drive in A or V, peak of the carrier; a voltage is turned into the current that it drives in steady state.
-    sensor : {"tribometer", "impedance"}
-        Friction (N), or the attraction (N) that `GapEstimator` reads from voltage and current; level "carrier" only.
-    carrier_frequency : float, Hz
-        A whole multiple of `rate`.
-    oversampling : int
-        Substeps a sample, at least 4 a turn of the carrier.
-    contact_area : float, m2
-        Apparent area at 1 N, > 0; grows with the load to the power `area_exponent` (0.33-0.67).
-    area_exponent : float
-        0 to 1.
-    electrical_share : float
-        Of the apparent area, > 0 and <= 1.
-    area_scale : float
-        Of this finger against the nominal one, > 0.
-    insulator_capacitance : float, F/m2
-        > 0 (1-3.5e-5).
-    corneum_capacitance : float, F/m2
-        Of the stratum corneum, > 0.
-    corneum_resistance : float, ohm m2
-        > 0.
-    gap_thickness : float, m
-        While sliding, > 0 (0.5-3 um).
-    gap_resistance : float, ohm m2
-        Leakage of the sliding gap, > 0: `DRY`, `NORMAL` or `MOIST`.
-    gap_short : float, ohm m2
-        The same while the finger rests, >= 0 (to 0.1).
-    ripple : float
-        The gap varies by this share of its thickness with the position, 0 to 0.9.
-    ripple_wavelength : float, m
-        > 0.
-    body_resistance : float, ohm
-        Body and return, >= 0 (0.5-2 kohm).
-    unevenness : float
-        kappa = <d^-2>/<d^-1>^2 of the gap, 1 to 10 (1-3).
-    current_limit : float, A
-        Largest peak of the source where the drive is a current, > 0.
-    voltage_limit : float, V
-        Its compliance, peak, > 0 (150-300); also the largest drive where that is a voltage.
-    current_offset : float, A
-        Direct current that the source leaks, -1 to 1 mA.
-    servo_conductance : float, S
-        The source bleeds this times the mean voltage of the last sample, >= 0; 0: no servo.
-    stray_capacitance : float, F
-        Across the source, >= 0.
-    voltage_noise, current_noise : float, V and A rms
-        White noise of the two channels at every substep, >= 0.
-    skew : float, s
-        The current's channel is late by this, -10 to 10 us.
-    estimator_bandwidth, estimator_smoothing : float, Hz and s
-        See `GapEstimator`.
-    least_leakage : float
-        L below which a gap leaks too much to be measured, 0 to 1.
-    open_loop_gain : float, N/A^2
-        g of a finger whose gap cannot be measured, > 0; renderers set that of a nominal finger unless the scene has it.
 
     Notes
     -----
@@ -173,37 +95,41 @@ class ElectroadhesionParameters(SlidingParameters):
     Offset and servo act at the level "carrier" only.
     """
 
-    level: str = option("envelope", "envelope", "carrier")
-    drive_kind: str = option("current", "current", "voltage")
-    sensor: str = option("tribometer", "tribometer", "impedance")
-    carrier_frequency: float = parameter(20e3, "Hz", above=0.0)
-    oversampling: int = parameter(20, "substeps", least=1, most=10_000)
-    contact_area: float = parameter(1.2e-4, "m2", above=0.0)
-    area_exponent: float = parameter(0.5, most=1.0)
-    electrical_share: float = parameter(0.6, above=0.0, most=1.0)
-    area_scale: float = parameter(1.0, above=0.0)
-    insulator_capacitance: float = parameter(3.45e-5, "F/m2", above=0.0)
-    corneum_capacitance: float = parameter(2.95e-5, "F/m2", above=0.0)
-    corneum_resistance: float = parameter(1.2, "ohm m2", above=0.0)
-    gap_thickness: float = parameter(1.5e-6, "m", above=0.0)
-    gap_resistance: float = parameter(NORMAL, "ohm m2", above=0.0)
-    gap_short: float = parameter(0.0, "ohm m2", most=0.1)
-    ripple: float = parameter(0.0, most=0.9)
-    ripple_wavelength: float = parameter(0.5e-3, "m", above=0.0)
-    body_resistance: float = parameter(1e3, "ohm")
-    unevenness: float = parameter(1.0, least=1.0, most=10.0)
-    current_limit: float = parameter(10e-3, "A", above=0.0)
-    voltage_limit: float = parameter(300.0, "V", above=0.0)
-    current_offset: float = parameter(0.0, "A", least=-1e-3, most=1e-3)
-    servo_conductance: float = parameter(1e-7, "S")
-    stray_capacitance: float = parameter(0.0, "F")
-    voltage_noise: float = parameter(0.5, "V")
-    current_noise: float = parameter(20e-6, "A")
-    skew: float = parameter(0.0, "s", least=-1e-5, most=1e-5)
-    estimator_bandwidth: float = parameter(1500.0, "Hz", above=0.0)
-    estimator_smoothing: float = parameter(5e-3, "s", above=0.0)
-    least_leakage: float = parameter(0.5, most=1.0)
-    open_loop_gain: float = parameter(2.2e4, "N/A^2", above=0.0)
+    level: str = option("envelope", "envelope", "carrier", about="of the model")
+    drive_kind: str = option("current", "current", "voltage", about="peak of the carrier (A or V)")
+    sensor: str = option(
+        "tribometer", "tribometer", "impedance", about='of friction, or of attraction (level "carrier")'
+    )
+    carrier_frequency: float = parameter(20e3, "Hz", "a whole multiple of `rate`", above=0.0)
+    oversampling: int = parameter(20, "substeps", "a sample, at least 4 a turn of the carrier", least=1, most=10_000)
+    contact_area: float = parameter(1.2e-4, "m2", "apparent area at 1 N", above=0.0)
+    area_exponent: float = parameter(0.5, about="of the load, with which the area grows (0.33-0.67)", most=1.0)
+    electrical_share: float = parameter(0.6, about="of the apparent area", above=0.0, most=1.0)
+    area_scale: float = parameter(1.0, about="of this finger against the nominal one", above=0.0)
+    insulator_capacitance: float = parameter(3.45e-5, "F/m2", "per area (1-3.5e-5)", above=0.0)
+    corneum_capacitance: float = parameter(2.95e-5, "F/m2", "of the stratum corneum", above=0.0)
+    corneum_resistance: float = parameter(1.2, "ohm m2", "of the stratum corneum", above=0.0)
+    gap_thickness: float = parameter(1.5e-6, "m", "while sliding (0.5-3 um)", above=0.0)
+    gap_resistance: float = parameter(NORMAL, "ohm m2", "leakage of the sliding gap: DRY, NORMAL or MOIST", above=0.0)
+    gap_short: float = parameter(0.0, "ohm m2", "the same while the finger rests", most=0.1)
+    ripple: float = parameter(0.0, about="share by which the gap varies with the position", most=0.9)
+    ripple_wavelength: float = parameter(0.5e-3, "m", "of that", above=0.0)
+    body_resistance: float = parameter(1e3, "ohm", "body and return (0.5-2 kohm)")
+    unevenness: float = parameter(1.0, about="kappa = <d^-2>/<d^-1>^2 of the gap (1-3)", least=1.0, most=10.0)
+    current_limit: float = parameter(10e-3, "A", "largest peak of the source where the drive is a current", above=0.0)
+    voltage_limit: float = parameter(300.0, "V", "its compliance, peak (150-300); largest drive in V", above=0.0)
+    current_offset: float = parameter(0.0, "A", "direct current that the source leaks", least=-1e-3, most=1e-3)
+    servo_conductance: float = parameter(1e-7, "S", "the source bleeds this times its mean voltage, 0: no servo")
+    stray_capacitance: float = parameter(0.0, "F", "across the source")
+    voltage_noise: float = parameter(0.5, "V", "white noise at every substep, rms")
+    current_noise: float = parameter(20e-6, "A", "white noise at every substep, rms")
+    skew: float = parameter(0.0, "s", "delay of the current's channel", least=-1e-5, most=1e-5)
+    estimator_bandwidth: float = parameter(1500.0, "Hz", "of the estimator's STDFT*, < rate/2", above=0.0)
+    estimator_smoothing: float = parameter(5e-3, "s", "for the impedance's average, at least a sample", above=0.0)
+    least_leakage: float = parameter(0.5, about="L below which a gap leaks too much to be measured", most=1.0)
+    open_loop_gain: float = parameter(
+        2.2e4, "N/A^2", "g where the gap cannot be measured; by default a nominal finger's", above=0.0
+    )
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -219,7 +145,9 @@ class ElectroadhesionParameters(SlidingParameters):
             )
         if self.sensor == "impedance" and self.level == "envelope":
             raise ValueError("sensor = 'impedance': must be 'tribometer' where level = 'envelope': no carrier")
-        _ = self.estimator  # refuses a bad bandwidth or smoothing
+        if self.estimator_smoothing * self.rate < 1.0:
+            raise ValueError(f"estimator_smoothing = {self.estimator_smoothing!r}: must be >= {1 / self.rate:g} s")
+        _ = self.estimator_filter  # refuses a bad bandwidth
 
     @property
     def omega(self) -> float:
@@ -239,20 +167,9 @@ class ElectroadhesionParameters(SlidingParameters):
         return 1 / (1j * self.omega * self.insulator_capacitance) + corneum
 
     @property
-    def estimator(self) -> GapEstimator:
-        """Estimator of the attraction for a finger with these numbers, its area aside."""
-        return GapEstimator(
-            rate=self.rate,
-            carrier_frequency=self.carrier_frequency,
-            series_impedance=self.series_impedance,
-            open_loop_gain=self.open_loop_gain,
-            bandwidth=self.estimator_bandwidth,
-            smoothing=self.estimator_smoothing,
-            body_resistance=self.body_resistance,
-            unevenness=self.unevenness,
-            least_speed=self.least_speed,
-            least_share=self.least_leakage,
-        )
+    def estimator_filter(self) -> StarSTDFT:
+        """The STDFT* of the estimator, which is also its response to a small change of |I|^2."""
+        return StarSTDFT(bandwidth=self.estimator_bandwidth, rate=self.rate)
 
     def area(self, normal_load: Any) -> Any:
         """Electrical contact area (m2) under `normal_load` (N)."""
@@ -279,7 +196,7 @@ class ElectroadhesionParameters(SlidingParameters):
         """Change of what is sensed per change of attraction (complex) at `frequency` (Hz), finger at `speed` (m/s)."""
         if self.sensor == "tribometer":
             return self.friction_coefficient * self.frequency_response(frequency, speed)
-        return self.estimator.frequency_response(frequency) / self._shift(frequency)
+        return self.estimator_filter.frequency_response(frequency) / self._shift(frequency)
 
     def sensor_response(self, frequency: Any, speed: float) -> Any:
         """Sensed friction per friction (complex) at `frequency` (Hz), finger at `speed` (m/s)."""
@@ -291,21 +208,13 @@ class ElectroadhesionParameters(SlidingParameters):
 class ElectroadhesionScreen(CompiledPlant):
     """The screen in discrete time, behind the `Plant` protocol.
 
-    Parameters
-    ----------
-    parameters : ElectroadhesionParameters
-        The screen and its level of modelling.
-    finger : Finger
-        Where the finger is, how hard it presses, and its lateral mechanics.
-    seed : int
-        Of the noise.
-    compensation : SquareRoot, optional
-        Makes the drive an attraction around its bias (N), by a gain in N/A^2, or N/V^2 where a voltage is driven; by
-        default the drive is the peak of the carrier (A or V).
+    The drive is the peak of the carrier (A or V); a `compensation` makes it an attraction around its bias (N), by a
+    gain in N/A^2, or N/V^2 where a voltage is driven.  `motion`: friction (N), and the mean
+    attraction of each sample (N).
     """
 
     step = screen_step
-    motion_channels = 3
+    motion_channels = 2
 
     def __init__(
         self,
@@ -317,21 +226,11 @@ class ElectroadhesionScreen(CompiledPlant):
         super().__init__(finger, parameters.rate, seed=seed)
         self.parameters, self.compensation = parameters, compensation
         self.noise_channels = 1 + 2 * parameters.oversampling if parameters.sensor == "impedance" else 1
-        self.state = screen_record(parameters, finger, compensation)
-
-    @property
-    def skin_velocity(self) -> Array:
-        """Velocity of the skin under friction (m/s, shape (n,)), against the motion, over the last run."""
-        return self.motion[:, SKIN_VELOCITY]
-
-    @property
-    def attraction(self) -> Array:
-        """Mean attraction in each sample of the last run (N, shape (n,))."""
-        return self.motion[:, ATTRACTION]
+        self.state = screen_record(parameters, compensation)
 
 
-def screen_record(parameters: ElectroadhesionParameters, finger: Finger, compensation: SquareRoot | None) -> Array:
-    """Return the record (`SCREEN`, shape (1,)) of a screen at rest with this finger on it."""
+def screen_record(parameters: ElectroadhesionParameters, compensation: SquareRoot | None) -> Array:
+    """Return the record (`SCREEN`, shape (1,)) of a screen at rest."""
     p, substep = parameters, 1.0 / (parameters.rate * parameters.oversampling)
     turn, corneum = np.exp(1j * p.omega * substep), p.corneum_resistance * p.corneum_capacitance
     elements = [element.py_func(tau, substep, p.omega, turn) for tau in (BLOCKING, corneum, corneum)]
@@ -352,6 +251,6 @@ def screen_record(parameters: ElectroadhesionParameters, finger: Finger, compens
         retention=[each[0] for each in elements],
         alternating=[each[1] for each in elements],
         direct=[each[2] for each in elements],
-        gap=p.estimator.start()[0],
-        sliding=sliding_record(p, finger.mechanics)[0],
+        gap=gap_record(p)[0],
+        sliding=sliding_record(p)[0],
     )

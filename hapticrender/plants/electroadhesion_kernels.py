@@ -16,13 +16,13 @@ import numba
 import numpy as np
 
 from hapticrender.jit import F8, I8, SIGNALS_T, kernel, pointer, step
-from hapticrender.plants.compiled import HUGE, LOAD, POSITION, SENSOR_CLIPPED, SPEED, STRENGTH
+from hapticrender.plants.compiled import HUGE, LOAD, POSITION, SENSOR_CLIPPED, SPEED
 from hapticrender.plants.contact import SLIDING, sliding_step
 from hapticrender.plants.gap import GAP, VACUUM, gap_step
 from hapticrender.protocols import Flag
 
 SATURATED, OPEN_LOOP = int(Flag.SATURATED), int(Flag.OPEN_LOOP)
-FRICTION, SKIN_VELOCITY, ATTRACTION = range(3)  # columns of `motion`
+FRICTION, ATTRACTION = range(2)  # columns of `motion`
 INPUTS = 4  # columns of the inputs
 
 FLAGS = ("carrier", "voltage", "sensing", "compensated", "straight")  # level, kind of drive, sensor, square root
@@ -169,17 +169,16 @@ def screen_step(state, signals, start, count):
     end, channels = start + count, 1 + 2 * s.oversampling if s.sensing else 1
     drive, inputs = numba.carray(pointer(io.drive, F8), end), numba.carray(pointer(io.inputs, F8), (end, INPUTS))
     noise, sensed = numba.carray(pointer(io.noise, F8), (end, channels)), numba.carray(pointer(io.sensed, F8), end)
-    motion, flags = numba.carray(pointer(io.motion, F8), (end, 3)), numba.carray(pointer(io.flags, I8), end)
+    motion, flags = numba.carray(pointer(io.motion, F8), (end, 2)), numba.carray(pointer(io.flags, I8), end)
     for n in range(start, end):
         x, reading, raised = inputs[n], s.reading, OPEN_LOOP if s.open_loop else 0
         attraction, cut = attract(s, drive[n], x, noise[n])
         if s.sensing:
             s.reading, s.open_loop = gap_step(s.gap, s.envelopes[0], s.envelopes[1], x[SPEED])
         steady = s.friction_coefficient * (x[LOAD] + attraction)
-        friction, measured, skin_velocity = sliding_step(s.sliding, steady, x[SPEED], noise[n, 0])
+        friction, measured = sliding_step(s.sliding, steady, x[SPEED], noise[n, 0])
         if not s.sensing:
             reading, raised = measured, SENSOR_CLIPPED if abs(measured) >= s.sliding.force_range else 0
         sensed[n], flags[n] = reading, raised | cut
         motion[n, FRICTION], motion[n, ATTRACTION] = friction, attraction
-        motion[n, SKIN_VELOCITY] = skin_velocity / x[STRENGTH] if x[STRENGTH] > 0.0 else 0.0
     return 0

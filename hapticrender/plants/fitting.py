@@ -50,30 +50,14 @@ FAULTS = (  # name, and what turns sensors and coils into those of a plate witho
 
 @dataclass(frozen=True, kw_only=True)
 class Record:
-    """Spectra of drive and measurement (amplitudes), at bin 0 and from below the first line to above the last.
+    """Spectra of drive and measurement (amplitudes), at bin 0 and from below the first line to above the last."""
 
-    Parameters
-    ----------
-    rate : float, Hz
-        Sampling rate.
-    samples : int
-        Length of the record.
-    turn : ndarray, shape (n,)
-        Frequency of each bin over rate; the first is 0 and is not fitted.
-    drive : ndarray of complex, shape (n, 2), A
-        Of each coil.
-    sensed : ndarray of complex, shape (n, 2), m
-        Of each sensor.
-    on_line : ndarray of bool, shape (n,)
-        Bins of the multi-sine's lines.
-    """
-
-    rate: float
-    samples: int
-    turn: Array
-    drive: Array
-    sensed: Array
-    on_line: Array
+    rate: float  # Hz
+    samples: int  # of the record
+    turn: Array  # frequency of each bin over rate (n,); the first is 0 and is not fitted
+    drive: Array  # of each coil (complex A, (n, 2))
+    sensed: Array  # of each sensor (complex m, (n, 2))
+    on_line: Array  # bins of the multi-sine's lines (bool, (n,))
 
     @property
     def between(self) -> Array:
@@ -82,17 +66,12 @@ class Record:
 
 
 class Fit(NamedTuple):
-    """Result of a search.
+    """Result of a search."""
 
-    `plate` with the identified parameters, sensor gains included; `unknown` (8,): logarithms of the six over their
-    starting point, delay (samples), gain difference; `covariance` (8, 8) of `unknown` at a variance of 1 m2 of every
-    real number of the spectra; `left` (n, 2), m: measured less predicted at all bins, the static one included.
-    """
-
-    plate: PlateParameters
-    unknown: Array
-    covariance: Array
-    left: Array
+    plate: PlateParameters  # with the identified parameters, sensor gains included
+    unknown: Array  # logarithms of the six over their starting point, delay (samples), gain difference (8,)
+    covariance: Array  # of `unknown` at a variance of 1 m2 of every real number of the spectra (8, 8)
+    left: Array  # measured less predicted at all bins, the static one included (m, (n, 2))
 
 
 def spectra(rate: float, sine: Multisine, sensed: Array) -> Record:
@@ -117,24 +96,10 @@ def sensor_gains(plate: PlateParameters) -> tuple[float, float]:
 
 
 def sampled_response(plate: PlateParameters, rate: float, late: float, turn: Array) -> tuple[Array, Array]:
-    """Compute the motion of the glass ends in discrete time, per drive and per free motion.
+    """Compute the motion of the glass ends in discrete time at `turn` (frequency over rate, shape (n,)).
 
-    Parameters
-    ----------
-    plate : PlateParameters
-    rate : float, Hz
-        Sampling rate.
-    late : float, samples
-        Delay of the held drive, any fraction.
-    turn : ndarray, shape (n,)
-        Frequency over rate.
-
-    Returns
-    -------
-    driven : ndarray of complex, shape (n, 2, 2), m/A
-        Both ends per coil current, all images of the hold included.
-    free : ndarray of complex, shape (n, 2, states)
-        The same per free motion; its states are coordinates (m) and their rates times the period (m).
+    Per coil current (m/A, (n, 2, 2)) held `late` samples late, any fraction, all images of the hold included; and per
+    free motion (n, 2, states), whose states are coordinates (m) and their rates times the period (m).
     """
     body = structure(plate)
     count = len(body.mass)
@@ -152,22 +117,9 @@ def sampled_response(plate: PlateParameters, rate: float, late: float, turn: Arr
 def equation_error(expected: PlateParameters, record: Record, latest: int) -> tuple[Array, int, float]:
     """Solve the force balance of heave and rocking at the lines for the six parameters, by linear least squares.
 
-    Parameters
-    ----------
-    expected : PlateParameters
-        For geometry, force constant, sensor gains, and weights of the lines.
-    record : Record
-    latest : int, samples
-        Largest delay; a delay turns the phase of the drive forces, and the one that leaves least is taken.
-
-    Returns
-    -------
-    solved : ndarray, shape (6,)
-        Values of `MECHANICAL`.
-    late : int, samples
-        Delay.
-    explained : float
-        Share of the drive force's mean square that the balance explains, 0 to 1.
+    Geometry, force constant, sensor gains and weights of the lines are those of `expected`.  A delay of up to `latest`
+    samples turns the phase of the drive forces; the one that leaves least is taken.  Returns the values of
+    `MECHANICAL`, the delay (samples), and the share of the drive force's mean square that the balance explains.
     """
     line, turn = record.on_line, record.turn[record.on_line]
     s = 2j * np.pi * record.rate * turn

@@ -103,9 +103,6 @@ def reference_amplitudes(law, ratio, load, speed, amplitude):
         amplitude[n] = reference_amplitude(law, ratio[n], load[n], speed[n])
 
 
-wanted_amplitudes = reference_amplitudes  # removed when all import the new name
-
-
 class FrictionLaw(Validated):
     """Base of the laws: checks arguments and broadcasts them over the kernels; a law adds its values."""
 
@@ -147,15 +144,6 @@ class FrictionLaw(Validated):
 class FitLaw(FrictionLaw):
     """mu/mu0 = floor + (1 - floor) exp(-(a/scale)^exponent).
 
-    Parameters
-    ----------
-    floor : float
-        Least mu/mu0, r: 0.05 to 0.3 in the literature's spread; >= 0 and < 1.
-    scale : float, m
-        Amplitude a0: 0.7e-6 to 1.8e-6; > 0.
-    exponent : float
-        p: 1 to 2; > 0.
-
     Notes
     -----
     Engineering defaults for 30 kHz and 0.5 N.  With p from 1.5 to 2 the law is close to `LoadSharing` at 0.5 to 1 N.
@@ -166,9 +154,9 @@ class FitLaw(FrictionLaw):
     [1.0, 0.48, 0.11]
     """
 
-    floor: float = parameter(0.10, most=0.999)
-    scale: float = parameter(1.1e-6, "m", above=0.0)
-    exponent: float = parameter(1.5, above=0.0)
+    floor: float = parameter(0.10, about="least mu/mu0, r (0.05 to 0.3)", most=0.999)
+    scale: float = parameter(1.1e-6, "m", "amplitude a0 (0.7e-6 to 1.8e-6)", above=0.0)
+    exponent: float = parameter(1.5, about="p (1 to 2)", above=0.0)
 
     def _values(self) -> tuple[float, ...]:
         return FIT, self.floor, self.scale, self.exponent, 1.0, 1.0
@@ -178,26 +166,15 @@ class FitLaw(FrictionLaw):
 class LoadSharing(FrictionLaw):
     """Asperities and a squeeze film carry the load together: W/A = pc exp(-u/u0) + 1.25 p0 (a/u)^2.
 
-    Parameters
-    ----------
-    contact_pressure : float, Pa
-        Of the asperities at zero gap, pc; the load must stay below pc A.
-    decay : float, m
-        Gap u0 over which their share falls by 1/e; about the height of their roughness.
-    pressure : float, Pa
-        Of the air around, p0.
-    area : float, m2
-        Of the contact, A: 0.6e-4 to 2e-4.
-
     Notes
     -----
     Film: Salbu's limit of a large squeeze number; asperities after Wiertlewski et al. 2016.
     """
 
-    contact_pressure: float = parameter(200e3, "Pa", above=0.0)
-    decay: float = parameter(1.5e-6, "m", above=0.0)
-    pressure: float = parameter(101e3, "Pa", above=0.0)
-    area: float = parameter(1e-4, "m2", above=0.0)
+    contact_pressure: float = parameter(200e3, "Pa", "asperities at zero gap, pc; load < pc A", above=0.0)
+    decay: float = parameter(1.5e-6, "m", "gap u0 over which their share falls by 1/e", above=0.0)
+    pressure: float = parameter(101e3, "Pa", "of the air around, p0", above=0.0)
+    area: float = parameter(1e-4, "m2", "of the contact, A (0.6e-4 to 2e-4)", above=0.0)
 
     _unloaded = False
 
@@ -213,24 +190,15 @@ class LoadSharing(FrictionLaw):
 class IntermittentContact(FrictionLaw):
     """mu/mu0 = exp(-c mu0 a f/v): a bouncing skin touches for a part of each cycle.
 
-    Parameters
-    ----------
-    coefficient : float
-        c: 0.5 to 5; with 2, mu0 0.8 and 30 kHz, 1.04 um take the friction to 1/e at 50 mm/s, as `FitLaw` has it.
-    friction : float
-        Friction coefficient mu0 without vibration: 0.3 to 1.2; > 0.
-    frequency : float, Hz
-        Of the vibration, f: 20e3 to 70e3.
-
     Notes
     -----
     After Vezzoli et al. 2017; the form of the group is uncertain.  A finger that stands has no friction
     left at any amplitude > 0, so the law holds while it slides.
     """
 
-    coefficient: float = parameter(2.0, above=0.0)
-    friction: float = parameter(0.8, above=0.0)
-    frequency: float = parameter(30e3, "Hz", above=0.0)
+    coefficient: float = parameter(2.0, about="c (0.5 to 5)", above=0.0)
+    friction: float = parameter(0.8, about="mu0 without vibration (0.3 to 1.2)", above=0.0)
+    frequency: float = parameter(30e3, "Hz", "of the vibration, f (20e3 to 70e3)", above=0.0)
 
     def _values(self) -> tuple[float, ...]:
         return BOUNCE, 0.0, 1.0 / (self.coefficient * self.friction * self.frequency), 1.0, 1.0, 1.0

@@ -9,12 +9,12 @@ With the complex envelopes V and I of voltage and current at the carrier, both l
     L = (w C)^2/((w C)^2 + G^2) = Im(Z_g)^2/|Z_g|^2
     F = kappa |I|^2 L/(4 w^2 eps0 A)
 
-The area changes with the load and only a resting finger shows it: 10 % of area is 11 % of force, and 1 us between the
-two channels about 10 %, because it turns Z.  The force follows |I|^2 at once; only the impedance is averaged over a
-longer time, weighted by power, so that an envelope may pass through zero.
+10 % of area is 11 % of force, and 1 us between the two channels about 10 %, because it turns Z.  The force follows
+|I|^2 at once; only the impedance is averaged over a longer time, weighted by power, so that an envelope may pass
+through zero.
 
-The force cannot be estimated while the finger is away or rests, when it was never seen at rest, or when its gap leaks
-so much that L falls below a bound.  The output is then F = g |I|^2, what a control loop expects of a nominal finger, so
+The force cannot be estimated while the finger is away or rests, before it has rested once, or when its gap leaks so
+much that L falls below a bound.  The output is then F = g |I|^2, what a control loop expects of a nominal finger, so
 that no integrator winds up, and `Flag.OPEN_LOOP` is raised.
 
 References
@@ -25,23 +25,23 @@ Shultz, Peshkin, Colgate 2018 (the sliding gap's impedance); Sun, Guo, Sun 2022 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hapticrender.control.estimators import StarSTDFT
-from hapticrender.control.transfer import require_positive
 from hapticrender.jit import kernel
 from hapticrender.plants.contact import new_record
 from hapticrender.protocols import Array
+
+if TYPE_CHECKING:
+    from hapticrender.plants.electroadhesion import ElectroadhesionParameters
 
 VACUUM = 8.8541878128e-12  # F/m
 LIFTED, RESTING, MOVING = -1, 0, 1  # states of the finger
 SETTLING = 5.0  # time constants of the low pass for which an impedance is not used after a change
 
 GAP = np.dtype(
-    [(name, "f8") for name in ("body_resistance", "least_speed", "least_share", "open_loop_gain")]
+    [(name, "f8") for name in ("body_resistance", "least_speed", "least_leakage", "open_loop_gain")]
     + [
         ("b", "f8", (3,)),  # of the STDFT*
         ("a", "f8", (2,)),
@@ -63,136 +63,44 @@ GAP = np.dtype(
 )
 
 
-@dataclass(frozen=True, kw_only=True)
-class GapEstimator:
-    """Estimator of the attraction from voltage and current at the carrier, for plants and for drivers.
+def gap_record(parameters: ElectroadhesionParameters) -> Array:
+    """Return the record (`GAP`, shape (1,)) of an estimator that has measured nothing, for a finger on this screen."""
+    p = parameters
+    b, a = p.estimator_filter.coefficients
+    return new_record(
+        GAP,
+        p,
+        b=b,
+        a=a[1:],
+        retention=math.exp(-1.0 / (p.estimator_smoothing * p.rate)),
+        settling=math.ceil(SETTLING * p.rate / (2 * math.pi * p.estimator_bandwidth)),
+        series=abs(p.series_impedance),
+        force=p.unevenness / (4 * p.omega**2 * VACUUM),
+        contact=LIFTED,
+    )
+
+
+def estimate_attraction(record: Array, voltage: Array, current: Array, speed: Array) -> tuple[Array, Array]:
+    """Estimate the attraction of n samples, for a driver that measures both channels.
 
     Parameters
     ----------
-    rate, carrier_frequency : float, Hz
-        Sampling rate of the envelopes, and the carrier, > 0.
-    series_impedance : complex, ohm m2
-        Insulator and stratum corneum at the carrier, per area; not 0.
-    open_loop_gain : float, N/A^2
-        g for a finger whose gap cannot be measured, > 0.
-    bandwidth : float, Hz
-        Of the STDFT*, > 0 and < rate/2.
-    smoothing : float, s
-        Time constant over which the impedance is averaged, at least a sample.
-    body_resistance : float, ohm
-    unevenness : float
-        kappa = <d^-2>/<d^-1>^2 of the gap, >= 1.
-    least_speed : float, m/s
-        A slower finger rests, > 0.
-    least_share : float
-        Bound of L, 0 to 1, below which the gap leaks too much for an estimate.
+    record : ndarray
+        From `gap_record`; changed in place, so that a run continues the one before.
+    voltage, current : ndarray of complex, shape (n,), V and A
+        Envelopes at the carrier; the modulus is the amplitude.  Non-finite values count as zero.
+    speed : ndarray, shape (n,), m/s
+        Of the finger, NaN while it is lifted.
 
-    Notes
-    -----
-    `frequency_response` and `delay` are those of a small change of |I|^2 around a constant.
-
-    Examples
-    --------
-    A driver keeps a state between blocks, here of 4 samples with 20 of both channels in each; `phase` (rad) is that of
-    the carrier:
-
-    >>> def envelope(samples, phase):
-    ...     return 2 * np.mean(samples * np.exp(-1j * phase), axis=1)
-    >>> estimator = GapEstimator(
-    ...     rate=10e3, carrier_frequency=20e3, series_impedance=0.06 - 0.49j, open_loop_gain=2.2e4
-    ... )
-    >>> state, phase = estimator.start(), np.arange(80).reshape(4, 20) * np.pi / 5
-    >>> current = envelope(5e-3 * np.cos(phase), phase)
-    >>> force, open_loop = estimator.run(10e3 * current, current, np.zeros(4), state)
-    >>> open_loop.all()
-    np.True_
+    Returns
+    -------
+    force : ndarray, shape (n,), N
+    open_loop : ndarray of bool, shape (n,)
+        Whether the force is that of a nominal finger, because the gap could not be measured.
     """
-
-    rate: float
-    carrier_frequency: float
-    series_impedance: complex
-    open_loop_gain: float
-    bandwidth: float = 1500.0
-    smoothing: float = 5e-3
-    body_resistance: float = 1e3
-    unevenness: float = 1.0
-    least_speed: float = 1e-3
-    least_share: float = 0.5
-
-    def __post_init__(self) -> None:
-        require_positive(
-            rate=self.rate,
-            carrier_frequency=self.carrier_frequency,
-            open_loop_gain=self.open_loop_gain,
-            least_speed=self.least_speed,
-            smoothing=self.smoothing,
-        )
-        for name, least, most, bound in (
-            ("smoothing", 1 / self.rate, math.inf, f">= {1 / self.rate:g} s"),
-            ("body_resistance", 0.0, math.inf, ">= 0 ohm"),
-            ("unevenness", 1.0, math.inf, ">= 1"),
-            ("least_share", 0.0, 1.0, ">= 0 and <= 1"),
-        ):
-            value = getattr(self, name)
-            if not (math.isfinite(value) and least <= value <= most):
-                raise ValueError(f"{name} = {value!r}: must be {bound}")
-        if not 0.0 < abs(self.series_impedance) < math.inf:
-            raise ValueError(f"series_impedance = {self.series_impedance!r}: must be finite and not 0 ohm m2")
-        _ = self.low_pass  # refuses a bad bandwidth
-
-    @property
-    def low_pass(self) -> StarSTDFT:
-        """The STDFT* of both envelopes."""
-        return StarSTDFT(bandwidth=self.bandwidth, rate=self.rate)
-
-    @property
-    def delay(self) -> float:
-        """Group delay of a slow force, s."""
-        return self.low_pass.delay
-
-    def frequency_response(self, frequency: Any) -> Any:
-        """Estimated force per force (complex) at `frequency` (Hz), for a small change of |I|^2."""
-        return self.low_pass.frequency_response(frequency)
-
-    def start(self) -> Array:
-        """Return the state of an estimator that has measured nothing, a record of shape (1,)."""
-        b, a = self.low_pass.coefficients
-        return new_record(
-            GAP,
-            self,
-            b=b,
-            a=a[1:],
-            retention=math.exp(-1.0 / (self.smoothing * self.rate)),
-            settling=math.ceil(SETTLING * self.rate / (2 * math.pi * self.bandwidth)),
-            series=abs(self.series_impedance),
-            force=self.unevenness / (4 * (2 * math.pi * self.carrier_frequency) ** 2 * VACUUM),
-            contact=LIFTED,
-        )
-
-    def run(self, voltage: Array, current: Array, speed: Array, state: Array | None = None) -> tuple[Array, Array]:
-        """Estimate the attraction of n samples.
-
-        Parameters
-        ----------
-        voltage, current : ndarray of complex, shape (n,), V and A
-            Envelopes at the carrier; the modulus is the amplitude.  Non-finite values count as zero.
-        speed : ndarray, shape (n,), m/s
-            Of the finger, NaN while it is lifted.
-        state : ndarray, optional
-            From `start`; changed in place, so that a run continues the one before.  By default a new one.
-
-        Returns
-        -------
-        force : ndarray, shape (n,), N
-        open_loop : ndarray of bool, shape (n,)
-            Whether the force is that of a nominal finger, because the gap could not be measured.
-        """
-        n = len(speed)
-        force, open_loop = np.zeros(n), np.zeros(n, bool)
-        voltage, current = (np.ascontiguousarray(np.broadcast_to(each, n), complex) for each in (voltage, current))
-        record = self.start() if state is None else state
-        _gap_run(record, voltage, current, np.ascontiguousarray(speed, float), force, open_loop)
-        return force, open_loop
+    force, open_loop = np.zeros(len(speed)), np.zeros(len(speed), bool)
+    _gap_run(record, voltage.astype(complex), current.astype(complex), np.asarray(speed, float), force, open_loop)
+    return force, open_loop
 
 
 @kernel
@@ -230,7 +138,7 @@ def gap_step(g, voltage, current, speed):
                 g.static, g.area = impedance, g.series / abs(impedance - g.body_resistance)
             elif g.area > 0.0:
                 g.share = gap.imag * gap.imag / (gap.real * gap.real + gap.imag * gap.imag) if gap.imag < 0.0 else 0.0
-    if contact == MOVING and g.area > 0.0 and g.share > g.least_share:
+    if contact == MOVING and g.area > 0.0 and g.share > g.least_leakage:
         return g.force * power * g.share / g.area, False
     return g.open_loop_gain * power, True
 

@@ -4,11 +4,10 @@ Velocities that feel alike add, in phase [Grigorii et al. 2021]::
 
     v = d/dt (displacement of the glass under the finger) + (v/F) (friction),   v/F = 0.64 m/(N s)
 
-The finger's load acts on both: the plate sags under it, and friction grows with it.  Attraction is a force between skin
-and glass: it presses one on the other as much as it pulls, so that the plate carries the load alone, but for the motion
-of the gap, which is left out.  Friction acts along the plate and does not move it.  What the plate's own vibration
-makes of the normal force, and so of friction, is left out as well: the match v/F was found by fingers that slid over a
-vibrating plate, so it is part of what a plate's velocity feels like.
+The finger's load acts on both: the plate sags under it, and friction grows with it.  Attraction presses skin and glass
+on each other as much as it pulls, so that the plate carries the load alone; friction acts along the plate and does not
+move it.  Left out are the motion of the gap, and what the plate's vibration makes of friction: the match v/F was
+measured by fingers that slid over a vibrating plate.
 """
 
 from __future__ import annotations
@@ -78,17 +77,9 @@ class HybridPlant(CompiledPlant):
     """Plate and screen in discrete time, behind the `Plant` protocol.
 
     Drive: a current for each coil (A), then the screen's; sensed: both ends of the plate (m), then what the screen
-    senses (N); `motion`: the skin's velocity (m/s), then what plate and screen add to it.
-
-    Parameters
-    ----------
-    plate : Plate
-        With both coils.
-    screen : ElectroadhesionScreen
-        At the same rate, under the same finger; any compiled plant of one drive channel and one sensor, whose motion
-        starts with friction (N), will do.
-    velocity_per_force : float, m/(N s)
-        Skin velocity that feels as strong as a newton of friction, > 0.
+    senses (N); `motion`: the skin's velocity (m/s), then what plate and screen add to it.  The screen is any compiled
+    plant of one drive channel and one sensor, whose motion starts with friction (N); `velocity_per_force` (m/(N s)) is
+    the skin velocity that matches a newton of friction, > 0.
 
     Raises
     ------
@@ -125,11 +116,6 @@ class HybridPlant(CompiledPlant):
             self.state[f"{name}_motion"] = row.ctypes.data
         self.state["noise_channels"] = self.noise_channels
         self.state["input_channels"] = screen.inputs(0, 1).shape[1]
-
-    @property
-    def felt(self) -> Array:
-        """What plate and screen add to the skin's velocity (m/s, shape (n, 2)), over the samples of the last run."""
-        return self.motion[:, 1:]
 
     def inputs(self, first: int, n: int) -> Array:
         """Finger and whatever else the screen takes, sample by sample."""

@@ -18,7 +18,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hapticrender.control.device_model import DeviceModel
 from hapticrender.driver_checks import check_driver, check_sensed
 from hapticrender.errors import DesignError, PlateMismatch
 from hapticrender.plants.fitting import (
@@ -89,46 +88,21 @@ class Difference(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class Identified:
-    """An identified plate.
+    """An identified plate."""
 
-    Parameters
-    ----------
-    parameters : PlateParameters
-        Plate with the identified values; `delay` in whole samples, sensor gains with the mean that was expected.
-    estimates : mapping of str to Estimate
-        Every name of `NAMES`: mass (kg), inertia (kg m2), stiffness_1 and _2 (N/m), damping_1 and _2 (N s/m), delay
-        (samples, of the whole loop, fractions included) and gain_difference (sensor 2 less sensor 1, over their mean).
-    noise : float, m rms
-        White noise of a sensor, measured between the lines.
-    residual : float, m rms
-        Motion of an end that the model leaves unexplained beyond the noise.
-    misfit : float
-        Residual on the lines over the noise between them; 1 where the model explains all.
-    misfit_bound : float
-        Largest misfit by chance.
-    load : float, N
-        Static load on the plate.
-    driver_delay : int, samples
-        Delay that the driver states.
-    """
-
-    parameters: PlateParameters
-    estimates: Mapping[str, Estimate]
-    noise: float
-    residual: float
-    misfit: float
-    misfit_bound: float
-    load: float
-    driver_delay: int
+    parameters: PlateParameters  # identified; `delay` in whole samples, sensor gains with the mean that was expected
+    estimates: Mapping[str, Estimate]  # of `NAMES`, in `UNITS`; the delay is of the whole loop, fractions included
+    noise: float  # m rms: white noise of a sensor, measured between the lines
+    residual: float  # m rms: motion of an end that the model leaves unexplained beyond the noise
+    misfit: float  # residual on the lines over the noise between them; 1 where the model explains all
+    misfit_bound: float  # largest misfit by chance
+    load: float  # N, static
+    driver_delay: int  # samples, as the driver states it
 
     @property
     def explained(self) -> bool:
         """Whether the model leaves no more than noise."""
         return self.misfit <= self.misfit_bound
-
-    def device_model(self) -> DeviceModel:
-        """Return the device model of the identified plate, sensor gains included."""
-        return self.parameters.device_model(self.parameters.rate, self.parameters.delay)
 
     def profile(self) -> dict[str, float]:
         """Return the identified parameters, and the others that differ from the defaults, for `Scene.profile`."""
@@ -180,19 +154,10 @@ class Identified:
 
 
 def compare(found: Identified, designed: PlateParameters) -> tuple[Difference, ...]:
-    """Compare an identified plate with the one that a controller is designed for.
+    """Compare an identified plate with the one that a controller is designed for, as in the scene's [device] table.
 
-    Parameters
-    ----------
-    found : Identified
-    designed : PlateParameters
-        Plate as in the scene's [device] table.
-
-    Returns
-    -------
-    tuple of Difference
-        Significant differences: beyond twice the half-width of the 95 % interval, which equal plates exceed in one
-        comparison of a thousand.
+    Returns the significant differences: beyond twice the half-width of the 95 % interval, which equal plates exceed in
+    one comparison of a thousand.
 
     Warns
     -----
@@ -230,23 +195,16 @@ def identify(
     driver : Driver
         Any driver of a plate: two coils, two sensors.
     parameters : PlateParameters
-        Expected plate, for which the drive is designed; electronics, geometry, the mean of the sensor gains and the
-        bending of the glass are taken as given.
-    seconds : float, s
-        Length of the record, enough to resolve the narrowest mode.
-    wait : float, s, >= 2 * 0.05
-        From the first drive to the record; delays up to wait - 0.05 s are identified.
+        Expected plate; electronics, geometry, the mean of the sensor gains and the bending mode are taken as given.
+    seconds, wait : float, s
+        Length of the record, enough to resolve the narrowest mode; and from the first drive to the record, >= 0.1 s:
+        delays up to wait - 0.05 s are identified.
     amplitude : float, m, > 0
         Largest displacement of a glass end, on the expected plate.
     contact : float, N, > 0
         Bound of the static load.
     unexplained : float, > 0
         Bound of the share of the motion that the model leaves unexplained.
-
-    Returns
-    -------
-    Identified
-        Estimates, intervals, and the profile for a scene.
 
     Raises
     ------

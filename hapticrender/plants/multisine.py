@@ -21,39 +21,19 @@ CREST_CLIP = 0.6  # of the peak
 
 
 class Multisine(NamedTuple):
-    """One period of drive, and its lines.
+    """One period of drive, and its lines."""
 
-    Attributes
-    ----------
-    bins : ndarray of int, shape (n,)
-        Lines, in periods a record, ascending.
-    coordinate : ndarray of int, shape (n,)
-        Coordinate that each line drives: 0 heave, 1 rocking.
-    drive : ndarray, shape (samples, 2), A
-        One period, rounded to the steps of the command.
-    motion : float, m
-        Amplitude of every line at the ends of the glass, on the plate that it was designed for.
-    """
-
-    bins: Array
-    coordinate: Array
-    drive: Array
-    motion: float
+    bins: Array  # lines, in periods a record, ascending
+    coordinate: Array  # that each line drives: 0 heave, 1 rocking
+    drive: Array  # one period, rounded to the steps of the command (A, (samples, 2))
+    motion: float  # amplitude of every line at the ends of the glass, on the plate that it was designed for (m)
 
 
 def design_multisine(parameters: PlateParameters, rate: float, samples: int, amplitude: float) -> Multisine:
     """Design lines on a 12 Hz grid, and 3 Hz apart around both modes, that move the glass ends by `amplitude`.
 
-    Parameters
-    ----------
-    parameters : PlateParameters
-        Expected plate.
-    rate : float, Hz
-        Sampling rate.
-    samples : int
-        Length of a period; lines are whole multiples of rate/samples.
-    amplitude : float, m, > 0
-        Largest displacement of a glass end on that plate.
+    `amplitude` (m) is the largest displacement of an end of the expected plate; lines are whole multiples of
+    `rate`/`samples` (Hz).
 
     Raises
     ------

@@ -25,11 +25,13 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from scipy.linalg import block_diag, expm
+from numpy.typing import ArrayLike
+from scipy.linalg import block_diag
 
 from hapticrender.checks import Validated, parameter
 from hapticrender.control.damping import BendingMode
 from hapticrender.control.device_model import DeviceModel
+from hapticrender.mathx import zoh
 from hapticrender.plants.compiled import CompiledPlant, aligned_record
 from hapticrender.plants.plate_kernels import COLUMNS, FUNCTIONS, NODES, PLATE, plate_step
 from hapticrender.protocols import Array
@@ -39,6 +41,7 @@ if TYPE_CHECKING:
     from hapticrender.touch.finger import Finger
 
 PLACES = ("centre", "end 1", "end 2")
+SIDES = np.array([[1.0, -1.0], [1.0, 1.0]])  # displacement of sides 1 and 2 per heave and rocking
 EXPECTED_BENDING = BendingMode(  # estimate for a plate that was not measured: 1.1-1.4 kHz, either sign
     frequency=1250.0, damping=0.01, coupling=(0.1 / 9.5e-3, 0.0), spread=150.0, measured=False
 )
@@ -50,86 +53,40 @@ NOMINAL_AMPLIFIER = (1 - 2e3 / 1.0) / 10e3  # A/V: gain of the default parts, by
 class PlateParameters(Validated):
     """Everything that describes the plate, its electronics and how finely it is modelled.
 
-    Parameters
-    ----------
-    mass, inertia : float, kg, kg m2
-        Moving mass and its inertia about the middle, > 0.
-    stiffness_1, stiffness_2 : float, N/m
-        Coil suspensions, > 0.
-    damping_1, damping_2 : float, N s/m
-        Coil dampings, >= 0.
-    force_constant : float, N/A
-        Of each coil, > 0.
-    coil_spacing, glass_length : float, m
-        Distance between the coils; length of the glass, the sensors sit at its ends.
-    amplifier_r1, amplifier_r2, amplifier_rp : float, ohm
-        Transconductance amplifier, i = V/R1 (1 - R2/Rp).  The drive is the current (A) that the default parts give;
-        other parts give another current.
-    current_limit : float, A
-        Of each coil, > 0 (engineering default).
-    current_bits : int
-        Resolution of the command over +- current_limit; 0 is ideal.
-    sensor_range : float, m
-        Full range of a sensor.
-    sensor_bits : int
-        Resolution over sensor_range; 0 is ideal.
-    sensor_noise : float, m rms
-        White noise of each sensor, >= 0.
-    sensor_gain_1, sensor_gain_2 : float
-        Reading per displacement of each sensor, > 0; the controller assumes 1.
-    rate : float, Hz
-        Sampling rate of the embedded loop.
-    delay : int, samples
-        Loop delay, >= 1: from a sensed sample to the drive computed from it.
-    coils : int
-        2: each at its suspension; 1: in the middle, which moves heave alone.
-    degrees_of_freedom : int
-        2: heave and rocking; 1: heave only.
-    finger_dynamics : int
-        1: the finger's mechanics act on the plate; 0: only its static load.
-    bending_frequency : float, Hz
-        First bending mode of the glass, at most `rate`; 0: the glass is rigid.
-    bending_damping : float
-        Damping ratio of that mode, >= 0.
-    bending_mass : float, kg
-        Its modal mass, the shape being 1 at the sensors; > 0.
-    bending_coil : float
-        Its shape at the coils, -1 to 1.  The coils sit near its nodes, so the sign has to be measured.
-
     Notes
     -----
     Defaults are the printed values of Grigorii et al. 2021; the limits of current and sensors are engineering
     defaults, the numbers of the bending mode are estimates for such a sheet of glass (1.1-1.4 kHz, 9.5 g, 0.01, +-0.1).
     """
 
-    mass: float = parameter(32e-3, "kg", above=0.0)
-    inertia: float = parameter(4e-5, "kg m2", above=0.0)
-    stiffness_1: float = parameter(22.4e3, "N/m", above=0.0)
-    stiffness_2: float = parameter(22.9e3, "N/m", above=0.0)
-    damping_1: float = parameter(0.85, "N s/m")
-    damping_2: float = parameter(0.85, "N s/m")
-    force_constant: float = parameter(7.4, "N/A", above=0.0)
-    coil_spacing: float = parameter(55e-3, "m", above=0.0)
-    glass_length: float = parameter(110e-3, "m", above=0.0)
-    amplifier_r1: float = parameter(10e3, "ohm", above=0.0)
-    amplifier_r2: float = parameter(2e3, "ohm", above=0.0)
-    amplifier_rp: float = parameter(1.0, "ohm", above=0.0)
-    current_limit: float = parameter(3.0, "A", above=0.0)
-    current_bits: int = parameter(12, most=24)
-    sensor_range: float = parameter(2e-3, "m", above=0.0)
-    sensor_bits: int = parameter(14, most=24)
-    sensor_noise: float = parameter(1e-6, "m")
-    sensor_gain_1: float = parameter(1.0, above=0.0)
-    sensor_gain_2: float = parameter(1.0, above=0.0)
-    rate: float = parameter(5000.0, "Hz", least=500.0, most=1000000.0)
-    delay: int = parameter(1, "samples", least=1, most=100_000)
-    coils: int = parameter(2, least=1, most=2)
-    degrees_of_freedom: int = parameter(2, least=1, most=2)
-    finger_dynamics: int = parameter(1, most=1)
-    bending_frequency: float = parameter(0.0, "Hz")
-    bending_damping: float = parameter(0.01)
-    bending_mass: float = parameter(9.5e-3, "kg", above=0.0)
-    bending_coil: float = parameter(-0.1, least=-1.0, most=1.0)
+    mass: float = parameter(32e-3, "kg", "moving mass", above=0.0)
+    inertia: float = parameter(4e-5, "kg m2", "about the middle", above=0.0)
+    stiffness_1: float = parameter(22.4e3, "N/m", "coil suspension", above=0.0)
+    stiffness_2: float = parameter(22.9e3, "N/m", "coil suspension", above=0.0)
+    damping_1: float = parameter(0.85, "N s/m", "of a coil")
+    damping_2: float = parameter(0.85, "N s/m", "of a coil")
+    force_constant: float = parameter(7.4, "N/A", "of each coil", above=0.0)
+    coil_spacing: float = parameter(55e-3, "m", "distance between the coils", above=0.0)
+    glass_length: float = parameter(110e-3, "m", "the sensors sit at its ends", above=0.0)
+    amplifier_r1: float = parameter(10e3, "ohm", "R1; the drive is the current that the default parts give", above=0.0)
+    amplifier_r2: float = parameter(2e3, "ohm", "R2; i = V/R1 (1 - R2/Rp)", above=0.0)
+    amplifier_rp: float = parameter(1.0, "ohm", "Rp", above=0.0)
+    current_limit: float = parameter(3.0, "A", "of each coil", above=0.0)
+    current_bits: int = parameter(12, about="resolution over +- current_limit, 0 is ideal", most=24)
+    sensor_range: float = parameter(2e-3, "m", "full range of a sensor", above=0.0)
+    sensor_bits: int = parameter(14, about="resolution over sensor_range, 0 is ideal", most=24)
+    sensor_noise: float = parameter(1e-6, "m", "white noise of a sensor, rms")
+    sensor_gain_1: float = parameter(1.0, about="reading per displacement", above=0.0)
+    sensor_gain_2: float = parameter(1.0, about="reading per displacement", above=0.0)
+    rate: float = parameter(5000.0, "Hz", "of the embedded loop", least=500.0, most=1000000.0)
+    delay: int = parameter(1, "samples", "from a sensed sample to the drive computed from it", least=1, most=100_000)
+    coils: int = parameter(2, about="2: at the suspensions, 1: in the middle, for heave alone", least=1, most=2)
+    degrees_of_freedom: int = parameter(2, about="2: heave and rocking, 1: heave only", least=1, most=2)
+    finger_dynamics: int = parameter(1, about="1: the finger's mechanics act, 0: only its static load", most=1)
+    bending_frequency: float = parameter(0.0, "Hz", "of the first bending mode, at most rate; 0: rigid glass")
+    bending_damping: float = parameter(0.01, about="damping ratio of that mode")
+    bending_mass: float = parameter(9.5e-3, "kg", "modal mass, the shape being 1 at the sensors", above=0.0)
+    bending_coil: float = parameter(-0.1, about="shape at the coils; its sign must be measured", least=-1.0, most=1.0)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -164,19 +121,22 @@ class PlateParameters(Validated):
     @property
     def damping_matrix(self) -> Array:
         """C (N s/m, shape (2, 2))."""
-        return _pair(self.damping_1, self.damping_2)
+        return SIDES.T @ np.diag([self.damping_1, self.damping_2]) @ SIDES
 
     @property
     def stiffness_matrix(self) -> Array:
         """K (N/m, shape (2, 2))."""
-        return _pair(self.stiffness_1, self.stiffness_2)
+        return SIDES.T @ np.diag([self.stiffness_1, self.stiffness_2]) @ SIDES
 
     @property
     def force_from_drive(self) -> Array:
         """Generalised forces per coil current (N/A, shape (2, coils))."""
-        if self.coils == 1:
-            return self.force_constant * np.array([[1.0], [0.0]])
-        return self.force_constant * np.array([[1.0, 1.0], [-1.0, 1.0]])
+        return self.force_constant * (SIDES.T if self.coils == 2 else np.eye(2)[:, :1])
+
+    @property
+    def ends(self) -> tuple[float, float]:
+        """Positions of the sensors (m from the middle)."""
+        return -self.glass_length / 2, self.glass_length / 2
 
     @property
     def bending(self) -> BendingMode | None:
@@ -189,14 +149,16 @@ class PlateParameters(Validated):
             coupling=(self.bending_coil / self.bending_mass, 0.0),
         )
 
-    def bending_shape(self, position: Array | float) -> Array:
-        """Shape of the bending mode at `position` (m from the middle), that of a free bar: 1 at the ends, -0.61 there.
+    def displacement(self, position: ArrayLike) -> Array:
+        """Displacement of the glass at `position` (m) per heave, rocking and bending, shape (..., 3).
 
-        The coils have a number of their own, `bending_coil`: a free bar would give -0.099 at the quarter points.
+        The bending mode has the shape of a free bar: 1 at the ends, -0.61 in the middle.  The coils have a number of
+        their own, `bending_coil`: a free bar would give -0.099 at the quarter points.
         """
-        wavenumber, grow, wave = self.bending_bar
-        angle = wavenumber * np.asarray(position, float)
-        return grow * np.cosh(angle) + wave * np.cos(angle)
+        position = np.asarray(position, float)
+        wavenumber, of_cosh, of_cos = self.bending_bar
+        bending = of_cosh * np.cosh(wavenumber * position) + of_cos * np.cos(wavenumber * position)
+        return np.stack([np.ones_like(position), position / self.half_spacing, bending], axis=-1)
 
     @property
     def bending_bar(self) -> tuple[float, float, float]:
@@ -214,32 +176,20 @@ class PlateParameters(Validated):
         poles = poles[np.argsort(abs(poles))]
         return abs(poles) / (2 * np.pi), -poles.real / abs(poles)
 
-    def static_load(self, side_1: float, side_2: float) -> tuple[float, float]:
-        """Normal load (N) and finger position (m from the middle, towards side 2) from the slow sag of the sides (m).
-
-        W = -(k1 x1 + k2 x2); the distance from transducer 2 towards 1 is d k1 x1/(k1 x1 + k2 x2), which the
-        paper prints as d (k2 x2/(k1 x1) + 1)^-1 and so divides by zero where side 1 does not sag.
-        """
-        carried_1, carried_2 = self.stiffness_1 * side_1, self.stiffness_2 * side_2
-        load = -(carried_1 + carried_2)
-        if load == 0.0:
-            raise ValueError(f"{side_1=}, {side_2=}: the sides carry no net load, so it has no position")
-        return load, self.half_spacing + self.coil_spacing * carried_1 / load
-
-    def dynamic_stiffness(self, frequency: Array, finger: Array | complex = 0.0, position: float = 0.0) -> Array:
+    def dynamic_stiffness(self, frequency: Array, finger: Array | complex = 0.0, position: ArrayLike = 0.0) -> Array:
         """D(j w) in heave and rocking (N/m, shape (..., 2, 2)) under a finger impedance (N s/m) at `position` (m).
 
         The glass counts as rigid, also where it bends: near and above `bending_frequency` this is no longer the plate.
         """
         s = 2j * np.pi * np.asarray(frequency, float)[..., None, None]
-        lever = np.array([1.0, position / self.half_spacing])
-        load = np.asarray(finger, complex)[..., None, None] * s * np.outer(lever, lever)
+        lever = self.displacement(position)[..., :2]
+        load = np.asarray(finger)[..., None, None] * s * lever[..., :, None] * lever[..., None, :]
         return self.mass_matrix * s**2 + self.damping_matrix * s + self.stiffness_matrix + load
 
     def device_model(self, rate: float, delay: int) -> DeviceModel:
-        """What the controller may know of this plate, in a loop of `rate` (Hz) and `delay` (samples)."""
-        reach, n = self.glass_length / self.coil_spacing, self.coils  # one coil moves one coordinate
-        ends_from_coordinate = np.array([[1.0, -reach], [1.0, reach]])
+        """Device model of this plate without a finger, in a loop of `rate` (Hz) and `delay` (samples)."""
+        n = self.coils  # one coil moves one coordinate
+        places = self.displacement([0.0, *self.ends])[:, :2]
         return DeviceModel(
             rate=rate,
             delay=delay,
@@ -247,9 +197,9 @@ class PlateParameters(Validated):
             damping=self.damping_matrix[:n, :n],
             stiffness=self.stiffness_matrix[:n, :n],
             force_from_drive=self.force_from_drive[:n],
-            coordinate_from_sensed=np.linalg.inv(ends_from_coordinate)[:n] / (self.sensor_gain_1, self.sensor_gain_2),
-            side_from_coordinate=np.array([[1.0, -1.0], [1.0, 1.0]])[:n, :n],
-            place_from_coordinate=np.array([[1.0, 0.0], [1.0, -reach], [1.0, reach]])[:, :n],
+            coordinate_from_sensed=np.linalg.inv(places[1:])[:n] / (self.sensor_gain_1, self.sensor_gain_2),
+            side_from_coordinate=SIDES[:n, :n],
+            place_from_coordinate=places[:, :n],
             places=PLACES,
             drive_limit=self.current_limit,
             sensed_limit=self.sensor_range / 2,
@@ -260,24 +210,12 @@ class PlateParameters(Validated):
         )
 
 
-def _pair(side_1: float, side_2: float) -> Array:
-    """Two equal-kind elements at the coils, in heave and rocking."""
-    return np.array([[side_1 + side_2, side_2 - side_1], [side_2 - side_1, side_1 + side_2]])
-
-
 class Structure(NamedTuple):
     """Plate and finger as M q'' + C q' + K q = inputs u, y = outputs q.
 
-    The coordinates q (m) are heave, rocking (displacement at the coils; unless it is locked), bending (displacement of
-    the sensors; where the glass bends) and the phalanx (under a finger of order 4), n in all.
-
-    Attributes
-    ----------
-    mass, damping, stiffness : ndarray, shape (n, n), kg, N s/m, N/m
-    inputs : ndarray, shape (n, coils + 1)
-        Forces per coil current (N/A), and per normal load of the finger.
-    outputs : ndarray, shape (4, n)
-        Displacements at centre, end 1, end 2 and of the glass under the finger; its rows give velocities from q'.
+    Coordinates q (m): heave, rocking (displacement at the coils; unless it is locked), bending (displacement of the
+    sensors; where the glass bends) and the phalanx (of order 4).  Inputs u: coil currents (A), normal load (N).
+    Outputs y (m): displacement of centre, end 1, end 2 and of the glass under the finger.
     """
 
     mass: Array
@@ -288,80 +226,45 @@ class Structure(NamedTuple):
 
     def zero_order_hold(self, rate: float) -> tuple[Array, Array]:
         """Phi (2n, 2n) and Gamma (2n, inputs) of [q, q'] from sample to sample (Hz) under held inputs, exactly."""
-        n, m = self.inputs.shape
-        generator = np.zeros((2 * n + m, 2 * n + m))
-        generator[:n, n : 2 * n] = np.eye(n)
-        generator[n : 2 * n] = np.linalg.solve(self.mass, np.hstack([-self.stiffness, -self.damping, self.inputs]))
-        held = expm(generator / rate)[: 2 * n]
-        return held[:, : 2 * n], held[:, 2 * n :]
+        n, zero = len(self.mass), np.zeros_like(self.mass)
+        a = np.block([[zero, np.eye(n)], [-np.linalg.solve(self.mass, np.hstack([self.stiffness, self.damping]))]])
+        return zoh(a, np.vstack([0 * self.inputs, np.linalg.solve(self.mass, self.inputs)]), 1.0 / rate)
 
 
 def structure(
     parameters: PlateParameters, mechanics: FingerMechanics = NONE, position: float = 0.0, strength: float = 1.0
 ) -> Structure:
-    """Assemble mass, damping and stiffness matrices of the plate with a finger on it.
+    """Assemble mass, damping and stiffness matrices of the plate with a finger at `position` (m from the middle).
 
-    Parameters
-    ----------
-    parameters : PlateParameters
-    mechanics : FingerMechanics
-        Order 0 adds nothing but the normal load, 2 its impedance, 4 the phalanx as a coordinate of its own.
-    position : float, m
-        Of the finger, from the middle.
-    strength : float
-        Factor on the finger's impedance, >= 0; 0: the finger is lifted.
-
-    Raises
-    ------
-    ValueError
-        A finger of order 4 has a phalanx without mass.
+    `mechanics` of order 0 add nothing but the normal load, of 2 their impedance, of 4 the phalanx as a coordinate of
+    its own, which needs a mass (ValueError).  `strength` is a factor on the impedance, >= 0; 0: the finger is lifted.
     """
-    order = mechanics.order if parameters.finger_dynamics and strength > 0.0 else 0
+    p, order = parameters, mechanics.order if parameters.finger_dynamics and strength > 0.0 else 0
     if order == 4 and not mechanics.phalanx_mass > 0.0:
         raise ValueError(f"phalanx_mass = {mechanics.phalanx_mass!r} kg: must be > 0")
-    omega, modal = 2 * math.pi * parameters.bending_frequency, parameters.bending_mass
-    reach, centre, bend = (
-        parameters.glass_length / parameters.coil_spacing,
-        *parameters.bending_shape(np.array([0.0, position])),
-    )
-    diagonals = (
-        (parameters.mass_matrix, modal, mechanics.phalanx_mass),
-        (parameters.damping_matrix, 2 * parameters.bending_damping * omega * modal, mechanics.phalanx_damping),
-        (parameters.stiffness_matrix, omega**2 * modal, mechanics.phalanx_stiffness),
-    )
-    matrices = [block_diag(rigid, bent, strength * phalanx) for rigid, bent, phalanx in diagonals]
-    glass = np.array([1.0, position / parameters.half_spacing, bend, 0.0])  # its displacement under the finger
-    tissue = glass - [0.0, 0.0, 0.0, order == 4]
-    if order:
-        for matrix, value, acting in zip(
-            matrices, (mechanics.mass, mechanics.damping, mechanics.stiffness), (glass, tissue, tissue), strict=True
-        ):
-            matrix += strength * value * np.outer(acting, acting)
-    coils = parameters.force_from_drive
-    bending_force = np.full((1, parameters.coils), parameters.force_constant * parameters.bending_coil)
-    inputs = np.column_stack([np.vstack([coils, bending_force, 0 * bending_force]), -glass])
-    outputs = np.array([[1.0, 0.0, centre, 0.0], [1.0, -reach, 1.0, 0.0], [1.0, reach, 1.0, 0.0], glass])
-    kept = np.flatnonzero([True, parameters.degrees_of_freedom == 2, omega > 0.0, order == 4])
+    omega, modal = 2 * math.pi * p.bending_frequency, p.bending_mass
+    output = np.pad(p.displacement([0.0, *p.ends, position]), ((0, 0), (0, 1)))
+    tissue = output[-1] - [0.0, 0.0, 0.0, order == 4]
+    matrices = []
+    for plate, bending, phalanx, finger, acting in (
+        (p.mass_matrix, modal, mechanics.phalanx_mass, mechanics.mass, output[-1]),
+        (p.damping_matrix, 2 * p.bending_damping * omega * modal, mechanics.phalanx_damping, mechanics.damping, tissue),
+        (p.stiffness_matrix, omega**2 * modal, mechanics.phalanx_stiffness, mechanics.stiffness, tissue),
+    ):
+        matrix = block_diag(plate, bending, strength * phalanx)
+        matrices.append(matrix + strength * finger * np.outer(acting, acting) if order else matrix)
+    forces = np.vstack([p.force_from_drive, np.full(p.coils, p.force_constant * p.bending_coil), np.zeros(p.coils)])
+    kept = np.flatnonzero([True, p.degrees_of_freedom == 2, omega > 0.0, order == 4])
     mass, damping, stiffness = (matrix[np.ix_(kept, kept)] for matrix in matrices)
-    return Structure(mass, damping, stiffness, inputs[kept], outputs[:, kept])
+    inputs = np.column_stack([forces, -output[-1]])[kept]
+    return Structure(mass, damping, stiffness, inputs, output[:, kept])
 
 
 class Plate(CompiledPlant):
-    """The plate in discrete time, behind the `Plant` protocol.
+    """The plate in discrete time, behind the `Plant` protocol; `block` samples a call of `run`, the rest queued inside.
 
     `motion` holds the displacements at `PLACES` (m) and, in a fourth column, the velocity of the glass under the
     finger (m/s).
-
-    Parameters
-    ----------
-    parameters : PlateParameters
-        The plate and its levels of modelling.
-    finger : Finger
-        Its position, normal load and mechanics.
-    seed : int
-        Of the sensor noise.
-    block : int, samples
-        Samples of a `run` call; the rest of the delay is queued inside.
     """
 
     step = plate_step

@@ -21,7 +21,7 @@ from hapticrender.plants.compiled import CompiledPlant
 from hapticrender.plants.contact import SlidingParameters, new_record, sliding_record
 from hapticrender.plants.friction_laws import LAWS, FrictionLaw
 from hapticrender.plants.ultrasonic import LEVELS, UltrasonicParameters, mode_inputs, mode_record
-from hapticrender.plants.ultrasonic_kernels import AMPLITUDE, SKIN_VELOCITY, SURFACE, surface_step
+from hapticrender.plants.ultrasonic_kernels import AMPLITUDE, SURFACE, surface_step
 from hapticrender.protocols import Array
 
 if TYPE_CHECKING:
@@ -43,45 +43,26 @@ LEAST_AMPLITUDE = 0.05e-6  # m: below it a resonance cannot be detected
 class SurfaceParameters(SlidingParameters):
     """Parameters of the surface, of its mode and friction law, and of the model's level.
 
-    Parameters
-    ----------
-    rate, friction_coefficient, memory_length, least_speed : float
-        See `SlidingParameters`; `rate` is that of the friction.
-    tribometer_frequency, tribometer_damping, force_noise, force_range, force_bits : float or int
-        See `SlidingParameters`.
-    level : {"carrier", "envelope"}
-        Whether the mode is simulated where it is.
-    sensor : {"amplitude", "tribometer"}
-        What is sensed: the friction that the sensed amplitude leaves by the law, or that of a tribometer.
-    law : {"fit", "load-sharing", "intermittent"}
-        Of friction over amplitude; its own numbers are those of `friction_laws`.
-    bias : float
-        Friction without a texture, mu/mu0: 0.1 to 0.95.
-    lock : float, Hz
-        Bandwidth of the resonance lock, 0 to 100 (1-20); 0: none.
-    oversampling, envelope_oversampling : int
-        Samples of the carrier in one of the friction, at either level.
-    mode : UltrasonicParameters
-        The plate; its rate and level follow from those above.
-    law_parameters : mapping
-        Numbers of the law that differ from its defaults.
-
     Notes
     -----
     Bias, lock and oversampling are engineering defaults.  The mode's sensor keeps the density of its noise whatever the
     oversampling; see `UltrasonicParameters`.
     """
 
-    rate: float = parameter(12e3, "Hz", least=1e3, most=1e6)
-    level: str = option("carrier", *LEVELS)
-    sensor: str = option("amplitude", "amplitude", "tribometer")
-    law: str = option("fit", *LAWS)
-    bias: float = parameter(0.55, least=0.1, most=0.95)
-    lock: float = parameter(20.0, "Hz", most=100.0)
-    oversampling: int = parameter(32, "samples", least=1, most=1000)
-    envelope_oversampling: int = parameter(4, "samples", least=1, most=1000)
-    mode: UltrasonicParameters = field(default_factory=UltrasonicParameters, metadata={"free": True})
-    law_parameters: Mapping[str, float] = field(default_factory=dict, hash=False, metadata={"free": True})
+    rate: float = parameter(12e3, "Hz", "of the friction", least=1e3, most=1e6)
+    level: str = option("carrier", *LEVELS, about="whether the mode is simulated where it is")
+    sensor: str = option("amplitude", "amplitude", "tribometer", about="what gives friction")
+    law: str = option("fit", *LAWS, about="of friction over amplitude, see `friction_laws`")
+    bias: float = parameter(0.55, about="friction without a texture, mu/mu0", least=0.1, most=0.95)
+    lock: float = parameter(20.0, "Hz", "bandwidth of the resonance lock (1-20), 0: none", most=100.0)
+    oversampling: int = parameter(32, "samples", "samples of the carrier in one of the friction", least=1, most=1000)
+    envelope_oversampling: int = parameter(4, "samples", 'the same at level "envelope"', least=1, most=1000)
+    mode: UltrasonicParameters = field(
+        default_factory=UltrasonicParameters, metadata={"about": "rate and level are set"}
+    )
+    law_parameters: Mapping[str, float] = field(
+        default_factory=dict, hash=False, metadata={"about": "that differ from defaults"}
+    )
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -147,12 +128,10 @@ class SurfaceParameters(SlidingParameters):
 def resonant(model: DeviceModel, mode: UltrasonicParameters, lock: float) -> DeviceModel:
     """Device model of a mode whose carrier is locked to its resonance with a bandwidth of `lock` (Hz).
 
-    Observer and integral grow with the pace, what they lose by being late with the delay.  With an inner loop the
-    pace leaves 45 degrees of phase, as measured with delays of 1 to 4 samples at 192 and 384 kHz; where the margins
-    allow none though it would answer in time (96 kHz, 70 kHz at 192 kHz), a touch costs several times as much.
-    Without one (a block device) it leaves a modulus margin of 0.35 (Ms 2.9), what is learnt of a finger being part
-    of the loop: thin, but at two thirds of it a texture of 400 Hz behind the longest delay is 12 % off in place of
-    3 %.
+    Observer and integral grow with the pace, what they lose by delay with the delay.  With an inner loop the pace
+    leaves 45 degrees of phase, as measured with delays of 1 to 4 samples at 192 and 384 kHz.  Without one (a block
+    device) it leaves a modulus margin of 0.35 (Ms 2.9), the finger estimate being part of the loop: thin, but at two
+    thirds of it a texture of 400 Hz behind the longest delay is 12 % off in place of 3 %.
     """
     stiffness, damping = float(model.stiffness[0, 0]), float(model.damping[0, 0])
     detuned = 2 * MOST_DETUNING * stiffness * mode.frequency / mode.carrier  # shifts are kept in Hz at either level
@@ -196,23 +175,13 @@ def full_slew(mode: UltrasonicParameters) -> float:
 class UltrasonicSurface(CompiledPlant):
     """The surface in discrete time, behind the `Plant` protocol.
 
-    Parameters
-    ----------
-    parameters : SurfaceParameters
-        The surface and its level of modelling.
-    amplitude : Controller
-        The amplitude loop, designed for `parameters.amplitude_model()` and `parameters.amplitude_bands()`, with a
-        compiled step that takes single samples.
-    finger : Finger
-        Where the finger is, how hard it presses, and its lateral mechanics.
-    seed : int
-        Of the noise.
-    nominal : (float, float), N and m/s
-        Load and speed that the amplitude is held for while no finger is there.
+    `amplitude` is the amplitude loop, designed for `parameters.amplitude_model()` and `parameters.amplitude_bands()`,
+    with a compiled step that takes single samples; it holds the `nominal` load (N) and speed (m/s) while no finger is
+    there.  `motion`: friction (N), and the amplitude (m).
     """
 
     step = surface_step
-    motion_channels = 3
+    motion_channels = 2
 
     def __init__(
         self,
@@ -225,7 +194,7 @@ class UltrasonicSurface(CompiledPlant):
         super().__init__(finger, parameters.rate, seed=seed)
         self.parameters, self.loop = parameters, amplitude
         self.noise_channels = 1 + parameters.substeps
-        self.state, queue = surface_record(parameters, amplitude, finger, nominal)
+        self.state, queue = surface_record(parameters, amplitude, nominal)
         self.buffers = (queue,)
 
     def inputs(self, first: int, n: int) -> Array:
@@ -233,20 +202,13 @@ class UltrasonicSurface(CompiledPlant):
         return mode_inputs(self.parameters.carrier_mode, super().inputs(first, n), first, self.rate)
 
     @property
-    def skin_velocity(self) -> Array:
-        """Velocity of the skin under friction (m/s, shape (n,)), against the motion, over the last run."""
-        return self.motion[:, SKIN_VELOCITY]
-
-    @property
     def amplitude(self) -> Array:
         """True amplitude of the mode (m, shape (n,)) in each sample of the last run."""
         return self.motion[:, AMPLITUDE]
 
 
-def surface_record(
-    parameters: SurfaceParameters, amplitude: Any, finger: Finger, nominal: tuple[float, float]
-) -> tuple[Array, Array]:
-    """Return the record (`SURFACE`, shape (1,)) of a surface at rest with this finger on it, and its drive's queue."""
+def surface_record(parameters: SurfaceParameters, amplitude: Any, nominal: tuple[float, float]) -> tuple[Array, Array]:
+    """Return the record (`SURFACE`, shape (1,)) of a surface at rest, and its drive's queue."""
     p, mode = parameters, parameters.carrier_mode
     inner, queue = mode_record(mode, mode.delay - 1)
     record = new_record(
@@ -263,7 +225,7 @@ def surface_record(
         reached=-1.0,
         law=p.friction_law.numbers,
         mode=inner[0],
-        sliding=sliding_record(p, finger.mechanics)[0],
+        sliding=sliding_record(p)[0],
     )
     for name in ("drive", "sensed", "position", "waveform", "target", "flags"):
         record["signals"][name] = record[name].ctypes.data

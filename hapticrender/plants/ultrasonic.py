@@ -36,7 +36,6 @@ if TYPE_CHECKING:
 
 LEVELS = ("carrier", "envelope")
 NOMINAL_LOAD = 0.5  # N: at which `finger_damping` and `finger_shift` hold
-NOMINAL_AMPLITUDE = 3e-6  # m: at which `headroom` is stated
 MOST_LOAD = 20.0  # N: largest load
 MOST_DAMPING_RATIO = 0.5
 MOST_SHIFT = 0.25  # of the carrier
@@ -48,44 +47,6 @@ WARMING = 1000  # steps a second in which the temperature rises
 class UltrasonicParameters(Validated):
     """Parameters of the mode, of its electronics and of the model's level.
 
-    Parameters
-    ----------
-    frequency : float, Hz
-        Undamped resonance of the free, cold plate: 20e3 to 70e3.
-    modal_mass : float, kg
-        3e-3 to 8e-3 in the literature; > 0.
-    quality : float
-        Of the free plate: 100 to 400; >= 5.
-    finger_damping : float, N s/m
-        That a finger of 0.5 N adds; grows with the cube root of the load; >= 0.
-    finger_shift : float, Hz
-        Of the resonance under a finger of 0.5 N, growing alike: -60 to -10.
-    temperature_coefficient : float, 1/K
-        Of the resonance: -200e-6 to -50e-6.
-    temperature_rise : float, K
-        That the plate reaches, within +-100.
-    temperature_time : float, s
-        In which it does so, linearly (in steps of 1 ms); > 0.
-    drive_limit : float, V
-        Largest drive, > 0.
-    force_constant : float, N/V
-        Modal force per drive, > 0.  The default drives the plate under a 0.5 N finger to 6 um (peak) at its
-        resonance, F = b w a: 6 um * 15.7 N s/m * 2 pi 30 kHz / 10 V; see `headroom`.
-    sensor_range : float, m
-        Full range of the sensor.
-    sensor_bits, drive_bits : int
-        Resolution over `sensor_range` and over +- `drive_limit`; 0 is ideal.
-    sensor_noise : float, m rms
-        White noise of each sample at `rate`, >= 0; at another rate its density stays.
-    rate : float, Hz
-        Sampling rate of the loop; the default is what a sound card can do.
-    delay : int, samples
-        Loop delay, >= 1: from a sensed sample to the drive computed from it.
-    level : {"carrier", "envelope"}
-        Whether the mode is simulated where it is, or moved down to `envelope_frequency`.
-    envelope_frequency : float, Hz
-        Carrier at level "envelope"; >= 500 and below `frequency`.
-
     Notes
     -----
     The defaults are engineering values (docs/theory.md), not measurements.
@@ -93,28 +54,30 @@ class UltrasonicParameters(Validated):
     Examples
     --------
     >>> plate = UltrasonicParameters()
-    >>> [round(float(plate.pole(load)), 1) for load in (0.0, 0.5)], round(plate.headroom, 2)
-    ([75.0, 250.1], 2.0)
+    >>> [round(float(plate.pole(load)), 1) for load in (0.0, 0.5)]
+    [75.0, 250.1]
     """
 
-    frequency: float = parameter(30e3, "Hz", least=20e3, most=70e3)
-    modal_mass: float = parameter(5e-3, "kg", above=0.0)
-    quality: float = parameter(200.0, least=5.0, most=1e5)
-    finger_damping: float = parameter(11.0, "N s/m")
-    finger_shift: float = parameter(-30.0, "Hz", least=-1e4, most=1e4)
-    temperature_coefficient: float = parameter(-100e-6, "1/K", least=-1e-3, most=1e-3)
-    temperature_rise: float = parameter(0.0, "K", least=-100.0, most=100.0)
-    temperature_time: float = parameter(1.0, "s", above=0.0)
-    drive_limit: float = parameter(10.0, "V", above=0.0)
-    force_constant: float = parameter(1.777, "N/V", above=0.0)
-    sensor_range: float = parameter(50e-6, "m", above=0.0)
-    sensor_bits: int = parameter(16, least=0, most=24)
-    drive_bits: int = parameter(16, least=0, most=24)
-    sensor_noise: float = parameter(2e-9, "m")
-    rate: float = parameter(192e3, "Hz", least=500.0, most=1e7)
-    delay: int = parameter(1, "samples", least=1, most=100_000)
-    level: str = option("carrier", *LEVELS)
-    envelope_frequency: float = parameter(6e3, "Hz", least=500.0)
+    frequency: float = parameter(30e3, "Hz", "undamped resonance of the free, cold plate", least=20e3, most=70e3)
+    modal_mass: float = parameter(5e-3, "kg", "3e-3 to 8e-3 in the literature", above=0.0)
+    quality: float = parameter(200.0, about="of the free plate: 100 to 400", least=5.0, most=1e5)
+    finger_damping: float = parameter(11.0, "N s/m", "under 0.5 N, growing with the cube root of the load")
+    finger_shift: float = parameter(-30.0, "Hz", "of the resonance, alike: -60 to -10", least=-1e4, most=1e4)
+    temperature_coefficient: float = parameter(
+        -100e-6, "1/K", "of the resonance (-200e-6 to -50e-6)", least=-1e-3, most=1e-3
+    )
+    temperature_rise: float = parameter(0.0, "K", "that the plate reaches", least=-100.0, most=100.0)
+    temperature_time: float = parameter(1.0, "s", "in which it does so, linearly (in steps of 1 ms)", above=0.0)
+    drive_limit: float = parameter(10.0, "V", "largest drive", above=0.0)
+    force_constant: float = parameter(1.777, "N/V", "modal force per drive", above=0.0)
+    sensor_range: float = parameter(50e-6, "m", "full range of the sensor", above=0.0)
+    sensor_bits: int = parameter(16, about="resolution over sensor_range, 0 is ideal", least=0, most=24)
+    drive_bits: int = parameter(16, about="resolution over +- drive_limit, 0 is ideal", least=0, most=24)
+    sensor_noise: float = parameter(2e-9, "m", "white noise of each sample, rms; at another rate its density stays")
+    rate: float = parameter(192e3, "Hz", "of the loop; the default is what a sound card can do", least=500.0, most=1e7)
+    delay: int = parameter(1, "samples", "from a sensed sample to the drive computed from it", least=1, most=100_000)
+    level: str = option("carrier", *LEVELS, about="mode simulated where it is, or moved down to `envelope_frequency`")
+    envelope_frequency: float = parameter(6e3, "Hz", 'carrier at level "envelope", below `frequency`', least=500.0)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -143,7 +106,7 @@ class UltrasonicParameters(Validated):
 
     def sampled(self, rate: float) -> UltrasonicParameters:
         """Return the same plate at `rate` (Hz); the sensor's noise keeps its density."""
-        return replace(self, rate=rate, sensor_noise=self._noise_at(rate))
+        return replace(self, rate=rate, sensor_noise=self.sensor_noise * math.sqrt(max(rate, 0.0) / self.rate))
 
     def transposed(self, frequency: float, rate: float) -> UltrasonicParameters:
         """Return the same plate at level "envelope": its mode on a carrier of `frequency` (Hz) at `rate` (Hz).
@@ -151,12 +114,8 @@ class UltrasonicParameters(Validated):
         The sensor's noise keeps its density, so that it disturbs the envelope alike; its resolution stays, and with
         it grows the density of rounding.  The delay stays in samples: at a lower rate it is a longer one.
         """
-        noise = self._noise_at(rate)
+        noise = self.sensor_noise * math.sqrt(max(rate, 0.0) / self.rate)
         return replace(self, level="envelope", envelope_frequency=frequency, rate=rate, sensor_noise=noise)
-
-    def _noise_at(self, rate: float) -> float:
-        """Noise of a sample (m rms) at `rate` (Hz), of the same density."""
-        return self.sensor_noise * math.sqrt(rate / self.rate) if rate > 0.0 else self.sensor_noise
 
     @property
     def carrier(self) -> float:
@@ -212,11 +171,6 @@ class UltrasonicParameters(Validated):
         return tuned * math.hypot(1.0, modulation / float(self.pole(normal_load)))
 
     @property
-    def headroom(self) -> float:
-        """Amplitude at full drive under a 0.5 N finger, over 3 um."""
-        return self.drive_limit / self.drive_for(NOMINAL_AMPLITUDE, normal_load=NOMINAL_LOAD)
-
-    @property
     def drive_step(self) -> float:
         """Resolution of the drive (V); 0 is ideal."""
         return 2 * self.drive_limit / 2**self.drive_bits if self.drive_bits else 0.0
@@ -254,18 +208,9 @@ def _finger_scale(normal_load: Array | float) -> Array:
 
 
 class UltrasonicPlate(CompiledPlant):
-    """The mode in discrete time, behind the `Plant` protocol.
+    """The mode in discrete time, behind the `Plant` protocol; `block` samples a call of `run`, the rest queued inside.
 
-    Parameters
-    ----------
-    parameters : UltrasonicParameters
-        The plate and its level of modelling.
-    finger : Finger
-        Where the finger is and how hard it presses; its own mechanics are too slow to matter.
-    seed : int
-        Of the sensor noise.
-    block : int
-        Samples a call of `run`; the rest of the delay is queued inside.
+    Of the finger only the load acts; its own mechanics are too slow to matter.
     """
 
     step = ultrasonic_step

@@ -22,14 +22,14 @@ import numpy as np
 
 from hapticrender.control.kernel import finger_damping, observed_envelope
 from hapticrender.jit import F8, I8, SIGNALS, SIGNALS_T, call, kernel, pointer, step
-from hapticrender.plants.compiled import HUGE, LOAD, SENSOR_CLIPPED, SPEED, STRENGTH, quantise, queue_drive
+from hapticrender.plants.compiled import HUGE, LOAD, SENSOR_CLIPPED, SPEED, quantise, queue_drive
 from hapticrender.plants.contact import SLIDING, sliding_step
 from hapticrender.plants.friction_laws import LAW, friction_ratio, reference_amplitude
 from hapticrender.protocols import Flag
 
 SATURATED = int(Flag.SATURATED)
 DAMPING, RESONANCE, INPUTS = 4, 5, 6  # columns of the inputs beside the finger's (N s/m, rad/s), and their number
-FRICTION, SKIN_VELOCITY, AMPLITUDE = range(3)  # columns of the surface's `motion`
+FRICTION, AMPLITUDE = range(2)  # columns of the surface's `motion`
 LEAST_SLEW = 0.05  # of the drive's slew: an amplitude beyond what it can hold is still approached, and flagged
 
 ELECTRONICS = ("mass", "force_constant", "drive_limit", "drive_step", "sensor_step", "sensor_noise")
@@ -190,7 +190,7 @@ def surface_step(state, signals, start, count):
         numba.carray(pointer(io.noise, F8), (end, 1 + s.substeps)),
         numba.carray(pointer(io.sensed, F8), end),
     )
-    motion, flags = numba.carray(pointer(io.motion, F8), (end, 3)), numba.carray(pointer(io.flags, I8), end)
+    motion, flags = numba.carray(pointer(io.motion, F8), (end, 2)), numba.carray(pointer(io.flags, I8), end)
     for n in range(start, end):
         x = inputs[n]
         load, speed, touching = x[LOAD], x[SPEED], not math.isnan(x[SPEED]) and x[LOAD] > 0.0
@@ -201,7 +201,7 @@ def surface_step(state, signals, start, count):
         reference = reference_amplitude(s.law, inside, load if touching else s.load, pace)
         amplitude, raised = amplitude_pass(s, reference, x, noise[n])
         steady = whole * friction_ratio(s.law, amplitude, load, pace)
-        friction, reading, skin_velocity = sliding_step(s.sliding, steady, speed, noise[n, 0])
+        friction, reading = sliding_step(s.sliding, steady, speed, noise[n, 0])
         if s.estimating:
             reading, (re, im) = s.reading, observed_envelope(s.controller_state)
             s.reading = whole * friction_ratio(s.law, math.hypot(re, im), load, pace)
@@ -209,5 +209,4 @@ def surface_step(state, signals, start, count):
             raised |= SENSOR_CLIPPED
         sensed[n], flags[n] = reading, raised if inside == ratio else raised | SATURATED
         motion[n, FRICTION], motion[n, AMPLITUDE] = friction, amplitude
-        motion[n, SKIN_VELOCITY] = skin_velocity / x[STRENGTH] if x[STRENGTH] > 0.0 else 0.0
     return 0
