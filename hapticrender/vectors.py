@@ -23,7 +23,7 @@ W = 8  # bands a vector
 DOUBLE, INDEX = ir.DoubleType(), ir.IntType(32)
 LANES, BITS = ir.VectorType(DOUBLE, W), ir.IntType(W)
 NONE = ir.Constant(BITS, 0)
-LAYOUTS: dict[Any, np.dtype[Any]] = {}  # of the tiles, by their types
+LAYOUTS: dict[Any, dict[str, int]] = {}  # offsets of the fields (bytes) of tiles, by their types
 
 
 class Vector(types.Type):
@@ -135,16 +135,16 @@ _operator(operator.ne, _comparison("!="), MASK)
 def tile_type(dtype: np.dtype[Any]) -> Any:
     """Type of records of `dtype`, whose fields are W wide, for `get` and `put`."""
     kind = numba.from_dtype(dtype)
-    LAYOUTS[kind] = dtype
+    LAYOUTS[kind] = {name: place[1] for name, place in (dtype.fields or {}).items()}
     return kind
 
 
 def _places(builder: Any, tile: Any, value: Any, name: str) -> list[Any]:
     """Pointers to the field `name`, or to its real and imaginary parts."""
-    fields: Any = LAYOUTS[tile].fields
+    fields = LAYOUTS[tile]
     start = builder.bitcast(value, ir.PointerType(ir.IntType(8)))
     names = [name] if name in fields else [f"{name}_re", f"{name}_im"]
-    offsets = [ir.Constant(ir.IntType(64), fields[each][1]) for each in names]
+    offsets = [ir.Constant(ir.IntType(64), fields[each]) for each in names]
     return [builder.bitcast(builder.gep(start, [each]), ir.PointerType(LANES)) for each in offsets]
 
 
@@ -156,7 +156,7 @@ def get(typingctx: Any, tile: Any, name: Any) -> Any:
         parts = [builder.load(each, align=64) for each in _places(builder, tile, values[0], name.literal_value)]
         return _value(builder, signature.return_type, parts[0], parts[-1])
 
-    return (REAL if name.literal_value in LAYOUTS[tile].fields else COMPLEX)(tile, name), build
+    return (REAL if name.literal_value in LAYOUTS[tile] else COMPLEX)(tile, name), build
 
 
 @intrinsic(prefer_literal=True)
