@@ -14,7 +14,7 @@ SOURCES = $(shell cat hapticrender/*.py hapticrender/control/*.py hapticrender/p
 export NUMBA_CACHE_DIR ?= $(CURDIR)/.venv/numba/$(SOURCES)
 OUT := out/demo
 OLDEST = $(shell sed -n 's/^dependencies = \[\(.*\)\]/\1/p' pyproject.toml | tr -d '",' | sed 's/>=/==/g')
-OLDEST_TESTS := $(addprefix tests/test_,$(addsuffix .py,math kernel blocks plate contact low_pass realtime combined))
+OLDEST_TESTS := $(addprefix tests/test_,$(addsuffix .py,math vectors kernel blocks plate contact low_pass realtime combined))
 API := hapticrender $(addprefix hapticrender.,loop sweep realtime skin validate protocols bands errors touch recordings \
 	control plants renderers drivers)
 

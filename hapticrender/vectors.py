@@ -91,6 +91,22 @@ def _operator(function: Any, act: Callable[..., Any], kind: Any = None) -> None:
             lower_builtin(function, other, Vector)(build)
 
 
+def _of_llvm(name: str) -> Callable[..., Any]:
+    """Code of a function that LLVM has an intrinsic of."""
+
+    def act(builder: Any, *lanes: Any) -> Any:
+        lanes, full = tuple(each for each in lanes if each is not None), f"llvm.{name}.v{W}f64"
+        function = builder.module.globals.get(full)
+        if function is None:
+            function = ir.Function(builder.module, ir.FunctionType(LANES, [LANES] * len(lanes)), full)
+        return builder.call(function, lanes)
+
+    return act
+
+
+FUSED = _of_llvm("fma")  # a b + c
+
+
 def _each(name: str) -> Callable[..., Any]:
     """Sum or difference."""
 
@@ -109,7 +125,7 @@ def _product(builder: Any, a: Any, b: Any, x: Any, y: Any) -> tuple[Any, Any]:
         return real, None if y is None else builder.fmul(a, y)
     if y is None:
         return real, builder.fmul(b, x)
-    return builder.fsub(real, builder.fmul(b, y)), builder.fadd(builder.fmul(a, y), builder.fmul(b, x))
+    return FUSED(builder, builder.fneg(b), y, real), FUSED(builder, a, y, builder.fmul(b, x))
 
 
 def _quotient(builder: Any, a: Any, b: Any, x: Any, y: Any) -> tuple[Any, Any]:
@@ -223,17 +239,6 @@ def _of_two(kind: Any, act: Callable[..., Any]) -> Any:
         return kind(x, y), build
 
     return function
-
-
-def _of_llvm(name: str) -> Callable[..., Any]:
-    def act(builder: Any, *lanes: Any) -> Any:
-        lanes, full = tuple(each for each in lanes if each is not None), f"llvm.{name}.v{W}f64"
-        function = builder.module.globals.get(full)
-        if function is None:
-            function = ir.Function(builder.module, ir.FunctionType(LANES, [LANES] * len(lanes)), full)
-        return builder.call(function, lanes)
-
-    return act
 
 
 def _total(builder: Any, value: Any, _: Any) -> Any:

@@ -21,7 +21,7 @@ IN_INTRINSICS = {  # attributes of what numba hands to a code generator, and of 
     "context": {"get_value_type"},
     "builder": set(
         "inttoptr add mul call atomic_rmw extract_value insert_value extract_element insert_element shuffle_vector "
-        "sitofp fadd fsub fmul fdiv fneg fcmp_ordered icmp_unsigned select bitcast gep load store module".split()
+        "sitofp fadd fsub fmul fdiv fma fneg fcmp_ordered icmp_unsigned select bitcast gep load store module".split()
     ),
     "signature": {"args", "return_type"},
     "typingctx": set(),

@@ -30,8 +30,7 @@ def test_any_executor_gives_the_same(pool, expected):
     else:
         with pool(2) as executor:
             found = sweep(SCENES, worst_error, executor=executor, at_a_time=2)
-    # seeded noise; the ultrasonic drive's rounding repeats within a process, and not yet from one to the next
-    assert found == pytest.approx(expected, rel=0.05)
+    assert found == expected  # noise is seeded, and a process that compiles makes the code that others load
     assert len(set(found)) == len(found)
 
 
@@ -42,9 +41,7 @@ def test_a_cluster_gives_the_same(expected):
         distributed.LocalCluster(n_workers=2, threads_per_worker=1, processes=False, dashboard_address=None) as cluster,
         distributed.Client(cluster) as client,
     ):
-        assert sweep(SCENES, worst_error, executor=client.get_executor(), at_a_time=2) == pytest.approx(
-            expected, rel=0.05
-        )
+        assert sweep(SCENES, worst_error, executor=client.get_executor(), at_a_time=2) == expected
 
 
 def test_the_method_is_that_of_each_scene_unless_given():

@@ -113,7 +113,10 @@ def adapt_finger(controller, observer, damper):
     gain = p.adaptation + high * (p.adaptation_high - p.adaptation)
     rest = (p.rest + high * (p.rest_high - p.rest)) / rate
     follow = max(0.5 * observer, 1e-4)
-    pole = 1.0 - (1.0 - follow) ** samples
+    kept = 1.0
+    for _ in range(samples):
+        kept *= 1.0 - follow
+    pole = 1.0 - kept
     middle = 0.5 if p.block > 1 else (1.0 / follow - 1.0) / samples - (1.0 / pole - 1.0)
     back, behind = int(p.age + 0.5), middle / rate
     share = p.age + middle - back
