@@ -24,8 +24,8 @@ from llvmlite import ir
 from numba import types
 from numba.extending import intrinsic
 
-# no fast mathematics: rounding would depend on what is inlined where, and a process that compiles runs other copies of a
-# part than one that loads from the cache; `hapticrender.vectors` fuses products and sums explicitly
+# no fast mathematics: rounding would depend on what is inlined where, and a process that compiles runs other copies of
+# a part than one that loads from the cache; `hapticrender.vectors` fuses products and sums explicitly
 OPTIONS: dict[str, Any] = {"error_model": "numpy", "nogil": True}
 PATIENCE = 1.0  # s: a compilation that takes longer is announced
 ANNOUNCED = threading.Event()
