@@ -9,7 +9,7 @@ import numpy as np
 from hapticrender import defaults
 from hapticrender.checks import require
 from hapticrender.control.controller import BankController
-from hapticrender.control.kernel import finger_damping, observed_envelope
+from hapticrender.control.kernel import observed_envelope
 from hapticrender.control.methods import method_named
 from hapticrender.driver_checks import check_sensed
 from hapticrender.plants.compiled import LOAD, SPEED, finger_inputs
@@ -112,7 +112,7 @@ class ResonantDriver(WrappedDriver):
         if self._reached < 0.0:  # from rest the loop's own ramp is slower
             first, self._reached = self.parameters.oversampling, lines[0, -1]
         mode, loop = self.parameters.carrier_mode, self.loop
-        finger = finger_damping(loop.state.ctypes.data)
+        finger = float(loop.state["finger_damping"][0])
         decay = amplitude_decay(float(mode.damping()), finger, mode.mass, 1.0 / mode.rate)
         rest = target[first:]
         references_within_reach(rest, self._reached, full_slew(mode), decay, rest, flags.ravel()[first:])

@@ -425,9 +425,3 @@ def observed_envelope(state):
     c = record(state, CONTROLLER_T, 0)
     b = record(c.tiles_at, TILE_T, 0)
     return b.r_re[0] + b.e0_re[0], b.r_im[0] + b.e0_im[0]
-
-
-@kernel
-def finger_damping(state):
-    """Estimated damping of the finger of the controller at an address."""
-    return record(state, CONTROLLER_T, 0).finger_damping

@@ -15,6 +15,7 @@ import numpy as np
 
 from hapticrender.bands import Bands
 from hapticrender.checks import check_names, option, parameter
+from hapticrender.control.controller import BankController
 from hapticrender.control.damping import within_a_turn
 from hapticrender.control.device_model import DeviceModel, FingerRange
 from hapticrender.plants.compiled import CompiledPlant
@@ -211,6 +212,11 @@ def surface_record(parameters: SurfaceParameters, amplitude: Any, nominal: tuple
     """Return the record (`SURFACE`, shape (1,)) of a surface at rest, and its drive's queue."""
     p, mode = parameters, parameters.carrier_mode
     inner, queue = mode_record(mode, mode.delay - 1)
+    ours = isinstance(amplitude, BankController)
+    if p.sensor == "amplitude" and not ours:
+        raise TypeError(
+            f"amplitude is a {type(amplitude).__name__}: must be a BankController, which observes the amplitude"
+        )
     record = new_record(
         SURFACE,
         p,
@@ -221,6 +227,7 @@ def surface_record(parameters: SurfaceParameters, amplitude: Any, nominal: tuple
         estimating=p.sensor == "amplitude",
         controller=amplitude.step.address,
         controller_state=amplitude.state.ctypes.data,
+        finger_damping=amplitude.state["finger_damping"].ctypes.data if ours else 0,
         position=np.nan,
         reached=-1.0,
         law=p.friction_law.numbers,

@@ -20,7 +20,7 @@ import math
 import numba
 import numpy as np
 
-from hapticrender.control.kernel import finger_damping, observed_envelope
+from hapticrender.control.kernel import observed_envelope
 from hapticrender.jit import F8, I8, SIGNALS, SIGNALS_T, call, kernel, pointer, step
 from hapticrender.plants.compiled import HUGE, LOAD, SENSOR_CLIPPED, SPEED, quantise, queue_drive
 from hapticrender.plants.contact import SLIDING, sliding_step
@@ -65,6 +65,7 @@ SURFACE = np.dtype(
         ("estimating", "i8"),  # the sensor is the friction that the sensed amplitude leaves; else the tribometer
         ("controller", "i8"),  # address of the amplitude controller's step
         ("controller_state", "i8"),
+        ("finger_damping", "i8"),  # address of what the controller estimates of it (N s/m); 0: it does not
         ("signals", SIGNALS),  # of the amplitude loop: addresses of the six fields below
         ("signals_at", "i8"),  # its own address
         ("drive", "f8", (1,)),  # V
@@ -164,7 +165,8 @@ def amplitude_pass(s, reference, x, noise):
     scale, z, drive = 1.0 / (x[RESONANCE] * m.period), m.z, s.drive
     before, from_rest = s.reference, s.reached < 0.0
     reached = s.reached
-    decay = amplitude_decay(s.free_damping, finger_damping(s.controller_state), m.mass, m.period)
+    finger_damping = pointer(s.finger_damping, F8)[0] if s.finger_damping > 0 else 0.0
+    decay = amplitude_decay(s.free_damping, finger_damping, m.mass, m.period)
     for k in range(s.substeps):
         line = before + (reference - before) * (k + 1) / s.substeps
         reached = line if from_rest else within_reach(reached, line, s.slew, decay)  # from rest the fade-in is slower
