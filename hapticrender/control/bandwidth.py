@@ -52,9 +52,7 @@ class BankGains:
     dc_drift: float  # (w/rate)^2
     inner: float  # factor on the inner damper, 0..1, at low and medium
     inner_high: float
-    crowd_speed: (
-        float  # m/s: below it the observer's gain falls in proportion, as finger-locked carriers crowd; 0: none
-    )
+    crowd_speed: float  # m/s: below it the observer's gain falls in proportion, as locked carriers crowd; 0: none
     lowest: float  # Hz, range of finger-locked carriers
     highest: float
     highest_edge: float  # times `highest`, where they have faded out

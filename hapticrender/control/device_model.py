@@ -69,9 +69,7 @@ class DeviceModel:
     shape: tuple[float, ...] | None = None  # pattern of the target over the coordinates; None: all in the first one
     finger: FingerRange = FingerRange()  # what a finger can add to D
     pace: float = 1.0  # > 0: on every rate of a method's rules, meant for carriers from 20 Hz on, but not on its limits
-    contact_damping: float = (
-        0.0  # N s/m times m/s: part of the first damping that goes as 1/|v|, times v; in `damping` ..
-    )
+    contact_damping: float = 0.0  # N: part of the first damping that goes as 1/|v|, times v; in `damping` ...
     typical_speed: float = 1.0  # m/s, > 0: ... it is as at this speed of the finger
     sensor_delay: float = 0.0  # s, of the sensor against the evaluation point; negative: a lead
     contact_lag: float = 0.0  # m: length by which a sliding contact lags behind what the sensor measures
