@@ -41,7 +41,7 @@ COILS = SENSORS = 2  # channels of the plate, which come first
 class HybridSettings(Validated):
     """How bands are shared out; set in a scene's [render] table beside the settings of the screen."""
 
-    crossover: float = parameter(100.0, "Hz", "where plate and screen take half of a band each", least=40.0, most=400.0)
+    crossover: float = parameter(100.0, "Hz", least=40.0, most=400.0)  # both take half; work from 2/3 to 4/3 of it
 
     @property
     def start(self) -> float:
