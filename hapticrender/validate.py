@@ -9,7 +9,7 @@ import tempfile
 import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from concurrent.futures import Future, ProcessPoolExecutor
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass, field
 from functools import partial
 from pathlib import Path
@@ -95,18 +95,9 @@ def validate(
 ) -> list[Verdict]:
     """Render scenes in closed loop against the plant models and judge each, in their order.
 
-    Parameters
-    ----------
-    scenes : iterable of Scene, str or Path
-        Scenes, names of built-in ones, or TOML files.  One that cannot be rendered stops no other.
-    method, seed
-        Of the control, and of the plants' noise (>= 0); default: those of each scene.
-    jobs : int, >= 1
-        Processes that render scenes side by side.
-    out : path, optional
-        Folder for the files of each scene that does not pass, in a folder of its name.
-    progress : file, optional
-        Where to show progress.
+    Scenes may be names of built-in ones or TOML files; one that cannot be rendered stops no other.  `method` and `seed`
+    (>= 0, of the plants' noise) are by default those of each scene.  `jobs` (>= 1) processes render side by side.
+    Files of each scene that does not pass go into a folder of its name in `out`.
 
     Examples
     --------
@@ -128,7 +119,7 @@ def validate(
         futures = [pool.submit(judge, *entry) for entry in entries]
         try:
             pairs = zip(entries, futures, strict=True)
-            return [_with_progress(bar, *entry, partial(_result, future)) for entry, future in pairs]
+            return [_with_progress(bar, *entry, lambda _, future=future: future.result()) for entry, future in pairs]
         except BaseException:
             pool.shutdown(cancel_futures=True)
             raise
@@ -163,10 +154,6 @@ def _judge(
             problem = str(error)
     reason, method = problem.removeprefix(f"{label}: "), method or defaults.METHOD
     return Verdict(scene=label, device=device, method=method, seed=seed or 0, verdict="error", reason=reason)
-
-
-def _result(future: Future[Verdict], _: Tick | None) -> Verdict:
-    return future.result()
 
 
 def _with_progress(
