@@ -9,7 +9,7 @@ import tempfile
 import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures import Future, ProcessPoolExecutor
 from dataclasses import asdict, dataclass, field
 from functools import partial
 from pathlib import Path
@@ -119,7 +119,7 @@ def validate(
         futures = [pool.submit(judge, *entry) for entry in entries]
         try:
             pairs = zip(entries, futures, strict=True)
-            return [_with_progress(bar, *entry, lambda _, future=future: future.result()) for entry, future in pairs]
+            return [_with_progress(bar, *entry, partial(_result, future)) for entry, future in pairs]
         except BaseException:
             pool.shutdown(cancel_futures=True)
             raise
@@ -154,6 +154,10 @@ def _judge(
             problem = str(error)
     reason, method = problem.removeprefix(f"{label}: "), method or defaults.METHOD
     return Verdict(scene=label, device=device, method=method, seed=seed or 0, verdict="error", reason=reason)
+
+
+def _result(future: Future[Verdict], _: Tick | None) -> Verdict:
+    return future.result()
 
 
 def _with_progress(

@@ -223,11 +223,7 @@ def _share_out(scene: Scene, settings: HybridSettings, plate: PlateParameters, r
     index = [np.flatnonzero(share > 0.0) for share in shares]
     plate_bands, friction_bands = map(part, shares)
     return CombinedBands(
-        **vars(whole),
-        plate=plate_bands,
-        friction=friction_bands,
-        plate_index=index[0],
-        friction_index=index[1],
+        **vars(whole), plate=plate_bands, friction=friction_bands, plate_index=index[0], friction_index=index[1]
     )
 
 

@@ -26,13 +26,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from hapticrender.bands import Bands
-from hapticrender.control.controller import (
-    BankController,
-    device_settings,
-    ridge_spacing,
-    shared_settings,
-    spacing,
-)
+from hapticrender.control.controller import BankController, device_settings, ridge_spacing, shared_settings, spacing
 from hapticrender.control.device_model import DeviceModel
 from hapticrender.control.error_design import FADE_IN, ONE_SPEED, Rules, design_error, rules_for
 from hapticrender.control.linear import Sampled
