@@ -21,7 +21,7 @@ from benchmarks.timing import Figure, compare, cores
 from hapticrender.bands import Bands
 from hapticrender.control.controller import BankController
 from hapticrender.control.demodulator import Demodulator
-from hapticrender.control.methods import METHODS, PerSide
+from hapticrender.control.methods import METHODS, Polar
 from hapticrender.plants.plate import Plate, PlateParameters
 from hapticrender.sweep import sweep
 from hapticrender.touch.mechanics import HEAVY
@@ -94,7 +94,7 @@ def paper(pairs: int) -> Iterator[Figure]:
     bands, parameters, samples = comb(64, 1e-6), PlateParameters(), 4096
     bands = replace(bands, frequency=np.round(2 * bands.frequency) / 2)  # the look-up table has a grid of 0.5 Hz
     model = replace(parameters.device_model(parameters.rate, 1), drive_limit=1e9)
-    controller = PerSide(bandwidths=(5.0, 10.0)).design(model, bands)
+    controller = Polar(bandwidths=(5.0, 10.0)).design(model, bands)
     naive = NaivePolar(NumpyPolar(bands.frequency, bands.phase, bands.envelope))
     sensed, nothing = 1e-6 * np.random.default_rng(0).standard_normal((samples, 2)), np.zeros(samples)
     drive, expected = controller.run(sensed, nothing, nothing)[0], naive.run(sensed)

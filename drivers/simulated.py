@@ -13,11 +13,6 @@ class SimulatedDriver(BaseDriver):
 
     Where the plant can run in closed loop with a controller inside compiled
     code, `exchange` does so; `play` gives the same samples one block at a time.
-
-    Parameters
-    ----------
-    plant : Plant
-        A device model with a finger on it.
     """
 
     def __init__(self, plant: Plant) -> None:

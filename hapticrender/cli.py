@@ -308,15 +308,11 @@ def _identify(arguments: argparse.Namespace) -> int:
     from hapticrender.plants.plate import Plate
     from hapticrender.report.outputs import check_file
     from hapticrender.touch.finger import Finger
-    from hapticrender.touch.grating import Grating
-    from hapticrender.touch.scene import Scene
 
     if arguments.out:
         check_file("--out", arguments.out)
-    where = arguments.scene or "identify"
-    unnamed = Scene(texture=Grating(frequency=100.0, amplitude=1e-6), duration=1.0)
-    scene = _scene(where) if arguments.scene else unnamed
-    with _naming(where):
+    scene = _scene(arguments.scene or "grating-20")  # any on the paper's plate
+    with _naming(arguments.scene or "identify"):
         if scene.device != "vt-plate":
             raise ValueError(f"device.kind = {scene.device!r}: must be 'vt-plate' to be identified")
         setup = registered("renderers", "vt-plate")().read(scene, None)

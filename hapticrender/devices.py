@@ -19,7 +19,10 @@ def text() -> str:
     """Everything as a table for the terminal."""
     kinds = [["kind", "installed", "simulated", "a real one needs"], *map(_kind, _registered("renderers"))]
     drivers = [["driver", "installed", "what it does"], *map(_driver, _registered("drivers"))]
-    extras = [["extra", "installed", "for"], *([extra, _installed(package), use] for package, extra, use in EXTRAS)]
+    extras = [
+        ["extra", "installed", "for"],
+        *([extra, "yes" if find_spec(package) else "no", use] for package, extra, use in EXTRAS),
+    ]
     hint = "A driver of your own serves any kind: hapticrender.drivers.base says in a page what it is."
     return "\n\n".join([table(kinds), table(drivers), hint, table(extras)])
 
@@ -53,7 +56,3 @@ def _load(entry: Any) -> tuple[Any, str]:
     except (Exception, SystemExit) as error:  # a third party's module may fail in any way; the list must go on
         reason = " ".join(f"{type(error).__name__}: {error}".split())
         return None, f"cannot be loaded from {entry.value} ({reason})"
-
-
-def _installed(package: str) -> str:
-    return "yes" if find_spec(package) else "no"

@@ -13,12 +13,7 @@ _PREFIXES = ((1.0, ""), (1e-3, "m"), (1e-6, "µ"), (1e-9, "n"), (1e-12, "p"))
 def quantity(value: float | None, unit: str, *, like: float | None = None) -> str:
     """Format a measured `value` (SI) with a prefix and three digits, a dash for none.
 
-    Parameters
-    ----------
-    value : float or None
-    unit : str
-    like : float, optional
-        Take the prefix that fits this value (SI): one prefix for a whole column.
+    The prefix is that which fits `like` (SI), where it is given: one for a whole column.
 
     Examples
     --------

@@ -134,13 +134,12 @@ class Plant(Protocol):
 class Controller(Protocol):
     """Makes every band follow its target: estimator, law and synthesis over preallocated state.
 
-    `tables` and `state` are the named tuples that its compiled step reads and writes; a plant hands them to the
-    kernel in which the two are closed sample by sample.
+    `state` is the record that its compiled step reads and writes; a plant hands its address to the kernel in which the
+    two are closed sample by sample.
     """
 
     method: str
     n_bands: int
-    tables: Any
     state: Any
 
     def run(self, sensed: Array, position: Array, waveform: Array) -> tuple[Array, Array, Array]:

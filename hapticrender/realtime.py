@@ -33,7 +33,7 @@ from hapticrender.jit import F8, I8, CFunction, addresses, call, entry, kernel, 
 from hapticrender.protocols import Array, Flag
 
 HORIZON = 0.05  # s: without a new position the finger stays where it was bound for by then
-CONTINUE, ABORT = 0, 2  # PortAudio's answers
+CONTINUE, ABORT = 0, 2  # results of PortAudio's callback
 OVERRUN = int(Flag.OVERRUN)
 LOST = 0b1111  # PortAudio's status: input or output under- or overflow
 UNSIGNED_LONG = types.uint32 if sys.platform == "win32" else types.uint64
@@ -129,56 +129,38 @@ def advance(entry):
     return raised
 
 
-def _plain(sensed, drive, frames, entry):
-    """Advance by blocks of double samples in SI units; returns the flags, or -1 where it refuses."""
-    e = record(entry, ENTRY_T, 0)
-    count, raised = int(frames), 0
+@kernel
+def carry(entry, sensed, drive, frames, dtype, sensed_scale, drive_scale):
+    """Advance by blocks of samples of `dtype` at two addresses; returns the flags, or -1 and zeros where it refuses."""
+    e, count = record(entry, ENTRY_T, 0), int(frames)
+    out = carray(pointer(drive, dtype), count * e.channels if drive != 0 else 0)
     if count % e.block or sensed == 0 or drive == 0:
         e.refused += 1
-        if drive != 0:
-            silent = carray(pointer(drive, F8), count * e.channels)
-            for i in range(count * e.channels):
-                silent[i] = 0.0
+        out[:] = 0.0
         return -1
-    given, out = carray(pointer(sensed, F8), count * e.sensors), carray(pointer(drive, F8), count * e.channels)
-    own, result = (
-        carray(pointer(e.sensed_at, F8), e.block * e.sensors),
-        carray(pointer(e.drive_at, F8), e.block * e.channels),
-    )
-    for start in range(0, count, e.block):
-        for i in range(e.block * e.sensors):
-            own[i] = given[start * e.sensors + i]
+    given, raised = carray(pointer(sensed, dtype), count * e.sensors), 0
+    inputs, outputs = e.block * e.sensors, e.block * e.channels
+    own, result = carray(pointer(e.sensed_at, F8), inputs), carray(pointer(e.drive_at, F8), outputs)
+    for block in range(count // e.block):
+        for i in range(inputs):
+            own[i] = sensed_scale * given[block * inputs + i]
         raised |= advance(entry)
-        for i in range(e.block * e.channels):
-            out[start * e.channels + i] = result[i]
+        for i in range(outputs):
+            out[block * outputs + i] = drive_scale * result[i]
     return raised
+
+
+def _plain(sensed, drive, frames, entry):
+    """Advance by blocks of double samples in SI units; returns the flags, or -1 where it refuses."""
+    return carry(entry, sensed, drive, frames, F8, 1.0, 1.0)
 
 
 def _audio(sensed, drive, frames, time, status, entry):
     """Advance by blocks of interleaved float samples at full scale: PortAudio's callback."""
     e = record(entry, ENTRY_T, 0)
-    count = int(frames)
     if status & LOST:
         e.flags |= OVERRUN
-    if count % e.block or sensed == 0 or drive == 0:
-        e.refused += 1
-        if drive != 0:
-            silent = carray(pointer(drive, F4), count * e.channels)
-            for i in range(count * e.channels):
-                silent[i] = F4(0.0)
-        return ABORT
-    given, out = carray(pointer(sensed, F4), count * e.sensors), carray(pointer(drive, F4), count * e.channels)
-    own, result = (
-        carray(pointer(e.sensed_at, F8), e.block * e.sensors),
-        carray(pointer(e.drive_at, F8), e.block * e.channels),
-    )
-    for start in range(0, count, e.block):
-        for i in range(e.block * e.sensors):
-            own[i] = e.sensed_scale * given[start * e.sensors + i]
-        advance(entry)
-        for i in range(e.block * e.channels):
-            out[start * e.channels + i] = e.drive_scale * result[i]
-    return CONTINUE
+    return ABORT if carry(entry, sensed, drive, frames, F4, e.sensed_scale, e.drive_scale) < 0 else CONTINUE
 
 
 PLAIN = CFunction(_plain, types.int32(I8, I8, types.uint64, I8))
@@ -207,7 +189,7 @@ class RealtimeEntry:
     ----------
     address : int
         Of ``int (const void *input, void *output, unsigned long frames, const void *time, unsigned long status, void
-        *user_data)``, PortAudio's callback, with interleaved float samples.  It answers 2 (abort) and writes zeros
+        *user_data)``, PortAudio's callback, with interleaved float samples.  It returns 2 (abort) and writes zeros
         where `frames` is no whole number of blocks or a buffer is missing.
     plain_address : int
         Of ``int (const double *sensed, double *drive, uint64_t frames, void *user_data)`` in m and A, which returns
@@ -242,12 +224,8 @@ class RealtimeEntry:
                 raise ValueError(f"{name}={value!r}: must be finite and > 0")
         analysed = controller.bands.envelope is None
         if analysed != (waveform is not None):
-            need = (
-                "must be given for targets that are a waveform"
-                if analysed
-                else "must be left out: targets are envelopes"
-            )
-            raise ValueError(f"waveform: {need}")
+            need = "given for targets that are a waveform" if analysed else "left out: targets are envelopes"
+            raise ValueError(f"waveform: must be {need}")
         self.controller, self.block, self.rate = controller, controller.block, float(controller.rate)
         setpoints = getattr(controller, "setpoints", np.zeros((SETPOINT_ROWS, 0)))
         self._slot = np.concatenate([[np.nan, 0.0, 1.0, 0.0, 0.0], setpoints.ravel()])
@@ -309,13 +287,7 @@ class RealtimeEntry:
         self._hand_over()
 
     def finger(self, position: float, velocity: float = 0.0) -> None:
-        """Set the finger's position (m, NaN: lifted) and velocity (m/s) at the start of the next block.
-
-        Raises
-        ------
-        ValueError
-            A number is infinite, or the velocity is NaN.
-        """
+        """Set the finger's position (m, NaN: lifted) and velocity (m/s, finite) at the start of the next block."""
         if np.isinf(position) or not np.isfinite(velocity):
             raise ValueError(f"{position=} m, {velocity=} m/s: must be finite (position may be NaN: lifted)")
         self._slot[[POSITION, VELOCITY]] = position, velocity
@@ -332,7 +304,7 @@ class RealtimeEntry:
 
     @property
     def samples(self) -> int:
-        """Samples that have been answered, silent ones included."""
+        """Samples that have been played, silent ones included."""
         return int(self._entry["samples"][0])
 
     @property
@@ -342,7 +314,7 @@ class RealtimeEntry:
 
     @property
     def refused(self) -> int:
-        """Calls that were answered with zeros because they did not fit."""
+        """Calls that were refused, and got zeros, because they did not fit."""
         return int(self._entry["refused"][0])
 
     def _hand_over(self) -> None:

@@ -95,18 +95,9 @@ def validate(
 ) -> list[Verdict]:
     """Render scenes in closed loop against the plant models and judge each, in their order.
 
-    Parameters
-    ----------
-    scenes : iterable of Scene, str or Path
-        Scenes, names of built-in ones, or TOML files.  One that cannot be rendered stops no other.
-    method, seed
-        Of the control, and of the plants' noise (>= 0); default: those of each scene.
-    jobs : int, >= 1
-        Processes that render scenes side by side.
-    out : path, optional
-        Folder for the files of each scene that does not pass, in a folder of its name.
-    progress : file, optional
-        Where to show progress.
+    Scenes may be names of built-in ones or TOML files; one that cannot be rendered stops no other.  `method` and `seed`
+    (>= 0, of the plants' noise) are by default those of each scene.  `jobs` (>= 1) processes render side by side.
+    Files of each scene that does not pass go into a folder of its name in `out`.
 
     Examples
     --------

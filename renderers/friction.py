@@ -85,15 +85,23 @@ class FrictionSetup:
         return impulse
 
     def targets(self, model: DeviceModel) -> Bands:
-        """Carriers and targets of the scene as friction (N)."""
-        scene, share = self.scene, self.settings.velocity_per_force
+        """Carriers and targets of the scene as friction (N): j w X/(v/F), w left to a carrier that follows the finger.
+
+        v/F (m/(N s)) is the settings', or that of the finger's own mechanics.
+        """
+        scene, share, mechanics = self.scene, self.settings.velocity_per_force, self.scene.finger.mechanics
         require(not scene.gradient, "gradient", scene.gradient, "0 1/m: friction is made under the finger alone")
         bands = perceptible(scene, scene.texture.bands(model.rate), model)
         check_carriers(scene, model, bands)
         if bands.envelope is None:
             require(share > 0, RATIO, share, "> 0 m/(N s) for a recording")
             return replace(bands, differentiated=True)
-        return replace(bands, **_as_friction(scene, bands, share))
+        if (bands.wavenumber > 0.0).any():
+            require(share > 0, RATIO, share, "> 0 m/(N s) for a texture over position")
+            return replace(bands, envelope=bands.envelope / share, differentiated=True)
+        require(share > 0 or mechanics.order > 0, RATIO, share, "> 0 m/(N s), or finger.mechanics not 'none'")
+        ratio = share or mechanics.skin_velocity_per_force(bands.frequency)
+        return replace(bands, envelope=2j * np.pi * bands.frequency * bands.envelope / ratio)
 
     def needed(self, model: DeviceModel) -> Need:
         """Amplitude and drive (N) that the scene needs of `model`."""
@@ -184,17 +192,3 @@ class FrictionRenderer(BaseRenderer):
         if direct or bands.envelope is None or (bands.wavenumber > 0.0).any():
             return bands
         return replace(bands, sensor_response=setup.assumed.sensor_response(bands.frequency, setup.speed))
-
-
-def _as_friction(scene: Scene, bands: Bands, velocity_per_force: float) -> dict[str, Any]:
-    """Envelopes of displacement (m) as friction (N): j w X/(v/F), w left to a carrier that follows the finger."""
-    locked = bool((bands.wavenumber > 0.0).any())
-    share: Array | float = velocity_per_force
-    if not velocity_per_force:
-        require(not locked, RATIO, velocity_per_force, "> 0 m/(N s) for a texture over position")
-        moves = scene.finger.mechanics.order > 0
-        require(moves, RATIO, velocity_per_force, "> 0 m/(N s), or finger.mechanics not 'none'")
-        share = scene.finger.mechanics.skin_velocity_per_force(bands.frequency)
-    if locked:
-        return {"envelope": bands.envelope / share, "differentiated": True}
-    return {"envelope": 2j * np.pi * bands.frequency * bands.envelope / share}

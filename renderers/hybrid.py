@@ -12,7 +12,7 @@ each bank takes its share while the frequency goes up and down, by the fades tha
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -39,15 +39,9 @@ COILS = SENSORS = 2  # channels of the plate, which come first
 
 @dataclass(frozen=True, kw_only=True)
 class HybridSettings(Validated):
-    """How bands are shared out; set in a scene's [render] table beside the settings of the screen.
+    """How bands are shared out; set in a scene's [render] table beside the settings of the screen."""
 
-    Parameters
-    ----------
-    crossover : float, Hz
-        Where plate and screen take half of a band each, 40 to 400; both work from 2/3 to 4/3 of it.
-    """
-
-    crossover: float = parameter(100.0, "Hz", least=40.0, most=400.0)
+    crossover: float = parameter(100.0, "Hz", least=40.0, most=400.0)  # both take half; work from 2/3 to 4/3 of it
 
     @property
     def start(self) -> float:
@@ -166,7 +160,8 @@ class HybridRenderer(BaseRenderer):
 
     def connect(self, setup: HybridSetup, driver: Driver) -> Driver:
         """Return `driver` behind the square root, with the skin's velocity computed from its sensors."""
-        _check_channels(driver)
+        meaning = {SENSORS + 1: "both ends of the plate, then friction", 0: "open loop"}
+        check_channels(driver, {COILS + 1: "both coils, then the screen"}, meaning)
         plate = setup.plate.assumed
         model = plate.device_model(driver.rate, driver.delay)
         lever = np.array([1.0, 1.0 / plate.half_spacing])
@@ -175,7 +170,6 @@ class HybridRenderer(BaseRenderer):
 
     def device_model(self, setup: HybridSetup, driver: Driver) -> CombinedModel:
         """Return the device models of the two parts behind `driver`."""
-        _check_channels(driver)
         plate = self._plate.device_model(setup.plate, _part_of(driver, COILS, SENSORS, "plate"))
         friction = None
         if setup.friction is not None:
@@ -221,14 +215,15 @@ def _share_out(scene: Scene, settings: HybridSettings, plate: PlateParameters, r
         raise ValueError("texture: a recording over time is not supported on a hybrid: use one over position")
     high = settings.share_of_screen(whole.frequency)
     shares = np.where(locked, 1.0, 1.0 - high), np.where(locked, 1.0, high)  # locked: the fades of the banks share
+
+    def part(share: Array) -> Bands:
+        envelope = None if whole.envelope is None else share * whole.envelope
+        return replace(whole, envelope=envelope).select(share > 0.0, unfelt=())
+
     index = [np.flatnonzero(share > 0.0) for share in shares]
-    changes = [{} if whole.envelope is None else {"envelope": (share * whole.envelope)} for share in shares]
-    plate_bands, friction_bands = (
-        replace(whole, **change).select(which, unfelt=()) for change, which in zip(changes, index, strict=True)
-    )
-    common = {each.name: getattr(whole, each.name) for each in fields(Bands)}
+    plate_bands, friction_bands = map(part, shares)
     return CombinedBands(
-        **common, plate=plate_bands, friction=friction_bands, plate_index=index[0], friction_index=index[1]
+        **vars(whole), plate=plate_bands, friction=friction_bands, plate_index=index[0], friction_index=index[1]
     )
 
 
@@ -238,14 +233,16 @@ def _split(scene: Scene) -> tuple[HybridSettings, Scene, Scene]:
     with inside("render"):
         check_names(scene.rendering, own | of_screen)
         settings = HybridSettings(**{key: value for key, value in scene.rendering.items() if key in own})
-    tables: list[dict[str, Any]] = [{}, {}]
-    for field, table in (("profile", "device"), ("simulation", "simulation")):
-        with inside(table):
-            for part, values in zip(tables, _split_table(getattr(scene, field), own | of_screen), strict=True):
-                part[field] = values
-    tables[0]["rendering"] = {}
-    tables[1]["rendering"] = {key: value for key, value in scene.rendering.items() if key not in own}
-    return settings, replace(scene, **tables[0]), replace(scene, **tables[1])
+    with inside("device"):
+        profiles = _split_table(scene.profile, own | of_screen)
+    with inside("simulation"):
+        simulations = _split_table(scene.simulation, own | of_screen)
+    renderings = {}, {key: value for key, value in scene.rendering.items() if key not in own}
+    plate, screen = (
+        replace(scene, profile=profile, simulation=simulation, rendering=rendering)
+        for profile, simulation, rendering in zip(profiles, simulations, renderings, strict=True)
+    )
+    return settings, plate, screen
 
 
 def _split_table(values: Mapping[str, Any], settings: set[str]) -> list[dict[str, Any]]:
@@ -270,35 +267,23 @@ def _split_table(values: Mapping[str, Any], settings: set[str]) -> list[dict[str
 
 def _side_by_side(plate: DeviceModel, friction: DeviceModel | None, velocity_per_force: float) -> CombinedModel:
     """Band model of both, block by block; what is judged is a velocity, no multiple of the coordinates."""
-    parts = [plate] if friction is None else [plate, friction]
-
     from scipy.linalg import block_diag
 
-    def blocks(name: str) -> Array:
-        return np.asarray(block_diag(*(getattr(part, name) for part in parts)))
-
+    parts = [plate] if friction is None else [plate, friction]
     names = ("mass", "damping", "stiffness", "force_from_drive", "coordinate_from_sensed", "side_from_coordinate")
-    matrices = {name: blocks(name) for name in names}
+    matrices: dict[str, Array] = {name: block_diag(*(getattr(part, name) for part in parts)) for name in names}
+    common: dict[str, Any] = {name: getattr(plate, name) for name in ("rate", "delay", "block", "lowest_frequency")}
     return CombinedModel(
-        rate=plate.rate,
-        delay=plate.delay,
-        block=plate.block,
         **matrices,
+        **common,
         place_from_coordinate=np.zeros((len(PLACES), len(matrices["mass"]))),
         places=PLACES,
         drive_limit=np.inf,
         sensed_limit=np.inf,
-        lowest_frequency=plate.lowest_frequency,
-        highest_frequency=plate.highest_frequency if friction is None else friction.highest_frequency,
+        highest_frequency=parts[-1].highest_frequency,
         unit="m/s",
         drive_unit="A, A, N",
         plate=plate,
         friction=friction,
         velocity_per_force=velocity_per_force,
     )
-
-
-def _check_channels(driver: Driver) -> None:
-    """Refuse a driver that cannot be that of a hybrid."""
-    meaning = {SENSORS + 1: "both ends of the plate, then friction", 0: "open loop"}
-    check_channels(driver, {COILS + 1: "both coils, then the screen"}, meaning)

@@ -106,7 +106,7 @@ def needed(scene: Scene, model: DeviceModel, bands: Bands, waveform: Waveform) -
     low = np.where(bands.wavenumber > 0.0, np.minimum(model.lowest_frequency, top), top)
     passed = low + np.linspace(0.0, 1.0, 400)[:, None] * (top - low)
     target = abs(bands.envelope) * (2 * np.pi * passed if bands.differentiated else np.ones_like(passed))
-    drive = target / common_gain(model, passed)
+    drive = target / abs(model.response(passed).sum(axis=-1)[..., 0])  # all channels driven alike
     worst = int(drive.max(axis=0).argmax())
     at = int(drive[:, worst].argmax()), worst
     sums = (float(each.max(axis=0).sum()) for each in (target, drive))
@@ -127,8 +127,3 @@ def _need_of_waveform(scene: Scene, model: DeviceModel, bands: Bands, waveform: 
     drive = abs(np.fft.irfft(spectrum / gain, len(time))).max()
     amplitude = float(abs(target).max())
     return Need(amplitude, float(drive), amplitude, float(frequency[abs(spectrum).argmax()]))
-
-
-def common_gain(model: DeviceModel, frequency: Array) -> Array:
-    """First coordinate of the free device per drive, all channels driven alike (shape of `frequency`)."""
-    return abs(model.response(frequency).sum(axis=-1)[..., 0])

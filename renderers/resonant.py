@@ -25,22 +25,13 @@ LONGEST_DELAY = 0.25e-3  # s: a tenth of a turn of 400 Hz, 3 % off there, and be
 
 
 class ResonantDriver(WrappedDriver):
-    """A driver of friction (N) on a device that vibrates: its drive in V, its sensor in m of the mode.
+    """A driver of friction (N) on a device that vibrates: its drive in V, its sensor in m of the mode, or none.
 
-    The device works at the carrier's rate; friction (N) goes in, and what follows from the sensed amplitude comes out,
-    at a fraction of that rate.
-
-    Parameters
-    ----------
-    driver : Driver
-        The device, at a whole multiple of `parameters.rate`, with one drive channel and one sensed channel, or none:
-        then it is driven open loop.  Its block is a whole multiple of that multiple, or divides it.
-    parameters : SurfaceParameters
-        The surface as assumed; its rate is that of the friction.
-    finger : Finger
-        Where the finger is, and how hard it presses where the device does not measure it.
-    nominal : (float, float), N and m/s
-        Load and speed that the amplitude is held for while no finger is there.
+    The device works at the carrier's rate, a whole multiple of that of `parameters`, the surface as assumed; friction
+    (N) goes in, and what follows from the sensed amplitude comes out, at the lower rate.  The device's block is a whole
+    multiple of that multiple, or divides it.  `finger` says where the finger is, and how hard it presses where the
+    device does not measure it; `nominal` is the load (N) and speed (m/s) for which the amplitude is held while no
+    finger is there.
 
     Notes
     -----

@@ -42,10 +42,6 @@ class WrappedDriver:
     def __exit__(self, *exc: object) -> None:
         self.driver.__exit__(*exc)
 
-    def play(self, drive: Array) -> Sensed:
-        """Play a block."""
-        raise NotImplementedError
-
 
 def thinned(sensed: Sensed, hold: int) -> Sensed:
     """Measurements once in `hold` samples; flags of all of them."""

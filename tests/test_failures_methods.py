@@ -8,7 +8,7 @@ from held import amplitude_error, fixed, hold
 
 import hapticrender as hr
 from hapticrender.control.loopshape import loop_margins, reduced_controller
-from hapticrender.control.methods import METHODS, CommonMode, DynamicStiffness, PerSide
+from hapticrender.control.methods import METHODS, Polar
 from hapticrender.control.transfer import butterworth
 from hapticrender.plants.plate import Plate, PlateParameters
 from hapticrender.touch.mechanics import HEAVY, LIGHT_SECOND
@@ -45,7 +45,7 @@ def sent(method, frequency, targets, seconds):
 def test_polar_without_a_clamp_runs_to_the_limit_below_2_6_percent():
     """The step's undershoot o takes the command to -A: r = o/(2 + o), 2.65 % for the o = 5.4 % of the loop here."""
     for clamp, ratio, holds in ((False, 0.027, True), (False, 0.025, False), (True, 0.01, True)):
-        motion = sent(CommonMode(clamp=clamp), 47.0, (1e-4, 1e-4 * ratio), (2.0, 4.0))
+        motion = sent(Polar(common=True, clamp=clamp), 47.0, (1e-4, 1e-4 * ratio), (2.0, 4.0))
         error = abs(amplitude_error(motion, 47.0, 1e-4 * ratio)[0])
         assert error < 1e-3 if holds else error > 100
 
@@ -54,7 +54,7 @@ def test_a_target_on_the_branch_cut_runs_the_phase_away():
     """The cut is at 90 degrees: the error of two cut angles is 0 or 360 deg; arg(X conj R) has no seam there."""
     noisy, on_the_cut = PlateParameters(), 1e-5 * np.exp(0.5j * np.pi)
     for subtract, holds in ((False, True), (True, False)):
-        motion = hold(PerSide(subtract=subtract), fixed((47.0, on_the_cut)), 6.0, noisy)[1][-5000:, 0]
+        motion = hold(Polar(subtract=subtract), fixed((47.0, on_the_cut)), 6.0, noisy)[1][-5000:, 0]
         n = np.arange(25_000, 30_000)
         found = 2 * np.mean(motion * np.exp(-2j * np.pi * 47.0 * n / RATE)) / on_the_cut
         assert (abs(found - 1) < 0.05) == holds
@@ -65,7 +65,7 @@ def test_a_target_on_the_branch_cut_runs_the_phase_away():
 @pytest.mark.parametrize(("faster", "bias"), [(1, -0.00097), (2, -0.0145), (3, -0.0573), (6, -0.168)])
 def test_too_fast_a_filter_biases_the_amplitude(faster, bias):
     """20 Hz with both bandwidths so many times 5 and 10 Hz; to the last printed digit.  An observer has no image."""
-    motion = hold(CommonMode(bandwidths=(5.0 * faster, 10.0 * faster)), fixed((20.0, 1e-4)), 6.0, IDEAL)[1]
+    motion = hold(Polar(common=True, bandwidths=(5.0 * faster, 10.0 * faster)), fixed((20.0, 1e-4)), 6.0, IDEAL)[1]
     assert amplitude_error(motion, 20.0, 1e-4)[0] == pytest.approx(bias, abs=5e-4)
     if faster == 1:
         assert max(ours(20.0, 6.0, method, target=1e-4) for method in ("h", "h2")) < 1e-6
@@ -136,7 +136,9 @@ def test_unknown_and_known_delay():
         assert off("static", 400.0, 6.0, plate=late(1 + extra)) < 1e-3
         assert max(ours(400.0, 6.0, method, plate=late(1 + extra)) for method in ("h", "h2")) < 1e-4
     for milliseconds, holds in ((60, True), (80, False)):
-        error = off(DynamicStiffness(bandwidths=(5.0, 10.0)), 111.0, 8.0, plate=late(5 * milliseconds))
+        error = off(
+            dataclasses.replace(METHODS["stiffness"], bandwidths=(5.0, 10.0)), 111.0, 8.0, plate=late(5 * milliseconds)
+        )
         assert error < 0.01 if holds else error > 0.1
 
 
@@ -164,8 +166,8 @@ def test_saturation_winds_the_polar_loop_up():
     [
         ("paper-common", 20.0, 0.015, 0.07),
         ("paper-common", 10.0, 0.3, 1.0),
-        (DynamicStiffness(bandwidths=(5.0, 10.0)), 8.0, 0.0, 1e-3),
-        (DynamicStiffness(bandwidths=(5.0, 10.0)), 7.0, 0.3, np.inf),
+        (dataclasses.replace(METHODS["stiffness"], bandwidths=(5.0, 10.0)), 8.0, 0.0, 1e-3),
+        (dataclasses.replace(METHODS["stiffness"], bandwidths=(5.0, 10.0)), 7.0, 0.3, np.inf),
         ("h2", 10.0, 0.0, 1e-6),
     ],
     ids=str,
@@ -185,7 +187,7 @@ def test_an_unfiltered_reference_makes_feedback_fight_feedforward():
     x = np.clip((np.arange(15_000) / RATE - 1.5) / 0.05, 0.0, 1.0)
     bands = dataclasses.replace(fixed((111.0, 1e-5)), modulated=True)
     for filtered, least, most in ((True, -0.02, 0.02), (False, 0.13, 0.17)):
-        method = DynamicStiffness(feed_forward=True, filtered=filtered)
+        method = dataclasses.replace(METHODS["stiffness"], feed_forward=True, filtered=filtered)
         motion = hold(method, bands, 3.0, IDEAL, waveform=1 + x * x * (3 - 2 * x))[1][:, 0]
         width = 2 * round(RATE / 111.0)
         product = 2 * motion * np.exp(-2j * np.pi * 111.0 * np.arange(15_000) / RATE)

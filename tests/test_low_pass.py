@@ -8,16 +8,7 @@ from naive_low_pass import NaiveLowPass
 
 import hapticrender as hr
 from hapticrender.bands import Bands
-from hapticrender.control.methods import (
-    METHODS,
-    Boxcar,
-    CommonMode,
-    DynamicStiffness,
-    PerSide,
-    Resonant,
-    StaticInverse,
-    frequency_table,
-)
+from hapticrender.control.methods import METHODS, Polar, Resonant, frequency_table
 from hapticrender.plants.plate import PlateParameters
 
 RATE, COUNT = 5000.0, 1500
@@ -84,13 +75,13 @@ def test_a_run_is_its_equations(name, bands, rng):
 @pytest.mark.parametrize(
     "method",
     [
-        PerSide(clamp=False),
-        PerSide(subtract=True),
-        CommonMode(bandwidths=(3.0, 9.0)),
-        Boxcar(subtract=True),
-        StaticInverse(form="integrator"),
-        DynamicStiffness(feed_forward=True),
-        DynamicStiffness(feed_forward=True, filtered=False),
+        Polar(clamp=False),
+        Polar(subtract=True),
+        Polar(common=True, bandwidths=(3.0, 9.0)),
+        Polar(boxcar=True, subtract=True),
+        dataclasses.replace(METHODS["static"], form="integrator"),
+        dataclasses.replace(METHODS["stiffness"], feed_forward=True),
+        dataclasses.replace(METHODS["stiffness"], feed_forward=True, filtered=False),
         Resonant(gain=3.0, feed_forward=True),
     ],
     ids=str,

@@ -11,12 +11,7 @@ import hapticrender as hr
 from hapticrender.bands import Bands
 from hapticrender.control.estimators import StarSTDFT
 from hapticrender.control.loopshape import controller_of
-from hapticrender.control.methods import (
-    METHODS,
-    DynamicStiffness,
-    Resonant,
-    least_decay,
-)
+from hapticrender.control.methods import METHODS, Resonant, least_decay
 from hapticrender.control.transfer import butterworth
 from hapticrender.plants.plate import Plate, PlateParameters
 
@@ -187,7 +182,7 @@ def test_dynamic_stiffness_settles_as_its_loop_alone_at_every_frequency(form, pr
     expected = step_settling(controller_of(form, 5.0, 10.0), butterworth(10.0))
     assert expected == pytest.approx(printed, abs=0.0005)
     for frequency in (31.0, 143.0, 189.0, 400.0):
-        _, sensed = hold(DynamicStiffness(form=form), tones(frequency), 1.0)
+        _, sensed = hold(dataclasses.replace(METHODS["stiffness"], form=form), tones(frequency), 1.0)
         found, window = settled(sensed.motion, frequency)
         assert abs(found - expected) < window, frequency
 

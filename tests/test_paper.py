@@ -9,7 +9,7 @@ from held import amplitude, fixed, grating
 import hapticrender as hr
 from examples.grigorii2021.shaping import analyse
 from hapticrender.control.loopshape import reduced_controller
-from hapticrender.control.methods import METHODS, CommonMode, method_named
+from hapticrender.control.methods import METHODS, Polar, method_named
 from hapticrender.control.transfer import TransferFunction, butterworth
 from hapticrender.plants.plate import Plate, PlateParameters
 from hapticrender.touch.mechanics import HEAVY_SECOND
@@ -171,7 +171,7 @@ def test_a_long_delay_slows_the_loop_down_until_its_margins_hold():
     """at 5 Hz polar loops bear 30-42 ms; slowed down they hold at 60 ms."""
     _, sensed, _ = close(fixed((111.0, 1e-5)), 12.0, overrides=dict(IDEAL, delay=300), method="paper-common")
     assert amplitude(sensed.motion, 111.0, 2.0)[0] == pytest.approx(1e-5, rel=2e-3)
-    naive = CommonMode(bandwidths=(5.0, 10.0))
+    naive = Polar(common=True, bandwidths=(5.0, 10.0))
     parameters = PlateParameters(delay=300, **IDEAL)
     plate = Plate(parameters, hr.Finger.absent())
     controller = naive.design(parameters.device_model(RATE, 300), fixed((111.0, 1e-5)))

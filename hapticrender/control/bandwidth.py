@@ -38,47 +38,24 @@ class FreeDevice(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class BankGains:
-    """Gains of the error observer, its law and the inner damper at every level of the gain schedule.
+    """Gains of the error observer, its law and the inner damper at every level of the gain schedule."""
 
-    Parameters
-    ----------
-    rate : float, Hz
-        Sampling rate.
-    delay : int, samples
-        From a sensed sample to the moment its force acts, >= 1.
-    lead : float, s
-        By which the law turns forces ahead: delay and half the hold.
-    observer, observer_high : float, per sample
-        Gain g of the observer, at low and medium, and at high.
-    integral_low, integral_medium, integral_high : float, 1/s
-    dc, dc_drift : float, per sample
-        Gains of the DC estimate, 1.6 w/rate and (w/rate)^2.
-    inner, inner_high : float
-        Factor on the inner damper, 0..1, at low and medium, and at high.
-    crowd_speed : float, m/s
-        Finger speed below which the observer's gain falls in proportion, as finger-locked carriers crowd; 0: none.
-    lowest, highest : float, Hz
-        Range of finger-locked carriers.
-    highest_edge : float
-        Times `highest`, where finger-locked carriers have faded out.
-    """
-
-    rate: float
-    delay: int
-    lead: float
-    observer: float
+    rate: float  # Hz
+    delay: int  # samples from a sensed sample to the moment its force acts, >= 1
+    lead: float  # s, by which the law turns forces ahead: delay and half the hold
+    observer: float  # gain g per sample, at low and medium
     observer_high: float
-    integral_low: float
+    integral_low: float  # 1/s
     integral_medium: float
     integral_high: float
-    dc: float
-    dc_drift: float
-    inner: float
+    dc: float  # of the DC estimate per sample, 1.6 w/rate
+    dc_drift: float  # (w/rate)^2
+    inner: float  # factor on the inner damper, 0..1, at low and medium
     inner_high: float
-    crowd_speed: float
-    lowest: float
+    crowd_speed: float  # m/s: below it the observer's gain falls in proportion, as locked carriers crowd; 0: none
+    lowest: float  # Hz, range of finger-locked carriers
     highest: float
-    highest_edge: float
+    highest_edge: float  # times `highest`, where they have faded out
 
     def at(self, level: str) -> tuple[float, float, float]:
         """Return observer gain, integral gain and inner damper at a level of the schedule."""
@@ -103,21 +80,11 @@ class BankGains:
 
 
 class Checked(NamedTuple):
-    """Gains whose margins hold.
+    """Gains whose margins hold."""
 
-    Attributes
-    ----------
-    gains : BankGains
-        As given, or with lower bandwidths.
-    margins : dict of Margins
-        The smallest of every margin, by level: "low", "medium", "high".
-    notes : tuple of str
-        What was lowered and why; empty where nothing was.
-    """
-
-    gains: BankGains
-    margins: dict[str, Margins]
-    notes: tuple[str, ...]
+    gains: BankGains  # as given, or with lower bandwidths
+    margins: dict[str, Margins]  # the smallest of every margin, by level of the schedule
+    notes: tuple[str, ...]  # what was lowered and why; empty where nothing was
 
 
 def error_loop(
@@ -133,26 +100,11 @@ def error_loop(
     delay: int | None = None,
     finger: FingerEstimate | None = None,
 ) -> ErrorLoop:
-    """Linear loop of a design at one level of its gain schedule.
+    """Linear loop of a design at one level of its gain schedule, on the free device `model` that the law inverts.
 
-    Parameters
-    ----------
-    model : DeviceModel or FreeDevice
-        The free device that the law inverts.
-    frequency, wavenumber : ndarray, shape (K,), Hz and 1/m
-        Fixed and finger-locked part of every carrier; no wavenumber: all fixed.
-    gains : BankGains
-    level : {"low", "medium", "high"}
-    taps : ndarray, shape (c, t), N/m, optional
-        Of the inner damper.
-    speed : float, m/s
-        Of the finger, for finger-locked carriers.
-    plant : Sampled, optional
-        What the loop closes on; by default the free device.
-    delay : int, optional
-        Samples that the loop really has; by default those of the design.
-    finger : FingerEstimate, optional
-        Finger estimate in the law.
+    `frequency` (Hz) and `wavenumber` (1/m, default: all fixed) are the parts of every carrier, shape (K,); `taps`
+    (c, t) those of the inner damper, N/m; `speed` (m/s) and the estimate in the law the `finger`'s.  The loop closes on
+    `plant` with `delay` samples where these differ from the free device and the design.
     """
     observer, integral, inner = gains.at(level)
     if gains.crowd_speed > 0.0:
@@ -196,24 +148,14 @@ def checked_gains(
 ) -> Checked:
     """Lower the bandwidth until the margins on the free device hold at every level of the gain schedule.
 
-    Parameters
-    ----------
-    model, frequency, wavenumber, taps
-        See `error_loop`.
-    gains : BankGains
-        As the rules of the method have them.
-    least : LeastMargins
+    The arguments are those of `error_loop`.  Observer and integral are lowered together, a quarter octave at a time;
+    low and medium share their observer and go down together.  Where not even a quarter of the bandwidth would hold, the
+    inner damper is softened first.  Carriers locked to the finger are checked at five of its speeds, frozen.
 
     Raises
     ------
     DesignError
         Where even 1/64 of the bandwidth leaves a margin too small: names margin, value and bound.
-
-    Notes
-    -----
-    Observer and integral are lowered together, a quarter octave at a time; low and medium share their observer and go
-    down together.  Where not even a quarter of the bandwidth would hold, the inner damper is softened first.  Carriers
-    locked to the finger are checked at five of its speeds, frozen.
     """
     wavenumber = np.zeros(len(frequency)) if wavenumber is None else wavenumber
     taps = np.zeros((len(model.mass), 1)) if taps is None else taps

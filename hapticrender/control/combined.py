@@ -23,39 +23,21 @@ from hapticrender.protocols import Array, Method
 
 @dataclass(frozen=True, kw_only=True)
 class CombinedModel(DeviceModel):
-    """Device model of a device of two parts, which have a model and a controller each.
+    """Device model of a device of two parts, which have a model and a controller each."""
 
-    Parameters
-    ----------
-    plate : DeviceModel
-        Of the part that moves the skin (m).
-    friction : DeviceModel or None
-        Of the part that rubs it (N); None: it has no target.
-    velocity_per_force : float, m/(N s)
-        Skin velocity that feels as strong as a newton of friction.
-    """
-
-    plate: DeviceModel
-    friction: DeviceModel | None
-    velocity_per_force: float
+    plate: DeviceModel  # of the part that moves the skin (m)
+    friction: DeviceModel | None  # of the part that rubs it (N); None: it has no target
+    velocity_per_force: float  # m/(N s): skin velocity that feels as strong as a newton of friction
 
 
 @dataclass(frozen=True, kw_only=True)
 class CombinedBands(Bands):
-    """Bands of a device of two parts, their envelopes the target displacement (m), and the share of each part.
+    """Bands of a device of two parts, their envelopes the target displacement (m), and the share of each part."""
 
-    Parameters
-    ----------
-    plate, friction : Bands
-        Targets of the two parts (m, N).
-    plate_index, friction_index : ndarray of int
-        Which of all bands each of those is.
-    """
-
-    plate: Bands
-    friction: Bands
-    plate_index: Array
-    friction_index: Array
+    plate: Bands  # targets (m)
+    friction: Bands  # targets (N)
+    plate_index: Array  # int: which of all bands those of the plate are
+    friction_index: Array  # alike
 
 
 BUFFERS = ("sensed", "drive", "waveform", "target", "flags", "position")
@@ -113,17 +95,9 @@ def combined_step(state, signals, start, count):
 
 
 class CombinedController:
-    """Two controllers behind the `Controller` protocol; `design_combined` makes one.
+    """Two controllers behind the `Controller` protocol, of plate and friction device; `design_combined` makes one.
 
-    Parameters
-    ----------
-    parts : (BankController or None, BankController or None)
-        Of plate and friction device; None where a part has no target and stays without drive.
-    bands : CombinedBands
-    velocity_per_force : float, m/(N s)
-    sensors, channels : (int, int)
-        Of each part.
-    method : str
+    A part is None where it has no target and stays without drive; `sensors` and `channels` are numbers of each part.
     """
 
     def __init__(
@@ -180,16 +154,7 @@ class CombinedController:
 def design_combined(
     method: Method, model: CombinedModel, bands: CombinedBands, *, feedback: bool = True
 ) -> CombinedController:
-    """Design a controller of `method` for each part, with its share of the targets.
-
-    Parameters
-    ----------
-    method : Method
-    model : CombinedModel
-    bands : CombinedBands
-    feedback : bool
-        False: nothing is sensed, both parts are driven open loop.
-    """
+    """Design a controller of `method` for each part, with its share of the targets; open loop without feedback."""
     models, shares = (model.plate, model.friction), (bands.plate, bands.friction)
     parts: tuple[Any, ...] = tuple(
         method.design(each, own, feedback=feedback) if each is not None and len(own) else None

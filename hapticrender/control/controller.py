@@ -45,20 +45,12 @@ class BankController:
     settings : dict
         Fields of `records.SETTINGS`; what is left out is zero.
     bands : Bands
-        Carriers and targets.
     history : int
         Steps of adaptation whose commands are kept.
     note : str
         What the design chose and why.
     arrays : dict, optional
-        Further arrays of the step by the name of their address, or others in place of `loops`.
-
-    Attributes
-    ----------
-    state : ndarray of `records.CONTROLLER`, shape (1,)
-        Settings and state; `tiles`, `setpoints` are arrays that it points to.
-    block : int
-        Samples that `step` takes at once; `run` takes any multiple.
+        Further arrays of the step by the name of their address.
     """
 
     def __init__(
@@ -73,9 +65,10 @@ class BankController:
         arrays: dict[str, Array] | None = None,
     ) -> None:
         self.method, self.step, self.bands, self.note = method, step, bands, note
-        self.n_bands, self.block = len(bands), int(settings["block"])
+        self.n_bands = len(bands)
+        self.block = int(settings["block"])  # samples that `step` takes at once; `run` takes any multiple
         self.channels, self.sensors = int(settings["channels"]), int(settings["sensors"])
-        self.rate = float(settings["rate"])
+        self.rate = float(settings["rate"])  # Hz
         tiles = max(-(-self.n_bands // W), 1)
         self.tiles = aligned(tiles, TILE)
         self.tiles["mode"] = FADING
@@ -166,12 +159,8 @@ class BankController:
     def fitting(self, bands: Bands) -> Array:
         """Return the setpoints of other targets, if this design holds for them: its bandwidths rest on the carriers.
 
-        Raises
-        ------
-        ValueError
-            Their number differs from the design's; they are a waveform where it was none, or the other way round;
-            others follow the finger; a carrier is lower, or two are closer, than any of the design's; or one is higher
-            than the device's highest.
+        A ValueError where their number differs; where they are a waveform, or follow the finger, and the design's do
+        not, or the other way round; and where a carrier is lower or higher, or two are closer, than designed for.
         """
         designed = self.bands
         if len(bands) != self.n_bands:
@@ -233,23 +222,10 @@ def lowest_carrier(model: DeviceModel, bands: Bands) -> float:
 def shared_settings(
     model: DeviceModel, bands: Bands, sensor_map: Array, drive_map: Array, feedback: bool
 ) -> dict[str, Any]:
-    """Settings that every method has, sample by sample.
+    """Settings that every method has, sample by sample; a ValueError where the device has too many channels.
 
-    Parameters
-    ----------
-    model : DeviceModel
-    bands : Bands
-    sensor_map : ndarray, shape (c, s)
-        Controlled coordinates from sensors.
-    drive_map : ndarray, shape (d, c)
-        Drive channels from what the law commands in each coordinate.
-    feedback : bool
-        False: nothing is sensed.
-
-    Raises
-    ------
-    ValueError
-        The device has too many coordinates, channels or sensors.
+    `sensor_map` (c, s) takes sensors to controlled coordinates, `drive_map` (d, c) what the law commands in each
+    coordinate to drive channels.  Without feedback nothing is sensed.
     """
     sensor_map = sensor_map[:, : None if feedback else 0]
     counts = {"coordinates": len(sensor_map), "channels": len(drive_map), "sensors": sensor_map.shape[1]}

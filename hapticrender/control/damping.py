@@ -29,28 +29,15 @@ LOOSE = LeastMargins(modulus=0.2, delay=0.0, phase=0.0, gain=1.0)  # with the be
 
 @dataclass(frozen=True, kw_only=True)
 class BendingMode:
-    """A mode of the surface beyond the controlled coordinates, as the loop sees it.
+    """A mode of the surface beyond the controlled coordinates, as the loop sees it."""
 
-    Parameters
-    ----------
-    frequency : float, Hz
-        Of the mode, > 0.
-    damping : float
-        Its damping ratio, >= 0.
-    coupling : tuple of float, 1/kg
-        For each coordinate, acceleration that the sensors show per force, short of the restoring force: mode shape at
-        the sensors times mode shape at the drive over modal mass.  Negative where sensors and drive move apart.
-    spread : float, Hz
-        How far off `frequency` it may lie, >= 0.
-    measured : bool
-        False for an estimate: then the coupling may have either sign, and Q stays at 2 or above.
-    """
-
-    frequency: float
-    damping: float
+    frequency: float  # Hz, > 0
+    damping: float  # ratio, >= 0
+    # 1/kg, for each coordinate: mode shape at the sensors times that at the drive over modal mass, that is acceleration
+    # at the sensors per force short of the restoring force; negative where sensors and drive move apart
     coupling: tuple[float, ...]
-    spread: float = 100.0
-    measured: bool = True
+    spread: float = 100.0  # Hz, >= 0: how far off `frequency` it may lie
+    measured: bool = True  # False for an estimate: then the coupling may have either sign, and Q stays at 2 or above
 
     def __post_init__(self) -> None:
         if not (math.isfinite(self.frequency) and self.frequency > 0):
@@ -71,30 +58,14 @@ class BendingMode:
 
 @dataclass(frozen=True, kw_only=True)
 class Damping:
-    """An inner damper, or the reason why there is none; `choose_damping` makes it.
+    """An inner damper, or the reason why there is none; `choose_damping` makes it."""
 
-    Attributes
-    ----------
-    taps : ndarray, shape (coordinates, n), N/m
-        Zero where the damper is off.
-    added_damping : ndarray, shape (coordinates,), N s/m
-        Damping that the taps add at each mode.
-    quality : float
-        Q of each mode with its damper; inf where the damper is off.
-    margins : tuple of Margins
-        One for each coordinate; none where the damper is off.
-    noise : tuple of float
-        Motion that white noise of the sensors causes, rms of each coordinate per rms of each sensor.
-    note : str
-        What was chosen, and why.
-    """
-
-    taps: Array
-    added_damping: Array
-    quality: float
-    margins: tuple[Margins, ...]
-    noise: tuple[float, ...]
-    note: str
+    taps: Array  # (coordinates, n), N/m; zero where the damper is off
+    added_damping: Array  # (coordinates,), N s/m, that the taps add at each mode
+    quality: float  # Q of each mode with its damper; inf where it is off
+    margins: tuple[Margins, ...]  # one for each coordinate; none where the damper is off
+    noise: tuple[float, ...]  # motion from white sensor noise, rms of each coordinate per rms of each sensor
+    note: str  # what was chosen, and why
 
     def text(self) -> str:
         """Return the note and a line of margins for each coordinate."""
@@ -128,25 +99,11 @@ def oscillators(model: DeviceModel) -> tuple[Oscillator, ...]:
 def damping_taps(
     model: DeviceModel, quality: float, *, bending: BendingMode | None = None, count: int | None = None
 ) -> tuple[Array, Array]:
-    """Solve for the taps of the inner damper and the damping that they add.
+    """Solve for the taps (coordinates, count), N/m, and the damping (coordinates,), N s/m, that they add.
 
-    Parameters
-    ----------
-    model : DeviceModel
-        The free device with its rate and delay.
-    quality : float
-        Q that the damper alone gives each mode, > 0; 1.4 wherever the bending mode of the surface is spared.
-    bending : BendingMode, optional
-        The taps then have zeros there; only coordinates that it couples into.
-    count : int, optional
-        Taps; by default the model's, and five with a bending mode.
-
-    Returns
-    -------
-    taps : ndarray, shape (coordinates, count), N/m
-        ``F[n] = -sum_i taps_i deviation[n - i]``, zeros at the end where fewer are of use.
-    added_damping : ndarray, shape (coordinates,), N s/m
-        b_a = m w1/Q.
+    ``F[n] = -sum_i taps_i deviation[n - i]`` with b_a = m w1/Q, `quality` Q > 0 being what the damper alone gives each
+    mode.  With a `bending` mode the taps of the coordinates that it couples into have zeros there.  `count` is by
+    default the model's, and five with a bending mode.
 
     Notes
     -----
@@ -246,21 +203,10 @@ def choose_damping(
 ) -> Damping:
     """Design the inner damper: the most damping whose margins hold, or none, and why.
 
-    Parameters
-    ----------
-    model : DeviceModel
-        The free device with its rate and delay.
-    bending : BendingMode, optional
-        The bending mode of the surface, which the taps then spare; once it is measured Q may go down to 1.4.
-        Without it Q stays at 2 or above, unless the model is known to be rigid.
-    least : LeastMargins
-
-    Notes
-    -----
     Q rises in steps of 0.1 until every coordinate keeps `least`, with the bending mode where it was measured, and Ms
-    stays below 5 with that mode at both ends of its tolerance.  Where even a damper of four times the modes' own
-    damping would not, the damper is off.  Notched taps reach back 0.6 to 1 bending period; the reach with the least
-    noise is taken.
+    stays below 5 with that mode at both ends of its tolerance.  Q starts at 1.4 where that mode is measured or the
+    model is rigid, else at 2.  Where even a damper of four times the modes' own damping would not do, the damper is
+    off.  Notched taps reach back 0.6 to 1 bending period; the reach with the least noise is taken.
     """
     if not (model.mass.diagonal() > 0.0).all():
         return _off(len(model.mass), "the device has no mode")

@@ -106,25 +106,10 @@ def rules_for(bands: Bands) -> Rules:
 def design_error(
     method: str, model: DeviceModel, bands: Bands, rules: Rules, *, feedback: bool = True
 ) -> BankController:
-    """Design the default controller for a device and its bands.
+    """Design the default controller, called `method`, for a device of 1 or 2 coordinates and its bands by `rules`.
 
-    Parameters
-    ----------
-    method : str
-        Name to carry.
-    model : DeviceModel
-        All that the controller is given of the device; 1 or 2 coordinates.
-    bands : Bands
-        Carriers and targets.
-    rules : Rules
-        Of the method.
-    feedback : bool
-        False: nothing is sensed, the law drives open loop.
-
-    Returns
-    -------
-    BankController
-        In blocks where the device's delay is that of a block device (more than 8 samples), else sample by sample.
+    It runs in blocks where the delay is that of a block device (more than 8 samples), else sample by sample.  Without
+    feedback nothing is sensed, and the law drives open loop.
 
     Raises
     ------

@@ -25,20 +25,11 @@ from hapticrender.protocols import Array
 class StarSTDFT:
     """The STDFT* of eq. 4: a second-order Butterworth low pass, discretised by Tustin's rule.
 
-    Parameters
-    ----------
-    bandwidth : float
-        -3 dB frequency fL of the low pass, Hz, between 0 and rate/2.
-    rate : float
-        Sampling rate, Hz.
-
-    Notes
-    -----
     The bilinear transform is prewarped at fL, so that the discrete filter is -3 dB there exactly.
     """
 
-    bandwidth: float
-    rate: float
+    bandwidth: float  # Hz, between 0 and rate/2: -3 dB frequency fL of the low pass
+    rate: float  # Hz
 
     def __post_init__(self) -> None:
         require_positive(rate=self.rate)

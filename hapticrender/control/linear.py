@@ -75,41 +75,20 @@ class FingerEstimate(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ErrorLoop:
-    """Linear loop of the error observer with K bands and its law on a device of c coordinates.
-
-    Parameters
-    ----------
-    plant : Sampled
-    delay : int
-        Samples from a sensed sample to its force taking effect, >= 1.
-    frequency : ndarray, shape (K,), Hz
-    observer : float
-        Gain g of the observer, per sample.
-    integral : float, 1/s
-    dc, dc_drift : float
-        Gains of the DC estimate, per sample.
-    inner : float
-        Factor on the inner damper, 0..1.
-    taps : ndarray, shape (c, t), N/m
-        Of the inner damper.
-    law, slope : ndarray of complex, shape (K, c, c), N/m, N s/m
-        rho D and rho D' of every band as the law has them.
-    share : ndarray, shape (K,)
-        Factor on the observer's gain of each band, less than 1 where it fades out.
-    """
+    """Linear loop of the error observer with K bands and its law on a device of c coordinates."""
 
     plant: Sampled
-    delay: int
-    frequency: Array
-    observer: float
-    integral: float
-    dc: float
+    delay: int  # samples from a sensed sample to its force taking effect, >= 1
+    frequency: Array  # (K,), Hz
+    observer: float  # gain g per sample
+    integral: float  # 1/s
+    dc: float  # of the DC estimate, per sample, as the next
     dc_drift: float
-    inner: float
-    taps: Array
-    law: Array
-    slope: Array
-    share: Array
+    inner: float  # factor on the inner damper, 0..1
+    taps: Array  # (c, t), N/m, of the inner damper
+    law: Array  # complex (K, c, c), N/m: rho D of every band as the law has it
+    slope: Array  # complex (K, c, c), N s/m: rho D'
+    share: Array  # (K,): factor on the observer's gain of each band, less than 1 where it fades out
 
     @cached_property
     def _bands(self) -> tuple[Array, Array, Array, Array]:

@@ -33,20 +33,9 @@ NARROWER, SLOWEST = 0.9, 0.05  # steps in which a loop is slowed down for its de
 def reduced_controller(loop_bandwidth: float, filter_bandwidth: float) -> TransferFunction:
     """Solve for the second-order controller ``ki p/(s (s + p))`` that makes the closed loop nearly a Butterworth T.
 
-    Parameters
-    ----------
-    loop_bandwidth, filter_bandwidth : float
-        Bandwidths of the Butterworth T and L, Hz; the loop's must be the smaller.
-
-    Raises
-    ------
-    DesignError
-        Where the filter is not faster than the loop: p would not be a stable pole.
-
-    Notes
-    -----
-    ``ki = wT wL/(sqrt2 (wT + wL))``, ``p = sqrt2 wT wL/(wL - wT)``: three moments of s C match those of T/(1 - L T) at
-    s = 0.
+    ``ki = wT wL/(sqrt2 (wT + wL))``, ``p = sqrt2 wT wL/(wL - wT)`` for the bandwidths (Hz) of T and L: three moments of
+    s C match those of T/(1 - L T) at s = 0.  A filter that is not faster than the loop is a `DesignError`: p would not
+    be a stable pole.
     """
     require_positive(loop_bandwidth=loop_bandwidth, filter_bandwidth=filter_bandwidth)
     if filter_bandwidth <= loop_bandwidth:
@@ -66,23 +55,10 @@ def integrator(gain: float) -> TransferFunction:
 
 
 def loop_margins(rational: TransferFunction, delay: float = 0.0) -> Margins:
-    """Compute the margins of the loop L C of one envelope.
+    """Compute the margins of the loop L C of one envelope: `rational`, stable but for integrators, and a `delay` (s).
 
-    Parameters
-    ----------
-    rational : TransferFunction
-        Everything in the loop but its delay; stable, but for integrators.
-    delay : float, s
-        Known delay, >= 0.
-
-    Raises
-    ------
-    ValueError
-        For a delay out of its bounds, and where |L C| never crosses 1.
-
-    Notes
-    -----
-    Margins come from a logarithmic grid of 20001 frequencies; linear interpolation between them errs by less than 1e-6.
+    They come from a logarithmic grid of 20001 frequencies; linear interpolation between them errs by less than 1e-6.
+    A delay below 0, and a gain |L C| that never crosses 1, are a ValueError.
     """
     if not (np.isfinite(delay) and delay >= 0):
         raise ValueError(f"{delay=} s must be finite and >= 0")
@@ -118,19 +94,8 @@ def design(
 ) -> TransferFunction:
     """Design the controller of one envelope's loop, and refuse it where its margins are too small.
 
-    Parameters
-    ----------
-    loop_bandwidth : float
-        Bandwidth of the closed loop T, Hz, at most a quarter of `lowest_frequency`.
-    filter_bandwidth : float
-        Bandwidth of the estimator's low pass L, Hz, at most half of `lowest_frequency`.
-    form : {"reduced", "integrator"}
-        Second-order controller, or a plain integrator of gain 3.4 loop_bandwidth.
-    lowest_frequency : float
-        Lowest carrier of the scene, Hz.
-    delay : float
-        Known delay of the loop, s.
-    least : LeastMargins
+    Bandwidths are in Hz, that of the closed loop T at most a quarter of the scene's lowest carrier (Hz), that of the
+    low pass L at most half of it; `delay` (s) is the loop's.  A plain integrator has the gain 3.4 loop_bandwidth.
 
     Raises
     ------
@@ -183,16 +148,12 @@ def ripple(
 
 
 class EnvelopeLoop(NamedTuple):
-    """Low pass of an estimator and its loop controller as second-order sections.
-
-    `boxcar` is the length of the running mean in samples, 0 for none; `bandwidth` (Hz) that of the closed loop, lowered
-    where the delay requires it.
-    """
+    """Low pass of an estimator and its loop controller as second-order sections."""
 
     filter: Section
     law: Section
-    boxcar: int
-    bandwidth: float
+    boxcar: int  # samples, length of the running mean; 0: none
+    bandwidth: float  # Hz, of the closed loop, lowered where the delay requires it
 
 
 def envelope_loop(
@@ -204,24 +165,12 @@ def envelope_loop(
     bandwidths: Bandwidths | None = None,
     feedback: bool = True,
 ) -> EnvelopeLoop:
-    """Design the loop of one envelope for the lowest carrier of `bands`, with the margins of a low-pass loop.
+    """Design the loop of one envelope for the lowest carrier, with the margins of a low-pass loop.
 
-    Parameters
-    ----------
-    model : DeviceModel
-        Gives the rate, the known delay and the lowest carrier that a moving finger may make.
-    bands : Bands
-        Gives the fixed carriers.
-    form : {"reduced", "integrator"}
-        Second-order controller of loop shaping, or a plain integrator.
-    boxcar : bool
-        Estimate by a running mean over one period of the lowest carrier, which removes the image of that carrier and of
-        its harmonics; its delay beyond the low pass's counts as the loop's.
-    bandwidths : (float, float), Hz, optional
-        Of loop and low pass, unchecked.  By default a quarter and half of the lowest carrier, or less where the delay
-        would leave too small a margin.
-    feedback : bool
-        Without it no delay is in the loop.
+    A `boxcar` estimates by a running mean over one period of the lowest carrier, which removes the image of that
+    carrier and of its harmonics; its delay beyond the low pass's counts as the loop's.  `bandwidths` (Hz, of loop and
+    low pass) are unchecked; by default they are a quarter and half of the lowest carrier, or less where the delay would
+    leave too small a margin.  Without feedback no delay is in the loop.
 
     Raises
     ------
@@ -229,7 +178,7 @@ def envelope_loop(
         Even a loop twenty times slower has too small a margin.
     """
     fixed = bands.frequency[bands.wavenumber == 0.0]
-    lowest = float(min(model.lowest_frequency, fixed.min(initial=np.inf)))
+    lowest = float(fixed.min(initial=model.lowest_frequency))
     length = round(model.rate / lowest) if boxcar else 0
     if bandwidths:
         width, wide = bandwidths

@@ -33,33 +33,15 @@ BISECTIONS = 24  # of a grid where the return difference turns by more than a ra
 
 @dataclass(frozen=True, kw_only=True)
 class Margins:
-    """Distances of a loop from instability; every margin of an unstable loop is 0, and its gain margin 1.
+    """Distances of a loop from instability; every margin of an unstable loop is 0, and its gain margin 1."""
 
-    Parameters
-    ----------
-    stable : bool
-        All closed-loop poles decay, or grow by less than 0.02 1/s.
-    modulus : float
-        1/Ms, 0..1, Ms being the maximum over frequency of the largest singular value of S.
-    worst_frequency : float, Hz
-        Where S peaks.
-    delay : float, s
-        Largest extra delay, the same in every coordinate.
-    phase : float, rad
-        Largest error of the plant's phase, the same in every coordinate and at every frequency, of either sign.
-    gain : float
-        Largest error of the plant's gain, as a factor >= 1: the loop bears the plant times it and divided by it.
-    bandwidth : float, Hz
-        Within this distance of every carrier S stays below 1/sqrt 2; inf where the loop has no carrier.
-    """
-
-    stable: bool
-    modulus: float
-    worst_frequency: float
-    delay: float
-    phase: float
-    gain: float
-    bandwidth: float = math.inf
+    stable: bool  # all closed-loop poles decay, or grow by less than 0.02 1/s
+    modulus: float  # 1/Ms, 0..1, Ms being the maximum over frequency of the largest singular value of S
+    worst_frequency: float  # Hz, where S peaks
+    delay: float  # s: largest extra delay, the same in every coordinate
+    phase: float  # rad: largest error of the plant's phase, the same in every coordinate and at every frequency
+    gain: float  # >= 1: the loop bears the plant times this factor and divided by it
+    bandwidth: float = math.inf  # Hz: so close to every carrier S stays below 1/sqrt 2; inf where there is no carrier
 
     @classmethod
     def unstable(cls) -> Margins:
@@ -92,22 +74,14 @@ class Margins:
 class LeastMargins:
     """Least margins of a design.
 
-    Parameters
-    ----------
-    modulus : float
-        1/Ms, 0..1; 0.5 is Ms = 2.
-    delay : float, samples
-        At most the time in which the highest carrier turns by `phase` is required: above 400 Hz a sample at 5 kHz is a
-        larger angle than any loop that follows a carrier bears.
-    phase : float, rad
-    gain : float
-        Factor, >= 1.
+    The delay is at most the time in which the highest carrier turns by `phase`: above 400 Hz a sample at 5 kHz is a
+    larger angle than any loop that follows a carrier bears.
     """
 
-    modulus: float = 0.5
-    delay: float = 1.0
-    phase: float = math.radians(30.0)
-    gain: float = 2.0
+    modulus: float = 0.5  # 1/Ms, 0..1; 0.5 is Ms = 2
+    delay: float = 1.0  # samples
+    phase: float = math.radians(30.0)  # rad
+    gain: float = 2.0  # factor, >= 1
 
     def complaint(self, found: Margins, rate: float = 1.0, highest: float = 0.0) -> str:
         """Name the first margin that falls short, with value, bound and unit; empty where all hold.
@@ -140,16 +114,10 @@ LEAST = {
 
 
 def carrier_grid(carriers: Array, widths: Array, rate: float) -> Array:
-    """Frequencies (Hz) from 0 to half the rate, denser towards the carriers, none of them on one.
+    """Frequencies (Hz) from 0 to half the `rate` (Hz), denser towards the carriers, none of them on one.
 
-    Parameters
-    ----------
-    carriers : ndarray, shape (n,), Hz
-        Where the loop, or the plant, changes fast; at least one.
-    widths : ndarray, shape (m,), Hz
-        Widths that the loop is known to have; points crowd around carriers plus and minus these.
-    rate : float, Hz
-        Sampling rate.
+    The loop or the plant changes fast at `carriers` (Hz, at least one); points crowd around these plus and minus
+    `widths` (Hz), which the loop is known to have.
     """
     carriers = np.unique(carriers)
     count = math.ceil(PER_DECADE * math.log10(rate / NARROWEST))
@@ -168,13 +136,9 @@ def carrier_grid(carriers: Array, widths: Array, rate: float) -> Array:
 def unstable_poles(difference: Callable[[Array], Array], grid: Array) -> int:
     """Count the closed-loop poles outside a contour, by Nyquist's criterion.
 
-    Parameters
-    ----------
-    difference : callable
-        Return difference det(I + L) at frequencies (Hz, shape (n,)) along the contour, real at both its ends.
-    grid : ndarray, Hz
-        Where to begin, from 0 to half the rate (or far beyond every corner); bisected wherever the difference turns by
-        more than one radian.
+    `difference` is det(I + L) at frequencies (Hz, shape (n,)) along the contour, real at both its ends.  `grid` (Hz)
+    goes from 0 to half the rate, or far beyond every corner; it is bisected wherever the difference turns by more than
+    one radian.
 
     Notes
     -----
@@ -194,16 +158,10 @@ def unstable_poles(difference: Callable[[Array], Array], grid: Array) -> int:
 
 
 def margins_of(loop: Callable[[Array], Array], grid: Array, carriers: Array | None = None) -> Margins:
-    """Read every margin of a stable loop off its frequency response.
+    """Read every margin of a stable loop off its frequency response, complex (n, c, c) at frequencies (Hz, (n,)).
 
-    Parameters
-    ----------
-    loop : callable
-        L at frequencies (Hz, shape (n,)), complex, shape (n, c, c).
-    grid : ndarray, Hz
-        Ascending, > 0, dense where L changes fast; S is searched more finely around its peaks.
-    carriers : ndarray, Hz, optional
-        Frequencies about which `bandwidth` is measured.
+    `grid` (Hz) is ascending, > 0 and dense where L changes fast; S is searched more finely around its peaks.
+    `bandwidth` is measured about the `carriers` (Hz).
     """
     values = loop(grid)
     peak = sensitivity(values)
@@ -256,18 +214,11 @@ def eigenloci(loop: Array) -> Array:
 
 
 def borne_errors(frequency: Array, loop: Array) -> tuple[float, float, float]:
-    """Largest delay (s), phase error (rad) and gain error (factor) that a stable loop bears.
+    """Largest delay (s), phase error (rad) and gain error (factor) that a stable `loop` (n, c, c) bears.
 
-    Parameters
-    ----------
-    frequency : ndarray, shape (n,), Hz
-        Ascending, >= 0.
-    loop : ndarray of complex, shape (n, c, c)
-
-    Notes
-    -----
-    A common factor q = exp(-j w tau), exp(-j theta) or kappa puts a pole on the boundary where det(I + q L) = 0, that
-    is where an eigenvalue of L equals -1/q: the first such q on the way from 1 is the margin, exactly.
+    `frequency` (Hz, shape (n,)) is ascending, >= 0.  A common factor q = exp(-j w tau), exp(-j theta) or kappa puts a
+    pole on the boundary where det(I + q L) = 0, that is where an eigenvalue of L equals -1/q: the first such q on the
+    way from 1 is the margin, exactly.
     """
     delay = phase = math.inf
     more, less = math.inf, 0.0

@@ -26,13 +26,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from hapticrender.bands import Bands
-from hapticrender.control.controller import (
-    BankController,
-    device_settings,
-    ridge_spacing,
-    shared_settings,
-    spacing,
-)
+from hapticrender.control.controller import BankController, device_settings, ridge_spacing, shared_settings, spacing
 from hapticrender.control.device_model import DeviceModel
 from hapticrender.control.error_design import FADE_IN, ONE_SPEED, Rules, design_error, rules_for
 from hapticrender.control.linear import Sampled
@@ -61,11 +55,7 @@ ALL_PASS = (1.0, 0.0, 0.0, 0.0, 0.0)
 class ErrorObserver:
     """The default method: an error observer and the device's dynamic stiffness, finger included.
 
-    Parameters
-    ----------
-    name : str
-    rules : Rules, optional
-        How fast it is; by default at two speeds, by the carriers' spacing.
+    Without `rules` it runs at two speeds, by the carriers' spacing.
     """
 
     name: str = "h2"
@@ -78,36 +68,24 @@ class ErrorObserver:
 
 @dataclass(frozen=True, kw_only=True)
 class Polar:
-    """Options of the polar methods; they show what each precaution is good for.
-
-    Parameters
-    ----------
-    clamp : bool
-        Keep the command amplitude from going negative.
-    subtract : bool
-        Naive phase error arg X - arg R, with a seam at -270/90 degrees in each, instead of arg(X conj R).
-    bandwidths : (float, float), Hz, optional
-        Of loop and low pass, unchecked; by default the paper's rule, a quarter and half of the lowest carrier.
+    """The paper's controller: amplitude and phase loops; the options show what each precaution is good for.
 
     References
     ----------
     Grigorii, Li, Peshkin and Colgate, IEEE Transactions on Haptics, 2021, eqs. 1-5.
     """
 
-    clamp: bool = True
-    subtract: bool = False
-    bandwidths: Bandwidths | None = None
-    name: ClassVar[str]
-    common: ClassVar[bool] = False
-    boxcar: ClassVar[bool] = False
+    name: str = "paper"
+    common: bool = False  # loops on the mean displacement; all transducers get the same drive
+    boxcar: bool = False  # estimate by a running mean
+    clamp: bool = True  # keep the command amplitude from going negative
+    subtract: bool = False  # naive phase error arg X - arg R, with a seam at -270/90 deg in each, not arg(X conj R)
+    bandwidths: Bandwidths | None = None  # Hz, of loop and low pass, unchecked; None: the paper's rule
 
     def design(self, model: DeviceModel, bands: Bands, *, feedback: bool = True) -> BankController:
-        """Design loops on the displacements at the transducers, or on their mean.
+        """Design loops on the displacements at the transducers; a `DesignError` where the delay leaves no margin.
 
-        Raises
-        ------
-        DesignError
-            A target is modulated or differentiated, or no loop has the margins with the device's delay.
+        Targets that are modulated or differentiated are refused alike.
         """
         if bands.modulated or bands.differentiated:
             raise DesignError(f"method {self.name!r} cannot modulate or differentiate targets: use 'h2' or 'stiffness'")
@@ -136,48 +114,16 @@ class Polar:
         return controller
 
 
-class PerSide(Polar):
-    """The paper's controller: each transducer with its own amplitude and phase loops."""
-
-    name = "paper"
-
-
-class CommonMode(Polar):
-    """The same loops on the mean displacement only; all transducers get the same drive."""
-
-    name = "paper-common"
-    common = True
-
-
-class Boxcar(Polar):
-    """The paper's loops, per transducer, on a running mean as long as a period of the lowest carrier."""
-
-    name = "boxcar"
-    boxcar = True
-
-
 @dataclass(frozen=True, kw_only=True)
 class Inverse:
-    """Complex loops and the inverse of the free device; the options show what each precaution is good for.
+    """Complex loops and the inverse of the free device; the options show what each precaution is good for."""
 
-    Parameters
-    ----------
-    form : {"reduced", "integrator"}
-        Second-order controller of loop shaping, or a plain integrator of 17 1/s at 5 Hz.
-    feed_forward : bool
-        Command the reference plus what the loop adds; by default the loop alone commands.
-    filtered : bool
-        With feed-forward, pass the reference through the estimator's low pass before it is compared; naive without.
-    bandwidths : (float, float), Hz, optional
-        Of loop and low pass, unchecked; by default the paper's rule.
-    """
-
-    form: Form = "reduced"
-    feed_forward: bool = False
-    filtered: bool = True
-    bandwidths: Bandwidths | None = None
-    name: ClassVar[str]
-    dynamic: ClassVar[bool]
+    name: str
+    dynamic: bool  # D V + D' dV/dt in place of the static D(jw) V
+    form: Form = "reduced"  # or an "integrator" of 17 1/s at 5 Hz
+    feed_forward: bool = False  # command the reference plus what the loop adds, in place of the loop alone
+    filtered: bool = True  # with feed-forward, compare the reference behind the estimator's low pass; naive without
+    bandwidths: Bandwidths | None = None  # Hz, of loop and low pass, unchecked; None: the paper's rule
 
     def design(self, model: DeviceModel, bands: Bands, *, feedback: bool = True) -> BankController:
         """Design loops in the device's coordinates; raises `DesignError` where its delay leaves no margin."""
@@ -187,32 +133,9 @@ class Inverse:
         return low_pass_controller(self.name, settings, bands)
 
 
-class StaticInverse(Inverse):
-    """Loop controller, then the static inverse D(jw) of the free device."""
-
-    name = "static"
-    dynamic = False
-
-
-class DynamicStiffness(Inverse):
-    """Loop controller, then D V + D' dV/dt of the free device."""
-
-    name = "stiffness"
-    dynamic = True
-
-
 @dataclass(frozen=True, kw_only=True)
 class Resonant:
     """Adaptive feed-forward cancellation (proportional-resonant control): one integrator a band and coordinate.
-
-    Parameters
-    ----------
-    gain : float, 1/s
-        Sum of ki over the bands, > 0, below the decay rate of the device's least damped mode.
-    feed_forward : bool
-        Command the reference plus what the loop adds; by default the loop alone commands.
-    checked : bool
-        Refuse a gain or a delay beyond its bound; naive without.
 
     Notes
     -----
@@ -222,19 +145,13 @@ class Resonant:
     Delay and hold leave 3 % more for low carriers and take the limit away for those above the modes.
     """
 
-    gain: float = 15.0
-    feed_forward: bool = False
-    checked: bool = True
+    gain: float = 15.0  # 1/s, sum of ki over the bands, > 0, below the decay rate of the least damped mode
+    feed_forward: bool = False  # command the reference plus what the loop adds, in place of the loop alone
+    checked: bool = True  # refuse a gain or a delay beyond its bound; naive without
     name: ClassVar[str] = "resonant"
 
     def design(self, model: DeviceModel, bands: Bands, *, feedback: bool = True) -> BankController:
-        """Design integrators in the device's coordinates.
-
-        Raises
-        ------
-        DesignError
-            The gain drives a mode, or the device's delay leaves no margin.
-        """
+        """Design integrators; a `DesignError` where the gain drives a mode, or the delay leaves no margin."""
         controller = integrator(self.gain / max(len(bands), 1))
         if feedback and self.checked:
             least = least_decay(model)
@@ -321,11 +238,11 @@ def low_pass_controller(
 
 
 _ALL: tuple[Any, ...] = (
-    PerSide(),
-    CommonMode(),
-    Boxcar(),
-    StaticInverse(),
-    DynamicStiffness(),
+    Polar(),
+    Polar(name="paper-common", common=True),
+    Polar(name="boxcar", boxcar=True),
+    Inverse(name="static", dynamic=False),
+    Inverse(name="stiffness", dynamic=True),
     Resonant(),
     ErrorObserver("h", ONE_SPEED),
     ErrorObserver("h2"),

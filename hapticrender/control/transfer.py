@@ -30,16 +30,8 @@ def require_positive(**values: float) -> None:
 class TransferFunction:
     """A proper rational function of s, ``numerator(s)/denominator(s)``.
 
-    Parameters
-    ----------
-    numerator, denominator : sequence of float
-        Coefficients in descending powers of s (rad/s).  They are kept as tuples, scaled so that the denominator is
-        monic; common factors stay.
-
-    Raises
-    ------
-    ValueError
-        For a zero or non-finite polynomial, or a numerator of higher order than the denominator.
+    Coefficients are in descending powers of s (rad/s), kept as tuples and scaled so that the denominator is monic;
+    common factors stay.  A zero or non-finite polynomial, or a numerator of higher order, is a ValueError.
     """
 
     numerator: tuple[float, ...]
@@ -75,15 +67,7 @@ class TransferFunction:
         return self(2j * np.pi * np.asarray(frequency, float))
 
     def tustin(self, rate: float, *, prewarp: float | None = None) -> tuple[Array, Array]:
-        """Discretise by the bilinear transform.
-
-        Parameters
-        ----------
-        rate : float
-            Sampling rate, Hz.
-        prewarp : float, optional
-            Frequency (Hz, below rate/2) at which the discrete response shall equal the continuous one exactly; by
-            default that is only 0 Hz.
+        """Discretise by the bilinear transform at `rate` (Hz), exact at `prewarp` (Hz, below rate/2), or at 0 Hz.
 
         Returns
         -------
@@ -114,13 +98,7 @@ def _bilinear(polynomial: tuple[float, ...], order: int, scale: float) -> Array:
 
 
 def butterworth(bandwidth: float) -> TransferFunction:
-    """Second-order Butterworth low pass, ``w^2/(s^2 + sqrt2 w s + w^2)``.
-
-    Parameters
-    ----------
-    bandwidth : float
-        -3 dB frequency w/(2 pi), Hz.
-    """
+    """Second-order Butterworth low pass, ``w^2/(s^2 + sqrt2 w s + w^2)``, -3 dB at `bandwidth` w/(2 pi) (Hz)."""
     require_positive(bandwidth=bandwidth)
     w = 2 * np.pi * bandwidth
     return TransferFunction((w**2,), (1.0, sqrt(2) * w, w**2))

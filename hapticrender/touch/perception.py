@@ -101,24 +101,11 @@ def drop_unfelt(bands: Bands, *, top_speed: float, lowest: float, highest: float
     """Leave out the bands below the detection threshold, and note them in `Bands.unfelt`.
 
     A band can go if it stays below the safe threshold at every frequency it can have: a fixed carrier at its own, one
-    that is locked to the finger at all from `lowest` to `highest` that a finger of up to `top_speed` gives it, in both
-    directions.  The weakest go first, and only as long as all that went, each over its threshold, sum to less than 1:
-    together and in phase they are below it too.  Masking of one band by another is not used.
-
-    Parameters
-    ----------
-    bands : Bands
-        Those of a recording (envelope None) are kept: their amplitudes are not known here.
-    top_speed : float, m/s
-        Of the finger, >= 0 and <= 10; 0 without a finger.
-    lowest, highest : float, Hz
-        Where the device renders finger-locked carriers, 0 <= lowest <= highest <= 1e6.
-        A band that never gets there is kept, as is one that gets below 1 Hz.
-
-    Raises
-    ------
-    ValueError
-        No band would be left, or an argument is out of its bounds.
+    that is locked to the finger at all from `lowest` to `highest` (Hz, where the device renders it) that a finger of up
+    to `top_speed` (m/s) gives it, in both directions.  A band that never gets there is kept, as is one that gets below
+    1 Hz, and those of a recording, whose amplitudes are not known here.  The weakest go first, and only as long as all
+    that went, each over its threshold, sum to less than 1: together and in phase they are below it too.  Masking of one
+    band by another is not used.  No band left is a ValueError.
 
     Examples
     --------
@@ -126,9 +113,6 @@ def drop_unfelt(bands: Bands, *, top_speed: float, lowest: float, highest: float
     >>> drop_unfelt(bands, top_speed=0.0, lowest=5.0, highest=1000.0).unfelt
     ('60 Hz: target 100 nm is below the detection threshold, 583 nm at 60 Hz',)
     """
-    top_speed = checks.number("top_speed", top_speed, "m/s", least=0, most=10)
-    lowest = checks.number("lowest", lowest, "Hz", least=0, most=1e6)
-    highest = checks.number("highest", highest, "Hz", least=lowest, most=1e6)
     if bands.envelope is None or not len(bands):
         return bands
     threshold, sensitive = _most_sensitive(bands, top_speed, lowest, highest)

@@ -22,17 +22,10 @@ FAINTEST = 1e-4  # a peak below this share of the strongest one's power is no ca
 
 @dataclass(frozen=True)
 class Profile:
-    """Values at a constant step, continued past both ends by reflection, so that it never jumps.
+    """Values at a constant step, continued past both ends by reflection, so that it never jumps."""
 
-    Parameters
-    ----------
-    values : ndarray, shape (n,), n >= 2
-    step : float, s
-        Recorded time between values.
-    """
-
-    values: Array
-    step: float
+    values: Array  # (n,), n >= 2
+    step: float  # s, recorded time between values
 
     @property
     def length(self) -> float:

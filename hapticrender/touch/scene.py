@@ -24,15 +24,7 @@ from hapticrender.touch.custom import Custom
 from hapticrender.touch.finger import Finger
 from hapticrender.touch.grating import Grating
 from hapticrender.touch.mechanics import NAMED
-from hapticrender.touch.motion import (
-    LONGEST_TIME,
-    Nowhere,
-    RecordedMotion,
-    Sampled,
-    SineMotion,
-    Still,
-    TriangleMotion,
-)
+from hapticrender.touch.motion import LONGEST_TIME, Nowhere, RecordedMotion, Sampled, SineMotion, Still, TriangleMotion
 from hapticrender.touch.recorded import Recorded, Swipe, Synthetic
 
 TEXTURES: dict[str, type[Any]] = {kind.kind: kind for kind in (Grating, Recorded, Swipe, Synthetic, Custom)}
@@ -165,12 +157,7 @@ class Scene(Validated):
 
     @classmethod
     def from_toml_text(
-        cls,
-        text: str,
-        where: str = "scene",
-        *,
-        folder: str | os.PathLike[str] = "",
-        name: str = "scene",
+        cls, text: str, where: str = "scene", *, folder: str | os.PathLike[str] = "", name: str = "scene"
     ) -> Scene:
         """Read a scene from TOML; `where` begins every message, `folder` holds the files, `name` is the default."""
         try:
