@@ -147,15 +147,7 @@ def test_drive_is_the_same_where_the_arithmetic_is(name):
     assert_same_drive(name)
 
 
-@pytest.mark.parametrize("name", sorted(SAME_ARITHMETIC))
-def test_amplitudes_are_the_same_where_the_arithmetic_is(name):
-    """Within 1e-5 of the largest: the stored ones are in single precision."""
-    stored = arrays()[f"{name}/amplitude"]
-    amplitude = judge.amplitudes_of(played(name), CASES[name].window)
-    np.testing.assert_allclose(amplitude, stored, rtol=0, atol=1e-5 * np.nanmax(stored))
-
-
-@pytest.mark.parametrize("name", ["plate-slide", "plate-reversal", "plate-press", "plate-block-25"])
+@pytest.mark.parametrize("name", ["plate-slide", "plate-press"])
 def test_the_comparison_fails_where_a_lesser_method_plays(name):
     case = replace(CASES[name], method="paper")
     assert complaints(found_of(case, play(case)), stored_of(name))
@@ -185,17 +177,23 @@ def suite_complaints(found, stored):
                 yield label
 
 
+BASELINES = ("chirp", "slide", "late", "overload", "electroadhesion: harmonic", "electroadhesion: swipe")
+SUITE = sorted(
+    {
+        (row["method"], row["case"])
+        for row in STORED["suite"]
+        if row["method"] == DEFAULT_METHOD or (row["method"] in ("paper", "boxcar") and row["case"] in BASELINES)
+    }
+)
 # The second harmonic that a screen adds and these methods leave: 89 % where it was 58 %.  Open: the cause is not known.
 WORSE = {("paper", "electroadhesion: harmonic"), ("boxcar", "electroadhesion: harmonic")}
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("case", sorted({row["case"] for row in STORED["suite"]}))
-@pytest.mark.parametrize("method", [DEFAULT_METHOD, "paper", "boxcar"])
-def test_the_accuracy_suite_keeps_its_table(request, case, method):
+@pytest.mark.parametrize(("method", "case"), SUITE)
+def test_the_accuracy_suite_keeps_its_table(request, method, case):
+    """Every case of the default method, which met its bounds and has to; where baselines fail, some of theirs."""
     if (method, case) in WORSE:
         request.applymarker(pytest.mark.xfail(reason="second harmonic 89 % after 58 %", strict=True))
-    stored = [row for row in STORED["suite"] if row["case"] == case and row["method"] == method]
-    if not stored:
-        pytest.skip(f"{case}: no method's doing")
+    stored = [row for row in STORED["suite"] if (row["method"], row["case"]) == (method, case)]
     assert list(suite_complaints(suite_of(method, (case,)), stored)) == []
