@@ -193,7 +193,7 @@ def test_a_broken_package_is_shown_as_broken_and_hides_no_other(run, tmp_path, m
     assert line.endswith("broken  cannot be loaded from third_party:Driver (SystemExit: no licence)")
 
 
-def test_help_lists_the_methods():
+def test_the_methods_that_help_lists_are_those_there_are():
     from hapticrender.control.methods import METHODS
 
     assert set(defaults.METHODS) == set(METHODS)

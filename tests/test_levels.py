@@ -129,13 +129,13 @@ def test_the_prediction_is_1_to_2_times_the_difference_of_two_played_levels(scen
 
 
 def test_random_plates():
-    """24 random plates, fingers and textures: wherever a difference is predicted it is 1 to 2 times the played one.
+    """12 random plates, fingers and textures: wherever a difference is predicted it is 1 to 2 times the played one.
 
     Not predicted are near carriers under a moving finger (they exchange sidebands) and a sag that changes by as much as
     the difference: neither is quasi-static.
     """
     judged = 0
-    for seed in range(24):
+    for seed in range(12):
         scene, lesser, names = random_case(seed)
         predicted = difference(scene, lesser)
         if not names or not np.isfinite(predicted):
@@ -144,7 +144,7 @@ def test_random_plates():
         if true > 2e-4:  # below, rounding of the fit counts
             assert 1.0 <= predicted / true <= 2.0, (seed, names)
             judged += 1
-    assert judged >= 8
+    assert judged >= 4
 
 
 def test_levels_are_taken_within_the_tolerance_only():
