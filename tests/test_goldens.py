@@ -177,7 +177,7 @@ def suite_complaints(found, stored):
                 yield label
 
 
-BASELINES = ("chirp", "slide", "late", "overload", "electroadhesion: harmonic", "electroadhesion: swipe")
+BASELINES = ("chirp", "slide", "overload", "electroadhesion: harmonic", "electroadhesion: swipe")
 SUITE = sorted(
     {
         (row["method"], row["case"])

@@ -163,7 +163,7 @@ class Bench(BaseDriver):
 
 def test_a_driver_of_ones_own_gets_currents_and_is_judged_by_its_sensors():
     played = []
-    recording = hr.render(scene(tone(100.0)), driver=Bench(played))
+    recording = hr.render(scene(tone(100.0), duration=0.8), driver=Bench(played))
     envelope = np.array(played)[:, 2]
     assert envelope.max() < 10e-3  # A
     assert envelope[5000:-1].min() > 0.0  # around a bias

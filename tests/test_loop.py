@@ -56,7 +56,7 @@ def equal(one, other, columns=COLUMNS, rounding=0.0):
 
 @pytest.mark.parametrize(
     ("scene", "method"),
-    [(SPATIAL, "h2"), (RECORDED, "paper-common"), (TONE, "paper")],
+    [(SPATIAL, "paper"), (RECORDED, "paper-common"), (TONE, "paper")],
     ids=["space", "file", "time"],
 )
 def test_compiled_loop_equals_the_ring_of_blocks(scene, method):
