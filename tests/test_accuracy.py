@@ -1,4 +1,4 @@
-"""The accuracy suite is met by the default method, its figures can miss their bounds, and gratings hold."""
+"""The accuracy suite: its figures can miss their bounds (test_goldens holds the default method to them); gratings."""
 
 import json
 
@@ -15,14 +15,6 @@ from hapticrender.protocols import Flag
 from hapticrender.touch.mechanics import FingerMechanics
 
 RANGES = ((1e-4, 5e-4), (0.5, 12.0), (400.0, 12e3), (1e-3, 10e-3), (0.3, 4.0), (60.0, 900.0))  # skin, then phalanx
-LONG = {"free", "touch", "press", "wobble", "wrong", "late", "identified", "every device: velocity"}
-LONG |= {
-    "electroadhesion: tones",
-    "electroadhesion: comb",
-    "ultrasonic: tones",
-    "ultrasonic: comb",
-    "ultrasonic: swipe",
-}
 
 
 def missed(figures):
@@ -33,17 +25,6 @@ def test_every_case_has_its_targets_and_every_target_its_case():
     assert {target.case for target in TARGETS} == set(CASES)
     assert all(target.aim <= target.bound for target in TARGETS)
     assert set(CASES) > METHOD_FREE
-    assert set(CASES) > LONG
-
-
-def test_the_default_method_meets_the_bounds():
-    assert not missed(run_suite([defaults.METHOD], sorted(set(CASES) - LONG)))
-
-
-@pytest.mark.slow
-def test_the_default_method_meets_every_other_bound():
-    """But for identification, which test_identify holds to the same bounds."""
-    assert not missed(run_suite([defaults.METHOD], sorted(LONG - {"identified"})))
 
 
 def test_a_comb_under_a_finger_that_is_adapted_to():

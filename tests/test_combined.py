@@ -2,11 +2,10 @@
 
 import numpy as np
 import pytest
-from test_kernel import IDEAL, RATE, friction_controller, plate_controller, tones
+from test_kernel import RATE, friction_controller, plate_controller, tones
 
-from hapticrender.bands import Bands
-from hapticrender.control.combined import CombinedBands, CombinedController, CombinedModel, design_combined
-from hapticrender.control.error_design import ONE_SPEED, design_error
+from hapticrender.control.combined import CombinedBands, CombinedController
+from hapticrender.control.error_design import ONE_SPEED
 from hapticrender.realtime import RealtimeEntry
 
 VELOCITY_PER_FORCE = 0.64  # m/(N s)
@@ -56,44 +55,6 @@ def test_each_part_is_driven_as_on_its_own(rng):
     expected[PLATE_INDEX] += 1j * w * x[-1]
     expected[FRICTION_INDEX] += VELOCITY_PER_FORCE * force[-1]
     np.testing.assert_allclose(target[-1], expected, rtol=1e-9)  # the tracker's speed, after 0.4 s at 60 Hz
-
-
-def test_a_part_without_targets_stays_without_drive(rng):
-    none = np.zeros(0)
-    nothing = Bands(frequency=none, wavenumber=none, phase=none, envelope=none + 0j)
-    model = IDEAL.device_model(RATE, 1)
-
-    class Method:
-        name = "h"
-
-        def design(self, model, bands, *, feedback=True):
-            return design_error("h", model, bands, ONE_SPEED, feedback=feedback)
-
-    names = ("rate", "delay", "mass", "damping", "stiffness", "force_from_drive", "coordinate_from_sensed")
-    names += ("side_from_coordinate", "place_from_coordinate", "places", "drive_limit", "sensed_limit", "drive_step")
-    both = CombinedModel(
-        **{name: getattr(model, name) for name in names},
-        plate=model,
-        friction=None,
-        velocity_per_force=VELOCITY_PER_FORCE,
-    )
-    fixed = tones([70.0])
-    bands = CombinedBands(
-        frequency=fixed.frequency,
-        wavenumber=fixed.wavenumber,
-        phase=fixed.phase,
-        envelope=fixed.envelope,
-        plate=fixed,
-        friction=nothing,
-        plate_index=np.array([0]),
-        friction_index=np.zeros(0, int),
-    )
-    controller = design_combined(Method(), both, bands)
-    drive, target, _ = controller.run(1e-7 * rng.standard_normal((1000, 3)), np.zeros(1000), np.zeros(1000))
-    assert abs(drive[:, :2]).max() > 0
-    assert (drive[:, 2] == 0).all()
-    assert target[-1, 0] == pytest.approx(2j * np.pi * 70.0 * 10e-6, rel=1e-12)
-    assert "friction: no target" in controller.note
 
 
 def test_it_plays_through_the_real_time_entry(rng):

@@ -62,9 +62,6 @@ def test_it_writes_where_it_is_asked_to(rng):
     [
         ({"frequency": []}, "at least one number"),
         ({"frequency": [2501.0]}, "half the rate, 2500 Hz"),
-        ({"frequency": [np.nan]}, "half the rate"),
-        ({"bandwidth": 0.0}, "bandwidth"),
-        ({"rate": -1.0}, "rate"),
         ({"channels": 0}, "channels=0"),
     ],
 )

@@ -105,10 +105,7 @@ def test_a_drive_that_is_not_finite_is_refused_and_pointed_at(value):
     ("change", "message"),
     [
         ({"rate": 0.0}, r"rate=0.0 must be finite and > 0 Hz"),
-        ({"rate": np.nan}, r"rate=nan must be finite and > 0 Hz"),
         ({"block": 0}, r"block=0 must be a whole number >= 1"),
-        ({"block": 1.5}, r"block=1.5 must be a whole number >= 1"),
-        ({"drive_channels": 0}, r"drive_channels=0 must be a whole number >= 1"),
         ({"sensed_channels": -1}, r"sensed_channels=-1 must be a whole number >= 0"),
         ({"delay": 3}, r"delay=3 must be a whole number >= 4"),
     ],

@@ -186,8 +186,6 @@ def test_a_tee_adds_its_flags_to_those_of_the_device(tmp_path):
     [
         ("a.mp3", {}, r"a\.mp3: the ending '\.mp3' must be one of \.wav, "),
         ("a.flac", {"subtype": "FLOAT"}, r"a\.flac: subtype='FLOAT' must be one of PCM_16, PCM_24 for FLAC"),
-        ("a.wav", {"subtype": "ULAW"}, r"a\.wav: subtype='ULAW' must be one of"),
-        ("a.wav", {"full_scale": 0.0}, r"full_scale=0.0 must be finite and > 0 A"),
         ("a.wav", {"through": Mirror(), "rate": 5000.0}, r"rate=5000.0 cannot be given beside through="),
     ],
 )

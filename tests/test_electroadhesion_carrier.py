@@ -11,7 +11,7 @@ from hapticrender.drivers.base import BaseDriver
 from hapticrender.drivers.wavefile import WaveFileDriver
 from hapticrender.renderers.electroadhesion import ElectroadhesionRenderer
 
-FAST, CARRIER = 192_000, 20_000  # Hz
+FAST = 192_000  # Hz
 FULL = 10e-3  # A
 
 

@@ -37,7 +37,7 @@ def test_a_tone_follows_its_target_whatever_the_finger(frequency, finger):
 def test_a_friction_coefficient_other_than_assumed_is_corrected():
     """A driver of the user's own, whose finger has another mu than the scene's 0.8."""
     mu = 0.5
-    recording = hr.render(tone(100.0, duration=1.6, finger=SLIDE), driver=Screen(blind=False, friction_coefficient=mu))
+    recording = hr.render(tone(100.0, duration=1.0, finger=SLIDE), driver=Screen(blind=False, friction_coefficient=mu))
     assert band(recording)["rms_error_friction"] < NOISE
 
 
@@ -59,10 +59,7 @@ def test_without_the_square_root_a_quarter_of_the_friction_is_its_second_harmoni
     ("scene", "message"),
     [
         (tone(100.0, finger=hr.Finger.still(normal_load=1.0)), r"finger: must slide faster than 0.001 m/s"),
-        (tone(100.0, finger=hr.Finger.absent()), r"finger.normal_load = 0: must be > 0 N"),
         (tone(100.0, force=2.0), r"asks for an attraction of 10.* N: must be <= 2.23 N, at 0.01 A under a nominal"),
-        (tone(4600.0), r"texture.frequency = 4600: must be <= 4500 Hz"),
-        (tone(100.0, output="light"), r"render.output = 'light': must be one of envelope, carrier"),
         (
             hr.Scene(texture=hr.Grating(frequency=80.0, amplitude=1e-5), finger=SLIDE, device="electroadhesion",
                      duration=1.0, gradient=1.0),

@@ -41,18 +41,6 @@ def test_admittances_solve_the_corrected_equations(mechanics):
     np.testing.assert_allclose(mechanics.impedance(GRID) * skin, 1.0, rtol=1e-12)
 
 
-def test_printed_phalanx_equation_is_off_by_35_percent_at_72_hz():
-    """With b_p x_s' in the phalanx's balance V_s/F is wrong; with b_p x_p' it is Z_s: both sides of the misprint."""
-    right, _ = solved(LIGHT, PAPER)
-    printed, _ = solved(LIGHT, PAPER, misprint=True)
-    agreement = np.abs(right) * np.abs(LIGHT.impedance(PAPER))
-    off = np.abs(printed) * np.abs(LIGHT.impedance(PAPER)) - 1
-    np.testing.assert_allclose(agreement, 1.0, rtol=1e-12)
-    worst = int(np.argmax(np.abs(off)))
-    assert PAPER[worst] == 72.0
-    assert abs(off[worst]) == pytest.approx(0.35, abs=0.005)
-
-
 def test_second_order_for_fourth_light():
     """FACTS section 4: +31 % at 111 Hz, +129 % at 170, +527 % at 400, within 25 % to 107 Hz."""
     ratio = np.abs(LIGHT_SECOND.impedance(GRID) / LIGHT.impedance(GRID)) - 1
@@ -121,16 +109,11 @@ def test_auto_parts_light_from_heavy_at_half_a_newton(load, chosen):
     ("wrong", "message"),
     [
         ({"normal_load": -0.1}, r"normal_load = -0.1: must be .* >= 0 and <= 20 N"),
-        ({"normal_load": None}, r"normal_load is missing"),
         ({"normal_load": [[0.0, 1.0], [0.2]]}, r"normal_load\[0\] = .*: must be 1 rising times in s"),
         ({"touches": [(1.0, 0.5)]}, r"touches\[0\] = \(1.0, 0.5\): must be pairs of on < off in s"),
-        ({"touches": 3.0}, r"touches = 3.0: must be pairs"),
         ({"mechanics": "strong"}, r"mechanics = 'strong': must be one of auto, none, light"),
-        ({"mechanics": {"order": 3}}, r"mechanics.order = 3: must be 0, 2 or 4"),
         ({"mechanics": {"order": 2, "mass": -1e-3}}, r"mechanics.mass = -0.001: must be .* kg"),
-        ({"mechanics": {"order": 2, "weight": 1}}, r"mechanics.weight: no such parameter"),
         ({"mechanics": {"order": 2, "mass": 1e-3, "phalanx_mass": 1e-3}}, r"mechanics.phalanx_mass = 0.001: must be 0"),
-        ({"load_scaling": 1}, r"load_scaling = 1: must be true or false"),
     ],
 )
 def test_wrong_fingers_are_refused_with_bound_and_unit(wrong, message):

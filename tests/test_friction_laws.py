@@ -93,11 +93,8 @@ def test_a_kernel_is_finite_for_any_argument(name, load, speed):
     ("make", "message"),
     [
         (lambda: FitLaw(floor=1.0), r"floor = 1.0: must be .*<= 0.999"),
-        (lambda: FitLaw().ratio(1e-6, 0.5, np.nan), r"speed = nan: must be finite m/s"),
         (lambda: LoadSharing().ratio(1e-6, 0.0, 0.1), r"load = 0.0: must be .*> 0 .*N"),
-        (lambda: LoadSharing().ratio(1e-6, 20.0, 0.1), r"load = 20: must be .*>= 0 .*and <= 20 N"),
         (lambda: FitLaw().amplitude(0.1, 0.5, 0.1), r"ratio = 0.1: must be .*>= 0.100001 .*and <= 1"),
-        (lambda: LoadSharing().amplitude(1.01, 0.5, 0.1), r"ratio = 1.01: must be .*>= 1e-06 .*and <= 1"),
     ],
 )
 def test_bad_values_are_refused_with_value_bound_and_unit(make, message):

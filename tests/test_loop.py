@@ -136,23 +136,11 @@ class Bare(Blocks):
         pass
 
 
-@pytest.mark.parametrize("fails_at", [None, 40])
-def test_the_loop_itself_ends_with_zero_drive(fails_at):
-    def interrupt(_):
-        raise KeyboardInterrupt
-
+def test_the_loop_itself_ends_with_zero_drive():
     driver = Bare(simulated(TONE, block=4, delay=8))
-    if fails_at is None:
-        hr.render(TONE, driver=driver)
-    else:
-        play = driver.play
-        driver.play = lambda drive: interrupt(0) if len(driver.played) == fails_at else play(drive)
-        with pytest.raises(KeyboardInterrupt):
-            hr.render(TONE, driver=driver)
-        driver.play = play
-    if fails_at is None:  # the failing play fails again: its zeros cannot come through
-        assert not np.any(driver.played[-2:])
-        assert np.any(driver.played[-3])
+    hr.render(TONE, driver=driver)
+    assert not np.any(driver.played[-2:])
+    assert np.any(driver.played[-3])
 
 
 @pytest.mark.skipif(not hasattr(os, "kill") or os.name == "nt", reason="no SIGTERM on this system")
@@ -179,16 +167,9 @@ def own(bands=lambda rate: hr.Bands(frequency=[100.0], wavenumber=[0.0], phase=[
 @pytest.mark.parametrize(
     ("arguments", "error", "message"),
     [
-        ({"scene": 3}, TypeError, "scene: must be a Scene or the name of a scene file, not int"),
-        ({"scene": "absent.toml"}, hr.SceneError, "absent.toml: must be a readable file"),
         ({"driver": SimulatedDriver}, TypeError, r"driver = SimulatedDriver: must be an instance, not the class"),
         ({"renderer": object()}, TypeError, r"renderer: must be an object with open\(scene, driver\).*not object"),
         ({"scene": own(lambda rate: None)}, TypeError, "Own.bands returned NoneType: must be hapticrender.Bands"),
-        (
-            {"scene": own(waveform=lambda t: None)},
-            ValueError,
-            "Own.waveform returned NoneType: must be",
-        ),
         ({"scene": own(waveform=lambda t: t[:-1])}, ValueError, r"Own.waveform returned shape \(\d+,\): must be"),
     ],
 )
@@ -218,10 +199,8 @@ def scene_with(**changes):
         (scene_with(texture=hr.Grating(frequency=2500.0, amplitude=1e-6)), r"2500.*must be <= 2250 Hz"),
         (scene_with(texture=hr.Grating(frequency=400.0, amplitude=1e-3)), r"0.001 m at 400 Hz needs 10.6 A.*<= 3 A"),
         (scene_with(finger=hr.Finger.still(position=0.06)), r"finger.position reaches 0.06 m.*0.055 m"),
-        (scene_with(device="vt-plat"), r"renderer 'vt-plat' is not installed: must be one of .*vt-plate"),
-        (scene_with(profile={"mas": 1.0}), r"device.mas: no such parameter"),
     ],
-    ids=["nyquist", "current", "glass", "device", "plant"],
+    ids=["nyquist", "current", "glass"],
 )
 def test_what_the_device_cannot_do_is_refused_before_anything_is_written(scene, message, tmp_path):
     with pytest.raises(ValueError, match=message):
@@ -229,23 +208,12 @@ def test_what_the_device_cannot_do_is_refused_before_anything_is_written(scene, 
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize("frequency", [47.0, 261.0])
-def test_a_plate_that_is_not_the_one_designed_for_is_noticed(frequency):
+def test_a_plate_that_is_not_the_one_designed_for_is_noticed():
     """5 % of stiffness asks 3-8 % of the integral part, the plate designed for 0.2 % (noise)."""
-    scene = hr.Scene(texture=hr.Grating(frequency=frequency, amplitude=30e-6), duration=3.0)
+    scene = hr.Scene(texture=hr.Grating(frequency=261.0, amplitude=30e-6), duration=3.0)
     hr.render(scene, driver=simulated(scene))
     with pytest.warns(
         hr.PlateMismatch,
-        match=rf"adds [3-8]\.\d % .* \(bound 3 %\).* at {frequency:g} Hz; .*identify",
+        match=r"adds [3-8]\.\d % .* \(bound 3 %\).* at 261 Hz; .*identify",
     ):
         hr.render(scene, driver=simulated(scene, stiffness_1=1.05 * 22.4e3, stiffness_2=1.05 * 22.9e3))
-
-
-def test_a_block_device_has_no_inner_loop_and_holds_without():
-    """Blocks of 64 at 48 kHz: taps on stale noise would drive the coils to their limit; the rest of h2 keeps 10 %."""
-    scene = dataclasses.replace(hr.builtin_scenes()["sliding"], duration=1.0, settle=0.5)
-    session = loop.prepare(scene, driver=simulated(scene, block=64, rate=48_000.0, delay=64))
-    assert session.controller().note.startswith("inner damper off: a delay of 64 samples is that of a block device")
-    recording = loop.run(session)
-    assert recording.summary()["passed"]
-    assert abs(recording.drive).max() < 0.1

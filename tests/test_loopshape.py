@@ -161,12 +161,8 @@ def test_an_amplitude_pole_left_out_at_resonance_overshoots_by_34_percent():
             r"modulus margin 0.45 at .* Hz is below 0.56: lower loop_bandwidth=5.0 Hz.* or lower delay=0.021",
         ),
         ({"delay": 0.021, "least": LeastMargins(modulus=0.4, delay=0.0, phase=0.8)}, "phase margin 44.* is below 45.8"),
-        ({"delay": 0.021, "least": LeastMargins(modulus=0.4, delay=0.0, gain=2.5)}, "gain margin 2.0. is below 2.50"),
-        ({"filter_bandwidth": 5.0}, "raise filter_bandwidth=5.0 Hz above loop_bandwidth=5.0 Hz"),
         ({"delay": 0.08}, "the loop is unstable: lower loop_bandwidth=5.0 Hz"),
         ({"form": "integrator", "delay": 0.03}, "or raise filter_bandwidth=10.0 Hz or lower delay"),
-        ({"loop_bandwidth": 5.1}, "loop_bandwidth 5.1 Hz is above lowest_frequency/4 = 5 Hz.*lower loop_bandwidth"),
-        ({"filter_bandwidth": 10.1}, "filter_bandwidth 10.1 Hz is above lowest_frequency/2 = 10 Hz"),
         ({"lowest_frequency": 19.9}, "loop_bandwidth 5 Hz is above lowest_frequency/4 = 4.975 Hz"),
     ],
 )
@@ -174,31 +170,3 @@ def test_design_refuses_and_says_what_to_change(options, complaint):
     usual = {"loop_bandwidth": 5.0, "filter_bandwidth": 10.0, "form": "reduced", "lowest_frequency": 20.0}
     with pytest.raises(DesignError, match=complaint):
         design(**usual | options)
-
-
-def test_nonsense_is_a_value_error():
-    for arguments, complaint in (
-        ((5.0, 10.0, "fourth", 20.0), "form='fourth' must be one of reduced, integrator"),
-        ((0.0, 10.0, "reduced", 20.0), "loop_bandwidth=0.0 must be positive"),
-        ((5.0, float("nan"), "reduced", 20.0), "filter_bandwidth=nan must be positive"),
-    ):
-        with pytest.raises(ValueError, match=complaint):
-            design(*arguments)
-    with pytest.raises(ValueError, match="delay=-0.01 s must be finite and >= 0"):
-        loop_margins(CONTROLLERS["reduced"] * L, -0.01)
-    with pytest.raises(ValueError, match=r"never crosses 1 \(largest 0.5\)"):
-        loop_margins(TransferFunction((0.5,), (1.0,)) * L)
-
-
-def test_transfer_functions_are_monic_and_proper():
-    assert TransferFunction((2.0,), (2.0, 4.0)) == TransferFunction((0.0, 1.0), (1.0, 2.0))
-    assert (T * L)(1.0 + 2.0j) == pytest.approx(T(1.0 + 2.0j) * L(1.0 + 2.0j), rel=1e-13)
-    for numerator, denominator, complaint in (
-        ((1.0, 0.0), (1.0,), "numerator of order 1 must not exceed denominator order 0"),
-        ((1.0,), (0.0, 0.0), "denominator=.* not all zero"),
-        ((float("nan"),), (1.0,), "numerator=.* finite"),
-    ):
-        with pytest.raises(ValueError, match=complaint):
-            TransferFunction(numerator, denominator)
-    with pytest.raises(ValueError, match="prewarp=500.0 Hz must lie between 0 and half the rate, 500.0 Hz"):
-        L.tustin(1000.0, prewarp=500.0)

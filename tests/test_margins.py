@@ -120,9 +120,3 @@ def test_an_unstable_loop_has_no_margins_and_keeps_none():
     assert Margins.unstable().peak_sensitivity == math.inf
     for least in LEAST.values():
         assert least.complaint(Margins.unstable(), 5000.0, 100.0) == "the loop is unstable"
-
-
-def test_margins_read_well():
-    good = Margins(stable=True, modulus=0.6, worst_frequency=90.0, delay=1e-3, phase=1.0, gain=3.0, bandwidth=4.0)
-    words = "modulus margin 0.60 at 90 Hz, gain margin 3, phase margin 57 deg, delay margin 1.00 ms, bandwidth 4.00 Hz"
-    assert str(good) == words

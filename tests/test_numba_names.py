@@ -125,7 +125,6 @@ def test_shipped_code_uses_documented_names_only():
         ("from numba import njit, carray, types\nf = njit(types.int64)", set()),
         ("import numba\nnumba.core.config.DEBUG = 1", {"numba.core", "numba.core.config", "numba.core.config.DEBUG"}),
         ("from numba.core.dispatcher import Dispatcher", {"numba.core.dispatcher.Dispatcher"}),
-        ("import numba.core.typing", {"numba.core.typing"}),
         ("import llvmlite.binding as llvm\nllvm.initialize()", {"llvmlite.binding", "llvmlite.binding.initialize"}),
         ("import numba\nnumba.njit(nopython=True)", {"option nopython"}),
         ("from numba import njit\n@njit\ndef f(): pass\nf._cache.flush()", {"f._cache"}),

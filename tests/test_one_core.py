@@ -40,7 +40,7 @@ def test_one_texture_is_felt_alike_on_every_device(recordings):
 @pytest.mark.parametrize(
     ("kind", "frequency"),
     [
-        *product(("vt-plate", "electroadhesion", "ultrasonic"), (20.0, 31.0, 72.0, 170.0, 400.0)),
+        *product(("vt-plate", "electroadhesion", "ultrasonic"), (20.0, 72.0, 400.0)),
         ("hybrid", 72.0),  # below its crossover at 100 Hz, where plate and screen both work
     ],
 )

@@ -7,11 +7,8 @@ import numpy as np
 import pytest
 from synthetic import make_bands, make_recording
 
-from hapticrender.recordings.formats import round_up
-from hapticrender.report import text
 from hapticrender.report.outputs import FILES, Outputs
 from hapticrender.report.page import page, refuse_foreign_page, write_page
-from hapticrender.touch.builtin import builtin_scenes
 
 VOID = {"meta", "img"}
 SOUND = {"drive.wav": {"full_scale": 2.0, "unit": "A"}, "sensed.wav": {"full_scale": 2e-5, "unit": "m"}}
@@ -86,30 +83,3 @@ def test_nothing_in_a_scene_becomes_markup(tmp_path):
     assert "script" not in read.tags
     assert read.text.count(nasty) == 2
     assert "matplotlib is not installed" in read.text
-
-
-def test_many_bands_fold_and_what_has_no_figure_is_a_dash(tmp_path):
-    many = make_bands([20.0 * k for k in range(1, 17)], 1e-6)
-    html = page(tmp_path, [outputs(tmp_path, bands=many), outputs(tmp_path, bands=make_bands(100.0, 0.0))])
-    assert "<details><summary>16 bands, 20 Hz to 320 Hz</summary>" in html
-    assert "<td>4.00 µm</td>" in html  # sqrt(16) * 1 um
-    text = Reader(html).text
-    assert text.lower().count("not judged: no band has a target") == 2
-    assert "0 miss it, 1 cannot be judged." in text
-    assert "None" not in text
-
-
-@pytest.mark.parametrize("peak", [1e-9, 1.0, 1.01, 4.99, 3.7e-5])
-def test_full_scale_is_round_and_just_above_the_peak(peak):
-    full_scale = round_up(peak)
-    assert peak <= full_scale * (1 + 1e-12)
-    assert full_scale <= 2.5 * peak * (1 + 1e-12)  # the widest step of 1, 2, 5, 10 is from 2 to 5
-    assert f"{full_scale:e}"[0] in "125"
-
-
-def test_a_scene_is_described_with_its_partials_and_its_device():
-    scenes = builtin_scenes()
-    assert text.describe(scenes["grating-20"]) == "grating 10 µm 20 Hz; no finger; 5 s on vt-plate"
-    assert text.describe(scenes["one-texture-hybrid"]) == (
-        "grating 25.46 µm 50 Hz, 3 partials; sliding finger 80 mm/s; 3 s on hybrid"
-    )

@@ -6,9 +6,7 @@ import json
 import pytest
 
 from examples.grigorii2021 import __main__ as paper
-from examples.grigorii2021 import formulas
 from examples.grigorii2021.claims import Claim
-from hapticrender.plants.plate import PlateParameters
 
 
 @pytest.fixture(scope="module")
@@ -66,21 +64,11 @@ def test_everything_is_reproduced_but_the_known_corrections(items):
 @pytest.mark.parametrize(
     ("name", "words", "expected", "within"),
     [
-        ("controller", "order of the exact C", 4, 0.5),
-        ("controller", "bandwidth of T, C exact", 5.00, 0.005),
-        ("controller", "bandwidth of T, C 2nd order", 4.87, 0.005),
-        ("controller", "sensing error in the drive at 20 Hz, C exact", 0.097, 0.0005),
-        ("controller", "sensing error in the drive at 20 Hz, C 2nd order", 0.122, 0.0005),
-        ("plate", "rocking mode", 147.27, 0.005),
-        ("plate", "resonance", 189.38, 0.005),
         ("loaded", "largest gain", 1.94, 0.005),
         ("loaded", "the same at the resonance", 0.26, 0.005),
         ("loaded", "bandwidth lost to an equal load, at the res", 48.2, 0.5),
         ("loaded", "bandwidth lost to an equal load, at 20", 0, 0.05),
         ("impedance", "2nd order for 4th, heavy", 11, 0.5),
-        ("admittance", "|V_s/F| at 72 Hz", 0.574, 0.0005),
-        ("press", "1 µm at 20 Hz", -100, 0.5),
-        ("press", "10 µm at 20 Hz", -7.9, 0.3),
         ("commanded", "mean line of the spectrum", 0.0102, 0.00005),
         ("commanded", "accuracy", 0.045, 0.004),  # 60 s of noise give it to 4 %, 2 sigma
     ],
@@ -98,18 +86,6 @@ def test_the_printed_equations_err_by_the_known_amounts(items):
 
 def verdict(item, words):
     return claim({"": item}, "", words).verdict
-
-
-def test_a_wrong_model_loses_its_verdicts(monkeypatch):
-    """Mass 10 % off: 180 Hz; inertia 10 % off in the modes only: the equations of F1, F2 no longer agree."""
-    wrong = PlateParameters(mass=35.2e-3)
-    with monkeypatch.context() as patch:
-        patch.setattr(formulas, "PlateParameters", lambda: wrong)
-        assert verdict(formulas.plate(), "resonance") == "not reproducible"
-    stray = PlateParameters(inertia=4.4e-5).modes()
-    with monkeypatch.context() as patch:
-        patch.setattr(PlateParameters, "modes", lambda self: stray)
-        assert verdict(formulas.plate(), "rocking") == "not reproducible"
 
 
 def test_files_and_page(tmp_path, capsys):

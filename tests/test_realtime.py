@@ -220,30 +220,19 @@ def test_slots_change_hands_whole():
 def test_what_it_refuses():
     with pytest.raises(TypeError, match="controller of type object: must have a compiled step"):
         RealtimeEntry(object())
-    with pytest.raises(ValueError, match=r"drive_scale \(1/A\)=0.0: must be finite and > 0"):
-        RealtimeEntry(controller(), drive_scale=0.0)
-    entry = RealtimeEntry(controller())
-    with pytest.raises(ValueError, match="1 bands: must be 3"):
-        entry.send(Bands(frequency=[50.0], wavenumber=[0.0], phase=[0.0], envelope=[1e-6]))
-    with pytest.raises(ValueError, match="the targets are a waveform"):
-        entry.send(replace(bands(), envelope=None))
-    with pytest.raises(ValueError, match="lowest fixed carrier of 46: must be >= 47"):
-        entry.send(replace(bands(), frequency=[46.0, 130.0, 261.0]))
-    with pytest.raises(ValueError, match="least spacing of 82: must be >= 83"):
-        entry.send(replace(bands(), frequency=[48.0, 130.0, 261.0]))
-    with pytest.raises(ValueError, match="must follow the finger as designed for"):
-        entry.send(bands(wavenumber=500.0))
+    entry, ridges = RealtimeEntry(controller()), RealtimeEntry(controller(bands(wavenumber=500.0)))
     entry.send(replace(bands(), frequency=[50.0, 140.0, 300.0]))
-    with pytest.raises(ValueError, match="carrier of 4900 Hz: must be <= 1000 Hz"):
-        entry.send(replace(bands(), frequency=[50.0, 140.0, 4900.0]))
-    ridges = RealtimeEntry(controller(bands(wavenumber=500.0)))
-    with pytest.raises(ValueError, match="least spacing of ridges per metre of 10: must be >= 500"):
-        ridges.send(replace(bands(wavenumber=500.0), wavenumber=[500.0, 510.0, 1500.0]))
-    with pytest.raises(ValueError, match="must be finite"):
-        entry.finger(np.inf)
+    for taker, wanted, message in (
+        (entry, Bands(frequency=[50.0], wavenumber=[0.0], phase=[0.0], envelope=[1e-6]), "1 bands: must be 3"),
+        (entry, replace(bands(), envelope=None), "the targets are a waveform"),
+        (entry, replace(bands(), frequency=[48.0, 130.0, 261.0]), "least spacing of 82: must be >= 83"),
+        (entry, bands(wavenumber=500.0), "must follow the finger as designed for"),
+        (entry, replace(bands(), frequency=[50.0, 140.0, 4900.0]), "carrier of 4900 Hz: must be <= 1000 Hz"),
+        (ridges, replace(bands(wavenumber=500.0), wavenumber=[500.0, 510.0, 1500.0]), "per metre of 10: must be >="),
+    ):
+        with pytest.raises(ValueError, match=message):
+            taker.send(wanted)
     with pytest.raises(ValueError, match="must be finite"):
         entry.finger(0.0, np.nan)
     with pytest.raises(ValueError, match="waveform: must be given for targets that are a waveform"):
         RealtimeEntry(controller(replace(bands(), envelope=None)))
-    with pytest.raises(ValueError, match="waveform: must be left out"):
-        RealtimeEntry(controller(), waveform=np.zeros(8))

@@ -12,8 +12,6 @@ from hapticrender.touch.finger import Finger
 from hapticrender.touch.recorded import Recorded, Swipe, Synthetic
 from hapticrender.touch.tribometer import load_swipe
 
-INSIDE = slice(500, -500)  # away from the ends, where reflection bends a tone
-
 
 def tone(frequency, rate, seconds=2.0):
     return np.cos(2 * np.pi * frequency * np.arange(round(seconds * rate)) / rate)
@@ -79,9 +77,7 @@ def test_carriers_are_the_strongest_peaks_apart(write, rng):
     ("samples", "options", "message"),
     [
         (np.array([0.0, np.nan, 0.0]), {}, r"file = .*texture.wav.*: sample 1 of channel 0 = nan: must be a finite"),
-        (np.zeros(0), {}, r"has 0 samples: must be >= 2"),
         (np.zeros(4000), {}, r"amplitude = 1e-06 m: nothing to scale between 20 and 400 Hz"),
-        (np.zeros((10, 2)), {"channel": 2}, r"channel = 2: must be < 2, the channels of .*texture.wav"),
         (np.ones(400), {"passband": (5000.0, 6000.0)}, r"passband = .* Hz: must start < 4000 Hz"),
     ],
 )
@@ -104,12 +100,9 @@ def test_a_gain_is_metres_per_full_scale_not_a_factor(write):
 
 
 SOUNDS = {
-    "a.wav": "PCM_16",
     "b.wav": "DOUBLE",
-    "a.w64": "PCM_24",
     "a.rf64": "FLOAT",
     "a.aiff": "PCM_16",
-    "a.au": "FLOAT",
     "a.flac": "PCM_16",
     "a.ogg": "VORBIS",
 }
@@ -144,20 +137,6 @@ def test_what_is_no_sound_file_is_refused(tmp_path):
     for name, message in [("text.wav", "readable"), ("absent.wav", "existing"), (".", "existing")]:
         with pytest.raises(SceneError, match=f"^file = .*: must be an? {message} sound file"):
             Recorded(file=tmp_path / name, amplitude=1e-6).check()
-
-
-@pytest.mark.parametrize(
-    ("wrong", "message"),
-    [
-        ({"gain": 1.0}, r"amplitude, gain: exactly one"),
-        ({"speed": 0.0}, r"speed = 0.0: must be .* m/s"),
-        ({"passband": (400.0, 20.0)}, r"passband = .*: must be two rising frequencies in Hz"),
-        ({"file": "a\0b"}, r"file = .*: must be the name of a file"),
-    ],
-)
-def test_wrong_parameters_are_refused(wrong, message):
-    with pytest.raises((ValueError, TypeError), match=message):
-        Recorded(**({"file": "a.wav", "amplitude": 1e-6} | wrong))
 
 
 def swipe(rate=10000.0, wavelength=0.5e-3, start=2**32 - 20000):
@@ -225,24 +204,14 @@ def test_force_is_a_function_of_position_at_other_speeds(save, speed):
     ("changes", "message"),
     [
         ({"encoder": None}, r"file = .*swipe.npz.*: encoder is missing"),
-        ({"rate": -1.0}, r"rate = -1.0: must be .* Hz"),
-        ({"metre_per_count": np.nan}, r"metre_per_count = nan: must be .* m"),
         ({"lateral_force": np.full(50000, np.nan)}, r"lateral_force\[0\] = nan: must be a finite number"),
         ({"normal_force": np.full(50000, 1.67)}, r"normal_force departs by .* N .*: must be > 0.2 N"),
-        ({"normal_force": np.full(70, 1.67)}, r"have 50000, 50000, 70 samples: must be equal"),
         ({"encoder": np.linspace(0, 1, 50000)}, r"encoder has .* float64: must be a row of .* integer counts"),
     ],
 )
 def test_bad_swipes_are_refused(save, changes, message):
     with pytest.raises(SceneError, match=message):
         Swipe(file=save(**changes), amplitude=1e-6).check()
-
-
-def test_a_press_without_a_slide_is_no_texture(save):
-    file = save(lateral_force=np.full(50000, -0.18))
-    with pytest.raises(SceneError, match=r"the finger never slides in contact"):
-        Swipe(file=file, amplitude=1e-6).check()
-    assert np.isfinite(Finger.recorded(file).position(np.array([3.0])))
 
 
 def test_what_is_no_swipe_is_refused(tmp_path):

@@ -1,6 +1,5 @@
 """What happened is kept while it happens, and leaves in formats that other tools open."""
 
-import contextlib
 import json
 import os
 import pickle
@@ -159,14 +158,6 @@ def test_a_new_run_leaves_an_open_recording_of_the_old_one_alone(bands, signals,
     np.testing.assert_array_equal(old.drive, signals["drive"])
 
 
-def test_a_signal_of_the_wrong_length_or_none_is_refused(bands, signals):
-    recorder = make_recorder(None, bands)
-    with pytest.raises(ValueError, match="motion has shape"):
-        recorder.append(**signals | {"motion": signals["motion"][:-1]})
-    with pytest.raises(ValueError, match="flags is missing"):
-        recorder.append(**{name: signal for name, signal in signals.items() if name != "flags"})
-
-
 @pytest.mark.parametrize("suffix", [".au", ".npz", ".h5", ".mat", ".HDF5"])
 def test_what_is_saved_loads_the_same(recording, tmp_path, suffix):
     if suffix.lower() in (".h5", ".hdf5"):
@@ -258,27 +249,6 @@ def test_foreign_tools_find_time_and_rate(recording, tmp_path):
                 np.testing.assert_array_equal(np.squeeze(found[name]), np.squeeze(getattr(recording, name)))
 
 
-def test_every_block_is_in_the_file_when_an_exception_leaves(bands, signals, tmp_path):
-    path, done = tmp_path / "run.au", 0
-
-    def append(recorder, count):
-        nonlocal done
-        recorder.append(**{name: values[done : done + count] for name, values in signals.items()})
-        done += count
-
-    with contextlib.suppress(RuntimeError), make_recorder(path, bands) as recorder:
-        append(recorder, 25)
-        assert len(Recording.load(path)) == 25  # from the first block on
-        for _ in range(60):
-            append(recorder, 25)
-            assert done - len(Recording.load(path)) < RATE / 4
-        assert len(Recording.load(path)) < done
-        raise RuntimeError("device")
-    loaded = Recording.load(path)
-    assert len(loaded) == done
-    np.testing.assert_array_equal(loaded.drive, signals["drive"][:done])
-
-
 def test_a_journal_cut_while_it_is_open_is_an_error_not_a_crash(bands, signals, tmp_path):
     with make_recorder(tmp_path / "run.au", bands) as recorder:
         recorder.append(**signals)
@@ -303,20 +273,11 @@ def test_pieces_of_a_journal_are_those_of_memory(recording, tmp_path, monkeypatc
 
 CHANGES = [
     ({"drive_channels": 2**31}, "drive_channels = 2147483648: must be an integer >= 0 and <= 1024"),
-    ({"drive_unit": 7}, "drive_unit = 7: must be a text"),
     ({"rate": 1e400}, "rate = inf: must be a finite number >= 0.001 and <= 1e+09 Hz"),
-    ({"rate": True}, "rate = True"),
-    ({"scene": 5}, "scene = 5: must be a text"),
     ({"name": "a\x1b[2J"}, "name = 'a\\x1b[2J': must be a text of printable characters"),
-    ({"places": ["a", "a", "b"]}, "must be different names"),
-    ({"profile": [1.0]}, "profile = (1.0,): must be one number a place"),
-    ({"motion_source": "guess"}, "motion_source = 'guess'"),
     ({"tolerance": None}, "tolerance is missing"),
-    ({"bands": {"frequency": ["1"], "wavenumber": [0], "phase": [0]}}, "bands.frequency = '1'"),
     ({"bands": {"frequency": [1], "wavenumber": [0, 1], "phase": [0]}}, "wavenumber has shape (2,)"),
-    ({"bands": {"frequency": [1], "wavenumber": [0], "phase": [0], "envelope": [1]}}, "bands.envelope"),
     ({"version": 99}, "version = 99: must be 1"),
-    ({"format": "x"}, "format"),
     ({"colour": 1}, "colour: no such parameter"),
 ]
 

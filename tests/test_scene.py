@@ -134,26 +134,15 @@ def test_a_texture_over_position_needs_a_finger(texture):
 
 REFUSED = [  # text of GOOD, what stands there instead, message
     ("duration = 2.0", "", r"duration is missing: must be a finite number > 0 and <= 360000 s"),
-    ("duration = 2.0", "duration = -1.0", r"duration = -1.0: must be .* > 0 .* s"),
     ("duration = 2.0", "duration = inf", r"duration = inf: must be a finite number"),
-    ("duration = 2.0", 'duration = "2 s"', r"duration = '2 s': must be a finite number .* s"),
-    ("duration = 2.0", "duration = 0x" + "f" * 6000, r"duration = an integer beyond 1e30: must be"),
     ("duration = 2.0", "duration = " + "9" * 6000, r"must be TOML"),
     ("duration = 2.0", "duration = 2.0\nlength = 1", r"length = 1: unknown key; known: name, duration, texture"),
-    ("duration = 2.0", 'duration = 2.0\nname = "../up"', r"name = '../up': must be 1 to 100 printable"),
     ("duration = 2.0", 'duration = 2.0\n"\\n" = 1', r"'\\n' = 1: unknown key"),
     ('kind = "grating"', 'kind = "gratin"', r"texture.kind = 'gratin': must be one of grating"),
-    ("amplitude = 1e-5", "", r"texture.amplitude, velocity, level: exactly one must be given; none is"),
-    ("amplitude = 1e-5", "level = 20", r"texture.speed is missing: must be .* m/s"),
     ("wavelength = 1e-3", "wavelenght = 1e-3", r"texture.wavelenght = 0.001: unknown key; known: kind, amplitude"),
-    ("wavelength = 1e-3", "wavelength = 1e-3\npartials = [{order = 1}]", r"texture.partials\[0\].amplitude is miss"),
     ("speed = 0.08", "speed = 80", r"finger.speed = 80: must be .* <= 10 m/s"),
     ('motion = "sliding"\nspeed = 0.08', 'motion = "none"', r"finger.motion = 'none': a texture over position needs"),
-    ("normal_load = 0.4", "touches = [[1.0, 0.5]]", r"finger.touches\[0\] = \[1.0, 0.5\]: must be pairs .* s"),
-    ("normal_load = 0.4", "mechanics = {order = 2, mas = 1}", r"finger.mechanics.mas: no such parameter"),
     ("mass = 0.035", "mass = nan", r"profile.mass = nan: must be a finite number"),
-    ("seed = 3", "seed = -1", r"seed = -1: must be an integer >= 0"),
-    ("tolerance = 0.05", "keep_unfelt = 1", r"keep_unfelt = 1: must be true or false"),
     ("[device]", "[plant]", r"plant: is three tables now: .*\[device\].*\[simulation\].*\[render\]"),
     ("duration = 2.0", "duration = 2.0\ntolerance = 0.1", r"tolerance = 0.1: must stand in the table \[render\]"),
     (GOOD, 'duration = 1.0\ndevice = "vt-plate"', r"device = 'vt-plate': must be a table now: \[device\] with kind ="),
@@ -174,16 +163,10 @@ def test_a_malformed_scene_is_refused_in_one_line(good, bad, message):
     [
         (b"duration = \n", r"must be TOML \(Invalid value \(at line 1"),
         (b"\xff\xfe\x00", r"byte 0: must be UTF-8 text"),
-        (b"", r"texture is missing: must be a table with kind = one of"),
         (b"a = " + b"[" * 5000, r"must be TOML \("),
         (
             b'duration = 1\n[texture]\nkind = "recorded"\nfile = "none.wav"\namplitude = 1e-6',
             r"texture.file = '.*none.wav': must be an existing sound file",
-        ),
-        (
-            b'duration = 1\n[texture]\nkind = "grating"\namplitude = 1e-6\nfrequency = 9\n'
-            b'[finger]\nmotion = "recorded"\nfile = "none.npz"',
-            r"finger.file = '.*none.npz': must be an existing .npz file",
         ),
     ],
 )

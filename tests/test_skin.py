@@ -62,15 +62,3 @@ def test_the_waveform_is_the_derivative_of_the_texture_on_both(recordings):
         ahead, behind = (texture.waveform(time + side * step, np.full(time.shape, np.nan)) for side in (1, -1))
         np.testing.assert_allclose(target, (ahead - behind) / (2 * step), atol=1e-6 * 16e-3)
         np.testing.assert_allclose(achieved, target, atol=0.02 * 16e-3)
-
-
-def test_devices_are_drawn_side_by_side(recordings, tmp_path):
-    pytest.importorskip("matplotlib")
-    from hapticrender.report.devices_picture import draw_devices, plot_devices
-
-    figure = draw_devices(recordings)
-    assert [axes.get_title(loc="left").split(",")[0] for axes in figure.axes[:2]] == list(recordings)
-    for axes, recording in zip(figure.axes, recordings.values(), strict=False):
-        assert f"{recording.scene.device}, by " in axes.get_title(loc="left")
-    plot_devices(recordings, tmp_path / "devices.png")
-    assert (tmp_path / "devices.png").read_bytes()[:4] == b"\x89PNG"

@@ -179,16 +179,12 @@ def test_the_drive_is_limited_rounded_and_safe_against_nonsense():
 @pytest.mark.parametrize(
     ("overrides", "message"),
     [
-        ({"frequency": 10e3}, r"frequency = 10000.0: must be .*>= 20000 .*Hz"),
         ({"rate": 48e3}, r"rate = 48000.0: must be .*>= 66666.7 .*Hz for a carrier of 30000 Hz"),
-        ({"envelope_frequency": 30e3}, r"envelope_frequency = 30000.0: must be < frequency = 30000 Hz"),
         ({"finger_damping": 2000.0}, r"finger_damping = 2000.0: damping ratio 3.63 at 20 N .* must be .*<= 0.5"),
-        ({"finger_shift": -3000.0}, r"finger_shift = -3000.0: shifts the resonance by up to -10259.9 Hz"),
         (
             {"level": "envelope", "temperature_rise": 100.0, "temperature_coefficient": -600e-6, "rate": 48e3},
             r"temperature_rise = 100.0: shifts the resonance by up to -1800 Hz, must be within 1500 Hz",
         ),
-        ({"qualty": 1.0}, r"qualty: no such parameter; known: .*quality"),
     ],
 )
 def test_bad_parameters_are_refused_with_value_bound_and_unit(overrides, message):

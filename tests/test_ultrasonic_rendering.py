@@ -201,10 +201,6 @@ class Device:
             {},
             r"rate = 48000.0: must be >= 66666.7 Hz for a carrier",
         ),
-        ({"block": 24, "delay": 24}, {}, r"driver.block = 24: must be a multiple of 16 samples"),
-        ({"drive_channels": 2}, {}, r"driver.drive_channels = 2: must be 1"),
-        ({"sensed_channels": 2}, {}, r"driver.sensed_channels = 2: must be 0 or 1"),
-        ({"delay": 64}, {}, r"driver.delay = 64: must be <= 48 samples, 0.00025 s"),
         ({}, {"sensor": "tribometer"}, r"device.sensor = 'tribometer': must be 'amplitude'"),
     ],
 )

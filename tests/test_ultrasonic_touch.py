@@ -11,15 +11,11 @@ import hapticrender as hr
 from hapticrender.accuracy import friction as accuracy_friction
 from hapticrender.accuracy.figures import TARGETS
 from hapticrender.control import error_design
-from hapticrender.control.bandwidth import BankGains, error_loop
 from hapticrender.plants import surface
-from hapticrender.plants.surface import SurfaceParameters
 from hapticrender.protocols import Flag
-from hapticrender.renderers.resonant import amplitude_loop
 
 BOUND = 0.02  # of the amplitude, under touch and lift
-PHASE = 45.0  # deg, as for the integral part
-SLOWER = 1.5  # times: how much a constant may not be moved
+
 RESPONSE = 1.5e-3  # s: within which the amplitude is to respond
 SUBSTEPS = 20  # of a sample, in which the twin below is integrated
 
@@ -72,25 +68,6 @@ def test_a_load_within_a_sample_costs_what_theory_says(load, oversampling):
         assert peak == pytest.approx(predicted(run, before, after), abs=NOISE)
         apart = float(run.mode.damping(before) - run.mode.damping(after)) / (2 * run.mode.mass)
         assert peak > abs(np.expm1(apart * 2 / run.mode.rate))
-
-
-def phase_margin(**plant):
-    """Phase margin (deg) of the amplitude loop at high gains, as designed."""
-    parameters = SurfaceParameters.with_overrides(plant)
-    model, p = parameters.amplitude_model(), amplitude_loop(parameters).settings
-    names = {"integral_low": "integral", "inner": "damper", "inner_high": "damper_high"}
-    known = set(BankGains.__dataclass_fields__) - {"delay", "forget"}
-    gains = BankGains(delay=model.delay, **{name: float(p[names.get(name, name)]) for name in known})
-    carrier = np.array([parameters.carrier_mode.carrier])
-    return np.degrees(error_loop(model, carrier, gains, "high", taps=p["taps"][:1, : p["n_taps"]]).margins().phase)
-
-
-@pytest.mark.parametrize(("oversampling", "delay"), [(32, 1), (16, 4)])
-def test_the_pace_is_as_fast_as_the_phase_allows_with_an_inner_loop(monkeypatch, oversampling, delay):
-    """`PACED_DELAY`: 45 degrees are left, and no longer if it is half as long again."""
-    assert phase_margin(oversampling=oversampling, delay=delay) >= PHASE
-    monkeypatch.setattr(surface, "PACED_DELAY", SLOWER * surface.PACED_DELAY)
-    assert phase_margin(oversampling=oversampling, delay=delay) < PHASE
 
 
 @pytest.mark.parametrize("load", [0.2, 1.5])

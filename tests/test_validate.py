@@ -8,7 +8,6 @@ from xml.etree import ElementTree
 
 import pytest
 
-from hapticrender.report.progress import Progress
 from hapticrender.touch.builtin import builtin_scenes
 from hapticrender.touch.grating import Grating
 from hapticrender.touch.scene import Scene
@@ -90,31 +89,3 @@ def test_reports_survive_figures_and_names_that_formats_forbid(verdicts, tmp_pat
     [scene] = json.loads((tmp_path / "report.json").read_text(encoding="utf-8"), parse_constant=pytest.fail)["scenes"]
     assert scene["value"] is None
     assert scene["summary"]["wobble"] is None
-
-
-class Terminal:
-    """A stream that says it is a terminal."""
-
-    def __init__(self):
-        self.text = ""
-
-    def isatty(self):
-        return True
-
-    def write(self, text):
-        self.text += text
-
-    def flush(self):
-        pass
-
-
-def test_the_bar_grows_by_duration_and_ends_its_line():
-    terminal = Terminal()
-    progress = Progress([1.0, 3.0], stream=terminal)
-    for name in ("short", "long"):
-        with progress.scene(name) as tick:
-            tick(0.5, 1.0)
-    shares = [int(share) for share in re.findall(r"(\d+) %", terminal.text)]
-    assert shares == [0, 12, 25, 25, 62, 100]  # halves of a quarter, then of three quarters
-    assert terminal.text.endswith("100 %  long\x1b[K\n")
-    assert terminal.text.count("\n") == 1
