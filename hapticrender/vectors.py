@@ -21,8 +21,7 @@ from numba.extending import intrinsic, lower_builtin, models, register_model, ty
 
 W = 8  # bands a vector
 DOUBLE, INDEX = ir.DoubleType(), ir.IntType(32)
-LANES, BITS = ir.VectorType(DOUBLE, W), ir.IntType(W)
-NONE = ir.Constant(BITS, 0)
+LANES, BITS, NONE = ir.VectorType(DOUBLE, W), ir.IntType(W), ir.Constant(ir.IntType(W), 0)
 LAYOUTS: dict[Any, dict[str, int]] = {}  # offsets of the fields (bytes) of tiles, by their types
 
 
@@ -43,11 +42,7 @@ class VectorModel(models.PrimitiveModel):
 
 
 REAL, COMPLEX = Vector("real vector", LANES), Vector("complex vector", ir.LiteralStructType([LANES, LANES]))
-MASK = Vector("mask vector", ir.VectorType(ir.IntType(1), W))
-
-
-def _constant(value: float) -> Any:
-    return ir.Constant(LANES, [ir.Constant(DOUBLE, value)] * W)
+MASK, ZERO = Vector("mask vector", ir.VectorType(ir.IntType(1), W)), ir.Constant(LANES, [ir.Constant(DOUBLE, 0.0)] * W)
 
 
 def _parts(builder: Any, kind: Any, value: Any) -> tuple[Any, Any]:
@@ -57,9 +52,8 @@ def _parts(builder: Any, kind: Any, value: Any) -> tuple[Any, Any]:
     if isinstance(kind, Vector):
         return value, None
     number = builder.sitofp(value, DOUBLE) if isinstance(kind, types.Integer) else value
-    empty = ir.Constant(LANES, ir.Undefined)
-    one = builder.insert_element(empty, number, ir.Constant(INDEX, 0))
-    return builder.shuffle_vector(one, empty, ir.Constant(ir.VectorType(INDEX, W), [0] * W)), None
+    one = builder.insert_element(ZERO, number, ir.Constant(INDEX, 0))
+    return builder.shuffle_vector(one, ZERO, ir.Constant(ir.VectorType(INDEX, W), [0] * W)), None
 
 
 def _value(builder: Any, kind: Any, real: Any, imag: Any) -> Any:
@@ -67,7 +61,7 @@ def _value(builder: Any, kind: Any, real: Any, imag: Any) -> Any:
     if kind != COMPLEX:
         return real
     pair = builder.insert_value(ir.Constant(COMPLEX.representation, ir.Undefined), real, 0)
-    return builder.insert_value(pair, _constant(0.0) if imag is None else imag, 1)
+    return builder.insert_value(pair, ZERO if imag is None else imag, 1)
 
 
 def _operator(function: Any, act: Callable[..., Any], kind: Any = None) -> None:
@@ -114,7 +108,7 @@ def _each(name: str) -> Callable[..., Any]:
         combine = getattr(builder, name)
         if b is None and y is None:
             return combine(a, x), None
-        return combine(a, x), combine(*(_constant(0.0) if each is None else each for each in (b, y)))
+        return combine(a, x), combine(*(ZERO if each is None else each for each in (b, y)))
 
     return act
 
@@ -134,18 +128,12 @@ def _quotient(builder: Any, a: Any, b: Any, x: Any, y: Any) -> tuple[Any, Any]:
     return builder.fdiv(a, x), None if b is None else builder.fdiv(b, x)
 
 
-def _comparison(sign: str) -> Callable[..., Any]:
-    return lambda builder, a, b, x, y: (builder.fcmp_ordered(sign, a, x), None)
-
-
 _operator(operator.add, _each("fadd"))
 _operator(operator.sub, _each("fsub"))
 _operator(operator.mul, _product)
 _operator(operator.truediv, _quotient)
-_operator(operator.gt, _comparison(">"), MASK)
-_operator(operator.ge, _comparison(">="), MASK)
-_operator(operator.lt, _comparison("<"), MASK)
-_operator(operator.ne, _comparison("!="), MASK)
+for _sign, _function in {">": operator.gt, ">=": operator.ge, "<": operator.lt, "!=": operator.ne}.items():
+    _operator(_function, lambda builder, a, b, x, y, sign=_sign: (builder.fcmp_ordered(sign, a, x), None), MASK)
 
 
 def tile_type(dtype: np.dtype[Any]) -> Any:
@@ -184,7 +172,7 @@ def put(typingctx: Any, tile: Any, name: Any, vector: Any) -> Any:
         if vector == COMPLEX and len(places) == 1:
             raise TypeError(f"field {name.literal_value!r} is real")
         for part, place in zip(_parts(builder, vector, values[2]), places, strict=False):
-            builder.store(_constant(0.0) if part is None else part, place, align=64)
+            builder.store(ZERO if part is None else part, place, align=64)
         return ir.Constant(ir.IntType(64), 0)
 
     return types.int64(tile, name, vector), build
@@ -203,7 +191,7 @@ def load(typingctx: Any, address: Any) -> Any:
 @intrinsic
 def zeros(typingctx: Any) -> Any:
     """Real vector of zeros."""
-    return REAL(), lambda context, builder, signature, values: _constant(0.0)
+    return REAL(), lambda context, builder, signature, values: ZERO
 
 
 @intrinsic
@@ -212,7 +200,7 @@ def where(typingctx: Any, mask: Any, a: Any, b: Any) -> Any:
 
     def build(context: Any, builder: Any, signature: Any, values: Any) -> Any:
         one, other = _parts(builder, a, values[1]), _parts(builder, b, values[2])
-        pairs = [[_constant(0.0) if each is None else each for each in both] for both in zip(one, other, strict=True)]
+        pairs = [[ZERO if each is None else each for each in both] for both in zip(one, other, strict=True)]
         return _value(builder, signature.return_type, *(builder.select(values[0], *both) for both in pairs))
 
     return (COMPLEX if COMPLEX in (a, b) else REAL)(mask, a, b), build
