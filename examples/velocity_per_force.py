@@ -7,7 +7,7 @@ import sys
 
 import numpy as np
 
-from hapticrender.touch.builtin import PAPER_FREQUENCIES
+from hapticrender.touch.builtin_scenes import PAPER_FREQUENCIES
 from hapticrender.touch.mechanics import HEAVY, LIGHT
 from hapticrender.touch.perception import VELOCITY_PER_FORCE
 

@@ -30,7 +30,7 @@ _HOMES = {
     "plants.identify": "Identified compare identify",
     "protocols": "Controller Driver Flag Method Motion Plant Renderer Rendering Sensed Texture",
     "recordings.recording": "Recorder Recording",
-    "touch.builtin": "builtin_scenes",
+    "touch.builtin_scenes": "builtin_scenes",
     "touch.finger": "Finger",
     "touch.grating": "Grating",
     "touch.mechanics": "FingerMechanics",
@@ -74,7 +74,7 @@ if _typing.TYPE_CHECKING:
     from hapticrender.protocols import Texture as Texture
     from hapticrender.recordings.recording import Recorder as Recorder
     from hapticrender.recordings.recording import Recording as Recording
-    from hapticrender.touch.builtin import builtin_scenes as builtin_scenes
+    from hapticrender.touch.builtin_scenes import builtin_scenes as builtin_scenes
     from hapticrender.touch.finger import Finger as Finger
     from hapticrender.touch.grating import Grating as Grating
     from hapticrender.touch.mechanics import FingerMechanics as FingerMechanics

@@ -184,7 +184,7 @@ def _demo(arguments: argparse.Namespace) -> int:
     from hapticrender.report import outputs
     from hapticrender.report.page import refuse_foreign_page, write_page
     from hapticrender.report.text import overview
-    from hapticrender.touch.builtin import builtin_scenes
+    from hapticrender.touch.builtin_scenes import builtin_scenes
 
     scenes = builtin_scenes()
     for name in scenes:
@@ -240,7 +240,7 @@ def _render(arguments: argparse.Namespace) -> int:
 def _scenes(arguments: argparse.Namespace) -> int:
     from hapticrender.formatting import table
     from hapticrender.report.text import describe
-    from hapticrender.touch.builtin import builtin_scenes
+    from hapticrender.touch.builtin_scenes import builtin_scenes
 
     scenes = builtin_scenes()
     if arguments.scene is None:
@@ -257,7 +257,7 @@ def _validate(arguments: argparse.Namespace) -> int:
         return _suite(arguments)
     from hapticrender.report.outputs import check_file, check_folder
     from hapticrender.report.text import overview
-    from hapticrender.touch.builtin import builtin_scenes
+    from hapticrender.touch.builtin_scenes import builtin_scenes
     from hapticrender.validate import exit_status, validate, write_json, write_junit
 
     reports = [("--json", arguments.json, write_json), ("--junit", arguments.junit, write_junit)]

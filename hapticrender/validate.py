@@ -25,7 +25,7 @@ from hapticrender.protocols import Rendering
 from hapticrender.report.outputs import JOURNAL, begin_outputs, refuse_to_overwrite, remove_outputs, write_outputs
 from hapticrender.report.progress import Progress
 from hapticrender.report.text import verdict as sentence
-from hapticrender.touch.builtin import builtin_scenes
+from hapticrender.touch.builtin_scenes import builtin_scenes
 from hapticrender.touch.scene import Scene, distinct_names
 
 IN_MEMORY = 2**26  # bytes: a longer run goes through a journal in a temporary folder

@@ -15,7 +15,7 @@ import numpy as np
 from hapticrender.bands import Bands
 from hapticrender.checks import Validated, option, parameter, require
 from hapticrender.control.device_model import DeviceModel, FingerRange
-from hapticrender.plants.contact import SlidingParameters
+from hapticrender.plants.sliding_contact import SlidingParameters
 from hapticrender.protocols import Array, Driver
 from hapticrender.renderers.base import BaseRenderer, Waveform
 from hapticrender.renderers.limits import Need, check_carriers, examined, needed, perceptible, speeds, top_speed

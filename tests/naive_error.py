@@ -147,8 +147,8 @@ class NaiveError:
         turn = 1j * self.w if p["differentiated"] else 1.0
         if p["analysed"]:
             e = waveform - (self.raw * carrier).real.sum()
-            self.raw = self.raw + calm * p["reference"] * e * carrier.conj()
-            follow = min(calm * p["reference"] / 2, 1.0)
+            self.raw = self.raw + calm * p["waveform_gain"] * e * carrier.conj()
+            follow = min(calm * p["waveform_gain"] / 2, 1.0)
             self.target = self.target + follow * (self.weight * turn * self.raw - self.target)
         else:
             self.target = turn * self.weight * self.set * (waveform if p["modulated"] else 1.0)

@@ -70,7 +70,7 @@ class NaiveLowPass:
     def references(self, wanted, carrier, omega, weight):
         target = self.bands.envelope
         if self.p["analysed"]:
-            gain = self.p["reference"]
+            gain = self.p["waveform_gain"]
             if self.p["crowd_speed"]:
                 gain = gain * min(abs(self.velocity) / self.p["crowd_speed"], 1.0)
             self.raw = self.raw + gain * (wanted - (self.raw * carrier).real.sum()) * carrier.conj()

@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hapticrender.control.bandwidth import SCHEDULE, STEPS, BankGains, FreeDevice, checked_gains, error_loop
 from hapticrender.control.damping import damping_taps
 from hapticrender.control.linear import FingerEstimate
+from hapticrender.control.margin_check import SCHEDULE, STEPS, BankGains, FreeDevice, checked_gains, error_loop
 from hapticrender.control.margins import LeastMargins
 from hapticrender.errors import DesignError
 from hapticrender.plants.plate import PlateParameters

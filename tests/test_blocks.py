@@ -7,7 +7,7 @@ import pytest
 from test_kernel import IDEAL, RATE, plate_controller, tones, waveform_of
 
 import hapticrender as hr
-from hapticrender.control.error_design import ONE_SPEED, design_error
+from hapticrender.control.controller_design import ONE_SPEED, design_controller
 from hapticrender.plants.plate import Plate
 from hapticrender.plants.surface import SurfaceParameters, resonant
 from hapticrender.plants.ultrasonic import UltrasonicPlate
@@ -58,7 +58,10 @@ def test_a_recorded_waveform_is_analysed_in_blocks_as_sample_by_sample(block, rn
     carriers = np.exp(1j * bands.carrier_phase(np.arange(n) / RATE, np.zeros(n)))
     raw = np.zeros(3, complex)
     for k in range(n):
-        raw = raw + controller.settings["reference"] * (wanted[k] - (raw * carriers[k]).real.sum()) * carriers[k].conj()
+        raw = (
+            raw
+            + controller.settings["waveform_gain"] * (wanted[k] - (raw * carriers[k]).real.sum()) * carriers[k].conj()
+        )
     found = controller.field("raw_re") + 1j * controller.field("raw_im")
     np.testing.assert_allclose(found, raw, rtol=0, atol=1e-12 * abs(raw).max())
 
@@ -117,7 +120,7 @@ def friction_session(block):
     scene = hr.Scene(texture=texture, finger=finger, device="electroadhesion", duration=2.0, keep_unfelt=True)
     opened = ElectroadhesionRenderer().open(scene)
     model = replace(opened.model, delay=block, block=block)
-    return opened.plant, design_error("h2", model, opened.bands, ONE_SPEED)
+    return opened.plant, design_controller("h2", model, opened.bands, ONE_SPEED)
 
 
 @pytest.mark.parametrize("block", [10, 64])
@@ -145,7 +148,7 @@ def test_an_ultrasonic_amplitude_loop_in_blocks_follows_its_waveform(block):
     surface = SurfaceParameters()
     mode = replace(surface.carrier_mode, delay=block)
     model = replace(resonant(mode.device_model(mode.rate, block), mode, 0.0), block=block)
-    controller = design_error("h2", model, surface.amplitude_bands(), ONE_SPEED)
+    controller = design_controller("h2", model, surface.amplitude_bands(), ONE_SPEED)
     assert controller.block == block
     n = round(0.4 * mode.rate) // block * block
     wanted = np.where(np.arange(n) < n // 2, 1e-6, 1.3e-6)

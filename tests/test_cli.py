@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 
 from hapticrender import cli, defaults
 from hapticrender.recordings.recording import Recording
-from hapticrender.touch.builtin import DEVICES, builtin_scenes
+from hapticrender.touch.builtin_scenes import DEVICES, builtin_scenes
 from hapticrender.touch.scene import Scene
 
 TINY = """\
@@ -57,7 +57,7 @@ def tiny(tmp_path):
 def two_tiny_scenes(monkeypatch):
     """A demo of two short scenes."""
     scenes = {name: Scene.from_toml_text(TINY.replace("tiny", name), where=name) for name in ("one", "two")}
-    monkeypatch.setattr("hapticrender.touch.builtin.builtin_scenes", lambda: scenes)
+    monkeypatch.setattr("hapticrender.touch.builtin_scenes.builtin_scenes", lambda: scenes)
     return scenes
 
 
@@ -86,7 +86,7 @@ def complaint(result):
 def test_the_demo_leaves_one_page_and_all_its_parts(run, tmp_path, monkeypatch):
     names = ["grating-47", "one-texture-vt-plate", "one-texture-electroadhesion"]
     scenes = {name: replace(builtin_scenes()[name], duration=1.0) for name in names}
-    monkeypatch.setattr("hapticrender.touch.builtin.builtin_scenes", lambda: scenes)
+    monkeypatch.setattr("hapticrender.touch.builtin_scenes.builtin_scenes", lambda: scenes)
     status, out, errors = run("demo", "--out", tmp_path / "out")
     assert status == 0
     lines = [line for line in errors if not line.startswith("compiling")]  # once, where the kernels' cache is empty

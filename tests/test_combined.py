@@ -5,7 +5,7 @@ import pytest
 from test_kernel import RATE, friction_controller, plate_controller, tones
 
 from hapticrender.control.combined import CombinedBands, CombinedController
-from hapticrender.control.error_design import ONE_SPEED
+from hapticrender.control.controller_design import ONE_SPEED
 from hapticrender.realtime import RealtimeEntry
 
 VELOCITY_PER_FORCE = 0.64  # m/(N s)

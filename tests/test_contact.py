@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from hapticrender.jit import kernel
-from hapticrender.plants.contact import SlidingParameters, sliding_record, sliding_step
+from hapticrender.plants.sliding_contact import SlidingParameters, sliding_record, sliding_step
 
 QUIET = SlidingParameters(force_noise=0.0)
 SPEEDS = [5e-3, 40e-3, 160e-3]

@@ -9,8 +9,8 @@ from naive_error import NaiveError
 import hapticrender as hr
 from hapticrender.bands import Bands
 from hapticrender.control.controller import setpoint_rows
+from hapticrender.control.controller_design import ONE_SPEED, design_controller, rules_for
 from hapticrender.control.device_model import FingerRange
-from hapticrender.control.error_design import ONE_SPEED, design_error, rules_for
 from hapticrender.plants.plate import Plate, PlateParameters
 from hapticrender.protocols import Flag
 from hapticrender.touch.mechanics import HEAVY
@@ -33,7 +33,7 @@ def waveform_of(bands):
 def plate_controller(bands, *, parameters=IDEAL, delay=1, block=1, rules=None, feedback=True, **settings):
     model = replace(parameters, delay=delay).device_model(parameters.rate, delay)
     rules = rules or rules_for(bands)
-    controller = design_error("h2", replace(model, block=block), bands, rules, feedback=feedback)
+    controller = design_controller("h2", replace(model, block=block), bands, rules, feedback=feedback)
     for name, value in settings.items():
         controller.state["p"][name] = value
     return controller
@@ -51,7 +51,7 @@ def friction_controller(bands):
         "drive_limit": 9.0,
     }
     model = replace(replace(IDEAL, coils=1).device_model(RATE, 1), **changes)
-    return design_error("h2", model, bands, ONE_SPEED)
+    return design_controller("h2", model, bands, ONE_SPEED)
 
 
 def played_by_twin(controller, sensed, position, wanted):

@@ -9,7 +9,7 @@ import pytest
 
 import hapticrender as hr
 from hapticrender.skin import skin_bands
-from hapticrender.touch.builtin import one_texture
+from hapticrender.touch.builtin_scenes import one_texture
 from hapticrender.touch.perception import VELOCITY_PER_FORCE
 
 KINDS = ("vt-plate", "electroadhesion", "ultrasonic", "hybrid")

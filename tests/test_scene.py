@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from hapticrender.bands import Bands
 from hapticrender.errors import SceneError
 from hapticrender.touch import toml
-from hapticrender.touch.builtin import builtin_scenes
+from hapticrender.touch.builtin_scenes import builtin_scenes
 from hapticrender.touch.finger import Finger
 from hapticrender.touch.grating import Grating
 from hapticrender.touch.mechanics import FingerMechanics

@@ -9,8 +9,8 @@ import pytest
 import hapticrender as hr
 from benchmarks.charts.stability_map import loaded_plate
 from hapticrender.bands import Bands
-from hapticrender.control.bandwidth import BankGains, error_loop
-from hapticrender.control.error_design import ONE_SPEED, design_error, rules_for
+from hapticrender.control.controller_design import ONE_SPEED, design_controller, rules_for
+from hapticrender.control.margin_check import BankGains, error_loop
 from hapticrender.plants.plate import Plate, PlateParameters
 from hapticrender.touch.mechanics import HEAVY, NAMED, NONE
 
@@ -32,7 +32,7 @@ def silent(*frequencies):
 def frozen(method, *frequencies, **changes):
     """Controller that stays at its high gains, never saturates and never adapts."""
     bands = silent(*frequencies)
-    controller = design_error(method, MODEL, bands, ONE_SPEED if method == "h" else rules_for(bands))
+    controller = design_controller(method, MODEL, bands, ONE_SPEED if method == "h" else rules_for(bands))
     settings = controller.state["p"]
     for names in SCHEDULED:
         for name in names:

@@ -9,7 +9,7 @@ import pytest
 import hapticrender as hr
 from hapticrender.loop import render
 from hapticrender.sweep import Failure, SweepError, sweep, worst_error
-from hapticrender.touch.builtin import one_texture
+from hapticrender.touch.builtin_scenes import one_texture
 
 SCENES = [
     *(replace(scene, duration=0.6, settle=0.2, name=kind) for kind, scene in one_texture().items() if kind != "hybrid"),

@@ -5,8 +5,8 @@ import pytest
 from proportional import Proportional
 
 import hapticrender as hr
-from hapticrender.plants.contact import sliding_record, sliding_step
 from hapticrender.plants.friction_laws import friction_ratio, reference_amplitude
+from hapticrender.plants.sliding_contact import sliding_record, sliding_step
 from hapticrender.plants.surface import SurfaceParameters, UltrasonicSurface, full_slew
 from hapticrender.plants.ultrasonic import UltrasonicParameters, UltrasonicPlate
 from hapticrender.protocols import Flag

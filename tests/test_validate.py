@@ -8,7 +8,7 @@ from xml.etree import ElementTree
 
 import pytest
 
-from hapticrender.touch.builtin import builtin_scenes
+from hapticrender.touch.builtin_scenes import builtin_scenes
 from hapticrender.touch.grating import Grating
 from hapticrender.touch.scene import Scene
 from hapticrender.validate import Verdict, exit_status, validate, write_json, write_junit

@@ -10,10 +10,10 @@ from typing import NamedTuple
 import numpy as np
 
 from benchmarks.charts.polar_loop import PolarLoop
-from hapticrender.control.bandwidth import BankGains, error_loop
 from hapticrender.control.damping import damping_taps
 from hapticrender.control.device_model import DeviceModel, FingerRange
 from hapticrender.control.linear import FingerEstimate, Sampled
+from hapticrender.control.margin_check import BankGains, error_loop
 from hapticrender.control.margins import sensitivity
 from hapticrender.plants.plate import PlateParameters, structure
 from hapticrender.protocols import Array

@@ -8,7 +8,8 @@ D_a = D + j w b_a with the damping b_a of the inner loop,
     z_found h X = <z_sent y> - D_a a - (D' + z' h) da/dt - j dw/dt (M + m_f h) a
 
 so that the estimate in use when the command was given is kept apart from the present one: neither delay nor observer
-closes a loop through the adaptation.  The motion X is <R> + E.  A step of adaptation is a block, or `TURN_SAMPLES`.
+closes a loop through the adaptation.  The motion X is <R> + E.  A step of adaptation is a block, or
+8 samples.
 """
 
 from __future__ import annotations
@@ -18,13 +19,13 @@ from hapticrender.control.records import COMMAND_T, CONTROLLER_T, TILE_T
 from hapticrender.jit import kernel, record
 from hapticrender.vectors import conj, get, imag, maximum, pair, put, real, square, total, where, zeros
 
-TURN_SAMPLES = 8  # samples of a step of adaptation, sample by sample
+ADAPTATION_SAMPLES = 8  # samples of a step of adaptation, sample by sample
 COMPLETE = 0.9  # of a carrier's own history, from which on its band counts
 LEAST_LOAD = 0.03  # N: a smaller load tells no place
 
 
 @kernel
-def detect_contact(controller, turn):
+def detect_contact(controller, adapt_now):
     """Load and lever arm of the finger from the DC estimate; True where contact has just begun or ended."""
     c = record(controller, CONTROLLER_T, 0)
     k = c.p.stiffness
@@ -33,7 +34,7 @@ def detect_contact(controller, turn):
     on = 1.0 if load > (c.p.contact_off if c.contact > 0.0 else c.p.contact_on) else 0.0
     changed = on != c.contact
     c.load, c.contact = load, on
-    if on > 0.0 and (turn or changed):
+    if on > 0.0 and (adapt_now or changed):
         c.lever = min(max(moment / max(load, LEAST_LOAD), -2.0), 2.0)
     return changed
 
@@ -42,7 +43,7 @@ def detect_contact(controller, turn):
 def adaptation_step(controller):
     """Number of the step of adaptation."""
     c = record(controller, CONTROLLER_T, 0)
-    return c.sample // (1 if c.p.block > 1 else TURN_SAMPLES)
+    return c.sample // (1 if c.p.block > 1 else ADAPTATION_SAMPLES)
 
 
 @kernel
@@ -108,7 +109,7 @@ def adapt_finger(controller, observer, damper):
     """
     c = record(controller, CONTROLLER_T, 0)
     p, lag, g = c.p, contact_damping(controller), c.lever
-    samples, number = max(p.block, TURN_SAMPLES), adaptation_step(controller)
+    samples, number = max(p.block, ADAPTATION_SAMPLES), adaptation_step(controller)
     rate, high = p.rate / samples, max(c.fast_open, c.slow_open)
     gain = p.adaptation + high * (p.adaptation_high - p.adaptation)
     rest = (p.rest + high * (p.rest_high - p.rest)) / rate

@@ -105,7 +105,7 @@ def fade_locked(controller, t):
     """Update frequency, sweep and weights of a tile whose carriers follow the finger, and what its sensor shows.
 
     A target fades in with contact (and with speed, where friction needs it), and out towards the ends of the device's
-    range; the feedback's weight stays until the last quarter of it.
+    range; the feedback's weight stays until the last quadrature of it.
     """
     c = record(controller, CONTROLLER_T, 0)
     b, p = record(c.tiles_at, TILE_T, t), c.p
@@ -175,7 +175,7 @@ def update_targets(controller, signals, first):
     c = record(controller, CONTROLLER_T, 0)
     p, io = c.p, record(signals, SIGNALS_T, 0)
     rate, row, calm = p.rate / p.block, first // p.block, crowding(controller) if p.block == 1 else 1.0
-    follow = min(0.5 * calm * p.reference * p.block, 1.0)
+    follow = min(0.5 * calm * p.waveform_gain * p.block, 1.0)
     factor = samples_of(controller)[WAVEFORM, p.block - 1] if p.modulated > 0.0 else 1.0
     log = carray(pointer(io.target, C16), (row + 1, c.bands))
     for t in range(c.tiles):

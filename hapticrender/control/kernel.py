@@ -3,20 +3,26 @@
 Over a block the envelopes are held.  The residuals e_h that follow from them and those e of the observer that runs
 sample by sample are related by a unit lower-triangular Toeplitz matrix, whatever the number of bands (docs/theory.md)::
 
-    e[m] + sum_(j<m) r[m-j] e[j] = e_h[m],   r[d] = g_dc + (d - 1) g_drift + g sum_k cos(w_k d)
+    e[m] + sum_(j<m) psi[m-j] e[j] = e_h[m],   psi[i] = g_dc + (i - 1) g_drift + g sum_k cos(w_k i)
 
 so that e = Q e_h with Q of one column; with M = 1 there is nothing to solve.  Then every envelope is updated once, the
-law is taken at the block's end, and the drive runs linearly from one block's force to the next's.  The inner damper
-needs the next sample and runs with M = 1 only.
+law is taken for the moment at which its force acts, and the drive runs linearly from one block's force to the next's.
+The inner damper needs the next sample and runs with M = 1 only.
 
-A block: carriers and targets, prediction, innovation, observer and integral, adaptation, law, drive.
+A block: sensors, carriers and targets, contact, prediction, innovation, observer and integral, adaptation, law, drive.
 """
 
 from __future__ import annotations
 
 from numba import carray
 
-from hapticrender.control.adaptation import TURN_SAMPLES, adapt_finger, detect_contact, note_commands, reset_finger
+from hapticrender.control.adaptation import (
+    ADAPTATION_SAMPLES,
+    adapt_finger,
+    detect_contact,
+    note_commands,
+    reset_finger,
+)
 from hapticrender.control.carriers import (
     FARTHEST,
     REFRESH,
@@ -50,9 +56,9 @@ FADE_OUT = 0.02  # s: within this the drive fades out while a sensor's samples a
 
 @kernel
 def sense_block(controller, signals, first):
-    """Coordinates of every sample, the finger's positions, and flags of what is no number; 1 where a sensor is not.
+    """Convert the block's sensors to coordinates; returns 1 where a sensor's sample is not finite or out of range.
 
-    Samples beyond what a sensor can show count as zero.
+    Such a sample counts as zero; it is flagged, as a position or a waveform that is no number is.
     """
     c = record(controller, CONTROLLER_T, 0)
     io, samples = record(signals, SIGNALS_T, 0), samples_of(controller)
@@ -86,7 +92,7 @@ def sense_block(controller, signals, first):
 
 @kernel
 def update_confidence(controller, implausible):
-    """Fade the confidence in the sensors out within 20 ms while samples are implausible, and in again; True at zero."""
+    """Fade the confidence in the sensors out within 20 ms while samples are implausible, and in again; True at none."""
     c = record(controller, CONTROLLER_T, 0)
     change = c.p.block / (FADE_OUT * c.p.rate)
     c.confidence = max(c.confidence - change, 0.0) if implausible > 0 else min(c.confidence + change, 1.0)
@@ -101,7 +107,7 @@ def analyse_sample(controller):
     for t in range(c.tiles):
         b = record(c.tiles_at, TILE_T, t)
         found = found + real(get(b, "raw") * get(b, "carrier"))
-    gain = c.p.reference * crowding(controller) * (samples_of(controller)[WAVEFORM, 0] - total(found))
+    gain = c.p.waveform_gain * crowding(controller) * (samples_of(controller)[WAVEFORM, 0] - total(found))
     for t in range(c.tiles):
         b = record(c.tiles_at, TILE_T, t)
         put(b, "raw", get(b, "raw") + gain * conj(get(b, "carrier")))
@@ -123,7 +129,7 @@ def analyse_block(controller):
     correlate(controller, WAVEFORM)
     for t in range(c.tiles):
         b, w = record(c.tiles_at, TILE_T, t), record(c.work_at, WORK_T, t)
-        put(b, "raw", get(b, "raw") + c.p.reference * conj(get(w, "x0") * get(b, "carrier")))
+        put(b, "raw", get(b, "raw") + c.p.waveform_gain * conj(get(w, "x0") * get(b, "carrier")))
 
 
 @kernel
@@ -151,8 +157,8 @@ def innovate_sample(controller):
     c = record(controller, CONTROLLER_T, 0)
     samples, now, p = samples_of(controller), c.sample & 15, c.p
     samples[SUM, 0], samples[SUM + 1, 0], command0, command1 = predict(controller)
-    gain = p.dc_fast if c.quick > 0.0 else p.dc
-    drift = p.dc_drift_fast if c.quick > 0.0 else p.dc_drift
+    gain = p.dc_fast if c.dc_fast_on > 0.0 else p.dc
+    drift = p.dc_drift_fast if c.dc_fast_on > 0.0 else p.dc_drift
     for i in range(2):
         deviation = samples[Y + i, 0] - c.scale * (command0 if i == 0 else command1)
         c.past[i, now], c.deviation[i] = deviation, deviation - c.dc[i]
@@ -178,8 +184,8 @@ def innovate_block(controller):
         put(w, "x0", (p.shape[0] * expected + get(b, "e0")) * carrier)
         put(w, "x1", (p.shape[1] * expected + get(b, "e1")) * carrier)
     sum_bands(controller, False)
-    gain = p.dc_fast if c.quick > 0.0 else p.dc
-    drift = p.dc_drift_fast if c.quick > 0.0 else p.dc_drift
+    gain = p.dc_fast if c.dc_fast_on > 0.0 else p.dc
+    drift = p.dc_drift_fast if c.dc_fast_on > 0.0 else p.dc_drift
     for i in range(2):
         for m in range(block):
             samples[Y + i, m] -= samples[SUM + i, m] + c.dc[i] + m * c.dc_drift[i]
@@ -203,7 +209,7 @@ def update_coordinate(e, v, innovation, reference, rise, gain, fading, gains):
     integral, back, period = gains
     e = (1.0 - period * fading) * e + gain * innovation
     slope = -1.0 * (integral * e + fading * v)
-    # back-calculation is no part of dV/dt: the law would answer the limiter by itself
+    # back-calculation is no part of dV/dt: else law and limiter would form an algebraic loop
     return e, v + period * (slope - back * (v + reference)), slope + rise
 
 
@@ -266,24 +272,24 @@ def synthesise_block(controller):
     """
     c = record(controller, CONTROLLER_T, 0)
     samples = samples_of(controller)
-    peak = c.p.peak_decay * c.p.peak_decay * c.peak
-    for quarter in range(2):
-        if quarter > 0 and peak <= NEAR_LIMIT:
+    peak = c.p.peak_decay * c.p.peak_decay * c.peak_squared
+    for quadrature in range(2):
+        if quadrature > 0 and peak <= NEAR_LIMIT:
             break
         for t in range(c.tiles):
             b, w = record(c.tiles_at, TILE_T, t), record(c.work_at, WORK_T, t)
             carrier, force0, force1 = get(b, "carrier"), get(b, "last_force0"), get(b, "last_force1")
-            if quarter > 0:
+            if quadrature > 0:
                 carrier = pair(imag(carrier), -1.0 * real(carrier))
             put(w, "x0", force0 * carrier)
             put(w, "x1", force1 * carrier)
             put(w, "rise0", (get(b, "force0") - force0) * carrier)
             put(w, "rise1", (get(b, "force1") - force1) * carrier)
         sum_bands(controller, True)
-        if quarter == 0:
+        if quadrature == 0:
             for m in range(c.p.block):
                 samples[Y, m], samples[Y + 1, m] = samples[SUM, m], samples[SUM + 1, m]
-        peak = max(peak, largest_drive(controller, samples, Y, SUM, quarter > 0))
+        peak = max(peak, largest_drive(controller, samples, Y, SUM, quadrature > 0))
     for t in range(c.tiles):
         b = record(c.tiles_at, TILE_T, t)
         put(b, "last_force0", get(b, "force0"))
@@ -322,17 +328,17 @@ def begin(controller, signals, first):
     if p.lock > 0.0 and (block > 1 or c.sample % REFRESH == 0):
         follow_resonance(controller)
     advance_carriers(controller)
-    c.quick = 1.0 if p.needs_contact > 0.0 and (c.finger_seen <= 0.0 or c.fresh > 0.0) else 0.0
-    c.idle = 1.0 if c.quick > 0.0 or (p.needs_contact > 0.0 and c.speed < p.least_speed) else 0.0
-    c.gain = crowding(controller) * (p.observer + c.fast_open * (p.observer_high - p.observer)) * (1.0 - c.idle)
+    c.dc_fast_on = 1.0 if p.needs_contact > 0.0 and (c.finger_seen <= 0.0 or c.fresh > 0.0) else 0.0
+    c.feedback_off = 1.0 if c.dc_fast_on > 0.0 or (p.needs_contact > 0.0 and c.speed < p.least_speed) else 0.0
+    c.gain = crowding(controller) * (p.observer + c.fast_open * (p.observer_high - p.observer)) * (1.0 - c.feedback_off)
 
 
 @kernel
-def find_contact(controller, turn):
+def find_contact(controller, adapt_now):
     """Contact by the DC estimate, which raises the gains for a while, and the gain of the inner damper."""
     c = record(controller, CONTROLLER_T, 0)
     p = c.p
-    if detect_contact(controller, turn):
+    if detect_contact(controller, adapt_now):
         c.fast_timer, c.fast_open = p.fast_time, 1.0
         reset_finger(controller)
     c.damping_gain = 0.0 if c.scale < 1.0 else p.damper + c.fast_open * (p.damper_high - p.damper)
@@ -340,7 +346,7 @@ def find_contact(controller, turn):
 
 
 @kernel
-def close_block(controller, touching, turn):
+def close_block(controller, touching, adapt_now):
     """Envelopes from the innovations, adaptation, law, and the gain schedule.
 
     A detector over its level raises the gains for a while; then they fall slowly.
@@ -348,15 +354,15 @@ def close_block(controller, touching, turn):
     c = record(controller, CONTROLLER_T, 0)
     p, block = c.p, c.p.block
     integral = p.integral + c.slow_open * (p.integral_medium - p.integral)
-    integral = (integral + c.fast_open * (p.integral_high - integral)) * (1.0 - c.idle)
+    integral = (integral + c.fast_open * (p.integral_high - integral)) * (1.0 - c.feedback_off)
     fast, slow = update_envelopes(controller, integral)
     if update_confidence(controller, c.implausible):
         reset_loop(controller)
-    if touching and turn:
+    if touching and adapt_now:
         if block == 1:
             note_commands(controller)
         adapt_finger(controller, c.gain, c.damping_gain)
-    update_law(controller, touching, turn)
+    update_law(controller, touching, adapt_now)
     if touching and block > 1:
         note_commands(controller)
     if fast > 0.0:
@@ -380,13 +386,13 @@ def error_step(state, signals, start, count):
         if c.p.analysed > 0.0:
             analyse_sample(state)
         update_targets(state, signals, n)
-        turn = c.sample % TURN_SAMPLES == 0
-        touching = find_contact(state, turn)
+        adapt_now = c.sample % ADAPTATION_SAMPLES == 0
+        touching = find_contact(state, adapt_now)
         innovate_sample(state)
-        close_block(state, touching, turn)
+        close_block(state, touching, adapt_now)
         along0, along1, samples[SUM, 0], samples[SUM + 1, 0] = apply_law(state)
         samples[Y, 0], samples[Y + 1, 0] = along0 + samples[STEP, 0], along1 + samples[STEP + 1, 0]
-        peak = max(c.p.peak_decay * c.p.peak_decay * c.peak, largest_drive(state, samples, Y, SUM, True))
+        peak = max(c.p.peak_decay * c.p.peak_decay * c.peak_squared, largest_drive(state, samples, Y, SUM, True))
         limit_drive(state, samples, Y, peak, drive, flags, n)
         if c.p.lock > 0.0 and c.unlocked > 0.0:
             flags[n] |= UNLOCKED

@@ -3,7 +3,7 @@
     F = rho (D V + D' dV/dt + j dw/dt M V),   rho = e^(j w lead) (w T/2)/sin(w T/2)
 
 with D(s) = M s^2 + C s + K + z(s) h h^T, h = [1, g] the finger's lever arm and z its three numbers and what a band
-leaves over.  An error of the law for changes of W rad/s is bounded by m W^2/|D|.
+leaves over.  An error of the law for changes of Omega rad/s is bounded by m Omega^2/|D|.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ def turn_ahead(controller, t):
 
 
 @kernel
-def stiffness(mass, damping, stiffness, b):
+def law_entry(mass, damping, stiffness, b):
     """D and D' of one pair of coordinates, turned ahead by rho."""
     omega, ahead = get(b, "omega"), get(b, "ahead")
     d = pair(stiffness - omega * omega * mass, omega * damping + get(b, "sweep") * mass)
@@ -56,19 +56,19 @@ def set_law(controller, t):
     mass, spring = on * c.finger_mass, on * get(b, "remainder")
     damping = on * c.finger_damping + contact_damping(controller)
     k = on * c.finger_stiffness
-    d, s = stiffness(p.mass[0, 0] + mass, p.damping[0, 0] + damping, p.stiffness[0, 0] + k, b)
+    d, s = law_entry(p.mass[0, 0] + mass, p.damping[0, 0] + damping, p.stiffness[0, 0] + k, b)
     more = spring * get(b, "ahead")
     put(b, "d00", d + more)
     put(b, "s00", s)
     mass, damping, k, more = g * mass, g * damping, g * k, g * more
-    d, s = stiffness(p.mass[0, 1] + mass, p.damping[0, 1] + damping, p.stiffness[0, 1] + k, b)
+    d, s = law_entry(p.mass[0, 1] + mass, p.damping[0, 1] + damping, p.stiffness[0, 1] + k, b)
     put(b, "d01", d + more)
     put(b, "s01", s)
-    d, s = stiffness(p.mass[1, 0] + mass, p.damping[1, 0] + damping, p.stiffness[1, 0] + k, b)
+    d, s = law_entry(p.mass[1, 0] + mass, p.damping[1, 0] + damping, p.stiffness[1, 0] + k, b)
     put(b, "d10", d + more)
     put(b, "s10", s)
     mass, damping, k, more = g * mass, g * damping, g * k, g * more
-    d, s = stiffness(p.mass[1, 1] + mass, p.damping[1, 1] + damping, p.stiffness[1, 1] + k, b)
+    d, s = law_entry(p.mass[1, 1] + mass, p.damping[1, 1] + damping, p.stiffness[1, 1] + k, b)
     put(b, "d11", d + more)
     put(b, "s11", s)
 
@@ -94,11 +94,11 @@ def follow_resonance(controller):
 
 
 @kernel
-def update_law(controller, touching, turn):
-    """Update the law with the finger estimate: where contact changed, in its turn, and always where carriers move."""
+def update_law(controller, touching, adapt_now):
+    """Update the law with the finger estimate: where contact changed or it is adapted, and where carriers move."""
     c = record(controller, CONTROLLER_T, 0)
     contact = 1.0 if touching else 0.0
-    due = contact != c.law_contact or (turn and touching) or c.stale > 0
+    due = contact != c.law_contact or (adapt_now and touching) or c.stale > 0
     if due:
         c.law_contact, c.law_lever = contact, c.lever
     if not (due or c.moving > 0):

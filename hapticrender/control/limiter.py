@@ -51,7 +51,7 @@ def limit_drive(controller, samples, force, peak, drive, flags, first):
     """Scale the whole envelope into the limit, round, and write the drive of a block."""
     c = record(controller, CONTROLLER_T, 0)
     before, after, limit = c.scale, 1.0, c.p.drive_limit
-    c.peak = peak
+    c.peak_squared = peak
     if peak > 1.0:
         after = 1.0 / math.sqrt(peak)
     for m in range(c.p.block):

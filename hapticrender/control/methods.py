@@ -27,8 +27,8 @@ import numpy as np
 
 from hapticrender.bands import Bands
 from hapticrender.control.controller import BankController, device_settings, ridge_spacing, shared_settings, spacing
+from hapticrender.control.controller_design import FADE_IN, ONE_SPEED, Rules, design_controller, rules_for
 from hapticrender.control.device_model import DeviceModel
-from hapticrender.control.error_design import FADE_IN, ONE_SPEED, Rules, design_error, rules_for
 from hapticrender.control.linear import Sampled
 from hapticrender.control.loopshape import (
     Bandwidths,
@@ -62,8 +62,8 @@ class ErrorObserver:
     rules: Rules | None = None
 
     def design(self, model: DeviceModel, bands: Bands, *, feedback: bool = True) -> BankController:
-        """Design the controller; see `design_error`."""
-        return design_error(self.name, model, bands, self.rules or rules_for(bands), feedback=feedback)
+        """Design the controller; see `design_controller`."""
+        return design_controller(self.name, model, bands, self.rules or rules_for(bands), feedback=feedback)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -200,7 +200,7 @@ def low_pass_settings(
         **shared_settings(model, bands, sensor_map, drive_map, feedback),
         "low_pass": loop.filter,
         "loop": loop.law,
-        "reference": 2 * analysis / model.rate,
+        "waveform_gain": 2 * analysis / model.rate,
         "crowd_speed": analysis / ridges if math.isfinite(ridges) else 0.0,
         "highest_edge": HIGHEST_EDGE,
         "feedback": feedback,

@@ -45,7 +45,7 @@ TILE_FIELDS = [
     "fade",  # 0..1: how far the target has faded in
     "weight",  # 0..1, of the target
     "feedback",  # 0..1: weight of the feedback
-    *_complex("target", "r", "slope"),  # target; reference R and its slope
+    *_complex("target", "r", "slope"),  # target; reference R and dR/dt
     *_complex("expected", "raw"),  # R in the block's middle; envelope of the waveform
     *_complex("ahead"),  # rho: the turn by delay and hold
     *_complex("remainder"),  # stiffness of the finger beyond its three numbers
@@ -78,7 +78,7 @@ LOW_PASS, COMMAND, WORK, PAIR = map(_record, (LOW_PASS_FIELDS, COMMAND_FIELDS, W
 """Commands are ordered [step, tile]; a pair is a complex number for each band of a tile."""
 
 _SETTINGS = """
-rate lead reference middle extrapolation fade_in lowest highest highest_edge modulated differentiated analysed
+rate lead waveform_gain middle extrapolation fade_in lowest highest highest_edge modulated differentiated analysed
 needs_contact least_speed sensor_delay contact_lag corrected sensor_limit drive_limit drive_step peak_decay
 back_calculation observer observer_high crowd_speed dc dc_drift dc_fast dc_drift_fast
 integral integral_medium integral_high damper damper_high
@@ -105,13 +105,13 @@ SETTINGS = np.dtype(
         ),
     ]
 )
-"""Settings of a controller, as its design derived them; `hapticrender.control.controller` says what each is."""
+"""Settings of a controller, as its design derived them; `hapticrender.control.controller_design` derives them."""
 
 _STATE = """
 held_position smooth_position velocity acceleration finger_seen fresh speed table_velocity
 load lever contact law_contact law_lever finger_mass finger_damping finger_stiffness
-fast_timer slow_timer fast_open slow_open peak scale confidence shift unlocked response_gain
-gain damping_gain quick idle
+fast_timer slow_timer fast_open slow_open peak_squared scale confidence shift unlocked response_gain
+gain damping_gain dc_fast_on feedback_off
 """.split()
 CONTROLLER = np.dtype(
     [

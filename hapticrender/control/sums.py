@@ -141,7 +141,7 @@ def invert(controller, g):
     for m in range(block):
         samples[RESPONSE, m] = samples[SUM, m]
     for row in range(INVERSE, ANALYSIS + 1):
-        gain, dc, drift = (g, p.dc, p.dc_drift) if row == INVERSE else (p.reference, 0.0, 0.0)
+        gain, dc, drift = (g, p.dc, p.dc_drift) if row == INVERSE else (p.waveform_gain, 0.0, 0.0)
         for m in range(block):
             samples[row, m] = 1.0 if m == 0 else 0.0
         for j in range(block):

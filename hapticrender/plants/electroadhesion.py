@@ -38,9 +38,9 @@ import numpy as np
 from hapticrender.checks import Validated, option, parameter
 from hapticrender.control.estimators import StarSTDFT
 from hapticrender.plants.compiled import CompiledPlant
-from hapticrender.plants.contact import SlidingParameters, new_record, sliding_record
 from hapticrender.plants.electroadhesion_kernels import SCREEN, element, screen_step
 from hapticrender.plants.gap import VACUUM, gap_record
+from hapticrender.plants.sliding_contact import SlidingParameters, new_record, sliding_record
 from hapticrender.protocols import Array
 
 if TYPE_CHECKING:

@@ -30,7 +30,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from hapticrender.jit import kernel
-from hapticrender.plants.contact import new_record
+from hapticrender.plants.sliding_contact import new_record
 from hapticrender.protocols import Array
 
 if TYPE_CHECKING:

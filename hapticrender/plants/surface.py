@@ -19,8 +19,8 @@ from hapticrender.control.controller import BankController
 from hapticrender.control.damping import within_a_turn
 from hapticrender.control.device_model import DeviceModel, FingerRange
 from hapticrender.plants.compiled import CompiledPlant
-from hapticrender.plants.contact import SlidingParameters, new_record, sliding_record
 from hapticrender.plants.friction_laws import LAWS, FrictionLaw
+from hapticrender.plants.sliding_contact import SlidingParameters, new_record, sliding_record
 from hapticrender.plants.ultrasonic import LEVELS, UltrasonicParameters, mode_inputs, mode_record
 from hapticrender.plants.ultrasonic_kernels import AMPLITUDE, SURFACE, surface_step
 from hapticrender.protocols import Array

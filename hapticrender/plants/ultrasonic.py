@@ -27,7 +27,7 @@ import numpy as np
 from hapticrender.checks import Validated, option, parameter
 from hapticrender.control.device_model import DeviceModel
 from hapticrender.plants.compiled import LOAD, STRENGTH, CompiledPlant
-from hapticrender.plants.contact import new_record
+from hapticrender.plants.sliding_contact import new_record
 from hapticrender.plants.ultrasonic_kernels import MODE, ultrasonic_step
 from hapticrender.protocols import Array
 

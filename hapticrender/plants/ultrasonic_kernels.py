@@ -23,8 +23,8 @@ import numpy as np
 from hapticrender.control.kernel import observed_envelope
 from hapticrender.jit import F8, I8, SIGNALS, SIGNALS_T, call, kernel, pointer, step
 from hapticrender.plants.compiled import HUGE, LOAD, SENSOR_CLIPPED, SPEED, quantise, queue_drive
-from hapticrender.plants.contact import SLIDING, sliding_step
 from hapticrender.plants.friction_laws import LAW, friction_ratio, reference_amplitude
+from hapticrender.plants.sliding_contact import SLIDING, sliding_step
 from hapticrender.protocols import Flag
 
 SATURATED = int(Flag.SATURATED)

@@ -2,7 +2,7 @@
 
 Bandwidths follow carriers, spacing and delay: observer <= f0/2 and spacing/2 pi, integral <= f0/4 and what delay and
 observer leave of the phase, DC estimate <= f0/8.  Thresholds follow the noise.  The inner damper is chosen by its
-margins; then all of it is lowered until the margins of the sampled loop hold (`bandwidth`).
+margins; then all of it is lowered until the margins of the sampled loop hold (`margin_check`).
 """
 
 from __future__ import annotations
@@ -14,8 +14,7 @@ from typing import Any
 import numpy as np
 
 from hapticrender.bands import Bands
-from hapticrender.control.adaptation import TURN_SAMPLES
-from hapticrender.control.bandwidth import BankGains, checked_gains
+from hapticrender.control.adaptation import ADAPTATION_SAMPLES
 from hapticrender.control.controller import (
     BankController,
     device_settings,
@@ -27,6 +26,7 @@ from hapticrender.control.controller import (
 from hapticrender.control.damping import Damping, choose_damping
 from hapticrender.control.device_model import DeviceModel, FingerRange
 from hapticrender.control.kernel import block_step, error_step
+from hapticrender.control.margin_check import BankGains, checked_gains
 from hapticrender.control.records import MOST_TAPS
 
 FADE_IN = 0.05  # s: a target fades in this slowly, so that it does not excite the modes
@@ -103,7 +103,7 @@ def rules_for(bands: Bands) -> Rules:
     return TWO_SPEEDS_CROWDED if crowded else TWO_SPEEDS
 
 
-def design_error(
+def design_controller(
     method: str, model: DeviceModel, bands: Bands, rules: Rules, *, feedback: bool = True
 ) -> BankController:
     """Design the default controller, called `method`, for a device of 1 or 2 coordinates and its bands by `rules`.
@@ -200,7 +200,7 @@ def _settings(
         "n_taps": taps.shape[1],
         "taps": np.pad(taps, ((0, 2 - len(taps)), (0, MOST_TAPS - taps.shape[1]))),
         "added_damping": np.resize(np.append(damping.added_damping if damping else 0.0, [0.0, 0.0]), 2),
-        "reference": 2 * 2 * math.pi * observer * period,
+        "waveform_gain": 2 * 2 * math.pi * observer * period,
         "extrapolation": 0.0,
         "fade_in": period / max(FADE_IN / model.pace, LEAST_FADE_IN),
         "corrected": bands.sensor_response is None and (model.sensor_delay != 0.0 or model.contact_lag != 0.0),
@@ -212,13 +212,13 @@ def _settings(
         "integral": gains.integral_low,
         "damper": gains.inner,
         "damper_high": gains.inner_high,
-        "age": (model.delay + 0.5) / TURN_SAMPLES,
+        "age": (model.delay + 0.5) / ADAPTATION_SAMPLES,
     }
 
 
 def _adaptation(model: DeviceModel, rules: Rules, observer: float, feedback: bool) -> dict[str, float]:
     """How fast the finger is estimated, by the observer's pole (1/s) and the delay; negative: never."""
-    most = min(ADAPTATION_SHARE * model.rate / TURN_SAMPLES, model.finger.fastest)
+    most = min(ADAPTATION_SHARE * model.rate / ADAPTATION_SAMPLES, model.finger.fastest)
     if model.finger.contact is None:  # what is always there is as large as D, and the law far from it while it adapts
         wait = model.delay / model.rate
         most = min(1 / (2 * wait + ADAPTATION_TIME / model.pace), most, observer / ADAPTATION_MARGIN)
