@@ -9,9 +9,6 @@ PROBE := import ensurepip, sys; sys.exit(sys.version_info < (3, 11))
 PYTHON = $(shell for candidate in python3 python3.13 python3.12 python3.11; do \
 	"$$candidate" -c '$(PROBE)' 2>/dev/null && { echo "$$candidate"; break; }; done)
 RUN := .venv/bin/python
-# numba's cache does not see an edit to a function called from another file: a folder for each state of the sources
-SOURCES = $(shell cat hapticrender/*.py hapticrender/control/*.py hapticrender/plants/*.py | cksum | cut -d ' ' -f 1)
-export NUMBA_CACHE_DIR ?= $(CURDIR)/.venv/numba/$(SOURCES)
 OUT := out/demo
 OLDEST = $(shell sed -n 's/^dependencies = \[\(.*\)\]/\1/p' pyproject.toml | tr -d '",' | sed 's/>=/==/g')
 OLDEST_TESTS := $(addprefix tests/test_,$(addsuffix .py,math vectors kernel blocks plate contact low_pass realtime combined))

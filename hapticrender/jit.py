@@ -12,10 +12,12 @@ addresses closes any plant with any controller, and a third party may give a ste
 
 from __future__ import annotations
 
+import hashlib
 import sys
 import threading
 from collections.abc import Callable
-from functools import cached_property
+from functools import cached_property, lru_cache
+from pathlib import Path
 from typing import Any
 
 import numba
@@ -42,6 +44,26 @@ SIGNALS = np.dtype(
 SIGNALS_T = numba.from_dtype(SIGNALS)
 
 
+@lru_cache
+def digest() -> str:
+    """Hash of all sources with kernels, and of the options: a part of the names under which machine code is cached.
+
+    numba compiles cached code anew when its own file changes, but not when a part of it in another file does.
+    """
+    found = hashlib.sha256(repr(OPTIONS).encode())
+    for path in sorted(Path(__file__).parent.rglob("*.py")):
+        source = path.read_bytes()
+        if b"numba" in source or b"hapticrender.jit" in source:
+            found.update(source)
+    return found.hexdigest()[:12]
+
+
+def keyed(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Name a function by the state of the sources, where numba caches it."""
+    function.__qualname__ = f"{function.__name__}_{digest()}"
+    return function
+
+
 def kernel(function: Callable[..., Any]) -> Any:
     """Compile a function on its first call, as a part of the kernels and steps that call it."""
     return numba.njit(function, **OPTIONS)
@@ -53,7 +75,7 @@ def entry(function: Callable[..., Any]) -> Any:
     A part is not: it lies in the code of all that call it, and storing each took a third of a cold start.
     """
     try:
-        return numba.njit(function, cache=True, **OPTIONS)
+        return numba.njit(keyed(function), cache=True, **OPTIONS)
     except RuntimeError:  # neither the package nor the user's cache folder can be written
         return numba.njit(function, **OPTIONS)
 
@@ -86,7 +108,7 @@ class CFunction:
         note.daemon = True
         note.start()
         try:
-            return numba.cfunc(self.signature, cache=True, **OPTIONS)(self.function)
+            return numba.cfunc(self.signature, cache=True, **OPTIONS)(keyed(self.function))
         except RuntimeError:
             return numba.cfunc(self.signature, **OPTIONS)(self.function)
         finally:

@@ -5,6 +5,9 @@ from pathlib import Path
 
 import pytest
 
+from hapticrender.control.kernel import error_step
+from hapticrender.jit import close_loop, digest
+
 ROOT = Path(__file__).resolve().parent.parent
 SHIPPED = sorted(path for folder in ("hapticrender", "renderers", "drivers") for path in (ROOT / folder).rglob("*.py"))
 PACKAGES = ("numba", "llvmlite")
@@ -137,3 +140,10 @@ def test_shipped_code_uses_documented_names_only():
 )
 def test_the_list_fails_on(source, found):
     assert outside(source) == found
+
+
+def test_cached_code_is_named_by_the_state_of_the_sources():
+    """numba's cache sees an edit of a function's own file only; parts of a step lie in others."""
+    assert close_loop.py_func.__qualname__ == f"close_loop_{digest()}"
+    assert error_step.address > 0
+    assert error_step.function.__qualname__ == f"error_step_{digest()}"

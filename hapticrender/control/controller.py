@@ -28,7 +28,8 @@ from hapticrender.control.records import (
 from hapticrender.jit import CFunction, addresses
 from hapticrender.protocols import Array
 
-LARGEST_GROUP = 16  # samples, of a block: carriers turn by products from group to group
+LARGEST_GROUP = 16  # samples of a block whose carriers are taken from the middle of them,
+LONGEST_GROUP = 0.5e-3  # s: an acceleration of 10 m/s2 moves the finger by 0.3 um from its mean motion in it
 SETTLED = 0.05  # of a target: below it an error counts as settled
 LEAST_TARGET = 3e-3  # of the sensors' range: below it noise adds more than a wrong device model
 
@@ -76,7 +77,8 @@ class BankController:
         self.tiles["active"] = (np.arange(tiles * W) < self.n_bands).reshape(tiles, W)
         self.setpoints = setpoint_rows(bands)
         self.state = np.zeros(1, CONTROLLER)
-        group = max(each for each in range(1, LARGEST_GROUP + 1) if self.block % each == 0)
+        most = min(max(int(LONGEST_GROUP * self.rate), 1), LARGEST_GROUP)
+        group = max(each for each in range(1, most + 1) if self.block % each == 0)
         for name, value in (settings | {"group": group}).items():
             self.state["p"][name][0] = value
         memory = {

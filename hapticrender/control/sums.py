@@ -7,7 +7,7 @@ that with y = x z_s::
 
 and one pair of products serves two samples, also of envelopes that rise linearly.  `table` holds z_d for the pairs,
 `phasors` z_s for the groups; where a carrier follows the finger, z_s has the finger's mean position in the group, and
-z_d its mean velocity in the block.
+z_d, filled anew for each group, its mean velocity.
 """
 
 from __future__ import annotations
@@ -34,21 +34,30 @@ from hapticrender.vectors import conj, get, imag, pair, put, real, total, zeros
 
 
 @kernel
+def turn_pairs(controller, t, q):
+    """Fill the table of a tile for a group, with the finger's mean velocity in it."""
+    c = record(controller, CONTROLLER_T, 0)
+    b, samples, group = record(c.tiles_at, TILE_T, t), samples_of(controller), c.p.group
+    middle, pairs, first = 0.5 * (group - 1), (group + 1) // 2, q * group
+    speed = (samples[POSITION, first + group - 1] - samples[POSITION, first]) / max(group - 1, 1)
+    speed = speed if abs(speed) * c.p.rate <= FASTEST else 0.0
+    turn = get(b, "frequency") / c.p.rate + speed * get(b, "wavenumber")
+    for i in range(pairs):
+        put(record(c.table_at, PAIR_T, i * c.tiles + t), "z", unit((middle - (pairs - 1 - i)) * turn))
+
+
+@kernel
 def turn_tables(controller):
     """Fill table and phasors of the carriers relative to the block's start, with the positions in `samples`."""
     c = record(controller, CONTROLLER_T, 0)
     p, samples, group = c.p, samples_of(controller), c.p.group
-    middle, pairs = 0.5 * (group - 1), (group + 1) // 2
-    speed = (samples[POSITION, p.block - 1] - samples[POSITION, 0]) / max(p.block - 1, 1)
-    speed = speed if abs(speed) * p.rate <= FASTEST else 0.0
+    middle = 0.5 * (group - 1)
     for t in range(c.tiles):
         b = record(c.tiles_at, TILE_T, t)
         if b.mode[0] != LOCKED and c.stale == 0:
             continue
+        turn_pairs(controller, t, 0)
         frequency, wavenumber = get(b, "frequency") / p.rate, get(b, "wavenumber")
-        for i in range(pairs):
-            distance = middle - (pairs - 1 - i)
-            put(record(c.table_at, PAIR_T, i * c.tiles + t), "z", unit((frequency + speed * wavenumber) * distance))
         for q in range(p.block // group):
             place = 0.0
             for m in range(q * group, (q + 1) * group):
@@ -66,6 +75,8 @@ def sum_bands(controller, rising):
     for q in range(block // group):
         share = (q * group + middle + 1.0) / block
         for t in range(tiles):
+            if record(c.tiles_at, TILE_T, t).mode[0] == LOCKED:
+                turn_pairs(controller, t, q)
             w, z = record(c.work_at, WORK_T, t), get(record(c.phasors_at, PAIR_T, q * tiles + t), "z")
             x0, x1 = get(w, "x0"), get(w, "x1")
             if rising:
@@ -109,6 +120,8 @@ def correlate(controller, row):
     for t in range(tiles):
         x0 = x1 = pair(zeros(), zeros())
         for q in range(c.p.block // group):
+            if record(c.tiles_at, TILE_T, t).mode[0] == LOCKED:
+                turn_pairs(controller, t, q)
             even0, odd0, even1, odd1 = zeros(), zeros(), zeros(), zeros()
             for i in range(pairs):
                 z, m = get(record(c.table_at, PAIR_T, i * tiles + t), "z"), q * group + i
