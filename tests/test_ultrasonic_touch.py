@@ -10,7 +10,7 @@ from ultrasonic import ASKED, NOISE, ran
 import hapticrender as hr
 from hapticrender.accuracy import friction as accuracy_friction
 from hapticrender.accuracy.figures import TARGETS
-from hapticrender.control import error_design
+from hapticrender.control import controller_design
 from hapticrender.plants import surface
 from hapticrender.protocols import Flag
 
@@ -109,5 +109,5 @@ def test_an_overload_leaves_nothing_behind_on_a_plate_that_rings_long(monkeypatc
         return np.median(after)
 
     assert settled() <= back
-    monkeypatch.setattr(error_design, "TOUCHED_DECAY", 0.0)
+    monkeypatch.setattr(controller_design, "TOUCHED_DECAY", 0.0)
     assert settled() > back
