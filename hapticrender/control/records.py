@@ -157,7 +157,7 @@ def samples_of(controller):
 
 
 def aligned(shape: int | tuple[int, ...], dtype: type | np.dtype = np.float64) -> Array:
-    """Array of zeros that starts at a multiple of 64 bytes, where vector loads are fastest."""
+    """Array of zeros that starts at a multiple of 64 bytes, as `get` and `put` of tiles require."""
     dtype = np.dtype(dtype)
     size = int(np.prod(shape)) * dtype.itemsize
     memory = np.zeros(size + 64, np.uint8)
