@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.timing import Absent
-from hapticrender.control.kernel import FORGET
+from hapticrender.control.kernel import LEAK
 from hapticrender.control.records import INVERSE, SAMPLE_ROWS, W, aligned
 from hapticrender.mathx import COS, SIN
 
@@ -119,7 +119,7 @@ class TunedBlock:
             "g": state["response_gain"],
             "lead": p["extrapolation"],
             "back": 0.0,
-            "forget": FORGET,
+            "forget": LEAK,
             "ramp": p["fade_in"] * self.block,
             "limit": p["drive_limit"],
             "sensed_limit": p["sensor_limit"],
@@ -158,8 +158,9 @@ def _rows(count, rows, **fields):
 def samples_of(controller):
     """The controller's work array of a block's samples, shape (rows, block)."""
     address = int(controller.state["samples_at"][0])
-    memory = (ctypes.c_double * (SAMPLE_ROWS * controller.block)).from_address(address)
-    return np.array(memory).reshape(SAMPLE_ROWS, controller.block)
+    width = int(controller.settings["groups"] * controller.settings["group"])
+    memory = (ctypes.c_double * (SAMPLE_ROWS * width)).from_address(address)
+    return np.array(memory).reshape(SAMPLE_ROWS, width)
 
 
 def _bands(tiles):

@@ -89,15 +89,34 @@ def note_commands(controller):
 
 
 @kernel
-def recalled(new, old, share):
-    """Value between a newer and an older one, `share` of the older."""
-    return new + share * (old - new)
+def interpolated(a, b, share):
+    """Value between a and b, `share` of b."""
+    return a + share * (b - a)
 
 
 @kernel
 def taken_force(spring, damping, drag, skin, mass, w, sweep, motion, slope):
     """Force that a motion beyond the commanded one takes in the heave row: D_a a + (D' + z' h) da/dt + j dw/dt m a."""
     return pair(spring - w * w * mass, w * damping + sweep * skin) * motion + pair(drag, 2.0 * skin * w) * slope
+
+
+@kernel
+def pool(controller, b, residual, motion, rest):
+    """Parts of a tile in stiffness, mass and damping, and weights |h X|^2/|D|^2; a band keeps what is left."""
+    c = record(controller, CONTROLLER_T, 0)
+    p, w = c.p, get(b, "filtered_omega")
+    w2, size2 = w * w, square(motion)
+    spring2, mass2 = p.typical_stiffness * p.typical_stiffness, p.typical_mass * p.typical_mass
+    counts = where(where(size2 >= p.least_motion * p.least_motion, get(b, "complete"), 0.0) >= COMPLETE, 1.0, 0.0)
+    found = counts / maximum(size2, 1e-300) * (residual * conj(motion))
+    left = found - counts * pair(c.finger_stiffness - w2 * c.finger_mass, w * c.finger_damping)
+    along = p.stiffness[0, 0] - w2 * p.mass[0, 0]
+    weight = counts * size2 / (along * along + p.damping[0, 0] * p.damping[0, 0] * w2 + 1e-300)
+    scale = real(left) * weight / (spring2 + mass2 * w2 * w2)
+    remainder = get(b, "remainder")
+    put(b, "remainder", remainder + rest * (left - counts * remainder))
+    # w < 0 where the finger moves backwards
+    return spring2 * scale, mass2 * w2 * scale, weight * imag(left) * w / maximum(w2, 1e-18), weight
 
 
 @kernel
@@ -127,19 +146,22 @@ def adapt_finger(controller, observer, damper):
     b0, b1 = p.damping[0, 0] + lag, p.damping[0, 1] + g * lag
     drag0, drag1, skin0, skin1 = b0 + damping, b1 + g * damping, m0 + mass, m1 + g * mass
     b0 += damper * p.added_damping[0]
-    spring2, mass2 = p.typical_stiffness * p.typical_stiffness, p.typical_mass * p.typical_mass
     sum_k, sum_m, sum_b, weights = zeros(), zeros(), zeros(), zeros()
     for t in range(c.tiles):
         b = record(c.tiles_at, TILE_T, t)
         new, old = record(c.commands_at, COMMAND_T, newer + t), record(c.commands_at, COMMAND_T, older + t)
-        command0 = recalled(get(b, "filtered0"), recalled(get(new, "command0"), get(old, "command0"), share), pole)
-        command1 = recalled(get(b, "filtered1"), recalled(get(new, "command1"), get(old, "command1"), share), pole)
-        force = recalled(get(b, "finger_force"), recalled(get(new, "force"), get(old, "force"), share), pole)
-        reference = recalled(get(b, "filtered_r"), get(b, "r") - behind * get(b, "slope"), pole)
+        command0 = interpolated(
+            get(b, "filtered0"), interpolated(get(new, "command0"), get(old, "command0"), share), pole
+        )
+        command1 = interpolated(
+            get(b, "filtered1"), interpolated(get(new, "command1"), get(old, "command1"), share), pole
+        )
+        force = interpolated(get(b, "finger_force"), interpolated(get(new, "force"), get(old, "force"), share), pole)
+        reference = interpolated(get(b, "filtered_r"), get(b, "r") - behind * get(b, "slope"), pole)
         sweep = get(b, "sweep")
         w, complete = get(b, "omega") - behind * sweep, get(b, "complete")
         whole = where(get(b, "fade") >= 1.0, get(b, "feedback"), 0.0) >= 1.0
-        w = where(whole, recalled(get(b, "filtered_omega"), w, pole), w)
+        w = where(whole, interpolated(get(b, "filtered_omega"), w, pole), w)
         complete = where(whole, complete + pole * (1.0 - complete), 0.0)
         x0, x1 = get(b, "e0") + p.shape[0] * reference, get(b, "e1") + p.shape[1] * reference
         motion, a0, a1 = x0 + g * x1, x0 - command0, x1 - command1
@@ -154,19 +176,8 @@ def adapt_finger(controller, observer, damper):
         put(b, "complete", complete)
         put(b, "last0", a0)
         put(b, "last1", a1)
-        w2, size2 = w * w, square(motion)
-        counts = where(where(size2 >= p.least_motion * p.least_motion, complete, 0.0) >= COMPLETE, 1.0, 0.0)
-        found = counts / maximum(size2, 1e-300) * (residual * conj(motion))
-        left = found - counts * pair(spring - w2 * mass, w * damping)
-        along = k0 - w2 * m0
-        weight = counts * size2 / (along * along + p.damping[0, 0] * p.damping[0, 0] * w2 + 1e-300)
-        scale = weight / (spring2 + mass2 * w2 * w2)
-        sum_k = sum_k + spring2 * scale * real(left)
-        sum_m = sum_m + mass2 * w2 * scale * real(left)
-        sum_b = sum_b + weight * imag(left) * w / maximum(w2, 1e-18)  # w < 0 where the finger moves backwards
-        weights = weights + weight
-        remainder = get(b, "remainder")
-        put(b, "remainder", remainder + rest * (left - counts * remainder))
+        part_k, part_m, part_b, weight = pool(controller, b, residual, motion, rest)
+        sum_k, sum_m, sum_b, weights = sum_k + part_k, sum_m + part_m, sum_b + part_b, weights + weight
     weight = total(weights)
     step = gain / rate / (weight if weight > 0.0 else 1.0)
     c.finger_stiffness = min(max(spring + step * total(sum_k), p.least_stiffness), p.most_stiffness)

@@ -170,7 +170,7 @@ def update_targets(controller, signals, first):
     """Targets, references R and their slopes for a block, and a row of the log.
 
     A target is the setpoint times its weight, or follows the envelope that the waveform was found to have, at the
-    observer's pace; both differentiated where that is asked.
+    observer's pace; both differentiated for a texture in velocity.
     """
     c = record(controller, CONTROLLER_T, 0)
     p, io = c.p, record(signals, SIGNALS_T, 0)

@@ -78,8 +78,9 @@ class BankController:
         self.setpoints = setpoint_rows(bands)
         self.state = np.zeros(1, CONTROLLER)
         most = min(max(int(LONGEST_GROUP * self.rate), 1), LARGEST_GROUP)
-        group = max(each for each in range(1, most + 1) if self.block % each == 0)
-        for name, value in (settings | {"group": group}).items():
+        group = min(most, self.block)
+        groups = -(-self.block // group)  # the last one may be filled in part
+        for name, value in (settings | {"group": group, "groups": groups}).items():
             self.state["p"][name][0] = value
         memory = {
             "tiles": self.tiles,
@@ -87,8 +88,8 @@ class BankController:
             "setpoints": self.setpoints,
             "work": aligned(tiles, WORK),
             "table": aligned((group + 1) // 2 * tiles, PAIR),
-            "phasors": aligned(self.block // group * tiles, PAIR),
-            "samples": np.zeros((SAMPLE_ROWS, self.block)),
+            "phasors": aligned(groups * tiles, PAIR),
+            "samples": np.zeros((SAMPLE_ROWS, groups * group)),
         } | (arrays or {})
         self._arrays = memory
         for name, array in memory.items():

@@ -37,6 +37,7 @@ from hapticrender.control.records import (
     ANALYSIS,
     CONTROLLER_T,
     INVERSE,
+    LEAK,
     POSITION,
     STEP,
     SUM,
@@ -50,7 +51,6 @@ from hapticrender.control.sums import correlate, invert, solve, sum_bands, turn_
 from hapticrender.jit import F8, I8, SIGNALS_T, kernel, pointer, record, step
 from hapticrender.vectors import conj, get, imag, maximum, pair, put, real, square, total, zeros
 
-FORGET = 50.0  # 1/s: error and integral of a carrier that has faded out decay at this rate
 FADE_OUT = 0.02  # s: within this the drive fades out while a sensor's samples are implausible
 
 
@@ -214,11 +214,21 @@ def update_coordinate(e, v, innovation, reference, rise, gain, fading, gains):
 
 
 @kernel
+def detect(controller, deviation, fast, slow, over, above):
+    """Low-pass a deviation twice; add the squares beyond the levels of the fast and of the slow detector."""
+    p = record(controller, CONTROLLER_T, 0).p
+    fast = fast + p.fast_pole * (deviation - fast)
+    slow = slow + p.slow_pole * (fast - slow)
+    over = over + maximum(square(fast) - p.fast_level, 0.0)
+    return fast, slow, over, above + maximum(square(slow) - p.slow_level, 0.0)
+
+
+@kernel
 def update_envelopes(controller, integral):
     """Update error envelopes, integral parts and slopes of the commands of all bands, and run the detectors.
 
-    Returns what the demodulated deviations, low-passed, exceed the levels of the fast and the slow detector by.  Sample
-    by sample the deviation itself is demodulated; in blocks it is E - v and what the innovations add to it.
+    Returns the sums of squares by which demodulated deviations exceed the levels of the two detectors.  Sample by
+    sample the deviation itself is demodulated; in blocks it is E - v and what the innovations add to it.
     """
     c = record(controller, CONTROLLER_T, 0)
     p, samples, shape0, shape1 = c.p, samples_of(controller), c.p.shape[0], c.p.shape[1]
@@ -237,22 +247,14 @@ def update_envelopes(controller, integral):
             found0, found1 = one0 * carrier, one1 * carrier
             deviation0, deviation1 = twice0 * carrier, twice1 * carrier
         if p.detects > 0.0:
-            fast, slow = get(b, "fast0"), get(b, "slow0")
-            fast = fast + p.fast_pole * (deviation0 - fast)
-            slow = slow + p.slow_pole * (fast - slow)
-            put(b, "fast0", fast)
-            put(b, "slow0", slow)
-            over = over + maximum(square(fast) - p.fast_level, 0.0)
-            above = above + maximum(square(slow) - p.slow_level, 0.0)
-            fast, slow = get(b, "fast1"), get(b, "slow1")
-            fast = fast + p.fast_pole * (deviation1 - fast)
-            slow = slow + p.slow_pole * (fast - slow)
-            put(b, "fast1", fast)
-            put(b, "slow1", slow)
-            over = over + maximum(square(fast) - p.fast_level, 0.0)
-            above = above + maximum(square(slow) - p.slow_level, 0.0)
+            fast0, slow0, over, above = detect(controller, deviation0, get(b, "fast0"), get(b, "slow0"), over, above)
+            fast1, slow1, over, above = detect(controller, deviation1, get(b, "fast1"), get(b, "slow1"), over, above)
+            put(b, "fast0", fast0)
+            put(b, "slow0", slow0)
+            put(b, "fast1", fast1)
+            put(b, "slow1", slow1)
         feedback, reference, rise = get(b, "feedback"), get(b, "r"), get(b, "slope")
-        gain, fading = c.gain * feedback, FORGET * (get(b, "active") - feedback)
+        gain, fading = c.gain * feedback, LEAK * (get(b, "active") - feedback)
         e, v, slope = update_coordinate(e0, v0, found0, shape0 * reference, shape0 * rise, gain, fading, gains)
         put(b, "e0", e)
         put(b, "v0", v)

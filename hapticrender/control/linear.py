@@ -24,10 +24,10 @@ from typing import NamedTuple
 import numpy as np
 
 from hapticrender.control.margins import NARROWEST, SLOWEST, Margins, carrier_grid, margins_of, unstable_poles
+from hapticrender.control.records import LEAK
 from hapticrender.mathx import zoh
 from hapticrender.protocols import Array
 
-FORGET = 50.0  # 1/s: decay of the states of a carrier that is faded out
 LEAST_POLE = 1e-300  # stands for a pole at z = 0, whose logarithm is not finite
 
 
@@ -93,7 +93,7 @@ class ErrorLoop:
     @cached_property
     def _bands(self) -> tuple[Array, Array, Array, Array]:
         """Turn a sample, observer's gain, decay (1/s) and what a sample leaves of the states, each (K,)."""
-        fading = FORGET * (1.0 - self.share)
+        fading = LEAK * (1.0 - self.share)
         turn = np.exp(2j * np.pi * self.frequency / self.plant.rate)
         return turn, self.observer * self.share, fading, 1.0 - fading / self.plant.rate
 

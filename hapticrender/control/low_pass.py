@@ -22,7 +22,7 @@ import math
 from numba import carray
 
 from hapticrender.control.carriers import advance_carriers, update_targets
-from hapticrender.control.kernel import FORGET, analyse_sample, sense_block, update_confidence
+from hapticrender.control.kernel import LEAK, analyse_sample, sense_block, update_confidence
 from hapticrender.control.laws import turn_ahead
 from hapticrender.control.limiter import SATURATED, drive_of
 from hapticrender.control.records import (
@@ -180,7 +180,7 @@ def complex_loops(controller, t, i, envelope):
     reference, weight = p.shape[i] * get(b, "r"), get(b, "weight")
     against = 0.0 if p.deviation > 0.0 else 1.0
     out = loop_controller(controller, x, p.feedback * weight * (against * reference - envelope), -math.inf)
-    keep = 1.0 - FORGET / p.rate * (1.0 - weight)
+    keep = 1.0 - LEAK / p.rate * (1.0 - weight)
     put(x, "law1", keep * get(x, "law1"))
     put(x, "law2", keep * get(x, "law2"))
     v = out + p.forward * reference

@@ -23,6 +23,7 @@ from hapticrender.vectors import W, tile_type
 
 MOST_SENSORS = MOST_CHANNELS = 8
 MOST_TAPS = 16
+LEAK = 50.0  # 1/s: error and integral of a carrier that has faded out decay at this rate
 FIXED, FADING, LOCKED = range(3)  # modes of a tile: nothing changes; its targets do; its carriers follow the finger
 SETPOINT_ROWS = 7  # frequency (Hz), wavenumber (1/m), phase (turns), target (re, im), sensor response (re, im)
 
@@ -36,7 +37,7 @@ TILE_FIELDS = [
     "frequency",  # Hz, the fixed part
     "wavenumber",  # 1/m
     "phase",  # turns
-    *_complex("setpoint", "response"),  # target that is asked for; what the sensor shows per target
+    *_complex("setpoint", "response"),  # target as set; what the sensor shows per target
     "turns",  # fixed part of the phase; of fixed carriers at the next refresh
     *_complex("carrier"),  # e^(j phi) at the sample, or at the block's start without the finger's part
     *_complex("turn"),  # of the carrier a sample
@@ -101,7 +102,7 @@ SETTINGS = np.dtype(
         ("loop", np.float64, (5,)),
         *(
             (name, np.int64)
-            for name in ("coordinates", "block", "group", "sensors", "channels", "n_taps", "window", "table")
+            for name in ("coordinates", "block", "group", "groups", "sensors", "channels", "n_taps", "window", "table")
         ),
     ]
 )
@@ -151,9 +152,9 @@ SAMPLE_ROWS = 16
 
 @kernel
 def samples_of(controller):
-    """Work array of the samples, shape (rows, M)."""
+    """Work array of the samples, shape (rows, groups g); samples beyond M stay zero but for the sums."""
     c = record(controller, CONTROLLER_T, 0)
-    return carray(pointer(c.samples_at, F8), (SAMPLE_ROWS, c.p.block))
+    return carray(pointer(c.samples_at, F8), (SAMPLE_ROWS, c.p.groups * c.p.group))
 
 
 def aligned(shape: int | tuple[int, ...], dtype: type | np.dtype = np.float64) -> Array:

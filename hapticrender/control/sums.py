@@ -35,35 +35,32 @@ from hapticrender.vectors import conj, get, imag, pair, put, real, total, zeros
 
 @kernel
 def turn_pairs(controller, t, q):
-    """Fill the table of a tile for a group, with the finger's mean velocity in it."""
+    """Fill table and phasor of a tile for a group, relative to the block's start, by the finger's mean motion."""
     c = record(controller, CONTROLLER_T, 0)
     b, samples, group = record(c.tiles_at, TILE_T, t), samples_of(controller), c.p.group
     middle, pairs, first = 0.5 * (group - 1), (group + 1) // 2, q * group
-    speed = (samples[POSITION, first + group - 1] - samples[POSITION, first]) / max(group - 1, 1)
+    last = min(first + group, c.p.block) - 1
+    speed = (samples[POSITION, last] - samples[POSITION, first]) / max(last - first, 1)
     speed = speed if abs(speed) * c.p.rate <= FASTEST else 0.0
     turn = get(b, "frequency") / c.p.rate + speed * get(b, "wavenumber")
     for i in range(pairs):
         put(record(c.table_at, PAIR_T, i * c.tiles + t), "z", unit((middle - (pairs - 1 - i)) * turn))
+    place = 0.0
+    for m in range(first, last + 1):
+        place += samples[POSITION, m] / (last + 1 - first)
+    place += speed * (first + middle - 0.5 * (first + last))  # the last group may be filled in part
+    turns = get(b, "frequency") / c.p.rate * (first + middle) + place * get(b, "wavenumber")
+    put(record(c.phasors_at, PAIR_T, q * c.tiles + t), "z", unit(turns))
 
 
 @kernel
 def turn_tables(controller):
-    """Fill table and phasors of the carriers relative to the block's start, with the positions in `samples`."""
+    """Fill the tables where carriers follow the finger or are other ones, the first group last."""
     c = record(controller, CONTROLLER_T, 0)
-    p, samples, group = c.p, samples_of(controller), c.p.group
-    middle = 0.5 * (group - 1)
     for t in range(c.tiles):
-        b = record(c.tiles_at, TILE_T, t)
-        if b.mode[0] != LOCKED and c.stale == 0:
-            continue
-        turn_pairs(controller, t, 0)
-        frequency, wavenumber = get(b, "frequency") / p.rate, get(b, "wavenumber")
-        for q in range(p.block // group):
-            place = 0.0
-            for m in range(q * group, (q + 1) * group):
-                place += samples[POSITION, m] / group
-            turns = frequency * (q * group + middle) + place * wavenumber
-            put(record(c.phasors_at, PAIR_T, q * c.tiles + t), "z", unit(turns))
+        if record(c.tiles_at, TILE_T, t).mode[0] == LOCKED or c.stale > 0:
+            for q in range(c.p.groups - 1, -1, -1):
+                turn_pairs(controller, t, q)
 
 
 @kernel
@@ -72,7 +69,7 @@ def sum_bands(controller, rising):
     c = record(controller, CONTROLLER_T, 0)
     samples, group, block, tiles = samples_of(controller), c.p.group, c.p.block, c.tiles
     middle, pairs = 0.5 * (group - 1), (group + 1) // 2
-    for q in range(block // group):
+    for q in range(c.p.groups):
         share = (q * group + middle + 1.0) / block
         for t in range(tiles):
             if record(c.tiles_at, TILE_T, t).mode[0] == LOCKED:
@@ -109,7 +106,7 @@ def correlate(controller, row):
     c = record(controller, CONTROLLER_T, 0)
     samples, group, tiles = samples_of(controller), c.p.group, c.tiles
     pairs = (group + 1) // 2
-    for start in range(0, c.p.block, group):
+    for start in range(0, c.p.groups * group, group):
         for i in range(pairs):
             early, late = start + pairs - 1 - i, start + group - pairs + i
             twice = 0.5 if early == late else 1.0  # the middle of an odd group
@@ -119,7 +116,7 @@ def correlate(controller, row):
                 samples[FOLDED + 2 * k + 1, start + i] = twice * (other - one)
     for t in range(tiles):
         x0 = x1 = pair(zeros(), zeros())
-        for q in range(c.p.block // group):
+        for q in range(c.p.groups):
             if record(c.tiles_at, TILE_T, t).mode[0] == LOCKED:
                 turn_pairs(controller, t, q)
             even0, odd0, even1, odd1 = zeros(), zeros(), zeros(), zeros()

@@ -119,9 +119,9 @@ class CompiledPlant:
         Row n of the drive is computed from samples before n: the plant queues the rest of the loop's delay.
         """
         waveform = np.ascontiguousarray(waveform, float)  # a name keeps a copy alive while its address is used
-        asked, block = len(waveform), self.block
-        n = -(-asked // block) * block  # whole blocks; what is beyond the end is played and not returned
-        waveform = np.append(waveform, np.zeros(n - asked))
+        length, block = len(waveform), self.block
+        n = -(-length // block) * block  # whole blocks; what is beyond the end is played and not returned
+        waveform = np.append(waveform, np.zeros(n - length))
         signals = self._signals(n)
         drive = np.zeros((n + block, self.drive_channels))
         drive[:block] = self._last
@@ -143,8 +143,8 @@ class CompiledPlant:
         self._last = drive[n:].copy()
         if controller.block > 1:
             target = np.repeat(target, controller.block, axis=0)
-        signals = {name: array[:asked] for name, array in signals.items()}
-        return drive[:asked], target[:asked], signals["flags"], self._sensed(signals)
+        signals = {name: array[:length] for name, array in signals.items()}
+        return drive[:length], target[:length], signals["flags"], self._sensed(signals)
 
 
 def aligned_record(dtype: np.dtype[Any]) -> Array:
