@@ -106,7 +106,7 @@ class Bands:
         if np.shape(values) != np.shape(position) or np.asarray(values).dtype.kind not in "iuf":
             found = f"shape {values.shape}" if isinstance(values, np.ndarray) else type(values).__name__
             raise ValueError(f"{name}.waveform returned {found}: must be {len(position)} numbers, one a sample")
-        away = np.isnan(position) if (self.wavenumber > 0.0).all() else np.zeros(len(position), bool)
+        away = np.isnan(position) if len(self) and (self.wavenumber > 0.0).all() else np.zeros(len(position), bool)
         values = np.where(away, 0.0, np.asarray(values, float))
         bad = np.flatnonzero(~np.isfinite(values))
         if bad.size:

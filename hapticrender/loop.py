@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 
+from hapticrender.control.controller import PositionPredictor
 from hapticrender.driver_checks import check_sensed
 from hapticrender.errors import HapticError, PlateMismatch
 from hapticrender.protocols import Array, Controller, Driver, Exchange, Renderer, Rendering, Sensed
@@ -203,7 +204,8 @@ class _Loop:
         exchange = _exchange(driver, self.controller)
         self._exchange = self._block if exchange is None else exchange
         self.step = driver.block * (max(int(CHUNK * driver.rate / driver.block), 1) if exchange is not None else 1)
-        self._start = 0
+        self._start, self._ahead = 0, int(getattr(self.controller, "lookahead", 0))
+        self._predict = PositionPredictor(driver.rate, self._ahead)
         self._drive = np.zeros((driver.block, driver.drive_channels))
 
     def advance(self, start: int, count: int) -> dict[str, Any]:
@@ -231,7 +233,10 @@ class _Loop:
         return played, target, flags if sensed.flags is None else flags | sensed.flags, sensed
 
     def _reference(self, position: Array) -> Array:
-        return self.rendering.reference(self._time(len(position)), position)
+        if self._ahead == 0 or self.rendering.bands.envelope is not None:
+            return self.rendering.reference(self._time(len(position)), position)
+        time = self._time(len(position)) + self._ahead / self.rendering.driver.rate
+        return self.rendering.reference(time, self._predict(position))
 
     def _time(self, count: int) -> Array:
         return (self._start + np.arange(count)) / self.rendering.driver.rate

@@ -82,7 +82,9 @@ class Bench:
         samples = int(round(seconds * RATE))
         plate = Plate(self.plate, finger or Finger.absent(), seed)
         zero = np.zeros(samples)
-        _, target, _, sensed = plate.closed_loop(self.design(bands), zero if waveform is None else waveform)
+        controller = self.design(bands)
+        ahead = np.append(waveform[controller.lookahead :], zero)[:samples] if waveform is not None else zero
+        _, target, _, sensed = plate.closed_loop(controller, ahead)
         return Run(bands, plate.motion[:, :3], zero if sensed.position is None else sensed.position, target)
 
 

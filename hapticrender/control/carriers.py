@@ -10,7 +10,7 @@ from __future__ import annotations
 from numba import carray
 
 from hapticrender.control.records import CONTROLLER_T, FADING, FIXED, LOCKED, TILE_T, WAVEFORM, W, samples_of
-from hapticrender.jit import C16, SIGNALS_T, kernel, pointer, record
+from hapticrender.jit import C16, SIGNALS_T, entry, kernel, pointer, record
 from hapticrender.mathx import TURN, smooth, unit
 from hapticrender.vectors import (
     get,
@@ -58,6 +58,18 @@ def track_finger(controller, position):
     c.speed += pole * (moved - c.speed)
     c.fresh = FRESH_TIME * c.p.rate if came else max(c.fresh - 1.0, 0.0)
     c.held_position, c.finger_seen = position, 1.0
+
+
+@entry
+def predict_positions(tracker, positions, ahead, predicted):
+    """Extrapolate positions (m, NaN while lifted, where the last prediction holds) by `ahead` samples, causally."""
+    c = record(tracker, CONTROLLER_T, 0)
+    for n in range(len(positions)):
+        track_finger(tracker, positions[n])
+        if c.finger_seen > 0.0:
+            time = ahead / c.p.rate
+            c.held_prediction = c.smooth_position + time * (c.velocity + 0.5 * time * c.acceleration)
+        predicted[n] = c.held_prediction
 
 
 @kernel

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from hapticrender.bands import Bands
-from hapticrender.control.carriers import REFRESH
+from hapticrender.control.carriers import REFRESH, predict_positions
 from hapticrender.control.device_model import DeviceModel
 from hapticrender.control.records import (
     COMMAND,
@@ -92,6 +92,7 @@ class BankController:
             "samples": np.zeros((SAMPLE_ROWS, groups * group)),
         } | (arrays or {})
         self._arrays = memory
+        self.lookahead = 0  # samples by which the waveform handed to `run` is to be ahead
         for name, array in memory.items():
             self.state[f"{name}_at"] = array.ctypes.data
         start: dict[str, float] = {"tiles": tiles, "bands": self.n_bands, "history": history, "stale": 1, "moving": 1}
@@ -184,6 +185,20 @@ class BankController:
         if bands.frequency.max(initial=0.0) > highest:
             raise ValueError(f"carrier of {bands.frequency.max():g} Hz: must be <= {highest:g} Hz")
         return setpoint_rows(bands)
+
+
+class PositionPredictor:
+    """Positions of the finger (m) `ahead` samples from now, extrapolated with the velocity and acceleration observed."""
+
+    def __init__(self, rate: float, ahead: int) -> None:
+        self.ahead, self._tracker = float(ahead), np.zeros(1, CONTROLLER)
+        self._tracker["p"]["rate"], self._tracker["held_prediction"] = rate, math.nan
+
+    def __call__(self, position: Array) -> Array:
+        """Predict from the next positions (n,), NaN while lifted, where the last prediction holds; shape (n,)."""
+        position, predicted = np.ascontiguousarray(position, float), np.empty(len(position))
+        predict_positions(self._tracker.ctypes.data, position, self.ahead, predicted)
+        return predicted
 
 
 def setpoint_rows(bands: Bands) -> Array:

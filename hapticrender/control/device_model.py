@@ -67,7 +67,8 @@ class DeviceModel:
     highest_frequency: float = 1000.0  # Hz, and above this; feedback stays on until its last quarter
     highest_edge: float = 1.25  # times `highest_frequency`, > 1, where they have faded out; low-pass methods use 1.25
     shape: tuple[float, ...] | None = None  # pattern of the target over the coordinates; None: all in the first one
-    finger: FingerRange = FingerRange()  # what a finger can add to D
+    finger: FingerRange = FingerRange()  # what a finger can add to D ...
+    lever_per_metre: float = 0.0  # 1/m: ... at the lever arm of this times its position
     pace: float = 1.0  # > 0: on every rate of a method's rules, meant for carriers from 20 Hz on, but not on its limits
     contact_damping: float = 0.0  # N: part of the first damping that goes as 1/|v|, times v; in `damping` ...
     typical_speed: float = 1.0  # m/s, > 0: ... it is as at this speed of the finger

@@ -29,6 +29,7 @@ from hapticrender.bands import Bands
 from hapticrender.control.controller import BankController, device_settings, ridge_spacing, shared_settings, spacing
 from hapticrender.control.controller_design import FADE_IN, ONE_SPEED, Rules, design_controller, rules_for
 from hapticrender.control.device_model import DeviceModel
+from hapticrender.control.inverse import AdaptiveInverse
 from hapticrender.control.linear import Sampled
 from hapticrender.control.loopshape import (
     Bandwidths,
@@ -246,6 +247,7 @@ _ALL: tuple[Any, ...] = (
     Resonant(),
     ErrorObserver("h", ONE_SPEED),
     ErrorObserver("h2"),
+    AdaptiveInverse(),
 )
 METHODS = {method.name: method for method in _ALL}
 

@@ -207,6 +207,7 @@ class PlateParameters(Validated):
             sensed_noise=self.sensor_noise,
             bending=self.bending,
             rigid=self.bending is None,
+            lever_per_metre=(n - 1) / self.half_spacing,
         )
 
 

@@ -1,0 +1,223 @@
+"""Design of the waveform law: filters, prior knowledge of fingers, and the settings of `inverse_kernel`."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+
+from hapticrender.bands import Bands
+from hapticrender.control.controller import BankController, device_settings, shared_settings
+from hapticrender.control.controller_design import FADE_IN, LEAST_NOISE, PROMPT
+from hapticrender.control.damping import Damping, choose_damping
+from hapticrender.control.device_model import DeviceModel
+from hapticrender.control.inverse_kernel import (
+    FINGER,
+    HEAVE,
+    INITIAL,
+    INVERSE,
+    LOAD,
+    PARAMETERS,
+    REVERSION,
+    RING,
+    ROCKING,
+    TAPS,
+    inverse_step,
+)
+from hapticrender.control.records import MOST_CHANNELS, MOST_TAPS, aligned
+from hapticrender.errors import DesignError
+from hapticrender.mathx import zoh
+from hapticrender.protocols import Array
+
+HIGHEST = 0.2  # of the rate: up to here the derivatives' filters are good to 5e-5
+LOWEST = 1e-3  # Hz: what follows a finger fades out below it, though a resting one may hold its displacement
+SCALE = 2 * math.pi * 200.0  # rad/s: derivatives are divided by its powers, so that every parameter is in N/m
+POLE, POLE_DAMPING = 2 * math.pi * 200.0, 0.8  # the finger's pair of poles
+PEOPLE, SEED = 300, 1  # fingers of the prior, and the seed that draws them
+REVERSION_RATES = {FINGER: 0.1, HEAVE: 0.003, ROCKING: 0.01, LOAD: 1.0}  # 1/sqrt(s), from each parameter on
+SETTLING, JOINING, AWAKE = 2e-3, 62e-3, 0.1  # s after a contact: learning starts, initial motion ends, damper sleeps
+GATE_SIGMAS = 2.0  # of the sensors' noise: a larger deviation within 4 ms opens the inner damper
+INITIAL_MOTION = (15e-6, 0.02)  # m and m/s: deviation and its velocity at a contact
+LOAD_SIZE = (0.6, 0.1)  # N: of the load, and of the moment beside it over a
+
+
+@lru_cache(maxsize=32)
+def derivative_filters(rate: float, top: float) -> Array:
+    """Filters for a signal and its first three derivatives half a sample ahead, the hold undone, shape (4, TAPS).
+
+    Least squares of ``sum_j h_i[j] exp(j w (j - 5) T) = (j w)^i exp(j w T/2)/sinc(w T/2)`` up to `top` (Hz), with a
+    light penalty on what lies above.
+    """
+    offsets, frequency = np.arange(TAPS) - (TAPS // 2 - 1), np.linspace(0.0, top, 400)
+    above = np.linspace(min(1.4 * top, 0.45 * rate), 0.5 * rate, 100)
+    inside, outside = (np.exp(2j * np.pi / rate * np.multiply.outer(each, offsets)) for each in (frequency, above))
+    omega = 2 * np.pi * frequency
+    ahead = np.exp(0.5j * omega / rate) / np.sinc(frequency / rate)
+    found = np.empty((4, TAPS))
+    for i in range(4):
+        weight = np.maximum(omega, 2 * np.pi * 20.0) ** -i
+        rows = np.vstack([inside * weight[:, None], 1e-6 * outside / (2 * np.pi * top) ** i]) * rate**i
+        wanted = np.concatenate([(1j * omega) ** i * ahead * weight, np.zeros(len(above))])
+        found[i] = rate**i * np.linalg.lstsq(np.vstack([rows.real, rows.imag]), np.r_[wanted.real, wanted.imag])[0]
+    return found
+
+
+def people(count: int = PEOPLE, seed: int = SEED) -> tuple[Array, Array]:
+    """Frequencies (Hz, shape (f,)) and dynamic stiffnesses z(j w) of fingers (N/m, shape (count, f)).
+
+    Log-uniform: 1-10 g, 0.3-4 N s/m, 60-900 N/m; three in four behind a skin of 0.1-0.5 g, 0.5-12 N s/m and
+    400-12000 N/m.
+    """
+    random, frequency = np.random.default_rng(seed), np.linspace(20.0, 500.0, 97)
+    s = 2j * np.pi * frequency
+
+    def drawn(low: float, high: float) -> Array:
+        return np.exp(random.uniform(np.log(low), np.log(high), (count, 1)))
+
+    whole = drawn(1e-3, 1e-2) * s**2 + drawn(0.3, 4.0) * s + drawn(60.0, 900.0)
+    mass, skin = drawn(1e-4, 5e-4) * s**2, drawn(0.5, 12.0) * s + drawn(400.0, 12e3)
+    behind = random.uniform(size=(count, 1)) < 0.75
+    return frequency, np.where(behind, mass + skin * whole / (skin + whole), whole)
+
+
+def finger_prior(model: DeviceModel) -> tuple[Array, Array]:
+    """Mean and covariance of the finger's five parameters over `people`, fitted where the free device moves easily."""
+    frequency, stiffness = people()
+    s = 2j * np.pi * frequency
+    low = s**2 + 2 * POLE_DAMPING * POLE * s + POLE**2
+    basis = np.stack([np.ones_like(s), s / SCALE, (s / SCALE) ** 2, POLE**2 / low, POLE * s / low], axis=1)
+    weight = 1.0 / abs(model.dynamic_stiffness(frequency)[:, 0, 0])
+    rows = basis * weight[:, None]
+    wanted = (stiffness * weight).T
+    found = np.linalg.lstsq(np.vstack([rows.real, rows.imag]), np.vstack([wanted.real, wanted.imag]))[0]
+    covariance = np.cov(found)
+    return found.mean(axis=1), covariance + np.diag(0.02 * covariance.diagonal())
+
+
+def prior(model: DeviceModel) -> tuple[Array, Array]:
+    """Mean (PARAMETERS,) and covariance of all parameters: fingers, the device's own errors, and the load."""
+    mean, sigma = np.zeros(PARAMETERS), np.zeros(PARAMETERS)
+    k, m = model.stiffness[0, 0], model.mass[0, 0] * SCALE**2
+    c = max(0.3 * model.damping[0, 0], 0.02 * math.sqrt(model.stiffness[0, 0] * model.mass[0, 0])) * SCALE
+    sigma[HEAVE : HEAVE + 4] = 0.05 * k, c, 0.05 * m, 1.0
+    sigma[LOAD] = LOAD_SIZE[0]
+    if len(model.mass) > 1:
+        k, m, c = model.stiffness[1, 1], model.mass[1, 1] * SCALE**2, c
+        sigma[ROCKING : ROCKING + 3] = 0.03 * k, c, 0.05 * m
+        sigma[LOAD + 1] = LOAD_SIZE[1]
+    covariance = np.diag(sigma**2)
+    mean[FINGER:HEAVE], covariance[FINGER:HEAVE, FINGER:HEAVE] = finger_prior(model)
+    return mean, covariance
+
+
+def pole_step(rate: float) -> Array:
+    """Step over a sample of x'' = u - 2 z w x' - w^2 x with u running linearly; x, x', u now and next, shape (2, 4)."""
+    a = np.array([[0.0, 1.0], [-(POLE**2), -2 * POLE_DAMPING * POLE]])
+    augmented = np.zeros((3, 3))  # x, x', u; the input is the slope of u
+    augmented[:2, :2], augmented[1, 2] = a, 1.0
+    phi, gamma = zoh(augmented, np.array([[0.0], [0.0], [1.0]]), 1.0 / rate)
+    rise = rate * gamma[:2, 0]
+    return np.column_stack([phi[:2, :2], phi[:2, 2] - rise, rise])
+
+
+@dataclass(frozen=True)
+class AdaptiveInverse:
+    """The waveform law: exact inverse dynamics of the reference, adapted by a Kalman filter, and a damper at contacts."""
+
+    name: str = "inverse"
+
+    def design(self, model: DeviceModel, bands: Bands, *, feedback: bool = True) -> BankController:
+        """Design the law for a device of 1 or 2 coordinates with mass; a `DesignError` where it has none."""
+        if not (model.mass.diagonal() > 0.0).all():
+            raise DesignError(f"method {self.name!r} needs a device with mass in every coordinate: use 'h2'")
+        prompt = model.delay <= PROMPT
+        damping = choose_damping(model, bending=model.bending) if feedback and prompt else None
+        if damping is not None and not damping.margins:
+            damping = None
+        settings = controller_settings(model, bands, damping, feedback)
+        state = aligned(1, INVERSE)
+        ahead = model.delay + TAPS // 2
+        rings = {"ring": np.zeros((model.delay + 1, RING)), "reference": np.zeros(ahead)}
+        for name, value in law_settings(model, bands, ahead, feedback).items():
+            state[name] = value
+        for name, array in rings.items():
+            state[f"{name}_at"] = array.ctypes.data
+        note = damping.text() if damping else "inner damper off"
+        controller = BankController(self.name, inverse_step, settings, bands, note=note, arrays={"loops": state})
+        controller.rings, controller.lookahead = rings, ahead
+        return controller
+
+
+def controller_settings(model: DeviceModel, bands: Bands, damping: Damping | None, feedback: bool) -> dict[str, Any]:
+    """Settings that the waveform law shares with the others."""
+    period, taps = 1.0 / model.rate, damping.taps if damping else np.zeros((len(model.mass), 1))
+    sensor_map, drive_map = model.coordinate_from_sensed, np.linalg.pinv(model.force_from_drive)
+    return {
+        **shared_settings(model, bands, sensor_map, drive_map, feedback),
+        **device_settings(model),
+        "fade_in": period / FADE_IN,
+        "highest_edge": model.highest_edge,
+        "lowest": LOWEST,
+        "drive_step": model.drive_step,
+        "n_taps": taps.shape[1],
+        "taps": np.pad(taps, ((0, 2 - len(taps)), (0, MOST_TAPS - taps.shape[1]))),
+        "damper_high": 1.0 if damping else 0.0,
+        "release": period / 0.05,
+    }
+
+
+def law_settings(model: DeviceModel, bands: Bands, ahead: int, feedback: bool) -> dict[str, Any]:
+    """Fields of `INVERSE`."""
+    period, n = 1.0 / model.rate, len(model.mass)
+    mean, spread = prior(model)
+    noise = np.sqrt((model.coordinate_from_sensed**2).sum(axis=1))
+    noise = np.resize(noise, 2) * max(model.sensed_noise, LEAST_NOISE * model.sensed_limit)
+    kept = np.ones(PARAMETERS)
+    for first, rate in REVERSION_RATES.items():
+        kept[first:INITIAL] = 1.0 - 0.5 * rate**2 * REVERSION * period
+    matrices = {}
+    for name in ("mass", "damping", "stiffness"):
+        matrices[name] = np.eye(2)
+        matrices[name][:n, :n] = getattr(model, name)
+    top = min(model.highest_frequency, HIGHEST * model.rate)
+    return {
+        "delay": model.delay,
+        "ahead": ahead,
+        "spatial": (bands.wavenumber > 0.0).any() if len(bands) else getattr(bands, "spatial", False),
+        "learns": feedback,
+        "lever_per_metre": model.lever_per_metre,
+        "hertz_scale": SCALE,
+        "pole": POLE,
+        "pole_damping": POLE_DAMPING,
+        "fade_step": period / FADE_IN,
+        "settling": round(SETTLING * model.rate),
+        "joining": round(JOINING * model.rate),
+        "awake": round(AWAKE * model.rate),
+        "level": (GATE_SIGMAS * noise[0]) ** 2,
+        "high_pass": -math.expm1(-2 * math.pi * 20.0 * period),
+        "mean_square": -math.expm1(-period / 4e-3),
+        "hold": round(0.05 * model.rate),
+        "decay": math.exp(-period / 0.02),
+        "smoothing": period / 2e-3,
+        "levelling": period / 50e-3 if n > 1 else 0.0,
+        "filters": derivative_filters(float(model.rate), float(top)),
+        "pair": pole_step(model.rate),
+        "force_from_drive": np.pad(
+            model.force_from_drive, ((0, 2 - n), (0, MOST_CHANNELS - model.force_from_drive.shape[1]))
+        ),
+        **matrices,
+        "noise": 5.0 * noise**2,
+        "prior": mean,
+        "spread": spread,
+        "covariance": spread,
+        "theta": mean,
+        "kept": kept,
+        "start": np.repeat(INITIAL_MOTION, 2) ** 2,
+        "scale": 1.0,
+        "smooth_scale": 1.0,
+        "since": 1e9,
+        "fade": 0.0,
+    }

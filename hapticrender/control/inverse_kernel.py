@@ -1,0 +1,448 @@
+"""The waveform law's step: exact inverse dynamics of the reference, and a Kalman filter that learns what they lack.
+
+With the reference r = s r(t) (s the pattern over the coordinates) the believed device takes the force
+F_nom = M r'' + C r' + K r.  The true one moves by r + e (docs/theory.md)::
+
+    (D + dD + z h h^T) e = F_dev - (dD + z h h^T) r - F_load,       F_dev = F_played - F_nom
+
+Everything that is not known is linear in parameters th_i: the finger z on r, r', r'' and on r through one pair of poles,
+the device's errors dD of stiffness, damping, mass and delay, and the finger's load.  So with G the loaded device,
+
+    e = w - sum_i th_i psi_i + noise,       psi_i = G [s_i phi_i],   w = G [F_dev]
+
+holds whatever was played, and a Kalman filter finds th; no stability limit follows from how fast it learns.  What it
+finds is played ahead, F = F_nom + sum_i th_i s_i phi_i, with the inner damper on e for a while after a contact.
+The delay d is that of samples: a block of M samples is the same law with a longer delay.
+"""
+
+from __future__ import annotations
+
+import numba
+import numpy as np
+from numba import carray
+
+from hapticrender.control.carriers import advance_carriers, track_finger, update_targets
+from hapticrender.control.kernel import sense_block, update_confidence
+from hapticrender.control.limiter import SATURATED, drive_of, shape_noise
+from hapticrender.control.records import (
+    CONTROLLER_T,
+    LOCKED,
+    MOST_CHANNELS,
+    TILE_T,
+    WAVEFORM,
+    Y,
+    samples_of,
+)
+from hapticrender.jit import F8, I8, SIGNALS_T, kernel, pointer, record, step
+from hapticrender.mathx import TURN, unit
+from hapticrender.vectors import get, put, real, total, zeros
+
+TAPS = 12  # of the derivatives' filters, 6 of them ahead
+BASIS = 6  # r, r'/w_n, r''/w_n^2, r through the pair of poles and its derivative/w_p, D_00 r' T
+FINGER, HEAVE, ROCKING, LOAD, INITIAL, PARAMETERS = 0, 5, 9, 12, 14, 18  # first parameter of each set, and their number
+ROWS = PARAMETERS + 1  # regressors psi_i, and w
+REFRESH = 25  # samples between two discretisations of the loaded device
+REVERSION = 20  # samples between two steps of the parameters' reversion to their mean
+
+INVERSE = np.dtype(
+    [
+        # settings
+        *((name, np.int64) for name in ("delay", "ahead", "spatial", "learns")),
+        *((name, np.float64) for name in ("lever_per_metre", "hertz_scale", "pole", "pole_damping", "fade_step")),
+        *((name, np.float64) for name in ("settling", "joining", "awake", "level", "high_pass", "mean_square")),
+        *((name, np.float64) for name in ("hold", "decay", "smoothing", "levelling")),
+        ("filters", np.float64, (4, TAPS)),
+        ("pair", np.float64, (2, 4)),  # step of the pair of poles: two states, r now and next
+        ("force_from_drive", np.float64, (2, MOST_CHANNELS)),
+        *((name, np.float64, (2, 2)) for name in ("mass", "damping", "stiffness")),
+        ("noise", np.float64, (2,)),
+        ("prior", np.float64, (PARAMETERS,)),
+        ("spread", np.float64, (PARAMETERS, PARAMETERS)),
+        ("kept", np.float64, (PARAMETERS,)),
+        ("start", np.float64, (4,)),
+        # state
+        *(
+            (name, np.float64)
+            for name in ("fade", "peak", "held", "scale", "smooth_scale", "lever", "contact", "since", "gate")
+        ),
+        *((name, np.float64) for name in ("slow", "power", "reference", "moment")),
+        *((name, np.int64) for name in ("sample", "ring_at", "reference_at")),
+        ("window", np.float64, (TAPS,)),  # references, the oldest first
+        ("poles", np.float64, (2,)),
+        ("basis", np.float64, (BASIS,)),
+        ("theta", np.float64, (PARAMETERS,)),
+        ("covariance", np.float64, (PARAMETERS, PARAMETERS)),
+        ("states", np.float64, (4, ROWS)),
+        ("inputs", np.float64, (2, ROWS)),
+        ("transition", np.float64, (4, 4)),
+        ("input", np.float64, (4, 2)),
+    ]
+)
+"""Settings and state of the waveform law beside those of the controller."""
+INVERSE_T = numba.from_dtype(INVERSE)
+SCALED = 0.999  # a reference scaled by less is saturated
+RING = BASIS + 2  # of a sample: basis and deviation force, until they act
+
+
+@kernel
+def bands_ahead(controller, lead):
+    """Sum of the bands' targets `lead` seconds from now."""
+    c = record(controller, CONTROLLER_T, 0)
+    found = zeros()
+    for t in range(c.tiles):
+        b = record(c.tiles_at, TILE_T, t)
+        if (b.mode[0] == LOCKED and c.finger_seen > 0.0) or c.stale > 0:  # a lifted finger keeps its turn
+            put(b, "ahead", unit((lead / TURN) * (get(b, "omega") + (0.5 * lead) * get(b, "sweep"))))
+        found = found + real(get(b, "target") * get(b, "ahead") * get(b, "carrier"))
+    c.stale = 0
+    return total(found)
+
+
+@kernel
+def take_reference(controller, inverse):
+    """Put the reference `ahead` samples from now into the window; note that of now, which the sensors should show."""
+    c, v = record(controller, CONTROLLER_T, 0), record(inverse, INVERSE_T, 0)
+    if c.p.analysed > 0.0:
+        value = samples_of(controller)[WAVEFORM, 0]
+        wanted = 1.0 if v.spatial == 0 or c.finger_seen > 0.0 else 0.0
+        v.fade = min(max(v.fade + (v.fade_step if wanted > 0.0 else -v.fade_step), 0.0), 1.0)
+        value *= v.fade * v.fade * (3.0 - 2.0 * v.fade)
+    else:
+        value = bands_ahead(controller, v.ahead / c.p.rate)
+    value *= v.smooth_scale
+    window, ring = v.window, carray(pointer(v.reference_at, F8), v.ahead)
+    for i in range(TAPS - 1):
+        window[i] = window[i + 1]
+    window[TAPS - 1] = value
+    at = v.sample % v.ahead
+    v.reference, ring[at] = ring[at], value
+
+
+@kernel
+def find_basis(controller, inverse):
+    """Basis of the forces at the moment at which this sample's drive acts: derivatives of r by the filters."""
+    v = record(inverse, INVERSE_T, 0)
+    window, filters, basis, poles, pair = v.window, v.filters, v.basis, v.poles, v.pair
+    d0 = d1 = d2 = d3 = 0.0
+    for i in range(TAPS):
+        d0 += filters[0, i] * window[i]
+        d1 += filters[1, i] * window[i]
+        d2 += filters[2, i] * window[i]
+        d3 += filters[3, i] * window[i]
+    last = basis[0]
+    first = pair[0, 0] * poles[0] + pair[0, 1] * poles[1] + pair[0, 2] * last + pair[0, 3] * d0
+    poles[1] = pair[1, 0] * poles[0] + pair[1, 1] * poles[1] + pair[1, 2] * last + pair[1, 3] * d0
+    poles[0] = first
+    w = v.hertz_scale
+    basis[0], basis[1], basis[2] = d0, d1 / w, d2 / (w * w)
+    basis[3], basis[4] = v.pole * v.pole * first, v.pole * poles[1]
+    m, c, k = v.mass[0, 0], v.damping[0, 0], v.stiffness[0, 0]
+    basis[5] = (m * d3 + c * d2 + k * d1) / record(controller, CONTROLLER_T, 0).p.rate
+    return d1, d2
+
+
+@kernel
+def discretise(controller, inverse):
+    """Exact step of the loaded device over a sample, from a series of ten terms; states are coordinates, velocities.
+
+    The finger counts by its mass and damping at 180 Hz, the device with what was learned of its heave.
+    """
+    v = record(inverse, INVERSE_T, 0)
+    theta, w, period = v.theta, TURN * 180.0, 1.0 / record(controller, CONTROLLER_T, 0).p.rate
+    turn, pole = w / v.hertz_scale, v.pole
+    low = complex(pole * pole - w * w, 2.0 * v.pole_damping * pole * w)
+    z = complex(theta[0] - theta[2] * turn * turn, theta[1] * turn)
+    z += (theta[3] * pole * pole + complex(0.0, theta[4] * pole * w)) / low
+    mass = min(max(-z.real / (w * w), -2e-3), 10e-3) * v.contact
+    damping = min(max(z.imag / w, 0.0), 12.0) * v.contact
+    s, h = v.hertz_scale, v.lever
+    m00 = v.mass[0, 0] + mass + theta[HEAVE + 2] / (s * s)
+    m01, m11 = v.mass[0, 1] + h * mass, v.mass[1, 1] + h * h * mass + theta[ROCKING + 2] / (s * s)
+    c00 = v.damping[0, 0] + damping + max(theta[HEAVE + 1] / s, -0.5 * v.damping[0, 0])
+    c01 = v.damping[0, 1] + h * damping
+    c11 = v.damping[1, 1] + h * h * damping + max(theta[ROCKING + 1] / s, -0.5 * v.damping[1, 1])
+    k00, k01 = v.stiffness[0, 0] + theta[HEAVE], v.stiffness[0, 1]
+    k11 = v.stiffness[1, 1] + theta[ROCKING]
+    scale = period / (m00 * m11 - m01 * m01)
+    i00, i01, i11 = scale * m11, -scale * m01, scale * m00
+    phi, gamma = v.transition, v.input
+    # columns of [Phi, Gamma]: powers of A T applied to unit vectors, divided by factorials
+    for column in range(6):
+        x0, x1, x2, x3 = 0.0, 0.0, 0.0, 0.0
+        if column == 0:
+            x0 = 1.0
+        elif column == 1:
+            x1 = 1.0
+        elif column == 2:
+            x2 = 1.0
+        elif column == 3:
+            x3 = 1.0
+        elif column == 4:
+            x2, x3 = i00, i01
+        else:
+            x2, x3 = i01, i11
+        s0, s1, s2, s3 = x0, x1, x2, x3
+        first = 1.0 if column < 4 else 2.0
+        for term in range(10):
+            f0 = -(k00 * x0 + k01 * x1 + c00 * x2 + c01 * x3)
+            f1 = -(k01 * x0 + k11 * x1 + c01 * x2 + c11 * x3)
+            over = 1.0 / (term + first)
+            x0, x1 = over * period * x2, over * period * x3
+            x2, x3 = over * (i00 * f0 + i01 * f1), over * (i01 * f0 + i11 * f1)
+            s0, s1, s2, s3 = s0 + x0, s1 + x1, s2 + x2, s3 + x3
+        if column < 4:
+            phi[0, column], phi[1, column], phi[2, column], phi[3, column] = s0, s1, s2, s3
+        else:
+            gamma[0, column - 4], gamma[1, column - 4] = s0, s1
+            gamma[2, column - 4], gamma[3, column - 4] = s2, s3
+
+
+@kernel
+def forget(inverse, first, last):
+    """Set parameters back to their prior; nothing else is known of them."""
+    v = record(inverse, INVERSE_T, 0)
+    theta, covariance, spread, states = v.theta, v.covariance, v.spread, v.states
+    for i in range(first, last):
+        theta[i] = v.prior[i]
+        for j in range(PARAMETERS):
+            inside = first <= j < last
+            covariance[i, j] = spread[i, j] if inside else 0.0
+            covariance[j, i] = covariance[i, j]
+        for k in range(4):
+            states[k, i] = 0.0
+
+
+@kernel
+def follow_contact(controller, inverse):
+    """Reset what belongs to a contact when one begins or ends; its initial motion joins the parameters for a while."""
+    c, v = record(controller, CONTROLLER_T, 0), record(inverse, INVERSE_T, 0)
+    states = v.states
+    if c.finger_seen > 0.0:
+        v.lever = v.lever_per_metre * c.held_position
+    v.since += 1.0
+    if c.finger_seen != v.contact:
+        v.contact, v.since = c.finger_seen, 0.0
+        forget(inverse, FINGER, HEAVE)
+        forget(inverse, LOAD, PARAMETERS)
+        c.fast_timer = v.awake
+        discretise(controller, inverse)
+    elif v.since == v.settling:
+        for i in range(ROWS):
+            for k in range(4):
+                states[k, i] = 0.0
+        for k in range(4):
+            states[k, INITIAL + k] = 1.0
+            v.covariance[INITIAL + k, INITIAL + k] = v.start[k]
+    elif v.since == v.joining:
+        forget(inverse, INITIAL, PARAMETERS)
+    return v.since >= v.settling
+
+
+@kernel
+def learn(inverse, coordinate, error):
+    """Update the parameters by a sensed deviation from the reference: a scalar step of the Kalman filter."""
+    v = record(inverse, INVERSE_T, 0)
+    states, theta, covariance, gain = v.states, v.theta, v.covariance, v.inputs
+    innovation, scatter = error - states[coordinate, PARAMETERS], v.noise[coordinate]
+    for i in range(PARAMETERS):
+        innovation += states[coordinate, i] * theta[i]
+    for i in range(PARAMETERS):
+        found = 0.0
+        for j in range(PARAMETERS):
+            found += covariance[i, j] * states[coordinate, j]
+        gain[0, i] = found
+        scatter += found * states[coordinate, i]
+    for i in range(PARAMETERS):
+        share = gain[0, i] / scatter
+        theta[i] -= share * innovation
+        for j in range(PARAMETERS):
+            covariance[i, j] -= share * gain[0, j]
+
+
+@kernel
+def revert(inverse):
+    """Let the parameters return to their mean, and their covariance to its prior."""
+    v = record(inverse, INVERSE_T, 0)
+    kept, theta, covariance, spread = v.kept, v.theta, v.covariance, v.spread
+    for i in range(PARAMETERS):
+        theta[i] = v.prior[i] + kept[i] * (theta[i] - v.prior[i])
+        for j in range(PARAMETERS):
+            share = kept[i] * kept[j]
+            covariance[i, j] = share * covariance[i, j] + (1.0 - share) * spread[i, j]
+
+
+@kernel
+def open_gate(controller, inverse, deviation):
+    """Gain of the inner damper: open after a contact, and while the deviation is more than noise."""
+    c, v = record(controller, CONTROLLER_T, 0), record(inverse, INVERSE_T, 0)
+    v.slow += v.high_pass * (deviation - v.slow)
+    above = deviation - v.slow
+    v.power += v.mean_square * (above * above - v.power)
+    if v.power > v.level:
+        c.fast_timer = max(c.fast_timer, 1.0)
+    c.fast_open = 1.0 if c.fast_timer > 0.0 else max(c.fast_open - c.p.release, 0.0)
+    c.fast_timer -= 1.0
+    c.damping_gain = c.p.damper + c.fast_open * (c.p.damper_high - c.p.damper)
+
+
+@kernel
+def damp(controller, coordinate, deviation):
+    """Force of the inner damper, F = -sum taps eps[n - j]; `past` is a ring of 16 deviations."""
+    c = record(controller, CONTROLLER_T, 0)
+    now, force = c.sample & 15, 0.0
+    c.past[coordinate, now] = deviation
+    if c.damping_gain > 0.0:
+        for j in range(c.p.n_taps):
+            force -= c.p.taps[coordinate, j] * c.past[coordinate, (now - j) & 15]
+    return c.damping_gain * force
+
+
+@kernel
+def advance_regressors(controller, inverse):
+    """Advance the regressors by a sample, under the basis and the deviation force that act in it."""
+    c, v = record(controller, CONTROLLER_T, 0), record(inverse, INVERSE_T, 0)
+    states, inputs, phi, gamma = v.states, v.inputs, v.transition, v.input
+    ring = carray(pointer(v.ring_at, F8), (v.delay + 1, RING))
+    at = (v.sample + 1) % (v.delay + 1)  # what was computed `delay` samples ago
+    touched, along = v.contact, v.contact * (c.p.shape[0] + v.lever * c.p.shape[1])
+    for i in range(ROWS):
+        inputs[0, i] = inputs[1, i] = 0.0
+    for i in range(5):
+        inputs[0, FINGER + i] = along * ring[at, i]
+        inputs[1, FINGER + i] = along * v.lever * ring[at, i]
+    for i in range(3):
+        inputs[0, HEAVE + i] = c.p.shape[0] * ring[at, i]
+        inputs[1, ROCKING + i] = ring[at, i]
+    inputs[0, HEAVE + 3] = c.p.shape[0] * ring[at, 5]
+    inputs[0, LOAD], inputs[1, LOAD] = 1.0, touched * v.lever
+    inputs[1, LOAD + 1] = 1.0
+    inputs[0, PARAMETERS], inputs[1, PARAMETERS] = ring[at, BASIS], ring[at, BASIS + 1]
+    p00, p01, p02, p03 = phi[0, 0], phi[0, 1], phi[0, 2], phi[0, 3]
+    p10, p11, p12, p13 = phi[1, 0], phi[1, 1], phi[1, 2], phi[1, 3]
+    p20, p21, p22, p23 = phi[2, 0], phi[2, 1], phi[2, 2], phi[2, 3]
+    p30, p31, p32, p33 = phi[3, 0], phi[3, 1], phi[3, 2], phi[3, 3]
+    g00, g01, g10, g11 = gamma[0, 0], gamma[0, 1], gamma[1, 0], gamma[1, 1]
+    g20, g21, g30, g31 = gamma[2, 0], gamma[2, 1], gamma[3, 0], gamma[3, 1]
+    for i in range(ROWS):
+        x0, x1, x2, x3, u0, u1 = states[0, i], states[1, i], states[2, i], states[3, i], inputs[0, i], inputs[1, i]
+        states[0, i] = p00 * x0 + p01 * x1 + p02 * x2 + p03 * x3 + g00 * u0 + g01 * u1
+        states[1, i] = p10 * x0 + p11 * x1 + p12 * x2 + p13 * x3 + g10 * u0 + g11 * u1
+        states[2, i] = p20 * x0 + p21 * x1 + p22 * x2 + p23 * x3 + g20 * u0 + g21 * u1
+        states[3, i] = p30 * x0 + p31 * x1 + p32 * x2 + p33 * x3 + g30 * u0 + g31 * u1
+
+
+@kernel
+def learned_force(controller, inverse, coordinate):
+    """What was learned of finger and device, as the force that it takes in a coordinate."""
+    c, v = record(controller, CONTROLLER_T, 0), record(inverse, INVERSE_T, 0)
+    theta, basis = v.theta, v.basis
+    finger = 0.0
+    for i in range(5):
+        finger += theta[FINGER + i] * basis[i]
+    finger *= v.contact * (c.p.shape[0] + v.lever * c.p.shape[1])
+    if coordinate == 0:
+        own = theta[HEAVE] * basis[0] + theta[HEAVE + 1] * basis[1] + theta[HEAVE + 2] * basis[2]
+        return finger + c.p.shape[0] * (own + theta[HEAVE + 3] * basis[5])
+    own = theta[ROCKING] * basis[0] + theta[ROCKING + 1] * basis[1] + theta[ROCKING + 2] * basis[2]
+    return v.lever * finger + own
+
+
+@kernel
+def level(inverse):
+    """Rocking force that slowly levels the device under the load: a moving finger would else tilt it to and fro."""
+    v = record(inverse, INVERSE_T, 0)
+    wanted = v.contact * (v.lever * v.theta[LOAD] + v.theta[LOAD + 1])
+    v.moment += v.levelling * (wanted - v.moment)
+    return v.moment
+
+
+@kernel
+def scale_reference(inverse, needed):
+    """Scale the reference so that the drive stays within its limit; `needed` is that of the whole reference, over it.
+
+    The largest need is held for a while and then falls; two poles smooth the scale, so that it makes no edges.
+    """
+    v = record(inverse, INVERSE_T, 0)
+    v.held -= 1.0
+    if needed >= 0.98 * v.peak:
+        v.peak, v.held = max(v.peak, needed), v.hold
+    elif v.held < 0.0:
+        v.peak *= v.decay
+    v.scale += v.smoothing * (1.0 / max(v.peak, 1.0) - v.scale)
+    v.smooth_scale += v.smoothing * (v.scale - v.smooth_scale)
+
+
+@kernel
+def play(controller, inverse, drive, flags, n, nominal0, nominal1):
+    """Write the drive of a sample; what of it is not the nominal force goes into the ring with the basis."""
+    c, v = record(controller, CONTROLLER_T, 0), record(inverse, INVERSE_T, 0)
+    samples, limit, basis = samples_of(controller), c.p.drive_limit, v.basis
+    ring = carray(pointer(v.ring_at, F8), (v.delay + 1, RING))
+    at = v.sample % (v.delay + 1)
+    played0 = played1 = most = 0.0
+    for i in range(c.p.channels):
+        exact = c.confidence * drive_of(controller, samples, Y, 0, i)
+        most = max(most, abs(exact) / limit)
+        if c.confidence == 0.0:
+            c.shaper[0, i] = c.shaper[1, i] = exact = 0.0
+        elif c.p.drive_step > 0.0:
+            exact = shape_noise(controller, exact, i)
+        value = min(max(exact, -limit), limit)
+        drive[n, i] = value
+        played0 += v.force_from_drive[0, i] * value
+        played1 += v.force_from_drive[1, i] * value
+    if most > 1.0 or v.smooth_scale < SCALED:
+        flags[n] |= SATURATED
+    scale_reference(inverse, most / v.smooth_scale)
+    for i in range(BASIS):
+        ring[at, i] = basis[i]
+    ring[at, BASIS], ring[at, BASIS + 1] = played0 - nominal0, played1 - nominal1
+
+
+@step
+def inverse_step(state, signals, start, count):
+    """Advance the waveform law by `count` samples; see `hapticrender.jit`."""
+    c, io = record(state, CONTROLLER_T, 0), record(signals, SIGNALS_T, 0)
+    inverse, samples, stop = c.loops_at, samples_of(state), start + count
+    v = record(inverse, INVERSE_T, 0)
+    drive, flags = carray(pointer(io.drive, F8), (stop, c.p.channels)), carray(pointer(io.flags, I8), stop)
+    position = carray(pointer(io.position, F8), stop)
+    for n in range(start, stop):
+        implausible = sense_block(state, signals, n)
+        if c.moving == 0:
+            track_finger(state, position[n])
+        y0, y1 = samples[Y, 0], samples[Y + 1, 0]
+        if c.bands > 0:
+            advance_carriers(state)
+            update_targets(state, signals, n)
+        else:
+            c.sample += 1
+        take_reference(state, inverse)
+        settled = follow_contact(state, inverse)
+        error0, error1 = y0 - c.p.shape[0] * v.reference, y1 - c.p.shape[1] * v.reference
+        force0 = force1 = 0.0
+        if update_confidence(state, implausible):
+            forget(inverse, 0, PARAMETERS)
+        elif implausible == 0 and v.learns > 0:
+            if settled:
+                learn(inverse, 0, error0)
+                if c.p.coordinates > 1:
+                    learn(inverse, 1, error1)
+            open_gate(state, inverse, error0)
+            force0, force1 = damp(state, 0, error0), damp(state, 1, error1)
+        if v.sample % REVERSION == 0:
+            revert(inverse)
+        if v.sample % REFRESH == 0:
+            discretise(state, inverse)
+        d1, d2 = find_basis(state, inverse)
+        s0, s1, d0 = c.p.shape[0], c.p.shape[1], v.basis[0]
+        along = v.stiffness[0, 0] * d0 + v.damping[0, 0] * d1 + v.mass[0, 0] * d2
+        across = v.stiffness[0, 1] * d0 + v.damping[0, 1] * d1 + v.mass[0, 1] * d2
+        other = v.stiffness[1, 1] * d0 + v.damping[1, 1] * d1 + v.mass[1, 1] * d2
+        nominal0, nominal1 = s0 * along + s1 * across, s0 * across + s1 * other
+        samples[Y, 0] = nominal0 + learned_force(state, inverse, 0) + force0
+        samples[Y + 1, 0] = nominal1 + learned_force(state, inverse, 1) + force1 + level(inverse)
+        play(state, inverse, drive, flags, n, nominal0, nominal1)
+        advance_regressors(state, inverse)
+        v.sample += 1
+    return 0
