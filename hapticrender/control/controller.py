@@ -52,6 +52,8 @@ class BankController:
         What the design chose and why.
     arrays : dict, optional
         Further arrays of the step by the name of their address.
+    lookahead : int
+        Samples by which the waveform handed to `run` is to be ahead.
     """
 
     def __init__(
@@ -64,7 +66,9 @@ class BankController:
         history: int = 1,
         note: str = "",
         arrays: dict[str, Array] | None = None,
+        lookahead: int = 0,
     ) -> None:
+        self.lookahead = lookahead
         self.method, self.step, self.bands, self.note = method, step, bands, note
         self.n_bands = len(bands)
         self.block = int(settings["block"])  # samples that `step` takes at once; `run` takes any multiple
@@ -92,9 +96,9 @@ class BankController:
             "samples": np.zeros((SAMPLE_ROWS, groups * group)),
         } | (arrays or {})
         self._arrays = memory
-        self.lookahead = 0  # samples by which the waveform handed to `run` is to be ahead
         for name, array in memory.items():
-            self.state[f"{name}_at"] = array.ctypes.data
+            if f"{name}_at" in CONTROLLER.names:
+                self.state[f"{name}_at"] = array.ctypes.data
         start: dict[str, float] = {"tiles": tiles, "bands": self.n_bands, "history": history, "stale": 1, "moving": 1}
         start |= {"scale": 1.0, "confidence": 1.0, "unlocked": 1.0, "response_gain": math.nan}
         for name, number in start.items():
@@ -188,7 +192,7 @@ class BankController:
 
 
 class PositionPredictor:
-    """Positions of the finger (m) `ahead` samples from now, extrapolated with the velocity and acceleration observed."""
+    """Positions of the finger (m) `ahead` samples from now, by the velocity and acceleration observed."""
 
     def __init__(self, rate: float, ahead: int) -> None:
         self.ahead, self._tracker = float(ahead), np.zeros(1, CONTROLLER)

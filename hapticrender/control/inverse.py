@@ -11,7 +11,7 @@ import numpy as np
 
 from hapticrender.bands import Bands
 from hapticrender.control.controller import BankController, device_settings, shared_settings
-from hapticrender.control.controller_design import FADE_IN, LEAST_NOISE, PROMPT
+from hapticrender.control.controller_design import FADE_IN, LEAST_NOISE, PROMPT, design_controller, rules_for
 from hapticrender.control.damping import Damping, choose_damping
 from hapticrender.control.device_model import DeviceModel
 from hapticrender.control.inverse_kernel import (
@@ -28,7 +28,6 @@ from hapticrender.control.inverse_kernel import (
     inverse_step,
 )
 from hapticrender.control.records import MOST_CHANNELS, MOST_TAPS, aligned
-from hapticrender.errors import DesignError
 from hapticrender.mathx import zoh
 from hapticrender.protocols import Array
 
@@ -125,14 +124,18 @@ def pole_step(rate: float) -> Array:
 
 @dataclass(frozen=True)
 class AdaptiveInverse:
-    """The waveform law: exact inverse dynamics of the reference, adapted by a Kalman filter, and a damper at contacts."""
+    """The default method: exact inverse dynamics of the waveform, adapted by a Kalman filter; a damper at contacts."""
 
     name: str = "inverse"
 
     def design(self, model: DeviceModel, bands: Bands, *, feedback: bool = True) -> BankController:
-        """Design the law for a device of 1 or 2 coordinates with mass; a `DesignError` where it has none."""
-        if not (model.mass.diagonal() > 0.0).all():
-            raise DesignError(f"method {self.name!r} needs a device with mass in every coordinate: use 'h2'")
+        """Design the law for a device of 1 or 2 coordinates.
+
+        Where the device itself is estimated (friction, a resonance), and for a recording on chosen carriers, the law
+        works by bands; see `design_controller`.
+        """
+        if model.finger.contact is None or (bands.envelope is None and len(bands)):
+            return design_controller(self.name, model, bands, rules_for(bands), feedback=feedback)
         prompt = model.delay <= PROMPT
         damping = choose_damping(model, bending=model.bending) if feedback and prompt else None
         if damping is not None and not damping.margins:
@@ -146,9 +149,8 @@ class AdaptiveInverse:
         for name, array in rings.items():
             state[f"{name}_at"] = array.ctypes.data
         note = damping.text() if damping else "inner damper off"
-        controller = BankController(self.name, inverse_step, settings, bands, note=note, arrays={"loops": state})
-        controller.rings, controller.lookahead = rings, ahead
-        return controller
+        memory = {"loops": state, **rings}
+        return BankController(self.name, inverse_step, settings, bands, note=note, arrays=memory, lookahead=ahead)
 
 
 def controller_settings(model: DeviceModel, bands: Bands, damping: Damping | None, feedback: bool) -> dict[str, Any]:

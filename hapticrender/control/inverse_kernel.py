@@ -5,8 +5,8 @@ F_nom = M r'' + C r' + K r.  The true one moves by r + e (docs/theory.md)::
 
     (D + dD + z h h^T) e = F_dev - (dD + z h h^T) r - F_load,       F_dev = F_played - F_nom
 
-Everything that is not known is linear in parameters th_i: the finger z on r, r', r'' and on r through one pair of poles,
-the device's errors dD of stiffness, damping, mass and delay, and the finger's load.  So with G the loaded device,
+Everything that is not known is linear in parameters th_i: the finger z on r, r', r'' and on r through one pair of
+poles, the device's errors dD of stiffness, damping, mass and delay, and the finger's load.  With G the loaded device,
 
     e = w - sum_i th_i psi_i + noise,       psi_i = G [s_i phi_i],   w = G [F_dev]
 
