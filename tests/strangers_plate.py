@@ -129,7 +129,7 @@ class StrangersPlate:
         self._finger = tuple(float(each) for each in (*finger, 0, 0, 0)[:6])
         self._touch = [self._course(each) for each in (position, load, contact)]
         self._lag, self._substeps = round(report_lag * rate), substeps or (6 if rate < 20e3 else 2)
-        self._queue, self._at = np.zeros((late, 2)), 0
+        self._queue, self._at, self._courses = np.zeros((late, 2)), 0, np.empty((0, 3))  # courses: from -lag on
         self._rng = np.random.default_rng(seed)
         self._z, self._truth, self._contact = self._equilibrium(), [], []
 
@@ -158,8 +158,12 @@ class StrangersPlate:
 
     def _touched(self, first, last):
         """Position, load and contact at the samples from `first` to `last` inclusive."""
-        n = np.arange(first, last + 1)
-        return np.stack([np.broadcast_to(each(n), n.shape) for each in self._touch], axis=1)
+        first, last = first + self._lag, last + self._lag
+        while last >= len(self._courses):  # a second and more at a time
+            n = len(self._courses) - self._lag + np.arange(round(self.rate) + self.block)
+            more = np.stack([np.broadcast_to(each(n), n.shape) for each in self._touch], axis=1)
+            self._courses = np.concatenate([self._courses, more])
+        return self._courses[first : last + 1]
 
     @property
     def truth(self):
@@ -196,7 +200,7 @@ class StrangersPlate:
         sensed = truth[:, 1:3] * [self.true["gain_1"], self.true["gain_2"]]
         sensed += self.noise * self._rng.standard_normal(sensed.shape)
         if self.sensor_step:
-            sensed = np.clip(self.sensor_step * np.round(sensed / self.sensor_step), -1e-3, 1e-3)
+            sensed = np.minimum(np.maximum(self.sensor_step * np.round(sensed / self.sensor_step), -1e-3), 1e-3)
         touching = self._touched(first - self._lag, last - 1 - self._lag)[:, 2] > 0.0
         position, load = np.where(touching, touch[:-1, 0], np.nan), np.where(touching, touch[:-1, 1], 0.0)
         return hr.Sensed(sensed, position, normal_load=load)
