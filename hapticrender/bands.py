@@ -56,6 +56,8 @@ class Bands:
         The waveform is a factor of every envelope, which is otherwise constant.
     differentiated : bool
         The target is the time derivative of the envelopes' signal, at whatever frequency a carrier comes to be.
+    spatial : bool
+        Whether a waveform without bands is read at the position of the finger.
     sensor_response : ndarray of complex, shape (n,), or None
         Response of the device's sensor to each band, not 0; None: 1.  `tone` refers the targets to the sensor.
     unfelt : tuple of str
@@ -74,6 +76,7 @@ class Bands:
     envelope: Array | None = None
     modulated: bool = False
     differentiated: bool = False
+    spatial: bool = False
     sensor_response: Array | None = None
     unfelt: tuple[str, ...] = ()
 

@@ -23,7 +23,7 @@ from hapticrender.protocols import Array, Controller, Driver, Exchange, Renderer
 from hapticrender.recordings.recording import Recorder, Recording
 from hapticrender.touch.scene import Scene
 
-MISMATCH = 0.03  # largest share of a target that the integral part may have to add on the untouched device
+MISMATCH = 0.03  # of what the model asks for: most that the controller may have to add on the untouched device
 CHUNK = 0.25  # s of signal between two writes of the journal
 
 Progress = Callable[[float, float], None]
@@ -263,7 +263,7 @@ def _compare(rendering: Rendering, controller: Controller, recording: Recording)
     if rendering.scene.device == "vt-plate":
         cure = "remove the finger and replace [device] by what `hapticrender identify --driver ... --scene ...` writes"
     message = (
-        f"the device differs from its model: the integral part adds {100 * mismatch:.1f} % of a target "
+        f"the device differs from its model: the controller adds {100 * mismatch:.1f} % to what that asks for "
         f"(bound {100 * MISMATCH:g} %){f'; dynamic stiffness against the model: {found}' if found else ''}; {cure}"
     )
     warnings.warn(message, PlateMismatch, stacklevel=3)

@@ -83,7 +83,7 @@ def test_any_split_into_blocks_gives_the_same_run(name, rng):
         assert np.array_equal(column, np.concatenate([part[i] for part in parts]))
 
 
-@pytest.mark.parametrize("name", METHODS)
+@pytest.mark.parametrize("name", sorted(set(METHODS) - {"inverse"}))  # it expects a finger where one is said to be
 def test_a_grating_felt_backwards_is_the_same_function_of_time(name):
     """cos(2 pi x/wavelength) at +v and -v; and a finger that turns round at 0.6 s meets it again in mirror image."""
     bands = dataclasses.replace(tones(0.0), wavenumber=np.array([5000.0]))

@@ -24,6 +24,7 @@ from hapticrender.control.inverse_kernel import (
     REVERSION,
     RING,
     ROCKING,
+    SCALED,
     TAPS,
     inverse_step,
 )
@@ -122,6 +123,22 @@ def pole_step(rate: float) -> Array:
     return np.column_stack([phi[:2, :2], phi[:2, 2] - rise, rise])
 
 
+class WaveformController(BankController):
+    """The waveform law behind the `Controller` protocol."""
+
+    @property
+    def law(self) -> Any:
+        """Settings and state of the law (a record, see `INVERSE`)."""
+        return self._arrays["loops"][0]
+
+    @property
+    def mismatch(self) -> float:
+        """Force that was learned on the untouched device over that of its model, rms over about a second, else 0."""
+        law = self.law
+        known = law["contact"] == 0.0 and law["smooth_scale"] > SCALED and law["learns"] and law["asked"] > 0.0
+        return float(np.sqrt(law["added"] / law["asked"])) if known else 0.0
+
+
 @dataclass(frozen=True)
 class AdaptiveInverse:
     """The default method: exact inverse dynamics of the waveform, adapted by a Kalman filter; a damper at contacts."""
@@ -150,7 +167,7 @@ class AdaptiveInverse:
             state[f"{name}_at"] = array.ctypes.data
         note = damping.text() if damping else "inner damper off"
         memory = {"loops": state, **rings}
-        return BankController(self.name, inverse_step, settings, bands, note=note, arrays=memory, lookahead=ahead)
+        return WaveformController(self.name, inverse_step, settings, bands, note=note, arrays=memory, lookahead=ahead)
 
 
 def controller_settings(model: DeviceModel, bands: Bands, damping: Damping | None, feedback: bool) -> dict[str, Any]:
@@ -188,7 +205,7 @@ def law_settings(model: DeviceModel, bands: Bands, ahead: int, feedback: bool) -
     return {
         "delay": model.delay,
         "ahead": ahead,
-        "spatial": (bands.wavenumber > 0.0).any() if len(bands) else getattr(bands, "spatial", False),
+        "spatial": (bands.wavenumber > 0.0).any() if len(bands) else bands.spatial,
         "learns": feedback,
         "lever_per_metre": model.lever_per_metre,
         "hertz_scale": SCALE,
@@ -204,6 +221,7 @@ def law_settings(model: DeviceModel, bands: Bands, ahead: int, feedback: bool) -
         "hold": round(0.05 * model.rate),
         "decay": math.exp(-period / 0.02),
         "smoothing": period / 2e-3,
+        "slowly": period / 1.0,
         "levelling": period / 50e-3 if n > 1 else 0.0,
         "filters": derivative_filters(float(model.rate), float(top)),
         "pair": pole_step(model.rate),

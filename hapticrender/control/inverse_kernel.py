@@ -50,7 +50,7 @@ INVERSE = np.dtype(
         *((name, np.int64) for name in ("delay", "ahead", "spatial", "learns")),
         *((name, np.float64) for name in ("lever_per_metre", "hertz_scale", "pole", "pole_damping", "fade_step")),
         *((name, np.float64) for name in ("settling", "joining", "awake", "level", "high_pass", "mean_square")),
-        *((name, np.float64) for name in ("hold", "decay", "smoothing", "levelling")),
+        *((name, np.float64) for name in ("hold", "decay", "smoothing", "levelling", "slowly")),
         ("filters", np.float64, (4, TAPS)),
         ("pair", np.float64, (2, 4)),  # step of the pair of poles: two states, r now and next
         ("force_from_drive", np.float64, (2, MOST_CHANNELS)),
@@ -61,11 +61,8 @@ INVERSE = np.dtype(
         ("kept", np.float64, (PARAMETERS,)),
         ("start", np.float64, (4,)),
         # state
-        *(
-            (name, np.float64)
-            for name in ("fade", "peak", "held", "scale", "smooth_scale", "lever", "contact", "since", "gate")
-        ),
-        *((name, np.float64) for name in ("slow", "power", "reference", "moment")),
+        *((name, np.float64) for name in ("fade", "peak", "held", "scale", "smooth_scale", "lever", "contact")),
+        *((name, np.float64) for name in ("since", "slow", "power", "reference", "moment", "asked", "added")),
         *((name, np.int64) for name in ("sample", "ring_at", "reference_at")),
         ("window", np.float64, (TAPS,)),  # references, the oldest first
         ("poles", np.float64, (2,)),
@@ -142,6 +139,12 @@ def find_basis(controller, inverse):
 
 
 @kernel
+def moved(value, change):
+    """Move a number by a change that is at most half of it."""
+    return value + min(max(change, -0.5 * value), 0.5 * value)
+
+
+@kernel
 def discretise(controller, inverse):
     """Exact step of the loaded device over a sample, from a series of ten terms; states are coordinates, velocities.
 
@@ -155,14 +158,13 @@ def discretise(controller, inverse):
     z += (theta[3] * pole * pole + complex(0.0, theta[4] * pole * w)) / low
     mass = min(max(-z.real / (w * w), -2e-3), 10e-3) * v.contact
     damping = min(max(z.imag / w, 0.0), 12.0) * v.contact
-    s, h = v.hertz_scale, v.lever
-    m00 = v.mass[0, 0] + mass + theta[HEAVE + 2] / (s * s)
-    m01, m11 = v.mass[0, 1] + h * mass, v.mass[1, 1] + h * h * mass + theta[ROCKING + 2] / (s * s)
-    c00 = v.damping[0, 0] + damping + max(theta[HEAVE + 1] / s, -0.5 * v.damping[0, 0])
-    c01 = v.damping[0, 1] + h * damping
-    c11 = v.damping[1, 1] + h * h * damping + max(theta[ROCKING + 1] / s, -0.5 * v.damping[1, 1])
-    k00, k01 = v.stiffness[0, 0] + theta[HEAVE], v.stiffness[0, 1]
-    k11 = v.stiffness[1, 1] + theta[ROCKING]
+    h, per_c, per_m = v.lever, 1.0 / v.hertz_scale, 1.0 / (v.hertz_scale * v.hertz_scale)
+    m00 = moved(v.mass[0, 0], per_m * theta[HEAVE + 2]) + mass
+    m01, m11 = v.mass[0, 1] + h * mass, moved(v.mass[1, 1], per_m * theta[ROCKING + 2]) + h * h * mass
+    c00 = moved(v.damping[0, 0], per_c * theta[HEAVE + 1]) + damping
+    c01, c11 = v.damping[0, 1] + h * damping, moved(v.damping[1, 1], per_c * theta[ROCKING + 1]) + h * h * damping
+    k00, k01 = moved(v.stiffness[0, 0], theta[HEAVE]), v.stiffness[0, 1]
+    k11 = moved(v.stiffness[1, 1], theta[ROCKING])
     scale = period / (m00 * m11 - m01 * m01)
     i00, i01, i11 = scale * m11, -scale * m01, scale * m00
     phi, gamma = v.transition, v.input
@@ -348,6 +350,14 @@ def learned_force(controller, inverse, coordinate):
 
 
 @kernel
+def compare(inverse, nominal, learned):
+    """Mean squares over a second of what the believed device asks for in heave, and of what was learned beside it."""
+    v = record(inverse, INVERSE_T, 0)
+    v.asked += v.slowly * (nominal * nominal - v.asked)
+    v.added += v.slowly * (learned * learned - v.added)
+
+
+@kernel
 def level(inverse):
     """Rocking force that slowly levels the device under the load: a moving finger would else tilt it to and fro."""
     v = record(inverse, INVERSE_T, 0)
@@ -440,7 +450,9 @@ def inverse_step(state, signals, start, count):
         across = v.stiffness[0, 1] * d0 + v.damping[0, 1] * d1 + v.mass[0, 1] * d2
         other = v.stiffness[1, 1] * d0 + v.damping[1, 1] * d1 + v.mass[1, 1] * d2
         nominal0, nominal1 = s0 * along + s1 * across, s0 * across + s1 * other
-        samples[Y, 0] = nominal0 + learned_force(state, inverse, 0) + force0
+        learned = learned_force(state, inverse, 0)
+        compare(inverse, nominal0, learned)
+        samples[Y, 0] = nominal0 + learned + force0
         samples[Y + 1, 0] = nominal1 + learned_force(state, inverse, 1) + force1 + level(inverse)
         play(state, inverse, drive, flags, n, nominal0, nominal1)
         advance_regressors(state, inverse)

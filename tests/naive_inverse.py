@@ -1,0 +1,184 @@
+"""Slow, obvious twin of the waveform law, sample by sample, from the equations of docs/theory.md.
+
+It imports nothing under test: `p` has the controller's numbers, `law` those of the waveform law; the drive is not rounded.  The reference comes
+`ahead` samples early, as a number a sample.
+"""
+
+import numpy as np
+from scipy.linalg import expm
+
+FINGER, HEAVE, ROCKING, LOAD, INITIAL, COUNT = 0, 5, 9, 12, 14, 18
+
+
+class NaiveInverse:
+    """Takes one sample a call; everything it remembers is an attribute."""
+
+    def __init__(self, p, law):
+        self.p, self.law, self.T, n = p, law, 1 / p["rate"], p["coordinates"]
+        self.M, self.C, self.K = law["mass"], law["damping"], law["stiffness"]
+        self.from_sensor = p["coordinate_from_sensor"][:, : p["sensors"]]
+        self.to_drive = p["drive_from_force"][: p["channels"]]
+        self.to_force = law["force_from_drive"][:, : p["channels"]]
+        self.s, self.taps, self.n = p["shape"], p["taps"][:, : p["n_taps"]], n
+        self.theta, self.P = law["prior"].copy(), law["spread"].copy()
+        self.psi = np.zeros((4, COUNT + 1))  # states of the regressors, and of w
+        self.references, self.forces = [], []  # r, early; basis and deviation force of each sample
+        self.poles, self.basis, self.past = np.zeros(2), np.zeros(6), np.zeros((2, self.taps.shape[1]))
+        self.fade = self.slow = self.power = self.timer = self.open = self.moment = self.lever = self.peak = 0.0
+        self.contact, self.since, self.held, self.scale, self.smooth = 0, 1e9, 0, 1.0, 1.0
+        self.samples = 0
+
+    def step(self, sensed, position, waveform):
+        """Drive (channels,) of one sample."""
+        law, p, n = self.law, self.p, self.samples
+        y = self.from_sensor @ sensed
+        touching = int(np.isfinite(position))
+        wanted = touching or not law["spatial"]
+        self.fade = np.clip(self.fade + (law["fade_step"] if wanted else -law["fade_step"]), 0, 1)
+        self.references.append(waveform * (3 * self.fade**2 - 2 * self.fade**3) * self.smooth)
+        now = self.reference(n - law["ahead"])
+        settled = self.follow(touching, position)
+        e = y - self.s * now
+        self.gate(e[0])
+        self.past = np.column_stack([e, self.past[:, :-1]])
+        if settled:
+            for i in range(self.n):
+                self.learn(i, e[i])
+        if n % 20 == 0:
+            self.revert()
+        if n % 25 == 0:
+            self.discretise()
+        phi, d1, d2 = self.find_basis(n)
+        nominal = self.K @ self.s * phi[0] + self.C @ self.s * d1 + self.M @ self.s * d2
+        force = nominal + self.directions() @ self.theta[:COUNT] + self.level()
+        force = force - (self.open * p["damper_high"]) * (self.taps * self.past).sum(axis=1)
+        drive = self.play(force)
+        self.forces.append((phi, self.to_force @ drive - nominal))
+        self.advance(n)
+        self.samples += 1
+        return drive
+
+    def reference(self, n):
+        """Of the texture at sample n."""
+        at = n  # entry n of the list is the reference of sample n + ahead
+        return self.references[at] if at >= 0 else 0.0
+
+    def follow(self, touching, position):
+        law = self.law
+        if touching:
+            self.lever = law["lever_per_metre"] * position
+        self.since += 1
+        if touching != self.contact:
+            self.contact, self.since, self.timer = touching, 0, law["awake"]
+            self.forget(FINGER, HEAVE)
+            self.forget(LOAD, COUNT)
+            self.discretise()
+        elif self.since == law["settling"]:
+            self.psi[:] = 0.0
+            for k in range(4):
+                self.psi[k, INITIAL + k] = 1.0
+                self.P[INITIAL + k, INITIAL + k] = law["start"][k]
+        elif self.since == law["joining"]:
+            self.forget(INITIAL, COUNT)
+        return self.since >= law["settling"]
+
+    def forget(self, first, last):
+        inside = slice(first, last)
+        self.theta[inside] = self.law["prior"][inside]
+        self.P[inside, :] = self.P[:, inside] = 0.0
+        self.P[inside, inside] = self.law["spread"][inside, inside]
+        self.psi[:, inside] = 0.0
+
+    def gate(self, deviation):
+        law = self.law
+        self.slow += law["high_pass"] * (deviation - self.slow)
+        self.power += law["mean_square"] * ((deviation - self.slow) ** 2 - self.power)
+        if self.power > law["level"]:
+            self.timer = max(self.timer, 1)
+        self.open = 1.0 if self.timer > 0 else max(self.open - self.p["release"], 0.0)
+        self.timer -= 1
+
+    def learn(self, i, error):
+        h = -self.psi[i, :COUNT]
+        innovation = error - self.psi[i, COUNT] - h @ self.theta
+        gain = self.P @ h / (h @ self.P @ h + self.law["noise"][i])
+        self.theta = self.theta + gain * innovation
+        self.P = self.P - np.outer(gain, h @ self.P)
+
+    def revert(self):
+        law = self.law
+        kept = np.outer(law["kept"], law["kept"])
+        self.theta = law["prior"] + law["kept"] * (self.theta - law["prior"])
+        self.P = kept * self.P + (1 - kept) * law["spread"]
+
+    def discretise(self):
+        law, th, scale = self.law, self.theta, self.law["hertz_scale"]
+        s, pole = 2j * np.pi * 180.0, law["pole"]
+        low = s**2 + 2 * law["pole_damping"] * pole * s + pole**2
+        z = th[0] + th[1] * s / scale + th[2] * (s / scale) ** 2 + th[3] * pole**2 / low + th[4] * pole * s / low
+        mass, damping = np.clip(z.real / (s**2).real, -2e-3, 10e-3), np.clip(z.imag / s.imag, 0.0, 12.0)
+        arm = np.outer([1.0, self.lever], [1.0, self.lever]) * self.contact
+
+        def learned(matrix, order):
+            own = matrix.diagonal()
+            change = th[[HEAVE + order, ROCKING + order]] / scale**order
+            return matrix + np.diag(np.clip(change, -0.5 * own, 0.5 * own))
+
+        M = learned(self.M, 2) + mass * arm
+        C, K = learned(self.C, 1) + damping * arm, learned(self.K, 0)
+        flow = np.zeros((6, 6))
+        flow[:2, 2:4] = np.eye(2)
+        flow[2:4] = np.linalg.solve(M, np.hstack([-K, -C, np.eye(2)]))
+        held = expm(flow * self.T)
+        self.Phi, self.Gamma = held[:4, :4], held[:4, 4:]
+
+    def find_basis(self, n):
+        law, scale = self.law, self.law["hertz_scale"]
+        window = np.array([self.references[k] if k >= 0 else 0.0 for k in range(n - 11, n + 1)])
+        d = law["filters"] @ window
+        last, x = self.basis[0], self.poles
+        self.poles = law["pair"] @ [x[0], x[1], last, d[0]]
+        delay = (self.M[0, 0] * d[3] + self.C[0, 0] * d[2] + self.K[0, 0] * d[1]) * self.T
+        pole = law["pole"]
+        self.basis = np.array(
+            [d[0], d[1] / scale, d[2] / scale**2, pole**2 * self.poles[0], pole * self.poles[1], delay]
+        )
+        return self.basis, d[1], d[2]
+
+    def directions(self, basis=None):
+        """Force of each parameter per unit, shape (2, COUNT); load and initial motion are not played."""
+        basis = self.basis if basis is None else basis
+        found = np.zeros((2, COUNT))
+        along = self.contact * (self.s[0] + self.lever * self.s[1])
+        found[:, FINGER:HEAVE] = along * np.outer([1.0, self.lever], basis[:5])
+        found[0, HEAVE : HEAVE + 4] = self.s[0] * basis[[0, 1, 2, 5]]
+        found[1, ROCKING : ROCKING + 3] = basis[:3]
+        return found
+
+    def level(self):
+        wanted = self.contact * (self.lever * self.theta[LOAD] + self.theta[LOAD + 1])
+        self.moment += self.law["levelling"] * (wanted - self.moment)
+        return np.array([0.0, self.moment])
+
+    def play(self, force):
+        p, law = self.p, self.law
+        exact = self.to_drive @ force
+        needed = abs(exact).max() / p["drive_limit"] / self.smooth
+        self.held -= 1
+        if needed >= 0.98 * self.peak:
+            self.peak, self.held = max(self.peak, needed), law["hold"]
+        elif self.held < 0:
+            self.peak *= law["decay"]
+        self.scale += law["smoothing"] * (1 / max(self.peak, 1.0) - self.scale)
+        self.smooth += law["smoothing"] * (self.scale - self.smooth)
+        return np.clip(exact, -p["drive_limit"], p["drive_limit"])
+
+    def advance(self, n):
+        at = n - self.law["delay"]
+        basis, deviation = self.forces[at] if at >= 0 else (np.zeros(6), np.zeros(2))
+        inputs = np.zeros((2, COUNT + 1))
+        inputs[:, :COUNT] = self.directions(basis)
+        inputs[:, LOAD] = 1.0, self.contact * self.lever
+        inputs[1, LOAD + 1] = 1.0
+        inputs[:, COUNT] = deviation
+        self.psi = self.Phi @ self.psi + self.Gamma @ inputs

@@ -1,0 +1,148 @@
+"""The waveform law: filters and poles against analysis, the kernel against its twin, and what the law is good for."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.signal import butter, lsim, sosfiltfilt
+
+import hapticrender as hr
+from hapticrender.bands import Bands
+from hapticrender.control.inverse import POLE, POLE_DAMPING, TAPS, AdaptiveInverse, derivative_filters, pole_step
+from hapticrender.plants.plate import Plate, PlateParameters
+from hapticrender.touch.mechanics import HEAVY
+from tests.naive_inverse import NaiveInverse
+
+RATE, RMS = 5000, 5e-6  # Hz, m
+PLATE = PlateParameters()
+NOTHING = Bands(frequency=[], wavenumber=[], phase=[])
+HEAVY_FINGER = {"normal_load": 0.8, "mechanics": HEAVY}
+
+
+def white(samples, seed=0, rate=RATE):
+    """White noise of 20-400 Hz, 5 um rms."""
+    spectrum = np.fft.rfft(np.random.default_rng(seed).standard_normal(samples))
+    frequency = np.fft.rfftfreq(samples, 1 / rate)
+    found = np.fft.irfft(np.where((frequency > 20) & (frequency < 400), spectrum, 0.0), samples)
+    return found * RMS / found.std()
+
+
+def play(finger, reference, *, known=PLATE, plate=PLATE, learns=True, rate=RATE, delay=1):
+    """True motion (n, 3) of a plate under the law, and its controller."""
+    controller = AdaptiveInverse().design(known.device_model(rate, delay), NOTHING)
+    controller.law["learns"] = learns
+    moved = Plate(plate, finger, seed=1)
+    moved.closed_loop(controller, reference[controller.lookahead :])
+    return moved.motion[:, :3], controller
+
+
+def error(motion, reference, start=1.5, rate=RATE):
+    """Rms of the deviation over that of the reference, 20-500 Hz, from `start` (s) on; shape (places,)."""
+    sos = butter(4, [20, 500], "bandpass", fs=rate, output="sos")
+    reference = reference[: len(motion), None]
+    deviation, reference = sosfiltfilt(sos, motion - reference, axis=0), sosfiltfilt(sos, reference, axis=0)
+    late = slice(round(start * rate), None)
+    return np.sqrt((deviation[late] ** 2).mean(axis=0) / (reference[late] ** 2).mean())
+
+
+def test_derivatives_are_those_half_a_sample_ahead_with_the_hold_undone():
+    filters = derivative_filters(5000.0, 1000.0)
+    for hertz in (20.0, 100.0, 400.0, 1000.0):
+        s = 2j * np.pi * hertz
+        found = filters @ np.exp(s * (np.arange(TAPS) - TAPS // 2 + 1) / RATE)
+        wanted = s ** np.arange(4) * np.exp(0.5 * s / RATE) / np.sinc(hertz / RATE)
+        assert abs(found / wanted - 1).max() < 1e-4, hertz
+
+
+def test_pair_of_poles_is_that_of_the_differential_equation():
+    time = np.arange(200) / RATE
+    signal = np.sin(2 * np.pi * 97.0 * time)
+    x, found = np.zeros(2), []
+    for before, now in zip(np.r_[0.0, signal], signal, strict=False):
+        x = pole_step(RATE) @ [*x, before, now]
+        found.append(x[0])
+    exact = lsim(([1.0], [1.0, 2 * POLE_DAMPING * POLE, POLE**2]), signal, time)[1]
+    assert np.allclose(found, exact, atol=1e-6 * abs(exact).max())
+
+
+@pytest.mark.parametrize("spatial", [False, True])
+def test_kernel_equals_its_twin(spatial):
+    """Touch, learning, the damper and its gate, saturation and lift-off, from equations and in compiled code."""
+    rng, n = np.random.default_rng(4), 900
+    model = replace(
+        PLATE.device_model(RATE, 2), drive_step=0.0, drive_limit=0.1
+    )  # a last bit would decide which way it rounds
+    controller = AdaptiveInverse().design(model, NOTHING)
+    own = controller._arrays["loops"]
+    controller.law["spatial"] = spatial
+    law = {name: controller.law[name].copy() for name in controller.law.dtype.names}
+    settings = controller.settings
+    twin = NaiveInverse({name: settings[name] for name in settings.dtype.names}, law)
+    position = np.where((np.arange(n) > 100) & (np.arange(n) < 700), 0.01 + 0.02 * np.arange(n) / n, np.nan)
+    reference, sensed = white(n), 1e-6 * rng.standard_normal((n, 2))
+    drive, _, _ = controller.run(sensed, position, reference)
+    slow = np.array([twin.step(*row) for row in zip(sensed, position, reference, strict=True)])
+    assert abs(drive).max() == model.drive_limit, "nothing was limited"
+    assert abs(drive - slow).max() < 1e-9
+
+
+def test_white_noise_arrives_whole_with_and_without_a_finger():
+    """What learning is good for: a finger as most people's leaves seven times as much."""
+    reference = white(4 * RATE)
+    free, _ = play(hr.Finger.absent(), reference)
+    resting = hr.Finger.still(0.015, **HEAVY_FINGER)
+    held, _ = play(resting, reference)
+    blind, _ = play(resting, reference, learns=False)
+    assert error(free, reference).max() < 0.01
+    assert error(held, reference).max() < 0.02
+    assert error(blind, reference)[0] > 0.1
+
+
+def test_a_plate_wrong_in_everything_is_learned():
+    factors = {"stiffness_1": 1.05, "stiffness_2": 1.05, "mass": 0.95, "inertia": 0.95, "damping_1": 0.8}
+    wrong = replace(PLATE, **{name: factor * getattr(PLATE, name) for name, factor in factors.items()})
+    reference = white(4 * RATE)
+    learned, _ = play(hr.Finger.absent(), reference, plate=wrong)
+    blind, _ = play(hr.Finger.absent(), reference, plate=wrong, learns=False)
+    assert error(learned, reference)[0] < 0.015 < 0.2 < error(blind, reference)[0]
+
+
+def test_what_is_learned_does_not_wind_up_on_one_tone():
+    """A tone leaves most parameters to the noise; white noise afterwards still arrives."""
+    tone = 50e-6 * np.sin(2 * np.pi * 189.0 * np.arange(60 * RATE) / RATE)
+    reference = np.r_[tone, white(2 * RATE)]
+    motion, _ = play(hr.Finger.still(0.015, **HEAVY_FINGER), reference)
+    assert error(motion, reference, 61.0).max() < 0.05
+
+
+def test_a_texture_over_position_fades_with_contact():
+    reference = np.full(2 * RATE, 20e-6)
+    for spatial in (False, True):
+        controller = AdaptiveInverse().design(PLATE.device_model(RATE, 1), replace(NOTHING, spatial=spatial))
+        position = np.where(np.arange(2 * RATE) < RATE, 0.0, np.nan)
+        plate = Plate(PLATE, hr.Finger.absent())
+        drive, _, _ = controller.run(np.zeros((2 * RATE, 2)), position, reference)
+        assert abs(drive[RATE - 100]).max() > 0.01
+        assert (abs(drive[-100:]).max() > 0.01) is not spatial
+        assert plate.rate == RATE
+
+
+@pytest.mark.parametrize("piece", [1, 7, 400])
+def test_pieces_change_nothing(piece):
+    reference, rng = white(400), np.random.default_rng(1)
+    sensed, position = 1e-6 * rng.standard_normal((400, 2)), np.r_[np.full(200, np.nan), np.zeros(200)]
+
+    def drive(size):
+        controller = AdaptiveInverse().design(PLATE.device_model(RATE, 1), NOTHING)
+        rows = range(0, 400, size)
+        return np.vstack([controller.run(*(x[k : k + size] for x in (sensed, position, reference)))[0] for k in rows])
+
+    assert np.array_equal(drive(piece), drive(400))
+
+
+def test_sensors_that_fail_take_the_drive_away_and_what_was_learned():
+    controller = AdaptiveInverse().design(PLATE.device_model(RATE, 1), NOTHING)
+    reference, none = white(1000), np.full(1000, np.nan)
+    drive, _, flags = controller.run(np.full((1000, 2), np.nan), none, reference)
+    assert (flags & hr.Flag.NONFINITE).all()
+    assert not drive[150:].any()
