@@ -27,6 +27,7 @@ class NaiveInverse:
         self.fade = self.slow = self.power = self.timer = self.open = self.moment = self.lever = self.peak = 0.0
         self.contact, self.since, self.held, self.scale, self.smooth = 0, 1e9, 0, 1.0, 1.0
         self.samples = 0
+        self.earlier = 2 * ((self.theta[HEAVE:LOAD].copy(), self.P[HEAVE:LOAD, HEAVE:LOAD].copy()),)
 
     def step(self, sensed, position, waveform):
         """Drive (channels,) of one sample."""
@@ -72,6 +73,9 @@ class NaiveInverse:
             self.contact, self.since, self.timer = touching, 0, law["awake"]
             self.forget(FINGER, HEAVE)
             self.forget(LOAD, COUNT)
+            self.forget(HEAVE, LOAD)
+            self.earlier = self.earlier[0], self.earlier[0]
+            self.theta[HEAVE:LOAD], self.P[HEAVE:LOAD, HEAVE:LOAD] = self.earlier[0]
             self.discretise()
         elif self.since == law["settling"]:
             self.psi[:] = 0.0
@@ -80,6 +84,8 @@ class NaiveInverse:
                 self.P[INITIAL + k, INITIAL + k] = law["start"][k]
         elif self.since == law["joining"]:
             self.forget(INITIAL, COUNT)
+        if self.samples % law["notice"] == 0:
+            self.earlier = self.earlier[1], (self.theta[HEAVE:LOAD].copy(), self.P[HEAVE:LOAD, HEAVE:LOAD].copy())
         return self.since >= law["settling"]
 
     def forget(self, first, last):

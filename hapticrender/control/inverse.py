@@ -39,6 +39,7 @@ POLE, POLE_DAMPING = 2 * math.pi * 200.0, 0.8  # the finger's pair of poles
 PEOPLE, SEED = 300, 1  # fingers of the prior, and the seed that draws them
 REVERSION_RATES = {FINGER: 0.1, HEAVE: 0.003, ROCKING: 0.01, LOAD: 1.0}  # 1/sqrt(s), from each parameter on
 SETTLING, JOINING, AWAKE = 2e-3, 62e-3, 0.1  # s after a contact: learning starts, initial motion ends, damper sleeps
+NOTICE = 10e-3  # s: a contact is reported within this
 GATE_SIGMAS = 2.0  # of the sensors' noise: a larger deviation within 4 ms opens the inner damper
 INITIAL_MOTION = (15e-6, 0.02)  # m and m/s: deviation and its velocity at a contact
 LOAD_SIZE = (0.6, 0.1)  # N: of the load, and of the moment beside it over a
@@ -215,6 +216,7 @@ def law_settings(model: DeviceModel, bands: Bands, ahead: int, feedback: bool) -
         "settling": round(SETTLING * model.rate),
         "joining": round(JOINING * model.rate),
         "awake": round(AWAKE * model.rate),
+        "notice": max(round(NOTICE * model.rate), 1),
         "level": (GATE_SIGMAS * noise[0]) ** 2,
         "high_pass": -math.expm1(-2 * math.pi * 20.0 * period),
         "mean_square": -math.expm1(-period / 4e-3),
@@ -233,6 +235,7 @@ def law_settings(model: DeviceModel, bands: Bands, ahead: int, feedback: bool) -
         "prior": mean,
         "spread": spread,
         "covariance": spread,
+        "earlier": np.vstack([spread[HEAVE:LOAD, HEAVE:LOAD], mean[HEAVE:LOAD]]),
         "theta": mean,
         "kept": kept,
         "start": np.repeat(INITIAL_MOTION, 2) ** 2,

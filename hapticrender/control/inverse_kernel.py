@@ -39,8 +39,8 @@ from hapticrender.vectors import get, put, real, total, zeros
 
 TAPS = 12  # of the derivatives' filters, 6 of them ahead
 BASIS = 6  # r, r'/w_n, r''/w_n^2, r through the pair of poles and its derivative/w_p, D_00 r' T
-FINGER, HEAVE, ROCKING, LOAD, INITIAL, PARAMETERS = 0, 5, 9, 12, 14, 18  # first parameter of each set, and their number
-ROWS = PARAMETERS + 1  # regressors psi_i, and w
+FINGER, HEAVE, ROCKING, LOAD, INITIAL, PARAMETERS = np.array([0, 5, 9, 12, 14, 18])  # first of each set; their number
+ROWS = int(PARAMETERS) + 1  # regressors psi_i, and w
 REFRESH = 25  # samples between two discretisations of the loaded device
 REVERSION = 20  # samples between two steps of the parameters' reversion to their mean
 
@@ -49,16 +49,19 @@ INVERSE = np.dtype(
         # settings
         *((name, np.int64) for name in ("delay", "ahead", "spatial", "learns")),
         *((name, np.float64) for name in ("lever_per_metre", "hertz_scale", "pole", "pole_damping", "fade_step")),
-        *((name, np.float64) for name in ("settling", "joining", "awake", "level", "high_pass", "mean_square")),
+        *(
+            (name, np.float64)
+            for name in ("settling", "joining", "awake", "notice", "level", "high_pass", "mean_square")
+        ),
         *((name, np.float64) for name in ("hold", "decay", "smoothing", "levelling", "slowly")),
         ("filters", np.float64, (4, TAPS)),
         ("pair", np.float64, (2, 4)),  # step of the pair of poles: two states, r now and next
         ("force_from_drive", np.float64, (2, MOST_CHANNELS)),
         *((name, np.float64, (2, 2)) for name in ("mass", "damping", "stiffness")),
         ("noise", np.float64, (2,)),
-        ("prior", np.float64, (PARAMETERS,)),
-        ("spread", np.float64, (PARAMETERS, PARAMETERS)),
-        ("kept", np.float64, (PARAMETERS,)),
+        ("prior", np.float64, (ROWS - 1,)),
+        ("spread", np.float64, (ROWS - 1, ROWS - 1)),
+        ("kept", np.float64, (ROWS - 1,)),
         ("start", np.float64, (4,)),
         # state
         *((name, np.float64) for name in ("fade", "peak", "held", "scale", "smooth_scale", "lever", "contact")),
@@ -67,12 +70,15 @@ INVERSE = np.dtype(
         ("window", np.float64, (TAPS,)),  # references, the oldest first
         ("poles", np.float64, (2,)),
         ("basis", np.float64, (BASIS,)),
-        ("theta", np.float64, (PARAMETERS,)),
-        ("covariance", np.float64, (PARAMETERS, PARAMETERS)),
+        ("theta", np.float64, (ROWS - 1,)),
+        ("covariance", np.float64, (ROWS - 1, ROWS - 1)),
+        ("earlier", np.float64, (2, 8, 7)),  # the device's own parameters and covariance, 10-20 ms and 0-10 ms ago
         ("states", np.float64, (4, ROWS)),
+        ("moved", np.float64, (4, ROWS)),
         ("inputs", np.float64, (2, ROWS)),
-        ("transition", np.float64, (4, 4)),
-        ("input", np.float64, (4, 2)),
+        *(
+            (name, np.float64, (4, 6)) for name in ("flow", "power_of_flow", "following", "step")
+        ),  # [A, B] T; [Phi, Gamma]
     ]
 )
 """Settings and state of the waveform law beside those of the controller."""
@@ -139,7 +145,7 @@ def find_basis(controller, inverse):
 
 
 @kernel
-def moved(value, change):
+def corrected(value, change):
     """Move a number by a change that is at most half of it."""
     return value + min(max(change, -0.5 * value), 0.5 * value)
 
@@ -159,44 +165,36 @@ def discretise(controller, inverse):
     mass = min(max(-z.real / (w * w), -2e-3), 10e-3) * v.contact
     damping = min(max(z.imag / w, 0.0), 12.0) * v.contact
     h, per_c, per_m = v.lever, 1.0 / v.hertz_scale, 1.0 / (v.hertz_scale * v.hertz_scale)
-    m00 = moved(v.mass[0, 0], per_m * theta[HEAVE + 2]) + mass
-    m01, m11 = v.mass[0, 1] + h * mass, moved(v.mass[1, 1], per_m * theta[ROCKING + 2]) + h * h * mass
-    c00 = moved(v.damping[0, 0], per_c * theta[HEAVE + 1]) + damping
-    c01, c11 = v.damping[0, 1] + h * damping, moved(v.damping[1, 1], per_c * theta[ROCKING + 1]) + h * h * damping
-    k00, k01 = moved(v.stiffness[0, 0], theta[HEAVE]), v.stiffness[0, 1]
-    k11 = moved(v.stiffness[1, 1], theta[ROCKING])
+    m00 = corrected(v.mass[0, 0], per_m * theta[HEAVE + 2]) + mass
+    m01, m11 = v.mass[0, 1] + h * mass, corrected(v.mass[1, 1], per_m * theta[ROCKING + 2]) + h * h * mass
+    c00 = corrected(v.damping[0, 0], per_c * theta[HEAVE + 1]) + damping
+    c01, c11 = v.damping[0, 1] + h * damping, corrected(v.damping[1, 1], per_c * theta[ROCKING + 1]) + h * h * damping
+    k00, k01 = corrected(v.stiffness[0, 0], theta[HEAVE]), v.stiffness[0, 1]
+    k11 = corrected(v.stiffness[1, 1], theta[ROCKING])
     scale = period / (m00 * m11 - m01 * m01)
     i00, i01, i11 = scale * m11, -scale * m01, scale * m00
-    phi, gamma = v.transition, v.input
-    # columns of [Phi, Gamma]: powers of A T applied to unit vectors, divided by factorials
-    for column in range(6):
-        x0, x1, x2, x3 = 0.0, 0.0, 0.0, 0.0
-        if column == 0:
-            x0 = 1.0
-        elif column == 1:
-            x1 = 1.0
-        elif column == 2:
-            x2 = 1.0
-        elif column == 3:
-            x3 = 1.0
-        elif column == 4:
-            x2, x3 = i00, i01
-        else:
-            x2, x3 = i01, i11
-        s0, s1, s2, s3 = x0, x1, x2, x3
-        first = 1.0 if column < 4 else 2.0
-        for term in range(10):
-            f0 = -(k00 * x0 + k01 * x1 + c00 * x2 + c01 * x3)
-            f1 = -(k01 * x0 + k11 * x1 + c01 * x2 + c11 * x3)
-            over = 1.0 / (term + first)
-            x0, x1 = over * period * x2, over * period * x3
-            x2, x3 = over * (i00 * f0 + i01 * f1), over * (i01 * f0 + i11 * f1)
-            s0, s1, s2, s3 = s0 + x0, s1 + x1, s2 + x2, s3 + x3
-        if column < 4:
-            phi[0, column], phi[1, column], phi[2, column], phi[3, column] = s0, s1, s2, s3
-        else:
-            gamma[0, column - 4], gamma[1, column - 4] = s0, s1
-            gamma[2, column - 4], gamma[3, column - 4] = s2, s3
+    flow, power, following, found = v.flow, v.power_of_flow, v.following, v.step
+    flow[0, 2] = flow[1, 3] = period
+    flow[2, 0], flow[3, 0] = -i00 * k00 - i01 * k01, -i01 * k00 - i11 * k01
+    flow[2, 1], flow[3, 1] = -i00 * k01 - i01 * k11, -i01 * k01 - i11 * k11
+    flow[2, 2], flow[3, 2] = -i00 * c00 - i01 * c01, -i01 * c00 - i11 * c01
+    flow[2, 3], flow[3, 3] = -i00 * c01 - i01 * c11, -i01 * c01 - i11 * c11
+    flow[2, 4], flow[3, 4], flow[2, 5], flow[3, 5] = i00, i01, i01, i11
+    for i in range(4):
+        for j in range(6):
+            power[i, j] = flow[i, j]
+            found[i, j] = flow[i, j] + (1.0 if i == j else 0.0)
+    for term in range(2, 11):
+        for i in range(4):
+            for j in range(6):
+                following[i, j] = 0.0
+            for k in range(4):
+                for j in range(6):
+                    following[i, j] += flow[i, k] * power[k, j] / term
+        for i in range(4):
+            for j in range(6):
+                power[i, j] = following[i, j]
+                found[i, j] += following[i, j]
 
 
 @kernel
@@ -215,6 +213,31 @@ def forget(inverse, first, last):
 
 
 @kernel
+def note_device(inverse):
+    """Note the device's own parameters and their covariance, and keep the last note."""
+    v = record(inverse, INVERSE_T, 0)
+    theta, covariance, earlier = v.theta, v.covariance, v.earlier
+    for i in range(7):
+        for j in range(8):
+            earlier[0, j, i] = earlier[1, j, i]
+            earlier[1, j, i] = theta[HEAVE + i] if j == 7 else covariance[HEAVE + j, HEAVE + i]
+
+
+@kernel
+def restore_device(inverse):
+    """Set the device's own parameters back to the earlier note: a contact is reported after it happened."""
+    v = record(inverse, INVERSE_T, 0)
+    theta, covariance, earlier = v.theta, v.covariance, v.earlier
+    forget(inverse, HEAVE, LOAD)
+    for i in range(7):
+        theta[HEAVE + i] = earlier[0, 7, i]
+        for j in range(7):
+            covariance[HEAVE + j, HEAVE + i] = earlier[0, j, i]
+            earlier[1, j, i] = earlier[0, j, i]
+        earlier[1, 7, i] = earlier[0, 7, i]
+
+
+@kernel
 def follow_contact(controller, inverse):
     """Reset what belongs to a contact when one begins or ends; its initial motion joins the parameters for a while."""
     c, v = record(controller, CONTROLLER_T, 0), record(inverse, INVERSE_T, 0)
@@ -226,6 +249,7 @@ def follow_contact(controller, inverse):
         v.contact, v.since = c.finger_seen, 0.0
         forget(inverse, FINGER, HEAVE)
         forget(inverse, LOAD, PARAMETERS)
+        restore_device(inverse)
         c.fast_timer = v.awake
         discretise(controller, inverse)
     elif v.since == v.settling:
@@ -237,6 +261,8 @@ def follow_contact(controller, inverse):
             v.covariance[INITIAL + k, INITIAL + k] = v.start[k]
     elif v.since == v.joining:
         forget(inverse, INITIAL, PARAMETERS)
+    if v.sample % int(v.notice) == 0:
+        note_device(inverse)
     return v.since >= v.settling
 
 
@@ -303,7 +329,7 @@ def damp(controller, coordinate, deviation):
 def advance_regressors(controller, inverse):
     """Advance the regressors by a sample, under the basis and the deviation force that act in it."""
     c, v = record(controller, CONTROLLER_T, 0), record(inverse, INVERSE_T, 0)
-    states, inputs, phi, gamma = v.states, v.inputs, v.transition, v.input
+    states, moved, inputs, phi = v.states, v.moved, v.inputs, v.step
     ring = carray(pointer(v.ring_at, F8), (v.delay + 1, RING))
     at = (v.sample + 1) % (v.delay + 1)  # what was computed `delay` samples ago
     touched, along = v.contact, v.contact * (c.p.shape[0] + v.lever * c.p.shape[1])
@@ -319,34 +345,30 @@ def advance_regressors(controller, inverse):
     inputs[0, LOAD], inputs[1, LOAD] = 1.0, touched * v.lever
     inputs[1, LOAD + 1] = 1.0
     inputs[0, PARAMETERS], inputs[1, PARAMETERS] = ring[at, BASIS], ring[at, BASIS + 1]
-    p00, p01, p02, p03 = phi[0, 0], phi[0, 1], phi[0, 2], phi[0, 3]
-    p10, p11, p12, p13 = phi[1, 0], phi[1, 1], phi[1, 2], phi[1, 3]
-    p20, p21, p22, p23 = phi[2, 0], phi[2, 1], phi[2, 2], phi[2, 3]
-    p30, p31, p32, p33 = phi[3, 0], phi[3, 1], phi[3, 2], phi[3, 3]
-    g00, g01, g10, g11 = gamma[0, 0], gamma[0, 1], gamma[1, 0], gamma[1, 1]
-    g20, g21, g30, g31 = gamma[2, 0], gamma[2, 1], gamma[3, 0], gamma[3, 1]
-    for i in range(ROWS):
-        x0, x1, x2, x3, u0, u1 = states[0, i], states[1, i], states[2, i], states[3, i], inputs[0, i], inputs[1, i]
-        states[0, i] = p00 * x0 + p01 * x1 + p02 * x2 + p03 * x3 + g00 * u0 + g01 * u1
-        states[1, i] = p10 * x0 + p11 * x1 + p12 * x2 + p13 * x3 + g10 * u0 + g11 * u1
-        states[2, i] = p20 * x0 + p21 * x1 + p22 * x2 + p23 * x3 + g20 * u0 + g21 * u1
-        states[3, i] = p30 * x0 + p31 * x1 + p32 * x2 + p33 * x3 + g30 * u0 + g31 * u1
+    for k in range(4):
+        for i in range(ROWS):
+            moved[k, i] = phi[k, 4] * inputs[0, i] + phi[k, 5] * inputs[1, i]
+        for j in range(4):
+            for i in range(ROWS):
+                moved[k, i] += phi[k, j] * states[j, i]
+    for k in range(4):
+        for i in range(ROWS):
+            states[k, i] = moved[k, i]
 
 
 @kernel
-def learned_force(controller, inverse, coordinate):
-    """What was learned of finger and device, as the force that it takes in a coordinate."""
+def learned_force(controller, inverse):
+    """What was learned of finger and device, as the forces that it takes in heave and rocking."""
     c, v = record(controller, CONTROLLER_T, 0), record(inverse, INVERSE_T, 0)
     theta, basis = v.theta, v.basis
-    finger = 0.0
+    finger = heave = rocking = 0.0
     for i in range(5):
         finger += theta[FINGER + i] * basis[i]
+    for i in range(3):
+        heave += theta[HEAVE + i] * basis[i]
+        rocking += theta[ROCKING + i] * basis[i]
     finger *= v.contact * (c.p.shape[0] + v.lever * c.p.shape[1])
-    if coordinate == 0:
-        own = theta[HEAVE] * basis[0] + theta[HEAVE + 1] * basis[1] + theta[HEAVE + 2] * basis[2]
-        return finger + c.p.shape[0] * (own + theta[HEAVE + 3] * basis[5])
-    own = theta[ROCKING] * basis[0] + theta[ROCKING + 1] * basis[1] + theta[ROCKING + 2] * basis[2]
-    return v.lever * finger + own
+    return finger + c.p.shape[0] * (heave + theta[HEAVE + 3] * basis[5]), v.lever * finger + rocking
 
 
 @kernel
@@ -430,16 +452,16 @@ def inverse_step(state, signals, start, count):
         take_reference(state, inverse)
         settled = follow_contact(state, inverse)
         error0, error1 = y0 - c.p.shape[0] * v.reference, y1 - c.p.shape[1] * v.reference
-        force0 = force1 = 0.0
+        samples[Y, 0] = samples[Y + 1, 0] = 0.0
         if update_confidence(state, implausible):
             forget(inverse, 0, PARAMETERS)
         elif implausible == 0 and v.learns > 0:
-            if settled:
-                learn(inverse, 0, error0)
-                if c.p.coordinates > 1:
-                    learn(inverse, 1, error1)
             open_gate(state, inverse, error0)
-            force0, force1 = damp(state, 0, error0), damp(state, 1, error1)
+            for i in range(c.p.coordinates):
+                error = error0 if i == 0 else error1
+                if settled:
+                    learn(inverse, i, error)
+                samples[Y + i, 0] = damp(state, i, error)
         if v.sample % REVERSION == 0:
             revert(inverse)
         if v.sample % REFRESH == 0:
@@ -450,10 +472,10 @@ def inverse_step(state, signals, start, count):
         across = v.stiffness[0, 1] * d0 + v.damping[0, 1] * d1 + v.mass[0, 1] * d2
         other = v.stiffness[1, 1] * d0 + v.damping[1, 1] * d1 + v.mass[1, 1] * d2
         nominal0, nominal1 = s0 * along + s1 * across, s0 * across + s1 * other
-        learned = learned_force(state, inverse, 0)
-        compare(inverse, nominal0, learned)
-        samples[Y, 0] = nominal0 + learned + force0
-        samples[Y + 1, 0] = nominal1 + learned_force(state, inverse, 1) + force1 + level(inverse)
+        learned0, learned1 = learned_force(state, inverse)
+        compare(inverse, nominal0, learned0)
+        samples[Y, 0] += nominal0 + learned0
+        samples[Y + 1, 0] += nominal1 + learned1 + level(inverse)
         play(state, inverse, drive, flags, n, nominal0, nominal1)
         advance_regressors(state, inverse)
         v.sample += 1
