@@ -73,18 +73,20 @@ class NaiveInverse:
             self.contact, self.since, self.timer = touching, 0, law["awake"]
             self.forget(FINGER, HEAVE)
             self.forget(LOAD, COUNT)
-            self.forget(HEAVE, LOAD)
-            self.earlier = self.earlier[0], self.earlier[0]
-            self.theta[HEAVE:LOAD], self.P[HEAVE:LOAD, HEAVE:LOAD] = self.earlier[0]
             self.discretise()
-        elif self.since == law["settling"]:
+        elif self.since in (law["settling"], law["joining"]):
+            self.theta[HEAVE:LOAD] = self.earlier[0][0]
+            self.P[:] = law["spread"]
+            self.P[HEAVE:LOAD, HEAVE:LOAD] = self.earlier[0][1]
+            self.earlier = self.earlier[0], self.earlier[0]
             self.psi[:] = 0.0
+            self.theta[INITIAL:] = 0.0
             for k in range(4):
                 self.psi[k, INITIAL + k] = 1.0
                 self.P[INITIAL + k, INITIAL + k] = law["start"][k]
-        elif self.since == law["joining"]:
+        elif self.since == law["joined"]:
             self.forget(INITIAL, COUNT)
-        if self.samples % law["notice"] == 0:
+        elif self.since > law["joined"] and self.samples % law["notice"] == 0:
             self.earlier = self.earlier[1], (self.theta[HEAVE:LOAD].copy(), self.P[HEAVE:LOAD, HEAVE:LOAD].copy())
         return self.since >= law["settling"]
 

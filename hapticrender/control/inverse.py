@@ -38,7 +38,8 @@ SCALE = 2 * math.pi * 200.0  # rad/s: derivatives are divided by its powers, so 
 POLE, POLE_DAMPING = 2 * math.pi * 200.0, 0.8  # the finger's pair of poles
 PEOPLE, SEED = 300, 1  # fingers of the prior, and the seed that draws them
 REVERSION_RATES = {FINGER: 0.1, HEAVE: 0.003, ROCKING: 0.01, LOAD: 1.0}  # 1/sqrt(s), from each parameter on
-SETTLING, JOINING, AWAKE = 2e-3, 62e-3, 0.1  # s after a contact: learning starts, initial motion ends, damper sleeps
+SETTLING, RESTART, AWAKE = 2e-3, 62e-3, 0.1  # s after a contact: learning starts, and again; the damper sleeps
+JOINING = 60e-3  # s: for so long the deviation at the start of learning is a parameter
 NOTICE = 10e-3  # s: a contact is reported within this
 GATE_SIGMAS = 2.0  # of the sensors' noise: a larger deviation within 4 ms opens the inner damper
 INITIAL_MOTION = (15e-6, 0.02)  # m and m/s: deviation and its velocity at a contact
@@ -214,7 +215,8 @@ def law_settings(model: DeviceModel, bands: Bands, ahead: int, feedback: bool) -
         "pole_damping": POLE_DAMPING,
         "fade_step": period / FADE_IN,
         "settling": round(SETTLING * model.rate),
-        "joining": round(JOINING * model.rate),
+        "joining": round(RESTART * model.rate),
+        "joined": round((RESTART + JOINING) * model.rate),
         "awake": round(AWAKE * model.rate),
         "notice": max(round(NOTICE * model.rate), 1),
         "level": (GATE_SIGMAS * noise[0]) ** 2,

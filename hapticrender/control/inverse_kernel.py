@@ -51,7 +51,7 @@ INVERSE = np.dtype(
         *((name, np.float64) for name in ("lever_per_metre", "hertz_scale", "pole", "pole_damping", "fade_step")),
         *(
             (name, np.float64)
-            for name in ("settling", "joining", "awake", "notice", "level", "high_pass", "mean_square")
+            for name in ("settling", "joining", "joined", "awake", "notice", "level", "high_pass", "mean_square")
         ),
         *((name, np.float64) for name in ("hold", "decay", "smoothing", "levelling", "slowly")),
         ("filters", np.float64, (4, TAPS)),
@@ -238,10 +238,34 @@ def restore_device(inverse):
 
 
 @kernel
+def restart(inverse):
+    """Learn afresh from here on, with the deviation of now as four more parameters; the estimates stay.
+
+    The covariance returns to the prior: what the ringing of a contact taught through a model without the finger is not
+    as certain as it seemed.
+    """
+    v = record(inverse, INVERSE_T, 0)
+    theta, covariance, states = v.theta, v.covariance, v.states
+    restore_device(inverse)
+    for i in range(PARAMETERS):
+        within = i < HEAVE or i >= LOAD
+        for j in range(PARAMETERS):
+            if within or j < HEAVE or j >= LOAD:
+                covariance[i, j] = v.spread[i, j]
+    for k in range(4):
+        for i in range(ROWS):
+            states[k, i] = 0.0
+        states[k, INITIAL + k] = 1.0
+        theta[INITIAL + k], covariance[INITIAL + k, INITIAL + k] = 0.0, v.start[k]
+
+
+@kernel
 def follow_contact(controller, inverse):
-    """Reset what belongs to a contact when one begins or ends; its initial motion joins the parameters for a while."""
+    """Reset what belongs to a contact when one begins or ends, and learn afresh: at once, and when its ringing is over.
+
+    Returns whether there is anything to learn from.
+    """
     c, v = record(controller, CONTROLLER_T, 0), record(inverse, INVERSE_T, 0)
-    states = v.states
     if c.finger_seen > 0.0:
         v.lever = v.lever_per_metre * c.held_position
     v.since += 1.0
@@ -249,19 +273,13 @@ def follow_contact(controller, inverse):
         v.contact, v.since = c.finger_seen, 0.0
         forget(inverse, FINGER, HEAVE)
         forget(inverse, LOAD, PARAMETERS)
-        restore_device(inverse)
         c.fast_timer = v.awake
         discretise(controller, inverse)
-    elif v.since == v.settling:
-        for i in range(ROWS):
-            for k in range(4):
-                states[k, i] = 0.0
-        for k in range(4):
-            states[k, INITIAL + k] = 1.0
-            v.covariance[INITIAL + k, INITIAL + k] = v.start[k]
-    elif v.since == v.joining:
+    elif v.since == v.settling or v.since == v.joining:
+        restart(inverse)
+    elif v.since == v.joined:
         forget(inverse, INITIAL, PARAMETERS)
-    if v.sample % int(v.notice) == 0:
+    elif v.since > v.joined and v.sample % int(v.notice) == 0:
         note_device(inverse)
     return v.since >= v.settling
 
