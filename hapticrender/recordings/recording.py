@@ -17,6 +17,7 @@ from hapticrender.recordings import formats, journal, judge
 from hapticrender.recordings.envelopes import Envelopes, analyse
 from hapticrender.recordings.formats import MissingExtra
 from hapticrender.recordings.journal import Header
+from hapticrender.recordings.verdict import waveform_figures
 
 if TYPE_CHECKING:
     from hapticrender.touch.scene import Scene
@@ -68,8 +69,9 @@ class Recorder:
         """Append n samples of every signal.
 
         `drive` (n, channels) as commanded in each interval; `sensed` (n, channels); `motion` (n, places), true or the
-        best estimate; finger `position` (n,), m, NaN while lifted; `normal_load` (n,), N; `target` (n, n_bands), the
-        complex reference envelopes; `flags` (n,), ``protocols.Flag``.  Units are those of the header.  The first
+        best estimate; finger `position` (n,), m, NaN while lifted; `normal_load` (n,), N; `reference` (n,), the texture
+        as the scene asks for it; `target` (n, n_bands), the envelopes that the controller makes of it; `flags` (n,),
+        ``protocols.Flag``.  Units are those of the header.  The first
         block's `motion_source` replaces that of the header.
         """
         if motion_source is not None and self._file is None and not self._blocks:
@@ -126,8 +128,9 @@ def _signal(name: str, doc: str) -> Any:
 class Recording:
     """The result of a run, with all signals on one clock.
 
-    `drive`, `sensed`, `motion`, `position`, `normal_load`, `target` and `flags` read a whole signal, `read` a part of
-    one; units are `header.unit` and `header.drive_unit`, and `header.motion_source` says where the motion comes from.
+    `drive`, `sensed`, `motion`, `position`, `normal_load`, `flags`, `reference` and `target` read a whole signal,
+    `read` a part of one; units are `header.unit` and `header.drive_unit`, and `header.motion_source` says where the
+    motion comes from.
 
     Parameters
     ----------
@@ -169,6 +172,9 @@ class Recording:
     motion: Array = _signal("motion", "Motion at the evaluation points (unit, shape (n, places)).")
     position: Array = _signal("position", "Finger from the middle of the surface (m, shape (n,)), NaN while lifted.")
     normal_load: Array = _signal("normal_load", "Load of the finger (N, shape (n,)).")
+    reference: Array = _signal(
+        "reference", "Texture as the scene asks for it (unit, shape (n,)), unscaled and in full."
+    )
     target: Array = _signal("target", "Reference envelopes (unit, complex, shape (n, n_bands)).")
     flags: Array = _signal("flags", "Status words (int, shape (n,)), see ``protocols.Flag``.")
 
@@ -180,7 +186,7 @@ class Recording:
     def read(self, name: str, start: int = 0, stop: int | None = None, step: int = 1) -> Array:
         """Read every `step`-th sample (>= 1) of a signal from `start` to `stop`, a bounded number at a time.
 
-        `name` is "drive", "sensed", "motion", "position", "normal_load", "target" or "flags".
+        `name` is "drive", "sensed", "motion", "position", "normal_load", "flags", "reference" or "target".
         """
         if isinstance(self.frames, np.ndarray):
             return journal.column(self.header, self.frames[start:stop:step], name)
@@ -193,6 +199,11 @@ class Recording:
     def envelopes(self) -> Envelopes:
         """Reference and achieved envelopes over time (computed once)."""
         return analyse(self)
+
+    @cached_property
+    def waveform(self) -> dict[str, Any]:
+        """Figures of the motion against the reference (computed once), see ``verdict.waveform_figures``."""
+        return waveform_figures(self)
 
     def summary(self) -> dict[str, Any]:
         """Figures and verdict as plain numbers, ready for JSON (see ``judge.summary``)."""
