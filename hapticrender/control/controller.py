@@ -222,14 +222,21 @@ def lowest_carrier(model: DeviceModel, bands: Bands) -> float:
     return min(lowest_fixed(bands), model.lowest_frequency if (bands.wavenumber > 0.0).any() else math.inf)
 
 
+def refuse_whole_waveform(bands: Bands) -> None:
+    """Refuse a texture without carriers, in a method that works band by band."""
+    if bands.envelope is None and not len(bands):
+        raise ValueError("texture.carriers is missing: must be >= 1, this method plays bands, not the whole waveform")
+
+
 def shared_settings(
     model: DeviceModel, bands: Bands, sensor_map: Array, drive_map: Array, feedback: bool
 ) -> dict[str, Any]:
-    """Settings that every method has, sample by sample; a ValueError where the device has too many channels.
+    """Settings that every method has, sample by sample; a ValueError without carriers or with too many channels.
 
     `sensor_map` (c, s) takes sensors to controlled coordinates, `drive_map` (d, c) what the law commands in each
     coordinate to drive channels.  Without feedback nothing is sensed.
     """
+    refuse_whole_waveform(bands)
     sensor_map = sensor_map[:, : None if feedback else 0]
     counts = {"coordinates": len(sensor_map), "channels": len(drive_map), "sensors": sensor_map.shape[1]}
     for (name, count), most in zip(counts.items(), (2, MOST_CHANNELS, MOST_SENSORS), strict=True):
