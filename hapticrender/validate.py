@@ -103,7 +103,7 @@ def validate(
 
     Examples
     --------
-    >>> [verdict] = validate(["grating-20"], seed=1)
+    >>> [verdict] = validate(["one-texture-electroadhesion"], seed=1)
     >>> verdict.passed
     True
     """
