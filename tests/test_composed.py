@@ -50,7 +50,7 @@ def test_samples_that_cannot_be_played_are_refused(fields, message):
 
 
 def test_a_sum_adds_waveforms_and_bands():
-    both = TONE - 0.5 * (RIDGES + TONE)
+    both = TONE + -0.5 * (RIDGES + TONE)
     position = 0.01 * np.sin(TIME)
     expected = 0.5 * TONE.waveform(TIME, position) - 0.5 * RIDGES.waveform(TIME, position)
     np.testing.assert_allclose(both.waveform(TIME, position), expected, atol=1e-18)
@@ -85,7 +85,7 @@ def test_a_playlist_plays_each_from_its_beginning_and_starts_again():
     np.testing.assert_allclose(played[4051:5600], played[1:1550], atol=1e-14)
 
 
-@pytest.mark.parametrize("texture", [CHIRP, ARRAY, 0.5 * ARRAY + TONE, hr.Playlist([(TONE - CHIRP, 1.0), (TONE, 0.5)])])
+@pytest.mark.parametrize("texture", [CHIRP, ARRAY, 0.5 * ARRAY + TONE, hr.Playlist([(TONE + CHIRP, 1.0), (TONE, 0.5)])])
 def test_a_scene_file_holds_them(texture):
     scene = hr.Scene(texture=texture, duration=1.0)
     assert hr.Scene.from_toml_text(scene.to_toml()) == scene

@@ -40,7 +40,7 @@ def test_a_friction_moves_it_by_the_fingers_admittance_where_the_scene_says_so()
     share = velocity_per_unit(recording, 111.0)
     assert abs(share) == pytest.approx(0.484, abs=5e-4)  # FACTS 4, light finger, 4th order
     [band] = skin_bands(recording)
-    assert band.target == pytest.approx(8e-3, rel=1e-6)  # a difference of 1 us
+    assert band.target == pytest.approx(8e-3, rel=1e-6)
     assert band.achieved == pytest.approx(8e-3, rel=0.02)
 
 

@@ -13,7 +13,6 @@ from hapticrender.touch.grating import Grating
 from hapticrender.touch.scene import Scene
 from hapticrender.validate import Verdict, exit_status, validate, write_json, write_junit
 
-
 FINE = {"current_bits": 20}  # of 12 bits a finger may feel the rounding at 160 to 200 Hz
 
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator
 from functools import partial
+from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -39,7 +40,7 @@ LOOSER = 2.0  # times the tolerance: bound on a third octave and on the worst wi
 UNPLAYABLE = 0.01  # share of the reference's energy outside B from which it is noted
 LEAST = 1e-4  # share of the reference's energy in B below which nothing is judged
 LONGEST_DELAY = 20e-3  # s, of the best delay
-AFTER_CONTACT = ((0.0, 0.05), (0.05, 0.2))  # s
+AFTER_CONTACT = (0.0, 0.05, 0.2)  # s: edges of the two spans that are stated
 MATTERS = Flag.SATURATED | Flag.NONFINITE | Flag.SENSOR_CLIPPED | Flag.OVERRUN
 
 
@@ -55,7 +56,9 @@ def waveform_figures(recording: Recording) -> dict[str, Any]:
     if not window or not count:
         return found
     stop = begin + count * window
-    power = np.concatenate([_power(recording, *piece, window) for piece in _pieces(begin, stop, window)])
+    size = max(READ_AT_ONCE // window, 1) * window
+    pieces = [(start, min(start + size, stop)) for start in range(begin, stop, size)]
+    power = np.concatenate([_power(recording, *piece, window) for piece in pieces])
     found["lost_windows"] = int(np.isnan(power).any(axis=1).sum())
     if found["lost_windows"]:
         return found
@@ -74,14 +77,9 @@ def waveform_figures(recording: Recording) -> dict[str, Any]:
         total = spectrum[_within(frequency, *_band(rate))].sum(axis=0)
         errors = {"waveform_error": math.sqrt(total[i] / total[0]), "window_error": _windows(power[:, [0, i]])}
         found["places"][place] = errors | _thirds(spectrum[:, [0, i]], frequency, rate, floor)
-    found |= _likeness(frequency[inside], spectrum[inside, :2], cross[inside], (header.profile or (1.0,))[0])
+    sign = float(np.sign((header.profile or (1.0,))[0]))
+    found |= _likeness(frequency[inside], spectrum[inside, :2], cross[inside], sign)
     return found | {"contacts": _contacts(recording, begin, stop, math.sqrt(power[:, 0].mean()))}
-
-
-def _pieces(begin: int, stop: int, window: int) -> Iterator[tuple[int, int]]:
-    """First and last sample of pieces of whole windows."""
-    size = max(READ_AT_ONCE // window, 1) * window
-    yield from ((start, min(start + size, stop)) for start in range(begin, stop, size))
 
 
 def _band(rate: float) -> tuple[float, float]:
@@ -187,16 +185,17 @@ def _outside(reference: Array, frequency: Array, inside: Array, unit: str) -> fl
     return float(outside.sum() / reference.sum())
 
 
-def _likeness(frequency: Array, spectrum: Array, cross: Array, share: float) -> dict[str, float]:
+def _likeness(frequency: Array, spectrum: Array, cross: Array, sign: float) -> dict[str, float]:
     """Best delay (s) and gain of y over r within 20 ms, and the share of y's energy that they do not explain.
 
     ``c(tau) = Re sum_f R* Y exp(j 2 pi f tau)`` is largest at the delay; gain ``c/sum |R|^2``, incoherent share
     ``1 - c^2/(sum |R|^2 sum |Y|^2)``.
     """
     reference, error = spectrum.T
-    motion = error + 2.0 * share * cross.real + share**2 * reference
+    whole = cross + sign * reference  # of r and y = e + sign r
+    motion = error + 2.0 * sign * cross.real + sign**2 * reference
     delay = np.linspace(-LONGEST_DELAY, LONGEST_DELAY, 4001)
-    turned = np.exp(2j * np.pi * np.outer(delay, frequency)) @ (cross + share * reference)
+    turned = np.exp(2j * np.pi * np.outer(delay, frequency)) @ whole
     best = int(np.argmax(turned.real * (1.0 - 1e-6 * np.abs(delay) / LONGEST_DELAY)))  # of equal ones the shortest
     found, total = float(turned.real[best]), float(reference.sum())
     incoherent = 1.0 - found**2 / max(total * float(motion.sum()), np.finfo(float).tiny)
@@ -205,19 +204,11 @@ def _likeness(frequency: Array, spectrum: Array, cross: Array, share: float) -> 
 
 def _contacts(recording: Recording, begin: int, stop: int, level: float) -> dict[str, Any]:
     """Count of touches and lifts, and the error after them over the reference's rms `level`, at the worst place."""
-    found: dict[str, Any] = {"count": 0}
-    squares: list[list[Array]] = [[] for _ in AFTER_CONTACT]
-    for event in _events(recording, begin, stop):
-        edges = [event + round(seconds * recording.rate) for pair in AFTER_CONTACT for seconds in pair]
-        if edges[-1] <= stop:
-            found["count"] += 1
-            values = _filtered(recording, event, edges[-1])[:, 1:] ** 2
-            for kept, (first, last) in zip(squares, (edges[:2], edges[2:]), strict=True):
-                kept.append(values[first - event : last - event].mean(axis=0))
-    for (after, until), kept in zip(AFTER_CONTACT, squares, strict=True):
-        name = f"error_{1e3 * after:.0f}_{1e3 * until:.0f}_ms"
-        found[name] = float(np.sqrt(np.mean(kept, axis=0).max()) / level) if kept else None
-    return found
+    edges = [round(seconds * recording.rate) for seconds in AFTER_CONTACT]
+    after = [_filtered(recording, at, at + edges[-1]) for at in _events(recording, begin, stop - edges[-1])]
+    squares = [[(values[a:b, 1:] ** 2).mean(axis=0) for a, b in pairwise(edges)] for values in after]
+    errors = (np.sqrt(np.mean(squares, axis=0).max(axis=1)) / level).tolist() if squares else [None, None]
+    return {"count": len(after), "error_0_50_ms": errors[0], "error_50_200_ms": errors[1]}
 
 
 def _events(recording: Recording, begin: int, stop: int) -> Iterator[int]:

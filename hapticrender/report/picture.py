@@ -74,7 +74,7 @@ def _draw(figure: Any, recording: Recording, touched: bool) -> None:
     grid = figure.add_gridspec(len(heights), 2, height_ratios=heights, width_ratios=[1.35, 1])
     _head(figure.add_subplot(grid[0, :]), summary, touched)
     amplitude = figure.add_subplot(grid[1, :])
-    _amplitude(amplitude, recording, summary)
+    (_amplitude if summary["bands"] else _course)(amplitude, recording, summary)
     _close_up(figure.add_subplot(grid[2, 0]), recording)
     _errors(figure.add_subplot(grid[2, 1]), recording)
     below = [figure.add_subplot(grid[3 + i, :], sharex=amplitude) for i in range(len(lanes))]
@@ -132,6 +132,18 @@ def _amplitude(axes: Any, recording: Recording, summary: dict[str, Any]) -> None
     several = "" if shown.sum() <= 1 else f" ({int(shown.sum())} bands: root of the sum of squares)"
     axes.set(title=f"Peak amplitude{several}", ylabel=f"amplitude ({unit})")
     axes.set_ylim(0, 1.25 * max(np.nanmax(achieved, initial=0), high.max(initial=0)) or 1)
+    legend(axes)
+
+
+def _course(axes: Any, recording: Recording, summary: dict[str, Any]) -> None:
+    """Range that texture and motion cover over time, of a texture without bands."""
+    scale, unit = drawn(recording.header.unit)
+    for name, colour, label in (("motion", BLUE, recording.header.places[0]), ("reference", INK, "texture")):
+        time, low, high = outline(recording, name)
+        low, high = (scale * _bounded(values.reshape(len(time), -1)[:, 0]) for values in (low, high))
+        axes.fill_between(time, low, high, color=colour, alpha=0.5, lw=0.5, label=label)
+    axes.axvline(summary["judged_from"], color=PALE, lw=0.9, ls=":", label="judged from here")
+    axes.set(title="Waveform", ylabel=f"{QUANTITIES.get(recording.header.unit, 'motion')} ({unit})")
     legend(axes)
 
 
@@ -193,7 +205,7 @@ def _errors(axes: Any, recording: Recording) -> None:
     axes.text(0.01, allowed, f"{allowed:.3g} %", fontsize=8, va="bottom", transform=axes.get_yaxis_transform())
     axes.set_xticks(range(len(names)), names, fontsize=7.5)
     axes.set_xlim(-0.6, max(len(names), 1) - 0.4)
-    axes.set(title="Error of the third octaves", ylabel="error (%)", xlabel="Hz")
+    axes.set(title="Third octaves", ylabel="error (%)", xlabel="Hz")
     legend(axes, columns=4)
 
 

@@ -22,7 +22,7 @@ Parts = tuple[tuple[Texture, float], ...]
 
 
 class Composable:
-    """Base of the library's textures: ``a + b``, ``a - b`` and ``0.5 * a`` are `Sum`s."""
+    """Base of the library's textures: ``a + b`` and ``0.5 * a`` are `Sum`s."""
 
     def __add__(self, other: Any) -> Sum:
         return Sum((*_terms(self), *_terms(other))) if isinstance(other, Texture) else NotImplemented
@@ -31,12 +31,6 @@ class Composable:
         return Sum(tuple((each, gain * own) for each, own in _terms(self)))
 
     __rmul__ = __mul__
-
-    def __neg__(self) -> Sum:
-        return -1.0 * self
-
-    def __sub__(self, other: Any) -> Sum:
-        return self + -1.0 * other
 
 
 def _terms(texture: Any) -> Parts:
