@@ -336,6 +336,19 @@ def test_figures_from_sensors_contain_the_uncertainty_of_their_gain():
         assert summary["verdict"] == found
 
 
+@pytest.mark.parametrize(("gain", "found"), [(1.0, "not judged"), (0.8, "failed")])
+def test_what_the_noise_of_the_sensors_hides_is_not_judged(rng, gain, found):
+    """White noise of 1 um has 0.44 um from 20 to 500 Hz, 6.2 % of a tone of 10 um; the tolerance is 2 %."""
+    bands = make_bands(100.0, 10 * UM)
+    recorder = make_recorder(None, bands, tolerance=0.02)
+    recorder.header = replace(recorder.header, sensed_noise=UM, motion_source="sensors")
+    recorder.append(**make_signals(bands, gain * bands.envelope, extra=UM * rng.standard_normal((20_000, 3))))
+    summary = recorder.finish().summary()
+    assert summary["waveform"]["sensor_noise"] == pytest.approx(math.sqrt(480 / 2500) / math.sqrt(50), rel=1e-3)
+    assert summary["waveform"]["places"]["centre"]["third_octaves"]["250 Hz"] < 0.04
+    assert summary["verdict"] == found
+
+
 def test_pieces_of_any_size_give_the_same_figures(rng, monkeypatch):
     noise = white(20, 400, rng)
     expected = make_play(noise, 0.9 * noise + 0.1 * np.roll(noise, 3)).waveform["places"]["centre"]

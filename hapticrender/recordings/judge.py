@@ -26,6 +26,7 @@ READ_AT_ONCE = 2**18  # samples
 SETTLED = 0.05  # of the target
 SETTLED_FOR = 0.5  # s, or
 SETTLED_SHARE = 0.1  # of the judged time where that is shorter: inside for so long at the end, a band has settled
+HARDLY = 2.0  # times what the sensors' noise alone reads: a smaller figure cannot be told from it
 IN_BAND = f"{BAND[0]:g} to {BAND[1]:g} Hz"
 UNJUDGED: dict[str, Any] = {"figure": "waveform_error", "value": None, "bound": None, "band": "any", "place": "any"}
 
@@ -163,6 +164,12 @@ def _verdict(recording: Recording, worst: dict[str, Any]) -> tuple[str, str]:
     if found["share_in_band"] < LEAST:
         return "not judged", f"the texture has nothing from {IN_BAND}"
     if worst["value"] > worst["bound"]:
+        noise = found["sensor_noise"]
+        if worst["value"] - header.calibration <= HARDLY * noise:
+            return (
+                "not judged",
+                f"the noise of the sensors alone reads {percent(noise)}, the worst figure is no clearer",
+            )
         return "failed", ""
     counts = _flag_counts(recording, round(judged_from(recording) * recording.rate))
     raised = [f"{flag.name} in {count} samples" for flag, count in counts.items() if count and flag & MATTERS]

@@ -51,7 +51,7 @@ def waveform_figures(recording: Recording) -> dict[str, Any]:
     window, begin = round(WINDOW * rate), math.ceil(judged_from(recording) * rate - 1e-6)
     count = max(len(recording) - begin, 0) // max(window, 1)
     places = [place.replace(" ", "_") for place in header.places]
-    found: dict[str, Any] = {"lost_windows": 0, "places": dict.fromkeys(places), "contacts": None}
+    found: dict[str, Any] = {"lost_windows": 0, "places": dict.fromkeys(places), "contacts": None, "sensor_noise": 0.0}
     found |= dict.fromkeys(("rms_reference", "share_in_band", "share_outside", "delay", "gain", "incoherent"))
     if not window or not count:
         return found
@@ -72,6 +72,7 @@ def waveform_figures(recording: Recording) -> dict[str, Any]:
     found["share_outside"] = _outside(reference, frequency, inside, header.unit)
     if found["share_in_band"] < LEAST:
         return found
+    found["sensor_noise"] = _noise(recording, *_band(rate)) / math.sqrt(reference[inside].sum())
     floor = partial(_floor, recording, level)
     for i, place in enumerate(places, start=1):
         total = spectrum[_within(frequency, *_band(rate))].sum(axis=0)
@@ -170,10 +171,14 @@ def _floor(recording: Recording, level: float, middle: float) -> float:
     """
     header = recording.header
     least = float(detection_threshold(middle, CURVE)) / math.sqrt(2.0) if header.unit == "m" else SPUR * level
-    if header.motion_source == "sensors":
-        width = middle * (EDGE - 1.0 / EDGE)
-        least = max(least, 2.0 * header.sensed_noise * math.sqrt(2.0 * width / header.rate))
-    return least / (LOOSER * header.tolerance)
+    return max(least, 2.0 * _noise(recording, middle / EDGE, middle * EDGE)) / (LOOSER * header.tolerance)
+
+
+def _noise(recording: Recording, low: float, high: float) -> float:
+    """Rms of a sensor's white noise from `low` to `high` (Hz) in the motion; 0 where that is not from the sensors."""
+    header = recording.header
+    measured = header.motion_source == "sensors"
+    return header.sensed_noise * math.sqrt(2.0 * (high - low) / header.rate) if measured else 0.0
 
 
 def _outside(reference: Array, frequency: Array, inside: Array, unit: str) -> float:
