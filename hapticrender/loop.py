@@ -117,6 +117,7 @@ def run(rendering: Rendering, *, journal: str | Path | None = None, progress: Pr
     names = ("places", "unit", "drive_unit", "profile")
     recorder = Recorder(
         journal,
+        requested=rendering.requested,
         scene=rendering.scene,
         method=rendering.scene.method,
         seed=rendering.scene.seed,
@@ -207,7 +208,6 @@ class _Loop:
         self.step = driver.block * (max(int(CHUNK * driver.rate / driver.block), 1) if exchange is not None else 1)
         self._start = 0
         self._drive = np.zeros((driver.block, driver.drive_channels))
-        self._before = np.full(2, np.nan)  # last positions (m) of the finger
 
     def advance(self, start: int, count: int) -> dict[str, Any]:
         """Advance by `count` samples from sample `start` on; a last block is cut in the record, not on the device."""
@@ -219,15 +219,8 @@ class _Loop:
         load = finger.load(time) if sensed.normal_load is None else sensed.normal_load
         motion, source = self._motion(sensed)
         signals = {"drive": drive, "sensed": values, "motion": motion, "position": position, "normal_load": load}
-        reference = self.rendering.requested(time, position, self._velocity(position))
-        signals |= {"target": target, "flags": flags, "reference": reference}
+        signals |= {"target": target, "flags": flags}
         return {"motion_source": source} | {name: signal[:count] for name, signal in signals.items()}
-
-    def _velocity(self, position: Array) -> Array:
-        """Finger's velocity (m/s), of second order; 0 at the edges of a touch."""
-        path = np.concatenate([self._before, position])
-        self._before = path[-2:]
-        return np.nan_to_num(np.gradient(path, edge_order=2)[2:] * self.rendering.driver.rate)
 
     def _block(self, count: int, reference: Callable[[Array], Array]) -> tuple[Array, Array, Array, Sensed]:
         """Exchange a block with the driver; the drive computed from it is played with the next one."""
