@@ -231,12 +231,11 @@ def refuse_whole_waveform(bands: Bands) -> None:
 def shared_settings(
     model: DeviceModel, bands: Bands, sensor_map: Array, drive_map: Array, feedback: bool
 ) -> dict[str, Any]:
-    """Settings that every method has, sample by sample; a ValueError without carriers or with too many channels.
+    """Settings that every method has, sample by sample; a ValueError where the device has too many channels.
 
     `sensor_map` (c, s) takes sensors to controlled coordinates, `drive_map` (d, c) what the law commands in each
     coordinate to drive channels.  Without feedback nothing is sensed.
     """
-    refuse_whole_waveform(bands)
     sensor_map = sensor_map[:, : None if feedback else 0]
     counts = {"coordinates": len(sensor_map), "channels": len(drive_map), "sensors": sensor_map.shape[1]}
     for (name, count), most in zip(counts.items(), (2, MOST_CHANNELS, MOST_SENSORS), strict=True):
