@@ -1,7 +1,7 @@
 """A new kind of device takes a plant and a renderer: here a shaker, a mass on a spring that one coil moves.
 
 Everything else is the library's: targets, control, judgement, pictures.
-The figure is the worst rms error (1) under a finger that touches and leaves.
+The figure is the rms error of the amplitude (1) under a finger that touches and leaves.
 """
 
 import numpy as np
@@ -73,7 +73,7 @@ class ShakerRenderer(BaseRenderer):
 def main() -> float:
     finger = hr.Finger.still(normal_load=0.4, touches=[(1.0, 2.0)], mechanics="light-2nd-order")
     scene = hr.Scene(texture=hr.Grating(frequency=80.0, amplitude=20e-6), finger=finger, device="shaker", duration=3.0)
-    return hr.render(scene, renderer=ShakerRenderer()).summary()["worst"]["value"]
+    return hr.render(scene, renderer=ShakerRenderer()).summary()["bands"][0]["rms_error_top"]
 
 
 if __name__ == "__main__":

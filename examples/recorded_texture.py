@@ -34,7 +34,7 @@ def main() -> float:
     with TemporaryDirectory() as folder:
         path = Path(folder) / "ridges.wav"
         make_recording(path)
-        texture = hr.Recorded(file=path, amplitude=10e-6, speed=RECORDED_SPEED)
+        texture = hr.Recorded(file=path, amplitude=10e-6, speed=RECORDED_SPEED, carriers=8)
         finger = hr.Finger.sliding(speed=2 * RECORDED_SPEED, span=0.09)
         recording = hr.render(hr.Scene(texture=texture, finger=finger, duration=2.0))
     one_stroke = (recording.time > 0.6) & (recording.time < 1.3)  # the finger turns at 0.45 and 1.35 s

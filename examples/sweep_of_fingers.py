@@ -1,6 +1,6 @@
 """Sixteen fingers on the same grating, rendered by two processes.
 
-The figure is the worst relative error at the finger.
+The figure is the worst waveform error of any finger, at its worst place.
 """
 
 from concurrent.futures import ProcessPoolExecutor

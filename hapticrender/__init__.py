@@ -31,6 +31,7 @@ _HOMES = {
     "protocols": "Controller Driver Flag Method Motion Plant Renderer Rendering Sensed Texture",
     "recordings.recording": "Recorder Recording",
     "touch.builtin_scenes": "builtin_scenes",
+    "touch.composed": "Chirp Playlist Sum",
     "touch.finger": "Finger",
     "touch.grating": "Grating",
     "touch.mechanics": "FingerMechanics",
@@ -75,6 +76,9 @@ if _typing.TYPE_CHECKING:
     from hapticrender.recordings.recording import Recorder as Recorder
     from hapticrender.recordings.recording import Recording as Recording
     from hapticrender.touch.builtin_scenes import builtin_scenes as builtin_scenes
+    from hapticrender.touch.composed import Chirp as Chirp
+    from hapticrender.touch.composed import Playlist as Playlist
+    from hapticrender.touch.composed import Sum as Sum
     from hapticrender.touch.finger import Finger as Finger
     from hapticrender.touch.grating import Grating as Grating
     from hapticrender.touch.mechanics import FingerMechanics as FingerMechanics

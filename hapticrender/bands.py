@@ -40,6 +40,8 @@ def _check(name: str, column: Array, shape: tuple[int, ...], unit: str, least: f
 class Bands:
     """Carriers of a texture, one entry a band, and the target envelope of each.
 
+    Without any (`Bands.none`) the whole waveform is the target, which methods that work band by band refuse.
+
     The target displacement is ``Re sum_k envelope_k exp(j phi_k)`` with
     ``phi_k = 2 pi (frequency_k t + wavenumber_k x) + phase_k``: a fixed carrier
     has wavenumber 0, a carrier locked to the finger has frequency 0.
@@ -57,7 +59,7 @@ class Bands:
     differentiated : bool
         The target is the time derivative of the envelopes' signal, at whatever frequency a carrier comes to be.
     spatial : bool
-        Whether a waveform without bands is read at the position of the finger.
+        The waveform follows the finger; said where there are no carriers, which would show it.
     sensor_response : ndarray of complex, shape (n,), or None
         Response of the device's sensor to each band, not 0; None: 1.  `tone` refers the targets to the sensor.
     unfelt : tuple of str
@@ -90,6 +92,16 @@ class Bands:
     def __len__(self) -> int:
         return len(self.frequency)
 
+    @classmethod
+    def none(cls, *, spatial: bool) -> Bands:
+        """No carriers: the whole waveform is the target; it follows the finger if `spatial`."""
+        return cls(frequency=np.zeros(0), wavenumber=np.zeros(0), phase=np.zeros(0), spatial=spatial)
+
+    @property
+    def follows_finger(self) -> bool:
+        """Whether the whole target follows the finger."""
+        return self.spatial or (len(self) > 0 and bool((self.wavenumber > 0.0).all()))
+
     def select(self, which: Array, **changes: Any) -> Bands:
         """Bands at the indices, or where the mask, `which`, with `changes` of other fields."""
         columns = {name: column[which] for name in _COLUMNS if (column := getattr(self, name)) is not None}
@@ -98,7 +110,7 @@ class Bands:
     def checked(self, name: str, waveform: Callable[[Array, Array], Any], time: Array, position: Array) -> Array:
         """Target waveform at `time` (s) and `position` (m); the texture `name` must return finite numbers.
 
-        0 while the finger is away, where every carrier is locked to it.
+        0 while the finger is away, where it all follows it.
 
         Raises
         ------
@@ -109,7 +121,7 @@ class Bands:
         if np.shape(values) != np.shape(position) or np.asarray(values).dtype.kind not in "iuf":
             found = f"shape {values.shape}" if isinstance(values, np.ndarray) else type(values).__name__
             raise ValueError(f"{name}.waveform returned {found}: must be {len(position)} numbers, one a sample")
-        away = np.isnan(position) if len(self) and (self.wavenumber > 0.0).all() else np.zeros(len(position), bool)
+        away = np.isnan(position) & self.follows_finger
         values = np.where(away, 0.0, np.asarray(values, float))
         bad = np.flatnonzero(~np.isfinite(values))
         if bad.size:

@@ -247,7 +247,7 @@ class Validated:
             check, value = each.metadata.get("check"), getattr(self, each.name)
             if check is None or (value is None and each.default is None):
                 continue
-            check = integer if check is number and each.type in (int, "int") else check
+            check = integer if check is number and each.type in (int, "int", "int | None") else check
             keep(self, **{each.name: check(each.name, value, **each.metadata["bounds"])})
 
     @classmethod

@@ -118,6 +118,7 @@ def run(rendering: Rendering, *, journal: str | Path | None = None, progress: Pr
     names = ("places", "unit", "drive_unit", "profile")
     recorder = Recorder(
         journal,
+        requested=rendering.requested,
         scene=rendering.scene,
         method=rendering.scene.method,
         seed=rendering.scene.seed,
@@ -126,6 +127,8 @@ def run(rendering: Rendering, *, journal: str | Path | None = None, progress: Pr
         drive_channels=driver.drive_channels,
         sensed_channels=driver.sensed_channels,
         drive_limit=model.drive_limit if np.isfinite(model.drive_limit) else None,
+        sensed_noise=model.sensed_noise,
+        calibration=getattr(rendering.device, "calibration", 0.0),
         **{name: getattr(model, name) for name in names},
     )
     with recorder, _stopped_by_sigterm(), driver, _zero_drive_after(rendering.device):

@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from hapticrender.touch.scene import Scene
 
 Array = np.ndarray[Any, np.dtype[Any]]
+DIFFERENCE = 1e-7  # s: step of a time derivative of a waveform
 
 
 class Flag(IntFlag):
@@ -56,8 +57,9 @@ class Texture(Protocol):
     def bands(self, rate: float) -> Bands:
         """Carriers, and constant envelopes where the texture has them, for sampling at `rate` (Hz).
 
-        Two carriers must differ: envelopes are estimated with a bandwidth of at most spacing/(2 pi).
-        `hapticrender.strongest_carriers` chooses the carriers of a signal.
+        No carriers at all: the whole waveform is played, by methods that need no bands.  Two carriers must differ:
+        envelopes are estimated with a bandwidth of at most spacing/(2 pi).  `hapticrender.strongest_carriers` chooses
+        the carriers of a signal.
         """
         ...
 
@@ -161,6 +163,7 @@ class Rendering:
     model: DeviceModel  # for which the controller is designed
     bands: Bands  # carriers and targets, in the device's quantity
     waveform: Callable[[Array, Array], Array]  # target over time (s) and position (m), in the device's quantity
+    differentiated: bool = False  # the target is the time derivative of `waveform`
     controller: Callable[[], Controller]  # a new one at rest
 
     @property
@@ -172,6 +175,24 @@ class Rendering:
         """Texture's waveform that the controller analyses; 0 where every band has a constant envelope."""
         if self.bands.envelope is not None:
             return np.zeros(len(position))
+        return self._checked(time, position)
+
+    def requested(self, time: Array, position: Array, velocity: Array) -> Array:
+        """Texture as the scene asks for it (device's quantity, shape (n,)), for a finger at `velocity` (m/s).
+
+        0 while the finger is away, where the texture follows it or the device works on a finger alone.  A derivative is
+        ``dr/dt = (r(t + h, x + v h) - r(t - h, x - v h))/(2 h)``, h = 0.1 us: an error of 2e-8 at 500 Hz.
+        """
+        if self.differentiated:
+            step = np.array([DIFFERENCE, -DIFFERENCE])[:, None]
+            ahead, behind = (self._checked(time + h, position + velocity * h) for h in step)
+            values = (ahead - behind) / (2 * DIFFERENCE)
+        else:
+            values = self._checked(time, position)
+        away = np.isnan(position) & (self.bands.follows_finger or self.model.finger.needs_contact)
+        return np.where(away, 0.0, values)
+
+    def _checked(self, time: Array, position: Array) -> Array:
         return self.bands.checked(type(self.scene.texture).__name__, self.waveform, time, position)
 
 

@@ -89,9 +89,9 @@ def sweep(
 
 
 def worst_error(recording: Recording) -> float:
-    """Largest rms error of any band over its target; infinite where nothing can be judged."""
-    value = recording.summary()["worst"]["value"]
-    return float("inf") if value is None else float(value)
+    """Waveform error at the worst place; infinite where nothing can be judged."""
+    errors = [figures["waveform_error"] for figures in recording.waveform["places"].values() if figures]
+    return max(errors, default=float("inf"))
 
 
 def _run(

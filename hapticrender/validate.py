@@ -39,7 +39,8 @@ Tick = Callable[[float, float], None]
 class Verdict:
     """Verdict on one scene.
 
-    "passed", "failed", "not judged" (no figure can be given, for the reason) or "error" (it cannot be rendered).
+    "passed", "passed in band" (for the reason, part of the texture cannot be played), "failed", "not judged" (no figure
+    can be given, for the reason) or "error" (it cannot be rendered).
     """
 
     scene: str
@@ -47,12 +48,13 @@ class Verdict:
     method: str
     seed: int
     verdict: str
-    reason: str = ""  # where there is no figure
-    tolerance: float | None = None  # bound on the figure (relative error, 1)
-    figure: str = "rms_error"  # the worst one
+    reason: str = ""  # where the worst figure is none
+    tolerance: float | None = None  # of the scene (relative error, 1)
+    figure: str = "waveform_error"  # the worst one
     band: str = "any"
     place: str = "any"
     value: float | None = None  # of the worst figure (relative error, 1)
+    bound: float | None = None  # on it
     elapsed: float = 0.0  # s
     summary: Mapping[str, Any] = field(default_factory=dict, repr=False)  # ``Recording.summary()``
 
@@ -60,12 +62,12 @@ class Verdict:
     def of(cls, summary: Mapping[str, Any], elapsed: float) -> Verdict:
         """Take the verdict from ``Recording.summary()``; `elapsed` is in s."""
         keys = ("scene", "device", "method", "seed", "verdict", "reason", "tolerance")
-        worst = {key: summary["worst"][key] for key in ("figure", "value", "band", "place")}
+        worst = {key: summary["worst"][key] for key in ("figure", "value", "bound", "band", "place")}
         return cls(**{key: summary[key] for key in keys}, **worst, elapsed=elapsed, summary=summary)
 
     @property
     def passed(self) -> bool:
-        """Whether the worst figure is within the tolerance."""
+        """Whether every figure is within its bound, and all of the texture can be played."""
         return self.verdict == "passed"
 
     def __str__(self) -> str:
@@ -101,7 +103,7 @@ def validate(
 
     Examples
     --------
-    >>> [verdict] = validate(["grating-20"], seed=1)
+    >>> [verdict] = validate(["one-texture-electroadhesion"], seed=1)
     >>> verdict.passed
     True
     """
@@ -172,7 +174,7 @@ def _with_progress(
 def _summary(rendering: Rendering, folder: Path | None, tick: Tick | None) -> dict[str, Any]:
     """Run a rendering and judge it; only what does not pass stays in `folder`."""
     if folder is None:
-        size = 8 * rendering.samples * (2 * len(rendering.bands) + 12)
+        size = 8 * rendering.samples * (2 * len(rendering.bands) + 13)
         if size < IN_MEMORY:
             return run(rendering, progress=tick).summary()
         with tempfile.TemporaryDirectory() as scratch:
@@ -229,7 +231,7 @@ def _add_case(suite: ElementTree.Element, verdict: Verdict) -> None:
     element = ElementTree.SubElement(suite, "testcase", case)
     if verdict.verdict == "failed":
         attributes = {"message": _xml(sentence(verdict.summary)), "type": "tolerance"}
-        ElementTree.SubElement(element, "failure", attributes).text = _xml(as_json(verdict.summary["bands"]))
+        ElementTree.SubElement(element, "failure", attributes).text = _xml(as_json(verdict.summary["waveform"]))
     elif verdict.verdict != "passed":
         tag = "error" if verdict.verdict == "error" else "skipped"
         ElementTree.SubElement(element, tag, {"message": _xml(verdict.reason), "type": "scene"})

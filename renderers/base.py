@@ -27,6 +27,7 @@ class BaseRenderer:
 
     name = ""
     needs = "a driver"  # of a real device of this kind, in a few words
+    differentiated = False  # the target is the time derivative of `waveform`
 
     def open(self, scene: Scene, driver: Driver | None = None) -> Rendering:
         """Open a scene on the device behind `driver`, or on the simulated one; see ``protocols.Renderer``."""
@@ -50,6 +51,7 @@ class BaseRenderer:
             model=model,
             bands=bands,
             waveform=self.waveform(setup),
+            differentiated=self.differentiated,
             controller=partial(self.design, method, model, bands, feedback=facing.sensed_channels > 0),
         )
 

@@ -76,10 +76,14 @@ class FrictionSetup:
     @property
     def waveform(self) -> Waveform:
         """Waveform whose time derivative is the target friction: displacement over v/F (N s)."""
-        factor = 1.0 / (self.settings.velocity_per_force or VELOCITY_PER_FORCE)
+        share, texture, mechanics = self.settings.velocity_per_force, self.scene.texture, self.scene.finger.mechanics
+        factor = 1.0 / (share or VELOCITY_PER_FORCE)
 
         def impulse(time: Array, position: Array) -> Any:
-            values = self.scene.texture.waveform(time, position)
+            if not share and (bands := texture.bands(np.inf)).envelope is not None:
+                turned = bands.envelope / mechanics.skin_velocity_per_force(bands.frequency)
+                return (turned * np.exp(1j * bands.carrier_phase(time, position))).real.sum(axis=1)
+            values = texture.waveform(time, position)
             return factor * np.asarray(values) if np.shape(values) else values  # no array: refused by its user
 
         return impulse
@@ -175,6 +179,8 @@ class FrictionSetup:
 
 class FrictionRenderer(BaseRenderer):
     """Base of the renderers whose target quantity is friction (N) against the motion of a sliding finger."""
+
+    differentiated = True
 
     def waveform(self, setup: FrictionSetup) -> Waveform:
         """Return the waveform whose time derivative is the target friction: displacement over v/F (N s)."""

@@ -119,6 +119,7 @@ class HybridRenderer(BaseRenderer):
 
     name = "hybrid"
     needs = "2 coils (A), 2 displacement sensors (m), a current source on a carrier (A peak), a tribometer (N)"
+    differentiated = True
 
     def __init__(self) -> None:
         self._plate, self._screen = VibrotactileRenderer(), ElectroadhesionRenderer()

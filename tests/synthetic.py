@@ -50,13 +50,15 @@ def make_signals(
     carrier = np.exp(1j * bands.carrier_phase(time, position))
     envelope = np.broadcast_to(np.asarray(motion_envelope, complex), (n, len(PLACES), k))
     motion = np.einsum("npk,nk->np", envelope, carrier).real + extra
+    target = np.broadcast_to(np.asarray(bands.envelope if target is None else target, complex), (n, k))
     return {
         "drive": np.outer(np.sin(time), [1.0, 0.5]),
         "sensed": motion[:, 1:],
         "motion": motion,
         "position": position,
         "normal_load": np.where(np.isfinite(position), 0.4, 0.0),
-        "target": np.broadcast_to(np.asarray(bands.envelope if target is None else target, complex), (n, k)),
+        "target": target,
+        "reference": (target * carrier).real.sum(axis=1),
         "flags": np.zeros(n, np.int64),
     }
 
@@ -66,4 +68,14 @@ def make_recording(
 ) -> Recording:
     recorder = make_recorder(None, bands, **({"duration": rest.get("duration", 4.0)} | (scene or {})))
     recorder.append(**make_signals(bands, motion_envelope, **rest), motion_source=motion_source)
+    return recorder.finish()
+
+
+def make_play(reference: Any, motion: Any, **fields: Any) -> Recording:
+    """Recording of a waveform without bands at `RATE`; `motion` is the same at every place, or (n, places)."""
+    n, bands = len(reference), Bands.none(spatial=False)
+    recorder = make_recorder(None, bands, **({"duration": n / RATE, "settle": 0.0} | fields))
+    motion = np.broadcast_to(np.reshape(motion, (n, -1)), (n, len(PLACES)))
+    signals = make_signals(bands, np.zeros(0), duration=n / RATE)
+    recorder.append(**signals | {"motion": motion, "reference": np.asarray(reference)})
     return recorder.finish()

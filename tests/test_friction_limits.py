@@ -43,7 +43,7 @@ def test_the_fingers_own_admittance_is_not_for_recordings_nor_for_no_finger(devi
     import soundfile
 
     soundfile.write(tmp_path / "noise.wav", 0.5 * np.sin(np.arange(20000) * 0.1), 10000)
-    recorded = hr.Recorded(file=str(tmp_path / "noise.wav"), amplitude=1e-5)
+    recorded = hr.Recorded(file=str(tmp_path / "noise.wav"), amplitude=1e-5, carriers=8)
     with pytest.raises(ValueError, match="velocity_per_force = 0.0: must be > 0 .* for a recording"):
         hr.render(scene(device, recorded, velocity_per_force=0.0))
     with pytest.raises(ValueError, match="finger.mechanics"):

@@ -11,6 +11,7 @@ import hapticrender as hr
 from hapticrender import loop
 from hapticrender.drivers.simulated import SimulatedDriver
 from hapticrender.plants.plate import Plate, PlateParameters
+from hapticrender.touch.perception import VELOCITY_PER_FORCE
 
 SPATIAL = hr.Scene(
     texture=hr.Grating(wavelength=1e-3, amplitude=10e-6),
@@ -19,7 +20,7 @@ SPATIAL = hr.Scene(
 )
 RECORDED = hr.builtin_scenes()["recorded-texture"]
 TONE = hr.Scene(texture=hr.Grating(frequency=47.0, amplitude=10e-6), duration=0.5)
-COLUMNS = ("drive", "sensed", "motion", "position", "normal_load", "target", "flags")
+COLUMNS = ("drive", "sensed", "motion", "position", "normal_load", "target", "flags", "reference")
 
 
 class Blocks:
@@ -81,6 +82,29 @@ def test_blocks_of_any_size_give_the_same_samples_for_the_same_delay():
         equal(expected, found, [name for name in COLUMNS if name != "drive"])
         later = block - 1  # a longer block is handed over later, and waits less inside
         np.testing.assert_array_equal(found.drive[later:], expected.drive[: len(found.drive) - later])
+
+
+def test_the_reference_is_the_texture_as_the_scene_asks_for_it():
+    """All of it, where a plate leaves out what is not felt; on a screen dr/dt over v/F; 0 while the finger is away."""
+    faint = ((1.0, 1.0, 0.0), (2.0, 1e-4, 0.3))
+    scene = dataclasses.replace(SPATIAL, texture=hr.Grating(amplitude=10e-6, wavelength=1e-3, partials=faint))
+    found = hr.render(scene)
+    assert len(found.bands) == 1
+    away = np.isnan(found.position)
+    assert away.any()
+    assert not found.reference[away].any()
+    texture = scene.texture.waveform(found.time, found.position)
+    np.testing.assert_allclose(found.reference, texture, rtol=0, atol=1e-18)
+    found = hr.render(dataclasses.replace(scene, device="electroadhesion", tolerance=0.2))
+    turns = found.position / 1e-3
+    slope = -10e-6 * (np.sin(2 * np.pi * turns) + 2e-4 * np.sin(4 * np.pi * turns + 0.3))
+    velocity = np.gradient(found.position) * found.rate
+    inside = np.isfinite(velocity)
+    expected = slope * 2e3 * np.pi * velocity / VELOCITY_PER_FORCE
+    np.testing.assert_allclose(
+        found.reference[inside], expected[inside], rtol=0, atol=1e-6 * abs(expected[inside]).max()
+    )
+    assert not found.reference[np.isnan(found.position)].any()
 
 
 def test_an_odd_duration_is_rounded_to_samples_whatever_the_block():

@@ -64,7 +64,7 @@ def test_the_page_needs_nothing_but_the_files_beside_it(tmp_path):
             assert address[1:] in (scene_id.replace(" ", "%20") for scene_id in read.ids)
         elif not address.endswith("recording.au"):
             assert (tmp_path / address.replace("%20", " ")).is_file()
-    sentence = "misses its tolerance: worst figure rms error of the 170 Hz band at centre = 400 %, tolerance 10 %"
+    sentence = "misses its tolerance: worst figure waveform error at centre = 400 %, bound 10 %"
     assert read.text.replace("\xa0", " ").lower().count(sentence.lower()) == 2  # in the table and in its section
     assert "1 of 2 are within their tolerance,\n1 miss it." in read.text
 

@@ -22,7 +22,7 @@ from hapticrender.recordings.journal import Header
 from hapticrender.recordings.recording import Recording
 
 UM = 1e-6
-SIGNALS = ("drive", "sensed", "motion", "position", "normal_load", "target", "flags")
+SIGNALS = ("drive", "sensed", "motion", "position", "normal_load", "target", "flags", "reference")
 
 
 @pytest.fixture
@@ -69,26 +69,26 @@ def test_the_annotation_is_json_that_names_every_column(bands, signals, tmp_path
     data = (tmp_path / "run.au").read_bytes()
     assert data[:4] == b".snd"
     offset, size, encoding, rate, columns = (int.from_bytes(data[i : i + 4], "big") for i in range(4, 24, 4))
-    assert (size, encoding, rate, columns) == (0xFFFFFFFF, 7, 5000, 14)
+    assert (size, encoding, rate, columns) == (0xFFFFFFFF, 7, 5000, 15)
     assert offset % 8 == 0
     note = json.loads(data[24:offset].rstrip(b"\0"))
     names = [channel["name"] for channel in note["channels"]]
     assert names == [
         *("drive 1", "drive 2", "sensed 1", "sensed 2", "motion centre", "motion end 1", "motion end 2"),
-        *("position", "normal load", "flags", "target 1 re", "target 1 im", "target 2 re", "target 2 im"),
+        *("position", "normal load", "flags", "reference", "target 1 re", "target 1 im", "target 2 re", "target 2 im"),
     ]
     units = dict.fromkeys(names, "m") | {"drive 1": "A", "drive 2": "A", "normal load": "N", "flags": "1"}
     assert [channel["unit"] for channel in note["channels"]] == list(units.values())
     assert (note["method"], note["seed"], note["drive_limit"]) == ("paper", 7, 3.0)
 
 
-@pytest.mark.parametrize("cut", [1, 112, 113])
+@pytest.mark.parametrize("cut", [1, 120, 121])
 def test_a_frame_cut_short_is_left_out(bands, signals, tmp_path, cut):
     path = tmp_path / "run.au"
     with make_recorder(path, bands) as recorder:
         recorder.append(**signals)
-    os.truncate(path, path.stat().st_size - cut)  # a frame has 14 columns, 112 bytes
-    kept = 2500 - -(-cut // 112)
+    os.truncate(path, path.stat().st_size - cut)  # a frame has 15 columns, 120 bytes
+    kept = 2500 - -(-cut // 120)
     loaded = Recording.load(path)
     assert len(loaded) == kept
     np.testing.assert_array_equal(loaded.drive, signals["drive"][:kept])
@@ -99,7 +99,7 @@ CHILD = """
 import sys
 sys.path.insert(0, sys.argv[2])
 from synthetic import make_bands, make_recorder, make_signals
-bands = make_bands(170.0, 1e-5)
+bands = make_bands(100.0, 1e-5)
 signals = make_signals(bands, bands.envelope, duration=0.01)
 recorder = make_recorder(sys.argv[1], bands, duration=1000.0)
 done = 0
@@ -277,7 +277,7 @@ CHANGES = [
     ({"name": "a\x1b[2J"}, "name = 'a\\x1b[2J': must be a text of printable characters"),
     ({"tolerance": None}, "tolerance is missing"),
     ({"bands": {"frequency": [1], "wavenumber": [0, 1], "phase": [0]}}, "wavenumber has shape (2,)"),
-    ({"version": 99}, "version = 99: must be 1"),
+    ({"version": 99}, "version = 99: must be 2"),
     ({"colour": 1}, "colour: no such parameter"),
 ]
 

@@ -59,8 +59,8 @@ def play(
 
 def worst(recording: Recording) -> float:
     """Largest rms error of any band over its target; infinite where nothing can be judged."""
-    value = recording.summary()["worst"]["value"]
-    return np.inf if value is None else float(value)
+    errors = [band["rms_error_friction"] for band in recording.summary()["bands"]]
+    return max((float(error) for error in errors if error is not None), default=np.inf)
 
 
 def line(signal: Array, rate: float, frequency: float, start: float) -> float:

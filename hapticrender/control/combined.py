@@ -14,7 +14,7 @@ import numpy as np
 from numba import carray
 
 from hapticrender.bands import Bands
-from hapticrender.control.controller import BankController
+from hapticrender.control.controller import BankController, refuse_whole_waveform
 from hapticrender.control.device_model import DeviceModel
 from hapticrender.control.records import CONTROLLER_T, TILE_T, W
 from hapticrender.jit import C16, F8, I8, SIGNALS_T, addresses, call, pointer, record, step
@@ -155,6 +155,7 @@ def design_combined(
     method: Method, model: CombinedModel, bands: CombinedBands, *, feedback: bool = True
 ) -> CombinedController:
     """Design a controller of `method` for each part, with its share of the targets; open loop without feedback."""
+    refuse_whole_waveform(bands)
     models, shares = (model.plate, model.friction), (bands.plate, bands.friction)
     parts: tuple[Any, ...] = tuple(
         method.design(each, own, feedback=feedback) if each is not None and len(own) else None

@@ -241,6 +241,12 @@ def lowest_carrier(model: DeviceModel, bands: Bands) -> float:
     return min(lowest_fixed(bands), model.lowest_frequency if (bands.wavenumber > 0.0).any() else math.inf)
 
 
+def refuse_whole_waveform(bands: Bands) -> None:
+    """Refuse a texture without carriers, in a method that works band by band."""
+    if bands.envelope is None and not len(bands):
+        raise ValueError("texture.carriers is missing: must be >= 1, this method plays bands, not the whole waveform")
+
+
 def shared_settings(
     model: DeviceModel, bands: Bands, sensor_map: Array, drive_map: Array, feedback: bool
 ) -> dict[str, Any]:

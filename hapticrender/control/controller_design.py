@@ -19,6 +19,7 @@ from hapticrender.control.controller import (
     BankController,
     device_settings,
     lowest_carrier,
+    refuse_whole_waveform,
     ridge_spacing,
     shared_settings,
     spacing,
@@ -116,8 +117,9 @@ def design_controller(
     DesignError
         No bandwidth keeps the least margins.
     ValueError
-        Two carriers are equal, or the device has too many coordinates, channels or sensors.
+        There are no carriers, two are equal, or the device has too many coordinates, channels or sensors.
     """
+    refuse_whole_waveform(bands)
     rules = rules.scaled(model.pace)
     prompt = model.delay <= PROMPT
     damping = choose_damping(model, bending=model.bending) if any(rules.damper) and feedback and prompt else None

@@ -26,7 +26,14 @@ from typing import Any, ClassVar
 import numpy as np
 
 from hapticrender.bands import Bands
-from hapticrender.control.controller import BankController, device_settings, ridge_spacing, shared_settings, spacing
+from hapticrender.control.controller import (
+    BankController,
+    device_settings,
+    refuse_whole_waveform,
+    ridge_spacing,
+    shared_settings,
+    spacing,
+)
 from hapticrender.control.controller_design import FADE_IN, ONE_SPEED, Rules, design_controller, rules_for
 from hapticrender.control.device_model import DeviceModel
 from hapticrender.control.inverse import AdaptiveInverse
@@ -197,6 +204,7 @@ def low_pass_settings(
     # a waveform's envelopes pass two poles, with the delay of the low pass's two
     analysis = min(2 * math.pi * math.sqrt(2.0) * 2.0 * loop.bandwidth, spacing(bands))
     ridges = ridge_spacing(bands)
+    refuse_whole_waveform(bands)
     return {
         **shared_settings(model, bands, sensor_map, drive_map, feedback),
         "low_pass": loop.filter,

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from hapticrender.recordings.recording import Recording
 
 SHORTEST_WINDOW = 20e-3  # s
+FADE_IN = 0.05  # s
 PERIODS = 2.0  # of the lowest carrier and of the smallest spacing in a window
 HOPS = 2  # window starts in a window's length
 HOPS_LOCKED = 8  # the same where carriers are locked to the finger, which is seldom fast enough for long
@@ -65,16 +66,13 @@ class Envelopes:
 
 
 def judged_from(recording: Recording) -> float:
-    """Time (s) from which a run is judged: after the scene's settling time, or its second half where it is short."""
+    """Time (s) from which a run is judged: after the scene's settling time, or its second half where it is short.
+
+    The fade-in of 50 ms at the start is never judged.
+    """
     duration = len(recording) / recording.rate
-    settle = recording.header.settle
+    settle = max(recording.header.settle, FADE_IN)
     return settle if duration >= 2 * settle else duration / 2
-
-
-def shortest_run(recording: Recording) -> float:
-    """Length (s) from which a run like this can be judged: what follows its settling time holds a window and a hop."""
-    needed = (1 + 1 / HOPS) * _window(recording, math.inf)
-    return needed + min(needed, recording.header.settle)
 
 
 def _window(recording: Recording, longest: float) -> float:
@@ -153,8 +151,7 @@ def _fit_windows(recording: Recording, first: Array, size: int) -> tuple[Array, 
     position = recording.read("position", start, stop)
     phase = recording.bands.carrier_phase(np.arange(start, stop) / recording.rate, position)
     target = recording.read("target", start, stop)
-    reference = (target.real * np.cos(phase) - target.imag * np.sin(phase)).sum(axis=1)
-    signals = np.column_stack([reference, recording.read("motion", start, stop)])[index]
+    signals = np.column_stack([recording.read("reference", start, stop), recording.read("motion", start, stop)])[index]
     envelope, inflation, rest = fit(phase[index], signals)
     residual = _unexplained(rest[..., 1], rest[..., 0], signals[..., 0])
     return envelope, inflation, residual, (target != 0)[index].all(axis=1), position[index]

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from hapticrender.touch.scene import Scene
 
 FORMAT = "hapticrender recording"
-VERSION = 1
+VERSION = 2
 AU_HEAD = struct.Struct(">4s5I")  # magic, data offset, data size, encoding, rate, channels
 AU_MAGIC, AU_UNKNOWN_SIZE, AU_DOUBLE = b".snd", 0xFFFFFFFF, 7
 JOURNAL_DTYPE = np.dtype(">f8")
@@ -60,7 +60,7 @@ def _bands(key: str, value: Any) -> Bands:
         parts = [[number(f"{key}.envelope", part, **_NUMBER) for part in pair] for pair in pairs]
         envelope = np.array([complex(*pair) for pair in parts], complex)
     marks: dict[str, Any] = {
-        name: flag(f"{key}.{name}", value.get(name, False)) for name in ("modulated", "differentiated")
+        name: flag(f"{key}.{name}", value.get(name, False)) for name in ("modulated", "differentiated", "spatial")
     }
     unfelt = tuple(text(f"{key}.unfelt", each, 1000) for each in value.get("unfelt", ()))
     arrays: dict[str, Any] = {name: np.array(column, float) for name, column in columns.items()}
@@ -82,7 +82,7 @@ class Header(Validated):
     seed: int = parameter(most=2**63 - 1)
     rate: float = parameter(unit="Hz", least=1e-3, most=1e9)  # exact; the AU header holds it rounded
     duration: float = parameter(unit="s", most=1e9)  # of the scene; a killed run is shorter
-    tolerance: float = parameter(most=1e3)  # largest relative amplitude error of the scene
+    tolerance: float = parameter(most=1e3)  # largest relative waveform error of the scene
     settle: float = parameter(unit="s", most=1e9)  # before the scene is judged
     bands: Bands = checked(_bands)
     drive_channels: int = parameter(2, most=1024)
@@ -93,6 +93,8 @@ class Header(Validated):
     drive_unit: str = checked(text, "A")
     profile: tuple[float, ...] | None = checked(numbers, None, least=-1e6, most=1e6)  # target at each place over first
     motion_source: str = option("true", *MOTION_SOURCES)
+    sensed_noise: float = parameter(0.0, most=1e12)  # rms of a sensor's white noise, in `unit`
+    calibration: float = parameter(0.0, most=1e3)  # relative uncertainty of the sensors' gain; 0 where it is not known
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -115,6 +117,7 @@ class Header(Validated):
             "position": 1,
             "normal_load": 1,
             "flags": 1,
+            "reference": 1,
             "target": 2 * len(self.bands),
         }
 
@@ -140,6 +143,7 @@ class Header(Validated):
             ("position", "m"),
             ("normal load", "N"),
             ("flags", "1"),
+            ("reference", self.unit),
             *((f"target {k + 1} {part}", self.unit) for k in range(len(self.bands)) for part in ("re", "im")),
         ]
 
@@ -148,7 +152,7 @@ class Header(Validated):
         values = {name: getattr(self, name) for name in self.__dataclass_fields__ if name != "bands"}
         envelope = self.bands.envelope
         bands = {name: getattr(self.bands, name).tolist() for name in _COLUMNS}
-        bands |= {name: getattr(self.bands, name) for name in ("modulated", "differentiated", "unfelt")}
+        bands |= {name: getattr(self.bands, name) for name in ("modulated", "differentiated", "spatial", "unfelt")}
         bands["envelope"] = None if envelope is None else [[z.real, z.imag] for z in envelope.tolist()]
         channels = [{"name": name, "unit": unit} for name, unit in self.channels]
         return json.dumps({"format": FORMAT, "version": VERSION, **values, "bands": bands, "channels": channels})
@@ -222,7 +226,7 @@ def read_journal(path: Path) -> tuple[Header, Array | JournalFrames]:
 
 
 def split(header: Header, frames: Array) -> dict[str, Array]:
-    """Signals by name, as native arrays: target complex, flags integer, position and load one-dimensional."""
+    """Signals by name, as native arrays: target complex, flags integer, position, load, reference one-dimensional."""
     return {name: column(header, frames, name) for name in header.slices}
 
 
@@ -233,7 +237,7 @@ def column(header: Header, frames: Array, name: str) -> Array:
         return np.ascontiguousarray(values).view(complex)
     if name == "flags":
         return np.nan_to_num(values[:, 0]).clip(0, 2**31).astype(np.int64)
-    return values[:, 0] if name in ("position", "normal_load") else values
+    return values[:, 0] if name in ("position", "normal_load", "reference") else values
 
 
 def join(header: Header, signals: dict[str, Array]) -> Array:

@@ -7,17 +7,17 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from hapticrender.formatting import band_label, bands_label
+from hapticrender.formatting import bands_label, percent
 from hapticrender.protocols import Array, Flag
 from hapticrender.recordings.envelopes import (
     DIVERGING,
-    LOWEST_FREQUENCY,
+    FADE_IN,
     RUNAWAY,
     Envelopes,
     amplitude_error,
     judged_from,
-    shortest_run,
 )
+from hapticrender.recordings.verdict import BAND, LEAST, LOOSER, MATTERS, UNPLAYABLE, WINDOW
 
 if TYPE_CHECKING:
     from hapticrender.recordings.recording import Recording
@@ -26,18 +26,27 @@ READ_AT_ONCE = 2**18  # samples
 SETTLED = 0.05  # of the target
 SETTLED_FOR = 0.5  # s, or
 SETTLED_SHARE = 0.1  # of the judged time where that is shorter: inside for so long at the end, a band has settled
-UNJUDGED: dict[str, Any] = {"figure": "rms_error", "value": None, "band": "any", "place": "any"}
+HARDLY = 2.0  # times what the sensors' noise alone reads: a smaller figure cannot be told from it
+IN_BAND = f"{BAND[0]:g} to {BAND[1]:g} Hz"
+UNJUDGED: dict[str, Any] = {"figure": "waveform_error", "value": None, "bound": None, "band": "any", "place": "any"}
 
 
 @np.errstate(**DIVERGING)
 def summary(recording: Recording) -> dict[str, Any]:
-    """Figures of every band, and the verdict, as plain numbers, strings, lists and dicts; None for no figure.
+    """Figures and verdict as plain numbers, strings, lists and dicts; None for no figure.
 
-    Relative errors compare with the target at every place over the judged windows: `error_*` is that of the mean
-    amplitude, `rms_error_*` the rms of |X| - |target| over the rms of |target|, `complex_error` the rms of |X - target|
-    at the first place over the same, `phase_error` the lead of the mean there.  The verdict ("passed", "failed", or
-    "not judged", with a `reason`) compares the largest `rms_error_*` with the scene's tolerance; a band whose target is
-    below the tolerance times the strongest band decides only if its error exceeds the tolerance times that band.
+    The verdict rests on `waveform`, which compares the motion y at every place with the reference r, the texture as the
+    scene asks for it, without time shift or gain fit.  It is "passed" where at every place `waveform_error`, E =
+    rms_B(y - r)/rms_B(r), is within the tolerance, `window_error`, the 95th percentile of the same in windows of
+    100 ms, and the worst `third_octave_error` are within twice the tolerance, and no sample is flagged as saturated or
+    faulty; "passed in band" where besides more than 1 % of the texture's energy is outside 20 to 500 Hz (B) and above
+    the detection threshold; else "failed", or "not judged".  `worst` is the figure furthest over its `bound`; `reason`
+    says what else decided.  See ``verdict`` for the equations.  `contacts` are the errors after touches and lifts;
+    `delay` (s), `gain` and `incoherent` share say how y differs from r and decide nothing, like all that follows.
+
+    Relative errors of a band compare with the target at every place over the judged windows: `error_*` is that of the
+    mean amplitude, `rms_error_*` the rms of |X| - |target| over the rms of |target|, `complex_error` the rms of
+    |X - target| at the first place over the same, `phase_error` the lead of the mean there.
 
     `wobble` (m) is the rms of the narrowband motion at the first place that is no multiple of its target: the root of
     sum_k mean |X_k - c_k target_k|^2 / 2 with c_k by least squares; a window of 2 periods passes variations up to about
@@ -51,7 +60,7 @@ def summary(recording: Recording) -> dict[str, Any]:
     settled = envelopes.start >= begin * (1 - 1e-9)
     judged = envelopes.judged & settled[:, None]
     bands = [_band(recording, k, judged[:, k], places) for k in range(len(recording.bands))]
-    worst = _worst(bands, places, header.tolerance) if envelopes.finite.all() else dict(UNJUDGED)
+    worst = _worst(recording)
     verdict, reason = _verdict(recording, worst)
     flags = _flag_counts(recording)
     residual = _mean(envelopes.residual[settled & envelopes.finite])
@@ -65,6 +74,7 @@ def summary(recording: Recording) -> dict[str, Any]:
         "passed": verdict == "passed",
         "reason": reason,
         "worst": worst,
+        "waveform": recording.waveform,
         "bands": bands,
         "wobble": _wobble(envelopes, judged),
         "residual_rms": math.sqrt(residual) if residual is not None and math.isfinite(residual) else None,
@@ -128,10 +138,10 @@ def _wobble(envelopes: Envelopes, judged: Array) -> float | None:
     return math.sqrt(power)
 
 
-def _flag_counts(recording: Recording) -> dict[Flag, int]:
-    """Count the samples in which each flag is set."""
+def _flag_counts(recording: Recording, first: int = 0) -> dict[Flag, int]:
+    """Count the samples from the `first` on in which each flag is set."""
     counts = dict.fromkeys(Flag, 0)
-    for start in range(0, len(recording), READ_AT_ONCE):
+    for start in range(first, len(recording), READ_AT_ONCE):
         flags = recording.read("flags", start, start + READ_AT_ONCE)
         for flag in Flag:
             counts[flag] += int(np.count_nonzero(flags & flag))
@@ -139,36 +149,55 @@ def _flag_counts(recording: Recording) -> dict[Flag, int]:
 
 
 def _verdict(recording: Recording, worst: dict[str, Any]) -> tuple[str, str]:
-    """Verdict and, where there is no worst figure, the reason."""
-    header, envelopes = recording.header, recording.envelopes
+    """Verdict and, where the worst figure is not the reason, what is."""
+    header, found = recording.header, recording.waveform
     if header.motion_source == "unknown":
         return "not judged", "the device has no sensors, so its motion is not measured"
-    if not envelopes.finite.all():
-        count, bound = int((~envelopes.finite).sum()), f"not finite, or beyond {RUNAWAY:g} {header.unit},"
-        return "failed", f"the motion is {bound} in {count} of {len(envelopes.finite)} windows"
-    if worst["value"] is not None:
-        return ("passed" if worst["value"] <= header.tolerance else "failed"), ""
-    needed = shortest_run(recording)
-    if len(recording) / recording.rate < needed < math.inf:
-        return "not judged", f"the run is too short: needs >= {math.ceil(1e3 * needed - 1e-6) / 1e3:g} s"
-    if not envelopes.has_target.any():
-        return "not judged", "no band has a target"
-    reason = f"no carrier is faster than {LOWEST_FREQUENCY:g} Hz and far enough from the others for a window"
-    return "not judged", reason
+    if found["lost_windows"]:
+        bound = f"not finite, or beyond {RUNAWAY:g} {header.unit},"
+        return "failed", f"the motion is {bound} in {found['lost_windows']} windows of {1e3 * WINDOW:g} ms"
+    if found["rms_reference"] is None:
+        needed = min(max(header.settle, FADE_IN) + WINDOW, 2 * WINDOW)
+        return "not judged", f"the run is too short: needs >= {needed:g} s"
+    if not found["rms_reference"]:
+        return "not judged", "the texture asks for nothing"
+    if found["share_in_band"] < LEAST:
+        return "not judged", f"the texture has nothing from {IN_BAND}"
+    if worst["value"] > worst["bound"]:
+        noise = found["sensor_noise"]
+        if worst["value"] - header.calibration <= HARDLY * noise:
+            return (
+                "not judged",
+                f"the noise of the sensors alone reads {percent(noise)}, the worst figure is no clearer",
+            )
+        return "failed", ""
+    counts = _flag_counts(recording, round(judged_from(recording) * recording.rate))
+    raised = [f"{flag.name} in {count} samples" for flag, count in counts.items() if count and flag & MATTERS]
+    if raised:
+        return "failed", f"flags that a play must not raise: {', '.join(raised).lower()}"
+    if found["share_outside"] > UNPLAYABLE:
+        return "passed in band", _unplayable(found["share_outside"])
+    return "passed", ""
 
 
-def _worst(bands: list[dict[str, Any]], places: list[str], tolerance: float) -> dict[str, Any]:
-    """Find the largest rms error of all bands that decide, at all places."""
-    strongest = max((band["target"] for band in bands if band["target"] is not None), default=0.0)
-    worst: dict[str, Any] = dict(UNJUDGED)
-    for band in bands:
-        for place in places:
-            value = band[f"rms_error_{place}"]
-            if value is None or max(value, 1.0) * band["target"] < tolerance * strongest:
+def _unplayable(share: float) -> str:
+    return f"not playable: {percent(share)} of the texture's energy, outside {IN_BAND}"
+
+
+def _worst(recording: Recording) -> dict[str, Any]:
+    """Find the figure that is largest over its bound, at all places; from sensors, their uncertainty is added."""
+    header, worst = recording.header, dict(UNJUDGED)
+    unsure = header.calibration if header.motion_source == "sensors" else 0.0
+    for place, figures in recording.waveform["places"].items():
+        for name, looser in (("waveform_error", 1.0), ("window_error", LOOSER), ("third_octave_error", LOOSER)):
+            value, bound = (figures or {}).get(name), looser * header.tolerance
+            if value is None or (
+                worst["value"] is not None and (value + unsure) / bound <= worst["value"] / worst["bound"]
+            ):
                 continue
-            if worst["value"] is None or value > worst["value"]:
-                figure, label = f"rms_error_{place}", band_label(band)
-                worst = {"figure": figure, "value": value, "band": label, "place": place.replace("_", " ")}
+            band = figures["third_octave"] if name == "third_octave_error" else IN_BAND
+            where = {"band": band, "place": place.replace("_", " ")}
+            worst = {"figure": name, "value": value + unsure, "bound": bound, **where}
     return worst
 
 
@@ -177,11 +206,16 @@ def _notes(recording: Recording, bands: list[dict[str, Any]], settled: Array) ->
     header, envelopes = recording.header, recording.envelopes
     seconds, notes = len(recording) / recording.rate, [f"left out, {text}" for text in recording.bands.unfelt]
     if header.motion_source == "sensors":
-        notes.append("the figures come from the sensors: errors of the sensors themselves do not show")
+        known = (
+            f"+-{percent(header.calibration)}, which is added to every figure" if header.calibration else "not known"
+        )
+        notes.append(f"the figures come from the sensors, whose errors do not show; uncertainty of their gain: {known}")
     if seconds < header.duration - 0.5 / recording.rate:
         notes.append(f"the run ended after {seconds:.3f} s of {header.duration:.3f} s")
     if seconds < 2 * header.settle:
         notes.append("the run is shorter than twice the settling time: its second half is judged")
+    if (recording.waveform["share_outside"] or 0.0) > UNPLAYABLE:
+        notes.append(_unplayable(recording.waveform["share_outside"]))
     windows = settled & envelopes.finite
     partly = [k for k, band in enumerate(bands) if band["judged_windows"] < windows.sum()]
     if header.motion_source != "unknown" and partly:

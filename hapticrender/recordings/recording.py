@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import warnings
+from collections.abc import Callable
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
@@ -17,6 +18,7 @@ from hapticrender.recordings import formats, journal, judge
 from hapticrender.recordings.envelopes import Envelopes, analyse
 from hapticrender.recordings.formats import MissingExtra
 from hapticrender.recordings.journal import Header
+from hapticrender.recordings.verdict import waveform_figures
 
 if TYPE_CHECKING:
     from hapticrender.touch.scene import Scene
@@ -38,6 +40,9 @@ class Recorder:
         Journal to write, suffix .au; None keeps the run in memory.
     scene : Scene
         What is rendered.
+    requested : callable, optional
+        ``requested(time, position, velocity)`` gives the reference (see ``protocols.Rendering``), a quarter of a second
+        at a time, so that no block waits for it; without it the reference is appended like the other signals.
     **header
         The other fields of `journal.Header`: method, seed, rate (Hz) and bands, and whatever differs from two coils
         (A) and two sensors (m) with places "centre", "end 1" and "end 2" of known motion.
@@ -48,12 +53,20 @@ class Recorder:
         The path does not end in .au, or a field is out of its bounds.
     """
 
-    def __init__(self, path: str | os.PathLike[str] | None, *, scene: Scene, **header: Any) -> None:
+    def __init__(
+        self,
+        path: str | os.PathLike[str] | None,
+        *,
+        scene: Scene,
+        requested: Callable[[Array, Array, Array], Array] | None = None,
+        **header: Any,
+    ) -> None:
         self.path = None if path is None else Path(path)
         if self.path is not None and self.path.suffix.lower() != ".au":
             raise ValueError(f"{self.path}: a journal is a Sun AU file, its name must end in .au")
         self.header = Header.of(scene, **header)
-        self._scene = scene
+        self._scene, self._requested = scene, requested
+        self._done, self._before = 0, np.full(2, np.nan)  # samples with a reference; the finger's last positions (m)
         self._file: BinaryIO | None = None
         self._blocks: list[Array] = []  # what is not in the file yet; without a path, everything
         self._waiting = 0  # samples in them
@@ -68,12 +81,15 @@ class Recorder:
         """Append n samples of every signal.
 
         `drive` (n, channels) as commanded in each interval; `sensed` (n, channels); `motion` (n, places), true or the
-        best estimate; finger `position` (n,), m, NaN while lifted; `normal_load` (n,), N; `target` (n, n_bands), the
-        complex reference envelopes; `flags` (n,), ``protocols.Flag``.  Units are those of the header.  The first
+        best estimate; finger `position` (n,), m, NaN while lifted; `normal_load` (n,), N; `reference` (n,), the texture
+        as the scene asks for it; `target` (n, n_bands), the envelopes that the controller makes of it; `flags` (n,),
+        ``protocols.Flag``.  Units are those of the header.  The first
         block's `motion_source` replaces that of the header.
         """
         if motion_source is not None and self._file is None and not self._blocks:
             self.header = replace(self.header, motion_source=motion_source)
+        if self._requested is not None:
+            signals["reference"] = np.zeros(len(signals["drive"]))
         self._blocks.append(journal.join(self.header, signals))
         self._waiting += len(signals["drive"])
         if self._file is None or self._waiting >= FLUSH * self.header.rate:
@@ -86,7 +102,7 @@ class Recorder:
         blocks, self._blocks, self._waiting = self._blocks, [], 0
         if self._file is None:
             self._file = self._create(self.path)
-        self._file.write(np.concatenate(blocks).astype(journal.JOURNAL_DTYPE).data)
+        self._file.write(self._frames(blocks).astype(journal.JOURNAL_DTYPE).data)
         self._file.flush()
 
     def close(self) -> None:
@@ -100,13 +116,25 @@ class Recorder:
     def finish(self) -> Recording:
         """Close the journal and return the recording; with a path it is read from the file, not held in memory."""
         if self.path is None:
-            frames = np.concatenate(self._blocks) if self._blocks else np.empty((0, len(self.header.channels)))
-            self._blocks = [frames]
+            frames = self._frames(self._blocks) if self._blocks else np.empty((0, len(self.header.channels)))
+            self._blocks, self._requested = [frames], None
             return Recording(self.header, frames, self._scene)
         self.close()
         if self._file is None:
             self._create(self.path).close()
         return Recording(*journal.read_journal(self.path), self._scene)
+
+    def _frames(self, blocks: list[Array]) -> Array:
+        """Frames of blocks with their reference, for the finger's velocity of second order (0 at edges of a touch)."""
+        frames = np.concatenate(blocks)
+        if self._requested is not None:
+            position, rate = journal.column(self.header, frames, "position"), self.header.rate
+            path = np.concatenate([self._before, position])
+            velocity = np.nan_to_num(np.gradient(path, edge_order=2)[2:] * rate)
+            time = (self._done + np.arange(len(frames))) / rate
+            frames[:, self.header.slices["reference"]] = self._requested(time, position, velocity)[:, None]
+            self._done, self._before = self._done + len(frames), path[-2:]
+        return frames
 
     def _create(self, path: Path) -> BinaryIO:
         path.unlink(missing_ok=True)  # a recording may still read the old file: replace it, never write into it
@@ -126,8 +154,9 @@ def _signal(name: str, doc: str) -> Any:
 class Recording:
     """The result of a run, with all signals on one clock.
 
-    `drive`, `sensed`, `motion`, `position`, `normal_load`, `target` and `flags` read a whole signal, `read` a part of
-    one; units are `header.unit` and `header.drive_unit`, and `header.motion_source` says where the motion comes from.
+    `drive`, `sensed`, `motion`, `position`, `normal_load`, `flags`, `reference` and `target` read a whole signal,
+    `read` a part of one; units are `header.unit` and `header.drive_unit`, and `header.motion_source` says where the
+    motion comes from.
 
     Parameters
     ----------
@@ -169,6 +198,9 @@ class Recording:
     motion: Array = _signal("motion", "Motion at the evaluation points (unit, shape (n, places)).")
     position: Array = _signal("position", "Finger from the middle of the surface (m, shape (n,)), NaN while lifted.")
     normal_load: Array = _signal("normal_load", "Load of the finger (N, shape (n,)).")
+    reference: Array = _signal(
+        "reference", "Texture as the scene asks for it (unit, shape (n,)), unscaled and in full."
+    )
     target: Array = _signal("target", "Reference envelopes (unit, complex, shape (n, n_bands)).")
     flags: Array = _signal("flags", "Status words (int, shape (n,)), see ``protocols.Flag``.")
 
@@ -180,7 +212,7 @@ class Recording:
     def read(self, name: str, start: int = 0, stop: int | None = None, step: int = 1) -> Array:
         """Read every `step`-th sample (>= 1) of a signal from `start` to `stop`, a bounded number at a time.
 
-        `name` is "drive", "sensed", "motion", "position", "normal_load", "target" or "flags".
+        `name` is "drive", "sensed", "motion", "position", "normal_load", "flags", "reference" or "target".
         """
         if isinstance(self.frames, np.ndarray):
             return journal.column(self.header, self.frames[start:stop:step], name)
@@ -193,6 +225,11 @@ class Recording:
     def envelopes(self) -> Envelopes:
         """Reference and achieved envelopes over time (computed once)."""
         return analyse(self)
+
+    @cached_property
+    def waveform(self) -> dict[str, Any]:
+        """Figures of the motion against the reference (computed once), see ``verdict.waveform_figures``."""
+        return waveform_figures(self)
 
     def summary(self) -> dict[str, Any]:
         """Figures and verdict as plain numbers, ready for JSON (see ``judge.summary``)."""

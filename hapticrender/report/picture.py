@@ -10,9 +10,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from hapticrender.formatting import band_label, percent
+from hapticrender.formatting import percent
 from hapticrender.protocols import Array
 from hapticrender.recordings.envelopes import RUNAWAY
+from hapticrender.recordings.verdict import LOOSER
 from hapticrender.report import figure as look
 from hapticrender.report.figure import BLUE, GREEN, INK, ORANGE, PALE, RED, check_format, legend, new_figure
 from hapticrender.report.text import verdict
@@ -27,10 +28,14 @@ COLUMNS = 1400  # points that a full-width panel can show
 QUANTITIES = {"m": "displacement", "N": "friction", "m/s": "skin velocity"}
 PERIODS = 4  # of the strongest carrier in the close-up
 LANE = 0.95  # inch: a lane of drive beyond the two of a plate
-MOST_LABELS = 8
 MOST_NOTES = 3  # lines
 GROUP = 64  # stretches of an outline that are read at once
-VERDICTS = {"passed": ("✓", "#00694E"), "failed": ("✗", "#A84300"), "not judged": ("–", "#555555")}
+VERDICTS = {
+    "passed": ("✓", "#00694E"),
+    "passed in band": ("✓", "#00694E"),
+    "failed": ("✗", "#A84300"),
+    "not judged": ("–", "#555555"),
+}
 FLOOR = 1e-5  # relative error below which a dot stands at the foot of its panel
 
 
@@ -69,9 +74,9 @@ def _draw(figure: Any, recording: Recording, touched: bool) -> None:
     grid = figure.add_gridspec(len(heights), 2, height_ratios=heights, width_ratios=[1.35, 1])
     _head(figure.add_subplot(grid[0, :]), summary, touched)
     amplitude = figure.add_subplot(grid[1, :])
-    _amplitude(amplitude, recording, summary)
+    (_amplitude if summary["bands"] else _course)(amplitude, recording, summary)
     _close_up(figure.add_subplot(grid[2, 0]), recording)
-    _errors(figure.add_subplot(grid[2, 1]), recording, summary)
+    _errors(figure.add_subplot(grid[2, 1]), recording)
     below = [figure.add_subplot(grid[3 + i, :], sharex=amplitude) for i in range(len(lanes))]
     _drive(below[:coils], recording, summary)
     if touched:
@@ -130,6 +135,18 @@ def _amplitude(axes: Any, recording: Recording, summary: dict[str, Any]) -> None
     legend(axes)
 
 
+def _course(axes: Any, recording: Recording, summary: dict[str, Any]) -> None:
+    """Range that texture and motion cover over time, of a texture without bands."""
+    scale, unit = drawn(recording.header.unit)
+    for name, colour, label in (("motion", BLUE, recording.header.places[0]), ("reference", INK, "texture")):
+        time, low, high = outline(recording, name)
+        low, high = (scale * _bounded(values.reshape(len(time), -1)[:, 0]) for values in (low, high))
+        axes.fill_between(time, low, high, color=colour, alpha=0.5, lw=0.5, label=label)
+    axes.axvline(summary["judged_from"], color=PALE, lw=0.9, ls=":", label="judged from here")
+    axes.set(title="Waveform", ylabel=f"{QUANTITIES.get(recording.header.unit, 'motion')} ({unit})")
+    legend(axes)
+
+
 def _bounded(values: Array) -> Array:
     """Values (SI) with a gap where they are no numbers, or beyond `RUNAWAY`."""
     return np.where(np.abs(values) < RUNAWAY, values, np.nan)
@@ -143,9 +160,8 @@ def _close_up(axes: Any, recording: Recording) -> None:
     """Draw a few periods of the reference and of the true waveform at the centre, at the end of the judged time."""
     start, stop = _close_span(recording)
     time = np.arange(start, stop) / recording.rate
-    phase = recording.bands.carrier_phase(time, recording.read("position", start, stop))
     scale, unit = drawn(recording.header.unit)
-    target = scale * (recording.read("target", start, stop) * np.exp(1j * phase)).real.sum(axis=1)
+    target = scale * recording.read("reference", start, stop)
     motion = scale * _bounded(recording.read("motion", start, stop)[:, 0])
     offset = np.nan_to_num(np.mean(motion - target)) if motion.size else 0.0  # a stretch holds parts of periods
     milliseconds = 1e3 * (time - time[:1])
@@ -173,28 +189,23 @@ def _close_span(recording: Recording) -> tuple[int, int]:
     return max(0, stop - round(seconds * rate)), stop
 
 
-def _errors(axes: Any, recording: Recording, summary: dict[str, Any]) -> None:
-    """Rms error of every band at every place, against the tolerance."""
-    bands, names = summary["bands"], recording.header.places
-    for i, name in enumerate(names):
-        values = [band[f"rms_error_{name.replace(' ', '_')}"] for band in bands]
-        shift = 0.0 if len(bands) > MOST_LABELS else 0.18 * (i - (len(names) - 1) / 2)
+def _errors(axes: Any, recording: Recording) -> None:
+    """Error of every third octave at every place, against its bound."""
+    figures = {place: each["third_octaves"] for place, each in recording.waveform["places"].items() if each}
+    for i, (place, thirds) in enumerate(figures.items()):
         colour, marker = PLACES[i % len(PLACES)]
-        known = [(k + shift, 100 * max(value, FLOOR)) for k, value in enumerate(values) if value is not None]
-        if known:
-            axes.plot(*zip(*known, strict=True), marker, color=colour, ms=6 if len(bands) <= 10 else 3.5, label=name)
-    allowed = 100 * recording.header.tolerance
-    axes.axhline(allowed, color=INK, lw=1, ls=DASHED, label="tolerance")
+        values = [100 * max(value, FLOOR) for value in thirds.values()]
+        axes.plot(range(len(values)), values, marker, color=colour, ms=4, label=place.replace("_", " "))
+    names = [name.removesuffix(" Hz") for name in next(iter(figures.values()), {})]
+    allowed = 100 * LOOSER * recording.header.tolerance
+    axes.axhline(allowed, color=INK, lw=1, ls=DASHED, label="bound")
     low, high = error_axis(axes, allowed)
     axes.axhspan(allowed, high, color=RED, alpha=0.08, lw=0)
     axes.set_ylim(low, high)
     axes.text(0.01, allowed, f"{allowed:.3g} %", fontsize=8, va="bottom", transform=axes.get_yaxis_transform())
-    every = -(-len(bands) // MOST_LABELS)
-    shown = range(0, len(bands), every)
-    small = {"fontsize": 7.5} if len(shown) > 5 else {}
-    axes.set_xticks(list(shown), [band_label(bands[k], "\n", "") for k in shown], **small)
-    axes.set_xlim(-0.6, len(bands) - 0.4)
-    axes.set(title="Rms error", ylabel="error of the amplitude (%)")
+    axes.set_xticks(range(len(names)), names, fontsize=7.5)
+    axes.set_xlim(-0.6, max(len(names), 1) - 0.4)
+    axes.set(title="Third octaves", ylabel="error (%)", xlabel="Hz")
     legend(axes, columns=4)
 
 

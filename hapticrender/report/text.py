@@ -16,8 +16,13 @@ MEASURED = {"friction": "friction", "skin": "skin velocity"}  # places that name
 
 def places_of(summary: Mapping[str, Any]) -> list[str]:
     """Evaluation points that a summary has errors of."""
-    first = (summary["bands"] or [{}])[0]
-    return [key.removeprefix("rms_error_") for key in first if key.startswith("rms_error_")]
+    return list(summary["waveform"]["places"])
+
+
+def waveform_error(summary: Mapping[str, Any]) -> float | None:
+    """Waveform error at the worst place; None where nothing is judged."""
+    found = [figures["waveform_error"] for figures in summary["waveform"]["places"].values() if figures]
+    return max(found, default=None)
 
 
 def at(places: Sequence[str]) -> str:
@@ -45,10 +50,11 @@ def verdict(summary: Mapping[str, Any]) -> str:
     """State in one sentence whether a run (``Recording.summary()``) is within its tolerance, and by which figure."""
     if summary["verdict"] == "not judged":
         return f"not judged: {summary['reason']}"
-    if summary["worst"]["value"] is None:
+    if summary["verdict"] == "failed" and summary["reason"]:
         return f"misses its tolerance: {summary['reason']}"
-    start = "within its tolerance" if summary["passed"] else "misses its tolerance"
-    return f"{start}: worst figure {worst_figure(summary)}, tolerance {100 * summary['tolerance']:.4g} %"
+    start = "misses its tolerance" if summary["verdict"] == "failed" else "within its tolerance"
+    start += f" in band ({summary['reason']})" if summary["verdict"] == "passed in band" else ""
+    return f"{start}: worst figure {worst_figure(summary)}, bound {100 * summary['worst']['bound']:.4g} %"
 
 
 def brief(summary: Mapping[str, Any]) -> str:
@@ -59,11 +65,9 @@ def brief(summary: Mapping[str, Any]) -> str:
 def worst_figure(summary: Mapping[str, Any]) -> str:
     """Name the figure that decides the verdict: its name, band, place or quantity, and value."""
     worst = summary["worst"]
-    place, figure = (str(worst[key]).replace("_", " ") for key in ("place", "figure"))
-    name, where = figure.removesuffix(f" {place}"), at([place])
-    band = f"the {worst['band']} band"
-    said = f"{where} in {band}" if place in MEASURED else f"of {band} {where}"
-    return f"{name} {said} = {percent(worst['value'])}"
+    third = f"error of the third octave of {worst['band']}"
+    figure = third if worst["figure"] == "third_octave_error" else str(worst["figure"]).replace("_", " ")
+    return f"{figure} {at([str(worst['place'])])} = {percent(worst['value'])}"
 
 
 def amplitudes(summaries: Sequence[Mapping[str, Any]]) -> list[tuple[str, str]]:
@@ -80,10 +84,10 @@ def amplitudes(summaries: Sequence[Mapping[str, Any]]) -> list[tuple[str, str]]:
 
 
 def overview(summaries: Sequence[Mapping[str, Any]]) -> str:
-    """Tabulate scenes, a line each: amplitudes, the worst rms error of any band at any place, the verdict."""
-    rows = [["scene", "target", "achieved", "rms error", "verdict"]]
+    """Tabulate scenes, a line each: amplitudes, the waveform error at the worst place, the verdict."""
+    rows = [["scene", "target", "achieved", "error", "verdict"]]
     for summary, pair in zip(summaries, amplitudes(summaries), strict=True):
-        rows.append([summary["scene"], *pair, percent(summary["worst"]["value"]), brief(summary)])
+        rows.append([summary["scene"], *pair, percent(waveform_error(summary)), brief(summary)])
     return table(rows)
 
 
@@ -96,11 +100,42 @@ def figures(summary: Mapping[str, Any]) -> str:
         sizes = [quantity(band[key], unit) for key in ("target", "achieved")]
         settled = quantity(band["settling_time"], "s")
         rows.append([band_label(band), *sizes, *errors, degrees(band["phase_error"]), settled])
-    lines = [table(rows)]
+    lines = [table(rows)] if len(rows) > 1 else []
+    lines.append(table([["", "waveform", "worst windows", "worst third octave"], *waveform_rows(summary)]))
     wobble, residual = (quantity(summary[key], unit) for key in ("wobble", "residual_rms"))
     saturated = percent(summary["saturated_share"])
+    lines.append(beside(summary))
     lines.append(f"rms errors {at(places)}; wobble {wobble}, beside the bands {residual}, saturated {saturated}")
     return "\n".join([*lines, *summary["notes"], f"{summary['scene']} {verdict(summary)}"])
+
+
+def waveform_rows(summary: Mapping[str, Any]) -> list[list[str]]:
+    """Figures of the waveform that decide, a row a place."""
+    return [
+        [
+            place.replace("_", " "),
+            percent(each["waveform_error"]),
+            percent(each["window_error"]),
+            f"{percent(each['third_octave_error'])} at {each['third_octave']}",
+        ]
+        for place, each in summary["waveform"]["places"].items()
+        if each
+    ]
+
+
+def beside(summary: Mapping[str, Any]) -> str:
+    """State what decides nothing: errors after contacts, and how the motion differs from the reference."""
+    found = summary["waveform"]
+    if found["delay"] is None:
+        return "no waveform"
+    said = [
+        f"delay {quantity(found['delay'], 's')}, gain {found['gain']:.3f}, incoherent {percent(found['incoherent'])}"
+    ]
+    contacts = found["contacts"]
+    if contacts["count"]:
+        errors = " and ".join(percent(contacts[f"error_{span}_ms"]) for span in ("0_50", "50_200"))
+        said.append(f"{contacts['count']} touches and lifts: error {errors} in 0-50 and 50-200 ms after them")
+    return "; ".join(said)
 
 
 def conditions(summary: Mapping[str, Any]) -> str:

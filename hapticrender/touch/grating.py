@@ -13,6 +13,7 @@ from hapticrender.bands import Bands
 from hapticrender.checks import Validated, checked, option, parameter
 from hapticrender.protocols import Array
 from hapticrender.touch import perception
+from hapticrender.touch.composed import Composable
 
 MOST_AMPLITUDE = 0.01  # m: ten times the travel of any plate, so it catches a wrong unit
 MOST_PARTIALS = 4096
@@ -59,7 +60,7 @@ def _read_partial(key: str, entry: Any) -> Partial:
 
 
 @dataclass(frozen=True)
-class Grating(Validated):
+class Grating(Validated, Composable):
     """A periodic texture, ``amplitude * sum_n a_n cos(n p + phase_n)``.
 
     In time ``p = 2 pi frequency t + phase``, in space ``p = 2 pi x / wavelength + phase`` at the finger's position x.

@@ -16,6 +16,7 @@ from hapticrender.bands import Bands
 from hapticrender.checks import Validated, checked, parameter
 from hapticrender.errors import SceneError
 from hapticrender.protocols import Array
+from hapticrender.touch.composed import Composable
 from hapticrender.touch.grating import MOST_AMPLITUDE
 from hapticrender.touch.profile import Profile, strongest_carriers
 from hapticrender.touch.tribometer import MOST_SPEED, load_swipe
@@ -30,6 +31,8 @@ MOST_POINTS = 1 << 24  # of a profile
 WHOLE = 0.99  # of a sound file: the length that a header gives for compressed sound may be an estimate
 STREAMED = 2**31 - 2**16  # bytes: a length from here on was not known when the header was written
 _PART = re.compile(r"^ *(?:RIFF|riff|Riff size|data|FORM|SSND|Data Size) *: (\d+) \(should be (\d+)\)", re.MULTILINE)
+FELT = (20.0, 1000.0)  # Hz: what is played by default, up to where vibration is felt, or
+CARRIED = (20.0, 400.0)  # where carriers are chosen
 GRID = 10e-6  # m: cells of a force profile; a wavelength of 0.1 mm loses 1.6 % in them
 
 Passband = tuple[float, float]
@@ -52,7 +55,7 @@ def _carriers(frequency: Array, speed: float | None, rate: float) -> Bands:
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Playback(Validated):
+class _Playback(Validated, Composable):
     """What every recording shares: scale, carriers, and how it is read.
 
     Its profile is over recorded seconds; a spatial one is read at (position - start) / speed.
@@ -60,20 +63,21 @@ class _Playback(Validated):
 
     amplitude: float | None = parameter(None, "m", above=0, most=MOST_AMPLITUDE)
     gain: float | None = parameter(None, "m per unit of the file", above=0, most=1e3)
-    carriers: int = parameter(8, least=1, most=MOST_CARRIERS)
+    carriers: int | None = parameter(None, least=1, most=MOST_CARRIERS)
     spacing: float = parameter(40.0, "Hz", least=0.1, most=1e5)
-    passband: Passband = checked(_read_passband, (20.0, 400.0))
-    file: str = checked(checks.file_name)
+    passband: Passband | None = checked(_read_passband, None)  # never None once it is made
 
     def __post_init__(self) -> None:
         super().__post_init__()
         checks.exactly_one(amplitude=self.amplitude, gain=self.gain)
+        if self.passband is None:
+            checks.keep(self, passband=FELT if self.carriers is None else CARRIED)
 
     @cached_property
     def profile(self) -> Profile:
         """The recording inside its passband, in m over recorded seconds; reads the file at the first use."""
         values, step = self._recorded()
-        low, high = self.passband
+        low, high = self.passband or FELT
         if 0.5 / step <= low:
             raise SceneError(f"passband = {self.passband} Hz: must start < {0.5 / step:g} Hz, half the file's rate")
         high = min(high, 0.5 / step)
@@ -115,10 +119,16 @@ class _Playback(Validated):
 
     def check(self) -> None:
         """Read the file, so that a bad one is refused before anything plays."""
+        self.profile  # noqa: B018
         self.bands(rate=np.inf)
 
     def bands(self, rate: float) -> Bands:
-        """Carriers at the strongest peaks of the spectrum below rate/2 (`rate` in Hz); envelopes are to be analysed."""
+        """Carriers at the strongest peaks of the spectrum below rate/2 (`rate` in Hz); envelopes are to be analysed.
+
+        None without `carriers`: the whole waveform is played.
+        """
+        if self.carriers is None:
+            return Bands.none(spatial=self.spatial)
         profile, chosen = self.profile, {"count": self.carriers, "spacing": self.spacing, "passband": self.passband}
         return _carriers(strongest_carriers(profile.values, 1 / profile.step, **chosen), self._speed(), rate)  # type: ignore[arg-type]
 
@@ -134,12 +144,14 @@ class _Playback(Validated):
 
 @dataclass(frozen=True, kw_only=True)
 class Recorded(_Playback):
-    """A sound file as a texture, in time or in space; beyond its ends it runs back and forth (reflection).
+    """Recorded samples as a texture, in time or in space; beyond its ends it runs back and forth (reflection).
 
     Parameters
     ----------
     file : str or Path
-        Whatever soundfile reads: WAV, FLAC, W64, ...; at most 2**24 frames.
+        Whatever soundfile reads: WAV, FLAC, W64, ...; at most 2**24 frames.  Or instead:
+    samples, rate : array_like, shape (n,), n >= 2, and float, Hz
+        Numbers within 1e6 and their sampling rate.
     amplitude, gain : float, m, or m per full scale of the file
         Target peak, or scale; exactly one, > 0; the peak must be <= 0.01 m.  The gain that plays a recording exactly
         often feels too weak: about 3 times as much suits fine textures, 5 times coarse ones.
@@ -148,10 +160,12 @@ class Recorded(_Playback):
     speed : float, m/s, or None
         At which a finger recorded it: then it is read at the finger's position,
         its middle at the middle of the surface.  None: played in time.
-    carriers : int
-        How many of the strongest peaks of its spectrum are followed, 1 to 512.
+    carriers : int or None
+        How many of the strongest peaks of its spectrum are followed, 1 to 512.  None: the whole waveform is played,
+        which methods that work band by band refuse.
     spacing, passband : float, (float, float), Hz
-        Least distance of the carriers, and what is played, at the recorded speed.
+        Least distance of the carriers, and what is played, at the recorded speed: by default 20 to 400 Hz with
+        carriers, 20 to 1000 Hz without.
 
     Examples
     --------
@@ -162,14 +176,26 @@ class Recorded(_Playback):
 
     kind: ClassVar[str] = "recorded"
 
+    file: str | None = checked(checks.file_name, None)
+    samples: tuple[float, ...] | None = checked(checks.numbers, None, least=-LOUDEST, most=LOUDEST)
+    rate: float | None = parameter(None, "Hz", least=1.0, most=MOST_RATE)
     channel: int = parameter(0, least=0, most=1023)
     speed: float | None = parameter(None, "m/s", above=1e-6, most=MOST_SPEED)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        checks.exactly_one(file=self.file, samples=self.samples)
+        checks.require(self.samples is None or len(self.samples) >= 2, "samples", self.samples, ">= 2 numbers")
+        bound = "left out, as the file has one" if self.samples is None else f"a number of Hz <= {MOST_RATE:g}"
+        checks.require((self.rate is None) == (self.samples is None), "rate", self.rate, bound)
 
     def _speed(self) -> float | None:
         return self.speed
 
     def _recorded(self) -> tuple[Array, float]:
-        return _read_sound(self.file, self.channel)
+        if self.samples is not None and self.rate is not None:
+            return np.array(self.samples), 1 / self.rate
+        return _read_sound(str(self.file), self.channel)
 
 
 def _read_sound(file: str, channel: int) -> tuple[Array, float]:
@@ -239,6 +265,8 @@ class Swipe(_Playback):
     kind: ClassVar[str] = "swipe"
     spatial: ClassVar[bool] = True  # type: ignore[misc]  # known without reading the file
 
+    file: str = checked(checks.file_name)
+
     def _speed(self) -> float:
         speed = load_swipe(self.file).speed
         if speed == 0.0:
@@ -262,7 +290,7 @@ LEAST_GAP = 40.0  # Hz
 
 
 @dataclass(frozen=True, kw_only=True)
-class Synthetic(Validated):
+class Synthetic(Validated, Composable):
     """A texture like a recorded one that needs no file: a few components with slowly varying amplitudes.
 
     Parameters

@@ -20,6 +20,7 @@ from hapticrender.checks import Validated, checked, parameter
 from hapticrender.errors import SceneError
 from hapticrender.protocols import Texture
 from hapticrender.touch import toml
+from hapticrender.touch.composed import Chirp, Playlist, Sum
 from hapticrender.touch.custom import Custom
 from hapticrender.touch.finger import Finger
 from hapticrender.touch.grating import Grating
@@ -27,7 +28,9 @@ from hapticrender.touch.mechanics import NAMED
 from hapticrender.touch.motion import LONGEST_TIME, Nowhere, RecordedMotion, Sampled, SineMotion, Still, TriangleMotion
 from hapticrender.touch.recorded import Recorded, Swipe, Synthetic
 
-TEXTURES: dict[str, type[Any]] = {kind.kind: kind for kind in (Grating, Recorded, Swipe, Synthetic, Custom)}
+TEXTURES: dict[str, type[Any]] = {
+    kind.kind: kind for kind in (Grating, Recorded, Swipe, Synthetic, Chirp, Sum, Playlist, Custom)
+}
 MOTIONS: dict[str, type[Any]] = {
     kind.kind: kind for kind in (Nowhere, Still, TriangleMotion, SineMotion, Sampled, RecordedMotion, Custom)
 }
@@ -73,7 +76,8 @@ class Scene(Validated):
     Parameters
     ----------
     texture : Texture
-        `Grating`, `Recorded`, `Swipe`, `Synthetic`, or any object that follows ``protocols.Texture``.
+        `Grating`, `Recorded`, `Swipe`, `Synthetic`, `Chirp`, `Sum` (``a + 0.5 * b``), `Playlist`, or any object that
+        follows ``protocols.Texture``.
     finger : Finger
         Default: none; a texture that is read at the finger's position needs one.
     device : str
@@ -176,13 +180,12 @@ class Scene(Validated):
 
     def to_toml(self) -> str:
         """TOML text that `from_toml_text` reads back to an equal scene (textures of your own: by description only)."""
-        texture: Any = self.texture if type(self.texture) in TEXTURES.values() else Custom(repr(self.texture))
         tables: dict[str, dict[str, Any]] = {table: {} for table in TABLES.values()}
         for (table, key), own in OWN.items():
             tables[table][key] = getattr(self, own)
         for own, table in TABLES.items():
             tables[table] |= getattr(self, own)
-        parts = {"texture": {"kind": texture.kind} | _write_fields(texture), "finger": _write_finger(self.finger)}
+        parts = {"texture": _write_texture(self.texture), "finger": _write_finger(self.finger)}
         return toml.dumps({"name": self.name, "duration": self.duration} | parts | tables)
 
 
@@ -264,9 +267,18 @@ def _read_kind(table: Any, key: str, choice: str, kinds: dict[str, type[Any]], f
             entry.name: None for entry in entries if entry.default is entry.default_factory is MISSING
         }
         values |= {entry.name: table[entry.name] for entry in entries if entry.name in table}
+        if isinstance(values.get("parts"), list):
+            values["parts"] = [_read_part(f"parts[{i}]", part, folder) for i, part in enumerate(values["parts"])]
         if isinstance(values.get("file"), str) and values["file"].isprintable():
             values["file"] = str(folder / values["file"]) if values["file"] else ""
         return kind(**values)
+
+
+def _read_part(key: str, part: Any, folder: Path) -> Any:
+    """Pair of a texture, from its table, and a number; anything else is left for the texture to refuse."""
+    if not (isinstance(part, list) and len(part) == 2):
+        return part
+    return _read_kind(part[0], f"{key}[0]", "kind", TEXTURES, folder), part[1]
 
 
 def _read_finger(table: Any, folder: Path) -> Finger:
@@ -283,6 +295,15 @@ def _write_fields(part: Any) -> dict[str, Any]:
     """Fields of a dataclass as TOML has them; None is left out, for TOML has no word for it."""
     values = {entry.name: getattr(part, entry.name) for entry in fields(part)}
     return {key: value for key, value in values.items() if value is not None}
+
+
+def _write_texture(texture: Any) -> dict[str, Any]:
+    """Texture as TOML has it, one of other textures with a table for each of them."""
+    known: Any = texture if type(texture) in TEXTURES.values() else Custom(repr(texture))
+    table = {"kind": known.kind} | _write_fields(known)
+    if "parts" in table:
+        table["parts"] = [(_write_texture(part), number) for part, number in table["parts"]]
+    return table
 
 
 def _write_finger(finger: Finger) -> dict[str, Any]:

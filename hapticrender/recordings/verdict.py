@@ -1,0 +1,226 @@
+"""Judge the waveform: the motion against the texture as the scene asks for it, without time shift or gain fit.
+
+Symbols: r reference, y motion at a place over the place's share of the target, e = y - r; rms_B over B = 20 to 500 Hz,
+rms_b over a third octave b with both edges in B; S_b detection threshold (rms) in it.  Over the whole play both come
+from spectra, E = rms_B(e)/rms_B(r) among them; windows of 100 ms and contacts from signals filtered without phase.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from functools import partial
+from itertools import pairwise
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from hapticrender.protocols import Array, Flag
+from hapticrender.recordings.envelopes import DIVERGING, RUNAWAY, judged_from
+from hapticrender.touch.perception import detection_threshold
+
+if TYPE_CHECKING:
+    from hapticrender.recordings.recording import Recording
+
+BAND = (20.0, 500.0)  # Hz
+HIGHEST = 0.4  # of the rate: B ends there at low rates
+ORDERS = (4, 12)  # of the Butterworth high pass and low pass, run both ways: half the amplitude is left at the edges
+MARGIN = 0.25  # s around a piece, in which the filter settles
+WINDOW = 0.1  # s
+SEGMENT = 10  # windows in a segment of the spectra (Hann, half overlapping): 1 s
+WORST_WINDOWS = 95.0  # percentile
+QUIET = 0.1  # of the rms of the whole reference: windows below count as this loud
+READ_AT_ONCE = 2**17  # samples
+NOMINAL = (25.0, 31.5, 40.0, 50.0, 63.0, 80.0, 100.0, 125.0, 160.0, 200.0, 250.0, 315.0, 400.0)  # Hz [IEC 61260]
+THIRDS = 1000.0 * 2.0 ** (np.arange(-16, -3) / 3)  # Hz: their exact middles
+EDGE = 2.0 ** (1 / 6)
+CURVE = "classic"  # detection threshold; the rounding of a 12-bit converter alone is 1.4 times the safe one at 200 Hz
+SPUR = 0.01  # of the rms of the whole reference: S_b where no threshold is known
+LOOSER = 2.0  # times the tolerance: bound on a third octave and on the worst windows
+UNPLAYABLE = 0.01  # share of the reference's energy outside B from which it is noted
+LEAST = 1e-4  # share of the reference's energy in B below which nothing is judged
+LONGEST_DELAY = 20e-3  # s, of the best delay
+AFTER_CONTACT = (0.0, 0.05, 0.2)  # s: edges of the two spans that are stated
+MATTERS = Flag.SATURATED | Flag.NONFINITE | Flag.SENSOR_CLIPPED | Flag.OVERRUN
+
+
+@np.errstate(**DIVERGING)
+def waveform_figures(recording: Recording) -> dict[str, Any]:
+    """Figures of the waveform as plain numbers, None where there is none; see ``judge.summary``."""
+    header, rate = recording.header, recording.rate
+    window, begin = round(WINDOW * rate), math.ceil(judged_from(recording) * rate - 1e-6)
+    count = max(len(recording) - begin, 0) // max(window, 1)
+    places = [place.replace(" ", "_") for place in header.places]
+    found: dict[str, Any] = {"lost_windows": 0, "places": dict.fromkeys(places), "contacts": None, "sensor_noise": 0.0}
+    found |= dict.fromkeys(("rms_reference", "share_in_band", "share_outside", "delay", "gain", "incoherent"))
+    if not window or not count:
+        return found
+    stop = begin + count * window
+    size = max(READ_AT_ONCE // window, 1) * window
+    pieces = [(start, min(start + size, stop)) for start in range(begin, stop, size)]
+    power = np.concatenate([_power(recording, *piece, window) for piece in pieces])
+    found["lost_windows"] = int(np.isnan(power).any(axis=1).sum())
+    if found["lost_windows"]:
+        return found
+    frequency, spectrum, cross = _spectra(recording, begin, stop, min(SEGMENT, count) * window)
+    inside = _within(frequency, *_band(rate), 2 * frequency[1])
+    reference = spectrum[:, 0]
+    level = found["rms_reference"] = math.sqrt(reference.sum())
+    if not level > 0.0:
+        return found
+    found["share_in_band"] = float(reference[inside].sum() / reference.sum())
+    found["share_outside"] = _outside(reference, frequency, inside, header.unit)
+    if found["share_in_band"] < LEAST:
+        return found
+    found["sensor_noise"] = _noise(recording, *_band(rate)) / math.sqrt(reference[inside].sum())
+    floor = partial(_floor, recording, level)
+    for i, place in enumerate(places, start=1):
+        total = spectrum[_within(frequency, *_band(rate))].sum(axis=0)
+        errors = {"waveform_error": math.sqrt(total[i] / total[0]), "window_error": _windows(power[:, [0, i]])}
+        found["places"][place] = errors | _thirds(spectrum[:, [0, i]], frequency, rate, floor)
+    sign = float(np.sign((header.profile or (1.0,))[0]))
+    found |= _likeness(frequency[inside], spectrum[inside, :2], cross[inside], sign)
+    return found | {"contacts": _contacts(recording, begin, stop, math.sqrt(power[:, 0].mean()))}
+
+
+def _band(rate: float) -> tuple[float, float]:
+    return BAND[0], min(BAND[1], HIGHEST * rate)
+
+
+def _within(frequency: Array, low: float, high: float, blur: float = 0.0) -> Array:
+    return (frequency >= low - blur) & (frequency < high + blur)
+
+
+def _signals(recording: Recording, start: int, stop: int) -> Array:
+    """Reference, and error at every place relative to its share of the target, shape (n, 1 + places)."""
+    shares = np.array(recording.header.profile or np.ones(len(recording.header.places)))
+    reference, motion = recording.read("reference", start, stop), recording.read("motion", start, stop)
+    motion = np.where(np.abs(motion) < RUNAWAY, motion, np.nan)
+    if recording.header.unit == "N":
+        motion = _without_base(motion, np.isfinite(recording.read("position", start, stop)))
+    error = (motion - np.outer(reference, shares)) / np.where(shares == 0.0, 1.0, np.abs(shares))
+    return np.column_stack([reference, error])
+
+
+def _without_base(friction: Array, touching: Array) -> Array:
+    """Friction (n, places) less its mean over each touch: a touch brings friction of its own, whatever the texture."""
+    for part in np.split(np.arange(len(touching)), np.flatnonzero(np.diff(touching)) + 1):
+        if part.size:
+            friction[part] -= friction[part].mean(axis=0)
+    return friction
+
+
+def _filtered(recording: Recording, start: int, stop: int) -> Array:
+    """`_signals` within B."""
+    from scipy.signal import butter, sosfiltfilt
+
+    margin = round(MARGIN * recording.rate)
+    first = max(start - margin, 0)
+    sides = zip(ORDERS, _band(recording.rate), ("highpass", "lowpass"), strict=True)
+    sections = np.vstack([butter(order, edge, kind, fs=recording.rate, output="sos") for order, edge, kind in sides])
+    signals = np.nan_to_num(_signals(recording, first, min(stop + margin, len(recording))))
+    return sosfiltfilt(sections, signals, axis=0, padlen=min(margin, len(signals) - 1))[start - first : stop - first]
+
+
+def _power(recording: Recording, start: int, stop: int, window: int) -> Array:
+    """Mean square within B in every window, shape (windows, 1 + places); NaN where the motion is no number."""
+    lost = np.isnan(_signals(recording, start, stop).sum(axis=1)).reshape(-1, window).any(axis=1)
+    values = _filtered(recording, start, stop)
+    return np.where(lost[:, None], np.nan, (values**2).reshape(-1, window, values.shape[1]).mean(axis=1))
+
+
+def _spectra(recording: Recording, begin: int, stop: int, segment: int) -> tuple[Array, Array, Array]:
+    """Frequencies (Hz), mean square a bin (bins, 1 + places), and cross spectrum of r and e at the first place."""
+    starts = np.unique([*range(begin, stop - segment + 1, max(segment // 2, 1)), stop - segment])
+    shape = np.hanning(segment + 1)[:-1, None]
+    scale = 2.0 / (segment * (shape**2).sum()) / len(starts)
+    power, cross = 0.0, 0.0
+    for start in starts:
+        values = _signals(recording, start, start + segment)
+        turned = np.fft.rfft(shape * (values - values.mean(axis=0)), axis=0)
+        power += scale * np.abs(turned) ** 2
+        cross += scale * turned[:, 0].conj() * turned[:, 1]
+    return np.fft.rfftfreq(segment, 1 / recording.rate), np.asarray(power), np.asarray(cross)
+
+
+def _windows(power: Array) -> float:
+    """95th percentile of ``rms_B(e)/max(rms_B(r), 0.1 of that of the whole play)`` in windows of 100 ms."""
+    reference, error = power.T
+    each = error / np.maximum(reference, QUIET**2 * reference.mean())
+    return float(np.sqrt(np.percentile(each, WORST_WINDOWS)))
+
+
+def _thirds(spectrum: Array, frequency: Array, rate: float, floor: Callable[[float], float]) -> dict[str, Any]:
+    """``e_b = rms_b(e)/max(rms_b(r), floor(b))`` of every third octave b inside B, and the largest."""
+    low, high = _band(rate)
+    found = {}
+    for name, middle in zip(NOMINAL, THIRDS, strict=True):
+        if low <= middle / EDGE and middle * EDGE <= high:
+            third = _within(frequency, middle / EDGE, middle * EDGE)
+            reference, error = np.sqrt(spectrum[third].sum(axis=0))
+            found[f"{name:g} Hz"] = float(error / max(reference, floor(middle)))
+    worst = max(found, key=lambda name: found[name], default=None)
+    return {"third_octave_error": found.get(worst or ""), "third_octave": worst, "third_octaves": found}
+
+
+def _floor(recording: Recording, level: float, middle: float) -> float:
+    """Least rms that the texture counts as in a third octave: S_b over the bound, so that an error of S_b is on it.
+
+    S_b is the detection threshold on a plate; of other quantities, for which none is known, 1 % of the rms `level` of
+    the whole reference.  It is never below twice the noise of the sensors where the motion comes from them.
+    """
+    header = recording.header
+    least = float(detection_threshold(middle, CURVE)) / math.sqrt(2.0) if header.unit == "m" else SPUR * level
+    return max(least, 2.0 * _noise(recording, middle / EDGE, middle * EDGE)) / (LOOSER * header.tolerance)
+
+
+def _noise(recording: Recording, low: float, high: float) -> float:
+    """Rms of a sensor's white noise from `low` to `high` (Hz) in the motion; 0 where that is not from the sensors."""
+    header = recording.header
+    measured = header.motion_source == "sensors"
+    return header.sensed_noise * math.sqrt(2.0 * (high - low) / header.rate) if measured else 0.0
+
+
+def _outside(reference: Array, frequency: Array, inside: Array, unit: str) -> float:
+    """Share of the reference's energy outside B; 0 where it is below the threshold at its strongest frequency (m)."""
+    outside = np.where(inside, 0.0, reference)
+    strongest = float(np.clip(frequency[outside.argmax()], 1.0, 1000.0))
+    if unit == "m" and math.sqrt(2.0 * outside.sum()) < detection_threshold(strongest):
+        return 0.0
+    return float(outside.sum() / reference.sum())
+
+
+def _likeness(frequency: Array, spectrum: Array, cross: Array, sign: float) -> dict[str, float]:
+    """Best delay (s) and gain of y over r within 20 ms, and the share of y's energy that they do not explain.
+
+    ``c(tau) = Re sum_f R* Y exp(j 2 pi f tau)`` is largest at the delay; gain ``c/sum |R|^2``, incoherent share
+    ``1 - c^2/(sum |R|^2 sum |Y|^2)``.
+    """
+    reference, error = spectrum.T
+    whole = cross + sign * reference  # of r and y = e + sign r
+    motion = error + 2.0 * sign * cross.real + sign**2 * reference
+    delay = np.linspace(-LONGEST_DELAY, LONGEST_DELAY, 4001)
+    turned = np.exp(2j * np.pi * np.outer(delay, frequency)) @ whole
+    best = int(np.argmax(turned.real * (1.0 - 1e-6 * np.abs(delay) / LONGEST_DELAY)))  # of equal ones the shortest
+    found, total = float(turned.real[best]), float(reference.sum())
+    incoherent = 1.0 - found**2 / max(total * float(motion.sum()), np.finfo(float).tiny)
+    return {"delay": float(delay[best]), "gain": found / total, "incoherent": max(incoherent, 0.0)}
+
+
+def _contacts(recording: Recording, begin: int, stop: int, level: float) -> dict[str, Any]:
+    """Count of touches and lifts, and the error after them over the reference's rms `level`, at the worst place."""
+    edges = [round(seconds * recording.rate) for seconds in AFTER_CONTACT]
+    after = [_filtered(recording, at, at + edges[-1]) for at in _events(recording, begin, stop - edges[-1])]
+    squares = [[(values[a:b, 1:] ** 2).mean(axis=0) for a, b in pairwise(edges)] for values in after]
+    errors = (np.sqrt(np.mean(squares, axis=0).max(axis=1)) / level).tolist() if squares else [None, None]
+    return {"count": len(after), "error_0_50_ms": errors[0], "error_50_200_ms": errors[1]}
+
+
+def _events(recording: Recording, begin: int, stop: int) -> Iterator[int]:
+    """Samples at which the finger touches or lifts."""
+    before = np.zeros(1, bool)
+    for start in range(begin, stop, READ_AT_ONCE):
+        touching = np.isfinite(recording.read("position", start, min(start + READ_AT_ONCE, stop)))
+        path = np.concatenate([touching[:1] if start == begin else before, touching])
+        yield from (start + np.flatnonzero(np.diff(path))).tolist()
+        before = touching[-1:]

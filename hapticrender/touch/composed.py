@@ -1,0 +1,188 @@
+"""Textures made of textures: sums, multiples and playlists; and the chirp."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+
+from hapticrender import checks
+from hapticrender.bands import Bands
+from hapticrender.checks import Validated, checked, parameter
+from hapticrender.protocols import Array, Texture
+
+MOST_PARTS = 4096
+MOST_GAIN = 1e6
+LONGEST_PART = 360_000.0  # s
+MOST_CHIRP = 0.01  # m
+
+Parts = tuple[tuple[Texture, float], ...]
+
+
+class Composable:
+    """Base of the library's textures: ``a + b`` and ``0.5 * a`` are `Sum`s."""
+
+    def __add__(self, other: Any) -> Sum:
+        return Sum((*_terms(self), *_terms(other))) if isinstance(other, Texture) else NotImplemented
+
+    def __mul__(self, gain: float) -> Sum:
+        return Sum(tuple((each, gain * own) for each, own in _terms(self)))
+
+    __rmul__ = __mul__
+
+
+def _terms(texture: Any) -> Parts:
+    return texture.parts if isinstance(texture, Sum) else ((texture, 1.0),)
+
+
+def _read_parts(key: str, value: Any, **bounds: Any) -> Parts:
+    bound = f"1 to {MOST_PARTS} pairs of a texture and a number"
+    checks.require(isinstance(value, list | tuple) and 1 <= len(value) <= MOST_PARTS, key, value, bound, TypeError)
+    for index, pair in enumerate(value):
+        good = isinstance(pair, list | tuple) and len(pair) == 2 and isinstance(pair[0], Texture)
+        checks.require(good, f"{key}[{index}]", pair, bound, TypeError)
+    return tuple((pair[0], checks.number(f"{key}[{i}][1]", pair[1], **bounds)) for i, pair in enumerate(value))
+
+
+class _Composed(Composable):
+    """What sums and playlists share."""
+
+    parts: Parts
+
+    @property
+    def spatial(self) -> bool:
+        """Whether any part is read at the finger's position."""
+        return any(getattr(texture, "spatial", False) for texture, _ in self.parts)
+
+    @property
+    def _follows_finger(self) -> bool:
+        return all(getattr(texture, "spatial", False) for texture, _ in self.parts)
+
+    def check(self) -> None:
+        """Read the files of all parts."""
+        for texture, _ in self.parts:
+            if hasattr(texture, "check"):
+                texture.check()
+
+
+@dataclass(frozen=True)
+class Sum(Validated, _Composed):
+    """Sum of textures, each times a gain: what ``a + 0.5 * b`` makes.
+
+    Parameters
+    ----------
+    parts : sequence of (texture, gain)
+        Gain between -1e6 and 1e6, 1.
+
+    Notes
+    -----
+    It has the bands of all parts where every part has constant envelopes, those of its only part where it has one;
+    else none, so that only methods that play a whole waveform take it.
+
+    Examples
+    --------
+    >>> from hapticrender.touch.grating import Grating
+    >>> both = Grating(amplitude=1e-6, frequency=50.0) + 0.5 * Grating(amplitude=1e-6, frequency=80.0)
+    >>> both.bands(5000.0).frequency.tolist(), abs(both.bands(5000.0).envelope).tolist()
+    ([50.0, 80.0], [1e-06, 5e-07])
+    """
+
+    kind: ClassVar[str] = "sum"
+
+    parts: Parts = checked(_read_parts, least=-MOST_GAIN, most=MOST_GAIN)
+
+    def bands(self, rate: float) -> Bands:
+        """Bands of all parts for sampling at `rate` (Hz), equal carriers as one."""
+        found = [(texture.bands(rate), gain) for texture, gain in self.parts]
+        if len(found) == 1 and found[0][0].envelope is None:
+            return found[0][0]
+        if any(bands.envelope is None for bands, _ in found):
+            return Bands.none(spatial=self._follows_finger)
+        carriers = np.concatenate([np.stack([bands.frequency, bands.wavenumber]) for bands, _ in found], axis=1)
+        turned = [gain * bands.envelope * np.exp(1j * bands.phase) for bands, gain in found]  # type: ignore[operator]
+        (frequency, wavenumber), which = np.unique(carriers, axis=1, return_inverse=True)
+        envelope = np.zeros(len(frequency), complex)
+        np.add.at(envelope, which.ravel(), np.concatenate(turned))
+        return Bands(frequency=frequency, wavenumber=wavenumber, phase=np.zeros(len(frequency)), envelope=envelope)
+
+    def waveform(self, time: Array, position: Array) -> Array:
+        """Target displacement (m, shape (n,)) at `time` (s) with the finger at `position` (m)."""
+        return np.sum([gain * texture.waveform(time, position) for texture, gain in self.parts], axis=0)
+
+
+@dataclass(frozen=True)
+class Playlist(Validated, _Composed):
+    """Textures one after another, each from its own t = 0, without a cross-fade; after the last the first again.
+
+    Parameters
+    ----------
+    parts : sequence of (texture, duration in s)
+        Duration > 0.
+
+    Examples
+    --------
+    >>> played = Playlist([(Chirp(start=50.0, stop=200.0, duration=1.0, amplitude=1e-6), 1.0)])
+    >>> len(played.bands(5000.0))
+    0
+    """
+
+    kind: ClassVar[str] = "playlist"
+
+    parts: Parts = checked(_read_parts, unit="s", above=0.0, most=LONGEST_PART)
+
+    def bands(self, rate: float) -> Bands:
+        """No carriers (`rate` in Hz is not needed): the whole waveform is played."""
+        return Bands.none(spatial=self._follows_finger)
+
+    def waveform(self, time: Array, position: Array) -> Array:
+        """Target displacement (m, shape (n,)) at `time` (s) with the finger at `position` (m)."""
+        ends = np.cumsum([seconds for _, seconds in self.parts])
+        own, position = np.mod(np.asarray(time, float), ends[-1]), np.asarray(position, float)
+        which, values = np.searchsorted(ends, own, side="right"), np.zeros(own.shape)
+        for index, (texture, seconds) in enumerate(self.parts):
+            here = which == index
+            values[here] = texture.waveform(own[here] - (ends[index] - seconds), position[here])
+        return values
+
+
+@dataclass(frozen=True, kw_only=True)
+class Chirp(Validated, Composable):
+    """A sine whose frequency rises or falls steadily in time; after its end it goes back, and so on.
+
+    Parameters
+    ----------
+    start, stop : float, Hz
+        First and last frequency, > 0 and <= 1e5.
+    duration : float, s
+        From the one to the other, > 0.
+    amplitude : float, m
+        Peak, > 0 and <= 0.01 m.
+
+    Examples
+    --------
+    >>> chirp = Chirp(start=20.0, stop=400.0, duration=2.0, amplitude=5e-6)
+    >>> chirp.waveform(np.array([0.0, 4.0]), np.full(2, np.nan)).round(9).tolist()
+    [5e-06, 5e-06]
+    """
+
+    kind: ClassVar[str] = "chirp"
+
+    start: float = parameter(unit="Hz", above=0, most=1e5)
+    stop: float = parameter(unit="Hz", above=0, most=1e5)
+    duration: float = parameter(unit="s", above=0, most=LONGEST_PART)
+    amplitude: float = parameter(unit="m", above=0, most=MOST_CHIRP)
+
+    def bands(self, rate: float) -> Bands:
+        """No carriers (`rate` in Hz is not needed): the whole waveform is played."""
+        return Bands.none(spatial=False)
+
+    def waveform(self, time: Array, position: Array) -> Array:
+        """Target displacement (m, shape (n,)): ``A cos 2 pi (f_0 t + (f_1 - f_0) t^2/(2 T))`` until T."""
+        whole = 0.5 * (self.start + self.stop) * self.duration  # turns of a pass
+        back, forth = np.divmod(np.asarray(time, float), 2.0 * self.duration)
+        there = np.minimum(forth, 2.0 * self.duration - forth)
+        turns = self.start * there + (self.stop - self.start) / (2.0 * self.duration) * there**2
+        turns = 2.0 * whole * back + np.where(forth > self.duration, 2.0 * whole - turns, turns)
+        return self.amplitude * np.cos(2.0 * math.pi * (turns % 1.0))
