@@ -25,7 +25,8 @@ import hapticrender as hr
 from hapticrender.bands import Bands
 from tests.strangers_plate import WRONG, StrangersPlate
 
-SWIPE = Path(__file__).parents[2] / "shared" / "data" / "swipe_40mm_s.npz"
+PLACES = [folder / "shared/data/swipe_40mm_s.npz" for folder in Path(__file__).resolve().parents]  # beside the checkout
+SWIPE = next((place for place in PLACES if place.exists()), None)
 FINE = 20e3  # Hz: of the textures' samples
 FREQUENCIES = (20.0, 31.0, 47.0, 72.0, 111.0, 143.0, 170.0, 178.0, 189.0, 261.0, 400.0)
 LIGHT, HEAVY = (4e-3, 1.0, 200.0), (4e-3, 1.5, 300.0)  # kg, N s/m, N/m: Grigorii et al. 2021, table 1
@@ -98,6 +99,12 @@ def swipe():
     return Wave(limited(resample_poly(force - force.mean(), 2, 1)))
 
 
+class Path(NamedTuple):
+    """A finger's motion, for the textures that are read at its position."""
+
+    position: object
+
+
 class Run(NamedTuple):
     time: np.ndarray  # s
     truth: np.ndarray  # m (n, 4)
@@ -112,7 +119,8 @@ def play(texture, seconds, finger=None, position=0.0, contact=None, **plate):
         contact = contact or (lambda t: np.clip((t - 0.1) / 1e-3, 0.0, 1.0))
         plate = {"finger": mechanics, "load": load, "contact": contact, "position": position} | plate
     device = StrangersPlate(**{"bending": options.bending, "seed": options.seed, "report_lag": 5e-3} | plate)
-    scene = hr.Scene(texture=texture, duration=seconds, keep_unfelt=True, method=options.method)
+    motion = hr.Finger(Path(position)) if callable(position) else hr.Finger.absent()
+    scene = hr.Scene(texture=texture, finger=motion, duration=seconds, keep_unfelt=True, method=options.method)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         hr.render(scene, driver=device)
@@ -171,8 +179,8 @@ def rms(values, axis=0):
 def worst_waves():
     """Pink noise, a recorded swipe, clicks and a chirp under each finger sliding."""
     kinds = {pink: (4.0, 1.5), clicks: (4.0, 1.5), chirp: (3.0, 0.3), swipe: (2.3, 0.7)}
-    if not SWIPE.exists():
-        print(f"{SWIPE} is not here: no swipe")
+    if SWIPE is None:
+        print("  ../shared/data/swipe_40mm_s.npz is not here: no swipe")
         del kinds[swipe]
     found = {}
     for kind, finger in product(kinds, FINGERS):

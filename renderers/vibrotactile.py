@@ -59,8 +59,9 @@ class VibrotactileRenderer(BaseRenderer):
         model = replace(assumed.device_model(driver.rate, delay), block=driver.block)
         if setup.scene.gradient:
             model = replace(model, shape=_pattern(setup.scene, assumed))
-        if model.rigid and not isinstance(plate, Plate):
-            return replace(model, bending=EXPECTED_BENDING, rigid=False)  # only a model of a plate is rigid
+        stated = "bending_frequency" in setup.scene.profile  # 0 as well: identified, and no mode found
+        if model.rigid and not stated and not isinstance(plate, Plate):
+            return replace(model, bending=EXPECTED_BENDING, rigid=False)
         return model
 
     def bands(self, setup: PlateSetup, model: DeviceModel) -> Bands:
