@@ -55,7 +55,8 @@ class VibrotactileRenderer(BaseRenderer):
         check_channels(driver, {coils: "one a coil"}, {2: "one an end", 0: "open loop"})
         plate = getattr(driver, "plant", None)
         own = isinstance(plate, Plate) and plate.parameters is setup.simulated
-        delay = assumed.delay if own else driver.delay  # that of a simulated plate may differ from what is assumed
+        # that of a simulated plate may differ from what is assumed; a driver may state less than was identified
+        delay = assumed.delay if own else max(assumed.delay, driver.delay)
         model = replace(assumed.device_model(driver.rate, delay), block=driver.block)
         if setup.scene.gradient:
             model = replace(model, shape=_pattern(setup.scene, assumed))

@@ -138,14 +138,19 @@ def test_a_bending_mode_is_found_from_five_standard_deviations_on():
 
 @pytest.mark.parametrize("coil", [0.1, 0.0])
 def test_what_was_identified_of_bending_reaches_the_design(coil):
-    """Measured: taps with zeros at the mode, or for rigid glass; an estimate of either sign where nothing is stated."""
-    plate = StrangersPlate(bending=(1250.0, 30, coil), **WRONG, told=2)
+    """Measured: taps with zeros at the mode, or for rigid glass; an estimate of either sign where nothing is stated.
+
+    So do the gains, and a delay beyond the driver's.
+    """
+    plate = StrangersPlate(bending=(1250.0, 30, coil), **WRONG, told=1)
     device = tomllib.loads(identify(plate, PAPER).to_toml())["device"]
     tone, kind = hr.Grating(frequency=72.0, amplitude=50e-6), device.pop("kind")
     scene = hr.Scene(texture=tone, duration=1.0, device=kind, profile=device)
     model = loop.prepare(scene, driver=plate).model
     assert loop.prepare(dataclasses.replace(scene, profile={}), driver=plate).model.bending.measured is False
     assert model.rigid is (coil == 0.0)
+    assert model.delay == 2
+    assert model.coordinate_from_sensed[0] == pytest.approx([0.5 / 1.02, 0.5 / 0.98], rel=1e-3)
     if coil:
         assert model.bending.measured
         assert model.bending.frequency == pytest.approx(1250.0, abs=0.5)
