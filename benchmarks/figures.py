@@ -23,9 +23,11 @@ from scipy.signal import butter, resample_poly, sosfiltfilt
 
 import hapticrender as hr
 from hapticrender.bands import Bands
-from tests.strangers_plate import WRONG, StrangersPlate
+from hapticrender.plants.plate import PlateParameters
+from tests.strangers_plate import TRUTH, WRONG, StrangersPlate
 
-SWIPE = Path(__file__).parents[2] / "shared" / "data" / "swipe_40mm_s.npz"
+PLACES = [folder / "shared/data/swipe_40mm_s.npz" for folder in Path(__file__).resolve().parents]  # beside the checkout
+SWIPE = next((place for place in PLACES if place.exists()), None)
 FINE = 20e3  # Hz: of the textures' samples
 FREQUENCIES = (20.0, 31.0, 47.0, 72.0, 111.0, 143.0, 170.0, 178.0, 189.0, 261.0, 400.0)
 LIGHT, HEAVY = (4e-3, 1.0, 200.0), (4e-3, 1.5, 300.0)  # kg, N s/m, N/m: Grigorii et al. 2021, table 1
@@ -37,7 +39,7 @@ FINGERS = {  # mechanics, load (N)
 }
 FINGER, ENDS, CENTRE = 0, [1, 2], 3  # columns of the plate's truth
 EVERY = [FINGER, *ENDS]
-options = argparse.Namespace(method="inverse", bending=None, seed=1)
+options = argparse.Namespace(method="inverse", bending=None, seed=1, identified=False)
 
 
 class Wave:
@@ -98,11 +100,22 @@ def swipe():
     return Wave(limited(resample_poly(force - force.mean(), 2, 1)))
 
 
+class Path(NamedTuple):
+    """A finger's motion, for the textures that are read at its position."""
+
+    position: object
+
+
 class Run(NamedTuple):
     time: np.ndarray  # s
     truth: np.ndarray  # m (n, 4)
     position: np.ndarray  # m, true, NaN without contact
     reference: np.ndarray  # m, of the texture at these
+
+
+def identified(seed=0, **plate):
+    """Identify a plate without a finger; its profile holds what was found."""
+    return hr.identify(StrangersPlate(**{"bending": options.bending, "seed": seed} | plate), PlateParameters())
 
 
 def play(texture, seconds, finger=None, position=0.0, contact=None, **plate):
@@ -112,7 +125,11 @@ def play(texture, seconds, finger=None, position=0.0, contact=None, **plate):
         contact = contact or (lambda t: np.clip((t - 0.1) / 1e-3, 0.0, 1.0))
         plate = {"finger": mechanics, "load": load, "contact": contact, "position": position} | plate
     device = StrangersPlate(**{"bending": options.bending, "seed": options.seed, "report_lag": 5e-3} | plate)
-    scene = hr.Scene(texture=texture, duration=seconds, keep_unfelt=True, method=options.method)
+    free = {key: value for key, value in plate.items() if key not in ("finger", "load", "contact", "position")}
+    profile = identified(**free).profile() if options.identified else {}
+    motion = hr.Finger(Path(position)) if callable(position) else hr.Finger.absent()
+    settings = {"method": options.method, "profile": profile, "keep_unfelt": True}
+    scene = hr.Scene(texture=texture, finger=motion, duration=seconds, **settings)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         hr.render(scene, driver=device)
@@ -180,8 +197,8 @@ def rms(values, axis=0):
 def worst_waves():
     """Pink noise, a recorded swipe, clicks and a chirp under each finger sliding."""
     kinds = {pink: (4.0, 1.5), clicks: (4.0, 1.5), chirp: (3.0, 0.3), swipe: (2.3, 0.7)}
-    if not SWIPE.exists():
-        print(f"{SWIPE} is not here: no swipe")
+    if SWIPE is None:
+        print("  ../shared/data/swipe_40mm_s.npz is not here: no swipe")
         del kinds[swipe]
     found = {}
     for kind, finger in product(kinds, FINGERS):
@@ -288,6 +305,22 @@ def wobble():
     return (worst,)
 
 
+def identification():
+    """Worst of 6 seeds, half of them wrong plates, mode at 1250 Hz, Q 30, +-.1: m, I, k and b %, samples, Hz, %."""
+    errors = []
+    for seed in range(6):
+        truth, mode = (WRONG if seed % 2 else TRUTH), (1250.0, 30, 0.1 * (-1) ** (seed // 2))
+        found = identified(seed, bending=mode, substeps=12, **truth).estimates
+        off = {name: abs(found[name].value - truth[name]) / truth[name] for name in TRUTH if name in found}
+        damping = [off[name] for name in ("damping_1", "damping_2")]
+        rest = [off[name] for name in ("mass", "inertia", "stiffness_1", "stiffness_2")]
+        late = abs(found["delay"].value - truth["delay"])
+        frequency = abs(found["bending_frequency"].value - mode[0])
+        coil = abs(found["bending_coil"].value / mode[2] - 1)
+        errors.append([100 * max(rest), 100 * max(damping), late, frequency, 100 * coil])
+    return tuple(np.max(errors, axis=0))
+
+
 ROWS = {  # what is measured; must; aim
     "white free, %": (lambda: wave_error(play(white(), 4.0)), (1, 2), (0.4, 0.7)),
     "white heavy sliding, %": (lambda: wave_error(play(white(), 4.0, "4H", sliding)), (1, 2), (0.5, 0.9)),
@@ -307,6 +340,7 @@ ROWS = {  # what is measured; must; aim
     "touch 10 um at .8 N, %": (lambda: touch(10e-6, ("2H", "4H")), (30, 70), ()),
     "small: 1 um pressed, .1 um, %": (small, (0.5, 1), ()),
     "wobble held, um": (wobble, (0.015,), (0.01,)),
+    "identify m I k %, b %, delay, f Hz, coupling %": (identification, (0.05, 0.2, 0.002, 0.5, 5), ()),
 }  # fmt: skip
 
 
@@ -314,6 +348,7 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--method", default="inverse")
     parser.add_argument("--only", default="", help="rows that contain this text")
+    parser.add_argument("--identified", action="store_true", help="identify each plate first and use its profile")
     parser.add_argument("--bending", type=lambda text: tuple(float(each) for each in text.split(",")))
     parser.add_argument("--seed", type=int, default=1)
     parser.parse_args(namespace=options)

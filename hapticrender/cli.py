@@ -119,8 +119,10 @@ def _parser() -> argparse.ArgumentParser:
     show = _add_verb(verbs, "show", _show, "print the figures of a recording, finished or cut off by a crash")
     show.add_argument("path", metavar="PATH", type=_path, help="a recording, or the folder of a rendered scene")
 
-    identify = _add_verb(verbs, "identify", _identify, "identify the parameters of a plate while no finger is on it")
-    text = "scene whose [device] is the expected plate, and [simulation] the simulated one (default: the paper's plate)"
+    identify = _add_verb(
+        verbs, "identify", _identify, "identify a plate or an ultrasonic surface without a finger, or a screen"
+    )
+    text = "scene whose [device] is the expected one, and [simulation] the simulated one (default: the paper's plate)"
     identify.add_argument("--scene", metavar="SCENE", help=text)
     text = "of a glass end (default: 100e-6)"
     identify.add_argument("--amplitude", metavar="M", type=float, default=100e-6, help=text)
@@ -304,26 +306,40 @@ def _suite(arguments: argparse.Namespace) -> int:
 
 def _identify(arguments: argparse.Namespace) -> int:
     from hapticrender.loop import registered
+    from hapticrender.plants.electroadhesion import ElectroadhesionScreen
     from hapticrender.plants.identify import identify
+    from hapticrender.plants.identify_friction import identify_resonance, identify_screen
     from hapticrender.plants.plate import Plate
+    from hapticrender.plants.ultrasonic import UltrasonicPlate
     from hapticrender.report.outputs import check_file
     from hapticrender.touch.finger import Finger
 
     if arguments.out:
         check_file("--out", arguments.out)
     scene = _scene(arguments.scene or "grating-20")  # any on the paper's plate
+    found: Any
     with _naming(arguments.scene or "identify"):
-        if scene.device != "vt-plate":
-            raise ValueError(f"device.kind = {scene.device!r}: must be 'vt-plate' to be identified")
-        setup = registered("renderers", "vt-plate")().read(scene, None)
+        if scene.device not in ("vt-plate", "ultrasonic", "electroadhesion"):
+            raise ValueError(f"device.kind = {scene.device!r}: must be vt-plate, ultrasonic or electroadhesion")
+        setup = registered("renderers", scene.device)().read(scene, None)
         seed = scene.seed if arguments.seed is None else arguments.seed
         driver = _driver(arguments.driver)
         if driver is None:
-            driver = registered("drivers", "simulated")(Plate(setup.simulated, Finger.absent(), seed))
+            plants = {
+                "vt-plate": lambda: Plate(setup.simulated, Finger.absent(), seed),
+                "ultrasonic": lambda: UltrasonicPlate(setup.simulated.carrier_mode, Finger.absent(), seed),
+                "electroadhesion": lambda: ElectroadhesionScreen(setup.simulated, scene.finger, seed),
+            }
+            driver = registered("drivers", "simulated")(plants[scene.device]())
         with driver:
-            found = identify(driver, setup.assumed, seconds=arguments.seconds, amplitude=arguments.amplitude)
+            if scene.device == "ultrasonic":
+                found = identify_resonance(driver, setup.assumed)
+            elif scene.device == "electroadhesion":
+                found = identify_screen(driver, setup.assumed, scene.finger)
+            else:
+                found = identify(driver, setup.assumed, seconds=arguments.seconds, amplitude=arguments.amplitude)
     print(found.text())
-    for difference in found.differences(setup.assumed):
+    for difference in found.differences(setup.assumed) if scene.device == "vt-plate" else ():
         print(f"differs from [device]: {difference}")
     if arguments.out:
         _made(arguments.out).write_text(found.to_toml(), encoding="utf-8")

@@ -55,12 +55,14 @@ class VibrotactileRenderer(BaseRenderer):
         check_channels(driver, {coils: "one a coil"}, {2: "one an end", 0: "open loop"})
         plate = getattr(driver, "plant", None)
         own = isinstance(plate, Plate) and plate.parameters is setup.simulated
-        delay = assumed.delay if own else driver.delay  # that of a simulated plate may differ from what is assumed
+        # that of a simulated plate may differ from what is assumed; a driver may state less than was identified
+        delay = assumed.delay if own else max(assumed.delay, driver.delay)
         model = replace(assumed.device_model(driver.rate, delay), block=driver.block)
         if setup.scene.gradient:
             model = replace(model, shape=_pattern(setup.scene, assumed))
-        if model.rigid and not isinstance(plate, Plate):
-            return replace(model, bending=EXPECTED_BENDING, rigid=False)  # only a model of a plate is rigid
+        stated = "bending_frequency" in setup.scene.profile  # 0 as well: identified, and no mode found
+        if model.rigid and not stated and not isinstance(plate, Plate):
+            return replace(model, bending=EXPECTED_BENDING, rigid=False)
         return model
 
     def bands(self, setup: PlateSetup, model: DeviceModel) -> Bands:

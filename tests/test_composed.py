@@ -1,5 +1,7 @@
 """Textures made of textures, arrays and chirps: what they play, in which bands, in a scene file; who refuses them."""
 
+from itertools import product
+
 import numpy as np
 import pytest
 
@@ -99,9 +101,11 @@ def test_a_part_that_is_no_texture_is_named():
         hr.Scene.from_toml_text(text)
 
 
-@pytest.mark.parametrize("method", sorted(METHODS))
-@pytest.mark.parametrize("device", ["vt-plate", "hybrid"])
-def test_methods_that_play_bands_refuse_a_whole_waveform(method, device):
+@pytest.mark.parametrize(
+    ("device", "method"),
+    [("hybrid", "inverse"), *product(("vt-plate", "hybrid"), sorted(set(METHODS) - {"inverse"}))],
+)
+def test_methods_that_play_bands_refuse_a_whole_waveform(device, method):
     texture = hr.Recorded(samples=ARRAY.samples, rate=2000.0, amplitude=1e-6, speed=0.1)
     scene = hr.Scene(texture=texture, finger=hr.Finger.sliding(speed=0.1), device=device, duration=0.1, method=method)
     with pytest.raises(ValueError, match="texture.carriers is missing: must be >= 1"):

@@ -278,7 +278,7 @@ def test_errors_of_white_noise_are_those_of_theory(rng):
 def test_a_spur_fails_where_it_is_felt(frequency, times_threshold, found):
     time = times(4.0)
     tone = 50 * UM * np.cos(2 * np.pi * 160 * time)
-    spur = times_threshold * hr.detection_threshold(frequency) * np.cos(2 * np.pi * frequency * time)
+    spur = times_threshold * hr.detection_threshold(frequency, "classic") * np.cos(2 * np.pi * frequency * time)
     figures, verdict = judged(tone, tone + spur)
     assert verdict == found
     assert figures["third_octave_error"] == pytest.approx(0.2 * times_threshold, rel=0.03)

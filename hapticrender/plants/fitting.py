@@ -7,7 +7,8 @@ In every bin the measured spectrum is
 U is the drive; Phi and Gamma are the plate discretised exactly for a held drive that is d + e samples late, so that
 the images of the hold and any fraction e of a sample are included.  S takes states to the glass ends, G = c diag(1 -
 g/2, 1 + g/2) holds the sensor gains, of known mean c and unknown difference g, and x is the free motion at the
-beginning of the record less that at its end.  A bending mode of the glass is included with its given parameters.
+beginning of the record less that at its end.  Where the glass bends, frequency, damping and shape at the coils of its
+mode are fitted with the rest, from where a template of a mode explains most of what a rigid plate leaves.
 
 Equation and output error: Pintelon & Schoukens, System Identification, 2nd ed. 2012, sections 9.8 and 9.10.
 """
@@ -27,7 +28,10 @@ from hapticrender.plants.plate import PlateParameters, structure
 from hapticrender.protocols import Array
 
 MECHANICAL = ("mass", "inertia", "stiffness_1", "stiffness_2", "damping_1", "damping_2")
-DELAY, GAIN, FREE = 6, 7, 8  # columns of the unknowns behind the logarithms of the six; free motion comes last
+BENDING = ("bending_frequency", "bending_damping", "bending_coil")
+DELAY, GAIN, FREE = 6, 7, 8  # columns of the unknowns behind the logarithms of the six; then mode and free motion
+CLEAREST = 5.0  # standard deviations: least shape at the coils that is taken for a bending mode
+TRIED_DAMPING = (0.01, 0.03)  # of the templates of a mode
 LEAST_RATIO = 0.1  # of the expected value: lower bound of the starting point
 LEAST_DAMPING = 1e-3  # of the critical one: the same for a plate that is expected to have none
 ROUNDING = 1e-9  # of the motion: least noise that is assumed
@@ -50,7 +54,7 @@ FAULTS = (  # name, and what turns sensors and coils into those of a plate witho
 
 @dataclass(frozen=True, kw_only=True)
 class Record:
-    """Spectra of drive and measurement (amplitudes), at bin 0 and from below the first line to above the last."""
+    """Spectra of drive and measurement (amplitudes): at bin 0, all over the lines of equal motion, at lines above."""
 
     rate: float  # Hz
     samples: int  # of the record
@@ -58,6 +62,12 @@ class Record:
     drive: Array  # of each coil (complex A, (n, 2))
     sensed: Array  # of each sensor (complex m, (n, 2))
     on_line: Array  # bins of the multi-sine's lines (bool, (n,))
+    above: Array  # of these, the lines of equal current above the rigid modes (bool, (n,))
+
+    @property
+    def lines(self) -> Array:
+        """Lines of equal motion."""
+        return self.on_line & ~self.above
 
     @property
     def between(self) -> Array:
@@ -69,8 +79,8 @@ class Fit(NamedTuple):
     """Result of a search."""
 
     plate: PlateParameters  # with the identified parameters, sensor gains included
-    unknown: Array  # logarithms of the six over their starting point, delay (samples), gain difference (8,)
-    covariance: Array  # of `unknown` at a variance of 1 m2 of every real number of the spectra (8, 8)
+    unknown: Array  # logarithms of the six over their start, delay (samples), gain difference, logarithms of `BENDING`
+    covariance: Array  # of `unknown` at a variance of 1 m2 of every real number of the spectra (8, 8) or (11, 11)
     left: Array  # measured less predicted at all bins, the static one included (m, (n, 2))
 
 
@@ -78,14 +88,15 @@ def spectra(rate: float, sine: Multisine, sensed: Array) -> Record:
     """Compute the spectra of one period of a multi-sine and of the measurement (m, shape (samples, 2))."""
     samples = len(sensed)
     margin = max(int(sine.bins[0]) // 2, 1)
-    bins = np.r_[0, sine.bins[0] - margin : sine.bins[-1] + margin + 1]
+    bins = np.r_[0, sine.bins[0] - margin : sine.bins[-1] + 1, sine.above]
     return Record(
         rate=rate,
         samples=samples,
         turn=bins / samples,
         drive=np.fft.rfft(sine.drive, axis=0)[bins] * (2 / samples),
         sensed=np.fft.rfft(sensed, axis=0)[bins] * (2 / samples),
-        on_line=np.isin(bins, sine.bins),
+        on_line=np.isin(bins, [*sine.bins, *sine.above]),
+        above=np.isin(bins, sine.above),
     )
 
 
@@ -121,7 +132,7 @@ def equation_error(expected: PlateParameters, record: Record, latest: int) -> tu
     samples turns the phase of the drive forces; the one that leaves least is taken.  Returns the values of
     `MECHANICAL`, the delay (samples), and the share of the drive force's mean square that the balance explains.
     """
-    line, turn = record.on_line, record.turn[record.on_line]
+    line, turn = record.lines, record.turn[record.lines]
     s = 2j * np.pi * record.rate * turn
     sensors = expected.device_model(record.rate, 1).coordinate_from_sensed
     motion = record.sensed[line] @ sensors.T
@@ -173,6 +184,32 @@ def check_wiring(expected: PlateParameters, record: Record, latest: int) -> None
     )
 
 
+def starting_bending(fit: Fit, record: Record, variance: float) -> tuple[float, float, float] | None:
+    """Find the bending mode that explains most of the heave which a rigid plate leaves at the lines above.
+
+    Returns `BENDING`; None where the shape at the coils is less than 5 standard deviations at a `variance` (m2) of
+    every real number of the spectra.  The modes tried lie 2 Hz apart.
+    """
+    plate, above = fit.plate, record.above
+    if not above.any():
+        return None
+    turn = record.turn[above]
+    hertz, late = turn * record.rate, fit.unknown[DELAY] + 0.5
+    left = (fit.left[above] / [plate.sensor_gain_1, plate.sensor_gain_2]).mean(axis=1)
+    force = plate.force_constant * record.drive[above].sum(axis=1) * np.sinc(turn) * np.exp(-2j * np.pi * turn * late)
+    modes = np.arange(hertz[0], hertz[-1], 2.0)[:, None]
+    best = None
+    for damping in TRIED_DAMPING:
+        templates = force / (4 * np.pi**2 * plate.bending_mass * (modes**2 - hertz**2 + 2j * damping * modes * hertz))
+        power = (abs(templates) ** 2).sum(axis=1)
+        coil = (templates.conj() @ left).real / power
+        clear = abs(coil) * np.sqrt(power / (variance / 2))
+        at = int(clear.argmax())
+        if best is None or clear[at] > best[0]:
+            best = float(clear[at]), (float(modes[at, 0]), damping, float(coil[at]))
+    return best[1] if best is not None and best[0] > CLEAREST else None
+
+
 def output_error(start: PlateParameters, late: float, record: Record) -> Fit:
     """Minimise the output error from the plate `start` and a delay of `late` samples.
 
@@ -183,26 +220,29 @@ def output_error(start: PlateParameters, late: float, record: Record) -> Fit:
     """
     scale = abs(record.sensed[1:]).max()
     mean, difference = sensor_gains(start)
-    begin = np.r_[np.zeros(DELAY), late, difference, np.zeros(2 * len(structure(start).mass))]
+    bending = BENDING if start.bending_frequency else ()
+    count = FREE + len(bending)
+    begin = np.r_[np.zeros(DELAY), late, difference, np.zeros(len(bending) + 2 * len(structure(start).mass))]
 
     def plate_at(unknown: Array) -> PlateParameters:
         values = [getattr(start, name) for name in MECHANICAL] * np.exp(unknown[:DELAY])
         gains = mean * (1 + unknown[GAIN] * np.array([-0.5, 0.5]))
-        names = (*MECHANICAL, "sensor_gain_1", "sensor_gain_2")
-        changes: dict[str, Any] = dict(zip(names, map(float, [*values, *gains]), strict=True))
+        modal = [getattr(start, name) for name in bending] * np.exp(unknown[FREE:count])
+        names = (*MECHANICAL, "sensor_gain_1", "sensor_gain_2", *bending)
+        changes: dict[str, Any] = dict(zip(names, map(float, [*values, *gains, *modal]), strict=True))
         return replace(start, **changes)
 
     def left(unknown: Array) -> Array:
         plate = plate_at(unknown)
         driven, free = sampled_response(plate, record.rate, unknown[DELAY], record.turn)
-        motion = (driven @ record.drive[:, :, None])[..., 0] + free @ (scale * unknown[FREE:])
+        motion = (driven @ record.drive[:, :, None])[..., 0] + free @ (scale * unknown[count:])
         return record.sensed - motion * [plate.sensor_gain_1, plate.sensor_gain_2]
 
     search = least_squares(
         lambda unknown: _real((left(unknown) / scale)[1:]).ravel(), begin, xtol=1e-12, ftol=1e-12, gtol=1e-12
     )
     covariance = np.linalg.inv(search.jac.T @ search.jac) / scale**2
-    return Fit(plate_at(search.x), search.x[:FREE], covariance[:FREE, :FREE], left(search.x))
+    return Fit(plate_at(search.x), search.x[:count], covariance[:count, :count], left(search.x))
 
 
 def _real(values: Array) -> Array:
@@ -223,7 +263,7 @@ def variances(fit: Fit, record: Record) -> tuple[float, float, float]:
     The ratio of the two variances has about the variance 2/n_1 + 2/n_2, n the numbers in each less those found.
     """
     power = abs(fit.left) ** 2
-    counts = 4 * record.on_line.sum() - FREE, 4 * record.between.sum()
+    counts = 4 * record.on_line.sum() - len(fit.unknown), 4 * record.between.sum()
     floor = (ROUNDING * abs(record.sensed[record.on_line]).max()) ** 2
     on_lines, between = (
         max(float(power[bins].sum() / count), floor)

@@ -1,4 +1,7 @@
-"""Multi-sine that excites a plate for identification: lines of equal motion, alternately heave and rocking."""
+"""Multi-sine that excites a plate for identification: lines of equal motion, alternately heave and rocking.
+
+Above them follow lines of equal current in heave, which excite a bending mode.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +17,9 @@ GRID = 12.0  # Hz between lines
 DENSE = 3.0  # Hz between lines within AROUND of a mode
 AROUND = 12.0  # Hz
 REACH_UP = 2.1  # highest line over highest mode
-HIGHEST_SHARE = 0.4  # of the sampling rate: bound of the highest line
+HIGHEST_SHARE = 0.4  # of the sampling rate: bound of the highest line of equal motion
+BENDING_TOP, BENDING_SHARE = 2200.0, 0.44  # Hz, of the sampling rate: bounds of the lines for a bending mode
+BENDING_GRID = 9.0  # Hz between these: a mode of 700 Hz and Q 50 is 14 Hz wide
 PATTERNS = np.array([[1.0, -1.0], [1.0, 1.0]])  # coil currents (rows) that drive heave and rocking (columns)
 CREST_ROUNDS = 200
 CREST_CLIP = 0.6  # of the peak
@@ -23,8 +28,9 @@ CREST_CLIP = 0.6  # of the peak
 class Multisine(NamedTuple):
     """One period of drive, and its lines."""
 
-    bins: Array  # lines, in periods a record, ascending
-    coordinate: Array  # that each line drives: 0 heave, 1 rocking
+    bins: Array  # lines of equal motion, in periods a record, ascending
+    coordinate: Array  # that each of them drives: 0 heave, 1 rocking
+    above: Array  # bins of the lines of equal current in heave, ascending
     drive: Array  # one period, rounded to the steps of the command (A, (samples, 2))
     motion: float  # amplitude of every line at the ends of the glass, on the plate that it was designed for (m)
 
@@ -33,7 +39,7 @@ def design_multisine(parameters: PlateParameters, rate: float, samples: int, amp
     """Design lines on a 12 Hz grid, and 3 Hz apart around both modes, that move the glass ends by `amplitude`.
 
     `amplitude` (m) is the largest displacement of an end of the expected plate; lines are whole multiples of
-    `rate`/`samples` (Hz).
+    `rate`/`samples` (Hz).  The lines above them, 9 Hz apart up to 2.2 kHz, add as much current again.
 
     Raises
     ------
@@ -50,7 +56,8 @@ def design_multisine(parameters: PlateParameters, rate: float, samples: int, amp
     bins = _lines(modes, rate, samples)
     coordinate = np.arange(len(bins)) % 2
     model = parameters.device_model(rate, parameters.delay)
-    frequency = bins * (rate / samples)
+    base = rate / samples
+    frequency = bins * base
     moved = model.response(frequency) * model.hold_and_delay(frequency)[:, None, None]
     ends = model.place_from_coordinate[1:] @ moved
     own = np.diagonal(moved @ PATTERNS, axis1=1, axis2=2)[np.arange(len(bins)), coordinate]
@@ -58,6 +65,11 @@ def design_multisine(parameters: PlateParameters, rate: float, samples: int, amp
     current = (np.exp(1j * _phases(bins, coordinate, samples)) / at_end)[:, None] * PATTERNS.T[coordinate]
     motion = amplitude / float(abs(_period(bins, (ends @ current[:, :, None])[..., 0], samples)).max())
     drive = motion * _period(bins, current, samples)
+    above = _spaced(REACH_UP * modes.max(), min(BENDING_TOP, BENDING_SHARE * rate), BENDING_GRID, base)
+    if len(above):
+        heave = np.zeros(len(above), int)
+        probe = _period(above, np.exp(1j * _phases(above, heave, samples))[:, None] * PATTERNS.T[heave], samples)
+        drive += probe * (abs(drive).max() / abs(probe).max())
     if parameters.current_step:
         drive = parameters.current_step * np.round(drive / parameters.current_step)
     peak = float(abs(drive).max())
@@ -66,7 +78,7 @@ def design_multisine(parameters: PlateParameters, rate: float, samples: int, amp
             f"amplitude = {amplitude:g} m: needs {peak:.3g} A, must be <= {parameters.current_limit:g} A; "
             f"the drive allows {amplitude * parameters.current_limit / peak:.3g} m"
         )
-    return Multisine(bins, coordinate, drive, motion)
+    return Multisine(bins, coordinate, above, drive, motion)
 
 
 def _check(
@@ -87,14 +99,15 @@ def _check(
 def _lines(modes: Array, rate: float, samples: int) -> Array:
     """Bins of the lines, ascending."""
     base = rate / samples
-
-    def spaced(first: float, last: float, spacing: float) -> Array:
-        return np.arange(math.ceil(first / base), math.floor(last / base) + 1, max(round(spacing / base), 1))
-
-    dense = np.concatenate([spaced(mode - AROUND, mode + AROUND, DENSE) for mode in modes])
-    grid = spaced(GRID, REACH_UP * modes.max(), GRID)
+    dense = np.concatenate([_spaced(mode - AROUND, mode + AROUND, DENSE, base) for mode in modes])
+    grid = _spaced(GRID, REACH_UP * modes.max(), GRID, base)
     apart = abs(grid[:, None] - dense).min(axis=1) * base
     return np.unique(np.concatenate([grid[apart >= DENSE], dense]))
+
+
+def _spaced(first: float, last: float, spacing: float, base: float) -> Array:
+    """Bins (multiples of `base`, Hz) about `spacing` apart from `first` to `last` (Hz)."""
+    return np.arange(math.ceil(first / base), math.floor(last / base) + 1, max(round(spacing / base), 1))
 
 
 def _phases(bins: Array, coordinate: Array, samples: int) -> Array:

@@ -1,0 +1,171 @@
+"""Identify a friction device through any driver: the resonance of an ultrasonic plate, the gain of a screen.
+
+The resonance is fitted to the free plate's response to lines of equal voltage around the expected one (output error)::
+
+    X = N e^(-jw tau)/(m (w0^2 - w^2 + j w w0/Q)) sinc(w T/2) U
+
+A screen's friction under a sliding finger of known load W is a linear regression on that load and on the current::
+
+    F = mu W + mu g I^2 - c dI^2/dt,  I^2 = I0^2 (1 + cos w t)/2
+
+in which c stands for delay and contact lag.  Intervals are those of white residuals.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy.optimize import least_squares
+
+from hapticrender.driver_checks import check_driver, check_sensed
+from hapticrender.errors import DesignError
+from hapticrender.plants.electroadhesion import ElectroadhesionParameters
+from hapticrender.plants.identify import SIGMAS_95, Estimate
+from hapticrender.plants.surface import SurfaceParameters
+from hapticrender.protocols import Array, Driver, Sensed
+from hapticrender.touch.finger import Finger
+
+REACH, GRID = 0.02, 10.0  # share of the expected resonance, Hz: range and spacing of the lines
+RING = 10.0  # time constants of the expected mode that the drive lasts before the record
+SHARE = 0.2  # of the drive's limit: largest drive of the lines
+MODULATION = 20.0  # Hz: of the current of a screen, far below the contact's corner
+UNEXPLAINED = 0.1  # largest share of the response that the model may leave
+
+
+class IdentifiedDevice(NamedTuple):
+    """Identified parameters of a friction device, each with its 95 % interval."""
+
+    kind: str
+    estimates: Mapping[str, Estimate]
+    unexplained: float  # share of the measurement that the model leaves, noise included
+
+    def profile(self) -> dict[str, float]:
+        """Return the identified parameters for `Scene.profile`."""
+        return {name: each.value for name, each in self.estimates.items()}
+
+    def to_toml(self) -> str:
+        """Return the profile as the [device] table of a scene, each interval as a comment."""
+        rows = [f"{name} = {each.value!r}  # +- {each.interval:.2g}" for name, each in self.estimates.items()]
+        return "\n".join(["# +- is the 95 % interval", "[device]", f'kind = "{self.kind}"', *rows]) + "\n"
+
+    def text(self) -> str:
+        """Return every estimate with its interval, and what the model leaves of the measurement."""
+        rows = [f"{name:<21} {each.value:>12.6g} +- {each.interval:.2g}" for name, each in self.estimates.items()]
+        return "\n".join([*rows, f"{'unexplained':<21} {100 * self.unexplained:.2g} %"])
+
+
+def identify_resonance(driver: Driver, parameters: SurfaceParameters, seconds: float = 0.2) -> IdentifiedDevice:
+    """Identify frequency (Hz), Q and force per volt (N/V, at the expected modal mass) of a plate without a finger.
+
+    The open driver takes V and senses m at the carrier's rate; a resonance within 2 % of the expected one is found.
+    """
+    mode, rate = parameters.mode, float(driver.rate)
+    _check(driver)
+    samples, start = round(seconds * rate), round(RING * mode.quality / (math.pi * mode.frequency) * rate)
+    base = rate / samples
+    bins = np.arange((1 - REACH) * mode.frequency, (1 + REACH) * mode.frequency, GRID) / base
+    bins = np.unique(np.round(bins).astype(int))
+    phase = -np.pi * np.arange(len(bins)) ** 2 / len(bins)
+    spectrum = np.zeros(samples // 2 + 1, complex)
+    spectrum[bins] = np.exp(1j * phase)
+    drive = np.fft.irfft(spectrum, samples)
+    drive *= SHARE * mode.drive_limit / abs(drive).max()
+    played = _play(driver, drive[np.arange(-start, samples) % samples]).sensed[start : start + samples, 0]
+    u, y = (np.fft.rfft(signal)[bins] * (2 / samples) for signal in (drive, played))
+    w = 2 * np.pi * bins * base
+    u = u * np.sinc(w / rate / (2 * np.pi)) * np.exp(-1j * w * (driver.delay - driver.block + 0.5) / rate)
+
+    expected = np.array([2 * np.pi * mode.frequency, mode.quality, mode.force_constant])
+
+    def response(x: Array) -> Array:
+        w0, quality, force = expected * np.exp(x[:3])
+        return force / mode.modal_mass / (w0**2 - w**2 + 1j * w * w0 / quality) * np.exp(-1j * w * x[3] / rate)
+
+    scale = abs(y).max()
+    begin = np.array([math.log(w[abs(y / u).argmax()] / expected[0]), 0.0, 0.0, 0.0])
+    begin[2] = math.log(abs(y / u).max() / abs(response(begin)).max())
+    fit = least_squares(lambda x: _real(response(x) * u - y) / scale, begin, xtol=1e-12, ftol=1e-12)
+    spread = _spread(fit.jac, fit.fun)
+    values = np.exp(fit.x[:3]) * [mode.frequency, mode.quality, mode.force_constant]  # tau: the delay beyond the told
+    names = ("frequency", "quality", "force_constant")
+    return _found("ultrasonic", names, values, values * spread[:3], fit.fun, _real(y) / scale)
+
+
+def identify_screen(
+    driver: Driver, parameters: ElectroadhesionParameters, finger: Finger, seconds: float = 2.0
+) -> IdentifiedDevice:
+    """Identify friction coefficient and gain g (N/A^2) of a screen under a finger that slides over it.
+
+    The open driver takes the envelope of the current (A, peak) and senses friction (N, positive against the motion);
+    `finger` gives load and position where it does not measure them.
+    """
+    rate, most = float(driver.rate), parameters.current_limit / 2
+    _check(driver)
+    time = np.arange(round(seconds * rate)) / rate
+    phase = 2 * np.pi * MODULATION * (time - (driver.delay - driver.block) / rate)
+    drive = most * np.sqrt((1 + np.cos(2 * np.pi * MODULATION * time)) / 2)
+    sensed = _play(driver, drive)
+    position = finger.position(time) if sensed.position is None else sensed.position[: len(time)]
+    load = finger.load(time) if sensed.normal_load is None else sensed.normal_load[: len(time)]
+    sliding = abs(np.gradient(position, 1 / rate)) >= parameters.least_speed  # NaN, lifted, is not
+    sliding[: round(rate / MODULATION)] = False
+    if not sliding.any():
+        raise DesignError(f"finger: must slide faster than {parameters.least_speed:g} m/s while the screen is measured")
+    columns = np.column_stack([load, most**2 * (1 + np.cos(phase)) / 2, most**2 * np.sin(phase)])[sliding]
+    friction = sensed.sensed[: len(time), 0][sliding]
+    found = np.linalg.lstsq(columns, friction, rcond=None)[0]
+    residual = friction - columns @ found
+    mu, gain = found[0], found[1] / found[0]
+    spread = _spread(columns, residual)
+    values = np.array([mu, gain])
+    halves = np.array([spread[0], gain * math.hypot(spread[1] / found[1], spread[0] / mu)])
+    changing = columns[:, 1:] @ found[1:]
+    names = ("friction_coefficient", "open_loop_gain")
+    return _found("electroadhesion", names, values, halves, residual, changing - changing.mean())
+
+
+def _check(driver: Driver) -> None:
+    check_driver(driver)
+    for name in ("drive_channels", "sensed_channels"):
+        if getattr(driver, name) != 1:
+            raise ValueError(f"{type(driver).__name__}: {name} = {getattr(driver, name)}: must be 1 to be identified")
+
+
+def _play(driver: Driver, drive: Array) -> Sensed:
+    """Play a drive (n,), then at least a block of zeros, and return what was sensed."""
+    padded = np.append(drive, np.zeros(-len(drive) % driver.block + driver.block))[:, None]
+    blocks = np.split(padded, len(padded) // driver.block)
+    try:
+        played = [check_sensed(driver, driver.play(block)._replace(motion=None), 0) for block in blocks]
+    except BaseException:
+        driver.play(np.zeros_like(blocks[0]))
+        raise
+    columns: Any = [None if each[0] is None else np.concatenate(each) for each in zip(*played, strict=True)]
+    return Sensed(*columns)
+
+
+def _spread(jacobian: Array, residual: Array) -> Array:
+    """Half-widths of the 95 % intervals of a least-squares fit."""
+    variance = (residual**2).sum() / max(len(residual) - jacobian.shape[1], 1)
+    return SIGMAS_95 * np.sqrt(np.diagonal(np.linalg.inv(jacobian.T @ jacobian)) * variance)
+
+
+def _real(values: Array) -> Array:
+    return np.concatenate([values.real, values.imag])
+
+
+def _found(
+    kind: str, names: tuple[str, ...], values: Array, halves: Array, residual: Array, signal: Array
+) -> IdentifiedDevice:
+    """Estimates, unless the model leaves too much of the signal."""
+    unexplained = float(np.sqrt((residual**2).mean() / (signal**2).mean()))
+    if not unexplained <= UNEXPLAINED:
+        raise DesignError(
+            f"unexplained response = {100 * unexplained:.3g} %: must be <= {100 * UNEXPLAINED:g} %; check connections "
+            "and [device]"
+        )
+    pairs = (Estimate(float(value), float(half)) for value, half in zip(values, halves, strict=True))
+    return IdentifiedDevice(kind, dict(zip(names, pairs, strict=True)), unexplained)

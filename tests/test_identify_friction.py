@@ -1,0 +1,114 @@
+"""Identification of friction devices that share no code with the library's."""
+
+import tomllib
+
+import numpy as np
+import pytest
+
+import hapticrender as hr
+from hapticrender import cli
+from hapticrender.plants.electroadhesion import ElectroadhesionParameters
+from hapticrender.plants.identify_friction import identify_resonance, identify_screen
+from hapticrender.plants.surface import SurfaceParameters
+
+
+class Resonator:
+    """A mode driven in V and sensed in m, exact for a held drive; 2 nm of noise."""
+
+    rate, block, delay, drive_channels, sensed_channels = 192e3, 64, 64, 1, 1
+
+    def __init__(self, frequency=30.1e3, quality=150.0, force=1.6, late=0, seed=0):
+        w = 2 * np.pi * frequency
+        self.pole = np.exp((-w / (2 * quality) + 1j * w * np.sqrt(1 - 0.25 / quality**2)) / self.rate)
+        s = np.log(self.pole) * self.rate
+        self.push = force / 5e-3 / (2j * s.imag) * (self.pole - 1) / s
+        self.state, self.queue, self.rng = 0j, [0.0] * late, np.random.default_rng(seed)
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *exc):
+        pass
+
+    def play(self, drive):
+        sensed = np.empty((len(drive), 1))
+        for i, u in enumerate(drive[:, 0]):
+            sensed[i] = 2 * self.state.real
+            self.queue.append(u)
+            self.state = self.pole * self.state + self.push * self.queue.pop(0)
+        return hr.Sensed(sensed + 2e-9 * self.rng.standard_normal(sensed.shape))
+
+
+class Screen(Resonator):
+    """Friction mu (W + g I^2) over 11.5 um of sliding at 80 mm/s, to and fro; 1 mN of noise, a load that varies."""
+
+    rate, block, delay = 10e3, 10, 10
+
+    def __init__(self, mu=0.6, gain=1.5e4, speed=0.08, seed=0):
+        self.mu, self.gain, self.speed, self.at, self.friction = mu, gain, speed, 0, 0.0
+        self.rng = np.random.default_rng(seed)
+
+    def play(self, drive):
+        time = (self.at + np.arange(len(drive))) / self.rate
+        self.at += len(drive)
+        load = 0.5 + 0.1 * np.sin(2 * np.pi * 1.3 * time)
+        sensed = np.empty((len(drive), 1))
+        for i, current in enumerate(drive[:, 0]):
+            sensed[i] = self.friction
+            whole = self.mu * (load[i] + self.gain * current**2)
+            self.friction += (whole - self.friction) * (1 - np.exp(-self.speed / (self.rate * 11.5e-6)))
+        position = 0.02 * (1 - 2 * abs((time * self.speed / 0.04) % 2 - 1)) if self.speed else np.zeros(len(drive))
+        return hr.Sensed(sensed + 1e-3 * self.rng.standard_normal(sensed.shape), position, normal_load=load)
+
+
+@pytest.mark.parametrize("late", [0, 2])
+def test_a_resonance_half_a_percent_off_is_found(late):
+    """f within 1 Hz, Q and force .2 %; also where the driver states too short a delay."""
+    found = identify_resonance(Resonator(late=late), SurfaceParameters())
+    truth = {"frequency": 30.1e3, "quality": 150.0, "force_constant": 1.6}
+    for name, within in (("frequency", 1.0), ("quality", 0.3), ("force_constant", 0.0032)):
+        estimate = found.estimates[name]
+        assert estimate.value == pytest.approx(truth[name], abs=within)
+    assert SurfaceParameters.with_overrides(found.profile()).mode.quality == found.profile()["quality"]
+
+
+def test_a_screens_gain_and_friction_are_found_under_a_sliding_finger():
+    """mu and g within 1 %; a profile that the renderer takes."""
+    found = identify_screen(Screen(), ElectroadhesionParameters(), hr.Finger.absent())
+    assert found.profile() == pytest.approx({"friction_coefficient": 0.6, "open_loop_gain": 1.5e4}, rel=0.01)
+    texture, finger = hr.Grating(frequency=100.0, amplitude=50e-6), hr.Finger.sliding(speed=0.08, normal_load=0.5)
+    scene = hr.Scene(texture=texture, finger=finger, duration=0.1, device="electroadhesion", profile=found.profile())
+    assert hr.prepare(scene, driver=Screen()).driver.shape.gain == pytest.approx(1.5e4, rel=0.01)
+    assert 'kind = "electroadhesion"\nfriction_coefficient = 0.' in found.to_toml()
+
+
+@pytest.mark.parametrize(
+    ("call", "error", "message"),
+    [
+        (lambda: identify_resonance(Resonator(force=0.0), SurfaceParameters()), hr.DesignError, "unexplained"),
+        (
+            lambda: identify_screen(Screen(speed=0.0), ElectroadhesionParameters(), hr.Finger.absent()),
+            hr.DesignError,
+            "must slide faster than 0.001 m/s",
+        ),
+    ],
+    ids=["no response", "resting"],
+)
+def test_what_cannot_be_identified_is_refused(call, error, message):
+    with pytest.raises(error, match=message):
+        call()
+
+
+@pytest.mark.parametrize(
+    ("kind", "expected"),
+    [
+        ("ultrasonic", {"frequency": 30e3, "quality": 200.0}),
+        ("electroadhesion", {"friction_coefficient": 0.8}),
+    ],
+)
+def test_the_command_line_identifies_the_device_of_a_scene(tmp_path, kind, expected):
+    """The simulated device, from a built-in scene; the profile holds what its parameters say, within .2 %."""
+    out = tmp_path / "device.toml"
+    assert cli.main(["identify", "--scene", f"one-texture-{kind}", "--out", str(out)]) == 0
+    device = tomllib.loads(out.read_text())["device"]
+    assert {name: device[name] for name in expected} == pytest.approx(expected, rel=2e-3)
