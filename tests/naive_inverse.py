@@ -1,7 +1,7 @@
 """Slow, obvious twin of the waveform law, sample by sample, from the equations of docs/theory.md.
 
-It imports nothing under test: `p` has the controller's numbers, `law` those of the waveform law; the drive is not rounded.  The reference comes
-`ahead` samples early, as a number a sample.
+It imports nothing under test: `p` has the controller's numbers, `law` those of the waveform law; the drive is not
+rounded.  The reference comes `ahead` samples early, as a number a sample.
 """
 
 import numpy as np

@@ -73,7 +73,6 @@ def test_kernel_equals_its_twin(spatial):
         PLATE.device_model(RATE, 2), drive_step=0.0, drive_limit=0.1
     )  # a last bit would decide which way it rounds
     controller = AdaptiveInverse().design(model, NOTHING)
-    own = controller._arrays["loops"]
     controller.law["spatial"] = spatial
     law = {name: controller.law[name].copy() for name in controller.law.dtype.names}
     settings = controller.settings

@@ -83,7 +83,8 @@ class Bench:
         plate = Plate(self.plate, finger or Finger.absent(), seed)
         zero = np.zeros(samples)
         controller = self.design(bands)
-        ahead = np.append(waveform[controller.lookahead :], zero)[:samples] if waveform is not None else zero
+        lookahead = getattr(controller, "lookahead", 0)
+        ahead = np.append(waveform[lookahead:], zero)[:samples] if waveform is not None else zero
         _, target, _, sensed = plate.closed_loop(controller, ahead)
         return Run(bands, plate.motion[:, :3], zero if sensed.position is None else sensed.position, target)
 

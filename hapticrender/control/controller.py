@@ -97,7 +97,7 @@ class BankController:
         } | (arrays or {})
         self._arrays = memory
         for name, array in memory.items():
-            if f"{name}_at" in CONTROLLER.names:
+            if f"{name}_at" in (CONTROLLER.names or ()):
                 self.state[f"{name}_at"] = array.ctypes.data
         start: dict[str, float] = {"tiles": tiles, "bands": self.n_bands, "history": history, "stale": 1, "moving": 1}
         start |= {"scale": 1.0, "confidence": 1.0, "unlocked": 1.0, "response_gain": math.nan}

@@ -391,10 +391,11 @@ def learned_force(controller, inverse):
 
 @kernel
 def compare(inverse, nominal, learned):
-    """Mean squares over a second of what the believed device asks for in heave, and of what was learned beside it."""
+    """Mean squares over a second of what the untouched device is asked for in heave, and of what was learned of it."""
     v = record(inverse, INVERSE_T, 0)
-    v.asked += v.slowly * (nominal * nominal - v.asked)
-    v.added += v.slowly * (learned * learned - v.added)
+    free = 1.0 - v.contact
+    v.asked += v.slowly * (free * nominal * nominal - v.asked)
+    v.added += v.slowly * (free * learned * learned - v.added)
 
 
 @kernel
