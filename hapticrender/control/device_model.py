@@ -38,6 +38,16 @@ class FingerRange:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Demand:
+    """What a scene needs of a device at most; supervision and drive limit follow from it."""
+
+    motion: float  # R, coordinate's unit: peak of the target anywhere on the surface
+    drive: float  # B, drive unit: amplitude of each channel with the worst finger
+    lowest: float  # Hz, of what the target moves with
+    highest: float  # Hz
+
+
+@dataclass(frozen=True, kw_only=True)
 class DeviceModel:
     """All that the controller is given of a device of c coordinates, d drive channels, s sensors and p places.
 
@@ -78,6 +88,7 @@ class DeviceModel:
     always_damped: bool = False  # the damper stays on at low gains: its noise costs less than the onset of a contact
     unit: str = "m"  # of the coordinates
     drive_unit: str = "A"
+    demand: Demand | None = None  # of the scene; None: not known, or too little to supervise a motion by
 
     @property
     def pattern(self) -> tuple[float, ...]:
