@@ -271,6 +271,10 @@ class _Loop:
 
 def _compare(rendering: Rendering, controller: Controller, recording: Recording) -> None:
     """Warn where the device differs from the model that the controller was designed for."""
+    scale = getattr(controller, "damper_scale", 1.0)
+    if scale < 1.0:
+        message = f"the inner damper rang above 500 Hz and was turned down to {scale:g}: identify the bending mode"
+        warnings.warn(message, PlateMismatch, stacklevel=3)
     mismatch = getattr(controller, "mismatch", 0.0)
     if mismatch <= MISMATCH:
         return

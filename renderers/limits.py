@@ -103,7 +103,8 @@ def demand(scene: Scene, model: DeviceModel, bands: Bands, waveform: Waveform) -
     """Return what the targets of a scene need of a plate at most, with the worst finger; see `control.supervisor`."""
     need = needed(scene, model, bands, waveform, partial(drive_per_target, model))
     motion = need.amplitude * max(map(abs, model.profile or (1.0,)))
-    return Demand(motion=motion, drive=need.drive, lowest=need.lowest, highest=need.highest)
+    lowest = max(need.lowest, model.lowest_frequency / 2)
+    return Demand(motion=motion, drive=need.drive, lowest=lowest, highest=max(need.highest, lowest))
 
 
 def needed(
@@ -115,7 +116,8 @@ def needed(
 ) -> Need:
     """Amplitude and drive that a scene's targets need of the free device, all channels driven alike.
 
-    `per_target` (drive per target at frequencies in Hz) may state another drive.  A finger-locked carrier of a constant target passes every frequency up to that of the finger's top speed.
+    `per_target` (drive per target at frequencies in Hz) may state another drive.  A finger-locked carrier of a constant
+    target passes every frequency up to that of the finger's top speed.
     """
     per_target = per_target or partial(_drive_of_free_device, model)
     if bands.envelope is None:

@@ -1,9 +1,9 @@
-"""Start-up probe: are sensors and actuators of a plate wired as the device model says, before the loop closes?
+"""Start-up probe: check the wiring of a plate's sensors and actuators before the loop closes.
 
 For 200 ms both actuators play lines of their own, away from the modes, so that a resting finger changes little; the
 surface moves by a fortieth of the sensors' range.  The answer y is compared with that of the model under 169
-hypotheses h (13 wirings, each with 13 delays) by the residual 1 - <y, y_h>/(|y| |y_h|), behind a projection that takes
-offset, slope and parabola out of each sensor.
+hypotheses h (13 wirings, each with 13 delays) by the residual 1 - <y, y_h>/(|y| |y_h|), with offset, slope and
+parabola taken out of each sensor.
 """
 
 from __future__ import annotations

@@ -22,9 +22,9 @@ no  test         condition                                                      
 === ============ ================================================================================ ====================
 
 R (m) and B (drive unit) are what the scene needs at most with the worst finger, A the drive of a hard press, `sag` the
-static displacement under 5 N.  *Danger* is a motion > 4 R + 1.36 sag or a drive above 0.9 of its limit.  The drive fades
-out in 10 ms, in danger in 2 ms, on overmotion in 0.2 ms, and stays at zero.  A ringing damper is turned down to 0.4, then
-to 0; the drive stops where it rings all the same for 150 ms.
+static displacement under 5 N.  *Danger* is a motion > 4 R + 1.36 sag or a drive above 0.9 of its limit.  The drive
+fades out in 10 ms, in danger in 2 ms, on overmotion in 0.2 ms, and stays at zero.  A ringing damper is turned down to
+0.4, then to 0; the drive stops where it rings all the same for 150 ms.
 
 Tests 3 to 5 and 7 need a `Demand`; 6 a controller with an inner damper.  Without them a controller has tests 1 and 2.
 """
@@ -59,8 +59,8 @@ MODEL_ERROR, DELAY_ERROR, LOAD = 0.1, 1.2, 1.15  # of D; samples; of K: a pressi
 NOISE_VARIANCES = 12.0
 BY_DRIVE = 6.0  # E_r over E_F: in a fault the residual is the drive, in a load step it is not
 POWER_TIME, POWER = 12e-3, 0.6
-DRIVE_TIME, PRESS_TIME = 30e-3, 60e-3  # s
-PRESS, PRESS_LOAD = 9.0, 5.0  # N: force that a press of 5 N in a millisecond takes of the loop (5.8 N) by half; its load
+DRIVE_TIME, PRESS_TIME, FASTEST_PACE = 30e-3, 60e-3, 6.0  # s, s; times of a faster device are shorter
+PRESS, PRESS_LOAD = 9.0, 5.0  # N: 1.5 times the force that a press of 5 N in a millisecond takes; its load
 RINGING_FROM, RINGING_TIME, RINGING_VARIANCES, RINGING_STEP = 500.0, 3e-3, 16.0, 0.4  # Hz, s, 4 sigma
 RINGING_WAIT, RINGING_STOP, SATURATED_WAIT = 10e-3, 150e-3, 0.5  # s
 DANGER_DRIVE = 0.9  # of the drive limit
@@ -98,7 +98,7 @@ SUPERVISOR = np.dtype(
         *((name, np.float64, (MOST_SENSORS,)) for name in ("last", "least", "most")),
         ("repeats", np.int64, (MOST_SENSORS,)),
         *((f"{name}_count", np.int64) for name in ("inconsistent", "active", "drive", "motion", "ring", "ring_wait")),
-        *((name, np.int64) for name in ("suspended", "sample", "sensor", "cause", "stopped")),
+        *((name, np.int64) for name in ("suspended", "sample", "sensors", "cause", "stopped")),
     ]
 )
 SUPERVISOR_T = numba.from_dtype(SUPERVISOR)
@@ -108,24 +108,30 @@ SUPERVISOR_T = numba.from_dtype(SUPERVISOR)
 def check_sensors(supervisor, sensed, n, drive):
     """Convert a sample's sensors to coordinates, an invalid one held; tests 1 and 2 against the sum of the drive."""
     s = record(supervisor, SUPERVISOR_T, 0)
-    p, cause, bad = s.p, 0, 0.0
+    p, cause, invalid, frozen = s.p, 0, 0, 0
     q0 = q1 = 0.0
     for i in range(p.sensors):
         value = sensed[n * p.sensors + i]
         if not abs(value) < p.sensor_limit:
-            bad, s.sensor = 1.0, i
+            invalid |= 1 << i
         elif value == s.last[i]:
             s.repeats[i] += 1
             s.least[i], s.most[i] = min(s.least[i], drive), max(s.most[i], drive)
             if s.repeats[i] >= p.frozen_time and s.most[i] - s.least[i] > p.frozen_drive:
-                cause, s.sensor = FROZEN, i
+                frozen |= 1 << i
         else:
             s.last[i], s.repeats[i], s.least[i], s.most[i] = value, 1, drive, drive
         q0 += p.coordinate_from_sensor[0, i] * s.last[i]
         q1 += p.coordinate_from_sensor[1, i] * s.last[i]
     s.input[0], s.input[1] = q0, q1
-    s.invalid += p.invalid_pole * (bad - s.invalid)
-    return INVALID if s.invalid > INVALID_SHARE else cause
+    s.invalid += p.invalid_pole * ((1.0 if invalid > 0 else 0.0) - s.invalid)
+    if invalid > 0 and s.invalid > INVALID_SHARE:
+        cause = INVALID
+    elif frozen > 0:
+        cause = FROZEN
+    if cause > 0 and s.cause == 0:
+        s.sensors = invalid if cause == INVALID else frozen
+    return cause
 
 
 @kernel
@@ -232,14 +238,14 @@ def supervise(supervisor, sensed, drive, flags, n):
     for i in range(2):
         s.input[2 + i], s.force[i] = 0.5 * (s.force[i] + forces[now, i]), forces[now, i]
     cause, danger = check_sensors(supervisor, sensed, n, forces[now, 2]), False
+    if check_drive(supervisor, drive, n) and cause == 0:
+        cause = DRIVE
     if p.modelled > 0:
         if s.sample == 0:  # a steady load is no motion
             for i in range(2):
                 s.low[i] = s.high[i] = s.input[i]
-        if check_drive(supervisor, drive, n):
-            cause = DRIVE
         found, danger = check_motion(supervisor, s.peak > p.danger_drive)
-        cause = max(cause, found) if cause == 0 or found == OVERMOTION else cause
+        cause = found if cause == 0 or found == OVERMOTION else cause
         if p.controller != 0 and check_ringing(supervisor) and cause == 0:
             cause = RINGING
     if cause != 0 and s.cause == 0:
@@ -281,23 +287,24 @@ class Fault(NamedTuple):
 
     cause: int  # INVALID to OVERMOTION
     sample: int  # at which the test failed; the drive fades out from it on
-    sensor: int  # counted from 0; of INVALID and FROZEN
+    sensors: int  # bit i: sensor i + 1; of INVALID and FROZEN
 
     @property
     def text(self) -> str:
         """What was found, the most likely reason, and what to check."""
         found, check = CAUSES[self.cause]
-        return f"{found.format(sensor=self.sensor + 1)}: check {check}"
+        names = " and ".join(str(i + 1) for i in range(MOST_SENSORS) if self.sensors >> i & 1)
+        return f"{found.format(sensor=names)}: check {check}"
 
 
 CAUSES = {
     INVALID: (
-        "sensor {sensor} gave samples that are no numbers, or at the end of its range",
-        "its cable, its supply, and that the surface stays within its range",
+        "sensor {sensor}: samples are no numbers, or at the end of the range",
+        "cable and supply, and that the surface stays within the range",
     ),
     FROZEN: (
-        "sensor {sensor} repeated one value while the drive moved; most likely it is frozen or disconnected",
-        "its cable, its supply and the converter",
+        "sensor {sensor}: one value repeats while the drive moves; most likely frozen or disconnected",
+        "cable, supply and converter",
     ),
     INCONSISTENT: (
         "the motion does not follow from the drive; most likely a sensor or an actuator is dead, inverted or swapped, "
@@ -355,8 +362,8 @@ class SupervisedController:
     @property
     def fault(self) -> Fault | None:
         """Why and when the drive has been stopped."""
-        cause, sample, sensor = (int(self.state[name][0]) for name in ("cause", "stopped", "sensor"))
-        return Fault(cause, sample, sensor) if cause else None
+        cause, sample, sensors = (int(self.state[name][0]) for name in ("cause", "stopped", "sensors"))
+        return Fault(cause, sample, sensors) if cause else None
 
     @property
     def damper_scale(self) -> float:
@@ -404,16 +411,26 @@ def design_supervisor(controller: Any, model: DeviceModel) -> dict[str, Any]:
         "block": getattr(controller, "block", 1),
         "delay": model.delay,
         "sensor_limit": model.sensed_limit,
+        "most_drive": UNLIMITED,
         "coordinate_from_sensor": _padded(model.coordinate_from_sensed, 2, MOST_SENSORS),
         "force_from_drive": _padded(model.force_from_drive, 2, MOST_CHANNELS),
         "invalid_pole": _pole(INVALID_TIME, rate),
-        "frozen_time": max(FROZEN_SAMPLES, round(FROZEN_TIME * rate)),
+        "frozen_time": max(FROZEN_SAMPLES, round(FROZEN_TIME / model.pace * rate)),
         "frozen_drive": FROZEN_SIGMAS * noise * max(stiffness, top) * channels / total,
         **{f"fade_{name}": min(1.0 / (time * rate), 1.0) for name, time in FADES.items()},
     }
     if demand is None:
         return settings
-    press, sag, shared = press_drive(model), PRESS_LOAD / stiffness, DELAY_ERROR**2
+    modelled = demand.lowest < rate / 10  # beyond it neither trapezoidal rule nor hold are the device's
+    press, pace = press_drive(model) if modelled else 0.0, min(model.pace, FASTEST_PACE)
+    settings |= {
+        "drive_pole": _pole(DRIVE_TIME / pace, rate),
+        "drive_time": PRESS_TIME / pace * rate,
+        "most_drive": (1.5 * demand.drive + press / 2.4) ** 2 / 2.0,
+    }
+    if not modelled:
+        return settings
+    sag, shared = PRESS_LOAD / stiffness, DELAY_ERROR**2
     corner = float(np.clip(1.4 * demand.highest, 250.0, max(rate / 10, 250.0)))
     low_end = float(np.clip(0.75 * demand.lowest, 15.0, 60.0))
     g, omega = _trapezoidal(corner, rate), 2.0 * rate * _trapezoidal(corner, rate)
@@ -427,29 +444,29 @@ def design_supervisor(controller: Any, model: DeviceModel) -> dict[str, Any]:
         bound[i, 4 + i] = MODEL_ERROR**2 * model.mass[i, i] ** 2
         bound[i, 6 + i] = shared
         floor[i] = NOISE_VARIANCES * noise**2 * _residual_noise(model, i, corner, low_end)
-    settings |= {
-        "modelled": 1,
-        **{name: _padded(getattr(model, name), 2, 2) for name in ("mass", "damping", "stiffness")},
-        "corner": g,
-        "shape": 1.0 / (1.0 + g * (g + ROOT2)),
-        "omega": omega,
-        "low": g / (1.0 + g),
-        "high": high / (1.0 + high),
-        "energy_pole": _pole(float(np.clip(0.36 / demand.lowest, 5e-3, 10e-3)), rate),
-        "power_pole": _pole(POWER_TIME, rate),
-        "bound": bound,
-        "noise": floor,
-        "inconsistent_time": rate * float(np.clip(1.2 / demand.lowest, 15e-3, 60e-3)),
-        "active_time": 5e-3 * rate,
-        "lever": abs(model.place_from_coordinate[:, 1:]).max(initial=0.0),
-        "danger_motion": 4.0 * demand.motion + 1.36 * sag,
-        "most_motion": 3.0 * demand.motion + 5.4 * sag,
-        "danger_drive": DANGER_DRIVE * model.drive_limit,
-        "drive_pole": _pole(DRIVE_TIME, rate),
-        "drive_time": PRESS_TIME * rate,
-        "most_drive": (1.5 * demand.drive + press / 2.4) ** 2 / 2.0,
-    }
-    return settings | _ringing(controller, model, demand)
+    return (
+        settings
+        | _ringing(controller, model, demand)
+        | {
+            "modelled": 1,
+            **{name: _padded(getattr(model, name), 2, 2) for name in ("mass", "damping", "stiffness")},
+            "corner": g,
+            "shape": 1.0 / (1.0 + g * (g + ROOT2)),
+            "omega": omega,
+            "low": g / (1.0 + g),
+            "high": high / (1.0 + high),
+            "energy_pole": _pole(float(np.clip(0.36 / demand.lowest, 5e-3, 10e-3)), rate),
+            "power_pole": _pole(POWER_TIME, rate),
+            "bound": bound,
+            "noise": floor,
+            "inconsistent_time": rate * float(np.clip(1.2 / demand.lowest, 15e-3, 60e-3)),
+            "active_time": 5e-3 * rate,
+            "lever": abs(model.place_from_coordinate[:, 1:]).max(initial=0.0),
+            "danger_motion": 4.0 * demand.motion + 1.36 * sag,
+            "most_motion": 3.0 * demand.motion + 5.4 * sag,
+            "danger_drive": DANGER_DRIVE * model.drive_limit,
+        }
+    )
 
 
 FADES = {"out": FADE_OUT, "danger": FADE_DANGER, "now": FADE_NOW}  # s
