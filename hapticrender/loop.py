@@ -234,7 +234,7 @@ class _Loop:
     def fault(self, start: int) -> DeviceFault | None:
         """Return why the drive was stopped, once it has faded out in the samples from `start` on."""
         rate, driver = self.rendering.driver.rate, self.rendering.driver
-        if self._stopped < 0 or start + self.step < self._stopped + FADE_OUT * rate:
+        if self._stopped < 0 or start + self.step < self._stopped + FADE_OUT * rate + driver.delay:
             return None
         found = getattr(self.controller, "fault", None) or getattr(driver, "fault", None)
         text = found.text if found else "the device stopped itself"

@@ -17,7 +17,7 @@ no  test         condition                                                      
 3   inconsistent E_r > finger + load + model + delay + noise, and E_r < 6 E_F                     15 to 60 ms
 4   active       -mean(r v) > 0.6 sqrt(E_F E_v), E_r < 6 E_F, in danger only                      5 ms
 5   drive        mean of u^2 > (1.5 B + A/2.4)^2/2: more than any finger takes                    30 ms (mean) + 60 ms
-6   ringing      inner damper's force beyond 500 Hz > 4 times what the sensors' noise makes of it 3 ms
+6   ringing      inner damper's force beyond 500 Hz > 4 times what the sensors' noise makes of it 8 ms
 7   overmotion   motion of an end > 3 R + 5.4 sag                                                 5 samples
 === ============ ================================================================================ ====================
 
@@ -61,7 +61,8 @@ BY_DRIVE = 6.0  # E_r over E_F: in a fault the residual is the drive, in a load 
 POWER_TIME, POWER = 12e-3, 0.6
 DRIVE_TIME, PRESS_TIME, FASTEST_PACE = 30e-3, 60e-3, 6.0  # s, s; times of a faster device are shorter
 PRESS, PRESS_LOAD = 9.0, 5.0  # N: 1.5 times the force that a press of 5 N in a millisecond takes; its load
-RINGING_FROM, RINGING_TIME, RINGING_VARIANCES, RINGING_STEP = 500.0, 3e-3, 16.0, 0.4  # Hz, s, 4 sigma
+RINGING_FROM, RINGING_VARIANCES, RINGING_STEP = 500.0, 16.0, 0.4  # Hz, 4 sigma
+RINGING_MEAN, RINGING_TIME = 3e-3, 8e-3  # s: what a sudden lift-off leaves behind falls in this time from 15 sigma
 RINGING_WAIT, RINGING_STOP, SATURATED_WAIT = 10e-3, 150e-3, 0.5  # s
 DANGER_DRIVE = 0.9  # of the drive limit
 UNLIMITED = 1e300
@@ -83,14 +84,17 @@ SETTINGS = np.dtype(
         ("ringing", np.float64, (2,)),  # N2, of the damper's force; 0: no test
         *((f"{name}_time", np.int64) for name in _TIMES),
         *((name, np.int64) for name in ("step", "state", "controller", "modelled", "sensors", "channels", "block")),
-        *((name, np.int64) for name in ("delay", "forces_at")),
+        *((name, np.int64) for name in ("delay", "needs_contact", "forces_at")),
     ]
 )
 """Settings of a supervisor, as `design_supervisor` derives them; poles and fades are per sample, times in samples."""
 SUPERVISOR = np.dtype(
     [
         ("p", SETTINGS),
-        *((name, np.float64) for name in ("fade", "fade_step", "invalid", "damper_scale", "motion", "peak")),
+        *(
+            (name, np.float64)
+            for name in ("fade", "fade_step", "invalid", "damper_scale", "motion", "peak", "position")
+        ),
         *((name, np.float64, (4,)) for name in ("input", "low", "high", "band", "level", "value", "rate", "change")),
         *((name, np.float64, (2,)) for name in ("force", "power", "ring_band", "ring_level", "ring_energy")),
         ("energy", np.float64, (12,)),  # of q, v, a, dF, F, r in both coordinates
@@ -105,8 +109,11 @@ SUPERVISOR_T = numba.from_dtype(SUPERVISOR)
 
 
 @kernel
-def check_sensors(supervisor, sensed, n, drive):
-    """Convert a sample's sensors to coordinates, an invalid one held; tests 1 and 2 against the sum of the drive."""
+def check_sensors(supervisor, sensed, n, drive, acts):
+    """Convert a sample's sensors to coordinates, an invalid one held; tests 1 and 2 against the sum of the drive.
+
+    A drive that does not act (on a surface without a sliding finger) moves no sensor.
+    """
     s = record(supervisor, SUPERVISOR_T, 0)
     p, cause, invalid, frozen = s.p, 0, 0, 0
     q0 = q1 = 0.0
@@ -114,7 +121,7 @@ def check_sensors(supervisor, sensed, n, drive):
         value = sensed[n * p.sensors + i]
         if not abs(value) < p.sensor_limit:
             invalid |= 1 << i
-        elif value == s.last[i]:
+        elif value == s.last[i] and acts:
             s.repeats[i] += 1
             s.least[i], s.most[i] = min(s.least[i], drive), max(s.most[i], drive)
             if s.repeats[i] >= p.frozen_time and s.most[i] - s.least[i] > p.frozen_drive:
@@ -205,7 +212,7 @@ def check_drive(supervisor, drive, n):
         large |= s.drive_energy[i] > p.most_drive
     s.drive_count = s.drive_count + 1 if large else 0
     s.peak = peak
-    return s.drive_count >= p.drive_time
+    return s.drive_count > p.drive_time
 
 
 @kernel
@@ -229,7 +236,7 @@ def check_ringing(supervisor):
 
 
 @kernel
-def supervise(supervisor, sensed, drive, flags, n):
+def supervise(supervisor, sensed, position, drive, flags, n):
     """Run the tests on a sample, and fade its drive out once one has failed."""
     s = record(supervisor, SUPERVISOR_T, 0)
     p = s.p
@@ -237,7 +244,9 @@ def supervise(supervisor, sensed, drive, flags, n):
     now = s.sample % (p.delay + 1)  # the drive that acts from this sample on
     for i in range(2):
         s.input[2 + i], s.force[i] = 0.5 * (s.force[i] + forces[now, i]), forces[now, i]
-    cause, danger = check_sensors(supervisor, sensed, n, forces[now, 2]), False
+    acts = p.needs_contact == 0 or (position[n] == position[n] and position[n] != s.position)
+    s.position = position[n]
+    cause, danger = check_sensors(supervisor, sensed, n, forces[now, 2], acts), False
     if check_drive(supervisor, drive, n) and cause == 0:
         cause = DRIVE
     if p.modelled > 0:
@@ -270,7 +279,7 @@ def supervised_step(state, signals, start, count):
     """Advance the supervised controller by `count` samples, block by block, and supervise every sample."""
     s, io, stop = record(state, SUPERVISOR_T, 0), record(signals, SIGNALS_T, 0), start + count
     p = s.p
-    sensed, flags = pointer(io.sensed, F8), carray(pointer(io.flags, I8), stop)
+    sensed, position, flags = pointer(io.sensed, F8), pointer(io.position, F8), carray(pointer(io.flags, I8), stop)
     drive = carray(pointer(io.drive, F8), (stop, p.channels))
     for first in range(start, stop, p.block):
         if s.fade > 0.0:
@@ -278,7 +287,7 @@ def supervised_step(state, signals, start, count):
         else:
             drive[first : first + p.block] = 0.0
         for n in range(first, first + p.block):
-            supervise(state, sensed, drive, flags, n)
+            supervise(state, sensed, position, drive, flags, n)
     return 0
 
 
@@ -410,6 +419,7 @@ def design_supervisor(controller: Any, model: DeviceModel) -> dict[str, Any]:
         "channels": channels,
         "block": getattr(controller, "block", 1),
         "delay": model.delay,
+        "needs_contact": model.finger.needs_contact,
         "sensor_limit": model.sensed_limit,
         "most_drive": UNLIMITED,
         "coordinate_from_sensor": _padded(model.coordinate_from_sensed, 2, MOST_SENSORS),
@@ -485,7 +495,7 @@ def _ringing(controller: Any, model: DeviceModel, demand: Demand) -> dict[str, A
         "ringing": RINGING_VARIANCES * state["p"]["damper_noise"][0] ** 2,
         "ring_corner": g,
         "ring_shape": 1.0 / (1.0 + g * (g + ROOT2)),
-        "ring_pole": _pole(RINGING_TIME, rate),
+        "ring_pole": _pole(RINGING_MEAN, rate),
         "large_drive": 0.6 * model.drive_limit if needs_all else UNLIMITED,
         **{f"{name}_time": time * rate for name, time in times.items()},
     }
