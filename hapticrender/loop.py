@@ -236,7 +236,7 @@ class _Loop:
         rate, driver = self.rendering.driver.rate, self.rendering.driver
         if self._stopped < 0 or start + self.step < self._stopped + FADE_OUT * rate + driver.delay:
             return None
-        found = getattr(self.controller, "fault", None) or getattr(driver, "fault", None)
+        found = getattr(driver, "fault", None) or getattr(self.controller, "fault", None)
         text = found.text if found else "the device stopped itself"
         time = self._stopped / rate
         return DeviceFault(f"{type(self.rendering.device).__name__}: stopped at {time:.4g} s: {text}", time)

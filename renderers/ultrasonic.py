@@ -111,6 +111,7 @@ def _model(setup: SurfaceSetup, driver: Driver | Port) -> DeviceModel:
             contact_damping=0.0,
             sensor_delay=0.0,
             contact_lag=assumed.memory_length,
+            inferred=True,
             sensed_noise=LEAST_NOISE * model.sensed_limit,
         )
     mass = model.mass + lag * model.damping + lag**2 / 2 * model.stiffness

@@ -70,6 +70,7 @@ class DeviceModel:
     sensed_limit: float  # sensor unit, > 0: a larger sample is a sensor fault, a larger target is refused
     drive_step: float = 0.0  # drive unit: resolution of the command; 0 is ideal
     sensed_noise: float = 0.0  # sensor unit rms: white noise of each sensor
+    inferred: bool = False  # what is sensed is computed from another quantity: that it repeats is no sensor fault
     bending: BendingMode | None = None  # the surface's own first mode, which the inner damper must not drive
     rigid: bool = False  # the surface is known to have no mode of its own in reach
     block: int = 1  # samples that the device takes and gives at once

@@ -17,7 +17,7 @@ no  test         condition                                                      
 3   inconsistent E_r > finger + load + model + delay + noise, and E_r < 6 E_F                     15 to 60 ms
 4   active       -mean(r v) > 0.6 sqrt(E_F E_v), E_r < 6 E_F, in danger only                      5 ms
 5   drive        mean of u^2 > (1.5 B + A/2.4)^2/2: more than any finger takes                    30 ms (mean) + 60 ms
-6   ringing      inner damper's force beyond 500 Hz > 4 times what the sensors' noise makes of it 8 ms
+6   ringing      inner damper's force beyond 500 Hz and 1.5 times the carriers > 4 times its noise   8 ms
 7   overmotion   motion of an end > 3 R + 5.4 sag                                                 5 samples
 === ============ ================================================================================ ====================
 
@@ -96,7 +96,8 @@ SUPERVISOR = np.dtype(
             for name in ("fade", "fade_step", "invalid", "damper_scale", "motion", "peak", "position")
         ),
         *((name, np.float64, (4,)) for name in ("input", "low", "high", "band", "level", "value", "rate", "change")),
-        *((name, np.float64, (2,)) for name in ("force", "power", "ring_band", "ring_level", "ring_energy")),
+        *((name, np.float64, (4,)) for name in ("ring_band", "ring_level")),
+        *((name, np.float64, (2,)) for name in ("force", "power", "ring_energy")),
         ("energy", np.float64, (12,)),  # of q, v, a, dF, F, r in both coordinates
         ("drive_energy", np.float64, (MOST_CHANNELS,)),
         *((name, np.float64, (MOST_SENSORS,)) for name in ("last", "least", "most")),
@@ -222,9 +223,11 @@ def check_ringing(supervisor):
     p, c, g, over = s.p, record(s.p.controller, CONTROLLER_T, 0), s.p.ring_corner, False
     s.suspended = p.suspension_time if s.peak > p.large_drive else max(s.suspended - 1, 0)
     for i in range(2):
-        top = p.ring_shape * (c.damper_force[i] - s.ring_level[i] - (g + ROOT2) * s.ring_band[i])
-        band = s.ring_band[i] + g * top
-        s.ring_band[i], s.ring_level[i] = band + g * top, s.ring_level[i] + 2.0 * g * band
+        top = c.damper_force[i]
+        for j in (i, 2 + i):
+            top = p.ring_shape * (top - s.ring_level[j] - (g + ROOT2) * s.ring_band[j])
+            band = s.ring_band[j] + g * top
+            s.ring_band[j], s.ring_level[j] = band + g * top, s.ring_level[j] + 2.0 * g * band
         s.ring_energy[i] += p.ring_pole * (top * top - s.ring_energy[i])
         over |= s.ring_energy[i] > p.ringing[i] > 0.0
     s.ring_wait_count = max(s.ring_wait_count - 1, 0)
@@ -414,6 +417,7 @@ def design_supervisor(controller: Any, model: DeviceModel) -> dict[str, Any]:
     n, noise = len(model.mass), max(model.sensed_noise, LEAST_NOISE * model.sensed_limit)
     demand, stiffness, total = model.demand, float(model.stiffness[0, 0]), float(abs(model.force_from_drive[0].sum()))
     top = abs(model.dynamic_stiffness(np.array(demand.highest if demand else 0.0))[0, 0])
+    moved = FROZEN_SIGMAS * noise * max(stiffness, top) * channels / total  # sum of the channels
     settings: dict[str, Any] = {
         "sensors": sensors,
         "channels": channels,
@@ -426,8 +430,8 @@ def design_supervisor(controller: Any, model: DeviceModel) -> dict[str, Any]:
         "force_from_drive": _padded(model.force_from_drive, 2, MOST_CHANNELS),
         "invalid_pole": _pole(INVALID_TIME, rate),
         "frozen_time": max(FROZEN_SAMPLES, round(FROZEN_TIME / model.pace * rate)),
-        "frozen_drive": FROZEN_SIGMAS * noise * max(stiffness, top) * channels / total,
-        **{f"fade_{name}": min(1.0 / (time * rate), 1.0) for name, time in FADES.items()},
+        "frozen_drive": UNLIMITED if model.inferred else moved,
+        **{f"fade_{name}": min(model.pace / (time * rate), 1.0) for name, time in FADES.items()},
     }
     if demand is None:
         return settings
@@ -487,7 +491,7 @@ def _ringing(controller: Any, model: DeviceModel, demand: Demand) -> dict[str, A
     state = controller.state
     if getattr(state, "dtype", None) != CONTROLLER or not state["p"]["damper_noise"].any():
         return {}
-    rate, g = model.rate, _trapezoidal(ringing_from(model.rate), model.rate)
+    rate, g = model.rate, _trapezoidal(ringing_from(model), model.rate)
     needs_all = demand.drive > 0.7 * model.drive_limit
     times = {"ring": RINGING_TIME, "ring_wait": RINGING_WAIT, "ring_stop": RINGING_STOP, "suspension": SATURATED_WAIT}
     return {
@@ -501,17 +505,17 @@ def _ringing(controller: Any, model: DeviceModel, demand: Demand) -> dict[str, A
     }
 
 
-def ringing_from(rate: float) -> float:
-    """Frequency (Hz) from which on the inner damper's force counts as ringing."""
-    return min(RINGING_FROM, rate / 5)
+def ringing_from(model: DeviceModel) -> float:
+    """Frequency (Hz) from which on the inner damper's force counts as ringing: well above the carriers."""
+    return min(max(RINGING_FROM, 1.5 * model.demand.highest if model.demand else 0.0), model.rate / 5)
 
 
 def damper_noise(model: DeviceModel, taps: Array) -> Array:
-    """Inner damper's force beyond `RINGING_FROM` (N rms, shape (2,)) by the sensors' noise, for taps (c, t) in N/m."""
+    """Inner damper's force beyond `ringing_from` (N rms, shape (2,)) by the sensors' noise, for taps (c, t) in N/m."""
     noise = max(model.sensed_noise, LEAST_NOISE * model.sensed_limit)
     turn = np.pi * (np.arange(512) + 0.5) / 512
-    s = 1j * np.tan(turn / 2) / _trapezoidal(ringing_from(model.rate), model.rate)
-    passed = abs(s * s / (s * s + ROOT2 * s + 1.0)) ** 2
+    s = 1j * np.tan(turn / 2) / _trapezoidal(ringing_from(model), model.rate)
+    passed = abs(s * s / (s * s + ROOT2 * s + 1.0)) ** 4
     response = np.exp(-1j * np.outer(turn, np.arange(taps.shape[1]))) @ taps.T  # (512, c)
     power = (passed[:, None] * abs(response) ** 2).mean(axis=0) * (model.coordinate_from_sensed**2).sum(axis=1)
     return np.append(noise * np.sqrt(power), [0.0, 0.0])[:2]
