@@ -16,6 +16,8 @@ A driver carries samples to a device, a file or a plant model, and back.  Any ob
     makes the device ready, and leaves it at rest with zero drive whatever has happened
 ``zero_on_exit`` (optional)
     True where ``__exit__`` plays zeros by itself; otherwise the loop plays them before it leaves
+``probe`` (optional)
+    False where the start-up probe of a plate is to be left out (docs/safety.md)
 ``exchange(controller)`` (optional)
     a whole closed loop of its own, sample by sample; see ``protocols.Exchange``
 

@@ -153,7 +153,8 @@ class CombinedController:
     @property
     def fault(self) -> Fault | None:
         """Why and when the drive of a part has been stopped; see `SupervisedController`."""
-        found = (part.fault for part in self.parts if isinstance(part, SupervisedController))
+        parts: tuple[Any, ...] = self.parts
+        found = (part.fault for part in parts if isinstance(part, SupervisedController))
         return next((fault for fault in found if fault is not None), None)
 
     run = BankController.run

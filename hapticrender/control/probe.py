@@ -95,7 +95,7 @@ def judge(model: DeviceModel, drive: Array, sensed: Array) -> Found:
     """Compare what was sensed (n, 2) under `drive` (n, 2) with the model's answers, and name what is not as told."""
     told = model.delay - model.block
     first = max(told - DELAYS // 2, 0)
-    valid = (abs(sensed) < model.sensed_limit).all(axis=1)
+    valid = np.asarray((abs(sensed) < model.sensed_limit).all(axis=1))
     repeats = (np.diff(sensed, axis=0) == 0.0).mean(axis=0)
     if (~valid).mean() > MOST_INVALID:
         return Found(f"{(~valid).mean():.0%} of the samples are invalid", np.nan, np.nan, -1)
@@ -108,7 +108,7 @@ def judge(model: DeviceModel, drive: Array, sensed: Array) -> Found:
         return Found(f"sensor {1 + int(repeats.argmax())} repeats its values", np.nan, np.nan, -1)
     residuals = {}
     for name, (sensors, actuators) in WIRINGS.items():
-        answer = np.einsum("a,ans->ns", np.ones(2), _answers(model, drive @ actuators.T)) @ sensors.T
+        answer = _answers(model, drive @ actuators.T).sum(axis=0) @ sensors.T
         for delay in range(first, first + DELAYS):
             h = _detrended(_late(answer, delay))
             residuals[name, delay] = 1.0 - float((y * h).sum()) / max(float((y**2).sum() * (h**2).sum()) ** 0.5, 1e-300)
