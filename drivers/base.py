@@ -18,6 +18,8 @@ A driver carries samples to a device, a file or a plant model, and back.  Any ob
     True where ``__exit__`` plays zeros by itself; otherwise the loop plays them before it leaves
 ``calibration`` (optional)
     relative uncertainty of the sensors' gain (0.01 is 1 %), which the verdict adds to its figures
+``probe`` (optional)
+    False where the start-up probe of a plate is to be left out (docs/safety.md)
 ``exchange(controller)`` (optional)
     a whole closed loop of its own, sample by sample; see ``protocols.Exchange``
 

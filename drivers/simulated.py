@@ -15,6 +15,8 @@ class SimulatedDriver(BaseDriver):
     code, `exchange` does so; `play` gives the same samples one block at a time.
     """
 
+    probe = False  # it is wired as its plant says
+
     def __init__(self, plant: Plant) -> None:
         self.plant = plant
         self._played = False

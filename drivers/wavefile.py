@@ -115,6 +115,7 @@ class WaveFileDriver(BaseDriver):
                 raise ValueError(f"{name}={value!r} cannot be given beside through=, which has its own")
             names = ("rate", "drive_channels", "sensed_channels", "block", "delay")
             numbers = {name: getattr(through, name) for name in names}
+        self.probe = getattr(through, "probe", True)
         super().__init__(**numbers)
 
     def _open(self) -> None:

@@ -24,8 +24,8 @@ __version__ = "0.2.0"
 _HOMES = {
     "bands": "Bands",
     "control.demodulator": "Demodulator",
-    "errors": "DesignError DeviceLost DeviceNotFound DeviceTimeout DriverError HapticError PlateMismatch ProtocolError "
-    "SceneError",
+    "errors": "DesignError DeviceFault DeviceLost DeviceNotFound DeviceTimeout DriverError HapticError PlateMismatch "
+    "ProtocolError SceneError",
     "loop": "prepare render run",
     "plants.identify": "Identified compare identify",
     "protocols": "Controller Driver Flag Method Motion Plant Renderer Rendering Sensed Texture",
@@ -49,6 +49,7 @@ if _typing.TYPE_CHECKING:
     from hapticrender.bands import Bands as Bands
     from hapticrender.control.demodulator import Demodulator as Demodulator
     from hapticrender.errors import DesignError as DesignError
+    from hapticrender.errors import DeviceFault as DeviceFault
     from hapticrender.errors import DeviceLost as DeviceLost
     from hapticrender.errors import DeviceNotFound as DeviceNotFound
     from hapticrender.errors import DeviceTimeout as DeviceTimeout

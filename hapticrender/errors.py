@@ -4,6 +4,14 @@ Bad arguments are plain ``ValueError`` and ``TypeError``; the classes here add
 what a caller may want to catch by kind.
 """
 
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from hapticrender.recordings.recording import Recording
+
 
 class HapticError(Exception):
     """Root of the library's own errors."""
@@ -35,6 +43,19 @@ class DeviceLost(DriverError):
 
 class ProtocolError(DriverError):
     """The device sent something that its protocol does not allow."""
+
+
+class DeviceFault(DriverError):
+    """The device does not do as it is told: says the most likely cause, when, and what to check.
+
+    `time` (s) counts from the start of the run, NaN before it; `recording` holds every sample that was played, None
+    before the first one.
+    """
+
+    def __init__(self, message: str, time: float = math.nan) -> None:
+        super().__init__(message)
+        self.time = time
+        self.recording: Recording | None = None
 
 
 class PlateMismatch(UserWarning):

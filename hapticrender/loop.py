@@ -17,8 +17,10 @@ from typing import Any
 import numpy as np
 
 from hapticrender.control.controller import PositionPredictor
+from hapticrender.control.probe import probe_plate
+from hapticrender.control.supervisor import FADE_OUT, STOPPED
 from hapticrender.driver_checks import check_sensed
-from hapticrender.errors import HapticError, PlateMismatch
+from hapticrender.errors import DeviceFault, HapticError, PlateMismatch
 from hapticrender.protocols import Array, Controller, Driver, Exchange, Renderer, Rendering, Sensed
 from hapticrender.recordings.recording import Recorder, Recording
 from hapticrender.touch.scene import Scene
@@ -104,6 +106,8 @@ def render(
         The loop cannot be made stable enough.
     DriverError
         The device failed; it was left at zero drive, and the journal holds what happened until then.
+    DeviceFault
+        The device does not do as it is told; a DriverError that names the most likely cause (docs/safety.md).
     """
     rendering = prepare(scene, driver=driver, method=method, seed=seed, renderer=renderer)
     return run(rendering, journal=journal, progress=progress)
@@ -132,9 +136,14 @@ def run(rendering: Rendering, *, journal: str | Path | None = None, progress: Pr
         **{name: getattr(model, name) for name in names},
     )
     with recorder, _stopped_by_sigterm(), driver, _zero_drive_after(rendering.device):
+        if rendering.probe:
+            probe_plate(rendering.device, model)
         loop = _Loop(rendering)
         for start in range(0, total, loop.step):
             recorder.append(**loop.advance(start, min(loop.step, total - start)))
+            if fault := loop.fault(start):
+                fault.recording = recorder.finish()
+                raise fault
             if progress is not None:
                 progress(min(start + loop.step, total) / driver.rate, total / driver.rate)
     recording = recorder.finish()
@@ -209,12 +218,15 @@ class _Loop:
         self.step = driver.block * (max(int(CHUNK * driver.rate / driver.block), 1) if exchange is not None else 1)
         self._start, self._ahead = 0, int(getattr(self.controller, "lookahead", 0))
         self._predict = PositionPredictor(driver.rate, self._ahead)
+        self._stopped = -1  # sample from which on the drive fades out; negative: none
         self._drive = np.zeros((driver.block, driver.drive_channels))
 
     def advance(self, start: int, count: int) -> dict[str, Any]:
         """Advance by `count` samples from sample `start` on; a last block is cut in the record, not on the device."""
         self._start = start
         drive, target, flags, sensed = self._exchange(count, self._reference)
+        if self._stopped < 0 and (flags & STOPPED).any():
+            self._stopped = start + int(np.argmax(flags & STOPPED))
         values, time = sensed.sensed, self._time(len(sensed.sensed))
         finger = self.rendering.scene.finger
         position = finger.position(time) if sensed.position is None else sensed.position
@@ -223,6 +235,16 @@ class _Loop:
         signals = {"drive": drive, "sensed": values, "motion": motion, "position": position, "normal_load": load}
         signals |= {"target": target, "flags": flags}
         return {"motion_source": source} | {name: signal[:count] for name, signal in signals.items()}
+
+    def fault(self, start: int) -> DeviceFault | None:
+        """Return why the drive was stopped, once it has faded out in the samples from `start` on."""
+        rate, driver = self.rendering.driver.rate, self.rendering.driver
+        if self._stopped < 0 or start + self.step < self._stopped + FADE_OUT * rate + driver.delay:
+            return None
+        found = getattr(driver, "fault", None) or getattr(self.controller, "fault", None)
+        text = found.text if found else "the device stopped itself"
+        time = self._stopped / rate
+        return DeviceFault(f"{type(self.rendering.device).__name__}: stopped at {time:.4g} s: {text}", time)
 
     def _block(self, count: int, reference: Callable[[Array], Array]) -> tuple[Array, Array, Array, Sensed]:
         """Exchange a block with the driver; the drive computed from it is played with the next one."""
@@ -257,6 +279,10 @@ class _Loop:
 
 def _compare(rendering: Rendering, controller: Controller, recording: Recording) -> None:
     """Warn where the device differs from the model that the controller was designed for."""
+    scale = getattr(controller, "damper_scale", 1.0)
+    if scale < 1.0:
+        message = f"the inner damper rang above 500 Hz and was turned down to {scale:g}: identify the bending mode"
+        warnings.warn(message, PlateMismatch, stacklevel=3)
     mismatch = getattr(controller, "mismatch", 0.0)
     if mismatch <= MISMATCH:
         return

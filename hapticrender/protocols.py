@@ -33,11 +33,12 @@ class Flag(IntFlag):
     """Status bits of a sample: faults at run time are data."""
 
     SATURATED = 1  # a drive channel was cut to its limit
-    NONFINITE = 2  # a sensed value was NaN, infinite or out of range, and was replaced by zero
-    SENSOR_CLIPPED = 4  # a sensor was at the end of its range
+    NONFINITE = 2  # a sensed value was NaN, infinite or out of range; its prediction is held
+    SENSOR_CLIPPED = 4  # a sensor was at the end of its range, or beyond
     OVERRUN = 8  # the driver lost samples
     OPEN_LOOP = 16  # a force could not be sensed and is driven open loop
     UNLOCKED = 32  # a carrier is off its resonance, or the motion is too small to measure it
+    STOPPED = 64  # the supervisor stopped the drive, which fades out, for good
 
 
 class Sensed(NamedTuple):
@@ -165,6 +166,7 @@ class Rendering:
     waveform: Callable[[Array, Array], Array]  # target over time (s) and position (m), in the device's quantity
     differentiated: bool = False  # the target is the time derivative of `waveform`
     controller: Callable[[], Controller]  # a new one at rest
+    probe: bool = False  # whether the device is probed before the loop closes
 
     @property
     def samples(self) -> int:

@@ -10,6 +10,7 @@ from hapticrender import checks
 from hapticrender.bands import Bands
 from hapticrender.control.device_model import DeviceModel
 from hapticrender.control.methods import method_named
+from hapticrender.control.supervisor import supervised
 from hapticrender.driver_checks import check_driver
 from hapticrender.drivers.simulated import SimulatedDriver
 from hapticrender.protocols import Array, Controller, Driver, Method, Plant, Rendering
@@ -43,6 +44,7 @@ class BaseRenderer:
         check_driver(facing)
         model = self.device_model(setup, facing)
         bands = self.bands(setup, model)
+        model = self.limited(setup, model, bands)
         return Rendering(
             scene=scene,
             device=device,
@@ -53,6 +55,7 @@ class BaseRenderer:
             waveform=self.waveform(setup),
             differentiated=self.differentiated,
             controller=partial(self.design, method, model, bands, feedback=facing.sensed_channels > 0),
+            probe=self.probes(setup, device),
         )
 
     def read(self, scene: Scene, driver: Driver | None) -> Setup:
@@ -75,13 +78,22 @@ class BaseRenderer:
         """Carriers and targets; refuses with a ValueError what the device cannot do."""
         raise NotImplementedError
 
+    def limited(self, setup: Setup, model: DeviceModel, bands: Bands) -> DeviceModel:
+        """Return the device model with the scene's demand, where motion and drive can be supervised by it."""
+        return model
+
+    def probes(self, setup: Setup, driver: Driver) -> bool:
+        """Whether the device is probed before the loop closes; see `control.probe`."""
+        return False
+
     def waveform(self, setup: Setup) -> Waveform:
         """Return the target waveform over time (s) and position (m), in the device's quantity."""
         return getattr(setup, "scene", setup).texture.waveform
 
     def design(self, method: Method, model: DeviceModel, bands: Bands, *, feedback: bool = True) -> Controller:
-        """Return a controller of `method` for the whole device."""
-        return method.design(model, bands, feedback=feedback)
+        """Return a controller of `method` for the whole device, supervised where something is sensed."""
+        controller = method.design(model, bands, feedback=feedback)
+        return supervised(controller, model) if feedback else controller
 
 
 def check_tables(

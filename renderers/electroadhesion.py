@@ -87,6 +87,7 @@ class ScreenSetup(FrictionSetup):
                 contact_damping=0.0,
                 sensor_delay=lag,
                 contact_lag=assumed.memory_length,
+                inferred=True,
             )
         return model
 

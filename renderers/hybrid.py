@@ -192,6 +192,11 @@ class HybridRenderer(BaseRenderer):
             bands = replace(bands, friction=self._screen.bands(setup.friction, model.friction))
         return bands
 
+    def limited(self, setup: HybridSetup, model: DeviceModel, bands: Bands) -> DeviceModel:
+        """Return the device model with the drive of the plate limited to what its share of the scene needs."""
+        parts: Any = model, bands
+        return replace(parts[0], plate=self._plate.limited(setup.plate, parts[0].plate, parts[1].plate))
+
     def design(self, method: Method, model: DeviceModel, bands: Bands, *, feedback: bool = True) -> CombinedController:
         """Return two controllers of `method`, one a part, as one."""
         return design_combined(method, model, bands, feedback=feedback)  # type: ignore[arg-type]

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 
 from hapticrender.bands import Bands
-from hapticrender.control.device_model import DeviceModel
+from hapticrender.control.device_model import Demand, DeviceModel
+from hapticrender.control.supervisor import drive_per_target
 from hapticrender.protocols import Array
 from hapticrender.renderers.base import Waveform
 from hapticrender.touch.perception import drop_unfelt
@@ -92,29 +95,55 @@ class Need(NamedTuple):
     drive: float  # that they need
     worst: float  # target of the band that needs most of it (of a waveform: its peak)
     frequency: float  # Hz, of that band
+    lowest: float  # Hz, of all that the targets move with
+    highest: float  # Hz
 
 
-def needed(scene: Scene, model: DeviceModel, bands: Bands, waveform: Waveform) -> Need:
-    """Amplitude and drive that a scene's targets need of the free device.
+def demand(scene: Scene, model: DeviceModel, bands: Bands, waveform: Waveform) -> Demand:
+    """Return what the targets of a scene need of a plate at most, with the worst finger; see `control.supervisor`."""
+    need = needed(scene, model, bands, waveform, partial(drive_per_target, model))
+    motion = need.amplitude * max(map(abs, model.profile or (1.0,)))
+    lowest = max(need.lowest, model.lowest_frequency / 2)
+    return Demand(motion=motion, drive=need.drive, lowest=lowest, highest=max(need.highest, lowest))
 
-    A finger-locked carrier of a constant target passes every frequency up to that of the finger's top speed.
+
+def needed(
+    scene: Scene,
+    model: DeviceModel,
+    bands: Bands,
+    waveform: Waveform,
+    per_target: Callable[[Array], Array] | None = None,
+) -> Need:
+    """Amplitude and drive that a scene's targets need of the free device, all channels driven alike.
+
+    `per_target` (drive per target at frequencies in Hz) may state another drive.  A finger-locked carrier of a constant
+    target passes every frequency up to that of the finger's top speed.
     """
+    per_target = per_target or partial(_drive_of_free_device, model)
     if bands.envelope is None:
-        return _need_of_waveform(scene, model, bands, waveform)
+        return _need_of_waveform(scene, model, bands, waveform, per_target)
     sweep = np.minimum(top_speed(scene) * bands.wavenumber, model.highest_edge * model.highest_frequency)
     top = bands.frequency + sweep
     low = np.where(bands.wavenumber > 0.0, np.minimum(model.lowest_frequency, top), top)
     passed = low + np.linspace(0.0, 1.0, 400)[:, None] * (top - low)
     target = abs(bands.envelope) * (2 * np.pi * passed if bands.differentiated else np.ones_like(passed))
-    drive = target / abs(model.response(passed).sum(axis=-1)[..., 0])  # all channels driven alike
+    drive = target * abs(per_target(passed))
     worst = int(drive.max(axis=0).argmax())
     at = int(drive[:, worst].argmax()), worst
     sums = (float(each.max(axis=0).sum()) for each in (target, drive))
-    return Need(*sums, float(target[at]), float(passed[at]))
+    ends = float(passed.min()), float(passed.max())
+    return Need(*sums, float(target[at]), float(passed[at]), *ends)
 
 
-def _need_of_waveform(scene: Scene, model: DeviceModel, bands: Bands, waveform: Waveform) -> Need:
-    """A target waveform, over all the frequencies that are rendered."""
+def _drive_of_free_device(model: DeviceModel, frequency: Array) -> Array:
+    """Drive of all channels alike per target, complex, at `frequency` (Hz)."""
+    return np.asarray(1.0 / model.response(frequency).sum(axis=-1)[..., 0])
+
+
+def _need_of_waveform(
+    scene: Scene, model: DeviceModel, bands: Bands, waveform: Waveform, per_target: Callable[[Array], Array]
+) -> Need:
+    """A target waveform, over all the frequencies that are rendered; its ends leave 0.1 % of the energy outside."""
     time = np.arange(int(min(scene.duration, LOOK_AHEAD) * model.rate) + 2) / model.rate
     target = bands.checked(type(scene.texture).__name__, waveform, time, scene.finger.position(time))
     frequency = np.fft.rfftfreq(len(time), 1.0 / model.rate)
@@ -123,7 +152,8 @@ def _need_of_waveform(scene: Scene, model: DeviceModel, bands: Bands, waveform: 
     spectrum = np.where(kept, turn * np.fft.rfft(target), 0.0)
     if bands.differentiated:
         target = np.fft.irfft(spectrum, len(time))
-    gain = model.response(frequency).sum(axis=-1)[:, 0]
-    drive = abs(np.fft.irfft(spectrum / gain, len(time))).max()
+    drive = abs(np.fft.irfft(spectrum * per_target(frequency), len(time))).max()
     amplitude = float(abs(target).max())
-    return Need(amplitude, float(drive), amplitude, float(frequency[abs(spectrum).argmax()]))
+    energy = np.cumsum(abs(spectrum) ** 2)
+    ends = (float(frequency[np.searchsorted(energy, share * energy[-1])]) for share in (1e-3, 1.0 - 1e-3))
+    return Need(amplitude, float(drive), amplitude, float(frequency[abs(spectrum).argmax()]), *ends)

@@ -9,8 +9,10 @@ import numpy as np
 from hapticrender import defaults
 from hapticrender.checks import require
 from hapticrender.control.controller import BankController
+from hapticrender.control.device_model import Demand
 from hapticrender.control.kernel import observed_envelope
 from hapticrender.control.methods import method_named
+from hapticrender.control.supervisor import Fault, supervised
 from hapticrender.driver_checks import check_sensed
 from hapticrender.plants.compiled import LOAD, SPEED, finger_inputs
 from hapticrender.plants.friction_laws import friction_ratios, reference_amplitudes
@@ -31,7 +33,8 @@ class ResonantDriver(WrappedDriver):
     (N) goes in, and what follows from the sensed amplitude comes out, at the lower rate.  The device's block is a whole
     multiple of that multiple, or divides it.  `finger` says where the finger is, and how hard it presses where the
     device does not measure it; `nominal` is the load (N) and speed (m/s) for which the amplitude is held while no
-    finger is there.
+    finger is there.  `demand` is what the scene needs of the mode (m, V); its drive is
+    supervised by it.
 
     Notes
     -----
@@ -41,7 +44,12 @@ class ResonantDriver(WrappedDriver):
     """
 
     def __init__(
-        self, driver: Driver, parameters: SurfaceParameters, finger: Finger, nominal: tuple[float, float]
+        self,
+        driver: Driver,
+        parameters: SurfaceParameters,
+        finger: Finger,
+        nominal: tuple[float, float],
+        demand: Demand | None = None,
     ) -> None:
         many = _multiple(driver, parameters)
         super().__init__(driver)
@@ -55,12 +63,19 @@ class ResonantDriver(WrappedDriver):
         self._piece = min(driver.block, many)
         self._nominal = nominal
         self.loop = amplitude_loop(self.parameters, held=None if driver.sensed_channels else nominal[0])
+        model = replace(self.parameters.amplitude_model(), demand=demand)
+        self._supervised = supervised(self.loop, model) if driver.sensed_channels else self.loop
         self._samples = 0
         self._target = 0.0  # m, at the end of the last sample
         self._reached = -1.0  # m, alike, by what the drive can do; negative: it starts from rest
         self._friction = 0.0  # N: measured in the last sample
         self._drive = np.zeros((driver.block, 1))
         self._next = np.zeros((driver.block, 1))
+
+    @property
+    def fault(self) -> Fault | None:
+        """Why the drive of the amplitude has been stopped; see `control.supervisor`."""
+        return getattr(self._supervised, "fault", None)
 
     def play(self, drive: Array) -> Sensed:
         """Play a block of friction (N); sample i of what is sensed was there at the start of interval i."""
@@ -121,7 +136,7 @@ class ResonantDriver(WrappedDriver):
                 played.append(check_sensed(self.driver, self.driver.play(self._drive), 1))
             here = slice(at, at + step)
             sensed = played[-1].sensed[here] if self.sensed_channels else silent
-            self._next[here], _, raised = self.loop.run(sensed, away, target[start : start + step])
+            self._next[here], _, raised = self._supervised.run(sensed, away, target[start : start + step])
             flags[start : start + step] |= raised
             if at + step == long:
                 self._drive = self._next.copy()

@@ -13,7 +13,7 @@ import numpy as np
 
 from hapticrender.bands import Bands
 from hapticrender.checks import inside, require
-from hapticrender.control.device_model import DeviceModel
+from hapticrender.control.device_model import Demand, DeviceModel
 from hapticrender.plants.friction_laws import LAWS
 from hapticrender.plants.surface import SurfaceParameters, UltrasonicSurface
 from hapticrender.plants.ultrasonic import UltrasonicParameters
@@ -21,8 +21,10 @@ from hapticrender.protocols import Driver
 from hapticrender.renderers.base import check_channels, check_tables, read_devices
 from hapticrender.renderers.friction import FrictionRenderer, FrictionSettings, FrictionSetup
 from hapticrender.renderers.resonant import ResonantDriver, amplitude_loop
+from hapticrender.renderers.shaped import Port
 from hapticrender.touch.scene import Scene
 
+WORST_SKIN = 3.0  # damping of a finger over that assumed
 LEAST_NOISE = 1e-6  # of the range: of a friction that is computed from the amplitude
 LEVEL = ("level", "oversampling", "envelope_oversampling", "envelope_frequency")  # how finely a surface is modelled
 
@@ -57,7 +59,7 @@ class UltrasonicRenderer(FrictionRenderer):
 
     def connect(self, setup: SurfaceSetup, driver: Driver) -> Driver:
         """Return a device at the carrier's rate as a driver of friction; see `ResonantDriver`."""
-        return ResonantDriver(driver, setup.assumed, setup.scene.finger, (setup.load, setup.speed))
+        return ResonantDriver(driver, setup.assumed, setup.scene.finger, (setup.load, setup.speed), _demand(setup))
 
     def device_model(self, setup: SurfaceSetup, driver: Driver) -> DeviceModel:
         """Return the device model of the surface behind `driver`; refuses what the law or the drive cannot do."""
@@ -83,7 +85,20 @@ class UltrasonicRenderer(FrictionRenderer):
         return bands
 
 
-def _model(setup: SurfaceSetup, driver: Driver) -> DeviceModel:
+def _demand(setup: SurfaceSetup) -> Demand:
+    """Amplitude (m) and drive (V) that the scene needs at most, with a finger that damps `WORST_SKIN` times as much."""
+    assumed, mode = setup.assumed, setup.assumed.mode
+    need = setup.needed(_model(setup, Port(assumed.rate, 1, 1)))
+    swing = need.drive / (assumed.friction_coefficient * setup.load)
+    amplitude = float(
+        assumed.friction_law.amplitude(max(assumed.bias - swing, assumed.least_ratio), setup.load, setup.speed)
+    )
+    worst = replace(mode, finger_damping=WORST_SKIN * mode.finger_damping)
+    drive = worst.drive_for(amplitude, need.highest, setup.largest_load)
+    return Demand(motion=amplitude, drive=drive, lowest=mode.frequency, highest=mode.frequency)
+
+
+def _model(setup: SurfaceSetup, driver: Driver | Port) -> DeviceModel:
     """Device model without its drive limit; the amplitude's interpolation adds half a sample to that of a hold."""
     assumed, lag = setup.assumed, 0.5 / driver.rate
     model = setup.contact(driver, 1.0)
@@ -96,6 +111,7 @@ def _model(setup: SurfaceSetup, driver: Driver) -> DeviceModel:
             contact_damping=0.0,
             sensor_delay=0.0,
             contact_lag=assumed.memory_length,
+            inferred=True,
             sensed_noise=LEAST_NOISE * model.sensed_limit,
         )
     mass = model.mass + lag * model.damping + lag**2 / 2 * model.stiffness

@@ -12,10 +12,11 @@ from dataclasses import dataclass, replace
 from hapticrender.bands import Bands
 from hapticrender.checks import require
 from hapticrender.control.device_model import DeviceModel
+from hapticrender.control.supervisor import governed
 from hapticrender.plants.plate import EXPECTED_BENDING, Plate, PlateParameters
 from hapticrender.protocols import Driver
 from hapticrender.renderers.base import BaseRenderer, check_channels, check_tables, read_devices
-from hapticrender.renderers.limits import check_carriers, check_path, check_targets, perceptible
+from hapticrender.renderers.limits import check_carriers, check_path, check_targets, demand, perceptible
 from hapticrender.touch.scene import Scene
 
 STEEPEST = 1.0  # change of the amplitude from the middle to an end
@@ -29,6 +30,7 @@ class PlateSetup:
     scene: Scene
     assumed: PlateParameters
     simulated: PlateParameters
+    probe: bool = True  # whether a device is probed before the loop closes
 
 
 class VibrotactileRenderer(BaseRenderer):
@@ -39,8 +41,10 @@ class VibrotactileRenderer(BaseRenderer):
 
     def read(self, scene: Scene, driver: Driver | None) -> PlateSetup:
         """Read the tables of a scene."""
-        check_tables(scene, PlateParameters.names(), level=LEVEL)
-        return PlateSetup(scene, *read_devices(scene, PlateParameters, LEVEL))
+        check_tables(scene, PlateParameters.names(), ("probe",), level=LEVEL)
+        probe = scene.rendering.get("probe", True)
+        require(isinstance(probe, bool), "render.probe", probe, "true or false", TypeError)
+        return PlateSetup(scene, *read_devices(scene, PlateParameters, LEVEL), probe)
 
     def plant(self, setup: PlateSetup, seed: int) -> Plate:
         """Return the simulated plate with the scene's finger on it."""
@@ -48,6 +52,11 @@ class VibrotactileRenderer(BaseRenderer):
         require(coils == assumed, "simulation.coils", coils, f"{assumed}, as in [device]")
         check_path(setup.scene, setup.simulated.glass_length / 2, "glass")
         return Plate(setup.simulated, setup.scene.finger, seed)
+
+    def probes(self, setup: PlateSetup, driver: Driver) -> bool:
+        """Whether a plate is probed: one of two coils and two sensors, unless driver or scene say no."""
+        asked = setup.probe and getattr(driver, "probe", True)
+        return asked and setup.assumed.coils == driver.sensed_channels == 2
 
     def device_model(self, setup: PlateSetup, driver: Driver) -> DeviceModel:
         """Return the device model of the plate behind `driver`."""
@@ -72,6 +81,11 @@ class VibrotactileRenderer(BaseRenderer):
         check_carriers(scene, model, bands)
         check_targets(scene, model, bands, scene.texture.waveform)
         return bands
+
+    def limited(self, setup: PlateSetup, model: DeviceModel, bands: Bands) -> DeviceModel:
+        """Return the device model with the scene's demand, its drive limited to what the scene needs."""
+        scene = setup.scene
+        return governed(model, demand(scene, model, bands, scene.texture.waveform)) if len(bands) else model
 
 
 def _pattern(scene: Scene, plate: PlateParameters) -> tuple[float, float]:

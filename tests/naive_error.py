@@ -7,7 +7,7 @@ complex arrays of shape (coordinates, bands).
 
 import numpy as np
 
-SATURATED, NONFINITE = 1, 2
+SATURATED, NONFINITE, SENSOR_CLIPPED = 1, 2, 4
 TURN, TRACKER = 2 * np.pi, 2 * np.pi * 60.0  # rad/s: triple pole of the finger's tracker
 FAR, FASTEST, FRESH, FADE_OUT, FORGET = 1e3, 10.0, 0.03, 0.02, 50.0  # m, m/s, s, s, 1/s
 STEP = 8  # samples of a step of adaptation
@@ -52,10 +52,11 @@ class NaiveError:
     def step(self, sensed, position, waveform):
         """Drive (channels,), target (bands,) and flags of one sample."""
         p, T = self.p, self.T
-        good = np.abs(sensed) <= p["sensor_limit"]
+        good = np.abs(sensed) < p["sensor_limit"]
         y = self.from_sensor @ np.where(good, sensed, 0.0)
         sane = abs(waveform) <= FAR or not (p["analysed"] or p["modulated"])
         flags = NONFINITE if not good.all() or abs(position) > FAR or not sane else 0
+        flags |= SENSOR_CLIPPED if (np.isfinite(sensed) & ~good).any() else 0
         if self.locked:
             self.track(position)
         carrier = self.carriers()
@@ -71,10 +72,12 @@ class NaiveError:
         ki = between(p["integral"], p["integral_medium"], self.open[1])
         ki = 0.0 if idle else between(ki, p["integral_high"], self.open[0])
 
+        predicted = self.l + ((self.shape * self.R + self.E) * carrier).real.sum(axis=1)
+        y = y if good.all() else predicted
         deviation = y - self.scale * ((self.shape * self.R + self.v) * carrier).real.sum(axis=1)
         self.past = np.column_stack([deviation, self.past[:, :-1]])
         damping = -inner * (self.taps * self.past).sum(axis=1)
-        e = y - self.l - ((self.shape * self.R + self.E) * carrier).real.sum(axis=1)  # residual
+        e = y - predicted  # residual
         self.l = self.l + self.r + (p["dc_fast"] if quick else p["dc"]) * e
         self.r = self.r + (p["dc_drift_fast"] if quick else p["dc_drift"]) * e
 

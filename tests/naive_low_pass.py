@@ -82,7 +82,7 @@ class NaiveLowPass:
     def step(self, sensed, position, wanted):
         """Return the drive, shape (channels,), and the targets, shape (bands,)."""
         p, bands = self.p, self.bands
-        plausible = abs(sensed) <= p["sensor_limit"]  # NaN is not
+        plausible = abs(sensed) < p["sensor_limit"]  # NaN is not
         y = self.listen @ np.where(plausible, sensed, 0.0)
         if (bands.wavenumber > 0.0).any():
             self.track(position)

@@ -26,6 +26,8 @@ COLUMNS = ("drive", "sensed", "motion", "position", "normal_load", "target", "fl
 class Blocks:
     """A driver that shows the loop nothing of the plant behind it but its blocks."""
 
+    probe = False
+
     def __init__(self, driver):
         self._driver = driver
         for name in ("rate", "drive_channels", "sensed_channels", "block", "delay"):
@@ -142,7 +144,9 @@ def test_a_sensor_gone_mad_leaves_the_drive_finite_limited_and_flagged(bad):
     def spoil(sensed):
         return sensed._replace(sensed=np.full_like(sensed.sensed, bad), motion=None)
 
-    recording = hr.render(TONE, driver=Faulty(simulated(TONE), 1000, spoil))
+    with pytest.raises(hr.DeviceFault, match="samples are no numbers") as stopped:
+        hr.render(TONE, driver=Faulty(simulated(TONE), 1000, spoil))
+    recording = stopped.value.recording
     assert np.isfinite(recording.drive).all()
     assert abs(recording.drive).max() <= 3.0
     assert np.all(recording.flags[1001:] & hr.Flag.NONFINITE)

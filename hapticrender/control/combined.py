@@ -17,6 +17,7 @@ from hapticrender.bands import Bands
 from hapticrender.control.controller import BankController, refuse_whole_waveform
 from hapticrender.control.device_model import DeviceModel
 from hapticrender.control.records import CONTROLLER_T, TILE_T, W
+from hapticrender.control.supervisor import Fault, SupervisedController, supervised
 from hapticrender.jit import C16, F8, I8, SIGNALS_T, addresses, call, pointer, record, step
 from hapticrender.protocols import Array, Method
 
@@ -43,7 +44,7 @@ class CombinedBands(Bands):
 BUFFERS = ("sensed", "drive", "waveform", "target", "flags", "position")
 PART = np.dtype(
     [
-        *((name, np.int64) for name in ("step", "state", "signals", "sensors", "channels", "bands", "index")),
+        *((name, np.int64) for name in ("step", "state", "bank", "signals", "sensors", "channels", "bands", "index")),
         ("scale", np.complex128),  # target of the skin's velocity per target of the part; 0: j w
         ("scale_waveform", np.float64),  # of the part per waveform of both
         *((f"{name}_at", np.int64) for name in BUFFERS),
@@ -88,7 +89,7 @@ def combined_step(state, signals, start, count):
             for k in range(p.bands):
                 scale = p.scale
                 if scale == 0.0:
-                    scale = complex(0.0, record(record(p.state, CONTROLLER_T, 0).tiles_at, TILE_T, k // W).omega[k % W])
+                    scale = complex(0.0, record(record(p.bank, CONTROLLER_T, 0).tiles_at, TILE_T, k // W).omega[k % W])
                 target[row, index[k]] += scale * goal[0, k]
             sensor, channel = sensor + p.sensors, channel + p.channels
     return 0
@@ -136,6 +137,7 @@ class CombinedController:
             own["scale_waveform"] = per_target if bands.envelope is None else 1.0
             if part is not None:
                 own["step"], own["state"] = part.step.address, part.state.ctypes.data
+                own["bank"] = getattr(part, "controller", part).state.ctypes.data
 
     @property
     def note(self) -> str:
@@ -148,6 +150,13 @@ class CombinedController:
         """Share of a target that the integral parts add on the untouched device; see `BankController.mismatch`."""
         return max((part.mismatch for part in self.parts if part is not None), default=0.0)
 
+    @property
+    def fault(self) -> Fault | None:
+        """Why and when the drive of a part has been stopped; see `SupervisedController`."""
+        parts: tuple[Any, ...] = self.parts
+        found = (part.fault for part in parts if isinstance(part, SupervisedController))
+        return next((fault for fault in found if fault is not None), None)
+
     run = BankController.run
 
 
@@ -157,10 +166,10 @@ def design_combined(
     """Design a controller of `method` for each part, with its share of the targets; open loop without feedback."""
     refuse_whole_waveform(bands)
     models, shares = (model.plate, model.friction), (bands.plate, bands.friction)
-    parts: tuple[Any, ...] = tuple(
-        method.design(each, own, feedback=feedback) if each is not None and len(own) else None
-        for each, own in zip(models, shares, strict=True)
-    )
+    parts: list[Any] = []
+    for each, own in zip(models, shares, strict=True):
+        part: Any = method.design(each, own, feedback=feedback) if each is not None and len(own) else None
+        parts.append(supervised(part, each) if feedback and part is not None and each is not None else part)
     sensors = (model.plate.coordinate_from_sensed.shape[1], 1) if feedback else (0, 0)
     channels = (model.plate.force_from_drive.shape[1], 1)
     return CombinedController(

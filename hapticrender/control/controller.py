@@ -100,7 +100,7 @@ class BankController:
             if f"{name}_at" in (CONTROLLER.names or ()):
                 self.state[f"{name}_at"] = array.ctypes.data
         start: dict[str, float] = {"tiles": tiles, "bands": self.n_bands, "history": history, "stale": 1, "moving": 1}
-        start |= {"scale": 1.0, "confidence": 1.0, "unlocked": 1.0, "response_gain": math.nan}
+        start |= {"scale": 1.0, "confidence": 1.0, "damper_scale": 1.0, "unlocked": 1.0, "response_gain": math.nan}
         for name, number in start.items():
             self.state[name] = number
 

@@ -29,6 +29,7 @@ from hapticrender.control.device_model import DeviceModel, FingerRange
 from hapticrender.control.kernel import block_step, error_step
 from hapticrender.control.margin_check import BankGains, checked_gains
 from hapticrender.control.records import MOST_TAPS
+from hapticrender.control.supervisor import damper_noise
 
 FADE_IN = 0.05  # s: a target fades in this slowly, so that it does not excite the modes
 LEAST_FADE_IN = 0.5e-3  # s: however fast the device, as drives are finite
@@ -201,6 +202,7 @@ def _settings(
         **{name: getattr(model, name) for name in FROM_MODEL},
         "n_taps": taps.shape[1],
         "taps": np.pad(taps, ((0, 2 - len(taps)), (0, MOST_TAPS - taps.shape[1]))),
+        "damper_noise": damper_noise(model, taps),
         "added_damping": np.resize(np.append(damping.added_damping if damping else 0.0, [0.0, 0.0]), 2),
         "waveform_gain": 2 * 2 * math.pi * observer * period,
         "extrapolation": 0.0,

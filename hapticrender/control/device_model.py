@@ -38,6 +38,16 @@ class FingerRange:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Demand:
+    """What a scene needs of a device at most; supervision and drive limit follow from it."""
+
+    motion: float  # R, coordinate's unit: peak of the target anywhere on the surface
+    drive: float  # B, drive unit: amplitude of each channel with the worst finger
+    lowest: float  # Hz, of what the target moves with
+    highest: float  # Hz
+
+
+@dataclass(frozen=True, kw_only=True)
 class DeviceModel:
     """All that the controller is given of a device of c coordinates, d drive channels, s sensors and p places.
 
@@ -60,6 +70,7 @@ class DeviceModel:
     sensed_limit: float  # sensor unit, > 0: a larger sample is a sensor fault, a larger target is refused
     drive_step: float = 0.0  # drive unit: resolution of the command; 0 is ideal
     sensed_noise: float = 0.0  # sensor unit rms: white noise of each sensor
+    inferred: bool = False  # what is sensed is computed from another quantity: that it repeats is no sensor fault
     bending: BendingMode | None = None  # the surface's own first mode, which the inner damper must not drive
     rigid: bool = False  # the surface is known to have no mode of its own in reach
     block: int = 1  # samples that the device takes and gives at once
@@ -79,6 +90,7 @@ class DeviceModel:
     always_damped: bool = False  # the damper stays on at low gains: its noise costs less than the onset of a contact
     unit: str = "m"  # of the coordinates
     drive_unit: str = "A"
+    demand: Demand | None = None  # of the scene; None: not known, or too little to supervise a motion by
 
     @property
     def pattern(self) -> tuple[float, ...]:

@@ -29,6 +29,7 @@ from hapticrender.control.inverse_kernel import (
     inverse_step,
 )
 from hapticrender.control.records import MOST_CHANNELS, MOST_TAPS, aligned
+from hapticrender.control.supervisor import damper_noise
 from hapticrender.mathx import zoh
 from hapticrender.protocols import Array
 
@@ -186,6 +187,7 @@ def controller_settings(model: DeviceModel, bands: Bands, damping: Damping | Non
         "n_taps": taps.shape[1],
         "taps": np.pad(taps, ((0, 2 - len(taps)), (0, MOST_TAPS - taps.shape[1]))),
         "damper_high": 1.0 if damping else 0.0,
+        "damper_noise": damper_noise(model, taps),
         "release": period / 0.05,
     }
 

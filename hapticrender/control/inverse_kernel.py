@@ -319,7 +319,10 @@ def revert(inverse):
 
 @kernel
 def open_gate(controller, inverse, deviation):
-    """Gain of the inner damper: open after a contact, and while the deviation is more than noise."""
+    """Gain of the inner damper: open after a contact, and while the deviation is more than noise.
+
+    `damper_scale` is the supervisor's: it turns a ringing damper down.
+    """
     c, v = record(controller, CONTROLLER_T, 0), record(inverse, INVERSE_T, 0)
     v.slow += v.high_pass * (deviation - v.slow)
     above = deviation - v.slow
@@ -328,18 +331,19 @@ def open_gate(controller, inverse, deviation):
         c.fast_timer = max(c.fast_timer, 1.0)
     c.fast_open = 1.0 if c.fast_timer > 0.0 else max(c.fast_open - c.p.release, 0.0)
     c.fast_timer -= 1.0
-    c.damping_gain = c.p.damper + c.fast_open * (c.p.damper_high - c.p.damper)
+    c.damping_gain = c.damper_scale * (c.p.damper + c.fast_open * (c.p.damper_high - c.p.damper))
 
 
 @kernel
 def damp(controller, coordinate, deviation):
-    """Force of the inner damper, F = -sum taps eps[n - j]; `past` is a ring of 16 deviations."""
+    """Force of the inner damper, F = -sum taps eps[n - j], and `damper_force` before its gain; `past` is a ring."""
     c = record(controller, CONTROLLER_T, 0)
     now, force = c.sample & 15, 0.0
     c.past[coordinate, now] = deviation
-    if c.damping_gain > 0.0:
+    if c.damping_gain > 0.0 or c.damper_scale < 1.0:
         for j in range(c.p.n_taps):
             force -= c.p.taps[coordinate, j] * c.past[coordinate, (now - j) & 15]
+    c.damper_force[coordinate] = force
     return c.damping_gain * force
 
 

@@ -14,6 +14,7 @@ A block: sensors, carriers and targets, contact, prediction, innovation, observe
 
 from __future__ import annotations
 
+import numpy as np
 from numba import carray
 
 from hapticrender.control.adaptation import (
@@ -32,7 +33,7 @@ from hapticrender.control.carriers import (
     update_targets,
 )
 from hapticrender.control.laws import apply_law, follow_resonance, update_law
-from hapticrender.control.limiter import NEAR_LIMIT, NONFINITE, UNLOCKED, largest_drive, limit_drive
+from hapticrender.control.limiter import NEAR_LIMIT, NONFINITE, SENSOR_CLIPPED, UNLOCKED, largest_drive, limit_drive
 from hapticrender.control.records import (
     ANALYSIS,
     CONTROLLER_T,
@@ -56,9 +57,10 @@ FADE_OUT = 0.02  # s: within this the drive fades out while a sensor's samples a
 
 @kernel
 def sense_block(controller, signals, first):
-    """Convert the block's sensors to coordinates; returns 1 where a sensor's sample is not finite or out of range.
+    """Convert the block's sensors to coordinates; returns 1 where a sensor's sample is invalid.
 
-    Such a sample counts as zero; it is flagged, as a position or a waveform that is no number is.
+    That is one that is not finite, or not inside the sensor's range: its coordinates are NaN, and the innovation takes
+    the prediction in their place.  It is flagged, as a position or a waveform that is no number is.
     """
     c = record(controller, CONTROLLER_T, 0)
     io, samples = record(signals, SIGNALS_T, 0), samples_of(controller)
@@ -72,18 +74,19 @@ def sense_block(controller, signals, first):
         y0 = y1 = 0.0
         for s in range(p.sensors):
             value = sensed[n * p.sensors + s]
-            if abs(value) <= p.sensor_limit:
+            if abs(value) < p.sensor_limit:
                 y0 += p.coordinate_from_sensor[0, s] * value
                 y1 += p.coordinate_from_sensor[1, s] * value
             else:  # NaN included
-                raised = 1
+                y0, y1 = np.nan, np.nan
+                raised |= SENSOR_CLIPPED if abs(value) < np.inf else NONFINITE
         samples[Y, m], samples[Y + 1, m] = y0, y1
-        implausible |= raised
+        implausible |= raised > 0
         value = waveform[n] if reads else 0.0
         sane = abs(value) <= FARTHEST
         samples[WAVEFORM, m] = value if sane else 0.0
         if raised > 0 or abs(position[n]) > FARTHEST or not sane:
-            flags[n] |= NONFINITE
+            flags[n] |= raised | NONFINITE
         if c.moving > 0:
             track_finger(controller, position[n])
         samples[POSITION, m] = c.held_position
@@ -152,7 +155,8 @@ def predict(controller):
 def innovate_sample(controller):
     """Innovation of a sample, DC estimates of type 2, and the inner damper's force into the row STEP.
 
-    The damper is F = -sum taps eps[n - j]; `past` is a ring of 16 deviations eps from the command.
+    The damper is F = -sum taps eps[n - j], `damper_force` before its gain; `past` is a ring of 16 deviations eps from
+    the command.
     """
     c = record(controller, CONTROLLER_T, 0)
     samples, now, p = samples_of(controller), c.sample & 15, c.p
@@ -160,13 +164,15 @@ def innovate_sample(controller):
     gain = p.dc_fast if c.dc_fast_on > 0.0 else p.dc
     drift = p.dc_drift_fast if c.dc_fast_on > 0.0 else p.dc_drift
     for i in range(2):
+        if samples[Y + i, 0] != samples[Y + i, 0]:  # invalid: hold the prediction
+            samples[Y + i, 0] = samples[SUM + i, 0] + c.dc[i]
         deviation = samples[Y + i, 0] - c.scale * (command0 if i == 0 else command1)
         c.past[i, now], c.deviation[i] = deviation, deviation - c.dc[i]
         force = 0.0
-        if c.damping_gain > 0.0:
+        if c.damping_gain > 0.0 or c.damper_scale < 1.0:
             for j in range(p.n_taps):
                 force -= p.taps[i, j] * c.past[i, (now - j) & 15]
-        samples[STEP + i, 0] = c.damping_gain * force
+        c.damper_force[i], samples[STEP + i, 0] = force, c.damping_gain * force
         error = samples[Y + i, 0] - samples[SUM + i, 0] - c.dc[i]
         samples[Y + i, 0] = error
         c.dc[i] += c.dc_drift[i] + gain * error
@@ -189,6 +195,8 @@ def innovate_block(controller):
     for i in range(2):
         for m in range(block):
             samples[Y + i, m] -= samples[SUM + i, m] + c.dc[i] + m * c.dc_drift[i]
+            if samples[Y + i, m] != samples[Y + i, m]:  # invalid: hold the prediction
+                samples[Y + i, m] = 0.0
         solve(controller, Y + i, INVERSE)
         gained = steeper = 0.0
         for m in range(block):
@@ -337,13 +345,16 @@ def begin(controller, signals, first):
 
 @kernel
 def find_contact(controller, adapt_now):
-    """Contact by the DC estimate, which raises the gains for a while, and the gain of the inner damper."""
+    """Contact by the DC estimate, which raises the gains for a while, and the gain of the inner damper.
+
+    `damper_scale` is the supervisor's: it turns a ringing damper down.
+    """
     c = record(controller, CONTROLLER_T, 0)
     p = c.p
     if detect_contact(controller, adapt_now):
         c.fast_timer, c.fast_open = p.fast_time, 1.0
         reset_finger(controller)
-    c.damping_gain = 0.0 if c.scale < 1.0 else p.damper + c.fast_open * (p.damper_high - p.damper)
+    c.damping_gain = 0.0 if c.scale < 1.0 else c.damper_scale * (p.damper + c.fast_open * (p.damper_high - p.damper))
     return c.contact > 0.0 and p.adaptation >= 0.0
 
 

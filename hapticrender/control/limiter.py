@@ -10,7 +10,7 @@ from hapticrender.control.records import CONTROLLER_T
 from hapticrender.jit import kernel, record
 
 NEAR_LIMIT = 0.25  # of the limit, squared: from here on the envelope of the drive counts, not its samples alone
-SATURATED, NONFINITE, UNLOCKED = 1, 2, 32  # Flag bits
+SATURATED, NONFINITE, SENSOR_CLIPPED, UNLOCKED = 1, 2, 4, 32  # Flag bits
 
 
 @kernel

@@ -253,9 +253,12 @@ def low_pass_step(state, signals, start, count):
     """Advance a controller with low passes by `count` samples; see `hapticrender.jit`."""
     c, io, stop = record(state, CONTROLLER_T, 0), record(signals, SIGNALS_T, 0), start + count
     drive, flags = carray(pointer(io.drive, F8), (stop, c.p.channels)), carray(pointer(io.flags, I8), stop)
+    samples = samples_of(state)
     for n in range(start, stop):
         seen, held = c.finger_seen, c.held_position
         implausible = sense_block(state, signals, n)
+        if implausible > 0:  # these methods predict nothing
+            samples[Y, 0], samples[Y + 1, 0] = 0.0, 0.0
         if c.moving > 0:
             smooth_velocity(state, seen, held)
         advance_carriers(state)

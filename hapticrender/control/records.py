@@ -95,6 +95,7 @@ SETTINGS = np.dtype(
         *((name, np.float64, (2, 2)) for name in ("mass", "damping", "stiffness")),
         ("shape", np.float64, (2,)),
         ("added_damping", np.float64, (2,)),
+        ("damper_noise", np.float64, (2,)),  # N rms beyond `RINGING`, of `damper_force` by sensor noise; 0: unknown
         ("taps", np.float64, (2, MOST_TAPS)),
         ("coordinate_from_sensor", np.float64, (2, MOST_SENSORS)),
         ("drive_from_force", np.float64, (MOST_CHANNELS, 2)),
@@ -112,13 +113,13 @@ _STATE = """
 held_position held_prediction smooth_position velocity acceleration finger_seen fresh speed table_velocity
 load lever contact law_contact law_lever finger_mass finger_damping finger_stiffness
 fast_timer slow_timer fast_open slow_open peak_squared scale confidence shift unlocked response_gain
-gain damping_gain dc_fast_on feedback_off
+gain damping_gain damper_scale dc_fast_on feedback_off
 """.split()
 CONTROLLER = np.dtype(
     [
         ("p", SETTINGS),
         *((name, np.float64) for name in _STATE),
-        *((name, np.float64, (2,)) for name in ("dc", "dc_drift", "deviation")),
+        *((name, np.float64, (2,)) for name in ("dc", "dc_drift", "deviation", "damper_force")),
         ("past", np.float64, (2, MOST_TAPS)),
         ("shaper", np.float64, (2, MOST_CHANNELS)),
         *((name, np.int64) for name in ("sample", "tiles", "bands", "history", "moving", "stale", "implausible")),

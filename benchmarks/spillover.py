@@ -1,0 +1,62 @@
+"""Plates whose bending mode the controller does not know: limit cycles with and without the supervisor.
+
+Run: python -m benchmarks.spillover
+
+38 modes a row: 500 to 2300 Hz in steps of 100, coupling +-0.1, Q 30 and 50 in turn; each free and under a finger of
+0.8 N for 1 s.  Printed for each texture: how many ring at the drive limit unsupervised; supervised, the largest drive
+over its limit, how often the damper was turned down, and how often the drive was stopped.
+"""
+
+import warnings
+
+import numpy as np
+
+import hapticrender as hr
+from benchmarks.false_stops import Hidden
+from hapticrender.plants.plate import Plate, PlateParameters
+from hapticrender.touch.mechanics import HEAVY
+
+TEXTURES = [(20.0, 10e-6), (72.0, 50e-6), (189.0, 50e-6), (400.0, 50e-6)]  # Hz, m
+TOUCH = hr.Finger.still(normal_load=0.8, touches=((0.5, 1.5),), mechanics=HEAVY)
+
+
+def run(frequency, amplitude, mode, finger, supervised=True):
+    """Largest drive (A, shape (n,)) over its limit, the damper's final gain, and whether it was stopped."""
+    plate = Plate(PlateParameters(**mode), finger, 1)
+    scene = hr.Scene(texture=hr.Grating(frequency=frequency, amplitude=amplitude), finger=finger, duration=2.0)
+    rendering = hr.prepare(scene, driver=Hidden(plate))
+    controller = rendering.controller()
+    inner = controller if supervised else controller.controller
+    drive = abs(plate.closed_loop(inner, np.zeros(10_000))[0]).max(axis=1)
+    return drive / rendering.model.drive_limit, controller.damper_scale, controller.fault is not None
+
+
+def modes():
+    """Bending modes that are tried."""
+    for number, frequency in enumerate(np.arange(500.0, 2301.0, 100.0)):
+        for sign in (-1, 1):
+            damping = 1 / 60 if number % 2 else 1 / 100
+            yield {"bending_frequency": frequency, "bending_damping": damping, "bending_coil": 0.1 * sign}
+
+
+def main():
+    warnings.simplefilter("ignore")
+    for texture in TEXTURES:
+        rings, left, peak, turned, stopped, needless = 0, 0, 0.0, 0, 0, 0
+        for mode in modes():
+            for finger in (hr.Finger.absent(), TOUCH):
+                unstable = run(*texture, mode, finger, supervised=False)[0][-1000:].max() > 0.95
+                drive, scale, fault = run(*texture, mode, finger)
+                rings, turned, stopped = rings + unstable, turned + (scale < 1.0), stopped + fault
+                needless += not unstable and (scale < 1.0 or fault)
+                left += drive[-1000:].max() > 0.95
+                peak = max(peak, drive.max())
+        print(
+            f"{texture[0]:g} Hz: {rings} of 76 ring; supervised: {peak:.2f} of the limit, {turned} turned down, "
+            f"{stopped} stopped, {left} ring on, {needless} turned down though stable",
+            flush=True,
+        )
+
+
+if __name__ == "__main__":
+    main()

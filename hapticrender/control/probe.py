@@ -1,0 +1,163 @@
+"""Start-up probe: check the wiring of a plate's sensors and actuators before the loop closes.
+
+For 200 ms both actuators play lines of their own, away from the modes, so that a resting finger changes little; the
+surface moves by a fortieth of the sensors' range.  The answer y is compared with that of the model under 169
+hypotheses h (13 wirings, each with 13 delays) by the residual 1 - <y, y_h>/(|y| |y_h|), with offset, slope and
+parabola taken out of each sensor.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from hapticrender.control.device_model import DeviceModel
+from hapticrender.control.linear import Sampled
+from hapticrender.driver_checks import check_sensed
+from hapticrender.errors import DeviceFault
+from hapticrender.protocols import Array, Driver
+
+DURATION, EDGE, REST = 0.2, 0.03, 0.1  # s; Hann edges; silence after it
+TRIES = 3
+LOW = np.array([[0.31, 0.51, 0.71], [0.37, 0.58, 0.78]])  # lines of each actuator, over the lowest mode
+HIGH = np.array([[1.40, 1.77], [1.59, 1.96]])  # over the highest
+HIGH_GAIN = (2.0, 2.8)  # amplitude of a line above the modes, over one below
+MOTION, MOST_DRIVE = 0.025, 0.05  # of the sensors' range; of the drive limit
+DELAYS = 13
+MOST_INVALID, MOST_REPEATS, LEAST_ENERGY = 0.02, 0.6, 0.02
+MOST_RESIDUAL, MOST_WORSE = 0.35, 0.05
+SCALES, DELAY_TOLERANCE = (0.6, 1.6), 2  # samples
+ONE, SWAP = np.eye(2), np.eye(2)[::-1]
+WIRINGS = {  # what is not as told: sensors (rows are what is sensed), actuators
+    "nothing": (ONE, ONE),
+    "sensor 1 is inverted": (np.diag([-1.0, 1.0]), ONE),
+    "sensor 2 is inverted": (np.diag([1.0, -1.0]), ONE),
+    "both sensors, or all actuators, are inverted": (-ONE, ONE),
+    "sensors, or actuators, are swapped": (SWAP, ONE),
+    "sensors, or actuators, are swapped, and all inverted": (-SWAP, ONE),
+    "sensor 1 is dead": (np.diag([0.0, 1.0]), ONE),
+    "sensor 2 is dead": (np.diag([1.0, 0.0]), ONE),
+    "actuator 1 is inverted": (ONE, np.diag([-1.0, 1.0])),
+    "actuator 2 is inverted": (ONE, np.diag([1.0, -1.0])),
+    "actuators, or sensors, are swapped": (ONE, SWAP),
+    "actuator 1 is dead": (ONE, np.diag([0.0, 1.0])),
+    "actuator 2 is dead": (ONE, np.diag([1.0, 0.0])),
+}
+
+
+class Found(NamedTuple):
+    """Result of a probe."""
+
+    fault: str  # what is not as told; "" where nothing was found
+    residual: float  # of the wiring as told
+    scale: float  # of the answer over that of the model, 1 where all is as told
+    delay: int  # samples, of the loop
+
+
+def probe_plate(driver: Driver, model: DeviceModel) -> None:
+    """Probe an open plate of two actuators and two sensors up to three times, and leave it at rest.
+
+    Raises
+    ------
+    DeviceFault
+        What is not as told was found in every try.
+    """
+    drive = probe_drive(model)
+    found = []
+    for _ in range(TRIES):
+        found.append(judge(model, drive, _play(driver, drive, len(model.places))))
+        if not found[-1].fault:
+            return
+    last = found[-1]
+    raise DeviceFault(
+        f"{type(driver).__name__}: refused by the start-up probe: {last.fault} (residual {last.residual:.2g}, scale "
+        f"{last.scale:.2g}, delay {last.delay} samples): check the wiring, or [device]; [render] probe = false leaves "
+        "the probe out"
+    )
+
+
+def probe_drive(model: DeviceModel) -> Array:
+    """Lines of the probe (drive unit, shape (n, 2)), from rest to rest."""
+    modes = Sampled.free(model.mass, model.damping, model.stiffness, model.rate).modes()
+    lines = np.hstack([LOW * modes.min(), HIGH * modes.max()])
+    time = np.arange(round(DURATION * model.rate)) / model.rate
+    gains = np.array([*[1.0] * LOW.shape[1], *HIGH_GAIN]) * (lines < 0.4 * model.rate)
+    phases = np.pi * np.arange(lines.shape[1]) ** 2 / lines.shape[1]  # Schroeder's
+    edge = np.clip(np.minimum(time, time[-1] - time) / EDGE, 0.0, 1.0)
+    drive = (gains[:, :, None] * np.sin(2 * np.pi * lines[:, :, None] * time + phases[:, None])).sum(axis=1).T
+    drive *= np.sin(np.pi / 2 * edge)[:, None] ** 2
+    limit = MOST_DRIVE * model.drive_limit / abs(drive).max()
+    return drive * min(MOTION * model.sensed_limit / abs(_answers(model, drive).sum(axis=0)).max(), limit)
+
+
+def judge(model: DeviceModel, drive: Array, sensed: Array) -> Found:
+    """Compare what was sensed (n, 2) under `drive` (n, 2) with the model's answers, and name what is not as told."""
+    told = model.delay - model.block
+    first = max(told - DELAYS // 2, 0)
+    valid = np.asarray((abs(sensed) < model.sensed_limit).all(axis=1))
+    repeats = (np.diff(sensed, axis=0) == 0.0).mean(axis=0)
+    if (~valid).mean() > MOST_INVALID:
+        return Found(f"{(~valid).mean():.0%} of the samples are invalid", np.nan, np.nan, -1)
+    y = _detrended(np.where(valid[:, None], sensed, 0.0))
+    expected = _detrended(_late(_answers(model, drive).sum(axis=0), told))
+    energy, told_energy = float((y**2).sum()), float((expected**2).sum())
+    if energy < LEAST_ENERGY * told_energy:
+        return Found("nothing moves: sensors or actuators are dead", np.nan, (energy / told_energy) ** 0.5, -1)
+    if (repeats > MOST_REPEATS).any():
+        return Found(f"sensor {1 + int(repeats.argmax())} repeats its values", np.nan, np.nan, -1)
+    residuals = {}
+    for name, (sensors, actuators) in WIRINGS.items():
+        answer = _answers(model, drive @ actuators.T).sum(axis=0) @ sensors.T
+        for delay in range(first, first + DELAYS):
+            h = _detrended(_late(answer, delay))
+            residuals[name, delay] = 1.0 - float((y * h).sum()) / max(float((y**2).sum() * (h**2).sum()) ** 0.5, 1e-300)
+    best = min(residuals, key=lambda each: residuals[each])
+    own = min((each for each in residuals if each[0] == "nothing"), key=lambda each: residuals[each])
+    h = _detrended(_late(_answers(model, drive).sum(axis=0), own[1]))
+    scale, delay = float((y * h).sum() / (h**2).sum()), own[1] + model.block
+    fault = ""
+    if residuals[own] > residuals[best] + MOST_WORSE:
+        fault = best[0]
+    elif residuals[own] > MOST_RESIDUAL:
+        fault = "the answer is not that of the device model"
+    elif not SCALES[0] <= scale <= SCALES[1]:
+        fault = f"sensors or actuators have {scale:.2g} times the gain that they should have"
+    elif abs(delay - model.delay) > DELAY_TOLERANCE:
+        fault = f"the loop's delay is {delay} samples, not {model.delay}"
+    return Found(fault, residuals[own], scale, delay)
+
+
+def _answers(model: DeviceModel, drive: Array) -> Array:
+    """What the free device's sensors show under each actuator alone, shape (actuators, n, sensors)."""
+    plate = Sampled.free(model.mass, model.damping, model.stiffness, model.rate)
+    forces = drive.T[:, :, None] * model.force_from_drive.T[:, None]
+    show = np.linalg.inv(model.coordinate_from_sensed) @ plate.c
+    state, found = np.zeros((len(forces), len(plate.a))), np.empty((*forces.shape[:2], len(show)))
+    for n in range(forces.shape[1]):
+        found[:, n] = state @ show.T
+        state = state @ plate.a.T + forces[:, n] @ plate.b.T
+    return found
+
+
+def _late(answer: Array, samples: int) -> Array:
+    return np.vstack([np.zeros((samples, answer.shape[1])), answer])[: len(answer)]
+
+
+def _detrended(values: Array) -> Array:
+    """Take offset, slope and parabola out of each column."""
+    basis = np.linalg.qr(np.vander(np.linspace(-1.0, 1.0, len(values)), 3))[0]
+    return np.asarray(values - basis @ (basis.T @ values))
+
+
+def _play(driver: Driver, drive: Array, places: int) -> Array:
+    """Play a drive and silence after it in blocks; what was sensed during the drive."""
+    silence = round(REST * driver.rate)
+    blocks = -(-(len(drive) + silence) // driver.block)
+    padded = np.zeros((blocks * driver.block, drive.shape[1]))
+    padded[: len(drive)] = drive
+    parts = [
+        check_sensed(driver, driver.play(block.copy()), places).sensed
+        for block in padded.reshape(blocks, driver.block, -1)
+    ]
+    return np.concatenate(parts)[: len(drive)]
