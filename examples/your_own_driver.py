@@ -13,10 +13,11 @@ MASS, DAMPING, STIFFNESS = 0.034, 2.0, 46e3  # kg, N s/m, N/m: not quite the pla
 
 
 class Shaker:
-    """Five numbers, a with statement and `play`: all that a driver is."""
+    """Five numbers, a with statement and `play`: all that a driver is; `probe` is for a plate that is none."""
 
     rate, block, delay = 5000.0, 1, 1  # Hz, samples, samples
     drive_channels, sensed_channels = 2, 2
+    probe = False  # it cannot rock, so the start-up probe would refuse it as a plate
 
     def __init__(self) -> None:
         spring = np.array([[0, 1, 0], [-STIFFNESS / MASS, -DAMPING / MASS, 1 / MASS], [0, 0, 0]])
