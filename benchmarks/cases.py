@@ -46,7 +46,7 @@ def comb(bands: int, amplitude: float, highest: float = 400.0) -> Bands:
 
 
 def in_blocks(bands: int) -> BankController:
-    """Make the default method on a sound card, 64 samples a block.
+    """Make the law by bands on a sound card, 64 samples a block.
 
     Designed for 8 bands and then given as many as asked for: the design's checks take minutes with 512 bands, and are
     not what is measured.
@@ -58,7 +58,7 @@ def in_blocks(bands: int) -> BankController:
 
 
 def blocks(bands: int, pairs: int) -> Iterator[Figure]:
-    """The default method in blocks of 64 on two channels at 48 kHz, over C tuned by hand; outputs are compared."""
+    """The law by bands in blocks of 64 on two channels at 48 kHz, over C tuned by hand; outputs are compared."""
     controller, count = in_blocks(bands), max(20, 10_000 // bands)
     samples = BLOCK * count
     sensed, nothing = 1e-9 * np.random.default_rng(0).standard_normal((samples, 2)), np.zeros(samples)
@@ -71,12 +71,12 @@ def blocks(bands: int, pairs: int) -> Iterator[Figure]:
     ours, _, ratio = compare(lambda: controller.run(sensed, nothing, nothing), lambda: tuned.run(sensed), pairs)
     share = 100 * ours * CARD / samples
     note = f"{ours / samples / bands / 2 * 1e9:.2f} ns a band-sample and channel, {share:.2g} % of a core"
-    yield Figure(f"default method, blocks of 64, {bands} bands: time over", 1 / ratio, "x", 1.1,
+    yield Figure(f"law by bands, blocks of 64, {bands} bands: time over", 1 / ratio, "x", 1.1,
                  2.5 if bands == 8 else 2.0, False, "C tuned by hand (native/block.c)", note)  # fmt: skip
 
 
 def closed_loop(what: str, seconds: float, pairs: int) -> Iterator[Figure]:
-    """Plate, finger and default method with 8 bands, times faster than the numpy loop of the paper's method."""
+    """Plate, finger and the law by bands with 8 bands, times faster than the numpy loop of the paper's method."""
     finger, noise, target, floor = FINGERS[what]
     parameters = PlateParameters(sensor_noise=noise)
     bands = comb(8, 1e-6)
@@ -85,8 +85,20 @@ def closed_loop(what: str, seconds: float, pairs: int) -> Iterator[Figure]:
     loop, free = NumpyPolar(bands.frequency, bands.phase, bands.envelope), NumpyPlate()
     ours, theirs, _ = compare(lambda: plate.closed_loop(controller, silence), lambda: numpy_run(loop, free, FEW), pairs)
     ratio = theirs / FEW / (ours / len(silence))
-    yield Figure(f"closed loop, 8 bands, {what}: times faster than", ratio, "x", target, floor, True, "the numpy loop",
+    yield Figure(f"closed loop, law by bands, 8 bands, {what}: times faster than", ratio, "x", target, floor, True, "the numpy loop",
                  f"{seconds / ours:.0f} simulated seconds a second")  # fmt: skip
+
+
+def waveform_law(seconds: float, pairs: int) -> Iterator[Figure]:
+    """The waveform law with 8 bands under a sliding finger, over the law by bands, each in closed loop with a plate."""
+    parameters, works = PlateParameters(), []
+    silence = np.zeros(int(seconds * parameters.rate))
+    for method in ("inverse", "h2"):
+        controller = METHODS[method].design(parameters.device_model(parameters.rate, 1), comb(8, 1e-6))
+        works.append(partial(Plate(parameters, SLIDING).closed_loop, controller, silence))
+    ours, _, ratio = compare(*works, pairs)
+    yield Figure("closed loop, waveform law, 8 bands, sliding: time over", 1 / ratio, "x", 10.0, 20.0, False,
+                 "the law by bands", f"{ours / len(silence) * 1e6:.2f} us a sample, plate included")  # fmt: skip
 
 
 def paper(pairs: int) -> Iterator[Figure]:
@@ -151,7 +163,7 @@ def two_cores(devices: tuple[str, ...], seconds: float, pairs: int) -> Iterator[
 
 
 def linear(pairs: int) -> Iterator[Figure]:
-    """Cost a band of the default method in blocks, 4096 bands over 64."""
+    """Cost a band of the law by bands in blocks, 4096 bands over 64."""
     runs = []
     for bands in (4096, 64):
         controller, samples = in_blocks(bands), BLOCK * max(2, 16_384 // bands)
@@ -188,6 +200,7 @@ def every_case(short: bool) -> dict[str, Callable[[], Iterator[Figure]]]:
     cases = {f"blocks {bands}": partial(blocks, bands, pairs) for bands in (8, 64, 512)}
     cases |= {f"closed loop {what}": partial(closed_loop, what, seconds, pairs) for what in FINGERS}
     return cases | {
+        "waveform": partial(waveform_law, seconds, pairs),
         "paper": partial(paper, pairs),
         "demodulation": partial(demodulation, 64, pairs),
         "sweep": partial(two_cores, DEVICES, 2.0, 1 if short else 3),

@@ -50,7 +50,7 @@ ENTRY = np.dtype(
         *((name, np.int64) for name in ("setpoints_at", "slots_at", "middle", "slot", "age")),
         *((name, np.float64) for name in ("finger_changes", "setpoint_changes", "rate", "sensed_scale", "drive_scale")),
         *((name, np.int64) for name in ("sensed_at", "drive_at", "position_at", "waveform_at", "flags_at")),
-        *((name, np.int64) for name in ("samples", "flags", "refused", "texture_at", "texture_length", "spatial")),
+        *((name, np.int64) for name in ("samples", "flags", "refused", "texture_at", "texture_length", "spatial", "ahead")),
         ("period", np.float64),
     ]
 )
@@ -96,7 +96,8 @@ def receive(entry):
         age = min((e.age + m) / e.rate, HORIZON)
         position[m] = slot[POSITION] + age * slot[VELOCITY]
         if e.texture_length > 0:
-            at = position[m] if e.spatial > 0 else (e.samples + m) / e.rate
+            ahead = e.ahead / e.rate
+            at = position[m] + ahead * slot[VELOCITY] if e.spatial > 0 else (e.samples + m) / e.rate + ahead
             turns = at / e.period
             if turns != turns:
                 waveform[m] = 0.0
@@ -179,7 +180,7 @@ class RealtimeEntry:
     drive_scale : float, 1/A of full scale, > 0
         Float sample at the output for a drive of 1 A.
     waveform : ndarray, shape (n,), m, optional
-        Of a texture whose bands are analysed (a recording): one period of it, repeated.
+        Of a texture that is a waveform (a recording): one period of it, repeated, read ahead as the law needs it.
     period : float, s or m
         Length of the waveform, > 0: in time, or along the surface where it is `spatial`.
     spatial : bool
@@ -261,6 +262,7 @@ class RealtimeEntry:
             "texture_at": waveform.ctypes.data,
             "texture_length": len(waveform),
             "spatial": spatial,
+            "ahead": getattr(controller, "lookahead", 0),
             "period": period,
             **{f"{name}_at": array.ctypes.data for name, array in arrays.items()},
         }

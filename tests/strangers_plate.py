@@ -109,6 +109,7 @@ class StrangersPlate:
     """
 
     drive_channels = sensed_channels = 2
+    probe = False  # the clock of its finger starts with the first sample
 
     def __init__(
         self, *, finger=(0, 0, 0), position=0.0, load=0.0, contact=0.0, bending=None, rate=5000.0, block=1, told=None,

@@ -12,6 +12,7 @@ from numba import types
 from test_kernel import friction_controller, plate_controller
 
 from hapticrender.bands import Bands
+from hapticrender.control.inverse import AdaptiveInverse
 from hapticrender.jit import F8, kernel, pointer
 from hapticrender.plants.plate import PlateParameters
 from hapticrender.protocols import Flag
@@ -95,6 +96,25 @@ def test_a_recorded_waveform_is_played_in_a_loop(spatial, rng):
     expected = twin.run(np.zeros((n, 2)), position, values)[0]
     assert abs(expected).max() > 0
     np.testing.assert_allclose(plain(entry, np.zeros((n, 2)))[0], expected, rtol=0, atol=1e-9 * abs(expected).max())
+
+
+@pytest.mark.parametrize("spatial", [False, True])
+def test_a_whole_waveform_is_read_ahead(spatial):
+    """By the law's look-ahead in time, or where the finger will be then at the speed it is told to have."""
+    period, speed = 0.05, 0.05
+    table = 1e-5 * np.sin(2 * np.pi * np.arange(256) / 256)
+
+    def designed():
+        return AdaptiveInverse().design(PlateParameters().device_model(RATE, 1), Bands.none(spatial=spatial))
+
+    entry, twin = RealtimeEntry(designed(), waveform=table, period=period, spatial=spatial), designed()
+    now = np.arange(100) / RATE
+    entry.finger(0.0, speed)
+    at = (now + twin.lookahead / RATE) * (speed if spatial else 1.0) / period
+    values = np.interp(np.mod(at, 1.0) * 256, np.arange(257), np.append(table, table[0]))
+    expected = twin.run(np.zeros((100, 2)), speed * now, values)[0]
+    assert abs(expected).max() > 0
+    np.testing.assert_allclose(plain(entry, np.zeros((100, 2)))[0], expected, rtol=0, atol=1e-9)
 
 
 def test_the_audio_callback_scales_full_scale_to_metres_and_amperes(rng):

@@ -38,8 +38,8 @@ LOWEST = 1e-3  # Hz: what follows a finger fades out below it, though a resting 
 SCALE = 2 * math.pi * 200.0  # rad/s: derivatives are divided by its powers, so that every parameter is in N/m
 POLE, POLE_DAMPING = 2 * math.pi * 200.0, 0.8  # the finger's pair of poles
 PEOPLE, SEED = 300, 1  # fingers of the prior, and the seed that draws them
-REVERSION_RATES = {FINGER: 0.1, HEAVE: 0.003, ROCKING: 0.01, LOAD: 1.0}  # 1/sqrt(s), from each parameter on
-SETTLING, RESTART, AWAKE = 2e-3, 62e-3, 0.1  # s after a contact: learning starts, and again; the damper sleeps
+REVERSION_RATES = {FINGER: 0.05, HEAVE: 0.003, ROCKING: 0.01, LOAD: 1.0}  # 1/sqrt(s), from each parameter on
+SETTLING, RESTART, AWAKE = 2e-3, 0.1, 0.1  # s after a contact: learning starts, and again; the damper sleeps
 JOINING = 60e-3  # s: for so long the deviation at the start of learning is a parameter
 NOTICE = 10e-3  # s: a contact is reported within this
 GATE_SIGMAS = 2.0  # of the sensors' noise: a larger deviation within 4 ms opens the inner damper
@@ -139,6 +139,7 @@ class WaveformController(BankController):
         """Force that was learned on the untouched device over that of its model, rms over about a second, else 0."""
         law = self.law
         known = law["contact"] == 0.0 and law["smooth_scale"] > SCALED and law["learns"] and law["asked"] > 0.0
+        known = known and law["sample"] >= self.rate  # in a shorter time there is little to learn from
         return float(np.sqrt(law["added"] / law["asked"])) if known else 0.0
 
 
@@ -235,7 +236,7 @@ def law_settings(model: DeviceModel, bands: Bands, ahead: int, feedback: bool) -
             model.force_from_drive, ((0, 2 - n), (0, MOST_CHANNELS - model.force_from_drive.shape[1]))
         ),
         **matrices,
-        "noise": 5.0 * noise**2,
+        "noise": 6.0 * noise**2,
         "prior": mean,
         "spread": spread,
         "covariance": spread,
