@@ -18,7 +18,7 @@ import numpy as np
 
 from hapticrender.control.controller import PositionPredictor
 from hapticrender.control.probe import probe_plate
-from hapticrender.control.supervisor import FADE_OUT, STOPPED
+from hapticrender.control.supervisor import FADE_OUT, STOPPED, Fault
 from hapticrender.driver_checks import check_sensed
 from hapticrender.errors import DeviceFault, HapticError, PlateMismatch
 from hapticrender.protocols import Array, Controller, Driver, Exchange, Renderer, Rendering, Sensed
@@ -241,8 +241,10 @@ class _Loop:
         rate, driver = self.rendering.driver.rate, self.rendering.driver
         if self._stopped < 0 or start + self.step < self._stopped + FADE_OUT * rate + driver.delay:
             return None
-        found = getattr(driver, "fault", None) or getattr(self.controller, "fault", None)
-        text = found.text if found else "the device stopped itself"
+        found = [
+            each for owner in (driver, self.controller) if isinstance(each := getattr(owner, "fault", None), Fault)
+        ]
+        text = found[0].text if found else "the device stopped itself"
         time = self._stopped / rate
         return DeviceFault(f"{type(self.rendering.device).__name__}: stopped at {time:.4g} s: {text}", time)
 

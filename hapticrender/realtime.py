@@ -50,7 +50,10 @@ ENTRY = np.dtype(
         *((name, np.int64) for name in ("setpoints_at", "slots_at", "middle", "slot", "age")),
         *((name, np.float64) for name in ("finger_changes", "setpoint_changes", "rate", "sensed_scale", "drive_scale")),
         *((name, np.int64) for name in ("sensed_at", "drive_at", "position_at", "waveform_at", "flags_at")),
-        *((name, np.int64) for name in ("samples", "flags", "refused", "texture_at", "texture_length", "spatial", "ahead")),
+        *(
+            (name, np.int64)
+            for name in ("samples", "flags", "refused", "texture_at", "texture_length", "spatial", "ahead")
+        ),
         ("period", np.float64),
     ]
 )

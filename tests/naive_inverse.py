@@ -130,7 +130,7 @@ class NaiveInverse:
         def learned(matrix, order):
             own = matrix.diagonal()
             change = th[[HEAVE + order, ROCKING + order]] / scale**order
-            return matrix + np.diag(np.clip(change, -0.5 * own, 0.5 * own))
+            return matrix + np.diag(np.clip(change, -0.7 * own, 4.0 * own))
 
         M = learned(self.M, 2) + mass * arm
         C, K = learned(self.C, 1) + damping * arm, learned(self.K, 0)
@@ -174,7 +174,7 @@ class NaiveInverse:
         needed = abs(exact).max() / p["drive_limit"] / self.smooth
         self.held -= 1
         if needed >= 0.98 * self.peak:
-            self.peak, self.held = max(self.peak, needed), law["hold"]
+            self.peak, self.held = min(max(self.peak, needed), 20.0), law["hold"]
         elif self.held < 0:
             self.peak *= law["decay"]
         self.scale += law["smoothing"] * (1 / max(self.peak, 1.0) - self.scale)

@@ -83,7 +83,7 @@ class NaiveLowPass:
         """Return the drive, shape (channels,), and the targets, shape (bands,)."""
         p, bands = self.p, self.bands
         plausible = abs(sensed) < p["sensor_limit"]  # NaN is not
-        y = self.listen @ np.where(plausible, sensed, 0.0)
+        y = self.listen @ (sensed if plausible.all() else np.zeros_like(sensed))
         if (bands.wavenumber > 0.0).any():
             self.track(position)
         turns = bands.frequency * self.sample / p["rate"] + bands.wavenumber * self.held
@@ -135,7 +135,7 @@ class NaiveLowPass:
     @staticmethod
     def cut(x):
         """Angle above -270 up to 90 degrees."""
-        angle = np.angle(x)
+        angle = np.where(x == 0.0, 0.0, np.angle(x))  # whatever the sign of zero
         return np.where(angle > np.pi / 2, angle - TURN, angle)
 
     def complex(self, y, carrier, omega, r, weight):

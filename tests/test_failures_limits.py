@@ -11,7 +11,7 @@ from hapticrender.plants.plate import PlateParameters
 from hapticrender.touch.mechanics import HEAVY, LIGHT_SECOND
 
 RATE = 5000.0
-IDEAL = PlateParameters(sensor_noise=0.0, sensor_bits=0, current_bits=0)
+IDEAL = PlateParameters(sensor_noise=0.0, sensor_bits=0, current_bits=0, sensor_range=0.1)
 TURN = 2 * np.pi
 
 
@@ -97,7 +97,7 @@ def wrong(stiffness=1.0, mass=1.0, **other):
     )
 
 
-IDEAL_SENSORS = {"sensor_noise": 0.0, "sensor_bits": 0, "current_bits": 0}
+IDEAL_SENSORS = {"sensor_noise": 0.0, "sensor_bits": 0, "current_bits": 0, "sensor_range": 0.1}
 
 
 def settled(motion, frequency):

@@ -14,7 +14,7 @@ from hapticrender.plants.plate import Plate, PlateParameters
 from hapticrender.touch.mechanics import HEAVY, LIGHT_SECOND
 
 RATE = 5000.0
-IDEAL = PlateParameters(sensor_noise=0.0, sensor_bits=0, current_bits=0)
+IDEAL = PlateParameters(sensor_noise=0.0, sensor_bits=0, current_bits=0, sensor_range=0.1)
 
 
 def late(samples):

@@ -145,3 +145,19 @@ def test_sensors_that_fail_take_the_drive_away_and_what_was_learned():
     drive, _, flags = controller.run(np.full((1000, 2), np.nan), none, reference)
     assert (flags & hr.Flag.NONFINITE).all()
     assert not drive[150:].any()
+
+
+def test_a_waveform_of_friction_arrives_whole_on_a_screen():
+    """Dry skin, twice the attraction that the design expects: white noise of 20-400 Hz as skin displacement."""
+    texture = hr.Recorded(samples=white(3 * RATE), rate=RATE, amplitude=40e-6, passband=(20.0, 400.0))
+    scene = hr.Scene(
+        texture=texture,
+        finger=hr.Finger.sliding(speed=0.08, normal_load=0.5),
+        device="electroadhesion",
+        duration=2.5,
+        simulation={"gap_resistance": 100.0},
+    )
+    recording = hr.render(scene)
+    assert error(recording.motion, recording.reference, 1.0, recording.rate)[0] < 0.03
+    with pytest.raises(ValueError, match=r"texture\.carriers"):
+        hr.render(replace(scene, method="h2"))

@@ -43,28 +43,34 @@ SETTLING, RESTART, AWAKE = 2e-3, 0.1, 0.1  # s after a contact: learning starts,
 JOINING = 60e-3  # s: for so long the deviation at the start of learning is a parameter
 NOTICE = 10e-3  # s: a contact is reported within this
 GATE_SIGMAS = 2.0  # of the sensors' noise: a larger deviation within 4 ms opens the inner damper
+INITIAL_FRICTION = (1.0, 1e3)  # N and N/s: deviation and its rate at a contact
 INITIAL_MOTION = (15e-6, 0.02)  # m and m/s: deviation and its velocity at a contact
+FRICTION = np.array([0.4, 0.4, 0.3, 0.1])  # of stiffness, damping and mass of a friction device; and samples of delay
+FRICTION_NOISE = 0.05  # N: of a friction that no model explains; a filter surer than that follows its own mistakes
+LOAD_OF_FRICTION = 3.0  # N: of the attraction that a finger's own friction amounts to
 LOAD_SIZE = (0.6, 0.1)  # N: of the load, and of the moment beside it over a
 
 
 @lru_cache(maxsize=32)
-def derivative_filters(rate: float, top: float) -> Array:
-    """Filters for a signal and its first three derivatives half a sample ahead, the hold undone, shape (4, TAPS).
+def derivative_filters(rate: float, top: float, first: int = 0, count: int = 4, ahead: float = 0.5) -> Array:
+    """Filters for derivatives of a signal from the `first` on, `ahead` samples from now, shape (count, TAPS).
 
-    Least squares of ``sum_j h_i[j] exp(j w (j - 5) T) = (j w)^i exp(j w T/2)/sinc(w T/2)`` up to `top` (Hz), with a
-    light penalty on what lies above.
+    Least squares of ``sum_j h_i[j] exp(j w (j - 5) T) = (j w)^i exp(j w ahead T)`` up to `top` (Hz), with a light
+    penalty on what lies above.  Half a sample ahead is the middle of the hold, which is undone: over sinc(w T/2).
     """
     offsets, frequency = np.arange(TAPS) - (TAPS // 2 - 1), np.linspace(0.0, top, 400)
     above = np.linspace(min(1.4 * top, 0.45 * rate), 0.5 * rate, 100)
     inside, outside = (np.exp(2j * np.pi / rate * np.multiply.outer(each, offsets)) for each in (frequency, above))
     omega = 2 * np.pi * frequency
-    ahead = np.exp(0.5j * omega / rate) / np.sinc(frequency / rate)
-    found = np.empty((4, TAPS))
-    for i in range(4):
-        weight = np.maximum(omega, 2 * np.pi * 20.0) ** -i
-        rows = np.vstack([inside * weight[:, None], 1e-6 * outside / (2 * np.pi * top) ** i]) * rate**i
-        wanted = np.concatenate([(1j * omega) ** i * ahead * weight, np.zeros(len(above))])
-        found[i] = rate**i * np.linalg.lstsq(np.vstack([rows.real, rows.imag]), np.r_[wanted.real, wanted.imag])[0]
+    turn = np.exp(1j * omega * ahead / rate) / (np.sinc(frequency / rate) if count > 1 else 1.0)
+    found = np.empty((count, TAPS))
+    for i in range(count):
+        order = first + i
+        weight = np.maximum(omega, 2 * np.pi * 20.0) ** -order
+        rows = np.vstack([inside * weight[:, None], 1e-6 * outside / (2 * np.pi * top) ** order]) * rate**order
+        wanted = np.concatenate([(1j * omega) ** order * turn * weight, np.zeros(len(above))])
+        fit = np.linalg.lstsq(np.vstack([rows.real, rows.imag]), np.r_[wanted.real, wanted.imag])[0]
+        found[i] = rate**order * fit
     return found
 
 
@@ -111,6 +117,10 @@ def prior(model: DeviceModel) -> tuple[Array, Array]:
         k, m, c = model.stiffness[1, 1], model.mass[1, 1] * SCALE**2, c
         sigma[ROCKING : ROCKING + 3] = 0.03 * k, c, 0.05 * m
         sigma[LOAD + 1] = LOAD_SIZE[1]
+    if model.finger.contact is None:  # friction: the device is what is not known, and no finger adds to it
+        sigma[HEAVE : HEAVE + 4] = FRICTION * np.array([k, model.damping[0, 0] * SCALE, m, 1.0])
+        sigma[LOAD] = LOAD_OF_FRICTION
+        return mean, np.diag(sigma**2)
     covariance = np.diag(sigma**2)
     mean[FINGER:HEAVE], covariance[FINGER:HEAVE, FINGER:HEAVE] = finger_prior(model)
     return mean, covariance
@@ -139,7 +149,7 @@ class WaveformController(BankController):
         """Force that was learned on the untouched device over that of its model, rms over about a second, else 0."""
         law = self.law
         known = law["contact"] == 0.0 and law["smooth_scale"] > SCALED and law["learns"] and law["asked"] > 0.0
-        known = known and law["sample"] >= self.rate  # in a shorter time there is little to learn from
+        known = known and min(law["sample"], law["since"]) >= self.rate  # in less than a second little is learned
         return float(np.sqrt(law["added"] / law["asked"])) if known else 0.0
 
 
@@ -155,7 +165,9 @@ class AdaptiveInverse:
         Where the device itself is estimated (friction, a resonance), and for a recording on chosen carriers, the law
         works by bands; see `design_controller`.
         """
-        if model.finger.contact is None or (bands.envelope is None and len(bands)):
+        whole = bands.envelope is None and not len(bands)
+        known = model.finger.contact is not None or (whole and model.mass[0, 0] > 0.0 and model.contact_lag == 0.0)
+        if not known or (bands.envelope is None and len(bands)):
             return design_controller(self.name, model, bands, rules_for(bands), feedback=feedback)
         prompt = model.delay <= PROMPT
         damping = choose_damping(model, bending=model.bending) if feedback and prompt else None
@@ -164,7 +176,7 @@ class AdaptiveInverse:
         settings = controller_settings(model, bands, damping, feedback)
         state = aligned(1, INVERSE)
         ahead = model.delay + TAPS // 2
-        rings = {"ring": np.zeros((model.delay + 1, RING)), "reference": np.zeros(ahead)}
+        rings = {"ring": np.zeros((model.delay + 1, RING)), "reference": np.zeros(model.delay)}
         for name, value in law_settings(model, bands, ahead, feedback).items():
             state[name] = value
         for name, array in rings.items():
@@ -181,6 +193,8 @@ def controller_settings(model: DeviceModel, bands: Bands, damping: Damping | Non
     return {
         **shared_settings(model, bands, sensor_map, drive_map, feedback),
         **device_settings(model),
+        "contact_damping": model.contact_damping,
+        "typical_speed": model.typical_speed,
         "fade_in": period / FADE_IN,
         "highest_edge": model.highest_edge,
         "lowest": LOWEST,
@@ -206,7 +220,11 @@ def law_settings(model: DeviceModel, bands: Bands, ahead: int, feedback: bool) -
     for name in ("mass", "damping", "stiffness"):
         matrices[name] = np.eye(2)
         matrices[name][:n, :n] = getattr(model, name)
-    top = min(model.highest_frequency, HIGHEST * model.rate)
+    top, order, late = min(model.highest_frequency, HIGHEST * model.rate), int(bands.differentiated), model.sensor_delay
+    late *= model.rate  # what is sensed of the target is that of so many samples ago
+    shown = np.eye(TAPS)[TAPS // 2 - 1]
+    if order or late:
+        shown = derivative_filters(float(model.rate), float(top), order, 1, -late)[0]
     return {
         "delay": model.delay,
         "ahead": ahead,
@@ -230,20 +248,21 @@ def law_settings(model: DeviceModel, bands: Bands, ahead: int, feedback: bool) -
         "smoothing": period / 2e-3,
         "slowly": period / 1.0,
         "levelling": period / 50e-3 if n > 1 else 0.0,
-        "filters": derivative_filters(float(model.rate), float(top)),
+        "filters": derivative_filters(float(model.rate), float(top), order, 4, 0.5 - late),
+        "sensor_filter": shown,
         "pair": pole_step(model.rate),
         "force_from_drive": np.pad(
             model.force_from_drive, ((0, 2 - n), (0, MOST_CHANNELS - model.force_from_drive.shape[1]))
         ),
         **matrices,
-        "noise": 6.0 * noise**2,
+        "noise": 6.0 * noise**2 + (FRICTION_NOISE**2 if model.finger.contact is None else 0.0),
         "prior": mean,
         "spread": spread,
         "covariance": spread,
         "earlier": np.vstack([spread[HEAVE:LOAD, HEAVE:LOAD], mean[HEAVE:LOAD]]),
         "theta": mean,
         "kept": kept,
-        "start": np.repeat(INITIAL_MOTION, 2) ** 2,
+        "start": np.repeat(INITIAL_FRICTION if model.finger.contact is None else INITIAL_MOTION, 2) ** 2,
         "scale": 1.0,
         "smooth_scale": 1.0,
         "since": 1e9,

@@ -23,6 +23,7 @@ from numba import carray
 
 from hapticrender.control.carriers import advance_carriers, track_finger, update_targets
 from hapticrender.control.kernel import sense_block, update_confidence
+from hapticrender.control.laws import contact_damping
 from hapticrender.control.limiter import SATURATED, drive_of, shape_noise
 from hapticrender.control.records import (
     CONTROLLER_T,
@@ -55,6 +56,7 @@ INVERSE = np.dtype(
         ),
         *((name, np.float64) for name in ("hold", "decay", "smoothing", "levelling", "slowly")),
         ("filters", np.float64, (4, TAPS)),
+        ("sensor_filter", np.float64, (TAPS,)),
         ("pair", np.float64, (2, 4)),  # step of the pair of poles: two states, r now and next
         ("force_from_drive", np.float64, (2, MOST_CHANNELS)),
         *((name, np.float64, (2, 2)) for name in ("mass", "damping", "stiffness")),
@@ -67,7 +69,8 @@ INVERSE = np.dtype(
         *((name, np.float64) for name in ("fade", "peak", "held", "scale", "smooth_scale", "lever", "contact")),
         *((name, np.float64) for name in ("since", "slow", "power", "reference", "moment", "asked", "added")),
         *((name, np.int64) for name in ("sample", "ring_at", "reference_at")),
-        ("window", np.float64, (TAPS,)),  # references, the oldest first
+        ("window", np.float64, (TAPS,)),  # references around the moment at which this sample's drive acts, oldest first
+        ("shown", np.float64, (TAPS,)),  # around now
         ("poles", np.float64, (2,)),
         ("basis", np.float64, (BASIS,)),
         ("theta", np.float64, (ROWS - 1,)),
@@ -83,6 +86,7 @@ INVERSE = np.dtype(
 )
 """Settings and state of the waveform law beside those of the controller."""
 INVERSE_T = numba.from_dtype(INVERSE)
+MOST_NEEDED = 20.0  # of the drive's limit; a reference that is scaled by more teaches nothing
 SCALED = 0.999  # a reference scaled by less is saturated
 RING = BASIS + 2  # of a sample: basis and deviation force, until they act
 
@@ -103,22 +107,24 @@ def bands_ahead(controller, lead):
 
 @kernel
 def take_reference(controller, inverse):
-    """Put the reference `ahead` samples from now into the window; note that of now, which the sensors should show."""
+    """Put the reference `ahead` samples from now into the window; find what the sensors should show of it now."""
     c, v = record(controller, CONTROLLER_T, 0), record(inverse, INVERSE_T, 0)
     if c.p.analysed > 0.0:
         value = samples_of(controller)[WAVEFORM, 0]
-        wanted = 1.0 if v.spatial == 0 or c.finger_seen > 0.0 else 0.0
+        wanted = 1.0 if v.contact > 0.0 or (v.spatial == 0 and c.p.needs_contact == 0.0) else 0.0
         v.fade = min(max(v.fade + (v.fade_step if wanted > 0.0 else -v.fade_step), 0.0), 1.0)
         value *= v.fade * v.fade * (3.0 - 2.0 * v.fade)
     else:
         value = bands_ahead(controller, v.ahead / c.p.rate)
     value *= v.smooth_scale
-    window, ring = v.window, carray(pointer(v.reference_at, F8), v.ahead)
+    window, shown, ring = v.window, v.shown, carray(pointer(v.reference_at, F8), v.delay)
+    at = v.sample % v.delay
     for i in range(TAPS - 1):
-        window[i] = window[i + 1]
-    window[TAPS - 1] = value
-    at = v.sample % v.ahead
-    v.reference, ring[at] = ring[at], value
+        window[i], shown[i] = window[i + 1], shown[i + 1]
+    window[TAPS - 1], shown[TAPS - 1], ring[at] = value, ring[at], value
+    v.reference = 0.0
+    for i in range(TAPS):
+        v.reference += v.sensor_filter[i] * shown[i]
 
 
 @kernel
@@ -139,15 +145,15 @@ def find_basis(controller, inverse):
     w = v.hertz_scale
     basis[0], basis[1], basis[2] = d0, d1 / w, d2 / (w * w)
     basis[3], basis[4] = v.pole * v.pole * first, v.pole * poles[1]
-    m, c, k = v.mass[0, 0], v.damping[0, 0], v.stiffness[0, 0]
-    basis[5] = (m * d3 + c * d2 + k * d1) / record(controller, CONTROLLER_T, 0).p.rate
+    damping = v.damping[0, 0] + contact_damping(controller)
+    basis[5] = (v.mass[0, 0] * d3 + damping * d2 + v.stiffness[0, 0] * d1) / record(controller, CONTROLLER_T, 0).p.rate
     return d1, d2
 
 
 @kernel
 def corrected(value, change):
-    """Move a number by a change that is at most half of it."""
-    return value + min(max(change, -0.5 * value), 0.5 * value)
+    """Move a positive number by a change that leaves it between 0.3 and 5 times what it was."""
+    return value + min(max(change, -0.7 * value), 4.0 * value)
 
 
 @kernel
@@ -167,7 +173,7 @@ def discretise(controller, inverse):
     h, per_c, per_m = v.lever, 1.0 / v.hertz_scale, 1.0 / (v.hertz_scale * v.hertz_scale)
     m00 = corrected(v.mass[0, 0], per_m * theta[HEAVE + 2]) + mass
     m01, m11 = v.mass[0, 1] + h * mass, corrected(v.mass[1, 1], per_m * theta[ROCKING + 2]) + h * h * mass
-    c00 = corrected(v.damping[0, 0], per_c * theta[HEAVE + 1]) + damping
+    c00 = corrected(v.damping[0, 0] + contact_damping(controller), per_c * theta[HEAVE + 1]) + damping
     c01, c11 = v.damping[0, 1] + h * damping, corrected(v.damping[1, 1], per_c * theta[ROCKING + 1]) + h * h * damping
     k00, k01 = corrected(v.stiffness[0, 0], theta[HEAVE]), v.stiffness[0, 1]
     k11 = corrected(v.stiffness[1, 1], theta[ROCKING])
@@ -269,8 +275,10 @@ def follow_contact(controller, inverse):
     if c.finger_seen > 0.0:
         v.lever = v.lever_per_metre * c.held_position
     v.since += 1.0
-    if c.finger_seen != v.contact:
-        v.contact, v.since = c.finger_seen, 0.0
+    sticks = c.p.needs_contact > 0.0 and c.speed < c.p.least_speed
+    touching = 0.0 if sticks else c.finger_seen
+    if touching != v.contact:
+        v.contact, v.since = touching, 0.0
         forget(inverse, FINGER, HEAVE)
         forget(inverse, LOAD, PARAMETERS)
         c.fast_timer = v.awake
@@ -420,7 +428,7 @@ def scale_reference(inverse, needed):
     v = record(inverse, INVERSE_T, 0)
     v.held -= 1.0
     if needed >= 0.98 * v.peak:
-        v.peak, v.held = max(v.peak, needed), v.hold
+        v.peak, v.held = min(max(v.peak, needed), MOST_NEEDED), v.hold
     elif v.held < 0.0:
         v.peak *= v.decay
     v.scale += v.smoothing * (1.0 / max(v.peak, 1.0) - v.scale)
@@ -472,8 +480,8 @@ def inverse_step(state, signals, start, count):
             update_targets(state, signals, n)
         else:
             c.sample += 1
-        take_reference(state, inverse)
         settled = follow_contact(state, inverse)
+        take_reference(state, inverse)
         error0, error1 = y0 - c.p.shape[0] * v.reference, y1 - c.p.shape[1] * v.reference
         samples[Y, 0] = samples[Y + 1, 0] = 0.0
         if update_confidence(state, implausible):
@@ -491,7 +499,7 @@ def inverse_step(state, signals, start, count):
             discretise(state, inverse)
         d1, d2 = find_basis(state, inverse)
         s0, s1, d0 = c.p.shape[0], c.p.shape[1], v.basis[0]
-        along = v.stiffness[0, 0] * d0 + v.damping[0, 0] * d1 + v.mass[0, 0] * d2
+        along = v.stiffness[0, 0] * d0 + (v.damping[0, 0] + contact_damping(state)) * d1 + v.mass[0, 0] * d2
         across = v.stiffness[0, 1] * d0 + v.damping[0, 1] * d1 + v.mass[0, 1] * d2
         other = v.stiffness[1, 1] * d0 + v.damping[1, 1] * d1 + v.mass[1, 1] * d2
         nominal0, nominal1 = s0 * along + s1 * across, s0 * across + s1 * other
