@@ -85,8 +85,8 @@ def closed_loop(what: str, seconds: float, pairs: int) -> Iterator[Figure]:
     loop, free = NumpyPolar(bands.frequency, bands.phase, bands.envelope), NumpyPlate()
     ours, theirs, _ = compare(lambda: plate.closed_loop(controller, silence), lambda: numpy_run(loop, free, FEW), pairs)
     ratio = theirs / FEW / (ours / len(silence))
-    yield Figure(f"closed loop, law by bands, 8 bands, {what}: times faster than", ratio, "x", target, floor, True, "the numpy loop",
-                 f"{seconds / ours:.0f} simulated seconds a second")  # fmt: skip
+    yield Figure(f"closed loop, law by bands, 8 bands, {what}: times faster than", ratio, "x", target, floor, True,
+                 "the numpy loop", f"{seconds / ours:.0f} simulated seconds a second")  # fmt: skip
 
 
 def waveform_law(seconds: float, pairs: int) -> Iterator[Figure]:
