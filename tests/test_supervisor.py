@@ -102,7 +102,7 @@ def test_a_late_polarity_is_stopped_although_only_after_a_millimetre():
     """At the governor the modes grow by 130 to 270 um/ms; the drive never reaches the device's 3 A."""
     plate = Watched(lambda plate, sensed: -sensed)
     with pytest.raises(hr.DeviceFault):
-        hr.render(scene(duration=1.5), driver=plate)
+        hr.render(scene(duration=2.0), driver=plate)
     assert max(plate.motion) < 3e-3
     assert abs(np.concatenate(plate.played)).max() < 1.08
 

@@ -12,7 +12,7 @@ from benchmarks.charts.style import BLUE, GREEN, INK, ORANGE, PALE, RED, new_fig
 
 METHODS = {
     "paper": ORANGE, "paper-common": "#B8860B", "boxcar": "#CC79A7", "static": PALE, "stiffness": "#56B4E9",
-    "resonant": RED, "h": GREEN, "h2": BLUE,
+    "resonant": RED, "h": GREEN, "h2": "#6A51A3", "inverse": BLUE,
 }  # fmt: skip
 DEVICES = {"vt-plate": BLUE, "electroadhesion": ORANGE, "ultrasonic": GREEN}
 SHAPES = {"h2": "o", "h": "s", "static": "^", "stiffness": "v", "paper-common": "D"}

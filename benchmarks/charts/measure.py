@@ -131,7 +131,8 @@ def methods_and_settings() -> list[Setting]:
     found.append(Setting(method="resonant", what="5 1/s", options={"gain": 5.0}))
     found += [Setting(method=name, what="heave only", heave_only=True) for name in ("h", "h2")]
     found += [
-        Setting(method="h2", what=f"blocks of {block} at {rate / 1000:g} kHz", rate=rate, block=block)
+        Setting(method=name, what=f"blocks of {block} at {rate / 1000:g} kHz", rate=rate, block=block)
+        for name in ("h2", "inverse")
         for rate, block in ((5000.0, 10), (5000.0, 25), (48000.0, 32), (48000.0, 64))
     ]
     return found
