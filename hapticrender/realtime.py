@@ -102,8 +102,8 @@ def receive(entry):
             ahead = e.ahead / e.rate
             at = position[m] + ahead * slot[VELOCITY] if e.spatial > 0 else (e.samples + m) / e.rate + ahead
             turns = at / e.period
-            if turns != turns:
-                waveform[m] = 0.0
+            if turns != turns:  # lifted: what was last there holds
+                waveform[m] = waveform[m - 1 if m > 0 else e.block - 1]
             else:
                 place = (turns - np.floor(turns)) * e.texture_length
                 i = int(place) % e.texture_length

@@ -85,7 +85,11 @@ class VibrotactileRenderer(BaseRenderer):
     def limited(self, setup: PlateSetup, model: DeviceModel, bands: Bands) -> DeviceModel:
         """Return the device model with the scene's demand, its drive limited to what the scene needs."""
         scene = setup.scene
-        return governed(model, demand(scene, model, bands, scene.texture.waveform)) if len(bands) else model
+        return (
+            governed(model, demand(scene, model, bands, scene.texture.waveform))
+            if len(bands) or bands.envelope is None
+            else model
+        )
 
 
 def _pattern(scene: Scene, plate: PlateParameters) -> tuple[float, float]:

@@ -26,19 +26,19 @@ class NaiveInverse:
         self.poles, self.basis, self.past = np.zeros(2), np.zeros(6), np.zeros((2, self.taps.shape[1]))
         self.fade = self.slow = self.power = self.timer = self.open = self.moment = self.lever = self.peak = 0.0
         self.contact, self.since, self.held, self.scale, self.smooth = 0, 1e9, 0, 1.0, 1.0
-        self.samples = 0
+        self.samples = self.away = 0
+        self.size = np.zeros(2)
         self.earlier = 2 * ((self.theta[HEAVE:LOAD].copy(), self.P[HEAVE:LOAD, HEAVE:LOAD].copy()),)
 
     def step(self, sensed, position, waveform):
         """Drive (channels,) of one sample."""
         law, p, n = self.law, self.p, self.samples
         y = self.from_sensor @ sensed
-        touching = int(np.isfinite(position))
-        wanted = touching or not law["spatial"]
+        settled = self.follow(int(np.isfinite(position)), position)
+        wanted = self.contact or not law["spatial"]
         self.fade = np.clip(self.fade + (law["fade_step"] if wanted else -law["fade_step"]), 0, 1)
         self.references.append(waveform * (3 * self.fade**2 - 2 * self.fade**3) * self.smooth)
         now = self.reference(n - law["ahead"])
-        settled = self.follow(touching, position)
         e = y - self.s * now
         self.gate(e[0])
         self.past = np.column_stack([e, self.past[:, :-1]])
@@ -67,8 +67,10 @@ class NaiveInverse:
     def follow(self, touching, position):
         law = self.law
         if touching:
-            self.lever = law["lever_per_metre"] * position
+            self.lever = np.clip(law["lever_per_metre"] * position, -2.0, 2.0)
         self.since += 1
+        self.away = 0 if touching else self.away + 1
+        touching = touching or int(self.contact and self.away < law["patience"])
         if touching != self.contact:
             self.contact, self.since, self.timer = touching, 0, law["awake"]
             self.forget(FINGER, HEAVE)
@@ -108,8 +110,10 @@ class NaiveInverse:
 
     def learn(self, i, error):
         h = -self.psi[i, :COUNT]
-        innovation = error - self.psi[i, COUNT] - h @ self.theta
-        gain = self.P @ h / (h @ self.P @ h + self.law["noise"][i])
+        explained = self.psi[i, COUNT]
+        self.size[i] += self.law["mean_square"] * (error**2 + explained**2 - self.size[i])
+        innovation = error - explained - h @ self.theta
+        gain = self.P @ h / (h @ self.P @ h + self.law["noise"][i] + self.law["model_error"] * self.size[i])
         self.theta = self.theta + gain * innovation
         self.P = self.P - np.outer(gain, h @ self.P)
 
@@ -164,7 +168,7 @@ class NaiveInverse:
         return found
 
     def level(self):
-        wanted = self.contact * (self.lever * self.theta[LOAD] + self.theta[LOAD + 1])
+        wanted = self.contact * np.clip(self.lever * self.theta[LOAD] + self.theta[LOAD + 1], -1.0, 1.0)
         self.moment += self.law["levelling"] * (wanted - self.moment)
         return np.array([0.0, self.moment])
 

@@ -161,3 +161,43 @@ def test_a_waveform_of_friction_arrives_whole_on_a_screen():
     assert error(recording.motion, recording.reference, 1.0, recording.rate)[0] < 0.03
     with pytest.raises(ValueError, match=r"texture\.carriers"):
         hr.render(replace(scene, method="h2"))
+
+
+PRESSED = {"finger": hr.Finger.still(0.01, normal_load=0.5, mechanics="heavy"), "duration": 2.0}
+GRATING = hr.Grating(amplitude=5e-6, frequency=100.0)
+
+
+@pytest.mark.parametrize(
+    ("changes", "most"),
+    [
+        ({"profile": {"sensor_noise": 0.0, "sensor_bits": 0}}, 0.02),  # nothing tells how sure to be but the model
+        ({"profile": {"rate": 1000.0, "damping_1": 200.0, "damping_2": 200.0}}, 0.05),  # faster than its own rate
+        ({"finger": hr.Finger.still(0.05, normal_load=5.0, mechanics="heavy"), "duration": 3.0}, 0.05),  # a hard press
+        ({"profile": {"rate": 20e3, "delay": 2}}, 0.02),  # a damper whose noise would fill the drive
+    ],
+    ids=["quiet", "stiff", "hard", "fast"],
+)
+def test_what_once_ran_away_does_not(changes, most):
+    recording = hr.render(hr.Scene(texture=GRATING, **(PRESSED | changes)))
+    assert recording.summary()["waveform"]["places"]["centre"]["waveform_error"] < most
+
+
+def test_a_screen_survives_a_lift():
+    """The contact's damping is ten times as large without a speed: the model's step has to stay stable."""
+    values = np.convolve(np.random.default_rng(0).standard_normal(4000), np.ones(5) / 5, "same")
+    finger = hr.Finger.sliding(0.1, 0.5, span=0.03, touches=[(0.2, 0.6), (0.9, 2.0)])
+    texture = hr.Recorded(samples=values, rate=5000.0, amplitude=1e-4, speed=0.1)
+    recording = hr.render(hr.Scene(device="electroadhesion", duration=2.0, texture=texture, finger=finger))
+    assert np.isfinite(recording.drive).all()
+
+
+def test_a_position_that_is_lost_for_a_sample_is_no_lift():
+    reference, position = white(4000), np.full(4000, 0.01)
+    position[1000::250] = np.nan
+    controller = AdaptiveInverse().design(PLATE.device_model(RATE, 1), NOTHING)
+    since = []
+    for start in range(0, 4000, 250):
+        piece = slice(start, start + 250)
+        controller.run(np.zeros((250, 2)), position[piece], reference[piece])
+        since.append(float(controller.law["since"]))
+    assert np.all(np.diff(since) == 250)

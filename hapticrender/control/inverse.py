@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 
 from hapticrender.bands import Bands
-from hapticrender.control.controller import BankController, device_settings, shared_settings
-from hapticrender.control.controller_design import FADE_IN, LEAST_NOISE, PROMPT, design_controller, rules_for
+from hapticrender.control.controller import LEAST_TARGET, BankController, device_settings, shared_settings
+from hapticrender.control.controller_design import FADE_IN, PROMPT, design_controller, rules_for
 from hapticrender.control.damping import Damping, choose_damping
 from hapticrender.control.device_model import DeviceModel
 from hapticrender.control.inverse_kernel import (
@@ -41,6 +41,9 @@ PEOPLE, SEED = 300, 1  # fingers of the prior, and the seed that draws them
 REVERSION_RATES = {FINGER: 0.05, HEAVE: 0.003, ROCKING: 0.01, LOAD: 1.0}  # 1/sqrt(s), from each parameter on
 SETTLING, RESTART, AWAKE = 2e-3, 0.1, 0.1  # s after a contact: learning starts, and again; the damper sleeps
 JOINING = 60e-3  # s: for so long the deviation at the start of learning is a parameter
+PATIENCE = 1e-3  # s: for so long a position may be missing
+MODEL_ERROR = 0.1  # of a deviation and of what the drive explains of it: part that no parameter explains
+LEAST_NOISE = 5e-5  # of the sensors' range
 NOTICE = 10e-3  # s: a contact is reported within this
 GATE_SIGMAS = 2.0  # of the sensors' noise: a larger deviation within 4 ms opens the inner damper
 INITIAL_FRICTION = (1.0, 1e3)  # N and N/s: deviation and its rate at a contact
@@ -149,6 +152,7 @@ class WaveformController(BankController):
         """Force that was learned on the untouched device over that of its model, rms over about a second, else 0."""
         law = self.law
         known = law["contact"] == 0.0 and law["smooth_scale"] > SCALED and law["learns"] and law["asked"] > 0.0
+        known = known and np.sqrt(2.0 * law["heard"]) > LEAST_TARGET * self.settings["sensor_limit"]
         known = known and min(law["sample"], law["since"]) >= self.rate  # in less than a second little is learned
         return float(np.sqrt(law["added"] / law["asked"])) if known else 0.0
 
@@ -167,11 +171,12 @@ class AdaptiveInverse:
         """
         whole = bands.envelope is None and not len(bands)
         known = model.finger.contact is not None or (whole and model.mass[0, 0] > 0.0 and model.contact_lag == 0.0)
-        if not known or (bands.envelope is None and len(bands)):
+        beyond = bands.frequency.max(initial=0.0) > 1.2 * HIGHEST * model.rate  # of the filters' range
+        if not known or beyond or (bands.envelope is None and len(bands)):
             return design_controller(self.name, model, bands, rules_for(bands), feedback=feedback)
         prompt = model.delay <= PROMPT
         damping = choose_damping(model, bending=model.bending) if feedback and prompt else None
-        if damping is not None and not damping.margins:
+        if damping is not None and not (damping.margins and quiet_enough(damping, model)):
             damping = None
         settings = controller_settings(model, bands, damping, feedback)
         state = aligned(1, INVERSE)
@@ -184,6 +189,13 @@ class AdaptiveInverse:
         note = damping.text() if damping else "inner damper off"
         memory = {"loops": state, **rings}
         return WaveformController(self.name, inverse_step, settings, bands, note=note, arrays=memory, lookahead=ahead)
+
+
+def quiet_enough(damping: Damping, model: DeviceModel) -> bool:
+    """Whether the damper makes of the sensors' noise a drive of which 3 sigma are within a third of the limit."""
+    noise = model.sensed_noise * np.sqrt((model.coordinate_from_sensed**2).sum(axis=1) * (damping.taps**2).sum(axis=1))
+    drive = np.sqrt((np.linalg.pinv(model.force_from_drive) ** 2) @ noise**2)
+    return bool(drive.max() < model.drive_limit / 9.0)
 
 
 def controller_settings(model: DeviceModel, bands: Bands, damping: Damping | None, feedback: bool) -> dict[str, Any]:
@@ -239,6 +251,8 @@ def law_settings(model: DeviceModel, bands: Bands, ahead: int, feedback: bool) -
         "joining": round(RESTART * model.rate),
         "joined": round((RESTART + JOINING) * model.rate),
         "awake": round(AWAKE * model.rate),
+        "patience": round(PATIENCE * model.rate),
+        "model_error": MODEL_ERROR**2,
         "notice": max(round(NOTICE * model.rate), 1),
         "level": (GATE_SIGMAS * noise[0]) ** 2,
         "high_pass": -math.expm1(-2 * math.pi * 20.0 * period),

@@ -24,13 +24,12 @@ from numba import carray
 from hapticrender.control.carriers import advance_carriers, track_finger, update_targets
 from hapticrender.control.kernel import sense_block, update_confidence
 from hapticrender.control.laws import contact_damping
-from hapticrender.control.limiter import SATURATED, drive_of, shape_noise
+from hapticrender.control.limiter import NONFINITE, SATURATED, drive_of, shape_noise
 from hapticrender.control.records import (
     CONTROLLER_T,
     LOCKED,
     MOST_CHANNELS,
     TILE_T,
-    WAVEFORM,
     Y,
     samples_of,
 )
@@ -52,7 +51,17 @@ INVERSE = np.dtype(
         *((name, np.float64) for name in ("lever_per_metre", "hertz_scale", "pole", "pole_damping", "fade_step")),
         *(
             (name, np.float64)
-            for name in ("settling", "joining", "joined", "awake", "notice", "level", "high_pass", "mean_square")
+            for name in (
+                "settling",
+                "joining",
+                "joined",
+                "awake",
+                "notice",
+                "patience",
+                "level",
+                "high_pass",
+                "mean_square",
+            )
         ),
         *((name, np.float64) for name in ("hold", "decay", "smoothing", "levelling", "slowly")),
         ("filters", np.float64, (4, TAPS)),
@@ -61,16 +70,21 @@ INVERSE = np.dtype(
         ("force_from_drive", np.float64, (2, MOST_CHANNELS)),
         *((name, np.float64, (2, 2)) for name in ("mass", "damping", "stiffness")),
         ("noise", np.float64, (2,)),
+        ("model_error", np.float64),
         ("prior", np.float64, (ROWS - 1,)),
         ("spread", np.float64, (ROWS - 1, ROWS - 1)),
         ("kept", np.float64, (ROWS - 1,)),
         ("start", np.float64, (4,)),
         # state
         *((name, np.float64) for name in ("fade", "peak", "held", "scale", "smooth_scale", "lever", "contact")),
-        *((name, np.float64) for name in ("since", "slow", "power", "reference", "moment", "asked", "added")),
+        *(
+            (name, np.float64)
+            for name in ("since", "away", "slow", "power", "reference", "moment", "asked", "added", "heard", "given")
+        ),
         *((name, np.int64) for name in ("sample", "ring_at", "reference_at")),
         ("window", np.float64, (TAPS,)),  # references around the moment at which this sample's drive acts, oldest first
         ("shown", np.float64, (TAPS,)),  # around now
+        ("size", np.float64, (2,)),  # mean squares of the deviation and of what the drive explains of it
         ("poles", np.float64, (2,)),
         ("basis", np.float64, (BASIS,)),
         ("theta", np.float64, (ROWS - 1,)),
@@ -86,7 +100,10 @@ INVERSE = np.dtype(
 )
 """Settings and state of the waveform law beside those of the controller."""
 INVERSE_T = numba.from_dtype(INVERSE)
+LARGEST_MOMENT = 1.0  # N, of the levelling: a hard press may tilt the device
+FARTHEST_LEVER = 2.0  # no surface is longer
 MOST_NEEDED = 20.0  # of the drive's limit; a reference that is scaled by more teaches nothing
+HUGE = 1e6  # drive unit: no drive
 SCALED = 0.999  # a reference scaled by less is saturated
 RING = BASIS + 2  # of a sample: basis and deviation force, until they act
 
@@ -106,11 +123,13 @@ def bands_ahead(controller, lead):
 
 
 @kernel
-def take_reference(controller, inverse):
+def take_reference(controller, inverse, waveform):
     """Put the reference `ahead` samples from now into the window; find what the sensors should show of it now."""
     c, v = record(controller, CONTROLLER_T, 0), record(inverse, INVERSE_T, 0)
     if c.p.analysed > 0.0:
-        value = samples_of(controller)[WAVEFORM, 0]
+        if abs(waveform) <= c.p.sensor_limit:  # else it is held
+            v.given = waveform
+        value = v.given
         wanted = 1.0 if v.contact > 0.0 or (v.spatial == 0 and c.p.needs_contact == 0.0) else 0.0
         v.fade = min(max(v.fade + (v.fade_step if wanted > 0.0 else -v.fade_step), 0.0), 1.0)
         value *= v.fade * v.fade * (3.0 - 2.0 * v.fade)
@@ -168,7 +187,7 @@ def discretise(controller, inverse):
     low = complex(pole * pole - w * w, 2.0 * v.pole_damping * pole * w)
     z = complex(theta[0] - theta[2] * turn * turn, theta[1] * turn)
     z += (theta[3] * pole * pole + complex(0.0, theta[4] * pole * w)) / low
-    mass = min(max(-z.real / (w * w), -2e-3), 10e-3) * v.contact
+    mass = min(max(-z.real / (w * w), -min(2e-3, 0.2 * v.mass[0, 0])), 10e-3) * v.contact
     damping = min(max(z.imag / w, 0.0), 12.0) * v.contact
     h, per_c, per_m = v.lever, 1.0 / v.hertz_scale, 1.0 / (v.hertz_scale * v.hertz_scale)
     m00 = corrected(v.mass[0, 0], per_m * theta[HEAVE + 2]) + mass
@@ -177,8 +196,14 @@ def discretise(controller, inverse):
     c01, c11 = v.damping[0, 1] + h * damping, corrected(v.damping[1, 1], per_c * theta[ROCKING + 1]) + h * h * damping
     k00, k01 = corrected(v.stiffness[0, 0], theta[HEAVE]), v.stiffness[0, 1]
     k11 = corrected(v.stiffness[1, 1], theta[ROCKING])
-    scale = period / (m00 * m11 - m01 * m01)
+    scale, size = 1.0 / (m00 * m11 - m01 * m01), 0.0
     i00, i01, i11 = scale * m11, -scale * m01, scale * m00
+    # rates (1/s) that bound the norm; the step is halved until the series converges, and doubled again after it
+    size = (abs(i00) + abs(i01) + abs(i11)) * (c00 + abs(c01) + c11 + period * (k00 + abs(k01) + k11)) * period
+    halvings = 0
+    while size > 0.5 and halvings < 30:
+        size, period, halvings = 0.5 * size, 0.5 * period, halvings + 1
+    i00, i01, i11 = period * i00, period * i01, period * i11
     flow, power, following, found = v.flow, v.power_of_flow, v.following, v.step
     flow[0, 2] = flow[1, 3] = period
     flow[2, 0], flow[3, 0] = -i00 * k00 - i01 * k01, -i01 * k00 - i11 * k01
@@ -201,6 +226,16 @@ def discretise(controller, inverse):
             for j in range(6):
                 power[i, j] = following[i, j]
                 found[i, j] += following[i, j]
+    for _ in range(halvings):  # Phi(2 h) = Phi Phi, Gamma(2 h) = Phi Gamma + Gamma
+        for i in range(4):
+            for j in range(6):
+                following[i, j] = found[i, j] if j >= 4 else 0.0
+            for k in range(4):
+                for j in range(6):
+                    following[i, j] += found[i, k] * found[k, j]
+        for i in range(4):
+            for j in range(6):
+                found[i, j] = following[i, j]
 
 
 @kernel
@@ -273,10 +308,13 @@ def follow_contact(controller, inverse):
     """
     c, v = record(controller, CONTROLLER_T, 0), record(inverse, INVERSE_T, 0)
     if c.finger_seen > 0.0:
-        v.lever = v.lever_per_metre * c.held_position
+        v.lever = min(max(v.lever_per_metre * c.held_position, -FARTHEST_LEVER), FARTHEST_LEVER)
     v.since += 1.0
     sticks = c.p.needs_contact > 0.0 and c.speed < c.p.least_speed
     touching = 0.0 if sticks else c.finger_seen
+    v.away = 0.0 if touching > 0.0 else v.away + 1.0
+    if v.contact > 0.0 and v.away < v.patience:  # a position that is missing for so short is no lift-off
+        touching = 1.0
     if touching != v.contact:
         v.contact, v.since = touching, 0.0
         forget(inverse, FINGER, HEAVE)
@@ -297,7 +335,9 @@ def learn(inverse, coordinate, error):
     """Update the parameters by a sensed deviation from the reference: a scalar step of the Kalman filter."""
     v = record(inverse, INVERSE_T, 0)
     states, theta, covariance, gain = v.states, v.theta, v.covariance, v.inputs
-    innovation, scatter = error - states[coordinate, PARAMETERS], v.noise[coordinate]
+    explained = states[coordinate, PARAMETERS]
+    v.size[coordinate] += v.mean_square * (error * error + explained * explained - v.size[coordinate])
+    innovation, scatter = error - explained, v.noise[coordinate] + v.model_error * v.size[coordinate]
     for i in range(PARAMETERS):
         innovation += states[coordinate, i] * theta[i]
     for i in range(PARAMETERS):
@@ -406,6 +446,7 @@ def compare(inverse, nominal, learned):
     """Mean squares over a second of what the untouched device is asked for in heave, and of what was learned of it."""
     v = record(inverse, INVERSE_T, 0)
     free = 1.0 - v.contact
+    v.heard += v.slowly * (free * v.reference * v.reference - v.heard)
     v.asked += v.slowly * (free * nominal * nominal - v.asked)
     v.added += v.slowly * (free * learned * learned - v.added)
 
@@ -414,7 +455,7 @@ def compare(inverse, nominal, learned):
 def level(inverse):
     """Rocking force that slowly levels the device under the load: a moving finger would else tilt it to and fro."""
     v = record(inverse, INVERSE_T, 0)
-    wanted = v.contact * (v.lever * v.theta[LOAD] + v.theta[LOAD + 1])
+    wanted = v.contact * min(max(v.lever * v.theta[LOAD] + v.theta[LOAD + 1], -LARGEST_MOMENT), LARGEST_MOMENT)
     v.moment += v.levelling * (wanted - v.moment)
     return v.moment
 
@@ -436,6 +477,24 @@ def scale_reference(inverse, needed):
 
 
 @kernel
+def recover(controller, inverse):
+    """Start afresh from the prior, with nothing learned: a number got out of hand."""
+    c, v = record(controller, CONTROLLER_T, 0), record(inverse, INVERSE_T, 0)
+    forget(inverse, FINGER, PARAMETERS)
+    note_device(inverse)
+    note_device(inverse)
+    v.moment = v.slow = v.power = v.asked = v.added = v.peak = v.size[0] = v.size[1] = v.poles[0] = v.poles[1] = 0.0
+    v.scale = v.smooth_scale = 1.0
+    for k in range(4):
+        v.states[k, PARAMETERS] = 0.0
+    for i in range(2):
+        c.shaper[i, 0] = c.shaper[i, 1] = 0.0
+        for j in range(16):
+            c.past[i, j] = 0.0
+    discretise(controller, inverse)
+
+
+@kernel
 def play(controller, inverse, drive, flags, n, nominal0, nominal1):
     """Write the drive of a sample; what of it is not the nominal force goes into the ring with the basis."""
     c, v = record(controller, CONTROLLER_T, 0), record(inverse, INVERSE_T, 0)
@@ -445,6 +504,10 @@ def play(controller, inverse, drive, flags, n, nominal0, nominal1):
     played0 = played1 = most = 0.0
     for i in range(c.p.channels):
         exact = c.confidence * drive_of(controller, samples, Y, 0, i)
+        if not abs(exact) < HUGE:
+            exact = 0.0
+            flags[n] |= NONFINITE
+            recover(controller, inverse)
         most = max(most, abs(exact) / limit)
         if c.confidence == 0.0:
             c.shaper[0, i] = c.shaper[1, i] = exact = 0.0
@@ -459,7 +522,9 @@ def play(controller, inverse, drive, flags, n, nominal0, nominal1):
     scale_reference(inverse, most / v.smooth_scale)
     for i in range(BASIS):
         ring[at, i] = basis[i]
-    ring[at, BASIS], ring[at, BASIS + 1] = played0 - nominal0, played1 - nominal1
+    sane = abs(nominal0) + abs(nominal1) < HUGE
+    ring[at, BASIS] = played0 - nominal0 if sane else 0.0
+    ring[at, BASIS + 1] = played1 - nominal1 if sane else 0.0
 
 
 @step
@@ -469,7 +534,7 @@ def inverse_step(state, signals, start, count):
     inverse, samples, stop = c.loops_at, samples_of(state), start + count
     v = record(inverse, INVERSE_T, 0)
     drive, flags = carray(pointer(io.drive, F8), (stop, c.p.channels)), carray(pointer(io.flags, I8), stop)
-    position = carray(pointer(io.position, F8), stop)
+    position, waveform = carray(pointer(io.position, F8), stop), carray(pointer(io.waveform, F8), stop)
     for n in range(start, stop):
         implausible = sense_block(state, signals, n)
         if c.moving == 0:
@@ -481,7 +546,7 @@ def inverse_step(state, signals, start, count):
         else:
             c.sample += 1
         settled = follow_contact(state, inverse)
-        take_reference(state, inverse)
+        take_reference(state, inverse, waveform[n] if c.p.analysed > 0.0 else 0.0)
         error0, error1 = y0 - c.p.shape[0] * v.reference, y1 - c.p.shape[1] * v.reference
         samples[Y, 0] = samples[Y + 1, 0] = 0.0
         if update_confidence(state, implausible):

@@ -440,7 +440,8 @@ def design_supervisor(controller: Any, model: DeviceModel) -> dict[str, Any]:
     if demand is None:
         return settings
     modelled = demand.lowest < rate / 10  # beyond it neither trapezoidal rule nor hold are the device's
-    press, pace = press_drive(model) if modelled else 0.0, min(model.pace, FASTEST_PACE)
+    pressed = modelled or model.finger.contact is not None
+    press, pace = press_drive(model) if pressed else 0.0, min(model.pace, FASTEST_PACE)
     settings |= {
         "drive_pole": _pole(DRIVE_TIME / pace, rate),
         "drive_time": PRESS_TIME / pace * rate,
