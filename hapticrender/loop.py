@@ -18,7 +18,8 @@ import numpy as np
 
 from hapticrender.control.controller import PositionPredictor
 from hapticrender.control.probe import probe_plate
-from hapticrender.control.supervisor import FADE_OUT, STOPPED, Fault
+from hapticrender.control.supervisor import FADE_OUT, Fault
+from hapticrender.control.supervisor_kernel import STOPPED
 from hapticrender.driver_checks import check_sensed
 from hapticrender.errors import DeviceFault, HapticError, PlateMismatch
 from hapticrender.protocols import Array, Controller, Driver, Exchange, Renderer, Rendering, Sensed

@@ -38,7 +38,7 @@ class NaiveInverse:
         wanted = self.contact or not law["spatial"]
         self.fade = np.clip(self.fade + (law["fade_step"] if wanted else -law["fade_step"]), 0, 1)
         self.references.append(waveform * (3 * self.fade**2 - 2 * self.fade**3) * self.smooth)
-        now = self.reference(n - law["ahead"])
+        now = self.reference(n - law["delay"] - 6)
         e = y - self.s * now
         self.gate(e[0])
         self.past = np.column_stack([e, self.past[:, :-1]])
@@ -72,7 +72,7 @@ class NaiveInverse:
         self.away = 0 if touching else self.away + 1
         touching = touching or int(self.contact and self.away < law["patience"])
         if touching != self.contact:
-            self.contact, self.since, self.timer = touching, 0, law["awake"]
+            self.contact, self.since, self.timer = touching, 0, law["damper_time"]
             self.forget(FINGER, HEAVE)
             self.forget(LOAD, COUNT)
             self.discretise()

@@ -201,3 +201,16 @@ def test_a_position_that_is_lost_for_a_sample_is_no_lift():
         controller.run(np.zeros((250, 2)), position[piece], reference[piece])
         since.append(float(controller.law["since"]))
     assert np.all(np.diff(since) == 250)
+
+
+def test_a_drive_that_is_no_number_starts_the_law_afresh():
+    controller = AdaptiveInverse().design(PLATE.device_model(RATE, 1), NOTHING)
+    reference, rest, none = white(2000), np.zeros((1000, 2)), np.full(1000, np.nan)
+    controller.run(rest, none, reference[:1000])
+    controller.law["theta"][:] = np.nan
+    drive, _, flags = controller.run(rest, none, reference[1000:])
+    assert flags[0] & hr.Flag.NONFINITE
+    assert not (flags[1:] & hr.Flag.NONFINITE).any()
+    assert np.isfinite(drive).all()
+    assert abs(drive[1:]).max() > 0.01
+    assert np.isfinite(controller.law["theta"]).all()

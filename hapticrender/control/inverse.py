@@ -14,19 +14,17 @@ from hapticrender.control.controller import LEAST_TARGET, BankController, device
 from hapticrender.control.controller_design import FADE_IN, PROMPT, design_controller, rules_for
 from hapticrender.control.damping import Damping, choose_damping
 from hapticrender.control.device_model import DeviceModel
-from hapticrender.control.inverse_kernel import (
+from hapticrender.control.inverse_kernel import REVERSION, SCALED, inverse_step
+from hapticrender.control.inverse_records import (
     FINGER,
     HEAVE,
     INITIAL,
     INVERSE,
     LOAD,
     PARAMETERS,
-    REVERSION,
     RING,
     ROCKING,
-    SCALED,
     TAPS,
-    inverse_step,
 )
 from hapticrender.control.records import MOST_CHANNELS, MOST_TAPS, aligned
 from hapticrender.control.supervisor import damper_noise
@@ -39,7 +37,7 @@ SCALE = 2 * math.pi * 200.0  # rad/s: derivatives are divided by its powers, so 
 POLE, POLE_DAMPING = 2 * math.pi * 200.0, 0.8  # the finger's pair of poles
 PEOPLE, SEED = 300, 1  # fingers of the prior, and the seed that draws them
 REVERSION_RATES = {FINGER: 0.05, HEAVE: 0.003, ROCKING: 0.01, LOAD: 1.0}  # 1/sqrt(s), from each parameter on
-SETTLING, RESTART, AWAKE = 2e-3, 0.1, 0.1  # s after a contact: learning starts, and again; the damper sleeps
+SETTLING, RESTART, DAMPER_TIME = 2e-3, 0.1, 0.1  # s after a contact: learning starts, and again; the damper sleeps
 JOINING = 60e-3  # s: for so long the deviation at the start of learning is a parameter
 PATIENCE = 1e-3  # s: for so long a position may be missing
 MODEL_ERROR = 0.1  # of a deviation and of what the drive explains of it: part that no parameter explains
@@ -151,10 +149,10 @@ class WaveformController(BankController):
     def mismatch(self) -> float:
         """Force that was learned on the untouched device over that of its model, rms over about a second, else 0."""
         law = self.law
-        known = law["contact"] == 0.0 and law["smooth_scale"] > SCALED and law["learns"] and law["asked"] > 0.0
-        known = known and np.sqrt(2.0 * law["heard"]) > LEAST_TARGET * self.settings["sensor_limit"]
+        known = law["contact"] == 0.0 and law["smooth_scale"] > SCALED and law["learns"] and law["nominal_power"] > 0.0
+        known = known and np.sqrt(2.0 * law["reference_power"]) > LEAST_TARGET * self.settings["sensor_limit"]
         known = known and min(law["sample"], law["since"]) >= self.rate  # in less than a second little is learned
-        return float(np.sqrt(law["added"] / law["asked"])) if known else 0.0
+        return float(np.sqrt(law["learned_power"] / law["nominal_power"])) if known else 0.0
 
 
 @dataclass(frozen=True)
@@ -182,7 +180,7 @@ class AdaptiveInverse:
         state = aligned(1, INVERSE)
         ahead = model.delay + TAPS // 2
         rings = {"ring": np.zeros((model.delay + 1, RING)), "reference": np.zeros(model.delay)}
-        for name, value in law_settings(model, bands, ahead, feedback).items():
+        for name, value in law_settings(model, bands, feedback).items():
             state[name] = value
         for name, array in rings.items():
             state[f"{name}_at"] = array.ctypes.data
@@ -219,7 +217,7 @@ def controller_settings(model: DeviceModel, bands: Bands, damping: Damping | Non
     }
 
 
-def law_settings(model: DeviceModel, bands: Bands, ahead: int, feedback: bool) -> dict[str, Any]:
+def law_settings(model: DeviceModel, bands: Bands, feedback: bool) -> dict[str, Any]:
     """Fields of `INVERSE`."""
     period, n = 1.0 / model.rate, len(model.mass)
     mean, spread = prior(model)
@@ -239,7 +237,6 @@ def law_settings(model: DeviceModel, bands: Bands, ahead: int, feedback: bool) -
         shown = derivative_filters(float(model.rate), float(top), order, 1, -late)[0]
     return {
         "delay": model.delay,
-        "ahead": ahead,
         "spatial": (bands.wavenumber > 0.0).any() if len(bands) else bands.spatial,
         "learns": feedback,
         "lever_per_metre": model.lever_per_metre,
@@ -250,7 +247,7 @@ def law_settings(model: DeviceModel, bands: Bands, ahead: int, feedback: bool) -
         "settling": round(SETTLING * model.rate),
         "joining": round(RESTART * model.rate),
         "joined": round((RESTART + JOINING) * model.rate),
-        "awake": round(AWAKE * model.rate),
+        "damper_time": round(DAMPER_TIME * model.rate),
         "patience": round(PATIENCE * model.rate),
         "model_error": MODEL_ERROR**2,
         "notice": max(round(NOTICE * model.rate), 1),

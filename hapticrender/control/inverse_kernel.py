@@ -17,95 +17,43 @@ The delay d is that of samples: a block of M samples is the same law with a long
 
 from __future__ import annotations
 
-import numba
-import numpy as np
 from numba import carray
 
 from hapticrender.control.carriers import advance_carriers, track_finger, update_targets
+from hapticrender.control.inverse_learning import (
+    advance_regressors,
+    discretise,
+    follow_contact,
+    learn,
+    note_device,
+    reset_parameters,
+    revert,
+)
+from hapticrender.control.inverse_records import (
+    BASIS,
+    FINGER,
+    HEAVE,
+    INVERSE_T,
+    LOAD,
+    PARAMETERS,
+    RING,
+    ROCKING,
+    TAPS,
+)
 from hapticrender.control.kernel import sense_block, update_confidence
 from hapticrender.control.laws import contact_damping
 from hapticrender.control.limiter import NONFINITE, SATURATED, drive_of, shape_noise
-from hapticrender.control.records import (
-    CONTROLLER_T,
-    LOCKED,
-    MOST_CHANNELS,
-    TILE_T,
-    Y,
-    samples_of,
-)
+from hapticrender.control.records import CONTROLLER_T, LOCKED, TILE_T, Y, samples_of
 from hapticrender.jit import F8, I8, SIGNALS_T, kernel, pointer, record, step
 from hapticrender.mathx import TURN, unit
 from hapticrender.vectors import get, put, real, total, zeros
 
-TAPS = 12  # of the derivatives' filters, 6 of them ahead
-BASIS = 6  # r, r'/w_n, r''/w_n^2, r through the pair of poles and its derivative/w_p, D_00 r' T
-FINGER, HEAVE, ROCKING, LOAD, INITIAL, PARAMETERS = np.array([0, 5, 9, 12, 14, 18])  # first of each set; their number
-ROWS = int(PARAMETERS) + 1  # regressors psi_i, and w
 REFRESH = 25  # samples between two discretisations of the loaded device
 REVERSION = 20  # samples between two steps of the parameters' reversion to their mean
-
-INVERSE = np.dtype(
-    [
-        # settings
-        *((name, np.int64) for name in ("delay", "ahead", "spatial", "learns")),
-        *((name, np.float64) for name in ("lever_per_metre", "hertz_scale", "pole", "pole_damping", "fade_step")),
-        *(
-            (name, np.float64)
-            for name in (
-                "settling",
-                "joining",
-                "joined",
-                "awake",
-                "notice",
-                "patience",
-                "level",
-                "high_pass",
-                "mean_square",
-            )
-        ),
-        *((name, np.float64) for name in ("hold", "decay", "smoothing", "levelling", "slowly")),
-        ("filters", np.float64, (4, TAPS)),
-        ("sensor_filter", np.float64, (TAPS,)),
-        ("pair", np.float64, (2, 4)),  # step of the pair of poles: two states, r now and next
-        ("force_from_drive", np.float64, (2, MOST_CHANNELS)),
-        *((name, np.float64, (2, 2)) for name in ("mass", "damping", "stiffness")),
-        ("noise", np.float64, (2,)),
-        ("model_error", np.float64),
-        ("prior", np.float64, (ROWS - 1,)),
-        ("spread", np.float64, (ROWS - 1, ROWS - 1)),
-        ("kept", np.float64, (ROWS - 1,)),
-        ("start", np.float64, (4,)),
-        # state
-        *((name, np.float64) for name in ("fade", "peak", "held", "scale", "smooth_scale", "lever", "contact")),
-        *(
-            (name, np.float64)
-            for name in ("since", "away", "slow", "power", "reference", "moment", "asked", "added", "heard", "given")
-        ),
-        *((name, np.int64) for name in ("sample", "ring_at", "reference_at")),
-        ("window", np.float64, (TAPS,)),  # references around the moment at which this sample's drive acts, oldest first
-        ("shown", np.float64, (TAPS,)),  # around now
-        ("size", np.float64, (2,)),  # mean squares of the deviation and of what the drive explains of it
-        ("poles", np.float64, (2,)),
-        ("basis", np.float64, (BASIS,)),
-        ("theta", np.float64, (ROWS - 1,)),
-        ("covariance", np.float64, (ROWS - 1, ROWS - 1)),
-        ("earlier", np.float64, (2, 8, 7)),  # the device's own parameters and covariance, 10-20 ms and 0-10 ms ago
-        ("states", np.float64, (4, ROWS)),
-        ("moved", np.float64, (4, ROWS)),
-        ("inputs", np.float64, (2, ROWS)),
-        *(
-            (name, np.float64, (4, 6)) for name in ("flow", "power_of_flow", "following", "step")
-        ),  # [A, B] T; [Phi, Gamma]
-    ]
-)
-"""Settings and state of the waveform law beside those of the controller."""
-INVERSE_T = numba.from_dtype(INVERSE)
 LARGEST_MOMENT = 1.0  # N, of the levelling: a hard press may tilt the device
-FARTHEST_LEVER = 2.0  # no surface is longer
 MOST_NEEDED = 20.0  # of the drive's limit; a reference that is scaled by more teaches nothing
 HUGE = 1e6  # drive unit: no drive
 SCALED = 0.999  # a reference scaled by less is saturated
-RING = BASIS + 2  # of a sample: basis and deviation force, until they act
 
 
 @kernel
@@ -124,17 +72,17 @@ def bands_ahead(controller, lead):
 
 @kernel
 def take_reference(controller, inverse, waveform):
-    """Put the reference `ahead` samples from now into the window; find what the sensors should show of it now."""
+    """Put the reference of the look-ahead into the window; find what the sensors should show of it now."""
     c, v = record(controller, CONTROLLER_T, 0), record(inverse, INVERSE_T, 0)
     if c.p.analysed > 0.0:
         if abs(waveform) <= c.p.sensor_limit:  # else it is held
-            v.given = waveform
-        value = v.given
-        wanted = 1.0 if v.contact > 0.0 or (v.spatial == 0 and c.p.needs_contact == 0.0) else 0.0
-        v.fade = min(max(v.fade + (v.fade_step if wanted > 0.0 else -v.fade_step), 0.0), 1.0)
+            v.last_waveform = waveform
+        value = v.last_waveform
+        touched = v.contact > 0.0 or (v.spatial == 0 and c.p.needs_contact == 0.0)
+        v.fade = min(max(v.fade + (v.fade_step if touched else -v.fade_step), 0.0), 1.0)
         value *= v.fade * v.fade * (3.0 - 2.0 * v.fade)
     else:
-        value = bands_ahead(controller, v.ahead / c.p.rate)
+        value = bands_ahead(controller, (v.delay + TAPS // 2) / c.p.rate)
     value *= v.smooth_scale
     window, shown, ring = v.window, v.shown, carray(pointer(v.reference_at, F8), v.delay)
     at = v.sample % v.delay
@@ -170,202 +118,6 @@ def find_basis(controller, inverse):
 
 
 @kernel
-def corrected(value, change):
-    """Move a positive number by a change that leaves it between 0.3 and 5 times what it was."""
-    return value + min(max(change, -0.7 * value), 4.0 * value)
-
-
-@kernel
-def discretise(controller, inverse):
-    """Exact step of the loaded device over a sample, from a series of ten terms; states are coordinates, velocities.
-
-    The finger counts by its mass and damping at 180 Hz, the device with what was learned of its heave.
-    """
-    v = record(inverse, INVERSE_T, 0)
-    theta, w, period = v.theta, TURN * 180.0, 1.0 / record(controller, CONTROLLER_T, 0).p.rate
-    turn, pole = w / v.hertz_scale, v.pole
-    low = complex(pole * pole - w * w, 2.0 * v.pole_damping * pole * w)
-    z = complex(theta[0] - theta[2] * turn * turn, theta[1] * turn)
-    z += (theta[3] * pole * pole + complex(0.0, theta[4] * pole * w)) / low
-    mass = min(max(-z.real / (w * w), -min(2e-3, 0.2 * v.mass[0, 0])), 10e-3) * v.contact
-    damping = min(max(z.imag / w, 0.0), 12.0) * v.contact
-    h, per_c, per_m = v.lever, 1.0 / v.hertz_scale, 1.0 / (v.hertz_scale * v.hertz_scale)
-    m00 = corrected(v.mass[0, 0], per_m * theta[HEAVE + 2]) + mass
-    m01, m11 = v.mass[0, 1] + h * mass, corrected(v.mass[1, 1], per_m * theta[ROCKING + 2]) + h * h * mass
-    c00 = corrected(v.damping[0, 0] + contact_damping(controller), per_c * theta[HEAVE + 1]) + damping
-    c01, c11 = v.damping[0, 1] + h * damping, corrected(v.damping[1, 1], per_c * theta[ROCKING + 1]) + h * h * damping
-    k00, k01 = corrected(v.stiffness[0, 0], theta[HEAVE]), v.stiffness[0, 1]
-    k11 = corrected(v.stiffness[1, 1], theta[ROCKING])
-    scale, size = 1.0 / (m00 * m11 - m01 * m01), 0.0
-    i00, i01, i11 = scale * m11, -scale * m01, scale * m00
-    # rates (1/s) that bound the norm; the step is halved until the series converges, and doubled again after it
-    size = (abs(i00) + abs(i01) + abs(i11)) * (c00 + abs(c01) + c11 + period * (k00 + abs(k01) + k11)) * period
-    halvings = 0
-    while size > 0.5 and halvings < 30:
-        size, period, halvings = 0.5 * size, 0.5 * period, halvings + 1
-    i00, i01, i11 = period * i00, period * i01, period * i11
-    flow, power, following, found = v.flow, v.power_of_flow, v.following, v.step
-    flow[0, 2] = flow[1, 3] = period
-    flow[2, 0], flow[3, 0] = -i00 * k00 - i01 * k01, -i01 * k00 - i11 * k01
-    flow[2, 1], flow[3, 1] = -i00 * k01 - i01 * k11, -i01 * k01 - i11 * k11
-    flow[2, 2], flow[3, 2] = -i00 * c00 - i01 * c01, -i01 * c00 - i11 * c01
-    flow[2, 3], flow[3, 3] = -i00 * c01 - i01 * c11, -i01 * c01 - i11 * c11
-    flow[2, 4], flow[3, 4], flow[2, 5], flow[3, 5] = i00, i01, i01, i11
-    for i in range(4):
-        for j in range(6):
-            power[i, j] = flow[i, j]
-            found[i, j] = flow[i, j] + (1.0 if i == j else 0.0)
-    for term in range(2, 11):
-        for i in range(4):
-            for j in range(6):
-                following[i, j] = 0.0
-            for k in range(4):
-                for j in range(6):
-                    following[i, j] += flow[i, k] * power[k, j] / term
-        for i in range(4):
-            for j in range(6):
-                power[i, j] = following[i, j]
-                found[i, j] += following[i, j]
-    for _ in range(halvings):  # Phi(2 h) = Phi Phi, Gamma(2 h) = Phi Gamma + Gamma
-        for i in range(4):
-            for j in range(6):
-                following[i, j] = found[i, j] if j >= 4 else 0.0
-            for k in range(4):
-                for j in range(6):
-                    following[i, j] += found[i, k] * found[k, j]
-        for i in range(4):
-            for j in range(6):
-                found[i, j] = following[i, j]
-
-
-@kernel
-def forget(inverse, first, last):
-    """Set parameters back to their prior; nothing else is known of them."""
-    v = record(inverse, INVERSE_T, 0)
-    theta, covariance, spread, states = v.theta, v.covariance, v.spread, v.states
-    for i in range(first, last):
-        theta[i] = v.prior[i]
-        for j in range(PARAMETERS):
-            inside = first <= j < last
-            covariance[i, j] = spread[i, j] if inside else 0.0
-            covariance[j, i] = covariance[i, j]
-        for k in range(4):
-            states[k, i] = 0.0
-
-
-@kernel
-def note_device(inverse):
-    """Note the device's own parameters and their covariance, and keep the last note."""
-    v = record(inverse, INVERSE_T, 0)
-    theta, covariance, earlier = v.theta, v.covariance, v.earlier
-    for i in range(7):
-        for j in range(8):
-            earlier[0, j, i] = earlier[1, j, i]
-            earlier[1, j, i] = theta[HEAVE + i] if j == 7 else covariance[HEAVE + j, HEAVE + i]
-
-
-@kernel
-def restore_device(inverse):
-    """Set the device's own parameters back to the earlier note: a contact is reported after it happened."""
-    v = record(inverse, INVERSE_T, 0)
-    theta, covariance, earlier = v.theta, v.covariance, v.earlier
-    forget(inverse, HEAVE, LOAD)
-    for i in range(7):
-        theta[HEAVE + i] = earlier[0, 7, i]
-        for j in range(7):
-            covariance[HEAVE + j, HEAVE + i] = earlier[0, j, i]
-            earlier[1, j, i] = earlier[0, j, i]
-        earlier[1, 7, i] = earlier[0, 7, i]
-
-
-@kernel
-def restart(inverse):
-    """Learn afresh from here on, with the deviation of now as four more parameters; the estimates stay.
-
-    The covariance returns to the prior: what the ringing of a contact taught through a model without the finger is not
-    as certain as it seemed.
-    """
-    v = record(inverse, INVERSE_T, 0)
-    theta, covariance, states = v.theta, v.covariance, v.states
-    restore_device(inverse)
-    for i in range(PARAMETERS):
-        within = i < HEAVE or i >= LOAD
-        for j in range(PARAMETERS):
-            if within or j < HEAVE or j >= LOAD:
-                covariance[i, j] = v.spread[i, j]
-    for k in range(4):
-        for i in range(ROWS):
-            states[k, i] = 0.0
-        states[k, INITIAL + k] = 1.0
-        theta[INITIAL + k], covariance[INITIAL + k, INITIAL + k] = 0.0, v.start[k]
-
-
-@kernel
-def follow_contact(controller, inverse):
-    """Reset what belongs to a contact when one begins or ends, and learn afresh: at once, and when its ringing is over.
-
-    Returns whether there is anything to learn from.
-    """
-    c, v = record(controller, CONTROLLER_T, 0), record(inverse, INVERSE_T, 0)
-    if c.finger_seen > 0.0:
-        v.lever = min(max(v.lever_per_metre * c.held_position, -FARTHEST_LEVER), FARTHEST_LEVER)
-    v.since += 1.0
-    sticks = c.p.needs_contact > 0.0 and c.speed < c.p.least_speed
-    touching = 0.0 if sticks else c.finger_seen
-    v.away = 0.0 if touching > 0.0 else v.away + 1.0
-    if v.contact > 0.0 and v.away < v.patience:  # a position that is missing for so short is no lift-off
-        touching = 1.0
-    if touching != v.contact:
-        v.contact, v.since = touching, 0.0
-        forget(inverse, FINGER, HEAVE)
-        forget(inverse, LOAD, PARAMETERS)
-        c.fast_timer = v.awake
-        discretise(controller, inverse)
-    elif v.since == v.settling or v.since == v.joining:
-        restart(inverse)
-    elif v.since == v.joined:
-        forget(inverse, INITIAL, PARAMETERS)
-    elif v.since > v.joined and v.sample % int(v.notice) == 0:
-        note_device(inverse)
-    return v.since >= v.settling
-
-
-@kernel
-def learn(inverse, coordinate, error):
-    """Update the parameters by a sensed deviation from the reference: a scalar step of the Kalman filter."""
-    v = record(inverse, INVERSE_T, 0)
-    states, theta, covariance, gain = v.states, v.theta, v.covariance, v.inputs
-    explained = states[coordinate, PARAMETERS]
-    v.size[coordinate] += v.mean_square * (error * error + explained * explained - v.size[coordinate])
-    innovation, scatter = error - explained, v.noise[coordinate] + v.model_error * v.size[coordinate]
-    for i in range(PARAMETERS):
-        innovation += states[coordinate, i] * theta[i]
-    for i in range(PARAMETERS):
-        found = 0.0
-        for j in range(PARAMETERS):
-            found += covariance[i, j] * states[coordinate, j]
-        gain[0, i] = found
-        scatter += found * states[coordinate, i]
-    for i in range(PARAMETERS):
-        share = gain[0, i] / scatter
-        theta[i] -= share * innovation
-        for j in range(PARAMETERS):
-            covariance[i, j] -= share * gain[0, j]
-
-
-@kernel
-def revert(inverse):
-    """Let the parameters return to their mean, and their covariance to its prior."""
-    v = record(inverse, INVERSE_T, 0)
-    kept, theta, covariance, spread = v.kept, v.theta, v.covariance, v.spread
-    for i in range(PARAMETERS):
-        theta[i] = v.prior[i] + kept[i] * (theta[i] - v.prior[i])
-        for j in range(PARAMETERS):
-            share = kept[i] * kept[j]
-            covariance[i, j] = share * covariance[i, j] + (1.0 - share) * spread[i, j]
-
-
-@kernel
 def open_gate(controller, inverse, deviation):
     """Gain of the inner damper: open after a contact, and while the deviation is more than noise.
 
@@ -396,37 +148,6 @@ def damp(controller, coordinate, deviation):
 
 
 @kernel
-def advance_regressors(controller, inverse):
-    """Advance the regressors by a sample, under the basis and the deviation force that act in it."""
-    c, v = record(controller, CONTROLLER_T, 0), record(inverse, INVERSE_T, 0)
-    states, moved, inputs, phi = v.states, v.moved, v.inputs, v.step
-    ring = carray(pointer(v.ring_at, F8), (v.delay + 1, RING))
-    at = (v.sample + 1) % (v.delay + 1)  # what was computed `delay` samples ago
-    touched, along = v.contact, v.contact * (c.p.shape[0] + v.lever * c.p.shape[1])
-    for i in range(ROWS):
-        inputs[0, i] = inputs[1, i] = 0.0
-    for i in range(5):
-        inputs[0, FINGER + i] = along * ring[at, i]
-        inputs[1, FINGER + i] = along * v.lever * ring[at, i]
-    for i in range(3):
-        inputs[0, HEAVE + i] = c.p.shape[0] * ring[at, i]
-        inputs[1, ROCKING + i] = ring[at, i]
-    inputs[0, HEAVE + 3] = c.p.shape[0] * ring[at, 5]
-    inputs[0, LOAD], inputs[1, LOAD] = 1.0, touched * v.lever
-    inputs[1, LOAD + 1] = 1.0
-    inputs[0, PARAMETERS], inputs[1, PARAMETERS] = ring[at, BASIS], ring[at, BASIS + 1]
-    for k in range(4):
-        for i in range(ROWS):
-            moved[k, i] = phi[k, 4] * inputs[0, i] + phi[k, 5] * inputs[1, i]
-        for j in range(4):
-            for i in range(ROWS):
-                moved[k, i] += phi[k, j] * states[j, i]
-    for k in range(4):
-        for i in range(ROWS):
-            states[k, i] = moved[k, i]
-
-
-@kernel
 def learned_force(controller, inverse):
     """What was learned of finger and device, as the forces that it takes in heave and rocking."""
     c, v = record(controller, CONTROLLER_T, 0), record(inverse, INVERSE_T, 0)
@@ -443,20 +164,20 @@ def learned_force(controller, inverse):
 
 @kernel
 def compare(inverse, nominal, learned):
-    """Mean squares over a second of what the untouched device is asked for in heave, and of what was learned of it."""
+    """Mean squares over a second of the free device's nominal force in heave, and of what was learned beside it."""
     v = record(inverse, INVERSE_T, 0)
     free = 1.0 - v.contact
-    v.heard += v.slowly * (free * v.reference * v.reference - v.heard)
-    v.asked += v.slowly * (free * nominal * nominal - v.asked)
-    v.added += v.slowly * (free * learned * learned - v.added)
+    v.reference_power += v.slowly * (free * v.reference * v.reference - v.reference_power)
+    v.nominal_power += v.slowly * (free * nominal * nominal - v.nominal_power)
+    v.learned_power += v.slowly * (free * learned * learned - v.learned_power)
 
 
 @kernel
 def level(inverse):
     """Rocking force that slowly levels the device under the load: a moving finger would else tilt it to and fro."""
     v = record(inverse, INVERSE_T, 0)
-    wanted = v.contact * min(max(v.lever * v.theta[LOAD] + v.theta[LOAD + 1], -LARGEST_MOMENT), LARGEST_MOMENT)
-    v.moment += v.levelling * (wanted - v.moment)
+    target = v.contact * min(max(v.lever * v.theta[LOAD] + v.theta[LOAD + 1], -LARGEST_MOMENT), LARGEST_MOMENT)
+    v.moment += v.levelling * (target - v.moment)
     return v.moment
 
 
@@ -480,10 +201,11 @@ def scale_reference(inverse, needed):
 def recover(controller, inverse):
     """Start afresh from the prior, with nothing learned: a number got out of hand."""
     c, v = record(controller, CONTROLLER_T, 0), record(inverse, INVERSE_T, 0)
-    forget(inverse, FINGER, PARAMETERS)
+    reset_parameters(inverse, FINGER, PARAMETERS)
     note_device(inverse)
     note_device(inverse)
-    v.moment = v.slow = v.power = v.asked = v.added = v.peak = v.size[0] = v.size[1] = v.poles[0] = v.poles[1] = 0.0
+    v.moment = v.slow = v.power = v.nominal_power = v.learned_power = v.peak = 0.0
+    v.model_power[0] = v.model_power[1] = v.poles[0] = v.poles[1] = 0.0
     v.scale = v.smooth_scale = 1.0
     for k in range(4):
         v.states[k, PARAMETERS] = 0.0
@@ -545,17 +267,17 @@ def inverse_step(state, signals, start, count):
             update_targets(state, signals, n)
         else:
             c.sample += 1
-        settled = follow_contact(state, inverse)
+        learning = follow_contact(state, inverse)
         take_reference(state, inverse, waveform[n] if c.p.analysed > 0.0 else 0.0)
         error0, error1 = y0 - c.p.shape[0] * v.reference, y1 - c.p.shape[1] * v.reference
         samples[Y, 0] = samples[Y + 1, 0] = 0.0
         if update_confidence(state, implausible):
-            forget(inverse, 0, PARAMETERS)
+            reset_parameters(inverse, 0, PARAMETERS)
         elif implausible == 0 and v.learns > 0:
             open_gate(state, inverse, error0)
             for i in range(c.p.coordinates):
                 error = error0 if i == 0 else error1
-                if settled:
+                if learning:
                     learn(inverse, i, error)
                 samples[Y + i, 0] = damp(state, i, error)
         if v.sample % REVERSION == 0:

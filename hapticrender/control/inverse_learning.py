@@ -1,0 +1,255 @@
+"""What the waveform law learns: a Kalman filter for finger, device and load, and the loaded device's model behind it.
+
+Symbols and equations are those of `inverse_kernel`: e = w - sum_i th_i psi_i + noise.  The regressors psi_i and w are
+states of the loaded device G, discretised anew as the estimate moves; what a contact does to them is here, too.
+"""
+
+from __future__ import annotations
+
+from numba import carray
+
+from hapticrender.control.inverse_records import (
+    BASIS,
+    FINGER,
+    HEAVE,
+    INITIAL,
+    INVERSE_T,
+    LOAD,
+    PARAMETERS,
+    RING,
+    ROCKING,
+    ROWS,
+)
+from hapticrender.control.laws import contact_damping
+from hapticrender.control.records import CONTROLLER_T
+from hapticrender.jit import F8, kernel, pointer, record
+from hapticrender.mathx import TURN
+
+FARTHEST_LEVER = 2.0  # no surface is longer
+
+
+@kernel
+def corrected(value, change):
+    """Move a positive number by a change that leaves it between 0.3 and 5 times what it was."""
+    return value + min(max(change, -0.7 * value), 4.0 * value)
+
+
+@kernel
+def discretise(controller, inverse):
+    """Exact step of the loaded device over a sample, from a series of ten terms; states are coordinates, velocities.
+
+    The finger counts by its mass and damping at 180 Hz, the device with what was learned of its heave.
+    """
+    v = record(inverse, INVERSE_T, 0)
+    theta, w, period = v.theta, TURN * 180.0, 1.0 / record(controller, CONTROLLER_T, 0).p.rate
+    turn, pole = w / v.hertz_scale, v.pole
+    low = complex(pole * pole - w * w, 2.0 * v.pole_damping * pole * w)
+    z = complex(theta[0] - theta[2] * turn * turn, theta[1] * turn)
+    z += (theta[3] * pole * pole + complex(0.0, theta[4] * pole * w)) / low
+    mass = min(max(-z.real / (w * w), -min(2e-3, 0.2 * v.mass[0, 0])), 10e-3) * v.contact
+    damping = min(max(z.imag / w, 0.0), 12.0) * v.contact
+    h, per_c, per_m = v.lever, 1.0 / v.hertz_scale, 1.0 / (v.hertz_scale * v.hertz_scale)
+    m00 = corrected(v.mass[0, 0], per_m * theta[HEAVE + 2]) + mass
+    m01, m11 = v.mass[0, 1] + h * mass, corrected(v.mass[1, 1], per_m * theta[ROCKING + 2]) + h * h * mass
+    c00 = corrected(v.damping[0, 0] + contact_damping(controller), per_c * theta[HEAVE + 1]) + damping
+    c01, c11 = v.damping[0, 1] + h * damping, corrected(v.damping[1, 1], per_c * theta[ROCKING + 1]) + h * h * damping
+    k00, k01 = corrected(v.stiffness[0, 0], theta[HEAVE]), v.stiffness[0, 1]
+    k11 = corrected(v.stiffness[1, 1], theta[ROCKING])
+    scale = 1.0 / (m00 * m11 - m01 * m01)
+    i00, i01, i11 = scale * m11, -scale * m01, scale * m00
+    # rates (1/s) that bound the norm; the step is halved until the series converges, and doubled again after it
+    size = (abs(i00) + abs(i01) + abs(i11)) * (c00 + abs(c01) + c11 + period * (k00 + abs(k01) + k11)) * period
+    halvings = 0
+    while size > 0.5 and halvings < 30:
+        size, period, halvings = 0.5 * size, 0.5 * period, halvings + 1
+    i00, i01, i11 = period * i00, period * i01, period * i11
+    flow, power, following, found = v.flow, v.power_of_flow, v.following, v.step
+    flow[0, 2] = flow[1, 3] = period
+    flow[2, 0], flow[3, 0] = -i00 * k00 - i01 * k01, -i01 * k00 - i11 * k01
+    flow[2, 1], flow[3, 1] = -i00 * k01 - i01 * k11, -i01 * k01 - i11 * k11
+    flow[2, 2], flow[3, 2] = -i00 * c00 - i01 * c01, -i01 * c00 - i11 * c01
+    flow[2, 3], flow[3, 3] = -i00 * c01 - i01 * c11, -i01 * c01 - i11 * c11
+    flow[2, 4], flow[3, 4], flow[2, 5], flow[3, 5] = i00, i01, i01, i11
+    for i in range(4):
+        for j in range(6):
+            power[i, j] = flow[i, j]
+            found[i, j] = flow[i, j] + (1.0 if i == j else 0.0)
+    for term in range(2, 11):
+        for i in range(4):
+            for j in range(6):
+                following[i, j] = 0.0
+            for k in range(4):
+                for j in range(6):
+                    following[i, j] += flow[i, k] * power[k, j] / term
+        for i in range(4):
+            for j in range(6):
+                power[i, j] = following[i, j]
+                found[i, j] += following[i, j]
+    for _ in range(halvings):  # Phi(2 h) = Phi Phi, Gamma(2 h) = Phi Gamma + Gamma
+        for i in range(4):
+            for j in range(6):
+                following[i, j] = found[i, j] if j >= 4 else 0.0
+            for k in range(4):
+                for j in range(6):
+                    following[i, j] += found[i, k] * found[k, j]
+        for i in range(4):
+            for j in range(6):
+                found[i, j] = following[i, j]
+
+
+@kernel
+def reset_parameters(inverse, first, last):
+    """Set parameters back to their prior; nothing else is known of them."""
+    v = record(inverse, INVERSE_T, 0)
+    theta, covariance, spread, states = v.theta, v.covariance, v.spread, v.states
+    for i in range(first, last):
+        theta[i] = v.prior[i]
+        for j in range(PARAMETERS):
+            inside = first <= j < last
+            covariance[i, j] = spread[i, j] if inside else 0.0
+            covariance[j, i] = covariance[i, j]
+        for k in range(4):
+            states[k, i] = 0.0
+
+
+@kernel
+def note_device(inverse):
+    """Note the device's own parameters and their covariance, and keep the last note."""
+    v = record(inverse, INVERSE_T, 0)
+    theta, covariance, earlier = v.theta, v.covariance, v.earlier
+    for i in range(7):
+        for j in range(8):
+            earlier[0, j, i] = earlier[1, j, i]
+            earlier[1, j, i] = theta[HEAVE + i] if j == 7 else covariance[HEAVE + j, HEAVE + i]
+
+
+@kernel
+def restore_device(inverse):
+    """Set the device's own parameters back to the earlier note: a contact is reported after it happened."""
+    v = record(inverse, INVERSE_T, 0)
+    theta, covariance, earlier = v.theta, v.covariance, v.earlier
+    reset_parameters(inverse, HEAVE, LOAD)
+    for i in range(7):
+        theta[HEAVE + i] = earlier[0, 7, i]
+        for j in range(7):
+            covariance[HEAVE + j, HEAVE + i] = earlier[0, j, i]
+            earlier[1, j, i] = earlier[0, j, i]
+        earlier[1, 7, i] = earlier[0, 7, i]
+
+
+@kernel
+def restart(inverse):
+    """Learn afresh from here on, with the deviation of now as four more parameters; the estimates stay.
+
+    The covariance returns to the prior: what the ringing of a contact taught through a model without the finger is not
+    as certain as it seemed.
+    """
+    v = record(inverse, INVERSE_T, 0)
+    theta, covariance, states = v.theta, v.covariance, v.states
+    restore_device(inverse)
+    for i in range(PARAMETERS):
+        within = i < HEAVE or i >= LOAD
+        for j in range(PARAMETERS):
+            if within or j < HEAVE or j >= LOAD:
+                covariance[i, j] = v.spread[i, j]
+    for k in range(4):
+        for i in range(ROWS):
+            states[k, i] = 0.0
+        states[k, INITIAL + k] = 1.0
+        theta[INITIAL + k], covariance[INITIAL + k, INITIAL + k] = 0.0, v.start[k]
+
+
+@kernel
+def follow_contact(controller, inverse):
+    """Reset what belongs to a contact when one begins or ends, and learn afresh: at once, and when its ringing is over.
+
+    Returns whether there is anything to learn from.
+    """
+    c, v = record(controller, CONTROLLER_T, 0), record(inverse, INVERSE_T, 0)
+    if c.finger_seen > 0.0:
+        v.lever = min(max(v.lever_per_metre * c.held_position, -FARTHEST_LEVER), FARTHEST_LEVER)
+    v.since += 1.0
+    sticks = c.p.needs_contact > 0.0 and c.speed < c.p.least_speed
+    touching = 0.0 if sticks else c.finger_seen
+    v.away = 0.0 if touching > 0.0 else v.away + 1.0
+    if v.contact > 0.0 and v.away < v.patience:  # a position that is missing for so short is no lift-off
+        touching = 1.0
+    if touching != v.contact:
+        v.contact, v.since = touching, 0.0
+        reset_parameters(inverse, FINGER, HEAVE)
+        reset_parameters(inverse, LOAD, PARAMETERS)
+        c.fast_timer = v.damper_time
+        discretise(controller, inverse)
+    elif v.since == v.settling or v.since == v.joining:
+        restart(inverse)
+    elif v.since == v.joined:
+        reset_parameters(inverse, INITIAL, PARAMETERS)
+    elif v.since > v.joined and v.sample % int(v.notice) == 0:
+        note_device(inverse)
+    return v.since >= v.settling
+
+
+@kernel
+def learn(inverse, coordinate, error):
+    """Update the parameters by a sensed deviation from the reference: a scalar step of the Kalman filter."""
+    v = record(inverse, INVERSE_T, 0)
+    states, theta, covariance, gain = v.states, v.theta, v.covariance, v.inputs
+    explained = states[coordinate, PARAMETERS]
+    v.model_power[coordinate] += v.mean_square * (error * error + explained * explained - v.model_power[coordinate])
+    innovation, scatter = error - explained, v.noise[coordinate] + v.model_error * v.model_power[coordinate]
+    for i in range(PARAMETERS):
+        innovation += states[coordinate, i] * theta[i]
+    for i in range(PARAMETERS):
+        found = 0.0
+        for j in range(PARAMETERS):
+            found += covariance[i, j] * states[coordinate, j]
+        gain[0, i] = found
+        scatter += found * states[coordinate, i]
+    for i in range(PARAMETERS):
+        share = gain[0, i] / scatter
+        theta[i] -= share * innovation
+        for j in range(PARAMETERS):
+            covariance[i, j] -= share * gain[0, j]
+
+
+@kernel
+def revert(inverse):
+    """Let the parameters return to their mean, and their covariance to its prior."""
+    v = record(inverse, INVERSE_T, 0)
+    kept, theta, covariance, spread = v.kept, v.theta, v.covariance, v.spread
+    for i in range(PARAMETERS):
+        theta[i] = v.prior[i] + kept[i] * (theta[i] - v.prior[i])
+        for j in range(PARAMETERS):
+            share = kept[i] * kept[j]
+            covariance[i, j] = share * covariance[i, j] + (1.0 - share) * spread[i, j]
+
+
+@kernel
+def advance_regressors(controller, inverse):
+    """Advance the regressors by a sample, under the basis and the deviation force that act in it."""
+    c, v = record(controller, CONTROLLER_T, 0), record(inverse, INVERSE_T, 0)
+    states, moved, inputs, phi = v.states, v.moved, v.inputs, v.step
+    ring = carray(pointer(v.ring_at, F8), (v.delay + 1, RING))
+    at = (v.sample + 1) % (v.delay + 1)  # what was computed `delay` samples ago
+    touched, along = v.contact, v.contact * (c.p.shape[0] + v.lever * c.p.shape[1])
+    for i in range(ROWS):
+        inputs[0, i] = inputs[1, i] = 0.0
+    for i in range(5):
+        inputs[0, FINGER + i] = along * ring[at, i]
+        inputs[1, FINGER + i] = along * v.lever * ring[at, i]
+    for i in range(3):
+        inputs[0, HEAVE + i] = c.p.shape[0] * ring[at, i]
+        inputs[1, ROCKING + i] = ring[at, i]
+    inputs[0, HEAVE + 3] = c.p.shape[0] * ring[at, 5]
+    inputs[0, LOAD], inputs[1, LOAD] = 1.0, touched * v.lever
+    inputs[1, LOAD + 1] = 1.0
+    inputs[0, PARAMETERS], inputs[1, PARAMETERS] = ring[at, BASIS], ring[at, BASIS + 1]
+    for k in range(4):
+        for i in range(ROWS):
+            moved[k, i] = phi[k, 4] * inputs[0, i] + phi[k, 5] * inputs[1, i]
+        for j in range(4):
+            for i in range(ROWS):
+                moved[k, i] += phi[k, j] * states[j, i]
+    for k in range(4):
+        for i in range(ROWS):
+            states[k, i] = moved[k, i]

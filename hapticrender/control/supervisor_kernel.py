@@ -1,0 +1,281 @@
+"""Supervision: a compiled step around a controller's that stops the drive where the device does not do as it is told.
+
+Every sample it compares what is sensed with the drive that acts, at a cost that does not grow with the bands.  With the
+coordinates q (heave, rocking) and the force F = B u, the mean of the samples before and after the moment of sensing,
+both behind the same filter H (one-pole high-pass and low-pass, then a Butterworth low-pass of second order, trapezoidal
+rule), the residual force
+
+    r = H F - (M H s^2 q + C H s q + K H q)
+
+is what the device model lacks: a finger, its load, noise, or a fault.  Energies E are one-pole means of squares.
+
+=== ============ ================================================================================ ====================
+no  test         condition                                                                        for
+=== ============ ================================================================================ ====================
+1   invalid      share of samples that are not finite or not inside the range > 0.3               50 ms (mean)
+2   frozen       a sensor repeats a value for 10 samples and 2 ms while the drive moves           at once
+3   inconsistent E_r > finger + load + model + delay + noise, and E_r < 6 E_F                     15 to 60 ms
+4   active       -mean(r v) > 0.6 sqrt(E_F E_v), E_r < 6 E_F, in danger only                      5 ms
+5   drive        mean of u^2 > (1.5 B + A/2.4)^2/2: more than any finger takes                    30 ms (mean) + 60 ms
+6   ringing      inner damper's force beyond 500 Hz and 1.5 times the carriers > 4 times its noise   8 ms
+7   overmotion   motion of an end > 3 R + 5.4 sag                                                 5 samples
+=== ============ ================================================================================ ====================
+
+R (m) and B (drive unit) are what the scene needs at most with the worst finger, A the drive of a hard press, `sag` the
+static displacement under 5 N.  *Danger* is a motion > 4 R + 1.36 sag or a drive above 0.9 of its limit.  The drive
+fades out in 10 ms, in danger in 2 ms, on overmotion in 0.2 ms, and stays at zero.  A ringing damper is turned down to
+0.4, then to 0; the drive stops where it rings all the same for 150 ms.
+
+Tests 3 to 5 and 7 need a `Demand`; 6 a controller with an inner damper.  Without them a controller has tests 1 and 2.
+`control.supervisor` designs all of it.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numba
+import numpy as np
+from numba import carray
+
+from hapticrender.control.records import CONTROLLER_T, MOST_CHANNELS, MOST_SENSORS
+from hapticrender.jit import F8, I8, SIGNALS_T, call, kernel, pointer, record, step
+from hapticrender.protocols import Flag
+
+INVALID, FROZEN, INCONSISTENT, ACTIVE, DRIVE, RINGING, OVERMOTION = range(1, 8)
+STOPPED = int(Flag.STOPPED)
+ROOT2 = math.sqrt(2.0)
+INVALID_SHARE = 0.3
+BY_DRIVE = 6.0  # E_r over E_F: in a fault the residual is the drive, in a load step it is not
+POWER = 0.6
+RINGING_STEP = 0.4
+
+_SETTINGS = """
+sensor_limit invalid_pole frozen_drive low high corner shape omega energy_pole power_pole drive_pole
+ring_corner ring_shape ring_pole lever danger_motion danger_drive most_motion most_drive large_drive
+fade_out fade_danger fade_now
+""".split()
+_TIMES = "frozen inconsistent active drive ring ring_wait ring_stop suspension".split()  # samples
+SETTINGS = np.dtype(
+    [
+        *((name, np.float64) for name in _SETTINGS),
+        *((name, np.float64, (2, 2)) for name in ("mass", "damping", "stiffness")),
+        ("coordinate_from_sensor", np.float64, (2, MOST_SENSORS)),
+        ("force_from_drive", np.float64, (2, MOST_CHANNELS)),
+        ("bound", np.float64, (2, 8)),  # of E_r, of each coordinate, per energy of q, v, a, dF in both
+        ("noise", np.float64, (2,)),  # of E_r (N2)
+        ("ringing", np.float64, (2,)),  # N2, of the damper's force; 0: no test
+        *((f"{name}_time", np.int64) for name in _TIMES),
+        *((name, np.int64) for name in ("step", "state", "controller", "modelled", "sensors", "channels", "block")),
+        *((name, np.int64) for name in ("delay", "needs_contact", "forces_at")),
+    ]
+)
+"""Settings of a supervisor, as `design_supervisor` derives them; poles and fades are per sample, times in samples."""
+SUPERVISOR = np.dtype(
+    [
+        ("p", SETTINGS),
+        *(
+            (name, np.float64)
+            for name in ("fade", "fade_step", "invalid", "damper_scale", "motion", "peak", "position")
+        ),
+        *((name, np.float64, (4,)) for name in ("input", "low", "high", "band", "level", "value", "rate", "change")),
+        *((name, np.float64, (4,)) for name in ("ring_band", "ring_level")),
+        *((name, np.float64, (2,)) for name in ("force", "power", "ring_energy")),
+        ("energy", np.float64, (12,)),  # of q, v, a, dF, F, r in both coordinates
+        ("drive_energy", np.float64, (MOST_CHANNELS,)),
+        *((name, np.float64, (MOST_SENSORS,)) for name in ("last", "least", "most")),
+        ("repeats", np.int64, (MOST_SENSORS,)),
+        *((f"{name}_count", np.int64) for name in ("inconsistent", "active", "drive", "motion", "ring", "ring_wait")),
+        *((name, np.int64) for name in ("suspended", "sample", "now", "sensors", "cause", "stopped")),
+    ]
+)
+SUPERVISOR_T = numba.from_dtype(SUPERVISOR)
+
+
+@kernel
+def check_sensors(supervisor, sensed, n, drive, acts):
+    """Convert a sample's sensors to coordinates, an invalid one held; tests 1 and 2 against the sum of the drive.
+
+    A drive that does not act (on a surface without a sliding finger) moves no sensor.
+    """
+    s = record(supervisor, SUPERVISOR_T, 0)
+    p, cause, invalid, frozen = s.p, 0, 0, 0
+    q0 = q1 = 0.0
+    for i in range(p.sensors):
+        value = sensed[n * p.sensors + i]
+        if not abs(value) < p.sensor_limit:
+            invalid |= 1 << i
+        elif value == s.last[i] and acts:
+            s.repeats[i] += 1
+            s.least[i], s.most[i] = min(s.least[i], drive), max(s.most[i], drive)
+            if s.repeats[i] >= p.frozen_time and s.most[i] - s.least[i] > p.frozen_drive:
+                frozen |= 1 << i
+        else:
+            s.last[i], s.repeats[i], s.least[i], s.most[i] = value, 1, drive, drive
+        q0 += p.coordinate_from_sensor[0, i] * s.last[i]
+        q1 += p.coordinate_from_sensor[1, i] * s.last[i]
+    s.input[0], s.input[1] = q0, q1
+    s.invalid += p.invalid_pole * ((1.0 if invalid > 0 else 0.0) - s.invalid)
+    if invalid > 0 and s.invalid > INVALID_SHARE:
+        cause = INVALID
+    elif frozen > 0:
+        cause = FROZEN
+    if cause > 0 and s.cause == 0:
+        s.sensors = invalid if cause == INVALID else frozen
+    return cause
+
+
+@kernel
+def filter_signals(supervisor):
+    """Filter coordinates and forces by H; the state-variable low-pass gives H x, H s x and H s^2 x at once."""
+    s = record(supervisor, SUPERVISOR_T, 0)
+    p, g = s.p, s.p.corner
+    for i in range(4):
+        step = p.low * (s.input[i] - s.low[i])
+        x = s.low[i] + step
+        s.low[i] = x + step
+        step = p.high * (x - s.high[i])
+        mean = s.high[i] + step
+        s.high[i] = mean + step
+        top = p.shape * (x - mean - s.level[i] - (g + ROOT2) * s.band[i])
+        band = s.band[i] + g * top
+        level = s.level[i] + g * band
+        s.band[i], s.level[i] = band + g * top, level + g * band
+        s.value[i], s.rate[i], s.change[i] = level, p.omega * band, p.omega * p.omega * top
+
+
+@kernel
+def check_motion(supervisor, drive_in_danger):
+    """Tests 3, 4 and 7: whether the motion follows from the drive; returns the cause and whether there is danger."""
+    s = record(supervisor, SUPERVISOR_T, 0)
+    p, e = s.p, s.energy
+    last0, last1 = s.value[2], s.value[3]
+    filter_signals(supervisor)
+    s.motion = abs(s.value[0]) + p.lever * abs(s.value[1])
+    danger = drive_in_danger or s.motion > p.danger_motion
+    pole, wrong, active = p.energy_pole, False, False
+    for i in range(2):
+        r = s.value[2 + i]
+        for j in range(2):
+            r -= p.mass[i, j] * s.change[j] + p.damping[i, j] * s.rate[j] + p.stiffness[i, j] * s.value[j]
+        change = s.value[2 + i] - (last0 if i == 0 else last1)
+        e[i] += pole * (s.value[i] * s.value[i] - e[i])
+        e[2 + i] += pole * (s.rate[i] * s.rate[i] - e[2 + i])
+        e[4 + i] += pole * (s.change[i] * s.change[i] - e[4 + i])
+        e[6 + i] += pole * (change * change - e[6 + i])
+        e[8 + i] += pole * (s.value[2 + i] * s.value[2 + i] - e[8 + i])
+        e[10 + i] += pole * (r * r - e[10 + i])
+        s.power[i] += p.power_pole * (-r * s.rate[i] - s.power[i])
+    for i in range(2):
+        bound = p.noise[i]
+        for j in range(8):
+            bound += p.bound[i, j] * e[j]
+        by_drive = e[10 + i] < BY_DRIVE * e[8 + i]
+        wrong |= by_drive and e[10 + i] > bound
+        power = s.power[i]
+        active |= by_drive and power > 0.0 and power * power > POWER * POWER * e[8 + i] * e[2 + i]
+    s.inconsistent_count = s.inconsistent_count + (4 if danger else 1) if wrong else max(s.inconsistent_count - 2, 0)
+    s.active_count = s.active_count + 1 if active and danger else 0
+    s.motion_count = s.motion_count + 1 if s.motion > p.most_motion else 0
+    if s.motion_count >= 5:
+        return OVERMOTION, danger
+    if s.active_count >= p.active_time:
+        return ACTIVE, danger
+    return INCONSISTENT if s.inconsistent_count >= p.inconsistent_time else 0, danger
+
+
+@kernel
+def check_drive(supervisor, drive, n):
+    """Test 5, on the drive of the last sample; returns whether it failed, and the largest drive."""
+    s = record(supervisor, SUPERVISOR_T, 0)
+    p, large, peak = s.p, False, 0.0
+    for i in range(p.channels):
+        value = drive[n, i]
+        peak = max(peak, abs(value))
+        s.drive_energy[i] += p.drive_pole * (value * value - s.drive_energy[i])
+        large |= s.drive_energy[i] > p.most_drive
+    s.drive_count = s.drive_count + 1 if large else 0
+    s.peak = peak
+    return s.drive_count > p.drive_time
+
+
+@kernel
+def check_ringing(supervisor):
+    """Test 6: turn a ringing inner damper down to 0.4, then to 0; returns whether it rings all the same."""
+    s = record(supervisor, SUPERVISOR_T, 0)
+    p, c, g, over = s.p, record(s.p.controller, CONTROLLER_T, 0), s.p.ring_corner, False
+    if c.damping_gain == 0.0 and s.damper_scale == 1.0:  # off by its schedule
+        return False
+    s.suspended = p.suspension_time if s.peak > p.large_drive else max(s.suspended - 1, 0)
+    for i in range(2):
+        top = c.damper_force[i]
+        for j in (i, 2 + i):
+            top = p.ring_shape * (top - s.ring_level[j] - (g + ROOT2) * s.ring_band[j])
+            band = s.ring_band[j] + g * top
+            s.ring_band[j], s.ring_level[j] = band + g * top, s.ring_level[j] + 2.0 * g * band
+        s.ring_energy[i] += p.ring_pole * (top * top - s.ring_energy[i])
+        over |= s.ring_energy[i] > p.ringing[i] > 0.0
+    s.ring_wait_count = max(s.ring_wait_count - 1, 0)
+    s.ring_count = s.ring_count + 1 if over and s.suspended == 0 and s.ring_wait_count == 0 else 0
+    if s.damper_scale > 0.0 and s.ring_count >= p.ring_time:
+        s.damper_scale = RINGING_STEP if s.damper_scale == 1.0 else 0.0
+        s.ring_count, s.ring_wait_count, c.damper_scale = 0, p.ring_wait_time, s.damper_scale
+    return s.ring_count >= p.ring_stop_time
+
+
+@kernel
+def supervise(supervisor, sensed, position, drive, flags, n):
+    """Run the tests on a sample, and fade its drive out once one has failed."""
+    s = record(supervisor, SUPERVISOR_T, 0)
+    p = s.p
+    forces = carray(pointer(p.forces_at, F8), (p.delay + 1, 3))
+    now, later = s.now, s.now - 1 if s.now > 0 else p.delay  # the drive that acts from this sample on; this sample's
+    s.now = now + 1 if now < p.delay else 0
+    for i in range(2):
+        s.input[2 + i], s.force[i] = 0.5 * (s.force[i] + forces[now, i]), forces[now, i]
+    acts = p.needs_contact == 0 or (position[n] == position[n] and position[n] != s.position)
+    s.position = position[n]
+    cause, danger = check_sensors(supervisor, sensed, n, forces[now, 2], acts), False
+    if check_drive(supervisor, drive, n) and cause == 0:
+        cause = DRIVE
+    if p.modelled > 0:
+        if s.sample == 0:  # a steady load is no motion
+            for i in range(2):
+                s.low[i] = s.high[i] = s.input[i]
+        found, danger = check_motion(supervisor, s.peak > p.danger_drive)
+        cause = found if cause == 0 or found == OVERMOTION else cause
+        if p.controller != 0 and check_ringing(supervisor) and cause == 0:
+            cause = RINGING
+    if cause != 0 and s.cause == 0:
+        s.cause, s.stopped = cause, s.sample
+    if s.cause != 0:
+        step = p.fade_now if cause == OVERMOTION else p.fade_danger if danger else p.fade_out
+        s.fade_step = max(s.fade_step, step)
+        s.fade = max(s.fade - s.fade_step, 0.0)
+        flags[n] |= STOPPED
+    force0 = force1 = total = 0.0
+    for i in range(p.channels):
+        value = s.fade * drive[n, i]
+        drive[n, i] = value
+        force0 += p.force_from_drive[0, i] * value
+        force1 += p.force_from_drive[1, i] * value
+        total += value
+    forces[later, 0], forces[later, 1], forces[later, 2] = force0, force1, total
+    s.sample += 1
+
+
+@step
+def supervised_step(state, signals, start, count):
+    """Advance the supervised controller by `count` samples, block by block, and supervise every sample."""
+    s, io, stop = record(state, SUPERVISOR_T, 0), record(signals, SIGNALS_T, 0), start + count
+    p = s.p
+    sensed, position, flags = pointer(io.sensed, F8), pointer(io.position, F8), carray(pointer(io.flags, I8), stop)
+    drive = carray(pointer(io.drive, F8), (stop, p.channels))
+    for first in range(start, stop, p.block):
+        if s.fade > 0.0:
+            call(p.step, (p.state, signals, first, p.block))
+        else:
+            drive[first : first + p.block] = 0.0
+        for n in range(first, first + p.block):
+            supervise(state, sensed, position, drive, flags, n)
+    return 0
