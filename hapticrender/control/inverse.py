@@ -70,7 +70,7 @@ def derivative_filters(rate: float, top: float, first: int = 0, count: int = 4, 
         weight = np.maximum(omega, 2 * np.pi * 20.0) ** -order
         rows = np.vstack([inside * weight[:, None], 1e-6 * outside / (2 * np.pi * top) ** order]) * rate**order
         wanted = np.concatenate([(1j * omega) ** order * turn * weight, np.zeros(len(above))])
-        fit = np.linalg.lstsq(np.vstack([rows.real, rows.imag]), np.r_[wanted.real, wanted.imag])[0]
+        fit = np.linalg.lstsq(np.vstack([rows.real, rows.imag]), np.r_[wanted.real, wanted.imag], rcond=None)[0]
         found[i] = rate**order * fit
     return found
 
@@ -102,7 +102,7 @@ def finger_prior(model: DeviceModel) -> tuple[Array, Array]:
     weight = 1.0 / abs(model.dynamic_stiffness(frequency)[:, 0, 0])
     rows = basis * weight[:, None]
     wanted = (stiffness * weight).T
-    found = np.linalg.lstsq(np.vstack([rows.real, rows.imag]), np.vstack([wanted.real, wanted.imag]))[0]
+    found = np.linalg.lstsq(np.vstack([rows.real, rows.imag]), np.vstack([wanted.real, wanted.imag]), rcond=None)[0]
     covariance = np.cov(found)
     return found.mean(axis=1), covariance + np.diag(0.02 * covariance.diagonal())
 
