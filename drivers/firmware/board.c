@@ -6,6 +6,8 @@
 
 #define TWO_PI REAL(6.28318530717958648)
 #define MICROSECOND REAL(1e-6)
+#define APPROACH REAL(10e-3)                      /* s */
+#define LARGEST_STEP REAL(5e-3)                   /* m */
 #ifdef REAL_DOUBLE
 #define real_cos cos
 #else
@@ -29,7 +31,7 @@ void board_init(board_t *board)
     board->clock_step = (uint32_t)(REAL(65536e6) / design.rate + REAL(0.5));
     board_defaults(board);
     law_init(&board->law, &board->played);
-    board->finger.position = (real_t)NAN;
+    board->finger.position = board->position = (real_t)NAN;
     board->quiet = samples_of(board, BOARD_SILENCE_MS);
 }
 
@@ -63,7 +65,8 @@ void board_stop(board_t *board, board_cause cause)
     }
 }
 
-/* Position of the finger now: along its velocity for a while, then held, then lifted. */
+/* Position of the finger now: along its velocity for a while, then held, then lifted.  Between words it follows the
+   velocity, and approaches what the last word says within 10 ms, so that words that differ make no step. */
 static void place_finger(board_t *board)
 {
     word_t *finger = &board->finger;
@@ -71,10 +74,18 @@ static void place_finger(board_t *board)
     if (age > 1000u * BOARD_FINGER_MS) {
         finger->position = (real_t)NAN;
     }
-    if (age > 1000u * BOARD_EXTRAPOLATE_MS) {
+    int moves = age <= 1000u * BOARD_EXTRAPOLATE_MS;
+    if (!moves) {
         age = 1000u * BOARD_EXTRAPOLATE_MS;
     }
-    board->position = finger->position + finger->velocity * (real_t)age * MICROSECOND;
+    real_t period = REAL(1.0) / board->played.rate, velocity = moves ? finger->velocity : REAL(0.0);
+    real_t now = finger->position + finger->velocity * (real_t)age * MICROSECOND;
+    real_t off = now - (board->position + velocity * period);
+    if (real_abs(off) < LARGEST_STEP) {
+        board->position += velocity * period + off * period / APPROACH;
+    } else {                                      /* NaN included: it touches, lifts, or is elsewhere */
+        board->position = now;
+    }
 }
 
 static void play_multisine(board_t *board)
