@@ -16,6 +16,7 @@
 
 #define LAW_FILTER_TAPS 12  /* of the derivatives' filters, 6 of them ahead */
 #define LAW_LOOKAHEAD (LAW_DELAY + LAW_FILTER_TAPS / 2)
+#define LAW_PAST 16         /* samples of the inner damper, a power of two */
 #define LAW_BASIS 6         /* r, r'/w_n, r''/w_n^2, r through the pair of poles, its derivative/w_p, D_00 r' T */
 #define LAW_RING (LAW_BASIS + 2) /* basis and deviation force of a sample, until they act */
 
@@ -38,9 +39,12 @@
 typedef struct {
     real_t frequency;  /* Hz, >= 0 */
     real_t wavenumber; /* 1/m, >= 0; > 0: it follows the finger */
-    real_t phase;      /* turns */
+    real_t phase;      /* turns, -1..1 */
     real_t re, im;     /* m, amplitude */
 } band_t;
+
+#define LAW_MOST_WAVENUMBER REAL(1e5) /* 1/m */
+#define LAW_MOST_PHASE REAL(1.0)      /* turns, either way */
 
 /* Everything that `hapticrender export` derives from a scene; see hapticrender/control/inverse_records.py. */
 typedef struct {
@@ -66,7 +70,7 @@ typedef struct {
     real_t lever_per_metre; /* 1/m: lever arm of a finger at x is this times x */
     /* inner damper */
     real_t taps[2][LAW_DAMPER_TAPS]; /* N/m */
-    real_t damper, damper_high;      /* gains at rest and while it is open */
+    real_t damper_high;              /* gain while it is open, 1 or 0 */
     real_t release;                  /* fall of the gain a sample */
     real_t level, high_pass, mean_square; /* m^2 that opens it; poles a sample */
     uint32_t damper_time;                 /* samples, after a contact */
@@ -81,7 +85,7 @@ typedef struct {
     uint32_t settling, joining, joined, notice, patience; /* samples */
     real_t noise[2], model_error;                         /* m^2, and part of the deviation's power */
     real_t levelling;                                     /* pole a sample */
-    real_t prior[LAW_PARAMETERS], kept[LAW_PARAMETERS], start[4];
+    real_t prior[LAW_PARAMETERS], lost[LAW_PARAMETERS], start[4]; /* lost: of the way from the prior, a reversion */
     real_t spread[LAW_PARAMETERS][LAW_PARAMETERS];
 } design_t;
 
@@ -94,6 +98,8 @@ typedef struct {
     real_t turns, omega, sweep, fade;
     real_t carrier_re, carrier_im, turn_re, turn_im, ahead_re, ahead_im;
     real_t target_re, target_im, measured_re, measured_im;
+    uint32_t active; /* 0: no amplitude now or next */
+    uint32_t stale;  /* 1: `ahead` is of another carrier */
 } band_state_t;
 
 typedef struct {
@@ -105,12 +111,11 @@ typedef struct {
     real_t theta[LAW_PARAMETERS];
     real_t covariance[LAW_PARAMETERS][LAW_PARAMETERS];
     real_t states[4][LAW_ROWS];
-    real_t step[4][6]; /* [Phi, Gamma] of the loaded device */
+    real_t step[4][6]; /* [Phi, Gamma] of the loaded device over a sample */
     real_t earlier[2][LAW_OWN + 1][LAW_OWN]; /* the device's own covariance and parameters, 10-20 ms and 0-10 ms ago */
     real_t model_power[2];
     real_t lever;
     uint32_t contact, since, away; /* 0 or 1; samples */
-    uint32_t notice_in;            /* samples to the next note */
 } learning_t;
 
 /* The whole state; only law_* functions touch it. */
@@ -120,21 +125,22 @@ typedef struct law {
     finger_t finger;
     learning_t learning;
     real_t drive_limit;                       /* A */
-    real_t gain, gain_from, gain_to, gain_change;
+    real_t gain, gain_from, gain_to, gain_change; /* of the reference: now, a change's ends, 0..1 how far it is */
     real_t fade, last_waveform;               /* of the waveform */
     real_t window[LAW_FILTER_TAPS], shown[LAW_FILTER_TAPS], delayed[LAW_DELAY];
     real_t reference;                         /* m, what the sensors should show now */
     real_t basis[LAW_BASIS], poles[2];
     real_t ring[LAW_DELAY + 1][LAW_RING];
-    real_t past[2][LAW_DAMPER_TAPS];          /* deviations, latest first */
+    real_t past[2][LAW_PAST];                 /* deviations, a ring */
     real_t slow, power, fast_open;            /* of the damper's gate */
     real_t moment, confidence;
     real_t peak, scale, smooth_scale;
     real_t shaper[2][LAW_CHANNELS];
     real_t measured_dc;
     uint32_t held, fast_timer;                /* samples */
-    uint32_t at_delay, at_ring;               /* places in `delayed` and `ring` */
-    uint32_t carriers_in, revert_in, discretise_in; /* samples to the next refresh */
+    uint32_t at_delayed, at_ring;             /* places in `delayed` and `ring` */
+    uint32_t sample;                          /* modulo 2^32 */
+    uint32_t flags;                           /* of this sample */
 } law_t;
 
 /* Set a law to rest, with the bands of its design and a gain of 1. */
