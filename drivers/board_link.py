@@ -5,18 +5,18 @@ from __future__ import annotations
 import math
 from collections import deque
 from dataclasses import dataclass
-from struct import pack as pack_fields
 
 from hapticrender.drivers import protocol
 from hapticrender.drivers.protocol import Capabilities, Frame, Kind, Reason, Stream, Telemetry
 from hapticrender.errors import ProtocolError
 
 WORDS = 0.01  # s between two words, FINGER or HEARTBEAT: eight of them fit into the board's 80 ms of silence
+FASTEST = 0.005  # s between two words of the finger at least
 RESEND = 0.03  # s after which a command without a reply is sent again
 STRANGE = 3  # answers for another session in a row after which ours has ended
 MOST_STREAM = 4096  # frames of the stream that wait for the caller
 
-Finger = tuple[float, float, float]  # position (m, NaN: lifted), velocity (m/s), load (N)
+Finger = tuple[float, float, float, float]  # time (s), position (m, NaN: lifted), velocity (m/s), load (N)
 
 
 @dataclass
@@ -58,10 +58,10 @@ class Link:
         self.capabilities: Capabilities | None = None
         self.telemetry: Telemetry | None = None
         self.stream: deque[Stream] = deque(maxlen=MOST_STREAM)
-        self.finger: Finger | None = None
+        self.finger: Finger | None = None  # not sent yet
         self.received = now  # s, of the last good frame
         self.sent_bytes = self.received_bytes = 0
-        self._began, self._word_due = now, now
+        self._began, self._spoken = now, -math.inf
         self._reader = protocol.Reader()
         self._sequence = nonce & 0xFFFF
         self._waiting: deque[Request] = deque()
@@ -96,13 +96,9 @@ class Link:
                 first.sequence = self._next()
             first.sent = now
             out += self._command(first.kind, first.sequence, first.payload)
-        if self.capabilities is not None and now >= self._word_due:
-            self._word_due = max(self._word_due + WORDS, now)
-            time = pack_fields("<I", int((now - self._began) * 1e6) & 0xFFFFFFFF)
-            kind = Kind.HEARTBEAT if self.finger is None else Kind.FINGER
-            out += self._command(
-                kind, self._next(), time + pack_fields(f"<{len(self.finger or ())}f", *self.finger or ())
-            )
+        if self.capabilities is not None and now - self._spoken >= (WORDS if self.finger is None else FASTEST):
+            self._spoken = now
+            out += self._word(now)
         self.sent_bytes += len(out)
         return out
 
@@ -114,6 +110,14 @@ class Link:
                 self._take(frame, now)
             except ValueError:  # a CRC that holds by chance
                 self._reader.bad += 1
+
+    def _word(self, now: float) -> bytes:
+        """Where the finger is, if that is new, or a sign of life."""
+        finger, self.finger = self.finger, None
+        time = round(((now if finger is None else finger[0]) - self._began) * 1e6) & 0xFFFFFFFF
+        if finger is None:
+            return self._command(Kind.HEARTBEAT, self._next(), protocol.pack(Kind.HEARTBEAT, time))
+        return self._command(Kind.FINGER, self._next(), protocol.pack(Kind.FINGER, time, *finger[1:]))
 
     def _take(self, frame: Frame, now: float) -> None:
         try:
@@ -137,7 +141,7 @@ class Link:
             found = protocol.capabilities(frame.payload)
             if request.kind != Kind.HELLO or found.nonce != self.nonce:
                 return
-            self.capabilities, self._word_due = found, -math.inf
+            self.capabilities = found
         elif not frame.payload or frame.payload[0] != request.kind:
             return
         elif kind == Kind.REFUSE and frame.payload[1] == Reason.CHECK:

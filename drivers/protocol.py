@@ -199,6 +199,8 @@ def encode(frame: Frame) -> bytes:
 
 def decode(code: bytes) -> Frame:
     """Frame from its bytes without the delimiter; a ValueError where they are no frame or the CRC is wrong."""
+    if len(code) > MOST_BODY + 1:
+        raise ValueError(f"code of {len(code)} bytes: must be <= {MOST_BODY + 1}")
     body = cobs_decode(code)
     if not 5 <= len(body) <= MOST_BODY:
         raise ValueError(f"frame of {len(body)} bytes: must be 5 to {MOST_BODY}")

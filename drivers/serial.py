@@ -13,7 +13,7 @@ import threading
 import time
 from collections.abc import Callable, Sequence
 from types import TracebackType
-from typing import Any, NamedTuple, Protocol, Self
+from typing import Any, NamedTuple, Protocol, Self, TypeVar
 
 import numpy as np
 import serial
@@ -21,12 +21,13 @@ import serial
 from hapticrender.bands import Bands
 from hapticrender.drivers import protocol
 from hapticrender.drivers.base import BaseDriver, carry_through
-from hapticrender.drivers.board_link import Finger, Link, Request
+from hapticrender.drivers.board_link import Link, Request
 from hapticrender.drivers.protocol import Capabilities, Cause, Kind, Reason, State, Telemetry
 from hapticrender.errors import DeviceFault, DeviceLost, DeviceNotFound, DeviceTimeout, DriverError
 from hapticrender.protocols import Array, Controller, Exchange, Flag, Sensed
 
 BAUD = 230_400  # of a UART; a board on USB or a pseudo-terminal does not care
+Result = TypeVar("Result")
 PAUSE = 1e-3  # s between two looks at the line
 SILENCE = 0.5  # s without a good frame from the board after which it counts as lost
 RETRY = 0.05  # s between two attempts to open the port anew
@@ -76,7 +77,7 @@ def open_port(port: str, baud: int) -> serial.SerialBase:
 class BoardClient:
     """A board that plays textures, live.
 
-    While it is open a thread sends a word every 10 ms, the finger's if there is one, and takes what the board sends.
+    While it is open a thread sends the finger's words, or a sign of life every 10 ms, and takes what the board sends.
     Methods may be called from any thread; a failure of the line is raised by the next of them.
 
     Parameters
@@ -121,7 +122,7 @@ class BoardClient:
         self._error: DriverError | None = None
         self._thread: threading.Thread | None = None
         self._ending = threading.Event()
-        self._finger: Finger | None = None
+        self._runs = False  # something has been started
 
     def open(self) -> Self:
         """Open the port and greet the board.
@@ -149,7 +150,7 @@ class BoardClient:
             self._thread = None
         if self._line is None:
             return
-        carry_through(*([] if self._error else [self.stop]), self._close_line)
+        carry_through(*([self.stop] if self._runs and not self._error else []), self._close_line)
 
     def __enter__(self) -> Self:
         return self.open()
@@ -185,17 +186,17 @@ class BoardClient:
             raise ValueError("the targets are a waveform: must be constant envelopes, which a board can play")
         if len(bands) > most:
             raise ValueError(f"{len(bands)} bands: must be <= {most} on {self.port}; export the scene with more")
-        with self._lock:
-            self._send_bands(bands)
-            self._wanted = self._wanted._replace(bands=bands)
+        self._steadily(lambda: self._send_bands(bands))
+        self._wanted = self._wanted._replace(bands=bands)
 
     def finger(self, position: float, velocity: float = 0.0, load: float = 0.0) -> None:
         """Say where the finger is now: position (m from the middle, NaN: lifted), velocity (m/s) and load (N).
 
-        Never waits.  The board follows the velocity for 50 ms, holds for 200 ms, and then takes the finger for lifted.
+        Never waits; the last one counts, sent at most every 5 ms.  The board follows the velocity for 50 ms, then
+        holds, and after 200 ms without another takes the finger for lifted.
         """
         self._raise_error()
-        self._finger = float(position), float(velocity), float(load)
+        self._link.finger = self.clock.monotonic(), float(position), float(velocity), float(load)
 
     @property
     def gain(self) -> float:
@@ -206,9 +207,8 @@ class BoardClient:
     def gain(self, value: float) -> None:
         if not 0.0 <= value <= 1.0:
             raise ValueError(f"gain = {value!r}: must be 0 to 1")
-        with self._lock:
-            self._do(Kind.GAIN, value)
-            self._wanted = self._wanted._replace(gain=value)
+        self._steadily(lambda: self._do(Kind.GAIN, value))
+        self._wanted = self._wanted._replace(gain=value)
 
     def limits(self, peak: float, rms: float | None = None, seconds: float = 1.0) -> None:
         """Limit the drive of a channel: `peak` (A) is cut, `rms` (A) over a time constant of `seconds` stops the board.
@@ -216,9 +216,8 @@ class BoardClient:
         Both are at most the limit of the board's design; rms is `peak` unless given.
         """
         limits = (peak, peak if rms is None else rms, seconds)
-        with self._lock:
-            self._do(Kind.LIMITS, *limits)
-            self._wanted = self._wanted._replace(limits=limits)
+        self._steadily(lambda: self._do(Kind.LIMITS, *limits))
+        self._wanted = self._wanted._replace(limits=limits)
 
     def start(self, *, stream: int = 0, telemetry: float = 0.02) -> int:
         """Start to play the bands, from rest; return the sample of the board's clock at which it began.
@@ -234,17 +233,15 @@ class BoardClient:
         for name, value, least in (("stream", stream, 0), ("telemetry", period, 1)):
             if not least <= value <= 0xFFFF:
                 raise ValueError(f"{name} = {value!r} samples: must be {least} to 65535")
-        with self._lock:
-            self._link.stream.clear()
-            sample = self._begin(Kind.START, stream, period)
-            self._wanted = self._wanted._replace(start=(stream, period))
+        sample = self._steadily(lambda: self._begin(Kind.START, stream, period))
+        self._wanted = self._wanted._replace(start=(stream, period))
         return sample
 
     def stop(self) -> None:
         """Fade out within 10 ms."""
-        with self._lock:
-            self._wanted = self._wanted._replace(start=None)
-            self._do(Kind.STOP)
+        self._wanted = self._wanted._replace(start=None)
+        self._steadily(lambda: self._do(Kind.STOP))
+        self._runs = False
 
     def telemetry(self) -> Telemetry:
         """Return what the board last said.
@@ -256,13 +253,7 @@ class BoardClient:
         DeviceFault
             The board stopped by itself: the drive, or a sensor.
         """
-        self._raise_error()
-        with self._lock:
-            self._wait(lambda: self._link.telemetry is not None, "telemetry")
-            found = self._link.telemetry
-        if found is None:
-            raise DeviceTimeout(f"{self.port}: telemetry: none in {self.timeout:g} s")
-        return found
+        return self._steadily(self._latest)
 
     def rows(self) -> list[protocol.Stream]:
         """Return what has been streamed back since the last call."""
@@ -281,23 +272,17 @@ class BoardClient:
         if not lines:
             raise ValueError("lines = []: must be 1 or more")
         samples = round(duration * self.capabilities.rate)
-        with self._lock:
-            payloads = [protocol.pack(Kind.LINE, index, *line) for index, line in enumerate(lines)]
-            for payload in payloads:
-                self._done(self._link.submit(Kind.LINE, payload))
-            self._link.stream.clear()
-            first = self._begin(Kind.IDENTIFY, len(lines), samples, stream, protocol.digest(payloads))
-            columns = self.capabilities.drive_channels + self.capabilities.sensed_channels
+        first = self._steadily(lambda: self._send_lines(lines, samples, stream))
+        columns = self.capabilities.drive_channels + self.capabilities.sensed_channels
         return RowReader(self, first, stream).take(samples // stream)[:, :columns]
 
     def begin_queue(self) -> None:
         """Let the board play what `queue` sends it, from the first row on, and stream back every sample."""
-        with self._lock:
-            self._link.stream.clear()
-            self._begin(Kind.IDENTIFY, 0, 0, 1, protocol.digest([]))
+        self._steadily(lambda: self._begin(Kind.IDENTIFY, 0, 0, 1, protocol.digest([])))
 
     def queue(self, first: int, drive: Array) -> None:
         """Append rows of drive (A, shape (n, channels)), the first one of which is number `first` of the queue."""
+        self._raise_error()
         with self._lock:
             for start in range(0, len(drive), ROWS):
                 rows = np.asarray(drive[start : start + ROWS], "<f4")
@@ -338,7 +323,6 @@ class BoardClient:
     def _carry(self) -> None:
         """Carry bytes both ways; a `DeviceLost` where the line is gone or the board silent."""
         link, now = self._link, self.clock.monotonic()
-        link.finger = self._finger
         try:
             link.receive(self._line.read(65536), now)
             if due := link.due(now):
@@ -423,17 +407,40 @@ class BoardClient:
             self._done(self._link.submit(Kind.SETPOINT, payload))
         self._do(Kind.COMMIT, len(payloads), protocol.digest(payloads))
 
+    def _send_lines(self, lines: Sequence[Line], samples: int, stream: int) -> int:
+        payloads = [protocol.pack(Kind.LINE, index, *line) for index, line in enumerate(lines)]
+        for payload in payloads:
+            self._done(self._link.submit(Kind.LINE, payload))
+        return self._begin(Kind.IDENTIFY, len(lines), samples, stream, protocol.digest(payloads))
+
     def _begin(self, kind: Kind, *fields: float) -> int:
         """Start something, once the board has come to rest; return its sample."""
+        self._link.stream.clear()
         end = self.clock.monotonic() + COMING_TO_REST
         while True:
             request = self._answer(self._link.submit(kind, protocol.pack(kind, *fields)))
             if request.refused != Reason.STATE or self.clock.monotonic() >= end:
-                self._link.telemetry = None
+                self._link.telemetry, self._runs = None, True
                 return self._checked(request).sample
 
-    def _do(self, kind: Kind, *fields: float) -> Request:
+    def _latest(self) -> Telemetry:
+        self._wait(lambda: self._link.telemetry is not None, "telemetry")
+        found = self._link.telemetry
+        if found is None:
+            raise DeviceTimeout(f"{self.port}: telemetry: none in {self.timeout:g} s")
+        return found
+
+    def _steadily(self, do: Callable[[], Result]) -> Result:
+        """Do it; where the board is lost meanwhile, find it again, set it up as before, and do it once more."""
         self._raise_error()
+        with self._lock:
+            try:
+                return do()
+            except (DeviceLost, DeviceTimeout) as error:
+                self._recover(error)
+                return do()
+
+    def _do(self, kind: Kind, *fields: float) -> Request:
         return self._done(self._link.submit(kind, protocol.pack(kind, *fields)))
 
     def _done(self, request: Request) -> Request:

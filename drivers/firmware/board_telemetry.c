@@ -37,7 +37,7 @@ static uint8_t *put_band(const board_t *board, uint8_t *at, uint32_t band)
 {
     real_t envelope[2];
     law_target(&board->law, band, envelope);
-    at = put_f32(put_f32(at, (float)envelope[0]), (float)envelope[1]);
+    at = put_f32(put_f32(at, (float)(board->gain * envelope[0])), (float)(board->gain * envelope[1]));
     law_measured(&board->law, band, envelope);
     return put_f32(put_f32(at, (float)envelope[0]), (float)envelope[1]);
 }

@@ -2,9 +2,11 @@
  * The board as a process: its serial line is a pseudo-terminal, its sensors and coils are those of a plate model, and
  * the finger presses where the host says.
  *
- *   board_posix LINK [--finger MASS,DAMPING,STIFFNESS] [--noise RMS] [--seed N] [--log FILE] [--step]
+ *   board_posix LINK [--finger MASS,DAMPING,STIFFNESS] [--noise RMS] [--seed N] [--log FILE] [--slow N]
+ *               [--step]
  *
- * LINK becomes a symbolic link to the pseudo-terminal.  Paced by the clock; with --step by its standard input: a line
+ * LINK becomes a symbolic link to the pseudo-terminal.  Paced by the clock, or by one that is N times as slow; with
+ * --step by its standard input: a line
  * "SAMPLES BYTES" lets it run so many samples once it has received so many bytes in all, after which it writes
  * "SAMPLE BYTES", where it is and the bytes that it has sent in all.  FILE gets a line for whatever it executes.
  */
@@ -34,6 +36,7 @@ static board_t board;
 static plate_t plate = {4e-3, 1.5, 300.0, 1e-6, 1u, {0.0, 0.0, 0.0, 0.0}};
 static double acting[2], handed_over[2];          /* A: current now, and from the next tick on */
 static int line = -1;                             /* master of the pseudo-terminal */
+static double slower = 1.0;                       /* than the clock */
 static int stepped;                               /* time comes from standard input */
 static uint8_t received[65536];
 static size_t received_in, received_out;
@@ -94,7 +97,7 @@ static void wait_for_clock(void)
     if (due.tv_sec == 0) {
         (void)clock_gettime(CLOCK_MONOTONIC, &due);
     }
-    ahead += (long)(1e9 / (double)design.rate);
+    ahead += (long)(1e9 * slower / (double)design.rate);
     if (ahead >= BURST) {
         due.tv_nsec += ahead;
         ahead = 0;
@@ -225,6 +228,9 @@ static void take_option(const char *name, const char *value)
         return;
     }
     if (strcmp(name, "--seed") == 0 && sscanf(value, "%" SCNu64, &plate.random) == 1 && plate.random != 0u) {
+        return;
+    }
+    if (strcmp(name, "--slow") == 0 && sscanf(value, "%lf", &slower) == 1 && slower >= 1.0 && slower <= 1000.0) {
         return;
     }
     if (strcmp(name, "--log") == 0 && (log_file = fopen(value, "w")) != NULL) {
