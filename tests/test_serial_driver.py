@@ -82,22 +82,24 @@ def sensed_error(recording):
     return np.linalg.norm(error[inside]) / np.linalg.norm(np.fft.rfft(reference)[inside])
 
 
-def test_a_grating_on_the_board_is_as_good_as_on_the_simulated_device(fast):
+@pytest.mark.parametrize("noise", [1e-6, 1e-7])
+def test_a_grating_on_the_board_is_as_good_as_on_the_simulated_device(program, tmp_path, noise):
     """The board's own plate against the library's, under a finger that moves as the board says it did."""
-    played = hr.render(SCENE, driver=driver_of(fast, finger=FINGER))
+    with SteppedBoard(program, tmp_path, options=("--noise", str(noise))) as board:
+        played = hr.render(SCENE, driver=driver_of(board, finger=FINGER))
     position = played.read("position")
     position[: np.argmax(np.isfinite(position))] = position[np.isfinite(position)][0]
     same = hr.Finger.sampled(position, rate=RATE, normal_load=0.4, mechanics=MECHANICS)
-    simulated = hr.render(replace(SCENE, finger=same))
+    simulated = hr.render(replace(SCENE, finger=same, simulation={"sensor_noise": noise}))
     on_board, in_library = sensed_error(played), sensed_error(simulated)
-    noise = 1e-6 / np.sqrt(2) * np.sqrt(480 / (RATE / 2)) / (10e-6 / np.sqrt(2))
-    print(f"error by the sensors: board {on_board:.4f}, simulated {in_library:.4f}, of that noise {noise:.4f}")
-    assert in_library > 0.9 * noise
-    # float32 may take 1.2 times; two plates with noise of their own learn the finger differently by as much again
+    of_noise = noise / np.sqrt(2) * np.sqrt(480 / (RATE / 2)) / (10e-6 / np.sqrt(2))
+    print(f"error by the sensors, noise {noise}: board {on_board:.4f}, library {in_library:.4f}, noise {of_noise:.4f}")
+    assert in_library > 0.9 * of_noise
+    # float32 may take 1.2 times as much; the noises differ, and so does what is learned of the finger: 1.2 again
     assert on_board < 1.2 * 1.2 * in_library
-    (band,), (other,) = played.summary()["bands"], simulated.summary()["bands"]
-    print(f"complex error of the band: board {band['complex_error']:.4f}, simulated {other['complex_error']:.4f}")
-    assert abs(band["error_centre"]) < 0.01
+    summaries = played.summary(), simulated.summary()
+    print([(each["verdict"], each["bands"][0]["complex_error"], each["worst"]) for each in summaries])
+    assert [each["passed"] for each in summaries] == [True, True]
     assert not played.read("flags").any()
 
 
@@ -339,7 +341,9 @@ def test_doubled_and_recorded_commands_do_nothing(stepped):
         before = stepped.board.log()
         replay(stepped, recorded)
         # greeted anew, it stopped, and refused all the rest
-        assert [line[1:3] for line in stepped.board.log()[len(before) :]] == [["state", "0"], ["drives", "0"]]
+        after = [line[1:] for line in stepped.board.log()[len(before) :] if line[1] != "drives"]
+        assert after == [["state", "0", str(int(Cause.SESSION))]]
+        assert driven(stepped.board.log(), stepped.sample - 1, stepped.sample) == []
         with pytest.raises(DeviceLost, match="session: the board has another session"):
             run(client, stepped, 1.0)
 
