@@ -319,9 +319,10 @@ void learning_revert(law_t *law)
 {
     learning_t *v = &law->learning;
     const design_t *d = law->design;
-    for (uint32_t i = 0u; i < LAW_INITIAL; i++) {
+    const uint32_t end = end_active(law);
+    for (uint32_t i = 0u; i < end; i++) {
         v->theta[i] += d->lost[i] * (d->prior[i] - v->theta[i]);
-        for (uint32_t j = i; j < LAW_INITIAL; j++) {
+        for (uint32_t j = i; j < end; j++) {
             const real_t share = d->lost[i] + d->lost[j] - d->lost[i] * d->lost[j];
             const real_t found = v->covariance[i][j] + share * (d->spread[i][j] - v->covariance[i][j]);
             v->covariance[i][j] = found;
