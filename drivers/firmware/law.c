@@ -3,7 +3,6 @@
 
 #include <string.h>
 
-#define REFRESH 25u               /* samples between two discretisations of the loaded device */
 #define REVERSION 20u             /* samples between two steps of the parameters' reversion to their mean */
 #define LARGEST_MOMENT REAL(1.0)  /* N, of the levelling: a hard press may tilt the device */
 #define MOST_NEEDED REAL(20.0)    /* of the drive's limit; a reference that is scaled by more teaches nothing */
@@ -173,13 +172,14 @@ static void update_confidence(law_t *law, uint32_t invalid)
 static void use_sensors(law_t *law, const real_t coordinates[2], uint32_t learns, real_t force[2])
 {
     const design_t *d = law->design;
-    const real_t gain = open_gate(law, coordinates[0] - d->shape[0] * law->reference);
+    const real_t error[2] = {
+        coordinates[0] - d->shape[0] * law->reference, coordinates[1] - d->shape[1] * law->reference};
+    const real_t gain = open_gate(law, error[0]);
+    if (learns != 0u) {
+        learning_update(law, error);
+    }
     for (uint32_t i = 0u; i < LAW_COORDINATES; i++) {
-        const real_t error = coordinates[i] - d->shape[i] * law->reference;
-        if (learns != 0u) {
-            learning_update(law, i, error);
-        }
-        force[i] = damp(law, i, error, gain);
+        force[i] = damp(law, i, error[i], gain);
     }
     bands_measure(law, coordinates[0]);
 }
@@ -332,7 +332,7 @@ uint32_t law_step(
     if ((law->sample % REVERSION) == 0u) {
         learning_revert(law);
     }
-    if ((law->sample % REFRESH) == 0u) {
+    if ((law->sample % LEARNING_REFRESH) == 0u) {
         learning_discretise(law);
     }
     nominal_force(law, nominal);

@@ -5,6 +5,7 @@
 #include "law.h"
 
 #define TURN REAL(6.283185307179586)
+#define LEARNING_REFRESH 25u /* samples between two discretisations of the loaded device */
 #define FARTHEST REAL(1e3) /* m: a position or a waveform beyond it is no number to work with */
 
 /* Third-order step x^2 (3 - 2 x) from 0 to 1, x cut to that range. */
@@ -26,7 +27,7 @@ void learning_init(law_t *law);
 void learning_reset(law_t *law, uint32_t first, uint32_t last);
 void learning_forget(law_t *law);
 uint32_t learning_follow_contact(law_t *law);
-void learning_update(law_t *law, uint32_t coordinate, real_t error);
+void learning_update(law_t *law, const real_t error[2]);
 void learning_revert(law_t *law);
 void learning_discretise(law_t *law);
 void learning_force(const law_t *law, real_t force[2]);

@@ -1,9 +1,15 @@
 /* Learning by a Kalman filter with the device's model behind it; as hapticrender/control/inverse_learning.py. */
 #include "law_parts.h"
 
+#include <string.h>
+
 #define FARTHEST_LEVER REAL(2.0) /* no surface is longer */
 #define LONG_AGO 1000000000u     /* samples since the contact of a law at rest */
-#define TERMS 10u                /* of the series of the exponential */
+#ifdef REAL_DOUBLE
+#define TERMS 10u                /* of the series of the exponential, whose rest is below a rounding: 0.5^11/11! */
+#else
+#define TERMS 7u
+#endif
 #define MOST_HALVINGS 30u        /* of its step, until it converges */
 #define FINGER_HERTZ REAL(180.0) /* where the finger counts by its mass and damping */
 
@@ -85,10 +91,10 @@ static uint32_t assemble(real_t flow[4][6], const loaded_t *p, real_t rate)
     return halvings;
 }
 
-/* out = scale left[:, :4] right, of 4 rows and 6 columns. */
-static void multiply(real_t out[4][6], real_t left[4][6], real_t right[4][6], real_t scale)
+/* Rows from `first` on of out = scale left[:, :4] right, of 4 rows and 6 columns. */
+static void multiply(real_t out[4][6], real_t left[4][6], real_t right[4][6], real_t scale, uint32_t first)
 {
-    for (uint32_t i = 0u; i < 4u; i++) {
+    for (uint32_t i = first; i < 4u; i++) {
         for (uint32_t j = 0u; j < 6u; j++) {
             real_t sum = REAL(0.0);
             for (uint32_t k = 0u; k < 4u; k++) {
@@ -115,7 +121,12 @@ void learning_discretise(law_t *law)
         }
     }
     for (uint32_t term = 2u; term <= TERMS; term++) {
-        multiply(next, flow, power, REAL(1.0) / (real_t)term);
+        const real_t scale = REAL(1.0) / (real_t)term;
+        multiply(next, flow, power, scale, 2u);
+        for (uint32_t j = 0u; j < 6u; j++) { /* what is left of the upper rows of A T: the velocities */
+            next[0][j] = scale * flow[0][2] * power[2][j];
+            next[1][j] = scale * flow[1][3] * power[3][j];
+        }
         for (uint32_t i = 0u; i < 4u; i++) {
             for (uint32_t j = 0u; j < 6u; j++) {
                 power[i][j] = next[i][j];
@@ -124,7 +135,7 @@ void learning_discretise(law_t *law)
         }
     }
     for (uint32_t n = 0u; n < halvings; n++) { /* Phi(2 h) = Phi Phi, Gamma(2 h) = Phi Gamma + Gamma */
-        multiply(next, v->step, v->step, REAL(1.0));
+        multiply(next, v->step, v->step, REAL(1.0), 0u);
         for (uint32_t i = 0u; i < 4u; i++) {
             for (uint32_t j = 0u; j < 6u; j++) {
                 v->step[i][j] = next[i][j] + ((j >= 4u) ? v->step[i][j] : REAL(0.0));
@@ -162,40 +173,22 @@ static void note_device(learning_t *v)
     }
 }
 
-/* Set the device's own parameters back to the earlier note: a contact is reported after it happened. */
-static void restore_device(law_t *law)
-{
-    learning_t *v = &law->learning;
-    learning_reset(law, LAW_HEAVE, LAW_LOAD);
-    for (uint32_t i = 0u; i < LAW_OWN; i++) {
-        v->theta[LAW_HEAVE + i] = v->earlier[0][LAW_OWN][i];
-        for (uint32_t j = 0u; j < LAW_OWN; j++) {
-            v->covariance[LAW_HEAVE + j][LAW_HEAVE + i] = v->earlier[0][j][i];
-        }
-        for (uint32_t j = 0u; j <= LAW_OWN; j++) {
-            v->earlier[1][j][i] = v->earlier[0][j][i];
-        }
-    }
-}
-
-/* Learn afresh, with the deviation of now as four more parameters; the estimates stay, their covariance does not. */
+/*
+ * Learn afresh, with the deviation of now as four more parameters.  The estimates stay, but the device's own go back to
+ * the earlier note, as a contact is reported after it happened; the covariance of all others returns to the prior.
+ */
 static void restart(law_t *law)
 {
     learning_t *v = &law->learning;
-    restore_device(law);
-    for (uint32_t i = 0u; i < LAW_PARAMETERS; i++) {
-        for (uint32_t j = 0u; j < LAW_PARAMETERS; j++) {
-            const uint32_t own =
-                ((i >= LAW_HEAVE) && (i < LAW_LOAD) && (j >= LAW_HEAVE) && (j < LAW_LOAD)) ? 1u : 0u;
-            if (own == 0u) {
-                v->covariance[i][j] = law->design->spread[i][j];
-            }
-        }
+    (void)memcpy(v->covariance, law->design->spread, sizeof(v->covariance));
+    (void)memcpy(v->earlier[1], v->earlier[0], sizeof(v->earlier[1]));
+    (void)memset(v->states, 0, sizeof(v->states));
+    for (uint32_t i = 0u; i < LAW_OWN; i++) {
+        v->theta[LAW_HEAVE + i] = v->earlier[0][LAW_OWN][i];
+        (void)memcpy(&v->covariance[LAW_HEAVE + i][LAW_HEAVE], v->earlier[0][i], sizeof(v->earlier[0][i]));
     }
     for (uint32_t k = 0u; k < 4u; k++) {
-        for (uint32_t i = 0u; i < LAW_ROWS; i++) {
-            v->states[k][i] = (i == LAW_INITIAL + k) ? REAL(1.0) : REAL(0.0);
-        }
+        v->states[k][LAW_INITIAL + k] = REAL(1.0);
         v->theta[LAW_INITIAL + k] = REAL(0.0);
         v->covariance[LAW_INITIAL + k][LAW_INITIAL + k] = law->design->start[k];
     }
@@ -221,7 +214,9 @@ uint32_t learning_follow_contact(law_t *law)
         learning_reset(law, LAW_FINGER, LAW_HEAVE);
         learning_reset(law, LAW_LOAD, LAW_PARAMETERS);
         law->fast_timer = d->damper_time;
-        learning_discretise(law);
+        if ((law->sample % LEARNING_REFRESH) != 0u) { /* else it is due in this sample anyway */
+            learning_discretise(law);
+        }
     } else if ((v->since == d->settling) || (v->since == d->joining)) {
         restart(law);
     } else if (v->since == d->joined) {
@@ -234,36 +229,89 @@ uint32_t learning_follow_contact(law_t *law)
     return (v->since >= d->settling) ? 1u : 0u;
 }
 
-/* Update the parameters by a sensed deviation from the reference: a scalar step of the Kalman filter. */
-void learning_update(law_t *law, uint32_t coordinate, real_t error)
+/*
+ * First of the parameters that anything can be learned of now, and the one behind the last: those of the finger and of
+ * the initial motion have no regressor, and no covariance with others, while there is neither.
+ */
+static uint32_t first_active(const learning_t *v) { return (v->contact != 0u) ? LAW_FINGER : LAW_HEAVE; }
+
+static uint32_t end_active(const law_t *law)
 {
-    learning_t *v = &law->learning;
-    const design_t *d = law->design;
-    const real_t *states = v->states[coordinate];
-    const real_t explained = states[LAW_PARAMETERS];
-    real_t gain[LAW_PARAMETERS];
-    real_t *power = &v->model_power[coordinate];
-    *power += d->mean_square * (error * error + explained * explained - *power);
-    real_t innovation = error - explained;
-    real_t scatter = d->noise[coordinate] + d->model_error * *power;
-    for (uint32_t i = 0u; i < LAW_PARAMETERS; i++) {
-        real_t found = REAL(0.0);
-        for (uint32_t j = 0u; j < LAW_PARAMETERS; j++) {
-            found += v->covariance[i][j] * states[j];
-        }
-        gain[i] = found;
-        innovation += states[i] * v->theta[i];
-        scatter += found * states[i];
+    const uint32_t since = law->learning.since;
+    return ((since >= law->design->settling) && (since < law->design->joined)) ? LAW_PARAMETERS : LAW_INITIAL;
+}
+
+/* Sum of the products of two rows' entries `first` to `end - 1`. */
+static real_t dot(const real_t a[], const real_t b[], uint32_t first, uint32_t end)
+{
+    real_t sum = REAL(0.0);
+    for (uint32_t i = first; i < end; i++) {
+        sum += a[i] * b[i];
     }
-    for (uint32_t i = 0u; i < LAW_PARAMETERS; i++) {
-        const real_t share = gain[i] / scatter;
-        v->theta[i] -= share * innovation;
-        for (uint32_t j = i; j < LAW_PARAMETERS; j++) { /* the covariance stays symmetric to the last bit */
-            const real_t left = v->covariance[i][j] - share * gain[j];
+    return sum;
+}
+
+/* Gains of both coordinates before either is used: the covariance times their regressors, in one pass over it. */
+static void project(const learning_t *v, uint32_t first, uint32_t end, real_t gain[2][LAW_PARAMETERS])
+{
+    for (uint32_t i = first; i < end; i++) {
+        const real_t *row = v->covariance[i];
+        real_t heave = REAL(0.0);
+        real_t rocking = REAL(0.0);
+        for (uint32_t j = first; j < end; j++) {
+            heave += row[j] * v->states[0][j];
+            rocking += row[j] * v->states[1][j];
+        }
+        gain[0][i] = heave;
+        gain[1][i] = rocking;
+    }
+}
+
+/* Subtract what both coordinates explain; the covariance stays symmetric to the last bit. */
+static void shrink(learning_t *v, uint32_t first, uint32_t end, real_t gain[2][LAW_PARAMETERS], const real_t precision[2])
+{
+    for (uint32_t i = first; i < end; i++) {
+        const real_t heave = gain[0][i] * precision[0];
+        const real_t rocking = gain[1][i] * precision[1];
+        for (uint32_t j = i; j < end; j++) {
+            const real_t left = v->covariance[i][j] - heave * gain[0][j] - rocking * gain[1][j];
             v->covariance[i][j] = left;
             v->covariance[j][i] = left;
         }
     }
+}
+
+/*
+ * Update the parameters by the sensed deviations from the reference: a step of the Kalman filter by each coordinate,
+ * one after the other; the gain of the second is what the first has left of it.
+ */
+void learning_update(law_t *law, const real_t error[2])
+{
+    learning_t *v = &law->learning;
+    const design_t *d = law->design;
+    const uint32_t first = first_active(v);
+    const uint32_t end = end_active(law);
+    real_t gain[2][LAW_PARAMETERS];
+    real_t precision[2] = {REAL(0.0), REAL(0.0)};
+    project(v, first, end, gain);
+    for (uint32_t c = 0u; c < LAW_COORDINATES; c++) {
+        const real_t *states = v->states[c];
+        const real_t explained = states[LAW_PARAMETERS];
+        if (c > 0u) {
+            const real_t share = dot(states, gain[0], first, end) * precision[0];
+            for (uint32_t i = first; i < end; i++) {
+                gain[1][i] -= share * gain[0][i];
+            }
+        }
+        v->model_power[c] += d->mean_square * (error[c] * error[c] + explained * explained - v->model_power[c]);
+        const real_t scatter = d->noise[c] + d->model_error * v->model_power[c] + dot(gain[c], states, first, end);
+        const real_t innovation = error[c] - explained + dot(states, v->theta, first, end);
+        precision[c] = REAL(1.0) / scatter;
+        for (uint32_t i = first; i < end; i++) {
+            v->theta[i] -= gain[c][i] * precision[c] * innovation;
+        }
+    }
+    shrink(v, first, end, gain, precision);
 }
 
 /* Let the parameters return to their mean, and their covariance to its prior; by what is lost, as 1 - 1e-8 is 1. */
@@ -271,9 +319,10 @@ void learning_revert(law_t *law)
 {
     learning_t *v = &law->learning;
     const design_t *d = law->design;
-    for (uint32_t i = 0u; i < LAW_PARAMETERS; i++) {
+    const uint32_t end = end_active(law);
+    for (uint32_t i = 0u; i < end; i++) {
         v->theta[i] += d->lost[i] * (d->prior[i] - v->theta[i]);
-        for (uint32_t j = i; j < LAW_PARAMETERS; j++) {
+        for (uint32_t j = i; j < end; j++) {
             const real_t share = d->lost[i] + d->lost[j] - d->lost[i] * d->lost[j];
             const real_t found = v->covariance[i][j] + share * (d->spread[i][j] - v->covariance[i][j]);
             v->covariance[i][j] = found;
@@ -329,23 +378,29 @@ static void set_inputs(const law_t *law, const real_t acting[LAW_RING], real_t h
     rocking[LAW_PARAMETERS] = acting[LAW_BASIS + 1];
 }
 
+/* A row of [Phi, Gamma] times states and forces. */
+static inline real_t row_times(const real_t row[6], const real_t x[4], real_t heave, real_t rocking)
+{
+    return row[4] * heave + row[5] * rocking + row[0] * x[0] + row[1] * x[1] + row[2] * x[2] + row[3] * x[3];
+}
+
 /* Advance the regressors by a sample, under the basis and the deviation force that act in it. */
 void learning_advance(law_t *law, const real_t acting[LAW_RING])
 {
     learning_t *v = &law->learning;
     real_t heave[LAW_ROWS];
     real_t rocking[LAW_ROWS];
+    real_t step[4][6]; /* a copy, which stays in registers */
+    const uint32_t end = end_active(law);
     set_inputs(law, acting, heave, rocking);
-    for (uint32_t i = 0u; i < LAW_ROWS; i++) {
-        const real_t x0 = v->states[0][i];
-        const real_t x1 = v->states[1][i];
-        const real_t x2 = v->states[2][i];
-        const real_t x3 = v->states[3][i];
-        for (uint32_t k = 0u; k < 4u; k++) {
-            const real_t *phi = v->step[k];
-            v->states[k][i] =
-                phi[4] * heave[i] + phi[5] * rocking[i] + phi[0] * x0 + phi[1] * x1 + phi[2] * x2 + phi[3] * x3;
-        }
+    (void)memcpy(step, v->step, sizeof(step));
+    for (uint32_t n = first_active(v); n <= end; n++) {
+        const uint32_t i = (n < end) ? n : (uint32_t)LAW_PARAMETERS; /* w comes last */
+        const real_t x[4] = {v->states[0][i], v->states[1][i], v->states[2][i], v->states[3][i]};
+        v->states[0][i] = row_times(step[0], x, heave[i], rocking[i]);
+        v->states[1][i] = row_times(step[1], x, heave[i], rocking[i]);
+        v->states[2][i] = row_times(step[2], x, heave[i], rocking[i]);
+        v->states[3][i] = row_times(step[3], x, heave[i], rocking[i]);
     }
 }
 
