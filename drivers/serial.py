@@ -48,7 +48,7 @@ class SerialDriver(BaseDriver):
     block : int, >= 1
         1: closed loop on the board.  More: drive from the host, a block a call, for identification; what it computes
         from a block acts two blocks later.
-    options
+    **options
         Of `BoardClient`.
     """
 
