@@ -48,7 +48,7 @@ def textures():
     found = {}
     for count in (1, 4, 8):
         partials = tuple((1.0 + 0.25 * k, 1.0, 0.0) for k in range(count))
-        found[f"{count} band{'s' * (count > 1)}"] = hr.Grating(amplitude=9e-6 / count, wavelength=1e-3, partials=partials)
+        found[f"{count} bands"] = hr.Grating(amplitude=9e-6 / count, wavelength=1e-3, partials=partials)
     partials = tuple((1.0 + 0.6 * k, 1.0, 0.0) for k in range(8))
     return found | {"8 fixed bands": hr.Grating(amplitude=1e-6, frequency=60.0, partials=partials), "waveform": White()}
 

@@ -429,7 +429,7 @@ def bank(count):
 
 
 def test_eight_bands_leave_a_third_of_a_cortex_m4(tmp_path):
-    """At 168 MHz and 5 kHz a sample has 33 600 cycles; an instruction takes at most 1.6 of them (1.51 in benchmarks/board.py).
+    """At 168 MHz and 5 kHz a sample has 33 600 cycles; an instruction takes at most 1.6 (benchmarks/board.py: 1.51).
 
     The mean while a contact is new is the most that a law takes for long.
     """
