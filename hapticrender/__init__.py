@@ -28,6 +28,7 @@ _HOMES = {
     "ProtocolError SceneError",
     "loop": "prepare render run",
     "plants.identify": "Identified compare identify",
+    "player": "Player",
     "protocols": "Controller Driver Flag Method Motion Plant Renderer Rendering Sensed Texture",
     "recordings.recording": "Recorder Recording",
     "touch.builtin_scenes": "builtin_scenes",
@@ -64,6 +65,7 @@ if _typing.TYPE_CHECKING:
     from hapticrender.plants.identify import Identified as Identified
     from hapticrender.plants.identify import compare as compare
     from hapticrender.plants.identify import identify as identify
+    from hapticrender.player import Player as Player
     from hapticrender.protocols import Controller as Controller
     from hapticrender.protocols import Driver as Driver
     from hapticrender.protocols import Flag as Flag

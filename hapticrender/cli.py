@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from hapticrender.report.progress import Progress
     from hapticrender.touch.scene import Scene
 
+LOOK = 0.25  # s between two looks at what plays
 PICTURES_HINT = 'no pictures without matplotlib; to get them: pip install "hapticrender[plot]"'
 
 _DESCRIPTION = "Make a finger feel a texture on a surface, in closed loop, on a device or on a model of one."
@@ -100,6 +101,15 @@ def _parser() -> argparse.ArgumentParser:
     _add_run(render, driver=True)
     render.add_argument("--least-model", action="store_true", help="leave out of the model what a scene does not need")
     render.add_argument("--verbose", "-v", action="store_true", help="print all figures and notes on the controller")
+
+    text = "play one scene live until Ctrl-C or its end: a line a band, with target, achieved and flags"
+    play = _add_verb(verbs, "play", _play, text)
+    play.add_argument("scene", metavar="SCENE", help="a TOML file, or the name of a built-in scene")
+    play.add_argument("--seconds", metavar="S", type=float, help="how long (default: the scene's duration)")
+    text = "folder for sound, picture, figures, journal and a page about it; made if it is not there"
+    play.add_argument("--out", "-o", metavar="DIR", type=_path, help=text)
+    play.add_argument("--force", action="store_true", help="overwrite files that are not from an earlier run")
+    _add_run(play, driver=True)
 
     scenes = _add_verb(verbs, "scenes", _scenes, "list the built-in scenes, or print one as TOML")
     scenes.add_argument("scene", metavar="NAME", nargs="?", help="the scene to print")
@@ -236,6 +246,44 @@ def _render(arguments: argparse.Namespace) -> int:
     print("wrote " + "\n      ".join(map(str, outputs.files)))
     if notes:
         print(notes)
+    return 0
+
+
+def _play(arguments: argparse.Namespace) -> int:
+    from dataclasses import replace
+
+    from hapticrender.player import Player
+    from hapticrender.report import outputs
+    from hapticrender.report.live_lines import LiveLines
+    from hapticrender.report.page import refuse_foreign_page, write_page
+
+    scene, out = _scene(arguments.scene), arguments.out
+    changes = {name: getattr(arguments, name) for name in ("method", "seed") if getattr(arguments, name) is not None}
+    scene = replace(scene, **changes)
+    seconds = scene.duration if arguments.seconds is None else arguments.seconds
+    if not 0.0 < seconds < float("inf"):
+        raise ValueError(f"--seconds = {seconds}: must be finite and > 0 s")
+    if out:
+        outputs.check_folder("--out", out / scene.name)
+        if not arguments.force:
+            outputs.refuse_to_overwrite(out / scene.name)
+            refuse_foreign_page(out)
+    lines, journal = LiveLines(sys.stdout), None
+    try:
+        with _naming(arguments.scene), Player(scene, _driver(arguments.driver)) as player:
+            player.play(scene.texture)
+            if out:
+                journal = outputs.begin_outputs(out / scene.name, scene)
+                player.record(journal)
+            while player.time < seconds:
+                player.sleep(min(LOOK, seconds - player.time))
+                lines.show(printable(str(player.state())), int(player.time))
+    finally:
+        if journal is not None and journal.exists():
+            from hapticrender.recordings.recording import Recording
+
+            made = outputs.write_outputs(out / scene.name, Recording.load(journal))
+            print(f"page: {write_page(out, [made])}")
     return 0
 
 

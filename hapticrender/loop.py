@@ -52,6 +52,20 @@ def prepare(
     renderer: Renderer | None = None,
 ) -> Rendering:
     """Do all the design-time work of a run and check it; see `render` for the parameters and errors."""
+    rendering = open_scene(scene, driver=driver, method=method, seed=seed, renderer=renderer)
+    _warm_up(rendering)
+    return rendering
+
+
+def open_scene(
+    scene: Scene | str | os.PathLike[str],
+    *,
+    driver: Driver | None = None,
+    method: str | None = None,
+    seed: int | None = None,
+    renderer: Renderer | None = None,
+) -> Rendering:
+    """Open a scene on its device and check it, without compiling anything; see `render`."""
     if isinstance(scene, str | os.PathLike):
         scene = Scene.from_toml(scene)
     if not isinstance(scene, Scene):
@@ -66,7 +80,6 @@ def prepare(
     if not isinstance(rendering, Rendering):
         kinds = type(renderer).__name__, type(rendering).__name__
         raise TypeError(f"{kinds[0]}.open returned {kinds[1]}: must be hapticrender.Rendering")
-    _warm_up(rendering)
     return rendering
 
 
@@ -136,7 +149,7 @@ def run(rendering: Rendering, *, journal: str | Path | None = None, progress: Pr
         calibration=getattr(rendering.device, "calibration", 0.0),
         **{name: getattr(model, name) for name in names},
     )
-    with recorder, _stopped_by_sigterm(), driver, _zero_drive_after(rendering.device):
+    with recorder, stopped_by_sigterm(), driver, zero_drive_after(rendering.device):
         if rendering.probe:
             probe_plate(rendering.device, model)
         loop = _Loop(rendering)
@@ -165,7 +178,7 @@ def _warm_up(rendering: Rendering) -> None:
 
 
 @contextmanager
-def _stopped_by_sigterm() -> Iterator[None]:
+def stopped_by_sigterm() -> Iterator[None]:
     """Turn SIGTERM into SystemExit in the main thread, so that the device is left at rest."""
     main = threading.current_thread() is threading.main_thread()
     if not main or signal.getsignal(signal.SIGTERM) is not signal.SIG_DFL:
@@ -183,7 +196,7 @@ def _stopped_by_sigterm() -> Iterator[None]:
 
 
 @contextmanager
-def _zero_drive_after(device: Driver) -> Iterator[None]:
+def zero_drive_after(device: Driver) -> Iterator[None]:
     """Play zeros until they have come through, whatever happened, unless the device does so itself on leaving."""
 
     def rest() -> None:

@@ -180,7 +180,7 @@ def _summary(rendering: Rendering, folder: Path | None, tick: Tick | None) -> di
         with tempfile.TemporaryDirectory() as scratch:
             return run(rendering, journal=Path(scratch) / JOURNAL, progress=tick).summary()
     refuse_to_overwrite(folder)
-    recording = run(rendering, journal=begin_outputs(folder, rendering), progress=tick)
+    recording = run(rendering, journal=begin_outputs(folder, rendering.scene), progress=tick)
     summary = recording.summary()
     if not summary["passed"]:
         return dict(write_outputs(folder, recording).summary)

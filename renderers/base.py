@@ -45,6 +45,7 @@ class BaseRenderer:
         model = self.device_model(setup, facing)
         bands = self.bands(setup, model)
         model = self.limited(setup, model, bands)
+        design = partial(self.design, method, model, feedback=facing.sensed_channels > 0)
         return Rendering(
             scene=scene,
             device=device,
@@ -54,7 +55,8 @@ class BaseRenderer:
             bands=bands,
             waveform=self.waveform(setup),
             differentiated=self.differentiated,
-            controller=partial(self.design, method, model, bands, feedback=facing.sensed_channels > 0),
+            controller=partial(design, bands),
+            design=design,
             probe=self.probes(setup, device),
         )
 
