@@ -67,7 +67,7 @@ class LiveLoop:
         self.entry = RealtimeEntry(self.controller, **scales)
         rows = len(self.entry.log(0)["flags"]) + round(LOG_TIME * rendering.driver.rate)
         self._told = np.full((rows, len(self.model.places) + 1), np.nan)  # true motion and load, where the device tells
-        self._true = False
+        self._true, self.senses = False, False  # whether the device tells its true motion, and where the finger is
         self._drive = np.zeros((self.driver.block, self.driver.drive_channels))
         self._bands = rendering.bands
         self.entry.play(self._voice(rendering))
@@ -78,9 +78,35 @@ class LiveLoop:
         return self.entry.whole and self.controller.n_bands == 0
 
     @property
+    def samples(self) -> int:
+        """Samples that have been played."""
+        return self.entry.samples
+
+    @property
+    def flags(self) -> Flag:
+        """Everything that was ever raised."""
+        return self.entry.flags
+
+    @property
     def silent(self) -> bool:
         """Whether the gain has come down to nothing."""
         return self.entry.current_gain < SILENT
+
+    def finger(self, position: float, velocity: float, load: float) -> None:
+        """Say where the finger is (m, m/s, N)."""
+        self.entry.finger(position, velocity, load)
+
+    def set_gain(self, gain: float) -> None:
+        """Set the factor on the texture."""
+        self.entry.set_gain(gain)
+
+    def silence(self) -> None:
+        """Set zero drive from the next block on."""
+        self.entry.silence()
+
+    def fill(self) -> None:
+        """Compute what comes next of textures in time; to be called at least once a second."""
+        self.entry.fill()
 
     def advance(self, sensing: bool) -> None:
         """Exchange a block with the driver; `sensing`: its own sense of the finger is used, where it has one."""
@@ -90,6 +116,7 @@ class LiveLoop:
             self._told[at, :-1], self._true = sensed.motion, True
         if sensed.normal_load is not None:
             self._told[at, -1] = sensed.normal_load
+        self.senses = sensed.position is not None
         flags = 0 if sensed.flags is None else int(np.bitwise_or.reduce(sensed.flags))
         self._drive = self.entry.process(sensed.sensed, sensed.position if sensing else None, flags)
 

@@ -40,6 +40,7 @@ LONGEST = 3600.0  # s: duration that is written into a recording's scene
 SERVICE = 0.05  # s between two looks: what comes next is computed, what was is recorded, faults are seen
 WORDS = 0.2  # s: two words within this time show a velocity
 FADE_OUT = 0.05  # s: five time constants of the gain; and the longest that zeros are waited for
+POINTING, INSTANT = 0.01, 1e-4  # s between two words of a scene's finger; over which its velocity is found
 PATIENCE = 5.0  # s without a sample, after which `sleep` gives a device up
 
 
@@ -111,8 +112,8 @@ class Player:
     Parameters
     ----------
     device : str or Scene
-        Kind of device, or a profile; or a scene, whose tables, method, seed and finger are used.  Where a device says
-        nothing of the finger, the application does (`finger`); that of a scene moves by itself on a simulated device.
+        Kind of device, or a profile; or a scene, whose tables, method, seed and finger are used.  The finger of a scene
+        moves by itself until the application speaks (`finger`); else only the application knows one.
     driver : Driver or str, optional
         As for `render`; the simulated device by default.
     finger : Finger, optional
@@ -154,7 +155,7 @@ class Player:
         self._error: BaseException | None = None
         self._raised = False
         self._recorder: Recorder | None = None
-        self._recorded = 0  # samples of this loop that were looked at
+        self._recorded, self._served = 0, 0.0  # samples of this loop that were looked at; when the last look was
         self._stack, self._stopping, self._lock = ExitStack(), threading.Event(), threading.RLock()
 
     def __enter__(self) -> Self:
@@ -165,7 +166,7 @@ class Player:
     ) -> None:
         """Zero drive, then close the device and the recording; a fault that nobody has seen is raised."""
         if kind is None and self._error is None and self._loop is not None and self._paced:
-            self._loop.entry.set_gain(0.0)
+            self._loop.set_gain(0.0)
             time.sleep(FADE_OUT)
         self._silence()
         self._stopping.set()
@@ -178,7 +179,7 @@ class Player:
     @property
     def time(self) -> float:
         """Time played so far (s)."""
-        return 0.0 if self._loop is None else (self._before + self._loop.entry.samples) / self._loop.driver.rate
+        return 0.0 if self._loop is None else (self._before + self._loop.samples) / self._loop.driver.rate
 
     @property
     def gain(self) -> float:
@@ -193,7 +194,7 @@ class Player:
                 raise ValueError(f"{gain=}: must be finite")
             self._gain = gain
             if self._loop is not None and self._next is None:
-                self._loop.entry.set_gain(gain)
+                self._loop.set_gain(gain)
 
     def play(self, texture: Texture) -> None:
         """Play a texture until the next one, into which it fades; the first one starts the device.
@@ -216,7 +217,7 @@ class Player:
                 self._loop.exchange(rendering)
             else:
                 self._next = LiveLoop(rendering)
-                self._loop.entry.set_gain(0.0)
+                self._loop.set_gain(0.0)
 
     def finger(self, position: float, velocity: float | None = None, load: float = 0.4) -> None:
         """Say where the finger is: position (m from the middle, NaN: lifted), velocity (m/s), normal load (N).
@@ -236,7 +237,7 @@ class Player:
             self._spoken, self._word, self._said = True, (position, now), (position, velocity, load)
             self._motion.say(position, velocity, load)
             if self._loop is not None:
-                self._loop.entry.finger(position, velocity, load)
+                self._loop.finger(position, velocity, load)
 
     def record(self, path: str | Path) -> None:
         """Keep everything from now on in a journal (.au), until `end_recording` or the end; the device must play."""
@@ -279,7 +280,7 @@ class Player:
             self._service()
             load = float(getattr(loop.rendering.device, "load", math.nan))
             bands = tuple(BandState(*row) for row in loop.figures())
-            return PlayerState(self.time, loop.model.unit, bands, loop.entry.flags, self._lost, load)
+            return PlayerState(self.time, loop.model.unit, bands, loop.flags, self._lost, load)
 
     def sleep(self, seconds: float) -> None:
         """Wait until the device has played for so long; one that is not paced plays meanwhile.
@@ -346,9 +347,9 @@ class Player:
         if rendering.probe:
             probe_plate(device, rendering.model)
         self._loop = loop
-        loop.entry.set_gain(self._gain)
+        loop.set_gain(self._gain)
         if self._spoken:
-            loop.entry.finger(*self._said)
+            loop.finger(*self._said)
         if calls_back:
             device.start(loop.entry)  # type: ignore[attr-defined]
             stack.callback(device.stop)  # type: ignore[attr-defined]
@@ -398,16 +399,16 @@ class Player:
     def _take_over(self, following: LiveLoop) -> None:
         self._service()
         loop, self._next = self._playing("play"), None
-        self._before += loop.entry.samples
+        self._before += loop.samples
         self._recorded = 0
         if following.rendering.plant is not None:
             self._motion.restart()
             self._hand_finger(following.rendering)
             following.rendering.device.paced = self._paced  # type: ignore[attr-defined]
             self._stack.enter_context(following.driver)
-        following.entry.set_gain(self._gain)
+        following.set_gain(self._gain)
         if self._spoken:
-            following.entry.finger(*self._said)
+            following.finger(*self._said)
         self._loop = following
 
     def _advance(self, seconds: float) -> None:
@@ -419,17 +420,28 @@ class Player:
             self._service()
 
     def _serve(self) -> None:
-        while not self._stopping.wait(SERVICE):
+        while not self._stopping.wait(POINTING):
             with self._lock:
-                self._service()
+                self._point()
+                if self.time - self._served >= SERVICE or self._stopping.is_set():
+                    self._served = self.time
+                    self._service()
+
+    def _point(self) -> None:
+        """Say where the finger of the scene is, to a device that does not sense it."""
+        loop = self._playing("play")
+        if self._given is not None and not self._spoken and not loop.senses:
+            finger, now = self._given.finger, self.time + np.array([0.0, INSTANT])
+            (here, there), load = finger.position(now), finger.load(now)[0]
+            loop.finger(here, float(np.nan_to_num((there - here) / INSTANT)), load)
 
     def _service(self) -> None:
         """Compute what comes next, record what was, see whether the device or the application has stopped."""
         loop = self._playing("play")
-        loop.entry.fill()
+        loop.fill()
         if self._watchdog is not None and self._next is None:
             asleep = self._now() - self._called > self._watchdog
-            loop.entry.set_gain(0.0 if asleep else self._gain)
+            loop.set_gain(0.0 if asleep else self._gain)
         first, signals = loop.signals(self._recorded)
         gap, self._recorded = first - self._recorded, first + len(signals["flags"])
         self._lost += gap + int(np.count_nonzero(signals["flags"] & Flag.OVERRUN))
@@ -443,9 +455,9 @@ class Player:
         loop = self._loop
         if loop is None:
             return
-        loop.entry.silence()
-        end, limit = loop.entry.samples + 2 * loop.driver.block, time.monotonic() + FADE_OUT
-        while self._paced and self._error is None and loop.entry.samples < end and time.monotonic() < limit:
+        loop.silence()
+        end, limit = loop.samples + 2 * loop.driver.block, time.monotonic() + FADE_OUT
+        while self._paced and self._error is None and loop.samples < end and time.monotonic() < limit:
             time.sleep(1e-3)
 
     def _close_recorder(self) -> None:

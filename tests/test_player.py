@@ -363,3 +363,24 @@ def test_a_live_run_of_the_command_line_is_stopped_cleanly(tmp_path, number):
     recording = Recording.load(tmp_path / "out" / "live" / "recording.au")
     assert len(recording) > 0.2 * recording.rate
     assert (tmp_path / "out" / "index.html").exists()
+
+
+class Blind(SimulatedDriver):
+    """A plate that senses no finger."""
+
+    def _play(self, drive):
+        return super()._play(drive)._replace(position=None, normal_load=None)
+
+
+def test_the_finger_of_a_scene_is_told_to_a_device_that_does_not_sense_it():
+    """Words every 10 ms of signal: a swipe of 2 Hz is off by a quarter of its acceleration times 10 ms squared."""
+    scene = hr.Scene(texture=RIDGES, finger=hr.Finger.swiping(2.0, speed=0.05), duration=5.0)
+    driver = Blind(Plate(PlateParameters(), scene.finger), paced=True)
+    with hr.Player(scene, driver) as player:
+        player.play(RIDGES)
+        player.sleep(1.0)
+        played = player._loop.signals(0)[1]
+    time = np.arange(len(played["position"])) / 5000.0
+    off = abs(played["position"] - scene.finger.position(time))[1000:]
+    assert np.median(off) < 1e-3  # a loaded machine says its words late
+    assert np.isfinite(played["position"][1000:]).all()
