@@ -1,0 +1,321 @@
+/* What the host may ask: each command is checked, done at most once, and acknowledged or refused with a reason. */
+#include <string.h>
+
+#include "board.h"
+#include "hardware.h"
+
+enum { CHECK = 4, SETPOINT_BYTES = 20, LINE_BYTES = 13, ROW_BYTES = 4 * LAW_CHANNELS };
+
+typedef uint8_t (*handler)(board_t *board, const uint8_t *payload, size_t count);
+
+/* CRC-32 of the session, the kind, the sequence and the payload before it: the last four bytes of every command. */
+static int check_holds(const board_t *board, const frame *from)
+{
+    uint8_t head[7];
+    size_t count = from->count - CHECK;
+    uint32_t session = from->kind == KIND_HELLO ? 0u : board->session;
+    (void)put_u16(put_u8(put_u32(head, session), from->kind), from->sequence);
+    return get_u32(from->payload + count) == crc32(from->payload, count, crc32(head, sizeof head, 0u));
+}
+
+static uint8_t setpoint(board_t *board, const uint8_t *payload, size_t count)
+{
+    (void)count;
+    uint32_t index = payload[0];
+    if (index >= LAW_BANDS) {
+        return REASON_VALUE;
+    }
+    const uint8_t *at = payload + 1;
+    memcpy(board->staged_bytes[index], at, SETPOINT_BYTES);
+    band_t band = {(real_t)get_f32(at), (real_t)get_f32(at + 4), (real_t)get_f32(at + 8), (real_t)get_f32(at + 12),
+                   (real_t)get_f32(at + 16)};
+    board->staged[index] = band;
+    return REASON_NONE;
+}
+
+static uint8_t commit(board_t *board, const uint8_t *payload, size_t length)
+{
+    (void)length;
+    uint32_t count = payload[0];
+    if (count > LAW_BANDS) {
+        return REASON_VALUE;
+    }
+    if (get_u32(payload + 1) != crc32(&board->staged_bytes[0][0], count * SETPOINT_BYTES, 0u)) {
+        return REASON_DIGEST;
+    }
+    if (law_set_bands(&board->law, board->staged, count) == 0u) {
+        return REASON_VALUE;
+    }
+    memcpy(board->played.bands, board->staged, sizeof board->staged);
+    board->played.bands_used = count;
+    board->played.spatial = count > 0u ? 1u : 0u;
+    for (uint32_t i = 0; i < count; i++) {
+        if (!(board->staged[i].wavenumber > REAL(0.0))) {
+            board->played.spatial = 0u;
+        }
+    }
+    board->committed = 1u;
+    board->commits++;
+    return REASON_NONE;
+}
+
+static uint8_t gain(board_t *board, const uint8_t *payload, size_t count)
+{
+    (void)count;
+    real_t value = (real_t)get_f32(payload);
+    if (!(value >= REAL(0.0) && value <= REAL(1.0))) {
+        return REASON_VALUE;
+    }
+    board->gain = value;
+    (void)law_set_gain(&board->law, value);
+    return REASON_NONE;
+}
+
+static uint8_t limits(board_t *board, const uint8_t *payload, size_t count)
+{
+    (void)count;
+    real_t peak = (real_t)get_f32(payload), rms = (real_t)get_f32(payload + 4), time = (real_t)get_f32(payload + 8);
+    if (!(peak > REAL(0.0) && peak <= design.drive_limit && rms > REAL(0.0) && rms <= peak && time >= REAL(1e-3) &&
+          time <= REAL(1e3))) {
+        return REASON_VALUE;
+    }
+    board->peak = peak;
+    board->rms = rms;
+    board->heating = real_min(REAL(1.0) / (time * board->played.rate), REAL(1.0));
+    (void)law_set_drive_limit(&board->law, peak);
+    return REASON_NONE;
+}
+
+static uint8_t start(board_t *board, const uint8_t *payload, size_t count)
+{
+    (void)count;
+    if (board->state != BOARD_IDLE || board->committed == 0u) {
+        return REASON_STATE;
+    }
+    board->stride = get_u16(payload);
+    board->period = get_u16(payload + 2);
+    board_begin(board, BOARD_PLAYING);
+    return REASON_NONE;
+}
+
+static uint8_t stop(board_t *board, const uint8_t *payload, size_t count)
+{
+    (void)payload;
+    (void)count;
+    board_stop(board, CAUSE_COMMAND);
+    return REASON_NONE;
+}
+
+static uint8_t line(board_t *board, const uint8_t *payload, size_t count)
+{
+    (void)count;
+    uint32_t index = payload[0];
+    const uint8_t *at = payload + 1;
+    line_t new_line = {at[0], (real_t)get_f32(at + 5), (real_t)get_f32(at + 9), (real_t)get_f32(at + 1)};
+    real_t frequency = new_line.step;
+    if (board->state != BOARD_IDLE) {
+        return REASON_STATE;
+    }
+    if (index >= BOARD_LINES || new_line.channel >= LAW_CHANNELS || !isfinite(new_line.amplitude) ||
+        !(new_line.turns >= REAL(0.0) && new_line.turns < REAL(1.0)) ||
+        !(frequency >= REAL(0.0) && frequency < REAL(0.5) * board->played.rate)) {
+        return REASON_VALUE;
+    }
+    new_line.step = frequency / board->played.rate;
+    memcpy(board->line_bytes[index], at, LINE_BYTES);
+    board->lines[index] = new_line;
+    return REASON_NONE;
+}
+
+static uint8_t identify(board_t *board, const uint8_t *payload, size_t count)
+{
+    (void)count;
+    uint32_t lines = payload[0];
+    if (board->state != BOARD_IDLE) {
+        return REASON_STATE;
+    }
+    if (lines > BOARD_LINES) {
+        return REASON_VALUE;
+    }
+    if (get_u32(payload + 7) != crc32(&board->line_bytes[0][0], lines * LINE_BYTES, 0u)) {
+        return REASON_DIGEST;
+    }
+    board->lines_used = lines;
+    board->remaining = get_u32(payload + 1);
+    board->stride = get_u16(payload + 5);
+    board_begin(board, lines > 0u ? BOARD_IDENTIFYING : BOARD_DRIVING);
+    board->queue_out = board->queue_in = 0;
+    return REASON_NONE;
+}
+
+static uint8_t drive(board_t *board, const uint8_t *payload, size_t count)
+{
+    size_t rows = (count - 4u) / ROW_BYTES;
+    if ((count - 4u) % ROW_BYTES != 0u) {
+        return REASON_LENGTH;
+    }
+    if (board->state != BOARD_DRIVING || get_u32(payload) != board->queue_in ||
+        board->queue_in - board->queue_out + rows > BOARD_QUEUE) {
+        return REASON_STATE;
+    }
+    for (size_t row = 0; row < rows; row++) {
+        float *to = board->queue[board->queue_in++ % BOARD_QUEUE];
+        for (uint32_t c = 0; c < LAW_CHANNELS; c++) {
+            to[c] = get_f32(payload + 4u + row * ROW_BYTES + 4u * c);
+        }
+    }
+    return REASON_NONE;
+}
+
+/* Return the age of a word (us) by the host's clock: the least difference of the clocks is taken for their offset, and may grow by
+   1 us a word, 100 ppm at 100 words a second, so that it follows a host's clock that is slow. */
+static uint32_t take_time(board_t *board, uint32_t host)
+{
+    word_t *finger = &board->finger;
+    uint32_t lead = board_time(board) - host;
+    int32_t later = (int32_t)(lead - finger->offset);
+    if (finger->known == 0u || later < 0) {
+        finger->offset = lead;
+    } else if (later > 0) {
+        finger->offset++;
+    }
+    finger->known = 1u;
+    board->echo = host;
+    return lead - finger->offset;
+}
+
+static void word(board_t *board, const frame *from)
+{
+    if (board->finger.known != 0u && (int16_t)(uint16_t)(from->sequence - board->worded) <= 0) {
+        return;                                   /* a copy, or late */
+    }
+    board->worded = from->sequence;
+    if (take_time(board, get_u32(from->payload)) < 1000u * BOARD_SILENCE_MS) {
+        board->quiet = 0;                         /* an older one has waited in a full line: no sign of life */
+    }
+    if (from->kind == KIND_FINGER) {
+        board->finger.written = get_u32(from->payload) + board->finger.offset;
+        board->finger.position = (real_t)get_f32(from->payload + 4);
+        board->finger.velocity = (real_t)get_f32(from->payload + 8);
+        board->finger.load = (real_t)get_f32(from->payload + 12);
+    }
+}
+
+static void reply(board_t *board, uint8_t kind, uint16_t sequence, const uint8_t *payload, size_t count)
+{
+    board->replied_count = count;
+    board->replied[0] = kind;
+    memcpy(board->replied + 1, payload, count);
+    board->commanded = sequence;
+    board_send(board, kind, sequence, payload, count);
+}
+
+static void refuse(board_t *board, const frame *from, uint8_t reason, int keep)
+{
+    uint8_t payload[6];
+    (void)put_u32(put_u8(put_u8(payload, from->kind), reason), board->sample);
+    board->refused++;
+    if (keep) {
+        reply(board, KIND_REFUSE, from->sequence, payload, sizeof payload);
+    } else {
+        board_send(board, KIND_REFUSE, from->sequence, payload, sizeof payload);
+    }
+}
+
+/* A new host begins at rest, with its own set-points only.  The session is made of its number and the board's clock:
+   what was recorded in another session is refused in this one. */
+static void begin_session(board_t *board, uint32_t nonce)
+{
+    uint8_t numbers[8];
+    board_stop(board, CAUSE_SESSION);
+    (void)put_u32(put_u32(numbers, nonce), board->sample);
+    board->nonce = nonce;
+    board->session = crc32(numbers, sizeof numbers, 0u) | 1u;
+    board->committed = 0u;
+    board->finger.known = 0u;
+    board->finger.position = (real_t)NAN;
+    board->period = (uint32_t)(board->played.rate * REAL(0.1));
+    board_defaults(board);
+}
+
+static void hello(board_t *board, const frame *from)
+{
+    uint8_t payload[FRAME_PAYLOAD];
+    uint32_t nonce = get_u32(from->payload + 1);
+    int late = nonce == board->nonce && (int16_t)(uint16_t)(from->sequence - board->commanded) < 0;
+    if (late) {
+        return;
+    }
+    if (nonce != board->nonce) {
+        begin_session(board, nonce);
+    }
+    uint8_t *at = put_u32(put_u32(put_u8(payload, BOARD_VERSION), board->nonce), board->session);
+    at = put_f32(put_f32(at, (float)design.rate), (float)design.drive_limit);
+    at = put_f32(at, (float)design.sensor_limit);
+    at = put_u32(at, hardware_cycle_rate);
+    at = put_u16(put_u16(at, (uint16_t)design.delay), BOARD_QUEUE);
+    at = put_u8(put_u8(at, LAW_CHANNELS), LAW_SENSORS);
+    at = put_u8(put_u8(at, LAW_BANDS), BOARD_LINES);
+    at = put_u8(at, BOARD_SILENCE_MS + BOARD_FADE_MS);
+    reply(board, KIND_CAPABILITIES, from->sequence, payload, (size_t)(at - payload));
+}
+
+/* Commands with a reply, and the bytes of their payload; DRIVE is as long as its rows. */
+static const struct {
+    uint8_t kind;
+    size_t count;
+    handler handle;
+} commands[] = {
+    {KIND_SETPOINT, 1 + SETPOINT_BYTES, setpoint}, {KIND_COMMIT, 5, commit}, {KIND_GAIN, 4, gain},
+    {KIND_LIMITS, 12, limits}, {KIND_START, 4, start}, {KIND_STOP, 0, stop}, {KIND_LINE, 1 + LINE_BYTES, line},
+    {KIND_IDENTIFY, 11, identify}, {KIND_DRIVE, 0, drive},
+};
+
+static void execute(board_t *board, const frame *from)
+{
+    size_t count = from->count - CHECK;
+    int16_t later = (int16_t)(uint16_t)(from->sequence - board->commanded);
+    if (later == 0) {                             /* asked again as the reply was lost: said again, not done again */
+        board_send(board, board->replied[0], from->sequence, board->replied + 1, board->replied_count);
+        return;
+    }
+    if (later < 0) {
+        return;
+    }
+    for (size_t i = 0; i < sizeof commands / sizeof commands[0]; i++) {
+        if (commands[i].kind == from->kind) {
+            int fits = from->kind == KIND_DRIVE ? count >= 4u : count == commands[i].count;
+            uint8_t reason = fits ? commands[i].handle(board, from->payload, count) : (uint8_t)REASON_LENGTH;
+            uint8_t payload[5];
+            if (reason != REASON_NONE) {
+                refuse(board, from, reason, 1);
+                return;
+            }
+            (void)put_u32(put_u8(payload, from->kind), board->sample);
+            reply(board, KIND_ACK, from->sequence, payload, sizeof payload);
+            return;
+        }
+    }
+    refuse(board, from, REASON_KIND, 1);
+}
+
+void board_command(board_t *board, const frame *from)
+{
+    size_t count = from->count;
+    if (count < CHECK || !check_holds(board, from)) {
+        refuse(board, from, REASON_CHECK, 0);
+    } else if (from->kind == KIND_HELLO && count == CHECK + 5u) {
+        if (from->payload[0] == BOARD_VERSION && get_u32(from->payload + 1) != 0u) {
+            hello(board, from);
+        } else {
+            refuse(board, from, REASON_VERSION, 0);
+        }
+    } else if (board->session == 0u) {
+        refuse(board, from, REASON_CHECK, 0);
+    } else if ((from->kind == KIND_HEARTBEAT && count == CHECK + 4u) ||
+               (from->kind == KIND_FINGER && count == CHECK + 16u)) {
+        word(board, from);
+    } else {
+        execute(board, from);
+    }
+}

@@ -1,0 +1,131 @@
+/*
+ * Measure the control law on a machine: a finger lands on the simulated plate and slides; prints what a sample takes
+ * and the telemetry of the bands, a line each: a name and numbers.
+ */
+#include "measure.h"
+
+#include <string.h>
+
+#include "law.h"
+#include "plate.h"
+
+#define SAMPLES 3000u
+#define LANDS 500u   /* sample at which the finger lands; the initial motion of a contact is learned for 0.16 s */
+#define SPEED 0.08   /* m/s */
+#define LOAD 0.4     /* N */
+#define NOPS 1000u
+
+static law_t law;
+static plate_t plate = {4e-3, 1.5, 300.0, 1e-6, 1u, {0.0, 0.0, 0.0, 0.0}};
+
+static char *write_digits(char *at, uint32_t value, uint32_t least)
+{
+    char digits[10];
+    uint32_t count = 0u;
+    uint32_t left = value;
+    do {
+        digits[count++] = (char)('0' + (char)(left % 10u));
+        left /= 10u;
+    } while ((left > 0u) || (count < least));
+    while (count > 0u) {
+        *at++ = digits[--count];
+    }
+    return at;
+}
+
+/* A line of a name and numbers of magnitude below 4e6, with three digits after the point. */
+static void print_line(const char *name, const double values[], uint32_t count)
+{
+    char text[128];
+    char *at = text;
+    (void)strcpy(at, name);
+    at += strlen(name);
+    for (uint32_t i = 0u; i < count; i++) {
+        const uint32_t thousandths = (uint32_t)((values[i] < 0.0 ? -values[i] : values[i]) * 1000.0 + 0.5);
+        *at++ = ' ';
+        *at = '-';
+        at += (values[i] < 0.0) ? 1 : 0;
+        at = write_digits(at, thousandths / 1000u, 1u);
+        *at++ = '.';
+        at = write_digits(at, thousandths % 1000u, 3u);
+    }
+    *at++ = '\n';
+    *at = '\0';
+    measure_print(text);
+}
+
+static void print_number(const char *name, double value) { print_line(name, &value, 1u); }
+
+/* Ask the machine to count a thousand instructions, and none: shows that it counts instructions, and at what cost. */
+static uint32_t calibrate(void)
+{
+    const uint32_t start = measure_count();
+    const uint32_t empty = measure_count() - start;
+#ifdef __arm__
+    const uint32_t first = measure_count();
+    __asm__ volatile(".rept 1000\n nop\n .endr");
+    print_number("nops", (double)(measure_count() - first - empty));
+#endif
+    return empty;
+}
+
+/* Noise of about 5 um rms and 50-500 Hz: a waveform where the scene has no bands. */
+static real_t next_waveform(void)
+{
+    static uint32_t random = 1u;
+    static real_t low = REAL(0.0);
+    static real_t slow = REAL(0.0);
+    random = random * 1664525u + 1013904223u;
+    const real_t white = (real_t)(random >> 8) / REAL(16777216.0) - REAL(0.5);
+    low += REAL(0.47) * (white * REAL(40e-6) - low);
+    slow += REAL(0.06) * (low - slow);
+    return low - slow;
+}
+
+static void print_telemetry(void)
+{
+    for (uint32_t k = 0u; k < design.bands_used; k++) {
+        real_t target[2];
+        real_t measured[2];
+        law_target(&law, k, target);
+        law_measured(&law, k, measured);
+        const double row[5] = {(double)k, 1e6 * (double)target[0], 1e6 * (double)target[1], 1e6 * (double)measured[0],
+                               1e6 * (double)measured[1]};
+        print_line("band", row, 5u);
+    }
+}
+
+int main(void)
+{
+    double currents[2] = {0.0, 0.0};
+    double sums[3] = {0.0, 0.0, 0.0}; /* without a finger, while its contact is new, and later */
+    uint32_t most = 0u;
+    uint32_t flags = 0u;
+    measure_start();
+    const uint32_t empty = calibrate();
+    law_init(&law, &design);
+    for (uint32_t n = 0u; n < SAMPLES; n++) {
+        double sensed[2];
+        real_t drive[LAW_CHANNELS] = {REAL(0.0)};
+        const real_t waveform = (design.bands_used == 0u) ? next_waveform() : REAL(0.0);
+        const double position = (n < LANDS) ? NAN : (SPEED / (double)design.rate * (double)(n - LANDS) - 0.02);
+        plate_sense(&plate, sensed);
+        const real_t shown[2] = {(real_t)sensed[0], (real_t)sensed[1]};
+        const uint32_t start = measure_count();
+        flags |= law_step(&law, shown, (real_t)position, REAL(0.0), waveform, drive);
+        const uint32_t taken = measure_count() - start - empty;
+        most = (taken > most) ? taken : most;
+        sums[(n < LANDS) ? 0 : ((n < LANDS + design.joined) ? 1 : 2)] += (double)taken;
+        plate_advance(&plate, 1.0 / (double)design.rate, currents, position, LOAD);
+        currents[0] = (double)drive[0];
+        currents[LAW_CHANNELS - 1] = (double)drive[LAW_CHANNELS - 1];
+    }
+    print_number("free", sums[0] / LANDS);
+    print_number("new", sums[1] / design.joined);
+    print_number("touched", sums[2] / (SAMPLES - LANDS - design.joined));
+    print_number("most", (double)most);
+    print_number("flags", (double)flags);
+    print_number("state", (double)sizeof(law_t));
+    print_telemetry();
+    return 0;
+}

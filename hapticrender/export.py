@@ -1,0 +1,185 @@
+"""Export a scene's controller for a microcontroller: tables of the design in C, beside copies of the portable sources.
+
+The sources are those of ``drivers/firmware``; they play what method ``inverse`` designs for a plate.
+"""
+
+from __future__ import annotations
+
+import math
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hapticrender.control.controller import lowest_carrier, spacing
+from hapticrender.control.inverse import WaveformController
+
+from hapticrender.control.kernel import FADE_OUT
+from hapticrender.protocols import Rendering
+
+MOST_BANDS, MOST_DELAY = 64, 64  # bands; samples
+BANDS = 8  # of a board at least: set-points may ask for more than the scene does
+CHANGE = 20e-3  # s: of a change of gain, amplitude or carrier
+MEASURING, MEASURING_DC = 10.0, 6.0  # Hz: widest bandwidth of the measured envelopes and of their offset
+GENERATED = "/* Written by `hapticrender export`; export the scene again instead of editing. */\n"
+SUFFIXES = (".c", ".h", ".ld", "Makefile")  # of the portable sources
+
+_CONTROLLER = """
+drive_limit drive_step sensor_limit lowest highest highest_edge coordinate_from_sensor drive_from_force shape damper_high
+release
+""".split()
+_LAW = """
+mass damping stiffness lever_per_metre level high_pass mean_square filters sensor_filter pair hertz_scale pole
+pole_damping fade_step decay smoothing noise model_error levelling prior start spread
+""".split()
+_SAMPLES = "damper_time hold settling joining joined notice patience".split()
+
+
+def export(rendering: Rendering, folder: Path, *, bands: int = 0, force: bool = False) -> list[Path]:
+    """Write design.c, design.h and the firmware's sources into `folder`, which is made where it is not there.
+
+    Parameters
+    ----------
+    rendering : Rendering
+        A scene, prepared for the device that the board drives (`hapticrender.prepare`).
+    folder : Path
+    bands : int
+        Most bands that the board can be set to, at most 64; by default 8, or the scene's number if that is larger.
+    force : bool
+        Overwrite sources that were changed since they were written.
+
+    Returns
+    -------
+    list of Path
+        What was written.
+
+    Raises
+    ------
+    ValueError
+        The board cannot play the scene, or a file of `folder` would be overwritten that is not as it was written.
+    """
+    sizes, design = board_design(rendering, bands)
+    texts = {path.name: path.read_text(encoding="utf-8") for path in sources()}
+    if not force:
+        for name, text in texts.items():
+            _refuse_changed(folder / name, text)
+        for name in ("design.h", "design.c"):
+            _refuse_changed(folder / name, GENERATED)
+    texts |= {"design.h": _header(sizes), "design.c": _tables(design)}
+    folder.mkdir(parents=True, exist_ok=True)
+    for name, text in texts.items():
+        (folder / name).write_text(text, encoding="utf-8")
+    return [folder / name for name in sorted(texts)]
+
+
+def sources() -> list[Path]:
+    """Paths of the portable sources as installed."""
+    folder = Path(str(files("hapticrender.drivers").joinpath("firmware")))
+    return sorted(path for path in folder.iterdir() if path.name.endswith(SUFFIXES))
+
+
+def board_design(rendering: Rendering, bands: int = 0) -> tuple[dict[str, int], dict[str, Any]]:
+    """Return sizes (of design.h) and fields (of `design_t`) of a rendering's controller; see `export` for the errors."""
+    controller = rendering.controller()
+    controller = getattr(controller, "controller", controller)  # without its supervisor
+    most = _checked(rendering, controller, bands)
+    settings, law, model = controller.settings, controller.law, rendering.model
+    sensors, channels, taps = (int(settings[name]) for name in ("sensors", "channels", "n_taps"))
+    sizes = {
+        "BANDS": most,
+        "DELAY": int(law["delay"]),
+        "COORDINATES": int(settings["coordinates"]),
+        "SENSORS": sensors,
+        "CHANNELS": channels,
+        "DAMPER_TAPS": taps,
+    }
+    lowest, period = lowest_carrier(model, rendering.bands), 1.0 / model.rate
+    measuring = min(MEASURING, lowest / 2, spacing(rendering.bands) / (2 * math.pi))
+    fields: dict[str, Any] = {
+        "rate": float(model.rate),
+        "delay": int(law["delay"]),
+        "lookahead": controller.lookahead,
+        "most_bands": most,
+        "bands_used": len(rendering.bands),
+        "spatial": int(law["spatial"]),
+        "learns": int(law["learns"]),
+        **{name: settings[name] for name in _CONTROLLER},
+        **{name: law[name] for name in _LAW},
+        **{name: int(law[name]) for name in _SAMPLES},
+        "lost": 1.0 - law["kept"],
+        "taps": settings["taps"][:, :taps],
+        "force_from_drive": law["force_from_drive"][:, :channels],
+        "change_step": period / CHANGE,
+        "confidence_step": period / FADE_OUT,
+        "measuring": 4 * math.pi * measuring * period,
+        "measuring_dc": 2 * math.pi * min(MEASURING_DC, lowest / 8) * period,
+    }
+    fields["coordinate_from_sensor"] = fields["coordinate_from_sensor"][:, :sensors]
+    fields["drive_from_force"] = fields["drive_from_force"][:channels]
+    if len(rendering.bands):
+        fields["bands"] = _bands(rendering)
+    return sizes, fields
+
+
+def _checked(rendering: Rendering, controller: Any, bands: int) -> int:
+    """Most bands of the board; refuses what its law does not play."""
+    scene, model, used = rendering.scene, rendering.model, len(rendering.bands)
+    if scene.device != "vt-plate":
+        raise ValueError(f"device.kind = {scene.device!r}: a board plays vt-plate only")
+    if not isinstance(controller, WaveformController):
+        cure = "render.method = \"inverse\" and a texture without `carriers`"
+        raise ValueError(f"render.method = {scene.method!r} of this texture: a board plays bands or a waveform by {cure}")
+    if rendering.bands.modulated or rendering.bands.differentiated:
+        raise ValueError("the target is modulated, or a velocity: a board plays displacements of constant amplitude")
+    if model.delay > MOST_DELAY:
+        raise ValueError(f"delay = {model.delay} samples: must be <= {MOST_DELAY} on a board")
+    most = bands or max(BANDS, used)
+    if not used <= most <= MOST_BANDS:
+        raise ValueError(f"bands = {most}: must be {max(used, 1)} (those of the scene) to {MOST_BANDS} on a board")
+    return most
+
+
+def _bands(rendering: Rendering) -> list[dict[str, Any]]:
+    """Fields of `band_t`, band after band."""
+    bands = rendering.bands
+    envelope = np.zeros(len(bands)) if bands.envelope is None else bands.envelope
+    turns = np.remainder(bands.phase / (2 * np.pi), 1.0)
+    rows = zip(bands.frequency, bands.wavenumber, turns, envelope, strict=True)
+    return [
+        {"frequency": hertz, "wavenumber": number, "phase": phase, "re": complex(each).real, "im": complex(each).imag}
+        for hertz, number, phase, each in rows
+    ]
+
+
+def _refuse_changed(path: Path, text: str) -> None:
+    """Refuse to overwrite a file that does not begin with `text`."""
+    if path.exists() and not path.read_text(encoding="utf-8", errors="replace").startswith(text):
+        raise ValueError(f"{str(path)!r}: is not as it was written: choose another folder, or add --force")
+
+
+def _header(sizes: dict[str, int]) -> str:
+    lines = [f"#define LAW_{name} {value}\n" for name, value in sizes.items()]
+    return f"{GENERATED}#ifndef DESIGN_H\n#define DESIGN_H\n\n{''.join(lines)}\n#endif\n"
+
+
+def _tables(fields: dict[str, Any]) -> str:
+    lines = [f"    .{name} = {_literal(value)},\n" for name, value in fields.items()]
+    return f'{GENERATED}#include "law.h"\n\nconst design_t design = {{\n{"".join(lines)}}};\n'
+
+
+def _literal(value: Any) -> str:
+    """C initialiser of an integer, a number, an array of numbers, or bands; numbers in full precision."""
+    if isinstance(value, dict):
+        return f"{{{', '.join(f'.{name} = {_literal(each)}' for name, each in value.items())}}}"
+    if isinstance(value, list | np.ndarray) and np.ndim(value):  # an array of numbers has no `dict` in it
+        return _braced([_literal(each) for each in value])
+    return f"{int(value)}u" if isinstance(value, int) else f"REAL({float(value)!r})"
+
+
+def _braced(items: list[str]) -> str:
+    """Initialiser of an array, in lines of at most 120 characters."""
+    joined = ", ".join(items)
+    return f"{{{joined}}}" if len(joined) < 80 else "{\n    " + ",\n    ".join(items) + ",\n    }"
+
+
