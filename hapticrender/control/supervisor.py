@@ -16,6 +16,7 @@ from hapticrender.control.device_model import Demand, DeviceModel
 from hapticrender.control.records import CONTROLLER, MOST_CHANNELS, MOST_SENSORS
 from hapticrender.control.supervisor_kernel import (
     ACTIVE,
+    BEYOND,
     DRIVE,
     FROZEN,
     INCONSISTENT,
@@ -43,6 +44,7 @@ PRESS, PRESS_LOAD = 9.0, 5.0  # N: 1.5 times the force that a press of 5 N in a 
 RINGING_FROM, RINGING_VARIANCES = 500.0, 16.0  # Hz, 4 sigma
 RINGING_MEAN, RINGING_TIME = 3e-3, 8e-3  # s: what a sudden lift-off leaves behind falls in this time from 15 sigma
 RINGING_WAIT, RINGING_STOP, SATURATED_WAIT = 10e-3, 150e-3, 0.5  # s
+BEYOND_TIME = 10e-3  # s: three samples in it are no spikes
 DANGER_DRIVE = 0.9  # of the drive limit
 UNLIMITED = 1e300
 
@@ -50,9 +52,9 @@ UNLIMITED = 1e300
 class Fault(NamedTuple):
     """Why a supervisor has stopped the drive."""
 
-    cause: int  # INVALID to OVERMOTION
+    cause: int  # INVALID to BEYOND
     sample: int  # at which the test failed; the drive fades out from it on
-    sensors: int  # bit i: sensor i + 1; of INVALID and FROZEN
+    sensors: int  # bit i: sensor i + 1; of INVALID, FROZEN and BEYOND
 
     @property
     def text(self) -> str:
@@ -91,6 +93,10 @@ CAUSES = {
     OVERMOTION: (
         "the surface moved farther than the scene and a press can move it; most likely the loop is unstable",
         "wiring and polarity of all sensors and actuators, the delay, and [device]",
+    ),
+    BEYOND: (
+        "sensor {sensor}: more than [limits] displacement",
+        "what the scene asks for, how hard the finger presses, and the sensor's offset",
     ),
 }
 
@@ -138,10 +144,17 @@ class SupervisedController:
     run = BankController.run
 
 
-def supervised(controller: Controller, model: DeviceModel) -> Any:
-    """Return a controller under supervision; as it is where it has no compiled step, or nothing is sensed."""
+def supervised(controller: Controller, model: DeviceModel, *, feedback: bool = True) -> Any:
+    """Return a controller under supervision; as it is where it has no compiled step.
+
+    Without `feedback` nothing is sensed, and the limit of rms drive is all that there is to hold.
+    """
     compiled = isinstance(getattr(controller, "step", None), CFunction)
-    return SupervisedController(controller, model) if compiled else controller
+    if not compiled or not (feedback or model.rms_limit < model.drive_limit):
+        return controller
+    if not feedback:
+        model = replace(model, demand=None, coordinate_from_sensed=model.coordinate_from_sensed[:, :0])
+    return SupervisedController(controller, model)
 
 
 def governed(model: DeviceModel, demand: Demand) -> DeviceModel:
@@ -185,6 +198,7 @@ def design_supervisor(controller: Any, model: DeviceModel) -> dict[str, Any]:
         "frozen_time": max(FROZEN_SAMPLES, round(FROZEN_TIME / model.pace * rate)),
         "frozen_drive": UNLIMITED if model.inferred else moved,
         **{f"fade_{name}": min(model.pace / (time * rate), 1.0) for name, time in FADES.items()},
+        **_limit_settings(controller, model),
     }
     if demand is None:
         return settings
@@ -199,6 +213,25 @@ def design_supervisor(controller: Any, model: DeviceModel) -> dict[str, Any]:
     if not modelled:
         return settings
     return settings | _motion_settings(model, demand, noise) | _ringing(controller, model, demand)
+
+
+def _limit_settings(controller: Any, model: DeviceModel) -> dict[str, Any]:
+    """Settings of test 8 and of the limit of rms drive, which is passed on to a controller with a drive limit."""
+    settings = {
+        "sensed_bound": min(model.sensed_bound, UNLIMITED),
+        "beyond_time": max(round(BEYOND_TIME * model.rate), 3),
+    }
+    if not model.rms_limit < model.drive_limit:
+        return settings
+    pole = _pole(model.rms_time, model.rate)
+    peak = min(model.drive_limit, model.rms_limit / math.sqrt(pole))  # a single sample passes no limit of the heat
+    own = getattr(controller.state, "dtype", None) == CONTROLLER
+    return settings | {
+        "drive_limit": peak,
+        "heat_pole": pole,
+        "heat_gain": (peak / model.rms_limit) ** 2 - 1.0,
+        "limited": controller.state.ctypes.data if own else 0,
+    }
 
 
 def _motion_settings(model: DeviceModel, demand: Demand, noise: float) -> dict[str, Any]:
