@@ -80,9 +80,12 @@ class BaseRenderer:
     def protected(self, limits: Limits, model: DeviceModel) -> DeviceModel:
         """Return the device model with the limits of the device, whose drive is that of `model`."""
         infinite = {name: getattr(limits, name) or math.inf for name in ("peak_drive", "rms_drive", "displacement")}
+        peak, step = infinite["peak_drive"], model.drive_step
+        if step > 0.0 and peak < model.drive_limit:
+            peak = step * math.floor(peak / step)  # what the converter rounds up would pass it
         return replace(
             model,
-            drive_limit=min(model.drive_limit, infinite["peak_drive"]),
+            drive_limit=min(model.drive_limit, peak),
             rms_limit=infinite["rms_drive"],
             rms_time=limits.rms_time,
             sensed_bound=infinite["displacement"],

@@ -88,8 +88,9 @@ def check_targets(scene: Scene, model: DeviceModel, bands: Bands, waveform: Wave
     ):
         if amplitude > most:
             raise ValueError(f"texture.amplitude {verb} {amplitude:.3g} {unit}: must be <= {most:g} {unit}, {whose}")
+    peak_drive = scene.device_profile.limits.peak_drive or math.inf
     each = " in each coil" if drive_unit == "A" else ""
-    own = ", [limits] peak_drive" if scene.device_profile.limits.peak_drive == model.drive_limit else ""
+    own = ", [limits] peak_drive" if 0.0 <= peak_drive - model.drive_limit <= model.drive_step else ""
     over = f" over {model.rms_time:g} s, [limits] rms_drive"
     for drive, most, kind, whose in (
         (need.drive, model.drive_limit, "", each + own),

@@ -165,7 +165,7 @@ class Scene(Validated):
     def device_profile(self) -> DeviceProfile:
         """What the scene says of its device; a ValueError where a limit or a calibration is none."""
         name = self.source or self.device
-        tables = {"device": self.profile, "limits": self.limits, "calibration": self.calibration}
+        tables: dict[str, Any] = {"device": self.profile, "limits": self.limits, "calibration": self.calibration}
         return DeviceProfile(kind=self.device, name=name, **tables)
 
     @classmethod
