@@ -41,9 +41,11 @@ NOISE_VARIANCES = 12.0
 POWER_TIME = 12e-3  # s
 DRIVE_TIME, PRESS_TIME, FASTEST_PACE = 30e-3, 60e-3, 6.0  # s, s; times of a faster device are shorter
 PRESS, PRESS_LOAD = 9.0, 5.0  # N: 1.5 times the force that a press of 5 N in a millisecond takes; its load
+SLIDE = 0.2  # m/s: a load that slides so fast is a moment that grows, and may be held against
 RINGING_FROM, RINGING_VARIANCES = 500.0, 16.0  # Hz, 4 sigma
 RINGING_MEAN, RINGING_TIME = 3e-3, 8e-3  # s: what a sudden lift-off leaves behind falls in this time from 15 sigma
 RINGING_WAIT, RINGING_STOP, SATURATED_WAIT = 10e-3, 150e-3, 0.5  # s
+SLOW_MEAN, SLOW_TIME = 0.2, 0.3  # s
 BEYOND_TIME = 10e-3  # s: three samples in it are no spikes
 DANGER_DRIVE = 0.9  # of the drive limit
 UNLIMITED = 1e300
@@ -235,7 +237,7 @@ def _limit_settings(controller: Any, model: DeviceModel) -> dict[str, Any]:
 
 
 def _motion_settings(model: DeviceModel, demand: Demand, noise: float) -> dict[str, Any]:
-    """Settings of tests 3, 4 and 7, which compare motion and drive; `noise` (rms) is that of each sensor."""
+    """Settings of tests 3, 4, 7 and 9, which compare motion and drive; `noise` (rms) is that of each sensor."""
     rate, stiffness = model.rate, float(model.stiffness[0, 0])
     sag, shared = PRESS_LOAD / stiffness, DELAY_ERROR**2
     corner = float(np.clip(1.4 * demand.highest, 250.0, max(rate / 10, 250.0)))
@@ -251,6 +253,7 @@ def _motion_settings(model: DeviceModel, demand: Demand, noise: float) -> dict[s
         bound[i, 4 + i] = MODEL_ERROR**2 * model.mass[i, i] ** 2
         bound[i, 6 + i] = shared
         floor[i] = NOISE_VARIANCES * noise**2 * _residual_noise(model, i, corner, low_end)
+    floor[1] += (PRESS_LOAD * SLIDE * model.lever_per_metre / (2 * np.pi * low_end)) ** 2  # a ramp behind the high-pass
     return {
         "modelled": 1,
         **{name: _padded(getattr(model, name), 2, 2) for name in ("mass", "damping", "stiffness")},
@@ -268,6 +271,8 @@ def _motion_settings(model: DeviceModel, demand: Demand, noise: float) -> dict[s
         "lever": abs(model.place_from_coordinate[:, 1:]).max(initial=0.0),
         "danger_motion": 4.0 * demand.motion + 1.36 * sag,
         "most_motion": 3.0 * demand.motion + 5.4 * sag,
+        "slow_pole": _pole(SLOW_MEAN, rate),
+        "slow_time": SLOW_TIME * rate,
         "danger_drive": DANGER_DRIVE * model.drive_limit,
     }
 
