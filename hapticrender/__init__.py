@@ -33,6 +33,7 @@ _HOMES = {
     "recordings.recording": "Recorder Recording",
     "touch.builtin_scenes": "builtin_scenes",
     "touch.composed": "Chirp Playlist Sum",
+    "touch.device_profile": "DeviceProfile",
     "touch.finger": "Finger",
     "touch.grating": "Grating",
     "touch.mechanics": "FingerMechanics",
@@ -82,6 +83,7 @@ if _typing.TYPE_CHECKING:
     from hapticrender.touch.composed import Chirp as Chirp
     from hapticrender.touch.composed import Playlist as Playlist
     from hapticrender.touch.composed import Sum as Sum
+    from hapticrender.touch.device_profile import DeviceProfile as DeviceProfile
     from hapticrender.touch.finger import Finger as Finger
     from hapticrender.touch.grating import Grating as Grating
     from hapticrender.touch.mechanics import FingerMechanics as FingerMechanics

@@ -12,6 +12,7 @@ import os
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
@@ -24,6 +25,7 @@ if TYPE_CHECKING:
     from hapticrender.protocols import Rendering
     from hapticrender.report.outputs import Outputs
     from hapticrender.report.progress import Progress
+    from hapticrender.touch.device_profile import DeviceProfile
     from hapticrender.touch.scene import Scene
 
 LOOK = 0.25  # s between two looks at what plays
@@ -124,7 +126,7 @@ def _parser() -> argparse.ArgumentParser:
     text = "folder for the files of each scene that does not pass"
     validate.add_argument("--out", "-o", metavar="DIR", type=_path, help=text)
     validate.add_argument("--jobs", "-j", metavar="N", type=_whole(1, 999), default=1, help="processes (default: 1)")
-    _add_run(validate)
+    _add_run(validate, driver=True)
 
     show = _add_verb(verbs, "show", _show, "print the figures of a recording, finished or cut off by a crash")
     show.add_argument("path", metavar="PATH", type=_path, help="a recording, or the folder of a rendered scene")
@@ -137,11 +139,13 @@ def _parser() -> argparse.ArgumentParser:
     text = "of a glass end (default: 100e-6)"
     identify.add_argument("--amplitude", metavar="M", type=float, default=100e-6, help=text)
     identify.add_argument("--seconds", metavar="S", type=float, default=1.0, help="length of the record (default: 1)")
-    text = "write the result as a [device] table (TOML) to paste into a scene"
+    text = "write the result as a profile (TOML), which a scene takes by device = FILE"
     identify.add_argument("--out", "-o", metavar="FILE", type=_path, help=text)
+    identify.add_argument("--name", metavar="TEXT", help="which device it is (default: the file's name)")
+    identify.add_argument("--by", metavar="TEXT", default="", help="who measures it")
     _add_run(identify, method=False, driver=True)
 
-    _add_verb(verbs, "devices", _devices, "list the kinds of device, what each needs, and whether it is there")
+    _add_verb(verbs, "devices", _devices, "list kinds of device, drivers, and the cards and ports that are there")
     return parser
 
 
@@ -162,7 +166,7 @@ def _add_run(verb: argparse.ArgumentParser, *, method: bool = True, driver: bool
         text = f"control method: one of {', '.join(defaults.METHODS)} (default: the scene's, or {defaults.METHOD})"
         verb.add_argument("--method", metavar="NAME", help=text)
     if driver:
-        text = "driver of the device, with its argument (default: a simulated device; see `hapticrender devices`)"
+        text = "simulated (default), wavefile:FILE, module:callable or another; see `hapticrender devices`"
         verb.add_argument("--driver", metavar="NAME[:ARG]", default="simulated", help=text)
     seed = _whole(0, 10**18 - 1)
     verb.add_argument("--seed", metavar="N", type=seed, help="seed of the noise (default: the scene's)")
@@ -234,7 +238,9 @@ def _render(arguments: argparse.Namespace) -> int:
         with _naming(arguments.scene):
             found = least_model(scene)
         scene, notes = found.scene, found.text
-    [rendering] = renderings = _prepare({arguments.scene: scene}, arguments, _driver(arguments.driver))
+    with _naming(arguments.scene):
+        driver = _driver(arguments.driver, scene)
+    [rendering] = renderings = _prepare({arguments.scene: scene}, arguments, driver)
     with _progress(renderings).scene(arguments.scene) as tick:
         outputs = run_into(arguments.out, rendering, progress=tick)
     if arguments.verbose:
@@ -320,6 +326,7 @@ def _validate(arguments: argparse.Namespace) -> int:
     if arguments.out:
         check_folder("--out", arguments.out)
     options = {"method": arguments.method, "seed": arguments.seed, "jobs": arguments.jobs, "out": arguments.out}
+    options["driver"] = arguments.driver
     verdicts = validate(references, **options, progress=sys.stderr)
     for _, path, write in reports:
         if path:
@@ -340,8 +347,9 @@ def _suite(arguments: argparse.Namespace) -> int:
     from hapticrender.report.outputs import check_file
 
     chosen = arguments.method or defaults.METHOD
-    if arguments.scenes or arguments.junit or arguments.out or arguments.jobs > 1:
-        raise ValueError("--suite runs no scenes and writes --json only")
+    simulated = arguments.driver == "simulated"
+    if arguments.scenes or arguments.junit or arguments.out or arguments.jobs > 1 or not simulated:
+        raise ValueError("--suite runs no scenes, on simulated devices, and writes --json only")
     if arguments.json:
         check_file("--json", arguments.json)
     methods = list(dict.fromkeys((chosen, "paper")))
@@ -371,7 +379,7 @@ def _identify(arguments: argparse.Namespace) -> int:
             raise ValueError(f"device.kind = {scene.device!r}: must be vt-plate, ultrasonic or electroadhesion")
         setup = registered("renderers", scene.device)().read(scene, None)
         seed = scene.seed if arguments.seed is None else arguments.seed
-        driver = _driver(arguments.driver)
+        driver = _driver(arguments.driver, scene)
         if driver is None:
             plants = {
                 "vt-plate": lambda: Plate(setup.simulated, Finger.absent(), seed),
@@ -390,9 +398,26 @@ def _identify(arguments: argparse.Namespace) -> int:
     for difference in found.differences(setup.assumed) if scene.device == "vt-plate" else ():
         print(f"differs from [device]: {difference}")
     if arguments.out:
-        _made(arguments.out).write_text(found.to_toml(), encoding="utf-8")
+        _profile(found, scene, arguments).save(_made(arguments.out))
         print(f"wrote {arguments.out}")
     return 0
+
+
+def _profile(found: Any, scene: Scene, arguments: argparse.Namespace) -> DeviceProfile:
+    """Profile of an identified device; limits, and what else the scene says of the device, are kept."""
+    from datetime import date
+
+    own, device = scene.device_profile, found.profile()
+    uncertainty = {name: value for name, value in found.uncertainty().items() if name in device}
+    return replace(
+        own,
+        name=arguments.name or arguments.out.stem,
+        measured_by=arguments.by,
+        measured_with=f"hapticrender {__version__} identify, driver {arguments.driver}",
+        measured_on=date.today(),
+        device={**own.device, **device},
+        uncertainty=uncertainty,
+    )
 
 
 def _show(arguments: argparse.Namespace) -> int:
@@ -437,18 +462,16 @@ def _prepare(scenes: dict[str, Scene], arguments: argparse.Namespace, driver: An
     return renderings
 
 
-def _driver(text: str) -> Any:
-    """Make the driver of ``--driver NAME[:ARG]``; None for the simulated device."""
-    from hapticrender.loop import registered
+def _driver(text: str, scene: Scene) -> Any:
+    """Make the driver of ``--driver``, calibrated as the scene says; None for the simulated device.
 
-    name, colon, argument = text.partition(":")
-    if text == "simulated":
-        return None
-    factory = registered("drivers", name)
-    try:
-        return factory(argument) if colon else factory()
-    except TypeError as error:
-        raise ValueError(f"--driver = {text!r}: {error}; give the driver's argument as {name}:ARG") from error
+    A module of the user's is looked for in the folder that the command is run in, too.
+    """
+    from hapticrender.devices import open_driver
+
+    if "" not in sys.path:
+        sys.path.insert(0, "")
+    return open_driver(text, scene.device_profile)
 
 
 def _progress(renderings: list[Rendering]) -> Progress:
