@@ -131,6 +131,21 @@ def _parser() -> argparse.ArgumentParser:
     identify.add_argument("--out", "-o", metavar="FILE", type=_path, help=text)
     _add_run(identify, method=False, driver=True)
 
+    latency = _add_verb(
+        verbs,
+        "latency",
+        _latency,
+        "measure the delay of a loop by a cable from a driver's first output to its first input",
+    )
+    latency.add_argument("--driver", metavar="NAME[:ARG]", required=True, help="driver of the device, such as audio:0")
+    latency.add_argument(
+        "--runs", metavar="N", type=_whole(1, 999), default=5, help="runs, which must agree (default: 5)"
+    )
+    text = "of the noise, of full scale on a sound card, in A or V elsewhere (default: 0.1)"
+    latency.add_argument("--amplitude", metavar="A", type=float, default=0.1, help=text)
+    text = "profile (TOML) whose [calibration] gets the delay; made if it is not there"
+    latency.add_argument("--out", "-o", metavar="FILE", type=_path, help=text)
+
     _add_verb(verbs, "devices", _devices, "list the kinds of device, what each needs, and whether it is there")
     return parser
 
@@ -343,6 +358,23 @@ def _identify(arguments: argparse.Namespace) -> int:
         print(f"differs from [device]: {difference}")
     if arguments.out:
         _made(arguments.out).write_text(found.to_toml(), encoding="utf-8")
+        print(f"wrote {arguments.out}")
+    return 0
+
+
+def _latency(arguments: argparse.Namespace) -> int:
+    from hapticrender.latency import measure_latency, write_delay
+    from hapticrender.report.outputs import check_file
+
+    if arguments.out:
+        check_file("--out", arguments.out)
+    driver = _driver(arguments.driver)
+    if driver is None:
+        raise ValueError("--driver = 'simulated': must be a device with a cable, such as audio:0")
+    found = measure_latency(driver, runs=arguments.runs, amplitude=arguments.amplitude)
+    print(printable(f"{arguments.driver}: {found}"))
+    if arguments.out:
+        write_delay(_made(arguments.out), found)
         print(f"wrote {arguments.out}")
     return 0
 
