@@ -8,6 +8,7 @@ from __future__ import annotations
 import ctypes
 import os
 import sys
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from ctypes import CDLL, POINTER, Structure, byref, c_char_p, c_double, c_int, c_ulong, c_void_p
@@ -23,6 +24,7 @@ LEAST_VERSION = 0x130600  # 19.6.0: the first whose Pa_GetVersion says more than
 FLOAT32 = 0x00000001  # paFloat32, interleaved
 ANTICIPATED_ERRORS = {-9985: "it is in use by another program, or does not exist any more"}  # paDeviceUnavailable
 HOST_ERROR = -9999  # paUnanticipatedHostError: PaHostErrorInfo says more
+PATIENCE = 3.0  # s: longest wait for a stream to close
 INSTALL = (
     "to get it: Debian and Ubuntu: apt install libportaudio2; Fedora: dnf install portaudio; "
     'macOS and Windows: pip install "hapticrender[audio]"'
@@ -300,13 +302,33 @@ class Stream:
         return 0.0 if self._handle is None else float(self._library.Pa_GetStreamCpuLoad(self._handle))
 
     def close(self) -> None:
-        """Stop after what has been played, and release the card; a second call does nothing."""
+        """Stop after what has been played, and release the card; a second call does nothing.
+
+        Raises
+        ------
+        DriverError
+            PortAudio reports an error, or does not return (with JACK, where the server has died): it is left behind.
+        """
         handle, self._handle = self._handle, None
         if handle is None:
             return
+        errors: list[DriverError] = []
+        release = threading.Thread(target=self._release, args=(handle, errors), daemon=True)
+        release.start()
+        release.join(PATIENCE)
+        if release.is_alive():
+            raise DriverError(
+                f"{self.name}: close: PortAudio did not return within {PATIENCE:g} s: restart the program"
+            )
+        if errors:
+            raise errors[0]
+
+    def _release(self, handle: c_void_p, errors: list[DriverError]) -> None:
         try:
             if self._library.Pa_IsStreamActive(handle) == 1:
                 check(self._library.Pa_StopStream(handle), f"{self.name}: stop")
+        except DriverError as error:
+            errors.append(error)
         finally:
             self._library.Pa_CloseStream(handle)
             self._library.Pa_Terminate()

@@ -21,6 +21,7 @@ SOURCE = Path(__file__).with_name("jack_plate.c")
 CLIENT = "plate"
 RATE, BLOCK = 48_000.0, 64  # Hz, samples
 AMPERES, METRES = 3.0, 1e-3  # of full scale, out and in
+PACKAGES = "jackd2 libportaudio2 libjack-jackd2-dev gcc"
 PATIENCE = 20.0  # s: until the server is there
 
 
@@ -31,9 +32,6 @@ def missing() -> str:
     if lacking:
         return f"{', '.join(lacking)} not installed: `make audio-test` as root, or apt install {PACKAGES}"
     return ""
-
-
-PACKAGES = "jackd2 libportaudio2 libjack-jackd2-dev gcc"
 
 
 class System(NamedTuple):
@@ -113,9 +111,9 @@ def build(folder: Path) -> Path:
 
 
 @contextmanager
-def server(folder: Path):
+def server(folder: Path, name: str = "test"):
     """Run a server of its own that needs no privileges; every client of this process finds it."""
-    name = f"hapticrender-{os.getpid()}"
+    name = f"hapticrender-{os.getpid()}-{name}"
     own = {"JACK_DEFAULT_SERVER": name, "JACK_NO_START_SERVER": "1", "JACK_NO_AUDIO_RESERVATION": "1"}
     before = {key: os.environ.get(key) for key in own}
     os.environ.update(own)
