@@ -324,6 +324,11 @@ class LiveAudioDriver(AudioDriver):
             super().close()
 
     @property
+    def last_sensed(self) -> Array:
+        """Samples that the last call of the entry got, float32 of shape (block, sensed_channels), full scale 1."""
+        return self._relay.sensed
+
+    @property
     def overruns(self) -> int:
         """Blocks before which the card lost samples since `start`."""
         return self._relay.count("overruns") - self._before if self._state != "new" else 0

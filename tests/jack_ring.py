@@ -1,27 +1,37 @@
-"""A JACK server with its dummy back end, and a second client on it that is a linear device (`jack_plate.c`)."""
+"""A JACK server with its dummy back end, a client on it that is a device (`jack_plate.c`), and the ring of both."""
 
+import ctypes
 import os
 import shutil
 import subprocess
+import threading
 import time
 from contextlib import contextmanager
 from ctypes.util import find_library
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
+from hapticrender.bands import Bands
+from hapticrender.control.methods import METHODS
 from hapticrender.drivers import portaudio
+from hapticrender.drivers.audio import AudioDriver
 from hapticrender.errors import DeviceNotFound
 from hapticrender.plants.plate import PlateParameters, structure
+from hapticrender.realtime import RealtimeEntry
 from hapticrender.touch.mechanics import HEAVY_SECOND
 
 SOURCE = Path(__file__).with_name("jack_plate.c")
 CLIENT = "plate"
 RATE, BLOCK = 48_000.0, 64  # Hz, samples
 AMPERES, METRES = 3.0, 1e-3  # of full scale, out and in
-PACKAGES = "jackd2 libportaudio2 libjack-jackd2-dev gcc"
+NOISE = 1e-6  # m rms, of a sensor
+ROUND_TRIP = 128  # samples: PortAudio and the plate each get what the other played in the period before
+FREQUENCY = np.array([40.0, 90, 140, 190, 240, 290, 340, 390])  # Hz
+AMPLITUDE = 2e-6  # m
+PACKAGES = "jackd2 libportaudio2 libjack-jackd2-dev gcc libc6-dev"
 PATIENCE = 20.0  # s: until the server is there
 
 
@@ -169,3 +179,88 @@ def _end(process: subprocess.Popen, patience: float = 0.0) -> None:
             return
         except subprocess.TimeoutExpired:
             continue
+
+
+def comb():
+    return Bands(
+        frequency=FREQUENCY,
+        wavenumber=np.zeros(8),
+        phase=np.linspace(0.0, 5.0, 8),
+        envelope=np.full(8, AMPLITUDE, complex),
+    )
+
+
+def driver(delay=ROUND_TRIP, **options):
+    scales = {"drive_per_full_scale": AMPERES, "sensed_per_full_scale": METRES}
+    return AudioDriver(CLIENT, (1, 2), (1, 2), delay=delay, **scales | options)
+
+
+def entry_for(live):
+    """Designed for the paper's plate behind this driver, and compiled."""
+    model = PlateParameters(rate=RATE, delay=live.delay).device_model(RATE, live.delay)
+    controller = METHODS["h2"].design(replace(model, block=BLOCK), comb())
+    entry = RealtimeEntry(controller, sensed_scale=live.sensed_scale, drive_scale=live.drive_scale)
+    entry.finger(0.01)
+    _ = entry.address
+    return entry
+
+
+def relative_errors(device, path, last, samples, seconds=2.0, before=0.1):
+    """Motion of centre and ends over the target, less 1, complex of shape (3, 8), `before` (s) the end of the record.
+
+    `last` is the last block that the entry sensed, after which it had played `samples`; it is found in what the device
+    has recorded with its noise, and so are the entry's own numbers of the device's samples.
+    """
+    true, noisy = device.recorded(path)
+    (place,) = (n for n in np.flatnonzero(noisy[: -BLOCK + 1, 0] == last[0, 0]) if (noisy[n : n + BLOCK] == last).all())
+    index = np.arange(round(seconds * RATE)) + place - round((before + seconds) * RATE)
+    phase = 2 * np.pi * np.outer(index - place + samples - BLOCK, FREQUENCY) / RATE + comb().phase
+    motion = np.column_stack([true.mean(axis=1), true])[index].astype(float) * METRES
+    found = np.linalg.lstsq(np.hstack([np.cos(phase), -np.sin(phase)]), motion, rcond=None)[0]
+    return (found[:8] + 1j * found[8:]).T / comb().envelope - 1
+
+
+class PythonEntry:
+    """An entry whose callback is a function of Python that calls the compiled one."""
+
+    def __init__(self, entry):
+        pointer, long = ctypes.c_void_p, ctypes.c_ulong
+        signature = ctypes.CFUNCTYPE(ctypes.c_int, pointer, pointer, long, pointer, long, pointer)
+        compiled = signature(entry.address)
+        self._callback = signature(lambda *arguments: compiled(*arguments))
+        self.address = ctypes.cast(self._callback, pointer).value
+        self.user_data, self.block, self.controller = entry.user_data, entry.block, entry.controller
+        self.silence = entry.silence
+
+
+@contextmanager
+def busy_thread(busy):
+    """Keep Python's lock in another thread, but for the turns that it gives away every 5 ms."""
+    stop = threading.Event()
+
+    def work():
+        while not stop.is_set():
+            sum(range(10_000))
+
+    thread = threading.Thread(target=work)
+    if busy:
+        thread.start()
+    try:
+        yield
+    finally:
+        stop.set()
+        if busy:
+            thread.join()
+
+
+def lost_callbacks(device, wrap, busy, seconds):
+    """Share of the periods that the plate's client went through, and this process did not."""
+    live = driver().live()
+    entry = entry_for(live)
+    with live, busy_thread(busy):
+        live.start(wrap(entry))
+        time.sleep(0.2)
+        first, samples = device.say("count"), entry.samples
+        time.sleep(seconds)
+        last, more = device.say("count"), entry.samples
+    return 1 - (more - samples) / BLOCK / (last.periods - first.periods)
