@@ -145,6 +145,21 @@ def _parser() -> argparse.ArgumentParser:
     identify.add_argument("--by", metavar="TEXT", default="", help="who measures it")
     _add_run(identify, method=False, driver=True)
 
+    latency = _add_verb(
+        verbs,
+        "latency",
+        _latency,
+        "measure the delay of a loop by a cable from a driver's first output to its first input",
+    )
+    latency.add_argument("--driver", metavar="NAME[:ARG]", required=True, help="driver of the device, such as audio:0")
+    latency.add_argument(
+        "--runs", metavar="N", type=_whole(1, 999), default=5, help="runs, which must agree (default: 5)"
+    )
+    text = "of the noise, of full scale on a sound card, in A or V elsewhere (default: 0.1)"
+    latency.add_argument("--amplitude", metavar="A", type=float, default=0.1, help=text)
+    text = "profile (TOML) whose [calibration] gets the delay; made if it is not there"
+    latency.add_argument("--out", "-o", metavar="FILE", type=_path, help=text)
+
     _add_verb(verbs, "devices", _devices, "list kinds of device, drivers, and the cards and ports that are there")
     return parser
 
@@ -276,7 +291,7 @@ def _play(arguments: argparse.Namespace) -> int:
             refuse_foreign_page(out)
     lines, journal = LiveLines(sys.stdout), None
     try:
-        with _naming(arguments.scene), Player(scene, _driver(arguments.driver)) as player:
+        with _naming(arguments.scene), Player(scene, _driver(arguments.driver, scene)) as player:
             player.play(scene.texture)
             if out:
                 journal = outputs.begin_outputs(out / scene.name, scene)
@@ -418,6 +433,24 @@ def _profile(found: Any, scene: Scene, arguments: argparse.Namespace) -> DeviceP
         device={**own.device, **device},
         uncertainty=uncertainty,
     )
+
+
+def _latency(arguments: argparse.Namespace) -> int:
+    from hapticrender.devices import open_driver
+    from hapticrender.latency import measure_latency, write_delay
+    from hapticrender.report.outputs import check_file
+
+    if arguments.out:
+        check_file("--out", arguments.out)
+    driver = open_driver(arguments.driver)
+    if driver is None:
+        raise ValueError("--driver = 'simulated': must be a device with a cable, such as audio:0")
+    found = measure_latency(driver, runs=arguments.runs, amplitude=arguments.amplitude)
+    print(printable(f"{arguments.driver}: {found}"))
+    if arguments.out:
+        write_delay(_made(arguments.out), found)
+        print(f"wrote {arguments.out}")
+    return 0
 
 
 def _show(arguments: argparse.Namespace) -> int:
