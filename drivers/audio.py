@@ -264,7 +264,8 @@ class AudioDriver(BaseDriver):
 class LiveAudioDriver(AudioDriver):
     """A sound card that calls a compiled controller back: between `start` and `stop` nothing waits for Python.
 
-    `delay` is the card's own.  `play` can be used before `start`, for a probe, and adds `queued` to it.
+    `delay` is the card's own, for which the controller is designed.  While none runs `play` can be used, for a probe;
+    its delay is longer by `queued`.
     """
 
     _entry: Any = None
@@ -307,6 +308,11 @@ class LiveAudioDriver(AudioDriver):
         self._entry = entry
         self._before = self._relay.count("overruns")
         self._relay.call(address, entry.user_data)
+
+    def _play(self, drive: Array) -> Sensed:
+        if self._entry is not None:
+            raise DriverError(f"{self}: play: it runs a controller; stop it first")
+        return super()._play(drive)
 
     def stop(self) -> None:
         """Play zeros from the next block on, and wait until they are played; nothing where it does not run."""

@@ -185,8 +185,10 @@ def initialised() -> Iterator[CDLL]:
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """Discard what the libraries below PortAudio write to standard error while they look for cards that are absent."""
-    sys.stderr.flush()
+    """Discard what ALSA and JACK write to standard error while they look for cards that are absent."""
+    if not sys.platform.startswith("linux"):
+        yield
+        return
     kept, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
     os.dup2(nowhere, 2)
     try:

@@ -160,6 +160,12 @@ def _parser() -> argparse.ArgumentParser:
     text = "profile (TOML) whose [calibration] gets the delay; made if it is not there"
     latency.add_argument("--out", "-o", metavar="FILE", type=_path, help=text)
 
+    export = _add_verb(verbs, "export", _export, "write a scene's controller as C sources for a microcontroller")
+    export.add_argument("scene", metavar="SCENE", help="a TOML file, or the name of a built-in scene")
+    text = "most bands that the board can be set to (default: 8, or as many as the scene has)"
+    export.add_argument("--bands", metavar="N", type=_whole(1, 64), default=0, help=text)
+    _add_out(export, None)
+
     _add_verb(verbs, "devices", _devices, "list kinds of device, drivers, and the cards and ports that are there")
     return parser
 
@@ -450,6 +456,20 @@ def _latency(arguments: argparse.Namespace) -> int:
     if arguments.out:
         write_delay(_made(arguments.out), found)
         print(f"wrote {arguments.out}")
+    return 0
+
+
+def _export(arguments: argparse.Namespace) -> int:
+    from hapticrender.export import export
+    from hapticrender.loop import prepare
+    from hapticrender.report.outputs import check_folder
+
+    check_folder("--out", arguments.out)
+    scene = _scene(arguments.scene)
+    with _naming(arguments.scene):
+        rendering = prepare(scene)
+        written = export(rendering, arguments.out, bands=arguments.bands, force=arguments.force)
+    print(f"wrote {len(written)} files into {arguments.out}; build them with: make -C {arguments.out}")
     return 0
 
 

@@ -50,7 +50,7 @@ def prepare(
 def open_scene(
     scene: Scene | str | os.PathLike[str],
     *,
-    driver: Driver | None = None,
+    driver: Driver | str | None = None,
     method: str | None = None,
     seed: int | None = None,
     renderer: Renderer | None = None,

@@ -135,7 +135,7 @@ class Player:
     def __init__(
         self,
         device: str | Scene = "vt-plate",
-        driver: Driver | None = None,
+        driver: Driver | str | None = None,
         *,
         finger: Finger | None = None,
         paced: bool = True,

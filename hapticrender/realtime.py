@@ -214,7 +214,7 @@ def carry(entry, sensed, drive, frames, dtype, sensed_scale, drive_scale):
     """Advance by blocks of samples of `dtype` at two addresses; returns the flags, or -1 and zeros where it refuses."""
     e, count = record(entry, ENTRY_T, 0), int(frames)
     out = carray(pointer(drive, dtype), count * e.channels if drive != 0 else 0)
-    if count % e.block or sensed == 0 or drive == 0:
+    if count % e.block or (sensed == 0 and e.sensors > 0) or drive == 0:
         e.refused += 1
         out[:] = 0.0
         return -1

@@ -122,7 +122,7 @@ def build(folder: Path) -> Path:
 
 @contextmanager
 def server(folder: Path, name: str = "test"):
-    """Run a server of its own that needs no privileges; every client of this process finds it."""
+    """Run a server of its own that needs no privileges, as a process; every client of this process finds it."""
     name = f"hapticrender-{os.getpid()}-{name}"
     own = {"JACK_DEFAULT_SERVER": name, "JACK_NO_START_SERVER": "1", "JACK_NO_AUDIO_RESERVATION": "1"}
     before = {key: os.environ.get(key) for key in own}
@@ -132,7 +132,7 @@ def server(folder: Path, name: str = "test"):
         process = subprocess.Popen(command, stdout=log, stderr=log)
     try:
         _wait_for_card(process, folder / "jackd.log")
-        yield
+        yield process
     finally:
         _end(process)
         for key, value in before.items():

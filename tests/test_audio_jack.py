@@ -243,7 +243,10 @@ def test_entries_that_do_not_fit_are_refused(connected):
         live.start(entry)
         with pytest.raises(DriverError, match="audio:plate: start: it is running already"):
             live.start(entry)
+        with pytest.raises(DriverError, match="audio:plate: play: it runs a controller; stop it first"):
+            live.play(np.zeros((BLOCK, 2)))
         live.stop()
+        live.play(np.zeros((BLOCK, 2)))
         live.start(entry)  # and again
     with (
         AudioDriver(CLIENT, (1,)).live() as other,
@@ -253,6 +256,7 @@ def test_entries_that_do_not_fit_are_refused(connected):
 
 
 LOSE = """
+import signal
 import sys
 from contextlib import ExitStack
 from pathlib import Path
@@ -262,26 +266,37 @@ import numpy as np
 import jack_ring
 from hapticrender.drivers.audio import AudioDriver
 
-folder, program = map(Path, sys.argv[1:])
+folder, program = map(Path, sys.argv[1:3])
 with ExitStack() as stack:
     server = stack.enter_context(ExitStack())
-    server.enter_context(jack_ring.server(folder))
+    process = server.enter_context(jack_ring.server(folder))
     stack.enter_context(jack_ring.device(program, folder, jack_ring.straight()))
     with AudioDriver(jack_ring.CLIENT) as opened:
         opened.play(np.zeros((64, 2)))
-        server.close()
+        if sys.argv[3] == "ends":
+            server.close()
+        else:
+            process.send_signal(signal.SIGSTOP)
+            stack.callback(process.send_signal, signal.SIGCONT)
         for _ in range(100):
             opened.play(np.zeros((64, 2)))
 """
 
 
-def test_a_card_that_goes_away_is_a_lost_device(program, tmp_path):
+@pytest.mark.parametrize(
+    ("server", "message"),
+    [
+        ("ends", "DeviceLost: audio:plate: the card stopped after 64 samples: is it still connected"),
+        ("halts", "DeviceTimeout: audio:plate: play: no block of 64 samples came within 2 s"),
+    ],
+)
+def test_a_card_that_goes_away_is_a_lost_device(program, tmp_path, server, message):
     """In a process of its own, whose PortAudio is of no use afterwards: it ends, and says what has happened."""
-    command = [sys.executable, "-c", LOSE, tmp_path, program]
+    command = [sys.executable, "-c", LOSE, tmp_path, program, server]
     paths = {"PYTHONPATH": os.pathsep.join(map(str, (Path(__file__).parent, Path(__file__).parent.parent)))}
     done = subprocess.run(command, env=os.environ | paths, capture_output=True, text=True, timeout=120)
     assert done.returncode == 1
-    assert "DeviceLost: audio:plate: the card stopped after 64 samples: is it still connected" in done.stderr
+    assert message in done.stderr
 
 
 def test_without_inputs_a_plate_is_driven_open_loop(connected, tmp_path):

@@ -179,8 +179,8 @@ def test_refusals_name_port_command_and_bytes(stepped):
         client.gain = 1.01
     with pytest.raises(ValueError, match="must be constant envelopes"):
         client.set_bands(replace(tones(50.0), envelope=None))
-    request = client._link.submit(Kind.COMMIT, protocol.pack(Kind.COMMIT, 1, 0))
-    assert client._answer(request).refused == Reason.DIGEST
+    request = client._line.link.submit(Kind.COMMIT, protocol.pack(Kind.COMMIT, 1, 0))
+    assert client._line._answer(request).refused == Reason.DIGEST
 
 
 def test_the_board_identifies_itself(program, tmp_path):
@@ -355,7 +355,7 @@ def test_a_word_that_waited_for_long_is_no_sign_of_life(stepped, late, stops):
     start, waiting = stepped.time, []
     while stepped.time < start + 0.6:
         arrival = stepped.time + min(late, (stepped.time - start) / 2)
-        waiting.append((arrival, client._link.due(stepped.time)))
+        waiting.append((arrival, client._line.link.due(stepped.time)))
         stepped.sleep(0.01)
         while waiting and waiting[0][0] <= stepped.time:
             stepped.inject(waiting.pop(0)[1])
@@ -369,7 +369,7 @@ def test_damage_that_the_crc_does_not_show_does_nothing(stepped):
     client.start()
     run(client, stepped, 0.2)
     before, refused = stepped.board.log(), client.telemetry().refused
-    link = client._link
+    link = client._line.link
     words = [
         (Kind.SETPOINT, protocol.pack(Kind.SETPOINT, 0, 47.0, 0.0, 0.0, 5e-6, 0.0)),
         (Kind.GAIN, protocol.pack(Kind.GAIN, 0.5)),
@@ -383,7 +383,7 @@ def test_damage_that_the_crc_does_not_show_does_nothing(stepped):
         changed = bytes([frame.payload[0] ^ 1]) + frame.payload[1:]
         stepped.inject(protocol.encode(frame._replace(payload=changed)))
         run(client, stepped, 0.02)
-    client._link._strange = 0
+    client._line.link._strange = 0
     run(client, stepped, 0.1)
     assert client.telemetry().refused == refused + len(words)
     assert client.telemetry().commits == 1
@@ -396,9 +396,9 @@ def test_a_commit_acts_only_on_what_it_says(stepped):
     client = client_of(stepped).open()
     client.set_bands(tones(47.0, 72.0))
     payloads = [protocol.pack(Kind.SETPOINT, index, 100.0 + 20 * index, 0.0, 0.0, 5e-6, 0.0) for index in (0, 1)]
-    client._done(client._link.submit(Kind.SETPOINT, payloads[1]))
+    client._line.send(Kind.SETPOINT, payloads[1])
     with pytest.raises(DriverError, match="COMMIT: refused by the board: digest"):
-        client._do(Kind.COMMIT, 2, protocol.digest(payloads))
+        client._line.ask(Kind.COMMIT, 2, protocol.digest(payloads))
     assert [line[3:9:5] for line in stepped.board.log() if line[1] == "commit"] == [["47", "72"]]
 
 
