@@ -66,6 +66,7 @@ class Link:
         self._sequence = nonce & 0xFFFF
         self._waiting: deque[Request] = deque()
         self._strange = 0
+        self._begun: Telemetry | None = None  # more bands than a frame holds
         self.greeting = self.submit(Kind.HELLO, protocol.pack(Kind.HELLO, protocol.VERSION, nonce))
 
     @property
@@ -159,9 +160,12 @@ class Link:
             self._strange += 1
             return
         self._strange = 0
-        if found.first and self.telemetry is not None and self.telemetry.sample == found.sample:
-            found = self.telemetry._replace(bands=self.telemetry.bands + found.bands)
-        self.telemetry = found
+        begun = self._begun
+        if found.first and begun is not None and (begun.sample, len(begun.bands)) == (found.sample, found.first):
+            found = begun._replace(bands=begun.bands + found.bands)
+        self._begun = found
+        if len(found.bands) == found.total:
+            self.telemetry = found
 
     def _next(self) -> int:
         self._sequence = (self._sequence + 1) & 0xFFFF

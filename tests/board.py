@@ -16,6 +16,8 @@ STRICT = ("-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic", "-ffp-contract
 SANITISED = ("-O1", "-g", "-fsanitize=address,undefined", "-fno-sanitize-recover=all")
 SOURCES = "board board_commands board_telemetry frames plate hardware_posix law learning carriers".split()
 RATE = 5000.0  # Hz
+SLOWER = 5  # times, so that a busy machine may pause the host for 0.4 s: 80 ms of the board's clock
+SLOW = "--slow", str(SLOWER)
 
 
 def compile_c(out, sources, *options):
@@ -27,12 +29,22 @@ def compile_c(out, sources, *options):
     return out
 
 
-def build_board(folder, rendering, *options):
+def build_board(folder, rendering, *options, bands=0):
     """Program of the board with the design of a rendering."""
     from hapticrender.export import export
 
-    export(rendering, folder, force=True)
+    export(rendering, folder, bands=bands, force=True)
     return compile_c(folder / "board", [folder / f"{name}.c" for name in (*SOURCES, "design")], *options)
+
+
+class SlowClock:
+    """A clock for a host whose board runs with `SLOW`."""
+
+    def monotonic(self):
+        return time.monotonic() / SLOWER
+
+    def sleep(self, seconds):
+        time.sleep(seconds * SLOWER)
 
 
 class BoardProcess:

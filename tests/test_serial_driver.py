@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from board import RATE, SANITISED, BoardProcess, Faults, SteppedBoard, build_board
+from board import RATE, SANITISED, SLOW, BoardProcess, Faults, SlowClock, SteppedBoard, build_board
 
 import hapticrender as hr
 from hapticrender.bands import Bands
@@ -20,7 +20,6 @@ from hapticrender.plants.plate import PlateParameters
 MECHANICS = "heavy-2nd-order"
 FINGER = hr.Finger.swiping(frequency=0.8, stroke=0.05, normal_load=0.4, mechanics=MECHANICS)
 SCENE = hr.Scene(texture=hr.Grating(wavelength=1e-3, amplitude=10e-6), finger=FINGER, duration=2.0, tolerance=0.1)
-SLOW = "--slow", "5"  # 80 ms of the board's clock are 0.4 s, so that a busy machine may pause the host
 ROUNDING = 2.0**-24  # relative, of float32
 
 
@@ -82,29 +81,31 @@ def sensed_error(recording):
     return np.linalg.norm(error[inside]) / np.linalg.norm(np.fft.rfft(reference)[inside])
 
 
-def test_a_grating_on_the_board_is_as_good_as_on_the_simulated_device(fast):
+@pytest.mark.parametrize("noise", [1e-6, 1e-7])
+def test_a_grating_on_the_board_is_as_good_as_on_the_simulated_device(program, tmp_path, noise):
     """The board's own plate against the library's, under a finger that moves as the board says it did."""
-    played = hr.render(SCENE, driver=driver_of(fast, finger=FINGER))
+    with SteppedBoard(program, tmp_path, options=("--noise", str(noise))) as board:
+        played = hr.render(SCENE, driver=driver_of(board, finger=FINGER))
     position = played.read("position")
     position[: np.argmax(np.isfinite(position))] = position[np.isfinite(position)][0]
     same = hr.Finger.sampled(position, rate=RATE, normal_load=0.4, mechanics=MECHANICS)
-    simulated = hr.render(replace(SCENE, finger=same))
+    simulated = hr.render(replace(SCENE, finger=same, simulation={"sensor_noise": noise}))
     on_board, in_library = sensed_error(played), sensed_error(simulated)
-    noise = 1e-6 / np.sqrt(2) * np.sqrt(480 / (RATE / 2)) / (10e-6 / np.sqrt(2))
-    print(f"error by the sensors: board {on_board:.4f}, simulated {in_library:.4f}, of that noise {noise:.4f}")
-    assert in_library > 0.9 * noise
-    # float32 may take 1.2 times; two plates with noise of their own learn the finger differently by as much again
+    of_noise = noise / np.sqrt(2) * np.sqrt(480 / (RATE / 2)) / (10e-6 / np.sqrt(2))
+    print(f"error by the sensors, noise {noise}: board {on_board:.4f}, library {in_library:.4f}, noise {of_noise:.4f}")
+    assert in_library > 0.9 * of_noise
+    # float32 may take 1.2 times as much; the noises differ, and so does what is learned of the finger: 1.2 again
     assert on_board < 1.2 * 1.2 * in_library
-    (band,), (other,) = played.summary()["bands"], simulated.summary()["bands"]
-    print(f"complex error of the band: board {band['complex_error']:.4f}, simulated {other['complex_error']:.4f}")
-    assert abs(band["error_centre"]) < 0.01
+    summaries = played.summary(), simulated.summary()
+    print([(each["verdict"], each["bands"][0]["complex_error"], each["worst"]) for each in summaries])
+    assert [each["passed"] for each in summaries] == [True, True]
     assert not played.read("flags").any()
 
 
 def test_what_was_recorded_is_complete_and_of_the_board(program, tmp_path):
     scene = replace(SCENE, duration=0.6)
     with BoardProcess(program, tmp_path, *SLOW) as board:
-        driver = SerialDriver(str(board.port), finger=FINGER)
+        driver = SerialDriver(str(board.port), finger=FINGER, clock=SlowClock())
         recording = hr.render(scene, driver=driver)
         time.sleep(0.05)
         log = board.log()
@@ -178,8 +179,8 @@ def test_refusals_name_port_command_and_bytes(stepped):
         client.gain = 1.01
     with pytest.raises(ValueError, match="must be constant envelopes"):
         client.set_bands(replace(tones(50.0), envelope=None))
-    request = client._link.submit(Kind.COMMIT, protocol.pack(Kind.COMMIT, 1, 0))
-    assert client._answer(request).refused == Reason.DIGEST
+    request = client._line.link.submit(Kind.COMMIT, protocol.pack(Kind.COMMIT, 1, 0))
+    assert client._line._answer(request).refused == Reason.DIGEST
 
 
 def test_the_board_identifies_itself(program, tmp_path):
@@ -215,6 +216,8 @@ def test_drive_from_the_host_identifies_the_plate(fast):
     expected = PlateParameters()
     with driver_of(fast, block=100) as driver:
         found = identify(driver, expected, amplitude=50e-6)
+        delay = driver.delay
+    assert found.estimates["delay"].value == pytest.approx(delay, abs=0.01)
     for name in ("mass", "inertia", "stiffness_1", "stiffness_2"):
         estimate = found.estimates[name]
         assert estimate.value == pytest.approx(getattr(expected, name), abs=4 * estimate.interval)
@@ -240,7 +243,7 @@ def test_times_are_checked(name):
 
 
 def test_an_unplugged_board_is_lost_with_port_operation_and_bytes(program, tmp_path):
-    with BoardProcess(program, tmp_path, *SLOW) as board, BoardClient(str(board.port)) as client:
+    with BoardProcess(program, tmp_path, *SLOW) as board, BoardClient(str(board.port), clock=SlowClock()) as client:
         client.set_bands(tones(47.0))
         client.start()
         board.kill()
@@ -252,7 +255,10 @@ def test_an_unplugged_board_is_lost_with_port_operation_and_bytes(program, tmp_p
 
 
 def test_a_replugged_board_goes_on(program, tmp_path):
-    with BoardProcess(program, tmp_path, *SLOW) as first, BoardClient(str(first.port), reconnect=20.0) as client:
+    with (
+        BoardProcess(program, tmp_path, *SLOW) as first,
+        BoardClient(str(first.port), clock=SlowClock(), reconnect=20.0) as client,
+    ):
         client.set_bands(tones(47.0))
         client.gain = 0.25
         client.start()
@@ -315,6 +321,114 @@ def test_limits_stop_the_board(stepped):
         run(client, stepped, 1.0)
 
 
+def test_a_press_beyond_the_sensors_range_stops_the_board(stepped):
+    """20 N at the end of the glass: 20/45.3e3 (1 + 2 * 2) = 2.2 mm there, of 1 mm."""
+    client = client_of(stepped).open()
+    client.set_bands(tones(47.0))
+    client.start()
+    client.finger(0.055, 0.0, 20.0)
+    with pytest.raises(DeviceFault, match="the board stopped: a sensor was invalid for 10 ms"):
+        run(client, stepped, 0.2)
+    last = stepped.board.log()[-1]
+    assert last[1:] == ["drives", "0"]
+
+
+def test_garbage_is_no_sign_of_life(stepped, rng):
+    client = client_of(stepped).open()
+    client.set_bands(tones(47.0))
+    client.start()
+    run(client, stepped, 0.2)
+    last = stepped.sample
+    for _ in range(20):
+        stepped.inject(bytes(rng.integers(0, 256, 200, dtype="u1")))
+        stepped.sleep(0.01)
+    assert driven(stepped.board.log(), last + int(0.1 * RATE), stepped.sample) == []
+
+
+@pytest.mark.parametrize(("late", "stops"), [(0.07, False), (0.09, True)])
+def test_a_word_that_waited_for_long_is_no_sign_of_life(stepped, late, stops):
+    """A line that fills up: words come every 15 ms, each 5 ms later than the one before, until they are `late` old."""
+    client = client_of(stepped).open()
+    client.set_bands(tones(47.0))
+    client.start()
+    run(client, stepped, 0.2)
+    start, waiting = stepped.time, []
+    while stepped.time < start + 0.6:
+        arrival = stepped.time + min(late, (stepped.time - start) / 2)
+        waiting.append((arrival, client._line.link.due(stepped.time)))
+        stepped.sleep(0.01)
+        while waiting and waiting[0][0] <= stepped.time:
+            stepped.inject(waiting.pop(0)[1])
+    assert bool(driven(stepped.board.log(), stepped.sample - 100, stepped.sample)) != stops
+
+
+def test_damage_that_the_crc_does_not_show_does_nothing(stepped):
+    """Commands with a number changed and the CRC-16 made anew: what one in 65 536 damaged frames amounts to."""
+    client = client_of(stepped).open()
+    client.set_bands(tones(47.0))
+    client.start()
+    run(client, stepped, 0.2)
+    before, refused = stepped.board.log(), client.telemetry().refused
+    link = client._line.link
+    words = [
+        (Kind.SETPOINT, protocol.pack(Kind.SETPOINT, 0, 47.0, 0.0, 0.0, 5e-6, 0.0)),
+        (Kind.GAIN, protocol.pack(Kind.GAIN, 0.5)),
+        (Kind.FINGER, protocol.pack(Kind.FINGER, 0, 0.01, 0.0, 0.4)),
+        (Kind.STOP, b""),
+    ]
+    for index, (kind, payload) in enumerate(words):
+        (frame,) = protocol.Reader().feed(
+            protocol.command(link.capabilities.session, kind, (link._sequence + 100 + index) & 0xFFFF, payload)
+        )
+        changed = bytes([frame.payload[0] ^ 1]) + frame.payload[1:]
+        stepped.inject(protocol.encode(frame._replace(payload=changed)))
+        run(client, stepped, 0.02)
+    client._line.link._strange = 0
+    run(client, stepped, 0.1)
+    assert client.telemetry().refused == refused + len(words)
+    assert client.telemetry().commits == 1
+    assert np.isnan(client.telemetry().position)
+    assert [line for line in stepped.board.log()[len(before) :] if line[1] != "drives"] == []
+
+
+def test_a_commit_acts_only_on_what_it_says(stepped):
+    """A set-point that never came leaves the one from before in its place: the digest shows it."""
+    client = client_of(stepped).open()
+    client.set_bands(tones(47.0, 72.0))
+    payloads = [protocol.pack(Kind.SETPOINT, index, 100.0 + 20 * index, 0.0, 0.0, 5e-6, 0.0) for index in (0, 1)]
+    client._line.send(Kind.SETPOINT, payloads[1])
+    with pytest.raises(DriverError, match="COMMIT: refused by the board: digest"):
+        client._line.ask(Kind.COMMIT, 2, protocol.digest(payloads))
+    assert [line[3:9:5] for line in stepped.board.log() if line[1] == "commit"] == [["47", "72"]]
+
+
+def test_a_board_that_stays_away_is_lost(stepped):
+    client = client_of(stepped, reconnect=1.0).open()
+    client.set_bands(tones(47.0))
+    client.start()
+    run(client, stepped, 0.1)
+    stepped.pulled = np.inf
+    start = stepped.time
+    with pytest.raises(DeviceLost, match=r"stepped: listen: no good frame for 0.5 s \(\d+ bytes sent"):
+        run(client, stepped, 10.0)
+    # silence for 0.5 s, 1 s of attempts, the last of which may take 1 s and 0.05 s
+    assert 1.5 <= stepped.time - start <= 2.56
+    with pytest.raises(DeviceLost, match="no good frame"):
+        client.gain = 0.5
+
+
+def test_more_bands_than_a_frame_holds(rendering, tmp_path):
+    program = build_board(tmp_path / "firmware", rendering, "-O1", "-DREAL_DOUBLE", bands=20)
+    with SteppedBoard(program, tmp_path) as board:
+        client = client_of(board).open()
+        client.set_bands(tones(*range(40, 340, 20), amplitude=1e-6))
+        client.start()
+        run(client, board, 0.1)
+        found = client.telemetry()
+        assert len(found.bands) == found.total == 15
+        assert [abs(band.target) for band in found.bands] == pytest.approx(15 * [1e-6], rel=ROUNDING)
+
+
 def test_doubled_and_recorded_commands_do_nothing(stepped):
     """A whole session, played back to the board in the same session and in the next."""
     recorded = []
@@ -339,7 +453,9 @@ def test_doubled_and_recorded_commands_do_nothing(stepped):
         before = stepped.board.log()
         replay(stepped, recorded)
         # greeted anew, it stopped, and refused all the rest
-        assert [line[1:3] for line in stepped.board.log()[len(before) :]] == [["state", "0"], ["drives", "0"]]
+        after = [line[1:] for line in stepped.board.log()[len(before) :] if line[1] != "drives"]
+        assert after == [["state", "0", str(int(Cause.SESSION))]]
+        assert driven(stepped.board.log(), stepped.sample - 1, stepped.sample) == []
         with pytest.raises(DeviceLost, match="session: the board has another session"):
             run(client, stepped, 1.0)
 
@@ -408,7 +524,8 @@ def attempt(change):
 
 
 @pytest.mark.parametrize("seconds", [60, pytest.param(600, marks=pytest.mark.slow)])
-def test_a_bad_line_never_plays_what_was_not_asked_for(fast, seconds):
+def test_a_bad_line_never_plays_what_was_not_asked_for(fast, seconds, rng, monkeypatch):
+    monkeypatch.setattr("secrets.randbelow", lambda most: int(rng.integers(most)))
     faults = Faults(18, 0.01)
     session = Session(fast, 18)
 
@@ -443,7 +560,7 @@ def driven(log, start, stop):
 
 
 def test_two_threads_can_set_a_board(program, tmp_path):
-    with BoardProcess(program, tmp_path, *SLOW) as board, BoardClient(str(board.port)) as client:
+    with BoardProcess(program, tmp_path, *SLOW) as board, BoardClient(str(board.port), clock=SlowClock()) as client:
         client.set_bands(tones(47.0))
         client.start()
         threads = [

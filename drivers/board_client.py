@@ -1,0 +1,319 @@
+"""A board that plays textures, live: set-points, finger and gain from any thread, and what came of them."""
+
+from __future__ import annotations
+
+import math
+import threading
+import time
+from collections.abc import Callable, Sequence
+from types import TracebackType
+from typing import Any, NamedTuple, Self, TypeVar
+
+from hapticrender.bands import Bands
+from hapticrender.drivers import protocol
+from hapticrender.drivers.base import carry_through
+from hapticrender.drivers.board_line import BAUD, PAUSE, BoardLine, Clock, Line, open_port
+from hapticrender.drivers.protocol import Capabilities, Cause, Kind, State, Telemetry
+from hapticrender.drivers.row_reader import RowReader
+from hapticrender.errors import DeviceFault, DeviceLost, DeviceTimeout, DriverError
+from hapticrender.protocols import Array
+
+RETRY = 0.05  # s between two attempts to reach the board anew
+FAULTS = {
+    Cause.LIMIT: "the mean square of the drive is above its limit: lower the amplitude, or raise limits(rms=)",
+    Cause.SENSOR: "a sensor was invalid for 10 ms: check its cable and its range",
+}
+Result = TypeVar("Result")
+
+
+class _Wanted(NamedTuple):
+    """What the board is to do, to be told again to a board that was lost."""
+
+    bands: Bands | None = None
+    gain: float = 1.0
+    limits: tuple[float, float, float] | None = None
+    start: tuple[int, int] | None = None  # samples between rows of the stream, and between telemetry; None: at rest
+
+
+class BoardClient:
+    """A board that plays textures, live.
+
+    While it is open a thread sends the finger's words, or a sign of life every 10 ms, and takes what the board sends.
+    Methods may be called from any thread; a failure of the line is raised by the next of them.  A process that pauses
+    for 80 ms stops the board.
+
+    Parameters
+    ----------
+    port : str
+        Name of the serial port, as ``/dev/ttyACM0`` or ``COM3``.
+    baud : int
+        Of a UART, 230 400 unless given.
+    timeout : float, s
+        Longest time to an answer.
+    reconnect : float, s
+        For how long to look for a board that is gone, or was reset; it is then set up as before.  0: `DeviceLost`.
+    background : bool
+        False: no thread; `step` is to be called at least every 10 ms.
+    clock : Clock
+        The module `time` unless given.
+    connect : callable
+        Opens the port, see `BoardLine`.
+    """
+
+    def __init__(
+        self,
+        port: str,
+        *,
+        baud: int = BAUD,
+        timeout: float = 1.0,
+        reconnect: float = 0.0,
+        background: bool = True,
+        clock: Clock = time,
+        connect: Callable[[str, int], Any] = open_port,
+    ) -> None:
+        for name, value in (("timeout", timeout), ("reconnect", reconnect)):
+            if not 0.0 <= value < math.inf:
+                raise ValueError(f"{name} = {value!r}: must be finite and >= 0 s")
+        self.port, self.timeout, self.reconnect, self.clock = port, timeout, reconnect, clock
+        self.reconnections = 0
+        self._connect = lambda: BoardLine(port, baud, timeout=timeout, clock=clock, connect=connect)
+        self._line: BoardLine | None = None
+        self._wanted = _Wanted()
+        self._runs = False  # something has been started
+        self._error: DriverError | None = None
+        self._background, self._thread = background, threading.Thread()
+        self._lock, self._ending = threading.RLock(), threading.Event()
+
+    def open(self) -> Self:
+        """Open the port and greet the board; see `BoardLine` for the errors."""
+        with self._lock:
+            self._line, self._error, self._wanted = self._connect(), None, _Wanted()
+        self._ending.clear()
+        if self._background:
+            self._thread = threading.Thread(target=self._run, name=f"board {self.port}", daemon=True)
+            self._thread.start()
+        return self
+
+    def close(self) -> None:
+        """Stop the board and close the port; the board comes to rest by itself where it cannot be reached."""
+        self._ending.set()
+        if self._thread.is_alive():
+            self._thread.join()
+        if self._line is not None:
+            carry_through(*([self.stop] if self._runs and not self._error else []), self._close_line)
+
+    def __enter__(self) -> Self:
+        return self.open()
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        """Close; where the body has failed already, a failure to close is noted on the body's error."""
+        try:
+            self.close()
+        except Exception as second:
+            if error is None:
+                raise
+            error.add_note(f"and while closing: {second}")
+
+    @property
+    def capabilities(self) -> Capabilities:
+        """What the board said of itself."""
+        return self._open_line().capabilities
+
+    def set_bands(self, bands: Bands) -> None:
+        """Set what the board plays, all bands at the same sample; it glides there within 20 ms while it plays.
+
+        Raises
+        ------
+        ValueError
+            The targets are no constant envelopes, there are too many bands, or the board refuses a number.
+        """
+        most = self.capabilities.bands
+        if bands.envelope is None:
+            raise ValueError("the targets are a waveform: must be constant envelopes, which a board can play")
+        if len(bands) > most:
+            raise ValueError(f"{len(bands)} bands: must be <= {most} on {self.port}; export the scene with more")
+        self._steadily(lambda line: line.set_bands(bands))
+        self._wanted = self._wanted._replace(bands=bands)
+
+    def finger(self, position: float, velocity: float = 0.0, load: float = 0.0) -> None:
+        """Say where the finger is now: position (m from the middle, NaN: lifted), velocity (m/s) and load (N).
+
+        Never waits; the last one counts, sent at most every 5 ms.  The board follows the velocity for 50 ms, then
+        holds, and after 200 ms without another takes the finger for lifted.
+        """
+        now = self.clock.monotonic()
+        self._open_line().link.finger = now, float(position), float(velocity), float(load)
+
+    @property
+    def gain(self) -> float:
+        """Factor on all targets, 0 to 1; faded over 20 ms."""
+        return self._wanted.gain
+
+    @gain.setter
+    def gain(self, value: float) -> None:
+        if not 0.0 <= value <= 1.0:
+            raise ValueError(f"gain = {value!r}: must be 0 to 1")
+        self._steadily(lambda line: line.ask(Kind.GAIN, value))
+        self._wanted = self._wanted._replace(gain=value)
+
+    def limits(self, peak: float, rms: float | None = None, seconds: float = 1.0) -> None:
+        """Limit the drive of a channel: `peak` (A) is cut, `rms` (A) over a time constant of `seconds` stops the board.
+
+        Both are at most the limit of the board's design; rms is `peak` unless given.
+        """
+        limits = (peak, peak if rms is None else rms, seconds)
+        self._steadily(lambda line: line.ask(Kind.LIMITS, *limits))
+        self._wanted = self._wanted._replace(limits=limits)
+
+    def start(self, *, stream: int = 0, telemetry: float = 0.02) -> int:
+        """Start to play the bands, from rest; return the sample of the board's clock at which it began.
+
+        Parameters
+        ----------
+        stream : int
+            Samples between two rows that the board streams back; 0: none.
+        telemetry : float, s
+            Time between two frames of telemetry, 0.2 ms to 13 s at 5 kHz.
+        """
+        period = round(telemetry * self.capabilities.rate)
+        for name, value, least in (("stream", stream, 0), ("telemetry", period, 1)):
+            if not least <= value <= 0xFFFF:
+                raise ValueError(f"{name} = {value!r} samples: must be {least} to 65535")
+        sample = self._steadily(lambda line: line.begin(Kind.START, stream, period))
+        self._wanted, self._runs = self._wanted._replace(start=(stream, period)), True
+        return sample
+
+    def stop(self) -> None:
+        """Fade out within 10 ms."""
+        self._wanted = self._wanted._replace(start=None)
+        self._steadily(lambda line: line.ask(Kind.STOP))
+        self._runs = False
+
+    def telemetry(self) -> Telemetry:
+        """Return what the board last said.
+
+        Raises
+        ------
+        DeviceLost
+            The line or the board is gone, and did not come back within `reconnect`.
+        DeviceFault
+            The board stopped by itself: the drive, or a sensor.
+        """
+        return self._steadily(lambda line: line.telemetry())
+
+    def rows(self) -> list[protocol.Stream]:
+        """Return what has been streamed back since the last call."""
+        stream = self._open_line().link.stream
+        with self._lock:
+            return [stream.popleft() for _ in range(len(stream))]
+
+    def identify(self, lines: Sequence[Line], duration: float, stream: int = 1) -> Array:
+        """Let the board play a multisine for `duration` (s); return drive (A) and sensed (m), shape (n, channels).
+
+        One row for every `stream` samples, from the first one of the multisine on; the drive fades in and out within
+        10 ms.  Rows that were lost on the line repeat the one before.
+        """
+        if not lines:
+            raise ValueError("lines = []: must be 1 or more")
+        samples = round(duration * self.capabilities.rate)
+        first = self._steadily(lambda line: line.identify(lines, samples, stream))
+        self._runs = True
+        columns = self.capabilities.drive_channels + self.capabilities.sensed_channels
+        return RowReader(self, first, stream).take(samples // stream)[:, :columns]
+
+    def begin_queue(self) -> None:
+        """Let the board play what `queue` sends it, from the first row on, and stream back every sample."""
+        self._steadily(lambda line: line.identify([], 0, 1))
+        self._runs = True
+
+    def queue(self, first: int, drive: Array) -> None:
+        """Append rows of drive (A, shape (n, channels)), the first one of which is number `first` of the queue."""
+        line = self._open_line()
+        with self._lock:
+            line.queue(first, drive)
+
+    def step(self) -> None:
+        """Take what has arrived and send what is due; for clients without a thread, at least every 10 ms."""
+        with self._lock:
+            line = self._open_line()
+            try:
+                line.carry()
+                self._compare(line)
+            except DeviceFault as error:
+                self._error = error
+                raise
+            except DeviceLost as error:
+                self._recover(error)
+
+    def pause(self) -> None:
+        """Let a millisecond pass, as one does between two looks at what has arrived."""
+        if not self._background:
+            self.step()
+        self.clock.sleep(PAUSE)
+
+    def _run(self) -> None:
+        while not self._ending.is_set() and self._error is None:
+            try:
+                self.step()
+            except DriverError as error:
+                self._error = error
+            self.clock.sleep(PAUSE)
+
+    def _compare(self, line: BoardLine) -> None:
+        """Compare what the board does with what it is to do."""
+        found = line.link.telemetry
+        if found is None or self._wanted.start is None or found.state != State.IDLE:
+            return
+        if found.cause in FAULTS:
+            raise DeviceFault(f"{self.port}: play: the board stopped: {FAULTS[found.cause]}")
+        if found.cause == Cause.SILENCE:
+            raise line.lost("play", "the board heard no good word for 80 ms, and stopped")
+
+    def _steadily(self, do: Callable[[BoardLine], Result]) -> Result:
+        """Do it; where the board is lost meanwhile, find it again, set it up as before, and do it once more."""
+        with self._lock:
+            try:
+                return do(self._open_line())
+            except (DeviceLost, DeviceTimeout) as error:
+                if self._error is None:
+                    self._recover(error)
+                return do(self._open_line())
+
+    def _recover(self, error: DriverError) -> None:
+        """Find the board again and set it up as before; raise `error` where that fails for `reconnect` seconds."""
+        end = self.clock.monotonic() + self.reconnect
+        while self.clock.monotonic() < end and not self._ending.is_set():
+            try:
+                self._close_line()
+                self._line = self._connect()
+                self._restore(self._line)
+                self.reconnections += 1
+                return
+            except (DriverError, ValueError):
+                self.clock.sleep(RETRY)
+        self._error = error
+        raise error
+
+    def _restore(self, line: BoardLine) -> None:
+        wanted = self._wanted
+        if wanted.limits is not None:
+            line.ask(Kind.LIMITS, *wanted.limits)
+        line.ask(Kind.GAIN, wanted.gain)
+        if wanted.bands is not None:
+            line.set_bands(wanted.bands)
+        if wanted.start is not None:
+            line.begin(Kind.START, *wanted.start)
+
+    def _open_line(self) -> BoardLine:
+        if self._error is not None:
+            raise self._error
+        if self._line is None:
+            raise DriverError(f"{self.port}: it is not open; use it in a with statement")
+        return self._line
+
+    def _close_line(self) -> None:
+        line, self._line = self._line, None
+        if line is not None:
+            line.close()

@@ -1,0 +1,208 @@
+"""A board on an open serial port: bytes both ways, commands until they are answered, errors with port and bytes."""
+
+from __future__ import annotations
+
+import secrets
+import time
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+import serial
+
+from hapticrender.bands import Bands
+from hapticrender.drivers import protocol
+from hapticrender.drivers.board_link import Link, Request
+from hapticrender.drivers.protocol import Capabilities, Kind, Reason, Telemetry
+from hapticrender.errors import DeviceLost, DeviceNotFound, DeviceTimeout, DriverError
+from hapticrender.protocols import Array
+
+BAUD = 230_400  # of a UART; a board on USB or a pseudo-terminal does not care
+PAUSE = 1e-3  # s between two looks at the line
+SILENCE = 0.5  # s without a good frame from the board after which it counts as lost
+COMING_TO_REST = 0.2  # s: longest fade-out of a board that is asked to start
+ROWS = 24  # of drive in a frame
+
+
+class Clock(Protocol):
+    """What of the module `time` is used."""
+
+    def monotonic(self) -> float:
+        """Return the time in s."""
+        ...
+
+    def sleep(self, seconds: float, /) -> None:
+        """Let time pass."""
+        ...
+
+
+class Line(NamedTuple):
+    """A line of a multisine: amplitude (A) * cos(2 pi (frequency t + phase)) on a channel; phase in turns, 0 to 1."""
+
+    channel: int
+    frequency: float
+    amplitude: float
+    phase: float = 0.0
+
+
+def open_port(port: str, baud: int) -> Any:
+    """Open a serial port that never waits for bytes."""
+    return serial.Serial(port, baud, timeout=0, write_timeout=1.0)
+
+
+class BoardLine:
+    """A board that has been greeted, on a port of its own; not for several threads at once.
+
+    Parameters
+    ----------
+    port : str
+        Name of the serial port.
+    baud : int
+        Of a UART.
+    timeout : float, s
+        Longest time to an answer.
+    clock : Clock
+        The module `time` unless given.
+    connect : callable
+        Opens the port, ``connect(port, baud)``: an object with `read`, `write` and `close` that never waits.
+
+    Raises
+    ------
+    DeviceNotFound
+        There is no such port, or it cannot be opened.
+    DeviceTimeout
+        Nothing answers in the protocol.
+    ProtocolError
+        What answers speaks another version of it.
+    """
+
+    def __init__(
+        self,
+        port: str,
+        baud: int = BAUD,
+        *,
+        timeout: float = 1.0,
+        clock: Clock = time,
+        connect: Callable[[str, int], Any] = open_port,
+    ) -> None:
+        self.port, self.timeout, self.clock = port, timeout, clock
+        try:
+            self._port = connect(port, baud)
+        except (OSError, ValueError) as error:
+            raise DeviceNotFound(f"{port}: open: {error}") from error
+        self.link = Link(secrets.randbelow(2**32 - 1) + 1, clock.monotonic())
+        try:
+            self._answer(self.link.greeting)
+        except DriverError:
+            self.close()
+            raise
+
+    def close(self) -> None:
+        """Close the port; the board comes to rest by itself."""
+        self._port.close()
+
+    @property
+    def capabilities(self) -> Capabilities:
+        """What the board said of itself."""
+        if self.link.capabilities is None:
+            raise DriverError(f"{self.port}: capabilities: the board has not answered yet")
+        return self.link.capabilities
+
+    def carry(self) -> None:
+        """Take what has arrived and send what is due; a `DeviceLost` where line or session are gone."""
+        link, now = self.link, self.clock.monotonic()
+        try:
+            link.receive(self._port.read(65536), now)
+            if due := link.due(now):
+                self._port.write(due)
+        except (OSError, TypeError) as error:  # pyserial's are OSErrors; TypeError where the port was closed meanwhile
+            raise self.lost("line", error) from error
+        if link.ended:
+            raise self.lost("session", "the board has another session: it was reset, or another host greeted it")
+        if now - link.received > SILENCE and link.capabilities is not None:
+            raise self.lost("listen", f"no good frame for {SILENCE:g} s")
+
+    def lost(self, operation: str, reason: object) -> DeviceLost:
+        """Error that says what the line has carried."""
+        return DeviceLost(f"{self.port}: {operation}: {reason} ({self._carried()}, {self.link.bad} bad frames)")
+
+    def wait(self, done: Callable[[], bool], operation: str) -> None:
+        """Carry bytes until it is done; a `DeviceTimeout` where it takes too long."""
+        end = self.clock.monotonic() + self.timeout
+        while not done():
+            self.carry()
+            if done():
+                return
+            if self.clock.monotonic() >= end:
+                text = f"{self.port}: {operation}: no answer in {self.timeout:g} s ({self._carried()})"
+                raise DeviceTimeout(text)
+            self.clock.sleep(PAUSE)
+
+    def ask(self, kind: Kind, *fields: float) -> Request:
+        """Send a command and return it with its reply; a ValueError or `DriverError` where it is refused."""
+        return self.send(kind, protocol.pack(kind, *fields))
+
+    def send(self, kind: Kind, payload: bytes) -> Request:
+        """Do the same with a payload."""
+        return self._checked(self._answer(self.link.submit(kind, payload)))
+
+    def begin(self, kind: Kind, *fields: float) -> int:
+        """Start something, once the board has come to rest; return the sample at which it began."""
+        self.link.stream.clear()
+        end = self.clock.monotonic() + COMING_TO_REST
+        while True:
+            request = self._answer(self.link.submit(kind, protocol.pack(kind, *fields)))
+            if request.refused != Reason.STATE or self.clock.monotonic() >= end:
+                self.link.telemetry = None  # what comes from now on is of this run
+                return self._checked(request).sample
+
+    def set_bands(self, bands: Bands) -> None:
+        """Send set-points, which act together at the end."""
+        envelope = np.zeros(len(bands)) if bands.envelope is None else bands.envelope
+        turns = np.remainder(bands.phase / (2 * np.pi), 1.0)
+        rows = zip(bands.frequency, bands.wavenumber, turns, envelope.real, envelope.imag, strict=True)
+        payloads = [protocol.pack(Kind.SETPOINT, index, *row) for index, row in enumerate(rows)]
+        for payload in payloads:
+            self.send(Kind.SETPOINT, payload)
+        self.ask(Kind.COMMIT, len(payloads), protocol.digest(payloads))
+
+    def identify(self, lines: Sequence[Line], samples: int, stride: int) -> int:
+        """Start a multisine, or without lines a queue; return the sample at which it began."""
+        payloads = [protocol.pack(Kind.LINE, index, *line) for index, line in enumerate(lines)]
+        for payload in payloads:
+            self.send(Kind.LINE, payload)
+        return self.begin(Kind.IDENTIFY, len(lines), samples, stride, protocol.digest(payloads))
+
+    def queue(self, first: int, drive: Array) -> None:
+        """Append rows of drive (A), the first one of which is number `first` of the queue."""
+        for start in range(0, len(drive), ROWS):
+            rows = np.asarray(drive[start : start + ROWS], "<f4")
+            self.send(Kind.DRIVE, protocol.pack(Kind.DRIVE, first + start) + rows.tobytes())
+
+    def telemetry(self) -> Telemetry:
+        """Return the latest telemetry; wait for it where none has come yet."""
+        self.wait(lambda: self.link.telemetry is not None, "telemetry")
+        if self.link.telemetry is None:
+            raise DeviceTimeout(f"{self.port}: telemetry: none in {self.timeout:g} s")
+        return self.link.telemetry
+
+    def _carried(self) -> str:
+        return f"{self.link.sent_bytes} bytes sent, {self.link.received_bytes} received"
+
+    def _answer(self, request: Request) -> Request:
+        """Wait until a command has been answered."""
+        try:
+            self.wait(lambda: request.reply is not None, request.kind.name)
+        except DriverError:
+            self.link.withdraw()
+            raise
+        return request
+
+    def _checked(self, request: Request) -> Request:
+        """Return a command that was done; raise where it was refused."""
+        if request.refused is None:
+            return request
+        text = f"{self.port}: {request.kind.name}: refused by the board: {request.refused.name.lower()}"
+        if request.refused == Reason.VALUE:
+            raise ValueError(f"{text}: a number is out of its range ({request.payload.hex(' ')})")
+        raise DriverError(f"{text} ({request.payload.hex(' ')})")

@@ -1,0 +1,59 @@
+"""A grating played by a microcontroller: its firmware, built for this machine, behind a serial line.
+
+The firmware is what `hapticrender export` writes; `hardware_posix.c` puts a plate model where a board has converters.
+The figure is the amplitude (m) of the grating under a sliding finger, by the board's sensors.
+"""
+
+import subprocess
+import tempfile
+import time
+from pathlib import Path
+
+import hapticrender as hr
+from hapticrender.drivers.serial import SerialDriver
+from hapticrender.export import export
+
+SOURCES = "board board_commands board_telemetry frames law learning carriers design hardware_posix plate".split()
+SLOWER = 4
+FLAGS = "-std=c99 -Wall -Wextra -Werror -pedantic -O2 -ffp-contract=off".split()
+
+
+class SlowClock:
+    """As slow as the board, which stops after 80 ms of silence: a busy machine may pause this process for so long."""
+
+    def monotonic(self) -> float:
+        return time.monotonic() / SLOWER
+
+    def sleep(self, seconds: float) -> None:
+        time.sleep(seconds * SLOWER)
+
+
+def build(scene: hr.Scene, folder: Path) -> Path:
+    """Firmware for the device of the scene, as a program."""
+    export(hr.prepare(scene), folder)
+    program = folder / "board"
+    sources = [str(folder / f"{name}.c") for name in SOURCES]
+    subprocess.run(["cc", *FLAGS, "-o", str(program), *sources, "-lm"], check=True)
+    return program
+
+
+def main() -> float:
+    finger = hr.Finger.sliding(speed=0.04, span=0.04, normal_load=0.4, mechanics="heavy-2nd-order")
+    scene = hr.Scene(texture=hr.Grating(wavelength=0.5e-3, amplitude=10e-6), finger=finger, duration=2.0)
+    with tempfile.TemporaryDirectory() as name:
+        program, port = build(scene, Path(name)), Path(name) / "port"
+        board = subprocess.Popen([program, port, "--slow", str(SLOWER)])
+        try:
+            while not port.exists():
+                time.sleep(0.01)
+            recording = hr.render(scene, driver=SerialDriver(str(port), finger=finger, clock=SlowClock()))
+        finally:
+            board.terminate()
+            board.wait()
+    (band,) = recording.summary()["bands"]
+    print(f"wanted {1e6 * band['target']:.2f} um, moved {1e6 * band['achieved']:.2f} um")
+    return band["achieved"]
+
+
+if __name__ == "__main__":
+    print(main())
