@@ -22,6 +22,13 @@ A driver carries samples to a device, a file or a plant model, and back.  Any ob
     False where the start-up probe of a plate is to be left out (docs/safety.md)
 ``exchange(controller)`` (optional)
     a whole closed loop of its own, sample by sample; see ``protocols.Exchange``
+``found()`` (optional, class method)
+    list of str: the devices that are there now, each as the driver's argument, two spaces, and what it can do; shown
+    by ``hapticrender devices``
+
+A class that is registered as an entry point ``hapticrender.drivers``, or named as ``package.module:callable``, is
+called with the text after ``--driver NAME:``, if there is any; parameters of it named ``drive_per_full_scale``,
+``sensed_per_full_scale``, ``delay``, ``gain_uncertainty`` or ``profile`` get what the device's profile has.
 
 Sample i of the drive is held during interval i; sample i of `Sensed` was taken at the *start* of interval i, before
 that drive could act: with ``block = 1`` the next drive acts one interval after the sensing, ``delay = 1``.  The

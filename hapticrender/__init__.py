@@ -28,10 +28,12 @@ _HOMES = {
     "ProtocolError SceneError",
     "loop": "prepare render run",
     "plants.identify": "Identified compare identify",
+    "player": "Player",
     "protocols": "Controller Driver Flag Method Motion Plant Renderer Rendering Sensed Texture",
     "recordings.recording": "Recorder Recording",
     "touch.builtin_scenes": "builtin_scenes",
     "touch.composed": "Chirp Playlist Sum",
+    "touch.device_profile": "DeviceProfile",
     "touch.finger": "Finger",
     "touch.grating": "Grating",
     "touch.mechanics": "FingerMechanics",
@@ -64,6 +66,7 @@ if _typing.TYPE_CHECKING:
     from hapticrender.plants.identify import Identified as Identified
     from hapticrender.plants.identify import compare as compare
     from hapticrender.plants.identify import identify as identify
+    from hapticrender.player import Player as Player
     from hapticrender.protocols import Controller as Controller
     from hapticrender.protocols import Driver as Driver
     from hapticrender.protocols import Flag as Flag
@@ -80,6 +83,7 @@ if _typing.TYPE_CHECKING:
     from hapticrender.touch.composed import Chirp as Chirp
     from hapticrender.touch.composed import Playlist as Playlist
     from hapticrender.touch.composed import Sum as Sum
+    from hapticrender.touch.device_profile import DeviceProfile as DeviceProfile
     from hapticrender.touch.finger import Finger as Finger
     from hapticrender.touch.grating import Grating as Grating
     from hapticrender.touch.mechanics import FingerMechanics as FingerMechanics

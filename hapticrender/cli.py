@@ -12,6 +12,7 @@ import os
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
@@ -24,8 +25,10 @@ if TYPE_CHECKING:
     from hapticrender.protocols import Rendering
     from hapticrender.report.outputs import Outputs
     from hapticrender.report.progress import Progress
+    from hapticrender.touch.device_profile import DeviceProfile
     from hapticrender.touch.scene import Scene
 
+LOOK = 0.25  # s between two looks at what plays
 PICTURES_HINT = 'no pictures without matplotlib; to get them: pip install "hapticrender[plot]"'
 
 _DESCRIPTION = "Make a finger feel a texture on a surface, in closed loop, on a device or on a model of one."
@@ -101,6 +104,15 @@ def _parser() -> argparse.ArgumentParser:
     render.add_argument("--least-model", action="store_true", help="leave out of the model what a scene does not need")
     render.add_argument("--verbose", "-v", action="store_true", help="print all figures and notes on the controller")
 
+    text = "play one scene live until Ctrl-C or its end: a line a band, with target, achieved and flags"
+    play = _add_verb(verbs, "play", _play, text)
+    play.add_argument("scene", metavar="SCENE", help="a TOML file, or the name of a built-in scene")
+    play.add_argument("--seconds", metavar="S", type=float, help="how long (default: the scene's duration)")
+    text = "folder for sound, picture, figures, journal and a page about it; made if it is not there"
+    play.add_argument("--out", "-o", metavar="DIR", type=_path, help=text)
+    play.add_argument("--force", action="store_true", help="overwrite files that are not from an earlier run")
+    _add_run(play, driver=True)
+
     scenes = _add_verb(verbs, "scenes", _scenes, "list the built-in scenes, or print one as TOML")
     scenes.add_argument("scene", metavar="NAME", nargs="?", help="the scene to print")
 
@@ -114,7 +126,7 @@ def _parser() -> argparse.ArgumentParser:
     text = "folder for the files of each scene that does not pass"
     validate.add_argument("--out", "-o", metavar="DIR", type=_path, help=text)
     validate.add_argument("--jobs", "-j", metavar="N", type=_whole(1, 999), default=1, help="processes (default: 1)")
-    _add_run(validate)
+    _add_run(validate, driver=True)
 
     show = _add_verb(verbs, "show", _show, "print the figures of a recording, finished or cut off by a crash")
     show.add_argument("path", metavar="PATH", type=_path, help="a recording, or the folder of a rendered scene")
@@ -127,11 +139,34 @@ def _parser() -> argparse.ArgumentParser:
     text = "of a glass end (default: 100e-6)"
     identify.add_argument("--amplitude", metavar="M", type=float, default=100e-6, help=text)
     identify.add_argument("--seconds", metavar="S", type=float, default=1.0, help="length of the record (default: 1)")
-    text = "write the result as a [device] table (TOML) to paste into a scene"
+    text = "write the result as a profile (TOML), which a scene takes by device = FILE"
     identify.add_argument("--out", "-o", metavar="FILE", type=_path, help=text)
+    identify.add_argument("--name", metavar="TEXT", help="which device it is (default: the file's name)")
+    identify.add_argument("--by", metavar="TEXT", default="", help="who measures it")
     _add_run(identify, method=False, driver=True)
 
-    _add_verb(verbs, "devices", _devices, "list the kinds of device, what each needs, and whether it is there")
+    latency = _add_verb(
+        verbs,
+        "latency",
+        _latency,
+        "measure the delay of a loop by a cable from a driver's first output to its first input",
+    )
+    latency.add_argument("--driver", metavar="NAME[:ARG]", required=True, help="driver of the device, such as audio:0")
+    latency.add_argument(
+        "--runs", metavar="N", type=_whole(1, 999), default=5, help="runs, which must agree (default: 5)"
+    )
+    text = "of the noise, of full scale on a sound card, in A or V elsewhere (default: 0.1)"
+    latency.add_argument("--amplitude", metavar="A", type=float, default=0.1, help=text)
+    text = "profile (TOML) whose [calibration] gets the delay; made if it is not there"
+    latency.add_argument("--out", "-o", metavar="FILE", type=_path, help=text)
+
+    export = _add_verb(verbs, "export", _export, "write a scene's controller as C sources for a microcontroller")
+    export.add_argument("scene", metavar="SCENE", help="a TOML file, or the name of a built-in scene")
+    text = "most bands that the board can be set to (default: 8, or as many as the scene has)"
+    export.add_argument("--bands", metavar="N", type=_whole(1, 64), default=0, help=text)
+    _add_out(export, None)
+
+    _add_verb(verbs, "devices", _devices, "list kinds of device, drivers, and the cards and ports that are there")
     return parser
 
 
@@ -152,7 +187,7 @@ def _add_run(verb: argparse.ArgumentParser, *, method: bool = True, driver: bool
         text = f"control method: one of {', '.join(defaults.METHODS)} (default: the scene's, or {defaults.METHOD})"
         verb.add_argument("--method", metavar="NAME", help=text)
     if driver:
-        text = "driver of the device, with its argument (default: a simulated device; see `hapticrender devices`)"
+        text = "simulated (default), wavefile:FILE, module:callable or another; see `hapticrender devices`"
         verb.add_argument("--driver", metavar="NAME[:ARG]", default="simulated", help=text)
     seed = _whole(0, 10**18 - 1)
     verb.add_argument("--seed", metavar="N", type=seed, help="seed of the noise (default: the scene's)")
@@ -224,7 +259,9 @@ def _render(arguments: argparse.Namespace) -> int:
         with _naming(arguments.scene):
             found = least_model(scene)
         scene, notes = found.scene, found.text
-    [rendering] = renderings = _prepare({arguments.scene: scene}, arguments, _driver(arguments.driver))
+    with _naming(arguments.scene):
+        driver = _driver(arguments.driver, scene)
+    [rendering] = renderings = _prepare({arguments.scene: scene}, arguments, driver)
     with _progress(renderings).scene(arguments.scene) as tick:
         outputs = run_into(arguments.out, rendering, progress=tick)
     if arguments.verbose:
@@ -236,6 +273,44 @@ def _render(arguments: argparse.Namespace) -> int:
     print("wrote " + "\n      ".join(map(str, outputs.files)))
     if notes:
         print(notes)
+    return 0
+
+
+def _play(arguments: argparse.Namespace) -> int:
+    from dataclasses import replace
+
+    from hapticrender.player import Player
+    from hapticrender.report import outputs
+    from hapticrender.report.live_lines import LiveLines
+    from hapticrender.report.page import refuse_foreign_page, write_page
+
+    scene, out = _scene(arguments.scene), arguments.out
+    changes = {name: getattr(arguments, name) for name in ("method", "seed") if getattr(arguments, name) is not None}
+    scene = replace(scene, **changes)
+    seconds = scene.duration if arguments.seconds is None else arguments.seconds
+    if not 0.0 < seconds < float("inf"):
+        raise ValueError(f"--seconds = {seconds}: must be finite and > 0 s")
+    if out:
+        outputs.check_folder("--out", out / scene.name)
+        if not arguments.force:
+            outputs.refuse_to_overwrite(out / scene.name)
+            refuse_foreign_page(out)
+    lines, journal = LiveLines(sys.stdout), None
+    try:
+        with _naming(arguments.scene), Player(scene, _driver(arguments.driver, scene)) as player:
+            player.play(scene.texture)
+            if out:
+                journal = outputs.begin_outputs(out / scene.name, scene)
+                player.record(journal)
+            while player.time < seconds:
+                player.sleep(min(LOOK, seconds - player.time))
+                lines.show(printable(str(player.state())), int(player.time))
+    finally:
+        if journal is not None and journal.exists():
+            from hapticrender.recordings.recording import Recording
+
+            made = outputs.write_outputs(out / scene.name, Recording.load(journal))
+            print(f"page: {write_page(out, [made])}")
     return 0
 
 
@@ -272,6 +347,7 @@ def _validate(arguments: argparse.Namespace) -> int:
     if arguments.out:
         check_folder("--out", arguments.out)
     options = {"method": arguments.method, "seed": arguments.seed, "jobs": arguments.jobs, "out": arguments.out}
+    options["driver"] = arguments.driver
     verdicts = validate(references, **options, progress=sys.stderr)
     for _, path, write in reports:
         if path:
@@ -292,8 +368,9 @@ def _suite(arguments: argparse.Namespace) -> int:
     from hapticrender.report.outputs import check_file
 
     chosen = arguments.method or defaults.METHOD
-    if arguments.scenes or arguments.junit or arguments.out or arguments.jobs > 1:
-        raise ValueError("--suite runs no scenes and writes --json only")
+    simulated = arguments.driver == "simulated"
+    if arguments.scenes or arguments.junit or arguments.out or arguments.jobs > 1 or not simulated:
+        raise ValueError("--suite runs no scenes, on simulated devices, and writes --json only")
     if arguments.json:
         check_file("--json", arguments.json)
     methods = list(dict.fromkeys((chosen, "paper")))
@@ -323,7 +400,7 @@ def _identify(arguments: argparse.Namespace) -> int:
             raise ValueError(f"device.kind = {scene.device!r}: must be vt-plate, ultrasonic or electroadhesion")
         setup = registered("renderers", scene.device)().read(scene, None)
         seed = scene.seed if arguments.seed is None else arguments.seed
-        driver = _driver(arguments.driver)
+        driver = _driver(arguments.driver, scene)
         if driver is None:
             plants = {
                 "vt-plate": lambda: Plate(setup.simulated, Finger.absent(), seed),
@@ -342,8 +419,57 @@ def _identify(arguments: argparse.Namespace) -> int:
     for difference in found.differences(setup.assumed) if scene.device == "vt-plate" else ():
         print(f"differs from [device]: {difference}")
     if arguments.out:
-        _made(arguments.out).write_text(found.to_toml(), encoding="utf-8")
+        _profile(found, scene, arguments).save(_made(arguments.out))
         print(f"wrote {arguments.out}")
+    return 0
+
+
+def _profile(found: Any, scene: Scene, arguments: argparse.Namespace) -> DeviceProfile:
+    """Profile of an identified device; limits, and what else the scene says of the device, are kept."""
+    from datetime import date
+
+    own, device = scene.device_profile, found.profile()
+    uncertainty = {name: value for name, value in found.uncertainty().items() if name in device}
+    return replace(
+        own,
+        name=arguments.name or arguments.out.stem,
+        measured_by=arguments.by,
+        measured_with=f"hapticrender {__version__} identify, driver {arguments.driver}",
+        measured_on=date.today(),
+        device={**own.device, **device},
+        uncertainty=uncertainty,
+    )
+
+
+def _latency(arguments: argparse.Namespace) -> int:
+    from hapticrender.devices import open_driver
+    from hapticrender.latency import measure_latency, write_delay
+    from hapticrender.report.outputs import check_file
+
+    if arguments.out:
+        check_file("--out", arguments.out)
+    driver = open_driver(arguments.driver)
+    if driver is None:
+        raise ValueError("--driver = 'simulated': must be a device with a cable, such as audio:0")
+    found = measure_latency(driver, runs=arguments.runs, amplitude=arguments.amplitude)
+    print(printable(f"{arguments.driver}: {found}"))
+    if arguments.out:
+        write_delay(_made(arguments.out), found)
+        print(f"wrote {arguments.out}")
+    return 0
+
+
+def _export(arguments: argparse.Namespace) -> int:
+    from hapticrender.export import export
+    from hapticrender.loop import prepare
+    from hapticrender.report.outputs import check_folder
+
+    check_folder("--out", arguments.out)
+    scene = _scene(arguments.scene)
+    with _naming(arguments.scene):
+        rendering = prepare(scene)
+        written = export(rendering, arguments.out, bands=arguments.bands, force=arguments.force)
+    print(f"wrote {len(written)} files into {arguments.out}; build them with: make -C {arguments.out}")
     return 0
 
 
@@ -389,18 +515,16 @@ def _prepare(scenes: dict[str, Scene], arguments: argparse.Namespace, driver: An
     return renderings
 
 
-def _driver(text: str) -> Any:
-    """Make the driver of ``--driver NAME[:ARG]``; None for the simulated device."""
-    from hapticrender.loop import registered
+def _driver(text: str, scene: Scene) -> Any:
+    """Make the driver of ``--driver``, calibrated as the scene says; None for the simulated device.
 
-    name, colon, argument = text.partition(":")
-    if text == "simulated":
-        return None
-    factory = registered("drivers", name)
-    try:
-        return factory(argument) if colon else factory()
-    except TypeError as error:
-        raise ValueError(f"--driver = {text!r}: {error}; give the driver's argument as {name}:ARG") from error
+    A module of the user's is looked for in the folder that the command is run in, too.
+    """
+    from hapticrender.devices import open_driver
+
+    if "" not in sys.path:
+        sys.path.insert(0, "")
+    return open_driver(text, scene.device_profile)
 
 
 def _progress(renderings: list[Rendering]) -> Progress:

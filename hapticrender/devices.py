@@ -1,33 +1,142 @@
-"""What is installed: kinds of device, drivers and extras, what each needs and whether it is installed."""
+"""What is installed and what is there: kinds of device, drivers, extras; and drivers chosen by a text."""
 
 from __future__ import annotations
 
+import inspect
+from collections.abc import Callable
+from dataclasses import fields
+from importlib import import_module
 from importlib.metadata import entry_points
 from importlib.util import find_spec
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
+from hapticrender.errors import HapticError
 from hapticrender.formatting import table
 
+if TYPE_CHECKING:
+    from hapticrender.protocols import Driver
+    from hapticrender.touch.device_profile import DeviceProfile
+
 EXTRAS = (  # package, extra, what it is good for
+    ("sounddevice", "audio", "sound cards"),
     ("matplotlib", "plot", "pictures"),
     ("h5py", "hdf5", "HDF5 files"),
     ("distributed", "cluster", "sweeps on a cluster"),
 )
+SIMULATED = "simulated"
+FORMS = "NAME, NAME:ARGUMENT, or package.module:callable for one of your own"
+
+
+def registered(group: str, name: str) -> Any:
+    """Load what the entry-point `group` (renderers, drivers) registers under `name`."""
+    found = {point.name: point for point in entry_points(group=f"hapticrender.{group}")}
+    if name not in found:
+        raise ValueError(f"{group[:-1]} {name!r} is not installed: must be one of {', '.join(sorted(found)) or 'none'}")
+    try:
+        return found[name].load()
+    except Exception as error:
+        reason = f"{group[:-1]} {name!r} cannot be loaded: {type(error).__name__}: {error}{_cure(error)}"
+        raise HapticError(reason) from error
+
+
+def open_driver(text: str, profile: DeviceProfile | None = None) -> Driver | None:
+    """Make the driver that a text names, for a ``with`` statement to open; None for the simulated device.
+
+    Parameters
+    ----------
+    text : str
+        "simulated"; the name of an installed driver, with its argument after a colon ("audio:0", "serial:/dev/ttyACM0",
+        "wavefile:drive.wav"); or "package.module:callable", which is called with what follows a second colon, if
+        anything does.
+    profile : DeviceProfile, optional
+        Of the device: a driver gets those entries of its calibration, by keyword, that its parameters name
+        (``drive_per_full_scale``, ``sensed_per_full_scale``, ``delay``, ``gain_uncertainty``), and a parameter
+        ``profile`` the profile itself.
+
+    Raises
+    ------
+    ValueError
+        There is no such driver, or it does not take the argument.
+    HapticError
+        A package that it needs is not installed, or cannot be loaded.
+    DriverError
+        The device is not there.
+
+    Examples
+    --------
+    >>> open_driver("simulated") is None
+    True
+    >>> open_driver("wavefile:drive.flac").rate
+    48000.0
+    """
+    if text == SIMULATED:
+        return None
+    name, colon, argument = text.partition(":")
+    if any(point.name == name for point in entry_points(group="hapticrender.drivers")):
+        factory = registered("drivers", name)
+    else:
+        called, colon, argument = argument.partition(":")
+        factory = _imported(text, name, called)
+    try:
+        return factory(*[argument] * bool(colon), **_calibration(factory, profile))  # type: ignore[no-any-return]
+    except TypeError as error:
+        raise ValueError(f"driver = {text!r}: {error}; give its argument as {name}:ARGUMENT") from error
+
+
+def _imported(text: str, module: str, called: str) -> Any:
+    """Return what "module:callable" names; a ValueError lists the drivers that are installed."""
+    if not called:
+        try:
+            return registered("drivers", module)  # which refuses it, and lists what there is
+        except ValueError as error:
+            raise ValueError(f"{error}; or {FORMS}") from None
+    try:
+        factory = getattr(import_module(module), called)
+    except (ImportError, AttributeError, ValueError) as error:
+        names = ", ".join(point.name for point in _points("drivers"))
+        raise ValueError(f"driver = {text!r}: {error}{_cure(error)}; installed are {names}; or {FORMS}") from error
+    except Exception as error:  # a user's own module may fail in any way
+        raise HapticError(f"driver = {text!r}: {module} cannot be loaded: {type(error).__name__}: {error}") from error
+    if not callable(factory):
+        raise ValueError(f"driver = {text!r}: {called} is a {type(factory).__name__}: must be a class or a function")
+    return factory
+
+
+def _calibration(factory: Callable[..., Any], profile: DeviceProfile | None) -> dict[str, Any]:
+    """Entries of the calibration, and the profile, that a driver's parameters name; what was not measured is none."""
+    if profile is None:
+        return {}
+    values = {each.name: getattr(profile.calibration, each.name) for each in fields(profile.calibration)}
+    values["profile"] = profile
+    known = inspect.signature(factory).parameters
+    return {name: value for name, value in values.items() if name in known and value is not None}
+
+
+def _cure(error: BaseException) -> str:
+    """Say what to install where a package of an extra, or the library behind it, is missing."""
+    if isinstance(error, OSError) and "PortAudio" in str(error):
+        return "; to get it: install PortAudio (Debian: apt-get install libportaudio2)"
+    missing = getattr(error, "name", None) if isinstance(error, ImportError) else None
+    extra = {package: extra for package, extra, _ in EXTRAS}.get(str(missing))
+    return f'; to get it: pip install "hapticrender[{extra}]"' if extra else ""
 
 
 def text() -> str:
     """Everything as a table for the terminal."""
-    kinds = [["kind", "installed", "simulated", "a real one needs"], *map(_kind, _registered("renderers"))]
-    drivers = [["driver", "installed", "what it does"], *map(_driver, _registered("drivers"))]
-    extras = [
-        ["extra", "installed", "for"],
-        *([extra, "yes" if find_spec(package) else "no", use] for package, extra, use in EXTRAS),
-    ]
-    hint = "A driver of your own serves any kind: hapticrender.drivers.base says in a page what it is."
-    return "\n\n".join([table(kinds), table(drivers), hint, table(extras)])
+    kinds = [["kind", "installed", "simulated", "a real one needs"], *map(_kind, _points("renderers"))]
+    drivers = [["driver", "installed", "what it does"], *map(_driver, _points("drivers"))]
+    there = [["--driver", "what is there"], *(row for entry in _points("drivers") for row in _there(entry))]
+    extras = [["extra", "installed", "for"], *(_extra(*each) for each in EXTRAS)]
+    hint = f"--driver takes {FORMS}: hapticrender.drivers.base says in a page what a driver is."
+    return "\n\n".join([table(kinds), table(drivers), hint, table(there), table(extras)])
 
 
-def _registered(group: str) -> list[Any]:
+def _extra(package: str, extra: str, use: str) -> list[str]:
+    """Row of an extra, with the command that installs it."""
+    return [extra, "yes" if find_spec(package) else "no", use + f' (pip install "hapticrender[{extra}]")']
+
+
+def _points(group: str) -> list[Any]:
     return sorted(entry_points(group=f"hapticrender.{group}"), key=lambda entry: entry.name)
 
 
@@ -49,10 +158,46 @@ def _driver(entry: Any) -> list[str]:
     return [entry.name, "yes", f"{first}  ({entry.value})"]
 
 
+def _there(entry: Any) -> list[list[str]]:
+    """Rows of the devices that a driver finds; see `found` in `hapticrender.drivers.base`."""
+    if entry.name == SIMULATED:
+        return [[SIMULATED, "always: a model of the scene's device, with its finger"]]
+    look: Any = getattr(_load(entry)[0], "found", SEARCHES.get(entry.name))
+    if look is None:
+        return []
+    try:
+        rows = [each.partition("  ")[::2] for each in look()]
+    except Exception as error:  # a third party's search may fail in any way; the list must go on
+        reason = " ".join(f"{type(error).__name__}: {error}{_cure(error)}".split())
+        return [[f"{entry.name}:", f"cannot be searched ({reason})"]]
+    return [[f"{entry.name}:{argument}", about.strip()] for argument, about in rows] or [[f"{entry.name}:", "none"]]
+
+
+def _cards() -> list[str]:
+    """Sound cards, by the index that sounddevice knows them by."""
+    import sounddevice
+
+    return [
+        f"{index}  {card['name']}: {card['max_output_channels']} out, {card['max_input_channels']} in, "
+        f"{card['default_samplerate']:g} Hz"
+        for index, card in enumerate(sounddevice.query_devices())
+    ]
+
+
+def _ports() -> list[str]:
+    """Serial ports, by their names."""
+    from serial.tools.list_ports import comports
+
+    return [f"{port.device}  {port.description}" for port in comports()]
+
+
+SEARCHES = {"audio": _cards, "serial": _ports}  # of drivers that have no search of their own
+
+
 def _load(entry: Any) -> tuple[Any, str]:
     """Return what an entry point is, or None and why it cannot be used."""
     try:
         return entry.load(), ""
     except (Exception, SystemExit) as error:  # a third party's module may fail in any way; the list must go on
         reason = " ".join(f"{type(error).__name__}: {error}".split())
-        return None, f"cannot be loaded from {entry.value} ({reason})"
+        return None, f"cannot be loaded from {entry.value} ({reason}){_cure(error)}"

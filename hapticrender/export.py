@@ -14,7 +14,6 @@ import numpy as np
 
 from hapticrender.control.controller import lowest_carrier, spacing
 from hapticrender.control.inverse import WaveformController
-
 from hapticrender.control.kernel import FADE_OUT
 from hapticrender.protocols import Rendering
 
@@ -26,8 +25,8 @@ GENERATED = "/* Written by `hapticrender export`; export the scene again instead
 SUFFIXES = (".c", ".h", ".ld", "Makefile")  # of the portable sources
 
 _CONTROLLER = """
-drive_limit drive_step sensor_limit lowest highest highest_edge coordinate_from_sensor drive_from_force shape damper_high
-release
+drive_limit drive_step sensor_limit lowest highest highest_edge coordinate_from_sensor drive_from_force shape
+damper_high release
 """.split()
 _LAW = """
 mass damping stiffness lever_per_metre level high_pass mean_square filters sensor_filter pair hertz_scale pole
@@ -52,7 +51,7 @@ def export(rendering: Rendering, folder: Path, *, bands: int = 0, force: bool = 
     Returns
     -------
     list of Path
-        What was written.
+        What was written, a Makefile among it.
 
     Raises
     ------
@@ -80,8 +79,8 @@ def sources() -> list[Path]:
 
 
 def board_design(rendering: Rendering, bands: int = 0) -> tuple[dict[str, int], dict[str, Any]]:
-    """Return sizes (of design.h) and fields (of `design_t`) of a rendering's controller; see `export` for the errors."""
-    controller = rendering.controller()
+    """Return sizes (in design.h) and fields of `design_t` for a rendering's controller; see `export` for the errors."""
+    controller: Any = rendering.controller()
     controller = getattr(controller, "controller", controller)  # without its supervisor
     most = _checked(rendering, controller, bands)
     settings, law, model = controller.settings, controller.law, rendering.model
@@ -127,9 +126,11 @@ def _checked(rendering: Rendering, controller: Any, bands: int) -> int:
     scene, model, used = rendering.scene, rendering.model, len(rendering.bands)
     if scene.device != "vt-plate":
         raise ValueError(f"device.kind = {scene.device!r}: a board plays vt-plate only")
+    if scene.method != "inverse":
+        raise ValueError(f'method = {scene.method!r}: a board plays "inverse" only, the default')
     if not isinstance(controller, WaveformController):
-        cure = "render.method = \"inverse\" and a texture without `carriers`"
-        raise ValueError(f"render.method = {scene.method!r} of this texture: a board plays bands or a waveform by {cure}")
+        playable = "a whole waveform, without `carriers`, or bands of constant amplitude up to 0.24 of the rate"
+        raise ValueError(f"texture {type(scene.texture).__name__}: a board plays {playable}")
     if rendering.bands.modulated or rendering.bands.differentiated:
         raise ValueError("the target is modulated, or a velocity: a board plays displacements of constant amplitude")
     if model.delay > MOST_DELAY:
@@ -181,5 +182,3 @@ def _braced(items: list[str]) -> str:
     """Initialiser of an array, in lines of at most 120 characters."""
     joined = ", ".join(items)
     return f"{{{joined}}}" if len(joined) < 80 else "{\n    " + ",\n    ".join(items) + ",\n    }"
-
-

@@ -10,7 +10,6 @@ import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
-from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any
 
@@ -20,8 +19,10 @@ from hapticrender.control.controller import PositionPredictor
 from hapticrender.control.probe import probe_plate
 from hapticrender.control.supervisor import FADE_OUT, Fault
 from hapticrender.control.supervisor_kernel import STOPPED
+from hapticrender.devices import open_driver
+from hapticrender.devices import registered as registered
 from hapticrender.driver_checks import check_sensed
-from hapticrender.errors import DeviceFault, HapticError, PlateMismatch
+from hapticrender.errors import DeviceFault, PlateMismatch
 from hapticrender.protocols import Array, Controller, Driver, Exchange, Renderer, Rendering, Sensed
 from hapticrender.recordings.recording import Recorder, Recording
 from hapticrender.touch.scene import Scene
@@ -32,32 +33,37 @@ CHUNK = 0.25  # s of signal between two writes of the journal
 Progress = Callable[[float, float], None]
 
 
-def registered(group: str, name: str) -> Any:
-    """Load what the entry-point `group` (renderers, drivers) registers under `name`."""
-    found = {point.name: point for point in entry_points(group=f"hapticrender.{group}")}
-    if name not in found:
-        raise ValueError(f"{group[:-1]} {name!r} is not installed: must be one of {', '.join(sorted(found)) or 'none'}")
-    try:
-        return found[name].load()
-    except Exception as error:
-        raise HapticError(f"{group[:-1]} {name!r} cannot be loaded: {type(error).__name__}: {error}") from error
-
-
 def prepare(
     scene: Scene | str | os.PathLike[str],
     *,
-    driver: Driver | None = None,
+    driver: Driver | str | None = None,
     method: str | None = None,
     seed: int | None = None,
     renderer: Renderer | None = None,
 ) -> Rendering:
     """Do all the design-time work of a run and check it; see `render` for the parameters and errors."""
+    rendering = open_scene(scene, driver=driver, method=method, seed=seed, renderer=renderer)
+    _warm_up(rendering)
+    return rendering
+
+
+def open_scene(
+    scene: Scene | str | os.PathLike[str],
+    *,
+    driver: Driver | str | None = None,
+    method: str | None = None,
+    seed: int | None = None,
+    renderer: Renderer | None = None,
+) -> Rendering:
+    """Open a scene on its device and check it, without compiling anything; see `render`."""
     if isinstance(scene, str | os.PathLike):
         scene = Scene.from_toml(scene)
     if not isinstance(scene, Scene):
         raise TypeError(f"scene: must be a Scene or the name of a scene file, not {type(scene).__name__}")
     changes: dict[str, Any] = {"method": method, "seed": seed}
     scene = replace(scene, **{key: value for key, value in changes.items() if value is not None})
+    if isinstance(driver, str):
+        driver = open_driver(driver, scene.device_profile)
     renderer = registered("renderers", scene.device)() if renderer is None else renderer
     if inspect.isclass(renderer) or not callable(getattr(renderer, "open", None)):
         kind = f"class {renderer.__name__}" if inspect.isclass(renderer) else type(renderer).__name__
@@ -66,14 +72,13 @@ def prepare(
     if not isinstance(rendering, Rendering):
         kinds = type(renderer).__name__, type(rendering).__name__
         raise TypeError(f"{kinds[0]}.open returned {kinds[1]}: must be hapticrender.Rendering")
-    _warm_up(rendering)
     return rendering
 
 
 def render(
     scene: Scene | str | os.PathLike[str],
     *,
-    driver: Driver | None = None,
+    driver: Driver | str | None = None,
     method: str | None = None,
     seed: int | None = None,
     renderer: Renderer | None = None,
@@ -86,8 +91,9 @@ def render(
     ----------
     scene : Scene or path
         A scene, or the name of a scene file (TOML).
-    driver : Driver, optional
-        Any object that follows the protocol of `hapticrender.drivers.base`; the simulated device by default.
+    driver : Driver or str, optional
+        Any object that follows the protocol of `hapticrender.drivers.base`, or a text as ``--driver`` takes it
+        ("audio:0", "package.module:callable"; see `hapticrender.devices.open_driver`); the simulated device by default.
     method : str, optional
         Name of the control method (`hapticrender.control.methods.METHODS`); default: that of the scene.
     seed : int, optional
@@ -133,10 +139,10 @@ def run(rendering: Rendering, *, journal: str | Path | None = None, progress: Pr
         sensed_channels=driver.sensed_channels,
         drive_limit=model.drive_limit if np.isfinite(model.drive_limit) else None,
         sensed_noise=model.sensed_noise,
-        calibration=getattr(rendering.device, "calibration", 0.0),
+        calibration=_gain_uncertainty(rendering),
         **{name: getattr(model, name) for name in names},
     )
-    with recorder, _stopped_by_sigterm(), driver, _zero_drive_after(rendering.device):
+    with recorder, stopped_by_sigterm(), driver, zero_drive_after(rendering.device):
         if rendering.probe:
             probe_plate(rendering.device, model)
         loop = _Loop(rendering)
@@ -152,6 +158,12 @@ def run(rendering: Rendering, *, journal: str | Path | None = None, progress: Pr
     return recording
 
 
+def _gain_uncertainty(rendering: Rendering) -> float:
+    """Relative uncertainty of the sensors' gain: the driver's own, or that of the device's profile."""
+    profile = rendering.scene.device_profile.calibration.gain_uncertainty
+    return float(getattr(rendering.device, "calibration", 0.0) or profile)
+
+
 def _warm_up(rendering: Rendering) -> None:
     """Compile before the device is live: a block through a controller that is thrown away.
 
@@ -165,7 +177,7 @@ def _warm_up(rendering: Rendering) -> None:
 
 
 @contextmanager
-def _stopped_by_sigterm() -> Iterator[None]:
+def stopped_by_sigterm() -> Iterator[None]:
     """Turn SIGTERM into SystemExit in the main thread, so that the device is left at rest."""
     main = threading.current_thread() is threading.main_thread()
     if not main or signal.getsignal(signal.SIGTERM) is not signal.SIG_DFL:
@@ -183,7 +195,7 @@ def _stopped_by_sigterm() -> Iterator[None]:
 
 
 @contextmanager
-def _zero_drive_after(device: Driver) -> Iterator[None]:
+def zero_drive_after(device: Driver) -> Iterator[None]:
     """Play zeros until they have come through, whatever happened, unless the device does so itself on leaving."""
 
     def rest() -> None:
@@ -282,9 +294,11 @@ class _Loop:
 
 def _compare(rendering: Rendering, controller: Controller, recording: Recording) -> None:
     """Warn where the device differs from the model that the controller was designed for."""
-    scale = getattr(controller, "damper_scale", 1.0)
+    scale, source = getattr(controller, "damper_scale", 1.0), rendering.scene.source
+    profile = f", profile {source}," if source else ""
     if scale < 1.0:
         message = f"the inner damper rang above 500 Hz and was turned down to {scale:g}: identify the bending mode"
+        message += f", which profile {source} lacks" if source else ""
         warnings.warn(message, PlateMismatch, stacklevel=3)
     mismatch = getattr(controller, "mismatch", 0.0)
     if mismatch <= MISMATCH:
@@ -293,9 +307,9 @@ def _compare(rendering: Rendering, controller: Controller, recording: Recording)
     found = ", ".join(f"{100 * error:+.1f} % at {hertz:g} Hz" for hertz, error in errors)
     cure = "correct [device]"
     if rendering.scene.device == "vt-plate":
-        cure = "remove the finger and replace [device] by what `hapticrender identify --driver ... --scene ...` writes"
+        cure = "remove the finger and take the profile that `hapticrender identify --driver ... --scene ...` writes"
     message = (
-        f"the device differs from its model: the controller adds {100 * mismatch:.1f} % to what that asks for "
+        f"the device differs from its model{profile}: the controller adds {100 * mismatch:.1f} % to what that asks for "
         f"(bound {100 * MISMATCH:g} %){f'; dynamic stiffness against the model: {found}' if found else ''}; {cure}"
     )
     warnings.warn(message, PlateMismatch, stacklevel=3)

@@ -166,6 +166,7 @@ class Rendering:
     waveform: Callable[[Array, Array], Array]  # target over time (s) and position (m), in the device's quantity
     differentiated: bool = False  # the target is the time derivative of `waveform`
     controller: Callable[[], Controller]  # a new one at rest
+    design: Callable[[Bands], Controller] | None = None  # one at rest for other bands; None: for these only
     probe: bool = False  # whether the device is probed before the loop closes
 
     @property

@@ -18,6 +18,7 @@ from xml.etree import ElementTree
 
 from hapticrender import __version__, defaults
 from hapticrender.control.methods import method_named
+from hapticrender.devices import SIMULATED
 from hapticrender.errors import HapticError, SceneError
 from hapticrender.formatting import as_json
 from hapticrender.loop import prepare, run
@@ -91,14 +92,16 @@ def validate(
     *,
     method: str | None = None,
     seed: int | None = None,
+    driver: str = SIMULATED,
     jobs: int = 1,
     out: str | Path | None = None,
     progress: TextIO | None = None,
 ) -> list[Verdict]:
-    """Render scenes in closed loop against the plant models and judge each, in their order.
+    """Render scenes in closed loop against the plant models, or on a device, and judge each, in their order.
 
     Scenes may be names of built-in ones or TOML files; one that cannot be rendered stops no other.  `method` and `seed`
-    (>= 0, of the plants' noise) are by default those of each scene.  `jobs` (>= 1) processes render side by side.
+    (>= 0, of the plants' noise) are by default those of each scene.  `driver` is a text as ``--driver`` takes it, made
+    anew for each scene.  `jobs` (>= 1) processes render side by side, on simulated devices.
     Files of each scene that does not pass go into a folder of its name in `out`.
 
     Examples
@@ -111,7 +114,9 @@ def validate(
         method_named(method)
     if jobs < 1:
         raise ValueError(f"{jobs=}: must be >= 1 process")
-    judge = partial(_judge, method=method, seed=seed, out=None if out is None else Path(out))
+    if jobs > 1 and driver != SIMULATED:
+        raise ValueError(f"{jobs=}: must be 1 process where driver = {driver!r}: a device plays one scene at a time")
+    judge = partial(_judge, method=method, seed=seed, driver=driver, out=None if out is None else Path(out))
     entries = _read(scenes)
     durations = [scene.duration for _, scene in entries if isinstance(scene, Scene)]
     bar = Progress(durations, progress or io.StringIO())
@@ -140,7 +145,14 @@ def _read(scenes: Iterable[Scene | str | Path]) -> list[tuple[str, Scene | str]]
 
 
 def _judge(
-    label: str, scene: Scene | str, tick: Tick | None = None, *, method: str | None, seed: int | None, out: Path | None
+    label: str,
+    scene: Scene | str,
+    tick: Tick | None = None,
+    *,
+    method: str | None,
+    seed: int | None,
+    driver: str,
+    out: Path | None,
 ) -> Verdict:
     """Render and judge a scene; `scene` may be why it cannot be read."""
     start, device = time.perf_counter(), ""
@@ -149,7 +161,7 @@ def _judge(
         device, method = scene.device, method or scene.method
         seed = scene.seed if seed is None else seed
         try:
-            rendering = prepare(scene, method=method, seed=seed)
+            rendering = prepare(scene, driver=driver, method=method, seed=seed)
             summary = _summary(rendering, out and out / _NO_NAME.sub("_", label), tick)
             return Verdict.of({**summary, "scene": label}, time.perf_counter() - start)
         except BAD_SCENE as error:
@@ -180,7 +192,7 @@ def _summary(rendering: Rendering, folder: Path | None, tick: Tick | None) -> di
         with tempfile.TemporaryDirectory() as scratch:
             return run(rendering, journal=Path(scratch) / JOURNAL, progress=tick).summary()
     refuse_to_overwrite(folder)
-    recording = run(rendering, journal=begin_outputs(folder, rendering), progress=tick)
+    recording = run(rendering, journal=begin_outputs(folder, rendering.scene), progress=tick)
     summary = recording.summary()
     if not summary["passed"]:
         return dict(write_outputs(folder, recording).summary)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Collection, Mapping
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -14,6 +16,7 @@ from hapticrender.control.supervisor import supervised
 from hapticrender.driver_checks import check_driver
 from hapticrender.drivers.simulated import SimulatedDriver
 from hapticrender.protocols import Array, Controller, Driver, Method, Plant, Rendering
+from hapticrender.touch.device_profile import Limits
 from hapticrender.touch.scene import Scene
 
 Waveform = Callable[[Array, Array], Array]
@@ -42,9 +45,10 @@ class BaseRenderer:
         else:
             plant, device, facing = None, driver, self.connect(setup, driver)
         check_driver(facing)
-        model = self.device_model(setup, facing)
+        model = self.protected(scene.device_profile.limits, self.device_model(setup, facing))
         bands = self.bands(setup, model)
         model = self.limited(setup, model, bands)
+        design = partial(self.design, method, model, feedback=facing.sensed_channels > 0)
         return Rendering(
             scene=scene,
             device=device,
@@ -54,7 +58,8 @@ class BaseRenderer:
             bands=bands,
             waveform=self.waveform(setup),
             differentiated=self.differentiated,
-            controller=partial(self.design, method, model, bands, feedback=facing.sensed_channels > 0),
+            controller=partial(design, bands),
+            design=design,
             probe=self.probes(setup, device),
         )
 
@@ -74,6 +79,20 @@ class BaseRenderer:
         """Return the device model of the device behind `driver`."""
         raise NotImplementedError
 
+    def protected(self, limits: Limits, model: DeviceModel) -> DeviceModel:
+        """Return the device model with the limits of the device, whose drive is that of `model`."""
+        infinite = {name: getattr(limits, name) or math.inf for name in ("peak_drive", "rms_drive", "displacement")}
+        peak, step = infinite["peak_drive"], model.drive_step
+        if step > 0.0 and peak < model.drive_limit:
+            peak = step * math.floor(peak / step)  # what the converter rounds up would pass it
+        return replace(
+            model,
+            drive_limit=min(model.drive_limit, peak),
+            rms_limit=infinite["rms_drive"],
+            rms_time=limits.rms_time,
+            sensed_bound=infinite["displacement"],
+        )
+
     def bands(self, setup: Setup, model: DeviceModel) -> Bands:
         """Carriers and targets; refuses with a ValueError what the device cannot do."""
         raise NotImplementedError
@@ -91,9 +110,9 @@ class BaseRenderer:
         return getattr(setup, "scene", setup).texture.waveform
 
     def design(self, method: Method, model: DeviceModel, bands: Bands, *, feedback: bool = True) -> Controller:
-        """Return a controller of `method` for the whole device, supervised where something is sensed."""
+        """Return a controller of `method` for the whole device, supervised."""
         controller = method.design(model, bands, feedback=feedback)
-        return supervised(controller, model) if feedback else controller
+        return supervised(controller, model, feedback=feedback)
 
 
 def check_tables(

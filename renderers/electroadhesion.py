@@ -11,12 +11,12 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from functools import cached_property
 
-from hapticrender.checks import inside, option, parameter
+from hapticrender.checks import inside, option, parameter, require
 from hapticrender.control.device_model import DeviceModel
 from hapticrender.plants.electroadhesion import NORMAL, ElectroadhesionParameters, ElectroadhesionScreen, SquareRoot
 from hapticrender.protocols import Driver
 from hapticrender.renderers.base import check_channels, check_tables, read_devices
-from hapticrender.renderers.friction import ROOM, FrictionRenderer, FrictionSettings, FrictionSetup
+from hapticrender.renderers.friction import ROOM, FrictionRenderer, FrictionSettings, FrictionSetup, carrier_limit
 from hapticrender.renderers.shaped import CarrierDriver, Port, ShapedDriver
 from hapticrender.touch.scene import Scene
 
@@ -64,6 +64,7 @@ class ScreenSetup(FrictionSetup):
         limit, unit = assumed.voltage_limit, "V"
         if assumed.drive_kind == "current":
             limit, unit = min(assumed.current_limit, limit / abs(finger.impedance(load))), "A"
+        limit = min(limit, carrier_limit(self.scene.device_profile.limits))
         gain = self.open_loop_gain / finger.gain(load) * float(finger.attraction(1.0, load))
         most = gain * limit**2
         swing = settings.headroom * self.needed(self.model(Port(assumed.rate, 1, 1))).drive
@@ -103,6 +104,8 @@ class ElectroadhesionRenderer(FrictionRenderer):
         check_tables(scene, ElectroadhesionParameters.names(), ElectroadhesionSettings.names(), LEVEL)
         with inside("render"):
             settings = ElectroadhesionSettings(**scene.rendering)
+        moved = scene.device_profile.limits.displacement
+        require(moved is None, "limits.displacement", moved, "left out: a screen senses no displacement")
         return ScreenSetup(scene, settings, *read_devices(scene, ElectroadhesionParameters, LEVEL))
 
     def plant(self, setup: ScreenSetup, seed: int) -> ElectroadhesionScreen:

@@ -19,6 +19,7 @@ from hapticrender.plants.sliding_contact import SlidingParameters
 from hapticrender.protocols import Array, Driver
 from hapticrender.renderers.base import BaseRenderer, Waveform
 from hapticrender.renderers.limits import Need, check_carriers, examined, needed, perceptible, speeds, top_speed
+from hapticrender.touch.device_profile import Limits
 from hapticrender.touch.perception import VELOCITY_PER_FORCE
 from hapticrender.touch.scene import Scene
 
@@ -177,10 +178,19 @@ class FrictionSetup:
         )
 
 
+def carrier_limit(limits: Limits) -> float:
+    """Largest peak (drive unit) of a carrier within the limits of peak and rms drive; the rms is that of a sine."""
+    return min(limits.peak_drive or np.inf, np.sqrt(2.0) * (limits.rms_drive or np.inf))
+
+
 class FrictionRenderer(BaseRenderer):
     """Base of the renderers whose target quantity is friction (N) against the motion of a sliding finger."""
 
     differentiated = True
+
+    def protected(self, limits: Limits, model: DeviceModel) -> DeviceModel:
+        """Return `model`: its drive is a friction, and the setup has the limits of the carrier; see `carrier_limit`."""
+        return model
 
     def waveform(self, setup: FrictionSetup) -> Waveform:
         """Return the waveform whose time derivative is the target friction: displacement over v/F (N s)."""

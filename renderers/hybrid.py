@@ -31,6 +31,7 @@ from hapticrender.renderers.friction import RATIO
 from hapticrender.renderers.limits import check_carriers, perceptible
 from hapticrender.renderers.shaped import Port, WrappedDriver
 from hapticrender.renderers.vibrotactile import PlateSetup, VibrotactileRenderer
+from hapticrender.touch.device_profile import Limits
 from hapticrender.touch.scene import Scene
 
 BOTH = "rate"  # the parameter that plate and screen share
@@ -181,6 +182,11 @@ class HybridRenderer(BaseRenderer):
             friction = replace(friction, lowest_frequency=2 * start)
         return _side_by_side(plate, friction, setup.velocity_per_force)
 
+    def protected(self, limits: Limits, model: DeviceModel) -> DeviceModel:
+        """Return the device models with the limits on the plate."""
+        parts: Any = model
+        return replace(parts, plate=self._plate.protected(limits, parts.plate))
+
     def bands(self, setup: HybridSetup, model: DeviceModel) -> CombinedBands:
         """Carriers and targets of a scene, shared out; refused where a part cannot do its share."""
         bands = setup.bands
@@ -248,7 +254,7 @@ def _split(scene: Scene) -> tuple[HybridSettings, Scene, Scene]:
         replace(scene, profile=profile, simulation=simulation, rendering=rendering)
         for profile, simulation, rendering in zip(profiles, simulations, renderings, strict=True)
     )
-    return settings, plate, screen
+    return settings, plate, replace(screen, limits={})  # they are those of the plate
 
 
 def _split_table(values: Mapping[str, Any], settings: set[str]) -> list[dict[str, Any]]:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from functools import partial
 from typing import NamedTuple
 
 import numpy as np
+from scipy.signal import lfilter
 
 from hapticrender.bands import Bands
 from hapticrender.control.device_model import Demand, DeviceModel
@@ -76,16 +78,28 @@ def check_carriers(scene: Scene, model: DeviceModel, bands: Bands) -> None:
 
 
 def check_targets(scene: Scene, model: DeviceModel, bands: Bands, waveform: Waveform) -> None:
-    """Refuse targets that the free device cannot reach within its drive, or that its sensors cannot follow."""
+    """Refuse targets that pass the free device's drive, what its sensors can follow, or the limits of the device."""
     need, unit, drive_unit = needed(scene, model, bands, waveform), model.unit, model.drive_unit
     verb = "=" if unit == "m" else "asks for"
-    if need.amplitude > model.sensed_limit:
-        bound = f"must be <= {model.sensed_limit:g} {unit}, the sensors' range"
-        raise ValueError(f"texture.amplitude {verb} {need.amplitude:.3g} {unit}: {bound}")
-    if need.drive > model.drive_limit:
-        bound = f"must be <= {model.drive_limit:g} {drive_unit}{' in each coil' if drive_unit == 'A' else ''}"
-        needs = f"at {need.frequency:.3g} Hz needs {need.drive:.3g} {drive_unit}"
-        raise ValueError(f"texture.amplitude {verb} {need.worst:.3g} {unit} {needs}: {bound}")
+    peak = need.amplitude * max(map(abs, model.profile or (1.0,)))
+    for amplitude, most, whose in (
+        (need.amplitude, model.sensed_limit, "the sensors' range"),
+        (peak, model.sensed_bound, "[limits] displacement"),
+    ):
+        if amplitude > most:
+            raise ValueError(f"texture.amplitude {verb} {amplitude:.3g} {unit}: must be <= {most:g} {unit}, {whose}")
+    peak_drive = scene.device_profile.limits.peak_drive or math.inf
+    each = " in each coil" if drive_unit == "A" else ""
+    own = ", [limits] peak_drive" if 0.0 <= peak_drive - model.drive_limit <= model.drive_step else ""
+    over = f" over {model.rms_time:g} s, [limits] rms_drive"
+    for drive, most, kind, whose in (
+        (need.drive, model.drive_limit, "", each + own),
+        (need.rms, model.rms_limit, " rms", each + over),
+    ):
+        if drive > most:
+            needs = f"at {need.frequency:.3g} Hz needs {drive:.3g} {drive_unit}{kind}"
+            bound = f"must be <= {most:g} {drive_unit}{kind}{whose}"
+            raise ValueError(f"texture.amplitude {verb} {need.worst:.3g} {unit} {needs}: {bound}")
 
 
 class Need(NamedTuple):
@@ -97,6 +111,7 @@ class Need(NamedTuple):
     frequency: float  # Hz, of that band
     lowest: float  # Hz, of all that the targets move with
     highest: float  # Hz
+    rms: float  # of the drive that no finger's speed changes, over the time constant of [limits]
 
 
 def demand(scene: Scene, model: DeviceModel, bands: Bands, waveform: Waveform) -> Demand:
@@ -132,7 +147,9 @@ def needed(
     at = int(drive[:, worst].argmax()), worst
     sums = (float(each.max(axis=0).sum()) for each in (target, drive))
     ends = float(passed.min()), float(passed.max())
-    return Need(*sums, float(target[at]), float(passed[at]), *ends)
+    power = (drive[0, bands.wavenumber == 0.0] ** 2).sum() / 2.0
+    rms = math.sqrt(power * -math.expm1(-scene.duration / scene.device_profile.limits.rms_time))
+    return Need(*sums, float(target[at]), float(passed[at]), *ends, rms)
 
 
 def _drive_of_free_device(model: DeviceModel, frequency: Array) -> Array:
@@ -152,8 +169,10 @@ def _need_of_waveform(
     spectrum = np.where(kept, turn * np.fft.rfft(target), 0.0)
     if bands.differentiated:
         target = np.fft.irfft(spectrum, len(time))
-    drive = abs(np.fft.irfft(spectrum * per_target(frequency), len(time))).max()
+    drive = np.fft.irfft(spectrum * per_target(frequency), len(time))
+    pole = -math.expm1(-1.0 / (model.rate * scene.device_profile.limits.rms_time))
+    rms = math.sqrt(lfilter([pole], [1.0, pole - 1.0], drive**2).max())
     amplitude = float(abs(target).max())
     energy = np.cumsum(abs(spectrum) ** 2)
     ends = (float(frequency[np.searchsorted(energy, share * energy[-1])]) for share in (1e-3, 1.0 - 1e-3))
-    return Need(amplitude, float(drive), amplitude, float(frequency[abs(spectrum).argmax()]), *ends)
+    return Need(amplitude, float(abs(drive).max()), amplitude, float(frequency[abs(spectrum).argmax()]), *ends, rms)

@@ -19,7 +19,7 @@ from hapticrender.plants.surface import SurfaceParameters, UltrasonicSurface
 from hapticrender.plants.ultrasonic import UltrasonicParameters
 from hapticrender.protocols import Driver
 from hapticrender.renderers.base import check_channels, check_tables, read_devices
-from hapticrender.renderers.friction import FrictionRenderer, FrictionSettings, FrictionSetup
+from hapticrender.renderers.friction import FrictionRenderer, FrictionSettings, FrictionSetup, carrier_limit
 from hapticrender.renderers.resonant import ResonantDriver, amplitude_loop
 from hapticrender.renderers.shaped import Port
 from hapticrender.touch.scene import Scene
@@ -50,7 +50,10 @@ class UltrasonicRenderer(FrictionRenderer):
         check_tables(scene, names, FrictionSettings.names(), LEVEL)
         with inside("render"):
             settings = FrictionSettings(**scene.rendering)
-        return SurfaceSetup(scene, settings, *read_devices(scene, SurfaceParameters, LEVEL))
+        assumed, simulated = read_devices(scene, SurfaceParameters, LEVEL)
+        limit = min(assumed.mode.drive_limit, carrier_limit(scene.device_profile.limits))
+        assumed = replace(assumed, mode=replace(assumed.mode, drive_limit=limit))
+        return SurfaceSetup(scene, settings, assumed, simulated)
 
     def plant(self, setup: SurfaceSetup, seed: int) -> UltrasonicSurface:
         """Return the simulated surface with the scene's finger on it."""

@@ -19,7 +19,9 @@ EXPECTED = {
     "recorded_texture": (2.0, 0.1 * 4 / 0.7 / 50),
     "your_own_driver": (10e-6, 0.006 * 10e-6),  # as the first, with half the averaging time
     "your_own_texture": (2.738, 0.274),  # rms heights of 8.67 to 12 um over 2 to 5.33 um, rounded off by the loop's lag
+    "play_live": (5e-6, 0.02 * 5e-6),  # a sliding finger, new to the law: 1 % must, and the state's own noise
     "realtime_callback": (10e-6, 0.006 * 10e-6),
+    "sound_card": (0.0, 0.0),  # no card is named
     "made_up_device": (0.01, 0.01),  # up to 2 %, the accuracy suite's bound for a touch at the centre
     "one_texture_three_devices": (0.025, 0.025),  # up to 5 %, how far devices may differ in skin velocity
     "velocity_per_force": (0.70425, 0.0005),  # mean of the eight figures of test_finger, each rounded to 0.0005

@@ -85,7 +85,8 @@ def test_targets_of_a_carrier_that_follows_the_finger_sum_to_all_of_it(monkeypat
     """
     rounding = 5 * 3 * TRACKER * np.finfo(float).eps / 2 * 0.05 / 0.03
     amplitude, acceleration, n = 1e-5, 0.3, 8000
-    monkeypatch.setattr(combined, "supervised", lambda part, model: part)  # sensors that show zeros would stop it
+    # sensors that show zeros would stop it
+    monkeypatch.setattr(combined, "supervised", lambda part, model, feedback: part)
     session = loop.prepare(scene(hr.Grating(amplitude=amplitude, wavelength=1e-3), duration=0.8))
     controller, time = session.controller(), np.arange(n) / RATE
     position = 0.01 * time + acceleration * time**2 / 2 - 0.05

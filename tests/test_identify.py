@@ -1,7 +1,6 @@
 """Identification of a plate through a driver that shares no code with the library's plants."""
 
 import dataclasses
-import tomllib
 import warnings
 
 import numpy as np
@@ -143,9 +142,8 @@ def test_what_was_identified_of_bending_reaches_the_design(coil):
     So do the gains, and a delay beyond the driver's.
     """
     plate = StrangersPlate(bending=(1250.0, 30, coil), **WRONG, told=1)
-    device = tomllib.loads(identify(plate, PAPER).to_toml())["device"]
-    tone, kind = hr.Grating(frequency=72.0, amplitude=50e-6), device.pop("kind")
-    scene = hr.Scene(texture=tone, duration=1.0, device=kind, profile=device)
+    tone = hr.Grating(frequency=72.0, amplitude=50e-6)
+    scene = hr.Scene(texture=tone, duration=1.0, profile=identify(plate, PAPER).profile())
     model = loop.prepare(scene, driver=plate).model
     assert loop.prepare(dataclasses.replace(scene, profile={}), driver=plate).model.bending.measured is False
     assert model.rigid is (coil == 0.0)
@@ -169,25 +167,22 @@ def test_the_command_line_identifies_a_wrong_plate_and_render_then_holds_it(tmp_
     truth = {"mass": 30e-3, "stiffness_1": 24e3, "stiffness_2": 24.5e3, "sensor_gain_1": 1.02, "sensor_gain_2": 0.98}
     scene = hr.Scene(texture=hr.Grating(frequency=143.0, amplitude=30e-6), duration=3.0, simulation=truth)
     (tmp_path / "wrong.toml").write_text(scene.to_toml())
-    with pytest.warns(hr.PlateMismatch, match="at 143 Hz; remove the finger and replace .*`hapticrender identify"):
+    with pytest.warns(hr.PlateMismatch, match="at 143 Hz; remove the finger and take .*`hapticrender identify"):
         before = amplitude(scene, hr.render(scene))
     arguments = ["identify", "--scene", str(tmp_path / "wrong.toml"), "--out", str(tmp_path / "plate.toml")]
     assert cli.main(arguments) == 0
     assert "differs from [device]: mass -6." in capsys.readouterr().out
-    device = tomllib.loads((tmp_path / "plate.toml").read_text())["device"]
-    device.pop("kind")
-    after = amplitude(scene, hr.render(dataclasses.replace(scene, profile=device)))
+    measured = dataclasses.replace(scene, device=str(tmp_path / "plate.toml"))
+    after = amplitude(scene, hr.render(measured))
+    assert measured.source.startswith("plate (")
     assert abs(before / 30e-6 - 1).max() > 0.015
     assert abs(after / 30e-6 - 1).max() < 0.003
 
 
-def test_the_command_line_takes_any_registered_driver(monkeypatch, capsys):
-    known = loop.registered
-    other = lambda group, name: OtherPlate if name == "other" else known(group, name)  # noqa: E731
-    monkeypatch.setattr(loop, "registered", other)
-    assert cli.main(["identify", "--driver", "other:0.04"]) == 0
+def test_the_command_line_takes_any_driver_by_its_module(capsys):
+    assert cli.main(["identify", "--driver", "other_plate:OtherPlate:0.04"]) == 0
     assert "mass                 0.040" in capsys.readouterr().out
-    assert cli.main(["identify", "--driver", "other:0.04", "--amplitude", "1e-6"]) == 2
+    assert cli.main(["identify", "--driver", "other_plate:OtherPlate:0.04", "--amplitude", "1e-6"]) == 2
     assert "10 times the noise: check drive and sensor connections, or increase amplitude" in capsys.readouterr().err
 
 

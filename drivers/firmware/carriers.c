@@ -173,13 +173,15 @@ void bands_measure(law_t *law, real_t displacement)
     for (uint32_t k = 0u; k < LAW_BANDS; k++) {
         const band_state_t *band = &law->bands[k];
         residual -= band->measured_re * band->carrier_re - band->measured_im * band->carrier_im;
-    }
+    } /* 0 of a band that is not active */
     law->measured_dc += law->design->measuring_dc * residual;
     const real_t share = law->design->measuring * residual;
     for (uint32_t k = 0u; k < LAW_BANDS; k++) {
         band_state_t *band = &law->bands[k];
-        band->measured_re += share * band->carrier_re;
-        band->measured_im -= share * band->carrier_im;
+        if (band->active != 0u) {
+            band->measured_re += share * band->carrier_re;
+            band->measured_im -= share * band->carrier_im;
+        }
     }
 }
 

@@ -2,12 +2,7 @@
 #include "machine_m4.h"
 #include "measure.h"
 
-void measure_start(void)
-{
-    TIMER0_RELOAD = 0xFFFFFFFFu;
-    TIMER0_VALUE = 0xFFFFFFFFu;
-    TIMER0_CONTROL = 1u;
-}
+void measure_start(void) { machine_start_timer(); }
 
 uint32_t measure_count(void) { return ~TIMER0_VALUE; }
 

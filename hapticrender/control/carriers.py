@@ -68,7 +68,7 @@ def predict_positions(tracker, positions, ahead, predicted):
         track_finger(tracker, positions[n])
         if c.finger_seen > 0.0:
             time = ahead / c.p.rate
-            c.held_prediction = c.smooth_position + time * (c.velocity + 0.5 * time * c.acceleration)
+            c.held_prediction = positions[n] + time * (c.velocity + 0.5 * time * c.acceleration)
         predicted[n] = c.held_prediction
 
 

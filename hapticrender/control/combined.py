@@ -169,7 +169,7 @@ def design_combined(
     parts: list[Any] = []
     for each, own in zip(models, shares, strict=True):
         part: Any = method.design(each, own, feedback=feedback) if each is not None and len(own) else None
-        parts.append(supervised(part, each) if feedback and part is not None and each is not None else part)
+        parts.append(part if part is None or each is None else supervised(part, each, feedback=feedback))
     sensors = (model.plate.coordinate_from_sensed.shape[1], 1) if feedback else (0, 0)
     channels = (model.plate.force_from_drive.shape[1], 1)
     return CombinedController(

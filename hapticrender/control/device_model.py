@@ -91,6 +91,9 @@ class DeviceModel:
     unit: str = "m"  # of the coordinates
     drive_unit: str = "A"
     demand: Demand | None = None  # of the scene; None: not known, or too little to supervise a motion by
+    rms_limit: float = math.inf  # drive unit, > 0: largest rms of each drive channel ...
+    rms_time: float = 10.0  # s: ... over about this time constant, by which a coil heats
+    sensed_bound: float = math.inf  # sensor unit, > 0: a larger magnitude stops the drive
 
     @property
     def pattern(self) -> tuple[float, ...]:

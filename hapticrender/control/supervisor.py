@@ -16,6 +16,7 @@ from hapticrender.control.device_model import Demand, DeviceModel
 from hapticrender.control.records import CONTROLLER, MOST_CHANNELS, MOST_SENSORS
 from hapticrender.control.supervisor_kernel import (
     ACTIVE,
+    BEYOND,
     DRIVE,
     FROZEN,
     INCONSISTENT,
@@ -40,9 +41,12 @@ NOISE_VARIANCES = 12.0
 POWER_TIME = 12e-3  # s
 DRIVE_TIME, PRESS_TIME, FASTEST_PACE = 30e-3, 60e-3, 6.0  # s, s; times of a faster device are shorter
 PRESS, PRESS_LOAD = 9.0, 5.0  # N: 1.5 times the force that a press of 5 N in a millisecond takes; its load
+SLIDE = 0.2  # m/s: a load that slides so fast is a moment that grows, and may be held against
 RINGING_FROM, RINGING_VARIANCES = 500.0, 16.0  # Hz, 4 sigma
 RINGING_MEAN, RINGING_TIME = 3e-3, 8e-3  # s: what a sudden lift-off leaves behind falls in this time from 15 sigma
 RINGING_WAIT, RINGING_STOP, SATURATED_WAIT = 10e-3, 150e-3, 0.5  # s
+SLOW_MEAN, SLOW_TIME = 0.2, 0.3  # s
+BEYOND_TIME = 10e-3  # s: three samples in it are no spikes
 DANGER_DRIVE = 0.9  # of the drive limit
 UNLIMITED = 1e300
 
@@ -50,9 +54,9 @@ UNLIMITED = 1e300
 class Fault(NamedTuple):
     """Why a supervisor has stopped the drive."""
 
-    cause: int  # INVALID to OVERMOTION
+    cause: int  # INVALID to BEYOND
     sample: int  # at which the test failed; the drive fades out from it on
-    sensors: int  # bit i: sensor i + 1; of INVALID and FROZEN
+    sensors: int  # bit i: sensor i + 1; of INVALID, FROZEN and BEYOND
 
     @property
     def text(self) -> str:
@@ -91,6 +95,10 @@ CAUSES = {
     OVERMOTION: (
         "the surface moved farther than the scene and a press can move it; most likely the loop is unstable",
         "wiring and polarity of all sensors and actuators, the delay, and [device]",
+    ),
+    BEYOND: (
+        "sensor {sensor}: more than [limits] displacement",
+        "what the scene asks for, how hard the finger presses, and the sensor's offset",
     ),
 }
 
@@ -138,10 +146,17 @@ class SupervisedController:
     run = BankController.run
 
 
-def supervised(controller: Controller, model: DeviceModel) -> Any:
-    """Return a controller under supervision; as it is where it has no compiled step, or nothing is sensed."""
+def supervised(controller: Controller, model: DeviceModel, *, feedback: bool = True) -> Any:
+    """Return a controller under supervision; as it is where it has no compiled step.
+
+    Without `feedback` nothing is sensed, and the limit of rms drive is all that there is to hold.
+    """
     compiled = isinstance(getattr(controller, "step", None), CFunction)
-    return SupervisedController(controller, model) if compiled else controller
+    if not compiled or not (feedback or model.rms_limit < model.drive_limit):
+        return controller
+    if not feedback:
+        model = replace(model, demand=None, coordinate_from_sensed=model.coordinate_from_sensed[:, :0])
+    return SupervisedController(controller, model)
 
 
 def governed(model: DeviceModel, demand: Demand) -> DeviceModel:
@@ -185,6 +200,7 @@ def design_supervisor(controller: Any, model: DeviceModel) -> dict[str, Any]:
         "frozen_time": max(FROZEN_SAMPLES, round(FROZEN_TIME / model.pace * rate)),
         "frozen_drive": UNLIMITED if model.inferred else moved,
         **{f"fade_{name}": min(model.pace / (time * rate), 1.0) for name, time in FADES.items()},
+        **_limit_settings(controller, model),
     }
     if demand is None:
         return settings
@@ -201,8 +217,27 @@ def design_supervisor(controller: Any, model: DeviceModel) -> dict[str, Any]:
     return settings | _motion_settings(model, demand, noise) | _ringing(controller, model, demand)
 
 
+def _limit_settings(controller: Any, model: DeviceModel) -> dict[str, Any]:
+    """Settings of test 8 and of the limit of rms drive, which is passed on to a controller with a drive limit."""
+    settings = {
+        "sensed_bound": min(model.sensed_bound, UNLIMITED),
+        "beyond_time": max(round(BEYOND_TIME * model.rate), 3),
+    }
+    if not model.rms_limit < model.drive_limit:
+        return settings
+    pole = _pole(model.rms_time, model.rate)
+    peak = min(model.drive_limit, model.rms_limit / math.sqrt(pole))  # a single sample passes no limit of the heat
+    own = getattr(controller.state, "dtype", None) == CONTROLLER
+    return settings | {
+        "drive_limit": peak,
+        "heat_pole": pole,
+        "heat_gain": (peak / model.rms_limit) ** 2 - 1.0,
+        "limited": controller.state.ctypes.data if own else 0,
+    }
+
+
 def _motion_settings(model: DeviceModel, demand: Demand, noise: float) -> dict[str, Any]:
-    """Settings of tests 3, 4 and 7, which compare motion and drive; `noise` (rms) is that of each sensor."""
+    """Settings of tests 3, 4, 7 and 9, which compare motion and drive; `noise` (rms) is that of each sensor."""
     rate, stiffness = model.rate, float(model.stiffness[0, 0])
     sag, shared = PRESS_LOAD / stiffness, DELAY_ERROR**2
     corner = float(np.clip(1.4 * demand.highest, 250.0, max(rate / 10, 250.0)))
@@ -218,6 +253,7 @@ def _motion_settings(model: DeviceModel, demand: Demand, noise: float) -> dict[s
         bound[i, 4 + i] = MODEL_ERROR**2 * model.mass[i, i] ** 2
         bound[i, 6 + i] = shared
         floor[i] = NOISE_VARIANCES * noise**2 * _residual_noise(model, i, corner, low_end)
+    floor[1] += (PRESS_LOAD * SLIDE * model.lever_per_metre / (2 * np.pi * low_end)) ** 2  # a ramp behind the high-pass
     return {
         "modelled": 1,
         **{name: _padded(getattr(model, name), 2, 2) for name in ("mass", "damping", "stiffness")},
@@ -235,6 +271,8 @@ def _motion_settings(model: DeviceModel, demand: Demand, noise: float) -> dict[s
         "lever": abs(model.place_from_coordinate[:, 1:]).max(initial=0.0),
         "danger_motion": 4.0 * demand.motion + 1.36 * sag,
         "most_motion": 3.0 * demand.motion + 5.4 * sag,
+        "slow_pole": _pole(SLOW_MEAN, rate),
+        "slow_time": SLOW_TIME * rate,
         "danger_drive": DANGER_DRIVE * model.drive_limit,
     }
 

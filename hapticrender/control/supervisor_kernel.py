@@ -19,6 +19,8 @@ no  test         condition                                                      
 5   drive        mean of u^2 > (1.5 B + A/2.4)^2/2: more than any finger takes                    30 ms (mean) + 60 ms
 6   ringing      inner damper's force beyond 500 Hz and 1.5 times the carriers > 4 times its noise   8 ms
 7   overmotion   motion of an end > 3 R + 5.4 sag                                                 5 samples
+8   beyond       a sensor shows more than the device's limit of displacement                      3 in 10 ms
+9   active       mean(-r v) > 0.65 sqrt(E_F E_v) in heave, E_r < 6 E_F, means over 0.2 s          0.3 s
 === ============ ================================================================================ ====================
 
 R (m) and B (drive unit) are what the scene needs at most with the worst finger, A the drive of a hard press, `sag` the
@@ -26,7 +28,8 @@ static displacement under 5 N.  *Danger* is a motion > 4 R + 1.36 sag or a drive
 fades out in 10 ms, in danger in 2 ms, on overmotion in 0.2 ms, and stays at zero.  A ringing damper is turned down to
 0.4, then to 0; the drive stops where it rings all the same for 150 ms.
 
-Tests 3 to 5 and 7 need a `Demand`; 6 a controller with an inner damper.  Without them a controller has tests 1 and 2.
+Tests 3 to 5, 7 and 9 need a `Demand`; 6 a controller with an inner damper; 8 a limit.  Without them a controller has
+tests 1 and 2.  Where the device has a limit of rms drive, `cool` holds it.
 `control.supervisor` designs all of it.
 """
 
@@ -42,20 +45,22 @@ from hapticrender.control.records import CONTROLLER_T, MOST_CHANNELS, MOST_SENSO
 from hapticrender.jit import F8, I8, SIGNALS_T, call, kernel, pointer, record, step
 from hapticrender.protocols import Flag
 
-INVALID, FROZEN, INCONSISTENT, ACTIVE, DRIVE, RINGING, OVERMOTION = range(1, 8)
-STOPPED = int(Flag.STOPPED)
+INVALID, FROZEN, INCONSISTENT, ACTIVE, DRIVE, RINGING, OVERMOTION, BEYOND = range(1, 9)
+STOPPED, SATURATED = int(Flag.STOPPED), int(Flag.SATURATED)
 ROOT2 = math.sqrt(2.0)
 INVALID_SHARE = 0.3
 BY_DRIVE = 6.0  # E_r over E_F: in a fault the residual is the drive, in a load step it is not
 POWER = 0.6
+SLOW_POWER, SLOW_FORCE = 0.65, 3.0  # healthy: below 0.03, with a finger negative, while it taps up to 0.8 for a moment
 RINGING_STEP = 0.4
 
 _SETTINGS = """
 sensor_limit invalid_pole frozen_drive low high corner shape omega energy_pole power_pole drive_pole
 ring_corner ring_shape ring_pole lever danger_motion danger_drive most_motion most_drive large_drive
+sensed_bound drive_limit heat_pole heat_gain slow_pole
 fade_out fade_danger fade_now
 """.split()
-_TIMES = "frozen inconsistent active drive ring ring_wait ring_stop suspension".split()  # samples
+_TIMES = "frozen inconsistent active drive ring ring_wait ring_stop suspension beyond slow".split()  # samples
 SETTINGS = np.dtype(
     [
         *((name, np.float64) for name in _SETTINGS),
@@ -67,7 +72,7 @@ SETTINGS = np.dtype(
         ("ringing", np.float64, (2,)),  # N2, of the damper's force; 0: no test
         *((f"{name}_time", np.int64) for name in _TIMES),
         *((name, np.int64) for name in ("step", "state", "controller", "modelled", "sensors", "channels", "block")),
-        *((name, np.int64) for name in ("delay", "needs_contact", "forces_at")),
+        *((name, np.int64) for name in ("delay", "needs_contact", "forces_at", "limited")),
     ]
 )
 """Settings of a supervisor, as `design_supervisor` derives them; poles and fades are per sample, times in samples."""
@@ -81,12 +86,13 @@ SUPERVISOR = np.dtype(
         *((name, np.float64, (4,)) for name in ("input", "low", "high", "band", "level", "value", "rate", "change")),
         *((name, np.float64, (4,)) for name in ("ring_band", "ring_level")),
         *((name, np.float64, (2,)) for name in ("force", "power", "ring_energy")),
+        ("slow", np.float64, (4,)),  # means of test 9: -r v, and the squares of v, F and r
         ("energy", np.float64, (12,)),  # of q, v, a, dF, F, r in both coordinates
-        ("drive_energy", np.float64, (MOST_CHANNELS,)),
+        *((name, np.float64, (MOST_CHANNELS,)) for name in ("drive_energy", "heat")),
         *((name, np.float64, (MOST_SENSORS,)) for name in ("last", "least", "most")),
         ("repeats", np.int64, (MOST_SENSORS,)),
-        *((f"{name}_count", np.int64) for name in ("inconsistent", "active", "drive", "motion", "ring", "ring_wait")),
-        *((name, np.int64) for name in ("suspended", "sample", "now", "sensors", "cause", "stopped")),
+        *((f"{name}_count", np.int64) for name in ("inconsistent", "active", "drive", "motion", "ring", "ring_wait", "slow")),
+        *((name, np.int64) for name in ("suspended", "sample", "now", "sensors", "cause", "stopped", "beyond_count")),
     ]
 )
 SUPERVISOR_T = numba.from_dtype(SUPERVISOR)
@@ -99,7 +105,7 @@ def check_sensors(supervisor, sensed, n, drive, acts):
     A drive that does not act (on a surface without a sliding finger) moves no sensor.
     """
     s = record(supervisor, SUPERVISOR_T, 0)
-    p, cause, invalid, frozen = s.p, 0, 0, 0
+    p, cause, invalid, frozen, beyond = s.p, 0, 0, 0, 0
     q0 = q1 = 0.0
     for i in range(p.sensors):
         value = sensed[n * p.sensors + i]
@@ -112,6 +118,8 @@ def check_sensors(supervisor, sensed, n, drive, acts):
                 frozen |= 1 << i
         else:
             s.last[i], s.repeats[i], s.least[i], s.most[i] = value, 1, drive, drive
+        if p.sensor_limit > abs(value) > p.sensed_bound:
+            beyond |= 1 << i
         q0 += p.coordinate_from_sensor[0, i] * s.last[i]
         q1 += p.coordinate_from_sensor[1, i] * s.last[i]
     s.input[0], s.input[1] = q0, q1
@@ -120,8 +128,11 @@ def check_sensors(supervisor, sensed, n, drive, acts):
         cause = INVALID
     elif frozen > 0:
         cause = FROZEN
+    s.beyond_count = max(s.beyond_count + (p.beyond_time if beyond > 0 else -1), 0)
+    if beyond > 0 and s.beyond_count > 2 * p.beyond_time:
+        cause = BEYOND
     if cause > 0 and s.cause == 0:
-        s.sensors = invalid if cause == INVALID else frozen
+        s.sensors = invalid if cause == INVALID else frozen if cause == FROZEN else beyond
     return cause
 
 
@@ -145,19 +156,36 @@ def filter_signals(supervisor):
 
 
 @kernel
+def check_growth(supervisor, residual):
+    """Test 9: whether heave has been driven on by what the model lacks for long, as no finger does."""
+    s = record(supervisor, SUPERVISOR_T, 0)
+    p, force, rate = s.p, s.value[2], s.rate[0]
+    s.slow[0] += p.slow_pole * (-residual * rate - s.slow[0])
+    s.slow[1] += p.slow_pole * (rate * rate - s.slow[1])
+    s.slow[2] += p.slow_pole * (force * force - s.slow[2])
+    s.slow[3] += p.slow_pole * (residual * residual - s.slow[3])
+    grows = s.slow[0] > 0.0 and s.slow[0] * s.slow[0] > SLOW_POWER * SLOW_POWER * s.slow[1] * s.slow[2]
+    grows &= s.slow[3] < BY_DRIVE * s.slow[2] and s.slow[2] > SLOW_FORCE * p.noise[0]
+    s.slow_count = s.slow_count + 1 if grows else 0
+    return s.slow_count >= p.slow_time
+
+
+@kernel
 def check_motion(supervisor, drive_in_danger):
-    """Tests 3, 4 and 7: whether the motion follows from the drive; returns the cause and whether there is danger."""
+    """Tests 3, 4, 7 and 9: whether the motion follows from the drive; returns the cause and whether there is danger."""
     s = record(supervisor, SUPERVISOR_T, 0)
     p, e = s.p, s.energy
     last0, last1 = s.value[2], s.value[3]
     filter_signals(supervisor)
     s.motion = abs(s.value[0]) + p.lever * abs(s.value[1])
     danger = drive_in_danger or s.motion > p.danger_motion
-    pole, wrong, active = p.energy_pole, False, False
+    pole, wrong, active, grows = p.energy_pole, False, False, False
     for i in range(2):
         r = s.value[2 + i]
         for j in range(2):
             r -= p.mass[i, j] * s.change[j] + p.damping[i, j] * s.rate[j] + p.stiffness[i, j] * s.value[j]
+        if i == 0:
+            grows = check_growth(supervisor, r)
         change = s.value[2 + i] - (last0 if i == 0 else last1)
         e[i] += pole * (s.value[i] * s.value[i] - e[i])
         e[2 + i] += pole * (s.rate[i] * s.rate[i] - e[2 + i])
@@ -179,7 +207,7 @@ def check_motion(supervisor, drive_in_danger):
     s.motion_count = s.motion_count + 1 if s.motion > p.most_motion else 0
     if s.motion_count >= 5:
         return OVERMOTION, danger
-    if s.active_count >= p.active_time:
+    if s.active_count >= p.active_time or grows:
         return ACTIVE, danger
     return INCONSISTENT if s.inconsistent_count >= p.inconsistent_time else 0, danger
 
@@ -224,6 +252,29 @@ def check_ringing(supervisor):
 
 
 @kernel
+def cool(supervisor, drive, flags, n):
+    """Cut a sample's drive to the limit that its heat leaves, and return the next sample's limit.
+
+    The heat h is the mean of u^2; with the rms limit L and the drive limit P, u^2 <= P^2 - (P^2/L^2 - 1) h, which is
+    L^2 where h is, so that h never passes L^2.
+    """
+    s = record(supervisor, SUPERVISOR_T, 0)
+    p, most, before = s.p, 0.0, 0.0
+    for i in range(p.channels):
+        before = max(before, s.heat[i])
+    limit = math.sqrt(max(p.drive_limit * p.drive_limit - p.heat_gain * before, 0.0))
+    for i in range(p.channels):
+        value = drive[n, i]
+        if abs(value) > limit:
+            value = math.copysign(limit, value)
+            flags[n] |= SATURATED
+        drive[n, i] = value
+        s.heat[i] += p.heat_pole * (value * value - s.heat[i])
+        most = max(most, s.heat[i])
+    return math.sqrt(max(p.drive_limit * p.drive_limit - p.heat_gain * most, 0.0))
+
+
+@kernel
 def supervise(supervisor, sensed, position, drive, flags, n):
     """Run the tests on a sample, and fade its drive out once one has failed."""
     s = record(supervisor, SUPERVISOR_T, 0)
@@ -253,6 +304,10 @@ def supervise(supervisor, sensed, position, drive, flags, n):
         s.fade_step = max(s.fade_step, step)
         s.fade = max(s.fade - s.fade_step, 0.0)
         flags[n] |= STOPPED
+    if p.heat_pole > 0.0:
+        limit = cool(supervisor, drive, flags, n)
+        if p.limited != 0:  # the controller scales its whole envelope into it
+            record(p.limited, CONTROLLER_T, 0).p.drive_limit = limit
     force0 = force1 = total = 0.0
     for i in range(p.channels):
         value = s.fade * drive[n, i]

@@ -119,16 +119,12 @@ class Identified:
         values = {each.name: getattr(self.parameters, each.name) for each in fields(PlateParameters)}
         return {name: value for name, value in values.items() if name in identified or value != getattr(default, name)}
 
-    def to_toml(self) -> str:
-        """Return the profile as the [device] table of a scene, each interval as a comment."""
+    def uncertainty(self) -> dict[str, float]:
+        """Return the standard uncertainties of identified parameters, in their units, for a `DeviceProfile`."""
         gain = self.estimates["gain_difference"].interval / 2 * sensor_gains(self.parameters)[0]
-        intervals = {name: (each.interval, UNITS[name]) for name, each in self.estimates.items()}
-        intervals |= {"sensor_gain_1": (gain, ""), "sensor_gain_2": (gain, "")}
-        lines = ["# identified on the free plate; +- is the 95 % interval", "[device]", 'kind = "vt-plate"']
-        for name, value in self.profile().items():
-            half, unit = intervals.get(name, (None, ""))
-            lines.append(f"{name} = {value!r}" + ("" if half is None else f"  # +- {half:.2g} {unit}".rstrip()))
-        return "\n".join(lines) + "\n"
+        intervals = {name: each.interval for name, each in self.estimates.items() if name != "gain_difference"}
+        intervals |= {"sensor_gain_1": gain, "sensor_gain_2": gain}
+        return {name: interval / SIGMAS_95 for name, interval in intervals.items()}
 
     def text(self) -> str:
         """Return every estimate with its interval, and how much the model explains of the measurement."""

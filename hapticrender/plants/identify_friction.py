@@ -46,10 +46,9 @@ class IdentifiedDevice(NamedTuple):
         """Return the identified parameters for `Scene.profile`."""
         return {name: each.value for name, each in self.estimates.items()}
 
-    def to_toml(self) -> str:
-        """Return the profile as the [device] table of a scene, each interval as a comment."""
-        rows = [f"{name} = {each.value!r}  # +- {each.interval:.2g}" for name, each in self.estimates.items()]
-        return "\n".join(["# +- is the 95 % interval", "[device]", f'kind = "{self.kind}"', *rows]) + "\n"
+    def uncertainty(self) -> dict[str, float]:
+        """Return the standard uncertainties of the parameters, in their units, for a `DeviceProfile`."""
+        return {name: each.interval / SIGMAS_95 for name, each in self.estimates.items()}
 
     def text(self) -> str:
         """Return every estimate with its interval, and what the model leaves of the measurement."""

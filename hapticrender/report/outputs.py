@@ -16,6 +16,7 @@ from hapticrender.recordings.formats import MissingExtra, write_sound
 from hapticrender.recordings.journal import read_journal
 from hapticrender.recordings.recording import Recording
 from hapticrender.report import picture
+from hapticrender.touch.scene import Scene
 
 JOURNAL = "recording.au"
 FILES = ("scene.toml", JOURNAL, "drive.wav", "sensed.wav", "picture.png", "summary.json")
@@ -77,14 +78,14 @@ def run_into(folder: Path, rendering: Rendering, *, progress: Callable[[float, f
 
     Files of an earlier run are removed first, so that all files are of this run, also after an interruption.
     """
-    return write_outputs(folder, run(rendering, journal=begin_outputs(folder, rendering), progress=progress))
+    return write_outputs(folder, run(rendering, journal=begin_outputs(folder, rendering.scene), progress=progress))
 
 
-def begin_outputs(folder: Path, rendering: Rendering) -> Path:
+def begin_outputs(folder: Path, scene: Scene) -> Path:
     """Make `folder`, remove the files of an earlier run, write the scene, and return the path of the journal."""
     folder.mkdir(parents=True, exist_ok=True)
     _remove_files(folder)
-    (folder / "scene.toml").write_text(rendering.scene.to_toml(), encoding="utf-8")
+    (folder / "scene.toml").write_text(scene.to_toml(), encoding="utf-8")
     return folder / JOURNAL
 
 

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import os
-import stat
-import tomllib
 from collections import Counter
 from collections.abc import Iterable, Mapping
 from dataclasses import MISSING, dataclass, field, fields
@@ -22,6 +20,7 @@ from hapticrender.protocols import Texture
 from hapticrender.touch import toml
 from hapticrender.touch.composed import Chirp, Playlist, Sum
 from hapticrender.touch.custom import Custom
+from hapticrender.touch.device_profile import ENDING, DeviceProfile, table_of
 from hapticrender.touch.finger import Finger
 from hapticrender.touch.grating import Grating
 from hapticrender.touch.mechanics import NAMED
@@ -34,10 +33,16 @@ TEXTURES: dict[str, type[Any]] = {
 MOTIONS: dict[str, type[Any]] = {
     kind.kind: kind for kind in (Nowhere, Still, TriangleMotion, SineMotion, Sampled, RecordedMotion, Custom)
 }
-LARGEST_FILE = 1 << 26  # bytes of TOML
-TABLES = {"profile": "device", "simulation": "simulation", "rendering": "render"}  # field of a scene: table of a file
+TABLES = {  # field of a scene: table of a file
+    "profile": "device",
+    "limits": "limits",
+    "calibration": "calibration",
+    "simulation": "simulation",
+    "rendering": "render",
+}
 OWN = {  # keys of these tables that are fields of a scene: table, key, field
     ("device", "kind"): "device",
+    ("device", "source"): "source",
     ("simulation", "seed"): "seed",
     **{("render", key): key for key in ("method", "tolerance", "settle", "keep_unfelt", "gradient")},
 }
@@ -70,8 +75,10 @@ def _table() -> Any:
 class Scene(Validated):
     """Everything that a rendering depends on, in SI; frozen, compared by value, TOML in and out.
 
-    In TOML, ``[device]`` holds `device` (as ``kind``) and `profile`, ``[simulation]`` holds `simulation` and `seed`,
-    ``[render]`` holds `rendering`, `method`, `tolerance`, `settle`, `keep_unfelt` and `gradient`.
+    In TOML, ``[device]`` holds `device` (as ``kind``), `profile` and `source`, ``[limits]`` and ``[calibration]`` hold
+    `limits` and `calibration`, ``[simulation]`` holds `simulation` and `seed`, ``[render]`` holds `rendering`,
+    `method`, `tolerance`, `settle`, `keep_unfelt` and `gradient`.  ``device = "plate.toml"``, or beside parameters
+    ``[device] profile = "plate.toml"``, names the file of a `DeviceProfile`, seen from the scene's folder.
 
     Parameters
     ----------
@@ -81,10 +88,15 @@ class Scene(Validated):
     finger : Finger
         Default: none; a texture that is read at the finger's position needs one.
     device : str
-        Kind of device: name of a renderer.
+        Kind of device: name of a renderer; or the file (.toml) of a `DeviceProfile`, which is read at once: the scene
+        then has its kind, parameters, limits and calibration, those given here before those of the file.
     profile, simulation : mapping of str to number, str or bool
         Parameters of the device for which the controller is designed, where they differ from the kind's defaults; of
         the simulated device, where they differ from the profile, and how finely it is modelled.
+    limits, calibration : mapping of str to number
+        Entries of `hapticrender.touch.device_profile.Limits` and `Calibration`.
+    source : str
+        Which profile the parameters are from, by whom and when; named where a run contradicts it.
     rendering : mapping of str to number, str or bool
         Settings of the renderer, such as ``velocity_per_force`` or ``crossover``.
     duration : float, s
@@ -118,6 +130,9 @@ class Scene(Validated):
     finger: Finger = field(default_factory=Finger.absent)
     device: str = checked(checks.word, "vt-plate")
     profile: Mapping[str, Value] = _table()
+    limits: Mapping[str, Value] = _table()
+    calibration: Mapping[str, Value] = _table()
+    source: str = checked(checks.text, "")
     simulation: Mapping[str, Value] = _table()
     rendering: Mapping[str, Value] = _table()
     duration: float = parameter(unit="s", above=0, most=LONGEST_TIME)
@@ -130,12 +145,28 @@ class Scene(Validated):
     name: str = checked(checks.word, "scene")
 
     def __post_init__(self) -> None:
+        if str(self.device).endswith(ENDING):
+            self._take_profile(DeviceProfile.load(self.device))
         super().__post_init__()
+        self.device_profile  # noqa: B018 (it refuses what is no limit, and no calibration)
         bound = "a texture with bands(rate) and waveform(time, position)"
         checks.require(isinstance(self.texture, Texture), "texture", self.texture, bound, TypeError)
         checks.require(isinstance(self.finger, Finger), "finger", self.finger, "a Finger", TypeError)
         if isinstance(self.finger.motion, Nowhere) and getattr(self.texture, "spatial", False):
             raise ValueError("finger.motion = 'none': a texture over position needs a finger")
+
+    def _take_profile(self, found: DeviceProfile) -> None:
+        """Fill in what a profile says and the scene does not."""
+        tables = {"profile": found.device, "limits": table_of(found.limits), "calibration": table_of(found.calibration)}
+        merged = {name: {**table, **_read_table(name, getattr(self, name))} for name, table in tables.items()}
+        checks.keep(self, device=found.kind, source=self.source or str(found), **merged)
+
+    @property
+    def device_profile(self) -> DeviceProfile:
+        """What the scene says of its device; a ValueError where a limit or a calibration is none."""
+        name = self.source or self.device
+        tables: dict[str, Any] = {"device": self.profile, "limits": self.limits, "calibration": self.calibration}
+        return DeviceProfile(kind=self.device, name=name, **tables)
 
     @classmethod
     def from_toml(cls, path: str | os.PathLike[str]) -> Scene:
@@ -146,17 +177,11 @@ class Scene(Validated):
         SceneError
             In one line: file, key, value, bound and unit.
         """
-        where = " ".join(str(path).split())
         try:
-            found = Path(path).stat()
-            usable = stat.S_ISREG(found.st_mode) and found.st_size <= LARGEST_FILE
-            text = Path(path).read_bytes().decode("utf-8") if usable else ""
-        except UnicodeDecodeError as problem:
-            raise SceneError(f"{where}: byte {problem.start}: must be UTF-8 text") from problem
-        except (OSError, ValueError) as problem:
-            raise SceneError(f"{where}: must be a readable file ({_reason(problem)})") from problem
-        if not usable:
-            raise SceneError(f"{where}: must be a regular file of at most {LARGEST_FILE} bytes")
+            text = toml.read_text(path)
+        except ValueError as problem:
+            raise SceneError(str(problem)) from problem
+        where = " ".join(str(path).split())
         return cls.from_toml_text(text, where, folder=Path(path).parent, name=Path(path).stem)
 
     @classmethod
@@ -165,9 +190,9 @@ class Scene(Validated):
     ) -> Scene:
         """Read a scene from TOML; `where` begins every message, `folder` holds the files, `name` is the default."""
         try:
-            table = tomllib.loads(text)
-        except (ValueError, RecursionError) as problem:
-            raise SceneError(f"{where}: must be TOML ({_reason(problem)})") from problem
+            table = toml.loads(text, where)
+        except ValueError as problem:
+            raise SceneError(str(problem)) from problem
         try:
             scene = _read_scene(table, Path(folder), name)
             for key, part in (("texture", scene.texture), ("finger", scene.finger.motion)):
@@ -185,6 +210,9 @@ class Scene(Validated):
             tables[table][key] = getattr(self, own)
         for own, table in TABLES.items():
             tables[table] |= getattr(self, own)
+        if not self.source:
+            del tables["device"]["source"]
+        tables = {table: values for table, values in tables.items() if values}
         parts = {"texture": _write_texture(self.texture), "finger": _write_finger(self.finger)}
         return toml.dumps({"name": self.name, "duration": self.duration} | parts | tables)
 
@@ -206,12 +234,8 @@ def distinct_names(names: Iterable[str]) -> list[str]:
     return names
 
 
-def _reason(problem: Exception) -> str:
-    """Return the first words of another library's message, in one line."""
-    return " ".join(str(getattr(problem, "strerror", None) or problem).split())[:200]
-
-
 def _read_scene(table: dict[str, Any], folder: Path, name: str) -> Scene:
+    table = _with_profile(table, folder)
     _check_keys(table)
     values: dict[str, Any] = {"duration": table.get("duration"), "name": table.get("name", _usable(name))}
     for own, where in TABLES.items():
@@ -221,6 +245,22 @@ def _read_scene(table: dict[str, Any], folder: Path, name: str) -> Scene:
     texture = _read_kind(table.get("texture"), "texture", "kind", TEXTURES, folder)
     finger = _read_finger(table["finger"], folder) if "finger" in table else Finger.absent()
     return Scene(texture=texture, finger=finger, **values)
+
+
+def _with_profile(table: dict[str, Any], folder: Path) -> dict[str, Any]:
+    """Take the file of a profile, at the top level or in [device], as the kind of device."""
+    device, key = table.get("device"), "device"
+    if isinstance(device, dict) and "profile" in device:
+        key, file = "device.profile", device["profile"]
+        rest = {each: value for each, value in device.items() if each != "profile"}
+        checks.require("kind" not in rest, "device.kind", rest.get("kind"), "left out beside profile, which has one")
+    elif isinstance(device, str) and device.endswith(ENDING):
+        file, rest = device, {}
+    else:
+        return table
+    bound = f"the name of a file that ends in {ENDING}"
+    checks.require(isinstance(file, str) and file.endswith(ENDING) and file.isprintable(), key, file, bound)
+    return {**table, "device": {"kind": str(folder / file), **rest}}
 
 
 def _check_keys(table: dict[str, Any]) -> None:

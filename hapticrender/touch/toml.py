@@ -1,17 +1,57 @@
-"""Writes the TOML that a scene needs (the standard library only reads it)."""
+"""Reads and writes the TOML of scenes and profiles (the standard library only reads it)."""
 
 from __future__ import annotations
 
 import json
+import os
 import re
+import stat
+import tomllib
 from collections.abc import Mapping
+from datetime import date
+from pathlib import Path
 from typing import Any
 
+LARGEST_FILE = 1 << 26  # bytes of TOML
 _BARE = re.compile(r"[A-Za-z0-9_-]+")
 
 
+def read_text(path: str | os.PathLike[str]) -> str:
+    """Text of a file; a ValueError where it is no regular file of UTF-8 text, or too large."""
+    where = " ".join(str(path).split())
+    try:
+        found = Path(path).stat()
+        usable = stat.S_ISREG(found.st_mode) and found.st_size <= LARGEST_FILE
+        text = Path(path).read_bytes().decode("utf-8") if usable else ""
+    except UnicodeDecodeError as problem:
+        raise ValueError(f"{where}: byte {problem.start}: must be UTF-8 text") from problem
+    except (OSError, ValueError) as problem:
+        raise ValueError(f"{where}: must be a readable file ({reason(problem)})") from problem
+    if not usable:
+        raise ValueError(f"{where}: must be a regular file of at most {LARGEST_FILE} bytes")
+    return text
+
+
+def loads(text: str, where: str) -> dict[str, Any]:
+    """Tables of a TOML text; a ValueError that begins with `where`, in one line."""
+    try:
+        return tomllib.loads(text)
+    except (ValueError, RecursionError) as problem:
+        raise ValueError(f"{where}: must be TOML ({reason(problem)})") from problem
+
+
+def read(path: str | os.PathLike[str]) -> dict[str, Any]:
+    """Tables of a TOML file; a ValueError that names it."""
+    return loads(read_text(path), " ".join(str(path).split()))
+
+
+def reason(problem: Exception) -> str:
+    """Return the first words of another library's message, in one line."""
+    return " ".join(str(getattr(problem, "strerror", None) or problem).split())[:200]
+
+
 def dumps(table: Mapping[str, Any]) -> str:
-    """TOML text of nested tables, lists, strings, numbers and booleans; floats survive to the last bit.
+    """TOML text of nested tables, lists, strings, dates, numbers and booleans; floats survive to the last bit.
 
     >>> print(dumps({"name": "a", "texture": {"amplitude": 1e-05}}))
     name = "a"
@@ -41,6 +81,8 @@ def _value(value: Any) -> str:
         return "true" if value else "false"
     if isinstance(value, str):
         return _text(value)
+    if isinstance(value, date):
+        return value.isoformat()
     if isinstance(value, int | float):
         return repr(value)
     if isinstance(value, list | tuple):

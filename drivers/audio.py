@@ -1,0 +1,356 @@
+"""A sound card: its outputs drive the device, its inputs sense it; block by block, or by a compiled callback.
+
+It needs DC-coupled outputs and inputs where the sag under a finger is to be corrected, an amplifier, and three numbers
+of the set-up: the drive and the displacement at full scale, and the delay of the loop, which
+``hapticrender latency --driver audio:NAME`` measures through a cable.
+"""
+
+from __future__ import annotations
+
+import atexit
+import time
+from typing import Any
+
+import numpy as np
+
+from hapticrender.drivers.audio_callback import AHEAD, BlockQueue, Relay
+from hapticrender.drivers.base import BaseDriver
+from hapticrender.drivers.portaudio import Card, Stream, cards, find
+from hapticrender.errors import DeviceLost, DeviceNotFound, DeviceTimeout, DriverError
+from hapticrender.protocols import Array, Flag, Sensed
+
+PATIENCE = 2.0  # s: longest wait for a block
+LONGEST = 10.0  # s: delay that no set-up has
+OVERRUN, SATURATED = int(Flag.OVERRUN), int(Flag.SATURATED)
+FULL_SCALE = 3.0  # A: drive at full scale, as in the sound files of `WaveFileDriver`, unless it is given
+Channels = tuple[int, ...]
+
+
+class AudioDriver(BaseDriver):
+    """Plays on a sound card through PortAudio: `play` block by block, or `start` with a compiled controller.
+
+    `play` serves `hapticrender.render` and identification.  Python computes its blocks, so it adds `queued` samples to
+    the delay; a driver made by `live` does not.  Where the card or Python has lost samples the block has
+    `Flag.OVERRUN`, `overruns` counts, and the delay stays the same.  The stream runs from `open` to `close`; while
+    nothing is played, the outputs are zero.
+
+    Parameters
+    ----------
+    device : int, str or (input, output), optional
+        Card by its index or by words of its name and host ("0", "scarlett", "usb alsa"), as ``hapticrender devices``
+        lists them; the system's default unless given.
+    channels : tuple of int, >= 1
+        Outputs that carry the drive, in the order of the drive's columns.
+    sensed_channels : tuple of int, >= 1, optional
+        Inputs that sense, in the order of the sensors.  Unless given: (1, 2) where `delay` and `sensed_per_full_scale`
+        are known, otherwise none: the device is driven open loop.
+    rate : float, Hz
+    block : int, samples
+        Frames a callback.
+    latency : "low", "high", float or (float, float)
+        What PortAudio is asked for: the card's own low or high latency, or seconds (input, output).
+    drive_per_full_scale : float, A, > 0
+        Drive at which an output is at full scale (V for a device driven by a voltage); 3 unless given.
+    sensed_per_full_scale : float, m, > 0, optional
+        Displacement at which an input is at full scale.
+    delay : float, samples, >= block, optional
+        Of the card with its buffers, as ``hapticrender latency`` measures it with this rate, block and latency.
+
+    Raises
+    ------
+    ValueError
+        A channel, a scale or the delay is out of its bound.
+    """
+
+    def __init__(
+        self,
+        device: int | str | tuple[int | str, int | str] | None = None,
+        channels: Channels = (1, 2),
+        sensed_channels: Channels | None = None,
+        *,
+        rate: float = 48000.0,
+        block: int = 64,
+        latency: Any = "low",
+        drive_per_full_scale: float = FULL_SCALE,
+        sensed_per_full_scale: float | None = None,
+        delay: float | None = None,
+    ) -> None:
+        if sensed_channels is None:
+            sensed_channels = () if delay is None or sensed_per_full_scale is None else (1, 2)
+        self.device, self.latency = device, latency
+        self.channels, self.inputs = _channels("channels", channels), _channels("sensed_channels", sensed_channels)
+        if not self.channels:
+            raise ValueError("channels=(): must name at least one output, such as (1, 2)")
+        scales = {"drive_per_full_scale": drive_per_full_scale, "sensed_per_full_scale": sensed_per_full_scale}
+        for name, value in scales.items():
+            if value is not None and not 0 < value < np.inf:
+                raise ValueError(f"{name}={value!r}: must be finite and > 0")
+        if delay is not None and not block <= delay <= LONGEST * rate:
+            raise ValueError(f"{delay=} samples: must be >= block = {block} and <= {LONGEST:g} s")
+        self.drive_per_full_scale, self.sensed_per_full_scale = drive_per_full_scale, sensed_per_full_scale
+        self._card_delay, self._unknown = delay, ""
+        self._stream: Stream | None = None
+        self._lost = self._number = 0
+        super().__init__(
+            rate=rate,
+            drive_channels=len(self.channels),
+            sensed_channels=len(self.inputs),
+            block=block,
+            delay=(1 + AHEAD) * block + (block if delay is None else int(np.floor(delay + 0.5))),
+        )
+        if self.inputs and (delay is None or sensed_per_full_scale is None):
+            self._unknown = "delay" if delay is None else "sensed_per_full_scale (m)"
+
+    @property
+    def delay(self) -> int:
+        """Samples from sensing to the drive computed from it, of the card and what `play` adds.
+
+        A DriverError where it is unknown, or what the inputs' full scale is.
+        """
+        if self._unknown:
+            raise DriverError(
+                f"{self}: {self._unknown} is unknown, so the loop cannot be closed: connect output {self.channels[0]} "
+                f"to input {self.inputs[0]}, measure with `hapticrender latency --driver {self} --out profile.toml`, "
+                "give sensed_per_full_scale too, or leave out sensed_channels to drive open loop"
+            )
+        return self._samples
+
+    @delay.setter
+    def delay(self, samples: int) -> None:
+        self._samples = samples
+
+    @property
+    def sensed_scale(self) -> float:
+        """Displacement (m) at full scale of an input, for ``RealtimeEntry``; 1 where nothing is sensed."""
+        return self.sensed_per_full_scale or 1.0
+
+    @property
+    def drive_scale(self) -> float:
+        """Full scales of an output per A, for ``RealtimeEntry``."""
+        return 1.0 / self.drive_per_full_scale
+
+    @property
+    def queued(self) -> int:
+        """Samples that `play` adds to the card's own delay: the block that Python computes, and those that wait."""
+        return (1 + AHEAD) * self.block
+
+    def live(self) -> LiveAudioDriver:
+        """Make the same driver for a compiled controller, with a shorter delay."""
+        return self._like(LiveAudioDriver)  # type: ignore[return-value]
+
+    def loop_back(self) -> AudioDriver:
+        """Make a driver of the first output and the first input (1 unless given), both in full scales."""
+        own = {"drive_per_full_scale": 1.0, "sensed_per_full_scale": 1.0, "delay": float(self.block)}
+        return self._like(AudioDriver, channels=self.channels[:1], sensed_channels=(self.inputs or (1,))[:1], **own)
+
+    def _like(self, kind: type[AudioDriver], **changes: Any) -> AudioDriver:
+        names = ("device", "channels", "rate", "block", "latency", "drive_per_full_scale", "sensed_per_full_scale")
+        values = {name: getattr(self, name) for name in names}
+        values |= {"sensed_channels": self.inputs, "delay": self._card_delay}
+        return kind(**values | changes)
+
+    @staticmethod
+    def found() -> list[str]:
+        """Sound cards that are there now: the driver's argument, and what the card can do."""
+        return [f"{each.index}  {each.name}: {each.about}" for each in cards()]
+
+    def _open(self) -> None:
+        """Open the card and start its stream, which plays zeros."""
+        chosen = [find(_index(each)) for each in self._sides()]
+        output, inputs = self._side(chosen[0], self.channels, 1), self._side(chosen[1], self.inputs, 0)
+        self._relay = Relay(*(tuple(n - 1 for n in each) for each in (self.inputs, self.channels)), self.block)
+        self._queue = BlockQueue(self.block, self.sensed_channels, self.drive_channels)
+        self._queue_address, _ = self._queue.address, self._queue.blocks  # compiled before the stream starts
+        addresses = self._relay.address, self._relay.user_data
+        self._stream = Stream(str(self), output, inputs, self.rate, self.block, *addresses)
+        atexit.register(self.close)  # the callback must not outlive the memory that it works in
+        try:
+            self._stream.start()
+            self._settle()
+        except BaseException:
+            self.close()
+            raise
+
+    def _sides(self) -> tuple[Any, Any]:
+        """Devices of output and input."""
+        return self.device[::-1] if isinstance(self.device, tuple) else (self.device, self.device)
+
+    def _side(self, card: Card, channels: Channels, output: int) -> tuple[int, int, float] | None:
+        """What a side of the stream asks of its card; None where no channel of it is used."""
+        if not channels:
+            return None
+        present, kind = (card.outputs, "outputs") if output else (card.inputs, "inputs")
+        if max(channels) > present:
+            raise DeviceNotFound(f"{self}: {kind} {channels}: {card} has {present} {kind}")
+        asked = self.latency if isinstance(self.latency, str | int | float) else self.latency[output]
+        own = card.output_latency if output else card.input_latency
+        seconds = {"low": own[0], "high": own[1]}.get(asked, asked) if isinstance(asked, str) else asked
+        if not isinstance(seconds, int | float):
+            raise ValueError(f"latency={self.latency!r}: must be 'low', 'high' or seconds, or a pair of them")
+        return card.index, max(channels), float(seconds)
+
+    def _settle(self) -> None:
+        """Wait until the card has called back twice more, or has ended."""
+        enough, end = self._relay.count("calls") + 2, time.monotonic() + PATIENCE
+        while self.active and self._relay.count("calls") < enough and time.monotonic() < end:
+            time.sleep(self.block / self.rate)
+
+    def check(self) -> None:
+        """Raise a `DeviceLost` where the card does not call back any more."""
+        if self._state == "open" and not self.active:
+            played = self._relay.count("blocks") * self.block
+            raise DeviceLost(f"{self}: the card stopped after {played} samples: is it still connected?")
+
+    def _play(self, drive: Array) -> Sensed:
+        number, queue = self._number, self._queue
+        if not queue.put(number + AHEAD, drive * self.drive_scale):
+            number = queue.blocks  # what was missed is lost; go on with the next one
+        if self._relay.count("function") == 0:
+            self._relay.call(self._queue_address, queue.user_data)
+        self._wait_for(number)
+        sensed, flags = queue.take(number)
+        flags |= OVERRUN if number > self._number else 0
+        self._lost += flags != 0
+        self._number = number + 1
+        raised = np.where(np.any(abs(drive) > self.drive_per_full_scale, axis=1), SATURATED, 0) | flags
+        return Sensed(sensed * self.sensed_scale, flags=raised)
+
+    def _wait_for(self, number: int) -> None:
+        """Wait until the callback has sensed block `number`."""
+        end = time.monotonic() + PATIENCE
+        while self._queue.blocks <= number:
+            self.check()
+            if time.monotonic() > end:
+                raise DeviceTimeout(f"{self}: play: no block of {self.block} samples came within {PATIENCE:g} s")
+            time.sleep(0.2 * self.block / self.rate)
+
+    def close(self) -> None:
+        """Play zeros, end the stream and release the card; a second call does nothing."""
+        self._state, stream = "closed", self._stream
+        if stream is None:
+            return
+        try:
+            self._relay.rest()
+            self._settle()
+        finally:
+            self._stream = None
+            stream.close()
+            atexit.unregister(self.close)
+
+    @property
+    def active(self) -> bool:
+        """Whether the card calls back."""
+        return self._stream is not None and self._stream.active
+
+    @property
+    def overruns(self) -> int:
+        """Blocks of `play` that lost samples, because the card did, or because Python was late."""
+        return self._lost
+
+    @property
+    def clipped(self) -> int:
+        """Samples of drive that were cut to full scale."""
+        return 0 if self._state == "new" else self._relay.count("clipped")
+
+    @property
+    def load(self) -> float:
+        """Time in the callback over the time of a block, averaged by PortAudio."""
+        return 0.0 if self._stream is None else self._stream.load
+
+    def __str__(self) -> str:
+        return f"audio:{'' if self.device is None else self.device}"
+
+
+class LiveAudioDriver(AudioDriver):
+    """A sound card that calls a compiled controller back: between `start` and `stop` nothing waits for Python.
+
+    `delay` is the card's own, for which the controller is designed.  While none runs `play` can be used, for a probe;
+    its delay is longer by `queued`.
+    """
+
+    _entry: Any = None
+    _before = 0  # overruns until `start`
+
+    @property
+    def delay(self) -> int:
+        """Samples from sensing to the drive computed from it; a DriverError where it is unknown."""
+        return super().delay - self.queued
+
+    @delay.setter
+    def delay(self, samples: int) -> None:
+        self._samples = samples
+
+    def start(self, entry: Any) -> None:
+        """Let the card call a compiled controller back until `stop`.
+
+        Parameters
+        ----------
+        entry : hapticrender.realtime.RealtimeEntry
+            Of this driver's `block`, channels, `sensed_scale` and `drive_scale`; it has to outlive `stop`.
+
+        Raises
+        ------
+        ValueError
+            The entry has another block or other channels.
+        DriverError
+            The driver is not open, or runs already.
+        """
+        if self._state != "open" or self._entry is not None:
+            raise DriverError(f"{self}: start: it is {self._state if self._state != 'open' else 'running already'}")
+        own = self.block, self.sensed_channels, self.drive_channels
+        theirs = entry.block, entry.controller.sensors, entry.controller.channels
+        if own != theirs:
+            raise ValueError(f"entry: (block, sensors, drive channels) is {theirs}: must be the driver's, {own}")
+        address = entry.address  # compiled here
+        self._relay.rest()
+        self._settle()
+        self.check()
+        self._entry = entry
+        self._before = self._relay.count("overruns")
+        self._relay.call(address, entry.user_data)
+
+    def _play(self, drive: Array) -> Sensed:
+        if self._entry is not None:
+            raise DriverError(f"{self}: play: it runs a controller; stop it first")
+        return super()._play(drive)
+
+    def stop(self) -> None:
+        """Play zeros from the next block on, and wait until they are played; nothing where it does not run."""
+        entry, self._entry = self._entry, None
+        if entry is not None:
+            self._relay.rest()
+            entry.silence()
+            self._settle()
+
+    def close(self) -> None:
+        """Stop, end the stream and release the card; a second call does nothing."""
+        try:
+            self.stop()
+        finally:
+            super().close()
+
+    @property
+    def last_sensed(self) -> Array:
+        """Samples that the last call of the entry got, float32 of shape (block, sensed_channels), full scale 1."""
+        return self._relay.sensed
+
+    @property
+    def overruns(self) -> int:
+        """Blocks before which the card lost samples since `start`."""
+        return self._relay.count("overruns") - self._before if self._state != "new" else 0
+
+
+def _index(device: Any) -> Any:
+    """Index or words of a card; a string of digits is an index."""
+    text = str(device).strip()
+    return (int(text) if text.isdigit() else text or None) if isinstance(device, str) else device
+
+
+def _channels(name: str, given: Any) -> Channels:
+    """Check channel numbers as they are printed on the card, from 1 on."""
+    channels = tuple(given)
+    if any(not isinstance(each, int | np.integer) or each < 1 for each in channels) or len(set(channels)) < len(
+        channels
+    ):
+        raise ValueError(f"{name}={given!r}: must be different whole numbers >= 1")
+    return tuple(int(each) for each in channels)

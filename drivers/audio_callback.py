@@ -1,0 +1,238 @@
+"""The compiled callback of a sound card: it holds no lock, allocates nothing and never waits.
+
+`_relay` is what PortAudio calls.  It gathers the chosen input channels, calls another function with PortAudio's
+signature, cuts what that returns to full scale and scatters it over the chosen output channels; all others get zeros,
+and so do these while there is no function.  It is that of a ``RealtimeEntry``, or `_queue`, which exchanges numbered
+blocks with Python.
+"""
+
+from __future__ import annotations
+
+import sys
+from typing import Any
+
+import numba
+import numpy as np
+from llvmlite import ir
+from numba import carray, types
+from numba.extending import intrinsic
+
+from hapticrender.jit import I8, CFunction, call, entry, kernel, pointer, record
+from hapticrender.protocols import Array, Flag
+
+SLOTS = 8  # blocks that wait in either direction
+AHEAD = 2  # blocks of drive that wait to be played while Python computes the next one
+CONTINUE = 0  # result of PortAudio's callback
+LOST = 0b1111  # PortAudio's status: input or output under- or overflow
+OVERRUN = int(Flag.OVERRUN)
+UNSIGNED_LONG = types.uint32 if sys.platform == "win32" else types.uint64
+F4 = types.float32
+CALLBACK = types.int32(I8, I8, UNSIGNED_LONG, I8, UNSIGNED_LONG, I8)
+
+RELAY = np.dtype(
+    [
+        *((name, np.int64) for name in ("function", "argument", "block", "sensors", "channels", "wide_in", "wide_out")),
+        *((name, np.int64) for name in ("inputs_at", "outputs_at", "sensed_at", "drive_at")),
+        *((name, np.int64) for name in ("calls", "blocks", "overruns", "clipped", "odd")),
+    ]
+)
+RELAY_T = numba.from_dtype(RELAY)
+QUEUE = np.dtype(
+    [(name, np.int64) for name in ("blocks", "first", "sensors", "channels", "sensed_at", "drive_at", "number_at")]
+    + [("flags_at", np.int64)]
+)
+QUEUE_T = numba.from_dtype(QUEUE)
+FUNCTION_AT = RELAY.fields["function"][1] if RELAY.fields else 0
+BLOCKS_AT = QUEUE.fields["blocks"][1] if QUEUE.fields else 0
+
+
+@intrinsic
+def fetch_add(typingctx: Any, address: Any, value: Any) -> Any:
+    """Add to the int64 at an address and return what was there, in one indivisible step that orders memory."""
+
+    def build(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+        place = builder.inttoptr(values[0], ir.PointerType(ir.IntType(64)))
+        return builder.atomic_rmw("add", place, values[1], "acq_rel")
+
+    return types.int64(types.int64, types.int64), build
+
+
+@entry
+def counted(address, value):
+    """Add to a counter that two threads share; returns what it was."""
+    return fetch_add(address, value)
+
+
+@kernel
+def within(value):
+    """Sample cut to full scale; 0 where it is not a number."""
+    if value != value:
+        return np.float32(0.0)
+    return min(max(value, np.float32(-1.0)), np.float32(1.0))
+
+
+@kernel
+def gather(relay, given, count):
+    """Copy the chosen input channels; without an input they stay 0."""
+    r = record(relay, RELAY_T, 0)
+    columns, sensed = carray(pointer(r.inputs_at, I8), r.sensors), carray(pointer(r.sensed_at, F4), count * r.sensors)
+    source = carray(pointer(given, F4), count * r.wide_in if given != 0 else 0)
+    if given != 0:
+        for n in range(count):
+            for i in range(r.sensors):
+                sensed[n * r.sensors + i] = source[n * r.wide_in + columns[i]]
+
+
+@kernel
+def scatter(relay, played, count):
+    """Copy the drive to the chosen output channels, cut to full scale."""
+    r = record(relay, RELAY_T, 0)
+    columns, drive = carray(pointer(r.outputs_at, I8), r.channels), carray(pointer(r.drive_at, F4), count * r.channels)
+    out = carray(pointer(played, F4), count * r.wide_out)
+    for n in range(count):
+        for i in range(r.channels):
+            value = drive[n * r.channels + i]
+            held = within(value)
+            r.clipped += held != value
+            out[n * r.wide_out + columns[i]] = held
+
+
+def _relay(given, played, frames, time, status, relay):
+    """PortAudio's callback: the chosen channels in, the other function, the chosen channels out."""
+    r, count = record(relay, RELAY_T, 0), int(frames)
+    out = carray(pointer(played, F4), count * r.wide_out)
+    out[:] = np.float32(0.0)
+    r.calls += 1
+    function = fetch_add(relay + FUNCTION_AT, 0)
+    if count != r.block:
+        r.odd += 1
+    elif function != 0:
+        r.overruns += (status & LOST) != 0
+        gather(relay, given, count)
+        call(function, (r.sensed_at, r.drive_at, frames, time, status, r.argument))
+        scatter(relay, played, count)
+        r.blocks += 1
+    return CONTINUE
+
+
+def _queue(sensed, drive, frames, time, status, address):
+    """Exchange block number n with Python: keep what was sensed, play what was left for it, zeros where it is late."""
+    q, count = record(address, QUEUE_T, 0), int(frames)
+    number = q.blocks
+    slot = number % SLOTS
+    given, kept = carray(pointer(sensed, F4), count * q.sensors), count * q.sensors
+    place = carray(pointer(q.sensed_at + 4 * slot * kept, F4), kept)
+    for i in range(kept):
+        place[i] = given[i]
+    width = count * q.channels
+    source, out = carray(pointer(q.drive_at + 4 * slot * width, F4), width), carray(pointer(drive, F4), width)
+    ready = fetch_add(q.number_at + 8 * slot, 0) == number
+    for i in range(width):
+        out[i] = source[i] if ready else np.float32(0.0)
+    flags = carray(pointer(q.flags_at, I8), SLOTS)
+    flags[slot] = OVERRUN if status & LOST or (not ready and number >= q.first) else 0
+    fetch_add(address + BLOCKS_AT, 1)
+    return CONTINUE
+
+
+RELAY_FUNCTION = CFunction(_relay, CALLBACK)
+QUEUE_FUNCTION = CFunction(_queue, CALLBACK)
+
+
+class Relay:
+    """What `relay` reads and writes: channels, the function that it calls, and counts.
+
+    Parameters
+    ----------
+    inputs, outputs : tuple of int, >= 0
+        Columns of the stream's input and output that are used, in the order of sensors and drive channels.
+    block : int, samples
+    """
+
+    def __init__(self, inputs: tuple[int, ...], outputs: tuple[int, ...], block: int) -> None:
+        self.wide_in, self.wide_out = (max(columns, default=-1) + 1 for columns in (inputs, outputs))
+        self._arrays = {
+            "inputs": np.array([*inputs, 0], np.int64),  # an array of length 0 may have no address
+            "outputs": np.array(outputs, np.int64),
+            "sensed": np.zeros((block, max(len(inputs), 1)), np.float32),
+            "drive": np.zeros((block, len(outputs)), np.float32),
+        }
+        self._record = np.zeros(1, RELAY)
+        values = {"block": block, "sensors": len(inputs), "channels": len(outputs)}
+        values |= {"wide_in": self.wide_in, "wide_out": self.wide_out}
+        for name, value in values.items():
+            self._record[name] = value
+        for name, array in self._arrays.items():
+            self._record[f"{name}_at"] = array.ctypes.data
+        self.user_data = int(self._record.ctypes.data)
+
+    @property
+    def address(self) -> int:
+        """Address of the callback for PortAudio; compiled when it is first read."""
+        return RELAY_FUNCTION.address
+
+    def call(self, function: int, argument: int) -> None:
+        """Set the function that fills every block from now on, where there was none."""
+        self._record["argument"] = argument
+        counted(self.user_data + FUNCTION_AT, function - self.count("function"))
+
+    def rest(self) -> None:
+        """Play zeros from the next call on; the function may still be in its last one."""
+        counted(self.user_data + FUNCTION_AT, -self.count("function"))
+
+    @property
+    def sensed(self) -> Array:
+        """Samples of the last block as the function got them, float32 of shape (block, sensors), full scale 1."""
+        return self._arrays["sensed"][:, : int(self._record["sensors"][0])].copy()
+
+    def count(self, name: str) -> int:
+        """Calls (`calls`; `odd`: not of a block), `blocks` filled, `overruns` before them, samples cut (`clipped`)."""
+        return int(self._record[name][0])
+
+
+class BlockQueue:
+    """Numbered blocks between Python and the callback: drive block n is played in call n, or not at all.
+
+    The time from a sensed sample to the drive that Python computes from it is therefore always the same, `AHEAD` + 1
+    blocks and what the card adds; where Python is late, the device gets zeros and the block is flagged.
+
+    Parameters
+    ----------
+    block : int, samples
+    sensors, channels : int
+    """
+
+    def __init__(self, block: int, sensors: int, channels: int) -> None:
+        self._sensed = np.zeros((SLOTS, block, max(sensors, 1)), np.float32)[:, :, :sensors]
+        self._drive = np.zeros((SLOTS, block, channels), np.float32)
+        self._numbers = np.full(SLOTS, -1, np.int64)
+        self._flags = np.zeros(SLOTS, np.int64)
+        self._record = np.zeros(1, QUEUE)
+        values = {"first": AHEAD, "sensors": sensors, "channels": channels}
+        values |= {"sensed_at": self._sensed.ctypes.data, "drive_at": self._drive.ctypes.data}
+        values |= {"number_at": self._numbers.ctypes.data, "flags_at": self._flags.ctypes.data}
+        for name, value in values.items():
+            self._record[name] = value
+        self.user_data = int(self._record.ctypes.data)
+
+    @property
+    def address(self) -> int:
+        """Address of a function with the signature of PortAudio's callback; compiled when it is first read."""
+        return QUEUE_FUNCTION.address
+
+    @property
+    def blocks(self) -> int:
+        """Calls so far: sensed blocks with lower numbers are complete."""
+        return int(counted(self.user_data + BLOCKS_AT, 0))
+
+    def put(self, number: int, drive: Array) -> bool:
+        """Leave the drive of call `number` (full scale 1, shape (block, channels)); False where that is over."""
+        slot = number % SLOTS
+        self._drive[slot] = drive
+        counted(self._numbers.ctypes.data + 8 * slot, number - int(self._numbers[slot]))
+        return number >= self.blocks
+
+    def take(self, number: int) -> tuple[Array, int]:
+        """Return what call `number` sensed (full scale 1) and its flags."""
+        slot = number % SLOTS
+        return self._sensed[slot].astype(float), int(self._flags[slot])

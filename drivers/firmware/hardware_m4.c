@@ -1,0 +1,74 @@
+/*
+ * The board on a bare Cortex-M4, as QEMU emulates it (mps2-an386): its serial line is the machine's first UART, its
+ * sensors and coils are those of a plate model, and the finger presses where the host says.
+ */
+#include "board.h"
+#include "hardware.h"
+#include "machine_m4.h"
+#include "plate.h"
+
+#define TICK (MACHINE_HERTZ / (uint32_t)design.rate)
+
+const uint32_t hardware_cycle_rate = MACHINE_HERTZ;
+
+static board_t board;
+static plate_t plate = {4e-3, 1.5, 300.0, 1e-6, 1u, {0.0, 0.0, 0.0, 0.0}};
+static double acting[2], handed_over[2]; /* A: current now, and from the next tick on */
+
+uint32_t hardware_cycles(void) { return ~TIMER0_VALUE; }
+
+/* At least a tick of the timer; an emulated plate takes longer, which the board's own clock does not see. */
+uint32_t hardware_wait(void)
+{
+    static uint32_t last;
+    plate_advance(&plate, 1.0 / (double)design.rate, acting, (double)board.position, (double)board.finger.load);
+    acting[0] = handed_over[0];
+    acting[1] = handed_over[1];
+    while (hardware_cycles() - last < TICK) {
+    }
+    last = hardware_cycles();
+    return 1u;
+}
+
+void hardware_sense(real_t sensed[])
+{
+    double values[2];
+    plate_sense(&plate, values);
+    sensed[0] = (real_t)values[0];
+    sensed[1] = (real_t)values[1];
+}
+
+void hardware_drive(const real_t drive[])
+{
+    handed_over[0] = (double)drive[0];
+    handed_over[1] = (double)drive[1];
+}
+
+size_t hardware_read(uint8_t bytes[], size_t most)
+{
+    size_t count = 0u;
+    while ((count < most) && ((UART0_STATE & UART_RECEIVED) != 0u)) {
+        bytes[count++] = (uint8_t)UART0_DATA;
+    }
+    return count;
+}
+
+size_t hardware_write(const uint8_t bytes[], size_t count)
+{
+    size_t written = 0u;
+    while ((written < count) && ((UART0_STATE & UART_FULL) == 0u)) {
+        UART0_DATA = bytes[written++];
+    }
+    return written;
+}
+
+int main(void)
+{
+    machine_start_timer();
+    UART0_DIVIDER = 16u;
+    UART0_CONTROL = UART_ENABLE;
+    board_init(&board);
+    for (;;) {
+        board_tick(&board, hardware_wait());
+    }
+}

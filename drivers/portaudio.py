@@ -1,0 +1,340 @@
+"""PortAudio's C interface (portaudio.h): the structs and functions that a stream with a compiled callback needs.
+
+The library is the system's (``libportaudio``), or that which the package sounddevice brings on Windows and macOS.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from ctypes import CDLL, POINTER, Structure, byref, c_char_p, c_double, c_int, c_ulong, c_void_p
+from ctypes.util import find_library
+from dataclasses import dataclass
+from functools import lru_cache
+from importlib.metadata import PackageNotFoundError, files
+from typing import Any
+
+from hapticrender.errors import DeviceNotFound, DriverError
+
+LEAST_VERSION = 0x130600  # 19.6.0: the first whose Pa_GetVersion says more than "19"
+FLOAT32 = 0x00000001  # paFloat32, interleaved
+ANTICIPATED_ERRORS = {-9985: "it is in use by another program, or does not exist any more"}  # paDeviceUnavailable
+HOST_ERROR = -9999  # paUnanticipatedHostError: PaHostErrorInfo says more
+PATIENCE = 3.0  # s: longest wait for a stream to close
+INSTALL = (
+    "to get it: Debian and Ubuntu: apt install libportaudio2; Fedora: dnf install portaudio; "
+    'macOS and Windows: pip install "hapticrender[audio]"'
+)
+
+
+class DeviceInfo(Structure):
+    """PaDeviceInfo."""
+
+    _fields_ = (
+        ("structVersion", c_int),
+        ("name", c_char_p),
+        ("hostApi", c_int),
+        ("maxInputChannels", c_int),
+        ("maxOutputChannels", c_int),
+        ("defaultLowInputLatency", c_double),
+        ("defaultLowOutputLatency", c_double),
+        ("defaultHighInputLatency", c_double),
+        ("defaultHighOutputLatency", c_double),
+        ("defaultSampleRate", c_double),
+    )
+
+
+class HostApiInfo(Structure):
+    """PaHostApiInfo."""
+
+    _fields_ = (
+        ("structVersion", c_int),
+        ("type", c_int),
+        ("name", c_char_p),
+        ("deviceCount", c_int),
+        ("defaultInputDevice", c_int),
+        ("defaultOutputDevice", c_int),
+    )
+
+
+class HostErrorInfo(Structure):
+    """PaHostErrorInfo."""
+
+    _fields_ = (("hostApiType", c_int), ("errorCode", ctypes.c_long), ("errorText", c_char_p))
+
+
+class StreamParameters(Structure):
+    """PaStreamParameters."""
+
+    _fields_ = (
+        ("device", c_int),
+        ("channelCount", c_int),
+        ("sampleFormat", c_ulong),
+        ("suggestedLatency", c_double),
+        ("hostApiSpecificStreamInfo", c_void_p),
+    )
+
+
+_PARAMETERS, _STREAM = POINTER(StreamParameters), c_void_p
+_OPEN = (POINTER(c_void_p), _PARAMETERS, _PARAMETERS, c_double, c_ulong, c_ulong, c_void_p, c_void_p)
+FUNCTIONS: dict[str, tuple[Any, tuple[Any, ...]]] = {  # name: result, arguments
+    "Pa_GetVersion": (c_int, ()),
+    "Pa_GetErrorText": (c_char_p, (c_int,)),
+    "Pa_GetLastHostErrorInfo": (POINTER(HostErrorInfo), ()),
+    "Pa_Initialize": (c_int, ()),
+    "Pa_Terminate": (c_int, ()),
+    "Pa_GetDeviceCount": (c_int, ()),
+    "Pa_GetDefaultOutputDevice": (c_int, ()),
+    "Pa_GetDeviceInfo": (POINTER(DeviceInfo), (c_int,)),
+    "Pa_GetHostApiInfo": (POINTER(HostApiInfo), (c_int,)),
+    "Pa_OpenStream": (c_int, _OPEN),
+    "Pa_StartStream": (c_int, (_STREAM,)),
+    "Pa_StopStream": (c_int, (_STREAM,)),
+    "Pa_CloseStream": (c_int, (_STREAM,)),
+    "Pa_IsStreamActive": (c_int, (_STREAM,)),
+    "Pa_GetStreamCpuLoad": (c_double, (_STREAM,)),
+}
+
+
+@dataclass(frozen=True)
+class Card:
+    """A sound card as PortAudio lists it: channels, rate (Hz) and latencies (s; low, high), input and output."""
+
+    index: int
+    name: str
+    host: str  # ALSA, JACK, Core Audio, ASIO ...
+    inputs: int
+    outputs: int
+    rate: float
+    input_latency: tuple[float, float]
+    output_latency: tuple[float, float]
+
+    @property
+    def about(self) -> str:
+        """Channels, rate, host and what it calls its latency, in words."""
+        milliseconds = " + ".join(f"{1e3 * each[0]:.1f}" for each in (self.input_latency, self.output_latency))
+        return f"{self.outputs} out, {self.inputs} in, {self.rate:g} Hz, {self.host}, latency {milliseconds} ms"
+
+    def __str__(self) -> str:
+        return f"{self.index} {self.name} ({self.about})"
+
+
+@lru_cache
+def library() -> CDLL:
+    """Load PortAudio and declare `FUNCTIONS`.
+
+    Raises
+    ------
+    DeviceNotFound
+        There is no PortAudio, or it is older than 19.6; the message says how to get it.
+    """
+    name = find_library("portaudio") or _bundled()
+    if name is None:
+        raise DeviceNotFound(f"audio: PortAudio is not installed; {INSTALL}")
+    try:
+        loaded = CDLL(name)
+        for function, (result, arguments) in FUNCTIONS.items():
+            declared = getattr(loaded, function)
+            declared.restype, declared.argtypes = result, arguments
+    except (OSError, AttributeError) as error:
+        raise DeviceNotFound(f"audio: {name} is no PortAudio that can be used: {error}; {INSTALL}") from error
+    version = loaded.Pa_GetVersion()
+    if version < LEAST_VERSION:
+        raise DeviceNotFound(f"audio: {name}: version {version:#x} must be >= {LEAST_VERSION:#x} (19.6.0); {INSTALL}")
+    return loaded
+
+
+def _bundled() -> str | None:
+    """Path of the library among the files of the installed package sounddevice."""
+    bits = 64 if sys.maxsize > 2**32 else 32
+    wanted = {"darwin": "libportaudio.dylib", "win32": f"libportaudio{bits}bit.dll"}.get(sys.platform)
+    try:
+        found = [file.locate() for file in files("sounddevice") or () if file.name == wanted]
+    except PackageNotFoundError:
+        return None
+    return str(found[0]) if found else None
+
+
+def check(code: int, what: str) -> int:
+    """Return a result of PortAudio; a `DriverError` that begins with `what` where it is an error."""
+    if code >= 0:
+        return code
+    text = library().Pa_GetErrorText(code).decode(errors="replace")
+    if code == HOST_ERROR:
+        host = library().Pa_GetLastHostErrorInfo().contents
+        text = f"{text}: {(host.errorText or b'').decode(errors='replace')} ({host.errorCode})"
+    reason = ANTICIPATED_ERRORS.get(code)
+    raise DriverError(f"{what}: {text} (PortAudio {code}{f': {reason}' if reason else ''})")
+
+
+@contextmanager
+def initialised() -> Iterator[CDLL]:
+    """Initialise PortAudio, which lists the cards anew unless it is in use, and terminate it afterwards."""
+    portaudio = library()
+    with _quiet():
+        check(portaudio.Pa_Initialize(), "audio: initialise")
+    try:
+        yield portaudio
+    finally:
+        portaudio.Pa_Terminate()
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Discard what ALSA and JACK write to standard error while they look for cards that are absent."""
+    if not sys.platform.startswith("linux"):
+        yield
+        return
+    kept, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
+    os.dup2(nowhere, 2)
+    try:
+        yield
+    finally:
+        os.dup2(kept, 2)
+        os.close(kept)
+        os.close(nowhere)
+
+
+def cards() -> list[Card]:
+    """Sound cards that are there now; a `DeviceNotFound` where PortAudio is not."""
+    with initialised() as portaudio:
+        return [card(portaudio, index) for index in range(check(portaudio.Pa_GetDeviceCount(), "audio: list"))]
+
+
+def card(portaudio: CDLL, index: int) -> Card:
+    """Card number `index` (< Pa_GetDeviceCount)."""
+    info = portaudio.Pa_GetDeviceInfo(index).contents
+    host = portaudio.Pa_GetHostApiInfo(info.hostApi).contents
+    return Card(
+        index=index,
+        name=info.name.decode(errors="replace"),
+        host=host.name.decode(errors="replace"),
+        inputs=info.maxInputChannels,
+        outputs=info.maxOutputChannels,
+        rate=info.defaultSampleRate,
+        input_latency=(info.defaultLowInputLatency, info.defaultHighInputLatency),
+        output_latency=(info.defaultLowOutputLatency, info.defaultHighOutputLatency),
+    )
+
+
+def find(device: int | str | None) -> Card:
+    """Card by index, by a part of its name and host ("usb", "Scarlett JACK"), or the default output (None).
+
+    Raises
+    ------
+    DeviceNotFound
+        No card fits, or more than one; the message lists those that are there.
+    """
+    with initialised() as portaudio:
+        default = portaudio.Pa_GetDefaultOutputDevice()
+    return chosen(cards(), default if device is None else device)
+
+
+def chosen(found: list[Card], device: int | str) -> Card:
+    """Card of `found` that has the index or the words of `device`, in any case; see `find`."""
+    if isinstance(device, str):
+        words = device.lower().split()
+        fitting = [each for each in found if all(word in f"{each.name} {each.host}".lower() for word in words)]
+        exact = [each for each in fitting if each.name.lower() == device.lower()]
+        fitting = exact or fitting
+    else:
+        fitting = [each for each in found if each.index == device]
+    if len(fitting) == 1:
+        return fitting[0]
+    listed = "; ".join(map(str, fitting or found)) or "there is no sound card"
+    problem = "no default output" if device == -1 else f"{len(fitting)} cards fit"
+    raise DeviceNotFound(f"audio: device {device!r}: {problem}: {listed}")
+
+
+class Stream:
+    """A stream of interleaved float samples whose callback is a C function.
+
+    Parameters
+    ----------
+    name : str
+        For error messages.
+    output, inputs : tuple of (int, int, float)
+        Card, channels and suggested latency (s); `inputs` None: no input.
+    rate : float, Hz
+    frames : int
+        Samples a call.
+    callback, user_data : int
+        Addresses; both have to outlive the stream.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        output: tuple[int, int, float],
+        inputs: tuple[int, int, float] | None,
+        rate: float,
+        frames: int,
+        callback: int,
+        user_data: int,
+    ) -> None:
+        self.name, self._library = name, library()
+        with _quiet():
+            check(self._library.Pa_Initialize(), f"{name}: initialise")
+        self._handle: c_void_p | None = c_void_p()
+        sides = [None if side is None else _parameters(*side) for side in (inputs, output)]
+        sides = [None if side is None else byref(side) for side in sides]
+        arguments = (*sides, rate, frames, 0, callback, user_data)
+        try:
+            check(self._library.Pa_OpenStream(byref(self._handle), *arguments), f"{name}: open at {rate:g} Hz")
+        except DriverError:
+            self._library.Pa_Terminate()
+            raise
+
+    def start(self) -> None:
+        """Start to call back."""
+        check(self._library.Pa_StartStream(self._handle), f"{self.name}: start")
+
+    @property
+    def active(self) -> bool:
+        """Whether it still calls back."""
+        return self._handle is not None and self._library.Pa_IsStreamActive(self._handle) == 1
+
+    @property
+    def load(self) -> float:
+        """Time in the callback over the time of a block, as PortAudio averages it."""
+        return 0.0 if self._handle is None else float(self._library.Pa_GetStreamCpuLoad(self._handle))
+
+    def close(self) -> None:
+        """Stop after what has been played, and release the card; a second call does nothing.
+
+        Raises
+        ------
+        DriverError
+            PortAudio reports an error, or does not return (with JACK, where the server has died): it is left behind.
+        """
+        handle, self._handle = self._handle, None
+        if handle is None:
+            return
+        errors: list[DriverError] = []
+        release = threading.Thread(target=self._release, args=(handle, errors), daemon=True)
+        release.start()
+        release.join(PATIENCE)
+        if release.is_alive():
+            raise DriverError(
+                f"{self.name}: close: PortAudio did not return within {PATIENCE:g} s: restart the program"
+            )
+        if errors:
+            raise errors[0]
+
+    def _release(self, handle: c_void_p, errors: list[DriverError]) -> None:
+        try:
+            if self._library.Pa_IsStreamActive(handle) == 1:
+                check(self._library.Pa_StopStream(handle), f"{self.name}: stop")
+        except DriverError as error:
+            errors.append(error)
+        finally:
+            self._library.Pa_CloseStream(handle)
+            self._library.Pa_Terminate()
+
+
+def _parameters(device: int, channels: int, latency: float) -> StreamParameters:
+    return StreamParameters(device, channels, FLOAT32, latency, None)

@@ -1,0 +1,192 @@
+"""Delay of a driver's loop, measured through a cable from its first output to its first input.
+
+A burst of random signs x is played and y is sensed; with the cross-spectrum S = Y X* the round trip is the shift s of
+the largest peak of its correlation, and then, to a fraction of a sample, the slope of the phase of S exp(j w s) through
+the origin (least squares, weighted by the magnitude of S, 0.05 to 0.4 of the rate).  With blocks of B samples, and
+`queued` samples that the driver's `play` itself adds, the delay of the device's loop is
+
+    delay = B + s - 1/2 - queued,
+
+for in the loop's models a drive is held for a sample, and so acts half a sample later than its number says.
+"""
+
+from __future__ import annotations
+
+import re
+import statistics
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from hapticrender.errors import DriverError
+from hapticrender.protocols import Array, Flag
+
+BURST, TAIL = 0.1, 0.5  # s: noise that is played; after it, the longest round trip that can be found
+FEWEST = 4096  # samples of a burst
+BAND = (0.05, 0.4)  # of the rate
+LEAST_CORRELATION = 0.5  # of what is sensed with what was played
+MOST_SPREAD = 0.5  # samples, between runs
+NEW_PROFILE = '[profile]\nkind = "vt-plate"  # or electroadhesion, ultrasonic, hybrid\n'
+TRIES = 3  # times as many runs as asked for, where samples are lost
+
+
+class Trip(NamedTuple):
+    """One run: round trip (samples), gain, and correlation (0 to 1) of what was sensed with what was played."""
+
+    samples: float
+    gain: float  # negative: the cable is inverted
+    correlation: float
+
+
+@dataclass(frozen=True)
+class Latency:
+    """Measured round trips (samples) of a driver of `rate` (Hz) and `block` (samples)."""
+
+    trips: tuple[Trip, ...]
+    rate: float
+    block: int
+    queued: int = 0  # samples that the driver's `play` adds
+
+    @property
+    def round_trip(self) -> float:
+        """Median over the runs (samples), of a block played to the same block sensed."""
+        return statistics.median(trip.samples for trip in self.trips)
+
+    @property
+    def spread(self) -> float:
+        """Largest less smallest round trip (samples)."""
+        found = [trip.samples for trip in self.trips]
+        return max(found) - min(found)
+
+    @property
+    def gain(self) -> float:
+        """Median of sensed over played, in the driver's units."""
+        return statistics.median(trip.gain for trip in self.trips)
+
+    @property
+    def delay(self) -> float:
+        """Delay of the device's loop (samples), the driver's argument `delay`."""
+        return self.block + self.round_trip - 0.5 - self.queued
+
+    def __str__(self) -> str:
+        milliseconds = 1e3 * self.delay / self.rate
+        return (
+            f"delay {self.delay:.2f} samples ({milliseconds:.3f} ms) at {self.rate:g} Hz in blocks of {self.block}; "
+            f"{len(self.trips)} runs, spread {self.spread:.3f} samples, gain of the cable {self.gain:.4g}"
+        )
+
+
+def measure_latency(driver: Any, *, runs: int = 5, amplitude: float = 0.1) -> Latency:
+    """Measure the delay of a driver's loop through a cable from its first output to its first input.
+
+    Parameters
+    ----------
+    driver : Driver
+        Any object with `play`; not opened yet.  One with ``loop_back()`` makes a new driver for every run.
+    runs : int, >= 1
+    amplitude : float, > 0
+        Of the burst, in the unit of the drive; of full scale for a sound card.
+
+    Raises
+    ------
+    ValueError
+        An argument is out of its bound, or the driver senses nothing.
+    DriverError
+        Nothing of what was played is sensed, samples were lost in most of the runs, or the runs disagree.
+    """
+    if runs < 1 or not 0 < amplitude < np.inf:
+        raise ValueError(f"{runs=}, {amplitude=}: must be >= 1, and finite and > 0")
+    rng, trips, tries = np.random.default_rng(0), [], 0
+    for opened in _opened(driver):
+        tries += 1
+        trip = _trip(opened, amplitude, rng)
+        if trip is not None:
+            trips.append(trip)
+        if len(trips) == runs or tries == TRIES * runs:
+            break
+    name = f"{driver}: latency"
+    if len(trips) < runs:
+        raise DriverError(f"{name}: samples were lost in {tries - len(trips)} of {tries} runs: use larger blocks")
+    found = Latency(tuple(trips), float(opened.rate), int(opened.block), int(getattr(opened, "queued", 0)))
+    weakest = min(trip.correlation for trip in trips)
+    if weakest < LEAST_CORRELATION:
+        raise DriverError(
+            f"{name}: what is sensed follows what is played with a correlation of {weakest:.2f}, must be >= "
+            f"{LEAST_CORRELATION:g}: connect the first output to the first input, nothing between, and turn both up"
+        )
+    if found.spread > MOST_SPREAD:
+        listed = ", ".join(f"{trip.samples:.2f}" for trip in trips)
+        raise DriverError(
+            f"{name}: the runs disagree by {found.spread:.2f} samples (bound {MOST_SPREAD:g}): {listed}; end other "
+            "programs that use the card, or use larger blocks"
+        )
+    return found
+
+
+def _opened(driver: Any) -> Iterator[Any]:
+    """Open drivers for one run after the other: new ones where it makes them, otherwise the same again and again."""
+    if hasattr(driver, "loop_back"):
+        while True:
+            with driver.loop_back() as opened:
+                yield opened
+    if not driver.sensed_channels:
+        raise ValueError(f"{driver}: senses nothing: a round trip needs an input")
+    with driver:
+        while True:
+            yield driver
+
+
+def _trip(driver: Any, amplitude: float, rng: np.random.Generator) -> Trip | None:
+    """Play a burst and find it in what is sensed; None where samples were lost."""
+    block = driver.block
+    length = -(-max(round(BURST * driver.rate), FEWEST) // block) * block
+    burst = amplitude * rng.choice([-1.0, 1.0], length)
+    played = np.concatenate([burst, np.zeros(-(-round(TAIL * driver.rate) // block) * block)])
+    sensed, lost = np.empty_like(played), np.zeros(len(played), bool)
+    for start in range(0, len(played), block):
+        drive = np.zeros((block, driver.drive_channels))
+        drive[:, 0] = played[start : start + block]
+        got = driver.play(drive)
+        sensed[start : start + block] = got.sensed[:, 0]
+        lost[start : start + block] = 0 if got.flags is None else got.flags & Flag.OVERRUN
+    trip = find_trip(played, sensed)
+    return None if lost[: length + int(trip.samples) + block].any() else trip
+
+
+def find_trip(played: Array, sensed: Array) -> Trip:
+    """Find `played` (shape (n,), its end silent) in `sensed` (n,): see the module for the equations."""
+    n = 2 * len(played)
+    turns = np.fft.rfftfreq(n)
+    cross = np.fft.rfft(sensed, n) * np.fft.rfft(played, n).conj()
+    correlation = np.fft.irfft(cross, n)[: len(played)]
+    shift = int(np.argmax(abs(correlation)))
+    sign = float(np.sign(correlation[shift]))
+    scale = np.sqrt(float(played @ played) * float(sensed @ sensed))
+    inside = (turns >= BAND[0]) & (turns <= BAND[1])
+    aligned = sign * cross[inside] * np.exp(2j * np.pi * turns[inside] * shift)
+    omega, weight = 2 * np.pi * turns[inside], abs(aligned)
+    slope = -np.sum(weight * omega * np.angle(aligned)) / max(float(np.sum(weight * omega**2)), np.finfo(float).tiny)
+    gain = (
+        sign
+        * float(np.sum((aligned * np.exp(1j * omega * slope)).real))
+        / float(np.sum(abs(np.fft.rfft(played, n)[inside]) ** 2))
+    )
+    return Trip(shift + float(slope), gain, abs(float(correlation[shift])) / scale if scale > 0 else 0.0)
+
+
+def write_delay(path: Path, found: Latency) -> None:
+    """Write the delay into the table [calibration] of a profile (TOML); a new one is that of a plate."""
+    line = f"delay = {found.delay:.3f}  # samples at {found.rate:g} Hz in blocks of {found.block}, measured\n"
+    text = path.read_text(encoding="utf-8") if path.exists() else NEW_PROFILE
+    head = re.search(r"^\[calibration\][^\n]*\n", text, re.M)
+    if head is None:
+        text = f"{text.rstrip()}\n\n[calibration]\n{line}"
+    else:
+        after = re.search(r"^\[", text[head.end() :], re.M)
+        end = len(text) if after is None else head.end() + after.start()
+        table = re.sub(r"^delay\s*=[^\n]*\n", "", text[head.end() : end], flags=re.M)
+        text = f"{text[: head.end()]}{line}{table}{text[end:]}"
+    path.write_text(text, encoding="utf-8")

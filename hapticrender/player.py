@@ -1,0 +1,466 @@
+"""Live play: textures, finger and gain change while a device plays.
+
+    with hr.Player("vt-plate") as player:
+        player.play(hr.Grating(wavelength=1e-3, amplitude=10e-6))
+        player.finger(position=0.01, velocity=0.08, load=0.4)
+        print(player.state())
+
+Controller and renderers are those of `render`; what advances them block by block is the compiled entry of
+`hapticrender.realtime`.  A driver that calls back (it has `start` and `stop`) is handed the entry; any other is played
+by a thread.  On a plate a texture fades into the next one under the same controller, which keeps what it has learned of
+finger and device.  Where the law works by bands (most screens, ultrasonic surfaces) the old texture fades out, then the
+next one fades in under a controller of its own.
+"""
+
+from __future__ import annotations
+
+import math
+import threading
+import time
+from contextlib import ExitStack
+from dataclasses import dataclass, replace
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+import numpy as np
+
+from hapticrender.control.probe import probe_plate
+from hapticrender.errors import HapticError
+from hapticrender.live import LiveLoop
+from hapticrender.loop import open_scene, prepare, stopped_by_sigterm, zero_drive_after
+from hapticrender.protocols import Array, Driver, Flag, Rendering, Texture
+from hapticrender.realtime import HORIZON
+from hapticrender.recordings.recording import Recorder, Recording
+from hapticrender.touch.finger import Finger
+from hapticrender.touch.scene import Scene
+
+NOMINAL = Finger.sliding(speed=0.08, normal_load=0.4)  # for which a device is designed where none is stated
+LONGEST = 3600.0  # s: duration that is written into a recording's scene
+SERVICE = 0.05  # s between two looks: what comes next is computed, what was is recorded, faults are seen
+WORDS = 0.2  # s: two words within this time show a velocity
+FADE_OUT = 0.05  # s: five time constants of the gain; and the longest that zeros are waited for
+POINTING, INSTANT = 0.01, 1e-4  # s between two words of a scene's finger; over which its velocity is found
+PATIENCE = 5.0  # s without a sample, after which `sleep` gives a device up
+
+
+@dataclass(frozen=True)
+class BandState:
+    """What a band does: its frequency (Hz), target and achieved amplitude, and |achieved - target|/|target|."""
+
+    frequency: float
+    target: float
+    achieved: float
+    error: float
+
+
+@dataclass(frozen=True)
+class PlayerState:
+    """What a player does at the moment: `time` (s played), bands over the last quarter of a second, and trouble.
+
+    A texture that is a whole waveform has one band of frequency 0, whose amplitudes are rms.  `lost` counts callbacks
+    in which the device lost samples, `load` is the share of its time that a callback takes (NaN where unknown).
+    """
+
+    time: float
+    unit: str
+    bands: tuple[BandState, ...]
+    flags: Flag
+    lost: int
+    load: float
+
+    def __str__(self) -> str:
+        """One line a band, flags and load."""
+        lines = [
+            f"{band.frequency:7.1f} Hz  target {band.target:9.3g} {self.unit}  achieved {band.achieved:9.3g} "
+            f"{self.unit}  error {100 * band.error:6.2f} %"
+            for band in self.bands
+        ]
+        load = "" if math.isnan(self.load) else f", load {100 * self.load:.0f} %"
+        return "\n".join([*lines, f"{self.time:.1f} s, {self.flags.name or 'no flags'}, {self.lost} lost{load}"])
+
+
+class LiveMotion:
+    """Where the application has last said that the finger is, and how hard it presses: for a simulated device."""
+
+    def __init__(self) -> None:
+        self._clock, self._since = 0.0, 0.0  # s
+        self._at, self._velocity, self._load = math.nan, 0.0, 0.0
+
+    def restart(self) -> None:
+        """Begin at time 0 again, with another simulated device."""
+        self._clock = self._since = 0.0
+
+    def say(self, position: float, velocity: float, load: float) -> None:
+        """Take up a word of the application (m, m/s, N)."""
+        self._since, self._at, self._velocity, self._load = self._clock, position, velocity, load
+
+    def position(self, time: Array) -> Array:
+        """Position (m) at `time` (s): at the last speed, for `HORIZON` at most."""
+        time = np.asarray(time, float)
+        self._clock = float(time[-1]) if time.size else self._clock
+        return self._at + self._velocity * np.clip(time - self._since, 0.0, HORIZON)
+
+    def load(self, time: Array) -> Array:
+        """Return the normal load (N)."""
+        return np.full(np.shape(time), self._load)
+
+
+class Player:
+    """Plays textures on a device while the application goes on; used in a `with` statement, from one thread at a time.
+
+    Parameters
+    ----------
+    device : str or Scene
+        Kind of device, or a profile; or a scene, whose tables, method, seed and finger are used.  The finger of a scene
+        moves by itself until the application speaks (`finger`); else only the application knows one.
+    driver : Driver or str, optional
+        As for `render`; the simulated device by default.
+    finger : Finger, optional
+        For which the device is designed, and whose mechanics a simulated finger has; by default one that slides at
+        0.08 m/s under 0.4 N.
+    paced : bool
+        Of a simulated device.  False: it plays only within `sleep`, as fast as it can and reproducibly.
+    watchdog : float, s, optional
+        Without any call of this player for so long the texture fades out, until the next one; > 0.
+    **tables
+        Further fields of the scene: profile, simulation, rendering, method, seed.
+
+    Raises
+    ------
+    ValueError, TypeError
+        An argument is out of its bound.
+    """
+
+    def __init__(
+        self,
+        device: str | Scene = "vt-plate",
+        driver: Driver | str | None = None,
+        *,
+        finger: Finger | None = None,
+        paced: bool = True,
+        watchdog: float | None = None,
+        **tables: Any,
+    ) -> None:
+        if watchdog is not None and not 0.0 < watchdog < math.inf:
+            raise ValueError(f"{watchdog=}: must be finite and > 0 s, or None")
+        self._given = device if isinstance(device, Scene) else None
+        self._fields = {"device": device, "finger": finger or NOMINAL, "duration": LONGEST, **tables}
+        self._driver, self._paced, self._watchdog = driver, paced, watchdog
+        self._motion, self._spoken = LiveMotion(), False
+        self._word, self._said = (math.nan, 0.0), (math.nan, 0.0, 0.0)  # the last word: place and moment; all of it
+        self._loop: LiveLoop | None = None
+        self._next: LiveLoop | None = None  # waits for silence
+        self._gain, self._called, self._before, self._lost = 1.0, 0.0, 0, 0
+        self._error: BaseException | None = None
+        self._raised = False
+        self._recorder: Recorder | None = None
+        self._recorded, self._served = 0, 0.0  # samples of this loop that were looked at; when the last look was
+        self._stack, self._stopping, self._lock = ExitStack(), threading.Event(), threading.RLock()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        """Zero drive, then close the device and the recording; a fault that nobody has seen is raised."""
+        if kind is None and self._error is None and self._loop is not None and self._paced:
+            self._loop.set_gain(0.0)
+            time.sleep(FADE_OUT)
+        self._silence()
+        self._stopping.set()
+        with ExitStack() as last:
+            last.callback(self._close_recorder)
+            last.push(self._stack.pop_all())
+        if kind is None and self._error is not None and not self._raised:
+            raise self._error
+
+    @property
+    def time(self) -> float:
+        """Time played so far (s)."""
+        return 0.0 if self._loop is None else (self._before + self._loop.samples) / self._loop.driver.rate
+
+    @property
+    def gain(self) -> float:
+        """Factor on every texture, finite; a new one is reached within some 30 ms."""
+        return self._gain
+
+    @gain.setter
+    def gain(self, gain: float) -> None:
+        with self._lock:
+            self._check()
+            if not math.isfinite(gain):
+                raise ValueError(f"{gain=}: must be finite")
+            self._gain = gain
+            if self._loop is not None and self._next is None:
+                self._loop.set_gain(gain)
+
+    def play(self, texture: Texture) -> None:
+        """Play a texture until the next one, into which it fades; the first one starts the device.
+
+        Raises
+        ------
+        ValueError, TypeError
+            The device cannot play it; what plays goes on.
+        DeviceFault, DriverError
+            The device has failed.
+        """
+        with self._lock:
+            self._check()
+            if self._loop is None:
+                self._start(prepare(self._scene(texture), driver=self._driver))
+                return
+            owned = self._loop.rendering.plant is not None and not self._loop.whole
+            rendering = open_scene(self._scene(texture), driver=None if owned else self._loop.rendering.device)
+            if self._loop.whole:
+                self._loop.exchange(rendering)
+            else:
+                self._next = LiveLoop(rendering)
+                self._loop.set_gain(0.0)
+
+    def finger(self, position: float, velocity: float | None = None, load: float = 0.4) -> None:
+        """Say where the finger is: position (m from the middle, NaN: lifted), velocity (m/s), normal load (N).
+
+        It goes on at this velocity for 50 ms at most.  Without a velocity, that since the last word is taken.  After
+        0.25 s without a word what lies along the surface fades out.
+        """
+        with self._lock:
+            self._check()
+            now, (last, then) = time.monotonic() if self._paced else self.time, self._word
+            if velocity is None:
+                recent = 0.0 < now - then < WORDS and math.isfinite(position - last)
+                velocity = (position - last) / (now - then) if recent else 0.0
+            if math.isinf(position) or not math.isfinite(velocity) or not 0.0 <= load < math.inf:
+                said = f"{position=} m, {velocity=} m/s, {load=} N"
+                raise ValueError(f"{said}: must be finite, a load >= 0 (a position may be NaN: lifted)")
+            self._spoken, self._word, self._said = True, (position, now), (position, velocity, load)
+            self._motion.say(position, velocity, load)
+            if self._loop is not None:
+                self._loop.finger(position, velocity, load)
+
+    def record(self, path: str | Path) -> None:
+        """Keep everything from now on in a journal (.au), until `end_recording` or the end; the device must play."""
+        with self._lock:
+            self._check()
+            loop = self._playing("record")
+            if self._recorder is not None:
+                raise ValueError(f"{path}: a recording is under way: call end_recording first")
+            self._service()
+            rendering, driver, model = loop.rendering, loop.driver, loop.model
+            self._recorder = Recorder(
+                path,
+                scene=rendering.scene,
+                method=rendering.scene.method,
+                seed=rendering.scene.seed,
+                rate=driver.rate,
+                bands=replace(rendering.bands.select(np.zeros(0, int)), envelope=None, unfelt=()),
+                drive_channels=driver.drive_channels,
+                sensed_channels=driver.sensed_channels,
+                drive_limit=model.drive_limit if np.isfinite(model.drive_limit) else None,
+                sensed_noise=model.sensed_noise,
+                calibration=getattr(rendering.device, "calibration", 0.0),
+                **{name: getattr(model, name) for name in ("places", "unit", "drive_unit", "profile")},
+            )
+
+    def end_recording(self) -> Recording:
+        """End the recording and return it."""
+        with self._lock:
+            if self._recorder is None:
+                raise ValueError("nothing is being recorded: call record first")
+            self._service()
+            recorder, self._recorder = self._recorder, None
+            return recorder.finish()
+
+    def state(self) -> PlayerState:
+        """Return what plays at the moment, and what became of it."""
+        with self._lock:
+            self._check()
+            loop = self._playing("state")
+            self._service()
+            load = float(getattr(loop.rendering.device, "load", math.nan))
+            bands = tuple(BandState(*row) for row in loop.figures())
+            return PlayerState(self.time, loop.model.unit, bands, loop.flags, self._lost, load)
+
+    def sleep(self, seconds: float) -> None:
+        """Wait until the device has played for so long; one that is not paced plays meanwhile.
+
+        Raises
+        ------
+        DeviceFault, DriverError
+            The device has failed.
+        """
+        if not 0.0 <= seconds < math.inf:
+            raise ValueError(f"{seconds=}: must be finite and >= 0 s")
+        with self._lock:
+            self._check()
+            rate = self._playing("sleep").driver.rate
+        end, seen, since = self.time + seconds, self.time, time.monotonic()
+        while self.time < end - 0.5 / rate:
+            if self._paced:
+                self._stopping.wait(min(end - self.time, SERVICE))
+            else:
+                self._advance(min(end - self.time, SERVICE))
+            if self.time > seen:
+                seen, since = self.time, time.monotonic()
+            if time.monotonic() - since > PATIENCE:
+                raise HapticError(f"the device has played no sample for {PATIENCE:g} s: check it and its driver")
+            with self._lock:
+                self._check()
+
+    def _scene(self, texture: Texture) -> Scene:
+        if self._given is not None:
+            return replace(self._given, texture=texture)
+        return Scene(texture=texture, **self._fields)
+
+    def _playing(self, what: str) -> LiveLoop:
+        if self._loop is None:
+            raise ValueError(f"{what}: nothing plays yet: call play first")
+        return self._loop
+
+    def _check(self) -> None:
+        """Raise what has gone wrong meanwhile; note that the application is alive."""
+        if self._error is not None:
+            self._raised = True
+            raise self._error
+        if self._stopping.is_set():
+            raise ValueError("the player has been closed: make a new one")
+        self._called = self._now()
+
+    def _now(self) -> float:
+        return time.monotonic() if self._paced else self.time
+
+    def _start(self, rendering: Rendering) -> None:
+        """Open the device at rest, probe it, and play."""
+        device, stack = rendering.device, self._stack
+        calls_back = hasattr(device, "start") and rendering.driver is device
+        scales = {name: getattr(device, name) for name in ("sensed_scale", "drive_scale")} if calls_back else {}
+        loop = LiveLoop(rendering, **scales)
+        self._hand_finger(rendering)
+        if rendering.plant is not None:
+            device.paced = self._paced  # type: ignore[attr-defined]
+        elif not self._paced:
+            raise ValueError("paced = False: must be True but for the simulated device, which alone waits for `sleep`")
+        stack.enter_context(stopped_by_sigterm())
+        stack.enter_context(rendering.driver)
+        stack.enter_context(zero_drive_after(device))
+        if rendering.probe:
+            probe_plate(device, rendering.model)
+        self._loop = loop
+        loop.set_gain(self._gain)
+        if self._spoken:
+            loop.finger(*self._said)
+        if calls_back:
+            device.start(loop.entry)  # type: ignore[attr-defined]
+            stack.callback(device.stop)  # type: ignore[attr-defined]
+        if self._paced:
+            self._run_thread(self._serve)
+        if self._paced and not calls_back:
+            self._run_thread(self._drive_device)
+
+    def _hand_finger(self, rendering: Rendering) -> None:
+        """Put the finger that the application moves on a simulated device."""
+        if self._given is None and rendering.plant is not None:
+            mechanics = rendering.scene.finger.mechanics
+            live = Finger(self._motion, None, mechanics=mechanics, load_scaling=rendering.scene.finger.load_scaling)
+            plant: Any = rendering.plant
+            for part in (plant, getattr(plant, "screen", plant)):
+                part.finger = live
+
+    def _run_thread(self, target: Any) -> None:
+        """Run `target` until the player stops; what it raises is kept for the application."""
+
+        def run() -> None:
+            try:
+                target()
+            except BaseException as error:
+                self._error = self._error or error
+
+        thread = threading.Thread(target=run, name=target.__name__.strip("_"), daemon=True)
+        thread.start()
+
+        def end() -> None:
+            self._stopping.set()
+            thread.join()
+
+        self._stack.callback(end)
+
+    def _drive_device(self) -> None:
+        while not self._stopping.is_set():
+            self._block()
+
+    def _block(self) -> None:
+        """Play a block; once the last texture is silent the next loop takes over."""
+        if self._next is not None and self._playing("play").silent:
+            with self._lock:
+                self._take_over(self._next)
+        self._playing("play").advance(sensing=self._given is not None or not self._spoken)
+
+    def _take_over(self, following: LiveLoop) -> None:
+        self._service()
+        loop, self._next = self._playing("play"), None
+        self._before += loop.samples
+        self._recorded = 0
+        if following.rendering.plant is not None:
+            self._motion.restart()
+            self._hand_finger(following.rendering)
+            following.rendering.device.paced = self._paced  # type: ignore[attr-defined]
+            self._stack.enter_context(following.driver)
+        following.set_gain(self._gain)
+        if self._spoken:
+            following.finger(*self._said)
+        self._loop = following
+
+    def _advance(self, seconds: float) -> None:
+        """Play for so long in this thread."""
+        driver = self._playing("sleep").driver
+        for _ in range(max(round(seconds * driver.rate / driver.block), 1)):
+            self._block()
+        with self._lock:
+            self._service()
+
+    def _serve(self) -> None:
+        while not self._stopping.wait(POINTING):
+            with self._lock:
+                self._point()
+                if self.time - self._served >= SERVICE or self._stopping.is_set():
+                    self._served = self.time
+                    self._service()
+
+    def _point(self) -> None:
+        """Say where the finger of the scene is, to a device that does not sense it."""
+        loop = self._playing("play")
+        if self._given is not None and not self._spoken and not loop.senses:
+            finger, now = self._given.finger, self.time + np.array([0.0, INSTANT])
+            (here, there), load = finger.position(now), finger.load(now)[0]
+            loop.finger(here, float(np.nan_to_num((there - here) / INSTANT)), load)
+
+    def _service(self) -> None:
+        """Compute what comes next, record what was, see whether the device or the application has stopped."""
+        loop = self._playing("play")
+        loop.fill()
+        if self._watchdog is not None and self._next is None:
+            asleep = self._now() - self._called > self._watchdog
+            loop.set_gain(0.0 if asleep else self._gain)
+        first, signals = loop.signals(self._recorded)
+        gap, self._recorded = first - self._recorded, first + len(signals["flags"])
+        self._lost += gap + int(np.count_nonzero(signals["flags"] & Flag.OVERRUN))
+        if self._recorder is not None and len(signals["flags"]):
+            self._recorder.append(motion_source=loop.motion_source, **signals)
+        if self._error is None and (fault := loop.fault()):
+            self._error = fault
+
+    def _silence(self) -> None:
+        """Set zero drive, and wait until a whole block of it has been played, where the device still plays."""
+        loop = self._loop
+        if loop is None:
+            return
+        loop.silence()
+        end, limit = loop.samples + 2 * loop.driver.block, time.monotonic() + FADE_OUT
+        while self._paced and self._error is None and loop.samples < end and time.monotonic() < limit:
+            time.sleep(1e-3)
+
+    def _close_recorder(self) -> None:
+        if self._recorder is not None:
+            self._service()
+            self._recorder.close()

@@ -1,0 +1,195 @@
+"""The profile of a device: what is believed of one, by which measurement, and what it must never be driven beyond."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields
+from datetime import date
+from pathlib import Path
+from typing import Any, Self
+
+from hapticrender import checks
+from hapticrender.checks import Validated, checked, parameter
+from hapticrender.errors import SceneError
+from hapticrender.touch import toml
+
+ENDING = ".toml"  # of a device's name that is a file
+TEXTS = ("name", "measured_by", "measured_with")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Limits(Validated):
+    """Limits of a device, which protect skin, coils and glass; None is no limit beside those of [device].
+
+    The drive is in the device's unit: A of a plate's coils and of a screen, V of an ultrasonic plate.
+    """
+
+    peak_drive: float | None = parameter(None, about="drive unit: largest magnitude of each channel", above=0.0)
+    rms_drive: float | None = parameter(
+        None, about="drive unit: largest rms of each channel over about `rms_time`, by which a coil heats", above=0.0
+    )
+    rms_time: float = parameter(10.0, "s", "time constant of that mean, of the coil's heat", least=0.1, most=1e4)
+    displacement: float | None = parameter(
+        None, "m", "largest magnitude that a sensor of displacement may show, static load included", above=0.0
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Calibration(Validated):
+    """Numbers between a converter and SI units, and how sure the sensors' gain is; None: not measured."""
+
+    drive_per_full_scale: float | None = parameter(None, about="A or V at a sample of 1.0 played", above=0.0)
+    sensed_per_full_scale: float | None = parameter(None, about="m or N at a sample of 1.0 recorded", above=0.0)
+    delay: float | None = parameter(None, "samples", "from a sensed sample to the drive computed from it", above=0.0)
+    gain_uncertainty: float = parameter(0.0, about="relative standard uncertainty of the sensors' gain", most=1.0)
+
+
+def table_of(part: Validated) -> dict[str, Any]:
+    """Entries of `part` that differ from their defaults, as a table of a file has them."""
+    values = ((each.name, getattr(part, each.name), each.default) for each in fields(part))  # type: ignore[arg-type]
+    return {name: value for name, value, default in values if value != default}
+
+
+def _day(key: str, value: Any) -> date:
+    """Return a date, or the date that a text "2026-11-22" is."""
+    try:
+        return date.fromisoformat(value) if isinstance(value, str) else date(value.year, value.month, value.day)
+    except (AttributeError, TypeError, ValueError):
+        checks.refuse(key, value, "a date such as 2026-11-22")
+
+
+def _uncertainty(key: str, value: Any) -> dict[str, float]:
+    checks.require(isinstance(value, Mapping), key, value, "a table of numbers", TypeError)
+    return {name: checks.number(f"{key}.{checks.plain(name)}", each, least=0.0) for name, each in value.items()}
+
+
+def _parameters(key: str, value: Any) -> dict[str, Any]:
+    checks.require(isinstance(value, Mapping), key, value, "a table of parameters", TypeError)
+    return dict(value)
+
+
+def _made(kind: type[Any]) -> Any:
+    """Check of a part that may be given as a table too."""
+
+    def check(key: str, value: Any) -> Any:
+        if isinstance(value, kind):
+            return value
+        checks.require(isinstance(value, Mapping), key, value, f"a table or {kind.__name__}", TypeError)
+        with checks.inside(key):
+            return kind.with_overrides(value)
+
+    return check
+
+
+def _table(check: Any) -> Any:
+    return field(default_factory=dict, hash=False, metadata={"check": check, "bounds": {}})
+
+
+@dataclass(frozen=True, kw_only=True)
+class DeviceProfile(Validated):
+    """All that is believed of one device, and where it comes from; a TOML file.
+
+    A scene takes it by the file's name (``Scene(device="plate.toml")``); `hapticrender identify` writes one.  In a file
+    the first five are the table ``[profile]``, the others a table of their name each.  A file without ``[profile]``
+    has its `kind` in ``[device]``.
+
+    Parameters
+    ----------
+    kind : str
+        Kind of device: name of a renderer.
+    name : str
+        Which device it is; default: "".
+    measured_by, measured_with : str
+        Who measured it, and with what.
+    measured_on : datetime.date, optional
+        When, also as a text "2026-11-22".
+    device : mapping of str to number, str or bool
+        Parameters, as in a scene's ``[device]``.
+    uncertainty : mapping of str to float
+        Standard uncertainty of parameters, in their units.
+    calibration : Calibration or mapping
+    limits : Limits or mapping
+
+    Examples
+    --------
+    >>> plate = DeviceProfile(kind="vt-plate", name="plate 3", device={"mass": 0.0321}, limits={"rms_drive": 0.5})
+    >>> print(plate.to_toml())
+    [profile]
+    kind = "vt-plate"
+    name = "plate 3"
+    <BLANKLINE>
+    [device]
+    mass = 0.0321
+    <BLANKLINE>
+    [limits]
+    rms_drive = 0.5
+    <BLANKLINE>
+    >>> DeviceProfile.from_table({"device": {"kind": "vt-plate", "mass": 0.03}}).device
+    {'mass': 0.03}
+    """
+
+    kind: str = checked(checks.word)
+    name: str = checked(checks.text, "")
+    measured_by: str = checked(checks.text, "")
+    measured_with: str = checked(checks.text, "")
+    measured_on: date | None = checked(_day, None)
+    device: Mapping[str, Any] = _table(_parameters)
+    uncertainty: Mapping[str, float] = _table(_uncertainty)
+    calibration: Calibration = field(default=Calibration(), metadata={"check": _made(Calibration), "bounds": {}})
+    limits: Limits = field(default=Limits(), metadata={"check": _made(Limits), "bounds": {}})
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if strangers := set(self.uncertainty) - set(self.device):
+            raise ValueError(f"uncertainty.{min(strangers)}: must be of a parameter in [device]")
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str]) -> Self:
+        """Read a profile; its file's stem is the name of one that has none.
+
+        Raises
+        ------
+        SceneError
+            In one line: file, key, value, bound and unit.
+        """
+        where = " ".join(str(path).split())
+        try:
+            found = cls.from_table(toml.read(path))
+        except (ValueError, TypeError) as problem:
+            raise SceneError(f"{where}: {str(problem).removeprefix(f'{where}: ')}") from problem
+        return found if found.name else cls(**{**vars(found), "name": Path(path).stem})
+
+    @classmethod
+    def from_table(cls, table: Mapping[str, Any]) -> Self:
+        """Make a profile from the tables of its file; a ValueError or TypeError names the entry that is wrong."""
+        known = ("profile", "device", "uncertainty", "calibration", "limits")
+        for key, value in table.items():
+            bound = f"one of the tables {', '.join(known)}"
+            checks.require(key in known and isinstance(value, Mapping), checks.plain(key), value, bound)
+        head, device = dict(table.get("profile", {})), dict(table.get("device", {}))
+        kind = device.pop("kind", None)
+        if kind is not None and head.setdefault("kind", kind) != kind:
+            checks.refuse("device.kind", kind, f"{head['kind']!r}, as in [profile]")
+        with checks.inside("profile"):
+            checks.check_names(head, ("kind", "measured_on", *TEXTS))
+            checks.require(head.get("kind") is not None, "kind", None, "the name of a renderer, such as 'vt-plate'")
+        return cls(**head, device=device, **{key: table[key] for key in known[2:] if key in table})
+
+    def to_toml(self) -> str:
+        """TOML text that `from_table` reads back to an equal profile."""
+        texts = {key: getattr(self, key) for key in TEXTS if getattr(self, key)}
+        day = {} if self.measured_on is None else {"measured_on": self.measured_on}
+        tables = {"profile": {"kind": self.kind, **texts, **day}, "device": self.device}
+        tables |= {"uncertainty": self.uncertainty, "calibration": table_of(self.calibration)}
+        tables |= {"limits": table_of(self.limits)}
+        return toml.dumps({key: table for key, table in tables.items() if table}).lstrip("\n")
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write the profile."""
+        Path(path).write_text(self.to_toml(), encoding="utf-8")
+
+    def __str__(self) -> str:
+        """Which device it is, and who measured it when."""
+        origin = ", ".join(str(each) for each in (self.measured_by, self.measured_on) if each)
+        return f"{self.name or self.kind} ({origin})" if origin else self.name or self.kind

@@ -1,0 +1,166 @@
+"""Drivers chosen by a text, the same on the command line and in Python, and what `hapticrender devices` shows."""
+
+import sys
+
+import numpy as np
+import pytest
+from other_plate import OtherPlate
+
+import hapticrender as hr
+from hapticrender import cli, devices
+from hapticrender.devices import open_driver
+
+TONE = hr.Scene(texture=hr.Grating(frequency=47.0, amplitude=10e-6), duration=0.1, rendering={"probe": False})
+
+
+class Calibrated:
+    """A driver that is told what its device's profile says."""
+
+    rate, block, drive_channels, sensed_channels = 5000.0, 1, 2, 0
+
+    def __init__(self, argument="", *, drive_per_full_scale=3.0, delay=1, profile=None):
+        self.argument, self.scale, self.delay, self.profile = argument, drive_per_full_scale, delay, profile
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *exc):
+        pass
+
+    def play(self, drive):
+        return hr.Sensed(np.empty((1, 0)))
+
+    @classmethod
+    def found(cls):
+        return ["7  a box on the bench, 2 out", "9"]
+
+
+NOT_CALLABLE = 3
+
+
+def test_a_text_makes_a_driver(tmp_path):
+    assert open_driver("simulated") is None
+    assert open_driver(f"wavefile:{tmp_path / 'a:b.wav'}").path == tmp_path / "a:b.wav"  # only the first colon counts
+    assert open_driver("test_devices:Calibrated").argument == ""
+    assert open_driver("test_devices:Calibrated:a:b").argument == "a:b"
+
+
+def test_a_driver_gets_what_it_names_of_its_profile_and_no_more():
+    profile = hr.DeviceProfile(kind="vt-plate", calibration={"drive_per_full_scale": 2.0, "gain_uncertainty": 0.1})
+    made = open_driver("test_devices:Calibrated", profile)
+    assert (made.scale, made.delay, made.profile) == (2.0, 1, profile)  # no delay was measured: its own
+    assert open_driver("other_plate:OtherPlate", profile).rate == 5000.0  # names none
+
+
+REFUSED = [
+    ("tea", ValueError, "driver 'tea' is not installed: must be one of .*simulated.*; or NAME, NAME:ARGUMENT"),
+    ("tea:cup", ValueError, "driver = 'tea:cup': No module named 'tea'; installed are .*wavefile"),
+    ("test_devices:Tea", ValueError, "has no attribute 'Tea'"),
+    ("test_devices:NOT_CALLABLE", ValueError, "NOT_CALLABLE is a int: must be a class or a function"),
+    ("wavefile", ValueError, "driver = 'wavefile': .*missing.*path.*give its argument as wavefile:ARGUMENT"),
+    ("wavefile:a.tea", ValueError, "ending '.tea' must be one of .wav"),
+]
+
+
+@pytest.mark.parametrize(("text", "error", "message"), REFUSED, ids=[each[0] for each in REFUSED])
+def test_a_text_that_names_no_driver_is_refused_with_what_there_is(text, error, message):
+    with pytest.raises(error, match=message):
+        open_driver(text)
+
+
+def test_a_missing_package_is_named_with_the_command_that_installs_it(tmp_path, monkeypatch):
+    (tmp_path / "my_card.py").write_text("import sounddevice\n\nclass Card:\n    pass\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setitem(sys.modules, "sounddevice", None)
+    with pytest.raises(ValueError, match=r'sounddevice.*to get it: pip install "hapticrender\[audio\]"'):
+        open_driver("my_card:Card")
+
+
+def test_a_module_of_ones_own_that_fails_is_named(tmp_path, monkeypatch):
+    (tmp_path / "my_driver.py").write_text("1 / 0")
+    monkeypatch.syspath_prepend(tmp_path)
+    with pytest.raises(hr.HapticError, match="my_driver cannot be loaded: ZeroDivisionError"):
+        open_driver("my_driver:Driver")
+
+
+def test_python_takes_the_same_texts(tmp_path):
+    """The drive in the file is that of the driver's object."""
+    played = tmp_path / "played.wav"
+    recording = hr.render(TONE, driver=f"wavefile:{played}")
+    from hapticrender.drivers.wavefile import read_back
+
+    np.testing.assert_allclose(read_back(played)[: len(recording)], recording.drive, rtol=0, atol=3.0 * 2.0**-24)
+    own = hr.render(TONE, driver="other_plate:OtherPlate")
+    np.testing.assert_array_equal(own.drive, hr.render(TONE, driver=OtherPlate()).drive)
+    np.testing.assert_array_equal(hr.render(TONE, driver="simulated").drive, hr.render(TONE).drive)
+
+
+def test_the_command_line_finds_a_driver_in_its_own_folder(tmp_path, monkeypatch, capsys):
+    """For render and validate; identify is in test_identify.py."""
+    (tmp_path / "bench.py").write_text(
+        "from other_plate import OtherPlate\n\n\ndef plate():\n    return OtherPlate()\n"
+    )
+    (tmp_path / "tone.toml").write_text(hr.Scene(texture=TONE.texture, duration=3.0).to_toml())
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", [path for path in sys.path if path])
+    assert cli.main(["render", "tone.toml", "--out", "out", "--driver", "bench:plate"]) == 0
+    assert cli.main(["validate", "tone.toml", "tone.toml", "--driver", "bench:plate"]) == 0
+    assert capsys.readouterr().out.count("within 10 %") == 2
+    assert cli.main(["validate", "tone.toml", "--driver", "bench:plate", "--jobs", "2"]) == 2
+    assert "must be 1 process where driver = 'bench:plate'" in capsys.readouterr().err
+    assert cli.main(["validate", "--suite", "accuracy", "--driver", "bench:plate"]) == 2
+    assert "--suite runs no scenes, on simulated devices" in capsys.readouterr().err
+
+
+class Entry:
+    """An entry point of a driver."""
+
+    def __init__(self, name, value):
+        self.name, self.value, self.group = name, f"there:{name}", "hapticrender.drivers"
+        self._value = value
+
+    def load(self):
+        return self._value
+
+
+def test_devices_shows_what_each_driver_finds(monkeypatch):
+    class Broken(Calibrated):
+        @classmethod
+        def found(cls):
+            raise OSError("PortAudio library not found")
+
+    class Empty(Calibrated):
+        @classmethod
+        def found(cls):
+            return []
+
+    kinds = {"box": Calibrated, "card": Broken, "none": Empty, "plain": OtherPlate}
+    points = [Entry(name, kind) for name, kind in kinds.items()]
+    known = devices.entry_points
+    monkeypatch.setattr(
+        devices, "entry_points", lambda group: points if group.endswith("drivers") else known(group=group)
+    )
+    lines = [" ".join(line.split()) for line in devices.text().splitlines()]
+    assert "box:7 a box on the bench, 2 out" in lines
+    assert "box:9" in lines
+    assert "none: none" in lines
+    (card,) = [line for line in lines if line.startswith("card:")]
+    assert card.endswith(
+        "(OSError: PortAudio library not found; to get it: install PortAudio (Debian: apt-get install libportaudio2))"
+    )
+    assert not [line for line in lines if line.startswith("plain:")]
+
+
+def test_serial_ports_and_cards_are_found_where_a_driver_has_no_search(monkeypatch):
+    """The ports of this machine, as pyserial lists them; the cards as sounddevice does, where it is installed."""
+    from serial.tools.list_ports import comports
+
+    points = [Entry("serial", OtherPlate), Entry("audio", OtherPlate)]
+    known = devices.entry_points
+    monkeypatch.setattr(
+        devices, "entry_points", lambda group: points if group.endswith("drivers") else known(group=group)
+    )
+    lines = devices.text().splitlines()
+    ports = [line.split()[0].partition(":")[2] for line in lines if line.startswith("serial:")]
+    assert ports == ([port.device for port in comports()] or [""])
+    assert [line for line in lines if line.startswith("audio:")]
