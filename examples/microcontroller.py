@@ -1,7 +1,8 @@
 """A grating played by a microcontroller: its firmware, built for this machine, behind a serial line.
 
-It needs make and a C compiler.  The firmware is what `hapticrender export` writes; `hardware_posix.c` puts a plate model
-where a board has converters.  The figure is the amplitude (m) of the grating under a sliding finger, by the board's sensors.
+It needs make and a C compiler.  The firmware is what `hapticrender export` writes; `hardware_posix.c` puts a plate
+model where a board has converters.  The figure is the amplitude (m) of the grating under a sliding finger, by the
+board's sensors.
 """
 
 import subprocess
