@@ -209,11 +209,7 @@ class Player:
         with self._lock:
             self._check()
             if self._loop is None:
-                scene = self._scene(texture)
-                driver = (
-                    open_driver(self._driver, scene.device_profile) if isinstance(self._driver, str) else self._driver
-                )
-                self._start(prepare(scene, driver=driver.live() if hasattr(driver, "live") else driver))
+                self._begin(self._scene(texture))
                 return
             owned = self._loop.rendering.plant is not None and not self._loop.whole
             rendering = open_scene(self._scene(texture), driver=None if owned else self._loop.rendering.device)
