@@ -1,7 +1,7 @@
 # Every verb works from a fresh clone: the environment is made, and made anew only when pyproject.toml changes.
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test audio-test test-oldest lint bench charts paper docs clean
+.PHONY: help demo test audio-test board-test test-oldest lint bench charts paper docs clean
 .DELETE_ON_ERROR:
 
 # The first interpreter that runs, is new enough and can make an environment; override with PYTHON=/path/to/python.
@@ -13,6 +13,9 @@ OUT := out/demo
 OLDEST = $(shell sed -n 's/^dependencies = \[\(.*\)\]/\1/p' pyproject.toml | tr -d '",' | sed 's/>=/==/g')
 OLDEST_TESTS := $(addprefix tests/test_,$(addsuffix .py,math vectors kernel blocks plate contact low_pass realtime combined))
 AUDIO := jackd2 libportaudio2 libjack-jackd2-dev gcc libc6-dev
+BOARD_PACKAGES := gcc make gcc-arm-none-eabi libnewlib-arm-none-eabi qemu-system-arm
+BOARD_TOOLS := { command -v gcc && command -v arm-none-eabi-gcc && command -v qemu-system-arm; } > /dev/null
+BOARD_TESTS := $(addprefix tests/test_,firmware_law.py protocol.py serial_driver.py)
 API := hapticrender $(addprefix hapticrender.,loop latency sweep realtime skin validate protocols bands errors touch recordings \
 	control plants renderers drivers)
 
@@ -34,6 +37,11 @@ audio-test: .venv/test.stamp ## run the sound-card driver on a JACK server, with
 
 test-oldest: .venv-oldest/made.stamp ## run the kernels' tests on the oldest numba, numpy and scipy that pyproject.toml allows
 	@MPLBACKEND=Agg .venv-oldest/bin/python -m pytest $(wildcard $(OLDEST_TESTS)) $(PYTEST_ARGS)
+
+board-test: .venv/test.stamp ## run the firmware's tests, on an emulated Cortex-M4 too (installs its compiler and QEMU where it may)
+	@$(BOARD_TOOLS) || { test "$$(id -u)" = 0 && apt-get install --yes --quiet $(BOARD_PACKAGES); } || \
+		echo "no Cortex-M4 here: its tests are skipped; to get it: sudo apt-get install $(BOARD_PACKAGES)" >&2
+	@MPLBACKEND=Agg $(RUN) -m pytest $(BOARD_TESTS) -rs $(PYTEST_ARGS)
 
 lint: .venv/test.stamp ## check style, formatting and types
 	@$(RUN) -m ruff check .

@@ -80,7 +80,7 @@ def sources() -> list[Path]:
 
 def board_design(rendering: Rendering, bands: int = 0) -> tuple[dict[str, int], dict[str, Any]]:
     """Return sizes (in design.h) and fields of `design_t` for a rendering's controller; see `export` for the errors."""
-    controller = rendering.controller()
+    controller: Any = rendering.controller()
     controller = getattr(controller, "controller", controller)  # without its supervisor
     most = _checked(rendering, controller, bands)
     settings, law, model = controller.settings, controller.law, rendering.model
@@ -129,8 +129,8 @@ def _checked(rendering: Rendering, controller: Any, bands: int) -> int:
     if scene.method != "inverse":
         raise ValueError(f'method = {scene.method!r}: a board plays "inverse" only, the default')
     if not isinstance(controller, WaveformController):
-        cure = "leave `carriers` out, so that the waveform is played whole, or choose carriers <= 0.24 of the rate"
-        raise ValueError(f"texture {type(scene.texture).__name__}: a board cannot play these carriers: {cure}")
+        playable = "a whole waveform, without `carriers`, or bands of constant amplitude up to 0.24 of the rate"
+        raise ValueError(f"texture {type(scene.texture).__name__}: a board plays {playable}")
     if rendering.bands.modulated or rendering.bands.differentiated:
         raise ValueError("the target is modulated, or a velocity: a board plays displacements of constant amplitude")
     if model.delay > MOST_DELAY:

@@ -367,8 +367,8 @@ def test_export_refuses_what_a_board_cannot_play(exports):
         refused(device="electroadhesion", texture=hr.Grating(velocity=8e-3, frequency=80.0), finger=FINGERS["sweep"])
     with pytest.raises(ValueError, match="method = 'h2': a board plays \"inverse\" only"):
         refused(method="h2")
-    with pytest.raises(ValueError, match="cannot play these carriers: leave `carriers` out"):
-        refused(texture=hr.Synthetic(amplitude=20e-6, speed=0.08, carriers=2), finger=FINGERS["sweep"])
+    with pytest.raises(ValueError, match="texture Synthetic: a board plays a whole waveform, without `carriers`"):
+        refused(texture=hr.Synthetic(amplitude=20e-6, speed=0.08), finger=FINGERS["sweep"])
     with pytest.raises(ValueError, match="delay = 65 samples: must be <= 64"):
         refused(profile={"delay": 65})
     rendering = exports.rendering("tones")
@@ -429,14 +429,14 @@ def bank(count):
 
 
 def test_eight_bands_leave_a_third_of_a_cortex_m4(tmp_path):
-    """At 168 MHz and 5 kHz a sample has 33 600 cycles; an instruction takes 1.5 of them (benchmarks/board.py).
+    """At 168 MHz and 5 kHz a sample has 33 600 cycles; an instruction takes at most 1.6 (benchmarks/board.py: 1.51).
 
     The mean while a contact is new is the most that a law takes for long.
     """
     found = measured(built(tmp_path, bank(8), "measure-m4.elf"))
     assert found["nops"][0] == pytest.approx(1000.0, abs=1.0), "instructions are not what is counted"
-    assert 1.5 * found["new"][0] < 168e6 / 5000 * 2 / 3
-    assert 1.5 * found["most"][0] < 168e6 / 5000
+    assert 1.6 * found["new"][0] < 168e6 / 5000 * 2 / 3
+    assert 1.6 * found["most"][0] < 168e6 / 5000
     assert found["free"][0] < found["touched"][0] < found["new"][0] < found["most"][0]
     assert found["flags"] == [0.0]
 
@@ -452,7 +452,7 @@ def test_a_cortex_m4_measures_what_is_asked(exports, tmp_path):
     wanted, found = complex(re_wanted, im_wanted), complex(re_found, im_found)
     assert abs(wanted) == pytest.approx(abs(rendering.bands.envelope[1]) * 1e6, rel=1e-3)
     assert abs(found - wanted) < 0.02 * abs(wanted) + 3 * 0.7 * np.sqrt(4 * np.pi * 10.0 / RATE)
-    assert lines["state"] == [float(exports.law("tones", "float").state.size)]
+    assert 0 <= exports.law("tones", "float").state.size - lines["state"][0] <= 8, "more than a shorter pointer"
 
 
 def test_the_board_on_a_cortex_m4_speaks_to_the_host(exports, tmp_path):

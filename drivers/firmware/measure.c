@@ -9,8 +9,10 @@
 #include "law.h"
 #include "plate.h"
 
+#ifndef SAMPLES
 #define SAMPLES 3000u
 #define LANDS 500u   /* sample at which the finger lands; the initial motion of a contact is learned for 0.16 s */
+#endif
 #define SPEED 0.08   /* m/s */
 #define LOAD 0.4     /* N */
 #define NOPS 1000u
