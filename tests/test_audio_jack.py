@@ -117,7 +117,7 @@ def shares(played, sensed, shift, pieces=10):
 def test_play_keeps_its_delay_when_python_is_late(connected, rng):
     """Noise out and back through a straight device, while Python sleeps for 30 blocks: flagged, and as late as before.
 
-    The medians bear with samples that a busy machine loses, which are flagged.
+    At any other delay two samples in 100 000 are equal by chance; more than half bears with what a busy machine loses.
     """
     connected(jack_ring.straight())
     played, sensed, flags = rng.uniform(-0.5, 0.5, (800, BLOCK, 2)), [], []
@@ -137,7 +137,7 @@ def test_play_keeps_its_delay_when_python_is_late(connected, rng):
         shares(played[part].reshape(-1, 2), np.concatenate(sensed[part]), shift)
         for part in (slice(0, 400), slice(405, 800))
     )
-    assert np.median(before) == np.median(after) == 1.0
+    assert min(np.median(before), np.median(after)) > 0.5
 
 
 def test_what_python_asks_beyond_full_scale_is_cut_and_flagged(connected):
