@@ -352,7 +352,8 @@ class Player:
         stack.enter_context(rendering.driver)
         stack.enter_context(zero_drive_after(device))
         if rendering.probe:
-            probe_plate(device, rendering.model)
+            late = getattr(device, "queued", 0)  # what `play` of a device that calls back adds to its delay
+            probe_plate(device, replace(rendering.model, delay=rendering.model.delay + late))
         self._loop = loop
         loop.set_gain(self._gain)
         if self._spoken:
