@@ -265,7 +265,7 @@ class LiveAudioDriver(AudioDriver):
     """A sound card that calls a compiled controller back: between `start` and `stop` nothing waits for Python.
 
     `delay` is the card's own, for which the controller is designed.  While none runs `play` can be used, for a probe;
-    its delay is longer by `queued`.
+    its delay is `play_delay`.
     """
 
     _entry: Any = None
@@ -279,6 +279,11 @@ class LiveAudioDriver(AudioDriver):
     @delay.setter
     def delay(self, samples: int) -> None:
         self._samples = samples
+
+    @property
+    def play_delay(self) -> int:
+        """Delay of `play` (samples)."""
+        return self.delay + self.queued
 
     def start(self, entry: Any) -> None:
         """Let the card call a compiled controller back until `stop`.
