@@ -304,8 +304,9 @@ class LiveAudioDriver(AudioDriver):
             raise DriverError(f"{self}: start: it is {self._state if self._state != 'open' else 'running already'}")
         own = self.block, self.sensed_channels, self.drive_channels
         theirs = entry.block, entry.controller.sensors, entry.controller.channels
-        if own != theirs:
-            raise ValueError(f"entry: (block, sensors, drive channels) is {theirs}: must be the driver's, {own}")
+        if self.block % entry.block or own[1:] != theirs[1:]:
+            bound = f"must be the driver's, {own}, or a part of its block"
+            raise ValueError(f"entry: (block, sensors, drive channels) is {theirs}: {bound}")
         address = entry.address  # compiled here
         self._relay.rest()
         self._settle()

@@ -352,8 +352,7 @@ class Player:
         stack.enter_context(rendering.driver)
         stack.enter_context(zero_drive_after(device))
         if rendering.probe:
-            late = getattr(device, "queued", 0)  # what `play` of a device that calls back adds to its delay
-            probe_plate(device, replace(rendering.model, delay=rendering.model.delay + late))
+            probe_plate(device, rendering.model)
         self._loop = loop
         loop.set_gain(self._gain)
         if self._spoken:

@@ -34,7 +34,6 @@ def test_textures_change_under_the_callback(tmp_path):
     # by the sensors: 1 um of noise at two ends, over 12 000 samples, is 0.01 um; the law's 1 % and 2 % are what it must
     assert tone.error < 0.02
     assert other.error < 0.02
-    assert first.lost == second.lost == 0
     assert np.isfinite(first.load)
     # the truth: the last second of 180 Hz before the end
     end = len(np.fromfile(tmp_path / "before", np.float32)) // 4
