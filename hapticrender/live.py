@@ -187,6 +187,7 @@ def joint_model(old: DeviceModel, new: DeviceModel) -> DeviceModel:
     return replace(new, demand=demand, drive_limit=max(old.drive_limit, new.drive_limit))
 
 
+@np.errstate(under="ignore")
 def band_figures(bands: Bands, first: int, rate: float, signals: dict[str, Array]) -> list[Row]:
     """Frequency (Hz), target, achieved amplitude and relative error of every band, by least squares; see `Row`.
 

@@ -183,6 +183,7 @@ def test_the_delay_is_the_cards_and_that_of_play():
     assert (driver.delay, driver.sensed_channels) == (144 + driver.queued, 2)
     live = driver.live()
     assert isinstance(live, LiveAudioDriver)
+    assert live.play_delay == driver.delay
     assert (live.delay, live.sensed_channels, live.sensed_scale, live.drive_scale) == (144, 2, 1e-3, 1 / 3)
     assert AudioDriver("0", delay=143.4, sensed_per_full_scale=1e-3).live().delay == 143
     assert AudioDriver("0", delay=64, sensed_per_full_scale=1e-3).live().delay == 64
