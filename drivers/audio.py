@@ -265,7 +265,7 @@ class LiveAudioDriver(AudioDriver):
     """A sound card that calls a compiled controller back: between `start` and `stop` nothing waits for Python.
 
     `delay` is the card's own, for which the controller is designed.  While none runs `play` can be used, for a probe;
-    its delay is longer by `queued`.
+    its delay is `play_delay`.
     """
 
     _entry: Any = None
@@ -279,6 +279,11 @@ class LiveAudioDriver(AudioDriver):
     @delay.setter
     def delay(self, samples: int) -> None:
         self._samples = samples
+
+    @property
+    def play_delay(self) -> int:
+        """Delay of `play` (samples)."""
+        return self.delay + self.queued
 
     def start(self, entry: Any) -> None:
         """Let the card call a compiled controller back until `stop`.
@@ -299,8 +304,9 @@ class LiveAudioDriver(AudioDriver):
             raise DriverError(f"{self}: start: it is {self._state if self._state != 'open' else 'running already'}")
         own = self.block, self.sensed_channels, self.drive_channels
         theirs = entry.block, entry.controller.sensors, entry.controller.channels
-        if own != theirs:
-            raise ValueError(f"entry: (block, sensors, drive channels) is {theirs}: must be the driver's, {own}")
+        if self.block % entry.block or own[1:] != theirs[1:]:
+            bound = f"must be the driver's, {own}, or a part of its block"
+            raise ValueError(f"entry: (block, sensors, drive channels) is {theirs}: {bound}")
         address = entry.address  # compiled here
         self._relay.rest()
         self._settle()

@@ -20,6 +20,8 @@ A driver carries samples to a device, a file or a plant model, and back.  Any ob
     relative uncertainty of the sensors' gain (0.01 is 1 %), which the verdict adds to its figures
 ``probe`` (optional)
     False where the start-up probe of a plate is to be left out (docs/safety.md)
+``play_delay`` (optional)
+    delay of `play`, where `delay` is that of a callback which plays a compiled controller (`start`, `stop`)
 ``exchange(controller)`` (optional)
     a whole closed loop of its own, sample by sample; see ``protocols.Exchange``
 ``found()`` (optional, class method)

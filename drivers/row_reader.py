@@ -61,6 +61,13 @@ class RowReader:
         found, self._rows = self._rows[:count], self._rows[count:]
         return np.array(found)
 
+    def arrived(self) -> Array:
+        """Return the rows that have arrived and were not taken, see `take`; none is waited for."""
+        for block in self._client.rows():
+            self._append(block)
+        found, self._rows = self._rows, []
+        return np.array(found)
+
     def _append(self, block: protocol.Stream) -> None:
         rows = np.array(block.rows)
         missing = 0 if self._next is None else (block.first - self._next) % WRAP // self._stride

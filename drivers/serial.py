@@ -16,9 +16,10 @@ from hapticrender.bands import Bands
 from hapticrender.drivers.base import BaseDriver
 from hapticrender.drivers.board_client import BoardClient as BoardClient
 from hapticrender.drivers.board_line import Line as Line
+from hapticrender.drivers.board_loop import BoardLoop
 from hapticrender.drivers.row_reader import RowReader
 from hapticrender.errors import DriverError
-from hapticrender.protocols import Array, Controller, Exchange, Sensed
+from hapticrender.protocols import Array, Controller, Exchange, Rendering, Sensed
 
 
 class Trajectory(Protocol):
@@ -37,7 +38,8 @@ class SerialDriver(BaseDriver):
     """Plays a scene on a board whose firmware was exported for its device, in closed loop on the board.
 
     The board has its own law, of method "inverse"; `render` sends it the bands of the scene and records what it streams
-    back.  A board senses no finger: `finger` is where the host says it is.
+    back, every sample: 140 kB/s at 5 kHz, as USB carries.  On a slower line samples are missing, with `Flag.OVERRUN`.
+    A board senses no finger: `finger` is where the host says it is.
 
     Parameters
     ----------
@@ -48,7 +50,7 @@ class SerialDriver(BaseDriver):
     block : int, >= 1
         1: closed loop on the board.  More: drive from the host, a block a call, for identification; what it computes
         from a block acts two blocks later.
-    options
+    **options
         Of `BoardClient`.
     """
 
@@ -94,6 +96,10 @@ class SerialDriver(BaseDriver):
 
         return advance
 
+    def loop(self, rendering: Rendering) -> BoardLoop:
+        """Return a loop of the board's own for live play, see `hapticrender.Player`."""
+        return BoardLoop(rendering, self)
+
     def _begin(self, bands: Bands) -> None:
         client = self.client
         client.set_bands(bands)
@@ -116,12 +122,14 @@ class SerialDriver(BaseDriver):
         reader = self._reader
         if reader is None:
             raise DriverError(f"{self}: exchange: it has not begun")
-        drive, sensed, position, load, flags = self._columns(reader.take(count))
+        drive, sensed, position, load, flags = self.columns(reader.take(count))
         target = np.tile(np.asarray(bands.envelope, complex), (count, 1))
         target[np.isnan(position)[:, None] & (bands.wavenumber > 0.0)] = 0.0
         return drive, target, flags, Sensed(sensed, position=position, normal_load=load, flags=flags)
 
-    def _columns(self, rows: Array) -> tuple[Array, Array, Array, Array, Array]:
+    def columns(self, rows: Array) -> tuple[Array, Array, Array, Array, Array]:
+        """Part rows (n, columns) into drive (A), sensed (m), position (m), load (N) and flags."""
+        rows = rows.reshape(-1, self.drive_channels + self.sensed_channels + 3)
         a, b = self.drive_channels, self.drive_channels + self.sensed_channels
         return rows[:, :a], rows[:, a:b], rows[:, b], rows[:, b + 1], rows[:, b + 2].astype(np.int64)
 
@@ -140,7 +148,7 @@ class SerialDriver(BaseDriver):
             self._sent = len(drive)
         client.queue(self._sent, drive)
         self._sent += len(drive)
-        _, sensed, _, _, flags = self._columns(self._reader.take(self.block))
+        _, sensed, _, _, flags = self.columns(self._reader.take(self.block))
         return Sensed(sensed, flags=flags)
 
     def close(self) -> None:

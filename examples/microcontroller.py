@@ -1,7 +1,8 @@
 """A grating played by a microcontroller: its firmware, built for this machine, behind a serial line.
 
-The firmware is what `hapticrender export` writes; `hardware_posix.c` puts a plate model where a board has converters.
-The figure is the amplitude (m) of the grating under a sliding finger, by the board's sensors.
+It needs make and a C compiler.  The firmware is what `hapticrender export` writes; `hardware_posix.c` puts a plate
+model where a board has converters.  The figure is the amplitude (m) of the grating under a sliding finger, by the
+board's sensors.
 """
 
 import subprocess
@@ -13,9 +14,7 @@ import hapticrender as hr
 from hapticrender.drivers.serial import SerialDriver
 from hapticrender.export import export
 
-SOURCES = "board board_commands board_telemetry frames law learning carriers design hardware_posix plate".split()
-SLOWER = 4
-FLAGS = "-std=c99 -Wall -Wextra -Werror -pedantic -O2 -ffp-contract=off".split()
+SLOWER = 4  # times
 
 
 class SlowClock:
@@ -31,10 +30,8 @@ class SlowClock:
 def build(scene: hr.Scene, folder: Path) -> Path:
     """Firmware for the device of the scene, as a program."""
     export(hr.prepare(scene), folder)
-    program = folder / "board"
-    sources = [str(folder / f"{name}.c") for name in SOURCES]
-    subprocess.run(["cc", *FLAGS, "-o", str(program), *sources, "-lm"], check=True)
-    return program
+    subprocess.run(["make", "--silent", "-C", str(folder), "board"], check=True)
+    return folder / "board"
 
 
 def main() -> float:

@@ -24,13 +24,13 @@ import numpy as np
 from hapticrender.errors import DriverError
 from hapticrender.protocols import Array, Flag
 
-BURST, TAIL = 0.1, 0.5  # s: noise that is played; after it, the longest round trip that can be found
-FEWEST = 4096  # samples of a burst
+BURST, TAIL = 0.05, 0.5  # s: noise that is played; after it, the longest round trip that can be found
+FEWEST = 2048  # samples of a burst
 BAND = (0.05, 0.4)  # of the rate
 LEAST_CORRELATION = 0.5  # of what is sensed with what was played
 MOST_SPREAD = 0.5  # samples, between runs
 NEW_PROFILE = '[profile]\nkind = "vt-plate"  # or electroadhesion, ultrasonic, hybrid\n'
-TRIES = 3  # times as many runs as asked for, where samples are lost
+TRIES = 10  # times as many runs as asked for, where samples are lost
 
 
 class Trip(NamedTuple):

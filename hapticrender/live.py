@@ -187,6 +187,7 @@ def joint_model(old: DeviceModel, new: DeviceModel) -> DeviceModel:
     return replace(new, demand=demand, drive_limit=max(old.drive_limit, new.drive_limit))
 
 
+@np.errstate(under="ignore")
 def band_figures(bands: Bands, first: int, rate: float, signals: dict[str, Array]) -> list[Row]:
     """Frequency (Hz), target, achieved amplitude and relative error of every band, by least squares; see `Row`.
 
@@ -206,7 +207,12 @@ def band_figures(bands: Bands, first: int, rate: float, signals: dict[str, Array
     target, achieved = (found[: len(bands)] + 1j * found[len(bands) : -1]).T
     speed = np.nan_to_num(abs(np.diff(position))).mean() * rate if len(time) > 1 else 0.0
     rows = zip(bands.frequency + bands.wavenumber * speed, target, achieved, strict=True)
-    return [(float(f), abs(r), abs(y), _share(abs(y - r), abs(r))) for f, r, y in rows]
+    return [band_row(*row) for row in rows]
+
+
+def band_row(frequency: float, target: complex, achieved: complex) -> Row:
+    """Row of a band of `frequency` (Hz) with two complex amplitudes."""
+    return float(frequency), float(abs(target)), float(abs(achieved)), _share(abs(achieved - target), abs(target))
 
 
 def _share(error: float, target: float) -> float:

@@ -6,10 +6,12 @@
         print(player.state())
 
 Controller and renderers are those of `render`; what advances them block by block is the compiled entry of
-`hapticrender.realtime`.  A driver that calls back (it has `start` and `stop`) is handed the entry; any other is played
-by a thread.  On a plate a texture fades into the next one under the same controller, which keeps what it has learned of
-finger and device.  Where the law works by bands (most screens, ultrasonic surfaces) the old texture fades out, then the
-next one fades in under a controller of its own.
+`hapticrender.realtime`.  A driver that calls back (it has `start` and `stop`) is handed the entry; one whose controller
+runs on the device (it has `loop`) brings a loop of its own; any other is played by a thread.
+
+On a plate a texture fades into the next one under the same controller, which keeps what it has learned of finger and
+device.  Where the law works by bands (ultrasonic surfaces, hybrids) the old texture fades out, then the next one fades
+in under a controller of its own.
 """
 
 from __future__ import annotations
@@ -26,6 +28,7 @@ from typing import Any, Self
 import numpy as np
 
 from hapticrender.control.probe import probe_plate
+from hapticrender.devices import open_driver
 from hapticrender.errors import HapticError
 from hapticrender.live import LiveLoop
 from hapticrender.loop import open_scene, prepare, stopped_by_sigterm, zero_drive_after
@@ -165,14 +168,11 @@ class Player:
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
         """Zero drive, then close the device and the recording; a fault that nobody has seen is raised."""
-        if kind is None and self._error is None and self._loop is not None and self._paced:
-            self._loop.set_gain(0.0)
-            time.sleep(FADE_OUT)
-        self._silence()
-        self._stopping.set()
-        with ExitStack() as last:
+        with ExitStack() as last:  # from the last to the first, whatever fails
             last.callback(self._close_recorder)
             last.push(self._stack.pop_all())
+            last.callback(self._stopping.set)
+            last.callback(self._rest, kind is None)
         if kind is None and self._error is not None and not self._raised:
             raise self._error
 
@@ -209,7 +209,7 @@ class Player:
         with self._lock:
             self._check()
             if self._loop is None:
-                self._start(prepare(self._scene(texture), driver=self._driver))
+                self._begin(self._scene(texture))
                 return
             owned = self._loop.rendering.plant is not None and not self._loop.whole
             rendering = open_scene(self._scene(texture), driver=None if owned else self._loop.rendering.device)
@@ -330,12 +330,19 @@ class Player:
     def _now(self) -> float:
         return time.monotonic() if self._paced else self.time
 
+    def _begin(self, scene: Scene) -> None:
+        """Make the driver, and start the device with the scene's texture."""
+        driver: Any = self._driver
+        if isinstance(driver, str):
+            driver = open_driver(driver, scene.device_profile)
+        self._start(prepare(scene, driver=driver.live() if hasattr(driver, "live") else driver))
+
     def _start(self, rendering: Rendering) -> None:
         """Open the device at rest, probe it, and play."""
-        device, stack = rendering.device, self._stack
-        calls_back = hasattr(device, "start") and rendering.driver is device
+        device, stack, direct = rendering.device, self._stack, rendering.driver is rendering.device
+        calls_back, own = hasattr(device, "start") and direct, hasattr(device, "loop") and direct
         scales = {name: getattr(device, name) for name in ("sensed_scale", "drive_scale")} if calls_back else {}
-        loop = LiveLoop(rendering, **scales)
+        loop: Any = device.loop(rendering) if own else LiveLoop(rendering, **scales)  # type: ignore[attr-defined]
         self._hand_finger(rendering)
         if rendering.plant is not None:
             device.paced = self._paced  # type: ignore[attr-defined]
@@ -353,10 +360,12 @@ class Player:
         if calls_back:
             device.start(loop.entry)  # type: ignore[attr-defined]
             stack.callback(device.stop)  # type: ignore[attr-defined]
+        elif own:
+            loop.start()
+        elif self._paced:
+            self._run_thread(self._drive_device)
         if self._paced:
             self._run_thread(self._serve)
-        if self._paced and not calls_back:
-            self._run_thread(self._drive_device)
 
     def _hand_finger(self, rendering: Rendering) -> None:
         """Put the finger that the application moves on a simulated device."""
@@ -423,8 +432,8 @@ class Player:
         while not self._stopping.wait(POINTING):
             with self._lock:
                 self._point()
-                if self.time - self._served >= SERVICE or self._stopping.is_set():
-                    self._served = self.time
+                if time.monotonic() - self._served >= SERVICE:
+                    self._served = time.monotonic()
                     self._service()
 
     def _point(self) -> None:
@@ -450,17 +459,23 @@ class Player:
         if self._error is None and (fault := loop.fault()):
             self._error = fault
 
-    def _silence(self) -> None:
-        """Set zero drive, and wait until a whole block of it has been played, where the device still plays."""
+    def _rest(self, gently: bool) -> None:
+        """Set zero drive, after a fade where nothing has failed, and wait until a whole block of it has been played."""
         loop = self._loop
         if loop is None:
             return
+        running = self._paced and self._error is None
+        if gently and running:
+            loop.set_gain(0.0)
+            time.sleep(FADE_OUT)
         loop.silence()
         end, limit = loop.samples + 2 * loop.driver.block, time.monotonic() + FADE_OUT
-        while self._paced and self._error is None and loop.samples < end and time.monotonic() < limit:
+        while running and loop.samples < end and time.monotonic() < limit:
             time.sleep(1e-3)
+        with self._lock:
+            if self._error is None:
+                self._service()
 
     def _close_recorder(self) -> None:
         if self._recorder is not None:
-            self._service()
             self._recorder.close()

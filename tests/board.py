@@ -1,14 +1,21 @@
 """The board as a real process behind a pseudo-terminal: built, run by the clock, or stepped through a faulty line."""
 
+import functools
 import os
 import select
 import shutil
 import subprocess
+import tempfile
 import time
 from pathlib import Path
 
 import numpy as np
 import pytest
+
+import hapticrender as hr
+from hapticrender.bands import Bands
+from hapticrender.drivers.serial import BoardClient, SerialDriver
+from hapticrender.export import export
 
 ROOT = Path(__file__).resolve().parent.parent
 FIRMWARE = ROOT / "drivers" / "firmware"
@@ -16,6 +23,10 @@ STRICT = ("-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic", "-ffp-contract
 SANITISED = ("-O1", "-g", "-fsanitize=address,undefined", "-fno-sanitize-recover=all")
 SOURCES = "board board_commands board_telemetry frames plate hardware_posix law learning carriers".split()
 RATE = 5000.0  # Hz
+MECHANICS = "heavy-2nd-order"
+FINGER = hr.Finger.swiping(frequency=0.8, stroke=0.05, normal_load=0.4, mechanics=MECHANICS)
+SCENE = hr.Scene(texture=hr.Grating(wavelength=1e-3, amplitude=10e-6), finger=FINGER, duration=2.0, tolerance=0.1)
+FOLDERS = []  # of programs, deleted at the end
 SLOWER = 5  # times, so that a busy machine may pause the host for 0.4 s: 80 ms of the board's clock
 SLOW = "--slow", str(SLOWER)
 
@@ -31,10 +42,16 @@ def compile_c(out, sources, *options):
 
 def build_board(folder, rendering, *options, bands=0):
     """Program of the board with the design of a rendering."""
-    from hapticrender.export import export
-
     export(rendering, folder, bands=bands, force=True)
     return compile_c(folder / "board", [folder / f"{name}.c" for name in (*SOURCES, "design")], *options)
+
+
+@functools.cache
+def program_of(*options):
+    """Program of a board with the design of `SCENE`, built once."""
+    folder = tempfile.TemporaryDirectory(prefix="board")
+    FOLDERS.append(folder)
+    return build_board(Path(folder.name), hr.prepare(SCENE), *options)
 
 
 class SlowClock:
@@ -77,6 +94,16 @@ class BoardProcess:
             if pipe is not None:
                 pipe.close()
         self.kill()
+
+
+def slow_board(folder):
+    """A board that is paced by a slow clock."""
+    return BoardProcess(program_of("-O2"), folder, *SLOW)
+
+
+def slow_client(board, **options):
+    """A client with a thread and the same clock."""
+    return BoardClient(str(board.port), clock=SlowClock(), **options)
 
 
 class SteppedBoard:
@@ -176,3 +203,32 @@ class Faults:
             flipped = bytes([data[at] ^ int(self._rng.integers(1, 256))])
             pieces[at] = (flipped, b"", 2 * pieces[at])[kind]
         return b"".join(pieces)
+
+
+def client_of(board, **options):
+    return BoardClient("stepped", background=False, clock=board, connect=board.connect, **options)
+
+
+def driver_of(board, **options):
+    return SerialDriver("stepped", background=False, clock=board, connect=board.connect, **options)
+
+
+def tones(*frequencies, amplitude=5e-6):
+    n = len(frequencies)
+    return Bands(frequency=frequencies, wavenumber=np.zeros(n), phase=np.zeros(n), envelope=np.full(n, amplitude))
+
+
+def run(client, board, seconds):
+    end = board.monotonic() + seconds
+    while board.monotonic() < end:
+        client.step()
+        board.sleep(0.005)
+
+
+def driven(log, start, stop):
+    """Samples from which on it drove between `start` and `stop`."""
+    changes = [(int(line[0]), line[2] == "1") for line in log if line[1] == "drives"]
+    ends = [sample for sample, _ in changes[1:]] + [2**62]
+    return [
+        sample for (sample, drives), end in zip(changes, ends, strict=True) if drives and sample < stop and end > start
+    ]

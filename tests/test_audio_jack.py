@@ -8,7 +8,8 @@ import os
 import subprocess
 import sys
 import time
-from contextlib import ExitStack
+from contextlib import ExitStack, nullcontext
+from dataclasses import replace
 from pathlib import Path
 
 import jack_ring
@@ -30,10 +31,12 @@ from jack_ring import (
 
 import hapticrender as hr
 from hapticrender.cli import main
+from hapticrender.control.probe import probe_plate
 from hapticrender.drivers import portaudio
 from hapticrender.drivers.audio import AudioDriver
-from hapticrender.errors import DeviceNotFound, DriverError
+from hapticrender.errors import DeviceFault, DeviceNotFound, DriverError
 from hapticrender.latency import measure_latency
+from hapticrender.plants.plate import PlateParameters
 from hapticrender.protocols import Flag
 
 pytestmark = pytest.mark.skipif(bool(jack_ring.missing()), reason=jack_ring.missing())
@@ -117,7 +120,7 @@ def shares(played, sensed, shift, pieces=10):
 def test_play_keeps_its_delay_when_python_is_late(connected, rng):
     """Noise out and back through a straight device, while Python sleeps for 30 blocks: flagged, and as late as before.
 
-    The medians bear with samples that a busy machine loses, which are flagged.
+    At any other delay two samples in 100 000 are equal by chance; more than half bears with what a busy machine loses.
     """
     connected(jack_ring.straight())
     played, sensed, flags = rng.uniform(-0.5, 0.5, (800, BLOCK, 2)), [], []
@@ -137,7 +140,7 @@ def test_play_keeps_its_delay_when_python_is_late(connected, rng):
         shares(played[part].reshape(-1, 2), np.concatenate(sensed[part]), shift)
         for part in (slice(0, 400), slice(405, 800))
     )
-    assert np.median(before) == np.median(after) == 1.0
+    assert min(np.median(before), np.median(after)) > 0.5
 
 
 def test_what_python_asks_beyond_full_scale_is_cut_and_flagged(connected):
@@ -183,6 +186,16 @@ def test_the_ring_is_closed_by_the_compiled_callback(connected, tmp_path):
     assert live.clipped == entry.refused == 0
     assert samples > 7500 * BLOCK
     assert_accurate(relative_errors(device, tmp_path / "record", last, samples))
+
+
+@pytest.mark.parametrize("wrong", [0, 3 * BLOCK])
+def test_a_live_card_is_probed_by_play(connected, wrong):
+    """Before the controller is started; the model has the delay of the callback, or one that is 4 ms longer."""
+    connected(jack_ring.plate(load=0.0), noise=NOISE / METRES)
+    with driver(delay=ROUND_TRIP + wrong).live() as live:
+        model = PlateParameters(rate=RATE).device_model(RATE, live.delay)
+        with pytest.raises(DeviceFault, match="refused by the start-up probe") if wrong else nullcontext():
+            probe_plate(live, replace(model, block=BLOCK))
 
 
 def test_the_phase_survives_an_overrun(connected, tmp_path):
@@ -258,7 +271,8 @@ def test_entries_that_do_not_fit_are_refused(connected):
 LOSE = """
 import signal
 import sys
-from contextlib import ExitStack
+from contextlib import ExitStack, nullcontext
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np

@@ -33,7 +33,7 @@ EXPECTED = {
     "microcontroller": (10e-6, 0.03 * 10e-6),
 }
 
-NEEDS = {"microcontroller": "cc"}  # a program; an example that cannot run is skipped
+NEEDS = {"microcontroller": ("make", "cc")}  # programs; an example that cannot run is skipped
 
 LONGEST = {"made_up_device": 80}  # lines: plant and renderer in one
 
@@ -51,8 +51,9 @@ def test_an_example_is_short_and_says_what_its_figure_is(name):
 
 @pytest.mark.parametrize("name", EXPECTED)
 def test_an_example_returns_its_figure(name, tmp_path):
-    if name in NEEDS and shutil.which(NEEDS[name]) is None:
-        pytest.skip(f"{name} needs {NEEDS[name]}: install a C compiler")
+    for program in NEEDS.get(name, ()):
+        if shutil.which(program) is None:
+            pytest.skip(f"{name} needs {program}: install make and a C compiler")
     done = subprocess.run(
         [sys.executable, "-W", "error", EXAMPLES / f"{name}.py"],
         capture_output=True,

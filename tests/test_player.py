@@ -384,3 +384,38 @@ def test_the_finger_of_a_scene_is_told_to_a_device_that_does_not_sense_it():
     off = abs(played["position"] - scene.finger.position(time))[1000:]
     assert np.median(off) < 1e-3  # a loaded machine says its words late
     assert np.isfinite(played["position"][1000:]).all()
+
+
+def test_a_board_plays_live(tmp_path):
+    """Textures, gain and finger go over the line; what the board measures comes back, and a recording of it."""
+    from board import SLOW, BoardProcess, SlowClock, build_board
+
+    from hapticrender.drivers.serial import SerialDriver
+
+    folder = tmp_path / "board"
+    program = build_board(folder, hr.prepare(hr.Scene(texture=TONE, duration=1.0)))
+    with BoardProcess(program, tmp_path, *SLOW) as board:
+        driver = SerialDriver(str(board.port), clock=SlowClock())
+        with hr.Player(driver=driver) as player:
+            player.play(TONE)
+            player.record(tmp_path / "board.au")
+            player.sleep(0.8)
+            [tone] = player.state().bands
+            player.play(hr.Grating(frequency=150.0, amplitude=4e-6))
+            player.gain = 0.5
+            player.sleep(0.8)
+            [other] = player.state().bands
+            with pytest.raises(ValueError, match="Chirp is a waveform"):
+                player.play(hr.Chirp(start=50.0, stop=100.0, duration=1.0, amplitude=1e-6))
+            recording = player.end_recording()
+    assert (tone.frequency, other.frequency) == (100.0, 150.0)
+    assert (tone.target, other.target) == pytest.approx((5e-6, 2e-6), rel=1e-3)
+    assert max(tone.error, other.error) < 0.2  # telemetry is of an instant, with 1 um of noise at each end
+    last = slice(-1500, None)
+    time = np.arange(len(recording))[last] / 5000.0
+    waves = np.stack([np.cos(2 * np.pi * 150.0 * time), np.sin(2 * np.pi * 150.0 * time), np.ones(1500)], axis=1)
+    parts = [
+        np.linalg.lstsq(waves, each[last], rcond=None)[0] for each in (recording.reference, recording.motion[:, 0])
+    ]
+    # 1 um of noise at two ends: 0.7 um sqrt(2/1500) = 0.026 um in each part, three times; the phase needs no fit
+    assert abs(parts[0] - parts[1])[:2].max() < 0.08e-6

@@ -8,6 +8,7 @@ parabola taken out of each sensor.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -58,11 +59,14 @@ class Found(NamedTuple):
 def probe_plate(driver: Driver, model: DeviceModel) -> None:
     """Probe an open plate of two actuators and two sensors up to three times, and leave it at rest.
 
+    It is probed by `play`, whose delay is longer than that of the model where the driver has a `play_delay`.
+
     Raises
     ------
     DeviceFault
         What is not as told was found in every try.
     """
+    model = replace(model, delay=model.delay + getattr(driver, "play_delay", driver.delay) - driver.delay)
     drive = probe_drive(model)
     found = []
     for _ in range(TRIES):
