@@ -13,7 +13,7 @@ OUT := out/demo
 OLDEST = $(shell sed -n 's/^dependencies = \[\(.*\)\]/\1/p' pyproject.toml | tr -d '",' | sed 's/>=/==/g')
 OLDEST_TESTS := $(addprefix tests/test_,$(addsuffix .py,math vectors kernel blocks plate contact low_pass realtime combined))
 AUDIO := jackd2 libportaudio2 libjack-jackd2-dev gcc libc6-dev
-BOARD_PACKAGES := gcc make gcc-arm-none-eabi libnewlib-arm-none-eabi qemu-system-arm
+BOARD := gcc libc6-dev make gcc-arm-none-eabi libnewlib-arm-none-eabi qemu-system-arm
 BOARD_TOOLS := { command -v gcc && command -v arm-none-eabi-gcc && command -v qemu-system-arm; } > /dev/null
 BOARD_TESTS := $(addprefix tests/test_,firmware_law.py protocol.py serial_driver.py)
 API := hapticrender $(addprefix hapticrender.,loop latency sweep realtime skin validate protocols bands errors touch recordings \
@@ -39,9 +39,11 @@ test-oldest: .venv-oldest/made.stamp ## run the kernels' tests on the oldest num
 	@MPLBACKEND=Agg .venv-oldest/bin/python -m pytest $(wildcard $(OLDEST_TESTS)) $(PYTEST_ARGS)
 
 board-test: .venv/test.stamp ## run the firmware's tests, on an emulated Cortex-M4 too (installs its compiler and QEMU where it may)
-	@$(BOARD_TOOLS) || { test "$$(id -u)" = 0 && apt-get install --yes --quiet $(BOARD_PACKAGES); } || \
-		echo "no Cortex-M4 here: its tests are skipped; to get it: sudo apt-get install $(BOARD_PACKAGES)" >&2
-	@MPLBACKEND=Agg $(RUN) -m pytest $(BOARD_TESTS) -rs $(PYTEST_ARGS)
+	@if ! $(BOARD_TOOLS); then if [ "$$(id -u)" = 0 ] && command -v apt-get >/dev/null; then \
+		echo "installing $(BOARD)"; apt-get update -qq; \
+		DEBIAN_FRONTEND=noninteractive apt-get install -qq -y --no-install-recommends $(BOARD) >/dev/null; \
+		else echo "tests on a Cortex-M4 are skipped; to run them: sudo apt-get install $(BOARD)" >&2; fi; fi
+	@$(RUN) -m pytest -rs $(BOARD_TESTS) $(PYTEST_ARGS)
 
 lint: .venv/test.stamp ## check style, formatting and types
 	@$(RUN) -m ruff check .

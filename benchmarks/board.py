@@ -111,7 +111,8 @@ def cycles_per_instruction(program):
 
 
 def build(folder, *options):
-    sources = "law learning carriers design plate measure measure_m4 startup_m4".split()
+    """Program that measures a design."""
+    sources = "law learning carriers supervisor design plate measure measure_m4 startup_m4".split()
     program = folder / "measure.elf"
     files = [f"{name}.c" for name in sources]
     command = [f"{PREFIX}gcc", *FLAGS.split(), *LINK.split(), *options, "-o", program, *files, "-lm"]
@@ -119,31 +120,34 @@ def build(folder, *options):
     return program
 
 
-def flash_of(folder):
-    """Bytes of code and tables of the law."""
-    parts = "law learning carriers design".split()
+def flash_of(folder, more):
+    """Bytes of code and tables of the law, and of one more part."""
+    parts = f"law learning carriers design {more}".split()
     subprocess.run([f"{PREFIX}gcc", *FLAGS.split(), "-c", *(f"{name}.c" for name in parts)], check=True, cwd=folder)
     objects = [f"{name}.o" for name in parts]
     sizes = subprocess.run([f"{PREFIX}size", *objects], check=True, cwd=folder, capture_output=True, text=True).stdout
     return sum(int(line.split()[0]) + int(line.split()[1]) for line in sizes.splitlines()[1:])
 
 
-def measure(name, texture):
-    """Print the row of a texture."""
+def measure(name, texture, *options):
+    """Print the row of a texture; RAM and flash are those of the law alone, or with its supervisor."""
     finger = hr.Finger.sliding(speed=0.08, normal_load=0.4)
     rendering = hr.prepare(hr.Scene(texture=texture, finger=finger, duration=1.0, keep_unfelt=True))
     with tempfile.TemporaryDirectory() as place:
         folder = Path(place)
         export(rendering, folder, bands=max(len(rendering.bands), 1))
-        done = subprocess.run([*MACHINE.split(), "-kernel", build(folder)], capture_output=True, text=True, check=True)
+        done = subprocess.run(
+            [*MACHINE.split(), "-kernel", build(folder, *options)], capture_output=True, text=True, check=True
+        )
         lines = (done.stdout + done.stderr).splitlines()  # semihosting's console is either
         counted = {words[0]: float(words[1]) for words in map(str.split, lines)}
-        ratio = cycles_per_instruction(build(folder, f"-DSAMPLES={TRACED}u", f"-DLANDS={LANDS}u"))
-        flash = flash_of(folder)
+        ratio = cycles_per_instruction(build(folder, *options, f"-DSAMPLES={TRACED}u", f"-DLANDS={LANDS}u"))
+        flash = flash_of(folder, "supervisor" if options else "")
     free, touched, new, most = (counted[each] / SCALE for each in ("free", "touched", "new", "most"))
+    ram = counted["state"] + (counted["supervisor"] if options else 0.0)
     rates = [f"{(1 - SPARE) * hertz / (ratio * new) / 1e3:.1f}" for hertz in PROCESSORS.values()]
     tops = [f"{hertz / (ratio * most) / 1e3:.1f}" for hertz in PROCESSORS.values()]
-    numbers = [f"{flash:.0f}", f"{counted['state']:.0f}", *(f"{each:.0f}" for each in (free, touched, new, most))]
+    numbers = [f"{flash:.0f}", f"{ram:.0f}", *(f"{each:.0f}" for each in (free, touched, new, most))]
     print(" | ".join([name, *numbers, f"{ratio:.2f}", f"{ratio * new:.0f}", f"{ratio * most:.0f}", *rates, *tops]))
 
 
@@ -153,6 +157,7 @@ def main():
     print(" | ".join([*names, *(f"kHz, {each}, most" for each in PROCESSORS)]))
     for name, texture in textures().items():
         measure(name, texture)
+    measure("8 bands, supervised", textures()["8 bands"], "-DSUPERVISED")
     return 0
 
 

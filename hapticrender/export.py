@@ -22,6 +22,7 @@ BANDS = 8  # of a board at least: set-points may ask for more than the scene doe
 CHANGE = 20e-3  # s: of a change of gain, amplitude or carrier
 MEASURING, MEASURING_DC = 10.0, 6.0  # Hz: widest bandwidth of the measured envelopes and of their offset
 GENERATED = "/* Written by `hapticrender export`; export the scene again instead of editing. */\n"
+HUGE = 1e30  # a bound that is none, in float32 too
 SUFFIXES = (".c", ".h", ".ld", "Makefile")  # of the portable sources
 
 _CONTROLLER = """
@@ -32,6 +33,12 @@ _LAW = """
 mass damping stiffness lever_per_metre level high_pass mean_square filters sensor_filter pair hertz_scale pole
 pole_damping fade_step decay smoothing noise model_error levelling prior start spread
 """.split()
+_SUPERVISION = """
+invalid_pole frozen_drive low high corner shape omega energy_pole power_pole drive_pole ring_corner ring_shape ring_pole
+lever danger_motion danger_drive most_motion most_drive large_drive sensed_bound drive_limit heat_pole heat_gain
+slow_pole fade_out fade_danger fade_now mass damping stiffness bound noise ringing
+""".split()
+_TIMES = "frozen inconsistent active drive ring ring_wait ring_stop suspension beyond slow".split()
 _SAMPLES = "damper_time hold settling joining joined notice patience".split()
 
 
@@ -65,7 +72,7 @@ def export(rendering: Rendering, folder: Path, *, bands: int = 0, force: bool = 
             _refuse_changed(folder / name, text)
         for name in ("design.h", "design.c"):
             _refuse_changed(folder / name, GENERATED)
-    texts |= {"design.h": _header(sizes), "design.c": _tables(design)}
+    texts |= {"design.h": _header(sizes), "design.c": _tables(design, supervision_table(rendering))}
     folder.mkdir(parents=True, exist_ok=True)
     for name, text in texts.items():
         (folder / name).write_text(text, encoding="utf-8")
@@ -121,6 +128,19 @@ def board_design(rendering: Rendering, bands: int = 0) -> tuple[dict[str, int], 
     return sizes, fields
 
 
+def supervision_table(rendering: Rendering) -> dict[str, Any]:
+    """Return the fields of `supervision_t` of a rendering's supervisor."""
+    controller: Any = rendering.controller()
+    settings = controller.state["p"][0]
+    return {
+        **{name: np.clip(settings[name], -HUGE, HUGE) for name in _SUPERVISION},
+        **{f"{name}_time": int(settings[f"{name}_time"]) for name in _TIMES},
+        "modelled": int(settings["modelled"]),
+        "damped": int(settings["controller"] != 0),
+        "limited": int(settings["limited"] != 0),
+    }
+
+
 def _checked(rendering: Rendering, controller: Any, bands: int) -> int:
     """Most bands of the board; refuses what its law does not play."""
     scene, model, used = rendering.scene, rendering.model, len(rendering.bands)
@@ -164,9 +184,15 @@ def _header(sizes: dict[str, int]) -> str:
     return f"{GENERATED}#ifndef DESIGN_H\n#define DESIGN_H\n\n{''.join(lines)}\n#endif\n"
 
 
-def _tables(fields: dict[str, Any]) -> str:
+def _tables(design: dict[str, Any], supervision: dict[str, Any]) -> str:
+    return f'{GENERATED}#include "supervisor.h"\n\n{_table("design_t design", design)}\n' + _table(
+        "supervision_t supervision", supervision
+    )
+
+
+def _table(declared: str, fields: dict[str, Any]) -> str:
     lines = [f"    .{name} = {_literal(value)},\n" for name, value in fields.items()]
-    return f'{GENERATED}#include "law.h"\n\nconst design_t design = {{\n{"".join(lines)}}};\n'
+    return f"const {declared} = {{\n{''.join(lines)}}};\n"
 
 
 def _literal(value: Any) -> str:

@@ -1,14 +1,16 @@
 /*
- * Play a law whatever its inputs are: sensors, positions, waveforms and set-points that are drawn at random, huge, or no
+ * Play a law, and a supervised one, whatever its inputs are: sensors, positions, waveforms and set-points that are drawn at random, huge, or no
  * numbers.  Prints the samples played; status 1 where a drive is not finite or beyond its limit.
  */
 #include <stdio.h>
 
-#include "law.h"
+#include "supervisor.h"
 
 #define SAMPLES 60000u
+#define STOPPED_FOR 300u /* samples, before it starts again */
 
-static law_t law;
+static law_t law, supervised;
+static supervisor_t supervisor;
 static uint32_t random_state = 12345u;
 
 static uint32_t draw(uint32_t below)
@@ -42,11 +44,28 @@ static void set_something(void)
     (void)law_set_gain(&law, draw_number(REAL(1.2), 10u));
 }
 
+static uint32_t beyond(const real_t drive[])
+{
+    uint32_t count = 0u;
+    for (uint32_t i = 0u; i < LAW_CHANNELS; i++) {
+        count += (real_abs(drive[i]) <= design.drive_limit) ? 0u : 1u;
+    }
+    return count;
+}
+
+static void start_supervised(void)
+{
+    law_init(&supervised, &design);
+    supervisor_init(&supervisor, &supervision, &design);
+}
+
 int main(void)
 {
     uint32_t bad = 0u;
+    uint32_t stopped = 0u;
     real_t position = REAL(0.0);
     law_init(&law, &design);
+    start_supervised();
     for (uint32_t n = 0u; n < SAMPLES; n++) {
         real_t drive[LAW_CHANNELS];
         real_t sensed[LAW_SENSORS];
@@ -60,9 +79,15 @@ int main(void)
         if (draw(500u) == 0u) {
             set_something();
         }
-        (void)law_step(&law, sensed, position, REAL(0.0), draw_number(REAL(1e-4), faulty), drive);
-        for (uint32_t i = 0u; i < LAW_CHANNELS; i++) {
-            bad += (real_abs(drive[i]) <= design.drive_limit) ? 0u : 1u;
+        const real_t waveform = draw_number(REAL(1e-4), faulty);
+        (void)law_step(&law, sensed, position, REAL(0.0), waveform, drive);
+        bad += beyond(drive);
+        (void)supervisor_step(&supervisor, &supervised, sensed, position, REAL(0.0), waveform, drive);
+        bad += beyond(drive);
+        stopped += (supervisor.cause != SUPERVISOR_FINE) ? 1u : 0u;
+        if (stopped > STOPPED_FOR) {
+            start_supervised();
+            stopped = 0u;
         }
     }
     (void)printf("%u\n", (unsigned int)SAMPLES);

@@ -1,7 +1,7 @@
 /* The exported law as a step of the library (hapticrender.jit): the simulated plate and recorded samples drive it. */
 #include <stddef.h>
 
-#include "law.h"
+#include "supervisor.h"
 
 typedef struct {
     int64_t drive, inputs, noise, sensed, motion, position, waveform, target, flags; /* addresses */
@@ -15,6 +15,10 @@ uint32_t law_bands(int64_t state, const double rows[], uint32_t count);
 void law_envelope(int64_t state, uint32_t band, double envelopes[4]);
 void law_covariance(int64_t state, double covariance[LAW_PARAMETERS * LAW_PARAMETERS]);
 int64_t law_rows(int64_t state, int64_t signals, int64_t start, int64_t count);
+size_t supervised_size(void);
+void supervised_start(int64_t state);
+uint32_t supervised_cause(int64_t state);
+int64_t supervised_rows(int64_t state, int64_t signals, int64_t start, int64_t count);
 
 static law_t *at(int64_t state) { return (law_t *)(intptr_t)state; }
 
@@ -60,8 +64,25 @@ void law_covariance(int64_t state, double covariance[LAW_PARAMETERS * LAW_PARAME
     }
 }
 
-/* Advance the law at the address `state` by rows `start` to `start + count - 1` of the signals. */
-int64_t law_rows(int64_t state, int64_t signals, int64_t start, int64_t count)
+typedef struct {
+    law_t law; /* first: an address of both is that of the law */
+    supervisor_t supervisor;
+} supervised_t;
+
+size_t supervised_size(void) { return sizeof(supervised_t); }
+
+void supervised_start(int64_t state)
+{
+    law_start(state);
+    supervisor_init(&((supervised_t *)(intptr_t)state)->supervisor, &supervision, &design);
+}
+
+uint32_t supervised_cause(int64_t state)
+{
+    return (uint32_t)((const supervised_t *)(intptr_t)state)->supervisor.cause;
+}
+
+static int64_t advance(law_t *law, supervisor_t *supervisor, int64_t signals, int64_t start, int64_t count)
 {
     const signals_t *io = (const signals_t *)(intptr_t)signals;
     const double *sensed = (const double *)(intptr_t)io->sensed;
@@ -70,15 +91,31 @@ int64_t law_rows(int64_t state, int64_t signals, int64_t start, int64_t count)
     double *drive = (double *)(intptr_t)io->drive;
     int64_t *flags = (int64_t *)(intptr_t)io->flags;
     for (int64_t n = start; n < start + count; n++) {
+        const real_t x = (real_t)position[n];
+        const real_t reference = (real_t)waveform[n];
         real_t y[LAW_SENSORS];
         real_t u[LAW_CHANNELS];
         for (int64_t i = 0; i < LAW_SENSORS; i++) {
             y[i] = (real_t)sensed[n * LAW_SENSORS + i];
         }
-        flags[n] |= (int64_t)law_step(at(state), y, (real_t)position[n], REAL(0.0), (real_t)waveform[n], u);
+        flags[n] |= (int64_t)((supervisor != NULL) ? supervisor_step(supervisor, law, y, x, REAL(0.0), reference, u)
+                                                   : law_step(law, y, x, REAL(0.0), reference, u));
         for (int64_t i = 0; i < LAW_CHANNELS; i++) {
             drive[n * LAW_CHANNELS + i] = (double)u[i];
         }
     }
     return 0;
+}
+
+/* Advance the law at the address `state` by rows `start` to `start + count - 1` of the signals. */
+int64_t law_rows(int64_t state, int64_t signals, int64_t start, int64_t count)
+{
+    return advance(at(state), NULL, signals, start, count);
+}
+
+/* The same under supervision. */
+int64_t supervised_rows(int64_t state, int64_t signals, int64_t start, int64_t count)
+{
+    supervised_t *both = (supervised_t *)(intptr_t)state;
+    return advance(&both->law, &both->supervisor, signals, start, count);
 }

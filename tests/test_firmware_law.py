@@ -16,6 +16,7 @@ from scipy.signal import butter, sosfiltfilt
 import hapticrender as hr
 from hapticrender import cli
 from hapticrender.bands import Bands
+from hapticrender.control.supervisor_kernel import ACTIVE, FROZEN, INCONSISTENT, INVALID, OVERMOTION, RINGING
 from hapticrender.drivers.serial import BoardClient
 from hapticrender.export import board_design, export, sources
 from hapticrender.jit import addresses
@@ -23,7 +24,7 @@ from hapticrender.plants.plate import Plate, PlateParameters
 from hapticrender.protocols import Flag
 
 RATE, SAMPLES, AHEAD = 5000, 15_000, 7  # Hz; of a run; by which a waveform is ahead: the delay and 6
-LAW = ("law", "learning", "carriers", "design")
+LAW = ("law", "learning", "carriers", "supervisor", "design")
 KINDS = {"double": "-DREAL_DOUBLE", "float": "-UREAL_DOUBLE"}
 CROSS, QEMU = "arm-none-eabi-gcc", "qemu-system-arm"
 RMS = 5e-6  # m, of the white noise
@@ -65,10 +66,11 @@ class Law:
 
     block, n_bands = 1, 0
 
-    def __init__(self, library):
-        self.library, self.state = library, np.zeros(library.law_size(), np.uint8)
-        self.step = SimpleNamespace(address=ctypes.cast(library.law_rows, ctypes.c_void_p).value)
-        library.law_start(self.address)
+    def __init__(self, library, name="law"):
+        self.library, self.rows = library, getattr(library, f"{name}_rows")
+        self.state = np.zeros(getattr(library, f"{name}_size")(), np.uint8)
+        self.step = SimpleNamespace(address=ctypes.cast(self.rows, ctypes.c_void_p).value)
+        getattr(library, f"{name}_start")(self.address)
 
     @property
     def address(self):
@@ -91,7 +93,7 @@ class Law:
     def run(self, sensed, position, waveform):
         drive, flags = np.zeros((len(sensed), 2)), np.zeros(len(sensed), np.int64)
         signals = addresses(drive=drive, sensed=sensed, position=position, waveform=waveform, flags=flags)
-        self.library.law_rows(self.address, signals.ctypes.data, 0, len(sensed))
+        self.rows(self.address, signals.ctypes.data, 0, len(sensed))
         return drive, flags
 
 
@@ -109,11 +111,11 @@ class Exports:
             self.renderings[texture] = hr.prepare(hr.Scene(texture=TEXTURES[texture], finger=finger, **fields))
         return self.renderings[texture]
 
-    def law(self, texture, kind):
+    def law(self, texture, kind, name="law"):
         key = texture, kind
         if key not in self.libraries:
             self.libraries[key] = self.library(texture, kind)
-        return Law(self.libraries[key])
+        return Law(self.libraries[key], name)
 
     def library(self, texture, kind):
         folder = self.folder / texture
@@ -123,7 +125,7 @@ class Exports:
         options = ("-O2", "-fPIC", "-shared", KINDS[kind], f"-I{folder}")
         library = ctypes.CDLL(str(compile_c(folder / f"law-{kind}.so", files, *options)))
         address, number, count = ctypes.c_int64, ctypes.c_double, ctypes.c_uint32
-        library.law_size.restype = ctypes.c_size_t
+        library.law_size.restype = library.supervised_size.restype = ctypes.c_size_t
         for name, types in {
             "law_start": (address,),
             "law_limit": (address, number),
@@ -132,6 +134,9 @@ class Exports:
             "law_envelope": (address, count, address),
             "law_covariance": (address, address),
             "law_rows": (address,) * 4,
+            "supervised_start": (address,),
+            "supervised_cause": (address,),
+            "supervised_rows": (address,) * 4,
         }.items():
             getattr(library, name).argtypes = types
         return library
@@ -201,6 +206,39 @@ def test_double_equals_the_kernel_through_faults(exports, rng):
     assert (found[1720:1750] == 0.0).all()
     assert (flags & Flag.NONFINITE).any()
     assert (flags & Flag.SENSOR_CLIPPED).any()
+
+
+FAULTS = {
+    "none": (0, lambda sensed: sensed),
+    "not finite": (INVALID, lambda sensed: np.nan * sensed),
+    "frozen": (FROZEN, lambda sensed: 0.0 * sensed + 1e-6),
+    "inverted": (INCONSISTENT, lambda sensed: -sensed),
+    "swings far": (OVERMOTION, lambda sensed: 0.95e-3 * np.sin(0.12 * np.arange(len(sensed)))),
+    "rings": (RINGING, lambda sensed: sensed + 15e-6 * np.sin(1.6 * np.arange(len(sensed)))),
+    "another tone": (ACTIVE, lambda sensed: 40e-6 * np.sin(0.2 * np.arange(len(sensed)))),
+}
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("fault", FAULTS)
+def test_the_supervisor_equals_the_librarys(exports, fault, kind):
+    """A sensor fails after 0.9 s; in float its tests see what rounding leaves, and stop for the same cause."""
+    cause, disturb = FAULTS[fault]
+    texture = TEXTURES["tones"]
+    signals = close(kernel_of(exports, "tones"), FINGERS["slide"], texture)[2]
+    sensed, position = signals.sensed[:9000].copy(), np.ascontiguousarray(signals.position[:9000])
+    sensed[4500:, 0] = disturb(sensed[4500:, 0])
+    controller = exports.rendering("tones").controller()
+    drive, _, flags = controller.run(sensed, position, np.zeros(9000))
+    law = exports.law("tones", kind, "supervised")
+    found, found_flags = law.run(sensed, position, np.zeros(9000))
+    print(fault, controller.fault, law.library.supervised_cause(law.address))
+    assert law.library.supervised_cause(law.address) == cause == (controller.fault.cause if controller.fault else 0)
+    stops = [np.argmax(each & Flag.STOPPED) for each in (flags, found_flags)]
+    assert abs(np.diff(stops)) <= (0 if kind == "double" else 5)
+    if kind == "double":
+        assert abs(found - drive).max() < 1e-9
+        assert np.array_equal(found_flags, flags)
 
 
 def error(motion, reference, start=1.0):

@@ -18,6 +18,7 @@ void law_init(law_t *law, const design_t *used)
     law->gain_to = REAL(1.0);
     law->gain_change = REAL(1.0);
     law->confidence = REAL(1.0);
+    law->damper_scale = REAL(1.0);
     law->scale = REAL(1.0);
     law->smooth_scale = REAL(1.0);
     learning_init(law);
@@ -129,8 +130,8 @@ static void find_basis(law_t *law, real_t *rate, real_t *acceleration)
     *acceleration = r[2];
 }
 
-/* Gain of the inner damper: open after a contact, and while the deviation is more than noise. */
-static real_t open_gate(law_t *law, real_t deviation)
+/* Set the gain of the inner damper: open after a contact, and while the deviation is more than noise. */
+static void open_gate(law_t *law, real_t deviation)
 {
     const design_t *d = law->design;
     law->slow += d->high_pass * (deviation - law->slow);
@@ -145,20 +146,21 @@ static real_t open_gate(law_t *law, real_t deviation)
     } else {
         law->fast_open = real_max(law->fast_open - d->release, REAL(0.0));
     }
-    return law->fast_open * d->damper_high;
+    law->damper_gain = law->damper_scale * (law->fast_open * d->damper_high);
 }
 
 /* Force of the inner damper, F = -sum taps eps[n - j]. */
-static real_t damp(law_t *law, uint32_t coordinate, real_t deviation, real_t gain)
+static real_t damp(law_t *law, uint32_t coordinate, real_t deviation)
 {
     real_t force = REAL(0.0);
     law->past[coordinate][law->sample % LAW_PAST] = deviation;
-    if (gain > REAL(0.0)) {
+    if ((law->damper_gain > REAL(0.0)) || (law->damper_scale < REAL(1.0))) {
         for (uint32_t j = 0u; j < LAW_DAMPER_TAPS; j++) {
             force -= law->design->taps[coordinate][j] * law->past[coordinate][(law->sample - j) % LAW_PAST];
         }
     }
-    return gain * force;
+    law->damper_force[coordinate] = force;
+    return law->damper_gain * force;
 }
 
 /* Confidence in the sensors fades out within 20 ms while samples are invalid, and in again. */
@@ -174,12 +176,12 @@ static void use_sensors(law_t *law, const real_t coordinates[2], uint32_t learns
     const design_t *d = law->design;
     const real_t error[2] = {
         coordinates[0] - d->shape[0] * law->reference, coordinates[1] - d->shape[1] * law->reference};
-    const real_t gain = open_gate(law, error[0]);
+    open_gate(law, error[0]);
     if (learns != 0u) {
         learning_update(law, error);
     }
     for (uint32_t i = 0u; i < LAW_COORDINATES; i++) {
-        force[i] = damp(law, i, error[i], gain);
+        force[i] = damp(law, i, error[i]);
     }
     bands_measure(law, coordinates[0]);
 }

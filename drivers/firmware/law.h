@@ -133,6 +133,8 @@ typedef struct law {
     real_t ring[LAW_DELAY + 1][LAW_RING];
     real_t past[2][LAW_PAST];                 /* deviations, a ring */
     real_t slow, power, fast_open;            /* of the damper's gate */
+    real_t damper_gain, damper_scale;         /* of the damper; the scale is a supervisor's */
+    real_t damper_force[2];                   /* N, before its gain */
     real_t moment, confidence;
     real_t peak, scale, smooth_scale;
     real_t shaper[2][LAW_CHANNELS];

@@ -1,13 +1,13 @@
 /*
- * Measure the control law on a machine: a finger lands on the simulated plate and slides; prints what a sample takes
+ * Measure the control law on a machine, with -DSUPERVISED under its supervisor: a finger lands on the simulated plate and slides; prints what a sample takes
  * and the telemetry of the bands, a line each: a name and numbers.
  */
 #include "measure.h"
 
 #include <string.h>
 
-#include "law.h"
 #include "plate.h"
+#include "supervisor.h"
 
 #ifndef SAMPLES
 #define SAMPLES 3000u
@@ -18,6 +18,7 @@
 #define NOPS 1000u
 
 static law_t law;
+static supervisor_t supervisor;
 static plate_t plate = {4e-3, 1.5, 300.0, 1e-6, 1u, {0.0, 0.0, 0.0, 0.0}};
 
 static char *write_digits(char *at, uint32_t value, uint32_t least)
@@ -106,6 +107,7 @@ int main(void)
     measure_start();
     const uint32_t empty = calibrate();
     law_init(&law, &design);
+    supervisor_init(&supervisor, &supervision, &design);
     for (uint32_t n = 0u; n < SAMPLES; n++) {
         double sensed[2];
         real_t drive[LAW_CHANNELS] = {REAL(0.0)};
@@ -114,7 +116,11 @@ int main(void)
         plate_sense(&plate, sensed);
         const real_t shown[2] = {(real_t)sensed[0], (real_t)sensed[1]};
         const uint32_t start = measure_count();
+#ifdef SUPERVISED
+        flags |= supervisor_step(&supervisor, &law, shown, (real_t)position, REAL(0.0), waveform, drive);
+#else
         flags |= law_step(&law, shown, (real_t)position, REAL(0.0), waveform, drive);
+#endif
         const uint32_t taken = measure_count() - start - empty;
         most = (taken > most) ? taken : most;
         sums[(n < LANDS) ? 0 : ((n < LANDS + design.joined) ? 1 : 2)] += (double)taken;
@@ -128,6 +134,7 @@ int main(void)
     print_number("most", (double)most);
     print_number("flags", (double)flags);
     print_number("state", (double)sizeof(law_t));
+    print_number("supervisor", (double)sizeof(supervisor_t));
     print_telemetry();
     return 0;
 }

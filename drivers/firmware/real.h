@@ -9,11 +9,13 @@ typedef double real_t;
 #define REAL(number) number
 #define real_abs fabs
 #define real_rint rint
+#define real_sqrt sqrt
 #else
 typedef float real_t;
 #define REAL(number) number##F
 #define real_abs fabsf
 #define real_rint rintf
+#define real_sqrt sqrtf
 #endif
 
 static inline real_t real_min(real_t a, real_t b) { return (b < a) ? b : a; }
