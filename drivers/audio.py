@@ -291,22 +291,23 @@ class LiveAudioDriver(AudioDriver):
         Parameters
         ----------
         entry : hapticrender.realtime.RealtimeEntry
-            Of this driver's `block`, channels, `sensed_scale` and `drive_scale`; it has to outlive `stop`.
+            Of this driver's channels, `sensed_scale` and `drive_scale`, and of a block that goes into this driver's; it
+            has to outlive `stop`.
 
         Raises
         ------
         ValueError
-            The entry has another block or other channels.
+            The entry has other channels, or a block that does not fit.
         DriverError
             The driver is not open, or runs already.
         """
         if self._state != "open" or self._entry is not None:
             raise DriverError(f"{self}: start: it is {self._state if self._state != 'open' else 'running already'}")
-        own = self.block, self.sensed_channels, self.drive_channels
-        theirs = entry.block, entry.controller.sensors, entry.controller.channels
-        if self.block % entry.block or own[1:] != theirs[1:]:
-            bound = f"must be the driver's, {own}, or a part of its block"
-            raise ValueError(f"entry: (block, sensors, drive channels) is {theirs}: {bound}")
+        own, theirs = (self.sensed_channels, self.drive_channels), (entry.controller.sensors, entry.controller.channels)
+        if own != theirs:
+            raise ValueError(f"entry: (sensors, drive channels) is {theirs}: must be the driver's, {own}")
+        if self.block % entry.block:
+            raise ValueError(f"entry.block = {entry.block} samples: must divide the driver's, {self.block}")
         address = entry.address  # compiled here
         self._relay.rest()
         self._settle()

@@ -137,14 +137,15 @@ class BoardClient:
         self._steadily(lambda line: line.set_bands(bands))
         self._wanted = self._wanted._replace(bands=bands)
 
-    def finger(self, position: float, velocity: float = 0.0, load: float = 0.0) -> None:
-        """Say where the finger is now: position (m from the middle, NaN: lifted), velocity (m/s) and load (N).
+    def finger(self, position: float, velocity: float = 0.0, load: float = 0.0, time: float | None = None) -> None:
+        """Say where the finger is: position (m from the middle, NaN: lifted), velocity (m/s) and load (N).
 
+        `time` (s, of the client's clock) is when it was there: now unless given, which is late if the process pauses.
         Never waits; the last one counts, sent at most every 5 ms.  The board follows the velocity for 50 ms, then
         holds, and after 200 ms without another takes the finger for lifted.
         """
-        now = self.clock.monotonic()
-        self._open_line().link.finger = now, float(position), float(velocity), float(load)
+        time = self.clock.monotonic() if time is None else time
+        self._open_line().link.finger = time, float(position), float(velocity), float(load)
 
     @property
     def gain(self) -> float:

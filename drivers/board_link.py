@@ -11,6 +11,7 @@ from hapticrender.drivers.protocol import Capabilities, Frame, Kind, Reason, Str
 from hapticrender.errors import ProtocolError
 
 WORDS = 0.01  # s between two words, FINGER or HEARTBEAT: eight of them fit into the board's 80 ms of silence
+MICROSECOND = 1e-6  # s: times that differ by less are the same
 FASTEST = 0.005  # s between two words of the finger at least
 RESEND = 0.03  # s after which a command without a reply is sent again
 STRANGE = 3  # answers for another session in a row after which ours has ended
@@ -97,7 +98,8 @@ class Link:
                 first.sequence = self._next()
             first.sent = now
             out += self._command(first.kind, first.sequence, first.payload)
-        if self.capabilities is not None and now - self._spoken >= (WORDS if self.finger is None else FASTEST):
+        since = now - self._spoken + MICROSECOND
+        if self.capabilities is not None and since >= (WORDS if self.finger is None else FASTEST):
             self._spoken = now
             out += self._word(now)
         self.sent_bytes += len(out)

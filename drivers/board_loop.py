@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -9,7 +10,6 @@ import numpy as np
 from hapticrender.bands import Bands
 from hapticrender.drivers.row_reader import RowReader
 from hapticrender.errors import DeviceFault
-from hapticrender.live import Row, band_row
 from hapticrender.protocols import Array, Flag, Rendering
 
 if TYPE_CHECKING:
@@ -104,12 +104,13 @@ class BoardLoop:
             "flags": flags,
         }
 
-    def figures(self) -> list[Row]:
-        """Return what the board last said of every band."""
-        found = self._client.telemetry()
-        bands, count = self._bands, min(len(found.bands), len(self._bands))
-        each = zip(bands.frequency[:count], found.bands, strict=False)
-        return [band_row(float(frequency), band.target, band.measured) for frequency, band in each]
+    def figures(self) -> list[tuple[float, float, float, float]]:
+        """Return what the board last said of every band: frequency (Hz), target, achieved (m) and relative error."""
+        rows = []
+        for hertz, band in zip(self._bands.frequency, self._client.telemetry().bands, strict=False):
+            size, error = abs(band.target), abs(band.measured - band.target)
+            rows.append((float(hertz), size, abs(band.measured), error / size if size > 0.0 else math.nan))
+        return rows
 
     def fault(self) -> DeviceFault | None:
         """Return why the board stopped the drive, if it did."""

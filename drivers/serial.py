@@ -113,10 +113,11 @@ class SerialDriver(BaseDriver):
         """Send where the finger is now."""
         if self._finger is None:
             return
-        now = np.array([0.0, 1e-4]) + max(self.client.clock.monotonic() - self._started, 0.0)
+        clock = self.client.clock.monotonic()
+        now = np.array([0.0, 1e-4]) + max(clock - self._started, 0.0)
         here, there = self._finger.position(now)
         velocity = (there - here) * 1e4
-        self.client.finger(here, velocity if np.isfinite(velocity) else 0.0, self._finger.load(now[:1])[0])
+        self.client.finger(here, velocity if np.isfinite(velocity) else 0.0, self._finger.load(now[:1])[0], clock)
 
     def _taken(self, count: int, bands: Bands) -> tuple[Array, Array, Array, Sensed]:
         reader = self._reader

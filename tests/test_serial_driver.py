@@ -11,6 +11,7 @@ from board import (
     FINGER,
     MECHANICS,
     RATE,
+    ROOT,
     SANITISED,
     SCENE,
     SlowClock,
@@ -230,6 +231,24 @@ def test_more_bands_than_a_frame_holds(tmp_path):
         found = client.telemetry()
         assert len(found.bands) == found.total == 15
         assert [abs(band.target) for band in found.bands] == pytest.approx(15 * [1e-6], rel=ROUNDING)
+
+
+@pytest.mark.parametrize(
+    ("stream", "period", "received"), [(1, 60.0 / RATE * 1000, 138_000), (10, 10.0, 13_800), (0, 0.02, 9_300)]
+)
+def test_what_the_line_carries_is_what_the_page_says(fast, stream, period, received):
+    """Bytes a second of the stream alone, of every tenth row, and of the telemetry of 8 bands; words besides."""
+    client = client_of(fast).open()
+    client.set_bands(tones(*range(40, 280, 30), amplitude=1e-6))
+    client.start(stream=stream, telemetry=period)
+    run(client, fast, 0.2)
+    before = client._line.link.received_bytes, client._line.link.sent_bytes
+    run(client, fast, 1.0)
+    found = client._line.link.received_bytes - before[0], client._line.link.sent_bytes - before[1]
+    assert found[0] == pytest.approx(received, rel=0.02)
+    assert found[1] == pytest.approx(1500, rel=0.02)
+    page = (ROOT / "docs" / "protocol.md").read_text(encoding="utf-8")
+    assert f"| {received:,} |".replace(",", " ") in page
 
 
 def test_two_threads_can_set_a_board(tmp_path):
