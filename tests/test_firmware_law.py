@@ -61,6 +61,14 @@ TEXTURES = {
 }
 
 
+DEVICES = {
+    "one coil": {"coils": 1},
+    "late": {"delay": 3},
+    "fast": {"rate": 10e3},
+    "bending": {"bending_frequency": 1250.0, "bending_coil": 0.1},
+}
+
+
 class Law:
     """A law in C at rest, with the face of a controller, so that the simulated plate can be closed with it."""
 
@@ -90,8 +98,8 @@ class Law:
         self.library.law_covariance(self.address, found.ctypes.data)
         return found
 
-    def run(self, sensed, position, waveform):
-        drive, flags = np.zeros((len(sensed), 2)), np.zeros(len(sensed), np.int64)
+    def run(self, sensed, position, waveform, channels=2):
+        drive, flags = np.zeros((len(sensed), channels)), np.zeros(len(sensed), np.int64)
         signals = addresses(drive=drive, sensed=sensed, position=position, waveform=waveform, flags=flags)
         self.rows(self.address, signals.ctypes.data, 0, len(sensed))
         return drive, flags
@@ -103,13 +111,16 @@ class Exports:
     def __init__(self, folder):
         self.folder, self.renderings, self.libraries = folder, {}, {}
 
-    def rendering(self, texture):
-        """Scene whose drive is not rounded: a last bit would decide which way, and both would part for good."""
-        if texture not in self.renderings:
-            finger = FINGERS["slide"]
-            fields = {"duration": 3.0, "profile": {"current_bits": 0}, "keep_unfelt": True}
-            self.renderings[texture] = hr.prepare(hr.Scene(texture=TEXTURES[texture], finger=finger, **fields))
-        return self.renderings[texture]
+    def rendering(self, name):
+        """Scene whose drive is not rounded: a last bit would decide which way, and both would part for good.
+
+        Its name is a texture's, or that of a device, which plays tones.
+        """
+        if name not in self.renderings:
+            texture, profile = TEXTURES.get(name, TEXTURES["tones"]), {"current_bits": 0} | DEVICES.get(name, {})
+            fields = {"duration": 3.0, "finger": FINGERS["slide"], "profile": profile, "keep_unfelt": True}
+            self.renderings[name] = hr.prepare(hr.Scene(texture=texture, **fields))
+        return self.renderings[name]
 
     def law(self, texture, kind, name="law"):
         key = texture, kind
@@ -118,7 +129,7 @@ class Exports:
         return Law(self.libraries[key], name)
 
     def library(self, texture, kind):
-        folder = self.folder / texture
+        folder = self.folder / texture.replace(" ", "-")
         if not folder.exists():
             export(self.rendering(texture), folder)
         files = [*(folder / f"{name}.c" for name in LAW), ROOT / "tests" / "law_step.c"]
@@ -186,6 +197,19 @@ def test_double_equals_the_kernel(exports, name, finger, limit):
     assert abs(drive).max() > 0.01, "nothing was played"
     assert np.isfinite(position).any()
     assert (limit is not None) == bool((flags & Flag.SATURATED).any())
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_double_equals_the_kernel_on_other_devices(exports, device):
+    """One coordinate; a longer delay; another rate; a damper of more taps."""
+    parameters = PlateParameters(current_bits=0, **DEVICES[device])
+    plate = Plate(parameters, FINGERS["slide"], seed=1)
+    drive, _, flags, signals = plate.closed_loop(kernel_of(exports, device), np.zeros(5000))
+    sensed, position = (np.ascontiguousarray(array) for array in (signals.sensed, signals.position))
+    found, found_flags = exports.law(device, "double").run(sensed, position, np.zeros(5000), parameters.coils)
+    assert abs(found[:-1] - drive[1:]).max() < 1e-9
+    assert np.array_equal(found_flags, flags)
+    assert np.isfinite(position).any()
 
 
 def test_double_equals_the_kernel_through_faults(exports, rng):
@@ -433,6 +457,17 @@ def test_every_source_is_shipped():
     assert {path.name for path in sources()} == {path.name for path in FIRMWARE.iterdir()}
 
 
+CAREFUL = "-Wconversion -Wshadow -Wcast-qual -Wundef -Wstrict-prototypes -Wmissing-prototypes -Wvla".split()
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_careful_warnings_find_nothing(exports, kind):
+    exports.law("tones", kind)
+    folder = exports.folder / "tones"
+    for name in LAW:
+        compile_c(folder / f"{name}.o", [folder / f"{name}.c"], *CAREFUL, "-Wdouble-promotion", KINDS[kind], "-c")
+
+
 # a real Cortex-M4, emulated
 
 
@@ -447,6 +482,21 @@ def built(folder, rendering, target):
     export(rendering, folder, force=True)
     subprocess.run(["make", "-s", "-C", folder, target], check=True)
     return folder / target
+
+
+def test_the_law_needs_no_heap_no_output_and_no_double_on_a_cortex_m4(exports, tmp_path):
+    """All that its parts ask of a C library; numbers of 64 bits would be functions of their own there."""
+    cross_tools()
+    export(exports.rendering("tones"), tmp_path)
+    parts = [f"{name}.o" for name in LAW]
+    flags = "-mcpu=cortex-m4 -mthumb -mfloat-abi=hard -mfpu=fpv4-sp-d16"
+    subprocess.run(["make", "-s", "-C", tmp_path, f"CC={CROSS} {flags}", *parts], check=True)
+    command = [CROSS.replace("gcc", "nm"), "-g", *parts]
+    symbols = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=True).stdout
+    listed = [line.split() for line in symbols.splitlines()]
+    defined = {words[-1] for words in listed if len(words) == 3}
+    asked = {words[-1] for words in listed if len(words) == 2 and words[0] == "U"}
+    assert asked - defined <= {"memcpy", "memmove", "memset", "rintf", "sqrtf"}
 
 
 def measured(program):

@@ -7,6 +7,10 @@
 #include "machine_m4.h"
 #include "plate.h"
 
+#if LAW_CHANNELS != 2
+#error "the plate model has two coils: write the functions of hardware.h for another device"
+#endif
+
 #define TICK (MACHINE_HERTZ / (uint32_t)design.rate)
 
 const uint32_t hardware_cycle_rate = MACHINE_HERTZ;

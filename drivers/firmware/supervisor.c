@@ -12,11 +12,11 @@
 #define RINGING_STEP REAL(0.4)
 #define MOTION_SAMPLES 5u
 
-void supervisor_init(supervisor_t *supervisor, const supervision_t *used, const design_t *design)
+void supervisor_init(supervisor_t *supervisor, const supervision_t *used, const design_t *played)
 {
     (void)memset(supervisor, 0, sizeof(*supervisor));
     supervisor->p = used;
-    supervisor->design = design;
+    supervisor->design = played;
     supervisor->fade = REAL(1.0);
 }
 

@@ -67,7 +67,7 @@ typedef struct {
 } supervisor_t;
 
 /* Set a supervisor to rest; the law is set to rest beside it, by law_init. */
-void supervisor_init(supervisor_t *supervisor, const supervision_t *used, const design_t *design);
+void supervisor_init(supervisor_t *supervisor, const supervision_t *used, const design_t *played);
 
 /* Advance the law by a sample, see law_step, and supervise it; a stop is for good. */
 uint32_t supervisor_step(
