@@ -251,8 +251,7 @@ def test_doubled_and_recorded_commands_do_nothing(stepped):
         # greeted anew, it stopped, and refused all the rest
         after = [line[1:] for line in stepped.board.log()[len(before) :] if line[1] != "drives"]
         assert after == [["state", "0", str(int(Cause.SESSION))]]
-        stepped.sleep(0.001)
-    assert driven(stepped.board.log(), stepped.sample - 1, stepped.sample) == []
+        assert driven(stepped.board.log(), stepped.sample - 1, stepped.sample) == []
         with pytest.raises(DeviceLost, match="session: the board has another session"):
             run(client, stepped, 1.0)
 
