@@ -22,6 +22,14 @@ RETRY = 0.05  # s between two attempts to reach the board anew
 FAULTS = {
     Cause.LIMIT: "the mean square of the drive is above its limit: lower the amplitude, or raise limits(rms=)",
     Cause.SENSOR: "a sensor was invalid for 10 ms: check its cable and its range",
+    Cause.INVALID: "samples of a sensor are no numbers, or at the end of its range: check its cable and its range",
+    Cause.FROZEN: "a sensor repeats one value while the drive moves: check its cable, supply and converter",
+    Cause.INCONSISTENT: "the motion does not follow from the drive: check the wiring and polarity of sensors and coils",
+    Cause.ACTIVE: "the motion grows with the drive: check the polarity of sensors and coils",
+    Cause.DRIVE: "the drive stayed above what any finger needs: check wiring and amplifier",
+    Cause.RINGING: "the surface rings above 500 Hz: check the delay, and identify the bending mode",
+    Cause.OVERMOTION: "the surface moved too far: check the polarity of sensors and coils, and the delay",
+    Cause.BEYOND: "the motion stayed beyond what the scene can cause: check the unit of the sensors",
 }
 Result = TypeVar("Result")
 
@@ -273,7 +281,7 @@ class BoardClient:
     def _compare(self, line: BoardLine) -> None:
         """Compare what the board does with what it is to do."""
         found = line.link.telemetry
-        if found is None or self._wanted.start is None or found.state != State.IDLE:
+        if found is None or not self._runs or found.state != State.IDLE:
             return
         if found.cause in FAULTS:
             raise DeviceFault(f"{self.port}: play: the board stopped: {FAULTS[found.cause]}")
