@@ -226,7 +226,9 @@ def run(client, board, seconds):
 
 
 def driven(log, start, stop):
-    """Samples from which on it drove between `start` and `stop`."""
+    """Samples from which on it drove between `start` and `stop`; none where there is nothing between."""
+    if start >= stop:
+        return []
     changes = [(int(line[0]), line[2] == "1") for line in log if line[1] == "drives"]
     ends = [sample for sample, _ in changes[1:]] + [2**62]
     return [

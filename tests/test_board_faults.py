@@ -289,7 +289,9 @@ def attempt(change):
 
 
 @pytest.mark.parametrize(
-    ("options", "seconds"), [(SANITISED, 60), pytest.param(("-O2",), 600, marks=pytest.mark.slow)], ids=["1", "10"]
+    ("options", "seconds"),
+    [(SANITISED, 60), pytest.param(("-O2",), 600, marks=[pytest.mark.slow, pytest.mark.timeout(900)])],
+    ids=["1", "10"],
 )
 def test_a_bad_line_never_plays_what_was_not_asked_for(tmp_path, options, seconds, rng, monkeypatch):
     """Minutes of the board's time at a share of 1 % of faulty bytes."""

@@ -99,11 +99,10 @@ def test_a_compiled_loop_stops_too():
 
 
 @pytest.mark.parametrize("frequency", [72.0, 189.0])
-def test_a_late_polarity_is_stopped_or_disarmed_although_only_after_a_millimetre(frequency):
-    """At the governor the modes grow by 130 to 270 um/ms; at 189 Hz the damper is turned off and the motion is left."""
+def test_a_late_polarity_is_stopped_although_only_after_a_millimetre(frequency):
+    """At the governor the modes grow by 130 to 270 um/ms; at 189 Hz the slow test of growth finds it, in 0.31 s."""
     plate = Watched(lambda plate, sensed: -sensed)
-    left = pytest.warns(hr.PlateMismatch)
-    with pytest.raises(hr.DeviceFault) if frequency == 72.0 else left:
+    with pytest.raises(hr.DeviceFault):
         hr.render(scene(frequency, duration=2.0), driver=plate)
     assert max(plate.motion) < 3e-3
     assert max(plate.motion[-500:]) < 0.75e-3
@@ -135,10 +134,10 @@ def test_a_ringing_damper_is_turned_down_and_the_texture_goes_on():
     assert np.ptp(motion) / 2 == pytest.approx(50e-6, rel=0.1)
 
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", [*range(1000, 1006), 10041, 10099])
 def test_normal_scenes_are_not_stopped(seed):
-    """20 s each; `benchmarks/false_stops.py` has hours of them."""
-    error, controller = run(*random_scene(1000 + seed))
+    """20 s each; `benchmarks/false_stops.py` has hours of them.  In the last two 4 and 5 N slide across the plate."""
+    error, controller = run(*random_scene(seed))
     assert error is None
     assert controller.damper_scale == 1.0
 

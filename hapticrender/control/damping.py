@@ -16,6 +16,7 @@ import numpy as np
 
 from hapticrender.control.device_model import DeviceModel
 from hapticrender.control.margins import LEAST, LeastMargins, Margins, margins_of, unstable_poles
+from hapticrender.control.records import MOST_TAPS
 from hapticrender.protocols import Array
 
 TAPS = 3
@@ -264,7 +265,7 @@ def _counts(rate: float, bending: BendingMode | None, plain: int) -> list[int]:
     """Numbers of taps worth trying."""
     if bending is None or not any(bending.coupling):
         return [plain if bending is None else TAPS + 2]
-    return sorted({max(TAPS + 2, 1 + round(span * rate / bending.frequency)) for span in REACHES})
+    return sorted({min(max(TAPS + 2, 1 + round(span * rate / bending.frequency)), MOST_TAPS) for span in REACHES})
 
 
 def _complaint(parts: tuple[Oscillator, ...], taps: Array, bending: BendingMode | None, least: LeastMargins) -> str:

@@ -205,11 +205,11 @@ def design_supervisor(controller: Any, model: DeviceModel) -> dict[str, Any]:
     if demand is None:
         return settings
     modelled = demand.lowest < rate / 10  # beyond it neither trapezoidal rule nor hold are the device's
-    pressed = modelled or model.finger.contact is not None
+    pressed = model.finger.contact is not None
     press, pace = press_drive(model) if pressed else 0.0, min(model.pace, FASTEST_PACE)
     settings |= {
         "drive_pole": _pole(DRIVE_TIME / pace, rate),
-        "drive_time": PRESS_TIME / pace * rate,
+        "drive_time": PRESS_TIME / pace * rate if pressed else 0.0,  # else no press is there to be waited for
         "most_drive": (1.5 * demand.drive + press / 2.4) ** 2 / 2.0,
     }
     if not modelled:

@@ -13,7 +13,8 @@ is what the device model lacks: a finger, its load, noise, or a fault.  Energies
 no  test         condition                                                                        for
 === ============ ================================================================================ ====================
 1   invalid      share of samples that are not finite or not inside the range > 0.3               50 ms (mean)
-2   frozen       a sensor repeats a value for 10 samples and 2 ms while the drive moves           at once
+2   frozen       a sensor repeats a value for 10 samples and 2 ms, and 5 times as long as ever
+                 before (or 10 ms), while the drive moves                                         at once
 3   inconsistent E_r > finger + load + model + delay + noise, and E_r < 6 E_F                     15 to 60 ms
 4   active       -mean(r v) > 0.6 sqrt(E_F E_v), E_r < 6 E_F, in danger only                      5 ms
 5   drive        mean of u^2 > (1.5 B + A/2.4)^2/2: more than any finger takes                    30 ms (mean) + 60 ms
@@ -49,6 +50,7 @@ INVALID, FROZEN, INCONSISTENT, ACTIVE, DRIVE, RINGING, OVERMOTION, BEYOND = rang
 STOPPED, SATURATED = int(Flag.STOPPED), int(Flag.SATURATED)
 ROOT2 = math.sqrt(2.0)
 INVALID_SHARE = 0.3
+HELD = 5  # times the longest repetition before: converters may hold their values
 BY_DRIVE = 6.0  # E_r over E_F: in a fault the residual is the drive, in a load step it is not
 POWER = 0.6
 SLOW_POWER, SLOW_FORCE = 0.65, 3.0  # healthy: below 0.03, with a finger negative, while it taps up to 0.8 for a moment
@@ -76,6 +78,7 @@ SETTINGS = np.dtype(
     ]
 )
 """Settings of a supervisor, as `design_supervisor` derives them; poles and fades are per sample, times in samples."""
+COUNTS = ("inconsistent", "active", "drive", "motion", "ring", "ring_wait", "slow")
 SUPERVISOR = np.dtype(
     [
         ("p", SETTINGS),
@@ -90,8 +93,8 @@ SUPERVISOR = np.dtype(
         ("energy", np.float64, (12,)),  # of q, v, a, dF, F, r in both coordinates
         *((name, np.float64, (MOST_CHANNELS,)) for name in ("drive_energy", "heat")),
         *((name, np.float64, (MOST_SENSORS,)) for name in ("last", "least", "most")),
-        ("repeats", np.int64, (MOST_SENSORS,)),
-        *((f"{name}_count", np.int64) for name in ("inconsistent", "active", "drive", "motion", "ring", "ring_wait", "slow")),
+        *((name, np.int64, (MOST_SENSORS,)) for name in ("repeats", "longest")),
+        *((f"{name}_count", np.int64) for name in COUNTS),
         *((name, np.int64) for name in ("suspended", "sample", "now", "sensors", "cause", "stopped", "beyond_count")),
     ]
 )
@@ -114,9 +117,11 @@ def check_sensors(supervisor, sensed, n, drive, acts):
         elif value == s.last[i] and acts:
             s.repeats[i] += 1
             s.least[i], s.most[i] = min(s.least[i], drive), max(s.most[i], drive)
-            if s.repeats[i] >= p.frozen_time and s.most[i] - s.least[i] > p.frozen_drive:
+            usual = HELD * (min(s.longest[i], p.frozen_time) if s.longest[i] > 0 else p.frozen_time)
+            if s.repeats[i] >= max(p.frozen_time, usual) and s.most[i] - s.least[i] > p.frozen_drive:
                 frozen |= 1 << i
         else:
+            s.longest[i] = max(s.longest[i], s.repeats[i])
             s.last[i], s.repeats[i], s.least[i], s.most[i] = value, 1, drive, drive
         if p.sensor_limit > abs(value) > p.sensed_bound:
             beyond |= 1 << i
