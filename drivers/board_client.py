@@ -129,8 +129,10 @@ class BoardClient:
         """What the board said of itself."""
         return self._open_line().capabilities
 
-    def set_bands(self, bands: Bands) -> None:
+    def set_bands(self, bands: Bands) -> int:
         """Set what the board plays, all bands at the same sample; it glides there within 20 ms while it plays.
+
+        Returns the sample of the board's clock at which it took them.
 
         Raises
         ------
@@ -142,8 +144,9 @@ class BoardClient:
             raise ValueError("the targets are a waveform: must be constant envelopes, which a board can play")
         if len(bands) > most:
             raise ValueError(f"{len(bands)} bands: must be <= {most} on {self.port}; export the scene with more")
-        self._steadily(lambda line: line.set_bands(bands))
+        sample = self._steadily(lambda line: line.set_bands(bands))
         self._wanted = self._wanted._replace(bands=bands)
+        return sample
 
     def finger(self, position: float, velocity: float = 0.0, load: float = 0.0, time: float | None = None) -> None:
         """Say where the finger is: position (m from the middle, NaN: lifted), velocity (m/s) and load (N).
@@ -162,10 +165,15 @@ class BoardClient:
 
     @gain.setter
     def gain(self, value: float) -> None:
+        self.set_gain(value)
+
+    def set_gain(self, value: float) -> int:
+        """Set `gain`; return the sample of the board's clock at which it took it."""
         if not 0.0 <= value <= 1.0:
             raise ValueError(f"gain = {value!r}: must be 0 to 1")
-        self._steadily(lambda line: line.ask(Kind.GAIN, value))
+        sample = self._steadily(lambda line: line.ask(Kind.GAIN, value)).sample
         self._wanted = self._wanted._replace(gain=value)
+        return sample
 
     def limits(self, peak: float, rms: float | None = None, seconds: float = 1.0) -> None:
         """Limit the drive of a channel: `peak` (A) is cut, `rms` (A) over a time constant of `seconds` stops the board.
