@@ -14,6 +14,7 @@ import statistics
 import sys
 import tempfile
 import time
+from contextlib import nullcontext
 from pathlib import Path
 
 import numpy as np
@@ -73,12 +74,14 @@ def print_times() -> None:
 
 
 def print_losses(device: jack_ring.Device, seconds: float, rounds: int) -> None:
-    """Median share of callbacks lost, of runs in turns."""
+    """Median share of callbacks lost, of runs in turns; a process takes a core as a thread does, but not the lock."""
     kinds = {
-        "compiled, alone": (lambda entry: entry, False),
-        "compiled, beside a busy Python thread": (lambda entry: entry, True),
-        "in Python, alone": (jack_ring.PythonEntry, False),
-        "in Python, beside a busy Python thread": (jack_ring.PythonEntry, True),
+        "compiled, alone": (lambda entry: entry, nullcontext),
+        "compiled, beside a busy process": (lambda entry: entry, jack_ring.busy_process),
+        "compiled, beside a busy Python thread": (lambda entry: entry, jack_ring.busy_thread),
+        "in Python, alone": (jack_ring.PythonEntry, nullcontext),
+        "in Python, beside a busy process": (jack_ring.PythonEntry, jack_ring.busy_process),
+        "in Python, beside a busy Python thread": (jack_ring.PythonEntry, jack_ring.busy_thread),
     }
     rows = [[jack_ring.lost_callbacks(device, *kind, seconds) for kind in kinds.values()] for _ in range(rounds)]
     for name, column in zip(kinds, zip(*rows, strict=True), strict=True):

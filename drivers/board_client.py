@@ -22,6 +22,14 @@ RETRY = 0.05  # s between two attempts to reach the board anew
 FAULTS = {
     Cause.LIMIT: "the mean square of the drive is above its limit: lower the amplitude, or raise limits(rms=)",
     Cause.SENSOR: "a sensor was invalid for 10 ms: check its cable and its range",
+    Cause.INVALID: "samples of a sensor are no numbers, or at the end of its range: check its cable and its range",
+    Cause.FROZEN: "a sensor repeats one value while the drive moves: check its cable, supply and converter",
+    Cause.INCONSISTENT: "the motion does not follow from the drive: check the wiring and polarity of sensors and coils",
+    Cause.ACTIVE: "the motion grows with the drive: check the polarity of sensors and coils",
+    Cause.DRIVE: "the drive stayed above what any finger needs: check wiring and amplifier",
+    Cause.RINGING: "the surface rings above 500 Hz: check the delay, and identify the bending mode",
+    Cause.OVERMOTION: "the surface moved too far: check the polarity of sensors and coils, and the delay",
+    Cause.BEYOND: "the motion stayed beyond what the scene can cause: check the unit of the sensors",
 }
 Result = TypeVar("Result")
 
@@ -121,8 +129,10 @@ class BoardClient:
         """What the board said of itself."""
         return self._open_line().capabilities
 
-    def set_bands(self, bands: Bands) -> None:
+    def set_bands(self, bands: Bands) -> int:
         """Set what the board plays, all bands at the same sample; it glides there within 20 ms while it plays.
+
+        Returns the sample of the board's clock at which it took them.
 
         Raises
         ------
@@ -134,8 +144,9 @@ class BoardClient:
             raise ValueError("the targets are a waveform: must be constant envelopes, which a board can play")
         if len(bands) > most:
             raise ValueError(f"{len(bands)} bands: must be <= {most} on {self.port}; export the scene with more")
-        self._steadily(lambda line: line.set_bands(bands))
+        sample = self._steadily(lambda line: line.set_bands(bands))
         self._wanted = self._wanted._replace(bands=bands)
+        return sample
 
     def finger(self, position: float, velocity: float = 0.0, load: float = 0.0, time: float | None = None) -> None:
         """Say where the finger is: position (m from the middle, NaN: lifted), velocity (m/s) and load (N).
@@ -154,10 +165,15 @@ class BoardClient:
 
     @gain.setter
     def gain(self, value: float) -> None:
+        self.set_gain(value)
+
+    def set_gain(self, value: float) -> int:
+        """Set `gain`; return the sample of the board's clock at which it took it."""
         if not 0.0 <= value <= 1.0:
             raise ValueError(f"gain = {value!r}: must be 0 to 1")
-        self._steadily(lambda line: line.ask(Kind.GAIN, value))
+        sample = self._steadily(lambda line: line.ask(Kind.GAIN, value)).sample
         self._wanted = self._wanted._replace(gain=value)
+        return sample
 
     def limits(self, peak: float, rms: float | None = None, seconds: float = 1.0) -> None:
         """Limit the drive of a channel: `peak` (A) is cut, `rms` (A) over a time constant of `seconds` stops the board.
@@ -265,7 +281,7 @@ class BoardClient:
     def _compare(self, line: BoardLine) -> None:
         """Compare what the board does with what it is to do."""
         found = line.link.telemetry
-        if found is None or self._wanted.start is None or found.state != State.IDLE:
+        if found is None or not self._runs or found.state != State.IDLE:
             return
         if found.cause in FAULTS:
             raise DeviceFault(f"{self.port}: play: the board stopped: {FAULTS[found.cause]}")

@@ -156,15 +156,15 @@ class BoardLine:
                 self.link.telemetry = None  # what comes from now on is of this run
                 return self._checked(request).sample
 
-    def set_bands(self, bands: Bands) -> None:
-        """Send set-points, which act together at the end."""
+    def set_bands(self, bands: Bands) -> int:
+        """Send set-points, which act together at the end; return the sample at which the board took them."""
         envelope = np.zeros(len(bands)) if bands.envelope is None else bands.envelope
         turns = np.remainder(bands.phase / (2 * np.pi), 1.0)
         rows = zip(bands.frequency, bands.wavenumber, turns, envelope.real, envelope.imag, strict=True)
         payloads = [protocol.pack(Kind.SETPOINT, index, *row) for index, row in enumerate(rows)]
         for payload in payloads:
             self.send(Kind.SETPOINT, payload)
-        self.ask(Kind.COMMIT, len(payloads), protocol.digest(payloads))
+        return self.ask(Kind.COMMIT, len(payloads), protocol.digest(payloads)).sample
 
     def identify(self, lines: Sequence[Line], samples: int, stride: int) -> int:
         """Start a multisine, or without lines a queue; return the sample at which it began."""

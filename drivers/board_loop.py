@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from hapticrender.bands import Bands
-from hapticrender.drivers.row_reader import RowReader
+from hapticrender.drivers.row_reader import WRAP, RowReader
 from hapticrender.errors import DeviceFault
 from hapticrender.protocols import Array, Flag, Rendering
 
@@ -16,6 +16,19 @@ if TYPE_CHECKING:
     from hapticrender.drivers.serial import SerialDriver
 
 TELEMETRY = 0.05  # s between two frames of telemetry
+CARRIER = ("frequency", "wavenumber", "phase")
+CHANGE = 0.02  # s in which a carrier fades out before another one takes its place,
+REFRESH = 64  # samples of a run between two looks of the board at other carriers
+MOST_BANDS = 255  # that a frame can count
+
+
+class _Asked(NamedTuple):
+    """What the board was asked for from a sample of the run on: bands, turns of their carriers until then, gain."""
+
+    start: int
+    bands: Bands
+    turns: Array
+    gain: float
 
 
 class BoardLoop:
@@ -42,22 +55,29 @@ class BoardLoop:
     def __init__(self, rendering: Rendering, driver: SerialDriver, stream: int = 1) -> None:
         self.rendering, self.driver, self.model = rendering, driver, rendering.model
         self.samples, self.flags = 0, Flag(0)
-        self._client, self._stream, self._gain = driver.client, stream, 1.0
-        self._bands, self._fault = _playable(rendering), None
+        self._client, self._stream, self._first = driver.client, stream, 0
+        self._asked = [_Asked(0, _playable(rendering), np.zeros(MOST_BANDS), 1.0)]
         self._reader: RowReader | None = None
+        self._fault: DeviceFault | None = None
 
     def start(self) -> None:
         """Set the bands and play; the port is open."""
-        self._client.set_bands(self._bands)
-        self._client.gain = self._gain
-        first = self._client.start(stream=self._stream, telemetry=TELEMETRY)
-        self._reader = RowReader(self._client, first, self._stream)
+        last = self._asked[-1]
+        self._client.set_bands(last.bands)
+        self._client.set_gain(last.gain)
+        self._first = self._client.start(stream=self._stream, telemetry=TELEMETRY)
+        self._reader = RowReader(self._client, self._first, self._stream)
 
     def exchange(self, rendering: Rendering) -> None:
         """Glide to the texture of another rendering of the same device, within 20 ms."""
         bands = _playable(rendering)
-        self._client.set_bands(bands)
-        self.rendering, self._bands = rendering, bands
+        taken, last = (self._client.set_bands(bands) - self._first) % WRAP, self._asked[-1]
+        start = -(-(taken + round(CHANGE * self.driver.rate) + 1) // REFRESH) * REFRESH
+        turns, both = np.zeros(MOST_BANDS), slice(min(len(bands), len(last.bands)))
+        same = [getattr(bands, name)[both] == getattr(last.bands, name)[both] for name in CARRIER]
+        turns[both] = np.where(np.all(same, axis=0), self._turns(start)[both], 0.0)  # another carrier starts anew
+        self._asked.append(_Asked(start, bands, turns, last.gain))
+        self.rendering = rendering
 
     def finger(self, position: float, velocity: float, load: float) -> None:
         """Say where the finger is (m, m/s, N)."""
@@ -65,9 +85,20 @@ class BoardLoop:
 
     def set_gain(self, gain: float) -> None:
         """Set the factor on the texture, 0 to 1."""
-        if gain != self._gain:
-            self._client.gain = gain
-            self._gain = gain
+        last = self._asked[-1]
+        if gain == last.gain:
+            return
+        if self._reader is None:
+            self._asked[-1] = last._replace(gain=gain)
+            return
+        start = max((self._client.set_gain(gain) - self._first) % WRAP, last.start)
+        self._asked.append(_Asked(start, last.bands, self._turns(start), gain))
+
+    def _turns(self, sample: int) -> Array:
+        """Turns of the carriers at a sample of the run."""
+        last, turns = self._asked[-1], self._asked[-1].turns.copy()
+        turns[: len(last.bands)] += (sample - last.start) / self.driver.rate * last.bands.frequency
+        return turns
 
     def silence(self) -> None:
         """Fade out within 10 ms."""
@@ -89,25 +120,36 @@ class BoardLoop:
         )
         count = len(flags)
         first, self.samples = self.samples, self.samples + count
-        model, time = self.model, (first + np.arange(count)) / self.driver.rate
-        phase, envelope = self._bands.carrier_phase(time, position), self._bands.envelope
-        texture = np.zeros(count) if envelope is None else (envelope * np.exp(1j * phase)).real.sum(axis=1)
-        away = np.isnan(position) & self._bands.follows_finger
+        model = self.model
         return first, {
             "drive": drive,
             "sensed": sensed,
             "motion": sensed @ (model.place_from_coordinate @ model.coordinate_from_sensed).T,
             "position": position,
             "normal_load": load,
-            "reference": np.where(away, 0.0, self._gain * texture),
+            "reference": self._reference(first, position),
             "target": np.zeros((count, 0), complex),
             "flags": flags,
         }
 
+    def _reference(self, first: int, position: Array) -> Array:
+        """Texture as asked for, of samples from `first` on, without the 20 ms in which the board glides."""
+        reference, sample = np.zeros(len(position)), first + np.arange(len(position))
+        for asked in self._asked:
+            since, bands = sample >= asked.start, asked.bands
+            time = (sample[since] - asked.start) / self.driver.rate
+            phase = bands.carrier_phase(time, position[since]) + 2 * np.pi * asked.turns[: len(bands)]
+            texture = (bands.envelope * np.exp(1j * phase)).real.sum(axis=1)  # type: ignore[operator]
+            away = np.isnan(position[since]) & bands.follows_finger
+            reference[since] = np.where(away, 0.0, asked.gain * texture)
+        while len(self._asked) > 1 and self._asked[1].start <= first:
+            del self._asked[0]
+        return reference
+
     def figures(self) -> list[tuple[float, float, float, float]]:
         """Return what the board last said of every band: frequency (Hz), target, achieved (m) and relative error."""
         rows = []
-        for hertz, band in zip(self._bands.frequency, self._client.telemetry().bands, strict=False):
+        for hertz, band in zip(self._asked[-1].bands.frequency, self._client.telemetry().bands, strict=False):
             size, error = abs(band.target), abs(band.measured - band.target)
             rows.append((float(hertz), size, abs(band.measured), error / size if size > 0.0 else math.nan))
         return rows

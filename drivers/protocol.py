@@ -96,6 +96,14 @@ class Cause(IntEnum):
     SENSOR = 4  # invalid for 10 ms
     DONE = 5  # an identification has ended
     SESSION = 6  # another host said hello
+    INVALID = 17  # the supervisor of the law, from here on: see docs/safety.md
+    FROZEN = 18
+    INCONSISTENT = 19
+    ACTIVE = 20
+    DRIVE = 21
+    RINGING = 22
+    OVERMOTION = 23
+    BEYOND = 24
 
 
 class Frame(NamedTuple):

@@ -19,7 +19,7 @@ from __future__ import annotations
 import math
 import threading
 import time
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import TracebackType
@@ -468,7 +468,8 @@ class Player:
         if gently and running:
             loop.set_gain(0.0)
             time.sleep(FADE_OUT)
-        loop.silence()
+        with suppress(*[] if self._error is None else [HapticError]):  # one that is lost cannot be silenced
+            loop.silence()
         end, limit = loop.samples + 2 * loop.driver.block, time.monotonic() + FADE_OUT
         while running and loop.samples < end and time.monotonic() < limit:
             time.sleep(1e-3)

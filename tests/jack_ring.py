@@ -4,6 +4,7 @@ import ctypes
 import os
 import shutil
 import subprocess
+import sys
 import threading
 import time
 from contextlib import contextmanager
@@ -234,7 +235,7 @@ class PythonEntry:
 
 
 @contextmanager
-def busy_thread(busy):
+def busy_thread():
     """Keep Python's lock in another thread, but for the turns that it gives away every 5 ms."""
     stop = threading.Event()
 
@@ -243,21 +244,30 @@ def busy_thread(busy):
             sum(range(10_000))
 
     thread = threading.Thread(target=work)
-    if busy:
-        thread.start()
+    thread.start()
     try:
         yield
     finally:
         stop.set()
-        if busy:
-            thread.join()
+        thread.join()
 
 
-def lost_callbacks(device, wrap, busy, seconds):
+@contextmanager
+def busy_process():
+    """Keep a core busy as that thread does, without the lock."""
+    process = subprocess.Popen([sys.executable, "-c", "while True: sum(range(10_000))"])
+    try:
+        yield
+    finally:
+        process.kill()
+        process.wait()
+
+
+def lost_callbacks(device, wrap, beside, seconds):
     """Share of the periods that the plate's client went through, and this process did not."""
     live = driver().live()
     entry = entry_for(live)
-    with live, busy_thread(busy):
+    with live, beside():
         live.start(wrap(entry))
         time.sleep(0.2)
         first, samples = device.say("count"), entry.samples

@@ -21,6 +21,7 @@ from board import (
 from hapticrender.bands import Bands
 from hapticrender.drivers import protocol
 from hapticrender.drivers.protocol import Cause, Kind, State
+from hapticrender.drivers.serial import Line
 from hapticrender.errors import DeviceFault, DeviceLost, DeviceTimeout, DriverError
 
 
@@ -113,16 +114,46 @@ def test_limits_stop_the_board(stepped):
         run(client, stepped, 1.0)
 
 
-def test_a_press_beyond_the_sensors_range_stops_the_board(stepped):
-    """20 N at the end of the glass: 20/45.3e3 (1 + 2 * 2) = 2.2 mm there, of 1 mm."""
+def test_a_press_that_moves_the_plate_too_far_stops_the_board(stepped):
+    """20 N at the end of the glass: 20/45.3e3 (1 + 2 * 2) = 2.2 mm there."""
     client = client_of(stepped).open()
     client.set_bands(tones(47.0))
     client.start()
     client.finger(0.055, 0.0, 20.0)
-    with pytest.raises(DeviceFault, match="the board stopped: a sensor was invalid for 10 ms"):
+    with pytest.raises(DeviceFault, match="the board stopped: the surface moved too far"):
         run(client, stepped, 0.2)
-    last = stepped.board.log()[-1]
-    assert last[1:] == ["drives", "0"]
+    stepped.sleep(0.001)
+    assert driven(stepped.board.log(), stepped.sample - 1, stepped.sample) == []
+
+
+def test_sensors_out_of_their_range_stop_an_identification(tmp_path):
+    """Noise of 1 um is 10 mm at a gain of 1e4; the range is 1 mm."""
+    with SteppedBoard(program_of(*SANITISED), tmp_path, options=("--gain", "1e4,1")) as board:
+        client = client_of(board).open()
+        with pytest.raises(DeviceFault, match="the board stopped: a sensor was invalid for 10 ms"):
+            client.identify([Line(0, 60.0, 0.05)], 1.0)
+        board.sleep(0.001)
+        assert driven(board.board.log(), board.sample - 1, board.sample) == []
+
+
+@pytest.mark.parametrize(
+    ("gains", "causes"),
+    [
+        ("0,1", {Cause.FROZEN, Cause.INCONSISTENT}),
+        ("1,-1", {Cause.INCONSISTENT, Cause.ACTIVE, Cause.OVERMOTION}),
+        ("-1,-1", {Cause.INCONSISTENT, Cause.ACTIVE, Cause.OVERMOTION}),
+    ],
+)
+def test_a_sensor_that_is_dead_or_inverted_stops_the_board(tmp_path, gains, causes):
+    with SteppedBoard(program_of(*SANITISED), tmp_path, options=("--gain", gains)) as board:
+        client = client_of(board).open()
+        client.set_bands(tones(72.0, amplitude=10e-6))
+        client.start()
+        with pytest.raises(DeviceFault, match="stepped: play: the board stopped: .*: check "):
+            run(client, board, 2.0)
+        assert client._line.link.telemetry.cause in causes
+        board.sleep(0.001)
+        assert driven(board.board.log(), board.sample - 1, board.sample) == []
 
 
 def test_garbage_is_no_sign_of_life(stepped, rng):

@@ -151,16 +151,28 @@ def test_devices_shows_what_each_driver_finds(monkeypatch):
     assert not [line for line in lines if line.startswith("plain:")]
 
 
-def test_serial_ports_and_cards_are_found_where_a_driver_has_no_search(monkeypatch):
-    """The ports of this machine, as pyserial lists them; the cards as sounddevice does, where it is installed."""
-    from serial.tools.list_ports import comports
+class Answering:
+    """A serial driver at whose second port a board answers."""
 
-    points = [Entry("serial", OtherPlate), Entry("audio", OtherPlate)]
+    rate, drive_channels, sensed_channels = 5000.0, 2, 2
+
+    def __init__(self, port, timeout):
+        if port == "COM1":
+            raise hr.DeviceTimeout("COM1: hello: no answer")
+
+
+def test_serial_ports_are_shown_with_the_boards_that_answer(monkeypatch):
+    from serial.tools import list_ports
+    from serial.tools.list_ports_common import ListPortInfo
+
     known = devices.entry_points
+    points = [Entry("serial", Answering)]
     monkeypatch.setattr(
         devices, "entry_points", lambda group: points if group.endswith("drivers") else known(group=group)
     )
-    lines = devices.text().splitlines()
-    ports = [line.split()[0].partition(":")[2] for line in lines if line.startswith("serial:")]
-    assert ports == ([port.device for port in comports()] or [""])
-    assert [line for line in lines if line.startswith("audio:")]
+    monkeypatch.setattr(list_ports, "comports", lambda: [ListPortInfo("COM1"), ListPortInfo("COM2")])
+    lines = [" ".join(line.split()) for line in devices.text().splitlines()]
+    assert "serial:COM1 n/a; no board answers (DeviceTimeout)" in lines
+    assert "serial:COM2 n/a; a board of 5000 Hz, 2 out, 2 in" in lines
+    monkeypatch.setattr(list_ports, "comports", list)
+    assert "serial: none" in [" ".join(line.split()) for line in devices.text().splitlines()]

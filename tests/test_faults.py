@@ -100,7 +100,7 @@ def scene(frequency=72.0, amplitude=20e-6, duration=1.0, **fields):
 @pytest.mark.skipif(sys.platform == "win32", reason="no such signals on this system")
 @pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
 def test_a_signal_to_the_process_ends_in_zero_drive(tmp_path, number, status):
-    """The command line on a device of one's own: what the device was played last is zero, and the journal can be read."""
+    """The command line on a device of one's own: what it was played last is zero, and the journal can be read."""
     log, out = tmp_path / "played", tmp_path / "out"
     (tmp_path / "long.toml").write_text(scene(duration=600.0).to_toml())
     command = [sys.executable, "-m", "hapticrender", "render", tmp_path / "long.toml", "--out", out]

@@ -45,6 +45,7 @@ void board_defaults(board_t *board)
 void board_begin(board_t *board, board_state state)
 {
     law_init(&board->law, &board->played);
+    supervisor_init(&board->supervisor, &supervision, &board->played);
     (void)law_set_drive_limit(&board->law, board->peak);
     (void)law_set_gain(&board->law, board->gain);
     board->state = state;
@@ -57,7 +58,7 @@ void board_begin(board_t *board, board_state state)
     board->stream_count = 0;
 }
 
-void board_stop(board_t *board, board_cause cause)
+void board_stop(board_t *board, uint32_t cause)
 {
     if (board->state != BOARD_IDLE && board->fade_to > REAL(0.0)) {
         board->fade_to = REAL(0.0);
@@ -122,8 +123,11 @@ static void compute_drive(board_t *board)
         board->drive[c] = REAL(0.0);
     }
     if (board->state == BOARD_PLAYING) {
-        board->flags |= law_step(&board->law, board->sensed, board->position, board->finger.velocity, REAL(0.0),
-                                 board->drive);
+        board->flags |= supervisor_step(&board->supervisor, &board->law, board->sensed, board->position,
+                                        board->finger.velocity, REAL(0.0), board->drive);
+        if (board->supervisor.cause != SUPERVISOR_FINE) {
+            board_stop(board, CAUSE_SUPERVISOR + (uint32_t)board->supervisor.cause);
+        }
     } else if (board->state == BOARD_IDENTIFYING) {
         play_multisine(board);
     } else if (board->state == BOARD_DRIVING) {

@@ -13,6 +13,7 @@
 
 #include "frames.h"
 #include "law.h"
+#include "supervisor.h"
 
 enum {
     BOARD_VERSION = 1,
@@ -41,7 +42,10 @@ enum {
 typedef enum { BOARD_IDLE, BOARD_PLAYING, BOARD_IDENTIFYING, BOARD_DRIVING } board_state;
 
 /* Why the board last came to rest. */
-typedef enum { CAUSE_NONE, CAUSE_COMMAND, CAUSE_SILENCE, CAUSE_LIMIT, CAUSE_SENSOR, CAUSE_DONE, CAUSE_SESSION } board_cause;
+typedef enum {
+    CAUSE_NONE, CAUSE_COMMAND, CAUSE_SILENCE, CAUSE_LIMIT, CAUSE_SENSOR, CAUSE_DONE, CAUSE_SESSION,
+    CAUSE_SUPERVISOR = 16                         /* and a supervisor_cause_t */
+} board_cause;
 
 /* Flags beside those of the law, as hapticrender.protocols.Flag. */
 #define BOARD_OVERRUN 8u
@@ -62,9 +66,10 @@ typedef struct {
 
 typedef struct {
     law_t law;
+    supervisor_t supervisor;
     design_t played;                              /* the design, with the bands in use */
     board_state state;
-    board_cause cause;
+    uint32_t cause;                               /* a board_cause, or CAUSE_SUPERVISOR and the supervisor's */
     uint32_t sample;                              /* since reset; wraps */
     uint64_t clock;                               /* us since reset, times 65536 */
     uint32_t clock_step;
@@ -112,7 +117,7 @@ void board_tick(board_t *board, uint32_t ticks);
 uint32_t board_time(const board_t *board);                      /* us since reset; wraps */
 void board_defaults(board_t *board);                            /* gain and limits of the design */
 void board_begin(board_t *board, board_state state);            /* a run, from rest */
-void board_stop(board_t *board, board_cause cause);             /* fade out, unless at rest */
+void board_stop(board_t *board, uint32_t cause);                /* fade out, unless at rest */
 void board_command(board_t *board, const frame *incoming);      /* board_commands.c: do what a frame says */
 void board_send(board_t *board, uint8_t kind, uint16_t sequence, const uint8_t *payload, size_t count);
 void board_telemetry(board_t *board);                           /* board_telemetry.c */

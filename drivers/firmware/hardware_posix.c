@@ -3,12 +3,13 @@
  * the finger presses where the host says.
  *
  *   board_posix LINK [--finger MASS,DAMPING,STIFFNESS] [--noise RMS] [--seed N] [--log FILE] [--slow N]
- *               [--step]
+ *               [--gain FIRST,SECOND] [--step]
  *
  * LINK becomes a symbolic link to the pseudo-terminal.  Paced by the clock, or by one that is N times as slow; with
  * --step by its standard input: a line
  * "SAMPLES BYTES" lets it run so many samples once it has received so many bytes in all, after which it writes
  * "SAMPLE BYTES", where it is and the bytes that it has sent in all.  FILE gets a line for whatever it executes.
+ * --gain makes a sensor inverted (-1), dead (0) or wrong.
  */
 #define _XOPEN_SOURCE 700
 
@@ -35,6 +36,7 @@ const uint32_t hardware_cycle_rate = 1000000000u;
 static board_t board;
 static plate_t plate = {4e-3, 1.5, 300.0, 1e-6, 1u, {0.0, 0.0, 0.0, 0.0}};
 static double acting[2], handed_over[2];          /* A: current now, and from the next tick on */
+static double gain[2] = {1.0, 1.0};               /* of the sensors */
 static int line = -1;                             /* master of the pseudo-terminal */
 static double slower = 1.0;                       /* than the clock */
 static int stepped;                               /* time comes from standard input */
@@ -132,8 +134,8 @@ void hardware_sense(real_t sensed[])
 {
     double values[2];
     plate_sense(&plate, values);
-    sensed[0] = (real_t)values[0];
-    sensed[1] = (real_t)values[1];
+    sensed[0] = (real_t)(gain[0] * values[0]);
+    sensed[1] = (real_t)(gain[1] * values[1]);
 }
 
 void hardware_drive(const real_t drive[])
@@ -222,6 +224,9 @@ static void open_line(void)
 static void take_option(const char *name, const char *value)
 {
     if (strcmp(name, "--finger") == 0 && sscanf(value, "%lf,%lf,%lf", &plate.mass, &plate.damping, &plate.stiffness) == 3) {
+        return;
+    }
+    if (strcmp(name, "--gain") == 0 && sscanf(value, "%lf,%lf", &gain[0], &gain[1]) == 2) {
         return;
     }
     if (strcmp(name, "--noise") == 0 && sscanf(value, "%lf", &plate.noise) == 1) {

@@ -5,7 +5,7 @@
 
 #define ROOT2 REAL(1.4142135623730951)
 #define INVALID_SHARE REAL(0.3)
-#define HELD 5u            /* times the longest repetition before: converters may hold their values */
+#define HELD 5u /* times the longest repetition before: converters may hold their values */
 #define BY_DRIVE REAL(6.0) /* energy of the residual over that of the force: in a fault the residual is the drive */
 #define POWER REAL(0.6)
 #define SLOW_POWER REAL(0.65)
@@ -28,7 +28,8 @@ static uint32_t less_one(uint32_t count) { return (count > 0u) ? (count - 1u) : 
 /* Whether a sensor has repeated a value for long while the drive moved. */
 static uint32_t is_frozen(supervisor_t *s, uint32_t i, real_t value, real_t drive)
 {
-    const uint32_t time = s->p->frozen_time;
+    const uint32_t most_usual = s->p->frozen_time;
+    uint32_t least_time;
     if ((value < s->last[i]) || (value > s->last[i])) {
         s->longest[i] = (s->repeats[i] > s->longest[i]) ? s->repeats[i] : s->longest[i];
         s->last[i] = value;
@@ -40,12 +41,9 @@ static uint32_t is_frozen(supervisor_t *s, uint32_t i, real_t value, real_t driv
     s->repeats[i] += 1u;
     s->least[i] = real_min(s->least[i], drive);
     s->most[i] = real_max(s->most[i], drive);
-    uint32_t usual = HELD * time;
-    if ((s->longest[i] > 0u) && (s->longest[i] < time)) {
-        usual = HELD * s->longest[i];
-    }
-    const uint32_t repeats = ((s->repeats[i] >= time) && (s->repeats[i] >= usual)) ? 1u : 0u;
-    return ((repeats != 0u) && (s->most[i] - s->least[i] > s->p->frozen_drive)) ? 1u : 0u;
+    least_time = HELD * (((s->longest[i] > 0u) && (s->longest[i] < most_usual)) ? s->longest[i] : most_usual);
+    least_time = (least_time > most_usual) ? least_time : most_usual;
+    return ((s->repeats[i] >= least_time) && (s->most[i] - s->least[i] > s->p->frozen_drive)) ? 1u : 0u;
 }
 
 static supervisor_cause_t cause_of(supervisor_t *s, uint32_t invalid, uint32_t frozen, uint32_t beyond)
