@@ -1,180 +1,37 @@
-"""The control law in C against the library's kernel, on the simulated plate, under sanitisers, and on a Cortex-M4."""
+"""The control law in C against the library's kernel, on the simulated plate, and under sanitisers."""
 
-import ctypes
-import fnmatch
-import re
-import shutil
 import subprocess
-import tomllib
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from board import FIRMWARE, ROOT, SANITISED, compile_c
+from board import ROOT, SANITISED, compile_c
+from laws import (
+    DEVICES,
+    FINGERS,
+    KINDS,
+    PARTS,
+    RATE,
+    SAMPLES,
+    TEXTURES,
+    Exports,
+    White,
+    ahead_of,
+    close,
+    kernel_of,
+)
 from scipy.signal import butter, sosfiltfilt
 
 import hapticrender as hr
-from hapticrender import cli
-from hapticrender.bands import Bands
 from hapticrender.control.supervisor_kernel import ACTIVE, FROZEN, INCONSISTENT, INVALID, OVERMOTION, RINGING
-from hapticrender.drivers.serial import BoardClient
-from hapticrender.export import board_design, export, sources
-from hapticrender.jit import addresses
 from hapticrender.plants.plate import Plate, PlateParameters
 from hapticrender.protocols import Flag
 
-RATE, SAMPLES, AHEAD = 5000, 15_000, 7  # Hz; of a run; by which a waveform is ahead: the delay and 6
-LAW = ("law", "learning", "carriers", "supervisor", "design")
-KINDS = {"double": "-DREAL_DOUBLE", "float": "-UREAL_DOUBLE"}
-CROSS, QEMU = "arm-none-eabi-gcc", "qemu-system-arm"
-RMS = 5e-6  # m, of the white noise
 LOW_LIMIT = 0.05  # A: every texture here needs more
-
-
-class White:
-    """White noise of 20-400 Hz, played whole."""
-
-    def __init__(self, spatial=False):
-        spectrum = np.fft.rfft(np.random.default_rng(0).standard_normal(SAMPLES + AHEAD))
-        frequency = np.fft.rfftfreq(SAMPLES + AHEAD, 1 / RATE)
-        values = np.fft.irfft(np.where((frequency > 20) & (frequency < 400), spectrum, 0.0), SAMPLES + AHEAD)
-        self.values, self.spatial = values * RMS / values.std(), spatial
-
-    def bands(self, rate):
-        return Bands.none(spatial=self.spatial)
-
-    def waveform(self, time, position):
-        index = np.minimum(np.round(np.asarray(time) * RATE).astype(int), SAMPLES + AHEAD - 1)
-        return self.values[index]
-
-
-FINGERS = {
-    "touch": hr.Finger.still(0.015, normal_load=0.6, mechanics="heavy", touches=[(0.8, 2.2)]),
-    "slide": hr.Finger.sliding(speed=0.08, normal_load=0.6, span=0.08, touches=[(0.3, 1.5), (1.7, 9.0)]),
-    "sweep": hr.Finger.swiping(frequency=1.0, speed=0.12, normal_load=0.4, mechanics="light"),
-}
-TEXTURES = {
-    "tones": hr.Grating(amplitude=10e-6, frequency=60.0, partials=((1.0, 1.0, 0.0), (2.4, 0.4, 1.0))),
-    "grating": hr.Grating(amplitude=10e-6, wavelength=1e-3),
-    "white": White(),
-    "white-spatial": White(spatial=True),
-}
-
-
-DEVICES = {
-    "one coil": {"coils": 1},
-    "late": {"delay": 3},
-    "fast": {"rate": 10e3},
-    "bending": {"bending_frequency": 1250.0, "bending_coil": 0.1},
-}
-
-
-class Law:
-    """A law in C at rest, with the face of a controller, so that the simulated plate can be closed with it."""
-
-    block, n_bands = 1, 0
-
-    def __init__(self, library, name="law"):
-        self.library, self.rows = library, getattr(library, f"{name}_rows")
-        self.state = np.zeros(getattr(library, f"{name}_size")(), np.uint8)
-        self.step = SimpleNamespace(address=ctypes.cast(self.rows, ctypes.c_void_p).value)
-        getattr(library, f"{name}_start")(self.address)
-
-    @property
-    def address(self):
-        return self.state.ctypes.data
-
-    def set_bands(self, *rows):
-        rows = np.array(rows, float).reshape(-1, 5)
-        return self.library.law_bands(self.address, rows.ctypes.data, len(rows))
-
-    def envelopes(self, band):
-        found = np.zeros(4)
-        self.library.law_envelope(self.address, band, found.ctypes.data)
-        return complex(*found[:2]), complex(*found[2:])
-
-    def covariance(self):
-        found = np.zeros((18, 18))
-        self.library.law_covariance(self.address, found.ctypes.data)
-        return found
-
-    def run(self, sensed, position, waveform, channels=2):
-        drive, flags = np.zeros((len(sensed), channels)), np.zeros(len(sensed), np.int64)
-        signals = addresses(drive=drive, sensed=sensed, position=position, waveform=waveform, flags=flags)
-        self.rows(self.address, signals.ctypes.data, 0, len(sensed))
-        return drive, flags
-
-
-class Exports:
-    """Designs of the textures, and their laws in C, each built once."""
-
-    def __init__(self, folder):
-        self.folder, self.renderings, self.libraries = folder, {}, {}
-
-    def rendering(self, name):
-        """Scene whose drive is not rounded: a last bit would decide which way, and both would part for good.
-
-        Its name is a texture's, or that of a device, which plays tones.
-        """
-        if name not in self.renderings:
-            texture, profile = TEXTURES.get(name, TEXTURES["tones"]), {"current_bits": 0} | DEVICES.get(name, {})
-            fields = {"duration": 3.0, "finger": FINGERS["slide"], "profile": profile, "keep_unfelt": True}
-            self.renderings[name] = hr.prepare(hr.Scene(texture=texture, **fields))
-        return self.renderings[name]
-
-    def law(self, texture, kind, name="law"):
-        key = texture, kind
-        if key not in self.libraries:
-            self.libraries[key] = self.library(texture, kind)
-        return Law(self.libraries[key], name)
-
-    def library(self, texture, kind):
-        folder = self.folder / texture.replace(" ", "-")
-        if not folder.exists():
-            export(self.rendering(texture), folder)
-        files = [*(folder / f"{name}.c" for name in LAW), ROOT / "tests" / "law_step.c"]
-        options = ("-O2", "-fPIC", "-shared", KINDS[kind], f"-I{folder}")
-        library = ctypes.CDLL(str(compile_c(folder / f"law-{kind}.so", files, *options)))
-        address, number, count = ctypes.c_int64, ctypes.c_double, ctypes.c_uint32
-        library.law_size.restype = library.supervised_size.restype = ctypes.c_size_t
-        for name, types in {
-            "law_start": (address,),
-            "law_limit": (address, number),
-            "law_gain": (address, number),
-            "law_bands": (address, address, count),
-            "law_envelope": (address, count, address),
-            "law_covariance": (address, address),
-            "law_rows": (address,) * 4,
-            "supervised_start": (address,),
-            "supervised_cause": (address,),
-            "supervised_rows": (address,) * 4,
-        }.items():
-            getattr(library, name).argtypes = types
-        return library
 
 
 @pytest.fixture(scope="module")
 def exports(tmp_path_factory):
     return Exports(tmp_path_factory.mktemp("exports"))
-
-
-def ahead_of(texture):
-    """Reference that a law is handed: of a waveform `AHEAD` samples early, 0 beside bands."""
-    return texture.values[AHEAD:].copy() if isinstance(texture, White) else np.zeros(SAMPLES)
-
-
-def close(controller, finger, texture, bits=0):
-    """Drive, flags and signals of the simulated plate under a controller, and the plate."""
-    plate = Plate(PlateParameters(current_bits=bits), finger, seed=1)
-    drive, _, flags, signals = plate.closed_loop(controller, ahead_of(texture))
-    return drive, flags, signals, plate
-
-
-def kernel_of(exports, texture, limit=None):
-    controller = exports.rendering(texture).controller().controller  # without its supervisor
-    if limit is not None:
-        controller.state["p"]["drive_limit"] = limit
-    return controller
 
 
 CASES = [(name, finger, limit) for name in TEXTURES for finger in FINGERS for limit in (None, LOW_LIMIT)]
@@ -256,7 +113,6 @@ def test_the_supervisor_equals_the_librarys(exports, fault, kind):
     drive, _, flags = controller.run(sensed, position, np.zeros(9000))
     law = exports.law("tones", kind, "supervised")
     found, found_flags = law.run(sensed, position, np.zeros(9000))
-    print(fault, controller.fault, law.library.supervised_cause(law.address))
     assert law.library.supervised_cause(law.address) == cause == (controller.fault.cause if controller.fault else 0)
     stops = [np.argmax(each & Flag.STOPPED) for each in (flags, found_flags)]
     assert abs(np.diff(stops)) <= (0 if kind == "double" else 5)
@@ -399,62 +255,10 @@ def test_sanitisers_find_nothing_whatever_the_inputs_are(exports, kind):
     """Numbers at random, huge and none at all; the drive is finite and within its limit in every sample."""
     exports.law("tones", kind)
     folder = exports.folder / "tones"
-    files = [*(folder / f"{name}.c" for name in LAW), ROOT / "tests" / "law_inputs.c"]
+    files = [*(folder / f"{name}.c" for name in PARTS), ROOT / "tests" / "law_inputs.c"]
     program = compile_c(folder / f"inputs-{kind}", files, *SANITISED, KINDS[kind], f"-I{folder}")
     done = subprocess.run([program], capture_output=True, text=True, check=False)
     assert (done.returncode, done.stdout, done.stderr) == (0, "60000\n", "")
-
-
-def test_export_says_what_it_writes_and_keeps_what_was_changed(exports, tmp_path):
-    rendering = exports.rendering("tones")
-    written = export(rendering, tmp_path, bands=12)
-    assert {path.name for path in written} == {path.name for path in sources()} | {"design.c", "design.h"}
-    assert "#define LAW_BANDS 12\n" in (tmp_path / "design.h").read_text()
-    assert export(rendering, tmp_path) == written
-    for name in ("law.c", "design.c"):
-        (tmp_path / name).write_text("mine\n")
-        with pytest.raises(ValueError, match=f"{name}.*not as it was written.*--force"):
-            export(rendering, tmp_path)
-        assert (tmp_path / name).read_text() == "mine\n"
-        export(rendering, tmp_path, force=True)
-
-
-def refused(**changes):
-    scene = hr.Scene(**{"texture": TEXTURES["tones"], "finger": hr.Finger.absent(), "duration": 1.0} | changes)
-    board_design(hr.prepare(scene))
-
-
-def test_export_refuses_what_a_board_cannot_play(exports):
-    with pytest.raises(ValueError, match="device.kind = 'electroadhesion': a board plays vt-plate only"):
-        refused(device="electroadhesion", texture=hr.Grating(velocity=8e-3, frequency=80.0), finger=FINGERS["sweep"])
-    with pytest.raises(ValueError, match="method = 'h2': a board plays \"inverse\" only"):
-        refused(method="h2")
-    with pytest.raises(ValueError, match="texture Synthetic: a board plays a whole waveform, without `carriers`"):
-        refused(texture=hr.Synthetic(amplitude=20e-6, speed=0.08), finger=FINGERS["sweep"])
-    with pytest.raises(ValueError, match="delay = 65 samples: must be <= 64"):
-        refused(profile={"delay": 65})
-    rendering = exports.rendering("tones")
-    assert board_design(rendering, 2)[0]["BANDS"] == 2
-    assert board_design(rendering, 64)[0]["BANDS"] == 64
-    for bands in (1, 65):
-        with pytest.raises(ValueError, match=f"bands = {bands}: must be 2 .* to 64"):
-            board_design(rendering, bands)
-
-
-def test_the_command_line_exports(tmp_path, capsys):
-    assert cli.main(["export", "grating-47", "--out", str(tmp_path / "board")]) == 0
-    assert "build them with: make -C" in capsys.readouterr().out
-    assert cli.main(["export", "screen-spatial", "--out", str(tmp_path / "other")]) == 2
-    assert "a board plays vt-plate only" in capsys.readouterr().err
-    assert not (tmp_path / "other").exists()
-
-
-def test_every_source_is_shipped():
-    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
-    patterns = project["tool"]["setuptools"]["package-data"]["hapticrender.drivers"]
-    names = [f"firmware/{path.name}" for path in FIRMWARE.iterdir()]
-    assert not [name for name in names if not any(fnmatch.fnmatch(name, each) for each in patterns)]
-    assert {path.name for path in sources()} == {path.name for path in FIRMWARE.iterdir()}
 
 
 CAREFUL = "-Wconversion -Wshadow -Wcast-qual -Wundef -Wstrict-prototypes -Wmissing-prototypes -Wvla".split()
@@ -464,103 +268,5 @@ CAREFUL = "-Wconversion -Wshadow -Wcast-qual -Wundef -Wstrict-prototypes -Wmissi
 def test_careful_warnings_find_nothing(exports, kind):
     exports.law("tones", kind)
     folder = exports.folder / "tones"
-    for name in LAW:
+    for name in PARTS:
         compile_c(folder / f"{name}.o", [folder / f"{name}.c"], *CAREFUL, "-Wdouble-promotion", KINDS[kind], "-c")
-
-
-# a real Cortex-M4, emulated
-
-
-def cross_tools():
-    missing = [tool for tool in (CROSS, QEMU) if shutil.which(tool) is None]
-    if missing:
-        pytest.skip(f"no {' and no '.join(missing)} here: make board-test installs them (gcc-arm-none-eabi, ...)")
-
-
-def built(folder, rendering, target):
-    cross_tools()
-    export(rendering, folder, force=True)
-    subprocess.run(["make", "-s", "-C", folder, target], check=True)
-    return folder / target
-
-
-def test_the_law_needs_no_heap_no_output_and_no_double_on_a_cortex_m4(exports, tmp_path):
-    """All that its parts ask of a C library; numbers of 64 bits would be functions of their own there."""
-    cross_tools()
-    export(exports.rendering("tones"), tmp_path)
-    parts = [f"{name}.o" for name in LAW]
-    flags = "-mcpu=cortex-m4 -mthumb -mfloat-abi=hard -mfpu=fpv4-sp-d16"
-    subprocess.run(["make", "-s", "-C", tmp_path, f"CC={CROSS} {flags}", *parts], check=True)
-    command = [CROSS.replace("gcc", "nm"), "-g", *parts]
-    symbols = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=True).stdout
-    listed = [line.split() for line in symbols.splitlines()]
-    defined = {words[-1] for words in listed if len(words) == 3}
-    asked = {words[-1] for words in listed if len(words) == 2 and words[0] == "U"}
-    assert asked - defined <= {"memcpy", "memmove", "memset", "rintf", "sqrtf"}
-
-
-def measured(program):
-    """Lines that measure.c prints on the emulated machine, by name; counts in instructions."""
-    machine = [QEMU, "-M", "mps2-an386", "-display", "none", "-monitor", "none", "-serial", "none"]
-    machine += ["-semihosting-config", "enable=on,target=native", "-icount", "shift=6", "-kernel", program]
-    done = subprocess.run(machine, capture_output=True, text=True, check=True, timeout=120)
-    lines = [line.split() for line in (done.stdout + done.stderr).splitlines()]
-    found = {words[0]: [float(word) for word in words[1:]] for words in lines}
-    return found | {name: [found[name][0] / 1.6] for name in ("nops", "free", "new", "touched", "most")}
-
-
-def bank(count):
-    """Scene of `count` ridges that follow the finger: the dearest kind of band."""
-    partials = tuple((1.0 + 0.25 * k, 1.0, 0.0) for k in range(count))
-    texture = hr.Grating(amplitude=20e-6 / (count + 1), wavelength=1e-3, partials=partials)
-    return hr.prepare(hr.Scene(texture=texture, finger=FINGERS["slide"], duration=1.0, keep_unfelt=True))
-
-
-def test_eight_bands_leave_a_third_of_a_cortex_m4(tmp_path):
-    """At 168 MHz and 5 kHz a sample has 33 600 cycles; an instruction takes at most 1.6 (benchmarks/board.py: 1.51).
-
-    The mean while a contact is new is the most that a law takes for long.
-    """
-    found = measured(built(tmp_path, bank(8), "measure-m4.elf"))
-    assert found["nops"][0] == pytest.approx(1000.0, abs=1.0), "instructions are not what is counted"
-    assert 1.6 * found["new"][0] < 168e6 / 5000 * 2 / 3
-    assert 1.6 * found["most"][0] < 168e6 / 5000
-    assert found["free"][0] < found["touched"][0] < found["new"][0] < found["most"][0]
-    assert found["flags"] == [0.0]
-
-
-def test_a_cortex_m4_measures_what_is_asked(exports, tmp_path):
-    """Telemetry of a band after 0.5 s of a sliding finger, in um, within 2 % of the target and the observer's noise.
-
-    That is 0.7 um of the mean of two sensors, times the root of the observer's gain of 4 pi 10 Hz/5 kHz.
-    """
-    rendering = exports.rendering("tones")
-    lines = measured(built(tmp_path, rendering, "measure-m4.elf"))
-    _, re_wanted, im_wanted, re_found, im_found = lines["band"]
-    wanted, found = complex(re_wanted, im_wanted), complex(re_found, im_found)
-    assert abs(wanted) == pytest.approx(abs(rendering.bands.envelope[1]) * 1e6, rel=1e-3)
-    assert abs(found - wanted) < 0.02 * abs(wanted) + 3 * 0.7 * np.sqrt(4 * np.pi * 10.0 / RATE)
-    assert 0 <= exports.law("tones", "float").state.size - lines["state"][0] <= 8, "more than a shorter pointer"
-
-
-def test_the_board_on_a_cortex_m4_speaks_to_the_host(exports, tmp_path):
-    """The same client as for any board, over the emulated machine's serial line: a pseudo-terminal."""
-    program = built(tmp_path, exports.rendering("tones"), "board-m4.elf")
-    machine = [QEMU, "-M", "mps2-an386", "-display", "none", "-monitor", "none", "-serial", "pty"]
-    board = subprocess.Popen([*machine, "-kernel", program], stdout=subprocess.PIPE, text=True)
-    try:
-        port = re.search(r"/dev/\S+", board.stdout.readline())[0]
-        with BoardClient(port, timeout=20.0) as client:  # the emulator looks for its host once a second
-            envelope = np.array([10e-6, 4e-6])
-            client.set_bands(Bands(frequency=[70.0, 120.0], wavenumber=[0, 0], phase=[0, 0], envelope=envelope))
-            start = client.start()
-            while client.telemetry().sample < start + RATE:
-                client.clock.sleep(0.05)
-            bands = client.telemetry().bands
-            client.stop()
-        for band, wanted in zip(bands, envelope, strict=True):
-            assert abs(band.target - wanted) < 1e-6 * wanted
-            assert abs(band.measured - wanted) < 0.05 * wanted
-    finally:
-        board.kill()
-        board.communicate()

@@ -1,0 +1,116 @@
+"""The law and the board on a real Cortex-M4, emulated by QEMU."""
+
+import re
+import shutil
+import subprocess
+
+import numpy as np
+import pytest
+from laws import FINGERS, PARTS, RATE, Exports
+
+import hapticrender as hr
+from hapticrender.bands import Bands
+from hapticrender.drivers.serial import BoardClient
+from hapticrender.export import export
+
+CROSS, QEMU = "arm-none-eabi-gcc", "qemu-system-arm"
+
+
+@pytest.fixture(scope="module")
+def exports(tmp_path_factory):
+    return Exports(tmp_path_factory.mktemp("exports"))
+
+
+def cross_tools():
+    missing = [tool for tool in (CROSS, QEMU) if shutil.which(tool) is None]
+    if missing:
+        pytest.skip(f"no {' and no '.join(missing)} here: make board-test installs them (gcc-arm-none-eabi, ...)")
+
+
+def built(folder, rendering, target):
+    cross_tools()
+    export(rendering, folder, force=True)
+    subprocess.run(["make", "-s", "-C", folder, target], check=True)
+    return folder / target
+
+
+def test_the_law_needs_no_heap_no_output_and_no_double_on_a_cortex_m4(exports, tmp_path):
+    """All that its parts ask of a C library; numbers of 64 bits would be functions of their own there."""
+    cross_tools()
+    export(exports.rendering("tones"), tmp_path)
+    parts = [f"{name}.o" for name in PARTS]
+    flags = "-mcpu=cortex-m4 -mthumb -mfloat-abi=hard -mfpu=fpv4-sp-d16"
+    subprocess.run(["make", "-s", "-C", tmp_path, f"CC={CROSS} {flags}", *parts], check=True)
+    command = [CROSS.replace("gcc", "nm"), "-g", *parts]
+    symbols = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=True).stdout
+    listed = [line.split() for line in symbols.splitlines()]
+    defined = {words[-1] for words in listed if len(words) == 3}
+    asked = {words[-1] for words in listed if len(words) == 2 and words[0] == "U"}
+    assert asked - defined <= {"memcpy", "memmove", "memset", "rintf", "sqrtf"}
+
+
+def measured(program):
+    """Lines that measure.c prints on the emulated machine, by name; counts in instructions."""
+    machine = [QEMU, "-M", "mps2-an386", "-display", "none", "-monitor", "none", "-serial", "none"]
+    machine += ["-semihosting-config", "enable=on,target=native", "-icount", "shift=6", "-kernel", program]
+    done = subprocess.run(machine, capture_output=True, text=True, check=True, timeout=120)
+    lines = [line.split() for line in (done.stdout + done.stderr).splitlines()]
+    found = {words[0]: [float(word) for word in words[1:]] for words in lines}
+    return found | {name: [found[name][0] / 1.6] for name in ("nops", "free", "new", "touched", "most")}
+
+
+def bank(count):
+    """Scene of `count` ridges that follow the finger: the dearest kind of band."""
+    partials = tuple((1.0 + 0.25 * k, 1.0, 0.0) for k in range(count))
+    texture = hr.Grating(amplitude=20e-6 / (count + 1), wavelength=1e-3, partials=partials)
+    return hr.prepare(hr.Scene(texture=texture, finger=FINGERS["slide"], duration=1.0, keep_unfelt=True))
+
+
+def test_eight_bands_leave_a_third_of_a_cortex_m4(tmp_path):
+    """At 168 MHz and 5 kHz a sample has 33 600 cycles; an instruction takes at most 1.6 (benchmarks/board.py: 1.51).
+
+    The mean while a contact is new is the most that a law takes for long.
+    """
+    found = measured(built(tmp_path, bank(8), "measure-m4.elf"))
+    assert found["nops"][0] == pytest.approx(1000.0, abs=1.0), "instructions are not what is counted"
+    assert 1.6 * found["new"][0] < 168e6 / 5000 * 2 / 3
+    assert 1.6 * found["most"][0] < 168e6 / 5000
+    assert found["free"][0] < found["touched"][0] < found["new"][0] < found["most"][0]
+    assert found["flags"] == [0.0]
+
+
+def test_a_cortex_m4_measures_what_is_asked(exports, tmp_path):
+    """Telemetry of a band after 0.5 s of a sliding finger, in um, within 2 % of the target and the observer's noise.
+
+    That is 0.7 um of the mean of two sensors, times the root of the observer's gain of 4 pi 10 Hz/5 kHz.
+    """
+    rendering = exports.rendering("tones")
+    lines = measured(built(tmp_path, rendering, "measure-m4.elf"))
+    _, re_wanted, im_wanted, re_found, im_found = lines["band"]
+    wanted, found = complex(re_wanted, im_wanted), complex(re_found, im_found)
+    assert abs(wanted) == pytest.approx(abs(rendering.bands.envelope[1]) * 1e6, rel=1e-3)
+    assert abs(found - wanted) < 0.02 * abs(wanted) + 3 * 0.7 * np.sqrt(4 * np.pi * 10.0 / RATE)
+    assert 0 <= exports.law("tones", "float").state.size - lines["state"][0] <= 8, "more than a shorter pointer"
+
+
+def test_the_board_on_a_cortex_m4_speaks_to_the_host(exports, tmp_path):
+    """The same client as for any board, over the emulated machine's serial line: a pseudo-terminal."""
+    program = built(tmp_path, exports.rendering("tones"), "board-m4.elf")
+    machine = [QEMU, "-M", "mps2-an386", "-display", "none", "-monitor", "none", "-serial", "pty"]
+    board = subprocess.Popen([*machine, "-kernel", program], stdout=subprocess.PIPE, text=True)
+    try:
+        port = re.search(r"/dev/\S+", board.stdout.readline())[0]
+        with BoardClient(port, timeout=20.0) as client:  # the emulator looks for its host once a second
+            envelope = np.array([10e-6, 4e-6])
+            client.set_bands(Bands(frequency=[70.0, 120.0], wavenumber=[0, 0], phase=[0, 0], envelope=envelope))
+            start = client.start()
+            while client.telemetry().sample < start + RATE:
+                client.clock.sleep(0.05)
+            bands = client.telemetry().bands
+            client.stop()
+        for band, wanted in zip(bands, envelope, strict=True):
+            assert abs(band.target - wanted) < 1e-6 * wanted
+            assert abs(band.measured - wanted) < 0.05 * wanted
+    finally:
+        board.kill()
+        board.communicate()
