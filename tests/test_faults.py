@@ -128,6 +128,31 @@ def test_a_signal_to_the_process_ends_in_zero_drive(tmp_path, number, status):
     np.testing.assert_array_equal(recording.drive, drive.reshape(-1, 2)[: len(recording)])
 
 
+class Interrupted:
+    """A tone whose reference is computed, for the journal, when Ctrl-C comes."""
+
+    caught = False
+
+    def bands(self, rate):
+        return hr.Bands(frequency=[72.0], wavenumber=[0.0], phase=[0.0], envelope=[20e-6 + 0j])
+
+    def waveform(self, at, position):
+        if at[0] > 0.2 and not self.caught:
+            self.caught = True
+            raise KeyboardInterrupt
+        return 20e-6 * np.cos(2 * np.pi * 72.0 * at)
+
+
+def test_a_signal_while_the_journal_is_written_loses_nothing(tmp_path):
+    plate = Logged(block=25, told=25, delay=25)
+    with pytest.raises(KeyboardInterrupt):
+        hr.render(hr.Scene(texture=Interrupted(), duration=2.0), driver=plate, journal=tmp_path / "run.au")
+    played = np.concatenate(plate.played)
+    recording = hr.Recording.load(tmp_path / "run.au")
+    np.testing.assert_array_equal(recording.drive, played[:-25])  # but for the zeros at the end
+    assert not played[-25:].any()
+
+
 def lost(sample, sensed):
     """Unplugged after half a second."""
     if sample >= 0.5 * RATE:

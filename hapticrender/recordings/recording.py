@@ -102,7 +102,12 @@ class Recorder:
         blocks, self._blocks, self._waiting = self._blocks, [], 0
         if self._file is None:
             self._file = self._create(self.path)
-        self._file.write(self._frames(blocks).astype(journal.JOURNAL_DTYPE).data)
+        try:
+            frames = self._frames(blocks)
+        except (KeyboardInterrupt, SystemExit):  # a signal: they are written on closing
+            self._blocks = blocks
+            raise
+        self._file.write(frames.astype(journal.JOURNAL_DTYPE).data)
         self._file.flush()
 
     def close(self) -> None:
