@@ -33,7 +33,7 @@ audio-test: .venv/test.stamp ## run the sound-card driver on a JACK server, with
 	@if [ "$$(id -u)" = 0 ] && command -v apt-get >/dev/null && ! dpkg -s $(AUDIO) >/dev/null 2>&1; then \
 		echo "installing $(AUDIO)"; apt-get update -qq; \
 		DEBIAN_FRONTEND=noninteractive apt-get install -qq -y --no-install-recommends $(AUDIO) >/dev/null; fi
-	@$(RUN) -m pytest -rs $(wildcard tests/test_audio*.py) $(PYTEST_ARGS)
+	@$(RUN) -m pytest -rs $(wildcard tests/test_audio*.py tests/test_player_jack.py) $(PYTEST_ARGS)
 
 test-oldest: .venv-oldest/made.stamp ## run the kernels' tests on the oldest numba, numpy and scipy that pyproject.toml allows
 	@MPLBACKEND=Agg .venv-oldest/bin/python -m pytest $(wildcard $(OLDEST_TESTS)) $(PYTEST_ARGS)

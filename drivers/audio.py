@@ -22,6 +22,7 @@ from hapticrender.protocols import Array, Flag, Sensed
 PATIENCE = 2.0  # s: longest wait for a block
 LONGEST = 10.0  # s: delay that no set-up has
 OVERRUN, SATURATED = int(Flag.OVERRUN), int(Flag.SATURATED)
+FAR_AHEAD = 40  # blocks that wait to be played through a cable: nothing is computed from what is sensed
 FULL_SCALE = 3.0  # A: drive at full scale, as in the sound files of `WaveFileDriver`, unless it is given
 Channels = tuple[int, ...]
 
@@ -61,6 +62,8 @@ class AudioDriver(BaseDriver):
     ValueError
         A channel, a scale or the delay is out of its bound.
     """
+
+    _ahead = AHEAD
 
     def __init__(
         self,
@@ -132,7 +135,7 @@ class AudioDriver(BaseDriver):
     @property
     def queued(self) -> int:
         """Samples that `play` adds to the card's own delay: the block that Python computes, and those that wait."""
-        return (1 + AHEAD) * self.block
+        return (1 + self._ahead) * self.block
 
     def live(self) -> LiveAudioDriver:
         """Make the same driver for a compiled controller, with a shorter delay."""
@@ -141,7 +144,9 @@ class AudioDriver(BaseDriver):
     def loop_back(self) -> AudioDriver:
         """Make a driver of the first output and the first input (1 unless given), both in full scales."""
         own = {"drive_per_full_scale": 1.0, "sensed_per_full_scale": 1.0, "delay": float(self.block)}
-        return self._like(AudioDriver, channels=self.channels[:1], sensed_channels=(self.inputs or (1,))[:1], **own)
+        driver = self._like(AudioDriver, channels=self.channels[:1], sensed_channels=(self.inputs or (1,))[:1], **own)
+        driver._ahead = FAR_AHEAD
+        return driver
 
     def _like(self, kind: type[AudioDriver], **changes: Any) -> AudioDriver:
         names = ("device", "channels", "rate", "block", "latency", "drive_per_full_scale", "sensed_per_full_scale")
@@ -159,7 +164,7 @@ class AudioDriver(BaseDriver):
         chosen = [find(_index(each)) for each in self._sides()]
         output, inputs = self._side(chosen[0], self.channels, 1), self._side(chosen[1], self.inputs, 0)
         self._relay = Relay(*(tuple(n - 1 for n in each) for each in (self.inputs, self.channels)), self.block)
-        self._queue = BlockQueue(self.block, self.sensed_channels, self.drive_channels)
+        self._queue = BlockQueue(self.block, self.sensed_channels, self.drive_channels, self._ahead)
         self._queue_address, _ = self._queue.address, self._queue.blocks  # compiled before the stream starts
         addresses = self._relay.address, self._relay.user_data
         self._stream = Stream(str(self), output, inputs, self.rate, self.block, *addresses)
@@ -203,7 +208,7 @@ class AudioDriver(BaseDriver):
 
     def _play(self, drive: Array) -> Sensed:
         number, queue = self._number, self._queue
-        if not queue.put(number + AHEAD, drive * self.drive_scale):
+        if not queue.put(number + self._ahead, drive * self.drive_scale):
             number = queue.blocks  # what was missed is lost; go on with the next one
         if self._relay.count("function") == 0:
             self._relay.call(self._queue_address, queue.user_data)

@@ -20,8 +20,8 @@ from numba.extending import intrinsic
 from hapticrender.jit import I8, CFunction, call, entry, kernel, pointer, record
 from hapticrender.protocols import Array, Flag
 
-SLOTS = 8  # blocks that wait in either direction
-AHEAD = 2  # blocks of drive that wait to be played while Python computes the next one
+SLOTS = 64  # blocks that wait in either direction
+AHEAD = 2  # blocks of drive that wait to be played while Python computes the next one, unless told
 CONTINUE = 0  # result of PortAudio's callback
 LOST = 0b1111  # PortAudio's status: input or output under- or overflow
 OVERRUN = int(Flag.OVERRUN)
@@ -193,22 +193,24 @@ class Relay:
 class BlockQueue:
     """Numbered blocks between Python and the callback: drive block n is played in call n, or not at all.
 
-    The time from a sensed sample to the drive that Python computes from it is therefore always the same, `AHEAD` + 1
+    The time from a sensed sample to the drive that Python computes from it is therefore always the same, `ahead` + 1
     blocks and what the card adds; where Python is late, the device gets zeros and the block is flagged.
 
     Parameters
     ----------
     block : int, samples
     sensors, channels : int
+    ahead : int, < SLOTS - 1
+        Blocks of drive that wait to be played.
     """
 
-    def __init__(self, block: int, sensors: int, channels: int) -> None:
+    def __init__(self, block: int, sensors: int, channels: int, ahead: int = AHEAD) -> None:
         self._sensed = np.zeros((SLOTS, block, max(sensors, 1)), np.float32)[:, :, :sensors]
         self._drive = np.zeros((SLOTS, block, channels), np.float32)
         self._numbers = np.full(SLOTS, -1, np.int64)
         self._flags = np.zeros(SLOTS, np.int64)
         self._record = np.zeros(1, QUEUE)
-        values = {"first": AHEAD, "sensors": sensors, "channels": channels}
+        values = {"first": ahead, "sensors": sensors, "channels": channels}
         values |= {"sensed_at": self._sensed.ctypes.data, "drive_at": self._drive.ctypes.data}
         values |= {"number_at": self._numbers.ctypes.data, "flags_at": self._flags.ctypes.data}
         for name, value in values.items():

@@ -22,6 +22,15 @@ A driver carries samples to a device, a file or a plant model, and back.  Any ob
     False where the start-up probe of a plate is to be left out (docs/safety.md)
 ``play_delay`` (optional)
     delay of `play`, where `delay` is that of a callback which plays a compiled controller (`start`, `stop`)
+``finger`` (optional)
+    of a device that has to be told where the finger is: None, until `render` sets it to the scene's `Finger`
+``live()`` (optional)
+    the same device for live play (`hapticrender.Player`), where that is another driver
+``start(entry)``, ``stop()`` (optional)
+    of a device that calls back: hands it a ``hapticrender.realtime.RealtimeEntry``, with ``sensed_scale`` (m) and
+    ``drive_scale`` (1/A) of full scale
+``loop(rendering)`` (optional)
+    of a device with a controller of its own: what it plays live, like ``hapticrender.live.LiveLoop``
 ``exchange(controller)`` (optional)
     a whole closed loop of its own, sample by sample; see ``protocols.Exchange``
 ``found()`` (optional, class method)

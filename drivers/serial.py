@@ -46,7 +46,7 @@ class SerialDriver(BaseDriver):
     port : str
         Name of the serial port.
     finger : Trajectory, optional
-        Where the finger is, from the start of the run on; lifted unless given.
+        Where the finger is, from the start of the run on; `render` sets it to that of the scene unless given.
     block : int, >= 1
         1: closed loop on the board.  More: drive from the host, a block a call, for identification; what it computes
         from a block acts two blocks later.
@@ -58,7 +58,7 @@ class SerialDriver(BaseDriver):
 
     def __init__(self, port: str, *, finger: Trajectory | None = None, block: int = 1, **options: Any) -> None:
         self.client = BoardClient(port, **options)
-        self._finger, self._sent = finger, 0
+        self.finger, self._sent = finger, 0
         self._reader: RowReader | None = None
         with self.client as client:
             found = client.capabilities
@@ -111,13 +111,13 @@ class SerialDriver(BaseDriver):
 
     def _point(self) -> None:
         """Send where the finger is now."""
-        if self._finger is None:
+        if self.finger is None:
             return
         clock = self.client.clock.monotonic()
         now = np.array([0.0, 1e-4]) + max(clock - self._started, 0.0)
-        here, there = self._finger.position(now)
+        here, there = self.finger.position(now)
         velocity = (there - here) * 1e4
-        self.client.finger(here, velocity if np.isfinite(velocity) else 0.0, self._finger.load(now[:1])[0], clock)
+        self.client.finger(here, velocity if np.isfinite(velocity) else 0.0, self.finger.load(now[:1])[0], clock)
 
     def _taken(self, count: int, bands: Bands) -> tuple[Array, Array, Array, Sensed]:
         reader = self._reader

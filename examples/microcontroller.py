@@ -43,7 +43,7 @@ def main() -> float:
         try:
             while not port.exists():
                 time.sleep(0.01)
-            recording = hr.render(scene, driver=SerialDriver(str(port), finger=finger, clock=SlowClock()))
+            recording = hr.render(scene, driver=SerialDriver(str(port), clock=SlowClock()))
         finally:
             board.terminate()
             board.wait()

@@ -28,8 +28,10 @@ BURST, TAIL = 0.05, 0.5  # s: noise that is played; after it, the longest round 
 FEWEST = 2048  # samples of a burst
 BAND = (0.05, 0.4)  # of the rate
 LEAST_CORRELATION = 0.5  # of what is sensed with what was played
+WHOLE = 0.9  # correlation from which on a burst has come back whole, although samples were lost somewhere
 MOST_SPREAD = 0.5  # samples, between runs
 NEW_PROFILE = '[profile]\nkind = "vt-plate"  # or electroadhesion, ultrasonic, hybrid\n'
+TINY = float(np.finfo(float).tiny)
 TRIES = 10  # times as many runs as asked for, where samples are lost
 
 
@@ -38,7 +40,7 @@ class Trip(NamedTuple):
 
     samples: float
     gain: float  # negative: the cable is inverted
-    correlation: float
+    correlation: float  # in the band that is used
 
 
 @dataclass(frozen=True)
@@ -140,7 +142,7 @@ def _opened(driver: Any) -> Iterator[Any]:
 
 
 def _trip(driver: Any, amplitude: float, rng: np.random.Generator) -> Trip | None:
-    """Play a burst and find it in what is sensed; None where samples were lost."""
+    """Play a burst and find it in what is sensed; None where samples of it were lost."""
     block = driver.block
     length = -(-max(round(BURST * driver.rate), FEWEST) // block) * block
     burst = amplitude * rng.choice([-1.0, 1.0], length)
@@ -153,7 +155,8 @@ def _trip(driver: Any, amplitude: float, rng: np.random.Generator) -> Trip | Non
         sensed[start : start + block] = got.sensed[:, 0]
         lost[start : start + block] = 0 if got.flags is None else got.flags & Flag.OVERRUN
     trip = find_trip(played, sensed)
-    return None if lost[: length + int(trip.samples) + block].any() else trip
+    damaged = lost[: length + int(trip.samples) + block].any() and trip.correlation < WHOLE
+    return None if damaged else trip
 
 
 def find_trip(played: Array, sensed: Array) -> Trip:
@@ -163,18 +166,15 @@ def find_trip(played: Array, sensed: Array) -> Trip:
     cross = np.fft.rfft(sensed, n) * np.fft.rfft(played, n).conj()
     correlation = np.fft.irfft(cross, n)[: len(played)]
     shift = int(np.argmax(abs(correlation)))
-    sign = float(np.sign(correlation[shift]))
-    scale = np.sqrt(float(played @ played) * float(sensed @ sensed))
     inside = (turns >= BAND[0]) & (turns <= BAND[1])
-    aligned = sign * cross[inside] * np.exp(2j * np.pi * turns[inside] * shift)
-    omega, weight = 2 * np.pi * turns[inside], abs(aligned)
-    slope = -np.sum(weight * omega * np.angle(aligned)) / max(float(np.sum(weight * omega**2)), np.finfo(float).tiny)
-    gain = (
-        sign
-        * float(np.sum((aligned * np.exp(1j * omega * slope)).real))
-        / float(np.sum(abs(np.fft.rfft(played, n)[inside]) ** 2))
-    )
-    return Trip(shift + float(slope), gain, abs(float(correlation[shift])) / scale if scale > 0 else 0.0)
+    omega = 2 * np.pi * turns[inside]
+    aligned = np.sign(correlation[shift]) * cross[inside] * np.exp(1j * omega * shift)
+    weight = abs(aligned)
+    slope = -np.sum(weight * omega * np.angle(aligned)) / max(float(np.sum(weight * omega**2)), TINY)
+    powers = [float(np.sum(abs(np.fft.rfft(each, n)[inside]) ** 2)) for each in (played, sensed)]
+    common = float(np.sum((aligned * np.exp(1j * omega * slope)).real))
+    gain = float(np.sign(correlation[shift])) * common / powers[0]
+    return Trip(shift + float(slope), gain, common / max((powers[0] * powers[1]) ** 0.5, TINY))
 
 
 def write_delay(path: Path, found: Latency) -> None:

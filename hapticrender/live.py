@@ -65,6 +65,7 @@ class LiveLoop:
         self.rendering, self.driver, self.model = rendering, rendering.driver, rendering.model
         self.controller: Any = live_controller(rendering)
         self.entry = RealtimeEntry(self.controller, **scales)
+        _ = self.entry.address if scales else self.entry.plain_address  # compiled before anything is live
         rows = len(self.entry.log(0)["flags"]) + round(LOG_TIME * rendering.driver.rate)
         self._told = np.full((rows, len(self.model.places) + 1), np.nan)  # true motion and load, where the device tells
         self._true, self.senses = False, False  # whether the device tells its true motion, and where the finger is

@@ -239,6 +239,8 @@ class Cable:
         line = np.concatenate([self._line, drive[:, 0]])
         self._line = line[64:]
         flags = np.full(64, int(Flag.OVERRUN) if self._opened in self._losing else 0)
+        if flags[0]:
+            line[:64:2] = 0.0
         sensed = self._gain * line[:64] + self._noise * self._rng.standard_normal(64)
         return Sensed(sensed[:, None], flags=flags)
 

@@ -85,7 +85,7 @@ MAY_IMPORT = {  # package: the others that it may import; renderers and drivers 
     "core": DEVICES,
     "top": {*DEVICES, "core"},
 }
-TOP = {f"hapticrender.{name}" for name in ("cli", "validate")}
+TOP = {f"hapticrender.{name}" for name in ("cli", "verbs", "validate")}
 
 
 def room_of(name):

@@ -1,0 +1,377 @@
+"""What the verbs of the command line do; `hapticrender.cli` reads their arguments."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from hapticrender import __version__, defaults
+from hapticrender.errors import HapticError, SceneError
+from hapticrender.formatting import printable
+
+if TYPE_CHECKING:
+    from hapticrender.protocols import Rendering
+    from hapticrender.report.outputs import Outputs
+    from hapticrender.report.progress import Progress
+    from hapticrender.touch.device_profile import DeviceProfile
+    from hapticrender.touch.scene import Scene
+
+LOOK = 0.25  # s between two looks at what plays
+PICTURES_HINT = 'no pictures without matplotlib; to get them: pip install "hapticrender[plot]"'
+
+
+def fail(message: str, status: int) -> int:
+    """Write exactly one line to standard error and return the exit status."""
+    print(f"hapticrender: {printable(' '.join(message.split()))}", file=sys.stderr)
+    return status
+
+
+def _made(path: Path) -> Path:
+    """Return `path`, its folder made."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    return path
+
+
+def demo(arguments: argparse.Namespace) -> int:
+    """Render the built-in scenes and make a page about them."""
+    from hapticrender.report import outputs
+    from hapticrender.report.page import refuse_foreign_page, write_page
+    from hapticrender.report.text import overview
+    from hapticrender.touch.builtin_scenes import builtin_scenes
+
+    scenes = builtin_scenes()
+    for name in scenes:
+        outputs.check_folder("--out", arguments.out / name)
+        if not arguments.force:
+            outputs.refuse_to_overwrite(arguments.out / name)
+            refuse_foreign_page(arguments.out)
+    renderings = _prepare(scenes, arguments)
+    progress = _progress(renderings)
+    finished: list[Outputs] = []
+    try:
+        for name, rendering in zip(scenes, renderings, strict=True):
+            with progress.scene(name) as tick:
+                finished.append(outputs.run_into(arguments.out / name, rendering, progress=tick))
+    finally:
+        if finished:
+            page = write_page(arguments.out, finished)
+    print(printable(overview([scene.summary for scene in finished])))
+    print(f"page: {page}")
+    return 0
+
+
+def render(arguments: argparse.Namespace) -> int:
+    """Render a scene into a folder."""
+    from hapticrender.report.outputs import check_folder, refuse_to_overwrite, run_into
+    from hapticrender.report.text import verdict
+
+    check_folder("--out", arguments.out)
+    scene = _scene(arguments.scene)
+    if not arguments.force:
+        refuse_to_overwrite(arguments.out, Path(arguments.scene))
+    notes = ""
+    if arguments.least_model:
+        from hapticrender.plants.levels import least_model
+
+        with _naming(arguments.scene):
+            found = least_model(scene)
+        scene, notes = found.scene, found.text
+    with _naming(arguments.scene):
+        driver = _driver(arguments.driver, scene)
+    [rendering] = renderings = _prepare({arguments.scene: scene}, arguments, driver)
+    with _progress(renderings).scene(arguments.scene) as tick:
+        outputs = run_into(arguments.out, rendering, progress=tick)
+    if arguments.verbose:
+        _print_figures(outputs.summary)
+        notes = "\n".join(filter(None, [getattr(rendering.controller(), "note", ""), notes]))
+    else:
+        lines = [f"{scene.name} on {scene.device}: {verdict(outputs.summary)}", *outputs.summary["notes"]]
+        print(printable("\n".join(lines)))
+    print("wrote " + "\n      ".join(map(str, outputs.files)))
+    if notes:
+        print(notes)
+    return 0
+
+
+def play(arguments: argparse.Namespace) -> int:
+    """Play a scene live, and say of every band what becomes of it."""
+    from hapticrender.player import Player
+    from hapticrender.report import outputs
+    from hapticrender.report.live_lines import LiveLines
+    from hapticrender.report.page import refuse_foreign_page, write_page
+
+    scene, out = _scene(arguments.scene), arguments.out
+    changes = {name: getattr(arguments, name) for name in ("method", "seed") if getattr(arguments, name) is not None}
+    scene = replace(scene, **changes)
+    seconds = scene.duration if arguments.seconds is None else arguments.seconds
+    if not 0.0 < seconds < float("inf"):
+        raise ValueError(f"--seconds = {seconds}: must be finite and > 0 s")
+    if out:
+        outputs.check_folder("--out", out / scene.name)
+        if not arguments.force:
+            outputs.refuse_to_overwrite(out / scene.name)
+            refuse_foreign_page(out)
+    lines, journal = LiveLines(sys.stdout), None
+    try:
+        with _naming(arguments.scene), Player(scene, _driver(arguments.driver, scene)) as player:
+            player.play(scene.texture)
+            if out:
+                journal = outputs.begin_outputs(out / scene.name, scene)
+                player.record(journal)
+            while player.time < seconds:
+                player.sleep(min(LOOK, seconds - player.time))
+                lines.show(printable(str(player.state())), int(player.time))
+    finally:
+        if journal is not None and journal.exists():
+            from hapticrender.recordings.recording import Recording
+
+            made = outputs.write_outputs(out / scene.name, Recording.load(journal))
+            print(f"page: {write_page(out, [made])}")
+    return 0
+
+
+def scenes(arguments: argparse.Namespace) -> int:
+    """List the built-in scenes, or print one."""
+    from hapticrender.formatting import table
+    from hapticrender.report.text import describe
+    from hapticrender.touch.builtin_scenes import builtin_scenes
+
+    scenes = builtin_scenes()
+    if arguments.scene is None:
+        print(table([[name, describe(scene)] for name, scene in scenes.items()]))
+    elif arguments.scene in scenes:
+        print(scenes[arguments.scene].to_toml(), end="")
+    else:
+        raise ValueError(f"{arguments.scene}: no such built-in scene; there are {', '.join(scenes)}")
+    return 0
+
+
+def validate(arguments: argparse.Namespace) -> int:
+    """Render scenes, or the accuracy suite; exit status 1 where one misses its tolerance."""
+    if arguments.suite:
+        return _suite(arguments)
+    from hapticrender.report.outputs import check_file, check_folder
+    from hapticrender.report.text import overview
+    from hapticrender.touch.builtin_scenes import builtin_scenes
+    from hapticrender.validate import exit_status, validate, write_json, write_junit
+
+    reports = [("--json", arguments.json, write_json), ("--junit", arguments.junit, write_junit)]
+    references = arguments.scenes or list(builtin_scenes())
+    for option, path, _ in reports:
+        if path:
+            check_file(option, path)
+            if path.exists() and any(Path(other).exists() and path.samefile(other) for other in references):
+                raise ValueError(f"{option} = {str(path)!r}: is a scene, must be another file")
+    if arguments.out:
+        check_folder("--out", arguments.out)
+    options = {"method": arguments.method, "seed": arguments.seed, "jobs": arguments.jobs, "out": arguments.out}
+    options["driver"] = arguments.driver
+    verdicts = validate(references, **options, progress=sys.stderr)
+    for _, path, write in reports:
+        if path:
+            write(_made(path), verdicts)
+    if rendered := [verdict.summary for verdict in verdicts if verdict.summary]:
+        print(printable(overview(rendered)))
+    for verdict in verdicts:
+        if verdict.verdict == "error":
+            fail(str(verdict), 2)
+    return exit_status(verdicts)
+
+
+def _suite(arguments: argparse.Namespace) -> int:
+    """Run the accuracy suite with the chosen method and with "paper"; exit status 1 where it misses a bound."""
+    from hapticrender.accuracy.figures import as_rows, write_json
+    from hapticrender.accuracy.suite import run_suite
+    from hapticrender.formatting import table
+    from hapticrender.report.outputs import check_file
+
+    chosen = arguments.method or defaults.METHOD
+    simulated = arguments.driver == "simulated"
+    if arguments.scenes or arguments.junit or arguments.out or arguments.jobs > 1 or not simulated:
+        raise ValueError("--suite runs no scenes, on simulated devices, and writes --json only")
+    if arguments.json:
+        check_file("--json", arguments.json)
+    methods = list(dict.fromkeys((chosen, "paper")))
+    figures = run_suite(methods, progress=lambda line: print(line, file=sys.stderr))
+    print(table(as_rows(figures, methods)))
+    if arguments.json:
+        write_json(_made(arguments.json), figures)
+    return 0 if all(figure.passed for figure in figures if figure.method == chosen) else 1
+
+
+def identify(arguments: argparse.Namespace) -> int:
+    """Identify a device, and write its profile."""
+    from hapticrender.loop import registered
+    from hapticrender.plants.electroadhesion import ElectroadhesionScreen
+    from hapticrender.plants.identify import identify
+    from hapticrender.plants.identify_friction import identify_resonance, identify_screen
+    from hapticrender.plants.plate import Plate
+    from hapticrender.plants.ultrasonic import UltrasonicPlate
+    from hapticrender.report.outputs import check_file
+    from hapticrender.touch.finger import Finger
+
+    if arguments.out:
+        check_file("--out", arguments.out)
+    scene = _scene(arguments.scene or "grating-20")  # any on the paper's plate
+    found: Any
+    with _naming(arguments.scene or "identify"):
+        if scene.device not in ("vt-plate", "ultrasonic", "electroadhesion"):
+            raise ValueError(f"device.kind = {scene.device!r}: must be vt-plate, ultrasonic or electroadhesion")
+        setup = registered("renderers", scene.device)().read(scene, None)
+        seed = scene.seed if arguments.seed is None else arguments.seed
+        driver = _driver(arguments.driver, scene)
+        if driver is None:
+            plants = {
+                "vt-plate": lambda: Plate(setup.simulated, Finger.absent(), seed),
+                "ultrasonic": lambda: UltrasonicPlate(setup.simulated.carrier_mode, Finger.absent(), seed),
+                "electroadhesion": lambda: ElectroadhesionScreen(setup.simulated, scene.finger, seed),
+            }
+            driver = registered("drivers", "simulated")(plants[scene.device]())
+        with driver:
+            if scene.device == "ultrasonic":
+                found = identify_resonance(driver, setup.assumed)
+            elif scene.device == "electroadhesion":
+                found = identify_screen(driver, setup.assumed, scene.finger)
+            else:
+                found = identify(driver, setup.assumed, seconds=arguments.seconds, amplitude=arguments.amplitude)
+    print(found.text())
+    for difference in found.differences(setup.assumed) if scene.device == "vt-plate" else ():
+        print(f"differs from [device]: {difference}")
+    if arguments.out:
+        _profile(found, scene, arguments).save(_made(arguments.out))
+        print(f"wrote {arguments.out}")
+    return 0
+
+
+def _profile(found: Any, scene: Scene, arguments: argparse.Namespace) -> DeviceProfile:
+    """Profile of an identified device; limits, and what else the scene says of the device, are kept."""
+    from datetime import date
+
+    own, device = scene.device_profile, found.profile()
+    uncertainty = {name: value for name, value in found.uncertainty().items() if name in device}
+    return replace(
+        own,
+        name=arguments.name or arguments.out.stem,
+        measured_by=arguments.by,
+        measured_with=f"hapticrender {__version__} identify, driver {arguments.driver}",
+        measured_on=date.today(),
+        device={**own.device, **device},
+        uncertainty=uncertainty,
+    )
+
+
+def latency(arguments: argparse.Namespace) -> int:
+    """Measure the delay of a loop through a cable."""
+    from hapticrender.devices import open_driver
+    from hapticrender.latency import measure_latency, write_delay
+    from hapticrender.report.outputs import check_file
+
+    if arguments.out:
+        check_file("--out", arguments.out)
+    driver = open_driver(arguments.driver)
+    if driver is None:
+        raise ValueError("--driver = 'simulated': must be a device with a cable, such as audio:0")
+    found = measure_latency(driver, runs=arguments.runs, amplitude=arguments.amplitude)
+    print(printable(f"{arguments.driver}: {found}"))
+    if arguments.out:
+        write_delay(_made(arguments.out), found)
+        print(f"wrote {arguments.out}")
+    return 0
+
+
+def export(arguments: argparse.Namespace) -> int:
+    """Write a scene's controller as C sources."""
+    from hapticrender.export import export
+    from hapticrender.loop import prepare
+    from hapticrender.report.outputs import check_folder
+
+    check_folder("--out", arguments.out)
+    scene = _scene(arguments.scene)
+    with _naming(arguments.scene):
+        rendering = prepare(scene)
+        written = export(rendering, arguments.out, bands=arguments.bands, force=arguments.force)
+    print(f"wrote {len(written)} files into {arguments.out}; build them with: make -C {arguments.out}")
+    return 0
+
+
+def show(arguments: argparse.Namespace) -> int:
+    """Print the figures of a recording."""
+    from hapticrender.recordings.recording import Recording
+
+    path = arguments.path / "recording.au" if arguments.path.is_dir() else arguments.path
+    with _naming(str(path)):
+        summary = Recording.load(path).summary()
+    _print_figures(summary)
+    return 0
+
+
+def devices(arguments: argparse.Namespace) -> int:
+    """List what is installed and what is there."""
+    from hapticrender.devices import text
+
+    print(text())
+    return 0
+
+
+def _print_figures(summary: Any) -> None:
+    from hapticrender.report.text import conditions, figures
+
+    print(printable(f"{conditions(summary)}\n{figures(summary)}"))
+
+
+def _scene(reference: str) -> Scene:
+    """Read a scene: a built-in one by its name, any other from its file."""
+    from hapticrender.validate import open_scene
+
+    with _naming(reference):
+        return open_scene(reference)
+
+
+def _prepare(scenes: dict[str, Scene], arguments: argparse.Namespace, driver: Any = None) -> list[Rendering]:
+    """Design everything that will run; the renderer refuses here what the device cannot do."""
+    from hapticrender.loop import prepare
+
+    renderings = []
+    for reference, scene in scenes.items():
+        with _naming(reference):
+            renderings.append(prepare(scene, driver=driver, method=arguments.method, seed=arguments.seed))
+    return renderings
+
+
+def _driver(text: str, scene: Scene) -> Any:
+    """Make the driver of ``--driver``, calibrated as the scene says; None for the simulated device.
+
+    A module of the user's is looked for in the folder that the command is run in, too.
+    """
+    from hapticrender.devices import open_driver
+
+    if "" not in sys.path:
+        sys.path.insert(0, "")
+    return open_driver(text, scene.device_profile)
+
+
+def _progress(renderings: list[Rendering]) -> Progress:
+    """Make the progress bar of what will run, and say before it runs that there will be no pictures."""
+    from hapticrender.report.progress import Progress
+
+    if find_spec("matplotlib") is None:
+        print(PICTURES_HINT, file=sys.stderr)
+    return Progress([rendering.scene.duration for rendering in renderings])
+
+
+@contextmanager
+def _naming(where: str) -> Iterator[None]:
+    """Name the file, or the scene, in every error about it."""
+    try:
+        yield
+    except OSError:
+        raise
+    except (ValueError, TypeError, ArithmeticError, RecursionError, HapticError) as error:
+        message = str(error)
+        raise SceneError(message if message.startswith(where) else f"{where}: {message}") from error
