@@ -28,7 +28,7 @@ Channels = tuple[int, ...]
 
 
 class AudioDriver(BaseDriver):
-    """Plays on a sound card through PortAudio: `play` block by block, or `start` with a compiled controller.
+    """Plays on a sound card through PortAudio, block by block; its `live()` calls a compiled controller back.
 
     `play` serves `hapticrender.render` and identification.  Python computes its blocks, so it adds `queued` samples to
     the delay; a driver made by `live` does not.  Where the card or Python has lost samples the block has
