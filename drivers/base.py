@@ -28,7 +28,7 @@ A driver carries samples to a device, a file or a plant model, and back.  Any ob
     the same device for live play (`hapticrender.Player`), where that is another driver
 ``start(entry)``, ``stop()`` (optional)
     of a device that calls back: hands it a ``hapticrender.realtime.RealtimeEntry``, with ``sensed_scale`` (m) and
-    ``drive_scale`` (1/A) of full scale
+    ``drive_scale`` (1/A) of full scale; its ``check()`` (optional) raises what went wrong meanwhile
 ``loop(rendering)`` (optional)
     of a device with a controller of its own: what it plays live, like ``hapticrender.live.LiveLoop``
 ``exchange(controller)`` (optional)

@@ -448,6 +448,8 @@ class Player:
         """Compute what comes next, record what was, see whether the device or the application has stopped."""
         loop = self._playing("play")
         loop.fill()
+        if hasattr(loop.rendering.device, "check"):
+            loop.rendering.device.check()  # one that calls back cannot say that it is gone
         if self._watchdog is not None and self._next is None:
             asleep = self._now() - self._called > self._watchdog
             loop.set_gain(0.0 if asleep else self._gain)
