@@ -1,0 +1,95 @@
+"""Measure live play: what the compiled callback of the waveform law takes, and how soon a word of the finger acts.
+
+Run: python -m benchmarks.live [--calls 2000]
+
+At 48 kHz in blocks of 64, with a simulated plate behind it; in ratios to the time of a block, and to an empty callback
+called alike.
+"""
+
+import argparse
+import ctypes
+import time
+from dataclasses import replace
+
+import numpy as np
+
+import hapticrender as hr
+from hapticrender.control.methods import METHODS
+from hapticrender.jit import CFunction
+from hapticrender.plants.plate import Plate, PlateParameters
+from hapticrender.realtime import AUDIO, RealtimeEntry
+from hapticrender.voices import Voice
+
+RATE, BLOCK = 48_000.0, 64  # Hz, samples
+POINTER, LONG = ctypes.c_void_p, ctypes.c_ulong
+SIGNATURE = ctypes.CFUNCTYPE(ctypes.c_int, POINTER, POINTER, LONG, POINTER, LONG, POINTER)
+NOTE = 0.1 * np.sin(2 * np.pi * 150.0 * np.arange(8000) / 8000.0)
+TEXTURES = {
+    "8 tones": hr.Grating(frequency=40.0, amplitude=5e-6, shape="square", harmonics=8),
+    "64 ridges": hr.Grating(wavelength=5e-3, amplitude=5e-6, shape="square", harmonics=64),
+    "a recording and ridges": hr.Recorded(samples=NOTE, rate=8000.0, amplitude=5e-6)
+    + hr.Grating(wavelength=1e-3, amplitude=5e-6),
+}
+
+
+def nothing(sensed, drive, frames, time, status, argument):
+    """Compiled callback that does nothing."""
+    return 0
+
+
+def entry_of(texture: hr.Texture) -> RealtimeEntry:
+    """The waveform law for the paper's plate, with a texture and a finger that slides."""
+    model = PlateParameters(rate=RATE, delay=2 * BLOCK).device_model(RATE, 2 * BLOCK)
+    controller = METHODS["inverse"].design(replace(model, block=BLOCK), hr.Bands.none(spatial=False))
+    entry = RealtimeEntry(controller)
+    entry.play(Voice(texture, RATE))
+    entry.finger(-0.02, 0.05, 0.4)
+    return entry
+
+
+def seconds_of(address: int, argument: int, calls: int) -> tuple[float, float]:
+    """Median and 99th percentile (s) of a call, in a loop with a plate."""
+    callback, plate = SIGNATURE(address), Plate(PlateParameters(rate=RATE, delay=BLOCK), hr.Finger.still(), block=BLOCK)
+    sensed, played, spent = np.zeros((BLOCK, 2), np.float32), np.zeros((BLOCK, 2), np.float32), np.empty(calls)
+    for call in range(calls):
+        sensed[:] = plate.run(played.astype(float)).sensed
+        start = time.perf_counter()
+        callback(sensed.ctypes.data, played.ctypes.data, BLOCK, None, 0, argument)
+        spent[call] = time.perf_counter() - start
+    return float(np.median(spent)), float(np.quantile(spent, 0.99))
+
+
+def finger_latency(calls: int) -> tuple[float, int]:
+    """Median time (s) of a call of `finger`, and samples from the call to the first one that is another."""
+    entry, spent = entry_of(TEXTURES["64 ridges"]), np.empty(calls)
+    entry.process(np.zeros((10 * BLOCK, 2)))
+    for call in range(calls):
+        start = time.perf_counter()
+        entry.finger(-0.02 + 1e-6 * call, 0.0, 0.4)
+        spent[call] = time.perf_counter() - start
+    before = entry.samples
+    entry.finger(0.01, 0.0, 0.4)
+    entry.process(np.zeros((4 * BLOCK, 2)))
+    changed = np.flatnonzero(entry.log(before)["position"] == 0.01)[0]
+    return float(np.median(spent)), int(changed)
+
+
+def main() -> None:
+    """Print every figure."""
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--calls", type=int, default=2000, help="calls timed (default: 2000)")
+    calls, block = parser.parse_args().calls, BLOCK / RATE
+    empty, _ = seconds_of(CFunction(nothing, AUDIO.signature).address, 0, calls)
+    print(f"empty callback                  {100 * empty / block:6.2f} % of a block of {1e3 * block:.2f} ms")
+    for name, texture in TEXTURES.items():
+        entry = entry_of(texture)
+        median, late = seconds_of(entry.address, entry.user_data, calls)
+        print(
+            f"waveform law, {name:<22}{100 * median / block:8.1f} %, 99 % of the calls below {100 * late / block:.0f} %"
+        )
+    call, samples = finger_latency(calls)
+    print(f"finger(): {1e6 * call:.1f} us, then acts from sample {samples} of the next block on (a block: {BLOCK})")
+
+
+if __name__ == "__main__":
+    main()
