@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 
 from hapticrender.drivers.base import BaseDriver
 from hapticrender.protocols import Array, Controller, Exchange, Plant, Sensed
-
-NAP, LATE = 2e-3, 0.1  # s
 
 
 class SimulatedDriver(BaseDriver):
@@ -16,14 +13,14 @@ class SimulatedDriver(BaseDriver):
 
     Where the plant can run in closed loop with a controller inside compiled
     code, `exchange` does so; `play` gives the same samples one block at a time.
-    With `paced`, `play` waits for the clock, as a device does: signal time is real time, to some milliseconds.
+    With `paced`, `play` waits for the clock, as a device does.
     """
 
     probe = False  # it is wired as its plant says
 
     def __init__(self, plant: Plant, *, paced: bool = False) -> None:
         self.plant, self.paced = plant, paced
-        self._played, self._samples, self._started = False, 0, 0.0
+        self._played = False
         super().__init__(
             rate=plant.rate,
             drive_channels=plant.drive_channels,
@@ -52,16 +49,5 @@ class SimulatedDriver(BaseDriver):
         self._state = "closed"
 
     def _play(self, drive: Array) -> Sensed:
-        if self.paced:
-            self._wait()
         self._played = True
         return self.plant.run(drive)
-
-    def _wait(self) -> None:
-        """Wait until the next block is due, where that is long enough to sleep; a clock left behind starts anew."""
-        now, due = time.monotonic(), self._started + self._samples / self.rate
-        if self._samples == 0 or now > due + LATE:
-            self._started, self._samples, due = now, 0, now
-        if due - now > NAP:
-            time.sleep(due - now)
-        self._samples += self.block

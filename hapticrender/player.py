@@ -123,7 +123,8 @@ class Player:
         For which the device is designed, and whose mechanics a simulated finger has; by default one that slides at
         0.08 m/s under 0.4 N.
     paced : bool
-        Of a simulated device.  False: it plays only within `sleep`, as fast as it can and reproducibly.
+        Of a device without a clock: a simulation, a file.  False: it plays only within `sleep`, as fast as it can and
+        reproducibly.
     watchdog : float, s, optional
         Without any call of this player for so long the texture fades out, until the next one; > 0.
     **tables
@@ -344,10 +345,10 @@ class Player:
         scales = {name: getattr(device, name) for name in ("sensed_scale", "drive_scale")} if calls_back else {}
         loop: Any = device.loop(rendering) if own else LiveLoop(rendering, **scales)  # type: ignore[attr-defined]
         self._hand_finger(rendering)
-        if rendering.plant is not None:
+        if getattr(device, "paced", None) is not None:
             device.paced = self._paced  # type: ignore[attr-defined]
         elif not self._paced:
-            raise ValueError("paced = False: must be True but for the simulated device, which alone waits for `sleep`")
+            raise ValueError("paced = False: must be True on a device with a clock of its own")
         stack.enter_context(stopped_by_sigterm())
         stack.enter_context(rendering.driver)
         stack.enter_context(zero_drive_after(device))

@@ -39,7 +39,7 @@ from hapticrender.voices import FADE, VOICE_T, Voice, along_surface, eased, in_t
 HORIZON = 0.05  # s: without a new position the finger stays where it was bound for by then,
 HOLD = 0.25  # s: and after so long what lies along the surface fades out
 TOUCH_FADE = 0.02  # s: of what lies along the surface, at touch and lift
-JUMP, JUMP_TIME = 2e-3, 10e-3  # m, s: a correction of the position up to this is spread over that time
+JUMP, JUMP_TIME = 2e-3, 5e-3  # m, s: a correction of the position up to this decays by two poles of that time
 GAIN_TIME = 10e-3  # s
 LOG_TIME = 2.0  # s: of signals that are kept
 CONTINUE, ABORT = 0, 2  # results of PortAudio's callback
@@ -57,7 +57,7 @@ BLOCK = ("sensed", "drive", "position", "waveform", "flags", "target")  # signal
 _ADDRESSES = "step controller signals slots_at setpoints_at sensed_at drive_at position_at waveform_at flags_at"
 _COUNTS = "block sensors channels setpoints middle slot age samples flags refused lost ahead analysed"
 _TEXTURE = "current previous switch gains_at tracker log_at log_rows log_width given taken"
-_STATE = "finger_changes setpoint_changes gain touch offset place pace"
+_STATE = "finger_changes setpoint_changes gain touch place pace offset offset_input lead lead_input"
 _SETTINGS = "rate sensed_scale drive_scale fade touch_step gain_pole offset_kept"
 ENTRY = np.dtype(
     [
@@ -103,7 +103,7 @@ def receive(entry):
     if slot[FINGER_CHANGES] != e.finger_changes:
         e.finger_changes, e.age = slot[FINGER_CHANGES], 0
         jump = e.place + e.pace - slot[POSITION]  # from where it would have gone on
-        e.offset = jump if abs(jump) < JUMP else 0.0
+        e.offset = e.offset_input = jump if abs(jump) < JUMP else 0.0
     voice = int(slot[VOICE_ADDRESS])
     if voice != e.current and e.samples >= e.switch + e.fade:  # one change after the other
         e.previous, e.current, e.switch = e.current, voice, e.samples + e.ahead
@@ -124,8 +124,12 @@ def follow_finger(entry, slot, m):
     else:
         age = (e.age + m) / e.rate
         position[m] = words[POSITION] + min(age, HORIZON) * words[VELOCITY] + e.offset
-        there = position[m] + (ahead * words[VELOCITY] if age < HORIZON else 0.0)
-        e.offset *= e.offset_kept
+        there = position[m] + e.lead
+        kept, lead = e.offset_kept, ahead * words[VELOCITY] if age < HORIZON else 0.0
+        e.lead_input = lead + kept * (e.lead_input - lead)  # two poles: neither place nor speed steps
+        e.lead = e.lead_input + kept * (e.lead - e.lead_input)
+        e.offset_input *= kept
+        e.offset = e.offset_input + kept * (e.offset - e.offset_input)
     touches = position[m] == position[m]
     if touches:
         e.pace = position[m] - e.place if abs(position[m] - e.place) < JUMP else 0.0

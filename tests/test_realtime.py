@@ -82,15 +82,17 @@ def test_it_is_the_python_path_sample_for_sample(size, rng):
 def followed(words, n):
     """Position and touch (0..1) of n samples from words (sample, position, velocity), obviously."""
     positions, touch, word = np.empty(n), np.empty(n), None
-    last, pace, offset, grown = np.nan, 0.0, 0.0, 0.0
+    last, pace, offset, first, grown = np.nan, 0.0, 0.0, 0.0, 0.0
+    kept = np.exp(-1.0 / (JUMP_TIME * RATE))
     for i in range(n):
         for said in words:
             if said[0] == i:
                 word, jump = said, last + pace - said[1]
-                offset = jump if abs(jump) < JUMP else 0.0
+                offset = first = jump if abs(jump) < JUMP else 0.0
         age = (i - word[0]) / RATE
         positions[i] = word[1] + min(age, HORIZON) * word[2] + offset
-        offset *= np.exp(-1.0 / (JUMP_TIME * RATE))
+        first *= kept
+        offset = first + kept * (offset - first)
         if np.isfinite(positions[i]):
             pace = positions[i] - last if abs(positions[i] - last) < JUMP else 0.0
             last = positions[i]
@@ -165,7 +167,12 @@ def test_a_texture_fades_in_and_another_fades_over_it(spatial, whole, rng):
     drive.append(plain(entry, sensed[change:])[0])
     position, touch = followed(words, n)
     ahead, now = entry.ahead, np.arange(n)
-    there = position + np.where(now / RATE < HORIZON, 0.05 * ahead / RATE, 0.0)
+    lead, input_, there, kept = 0.0, 0.0, position.copy(), np.exp(-1.0 / (JUMP_TIME * RATE))
+    for i in now:
+        there[i] += lead
+        wanted = 0.05 * ahead / RATE if i / RATE < HORIZON else 0.0
+        input_ = wanted + kept * (input_ - wanted)
+        lead = input_ + kept * (lead - input_)
     expected = np.zeros(n)
     for texture, begun in ((first, ahead), (second, change + ahead)):
         time = (now + ahead - begun) / RATE
