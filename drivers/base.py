@@ -11,7 +11,8 @@ A driver carries samples to a device, a file or a plant model, and back.  Any ob
 ``delay``
     samples from the moment that a sample is sensed to the moment that the drive computed from it acts, >= `block`
 ``play(drive)``
-    plays a block, float64 of shape (block, drive_channels), in A, and returns `Sensed` of as many samples
+    plays a block, float64 of shape (block, drive_channels), in A, and returns `Sensed` of as many samples; a device
+    waits here until the block is due
 ``__enter__``, ``__exit__``
     makes the device ready, and leaves it at rest with zero drive whatever has happened
 ``zero_on_exit`` (optional)
@@ -24,8 +25,6 @@ A driver carries samples to a device, a file or a plant model, and back.  Any ob
     delay of `play`, where `delay` is that of a callback which plays a compiled controller (`start`, `stop`)
 ``finger`` (optional)
     of a device that has to be told where the finger is: None, until `render` sets it to the scene's `Finger`
-``paced`` (optional)
-    of a device without a clock (a simulation, a file): whether `play` waits until the next block is due
 ``live()`` (optional)
     the same device for live play (`hapticrender.Player`), where that is another driver
 ``start(entry)``, ``stop()`` (optional)
@@ -90,7 +89,6 @@ Nothing has to be inherited.  Here is a whole driver, a plate on two coils with 
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from types import TracebackType
 from typing import Self
@@ -100,8 +98,6 @@ import numpy as np
 from hapticrender.driver_checks import check_driver as check_driver
 from hapticrender.errors import DriverError
 from hapticrender.protocols import Array, Sensed
-
-NAP, LATE = 2e-3, 0.1  # s: shorter waits are not slept; a clock left behind by so much starts anew
 
 
 def checked_drive(drive: Array, block: int, drive_channels: int) -> Array:
@@ -133,7 +129,6 @@ class BaseDriver:
     """
 
     zero_on_exit = True
-    paced: bool | None = None  # whether `play` waits for the clock; None: the device has a clock of its own
 
     def __init__(
         self, *, rate: float, drive_channels: int, sensed_channels: int, block: int = 1, delay: int | None = None
@@ -143,7 +138,7 @@ class BaseDriver:
         self.sensed_channels = sensed_channels
         self.block = block
         self.delay = block if delay is None else delay
-        self._state, self._samples, self._started = "new", 0, 0.0
+        self._state = "new"
         check_driver(self)
 
     def _open(self) -> None:
@@ -177,19 +172,7 @@ class BaseDriver:
         """
         if self._state != "open":
             raise DriverError(f"{self}: play: it is {self._state}, not open; use it in a with statement")
-        checked = checked_drive(drive, self.block, self.drive_channels)
-        if self.paced:
-            self._wait()
-        return self._play(checked)
-
-    def _wait(self) -> None:
-        """Wait until the next block is due, where that is long enough to sleep; a clock left behind starts anew."""
-        now, due = time.monotonic(), self._started + self._samples / self.rate
-        if self._samples == 0 or now > due + LATE:
-            self._started, self._samples, due = now, 0, now
-        if due - now > NAP:
-            time.sleep(due - now)
-        self._samples += self.block
+        return self._play(checked_drive(drive, self.block, self.drive_channels))
 
     def close(self) -> None:
         """Play zeros until they have come through and release the device; raise the first failure after both."""

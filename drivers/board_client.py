@@ -84,6 +84,7 @@ class BoardClient:
                 raise ValueError(f"{name} = {value!r}: must be finite and >= 0 s")
         self.port, self.timeout, self.reconnect, self.clock = port, timeout, reconnect, clock
         self.reconnections = 0
+        self.started = 0  # sample of the board's clock at which it last began to play
         self._connect = lambda: BoardLine(port, baud, timeout=timeout, clock=clock, connect=connect)
         self._line: BoardLine | None = None
         self._wanted = _Wanted()
@@ -199,7 +200,7 @@ class BoardClient:
             if not least <= value <= 0xFFFF:
                 raise ValueError(f"{name} = {value!r} samples: must be {least} to 65535")
         sample = self._steadily(lambda line: line.begin(Kind.START, stream, period))
-        self._wanted, self._runs = self._wanted._replace(start=(stream, period)), True
+        self._wanted, self._runs, self.started = self._wanted._replace(start=(stream, period)), True, sample
         return sample
 
     def stop(self) -> None:
@@ -276,6 +277,8 @@ class BoardClient:
                 self.step()
             except DriverError as error:
                 self._error = error
+            except Exception as error:  # of a frame that nobody has thought of: the board must not play on unheard
+                self._error = DriverError(f"{self.port}: {type(error).__name__}: {error}")
             self.clock.sleep(PAUSE)
 
     def _compare(self, line: BoardLine) -> None:
@@ -321,7 +324,7 @@ class BoardClient:
         if wanted.bands is not None:
             line.set_bands(wanted.bands)
         if wanted.start is not None:
-            line.begin(Kind.START, *wanted.start)
+            self.started = line.begin(Kind.START, *wanted.start)
 
     def _open_line(self) -> BoardLine:
         if self._error is not None:

@@ -58,6 +58,7 @@ class BoardLoop:
         self._client, self._stream, self._first = driver.client, stream, 0
         self._asked = [_Asked(0, _playable(rendering), np.zeros(MOST_BANDS), 1.0)]
         self._reader: RowReader | None = None
+        self._connections = 0
         self._fault: DeviceFault | None = None
 
     def start(self) -> None:
@@ -65,8 +66,14 @@ class BoardLoop:
         last = self._asked[-1]
         self._client.set_bands(last.bands)
         self._client.set_gain(last.gain)
-        self._first = self._client.start(stream=self._stream, telemetry=TELEMETRY)
-        self._reader = RowReader(self._client, self._first, self._stream)
+        self._client.start(stream=self._stream, telemetry=TELEMETRY)
+        self._read()
+
+    def _read(self) -> None:
+        """Read the rows of the run that the board has begun, after those of an earlier one."""
+        self._first = (self._client.started - self.samples) % WRAP
+        self._reader = RowReader(self._client, self._client.started, self._stream)
+        self._connections = self._client.reconnections
 
     def exchange(self, rendering: Rendering) -> None:
         """Glide to the texture of another rendering of the same device, within 20 ms."""
@@ -105,7 +112,14 @@ class BoardLoop:
         self._client.stop()
 
     def fill(self) -> None:
-        """Look at the telemetry; a `DriverError` where board or line are gone."""
+        """Look at the telemetry; a `DriverError` where board or line are gone.
+
+        A board that was lost and found again plays a new run, whose carriers begin anew; what was lost is not counted.
+        """
+        if self._reader is not None and self._client.reconnections != self._connections:
+            self.flags |= Flag.OVERRUN
+            self._asked = [self._asked[-1]._replace(start=self.samples, turns=np.zeros(MOST_BANDS))]
+            self._read()
         try:
             self.flags |= self._client.telemetry().flags
         except DeviceFault as fault:

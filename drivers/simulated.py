@@ -13,13 +13,12 @@ class SimulatedDriver(BaseDriver):
 
     Where the plant can run in closed loop with a controller inside compiled
     code, `exchange` does so; `play` gives the same samples one block at a time.
-    With `paced`, `play` waits for the clock, as a device does.
     """
 
     probe = False  # it is wired as its plant says
 
-    def __init__(self, plant: Plant, *, paced: bool = False) -> None:
-        self.plant, self.paced = plant, paced
+    def __init__(self, plant: Plant) -> None:
+        self.plant = plant
         self._played = False
         super().__init__(
             rate=plant.rate,
@@ -34,7 +33,7 @@ class SimulatedDriver(BaseDriver):
 
         A subclass that plays in its own way gets its blocks.
         """
-        if self.paced or type(self) is not SimulatedDriver or self.block != 1 or not self.plant.closes(controller):
+        if type(self) is not SimulatedDriver or self.block != 1 or not self.plant.closes(controller):
             return None
 
         def advance(count: int, reference: Callable[[Array], Array]) -> tuple[Array, Array, Array, Sensed]:

@@ -116,7 +116,6 @@ class WaveFileDriver(BaseDriver):
             names = ("rate", "drive_channels", "sensed_channels", "block", "delay")
             numbers = {name: getattr(through, name) for name in names}
         self.probe = getattr(through, "probe", True)
-        self.paced = False if through is None else None
         super().__init__(**numbers)
 
     def _open(self) -> None:

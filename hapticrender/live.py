@@ -121,9 +121,13 @@ class LiveLoop:
         flags = 0 if sensed.flags is None else int(np.bitwise_or.reduce(sensed.flags))
         self._drive = self.entry.process(sensed.sensed, sensed.position if sensing else None, flags)
 
+    def rest(self) -> None:
+        """Play a block of zeros."""
+        self.driver.play(np.zeros_like(self._drive))
+
     def exchange(self, rendering: Rendering) -> None:
         """Fade into the texture of another rendering of the same device, under the same controller."""
-        self.model = joint_model(self.model, rendering.model)
+        self.model = joint_model(self.rendering.model, rendering.model)
         inner = self.controller
         if isinstance(inner, SupervisedController):
             for name, value in design_supervisor(inner.controller, self.model).items():

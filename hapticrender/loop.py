@@ -29,6 +29,7 @@ from hapticrender.touch.scene import Scene
 
 MISMATCH = 0.03  # of what the model asks for: most that the controller may have to add on the untouched device
 CHUNK = 0.25  # s of signal between two writes of the journal
+GUARDED: list[None] = []  # an entry for each run that SIGTERM is to end by an exception
 
 Progress = Callable[[float, float], None]
 
@@ -141,7 +142,7 @@ def run(rendering: Rendering, *, journal: str | Path | None = None, progress: Pr
         sensed_channels=driver.sensed_channels,
         drive_limit=model.drive_limit if np.isfinite(model.drive_limit) else None,
         sensed_noise=model.sensed_noise,
-        calibration=_gain_uncertainty(rendering),
+        calibration=gain_uncertainty_of(rendering),
         **{name: getattr(model, name) for name in names},
     )
     with recorder, stopped_by_sigterm(), driver, zero_drive_after(rendering.device):
@@ -160,7 +161,7 @@ def run(rendering: Rendering, *, journal: str | Path | None = None, progress: Pr
     return recording
 
 
-def _gain_uncertainty(rendering: Rendering) -> float:
+def gain_uncertainty_of(rendering: Rendering) -> float:
     """Relative uncertainty of the sensors' gain: the driver's own, or that of the device's profile."""
     profile = rendering.scene.device_profile.calibration.gain_uncertainty
     return float(getattr(rendering.device, "calibration", 0.0) or profile)
@@ -178,22 +179,26 @@ def _warm_up(rendering: Rendering) -> None:
         controller.run(np.zeros((block, rendering.driver.sensed_channels)), nothing, nothing)
 
 
+def _end(number: int, frame: object) -> None:
+    """End the process by an exception, so that devices are left at rest."""
+    raise SystemExit(128 + number)
+
+
 @contextmanager
 def stopped_by_sigterm() -> Iterator[None]:
-    """Turn SIGTERM into SystemExit in the main thread, so that the device is left at rest."""
+    """Turn SIGTERM into SystemExit in the main thread, so that the device is left at rest; may be nested or overlap."""
     main = threading.current_thread() is threading.main_thread()
-    if not main or signal.getsignal(signal.SIGTERM) is not signal.SIG_DFL:
+    if not main or signal.getsignal(signal.SIGTERM) not in (signal.SIG_DFL, _end):
         yield
         return
-
-    def stop(number: int, frame: object) -> None:
-        raise SystemExit(128 + number)
-
-    signal.signal(signal.SIGTERM, stop)
+    signal.signal(signal.SIGTERM, _end)
+    GUARDED.append(None)
     try:
         yield
     finally:
-        signal.signal(signal.SIGTERM, signal.SIG_DFL)
+        GUARDED.pop()
+        if not GUARDED:
+            signal.signal(signal.SIGTERM, signal.SIG_DFL)
 
 
 @contextmanager

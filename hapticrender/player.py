@@ -31,19 +31,21 @@ from hapticrender.control.probe import probe_plate
 from hapticrender.devices import open_driver
 from hapticrender.errors import HapticError
 from hapticrender.live import LiveLoop
-from hapticrender.loop import open_scene, prepare, stopped_by_sigterm, zero_drive_after
+from hapticrender.loop import gain_uncertainty_of, open_scene, prepare, stopped_by_sigterm, zero_drive_after
 from hapticrender.protocols import Array, Driver, Flag, Rendering, Texture
 from hapticrender.realtime import HORIZON
 from hapticrender.recordings.recording import Recorder, Recording
 from hapticrender.touch.finger import Finger
 from hapticrender.touch.scene import Scene
 
+MOST_GAIN = 10.0
 NOMINAL = Finger.sliding(speed=0.08, normal_load=0.4)  # for which a device is designed where none is stated
-LONGEST = 3600.0  # s: duration that is written into a recording's scene
+LONGEST, SHORTEST = 3600.0, 1e-3  # s: duration of a scene that has no end; and as a recording of it says
 SERVICE = 0.05  # s between two looks: what comes next is computed, what was is recorded, faults are seen
 WORDS = 0.2  # s: two words within this time show a velocity
 FADE_OUT = 0.05  # s: five time constants of the gain; and the longest that zeros are waited for
 POINTING, INSTANT = 0.01, 1e-4  # s between two words of a scene's finger; over which its velocity is found
+NAP, LATE = 2e-3, 0.1  # s: shorter waits are not slept; so late the clock starts anew
 PATIENCE = 5.0  # s without a sample, after which `sleep` gives a device up
 
 
@@ -75,42 +77,52 @@ class PlayerState:
     def __str__(self) -> str:
         """One line a band, flags and load."""
         lines = [
-            f"{band.frequency:7.1f} Hz  target {band.target:9.3g} {self.unit}  achieved {band.achieved:9.3g} "
-            f"{self.unit}  error {100 * band.error:6.2f} %"
+            f"{_label(band.frequency)}  target {band.target:9.3g} {self.unit}  achieved {band.achieved:9.3g} "
+            f"{self.unit}  error {_percent(band.error)}"
             for band in self.bands
         ]
         load = "" if math.isnan(self.load) else f", load {100 * self.load:.0f} %"
         return "\n".join([*lines, f"{self.time:.1f} s, {self.flags.name or 'no flags'}, {self.lost} lost{load}"])
 
 
+def _label(frequency: float) -> str:
+    return f"{frequency:7.1f} Hz" if frequency > 0.0 else "  rms of all"
+
+
+def _percent(error: float) -> str:
+    return "  -" if math.isnan(error) else f"{100 * error:6.2f} %"
+
+
 class LiveMotion:
     """Where the application has last said that the finger is, and how hard it presses: for a simulated device."""
 
     def __init__(self) -> None:
-        self._clock, self._since = 0.0, 0.0  # s
-        self._at, self._velocity, self._load = math.nan, 0.0, 0.0
+        self._clock = 0.0  # s
+        self._word = (0.0, math.nan, 0.0, 0.0)  # since (s), position, velocity, load
 
     def restart(self) -> None:
         """Begin at time 0 again, with another simulated device."""
-        self._clock = self._since = 0.0
+        self._clock, self._word = 0.0, (0.0, *self._word[1:])
 
     def say(self, position: float, velocity: float, load: float) -> None:
         """Take up a word of the application (m, m/s, N)."""
-        self._since, self._at, self._velocity, self._load = self._clock, position, velocity, load
+        self._word = (self._clock, position, velocity, load)
 
     def position(self, time: Array) -> Array:
         """Position (m) at `time` (s): at the last speed, for `HORIZON` at most."""
-        time = np.asarray(time, float)
+        time, (since, place, velocity, _) = np.asarray(time, float), self._word
         self._clock = float(time[-1]) if time.size else self._clock
-        return self._at + self._velocity * np.clip(time - self._since, 0.0, HORIZON)
+        return place + velocity * np.clip(time - since, 0.0, HORIZON)
 
     def load(self, time: Array) -> Array:
         """Return the normal load (N)."""
-        return np.full(np.shape(time), self._load)
+        return np.full(np.shape(time), self._word[3])
 
 
 class Player:
-    """Plays textures on a device while the application goes on; used in a `with` statement, from one thread at a time.
+    """Plays textures on a device while the application goes on; used in a `with` statement.
+
+    Its methods may be called from any thread; `finger` never waits for the others.
 
     Parameters
     ----------
@@ -123,8 +135,8 @@ class Player:
         For which the device is designed, and whose mechanics a simulated finger has; by default one that slides at
         0.08 m/s under 0.4 N.
     paced : bool
-        Of a device without a clock: a simulation, a file.  False: it plays only within `sleep`, as fast as it can and
-        reproducibly.
+        False: a simulation, or a driver that does not wait, plays only within `sleep`, as fast as it can, and a
+        simulation reproducibly.
     watchdog : float, s, optional
         Without any call of this player for so long the texture fades out, until the next one; > 0.
     **tables
@@ -159,10 +171,13 @@ class Player:
         self._error: BaseException | None = None
         self._raised = False
         self._recorder: Recorder | None = None
+        self._unwritten: OSError | None = None  # why a recording has ended
+        self._calls_back = self._closing = self._entered = False
         self._recorded, self._served = 0, 0.0  # samples of this loop that were looked at; when the last look was
         self._stack, self._stopping, self._lock = ExitStack(), threading.Event(), threading.RLock()
 
     def __enter__(self) -> Self:
+        self._entered = True
         return self
 
     def __exit__(
@@ -184,18 +199,18 @@ class Player:
 
     @property
     def gain(self) -> float:
-        """Factor on every texture, finite; a new one is reached within some 30 ms."""
+        """Factor on every texture, 0 to 10 (on a board to 1); a new one is reached within some 30 ms."""
         return self._gain
 
     @gain.setter
     def gain(self, gain: float) -> None:
         with self._lock:
             self._check()
-            if not math.isfinite(gain):
-                raise ValueError(f"{gain=}: must be finite")
-            self._gain = gain
+            if not 0.0 <= gain <= MOST_GAIN:
+                raise ValueError(f"{gain=}: must be 0 to {MOST_GAIN:g}; an amplitude belongs in the texture")
             if self._loop is not None and self._next is None:
                 self._loop.set_gain(gain)
+            self._gain = gain
 
     def play(self, texture: Texture) -> None:
         """Play a texture until the next one, into which it fades; the first one starts the device.
@@ -216,6 +231,11 @@ class Player:
             rendering = open_scene(self._scene(texture), driver=None if owned else self._loop.rendering.device)
             if self._loop.whole:
                 self._loop.exchange(rendering)
+            elif self._calls_back:
+                method = rendering.scene.method
+                raise ValueError(
+                    f"method {method!r} works by bands: a device that calls back takes one texture of them"
+                )
             else:
                 self._next = LiveLoop(rendering)
                 self._loop.set_gain(0.0)
@@ -226,19 +246,18 @@ class Player:
         It goes on at this velocity for 50 ms at most.  Without a velocity, that since the last word is taken.  After
         0.25 s without a word what lies along the surface fades out.
         """
-        with self._lock:
-            self._check()
-            now, (last, then) = time.monotonic() if self._paced else self.time, self._word
-            if velocity is None:
-                recent = 0.0 < now - then < WORDS and math.isfinite(position - last)
-                velocity = (position - last) / (now - then) if recent else 0.0
-            if math.isinf(position) or not math.isfinite(velocity) or not 0.0 <= load < math.inf:
-                said = f"{position=} m, {velocity=} m/s, {load=} N"
-                raise ValueError(f"{said}: must be finite, a load >= 0 (a position may be NaN: lifted)")
-            self._spoken, self._word, self._said = True, (position, now), (position, velocity, load)
-            self._motion.say(position, velocity, load)
-            if self._loop is not None:
-                self._loop.finger(position, velocity, load)
+        self._check()
+        now, (last, then) = time.monotonic() if self._paced else self.time, self._word
+        if velocity is None:
+            recent = 0.0 < now - then < WORDS and math.isfinite(position - last)
+            velocity = (position - last) / (now - then) if recent else 0.0
+        if math.isinf(position) or not math.isfinite(velocity) or not 0.0 <= load < math.inf:
+            said = f"{position=} m, {velocity=} m/s, {load=} N"
+            raise ValueError(f"{said}: must be finite, a load >= 0 (a position may be NaN: lifted)")
+        self._spoken, self._word, self._said = True, (position, now), (position, velocity, load)
+        self._motion.say(position, velocity, load)
+        if self._loop is not None:
+            self._loop.finger(position, velocity, load)
 
     def record(self, path: str | Path) -> None:
         """Keep everything from now on in a journal (.au), until `end_recording` or the end; the device must play."""
@@ -249,9 +268,10 @@ class Player:
                 raise ValueError(f"{path}: a recording is under way: call end_recording first")
             self._service()
             rendering, driver, model = loop.rendering, loop.driver, loop.model
+            Path(path).open("ab").close()  # what cannot be written is refused here
             self._recorder = Recorder(
                 path,
-                scene=rendering.scene,
+                scene=replace(rendering.scene, duration=SHORTEST) if self._given is None else rendering.scene,
                 method=rendering.scene.method,
                 seed=rendering.scene.seed,
                 rate=driver.rate,
@@ -260,13 +280,15 @@ class Player:
                 sensed_channels=driver.sensed_channels,
                 drive_limit=model.drive_limit if np.isfinite(model.drive_limit) else None,
                 sensed_noise=model.sensed_noise,
-                calibration=getattr(rendering.device, "calibration", 0.0),
+                calibration=gain_uncertainty_of(rendering),
                 **{name: getattr(model, name) for name in ("places", "unit", "drive_unit", "profile")},
             )
 
     def end_recording(self) -> Recording:
         """End the recording and return it."""
         with self._lock:
+            if self._unwritten is not None:
+                raise self._unwritten
             if self._recorder is None:
                 raise ValueError("nothing is being recorded: call record first")
             self._service()
@@ -326,6 +348,8 @@ class Player:
             raise self._error
         if self._stopping.is_set():
             raise ValueError("the player has been closed: make a new one")
+        if not self._entered:
+            raise ValueError("the player is not open: use it in a with statement")
         self._called = self._now()
 
     def _now(self) -> float:
@@ -341,13 +365,12 @@ class Player:
     def _start(self, rendering: Rendering) -> None:
         """Open the device at rest, probe it, and play."""
         device, stack, direct = rendering.device, self._stack, rendering.driver is rendering.device
-        calls_back, own = hasattr(device, "start") and direct, hasattr(device, "loop") and direct
+        calls_back = self._calls_back = hasattr(device, "start") and direct
+        own = hasattr(device, "loop") and direct
         scales = {name: getattr(device, name) for name in ("sensed_scale", "drive_scale")} if calls_back else {}
         loop: Any = device.loop(rendering) if own else LiveLoop(rendering, **scales)  # type: ignore[attr-defined]
         self._hand_finger(rendering)
-        if getattr(device, "paced", None) is not None:
-            device.paced = self._paced  # type: ignore[attr-defined]
-        elif not self._paced:
+        if not self._paced and (calls_back or own):
             raise ValueError("paced = False: must be True on a device with a clock of its own")
         stack.enter_context(stopped_by_sigterm())
         stack.enter_context(rendering.driver)
@@ -385,6 +408,7 @@ class Player:
                 target()
             except BaseException as error:
                 self._error = self._error or error
+                self._zero_drive()
 
         thread = threading.Thread(target=run, name=target.__name__.strip("_"), daemon=True)
         thread.start()
@@ -395,9 +419,26 @@ class Player:
 
         self._stack.callback(end)
 
+    def _zero_drive(self) -> None:
+        """Set zero drive at once, on a device that may have failed; the next call of the application hears why."""
+        loop = self._playing("play")
+        with suppress(Exception):
+            loop.silence()
+        if isinstance(loop, LiveLoop) and not self._calls_back:
+            with suppress(Exception):
+                for _ in range(-(-loop.driver.delay // loop.driver.block)):
+                    loop.rest()
+
     def _drive_device(self) -> None:
+        """Play block after block, no faster than the clock; one that was left behind by `LATE` starts anew."""
+        start = time.monotonic()
         while not self._stopping.is_set():
             self._block()
+            ahead = self.time - (time.monotonic() - start)
+            if ahead > NAP:
+                time.sleep(ahead)
+            elif ahead < -LATE:
+                start -= ahead
 
     def _block(self) -> None:
         """Play a block; once the last texture is silent the next loop takes over."""
@@ -414,7 +455,6 @@ class Player:
         if following.rendering.plant is not None:
             self._motion.restart()
             self._hand_finger(following.rendering)
-            following.rendering.device.paced = self._paced  # type: ignore[attr-defined]
             self._stack.enter_context(following.driver)
         following.set_gain(self._gain)
         if self._spoken:
@@ -433,7 +473,7 @@ class Player:
         while not self._stopping.wait(POINTING):
             with self._lock:
                 self._point()
-                if time.monotonic() - self._served >= SERVICE:
+                if time.monotonic() - self._served >= (SERVICE if isinstance(self._loop, LiveLoop) else POINTING):
                     self._served = time.monotonic()
                     self._service()
 
@@ -451,14 +491,22 @@ class Player:
         loop.fill()
         if hasattr(loop.rendering.device, "check"):
             loop.rendering.device.check()  # one that calls back cannot say that it is gone
-        if self._watchdog is not None and self._next is None:
+        if self._watchdog is not None and self._next is None and not self._closing:
             asleep = self._now() - self._called > self._watchdog
             loop.set_gain(0.0 if asleep else self._gain)
         first, signals = loop.signals(self._recorded)
         gap, self._recorded = first - self._recorded, first + len(signals["flags"])
         self._lost += gap + int(np.count_nonzero(signals["flags"] & Flag.OVERRUN))
         if self._recorder is not None and len(signals["flags"]):
-            self._recorder.append(motion_source=loop.motion_source, **signals)
+            try:
+                if gap > 0:
+                    self._recorder.append(motion_source=loop.motion_source, **_missing(signals, gap))
+                self._recorder.append(motion_source=loop.motion_source, **signals)
+            except OSError as error:  # a full disk ends the recording, not the play
+                self._unwritten = error
+                with suppress(OSError):
+                    self._recorder.close()
+                self._recorder = None
         if self._error is None and (fault := loop.fault()):
             self._error = fault
 
@@ -467,7 +515,7 @@ class Player:
         loop = self._loop
         if loop is None:
             return
-        running = self._paced and self._error is None
+        running, self._closing = self._paced and self._error is None, True
         if gently and running:
             loop.set_gain(0.0)
             time.sleep(FADE_OUT)
@@ -483,3 +531,10 @@ class Player:
     def _close_recorder(self) -> None:
         if self._recorder is not None:
             self._recorder.close()
+
+
+def _missing(signals: dict[str, Array], count: int) -> dict[str, Array]:
+    """Signals of samples that nobody has kept: no numbers, and `Flag.OVERRUN`."""
+    found = {name: np.full((count, *each.shape[1:]), np.nan) for name, each in signals.items() if name != "target"}
+    found |= {name: np.zeros((count, *signals[name].shape[1:])) for name in ("drive", "reference", "normal_load")}
+    return found | {"flags": np.full(count, int(Flag.OVERRUN)), "target": np.zeros((count, 0), complex)}

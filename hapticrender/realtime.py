@@ -20,6 +20,7 @@ from __future__ import annotations
 
 import math
 import sys
+import threading
 from functools import cached_property
 from typing import Any
 
@@ -301,6 +302,7 @@ class RealtimeEntry:
         self._slot[[POSITION, PLAYING, GAIN]] = np.nan, 1.0, 1.0
         self._slots, self._back = np.tile(self._slot, (SLOTS, 1)), 0
         self._voices: list[Voice] = []
+        self._writing = threading.Lock()  # of threads of the application; the callback never waits
         self.ahead, self._tracker = int(getattr(controller, "lookahead", 0)), np.zeros(1, CONTROLLER)
         self._tracker["p"]["rate"] = self.rate
         self._arrays = self._buffers()
@@ -401,8 +403,9 @@ class RealtimeEntry:
         """Set the finger's position (m, NaN: lifted), velocity (m/s) and load (N) at the start of the next block."""
         if np.isinf(position) or not np.isfinite(velocity) or not 0.0 <= load < np.inf:
             raise ValueError(f"{position=} m, {velocity=} m/s, {load=} N: must be finite (position may be NaN: lifted)")
-        self._slot[[POSITION, VELOCITY, LOAD]] = position, velocity, load
-        self._slot[FINGER_CHANGES] += 1
+        with self._writing:
+            self._slot[[POSITION, VELOCITY, LOAD]] = position, velocity, load
+            self._slot[FINGER_CHANGES] += 1
         self._hand_over()
 
     def set_gain(self, gain: float) -> None:
@@ -461,5 +464,6 @@ class RealtimeEntry:
         return waiting | {int(self._entry[name][0]) for name in ("current", "previous")}
 
     def _hand_over(self) -> None:
-        self._slots[self._back] = self._slot
-        self._back = int(publish(self.user_data, self._back))
+        with self._writing:
+            self._slots[self._back] = self._slot
+            self._back = int(publish(self.user_data, self._back))
