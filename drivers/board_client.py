@@ -157,6 +157,8 @@ class BoardClient:
         holds, and after 200 ms without another takes the finger for lifted.
         """
         time = self.clock.monotonic() if time is None else time
+        if self._line is None and self._error is None and self._runs:
+            return  # the board is being looked for
         self._open_line().link.finger = time, float(position), float(velocity), float(load)
 
     @property

@@ -147,6 +147,8 @@ class Link:
             self.capabilities = found
         elif not frame.payload or frame.payload[0] != request.kind:
             return
+        elif kind == Kind.REFUSE and (len(frame.payload) < 2 or frame.payload[1] not in set(Reason)):
+            return  # of another version
         elif kind == Kind.REFUSE and frame.payload[1] == Reason.CHECK:
             self._strange += 1
             return

@@ -360,7 +360,12 @@ class Player:
         driver: Any = self._driver
         if isinstance(driver, str):
             driver = open_driver(driver, scene.device_profile)
-        self._start(prepare(scene, driver=driver.live() if hasattr(driver, "live") else driver))
+        try:
+            self._start(prepare(scene, driver=driver.live() if hasattr(driver, "live") else driver))
+        except BaseException:
+            self._loop = None  # what has been opened is left at rest
+            self._stack.close()
+            raise
 
     def _start(self, rendering: Rendering) -> None:
         """Open the device at rest, probe it, and play."""

@@ -7,6 +7,7 @@ import subprocess
 import sys
 import threading
 import time
+from contextlib import ExitStack
 from dataclasses import replace
 
 import numpy as np
@@ -372,6 +373,24 @@ def test_a_device_that_calls_back_is_handed_the_compiled_entry():
     assert abs(device.last).max() == 0.0
 
 
+def test_a_device_that_does_not_start_is_left_closed():
+    """And may be started again."""
+    device = Calling()
+    start, closed = device.start, []
+    device.__class__ = type("Failing", (Calling,), {"__exit__": lambda self, *exc: closed.append(self)})
+    device.start = lambda entry: (_ for _ in ()).throw(hr.DriverError("no stream"))
+    with hr.Player(driver=device) as player:
+        with pytest.raises(hr.DriverError, match="no stream"):
+            player.play(TONE)
+        assert closed == [device]
+        with pytest.raises(ValueError, match="nothing plays yet"):
+            player.state()
+        device.start = start
+        player.play(TONE)
+        player.sleep(0.2)
+        assert player.time >= 0.2
+
+
 def test_a_device_that_calls_back_takes_one_texture_of_bands():
     with hr.Player(driver=Calling(), method="h2") as player:
         player.play(TONE)
@@ -503,3 +522,29 @@ def test_a_board_plays_live(tmp_path):
     ]
     # 1 um of noise at two ends: 0.7 um sqrt(2/1500) = 0.026 um in each part, three times; the phase needs no fit
     assert abs(parts[0] - parts[1])[:2].max() < 0.08e-6
+
+
+def test_a_board_that_is_found_again_is_heard_again(tmp_path):
+    """Its clock begins anew: rows of the new run follow those of the old one, and a flag says that some are lost."""
+    from board import SLOW, BoardProcess, SlowClock, build_board
+
+    from hapticrender.drivers.serial import SerialDriver
+
+    program = build_board(tmp_path / "board", hr.prepare(hr.Scene(texture=TONE, duration=1.0)))
+    with ExitStack() as boards:
+        board = boards.enter_context(BoardProcess(program, tmp_path, *SLOW))
+        driver = SerialDriver(str(board.port), clock=SlowClock(), reconnect=20.0)
+        with hr.Player(driver=driver) as player:
+            player.play(TONE)
+            player.record(tmp_path / "board.au")
+            player.sleep(0.5)
+            before = player.time
+            board.kill()
+            boards.enter_context(BoardProcess(program, tmp_path, *SLOW))
+            player.sleep(0.6)
+            assert player.time >= before + 0.6
+            assert player.state().flags & hr.Flag.OVERRUN
+            recording = player.end_recording()
+    phase = 2 * np.pi * 100.0 * np.arange(1500) / 5000.0
+    parts = [2 * np.mean(each[-1500:] * np.exp(-1j * phase)) for each in (recording.reference, recording.motion[:, 0])]
+    assert abs(parts[1] - parts[0]) < 0.05 * 5e-6  # the new run's carriers begin anew, and so does the texture
