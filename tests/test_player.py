@@ -244,8 +244,7 @@ def test_a_sensor_that_sticks_stops_the_drive_and_is_told_at_the_next_call(tmp_p
         player.record(tmp_path / "fault.au")
         with pytest.raises(hr.DeviceFault, match="sensor 1: one value repeats"):
             go_on(player)
-    drive = np.concatenate(driver.played)
-    assert abs(drive[-10:]).max() == 0.0
+    assert abs(driver.played[-1]).max() == 0.0  # the fade of 10 ms may be cut short by the end
     stopped = np.flatnonzero(Recording.load(tmp_path / "fault.au").flags & hr.Flag.STOPPED)
     assert stopped[0] / 5000.0 < 0.55
 
