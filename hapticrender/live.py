@@ -11,7 +11,7 @@ import numpy as np
 from hapticrender.bands import Bands
 from hapticrender.control.combined import CombinedBands
 from hapticrender.control.device_model import DeviceModel
-from hapticrender.control.supervisor import Fault, SupervisedController, design_supervisor
+from hapticrender.control.supervisor import FADE_OUT, Fault, SupervisedController, design_supervisor
 from hapticrender.driver_checks import check_sensed
 from hapticrender.errors import DeviceFault
 from hapticrender.protocols import Array, Controller, Flag, Rendering
@@ -71,6 +71,7 @@ class LiveLoop:
         self._true, self.senses = False, False  # whether the device tells its true motion, and where the finger is
         self._drive = np.zeros((self.driver.block, self.driver.drive_channels))
         self._bands = rendering.bands
+        self._stopped: int | None = None  # sample
         self.entry.play(self._voice(rendering))
 
     @property
@@ -165,12 +166,18 @@ class LiveLoop:
         return band_figures(self._bands, first, self.driver.rate, signals)
 
     def fault(self) -> DeviceFault | None:
-        """Return why the drive was stopped, if it was."""
+        """Return why the drive was stopped, once it has faded out and stayed at zero for as long again."""
         if not self.entry.flags & Flag.STOPPED:
             return None
         found = getattr(self.controller, "fault", None)
-        text = found.text if isinstance(found, Fault) else "the device stopped itself"
-        at = (found.sample if isinstance(found, Fault) else self.entry.samples) / self.driver.rate
+        if self._stopped is None:
+            self._stopped = found.sample if isinstance(found, Fault) else self.entry.samples
+        if self.entry.samples < self._stopped + 2 * FADE_OUT * self.driver.rate + self.driver.delay:
+            return None
+        text, at = (
+            found.text if isinstance(found, Fault) else "the device stopped itself",
+            self._stopped / self.driver.rate,
+        )
         return DeviceFault(f"{type(self.rendering.device).__name__}: stopped at {at:.4g} s: {text}", at)
 
     def _voice(self, rendering: Rendering) -> Voice:

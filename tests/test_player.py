@@ -128,22 +128,23 @@ def test_it_is_what_render_plays(tmp_path):
 
 @pytest.mark.parametrize("device", ["vt-plate", "electroadhesion", "ultrasonic", "hybrid"])
 def test_every_device_exchanges_textures(device):
-    """A tone, then ridges, each within 4 %; no sample is lost."""
+    """A tone, then ridges, each within 4 %; nothing saturates, and no sample is lost."""
     tone = replace(TONE, frequency=60.0)  # at its crossover of 100 Hz the hybrid leaves up to 7 %
     with hr.Player(device, paced=False, simulation={"sensor_noise": 0.0} if device == "vt-plate" else {}) as player:
-        player.finger(-0.02, 0.08, 0.4)
+        player.finger(-0.04, 0.08, 0.4)
         player.play(tone)
-        place = slide(player, 0.6, speed=0.08)
+        place = slide(player, 0.6, start=-0.04, speed=0.08)
         assert all(band.error < 0.04 for band in player.state().bands)
         player.play(RIDGES)
-        place = slide(player, 0.6, start=place, speed=-0.08)
-        slide(player, 0.6, start=place, speed=0.08)
+        place = slide(player, 0.4, start=place, speed=0.08)
+        if device in ("ultrasonic", "hybrid"):  # a new controller learns the contact; a turn at once saturates a screen
+            place = slide(player, 0.8, start=place, speed=-0.08)
+            slide(player, 0.8, start=place, speed=0.08)
         state = player.state()
         assert [band.frequency for band in state.bands] == pytest.approx([80.0], rel=0.02)
         assert all(band.error < 0.04 for band in state.bands)
         assert state.lost == 0
-        # a finger that turns at once asks for a step of the friction, which saturates
-        assert device == "electroadhesion" or not state.flags & hr.Flag.SATURATED
+        assert not state.flags & hr.Flag.SATURATED
 
 
 def test_an_exchange_steps_no_more_than_a_start():
@@ -244,7 +245,8 @@ def test_a_sensor_that_sticks_stops_the_drive_and_is_told_at_the_next_call(tmp_p
         player.record(tmp_path / "fault.au")
         with pytest.raises(hr.DeviceFault, match="sensor 1: one value repeats"):
             go_on(player)
-    assert abs(driver.played[-1]).max() == 0.0  # the fade of 10 ms may be cut short by the end
+    drive = np.concatenate(driver.played)
+    assert abs(drive[-10:]).max() == 0.0
     stopped = np.flatnonzero(Recording.load(tmp_path / "fault.au").flags & hr.Flag.STOPPED)
     assert stopped[0] / 5000.0 < 0.55
 
