@@ -1,15 +1,18 @@
-"""Measure live play: what the compiled callback of the waveform law takes, and how soon a word of the finger acts.
+"""Measure live play: the compiled callback of the waveform law, how soon `finger` acts, and how well textures play.
 
 Run: python -m benchmarks.live [--calls 2000]
 
-At 48 kHz in blocks of 64, with a simulated plate behind it; in ratios to the time of a block, and to an empty callback
-called alike.
+The callback at 48 kHz in blocks of 64, with a simulated plate behind it; in ratios to the time of a block, and to an
+empty callback called alike.  Errors are those of a third party's plate (``tests/strangers_plate.py``) behind the public
+driver protocol, of its true motion, 20-500 Hz, without shift or gain fit: under the finger, and at the worse end.
 """
 
 import argparse
 import ctypes
+import tempfile
 import time
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 
@@ -19,11 +22,15 @@ from hapticrender.jit import CFunction
 from hapticrender.plants.plate import Plate, PlateParameters
 from hapticrender.realtime import AUDIO, RealtimeEntry
 from hapticrender.voices import Voice
+from tests.strangers_plate import StrangersPlate
 
 RATE, BLOCK = 48_000.0, 64  # Hz, samples
 POINTER, LONG = ctypes.c_void_p, ctypes.c_ulong
 SIGNATURE = ctypes.CFUNCTYPE(ctypes.c_int, POINTER, POINTER, LONG, POINTER, LONG, POINTER)
 NOTE = 0.1 * np.sin(2 * np.pi * 150.0 * np.arange(8000) / 8000.0)
+FINGERS = {"4 g": (4e-3, 1.5, 300.0), "skin on a heavy phalanx": (2e-4, 3.0, 3000.0, 8e-3, 2.0, 400.0)}
+SPANS = (0.7, 1.5), (1.5, 1.54), (1.6, 3.0), (3.0, 3.04), (3.1, 4.5)  # s
+WHAT = "a tone", "while it fades into", "ridges and a tone", "while they fade into", "a chirp"
 TEXTURES = {
     "8 tones": hr.Grating(frequency=40.0, amplitude=5e-6, shape="square", harmonics=8),
     "64 ridges": hr.Grating(wavelength=5e-3, amplitude=5e-6, shape="square", harmonics=64),
@@ -74,6 +81,34 @@ def finger_latency(calls: int) -> tuple[float, int]:
     return float(np.median(spent)), int(changed)
 
 
+def session(finger: tuple[float, ...], place: float, phase: float) -> np.ndarray:
+    """Errors (spans, 2) of a session whose finger swipes by 20 mm about `place` (m), touching from 0.2 s on."""
+    from scipy.signal import butter, sosfiltfilt
+
+    plate = StrangersPlate(
+        finger=finger,
+        position=lambda time: place + 0.01 * np.sin(2 * np.pi * (0.8 * np.asarray(time) + phase)),
+        load=0.4,
+        contact=lambda time: np.clip((np.asarray(time) - 0.2) / 0.02, 0.0, 1.0),
+        report_lag=5e-3,
+    )
+    with tempfile.TemporaryDirectory() as folder, hr.Player("vt-plate", plate, paced=False) as player:
+        player.play(hr.Grating(frequency=100.0, amplitude=5e-6))
+        player.record(Path(folder) / "session.au")
+        player.sleep(1.5)
+        player.play(hr.Grating(wavelength=3e-4, amplitude=5e-6) + hr.Grating(frequency=180.0, amplitude=2.5e-6))
+        player.sleep(1.5)
+        player.play(hr.Chirp(start=60.0, stop=300.0, duration=2.0, amplitude=5e-6))
+        player.sleep(1.5)
+        reference = player.end_recording().reference
+    kinds = (4, 20.0, "highpass"), (12, 500.0, "lowpass")
+    sections = np.vstack([butter(order, edge, kind, fs=plate.rate, output="sos") for order, edge, kind in kinds])
+    error = sosfiltfilt(sections, plate.truth[: len(reference), :3] - reference[:, None], axis=0)
+    texture, spans = sosfiltfilt(sections, reference), (np.array(SPANS) * plate.rate).astype(int)
+    found = [np.sqrt((error[a:b] ** 2).mean(axis=0) / (texture[a:b] ** 2).mean()) for a, b in spans]
+    return np.array([[each[0], each[1:].max()] for each in found])
+
+
 def main() -> None:
     """Print every figure."""
     parser = argparse.ArgumentParser()
@@ -89,6 +124,11 @@ def main() -> None:
         )
     call, samples = finger_latency(calls)
     print(f"finger(): {1e6 * call:.1f} us, then acts from sample {samples} of the next block on (a block: {BLOCK})")
+    runs = [session(each, place, phase) for each in FINGERS.values() for place in (0.0, 0.02) for phase in (0.0, 0.3)]
+    median, worst = 100 * np.median(runs, axis=0), 100 * np.max(runs, axis=0)
+    print(f"third party's plate, {len(runs)} sessions: median and worst error, under the finger / at the worse end")
+    for what, middle, most in zip(WHAT, median, worst, strict=True):
+        print(f"{what:<22}{middle[0]:6.2f} / {middle[1]:.2f} %   {most[0]:6.2f} / {most[1]:.2f} %")
 
 
 if __name__ == "__main__":
