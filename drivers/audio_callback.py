@@ -9,15 +9,12 @@ blocks with Python.
 from __future__ import annotations
 
 import sys
-from typing import Any
 
 import numba
 import numpy as np
-from llvmlite import ir
 from numba import carray, types
-from numba.extending import intrinsic
 
-from hapticrender.jit import I8, CFunction, call, entry, kernel, pointer, record
+from hapticrender.jit import I8, CFunction, call, entry, fetch_add, kernel, pointer, record
 from hapticrender.protocols import Array, Flag
 
 SLOTS = 64  # blocks that wait in either direction
@@ -44,17 +41,6 @@ QUEUE = np.dtype(
 QUEUE_T = numba.from_dtype(QUEUE)
 FUNCTION_AT = RELAY.fields["function"][1] if RELAY.fields else 0
 BLOCKS_AT = QUEUE.fields["blocks"][1] if QUEUE.fields else 0
-
-
-@intrinsic
-def fetch_add(typingctx: Any, address: Any, value: Any) -> Any:
-    """Add to the int64 at an address and return what was there, in one indivisible step that orders memory."""
-
-    def build(context: Any, builder: Any, signature: Any, values: Any) -> Any:
-        place = builder.inttoptr(values[0], ir.PointerType(ir.IntType(64)))
-        return builder.atomic_rmw("add", place, values[1], "acq_rel")
-
-    return types.int64(types.int64, types.int64), build
 
 
 @entry

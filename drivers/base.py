@@ -112,7 +112,33 @@ def checked_drive(drive: Array, block: int, drive_channels: int) -> Array:
     return checked
 
 
-class BaseDriver:
+class OpenedInWith:
+    """Base of what a `with` statement opens and closes, by `open` and `close`."""
+
+    def open(self) -> Self:
+        """Make it ready."""
+        raise NotImplementedError
+
+    def close(self) -> None:
+        """Leave it at rest."""
+        raise NotImplementedError
+
+    def __enter__(self) -> Self:
+        return self.open()
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        """Close; where the body has failed already, a failure to close is noted on the body's error."""
+        try:
+            self.close()
+        except Exception as second:
+            if error is None:
+                raise
+            error.add_note(f"and while closing: {second}")
+
+
+class BaseDriver(OpenedInWith):
     """A driver whose kinds differ only in how they open, play and close.
 
     A subclass fills in `_play`, and `_open` and `_close` where it has something to acquire.  It is used once: opened,
@@ -183,20 +209,6 @@ class BaseDriver:
         rest = np.zeros((self.block, self.drive_channels))
         blocks = -(-self.delay // self.block)  # until zeros have come through to the device
         carry_through(lambda: [self._play(rest) for _ in range(blocks)], self._close)
-
-    def __enter__(self) -> Self:
-        return self.open()
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
-        """Close; where the body has failed already, a failure to close is noted on the body's error."""
-        try:
-            self.close()
-        except Exception as second:
-            if error is None:
-                raise
-            error.add_note(f"and while closing: {second}")
 
     def __str__(self) -> str:
         return type(self).__name__

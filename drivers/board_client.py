@@ -6,12 +6,11 @@ import math
 import threading
 import time
 from collections.abc import Callable, Sequence
-from types import TracebackType
 from typing import Any, NamedTuple, Self, TypeVar
 
 from hapticrender.bands import Bands
 from hapticrender.drivers import protocol
-from hapticrender.drivers.base import carry_through
+from hapticrender.drivers.base import OpenedInWith, carry_through
 from hapticrender.drivers.board_line import BAUD, PAUSE, BoardLine, Clock, Line, open_port
 from hapticrender.drivers.protocol import Capabilities, Cause, Kind, State, Telemetry
 from hapticrender.drivers.row_reader import RowReader
@@ -43,7 +42,7 @@ class _Wanted(NamedTuple):
     start: tuple[int, int] | None = None  # samples between rows of the stream, and between telemetry; None: at rest
 
 
-class BoardClient:
+class BoardClient(OpenedInWith):
     """A board that plays textures, live.
 
     While it is open a thread sends the finger's words, or a sign of life every 10 ms, and takes what the board sends.
@@ -110,20 +109,6 @@ class BoardClient:
             self._thread.join()
         if self._line is not None:
             carry_through(*([self.stop] if self._runs and not self._error else []), self._close_line)
-
-    def __enter__(self) -> Self:
-        return self.open()
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
-        """Close; where the body has failed already, a failure to close is noted on the body's error."""
-        try:
-            self.close()
-        except Exception as second:
-            if error is None:
-                raise
-            error.add_note(f"and while closing: {second}")
 
     @property
     def capabilities(self) -> Capabilities:

@@ -22,8 +22,8 @@ REFRESH = 64  # samples of a run between two looks of the board at other carrier
 MOST_BANDS = 255  # that a frame can count
 
 
-class _Asked(NamedTuple):
-    """What the board was asked for from a sample of the run on: bands, turns of their carriers until then, gain."""
+class _Piece(NamedTuple):
+    """Reference from a sample of the run on: bands, turns of their carriers until then, gain."""
 
     start: int
     bands: Bands
@@ -56,14 +56,14 @@ class BoardLoop:
         self.rendering, self.driver, self.model = rendering, driver, rendering.model
         self.samples, self.flags = 0, Flag(0)
         self._client, self._stream, self._first = driver.client, stream, 0
-        self._asked = [_Asked(0, _playable(rendering), np.zeros(MOST_BANDS), 1.0)]
+        self._pieces = [_Piece(0, _playable(rendering), np.zeros(MOST_BANDS), 1.0)]
         self._reader: RowReader | None = None
         self._connections = 0
         self._fault: DeviceFault | None = None
 
     def start(self) -> None:
         """Set the bands and play; the port is open."""
-        last = self._asked[-1]
+        last = self._pieces[-1]
         self._client.set_bands(last.bands)
         self._client.set_gain(last.gain)
         self._client.start(stream=self._stream, telemetry=TELEMETRY)
@@ -78,12 +78,12 @@ class BoardLoop:
     def exchange(self, rendering: Rendering) -> None:
         """Glide to the texture of another rendering of the same device, within 20 ms."""
         bands = _playable(rendering)
-        taken, last = (self._client.set_bands(bands) - self._first) % WRAP, self._asked[-1]
+        taken, last = (self._client.set_bands(bands) - self._first) % WRAP, self._pieces[-1]
         start = -(-(taken + round(CHANGE * self.driver.rate) + 1) // REFRESH) * REFRESH
         turns, both = np.zeros(MOST_BANDS), slice(min(len(bands), len(last.bands)))
         same = [getattr(bands, name)[both] == getattr(last.bands, name)[both] for name in CARRIER]
         turns[both] = np.where(np.all(same, axis=0), self._turns(start)[both], 0.0)  # another carrier starts anew
-        self._asked.append(_Asked(start, bands, turns, last.gain))
+        self._pieces.append(_Piece(start, bands, turns, last.gain))
         self.rendering = rendering
 
     def finger(self, position: float, velocity: float, load: float) -> None:
@@ -92,18 +92,18 @@ class BoardLoop:
 
     def set_gain(self, gain: float) -> None:
         """Set the factor on the texture, 0 to 1."""
-        last = self._asked[-1]
+        last = self._pieces[-1]
         if gain == last.gain:
             return
         if self._reader is None:
-            self._asked[-1] = last._replace(gain=gain)
+            self._pieces[-1] = last._replace(gain=gain)
             return
         start = max((self._client.set_gain(gain) - self._first) % WRAP, last.start)
-        self._asked.append(_Asked(start, last.bands, self._turns(start), gain))
+        self._pieces.append(_Piece(start, last.bands, self._turns(start), gain))
 
     def _turns(self, sample: int) -> Array:
         """Turns of the carriers at a sample of the run."""
-        last, turns = self._asked[-1], self._asked[-1].turns.copy()
+        last, turns = self._pieces[-1], self._pieces[-1].turns.copy()
         turns[: len(last.bands)] += (sample - last.start) / self.driver.rate * last.bands.frequency
         return turns
 
@@ -118,7 +118,7 @@ class BoardLoop:
         """
         if self._reader is not None and self._client.reconnections != self._connections:
             self.flags |= Flag.OVERRUN
-            self._asked = [self._asked[-1]._replace(start=self.samples, turns=np.zeros(MOST_BANDS))]
+            self._pieces = [self._pieces[-1]._replace(start=self.samples, turns=np.zeros(MOST_BANDS))]
             self._read()
         try:
             self.flags |= self._client.telemetry().flags
@@ -147,23 +147,23 @@ class BoardLoop:
         }
 
     def _reference(self, first: int, position: Array) -> Array:
-        """Texture as asked for, of samples from `first` on, without the 20 ms in which the board glides."""
+        """Reference of the samples from `first` on, without the 20 ms in which the board glides."""
         reference, sample = np.zeros(len(position)), first + np.arange(len(position))
-        for asked in self._asked:
-            since, bands = sample >= asked.start, asked.bands
-            time = (sample[since] - asked.start) / self.driver.rate
-            phase = bands.carrier_phase(time, position[since]) + 2 * np.pi * asked.turns[: len(bands)]
+        for piece in self._pieces:
+            since, bands = sample >= piece.start, piece.bands
+            time = (sample[since] - piece.start) / self.driver.rate
+            phase = bands.carrier_phase(time, position[since]) + 2 * np.pi * piece.turns[: len(bands)]
             texture = (bands.envelope * np.exp(1j * phase)).real.sum(axis=1)  # type: ignore[operator]
             away = np.isnan(position[since]) & bands.follows_finger
-            reference[since] = np.where(away, 0.0, asked.gain * texture)
-        while len(self._asked) > 1 and self._asked[1].start <= first:
-            del self._asked[0]
+            reference[since] = np.where(away, 0.0, piece.gain * texture)
+        while len(self._pieces) > 1 and self._pieces[1].start <= first:
+            del self._pieces[0]
         return reference
 
     def figures(self) -> list[tuple[float, float, float, float]]:
         """Return what the board last said of every band: frequency (Hz), target, achieved (m) and relative error."""
         rows = []
-        for hertz, band in zip(self._asked[-1].bands.frequency, self._client.telemetry().bands, strict=False):
+        for hertz, band in zip(self._pieces[-1].bands.frequency, self._client.telemetry().bands, strict=False):
             size, error = abs(band.target), abs(band.measured - band.target)
             rows.append((float(hertz), size, abs(band.measured), error / size if size > 0.0 else math.nan))
         return rows

@@ -19,13 +19,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from types import TracebackType
 from typing import Any, NamedTuple, Self
 
 import numpy as np
 import serial
 
 from hapticrender.bands import Bands
+from hapticrender.drivers.base import OpenedInWith
 from hapticrender.errors import DeviceLost, DeviceNotFound, DeviceTimeout, DriverError, ProtocolError
 
 BAUD = 230_400
@@ -49,7 +49,7 @@ def open_port(port: str, timeout: float) -> Any:
     return serial.Serial(port, BAUD, timeout=timeout, write_timeout=timeout, rtscts=True)
 
 
-class NU32Board:
+class NU32Board(OpenedInWith):
     """A plate whose own controller holds one tone at both of its sensors.
 
     Parameters
@@ -92,20 +92,6 @@ class NU32Board:
             finally:
                 self._line = None
                 line.close()
-
-    def __enter__(self) -> Self:
-        return self.open()
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
-        """Close; where the body has failed already, a failure to close is noted on the body's error."""
-        try:
-            self.close()
-        except DriverError as second:
-            if error is None:
-                raise
-            error.add_note(f"and while closing: {second}")
 
     def set_bands(self, bands: Bands) -> None:
         """Choose the tone that `start` plays: one band at one of `FREQUENCIES`, up to its amplitude in `MOST` (m)."""

@@ -124,7 +124,7 @@ class Card:
 
 
 @lru_cache
-def library() -> CDLL:
+def load() -> CDLL:
     """Load PortAudio and declare `FUNCTIONS`.
 
     Raises
@@ -163,9 +163,9 @@ def check(code: int, what: str) -> int:
     """Return a result of PortAudio; a `DriverError` that begins with `what` where it is an error."""
     if code >= 0:
         return code
-    text = library().Pa_GetErrorText(code).decode(errors="replace")
+    text = load().Pa_GetErrorText(code).decode(errors="replace")
     if code == HOST_ERROR:
-        host = library().Pa_GetLastHostErrorInfo().contents
+        host = load().Pa_GetLastHostErrorInfo().contents
         text = f"{text}: {(host.errorText or b'').decode(errors='replace')} ({host.errorCode})"
     reason = ANTICIPATED_ERRORS.get(code)
     raise DriverError(f"{what}: {text} (PortAudio {code}{f': {reason}' if reason else ''})")
@@ -174,7 +174,7 @@ def check(code: int, what: str) -> int:
 @contextmanager
 def initialised() -> Iterator[CDLL]:
     """Initialise PortAudio, which lists the cards anew unless it is in use, and terminate it afterwards."""
-    portaudio = library()
+    portaudio = load()
     with _quiet():
         check(portaudio.Pa_Initialize(), "audio: initialise")
     try:
@@ -276,7 +276,7 @@ class Stream:
         callback: int,
         user_data: int,
     ) -> None:
-        self.name, self._library = name, library()
+        self.name, self._library = name, load()
         with _quiet():
             check(self._library.Pa_Initialize(), f"{name}: initialise")
         self._handle: c_void_p | None = c_void_p()

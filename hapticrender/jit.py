@@ -168,6 +168,26 @@ def call(typingctx: Any, function: Any, values: Any) -> Any:
     return types.int64(types.int64, values), build
 
 
+def atomic(operation: str) -> Any:
+    """Change the int64 at an address and return what was there, in one indivisible step that orders memory.
+
+    `operation` is one of LLVM's ``atomicrmw``: "xchg" stores a value, "add" adds it.
+    """
+
+    @intrinsic
+    def change(typingctx: Any, address: Any, value: Any) -> Any:
+        def build(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+            place = builder.inttoptr(values[0], ir.PointerType(ir.IntType(64)))
+            return builder.atomic_rmw(operation, place, values[1], "acq_rel")
+
+        return types.int64(types.int64, types.int64), build
+
+    return change
+
+
+swap, fetch_add = atomic("xchg"), atomic("add")
+
+
 def addresses(**arrays: np.ndarray[Any, Any] | None) -> np.ndarray[Any, Any]:
     """Record of the addresses of some signals, shape (1,); the caller keeps the arrays alive.
 

@@ -41,22 +41,12 @@ def prepare(
     method: str | None = None,
     seed: int | None = None,
     renderer: Renderer | None = None,
+    compiled: bool = True,
 ) -> Rendering:
-    """Do all the design-time work of a run and check it; see `render` for the parameters and errors."""
-    rendering = open_scene(scene, driver=driver, method=method, seed=seed, renderer=renderer)
-    _warm_up(rendering)
-    return rendering
+    """Do all the design-time work of a run and check it; see `render` for the parameters and errors.
 
-
-def open_scene(
-    scene: Scene | str | os.PathLike[str],
-    *,
-    driver: Driver | str | None = None,
-    method: str | None = None,
-    seed: int | None = None,
-    renderer: Renderer | None = None,
-) -> Rendering:
-    """Open a scene on its device and check it, without compiling anything; see `render`."""
+    What a run needs is compiled here, unless `compiled` is false.
+    """
     if isinstance(scene, str | os.PathLike):
         scene = Scene.from_toml(scene)
     if not isinstance(scene, Scene):
@@ -75,6 +65,8 @@ def open_scene(
     if not isinstance(rendering, Rendering):
         kinds = type(renderer).__name__, type(rendering).__name__
         raise TypeError(f"{kinds[0]}.open returned {kinds[1]}: must be hapticrender.Rendering")
+    if compiled:
+        _warm_up(rendering)
     return rendering
 
 

@@ -26,14 +26,12 @@ from typing import Any
 
 import numba
 import numpy as np
-from llvmlite import ir
 from numba import carray, types
-from numba.extending import intrinsic
 
 from hapticrender.bands import Bands
 from hapticrender.control.carriers import track_finger
 from hapticrender.control.records import CONTROLLER, CONTROLLER_T, SETPOINT_ROWS
-from hapticrender.jit import F8, I8, CFunction, addresses, call, entry, kernel, pointer, record
+from hapticrender.jit import F8, I8, CFunction, addresses, call, entry, kernel, pointer, record, swap
 from hapticrender.protocols import Array, Flag
 from hapticrender.voices import FADE, VOICE_T, Voice, along_surface, eased, in_time
 
@@ -71,17 +69,6 @@ FIELDS = ENTRY.names or ()
 MIDDLE_AT = ENTRY.fields["middle"][1] if ENTRY.fields else 0
 
 
-@intrinsic
-def swap(typingctx: Any, address: Any, value: Any) -> Any:
-    """Store an int64 at an address and return what was there, in one indivisible step that orders memory."""
-
-    def build(context: Any, builder: Any, signature: Any, values: Any) -> Any:
-        place = builder.inttoptr(values[0], ir.PointerType(ir.IntType(64)))
-        return builder.atomic_rmw("xchg", place, values[1], "acq_rel")
-
-    return types.int64(types.int64, types.int64), build
-
-
 @entry
 def publish(entry, back):
     """Swap the writer's slot `back` for the one in the middle; returns the writer's next slot."""
@@ -115,7 +102,7 @@ def receive(entry):
 @kernel
 def follow_finger(entry, slot, m):
     """Where the finger is in sample m of the block, and where it will be at the end of the look-ahead (m)."""
-    e, words = record(entry, ENTRY_T, 0), carray(pointer(slot, F8), HEAD)
+    e, values = record(entry, ENTRY_T, 0), carray(pointer(slot, F8), HEAD)
     position, ahead = carray(pointer(e.position_at, F8), e.block), e.ahead / e.rate
     if e.given != 0:
         position[m] = carray(pointer(e.given, F8), 1)[e.taken + m]
@@ -124,9 +111,9 @@ def follow_finger(entry, slot, m):
         there = position[m] + ahead * (c.velocity + 0.5 * ahead * c.acceleration)
     else:
         age = (e.age + m) / e.rate
-        position[m] = words[POSITION] + min(age, HORIZON) * words[VELOCITY] + e.offset
+        position[m] = values[POSITION] + min(age, HORIZON) * values[VELOCITY] + e.offset
         there = position[m] + e.lead
-        kept, lead = e.offset_kept, ahead * words[VELOCITY] if age < HORIZON else 0.0
+        kept, lead = e.offset_kept, ahead * values[VELOCITY] if age < HORIZON else 0.0
         e.lead_input = lead + kept * (e.lead_input - lead)  # two poles: neither place nor speed steps
         e.lead = e.lead_input + kept * (e.lead - e.lead_input)
         e.offset_input *= kept
@@ -158,12 +145,12 @@ def play_texture(entry, slot):
 
     Gain and touch wait in a ring meanwhile, so that what is asked for is what was handed to the law.
     """
-    e, words = record(entry, ENTRY_T, 0), carray(pointer(slot, F8), HEAD)
+    e, values = record(entry, ENTRY_T, 0), carray(pointer(slot, F8), HEAD)
     waveform, gains = carray(pointer(e.waveform_at, F8), e.block), carray(pointer(e.gains_at, F8), (e.ahead + 1, 2))
     log = carray(pointer(e.log_at, F8), (e.log_rows, e.log_width))
     for m in range(e.block):
         now, (here, there) = e.samples + m, follow_finger(entry, slot, m)
-        e.gain += e.gain_pole * (words[GAIN] - e.gain)
+        e.gain += e.gain_pole * (values[GAIN] - e.gain)
         gain, touch = e.gain, eased(e.touch)
         waveform[m] = texture_at(entry, now + e.ahead, there, gain, touch) if e.analysed > 0 else gain
         gains[(now + e.ahead) % (e.ahead + 1), 0], gains[(now + e.ahead) % (e.ahead + 1), 1] = gain, touch
@@ -176,7 +163,7 @@ def play_texture(entry, slot):
 @kernel
 def write_log(entry, slot):
     """Drive, sensed, position, load and flags of the block into the log, beside the texture."""
-    e, words = record(entry, ENTRY_T, 0), carray(pointer(slot, F8), HEAD)
+    e, values = record(entry, ENTRY_T, 0), carray(pointer(slot, F8), HEAD)
     drive, sensed = carray(pointer(e.drive_at, F8), e.block * e.channels), carray(pointer(e.sensed_at, F8), 1)
     position, flags = carray(pointer(e.position_at, F8), e.block), carray(pointer(e.flags_at, I8), e.block)
     log = carray(pointer(e.log_at, F8), (e.log_rows, e.log_width))
@@ -187,7 +174,7 @@ def write_log(entry, slot):
         for i in range(e.sensors):
             log[row, e.channels + i] = sensed[m * e.sensors + i]
         log[row, e.channels + e.sensors] = position[m]
-        log[row, e.channels + e.sensors + 1] = words[LOAD]
+        log[row, e.channels + e.sensors + 1] = values[LOAD]
         log[row, e.channels + e.sensors + 3] = flags[m]
 
 

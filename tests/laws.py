@@ -61,11 +61,11 @@ class Law:
 
     block, n_bands = 1, 0
 
-    def __init__(self, library, name="law"):
-        self.library, self.rows = library, getattr(library, f"{name}_rows")
-        self.state = np.zeros(getattr(library, f"{name}_size")(), np.uint8)
+    def __init__(self, code, name="law"):
+        self.code, self.rows = code, getattr(code, f"{name}_rows")
+        self.state = np.zeros(getattr(code, f"{name}_size")(), np.uint8)
         self.step = SimpleNamespace(address=ctypes.cast(self.rows, ctypes.c_void_p).value)
-        getattr(library, f"{name}_start")(self.address)
+        getattr(code, f"{name}_start")(self.address)
 
     @property
     def address(self):
@@ -73,16 +73,16 @@ class Law:
 
     def set_bands(self, *rows):
         rows = np.array(rows, float).reshape(-1, 5)
-        return self.library.law_bands(self.address, rows.ctypes.data, len(rows))
+        return self.code.law_bands(self.address, rows.ctypes.data, len(rows))
 
     def envelopes(self, band):
         found = np.zeros(4)
-        self.library.law_envelope(self.address, band, found.ctypes.data)
+        self.code.law_envelope(self.address, band, found.ctypes.data)
         return complex(*found[:2]), complex(*found[2:])
 
     def covariance(self):
         found = np.zeros((18, 18))
-        self.library.law_covariance(self.address, found.ctypes.data)
+        self.code.law_covariance(self.address, found.ctypes.data)
         return found
 
     def run(self, sensed, position, waveform, channels=2):
@@ -112,10 +112,10 @@ class Exports:
     def law(self, texture, kind, name="law"):
         key = texture, kind
         if key not in self.libraries:
-            self.libraries[key] = self.library(texture, kind)
+            self.libraries[key] = self.build(texture, kind)
         return Law(self.libraries[key], name)
 
-    def library(self, texture, kind):
+    def build(self, texture, kind):
         folder = self.folder / texture.replace(" ", "-")
         if not folder.exists():
             export(self.rendering(texture), folder)

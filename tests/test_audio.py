@@ -147,7 +147,7 @@ def test_a_card_that_is_not_there_is_refused_with_those_that_are(device, message
 
 def test_without_portaudio_it_is_said_how_to_get_it(monkeypatch):
     """Nor with a library that is something else."""
-    portaudio.library.cache_clear()
+    portaudio.load.cache_clear()
     try:
         monkeypatch.setattr(portaudio, "find_library", lambda name: None)
         with pytest.raises(DeviceNotFound, match="PortAudio is not installed; to get it: .*apt install libportaudio2"):
@@ -156,7 +156,7 @@ def test_without_portaudio_it_is_said_how_to_get_it(monkeypatch):
         with pytest.raises(DeviceNotFound, match="libc.so.6 is no PortAudio that can be used.*Pa_GetVersion"):
             AudioDriver("0").open()
     finally:
-        portaudio.library.cache_clear()
+        portaudio.load.cache_clear()
 
 
 @pytest.mark.parametrize(

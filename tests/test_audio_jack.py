@@ -82,7 +82,7 @@ def assert_accurate(errors):
 def test_portaudio_is_what_is_declared(connected):
     """Its version, and through structs as it fills them: names, channels and rate of a card that is known."""
     connected(jack_ring.straight())
-    assert portaudio.library().Pa_GetVersion() >= portaudio.LEAST_VERSION
+    assert portaudio.load().Pa_GetVersion() >= portaudio.LEAST_VERSION
     card = portaudio.find(CLIENT)
     assert (card.name, card.inputs, card.outputs, card.rate) == (CLIENT, 2, 2, RATE)
     assert card.host == "JACK Audio Connection Kit"

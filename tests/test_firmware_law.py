@@ -46,7 +46,7 @@ def test_double_equals_the_kernel(exports, name, finger, limit):
     drive, flags, signals, _ = close(kernel_of(exports, name, limit), FINGERS[finger], texture)
     law = exports.law(name, "double")
     if limit is not None:
-        assert law.library.law_limit(law.address, limit)
+        assert law.code.law_limit(law.address, limit)
     sensed, position = (np.ascontiguousarray(array) for array in (signals.sensed, signals.position))
     found, found_flags = law.run(sensed, position, ahead_of(texture))
     assert abs(found[:-1] - drive[1:]).max() < 1e-9
@@ -113,7 +113,7 @@ def test_the_supervisor_equals_the_librarys(exports, fault, kind):
     drive, _, flags = controller.run(sensed, position, np.zeros(9000))
     law = exports.law("tones", kind, "supervised")
     found, found_flags = law.run(sensed, position, np.zeros(9000))
-    assert law.library.supervised_cause(law.address) == cause == (controller.fault.cause if controller.fault else 0)
+    assert law.code.supervised_cause(law.address) == cause == (controller.fault.cause if controller.fault else 0)
     stops = [np.argmax(each & Flag.STOPPED) for each in (flags, found_flags)]
     assert abs(np.diff(stops)) <= (0 if kind == "double" else 5)
     if kind == "double":
@@ -145,7 +145,7 @@ def test_float_is_as_accurate_as_double(exports, name, finger, limit):
     for kind in KINDS:
         law = exports.law(name, kind)
         if limit is not None:
-            law.library.law_limit(law.address, limit)
+            law.code.law_limit(law.address, limit)
         plate = close(law, FINGERS[finger], texture, bits=12)[3]
         errors[kind] = error(plate.motion[:, 0], reference_of(texture, FINGERS[finger]))
     assert errors["float"] < 1.2 * errors["double"]
@@ -234,8 +234,8 @@ def test_numbers_of_bands_gains_and_limits_have_bounds(exports):
     assert not law.set_bands(*9 * [GOOD])
     limit = float(exports.rendering("tones").model.drive_limit)
     for setter, goods, bads in (
-        (law.library.law_gain, (0.0, 1.0), (-0.01, 1.01, np.nan)),
-        (law.library.law_limit, (1e-3, 0.999 * limit), (0.0, 1.001 * limit, np.nan)),
+        (law.code.law_gain, (0.0, 1.0), (-0.01, 1.01, np.nan)),
+        (law.code.law_limit, (1e-3, 0.999 * limit), (0.0, 1.001 * limit, np.nan)),
     ):
         assert all(setter(law.address, each) for each in goods)
         assert not any(setter(law.address, each) for each in bads)
@@ -245,7 +245,7 @@ def test_a_gain_scales_the_reference(exports):
     law = exports.law("tones", "double")
     plate, _ = settled(law, 2.0)
     full = abs(law.envelopes(0)[1])
-    law.library.law_gain(law.address, 0.5)
+    law.code.law_gain(law.address, 0.5)
     plate.closed_loop(law, np.zeros(RATE))
     assert abs(law.envelopes(0)[1]) == pytest.approx(0.5 * full, rel=0.01)
 
