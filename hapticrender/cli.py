@@ -72,7 +72,13 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--version", action="version", version=f"hapticrender {__version__}")
     parser.set_defaults(run=lambda _: print(parser.format_help(), end="") or 0)
     choices = parser.add_subparsers(title="verbs", metavar="VERB")
+    for add in (_add_players, _add_checks, _add_measurements, _add_lists):
+        add(choices)
+    return parser
 
+
+def _add_players(choices: Any) -> None:
+    """Add the verbs that play scenes."""
     demo = _add_verb(
         choices, "demo", verbs.demo, "render the built-in scenes and make a page of sounds, pictures and figures"
     )
@@ -95,9 +101,9 @@ def _parser() -> argparse.ArgumentParser:
     play.add_argument("--force", action="store_true", help="overwrite files that are not from an earlier run")
     _add_run(play, driver=True)
 
-    scenes = _add_verb(choices, "scenes", verbs.scenes, "list the built-in scenes, or print one as TOML")
-    scenes.add_argument("scene", metavar="NAME", nargs="?", help="the scene to print")
 
+def _add_checks(choices: Any) -> None:
+    """Add the verbs that judge."""
     validate = _add_verb(choices, "validate", verbs.validate, "render scenes and exit 1 when one misses its tolerance")
     validate.add_argument("scenes", metavar="SCENE", nargs="*", help="TOML files or built-in names (default: all)")
     validate.add_argument(
@@ -113,6 +119,9 @@ def _parser() -> argparse.ArgumentParser:
     show = _add_verb(choices, "show", verbs.show, "print the figures of a recording, finished or cut off by a crash")
     show.add_argument("path", metavar="PATH", type=_path, help="a recording, or the folder of a rendered scene")
 
+
+def _add_measurements(choices: Any) -> None:
+    """Add the verbs about a device of one's own."""
     identify = _add_verb(
         choices, "identify", verbs.identify, "identify a plate or an ultrasonic surface without a finger, or a screen"
     )
@@ -148,10 +157,15 @@ def _parser() -> argparse.ArgumentParser:
     export.add_argument("--bands", metavar="N", type=_whole(1, 64), default=0, help=text)
     _add_out(export, None)
 
+
+def _add_lists(choices: Any) -> None:
+    """Add the verbs that list."""
+    scenes = _add_verb(choices, "scenes", verbs.scenes, "list the built-in scenes, or print one as TOML")
+    scenes.add_argument("scene", metavar="NAME", nargs="?", help="the scene to print")
+
     _add_verb(
         choices, "devices", verbs.devices, "list kinds of device, drivers, and the cards and ports that are there"
     )
-    return parser
 
 
 def _add_verb(choices: Any, name: str, run: Any, text: str) -> argparse.ArgumentParser:

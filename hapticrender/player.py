@@ -20,7 +20,7 @@ import math
 import threading
 import time
 from contextlib import ExitStack, suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -31,92 +31,24 @@ from hapticrender.control.probe import probe_plate
 from hapticrender.devices import open_driver
 from hapticrender.errors import HapticError
 from hapticrender.live import LiveLoop
-from hapticrender.loop import gain_uncertainty_of, open_scene, prepare, stopped_by_sigterm, zero_drive_after
-from hapticrender.protocols import Array, Driver, Flag, Rendering, Texture
-from hapticrender.realtime import HORIZON
-from hapticrender.recordings.recording import Recorder, Recording
+from hapticrender.live_motion import LiveMotion
+from hapticrender.live_recorder import LiveRecorder
+from hapticrender.loop import prepare, stopped_by_sigterm, zero_drive_after
+from hapticrender.player_state import BandState, PlayerState
+from hapticrender.protocols import Driver, Flag, Rendering, Texture
+from hapticrender.recordings.recording import Recording
 from hapticrender.touch.finger import Finger
 from hapticrender.touch.scene import Scene
 
 MOST_GAIN = 10.0
 NOMINAL = Finger.sliding(speed=0.08, normal_load=0.4)  # for which a device is designed where none is stated
-LONGEST, SHORTEST = 3600.0, 1e-3  # s: duration of a scene that has no end; and as a recording of it says
+LONGEST = 3600.0  # s: duration of a scene that has no end
 SERVICE = 0.05  # s between two looks: what comes next is computed, what was is recorded, faults are seen
-WORDS = 0.2  # s: two words within this time show a velocity
+UPDATES = 0.2  # s: two positions within this time show a velocity
 FADE_OUT = 0.05  # s: five time constants of the gain; and the longest that zeros are waited for
-POINTING, INSTANT = 0.01, 1e-4  # s between two words of a scene's finger; over which its velocity is found
+POINTING, INSTANT = 0.01, 1e-4  # s between two positions of a scene's finger; over which its velocity is found
 NAP, LATE = 2e-3, 0.1  # s: shorter waits are not slept; so late the clock starts anew
 PATIENCE = 5.0  # s without a sample, after which `sleep` gives a device up
-
-
-@dataclass(frozen=True)
-class BandState:
-    """What a band does: its frequency (Hz), target and achieved amplitude, and |achieved - target|/|target|."""
-
-    frequency: float
-    target: float
-    achieved: float
-    error: float
-
-
-@dataclass(frozen=True)
-class PlayerState:
-    """What a player does at the moment: `time` (s played), bands over the last quarter of a second, and trouble.
-
-    A texture that is a whole waveform has one band of frequency 0, whose amplitudes are rms.  `lost` counts callbacks
-    in which the device lost samples, `load` is the share of its time that a callback takes (NaN where unknown).
-    """
-
-    time: float
-    unit: str
-    bands: tuple[BandState, ...]
-    flags: Flag
-    lost: int
-    load: float
-
-    def __str__(self) -> str:
-        """One line a band, flags and load."""
-        lines = [
-            f"{_label(band.frequency)}  target {band.target:9.3g} {self.unit}  achieved {band.achieved:9.3g} "
-            f"{self.unit}  error {_percent(band.error)}"
-            for band in self.bands
-        ]
-        load = "" if math.isnan(self.load) else f", load {100 * self.load:.0f} %"
-        return "\n".join([*lines, f"{self.time:.1f} s, {self.flags.name or 'no flags'}, {self.lost} lost{load}"])
-
-
-def _label(frequency: float) -> str:
-    return f"{frequency:7.1f} Hz" if frequency > 0.0 else "  rms of all"
-
-
-def _percent(error: float) -> str:
-    return "  -" if math.isnan(error) else f"{100 * error:6.2f} %"
-
-
-class LiveMotion:
-    """Where the application has last said that the finger is, and how hard it presses: for a simulated device."""
-
-    def __init__(self) -> None:
-        self._clock = 0.0  # s
-        self._word = (0.0, math.nan, 0.0, 0.0)  # since (s), position, velocity, load
-
-    def restart(self) -> None:
-        """Begin at time 0 again, with another simulated device."""
-        self._clock, self._word = 0.0, (0.0, *self._word[1:])
-
-    def say(self, position: float, velocity: float, load: float) -> None:
-        """Take up a word of the application (m, m/s, N)."""
-        self._word = (self._clock, position, velocity, load)
-
-    def position(self, time: Array) -> Array:
-        """Position (m) at `time` (s): at the last speed, for `HORIZON` at most."""
-        time, (since, place, velocity, _) = np.asarray(time, float), self._word
-        self._clock = float(time[-1]) if time.size else self._clock
-        return place + velocity * np.clip(time - since, 0.0, HORIZON)
-
-    def load(self, time: Array) -> Array:
-        """Return the normal load (N)."""
-        return np.full(np.shape(time), self._word[3])
 
 
 class Player:
@@ -128,7 +60,7 @@ class Player:
     ----------
     device : str or Scene
         Kind of device, or a profile; or a scene, whose tables, method, seed and finger are used.  The finger of a scene
-        moves by itself until the application speaks (`finger`); else only the application knows one.
+        moves by itself until `finger` is called; else there is the finger of `finger` only.
     driver : Driver or str, optional
         As for `render`; the simulated device by default.
     finger : Finger, optional
@@ -163,15 +95,17 @@ class Player:
         self._given = device if isinstance(device, Scene) else None
         self._fields = {"device": device, "finger": finger or NOMINAL, "duration": LONGEST, **tables}
         self._driver, self._paced, self._watchdog = driver, paced, watchdog
-        self._motion, self._spoken = LiveMotion(), False
-        self._word, self._said = (math.nan, 0.0), (math.nan, 0.0, 0.0)  # the last word: place and moment; all of it
+        self._motion, self._located = LiveMotion(), False
+        self._last, self._finger = (
+            (math.nan, 0.0),
+            (math.nan, 0.0, 0.0),
+        )  # the last position with its time; position, velocity, load
         self._loop: LiveLoop | None = None
         self._next: LiveLoop | None = None  # waits for silence
         self._gain, self._called, self._before, self._lost = 1.0, 0.0, 0, 0
         self._error: BaseException | None = None
         self._raised = False
-        self._recorder: Recorder | None = None
-        self._unwritten: OSError | None = None  # why a recording has ended
+        self._recorder: LiveRecorder | None = None
         self._calls_back = self._closing = self._entered = False
         self._recorded, self._served = 0, 0.0  # samples of this loop that were looked at; when the last look was
         self._stack, self._stopping, self._lock = ExitStack(), threading.Event(), threading.RLock()
@@ -228,7 +162,8 @@ class Player:
                 self._begin(self._scene(texture))
                 return
             owned = self._loop.rendering.plant is not None and not self._loop.whole
-            rendering = open_scene(self._scene(texture), driver=None if owned else self._loop.rendering.device)
+            device = None if owned else self._loop.rendering.device
+            rendering = prepare(self._scene(texture), driver=device, compiled=False)
             if self._loop.whole:
                 self._loop.exchange(rendering)
             elif self._calls_back:
@@ -241,21 +176,21 @@ class Player:
                 self._loop.set_gain(0.0)
 
     def finger(self, position: float, velocity: float | None = None, load: float = 0.4) -> None:
-        """Say where the finger is: position (m from the middle, NaN: lifted), velocity (m/s), normal load (N).
+        """Set where the finger is: position (m from the middle, NaN: lifted), velocity (m/s), normal load (N).
 
-        It goes on at this velocity for 50 ms at most.  Without a velocity, that since the last word is taken.  After
-        0.25 s without a word what lies along the surface fades out.
+        It goes on at this velocity for 50 ms at most.  Without a velocity, that since the last call is taken.  After
+        0.25 s without a call what lies along the surface fades out.
         """
         self._check()
-        now, (last, then) = time.monotonic() if self._paced else self.time, self._word
+        now, (last, then) = time.monotonic() if self._paced else self.time, self._last
         if velocity is None:
-            recent = 0.0 < now - then < WORDS and math.isfinite(position - last)
+            recent = 0.0 < now - then < UPDATES and math.isfinite(position - last)
             velocity = (position - last) / (now - then) if recent else 0.0
         if math.isinf(position) or not math.isfinite(velocity) or not 0.0 <= load < math.inf:
-            said = f"{position=} m, {velocity=} m/s, {load=} N"
-            raise ValueError(f"{said}: must be finite, a load >= 0 (a position may be NaN: lifted)")
-        self._spoken, self._word, self._said = True, (position, now), (position, velocity, load)
-        self._motion.say(position, velocity, load)
+            values = f"{position=} m, {velocity=} m/s, {load=} N"
+            raise ValueError(f"{values}: must be finite, a load >= 0 (a position may be NaN: lifted)")
+        self._located, self._last, self._finger = True, (position, now), (position, velocity, load)
+        self._motion.update(position, velocity, load)
         if self._loop is not None:
             self._loop.finger(position, velocity, load)
 
@@ -267,28 +202,11 @@ class Player:
             if self._recorder is not None:
                 raise ValueError(f"{path}: a recording is under way: call end_recording first")
             self._service()
-            rendering, driver, model = loop.rendering, loop.driver, loop.model
-            Path(path).open("ab").close()  # what cannot be written is refused here
-            self._recorder = Recorder(
-                path,
-                scene=replace(rendering.scene, duration=SHORTEST) if self._given is None else rendering.scene,
-                method=rendering.scene.method,
-                seed=rendering.scene.seed,
-                rate=driver.rate,
-                bands=replace(rendering.bands.select(np.zeros(0, int)), envelope=None, unfelt=()),
-                drive_channels=driver.drive_channels,
-                sensed_channels=driver.sensed_channels,
-                drive_limit=model.drive_limit if np.isfinite(model.drive_limit) else None,
-                sensed_noise=model.sensed_noise,
-                calibration=gain_uncertainty_of(rendering),
-                **{name: getattr(model, name) for name in ("places", "unit", "drive_unit", "profile")},
-            )
+            self._recorder = LiveRecorder(path, loop, endless=self._given is None)
 
     def end_recording(self) -> Recording:
         """End the recording and return it."""
         with self._lock:
-            if self._unwritten is not None:
-                raise self._unwritten
             if self._recorder is None:
                 raise ValueError("nothing is being recorded: call record first")
             self._service()
@@ -384,8 +302,8 @@ class Player:
             probe_plate(device, rendering.model)
         self._loop = loop
         loop.set_gain(self._gain)
-        if self._spoken:
-            loop.finger(*self._said)
+        if self._located:
+            loop.finger(*self._finger)
         if calls_back:
             device.start(loop.entry)  # type: ignore[attr-defined]
             stack.callback(device.stop)  # type: ignore[attr-defined]
@@ -425,7 +343,7 @@ class Player:
         self._stack.callback(end)
 
     def _zero_drive(self) -> None:
-        """Set zero drive at once, on a device that may have failed; the next call of the application hears why."""
+        """Set zero drive at once, on a device that may have failed; the next call raises the error."""
         loop = self._playing("play")
         with suppress(Exception):
             loop.silence()
@@ -450,7 +368,7 @@ class Player:
         if self._next is not None and self._playing("play").silent:
             with self._lock:
                 self._take_over(self._next)
-        self._playing("play").advance(sensing=self._given is not None or not self._spoken)
+        self._playing("play").advance(sensing=self._given is not None or not self._located)
 
     def _take_over(self, following: LiveLoop) -> None:
         self._service()
@@ -462,8 +380,8 @@ class Player:
             self._hand_finger(following.rendering)
             self._stack.enter_context(following.driver)
         following.set_gain(self._gain)
-        if self._spoken:
-            following.finger(*self._said)
+        if self._located:
+            following.finger(*self._finger)
         self._loop = following
 
     def _advance(self, seconds: float) -> None:
@@ -483,9 +401,9 @@ class Player:
                     self._service()
 
     def _point(self) -> None:
-        """Say where the finger of the scene is, to a device that does not sense it."""
+        """Send the position of the scene's finger to a device that does not sense it."""
         loop = self._playing("play")
-        if self._given is not None and not self._spoken and not loop.senses:
+        if self._given is not None and not self._located and not loop.senses:
             finger, now = self._given.finger, self.time + np.array([0.0, INSTANT])
             (here, there), load = finger.position(now), finger.load(now)[0]
             loop.finger(here, float(np.nan_to_num((there - here) / INSTANT)), load)
@@ -503,15 +421,7 @@ class Player:
         gap, self._recorded = first - self._recorded, first + len(signals["flags"])
         self._lost += gap + int(np.count_nonzero(signals["flags"] & Flag.OVERRUN))
         if self._recorder is not None and len(signals["flags"]):
-            try:
-                if gap > 0:
-                    self._recorder.append(motion_source=loop.motion_source, **_missing(signals, gap))
-                self._recorder.append(motion_source=loop.motion_source, **signals)
-            except OSError as error:  # a full disk ends the recording, not the play
-                self._unwritten = error
-                with suppress(OSError):
-                    self._recorder.close()
-                self._recorder = None
+            self._recorder.append(signals, gap, loop.motion_source)
         if self._error is None and (fault := loop.fault()):
             self._error = fault
 
@@ -536,10 +446,3 @@ class Player:
     def _close_recorder(self) -> None:
         if self._recorder is not None:
             self._recorder.close()
-
-
-def _missing(signals: dict[str, Array], count: int) -> dict[str, Array]:
-    """Signals of samples that nobody has kept: no numbers, and `Flag.OVERRUN`."""
-    found = {name: np.full((count, *each.shape[1:]), np.nan) for name, each in signals.items() if name != "target"}
-    found |= {name: np.zeros((count, *signals[name].shape[1:])) for name in ("drive", "reference", "normal_load")}
-    return found | {"flags": np.full(count, int(Flag.OVERRUN)), "target": np.zeros((count, 0), complex)}

@@ -1,37 +1,15 @@
 """Live play: what sounds is what was asked for, whatever changes on the way, and whoever drives the device."""
 
-import ctypes
-import os
-import signal
-import subprocess
-import sys
-import threading
-import time
-from contextlib import ExitStack
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from live_devices import RIDGES, ROUNDING, TONE, Blind, Calling, slide
 
 import hapticrender as hr
-from hapticrender.drivers.simulated import SimulatedDriver
 from hapticrender.plants.plate import Plate, PlateParameters
 from hapticrender.recordings.recording import Recording
 from hapticrender.voices import FADE
-
-RIDGES = hr.Grating(wavelength=1e-3, amplitude=5e-6)
-TONE = hr.Grating(frequency=100.0, amplitude=5e-6)
-ROUNDING = 10.0 / 4096  # A: a step of a 12-bit converter, which a rounding may move by one
-
-
-def slide(player, seconds, start=-0.02, speed=0.05, load=0.4, pause=0.02):
-    """Say where a sliding finger is, again and again; returns where it ends."""
-    place = start
-    for _ in range(round(seconds / pause)):
-        player.finger(place, speed, load)
-        player.sleep(pause)
-        place += speed * pause
-    return place
 
 
 def error_of(recording, start, stop=None):
@@ -176,192 +154,6 @@ def test_a_texture_that_cannot_be_played_changes_nothing():
         assert player.state().bands[0].error < 0.02
 
 
-def test_the_watchdog_silences_a_player_that_nobody_calls_and_the_next_call_wakes_it():
-    with hr.Player(paced=False, watchdog=0.3) as player:
-        player.play(TONE)
-        for _ in range(10):
-            player.sleep(0.1)
-        assert player.state().bands[0].target == pytest.approx(5e-6, rel=0.01)
-        player._called -= 10.0  # as if the application had hung
-        player._service()
-        player._advance(0.2)
-        player._called -= 10.0
-        player._service()
-        assert abs(player._loop.entry.log(player._loop.entry.samples - 100)["reference"]).max() < 1e-8
-        for _ in range(5):
-            player.sleep(0.1)
-        assert player.state().bands[0].target == pytest.approx(5e-6, rel=0.01)
-
-
-def test_the_watchdog_acts_while_the_application_hangs():
-    """In real time: nobody calls, the texture fades out; the next call wakes it."""
-    with hr.Player(watchdog=0.2) as player:
-        player.play(TONE)
-        player.sleep(0.3)
-        assert player._loop.entry.current_gain == pytest.approx(1.0, rel=1e-6)
-        end = time.monotonic() + 20.0
-        while player._loop.entry.current_gain > 1e-3 and time.monotonic() < end:
-            time.sleep(0.05)
-        assert player._loop.entry.current_gain < 1e-3
-        player.sleep(0.4)
-        assert player._loop.entry.current_gain > 0.9
-
-
-class Lying(SimulatedDriver):
-    """A plate whose first sensor sticks from a moment on, or whose cable is pulled."""
-
-    def __init__(self, at, what):
-        super().__init__(Plate(PlateParameters(), hr.Finger.absent()))
-        self.at, self.what, self.played, self.count = at, what, [], 0
-
-    def _play(self, drive):
-        sensed = super()._play(drive)
-        self.count += 1
-        self.played.append(drive.copy())
-        if self.count > self.at * self.rate:
-            if self.what == "unplugged" and self.count < self.at * self.rate + 10:
-                raise hr.DeviceLost("plate: play: no answer")
-            if self.what == "stuck":
-                sensed.sensed[:, 0] = 1e-5
-            if self.what == "cut" and self.count < self.at * self.rate + 2:
-                return sensed._replace(sensed=sensed.sensed[:, :1])
-        return sensed
-
-
-def go_on(player):
-    player.play(TONE)
-    for _ in range(200):
-        player.sleep(0.05)
-
-
-def fail(player):
-    player.play(TONE)
-    player.sleep(0.2)
-    raise ZeroDivisionError
-
-
-def test_a_sensor_that_sticks_stops_the_drive_and_is_told_at_the_next_call(tmp_path):
-    driver = Lying(0.5, "stuck")
-    with hr.Player(driver=driver) as player:
-        player.play(RIDGES)
-        player.record(tmp_path / "fault.au")
-        with pytest.raises(hr.DeviceFault, match="sensor 1: one value repeats"):
-            go_on(player)
-    drive = np.concatenate(driver.played)
-    assert abs(drive[-10:]).max() == 0.0
-    stopped = np.flatnonzero(Recording.load(tmp_path / "fault.au").flags & hr.Flag.STOPPED)
-    assert stopped[0] / 5000.0 < 0.55
-
-
-def test_a_device_that_is_unplugged_is_told_at_the_next_call():
-    driver = Lying(0.3, "unplugged")
-    with pytest.raises(hr.DeviceLost, match="no answer"), hr.Player(driver=driver) as player:
-        go_on(player)
-    assert abs(driver.played[-1]).max() == 0.0
-
-
-def test_a_driver_that_fails_is_left_at_zero_drive_at_once():
-    """Before the application has called anything."""
-    driver = Lying(0.3, "cut")
-
-    def hang(player):
-        player.play(TONE)
-        end = time.monotonic() + 20.0
-        while player._error is None and time.monotonic() < end:
-            time.sleep(0.01)
-        time.sleep(0.1)
-        assert abs(driver.played[-1]).max() == 0.0
-        assert abs(np.concatenate(driver.played)).max() > 0.0
-
-    with pytest.raises(hr.ProtocolError, match="sensed"), hr.Player(driver=driver) as player:
-        hang(player)
-
-
-def test_a_disk_that_fails_ends_the_recording_and_not_the_play(tmp_path, monkeypatch):
-    with hr.Player(paced=False) as player:
-        player.play(TONE)
-        with pytest.raises(FileNotFoundError):
-            player.record(tmp_path / "nowhere" / "a.au")
-        player.record(tmp_path / "a.au")
-        player.sleep(0.5)
-
-        def full(**signals):
-            raise OSError(28, "No space left on device")
-
-        monkeypatch.setattr(player._recorder, "append", full)
-        player.sleep(0.5)
-        assert player.state().bands[0].error < 0.02
-        with pytest.raises(OSError, match="No space left"):
-            player.end_recording()
-
-
-def test_samples_that_were_not_kept_are_marked(tmp_path):
-    """The service thread held up for longer than the log: no numbers and a flag, and the clock goes on."""
-    with hr.Player(paced=False) as player:
-        player.play(TONE)
-        player.record(tmp_path / "gap.au")
-        player.sleep(0.5)
-        for _ in range(15_000):
-            player._block()
-        player._loop.fill()
-        player.sleep(0.1)
-        state, recording = player.state(), player.end_recording()
-    lost = recording.flags & hr.Flag.OVERRUN > 0
-    assert len(recording) == 18_000
-    assert 4_000 < np.count_nonzero(lost) == state.lost
-    assert np.isnan(recording.motion[lost]).all()
-    assert np.isfinite(recording.motion[~lost]).all()
-
-
-def test_an_error_of_the_application_leaves_zero_drive():
-    driver = Lying(1e9, "")
-    with pytest.raises(ZeroDivisionError), hr.Player(driver=driver) as player:
-        fail(player)
-    assert abs(np.concatenate(driver.played)).max() > 0.0
-    assert abs(driver.played[-1]).max() == 0.0
-
-
-class Calling:
-    """A device that calls back, like a sound card: a thread of its own calls the entry block by block."""
-
-    rate, block, delay = 48_000.0, 64, 64
-    drive_channels = sensed_channels = 2
-    sensed_scale, drive_scale, probe, zero_on_exit = 1e-3, 0.5, False, True
-    load = 0.25
-
-    def __init__(self):
-        parameters = replace(PlateParameters(), rate=self.rate, delay=self.delay)
-        self.plate = Plate(parameters, hr.Finger.absent(), block=self.block)
-        self.stopping, self.last = threading.Event(), None
-
-    def __enter__(self):
-        return self
-
-    def __exit__(self, *exc):
-        pass
-
-    def start(self, entry):
-        self.thread = threading.Thread(target=self.call, args=(entry,))
-        self.thread.start()
-
-    def stop(self):
-        self.stopping.set()
-        self.thread.join()
-
-    def call(self, entry):
-        pointer, long = ctypes.c_void_p, ctypes.c_ulong
-        callback = ctypes.CFUNCTYPE(ctypes.c_int, pointer, pointer, long, pointer, long, pointer)(entry.address)
-        given, made = np.zeros((self.block, 2), np.float32), np.zeros((self.block, 2), np.float32)
-        while not self.stopping.is_set():
-            given[:] = self.plate.run(made.astype(float) / self.drive_scale).sensed / self.sensed_scale
-            callback(given.ctypes.data, made.ctypes.data, self.block, None, 0, entry.user_data)
-            self.last = made.copy()
-            threading.Event().wait(1e-3)
-
-    def play(self, drive):
-        return hr.Sensed(self.plate.run(drive).sensed)
-
-
 def test_a_device_that_calls_back_is_handed_the_compiled_entry():
     device = Calling()
     with hr.Player(driver=device) as player:
@@ -374,24 +166,6 @@ def test_a_device_that_calls_back_is_handed_the_compiled_entry():
         assert state.bands[0].target == pytest.approx(4e-6, rel=0.01)
         assert state.bands[0].error < 0.03
     assert abs(device.last).max() == 0.0
-
-
-def test_a_device_that_does_not_start_is_left_closed():
-    """And may be started again."""
-    device = Calling()
-    start, closed = device.start, []
-    device.__class__ = type("Failing", (Calling,), {"__exit__": lambda self, *exc: closed.append(self)})
-    device.start = lambda entry: (_ for _ in ()).throw(hr.DriverError("no stream"))
-    with hr.Player(driver=device) as player:
-        with pytest.raises(hr.DriverError, match="no stream"):
-            player.play(TONE)
-        assert closed == [device]
-        with pytest.raises(ValueError, match="nothing plays yet"):
-            player.state()
-        device.start = start
-        player.play(TONE)
-        player.sleep(0.2)
-        assert player.time >= 0.2
 
 
 def test_a_device_that_calls_back_takes_one_texture_of_bands():
@@ -429,55 +203,6 @@ def test_what_it_refuses(tmp_path):
                 player.gain = gain
 
 
-SCENE = """
-name = "live"
-duration = 100.0
-[texture]
-kind = "grating"
-wavelength = 1e-3
-amplitude = 5e-6
-[finger]
-motion = "swiping"
-frequency = 2.0
-speed = 0.1
-[device]
-kind = "vt-plate"
-"""
-
-
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_live_run_of_the_command_line_is_stopped_cleanly(tmp_path, number):
-    """By Ctrl-C, or by whoever ends processes: the journal is whole, and the page about it is written."""
-    (tmp_path / "live.toml").write_text(SCENE)
-    command = [sys.executable, "-m", "hapticrender", "play", "live.toml", "--out", "out"]
-    run = subprocess.Popen(
-        command,
-        cwd=tmp_path,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        env=os.environ | {"PYTHONPATH": os.getcwd()},
-    )
-    line = run.stdout.readline()
-    assert "Hz  target" in line
-    run.send_signal(number)
-    printed, complaint = run.communicate(timeout=120)
-    assert run.returncode == (130 if number == signal.SIGINT else 143)
-    assert "page: " in printed
-    if number == signal.SIGINT:
-        assert "interrupted" in complaint
-    recording = Recording.load(tmp_path / "out" / "live" / "recording.au")
-    assert len(recording) > 0.2 * recording.rate
-    assert (tmp_path / "out" / "index.html").exists()
-
-
-class Blind(SimulatedDriver):
-    """A plate that senses no finger."""
-
-    def _play(self, drive):
-        return super()._play(drive)._replace(position=None, normal_load=None)
-
-
 def test_the_finger_of_a_scene_is_told_to_a_device_that_does_not_sense_it():
     """Words every 10 ms of signal: a swipe of 2 Hz is off by a quarter of its acceleration times 10 ms squared."""
     scene = hr.Scene(texture=RIDGES, finger=hr.Finger.swiping(2.0, speed=0.05), duration=5.0)
@@ -490,64 +215,3 @@ def test_the_finger_of_a_scene_is_told_to_a_device_that_does_not_sense_it():
     off = abs(played["position"] - scene.finger.position(time))[1000:]
     assert np.median(off) < 1e-3  # a loaded machine says its words late
     assert np.isfinite(played["position"][1000:]).all()
-
-
-def test_a_board_plays_live(tmp_path):
-    """Textures, gain and finger go over the line; what the board measures comes back, and a recording of it."""
-    from board import SLOW, BoardProcess, SlowClock, build_board
-
-    from hapticrender.drivers.serial import SerialDriver
-
-    folder = tmp_path / "board"
-    program = build_board(folder, hr.prepare(hr.Scene(texture=TONE, duration=1.0)))
-    with BoardProcess(program, tmp_path, *SLOW) as board:
-        driver = SerialDriver(str(board.port), clock=SlowClock())
-        with hr.Player(driver=driver) as player:
-            player.play(TONE)
-            player.record(tmp_path / "board.au")
-            player.sleep(0.8)
-            [tone] = player.state().bands
-            player.play(hr.Grating(frequency=150.0, amplitude=4e-6))
-            player.gain = 0.5
-            player.sleep(0.8)
-            [other] = player.state().bands
-            with pytest.raises(ValueError, match="Chirp is a waveform"):
-                player.play(hr.Chirp(start=50.0, stop=100.0, duration=1.0, amplitude=1e-6))
-            recording = player.end_recording()
-    assert (tone.frequency, other.frequency) == (100.0, 150.0)
-    assert (tone.target, other.target) == pytest.approx((5e-6, 2e-6), rel=1e-3)
-    assert max(tone.error, other.error) < 0.2  # telemetry is of an instant, with 1 um of noise at each end
-    last = slice(-1500, None)
-    time = np.arange(len(recording))[last] / 5000.0
-    waves = np.stack([np.cos(2 * np.pi * 150.0 * time), np.sin(2 * np.pi * 150.0 * time), np.ones(1500)], axis=1)
-    parts = [
-        np.linalg.lstsq(waves, each[last], rcond=None)[0] for each in (recording.reference, recording.motion[:, 0])
-    ]
-    # 1 um of noise at two ends: 0.7 um sqrt(2/1500) = 0.026 um in each part, three times; the phase needs no fit
-    assert abs(parts[0] - parts[1])[:2].max() < 0.08e-6
-
-
-def test_a_board_that_is_found_again_is_heard_again(tmp_path):
-    """Its clock begins anew: rows of the new run follow those of the old one, and a flag says that some are lost."""
-    from board import SLOW, BoardProcess, SlowClock, build_board
-
-    from hapticrender.drivers.serial import SerialDriver
-
-    program = build_board(tmp_path / "board", hr.prepare(hr.Scene(texture=TONE, duration=1.0)))
-    with ExitStack() as boards:
-        board = boards.enter_context(BoardProcess(program, tmp_path, *SLOW))
-        driver = SerialDriver(str(board.port), clock=SlowClock(), reconnect=20.0)
-        with hr.Player(driver=driver) as player:
-            player.play(TONE)
-            player.record(tmp_path / "board.au")
-            player.sleep(0.5)
-            before = player.time
-            board.kill()
-            boards.enter_context(BoardProcess(program, tmp_path, *SLOW))
-            player.sleep(0.6)
-            assert player.time >= before + 0.6
-            assert player.state().flags & hr.Flag.OVERRUN
-            recording = player.end_recording()
-    phase = 2 * np.pi * 100.0 * np.arange(1500) / 5000.0
-    parts = [2 * np.mean(each[-1500:] * np.exp(-1j * phase)) for each in (recording.reference, recording.motion[:, 0])]
-    assert abs(parts[1] - parts[0]) < 0.05 * 5e-6  # the new run's carriers begin anew, and so does the texture

@@ -217,6 +217,28 @@ def controller_settings(model: DeviceModel, bands: Bands, damping: Damping | Non
     }
 
 
+def law_times(model: DeviceModel, noise: float) -> dict[str, Any]:
+    """Fields of `INVERSE` that are times, in samples, or poles a sample; `noise` (m rms) opens the damper's gate."""
+    period = 1.0 / model.rate
+    return {
+        "settling": round(SETTLING * model.rate),
+        "joining": round(RESTART * model.rate),
+        "joined": round((RESTART + JOINING) * model.rate),
+        "damper_time": round(DAMPER_TIME * model.rate),
+        "patience": round(PATIENCE * model.rate),
+        "model_error": MODEL_ERROR**2,
+        "notice": max(round(NOTICE * model.rate), 1),
+        "level": (GATE_SIGMAS * noise) ** 2,
+        "high_pass": -math.expm1(-2 * math.pi * 20.0 * period),
+        "mean_square": -math.expm1(-period / 4e-3),
+        "hold": round(0.05 * model.rate),
+        "decay": math.exp(-period / 0.02),
+        "smoothing": period / 2e-3,
+        "slowly": period / 1.0,
+        "levelling": period / 50e-3 if len(model.mass) > 1 else 0.0,
+    }
+
+
 def law_settings(model: DeviceModel, bands: Bands, feedback: bool) -> dict[str, Any]:
     """Fields of `INVERSE`."""
     period, n = 1.0 / model.rate, len(model.mass)
@@ -244,21 +266,7 @@ def law_settings(model: DeviceModel, bands: Bands, feedback: bool) -> dict[str, 
         "pole": POLE,
         "pole_damping": POLE_DAMPING,
         "fade_step": period / FADE_IN,
-        "settling": round(SETTLING * model.rate),
-        "joining": round(RESTART * model.rate),
-        "joined": round((RESTART + JOINING) * model.rate),
-        "damper_time": round(DAMPER_TIME * model.rate),
-        "patience": round(PATIENCE * model.rate),
-        "model_error": MODEL_ERROR**2,
-        "notice": max(round(NOTICE * model.rate), 1),
-        "level": (GATE_SIGMAS * noise[0]) ** 2,
-        "high_pass": -math.expm1(-2 * math.pi * 20.0 * period),
-        "mean_square": -math.expm1(-period / 4e-3),
-        "hold": round(0.05 * model.rate),
-        "decay": math.exp(-period / 0.02),
-        "smoothing": period / 2e-3,
-        "slowly": period / 1.0,
-        "levelling": period / 50e-3 if n > 1 else 0.0,
+        **law_times(model, noise[0]),
         "filters": derivative_filters(float(model.rate), float(top), order, 4, 0.5 - late),
         "sensor_filter": shown,
         "pair": pole_step(model.rate),

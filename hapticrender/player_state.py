@@ -1,0 +1,52 @@
+"""What a player does at the moment, for the application and for the terminal."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from hapticrender.protocols import Flag
+
+
+@dataclass(frozen=True)
+class BandState:
+    """What a band does: its frequency (Hz), target and achieved amplitude, and |achieved - target|/|target|."""
+
+    frequency: float
+    target: float
+    achieved: float
+    error: float
+
+
+@dataclass(frozen=True)
+class PlayerState:
+    """What a player does at the moment: `time` (s played), bands over the last quarter of a second, and trouble.
+
+    A texture that is a whole waveform has one band of frequency 0, whose amplitudes are rms.  `lost` counts callbacks
+    in which the device lost samples, `load` is the share of its time that a callback takes (NaN where unknown).
+    """
+
+    time: float
+    unit: str
+    bands: tuple[BandState, ...]
+    flags: Flag
+    lost: int
+    load: float
+
+    def __str__(self) -> str:
+        """One line a band, flags and load."""
+        lines = [
+            f"{_label(band.frequency)}  target {band.target:9.3g} {self.unit}  achieved {band.achieved:9.3g} "
+            f"{self.unit}  error {_percent(band.error)}"
+            for band in self.bands
+        ]
+        load = "" if math.isnan(self.load) else f", load {100 * self.load:.0f} %"
+        return "\n".join([*lines, f"{self.time:.1f} s, {self.flags.name or 'no flags'}, {self.lost} lost{load}"])
+
+
+def _label(frequency: float) -> str:
+    return f"{frequency:7.1f} Hz" if frequency > 0.0 else "  rms of all"
+
+
+def _percent(error: float) -> str:
+    return "  -" if math.isnan(error) else f"{100 * error:6.2f} %"
