@@ -20,6 +20,7 @@ from hapticrender.voices import Voice
 
 JUDGED = 0.25  # s: of signal that figures are of
 SILENT = 1e-3  # of the gain: below it a texture has faded out
+DEVICE = ("driver", "device", "plant")  # of a rendering: they stay where its texture changes
 LEAST_TARGET = 1e-12  # in the device's unit: a smaller one has no error
 
 Row = tuple[float, float, float, float]  # frequency (Hz), target, achieved amplitude, relative error
@@ -142,7 +143,8 @@ class LiveLoop:
             for name, value in design_supervisor(inner.controller, self.model).items():
                 inner.state["p"][name] = value
         self.controller.settings["drive_limit"] = self.model.drive_limit
-        self.rendering, self._bands = rendering, rendering.bands
+        self.rendering = replace(rendering, **{name: getattr(self.rendering, name) for name in DEVICE})
+        self._bands = rendering.bands
         self.entry.play(self._voice(rendering))
 
     def signals(self, start: int) -> tuple[int, dict[str, Array]]:

@@ -161,8 +161,8 @@ class Player:
             if self._loop is None:
                 self._begin(self._scene(texture))
                 return
-            owned = self._loop.rendering.plant is not None and not self._loop.whole
-            device = None if owned else self._loop.rendering.device
+            playing = self._loop.rendering
+            device = None if playing.plant is not None else playing.device
             rendering = prepare(self._scene(texture), driver=device, compiled=False)
             if self._loop.whole:
                 self._loop.exchange(rendering)

@@ -168,7 +168,7 @@ class AdaptiveInverse:
         works by bands; see `design_controller`.
         """
         whole = bands.envelope is None and not len(bands)
-        known = model.finger.contact is not None or (whole and model.mass[0, 0] > 0.0 and model.contact_lag == 0.0)
+        known = model.finger.contact is not None or (whole and model.mass[0, 0] > 0.0)
         beyond = bands.frequency.max(initial=0.0) > 1.2 * HIGHEST * model.rate  # of the filters' range
         if not known or beyond or (bands.envelope is None and len(bands)):
             return design_controller(self.name, model, bands, rules_for(bands), feedback=feedback)
@@ -204,6 +204,7 @@ def controller_settings(model: DeviceModel, bands: Bands, damping: Damping | Non
         **shared_settings(model, bands, sensor_map, drive_map, feedback),
         **device_settings(model),
         "contact_damping": model.contact_damping,
+        "contact_lag": model.contact_lag,
         "typical_speed": model.typical_speed,
         "fade_in": period / FADE_IN,
         "highest_edge": model.highest_edge,
@@ -255,8 +256,11 @@ def law_settings(model: DeviceModel, bands: Bands, feedback: bool) -> dict[str, 
     top, order, late = min(model.highest_frequency, HIGHEST * model.rate), int(bands.differentiated), model.sensor_delay
     late *= model.rate  # what is sensed of the target is that of so many samples ago
     shown = np.eye(TAPS)[TAPS // 2 - 1]
+    rate_shown = np.zeros(TAPS)
     if order or late:
         shown = derivative_filters(float(model.rate), float(top), order, 1, -late)[0]
+    if model.contact_lag > 0.0:
+        rate_shown = derivative_filters(float(model.rate), float(top), order + 1, 1, -late)[0]
     return {
         "delay": model.delay,
         "spatial": (bands.wavenumber > 0.0).any() if len(bands) else bands.spatial,
@@ -269,6 +273,7 @@ def law_settings(model: DeviceModel, bands: Bands, feedback: bool) -> dict[str, 
         **law_times(model, noise[0]),
         "filters": derivative_filters(float(model.rate), float(top), order, 4, 0.5 - late),
         "sensor_filter": shown,
+        "sensor_rate_filter": rate_shown,
         "pair": pole_step(model.rate),
         "force_from_drive": np.pad(
             model.force_from_drive, ((0, 2 - n), (0, MOST_CHANNELS - model.force_from_drive.shape[1]))
