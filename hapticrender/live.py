@@ -14,6 +14,7 @@ from hapticrender.control.device_model import DeviceModel
 from hapticrender.control.supervisor import FADE_OUT, Fault, SupervisedController, design_supervisor
 from hapticrender.driver_checks import check_sensed
 from hapticrender.errors import DeviceFault, HapticError, WatchdogTimeout
+from hapticrender.inferred import ContactLag
 from hapticrender.protocols import Array, Controller, Flag, Rendering
 from hapticrender.realtime import LOG_TIME, RealtimeEntry
 from hapticrender.voices import Voice
@@ -163,12 +164,15 @@ class LiveLoop:
         motion = told[:, :-1]  # NaN where nothing is sensed
         if not self._true and found["sensed"].shape[1]:
             motion = found["sensed"] @ (model.place_from_coordinate @ model.coordinate_from_sensed).T
+            motion = ContactLag(model.contact_lag).run(motion, found["position"]) if model.inferred else motion
         return first, found | {"motion": motion, "target": np.zeros((count, 0), complex)}
 
     @property
     def motion_source(self) -> str:
         """Where `motion` comes from."""
-        return "true" if self._true else "sensors" if self.driver.sensed_channels else "unknown"
+        if self._true or not self.driver.sensed_channels:
+            return "true" if self._true else "unknown"
+        return "inferred" if self.model.inferred else "sensors"
 
     def figures(self) -> list[Row]:
         """What every band did over the last `JUDGED` seconds, see `band_figures`."""

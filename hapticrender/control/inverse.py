@@ -43,6 +43,7 @@ PATIENCE = 1e-3  # s: for so long a position may be missing
 MODEL_ERROR = 0.1  # of a deviation and of what the drive explains of it: part that no parameter explains
 LEAST_NOISE = 5e-5  # of the sensors' range
 NOTICE = 10e-3  # s: a contact is reported within this
+HOLD, DECAY = (50e-3, 2e-3), (20e-3, 2e-3)  # s, of the largest need; on friction a finger that turns makes it a spike
 GATE_SIGMAS = 2.0  # of the sensors' noise: a larger deviation within 4 ms opens the inner damper
 INITIAL_FRICTION = (1.0, 1e3)  # N and N/s: deviation and its rate at a contact
 INITIAL_MOTION = (15e-6, 0.02)  # m and m/s: deviation and its velocity at a contact
@@ -220,7 +221,7 @@ def controller_settings(model: DeviceModel, bands: Bands, damping: Damping | Non
 
 def law_times(model: DeviceModel, noise: float) -> dict[str, Any]:
     """Fields of `INVERSE` that are times, in samples, or poles a sample; `noise` (m rms) opens the damper's gate."""
-    period = 1.0 / model.rate
+    period, friction = 1.0 / model.rate, model.finger.contact is None
     return {
         "settling": round(SETTLING * model.rate),
         "joining": round(RESTART * model.rate),
@@ -232,8 +233,8 @@ def law_times(model: DeviceModel, noise: float) -> dict[str, Any]:
         "level": (GATE_SIGMAS * noise) ** 2,
         "high_pass": -math.expm1(-2 * math.pi * 20.0 * period),
         "mean_square": -math.expm1(-period / 4e-3),
-        "hold": round(0.05 * model.rate),
-        "decay": math.exp(-period / 0.02),
+        "hold": round(HOLD[friction] * model.rate),
+        "decay": math.exp(-period / DECAY[friction]),
         "smoothing": period / 2e-3,
         "slowly": period / 1.0,
         "levelling": period / 50e-3 if len(model.mass) > 1 else 0.0,
