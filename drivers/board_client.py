@@ -12,15 +12,19 @@ from hapticrender.bands import Bands
 from hapticrender.drivers import protocol
 from hapticrender.drivers.base import OpenedInWith, carry_through
 from hapticrender.drivers.board_line import BAUD, PAUSE, BoardLine, Clock, Line, open_port
+from hapticrender.drivers.board_texture import BoardTexture
 from hapticrender.drivers.protocol import Capabilities, Cause, Kind, State, Telemetry
 from hapticrender.drivers.row_reader import RowReader
 from hapticrender.errors import DeviceFault, DeviceLost, DeviceTimeout, DriverError
 from hapticrender.protocols import Array
 
 RETRY = 0.05  # s between two attempts to reach the board anew
+NO_BANDS = Bands.none(spatial=False)
+LEAST_WATCHDOG, MOST_WATCHDOG = 0.05, 65.0  # s
 FAULTS = {
     Cause.LIMIT: "the mean square of the drive is above its limit: lower the amplitude, or raise limits(rms=)",
     Cause.SENSOR: "a sensor was invalid for 10 ms: check its cable and its range",
+    Cause.APPLICATION: "the application was silent for longer than its watchdog allows: call it more often",
     Cause.INVALID: "samples of a sensor are no numbers, or at the end of its range: check its cable and its range",
     Cause.FROZEN: "a sensor repeats one value while the drive moves: check its cable, supply and converter",
     Cause.INCONSISTENT: "the motion does not follow from the drive: check the wiring and polarity of sensors and coils",
@@ -37,9 +41,10 @@ class _Wanted(NamedTuple):
     """What the board is to do, to be told again to a board that was lost."""
 
     bands: Bands | None = None
+    texture: BoardTexture | None = None
     gain: float = 1.0
     limits: tuple[float, float, float] | None = None
-    start: tuple[int, int] | None = None  # samples between rows of the stream, and between telemetry; None: at rest
+    start: tuple[int, int, int] | None = None  # fields of START; None: at rest
 
 
 class BoardClient(OpenedInWith):
@@ -130,8 +135,25 @@ class BoardClient(OpenedInWith):
             raise ValueError("the targets are a waveform: must be constant envelopes, which a board can play")
         if len(bands) > most:
             raise ValueError(f"{len(bands)} bands: must be <= {most} on {self.port}; export the scene with more")
-        sample = self._steadily(lambda line: line.set_bands(bands))
-        self._wanted = self._wanted._replace(bands=bands)
+        return self._set(bands, None)
+
+    def set_texture(self, texture: BoardTexture) -> int:
+        """Set a texture that is no sum of bands, in place of them; faded into within 40 ms while the board plays.
+
+        Its samples are sent ahead of play, from the client's thread or `step`; where they come too late the texture
+        fades out, with `Flag.OVERRUN`, and in again.  Returns the sample of the board's clock at which it took it.
+        """
+        return self._set(NO_BANDS, texture)
+
+    def _set(self, bands: Bands, texture: BoardTexture | None) -> int:
+        def put(line: BoardLine) -> int:
+            last = self._wanted
+            if last.start is not None and (texture or last.texture):  # at rest `start` sends it
+                line.play(texture, last.texture)
+            return line.set_bands(bands)
+
+        sample = self._steadily(put)
+        self._wanted = self._wanted._replace(bands=bands, texture=texture)
         return sample
 
     def finger(self, position: float, velocity: float = 0.0, load: float = 0.0, time: float | None = None) -> None:
@@ -172,8 +194,13 @@ class BoardClient(OpenedInWith):
         self._steadily(lambda line: line.ask(Kind.LIMITS, *limits))
         self._wanted = self._wanted._replace(limits=limits)
 
-    def start(self, *, stream: int = 0, telemetry: float = 0.02) -> int:
-        """Start to play the bands, from rest; return the sample of the board's clock at which it began.
+    def beat(self) -> None:
+        """Say that the application is alive, for the `watchdog` of `start`; never waits."""
+        if self._line is not None:
+            self._line.link.beat += 1
+
+    def start(self, *, stream: int = 0, telemetry: float = 0.02, watchdog: float = 0.0) -> int:
+        """Start to play the bands, or the texture, from rest; return the sample of the board's clock at which it began.
 
         Parameters
         ----------
@@ -181,13 +208,27 @@ class BoardClient(OpenedInWith):
             Samples between two rows that the board streams back; 0: none.
         telemetry : float, s
             Time between two frames of telemetry, 0.2 ms to 13 s at 5 kHz.
+        watchdog : float, s
+            Without a `beat` for so long the board stops, 0.05 to 65; 0: it needs none.
         """
         period = round(telemetry * self.capabilities.rate)
         for name, value, least in (("stream", stream, 0), ("telemetry", period, 1)):
             if not least <= value <= 0xFFFF:
                 raise ValueError(f"{name} = {value!r} samples: must be {least} to 65535")
-        sample = self._steadily(lambda line: line.begin(Kind.START, stream, period))
-        self._wanted, self._runs, self.started = self._wanted._replace(start=(stream, period)), True, sample
+        if watchdog and not LEAST_WATCHDOG <= watchdog <= MOST_WATCHDOG:
+            raise ValueError(f"{watchdog=}: must be {LEAST_WATCHDOG} to {MOST_WATCHDOG:g} s on a board, or 0 for none")
+        start = stream, period, round(1e3 * watchdog)
+        self.started = self._steadily(lambda line: self._begin(line, start))
+        self._wanted, self._runs = self._wanted._replace(start=start), True
+        return self.started
+
+    def _begin(self, line: BoardLine, start: tuple[int, int, int]) -> int:
+        texture = self._wanted.texture
+        if texture is not None:
+            line.play(texture)
+        sample = line.begin(Kind.START, *start)
+        if texture is not None:
+            texture.began = sample
         return sample
 
     def stop(self) -> None:
@@ -246,10 +287,12 @@ class BoardClient(OpenedInWith):
             try:
                 line.carry()
                 self._compare(line)
+                if self._wanted.start is not None and self._wanted.texture is not None:
+                    line.stream(self._wanted.texture)
             except DeviceFault as error:
                 self._error = error
                 raise
-            except DeviceLost as error:
+            except (DeviceLost, DeviceTimeout) as error:
                 self._recover(error)
 
     def pause(self) -> None:
@@ -311,7 +354,7 @@ class BoardClient(OpenedInWith):
         if wanted.bands is not None:
             line.set_bands(wanted.bands)
         if wanted.start is not None:
-            self.started = line.begin(Kind.START, *wanted.start)
+            self.started = self._begin(line, wanted.start)
 
     def _open_line(self) -> BoardLine:
         if self._error is not None:

@@ -3,13 +3,18 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from hapticrender.bands import Bands
+from hapticrender.drivers.board_client import NO_BANDS
+from hapticrender.drivers.board_texture import BoardTexture
+from hapticrender.drivers.protocol import Capabilities
 from hapticrender.drivers.row_reader import WRAP, RowReader
 from hapticrender.errors import DeviceFault
+from hapticrender.mathx import smoothstep
 from hapticrender.protocols import Array, Flag, Rendering
 
 if TYPE_CHECKING:
@@ -18,17 +23,31 @@ if TYPE_CHECKING:
 TELEMETRY = 0.05  # s between two frames of telemetry
 CARRIER = ("frequency", "wavenumber", "phase")
 CHANGE = 0.02  # s in which a carrier fades out before another one takes its place,
+FADE = 0.04  # s in which a texture fades into the next one
+JUDGED = 0.25  # s of signal that the figures of a texture are of
 REFRESH = 64  # samples of a run between two looks of the board at other carriers
 MOST_BANDS = 255  # that a frame can count
 
 
 class _Piece(NamedTuple):
-    """Reference from a sample of the run on: bands, turns of their carriers until then, gain."""
+    """Reference from a sample of the run on, fully after `fade` samples more."""
 
     start: int
     bands: Bands
-    turns: Array
+    turns: Array  # of the bands' carriers until `start`
     gain: float
+    texture: BoardTexture | None = None
+    began: int = 0  # sample of the run at which the texture's sample 0 plays
+    fade: int = 0
+
+    def values(self, sample: Array, position: Array, rate: float) -> Array:
+        """Reference (m, shape (n,)) at samples of the run."""
+        if self.texture is not None:
+            return self.gain * self.texture.at((sample - self.began) / rate, position)
+        bands = self.bands
+        phase = bands.carrier_phase((sample - self.start) / rate, position) + 2 * np.pi * self.turns[: len(bands)]
+        texture = (bands.envelope * np.exp(1j * phase)).real.sum(axis=1)  # type: ignore[operator]
+        return self.gain * np.where(np.isnan(position) & bands.follows_finger, 0.0, texture)
 
 
 class BoardLoop:
@@ -37,26 +56,41 @@ class BoardLoop:
     Parameters
     ----------
     rendering : Rendering
-        With a texture of constant amplitudes, which is all that a board plays.
+        With a texture of displacements.
     driver : SerialDriver
+    called : callable
+        Returns a number that changes with every call of the application.
+    watchdog : float, s, optional
+        Where `called` returns the same for so long, the board stops; see `BoardClient.start`.
     stream : int
         Samples between two rows that the board streams back for a recording; what lies between repeats the last one.
 
     Raises
     ------
     ValueError
-        The texture is a recording.
+        A board cannot play the texture, or count the watchdog's time.
     """
 
     whole, silent = True, False  # textures are exchanged under one law
     senses = False  # the host says where the finger is
     motion_source = "sensors"
 
-    def __init__(self, rendering: Rendering, driver: SerialDriver, stream: int = 1) -> None:
+    def __init__(
+        self,
+        rendering: Rendering,
+        driver: SerialDriver,
+        stream: int = 1,
+        *,
+        called: Callable[[], float] = lambda: 0.0,
+        watchdog: float | None = None,
+    ) -> None:
         self.rendering, self.driver, self.model = rendering, driver, rendering.model
+        self._called, self._call, self._watchdog = called, math.nan, watchdog
         self.samples, self.flags = 0, Flag(0)
         self._client, self._stream, self._first = driver.client, stream, 0
-        self._pieces = [_Piece(0, _playable(rendering), np.zeros(MOST_BANDS), 1.0)]
+        bands, texture = playable(rendering, driver.capabilities)
+        self._pieces = [_Piece(0, bands, np.zeros(MOST_BANDS), 1.0, texture)]
+        self._recent = np.zeros((0, 2))  # reference and motion, m
         self._reader: RowReader | None = None
         self._connections = 0
         self._fault: DeviceFault | None = None
@@ -64,9 +98,12 @@ class BoardLoop:
     def start(self) -> None:
         """Set the bands and play; the port is open."""
         last = self._pieces[-1]
-        self._client.set_bands(last.bands)
+        if last.texture is not None:
+            self._client.set_texture(last.texture)
+        else:
+            self._client.set_bands(last.bands)
         self._client.set_gain(last.gain)
-        self._client.start(stream=self._stream, telemetry=TELEMETRY)
+        self._client.start(stream=self._stream, telemetry=TELEMETRY, watchdog=self._watchdog or 0.0)
         self._read()
 
     def _read(self) -> None:
@@ -76,15 +113,21 @@ class BoardLoop:
         self._connections = self._client.reconnections
 
     def exchange(self, rendering: Rendering) -> None:
-        """Glide to the texture of another rendering of the same device, within 20 ms."""
-        bands = _playable(rendering)
-        taken, last = (self._client.set_bands(bands) - self._first) % WRAP, self._pieces[-1]
+        """Go over to the texture of another rendering of the same device: within 20 ms from bands to bands, else 40."""
+        last, (bands, texture) = self._pieces[-1], playable(rendering, self.driver.capabilities)
+        self.rendering = rendering
+        if texture is not None:
+            self._client.set_texture(texture)
+            began = ((texture.began or 0) - self._first) % WRAP
+            fade = round(FADE * self.driver.rate)
+            self._pieces.append(_Piece(began, bands, np.zeros(MOST_BANDS), last.gain, texture, began, fade))
+            return
+        taken = (self._client.set_bands(bands) - self._first) % WRAP
         start = -(-(taken + round(CHANGE * self.driver.rate) + 1) // REFRESH) * REFRESH
         turns, both = np.zeros(MOST_BANDS), slice(min(len(bands), len(last.bands)))
         same = [getattr(bands, name)[both] == getattr(last.bands, name)[both] for name in CARRIER]
         turns[both] = np.where(np.all(same, axis=0), self._turns(start)[both], 0.0)  # another carrier starts anew
         self._pieces.append(_Piece(start, bands, turns, last.gain))
-        self.rendering = rendering
 
     def finger(self, position: float, velocity: float, load: float) -> None:
         """Say where the finger is (m, m/s, N)."""
@@ -99,7 +142,7 @@ class BoardLoop:
             self._pieces[-1] = last._replace(gain=gain)
             return
         start = max((self._client.set_gain(gain) - self._first) % WRAP, last.start)
-        self._pieces.append(_Piece(start, last.bands, self._turns(start), gain))
+        self._pieces.append(last._replace(start=start, turns=self._turns(start), gain=gain, fade=0))
 
     def _turns(self, sample: int) -> Array:
         """Turns of the carriers at a sample of the run."""
@@ -116,9 +159,13 @@ class BoardLoop:
 
         A board that was lost and found again plays a new run, whose carriers begin anew; what was lost is not counted.
         """
+        if (call := self._called()) != self._call:
+            self._call = call
+            self._client.beat()
         if self._reader is not None and self._client.reconnections != self._connections:
             self.flags |= Flag.OVERRUN
-            self._pieces = [self._pieces[-1]._replace(start=self.samples, turns=np.zeros(MOST_BANDS))]
+            anew = {"start": self.samples, "began": self.samples, "turns": np.zeros(MOST_BANDS), "fade": 0}
+            self._pieces = [self._pieces[-1]._replace(**anew)]
             self._read()
         try:
             self.flags |= self._client.telemetry().flags
@@ -134,14 +181,17 @@ class BoardLoop:
         )
         count = len(flags)
         first, self.samples = self.samples, self.samples + count
-        model = self.model
+        model, reference = self.model, self._reference(first, position)
+        motion = sensed @ (model.place_from_coordinate @ model.coordinate_from_sensed).T
+        recent = np.vstack([self._recent, np.stack([reference, motion[:, 0]], axis=1)])
+        self._recent = recent[-round(JUDGED * self.driver.rate) :]
         return first, {
             "drive": drive,
             "sensed": sensed,
-            "motion": sensed @ (model.place_from_coordinate @ model.coordinate_from_sensed).T,
+            "motion": motion,
             "position": position,
             "normal_load": load,
-            "reference": self._reference(first, position),
+            "reference": reference,
             "target": np.zeros((count, 0), complex),
             "flags": flags,
         }
@@ -150,19 +200,24 @@ class BoardLoop:
         """Reference of the samples from `first` on, without the 20 ms in which the board glides."""
         reference, sample = np.zeros(len(position)), first + np.arange(len(position))
         for piece in self._pieces:
-            since, bands = sample >= piece.start, piece.bands
-            time = (sample[since] - piece.start) / self.driver.rate
-            phase = bands.carrier_phase(time, position[since]) + 2 * np.pi * piece.turns[: len(bands)]
-            texture = (bands.envelope * np.exp(1j * phase)).real.sum(axis=1)  # type: ignore[operator]
-            away = np.isnan(position[since]) & bands.follows_finger
-            reference[since] = np.where(away, 0.0, piece.gain * texture)
-        while len(self._pieces) > 1 and self._pieces[1].start <= first:
+            since = sample >= piece.start
+            weight = smoothstep((sample[since] - piece.start + 1) / max(piece.fade, 1))
+            values = piece.values(sample[since], position[since], self.driver.rate)
+            reference[since] += weight * (values - reference[since])
+        while len(self._pieces) > 1 and self._pieces[1].start + self._pieces[1].fade <= first:
             del self._pieces[0]
         return reference
 
     def figures(self) -> list[tuple[float, float, float, float]]:
-        """Return what the board last said of every band: frequency (Hz), target, achieved (m) and relative error."""
+        """Return what the board last said of every band: frequency (Hz), target, achieved (m) and relative error.
+
+        Of a texture that is no sum of bands the amplitudes are rms, over the last quarter of a second.
+        """
         rows = []
+        if self._pieces[-1].texture is not None and len(self._recent):
+            reference, motion = (self._recent - self._recent.mean(axis=0)).T
+            target, achieved, off = (float(np.sqrt(np.mean(x**2))) for x in (reference, motion, motion - reference))
+            return [(0.0, target, achieved, off / target if target > 0.0 else math.nan)]
         for hertz, band in zip(self._pieces[-1].bands.frequency, self._client.telemetry().bands, strict=False):
             size, error = abs(band.target), abs(band.measured - band.target)
             rows.append((float(hertz), size, abs(band.measured), error / size if size > 0.0 else math.nan))
@@ -173,9 +228,17 @@ class BoardLoop:
         return self._fault
 
 
-def _playable(rendering: Rendering) -> Bands:
-    bands = rendering.bands
-    if bands.envelope is None or bands.differentiated:
-        kind = type(rendering.scene.texture).__name__
-        raise ValueError(f"texture: {kind} is a waveform, or a force: a board plays gratings, and sums of them")
-    return bands
+def playable(rendering: Rendering, board: Capabilities) -> tuple[Bands, BoardTexture | None]:
+    """Return what a board plays of a rendering: its bands, or none and a texture of samples.
+
+    Raises
+    ------
+    ValueError
+        The texture is a force or a velocity, or one that `BoardTexture` refuses.
+    """
+    bands, texture = rendering.bands, rendering.scene.texture
+    if rendering.differentiated or bands.differentiated:
+        raise ValueError(f"texture: {type(texture).__name__} is a force, or a velocity: a board plays displacements")
+    if bands.envelope is not None and len(bands) and not bands.modulated:
+        return bands, None
+    return NO_BANDS, BoardTexture(texture, board, rendering.model)

@@ -55,8 +55,6 @@ def prepare(
     scene = replace(scene, **{key: value for key, value in changes.items() if value is not None})
     if isinstance(driver, str):
         driver = open_driver(driver, scene.device_profile)
-    if driver is not None and getattr(driver, "finger", driver) is None:
-        driver.finger = scene.finger  # type: ignore[attr-defined]
     renderer = registered("renderers", scene.device)() if renderer is None else renderer
     if inspect.isclass(renderer) or not callable(getattr(renderer, "open", None)):
         kind = f"class {renderer.__name__}" if inspect.isclass(renderer) else type(renderer).__name__
@@ -65,6 +63,8 @@ def prepare(
     if not isinstance(rendering, Rendering):
         kinds = type(renderer).__name__, type(rendering).__name__
         raise TypeError(f"{kinds[0]}.open returned {kinds[1]}: must be hapticrender.Rendering")
+    if driver is not None and getattr(driver, "rendering", driver) is None:
+        driver.rendering = rendering  # type: ignore[attr-defined]
     if compiled:
         _warm_up(rendering)
     return rendering

@@ -291,7 +291,8 @@ class Player:
         calls_back = self._calls_back = hasattr(device, "start") and direct
         own = hasattr(device, "loop") and direct
         scales = {name: getattr(device, name) for name in ("sensed_scale", "drive_scale")} if calls_back else {}
-        loop: Any = device.loop(rendering) if own else LiveLoop(rendering, **scales)  # type: ignore[attr-defined]
+        alive = (lambda: self._called), self._watchdog
+        loop: Any = device.loop(rendering, *alive) if own else LiveLoop(rendering, **scales)  # type: ignore[attr-defined]
         self._hand_finger(rendering)
         if not self._paced and (calls_back or own):
             raise ValueError("paced = False: must be True on a device with a clock of its own")
