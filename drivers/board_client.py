@@ -12,10 +12,10 @@ from hapticrender.bands import Bands
 from hapticrender.drivers import protocol
 from hapticrender.drivers.base import OpenedInWith, carry_through
 from hapticrender.drivers.board_line import BAUD, PAUSE, BoardLine, Clock, Line, open_port
-from hapticrender.drivers.board_texture import BoardTexture
+from hapticrender.drivers.board_texture import WRAP, BoardTexture
 from hapticrender.drivers.protocol import Capabilities, Cause, Kind, State, Telemetry
 from hapticrender.drivers.row_reader import RowReader
-from hapticrender.errors import DeviceFault, DeviceLost, DeviceTimeout, DriverError
+from hapticrender.errors import DeviceFault, DeviceLost, DeviceTimeout, DriverError, HapticError, WatchdogTimeout
 from hapticrender.protocols import Array
 
 RETRY = 0.05  # s between two attempts to reach the board anew
@@ -24,7 +24,6 @@ LEAST_WATCHDOG, MOST_WATCHDOG = 0.05, 65.0  # s
 FAULTS = {
     Cause.LIMIT: "the mean square of the drive is above its limit: lower the amplitude, or raise limits(rms=)",
     Cause.SENSOR: "a sensor was invalid for 10 ms: check its cable and its range",
-    Cause.APPLICATION: "the application was silent for longer than its watchdog allows: call it more often",
     Cause.INVALID: "samples of a sensor are no numbers, or at the end of its range: check its cable and its range",
     Cause.FROZEN: "a sensor repeats one value while the drive moves: check its cable, supply and converter",
     Cause.INCONSISTENT: "the motion does not follow from the drive: check the wiring and polarity of sensors and coils",
@@ -44,7 +43,7 @@ class _Wanted(NamedTuple):
     texture: BoardTexture | None = None
     gain: float = 1.0
     limits: tuple[float, float, float] | None = None
-    start: tuple[int, int, int] | None = None  # fields of START; None: at rest
+    start: tuple[int, int] | None = None  # fields of START; None: at rest
 
 
 class BoardClient(OpenedInWith):
@@ -93,7 +92,8 @@ class BoardClient(OpenedInWith):
         self._line: BoardLine | None = None
         self._wanted = _Wanted()
         self._runs = False  # something has been started
-        self._error: DriverError | None = None
+        self._error: HapticError | None = None
+        self._beats = self._watchdog = 0  # of the application: its calls; ms, 0: none
         self._background, self._thread = background, threading.Thread()
         self._lock, self._ending = threading.RLock(), threading.Event()
 
@@ -194,12 +194,24 @@ class BoardClient(OpenedInWith):
         self._steadily(lambda line: line.ask(Kind.LIMITS, *limits))
         self._wanted = self._wanted._replace(limits=limits)
 
-    def beat(self) -> None:
-        """Say that the application is alive, for the `watchdog` of `start`; never waits."""
-        if self._line is not None:
-            self._line.link.beat += 1
+    def watch(self, seconds: float | None) -> None:
+        """Let the board stop for good where the application is silent for so long, 0.05 to 65 s; None: never.
 
-    def start(self, *, stream: int = 0, telemetry: float = 0.02, watchdog: float = 0.0) -> int:
+        It has to call `beat`, or `watch` again: what the client's thread sends does not count.  Never waits.
+        """
+        if seconds is not None and not LEAST_WATCHDOG <= seconds <= MOST_WATCHDOG:
+            bound = f"{LEAST_WATCHDOG} to {MOST_WATCHDOG:g} s on a board, or None"
+            raise ValueError(f"watchdog = {seconds!r} s: must be {bound}")
+        self._watchdog = round(1e3 * (seconds or 0.0))
+        self.beat()
+
+    def beat(self) -> None:
+        """Say that the application is alive, see `watch`; never waits."""
+        self._beats += 1
+        if (line := self._line) is not None:
+            line.link.application = self._beats & 0xFFFF, self._watchdog
+
+    def start(self, *, stream: int = 0, telemetry: float = 0.02) -> int:
         """Start to play the bands, or the texture, from rest; return the sample of the board's clock at which it began.
 
         Parameters
@@ -208,21 +220,17 @@ class BoardClient(OpenedInWith):
             Samples between two rows that the board streams back; 0: none.
         telemetry : float, s
             Time between two frames of telemetry, 0.2 ms to 13 s at 5 kHz.
-        watchdog : float, s
-            Without a `beat` for so long the board stops, 0.05 to 65; 0: it needs none.
         """
         period = round(telemetry * self.capabilities.rate)
         for name, value, least in (("stream", stream, 0), ("telemetry", period, 1)):
             if not least <= value <= 0xFFFF:
                 raise ValueError(f"{name} = {value!r} samples: must be {least} to 65535")
-        if watchdog and not LEAST_WATCHDOG <= watchdog <= MOST_WATCHDOG:
-            raise ValueError(f"{watchdog=}: must be {LEAST_WATCHDOG} to {MOST_WATCHDOG:g} s on a board, or 0 for none")
-        start = stream, period, round(1e3 * watchdog)
+        start = stream, period
         self.started = self._steadily(lambda line: self._begin(line, start))
         self._wanted, self._runs = self._wanted._replace(start=start), True
         return self.started
 
-    def _begin(self, line: BoardLine, start: tuple[int, int, int]) -> int:
+    def _begin(self, line: BoardLine, start: tuple[int, int]) -> int:
         texture = self._wanted.texture
         if texture is not None:
             line.play(texture)
@@ -246,6 +254,8 @@ class BoardClient(OpenedInWith):
             The line or the board is gone, and did not come back within `reconnect`.
         DeviceFault
             The board stopped by itself: the drive, or a sensor.
+        WatchdogTimeout
+            The board stopped as the application was silent, see `watch`.
         """
         return self._steadily(lambda line: line.telemetry())
 
@@ -289,7 +299,7 @@ class BoardClient(OpenedInWith):
                 self._compare(line)
                 if self._wanted.start is not None and self._wanted.texture is not None:
                     line.stream(self._wanted.texture)
-            except DeviceFault as error:
+            except (DeviceFault, WatchdogTimeout) as error:
                 self._error = error
                 raise
             except (DeviceLost, DeviceTimeout) as error:
@@ -305,7 +315,7 @@ class BoardClient(OpenedInWith):
         while not self._ending.is_set() and self._error is None:
             try:
                 self.step()
-            except DriverError as error:
+            except HapticError as error:
                 self._error = error
             except Exception as error:  # of a frame that nobody has thought of: the board must not play on unheard
                 self._error = DriverError(f"{self.port}: {type(error).__name__}: {error}")
@@ -318,6 +328,8 @@ class BoardClient(OpenedInWith):
             return
         if found.cause in FAULTS:
             raise DeviceFault(f"{self.port}: play: the board stopped: {FAULTS[found.cause]}")
+        if found.cause == Cause.APPLICATION:
+            raise WatchdogTimeout((found.sample - self.started) % WRAP / self.capabilities.rate)
         if found.cause == Cause.SILENCE:
             raise line.lost("play", "the board heard no good word for 80 ms, and stopped")
 
@@ -338,6 +350,7 @@ class BoardClient(OpenedInWith):
             try:
                 self._close_line()
                 self._line = self._connect()
+                self.beat()
                 self._restore(self._line)
                 self.reconnections += 1
                 return

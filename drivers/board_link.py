@@ -60,7 +60,7 @@ class Link:
         self.telemetry: Telemetry | None = None
         self.stream: deque[Stream] = deque(maxlen=MOST_STREAM)
         self.finger: Finger | None = None  # not sent yet
-        self.beat = 0  # changes with every call of the application
+        self.application = 0, 0  # changes with every call of it; ms without one after which the board stops, 0: never
         self.received = now  # s, of the last good frame
         self.sent_bytes = self.received_bytes = 0
         self._began, self._spoken = now, -math.inf
@@ -120,7 +120,7 @@ class Link:
         finger, self.finger = self.finger, None
         time = round(((now if finger is None else finger[0]) - self._began) * 1e6) & 0xFFFFFFFF
         kind, fields = (Kind.HEARTBEAT, ()) if finger is None else (Kind.FINGER, finger[1:])
-        return self._command(kind, self._next(), protocol.pack(kind, time, self.beat & 0xFFFF, *fields))
+        return self._command(kind, self._next(), protocol.pack(kind, time, *self.application, *fields))
 
     def _take(self, frame: Frame, now: float) -> None:
         try:

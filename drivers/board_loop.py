@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -13,7 +12,7 @@ from hapticrender.drivers.board_client import NO_BANDS
 from hapticrender.drivers.board_texture import BoardTexture
 from hapticrender.drivers.protocol import Capabilities
 from hapticrender.drivers.row_reader import WRAP, RowReader
-from hapticrender.errors import DeviceFault
+from hapticrender.errors import DeviceFault, HapticError, WatchdogTimeout
 from hapticrender.mathx import smoothstep
 from hapticrender.protocols import Array, Flag, Rendering
 
@@ -58,34 +57,21 @@ class BoardLoop:
     rendering : Rendering
         With a texture of displacements.
     driver : SerialDriver
-    called : callable
-        Returns a number that changes with every call of the application.
-    watchdog : float, s, optional
-        Where `called` returns the same for so long, the board stops; see `BoardClient.start`.
     stream : int
         Samples between two rows that the board streams back for a recording; what lies between repeats the last one.
 
     Raises
     ------
     ValueError
-        A board cannot play the texture, or count the watchdog's time.
+        A board cannot play the texture.
     """
 
     whole, silent = True, False  # textures are exchanged under one law
     senses = False  # the host says where the finger is
     motion_source = "sensors"
 
-    def __init__(
-        self,
-        rendering: Rendering,
-        driver: SerialDriver,
-        stream: int = 1,
-        *,
-        called: Callable[[], float] = lambda: 0.0,
-        watchdog: float | None = None,
-    ) -> None:
+    def __init__(self, rendering: Rendering, driver: SerialDriver, stream: int = 1) -> None:
         self.rendering, self.driver, self.model = rendering, driver, rendering.model
-        self._called, self._call, self._watchdog = called, math.nan, watchdog
         self.samples, self.flags = 0, Flag(0)
         self._client, self._stream, self._first = driver.client, stream, 0
         bands, texture = playable(rendering, driver.capabilities)
@@ -93,7 +79,7 @@ class BoardLoop:
         self._recent = np.zeros((0, 2))  # reference and motion, m
         self._reader: RowReader | None = None
         self._connections = 0
-        self._fault: DeviceFault | None = None
+        self._fault: HapticError | None = None
 
     def start(self) -> None:
         """Set the bands and play; the port is open."""
@@ -103,7 +89,7 @@ class BoardLoop:
         else:
             self._client.set_bands(last.bands)
         self._client.set_gain(last.gain)
-        self._client.start(stream=self._stream, telemetry=TELEMETRY, watchdog=self._watchdog or 0.0)
+        self._client.start(stream=self._stream, telemetry=TELEMETRY)
         self._read()
 
     def _read(self) -> None:
@@ -133,6 +119,14 @@ class BoardLoop:
         """Say where the finger is (m, m/s, N)."""
         self._client.finger(position, velocity, load)
 
+    def watch(self, seconds: float | None) -> None:
+        """Let the board stop once the application has not called for so long (s); None: never."""
+        self._client.watch(seconds)
+
+    def alive(self) -> None:
+        """Note a call of the application."""
+        self._client.beat()
+
     def set_gain(self, gain: float) -> None:
         """Set the factor on the texture, 0 to 1."""
         last = self._pieces[-1]
@@ -159,9 +153,6 @@ class BoardLoop:
 
         A board that was lost and found again plays a new run, whose carriers begin anew; what was lost is not counted.
         """
-        if (call := self._called()) != self._call:
-            self._call = call
-            self._client.beat()
         if self._reader is not None and self._client.reconnections != self._connections:
             self.flags |= Flag.OVERRUN
             anew = {"start": self.samples, "began": self.samples, "turns": np.zeros(MOST_BANDS), "fade": 0}
@@ -169,7 +160,7 @@ class BoardLoop:
             self._read()
         try:
             self.flags |= self._client.telemetry().flags
-        except DeviceFault as fault:
+        except (DeviceFault, WatchdogTimeout) as fault:
             self._fault = fault
             self.flags |= Flag.STOPPED
 
@@ -223,7 +214,7 @@ class BoardLoop:
             rows.append((float(hertz), size, abs(band.measured), error / size if size > 0.0 else math.nan))
         return rows
 
-    def fault(self) -> DeviceFault | None:
+    def fault(self) -> HapticError | None:
         """Return why the board stopped the drive, if it did."""
         return self._fault
 

@@ -49,13 +49,13 @@ class Kind(IntEnum):
 
 LAYOUT = {  # payloads, without the check word of commands; some go on with rows
     Kind.HELLO: "<BI",  # version, nonce (not 0)
-    Kind.HEARTBEAT: "<IH",  # host's time, us; beat of the application
-    Kind.FINGER: "<IHfff",  # the same; position, m, NaN: lifted; velocity, m/s; load, N
+    Kind.HEARTBEAT: "<IHH",  # host's time, us; application: its beat, and its watchdog, ms, 0: none
+    Kind.FINGER: "<IHHfff",  # the same; position, m, NaN: lifted; velocity, m/s; load, N
     Kind.SETPOINT: "<Bfffff",  # band; frequency, Hz; wavenumber, 1/m; phase, turns; target re, im, m
     Kind.COMMIT: "<BI",  # bands; CRC-32 of their set-points
     Kind.GAIN: "<f",  # 0 to 1
     Kind.LIMITS: "<fff",  # peak, A; rms, A; time constant, s
-    Kind.START: "<HHH",  # samples between rows of the stream, and between telemetry; 0: none; watchdog, ms
+    Kind.START: "<HH",  # samples between rows of the stream, and between telemetry; 0: none
     Kind.STOP: "<",
     Kind.LINE: "<BBfff",  # line; channel; frequency, Hz; amplitude, A; phase, turns
     Kind.IDENTIFY: "<BIHI",  # lines, 0: DRIVE frames; samples; samples between rows of the stream; CRC-32 of the lines

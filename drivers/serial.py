@@ -101,11 +101,9 @@ class SerialDriver(BaseDriver):
 
         return advance
 
-    def loop(
-        self, rendering: Rendering, called: Callable[[], float] = lambda: 0.0, watchdog: float | None = None
-    ) -> BoardLoop:
-        """Return a loop of the board's own for live play, see `BoardLoop`."""
-        return BoardLoop(rendering, self, called=called, watchdog=watchdog)
+    def loop(self, rendering: Rendering) -> BoardLoop:
+        """Return a loop of the board's own for live play, see `hapticrender.Player`."""
+        return BoardLoop(rendering, self)
 
     def _begin(self, bands: Bands, texture: BoardTexture | None) -> None:
         client = self.client

@@ -219,9 +219,8 @@ def tones(*frequencies, amplitude=5e-6):
     return Bands(frequency=frequencies, wavenumber=np.zeros(n), phase=np.zeros(n), envelope=np.full(n, amplitude))
 
 
-def sensed_error(recording):
-    """Error of the middle of the plate by its sensors, 20-500 Hz, over the texture, after the fade-in."""
-    start = int(0.3 * RATE)
+def sensed_error(recording, start=int(0.3 * RATE)):
+    """Error of the middle of the plate by its sensors, 20-500 Hz, over the texture, from sample `start` on."""
     reference = recording.read("reference", start)
     error = np.fft.rfft(recording.read("sensed", start).mean(axis=1) - reference)
     frequency = np.fft.rfftfreq(len(reference), 1 / RATE)

@@ -201,7 +201,7 @@ static void listen_to_host(board_t *board)
     if (board->quiet > board_samples_of(board, BOARD_SILENCE_MS)) {
         board_stop(board, CAUSE_SILENCE);
     }
-    if (board->watchdog > 0u && board->unattended > board->watchdog) {
+    if (board->state == BOARD_PLAYING && board->watchdog > 0u && board->unattended > board->watchdog) {
         board_stop(board, CAUSE_APPLICATION);
     }
 }

@@ -3,7 +3,7 @@
  *
  * docs/protocol.md has every frame.  A set-point acts only after a COMMIT whose digest is that of what the board holds;
  * every command carries a CRC-32 that starts from the session, beside the frame's CRC-16.  Without a word for 80 ms, or
- * without a beat of the application for as long as START says, the drive fades out within 10 ms.  Static memory: sizeof(board_t), no heap, no recursion.
+ * without a beat of the application for as long as it says, the drive fades out within 10 ms.  Static memory: sizeof(board_t), no heap, no recursion.
  */
 #ifndef BOARD_H
 #define BOARD_H
@@ -81,7 +81,8 @@ typedef struct {
     uint8_t replied[FRAME_WIRE];                  /* to the last command */
     size_t replied_count;
     uint32_t quiet;                               /* samples since the last good word */
-    uint32_t beat, unattended, watchdog;          /* of the application: its last beat; samples since; most, 0: any */
+    uint32_t beat, unattended, watchdog;          /* of the application: its last beat; samples since;
+                                                     most, 0: any */
     uint32_t echo;                                /* us: host's time of the last word */
     uint32_t bad, refused, dropped;               /* frames: malformed; refused; not sent as the line was full */
     word_t finger;

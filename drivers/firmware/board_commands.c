@@ -94,7 +94,6 @@ static uint8_t start(board_t *board, const uint8_t *payload, size_t count)
     }
     board->stride = get_u16(payload);
     board->period = get_u16(payload + 2);
-    board->watchdog = board_samples_of(board, get_u16(payload + 4));
     board->unattended = 0;
     board->textures.of[board->textures.current].began = board->sample;
     board_begin(board, BOARD_PLAYING);
@@ -146,7 +145,6 @@ static uint8_t identify(board_t *board, const uint8_t *payload, size_t count)
     board->lines_used = lines;
     board->remaining = get_u32(payload + 1);
     board->stride = get_u16(payload + 5);
-    board->watchdog = 0;
     board_begin(board, lines > 0u ? BOARD_IDENTIFYING : BOARD_DRIVING);
     board->queue_out = board->queue_in = 0;
     return REASON_NONE;
@@ -195,12 +193,13 @@ static void word(board_t *board, const frame *from)
         board->quiet = 0;                         /* an older one has waited in a full line: no sign of life */
         board->unattended = get_u16(from->payload + 4) != board->beat ? 0u : board->unattended;
         board->beat = get_u16(from->payload + 4);
+        board->watchdog = board_samples_of(board, get_u16(from->payload + 6));
     }
     if (from->kind == KIND_FINGER) {
         board->finger.written = get_u32(from->payload) + board->finger.offset;
-        board->finger.position = (real_t)get_f32(from->payload + 6);
-        board->finger.velocity = (real_t)get_f32(from->payload + 10);
-        board->finger.load = (real_t)get_f32(from->payload + 14);
+        board->finger.position = (real_t)get_f32(from->payload + 8);
+        board->finger.velocity = (real_t)get_f32(from->payload + 12);
+        board->finger.load = (real_t)get_f32(from->payload + 16);
     }
 }
 
@@ -236,6 +235,7 @@ static void begin_session(board_t *board, uint32_t nonce)
     board->session = crc32(numbers, sizeof numbers, 0u) | 1u;
     board->committed = 0u;
     board->finger.known = 0u;
+    board->watchdog = 0;
     board->finger.position = (real_t)NAN;
     board->period = (uint32_t)(board->played.rate * REAL(0.1));
     board_defaults(board);
@@ -274,7 +274,7 @@ static const struct {
     handler handle;
 } commands[] = {
     {KIND_SETPOINT, 1 + SETPOINT_BYTES, 0, setpoint}, {KIND_COMMIT, 5, 0, commit}, {KIND_GAIN, 4, 0, gain},
-    {KIND_LIMITS, 12, 0, limits}, {KIND_START, 6, 0, start}, {KIND_STOP, 0, 0, stop},
+    {KIND_LIMITS, 12, 0, limits}, {KIND_START, 4, 0, start}, {KIND_STOP, 0, 0, stop},
     {KIND_LINE, 1 + LINE_BYTES, 0, line}, {KIND_IDENTIFY, 11, 0, identify}, {KIND_DRIVE, 4, ROW_BYTES, drive},
     {KIND_TEXTURE, 16, 0, board_texture}, {KIND_PROFILE, 2, 2, board_profile}, {KIND_SAMPLES, 9, 2, board_samples},
     {KIND_PLAY, 4, 0, board_play},
@@ -322,8 +322,8 @@ void board_command(board_t *board, const frame *from)
         }
     } else if (board->session == 0u) {
         refuse(board, from, REASON_CHECK, 0);
-    } else if ((from->kind == KIND_HEARTBEAT && count == CHECK + 6u) ||
-               (from->kind == KIND_FINGER && count == CHECK + 18u)) {
+    } else if ((from->kind == KIND_HEARTBEAT && count == CHECK + 8u) ||
+               (from->kind == KIND_FINGER && count == CHECK + 20u)) {
         word(board, from);
     } else {
         execute(board, from);
