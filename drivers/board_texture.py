@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from hapticrender.control.device_model import DeviceModel
 
 FULL_SCALE = 32767  # of i16
-ROWS = 118  # points or samples in a frame
+ROWS = 64  # points or samples in a frame: a longer one takes a Cortex-M4 too long beside the law (benchmarks/board.py)
 AHEAD = 0.5  # s: of samples that are on the board before they play
 LEAST_POINTS = 512
 FINE, COARSE = 1e-3, 0.1  # rms error of the table over rms: more points are taken; the texture is refused

@@ -25,17 +25,17 @@ def test_a_board_plays_live(tmp_path):
         with hr.Player(driver=driver) as player:
             player.play(TONE)
             player.record(tmp_path / "board.au")
-            player.sleep(0.8)
+            player.sleep(0.5)
             [tone] = player.state().bands
             player.play(hr.Grating(frequency=150.0, amplitude=4e-6))
             player.gain = 0.5
-            player.sleep(0.8)
+            player.sleep(0.5)
             [other] = player.state().bands
             recording = player.end_recording()
             player.gain = 1.0
             player.play(WHITE)
             player.record(tmp_path / "white.au")
-            player.sleep(0.8)
+            player.sleep(0.5)
             [white] = player.state().bands
             player.play(replace(WHITE, speed=0.1) + 0.5 * hr.Chirp(start=50.0, stop=90.0, duration=1.0, amplitude=4e-6))
             for n in range(40):
@@ -49,9 +49,11 @@ def test_a_board_plays_live(tmp_path):
     # noise of 0.7 um rms in the middle; what is left of the error is below 5 % of the target
     assert white.frequency == 0.0
     assert white.error * white.target < np.hypot(0.75e-6, 0.05 * white.target)
-    print(white, sensed_error(both, len(both) - 1500))
+    # the same noise within 20-500 Hz; the finger has just landed: 10 % until it is learned
     noise = 0.71e-6 * np.sqrt(480 / 2500) / np.std(both.reference[-1500:])
-    assert sensed_error(both, len(both) - 1500) < 1.2 * np.hypot(noise, 0.1)
+    found = sensed_error(both, len(both) - 1500)
+    print(f"live: {white}; along the surface and in time: {found:.3f}, noise {noise:.3f}")
+    assert found < np.hypot(1.2 * noise, 0.1)
     last = slice(-1500, None)
     time = np.arange(len(recording))[last] / 5000.0
     waves = np.stack([np.cos(2 * np.pi * 150.0 * time), np.sin(2 * np.pi * 150.0 * time), np.ones(1500)], axis=1)
