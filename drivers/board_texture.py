@@ -91,20 +91,21 @@ class BoardTexture:
 
     def _sampled(self, most: int) -> tuple[float, Array]:
         """Step (m) and values (m) of the table: as few points as are fine enough."""
-        points, error = LEAST_POINTS // 2, 1.0
-        while error > FINE and 2 * points <= most:
-            points *= 2
+        points = min(LEAST_POINTS, most)
+        while True:
             places, step = np.linspace(self._start, -self._start, points, retstep=True)
             table, x = self.parts.along_surface(places), BETWEEN
             truth = self.parts.along_surface(places[1:-2] + x * step)
             inner = (1 + x) * (2 - x) / 2 * ((1 - x) * table[1:-2] + x * table[2:-1])
             off = inner - x * (1 - x) / 6 * ((2 - x) * table[:-3] + (1 + x) * table[3:]) - truth
             error = float(np.linalg.norm(off) / max(np.linalg.norm(truth), 1e-30))
+            if error <= FINE or 2 * points > most:
+                break
+            points *= 2
         if error > COARSE:
             raise ValueError(
                 f"texture {self._name}: {points} points, {1e6 * step:.3g} um apart, are {100 * error:.2g} % off it: "
-                f"must be <= {100 * COARSE:g} %; play it slower, narrow its passband, or compile the board with more "
-                "TEXTURE_POINTS"
+                f"must be <= {100 * COARSE:g} %; narrow its passband, or compile the board with more TEXTURE_POINTS"
             )
         return float(step), table
 

@@ -165,6 +165,24 @@ def test_only_what_was_sent_plays(stepped):
     assert not rows[:, 6].any()
 
 
+def test_a_board_that_was_reset_begins_its_texture_anew(tmp_path):
+    with SteppedBoard(program_of(*SANITISED), tmp_path, options=("--noise", "1e-8")) as board:
+        client = client_of(board, reconnect=5.0).open()
+        client.set_texture(BoardTexture(Tones(), client.capabilities, MODEL))
+        client.start(stream=1)
+        run(client, board, 0.2)
+        board.reset()
+        while not client.reconnections:
+            run(client, board, 0.01)
+        reader = RowReader(client, client.started)
+        run(client, board, 1.0)
+        rows = reader.take(int(0.9 * RATE))
+    late = np.arange(int(0.3 * RATE), len(rows))
+    expected = Tones().waveform(late / RATE, None)
+    assert np.sqrt(np.mean((motion_of(rows)[late] - expected) ** 2)) < 0.03 * 4e-6  # as where it starves
+    assert not rows[:, 6].any()
+
+
 def test_what_the_samples_take_of_the_line_is_what_the_page_says(stepped):
     client, _, _ = streaming(stepped, hr.Recorded(**RECORDED))
     run(client, stepped, 0.2)

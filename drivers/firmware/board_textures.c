@@ -63,8 +63,8 @@ uint8_t board_samples(board_t *board, const uint8_t *payload, size_t count)
     if (to == NULL || get_u32(payload + 1) != to->written) {
         return REASON_STATE;
     }
-    int plays = to == &board->textures.of[board->textures.current];
-    uint32_t held = plays ? texture_left(to, board->sample) : to->written;
+    int plays = board->state != BOARD_IDLE && to == &board->textures.of[board->textures.current];
+    uint32_t held = plays ? texture_left(to, board->sample + LAW_LOOKAHEAD) : to->written; /* not yet read */
     if (held + samples > TEXTURE_RING) {
         return REASON_STATE;
     }
