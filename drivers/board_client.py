@@ -12,14 +12,13 @@ from hapticrender.bands import Bands
 from hapticrender.drivers import protocol
 from hapticrender.drivers.base import OpenedInWith, carry_through
 from hapticrender.drivers.board_line import BAUD, PAUSE, BoardLine, Clock, Line, open_port
-from hapticrender.drivers.board_texture import WRAP, BoardTexture
-from hapticrender.drivers.protocol import Capabilities, Cause, Kind, State, Telemetry
+from hapticrender.drivers.board_texture import BoardTexture
+from hapticrender.drivers.protocol import WRAP, Capabilities, Cause, Kind, State, Telemetry
 from hapticrender.drivers.row_reader import RowReader
 from hapticrender.errors import DeviceFault, DeviceLost, DeviceTimeout, DriverError, HapticError, WatchdogTimeout
 from hapticrender.protocols import Array
 
 RETRY = 0.05  # s between two attempts to reach the board anew
-NO_BANDS = Bands.none(spatial=False)
 LEAST_WATCHDOG, MOST_WATCHDOG = 0.05, 65.0  # s
 FAULTS = {
     Cause.LIMIT: "the mean square of the drive is above its limit: lower the amplitude, or raise limits(rms=)",
@@ -120,10 +119,13 @@ class BoardClient(OpenedInWith):
         """What the board said of itself."""
         return self._open_line().capabilities
 
-    def set_bands(self, bands: Bands) -> int:
-        """Set what the board plays, all bands at the same sample; it glides there within 20 ms while it plays.
+    def set_bands(self, bands: Bands, texture: BoardTexture | None = None) -> int:
+        """Set what the board plays: bands, all at the same sample, and beside them a texture that is no sum of bands.
 
-        Returns the sample of the board's clock at which it took them.
+        While it plays it glides to the bands within 20 ms, and fades over to the texture, or from it, within 40 ms.
+        Samples of the texture are sent ahead of play by the client's thread, or `step`; where they come too late the
+        texture fades out, with `Flag.OVERRUN`, and in again.  Returns the sample of the board's clock at which it took
+        the bands.
 
         Raises
         ------
@@ -131,21 +133,11 @@ class BoardClient(OpenedInWith):
             The targets are no constant envelopes, there are too many bands, or the board refuses a number.
         """
         most = self.capabilities.bands
-        if bands.envelope is None:
-            raise ValueError("the targets are a waveform: must be constant envelopes, which a board can play")
+        if bands.envelope is None and (texture is None or len(bands)):
+            raise ValueError("the targets are a waveform: must be constant envelopes, or a BoardTexture")
         if len(bands) > most:
             raise ValueError(f"{len(bands)} bands: must be <= {most} on {self.port}; export the scene with more")
-        return self._set(bands, None)
 
-    def set_texture(self, texture: BoardTexture) -> int:
-        """Set a texture that is no sum of bands, in place of them; faded into within 40 ms while the board plays.
-
-        Its samples are sent ahead of play, from the client's thread or `step`; where they come too late the texture
-        fades out, with `Flag.OVERRUN`, and in again.  Returns the sample of the board's clock at which it took it.
-        """
-        return self._set(NO_BANDS, texture)
-
-    def _set(self, bands: Bands, texture: BoardTexture | None) -> int:
         def put(line: BoardLine) -> int:
             last = self._wanted
             if last.start is not None and (texture or last.texture):  # at rest `start` sends it

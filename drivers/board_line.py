@@ -13,8 +13,8 @@ import serial
 from hapticrender.bands import Bands
 from hapticrender.drivers import protocol
 from hapticrender.drivers.board_link import Link, Request
-from hapticrender.drivers.board_texture import ROWS, WRAP, BoardTexture, no_texture
-from hapticrender.drivers.protocol import Capabilities, Kind, Reason, Telemetry
+from hapticrender.drivers.board_texture import ROWS, BoardTexture, no_texture
+from hapticrender.drivers.protocol import WRAP, Capabilities, Kind, Reason, Telemetry
 from hapticrender.errors import DeviceLost, DeviceNotFound, DeviceTimeout, DriverError
 from hapticrender.protocols import Array
 

@@ -8,10 +8,9 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from hapticrender.bands import Bands
-from hapticrender.drivers.board_client import NO_BANDS
 from hapticrender.drivers.board_texture import BoardTexture
-from hapticrender.drivers.protocol import Capabilities
-from hapticrender.drivers.row_reader import WRAP, RowReader
+from hapticrender.drivers.protocol import WRAP, Capabilities
+from hapticrender.drivers.row_reader import RowReader
 from hapticrender.errors import DeviceFault, HapticError, WatchdogTimeout
 from hapticrender.mathx import smoothstep
 from hapticrender.protocols import Array, Flag, Rendering
@@ -84,10 +83,7 @@ class BoardLoop:
     def start(self) -> None:
         """Set the bands and play; the port is open."""
         last = self._pieces[-1]
-        if last.texture is not None:
-            self._client.set_texture(last.texture)
-        else:
-            self._client.set_bands(last.bands)
+        self._client.set_bands(last.bands, last.texture)
         self._client.set_gain(last.gain)
         self._client.start(stream=self._stream, telemetry=TELEMETRY)
         self._read()
@@ -101,14 +97,13 @@ class BoardLoop:
     def exchange(self, rendering: Rendering) -> None:
         """Go over to the texture of another rendering of the same device: within 20 ms from bands to bands, else 40."""
         last, (bands, texture) = self._pieces[-1], playable(rendering, self.driver.capabilities)
+        taken = (self._client.set_bands(bands, texture) - self._first) % WRAP
         self.rendering = rendering
         if texture is not None:
-            self._client.set_texture(texture)
             began = ((texture.began or 0) - self._first) % WRAP
             fade = round(FADE * self.driver.rate)
             self._pieces.append(_Piece(began, bands, np.zeros(MOST_BANDS), last.gain, texture, began, fade))
             return
-        taken = (self._client.set_bands(bands) - self._first) % WRAP
         start = -(-(taken + round(CHANGE * self.driver.rate) + 1) // REFRESH) * REFRESH
         turns, both = np.zeros(MOST_BANDS), slice(min(len(bands), len(last.bands)))
         same = [getattr(bands, name)[both] == getattr(last.bands, name)[both] for name in CARRIER]
@@ -232,4 +227,4 @@ def playable(rendering: Rendering, board: Capabilities) -> tuple[Bands, BoardTex
         raise ValueError(f"texture: {type(texture).__name__} is a force, or a velocity: a board plays displacements")
     if bands.envelope is not None and len(bands) and not bands.modulated:
         return bands, None
-    return NO_BANDS, BoardTexture(texture, board, rendering.model)
+    return Bands.none(spatial=False), BoardTexture(texture, board, rendering.model)

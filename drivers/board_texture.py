@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from hapticrender.drivers import protocol
-from hapticrender.drivers.protocol import Capabilities, Kind
+from hapticrender.drivers.protocol import WRAP, Capabilities, Kind
 from hapticrender.protocols import Array, Texture
 from hapticrender.touch.composed import SeparatedTexture
 
@@ -23,7 +23,6 @@ LEAST_POINTS = 512
 FINE, COARSE = 1e-3, 0.1  # rms error of the table over rms: more points are taken; the texture is refused
 BETWEEN = 0.382  # of a step, where the error is taken: no wavelength fits into it and the step
 REACH, MARGIN = 0.1, 2e-3  # m: to either side of the middle where a model does not show its ends; beyond the ends
-WRAP = 2**32  # of samples and of the board's clock
 
 
 class BoardTexture:

@@ -19,6 +19,7 @@ MOST_BODY = 254  # bytes of kind, sequence, payload and CRC: one COBS group at m
 MOST_PAYLOAD = MOST_BODY - 5
 CRC_START = 0xFFFF
 DELIMITER = b"\0"
+WRAP = 2**32  # of times, and of numbers of samples
 
 
 class Kind(IntEnum):

@@ -109,10 +109,7 @@ class SerialDriver(BaseDriver):
         client = self.client
         if self.finger is None and self.rendering is not None:
             self.finger = self.rendering.scene.finger
-        if texture is None:
-            client.set_bands(bands)
-        else:
-            client.set_texture(texture)
+        client.set_bands(bands, texture)
         self._started = client.clock.monotonic()
         self._point()
         first = client.start(stream=1)

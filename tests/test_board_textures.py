@@ -33,6 +33,7 @@ from hapticrender.mathx import smoothstep
 NOISE = np.random.default_rng(3).standard_normal(20_000)
 RECORDED = {"samples": NOISE, "rate": 5000.0, "gain": 4e-6, "passband": (20.0, 400.0)}
 MODEL = hr.prepare(SCENE).model
+NO_BANDS = Bands.none(spatial=False)
 
 
 class Sine:
@@ -93,7 +94,7 @@ def streaming(board, texture):
     """Client whose board plays a texture and streams every sample, and the reader of its rows."""
     client = client_of(board).open()
     found = BoardTexture(texture, client.capabilities, MODEL)
-    client.set_texture(found)
+    client.set_bands(NO_BANDS, found)
     first = client.start(stream=1)
     return client, found, RowReader(client, first)
 
@@ -134,6 +135,8 @@ def test_only_what_was_sent_plays(stepped):
     """A point lost or changed on its way, samples out of order or too many: refused, and what plays goes on."""
     client, texture, reader = streaming(stepped, Tones())
     line = client._line
+    nothing = line.link.submit(Kind.PLAY, protocol.pack(Kind.PLAY, 0))  # the digest of what was never described
+    assert line._answer(nothing).refused == Reason.STATE
     frames = list(BoardTexture(Sine(2e-3), client.capabilities, MODEL).frames(200))
     (_, described), *points, play = frames
     line.send(Kind.TEXTURE, described)
@@ -168,7 +171,7 @@ def test_only_what_was_sent_plays(stepped):
 def test_a_board_that_was_reset_begins_its_texture_anew(tmp_path):
     with SteppedBoard(program_of(*SANITISED), tmp_path, options=("--noise", "1e-8")) as board:
         client = client_of(board, reconnect=5.0).open()
-        client.set_texture(BoardTexture(Tones(), client.capabilities, MODEL))
+        client.set_bands(NO_BANDS, BoardTexture(Tones(), client.capabilities, MODEL))
         client.start(stream=1)
         run(client, board, 0.2)
         board.reset()
@@ -199,9 +202,9 @@ def test_textures_fade_into_each_other(stepped):
     surface = BoardTexture(Sine(2e-3), client.capabilities, MODEL)
     changes = [
         lambda: None,
-        lambda: client.set_texture(surface),
+        lambda: client.set_bands(NO_BANDS, surface),
         lambda: client.set_bands(tones(60.0, amplitude=4e-6)),
-        lambda: client.set_texture(BoardTexture(Tones(), client.capabilities, MODEL)),
+        lambda: client.set_bands(NO_BANDS, BoardTexture(Tones(), client.capabilities, MODEL)),
     ]
     for change in changes:
         change()
