@@ -211,7 +211,8 @@ class BoardClient(OpenedInWith):
         stream : int
             Samples between two rows that the board streams back; 0: none.
         telemetry : float, s
-            Time between two frames of telemetry, 0.2 ms to 13 s at 5 kHz.
+            Time between two frames of telemetry, 0.2 ms to 13 s at 5 kHz; at most 0.1 s with a texture, of which as
+            much is sent as the telemetry says has been played.
         """
         period = round(telemetry * self.capabilities.rate)
         for name, value, least in (("stream", stream, 0), ("telemetry", period, 1)):

@@ -12,6 +12,7 @@ from board import (
     ROOT,
     SANITISED,
     SCENE,
+    Faults,
     SteppedBoard,
     client_of,
     driver_of,
@@ -166,6 +167,24 @@ def test_only_what_was_sent_plays(stepped):
     rows = reader.take(int(0.3 * RATE))
     assert client.telemetry().state == State.PLAYING
     assert not rows[:, 6].any()
+
+
+def test_a_line_that_damages_bytes_plays_no_other_sample(stepped):
+    """1 byte of 1000, 14 % of the frames of samples; what is sent again may come too late, which is flagged."""
+    client, _, reader = streaming(stepped, Tones())
+    stepped.damage = Faults(11, 0.001)
+    run(client, stepped, 3.0)
+    stepped.damage = lambda data: data
+    run(client, stepped, 0.1)
+    rows = reader.take(int(2.9 * RATE))
+    whole = (rows[:, 6] == 0.0) & (np.arange(len(rows)) > 0.3 * RATE)
+    expected = Tones().waveform(np.arange(len(rows)) / RATE, None)
+    print(f"{np.mean(whole):.2f} of the rows came whole; {client.telemetry().bad} bad frames")
+    assert client.telemetry().bad > 30
+    assert (
+        np.mean(whole) > 0.3
+    )  # nine rows in a frame of 248 bytes: 0.998^248 = 0.6 come, half of them at least in time
+    assert np.sqrt(np.mean((motion_of(rows) - expected)[whole] ** 2)) < 0.03 * 4e-6
 
 
 def test_a_board_that_was_reset_begins_its_texture_anew(tmp_path):

@@ -69,7 +69,6 @@ typedef struct {
 typedef struct {
     law_t law;
     supervisor_t supervisor;
-    textures_t textures;
     design_t played;                              /* the design, with the bands in use */
     board_state state;
     uint32_t cause;                               /* a board_cause, or CAUSE_SUPERVISOR and the supervisor's */
@@ -110,6 +109,7 @@ typedef struct {
     frame incoming;
     uint8_t sending[BOARD_SEND];
     size_t sending_in, sending_out;
+    textures_t textures;                          /* last, as they are large */
 } board_t;
 
 /* Set the board to rest, as after a reset. */
