@@ -220,11 +220,9 @@ def playable(rendering: Rendering, board: Capabilities) -> tuple[Bands, BoardTex
     Raises
     ------
     ValueError
-        The texture is a force or a velocity, or one that `BoardTexture` refuses.
+        `BoardTexture` refuses the texture.
     """
     bands, texture = rendering.bands, rendering.scene.texture
-    if rendering.differentiated or bands.differentiated:
-        raise ValueError(f"texture: {type(texture).__name__} is a force, or a velocity: a board plays displacements")
     if bands.envelope is not None and len(bands) and not bands.modulated:
         return bands, None
     return Bands.none(spatial=False), BoardTexture(texture, board, rendering.model)

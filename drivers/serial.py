@@ -48,7 +48,7 @@ class SerialDriver(BaseDriver):
     port : str
         Name of the serial port.
     finger : Trajectory, optional
-        Where the finger is, from the start of the run on; that of the scene unless given.
+        Where the finger is, from the start of the run on; `render` sets it to that of the scene unless given.
     block : int, >= 1
         1: closed loop on the board.  More: drive from the host, a block a call, for identification; what it computes
         from a block acts two blocks later.
@@ -56,6 +56,7 @@ class SerialDriver(BaseDriver):
         Of `BoardClient`.
     """
 
+    device_kind = "vt-plate"  # of which the firmware has the law
     probe = False  # the law on the board is the board's; its own guards are in docs/protocol.md
 
     def __init__(self, port: str, *, finger: Trajectory | None = None, block: int = 1, **options: Any) -> None:
@@ -107,8 +108,6 @@ class SerialDriver(BaseDriver):
 
     def _begin(self, bands: Bands, texture: BoardTexture | None) -> None:
         client = self.client
-        if self.finger is None and self.rendering is not None:
-            self.finger = self.rendering.scene.finger
         client.set_bands(bands, texture)
         self._started = client.clock.monotonic()
         self._point()

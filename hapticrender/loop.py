@@ -55,6 +55,11 @@ def prepare(
     scene = replace(scene, **{key: value for key, value in changes.items() if value is not None})
     if isinstance(driver, str):
         driver = open_driver(driver, scene.device_profile)
+    if driver is not None and getattr(driver, "finger", driver) is None:
+        driver.finger = scene.finger  # type: ignore[attr-defined]
+    kind = getattr(driver, "device_kind", scene.device)
+    if kind != scene.device:
+        raise ValueError(f"device = {scene.device!r}: {driver} has the law of {kind!r} on it, and plays nothing else")
     renderer = registered("renderers", scene.device)() if renderer is None else renderer
     if inspect.isclass(renderer) or not callable(getattr(renderer, "open", None)):
         kind = f"class {renderer.__name__}" if inspect.isclass(renderer) else type(renderer).__name__
