@@ -68,19 +68,24 @@ def stepped(tmp_path):
         yield board
 
 
+CHIRP = hr.Chirp(start=40.0, stop=300.0, duration=1.0, amplitude=3e-6)
+SMALL = "-DTEXTURE_RING=1024u", "-DTEXTURE_POINTS=2048u"
+
+
 @pytest.mark.parametrize(
-    "texture",
+    ("texture", "sizes"),
     [
-        hr.Recorded(**RECORDED),
-        hr.Recorded(**RECORDED, speed=0.08),
-        hr.Recorded(**RECORDED, speed=0.08) + hr.Chirp(start=40.0, stop=300.0, duration=1.0, amplitude=3e-6),
+        (hr.Recorded(**RECORDED), ()),
+        (hr.Recorded(**RECORDED, speed=0.08), ()),
+        (hr.Recorded(**RECORDED, speed=0.08) + CHIRP, ()),
+        (hr.Recorded(**RECORDED, speed=0.3) + CHIRP, SMALL),
     ],
-    ids=["time", "surface", "both"],
+    ids=["time", "surface", "both", "small"],
 )
-def test_a_recording_on_the_board_is_as_good_as_on_the_simulated_device(tmp_path, texture):
+def test_a_recording_on_the_board_is_as_good_as_on_the_simulated_device(tmp_path, texture, sizes):
     """Under a finger that moves as the board says it did; sanitisers on; both plates have their own noise."""
     scene = replace(SCENE, texture=texture, duration=1.5)
-    with SteppedBoard(program_of(*SANITISED), tmp_path, options=("--noise", "1e-7")) as board:
+    with SteppedBoard(program_of(*SANITISED, *sizes), tmp_path, options=("--noise", "1e-7")) as board:
         played = hr.render(scene, driver=driver_of(board, finger=FINGER))
     position = played.read("position")
     position[: np.argmax(np.isfinite(position))] = position[np.isfinite(position)][0]
