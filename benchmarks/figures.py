@@ -118,17 +118,17 @@ def identified(seed=0, **plate):
     return hr.identify(StrangersPlate(**{"bending": options.bending, "seed": seed} | plate), PlateParameters())
 
 
-def play(texture, seconds, finger=None, position=0.0, contact=None, **plate):
-    """Render a texture on the plate, and return what the plate truly did."""
+def play(texture, seconds, finger=None, position=0.0, contact=None, *, method=None, device=StrangersPlate, **plate):
+    """Render a texture on the plate, a `StrangersPlate` or a subclass, and return what the plate truly did."""
     if finger is not None:
         mechanics, load = FINGERS[finger] if isinstance(finger, str) else finger
         contact = contact or (lambda t: np.clip((t - 0.1) / 1e-3, 0.0, 1.0))
         plate = {"finger": mechanics, "load": load, "contact": contact, "position": position} | plate
-    device = StrangersPlate(**{"bending": options.bending, "seed": options.seed, "report_lag": 5e-3} | plate)
+    device = device(**{"bending": options.bending, "seed": options.seed, "report_lag": 5e-3} | plate)
     free = {key: value for key, value in plate.items() if key not in ("finger", "load", "contact", "position")}
     profile = identified(**free).profile() if options.identified else {}
-    motion = hr.Finger(Path(position)) if callable(position) else hr.Finger.absent()
-    settings = {"method": options.method, "profile": profile, "keep_unfelt": True}
+    motion = hr.Finger(Path(position)) if callable(position) and device.sensed_channels else hr.Finger.absent()
+    settings = {"method": method or options.method, "profile": profile, "keep_unfelt": True}
     scene = hr.Scene(texture=texture, finger=motion, duration=seconds, **settings)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
@@ -140,26 +140,28 @@ def play(texture, seconds, finger=None, position=0.0, contact=None, **plate):
     return Run(time, truth, course, texture.waveform(time, course))
 
 
-def sliding(time):
-    """Positions of a finger at 100 mm/s, to and fro over +-25 mm, turning within 50 ms at 4 m/s2.
+def sliding(time, speed=0.1):
+    """Positions of a finger at `speed` (m/s), to and fro over +-25 mm, turning within 50 ms (4 m/s2 at 100 mm/s).
 
     Turned at once, the finger's load alone shakes the plate by 1.4 % of 5 um rms, whatever is played.
     """
-    phase = np.asarray(time) % 1.0
-    turn = lambda t: np.where(abs(t) < 0.025, 2.0 * t**2 + 0.00125, 0.1 * abs(t))  # noqa: E731
-    return (
-        0.025
-        - turn(phase - np.round(phase)) * (abs(phase - 0.5) >= 0.25)
-        - (0.05 - turn(phase - 0.5)) * (abs(phase - 0.5) < 0.25)
-    )
+    half = 0.05 / speed  # s, from turn to turn
+    turn = np.round(np.asarray(time) / half)
+    since = abs(time - half * turn)
+    away = speed * np.where(since < 0.025, since**2 / 0.05 + 0.0125, since)
+    return (-1.0) ** turn * (0.025 - away)
+
+
+def in_band(run):
+    """Reference (n,) and error under the finger and at both ends (n, 3), m, 20 to 500 Hz."""
+    sos = butter(4, [20.0, 500.0], "bandpass", fs=1 / run.time[1], output="sos")
+    return sosfiltfilt(sos, run.reference), sosfiltfilt(sos, run.truth[:, EVERY] - run.reference[:, None], axis=0)
 
 
 def wave_error(run, start=1.5):
     """Percent of the reference, under the finger and at the worse end."""
-    sos = butter(4, [20.0, 500.0], "bandpass", fs=1 / run.time[1], output="sos")
     judged = (run.time >= start) & (run.time <= run.time[-1] - 0.05)
-    reference = sosfiltfilt(sos, run.reference)[judged]
-    error = sosfiltfilt(sos, run.truth[:, EVERY] - run.reference[:, None], axis=0)[judged]
+    reference, error = (each[judged] for each in in_band(run))
     each = 100 * np.sqrt(np.mean(error**2, axis=0) / np.mean(reference**2))
     return each[0], max(each[1:])
 
@@ -208,16 +210,19 @@ def worst_waves():
     return np.max(list(found.values()), axis=0)
 
 
-def random_fingers(count=24):
-    """Draw m 1-10 g, b .3-4, k 60-900, 3 of 4 behind skin of .1-.5 g, .5-12, 400-12000; log-uniform, seed 24."""
+def draw_fingers(count):
+    """Draw m 1-10 g, b .3-4, k 60-900, 3 of 4 behind skin of .1-.5 g, .5-12, 400-12000; log-uniform, seed 24; 0.5 N."""
     rng = np.random.default_rng(24)
     draw = lambda *bounds: tuple(float(np.exp(rng.uniform(*np.log(bound)))) for bound in bounds)  # noqa: E731
-    errors = []
     for _ in range(count):
         phalanx = draw((1e-3, 1e-2), (0.3, 4.0), (60.0, 900.0))
         skin = draw((1e-4, 5e-4), (0.5, 12.0), (400.0, 12e3))
-        mechanics = (*skin, *phalanx) if rng.random() < 0.75 else phalanx
-        errors.append(wave_error(play(white(), 4.0, (mechanics, 0.5), sliding))[0])
+        yield ((*skin, *phalanx) if rng.random() < 0.75 else phalanx), 0.5
+
+
+def random_fingers(count=24):
+    """White noise under random fingers sliding."""
+    errors = [wave_error(play(white(), 4.0, finger, sliding))[0] for finger in draw_fingers(count)]
     print("  " + " ".join(f"{each:.2g}" for each in sorted(errors)))
     return np.median(errors), sum(each > 5 for each in errors)
 

@@ -1,6 +1,6 @@
 """Draw every chart and renew the pictures in docs/.
 
-Run: python -m benchmarks.charts [story pareto devices stability demo] [--out docs]
+Run: python -m benchmarks.charts [story waveforms pareto devices stability demo] [--out docs]
 """
 
 from __future__ import annotations
@@ -15,14 +15,26 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.charts import draw, measure, stability, story
+from benchmarks.charts import draw, measure, stability, story, waveforms
 
 ROOT = Path(__file__).parents[2]
 
 
 def draw_story(out: Path) -> None:
-    """Two methods under the same finger."""
-    story.draw().savefig(out / "picture.png", dpi=110)
+    """Four ways to play the same noise under the same finger; their figures are printed."""
+    runs = story.measure()
+    for name, run in runs.items():
+        print(f"  {name}: " + ", ".join(f"{what} {value:.2f} %" for what, value in story.over_time(run)[2].items()))
+    story.draw(runs).savefig(out / "picture.png", dpi=110)
+
+
+def draw_waveforms(out: Path) -> None:
+    """The error of whole waveforms by signal, finger and speed."""
+    found = []
+    for row in waveforms.rows():
+        found.append(row)
+        print("  {}, {}, {}, {:g} m/s: {:.2f} / {:.2f} %".format(*row), flush=True)
+    _write(out / "waveforms", waveforms.draw(found), [row._asdict() for row in found])
 
 
 def draw_pareto(out: Path) -> None:
@@ -54,7 +66,7 @@ def draw_demo(out: Path) -> None:
 
 
 CHARTS: dict[str, Callable[[Path], None]] = {
-    "story": draw_story, "pareto": draw_pareto, "devices": draw_devices, "stability": draw_stability,
+    "story": draw_story, "waveforms": draw_waveforms, "pareto": draw_pareto, "devices": draw_devices, "stability": draw_stability,
     "demo": draw_demo,
 }  # fmt: skip
 

@@ -80,9 +80,8 @@ class Setting:
             keep_unfelt=True,
         )
         session = prepare(scene, method=self.method)
-        method = METHODS[self.method]
-        if self.options:
-            method = type(method)(**self.options)
+        known: Any = METHODS[self.method]
+        method = replace(known, **self.options)
         model = _heave_only(session.model) if self.heave_only else session.model
         if self.options or self.heave_only or self.block > 1:
             model = replace(model, block=self.block)

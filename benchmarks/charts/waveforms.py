@@ -1,0 +1,151 @@
+"""Measure and draw the error of whole waveforms by signal, finger and speed: `inverse` against the open inverse.
+
+On the plate of ``tests/strangers_plate.py`` through ``hr.render``; E = rms(y - r)/rms(r) of its true motion, 20-500 Hz,
+without shift or gain fit, under the finger and at the worse end (`benchmarks.figures`).  The open inverse is the same
+method on the same plate without sensors: of the free plate, with the finger's path known beforehand.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from benchmarks import figures
+from benchmarks.charts.open_loop import AlongPath, SensorlessPlate
+from benchmarks.charts.style import BLUE, INK, ORANGE, new_figure
+from hapticrender import Grating
+
+SPEED, SPEEDS = 0.1, (0.04, 0.08, 0.15, 0.3)  # m/s
+RANDOM = 6  # the first of the random fingers of `benchmarks.figures`
+RMS = 5e-6  # m: of every waveform
+TONES = (47.0, 120.0, 178.0, 261.0)  # Hz
+LAWS = {"inverse": BLUE, "open inverse of the free plate": ORANGE}
+FINGERS = ("none", "light, 0.3 N", "heavy, 0.8 N", "random, 0.5 N")
+
+
+def tones() -> figures.Wave:
+    """Four tones together, at random phases."""
+    phases = np.random.default_rng(figures.options.seed).uniform(0.0, 2 * np.pi, len(TONES))
+    turns = np.multiply.outer(np.arange(round(5 * figures.FINE)) / figures.FINE, TONES)
+    return figures.Wave(np.sin(2 * np.pi * turns + phases).sum(axis=1))
+
+
+def ridges() -> Grating:
+    """Ridges of 2 mm with two harmonics: 50, 100 and 150 Hz at 100 mm/s."""
+    partials = ((1, 1.0, 0.0), (2, 0.5, 1.0), (3, 1 / 3, 2.0))
+    peak = RMS / np.sqrt(sum(size**2 for _, size, _ in partials) / 2)
+    return Grating(wavelength=2e-3, amplitude=peak, partials=partials)
+
+
+SIGNALS: dict[str, tuple[Callable[[], Any], float, float]] = {  # texture, length (s), judged from (s)
+    "white": (figures.white, 4.0, 1.5), "pink": (figures.pink, 4.0, 1.5), "chirp": (figures.chirp, 3.0, 0.3),
+    "clicks": (figures.clicks, 4.0, 1.5), "tones": (tones, 4.0, 1.5), "ridges": (ridges, 4.0, 1.5),
+}  # fmt: skip
+
+
+class Row(NamedTuple):
+    """One measurement: errors (%) under the finger and at the worse end."""
+
+    law: str
+    signal: str
+    finger: str
+    speed: float  # m/s
+    error: float
+    end: float
+
+
+def rows(
+    signals: Sequence[str] = tuple(SIGNALS), random: int = RANDOM, speeds: Sequence[float] = SPEEDS
+) -> Iterator[Row]:
+    """Measure every signal under every finger at `SPEED`, and white noise and ridges under a heavy one at `speeds`."""
+    still = ((0.0, 0.0, 0.0), 0.0)  # a position, but no force
+    known: list[tuple[str, Any]] = list(zip(FINGERS, (still, "4L", "4H"), strict=False))
+    fingers = known + [(FINGERS[-1], finger) for finger in figures.draw_fingers(random)]
+    cases = [(signal, name, finger, SPEED) for signal in signals for name, finger in fingers]
+    cases += [
+        (signal, FINGERS[2], "4H", speed) for signal in ("white", "ridges") if signal in signals for speed in speeds
+    ]
+    for law in LAWS:
+        for signal, name, finger, speed in cases:
+            yield Row(law, signal, name, speed, *error(law, signal, finger, speed))
+
+
+def error(law: str, signal: str, finger: Any, speed: float) -> tuple[float, float]:
+    """Play one waveform under a sliding finger."""
+    make, seconds, start = SIGNALS[signal]
+    texture, path = make(), partial(figures.sliding, speed=speed)
+    plate: dict[str, Any] = {"contact": np.ones_like, "method": "inverse"}
+    if law != "inverse":
+        texture, plate["device"] = AlongPath(texture, path), SensorlessPlate
+    return figures.wave_error(figures.play(texture, seconds, finger, path, **plate), start)
+
+
+def draw(found: Sequence[Row]) -> Any:
+    """Draw a panel for each finger, and one over speed."""
+    signals = list(dict.fromkeys(row.signal for row in found))
+    with new_figure((12.5, 4.2)) as figure:
+        axes = figure.subplots(1, 5, width_ratios=[1, 1, 1, 1, 1.5])
+        for panel, finger in zip(axes, FINGERS, strict=False):
+            for law, color in LAWS.items():
+                for at, signal in enumerate(signals):
+                    own = [row for row in found if row[:4] == (law, signal, finger, SPEED)]
+                    _errors(panel, at, own, color, law == "inverse")
+            panel.set_yticks(range(len(signals)), signals if panel is axes[0] else [])
+            panel.set(
+                xscale="log", xlim=(0.1, 150.0), ylim=(len(signals) - 0.5, -0.5), title=finger, xlabel="error (%)"
+            )
+            _plain(panel.xaxis)
+        _over_speed(axes[-1], found)
+        _legend(figure)
+        figure.suptitle("Error of whole waveforms, 5 µm rms, on a plate that the library has no model of")
+    return figure
+
+
+def _errors(axes: Any, at: float, own: Sequence[Row], color: str, written: bool) -> None:
+    """Draw the median error of one signal, its range over fingers, and the worse end; write it where it is ours."""
+    if not own:
+        return
+    errors = [row.error for row in own]
+    middle = float(np.median(errors))
+    axes.plot([min(errors), max(errors)], [at, at], color=color, lw=1.5)
+    axes.plot(middle, at, "o", color=color, ms=6)
+    axes.plot(np.median([row.end for row in own]), at, "|", color=color, ms=9, mew=1.5)
+    if written:
+        axes.annotate(f"{middle:.2g}", (middle, at), (0, 5), textcoords="offset points", ha="center", fontsize=7.5)
+
+
+def _over_speed(axes: Any, found: Sequence[Row]) -> None:
+    """Draw white noise and ridges under the heavy finger over speed."""
+    for signal, line in (("white", "o-"), ("ridges", "s--")):
+        for law, color in LAWS.items():
+            own = {row.speed: row.error for row in found if row[:3] == (law, signal, FINGERS[2])}
+            speeds = sorted(own)
+            axes.plot(1e3 * np.array(speeds), [own[each] for each in speeds], line, color=color, label=signal)
+    axes.set(xscale="log", yscale="log", ylim=(0.1, 150.0), title="heavy finger, by speed", xlabel="speed (mm/s)")
+    ticks = sorted({round(1e3 * row.speed) for row in found})
+    axes.set_xticks(ticks, [str(tick) for tick in ticks])
+    axes.minorticks_off()
+    axes.yaxis.set_major_formatter(lambda value, _: f"{value:g} %")
+
+
+def _plain(axis: Any) -> None:
+    """Write the ticks as plain numbers."""
+    axis.set_major_formatter(lambda value, _: f"{value:g}")
+
+
+def _legend(figure: Any) -> None:
+    """Explain colours and marks."""
+    from matplotlib.lines import Line2D
+
+    handles = [Line2D([], [], color=color, lw=4, label=law) for law, color in LAWS.items()]
+    handles += [
+        Line2D([], [], color=INK, marker=mark, ls=line, label=label)
+        for mark, line, label in (
+            ("o", "", "under the finger (random: median, range)"), ("|", "", "at the worse end"),
+            ("o", "-", "white"), ("s", "--", "ridges"),
+        )
+    ]  # fmt: skip
+    figure.legend(handles=handles, loc="outside lower center", ncols=6)
