@@ -66,8 +66,8 @@ def draw_demo(out: Path) -> None:
 
 
 CHARTS: dict[str, Callable[[Path], None]] = {
-    "story": draw_story, "waveforms": draw_waveforms, "pareto": draw_pareto, "devices": draw_devices, "stability": draw_stability,
-    "demo": draw_demo,
+    "story": draw_story, "waveforms": draw_waveforms, "pareto": draw_pareto, "devices": draw_devices,
+    "stability": draw_stability, "demo": draw_demo,
 }  # fmt: skip
 
 

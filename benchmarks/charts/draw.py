@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.charts.measure import LOST, SWEEP, Point, front
+from benchmarks.charts.measure import LOST, PARTIALS, SWEEP, Point, front
 from benchmarks.charts.style import BLUE, GREEN, INK, ORANGE, PALE, RED, new_figure
 
 METHODS = {
@@ -31,9 +31,11 @@ def pareto(points: Sequence[Point], swept: dict[str, list[float]]) -> Any:
 
     with new_figure((12.5, 9.0)) as figure:
         panels = figure.subplot_mosaic([["cost", "speed"], ["map", "map"]], height_ratios=[3, 2])
-        scatter(panels["cost"], points, lambda each: each.nanoseconds, look, ["methods on the plate"])
+        scatter(
+            panels["cost"], points, lambda each: 1e-3 * len(PARTIALS) * each.nanoseconds, look, ["methods on the plate"]
+        )
         scatter(panels["speed"], points, lambda each: -each.speed, look, ["methods on the plate"])
-        panels["cost"].set(xlabel="time of the controller, ns a band-sample (8 bands)", title="Controller alone")
+        panels["cost"].set(xlabel="time of the controller for a sample of 8 bands (µs)", title="Controller alone")
         panels["speed"].set(xlabel="simulated seconds a second", title="Controller, plate and finger", ylabel="")
         _map(figure, panels["map"], {name.split()[-1]: values for name, values in swept.items()})
         shapes = {"sample by sample": "o", "in blocks": "s", "model of heave only": "^", "a scene is lost": "x"}
