@@ -52,10 +52,14 @@ def draw_devices(out: Path) -> None:
 
 
 def draw_stability(_: Path) -> None:
-    """Stability over carrier and bandwidth, picture and data into out/charts."""
-    rows = stability.measure()
-    stability.draw(rows).savefig(_data() / "stability.png", dpi=90)
+    """Stability of every method, picture and data into out/charts."""
+    rows, dampers = stability.measure(), [stability.damper_map(case) for case in stability.cases()]
+    stability.draw(rows, dampers).savefig(_data() / "stability.png", dpi=90)
     arrays = {name: np.array([each.modulus[0, 0, 0] for each in row]) for name, row in rows.items()}
+    arrays["inverse"] = np.array([each.modulus for each in dampers])
+    for case, each in zip(stability.cases(), dampers, strict=True):
+        held, margin = stability.limits(each)
+        print(f"  inverse, {case.title}: ".replace("\n", " ") + f"stable to {held:g} samples, margin {margin:.2f}")
     np.savez(_data() / "stability.npz", **arrays)
 
 

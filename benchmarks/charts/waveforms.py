@@ -17,6 +17,7 @@ from benchmarks import figures
 from benchmarks.charts.open_loop import AlongPath, SensorlessPlate
 from benchmarks.charts.style import BLUE, INK, ORANGE, new_figure
 from hapticrender import Grating
+from tests.strangers_plate import StrangersPlate
 
 SPEED, SPEEDS = 0.1, (0.04, 0.08, 0.15, 0.3)  # m/s
 RANDOM = 6  # the first of the random fingers of `benchmarks.figures`
@@ -61,8 +62,7 @@ def rows(
     signals: Sequence[str] = tuple(SIGNALS), random: int = RANDOM, speeds: Sequence[float] = SPEEDS
 ) -> Iterator[Row]:
     """Measure every signal under every finger at `SPEED`, and white noise and ridges under a heavy one at `speeds`."""
-    still = ((0.0, 0.0, 0.0), 0.0)  # a position, but no force
-    known: list[tuple[str, Any]] = list(zip(FINGERS, (still, "4L", "4H"), strict=False))
+    known: list[tuple[str, Any]] = list(zip(FINGERS, (None, "4L", "4H"), strict=False))
     fingers = known + [(FINGERS[-1], finger) for finger in figures.draw_fingers(random)]
     cases = [(signal, name, finger, SPEED) for signal in signals for name, finger in fingers]
     cases += [
@@ -74,13 +74,15 @@ def rows(
 
 
 def error(law: str, signal: str, finger: Any, speed: float) -> tuple[float, float]:
-    """Play one waveform under a sliding finger."""
+    """Play one waveform under a sliding finger; None: there is none, or for ridges a position without a force."""
     make, seconds, start = SIGNALS[signal]
-    texture, path = make(), partial(figures.sliding, speed=speed)
-    plate: dict[str, Any] = {"contact": np.ones_like, "method": "inverse"}
+    texture, path, device = make(), partial(figures.sliding, speed=speed), StrangersPlate
     if law != "inverse":
-        texture, plate["device"] = AlongPath(texture, path), SensorlessPlate
-    return figures.wave_error(figures.play(texture, seconds, finger, path, **plate), start)
+        texture, device = AlongPath(texture, path), SensorlessPlate
+    if finger is None and signal == "ridges":
+        finger = ((0.0, 0.0, 0.0), 0.0)  # a position without a force
+    touched: dict[str, Any] = {"finger": finger, "position": path, "contact": np.ones_like} if finger else {}
+    return figures.wave_error(figures.play(texture, seconds, method="inverse", device=device, **touched), start)
 
 
 def draw(found: Sequence[Row]) -> Any:
