@@ -5,7 +5,8 @@ import pytest
 
 pytest.importorskip("matplotlib")
 
-from benchmarks.charts import measure, stability
+from benchmarks import figures
+from benchmarks.charts import measure, stability, story, waveforms
 from benchmarks.charts.measure import Point, Setting
 
 
@@ -32,4 +33,38 @@ def test_the_stability_chart_shows_what_a_wrong_plate_does():
     at = {name: row[1].growth[0, 0, 0][:, 1] for name, row in rows.items()}  # bandwidth 4.3 Hz
     assert at["h"].max() > 0
     assert at["h2"].max() < 0
-    assert len(stability.draw(rows).axes) == 4 * len(stability.cases()) + 1
+    dampers = [stability.damper_map(stability.cases()[0])] * len(stability.cases())
+    assert len(stability.draw(rows, dampers).axes) == 5 * len(stability.cases()) + 1
+
+
+def test_the_damper_of_the_waveform_law_has_the_margins_of_its_design():
+    """Ms on a grid of 8.3 Hz, at a peak some 200 Hz wide: within (4.2/200)^2; stable below the gain margin only."""
+    parameters = stability.PlateParameters()
+    designed = stability.choose_damping(parameters.device_model(parameters.rate, parameters.delay)).margins
+    found = stability.damper_map(stability.cases()[0])
+    assert stability.limits(found)[1] == pytest.approx(min(each.modulus for each in designed), rel=(4.2 / 200) ** 2)
+    stable = stability.FACTORS < min(each.gain for each in designed)
+    assert np.array_equal(found.growth[0] < 0, stable)
+
+
+def test_no_motion_is_an_error_of_all_of_the_reference():
+    time = np.arange(round(story.SECONDS * story.RATE)) / story.RATE
+    with np.errstate(under="ignore"):  # in scipy's periodic splines
+        reference = figures.white().waveform(time, None)
+    for share in (0.0, 0.9):
+        moved = figures.Run(time, share * reference[:, None] * np.ones(4), None, reference)
+        assert list(story.over_time(moved)[2].values()) == pytest.approx([100 * (1 - share)] * 3)
+
+
+def test_the_chart_of_waveforms_shows_what_an_open_inverse_loses_under_a_finger():
+    """White noise under the heavy finger; bounds: what is required of the law, and half of what no feedback costs."""
+    case = "white", waveforms.FINGERS[2], waveforms.SPEED
+    with np.errstate(under="ignore"):
+        found = [
+            waveforms.Row(law, *case, *waveforms.error(law, "white", "4H", waveforms.SPEED)) for law in waveforms.LAWS
+        ]
+    ours, without = found
+    assert ours.error < 1.0
+    assert ours.end < 2.0
+    assert without.error > 16.0
+    assert len(waveforms.draw(found).axes) == 5

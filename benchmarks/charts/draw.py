@@ -113,7 +113,7 @@ def scatter(
                           fontsize=8, fontweight="bold", color=line["color"])  # fmt: skip
     if numbered:  # where there are no points: fast and wrong, or slow and wrong
         at, side = (0.02, "left") if cost(points[0]) < 0 else (0.98, "right")
-        axes.text(at, 0.58, "front:\n" + "\n".join(numbered), transform=axes.transAxes, ha=side, va="top", fontsize=8,
+        axes.text(at, 0.9, "front:\n" + "\n".join(numbered), transform=axes.transAxes, ha=side, va="top", fontsize=8,
                   bbox={"facecolor": "white", "edgecolor": "#DDDDDD"}, zorder=4)  # fmt: skip
     axes.set(xscale="log", yscale="log", ylabel="worst error of any band at the finger (%)", ylim=(foot, 1.6 * top))
     low, high = axes.get_xlim()

@@ -24,7 +24,7 @@ RANDOM = 6  # the first of the random fingers of `benchmarks.figures`
 RMS = 5e-6  # m: of every waveform
 TONES = (47.0, 120.0, 178.0, 261.0)  # Hz
 LAWS = {"inverse": BLUE, "open inverse of the free plate": ORANGE}
-FINGERS = ("none", "light, 0.3 N", "heavy, 0.8 N", "random, 0.5 N")
+FINGERS = ("no finger", "light finger, 0.3 N", "heavy finger, 0.8 N", f"{RANDOM} random fingers, 0.5 N")
 
 
 def tones() -> figures.Wave:
@@ -94,7 +94,7 @@ def draw(found: Sequence[Row]) -> Any:
             for law, color in LAWS.items():
                 for at, signal in enumerate(signals):
                     own = [row for row in found if row[:4] == (law, signal, finger, SPEED)]
-                    _errors(panel, at, own, color, law == "inverse")
+                    _errors(panel, at, own, color)
             panel.set_yticks(range(len(signals)), signals if panel is axes[0] else [])
             panel.set(
                 xscale="log", xlim=(0.1, 150.0), ylim=(len(signals) - 0.5, -0.5), title=finger, xlabel="error (%)"
@@ -102,12 +102,14 @@ def draw(found: Sequence[Row]) -> Any:
             _plain(panel.xaxis)
         _over_speed(axes[-1], found)
         _legend(figure)
-        figure.suptitle("Error of whole waveforms, 5 µm rms, on a plate that the library has no model of")
+        figure.suptitle(
+            "Error of whole waveforms of 5 µm rms on a third party's plate, under a finger that slides to and fro"
+        )
     return figure
 
 
-def _errors(axes: Any, at: float, own: Sequence[Row], color: str, written: bool) -> None:
-    """Draw the median error of one signal, its range over fingers, and the worse end; write it where it is ours."""
+def _errors(axes: Any, at: float, own: Sequence[Row], color: str) -> None:
+    """Draw and write the median error of one signal, its range over fingers, and the worse end."""
     if not own:
         return
     errors = [row.error for row in own]
@@ -115,8 +117,7 @@ def _errors(axes: Any, at: float, own: Sequence[Row], color: str, written: bool)
     axes.plot([min(errors), max(errors)], [at, at], color=color, lw=1.5)
     axes.plot(middle, at, "o", color=color, ms=6)
     axes.plot(np.median([row.end for row in own]), at, "|", color=color, ms=9, mew=1.5)
-    if written:
-        axes.annotate(f"{middle:.2g}", (middle, at), (0, 5), textcoords="offset points", ha="center", fontsize=7.5)
+    axes.annotate(f"{middle:.2g}", (middle, at), (0, 5), textcoords="offset points", ha="center", fontsize=7.5)
 
 
 def _over_speed(axes: Any, found: Sequence[Row]) -> None:
@@ -126,7 +127,13 @@ def _over_speed(axes: Any, found: Sequence[Row]) -> None:
             own = {row.speed: row.error for row in found if row[:3] == (law, signal, FINGERS[2])}
             speeds = sorted(own)
             axes.plot(1e3 * np.array(speeds), [own[each] for each in speeds], line, color=color, label=signal)
-    axes.set(xscale="log", yscale="log", ylim=(0.1, 150.0), title="heavy finger, by speed", xlabel="speed (mm/s)")
+    axes.set(
+        xscale="log",
+        yscale="log",
+        ylim=(0.1, 150.0),
+        title="heavy finger, at other speeds than 100 mm/s",
+        xlabel="speed (mm/s)",
+    )
     ticks = sorted({round(1e3 * row.speed) for row in found})
     axes.set_xticks(ticks, [str(tick) for tick in ticks])
     axes.minorticks_off()
