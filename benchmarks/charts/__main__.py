@@ -47,7 +47,7 @@ def draw_pareto(out: Path) -> None:
 def draw_devices(out: Path) -> None:
     """Methods and levels on every simulated device."""
     points = measure.measure(measure.devices_and_levels())
-    swept = measure.over_frequency([measure.Setting(method="h2", device=device) for device in measure.LEVELS])
+    swept = measure.over_frequency([measure.Setting(method="inverse", device=device) for device in measure.LEVELS])
     _write(out / "device-chart", draw.devices(points, swept), measure.as_data(points, swept))
 
 

@@ -15,7 +15,7 @@ METHODS = {
     "resonant": RED, "h": GREEN, "h2": "#6A51A3", "inverse": BLUE,
 }  # fmt: skip
 DEVICES = {"vt-plate": BLUE, "electroadhesion": ORANGE, "ultrasonic": GREEN}
-SHAPES = {"h2": "o", "h": "s", "static": "^", "stiffness": "v", "paper-common": "D"}
+SHAPES = {"inverse": "o", "h": "s", "static": "^", "stiffness": "v", "paper-common": "D"}
 LEVELS = (0.1, 0.3, 1.0, 3.0, 10.0, 50.0)  # %
 OFF = 5.0  # %: a larger error over frequency is crossed out
 UNFELT = 10.0  # %: errors below every just noticeable difference of an amplitude

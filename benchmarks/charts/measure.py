@@ -147,7 +147,7 @@ def devices_and_levels() -> list[Setting]:
     return [
         Setting(method=name, device=device, level=level)
         for device, levels in LEVELS.items() for level in levels
-        for name in ("h2", "h", "static", "stiffness", "paper-common")
+        for name in ("inverse", "h", "static", "stiffness", "paper-common")
     ]  # fmt: skip
 
 

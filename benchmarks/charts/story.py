@@ -11,7 +11,7 @@ import numpy as np
 
 from benchmarks import figures
 from benchmarks.charts.open_loop import SensorlessPlate
-from benchmarks.charts.style import BLUE, GREEN, INK, ORANGE, PALE, new_figure
+from benchmarks.charts.style import BLUE, GREEN, INK, ORANGE, PALE, new_figure, rounded
 from hapticrender import strongest_carriers
 from hapticrender.bands import Bands
 from tests.strangers_plate import FORCE_CONSTANT, TRUTH, StrangersPlate
@@ -87,11 +87,6 @@ def over_time(run: figures.Run) -> tuple[Any, Any, dict[str, float]]:
     return (np.arange(count) + 0.5) * WINDOW, windows, judged
 
 
-def percent(value: float) -> str:
-    """Write an error with two digits or more."""
-    return f"{value:.0f} %" if value >= 10 else f"{value:.1f} %" if value >= 1 else f"{value:.2f} %"
-
-
 def draw(runs: dict[str, figures.Run]) -> Any:
     """Draw a row for each way: its error over time in numbers, and a piece of the motion under the finger."""
     with new_figure((11, 8.4)) as figure:
@@ -120,7 +115,7 @@ def _errors(axes: Any, name: str, run: figures.Run, color: str) -> None:
     axes.semilogy(time, windows, color=color, lw=1.6)
     for what, (start, end) in JUDGED.items():
         middle = (start + end) / 2
-        axes.text(middle, 2.5e3, f"{what}: {percent(judged[what])}", ha="center", va="center", fontweight="bold")
+        axes.text(middle, 2.5e3, f"{what}: {rounded(judged[what])} %", ha="center", va="center", fontweight="bold")
     axes.axhline(100.0, color=PALE, lw=0.8)
     axes.set(ylim=(0.1, 1e4), ylabel="error (%)", title=name)
     axes.set_yticks([0.1, 1, 10, 100, 1000], ["0.1", "1", "10", "100", "1000"])

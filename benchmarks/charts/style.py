@@ -28,3 +28,8 @@ def new_figure(size: tuple[float, float], **style: Any) -> Iterator[Any]:
         FigureCanvasAgg(figure)
         figure.get_layout_engine().set(w_pad=0.1, h_pad=0.08)
         yield figure
+
+
+def rounded(value: float) -> str:
+    """Write a number to two digits, or to the unit from 10 on."""
+    return f"{value:.{2 if value < 0.995 else 1 if value < 9.95 else 0}f}"
