@@ -22,6 +22,9 @@ if not (_here / "renderers").is_dir():
 __version__ = "0.2.0"
 
 _HOMES = {
+    "analysis.analyse": "analyse_finger",
+    "analysis.records": "FingerRecord",
+    "analysis.tracker": "FingerTracker",
     "bands": "Bands",
     "control.demodulator": "Demodulator",
     "errors": "DesignError DeviceFault DeviceLost DeviceNotFound DeviceTimeout DriverError HapticError PlateMismatch "
@@ -48,6 +51,9 @@ _HOME_OF = {name: home for home, names in _HOMES.items() for name in names.split
 __all__ = sorted(_HOME_OF)
 
 if _typing.TYPE_CHECKING:
+    from hapticrender.analysis.analyse import analyse_finger as analyse_finger
+    from hapticrender.analysis.records import FingerRecord as FingerRecord
+    from hapticrender.analysis.tracker import FingerTracker as FingerTracker
     from hapticrender.bands import Bands as Bands
     from hapticrender.control.demodulator import Demodulator as Demodulator
     from hapticrender.errors import DesignError as DesignError

@@ -35,17 +35,20 @@ class ContactDetector:
     rate : float, Hz
     quiet : int, samples
         At the beginning, in which filters settle and no contact is detected.
+    still : float, N
+        A mean of the heave force over a tick that is farther from that at rest is not averaged into it: a touch too
+        light to be detected at once.
     columns : int
         Of what is measured: the heave force (N) first, others beside it, whose values at rest are followed as well.
     """
 
-    def __init__(self, rate: float, quiet: int, columns: int = 1) -> None:
+    def __init__(self, rate: float, quiet: int, still: float, columns: int = 1) -> None:
         self.rate, self.delay = rate, round(HOLD * rate)
         self._tick = max(round(TICK * rate), 1)
         self._measured, self._high = History(self.delay), History(self.delay)
         self._given = History(self.delay)
         self._at = -self.delay  # sample of the next result
-        self._quiet, self._loaded = quiet, False
+        self._quiet, self._still, self._loaded = quiet, still, False
         self._rest, self._ticks = np.zeros(columns), 0.0  # values at rest; ticks averaged in them
         self._sum, self._count = np.zeros(columns), 0  # of the present tick
 
@@ -92,7 +95,8 @@ class ContactDetector:
         if not loaded.any() and end > self._quiet:
             self._sum, self._count = self._sum + measured.sum(axis=0), self._count + len(measured)
         if end % self._tick == 0:
-            if self._count == self._tick:
+            change = self._sum / self._tick - self._rest
+            if self._count == self._tick and (self._ticks == 0.0 or abs(change[0]) < self._still):
                 self._ticks = min(self._ticks + 1.0, FOLLOWED / TICK)
-                self._rest = self._rest + (self._sum / self._tick - self._rest) / self._ticks
+                self._rest = self._rest + change / self._ticks
             self._sum, self._count = np.zeros_like(self._sum), 0
