@@ -3,7 +3,7 @@
 In each window and band the heave row of the balance of forces gives F_f, and ``v = j w (x_c + (p/a) a theta)`` the
 velocity at the finger.  White noise n of the coordinates and the parameters' error e change the quotient by::
 
-    dZ = ([D_cc, D_cr] - j w Z [1, g]) n/v - Phi_c e/v,   g = p/a
+    dZ = -([D_cc, D_cr] + j w Z [1, g]) n/v - Phi_c e/v,   g = p/a
 
 so that it is the noise of the plate under the finger, over the velocity.  An error of g by de adds ``Z v_r de/v``, a gain
 error common to both sensors its share of Z.
@@ -50,7 +50,7 @@ def impedance_of(
     s = 2j * np.pi * lines.frequency
     heave = course.dynamic_stiffness(lines.frequency, times)[..., 0, :]
     at_finger = np.stack(np.broadcast_arrays(1.0, (position / a)[:, None] + 0.0 * value.real), axis=-1)
-    by_noise = (np.abs(heave - (s * value)[..., None] * at_finger) ** 2 @ noise**2) * lines.variance
+    by_noise = (np.abs(heave + (s * value)[..., None] * at_finger) ** 2 @ noise**2) * lines.variance
     covariance = np.array([course.covariance_at(each) for each in lines.time]).reshape(-1, 6, 6)
     by_plate = np.einsum("nbi,nij,nbj->nb", phi, covariance, phi.conj()).real / 2
     by_place = np.abs(value * amplitudes.velocity[..., 1] * (position_error / a)[:, None]) ** 2 / 2
