@@ -76,7 +76,7 @@ def analyse_finger(
     lines = signals.unloaded(first, frequency, length, signals.tracker(course, None).threshold / 2)
     rest = None
     if len(lines.time):
-        course = regress(course, lines, signals.noise)
+        course = regress(course, lines, signals.noise) if frequency.size else course
         rest = rest_of(course, lines)
     touch, tracker = signals.track(course, rest), signals.tracker(course, rest)
     impedance = signals.impedance(course, touch, recording.bands, frequency, length, recording.header.calibration)
@@ -194,7 +194,7 @@ class _Signals:
         ]
         locked = bands.wavenumber > 0.0
         moving = np.abs(bands.frequency[locked] + np.multiply.outer(means[3], bands.wavenumber[locked]))
-        frequency = np.hstack([np.tile(fixed, (len(starts), 1)), moving.reshape(len(starts), -1)])
+        frequency = np.hstack([np.tile(fixed, (len(starts), 1)), moving.reshape(len(starts), int(locked.sum()))])
         usable = (frequency >= SLOWEST) & (frequency <= FASTEST * self.rate)
         frequency = np.where(usable, frequency, SLOWEST)
         lever = np.nan_to_num(place) / a * self.columns[: len(place), 3]
@@ -221,13 +221,13 @@ def _notes(recording: Recording, course: Course, touch: Touch, rest: Rest | None
             "profile"
         )
     elif not course.measured:
-        yield "the drive is too weak while nothing touches: the plate's parameters are those of the profile"
+        yield (
+            "the carriers do not determine the stiffness while nothing touches: it is mostly that of the profile"
+        )
     if not (touch.contact == LOADED).any():
         yield "no finger touches"
     elif not len(impedance.time):
         yield "no touch is long enough for a window: the impedance is not measured"
-    if course.plate.bending_frequency:
-        yield "the glass is taken as rigid: its bending mode is left out of the force"
     flags = np.bitwise_or.reduce(recording.flags) if len(recording) else 0
     for bad, text in ((Flag.NONFINITE, "samples that are no numbers are held"), (Flag.SENSOR_CLIPPED, "a sensor clips")):
         if flags & bad:

@@ -5,6 +5,10 @@ In heave and rocking q = [x_c, a theta], with the finger at g = p/a (see `haptic
     F_f [1, g] = K_f [[1, 1], [-1, 1]] i - (M q'' + C q' + K q)
 
 The bracket is linear in the parameters theta = [m, I, k1, k2, b1, b2]: it is ``Phi theta`` with the regressors Phi.
+Where the glass bends (frequency, damping and shape phi of the profile), the sensors add ``e = B(s) (phi_coil f_c -
+phi(p) F_f)`` to x_c, B the compliance of the mode and f_c the drive's heave force, so that with D the heave row of
+``M s^2 + C s + K`` and r the residual as for rigid glass ``F_f (1 + D phi(p) B) = r + D phi_coil B f_c``.
+
 The rows differ from those that Grigorii et al. 2021 print, (m/2) x'' -+ (I/2) theta'', whose units do not agree.
 """
 
@@ -93,6 +97,14 @@ class Course:
         """Covariance (6, 6) of the parameters at a time (s)."""
         both = np.hstack([np.eye(6), np.vstack([np.zeros((2, 4)), time * np.eye(4)])])
         return both @ self.covariance @ both.T
+
+    def bending(self, frequency: Array | float) -> Array:
+        """Displacement of the sensors by bending per modal force (m/N, complex) at `frequency` (Hz); 0: rigid glass."""
+        p, f = self.plate, np.asarray(frequency, float)
+        f0 = p.bending_frequency
+        if not f0:
+            return np.zeros(f.shape, complex)
+        return 1 / (4 * np.pi**2 * p.bending_mass * (f0**2 - f**2 + 2j * p.bending_damping * f0 * f))
 
     def dynamic_stiffness(self, frequency: Array, time: Array | float = 0.0) -> Array:
         """D (N/m, shape (..., 2, 2)) at frequencies (Hz) and times (s) of one shape."""
