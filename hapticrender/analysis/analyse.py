@@ -97,15 +97,16 @@ def analyse_finger(
 
 def _believed(recording: Recording, profile: DeviceProfile | PlateParameters | str | os.PathLike[str] | None) -> Course:
     """Return what is believed of the recorded plate."""
+    duration = len(recording) / recording.rate
     if isinstance(profile, PlateParameters):
-        return Course.of(profile)
+        return Course.of(profile, duration=duration)
     if isinstance(profile, str | os.PathLike):
         profile = DeviceProfile.load(profile)
     elif profile is None:
         profile = recording.scene.device_profile
     if profile.kind != "vt-plate":
         raise ValueError(f"profile.kind = {profile.kind!r}: must be vt-plate, a plate with sensors of displacement")
-    return Course.of(PlateParameters.with_overrides(profile.device), profile.uncertainty)
+    return Course.of(PlateParameters.with_overrides(profile.device), profile.uncertainty, duration)
 
 
 def _check(recording: Recording, plate: PlateParameters, late: int) -> None:
@@ -119,7 +120,7 @@ def _check(recording: Recording, plate: PlateParameters, late: int) -> None:
     if len(recording) < recording.rate:
         raise ValueError(f"{header.name}: {len(recording) / recording.rate:g} s long: must be >= 1 s")
     if late < 0:
-        raise ValueError(f"block = {late + plate.delay - late}: must be <= the plate's delay of {plate.delay} samples")
+        raise ValueError(f"block = {plate.delay - late}: must be <= the plate's delay of {plate.delay} samples")
     if not np.isfinite(recording.sensed).any(axis=0).all():
         raise ValueError(f"{header.name}: a sensor is finite nowhere: must be displacement in m")
 

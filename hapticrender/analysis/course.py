@@ -25,7 +25,7 @@ from hapticrender.protocols import Array
 
 TRACKED = MECHANICAL[2:]  # stiffness and damping, first order in time
 UNCERTAINTY = (0.02, 0.02, 0.02, 0.02, 0.1, 0.1)  # relative, of `MECHANICAL`, where a profile says nothing
-DRIFT = (5e-4, 5e-4, 5e-3, 5e-3)  # 1/s, relative, of `TRACKED`: what they may change before anything is measured
+DRIFT, DRIFT_TIME = (0.02, 0.02, 0.2, 0.2), 40.0  # relative, of `TRACKED`, and s: change over a recording, or over this
 
 
 @dataclass(frozen=True)
@@ -82,12 +82,18 @@ class Course:
     measured: bool = False
 
     @classmethod
-    def of(cls, plate: PlateParameters, uncertainty: Mapping[str, float] | None = None) -> Course:
-        """Parameters of a profile; `uncertainty` is standard, in their units, and `UNCERTAINTY` where it has none."""
+    def of(
+        cls, plate: PlateParameters, uncertainty: Mapping[str, float] | None = None, duration: float = 0.0
+    ) -> Course:
+        """Parameters of a profile; `uncertainty` is standard, in their units, and `UNCERTAINTY` where it has none.
+
+        Over a recording of a `duration` (s) stiffness and damping may drift by `DRIFT`, one standard deviation.
+        """
         start = np.array([getattr(plate, name) for name in MECHANICAL])
         given = uncertainty or {}
         spread = [given.get(name, share * value) for name, share, value in zip(MECHANICAL, UNCERTAINTY, start, strict=True)]  # fmt: skip
-        return cls(plate, start, np.zeros(4), np.diag(np.r_[spread, DRIFT * start[2:]] ** 2))
+        drift = np.array(DRIFT) * start[2:] / max(duration, DRIFT_TIME) if duration else np.zeros(4)
+        return cls(plate, start, np.zeros(4), np.diag(np.r_[spread, drift] ** 2))
 
     def at(self, time: Array | float) -> Array:
         """Parameters at `time` (s), shape (..., 6)."""

@@ -114,7 +114,7 @@ class FingerTracker:
     @property
     def bandwidth(self) -> tuple[float, float]:
         """Frequencies (Hz) at which load and position, and the velocity, pass half of the power."""
-        return self._line.bandwidths()
+        return self._line.bandwidths
 
     @property
     def load_noise(self) -> float:
