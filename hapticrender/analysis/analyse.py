@@ -38,7 +38,10 @@ BLOCK = 1.0  # s of signal at a time
 
 
 def analyse_finger(
-    recording: Recording, profile: DeviceProfile | PlateParameters | str | os.PathLike[str] | None = None, *, block: int = 1
+    recording: Recording,
+    profile: DeviceProfile | PlateParameters | str | os.PathLike[str] | None = None,
+    *,
+    block: int = 1,
 ) -> FingerRecord:
     """Estimate load, position, velocity, contact, force and impedance of the finger in a recording of a plate.
 
@@ -151,9 +154,7 @@ class _Signals:
 
     def tracker(self, course: Course, rest: Rest | None) -> FingerTracker:
         """Tracker that is symmetric in time."""
-        return FingerTracker(
-            course, rate=self.rate, late=self.late, noise=self.sensor_noise, lookahead=1.0, rest=rest
-        )
+        return FingerTracker(course, rate=self.rate, late=self.late, noise=self.sensor_noise, lookahead=1.0, rest=rest)
 
     def track(self, course: Course, rest: Rest | None) -> Touch:
         """Track the whole recording, a second at a time."""
@@ -182,7 +183,9 @@ class _Signals:
         passed = np.exp(-0.5 * (2 * np.pi * frequency * self.spread) ** 2)
         return replace(lines, amplitude=lines.amplitude / passed[..., None])
 
-    def impedance(self, course: Course, touch: Touch, bands: Bands, fixed: Array, length: int, gain: float) -> Impedance:
+    def impedance(
+        self, course: Course, touch: Touch, bands: Bands, fixed: Array, length: int, gain: float
+    ) -> Impedance:
         """Impedance of the finger in windows under load."""
         a, end = course.plate.half_spacing, course.plate.glass_length / 2 - NEAR_END
         place, error = touch.position.value, touch.position.standard_error
@@ -214,7 +217,9 @@ def _segments(touch: Touch, rate: float) -> tuple[Segment, ...]:
     )
 
 
-def _notes(recording: Recording, course: Course, touch: Touch, rest: Rest | None, impedance: Impedance) -> Iterator[str]:
+def _notes(
+    recording: Recording, course: Course, touch: Touch, rest: Rest | None, impedance: Impedance
+) -> Iterator[str]:
     """Say what could not be measured, and why."""
     if rest is None:
         yield (
@@ -222,14 +227,15 @@ def _notes(recording: Recording, course: Course, touch: Touch, rest: Rest | None
             "profile"
         )
     elif not course.measured:
-        yield (
-            "the carriers do not determine the stiffness while nothing touches: it is mostly that of the profile"
-        )
+        yield ("the carriers do not determine the stiffness while nothing touches: it is mostly that of the profile")
     if not (touch.contact == LOADED).any():
         yield "no finger touches"
     elif not len(impedance.time):
         yield "no touch is long enough for a window: the impedance is not measured"
     flags = np.bitwise_or.reduce(recording.flags) if len(recording) else 0
-    for bad, text in ((Flag.NONFINITE, "samples that are no numbers are held"), (Flag.SENSOR_CLIPPED, "a sensor clips")):
+    for bad, text in (
+        (Flag.NONFINITE, "samples that are no numbers are held"),
+        (Flag.SENSOR_CLIPPED, "a sensor clips"),
+    ):
         if flags & bad:
             yield f"{text}: estimates near them are wrong by more than they say"

@@ -71,4 +71,3 @@ class MotionFilter:
         balance = np.stack([np.diagonal(each) for each in (p.stiffness_matrix, p.damping_matrix, p.mass_matrix)])
         taps = balance.T @ self._motion
         return self.coordinate_noise(noise) * np.sqrt((taps**2).sum(axis=1))
-

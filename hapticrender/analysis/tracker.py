@@ -99,12 +99,13 @@ class FingerTracker:
         self._noise = float(self._filter.force_noise(noise)[0])
         self._clear = clear_sigmas(2 * FAST)
         self._bent = float(p.stiffness_matrix[0, 0] * self.course.bending(0.0).real)
-        self._detector = ContactDetector(self.rate, 2 * self._filter.delay, self._clear * self._noise / 2, columns=4)
+        self._white = p.stiffness_matrix[0, 0] * self._filter.coordinate_noise(noise)
+        quiet, still = 2 * self._filter.delay, self._clear * self._noise / 2
+        self._detector = ContactDetector(self.rate, quiet, still, columns=4)
         self._edge = self._filter.delay  # samples beside a change of contact that are left out
         self._given, self._at, self._first = rest, -self._filter.delay, 0
         self._history = History(self._line.behind + self._line.ahead + 2 * self._edge)
         self._peak, self._delayed = History(round(PEAK * self.rate)), History(self._detector.delay)
-        self._white = p.stiffness_matrix[0, 0] * self._filter.coordinate_noise(noise)
 
     @property
     def latency(self) -> int:
