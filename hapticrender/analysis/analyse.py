@@ -162,12 +162,10 @@ class _Signals:
         starts = range(0, len(self.drive), step)
         parts = [tracker.update(self.drive[i : i + step], self.sensed[i : i + step]) for i in starts]
         time, contact = (np.concatenate([getattr(part, name) for part in parts]) for name in ("time", "contact"))
-        series = []
-        for name in ("normal_load", "position", "velocity"):
-            each = [getattr(part, name) for part in parts]
-            value, error = (np.concatenate([getattr(x, y) for x in each]) for y in ("value", "standard_error"))
-            series.append(Series(value, error, each[0].bandwidth))
-        return Touch(time, *series, contact)
+        load, position, velocity = (
+            _joined([getattr(part, name) for part in parts]) for name in ("normal_load", "position", "velocity")
+        )
+        return Touch(time, load, position, velocity, contact)
 
     def unloaded(self, touch: Touch, frequency: Array, length: int, quiet: float) -> Lines:
         """Demodulate windows without contact, whose mean load is below `quiet` (N)."""
@@ -192,21 +190,25 @@ class _Signals:
         with np.errstate(invalid="ignore"):
             inside = (touch.contact == LOADED) & (np.abs(place) < end)
         starts = tile(inside, length, round(SETTLING * self.rate), round(BEFORE * self.rate))
-        means = [
-            np.array([each[i : i + length].mean() for i in starts])
-            for each in (touch.normal_load.value, place, error, touch.velocity.value)
-        ]
+        series = touch.normal_load.value, place, error, touch.velocity.value
+        load, middle, spread, speed = (np.array([each[i : i + length].mean() for i in starts]) for each in series)
         locked = bands.wavenumber > 0.0
-        moving = np.abs(bands.frequency[locked] + np.multiply.outer(means[3], bands.wavenumber[locked]))
+        moving = np.abs(bands.frequency[locked] + np.multiply.outer(speed, bands.wavenumber[locked]))
         frequency = np.hstack([np.tile(fixed, (len(starts), 1)), moving.reshape(len(starts), int(locked.sum()))])
         usable = (frequency >= SLOWEST) & (frequency <= FASTEST * self.rate)
         frequency = np.where(usable, frequency, SLOWEST)
         lever = np.nan_to_num(place) / a * self.columns[: len(place), 3]
         columns = np.column_stack([self.columns[: len(place)], lever])
         lines = self.lines(columns, starts, length, frequency)
-        found = impedance_of(course, lines, self.noise, *means[:3], gain)
-        value, spread = (np.where(usable, each, np.nan) for each in (found.value, found.standard_error))
-        return replace(found, value=value, standard_error=spread)
+        found = impedance_of(course, lines, self.noise, load, middle, spread, gain)
+        value, errors = (np.where(usable, each, np.nan) for each in (found.value, found.standard_error))
+        return replace(found, value=value, standard_error=errors)
+
+
+def _joined(parts: list[Series]) -> Series:
+    """One series of several."""
+    value, error = (np.concatenate([getattr(part, name) for part in parts]) for name in ("value", "standard_error"))
+    return Series(value, error, parts[0].bandwidth)
 
 
 def _segments(touch: Touch, rate: float) -> tuple[Segment, ...]:

@@ -31,8 +31,8 @@ def clear_sigmas(bandwidth: float) -> float:
 class ContactDetector:
     """Detect contact in the heave force, block by block: on above `high`, off once below half of it for `HOLD`.
 
-    While nothing touches, the force at rest (sensors that drift, a suspension that creeps) is followed as a line over up
-    to `FOLLOWED`, corrected every `TICK`; under a finger it is held, or goes on by its trend.
+    While nothing touches, the force at rest (sensors that drift, a suspension that creeps) is followed as a line over
+    up to `FOLLOWED`, corrected every `TICK`; under a finger it is held, or goes on by its trend.
 
     Parameters
     ----------
@@ -40,8 +40,8 @@ class ContactDetector:
     quiet : int, samples
         At the beginning, in which filters settle and no contact is detected.
     still : float, N
-        Where the mean of the heave force over a tick is farther from that at rest, as by a touch too light to be detected,
-        the values at rest go towards it by so much in `FOLLOWED`.
+        Where the mean of the heave force over a tick is farther from that at rest, as by a touch too light to be
+        detected, the values at rest go towards it by so much in `FOLLOWED`.
     columns : int
         Of what is measured: the heave force (N) first, others beside it, whose values at rest are followed as well.
     """
@@ -58,12 +58,12 @@ class ContactDetector:
         self._sum, self._count = np.zeros(columns), 0  # of the present tick
 
     @property
-    def averaged(self) -> float:
-        """Samples whose mean would be as certain as the values at rest: a quarter of those that a line is fitted to."""
-        return self._ticks * self._tick / 4
+    def variance(self) -> float:
+        """Variance (N^2) of the heave force at rest: at its end a line is four times as uncertain as a mean."""
+        return 4 * self._scatter / max(self._ticks, 1)
 
     def update(self, measured: Array, high: Array, rest: Array | None = None) -> tuple[Array, Array]:
-        """Contact (bool, (n,)) and values at rest (n, columns) of the n samples that end `delay` before the block's end.
+        """Contact (bool, (n,)) and values at rest (n, columns) of the n samples that end `delay` before the block does.
 
         `measured` (n, columns) has the heave force (N) first, `high` (N, (n,)) is its upper threshold; `rest`
         (n, columns) replaces what would be followed.
@@ -74,7 +74,7 @@ class ContactDetector:
         joined, high = self._measured.before(measured), self._high.before(high)
         ahead = maximum_filter1d(joined[:, 0], self.delay + 1, origin=-((self.delay + 1) // 2))[:n]
         loaded, level = np.zeros(n, bool), np.zeros_like(measured)
-        delayed = None if rest is None else self._given.before(rest)
+        delayed = np.empty(0) if rest is None else self._given.before(rest)
         first = 0
         while first < n:
             last = min(n, first + self._tick - (self._at + first) % self._tick)
@@ -113,7 +113,8 @@ class ContactDetector:
         """
         gone = change - self._trend
         if self._ticks > 1 and abs(gone[0]) > self._still:
-            self._rest = self._rest + (self._trend if self._clear else 0.0) + gone * self._still / abs(gone[0]) * TICK / FOLLOWED
+            trend = self._trend if self._clear else 0.0
+            self._rest = self._rest + trend + gone * self._still / abs(gone[0]) * TICK / FOLLOWED
             return
         self._ticks = k = min(self._ticks + 1, round(FOLLOWED / TICK))
         self._rest = self._rest + self._trend + gone * 2 * (2 * k - 1) / (k * (k + 1))

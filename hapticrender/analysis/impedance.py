@@ -5,8 +5,8 @@ velocity at the finger.  White noise n of the coordinates and the parameters' er
 
     dZ = -([D_cc, D_cr] + j w Z [1, g]) n/v - Phi_c e/v,   g = p/a
 
-so that it is the noise of the plate under the finger, over the velocity.  An error of g by de adds ``Z v_r de/v``, a gain
-error common to both sensors its share of Z.
+so that it is the noise of the plate under the finger, over the velocity.  An error of g by dg adds ``Z v_r dg/v``, a
+gain error common to both sensors its share of Z.
 """
 
 from __future__ import annotations

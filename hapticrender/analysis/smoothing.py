@@ -106,7 +106,7 @@ class LocalLine:
         self.noise = tuple(float((weights**2).sum()) for weights in self.weights())
 
     def weights(self) -> tuple[Array, Array]:
-        """w and u inside a long span, as taps for `convolve`."""
+        """Taps w and u inside a long span, for `convolve`."""
         s0, s1, s2 = (taps.sum() for taps in self._taps)
         g, det = self._taps[0], s0 * s2 - s1**2
         return g * (s2 - s1 * self._times) / det, g * (s0 * self._times - s1) / det
