@@ -173,9 +173,7 @@ def test_bandwidth_and_latency_are_as_predicted(lookahead):
         periods = int(frequency * 10)
         at = slice(10_000, 10_000 + round(periods / frequency * RATE))
         signal = found["load"] if of_load else found["velocity"]
-        amplitude = abs(complex_amplitude(signal[at], frequency)) / (
-            0.2 if of_load else 2 * np.pi * frequency * 0.005
-        )
+        amplitude = abs(complex_amplitude(signal[at], frequency)) / (0.2 if of_load else 2 * np.pi * frequency * 0.005)
         assert amplitude == pytest.approx(np.sqrt(0.5), rel=0.01)  # a frequency is stated to 0.05 Hz: 0.4 % of gain
     assert len(found["time"]) == len(drive) - tracker.latency
 
@@ -207,7 +205,7 @@ def test_position_is_undefined_under_a_load_that_is_too_small():
 
 
 def test_threshold_of_contact_is_that_of_the_noise():
-    """Once in ten minutes of 200 Hz noise and a thousand such spans; a touch below it is no contact, one above it is."""
+    """False once in a thousand times ten minutes of 200 Hz noise; a touch below it is no contact, one above it is."""
     assert clear_sigmas(200.0) == pytest.approx(5.76, abs=0.01)
     tracker = hr.FingerTracker(PLATE)
     for share in (0.6, 1.5):
