@@ -75,7 +75,7 @@ def _touches(record: FingerRecord) -> str:
     """Mean load and range of the position of each touch."""
     rows = [["touch", "from (s)", "to (s)", "load (N)", "position (mm)"]]
     for number, each in enumerate(record.of_kind(LOADED), 1):
-        at = slice(*record.at([each.start, each.stop]))
+        at = slice(*record.at(np.array([each.start, each.stop])))
         load, place = record.normal_load.value[at], 1e3 * record.position.value[at]
         known = place[np.isfinite(place)]
         span = f"{known.min():.1f} to {known.max():.1f}" if known.size else "undefined"
