@@ -13,13 +13,15 @@ from hapticrender.control.combined import CombinedBands
 from hapticrender.control.device_model import DeviceModel
 from hapticrender.control.supervisor import FADE_OUT, Fault, SupervisedController, design_supervisor
 from hapticrender.driver_checks import check_sensed
-from hapticrender.errors import DeviceFault
+from hapticrender.errors import DeviceFault, HapticError, WatchdogTimeout
+from hapticrender.inferred import ContactLag
 from hapticrender.protocols import Array, Controller, Flag, Rendering
 from hapticrender.realtime import LOG_TIME, RealtimeEntry
 from hapticrender.voices import Voice
 
 JUDGED = 0.25  # s: of signal that figures are of
 SILENT = 1e-3  # of the gain: below it a texture has faded out
+DEVICE = ("driver", "device", "plant")  # of a rendering: they stay where its texture changes
 LEAST_TARGET = 1e-12  # in the device's unit: a smaller one has no error
 
 Row = tuple[float, float, float, float]  # frequency (Hz), target, achieved amplitude, relative error
@@ -98,6 +100,14 @@ class LiveLoop:
         """Say where the finger is (m, m/s, N)."""
         self.entry.finger(position, velocity, load)
 
+    def watch(self, seconds: float | None) -> None:
+        """Stop the drive once the application has not called for so long (s); None: never."""
+        self.entry.watch(seconds)
+
+    def alive(self) -> None:
+        """Note a call of the application."""
+        self.entry.alive()
+
     def set_gain(self, gain: float) -> None:
         """Set the factor on the texture."""
         self.entry.set_gain(gain)
@@ -134,7 +144,8 @@ class LiveLoop:
             for name, value in design_supervisor(inner.controller, self.model).items():
                 inner.state["p"][name] = value
         self.controller.settings["drive_limit"] = self.model.drive_limit
-        self.rendering, self._bands = rendering, rendering.bands
+        self.rendering = replace(rendering, **{name: getattr(self.rendering, name) for name in DEVICE})
+        self._bands = rendering.bands
         self.entry.play(self._voice(rendering))
 
     def signals(self, start: int) -> tuple[int, dict[str, Array]]:
@@ -153,31 +164,35 @@ class LiveLoop:
         motion = told[:, :-1]  # NaN where nothing is sensed
         if not self._true and found["sensed"].shape[1]:
             motion = found["sensed"] @ (model.place_from_coordinate @ model.coordinate_from_sensed).T
+            motion = ContactLag(model.contact_lag).run(motion, found["position"]) if model.inferred else motion
         return first, found | {"motion": motion, "target": np.zeros((count, 0), complex)}
 
     @property
     def motion_source(self) -> str:
         """Where `motion` comes from."""
-        return "true" if self._true else "sensors" if self.driver.sensed_channels else "unknown"
+        if self._true or not self.driver.sensed_channels:
+            return "true" if self._true else "unknown"
+        return "inferred" if self.model.inferred else "sensors"
 
     def figures(self) -> list[Row]:
         """What every band did over the last `JUDGED` seconds, see `band_figures`."""
         first, signals = self.signals(self.entry.samples - round(JUDGED * self.driver.rate))
         return band_figures(self._bands, first, self.driver.rate, signals)
 
-    def fault(self) -> DeviceFault | None:
+    def fault(self) -> HapticError | None:
         """Return why the drive was stopped, once it has faded out and stayed at zero for as long again."""
         if not self.entry.flags & Flag.STOPPED:
             return None
         found = getattr(self.controller, "fault", None)
         if self._stopped is None:
-            self._stopped = found.sample if isinstance(found, Fault) else self.entry.samples
+            own = found.sample if isinstance(found, Fault) else self.entry.samples
+            self._stopped = own if self.entry.timed_out is None else self.entry.timed_out
         if self.entry.samples < self._stopped + 2 * FADE_OUT * self.driver.rate + self.driver.delay:
             return None
-        text, at = (
-            found.text if isinstance(found, Fault) else "the device stopped itself",
-            self._stopped / self.driver.rate,
-        )
+        at = self._stopped / self.driver.rate
+        if self.entry.timed_out is not None:
+            return WatchdogTimeout(at)
+        text = found.text if isinstance(found, Fault) else "the device stopped itself"
         return DeviceFault(f"{type(self.rendering.device).__name__}: stopped at {at:.4g} s: {text}", at)
 
     def _voice(self, rendering: Rendering) -> Voice:
