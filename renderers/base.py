@@ -41,7 +41,7 @@ class BaseRenderer:
         setup = self.read(scene, driver)
         if driver is None:
             plant = self.plant(setup, scene.seed)
-            device = facing = SimulatedDriver(plant)
+            device = facing = SimulatedDriver(plant, scene.panel, scene.seed)
         else:
             plant, device, facing = None, driver, self.connect(setup, driver)
         check_driver(facing)
