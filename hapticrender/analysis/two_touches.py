@@ -58,11 +58,9 @@ class TouchTest(NamedTuple):
 
 
 def can_tell(model: DeviceModel) -> bool:
-    """Whether force and moment of a finger can be measured on such a device: a plate with two coils and two sensors."""
-    sensors = model.coordinate_from_sensed.shape
-    return (
-        len(model.mass) == 2 and sensors == (2, 2) and model.lever_per_metre > 0.0 and model.finger.contact is not None
-    )
+    """Whether a finger's force and moment can be measured on such a device: a plate with two coils and two sensors."""
+    plate = model.finger.contact is not None and model.lever_per_metre > 0.0
+    return plate and len(model.mass) == 2 and model.coordinate_from_sensed.shape == (2, 2)
 
 
 def bound_of(freedom: float, false_alarms: float = FALSE_ALARMS) -> float:
