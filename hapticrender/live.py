@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from hapticrender.analysis.two_touches import TouchWatch
 from hapticrender.bands import Bands
 from hapticrender.control.combined import CombinedBands
 from hapticrender.control.device_model import DeviceModel
@@ -72,6 +73,7 @@ class LiveLoop:
         self._drive = np.zeros((self.driver.block, self.driver.drive_channels))
         self._bands = rendering.bands
         self._stopped: int | None = None  # sample
+        self._touches = TouchWatch(rendering.model, self.controller, rendering.model.delay)
         self.entry.play(self._voice(rendering))
 
     @property
@@ -87,7 +89,7 @@ class LiveLoop:
     @property
     def flags(self) -> Flag:
         """Everything that was ever raised."""
-        return self.entry.flags
+        return self.entry.flags | self._touches.flags
 
     @property
     def silent(self) -> bool:
@@ -154,6 +156,13 @@ class LiveLoop:
         if not self._true and found["sensed"].shape[1]:
             motion = found["sensed"] @ (model.place_from_coordinate @ model.coordinate_from_sensed).T
         return first, found | {"motion": motion, "target": np.zeros((count, 0), complex)}
+
+    def watch_touches(self, signals: dict[str, Array], gap: int) -> None:
+        """Flag two touches in the signals that follow those of the last call, `gap` samples later."""
+        if gap and self._touches.monitor is not None:
+            self._touches.monitor.restart()
+        if len(signals["flags"]):
+            signals["flags"] = self._touches.update(signals)
 
     @property
     def motion_source(self) -> str:

@@ -23,7 +23,7 @@ import numpy as np
 
 from hapticrender.control.device_model import DeviceModel
 from hapticrender.control.inverse import derivative_filters
-from hapticrender.control.inverse_records import TAPS
+from hapticrender.control.inverse_records import HEAVE, LOAD, TAPS
 from hapticrender.protocols import Array, Flag
 
 WINDOW = 0.25  # s
@@ -39,6 +39,7 @@ LEAST_SIGNAL = 100.0  # of the noise's power
 MARGIN = 60e-3  # s after a touch or a lift, which may be reported late
 KEPT = 15 / 16  # of what earlier windows of the free plate have shown: 4 s of memory, coils warm up
 SLOWER = 100.0  # times the variance by which the law trusts a deviation: it learns ten times more slowly
+DEVICE = slice(int(HEAVE), int(LOAD))  # of the law's parameters: the device's own
 UNUSABLE = Flag.NONFINITE | Flag.SENSOR_CLIPPED | Flag.OVERRUN | Flag.STOPPED
 SEARCH = np.linspace(-4.0, 4.0, 41)  # s_d: first grid of d
 
@@ -86,6 +87,9 @@ class TouchMonitor:
     ----------
     model : DeviceModel
         Of a plate with two coordinates, see `can_tell`.
+    late : int, samples, optional
+        From a row of the drive to the interval in which it acts; by default that of drives as they are played, ``delay
+        - block``.
 
     Attributes
     ----------
@@ -97,15 +101,13 @@ class TouchMonitor:
         Whether two fingers touch, by the last window; a lift ends it.
     """
 
-    def __init__(self, model: DeviceModel) -> None:
+    def __init__(self, model: DeviceModel, late: int | None = None) -> None:
         if not can_tell(model):
-            raise ValueError(
-                f"{len(model.mass)} coordinates: must be 2, force and moment, to tell two fingers from one"
-            )
+            raise ValueError(f"{len(model.mass)} coordinates: must be a plate with 2, and a sensor for each of them")
         self.model, self.length, self._margin = model, round(WINDOW * model.rate), round(MARGIN * model.rate)
         top = min(model.highest_frequency, 0.2 * model.rate)
         self._filters = derivative_filters(float(model.rate), float(top))[:3]
-        self._late = model.delay - 1  # samples from a row of the drive to the interval in which it acts
+        self._late = model.delay - model.block if late is None else late
         bins = np.arange(0, self.length // 2)
         hertz = bins * model.rate / self.length
         self._bins = bins[(hertz >= BAND[0]) & (hertz <= min(BAND[1], top))][::SPACING]
@@ -128,7 +130,7 @@ class TouchMonitor:
         Parameters
         ----------
         drive, sensed : ndarray, shape (n, channels) and (n, sensors)
-            As played and measured; row i of the drive is held from the moment of row i of `sensed` on.
+            As played and measured.
         position : ndarray, shape (n,)
             Of the finger (m), NaN while lifted.
         flags : ndarray of int, shape (n,)
@@ -145,6 +147,10 @@ class TouchMonitor:
             split = np.split(rows, [channels, channels + sensors, channels + sensors + 1], axis=1)
             self._pieces, self._count = [(split[0], split[1], split[2][:, 0], split[3][:, 0])], len(rows)
         return int(Flag.TWO_TOUCHES) if self.two else 0
+
+    def restart(self) -> None:
+        """Begin a new window: samples are missing here."""
+        self._pieces, self._count, self._free = [], 0, None
 
     def _take(self, rows: Array) -> int:
         """Test or learn from a window; returns the samples that are done with: up to a while after a change."""
@@ -195,7 +201,7 @@ class TouchMonitor:
         return np.fft.rfft(signal * self._window, axis=-1)[..., np.r_[0, self._bins]]
 
     def _force(self, parts: Array) -> Array:
-        """f = B i - K q - C q' - M q'' in both coordinates, shape (2, length)."""
+        """Return f = B i - K q - C q' - M q'' in both coordinates, shape (2, length)."""
         model = self.model
         return parts[0] - model.stiffness @ parts[1] - model.damping @ parts[2] - model.mass @ parts[3]
 
@@ -230,7 +236,7 @@ class TouchMonitor:
         along, across = self._spectrum(force[0]), self._spectrum(force[1] - lever * force[0])
         rows = self._spectrum(per_error[1] - lever * per_error[0]), self._spectrum(per_error[0])
         if self._rest is None:
-            along, across, rows = along[1:], across[1:], tuple(each[:, 1:] for each in rows)
+            along, across, rows = along[1:], across[1:], (rows[0][:, 1:], rows[1][:, 1:])
         else:
             along[0] -= self._rest[0]
             across[0] -= self._rest[1] - lever.mean() * self._rest[0]
@@ -258,25 +264,60 @@ class TouchMonitor:
 
 
 class TouchWatch:
-    """A `TouchMonitor` on a running controller, whose law learns more slowly while two fingers touch.
+    """A `TouchMonitor` on a running controller: while two fingers touch, the waveform law is set back and slowed.
+
+    What was learned of the finger returns to the prior, of the device to what it was while one finger explained the
+    signals, and the law trusts `SLOWER` times less in what it measures: it is the open inverse of an average finger,
+    which improves slowly.  Once one finger explains the signals again it learns as designed.
 
     Parameters
     ----------
     model : DeviceModel
     controller : Controller
-        Of the waveform law; laws by bands are left as they are.
+        Laws by bands are left as they are.
+    late : int, samples, optional
+        As for `TouchMonitor`.
     """
 
-    def __init__(self, model: DeviceModel, controller: Any) -> None:
-        self.monitor = TouchMonitor(model) if can_tell(model) else None
-        self._law = getattr(controller, "law", None)
-        self._noise = None if self._law is None else self._law["noise"].copy()
+    def __init__(self, model: DeviceModel, controller: Any, late: int | None = None) -> None:
+        self.monitor = TouchMonitor(model, late) if can_tell(model) else None
+        self._law: Any = getattr(controller, "law", None)
+        self._kept: dict[str, Array] = {}
+        if self._law is not None:
+            self._kept["noise"] = self._law["noise"].copy()
+            self._note_device()
+
+    @property
+    def flags(self) -> Flag:
+        """`Flag.TWO_TOUCHES` once it was ever raised."""
+        return Flag.TWO_TOUCHES if self.monitor is not None and self.monitor.detections else Flag(0)
 
     def update(self, signals: Mapping[str, Array]) -> Array:
         """Take the next drive, sensed, position and flags; returns the flags, with `Flag.TWO_TOUCHES` where it is."""
-        if self.monitor is None:
+        monitor = self.monitor
+        if monitor is None or signals["sensed"].shape[1] != 2:
             return signals["flags"]
-        raised = self.monitor.update(*(signals[name] for name in ("drive", "sensed", "position", "flags")))
-        if self._law is not None:
-            self._law["noise"] = self._noise * (SLOWER if raised else 1.0)
+        before, tested = monitor.two, monitor.tests
+        raised = monitor.update(*(signals[name] for name in ("drive", "sensed", "position", "flags")))
+        if self._law is not None and (monitor.two != before or monitor.tests > tested):
+            self._slow_down(monitor.two, before)
         return signals["flags"] | raised
+
+    def _slow_down(self, two: bool, before: bool) -> None:
+        """Set the law back at the first window with two touches, and slow it until there is one."""
+        law, kept, end = self._law, self._kept, int(LOAD)
+        if two and not before:
+            law["theta"][:end], law["covariance"][:end] = law["prior"][:end], law["spread"][:end]
+            law["covariance"][:, :end] = law["spread"][:, :end]
+            law["theta"][DEVICE], law["covariance"][DEVICE, DEVICE] = kept["theta"], kept["covariance"]
+        elif not two:
+            self._note_device()
+        law["noise"] = kept["noise"] * (SLOWER if two else 1.0)
+
+    def _note_device(self) -> None:
+        """Note what is learned of the device itself, while one finger explains the signals."""
+        law = self._law
+        self._kept["theta"], self._kept["covariance"] = (
+            law["theta"][DEVICE].copy(),
+            law["covariance"][DEVICE, DEVICE].copy(),
+        )

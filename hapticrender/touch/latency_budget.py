@@ -87,8 +87,9 @@ def bandwidth(estimator: MotionEstimator, rate: float) -> float:
 def noise_gain(a: Array, b: Array) -> Array:
     """S of the module: covariance of the state under white noise of variance 1, shape (n, n)."""
     total, power = np.outer(b, b), a
-    for _ in range(40):  # S over 2^k samples, doubled each time
-        total, power = total + power @ total @ power.T, power @ power
+    with np.errstate(under="ignore"):
+        for _ in range(24):  # S over 2^k samples, doubled each time
+            total, power = total + power @ total @ power.T, power @ power
     return total
 
 

@@ -159,6 +159,7 @@ class Scene(Validated):
         self.panel  # noqa: B018 (it refuses what is no touch panel)
         bound = "a texture with bands(rate) and waveform(time, position)"
         checks.require(isinstance(self.texture, Texture), "texture", self.texture, bound, TypeError)
+        _refuse_fingers(self.finger)
         checks.require(isinstance(self.finger, Finger), "finger", self.finger, "a Finger", TypeError)
         if isinstance(self.finger.motion, Nowhere) and getattr(self.texture, "spatial", False):
             raise ValueError("finger.motion = 'none': a texture over position needs a finger")
@@ -335,7 +336,14 @@ def _read_part(key: str, part: Any, folder: Path) -> Any:
     return _read_kind(part[0], f"{key}[0]", "kind", TEXTURES, folder), part[1]
 
 
+def _refuse_fingers(finger: Any) -> None:
+    """Refuse several fingers: a device senses the sum of all touches, and the law has one finger's model."""
+    if isinstance(finger, list | tuple):
+        raise ValueError(f"finger: {len(finger)} fingers are stated: must be one, a device renders for one finger")
+
+
 def _read_finger(table: Any, folder: Path) -> Finger:
+    _refuse_fingers(table)
     own = [entry.name for entry in fields(Finger) if entry.name != "motion"]
     motion = _read_kind(table, "finger", "motion", MOTIONS, folder, extra=own)
     values = {key: table[key] for key in own if key in table}
