@@ -4,8 +4,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from live_devices import Blind
 
 import hapticrender as hr
+from hapticrender.plants.plate import Plate, PlateParameters
 from hapticrender.touch import latency_budget as budget
 from hapticrender.touch.motion import SineMotion, TriangleMotion
 from hapticrender.touch.motion_estimator import ANYWHERE, MotionEstimator, jerk_covariance, transition
@@ -226,3 +228,19 @@ def test_a_scene_with_a_touch_panel_is_played_at_the_estimated_position():
     error = (recording.position - truth)[round(0.4 * recording.rate) : round(1.39 * recording.rate)]
     predicted = budget.position_error(scene.panel, 0.05)
     assert np.sqrt(np.mean(error**2)) == pytest.approx(predicted, rel=5 / np.sqrt(2 * 40))  # 1 s of 40 Hz
+
+
+@pytest.mark.parametrize("pause", [1e-3, 8e-3, 20e-3])
+def test_a_player_takes_up_a_correction_however_often_it_is_called(pause, tmp_path):
+    """Two poles of 5 ms pass 1 - 5 exp(-4) = 91 % of it in 20 ms, less 2 ms of the call and of the loop: 86 %."""
+    device = Blind(Plate(PlateParameters(), hr.Finger.absent()))
+    with hr.Player("vt-plate", device, paced=False) as player:
+        player.play(hr.Grating(wavelength=1e-3, amplitude=5e-6))
+        for position in (0.0, 1e-3):
+            if position:
+                player.record(tmp_path / "step.au")
+            for _ in range(round(40e-3 / pause)):
+                player.finger(position, 0.0)
+                player.sleep(pause)
+        reached = player.end_recording().position[round(20e-3 * device.rate)]
+    assert 0.86e-3 < reached < 0.93e-3
