@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import sys
 import warnings
-from collections.abc import Iterator
 from typing import Any
 from unittest.mock import patch
 
@@ -15,7 +14,7 @@ import numpy as np
 from scipy.signal import firwin, lfilter
 
 import hapticrender as hr
-from hapticrender.analysis.two_touches import TouchMonitor, TouchWatch
+from hapticrender.analysis.two_touches import TouchWatch, windows_under_touch
 from hapticrender.loop import prepare, run
 from hapticrender.protocols import Array
 from tests.strangers_plate import WRONG, StrangersPlate
@@ -45,17 +44,6 @@ def textures() -> dict[str, Any]:
     }
 
 
-def tests_of(recording: Any, model: Any) -> Iterator[Any]:
-    """Results of all windows under a finger."""
-    monitor = TouchMonitor(model)
-    signals = [getattr(recording, name) for name in ("drive", "sensed", "position", "flags")]
-    for start in range(0, len(recording), 100):
-        before = monitor.tests
-        monitor.update(*(each[start : start + 100] for each in signals))
-        if monitor.tests > before:
-            yield monitor.last
-
-
 def one_finger() -> None:
     """Print, of single sliding fingers, how near to the bound the statistic comes."""
     for name, (finger, load, speed, wrong) in ONE.items():
@@ -67,7 +55,7 @@ def one_finger() -> None:
             rendering = prepare(
                 hr.Scene(texture=played, finger=hr.Finger.sliding(0.08, load), duration=5.0), driver=plate
             )
-            found = list(tests_of(run(rendering), rendering.model))
+            found = [each for _, each in windows_under_touch(run(rendering), rendering.model)]
             ratio = np.array([each.statistic / each.bound for each in found])
             place = 1e3 * np.sqrt(np.mean([each.offset**2 for each in found]))
             print(f"{name}, {texture}: {len(found)} windows, {sum(each.two for each in found)} false alarms, "

@@ -6,22 +6,20 @@ from collections.abc import Callable
 
 from hapticrender.drivers.base import BaseDriver
 from hapticrender.protocols import Array, Controller, Exchange, Plant, Sensed
-from hapticrender.touch.touch_panel import PanelReader, TouchPanel
 
 
 class SimulatedDriver(BaseDriver):
     """Plays on a plant model instead of hardware.
 
     Where the plant can run in closed loop with a controller inside compiled
-    code, `exchange` does so; `play` gives the same samples one block at a time.  With a `touch_panel`, whose errors are
-    drawn from `seed`, the finger's position is the one that is known behind it, and all goes block by block.
+    code, `exchange` does so; `play` gives the same samples one block at a time.  With `locate`, which makes of the
+    finger's positions (m, shape (block,)) those that a sensor gives, all goes block by block.
     """
 
     probe = False  # it is wired as its plant says
 
-    def __init__(self, plant: Plant, touch_panel: TouchPanel | None = None, seed: int = 0) -> None:
-        self.plant = plant
-        self._panel = None if touch_panel is None else PanelReader(touch_panel, plant.rate, seed)
+    def __init__(self, plant: Plant, locate: Callable[[Array], Array] | None = None) -> None:
+        self.plant, self._locate = plant, locate
         self._played = False
         super().__init__(
             rate=plant.rate,
@@ -36,7 +34,7 @@ class SimulatedDriver(BaseDriver):
 
         A subclass that plays in its own way gets its blocks.
         """
-        compiled = self._panel is None and type(self) is SimulatedDriver and self.block == 1
+        compiled = self._locate is None and type(self) is SimulatedDriver and self.block == 1
         if not compiled or not self.plant.closes(controller):
             return None
 
@@ -54,6 +52,6 @@ class SimulatedDriver(BaseDriver):
     def _play(self, drive: Array) -> Sensed:
         self._played = True
         sensed = self.plant.run(drive)
-        if self._panel is None or sensed.position is None:
+        if self._locate is None or sensed.position is None:
             return sensed
-        return sensed._replace(position=self._panel(sensed.position))
+        return sensed._replace(position=self._locate(sensed.position))

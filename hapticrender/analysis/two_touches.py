@@ -17,7 +17,7 @@ fingers alike, at places that the plate moves alike under the same load, leave w
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -25,6 +25,9 @@ from hapticrender.control.device_model import DeviceModel
 from hapticrender.control.inverse import derivative_filters
 from hapticrender.control.inverse_records import HEAVE, LOAD, TAPS
 from hapticrender.protocols import Array, Flag
+
+if TYPE_CHECKING:
+    from hapticrender.recordings.recording import Recording
 
 WINDOW = 0.25  # s
 BAND = (20.0, 400.0)  # Hz
@@ -40,7 +43,8 @@ MARGIN = 60e-3  # s after a touch or a lift, which may be reported late
 KEPT = 15 / 16  # of what earlier windows of the free plate have shown: 4 s of memory, coils warm up
 SLOWER = 100.0  # times the variance by which the law trusts a deviation: it learns ten times more slowly
 DEVICE = slice(int(HEAVE), int(LOAD))  # of the law's parameters: the device's own
-UNUSABLE = Flag.NONFINITE | Flag.SENSOR_CLIPPED | Flag.OVERRUN | Flag.STOPPED
+UNUSABLE = int(Flag.NONFINITE | Flag.SENSOR_CLIPPED | Flag.OVERRUN | Flag.STOPPED)
+TWO_TOUCHES = int(Flag.TWO_TOUCHES)
 SEARCH = np.linspace(-4.0, 4.0, 41)  # s_d: first grid of d
 
 
@@ -136,8 +140,7 @@ class TouchMonitor:
         flags : ndarray of int, shape (n,)
             Windows with samples that are `UNUSABLE` are left out.
         """
-        unusable = (np.asarray(flags) & UNUSABLE) != 0
-        self._pieces.append((drive, sensed, position, unusable))
+        self._pieces.append((drive, sensed, position, flags & UNUSABLE))
         self._count += len(position)
         need = self.length + TAPS - 1 + self._late
         while self._count >= need:
@@ -146,7 +149,7 @@ class TouchMonitor:
             rows = rows[self._take(rows[:need]) :]
             split = np.split(rows, [channels, channels + sensors, channels + sensors + 1], axis=1)
             self._pieces, self._count = [(split[0], split[1], split[2][:, 0], split[3][:, 0])], len(rows)
-        return int(Flag.TWO_TOUCHES) if self.two else 0
+        return TWO_TOUCHES if self.two else 0
 
     def restart(self) -> None:
         """Begin a new window: samples are missing here."""
@@ -261,6 +264,26 @@ class TouchMonitor:
         vector = self._known + ((rows.conj() * weight) @ left).real
         fixed = self._known @ np.linalg.solve(self._information, self._known)
         return float(np.sum(weight * abs(left) ** 2) + fixed - vector @ np.linalg.solve(matrix, vector))
+
+
+def windows_under_touch(recording: Recording, model: DeviceModel) -> list[tuple[float, TouchTest]]:
+    """Test every whole window of a recording under a finger; each with the time by which it was over (s).
+
+    Parameters
+    ----------
+    recording : Recording
+        Of a plate, with the drive, what was sensed and the finger's position.
+    model : DeviceModel
+        As the plate is believed to be: of ``hapticrender.prepare(scene).model``, or of `PlateParameters.device_model`.
+    """
+    monitor, found, piece = TouchMonitor(model), [], round(0.1 * WINDOW * model.rate)
+    signals = [recording.drive, recording.sensed, recording.position, recording.flags]
+    for start in range(0, len(recording), piece):
+        before = monitor.tests
+        monitor.update(*(each[start : start + piece] for each in signals))
+        if monitor.last is not None and monitor.tests > before:
+            found.append((min(start + piece, len(recording)) / recording.rate, monitor.last))
+    return found
 
 
 class TouchWatch:
