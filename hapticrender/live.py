@@ -73,7 +73,8 @@ class LiveLoop:
         self._drive = np.zeros((self.driver.block, self.driver.drive_channels))
         self._bands = rendering.bands
         self._stopped: int | None = None  # sample
-        self._touches = TouchWatch(rendering.model, self.controller, rendering.model.delay)
+        own = rendering.plant is not None
+        self._touches = TouchWatch(rendering.model, self.controller, rendering.model.delay, active=not own)
         self.entry.play(self._voice(rendering))
 
     @property

@@ -231,7 +231,7 @@ class _Loop:
         self.step = driver.block * (max(int(CHUNK * driver.rate / driver.block), 1) if exchange is not None else 1)
         self._start, self._ahead = 0, int(getattr(self.controller, "lookahead", 0))
         self._predict = PositionPredictor(driver.rate, self._ahead)
-        self._touches = TouchWatch(rendering.model, self.controller)
+        self._touches = TouchWatch(rendering.model, self.controller, active=rendering.plant is None)
         self._stopped = -1  # sample from which on the drive fades out; negative: none
         self._drive = np.zeros((driver.block, driver.drive_channels))
 

@@ -137,6 +137,17 @@ def test_reversals_and_stops_are_caught_up_with():
     assert abs(found[-50:, 1]).max() < 1e-3
 
 
+@pytest.mark.parametrize("speed", [0.3, 1.0, 3.0])
+def test_a_flick_is_followed_though_no_swipe_is_so_fast(speed):
+    """Two samples beyond the gate make a new start, with the velocity between them; it is right from then on."""
+    estimator, rate = ignoring(MotionEstimator(50e-6)), 120.0
+    time = np.arange(60) / rate
+    truth = speed * np.maximum(time - 0.25, 0.0)
+    found = followed(estimator, rate, truth)
+    assert abs(found[-20:, 0] - truth[-20:]).max() < 5 * 50e-6
+    assert found[-20:, 1] == pytest.approx(speed, rel=0.05)
+
+
 def ignoring(estimator):
     """The estimator, whatever `update` says of a sample."""
     plain = estimator.update

@@ -45,7 +45,7 @@ SLOWER = 100.0  # times the variance by which the law trusts a deviation: it lea
 DEVICE = slice(int(HEAVE), int(LOAD))  # of the law's parameters: the device's own
 UNUSABLE = int(Flag.NONFINITE | Flag.SENSOR_CLIPPED | Flag.OVERRUN | Flag.STOPPED)
 TWO_TOUCHES = int(Flag.TWO_TOUCHES)
-SEARCH = np.linspace(-4.0, 4.0, 41)  # s_d: first grid of d
+SEARCH = np.linspace(-4.0, 4.0, 9)  # grid of d, three times: in s_d, and in a quarter of the last one
 
 
 class TouchTest(NamedTuple):
@@ -245,7 +245,7 @@ class TouchMonitor:
             across[0] -= self._rest[1] - lever.mean() * self._rest[0]
         spread, best = POSITION_ERROR * self.model.lever_per_metre, 0.0
         mean, noise = float(lever.mean()), self._noise[len(self._noise) - along.size :]
-        for width in (1.0, 0.1, 0.01):
+        for width in (1.0, 0.25, 0.0625):
             errors = best + spread * width * SEARCH
             values = [self._value(across - d * along, rows[0] - d * rows[1], noise, mean + d) for d in errors]
             totals = np.array(values) + (errors / spread) ** 2
@@ -300,10 +300,12 @@ class TouchWatch:
         Laws by bands are left as they are.
     late : int, samples, optional
         As for `TouchMonitor`.
+    active : bool
+        False: nothing is watched, as on a simulated device, which has one finger.
     """
 
-    def __init__(self, model: DeviceModel, controller: Any, late: int | None = None) -> None:
-        self.monitor = TouchMonitor(model, late) if can_tell(model) else None
+    def __init__(self, model: DeviceModel, controller: Any, late: int | None = None, active: bool = True) -> None:
+        self.monitor = TouchMonitor(model, late) if active and can_tell(model) else None
         self._law: Any = getattr(controller, "law", None)
         self._kept: dict[str, Array] = {}
         if self._law is not None:

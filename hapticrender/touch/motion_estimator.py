@@ -24,6 +24,7 @@ from hapticrender.protocols import Array
 
 FREQUENCY, SPEED = 3.0, 0.05  # Hz and m/s of the swipes that a finger makes on a texture
 GATE = 5.0  # standard errors: one good sample in two million is beyond it
+FASTEST = 10.0  # m/s
 LEAST_NOISE = 1e-9  # m
 ANYWHERE = 20.0**0.2  # over w: time after which q t5/20 is the squared amplitude (V/w)2 of the swipe
 
@@ -130,9 +131,7 @@ class MotionEstimator:
         if self._rejected is None:
             self._rejected = time, position
             return False
-        self._start(*self._rejected)
-        if not self._correct(time, position):  # two samples that contradict each other, too: the newer one counts
-            self._start(time, position)
+        self._start_from_two(*self._rejected, time, position)
         return True
 
     def at(self, time: float | Array) -> MotionEstimate:
@@ -159,7 +158,17 @@ class MotionEstimator:
         self._covariance = np.diag(self._prior + [self.variance + self._prior[1] * self.jitter**2, 0.0, 0.0])
         self._time, self._rejected = time, None
 
-    def _correct(self, time: float, position: float) -> bool:
+    def _start_from_two(self, before: float, there: float, time: float, position: float) -> None:
+        """Start from two samples, at the velocity between them; from the newer one, where no finger is so fast."""
+        velocity = (position - there) / (time - before)
+        if abs(velocity) > FASTEST:
+            self._start(time, position)
+            return
+        self._start(before, there)
+        self._covariance[1, 1] = max(self._covariance[1, 1], velocity**2)
+        self._correct(time, position, gate=math.inf)
+
+    def _correct(self, time: float, position: float, gate: float = GATE) -> bool:
         """Predict to `time` and correct by a sample, unless it is beyond the gate."""
         step = time - self._time
         f = transition(step)
@@ -167,7 +176,7 @@ class MotionEstimator:
         covariance = f @ self._covariance @ f.T + jerk_covariance(step, self.density)
         variance = self.variance + (state[1] * self.jitter) ** 2
         innovation, scatter = position - state[0], covariance[0, 0] + variance
-        if innovation**2 > GATE**2 * scatter:
+        if innovation**2 > gate**2 * scatter:
             return False
         gain = covariance[:, 0] / scatter
         reduced = np.eye(3)
