@@ -155,6 +155,17 @@ def ignoring(estimator):
     return estimator
 
 
+def test_a_sample_may_state_its_own_error():
+    """Then it counts as one of a sensor with that error: a place found from the load is surer under a higher load."""
+    stated, plain = MotionEstimator(50e-6), MotionEstimator(1e-3)
+    for n in range(50):
+        for estimator, error in ((stated, 1e-3), (plain, None)):
+            estimator.update(n / 100, 0.02 * np.sin(OMEGA * n / 100), error)
+    assert stated.at(0.5) == pytest.approx(plain.at(0.5), rel=1e-12)
+    with pytest.raises(ValueError, match="error=0.0 m: must be finite and > 0"):
+        stated.update(1.0, 0.0, 0.0)
+
+
 def test_lift_return_and_patience():
     estimator = MotionEstimator(50e-6, latency=5e-3)
     assert np.isnan(estimator.at(0.0).position)
@@ -255,3 +266,25 @@ def test_a_player_takes_up_a_correction_however_often_it_is_called(pause, tmp_pa
                 player.sleep(pause)
         reached = player.end_recording().position[round(20e-3 * device.rate)]
     assert 0.86e-3 < reached < 0.93e-3
+
+
+def test_an_application_behind_a_panel_is_within_the_budget(tmp_path, rng):
+    """Panel of 120 Hz, estimator, `Player.finger` 240 times a second: the error of the position that is played."""
+    panel, motion, done = replace(TouchPanel(), **PLAIN), SineMotion(frequency=3.0, speed=0.05), 0
+    estimator, device = panel.estimator(), Blind(Plate(PlateParameters(), hr.Finger.absent()))
+    with hr.Player("vt-plate", device, paced=False) as player:
+        player.play(hr.Grating(wavelength=2e-3, amplitude=5e-6))
+        player.record(tmp_path / "panel.au")
+        start = player.time
+        while (now := player.time) < start + 2.5:
+            while done / panel.rate + panel.latency <= now:
+                sample = motion.position(done / panel.rate) + panel.noise * rng.standard_normal()
+                estimator.update(done / panel.rate + panel.latency, sample)
+                done += 1
+            player.finger(*estimator.at(now)[:2])
+            player.sleep(1 / 240)
+        played = player.end_recording().position
+    error = (played - motion.position(start + np.arange(len(played)) / device.rate))[round(0.5 * device.rate) :]
+    independent = 2.0 * budget.bandwidth(panel.estimator(), panel.rate)
+    expected = budget.position_error(panel, 0.05)
+    assert np.sqrt(np.mean(error**2)) == pytest.approx(expected, rel=5 / np.sqrt(2 * independent))

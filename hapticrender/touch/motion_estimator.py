@@ -105,20 +105,26 @@ class MotionEstimator:
         self.density = omega**3 * speed**2  # m2/s5
         self.patience = ANYWHERE / omega  # s
         self._prior = np.array([0.0, speed**2, (omega * speed) ** 2])  # variances of an unknown motion
+        self._sampled = self.variance  # of the sample at hand
         self._state, self._covariance = np.zeros(3), np.zeros((3, 3))
         self._time = math.nan  # of the last sample that was taken; NaN: lifted
         self._rejected: tuple[float, float] | None = None  # the last sample, where it was left out
 
-    def update(self, time: float, position: float) -> bool:
+    def update(self, time: float, position: float, error: float | None = None) -> bool:
         """Take a sample (m; NaN: lifted) that arrives at `time` (s); False where it is left out.
 
-        A sample that is no later than the last one is left out, too.  ValueError: a number is not finite.
+        `error` (m, > 0) is its own standard error, where that differs from sample to sample, as that of a place found
+        from the load on a plate does; by default that of the sensor.  A sample that is no later than the last one is
+        left out, too.  ValueError: a number is not finite.
         """
         if math.isnan(position):
             self.lift()
             return True
         if not (math.isfinite(time) and math.isfinite(position)):
             raise ValueError(f"{time=} s, {position=} m: must be finite (a position may be NaN: lifted)")
+        if error is not None and not 0.0 < error < math.inf:
+            raise ValueError(f"{error=} m: must be finite and > 0")
+        self._sampled = self.variance if error is None else error**2
         time -= self.latency
         if math.isnan(self._time) or time - self._time > self.patience:
             self._start(time, position)
@@ -155,7 +161,7 @@ class MotionEstimator:
     def _start(self, time: float, position: float) -> None:
         """Start from one sample of a finger of unknown motion."""
         self._state = np.array([position, 0.0, 0.0])
-        self._covariance = np.diag(self._prior + [self.variance + self._prior[1] * self.jitter**2, 0.0, 0.0])
+        self._covariance = np.diag(self._prior + [self._sampled + self._prior[1] * self.jitter**2, 0.0, 0.0])
         self._time, self._rejected = time, None
 
     def _start_from_two(self, before: float, there: float, time: float, position: float) -> None:
@@ -174,7 +180,7 @@ class MotionEstimator:
         f = transition(step)
         state = f @ self._state
         covariance = f @ self._covariance @ f.T + jerk_covariance(step, self.density)
-        variance = self.variance + (state[1] * self.jitter) ** 2
+        variance = self._sampled + (state[1] * self.jitter) ** 2
         innovation, scatter = position - state[0], covariance[0, 0] + variance
         if innovation**2 > gate**2 * scatter:
             return False
@@ -231,10 +237,10 @@ class Encoder(MotionEstimator):
         self._count: int | None = None
         self._total = 0  # counts from the first one
 
-    def update(self, time: float, position: float) -> bool:
+    def update(self, time: float, position: float, error: float | None = None) -> bool:
         """Take a count (`position`, an integer) that arrives at `time` (s); False where it is left out."""
         count, half = int(position), 1 << (self.bits - 1)
         last = count if self._count is None else self._count
         self._total += (count - last + half) % (2 * half) - half
         self._count = count
-        return super().update(time, self.origin + self.step * self._total)
+        return super().update(time, self.origin + self.step * self._total, error)
