@@ -36,7 +36,7 @@ ONE = {  # finger, load (N), peak speed (m/s), further arguments of the plate
 
 
 def textures() -> dict[str, Any]:
-    """White noise of 20-400 Hz, 5 um rms; a tone; ridges."""
+    """White noise of 20-400 Hz, 5 um rms; a tone."""
     samples = lfilter(firwin(401, [20, 400], pass_zero=False, fs=RATE), 1, np.random.default_rng(0).normal(size=26_000))
     return {
         "noise": hr.Recorded(samples=samples[401:], rate=RATE, amplitude=5e-6),
