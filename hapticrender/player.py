@@ -428,6 +428,8 @@ class Player:
             loop.rendering.device.check()  # one that calls back cannot say that it is gone
         first, signals = loop.signals(self._recorded)
         gap, self._recorded = first - self._recorded, first + len(signals["flags"])
+        if isinstance(loop, LiveLoop):
+            loop.watch_touches(signals, gap)
         self._lost += gap + int(np.count_nonzero(signals["flags"] & Flag.OVERRUN))
         if self._recorder is not None and len(signals["flags"]):
             self._recorder.append(signals, gap, loop.motion_source)

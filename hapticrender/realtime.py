@@ -93,7 +93,9 @@ def receive(entry):
     if slot[FINGER_CHANGES] != e.finger_changes:
         e.finger_changes, e.age = slot[FINGER_CHANGES], 0
         jump = e.place + e.pace - slot[POSITION]  # from where it would have gone on
-        e.offset = e.offset_input = jump if abs(jump) < JUMP else 0.0
+        # only what is new of it enters both poles: calls that follow each other closely do not hold it up
+        e.offset_input = e.offset_input + jump - e.offset if abs(jump) < JUMP else 0.0
+        e.offset = jump if abs(jump) < JUMP else 0.0
     voice = int(slot[VOICE_ADDRESS])
     if voice != e.current and e.samples >= e.switch + e.fade:  # one change after the other
         e.previous, e.current, e.switch = e.current, voice, e.samples + e.ahead
