@@ -22,6 +22,7 @@ if not (_here / "renderers").is_dir():
 __version__ = "0.2.0"
 
 _HOMES = {
+    "analysis.models": "fit_finger fit_load_classes load_exponent",
     "bands": "Bands",
     "control.demodulator": "Demodulator",
     "errors": "DesignError DeviceFault DeviceLost DeviceNotFound DeviceTimeout DriverError HapticError PlateMismatch "
@@ -48,6 +49,9 @@ _HOME_OF = {name: home for home, names in _HOMES.items() for name in names.split
 __all__ = sorted(_HOME_OF)
 
 if _typing.TYPE_CHECKING:
+    from hapticrender.analysis.models import fit_finger as fit_finger
+    from hapticrender.analysis.models import fit_load_classes as fit_load_classes
+    from hapticrender.analysis.models import load_exponent as load_exponent
     from hapticrender.bands import Bands as Bands
     from hapticrender.control.demodulator import Demodulator as Demodulator
     from hapticrender.errors import DesignError as DesignError
