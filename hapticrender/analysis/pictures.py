@@ -1,0 +1,485 @@
+"""Draw what the analysis of recordings found: load and impedance over time, over the load, and over frequency."""
+
+from __future__ import annotations
+
+import os
+import warnings
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from html import escape
+from math import isfinite
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hapticrender import __version__
+from hapticrender.analysis import models
+from hapticrender.analysis.models import LOAD_CLASSES, FingerFit, LoadLaw, Samples, by_frequency, samples_of
+from hapticrender.analysis.records import DOUBTFUL, LOADED, UNLOADED, FingerRecord, Series
+from hapticrender.protocols import Array
+from hapticrender.recordings.formats import MissingExtra
+from hapticrender.report.figure import BLUE, INK, ORANGE, PALE, RED, legend, new_figure, save
+from hapticrender.report.page import GENERATOR, NO_PICTURE, STYLE, html_table
+
+Fits = dict[str, dict[int, FingerFit]]  # by load class and order
+MOST_BANDS = 8  # in one panel
+TYPICAL = 111.0  # Hz: of the paper's Fig. 5, and where |Z_f| begins to grow with the load
+COLOURS = {2: ORANGE, 4: BLUE}
+NAMES = {2: "2nd order", 4: "4th order"}
+LABELS = {
+    "mass": "mass at the surface (g)",
+    "damping": "its damping (N s/m)",
+    "stiffness": "its stiffness (N/mm)",
+    "phalanx_mass": "mass of the phalanx (g)",
+    "phalanx_damping": "its damping (N s/m)",
+    "phalanx_stiffness": "its stiffness (N/mm)",
+    "load_exponent": "exponent n of the load",
+}
+SURE = 1.96  # standard errors: 95 %
+POINTS = 1500  # of a curve over time
+
+
+def draw(records: FingerRecord | Sequence[FingerRecord], folder: str | os.PathLike[str]) -> Path:
+    """Draw one or several recordings into `folder`, which is made where it is not there; return its page.
+
+    As Grigorii et al. 2021: impedance and load over time (Fig. 5, ``time-1.png`` and so on, one a recording), impedance
+    over the load, and how much of it the load explains (Fig. 8 C and D, ``load.png``), impedance over frequency with
+    fits of both orders for each class of loads (Fig. 9, ``frequency.png``); ``index.html`` has them, the parameters
+    with their intervals, and what could not be measured.  Without matplotlib there are no pictures, and a warning says
+    how to install it.
+
+    Raises
+    ------
+    ValueError
+        There is no recording.
+    OSError
+        The folder cannot be written.
+    """
+    records = [records] if isinstance(records, FingerRecord) else list(records)
+    if not records:
+        raise ValueError("records is empty: must be at least one FingerRecord")
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    fits, laws = fit_all(records), [models.load_exponent(each.impedance) for each in records]
+    drawn: dict[str, Callable[[Path], None]] = {
+        f"time-{i + 1}.png": partial(draw_time, each) for i, each in enumerate(records)
+    }
+    if any(law.frequency.size for law in laws):
+        drawn["load.png"] = partial(draw_load, records)
+    if fits:
+        drawn["frequency.png"] = partial(draw_frequency, records, fits)
+    try:
+        for name, drawing in drawn.items():
+            drawing(folder / name)
+    except MissingExtra as error:
+        warnings.warn(f"{folder}: no pictures: {error}", stacklevel=2)
+        drawn = {}
+    page = folder / "index.html"
+    page.write_text(_page(records, fits, list(drawn)), encoding="utf-8")
+    return page
+
+
+def fit_all(records: Sequence[FingerRecord]) -> Fits:
+    """Fit both orders to every class of loads that has enough data, all recordings together, the better one first."""
+    impedances, found = [each.impedance for each in records], {}
+    for name, fit in models.fit_load_classes(impedances).items():
+        found[name] = {fit.order: fit}
+        if isfinite(fit.bic_margin):
+            other = 6 - fit.order
+            found[name][other] = models.fit_finger(impedances, other, loads=LOAD_CLASSES[name])
+    return found
+
+
+def draw_time(record: FingerRecord, path: str | os.PathLike[str]) -> None:
+    """Draw load and impedance, impedance of every band, and position and velocity over time, unloaded spans shaded."""
+    bands = _shown(record.impedance.value)
+    with new_figure((9, 7.2), pads=(0.1, 0.08)) as figure:
+        together, every, place = figure.subplots(3, 1, sharex=True, height_ratios=[1.5, 1.5, 1.0])
+        _load_and_impedance(together, record, bands)
+        _all_bands(every, record, bands)
+        _kinematics(place, record)
+        for axes in (together, every, place):
+            _shade(axes, record)
+        place.set(xlabel="time (s)", xlim=(record.time[0], record.time[-1]))
+        figure.align_ylabels([together, every, place])
+        save(figure, path)
+
+
+def draw_load(records: Sequence[FingerRecord], path: str | os.PathLike[str]) -> None:
+    """Draw the impedance over the load, how much of it the load explains, and the exponent, over frequency."""
+    impedances = [each.impedance for each in records]
+    pooled, each = models.load_exponent(impedances), [models.load_exponent(one) for one in impedances]
+    with new_figure((12, 4.2), pads=(0.1, 0.05)) as figure:
+        over_load, share, power = figure.subplots(1, 3, width_ratios=[1.4, 1, 1])
+        _over_load(over_load, records, pooled)
+        _determination(share, each, pooled)
+        _exponent(power, each, pooled)
+        save(figure, path)
+
+
+def draw_frequency(records: Sequence[FingerRecord], fits: Fits, path: str | os.PathLike[str]) -> None:
+    """Draw modulus and phase of the impedance over frequency, with both fits and their 95 % bands, a class a column."""
+    impedances = [each.impedance for each in records]
+    with new_figure((5.4 * max(len(fits), 1.3), 6.2), pads=(0.1, 0.08)) as figure:
+        panels = figure.subplots(2, len(fits), sharex=True, sharey="row", height_ratios=[1.5, 1], squeeze=False)
+        for (name, of_class), column in zip(fits.items(), panels.T, strict=True):
+            _over_frequency(column, name, of_class, samples_of(impedances, LOAD_CLASSES[name]))
+        size = np.abs(samples_of(impedances).value)
+        panels[0, 0].set_ylim(0.6 * np.quantile(size, 0.01), 1.7 * np.quantile(size, 0.99))
+        panels[0, 0].set_ylabel("|Z_f| (N s/m)")
+        panels[1, 0].set_ylabel("phase (degrees)")
+        for axis in (panels[0, 0].xaxis, panels[0, 0].yaxis):
+            _numbers(axis)
+        save(figure, path)
+
+
+def _shown(value: Array) -> list[int]:
+    """Up to 8 bands with data, evenly spread."""
+    there = np.flatnonzero(np.isfinite(value).any(axis=0))
+    return there[np.unique(np.linspace(0, len(there) - 1, min(len(there), MOST_BANDS)).astype(int))].tolist()
+
+
+def _colours(count: int) -> list[Any]:
+    """Colours from low to high frequency, none of them too pale."""
+    from matplotlib import colormaps
+
+    return [colormaps["viridis"](0.9 * i / max(count - 1, 1)) for i in range(count)]
+
+
+def _shade(axes: Any, record: FingerRecord) -> None:
+    for kind, colour in ((UNLOADED, "#DDDDDD"), (DOUBTFUL, "#F6DDB0")):
+        for segment in record.of_kind(kind):
+            axes.axvspan(segment.start, segment.stop, color=colour, alpha=0.7, lw=0, zorder=0)
+
+
+def _curve(axes: Any, time: Array, series: Series, scale: float, colour: str, label: str) -> Any:
+    """A quantity over time with its 95 % band."""
+    step = max(len(time) // POINTS, 1)
+    at, value, error = time[::step], scale * series.value[::step], scale * SURE * series.standard_error[::step]
+    axes.fill_between(at, value - error, value + error, color=colour, alpha=0.25, lw=0)
+    (line,) = axes.plot(at, value, color=colour, lw=1.4, label=label)
+    return line
+
+
+def _load_and_impedance(axes: Any, record: FingerRecord, bands: list[int]) -> None:
+    """The paper's Fig. 5: load (black) and |Z_f| of one band (red) over one another."""
+    lines = [_curve(axes, record.time, record.normal_load, 1.0, INK, "normal load")]
+    axes.set(title="Impedance and load", ylabel="normal load W (N)")
+    most = float(np.nanmax(np.where(record.contact == LOADED, record.normal_load.value, np.nan), initial=0.1))
+    axes.set_ylim(-0.08 * most, 1.25 * most)
+    z = record.impedance
+    if bands:
+        band = min(bands, key=lambda each: abs(np.log(np.nanmedian(z.frequency[:, each]) / TYPICAL)))
+        right = axes.twinx()
+        right.grid(False)
+        right.spines["right"].set_visible(True)
+        size = np.abs(z.value[:, band])
+        label = f"|Z_f| at {np.nanmedian(z.frequency[:, band]):.0f} Hz"
+        lines.append(_dots(right, z.time, size, z.standard_error[:, band], RED, label))
+        right.set_ylabel("|Z_f| (N s/m)", color=RED)
+        right.tick_params(axis="y", colors=RED)
+        right.set_ylim(-0.08 * np.nanmax(size), 1.25 * np.nanmax(size))
+    _shading_legend(axes, record, lines)
+
+
+def _shading_legend(axes: Any, record: FingerRecord, lines: list[Any]) -> None:
+    """Legend of lines and of the kinds of contact that are shaded."""
+    from matplotlib.patches import Patch
+
+    shaded = {UNLOADED: ("#DDDDDD", "unloaded"), DOUBTFUL: ("#F6DDB0", "doubtful")}
+    handles = lines + [
+        Patch(color=colour, label=name) for kind, (colour, name) in shaded.items() if record.of_kind(kind)
+    ]
+    legend(axes, handles, [each.get_label() for each in handles])
+
+
+def _dots(axes: Any, x: Array, y: Array, error: Array, colour: Any, label: str) -> Any:
+    """Points with bars of one standard error, joined where none is missing between."""
+    style = {"color": colour, "marker": "o", "ms": 3, "lw": 0.9, "elinewidth": 0.8, "label": label}
+    return axes.errorbar(x, y, error, **style)
+
+
+def _all_bands(axes: Any, record: FingerRecord, bands: list[int]) -> None:
+    z = record.impedance
+    for band, colour in zip(bands, _colours(len(bands)), strict=True):
+        label = f"{np.nanmedian(z.frequency[:, band]):.0f} Hz"
+        _dots(axes, z.time, np.abs(z.value[:, band]), z.standard_error[:, band], colour, label)
+    axes.set(title="Impedance", ylabel="|Z_f| (N s/m)", yscale="log")
+    _numbers(axes.yaxis)
+    if bands:
+        size = np.abs(z.value[:, bands])
+        axes.set_ylim(0.7 * np.nanmin(size), 1.4 * np.nanmax(size))
+        legend(axes, columns=MOST_BANDS)
+
+
+def _kinematics(axes: Any, record: FingerRecord) -> None:
+    lines = [_curve(axes, record.time, record.position, 1e3, BLUE, "position (mm)")]
+    right = axes.twinx()
+    right.grid(False)
+    right.spines["right"].set_visible(True)
+    lines.append(_curve(right, record.time, record.velocity, 1e3, ORANGE, "velocity (mm/s)"))
+    axes.set(title="Motion", ylabel="position (mm)")
+    right.set_ylabel("velocity (mm/s)")
+    for panel, series in ((axes, record.position), (right, record.velocity)):
+        loaded = np.abs(1e3 * series.value[np.isfinite(series.value) & (record.contact == LOADED)])
+        reach = 1.3 * float(np.quantile(loaded, 0.99)) if loaded.size else 1.0
+        panel.set_ylim(-max(reach, 0.1), max(reach, 0.1))
+    legend(axes, lines, [each.get_label() for each in lines])
+
+
+def _over_load(axes: Any, records: Sequence[FingerRecord], law: LoadLaw) -> None:
+    """The paper's Fig. 8 C: windows as dots, a fitted power a frequency, and mean and deviation of every recording."""
+    bins = by_frequency(samples_of([each.impedance for each in records]))
+    chosen = [bins[i] for i in _shown(np.ones((1, len(bins))))]
+    for samples, colour in zip(chosen, _colours(len(chosen)), strict=True):
+        label = f"{np.median(samples.frequency):.0f} Hz"
+        at = int(np.argmin(np.abs(law.frequency - np.median(samples.frequency))))
+        axes.plot(samples.load, np.abs(samples.value), ".", color=colour, ms=2.5, alpha=0.5)
+        reach = np.array([samples.load.min(), samples.load.max()])
+        line = law.magnitude[at] * (reach / law.reference_load[at]) ** law.exponent[at]
+        axes.plot(reach, line, color=colour, lw=1.6, label=label)
+    if len(records) > 1:
+        _means(axes, records, float(law.frequency[np.argmin(np.abs(np.log(law.frequency / TYPICAL)))]))
+    axes.set(title="Impedance over load", xlabel="normal load W (N)", ylabel="|Z_f| (N s/m)", xscale="log")
+    axes.set_yscale("log")
+    for axis in (axes.xaxis, axes.yaxis):
+        _numbers(axis)
+    axes.legend(fontsize=7, loc="center left", bbox_to_anchor=(1.0, 0.5), handlelength=1.2)
+
+
+def _means(axes: Any, records: Sequence[FingerRecord], frequency: float) -> None:
+    """Mean and standard deviation of load and impedance of every recording at one frequency, black as in Fig. 8 C."""
+    label: str | None = f"each at {frequency:.0f} Hz"
+    for record in records:
+        near = [each for each in by_frequency(samples_of(record.impedance)) if _near(each, frequency)]
+        if near:
+            load, size = near[0].load, np.abs(near[0].value)
+            style = {"color": "black", "marker": "o", "ms": 4, "lw": 0, "elinewidth": 1.0, "zorder": 5, "label": label}
+            axes.errorbar(load.mean(), size.mean(), size.std(), load.std(), **style)
+            label = None
+
+
+def _near(samples: Samples, frequency: float) -> bool:
+    return abs(np.log(np.median(samples.frequency) / frequency)) < models.BAND
+
+
+def _determination(axes: Any, each: list[LoadLaw], pooled: LoadLaw) -> None:
+    """The paper's Fig. 8 D: coefficient of determination between load and impedance, within a recording."""
+    for law in each:
+        axes.plot(law.frequency, law.determination, "o", color=PALE, ms=3, alpha=0.7)
+    mean = [
+        np.mean([law.determination[np.abs(np.log(law.frequency / at)) < models.BAND].mean() for law in _with(each, at)])
+        for at in pooled.frequency
+    ]
+    axes.plot(pooled.frequency, mean, "o-", color=INK, lw=1.4, ms=4, label="mean" if len(each) > 1 else None)
+    axes.set(title="|Z_f| explained by the load", ylabel="R² within a recording", ylim=(-0.03, 1.03))
+    _frequency_axis(axes.xaxis)
+
+
+def _with(laws: list[LoadLaw], frequency: float) -> list[LoadLaw]:
+    """Laws that have a determination at a frequency."""
+    return [
+        law for law in laws
+        if np.isfinite(law.determination[np.abs(np.log(law.frequency / frequency)) < models.BAND]).any()
+    ]  # fmt: skip
+
+
+def _exponent(axes: Any, each: list[LoadLaw], pooled: LoadLaw) -> None:
+    """Exponent of the impedance over the load, with 1/3 of Hertz contact."""
+    if len(each) > 1:
+        for law in each:
+            axes.plot(law.frequency, law.exponent, "o", color=PALE, ms=3, alpha=0.7)
+    bars = SURE * pooled.standard_error
+    label = "all, 95 %" if len(each) > 1 else "95 %"
+    style = {"color": BLUE, "marker": "o", "ms": 4, "lw": 1.2, "capsize": 2, "label": label}
+    axes.errorbar(pooled.frequency, pooled.exponent, bars, **style)
+    axes.axhline(1 / 3, color=INK, lw=1.0, ls="--", label="1/3 (Hertz)")
+    known = pooled.exponent[np.isfinite(pooled.exponent)]
+    axes.set(title="Exponent n of |Z_f| ~ Wⁿ", ylabel="n")
+    axes.set_ylim(min(-0.1, known.min(initial=0) - 0.2), max(0.8, known.max(initial=0) + 0.2))
+    _frequency_axis(axes.xaxis)
+    axes.legend(loc="lower right")
+
+
+def _over_frequency(column: Any, name: str, fits: Mapping[int, FingerFit], samples: Samples) -> None:
+    """One class: windows, their weighted means and the fits, all at the reference load of the better fit."""
+    best = next(iter(fits.values()))
+    load = best.mechanics.reference_load
+    growth = (load / samples.load) ** best.load_exponent
+    samples = samples._replace(value=samples.value * growth, standard_error=samples.standard_error * growth)
+    grid = np.geomspace(samples.frequency.min(), samples.frequency.max(), 300)
+    views: tuple[Callable[[Array], Array], ...] = (np.abs, lambda z: np.degrees(np.angle(z)))
+    for axes, view in zip(column, views, strict=True):
+        axes.plot(samples.frequency, view(samples.value), ".", color=PALE, ms=2, alpha=0.4, zorder=1)
+    frequency, mean, error = _band_means(samples)
+    bars = (error, np.degrees(error / np.abs(mean)))
+    for axes, view, bar in zip(column, views, bars, strict=True):
+        style = {"fmt": "o", "color": INK, "ms": 4.5, "elinewidth": 1, "capsize": 2, "zorder": 4, "label": "measured"}
+        axes.errorbar(frequency, view(mean), bar, **style)
+    for order, fit in sorted(fits.items()):
+        _model(column, fit, grid, load, COLOURS[order], NAMES[order])
+    low, high = samples.load.min(), samples.load.max()
+    at = f"{load:.2g} N (data: {low:.2g} to {high:.2g} N)"
+    column[0].set(title=f"{name.capitalize()} touch, at {at}", xscale="log", yscale="log")
+    column[1].set_xlabel("frequency (Hz)")
+    column[0].legend(loc="best")
+
+
+def _model(column: Any, fit: FingerFit, grid: Array, load: float, colour: str, name: str) -> None:
+    """Modulus and phase of a fit, with 95 % bands."""
+    z, error = fit.impedance(grid, load), SURE * fit.relative_error(grid, load)
+    phase, line = (
+        np.degrees(np.angle(z)),
+        {"color": colour, "lw": 1.6, "ls": "--" if fit.order == 2 else "-", "zorder": 3},
+    )
+    column[0].plot(grid, np.abs(z), label=name, **line)
+    column[1].plot(grid, phase, **line)
+    column[0].fill_between(
+        grid, np.abs(z) * np.exp(-error.real), np.abs(z) * np.exp(error.real), color=colour, alpha=0.25, lw=0
+    )
+    spread = np.degrees(error.imag)
+    column[1].fill_between(grid, phase - spread, phase + spread, color=colour, alpha=0.25, lw=0)
+
+
+def _band_means(samples: Samples) -> tuple[Array, Array, Array]:
+    """Weighted mean of every bin of frequencies, and its standard error, enlarged where the windows scatter more."""
+    rows = []
+    for each in by_frequency(samples):
+        weight = each.standard_error**-2
+        mean, error = np.average(each.value, weights=weight), weight.sum() ** -0.5
+        freedom = max(2 * len(each.value) - 2, 1)
+        scatter = np.sum(np.abs(each.value - mean) ** 2 * weight) / freedom
+        rows.append((np.median(each.frequency), mean, error * max(1.0, scatter) ** 0.5))
+    frequency, mean, error = (np.array(column) for column in zip(*rows, strict=True))
+    return frequency, mean, error
+
+
+def _numbers(axis: Any) -> None:
+    """Plain numbers on a logarithmic axis, also at 2 and 5 within a decade."""
+    axis.set_major_formatter(lambda value, _: f"{value:g}")
+    axis.set_minor_formatter(lambda value, _: f"{value:g}" if f"{value:e}"[0] in "25" else "")
+
+
+def _frequency_axis(axis: Any) -> None:
+    axis.axes.set_xscale("log")
+    axis.axes.set_xlabel("frequency (Hz)")
+    _numbers(axis)
+
+
+def _page(records: Sequence[FingerRecord], fits: Fits, pictures: list[str]) -> str:
+    """HTML of the page."""
+    title = escape(records[0].name) if len(records) == 1 else f"{len(records)} recordings"
+    times = "\n".join(_record(record, f"time-{i + 1}.png", pictures) for i, record in enumerate(records))
+    return f"""<!DOCTYPE html>
+<html lang="en">
+<head>
+<meta charset="utf-8">
+<meta name="viewport" content="width=device-width, initial-scale=1">
+{GENERATOR}
+<title>The finger, measured: {title}</title>
+<style>{STYLE}</style>
+</head>
+<body>
+<h1>The finger, measured: {title}</h1>
+<p>Load, position and mechanical impedance Z<sub>f</sub> = F<sub>f</sub>/v of the finger, computed from the sensors of
+the surface and from its drive. Intervals are of 95&nbsp;%.</p>
+<section><h2>Impedance over frequency</h2>
+{_picture("frequency.png", pictures, "Modulus and phase of the impedance over frequency, with fits")}
+{_fits(fits)}</section>
+<section><h2>Impedance over the load</h2>
+{_picture("load.png", pictures, "Impedance over load, share explained by the load, exponent over frequency")}
+{_laws(records)}</section>
+{times}
+<footer class="note">Made by hapticrender {escape(__version__)}.</footer>
+</body>
+</html>
+"""
+
+
+def _picture(name: str, pictures: list[str], alt: str) -> str:
+    if name in pictures:
+        return f'<a href="{name}"><img src="{name}" alt="{escape(alt)}"></a>'
+    return NO_PICTURE if not pictures else '<p class="note">No picture: there are too few data.</p>'
+
+
+def _fits(fits: Fits) -> str:
+    """Table of all fits, one a column, the supported order marked."""
+    if not fits:
+        return '<p class="note">No fit: a finger takes at least two frequencies.</p>'
+    flat = [(name, fit) for name, of_class in fits.items() for _, fit in sorted(of_class.items())]
+    rows = [(escape(label), *(_value(fit, name) for _, fit in flat)) for name, label in LABELS.items()]
+    rows += [
+        ("loads", *(f"{fit.loads[0]:.2f} to {fit.loads[1]:.2f} N" for _, fit in flat)),
+        ("χ² / degrees of freedom", *(f"{fit.chi_square:.0f} / {fit.degrees_of_freedom}" for _, fit in flat)),
+        ("probability p of a larger χ²", *(_probability(fit.p_value) for _, fit in flat)),
+        ("supported by the data", *(_supported(fits[name], fit) for name, fit in flat)),
+    ]  # fmt: skip
+    body = [_row("td", *cells) for cells in rows]
+    heads = (f"{name}, {NAMES[fit.order]}<br>at {fit.mechanics.reference_load:.2f} N" for name, fit in flat)
+    return f"""{html_table(_row("th", "Finger", *heads), body)}
+<p class="note">With half of the 95&nbsp;% interval. The supported order has the smaller Bayesian information
+criterion; a difference of 10 is strong.
+With p below 0.01 the model, with one exponent for all loads, does not explain the data within their stated errors:
+intervals are enlarged by the scatter, and the parameters describe the data without being the finger’s.</p>"""
+
+
+def _probability(p: float) -> str:
+    return "&lt;0.001" if p < 1e-3 else f"{p:.3f}"
+
+
+def _supported(of_class: Mapping[int, FingerFit], fit: FingerFit) -> str:
+    if len(of_class) == 1:
+        return "too few frequencies to say"
+    return f"yes, by {fit.bic_margin:.3g}" if isfinite(fit.bic_margin) else "no"
+
+
+def _row(kind: str, first: str, *cells: str) -> str:
+    """One row of a table, its first cell a text."""
+    return f'<tr><{kind} class="text">{first}</{kind}>{"".join(f"<{kind}>{each}</{kind}>" for each in cells)}</tr>'
+
+
+def _value(fit: FingerFit, name: str) -> str:
+    """A parameter and half of its 95 % interval, in g, N s/m, N/mm or 1; a dash where the model has none."""
+    if name not in fit.names:
+        return "–"
+    scale = 1e3 if name.endswith("mass") else 1e-3 if name.endswith("stiffness") else 1.0
+    half = SURE * fit.standard_errors[name] * scale
+    digits = int(np.clip(1 - np.floor(np.log10(half)), 0, 4)) if half > 0 else 3
+    return f"{fit.values[name] * scale:.{digits}f} ± {half:.{digits}f}"
+
+
+def _laws(records: Sequence[FingerRecord]) -> str:
+    """Table of exponents, all recordings together."""
+    law = models.load_exponent([each.impedance for each in records])
+    rows = [
+        _row("td", f"{frequency:.0f} Hz", f"{n:.3f} ± {SURE * error:.3f}" if np.isfinite(n) else "–",
+             f"{size:.2f} N s/m at {load:.2f} N", f"{count}")
+        for frequency, n, error, size, load, count in zip(
+            law.frequency, law.exponent, law.standard_error, law.magnitude, law.reference_load, law.count, strict=True
+        )
+    ]  # fmt: skip
+    return f"""{html_table(_row("th", "Frequency", "exponent n", "|Z<sub>f</sub>|", "windows"), rows)}
+<p class="note">|Z<sub>f</sub>| ~ W<sup>n</sup>; contact of an elastic sphere suggests n = 1/3.</p>"""
+
+
+def _record(record: FingerRecord, name: str, pictures: list[str]) -> str:
+    """Section of one recording."""
+    touched = sum(each.stop - each.start for each in record.of_kind(LOADED))
+    plate = "measured in its unloaded spans" if record.plate.measured else "as in the profile"
+    entries = [
+        (
+            "In contact",
+            f"{touched:.2f} of {record.time[-1] - record.time[0]:.2f} s, {len(record.of_kind(LOADED))} touches",
+        ),
+        ("Position good to 1 mm", f"from {record.least_load:.2f} N on" if isfinite(record.least_load) else "nowhere"),
+        (
+            "Bandwidth of load and position",
+            f"{record.normal_load.bandwidth:.3g} and {record.position.bandwidth:.3g} Hz",
+        ),
+        ("The plate's own stiffness and damping", plate),
+        *(("Note", note) for note in record.notes),
+    ]
+    return f"""<section><h2>{escape(record.name)}</h2>
+{_picture(name, pictures, f"Load, impedance, position and velocity over time: {record.name}")}
+<dl>{"".join(f"<dt>{key}</dt><dd>{escape(value)}</dd>" for key, value in entries)}</dl></section>"""
