@@ -22,6 +22,9 @@ if not (_here / "renderers").is_dir():
 __version__ = "0.2.0"
 
 _HOMES = {
+    "analysis.analyse": "analyse_finger",
+    "analysis.records": "FingerRecord",
+    "analysis.tracker": "FingerTracker",
     "analysis.models": "fit_finger fit_load_classes load_exponent",
     "bands": "Bands",
     "control.demodulator": "Demodulator",
@@ -49,6 +52,9 @@ _HOME_OF = {name: home for home, names in _HOMES.items() for name in names.split
 __all__ = sorted(_HOME_OF)
 
 if _typing.TYPE_CHECKING:
+    from hapticrender.analysis.analyse import analyse_finger as analyse_finger
+    from hapticrender.analysis.records import FingerRecord as FingerRecord
+    from hapticrender.analysis.tracker import FingerTracker as FingerTracker
     from hapticrender.analysis.models import fit_finger as fit_finger
     from hapticrender.analysis.models import fit_load_classes as fit_load_classes
     from hapticrender.analysis.models import load_exponent as load_exponent
