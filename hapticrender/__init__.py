@@ -53,11 +53,11 @@ __all__ = sorted(_HOME_OF)
 
 if _typing.TYPE_CHECKING:
     from hapticrender.analysis.analyse import analyse_finger as analyse_finger
-    from hapticrender.analysis.records import FingerRecord as FingerRecord
-    from hapticrender.analysis.tracker import FingerTracker as FingerTracker
     from hapticrender.analysis.models import fit_finger as fit_finger
     from hapticrender.analysis.models import fit_load_classes as fit_load_classes
     from hapticrender.analysis.models import load_exponent as load_exponent
+    from hapticrender.analysis.records import FingerRecord as FingerRecord
+    from hapticrender.analysis.tracker import FingerTracker as FingerTracker
     from hapticrender.bands import Bands as Bands
     from hapticrender.control.demodulator import Demodulator as Demodulator
     from hapticrender.errors import DesignError as DesignError
