@@ -5,7 +5,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from finger_data import FREQUENCIES, make_impedance
+from finger_data import FREQUENCIES, make_impedance, make_record
 from scipy.stats import binom, chi2
 
 import hapticrender as hr
@@ -59,6 +59,27 @@ def test_the_predicted_error_of_the_impedance_is_the_measured_one(fitted):
     for part in (np.real, np.imag):  # ln |Z| and phase; the standard error of a deviation is 1/sqrt(2 n) of it
         measured = np.sqrt(np.mean(part(off) ** 2, axis=0))
         np.testing.assert_allclose(measured, part(predicted), rtol=4 / np.sqrt(2 * len(off)))
+
+
+def test_errors_of_the_plate_are_not_averaged_over_windows():
+    """All windows of a record have the same error of the plate's mass, damping and stiffness, drawn for each record."""
+    rng, w = np.random.default_rng(3), 2 * np.pi * FREQUENCIES
+    errors = np.array([3e-5, 0.02, 10.0])  # kg, N s/m, N/m
+    patterns = np.array([1j * w, w**0, 1 / (1j * w)])
+    record, pulls = make_record(rng, LIGHT_SECOND, plate_errors=errors[1:]), {"record": [], "impedance": []}
+    for _ in range(60):
+        z = make_impedance(rng, LIGHT_SECOND, 8, (0.1, 0.49), noise=0.02)
+        stated = np.sqrt(z.standard_error**2 + errors**2 @ np.abs(patterns) ** 2 / 2)
+        z = replace(z, value=z.value + (errors * rng.standard_normal(3)) @ patterns, standard_error=stated)
+        for name, measured in (("record", replace(record, impedance=z)), ("impedance", z)):
+            fit = hr.fit_finger(measured, 2)
+            truth = LIGHT_SECOND.load_factor(fit.mechanics.reference_load)
+            parts = [(getattr(fit.mechanics, key) / getattr(LIGHT_SECOND, key) - truth) for key in fit.names[:3]]
+            sigma = [fit.standard_errors[key] / getattr(LIGHT_SECOND, key) for key in fit.names[:3]]
+            pulls[name].append(np.divide(parts, sigma))
+    inside = (np.abs(pulls["record"]) < 1).sum(axis=0)
+    assert (binom.ppf(RARE, 60, 0.683) <= inside).all()
+    assert (np.sqrt(np.mean(np.square(pulls["impedance"]), axis=0)) > 1.5).all()
 
 
 @pytest.mark.parametrize(("order", "draws"), [(2, 20), (4, 10)])

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from hapticrender.analysis.records import Impedance
+from hapticrender.analysis.records import FingerRecord, Impedance
 from hapticrender.checks import require
 from hapticrender.protocols import Array
 from hapticrender.touch.mechanics import HEAVY, LIGHT, LIGHT_BELOW, FingerMechanics
@@ -25,6 +25,9 @@ MOST_STEPS = 100  # of a search; without a skin in the data its stiffness would 
 _STIFF_SKIN = (0.1, 20.0, 40.0)  # in these units: hardly a skin
 
 
+Source = FingerRecord | Impedance
+
+
 class Samples(NamedTuple):
     """Unmasked entries of impedances, one row each."""
 
@@ -32,6 +35,7 @@ class Samples(NamedTuple):
     value: Array  # N s/m, complex
     standard_error: Array  # N s/m
     load: Array  # N
+    source: Array  # which of the recordings
 
 
 @dataclass(frozen=True)
@@ -60,8 +64,7 @@ class FingerFit:
 
     Notes
     -----
-    Intervals hold for a model that explains the data (`p_value`) and errors that are independent.  An error shared by
-    all windows, as of the plate's own mass, is in neither: it adds to the fitted mass, damping and stiffness directly.
+    Intervals hold for a model that explains the data (see `p_value`).
     """
 
     mechanics: FingerMechanics
@@ -157,7 +160,7 @@ class LoadLaw:
 
 
 def fit_finger(
-    impedance: Impedance | Sequence[Impedance],
+    impedance: Source | Sequence[Source],
     order: int | None = None,
     *,
     loads: tuple[float, float] = (0.0, inf),
@@ -167,8 +170,9 @@ def fit_finger(
 
     Parameters
     ----------
-    impedance : Impedance, or a sequence of them
-        As measured, in one or several recordings; masked entries (NaN) are left out.
+    impedance : FingerRecord, Impedance, or a sequence of them
+        As measured, in one or several recordings; masked entries (NaN) are left out.  All errors of an Impedance count
+        as independent; those of a FingerRecord are in part shared, see the notes.
     order : {2, 4} or None
         None takes the order that the data support: the 4th where the Bayesian information criterion is smaller.
     loads : (float, float), N
@@ -193,6 +197,11 @@ def fit_finger(
     them is at most that of 3 more parameters; both are divided by ``max(1, chi^2/degrees of freedom)`` of the 4th (as
     an F test does), so that errors which were stated too small do not call for more parameters.
 
+    All windows of a recording share the errors of the plate's own mass, damping and stiffness, which no number of
+    windows averages: ``dZ = j w dm + db + dk/(j w)``.  Their standard deviations are those of the record's plate, at
+    most ``min sqrt(2) sigma_i/w_i`` (for the mass: just this), ``min sqrt(2) sigma_i`` and ``min sqrt(2) sigma_i w_i``,
+    what the impedance's errors have room for.  They add to the covariance of the samples: ``r^T (S + G G^T)^-1 r``.
+
     References
     ----------
     Grigorii et al. 2021, Table 1 and Fig. 9; Schwarz: Estimating the dimension of a model, 1978.
@@ -210,15 +219,16 @@ def fit_finger(
     require(order in (None, 2, 4), "order", order, "2, 4 or None")
     samples = samples_of(impedance, loads)
     _check_enough(samples, order or 2, loads)
-    second = _fit(samples, 2, load_exponent)
+    shared = _shared_errors(impedance, samples)
+    second = _fit(samples, shared, 2, load_exponent)
     if order == 2 or (order is None and _carriers(samples) < FEWEST[4]):
         return second
-    fourth = _fit(samples, 4, load_exponent, second)
+    fourth = _fit(samples, shared, 4, load_exponent, second)
     return fourth if order == 4 else _supported(second, fourth)
 
 
 def fit_load_classes(
-    impedance: Impedance | Sequence[Impedance],
+    impedance: Source | Sequence[Source],
     classes: Mapping[str, tuple[float, float]] = LOAD_CLASSES,
     *,
     order: int | None = None,
@@ -235,7 +245,7 @@ def fit_load_classes(
     }
 
 
-def load_exponent(impedance: Impedance | Sequence[Impedance]) -> LoadLaw:
+def load_exponent(impedance: Source | Sequence[Source]) -> LoadLaw:
     """Fit ``|Z_f| ~ W**n`` at every frequency (bins of 5 %), weighted by the standard errors.
 
     The standard error of n is enlarged by ``sqrt(chi^2/degrees of freedom)`` where the windows scatter by more than
@@ -248,15 +258,19 @@ def load_exponent(impedance: Impedance | Sequence[Impedance]) -> LoadLaw:
     return LoadLaw(*(np.array(column) for column in columns))
 
 
-def samples_of(impedance: Impedance | Sequence[Impedance], loads: tuple[float, float] = (0.0, inf)) -> Samples:
+def _parts(impedance: Source | Sequence[Source]) -> list[Source]:
+    return [impedance] if isinstance(impedance, FingerRecord | Impedance) else list(impedance)
+
+
+def samples_of(impedance: Source | Sequence[Source], loads: tuple[float, float] = (0.0, inf)) -> Samples:
     """Unmasked entries with a load (N) from the first of `loads` to below the second, and above 0."""
-    parts = [impedance] if isinstance(impedance, Impedance) else list(impedance)
+    parts = [each.impedance if isinstance(each, FingerRecord) else each for each in _parts(impedance)]
     rows = [
-        np.broadcast_arrays(each.frequency, each.value, each.standard_error, each.normal_load[:, None])
-        for each in parts
+        np.broadcast_arrays(each.frequency, each.value, each.standard_error, each.normal_load[:, None], number)
+        for number, each in enumerate(parts)
     ]
     columns = [np.concatenate([np.ravel(column) for column in same]) for same in zip(*rows, strict=True)]
-    found = Samples(*(columns or [np.empty(0)] * 4))
+    found = Samples(*(columns or [np.empty(0)] * 5))
     good = np.isfinite(found.frequency) & np.isfinite(found.value) & np.isfinite(found.standard_error)
     with np.errstate(invalid="ignore"):
         good &= (found.frequency > 0) & (found.load > 0) & (found.load >= loads[0]) & (found.load < loads[1])
@@ -301,7 +315,30 @@ def _impedance(numbers: Mapping[str, Any], frequency: Array, normal_load: float 
     return whole * np.exp(numbers["load_exponent"] * np.log(np.asarray(normal_load) / numbers["reference_load"]))
 
 
-def _fit(samples: Samples, order: int, exponent: float | None, second: FingerFit | None = None) -> FingerFit:
+def _shared_errors(impedance: Source | Sequence[Source], samples: Samples) -> Array:
+    """G over the samples' own errors, for real and imaginary parts: shape (2 n, 3 recordings); see `fit_finger`."""
+    parts, w, sigma = _parts(impedance), 2 * np.pi * samples.frequency, samples.standard_error
+    shared = np.zeros((2, len(w), len(parts), 3))
+    for number, each in enumerate(parts):
+        own = samples.source == number
+        if not isinstance(each, FingerRecord) or not own.any():
+            continue
+        errors = each.plate.standard_errors
+        known = [
+            np.hypot(errors[f"{name}_1"].mean(), errors[f"{name}_2"].mean()) if f"{name}_1" in errors else inf
+            for name in ("damping", "stiffness")
+        ]
+        most = [sqrt(2) * (sigma[own] * factor).min() for factor in (1 / w[own], 1.0, w[own])]
+        mass, damping, stiffness = np.minimum([inf, *known], most)
+        shared[0, own, number, 1] = damping / sigma[own]
+        shared[1, own, number, 0] = mass * w[own] / sigma[own]
+        shared[1, own, number, 2] = -stiffness / w[own] / sigma[own]
+    return shared.reshape(2 * len(w), -1)
+
+
+def _fit(
+    samples: Samples, shared: Array, order: int, exponent: float | None, second: FingerFit | None = None
+) -> FingerFit:
     """Fit one order, from several starts where it is the 4th."""
     from scipy.optimize import least_squares
 
@@ -311,11 +348,14 @@ def _fit(samples: Samples, order: int, exponent: float | None, second: FingerFit
         names = (*names, "load_exponent")
     units = np.array([_unit(name) for name in names])
     weight = 1 / samples.standard_error
+    along, size, _ = np.linalg.svd(shared, full_matrices=False)  # (1 + G G^T)^(-1/2) = 1 - U (1 - (1 + s^2)^(-1/2)) U^T
+    shrink = 1 - 1 / np.sqrt(1 + size**2)
 
     def residual(x: Array) -> Array:
         numbers = fixed | dict(zip(names, (x * units).tolist(), strict=True))
         apart = (_impedance(numbers, samples.frequency, samples.load) - samples.value) * weight
-        return np.concatenate([apart.real, apart.imag])
+        white = np.concatenate([apart.real, apart.imag])
+        return white - along @ (shrink * (along.T @ white))
 
     most = np.append(_MOST, 10.0)[[*range(3 * order // 2), *([6] if len(names) % 3 else [])]]
     least = np.where(np.array(names) == "load_exponent", -10.0, 0.0)

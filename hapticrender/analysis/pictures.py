@@ -61,7 +61,7 @@ def draw(records: FingerRecord | Sequence[FingerRecord], folder: str | os.PathLi
         raise ValueError("records is empty: must be at least one FingerRecord")
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
-    fits, laws = fit_all(records), [models.load_exponent(each.impedance) for each in records]
+    fits, laws = fit_all(records), [models.load_exponent(each) for each in records]
     drawn: dict[str, Callable[[Path], None]] = {
         f"time-{i + 1}.png": partial(draw_time, each) for i, each in enumerate(records)
     }
@@ -82,12 +82,12 @@ def draw(records: FingerRecord | Sequence[FingerRecord], folder: str | os.PathLi
 
 def fit_all(records: Sequence[FingerRecord]) -> Fits:
     """Fit both orders to every class of loads that has enough data, all recordings together, the better one first."""
-    impedances, found = [each.impedance for each in records], {}
-    for name, fit in models.fit_load_classes(impedances).items():
+    found: Fits = {}
+    for name, fit in models.fit_load_classes(records).items():
         found[name] = {fit.order: fit}
         if isfinite(fit.bic_margin):
             other = 6 - fit.order
-            found[name][other] = models.fit_finger(impedances, other, loads=LOAD_CLASSES[name])
+            found[name][other] = models.fit_finger(records, other, loads=LOAD_CLASSES[name])
     return found
 
 
@@ -108,8 +108,7 @@ def draw_time(record: FingerRecord, path: str | os.PathLike[str]) -> None:
 
 def draw_load(records: Sequence[FingerRecord], path: str | os.PathLike[str]) -> None:
     """Draw the impedance over the load, how much of it the load explains, and the exponent, over frequency."""
-    impedances = [each.impedance for each in records]
-    pooled, each = models.load_exponent(impedances), [models.load_exponent(one) for one in impedances]
+    pooled, each = models.load_exponent(records), [models.load_exponent(one) for one in records]
     with new_figure((12, 4.2), pads=(0.1, 0.05)) as figure:
         over_load, share, power = figure.subplots(1, 3, width_ratios=[1.4, 1, 1])
         _over_load(over_load, records, pooled)
@@ -120,12 +119,11 @@ def draw_load(records: Sequence[FingerRecord], path: str | os.PathLike[str]) -> 
 
 def draw_frequency(records: Sequence[FingerRecord], fits: Fits, path: str | os.PathLike[str]) -> None:
     """Draw modulus and phase of the impedance over frequency, with both fits and their 95 % bands, a class a column."""
-    impedances = [each.impedance for each in records]
     with new_figure((5.4 * max(len(fits), 1.3), 6.2), pads=(0.1, 0.08)) as figure:
         panels = figure.subplots(2, len(fits), sharex=True, sharey="row", height_ratios=[1.5, 1], squeeze=False)
         for (name, of_class), column in zip(fits.items(), panels.T, strict=True):
-            _over_frequency(column, name, of_class, samples_of(impedances, LOAD_CLASSES[name]))
-        size = np.abs(samples_of(impedances).value)
+            _over_frequency(column, name, of_class, samples_of(records, LOAD_CLASSES[name]))
+        size = np.abs(samples_of(records).value)
         panels[0, 0].set_ylim(0.6 * np.quantile(size, 0.01), 1.7 * np.quantile(size, 0.99))
         panels[0, 0].set_ylabel("|Z_f| (N s/m)")
         panels[1, 0].set_ylabel("phase (degrees)")
@@ -230,7 +228,7 @@ def _kinematics(axes: Any, record: FingerRecord) -> None:
 
 def _over_load(axes: Any, records: Sequence[FingerRecord], law: LoadLaw) -> None:
     """The paper's Fig. 8 C: windows as dots, a fitted power a frequency, and mean and deviation of every recording."""
-    bins = by_frequency(samples_of([each.impedance for each in records]))
+    bins = by_frequency(samples_of(records))
     chosen = [bins[i] for i in _shown(np.ones((1, len(bins))))]
     for samples, colour in zip(chosen, _colours(len(chosen)), strict=True):
         label = f"{np.median(samples.frequency):.0f} Hz"
@@ -252,7 +250,7 @@ def _means(axes: Any, records: Sequence[FingerRecord], frequency: float) -> None
     """Mean and standard deviation of load and impedance of every recording at one frequency, black as in Fig. 8 C."""
     label: str | None = f"each at {frequency:.0f} Hz"
     for record in records:
-        near = [each for each in by_frequency(samples_of(record.impedance)) if _near(each, frequency)]
+        near = [each for each in by_frequency(samples_of(record)) if _near(each, frequency)]
         if near:
             load, size = near[0].load, np.abs(near[0].value)
             style = {"color": "black", "marker": "o", "ms": 4, "lw": 0, "elinewidth": 1.0, "zorder": 5, "label": label}
@@ -451,7 +449,7 @@ def _value(fit: FingerFit, name: str) -> str:
 
 def _laws(records: Sequence[FingerRecord]) -> str:
     """Table of exponents, all recordings together."""
-    law = models.load_exponent([each.impedance for each in records])
+    law = models.load_exponent(records)
     rows = [
         _row("td", f"{frequency:.0f} Hz", f"{n:.3f} ± {SURE * error:.3f}" if np.isfinite(n) else "–",
              f"{size:.2f} N s/m at {load:.2f} N", f"{count}")
