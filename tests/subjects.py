@@ -27,8 +27,13 @@ class Subject:
     off: float = 0.02  # of the plate from its profile
 
     @property
+    def amplitudes(self):
+        return np.maximum(SPEED / (2 * np.pi * np.array(self.frequencies)), LEAST)
+
+    @property
     def scene(self):
-        bands = [hr.Grating(frequency=f, amplitude=max(SPEED / (2 * np.pi * f), LEAST)) for f in self.frequencies]
+        pairs = zip(self.frequencies, self.amplitudes.tolist(), strict=True)
+        bands = [hr.Grating(frequency=float(f), amplitude=a) for f, a in pairs]
         texture = bands[0] if len(bands) == 1 else sum(bands[1:], bands[0])
         load = ([0.0, ON, OFF], [self.load, self.load, 1.25 * self.load])
         touch = {"normal_load": load, "touches": [(ON, OFF)], "mechanics": self.mechanics, "load_scaling": True}
@@ -38,13 +43,11 @@ class Subject:
             if self.speed
             else hr.Finger.still(position=0.005, **touch)
         )
-        plate = hr.Scene(texture=bands[0], duration=1.0).profile
         off = np.random.default_rng(self.seed).standard_normal(len(NAMES))
         true = PLATE * (1 + self.off * off)
         return hr.Scene(
             texture=texture,
             finger=finger,
-            profile=plate,
             simulation=dict(zip(NAMES, true.tolist(), strict=True)),
             duration=DURATION,
             seed=self.seed,

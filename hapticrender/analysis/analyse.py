@@ -76,7 +76,7 @@ def analyse_finger(
     lines = signals.unloaded(first, frequency, length, signals.tracker(course, None).threshold / 2)
     rest = None
     if len(lines.time):
-        course = regress(course, lines, signals.noise)
+        course = regress(course, lines, signals.noise) if frequency.size else course
         rest = rest_of(course, lines)
     touch, tracker = signals.track(course, rest), signals.tracker(course, rest)
     impedance = signals.impedance(course, touch, recording.bands, frequency, length, recording.header.calibration)
@@ -97,15 +97,16 @@ def analyse_finger(
 
 def _believed(recording: Recording, profile: DeviceProfile | PlateParameters | str | os.PathLike[str] | None) -> Course:
     """Return what is believed of the recorded plate."""
+    duration = len(recording) / recording.rate
     if isinstance(profile, PlateParameters):
-        return Course.of(profile)
+        return Course.of(profile, duration=duration)
     if isinstance(profile, str | os.PathLike):
         profile = DeviceProfile.load(profile)
     elif profile is None:
         profile = recording.scene.device_profile
     if profile.kind != "vt-plate":
         raise ValueError(f"profile.kind = {profile.kind!r}: must be vt-plate, a plate with sensors of displacement")
-    return Course.of(PlateParameters.with_overrides(profile.device), profile.uncertainty)
+    return Course.of(PlateParameters.with_overrides(profile.device), profile.uncertainty, duration)
 
 
 def _check(recording: Recording, plate: PlateParameters, late: int) -> None:
@@ -119,7 +120,7 @@ def _check(recording: Recording, plate: PlateParameters, late: int) -> None:
     if len(recording) < recording.rate:
         raise ValueError(f"{header.name}: {len(recording) / recording.rate:g} s long: must be >= 1 s")
     if late < 0:
-        raise ValueError(f"block = {late + plate.delay - late}: must be <= the plate's delay of {plate.delay} samples")
+        raise ValueError(f"block = {plate.delay - late}: must be <= the plate's delay of {plate.delay} samples")
     if not np.isfinite(recording.sensed).any(axis=0).all():
         raise ValueError(f"{header.name}: a sensor is finite nowhere: must be displacement in m")
 
@@ -194,7 +195,7 @@ class _Signals:
         ]
         locked = bands.wavenumber > 0.0
         moving = np.abs(bands.frequency[locked] + np.multiply.outer(means[3], bands.wavenumber[locked]))
-        frequency = np.hstack([np.tile(fixed, (len(starts), 1)), moving.reshape(len(starts), -1)])
+        frequency = np.hstack([np.tile(fixed, (len(starts), 1)), moving.reshape(len(starts), int(locked.sum()))])
         usable = (frequency >= SLOWEST) & (frequency <= FASTEST * self.rate)
         frequency = np.where(usable, frequency, SLOWEST)
         lever = np.nan_to_num(place) / a * self.columns[: len(place), 3]
@@ -221,13 +222,13 @@ def _notes(recording: Recording, course: Course, touch: Touch, rest: Rest | None
             "profile"
         )
     elif not course.measured:
-        yield "the drive is too weak while nothing touches: the plate's parameters are those of the profile"
+        yield (
+            "the carriers do not determine the stiffness while nothing touches: it is mostly that of the profile"
+        )
     if not (touch.contact == LOADED).any():
         yield "no finger touches"
     elif not len(impedance.time):
         yield "no touch is long enough for a window: the impedance is not measured"
-    if course.plate.bending_frequency:
-        yield "the glass is taken as rigid: its bending mode is left out of the force"
     flags = np.bitwise_or.reduce(recording.flags) if len(recording) else 0
     for bad, text in ((Flag.NONFINITE, "samples that are no numbers are held"), (Flag.SENSOR_CLIPPED, "a sensor clips")):
         if flags & bad:

@@ -36,8 +36,8 @@ class ContactDetector:
     quiet : int, samples
         At the beginning, in which filters settle and no contact is detected.
     still : float, N
-        A mean of the heave force over a tick that is farther from that at rest is not averaged into it: a touch too
-        light to be detected at once.
+        A mean of the heave force over a tick that is farther from that at rest counts as if it were so far: a touch too
+        light to be detected changes the force at rest slowly.
     columns : int
         Of what is measured: the heave force (N) first, others beside it, whose values at rest are followed as well.
     """
@@ -92,11 +92,12 @@ class ContactDetector:
 
     def _follow(self, measured: Array, loaded: Array, end: int) -> None:
         """Average a tick without contact into the values at rest."""
-        if not loaded.any() and end > self._quiet:
+        if not loaded.any() and end - self._count - len(measured) >= self._quiet:
             self._sum, self._count = self._sum + measured.sum(axis=0), self._count + len(measured)
         if end % self._tick == 0:
             change = self._sum / self._tick - self._rest
-            if self._count == self._tick and (self._ticks == 0.0 or abs(change[0]) < self._still):
+            if self._count == self._tick:
+                most = np.inf if self._ticks == 0.0 else self._still
                 self._ticks = min(self._ticks + 1.0, FOLLOWED / TICK)
-                self._rest = self._rest + change / self._ticks
+                self._rest = self._rest + change * min(1.0, most / max(abs(change[0]), 1e-30)) / self._ticks
             self._sum, self._count = np.zeros_like(self._sum), 0

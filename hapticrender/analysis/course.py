@@ -5,6 +5,10 @@ In heave and rocking q = [x_c, a theta], with the finger at g = p/a (see `haptic
     F_f [1, g] = K_f [[1, 1], [-1, 1]] i - (M q'' + C q' + K q)
 
 The bracket is linear in the parameters theta = [m, I, k1, k2, b1, b2]: it is ``Phi theta`` with the regressors Phi.
+Where the glass bends (frequency, damping and shape phi of the profile), the sensors add ``e = B(s) (phi_coil f_c -
+phi(p) F_f)`` to x_c, B the compliance of the mode and f_c the drive's heave force, so that with D the heave row of
+``M s^2 + C s + K`` and r the residual as for rigid glass ``F_f (1 + D phi(p) B) = r + D phi_coil B f_c``.
+
 The rows differ from those that Grigorii et al. 2021 print, (m/2) x'' -+ (I/2) theta'', whose units do not agree.
 """
 
@@ -21,7 +25,7 @@ from hapticrender.protocols import Array
 
 TRACKED = MECHANICAL[2:]  # stiffness and damping, first order in time
 UNCERTAINTY = (0.02, 0.02, 0.02, 0.02, 0.1, 0.1)  # relative, of `MECHANICAL`, where a profile says nothing
-DRIFT = (5e-4, 5e-4, 5e-3, 5e-3)  # 1/s, relative, of `TRACKED`: what they may change before anything is measured
+DRIFT, DRIFT_TIME = (0.02, 0.02, 0.2, 0.2), 40.0  # relative, of `TRACKED`, and s: change over a recording, or over this
 
 
 @dataclass(frozen=True)
@@ -78,12 +82,18 @@ class Course:
     measured: bool = False
 
     @classmethod
-    def of(cls, plate: PlateParameters, uncertainty: Mapping[str, float] | None = None) -> Course:
-        """Parameters of a profile; `uncertainty` is standard, in their units, and `UNCERTAINTY` where it has none."""
+    def of(
+        cls, plate: PlateParameters, uncertainty: Mapping[str, float] | None = None, duration: float = 0.0
+    ) -> Course:
+        """Parameters of a profile; `uncertainty` is standard, in their units, and `UNCERTAINTY` where it has none.
+
+        Over a recording of a `duration` (s) stiffness and damping may drift by `DRIFT`, one standard deviation.
+        """
         start = np.array([getattr(plate, name) for name in MECHANICAL])
         given = uncertainty or {}
         spread = [given.get(name, share * value) for name, share, value in zip(MECHANICAL, UNCERTAINTY, start, strict=True)]  # fmt: skip
-        return cls(plate, start, np.zeros(4), np.diag(np.r_[spread, DRIFT * start[2:]] ** 2))
+        drift = np.array(DRIFT) * start[2:] / max(duration, DRIFT_TIME) if duration else np.zeros(4)
+        return cls(plate, start, np.zeros(4), np.diag(np.r_[spread, drift] ** 2))
 
     def at(self, time: Array | float) -> Array:
         """Parameters at `time` (s), shape (..., 6)."""
@@ -93,6 +103,14 @@ class Course:
         """Covariance (6, 6) of the parameters at a time (s)."""
         both = np.hstack([np.eye(6), np.vstack([np.zeros((2, 4)), time * np.eye(4)])])
         return both @ self.covariance @ both.T
+
+    def bending(self, frequency: Array | float) -> Array:
+        """Displacement of the sensors by bending per modal force (m/N, complex) at `frequency` (Hz); 0: rigid glass."""
+        p, f = self.plate, np.asarray(frequency, float)
+        f0 = p.bending_frequency
+        if not f0:
+            return np.zeros(f.shape, complex)
+        return 1 / (4 * np.pi**2 * p.bending_mass * (f0**2 - f**2 + 2j * p.bending_damping * f0 * f))
 
     def dynamic_stiffness(self, frequency: Array, time: Array | float = 0.0) -> Array:
         """D (N/m, shape (..., 2, 2)) at frequencies (Hz) and times (s) of one shape."""

@@ -45,17 +45,22 @@ def impedance_of(
     phi = amplitudes.regressors(a)[..., 0, :]
     force = amplitudes.force[..., 0] - np.einsum("nbi,ni->nb", phi, course.at(lines.time))
     velocity = amplitudes.velocity[..., 0] + lines.amplitude[..., 8]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        value = force / velocity
     s = 2j * np.pi * lines.frequency
     heave = course.dynamic_stiffness(lines.frequency, times)[..., 0, :]
+    bending, shape = course.bending(lines.frequency), course.plate.displacement(position)[:, 2:]
+    passed = 1 + heave[..., 0] * shape * bending
+    by_coils = course.plate.bending_coil * amplitudes.force[..., 0]
+    force = (force + heave[..., 0] * bending * by_coils) / passed
+    velocity = velocity + s * (shape - 1) * bending * (by_coils - shape * force)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        value = force / velocity
     at_finger = np.stack(np.broadcast_arrays(1.0, (position / a)[:, None] + 0.0 * value.real), axis=-1)
     by_noise = (np.abs(heave + (s * value)[..., None] * at_finger) ** 2 @ noise**2) * lines.variance
     covariance = np.array([course.covariance_at(each) for each in lines.time]).reshape(-1, 6, 6)
     by_plate = np.einsum("nbi,nij,nbj->nb", phi, covariance, phi.conj()).real / 2
     by_place = np.abs(value * amplitudes.velocity[..., 1] * (position_error / a)[:, None]) ** 2 / 2
     with np.errstate(divide="ignore", invalid="ignore"):
-        variance = (by_noise + by_plate + by_place) / np.abs(velocity) ** 2 + np.abs(value * gain_error) ** 2 / 2
+        variance = (by_noise + by_plate + by_place) / np.abs(passed * velocity) ** 2 + np.abs(value * gain_error) ** 2 / 2
         clear = np.abs(velocity) > CLEAR * np.abs(s) * noise[0] * np.sqrt(lines.variance)
     return Impedance(
         lines.time,

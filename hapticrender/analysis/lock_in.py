@@ -53,9 +53,9 @@ def demodulate(signals: Array, starts: Array, length: int, frequency: Array, rat
     time = (np.arange(length) - (length - 1) / 2) / rate
     amplitude = np.empty((count, bands, signals.shape[1]), complex)
     mean, variance, of_mean = np.empty((count, signals.shape[1])), np.empty((count, bands)), np.empty(count)
-    inverse, last = np.empty(0), np.full(bands, np.nan)
+    last = None
     for n, start in enumerate(starts):
-        if not np.array_equal(frequency[n], last):
+        if last is None or not np.array_equal(frequency[n], last):
             inverse, last = _inverse(time, frequency[n]), frequency[n]
             shares = (inverse**2).sum(axis=1)
         found = inverse @ signals[start : start + length]

@@ -69,11 +69,13 @@ def regress(course: Course, lines: Lines, noise: Array) -> Course:
     spread = np.sqrt(np.diagonal(course.covariance))
     scale = np.where(spread > 0.0, spread, 1e-9 * np.maximum(np.abs(prior), 1e-9))
     times = np.broadcast_to(lines.time[:, None], lines.frequency.shape)
+    bent = np.zeros_like(measured.force)
+    bent[..., 0] = course.bending(lines.frequency) * course.plate.bending_coil * measured.force[..., 0]
 
     def left(unknown: Array) -> Array:
         values = prior + scale * unknown
         stiffness = replace(course, start=values[:6], slope=values[6:]).dynamic_stiffness(lines.frequency, times)
-        motion = np.linalg.solve(stiffness, measured.force[..., None])[..., 0]
+        motion = np.linalg.solve(stiffness, measured.force[..., None])[..., 0] + bent
         error = (measured.displacement - motion) / (noise * np.sqrt(lines.variance)[..., None])
         return np.r_[error.real.ravel(), error.imag.ravel(), unknown]
 

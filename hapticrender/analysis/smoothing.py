@@ -87,6 +87,13 @@ class LocalLine:
     rate : float, Hz
     ahead : int, samples
         After each sample that are used; at most `half_width`.
+
+    Attributes
+    ----------
+    bandwidths : (float, float), Hz
+        At which level and slope pass half of the power, inside a long span.
+    noise : (float, float)
+        Sums of w_i^2 (1) and u_i^2 (1/s^2) there.
     """
 
     def __init__(self, spread: float, rate: float, ahead: int) -> None:
@@ -95,6 +102,7 @@ class LocalLine:
         g = derivative_kernels(spread, rate)[0][self.behind - ahead :]
         self._taps = [g * self._times**k for k in range(3)]
         self._squares = [g**2 * self._times**k for k in range(3)]
+        self.bandwidths = self._bandwidths()
         self.noise = tuple(float((weights**2).sum()) for weights in self.weights())
 
     def weights(self) -> tuple[Array, Array]:
@@ -109,7 +117,7 @@ class LocalLine:
         level, slope = (np.exp(1j * np.outer(w, self._times)) @ weights for weights in self.weights())
         return level, slope / (1j * w)
 
-    def bandwidths(self) -> tuple[float, float]:
+    def _bandwidths(self) -> tuple[float, float]:
         """Frequencies (Hz) at which level and slope pass half of the power."""
         frequency = np.arange(0.25, 250.0, 0.25)
         return tuple(float(frequency[np.argmax(np.abs(each) ** 2 < 0.5)]) for each in self.response(frequency))  # type: ignore[return-value]
@@ -119,6 +127,11 @@ class LocalLine:
 
         `inside` (bool, one a sample) says which samples count; all are NaN where too few do.
         """
+        n, k = len(signal) - len(self._times) + 1, signal.shape[1]
+        if not inside.any():
+            return (*np.full((2, n, k), np.nan), *np.full((2, n), np.nan))
+        if inside.all():
+            return (*(convolve(signal, weights) for weights in self.weights()), *np.repeat([self.noise], n, axis=0).T)
         s0, s1, s2 = (convolve(inside.astype(float), taps) for taps in self._taps)
         q0, q1, q2 = (convolve(inside.astype(float), taps) for taps in self._squares)
         t0, t1 = (convolve(np.where(inside[:, None], signal, 0.0), taps) for taps in self._taps[:2])

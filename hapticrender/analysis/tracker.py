@@ -98,6 +98,7 @@ class FingerTracker:
         self._filter = MotionFilter(p, self.rate, spread_of(FAST), late)
         self._noise = float(self._filter.force_noise(noise)[0])
         self._clear = clear_sigmas(2 * FAST)
+        self._bent = float(p.stiffness_matrix[0, 0] * self.course.bending(0.0).real)
         self._detector = ContactDetector(self.rate, 2 * self._filter.delay, self._clear * self._noise / 2, columns=4)
         self._edge = self._filter.delay  # samples beside a change of contact that are left out
         self._given, self._at, self._first = rest, -self._filter.delay, 0
@@ -113,7 +114,7 @@ class FingerTracker:
     @property
     def bandwidth(self) -> tuple[float, float]:
         """Frequencies (Hz) at which load and position, and the velocity, pass half of the power."""
-        return self._line.bandwidths()
+        return self._line.bandwidths
 
     @property
     def load_noise(self) -> float:
@@ -193,19 +194,22 @@ class FingerTracker:
         a, widths = self.course.plate.half_spacing, self.bandwidth
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
             load = np.where(loaded & (level[:, 0] > 0.0), level[:, 0], np.nan)
-            g = level[:, 1] / load
+            for _ in range(2 if self._bent else 0):  # the bending depends on the place, and that on the load
+                load = level[:, 0] / (1 + self._bent * self.course.plate.displacement(a * level[:, 1] / load)[:, 2])
+            g, share = level[:, 1] / load, load / level[:, 0]
             of_load, of_lever = self._of_stiffness(level[:, 2:], g)
             averaged = self._detector.averaged if self._given is None else self._given.samples
             rest = 1.0 / averaged if averaged else 0.0
             scatter = self._white[1] ** 2 + g**2 * self._white[0] ** 2
             load_error = np.sqrt(self._white[0] ** 2 * (of_level + rest) + of_load)
             error = a / load * np.sqrt(scatter * (of_level + rest) + of_lever)
-            velocity = a * (slope[:, 1] - g * slope[:, 0]) / load
+            velocity = a * (slope[:, 1] - g * share * slope[:, 0]) / load
             velocity_error = a / load * np.sqrt(scatter * of_slope)
             defined = error < FARTHEST * a
         position, velocity = (np.where(defined, each, np.nan) for each in (a * g, velocity))
         error, velocity_error = (np.where(defined, each, np.nan) for each in (error, velocity_error))
-        return [(level[:, 0], load_error, widths[0]), (position, error, widths[0]), (velocity, velocity_error, widths[1])]  # fmt: skip
+        load = np.where(np.isnan(load), level[:, 0], load)
+        return [(load, load_error, widths[0]), (position, error, widths[0]), (velocity, velocity_error, widths[1])]  # fmt: skip
 
     def _of_stiffness(self, sag: Array, g: Array) -> tuple[Array, Array]:
         """Variances of the load (N^2) and of N - g W (N^2) by the uncertainty of k1 and k2, for a sag (m, (n, 2))."""
