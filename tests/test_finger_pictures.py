@@ -11,6 +11,7 @@ from finger_data import FREQUENCIES, make_record
 
 import hapticrender as hr
 from hapticrender.analysis import pictures
+from hapticrender.analysis.models import LoadLaw
 from hapticrender.analysis.records import UNLOADED, Impedance
 from hapticrender.touch.mechanics import HEAVY_SECOND, LIGHT
 
@@ -75,7 +76,7 @@ def test_a_folder_has_every_picture_and_a_page_of_them(record, tmp_path):
     assert "a &lt;light&gt; touch" in text
     assert "<light>" not in text
     assert "400 Hz: too light a finger" in text
-    fit = hr.fit_load_classes([record.impedance] * 2)["light"]
+    fit = hr.fit_load_classes([record] * 2)["light"]
     assert f"{1e-3 * fit.mechanics.stiffness:.2f}" in text
     assert f"{fit.chi_square:.0f} / {fit.degrees_of_freedom}" in text
 
@@ -114,6 +115,18 @@ def test_exponents_and_shares_are_the_laws(record, drawn, tmp_path):
     law = hr.load_exponent(record.impedance)
     np.testing.assert_array_equal(share.lines[-1].get_xydata()[:, 1], law.determination)
     np.testing.assert_array_equal(points(power, "95 %")[:, 1], law.exponent)
+
+
+def test_a_mean_exponent_is_weighted_and_its_error_widened_by_scatter():
+    one = LoadLaw(*np.array([[100.0], [0.1], [0.1], [1.0], [1.0], [1.0], [9.0]]))
+    apart, near = (replace(one, exponent=np.array([n]), standard_error=np.array([0.2])) for n in (1.1, 0.1))
+    missing = replace(one, exponent=np.array([np.nan]))
+    (mean,), (error,) = pictures.mean_exponent([one, near, missing], np.array([101.0]))
+    assert (mean, error) == pytest.approx((0.1, 0.2 / np.sqrt(5)))  # weights 100 and 25
+    (mean,), (error,) = pictures.mean_exponent([one, apart], np.array([101.0]))
+    assert mean == pytest.approx((100 * 0.1 + 25 * 1.1) / 125)
+    assert error == pytest.approx(np.sqrt((100 * 0.2**2 + 25 * 0.8**2) / 125))
+    assert np.isnan(pictures.mean_exponent([one], np.array([200.0]))).all()
 
 
 @pytest.mark.parametrize(

@@ -94,15 +94,17 @@ def fit_all(records: Sequence[FingerRecord]) -> Fits:
 def draw_time(record: FingerRecord, path: str | os.PathLike[str]) -> None:
     """Draw load and impedance, impedance of every band, and position and velocity over time, unloaded spans shaded."""
     bands = _shown(record.impedance.value)
-    with new_figure((9, 7.2), pads=(0.1, 0.08)) as figure:
-        together, every, place = figure.subplots(3, 1, sharex=True, height_ratios=[1.5, 1.5, 1.0])
-        _load_and_impedance(together, record, bands)
-        _all_bands(every, record, bands)
-        _kinematics(place, record)
-        for axes in (together, every, place):
+    drawings: list[Any] = [partial(_load_and_impedance, bands=bands), _kinematics]
+    if len(bands) > 1:
+        drawings.insert(1, partial(_all_bands, bands=bands))
+    heights = [1.5] * (len(drawings) - 1) + [1.0]
+    with new_figure((9, 2.05 * sum(heights) - 1), pads=(0.1, 0.08)) as figure:
+        panels = figure.subplots(len(drawings), 1, sharex=True, height_ratios=heights)
+        for axes, drawing in zip(panels, drawings, strict=True):
+            drawing(axes, record)
             _shade(axes, record)
-        place.set(xlabel="time (s)", xlim=(record.time[0], record.time[-1]))
-        figure.align_ylabels([together, every, place])
+        panels[-1].set(xlabel="time (s)", xlim=(record.time[0], record.time[-1]))
+        figure.align_ylabels(panels)
         save(figure, path)
 
 
@@ -193,7 +195,9 @@ def _shading_legend(axes: Any, record: FingerRecord, lines: list[Any]) -> None:
 
 
 def _dots(axes: Any, x: Array, y: Array, error: Array, colour: Any, label: str) -> Any:
-    """Points with bars of one standard error, joined where none is missing between."""
+    """Points at rising x with bars of one standard error, joined where none is missing between."""
+    gaps = np.flatnonzero(np.diff(x) > 1.5 * np.median(np.diff(x))) + 1 if len(x) > 1 else []
+    x, y, error = (np.insert(each, gaps, np.nan) for each in (x, y, error))
     style = {"color": colour, "marker": "o", "ms": 3, "lw": 0.9, "elinewidth": 0.8, "label": label}
     return axes.errorbar(x, y, error, **style)
 
@@ -205,10 +209,9 @@ def _all_bands(axes: Any, record: FingerRecord, bands: list[int]) -> None:
         _dots(axes, z.time, np.abs(z.value[:, band]), z.standard_error[:, band], colour, label)
     axes.set(title="Impedance", ylabel="|Z_f| (N s/m)", yscale="log")
     _numbers(axes.yaxis)
-    if bands:
-        size = np.abs(z.value[:, bands])
-        axes.set_ylim(0.7 * np.nanmin(size), 1.4 * np.nanmax(size))
-        legend(axes, columns=MOST_BANDS)
+    size = np.abs(z.value[:, bands])
+    axes.set_ylim(0.7 * np.nanmin(size), 1.4 * np.nanmax(size))
+    legend(axes, columns=MOST_BANDS)
 
 
 def _kinematics(axes: Any, record: FingerRecord) -> None:
@@ -284,20 +287,41 @@ def _with(laws: list[LoadLaw], frequency: float) -> list[LoadLaw]:
 
 
 def _exponent(axes: Any, each: list[LoadLaw], pooled: LoadLaw) -> None:
-    """Exponent of the impedance over the load, with 1/3 of Hertz contact."""
+    """Exponent of the impedance over the load, with 1/3 of Hertz contact; of several recordings also their mean."""
+    style = {"marker": "o", "ms": 4, "lw": 1.2, "capsize": 2}
+    shown = [(pooled.exponent, pooled.standard_error)]
     if len(each) > 1:
         for law in each:
             axes.plot(law.frequency, law.exponent, "o", color=PALE, ms=3, alpha=0.7)
-    bars = SURE * pooled.standard_error
-    label = "all, 95 %" if len(each) > 1 else "95 %"
-    style = {"color": BLUE, "marker": "o", "ms": 4, "lw": 1.2, "capsize": 2, "label": label}
-    axes.errorbar(pooled.frequency, pooled.exponent, bars, **style)
+        shown.append(mean_exponent(each, pooled.frequency))
+        axes.errorbar(pooled.frequency, shown[1][0], SURE * shown[1][1], color=BLUE, label="mean of each", **style)
+    label, colour = ("all together", ORANGE) if len(each) > 1 else ("95 %", BLUE)
+    axes.errorbar(pooled.frequency, pooled.exponent, SURE * pooled.standard_error, color=colour, label=label, **style)
     axes.axhline(1 / 3, color=INK, lw=1.0, ls="--", label="1/3 (Hertz)")
-    known = pooled.exponent[np.isfinite(pooled.exponent)]
+    ends = np.concatenate([value + sign * SURE * error for value, error in shown for sign in (-1, 1)])
+    ends = ends[np.isfinite(ends)]
     axes.set(title="Exponent n of |Z_f| ~ Wⁿ", ylabel="n")
-    axes.set_ylim(min(-0.1, known.min(initial=0) - 0.2), max(0.8, known.max(initial=0) + 0.2))
+    axes.set_ylim(min(-0.1, ends.min(initial=0) - 0.1), max(0.8, ends.max(initial=0) + 0.1))
     _frequency_axis(axes.xaxis)
     axes.legend(loc="lower right")
+
+
+def mean_exponent(laws: Sequence[LoadLaw], frequency: Array) -> tuple[Array, Array]:
+    """Weighted mean of the exponents of several recordings at each frequency (Hz), and its standard error."""
+    found = []
+    for at in frequency:
+        own = [np.isfinite(law.exponent) & (np.abs(np.log(law.frequency / at)) < models.BAND) for law in laws]
+        n, error = (
+            np.concatenate([getattr(law, name)[mine] for law, mine in zip(laws, own, strict=True)])
+            for name in ("exponent", "standard_error")
+        )
+        if not n.size:
+            found.append((np.nan, np.nan))
+            continue
+        mean = np.average(n, weights=error**-2)
+        scatter = max(1.0, np.sum(((n - mean) / error) ** 2) / max(len(n) - 1, 1))
+        found.append((mean, np.sqrt(scatter / np.sum(error**-2))))
+    return np.array(found)[:, 0], np.array(found)[:, 1]
 
 
 def _over_frequency(column: Any, name: str, fits: Mapping[int, FingerFit], samples: Samples) -> None:
@@ -448,17 +472,25 @@ def _value(fit: FingerFit, name: str) -> str:
 
 
 def _laws(records: Sequence[FingerRecord]) -> str:
-    """Table of exponents, all recordings together."""
+    """Table of exponents, of each recording and of all together."""
     law = models.load_exponent(records)
+    means = mean_exponent([models.load_exponent(each) for each in records], law.frequency) if law.frequency.size else ()
     rows = [
-        _row("td", f"{frequency:.0f} Hz", f"{n:.3f} ± {SURE * error:.3f}" if np.isfinite(n) else "–",
+        _row("td", f"{frequency:.0f} Hz", _exponent_cell(*mean), _exponent_cell(n, error),
              f"{size:.2f} N s/m at {load:.2f} N", f"{count}")
-        for frequency, n, error, size, load, count in zip(
-            law.frequency, law.exponent, law.standard_error, law.magnitude, law.reference_load, law.count, strict=True
+        for frequency, n, error, size, load, count, *mean in zip(
+            law.frequency, law.exponent, law.standard_error, law.magnitude, law.reference_load, law.count, *means,
+            strict=True,
         )
     ]  # fmt: skip
-    return f"""{html_table(_row("th", "Frequency", "exponent n", "|Z<sub>f</sub>|", "windows"), rows)}
-<p class="note">|Z<sub>f</sub>| ~ W<sup>n</sup>; contact of an elastic sphere suggests n = 1/3.</p>"""
+    head = _row("th", "Frequency", "n within a recording", "n of all windows", "|Z<sub>f</sub>| of all", "windows")
+    return f"""{html_table(head, rows)}
+<p class="note">|Z<sub>f</sub>| ~ W<sup>n</sup>; contact of an elastic sphere suggests n = 1/3. Within a recording: mean
+of the recordings, weighted by their errors. All windows: also the differences between fingers count.</p>"""
+
+
+def _exponent_cell(n: float, error: float) -> str:
+    return f"{n:.3f} ± {SURE * error:.3f}" if np.isfinite(n) else "–"
 
 
 def _record(record: FingerRecord, name: str, pictures: list[str]) -> str:
