@@ -11,7 +11,7 @@ from finger_data import FREQUENCIES, make_record
 
 import hapticrender as hr
 from hapticrender.analysis import pictures
-from hapticrender.analysis.models import LoadLaw
+from hapticrender.analysis.load_law import LoadLaw, mean_exponent
 from hapticrender.analysis.records import UNLOADED, Impedance
 from hapticrender.touch.mechanics import HEAVY_SECOND, LIGHT
 
@@ -121,12 +121,12 @@ def test_a_mean_exponent_is_weighted_and_its_error_widened_by_scatter():
     one = LoadLaw(*np.array([[100.0], [0.1], [0.1], [1.0], [1.0], [1.0], [9.0]]))
     apart, near = (replace(one, exponent=np.array([n]), standard_error=np.array([0.2])) for n in (1.1, 0.1))
     missing = replace(one, exponent=np.array([np.nan]))
-    (mean,), (error,) = pictures.mean_exponent([one, near, missing], np.array([101.0]))
+    (mean,), (error,) = mean_exponent([one, near, missing], np.array([101.0]))
     assert (mean, error) == pytest.approx((0.1, 0.2 / np.sqrt(5)))  # weights 100 and 25
-    (mean,), (error,) = pictures.mean_exponent([one, apart], np.array([101.0]))
+    (mean,), (error,) = mean_exponent([one, apart], np.array([101.0]))
     assert mean == pytest.approx((100 * 0.1 + 25 * 1.1) / 125)
     assert error == pytest.approx(np.sqrt((100 * 0.2**2 + 25 * 0.8**2) / 125))
-    assert np.isnan(pictures.mean_exponent([one], np.array([200.0]))).all()
+    assert np.isnan(mean_exponent([one], np.array([200.0]))).all()
 
 
 @pytest.mark.parametrize(

@@ -34,7 +34,9 @@ from hapticrender import (
     render,
 )
 from hapticrender.analysis import pictures
-from hapticrender.analysis.models import LOAD_CLASSES, samples_of
+from hapticrender.analysis.models import LOAD_CLASSES
+from hapticrender.analysis.page import NAMES
+from hapticrender.analysis.samples import samples_of
 from hapticrender.plants.fitting import MECHANICAL
 from hapticrender.plants.plate import PlateParameters
 from hapticrender.touch.mechanics import HEAVY, HEAVY_SECOND, LIGHT, LIGHT_BELOW
@@ -181,7 +183,7 @@ def measured() -> Item:
          *(_of_table(name, getattr(LIGHT, name) * growth, light[4].values[name]) for name in ("damping", "stiffness",
            "phalanx_mass", "phalanx_damping", "phalanx_stiffness"))),
         tuple(Panel(f"{kind.capitalize()} touch", FREQUENCY, "|Z_f| (N s/m)",
-                    tuple(Curve(pictures.NAMES[order], GRID, np.abs(fit.impedance(GRID)))
+                    tuple(Curve(NAMES[order], GRID, np.abs(fit.impedance(GRID)))
                           for order, fit in of_class.items()), "xy") for kind, of_class in fits.items()),
         f"Of light touch 2nd order: chi-square {light[2].chi_square:.0f} for {light[2].degrees_of_freedom} degrees of "
         f"freedom; 4th order: {light[4].chi_square:.0f} for {light[4].degrees_of_freedom}, of heavy touch "

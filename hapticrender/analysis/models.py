@@ -1,41 +1,27 @@
-"""Fit finger models to measured impedances: order, parameters with intervals, growth with the normal load."""
+"""Fit finger models to measured impedances: order, and parameters with intervals."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from math import inf, log, nan, sqrt
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
-from hapticrender.analysis.records import FingerRecord, Impedance
+from hapticrender.analysis.records import FingerRecord
+from hapticrender.analysis.samples import APART, Samples, Source, parts_of, samples_of
 from hapticrender.checks import require
 from hapticrender.protocols import Array
 from hapticrender.touch.mechanics import HEAVY, LIGHT, LIGHT_BELOW, FingerMechanics
 
 LOAD_CLASSES: Mapping[str, tuple[float, float]] = {"light": (0.0, LIGHT_BELOW), "heavy": (LIGHT_BELOW, inf)}  # N
-APART = 0.01  # two carriers, or two loads, count as different if they differ by more than this, relatively
-BAND = 0.05  # relative width of a bin of frequencies in which |Z| is compared over the load
-FEWEST = {2: 2, 4: 4}  # different carriers for a model of this order: one more complex number than unknown pairs, if 4
+FEWEST = {2: 2, 4: 4}  # carriers by order: two numbers each, for three or six parameters and the exponent
 NAMES = ("mass", "damping", "stiffness", "phalanx_mass", "phalanx_damping", "phalanx_stiffness")
 _UNITS = np.array([1e-3, 1.0, 1e3, 1e-3, 1.0, 1e3])  # g, N s/m, N/mm: the fit's parameters are then near 1
 _MOST = np.array([1.0, 1e4, 1e6, 1.0, 1e4, 1e6]) / _UNITS  # bounds of FingerMechanics
 MOST_STEPS = 100  # of a search; without a skin in the data its stiffness would grow for ever
 _STIFF_SKIN = (0.1, 20.0, 40.0)  # in these units: hardly a skin
-
-
-Source = FingerRecord | Impedance
-
-
-class Samples(NamedTuple):
-    """Unmasked entries of impedances, one row each."""
-
-    frequency: Array  # Hz
-    value: Array  # N s/m, complex
-    standard_error: Array  # N s/m
-    load: Array  # N
-    source: Array  # which of the recordings
 
 
 @dataclass(frozen=True)
@@ -64,7 +50,9 @@ class FingerFit:
 
     Notes
     -----
-    Intervals hold for a model that explains the data (see `p_value`).
+    Intervals hold for a model that explains the data (see `p_value`), and for small errors, in which it is linear:
+    where the data hardly tell the skin's stiffness from the phalanx (standard error above half of it), the phalanx may
+    be off by more.
     """
 
     mechanics: FingerMechanics
@@ -129,36 +117,6 @@ class FingerFit:
         return fields | {"load_exponent": self.load_exponent}
 
 
-@dataclass(frozen=True)
-class LoadLaw:
-    """Growth of the impedance with the load, ``|Z_f| = magnitude (W/reference_load)**exponent``, per frequency.
-
-    Parameters
-    ----------
-    frequency : ndarray, shape (bands,)
-        Median of each band (Hz), rising.
-    exponent, standard_error : ndarray, shape (bands,)
-        n and its standard error; NaN where fewer than 3 windows are above their noise, or the loads differ by
-        less than 1 %.
-    magnitude : ndarray, shape (bands,)
-        |Z_f| at the reference load (N s/m).
-    reference_load : ndarray, shape (bands,)
-        Geometric mean of the loads (N).
-    determination : ndarray, shape (bands,)
-        Squared correlation of |Z_f| and W.
-    count : ndarray of int, shape (bands,)
-        Windows in each band.
-    """
-
-    frequency: Array
-    exponent: Array
-    standard_error: Array
-    magnitude: Array
-    reference_load: Array
-    determination: Array
-    count: Array
-
-
 def fit_finger(
     impedance: Source | Sequence[Source],
     order: int | None = None,
@@ -208,6 +166,7 @@ def fit_finger(
 
     Examples
     --------
+    >>> from hapticrender.analysis.records import Impedance
     >>> f, n = np.array([20.0, 47.0, 111.0, 261.0]), 5
     >>> truth = FingerMechanics(order=2, mass=4e-3, damping=1.0, stiffness=200.0)
     >>> ones, row = np.ones((n, len(f))), np.ones(n)
@@ -245,47 +204,6 @@ def fit_load_classes(
     }
 
 
-def load_exponent(impedance: Source | Sequence[Source]) -> LoadLaw:
-    """Fit ``|Z_f| ~ W**n`` at every frequency (bins of 5 %), weighted by the standard errors.
-
-    The standard error of n is enlarged by ``sqrt(chi^2/degrees of freedom)`` where the windows scatter by more than
-    they state.  |Z| is corrected for its noise, ``sqrt(|Z|^2 - sigma^2)``, good to 1 % of |Z| from |Z| = 3 sigma on.
-    Hertz contact suggests n = 1/3 (Grigorii et al. 2021, from 111 Hz on).
-    """
-    samples = samples_of(impedance)
-    rows = [_power(each) for each in by_frequency(samples)]
-    columns: Any = zip(*rows, strict=True) if rows else [()] * 7
-    return LoadLaw(*(np.array(column) for column in columns))
-
-
-def _parts(impedance: Source | Sequence[Source]) -> list[Source]:
-    return [impedance] if isinstance(impedance, FingerRecord | Impedance) else list(impedance)
-
-
-def samples_of(impedance: Source | Sequence[Source], loads: tuple[float, float] = (0.0, inf)) -> Samples:
-    """Unmasked entries with a load (N) from the first of `loads` to below the second, and above 0."""
-    parts = [each.impedance if isinstance(each, FingerRecord) else each for each in _parts(impedance)]
-    rows = [
-        np.broadcast_arrays(each.frequency, each.value, each.standard_error, each.normal_load[:, None], number)
-        for number, each in enumerate(parts)
-    ]
-    columns = [np.concatenate([np.ravel(column) for column in same]) for same in zip(*rows, strict=True)]
-    found = Samples(*(columns or [np.empty(0)] * 5))
-    good = np.isfinite(found.frequency) & np.isfinite(found.value) & np.isfinite(found.standard_error)
-    with np.errstate(invalid="ignore"):
-        good &= (found.frequency > 0) & (found.load > 0) & (found.load >= loads[0]) & (found.load < loads[1])
-    found = Samples(*(column[good] for column in found))
-    least = found.standard_error.min(initial=inf)
-    require(bool(least > 0), "standard_error", float(least), "> 0 N s/m: mask (NaN) what was not measured")
-    return found
-
-
-def by_frequency(samples: Samples) -> list[Samples]:
-    """Split samples into bins of 5 % of frequency, by rising frequency."""
-    bins = np.rint(np.log(samples.frequency) / BAND).astype(int)
-    return [Samples(*(column[bins == at] for column in samples)) for at in np.unique(bins)]
-
-
 def _carriers(samples: Samples) -> int:
     """Number of carriers that differ by more than 1 %."""
     if not samples.frequency.size:
@@ -315,29 +233,40 @@ def _impedance(numbers: Mapping[str, Any], frequency: Array, normal_load: float 
     return whole * np.exp(numbers["load_exponent"] * np.log(np.asarray(normal_load) / numbers["reference_load"]))
 
 
-def _shared_errors(impedance: Source | Sequence[Source], samples: Samples) -> Array:
-    """G over the samples' own errors, for real and imaginary parts: shape (2 n, 3 recordings); see `fit_finger`."""
-    parts, w, sigma = _parts(impedance), 2 * np.pi * samples.frequency, samples.standard_error
-    shared = np.zeros((2, len(w), len(parts), 3))
-    for number, each in enumerate(parts):
-        own = samples.source == number
-        if not isinstance(each, FingerRecord) or not own.any():
-            continue
-        errors = each.plate.standard_errors
-        known = [
-            np.hypot(errors[f"{name}_1"].mean(), errors[f"{name}_2"].mean()) if f"{name}_1" in errors else inf
-            for name in ("damping", "stiffness")
-        ]
-        most = [sqrt(2) * (sigma[own] * factor).min() for factor in (1 / w[own], 1.0, w[own])]
-        mass, damping, stiffness = np.minimum([inf, *known], most)
-        shared[0, own, number, 1] = damping / sigma[own]
-        shared[1, own, number, 0] = mass * w[own] / sigma[own]
-        shared[1, own, number, 2] = -stiffness / w[own] / sigma[own]
-    return shared.reshape(2 * len(w), -1)
+def _plate_errors(record: FingerRecord, w: Array, sigma: Array) -> Array:
+    """Standard errors of the plate's mass (kg), damping (N s/m), stiffness (N/m), at most what `sigma` has room for."""
+    errors, known = record.plate.standard_errors, [inf]
+    for name in ("damping", "stiffness"):
+        sides = [errors[f"{name}_{side}"].mean() for side in (1, 2) if f"{name}_{side}" in errors]
+        known.append(float(np.hypot(*sides)) if len(sides) == 2 else inf)
+    return np.minimum(known, [sqrt(2) * (sigma * factor).min() for factor in (1 / w, 1.0, w)])
+
+
+def _shared_errors(impedance: Source | Sequence[Source], samples: Samples) -> list[tuple[Array, Array, Array]]:
+    """Rows, U and 1 - (1 + s^2)^(-1/2) of each recording's G/sigma = U s V, over real and then imaginary parts.
+
+    ``(1 + G G^T)^(-1/2) = 1 - U (1 - (1 + s^2)^(-1/2)) U^T`` whitens them, see `fit_finger`.
+    """
+    found = []
+    for number, each in enumerate(parts_of(impedance)):
+        own = np.flatnonzero(samples.source == number)
+        if isinstance(each, FingerRecord) and own.size:
+            w, sigma = 2 * np.pi * samples.frequency[own], samples.standard_error[own]
+            mass, damping, stiffness = _plate_errors(each, w, sigma)
+            zero = np.zeros_like(w)
+            real = np.column_stack([zero, damping / sigma, zero])
+            imaginary = np.column_stack([mass * w / sigma, zero, -stiffness / w / sigma])
+            along, size, _ = np.linalg.svd(np.vstack([real, imaginary]), full_matrices=False)
+            found.append((np.concatenate([own, own + len(samples.source)]), along, 1 - 1 / np.sqrt(1 + size**2)))
+    return found
 
 
 def _fit(
-    samples: Samples, shared: Array, order: int, exponent: float | None, second: FingerFit | None = None
+    samples: Samples,
+    shared: list[tuple[Array, Array, Array]],
+    order: int,
+    exponent: float | None,
+    second: FingerFit | None = None,
 ) -> FingerFit:
     """Fit one order, from several starts where it is the 4th."""
     from scipy.optimize import least_squares
@@ -348,14 +277,14 @@ def _fit(
         names = (*names, "load_exponent")
     units = np.array([_unit(name) for name in names])
     weight = 1 / samples.standard_error
-    along, size, _ = np.linalg.svd(shared, full_matrices=False)  # (1 + G G^T)^(-1/2) = 1 - U (1 - (1 + s^2)^(-1/2)) U^T
-    shrink = 1 - 1 / np.sqrt(1 + size**2)
 
     def residual(x: Array) -> Array:
         numbers = fixed | dict(zip(names, (x * units).tolist(), strict=True))
         apart = (_impedance(numbers, samples.frequency, samples.load) - samples.value) * weight
         white = np.concatenate([apart.real, apart.imag])
-        return white - along @ (shrink * (along.T @ white))
+        for rows, along, shrink in shared:
+            white[rows] -= along @ (shrink * (along.T @ white[rows]))
+        return white
 
     most = np.append(_MOST, 10.0)[[*range(3 * order // 2), *([6] if len(names) % 3 else [])]]
     least = np.where(np.array(names) == "load_exponent", -10.0, 0.0)
@@ -401,26 +330,3 @@ def _supported(second: FingerFit, fourth: FingerFit) -> FingerFit:
     scatter = max(1.0, fourth.chi_square / max(fourth.degrees_of_freedom, 1))
     gain = (second.chi_square - fourth.chi_square) / scatter - 3 * log(size)
     return replace(fourth, bic_margin=gain) if gain > 0 else replace(second, bic_margin=-gain)
-
-
-def _power(samples: Samples) -> tuple[float, ...]:
-    """One row of `LoadLaw` from the samples of a bin."""
-    from scipy.optimize import curve_fit
-
-    logs, sigma = np.log(samples.load), samples.standard_error
-    middle, count = float(logs.mean()), len(logs)
-    size = np.sqrt(np.maximum(np.abs(samples.value) ** 2 - sigma**2, 0.0))
-    frequency, mean = float(np.median(samples.frequency)), float(np.average(size, weights=sigma**-2))
-    if np.count_nonzero(size) < 3 or np.ptp(logs) < APART:
-        return frequency, nan, nan, mean, float(np.exp(middle)), nan, count
-
-    def power(at: Array, magnitude: float, exponent: float) -> Array:
-        return magnitude * np.exp(np.clip(exponent * at, -50, 50))
-
-    (magnitude, exponent), covariance = curve_fit(
-        power, logs - middle, size, p0=(mean, 0.3), sigma=sigma, absolute_sigma=True
-    )
-    chi_square = float(np.sum(((power(logs - middle, magnitude, exponent) - size) / sigma) ** 2))
-    error = sqrt(covariance[1, 1] * max(1.0, chi_square / (count - 2)))
-    together = float(np.corrcoef(samples.load, size)[0, 1] ** 2) if np.ptp(size) else 0.0
-    return frequency, float(exponent), error, float(magnitude), float(np.exp(middle)), together, count

@@ -6,37 +6,24 @@ import os
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from html import escape
 from math import isfinite
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from hapticrender import __version__
-from hapticrender.analysis import models
-from hapticrender.analysis.models import LOAD_CLASSES, FingerFit, LoadLaw, Samples, by_frequency, samples_of
+from hapticrender.analysis.load_law import LoadLaw, load_exponent, mean_exponent
+from hapticrender.analysis.models import LOAD_CLASSES, FingerFit, fit_finger, fit_load_classes
+from hapticrender.analysis.page import NAMES, SURE, Fits, page_of
 from hapticrender.analysis.records import DOUBTFUL, LOADED, UNLOADED, FingerRecord, Series
+from hapticrender.analysis.samples import BAND, Samples, by_frequency, samples_of
 from hapticrender.protocols import Array
 from hapticrender.recordings.formats import MissingExtra
 from hapticrender.report.figure import BLUE, INK, ORANGE, PALE, RED, legend, new_figure, save
-from hapticrender.report.page import GENERATOR, NO_PICTURE, STYLE, html_table
 
-Fits = dict[str, dict[int, FingerFit]]  # by load class and order
 MOST_BANDS = 8  # in one panel
 TYPICAL = 111.0  # Hz: of the paper's Fig. 5, and where |Z_f| begins to grow with the load
 COLOURS = {2: ORANGE, 4: BLUE}
-NAMES = {2: "2nd order", 4: "4th order"}
-LABELS = {
-    "mass": "mass at the surface (g)",
-    "damping": "its damping (N s/m)",
-    "stiffness": "its stiffness (N/mm)",
-    "phalanx_mass": "mass of the phalanx (g)",
-    "phalanx_damping": "its damping (N s/m)",
-    "phalanx_stiffness": "its stiffness (N/mm)",
-    "load_exponent": "exponent n of the load",
-}
-SURE = 1.96  # standard errors: 95 %
 POINTS = 1500  # of a curve over time
 
 
@@ -61,7 +48,7 @@ def draw(records: FingerRecord | Sequence[FingerRecord], folder: str | os.PathLi
         raise ValueError("records is empty: must be at least one FingerRecord")
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
-    fits, laws = fit_all(records), [models.load_exponent(each) for each in records]
+    fits, laws = fit_all(records), [load_exponent(each) for each in records]
     drawn: dict[str, Callable[[Path], None]] = {
         f"time-{i + 1}.png": partial(draw_time, each) for i, each in enumerate(records)
     }
@@ -76,18 +63,18 @@ def draw(records: FingerRecord | Sequence[FingerRecord], folder: str | os.PathLi
         warnings.warn(f"{folder}: no pictures: {error}", stacklevel=2)
         drawn = {}
     page = folder / "index.html"
-    page.write_text(_page(records, fits, list(drawn)), encoding="utf-8")
+    page.write_text(page_of(records, fits, list(drawn)), encoding="utf-8")
     return page
 
 
 def fit_all(records: Sequence[FingerRecord]) -> Fits:
     """Fit both orders to every class of loads that has enough data, all recordings together, the better one first."""
     found: Fits = {}
-    for name, fit in models.fit_load_classes(records).items():
+    for name, fit in fit_load_classes(records).items():
         found[name] = {fit.order: fit}
         if isfinite(fit.bic_margin):
             other = 6 - fit.order
-            found[name][other] = models.fit_finger(records, other, loads=LOAD_CLASSES[name])
+            found[name][other] = fit_finger(records, other, loads=LOAD_CLASSES[name])
     return found
 
 
@@ -110,7 +97,7 @@ def draw_time(record: FingerRecord, path: str | os.PathLike[str]) -> None:
 
 def draw_load(records: Sequence[FingerRecord], path: str | os.PathLike[str]) -> None:
     """Draw the impedance over the load, how much of it the load explains, and the exponent, over frequency."""
-    pooled, each = models.load_exponent(records), [models.load_exponent(one) for one in records]
+    pooled, each = load_exponent(records), [load_exponent(one) for one in records]
     with new_figure((12, 4.2), pads=(0.1, 0.05)) as figure:
         over_load, share, power = figure.subplots(1, 3, width_ratios=[1.4, 1, 1])
         _over_load(over_load, records, pooled)
@@ -196,7 +183,7 @@ def _shading_legend(axes: Any, record: FingerRecord, lines: list[Any]) -> None:
 
 def _dots(axes: Any, x: Array, y: Array, error: Array, colour: Any, label: str) -> Any:
     """Points at rising x with bars of one standard error, joined where none is missing between."""
-    gaps = np.flatnonzero(np.diff(x) > 1.5 * np.median(np.diff(x))) + 1 if len(x) > 1 else []
+    gaps: Any = np.flatnonzero(np.diff(x) > 1.5 * np.median(np.diff(x))) + 1 if len(x) > 1 else []
     x, y, error = (np.insert(each, gaps, np.nan) for each in (x, y, error))
     style = {"color": colour, "marker": "o", "ms": 3, "lw": 0.9, "elinewidth": 0.8, "label": label}
     return axes.errorbar(x, y, error, **style)
@@ -262,7 +249,7 @@ def _means(axes: Any, records: Sequence[FingerRecord], frequency: float) -> None
 
 
 def _near(samples: Samples, frequency: float) -> bool:
-    return abs(np.log(np.median(samples.frequency) / frequency)) < models.BAND
+    return abs(np.log(np.median(samples.frequency) / frequency)) < BAND
 
 
 def _determination(axes: Any, each: list[LoadLaw], pooled: LoadLaw) -> None:
@@ -270,7 +257,7 @@ def _determination(axes: Any, each: list[LoadLaw], pooled: LoadLaw) -> None:
     for law in each:
         axes.plot(law.frequency, law.determination, "o", color=PALE, ms=3, alpha=0.7)
     mean = [
-        np.mean([law.determination[np.abs(np.log(law.frequency / at)) < models.BAND].mean() for law in _with(each, at)])
+        np.mean([law.determination[np.abs(np.log(law.frequency / at)) < BAND].mean() for law in _with(each, at)])
         for at in pooled.frequency
     ]
     axes.plot(pooled.frequency, mean, "o-", color=INK, lw=1.4, ms=4, label="mean" if len(each) > 1 else None)
@@ -282,7 +269,7 @@ def _with(laws: list[LoadLaw], frequency: float) -> list[LoadLaw]:
     """Laws that have a determination at a frequency."""
     return [
         law for law in laws
-        if np.isfinite(law.determination[np.abs(np.log(law.frequency / frequency)) < models.BAND]).any()
+        if np.isfinite(law.determination[np.abs(np.log(law.frequency / frequency)) < BAND]).any()
     ]  # fmt: skip
 
 
@@ -304,24 +291,6 @@ def _exponent(axes: Any, each: list[LoadLaw], pooled: LoadLaw) -> None:
     axes.set_ylim(min(-0.1, ends.min(initial=0) - 0.1), max(0.8, ends.max(initial=0) + 0.1))
     _frequency_axis(axes.xaxis)
     axes.legend(loc="lower right")
-
-
-def mean_exponent(laws: Sequence[LoadLaw], frequency: Array) -> tuple[Array, Array]:
-    """Weighted mean of the exponents of several recordings at each frequency (Hz), and its standard error."""
-    found = []
-    for at in frequency:
-        own = [np.isfinite(law.exponent) & (np.abs(np.log(law.frequency / at)) < models.BAND) for law in laws]
-        n, error = (
-            np.concatenate([getattr(law, name)[mine] for law, mine in zip(laws, own, strict=True)])
-            for name in ("exponent", "standard_error")
-        )
-        if not n.size:
-            found.append((np.nan, np.nan))
-            continue
-        mean = np.average(n, weights=error**-2)
-        scatter = max(1.0, np.sum(((n - mean) / error) ** 2) / max(len(n) - 1, 1))
-        found.append((mean, np.sqrt(scatter / np.sum(error**-2))))
-    return np.array(found)[:, 0], np.array(found)[:, 1]
 
 
 def _over_frequency(column: Any, name: str, fits: Mapping[int, FingerFit], samples: Samples) -> None:
@@ -387,129 +356,3 @@ def _frequency_axis(axis: Any) -> None:
     axis.axes.set_xscale("log")
     axis.axes.set_xlabel("frequency (Hz)")
     _numbers(axis)
-
-
-def _page(records: Sequence[FingerRecord], fits: Fits, pictures: list[str]) -> str:
-    """HTML of the page."""
-    title = escape(records[0].name) if len(records) == 1 else f"{len(records)} recordings"
-    times = "\n".join(_record(record, f"time-{i + 1}.png", pictures) for i, record in enumerate(records))
-    return f"""<!DOCTYPE html>
-<html lang="en">
-<head>
-<meta charset="utf-8">
-<meta name="viewport" content="width=device-width, initial-scale=1">
-{GENERATOR}
-<title>The finger, measured: {title}</title>
-<style>{STYLE}</style>
-</head>
-<body>
-<h1>The finger, measured: {title}</h1>
-<p>Load, position and mechanical impedance Z<sub>f</sub> = F<sub>f</sub>/v of the finger, computed from the sensors of
-the surface and from its drive. Intervals are of 95&nbsp;%.</p>
-<section><h2>Impedance over frequency</h2>
-{_picture("frequency.png", pictures, "Modulus and phase of the impedance over frequency, with fits")}
-{_fits(fits)}</section>
-<section><h2>Impedance over the load</h2>
-{_picture("load.png", pictures, "Impedance over load, share explained by the load, exponent over frequency")}
-{_laws(records)}</section>
-{times}
-<footer class="note">Made by hapticrender {escape(__version__)}.</footer>
-</body>
-</html>
-"""
-
-
-def _picture(name: str, pictures: list[str], alt: str) -> str:
-    if name in pictures:
-        return f'<a href="{name}"><img src="{name}" alt="{escape(alt)}"></a>'
-    return NO_PICTURE if not pictures else '<p class="note">No picture: there are too few data.</p>'
-
-
-def _fits(fits: Fits) -> str:
-    """Table of all fits, one a column, the supported order marked."""
-    if not fits:
-        return '<p class="note">No fit: a finger takes at least two frequencies.</p>'
-    flat = [(name, fit) for name, of_class in fits.items() for _, fit in sorted(of_class.items())]
-    rows = [(escape(label), *(_value(fit, name) for _, fit in flat)) for name, label in LABELS.items()]
-    rows += [
-        ("loads", *(f"{fit.loads[0]:.2f} to {fit.loads[1]:.2f} N" for _, fit in flat)),
-        ("χ² / degrees of freedom", *(f"{fit.chi_square:.0f} / {fit.degrees_of_freedom}" for _, fit in flat)),
-        ("probability p of a larger χ²", *(_probability(fit.p_value) for _, fit in flat)),
-        ("supported by the data", *(_supported(fits[name], fit) for name, fit in flat)),
-    ]  # fmt: skip
-    body = [_row("td", *cells) for cells in rows]
-    heads = (f"{name}, {NAMES[fit.order]}<br>at {fit.mechanics.reference_load:.2f} N" for name, fit in flat)
-    return f"""{html_table(_row("th", "Finger", *heads), body)}
-<p class="note">With half of the 95&nbsp;% interval. The supported order has the smaller Bayesian information
-criterion; a difference of 10 is strong.
-With p below 0.01 the model, with one exponent for all loads, does not explain the data within their stated errors:
-intervals are enlarged by the scatter, and the parameters describe the data without being the finger’s.</p>"""
-
-
-def _probability(p: float) -> str:
-    return "&lt;0.001" if p < 1e-3 else f"{p:.3f}"
-
-
-def _supported(of_class: Mapping[int, FingerFit], fit: FingerFit) -> str:
-    if len(of_class) == 1:
-        return "too few frequencies to say"
-    return f"yes, by {fit.bic_margin:.3g}" if isfinite(fit.bic_margin) else "no"
-
-
-def _row(kind: str, first: str, *cells: str) -> str:
-    """One row of a table, its first cell a text."""
-    return f'<tr><{kind} class="text">{first}</{kind}>{"".join(f"<{kind}>{each}</{kind}>" for each in cells)}</tr>'
-
-
-def _value(fit: FingerFit, name: str) -> str:
-    """A parameter and half of its 95 % interval, in g, N s/m, N/mm or 1; a dash where the model has none."""
-    if name not in fit.names:
-        return "–"
-    scale = 1e3 if name.endswith("mass") else 1e-3 if name.endswith("stiffness") else 1.0
-    half = SURE * fit.standard_errors[name] * scale
-    digits = int(np.clip(1 - np.floor(np.log10(half)), 0, 4)) if half > 0 else 3
-    return f"{fit.values[name] * scale:.{digits}f} ± {half:.{digits}f}"
-
-
-def _laws(records: Sequence[FingerRecord]) -> str:
-    """Table of exponents, of each recording and of all together."""
-    law = models.load_exponent(records)
-    means = mean_exponent([models.load_exponent(each) for each in records], law.frequency) if law.frequency.size else ()
-    rows = [
-        _row("td", f"{frequency:.0f} Hz", _exponent_cell(*mean), _exponent_cell(n, error),
-             f"{size:.2f} N s/m at {load:.2f} N", f"{count}")
-        for frequency, n, error, size, load, count, *mean in zip(
-            law.frequency, law.exponent, law.standard_error, law.magnitude, law.reference_load, law.count, *means,
-            strict=True,
-        )
-    ]  # fmt: skip
-    head = _row("th", "Frequency", "n within a recording", "n of all windows", "|Z<sub>f</sub>| of all", "windows")
-    return f"""{html_table(head, rows)}
-<p class="note">|Z<sub>f</sub>| ~ W<sup>n</sup>; contact of an elastic sphere suggests n = 1/3. Within a recording: mean
-of the recordings, weighted by their errors. All windows: also the differences between fingers count.</p>"""
-
-
-def _exponent_cell(n: float, error: float) -> str:
-    return f"{n:.3f} ± {SURE * error:.3f}" if np.isfinite(n) else "–"
-
-
-def _record(record: FingerRecord, name: str, pictures: list[str]) -> str:
-    """Section of one recording."""
-    touched = sum(each.stop - each.start for each in record.of_kind(LOADED))
-    plate = "measured in its unloaded spans" if record.plate.measured else "as in the profile"
-    entries = [
-        (
-            "In contact",
-            f"{touched:.2f} of {record.time[-1] - record.time[0]:.2f} s, {len(record.of_kind(LOADED))} touches",
-        ),
-        ("Position good to 1 mm", f"from {record.least_load:.2f} N on" if isfinite(record.least_load) else "nowhere"),
-        (
-            "Bandwidth of load and position",
-            f"{record.normal_load.bandwidth:.3g} and {record.position.bandwidth:.3g} Hz",
-        ),
-        ("The plate's own stiffness and damping", plate),
-        *(("Note", note) for note in record.notes),
-    ]
-    return f"""<section><h2>{escape(record.name)}</h2>
-{_picture(name, pictures, f"Load, impedance, position and velocity over time: {record.name}")}
-<dl>{"".join(f"<dt>{key}</dt><dd>{escape(value)}</dd>" for key, value in entries)}</dl></section>"""
