@@ -111,24 +111,26 @@ def _value(fit: FingerFit, name: str) -> str:
 
 
 def _laws(records: Sequence[FingerRecord]) -> str:
-    """Table of exponents, of each recording and of all together."""
-    law = load_exponent(records)
-    means = mean_exponent([load_exponent(each) for each in records], law.frequency) if law.frequency.size else ()
+    """Table of exponents, of all recordings together, and the mean of each where there are several."""
+    law, several = load_exponent(records), len(records) > 1
     rows = [
-        _row("td", f"{frequency:.0f} Hz", _exponent_cell(*mean), _exponent_cell(n, error),
-             f"{size:.2f} N s/m at {load:.2f} N", f"{count}")
-        for frequency, n, error, size, load, count, *mean in zip(
-            law.frequency, law.exponent, law.standard_error, law.magnitude, law.reference_load, law.count, *means,
-            strict=True,
+        [f"{frequency:.0f} Hz", _exponent(n, error), f"{size:.2f} N s/m at {load:.2f} N", f"{count}"]
+        for frequency, n, error, size, load, count in zip(
+            law.frequency, law.exponent, law.standard_error, law.magnitude, law.reference_load, law.count, strict=True
         )
-    ]  # fmt: skip
-    head = _row("th", "Frequency", "n within a recording", "n of all windows", "|Z<sub>f</sub>| of all", "windows")
-    return f"""{html_table(head, rows)}
-<p class="note">|Z<sub>f</sub>| ~ W<sup>n</sup>; contact of an elastic sphere suggests n = 1/3. Within a recording: mean
-of the recordings, weighted by their errors. All windows: also the differences between fingers count.</p>"""
+    ]
+    head, note = ["Frequency", "exponent n", "|Z<sub>f</sub>|", "windows"], ""
+    if several and rows:
+        head.insert(1, "n within a recording")
+        note = " Within a recording: the mean, weighted by errors; beside it, differences between fingers count too."
+        means = mean_exponent([load_exponent(each) for each in records], law.frequency)
+        for row, n, error in zip(rows, *means, strict=True):
+            row.insert(1, _exponent(n, error))
+    return f"""{html_table(_row("th", *head), [_row("td", *row) for row in rows])}
+<p class="note">|Z<sub>f</sub>| ~ W<sup>n</sup>; contact of an elastic sphere suggests n = 1/3.{note}</p>"""
 
 
-def _exponent_cell(n: float, error: float) -> str:
+def _exponent(n: float, error: float) -> str:
     return f"{n:.3f} ± {SURE * error:.3f}" if np.isfinite(n) else "–"
 
 

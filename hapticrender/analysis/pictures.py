@@ -108,14 +108,20 @@ def draw_load(records: Sequence[FingerRecord], path: str | os.PathLike[str]) -> 
 
 def draw_frequency(records: Sequence[FingerRecord], fits: Fits, path: str | os.PathLike[str]) -> None:
     """Draw modulus and phase of the impedance over frequency, with both fits and their 95 % bands, a class a column."""
-    with new_figure((5.4 * max(len(fits), 1.3), 6.2), pads=(0.1, 0.08)) as figure:
-        panels = figure.subplots(2, len(fits), sharex=True, sharey="row", height_ratios=[1.5, 1], squeeze=False)
+    size = np.abs(samples_of(records).value)
+    common: Any = {"sharex": True, "squeeze": False}
+    with new_figure((5.4 * max(len(fits), 2), 6.2 if len(fits) > 1 else 3.8), pads=(0.1, 0.08)) as figure:
+        if len(fits) > 1:
+            panels = figure.subplots(2, len(fits), sharey="row", height_ratios=[1.5, 1], **common)
+        else:
+            panels = figure.subplots(1, 2, **common).T
         for (name, of_class), column in zip(fits.items(), panels.T, strict=True):
             _over_frequency(column, name, of_class, samples_of(records, LOAD_CLASSES[name]))
-        size = np.abs(samples_of(records).value)
         panels[0, 0].set_ylim(0.6 * np.quantile(size, 0.01), 1.7 * np.quantile(size, 0.99))
         panels[0, 0].set_ylabel("|Z_f| (N s/m)")
         panels[1, 0].set_ylabel("phase (degrees)")
+        for axes in panels[-1] if len(fits) > 1 else panels[:, 0]:
+            axes.set_xlabel("frequency (Hz)")
         for axis in (panels[0, 0].xaxis, panels[0, 0].yaxis):
             _numbers(axis)
         save(figure, path)
@@ -229,10 +235,11 @@ def _over_load(axes: Any, records: Sequence[FingerRecord], law: LoadLaw) -> None
         axes.plot(reach, line, color=colour, lw=1.6, label=label)
     if len(records) > 1:
         _means(axes, records, float(law.frequency[np.argmin(np.abs(np.log(law.frequency / TYPICAL)))]))
-    axes.set(title="Impedance over load", xlabel="normal load W (N)", ylabel="|Z_f| (N s/m)", xscale="log")
-    axes.set_yscale("log")
-    for axis in (axes.xaxis, axes.yaxis):
-        _numbers(axis)
+    axes.set(title="Impedance over load", xlabel="normal load W (N)", ylabel="|Z_f| (N s/m)", yscale="log")
+    _numbers(axes.yaxis)
+    if np.ptp(np.log(np.concatenate([each.load for each in bins]))) > 1:
+        axes.set_xscale("log")
+        _numbers(axes.xaxis)
     axes.legend(fontsize=7, loc="center left", bbox_to_anchor=(1.0, 0.5), handlelength=1.2)
 
 
@@ -313,7 +320,6 @@ def _over_frequency(column: Any, name: str, fits: Mapping[int, FingerFit], sampl
     low, high = samples.load.min(), samples.load.max()
     at = f"{load:.2g} N (data: {low:.2g} to {high:.2g} N)"
     column[0].set(title=f"{name.capitalize()} touch, at {at}", xscale="log", yscale="log")
-    column[1].set_xlabel("frequency (Hz)")
     column[0].legend(loc="best")
 
 
