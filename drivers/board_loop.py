@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
+import time
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from hapticrender.bands import Bands
 from hapticrender.drivers.row_reader import WRAP, RowReader
-from hapticrender.errors import DeviceFault
+from hapticrender.errors import DeviceFault, HapticError, WatchdogTimeout
 from hapticrender.protocols import Array, Flag, Rendering
 
 if TYPE_CHECKING:
@@ -59,7 +60,9 @@ class BoardLoop:
         self._pieces = [_Piece(0, _playable(rendering), np.zeros(MOST_BANDS), 1.0)]
         self._reader: RowReader | None = None
         self._connections = 0
-        self._fault: DeviceFault | None = None
+        self._fault: HapticError | None = None
+        self._watchdog: float | None = None  # s
+        self._called = math.inf
 
     def start(self) -> None:
         """Set the bands and play; the port is open."""
@@ -89,6 +92,15 @@ class BoardLoop:
     def finger(self, position: float, velocity: float, load: float) -> None:
         """Say where the finger is (m, m/s, N)."""
         self._client.finger(position, velocity, load)
+
+    def watch(self, seconds: float | None) -> None:
+        """Stop the drive once the application has not called for so long (s); None: never."""
+        self._watchdog = seconds
+        self.alive()
+
+    def alive(self) -> None:
+        """Note a call of the application."""
+        self._called = time.monotonic()
 
     def set_gain(self, gain: float) -> None:
         """Set the factor on the texture, 0 to 1."""
@@ -120,6 +132,9 @@ class BoardLoop:
             self.flags |= Flag.OVERRUN
             self._pieces = [self._pieces[-1]._replace(start=self.samples, turns=np.zeros(MOST_BANDS))]
             self._read()
+        if self._watchdog is not None and time.monotonic() - self._called > self._watchdog and self._fault is None:
+            self._client.stop()
+            self._fault, self.flags = WatchdogTimeout(self.samples / self.driver.rate), self.flags | Flag.STOPPED
         try:
             self.flags |= self._client.telemetry().flags
         except DeviceFault as fault:
@@ -168,7 +183,7 @@ class BoardLoop:
             rows.append((float(hertz), size, abs(band.measured), error / size if size > 0.0 else math.nan))
         return rows
 
-    def fault(self) -> DeviceFault | None:
+    def fault(self) -> HapticError | None:
         """Return why the board stopped the drive, if it did."""
         return self._fault
 

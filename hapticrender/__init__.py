@@ -30,7 +30,7 @@ _HOMES = {
     "bands": "Bands",
     "control.demodulator": "Demodulator",
     "errors": "DesignError DeviceFault DeviceLost DeviceNotFound DeviceTimeout DriverError HapticError PlateMismatch "
-    "ProtocolError SceneError",
+    "ProtocolError SceneError WatchdogTimeout",
     "loop": "prepare render run",
     "plants.identify": "Identified compare identify",
     "player": "Player",
@@ -71,6 +71,7 @@ if _typing.TYPE_CHECKING:
     from hapticrender.errors import PlateMismatch as PlateMismatch
     from hapticrender.errors import ProtocolError as ProtocolError
     from hapticrender.errors import SceneError as SceneError
+    from hapticrender.errors import WatchdogTimeout as WatchdogTimeout
     from hapticrender.loop import prepare as prepare
     from hapticrender.loop import render as render
     from hapticrender.loop import run as run

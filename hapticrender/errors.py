@@ -58,5 +58,18 @@ class DeviceFault(DriverError):
         self.recording: Recording | None = None
 
 
+class WatchdogTimeout(HapticError):
+    """The application hung: it made no call for as long as its watchdog allows, and the drive was stopped.
+
+    `time` (s) counts from the start of the run.
+    """
+
+    def __init__(self, time: float) -> None:
+        super().__init__(
+            f"stopped at {time:.4g} s: no method of the player was called for as long as its watchdog allows"
+        )
+        self.time = time
+
+
 class PlateMismatch(UserWarning):
     """The device differs from the model that a controller is designed for; names the quantities and by how much."""

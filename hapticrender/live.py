@@ -13,7 +13,7 @@ from hapticrender.control.combined import CombinedBands
 from hapticrender.control.device_model import DeviceModel
 from hapticrender.control.supervisor import FADE_OUT, Fault, SupervisedController, design_supervisor
 from hapticrender.driver_checks import check_sensed
-from hapticrender.errors import DeviceFault
+from hapticrender.errors import DeviceFault, HapticError, WatchdogTimeout
 from hapticrender.protocols import Array, Controller, Flag, Rendering
 from hapticrender.realtime import LOG_TIME, RealtimeEntry
 from hapticrender.voices import Voice
@@ -98,6 +98,14 @@ class LiveLoop:
         """Say where the finger is (m, m/s, N)."""
         self.entry.finger(position, velocity, load)
 
+    def watch(self, seconds: float | None) -> None:
+        """Stop the drive once the application has not called for so long (s); None: never."""
+        self.entry.watch(seconds)
+
+    def alive(self) -> None:
+        """Note a call of the application."""
+        self.entry.alive()
+
     def set_gain(self, gain: float) -> None:
         """Set the factor on the texture."""
         self.entry.set_gain(gain)
@@ -165,19 +173,20 @@ class LiveLoop:
         first, signals = self.signals(self.entry.samples - round(JUDGED * self.driver.rate))
         return band_figures(self._bands, first, self.driver.rate, signals)
 
-    def fault(self) -> DeviceFault | None:
+    def fault(self) -> HapticError | None:
         """Return why the drive was stopped, once it has faded out and stayed at zero for as long again."""
         if not self.entry.flags & Flag.STOPPED:
             return None
         found = getattr(self.controller, "fault", None)
         if self._stopped is None:
-            self._stopped = found.sample if isinstance(found, Fault) else self.entry.samples
+            own = found.sample if isinstance(found, Fault) else self.entry.samples
+            self._stopped = own if self.entry.timed_out is None else self.entry.timed_out
         if self.entry.samples < self._stopped + 2 * FADE_OUT * self.driver.rate + self.driver.delay:
             return None
-        text, at = (
-            found.text if isinstance(found, Fault) else "the device stopped itself",
-            self._stopped / self.driver.rate,
-        )
+        at = self._stopped / self.driver.rate
+        if self.entry.timed_out is not None:
+            return WatchdogTimeout(at)
+        text = found.text if isinstance(found, Fault) else "the device stopped itself"
         return DeviceFault(f"{type(self.rendering.device).__name__}: stopped at {at:.4g} s: {text}", at)
 
     def _voice(self, rendering: Rendering) -> Voice:

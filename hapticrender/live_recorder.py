@@ -36,7 +36,6 @@ class LiveRecorder:
 
     def __init__(self, path: str | Path, loop: LiveLoop, *, endless: bool) -> None:
         rendering, driver, model = loop.rendering, loop.driver, loop.model
-        Path(path).open("ab").close()  # what cannot be written is refused here
         self.error: OSError | None = None  # why it has ended
         self._recorder = Recorder(
             path,
@@ -52,6 +51,7 @@ class LiveRecorder:
             calibration=gain_uncertainty_of(rendering),
             **{name: getattr(model, name) for name in ("places", "unit", "drive_unit", "profile")},
         )
+        self._recorder.begin()
 
     def append(self, signals: dict[str, Array], gap: int, motion_source: str) -> None:
         """Append signals after `gap` samples that nobody has kept."""
@@ -71,10 +71,10 @@ class LiveRecorder:
             raise self.error
         return self._recorder.finish()
 
-    def close(self) -> None:
-        """Close the journal, whatever the disk says."""
+    def close(self, stopped: bool = False) -> None:
+        """Close the journal, whatever the disk says; `stopped`: by an error or a signal."""
         with suppress(OSError):
-            self._recorder.close()
+            self._recorder.close(stopped)
 
 
 def _missing(signals: dict[str, Array], count: int) -> dict[str, Array]:

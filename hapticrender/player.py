@@ -19,7 +19,8 @@ from __future__ import annotations
 import math
 import threading
 import time
-from contextlib import ExitStack, suppress
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
@@ -70,7 +71,8 @@ class Player:
         False: a simulation, or a driver that does not wait, plays only within `sleep`, as fast as it can, and a
         simulation reproducibly.
     watchdog : float, s, optional
-        Without any call of this player for so long the texture fades out, until the next one; > 0.
+        Where no method of this player is called for so long, the application counts as hung and the drive is stopped
+        for good, within 10 ms; >= 0.1.  `sleep` counts as calls.
     **tables
         Further fields of the scene: profile, simulation, rendering, method, seed.
 
@@ -90,8 +92,8 @@ class Player:
         watchdog: float | None = None,
         **tables: Any,
     ) -> None:
-        if watchdog is not None and not 0.0 < watchdog < math.inf:
-            raise ValueError(f"{watchdog=}: must be finite and > 0 s, or None")
+        if watchdog is not None and not 2.0 * SERVICE <= watchdog < math.inf:
+            raise ValueError(f"{watchdog=} s: must be finite and >= {2.0 * SERVICE:g} s, or None")
         self._given = device if isinstance(device, Scene) else None
         self._fields = {"device": device, "finger": finger or NOMINAL, "duration": LONGEST, **tables}
         self._driver, self._paced, self._watchdog = driver, paced, watchdog
@@ -102,11 +104,11 @@ class Player:
         )  # the last position with its time; position, velocity, load
         self._loop: LiveLoop | None = None
         self._next: LiveLoop | None = None  # waits for silence
-        self._gain, self._called, self._before, self._lost = 1.0, 0.0, 0, 0
+        self._gain, self._before, self._lost = 1.0, 0, 0
         self._error: BaseException | None = None
         self._raised = False
         self._recorder: LiveRecorder | None = None
-        self._calls_back = self._closing = self._entered = False
+        self._calls_back = self._entered = False
         self._recorded, self._served = 0, 0.0  # samples of this loop that were looked at; when the last look was
         self._stack, self._stopping, self._lock = ExitStack(), threading.Event(), threading.RLock()
 
@@ -119,7 +121,7 @@ class Player:
     ) -> None:
         """Zero drive, then close the device and the recording; a fault that nobody has seen is raised."""
         with ExitStack() as last:  # from the last to the first, whatever fails
-            last.callback(self._close_recorder)
+            last.callback(self._close_recorder, kind is not None or self._error is not None)
             last.push(self._stack.pop_all())
             last.callback(self._stopping.set)
             last.callback(self._rest, kind is None)
@@ -138,8 +140,7 @@ class Player:
 
     @gain.setter
     def gain(self, gain: float) -> None:
-        with self._lock:
-            self._check()
+        with self._calling():
             if not 0.0 <= gain <= MOST_GAIN:
                 raise ValueError(f"{gain=}: must be 0 to {MOST_GAIN:g}; an amplitude belongs in the texture")
             if self._loop is not None and self._next is None:
@@ -156,8 +157,7 @@ class Player:
         DeviceFault, DriverError
             The device has failed.
         """
-        with self._lock:
-            self._check()
+        with self._calling():
             if self._loop is None:
                 self._begin(self._scene(texture))
                 return
@@ -182,7 +182,7 @@ class Player:
         0.25 s without a call what lies along the surface fades out.
         """
         self._check()
-        now, (last, then) = time.monotonic() if self._paced else self.time, self._last
+        (last, then), now = self._last, time.monotonic() if self._paced else self.time
         if velocity is None:
             recent = 0.0 < now - then < UPDATES and math.isfinite(position - last)
             velocity = (position - last) / (now - then) if recent else 0.0
@@ -196,8 +196,7 @@ class Player:
 
     def record(self, path: str | Path) -> None:
         """Keep everything from now on in a journal (.au), until `end_recording` or the end; the device must play."""
-        with self._lock:
-            self._check()
+        with self._calling():
             loop = self._playing("record")
             if self._recorder is not None:
                 raise ValueError(f"{path}: a recording is under way: call end_recording first")
@@ -215,8 +214,7 @@ class Player:
 
     def state(self) -> PlayerState:
         """Return what plays at the moment, and what became of it."""
-        with self._lock:
-            self._check()
+        with self._calling():
             loop = self._playing("state")
             self._service()
             load = float(getattr(loop.rendering.device, "load", math.nan))
@@ -260,7 +258,7 @@ class Player:
         return self._loop
 
     def _check(self) -> None:
-        """Raise what has gone wrong meanwhile; note that the application is alive."""
+        """Raise what has gone wrong meanwhile; note that the application has called."""
         if self._error is not None:
             self._raised = True
             raise self._error
@@ -268,10 +266,23 @@ class Player:
             raise ValueError("the player has been closed: make a new one")
         if not self._entered:
             raise ValueError("the player is not open: use it in a with statement")
-        self._called = self._now()
+        if self._loop is not None:
+            self._loop.alive()
 
-    def _now(self) -> float:
-        return time.monotonic() if self._paced else self.time
+    @contextmanager
+    def _calling(self) -> Iterator[None]:
+        """A call of the application that may take long: meanwhile the watchdog waits."""
+        with self._lock:
+            self._check()
+            self._watch(None)
+            try:
+                yield
+            finally:
+                self._watch(self._watchdog)
+
+    def _watch(self, seconds: float | None) -> None:
+        if self._watchdog is not None and self._loop is not None:
+            self._loop.watch(seconds)
 
     def _begin(self, scene: Scene) -> None:
         """Make the driver, and start the device with the scene's texture."""
@@ -383,6 +394,7 @@ class Player:
         if self._located:
             following.finger(*self._finger)
         self._loop = following
+        self._watch(self._watchdog)
 
     def _advance(self, seconds: float) -> None:
         """Play for so long in this thread."""
@@ -414,9 +426,6 @@ class Player:
         loop.fill()
         if hasattr(loop.rendering.device, "check"):
             loop.rendering.device.check()  # one that calls back cannot say that it is gone
-        if self._watchdog is not None and self._next is None and not self._closing:
-            asleep = self._now() - self._called > self._watchdog
-            loop.set_gain(0.0 if asleep else self._gain)
         first, signals = loop.signals(self._recorded)
         gap, self._recorded = first - self._recorded, first + len(signals["flags"])
         self._lost += gap + int(np.count_nonzero(signals["flags"] & Flag.OVERRUN))
@@ -430,7 +439,8 @@ class Player:
         loop = self._loop
         if loop is None:
             return
-        running, self._closing = self._paced and self._error is None, True
+        running = self._paced and self._error is None
+        self._watch(None)
         if gently and running:
             loop.set_gain(0.0)
             time.sleep(FADE_OUT)
@@ -443,6 +453,6 @@ class Player:
             if self._error is None:
                 self._service()
 
-    def _close_recorder(self) -> None:
+    def _close_recorder(self, stopped: bool) -> None:
         if self._recorder is not None:
-            self._recorder.close()
+            self._recorder.close(stopped)

@@ -31,6 +31,7 @@ from numba import carray, types
 from hapticrender.bands import Bands
 from hapticrender.control.carriers import track_finger
 from hapticrender.control.records import CONTROLLER, CONTROLLER_T, SETPOINT_ROWS
+from hapticrender.control.supervisor import FADE_OUT
 from hapticrender.jit import F8, I8, CFunction, addresses, call, entry, kernel, pointer, record, swap
 from hapticrender.protocols import Array, Flag
 from hapticrender.voices import FADE, VOICE_T, Voice, along_surface, eased, in_time
@@ -42,22 +43,23 @@ JUMP, JUMP_TIME = 2e-3, 5e-3  # m, s: a correction of the position up to this de
 GAIN_TIME = 10e-3  # s
 LOG_TIME = 2.0  # s: of signals that are kept
 CONTINUE, ABORT = 0, 2  # results of PortAudio's callback
-OVERRUN = int(Flag.OVERRUN)
+OVERRUN, STOPPED = int(Flag.OVERRUN), int(Flag.STOPPED)
 LOST = 0b1111  # PortAudio's status: input or output under- or overflow
 UNSIGNED_LONG = types.uint32 if sys.platform == "win32" else types.uint64
 F4 = types.float32
 SLOTS, FRESH = 3, 4  # slots; bit beside the number of the slot in the middle: not yet read
 # entries of a slot: the finger's position, speed and load, whether anything is played, the gain, the voice's address,
-# how often finger and setpoints have changed, then the setpoints row by row
-POSITION, VELOCITY, LOAD, PLAYING, GAIN, VOICE_ADDRESS, FINGER_CHANGES, SETPOINT_CHANGES = range(8)
-HEAD = 8
+# how often finger and setpoints have changed, the watchdog's time (samples; 0: none), how often the application has
+# called, then the setpoints row by row
+POSITION, VELOCITY, LOAD, PLAYING, GAIN, VOICE_ADDRESS, FINGER_CHANGES, SETPOINT_CHANGES, WATCHDOG, CALLS = range(10)
+HEAD = 10
 
 BLOCK = ("sensed", "drive", "position", "waveform", "flags", "target")  # signals of a block
 _ADDRESSES = "step controller signals slots_at setpoints_at sensed_at drive_at position_at waveform_at flags_at"
-_COUNTS = "block sensors channels setpoints middle slot age samples flags refused lost ahead analysed"
+_COUNTS = "block sensors channels setpoints middle slot age samples flags refused lost ahead analysed idle timed_out"
 _TEXTURE = "current previous switch gains_at tracker log_at log_rows log_width given taken"
-_STATE = "finger_changes setpoint_changes gain touch place pace offset offset_input lead lead_input"
-_SETTINGS = "rate sensed_scale drive_scale fade touch_step gain_pole offset_kept"
+_STATE = "finger_changes setpoint_changes calls gain touch place pace offset offset_input lead lead_input open"
+_SETTINGS = "rate sensed_scale drive_scale fade touch_step gain_pole offset_kept closing_step"
 ENTRY = np.dtype(
     [
         *((name, np.int64) for name in f"{_ADDRESSES} {_COUNTS} {_TEXTURE}".split()),
@@ -179,20 +181,46 @@ def write_log(entry, slot):
 
 
 @kernel
+def watch(entry, slot):
+    """Count the samples since the application has called; beyond the watchdog's time the drive is stopped."""
+    e, values = record(entry, ENTRY_T, 0), carray(pointer(slot, F8), HEAD)
+    if values[CALLS] != e.calls:
+        e.calls, e.idle = values[CALLS], 0
+    e.idle += e.block
+    if values[WATCHDOG] > 0.0 and e.idle > values[WATCHDOG] and e.timed_out < 0:
+        e.timed_out = e.samples
+
+
+@kernel
+def fade_out(entry):
+    """Bring the drive of a block, and of all that follow, down to zero within `supervisor.FADE_OUT`."""
+    e = record(entry, ENTRY_T, 0)
+    flags, drive = carray(pointer(e.flags_at, I8), e.block), carray(pointer(e.drive_at, F8), e.block * e.channels)
+    for m in range(e.block):
+        e.open = max(e.open - e.closing_step, 0.0)
+        flags[m] |= STOPPED
+        for i in range(e.channels):
+            drive[m * e.channels + i] *= e.open
+
+
+@kernel
 def advance(entry):
     """Advance the controller by the block that is in its `sensed`; returns all flags of the block."""
     e = record(entry, ENTRY_T, 0)
     flags, drive = carray(pointer(e.flags_at, I8), e.block), carray(pointer(e.drive_at, F8), e.block * e.channels)
     slot, raised = receive(entry), 0
+    watch(entry, slot)
     play_texture(entry, slot)
     for m in range(e.block):
         flags[m] = e.lost
     e.lost = 0
-    if carray(pointer(slot, F8), HEAD)[PLAYING] > 0.0:
+    if carray(pointer(slot, F8), HEAD)[PLAYING] > 0.0 and e.open > 0.0:
         call(e.step, (e.controller, e.signals, 0, e.block))
     else:
         for i in range(e.block * e.channels):
             drive[i] = 0.0
+    if e.timed_out >= 0:
+        fade_out(entry)
     for m in range(e.block):
         raised |= flags[m]
     write_log(entry, slot)
@@ -331,12 +359,13 @@ class RealtimeEntry:
         log, rate = self._arrays["log"], self.rate
         return {
             **{"block": self.block, "sensors": self.controller.sensors, "channels": self.controller.channels},
-            **{"middle": 1, "slot": 2, "gain": 1.0, "place": np.nan, "rate": rate},
+            **{"middle": 1, "slot": 2, "timed_out": -1, "gain": 1.0, "open": 1.0, "place": np.nan, "rate": rate},
             **{"ahead": self.ahead, "analysed": self.whole, "log_rows": log.shape[0], "log_width": log.shape[1]},
             "age": round(HOLD * rate),
             "fade": round(FADE * rate),
             "switch": -round(FADE * rate),
             "touch_step": 1.0 / (TOUCH_FADE * rate),
+            "closing_step": 1.0 / (FADE_OUT * rate),
             "gain_pole": -math.expm1(-1.0 / (GAIN_TIME * rate)),
             "offset_kept": math.exp(-1.0 / (JUMP_TIME * rate)),
         }
@@ -402,6 +431,20 @@ class RealtimeEntry:
         self._slot[GAIN] = gain
         self._hand_over()
 
+    def watch(self, seconds: float | None = None) -> None:
+        """Stop the drive for good once neither this nor `alive` has been called for so long (s); None: never."""
+        with self._writing:
+            self._slot[WATCHDOG] = 0.0 if seconds is None else seconds * self.rate
+            self._slot[CALLS] += 1
+        self._hand_over()
+
+    def alive(self) -> None:
+        """Note a call of the application, for the watchdog."""
+        if self._slot[WATCHDOG] > 0.0:
+            with self._writing:
+                self._slot[CALLS] += 1
+            self._hand_over()
+
     def silence(self, quiet: bool = True) -> None:
         """Set zero drive from the next block on, whatever is sensed.
 
@@ -434,6 +477,12 @@ class RealtimeEntry:
     def flags(self) -> Flag:
         """Everything that was ever raised."""
         return Flag(int(self._entry["flags"][0]))
+
+    @property
+    def timed_out(self) -> int | None:
+        """Sample from which on the watchdog has stopped the drive; None where it has not."""
+        sample = int(self._entry["timed_out"][0])
+        return None if sample < 0 else sample
 
     @property
     def current_gain(self) -> float:

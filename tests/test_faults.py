@@ -65,6 +65,13 @@ def played_after(driver, moment):
     return np.concatenate(driver.played)[round(moment * driver.rate) :]
 
 
+def stopped(recording):
+    """Drive of a recording, which has to end with a sample of zero drive that says so, and with no other one."""
+    assert list(np.flatnonzero(recording.flags & hr.Flag.STOPPED)) == [len(recording) - 1]
+    assert not recording.drive[-1].any()
+    return recording.drive[:-1]
+
+
 @pytest.mark.parametrize("block", [1, 25])
 @pytest.mark.parametrize("error", [RuntimeError("the app broke"), KeyboardInterrupt(), MemoryError()])
 def test_an_exception_in_the_application_ends_in_zero_drive(block, error):
@@ -125,7 +132,7 @@ def test_a_signal_to_the_process_ends_in_zero_drive(tmp_path, number, status):
     assert drive[-3:-1].any()  # and no sooner: it played until the signal came
     recording = hr.Recording.load(out / "recording.au")
     assert len(recording) > 0.5 * RATE
-    np.testing.assert_array_equal(recording.drive, drive.reshape(-1, 2)[: len(recording)])
+    np.testing.assert_array_equal(stopped(recording), drive.reshape(-1, 2)[: len(recording) - 1])
 
 
 class Interrupted:
@@ -149,7 +156,7 @@ def test_a_signal_while_the_journal_is_written_loses_nothing(tmp_path):
         hr.render(hr.Scene(texture=Interrupted(), duration=2.0), driver=plate, journal=tmp_path / "run.au")
     played = np.concatenate(plate.played)
     recording = hr.Recording.load(tmp_path / "run.au")
-    np.testing.assert_array_equal(recording.drive, played[:-25])  # but for the zeros at the end
+    np.testing.assert_array_equal(stopped(recording), played[:-25])  # but for the zeros at the end
     assert not played[-25:].any()
 
 
@@ -167,7 +174,7 @@ def test_a_device_that_is_unplugged_raises_device_lost(tmp_path):
         hr.render(scene(), driver=plate, journal=tmp_path / "run.au")
     assert any("while the drive was set to zero" in note for note in gone.value.__notes__)
     assert not plate.is_open
-    assert len(hr.Recording.load(tmp_path / "run.au")) == 0.5 * RATE
+    assert len(stopped(hr.Recording.load(tmp_path / "run.au"))) == 0.5 * RATE
     assert not plate.played[-1].any()  # that was tried
 
 

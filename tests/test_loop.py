@@ -135,7 +135,9 @@ def test_a_lost_device_ends_at_rest_and_keeps_what_happened(tmp_path):
     driver = Faulty(inner, 2000, lose)
     with pytest.raises(hr.DeviceLost, match="unplugged"):
         hr.render(TONE, driver=driver, journal=tmp_path / "run.au")
-    assert len(hr.Recording.load(tmp_path / "run.au").time) == 2000  # every sample played
+    kept = hr.Recording.load(tmp_path / "run.au")
+    assert len(kept) == 2001  # every sample played, and the stop
+    assert kept.flags[-1] == hr.Flag.STOPPED
     assert not inner.plant.state["current"].any()
 
 

@@ -26,35 +26,60 @@ def fail(player):
     raise ZeroDivisionError
 
 
-def test_the_watchdog_silences_a_player_that_nobody_calls_and_the_next_call_wakes_it():
+def fail_while_recording(player, path):
+    player.play(TONE)
+    player.record(path)
+    fail(player)
+
+
+def test_the_watchdog_stops_the_drive_of_an_application_that_hangs(tmp_path):
+    """0.3 s after the last call, to a block; within 10 ms; for good, with a flag and an error."""
     with hr.Player(paced=False, watchdog=0.3) as player:
         player.play(TONE)
-        for _ in range(10):
+        player.record(tmp_path / "hung.au")
+        player.sleep(1.0)  # longer than the watchdog's time, and no stop
+        player._advance(0.4)
+        with pytest.raises(hr.WatchdogTimeout, match=r"stopped at 1\.3 s: no method of the player was called"):
             player.sleep(0.1)
-        assert player.state().bands[0].target == pytest.approx(5e-6, rel=0.01)
-        player._called -= 10.0  # as if the application had hung
-        player._service()
-        player._advance(0.2)
-        player._called -= 10.0
-        player._service()
-        assert abs(player._loop.entry.log(player._loop.entry.samples - 100)["reference"]).max() < 1e-8
-        for _ in range(5):
-            player.sleep(0.1)
-        assert player.state().bands[0].target == pytest.approx(5e-6, rel=0.01)
+    hung = Recording.load(tmp_path / "hung.au")
+    first = int(np.argmax(hung.flags & hr.Flag.STOPPED > 0))
+    assert first == pytest.approx(round(1.3 * hung.rate), abs=2)
+    assert abs(hung.drive[first - 100 : first]).max() > 0.01
+    assert abs(hung.drive[first + round(0.01 * hung.rate) :]).max() == 0.0
+    assert np.all(hung.flags[first:] & hr.Flag.STOPPED)
 
 
-def test_the_watchdog_acts_while_the_application_hangs():
-    """In real time: nobody calls, the texture fades out; the next call wakes it."""
+def test_the_watchdog_runs_in_real_time_and_waits_for_calls_that_take_long():
     with hr.Player(watchdog=0.2) as player:
         player.play(TONE)
-        player.sleep(0.3)
-        assert player._loop.entry.current_gain == pytest.approx(1.0, rel=1e-6)
+        with player._calling():
+            time.sleep(0.5)
+        player.sleep(0.1)
         end = time.monotonic() + 20.0
-        while player._loop.entry.current_gain > 1e-3 and time.monotonic() < end:
-            time.sleep(0.05)
-        assert player._loop.entry.current_gain < 1e-3
-        player.sleep(0.4)
-        assert player._loop.entry.current_gain > 0.9
+        while player._loop.entry.timed_out is None and time.monotonic() < end:
+            time.sleep(0.02)
+        assert player._loop.entry.timed_out is not None
+        time.sleep(0.2)
+        with pytest.raises(hr.WatchdogTimeout):
+            player.finger(0.0)
+
+
+def test_a_recording_says_that_an_error_ended_it(tmp_path):
+    """And one that ended well does not."""
+    with hr.Player(paced=False) as player:
+        player.play(TONE)
+        player.record(tmp_path / "well.au")
+        player.sleep(0.2)
+        player.end_recording()
+        player.record(tmp_path / "closed.au")
+    with pytest.raises(ZeroDivisionError), hr.Player(paced=False) as player:
+        fail_while_recording(player, tmp_path / "cut.au")
+    well, closed, cut = (Recording.load(tmp_path / f"{name}.au") for name in ("well", "closed", "cut"))
+    assert not (well.flags & hr.Flag.STOPPED).any()
+    assert not (closed.flags & hr.Flag.STOPPED).any()
+    assert cut.flags[-1] == hr.Flag.STOPPED
+    assert not cut.drive[-1].any()
+    assert not (cut.flags[:-1] & hr.Flag.STOPPED).any()
 
 
 def test_a_sensor_that_sticks_stops_the_drive_and_is_told_at_the_next_call(tmp_path):

@@ -43,6 +43,8 @@ class Segment:
 class Impedance:
     """Mechanical impedance of the finger over time and frequency, ``Z_f = F_f / v`` at the finger.
 
+    Consecutive windows are independent: each is as long as the estimator's memory.
+
     Parameters
     ----------
     time : ndarray, shape (n,)
@@ -55,8 +57,6 @@ class Impedance:
         Standard error of the real part and of the imaginary part (N s/m), which are taken as equal and independent.
     normal_load, position : ndarray, shape (n,)
         Of the finger (N, m).
-
-    Consecutive windows are independent: each is as long as the estimator's memory.
     """
 
     time: Array

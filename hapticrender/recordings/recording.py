@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, BinaryIO
 import numpy as np
 
 from hapticrender.bands import Bands
-from hapticrender.protocols import Array
+from hapticrender.protocols import Array, Flag
 from hapticrender.recordings import formats, journal, judge
 from hapticrender.recordings.envelopes import Envelopes, analyse
 from hapticrender.recordings.formats import MissingExtra
@@ -71,12 +71,13 @@ class Recorder:
         self._file: BinaryIO | None = None
         self._blocks: list[Array] = []  # what is not in the file yet; without a path, everything
         self._waiting = 0  # samples in them
+        self._closed = False
 
     def __enter__(self) -> Recorder:
         return self
 
-    def __exit__(self, *exc: object) -> None:
-        self.close()
+    def __exit__(self, kind: type[BaseException] | None, *exc: object) -> None:
+        self.close(stopped=kind is not None)
 
     def append(self, *, motion_source: str | None = None, **signals: Array) -> None:
         """Append n samples of every signal.
@@ -96,13 +97,16 @@ class Recorder:
         if self._file is None or self._waiting >= FLUSH * self.header.rate:
             self.flush()
 
+    def begin(self) -> None:
+        """Make the file of `path` now, not at the first block; an OSError says why it cannot be written."""
+        self._file = self._file or self._create(Path(self.path or ""))
+
     def flush(self) -> None:
         """Hand everything appended so far to the operating system; without a path, do nothing."""
         if self.path is None or not self._blocks:
             return
         blocks, self._blocks, self._waiting = self._blocks, [], 0
-        if self._file is None:
-            self._file = self._create(self.path)
+        self._file = self._file or self._create(self.path)
         try:
             frames = self._frames(blocks)
         except (KeyboardInterrupt, SystemExit):  # a signal: they are written on closing
@@ -111,13 +115,27 @@ class Recorder:
         self._file.write(frames.astype(journal.JOURNAL_DTYPE).data)
         self._file.flush()
 
-    def close(self) -> None:
-        """Write what is left and close the journal."""
+    def close(self, stopped: bool = False) -> None:
+        """Write what is left and close the journal.
+
+        A run that was `stopped` by an error or a signal ends with a sample of zero drive that has ``Flag.STOPPED``;
+        what was sensed then is not known.
+        """
         try:
+            if stopped and not self._closed and (self._file is not None or self._blocks):
+                self._append_stop()
+            self._closed = True
             self.flush()
         finally:
             if self._file is not None:
                 self._file.close()
+
+    def _append_stop(self) -> None:
+        stop, columns = np.zeros((1, len(self.header.channels))), self.header.slices
+        for name in ("sensed", "motion", "position"):
+            stop[:, columns[name]] = np.nan
+        stop[:, columns["flags"]] = int(Flag.STOPPED)
+        self._blocks.append(stop)
 
     def finish(self) -> Recording:
         """Close the journal and return the recording; with a path it is read from the file, not held in memory."""
