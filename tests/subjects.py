@@ -87,4 +87,6 @@ def population(count, seed=1):
     loads = np.geomspace(0.1, 1.2, count)[rng.permutation(count)]
     speeds = np.linspace(0.0, 0.15, count)[rng.permutation(count)]
     mechanics = [TABLE_1[i] if i < 4 else random_mechanics(rng) for i in range(count)]
-    return [Subject(m, float(w), float(v), seed + i) for i, (m, w, v) in enumerate(zip(mechanics, loads, speeds, strict=True))]  # fmt: skip
+    seeds = range(seed, seed + count)
+    each = zip(mechanics, loads.tolist(), speeds.tolist(), seeds, strict=True)
+    return [Subject(*values) for values in each]

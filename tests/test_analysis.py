@@ -129,7 +129,7 @@ def test_recorded_truth_is_not_read(studied):
 
 
 def test_bending_glass_is_taken_from_the_profile():
-    """A mode at 1250 Hz adds 5 % to the sag under the finger: the rigid profile is off by it, the bending one is not."""
+    """A mode at 1250 Hz adds 5 % to the sag under a finger: the rigid profile is off by it, the bending one is not."""
     subject = Subject(LIGHT_SECOND, 0.8, 0.0, 5, frequencies=(111.0, 400.0), off=0.0)
     scene = replace(subject.scene, profile={"bending_frequency": 1250.0})
     recording = hr.render(scene)

@@ -38,7 +38,10 @@ BLOCK = 1.0  # s of signal at a time
 
 
 def analyse_finger(
-    recording: Recording, profile: DeviceProfile | PlateParameters | str | os.PathLike[str] | None = None, *, block: int = 1
+    recording: Recording,
+    profile: DeviceProfile | PlateParameters | str | os.PathLike[str] | None = None,
+    *,
+    block: int = 1,
 ) -> FingerRecord:
     """Estimate load, position, velocity, contact, force and impedance of the finger in a recording of a plate.
 
@@ -151,9 +154,7 @@ class _Signals:
 
     def tracker(self, course: Course, rest: Rest | None) -> FingerTracker:
         """Tracker that is symmetric in time."""
-        return FingerTracker(
-            course, rate=self.rate, late=self.late, noise=self.sensor_noise, lookahead=1.0, rest=rest
-        )
+        return FingerTracker(course, rate=self.rate, late=self.late, noise=self.sensor_noise, lookahead=1.0, rest=rest)
 
     def track(self, course: Course, rest: Rest | None) -> Touch:
         """Track the whole recording, a second at a time."""
@@ -161,12 +162,10 @@ class _Signals:
         starts = range(0, len(self.drive), step)
         parts = [tracker.update(self.drive[i : i + step], self.sensed[i : i + step]) for i in starts]
         time, contact = (np.concatenate([getattr(part, name) for part in parts]) for name in ("time", "contact"))
-        series = []
-        for name in ("normal_load", "position", "velocity"):
-            each = [getattr(part, name) for part in parts]
-            value, error = (np.concatenate([getattr(x, y) for x in each]) for y in ("value", "standard_error"))
-            series.append(Series(value, error, each[0].bandwidth))
-        return Touch(time, *series, contact)
+        load, position, velocity = (
+            _joined([getattr(part, name) for part in parts]) for name in ("normal_load", "position", "velocity")
+        )
+        return Touch(time, load, position, velocity, contact)
 
     def unloaded(self, touch: Touch, frequency: Array, length: int, quiet: float) -> Lines:
         """Demodulate windows without contact, whose mean load is below `quiet` (N)."""
@@ -182,28 +181,34 @@ class _Signals:
         passed = np.exp(-0.5 * (2 * np.pi * frequency * self.spread) ** 2)
         return replace(lines, amplitude=lines.amplitude / passed[..., None])
 
-    def impedance(self, course: Course, touch: Touch, bands: Bands, fixed: Array, length: int, gain: float) -> Impedance:
+    def impedance(
+        self, course: Course, touch: Touch, bands: Bands, fixed: Array, length: int, gain: float
+    ) -> Impedance:
         """Impedance of the finger in windows under load."""
         a, end = course.plate.half_spacing, course.plate.glass_length / 2 - NEAR_END
         place, error = touch.position.value, touch.position.standard_error
         with np.errstate(invalid="ignore"):
             inside = (touch.contact == LOADED) & (np.abs(place) < end)
         starts = tile(inside, length, round(SETTLING * self.rate), round(BEFORE * self.rate))
-        means = [
-            np.array([each[i : i + length].mean() for i in starts])
-            for each in (touch.normal_load.value, place, error, touch.velocity.value)
-        ]
+        series = touch.normal_load.value, place, error, touch.velocity.value
+        load, middle, spread, speed = (np.array([each[i : i + length].mean() for i in starts]) for each in series)
         locked = bands.wavenumber > 0.0
-        moving = np.abs(bands.frequency[locked] + np.multiply.outer(means[3], bands.wavenumber[locked]))
+        moving = np.abs(bands.frequency[locked] + np.multiply.outer(speed, bands.wavenumber[locked]))
         frequency = np.hstack([np.tile(fixed, (len(starts), 1)), moving.reshape(len(starts), int(locked.sum()))])
         usable = (frequency >= SLOWEST) & (frequency <= FASTEST * self.rate)
         frequency = np.where(usable, frequency, SLOWEST)
         lever = np.nan_to_num(place) / a * self.columns[: len(place), 3]
         columns = np.column_stack([self.columns[: len(place)], lever])
         lines = self.lines(columns, starts, length, frequency)
-        found = impedance_of(course, lines, self.noise, *means[:3], gain)
-        value, spread = (np.where(usable, each, np.nan) for each in (found.value, found.standard_error))
-        return replace(found, value=value, standard_error=spread)
+        found = impedance_of(course, lines, self.noise, load, middle, spread, gain)
+        value, errors = (np.where(usable, each, np.nan) for each in (found.value, found.standard_error))
+        return replace(found, value=value, standard_error=errors)
+
+
+def _joined(parts: list[Series]) -> Series:
+    """One series of several."""
+    value, error = (np.concatenate([getattr(part, name) for part in parts]) for name in ("value", "standard_error"))
+    return Series(value, error, parts[0].bandwidth)
 
 
 def _segments(touch: Touch, rate: float) -> tuple[Segment, ...]:
@@ -214,7 +219,9 @@ def _segments(touch: Touch, rate: float) -> tuple[Segment, ...]:
     )
 
 
-def _notes(recording: Recording, course: Course, touch: Touch, rest: Rest | None, impedance: Impedance) -> Iterator[str]:
+def _notes(
+    recording: Recording, course: Course, touch: Touch, rest: Rest | None, impedance: Impedance
+) -> Iterator[str]:
     """Say what could not be measured, and why."""
     if rest is None:
         yield (
@@ -222,14 +229,15 @@ def _notes(recording: Recording, course: Course, touch: Touch, rest: Rest | None
             "profile"
         )
     elif not course.measured:
-        yield (
-            "the carriers do not determine the stiffness while nothing touches: it is mostly that of the profile"
-        )
+        yield ("the carriers do not determine the stiffness while nothing touches: it is mostly that of the profile")
     if not (touch.contact == LOADED).any():
         yield "no finger touches"
     elif not len(impedance.time):
         yield "no touch is long enough for a window: the impedance is not measured"
     flags = np.bitwise_or.reduce(recording.flags) if len(recording) else 0
-    for bad, text in ((Flag.NONFINITE, "samples that are no numbers are held"), (Flag.SENSOR_CLIPPED, "a sensor clips")):
+    for bad, text in (
+        (Flag.NONFINITE, "samples that are no numbers are held"),
+        (Flag.SENSOR_CLIPPED, "a sensor clips"),
+    ):
         if flags & bad:
             yield f"{text}: estimates near them are wrong by more than they say"

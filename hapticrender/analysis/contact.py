@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from hapticrender.analysis.smoothing import History
@@ -11,7 +13,9 @@ FALSE = 1e-3  # false contacts in `SPAN`
 SPAN = 600.0  # s
 HOLD = 5e-3  # s for which the force stays below the lower threshold before contact is lost
 TICK = 0.05  # s between two corrections of the force at rest
-FOLLOWED = 2.0  # s over which it is averaged
+FOLLOWED = 5.0  # s over which it and its trend are fitted
+LEAST = 2.0  # s of a line before its trend counts
+TREND = 4.0  # standard deviations from which on a trend counts, and goes on under a finger
 
 
 def clear_sigmas(bandwidth: float) -> float:
@@ -27,8 +31,8 @@ def clear_sigmas(bandwidth: float) -> float:
 class ContactDetector:
     """Detect contact in the heave force, block by block: on above `high`, off once below half of it for `HOLD`.
 
-    While nothing touches, the force at rest (sensors that drift, a suspension that creeps) is followed as a mean over
-    up to `FOLLOWED`, corrected every `TICK`; under a finger it is held.
+    While nothing touches, the force at rest (sensors that drift, a suspension that creeps) is followed as a line over
+    up to `FOLLOWED`, corrected every `TICK`; under a finger it is held, or goes on by its trend.
 
     Parameters
     ----------
@@ -36,8 +40,8 @@ class ContactDetector:
     quiet : int, samples
         At the beginning, in which filters settle and no contact is detected.
     still : float, N
-        A mean of the heave force over a tick that is farther from that at rest counts as if it were so far: a touch too
-        light to be detected changes the force at rest slowly.
+        Where the mean of the heave force over a tick is farther from that at rest, as by a touch too light to be
+        detected, the values at rest go towards it by so much in `FOLLOWED`.
     columns : int
         Of what is measured: the heave force (N) first, others beside it, whose values at rest are followed as well.
     """
@@ -49,16 +53,17 @@ class ContactDetector:
         self._given = History(self.delay)
         self._at = -self.delay  # sample of the next result
         self._quiet, self._still, self._loaded = quiet, still, False
-        self._rest, self._ticks = np.zeros(columns), 0.0  # values at rest; ticks averaged in them
+        self._rest, self._trend, self._ticks = np.zeros(columns), np.zeros(columns), 0  # trend: a tick; ticks fitted
+        self._scatter = 0.0  # N^2: mean square of what ticks differ from the line
         self._sum, self._count = np.zeros(columns), 0  # of the present tick
 
     @property
-    def averaged(self) -> float:
-        """Samples of which the values at rest are the mean."""
-        return self._ticks * self._tick
+    def variance(self) -> float:
+        """Variance (N^2) of the heave force at rest: at its end a line is four times as uncertain as a mean."""
+        return 4 * self._scatter / max(self._ticks, 1)
 
     def update(self, measured: Array, high: Array, rest: Array | None = None) -> tuple[Array, Array]:
-        """Contact (bool, (n,)) and values at rest (n, columns) of the n samples that end `delay` before the block's end.
+        """Contact (bool, (n,)) and values at rest (n, columns) of the n samples that end `delay` before the block does.
 
         `measured` (n, columns) has the heave force (N) first, `high` (N, (n,)) is its upper threshold; `rest`
         (n, columns) replaces what would be followed.
@@ -69,7 +74,7 @@ class ContactDetector:
         joined, high = self._measured.before(measured), self._high.before(high)
         ahead = maximum_filter1d(joined[:, 0], self.delay + 1, origin=-((self.delay + 1) // 2))[:n]
         loaded, level = np.zeros(n, bool), np.zeros_like(measured)
-        delayed = None if rest is None else self._given.before(rest)
+        delayed = np.empty(0) if rest is None else self._given.before(rest)
         first = 0
         while first < n:
             last = min(n, first + self._tick - (self._at + first) % self._tick)
@@ -95,9 +100,30 @@ class ContactDetector:
         if not loaded.any() and end - self._count - len(measured) >= self._quiet:
             self._sum, self._count = self._sum + measured.sum(axis=0), self._count + len(measured)
         if end % self._tick == 0:
-            change = self._sum / self._tick - self._rest
             if self._count == self._tick:
-                most = np.inf if self._ticks == 0.0 else self._still
-                self._ticks = min(self._ticks + 1.0, FOLLOWED / TICK)
-                self._rest = self._rest + change * min(1.0, most / max(abs(change[0]), 1e-30)) / self._ticks
+                self._correct(self._sum / self._tick - self._rest)
+            elif self._clear:
+                self._rest = self._rest + self._trend
             self._sum, self._count = np.zeros_like(self._sum), 0
+
+    def _correct(self, change: Array) -> None:
+        """Move line and trend at rest by what a tick differs from them: least squares over a growing, then fading span.
+
+        The gains are those of a line fitted to k values (Brookner, Tracking and Kalman filtering made easy, 1998, 4.3).
+        """
+        gone = change - self._trend
+        if self._ticks > 1 and abs(gone[0]) > self._still:
+            trend = self._trend if self._clear else 0.0
+            self._rest = self._rest + trend + gone * self._still / abs(gone[0]) * TICK / FOLLOWED
+            return
+        self._ticks = k = min(self._ticks + 1, round(FOLLOWED / TICK))
+        self._rest = self._rest + self._trend + gone * 2 * (2 * k - 1) / (k * (k + 1))
+        if k > 1:
+            self._trend = self._trend + gone * 6 / (k * (k + 1))
+            self._scatter += (float(gone[0]) ** 2 - self._scatter) / (k - 1)
+
+    @property
+    def _clear(self) -> bool:
+        """Whether the trend is beyond chance."""
+        k = self._ticks
+        return k * TICK >= LEAST and abs(self._trend[0]) > TREND * math.sqrt(12 * self._scatter / k**3)

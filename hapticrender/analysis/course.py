@@ -52,9 +52,10 @@ class Signals:
     def residual(self, theta: Array, half_spacing: float) -> Array:
         """Force of the finger on heave and rocking (N, shape (..., 2)) for parameters theta (..., 6)."""
         x, v, (m, inertia, k1, k2, b1, b2) = self.displacement, self.velocity, np.moveaxis(theta, -1, 0)
-        side = [k * (x[..., 0] + s * x[..., 1]) + b * (v[..., 0] + s * v[..., 1]) for k, b, s in ((k1, b1, -1), (k2, b2, 1))]  # fmt: skip
+        first = k1 * (x[..., 0] - x[..., 1]) + b1 * (v[..., 0] - v[..., 1])
+        second = k2 * (x[..., 0] + x[..., 1]) + b2 * (v[..., 0] + v[..., 1])
         masses = np.stack(np.broadcast_arrays(m, inertia / half_spacing**2), axis=-1)
-        return self.force - masses * self.acceleration - np.stack([side[0] + side[1], side[1] - side[0]], axis=-1)
+        return self.force - masses * self.acceleration - np.stack([first + second, second - first], axis=-1)
 
 
 @dataclass(frozen=True)
@@ -90,8 +91,8 @@ class Course:
         Over a recording of a `duration` (s) stiffness and damping may drift by `DRIFT`, one standard deviation.
         """
         start = np.array([getattr(plate, name) for name in MECHANICAL])
-        given = uncertainty or {}
-        spread = [given.get(name, share * value) for name, share, value in zip(MECHANICAL, UNCERTAINTY, start, strict=True)]  # fmt: skip
+        defaults = dict(zip(MECHANICAL, start * UNCERTAINTY, strict=True))
+        spread = [{**defaults, **(uncertainty or {})}[name] for name in MECHANICAL]
         drift = np.array(DRIFT) * start[2:] / max(duration, DRIFT_TIME) if duration else np.zeros(4)
         return cls(plate, start, np.zeros(4), np.diag(np.r_[spread, drift] ** 2))
 

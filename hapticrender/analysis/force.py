@@ -23,7 +23,7 @@ def sensor_noise(sensed: Array) -> Array:
 
 
 class MotionFilter:
-    """Smooth the sensed motion, differentiate it twice, and smooth the drive's force by the same kernel, block by block.
+    """Smooth the sensed motion, differentiate it twice, and smooth the drive's force by one kernel, block by block.
 
     Row n of the drive is held while row n to n + 1 are sensed, `late` samples later.  Results come `delay` samples
     after the sample that they belong to.
@@ -66,9 +66,8 @@ class MotionFilter:
         return np.sqrt(self.coordinate_from_sensed**2 @ np.asarray(noise) ** 2)
 
     def force_noise(self, noise: Array) -> Array:
-        """Standard deviation (N, (2,)) of the residual forces by that of the sensors (m, (2,)), coordinate by coordinate."""
+        """Standard deviation (N, (2,)) of the residual forces of heave and rocking by that of the sensors (m, (2,))."""
         p = self._plate
         balance = np.stack([np.diagonal(each) for each in (p.stiffness_matrix, p.damping_matrix, p.mass_matrix)])
         taps = balance.T @ self._motion
         return self.coordinate_noise(noise) * np.sqrt((taps**2).sum(axis=1))
-

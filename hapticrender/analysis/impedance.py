@@ -5,8 +5,8 @@ velocity at the finger.  White noise n of the coordinates and the parameters' er
 
     dZ = -([D_cc, D_cr] + j w Z [1, g]) n/v - Phi_c e/v,   g = p/a
 
-so that it is the noise of the plate under the finger, over the velocity.  An error of g by de adds ``Z v_r de/v``, a gain
-error common to both sensors its share of Z.
+so that it is the noise of the plate under the finger, over the velocity.  An error of g by dg adds ``Z v_r dg/v``, a
+gain error common to both sensors its share of Z.
 """
 
 from __future__ import annotations
@@ -60,7 +60,9 @@ def impedance_of(
     by_plate = np.einsum("nbi,nij,nbj->nb", phi, covariance, phi.conj()).real / 2
     by_place = np.abs(value * amplitudes.velocity[..., 1] * (position_error / a)[:, None]) ** 2 / 2
     with np.errstate(divide="ignore", invalid="ignore"):
-        variance = (by_noise + by_plate + by_place) / np.abs(passed * velocity) ** 2 + np.abs(value * gain_error) ** 2 / 2
+        variance = (by_noise + by_plate + by_place) / np.abs(passed * velocity) ** 2 + np.abs(
+            value * gain_error
+        ) ** 2 / 2
         clear = np.abs(velocity) > CLEAR * np.abs(s) * noise[0] * np.sqrt(lines.variance)
     return Impedance(
         lines.time,

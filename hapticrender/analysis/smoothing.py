@@ -90,10 +90,8 @@ class LocalLine:
 
     Attributes
     ----------
-    bandwidths : (float, float), Hz
-        At which level and slope pass half of the power, inside a long span.
     noise : (float, float)
-        Sums of w_i^2 (1) and u_i^2 (1/s^2) there.
+        Sums of w_i^2 (1) and u_i^2 (1/s^2) inside a long span.
     """
 
     def __init__(self, spread: float, rate: float, ahead: int) -> None:
@@ -102,11 +100,10 @@ class LocalLine:
         g = derivative_kernels(spread, rate)[0][self.behind - ahead :]
         self._taps = [g * self._times**k for k in range(3)]
         self._squares = [g**2 * self._times**k for k in range(3)]
-        self.bandwidths = self._bandwidths()
         self.noise = tuple(float((weights**2).sum()) for weights in self.weights())
 
     def weights(self) -> tuple[Array, Array]:
-        """w and u inside a long span, as taps for `convolve`."""
+        """Taps w and u inside a long span, for `convolve`."""
         s0, s1, s2 = (taps.sum() for taps in self._taps)
         g, det = self._taps[0], s0 * s2 - s1**2
         return g * (s2 - s1 * self._times) / det, g * (s0 * self._times - s1) / det
@@ -117,10 +114,15 @@ class LocalLine:
         level, slope = (np.exp(1j * np.outer(w, self._times)) @ weights for weights in self.weights())
         return level, slope / (1j * w)
 
-    def _bandwidths(self) -> tuple[float, float]:
-        """Frequencies (Hz) at which level and slope pass half of the power."""
-        frequency = np.arange(0.25, 250.0, 0.25)
-        return tuple(float(frequency[np.argmax(np.abs(each) ** 2 < 0.5)]) for each in self.response(frequency))  # type: ignore[return-value]
+    def bandwidths(self, smoothed: float = 0.0) -> tuple[float, float]:
+        """Frequencies (Hz) at which level and slope pass half of the power of a signal smoothed by g before.
+
+        `smoothed` is the spread (s) of that g.
+        """
+        frequency = np.arange(0.05, 500.0, 0.05)
+        before = np.exp(-((2 * np.pi * frequency * smoothed) ** 2))
+        level, slope = (int(np.argmax(before * np.abs(each) ** 2 < 0.5)) for each in self.response(frequency))
+        return float(frequency[level]), float(frequency[slope])
 
     def fit(self, signal: Array, inside: Array) -> tuple[Array, Array, Array, Array]:
         """Level and slope (n, k) of a signal (n + behind + ahead, k), and the sums of squares of w and u (n,).

@@ -99,12 +99,14 @@ class FingerTracker:
         self._noise = float(self._filter.force_noise(noise)[0])
         self._clear = clear_sigmas(2 * FAST)
         self._bent = float(p.stiffness_matrix[0, 0] * self.course.bending(0.0).real)
-        self._detector = ContactDetector(self.rate, 2 * self._filter.delay, self._clear * self._noise / 2, columns=4)
+        self._white = p.stiffness_matrix[0, 0] * self._filter.coordinate_noise(noise)
+        quiet, still = 2 * self._filter.delay, self._clear * self._noise / 2
+        self._detector = ContactDetector(self.rate, quiet, still, columns=4)
+        self._bandwidth = self._line.bandwidths(self._filter.spread)
         self._edge = self._filter.delay  # samples beside a change of contact that are left out
         self._given, self._at, self._first = rest, -self._filter.delay, 0
         self._history = History(self._line.behind + self._line.ahead + 2 * self._edge)
         self._peak, self._delayed = History(round(PEAK * self.rate)), History(self._detector.delay)
-        self._white = p.stiffness_matrix[0, 0] * self._filter.coordinate_noise(noise)
 
     @property
     def latency(self) -> int:
@@ -114,7 +116,7 @@ class FingerTracker:
     @property
     def bandwidth(self) -> tuple[float, float]:
         """Frequencies (Hz) at which load and position, and the velocity, pass half of the power."""
-        return self._line.bandwidths
+        return self._bandwidth
 
     @property
     def load_noise(self) -> float:
@@ -184,8 +186,8 @@ class FingerTracker:
         time = self._first - self.latency + np.arange(n)
         self._first += n
         kept = time >= 0
-        series = [Series(value[kept], error[kept], width) for value, error, width in series]  # type: ignore[assignment]
-        return Touch(time[kept] / self.rate, *series, contact[kept])  # type: ignore[arg-type]
+        load, position, velocity = (Series(value[kept], error[kept], width) for value, error, width in series)
+        return Touch(time[kept] / self.rate, load, position, velocity, contact[kept])
 
     def _series(
         self, level: Array, slope: Array, of_level: Array, of_slope: Array, loaded: Array
@@ -198,8 +200,7 @@ class FingerTracker:
                 load = level[:, 0] / (1 + self._bent * self.course.plate.displacement(a * level[:, 1] / load)[:, 2])
             g, share = level[:, 1] / load, load / level[:, 0]
             of_load, of_lever = self._of_stiffness(level[:, 2:], g)
-            averaged = self._detector.averaged if self._given is None else self._given.samples
-            rest = 1.0 / averaged if averaged else 0.0
+            rest = self._detector.variance / self._white[0] ** 2 if self._given is None else 1.0 / self._given.samples
             scatter = self._white[1] ** 2 + g**2 * self._white[0] ** 2
             load_error = np.sqrt(self._white[0] ** 2 * (of_level + rest) + of_load)
             error = a / load * np.sqrt(scatter * (of_level + rest) + of_lever)
@@ -209,7 +210,8 @@ class FingerTracker:
         position, velocity = (np.where(defined, each, np.nan) for each in (a * g, velocity))
         error, velocity_error = (np.where(defined, each, np.nan) for each in (error, velocity_error))
         load = np.where(np.isnan(load), level[:, 0], load)
-        return [(load, load_error, widths[0]), (position, error, widths[0]), (velocity, velocity_error, widths[1])]  # fmt: skip
+        errors = load_error, error, velocity_error
+        return list(zip((load, position, velocity), errors, (widths[0], *widths), strict=True))
 
     def _of_stiffness(self, sag: Array, g: Array) -> tuple[Array, Array]:
         """Variances of the load (N^2) and of N - g W (N^2) by the uncertainty of k1 and k2, for a sag (m, (n, 2))."""
