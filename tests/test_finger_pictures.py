@@ -121,9 +121,9 @@ def test_a_mean_exponent_is_weighted_and_its_error_widened_by_scatter():
     one = LoadLaw(*np.array([[100.0], [0.1], [0.1], [1.0], [1.0], [1.0], [9.0]]))
     apart, near = (replace(one, exponent=np.array([n]), standard_error=np.array([0.2])) for n in (1.1, 0.1))
     missing = replace(one, exponent=np.array([np.nan]))
-    (mean,), (error,) = mean_exponent([one, near, missing], np.array([101.0]))
+    (mean,), (error,), _ = mean_exponent([one, near, missing], np.array([101.0]))
     assert (mean, error) == pytest.approx((0.1, 0.2 / np.sqrt(5)))  # weights 100 and 25
-    (mean,), (error,) = mean_exponent([one, apart], np.array([101.0]))
+    (mean,), (error,), _ = mean_exponent([one, apart], np.array([101.0]))
     assert mean == pytest.approx((100 * 0.1 + 25 * 1.1) / 125)
     assert error == pytest.approx(np.sqrt((100 * 0.2**2 + 25 * 0.8**2) / 125))
     assert np.isnan(mean_exponent([one], np.array([200.0]))).all()
@@ -142,6 +142,17 @@ def test_a_record_with_few_bands_or_none_has_what_can_be_drawn(rng, tmp_path, ba
     shown, text = parsed(pictures.draw(few, tmp_path))
     assert sorted(shown) == names
     assert sentence in text
+
+
+def test_a_carrier_that_follows_the_finger_is_drawn_where_it_was(record, tmp_path):
+    """Every window has a frequency of its own, and none an exponent."""
+    z, count = record.impedance, len(record.impedance.time)
+    frequency = np.geomspace(20, 200, count)[:, None]
+    error = np.where(np.isfinite(z.value[:, :1]), 0.1, np.nan)
+    moving = Impedance(z.time, frequency, 0 * error + LIGHT.impedance(frequency), error, z.normal_load, z.position)
+    shown, text = parsed(pictures.draw(replace(record, impedance=moving), tmp_path))
+    assert len(shown) == 3
+    assert text.count("<td>–</td><td>") >= 10
 
 
 def test_a_finger_that_never_touched_has_a_page(record, tmp_path):

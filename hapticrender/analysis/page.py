@@ -124,7 +124,7 @@ def _laws(records: Sequence[FingerRecord]) -> str:
         head.insert(1, "n within a recording")
         note = " Within a recording: the mean, weighted by errors; beside it, differences between fingers count too."
         means = mean_exponent([load_exponent(each) for each in records], law.frequency)
-        for row, n, error in zip(rows, *means, strict=True):
+        for row, n, error in zip(rows, *means[:2], strict=True):
             row.insert(1, _exponent(n, error))
     return f"""{html_table(_row("th", *head), [_row("td", *row) for row in rows])}
 <p class="note">|Z<sub>f</sub>| ~ W<sup>n</sup>; contact of an elastic sphere suggests n = 1/3.{note}</p>"""

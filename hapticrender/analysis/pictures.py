@@ -119,7 +119,8 @@ def draw_frequency(records: Sequence[FingerRecord], fits: Fits, path: str | os.P
             _over_frequency(column, name, of_class, samples_of(records, LOAD_CLASSES[name]))
         panels[0, 0].set_ylim(0.6 * np.quantile(size, 0.01), 1.7 * np.quantile(size, 0.99))
         panels[0, 0].set_ylabel("|Z_f| (N s/m)")
-        panels[1, 0].set_ylabel("phase (degrees)")
+        low, high = panels[1, 0].get_ylim()
+        panels[1, 0].set(ylabel="phase (degrees)", ylim=(max(low, -180), min(high, 180)))
         for axes in panels[-1] if len(fits) > 1 else panels[:, 0]:
             axes.set_xlabel("frequency (Hz)")
         for axis in (panels[0, 0].xaxis, panels[0, 0].yaxis):
@@ -263,21 +264,10 @@ def _determination(axes: Any, each: list[LoadLaw], pooled: LoadLaw) -> None:
     """The paper's Fig. 8 D: coefficient of determination between load and impedance, within a recording."""
     for law in each:
         axes.plot(law.frequency, law.determination, "o", color=PALE, ms=3, alpha=0.7)
-    mean = [
-        np.mean([law.determination[np.abs(np.log(law.frequency / at)) < BAND].mean() for law in _with(each, at)])
-        for at in pooled.frequency
-    ]
+    mean = mean_exponent(each, pooled.frequency)[2]
     axes.plot(pooled.frequency, mean, "o-", color=INK, lw=1.4, ms=4, label="mean" if len(each) > 1 else None)
     axes.set(title="|Z_f| explained by the load", ylabel="R² within a recording", ylim=(-0.03, 1.03))
-    _frequency_axis(axes.xaxis)
-
-
-def _with(laws: list[LoadLaw], frequency: float) -> list[LoadLaw]:
-    """Laws that have a determination at a frequency."""
-    return [
-        law for law in laws
-        if np.isfinite(law.determination[np.abs(np.log(law.frequency / frequency)) < BAND]).any()
-    ]  # fmt: skip
+    _frequency_axis(axes, pooled.frequency)
 
 
 def _exponent(axes: Any, each: list[LoadLaw], pooled: LoadLaw) -> None:
@@ -287,7 +277,7 @@ def _exponent(axes: Any, each: list[LoadLaw], pooled: LoadLaw) -> None:
     if len(each) > 1:
         for law in each:
             axes.plot(law.frequency, law.exponent, "o", color=PALE, ms=3, alpha=0.7)
-        shown.append(mean_exponent(each, pooled.frequency))
+        shown.append(mean_exponent(each, pooled.frequency)[:2])
         axes.errorbar(pooled.frequency, shown[1][0], SURE * shown[1][1], color=BLUE, label="mean of each", **style)
     label, colour = ("all together", ORANGE) if len(each) > 1 else ("95 %", BLUE)
     axes.errorbar(pooled.frequency, pooled.exponent, SURE * pooled.standard_error, color=colour, label=label, **style)
@@ -296,7 +286,7 @@ def _exponent(axes: Any, each: list[LoadLaw], pooled: LoadLaw) -> None:
     ends = ends[np.isfinite(ends)]
     axes.set(title="Exponent n of |Z_f| ~ Wⁿ", ylabel="n")
     axes.set_ylim(min(-0.1, ends.min(initial=0) - 0.1), max(0.8, ends.max(initial=0) + 0.1))
-    _frequency_axis(axes.xaxis)
+    _frequency_axis(axes, pooled.frequency)
     axes.legend(loc="lower right")
 
 
@@ -358,7 +348,6 @@ def _numbers(axis: Any) -> None:
     axis.set_minor_formatter(lambda value, _: f"{value:g}" if f"{value:e}"[0] in "25" else "")
 
 
-def _frequency_axis(axis: Any) -> None:
-    axis.axes.set_xscale("log")
-    axis.axes.set_xlabel("frequency (Hz)")
-    _numbers(axis)
+def _frequency_axis(axes: Any, frequency: Array) -> None:
+    axes.set(xlabel="frequency (Hz)", xlim=(0.87 * frequency.min(), 1.15 * frequency.max()), xscale="log")
+    _numbers(axes.xaxis)
