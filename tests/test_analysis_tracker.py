@@ -173,9 +173,7 @@ def test_bandwidth_and_latency_are_as_predicted(lookahead):
         periods = int(frequency * 10)
         at = slice(10_000, 10_000 + round(periods / frequency * RATE))
         signal = found["load"] if of_load else found["velocity"]
-        amplitude = abs(complex_amplitude(signal[at], frequency)) / (
-            0.2 if of_load else 2 * np.pi * frequency * 0.005
-        )
+        amplitude = abs(complex_amplitude(signal[at], frequency)) / (0.2 if of_load else 2 * np.pi * frequency * 0.005)
         assert amplitude == pytest.approx(np.sqrt(0.5), rel=0.01)  # a frequency is stated to 0.05 Hz: 0.4 % of gain
     assert len(found["time"]) == len(drive) - tracker.latency
 
@@ -207,7 +205,7 @@ def test_position_is_undefined_under_a_load_that_is_too_small():
 
 
 def test_threshold_of_contact_is_that_of_the_noise():
-    """Once in ten minutes of 200 Hz noise and a thousand such spans; a touch below it is no contact, one above it is."""
+    """False once in a thousand times ten minutes of 200 Hz noise; a touch below it is no contact, one above it is."""
     assert clear_sigmas(200.0) == pytest.approx(5.76, abs=0.01)
     tracker = hr.FingerTracker(PLATE)
     for share in (0.6, 1.5):
@@ -220,3 +218,19 @@ def test_threshold_of_contact_is_that_of_the_noise():
 def test_wrong_arguments_are_refused():
     with pytest.raises(ValueError, match=r"lookahead=-1 s: must be finite and >= 0"):
         hr.FingerTracker(PLATE, lookahead=-1)
+
+
+@pytest.mark.parametrize(("left", "ends"), [(0.0, True), (0.04, True), (0.1, False)])
+def test_a_suspension_that_creeps_under_a_touch(left, ends):
+    """A lift may leave 4 % of the load, which is then the zero; 10 % are a lighter touch."""
+    finger = hr.Finger.still(position=5e-3, normal_load=1.0, touches=[(1.0, 3.0), (4.0, 4.5)])
+    drive, sensed = run(finger, 5.0)
+    time = np.arange(len(drive)) / RATE
+    sensed[time >= 1.0] -= left * 1.0 / PLATE.stiffness_matrix[0, 0] * np.minimum(time[time >= 1.0] - 1.0, 1.0)[:, None]
+    found = tracked(hr.FingerTracker(PLATE), drive, sensed)
+    loaded = found["contact"] == LOADED
+    assert loaded[(found["time"] > 3.01) & (found["time"] < 3.99)].any() != ends
+    if ends:
+        assert not loaded[found["time"] > 4.51].any()
+        again = (found["time"] > 4.1) & (found["time"] < 4.4)
+        assert (np.abs(found["load"][again] - 1.0) < 0.02).all()

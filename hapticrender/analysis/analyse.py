@@ -65,7 +65,7 @@ def analyse_finger(
     Notes
     -----
     Contact is first decided on the profile's plate; the plate's parameters and the sensors' zero are then estimated
-    from the spans without contact, and all is repeated with them.  The series end 105 ms before the recording does.
+    from the spans without contact, and all is repeated with them.  The series end 85 ms before the recording does.
     """
     course = _believed(recording, profile)
     late = course.plate.delay - block

@@ -11,6 +11,7 @@ from hapticrender.protocols import Array
 
 FALSE = 1e-3  # false contacts in `SPAN`
 SPAN = 600.0  # s
+CREEP = 0.05  # of a touch's load: what may be left of it after a lift, by a suspension that creeps
 HOLD = 5e-3  # s for which the force stays below the lower threshold before contact is lost
 TICK = 0.05  # s between two corrections of the force at rest
 FOLLOWED = 5.0  # s over which it and its trend are fitted
@@ -29,10 +30,11 @@ def clear_sigmas(bandwidth: float) -> float:
 
 
 class ContactDetector:
-    """Detect contact in the heave force, block by block: on above `high`, off once below half of it for `HOLD`.
+    """Detect contact in the heave force, block by block: on above `high`, off below half of it for `HOLD`.
 
     While nothing touches, the force at rest (sensors that drift, a suspension that creeps) is followed as a line over
-    up to `FOLLOWED`, corrected every `TICK`; under a finger it is held, or goes on by its trend.
+    up to `FOLLOWED`, corrected every `TICK`; under a finger it is held, or goes on by its trend.  A lift may leave
+    `CREEP` of the touch's load, which is then the force at rest.
 
     Parameters
     ----------
@@ -55,7 +57,8 @@ class ContactDetector:
         self._quiet, self._still, self._loaded = quiet, still, False
         self._rest, self._trend, self._ticks = np.zeros(columns), np.zeros(columns), 0  # trend: a tick; ticks fitted
         self._scatter = 0.0  # N^2: mean square of what ticks differ from the line
-        self._sum, self._count = np.zeros(columns), 0  # of the present tick
+        self._sum, self._count, self._down = np.zeros(columns), 0, 0  # of the present tick; samples under a finger
+        self._peak = 0.0  # N: largest mean of a tick in the present touch
 
     @property
     def variance(self) -> float:
@@ -80,15 +83,25 @@ class ContactDetector:
             last = min(n, first + self._tick - (self._at + first) % self._tick)
             now = slice(first, last)
             level[now] = self._rest if rest is None else delayed[now]
+            before = self._loaded
             loaded[now] = self._decide(joined[now, 0] - level[now, 0], ahead[now] - level[now, 0], high[now], first)
-            self._follow(joined[now], loaded[now], self._at + last)
-            first = last
+            if before and not loaded[now].all():
+                lifted = first + int(np.argmin(loaded[now]))
+                left = joined[lifted : lifted + self.delay + 1].mean(axis=0) - level[lifted]
+                self._peak = 0.0
+                if rest is None and left[0] > 0.5 * high[lifted]:
+                    self._rest, self._trend, self._ticks = self._rest + left, 0 * self._trend, 1
+                    now, self._loaded = slice(first, lifted + 1), False
+                    level[lifted] = self._rest
+            self._follow(joined[now], loaded[now], self._at + now.stop)
+            first = now.stop
         self._at += n
         return loaded, level
 
     def _decide(self, force: Array, ahead: Array, high: Array, first: int) -> Array:
         """Contact of a part of a tick: the last of the events on and off."""
-        event = np.where(force > high, 1, np.where(ahead < 0.5 * high, -1, 0))
+        low = np.maximum(0.5 * high, CREEP * self._peak)
+        event = np.where(force > np.maximum(high, low), 1, np.where(ahead < low, -1, 0))
         event[np.arange(len(event)) + self._at + first < self._quiet] = 0
         last = np.maximum.accumulate(np.where(event != 0, np.arange(len(event)), -1))
         loaded = np.where(last < 0, self._loaded, event[last] > 0)
@@ -96,15 +109,19 @@ class ContactDetector:
         return loaded
 
     def _follow(self, measured: Array, loaded: Array, end: int) -> None:
-        """Average a tick without contact into the values at rest."""
-        if not loaded.any() and end - self._count - len(measured) >= self._quiet:
-            self._sum, self._count = self._sum + measured.sum(axis=0), self._count + len(measured)
-        if end % self._tick == 0:
-            if self._count == self._tick:
-                self._correct(self._sum / self._tick - self._rest)
-            elif self._clear:
-                self._rest = self._rest + self._trend
-            self._sum, self._count = np.zeros_like(self._sum), 0
+        """Take a part of a tick in; at its end correct the values at rest, or note the load of the touch."""
+        self._sum, self._count = self._sum + measured.sum(axis=0), self._count + len(measured)
+        self._down += int(loaded.sum())
+        if end % self._tick:
+            return
+        change = self._sum / self._count - self._rest
+        if self._count == self._tick and end - self._tick >= self._quiet and self._down == 0:
+            self._correct(change)
+        elif self._clear:
+            self._rest = self._rest + self._trend
+        if self._down == self._tick:
+            self._peak = max(self._peak, float(change[0]))
+        self._sum, self._count, self._down = np.zeros_like(self._sum), 0, 0
 
     def _correct(self, change: Array) -> None:
         """Move line and trend at rest by what a tick differs from them: least squares over a growing, then fading span.

@@ -74,7 +74,7 @@ class FingerTracker:
     --------
     >>> tracker = FingerTracker(PlateParameters())
     >>> f"{1e3 * tracker.latency / 5000:.0f} ms, {tracker.bandwidth[0]:.1f} Hz, {1e3 * tracker.load_noise:.1f} mN"
-    '39 ms, 12.0 Hz, 2.3 mN'
+    '39 ms, 11.7 Hz, 2.3 mN'
     """
 
     def __init__(
