@@ -12,6 +12,8 @@ RUN := .venv/bin/python
 OUT := out/demo
 OLDEST = $(shell sed -n 's/^dependencies = \[\(.*\)\]/\1/p' pyproject.toml | tr -d '",' | sed 's/>=/==/g')
 OLDEST_TESTS := $(addprefix tests/test_,$(addsuffix .py,math vectors kernel blocks plate contact low_pass realtime combined))
+# Tests that play in real time run first, one after the other; the rest on two cores.
+REAL_TIME := $(wildcard tests/test_audio*.py tests/test_player*.py tests/test_board_faults.py tests/test_serial_driver.py)
 AUDIO := jackd2 libportaudio2 libjack-jackd2-dev gcc libc6-dev
 BOARD := gcc libc6-dev make gcc-arm-none-eabi libnewlib-arm-none-eabi qemu-system-arm
 BOARD_TOOLS := { command -v gcc && command -v arm-none-eabi-gcc && command -v qemu-system-arm; } > /dev/null
@@ -26,7 +28,8 @@ demo: .venv/demo.stamp ## render the built-in scenes on simulated devices into o
 	@.venv/bin/hapticrender demo --out $(OUT)
 
 test: .venv/test.stamp ## run every test (PYTEST_ARGS="-m 'not slow'" leaves out the long ones)
-	@MPLBACKEND=Agg $(RUN) -m pytest $(PYTEST_ARGS)
+	@MPLBACKEND=Agg $(RUN) -m pytest $(REAL_TIME) $(PYTEST_ARGS)
+	@MPLBACKEND=Agg $(RUN) -m pytest -n 2 --dist worksteal $(addprefix --ignore=,$(REAL_TIME)) $(PYTEST_ARGS)
 
 # Of a package that is missing the tests are skipped, and say so; only root can install it.
 audio-test: .venv/test.stamp ## run the sound-card driver on a JACK server, with a plate behind it

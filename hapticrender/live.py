@@ -14,12 +14,14 @@ from hapticrender.control.device_model import DeviceModel
 from hapticrender.control.supervisor import FADE_OUT, Fault, SupervisedController, design_supervisor
 from hapticrender.driver_checks import check_sensed
 from hapticrender.errors import DeviceFault, HapticError, WatchdogTimeout
+from hapticrender.inferred import ContactLag
 from hapticrender.protocols import Array, Controller, Flag, Rendering
 from hapticrender.realtime import LOG_TIME, RealtimeEntry
 from hapticrender.voices import Voice
 
 JUDGED = 0.25  # s: of signal that figures are of
 SILENT = 1e-3  # of the gain: below it a texture has faded out
+DEVICE = ("driver", "device", "plant")  # of a rendering: they stay where its texture changes
 LEAST_TARGET = 1e-12  # in the device's unit: a smaller one has no error
 
 Row = tuple[float, float, float, float]  # frequency (Hz), target, achieved amplitude, relative error
@@ -142,7 +144,8 @@ class LiveLoop:
             for name, value in design_supervisor(inner.controller, self.model).items():
                 inner.state["p"][name] = value
         self.controller.settings["drive_limit"] = self.model.drive_limit
-        self.rendering, self._bands = rendering, rendering.bands
+        self.rendering = replace(rendering, **{name: getattr(self.rendering, name) for name in DEVICE})
+        self._bands = rendering.bands
         self.entry.play(self._voice(rendering))
 
     def signals(self, start: int) -> tuple[int, dict[str, Array]]:
@@ -161,12 +164,15 @@ class LiveLoop:
         motion = told[:, :-1]  # NaN where nothing is sensed
         if not self._true and found["sensed"].shape[1]:
             motion = found["sensed"] @ (model.place_from_coordinate @ model.coordinate_from_sensed).T
+            motion = ContactLag(model.contact_lag).run(motion, found["position"]) if model.inferred else motion
         return first, found | {"motion": motion, "target": np.zeros((count, 0), complex)}
 
     @property
     def motion_source(self) -> str:
         """Where `motion` comes from."""
-        return "true" if self._true else "sensors" if self.driver.sensed_channels else "unknown"
+        if self._true or not self.driver.sensed_channels:
+            return "true" if self._true else "unknown"
+        return "inferred" if self.model.inferred else "sensors"
 
     def figures(self) -> list[Row]:
         """What every band did over the last `JUDGED` seconds, see `band_figures`."""

@@ -23,6 +23,7 @@ from hapticrender.devices import open_driver
 from hapticrender.devices import registered as registered
 from hapticrender.driver_checks import check_sensed
 from hapticrender.errors import DeviceFault, PlateMismatch
+from hapticrender.inferred import ContactLag
 from hapticrender.protocols import Array, Controller, Driver, Exchange, Renderer, Rendering, Sensed
 from hapticrender.recordings.recording import Recorder, Recording
 from hapticrender.touch.scene import Scene
@@ -230,6 +231,7 @@ class _Loop:
         self.step = driver.block * (max(int(CHUNK * driver.rate / driver.block), 1) if exchange is not None else 1)
         self._start, self._ahead = 0, int(getattr(self.controller, "lookahead", 0))
         self._predict = PositionPredictor(driver.rate, self._ahead)
+        self._contact = ContactLag(rendering.model.contact_lag)
         self._stopped = -1  # sample from which on the drive fades out; negative: none
         self._drive = np.zeros((driver.block, driver.drive_channels))
 
@@ -243,7 +245,7 @@ class _Loop:
         finger = self.rendering.scene.finger
         position = finger.position(time) if sensed.position is None else sensed.position
         load = finger.load(time) if sensed.normal_load is None else sensed.normal_load
-        motion, source = self._motion(sensed)
+        motion, source = self._motion(sensed, position)
         signals = {"drive": drive, "sensed": values, "motion": motion, "position": position, "normal_load": load}
         signals |= {"target": target, "flags": flags}
         return {"motion_source": source} | {name: signal[:count] for name, signal in signals.items()}
@@ -280,7 +282,7 @@ class _Loop:
     def _time(self, count: int) -> Array:
         return (self._start + np.arange(count)) / self.rendering.driver.rate
 
-    def _motion(self, sensed: Sensed) -> tuple[Array, str]:
+    def _motion(self, sensed: Sensed, position: Array) -> tuple[Array, str]:
         """Motion at the evaluation points, and its source: the device itself, its sensors, or none (NaN)."""
         model, values = self.rendering.model, sensed.sensed
         if sensed.motion is not None:
@@ -288,7 +290,8 @@ class _Loop:
         if not values.shape[1]:
             return np.full((len(values), len(model.places)), np.nan), "unknown"
         with np.errstate(invalid="ignore"):  # a faulty sensor is the controller's to flag
-            return values @ (model.place_from_coordinate @ model.coordinate_from_sensed).T, "sensors"
+            shown = values @ (model.place_from_coordinate @ model.coordinate_from_sensed).T
+            return (self._contact.run(shown, position), "inferred") if model.inferred else (shown, "sensors")
 
 
 def _compare(rendering: Rendering, controller: Controller, recording: Recording) -> None:

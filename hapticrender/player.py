@@ -9,9 +9,9 @@ Controller and renderers are those of `render`; what advances them block by bloc
 `hapticrender.realtime`.  A driver that calls back (it has `start` and `stop`) is handed the entry; one whose controller
 runs on the device (it has `loop`) brings a loop of its own; any other is played by a thread.
 
-On a plate a texture fades into the next one under the same controller, which keeps what it has learned of finger and
-device.  Where the law works by bands (ultrasonic surfaces, hybrids) the old texture fades out, then the next one fades
-in under a controller of its own.
+A texture fades into the next one under the same controller, which keeps what it has learned of finger and device.
+Where the law works by bands (hybrids) the old texture fades out, then the next one fades in under a controller of its
+own.
 """
 
 from __future__ import annotations
@@ -161,8 +161,8 @@ class Player:
             if self._loop is None:
                 self._begin(self._scene(texture))
                 return
-            owned = self._loop.rendering.plant is not None and not self._loop.whole
-            device = None if owned else self._loop.rendering.device
+            playing = self._loop.rendering
+            device = None if playing.plant is not None else playing.device
             rendering = prepare(self._scene(texture), driver=device, compiled=False)
             if self._loop.whole:
                 self._loop.exchange(rendering)

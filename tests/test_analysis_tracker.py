@@ -218,6 +218,18 @@ def test_threshold_of_contact_is_that_of_the_noise():
 def test_wrong_arguments_are_refused():
     with pytest.raises(ValueError, match=r"lookahead=-1 s: must be finite and >= 0"):
         hr.FingerTracker(PLATE, lookahead=-1)
+    with pytest.raises(ValueError, match=r"shapes \(5, 1\) and \(5, 2\): must be \(5, 2\) and \(5, 2\)"):
+        hr.FingerTracker(PLATE).update(np.zeros((5, 1)), np.zeros((5, 2)))
+
+
+def test_measurements_that_are_no_numbers_are_held():
+    finger = hr.Finger.still(position=5e-3, normal_load=0.5, touches=[(0.5, 1.5)])
+    drive, sensed = run(finger, 2.0)
+    sensed[[100, 3000, 3001], [0, 1, 1]] = np.nan, np.inf, np.nan
+    found = tracked(hr.FingerTracker(PLATE), drive, sensed)
+    at = (found["time"] > 0.7) & (found["time"] < 1.4)
+    assert (np.abs(found["load"][at] - 0.5) < 0.02).all()
+    assert np.isfinite(found["load"][found["time"] > 1.6]).all()
 
 
 @pytest.mark.parametrize(("left", "ends"), [(0.0, True), (0.04, True), (0.1, False)])

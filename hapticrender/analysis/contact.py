@@ -88,10 +88,8 @@ class ContactDetector:
             if before and not loaded[now].all():
                 lifted = first + int(np.argmin(loaded[now]))
                 left = joined[lifted : lifted + self.delay + 1].mean(axis=0) - level[lifted]
-                self._peak = 0.0
-                if rest is None and left[0] > 0.5 * high[lifted]:
-                    self._rest, self._trend, self._ticks = self._rest + left, 0 * self._trend, 1
-                    now, self._loaded = slice(first, lifted + 1), False
+                if self._lift(left, rest is None):
+                    now = slice(first, lifted + 1)
                     level[lifted] = self._rest
             self._follow(joined[now], loaded[now], self._at + now.stop)
             first = now.stop
@@ -107,6 +105,14 @@ class ContactDetector:
         loaded = np.where(last < 0, self._loaded, event[last] > 0)
         self._loaded = bool(loaded[-1])
         return loaded
+
+    def _lift(self, left: Array, follow: bool) -> bool:
+        """End a touch; whether what it left is clear and, where they are followed, begins the values at rest anew."""
+        self._peak = 0.0
+        if not follow or left[0] <= self._still:
+            return False
+        self._rest, self._trend, self._ticks, self._loaded = self._rest + left, 0 * self._trend, 1, False
+        return True
 
     def _follow(self, measured: Array, loaded: Array, end: int) -> None:
         """Take a part of a tick in; at its end correct the values at rest, or note the load of the touch."""

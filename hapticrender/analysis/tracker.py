@@ -27,6 +27,7 @@ from hapticrender.analysis.force import MotionFilter
 from hapticrender.analysis.plate_track import Rest
 from hapticrender.analysis.records import DOUBTFUL, LOADED, UNLOADED, Series
 from hapticrender.analysis.smoothing import History, LocalLine, half_width, spread_of
+from hapticrender.bands import hold_last
 from hapticrender.plants.plate import PlateParameters
 from hapticrender.protocols import Array
 
@@ -106,6 +107,7 @@ class FingerTracker:
         self._edge = self._filter.delay  # samples beside a change of contact that are left out
         self._given, self._at, self._first = rest, -self._filter.delay, 0
         self._history = History(self._line.behind + self._line.ahead + 2 * self._edge)
+        self._held = np.zeros((1, 2))  # m: last measurement
         self._peak, self._delayed = History(round(PEAK * self.rate)), History(self._detector.delay)
 
     @property
@@ -137,10 +139,19 @@ class FingerTracker:
         return noise / math.sqrt(error**2 - wrong**2) if wrong < error else math.inf
 
     def update(self, drive: Array, sensed: Array) -> Touch:
-        """Estimates from the next n samples of drive (A, (n, coils)) and measurement (m, (n, 2)).
+        """Estimates from the next n >= 1 samples of drive (A, (n, coils)) and measurement (m, (n, 2)).
 
-        They are of the n samples `latency` before these, less those before the first one.
+        They are of the n samples `latency` before these, less those before the first one.  A measurement that is no
+        number is replaced by the last one that is.
         """
+        wanted = (len(drive), self.course.plate.coils), (len(drive), 2)
+        if len(drive) == 0 or (np.shape(drive), np.shape(sensed)) != wanted:
+            raise ValueError(
+                f"drive and measurement of shapes {np.shape(drive)} and {np.shape(sensed)}: must be {wanted[0]} and "
+                f"{wanted[1]}, at least one sample"
+            )
+        sensed = np.stack([hold_last(each)[1:] for each in np.vstack([self._held, sensed]).T], axis=1)
+        self._held = sensed[-1:]
         signals = self._filter.update(drive, sensed)
         time = (self._at + np.arange(len(drive))) / self.rate
         self._at += len(drive)

@@ -113,6 +113,13 @@ def fade_fixed(controller, t):
 
 
 @kernel
+def contact_lag(controller):
+    """Time (s) by which friction follows what the sensors show: the contact's length over the finger's speed."""
+    c = record(controller, CONTROLLER_T, 0)
+    return c.p.contact_lag / max(c.speed, SLOWEST * c.p.typical_speed) if c.p.contact_lag > 0.0 else 0.0
+
+
+@kernel
 def fade_locked(controller, t):
     """Update frequency, sweep and weights of a tile whose carriers follow the finger, and what its sensor shows.
 
@@ -136,8 +143,7 @@ def fade_locked(controller, t):
     put(b, "weight", weight * where(follows, smooth(left / (p.highest_edge - 1.0)), 1.0))
     put(b, "feedback", minimum(weight * where(follows, smooth(4.0 * left), 1.0) / maximum(fade, 1e-9), 1.0))
     if p.corrected > 0.0:  # before the contact's lag, and delayed
-        lag = p.contact_lag / max(c.speed, SLOWEST * p.typical_speed)
-        put(b, "response", unit((-p.sensor_delay / TURN) * omega) * pair(1.0, lag * omega))
+        put(b, "response", unit((-p.sensor_delay / TURN) * omega) * pair(1.0, contact_lag(controller) * omega))
 
 
 @kernel

@@ -43,6 +43,7 @@ PATIENCE = 1e-3  # s: for so long a position may be missing
 MODEL_ERROR = 0.1  # of a deviation and of what the drive explains of it: part that no parameter explains
 LEAST_NOISE = 5e-5  # of the sensors' range
 NOTICE = 10e-3  # s: a contact is reported within this
+HOLD, DECAY = (50e-3, 2e-3), (20e-3, 2e-3)  # s, of the largest need; on friction a finger that turns makes it a spike
 GATE_SIGMAS = 2.0  # of the sensors' noise: a larger deviation within 4 ms opens the inner damper
 INITIAL_FRICTION = (1.0, 1e3)  # N and N/s: deviation and its rate at a contact
 INITIAL_MOTION = (15e-6, 0.02)  # m and m/s: deviation and its velocity at a contact
@@ -168,7 +169,7 @@ class AdaptiveInverse:
         works by bands; see `design_controller`.
         """
         whole = bands.envelope is None and not len(bands)
-        known = model.finger.contact is not None or (whole and model.mass[0, 0] > 0.0 and model.contact_lag == 0.0)
+        known = model.finger.contact is not None or (whole and model.mass[0, 0] > 0.0)
         beyond = bands.frequency.max(initial=0.0) > 1.2 * HIGHEST * model.rate  # of the filters' range
         if not known or beyond or (bands.envelope is None and len(bands)):
             return design_controller(self.name, model, bands, rules_for(bands), feedback=feedback)
@@ -204,6 +205,7 @@ def controller_settings(model: DeviceModel, bands: Bands, damping: Damping | Non
         **shared_settings(model, bands, sensor_map, drive_map, feedback),
         **device_settings(model),
         "contact_damping": model.contact_damping,
+        "contact_lag": model.contact_lag,
         "typical_speed": model.typical_speed,
         "fade_in": period / FADE_IN,
         "highest_edge": model.highest_edge,
@@ -219,7 +221,7 @@ def controller_settings(model: DeviceModel, bands: Bands, damping: Damping | Non
 
 def law_times(model: DeviceModel, noise: float) -> dict[str, Any]:
     """Fields of `INVERSE` that are times, in samples, or poles a sample; `noise` (m rms) opens the damper's gate."""
-    period = 1.0 / model.rate
+    period, friction = 1.0 / model.rate, model.finger.contact is None
     return {
         "settling": round(SETTLING * model.rate),
         "joining": round(RESTART * model.rate),
@@ -231,8 +233,8 @@ def law_times(model: DeviceModel, noise: float) -> dict[str, Any]:
         "level": (GATE_SIGMAS * noise) ** 2,
         "high_pass": -math.expm1(-2 * math.pi * 20.0 * period),
         "mean_square": -math.expm1(-period / 4e-3),
-        "hold": round(0.05 * model.rate),
-        "decay": math.exp(-period / 0.02),
+        "hold": round(HOLD[friction] * model.rate),
+        "decay": math.exp(-period / DECAY[friction]),
         "smoothing": period / 2e-3,
         "slowly": period / 1.0,
         "levelling": period / 50e-3 if len(model.mass) > 1 else 0.0,
@@ -255,8 +257,11 @@ def law_settings(model: DeviceModel, bands: Bands, feedback: bool) -> dict[str, 
     top, order, late = min(model.highest_frequency, HIGHEST * model.rate), int(bands.differentiated), model.sensor_delay
     late *= model.rate  # what is sensed of the target is that of so many samples ago
     shown = np.eye(TAPS)[TAPS // 2 - 1]
+    rate_shown = np.zeros(TAPS)
     if order or late:
         shown = derivative_filters(float(model.rate), float(top), order, 1, -late)[0]
+    if model.contact_lag > 0.0:
+        rate_shown = derivative_filters(float(model.rate), float(top), order + 1, 1, -late)[0]
     return {
         "delay": model.delay,
         "spatial": (bands.wavenumber > 0.0).any() if len(bands) else bands.spatial,
@@ -269,6 +274,7 @@ def law_settings(model: DeviceModel, bands: Bands, feedback: bool) -> dict[str, 
         **law_times(model, noise[0]),
         "filters": derivative_filters(float(model.rate), float(top), order, 4, 0.5 - late),
         "sensor_filter": shown,
+        "sensor_rate_filter": rate_shown,
         "pair": pole_step(model.rate),
         "force_from_drive": np.pad(
             model.force_from_drive, ((0, 2 - n), (0, MOST_CHANNELS - model.force_from_drive.shape[1]))

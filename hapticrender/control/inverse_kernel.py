@@ -19,7 +19,7 @@ from __future__ import annotations
 
 from numba import carray
 
-from hapticrender.control.carriers import advance_carriers, track_finger, update_targets
+from hapticrender.control.carriers import advance_carriers, contact_lag, track_finger, update_targets
 from hapticrender.control.inverse_learning import (
     advance_regressors,
     discretise,
@@ -89,9 +89,9 @@ def take_reference(controller, inverse, waveform):
     for i in range(TAPS - 1):
         window[i], shown[i] = window[i + 1], shown[i + 1]
     window[TAPS - 1], shown[TAPS - 1], ring[at] = value, ring[at], value
-    v.reference = 0.0
+    v.reference, lag = 0.0, contact_lag(controller)
     for i in range(TAPS):
-        v.reference += v.sensor_filter[i] * shown[i]
+        v.reference += (v.sensor_filter[i] + lag * v.sensor_rate_filter[i]) * shown[i]
 
 
 @kernel
@@ -105,6 +105,8 @@ def find_basis(controller, inverse):
         d1 += filters[1, i] * window[i]
         d2 += filters[2, i] * window[i]
         d3 += filters[3, i] * window[i]
+    lag = contact_lag(controller)  # what has to be made is r + lag r', for the contact to follow r
+    d0, d1, d2 = d0 + lag * d1, d1 + lag * d2, d2 + lag * d3
     last = basis[0]
     first = pair[0, 0] * poles[0] + pair[0, 1] * poles[1] + pair[0, 2] * last + pair[0, 3] * d0
     poles[1] = pair[1, 0] * poles[0] + pair[1, 1] * poles[1] + pair[1, 2] * last + pair[1, 3] * d0

@@ -35,6 +35,7 @@ INVERSE = np.dtype(
         *((name, np.float64) for name in f"{_LAW} {_CONTACT} {_POLES}".split()),
         ("filters", np.float64, (4, TAPS)),
         ("sensor_filter", np.float64, (TAPS,)),
+        ("sensor_rate_filter", np.float64, (TAPS,)),  # of its derivative, where the sensors are ahead of the contact
         ("pair", np.float64, (2, 4)),  # step of the pair of poles: two states, r now and next
         ("force_from_drive", np.float64, (2, MOST_CHANNELS)),
         *((name, np.float64, (2, 2)) for name in ("mass", "damping", "stiffness")),

@@ -32,7 +32,7 @@ AU_MAGIC, AU_UNKNOWN_SIZE, AU_DOUBLE = b".snd", 0xFFFFFFFF, 7
 JOURNAL_DTYPE = np.dtype(">f8")
 CHUNK_VALUES = 2**20  # numbers read at once
 LONGEST_NOTE = 2**26  # bytes of header
-MOTION_SOURCES = ("true", "sensors", "unknown")
+MOTION_SOURCES = ("true", "sensors", "inferred", "unknown")
 _COLUMNS = ("frequency", "wavenumber", "phase")  # of bands
 _NUMBER: dict[str, Any] = {"least": -1e12, "most": 1e12}
 
@@ -72,7 +72,8 @@ class Header(Validated):
     """Meaning and origin of the columns of a recording; a field out of its bounds is a ValueError or TypeError.
 
     `motion_source` is "true" (of a simulation or an independent instrument), "sensors" (computed from the sensed
-    signals, so that errors of the sensors do not show), or "unknown" (no sensors).
+    signals, so that errors of the sensors do not show), "inferred" (computed from another quantity by a law that is
+    assumed, such as friction from an amplitude), or "unknown" (no sensors).
     """
 
     scene: str = checked(text, longest=2**26, lines=True)  # as TOML

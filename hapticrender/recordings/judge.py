@@ -26,6 +26,7 @@ READ_AT_ONCE = 2**18  # samples
 SETTLED = 0.05  # of the target
 SETTLED_FOR = 0.5  # s, or
 SETTLED_SHARE = 0.1  # of the judged time where that is shorter: inside for so long at the end, a band has settled
+INFERRED = "the friction is inferred by a law that is assumed, not measured"
 HARDLY = 2.0  # times what the sensors' noise alone reads: a smaller figure cannot be told from it
 IN_BAND = f"{BAND[0]:g} to {BAND[1]:g} Hz"
 UNJUDGED: dict[str, Any] = {"figure": "waveform_error", "value": None, "bound": None, "band": "any", "place": "any"}
@@ -175,6 +176,8 @@ def _verdict(recording: Recording, worst: dict[str, Any]) -> tuple[str, str]:
     raised = [f"{flag.name} in {count} samples" for flag, count in counts.items() if count and flag & MATTERS]
     if raised:
         return "failed", f"flags that a play must not raise: {', '.join(raised).lower()}"
+    if header.motion_source == "inferred":
+        return "not judged", INFERRED
     if found["share_outside"] > UNPLAYABLE:
         return "passed in band", _unplayable(found["share_outside"])
     return "passed", ""
@@ -205,6 +208,8 @@ def _notes(recording: Recording, bands: list[dict[str, Any]], settled: Array) ->
     """State in plain sentences what limits the figures."""
     header, envelopes = recording.header, recording.envelopes
     seconds, notes = len(recording) / recording.rate, [f"left out, {text}" for text in recording.bands.unfelt]
+    if header.motion_source == "inferred":
+        notes.append(INFERRED)
     if header.motion_source == "sensors":
         known = (
             f"+-{percent(header.calibration)}, which is added to every figure" if header.calibration else "not known"
