@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from finger_data import FREQUENCIES, make_impedance, make_record
 from scipy.stats import binom, chi2
+from subjects import population
 
 import hapticrender as hr
 from hapticrender.analysis.models import FEWEST, LOAD_CLASSES
@@ -111,6 +112,20 @@ def test_each_class_of_loads_has_its_own_finger(rng):
         assert abs(fit.mechanics.stiffness - truth) < 4 * fit.standard_errors["stiffness"] < truth
     assert list(hr.fit_load_classes(light)) == ["light"]
     assert hr.fit_load_classes(light, {"all": (0, 2)}, order=2)["all"].order == 2
+
+
+def test_the_fingers_of_simulated_subjects_are_found():
+    """The four of Table 1 on plates 2 % off their profile: order, and 95 % intervals of parameters and exponent."""
+    inside = []
+    for subject in population(10)[:4]:
+        fit = hr.fit_finger(hr.analyse_finger(subject.record()))
+        assert fit.order == subject.mechanics.order
+        growth = subject.mechanics.load_factor(fit.mechanics.reference_load)
+        given = {name: getattr(subject.mechanics, name, 0) * growth for name in fit.names} | {"load_exponent": 1 / 3}
+        inside += [
+            low <= given[name] <= high for name, (low, high) in ((each, fit.interval(each)) for each in fit.names)
+        ]
+    assert sum(inside) >= binom.ppf(RARE, len(inside), 0.95)
 
 
 def test_masked_entries_are_left_out(rng):
