@@ -129,6 +129,8 @@ def _add_measurements(choices: Any) -> None:
     finger.add_argument("--profile", metavar="FILE", type=_path, help=text)
     text = "samples of a block of the driver that recorded (default: 1)"
     finger.add_argument("--block", metavar="N", type=_whole(1, 99999), default=1, help=text)
+    text = "nothing touches in the first 0.5 s: take the sensors' zero from there (default: they read zero at rest)"
+    finger.add_argument("--free-start", action="store_true", help=text)
     _add_out(finger, None)
 
     identify = _add_verb(

@@ -279,7 +279,8 @@ def finger(arguments: argparse.Namespace) -> int:
             raise ValueError(f"{str(arguments.out / name)!r}: is there: choose another folder, or add --force")
     path = arguments.path / "recording.au" if arguments.path.is_dir() else arguments.path
     with _naming(str(path)):
-        found = analyse_finger(Recording.load(path), arguments.profile, block=arguments.block)
+        recording = Recording.load(path)
+        found = analyse_finger(recording, arguments.profile, block=arguments.block, free_start=arguments.free_start)
     print(printable(output.text(found)))
     written = [*output.write(found, arguments.out), pictures.draw(found, arguments.out)]
     print("wrote " + "\n      ".join(map(str, written)))

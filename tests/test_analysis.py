@@ -66,7 +66,7 @@ def test_position_is_within_1_mm_in_the_middle_30_mm_above_150_mN(studied):
 def test_contact_is_within_10_ms(studied):
     for subject, _, found in studied:
         (touch,) = found.of_kind(LOADED)
-        assert (abs(touch.start - ON), abs(touch.stop - OFF)) < (0.01, 0.01), subject
+        assert max(abs(touch.start - ON), abs(touch.stop - OFF)) < 0.01, subject
 
 
 def test_standard_errors_are_right(studied):
@@ -158,6 +158,22 @@ def test_no_false_contact_in_ten_minutes():
     assert not (before == LOADED).any()
     assert (before == DOUBTFUL).sum() < 100
     assert abs(time[np.argmax(contact == LOADED)] - 600.5) < 0.01
+
+
+def test_zero_of_the_sensors_is_taken_from_a_free_start(studied):
+    """50 um are 2.3 N: without the zero the finger never lifts."""
+    _, recording, found = studied[3]
+    shifted = recording.frames.copy()
+    shifted[:, recording.header.slices["sensed"]] -= 50e-6
+    shifted = hr.Recording(recording.header, shifted, recording.scene)
+    (always,) = hr.analyse_finger(shifted).of_kind(LOADED)
+    assert always.start < 0.1
+    assert always.stop > 4.9
+    again = hr.analyse_finger(shifted, free_start=True)
+    (touch,) = again.of_kind(LOADED)
+    assert max(abs(touch.start - ON), abs(touch.stop - OFF)) < 0.01
+    at = judged(found)
+    assert np.abs(again.normal_load.value[at] - found.normal_load.value[at]).max() < 0.005
 
 
 @pytest.mark.parametrize(

@@ -34,6 +34,7 @@ SLOWEST, FASTEST = 15.0, 0.1  # Hz, of the sampling rate: carriers between them 
 NEAR_END = 5e-3  # m: a finger nearer to an end of the glass is not judged
 MIDDLE = 15e-3  # m from the middle: where `least_load` holds
 MILLIMETRE = 1e-3  # m
+START = 0.5  # s: free of a finger, where the caller says so
 BLOCK = 1.0  # s of signal at a time
 
 
@@ -42,6 +43,7 @@ def analyse_finger(
     profile: DeviceProfile | PlateParameters | str | os.PathLike[str] | None = None,
     *,
     block: int = 1,
+    free_start: bool = False,
 ) -> FingerRecord:
     """Estimate load, position, velocity, contact, force and impedance of the finger in a recording of a plate.
 
@@ -56,6 +58,9 @@ def analyse_finger(
         one count as known to 2 %, damping to 10 %.
     block : int, samples
         Of the driver: a row of the drive acts ``delay - block`` samples after the row sensed with it.
+    free_start : bool
+        Whether nothing touches in the first 0.5 s, from which the sensors' zero is then taken; default: they read zero
+        where nothing touches.
 
     Raises
     ------
@@ -72,6 +77,8 @@ def analyse_finger(
     _check(recording, course.plate, late)
     rate, drive = recording.rate, recording.drive
     sensed = np.stack([hold_last(channel) for channel in recording.sensed.T], axis=1)
+    if free_start:
+        sensed = sensed - sensed[: round(START * rate)].mean(axis=0)
     signals = _Signals(course.plate, late, rate, drive, sensed)
     first = signals.track(course, None)
     frequency = _carriers(recording.bands, sensed, rate)

@@ -107,9 +107,9 @@ class ContactDetector:
         return loaded
 
     def _lift(self, left: Array, follow: bool) -> bool:
-        """End a touch; whether what it left is clear and, where they are followed, begins the values at rest anew."""
-        self._peak = 0.0
-        if not follow or left[0] <= self._still:
+        """End a touch; whether the suspension has crept, so that values at rest that are followed begin anew."""
+        crept, self._peak = self._still < left[0] <= CREEP * self._peak, 0.0
+        if not (follow and crept):
             return False
         self._rest, self._trend, self._ticks, self._loaded = self._rest + left, 0 * self._trend, 1, False
         return True
