@@ -14,7 +14,7 @@ from hapticrender.analysis.models import FEWEST, LOAD_CLASSES
 from hapticrender.analysis.records import Impedance
 from hapticrender.touch.mechanics import HEAVY, LIGHT, LIGHT_SECOND
 
-DRAWS = {2: 200, 4: 100}
+DRAWS = {2: 200, 4: 60}
 RARE = 1e-4  # probability of a false alarm of a bound
 FINGERS = {2: LIGHT_SECOND, 4: LIGHT}
 
@@ -83,7 +83,7 @@ def test_errors_of_the_plate_are_not_averaged_over_windows():
     assert (np.sqrt(np.mean(np.square(pulls["impedance"]), axis=0)) > 1.5).all()
 
 
-@pytest.mark.parametrize(("order", "draws"), [(2, 20), (4, 10)])
+@pytest.mark.parametrize(("order", "draws"), [(2, 12), (4, 6)])
 def test_the_data_choose_the_order(rng, order, draws):
     """A finger of the 2nd order seems one of the 4th where chi^2 of 3 parameters gains more than 3 ln N."""
     fits = [hr.fit_finger(make_impedance(rng, FINGERS[order], 6, (0.1, 0.49))) for _ in range(draws)]
@@ -115,9 +115,9 @@ def test_each_class_of_loads_has_its_own_finger(rng):
 
 
 def test_the_fingers_of_simulated_subjects_are_found():
-    """The four of Table 1 on plates 2 % off their profile: order, and 95 % intervals of parameters and exponent."""
+    """Two of Table 1, of either order, on plates 2 % off their profile: order, and 95 % intervals of all numbers."""
     inside = []
-    for subject in population(10)[:4]:
+    for subject in population(10)[:4:3]:
         fit = hr.fit_finger(hr.analyse_finger(subject.record()))
         assert fit.order == subject.mechanics.order
         growth = subject.mechanics.load_factor(fit.mechanics.reference_load)
