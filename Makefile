@@ -17,7 +17,8 @@ REAL_TIME := $(wildcard tests/test_audio*.py tests/test_player*.py tests/test_bo
 AUDIO := jackd2 libportaudio2 libjack-jackd2-dev gcc libc6-dev
 BOARD := gcc libc6-dev make gcc-arm-none-eabi libnewlib-arm-none-eabi qemu-system-arm
 BOARD_TOOLS := { command -v gcc && command -v arm-none-eabi-gcc && command -v qemu-system-arm; } > /dev/null
-BOARD_TESTS := $(addprefix tests/test_,firmware_law.py firmware_m4.py export.py protocol.py serial_driver.py board_faults.py nu32.py player_board.py)
+BOARD_TESTS := $(addprefix tests/test_,firmware_law.py firmware_m4.py export.py protocol.py serial_driver.py board_faults.py board_textures.py nu32.py \
+	player_board.py)
 API := hapticrender $(addprefix hapticrender.,loop latency sweep realtime skin validate protocols bands errors touch recordings \
 	control plants renderers drivers)
 

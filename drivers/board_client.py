@@ -12,12 +12,14 @@ from hapticrender.bands import Bands
 from hapticrender.drivers import protocol
 from hapticrender.drivers.base import OpenedInWith, carry_through
 from hapticrender.drivers.board_line import BAUD, PAUSE, BoardLine, Clock, Line, open_port
-from hapticrender.drivers.protocol import Capabilities, Cause, Kind, State, Telemetry
+from hapticrender.drivers.board_texture import BoardTexture
+from hapticrender.drivers.protocol import WRAP, Capabilities, Cause, Kind, State, Telemetry
 from hapticrender.drivers.row_reader import RowReader
-from hapticrender.errors import DeviceFault, DeviceLost, DeviceTimeout, DriverError
+from hapticrender.errors import DeviceFault, DeviceLost, DeviceTimeout, DriverError, HapticError, WatchdogTimeout
 from hapticrender.protocols import Array
 
 RETRY = 0.05  # s between two attempts to reach the board anew
+LEAST_WATCHDOG, MOST_WATCHDOG = 0.05, 65.0  # s
 FAULTS = {
     Cause.LIMIT: "the mean square of the drive is above its limit: lower the amplitude, or raise limits(rms=)",
     Cause.SENSOR: "a sensor was invalid for 10 ms: check its cable and its range",
@@ -37,9 +39,10 @@ class _Wanted(NamedTuple):
     """What the board is to do, to be told again to a board that was lost."""
 
     bands: Bands | None = None
+    texture: BoardTexture | None = None
     gain: float = 1.0
     limits: tuple[float, float, float] | None = None
-    start: tuple[int, int] | None = None  # samples between rows of the stream, and between telemetry; None: at rest
+    start: tuple[int, int] | None = None  # fields of START; None: at rest
 
 
 class BoardClient(OpenedInWith):
@@ -88,7 +91,8 @@ class BoardClient(OpenedInWith):
         self._line: BoardLine | None = None
         self._wanted = _Wanted()
         self._runs = False  # something has been started
-        self._error: DriverError | None = None
+        self._error: HapticError | None = None
+        self._beats = self._watchdog = 0  # of the application: its calls; ms, 0: none
         self._background, self._thread = background, threading.Thread()
         self._lock, self._ending = threading.RLock(), threading.Event()
 
@@ -115,10 +119,13 @@ class BoardClient(OpenedInWith):
         """What the board said of itself."""
         return self._open_line().capabilities
 
-    def set_bands(self, bands: Bands) -> int:
-        """Set what the board plays, all bands at the same sample; it glides there within 20 ms while it plays.
+    def set_bands(self, bands: Bands, texture: BoardTexture | None = None) -> int:
+        """Set what the board plays: bands, all at the same sample, and beside them a texture that is no sum of bands.
 
-        Returns the sample of the board's clock at which it took them.
+        While it plays it glides to the bands within 20 ms, and fades over to the texture, or from it, within 40 ms.
+        Samples of the texture are sent ahead of play by the client's thread, or `step`; where they come too late the
+        texture fades out, with `Flag.OVERRUN`, and in again.  Returns the sample of the board's clock at which it took
+        the bands.
 
         Raises
         ------
@@ -126,12 +133,19 @@ class BoardClient(OpenedInWith):
             The targets are no constant envelopes, there are too many bands, or the board refuses a number.
         """
         most = self.capabilities.bands
-        if bands.envelope is None:
-            raise ValueError("the targets are a waveform: must be constant envelopes, which a board can play")
+        if bands.envelope is None and (texture is None or len(bands)):
+            raise ValueError("the targets are a waveform: must be constant envelopes, or a BoardTexture")
         if len(bands) > most:
             raise ValueError(f"{len(bands)} bands: must be <= {most} on {self.port}; export the scene with more")
-        sample = self._steadily(lambda line: line.set_bands(bands))
-        self._wanted = self._wanted._replace(bands=bands)
+
+        def put(line: BoardLine) -> int:
+            last = self._wanted
+            if last.start is not None and (texture or last.texture):  # at rest `start` sends it
+                line.play(texture, last.texture)
+            return line.set_bands(bands)
+
+        sample = self._steadily(put)
+        self._wanted = self._wanted._replace(bands=bands, texture=texture)
         return sample
 
     def finger(self, position: float, velocity: float = 0.0, load: float = 0.0, time: float | None = None) -> None:
@@ -172,22 +186,50 @@ class BoardClient(OpenedInWith):
         self._steadily(lambda line: line.ask(Kind.LIMITS, *limits))
         self._wanted = self._wanted._replace(limits=limits)
 
+    def watch(self, seconds: float | None) -> None:
+        """Let the board stop for good where the application is silent for so long, 0.05 to 65 s; None: never.
+
+        It has to call `beat`, or `watch` again: what the client's thread sends does not count.  Never waits.
+        """
+        if seconds is not None and not LEAST_WATCHDOG <= seconds <= MOST_WATCHDOG:
+            bound = f"{LEAST_WATCHDOG} to {MOST_WATCHDOG:g} s on a board, or None"
+            raise ValueError(f"watchdog = {seconds!r} s: must be {bound}")
+        self._watchdog = round(1e3 * (seconds or 0.0))
+        self.beat()
+
+    def beat(self) -> None:
+        """Say that the application is alive, see `watch`; never waits."""
+        self._beats += 1
+        if (line := self._line) is not None:
+            line.link.application = self._beats & 0xFFFF, self._watchdog
+
     def start(self, *, stream: int = 0, telemetry: float = 0.02) -> int:
-        """Start to play the bands, from rest; return the sample of the board's clock at which it began.
+        """Start to play the bands, or the texture, from rest; return the sample of the board's clock at which it began.
 
         Parameters
         ----------
         stream : int
             Samples between two rows that the board streams back; 0: none.
         telemetry : float, s
-            Time between two frames of telemetry, 0.2 ms to 13 s at 5 kHz.
+            Time between two frames of telemetry, 0.2 ms to 13 s at 5 kHz; at most 0.1 s with a texture, of which as
+            much is sent as the telemetry says has been played.
         """
         period = round(telemetry * self.capabilities.rate)
         for name, value, least in (("stream", stream, 0), ("telemetry", period, 1)):
             if not least <= value <= 0xFFFF:
                 raise ValueError(f"{name} = {value!r} samples: must be {least} to 65535")
-        sample = self._steadily(lambda line: line.begin(Kind.START, stream, period))
-        self._wanted, self._runs, self.started = self._wanted._replace(start=(stream, period)), True, sample
+        start = stream, period
+        self.started = self._steadily(lambda line: self._begin(line, start))
+        self._wanted, self._runs = self._wanted._replace(start=start), True
+        return self.started
+
+    def _begin(self, line: BoardLine, start: tuple[int, int]) -> int:
+        texture = self._wanted.texture
+        if texture is not None:
+            line.play(texture)
+        sample = line.begin(Kind.START, *start)
+        if texture is not None:
+            texture.began = sample
         return sample
 
     def stop(self) -> None:
@@ -205,6 +247,8 @@ class BoardClient(OpenedInWith):
             The line or the board is gone, and did not come back within `reconnect`.
         DeviceFault
             The board stopped by itself: the drive, or a sensor.
+        WatchdogTimeout
+            The board stopped as the application was silent, see `watch`.
         """
         return self._steadily(lambda line: line.telemetry())
 
@@ -246,10 +290,12 @@ class BoardClient(OpenedInWith):
             try:
                 line.carry()
                 self._compare(line)
-            except DeviceFault as error:
+                if self._wanted.start is not None and self._wanted.texture is not None:
+                    line.stream(self._wanted.texture)
+            except (DeviceFault, WatchdogTimeout) as error:
                 self._error = error
                 raise
-            except DeviceLost as error:
+            except (DeviceLost, DeviceTimeout) as error:
                 self._recover(error)
 
     def pause(self) -> None:
@@ -262,7 +308,7 @@ class BoardClient(OpenedInWith):
         while not self._ending.is_set() and self._error is None:
             try:
                 self.step()
-            except DriverError as error:
+            except HapticError as error:
                 self._error = error
             except Exception as error:  # of a frame that nobody has thought of: the board must not play on unheard
                 self._error = DriverError(f"{self.port}: {type(error).__name__}: {error}")
@@ -275,6 +321,8 @@ class BoardClient(OpenedInWith):
             return
         if found.cause in FAULTS:
             raise DeviceFault(f"{self.port}: play: the board stopped: {FAULTS[found.cause]}")
+        if found.cause == Cause.APPLICATION:
+            raise WatchdogTimeout((found.sample - self.started) % WRAP / self.capabilities.rate)
         if found.cause == Cause.SILENCE:
             raise line.lost("play", "the board heard no good word for 80 ms, and stopped")
 
@@ -295,6 +343,7 @@ class BoardClient(OpenedInWith):
             try:
                 self._close_line()
                 self._line = self._connect()
+                self.beat()
                 self._restore(self._line)
                 self.reconnections += 1
                 return
@@ -311,7 +360,7 @@ class BoardClient(OpenedInWith):
         if wanted.bands is not None:
             line.set_bands(wanted.bands)
         if wanted.start is not None:
-            self.started = line.begin(Kind.START, *wanted.start)
+            self.started = self._begin(line, wanted.start)
 
     def _open_line(self) -> BoardLine:
         if self._error is not None:

@@ -13,15 +13,16 @@ import serial
 from hapticrender.bands import Bands
 from hapticrender.drivers import protocol
 from hapticrender.drivers.board_link import Link, Request
-from hapticrender.drivers.protocol import Capabilities, Kind, Reason, Telemetry
+from hapticrender.drivers.board_texture import ROWS, BoardTexture, no_texture
+from hapticrender.drivers.protocol import WRAP, Capabilities, Kind, Reason, Telemetry
 from hapticrender.errors import DeviceLost, DeviceNotFound, DeviceTimeout, DriverError
 from hapticrender.protocols import Array
 
 BAUD = 230_400  # of a UART; a board on USB or a pseudo-terminal does not care
 PAUSE = 1e-3  # s between two looks at the line
 SILENCE = 0.5  # s without a good frame from the board after which it counts as lost
-COMING_TO_REST = 0.2  # s: longest fade-out of a board that is asked to start
-ROWS = 24  # of drive in a frame
+FADING = 0.2  # s: longest fade of what a command has to wait for
+DRIVE_ROWS = 24  # of drive in a frame
 
 
 class Clock(Protocol):
@@ -90,6 +91,7 @@ class BoardLine:
             self._port = connect(port, baud)
         except (OSError, ValueError) as error:
             raise DeviceNotFound(f"{port}: open: {error}") from error
+        self._textures = 0  # that were sent
         self.link = Link(secrets.randbelow(2**32 - 1) + 1, clock.monotonic())
         try:
             self._answer(self.link.greeting)
@@ -149,12 +151,9 @@ class BoardLine:
     def begin(self, kind: Kind, *fields: float) -> int:
         """Start something, once the board has come to rest; return the sample at which it began."""
         self.link.stream.clear()
-        end = self.clock.monotonic() + COMING_TO_REST
-        while True:
-            request = self._answer(self.link.submit(kind, protocol.pack(kind, *fields)))
-            if request.refused != Reason.STATE or self.clock.monotonic() >= end:
-                self.link.telemetry = None  # what comes from now on is of this run
-                return self._checked(request).sample
+        sample = self._patiently(kind, protocol.pack(kind, *fields)).sample
+        self.link.telemetry = None  # what comes from now on is of this run
+        return sample
 
     def set_bands(self, bands: Bands) -> int:
         """Send set-points, which act together at the end; return the sample at which the board took them."""
@@ -166,6 +165,29 @@ class BoardLine:
             self.send(Kind.SETPOINT, payload)
         return self.ask(Kind.COMMIT, len(payloads), protocol.digest(payloads)).sample
 
+    def play(self, texture: BoardTexture | None, meanwhile: BoardTexture | None = None) -> None:
+        """Send a texture, and fade into it; `meanwhile` goes on until then.  None: fade out what plays."""
+        self._textures = (self._textures + 1) % 256
+        number = self._textures
+        for kind, payload in no_texture(number) if texture is None else texture.frames(number):
+            request = self._patiently(kind, payload)
+            if meanwhile is not None:
+                self.stream(meanwhile)
+        if texture is not None:
+            texture.began = (request.sample + self.capabilities.lookahead) % WRAP
+
+    def stream(self, texture: BoardTexture) -> None:
+        """Send a frame of the samples that come next, where they are due; a board at rest takes none."""
+        now = self.link.telemetry
+        played = 0 if now is None or texture.began is None else (now.sample - texture.began) % WRAP
+        samples = texture.samples(played if played < WRAP // 2 else 0)
+        if samples is None:
+            return
+        request = self._answer(self.link.submit(Kind.SAMPLES, samples))
+        if request.refused != Reason.STATE:
+            self._checked(request)
+            texture.written += ROWS
+
     def identify(self, lines: Sequence[Line], samples: int, stride: int) -> int:
         """Start a multisine, or without lines a queue; return the sample at which it began."""
         payloads = [protocol.pack(Kind.LINE, index, *line) for index, line in enumerate(lines)]
@@ -175,8 +197,8 @@ class BoardLine:
 
     def queue(self, first: int, drive: Array) -> None:
         """Append rows of drive (A), the first one of which is number `first` of the queue."""
-        for start in range(0, len(drive), ROWS):
-            rows = np.asarray(drive[start : start + ROWS], "<f4")
+        for start in range(0, len(drive), DRIVE_ROWS):
+            rows = np.asarray(drive[start : start + DRIVE_ROWS], "<f4")
             self.send(Kind.DRIVE, protocol.pack(Kind.DRIVE, first + start) + rows.tobytes())
 
     def telemetry(self) -> Telemetry:
@@ -197,6 +219,14 @@ class BoardLine:
             self.link.withdraw()
             raise
         return request
+
+    def _patiently(self, kind: Kind, payload: bytes) -> Request:
+        """Send a command again and again until what it waits for has faded out."""
+        end = self.clock.monotonic() + FADING
+        while True:
+            request = self._answer(self.link.submit(kind, payload))
+            if request.refused != Reason.STATE or self.clock.monotonic() >= end:
+                return self._checked(request)
 
     def _checked(self, request: Request) -> Request:
         """Return a command that was done; raise where it was refused."""

@@ -60,6 +60,7 @@ class Link:
         self.telemetry: Telemetry | None = None
         self.stream: deque[Stream] = deque(maxlen=MOST_STREAM)
         self.finger: Finger | None = None  # not sent yet
+        self.application = 0, 0  # changes with every call of it; ms without one after which the board stops, 0: never
         self.received = now  # s, of the last good frame
         self.sent_bytes = self.received_bytes = 0
         self._began, self._spoken = now, -math.inf
@@ -118,9 +119,8 @@ class Link:
         """Where the finger is, if that is new, or a sign of life."""
         finger, self.finger = self.finger, None
         time = round(((now if finger is None else finger[0]) - self._began) * 1e6) & 0xFFFFFFFF
-        if finger is None:
-            return self._command(Kind.HEARTBEAT, self._next(), protocol.pack(Kind.HEARTBEAT, time))
-        return self._command(Kind.FINGER, self._next(), protocol.pack(Kind.FINGER, time, *finger[1:]))
+        kind, fields = (Kind.HEARTBEAT, ()) if finger is None else (Kind.FINGER, finger[1:])
+        return self._command(kind, self._next(), protocol.pack(kind, time, *self.application, *fields))
 
     def _take(self, frame: Frame, now: float) -> None:
         try:

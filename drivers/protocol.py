@@ -14,11 +14,12 @@ from typing import NamedTuple
 
 from hapticrender.protocols import Flag
 
-VERSION = 1
+VERSION = 2
 MOST_BODY = 254  # bytes of kind, sequence, payload and CRC: one COBS group at most
 MOST_PAYLOAD = MOST_BODY - 5
 CRC_START = 0xFFFF
 DELIMITER = b"\0"
+WRAP = 2**32  # of times, and of numbers of samples
 
 
 class Kind(IntEnum):
@@ -36,6 +37,10 @@ class Kind(IntEnum):
     LINE = 0x0A
     IDENTIFY = 0x0B
     DRIVE = 0x0C
+    TEXTURE = 0x0D
+    PROFILE = 0x0E
+    SAMPLES = 0x0F
+    PLAY = 0x10
     CAPABILITIES = 0x81
     ACK = 0x82
     REFUSE = 0x83
@@ -43,10 +48,10 @@ class Kind(IntEnum):
     STREAM = 0x85
 
 
-LAYOUT = {  # payloads, without the check word of commands; TELEMETRY, STREAM and DRIVE go on with rows
+LAYOUT = {  # payloads, without the check word of commands; some go on with rows
     Kind.HELLO: "<BI",  # version, nonce (not 0)
-    Kind.HEARTBEAT: "<I",  # host's time, us
-    Kind.FINGER: "<Ifff",  # host's time, us; position, m, NaN: lifted; velocity, m/s; load, N
+    Kind.HEARTBEAT: "<IHH",  # host's time, us; application: its beat, and its watchdog, ms, 0: none
+    Kind.FINGER: "<IHHfff",  # the same; position, m, NaN: lifted; velocity, m/s; load, N
     Kind.SETPOINT: "<Bfffff",  # band; frequency, Hz; wavenumber, 1/m; phase, turns; target re, im, m
     Kind.COMMIT: "<BI",  # bands; CRC-32 of their set-points
     Kind.GAIN: "<f",  # 0 to 1
@@ -56,7 +61,11 @@ LAYOUT = {  # payloads, without the check word of commands; TELEMETRY, STREAM an
     Kind.LINE: "<BBfff",  # line; channel; frequency, Hz; amplitude, A; phase, turns
     Kind.IDENTIFY: "<BIHI",  # lines, 0: DRIVE frames; samples; samples between rows of the stream; CRC-32 of the lines
     Kind.DRIVE: "<I",  # number of the first row; then rows of drive, A
-    Kind.CAPABILITIES: "<BIIfffIHHBBBBB",
+    Kind.TEXTURE: "<BBHfff",  # number; 1: samples follow; points of its profile; first, step, m; m per unit of a point
+    Kind.PROFILE: "<H",  # number of the first point; then points, i16
+    Kind.SAMPLES: "<BIf",  # number of the texture; of the first sample; m per unit; then samples, i16
+    Kind.PLAY: "<I",  # CRC-32 of TEXTURE and all points
+    Kind.CAPABILITIES: "<BIIfffIHHBBBBBHHB",
     Kind.ACK: "<BI",  # kind; sample
     Kind.REFUSE: "<BBI",  # kind; reason; sample
     Kind.TELEMETRY: "<IIIIBBHIIIIIfIBB",
@@ -96,6 +105,7 @@ class Cause(IntEnum):
     SENSOR = 4  # invalid for 10 ms
     DONE = 5  # an identification has ended
     SESSION = 6  # another host said hello
+    APPLICATION = 7  # no beat of the application for the time of the watchdog
     INVALID = 17  # the supervisor of the law, from here on: see docs/safety.md
     FROZEN = 18
     INCONSISTENT = 19
@@ -131,6 +141,9 @@ class Capabilities(NamedTuple):
     bands: int  # at most
     lines: int  # of a multisine, at most
     silence: int  # ms after which the drive is zero
+    ring: int  # samples of a texture that it holds
+    points: int  # of a texture's profile, at most
+    lookahead: int  # samples after PLAY with which a texture begins
 
 
 class BandTelemetry(NamedTuple):

@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from hapticrender.drivers import protocol
+from hapticrender.drivers.protocol import WRAP
 from hapticrender.errors import DeviceTimeout
 from hapticrender.protocols import Array, Flag
 
 if TYPE_CHECKING:
     from hapticrender.drivers.board_client import BoardClient
-WRAP = 2**32  # of the board's sample counter
 LONGEST_GAP = 2**16  # rows
 
 

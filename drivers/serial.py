@@ -16,7 +16,8 @@ from hapticrender.bands import Bands
 from hapticrender.drivers.base import BaseDriver
 from hapticrender.drivers.board_client import BoardClient as BoardClient
 from hapticrender.drivers.board_line import Line as Line
-from hapticrender.drivers.board_loop import BoardLoop
+from hapticrender.drivers.board_loop import BoardLoop, playable
+from hapticrender.drivers.board_texture import BoardTexture as BoardTexture
 from hapticrender.drivers.row_reader import RowReader
 from hapticrender.errors import DriverError
 from hapticrender.protocols import Array, Controller, Exchange, Rendering, Sensed
@@ -39,7 +40,8 @@ class SerialDriver(BaseDriver):
 
     The board has its own law, of method "inverse"; `render` sends it the bands of the scene and records what it streams
     back, every sample: 140 kB/s at 5 kHz, as USB carries.  On a slower line samples are missing, with `Flag.OVERRUN`.
-    A board senses no finger: `finger` is where the host says it is.
+    A texture that is no sum of bands is sent as samples and as a table along the surface, see `BoardTexture`.  A board
+    senses no finger: `finger` is where the host says it is.
 
     Parameters
     ----------
@@ -54,15 +56,16 @@ class SerialDriver(BaseDriver):
         Of `BoardClient`.
     """
 
+    device_kind = "vt-plate"  # of which the firmware has the law
     probe = False  # the law on the board is the board's; its own guards are in docs/protocol.md
 
     def __init__(self, port: str, *, finger: Trajectory | None = None, block: int = 1, **options: Any) -> None:
         self.client = BoardClient(port, **options)
         self.finger, self._sent = finger, 0
+        self.rendering: Rendering | None = None  # set by `prepare`
         self._reader: RowReader | None = None
         with self.client as client:
-            found = client.capabilities
-        self._limit = found.drive_limit
+            found = self.capabilities = client.capabilities
         super().__init__(
             rate=found.rate,
             drive_channels=found.drive_channels,
@@ -72,26 +75,29 @@ class SerialDriver(BaseDriver):
         )
 
     def exchange(self, controller: Controller) -> Exchange | None:
-        """Return the exchange that runs the board's own loop with the bands of `controller`; None for a block device.
+        """Return the exchange that runs the board's own loop with the scene's texture; None for a block device.
 
         Raises
         ------
         DriverError
-            The board cannot play this: it has the law of method "inverse", and plays constant envelopes.
+            The board cannot play this: it has the law of method "inverse".
+        ValueError
+            The board cannot play this texture, see `playable`.
         """
         if self.block != 1:
             return None
-        inner = getattr(controller, "controller", controller)
-        bands = getattr(inner, "bands", None)
-        if bands is None or inner.method != "inverse" or bands.envelope is None or not len(bands):
+        inner: Any = getattr(controller, "controller", controller)
+        if self.rendering is None or inner.method != "inverse":
             raise DriverError(
-                f"{self}: exchange: method {inner.method!r} of this scene cannot run on a board: must be 'inverse', "
-                "with a texture of constant amplitudes"
+                f"{self}: exchange: method {inner.method!r} of this scene cannot run on a board: must be 'inverse'"
             )
+        bands, texture = playable(self.rendering, self.capabilities)
+        if texture is not None and inner.n_bands:
+            raise ValueError(f"texture: carriers = {inner.n_bands}: must be left out on a board, which plays it whole")
 
         def advance(count: int, reference: Callable[[Array], Array]) -> tuple[Array, Array, Array, Sensed]:
             if self._reader is None:
-                self._begin(bands)
+                self._begin(bands, texture)
             return self._taken(count, bands)
 
         return advance
@@ -100,9 +106,9 @@ class SerialDriver(BaseDriver):
         """Return a loop of the board's own for live play, see `hapticrender.Player`."""
         return BoardLoop(rendering, self)
 
-    def _begin(self, bands: Bands) -> None:
+    def _begin(self, bands: Bands, texture: BoardTexture | None) -> None:
         client = self.client
-        client.set_bands(bands)
+        client.set_bands(bands, texture)
         self._started = client.clock.monotonic()
         self._point()
         first = client.start(stream=1)
@@ -124,7 +130,8 @@ class SerialDriver(BaseDriver):
         if reader is None:
             raise DriverError(f"{self}: exchange: it has not begun")
         drive, sensed, position, load, flags = self.columns(reader.take(count))
-        target = np.tile(np.asarray(bands.envelope, complex), (count, 1))
+        envelope = np.zeros(0) if bands.envelope is None else bands.envelope
+        target = np.tile(np.asarray(envelope, complex), (count, 1))
         target[np.isnan(position)[:, None] & (bands.wavenumber > 0.0)] = 0.0
         return drive, target, flags, Sensed(sensed, position=position, normal_load=load, flags=flags)
 

@@ -13,10 +13,9 @@ import numba
 import numpy as np
 from numba import carray
 
-from hapticrender.bands import Bands
 from hapticrender.jit import F8, kernel, pointer, record
-from hapticrender.protocols import Array, Texture
-from hapticrender.touch.composed import Sum
+from hapticrender.protocols import Texture
+from hapticrender.touch.composed import SeparatedTexture
 
 AHEAD = 2.0  # s: samples in time that are computed ahead; a busy process that is later hears its texture fade out
 CHUNK = 4096  # samples computed at once
@@ -83,16 +82,10 @@ class Voice:
     """
 
     def __init__(self, texture: Texture, rate: float, waveform: Any = None) -> None:
-        parts = texture.parts if isinstance(texture, Sum) and waveform is None else ((texture, 1.0),)
-        for each, _ in parts:
-            refuse_mixed(each)
-        found = [(each, waveform or each.waveform, gain) for each, gain in parts]
-        self.texture, self.rate = texture, rate
-        self._in_time = [part for part in found if not getattr(part[0], "spatial", False)]
-        self._samples = np.zeros(2 * round(AHEAD * rate) if self._in_time else 0)
-        places = np.arange(-REACH, REACH, STEP)
-        profiles = [_values(part, np.zeros(len(places)), places) for part in found if part not in self._in_time]
-        self._profile = np.sum(profiles, axis=0) if profiles else np.zeros(0)
+        self.texture, self.rate, self._parts = texture, rate, SeparatedTexture(texture, waveform)
+        self._samples = np.zeros(2 * round(AHEAD * rate) if self._parts.timed else 0)
+        places = np.arange(-REACH, REACH, STEP) if self._parts.spatial else np.zeros(0)
+        self._profile = self._parts.along_surface(places)
         self.record = np.zeros(1, VOICE)
         values = {
             "samples_at": self._samples.ctypes.data,
@@ -112,23 +105,9 @@ class Voice:
         """Compute samples until `AHEAD` seconds beyond sample `now` of the texture."""
         written = int(self.record["written"][0])
         end = max(now, 0) + round(AHEAD * self.rate)
-        while self._in_time and written < end:
+        while self._parts.timed and written < end:
             count = min(CHUNK, end - written)
-            time = (written + np.arange(count)) / self.rate
-            total = np.sum([_values(part, time, np.full(count, np.nan)) for part in self._in_time], axis=0)
-            self._samples[(written + np.arange(count)) % len(self._samples)] = total
+            index = written + np.arange(count)
+            self._samples[index % len(self._samples)] = self._parts.in_time(index / self.rate)
             written += count
             self.record["written"] = written
-
-
-def refuse_mixed(texture: Texture) -> None:
-    """Refuse a texture that is read in time and along the surface at once."""
-    spatial = {bool(getattr(part, "spatial", False)) for part, _ in getattr(texture, "parts", ())}
-    if spatial == {True, False} or (True in spatial and not isinstance(texture, Sum)):
-        raise ValueError(f"{type(texture).__name__} with a part along the surface: play its parts one after another")
-
-
-def _values(part: tuple[Texture, Any, float], time: Array, position: Array) -> Array:
-    texture, waveform, gain = part
-    bands = Bands.none(spatial=bool(getattr(texture, "spatial", False)))
-    return gain * bands.checked(type(texture).__name__, waveform, time, position)

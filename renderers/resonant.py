@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -71,6 +72,7 @@ class ResonantDriver(WrappedDriver):
         self._target = 0.0  # m, at the end of the last sample
         self._reached = -1.0  # m, alike, by what the drive can do; negative: it starts from rest
         self._friction = 0.0  # N: measured in the last sample
+        self._load = math.nan  # N: that the device has last measured
         self._drive = np.zeros((driver.block, 1))
         self._next = np.zeros((driver.block, 1))
 
@@ -82,6 +84,7 @@ class ResonantDriver(WrappedDriver):
     def play(self, drive: Array) -> Sensed:
         """Play a block of friction (N); sample i of what is sensed was there at the start of interval i."""
         rows = finger_inputs(self.finger, self._samples, self.block, self.rate)
+        rows[:, LOAD] = rows[:, LOAD] if math.isnan(self._load) else self._load
         self._samples += self.block
         whole, load, speed = self._contact(rows)
         flags = np.zeros((self.block, self.parameters.oversampling), np.int64)
@@ -91,6 +94,8 @@ class ResonantDriver(WrappedDriver):
         friction_ratios(self.parameters.friction_law.numbers, measured, load, speed, friction)
         measured_friction = np.r_[self._friction, whole * friction]
         self._friction = measured_friction[-1]
+        if played[-1].normal_load is not None:
+            self._load = float(played[-1].normal_load[-1])
         return self._sensed(measured_friction[:-1, None], played, np.bitwise_or.reduce(flags, axis=1))
 
     def _contact(self, rows: Array) -> tuple[Array, Array, Array]:

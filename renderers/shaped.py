@@ -52,7 +52,11 @@ def thinned(sensed: Sensed, hold: int) -> Sensed:
 
 
 class ShapedDriver(WrappedDriver):
-    """A driver that plays `shape` of its drive: the device's from the controller's, sample by sample (n, channels)."""
+    """A driver that plays `shape` of its drive: the device's from the controller's, sample by sample (n, channels).
+
+    What it senses, or knows, of the friction is taken as a magnitude: a tribometer that keeps the sign of the lateral
+    force changes it with the finger's direction, and the friction does not.
+    """
 
     def __init__(self, driver: Driver, shape: Callable[[Array], Any]) -> None:
         super().__init__(driver)
@@ -60,7 +64,9 @@ class ShapedDriver(WrappedDriver):
 
     def play(self, drive: Array) -> Sensed:
         """Play `shape` of a block."""
-        return self.driver.play(self.shape(drive))
+        sensed = self.driver.play(self.shape(drive))
+        motion = None if sensed.motion is None else np.abs(sensed.motion)
+        return sensed._replace(sensed=np.abs(sensed.sensed), motion=motion)
 
 
 class CarrierDriver(ShapedDriver):

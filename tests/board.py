@@ -21,7 +21,8 @@ ROOT = Path(__file__).resolve().parent.parent
 FIRMWARE = ROOT / "drivers" / "firmware"
 STRICT = ("-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic", "-ffp-contract=off")
 SANITISED = ("-O1", "-g", "-fsanitize=address,undefined", "-fno-sanitize-recover=all")
-SOURCES = "board board_commands board_telemetry frames plate hardware_posix law learning carriers supervisor".split()
+SOURCES = "board board_commands board_telemetry board_textures frames texture plate hardware_posix".split()
+SOURCES += "law learning carriers supervisor".split()
 RATE = 5000.0  # Hz
 MECHANICS = "heavy-2nd-order"
 FINGER = hr.Finger.swiping(frequency=0.8, stroke=0.05, normal_load=0.4, mechanics=MECHANICS)
@@ -216,6 +217,15 @@ def driver_of(board, **options):
 def tones(*frequencies, amplitude=5e-6):
     n = len(frequencies)
     return Bands(frequency=frequencies, wavenumber=np.zeros(n), phase=np.zeros(n), envelope=np.full(n, amplitude))
+
+
+def sensed_error(recording, start=int(0.3 * RATE)):
+    """Error of the middle of the plate by its sensors, 20-500 Hz, over the texture, from sample `start` on."""
+    reference = recording.read("reference", start)
+    error = np.fft.rfft(recording.read("sensed", start).mean(axis=1) - reference)
+    frequency = np.fft.rfftfreq(len(reference), 1 / RATE)
+    inside = (frequency >= 20) & (frequency <= 500)
+    return np.linalg.norm(error[inside]) / np.linalg.norm(np.fft.rfft(reference)[inside])
 
 
 def run(client, board, seconds):

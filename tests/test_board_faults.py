@@ -196,7 +196,7 @@ def test_damage_that_the_crc_does_not_show_does_nothing(stepped):
     words = [
         (Kind.SETPOINT, protocol.pack(Kind.SETPOINT, 0, 47.0, 0.0, 0.0, 5e-6, 0.0)),
         (Kind.GAIN, protocol.pack(Kind.GAIN, 0.5)),
-        (Kind.FINGER, protocol.pack(Kind.FINGER, 0, 0.01, 0.0, 0.4)),
+        (Kind.FINGER, protocol.pack(Kind.FINGER, 0, 0, 0, 0.01, 0.0, 0.4)),
         (Kind.STOP, b""),
     ]
     for index, (kind, payload) in enumerate(words):

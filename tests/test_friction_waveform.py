@@ -5,6 +5,7 @@ The bound is what the project has set itself: 3 % of the waveform, from the true
 
 import numpy as np
 import pytest
+from electroadhesive import Screen
 from scipy.signal import butter, hilbert, lfilter, sosfiltfilt
 from test_ultrasonic_rendering import Watched
 
@@ -98,3 +99,63 @@ def test_a_third_partys_plate_plays_white_noise_and_the_verdict_says_what_it_can
     summary = recording.summary()
     assert summary["verdict"] == "not judged"
     assert "inferred by a law that is assumed" in summary["reason"]
+
+
+class Weighed(Watched):
+    """A plate under a finger of 0.8 N, which it tells or keeps to itself."""
+
+    def __init__(self, tells):
+        heavy = hr.Finger.sliding(speed=0.08, normal_load=0.8, mechanics="light")
+        super().__init__(UltrasonicParameters(), heavy)
+        self.tells = tells
+
+    def _play(self, drive):
+        return super()._play(drive)._replace(normal_load=np.full(len(drive), 0.8) if self.tells else None)
+
+
+@pytest.mark.parametrize(("tells", "least", "most"), [(True, 0.97, 1.03), (False, 1.5, 3.0)])
+def test_the_load_that_a_device_tells_is_used(tells, least, most):
+    """A scene states half of it: friction comes out about twice as large where the device does not tell."""
+    texture = hr.Grating(frequency=200.0, velocity=10e-3)
+    finger = hr.Finger.sliding(speed=0.08, normal_load=0.4, mechanics="light")
+    device = Weighed(tells)
+    recording = hr.render(
+        hr.Scene(texture=texture, finger=finger, device="ultrasonic", duration=0.5, settle=0.2), driver=device
+    )
+    p, time = SurfaceParameters(), np.arange(sum(map(len, device.moved))) / 192e3
+    amplitude, late = abs(hilbert(np.concatenate(device.moved))), (time > 0.3) & (time < 0.45)
+    friction = p.friction_coefficient * 0.8 * p.friction_law.ratio(amplitude, 0.8, 0.08)
+    line = 2 * np.mean((friction * np.exp(-2j * np.pi * 200.0 * time))[late]) * p.lag_response(200.0, 0.08)
+    assert least < abs(line) / (10e-3 / 0.64) < most
+    assert recording.summary()["verdict"] != "passed"
+
+
+class Signed(Screen):
+    """A screen whose tribometer keeps the sign of the lateral force; it tells nothing else."""
+
+    def __init__(self, finger, *, blind):
+        super().__init__(blind=blind, finger=finger)
+        self.finger, self.true = finger, []
+
+    def _play(self, drive):
+        start = len(self.true) / self.rate
+        played = super()._play(drive)
+        self.true += [float(each) for each in self.plant.motion[:, 0]]
+        way = np.diff(self.finger.position(np.array([start, start + 1 / self.rate])))
+        return played._replace(sensed=played.sensed * np.sign(way), motion=None)
+
+
+def test_a_signed_friction_sensor_is_no_worse_than_open_loop():
+    """Ridges of 1 mm under swipes at 3 Hz: the sign turns with the finger, the friction does not."""
+    finger, errors = hr.Finger.swiping(frequency=3.0, speed=0.05, normal_load=0.4), {}
+    band = butter(2, [20.0, 500.0], "bandpass", fs=10e3, output="sos")
+    late = slice(5000, 14_000)
+    for blind in (True, False):
+        screen = Signed(finger, blind=blind)
+        scene = hr.Scene(texture=ridges(), finger=finger, device="electroadhesion", duration=1.5)
+        recording = hr.render(scene, driver=screen)
+        true, asked = np.array(screen.true)[: len(recording)], recording.reference
+        played, asked = (sosfiltfilt(band, each)[late] for each in (true, asked))
+        errors[blind] = np.std(played - asked) / np.std(asked)
+    assert errors[True] < MUST
+    assert errors[False] < max(errors[True], 0.02)

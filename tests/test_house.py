@@ -81,7 +81,7 @@ MAY_IMPORT = {  # package: the others that it may import; renderers and drivers 
     "control": set(),
     "plants": {"control", "touch"},
     "renderers": DEVICES | {"drivers"},
-    "drivers": {"plants"},
+    "drivers": {"plants", "touch"},
     "core": DEVICES,
     "top": {*DEVICES, "core"},
 }

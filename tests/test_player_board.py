@@ -1,14 +1,19 @@
 """Live play on a board: a process behind a pseudo-terminal, with a plate in it."""
 
 from contextlib import ExitStack
+from dataclasses import replace
 
 import numpy as np
 import pytest
-from board import SLOW, BoardProcess, SlowClock, build_board
+from board import SLOW, BoardProcess, SlowClock, build_board, sensed_error
 from live_devices import TONE
 
 import hapticrender as hr
 from hapticrender.drivers.serial import SerialDriver
+
+WHITE = hr.Recorded(
+    samples=np.random.default_rng(5).standard_normal(20_000), rate=5000.0, gain=10e-6, passband=(30.0, 300.0)
+)
 
 
 def test_a_board_plays_live(tmp_path):
@@ -20,18 +25,36 @@ def test_a_board_plays_live(tmp_path):
         with hr.Player(driver=driver) as player:
             player.play(TONE)
             player.record(tmp_path / "board.au")
-            player.sleep(0.8)
+            player.sleep(0.5)
             [tone] = player.state().bands
             player.play(hr.Grating(frequency=150.0, amplitude=4e-6))
             player.gain = 0.5
-            player.sleep(0.8)
+            player.sleep(0.5)
             [other] = player.state().bands
-            with pytest.raises(ValueError, match="Chirp is a waveform"):
-                player.play(hr.Chirp(start=50.0, stop=100.0, duration=1.0, amplitude=1e-6))
             recording = player.end_recording()
+            player.gain = 1.0
+            player.play(WHITE)
+            player.record(tmp_path / "white.au")
+            player.sleep(0.5)
+            [white] = player.state().bands
+            player.play(replace(WHITE, speed=0.1) + 0.5 * hr.Chirp(start=50.0, stop=90.0, duration=1.0, amplitude=4e-6))
+            start = driver.client.clock.monotonic()
+            while (slid := driver.client.clock.monotonic() - start) < 0.6:
+                player.finger(-0.03 + 0.1 * slid, 0.1, 0.4)
+                player.sleep(0.01)
+            assert player.state().flags == hr.Flag(0)
+            both = player.end_recording()
     assert (tone.frequency, other.frequency) == (100.0, 150.0)
     assert (tone.target, other.target) == pytest.approx((5e-6, 2e-6), rel=1e-3)
     assert max(tone.error, other.error) < 0.2  # telemetry is of an instant, with 1 um of noise at each end
+    # noise of 0.7 um rms in the middle; what is left of the error is below 5 % of the target
+    assert white.frequency == 0.0
+    assert white.error * white.target < np.hypot(0.75e-6, 0.05 * white.target)
+    # the same noise within 20-500 Hz, 288 numbers over 0.3 s: 13 % are three sigmas of its rms
+    noise = 0.71e-6 * np.sqrt(480 / 2500) / np.std(both.reference[-1500:])
+    found = sensed_error(both, len(both) - 1500)
+    print(f"live: {white}; along the surface and in time: {found:.3f}, noise {noise:.3f}")
+    assert found < np.hypot(1.13 * noise, 0.05)
     last = slice(-1500, None)
     time = np.arange(len(recording))[last] / 5000.0
     waves = np.stack([np.cos(2 * np.pi * 150.0 * time), np.sin(2 * np.pi * 150.0 * time), np.ones(1500)], axis=1)
@@ -62,3 +85,18 @@ def test_a_board_that_is_found_again_is_heard_again(tmp_path):
     phase = 2 * np.pi * 100.0 * np.arange(1500) / 5000.0
     parts = [2 * np.mean(each[-1500:] * np.exp(-1j * phase)) for each in (recording.reference, recording.motion[:, 0])]
     assert abs(parts[1] - parts[0]) < 0.05 * 5e-6  # the new run's carriers begin anew, and so does the texture
+
+
+def test_the_board_stops_when_the_application_is_silent(tmp_path):
+    """The player's threads go on, and so do the signs of life; only the calls of the application are missing."""
+    program = build_board(tmp_path / "board", hr.prepare(hr.Scene(texture=TONE, duration=1.0)))
+    with BoardProcess(program, tmp_path, *SLOW) as board:
+        driver = SerialDriver(str(board.port), clock=SlowClock())
+        with hr.Player(driver=driver, watchdog=0.1) as player:
+            player.play(TONE)
+            player.sleep(0.5)
+            assert player.state().flags == hr.Flag(0)
+            driver.client.clock.sleep(0.3)
+            with pytest.raises(hr.WatchdogTimeout, match="no method of the player was called"):
+                player.state()
+        assert [line[2:] for line in board.log() if line[1] == "state"] == [["1", "0"], ["0", "7"]]

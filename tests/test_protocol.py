@@ -69,7 +69,8 @@ def test_the_table_has_every_command_with_its_check_word():
     for kind, sequence, payload in commands:
         word = protocol.check_word(0 if kind == Kind.HELLO else SESSION, kind, sequence, payload[:-4])
         assert payload[-4:] == struct.pack("<I", word)
-        assert len(payload) - 4 == struct.calcsize(protocol.LAYOUT[kind])
+        rows = {Kind.PROFILE: 4 * 2, Kind.SAMPLES: 3 * 2}.get(kind, 0)
+        assert len(payload) - 4 == struct.calcsize(protocol.LAYOUT[kind]) + rows
 
 
 def test_the_page_explains_a_frame_of_the_table():

@@ -21,6 +21,7 @@ from board import (
     driver_of,
     program_of,
     run,
+    sensed_error,
     slow_board,
     slow_client,
     tones,
@@ -48,16 +49,6 @@ def fast(tmp_path):
     """The same without sanitisers."""
     with SteppedBoard(program_of("-O2"), tmp_path) as board:
         yield board
-
-
-def sensed_error(recording):
-    """Error of the middle of the plate by its sensors, 20-500 Hz, over the texture, after the fade-in."""
-    start = int(0.3 * RATE)
-    reference = recording.read("reference", start)
-    error = np.fft.rfft(recording.read("sensed", start).mean(axis=1) - reference)
-    frequency = np.fft.rfftfreq(len(reference), 1 / RATE)
-    inside = (frequency >= 20) & (frequency <= 500)
-    return np.linalg.norm(error[inside]) / np.linalg.norm(np.fft.rfft(reference)[inside])
 
 
 @pytest.mark.parametrize("noise", [1e-6, 1e-7])
@@ -99,12 +90,9 @@ def test_what_was_recorded_is_complete_and_of_the_board(tmp_path):
 
 
 def test_a_scene_that_no_board_can_play_is_refused(stepped):
-    white = hr.Scene(texture=hr.Recorded(samples=np.sin(np.arange(500.0)), rate=5000.0, amplitude=1e-6), duration=0.1)
     driver = driver_of(stepped)
     with pytest.raises(DriverError, match="exchange: method 'h2' of this scene cannot run on a board"):
         hr.render(SCENE, driver=driver, method="h2")
-    with pytest.raises(DriverError, match="exchange: method 'inverse' of this scene cannot run"):
-        hr.render(white, driver=driver)
     with driver, pytest.raises(DriverError, match="play: the loop runs on the board"):
         driver.play(np.zeros((1, 2)))
 
@@ -246,7 +234,7 @@ def test_what_the_line_carries_is_what_the_page_says(fast, stream, period, recei
     run(client, fast, 1.0)
     found = client._line.link.received_bytes - before[0], client._line.link.sent_bytes - before[1]
     assert found[0] == pytest.approx(received, rel=0.02)
-    assert found[1] == pytest.approx(1500, rel=0.02)
+    assert found[1] == pytest.approx(1900, rel=0.02)
     page = (ROOT / "docs" / "protocol.md").read_text(encoding="utf-8")
     assert f"| {received:,} |".replace(",", " ") in page
 

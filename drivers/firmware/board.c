@@ -14,7 +14,7 @@
 #define real_cos cosf
 #endif
 
-static uint32_t samples_of(const board_t *board, uint32_t milliseconds)
+uint32_t board_samples_of(const board_t *board, uint32_t milliseconds)
 {
     return (uint32_t)((real_t)milliseconds * REAL(1e-3) * board->played.rate);
 }
@@ -31,8 +31,9 @@ void board_init(board_t *board)
     board->clock_step = (uint32_t)(REAL(65536e6) / design.rate + REAL(0.5));
     board_defaults(board);
     law_init(&board->law, &board->played);
+    textures_init(&board->textures);
     board->finger.position = board->position = (real_t)NAN;
-    board->quiet = samples_of(board, BOARD_SILENCE_MS);
+    board->quiet = board_samples_of(board, BOARD_SILENCE_MS);
 }
 
 void board_defaults(board_t *board)
@@ -123,8 +124,12 @@ static void compute_drive(board_t *board)
         board->drive[c] = REAL(0.0);
     }
     if (board->state == BOARD_PLAYING) {
+        uint32_t dry = 0;
+        real_t reference = textures_step(&board->textures, board->position, board->sample + LAW_LOOKAHEAD,
+                                         board->played.rate, &dry);
+        board->flags |= dry != 0u ? BOARD_OVERRUN : 0u;
         board->flags |= supervisor_step(&board->supervisor, &board->law, board->sensed, board->position,
-                                        board->finger.velocity, REAL(0.0), board->drive);
+                                        board->finger.velocity, reference, board->drive);
         if (board->supervisor.cause != SUPERVISOR_FINE) {
             board_stop(board, CAUSE_SUPERVISOR + (uint32_t)board->supervisor.cause);
         }
@@ -156,7 +161,7 @@ static void guard(board_t *board)
         valid = valid && isfinite(board->sensed[s]) && real_abs(board->sensed[s]) < board->played.sensor_limit;
     }
     board->invalid = valid ? 0u : board->invalid + 1u;
-    if (board->invalid > samples_of(board, BOARD_INVALID_MS)) {
+    if (board->invalid > board_samples_of(board, BOARD_INVALID_MS)) {
         board_stop(board, CAUSE_SENSOR);
     }
 }
@@ -175,6 +180,7 @@ static void advance_fade(board_t *board)
         board->flags |= BOARD_STOPPED;
         if (board->fade == REAL(0.0)) {
             board->state = BOARD_IDLE;
+            textures_init(&board->textures);
             board_telemetry(board);
         }
     }
@@ -192,8 +198,11 @@ static void listen_to_host(board_t *board)
             board->bad++;
         }
     }
-    if (board->quiet > samples_of(board, BOARD_SILENCE_MS)) {
+    if (board->quiet > board_samples_of(board, BOARD_SILENCE_MS)) {
         board_stop(board, CAUSE_SILENCE);
+    }
+    if (board->state == BOARD_PLAYING && board->watchdog > 0u && board->unattended > board->watchdog) {
+        board_stop(board, CAUSE_APPLICATION);
     }
 }
 
@@ -226,5 +235,6 @@ void board_tick(board_t *board, uint32_t ticks)
     board->sample += ticks;
     board->clock += (uint64_t)ticks * board->clock_step;
     board->quiet += board->quiet < UINT32_MAX - ticks ? ticks : 0u;
+    board->unattended += board->unattended < UINT32_MAX - ticks ? ticks : 0u;
     count_cycles(board, hardware_cycles() - start);
 }

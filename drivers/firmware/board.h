@@ -2,8 +2,8 @@
  * The board: bytes from the host become set-points, finger and commands; the law runs once a tick; telemetry goes back.
  *
  * docs/protocol.md has every frame.  A set-point acts only after a COMMIT whose digest is that of what the board holds;
- * every command carries a CRC-32 that starts from the session, beside the frame's CRC-16.  Without a word for 80 ms
- * the drive fades out within 10 ms.  Static memory: sizeof(board_t), no heap, no recursion.
+ * every command carries a CRC-32 that starts from the session, beside the frame's CRC-16.  Without a word for 80 ms, or
+ * without a beat of the application for as long as it says, the drive fades out within 10 ms.  Static memory: sizeof(board_t), no heap, no recursion.
  */
 #ifndef BOARD_H
 #define BOARD_H
@@ -14,9 +14,10 @@
 #include "frames.h"
 #include "law.h"
 #include "supervisor.h"
+#include "texture.h"
 
 enum {
-    BOARD_VERSION = 1,
+    BOARD_VERSION = 2,
     BOARD_SILENCE_MS = 80,                        /* without a good word (HEARTBEAT, FINGER): fade out */
     BOARD_FADE_MS = 10,
     BOARD_EXTRAPOLATE_MS = 50,                    /* a finger's position follows its velocity for so long, then holds */
@@ -30,7 +31,7 @@ enum {
 /* Kinds of frames. */
 enum {
     KIND_HELLO = 0x01, KIND_HEARTBEAT, KIND_FINGER, KIND_SETPOINT, KIND_COMMIT, KIND_GAIN, KIND_LIMITS, KIND_START,
-    KIND_STOP, KIND_LINE, KIND_IDENTIFY, KIND_DRIVE,
+    KIND_STOP, KIND_LINE, KIND_IDENTIFY, KIND_DRIVE, KIND_TEXTURE, KIND_PROFILE, KIND_SAMPLES, KIND_PLAY,
     KIND_CAPABILITIES = 0x81, KIND_ACK, KIND_REFUSE, KIND_TELEMETRY, KIND_STREAM
 };
 
@@ -44,6 +45,7 @@ typedef enum { BOARD_IDLE, BOARD_PLAYING, BOARD_IDENTIFYING, BOARD_DRIVING } boa
 /* Why the board last came to rest. */
 typedef enum {
     CAUSE_NONE, CAUSE_COMMAND, CAUSE_SILENCE, CAUSE_LIMIT, CAUSE_SENSOR, CAUSE_DONE, CAUSE_SESSION,
+    CAUSE_APPLICATION,
     CAUSE_SUPERVISOR = 16                         /* and a supervisor_cause_t */
 } board_cause;
 
@@ -78,6 +80,8 @@ typedef struct {
     uint8_t replied[FRAME_WIRE];                  /* to the last command */
     size_t replied_count;
     uint32_t quiet;                               /* samples since the last good word */
+    uint32_t beat, unattended, watchdog;          /* of the application: its last beat; samples since;
+                                                     most, 0: any */
     uint32_t echo;                                /* us: host's time of the last word */
     uint32_t bad, refused, dropped;               /* frames: malformed; refused; not sent as the line was full */
     word_t finger;
@@ -105,6 +109,7 @@ typedef struct {
     frame incoming;
     uint8_t sending[BOARD_SEND];
     size_t sending_in, sending_out;
+    textures_t textures;                          /* last, as they are large */
 } board_t;
 
 /* Set the board to rest, as after a reset. */
@@ -115,11 +120,16 @@ void board_tick(board_t *board, uint32_t ticks);
 
 /* Between the files of the board. */
 uint32_t board_time(const board_t *board);                      /* us since reset; wraps */
+uint32_t board_samples_of(const board_t *board, uint32_t milliseconds);
 void board_defaults(board_t *board);                            /* gain and limits of the design */
 void board_begin(board_t *board, board_state state);            /* a run, from rest */
 void board_stop(board_t *board, uint32_t cause);                /* fade out, unless at rest */
 void board_command(board_t *board, const frame *incoming);      /* board_commands.c: do what a frame says */
 void board_send(board_t *board, uint8_t kind, uint16_t sequence, const uint8_t *payload, size_t count);
+uint8_t board_texture(board_t *board, const uint8_t *payload, size_t count); /* board_textures.c: a reason, or none */
+uint8_t board_profile(board_t *board, const uint8_t *payload, size_t count);
+uint8_t board_samples(board_t *board, const uint8_t *payload, size_t count);
+uint8_t board_play(board_t *board, const uint8_t *payload, size_t count);
 void board_telemetry(board_t *board);                           /* board_telemetry.c */
 void board_stream(board_t *board);
 void board_flush(board_t *board);

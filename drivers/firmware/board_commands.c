@@ -94,6 +94,8 @@ static uint8_t start(board_t *board, const uint8_t *payload, size_t count)
     }
     board->stride = get_u16(payload);
     board->period = get_u16(payload + 2);
+    board->unattended = 0;
+    board->textures.of[board->textures.current].began = board->sample;
     board_begin(board, BOARD_PLAYING);
     return REASON_NONE;
 }
@@ -151,9 +153,6 @@ static uint8_t identify(board_t *board, const uint8_t *payload, size_t count)
 static uint8_t drive(board_t *board, const uint8_t *payload, size_t count)
 {
     size_t rows = (count - 4u) / ROW_BYTES;
-    if ((count - 4u) % ROW_BYTES != 0u) {
-        return REASON_LENGTH;
-    }
     if (board->state != BOARD_DRIVING || get_u32(payload) != board->queue_in ||
         board->queue_in - board->queue_out + rows > BOARD_QUEUE) {
         return REASON_STATE;
@@ -192,12 +191,15 @@ static void word(board_t *board, const frame *from)
     board->worded = from->sequence;
     if (take_time(board, get_u32(from->payload)) < 1000u * BOARD_SILENCE_MS) {
         board->quiet = 0;                         /* an older one has waited in a full line: no sign of life */
+        board->unattended = get_u16(from->payload + 4) != board->beat ? 0u : board->unattended;
+        board->beat = get_u16(from->payload + 4);
+        board->watchdog = board_samples_of(board, get_u16(from->payload + 6));
     }
     if (from->kind == KIND_FINGER) {
         board->finger.written = get_u32(from->payload) + board->finger.offset;
-        board->finger.position = (real_t)get_f32(from->payload + 4);
-        board->finger.velocity = (real_t)get_f32(from->payload + 8);
-        board->finger.load = (real_t)get_f32(from->payload + 12);
+        board->finger.position = (real_t)get_f32(from->payload + 8);
+        board->finger.velocity = (real_t)get_f32(from->payload + 12);
+        board->finger.load = (real_t)get_f32(from->payload + 16);
     }
 }
 
@@ -233,9 +235,13 @@ static void begin_session(board_t *board, uint32_t nonce)
     board->session = crc32(numbers, sizeof numbers, 0u) | 1u;
     board->committed = 0u;
     board->finger.known = 0u;
+    board->watchdog = 0;
     board->finger.position = (real_t)NAN;
     board->period = (uint32_t)(board->played.rate * REAL(0.1));
     board_defaults(board);
+    if (board->state == BOARD_IDLE) {
+        textures_init(&board->textures);
+    }
 }
 
 static void hello(board_t *board, const frame *from)
@@ -257,18 +263,21 @@ static void hello(board_t *board, const frame *from)
     at = put_u8(put_u8(at, LAW_CHANNELS), LAW_SENSORS);
     at = put_u8(put_u8(at, LAW_BANDS), BOARD_LINES);
     at = put_u8(at, BOARD_SILENCE_MS + BOARD_FADE_MS);
+    at = put_u8(put_u16(put_u16(at, TEXTURE_RING), TEXTURE_POINTS), LAW_LOOKAHEAD);
     reply(board, KIND_CAPABILITIES, from->sequence, payload, (size_t)(at - payload));
 }
 
-/* Commands with a reply, and the bytes of their payload; DRIVE is as long as its rows. */
+/* Commands with a reply, the bytes of their payload, and of the rows that follow it, 0: none. */
 static const struct {
     uint8_t kind;
-    size_t count;
+    size_t count, row;
     handler handle;
 } commands[] = {
-    {KIND_SETPOINT, 1 + SETPOINT_BYTES, setpoint}, {KIND_COMMIT, 5, commit}, {KIND_GAIN, 4, gain},
-    {KIND_LIMITS, 12, limits}, {KIND_START, 4, start}, {KIND_STOP, 0, stop}, {KIND_LINE, 1 + LINE_BYTES, line},
-    {KIND_IDENTIFY, 11, identify}, {KIND_DRIVE, 0, drive},
+    {KIND_SETPOINT, 1 + SETPOINT_BYTES, 0, setpoint}, {KIND_COMMIT, 5, 0, commit}, {KIND_GAIN, 4, 0, gain},
+    {KIND_LIMITS, 12, 0, limits}, {KIND_START, 4, 0, start}, {KIND_STOP, 0, 0, stop},
+    {KIND_LINE, 1 + LINE_BYTES, 0, line}, {KIND_IDENTIFY, 11, 0, identify}, {KIND_DRIVE, 4, ROW_BYTES, drive},
+    {KIND_TEXTURE, 16, 0, board_texture}, {KIND_PROFILE, 2, 2, board_profile}, {KIND_SAMPLES, 9, 2, board_samples},
+    {KIND_PLAY, 4, 0, board_play},
 };
 
 static void execute(board_t *board, const frame *from)
@@ -284,7 +293,8 @@ static void execute(board_t *board, const frame *from)
     }
     for (size_t i = 0; i < sizeof commands / sizeof commands[0]; i++) {
         if (commands[i].kind == from->kind) {
-            int fits = from->kind == KIND_DRIVE ? count >= 4u : count == commands[i].count;
+            size_t least = commands[i].count, row = commands[i].row;
+            int fits = count == least || (row > 0u && count > least && (count - least) % row == 0u);
             uint8_t reason = fits ? commands[i].handle(board, from->payload, count) : (uint8_t)REASON_LENGTH;
             uint8_t payload[5];
             if (reason != REASON_NONE) {
@@ -312,8 +322,8 @@ void board_command(board_t *board, const frame *from)
         }
     } else if (board->session == 0u) {
         refuse(board, from, REASON_CHECK, 0);
-    } else if ((from->kind == KIND_HEARTBEAT && count == CHECK + 4u) ||
-               (from->kind == KIND_FINGER && count == CHECK + 16u)) {
+    } else if ((from->kind == KIND_HEARTBEAT && count == CHECK + 8u) ||
+               (from->kind == KIND_FINGER && count == CHECK + 20u)) {
         word(board, from);
     } else {
         execute(board, from);

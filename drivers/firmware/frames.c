@@ -4,24 +4,26 @@
 
 uint16_t crc16(const uint8_t *bytes, size_t count, uint16_t start)
 {
-    uint16_t crc = start;
+    static const uint16_t table[16] = {            /* of four bits; one at a time they take six times as long */
+        0x0000u, 0x1021u, 0x2042u, 0x3063u, 0x4084u, 0x50A5u, 0x60C6u, 0x70E7u,
+        0x8108u, 0x9129u, 0xA14Au, 0xB16Bu, 0xC18Cu, 0xD1ADu, 0xE1CEu, 0xF1EFu};
+    uint32_t crc = start;
     for (size_t i = 0; i < count; i++) {
-        crc = (uint16_t)(crc ^ (uint16_t)((uint16_t)bytes[i] << 8));
-        for (int bit = 0; bit < 8; bit++) {
-            crc = (uint16_t)((crc & 0x8000u) != 0u ? ((uint32_t)crc << 1) ^ 0x1021u : (uint32_t)crc << 1);
-        }
+        crc = (crc << 4 ^ table[(crc >> 12 ^ (uint32_t)bytes[i] >> 4) & 15u]) & 0xFFFFu;
+        crc = (crc << 4 ^ table[(crc >> 12 ^ bytes[i]) & 15u]) & 0xFFFFu;
     }
-    return crc;
+    return (uint16_t)crc;
 }
 
 uint32_t crc32(const uint8_t *bytes, size_t count, uint32_t start)
 {
+    static const uint32_t table[16] = {
+        0x00000000u, 0x1DB71064u, 0x3B6E20C8u, 0x26D930ACu, 0x76DC4190u, 0x6B6B51F4u, 0x4DB26158u, 0x5005713Cu,
+        0xEDB88320u, 0xF00F9344u, 0xD6D6A3E8u, 0xCB61B38Cu, 0x9B64C2B0u, 0x86D3D2D4u, 0xA00AE278u, 0xBDBDF21Cu};
     uint32_t crc = ~start;
     for (size_t i = 0; i < count; i++) {
-        crc ^= bytes[i];
-        for (int bit = 0; bit < 8; bit++) {
-            crc = (crc & 1u) != 0u ? (crc >> 1) ^ 0xEDB88320u : crc >> 1;
-        }
+        crc = crc >> 4 ^ table[(crc ^ bytes[i]) & 15u];
+        crc = crc >> 4 ^ table[(crc ^ (uint32_t)bytes[i] >> 4) & 15u];
     }
     return ~crc;
 }
@@ -137,6 +139,12 @@ uint8_t *put_f32(uint8_t *at, float value)
 uint16_t get_u16(const uint8_t *at)
 {
     return (uint16_t)(at[0] | (uint16_t)((uint16_t)at[1] << 8));
+}
+
+int16_t get_i16(const uint8_t *at)
+{
+    int32_t value = get_u16(at);
+    return (int16_t)(value > INT16_MAX ? value - 65536 : value);
 }
 
 uint32_t get_u32(const uint8_t *at)

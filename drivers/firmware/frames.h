@@ -47,6 +47,7 @@ uint8_t *put_u16(uint8_t *at, uint16_t value);
 uint8_t *put_u32(uint8_t *at, uint32_t value);
 uint8_t *put_f32(uint8_t *at, float value);
 uint16_t get_u16(const uint8_t *at);
+int16_t get_i16(const uint8_t *at);
 uint32_t get_u32(const uint8_t *at);
 float get_f32(const uint8_t *at);
 

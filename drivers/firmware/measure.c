@@ -1,13 +1,16 @@
 /*
  * Measure the control law on a machine, with -DSUPERVISED under its supervisor: a finger lands on the simulated plate and slides; prints what a sample takes
- * and the telemetry of the bands, a line each: a name and numbers.
+ * and the telemetry of the bands, a line each: a name and numbers.  Beside it what the board takes more: to read and
+ * check a frame of 64 samples of a texture, and for a sample of two textures of which one fades into the other.
  */
 #include "measure.h"
 
 #include <string.h>
 
+#include "frames.h"
 #include "plate.h"
 #include "supervisor.h"
+#include "texture.h"
 
 #ifndef SAMPLES
 #define SAMPLES 3000u
@@ -59,8 +62,9 @@ static void print_line(const char *name, const double values[], uint32_t count)
 
 static void print_number(const char *name, double value) { print_line(name, &value, 1u); }
 
-/* Ask the machine to count a thousand instructions, and none: shows that it counts instructions, and at what cost. */
-static uint32_t calibrate(void)
+/* Ask the machine to count a thousand instructions, and none: shows that it counts instructions, and at what cost.
+   A function of its own, so that what stands around it does not change the count. */
+static __attribute__((noinline)) uint32_t calibrate(void)
 {
     const uint32_t start = measure_count();
     const uint32_t empty = measure_count() - start;
@@ -96,6 +100,52 @@ static void print_telemetry(void)
                                1e6 * (double)measured[1]};
         print_line("band", row, 5u);
     }
+}
+
+static void measure_frame(uint32_t empty)
+{
+    static frame_reader reader;
+    static frame incoming;
+    uint8_t payload[141]; /* of SAMPLES */
+    uint8_t wire[FRAME_WIRE];
+    uint32_t good = 0u;
+    for (size_t i = 0u; i < sizeof(payload); i++) {
+        payload[i] = (uint8_t)(i + 1u);
+    }
+    const size_t count = frame_encode(1u, 1u, payload, sizeof(payload), wire);
+    const uint32_t begin = measure_count();
+    for (size_t i = 0u; i + 1u < count; i++) {
+        good += (frame_read(&reader, wire[i], &incoming) == FRAME_GOOD) ? 1u : 0u;
+    }
+    const uint32_t start = measure_count(); /* the work of one sample, in which a frame ends */
+    good += (frame_read(&reader, wire[count - 1u], &incoming) == FRAME_GOOD) ? 1u : 0u;
+    good += crc32(incoming.payload, incoming.count, 0u) & 1u;
+    print_number("frame", (double)(measure_count() - start - empty));
+    print_number("byte", (double)(start - begin - empty) / (double)count);
+    print_number("frames_read", (double)good);
+}
+
+static void measure_textures(uint32_t empty)
+{
+    static textures_t textures;
+    uint32_t dry = 0u;
+    textures_init(&textures);
+    for (uint32_t i = 0u; i < 2u; i++) {
+        texture_t *texture = &textures.of[i];
+        texture->timed = 1u;
+        texture->written = TEXTURE_RING;
+        texture->points = TEXTURE_POINTS;
+        texture->start = REAL(-0.057);
+        texture->step = REAL(1.4e-5);
+        texture->scale = REAL(1e-10);
+    }
+    textures.weight = REAL(0.0);
+    const uint32_t start = measure_count();
+    for (uint32_t n = 0u; n < 100u; n++) {
+        (void)textures_step(&textures, REAL(0.01), n, design.rate, &dry);
+    }
+    print_number("textures", (double)(measure_count() - start - empty) / 100.0);
+    print_number("textures_state", (double)sizeof(textures_t));
 }
 
 int main(void)
@@ -135,6 +185,8 @@ int main(void)
     print_number("flags", (double)flags);
     print_number("state", (double)sizeof(law_t));
     print_number("supervisor", (double)sizeof(supervisor_t));
+    measure_frame(empty);
+    measure_textures(empty);
     print_telemetry();
     return 0;
 }

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any
 
@@ -169,6 +169,8 @@ class AdaptiveInverse:
         works by bands; see `design_controller`.
         """
         whole = bands.envelope is None and not len(bands)
+        if whole and model.mass[0, 0] == 0.0:  # friction without a sensor: of first order, but for the law's equations
+            model = replace(model, mass=model.stiffness / (2.0 * math.pi * model.rate) ** 2)
         known = model.finger.contact is not None or (whole and model.mass[0, 0] > 0.0)
         beyond = bands.frequency.max(initial=0.0) > 1.2 * HIGHEST * model.rate  # of the filters' range
         if not known or beyond or (bands.envelope is None and len(bands)):

@@ -37,6 +37,58 @@ def _terms(texture: Any) -> Parts:
     return texture.parts if isinstance(texture, Sum) else ((texture, 1.0),)
 
 
+class SeparatedTexture:
+    """A texture, parted into what lies in time and what lies along the surface.
+
+    Parameters
+    ----------
+    texture : Texture
+        In time, along the surface (`spatial` is true), or a `Sum` of both.
+    waveform : callable, optional
+        In place of the texture's own, in the device's quantity.
+
+    Attributes
+    ----------
+    timed, spatial : bool
+        Whether anything lies in time, and along the surface.
+
+    Raises
+    ------
+    ValueError
+        Its parts are in time and along the surface, and it is no sum.
+    """
+
+    def __init__(self, texture: Texture, waveform: Any = None) -> None:
+        terms = _terms(texture) if waveform is None else ((texture, 1.0),)
+        for each, _ in terms:
+            _refuse_mixed(each)
+        self._terms = [(each, waveform or each.waveform, gain) for each, gain in terms]
+        along = [bool(getattr(each, "spatial", False)) for each, _ in terms]
+        self.timed, self.spatial = not all(along), any(along)
+
+    def in_time(self, time: Array) -> Array:
+        """Sum of what lies in time, at `time` (s, shape (n,)); a ValueError where it is not finite."""
+        return self._sum(False, time, np.full(len(time), np.nan))
+
+    def along_surface(self, position: Array) -> Array:
+        """Sum of what lies along the surface, at `position` (m, shape (n,); 0 where it is NaN)."""
+        return self._sum(True, np.zeros(len(position)), position)
+
+    def _sum(self, spatial: bool, time: Array, position: Array) -> Array:
+        bands, total = Bands.none(spatial=spatial), np.zeros(len(time))
+        for texture, waveform, gain in self._terms:
+            if bool(getattr(texture, "spatial", False)) == spatial:
+                total += gain * bands.checked(type(texture).__name__, waveform, time, position)
+        return total
+
+
+def _refuse_mixed(texture: Texture) -> None:
+    """Refuse a texture that is read in time and along the surface at once."""
+    spatial = {bool(getattr(part, "spatial", False)) for part, _ in getattr(texture, "parts", ())}
+    if spatial == {True, False} or (True in spatial and not isinstance(texture, Sum)):
+        raise ValueError(f"{type(texture).__name__} with a part along the surface: play its parts one after another")
+
+
 def _read_parts(key: str, value: Any, **bounds: Any) -> Parts:
     bound = f"1 to {MOST_PARTS} pairs of a texture and a number"
     checks.require(isinstance(value, list | tuple) and 1 <= len(value) <= MOST_PARTS, key, value, bound, TypeError)

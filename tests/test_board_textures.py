@@ -1,0 +1,299 @@
+"""Textures that are no sum of bands on a board: recordings in time and along the surface, and hosts that are late."""
+
+from contextlib import nullcontext
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from board import (
+    FINGER,
+    MECHANICS,
+    RATE,
+    ROOT,
+    SANITISED,
+    SCENE,
+    Faults,
+    SteppedBoard,
+    client_of,
+    driver_of,
+    program_of,
+    run,
+    sensed_error,
+    tones,
+)
+
+import hapticrender as hr
+from hapticrender.bands import Bands
+from hapticrender.drivers import protocol
+from hapticrender.drivers.board_texture import AHEAD, COARSE, ROWS, BoardTexture
+from hapticrender.drivers.protocol import Cause, Kind, Reason, State
+from hapticrender.drivers.row_reader import RowReader
+from hapticrender.errors import DriverError, WatchdogTimeout
+from hapticrender.mathx import smoothstep
+
+NOISE = np.random.default_rng(3).standard_normal(20_000)
+RECORDED = {"samples": NOISE, "rate": 5000.0, "gain": 4e-6, "passband": (20.0, 400.0)}
+MODEL = hr.prepare(SCENE).model
+NO_BANDS = Bands.none(spatial=False)
+
+
+class Sine:
+    """A sine along the surface."""
+
+    spatial = True
+
+    def __init__(self, wavelength):
+        self.wavelength = wavelength
+
+    def bands(self, rate):
+        return Bands.none(spatial=True)
+
+    def waveform(self, time, position):
+        return 5e-6 * np.sin(2 * np.pi * position / self.wavelength)
+
+
+class Tones:
+    """Two tones in time that never repeat within a run: a sample of another moment is another."""
+
+    def bands(self, rate):
+        return Bands.none(spatial=False)
+
+    def waveform(self, time, position):
+        return 4e-6 * np.sin(2 * np.pi * 70.0 * time) + 4e-6 * np.sin(2 * np.pi * 70.0 * np.sqrt(2.0) * time)
+
+
+@pytest.fixture
+def stepped(tmp_path):
+    with SteppedBoard(program_of(*SANITISED), tmp_path, options=("--noise", "1e-8")) as board:
+        yield board
+
+
+CHIRP = hr.Chirp(start=40.0, stop=300.0, duration=1.0, amplitude=3e-6)
+SMALL = "-DTEXTURE_RING=1024u", "-DTEXTURE_POINTS=2048u"
+
+
+@pytest.mark.parametrize(
+    ("texture", "sizes"),
+    [
+        (hr.Recorded(**RECORDED), ()),
+        (hr.Recorded(**RECORDED, speed=0.08), ()),
+        (hr.Recorded(**RECORDED, speed=0.08) + CHIRP, ()),
+        (hr.Recorded(**RECORDED, speed=0.3) + CHIRP, SMALL),
+    ],
+    ids=["time", "surface", "both", "small"],
+)
+def test_a_recording_on_the_board_is_as_good_as_on_the_simulated_device(tmp_path, texture, sizes):
+    """Under a finger that moves as the board says it did; sanitisers on; both plates have their own noise."""
+    scene = replace(SCENE, texture=texture, duration=1.5)
+    with SteppedBoard(program_of(*SANITISED, *sizes), tmp_path, options=("--noise", "1e-7")) as board:
+        played = hr.render(scene, driver=driver_of(board, finger=FINGER))
+    position = played.read("position")
+    position[: np.argmax(np.isfinite(position))] = position[np.isfinite(position)][0]
+    same = hr.Finger.sampled(position, rate=RATE, normal_load=0.4, mechanics=MECHANICS)
+    simulated = sensed_error(hr.render(replace(scene, finger=same, simulation={"sensor_noise": 1e-7})))
+    print(f"error by the sensors: board {sensed_error(played):.4f}, library {simulated:.4f}")
+    assert sensed_error(played) < 1.2 * simulated
+    assert not played.read("flags").any()
+
+
+def streaming(board, texture):
+    """Client whose board plays a texture and streams every sample, and the reader of its rows."""
+    client = client_of(board).open()
+    found = BoardTexture(texture, client.capabilities, MODEL)
+    client.set_bands(NO_BANDS, found)
+    first = client.start(stream=1)
+    return client, found, RowReader(client, first)
+
+
+def motion_of(rows):
+    return rows[:, 2:4].mean(axis=1)
+
+
+def test_a_board_that_starves_fades_out_and_plays_nothing_stale(stepped):
+    """The host sends nothing for a second, half a second more than it had sent ahead, then goes on."""
+    client, texture, reader = streaming(stepped, Tones())
+    run(client, stepped, 0.4)
+    texture.samples, samples = lambda played: None, texture.samples
+    last = texture.written
+    run(client, stepped, 1.0)
+    texture.samples = samples
+    run(client, stepped, 1.2)
+    rows = reader.take(int(2.5 * RATE))
+    n = np.arange(len(rows))
+    ahead, fade = client.capabilities.lookahead, 0.04 * RATE
+    starved = np.flatnonzero(rows[:, 6].astype(int) & hr.Flag.OVERRUN)
+    # its reference lies `ahead` samples ahead; flagged from where fewer than a fade's samples are left, to the recovery
+    assert starved[0] == last - ahead - fade + 1
+    assert (np.diff(starved) == 1).all()
+    back = starved[-1] + 1 - fade + ahead  # where the first late samples came, rising from 0
+    # a frame in a step of at most 7.5 ms makes up for the half second
+    assert last + 0.4 * RATE < back < (1.41 + 0.5 / (ROWS / (0.0075 * RATE) - 1.0)) * RATE
+    weight = smoothstep((last - n) / fade) + smoothstep((n - back) / fade)
+    expected = weight * Tones().waveform(n / RATE, None)
+    late = n > 0.3 * RATE  # after the fade-in, and what is learned of the free plate
+    silent = (n > last + 0.05 * RATE) & (n < back)
+    # edges of the fades are followed as any texture; sensors of 14 bits, 0.12 um a step, two of them: 0.025 um rms
+    assert np.sqrt(np.mean((motion_of(rows) - expected)[late] ** 2)) < 0.03 * 4e-6
+    assert np.sqrt(np.mean(motion_of(rows)[silent] ** 2)) < 0.03 * 4e-6
+
+
+def test_only_what_was_sent_plays(stepped):
+    """A point lost or changed on its way, samples out of order or too many: refused, and what plays goes on."""
+    client, texture, reader = streaming(stepped, Tones())
+    line = client._line
+    nothing = line.link.submit(Kind.PLAY, protocol.pack(Kind.PLAY, 0))  # the digest of what was never described
+    assert line._answer(nothing).refused == Reason.STATE
+    frames = list(BoardTexture(Sine(2e-3), client.capabilities, MODEL).frames(200))
+    (_, described), *points, play = frames
+    line.send(Kind.TEXTURE, described)
+    for kind, payload in points[:-1]:
+        line.send(kind, payload)
+    assert line._answer(line.link.submit(*play)).refused == Reason.STATE
+    kind, payload = points[-1]
+    assert line._answer(line.link.submit(kind, payload + payload[-2:])).refused == Reason.STATE
+    line.send(kind, payload[:-2] + bytes([payload[-2] ^ 1]) + payload[-1:])
+    assert line._answer(line.link.submit(*play)).refused == Reason.DIGEST
+    number, scale = texture._number, 1e-9
+    for index, first in ((number, texture.written + 1), (number + 1, texture.written)):
+        request = line.link.submit(Kind.SAMPLES, protocol.pack(Kind.SAMPLES, index, first, scale) + bytes(2))
+        assert line._answer(request).refused == Reason.STATE
+    sent = texture.written
+    while texture.written < sent + client.capabilities.ring:
+        head = protocol.pack(Kind.SAMPLES, number, texture.written, scale)
+        if line._answer(line.link.submit(Kind.SAMPLES, head + bytes(2 * ROWS))).refused == Reason.STATE:
+            break
+        texture.written += ROWS
+    # 0.5 s are held, and up to a frame more; what plays meanwhile makes room
+    assert 0 < texture.written - sent < client.capabilities.ring - (AHEAD - 0.1) * RATE
+    with pytest.raises(DriverError, match="TEXTURE: refused by the board: length"):
+        line.send(Kind.TEXTURE, described[:-1])
+    with pytest.raises(ValueError, match="TEXTURE: refused by the board: value"):
+        line.send(Kind.TEXTURE, protocol.pack(Kind.TEXTURE, 1, 0, 8193, 0.0, 1e-5, 1e-9))
+    rows = reader.take(int(0.3 * RATE))
+    assert client.telemetry().state == State.PLAYING
+    assert not rows[:, 6].any()
+
+
+def test_a_line_that_damages_bytes_plays_no_other_sample(stepped):
+    """1 byte of 1000, 14 % of the frames of samples; what is sent again may come too late, which is flagged."""
+    client, _, reader = streaming(stepped, Tones())
+    stepped.damage = Faults(11, 0.001)
+    run(client, stepped, 3.0)
+    stepped.damage = lambda data: data
+    run(client, stepped, 0.1)
+    rows = reader.take(int(2.9 * RATE))
+    whole = (rows[:, 6] == 0.0) & (np.arange(len(rows)) > 0.3 * RATE)
+    expected = Tones().waveform(np.arange(len(rows)) / RATE, None)
+    print(f"{np.mean(whole):.2f} of the rows came whole; {client.telemetry().bad} bad frames")
+    assert client.telemetry().bad > 30
+    assert (
+        np.mean(whole) > 0.3
+    )  # nine rows in a frame of 248 bytes: 0.998^248 = 0.6 come, half of them at least in time
+    assert np.sqrt(np.mean((motion_of(rows) - expected)[whole] ** 2)) < 0.03 * 4e-6
+
+
+def test_a_board_that_was_reset_begins_its_texture_anew(tmp_path):
+    with SteppedBoard(program_of(*SANITISED), tmp_path, options=("--noise", "1e-8")) as board:
+        client = client_of(board, reconnect=5.0).open()
+        client.set_bands(NO_BANDS, BoardTexture(Tones(), client.capabilities, MODEL))
+        client.start(stream=1)
+        run(client, board, 0.2)
+        board.reset()
+        while not client.reconnections:
+            run(client, board, 0.01)
+        reader = RowReader(client, client.started)
+        run(client, board, 1.0)
+        rows = reader.take(int(0.9 * RATE))
+    late = np.arange(int(0.3 * RATE), len(rows))
+    expected = Tones().waveform(late / RATE, None)
+    assert np.sqrt(np.mean((motion_of(rows)[late] - expected) ** 2)) < 0.03 * 4e-6  # as where it starves
+    assert not rows[:, 6].any()
+
+
+def test_what_the_samples_take_of_the_line_is_what_the_page_says(stepped):
+    client, _, _ = streaming(stepped, hr.Recorded(**RECORDED))
+    run(client, stepped, 0.2)
+    before = client._line.link.sent_bytes
+    run(client, stepped, 2.0)
+    # a frame more or less in two seconds; signs of life come up to 1 ms late, as a command is waited for in between
+    assert (client._line.link.sent_bytes - before) / 2.0 - 1900 == pytest.approx(11_600, abs=74 + 0.1 * 1900)
+    assert "| 11 600 |" in (ROOT / "docs" / "protocol.md").read_text(encoding="utf-8")
+
+
+def test_textures_fade_into_each_other(stepped):
+    """From time to the surface, to bands and back, without a step: a jump of either texture would be 4 um and more."""
+    client, _, reader = streaming(stepped, Tones())
+    surface = BoardTexture(Sine(2e-3), client.capabilities, MODEL)
+    changes = [
+        lambda: None,
+        lambda: client.set_bands(NO_BANDS, surface),
+        lambda: client.set_bands(tones(60.0, amplitude=4e-6)),
+        lambda: client.set_bands(NO_BANDS, BoardTexture(Tones(), client.capabilities, MODEL)),
+    ]
+    for change in changes:
+        change()
+        for _ in range(8):
+            client.finger(0.0005, 0.0, 0.4)  # a quarter of the wavelength
+            run(client, stepped, 0.05)
+    rows = reader.take(int(1.5 * RATE))
+    # tones up to 100 Hz of 8 um: 1 um a sample, its half for what the sum of two fading textures adds
+    assert abs(np.diff(motion_of(rows)))[int(0.2 * RATE) :].max() < 1.5e-6
+    assert not rows[:, 6].any()
+    client.finger(0.0005, 0.0, 0.4)
+    assert client.telemetry().state == State.PLAYING
+
+
+def test_a_table_is_as_fine_as_it_has_to_be(stepped):
+    """Cubic interpolation at x = 0.382 between points of distance h has the response sum w_j e^(i k h (j - x))."""
+    found = client_of(stepped).open().capabilities
+    reach = 0.055 + 2e-3  # of the plate's glass
+    places, x = np.arange(-1, 3), 0.382
+    weights = np.array([np.prod([(x - other) / (own - other) for other in places if other != own]) for own in places])
+    turns = np.linspace(1.0, 2.5, 15_001)
+    error = abs(np.exp(1j * np.multiply.outer(turns, places - x)) @ weights - 1.0)
+    finest = 2 * np.pi * (2 * reach / (found.points - 1)) / turns[np.argmin(abs(error - COARSE))]
+    assert len(BoardTexture(Sine(1.02 * finest), found, MODEL)._table) == found.points
+    with pytest.raises(ValueError, match=r"texture Sine: 8192 points, 13.9 um apart, are .* % off it: must be <= 10 %"):
+        BoardTexture(Sine(finest / 1.02), found, MODEL)
+    assert len(BoardTexture(Sine(5e-3), found, MODEL)._table) < found.points
+
+
+def test_a_force_and_carriers_are_refused(stepped):
+    screen = replace(SCENE, texture=hr.Grating(velocity=8e-3, frequency=80.0), device="electroadhesion")
+    with pytest.raises(ValueError, match=r"device = 'electroadhesion': .*has the law of 'vt-plate' on it, and plays"):
+        hr.render(screen, driver=driver_of(stepped))
+    scene = replace(SCENE, texture=hr.Recorded(**RECORDED, carriers=4), duration=0.1)
+    with pytest.raises(ValueError, match="carriers = 4: must be left out on a board"):
+        hr.render(scene, driver=driver_of(stepped))
+
+
+@pytest.mark.parametrize(("beats", "stops"), [(True, False), (False, True)])
+def test_the_board_stops_without_a_beat_of_the_application(stepped, beats, stops):
+    """The service goes on: fingers and signs of life, but none of them from the application."""
+    client, _, _ = streaming(stepped, Tones())
+    client.watch(0.1)
+    run(client, stepped, 0.02)
+    start = stepped.sample
+    with pytest.raises(WatchdogTimeout) if stops else nullcontext():
+        for _ in range(6):
+            if beats:
+                client.beat()
+            client.finger(0.0, 0.0, 0.4)
+            run(client, stepped, 0.05)
+    if not stops:
+        assert client.telemetry().state == State.PLAYING
+        return
+    assert client._line.link.telemetry.cause == Cause.APPLICATION
+    (stopped,) = [int(line[0]) for line in stepped.board.log() if line[1:3] == ["state", "0"]]
+    # 0.1 s and the fade of 10 ms, from a beat that came in the 20 ms before `start`
+    assert 0.090 * RATE <= stopped - start <= 0.110 * RATE + 2
+    assert stepped.board.log()[-1][1:] == ["drives", "0"]
+
+
+@pytest.mark.parametrize("wrong", [0.049, 66.0, -1.0, np.nan])
+def test_a_watchdog_that_no_board_can_count_is_refused(stepped, wrong):
+    client = client_of(stepped).open()
+    for right in (0.05, 65.0, None):
+        client.watch(right)
+    with pytest.raises(ValueError, match="must be 0.05 to 65 s on a board, or None"):
+        client.watch(wrong)
