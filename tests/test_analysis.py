@@ -176,6 +176,17 @@ def test_zero_of_the_sensors_is_taken_from_a_free_start(studied):
     assert np.abs(again.normal_load.value[at] - found.normal_load.value[at]).max() < 0.005
 
 
+@pytest.mark.parametrize("bits", [0, 14])
+def test_ideal_sensors_are_no_exception(bits):
+    subject = Subject(LIGHT, 0.5, 0.0, 8, frequencies=(111.0,), off=0.0)
+    scene = replace(subject.scene, simulation={"sensor_noise": 0.0, "sensor_bits": bits})
+    recording = hr.render(scene)
+    found = hr.analyse_finger(recording)
+    at = judged(found)
+    assert len(found.of_kind(LOADED)) == 1
+    assert np.abs(found.normal_load.value[at] / glass_force(subject, recording, len(found.time))[at] - 1).max() < 0.005
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from hapticrender.analysis.course import Course
-from hapticrender.analysis.force import MotionFilter, sensor_noise
+from hapticrender.analysis.force import MotionFilter, at_least, sensor_noise
 from hapticrender.analysis.impedance import impedance_of
 from hapticrender.analysis.lock_in import Lines, demodulate, tile, window_length
 from hapticrender.analysis.plate_track import Rest, regress, rest_of, track_of
@@ -156,7 +156,7 @@ class _Signals:
         padded = (np.concatenate([each, np.repeat(each[-1:], wide.delay, axis=0)]) for each in (drive, sensed))
         x = wide.update(*padded)
         self.columns = np.hstack([x.displacement, x.velocity, x.acceleration, x.force])[wide.delay :]
-        self.sensor_noise = sensor_noise(sensed)
+        self.sensor_noise = at_least(sensor_noise(sensed), plate)
         self.noise = wide.coordinate_noise(self.sensor_noise)
 
     def tracker(self, course: Course, rest: Rest | None) -> FingerTracker:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from statistics import NormalDist
 
 import numpy as np
 
@@ -24,9 +25,7 @@ def clear_sigmas(bandwidth: float) -> float:
 
     Such noise has about two independent values per hertz and second.
     """
-    from scipy.stats import norm
-
-    return float(norm.isf(FALSE / (2 * bandwidth * SPAN)))
+    return -NormalDist().inv_cdf(FALSE / (2 * bandwidth * SPAN))
 
 
 class ContactDetector:

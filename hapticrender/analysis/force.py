@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from hapticrender.analysis.course import Signals
@@ -10,6 +12,7 @@ from hapticrender.plants.plate import NOMINAL_AMPLIFIER, PlateParameters
 from hapticrender.protocols import Array
 
 DIFFERENCES = 6  # order of the differences that show a sensor's noise
+FINEST = 1e-9  # m: least noise that is assumed
 GAIN = 924.0  # of white noise through them: binomial(12, 6)
 
 
@@ -20,6 +23,11 @@ def sensor_noise(sensed: Array) -> Array:
     """
     differences = np.diff(sensed, DIFFERENCES, axis=0)
     return np.sqrt((differences**2).mean(axis=0) / GAIN)
+
+
+def at_least(noise: Array, plate: PlateParameters) -> Array:
+    """Noise (m rms) of the sensors, but no less than that of their rounding, or 1 nm."""
+    return np.maximum(noise, max(plate.sensor_step / math.sqrt(12.0), FINEST))
 
 
 class MotionFilter:

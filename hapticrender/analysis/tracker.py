@@ -23,7 +23,7 @@ import numpy as np
 
 from hapticrender.analysis.contact import ContactDetector, clear_sigmas
 from hapticrender.analysis.course import Course, Signals
-from hapticrender.analysis.force import MotionFilter
+from hapticrender.analysis.force import MotionFilter, at_least
 from hapticrender.analysis.plate_track import Rest
 from hapticrender.analysis.records import DOUBTFUL, LOADED, UNLOADED, Series
 from hapticrender.analysis.smoothing import History, LocalLine, half_width, spread_of
@@ -91,7 +91,7 @@ class FingerTracker:
         self.course = plate if isinstance(plate, Course) else Course.of(plate)
         p = self.course.plate
         self.rate = p.rate if rate is None else float(rate)
-        noise = np.full(2, p.sensor_noise) if noise is None else np.asarray(noise, float)
+        noise = at_least(np.full(2, p.sensor_noise) if noise is None else np.asarray(noise, float), p)
         spread = spread_of(SLOW)
         if not 0.0 <= lookahead < math.inf:
             raise ValueError(f"{lookahead=} s: must be finite and >= 0")
