@@ -22,6 +22,11 @@ if not (_here / "renderers").is_dir():
 __version__ = "0.2.0"
 
 _HOMES = {
+    "analysis.analyse": "analyse_finger",
+    "analysis.records": "FingerRecord",
+    "analysis.tracker": "FingerTracker",
+    "analysis.load_law": "load_exponent",
+    "analysis.models": "fit_finger fit_load_classes",
     "bands": "Bands",
     "control.demodulator": "Demodulator",
     "errors": "DesignError DeviceFault DeviceLost DeviceNotFound DeviceTimeout DriverError HapticError PlateMismatch "
@@ -36,18 +41,27 @@ _HOMES = {
     "touch.device_profile": "DeviceProfile",
     "touch.finger": "Finger",
     "touch.grating": "Grating",
+    "touch.latency_budget": "finest_wavelength phase_error",
     "touch.mechanics": "FingerMechanics",
     "touch.motion": "Sampled TriangleMotion Still SineMotion RecordedMotion",
+    "touch.motion_estimator": "Encoder MotionEstimator",
     "touch.perception": "detection_threshold roughness sensation_level",
     "touch.profile": "strongest_carriers",
     "touch.recorded": "Recorded Swipe Synthetic",
     "touch.scene": "Scene",
+    "touch.touch_panel": "TouchPanel",
 }
 _HOME_OF = {name: home for home, names in _HOMES.items() for name in names.split()}
 
 __all__ = sorted(_HOME_OF)
 
 if _typing.TYPE_CHECKING:
+    from hapticrender.analysis.analyse import analyse_finger as analyse_finger
+    from hapticrender.analysis.load_law import load_exponent as load_exponent
+    from hapticrender.analysis.models import fit_finger as fit_finger
+    from hapticrender.analysis.models import fit_load_classes as fit_load_classes
+    from hapticrender.analysis.records import FingerRecord as FingerRecord
+    from hapticrender.analysis.tracker import FingerTracker as FingerTracker
     from hapticrender.bands import Bands as Bands
     from hapticrender.control.demodulator import Demodulator as Demodulator
     from hapticrender.errors import DesignError as DesignError
@@ -87,12 +101,16 @@ if _typing.TYPE_CHECKING:
     from hapticrender.touch.device_profile import DeviceProfile as DeviceProfile
     from hapticrender.touch.finger import Finger as Finger
     from hapticrender.touch.grating import Grating as Grating
+    from hapticrender.touch.latency_budget import finest_wavelength as finest_wavelength
+    from hapticrender.touch.latency_budget import phase_error as phase_error
     from hapticrender.touch.mechanics import FingerMechanics as FingerMechanics
     from hapticrender.touch.motion import RecordedMotion as RecordedMotion
     from hapticrender.touch.motion import Sampled as Sampled
     from hapticrender.touch.motion import SineMotion as SineMotion
     from hapticrender.touch.motion import Still as Still
     from hapticrender.touch.motion import TriangleMotion as TriangleMotion
+    from hapticrender.touch.motion_estimator import Encoder as Encoder
+    from hapticrender.touch.motion_estimator import MotionEstimator as MotionEstimator
     from hapticrender.touch.perception import detection_threshold as detection_threshold
     from hapticrender.touch.perception import roughness as roughness
     from hapticrender.touch.perception import sensation_level as sensation_level
@@ -101,6 +119,7 @@ if _typing.TYPE_CHECKING:
     from hapticrender.touch.recorded import Swipe as Swipe
     from hapticrender.touch.recorded import Synthetic as Synthetic
     from hapticrender.touch.scene import Scene as Scene
+    from hapticrender.touch.touch_panel import TouchPanel as TouchPanel
 
 
 def __getattr__(name: str) -> _typing.Any:

@@ -121,7 +121,18 @@ def _add_checks(choices: Any) -> None:
 
 
 def _add_measurements(choices: Any) -> None:
-    """Add the verbs about a device of one's own."""
+    """Add the verbs about a device of one's own, and about the finger on it."""
+    text = "measure the finger in a recording of a plate: load, position, contact, impedance"
+    finger = _add_verb(choices, "finger", verbs.finger, text)
+    finger.add_argument("path", metavar="PATH", type=_path, help="a recording, or the folder of a rendered scene")
+    text = "profile (TOML) of the plate, as identify writes it (default: what the recording's scene says of it)"
+    finger.add_argument("--profile", metavar="FILE", type=_path, help=text)
+    text = "samples of a block of the driver that recorded (default: 1)"
+    finger.add_argument("--block", metavar="N", type=_whole(1, 99999), default=1, help=text)
+    text = "nothing touches in the first 0.5 s: take the sensors' zero from there (default: they read zero at rest)"
+    finger.add_argument("--free-start", action="store_true", help=text)
+    _add_out(finger, None)
+
     identify = _add_verb(
         choices, "identify", verbs.identify, "identify a plate or an ultrasonic surface without a finger, or a screen"
     )

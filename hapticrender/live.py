@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from hapticrender.analysis.two_touches import TouchWatch
 from hapticrender.bands import Bands
 from hapticrender.control.combined import CombinedBands
 from hapticrender.control.device_model import DeviceModel
@@ -74,6 +75,8 @@ class LiveLoop:
         self._drive = np.zeros((self.driver.block, self.driver.drive_channels))
         self._bands = rendering.bands
         self._stopped: int | None = None  # sample
+        own = rendering.plant is not None
+        self._touches = TouchWatch(rendering.model, self.controller, rendering.model.delay, active=not own)
         self.entry.play(self._voice(rendering))
 
     @property
@@ -89,7 +92,7 @@ class LiveLoop:
     @property
     def flags(self) -> Flag:
         """Everything that was ever raised."""
-        return self.entry.flags
+        return self.entry.flags | self._touches.flags
 
     @property
     def silent(self) -> bool:
@@ -166,6 +169,13 @@ class LiveLoop:
             motion = found["sensed"] @ (model.place_from_coordinate @ model.coordinate_from_sensed).T
             motion = ContactLag(model.contact_lag).run(motion, found["position"]) if model.inferred else motion
         return first, found | {"motion": motion, "target": np.zeros((count, 0), complex)}
+
+    def watch_touches(self, signals: dict[str, Array], gap: int) -> None:
+        """Flag two touches in the signals that follow those of the last call, `gap` samples later."""
+        if gap and self._touches.monitor is not None:
+            self._touches.monitor.restart()
+        if len(signals["flags"]):
+            signals["flags"] = self._touches.update(signals)
 
     @property
     def motion_source(self) -> str:

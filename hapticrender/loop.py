@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from hapticrender.analysis.two_touches import TouchWatch
 from hapticrender.control.controller import PositionPredictor
 from hapticrender.control.probe import probe_plate
 from hapticrender.control.supervisor import FADE_OUT, Fault
@@ -236,6 +237,7 @@ class _Loop:
         self.step = driver.block * (max(int(CHUNK * driver.rate / driver.block), 1) if exchange is not None else 1)
         self._start, self._ahead = 0, int(getattr(self.controller, "lookahead", 0))
         self._predict = PositionPredictor(driver.rate, self._ahead)
+        self._touches = TouchWatch(rendering.model, self.controller, active=rendering.plant is None)
         self._contact = ContactLag(rendering.model.contact_lag)
         self._stopped = -1  # sample from which on the drive fades out; negative: none
         self._drive = np.zeros((driver.block, driver.drive_channels))
@@ -253,6 +255,7 @@ class _Loop:
         motion, source = self._motion(sensed, position)
         signals = {"drive": drive, "sensed": values, "motion": motion, "position": position, "normal_load": load}
         signals |= {"target": target, "flags": flags}
+        signals["flags"] = self._touches.update(signals)
         return {"motion_source": source} | {name: signal[:count] for name, signal in signals.items()}
 
     def fault(self, start: int) -> DeviceFault | None:

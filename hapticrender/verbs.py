@@ -266,6 +266,27 @@ def _profile(found: Any, scene: Scene, arguments: argparse.Namespace) -> DeviceP
     )
 
 
+def finger(arguments: argparse.Namespace) -> int:
+    """Analyse the finger in a recording; write tables and pictures, print a summary."""
+    from hapticrender.analysis import output, pictures
+    from hapticrender.analysis.analyse import analyse_finger
+    from hapticrender.recordings.recording import Recording
+    from hapticrender.report.outputs import check_folder
+
+    check_folder("--out", arguments.out)
+    for name in output.FILES:
+        if (arguments.out / name).exists() and not arguments.force:
+            raise ValueError(f"{str(arguments.out / name)!r}: is there: choose another folder, or add --force")
+    path = arguments.path / "recording.au" if arguments.path.is_dir() else arguments.path
+    with _naming(str(path)):
+        recording = Recording.load(path)
+        found = analyse_finger(recording, arguments.profile, block=arguments.block, free_start=arguments.free_start)
+    print(printable(output.text(found)))
+    written = [*output.write(found, arguments.out), pictures.draw(found, arguments.out)]
+    print("wrote " + "\n      ".join(map(str, written)))
+    return 0
+
+
 def latency(arguments: argparse.Namespace) -> int:
     """Measure the delay of a loop through a cable."""
     from hapticrender.devices import open_driver

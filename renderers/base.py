@@ -18,6 +18,7 @@ from hapticrender.drivers.simulated import SimulatedDriver
 from hapticrender.protocols import Array, Controller, Driver, Method, Plant, Rendering
 from hapticrender.touch.device_profile import Limits
 from hapticrender.touch.scene import Scene
+from hapticrender.touch.touch_panel import PanelReader
 
 Waveform = Callable[[Array, Array], Array]
 Setup = Any  # what `read` returns: a class of each renderer's own
@@ -41,7 +42,8 @@ class BaseRenderer:
         setup = self.read(scene, driver)
         if driver is None:
             plant = self.plant(setup, scene.seed)
-            device = facing = SimulatedDriver(plant)
+            panel = scene.panel
+            device = facing = SimulatedDriver(plant, panel and PanelReader(panel, plant.rate, scene.seed))
         else:
             plant, device, facing = None, driver, self.connect(setup, driver)
         check_driver(facing)

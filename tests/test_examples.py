@@ -24,6 +24,7 @@ EXPECTED = {
     "sound_card": (0.0, 0.0),  # no card is named
     "made_up_device": (0.01, 0.01),  # up to 2 %, the accuracy suite's bound for a touch at the centre
     "one_texture_three_devices": (0.025, 0.025),  # up to 5 %, how far devices may differ in skin velocity
+    "measure_a_finger": (200.0, 3 * 12.2),  # three of its own standard errors
     "velocity_per_force": (0.70425, 0.0005),  # mean of the eight figures of test_finger, each rounded to 0.0005
     "sweep_of_fingers": (0.0055, 0.002),
     "electroadhesion_square_root": (0.25, 0.001),  # (1 + sin)^2 is 1.5 + 2 sin - cos(2)/2

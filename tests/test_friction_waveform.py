@@ -50,6 +50,24 @@ def test_white_noise_is_played_whole(device, finger):
     assert not (recording.flags & hr.Flag.SATURATED).any()
 
 
+@pytest.mark.parametrize("area", [0.7, 1.3])
+def test_a_finger_with_another_contact_area_is_learned(area):
+    """Within the scene's tolerance after a second; a gain that is 30 % off would be 30 % of the waveform."""
+    scene = hr.Scene(
+        texture=white(),
+        finger=FINGERS["usual"],
+        device="electroadhesion",
+        simulation={"area_scale": area},
+        duration=2.0,
+        settle=1.0,
+    )
+    recording = hr.render(scene)
+    assert waveform_error(recording) < scene.tolerance == 0.1
+    begin = slice(round(0.1 * recording.rate), round(0.3 * recording.rate))
+    left = np.diff(recording.motion[begin, 0]) - np.diff(recording.reference[begin])
+    assert left.std() > 0.1 * np.diff(recording.reference[begin]).std()  # 2 % where the area is what was believed
+
+
 def ridges(wavelength=1e-3, speed=0.05, rate=10e3):
     along = np.arange(0.0, 0.2, speed / rate)
     return hr.Recorded(samples=np.sin(2 * np.pi * along / wavelength), rate=rate, amplitude=5e-6, speed=speed)

@@ -92,7 +92,7 @@ def test_files_and_page(tmp_path, capsys):
     pytest.importorskip("matplotlib")
     assert paper.main(["--out", str(tmp_path / "out"), "--only", "plate", "statistics"]) == 0
     out = capsys.readouterr().out
-    assert out.count("not reproducible  needs 13 participants") == 6
+    assert out.count("not reproducible  needs 13 participants") == 5
     report = json.loads((tmp_path / "out" / "paper.json").read_text(encoding="utf-8"))
     page = (tmp_path / "out" / "index.html").read_text(encoding="utf-8")
     assert [item["name"] for item in report["items"]] == ["plate", "statistics"]

@@ -1,6 +1,6 @@
 """Draw every chart and renew the pictures in docs/.
 
-Run: python -m benchmarks.charts [story waveforms pareto devices stability demo] [--out docs]
+Run: python -m benchmarks.charts [story waveforms pareto devices stability latency demo] [--out docs]
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.charts import draw, measure, stability, story, waveforms
+from benchmarks.charts import draw, latency, measure, stability, story, waveforms
 
 ROOT = Path(__file__).parents[2]
 
@@ -63,6 +63,12 @@ def draw_stability(_: Path) -> None:
     np.savez(_data() / "stability.npz", **arrays)
 
 
+def draw_latency(out: Path) -> None:
+    """Phase error of gratings behind sensors of the finger, and the table of docs/devices.md."""
+    print(latency.table())
+    latency.draw().savefig(out / "latency.png", dpi=110)
+
+
 def draw_demo(out: Path) -> None:
     """The picture of one texture on every device, from the demonstration."""
     subprocess.run([sys.executable, "-m", "hapticrender", "demo", "--out", str(_data() / "demo")], cwd=ROOT, check=True)
@@ -71,7 +77,7 @@ def draw_demo(out: Path) -> None:
 
 CHARTS: dict[str, Callable[[Path], None]] = {
     "story": draw_story, "waveforms": draw_waveforms, "pareto": draw_pareto, "devices": draw_devices,
-    "stability": draw_stability, "demo": draw_demo,
+    "stability": draw_stability, "latency": draw_latency, "demo": draw_demo,
 }  # fmt: skip
 
 

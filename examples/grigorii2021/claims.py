@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -102,6 +104,8 @@ class Item:
     panels : sequence of Panel
         What is drawn, and written as CSV.
     note : str
+    picture : callable, optional
+        Draws the picture into a file (.png), in place of the panels.
     """
 
     name: str
@@ -110,6 +114,7 @@ class Item:
     claims: tuple[Claim, ...]
     panels: tuple[Panel, ...]
     note: str = ""
+    picture: Callable[[Path], None] | None = None
 
     def __post_init__(self) -> None:
         if not self.claims:

@@ -103,7 +103,7 @@ def impedance() -> Item:
                     tuple(Curve(f"{order} order", GRID, size[f"{kind}, {order}"], style)
                           for order, style in (("4th", "-"), ("2nd", ":"))), "xy", (0.5, 20))
               for kind, load in (("light", "W < 0.5 N"), ("heavy", "W > 0.5 N"))),
-        "The measured points of Fig. 9 A need the participants.",
+        "For points see the simulated subjects.",
     )  # fmt: skip
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
@@ -21,6 +21,7 @@ from hapticrender.recordings.journal import Header
 from hapticrender.recordings.verdict import waveform_figures
 
 if TYPE_CHECKING:
+    from hapticrender.recordings.columns import Chosen
     from hapticrender.touch.scene import Scene
 
 
@@ -286,3 +287,63 @@ class Recording:
     def load(cls, path: str | os.PathLike[str]) -> Recording:
         """Open a recording (.au, .npz, .h5, .hdf5, .mat, .csv); a journal also while another process writes it."""
         return cls(*formats.read(path))
+
+    @classmethod
+    def from_columns(
+        cls,
+        columns: Mapping[str, Any] | str | os.PathLike[str],
+        *,
+        drive: Chosen,
+        sensed: Chosen,
+        rate: float | None = None,
+        time: Chosen | None = None,
+        position: Chosen | None = None,
+        normal_load: Chosen | None = None,
+        carriers: Sequence[float] = (),
+        **header: Any,
+    ) -> Recording:
+        """Make a recording of what another program has recorded, for analysis, pictures and `save`.
+
+        A column is chosen by its name, with a scale, or a scale and an offset: ``{"adc1": (122e-9, 8192)}`` is ``122e-9
+        (adc1 - 8192)``; a name, or a list of names, is scaled by 1.
+
+        Parameters
+        ----------
+        columns : mapping of str to array, or path
+            Arrays of one length by name; or a .csv, .txt, .mat, .h5, .hdf5 or .npz file of them, see
+            `hapticrender.recordings.columns.read_columns`.
+        drive, sensed : columns
+            In A and m of the device's channels, in its order (a plate: coil 1 and 2, sensor 1 and 2 at the ends of the
+            glass), after the scale.  All values must be finite.  A row of the drive is held until the next (a command;
+            a current that was measured at the same instant has acted half a sample before).  ``drive=[]``: no drive.
+        rate : float, Hz
+            Sampling rate; it may be left out where there is a column of times.
+        time : column, s
+            Every time must be within half a sample of an even grid.
+        position : column, m from the middle of the surface
+            NaN while the finger is away; default: not known.  A column of unsigned integers is unwrapped.
+        normal_load : column, N
+            Default: not known.
+        carriers : sequence of float, Hz
+            Frequencies that were driven: the impedance is analysed at these.
+        **header
+            `name`, `device` (kind, or file of a profile), `unit` of the sensors ("m"), `drive_unit` ("A"),
+            `sensed_noise`, and other fields of `hapticrender.recordings.journal.Header`.
+
+        Raises
+        ------
+        ValueError, TypeError
+            A column is missing, has no numbers or another length; a value is not finite; times are not even.
+
+        Examples
+        --------
+        >>> import numpy as np
+        >>> theirs = {"volt": np.array([0.0, 0.5]), "adc": np.array([8192, 8200])}
+        >>> made = Recording.from_columns(theirs, rate=5000.0, drive={"volt": -0.2}, sensed={"adc": (122e-9, 8192)})
+        >>> made.drive[:, 0].tolist(), made.sensed[:, 0].round(9).tolist()
+        ([-0.0, -0.1], [0.0, 9.76e-07])
+        """
+        from hapticrender.recordings.columns import assemble
+
+        chosen: Any = {"drive": drive, "sensed": sensed, "time": time, "position": position, "normal_load": normal_load}
+        return cls(*assemble(columns, **chosen, rate=rate, carriers=carriers, **header))

@@ -26,6 +26,7 @@ from hapticrender.touch.grating import Grating
 from hapticrender.touch.mechanics import NAMED
 from hapticrender.touch.motion import LONGEST_TIME, Nowhere, RecordedMotion, Sampled, SineMotion, Still, TriangleMotion
 from hapticrender.touch.recorded import Recorded, Swipe, Synthetic
+from hapticrender.touch.touch_panel import TouchPanel
 
 TEXTURES: dict[str, type[Any]] = {
     kind.kind: kind for kind in (Grating, Recorded, Swipe, Synthetic, Chirp, Sum, Playlist, Custom)
@@ -39,6 +40,7 @@ TABLES = {  # field of a scene: table of a file
     "calibration": "calibration",
     "simulation": "simulation",
     "rendering": "render",
+    "touch_panel": "touch_panel",
 }
 OWN = {  # keys of these tables that are fields of a scene: table, key, field
     ("device", "kind"): "device",
@@ -76,9 +78,10 @@ class Scene(Validated):
     """Everything that a rendering depends on, in SI; frozen, compared by value, TOML in and out.
 
     In TOML, ``[device]`` holds `device` (as ``kind``), `profile` and `source`, ``[limits]`` and ``[calibration]`` hold
-    `limits` and `calibration`, ``[simulation]`` holds `simulation` and `seed`, ``[render]`` holds `rendering`,
-    `method`, `tolerance`, `settle`, `keep_unfelt` and `gradient`.  ``device = "plate.toml"``, or beside parameters
-    ``[device] profile = "plate.toml"``, names the file of a `DeviceProfile`, seen from the scene's folder.
+    `limits` and `calibration`, ``[simulation]`` holds `simulation` and `seed`, ``[touch_panel]`` holds `touch_panel`,
+    ``[render]`` holds `rendering`, `method`, `tolerance`, `settle`, `keep_unfelt` and `gradient`.  ``device =
+    "plate.toml"``, or beside parameters ``[device] profile = "plate.toml"``, names the file of a `DeviceProfile`, seen
+    from the scene's folder.
 
     Parameters
     ----------
@@ -99,6 +102,9 @@ class Scene(Validated):
         Which profile the parameters are from, by whom and when; named where a run contradicts it.
     rendering : mapping of str to number, str or bool
         Settings of the renderer, such as ``velocity_per_force`` or ``crossover``.
+    touch_panel : mapping of str to number
+        Parameters of the `TouchPanel` that senses the finger on a simulated device, such as ``{"rate": 120.0}``; none
+        given: the position is known without error.
     duration : float, s
         > 0 and <= 360 000 (100 h).
     method : str
@@ -135,6 +141,7 @@ class Scene(Validated):
     source: str = checked(checks.text, "")
     simulation: Mapping[str, Value] = _table()
     rendering: Mapping[str, Value] = _table()
+    touch_panel: Mapping[str, Value] = _table()
     duration: float = parameter(unit="s", above=0, most=LONGEST_TIME)
     method: str = checked(checks.word, defaults.METHOD)
     tolerance: float = parameter(0.1, above=0, most=10)
@@ -149,8 +156,10 @@ class Scene(Validated):
             self._take_profile(DeviceProfile.load(self.device))
         super().__post_init__()
         self.device_profile  # noqa: B018 (it refuses what is no limit, and no calibration)
+        self.panel  # noqa: B018 (it refuses what is no touch panel)
         bound = "a texture with bands(rate) and waveform(time, position)"
         checks.require(isinstance(self.texture, Texture), "texture", self.texture, bound, TypeError)
+        _refuse_fingers(self.finger)
         checks.require(isinstance(self.finger, Finger), "finger", self.finger, "a Finger", TypeError)
         if isinstance(self.finger.motion, Nowhere) and getattr(self.texture, "spatial", False):
             raise ValueError("finger.motion = 'none': a texture over position needs a finger")
@@ -167,6 +176,12 @@ class Scene(Validated):
         name = self.source or self.device
         tables: dict[str, Any] = {"device": self.profile, "limits": self.limits, "calibration": self.calibration}
         return DeviceProfile(kind=self.device, name=name, **tables)
+
+    @property
+    def panel(self) -> TouchPanel | None:
+        """Touch panel of the simulated device; None: the position is known without error."""
+        with checks.inside("touch_panel"):
+            return TouchPanel.with_overrides(self.touch_panel) if self.touch_panel else None
 
     @classmethod
     def from_toml(cls, path: str | os.PathLike[str]) -> Scene:
@@ -321,7 +336,14 @@ def _read_part(key: str, part: Any, folder: Path) -> Any:
     return _read_kind(part[0], f"{key}[0]", "kind", TEXTURES, folder), part[1]
 
 
+def _refuse_fingers(finger: Any) -> None:
+    """Refuse several fingers: a device senses the sum of all touches, and the law has one finger's model."""
+    if isinstance(finger, list | tuple):
+        raise ValueError(f"finger: {len(finger)} fingers are stated: must be one, a device renders for one finger")
+
+
 def _read_finger(table: Any, folder: Path) -> Finger:
+    _refuse_fingers(table)
     own = [entry.name for entry in fields(Finger) if entry.name != "motion"]
     motion = _read_kind(table, "finger", "motion", MOTIONS, folder, extra=own)
     values = {key: table[key] for key in own if key in table}

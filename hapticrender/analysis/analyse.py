@@ -1,0 +1,250 @@
+"""The finger out of a recording: contact, then the plate where nothing touches it, then the finger on that plate."""
+
+from __future__ import annotations
+
+import itertools
+import os
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from hapticrender.analysis.course import Course
+from hapticrender.analysis.force import MotionFilter, at_least, sensor_noise
+from hapticrender.analysis.impedance import impedance_of
+from hapticrender.analysis.lock_in import Lines, demodulate, tile, window_length
+from hapticrender.analysis.plate_track import Rest, regress, rest_of, track_of
+from hapticrender.analysis.records import LOADED, UNLOADED, FingerRecord, Impedance, Segment, Series
+from hapticrender.analysis.smoothing import LEAST_SPREAD
+from hapticrender.analysis.tracker import FingerTracker, Touch
+from hapticrender.bands import Bands, hold_last
+from hapticrender.plants.plate import PlateParameters
+from hapticrender.protocols import Array, Flag
+from hapticrender.touch.device_profile import DeviceProfile
+
+if TYPE_CHECKING:
+    from hapticrender.recordings.recording import Recording
+
+WIDE = 0.25e-3  # s: spread of the kernel under the carriers; 0.8 of 400 Hz passes
+RINGING = 0.25  # s after a lift in which the free plate rings down: 6 time constants of its heave mode
+SETTLING = 0.06  # s after a touch in which the finger does: 6 of the least damped one of Table 1
+BEFORE = 0.02  # s before a change of contact that are left out
+SLOWEST, FASTEST = 15.0, 0.1  # Hz, of the sampling rate: carriers between them are analysed
+NEAR_END = 5e-3  # m: a finger nearer to an end of the glass is not judged
+MIDDLE = 15e-3  # m from the middle: where `least_load` holds
+MILLIMETRE = 1e-3  # m
+START = 0.5  # s: free of a finger, where the caller says so
+BLOCK = 1.0  # s of signal at a time
+
+
+def analyse_finger(
+    recording: Recording,
+    profile: DeviceProfile | PlateParameters | str | os.PathLike[str] | None = None,
+    *,
+    block: int = 1,
+    free_start: bool = False,
+) -> FingerRecord:
+    """Estimate load, position, velocity, contact, force and impedance of the finger in a recording of a plate.
+
+    Only `drive` and `sensed` are read: in a simulation the recorded position, load and motion are the truth.
+
+    Parameters
+    ----------
+    recording : Recording
+        Of a plate with two sensors at the ends of its glass, at least 1 s.
+    profile : DeviceProfile, PlateParameters or path of a profile, optional
+        What is believed of the plate, with its uncertainty; default: that of the recording's scene.  Parameters without
+        one count as known to 2 %, damping to 10 %.
+    block : int, samples
+        Of the driver: a row of the drive acts ``delay - block`` samples after the row sensed with it.
+    free_start : bool
+        Whether nothing touches in the first 0.5 s, from which the sensors' zero is then taken; default: they read zero
+        where nothing touches.
+
+    Raises
+    ------
+    ValueError
+        The recording is not of such a plate, too short, or a measurement is nowhere finite.
+
+    Notes
+    -----
+    Contact is first decided on the profile's plate; the plate's parameters and the sensors' zero are then estimated
+    from the spans without contact, and all is repeated with them.  The series end 85 ms before the recording does.
+    """
+    course = _believed(recording, profile)
+    late = course.plate.delay - block
+    _check(recording, course.plate, late)
+    rate, drive = recording.rate, recording.drive
+    sensed = np.stack([hold_last(channel) for channel in recording.sensed.T], axis=1)
+    if free_start:
+        sensed = sensed - sensed[: round(START * rate)].mean(axis=0)
+    signals = _Signals(course.plate, late, rate, drive, sensed)
+    first = signals.track(course, None)
+    frequency = _carriers(recording.bands, sensed, rate)
+    length = window_length(frequency, rate)
+    lines = signals.unloaded(first, frequency, length, signals.tracker(course, None).threshold / 2)
+    rest = None
+    if len(lines.time):
+        course = regress(course, lines, signals.noise) if frequency.size else course
+        rest = rest_of(course, lines)
+    touch, tracker = signals.track(course, rest), signals.tracker(course, rest)
+    impedance = signals.impedance(course, touch, recording.bands, frequency, length, recording.header.calibration)
+    return FingerRecord(
+        name=recording.header.name,
+        time=touch.time,
+        normal_load=touch.normal_load,
+        position=touch.position,
+        velocity=touch.velocity,
+        contact=touch.contact,
+        segments=_segments(touch, rate),
+        plate=track_of(course, len(drive) / rate),
+        impedance=impedance,
+        least_load=tracker.least_load(MIDDLE, MILLIMETRE),
+        notes=tuple(_notes(recording, course, touch, rest, impedance)),
+    )
+
+
+def _believed(recording: Recording, profile: DeviceProfile | PlateParameters | str | os.PathLike[str] | None) -> Course:
+    """Return what is believed of the recorded plate."""
+    duration = len(recording) / recording.rate
+    if isinstance(profile, PlateParameters):
+        return Course.of(profile, duration=duration)
+    if isinstance(profile, str | os.PathLike):
+        profile = DeviceProfile.load(profile)
+    elif profile is None:
+        profile = recording.scene.device_profile
+    if profile.kind != "vt-plate":
+        raise ValueError(f"profile.kind = {profile.kind!r}: must be vt-plate, a plate with sensors of displacement")
+    return Course.of(PlateParameters.with_overrides(profile.device), profile.uncertainty, duration)
+
+
+def _check(recording: Recording, plate: PlateParameters, late: int) -> None:
+    """Refuse a recording that is not of such a plate."""
+    header = recording.header
+    if header.sensed_channels != 2 or header.unit != "m":
+        found = f"{header.sensed_channels} sensors in {header.unit}"
+        raise ValueError(f"{header.name}: {found}: must be 2 in m, at the ends of a plate's glass")
+    if header.drive_channels != plate.coils:
+        raise ValueError(f"{header.name}: {header.drive_channels} drive channels: must be {plate.coils}, one a coil")
+    if len(recording) < recording.rate:
+        raise ValueError(f"{header.name}: {len(recording) / recording.rate:g} s long: must be >= 1 s")
+    if late < 0:
+        raise ValueError(f"block = {plate.delay - late}: must be <= the plate's delay of {plate.delay} samples")
+    if not np.isfinite(recording.sensed).any(axis=0).all():
+        raise ValueError(f"{header.name}: a sensor is finite nowhere: must be displacement in m")
+
+
+def _carriers(bands: Bands, sensed: Array, rate: float) -> Array:
+    """Fixed carriers (Hz) to be analysed; where there are no carriers at all, the strongest of the motion."""
+    if len(bands):
+        fixed = bands.frequency[bands.wavenumber == 0.0]
+    else:
+        from hapticrender.touch.profile import strongest_carriers
+
+        fixed = strongest_carriers(sensed.mean(axis=1), rate, passband=(SLOWEST, FASTEST * rate))
+    return np.unique(fixed[(fixed >= SLOWEST) & (fixed <= FASTEST * rate)])
+
+
+class _Signals:
+    """Drive and measurement of a recording: tracked, and demodulated in windows."""
+
+    def __init__(self, plate: PlateParameters, late: int, rate: float, drive: Array, sensed: Array) -> None:
+        self.late, self.rate, self.drive, self.sensed = late, rate, drive, sensed
+        self.spread = max(WIDE, LEAST_SPREAD / rate)
+        wide = MotionFilter(plate, rate, self.spread, late)
+        padded = (np.concatenate([each, np.repeat(each[-1:], wide.delay, axis=0)]) for each in (drive, sensed))
+        x = wide.update(*padded)
+        self.columns = np.hstack([x.displacement, x.velocity, x.acceleration, x.force])[wide.delay :]
+        self.sensor_noise = at_least(sensor_noise(sensed), plate)
+        self.noise = wide.coordinate_noise(self.sensor_noise)
+
+    def tracker(self, course: Course, rest: Rest | None) -> FingerTracker:
+        """Tracker that is symmetric in time."""
+        return FingerTracker(course, rate=self.rate, late=self.late, noise=self.sensor_noise, lookahead=1.0, rest=rest)
+
+    def track(self, course: Course, rest: Rest | None) -> Touch:
+        """Track the whole recording, a second at a time."""
+        tracker, step = self.tracker(course, rest), round(BLOCK * self.rate)
+        starts = range(0, len(self.drive), step)
+        parts = [tracker.update(self.drive[i : i + step], self.sensed[i : i + step]) for i in starts]
+        time, contact = (np.concatenate([getattr(part, name) for part in parts]) for name in ("time", "contact"))
+        load, position, velocity = (
+            _joined([getattr(part, name) for part in parts]) for name in ("normal_load", "position", "velocity")
+        )
+        return Touch(time, load, position, velocity, contact)
+
+    def unloaded(self, touch: Touch, frequency: Array, length: int, quiet: float) -> Lines:
+        """Demodulate windows without contact, whose mean load is below `quiet` (N)."""
+        free = touch.contact == UNLOADED
+        starts = tile(free, length, round(RINGING * self.rate), round(BEFORE * self.rate))
+        mean = np.array([touch.normal_load.value[i : i + length].mean() for i in starts])
+        starts = starts[np.abs(mean) < quiet] if len(starts) else starts
+        return self.lines(self.columns, starts, length, np.tile(frequency, (len(starts), 1)))
+
+    def lines(self, columns: Array, starts: Array, length: int, frequency: Array) -> Lines:
+        """Demodulate, and undo what the kernel does to the carriers."""
+        lines = demodulate(columns, starts, length, frequency, self.rate)
+        passed = np.exp(-0.5 * (2 * np.pi * frequency * self.spread) ** 2)
+        return replace(lines, amplitude=lines.amplitude / passed[..., None])
+
+    def impedance(
+        self, course: Course, touch: Touch, bands: Bands, fixed: Array, length: int, gain: float
+    ) -> Impedance:
+        """Impedance of the finger in windows under load."""
+        a, end = course.plate.half_spacing, course.plate.glass_length / 2 - NEAR_END
+        place, error = touch.position.value, touch.position.standard_error
+        with np.errstate(invalid="ignore"):
+            inside = (touch.contact == LOADED) & (np.abs(place) < end)
+        starts = tile(inside, length, round(SETTLING * self.rate), round(BEFORE * self.rate))
+        series = touch.normal_load.value, place, error, touch.velocity.value
+        load, middle, spread, speed = (np.array([each[i : i + length].mean() for i in starts]) for each in series)
+        locked = bands.wavenumber > 0.0
+        moving = np.abs(bands.frequency[locked] + np.multiply.outer(speed, bands.wavenumber[locked]))
+        frequency = np.hstack([np.tile(fixed, (len(starts), 1)), moving.reshape(len(starts), int(locked.sum()))])
+        usable = (frequency >= SLOWEST) & (frequency <= FASTEST * self.rate)
+        frequency = np.where(usable, frequency, SLOWEST)
+        lever = np.nan_to_num(place) / a * self.columns[: len(place), 3]
+        columns = np.column_stack([self.columns[: len(place)], lever])
+        lines = self.lines(columns, starts, length, frequency)
+        found = impedance_of(course, lines, self.noise, load, middle, spread, gain)
+        value, errors = (np.where(usable, each, np.nan) for each in (found.value, found.standard_error))
+        return replace(found, value=value, standard_error=errors)
+
+
+def _joined(parts: list[Series]) -> Series:
+    """One series of several."""
+    value, error = (np.concatenate([getattr(part, name) for part in parts]) for name in ("value", "standard_error"))
+    return Series(value, error, parts[0].bandwidth)
+
+
+def _segments(touch: Touch, rate: float) -> tuple[Segment, ...]:
+    """Spans of one kind of contact."""
+    edges = np.r_[0, np.flatnonzero(np.diff(touch.contact)) + 1, len(touch.contact)]
+    return tuple(
+        Segment(int(touch.contact[i]), float(i / rate), float(j / rate)) for i, j in itertools.pairwise(edges.tolist())
+    )
+
+
+def _notes(
+    recording: Recording, course: Course, touch: Touch, rest: Rest | None, impedance: Impedance
+) -> Iterator[str]:
+    """Say what could not be measured, and why."""
+    if rest is None:
+        yield (
+            "no span without contact is long enough: the sensors' zero and the plate's parameters are taken from the "
+            "profile"
+        )
+    elif not course.measured:
+        yield ("the carriers do not determine the stiffness while nothing touches: it is mostly that of the profile")
+    if not (touch.contact == LOADED).any():
+        yield "no finger touches"
+    elif not len(impedance.time):
+        yield "no touch is long enough for a window: the impedance is not measured"
+    flags = np.bitwise_or.reduce(recording.flags) if len(recording) else 0
+    for bad, text in (
+        (Flag.NONFINITE, "samples that are no numbers are held"),
+        (Flag.SENSOR_CLIPPED, "a sensor clips"),
+    ):
+        if flags & bad:
+            yield f"{text}: estimates near them are wrong by more than they say"

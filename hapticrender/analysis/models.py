@@ -1,0 +1,332 @@
+"""Fit finger models to measured impedances: order, and parameters with intervals."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from math import inf, log, nan, sqrt
+from typing import Any
+
+import numpy as np
+
+from hapticrender.analysis.records import FingerRecord
+from hapticrender.analysis.samples import APART, Samples, Source, parts_of, samples_of
+from hapticrender.checks import require
+from hapticrender.protocols import Array
+from hapticrender.touch.mechanics import HEAVY, LIGHT, LIGHT_BELOW, FingerMechanics
+
+LOAD_CLASSES: Mapping[str, tuple[float, float]] = {"light": (0.0, LIGHT_BELOW), "heavy": (LIGHT_BELOW, inf)}  # N
+FEWEST = {2: 2, 4: 4}  # carriers by order: two numbers each, for three or six parameters and the exponent
+NAMES = ("mass", "damping", "stiffness", "phalanx_mass", "phalanx_damping", "phalanx_stiffness")
+_UNITS = np.array([1e-3, 1.0, 1e3, 1e-3, 1.0, 1e3])  # g, N s/m, N/mm: the fit's parameters are then near 1
+_MOST = np.array([1.0, 1e4, 1e6, 1.0, 1e4, 1e6]) / _UNITS  # bounds of FingerMechanics
+MOST_STEPS = 100  # of a search; without a skin in the data its stiffness would grow for ever
+_STIFF_SKIN = (0.1, 20.0, 40.0)  # in these units: hardly a skin
+
+
+@dataclass(frozen=True)
+class FingerFit:
+    """A finger model fitted to measured impedances.
+
+    Parameters
+    ----------
+    mechanics : FingerMechanics
+        The finger at its `reference_load`, the geometric mean of the loads; for ``hr.Finger(mechanics=...)``.
+    load_exponent : float
+        n in ``|Z| ~ (W/reference_load)**n``, one for all frequencies; 0 where the loads do not differ.
+    names : tuple of str
+        Fitted parameters, in the order of `covariance`: fields of `mechanics`, then "load_exponent" if it was fitted.
+    covariance : ndarray, shape (p, p)
+        Of the parameters in SI units, times ``max(1, chi_square/degrees_of_freedom)``.
+    chi_square : float
+        Sum of squares of real and imaginary residuals, each over its standard error.
+    degrees_of_freedom : int
+        Real numbers measured minus parameters fitted.
+    loads : (float, float)
+        Least and largest load in the data (N).
+    bic_margin : float
+        By how much the Bayesian information criterion prefers this order to the other; NaN where the order was given,
+        or the data are too few for the other.
+
+    Notes
+    -----
+    Intervals hold for a model that explains the data (see `p_value`), and for small errors, in which it is linear:
+    where the data hardly tell the skin's stiffness from the phalanx (standard error above half of it), the phalanx may
+    be off by more.
+    """
+
+    mechanics: FingerMechanics
+    load_exponent: float
+    names: tuple[str, ...]
+    covariance: Array
+    chi_square: float
+    degrees_of_freedom: int
+    loads: tuple[float, float]
+    bic_margin: float = nan
+
+    @property
+    def order(self) -> int:
+        """2 or 4."""
+        return self.mechanics.order
+
+    @property
+    def values(self) -> dict[str, float]:
+        """Fitted parameters by name (SI)."""
+        return {name: float(self._all()[name]) for name in self.names}
+
+    @property
+    def standard_errors(self) -> dict[str, float]:
+        """Standard errors by name (SI)."""
+        return dict(zip(self.names, np.sqrt(np.diag(self.covariance)).tolist(), strict=True))
+
+    @property
+    def p_value(self) -> float:
+        """Probability of a larger chi-square if the model and the stated errors are right; below 0.01: they are not."""
+        from scipy.special import chdtrc
+
+        return float(chdtrc(self.degrees_of_freedom, self.chi_square)) if self.degrees_of_freedom else nan
+
+    def interval(self, name: str, level: float = 0.95) -> tuple[float, float]:
+        """Confidence interval of a parameter (SI) at a `level` between 0 and 1; not below 0 but for the exponent."""
+        from scipy.special import ndtri
+
+        require(name in self.names, "name", name, f"one of {', '.join(self.names)}")
+        require(0 < level < 1, "level", level, "> 0 and < 1")
+        value, half = self.values[name], float(ndtri(0.5 + level / 2)) * self.standard_errors[name]
+        return (value - half if name == "load_exponent" else max(value - half, 0.0)), value + half
+
+    def impedance(self, frequency: Array, normal_load: float | None = None) -> Array:
+        """Z_f of the model (complex, N s/m) at `frequency` (Hz) and a load (N); None: the reference load."""
+        return _impedance(self._all(), np.asarray(frequency, float), normal_load)
+
+    def relative_error(self, frequency: Array, normal_load: float | None = None) -> Array:
+        """Standard error of ln Z_f, as a complex number: of ln |Z_f| (real part) and of the phase (rad, imaginary)."""
+        frequency = np.asarray(frequency, float)
+        whole, gradient = self.impedance(frequency, normal_load), []
+        for name in self.names:
+            step = 1e-6 * max(self.values[name], 1e-3 * _unit(name))
+            moved = self._all() | {name: self.values[name] + step}
+            gradient.append((_impedance(moved, frequency, normal_load) / whole - 1) / step)
+        slope = np.array(gradient)
+        real, imaginary = (np.einsum("if,ij,jf->f", part, self.covariance, part) for part in (slope.real, slope.imag))
+        return np.sqrt(np.maximum(real, 0)) + 1j * np.sqrt(np.maximum(imaginary, 0))
+
+    def _all(self) -> dict[str, Any]:
+        """Every number of the model by name."""
+        fields = {name: getattr(self.mechanics, name) for name in ("order", *NAMES, "reference_load")}
+        return fields | {"load_exponent": self.load_exponent}
+
+
+def fit_finger(
+    impedance: Source | Sequence[Source],
+    order: int | None = None,
+    *,
+    loads: tuple[float, float] = (0.0, inf),
+    load_exponent: float | None = None,
+) -> FingerFit:
+    """Fit a finger of 2nd or 4th order to measured impedances by weighted complex least squares.
+
+    Parameters
+    ----------
+    impedance : FingerRecord, Impedance, or a sequence of them
+        As measured, in one or several recordings; masked entries (NaN) are left out.  All errors of an Impedance count
+        as independent; those of a FingerRecord are in part shared, see the notes.
+    order : {2, 4} or None
+        None takes the order that the data support: the 4th where the Bayesian information criterion is smaller.
+    loads : (float, float), N
+        The class of loads: least (included) and largest (excluded).
+    load_exponent : float or None
+        Growth of |Z_f| with the load inside the class; None fits it, 0 takes the finger as the same at all loads.
+
+    Returns
+    -------
+    FingerFit
+
+    Raises
+    ------
+    ValueError
+        Too few different carriers (2 for the 2nd order, 4 for the 4th), or a standard error of 0.
+
+    Notes
+    -----
+    Minimises ``chi^2 = sum |Z_f(f_i) (W_i/W_ref)^n - Z_i|^2/sigma_i^2`` over the parameters, which are >= 0; Z_f is
+    that of `FingerMechanics`.  Errors of the load are neglected: where they are a share e of the spread of ln W, n is
+    too small by e^2.  The 2nd order is the limit of the 4th for a stiff skin, so that the difference of chi^2 between
+    them is at most that of 3 more parameters; both are divided by ``max(1, chi^2/degrees of freedom)`` of the 4th (as
+    an F test does), so that errors which were stated too small do not call for more parameters.
+
+    All windows of a recording share the errors of the plate's own mass, damping and stiffness, which no number of
+    windows averages: ``dZ = j w dm + db + dk/(j w)``.  Their standard deviations are those of the record's plate, at
+    most ``min sqrt(2) sigma_i/w_i`` (for the mass: just this), ``min sqrt(2) sigma_i`` and ``min sqrt(2) sigma_i w_i``,
+    what the impedance's errors have room for.  They add to the covariance of the samples: ``r^T (S + G G^T)^-1 r``.
+
+    References
+    ----------
+    Grigorii et al. 2021, Table 1 and Fig. 9; Schwarz: Estimating the dimension of a model, 1978.
+
+    Examples
+    --------
+    >>> from hapticrender.analysis.records import Impedance
+    >>> f, n = np.array([20.0, 47.0, 111.0, 261.0]), 5
+    >>> truth = FingerMechanics(order=2, mass=4e-3, damping=1.0, stiffness=200.0)
+    >>> ones, row = np.ones((n, len(f))), np.ones(n)
+    >>> data = Impedance(np.arange(n), f * ones, truth.impedance(f) * ones, 0.05 * ones, 0.3 * row, 0 * row)
+    >>> fit = fit_finger(data)
+    >>> fit.order, round(fit.mechanics.stiffness), round(fit.standard_errors["stiffness"], 1)
+    (2, 200, 2.6)
+    """
+    require(order in (None, 2, 4), "order", order, "2, 4 or None")
+    samples = samples_of(impedance, loads)
+    _check_enough(samples, order or 2, loads)
+    shared = _shared_errors(impedance, samples)
+    second = _fit(samples, shared, 2, load_exponent)
+    if order == 2 or (order is None and _carriers(samples) < FEWEST[4]):
+        return second
+    fourth = _fit(samples, shared, 4, load_exponent, second)
+    return fourth if order == 4 else _supported(second, fourth)
+
+
+def fit_load_classes(
+    impedance: Source | Sequence[Source],
+    classes: Mapping[str, tuple[float, float]] = LOAD_CLASSES,
+    *,
+    order: int | None = None,
+) -> dict[str, FingerFit]:
+    """Fit a finger to every class of loads, as `fit_finger`, by name; a class with too few data is left out.
+
+    `classes` holds least and largest load (N) by name: below and above 0.5 N, as in Table 1 of Grigorii et al. 2021.
+    """
+    fewest = FEWEST[order or 2]
+    return {
+        name: fit_finger(impedance, order, loads=loads)
+        for name, loads in classes.items()
+        if _carriers(samples_of(impedance, loads)) >= fewest
+    }
+
+
+def _carriers(samples: Samples) -> int:
+    """Number of carriers that differ by more than 1 %."""
+    if not samples.frequency.size:
+        return 0
+    return 1 + int((np.diff(np.log(np.sort(samples.frequency))) > APART).sum())
+
+
+def _check_enough(samples: Samples, order: int, loads: tuple[float, float]) -> None:
+    found, fewest = _carriers(samples), FEWEST[order]
+    if found < fewest:
+        raise ValueError(
+            f"impedance: {found} different carriers with data at loads from {loads[0]:g} to {loads[1]:g} N, a "
+            f"finger of order {order} needs at least {fewest}: record more frequencies, or widen the loads"
+        )
+
+
+def _unit(name: str) -> float:
+    return 1.0 if name == "load_exponent" else float(_UNITS[NAMES.index(name)])
+
+
+def _impedance(numbers: Mapping[str, Any], frequency: Array, normal_load: float | Array | None) -> Array:
+    """Z_f (N s/m) of a model given by its numbers, times its growth with the load."""
+    fields = {name: value for name, value in numbers.items() if name != "load_exponent"}
+    whole = FingerMechanics(**fields).impedance(frequency)
+    if normal_load is None:
+        return whole
+    return whole * np.exp(numbers["load_exponent"] * np.log(np.asarray(normal_load) / numbers["reference_load"]))
+
+
+def _plate_errors(record: FingerRecord, w: Array, sigma: Array) -> Array:
+    """Standard errors of the plate's mass (kg), damping (N s/m), stiffness (N/m), at most what `sigma` has room for."""
+    errors, known = record.plate.standard_errors, [inf]
+    for name in ("damping", "stiffness"):
+        sides = [errors[f"{name}_{side}"].mean() for side in (1, 2) if f"{name}_{side}" in errors]
+        known.append(float(np.hypot(*sides)) if len(sides) == 2 else inf)
+    return np.minimum(known, [sqrt(2) * (sigma * factor).min() for factor in (1 / w, 1.0, w)])
+
+
+def _shared_errors(impedance: Source | Sequence[Source], samples: Samples) -> list[tuple[Array, Array, Array]]:
+    """Rows, U and 1 - (1 + s^2)^(-1/2) of each recording's G/sigma = U s V, over real and then imaginary parts.
+
+    ``(1 + G G^T)^(-1/2) = 1 - U (1 - (1 + s^2)^(-1/2)) U^T`` whitens them, see `fit_finger`.
+    """
+    found = []
+    for number, each in enumerate(parts_of(impedance)):
+        own = np.flatnonzero(samples.source == number)
+        if isinstance(each, FingerRecord) and own.size:
+            w, sigma = 2 * np.pi * samples.frequency[own], samples.standard_error[own]
+            mass, damping, stiffness = _plate_errors(each, w, sigma)
+            zero = np.zeros_like(w)
+            real = np.column_stack([zero, damping / sigma, zero])
+            imaginary = np.column_stack([mass * w / sigma, zero, -stiffness / w / sigma])
+            along, size, _ = np.linalg.svd(np.vstack([real, imaginary]), full_matrices=False)
+            found.append((np.concatenate([own, own + len(samples.source)]), along, 1 - 1 / np.sqrt(1 + size**2)))
+    return found
+
+
+def _fit(
+    samples: Samples,
+    shared: list[tuple[Array, Array, Array]],
+    order: int,
+    exponent: float | None,
+    second: FingerFit | None = None,
+) -> FingerFit:
+    """Fit one order, from several starts where it is the 4th."""
+    from scipy.optimize import least_squares
+
+    names, logs = NAMES[: 3 * order // 2], np.log(samples.load)
+    fixed = {"order": order, "reference_load": float(np.exp(logs.mean())), "load_exponent": exponent or 0.0}
+    if exponent is None and np.ptp(logs) > APART:
+        names = (*names, "load_exponent")
+    units = np.array([_unit(name) for name in names])
+    weight = 1 / samples.standard_error
+
+    def residual(x: Array) -> Array:
+        numbers = fixed | dict(zip(names, (x * units).tolist(), strict=True))
+        apart = (_impedance(numbers, samples.frequency, samples.load) - samples.value) * weight
+        white = np.concatenate([apart.real, apart.imag])
+        for rows, along, shrink in shared:
+            white[rows] -= along @ (shrink * (along.T @ white[rows]))
+        return white
+
+    most = np.append(_MOST, 10.0)[[*range(3 * order // 2), *([6] if len(names) % 3 else [])]]
+    least = np.where(np.array(names) == "load_exponent", -10.0, 0.0)
+    settings: Any = {"bounds": (least, most), "x_scale": "jac", "ftol": 1e-6, "max_nfev": MOST_STEPS}
+    with np.errstate(under="ignore"):  # the solver's own step from a bound of 0
+        starts = [np.clip(start[: len(names)], least + 1e-6, most) for start in _starts(samples, second)]
+        best = min((least_squares(residual, start, **settings) for start in starts), key=lambda each: each.cost)
+    numbers = fixed | dict(zip(names, (best.x * units).tolist(), strict=True))
+    growth, chi_square, freedom = numbers.pop("load_exponent"), 2 * float(best.cost), best.fun.size - len(names)
+    covariance = _inverse(best.jac) * np.outer(units, units) * max(1.0, chi_square / max(freedom, 1))
+    reach = float(samples.load.min()), float(samples.load.max())
+    return FingerFit(FingerMechanics(**numbers), growth, names, covariance, chi_square, freedom, reach)
+
+
+def _starts(samples: Samples, second: FingerFit | None) -> list[Array]:
+    """Where the search begins, in the fit's units.
+
+    The 2nd order: at its linear solution; the 4th: at both fingers of Table 1, and at the 2nd order behind a stiff
+    skin, so that it fits no worse.
+    """
+    if second is not None:
+        whole = [getattr(second.mechanics, name) / unit for name, unit in zip(NAMES, _UNITS[:3], strict=False)]
+        table = [[getattr(each, name) for name in NAMES] / _UNITS for each in (LIGHT, HEAVY)]
+        return [np.append(each, 0.0) for each in (*table, [*_STIFF_SKIN, *whole])]
+    w, weight = 2e-3 * np.pi * samples.frequency, 1 / samples.standard_error
+    zero = np.zeros_like(w)
+    real, imaginary = np.column_stack([zero, weight, zero]), np.column_stack([w * weight, zero, -weight / w])
+    matrix = np.vstack([real, imaginary])
+    right = np.concatenate([samples.value.real, samples.value.imag]) * np.tile(weight, 2)
+    return [np.append(np.linalg.lstsq(matrix, right, rcond=None)[0], 0.0)]
+
+
+def _inverse(jacobian: Array) -> Array:
+    """Inverse of J^T J; a direction in which the data say nothing has a variance beyond every bound, not 0."""
+    _, size, right = np.linalg.svd(jacobian, full_matrices=False)
+    spread = right.T / np.maximum(size, 1e-12 * size[0])
+    return spread @ spread.T
+
+
+def _supported(second: FingerFit, fourth: FingerFit) -> FingerFit:
+    """Return the fit with the smaller Bayesian information criterion, with its margin."""
+    size = fourth.degrees_of_freedom + len(fourth.names)
+    scatter = max(1.0, fourth.chi_square / max(fourth.degrees_of_freedom, 1))
+    gain = (second.chi_square - fourth.chi_square) / scatter - 3 * log(size)
+    return replace(fourth, bic_margin=gain) if gain > 0 else replace(second, bic_margin=-gain)

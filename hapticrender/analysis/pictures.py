@@ -1,0 +1,353 @@
+"""Draw what the analysis of recordings found: load and impedance over time, over the load, and over frequency."""
+
+from __future__ import annotations
+
+import os
+import warnings
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from math import isfinite
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hapticrender.analysis.load_law import LoadLaw, load_exponent, mean_exponent
+from hapticrender.analysis.models import LOAD_CLASSES, FingerFit, fit_finger, fit_load_classes
+from hapticrender.analysis.page import NAMES, SURE, Fits, page_of
+from hapticrender.analysis.records import DOUBTFUL, LOADED, UNLOADED, FingerRecord, Series
+from hapticrender.analysis.samples import BAND, Samples, by_frequency, samples_of
+from hapticrender.protocols import Array
+from hapticrender.recordings.formats import MissingExtra
+from hapticrender.report.figure import BLUE, INK, ORANGE, PALE, RED, legend, new_figure, save
+
+MOST_BANDS = 8  # in one panel
+TYPICAL = 111.0  # Hz: of the paper's Fig. 5, and where |Z_f| begins to grow with the load
+COLOURS = {2: ORANGE, 4: BLUE}
+POINTS = 1500  # of a curve over time
+
+
+def draw(records: FingerRecord | Sequence[FingerRecord], folder: str | os.PathLike[str]) -> Path:
+    """Draw one or several recordings into `folder`, which is made where it is not there; return its page.
+
+    As Grigorii et al. 2021: impedance and load over time (Fig. 5, ``time-1.png`` and so on, one a recording), impedance
+    over the load, and how much of it the load explains (Fig. 8 C and D, ``load.png``), impedance over frequency with
+    fits of both orders for each class of loads (Fig. 9, ``frequency.png``); ``index.html`` has them, the parameters
+    with their intervals, and what could not be measured.  Without matplotlib there are no pictures, and a warning says
+    how to install it.
+
+    Raises
+    ------
+    ValueError
+        There is no recording.
+    OSError
+        The folder cannot be written.
+    """
+    records = [records] if isinstance(records, FingerRecord) else list(records)
+    if not records:
+        raise ValueError("records is empty: must be at least one FingerRecord")
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    fits, laws = fit_all(records), [load_exponent(each) for each in records]
+    drawn: dict[str, Callable[[Path], None]] = {
+        f"time-{i + 1}.png": partial(draw_time, each) for i, each in enumerate(records)
+    }
+    if any(law.frequency.size for law in laws):
+        drawn["load.png"] = partial(draw_load, records)
+    if fits:
+        drawn["frequency.png"] = partial(draw_frequency, records, fits)
+    try:
+        for name, drawing in drawn.items():
+            drawing(folder / name)
+    except MissingExtra as error:
+        warnings.warn(f"{folder}: no pictures: {error}", stacklevel=2)
+        drawn = {}
+    page = folder / "index.html"
+    page.write_text(page_of(records, fits, list(drawn)), encoding="utf-8")
+    return page
+
+
+def fit_all(records: Sequence[FingerRecord]) -> Fits:
+    """Fit both orders to every class of loads that has enough data, all recordings together, the better one first."""
+    found: Fits = {}
+    for name, fit in fit_load_classes(records).items():
+        found[name] = {fit.order: fit}
+        if isfinite(fit.bic_margin):
+            other = 6 - fit.order
+            found[name][other] = fit_finger(records, other, loads=LOAD_CLASSES[name])
+    return found
+
+
+def draw_time(record: FingerRecord, path: str | os.PathLike[str]) -> None:
+    """Draw load and impedance, impedance of every band, and position and velocity over time, unloaded spans shaded."""
+    bands = _shown(record.impedance.value)
+    drawings: list[Any] = [partial(_load_and_impedance, bands=bands), _kinematics]
+    if len(bands) > 1:
+        drawings.insert(1, partial(_all_bands, bands=bands))
+    heights = [1.5] * (len(drawings) - 1) + [1.0]
+    with new_figure((9, 2.05 * sum(heights) - 1), pads=(0.1, 0.08)) as figure:
+        panels = figure.subplots(len(drawings), 1, sharex=True, height_ratios=heights)
+        for axes, drawing in zip(panels, drawings, strict=True):
+            drawing(axes, record)
+            _shade(axes, record)
+        panels[-1].set(xlabel="time (s)", xlim=(record.time[0], record.time[-1]))
+        figure.align_ylabels(panels)
+        save(figure, path)
+
+
+def draw_load(records: Sequence[FingerRecord], path: str | os.PathLike[str]) -> None:
+    """Draw the impedance over the load, how much of it the load explains, and the exponent, over frequency."""
+    pooled, each = load_exponent(records), [load_exponent(one) for one in records]
+    with new_figure((12, 4.2), pads=(0.1, 0.05)) as figure:
+        over_load, share, power = figure.subplots(1, 3, width_ratios=[1.4, 1, 1])
+        _over_load(over_load, records, pooled)
+        _determination(share, each, pooled)
+        _exponent(power, each, pooled)
+        save(figure, path)
+
+
+def draw_frequency(records: Sequence[FingerRecord], fits: Fits, path: str | os.PathLike[str]) -> None:
+    """Draw modulus and phase of the impedance over frequency, with both fits and their 95 % bands, a class a column."""
+    size = np.abs(samples_of(records).value)
+    common: Any = {"sharex": True, "squeeze": False}
+    with new_figure((5.4 * max(len(fits), 2), 6.2 if len(fits) > 1 else 3.8), pads=(0.1, 0.08)) as figure:
+        if len(fits) > 1:
+            panels = figure.subplots(2, len(fits), sharey="row", height_ratios=[1.5, 1], **common)
+        else:
+            panels = figure.subplots(1, 2, **common).T
+        for (name, of_class), column in zip(fits.items(), panels.T, strict=True):
+            _over_frequency(column, name, of_class, samples_of(records, LOAD_CLASSES[name]))
+        panels[0, 0].set_ylim(0.6 * np.quantile(size, 0.01), 1.7 * np.quantile(size, 0.99))
+        panels[0, 0].set_ylabel("|Z_f| (N s/m)")
+        low, high = panels[1, 0].get_ylim()
+        panels[1, 0].set(ylabel="phase (degrees)", ylim=(max(low, -180), min(high, 180)))
+        for axes in panels[-1] if len(fits) > 1 else panels[:, 0]:
+            axes.set_xlabel("frequency (Hz)")
+        for axis in (panels[0, 0].xaxis, panels[0, 0].yaxis):
+            _numbers(axis)
+        save(figure, path)
+
+
+def _shown(value: Array) -> list[int]:
+    """Up to 8 bands with data, evenly spread."""
+    there = np.flatnonzero(np.isfinite(value).any(axis=0))
+    return there[np.unique(np.linspace(0, len(there) - 1, min(len(there), MOST_BANDS)).astype(int))].tolist()
+
+
+def _colours(count: int) -> list[Any]:
+    """Colours from low to high frequency, none of them too pale."""
+    from matplotlib import colormaps
+
+    return [colormaps["viridis"](0.9 * i / max(count - 1, 1)) for i in range(count)]
+
+
+def _shade(axes: Any, record: FingerRecord) -> None:
+    for kind, colour in ((UNLOADED, "#DDDDDD"), (DOUBTFUL, "#F6DDB0")):
+        for segment in record.of_kind(kind):
+            axes.axvspan(segment.start, segment.stop, color=colour, alpha=0.7, lw=0, zorder=0)
+
+
+def _curve(axes: Any, time: Array, series: Series, scale: float, colour: str, label: str) -> Any:
+    """A quantity over time with its 95 % band."""
+    step = max(len(time) // POINTS, 1)
+    at, value, error = time[::step], scale * series.value[::step], scale * SURE * series.standard_error[::step]
+    axes.fill_between(at, value - error, value + error, color=colour, alpha=0.25, lw=0)
+    (line,) = axes.plot(at, value, color=colour, lw=1.4, label=label)
+    return line
+
+
+def _load_and_impedance(axes: Any, record: FingerRecord, bands: list[int]) -> None:
+    """The paper's Fig. 5: load (black) and |Z_f| of one band (red) over one another."""
+    lines = [_curve(axes, record.time, record.normal_load, 1.0, INK, "normal load")]
+    axes.set(title="Impedance and load", ylabel="normal load W (N)")
+    most = float(np.nanmax(np.where(record.contact == LOADED, record.normal_load.value, np.nan), initial=0.1))
+    axes.set_ylim(-0.08 * most, 1.25 * most)
+    z = record.impedance
+    if bands:
+        band = min(bands, key=lambda each: abs(np.log(np.nanmedian(z.frequency[:, each]) / TYPICAL)))
+        right = axes.twinx()
+        right.grid(False)
+        right.spines["right"].set_visible(True)
+        size = np.abs(z.value[:, band])
+        label = f"|Z_f| at {np.nanmedian(z.frequency[:, band]):.0f} Hz"
+        lines.append(_dots(right, z.time, size, z.standard_error[:, band], RED, label))
+        right.set_ylabel("|Z_f| (N s/m)", color=RED)
+        right.tick_params(axis="y", colors=RED)
+        right.set_ylim(-0.08 * np.nanmax(size), 1.25 * np.nanmax(size))
+    _shading_legend(axes, record, lines)
+
+
+def _shading_legend(axes: Any, record: FingerRecord, lines: list[Any]) -> None:
+    """Legend of lines and of the kinds of contact that are shaded."""
+    from matplotlib.patches import Patch
+
+    shaded = {UNLOADED: ("#DDDDDD", "unloaded"), DOUBTFUL: ("#F6DDB0", "doubtful")}
+    handles = lines + [
+        Patch(color=colour, label=name) for kind, (colour, name) in shaded.items() if record.of_kind(kind)
+    ]
+    legend(axes, handles, [each.get_label() for each in handles])
+
+
+def _dots(axes: Any, x: Array, y: Array, error: Array, colour: Any, label: str) -> Any:
+    """Points at rising x with bars of one standard error, joined where none is missing between."""
+    gaps: Any = np.flatnonzero(np.diff(x) > 1.5 * np.median(np.diff(x))) + 1 if len(x) > 1 else []
+    x, y, error = (np.insert(each, gaps, np.nan) for each in (x, y, error))
+    style = {"color": colour, "marker": "o", "ms": 3, "lw": 0.9, "elinewidth": 0.8, "label": label}
+    return axes.errorbar(x, y, error, **style)
+
+
+def _all_bands(axes: Any, record: FingerRecord, bands: list[int]) -> None:
+    z = record.impedance
+    for band, colour in zip(bands, _colours(len(bands)), strict=True):
+        label = f"{np.nanmedian(z.frequency[:, band]):.0f} Hz"
+        _dots(axes, z.time, np.abs(z.value[:, band]), z.standard_error[:, band], colour, label)
+    axes.set(title="Impedance", ylabel="|Z_f| (N s/m)", yscale="log")
+    _numbers(axes.yaxis)
+    size = np.abs(z.value[:, bands])
+    axes.set_ylim(0.7 * np.nanmin(size), 1.4 * np.nanmax(size))
+    legend(axes, columns=MOST_BANDS)
+
+
+def _kinematics(axes: Any, record: FingerRecord) -> None:
+    lines = [_curve(axes, record.time, record.position, 1e3, BLUE, "position (mm)")]
+    right = axes.twinx()
+    right.grid(False)
+    right.spines["right"].set_visible(True)
+    lines.append(_curve(right, record.time, record.velocity, 1e3, ORANGE, "velocity (mm/s)"))
+    axes.set(title="Motion", ylabel="position (mm)")
+    right.set_ylabel("velocity (mm/s)")
+    for panel, series in ((axes, record.position), (right, record.velocity)):
+        loaded = np.abs(1e3 * series.value[np.isfinite(series.value) & (record.contact == LOADED)])
+        reach = 1.3 * float(np.quantile(loaded, 0.99)) if loaded.size else 1.0
+        panel.set_ylim(-max(reach, 0.1), max(reach, 0.1))
+    legend(axes, lines, [each.get_label() for each in lines])
+
+
+def _over_load(axes: Any, records: Sequence[FingerRecord], law: LoadLaw) -> None:
+    """The paper's Fig. 8 C: windows as dots, a fitted power a frequency, and mean and deviation of every recording."""
+    bins = by_frequency(samples_of(records))
+    chosen = [bins[i] for i in _shown(np.ones((1, len(bins))))]
+    for samples, colour in zip(chosen, _colours(len(chosen)), strict=True):
+        label = f"{np.median(samples.frequency):.0f} Hz"
+        at = int(np.argmin(np.abs(law.frequency - np.median(samples.frequency))))
+        axes.plot(samples.load, np.abs(samples.value), ".", color=colour, ms=2.5, alpha=0.5)
+        reach = np.array([samples.load.min(), samples.load.max()])
+        line = law.magnitude[at] * (reach / law.reference_load[at]) ** law.exponent[at]
+        axes.plot(reach, line, color=colour, lw=1.6, label=label)
+    if len(records) > 1:
+        _means(axes, records, float(law.frequency[np.argmin(np.abs(np.log(law.frequency / TYPICAL)))]))
+    axes.set(title="Impedance over load", xlabel="normal load W (N)", ylabel="|Z_f| (N s/m)", yscale="log")
+    _numbers(axes.yaxis)
+    if np.ptp(np.log(np.concatenate([each.load for each in bins]))) > 1:
+        axes.set_xscale("log")
+        _numbers(axes.xaxis)
+    axes.legend(fontsize=7, loc="center left", bbox_to_anchor=(1.0, 0.5), handlelength=1.2)
+
+
+def _means(axes: Any, records: Sequence[FingerRecord], frequency: float) -> None:
+    """Mean and standard deviation of load and impedance of every recording at one frequency, black as in Fig. 8 C."""
+    label: str | None = f"each at {frequency:.0f} Hz"
+    for record in records:
+        near = [each for each in by_frequency(samples_of(record)) if _near(each, frequency)]
+        if near:
+            load, size = near[0].load, np.abs(near[0].value)
+            style = {"color": "black", "marker": "o", "ms": 4, "lw": 0, "elinewidth": 1.0, "zorder": 5, "label": label}
+            axes.errorbar(load.mean(), size.mean(), size.std(), load.std(), **style)
+            label = None
+
+
+def _near(samples: Samples, frequency: float) -> bool:
+    return abs(np.log(np.median(samples.frequency) / frequency)) < BAND
+
+
+def _determination(axes: Any, each: list[LoadLaw], pooled: LoadLaw) -> None:
+    """The paper's Fig. 8 D: coefficient of determination between load and impedance, within a recording."""
+    for law in each:
+        axes.plot(law.frequency, law.determination, "o", color=PALE, ms=3, alpha=0.7)
+    mean = mean_exponent(each, pooled.frequency)[2]
+    axes.plot(pooled.frequency, mean, "o-", color=INK, lw=1.4, ms=4, label="mean" if len(each) > 1 else None)
+    axes.set(title="|Z_f| explained by the load", ylabel="R² within a recording", ylim=(-0.03, 1.03))
+    _frequency_axis(axes, pooled.frequency)
+
+
+def _exponent(axes: Any, each: list[LoadLaw], pooled: LoadLaw) -> None:
+    """Exponent of the impedance over the load, with 1/3 of Hertz contact; of several recordings also their mean."""
+    style = {"marker": "o", "ms": 4, "lw": 1.2, "capsize": 2}
+    shown = [(pooled.exponent, pooled.standard_error)]
+    if len(each) > 1:
+        for law in each:
+            axes.plot(law.frequency, law.exponent, "o", color=PALE, ms=3, alpha=0.7)
+        shown.append(mean_exponent(each, pooled.frequency)[:2])
+        axes.errorbar(pooled.frequency, shown[1][0], SURE * shown[1][1], color=BLUE, label="mean of each", **style)
+    label, colour = ("all together", ORANGE) if len(each) > 1 else ("95 %", BLUE)
+    axes.errorbar(pooled.frequency, pooled.exponent, SURE * pooled.standard_error, color=colour, label=label, **style)
+    axes.axhline(1 / 3, color=INK, lw=1.0, ls="--", label="1/3 (Hertz)")
+    ends = np.concatenate([value + sign * SURE * error for value, error in shown for sign in (-1, 1)])
+    ends = ends[np.isfinite(ends)]
+    axes.set(title="Exponent n of |Z_f| ~ Wⁿ", ylabel="n")
+    axes.set_ylim(min(-0.1, ends.min(initial=0) - 0.1), max(0.8, ends.max(initial=0) + 0.1))
+    _frequency_axis(axes, pooled.frequency)
+    axes.legend(loc="lower right")
+
+
+def _over_frequency(column: Any, name: str, fits: Mapping[int, FingerFit], samples: Samples) -> None:
+    """One class: windows, their weighted means and the fits, all at the reference load of the better fit."""
+    best = next(iter(fits.values()))
+    load = best.mechanics.reference_load
+    growth = (load / samples.load) ** best.load_exponent
+    samples = samples._replace(value=samples.value * growth, standard_error=samples.standard_error * growth)
+    grid = np.geomspace(samples.frequency.min(), samples.frequency.max(), 300)
+    views: tuple[Callable[[Array], Array], ...] = (np.abs, lambda z: np.degrees(np.angle(z)))
+    for axes, view in zip(column, views, strict=True):
+        axes.plot(samples.frequency, view(samples.value), ".", color=PALE, ms=2, alpha=0.4, zorder=1)
+    frequency, mean, error = _band_means(samples)
+    bars = (error, np.degrees(error / np.abs(mean)))
+    for axes, view, bar in zip(column, views, bars, strict=True):
+        style = {"fmt": "o", "color": INK, "ms": 4.5, "elinewidth": 1, "capsize": 2, "zorder": 4, "label": "measured"}
+        axes.errorbar(frequency, view(mean), bar, **style)
+    for order, fit in sorted(fits.items()):
+        _model(column, fit, grid, load, COLOURS[order], NAMES[order])
+    low, high = samples.load.min(), samples.load.max()
+    at = f"{load:.2g} N (data: {low:.2g} to {high:.2g} N)"
+    column[0].set(title=f"{name.capitalize()} touch, at {at}", xscale="log", yscale="log")
+    column[0].legend(loc="best")
+
+
+def _model(column: Any, fit: FingerFit, grid: Array, load: float, colour: str, name: str) -> None:
+    """Modulus and phase of a fit, with 95 % bands."""
+    z, error = fit.impedance(grid, load), SURE * fit.relative_error(grid, load)
+    phase, line = (
+        np.degrees(np.angle(z)),
+        {"color": colour, "lw": 1.6, "ls": "--" if fit.order == 2 else "-", "zorder": 3},
+    )
+    column[0].plot(grid, np.abs(z), label=name, **line)
+    column[1].plot(grid, phase, **line)
+    column[0].fill_between(
+        grid, np.abs(z) * np.exp(-error.real), np.abs(z) * np.exp(error.real), color=colour, alpha=0.25, lw=0
+    )
+    spread = np.degrees(error.imag)
+    column[1].fill_between(grid, phase - spread, phase + spread, color=colour, alpha=0.25, lw=0)
+
+
+def _band_means(samples: Samples) -> tuple[Array, Array, Array]:
+    """Weighted mean of every bin of frequencies, and its standard error, enlarged where the windows scatter more."""
+    rows = []
+    for each in by_frequency(samples):
+        weight = each.standard_error**-2
+        mean, error = np.average(each.value, weights=weight), weight.sum() ** -0.5
+        freedom = max(2 * len(each.value) - 2, 1)
+        scatter = np.sum(np.abs(each.value - mean) ** 2 * weight) / freedom
+        rows.append((np.median(each.frequency), mean, error * max(1.0, scatter) ** 0.5))
+    frequency, mean, error = (np.array(column) for column in zip(*rows, strict=True))
+    return frequency, mean, error
+
+
+def _numbers(axis: Any) -> None:
+    """Plain numbers on a logarithmic axis, also at 2 and 5 within a decade."""
+    axis.set_major_formatter(lambda value, _: f"{value:g}")
+    axis.set_minor_formatter(lambda value, _: f"{value:g}" if f"{value:e}"[0] in "25" else "")
+
+
+def _frequency_axis(axes: Any, frequency: Array) -> None:
+    axes.set(xlabel="frequency (Hz)", xlim=(0.87 * frequency.min(), 1.15 * frequency.max()), xscale="log")
+    _numbers(axes.xaxis)

@@ -1,0 +1,348 @@
+"""Detection of two touches on a plate: whether one finger can explain what the plate senses.
+
+With q heave and rocking, i the drive, p the finger's position and g = p/a its lever arm, one finger of any mechanics
+leaves the force f = B i - D(s) q = F [1, g]: the moment over the force is g, real and the same from 0 Hz to the highest
+band.  Two fingers leave z1 u1 [1, g1] + z2 u2 [1, g2] with u the motion and z the dynamic stiffness at each, and their
+ratio depends on frequency, is complex, or contradicts the position that is reported.  So of ``u = f_2 - (g + d) f_1``
+nothing but noise is left for one finger, where d is the error of g.  Over a window of Hann, with U_k its spectrum,
+S_k the known density of its noise, and y the plate's errors (of M, C and K, covariance P from the untouched plate)::
+
+    T = min over d, y of  sum_k |U_k - a_k y|^2/S_k + y^T P^-1 y + d^2/s_d^2
+
+is a sum of squares with one degree of freedom for each real number in U: chi-square, by which the window's threshold
+follows from the rate of false alarms.  With two fingers it is a non-central one, by which `miss_rate` follows.  Two
+fingers alike, at places that the plate moves alike under the same load, leave what one finger between them would.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from hapticrender.control.device_model import DeviceModel
+from hapticrender.control.inverse import derivative_filters
+from hapticrender.control.inverse_records import HEAVE, LOAD, TAPS
+from hapticrender.protocols import Array, Flag
+
+if TYPE_CHECKING:
+    from hapticrender.recordings.recording import Recording
+
+WINDOW = 0.25  # s
+BAND = (20.0, 400.0)  # Hz
+FALSE_ALARMS = 1e-6  # of a window: one in 70 hours of touch
+POSITION_ERROR = 2e-3  # m, of a reported position against the centre of the forces
+DRIFT = 1e-6  # m, of a sensor's offset since the plate was last free
+ERRORS = {"stiffness": 0.02, "damping": 0.3, "mass": 0.02}  # of a profile, of the largest entry of each matrix
+SPACING = 2  # bins: those of a Hann window that are two apart are correlated by 1/6, their squares by 1/36
+CORRELATION = 1.0 + 2.0 / 36.0  # variance of a sum of those squares, over that of independent ones
+LEAST_NOISE = 1e-4  # of a sensor's range: a model may state no noise
+LEAST_SIGNAL = 100.0  # of the noise's power
+MARGIN = 60e-3  # s after a touch or a lift, which may be reported late
+KEPT = 15 / 16  # of what earlier windows of the free plate have shown: 4 s of memory, coils warm up
+SLOWER = 100.0  # times the variance by which the law trusts a deviation: it learns ten times more slowly
+DEVICE = slice(int(HEAVE), int(LOAD))  # of the law's parameters: the device's own
+UNUSABLE = int(Flag.NONFINITE | Flag.SENSOR_CLIPPED | Flag.OVERRUN | Flag.STOPPED)
+TWO_TOUCHES = int(Flag.TWO_TOUCHES)
+SEARCH = np.linspace(-4.0, 4.0, 9)  # grid of d, three times: in s_d, and in a quarter of the last one
+
+
+class TouchTest(NamedTuple):
+    """Result of a window: T, its degrees of freedom and bound; the error d of the position (m), found on the way."""
+
+    statistic: float
+    freedom: float
+    bound: float
+    offset: float
+
+    @property
+    def two(self) -> bool:
+        """Whether one finger cannot explain the window."""
+        return self.statistic > self.bound
+
+
+def can_tell(model: DeviceModel) -> bool:
+    """Whether a finger's force and moment can be measured on such a device: a plate with two coils and two sensors."""
+    plate = model.finger.contact is not None and model.lever_per_metre > 0.0
+    return plate and len(model.mass) == 2 and model.coordinate_from_sensed.shape == (2, 2)
+
+
+def bound_of(freedom: float, false_alarms: float = FALSE_ALARMS) -> float:
+    """Value that a chi-square statistic of `freedom` passes with the probability `false_alarms`."""
+    from scipy.stats import chi2
+
+    free = freedom / CORRELATION
+    return float(CORRELATION * chi2.isf(false_alarms, free))
+
+
+def miss_rate(excess: float, freedom: float, false_alarms: float = FALSE_ALARMS) -> float:
+    """Probability that two touches that add `excess` to the mean of the statistic stay below the bound."""
+    from scipy.stats import ncx2
+
+    bound, free = bound_of(freedom, false_alarms) / CORRELATION, freedom / CORRELATION
+    return float(ncx2.cdf(bound, free, excess / CORRELATION))
+
+
+class TouchMonitor:
+    """Test of one finger against two, window by window, for signals that come in pieces of any length.
+
+    Parameters
+    ----------
+    model : DeviceModel
+        Of a plate with two coordinates, see `can_tell`.
+    late : int, samples, optional
+        From a row of the drive to the interval in which it acts; by default that of drives as they are played, ``delay
+        - block``.
+
+    Attributes
+    ----------
+    last : TouchTest or None
+        Result of the last window under a finger.
+    tests, detections : int
+        Windows that were tested, and those in which one finger could not explain the signals.
+    two : bool
+        Whether two fingers touch, by the last window; a lift ends it.
+    """
+
+    def __init__(self, model: DeviceModel, late: int | None = None) -> None:
+        if not can_tell(model):
+            raise ValueError(f"{len(model.mass)} coordinates: must be a plate with 2, and a sensor for each of them")
+        self.model, self.length, self._margin = model, round(WINDOW * model.rate), round(MARGIN * model.rate)
+        top = min(model.highest_frequency, 0.2 * model.rate)
+        self._filters = derivative_filters(float(model.rate), float(top))[:3]
+        self._late = model.delay - model.block if late is None else late
+        bins = np.arange(0, self.length // 2)
+        hertz = bins * model.rate / self.length
+        self._bins = bins[(hertz >= BAND[0]) & (hertz <= min(BAND[1], top))][::SPACING]
+        self._window = np.hanning(self.length + 1)[:-1]
+        self._noise = self._noise_density()
+        largest = [error * abs(getattr(model, name)).max() for name, error in ERRORS.items()]
+        self._prior = np.diag(np.repeat(largest, 3) ** -2.0)
+        self._information, self._known = self._prior.copy(), np.zeros(9)
+        self._rest: Array | None = None  # force that the free plate leaves at 0 Hz: offsets of the sensors
+        self._free: Array | None = None  # last window of the free plate, until no touch is seen to follow
+        self._pieces: list[tuple[Array, ...]] = []
+        self._count = 0
+        self.last: TouchTest | None = None
+        self.tests = self.detections = 0
+        self.two = False
+
+    def update(self, drive: Array, sensed: Array, position: Array, flags: Array) -> int:
+        """Take the next samples and return `Flag.TWO_TOUCHES` while two fingers touch, else 0.
+
+        Parameters
+        ----------
+        drive, sensed : ndarray, shape (n, channels) and (n, sensors)
+            As played and measured.
+        position : ndarray, shape (n,)
+            Of the finger (m), NaN while lifted.
+        flags : ndarray of int, shape (n,)
+            Windows with samples that are `UNUSABLE` are left out.
+        """
+        self._pieces.append((drive, sensed, position, flags & UNUSABLE))
+        self._count += len(position)
+        need = self.length + TAPS - 1 + self._late
+        while self._count >= need:
+            rows = np.concatenate([np.column_stack(piece) for piece in self._pieces])
+            channels, sensors = drive.shape[1], sensed.shape[1]
+            rows = rows[self._take(rows[:need]) :]
+            split = np.split(rows, [channels, channels + sensors, channels + sensors + 1], axis=1)
+            self._pieces, self._count = [(split[0], split[1], split[2][:, 0], split[3][:, 0])], len(rows)
+        return TWO_TOUCHES if self.two else 0
+
+    def restart(self) -> None:
+        """Begin a new window: samples are missing here."""
+        self._pieces, self._count, self._free = [], 0, None
+
+    def _take(self, rows: Array) -> int:
+        """Test or learn from a window; returns the samples that are done with: up to a while after a change."""
+        position, channels = rows[:, -2], self.model.force_from_drive.shape[1]
+        touching = np.isfinite(position)
+        changes = np.flatnonzero(np.diff(touching))
+        if changes.size or rows[:, -1].any() or not np.isfinite(rows[:, :-2]).all():
+            self.two, self._free = self.two and bool(touching.all()), None
+            return int(changes[-1]) + 1 + self._margin if changes.size else self.length
+        parts = self._parts(rows[:, :channels], rows[:, channels:-2])
+        if touching.all():
+            first = self._late + TAPS // 2 - 1
+            self.last = self._test(parts, self.model.lever_per_metre * position[first : first + self.length])
+            self.tests, self.two, self._free = self.tests + 1, self.last.two, None
+            self.detections += self.two
+        else:
+            if self._free is not None:
+                self._calibrate(self._free)
+            self.two, self._free = False, parts
+        return self.length
+
+    def _parts(self, drive: Array, sensed: Array) -> Array:
+        """Force B i and the motion's derivatives of order 0, 1, 2 in both coordinates, shape (4, 2, length)."""
+        model, n = self.model, self.length
+        motion = sensed[self._late :] @ model.coordinate_from_sensed.T
+        acting = drive[TAPS // 2 - 1 : TAPS // 2 - 1 + n] @ model.force_from_drive.T
+        derivatives = [[np.correlate(motion[:, c], each, "valid")[:n] for c in (0, 1)] for each in self._filters]
+        return np.array([acting.T, *derivatives])
+
+    def _noise_density(self) -> Array:
+        """Covariance of the force's spectrum by the sensors' noise, of 0 Hz and every bin, shape (bins + 1, 2, 2)."""
+        model, power = self.model, float(np.sum(self._window**2))
+        variance = self._sensed_variance()
+        turn = np.exp(2j * np.pi / self.length * np.multiply.outer(np.r_[0, self._bins], np.arange(TAPS)))
+        h = turn @ self._filters.T
+        terms = (model.stiffness, model.damping, model.mass)
+        response = sum(h[:, k, None, None] * each for k, each in enumerate(terms)) @ model.coordinate_from_sensed
+        density = variance * power * response @ np.conj(np.swapaxes(response, 1, 2))
+        density[0] += (DRIFT * self._window.sum()) ** 2 * (response[0] @ response[0].conj().T)
+        return density.real  # the sensors are alike: cross terms are real but for the filters' tiny phase
+
+    def _sensed_variance(self) -> float:
+        """Variance of a sensor's noise (m2)."""
+        return max(self.model.sensed_noise, LEAST_NOISE * self.model.sensed_limit) ** 2
+
+    def _spectrum(self, signal: Array) -> Array:
+        """Hann-weighted spectrum at 0 Hz and at the bins, along the last axis."""
+        return np.fft.rfft(signal * self._window, axis=-1)[..., np.r_[0, self._bins]]
+
+    def _force(self, parts: Array) -> Array:
+        """Return f = B i - K q - C q' - M q'' in both coordinates, shape (2, length)."""
+        model = self.model
+        return parts[0] - model.stiffness @ parts[1] - model.damping @ parts[2] - model.mass @ parts[3]
+
+    def _regressors(self, parts: Array) -> Array:
+        """Forces per error of K, C and M (entries 11, 12, 22 of each), shape (2, 9, length)."""
+        found = np.zeros((2, 9, parts.shape[-1]))
+        for i in range(3):
+            heave, rocking = parts[1 + i]
+            found[0, 3 * i], found[0, 3 * i + 1] = heave, rocking
+            found[1, 3 * i + 1], found[1, 3 * i + 2] = heave, rocking
+        return found
+
+    def _calibrate(self, parts: Array) -> None:
+        """Learn the plate's errors and the sensors' offsets from a window of the free plate; forget older ones.
+
+        Bins in which the plate hardly moves are left out: their noise would be taken for a softer plate.
+        """
+        force, rows = self._spectrum(self._force(parts)), self._spectrum(self._regressors(parts))
+        self._rest = force[:, 0].real
+        quiet = self._sensed_variance() * np.sum(self._window**2) * np.sum(self.model.coordinate_from_sensed[0] ** 2)
+        moved = np.flatnonzero(abs(rows[0, 0]) ** 2 > LEAST_SIGNAL * quiet)
+        moved = moved[moved > 0]
+        rows, force = np.moveaxis(rows[:, :, moved], 2, 0), force[:, moved].T[:, :, None]
+        # half the variance of a complex number is in its real part: of both together 2/S
+        weighted = 2.0 * rows.conj().transpose(0, 2, 1) @ np.linalg.inv(self._noise[moved])
+        self._information = self._prior + KEPT * (self._information - self._prior) + (weighted @ rows).real.sum(axis=0)
+        self._known = KEPT * self._known + (weighted @ force).real.sum(axis=0)[:, 0]
+
+    def _test(self, parts: Array, lever: Array) -> TouchTest:
+        """T over d by a grid and two refinements; the plate's errors are found for each d by least squares."""
+        force, per_error = self._force(parts), self._regressors(parts)
+        along, across = self._spectrum(force[0]), self._spectrum(force[1] - lever * force[0])
+        rows = self._spectrum(per_error[1] - lever * per_error[0]), self._spectrum(per_error[0])
+        if self._rest is None:
+            along, across, rows = along[1:], across[1:], (rows[0][:, 1:], rows[1][:, 1:])
+        else:
+            along[0] -= self._rest[0]
+            across[0] -= self._rest[1] - lever.mean() * self._rest[0]
+        spread, best = POSITION_ERROR * self.model.lever_per_metre, 0.0
+        mean, noise = float(lever.mean()), self._noise[len(self._noise) - along.size :]
+        for width in (1.0, 0.25, 0.0625):
+            errors = best + spread * width * SEARCH
+            values = [self._value(across - d * along, rows[0] - d * rows[1], noise, mean + d) for d in errors]
+            totals = np.array(values) + (errors / spread) ** 2
+            best, statistic = float(errors[np.argmin(totals)]), float(totals.min())
+        freedom = 2.0 * along.size - (1.0 if self._rest is not None else 0.0)  # at 0 Hz a number is real
+        return TouchTest(statistic, freedom, bound_of(freedom), best / self.model.lever_per_metre)
+
+    def _value(self, left: Array, rows: Array, noise: Array, lever: float) -> float:
+        """T without its term of d, for one d: least squares over the plate's errors."""
+        combine = np.array([-lever, 1.0])
+        variance = np.einsum("i,kij,j->k", combine, noise, combine)
+        weight = 2.0 / variance
+        if left.size > self._bins.size:
+            weight[0] = 1.0 / variance[0]
+        matrix = self._information + ((rows.conj() * weight) @ rows.T).real
+        vector = self._known + ((rows.conj() * weight) @ left).real
+        fixed = self._known @ np.linalg.solve(self._information, self._known)
+        return float(np.sum(weight * abs(left) ** 2) + fixed - vector @ np.linalg.solve(matrix, vector))
+
+
+def windows_under_touch(recording: Recording, model: DeviceModel) -> list[tuple[float, TouchTest]]:
+    """Test every whole window of a recording under a finger; each with the time by which it was over (s).
+
+    Parameters
+    ----------
+    recording : Recording
+        Of a plate, with the drive, what was sensed and the finger's position.
+    model : DeviceModel
+        As the plate is believed to be: of ``hapticrender.prepare(scene).model``, or of `PlateParameters.device_model`.
+    """
+    monitor, found, piece = TouchMonitor(model), [], round(0.1 * WINDOW * model.rate)
+    signals = [recording.drive, recording.sensed, recording.position, recording.flags]
+    for start in range(0, len(recording), piece):
+        before = monitor.tests
+        monitor.update(*(each[start : start + piece] for each in signals))
+        if monitor.last is not None and monitor.tests > before:
+            found.append((min(start + piece, len(recording)) / recording.rate, monitor.last))
+    return found
+
+
+class TouchWatch:
+    """A `TouchMonitor` on a running controller: while two fingers touch, the waveform law is set back and slowed.
+
+    What was learned of the finger returns to the prior, of the device to what it was while one finger explained the
+    signals, and the law trusts `SLOWER` times less in what it measures: it is the open inverse of an average finger,
+    which improves slowly.  Once one finger explains the signals again it learns as designed.
+
+    Parameters
+    ----------
+    model : DeviceModel
+    controller : Controller
+        Laws by bands are left as they are.
+    late : int, samples, optional
+        As for `TouchMonitor`.
+    active : bool
+        False: nothing is watched, as on a simulated device, which has one finger.
+    """
+
+    def __init__(self, model: DeviceModel, controller: Any, late: int | None = None, active: bool = True) -> None:
+        self.monitor = TouchMonitor(model, late) if active and can_tell(model) else None
+        self._law: Any = getattr(controller, "law", None)
+        self._kept: dict[str, Array] = {}
+        if self._law is not None:
+            self._kept["noise"] = self._law["noise"].copy()
+            self._note_device()
+
+    @property
+    def flags(self) -> Flag:
+        """`Flag.TWO_TOUCHES` once it was ever raised."""
+        return Flag.TWO_TOUCHES if self.monitor is not None and self.monitor.detections else Flag(0)
+
+    def update(self, signals: Mapping[str, Array]) -> Array:
+        """Take the next drive, sensed, position and flags; returns the flags, with `Flag.TWO_TOUCHES` where it is."""
+        monitor = self.monitor
+        if monitor is None or signals["sensed"].shape[1] != 2:
+            return signals["flags"]
+        before, tested = monitor.two, monitor.tests
+        raised = monitor.update(*(signals[name] for name in ("drive", "sensed", "position", "flags")))
+        if self._law is not None and (monitor.two != before or monitor.tests > tested):
+            self._slow_down(monitor.two, before)
+        return signals["flags"] | raised
+
+    def _slow_down(self, two: bool, before: bool) -> None:
+        """Set the law back at the first window with two touches, and slow it until there is one."""
+        law, kept, end = self._law, self._kept, int(LOAD)
+        if two and not before:
+            law["theta"][:end], law["covariance"][:end] = law["prior"][:end], law["spread"][:end]
+            law["covariance"][:, :end] = law["spread"][:, :end]
+            law["theta"][DEVICE], law["covariance"][DEVICE, DEVICE] = kept["theta"], kept["covariance"]
+        elif not two:
+            self._note_device()
+        law["noise"] = kept["noise"] * (SLOWER if two else 1.0)
+
+    def _note_device(self) -> None:
+        """Note what is learned of the device itself, while one finger explains the signals."""
+        law = self._law
+        self._kept["theta"], self._kept["covariance"] = (
+            law["theta"][DEVICE].copy(),
+            law["covariance"][DEVICE, DEVICE].copy(),
+        )

@@ -1,0 +1,258 @@
+"""Read recordings of other programs: name the columns of a CSV, MAT, HDF5 or NPZ file, with their scales."""
+
+from __future__ import annotations
+
+import csv
+import os
+from collections.abc import Callable, Mapping, Sequence
+from itertools import chain
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hapticrender.bands import Bands
+from hapticrender.checks import number, require, show
+from hapticrender.protocols import Array
+from hapticrender.recordings.formats import _h5py
+from hapticrender.recordings.journal import Header, join
+
+METHOD = "recorded elsewhere"
+EVEN = 0.5  # samples: farthest that a time may be from its place on an even grid
+Scale = float | tuple[float, float]
+Chosen = str | Sequence[str] | Mapping[str, Scale]
+
+
+def read_columns(path: str | os.PathLike[str]) -> dict[str, Array]:
+    """Read every numeric array of a file by name: .csv, .txt, .mat, .h5, .hdf5 or .npz.
+
+    A CSV file has one line of titles, between any lines that begin with # and the numbers; without it the columns are
+    "1", "2" and so on.  Columns of a table, shape (n, k), are named "table[0]" and so on; its longer side is time.
+
+    Raises
+    ------
+    OSError
+        The file is not there or may not be read.
+    ValueError
+        The format is not known, or the file damaged.
+    MissingExtra
+        An HDF5 file, or a MAT file of version 7.3, without h5py.
+    """
+    path = Path(path)
+    readers: dict[str, Callable[[Path], Mapping[str, Any]]] = {
+        ".csv": _read_text, ".txt": _read_text, ".mat": _read_mat, ".h5": _read_hdf5, ".hdf5": _read_hdf5,
+        ".npz": _read_npz,
+    }  # fmt: skip
+    require(path.suffix.lower() in readers, "path", str(path), f"a file that ends in {', '.join(readers)}")
+    with path.open("rb"):  # a missing file is the same OSError for every format
+        found = readers[path.suffix.lower()](path)
+    columns: dict[str, Array] = {}
+    for name, values in found.items():
+        values = np.squeeze(np.asarray(values))
+        if values.dtype.kind not in "iufb" or values.ndim > 2:
+            continue
+        if values.ndim < 2:
+            columns[name] = np.atleast_1d(values)
+        else:
+            long = values if values.shape[0] >= values.shape[1] else values.T
+            columns |= {f"{name}[{i}]": long[:, i] for i in range(long.shape[1])}
+    require(bool(columns), "path", str(path), "a file with columns of numbers")
+    return columns
+
+
+def assemble(
+    columns: Mapping[str, Any] | str | os.PathLike[str],
+    *,
+    drive: Chosen,
+    sensed: Chosen,
+    rate: float | None = None,
+    time: Chosen | None = None,
+    position: Chosen | None = None,
+    normal_load: Chosen | None = None,
+    carriers: Sequence[float] = (),
+    **header: Any,
+) -> tuple[Header, Array]:
+    """Header and frames from columns; see ``Recording.from_columns``."""
+    from hapticrender.touch.custom import Custom
+    from hapticrender.touch.scene import Scene
+
+    source = "columns" if isinstance(columns, Mapping) else Path(columns).name
+    table = columns if isinstance(columns, Mapping) else read_columns(columns)
+    inputs, outputs = (_several(table, key, chosen) for key, chosen in (("drive", drive), ("sensed", sensed)))
+    places = tuple(_scales(sensed))
+    require(bool(places), "sensed", sensed, "at least one column")
+    one = {"position": position, "normal_load": normal_load}
+    others = {key: _one(table, key, chosen) for key, chosen in one.items() if chosen is not None}
+    count = _length(table, drive, sensed, time, position, normal_load)
+    rate = _rate(rate, None if time is None else _one(table, "time", time), count)
+    own = {"name": Path(source).stem} | {key: header.pop(key) for key in ("name", "device") if key in header}
+    scene = Scene(texture=Custom(f"what {source} was recorded with"), duration=count / rate, settle=0.0, **own)
+    band = np.array([number("carriers", each, "Hz", above=0, most=rate / 2) for each in carriers])
+    made = Header.of(
+        scene,
+        **{"method": METHOD, "seed": 0, "rate": rate, "motion_source": "sensors", "places": places, **header},
+        bands=Bands(frequency=band, wavenumber=0 * band, phase=0 * band),
+        drive_channels=inputs.shape[1] if inputs.size else 0,
+        sensed_channels=outputs.shape[1],
+    )
+    unknown = np.full(count, np.nan)
+    signals = {"position": unknown, "normal_load": unknown, **others, "sensed": outputs, "motion": outputs}
+    signals |= {
+        "drive": inputs if inputs.size else np.zeros((count, 0)),
+        "target": np.zeros((count, len(band)), complex),
+    }
+    return made, join(made, signals | {"flags": np.zeros(count), "reference": np.zeros(count)})
+
+
+def _scales(chosen: Chosen) -> dict[str, tuple[float, float]]:
+    """Scale and offset by name of column."""
+    if isinstance(chosen, str):
+        chosen = [chosen]
+    given = chosen if isinstance(chosen, Mapping) else dict.fromkeys(chosen, 1.0)
+    pairs = {name: pair if isinstance(pair, tuple | list) else (pair, 0.0) for name, pair in given.items()}
+    for name, pair in pairs.items():
+        require(len(pair) == 2, f"columns[{name!r}]", pair, "a scale, or a scale and an offset")
+    return {
+        name: (number(f"scale of {name}", scale), number(f"offset of {name}", offset))
+        for name, (scale, offset) in pairs.items()
+    }
+
+
+def _column(table: Mapping[str, Any], name: str, scale: float, offset: float) -> Array:
+    """``scale (column - offset)``; counts of a column of unsigned integers are unwrapped first."""
+    if name not in table:
+        there = ", ".join(map(str, table)) or "none"
+        raise ValueError(f"column {show(name)} is missing: there are {there}")
+    values = np.squeeze(np.asarray(table[name]))
+    require(values.ndim == 1 and values.dtype.kind in "iufb", f"column {name}", table[name], "numbers, one a sample")
+    if values.dtype.kind == "u":
+        signed = f"i{values.itemsize}"  # of the first count, and of the steps
+        values = np.cumsum(np.append(values[:1].view(signed), np.diff(values).view(signed)), dtype=np.int64)
+    return scale * (values.astype(float) - offset)
+
+
+def _several(table: Mapping[str, Any], key: str, chosen: Chosen) -> Array:
+    """Columns side by side, shape (n, k), all finite."""
+    found = []
+    for name, pair in _scales(chosen).items():
+        values = _column(table, name, *pair)
+        bad = np.flatnonzero(~np.isfinite(values))
+        if bad.size:
+            cure = "cut the recording there, or interpolate"
+            raise ValueError(f"{key}: column {name}: {bad.size} values are not finite, first in row {bad[0]}: {cure}")
+        found.append(values)
+    lengths = {len(each) for each in found}
+    return np.column_stack(found) if len(lengths) == 1 else np.empty((0, 0))  # `_length` refuses several
+
+
+def _one(table: Mapping[str, Any], key: str, chosen: Chosen) -> Array:
+    """One column, which may have NaN."""
+    pairs = _scales(chosen)
+    require(len(pairs) == 1, key, chosen, "one column")
+    ((name, pair),) = pairs.items()
+    values = _column(table, name, *pair)
+    require(
+        not np.isinf(values).any(), f"{key}: column {name}", float(np.inf), "finite, or NaN where there is no value"
+    )
+    return values
+
+
+def _length(table: Mapping[str, Any], *choices: Chosen | None) -> int:
+    """Length of all chosen columns, at least 2."""
+    names = chain.from_iterable(_scales(each) for each in choices if each is not None)
+    lengths = {name: np.squeeze(np.asarray(table[name])).shape[0] for name in names}
+    if len(set(lengths.values())) > 1:
+        listed = ", ".join(f"{name} {length}" for name, length in lengths.items())
+        raise ValueError(f"columns differ in length: {listed} samples: all must be of one clock")
+    count = max(lengths.values(), default=0)
+    require(count >= 2, "columns", count, "at least 2 samples")
+    return count
+
+
+def _rate(rate: float | None, time: Array | None, count: int) -> float:
+    """Sampling rate (Hz) as given, or from the first and last time; every time (s) must be on that grid."""
+    if time is None:
+        require(rate is not None, "rate", None, "a sampling rate in Hz, or else name a column of times with time=")
+        return number("rate", rate, "Hz", least=1e-3, most=1e9)
+    bad = np.flatnonzero(~(np.diff(time) > 0))
+    if bad.size:
+        raise ValueError(
+            f"time: must rise, but row {bad[0] + 1} has {time[bad[0] + 1]:.9g} s after {time[bad[0]]:.9g} s"
+        )
+    measured = (count - 1) / float(time[-1] - time[0])
+    rate = measured if rate is None else number("rate", rate, "Hz", least=1e-3, most=1e9)
+    off = np.abs((time - time[0]) * rate - np.arange(count))
+    if off.max() > EVEN:
+        row = int(np.argmax(off > EVEN))
+        raise ValueError(
+            f"time: row {row} is {off[row]:.3g} samples off an even grid of {rate:.9g} Hz (mean rate {measured:.9g} "
+            "Hz): samples are missing, or the rate varies: cut the recording there, or resample it"
+        )
+    return rate
+
+
+def _read_text(path: Path) -> dict[str, Array]:
+    """Columns of a text with commas, semicolons, tabs or spaces between them."""
+    with path.open(encoding="utf-8-sig", newline="") as file:
+        skipped, line = 0, file.readline()
+        while line.startswith("#") or (line and not line.strip()):
+            skipped, line = skipped + 1, file.readline()
+        between = next((each for each in ",;\t" if each in line), None)
+        first = next(csv.reader([line], delimiter=between), []) if between else line.split()
+        titled = not all(map(_is_number, first))
+        names = [each.strip() for each in first] if titled else [str(i + 1) for i in range(len(first))]
+        lines = file if titled else chain([line], file)
+        rows = list(lines)
+    require(bool(first and rows), str(path), len(rows), "lines of numbers")
+    try:
+        numbers = np.genfromtxt(rows, delimiter=between, ndmin=2)
+    except ValueError as error:
+        raise ValueError(f"{path}: not a table of numbers ({' '.join(str(error).split())})") from error
+    if len(set(names)) < len(names) or numbers.shape[1] != len(names):
+        raise ValueError(f"{path}: line {skipped + 1} has the titles {show(names)}: one different one for each column")
+    return dict(zip(names, numbers.T, strict=True))
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
+
+
+def _read_mat(path: Path) -> dict[str, Any]:
+    from scipy.io import loadmat
+    from scipy.io.matlab import MatReadError
+
+    try:
+        found = loadmat(path, appendmat=False)
+    except NotImplementedError:  # version 7.3 is HDF5
+        return _read_hdf5(path)
+    except (MatReadError, TypeError, ValueError) as error:
+        raise ValueError(f"{path}: not a MAT file ({error})") from error
+    return {name: values for name, values in found.items() if not name.startswith("__")}
+
+
+def _read_hdf5(path: Path) -> dict[str, Array]:
+    h5py = _h5py()
+    found: dict[str, Array] = {}
+
+    def take(name: str, entry: Any) -> None:
+        if isinstance(entry, h5py.Dataset) and entry.dtype.kind in "iufb":
+            found[name] = entry[()]
+
+    try:
+        with h5py.File(path, "r") as file:
+            file.visititems(take)
+    except OSError as error:
+        raise ValueError(f"{path}: not an HDF5 file ({error})") from error
+    return found
+
+
+def _read_npz(path: Path) -> dict[str, Array]:
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            return {name: file[name] for name in file.files}
+    except (ValueError, OSError, EOFError, AttributeError) as error:
+        raise ValueError(f"{path}: not an NPZ file of arrays ({error})") from error

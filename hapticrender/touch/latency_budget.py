@@ -1,0 +1,172 @@
+"""Phase error of a grating, end to end: from a late, noisy sensor of the finger to the texture that is played.
+
+A texture over position is played at 2 pi x/wavelength, so an error dx of the position is a phase error of
+360 degrees dx/wavelength.  The estimator of `hapticrender.touch.motion_estimator` has settled on samples every T with
+the gain k.  Its estimate and the correction that is still being eased in (two poles of tau, `PanelReader`) are linear::
+
+    z[n] = A z[n-1] + B y[n],   z = [x, v, a, c1, c2],   x_played(t_n + h) = C(h) z[n]
+
+so a swipe X sin(w t), X = V/w, leaves the error X (C(h) (e^{jwT} I - A)^-1 e^{jwT} B - e^{jwh}), and white noise of
+variance R the variance R C(h) S C(h)^T, S = A S A^T + B B^T.  h runs from the latency over a sample's time, and longer
+after a lost one.  Both are exact for the filter at its constant gain; gate, irregular times and lifts are left out.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+
+from hapticrender.protocols import Array
+from hapticrender.touch.motion_estimator import FREQUENCY, SPEED, MotionEstimator, jerk_covariance, transition
+from hapticrender.touch.touch_panel import EASING, TouchPanel
+
+AGES = (np.arange(16) + 0.5) / 16  # of a sample's time: ages over which errors are averaged
+MOST_LOST = 1e-4  # longer runs of lost samples, of a smaller share, are left out
+FINEST, COARSEST = 1e-6, 10.0  # m
+
+
+def settled_gain(estimator: MotionEstimator, rate: float, speed: float = 0.0) -> tuple[Array, Array]:
+    """Gain, shape (3,), and covariance of the state (3, 3), after many samples at `rate` (Hz) at `speed` (m/s rms)."""
+    step, variance = 1.0 / rate, estimator.variance + (speed * estimator.jitter) ** 2
+    f, q = transition(step), jerk_covariance(step, estimator.density)
+    pace = step * (estimator.density / (variance * step)) ** (1 / 6)  # poles of the filter in continuous time, times T
+    covariance, gain = np.diag([variance, variance / step**2, variance / step**4]), np.zeros(3)
+    for _ in range(20 + math.ceil(40.0 / pace)):
+        predicted = f @ covariance @ f.T + q
+        gain = predicted[:, 0] / (predicted[0, 0] + variance)
+        reduced = np.eye(3)
+        reduced[:, 0] -= gain
+        covariance = reduced @ predicted @ reduced.T + variance * np.outer(gain, gain)
+    return gain, covariance
+
+
+def _system(gain: Array, step: float, latency: float, easing: float) -> tuple[Array, Array]:
+    """A (5, 5) and B (5,) of the module; without an easing the corrections are 0."""
+    reduced = np.eye(3)
+    reduced[:, 0] -= gain
+    a, b = np.zeros((5, 5)), np.zeros(5)
+    a[:3, :3], b[:3] = reduced @ transition(step), gain
+    if easing > 0.0:
+        jump = -_row(latency)[:3] @ gain  # of the position that is played, per innovation, at the sample's arrival
+        a[3:, :3], b[3:] = -jump * transition(step)[0], jump
+        a[3:, 3:] = math.exp(-step / easing) * np.array([[1.0, 0.0], [step / easing, 1.0]])
+    return a, b
+
+
+def _row(ahead: float, age: float = 0.0, easing: float = 0.0) -> Array:
+    """C(h), `age` after the arrival of the last sample, shape (5,)."""
+    u = age / easing if easing > 0.0 else 0.0
+    return np.array([1.0, ahead, 0.5 * ahead**2, u * math.exp(-u), math.exp(-u)])
+
+
+def frequency_response(
+    estimator: MotionEstimator, rate: float, frequency: Array, ahead: float = 0.0, order: int = 0
+) -> Array:
+    """Estimate over position at `frequency` (Hz, below rate/2), complex, of samples at `rate` (Hz).
+
+    `order` 0 is the position `ahead` (s) of the last sample, which without error is ``exp(j w ahead)``; 1 the velocity
+    there, per position, which is ``j w exp(j w ahead)``.
+    """
+    gain, _ = settled_gain(estimator, rate)
+    a, b = _system(gain, 1.0 / rate, 0.0, 0.0)
+    row = np.array([1.0, ahead, 0.5 * ahead**2] if order == 0 else [0.0, 1.0, ahead])
+    z = np.exp(2j * np.pi * np.atleast_1d(np.asarray(frequency, float)) / rate)
+    return np.array([row @ np.linalg.solve(each * np.eye(3) - a[:3, :3], each * b[:3]) for each in z])
+
+
+def bandwidth(estimator: MotionEstimator, rate: float) -> float:
+    """Frequency (Hz) at which the position's power is down to half; rate/2 where it never is."""
+    grid = np.linspace(0.0, 0.5 * rate, 4001)[1:]
+    below = np.flatnonzero(abs(frequency_response(estimator, rate, grid)) ** 2 < 0.5)
+    return float(grid[below[0]]) if below.size else 0.5 * rate
+
+
+def noise_gain(a: Array, b: Array) -> Array:
+    """S of the module: covariance of the state under white noise of variance 1, shape (n, n)."""
+    total, power = np.outer(b, b), a
+    with np.errstate(under="ignore"):
+        for _ in range(24):  # S over 2^k samples, doubled each time
+            total, power = total + power @ total @ power.T, power @ power
+    return total
+
+
+def noise_errors(estimator: MotionEstimator, rate: float, ahead: float = 0.0) -> tuple[float, float]:
+    """Standard errors of position (m) and velocity (m/s), `ahead` (s) of the last sample, by its noise alone."""
+    a, b = _system(settled_gain(estimator, rate)[0], 1.0 / rate, 0.0, 0.0)
+    spread = estimator.variance * noise_gain(a[:3, :3], b[:3])
+    rows = [1.0, ahead, 0.5 * ahead**2], [0.0, 1.0, ahead]
+    return tuple(math.sqrt(np.array(row) @ spread @ row) for row in rows)  # type: ignore[return-value]
+
+
+def _ages(panel: TouchPanel) -> Iterator[tuple[float, float]]:
+    """Age of the last sample beside its latency (s), and the share of the time with that age."""
+    lost, share = 0, 1.0 - panel.dropouts
+    while share > MOST_LOST:
+        for age in AGES:
+            yield (lost + age) / panel.rate, share / len(AGES)
+        lost, share = lost + 1, share * panel.dropouts
+
+
+def position_error(
+    panel: TouchPanel,
+    speed: float = SPEED,
+    *,
+    frequency: float = FREQUENCY,
+    delay: float = 0.0,
+    predicted: bool = True,
+    easing: float = EASING,
+) -> float:
+    """Error of the position at which a texture is played (m rms), for a swipe and all its reversals.
+
+    Parameters
+    ----------
+    panel : TouchPanel
+        Sensor of the finger.
+    speed, frequency : float, m/s and Hz
+        Peak speed of a sinusoidal swipe, and its frequency.
+    delay : float, s
+        Behind the sensor: from an estimate to the surface, as far as it is not predicted by the device's own loop.
+    predicted : bool
+        False: the last sample is played as it is, without an estimator.
+    easing : float, s
+        Pole pair by which corrections are spread; 0: none.
+    """
+    omega, step = 2 * math.pi * frequency, 1.0 / panel.rate
+    late, amplitude, rms = panel.latency + delay, speed / omega, speed / math.sqrt(2.0)
+    estimator, square, weight = panel.estimator(), 0.0, 0.0
+    variance = estimator.variance + (rms * panel.jitter) ** 2
+    if predicted:
+        a, b = _system(settled_gain(estimator, panel.rate, rms)[0], step, late, easing)
+        turn = np.exp(1j * omega * step)
+        played, spread = np.linalg.solve(turn * np.eye(5) - a, turn * b), noise_gain(a, b)
+    for age, share in _ages(panel):
+        row = _row(late + age, age, easing) if predicted else np.eye(5)[0]
+        found, noise = (row @ played, row @ spread @ row) if predicted else (1.0, 1.0)
+        bias = 0.5 * (amplitude * abs(found - np.exp(1j * omega * (late + age)))) ** 2
+        square, weight = square + share * (bias + variance * noise), weight + share
+    return math.sqrt(square / weight)
+
+
+def phase_error(panel: TouchPanel, speed: float, wavelength: float, **path: float) -> float:
+    """Phase error of a grating of `wavelength` (m), in degrees rms; `speed` and `path` as for `position_error`."""
+    return 360.0 * position_error(panel, speed, **path) / wavelength  # type: ignore[arg-type]
+
+
+def finest_wavelength(
+    panel: TouchPanel, speed: float, *, degrees: float = 30.0, highest: float = math.inf, **path: float
+) -> float:
+    """Finest grating (m) with a phase error of `degrees` rms, and at most `highest` (Hz) at the peak `speed` (m/s)."""
+    return max(360.0 * position_error(panel, speed, **path) / degrees, speed / highest)  # type: ignore[arg-type]
+
+
+PANELS = {  # for the table in docs/devices.md and the chart; engineering estimates
+    "encoder, 1 kHz, 0.5 um": TouchPanel(
+        rate=1000.0, noise=0.0, resolution=0.5e-6, latency=1e-3, jitter=0.0, dropouts=0.0
+    ),
+    "panel, 240 Hz, 8 ms": TouchPanel(rate=240.0, latency=8e-3),
+    "panel, 120 Hz, 15 ms": TouchPanel(),
+    "panel, 60 Hz, 25 ms": replace(TouchPanel(), rate=60.0, latency=25e-3),
+}

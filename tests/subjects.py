@@ -1,0 +1,92 @@
+"""Simulated subjects: a finger of known mechanics touches a plate that is 2 % off its profile, slides and lifts."""
+
+import warnings
+from dataclasses import dataclass
+
+import numpy as np
+
+import hapticrender as hr
+from hapticrender.touch.mechanics import HEAVY, HEAVY_SECOND, LIGHT, LIGHT_SECOND
+
+FREQUENCIES = np.array([20.0, 31.0, 47.0, 72.0, 111.0, 170.0, 261.0, 400.0])  # Hz, of the paper
+SPEED, LEAST = 10e-3, 6e-6  # m/s and m: amplitude of each band
+NAMES = ("mass", "inertia", "stiffness_1", "stiffness_2", "damping_1", "damping_2")
+ON, OFF, DURATION = 1.0, 4.0, 5.0  # s
+TABLE_1 = (LIGHT, HEAVY, LIGHT_SECOND, HEAVY_SECOND)
+
+
+@dataclass(frozen=True)
+class Subject:
+    """A finger: mechanics, load at the touch (N; it grows by a quarter), peak speed (m/s), and a seed of the plate."""
+
+    mechanics: hr.FingerMechanics
+    load: float
+    speed: float
+    seed: int
+    frequencies: tuple = tuple(FREQUENCIES)
+    off: float = 0.02  # of the plate from its profile
+
+    @property
+    def amplitudes(self):
+        return np.maximum(SPEED / (2 * np.pi * np.array(self.frequencies)), LEAST)
+
+    @property
+    def scene(self):
+        pairs = zip(self.frequencies, self.amplitudes.tolist(), strict=True)
+        bands = [hr.Grating(frequency=float(f), amplitude=a) for f, a in pairs]
+        texture = bands[0] if len(bands) == 1 else sum(bands[1:], bands[0])
+        load = ([0.0, ON, OFF], [self.load, self.load, 1.25 * self.load])
+        touch = {"normal_load": load, "touches": [(ON, OFF)], "mechanics": self.mechanics, "load_scaling": True}
+        stroke = 0.03
+        finger = (
+            hr.Finger.swiping(frequency=self.speed / (np.pi * stroke), stroke=stroke, **touch)
+            if self.speed
+            else hr.Finger.still(position=0.005, **touch)
+        )
+        off = np.random.default_rng(self.seed).standard_normal(len(NAMES))
+        true = PLATE * (1 + self.off * off)
+        return hr.Scene(
+            texture=texture,
+            finger=finger,
+            simulation=dict(zip(NAMES, true.tolist(), strict=True)),
+            duration=DURATION,
+            seed=self.seed,
+            keep_unfelt=True,
+            name=f"subject-{self.seed}",
+        )
+
+    def record(self):
+        """Render the subject in closed loop; the controller may say that the plate is not its model's."""
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", hr.PlateMismatch)
+            return hr.render(self.scene)
+
+    def impedance(self, frequency, load):
+        """True impedance (N s/m) at frequencies (n, bands) under loads (n,)."""
+        return self.mechanics.impedance(frequency) * self.mechanics.load_factor(load)[:, None]
+
+
+PLATE = np.array([32e-3, 4e-5, 22.4e3, 22.9e3, 0.85, 0.85])  # the default profile's
+
+
+def random_mechanics(rng):
+    """A finger of 2nd or 4th order, within a factor of about 2 of Table 1."""
+    m, b, k = rng.uniform(2e-3, 6e-3), rng.uniform(0.7, 2.0), rng.uniform(150.0, 400.0)
+    if rng.random() < 0.3:
+        return hr.FingerMechanics(order=2, mass=m, damping=b, stiffness=k, reference_load=0.5)
+    hard = rng.uniform(1.0, 8.0)
+    return hr.FingerMechanics(
+        order=4, mass=rng.uniform(1e-4, 4e-4), damping=1.5 * hard**0.8, stiffness=1e3 * hard,
+        phalanx_mass=m, phalanx_damping=b, phalanx_stiffness=k, reference_load=0.5,
+    )  # fmt: skip
+
+
+def population(count, seed=1):
+    """Subjects over loads of 0.1 to 1.2 N and speeds of 0 to 150 mm/s: Table 1, then random fingers."""
+    rng = np.random.default_rng(seed)
+    loads = np.geomspace(0.1, 1.2, count)[rng.permutation(count)]
+    speeds = np.linspace(0.0, 0.15, count)[rng.permutation(count)]
+    mechanics = [TABLE_1[i] if i < 4 else random_mechanics(rng) for i in range(count)]
+    seeds = range(seed, seed + count)
+    each = zip(mechanics, loads.tolist(), speeds.tolist(), seeds, strict=True)
+    return [Subject(*values) for values in each]

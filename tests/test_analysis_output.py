@@ -1,0 +1,62 @@
+"""The verb `finger`: what it prints, writes and refuses."""
+
+import json
+
+import numpy as np
+import pytest
+from subjects import Subject
+
+import hapticrender as hr
+from hapticrender import cli
+from hapticrender.analysis import output
+from hapticrender.touch.mechanics import LIGHT
+
+BANDS = (47.0, 111.0, 170.0)
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory):
+    path = tmp_path_factory.mktemp("finger") / "recording.npz"
+    recording = Subject(LIGHT, 0.4, 0.05, 9, frequencies=BANDS).record()
+    recording.save(path)
+    return path, recording
+
+
+def test_verb_writes_tables_pictures_and_a_summary(recorded, tmp_path, capsys):
+    pytest.importorskip("matplotlib")
+    path, recording = recorded
+    profile = tmp_path / "plate.toml"
+    hr.DeviceProfile(kind="vt-plate", device={"stiffness_1": 22.4e3}).save(profile)
+    out = tmp_path / "out"
+    assert cli.main(["finger", str(path), "--profile", str(profile), "--out", str(out)]) == 0
+    printed = capsys.readouterr().out
+    assert all(word in printed for word in ("touch", "111.0", "stiffness_1", "position is good to 1 mm"))
+    found = hr.analyse_finger(recording, profile)
+    series = np.loadtxt(out / "finger.csv", delimiter=",", skiprows=1)
+    assert series.shape == (-(-len(found.time) // 50), 8)
+    np.testing.assert_allclose(series[:, 1], found.normal_load.value[::50], rtol=1e-8)
+    windows = np.loadtxt(out / "impedance.csv", delimiter=",", skiprows=1)
+    np.testing.assert_allclose(windows[:, 4] + 1j * windows[:, 5], found.impedance.value.ravel(), rtol=1e-8)
+    figures = json.loads((out / "finger.json").read_text())
+    assert [each["kind"] for each in figures["segments"]].count("loaded") == 1
+    assert figures["plate"]["measured"]
+    assert (out / "index.html").exists()
+    assert cli.main(["finger", str(path), "--out", str(out)]) == 2
+    assert "is there: choose another folder, or add --force" in capsys.readouterr().err
+    assert cli.main(["finger", str(path), "--out", str(out), "--force"]) == 0
+
+
+def test_verb_names_the_recording_in_an_error(recorded, tmp_path, capsys):
+    path, _ = recorded
+    assert cli.main(["finger", str(path), "--block", "2", "--out", str(tmp_path / "out")]) == 2
+    error = capsys.readouterr().err
+    assert str(path) in error
+    assert "block = 2: must be <= the plate's delay of 1 samples" in error
+    assert not (tmp_path / "out").exists()
+
+
+def test_summary_of_a_recording_without_a_finger():
+    recording = hr.render(hr.Scene(texture=hr.Grating(frequency=111.0, amplitude=10e-6), duration=1.5))
+    text = output.text(hr.analyse_finger(recording))
+    assert "note: no finger touches" in text
+    assert "nan" not in text

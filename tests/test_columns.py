@@ -1,0 +1,213 @@
+"""Recordings of other programs: columns by name, with scales, from every format; what does not fit is refused."""
+
+import h5py
+import numpy as np
+import pytest
+from scipy.io import savemat
+
+import hapticrender as hr
+from hapticrender.recordings.columns import read_columns
+from hapticrender.touch.tribometer import load_swipe
+
+N, RATE = 400, 5000.0
+MEANING = {"drive": {"volt 1": -0.2, "volt 2": -0.2}, "sensed": {"adc 1": (122e-9, 8192), "adc 2": (122e-9, 8192)}}
+
+
+@pytest.fixture
+def theirs(rng):
+    """Volts, counts, times, a counter that wraps both ways, and a load that is unknown at times."""
+    counts = (2**32 - 50 + np.cumsum(rng.integers(-3, 4, N))).astype(np.uint32)
+    return {
+        "t": np.arange(N) / RATE + 7.0,
+        "volt 1": rng.standard_normal(N),
+        "volt 2": rng.standard_normal(N),
+        "adc 1": rng.integers(0, 16384, N),
+        "adc 2": rng.integers(0, 16384, N).astype(np.uint16).astype(np.int16),
+        "encoder": counts,
+        "load": np.where(np.arange(N) < 9, np.nan, 0.3),
+    }
+
+
+def write(path, columns):
+    if path.suffix == ".npz":
+        np.savez(path, **columns, note="a text")
+    elif path.suffix == ".mat":
+        savemat(path, {name.replace(" ", "_"): values for name, values in columns.items()} | {"note": "a text"})
+    elif path.suffix in (".h5", ".hdf5"):
+        with h5py.File(path, "w") as file:
+            for name, values in columns.items():
+                file[name] = values
+            file["note"] = "a text"
+    else:
+        between = {".csv": ",", ".txt": "\t"}[path.suffix]
+        head = between.join(columns)
+        table = np.column_stack([np.asarray(values, float) for values in columns.values()])
+        np.savetxt(path, table, "%.17g", between, header=f"# made by another program\n{head}", comments="")
+
+
+@pytest.mark.parametrize("ending", [".csv", ".txt", ".mat", ".npz", ".h5", ".hdf5"])
+def test_every_format_gives_the_columns_in_si(theirs, tmp_path, ending):
+    path = tmp_path / f"theirs{ending}"
+    write(path, theirs)
+    under = (lambda name: name.replace(" ", "_")) if ending == ".mat" else str
+    meaning = {key: {under(name): scale for name, scale in of.items()} for key, of in MEANING.items()}
+    made = hr.Recording.from_columns(path, time="t", normal_load="load", carriers=[111.0], **meaning)
+    for i in range(2):
+        np.testing.assert_array_equal(made.drive[:, i], -0.2 * theirs[f"volt {i + 1}"])
+        np.testing.assert_array_equal(made.sensed[:, i], 122e-9 * (theirs[f"adc {i + 1}"] - 8192.0))
+    np.testing.assert_array_equal(made.normal_load, theirs["load"])
+    assert np.isnan(made.position).all()
+    assert made.rate == pytest.approx(RATE, rel=1e-12)
+    assert (made.header.name, made.bands.frequency.tolist(), made.header.motion_source) == (
+        "theirs",
+        [111.0],
+        "sensors",
+    )
+
+
+@pytest.mark.parametrize("ending", [".au", ".h5", ".npz"])
+def test_it_is_a_recording_like_any_other(theirs, tmp_path, ending):
+    made = hr.Recording.from_columns(theirs, rate=RATE, name="theirs", sensed_noise=1e-6, **MEANING)
+    made.save(tmp_path / f"ours{ending}")
+    again = hr.Recording.load(tmp_path / f"ours{ending}")
+    assert again.header.to_json() == made.header.to_json()
+    np.testing.assert_array_equal(again.frames[:], made.frames)
+    assert again.summary()["verdict"] == "not judged"
+    assert again.scene.device == "vt-plate"
+    with pytest.raises(hr.SceneError, match="what was made in Python cannot be played"):
+        hr.render(again.scene)
+
+
+@pytest.mark.parametrize("kind", [np.uint8, np.uint16, np.uint32])
+def test_a_counter_is_unwrapped_both_ways(rng, kind):
+    steps = rng.integers(-100, 101, 3000)
+    true = np.cumsum(steps)
+    table = {"count": true.astype(kind), "x": np.zeros(3000)}
+    made = hr.Recording.from_columns(table, rate=RATE, drive=[], sensed="x", position={"count": 5e-7})
+    np.testing.assert_allclose(np.diff(made.position), 5e-7 * steps[1:], atol=1e-18)
+    assert abs(true).max() > np.iinfo(kind).max or kind is not np.uint8  # it did wrap
+    assert made.drive.shape == (3000, 0)
+
+
+def test_the_recorded_swipe_is_read(shared_data):
+    file = shared_data / "swipe_40mm_s.npz"
+    counts, swipe = read_columns(file), load_swipe(str(file))
+    made = hr.Recording.from_columns(
+        file, rate=float(counts["rate"][0]), drive=[], sensed="lateral_force", unit="N", normal_load="normal_force",
+        position={"encoder": float(counts["metre_per_count"][0])},
+    )  # fmt: skip
+    assert made.rate == swipe.rate
+    assert np.ptp(made.position - swipe.position) < 1e-12
+    np.testing.assert_array_equal(made.sensed[:, 0], counts["lateral_force"].astype(float))
+
+
+def test_tables_and_untitled_columns_have_numbers(tmp_path):
+    np.savez(tmp_path / "table.npz", sensed=np.arange(6.0).reshape(2, 3), rate=5000.0)
+    (tmp_path / "bare.csv").write_text("0;1\n2;3\n;4\n", encoding="utf-8")
+    table, bare = read_columns(tmp_path / "table.npz"), read_columns(tmp_path / "bare.csv")
+    assert {name: values.tolist() for name, values in table.items()} == {
+        "sensed[0]": [0.0, 1.0, 2.0], "sensed[1]": [3.0, 4.0, 5.0], "rate": [5000.0],
+    }  # fmt: skip
+    np.testing.assert_array_equal(bare["1"], [0.0, 2.0, np.nan])
+    np.testing.assert_array_equal(bare["2"], [1.0, 3.0, 4.0])
+
+
+def test_a_finger_is_the_same_in_someone_elses_columns(tmp_path):
+    """Drive in volts, displacement in counts of 1 nm from 5e6 on, as CSV: what is analysed does not change."""
+    finger = hr.Finger.still(0.005, normal_load=0.5, touches=[(0.8, 1.8)], mechanics="light")
+    texture = hr.Grating(frequency=111.0, amplitude=20e-6)
+    ours = hr.render(hr.Scene(texture=texture, finger=finger, duration=2.2))
+    columns = dict(zip("ab", -5.0 * ours.drive.T, strict=True)) | dict(
+        zip("cd", 1e9 * ours.sensed.T + 5e6, strict=True)
+    )
+    path = tmp_path / "theirs.csv"
+    write(path, columns)
+    meaning = {"drive": {"a": -0.2, "b": -0.2}, "sensed": {"c": (1e-9, 5e6), "d": (1e-9, 5e6)}}
+    theirs = hr.Recording.from_columns(path, rate=ours.rate, carriers=[111.0], **meaning)
+    one, other = (hr.analyse_finger(each) for each in (ours, theirs))
+    assert len(other.of_kind(2)) == 1
+    np.testing.assert_array_equal(other.contact, one.contact)
+    loaded = one.contact == 2
+    np.testing.assert_allclose(other.normal_load.value, one.normal_load.value, atol=1e-6)
+    np.testing.assert_allclose(other.position.value[loaded], one.position.value[loaded], atol=1e-7)
+    np.testing.assert_allclose(other.impedance.value, one.impedance.value, rtol=1e-5)
+
+
+def test_a_profile_goes_with_the_columns(tmp_path):
+    (tmp_path / "plate.toml").write_text('[device]\nkind = "vt-plate"\nmass = 0.03\n', encoding="utf-8")
+    made = hr.Recording.from_columns(SMALL, rate=RATE, drive="i", sensed="x", device=str(tmp_path / "plate.toml"))
+    assert made.scene.device_profile.device["mass"] == 0.03
+    made.save(tmp_path / "ours.npz")
+    assert hr.Recording.load(tmp_path / "ours.npz").scene.device_profile.device["mass"] == 0.03
+
+
+SMALL = {"t": np.arange(50) / RATE, "i": np.ones(50), "x": np.ones(50)}
+GAP = np.delete(np.arange(51), 20) / RATE
+
+
+@pytest.mark.parametrize(
+    ("columns", "meaning", "message"),
+    [
+        ({}, {"sensed": "y"}, "column 'y' is missing: there are t, i, x"),
+        ({"x": np.ones(49)}, {}, "columns differ in length: i 50, x 49 samples"),
+        (
+            {"x": np.r_[np.ones(9), np.nan, np.ones(40)]},
+            {},
+            "sensed: column x: 1 values are not finite, first in row 9",
+        ),
+        ({"i": np.full(50, "a")}, {}, "column i = .*: must be numbers, one a sample"),
+        (
+            {"w": np.r_[np.inf, np.ones(49)]},
+            {"normal_load": "w"},
+            "normal_load: column w = inf: must be finite, or NaN",
+        ),
+        ({}, {"rate": None}, "rate is missing: must be a sampling rate in Hz"),
+        ({"t": GAP}, {"time": "t", "rate": RATE}, "row 20 is 1 samples off an even grid of 5000 Hz"),
+        ({"t": SMALL["t"][::-1]}, {"time": "t"}, "time: must rise, but row 1 has 0.0096 s after 0.0098 s"),
+        ({}, {"time": "t", "rate": 5100.0}, "off an even grid of 5100 Hz .mean rate 5000 Hz"),
+        ({}, {"rate": 0.0}, "rate = 0.0: must be a finite number >= 0.001"),
+        ({}, {"carriers": [2501.0]}, "carriers = 2501.0: must be a finite number > 0 and <= 2500 Hz"),
+        ({}, {"sensed": []}, r"sensed = \[\]: must be at least one column"),
+        ({}, {"sensed": {"x": (1, 2, 3)}}, "must be a scale, or a scale and an offset"),
+        ({}, {"position": ["i", "x"]}, "position = .*: must be one column"),
+        ({}, {"sensed": {"x": np.nan}}, "scale of x = nan: must be a finite number"),
+    ],
+)
+def test_what_does_not_fit_is_refused(columns, meaning, message):
+    with pytest.raises(ValueError, match=message):
+        hr.Recording.from_columns(SMALL | columns, **{"drive": "i", "sensed": "x", "rate": RATE} | meaning)
+
+
+@pytest.mark.parametrize(
+    ("jitter", "good"), [(0.45, True), (0.55, False)], ids=["within half a sample", "beyond half a sample"]
+)
+def test_times_may_jitter_by_half_a_sample(jitter, good):
+    time = SMALL["t"] + np.where(np.arange(50) == 30, jitter / RATE, 0.0)
+    columns = SMALL | {"t": time}
+    if good:
+        assert hr.Recording.from_columns(columns, time="t", drive="i", sensed="x").rate == pytest.approx(RATE)
+    else:
+        with pytest.raises(ValueError, match="time: row 30 is 0.55 samples off"):
+            hr.Recording.from_columns(columns, time="t", drive="i", sensed="x")
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "message"),
+    [
+        ("a.xls", b"", "must be a file that ends in .csv"),
+        ("a.mat", b"no such thing", "not a MAT file"),
+        ("a.h5", b"no such thing", "not an HDF5 file"),
+        ("a.npz", b"no such thing", "not an NPZ file"),
+        ("a.csv", b"", "must be lines of numbers"),
+        ("a.csv", b"x,y\n", "must be lines of numbers"),
+        ("a.csv", b"x,x\n1,2\n", "one different one for each column"),
+        ("a.csv", b"x,y\n1,2,3\n", "one different one for each column"),
+        ("a.csv", b"x,y\n1,2\n3\n", "a.csv: not a table of numbers .*Line #2"),
+    ],
+)
+def test_files_that_are_none_are_refused(tmp_path, name, content, message):
+    (tmp_path / name).write_bytes(content)
+    with pytest.raises(ValueError, match=message):
+        read_columns(tmp_path / name)
+    with pytest.raises(FileNotFoundError):
+        read_columns(tmp_path / "missing.csv")

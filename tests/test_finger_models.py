@@ -1,0 +1,194 @@
+"""Fits of finger models: their intervals cover the truth as often as they say, and the data choose the order."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from finger_data import FREQUENCIES, make_impedance, make_record
+from scipy.stats import binom, chi2
+from subjects import population
+
+import hapticrender as hr
+from hapticrender.analysis.models import FEWEST, LOAD_CLASSES
+from hapticrender.analysis.records import Impedance
+from hapticrender.touch.mechanics import HEAVY, LIGHT, LIGHT_SECOND
+
+DRAWS = {2: 200, 4: 60}
+RARE = 1e-4  # probability of a false alarm of a bound
+FINGERS = {2: LIGHT_SECOND, 4: LIGHT}
+
+
+@pytest.fixture(scope="module", params=[2, 4])
+def fitted(request):
+    """Fits of one order to many measurements of one finger, with the truth at each fit's own reference load."""
+    rng, finger = np.random.default_rng(request.param), FINGERS[request.param]
+    fits = [
+        hr.fit_finger(make_impedance(rng, finger, 8, (0.1, 0.49), masked=0.1), request.param)
+        for _ in range(DRAWS[request.param])
+    ]
+    growth = [finger.load_factor(fit.mechanics.reference_load) for fit in fits]
+    truth = {
+        name: np.full(len(fits), 1 / 3) if name == "load_exponent" else getattr(finger, name) * np.array(growth)
+        for name in fits[0].names
+    }
+    return SimpleNamespace(fits=fits, truth=truth, finger=finger, growth=growth)
+
+
+@pytest.mark.parametrize("level", [0.683, 0.95])
+def test_intervals_cover_the_truth_as_often_as_they_say(fitted, level):
+    for name, truth in fitted.truth.items():
+        low, high = np.array([fit.interval(name, level) for fit in fitted.fits]).T
+        hits = int(((low <= truth) & (truth <= high)).sum())
+        assert binom.ppf(RARE, len(truth), level) <= hits <= binom.ppf(1 - RARE, len(truth), level), (name, hits)
+
+
+def test_chi_square_is_that_of_a_model_that_explains_the_data(fitted):
+    p = np.array([fit.p_value for fit in fitted.fits])
+    assert p.mean() == pytest.approx(0.5, abs=4 / np.sqrt(12 * len(p)))  # p is uniform
+
+
+def test_the_predicted_error_of_the_impedance_is_the_measured_one(fitted):
+    f = np.array([25.0, 150.0, 400.0])
+    off = np.array(
+        [
+            np.log(fit.impedance(f) / (growth * fitted.finger.impedance(f)))
+            for fit, growth in zip(fitted.fits, fitted.growth, strict=True)
+        ]
+    )
+    predicted = np.mean([fit.relative_error(f) for fit in fitted.fits], axis=0)
+    for part in (np.real, np.imag):  # ln |Z| and phase; the standard error of a deviation is 1/sqrt(2 n) of it
+        measured = np.sqrt(np.mean(part(off) ** 2, axis=0))
+        np.testing.assert_allclose(measured, part(predicted), rtol=4 / np.sqrt(2 * len(off)))
+
+
+def test_errors_of_the_plate_are_not_averaged_over_windows():
+    """All windows of a record have the same error of the plate's mass, damping and stiffness, drawn for each record."""
+    rng, w = np.random.default_rng(3), 2 * np.pi * FREQUENCIES
+    errors = np.array([3e-5, 0.02, 10.0])  # kg, N s/m, N/m
+    patterns = np.array([1j * w, w**0, 1 / (1j * w)])
+    record, pulls = make_record(rng, LIGHT_SECOND, plate_errors=errors[1:]), {"record": [], "impedance": []}
+    for _ in range(60):
+        z = make_impedance(rng, LIGHT_SECOND, 8, (0.1, 0.49), noise=0.02)
+        stated = np.sqrt(z.standard_error**2 + errors**2 @ np.abs(patterns) ** 2 / 2)
+        z = replace(z, value=z.value + (errors * rng.standard_normal(3)) @ patterns, standard_error=stated)
+        for name, measured in (("record", replace(record, impedance=z)), ("impedance", z)):
+            fit = hr.fit_finger(measured, 2)
+            truth = LIGHT_SECOND.load_factor(fit.mechanics.reference_load)
+            parts = [(getattr(fit.mechanics, key) / getattr(LIGHT_SECOND, key) - truth) for key in fit.names[:3]]
+            sigma = [fit.standard_errors[key] / getattr(LIGHT_SECOND, key) for key in fit.names[:3]]
+            pulls[name].append(np.divide(parts, sigma))
+    inside = (np.abs(pulls["record"]) < 1).sum(axis=0)
+    assert (binom.ppf(RARE, 60, 0.683) <= inside).all()
+    assert (np.sqrt(np.mean(np.square(pulls["impedance"]), axis=0)) > 1.5).all()
+
+
+@pytest.mark.parametrize(("order", "draws"), [(2, 12), (4, 6)])
+def test_the_data_choose_the_order(rng, order, draws):
+    """A finger of the 2nd order seems one of the 4th where chi^2 of 3 parameters gains more than 3 ln N."""
+    fits = [hr.fit_finger(make_impedance(rng, FINGERS[order], 6, (0.1, 0.49))) for _ in range(draws)]
+    wrong = sum(fit.order != order for fit in fits)
+    assert wrong <= binom.ppf(1 - RARE, draws, chi2.sf(3 * np.log(2 * 6 * len(FREQUENCIES)), 3))
+    assert all(fit.bic_margin > 0 for fit in fits)
+
+
+def test_errors_stated_too_small_do_not_choose_the_higher_order(rng):
+    data = make_impedance(rng, LIGHT_SECOND, 20, (0.1, 0.49))
+    assert hr.fit_finger(replace(data, standard_error=data.standard_error / 10)).order == 2
+
+
+def test_a_light_touch_is_not_explained_by_the_second_order(rng):
+    data = make_impedance(rng, LIGHT, 10, (0.1, 0.49))
+    assert hr.fit_finger(data, 2).p_value < 1e-6 < 1e-3 < hr.fit_finger(data, 4).p_value
+
+
+def test_each_class_of_loads_has_its_own_finger(rng):
+    light, heavy = (make_impedance(rng, LIGHT, 12, (0.1, 0.49)), make_impedance(rng, HEAVY, 12, (0.51, 1.5)))
+    fits = hr.fit_load_classes([light, heavy])
+    assert list(fits) == list(LOAD_CLASSES)
+    for finger, (name, fit) in zip((LIGHT, HEAVY), fits.items(), strict=True):
+        assert LOAD_CLASSES[name][0] <= fit.loads[0] < fit.loads[1] < LOAD_CLASSES[name][1]
+        truth = finger.stiffness * finger.load_factor(fit.mechanics.reference_load)
+        assert abs(fit.mechanics.stiffness - truth) < 4 * fit.standard_errors["stiffness"] < truth
+    assert list(hr.fit_load_classes(light)) == ["light"]
+    assert hr.fit_load_classes(light, {"all": (0, 2)}, order=2)["all"].order == 2
+
+
+def test_the_fingers_of_simulated_subjects_are_found():
+    """Two of Table 1, of either order, on plates 2 % off their profile: order, and 95 % intervals of all numbers."""
+    inside = []
+    for subject in population(10)[:4:3]:
+        fit = hr.fit_finger(hr.analyse_finger(subject.record()))
+        assert fit.order == subject.mechanics.order
+        growth = subject.mechanics.load_factor(fit.mechanics.reference_load)
+        given = {name: getattr(subject.mechanics, name, 0) * growth for name in fit.names} | {"load_exponent": 1 / 3}
+        inside += [
+            low <= given[name] <= high for name, (low, high) in ((each, fit.interval(each)) for each in fit.names)
+        ]
+    assert sum(inside) >= binom.ppf(RARE, len(inside), 0.95)
+
+
+def test_masked_entries_are_left_out(rng):
+    data = make_impedance(rng, LIGHT_SECOND, 9, (0.1, 0.49))
+    hidden = replace(data, value=np.where(np.arange(9)[:, None] < 3, np.nan, data.value))
+    shorter = Impedance(*(getattr(data, name)[3:] for name in data.__dataclass_fields__))
+    assert hr.fit_finger(hidden, 2).values == hr.fit_finger(shorter, 2).values
+
+
+def test_at_one_load_there_is_no_exponent(rng):
+    data = make_impedance(rng, LIGHT_SECOND, 5, (0.3, 0.3))
+    assert hr.fit_finger(data, 2).names == ("mass", "damping", "stiffness")
+    assert np.isnan(hr.load_exponent(data).exponent).all()
+
+
+@pytest.mark.parametrize("order", [2, 4])
+def test_too_few_carriers_are_refused_and_enough_are_not(rng, order):
+    few = make_impedance(rng, LIGHT, 6, (0.1, 0.49), frequency=FREQUENCIES[: FEWEST[order] - 1])
+    with pytest.raises(ValueError, match=f"{FEWEST[order] - 1} different carriers .* needs at least {FEWEST[order]}"):
+        hr.fit_finger(few, order)
+    enough = make_impedance(rng, LIGHT, 6, (0.1, 0.49), frequency=FREQUENCIES[: FEWEST[order]])
+    assert hr.fit_finger(enough, order).order == order
+    assert hr.fit_finger(enough).order == order  # with two carriers only the 2nd order can be fitted
+
+
+def test_what_makes_no_sense_is_refused(rng):
+    data = make_impedance(rng, LIGHT_SECOND, 3, (0.1, 0.49))
+    with pytest.raises(ValueError, match="standard_error = 0.0: must be > 0 N s/m"):
+        hr.fit_finger(replace(data, standard_error=0 * data.standard_error))
+    with pytest.raises(ValueError, match="0 different carriers with data at loads from 3 to 9 N"):
+        hr.fit_finger(data, loads=(3.0, 9.0))
+    with pytest.raises(ValueError, match="order = 3: must be 2, 4 or None"):
+        hr.fit_finger(data, 3)
+    with pytest.raises(ValueError, match="level = 1: must be > 0 and < 1"):
+        hr.fit_finger(data, 2).interval("mass", 1)
+    with pytest.raises(ValueError, match="phalanx_mass.*: must be one of mass, damping, stiffness, load_exponent"):
+        hr.fit_finger(data, 2).interval("phalanx_mass")
+
+
+def test_a_fitted_finger_goes_into_a_scene(rng):
+    mechanics = hr.fit_finger(make_impedance(rng, LIGHT, 6, (0.1, 0.49)), 4).mechanics
+    finger = hr.Finger.sliding(speed=0.05, normal_load=0.4, mechanics=mechanics, load_scaling=True)
+    scene = hr.Scene(texture=hr.Grating(frequency=111.0, amplitude=1e-5), finger=finger, duration=1.0)
+    assert hr.Scene.from_toml_text(scene.to_toml()).finger.mechanics == mechanics
+
+
+@pytest.mark.parametrize("exponent", [0.0, 1 / 3])
+@pytest.mark.parametrize("stated", [1.0, 1 / 3])
+def test_the_exponent_is_within_its_error_also_where_the_windows_scatter_more_than_they_state(rng, exponent, stated):
+    laws = []
+    for _ in range(40):
+        data = make_impedance(rng, LIGHT, 60, (0.1, 1.2), exponent=exponent, noise=0.06)
+        laws.append(hr.load_exponent(replace(data, standard_error=stated * data.standard_error)))
+    off = np.array([(law.exponent - exponent) / law.standard_error for law in laws])
+    inside = np.abs(off) < 1
+    assert inside.mean() == pytest.approx(0.683, abs=4 * np.sqrt(0.683 * 0.317 / off.size))
+    np.testing.assert_array_equal(laws[0].frequency, FREQUENCIES)
+    assert (laws[0].count == 60).all()
+
+
+def test_the_load_explains_what_it_explains(rng):
+    """R^2 is the share of the load in the variance of |Z|: here var(W) slope^2 against the noise."""
+    exact = make_impedance(rng, LIGHT, 400, (0.2, 1.0), exponent=1.0, noise=1e-3)
+    assert (hr.load_exponent(exact).determination > 0.9999).all()
+    unrelated = replace(exact, normal_load=rng.permutation(exact.normal_load))
+    assert (hr.load_exponent(unrelated).determination < 16 / 400).all()  # 4 standard errors of r, 1/sqrt(n), squared

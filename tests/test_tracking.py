@@ -1,0 +1,290 @@
+"""Motion estimators against what they predict of themselves, on simulated fingers and sensors and a recorded one."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from live_devices import Blind
+
+import hapticrender as hr
+from hapticrender.plants.plate import Plate, PlateParameters
+from hapticrender.touch import latency_budget as budget
+from hapticrender.touch.motion import SineMotion, TriangleMotion
+from hapticrender.touch.motion_estimator import ANYWHERE, MotionEstimator, jerk_covariance, transition
+from hapticrender.touch.touch_panel import PanelReader, TouchPanel
+
+PLAIN = {"jitter": 0.0, "dropouts": 0.0}
+OMEGA = 2 * np.pi * 3.0
+
+
+def followed(estimator, rate, positions, ahead=0.0):
+    """Estimates `ahead` of every sample."""
+    found = []
+    for n, position in enumerate(positions):
+        assert estimator.update(n / rate, position)
+        found.append(estimator.at(n / rate + ahead)[:2])
+    return np.array(found)
+
+
+@pytest.mark.parametrize(("rate", "noise"), [(60.0, 1e-4), (120.0, 5e-5), (1000.0, 1e-6)])
+@pytest.mark.parametrize("ahead", [0.0, 0.02])
+def test_the_filter_passes_what_it_predicts(rate, noise, ahead):
+    """Complex response of position and velocity at three frequencies, the half-power one among them."""
+    estimator = MotionEstimator(noise)
+    half = budget.bandwidth(estimator, rate)
+    frequencies = np.array([3.0, half, 0.4 * rate])
+    predicted = [budget.frequency_response(estimator, rate, frequencies, ahead, order) for order in (0, 1)]
+    for i, frequency in enumerate(frequencies):
+        wave = noise * np.exp(2j * np.pi * frequency * np.arange(600) / rate)  # small: inside the gate, so linear
+        seen = [followed(MotionEstimator(noise), rate, part, ahead) for part in (wave.real, wave.imag)]
+        found = (seen[0] + 1j * seen[1])[-100:] / wave[-100:, None]
+        for order in (0, 1):
+            np.testing.assert_allclose(found[:, order], predicted[order][i], rtol=1e-6)
+    if half < 0.5 * rate:  # to the steps of the grid on which it is looked for
+        assert abs(budget.frequency_response(estimator, rate, half)[0]) ** 2 == pytest.approx(0.5, abs=2e-3)
+    slow = budget.frequency_response(estimator, rate, np.array([0.1]), ahead)[0]
+    assert slow == pytest.approx(np.exp(0.2j * np.pi * ahead), abs=1e-4)  # no lag at low frequencies
+
+
+@pytest.mark.parametrize(("rate", "noise"), [(60.0, 1e-4), (240.0, 5e-5)])
+def test_the_filter_has_the_noise_that_it_predicts(rate, noise, rng):
+    estimator, ahead, apart = MotionEstimator(noise), 0.01, 12
+    found = followed(estimator, rate, noise * rng.standard_normal(8000), ahead)[100::apart]
+    predicted = budget.noise_errors(estimator, rate, ahead)
+    # estimates so far apart are independent: the memory is some 3 samples at 60 Hz and 6 at 240 Hz
+    np.testing.assert_allclose(found.std(axis=0), predicted, rtol=5 / np.sqrt(2 * len(found)))
+
+
+def test_standard_errors_are_right_under_irregular_times(rng):
+    """On fingers of white jerk: 68.3 % of the errors within one, of 600 independent ones, 5 sigma allowed."""
+    noise, latency, inside, scale = 50e-6, 15e-3, [], []
+    for _ in range(150):
+        estimator = MotionEstimator(noise, latency=latency)
+        root = np.linalg.cholesky(np.diag([1e-12, *estimator._prior[1:]]))
+        state, time = root @ rng.standard_normal(3), 0.0
+        for n in range(40):
+            step = rng.uniform(2e-3, 14e-3) + (40e-3 if rng.random() < 0.05 else 0.0)
+            shape = np.linalg.cholesky(jerk_covariance(step, estimator.density))
+            state, time = transition(step) @ state + shape @ rng.standard_normal(3), time + step
+            estimator.update(time + latency, state[0] + noise * rng.standard_normal())
+            if n % 10 == 9:
+                shape = np.linalg.cholesky(jerk_covariance(latency, estimator.density))
+                now = transition(latency) @ state + shape @ rng.standard_normal(3)
+                found = estimator.at(time + latency)
+                inside.append(np.abs(now[:2] - found[:2]) < found[2:])
+                scale.append((now[:2] - found[:2]) / found[2:])
+    assert np.mean(inside, axis=0) == pytest.approx(0.683, abs=5 * np.sqrt(0.683 * 0.317 / len(inside)))
+    assert np.std(scale, axis=0) == pytest.approx(1.0, abs=5 / np.sqrt(2 * len(scale)))
+
+
+@pytest.mark.parametrize("name", list(budget.PANELS)[1:])
+@pytest.mark.parametrize("speed", [0.01, 0.05])
+def test_the_latency_budget_is_what_a_panel_does(name, speed):
+    """Error of the played position on 3 Hz swipes; the budget is exact but for the gate."""
+    panel, rate, seconds = replace(budget.PANELS[name], **PLAIN), 1000.0, 16.0
+    truth = SineMotion(frequency=3.0, speed=speed).position(np.arange(round(seconds * rate)) / rate)
+    found = np.concatenate([PanelReader(panel, rate, seed=1)(truth)])
+    seen = np.sqrt(np.mean((found - truth)[1000:] ** 2))
+    predicted = budget.position_error(panel, speed)
+    independent = (seconds - 1.0) * budget.bandwidth(panel.estimator(), panel.rate)
+    assert seen == pytest.approx(predicted, rel=5 / np.sqrt(2 * independent))
+    assert budget.position_error(panel, speed, predicted=False) == pytest.approx(
+        np.sqrt(panel.noise**2 + panel.resolution**2 / 12 + np.mean(held(panel, speed) ** 2)), rel=0.01
+    )
+
+
+def held(panel, speed):
+    """Error of a position that is held from a sample on, over a swipe and over ages."""
+    time, age = np.meshgrid(np.linspace(0, 1, 500, endpoint=False), (np.arange(40) + 0.5) / 40 / panel.rate)
+    motion = SineMotion(frequency=3.0, speed=speed)
+    return motion.position((time - panel.latency - age).ravel() + 10.0) - motion.position(time.ravel() + 10.0)
+
+
+def test_prediction_and_the_order_of_the_errors():
+    panel = budget.PANELS["panel, 120 Hz, 15 ms"]
+    assert budget.position_error(panel, 0.05) < 0.5 * budget.position_error(panel, 0.05, predicted=False)
+    late = [budget.position_error(replace(panel, latency=each), 0.05) for each in (5e-3, 15e-3, 40e-3)]
+    assert sorted(late) == late
+    assert hr.finest_wavelength(panel, 0.05, degrees=30) == pytest.approx(12 * budget.position_error(panel, 0.05))
+    assert hr.finest_wavelength(panel, 0.1, highest=50.0) >= 2e-3
+    assert hr.phase_error(panel, 0.05, hr.finest_wavelength(panel, 0.05)) == pytest.approx(30.0)
+
+
+def test_dropouts_outliers_and_jitter_cost_no_more_than_the_budget_says(rng):
+    panel, rate = TouchPanel(dropouts=0.05, jitter=1e-3), 1000.0
+    truth = SineMotion(frequency=3.0, speed=0.05).position(np.arange(20_000) / rate)
+    found = PanelReader(panel, rate, seed=2)(truth)
+    predicted = budget.position_error(panel, 0.05)
+    assert np.sqrt(np.mean((found - truth)[1000:] ** 2)) == pytest.approx(predicted, rel=0.2)  # irregular: not exact
+    estimator, errors = panel.estimator(), []
+    for n in range(1200):
+        sample = truth[n * 8] + panel.noise * rng.standard_normal() + (0.02 if n % 20 == 19 else 0.0)
+        assert estimator.update(n * 8e-3 + panel.latency, sample) == (n % 20 != 19)
+        errors.append(estimator.at(n * 8e-3).position - truth[n * 8])
+    assert np.std(errors[100:]) < 2 * panel.noise  # an outlier of 20 mm leaves nothing
+
+
+def test_reversals_and_stops_are_caught_up_with():
+    """Instant reversals at 100 mm/s: within 6 samples (two poles of the filter each) the error is below 1 mm/20."""
+    motion, rate = TriangleMotion(speed=0.1, span=0.04), 240.0
+    time = np.arange(480) / rate
+    found = followed(ignoring(MotionEstimator(20e-6)), rate, motion.position(time))
+    since = np.mod(time - 0.2, 0.4) * rate  # samples since the last reversal, at 0.2, 0.6 ... s
+    settled = (since > 12) & (time > 0.1)
+    assert abs(found[settled, 0] - motion.position(time)[settled]).max() < 0.1e-3
+    stop = np.minimum(0.04 * time, 0.02)
+    found = followed(ignoring(MotionEstimator(20e-6)), rate, stop)
+    assert abs(found[-50:, 1]).max() < 1e-3
+
+
+@pytest.mark.parametrize("speed", [0.3, 1.0, 3.0])
+def test_a_flick_is_followed_though_no_swipe_is_so_fast(speed):
+    """Two samples beyond the gate make a new start, with the velocity between them; it is right from then on."""
+    estimator, rate = ignoring(MotionEstimator(50e-6)), 120.0
+    time = np.arange(60) / rate
+    truth = speed * np.maximum(time - 0.25, 0.0)
+    found = followed(estimator, rate, truth)
+    assert abs(found[-20:, 0] - truth[-20:]).max() < 5 * 50e-6
+    assert found[-20:, 1] == pytest.approx(speed, rel=0.05)
+
+
+def ignoring(estimator):
+    """The estimator, whatever `update` says of a sample."""
+    plain = estimator.update
+    estimator.update = lambda *sample: plain(*sample) is not None
+    return estimator
+
+
+def test_a_sample_may_state_its_own_error():
+    """Then it counts as one of a sensor with that error: a place found from the load is surer under a higher load."""
+    stated, plain = MotionEstimator(50e-6), MotionEstimator(1e-3)
+    for n in range(50):
+        for estimator, error in ((stated, 1e-3), (plain, None)):
+            estimator.update(n / 100, 0.02 * np.sin(OMEGA * n / 100), error)
+    assert stated.at(0.5) == pytest.approx(plain.at(0.5), rel=1e-12)
+    with pytest.raises(ValueError, match="error=0.0 m: must be finite and > 0"):
+        stated.update(1.0, 0.0, 0.0)
+
+
+def test_lift_return_and_patience():
+    estimator = MotionEstimator(50e-6, latency=5e-3)
+    assert np.isnan(estimator.at(0.0).position)
+    for n in range(30):
+        estimator.update(n / 120 + 5e-3, 0.05 * n / 120)
+    last = 29 / 120
+    assert estimator.at(last).velocity == pytest.approx(0.05, rel=0.02)
+    patience = ANYWHERE / OMEGA
+    assert np.isfinite(estimator.at(last + 0.99 * patience).position)
+    gone = estimator.at(last + 1.01 * patience)
+    assert np.isnan(gone.position)
+    assert gone.velocity == 0.0
+    assert estimator.update(0.3, np.nan)  # lifted
+    assert np.isnan(estimator.at(0.3).position)
+    assert estimator.update(0.31, -0.01)
+    back = estimator.at(0.305)
+    assert back.position == -0.01
+    assert back.velocity_error == pytest.approx(0.05)  # nothing is known of it but how fingers move
+    assert not estimator.update(0.31, -0.01)  # not later than the last one
+
+
+@pytest.mark.parametrize(("bits", "first"), [(32, 2**32 - 500), (16, 2**16 - 500), (16, 300)])
+def test_counts_wrap_both_ways(bits, first):
+    encoder = hr.Encoder(resolution=0.5e-6, bits=bits, origin=0.01)
+    motion = SineMotion(frequency=3.0, speed=0.16)
+    for n in range(500):
+        encoder.update(n * 1e-3, (first + round(motion.position(n * 1e-3) / 0.5e-6)) % 2**bits)
+    found = encoder.at(0.499)
+    assert found.position - 0.01 == pytest.approx(motion.position(0.499), abs=5 * found.position_error)
+    assert found.velocity == pytest.approx(0.16 * np.cos(OMEGA * 0.499), abs=5 * found.velocity_error)
+
+
+def test_the_recorded_swipe_slides_at_40_mm_s(shared_data):
+    with np.load(shared_data / "swipe_40mm_s.npz") as data:
+        counts, rate, step = data["encoder"], float(data["rate"]), float(data["metre_per_count"])
+    assert (np.diff(counts.astype(float)) > 2**31).any()  # it wraps
+    encoder, pick = hr.Encoder(resolution=step), 10  # 1 kHz
+    times, found = np.arange(0, len(counts), pick) / rate, []
+    for time, count in zip(times, counts[::pick], strict=True):
+        encoder.update(time, int(count))
+        found.append(encoder.at(time))
+    position, velocity, position_error, velocity_error = np.array(found).T
+    travelled = np.concatenate([[0], np.cumsum(np.diff(counts).view(np.int32).astype(int))])[::pick] * step
+    assert abs(position - travelled).max() < step + 5 * position_error.max()
+    slide = (times > 4.7) & (times < 6.8)
+    mean = (travelled[slide][-1] - travelled[slide][0]) / (times[slide][-1] - times[slide][0])
+    assert velocity[slide].mean() == pytest.approx(mean, abs=5 * velocity_error.max() / np.sqrt(slide.sum()))
+    assert mean == pytest.approx(0.04, rel=0.005)
+    moving = times[(velocity > 0.02) & (times > 4.0)]
+    raw = times[1:][(np.diff(travelled) > 0.5 * 0.04e-3) & (times[1:] > 4.0)]  # more than half the steps of the slide
+    assert [moving[0], moving[-1]] == pytest.approx([raw[0], raw[-1]], abs=5e-3)
+    rest = (times > 3.2) & (times < 4.2)
+    assert abs(velocity[rest]).max() < 1e-3
+
+
+def test_wrong_sensors_are_refused():
+    for make, message in (
+        (lambda: MotionEstimator(), "one must be > 1e-09 m"),
+        (lambda: MotionEstimator(1e-4, latency=-1.0), "latency = -1.0: must be a finite number >= 0 s"),
+        (lambda: MotionEstimator(1e-4).update(0.0, np.inf), "must be finite"),
+        (lambda: hr.Encoder(0.5e-6, bits=70), "bits = 70: must be an integer >= 2 and <= 64"),
+        (lambda: TouchPanel(rate=0.0), "rate = 0.0"),
+        (lambda: hr.Scene(texture=hr.Grating(frequency=50.0, amplitude=1e-6), duration=1.0, touch_panel={"hz": 1}),
+         "touch_panel.hz: no such parameter"),
+    ):  # fmt: skip
+        with pytest.raises((ValueError, TypeError), match=message):
+            make()
+
+
+def test_a_scene_with_a_touch_panel_is_played_at_the_estimated_position():
+    scene = hr.Scene(
+        texture=hr.Grating(wavelength=2e-3, amplitude=5e-6),
+        finger=hr.Finger.swiping(3.0, 0.05, touches=[(0.1, 1.4)]),
+        duration=1.6,
+        touch_panel={"rate": 240.0, "latency": 8e-3},
+    )
+    assert hr.Scene.from_toml_text(scene.to_toml()) == scene
+    recording = hr.render(scene)
+    truth = scene.finger.position(np.arange(len(recording)) / recording.rate)
+    late = np.flatnonzero(np.isfinite(recording.position))[[0, -1]] / recording.rate
+    assert late == pytest.approx([0.1, 1.4], abs=0.008 + 1 / 240 + 0.002)
+    error = (recording.position - truth)[round(0.4 * recording.rate) : round(1.39 * recording.rate)]
+    predicted = budget.position_error(scene.panel, 0.05)
+    assert np.sqrt(np.mean(error**2)) == pytest.approx(predicted, rel=5 / np.sqrt(2 * 40))  # 1 s of 40 Hz
+
+
+@pytest.mark.parametrize("pause", [1e-3, 8e-3, 20e-3])
+def test_a_player_takes_up_a_correction_however_often_it_is_called(pause, tmp_path):
+    """Two poles of 5 ms pass 1 - 5 exp(-4) = 91 % of it in 20 ms, less 2 ms of the call and of the loop: 86 %."""
+    device = Blind(Plate(PlateParameters(), hr.Finger.absent()))
+    with hr.Player("vt-plate", device, paced=False) as player:
+        player.play(hr.Grating(wavelength=1e-3, amplitude=5e-6))
+        for position in (0.0, 1e-3):
+            if position:
+                player.record(tmp_path / "step.au")
+            for _ in range(round(40e-3 / pause)):
+                player.finger(position, 0.0)
+                player.sleep(pause)
+        reached = player.end_recording().position[round(20e-3 * device.rate)]
+    assert 0.86e-3 < reached < 0.93e-3
+
+
+def test_an_application_behind_a_panel_is_within_the_budget(tmp_path, rng):
+    """Panel of 120 Hz, estimator, `Player.finger` 240 times a second: the error of the position that is played."""
+    panel, motion, done = replace(TouchPanel(), **PLAIN), SineMotion(frequency=3.0, speed=0.05), 0
+    estimator, device = panel.estimator(), Blind(Plate(PlateParameters(), hr.Finger.absent()))
+    with hr.Player("vt-plate", device, paced=False) as player:
+        player.play(hr.Grating(wavelength=2e-3, amplitude=5e-6))
+        player.record(tmp_path / "panel.au")
+        start = player.time
+        while (now := player.time) < start + 2.5:
+            while done / panel.rate + panel.latency <= now:
+                sample = motion.position(done / panel.rate) + panel.noise * rng.standard_normal()
+                estimator.update(done / panel.rate + panel.latency, sample)
+                done += 1
+            player.finger(*estimator.at(now)[:2])
+            player.sleep(1 / 240)
+        played = player.end_recording().position
+    error = (played - motion.position(start + np.arange(len(played)) / device.rate))[round(0.5 * device.rate) :]
+    independent = 2.0 * budget.bandwidth(panel.estimator(), panel.rate)
+    expected = budget.position_error(panel, 0.05)
+    assert np.sqrt(np.mean(error**2)) == pytest.approx(expected, rel=5 / np.sqrt(2 * independent))

@@ -1,0 +1,120 @@
+"""Two fingers on a plate: told from one at a stated rate of false alarms, flagged, held stable, refused in a scene."""
+
+import numpy as np
+import pytest
+from scipy.signal import firwin, lfilter
+from strangers_plate import WRONG, StrangersPlate
+from two_fingers import HEAVY, LIGHT, TwoFingers
+
+import hapticrender as hr
+from hapticrender.analysis.two_touches import (
+    CORRELATION,
+    SPACING,
+    TouchMonitor,
+    bound_of,
+    can_tell,
+    miss_rate,
+    windows_under_touch,
+)
+
+RATE, PAIR = 5000.0, ((HEAVY, -20e-3, 0.8, 0.6, 1.9), (HEAVY, 20e-3, 0.8, 1.0, 1.9))
+
+
+@pytest.fixture
+def noise(rng):
+    """White noise of 20-400 Hz, 5 um rms."""
+    samples = lfilter(firwin(401, [20, 400], pass_zero=False, fs=RATE), 1, rng.standard_normal(30_000))[401:]
+    return hr.Recorded(samples=samples, rate=RATE, amplitude=5e-6)
+
+
+@pytest.mark.parametrize("excess", [0.0, 40.0, 120.0])
+def test_false_alarms_and_misses_are_as_stated(excess, rng):
+    """Windows of noise and a known signal: the share below the bound is the predicted one, to 5 sigma of its count."""
+    length, rate, count = 500, 0.01, 4000
+    bins = np.arange(5, 101, SPACING)
+    window = np.hanning(length + 1)[:-1]
+    spectra = np.fft.rfft(rng.standard_normal((count, length)) * window)[:, bins] / np.sqrt(0.5 * np.sum(window**2))
+    spectra += np.sqrt(excess / len(bins)) * np.exp(1j * np.arange(len(bins)))
+    below = np.mean(np.sum(abs(spectra) ** 2, axis=1) < bound_of(2.0 * len(bins), rate))
+    predicted = miss_rate(excess, 2.0 * len(bins), rate) if excess else 1.0 - rate
+    assert below == pytest.approx(predicted, abs=5 * np.sqrt(predicted * (1 - predicted) / count))
+
+
+def test_one_sliding_finger_on_a_wrong_plate_is_one(noise):
+    """The statistic is that of noise: with up to 10 degrees of freedom less, for the errors that were in fact none."""
+    plate = StrangersPlate(
+        finger=HEAVY, load=0.8, contact=lambda time: 1.0 * (time > 1.0), report_lag=5e-3, told=2,
+        position=lambda time: 0.02 * np.sin(4.0 * time), **WRONG,
+    )  # fmt: skip
+    rendering = hr.prepare(hr.Scene(texture=noise, finger=hr.Finger.sliding(0.08, 0.8), duration=3.5), driver=plate)
+    recording = hr.run(rendering)
+    assert not (recording.flags & hr.Flag.TWO_TOUCHES).any()
+    found = [each for _, each in windows_under_touch(recording, rendering.model)]
+    assert len(found) >= 8
+    mean, freedom = np.mean([each.statistic for each in found]), found[0].freedom
+    spread = 5 * np.sqrt(2 * CORRELATION * freedom / len(found))
+    assert freedom - 10 - spread < mean < freedom + spread
+    assert max(abs(each.offset) for each in found) < 5 * 2e-3
+
+
+def rendered(texture, fingers, duration=2.4, **plate):
+    """Recording, and the plate."""
+    device = TwoFingers(*fingers, **plate)
+    finger = hr.Finger.still(fingers[0][1], fingers[0][2], mechanics="light")
+    return hr.render(hr.Scene(texture=texture, finger=finger, duration=duration), driver=device), device
+
+
+@pytest.mark.parametrize("second", [PAIR[1], (LIGHT, 40e-3, 0.3, 1.0, 1.9)], ids=["alike", "lighter"])
+def test_a_second_finger_is_flagged_and_the_plate_plays_as_well_as_without_feedback(noise, second):
+    """Flagged from the second whole window after it came until the lift; then the law is as good as before."""
+    recording, plate = rendered(noise, (PAIR[0], second))
+    flagged = np.flatnonzero(recording.flags & hr.Flag.TWO_TOUCHES) / RATE
+    assert 1.0 < flagged[0] < 1.0 + 2 * 0.25 + 0.06
+    assert 1.9 < flagged[-1] < 1.9 + 2 * 0.25 + 0.06
+    assert len(flagged) == round((flagged[-1] - flagged[0]) * RATE) + 1
+    assert not recording.flags[recording.flags != int(hr.Flag.TWO_TOUCHES)].any()
+    _, blind = rendered(noise, (PAIR[0], second), senses=False)
+    reference = noise.waveform(np.arange(len(recording)) / RATE, np.zeros(len(recording)))
+    slowed, open_loop = (np.linalg.norm(each.error(reference, 1.6, 1.9)) for each in (plate, blind))
+    # each is the rms of 0.3 s of 380 Hz: 2 B T = 228 numbers, to 3 sigma of the ratio
+    assert slowed < open_loop * (1 + 3 / np.sqrt(228))
+    assert plate.error(reference, 2.2, 2.4).max() < 0.1  # on the free plate, 0.3 s after the lift
+
+
+def test_what_one_finger_explains_is_not_flagged(noise):
+    """Two alike at the same distance from the place that is reported load the plate as one between them would."""
+    first = (HEAVY, -20e-3, 0.8, 0.6, 9.0)
+    recording, _ = rendered(noise, (first, (HEAVY, 20e-3, 0.8, 0.6, 9.0)), 1.6, place=0.0)
+    assert not (recording.flags & hr.Flag.TWO_TOUCHES).any()
+
+
+@pytest.mark.parametrize("fingers", [1, 2])
+def test_live_play_flags_two_touches_and_no_single_one(fingers, tmp_path):
+    device = TwoFingers(*((*each[:3], 0.6, 9.0) for each in PAIR[:fingers]))
+    with hr.Player("vt-plate", device, paced=False) as player:
+        player.play(hr.Grating(frequency=120.0, amplitude=5e-6))
+        player.sleep(0.6)
+        player.record(tmp_path / "two.au")
+        for _ in range(40):
+            player.finger(-20e-3, 0.0, 0.8)
+            player.sleep(0.02)
+        expected = fingers == 2
+        assert bool(player.state().flags & hr.Flag.TWO_TOUCHES) == expected
+        assert bool((player.end_recording().flags & hr.Flag.TWO_TOUCHES).any()) == expected
+
+
+def test_devices_without_force_and_moment_are_not_watched():
+    model = hr.prepare(hr.Scene(texture=hr.Grating(frequency=50.0, amplitude=1e-6), duration=1.0, profile={"coils": 1}))
+    assert not can_tell(model.model)
+    with pytest.raises(ValueError, match="1 coordinates: must be a plate with 2"):
+        TouchMonitor(model.model)
+
+
+def test_a_scene_with_two_fingers_is_refused():
+    finger, texture = hr.Finger.still(0.01), hr.Grating(frequency=50.0, amplitude=1e-6)
+    with pytest.raises(ValueError, match="finger: 2 fingers are stated: must be one"):
+        hr.Scene(texture=texture, finger=[finger, finger], duration=1.0)
+    two = '[[finger]]\nmotion = "still"\n' * 2
+    text = f'duration = 1.0\n[texture]\nkind = "grating"\nfrequency = 50.0\namplitude = 1e-6\n{two}'
+    with pytest.raises(hr.SceneError, match="finger: 2 fingers are stated: must be one"):
+        hr.Scene.from_toml_text(text)
