@@ -117,8 +117,8 @@ def draw(rows: dict[str, list[StabilityMap]], dampers: list[DamperMap]) -> Any:
             for panel, each in zip(lane, row, strict=True):
                 shade = _by_bands(panel, each)
             lane[0].set_ylabel(f"{METHODS[method]}\nbandwidth (Hz)".replace(": ", ":\n"))
-        for panel, each in zip(axes[-1], dampers, strict=True):
-            _damper(panel, each)
+        for panel, found in zip(axes[-1], dampers, strict=True):
+            _damper(panel, found)
         axes[-1, 0].set_ylabel("inverse, the default:\ndamper around contacts\nfactor on its gain")
         for panel, case in zip(axes[0], columns, strict=True):
             panel.set_title(case.title, loc="center")
