@@ -71,7 +71,8 @@ def analyse_finger(
     -----
     Contact is first decided on the profile's plate; the plate's parameters and the sensors' zero are then estimated
     from the spans without contact, and all is repeated with them.  On a plate so far off its profile that its carriers
-    look like touches no such span is left: then it is where the force below 5 Hz is near zero.  The series end 85 ms before the recording does.
+    look like touches no such span is left: then they are taken where the force below 5 Hz is near zero.  The series end
+    85 ms before the recording does.
     """
     course = _believed(recording, profile)
     late = course.plate.delay - block
@@ -180,9 +181,9 @@ class _Signals:
         return Touch(time, load, position, velocity, contact)
 
     def slow_force(self, course: Course) -> Array:
-        """Heave force (N, (n,)) below `SLOWEST` / 3, where carriers on a plate that is far off its profile leave nothing.
+        """Heave force (N, (n,)) below a third of `SLOWEST`: of a carrier there 4 % pass, at 20 Hz 0.4 %.
 
-        Of the lowest carrier, `SLOWEST`, 4 % pass, of 20 Hz 0.4 %.
+        What carriers leave of a plate that is far off its profile is not in it.
         """
         from scipy.ndimage import gaussian_filter1d
 

@@ -122,7 +122,7 @@ class LocalLine:
         return self._half_power(0, smoothed), self._half_power(1, smoothed)
 
     def _half_power(self, which: int, smoothed: float) -> float:
-        """First frequency (Hz) at which level (0) or slope (1) passes less than half of the power: to 2, then 0.05 Hz."""
+        """First frequency (Hz, in steps of 0.05) at which level (0) or slope (1) passes less than half of the power."""
         low = 0.0
         for step, count in ((2.0, 250), (0.05, 40)):
             frequency = low + step * np.arange(1, count + 1)
