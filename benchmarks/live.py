@@ -20,7 +20,8 @@ import hapticrender as hr
 from hapticrender.control.methods import METHODS
 from hapticrender.jit import CFunction
 from hapticrender.plants.plate import Plate, PlateParameters
-from hapticrender.realtime import AUDIO, RealtimeEntry
+from hapticrender.realtime import RealtimeEntry
+from hapticrender.realtime_kernel import AUDIO
 from hapticrender.voices import Voice
 from tests.strangers_plate import StrangersPlate
 

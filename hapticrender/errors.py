@@ -64,10 +64,9 @@ class WatchdogTimeout(HapticError):
     `time` (s) counts from the start of the run.
     """
 
-    def __init__(self, time: float) -> None:
-        super().__init__(
-            f"stopped at {time:.4g} s: no method of the player was called for as long as its watchdog allows"
-        )
+    def __init__(self, time: float, watchdog: float | None = None) -> None:
+        allowed = "the time of its watchdog" if watchdog is None else f"{watchdog:g} s, the time of its watchdog"
+        super().__init__(f"stopped at {time:.4g} s: no method of the player was called for {allowed}")
         self.time = time
 
 

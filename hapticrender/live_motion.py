@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from hapticrender.protocols import Array
-from hapticrender.realtime import HORIZON
+from hapticrender.realtime_kernel import HORIZON
 
 
 class LiveMotion:

@@ -30,7 +30,7 @@ import numpy as np
 
 from hapticrender.control.probe import probe_plate
 from hapticrender.devices import open_driver
-from hapticrender.errors import HapticError
+from hapticrender.errors import HapticError, WatchdogTimeout
 from hapticrender.live import LiveLoop
 from hapticrender.live_motion import LiveMotion
 from hapticrender.live_recorder import LiveRecorder
@@ -435,6 +435,8 @@ class Player:
             self._recorder.append(signals, gap, loop.motion_source)
         if self._error is None and (fault := loop.fault()):
             self._error = fault
+            if isinstance(fault, WatchdogTimeout):
+                self._error = WatchdogTimeout(fault.time, self._watchdog)
 
     def _rest(self, gently: bool) -> None:
         """Set zero drive, after a fade where nothing has failed, and wait until a whole block of it has been played."""

@@ -290,7 +290,7 @@ def test_what_no_plate_can_play_is_said(rng):
     played = np.fft.irfft(np.where(np.fft.rfftfreq(len(noise), 1 / RATE) < 500.0, np.fft.rfft(noise), 0.0))
     summary = make_play(noise, played).summary()
     assert (summary["verdict"], summary["passed"]) == ("passed in band", False)
-    assert any(note.startswith("not playable: 6") for note in summary["notes"])
+    assert any(note.startswith("not judged: 6") for note in summary["notes"])
     assert summary["waveform"]["share_outside"] == pytest.approx(1000 / 1480, abs=0.02)  # 4 s of noise
     faint = make_play(noise + 1e-9 * np.cos(2 * np.pi * 700 * times(4.0)) - noise + played, played).summary()
     assert faint["verdict"] == "passed"  # 1 nm at 700 Hz is below the threshold

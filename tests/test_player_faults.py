@@ -39,7 +39,7 @@ def test_the_watchdog_stops_the_drive_of_an_application_that_hangs(tmp_path):
         player.record(tmp_path / "hung.au")
         player.sleep(1.0)  # longer than the watchdog's time, and no stop
         player._advance(0.4)
-        with pytest.raises(hr.WatchdogTimeout, match=r"stopped at 1\.3 s: no method of the player was called"):
+        with pytest.raises(hr.WatchdogTimeout, match=r"stopped at 1\.3 s: no method of the player .* for 0\.3 s"):
             player.sleep(0.1)
     hung = Recording.load(tmp_path / "hung.au")
     first = int(np.argmax(hung.flags & hr.Flag.STOPPED > 0))

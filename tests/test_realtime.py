@@ -18,21 +18,8 @@ from hapticrender.jit import F8, kernel, pointer
 from hapticrender.mathx import smoothstep
 from hapticrender.plants.plate import PlateParameters
 from hapticrender.protocols import Flag
-from hapticrender.realtime import (
-    ENTRY,
-    FRESH,
-    GAIN_TIME,
-    HOLD,
-    HORIZON,
-    JUMP,
-    JUMP_TIME,
-    MIDDLE_AT,
-    SLOTS,
-    TOUCH_FADE,
-    RealtimeEntry,
-    publish,
-    swap,
-)
+from hapticrender.realtime import GAIN_TIME, JUMP_TIME, SLOTS, TOUCH_FADE, RealtimeEntry
+from hapticrender.realtime_kernel import ENTRY, FRESH, HOLD, HORIZON, JUMP, MIDDLE_AT, publish, swap
 from hapticrender.voices import FADE, Voice
 
 RATE, BLOCK = 5000.0, 10

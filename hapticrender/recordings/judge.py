@@ -171,7 +171,7 @@ def _verdict(recording: Recording, worst: dict[str, Any]) -> tuple[str, str]:
                 "not judged",
                 f"the noise of the sensors alone reads {percent(noise)}, the worst figure is no clearer",
             )
-        return "failed", ""
+        return "failed", _stopped(recording)
     counts = _flag_counts(recording, round(judged_from(recording) * recording.rate))
     raised = [f"{flag.name} in {count} samples" for flag, count in counts.items() if count and flag & MATTERS]
     if raised:
@@ -183,8 +183,17 @@ def _verdict(recording: Recording, worst: dict[str, Any]) -> tuple[str, str]:
     return "passed", ""
 
 
+def _stopped(recording: Recording) -> str:
+    """State when the drive was stopped; nothing where it was not."""
+    for start in range(0, len(recording), READ_AT_ONCE):
+        stopped = recording.read("flags", start, start + READ_AT_ONCE) & Flag.STOPPED
+        if stopped.any():
+            return f"the drive was stopped at {(start + int(np.argmax(stopped > 0))) / recording.rate:.4g} s"
+    return ""
+
+
 def _unplayable(share: float) -> str:
-    return f"not playable: {percent(share)} of the texture's energy, outside {IN_BAND}"
+    return f"not judged: {percent(share)} of the reference's energy, which lies outside {IN_BAND}"
 
 
 def _worst(recording: Recording) -> dict[str, Any]:
@@ -215,6 +224,10 @@ def _notes(recording: Recording, bands: list[dict[str, Any]], settled: Array) ->
             f"+-{percent(header.calibration)}, which is added to every figure" if header.calibration else "not known"
         )
         notes.append(f"the figures come from the sensors, whose errors do not show; uncertainty of their gain: {known}")
+    if touched := _flag_counts(recording)[Flag.TWO_TOUCHES]:
+        notes.append(f"more than one finger touched, in {percent(touched / len(recording))} of the samples")
+    if "[touch_panel]" in header.scene:
+        notes.append("the texture lies where a touch panel located the finger: its error does not show in the figures")
     if seconds < header.duration - 0.5 / recording.rate:
         notes.append(f"the run ended after {seconds:.3f} s of {header.duration:.3f} s")
     if seconds < 2 * header.settle:

@@ -1,0 +1,245 @@
+"""What the real-time entry runs: hand-over, the finger between two calls, textures, watchdog, controller, log.
+
+`realtime.RealtimeEntry` makes the record and says what it is for.
+"""
+
+from __future__ import annotations
+
+import sys
+
+import numba
+import numpy as np
+from numba import carray, types
+
+from hapticrender.control.carriers import track_finger
+from hapticrender.control.records import CONTROLLER_T
+from hapticrender.jit import F8, I8, CFunction, call, entry, kernel, pointer, record, swap
+from hapticrender.protocols import Flag
+from hapticrender.voices import VOICE_T, along_surface, eased, in_time
+
+HORIZON = 0.05  # s: without a new position the finger stays where it was bound for by then,
+HOLD = 0.25  # s: and after so long what lies along the surface fades out
+JUMP = 2e-3  # m: a larger correction of the position is a leap
+CONTINUE, ABORT = 0, 2  # results of PortAudio's callback
+OVERRUN, STOPPED = int(Flag.OVERRUN), int(Flag.STOPPED)
+LOST = 0b1111  # PortAudio's status: input or output under- or overflow
+UNSIGNED_LONG = types.uint32 if sys.platform == "win32" else types.uint64
+F4 = types.float32
+FRESH = 4  # bit beside the number of the slot in the middle: not yet read
+# entries of a slot: the finger's position, speed and load, whether anything is played, the gain, the voice's address,
+# how often finger and setpoints have changed, the watchdog's time (samples; 0: none), how often the application has
+# called, then the setpoints row by row
+POSITION, VELOCITY, LOAD, PLAYING, GAIN, VOICE_ADDRESS, FINGER_CHANGES, SETPOINT_CHANGES, WATCHDOG, CALLS = range(10)
+HEAD = 10
+
+_ADDRESSES = "step controller signals slots_at setpoints_at sensed_at drive_at position_at waveform_at flags_at"
+_COUNTS = "block sensors channels setpoints middle slot age samples flags refused lost ahead analysed idle timed_out"
+_TEXTURE = "current previous switch gains_at tracker log_at log_rows log_width given taken"
+_STATE = "finger_changes setpoint_changes calls gain touch place pace offset offset_input lead lead_input open"
+_SETTINGS = "rate sensed_scale drive_scale fade touch_step gain_pole offset_kept closing_step"
+ENTRY = np.dtype(
+    [
+        *((name, np.int64) for name in f"{_ADDRESSES} {_COUNTS} {_TEXTURE}".split()),
+        *((name, np.float64) for name in f"{_STATE} {_SETTINGS}".split()),
+    ]
+)
+ENTRY_T = numba.from_dtype(ENTRY)
+MIDDLE_AT = ENTRY.fields["middle"][1] if ENTRY.fields else 0
+
+
+@entry
+def publish(entry, back):
+    """Swap the writer's slot `back` for the one in the middle; returns the writer's next slot."""
+    return swap(entry + MIDDLE_AT, back | FRESH) & (FRESH - 1)
+
+
+@kernel
+def receive(entry):
+    """Take up what the application has handed over; returns the address of the slot."""
+    e = record(entry, ENTRY_T, 0)
+    if e.middle & FRESH:
+        e.slot = swap(entry + MIDDLE_AT, e.slot) & (FRESH - 1)
+    width = HEAD + e.setpoints
+    slot = carray(pointer(e.slots_at + 8 * width * e.slot, F8), width)
+    if slot[SETPOINT_CHANGES] != e.setpoint_changes:
+        e.setpoint_changes = slot[SETPOINT_CHANGES]
+        setpoints = carray(pointer(e.setpoints_at, F8), e.setpoints)
+        for i in range(e.setpoints):
+            setpoints[i] = slot[HEAD + i]
+    if slot[FINGER_CHANGES] != e.finger_changes:
+        e.finger_changes, e.age = slot[FINGER_CHANGES], 0
+        jump = e.place + e.pace - slot[POSITION]  # from where it would have gone on
+        # only what is new of it enters both poles: calls that follow each other closely do not hold it up
+        e.offset_input = e.offset_input + jump - e.offset if abs(jump) < JUMP else 0.0
+        e.offset = jump if abs(jump) < JUMP else 0.0
+    voice = int(slot[VOICE_ADDRESS])
+    if voice != e.current and e.samples >= e.switch + e.fade:  # one change after the other
+        e.previous, e.current, e.switch = e.current, voice, e.samples + e.ahead
+        record(voice, VOICE_T, 0).begun = e.switch
+    return e.slots_at + 8 * width * e.slot
+
+
+@kernel
+def follow_finger(entry, slot, m):
+    """Where the finger is in sample m of the block, and where it will be at the end of the look-ahead (m)."""
+    e, values = record(entry, ENTRY_T, 0), carray(pointer(slot, F8), HEAD)
+    position, ahead = carray(pointer(e.position_at, F8), e.block), e.ahead / e.rate
+    if e.given != 0:
+        position[m] = carray(pointer(e.given, F8), 1)[e.taken + m]
+        c = record(e.tracker, CONTROLLER_T, 0)
+        track_finger(e.tracker, position[m])
+        there = position[m] + ahead * (c.velocity + 0.5 * ahead * c.acceleration)
+    else:
+        age = (e.age + m) / e.rate
+        position[m] = values[POSITION] + min(age, HORIZON) * values[VELOCITY] + e.offset
+        there = position[m] + e.lead
+        kept, lead = e.offset_kept, ahead * values[VELOCITY] if age < HORIZON else 0.0
+        e.lead_input = lead + kept * (e.lead_input - lead)  # two poles: neither place nor speed steps
+        e.lead = e.lead_input + kept * (e.lead - e.lead_input)
+        e.offset_input *= kept
+        e.offset = e.offset_input + kept * (e.offset - e.offset_input)
+    touches = position[m] == position[m]
+    if touches:
+        e.pace = position[m] - e.place if abs(position[m] - e.place) < JUMP else 0.0
+        e.place = position[m]
+    fresh = e.given != 0 or e.age + m < HOLD * e.rate
+    e.touch = min(max(e.touch + (e.touch_step if touches and fresh else -e.touch_step), 0.0), 1.0)
+    return e.place, there if touches else e.place
+
+
+@kernel
+def texture_at(entry, sample, position, gain, touch):
+    """Texture at a sample: a voice while it fades into the next one."""
+    e = record(entry, ENTRY_T, 0)
+    weight, total = eased((sample - e.switch) / e.fade), 0.0
+    if e.current != 0:
+        total += weight * gain * (in_time(e.current, sample) + touch * along_surface(e.current, position))
+    if e.previous != 0 and weight < 1.0:
+        total += (1.0 - weight) * gain * (in_time(e.previous, sample) + touch * along_surface(e.previous, position))
+    return total
+
+
+@kernel
+def play_texture(entry, slot):
+    """Waveform of the block, ahead of time as the law needs it (of bands: the gain); the texture itself into the log.
+
+    Gain and touch wait in a ring meanwhile, so that what is asked for is what was handed to the law.
+    """
+    e, values = record(entry, ENTRY_T, 0), carray(pointer(slot, F8), HEAD)
+    waveform, gains = carray(pointer(e.waveform_at, F8), e.block), carray(pointer(e.gains_at, F8), (e.ahead + 1, 2))
+    log = carray(pointer(e.log_at, F8), (e.log_rows, e.log_width))
+    for m in range(e.block):
+        now, (here, there) = e.samples + m, follow_finger(entry, slot, m)
+        e.gain += e.gain_pole * (values[GAIN] - e.gain)
+        gain, touch = e.gain, eased(e.touch)
+        waveform[m] = texture_at(entry, now + e.ahead, there, gain, touch) if e.analysed > 0 else gain
+        gains[(now + e.ahead) % (e.ahead + 1), 0], gains[(now + e.ahead) % (e.ahead + 1), 1] = gain, touch
+        then = now % (e.ahead + 1)
+        log[now % e.log_rows, e.channels + e.sensors + 2] = texture_at(entry, now, here, gains[then, 0], gains[then, 1])
+    e.age += e.block
+    e.taken += e.block
+
+
+@kernel
+def write_log(entry, slot):
+    """Drive, sensed, position, load and flags of the block into the log, beside the texture."""
+    e, values = record(entry, ENTRY_T, 0), carray(pointer(slot, F8), HEAD)
+    drive, sensed = carray(pointer(e.drive_at, F8), e.block * e.channels), carray(pointer(e.sensed_at, F8), 1)
+    position, flags = carray(pointer(e.position_at, F8), e.block), carray(pointer(e.flags_at, I8), e.block)
+    log = carray(pointer(e.log_at, F8), (e.log_rows, e.log_width))
+    for m in range(e.block):
+        row = (e.samples + m) % e.log_rows
+        for i in range(e.channels):
+            log[row, i] = drive[m * e.channels + i]
+        for i in range(e.sensors):
+            log[row, e.channels + i] = sensed[m * e.sensors + i]
+        log[row, e.channels + e.sensors] = position[m]
+        log[row, e.channels + e.sensors + 1] = values[LOAD]
+        log[row, e.channels + e.sensors + 3] = flags[m]
+
+
+@kernel
+def watch(entry, slot):
+    """Count the samples since the application has called; beyond the watchdog's time the drive is stopped."""
+    e, values = record(entry, ENTRY_T, 0), carray(pointer(slot, F8), HEAD)
+    if values[CALLS] != e.calls:
+        e.calls, e.idle = values[CALLS], 0
+    e.idle += e.block
+    if values[WATCHDOG] > 0.0 and e.idle > values[WATCHDOG] and e.timed_out < 0:
+        e.timed_out = e.samples
+
+
+@kernel
+def fade_out(entry):
+    """Bring the drive of a block, and of all that follow, down to zero within `supervisor.FADE_OUT`."""
+    e = record(entry, ENTRY_T, 0)
+    flags, drive = carray(pointer(e.flags_at, I8), e.block), carray(pointer(e.drive_at, F8), e.block * e.channels)
+    for m in range(e.block):
+        e.open = max(e.open - e.closing_step, 0.0)
+        flags[m] |= STOPPED
+        for i in range(e.channels):
+            drive[m * e.channels + i] *= e.open
+
+
+@kernel
+def advance(entry):
+    """Advance the controller by the block that is in its `sensed`; returns all flags of the block."""
+    e = record(entry, ENTRY_T, 0)
+    flags, drive = carray(pointer(e.flags_at, I8), e.block), carray(pointer(e.drive_at, F8), e.block * e.channels)
+    slot, raised = receive(entry), 0
+    watch(entry, slot)
+    play_texture(entry, slot)
+    for m in range(e.block):
+        flags[m] = e.lost
+    e.lost = 0
+    if carray(pointer(slot, F8), HEAD)[PLAYING] > 0.0 and e.open > 0.0:
+        call(e.step, (e.controller, e.signals, 0, e.block))
+    else:
+        for i in range(e.block * e.channels):
+            drive[i] = 0.0
+    if e.timed_out >= 0:
+        fade_out(entry)
+    for m in range(e.block):
+        raised |= flags[m]
+    write_log(entry, slot)
+    e.flags |= raised
+    e.samples += e.block
+    return raised
+
+
+@kernel
+def carry(entry, sensed, drive, frames, dtype, sensed_scale, drive_scale):
+    """Advance by blocks of samples of `dtype` at two addresses; returns the flags, or -1 and zeros where it refuses."""
+    e, count = record(entry, ENTRY_T, 0), int(frames)
+    out = carray(pointer(drive, dtype), count * e.channels if drive != 0 else 0)
+    if count % e.block or (sensed == 0 and e.sensors > 0) or drive == 0:
+        e.refused += 1
+        out[:] = 0.0
+        return -1
+    given, raised = carray(pointer(sensed, dtype), count * e.sensors), 0
+    inputs, outputs = e.block * e.sensors, e.block * e.channels
+    own, result = carray(pointer(e.sensed_at, F8), inputs), carray(pointer(e.drive_at, F8), outputs)
+    for block in range(count // e.block):
+        for i in range(inputs):
+            own[i] = sensed_scale * given[block * inputs + i]
+        raised |= advance(entry)
+        for i in range(outputs):
+            out[block * outputs + i] = drive_scale * result[i]
+    return raised
+
+
+def _plain(sensed, drive, frames, entry):
+    """Advance by blocks of double samples in SI units; returns the flags, or -1 where it refuses."""
+    return carry(entry, sensed, drive, frames, F8, 1.0, 1.0)
+
+
+def _audio(sensed, drive, frames, time, status, entry):
+    """Advance by blocks of interleaved float samples at full scale: PortAudio's callback."""
+    e = record(entry, ENTRY_T, 0)
+    if status & LOST:
+        e.lost = OVERRUN
+    return ABORT if carry(entry, sensed, drive, frames, F4, e.sensed_scale, e.drive_scale) < 0 else CONTINUE
+
+
+PLAIN = CFunction(_plain, types.int32(I8, I8, types.uint64, I8))
+AUDIO = CFunction(_audio, types.int32(I8, I8, UNSIGNED_LONG, I8, UNSIGNED_LONG, I8))
