@@ -220,5 +220,29 @@ def test_short_recordings_and_wrong_profiles_are_refused(studied):
         hr.analyse_finger(short)
     with pytest.raises(ValueError, match=r"profile.kind = 'ultrasonic': must be vt-plate"):
         hr.analyse_finger(recording, hr.DeviceProfile(kind="ultrasonic"))
-    with pytest.raises(ValueError, match=r"block = 2: must be <= the plate's delay of 1 samples"):
+    with pytest.raises(ValueError, match=r"block=2 samples: must be an integer from 1 to the plate's delay, 1"):
         hr.analyse_finger(recording, block=2)
+
+
+def test_what_was_lost_or_is_not_one_finger_is_not_taken_for_one(studied):
+    """100 ms without samples, as live play marks them, under a finger: no other touch, no window there, and a note."""
+    subject, recording, found = studied[0]
+    frames, columns = recording.frames[:].copy(), recording.header.slices
+    lost = slice(round(2.0 * recording.rate), round(2.1 * recording.rate))
+    frames[lost, columns["drive"]], frames[lost, columns["sensed"]] = 0.0, np.nan
+    frames[lost, columns["flags"]] = int(hr.Flag.OVERRUN)
+    spoiled = hr.analyse_finger(hr.Recording(recording.header, frames, recording.scene))
+    assert any(note.startswith("samples were lost") for note in spoiled.notes)
+    assert not any(note.startswith("samples were lost") for note in found.notes)
+    inside = (spoiled.time > 1.9) & (spoiled.time < 2.2)
+    assert set(spoiled.contact[inside]) == {DOUBTFUL}
+    assert not ((spoiled.impedance.time > 1.95) & (spoiled.impedance.time < 2.15)).any()
+
+
+def test_nonsense_is_named(studied):
+    """Micrometres that are taken for metres press with mega-newtons."""
+    _, recording, _ = studied[0]
+    frames = recording.frames[:].copy()
+    frames[:, recording.header.slices["sensed"]] *= 1e6
+    found = hr.analyse_finger(hr.Recording(recording.header, frames, recording.scene))
+    assert any("check units, signs and scales" in note for note in found.notes)

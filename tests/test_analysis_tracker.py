@@ -226,6 +226,8 @@ def test_measurements_that_are_no_numbers_are_held():
     finger = hr.Finger.still(position=5e-3, normal_load=0.5, touches=[(0.5, 1.5)])
     drive, sensed = run(finger, 2.0)
     sensed[[100, 3000, 3001], [0, 1, 1]] = np.nan, np.inf, np.nan
+    drive = np.array(drive)
+    drive[200, 0] = np.nan
     found = tracked(hr.FingerTracker(PLATE), drive, sensed)
     at = (found["time"] > 0.7) & (found["time"] < 1.4)
     assert (np.abs(found["load"][at] - 0.5) < 0.02).all()

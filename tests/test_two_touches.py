@@ -16,6 +16,8 @@ from hapticrender.analysis.two_touches import (
     miss_rate,
     windows_under_touch,
 )
+from hapticrender.touch.latency_budget import PANELS
+from hapticrender.touch.touch_panel import PanelReader
 
 RATE, PAIR = 5000.0, ((HEAVY, -20e-3, 0.8, 0.6, 1.9), (HEAVY, 20e-3, 0.8, 1.0, 1.9))
 
@@ -55,6 +57,25 @@ def test_one_sliding_finger_on_a_wrong_plate_is_one(noise):
     spread = 5 * np.sqrt(2 * CORRELATION * freedom / len(found))
     assert freedom - 10 - spread < mean < freedom + spread
     assert max(abs(each.offset) for each in found) < 5 * 2e-3
+
+
+def test_a_finger_behind_a_slow_touch_panel_is_one():
+    """60 Hz, 25 ms late, predicted: swipes at 3 Hz and 100 mm/s; its error is along velocity and acceleration."""
+
+    class Located(StrangersPlate):
+        def play(self, drive):
+            sensed = super().play(drive)
+            return sensed._replace(position=self.reader(sensed.position))
+
+    plate = Located(
+        finger=HEAVY, load=0.8, contact=lambda time: 1.0 * (time > 1.0), report_lag=5e-3, told=2,
+        position=lambda time: 0.1 / (6 * np.pi) * np.sin(6 * np.pi * time), **WRONG,
+    )  # fmt: skip
+    plate.reader = PanelReader(PANELS["panel, 60 Hz, 25 ms"], RATE, 1)
+    texture, finger = hr.Grating(frequency=120.0, amplitude=5e-6), hr.Finger.sliding(0.08, 0.8)
+    recording = hr.render(hr.Scene(texture=texture, finger=finger, duration=3.5), driver=plate)
+    assert np.isfinite(recording.position).sum() > 8 * 0.25 * RATE
+    assert not (recording.flags & hr.Flag.TWO_TOUCHES).any()
 
 
 def rendered(texture, fingers, duration=2.4, **plate):

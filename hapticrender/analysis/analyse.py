@@ -15,7 +15,7 @@ from hapticrender.analysis.force import MotionFilter, at_least, sensor_noise
 from hapticrender.analysis.impedance import impedance_of
 from hapticrender.analysis.lock_in import Lines, demodulate, tile, window_length
 from hapticrender.analysis.plate_track import Rest, regress, rest_of, track_of
-from hapticrender.analysis.records import LOADED, UNLOADED, FingerRecord, Impedance, Segment, Series
+from hapticrender.analysis.records import DOUBTFUL, LOADED, UNLOADED, FingerRecord, Impedance, Segment, Series
 from hapticrender.analysis.smoothing import LEAST_SPREAD, spread_of
 from hapticrender.analysis.tracker import FingerTracker, Touch
 from hapticrender.bands import Bands, hold_last
@@ -34,6 +34,8 @@ SLOWEST, FASTEST = 15.0, 0.1  # Hz, of the sampling rate: carriers between them 
 NEAR_END = 5e-3  # m: a finger nearer to an end of the glass is not judged
 MIDDLE = 15e-3  # m from the middle: where `least_load` holds
 MILLIMETRE = 1e-3  # m
+AROUND = 0.1  # s: what is lost acts so far, by the kernels
+HEAVIEST, MOST_TOUCHES = 20.0, 5.0  # N; 1/s: no finger presses harder, or touches more often
 START = 0.5  # s: free of a finger, where the caller says so
 BLOCK = 1.0  # s of signal at a time
 
@@ -77,8 +79,10 @@ def analyse_finger(
     course = _believed(recording, profile)
     late = course.plate.delay - block
     _check(recording, course.plate, late)
-    rate, drive = recording.rate, recording.drive
-    sensed = np.stack([hold_last(channel) for channel in recording.sensed.T], axis=1)
+    rate = recording.rate
+    drive, sensed = (
+        np.stack([hold_last(each) for each in signal.T], axis=1) for signal in (recording.drive, recording.sensed)
+    )
     if free_start:
         sensed = sensed - sensed[: round(START * rate)].mean(axis=0)
     signals = _Signals(course.plate, late, rate, drive, sensed)
@@ -95,6 +99,8 @@ def analyse_finger(
         course = regress(course, lines, signals.noise) if frequency.size else course
         rest = rest_of(course, lines)
     touch, tracker = signals.track(course, rest), signals.tracker(course, rest)
+    spoiled = _spoiled(recording)[: len(touch.contact)]
+    touch = replace(touch, contact=np.where(spoiled, DOUBTFUL, touch.contact))
     impedance = signals.impedance(course, touch, recording.bands, frequency, length, recording.header.calibration)
     return FingerRecord(
         name=recording.header.name,
@@ -109,6 +115,14 @@ def analyse_finger(
         least_load=tracker.least_load(MIDDLE, MILLIMETRE),
         notes=tuple(_notes(recording, course, touch, rest, impedance)),
     )
+
+
+def _spoiled(recording: Recording) -> Array:
+    """Samples (bool, (n,)) within `AROUND` of one that is lost, no number, or of two fingers."""
+    from scipy.ndimage import maximum_filter1d
+
+    bad = (recording.flags & int(Flag.OVERRUN | Flag.NONFINITE | Flag.TWO_TOUCHES)) > 0
+    return np.asarray(maximum_filter1d(bad.astype(np.uint8), 2 * round(AROUND * recording.rate) + 1) > 0)
 
 
 def _believed(recording: Recording, profile: DeviceProfile | PlateParameters | str | os.PathLike[str] | None) -> Course:
@@ -135,8 +149,9 @@ def _check(recording: Recording, plate: PlateParameters, late: int) -> None:
         raise ValueError(f"{header.name}: {header.drive_channels} drive channels: must be {plate.coils}, one a coil")
     if len(recording) < recording.rate:
         raise ValueError(f"{header.name}: {len(recording) / recording.rate:g} s long: must be >= 1 s")
-    if late < 0:
-        raise ValueError(f"block = {plate.delay - late}: must be <= the plate's delay of {plate.delay} samples")
+    block = plate.delay - late
+    if not (isinstance(block, int | np.integer) and 1 <= block <= plate.delay):
+        raise ValueError(f"{block=} samples: must be an integer from 1 to the plate's delay, {plate.delay}")
     if not np.isfinite(recording.sensed).any(axis=0).all():
         raise ValueError(f"{header.name}: a sensor is finite nowhere: must be displacement in m")
 
@@ -261,6 +276,18 @@ def _notes(
     for bad, text in (
         (Flag.NONFINITE, "samples that are no numbers are held"),
         (Flag.SENSOR_CLIPPED, "a sensor clips"),
+        (Flag.OVERRUN, "samples were lost"),
+        (Flag.TWO_TOUCHES, "more than one finger touched"),
+        (Flag.STOPPED, "the drive was stopped"),
     ):
         if flags & bad:
-            yield f"{text}: estimates near them are wrong by more than they say"
+            yield f"{text}: estimates near there are wrong by more than they say"
+    heaviest, touches = np.nanmax(touch.normal_load.value, initial=0.0), np.diff(touch.contact == LOADED).sum() / 2
+    if heaviest > HEAVIEST or touches > MOST_TOUCHES * max(len(recording) / recording.rate, 1.0):
+        yield (
+            f"up to {heaviest:.3g} N in {touches:.0f} touches: check units, signs and scales of drive and sensors, the "
+            "block, and the profile"
+        )
+    plate = course.plate
+    if abs(recording.rate - plate.rate) > 1e-3 * plate.rate:
+        yield f"the profile's delay, {plate.delay} samples, is taken at {recording.rate:g} Hz, not at {plate.rate:g} Hz"

@@ -107,7 +107,7 @@ class FingerTracker:
         self._edge = self._filter.delay  # samples beside a change of contact that are left out
         self._given, self._at, self._first = rest, -self._filter.delay, 0
         self._history = History(self._line.behind + self._line.ahead + 2 * self._edge)
-        self._held = np.zeros((1, 2))  # m: last measurement
+        self._held = np.zeros((1, self.course.plate.coils + 2))  # A, m: last drive and measurement
         self._peak, self._delayed = History(round(PEAK * self.rate)), History(self._detector.delay)
 
     @property
@@ -141,17 +141,19 @@ class FingerTracker:
     def update(self, drive: Array, sensed: Array) -> Touch:
         """Estimates from the next n >= 1 samples of drive (A, (n, coils)) and measurement (m, (n, 2)).
 
-        They are of the n samples `latency` before these, less those before the first one.  A measurement that is no
-        number is replaced by the last one that is.
+        They are of the n samples `latency` before these, less those before the first one.  What is no number is
+        replaced by the last one that is.
         """
+        drive, sensed = np.asarray(drive, float), np.asarray(sensed, float)
         wanted = (len(drive), self.course.plate.coils), (len(drive), 2)
         if len(drive) == 0 or (np.shape(drive), np.shape(sensed)) != wanted:
             raise ValueError(
                 f"drive and measurement of shapes {np.shape(drive)} and {np.shape(sensed)}: must be {wanted[0]} and "
                 f"{wanted[1]}, at least one sample"
             )
-        sensed = np.stack([hold_last(each)[1:] for each in np.vstack([self._held, sensed]).T], axis=1)
-        self._held = sensed[-1:]
+        rows = np.vstack([self._held, np.column_stack([drive, sensed])])
+        rows = np.stack([hold_last(each)[1:] for each in rows.T], axis=1)
+        self._held, (drive, sensed) = rows[-1:], np.split(rows, [drive.shape[1]], axis=1)
         signals = self._filter.update(drive, sensed)
         time = (self._at + np.arange(len(drive))) / self.rate
         self._at += len(drive)

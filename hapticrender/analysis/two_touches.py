@@ -35,7 +35,7 @@ BAND = (20.0, 400.0)  # Hz
 FALSE_ALARMS = 1e-6  # of a window: one in 70 hours of touch
 POSITION_ERROR = 2e-3  # m, of a reported position against the centre of the forces
 LATENESS = 50e-3  # s, of a reported position, and of its prediction: errors along velocity and acceleration
-SMOOTHED = 20e-3  # s: mean of the reported position before its derivatives, as it may come in steps
+SMOOTHED = 34e-3  # s: mean of the reported position, which may come in steps: two samples of a panel of 60 Hz
 DRIFT = 1e-6  # m, of a sensor's offset since the plate was last free
 ERRORS = {"stiffness": 0.02, "damping": 0.3, "mass": 0.02}  # of a profile, of the largest entry of each matrix
 SPACING = 2  # bins: those of a Hann window that are two apart are correlated by 1/6, their squares by 1/36
@@ -238,6 +238,7 @@ class TouchMonitor:
 
     def _test(self, parts: Array, lever: Array) -> TouchTest:
         """T over d by a grid and two refinements; the plate's errors are found for each d by least squares."""
+        lever = self._smoothed(lever)
         force, per_error = self._force(parts), self._regressors(parts)
         along, across = self._spectrum(force[0]), self._spectrum(force[1] - lever * force[0])
         rows = self._spectrum(per_error[1] - lever * per_error[0]), self._spectrum(per_error[0])
@@ -258,11 +259,15 @@ class TouchMonitor:
         freedom = 2.0 * along.size - (1.0 if self._rest is not None else 0.0)  # at 0 Hz a number is real
         return TouchTest(statistic, freedom, bound_of(freedom), best / self.model.lever_per_metre)
 
+    def _smoothed(self, lever: Array) -> Array:
+        width = max(round(SMOOTHED * self.model.rate), 1)
+        padded = np.pad(lever, (width // 2, width - 1 - width // 2), "edge")
+        return np.convolve(padded, np.full(width, 1.0 / width), "valid")
+
     def _changes(self, lever: Array) -> Array:
         """First derivative of the lever arm times a lateness, and second one times half its square, shape (2, n)."""
-        rate, width = self.model.rate, max(round(SMOOTHED * self.model.rate), 1)
-        padded = np.pad(lever, (width // 2, width - 1 - width // 2), "edge")
-        speed = rate * np.gradient(np.convolve(padded, np.full(width, 1.0 / width), "valid"))
+        rate = self.model.rate
+        speed = rate * np.gradient(lever)
         return np.array([LATENESS * speed, LATENESS**2 / 2.0 * rate * np.gradient(speed)])
 
     def _value(self, left: Array, rows: Array, noise: Array, lever: float) -> float:

@@ -164,6 +164,8 @@ def _verdict(recording: Recording, worst: dict[str, Any]) -> tuple[str, str]:
         return "not judged", "the texture asks for nothing"
     if found["share_in_band"] < LEAST:
         return "not judged", f"the texture has nothing from {IN_BAND}"
+    if header.motion_source == "inferred":
+        return "not judged", INFERRED
     if worst["value"] > worst["bound"]:
         noise = found["sensor_noise"]
         if worst["value"] - header.calibration <= HARDLY * noise:
@@ -176,8 +178,6 @@ def _verdict(recording: Recording, worst: dict[str, Any]) -> tuple[str, str]:
     raised = [f"{flag.name} in {count} samples" for flag, count in counts.items() if count and flag & MATTERS]
     if raised:
         return "failed", f"flags that a play must not raise: {', '.join(raised).lower()}"
-    if header.motion_source == "inferred":
-        return "not judged", INFERRED
     if found["share_outside"] > UNPLAYABLE:
         return "passed in band", _unplayable(found["share_outside"])
     return "passed", ""

@@ -115,7 +115,7 @@ class MotionEstimator:
 
         `error` (m, > 0) is its own standard error, where that differs from sample to sample, as that of a place found
         from the load on a plate does; by default that of the sensor.  A sample that is no later than the last one is
-        left out, too.  ValueError: a number is not finite.
+        left out, too, unless the clock has been set back by more than `patience`.  ValueError: a number is not finite.
         """
         if math.isnan(position):
             self.lift()
@@ -126,7 +126,7 @@ class MotionEstimator:
             raise ValueError(f"{error=} m: must be finite and > 0")
         self._sampled = self.variance if error is None else error**2
         time -= self.latency
-        if math.isnan(self._time) or time - self._time > self.patience:
+        if math.isnan(self._time) or abs(time - self._time) > self.patience:
             self._start(time, position)
             return True
         if time <= max(self._time, self._rejected[0] if self._rejected else -math.inf):
@@ -143,7 +143,7 @@ class MotionEstimator:
     def at(self, time: float | Array) -> MotionEstimate:
         """Return the motion at `time` (s, any shape), by the samples so far: velocity and acceleration go on."""
         ahead = np.asarray(time, float) - self._time
-        gone = ~(ahead <= self.patience)  # NaN as well
+        gone = ~(abs(ahead) <= self.patience)  # NaN as well
         h = np.where(gone, 0.0, ahead)
         one, zero, t = np.ones_like(h), np.zeros_like(h), abs(h)
         errors, values = [], []
