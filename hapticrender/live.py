@@ -76,7 +76,8 @@ class LiveLoop:
         self._bands = rendering.bands
         self._stopped: int | None = None  # sample
         own = rendering.plant is not None
-        self._touches = TouchWatch(rendering.model, self.controller, rendering.model.delay, active=not own)
+        self._touches = TouchWatch(rendering.model, self.controller, active=not own, slows=False)
+        self._contact, self._followed = ContactLag(self.model.contact_lag), 0  # of the samples before this one
         self.entry.play(self._voice(rendering))
 
     @property
@@ -133,6 +134,7 @@ class LiveLoop:
             self._told[at, -1] = sensed.normal_load
         self.senses = sensed.position is not None
         flags = 0 if sensed.flags is None else int(np.bitwise_or.reduce(sensed.flags))
+        self._touches.slow()
         self._drive = self.entry.process(sensed.sensed, sensed.position if sensing else None, flags)
 
     def rest(self) -> None:
@@ -167,8 +169,16 @@ class LiveLoop:
         motion = told[:, :-1]  # NaN where nothing is sensed
         if not self._true and found["sensed"].shape[1]:
             motion = found["sensed"] @ (model.place_from_coordinate @ model.coordinate_from_sensed).T
-            motion = ContactLag(model.contact_lag).run(motion, found["position"]) if model.inferred else motion
+            motion = self._behind_contact(first, motion, found["position"]) if model.inferred else motion
         return first, found | {"motion": motion, "target": np.zeros((count, 0), complex)}
+
+    def _behind_contact(self, first: int, motion: Array, position: Array) -> Array:
+        """Friction behind the contact's lag, which goes on where these samples follow the last ones."""
+        follows = first == self._followed
+        lag = self._contact if follows else ContactLag(self.model.contact_lag)
+        if first >= self._followed:
+            self._contact, self._followed = lag, first + len(motion)
+        return lag.run(motion, position)
 
     def watch_touches(self, signals: dict[str, Array], gap: int) -> None:
         """Flag two touches in the signals that follow those of the last call, `gap` samples later."""

@@ -42,6 +42,7 @@ from hapticrender.touch.finger import Finger
 from hapticrender.touch.scene import Scene
 
 MOST_GAIN = 10.0
+LONGEST_WATCHDOG = 60.0  # s
 NOMINAL = Finger.sliding(speed=0.08, normal_load=0.4)  # for which a device is designed where none is stated
 LONGEST = 3600.0  # s: duration of a scene that has no end
 SERVICE = 0.05  # s between two looks: what comes next is computed, what was is recorded, faults are seen
@@ -72,7 +73,7 @@ class Player:
         simulation reproducibly.
     watchdog : float, s, optional
         Where no method of this player is called for so long, the application counts as hung and the drive is stopped
-        for good, within 10 ms; >= 0.1.  `sleep` counts as calls.
+        for good, within 10 ms; 0.1 to 60, and at least two blocks of the driver.  `sleep` counts as calls.
     **tables
         Further fields of the scene: profile, simulation, rendering, method, seed.
 
@@ -92,8 +93,8 @@ class Player:
         watchdog: float | None = None,
         **tables: Any,
     ) -> None:
-        if watchdog is not None and not 2.0 * SERVICE <= watchdog < math.inf:
-            raise ValueError(f"{watchdog=} s: must be finite and >= {2.0 * SERVICE:g} s, or None")
+        if watchdog is not None and not 2.0 * SERVICE <= watchdog <= LONGEST_WATCHDOG:
+            raise ValueError(f"{watchdog=} s: must be {2.0 * SERVICE:g} to {LONGEST_WATCHDOG:g} s, or None")
         self._given = device if isinstance(device, Scene) else None
         self._fields = {"device": device, "finger": finger or NOMINAL, "duration": LONGEST, **tables}
         self._driver, self._paced, self._watchdog = driver, paced, watchdog
@@ -301,6 +302,9 @@ class Player:
         device, stack, direct = rendering.device, self._stack, rendering.driver is rendering.device
         calls_back = self._calls_back = hasattr(device, "start") and direct
         own = hasattr(device, "loop") and direct
+        blocks = 2 * rendering.driver.block / rendering.driver.rate
+        if self._watchdog is not None and self._watchdog < blocks:
+            raise ValueError(f"watchdog = {self._watchdog:g} s: must be >= {blocks:g} s, two blocks of the driver")
         scales = {name: getattr(device, name) for name in ("sensed_scale", "drive_scale")} if calls_back else {}
         loop: Any = device.loop(rendering) if own else LiveLoop(rendering, **scales)  # type: ignore[attr-defined]
         self._hand_finger(rendering)

@@ -248,16 +248,18 @@ class RealtimeEntry:
     def log(self, start: int) -> dict[str, Array]:
         """Signals from sample `start` on, as far back as they are kept (`LOG_TIME`).
 
-        `first` (the first sample), drive (n, channels), sensed (n, sensors), position (m), normal_load (N), reference
-        (the texture as asked for) and flags, each shape (n,).
+        `first` (the first sample), drive (n, channels) as it plays with a sample, sensed (n, sensors), position (m),
+        normal_load (N), reference (the texture as asked for) and flags, each shape (n,).
         """
         table, end = self._arrays["log"], self.samples
         first = max(start, end - len(table) + 8 * self.block, 0)
         rows = table[np.arange(first, end) % len(table)]
         c, s = self.controller.channels, self.controller.sensors
+        played = np.arange(first, end) - self.block  # a block's drive plays with the next one
+        drive = np.where(played[:, None] < 0, 0.0, table[played % len(table), :c])
         names = ("position", "normal_load", "reference")
         found = {name: rows[:, c + s + i] for i, name in enumerate(names)}
-        found |= {"drive": rows[:, :c], "sensed": rows[:, c : c + s], "flags": rows[:, -1].astype(np.int64)}
+        found |= {"drive": drive, "sensed": rows[:, c : c + s], "flags": rows[:, -1].astype(np.int64)}
         return {"first": np.array(first), **found}
 
     @property

@@ -46,6 +46,17 @@ def test_verb_writes_tables_pictures_and_a_summary(recorded, tmp_path, capsys):
     assert cli.main(["finger", str(path), "--out", str(out), "--force"]) == 0
 
 
+@pytest.mark.parametrize("grating", [{"frequency": 111.0}, {"wavelength": 1e-3}], ids=["fixed", "following"])
+def test_verb_draws_a_single_band(grating, tmp_path):
+    """A fixed carrier, and one that follows the finger, under a load that hardly changes."""
+    pytest.importorskip("matplotlib")
+    finger = hr.Finger.swiping(frequency=1.0, stroke=0.03, normal_load=0.4, touches=[(0.8, 2.2)], mechanics="light")
+    scene = hr.Scene(texture=hr.Grating(**grating, amplitude=10e-6), finger=finger, duration=3.0)
+    hr.render(scene).save(tmp_path / "recording.npz")
+    assert cli.main(["finger", str(tmp_path / "recording.npz"), "--out", str(tmp_path / "out")]) == 0
+    assert {"time-1.png", "load.png"} <= {path.name for path in (tmp_path / "out").iterdir()}
+
+
 def test_verb_names_the_recording_in_an_error(recorded, tmp_path, capsys):
     path, _ = recorded
     assert cli.main(["finger", str(path), "--block", "2", "--out", str(tmp_path / "out")]) == 2

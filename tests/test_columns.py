@@ -211,3 +211,15 @@ def test_files_that_are_none_are_refused(tmp_path, name, content, message):
         read_columns(tmp_path / name)
     with pytest.raises(FileNotFoundError):
         read_columns(tmp_path / "missing.csv")
+
+
+def test_only_counters_wrap(tmp_path):
+    """Offset-binary samples of a converter swing about the middle of their range; an encoder goes round."""
+    raw = np.array([32768, 32769, 32770, 0, 65535, 32768], ">u2")
+    table = {"dac": raw, "adc": raw.astype(np.uint16), "turns": np.array([65534, 65535, 0, 1, 0, 65535], ">u2")}
+    made = hr.Recording.from_columns(
+        table, rate=RATE, drive={"dac": (1.0, 32768)}, sensed={"adc": (1.0, 32768)}, position={"turns": 1.0}
+    )
+    for signal in (made.drive, made.sensed):
+        np.testing.assert_array_equal(signal[:, 0], [0, 1, 2, -32768, 32767, 0])
+    np.testing.assert_array_equal(made.position - made.position[0], [0, 1, 2, 3, 2, 1])

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from live_devices import RIDGES, ROUNDING, TONE, Blind, Calling, slide
+from live_devices import RIDGES, ROUNDING, TONE, Blind, Calling, Lying, slide
 
 import hapticrender as hr
 from hapticrender.plants.plate import Plate, PlateParameters
@@ -76,6 +76,30 @@ def test_a_session_is_a_recording_like_any_other(session):
     np.testing.assert_array_equal(loaded.drive, recording.drive)
     assert loaded.header.motion_source == "true"
     assert loaded.summary()["waveform"]["share_in_band"] > 0.9
+
+
+def test_a_recording_has_the_drive_that_played_with_each_sample(tmp_path):
+    """As that of `render`: what acts, and not what was computed from the sample."""
+    driver = Lying(100.0, "nothing")
+    driver.probe = False
+    with hr.Player(driver=driver, paced=False) as player:
+        player.play(TONE)
+        player.record(tmp_path / "live.au")
+        player.sleep(0.2)
+        live = player.end_recording()
+        played = np.concatenate(driver.played)[: len(live)]
+    assert abs(played).max() > 0.01
+    np.testing.assert_array_equal(live.drive, played)
+
+
+def test_a_watchdog_waits_for_two_blocks_of_the_driver():
+    driver = Lying(100.0, "nothing")
+    driver.block = driver.delay = 1000
+    with (
+        hr.Player(driver=driver, watchdog=0.3) as player,
+        pytest.raises(ValueError, match=r"watchdog = 0\.3 s: must be >= 0\.4 s, two blocks"),
+    ):
+        player.play(TONE)
 
 
 def test_one_that_is_not_paced_repeats_to_the_bit():
@@ -193,7 +217,7 @@ def test_what_it_refuses(tmp_path):
         player.play(TONE)
     with pytest.raises(ValueError, match="the player is not open: use it in a with statement"):
         hr.Player(paced=False).play(TONE)
-    with pytest.raises(ValueError, match=r"watchdog=0 s: must be finite and >= 0\.1 s"):
+    with pytest.raises(ValueError, match=r"watchdog=0 s: must be 0\.1 to 60 s"):
         hr.Player(watchdog=0)
     with hr.Player(driver=Calling(), paced=False) as player, pytest.raises(ValueError, match="paced = False"):
         player.play(TONE)

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from live_devices import Blind
+from plate_swipes import followed_on_a_plate
 
 import hapticrender as hr
 from hapticrender.plants.plate import Plate, PlateParameters
@@ -164,6 +165,15 @@ def test_a_sample_may_state_its_own_error():
     assert stated.at(0.5) == pytest.approx(plain.at(0.5), rel=1e-12)
     with pytest.raises(ValueError, match="error=0.0 m: must be finite and > 0"):
         stated.update(1.0, 0.0, 0.0)
+
+
+def test_the_plate_alone_says_where_a_finger_of_400_mN_is_now(rng):
+    """Errors of position and velocity are what is stated, to 3 sigma of the share of some 270 independent ones."""
+    errors, stated = followed_on_a_plate(0.4, 10.0, rng)
+    one, two = ((np.abs(errors) < times * stated).mean(axis=0) for times in (1, 2))
+    assert ((one > 0.60) & (one < 0.76)).all(), one
+    assert ((two > 0.90) & (two < 0.98)).all(), two
+    assert np.sqrt(np.mean(errors[:, 0] ** 2)) < 0.5e-3  # of 1.9 mm rms of the swipes
 
 
 def test_lift_return_and_patience():

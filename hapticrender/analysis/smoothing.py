@@ -111,7 +111,7 @@ class LocalLine:
     def response(self, frequency: Array) -> tuple[Array, Array]:
         """Response at `frequency` (Hz) of the level (1) and of the slope over that of a derivative (1), complex."""
         w = 2 * np.pi * np.asarray(frequency, float)
-        level, slope = (np.exp(1j * np.outer(w, self._times)) @ weights for weights in self.weights())
+        level, slope = (np.exp(1j * np.outer(w, self._times)) @ np.stack(self.weights(), axis=1)).T
         return level, slope / (1j * w)
 
     def bandwidths(self, smoothed: float = 0.0) -> tuple[float, float]:
@@ -119,10 +119,16 @@ class LocalLine:
 
         `smoothed` is the spread (s) of that g.
         """
-        frequency = np.arange(0.05, 500.0, 0.05)
-        before = np.exp(-((2 * np.pi * frequency * smoothed) ** 2))
-        level, slope = (int(np.argmax(before * np.abs(each) ** 2 < 0.5)) for each in self.response(frequency))
-        return float(frequency[level]), float(frequency[slope])
+        return self._half_power(0, smoothed), self._half_power(1, smoothed)
+
+    def _half_power(self, which: int, smoothed: float) -> float:
+        """First frequency (Hz, in steps of 0.05) at which level (0) or slope (1) passes less than half of the power."""
+        low = 0.0
+        for step, count in ((2.0, 250), (0.05, 40)):
+            frequency = low + step * np.arange(1, count + 1)
+            passed = np.exp(-((2 * np.pi * frequency * smoothed) ** 2)) * np.abs(self.response(frequency)[which]) ** 2
+            low += step * int(np.argmax(passed < 0.5))
+        return low + step
 
     def fit(self, signal: Array, inside: Array) -> tuple[Array, Array, Array, Array]:
         """Level and slope (n, k) of a signal (n + behind + ahead, k), and the sums of squares of w and u (n,).

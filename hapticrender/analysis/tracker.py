@@ -18,6 +18,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -103,7 +104,6 @@ class FingerTracker:
         self._white = p.stiffness_matrix[0, 0] * self._filter.coordinate_noise(noise)
         quiet, still = 2 * self._filter.delay, self._clear * self._noise / 2
         self._detector = ContactDetector(self.rate, quiet, still, columns=4)
-        self._bandwidth = self._line.bandwidths(self._filter.spread)
         self._edge = self._filter.delay  # samples beside a change of contact that are left out
         self._given, self._at, self._first = rest, -self._filter.delay, 0
         self._history = History(self._line.behind + self._line.ahead + 2 * self._edge)
@@ -115,10 +115,10 @@ class FingerTracker:
         """Samples from a sample to the estimate of it."""
         return self._filter.delay + self._detector.delay + self._edge + self._line.ahead
 
-    @property
+    @cached_property
     def bandwidth(self) -> tuple[float, float]:
         """Frequencies (Hz) at which load and position, and the velocity, pass half of the power."""
-        return self._bandwidth
+        return self._line.bandwidths(self._filter.spread)
 
     @property
     def load_noise(self) -> float:

@@ -9,6 +9,7 @@ S_k the known density of its noise, and y the plate's errors (of M, C and K, cov
 
     T = min over d, y of  sum_k |U_k - a_k y|^2/S_k + y^T P^-1 y + d^2/s_d^2
 
+A position that is late, or predicted, is off along the finger's velocity and acceleration too: two more entries of y.
 is a sum of squares with one degree of freedom for each real number in U: chi-square, by which the window's threshold
 follows from the rate of false alarms.  With two fingers it is a non-central one, by which `miss_rate` follows.  Two
 fingers alike, at places that the plate moves alike under the same load, leave what one finger between them would.
@@ -33,6 +34,8 @@ WINDOW = 0.25  # s
 BAND = (20.0, 400.0)  # Hz
 FALSE_ALARMS = 1e-6  # of a window: one in 70 hours of touch
 POSITION_ERROR = 2e-3  # m, of a reported position against the centre of the forces
+LATENESS = 50e-3  # s, of a reported position, and of its prediction: errors along velocity and acceleration
+SMOOTHED = 20e-3  # s: mean of the reported position before its derivatives, as it may come in steps
 DRIFT = 1e-6  # m, of a sensor's offset since the plate was last free
 ERRORS = {"stiffness": 0.02, "damping": 0.3, "mass": 0.02}  # of a profile, of the largest entry of each matrix
 SPACING = 2  # bins: those of a Hann window that are two apart are correlated by 1/6, their squares by 1/36
@@ -238,6 +241,8 @@ class TouchMonitor:
         force, per_error = self._force(parts), self._regressors(parts)
         along, across = self._spectrum(force[0]), self._spectrum(force[1] - lever * force[0])
         rows = self._spectrum(per_error[1] - lever * per_error[0]), self._spectrum(per_error[0])
+        late = self._spectrum(self._changes(lever) * force[0])
+        rows = np.vstack([rows[0], late]), np.vstack([rows[1], 0.0 * late])
         if self._rest is None:
             along, across, rows = along[1:], across[1:], (rows[0][:, 1:], rows[1][:, 1:])
         else:
@@ -253,15 +258,27 @@ class TouchMonitor:
         freedom = 2.0 * along.size - (1.0 if self._rest is not None else 0.0)  # at 0 Hz a number is real
         return TouchTest(statistic, freedom, bound_of(freedom), best / self.model.lever_per_metre)
 
+    def _changes(self, lever: Array) -> Array:
+        """First derivative of the lever arm times a lateness, and second one times half its square, shape (2, n)."""
+        rate, width = self.model.rate, max(round(SMOOTHED * self.model.rate), 1)
+        padded = np.pad(lever, (width // 2, width - 1 - width // 2), "edge")
+        speed = rate * np.gradient(np.convolve(padded, np.full(width, 1.0 / width), "valid"))
+        return np.array([LATENESS * speed, LATENESS**2 / 2.0 * rate * np.gradient(speed)])
+
     def _value(self, left: Array, rows: Array, noise: Array, lever: float) -> float:
-        """T without its term of d, for one d: least squares over the plate's errors."""
+        """T without its term of d, for one d: least squares over the plate's errors and the position's lateness."""
+        from scipy.linalg import block_diag
+
         combine = np.array([-lever, 1.0])
         variance = np.einsum("i,kij,j->k", combine, noise, combine)
         weight = 2.0 / variance
         if left.size > self._bins.size:
             weight[0] = 1.0 / variance[0]
-        matrix = self._information + ((rows.conj() * weight) @ rows.T).real
-        vector = self._known + ((rows.conj() * weight) @ left).real
+        late = len(rows) - len(self._known)  # further errors, each of variance 1
+        information = block_diag(self._information, np.eye(late))
+        known = np.pad(self._known, (0, late))
+        matrix = information + ((rows.conj() * weight) @ rows.T).real
+        vector = known + ((rows.conj() * weight) @ left).real
         fixed = self._known @ np.linalg.solve(self._information, self._known)
         return float(np.sum(weight * abs(left) ** 2) + fixed - vector @ np.linalg.solve(matrix, vector))
 
@@ -302,9 +319,14 @@ class TouchWatch:
         As for `TouchMonitor`.
     active : bool
         False: nothing is watched, as on a simulated device, which has one finger.
+    slows : bool
+        False: `slow` is left to the thread that runs the controller.
     """
 
-    def __init__(self, model: DeviceModel, controller: Any, late: int | None = None, active: bool = True) -> None:
+    def __init__(
+        self, model: DeviceModel, controller: Any, late: int | None = None, active: bool = True, slows: bool = True
+    ) -> None:
+        self._slows, self._slowed, self._tests = slows, False, 0
         self.monitor = TouchMonitor(model, late) if active and can_tell(model) else None
         self._law: Any = getattr(controller, "law", None)
         self._kept: dict[str, Array] = {}
@@ -322,11 +344,20 @@ class TouchWatch:
         monitor = self.monitor
         if monitor is None or signals["sensed"].shape[1] != 2:
             return signals["flags"]
-        before, tested = monitor.two, monitor.tests
         raised = monitor.update(*(signals[name] for name in ("drive", "sensed", "position", "flags")))
-        if self._law is not None and (monitor.two != before or monitor.tests > tested):
-            self._slow_down(monitor.two, before)
+        if self._slows:
+            self.slow()
         return signals["flags"] | raised
+
+    def slow(self) -> None:
+        """Set the law back and slow it, or let it go on, by what was found last; while the controller does not run."""
+        monitor = self.monitor
+        if monitor is None or self._law is None:
+            return
+        two, tests = monitor.two, monitor.tests
+        if two != self._slowed or tests > self._tests:
+            self._slow_down(two, self._slowed)
+            self._slowed, self._tests = two, tests
 
     def _slow_down(self, two: bool, before: bool) -> None:
         """Set the law back at the first window with two touches, and slow it until there is one."""

@@ -118,14 +118,15 @@ def _scales(chosen: Chosen) -> dict[str, tuple[float, float]]:
     }
 
 
-def _column(table: Mapping[str, Any], name: str, scale: float, offset: float) -> Array:
-    """``scale (column - offset)``; counts of a column of unsigned integers are unwrapped first."""
+def _column(table: Mapping[str, Any], name: str, scale: float, offset: float, counter: bool = False) -> Array:
+    """``scale (column - offset)``; unsigned integers of a `counter` are unwrapped first."""
     if name not in table:
         there = ", ".join(map(str, table)) or "none"
         raise ValueError(f"column {show(name)} is missing: there are {there}")
     values = np.squeeze(np.asarray(table[name]))
     require(values.ndim == 1 and values.dtype.kind in "iufb", f"column {name}", table[name], "numbers, one a sample")
-    if values.dtype.kind == "u":
+    if counter and values.dtype.kind == "u":
+        values = values.astype(values.dtype.newbyteorder("="))
         signed = f"i{values.itemsize}"  # of the first count, and of the steps
         values = np.cumsum(np.append(values[:1].view(signed), np.diff(values).view(signed)), dtype=np.int64)
     return scale * (values.astype(float) - offset)
@@ -150,7 +151,7 @@ def _one(table: Mapping[str, Any], key: str, chosen: Chosen) -> Array:
     pairs = _scales(chosen)
     require(len(pairs) == 1, key, chosen, "one column")
     ((name, pair),) = pairs.items()
-    values = _column(table, name, *pair)
+    values = _column(table, name, *pair, counter=key in ("position", "time"))
     require(
         not np.isinf(values).any(), f"{key}: column {name}", float(np.inf), "finite, or NaN where there is no value"
     )
