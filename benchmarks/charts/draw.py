@@ -109,8 +109,9 @@ def scatter(
             if len(models) == 1:
                 numbered.append(f"{len(numbered) + 1}  {name}")
                 name = str(len(numbered))
-            axes.annotate(name, (abs(cost(point)), 100 * point.error), (8, -3), textcoords="offset points", va="top",
-                          fontsize=8, fontweight="bold", color=line["color"])  # fmt: skip
+            offset, side = ((-8, -3), "right") if point.setting.level == "carrier" else ((8, -3), "left")
+            axes.annotate(name, (abs(cost(point)), 100 * point.error), offset, textcoords="offset points", ha=side,
+                          va="top", fontsize=8, fontweight="bold", color=line["color"])  # fmt: skip
     if numbered:  # where there are no points: fast and wrong, or slow and wrong
         at, side = (0.02, "left") if cost(points[0]) < 0 else (0.98, "right")
         axes.text(at, 0.9, "front:\n" + "\n".join(numbered), transform=axes.transAxes, ha=side, va="top", fontsize=8,

@@ -70,7 +70,9 @@ def measure() -> dict[str, figures.Run]:
     return {
         "Constant gain": constant_gain(texture),
         "Open inverse of the free plate": play(texture, device=SensorlessPlate),
-        f"Controller of Grigorii et al. 2021, {CARRIERS} carriers": play(OnCarriers(texture), method="paper-common"),
+        f"Controller of Grigorii et al. 2021, common mode, {CARRIERS} carriers": play(
+            OnCarriers(texture), method="paper-common"
+        ),
         "inverse, the default": play(texture),
     }
 

@@ -101,7 +101,7 @@ def draw(found: Sequence[Row]) -> Any:
             panel.set(
                 xscale="log", xlim=(0.1, 150.0), ylim=(len(signals) - 0.5, -0.5), title=finger, xlabel="error (%)"
             )
-            _plain(panel.xaxis)
+            panel.xaxis.set_major_formatter(lambda value, _: f"{value:g}")
         _over_speed(axes[-1], found)
         _legend(figure)
         figure.suptitle(
@@ -141,11 +141,6 @@ def _over_speed(axes: Any, found: Sequence[Row]) -> None:
     axes.set_xticks(ticks, [str(tick) for tick in ticks])
     axes.minorticks_off()
     axes.yaxis.set_major_formatter(lambda value, _: f"{value:g} %")
-
-
-def _plain(axis: Any) -> None:
-    """Write the ticks as plain numbers."""
-    axis.set_major_formatter(lambda value, _: f"{value:g}")
 
 
 def _legend(figure: Any) -> None:
