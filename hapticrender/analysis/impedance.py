@@ -71,4 +71,5 @@ def impedance_of(
         np.where(clear, np.sqrt(variance), np.nan),
         load,
         position,
+        velocity,
     )

@@ -57,6 +57,8 @@ class Impedance:
         Standard error of the real part and of the imaginary part (N s/m), which are taken as equal and independent.
     normal_load, position : ndarray, shape (n,)
         Of the finger (N, m).
+    velocity : ndarray of complex, shape (n, bands), optional
+        Amplitude of the velocity v at the finger (m/s).
     """
 
     time: Array
@@ -65,6 +67,12 @@ class Impedance:
     standard_error: Array
     normal_load: Array
     position: Array
+    velocity: Array = field(default_factory=lambda: np.zeros((0, 0), complex))
+
+    @property
+    def force(self) -> Array:
+        """Amplitude of the finger's force F_f = Z_f v (N, complex); its standard error is that of Z_f times abs(v)."""
+        return np.asarray(self.value * self.velocity)
 
 
 @dataclass(frozen=True)
