@@ -40,7 +40,8 @@ class NaiveInverse:
         self.references.append(waveform * (3 * self.fade**2 - 2 * self.fade**3) * self.smooth)
         now = self.reference(n - law["delay"] - 6)
         e = y - self.s * now
-        self.gate(e[0])
+        if self.gate(e[0]) and self.since > law["joined"]:
+            self.suspect()
         self.past = np.column_stack([e, self.past[:, :-1]])
         if settled:
             for i in range(self.n):
@@ -81,16 +82,27 @@ class NaiveInverse:
             self.P[:] = law["spread"]
             self.P[HEAVE:LOAD, HEAVE:LOAD] = self.earlier[0][1]
             self.earlier = self.earlier[0], self.earlier[0]
-            self.psi[:] = 0.0
-            self.theta[INITIAL:] = 0.0
-            for k in range(4):
-                self.psi[k, INITIAL + k] = 1.0
-                self.P[INITIAL + k, INITIAL + k] = law["start"][k]
+            self.take_motion()
         elif self.since == law["joined"]:
             self.forget(INITIAL, COUNT)
         elif self.since > law["joined"] and self.samples % law["notice"] == 0:
             self.earlier = self.earlier[1], (self.theta[HEAVE:LOAD].copy(), self.P[HEAVE:LOAD, HEAVE:LOAD].copy())
         return self.since >= law["settling"]
+
+    def take_motion(self):
+        self.psi[:] = 0.0
+        self.psi[:, INITIAL:COUNT] = np.eye(4)
+        self.theta[INITIAL:] = 0.0
+        self.P[INITIAL:, INITIAL:] = np.diag(self.law["start"])
+
+    def suspect(self):
+        for i in (HEAVE, HEAVE + 1, HEAVE + 2, ROCKING, ROCKING + 1, ROCKING + 2):
+            self.P[i, i] = max(self.P[i, i], self.law["suspected"])
+        self.P[LOAD:] = self.law["spread"][LOAD:]
+        self.P[:, LOAD:] = self.law["spread"][:, LOAD:]
+        self.P[LOAD + 1, LOAD + 1] = self.P[LOAD, LOAD]
+        self.take_motion()
+        self.since = self.law["joining"]
 
     def forget(self, first, last):
         inside = slice(first, last)
@@ -105,8 +117,10 @@ class NaiveInverse:
         self.power += law["mean_square"] * ((deviation - self.slow) ** 2 - self.power)
         if self.power > law["level"]:
             self.timer = max(self.timer, 1)
+        opens = self.power > law["level"] and self.open == 0.0
         self.open = 1.0 if self.timer > 0 else max(self.open - self.p["release"], 0.0)
         self.timer -= 1
+        return opens
 
     def learn(self, i, error):
         h = -self.psi[i, :COUNT]

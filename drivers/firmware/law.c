@@ -130,13 +130,17 @@ static void find_basis(law_t *law, real_t *rate, real_t *acceleration)
     *acceleration = r[2];
 }
 
-/* Set the gain of the inner damper: open after a contact, and while the deviation is more than noise. */
-static void open_gate(law_t *law, real_t deviation)
+/*
+ * Set the gain of the inner damper: open after a contact, and while the deviation is more than noise; 1 where a deviation
+ * opens a closed gate.
+ */
+static uint32_t open_gate(law_t *law, real_t deviation)
 {
     const design_t *d = law->design;
     law->slow += d->high_pass * (deviation - law->slow);
     const real_t above = deviation - law->slow;
     law->power += d->mean_square * (above * above - law->power);
+    const uint32_t opens = ((law->power > d->level) && (law->fast_open <= REAL(0.0))) ? 1u : 0u;
     if ((law->power > d->level) && (law->fast_timer == 0u)) {
         law->fast_timer = 1u;
     }
@@ -147,6 +151,7 @@ static void open_gate(law_t *law, real_t deviation)
         law->fast_open = real_max(law->fast_open - d->release, REAL(0.0));
     }
     law->damper_gain = law->damper_scale * (law->fast_open * d->damper_high);
+    return opens;
 }
 
 /* Force of the inner damper, F = -sum taps eps[n - j]. */
@@ -176,7 +181,9 @@ static void use_sensors(law_t *law, const real_t coordinates[2], uint32_t learns
     const design_t *d = law->design;
     const real_t error[2] = {
         coordinates[0] - d->shape[0] * law->reference, coordinates[1] - d->shape[1] * law->reference};
-    open_gate(law, error[0]);
+    if ((open_gate(law, error[0]) != 0u) && (law->learning.since > d->joined)) {
+        learning_suspect(law);
+    }
     if (learns != 0u) {
         learning_update(law, error);
     }

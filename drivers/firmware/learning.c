@@ -173,6 +173,18 @@ static void note_device(learning_t *v)
     }
 }
 
+/* Start the regressors from rest, with the deviation of now as four more parameters. */
+static void take_motion(law_t *law)
+{
+    learning_t *v = &law->learning;
+    (void)memset(v->states, 0, sizeof(v->states));
+    for (uint32_t k = 0u; k < 4u; k++) {
+        v->states[k][LAW_INITIAL + k] = REAL(1.0);
+        v->theta[LAW_INITIAL + k] = REAL(0.0);
+        v->covariance[LAW_INITIAL + k][LAW_INITIAL + k] = law->design->start[k];
+    }
+}
+
 /*
  * Learn afresh, with the deviation of now as four more parameters.  The estimates stay, but the device's own go back to
  * the earlier note, as a contact is reported after it happened; the covariance of all others returns to the prior.
@@ -182,16 +194,35 @@ static void restart(law_t *law)
     learning_t *v = &law->learning;
     (void)memcpy(v->covariance, law->design->spread, sizeof(v->covariance));
     (void)memcpy(v->earlier[1], v->earlier[0], sizeof(v->earlier[1]));
-    (void)memset(v->states, 0, sizeof(v->states));
     for (uint32_t i = 0u; i < LAW_OWN; i++) {
         v->theta[LAW_HEAVE + i] = v->earlier[0][LAW_OWN][i];
         (void)memcpy(&v->covariance[LAW_HEAVE + i][LAW_HEAVE], v->earlier[0][i], sizeof(v->earlier[0][i]));
     }
-    for (uint32_t k = 0u; k < 4u; k++) {
-        v->states[k][LAW_INITIAL + k] = REAL(1.0);
-        v->theta[LAW_INITIAL + k] = REAL(0.0);
-        v->covariance[LAW_INITIAL + k][LAW_INITIAL + k] = law->design->start[k];
+    take_motion(law);
+}
+
+/*
+ * Learn at once what a finger may add to the device or take from it, and its load: a contact is reported late.  Heave
+ * and rocking stand for the finger until the report comes, which sets them back.
+ */
+void learning_suspect(law_t *law)
+{
+    static const uint32_t stand_in[6] = {
+        LAW_HEAVE, LAW_HEAVE + 1u, LAW_HEAVE + 2u, LAW_ROCKING, LAW_ROCKING + 1u, LAW_ROCKING + 2u};
+    learning_t *v = &law->learning;
+    for (uint32_t n = 0u; n < 6u; n++) {
+        const uint32_t i = stand_in[n];
+        v->covariance[i][i] = real_max(v->covariance[i][i], law->design->suspected);
     }
+    for (uint32_t i = LAW_LOAD; i < LAW_PARAMETERS; i++) {
+        for (uint32_t j = 0u; j < LAW_PARAMETERS; j++) {
+            v->covariance[i][j] = law->design->spread[i][j];
+            v->covariance[j][i] = law->design->spread[i][j];
+        }
+    }
+    v->covariance[LAW_LOAD + 1u][LAW_LOAD + 1u] = law->design->spread[LAW_LOAD][LAW_LOAD]; /* it may act anywhere */
+    take_motion(law);
+    v->since = law->design->joining;
 }
 
 /* Reset what belongs to a contact when one begins or ends, and learn afresh; 1 where there is something to learn. */

@@ -63,7 +63,7 @@ class Damping:
 
     taps: Array  # (coordinates, n), N/m; zero where the damper is off
     added_damping: Array  # (coordinates,), N s/m, that the taps add at each mode
-    quality: float  # Q of each mode with its damper; inf where it is off
+    quality: float  # Q of each mode with its damper, but for what the note names; inf where it is off
     margins: tuple[Margins, ...]  # one for each coordinate; none where the damper is off
     noise: tuple[float, ...]  # motion from white sensor noise, rms of each coordinate per rms of each sensor
     note: str  # what was chosen, and why
@@ -200,7 +200,11 @@ def _held_mode(z: Array, rate: float, omega: float, ratio: float, gain: float) -
 
 
 def choose_damping(
-    model: DeviceModel, *, bending: BendingMode | None = None, least: LeastMargins = LEAST["damper"]
+    model: DeviceModel,
+    *,
+    bending: BendingMode | None = None,
+    least: LeastMargins = LEAST["damper"],
+    apart: bool = False,
 ) -> Damping:
     """Design the inner damper: the most damping whose margins hold, or none, and why.
 
@@ -208,11 +212,32 @@ def choose_damping(
     stays below 5 with that mode at both ends of its tolerance.  Q starts at 1.4 where that mode is measured or the
     model is rigid, else at 2.  Where even a damper of four times the modes' own damping would not do, the damper is
     off.  Notched taps reach back 0.6 to 1 bending period; the reach with the least noise is taken.
+
+    `apart`: every coordinate has a Q of its own, so that rocking, which a symmetric bending mode does not couple into,
+    is damped from Q 1.4 on and without a notch.
     """
     if not (model.mass.diagonal() > 0.0).all():
         return _off(len(model.mass), "the device has no mode")
-    known = model.rigid if bending is None else bending.measured
-    return _chosen(oscillators(model), QUALITY if known else QUALITY_UNMEASURED, bending, model.taps, least)
+    known, parts = model.rigid if bending is None else bending.measured, oscillators(model)
+    whole = _chosen(parts, QUALITY if known else QUALITY_UNMEASURED, bending, model.taps, least)
+    if bending is None or not apart or not whole.margins:
+        return whole
+    free = [i for i in range(len(parts)) if bending.coupling[i] == 0.0]
+    for i in free:
+        whole = _replaced(whole, i, _chosen((parts[i],), QUALITY, None, model.taps, least))
+    return whole
+
+
+def _replaced(whole: Damping, i: int, own: Damping) -> Damping:
+    """Damper with the taps of coordinate i from a design of its own, where that has any."""
+    if not own.margins:
+        return whole
+    taps, added = whole.taps.copy(), whole.added_damping.copy()
+    taps[i], added[i] = np.pad(own.taps[0], (0, taps.shape[1] - own.taps.shape[1])), own.added_damping[0]
+    margins, noise = list(whole.margins), list(whole.noise)
+    margins[i], noise[i] = own.margins[0], own.noise[0]
+    note = f"{whole.note}; coordinate {i + 1} Q {own.quality:g}"
+    return replace(whole, taps=taps, added_damping=added, margins=tuple(margins), noise=tuple(noise), note=note)
 
 
 def within_a_turn(model: DeviceModel) -> bool:

@@ -51,6 +51,9 @@ FRICTION = np.array([0.4, 0.4, 0.3, 0.1])  # of stiffness, damping and mass of a
 FRICTION_NOISE = 0.05  # N: of a friction that no model explains; a filter surer than that follows its own mistakes
 LOAD_OF_FRICTION = 3.0  # N: of the attraction that a finger's own friction amounts to
 LOAD_SIZE = (0.6, 0.1)  # N: of the load, and of the moment beside it over a
+SUSPECTED = (
+    14e3  # N/m: of each of heave's and rocking's parameters once the damper's gate opens with no contact reported
+)
 
 
 @lru_cache(maxsize=32)
@@ -176,7 +179,7 @@ class AdaptiveInverse:
         if not known or beyond or (bands.envelope is None and len(bands)):
             return design_controller(self.name, model, bands, rules_for(bands), feedback=feedback)
         prompt = model.delay <= PROMPT
-        damping = choose_damping(model, bending=model.bending) if feedback and prompt else None
+        damping = choose_damping(model, bending=model.bending, apart=True) if feedback and prompt else None
         if damping is not None and not (damping.margins and quiet_enough(damping, model)):
             damping = None
         settings = controller_settings(model, bands, damping, feedback)
@@ -285,6 +288,7 @@ def law_settings(model: DeviceModel, bands: Bands, feedback: bool) -> dict[str, 
         "noise": 6.0 * noise**2 + (FRICTION_NOISE**2 if model.finger.contact is None else 0.0),
         "prior": mean,
         "spread": spread,
+        "suspected": 0.0 if model.finger.contact is None else SUSPECTED**2,
         "covariance": spread,
         "earlier": np.vstack([spread[HEAVE:LOAD, HEAVE:LOAD], mean[HEAVE:LOAD]]),
         "theta": mean,

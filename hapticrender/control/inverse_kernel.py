@@ -28,6 +28,7 @@ from hapticrender.control.inverse_learning import (
     note_device,
     reset_parameters,
     revert,
+    suspect_contact,
 )
 from hapticrender.control.inverse_records import (
     BASIS,
@@ -123,17 +124,19 @@ def find_basis(controller, inverse):
 def open_gate(controller, inverse, deviation):
     """Gain of the inner damper: open after a contact, and while the deviation is more than noise.
 
-    `damper_scale` is the supervisor's: it turns a ringing damper down.
+    `damper_scale` is the supervisor's: it turns a ringing damper down.  Returns whether a deviation opens it.
     """
     c, v = record(controller, CONTROLLER_T, 0), record(inverse, INVERSE_T, 0)
     v.slow += v.high_pass * (deviation - v.slow)
     above = deviation - v.slow
     v.power += v.mean_square * (above * above - v.power)
-    if v.power > v.level:
+    large, closed = v.power > v.level, c.fast_open == 0.0
+    if large:
         c.fast_timer = max(c.fast_timer, 1.0)
     c.fast_open = 1.0 if c.fast_timer > 0.0 else max(c.fast_open - c.p.release, 0.0)
     c.fast_timer -= 1.0
     c.damping_gain = c.damper_scale * (c.p.damper + c.fast_open * (c.p.damper_high - c.p.damper))
+    return large and closed
 
 
 @kernel
@@ -276,7 +279,8 @@ def inverse_step(state, signals, start, count):
         if update_confidence(state, implausible):
             reset_parameters(inverse, 0, PARAMETERS)
         elif implausible == 0 and v.learns > 0:
-            open_gate(state, inverse, error0)
+            if open_gate(state, inverse, error0) and v.since > v.joined and v.suspected > 0.0:
+                suspect_contact(inverse)
             for i in range(c.p.coordinates):
                 error = error0 if i == 0 else error1
                 if learning:

@@ -138,6 +138,18 @@ def restore_device(inverse):
 
 
 @kernel
+def take_motion(inverse):
+    """Start the regressors from rest, with the deviation of now as four more parameters."""
+    v = record(inverse, INVERSE_T, 0)
+    theta, covariance, states = v.theta, v.covariance, v.states
+    for k in range(4):
+        for i in range(ROWS):
+            states[k, i] = 0.0
+        states[k, INITIAL + k] = 1.0
+        theta[INITIAL + k], covariance[INITIAL + k, INITIAL + k] = 0.0, v.start[k]
+
+
+@kernel
 def restart(inverse):
     """Learn afresh from here on, with the deviation of now as four more parameters; the estimates stay.
 
@@ -145,18 +157,33 @@ def restart(inverse):
     as certain as it seemed.
     """
     v = record(inverse, INVERSE_T, 0)
-    theta, covariance, states = v.theta, v.covariance, v.states
+    covariance = v.covariance
     restore_device(inverse)
     for i in range(PARAMETERS):
         within = i < HEAVE or i >= LOAD
         for j in range(PARAMETERS):
             if within or j < HEAVE or j >= LOAD:
                 covariance[i, j] = v.spread[i, j]
-    for k in range(4):
-        for i in range(ROWS):
-            states[k, i] = 0.0
-        states[k, INITIAL + k] = 1.0
-        theta[INITIAL + k], covariance[INITIAL + k, INITIAL + k] = 0.0, v.start[k]
+    take_motion(inverse)
+
+
+@kernel
+def suspect_contact(inverse):
+    """Learn at once what a finger may add to the device or take from it, and its load: a contact is reported late.
+
+    Heave and rocking stand for the finger until the report comes, which sets them back (`restore_device`).
+    """
+    v = record(inverse, INVERSE_T, 0)
+    covariance = v.covariance
+    for first in (HEAVE, ROCKING):
+        for i in range(first, first + 3):
+            covariance[i, i] = max(covariance[i, i], v.suspected)
+    for i in range(LOAD, PARAMETERS):
+        for j in range(PARAMETERS):
+            covariance[i, j] = covariance[j, i] = v.spread[i, j]
+    covariance[LOAD + 1, LOAD + 1] = v.spread[LOAD, LOAD]  # the load may act anywhere
+    take_motion(inverse)
+    v.since = v.joining
 
 
 @kernel
