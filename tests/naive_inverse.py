@@ -96,11 +96,14 @@ class NaiveInverse:
         self.P[INITIAL:, INITIAL:] = np.diag(self.law["start"])
 
     def suspect(self):
-        for i in (HEAVE, HEAVE + 1, HEAVE + 2, ROCKING, ROCKING + 1, ROCKING + 2):
-            self.P[i, i] = max(self.P[i, i], self.law["suspected"])
         self.P[LOAD:] = self.law["spread"][LOAD:]
         self.P[:, LOAD:] = self.law["spread"][:, LOAD:]
-        self.P[LOAD + 1, LOAD + 1] = self.P[LOAD, LOAD]
+        if self.contact:
+            self.P[:HEAVE, :HEAVE] += np.outer(self.theta[:HEAVE], self.theta[:HEAVE])
+        else:
+            for i in (HEAVE, HEAVE + 1, HEAVE + 2, ROCKING, ROCKING + 1, ROCKING + 2):
+                self.P[i, i] = max(self.P[i, i], self.law["suspected"])
+            self.P[LOAD + 1, LOAD + 1] = self.P[LOAD, LOAD]
         self.take_motion()
         self.since = self.law["joining"]
 

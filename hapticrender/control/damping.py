@@ -222,9 +222,9 @@ def choose_damping(
     whole = _chosen(parts, QUALITY if known else QUALITY_UNMEASURED, bending, model.taps, least)
     if bending is None or not apart or not whole.margins:
         return whole
-    free = [i for i in range(len(parts)) if bending.coupling[i] == 0.0]
-    for i in free:
-        whole = _replaced(whole, i, _chosen((parts[i],), QUALITY, None, model.taps, least))
+    for i, part in enumerate(parts):
+        if bending.coupling[i] == 0.0:
+            whole = _replaced(whole, i, _chosen((part,), QUALITY, None, model.taps, least))
     return whole
 
 

@@ -51,9 +51,7 @@ FRICTION = np.array([0.4, 0.4, 0.3, 0.1])  # of stiffness, damping and mass of a
 FRICTION_NOISE = 0.05  # N: of a friction that no model explains; a filter surer than that follows its own mistakes
 LOAD_OF_FRICTION = 3.0  # N: of the attraction that a finger's own friction amounts to
 LOAD_SIZE = (0.6, 0.1)  # N: of the load, and of the moment beside it over a
-SUSPECTED = (
-    14e3  # N/m: of each of heave's and rocking's parameters once the damper's gate opens with no contact reported
-)
+SUSPECTED = 14e3  # N/m: what a finger that is not reported yet may add to each parameter of heave and rocking
 
 
 @lru_cache(maxsize=32)

@@ -169,19 +169,25 @@ def restart(inverse):
 
 @kernel
 def suspect_contact(inverse):
-    """Learn at once what a finger may add to the device or take from it, and its load: a contact is reported late.
+    """Learn at once from a deviation that no report explains: a contact is reported late.
 
-    Heave and rocking stand for the finger until the report comes, which sets them back (`restore_device`).
+    On the untouched device heave and rocking stand for the finger, until the report sets them back
+    (`restore_device`); under a finger that may have left, all of its estimate is uncertain alike.
     """
     v = record(inverse, INVERSE_T, 0)
-    covariance = v.covariance
-    for first in (HEAVE, ROCKING):
-        for i in range(first, first + 3):
-            covariance[i, i] = max(covariance[i, i], v.suspected)
+    theta, covariance = v.theta, v.covariance
     for i in range(LOAD, PARAMETERS):
         for j in range(PARAMETERS):
             covariance[i, j] = covariance[j, i] = v.spread[i, j]
-    covariance[LOAD + 1, LOAD + 1] = v.spread[LOAD, LOAD]  # the load may act anywhere
+    if v.contact > 0.0:
+        for i in range(FINGER, HEAVE):
+            for j in range(FINGER, HEAVE):
+                covariance[i, j] += theta[i] * theta[j]
+    else:
+        for first in (HEAVE, ROCKING):
+            for i in range(first, first + 3):
+                covariance[i, i] = max(covariance[i, i], v.suspected)
+        covariance[LOAD + 1, LOAD + 1] = v.spread[LOAD, LOAD]  # the load may act anywhere
     take_motion(inverse)
     v.since = v.joining
 
