@@ -32,7 +32,6 @@ damper_high release
 _LAW = """
 mass damping stiffness lever_per_metre level high_pass mean_square filters sensor_filter pair hertz_scale pole
 pole_damping fade_step decay smoothing noise model_error levelling prior start spread
-suspected
 """.split()
 _SUPERVISION = """
 invalid_pole frozen_drive low high corner shape omega energy_pole power_pole drive_pole ring_corner ring_shape ring_pole

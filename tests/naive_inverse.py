@@ -40,7 +40,7 @@ class NaiveInverse:
         self.references.append(waveform * (3 * self.fade**2 - 2 * self.fade**3) * self.smooth)
         now = self.reference(n - law["delay"] - 6)
         e = y - self.s * now
-        if self.gate(e[0]) and self.since > law["joined"]:
+        if self.gate(e[0]) and self.since > law["joined"] and self.contact:
             self.suspect()
         self.past = np.column_stack([e, self.past[:, :-1]])
         if settled:
@@ -98,12 +98,7 @@ class NaiveInverse:
     def suspect(self):
         self.P[LOAD:] = self.law["spread"][LOAD:]
         self.P[:, LOAD:] = self.law["spread"][:, LOAD:]
-        if self.contact:
-            self.P[:HEAVE, :HEAVE] += np.outer(self.theta[:HEAVE], self.theta[:HEAVE])
-        else:
-            for i in (HEAVE, HEAVE + 1, HEAVE + 2, ROCKING, ROCKING + 1, ROCKING + 2):
-                self.P[i, i] = max(self.P[i, i], self.law["suspected"])
-            self.P[LOAD + 1, LOAD + 1] = self.P[LOAD, LOAD]
+        self.P[:HEAVE, :HEAVE] += np.outer(self.theta[:HEAVE], self.theta[:HEAVE])
         self.take_motion()
         self.since = self.law["joining"]
 

@@ -181,7 +181,7 @@ static void use_sensors(law_t *law, const real_t coordinates[2], uint32_t learns
     const design_t *d = law->design;
     const real_t error[2] = {
         coordinates[0] - d->shape[0] * law->reference, coordinates[1] - d->shape[1] * law->reference};
-    if ((open_gate(law, error[0]) != 0u) && (law->learning.since > d->joined)) {
+    if ((open_gate(law, error[0]) != 0u) && (law->learning.since > d->joined) && (law->learning.contact != 0u)) {
         learning_suspect(law);
     }
     if (learns != 0u) {

@@ -87,7 +87,6 @@ typedef struct {
     real_t levelling;                                     /* pole a sample */
     real_t prior[LAW_PARAMETERS], lost[LAW_PARAMETERS], start[4]; /* lost: of the way from the prior, a reversion */
     real_t spread[LAW_PARAMETERS][LAW_PARAMETERS];
-    real_t suspected; /* (N/m)^2, of a finger that is not reported yet */
 } design_t;
 
 extern const design_t design; /* in design.c */

@@ -201,24 +201,7 @@ static void restart(law_t *law)
     take_motion(law);
 }
 
-/* What an untouched device lacks may be a finger, and its load may act anywhere. */
-static void suspect_touch(law_t *law)
-{
-    static const uint32_t stand_in[6] = {
-        LAW_HEAVE, LAW_HEAVE + 1u, LAW_HEAVE + 2u, LAW_ROCKING, LAW_ROCKING + 1u, LAW_ROCKING + 2u};
-    learning_t *v = &law->learning;
-    for (uint32_t n = 0u; n < 6u; n++) {
-        const uint32_t i = stand_in[n];
-        v->covariance[i][i] = real_max(v->covariance[i][i], law->design->suspected);
-    }
-    v->covariance[LAW_LOAD + 1u][LAW_LOAD + 1u] = law->design->spread[LAW_LOAD][LAW_LOAD];
-}
-
-/*
- * Learn at once from a deviation that no report explains: a contact is reported late.  On the untouched device heave and
- * rocking stand for the finger until the report sets them back; under a finger that may have left, all of its estimate
- * is uncertain alike.
- */
+/* Learn at once whether the finger is still there: all of its estimate becomes uncertain alike; a lift is reported late. */
 void learning_suspect(law_t *law)
 {
     learning_t *v = &law->learning;
@@ -228,13 +211,9 @@ void learning_suspect(law_t *law)
             v->covariance[j][i] = law->design->spread[i][j];
         }
     }
-    if (v->contact == 0u) {
-        suspect_touch(law);
-    } else {
-        for (uint32_t i = LAW_FINGER; i < LAW_HEAVE; i++) {
-            for (uint32_t j = LAW_FINGER; j < LAW_HEAVE; j++) {
-                v->covariance[i][j] += v->theta[i] * v->theta[j];
-            }
+    for (uint32_t i = LAW_FINGER; i < LAW_HEAVE; i++) {
+        for (uint32_t j = LAW_FINGER; j < LAW_HEAVE; j++) {
+            v->covariance[i][j] += v->theta[i] * v->theta[j];
         }
     }
     take_motion(law);

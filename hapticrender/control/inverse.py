@@ -51,7 +51,6 @@ FRICTION = np.array([0.4, 0.4, 0.3, 0.1])  # of stiffness, damping and mass of a
 FRICTION_NOISE = 0.05  # N: of a friction that no model explains; a filter surer than that follows its own mistakes
 LOAD_OF_FRICTION = 3.0  # N: of the attraction that a finger's own friction amounts to
 LOAD_SIZE = (0.6, 0.1)  # N: of the load, and of the moment beside it over a
-SUSPECTED = 14e3  # N/m: what a finger that is not reported yet may add to each parameter of heave and rocking
 
 
 @lru_cache(maxsize=32)
@@ -286,7 +285,6 @@ def law_settings(model: DeviceModel, bands: Bands, feedback: bool) -> dict[str, 
         "noise": 6.0 * noise**2 + (FRICTION_NOISE**2 if model.finger.contact is None else 0.0),
         "prior": mean,
         "spread": spread,
-        "suspected": 0.0 if model.finger.contact is None else SUSPECTED**2,
         "covariance": spread,
         "earlier": np.vstack([spread[HEAVE:LOAD, HEAVE:LOAD], mean[HEAVE:LOAD]]),
         "theta": mean,

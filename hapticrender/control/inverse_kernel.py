@@ -28,7 +28,7 @@ from hapticrender.control.inverse_learning import (
     note_device,
     reset_parameters,
     revert,
-    suspect_contact,
+    suspect_lift,
 )
 from hapticrender.control.inverse_records import (
     BASIS,
@@ -279,8 +279,13 @@ def inverse_step(state, signals, start, count):
         if update_confidence(state, implausible):
             reset_parameters(inverse, 0, PARAMETERS)
         elif implausible == 0 and v.learns > 0:
-            if open_gate(state, inverse, error0) and v.since > v.joined and v.suspected > 0.0:
-                suspect_contact(inverse)
+            if (
+                open_gate(state, inverse, error0)
+                and v.since > v.joined
+                and v.contact > 0.0
+                and c.p.needs_contact == 0.0
+            ):
+                suspect_lift(inverse)
             for i in range(c.p.coordinates):
                 error = error0 if i == 0 else error1
                 if learning:

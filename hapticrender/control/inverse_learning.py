@@ -168,26 +168,19 @@ def restart(inverse):
 
 
 @kernel
-def suspect_contact(inverse):
-    """Learn at once from a deviation that no report explains: a contact is reported late.
+def suspect_lift(inverse):
+    """Learn at once whether the finger is still there: all of its estimate becomes uncertain alike.
 
-    On the untouched device heave and rocking stand for the finger, until the report sets them back
-    (`restore_device`); under a finger that may have left, all of its estimate is uncertain alike.
+    A lift is reported late.
     """
     v = record(inverse, INVERSE_T, 0)
     theta, covariance = v.theta, v.covariance
     for i in range(LOAD, PARAMETERS):
         for j in range(PARAMETERS):
             covariance[i, j] = covariance[j, i] = v.spread[i, j]
-    if v.contact > 0.0:
-        for i in range(FINGER, HEAVE):
-            for j in range(FINGER, HEAVE):
-                covariance[i, j] += theta[i] * theta[j]
-    else:
-        for first in (HEAVE, ROCKING):
-            for i in range(first, first + 3):
-                covariance[i, i] = max(covariance[i, i], v.suspected)
-        covariance[LOAD + 1, LOAD + 1] = v.spread[LOAD, LOAD]  # the load may act anywhere
+    for i in range(FINGER, HEAVE):
+        for j in range(FINGER, HEAVE):
+            covariance[i, j] += theta[i] * theta[j]
     take_motion(inverse)
     v.since = v.joining
 

@@ -18,9 +18,8 @@ _LAW = "lever_per_metre hertz_scale pole pole_damping fade_step"
 # after a contact, in samples: learning begins, begins again, has no initial motion any more, the damper closes;
 # samples between two notes of the device's parameters; for so many a position may be missing
 _CONTACT = "settling joining joined damper_time notice patience"
-# variance of what a suspected finger adds ((N/m)^2)
 # of the damper's gate (m^2; poles a sample), of the reference's scale (samples; poles a sample), of means and levelling
-_POLES = "suspected level high_pass mean_square hold decay smoothing levelling slowly"
+_POLES = "level high_pass mean_square hold decay smoothing levelling slowly"
 # fade and scale of the reference, the drive's largest need; the finger's lever arm and contact, samples since it
 # changed and since a position was there; the gate's slow part and mean square; r as the sensors show it; levelling
 # force; mean squares on the untouched device, see `compare`; last sane sample of the waveform
