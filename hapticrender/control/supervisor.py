@@ -13,8 +13,8 @@ import numpy as np
 
 from hapticrender.control.controller import BankController
 from hapticrender.control.device_model import Demand, DeviceModel
+from hapticrender.control.gains import design_gains
 from hapticrender.control.records import CONTROLLER, MOST_CHANNELS, MOST_SENSORS
-from hapticrender.control.sensor_gains import design_gains
 from hapticrender.control.supervisor_kernel import (
     ACTIVE,
     BEYOND,
@@ -22,6 +22,7 @@ from hapticrender.control.supervisor_kernel import (
     FROZEN,
     INCONSISTENT,
     INVALID,
+    INVERTED,
     OVERMOTION,
     RESCALED,
     RINGING,
@@ -56,10 +57,10 @@ UNLIMITED = 1e300
 class Fault(NamedTuple):
     """Why a supervisor has stopped the drive."""
 
-    cause: int  # INVALID to RESCALED
+    cause: int  # INVALID to INVERTED
     sample: int  # at which the test failed; the drive fades out from it on
-    sensors: int  # bit i: sensor i + 1; of INVALID, FROZEN, BEYOND and RESCALED
-    gains: tuple[float, ...] = ()  # of all sensors, over those before; of RESCALED
+    sensors: int  # bit i: sensor i + 1; of INVALID, FROZEN, BEYOND and RESCALED; actuator of INVERTED
+    gains: tuple[float, ...] = ()  # of all sensors or actuators, over those before; of the last two
 
     @property
     def text(self) -> str:
@@ -112,6 +113,10 @@ CAUSES = {
         "disconnected, or its gain has changed",
         "wiring, polarity and gain of all sensors",
     ),
+    INVERTED: (
+        "actuator {sensor}: the motion is that of {gain} times its drive; most likely it is inverted, or sensors are",
+        "wiring and polarity of all actuators and sensors",
+    ),
 }
 
 
@@ -152,7 +157,9 @@ class SupervisedController:
     def fault(self) -> Fault | None:
         """Why and when the drive has been stopped."""
         cause, sample, sensors = (int(self.state[name][0]) for name in ("cause", "stopped", "sensors"))
-        gains = () if self._gains is None else tuple(self._gains["gain"][0].tolist())
+        gains = (
+            () if cause < RESCALED or self._gains is None else tuple(self._gains["gain"][0, cause - RESCALED].tolist())
+        )
         return Fault(cause, sample, sensors, gains) if cause else None
 
     @property
