@@ -112,7 +112,7 @@ def cycles_per_instruction(program):
 
 def build(folder, *options):
     """Program that measures a design."""
-    sources = "law learning carriers supervisor design plate frames texture measure measure_m4 startup_m4".split()
+    sources = "law learning carriers supervisor gains design plate frames texture measure measure_m4 startup_m4".split()
     program = folder / "measure.elf"
     files = [f"{name}.c" for name in sources]
     command = [f"{PREFIX}gcc", *FLAGS.split(), *LINK.split(), *options, "-o", program, *files, "-lm"]

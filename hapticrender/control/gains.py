@@ -40,9 +40,9 @@ from hapticrender.protocols import Array
 
 MOST = 2  # sensors, and actuators
 SENSOR, ACTUATOR = range(2)  # kinds of gains
-RESCALED = ((0.4, 2.0), (-0.5, 1e9))  # gains between these are no fault
-LEAST_INVERTED = -1.6  # of an actuator
-UNEXPLAINED = (0.15, 0.1)  # of the energy of e; normal scenes leave more than 0.24
+INVERTED, LEAST_GAIN, MOST_GAIN = -0.4, 0.25, 2.0  # of a sensor; a finger that comes or goes may shrink a motion
+LEAST_ACTUATOR, MOST_ACTUATOR = -1.6, -0.5
+UNEXPLAINED, UNEXPLAINED_INVERTED = 0.1, 0.15  # of the energy of e: the latter of an inverted sensor
 CERTAIN, JUMP = 25.0, 20.0  # variances: 5 sigma of a gain; 4.5 sigma of an innovation
 WATCHED, LARGE = 5.0, 20.0  # variances of e: actuators are followed, judged
 WANDER = 3.5  # N/sqrt(s), of d
@@ -55,7 +55,8 @@ GAINS = np.dtype(
         ("filter_gain", np.float64, (6, MOST)),  # K
         ("sensor_from_coordinate", np.float64, (MOST, 2)),  # of C
         ("force_of_actuator", np.float64, (MOST, 2, 2)),  # F_j per F
-        ("innovation", np.float64),  # variance of e of each sensor by noise
+        ("scale", np.float64),  # 1/m: e and C are in units of the sensors' noise
+        ("innovation", np.float64),  # variance of e of each sensor by noise, as a multiple of its own
         *((name, np.float64) for name in ("mean_pole", "window_pole")),  # a sample
         ("duration", np.int64),  # samples of a trial
         ("models", np.float64, (6, 6)),  # x, p, xi_1, xi_2, zeta_1, zeta_2
@@ -79,18 +80,18 @@ def design_gains(model: DeviceModel, noise: float) -> Array | None:
     a, b = np.zeros((2 * n, 2 * n)), np.vstack([np.zeros((n, n)), inverse])
     a[:n, n:], a[n:, :n], a[n:, n:] = np.eye(n), -inverse @ model.stiffness, -inverse @ model.damping
     a, b = zoh(a, b, 1.0 / model.rate)
-    show = np.hstack([np.linalg.pinv(model.coordinate_from_sensed), np.zeros((sensors, 2 * n))])
     whole = np.block([[a, b], [np.zeros((n, 2 * n)), np.eye(n)]])
-    gain, variance = _filter(whole, show / noise, WANDER / math.sqrt(model.rate))
+    show = np.hstack([np.linalg.pinv(model.coordinate_from_sensed) / noise, np.zeros((sensors, 2 * n))])
+    gain, variance = _filter(whole, show, WANDER / math.sqrt(model.rate))
     found = np.zeros(1, GAINS)
     rows = np.r_[0:n, 2 : 2 + n, 4 : 4 + n]  # of a device of one coordinate
     found["step_state"][0][np.ix_(rows[: 2 * n], rows[: 2 * n])] = a
     found["step_force"][0][rows[: 2 * n], :n] = b
-    found["filter_gain"][0][rows, :sensors] = gain / noise
+    found["filter_gain"][0][rows, :sensors] = gain
     found["sensor_from_coordinate"][0][:sensors, :n] = show[:, :n]
     shares = np.einsum("aj,jb->jab", force_map, np.linalg.pinv(force_map))
     found["force_of_actuator"][0][:actuators, :n, :n] = shares
-    found["innovation"] = noise**2 * variance
+    found["scale"], found["innovation"] = 1.0 / noise, variance
     found["mean_pole"], found["window_pole"] = (-math.expm1(-1.0 / (t * model.rate)) for t in (MEAN, WINDOW))
     found["duration"] = max(round(TRIAL * model.rate), LEAST_TRIAL)
     return found
@@ -130,7 +131,7 @@ def correct_model(gains, k, error0, error1):
 
 @kernel
 def model_sensor(gains, k, i):
-    """What sensor i shows of model k."""
+    """What sensor i shows of model k, over its noise."""
     s = record(gains, GAINS_T, 0)
     return s.sensor_from_coordinate[i, 0] * s.models[k, 0] + s.sensor_from_coordinate[i, 1] * s.models[k, 1]
 
@@ -158,23 +159,31 @@ def add_sums(gains, kind, pole, w0, w1):
 
 
 @kernel
+def is_fault(kind, gain, rest):
+    """Whether a gain is that of a fault, with `rest` the share of the energy of e that it leaves unexplained."""
+    if kind == ACTUATOR:
+        return rest < UNEXPLAINED and LEAST_ACTUATOR < gain < MOST_ACTUATOR
+    if gain < INVERTED:
+        return rest < UNEXPLAINED_INVERTED
+    return rest < UNEXPLAINED and not LEAST_GAIN < gain < MOST_GAIN
+
+
+@kernel
 def judge_gains(gains, kind, noise):
-    """Find both gains; those out of bounds, as bits, if they explain the innovations of variance `noise`."""
+    """Find both gains, from innovations of variance `noise`; those that are faults, as bits."""
     s = record(gains, GAINS_T, 0)
-    w, b, energy, outside = s.weights[kind], s.weighted[kind], s.energy[kind], 0
+    w, b, faults = s.weights[kind], s.weighted[kind], 0
     w00, w11 = w[0, 0] + noise, w[1, 1] + noise  # a sensor that shows nothing keeps its gain
     scale = 1.0 / (w00 * w11 - w[0, 1] * w[0, 1])
     g0, g1 = scale * (w11 * b[0] - w[0, 1] * b[1]), scale * (w00 * b[1] - w[0, 1] * b[0])
-    rest = energy - 2.0 * (g0 * b[0] + g1 * b[1])
+    rest = s.energy[kind] - 2.0 * (g0 * b[0] + g1 * b[1])
     rest += g0 * g0 * w[0, 0] + 2.0 * g0 * g1 * w[0, 1] + g1 * g1 * w[1, 1]
     s.gain[kind, 0], s.gain[kind, 1] = 1.0 + g0, 1.0 + g1
-    least, most = RESCALED[kind]
     for j in range(2):
         g, variance = (g0, w11) if j == 0 else (g1, w00)
-        certain = g * g > CERTAIN * scale * variance * noise
-        if certain and not least < 1.0 + g < most and (kind == SENSOR or 1.0 + g > LEAST_INVERTED):
-            outside |= 1 << j
-    return outside if rest < UNEXPLAINED[kind] * energy else 0
+        if g * g > CERTAIN * scale * variance * noise and is_fault(kind, 1.0 + g, rest / s.energy[kind]):
+            faults |= 1 << j
+    return faults
 
 
 @kernel
@@ -221,7 +230,7 @@ def note_innovations(gains, sensed, sensors):
     s = record(gains, GAINS_T, 0)
     jump, energy = False, 0.0
     for i in range(sensors):
-        s.e[i] = sensed[i] - model_sensor(gains, 0, i)
+        s.e[i] = s.scale * sensed[i] - model_sensor(gains, 0, i)
         square = s.e[i] * s.e[i]
         jump |= square > JUMP * max(s.innovation, s.mean[i])
         s.mean[i] += s.mean_pole * (square - s.mean[i])

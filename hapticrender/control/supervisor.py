@@ -13,7 +13,7 @@ import numpy as np
 
 from hapticrender.control.controller import BankController
 from hapticrender.control.device_model import Demand, DeviceModel
-from hapticrender.control.gains import design_gains
+from hapticrender.control.gains import GAINS, design_gains
 from hapticrender.control.records import CONTROLLER, MOST_CHANNELS, MOST_SENSORS
 from hapticrender.control.supervisor_kernel import (
     ACTIVE,
@@ -135,12 +135,13 @@ class SupervisedController:
         self._forces = np.zeros((model.delay + 1, 3))
         settings = design_supervisor(controller, model)
         noise = max(model.sensed_noise, LEAST_NOISE * model.sensed_limit)
-        self._gains = design_gains(model, noise) if settings.get("modelled") else None
+        found = design_gains(model, noise) if settings.get("modelled") else None
+        self.gains = np.zeros(1, GAINS) if found is None else found
         settings |= {
             "step": controller.step.address,
             "state": controller.state.ctypes.data,
             "forces_at": self._forces.ctypes.data,
-            "gains": 0 if self._gains is None else self._gains.ctypes.data,
+            "gains": 0 if found is None else self.gains.ctypes.data,
         }
         for name, value in settings.items():
             self.state["p"][name] = value
@@ -157,9 +158,7 @@ class SupervisedController:
     def fault(self) -> Fault | None:
         """Why and when the drive has been stopped."""
         cause, sample, sensors = (int(self.state[name][0]) for name in ("cause", "stopped", "sensors"))
-        gains = (
-            () if cause < RESCALED or self._gains is None else tuple(self._gains["gain"][0, cause - RESCALED].tolist())
-        )
+        gains = tuple(self.gains["gain"][0, cause - RESCALED].tolist()) if cause >= RESCALED else ()
         return Fault(cause, sample, sensors, gains) if cause else None
 
     @property

@@ -22,7 +22,7 @@ no  test         condition                                                      
 7   overmotion   motion of an end > 3 R + 5.4 sag                                                 5 samples
 8   beyond       a sensor shows more than the device's limit of displacement                      3 in 10 ms
 9   active       mean(-r v) > 0.65 sqrt(E_F E_v) in heave, E_r < 6 E_F, means over 0.2 s          0.3 s
-10  rescaled     a sensor shows less than 0.4 or more than 2 times the motion that device and
+10  rescaled     a sensor shows less than 0.25 or more than 2 times the motion that device and
                  drive give, negative included; see `gains`                                       2 ms
 11  inverted     an actuator gives -0.5 to -1.6 times its force; see `gains`                      3 ms (mean)
 === ============ ================================================================================ ====================
@@ -231,6 +231,9 @@ def compare_gains(supervisor):
         held = p.stiffness
         start_gains(p.gains, q[0], q[1], held[0, 0] * q[0] + held[0, 1] * q[1], held[1, 0] * q[0] + held[1, 1] * q[1])
     rescaled, inverted = check_gains(p.gains, s.last, p.sensors, s.force[0], s.force[1])
+    for i in range(p.sensors):
+        if 2 * s.repeats[i] > p.frozen_time:  # that is for test 2 to find
+            rescaled &= ~(1 << i)
     if rescaled > 0:
         return RESCALED, rescaled
     return (INVERTED, inverted) if inverted > 0 else (0, 0)
