@@ -7,16 +7,15 @@
 
 #define SENSOR 0u
 #define ACTUATOR 1u
-#define INVERTED REAL(-0.4) /* gains of a sensor */
-#define LEAST_GAIN REAL(0.25)
+#define LEAST_INVERTED REAL(-1.6) /* gains of a sensor or an actuator that is inverted */
+#define MOST_INVERTED REAL(-0.4)
+#define DEAD REAL(0.25) /* of a sensor: a smaller magnitude is a fault, and a larger gain than this: */
 #define MOST_GAIN REAL(2.0)
-#define LEAST_ACTUATOR REAL(-1.6) /* gains of an inverted actuator */
-#define MOST_ACTUATOR REAL(-0.5)
 #define UNEXPLAINED REAL(0.1) /* of the energy of the innovations */
-#define UNEXPLAINED_INVERTED REAL(0.15)
+#define UNEXPLAINED_INVERTED REAL(0.2)
 #define CERTAIN REAL(25.0) /* variances: 5 sigma of a gain */
 #define JUMP REAL(20.0)    /* variances: 4.5 sigma of an innovation */
-#define WATCHED REAL(5.0)  /* variances: actuators are followed */
+#define WATCHED REAL(4.0)  /* variances: actuators are followed */
 #define LARGE REAL(20.0)   /* and judged */
 
 /* Advance a model by a sample, under the force that acts. */
@@ -71,14 +70,11 @@ static void add_sums(gains_t *s, uint32_t kind, real_t pole, const real_t w[2][2
 /* Whether a gain is that of a fault, with `rest` the share of the energy that it leaves unexplained. */
 static uint32_t is_fault(uint32_t kind, real_t gain, real_t rest)
 {
-    const uint32_t explained = (rest < UNEXPLAINED) ? 1u : 0u;
-    if (kind == ACTUATOR) {
-        return explained & (((gain > LEAST_ACTUATOR) && (gain < MOST_ACTUATOR)) ? 1u : 0u);
+    const uint32_t changed = ((real_abs(gain) < DEAD) || (gain > MOST_GAIN)) ? 1u : 0u;
+    if ((gain > LEAST_INVERTED) && (gain < MOST_INVERTED)) {
+        return (rest < ((kind == SENSOR) ? UNEXPLAINED_INVERTED : UNEXPLAINED)) ? 1u : 0u;
     }
-    if (gain < INVERTED) {
-        return (rest < UNEXPLAINED_INVERTED) ? 1u : 0u;
-    }
-    return explained & (((gain > LEAST_GAIN) && (gain < MOST_GAIN)) ? 0u : 1u);
+    return ((kind == SENSOR) && (rest < UNEXPLAINED)) ? changed : 0u;
 }
 
 /* Find both gains, from innovations of variance `noise`; those that are faults, as bits. */
@@ -134,14 +130,16 @@ static uint32_t follow_actuators(gains_t *s, const gain_settings_t *p, const rea
             w[j][i] = model_sensor(s->models[4u + j], p, i);
         }
     }
-    add_sums(s, ACTUATOR, p->window_pole, (const real_t (*)[2])w);
+    if (s->watched > p->duration / 2u) { /* by then w has forgotten where it began */
+        add_sums(s, ACTUATOR, p->window_pole, (const real_t (*)[2])w);
+    }
     for (uint32_t j = 0u; j < 2u; j++) {
         const real_t own[2] = {product(p->force_of_actuator[j][0], force), product(p->force_of_actuator[j][1], force)};
         correct_model(s->models[4u + j], p, w[j], REAL(-1.0));
         advance_model(s->models[4u + j], p, own);
     }
     const uint32_t found = judge_gains(s, ACTUATOR, p->window_pole * p->innovation);
-    return (s->energy[ACTUATOR] > LARGE * p->innovation) ? found : 0u;
+    return ((2u * s->watched > 3u * p->duration) && (s->energy[ACTUATOR] > LARGE * p->innovation)) ? found : 0u;
 }
 
 /* Find the innovations and their mean squares; whether one has jumped. */
@@ -176,8 +174,8 @@ uint32_t gains_check(
         rescaled = follow_sensors(s, p, force);
     }
     if (s->energy[ACTUATOR] > WATCHED * p->innovation) {
+        s->watched += 1u;
         *inverted = follow_actuators(s, p, force);
-        s->watched = 1u;
     } else if (s->watched != 0u) {
         clear_sums(s, ACTUATOR);
         s->watched = 0u;

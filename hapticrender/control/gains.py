@@ -16,7 +16,7 @@ An actuator j that gives g_j times its force F_j adds (g_j - 1) w_j::
 
 Least squares of e on w find g, of both sensors or of both actuators.
 
-Sensors are judged over the 2 ms after an innovation above 4.5 times its noise, and its mean square before: a finger's
+Sensors are judged over the 3 ms after an innovation above 4.5 times its noise, and its mean square before: a finger's
 force makes no jump, what it adds to e is no multiple of w.  Actuators are judged by means over 3 ms, while e is large:
 an inversion alone is told from a finger by these, and so is one of a sensor that began where p was zero.
 
@@ -40,13 +40,13 @@ from hapticrender.protocols import Array
 
 MOST = 2  # sensors, and actuators
 SENSOR, ACTUATOR = range(2)  # kinds of gains
-INVERTED, LEAST_GAIN, MOST_GAIN = -0.4, 0.25, 2.0  # of a sensor; a finger that comes or goes may shrink a motion
-LEAST_ACTUATOR, MOST_ACTUATOR = -1.6, -0.5
-UNEXPLAINED, UNEXPLAINED_INVERTED = 0.1, 0.15  # of the energy of e: the latter of an inverted sensor
+LEAST_INVERTED, MOST_INVERTED = -1.6, -0.4  # gains of a sensor or an actuator that is inverted
+DEAD, MOST_GAIN = 0.25, 2.0  # of a sensor: a smaller magnitude, a larger gain is a fault
+UNEXPLAINED, UNEXPLAINED_INVERTED = 0.1, 0.2  # of the energy of e; the latter of an inverted sensor
 CERTAIN, JUMP = 25.0, 20.0  # variances: 5 sigma of a gain; 4.5 sigma of an innovation
-WATCHED, LARGE = 5.0, 20.0  # variances of e: actuators are followed, judged
+WATCHED, LARGE = 4.0, 20.0  # variances of e: actuators are followed, judged
 WANDER = 3.5  # N/sqrt(s), of d
-TRIAL, LEAST_TRIAL, MEAN, WINDOW = 2e-3, 8, 20e-3, 3e-3  # s, samples, s, s
+TRIAL, LEAST_TRIAL, MEAN, WINDOW = 3e-3, 8, 20e-3, 3e-3  # s, samples, s, s
 
 GAINS = np.dtype(
     [
@@ -64,7 +64,7 @@ GAINS = np.dtype(
         *((name, np.float64, (MOST,)) for name in ("e", "mean", "energy")),  # mean of e^2 of a sensor; sums of e^2
         ("weights", np.float64, (2, 2, 2)),  # sums of w_i w_j of sensors, of actuators
         *((name, np.float64, (2, 2)) for name in ("weighted", "gain")),  # sums of w_i e
-        *((name, np.int64) for name in ("left", "watched")),  # samples of the trial that is going on
+        *((name, np.int64) for name in ("left", "watched")),  # samples: to go in the trial; with actuators followed
     ]
 )
 """Settings and state of the tests of gains."""
@@ -161,11 +161,9 @@ def add_sums(gains, kind, pole, w0, w1):
 @kernel
 def is_fault(kind, gain, rest):
     """Whether a gain is that of a fault, with `rest` the share of the energy of e that it leaves unexplained."""
-    if kind == ACTUATOR:
-        return rest < UNEXPLAINED and LEAST_ACTUATOR < gain < MOST_ACTUATOR
-    if gain < INVERTED:
-        return rest < UNEXPLAINED_INVERTED
-    return rest < UNEXPLAINED and not LEAST_GAIN < gain < MOST_GAIN
+    if LEAST_INVERTED < gain < MOST_INVERTED:
+        return rest < (UNEXPLAINED_INVERTED if kind == SENSOR else UNEXPLAINED)
+    return kind == SENSOR and rest < UNEXPLAINED and (abs(gain) < DEAD or gain > MOST_GAIN)
 
 
 @kernel
@@ -210,7 +208,8 @@ def follow_actuators(gains, force0, force1):
     share = s.force_of_actuator
     w0 = (model_sensor(gains, 4, 0), model_sensor(gains, 4, 1))
     w1 = (model_sensor(gains, 5, 0), model_sensor(gains, 5, 1))
-    add_sums(gains, ACTUATOR, s.window_pole, w0, w1)
+    if s.watched > s.duration // 2:  # by then w has forgotten where it began
+        add_sums(gains, ACTUATOR, s.window_pole, w0, w1)
     for j in range(2):
         w = w0 if j == 0 else w1
         correct_model(gains, 4 + j, -w[0], -w[1])
@@ -221,7 +220,8 @@ def follow_actuators(gains, force0, force1):
             share[j, 1, 0] * force0 + share[j, 1, 1] * force1,
         )
     found = judge_gains(gains, ACTUATOR, s.window_pole * s.innovation)
-    return found if s.energy[ACTUATOR] > LARGE * s.innovation else 0
+    known = 2 * s.watched > 3 * s.duration
+    return found if known and s.energy[ACTUATOR] > LARGE * s.innovation else 0
 
 
 @kernel
@@ -252,7 +252,8 @@ def check_gains(gains, sensed, sensors, force0, force1):
     if s.left > 0:
         rescaled = follow_sensors(gains, force0, force1)
     if s.energy[ACTUATOR] > WATCHED * s.innovation:
-        inverted, s.watched = follow_actuators(gains, force0, force1), 1
+        s.watched += 1
+        inverted = follow_actuators(gains, force0, force1)
     elif s.watched > 0:
         clear_sums(gains, ACTUATOR)
         s.watched = 0

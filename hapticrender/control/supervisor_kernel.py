@@ -22,9 +22,9 @@ no  test         condition                                                      
 7   overmotion   motion of an end > 3 R + 5.4 sag                                                 5 samples
 8   beyond       a sensor shows more than the device's limit of displacement                      3 in 10 ms
 9   active       mean(-r v) > 0.65 sqrt(E_F E_v) in heave, E_r < 6 E_F, means over 0.2 s          0.3 s
-10  rescaled     a sensor shows less than 0.25 or more than 2 times the motion that device and
-                 drive give, negative included; see `gains`                                       2 ms
-11  inverted     an actuator gives -0.5 to -1.6 times its force; see `gains`                      3 ms (mean)
+10  rescaled     a sensor shows -1.6 to -0.4, -0.25 to 0.25, or more than 2 times the motion that
+                 device and drive give; see `gains`                                               3 ms
+11  inverted     an actuator gives -1.6 to -0.4 times its force; see `gains`                      5 ms and more
 === ============ ================================================================================ ====================
 
 R (m) and B (drive unit) are what the scene needs at most with the worst finger, A the drive of a hard press, `sag` the
