@@ -1,6 +1,7 @@
 """The control law in C against the library's kernel, on the simulated plate, and under sanitisers."""
 
 import subprocess
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -19,10 +20,20 @@ from laws import (
     close,
     kernel_of,
 )
+from other_plate import OtherPlate
 from scipy.signal import butter, sosfiltfilt
 
 import hapticrender as hr
-from hapticrender.control.supervisor_kernel import ACTIVE, FROZEN, INCONSISTENT, INVALID, OVERMOTION, RINGING
+from hapticrender.control.supervisor_kernel import (
+    ACTIVE,
+    FROZEN,
+    INCONSISTENT,
+    INVALID,
+    INVERTED,
+    OVERMOTION,
+    RESCALED,
+    RINGING,
+)
 from hapticrender.plants.plate import Plate, PlateParameters
 from hapticrender.protocols import Flag
 
@@ -96,6 +107,7 @@ FAULTS = {
     "inverted": (INCONSISTENT, lambda sensed: -sensed),
     "swings far": (OVERMOTION, lambda sensed: 0.95e-3 * np.sin(0.12 * np.arange(len(sensed)))),
     "rings": (RINGING, lambda sensed: sensed + 15e-6 * np.sin(1.6 * np.arange(len(sensed)))),
+    "five times": (RESCALED, lambda sensed: 5.0 * sensed),
     "another tone": (ACTIVE, lambda sensed: 40e-6 * np.sin(0.2 * np.arange(len(sensed)))),
 }
 
@@ -119,6 +131,35 @@ def test_the_supervisor_equals_the_librarys(exports, fault, kind):
     if kind == "double":
         assert abs(found - drive).max() < 1e-9
         assert np.array_equal(found_flags, flags)
+
+
+class Reversed(OtherPlate):
+    """A plate whose coils are inverted after 0.9 s; not probed."""
+
+    probe = False
+
+    def play(self, drive):
+        if len(self.played) == 4500:
+            self._gamma = -self._gamma
+        return super().play(drive)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_inverted_coils_stop_both(exports, kind):
+    """The sensors of a closed loop that the library stopped, played back to both."""
+    rendering = exports.rendering("tones")
+    with pytest.raises(hr.DeviceFault, match="actuator 1 and 2") as stopped:
+        hr.render(replace(rendering.scene, finger=hr.Finger.absent(), duration=1.0), driver=Reversed(seed=1))
+    sensed = np.ascontiguousarray(stopped.value.recording.sensed)
+    n, position = len(sensed), np.full(len(sensed), np.nan)
+    controller, law = rendering.controller(), exports.law("tones", kind, "supervised")
+    drive, _, flags = controller.run(sensed, position, np.zeros(n))
+    found, found_flags = law.run(sensed, position, np.zeros(n))
+    assert law.code.supervised_cause(law.address) == INVERTED == controller.fault.cause
+    stops = [np.argmax(each & Flag.STOPPED) for each in (flags, found_flags)]
+    assert abs(np.diff(stops)) <= (0 if kind == "double" else 5)
+    if kind == "double":
+        assert abs(found - drive).max() < 1e-9
 
 
 def error(motion, reference, start=1.0):
