@@ -107,7 +107,6 @@ FAULTS = {
     "inverted": (INCONSISTENT, lambda sensed: -sensed),
     "swings far": (OVERMOTION, lambda sensed: 0.95e-3 * np.sin(0.12 * np.arange(len(sensed)))),
     "rings": (RINGING, lambda sensed: sensed + 15e-6 * np.sin(1.6 * np.arange(len(sensed)))),
-    "five times": (RESCALED, lambda sensed: 5.0 * sensed),
     "another tone": (ACTIVE, lambda sensed: 40e-6 * np.sin(0.2 * np.arange(len(sensed)))),
 }
 
@@ -133,29 +132,38 @@ def test_the_supervisor_equals_the_librarys(exports, fault, kind):
         assert np.array_equal(found_flags, flags)
 
 
-class Reversed(OtherPlate):
-    """A plate whose coils are inverted after 0.9 s; not probed."""
+class Rewired(OtherPlate):
+    """A plate whose sensors and coils are multiplied after 0.9 s; not probed."""
 
     probe = False
 
+    def __init__(self, shown, moved):
+        super().__init__(seed=1)
+        self.shown, self.moved = shown, moved
+
     def play(self, drive):
         if len(self.played) == 4500:
-            self._gamma = -self._gamma
+            self._gamma, self._show = self.moved * self._gamma, self.shown * self._show
         return super().play(drive)
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_inverted_coils_stop_both(exports, kind):
+@pytest.mark.parametrize(
+    ("shown", "moved", "cause", "named"),
+    [(10.0, 1.0, RESCALED, "sensor 1 and 2"), (1.0, -1.0, INVERTED, "actuator 1 and 2")],
+    ids=["sensors times ten", "coils inverted"],
+)
+def test_changes_of_gains_stop_both(exports, shown, moved, cause, named, kind):
     """The sensors of a closed loop that the library stopped, played back to both."""
     rendering = exports.rendering("tones")
-    with pytest.raises(hr.DeviceFault, match="actuator 1 and 2") as stopped:
-        hr.render(replace(rendering.scene, finger=hr.Finger.absent(), duration=1.0), driver=Reversed(seed=1))
+    with pytest.raises(hr.DeviceFault, match=named) as stopped:
+        hr.render(replace(rendering.scene, finger=hr.Finger.absent(), duration=1.0), driver=Rewired(shown, moved))
     sensed = np.ascontiguousarray(stopped.value.recording.sensed)
     n, position = len(sensed), np.full(len(sensed), np.nan)
     controller, law = rendering.controller(), exports.law("tones", kind, "supervised")
     drive, _, flags = controller.run(sensed, position, np.zeros(n))
     found, found_flags = law.run(sensed, position, np.zeros(n))
-    assert law.code.supervised_cause(law.address) == INVERTED == controller.fault.cause
+    assert law.code.supervised_cause(law.address) == cause == controller.fault.cause
     stops = [np.argmax(each & Flag.STOPPED) for each in (flags, found_flags)]
     assert abs(np.diff(stops)) <= (0 if kind == "double" else 5)
     if kind == "double":
