@@ -232,6 +232,10 @@ def test_short_recordings_and_wrong_profiles_are_refused(studied):
         hr.analyse_finger(short)
     with pytest.raises(ValueError, match=r"profile.kind = 'ultrasonic': must be vt-plate"):
         hr.analyse_finger(recording, hr.DeviceProfile(kind="ultrasonic"))
+    with pytest.raises(TypeError, match=r"profile = 3: must be a DeviceProfile, PlateParameters, the path of"):
+        hr.analyse_finger(recording, profile=3)
+    with pytest.raises(TypeError, match=r"recording = '/a.h5': must be a Recording: see Recording.load"):
+        hr.analyse_finger("/a.h5")
     with pytest.raises(ValueError, match=r"block=2 samples: must be an integer from 1 to the plate's delay, 1"):
         hr.analyse_finger(recording, block=2)
 

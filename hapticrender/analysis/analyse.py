@@ -6,7 +6,6 @@ import itertools
 import os
 from collections.abc import Iterator
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -19,12 +18,11 @@ from hapticrender.analysis.records import DOUBTFUL, LOADED, UNLOADED, FingerReco
 from hapticrender.analysis.smoothing import LEAST_SPREAD, spread_of
 from hapticrender.analysis.tracker import FingerTracker, Touch
 from hapticrender.bands import Bands, hold_last
+from hapticrender.checks import require
 from hapticrender.plants.plate import PlateParameters
 from hapticrender.protocols import Array, Flag
+from hapticrender.recordings.recording import Recording
 from hapticrender.touch.device_profile import DeviceProfile
-
-if TYPE_CHECKING:
-    from hapticrender.recordings.recording import Recording
 
 WIDE = 0.25e-3  # s: spread of the kernel under the carriers; 0.8 of 400 Hz passes
 RINGING = 0.25  # s after a lift in which the free plate rings down: 6 time constants of its heave mode
@@ -54,10 +52,10 @@ def analyse_finger(
     Parameters
     ----------
     recording : Recording
-        Of a plate with two sensors at the ends of its glass, at least 1 s.
+        Of a plate with two sensors at the ends of its glass, at least 1 s and 944 Hz.
     profile : DeviceProfile, PlateParameters or path of a profile, optional
-        What is believed of the plate, with its uncertainty; default: that of the recording's scene.  Parameters without
-        one count as known to 2 %, damping to 10 %.
+        Model of the plate, with its uncertainty; default: that of the recording's scene.  Parameters without one have
+        2 %, damping 10 %.
     block : int, samples
         Of the driver: a row of the drive acts ``delay - block`` samples after the row sensed with it.
     free_start : bool
@@ -66,8 +64,9 @@ def analyse_finger(
 
     Raises
     ------
-    ValueError
-        The recording is not of such a plate, too short, or a measurement is nowhere finite.
+    ValueError, TypeError
+        An argument is of another kind; the recording is not of such a plate, too short, too slow, or a measurement is
+        nowhere finite.
 
     Notes
     -----
@@ -76,7 +75,8 @@ def analyse_finger(
     look like touches no such span is left: then they are taken where the force below 5 Hz is near zero.  The series end
     85 ms before the recording does.
     """
-    course = _believed(recording, profile)
+    require(isinstance(recording, Recording), "recording", recording, "a Recording: see Recording.load", TypeError)
+    course = _course(recording, profile)
     late = course.plate.delay - block
     _check(recording, course.plate, late)
     rate = recording.rate
@@ -125,8 +125,8 @@ def _spoiled(recording: Recording) -> Array:
     return np.asarray(maximum_filter1d(bad.astype(np.uint8), 2 * round(AROUND * recording.rate) + 1) > 0)
 
 
-def _believed(recording: Recording, profile: DeviceProfile | PlateParameters | str | os.PathLike[str] | None) -> Course:
-    """Return what is believed of the recorded plate."""
+def _course(recording: Recording, profile: DeviceProfile | PlateParameters | str | os.PathLike[str] | None) -> Course:
+    """Return the plate's parameters before the recording is looked at."""
     duration = len(recording) / recording.rate
     if isinstance(profile, PlateParameters):
         return Course.of(profile, duration=duration)
@@ -134,6 +134,8 @@ def _believed(recording: Recording, profile: DeviceProfile | PlateParameters | s
         profile = DeviceProfile.load(profile)
     elif profile is None:
         profile = recording.scene.device_profile
+    accepted = "a DeviceProfile, PlateParameters, the path of a profile, or None for that of the recording"
+    require(isinstance(profile, DeviceProfile), "profile", profile, accepted, TypeError)
     if profile.kind != "vt-plate":
         raise ValueError(f"profile.kind = {profile.kind!r}: must be vt-plate, a plate with sensors of displacement")
     return Course.of(PlateParameters.with_overrides(profile.device), profile.uncertainty, duration)

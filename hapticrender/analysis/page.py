@@ -8,11 +8,10 @@ from math import isfinite
 
 import numpy as np
 
-from hapticrender import __version__
 from hapticrender.analysis.load_law import load_exponent, mean_exponent
 from hapticrender.analysis.models import FingerFit
 from hapticrender.analysis.records import LOADED, FingerRecord
-from hapticrender.report.page import GENERATOR, NO_PICTURE, STYLE, html_table
+from hapticrender.report.page import FOOTER, GENERATOR, NO_PICTURE, STYLE, html_table
 
 Fits = dict[str, dict[int, FingerFit]]  # by load class and order
 LABELS = {
@@ -52,7 +51,7 @@ the surface and from its drive. Intervals are of 95&nbsp;%.</p>
 {_picture("load.png", pictures, "Impedance over load, share explained by the load, exponent over frequency")}
 {_laws(records)}</section>
 {times}
-<footer class="note">Made by hapticrender {escape(__version__)}.</footer>
+{FOOTER}
 </body>
 </html>
 """

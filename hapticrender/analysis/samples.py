@@ -29,11 +29,16 @@ class Samples(NamedTuple):
 
 def parts_of(impedance: Source | Sequence[Source]) -> list[Source]:
     """List of the recordings, of which one may stand alone."""
-    return [impedance] if isinstance(impedance, FingerRecord | Impedance) else list(impedance)
+    parts = [impedance] if isinstance(impedance, FingerRecord | Impedance) else impedance
+    good = isinstance(parts, Sequence) and all(isinstance(each, FingerRecord | Impedance) for each in parts)
+    require(good, "impedance", impedance, "what analyse_finger returns, an Impedance, or a list of them", TypeError)
+    return list(parts)
 
 
 def samples_of(impedance: Source | Sequence[Source], loads: tuple[float, float] = (0.0, inf)) -> Samples:
     """Unmasked entries with a load (N) from the first of `loads` to below the second, and above 0."""
+    rising = np.shape(loads) == (2,) and loads[0] < loads[1]
+    require(rising, "loads", loads, "two loads in N, the least and a larger one")
     parts = [each.impedance if isinstance(each, FingerRecord) else each for each in parts_of(impedance)]
     rows = [
         np.broadcast_arrays(each.frequency, each.value, each.standard_error, each.normal_load[:, None], number)
