@@ -252,6 +252,7 @@ def test_wrong_sensors_are_refused():
         (lambda: budget.bandwidth(MotionEstimator(1e-4), np.nan), "rate = nan: must be a finite number > 0 Hz"),
         (lambda: hr.Scene(texture=hr.Grating(frequency=50.0, amplitude=1e-6), duration=1.0, touch_panel={"hz": 1}),
          "touch_panel.hz: no such parameter"),
+        (lambda: hr.Player("vt-plate", touch_panel={"rate": 60.0}), "touch_panel: has no effect on the positions that"),
     ):  # fmt: skip
         with pytest.raises((ValueError, TypeError), match=message):
             make()
@@ -266,6 +267,7 @@ def test_a_scene_with_a_touch_panel_is_played_at_the_estimated_position():
     )
     assert hr.Scene.from_toml_text(scene.to_toml()) == scene
     recording = hr.render(scene)
+    assert any("texture at the recorded position, which the touch panel" in each for each in recording.summary()["notes"])
     truth = scene.finger.position(np.arange(len(recording)) / recording.rate)
     late = np.flatnonzero(np.isfinite(recording.position))[[0, -1]] / recording.rate
     assert late == pytest.approx([0.1, 1.4], abs=0.008 + 1 / 240 + 0.002)
