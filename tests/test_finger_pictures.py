@@ -162,7 +162,7 @@ def test_a_finger_that_never_touched_has_a_page(record, tmp_path):
     lifted = replace(record, impedance=masked, position=empty, velocity=empty, contact=0 * record.contact, segments=())
     shown, text = parsed(pictures.draw(lifted, tmp_path))
     assert shown == ["time-1.png"]
-    assert re.search(r"0\.00 of 5\.99 s, 0 touches", text)
+    assert re.search(r"Loaded</dt><dd>0\.00 of 5\.99 s, 0 touches", text)
 
 
 def test_without_matplotlib_there_is_a_page_and_a_warning(record, tmp_path, monkeypatch):

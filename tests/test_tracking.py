@@ -267,7 +267,9 @@ def test_a_scene_with_a_touch_panel_is_played_at_the_estimated_position():
     )
     assert hr.Scene.from_toml_text(scene.to_toml()) == scene
     recording = hr.render(scene)
-    assert any("texture at the recorded position, which the touch panel" in each for each in recording.summary()["notes"])
+    assert any(
+        "texture at the recorded position, which the touch panel" in each for each in recording.summary()["notes"]
+    )
     truth = scene.finger.position(np.arange(len(recording)) / recording.rate)
     late = np.flatnonzero(np.isfinite(recording.position))[[0, -1]] / recording.rate
     assert late == pytest.approx([0.1, 1.4], abs=0.008 + 1 / 240 + 0.002)

@@ -16,7 +16,7 @@ from hapticrender.analysis.load_law import LoadLaw, load_exponent, mean_exponent
 from hapticrender.analysis.models import LOAD_CLASSES, FingerFit, fit_finger, fit_load_classes
 from hapticrender.analysis.page import NAMES, SURE, Fits, page_of
 from hapticrender.analysis.records import DOUBTFUL, LOADED, UNLOADED, FingerRecord, Series
-from hapticrender.analysis.samples import BAND, Samples, by_frequency, samples_of
+from hapticrender.analysis.samples import BAND, Samples, by_frequency, one_load, samples_of, weighted_mean
 from hapticrender.protocols import Array
 from hapticrender.recordings.formats import MissingExtra
 from hapticrender.report.figure import BLUE, INK, ORANGE, PALE, RED, legend, new_figure, save
@@ -33,7 +33,8 @@ def draw(records: FingerRecord | Sequence[FingerRecord], folder: str | os.PathLi
     As Grigorii et al. 2021: impedance and load over time (Fig. 5, ``time-1.png`` and so on, one a recording), impedance
     over the load, and how much of it the load explains (Fig. 8 C and D, ``load.png``), impedance over frequency with
     fits of both orders for each class of loads (Fig. 9, ``frequency.png``); ``index.html`` has them, the parameters
-    with their intervals, and what could not be measured.  Without matplotlib there are no pictures, and a warning says
+    with their intervals, and what could not be measured.  A picture without data is left out: that over the load where
+    the loads differ by less than 1 %.  Without matplotlib there are no pictures, and a warning says
     how to install it.
 
     Raises
@@ -48,11 +49,11 @@ def draw(records: FingerRecord | Sequence[FingerRecord], folder: str | os.PathLi
         raise ValueError("records is empty: must be at least one FingerRecord")
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
-    fits, laws = fit_all(records), [load_exponent(each) for each in records]
+    fits = fit_all(records)
     drawn: dict[str, Callable[[Path], None]] = {
         f"time-{i + 1}.png": partial(draw_time, each) for i, each in enumerate(records)
     }
-    if any(law.frequency.size for law in laws):
+    if not one_load(samples_of(records)):
         drawn["load.png"] = partial(draw_load, records)
     if fits:
         drawn["frequency.png"] = partial(draw_frequency, records, fits)
@@ -189,11 +190,11 @@ def _shading_legend(axes: Any, record: FingerRecord, lines: list[Any]) -> None:
 
 
 def _dots(axes: Any, x: Array, y: Array, error: Array, colour: Any, label: str) -> Any:
-    """Points at rising x with bars of one standard error, joined where none is missing between."""
+    """Points at rising x with bars of 95 %, joined where none is missing between."""
     gaps: Any = np.flatnonzero(np.diff(x) > 1.5 * np.median(np.diff(x))) + 1 if len(x) > 1 else []
     x, y, error = (np.insert(each, gaps, np.nan) for each in (x, y, error))
     style = {"color": colour, "marker": "o", "ms": 3, "lw": 0.9, "elinewidth": 0.8, "label": label}
-    return axes.errorbar(x, y, error, **style)
+    return axes.errorbar(x, y, SURE * error, **style)
 
 
 def _all_bands(axes: Any, record: FingerRecord, bands: list[int]) -> None:
@@ -301,7 +302,7 @@ def _over_frequency(column: Any, name: str, fits: Mapping[int, FingerFit], sampl
     for axes, view in zip(column, views, strict=True):
         axes.plot(samples.frequency, view(samples.value), ".", color=PALE, ms=2, alpha=0.4, zorder=1)
     frequency, mean, error = _band_means(samples)
-    bars = (error, np.degrees(error / np.abs(mean)))
+    bars = (SURE * error, np.degrees(SURE * error / np.abs(mean)))
     for axes, view, bar in zip(column, views, bars, strict=True):
         style = {"fmt": "o", "color": INK, "ms": 4.5, "elinewidth": 1, "capsize": 2, "zorder": 4, "label": "measured"}
         axes.errorbar(frequency, view(mean), bar, **style)
@@ -330,14 +331,9 @@ def _model(column: Any, fit: FingerFit, grid: Array, load: float, colour: str, n
 
 
 def _band_means(samples: Samples) -> tuple[Array, Array, Array]:
-    """Weighted mean of every bin of frequencies, and its standard error, enlarged where the windows scatter more."""
-    rows = []
-    for each in by_frequency(samples):
-        weight = each.standard_error**-2
-        mean, error = np.average(each.value, weights=weight), weight.sum() ** -0.5
-        freedom = max(2 * len(each.value) - 2, 1)
-        scatter = np.sum(np.abs(each.value - mean) ** 2 * weight) / freedom
-        rows.append((np.median(each.frequency), mean, error * max(1.0, scatter) ** 0.5))
+    """Median frequency (Hz), weighted mean and its standard error of every bin of frequencies."""
+    bins = by_frequency(samples)
+    rows = [(np.median(each.frequency), *weighted_mean(each.value, each.standard_error)) for each in bins]
     frequency, mean, error = (np.array(column) for column in zip(*rows, strict=True))
     return frequency, mean, error
 

@@ -55,6 +55,19 @@ def samples_of(impedance: Source | Sequence[Source], loads: tuple[float, float] 
     return found
 
 
+def weighted_mean(value: Array, standard_error: Array) -> tuple[complex, float]:
+    """Mean of complex values weighted by their standard errors, and its own, enlarged where the values scatter more."""
+    weight = standard_error**-2.0
+    mean = complex(np.average(value, weights=weight))
+    scatter = float(np.sum(np.abs(value - mean) ** 2 * weight)) / max(2 * len(value) - 2, 1)
+    return mean, (max(1.0, scatter) / float(weight.sum())) ** 0.5
+
+
+def one_load(samples: Samples) -> bool:
+    """Whether all loads are the same, within 1 %: how the impedance grows with the load is not in the data."""
+    return not samples.load.size or bool(np.ptp(np.log(samples.load)) < APART)
+
+
 def by_frequency(samples: Samples) -> list[Samples]:
     """Split samples into bins of 5 % of frequency, by rising frequency."""
     bins = np.rint(np.log(samples.frequency) / BAND).astype(int)
