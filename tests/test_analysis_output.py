@@ -83,7 +83,7 @@ def test_summary_states_the_mean_of_each_band_with_its_own_error(recorded):
     (touch,) = [line.split() for line in text.splitlines() if line.startswith("1 ")]
     load = slice(*found.at(np.array([found.of_kind(LOADED)[0].start, found.of_kind(LOADED)[0].stop])))
     assert touch[4] == f"{np.nanmedian(found.normal_load.standard_error[load]):.3f}"
-    assert touch[-1] == f"{1e3 * np.nanmedian(found.position.standard_error[load]):.1f}"
+    assert touch[-1] == f"{1e3 * np.nanmedian(found.position.standard_error[load]):.2f}"
 
 
 def test_summary_of_a_recording_without_a_finger():

@@ -134,7 +134,7 @@ def test_a_mean_exponent_is_weighted_and_its_error_widened_by_scatter():
     [
         ([], ["time-1.png"], "No fit: a finger takes at least two frequencies"),
         ([4], ["load.png", "time-1.png"], "No fit: a finger takes at least two frequencies"),
-        ([0, 4], ["frequency.png", "load.png", "time-1.png"], "too few frequencies to say"),
+        ([0, 4], ["frequency.png", "load.png", "time-1.png"], "too few frequencies to compare"),
     ],
 )
 def test_a_record_with_few_bands_or_none_has_what_can_be_drawn(rng, tmp_path, bands, names, sentence):

@@ -34,7 +34,7 @@ MIDDLE = 15e-3  # m from the middle: where `least_load` holds
 MILLIMETRE = 1e-3  # m
 AROUND = 0.1  # s: what is lost acts so far, by the kernels
 HEAVIEST, MOST_TOUCHES = 20.0, 5.0  # N; 1/s: no finger presses harder, or touches more often
-START = 0.5  # s: free of a finger, where the caller says so
+START = 0.5  # s: free of a finger with `free_start`
 BLOCK = 1.0  # s of signal at a time
 
 
@@ -262,14 +262,13 @@ def _segments(touch: Touch, rate: float) -> tuple[Segment, ...]:
 def _notes(
     recording: Recording, course: Course, touch: Touch, rest: Rest | None, impedance: Impedance
 ) -> Iterator[str]:
-    """Say what could not be measured, and why."""
+    """List what could not be measured, and why."""
     if rest is None:
         yield (
-            "no span without contact is long enough: the sensors' zero and the plate's parameters are taken from the "
-            "profile"
+            "no unloaded span is long enough: the sensors' zero and the plate's parameters are taken from the profile"
         )
     elif not course.measured:
-        yield ("the carriers do not determine the stiffness while nothing touches: it is mostly that of the profile")
+        yield ("the carriers do not determine the stiffness in the unloaded spans: it is mostly that of the profile")
     if not (touch.contact == LOADED).any():
         yield "no finger touches"
     elif not len(impedance.time):
@@ -283,7 +282,7 @@ def _notes(
         (Flag.STOPPED, "the drive was stopped"),
     ):
         if flags & bad:
-            yield f"{text}: estimates near there are wrong by more than they say"
+            yield f"{text}: errors near there are larger than stated"
     heaviest, touches = np.nanmax(touch.normal_load.value, initial=0.0), np.diff(touch.contact == LOADED).sum() / 2
     if heaviest > HEAVIEST or touches > MOST_TOUCHES * max(len(recording) / recording.rate, 1.0):
         yield (

@@ -94,7 +94,7 @@ def _probability(p: float) -> str:
 
 def _supported(of_class: Mapping[int, FingerFit], fit: FingerFit) -> str:
     if len(of_class) == 1:
-        return "too few frequencies to say"
+        return "too few frequencies to compare"
     return f"yes, by {fit.bic_margin:.3g}" if isfinite(fit.bic_margin) else "no"
 
 

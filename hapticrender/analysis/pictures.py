@@ -124,8 +124,8 @@ def draw_frequency(records: Sequence[FingerRecord], fits: Fits, path: str | os.P
         panels[1, 0].set(ylabel="phase (degrees)", ylim=(max(low, -180), min(high, 180)))
         for axes in panels[-1] if len(fits) > 1 else panels[:, 0]:
             axes.set_xlabel("frequency (Hz)")
-        for axis in (panels[0, 0].xaxis, panels[0, 0].yaxis):
-            _numbers(axis)
+        _numbers(panels[0, 0].xaxis, "25")
+        _numbers(panels[0, 0].yaxis)
         save(figure, path)
 
 
@@ -338,12 +338,12 @@ def _band_means(samples: Samples) -> tuple[Array, Array, Array]:
     return frequency, mean, error
 
 
-def _numbers(axis: Any) -> None:
-    """Plain numbers on a logarithmic axis, also at 2 and 5 within a decade."""
+def _numbers(axis: Any, within: str = "235") -> None:
+    """Plain numbers on a logarithmic axis, also `within` a decade."""
     axis.set_major_formatter(lambda value, _: f"{value:g}")
-    axis.set_minor_formatter(lambda value, _: f"{value:g}" if f"{value:e}"[0] in "25" else "")
+    axis.set_minor_formatter(lambda value, _: f"{value:g}" if f"{value:e}"[0] in within else "")
 
 
 def _frequency_axis(axes: Any, frequency: Array) -> None:
     axes.set(xlabel="frequency (Hz)", xlim=(0.87 * frequency.min(), 1.15 * frequency.max()), xscale="log")
-    _numbers(axes.xaxis)
+    _numbers(axes.xaxis, "25")

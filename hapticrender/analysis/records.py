@@ -97,7 +97,7 @@ class PlateTrack:
 
 @dataclass(frozen=True)
 class FingerRecord:
-    """What a recording says of the finger that touched the surface.
+    """Measured quantities of the finger in a recording.
 
     Parameters
     ----------
