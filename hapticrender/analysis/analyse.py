@@ -204,8 +204,9 @@ class _Signals:
         """
         from scipy.ndimage import gaussian_filter1d
 
-        signals = Signals(*(self.columns[:, i : i + 2] for i in range(0, 8, 2)))
-        force = signals.residual(course.at(np.arange(len(self.columns)) / self.rate), course.plate.half_spacing)
+        force = Signals.of(self.columns).residual(
+            course.at(np.arange(len(self.columns)) / self.rate), course.plate.half_spacing
+        )
         return np.asarray(gaussian_filter1d(force[:, 0], spread_of(SLOWEST / 3) * self.rate, mode="nearest"))
 
     def unloaded(self, free: Array, load: Array, frequency: Array, length: int, quiet: float) -> Lines:

@@ -40,6 +40,11 @@ class Signals:
     acceleration: Array  # m/s^2
     force: Array  # N
 
+    @classmethod
+    def of(cls, columns: Array) -> Signals:
+        """Signals of the first eight columns (..., >= 8): displacement, velocity, acceleration, force."""
+        return cls(*(columns[..., i : i + 2] for i in range(0, 8, 2)))
+
     def regressors(self, half_spacing: float) -> Array:
         """Phi, shape (..., 2, 6)."""
         x, v = self.displacement, self.velocity

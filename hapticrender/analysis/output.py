@@ -7,14 +7,13 @@ from typing import Any
 
 import numpy as np
 
-from hapticrender.analysis.records import DOUBTFUL, LOADED, UNLOADED, FingerRecord, Series
+from hapticrender.analysis.records import KINDS, LOADED, FingerRecord, Series
 from hapticrender.analysis.samples import weighted_mean
 from hapticrender.formatting import as_json, table
 from hapticrender.protocols import Array
 
 FILES = ("finger.csv", "impedance.csv", "finger.json")
 ROWS = 100.0  # a second, in finger.csv
-KINDS = {UNLOADED: "unloaded", DOUBTFUL: "doubtful", LOADED: "loaded"}
 SERIES = {"normal_load": "N", "position": "m", "velocity": "m/s"}
 
 

@@ -15,7 +15,7 @@ import numpy as np
 from hapticrender.analysis.load_law import LoadLaw, load_exponent, mean_exponent
 from hapticrender.analysis.models import LOAD_CLASSES, FingerFit, fit_finger, fit_load_classes
 from hapticrender.analysis.page import NAMES, SURE, Fits, page_of
-from hapticrender.analysis.records import DOUBTFUL, LOADED, UNLOADED, FingerRecord, Series
+from hapticrender.analysis.records import DOUBTFUL, KINDS, LOADED, UNLOADED, FingerRecord, Series
 from hapticrender.analysis.samples import BAND, Samples, by_frequency, one_load, samples_of, weighted_mean
 from hapticrender.protocols import Array
 from hapticrender.recordings.formats import MissingExtra
@@ -23,6 +23,7 @@ from hapticrender.report.figure import BLUE, INK, ORANGE, PALE, RED, legend, new
 
 MOST_BANDS = 8  # in one panel
 TYPICAL = 111.0  # Hz: of the paper's Fig. 5, and where |Z_f| begins to grow with the load
+SHADES = {UNLOADED: "#DDDDDD", DOUBTFUL: "#F6DDB0"}
 COLOURS = {2: ORANGE, 4: BLUE}
 POINTS = 1500  # of a curve over time
 
@@ -143,7 +144,7 @@ def _colours(count: int) -> list[Any]:
 
 
 def _shade(axes: Any, record: FingerRecord) -> None:
-    for kind, colour in ((UNLOADED, "#DDDDDD"), (DOUBTFUL, "#F6DDB0")):
+    for kind, colour in SHADES.items():
         for segment in record.of_kind(kind):
             axes.axvspan(segment.start, segment.stop, color=colour, alpha=0.7, lw=0, zorder=0)
 
@@ -166,9 +167,7 @@ def _load_and_impedance(axes: Any, record: FingerRecord, bands: list[int]) -> No
     z = record.impedance
     if bands:
         band = min(bands, key=lambda each: abs(np.log(np.nanmedian(z.frequency[:, each]) / TYPICAL)))
-        right = axes.twinx()
-        right.grid(False)
-        right.spines["right"].set_visible(True)
+        right = _right(axes)
         size = np.abs(z.value[:, band])
         label = f"|Z_f| at {np.nanmedian(z.frequency[:, band]):.0f} Hz"
         lines.append(_dots(right, z.time, size, z.standard_error[:, band], RED, label))
@@ -182,10 +181,7 @@ def _shading_legend(axes: Any, record: FingerRecord, lines: list[Any]) -> None:
     """Legend of lines and of the kinds of contact that are shaded."""
     from matplotlib.patches import Patch
 
-    shaded = {UNLOADED: ("#DDDDDD", "unloaded"), DOUBTFUL: ("#F6DDB0", "doubtful")}
-    handles = lines + [
-        Patch(color=colour, label=name) for kind, (colour, name) in shaded.items() if record.of_kind(kind)
-    ]
+    handles = lines + [Patch(color=SHADES[kind], label=KINDS[kind]) for kind in SHADES if record.of_kind(kind)]
     legend(axes, handles, [each.get_label() for each in handles])
 
 
@@ -209,11 +205,17 @@ def _all_bands(axes: Any, record: FingerRecord, bands: list[int]) -> None:
     legend(axes, columns=MOST_BANDS)
 
 
-def _kinematics(axes: Any, record: FingerRecord) -> None:
-    lines = [_curve(axes, record.time, record.position, 1e3, BLUE, "position (mm)")]
+def _right(axes: Any) -> Any:
+    """Second axis of values, on the right."""
     right = axes.twinx()
     right.grid(False)
     right.spines["right"].set_visible(True)
+    return right
+
+
+def _kinematics(axes: Any, record: FingerRecord) -> None:
+    lines = [_curve(axes, record.time, record.position, 1e3, BLUE, "position (mm)")]
+    right = _right(axes)
     lines.append(_curve(right, record.time, record.velocity, 1e3, ORANGE, "velocity (mm/s)"))
     axes.set(title="Motion", ylabel="position (mm)")
     right.set_ylabel("velocity (mm/s)")

@@ -9,6 +9,7 @@ import numpy as np
 from hapticrender.protocols import Array
 
 UNLOADED, DOUBTFUL, LOADED = 0, 1, 2  # contact of a sample
+KINDS = {UNLOADED: "unloaded", DOUBTFUL: "doubtful", LOADED: "loaded"}
 
 
 @dataclass(frozen=True)

@@ -26,7 +26,6 @@ from hapticrender.touch.touch_panel import EASING, TouchPanel
 
 AGES = (np.arange(16) + 0.5) / 16  # of a sample's time: ages over which errors are averaged
 MOST_LOST = 1e-4  # longer runs of lost samples, of a smaller share, are left out
-FINEST, COARSEST = 1e-6, 10.0  # m
 
 
 def settled_gain(estimator: MotionEstimator, rate: float, speed: float = 0.0) -> tuple[Array, Array]:
