@@ -52,7 +52,7 @@ def analyse_finger(
     Parameters
     ----------
     recording : Recording
-        Of a plate with two sensors at the ends of its glass, at least 1 s and 944 Hz.
+        Of a plate with two sensors at the ends of its glass, at least 1 s and 500 Hz.
     profile : DeviceProfile, PlateParameters or path of a profile, optional
         Model of the plate, with its uncertainty; default: that of the recording's scene.  Parameters without one have
         2 %, damping 10 %.

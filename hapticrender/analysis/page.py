@@ -23,7 +23,7 @@ LABELS = {
     "phalanx_stiffness": "its stiffness (N/mm)",
     "load_exponent": "exponent n of the load",
 }
-ONE_LOAD = "the loads differ by less than 1&nbsp;%; record several, or a finger that presses harder and harder"
+ONE_LOAD = "no windows under loads that differ by 1&nbsp;% or more; record several loads, or one that grows"
 SURE = 1.96  # standard errors: 95 %
 NAMES = {2: "2nd order", 4: "4th order"}
 
