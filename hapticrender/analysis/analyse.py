@@ -34,6 +34,7 @@ MIDDLE = 15e-3  # m from the middle: where `least_load` holds
 MILLIMETRE = 1e-3  # m
 AROUND = 0.1  # s: what is lost acts so far, by the kernels
 HEAVIEST, MOST_TOUCHES = 20.0, 5.0  # N; 1/s: no finger presses harder, or touches more often
+STIFFEST = 100.0  # N s/m: no finger has a larger impedance from 15 Hz on
 START = 0.5  # s: free of a finger with `free_start`
 BLOCK = 1.0  # s of signal at a time
 
@@ -113,7 +114,7 @@ def analyse_finger(
         plate=track_of(course, len(drive) / rate),
         impedance=impedance,
         least_load=tracker.least_load(MIDDLE, MILLIMETRE),
-        notes=tuple(_notes(recording, course, touch, rest, impedance)),
+        notes=tuple(_notes(recording, course, touch, rest, impedance, threshold)),
     )
 
 
@@ -260,8 +261,18 @@ def _segments(touch: Touch, rate: float) -> tuple[Segment, ...]:
     )
 
 
+def _implausible(touch: Touch, impedance: Impedance, seconds: float) -> str:
+    """Describe touches that are no finger's; empty where all may be."""
+    heaviest, touches = np.nanmax(touch.normal_load.value, initial=0.0), np.diff(touch.contact == LOADED).sum() / 2
+    sizes = np.abs(impedance.value[np.isfinite(impedance.value)])
+    size = np.median(sizes) if sizes.size else 0.0
+    if heaviest <= HEAVIEST and touches <= MOST_TOUCHES * max(seconds, 1.0) and size <= STIFFEST:
+        return ""
+    return f"up to {heaviest:.3g} N in {touches:.0f} touches, |Z| {size:.3g} N s/m"
+
+
 def _notes(
-    recording: Recording, course: Course, touch: Touch, rest: Rest | None, impedance: Impedance
+    recording: Recording, course: Course, touch: Touch, rest: Rest | None, impedance: Impedance, threshold: float
 ) -> Iterator[str]:
     """List what could not be measured, and why."""
     if rest is None:
@@ -270,6 +281,11 @@ def _notes(
         )
     elif not course.measured:
         yield ("the carriers do not determine the stiffness in the unloaded spans: it is mostly that of the profile")
+    if rest is not None and abs(force := float(np.median(rest.values[:, 0]))) > threshold:
+        yield (
+            f"the sensors show {force:.3g} N while unloaded, beyond the threshold of contact ({threshold:.3g} N): "
+            "set their zero, or take it from the first 0.5 s (free_start, --free-start)"
+        )
     if not (touch.contact == LOADED).any():
         yield "no finger touches"
     elif not len(impedance.time):
@@ -284,12 +300,8 @@ def _notes(
     ):
         if flags & bad:
             yield f"{text}: errors near there are larger than stated"
-    heaviest, touches = np.nanmax(touch.normal_load.value, initial=0.0), np.diff(touch.contact == LOADED).sum() / 2
-    if heaviest > HEAVIEST or touches > MOST_TOUCHES * max(len(recording) / recording.rate, 1.0):
-        yield (
-            f"up to {heaviest:.3g} N in {touches:.0f} touches: check units, signs and scales of drive and sensors, the "
-            "block, and the profile"
-        )
+    if implausible := _implausible(touch, impedance, len(recording) / recording.rate):
+        yield f"{implausible}: check units, signs and scales of drive and sensors, the block, and the profile"
     plate = course.plate
     if abs(recording.rate - plate.rate) > 1e-3 * plate.rate:
         yield f"the profile's delay, {plate.delay} samples, is taken at {recording.rate:g} Hz, not at {plate.rate:g} Hz"
