@@ -110,6 +110,8 @@ def test_tables_and_untitled_columns_have_numbers(tmp_path):
     }  # fmt: skip
     np.testing.assert_array_equal(bare["1"], [0.0, 2.0, np.nan])
     np.testing.assert_array_equal(bare["2"], [1.0, 3.0, 4.0])
+    (tmp_path / "tabs.txt").write_text("x\ty\n1\t2\n\t\n \n3\t4 # the last\n", encoding="utf-8")
+    np.testing.assert_array_equal(read_columns(tmp_path / "tabs.txt")["y"], [2.0, np.nan, 4.0])  # a row without values
 
 
 def test_a_finger_is_the_same_in_someone_elses_columns(tmp_path):

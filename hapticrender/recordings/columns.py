@@ -202,7 +202,7 @@ def _read_text(path: Path) -> dict[str, Array]:
         text = path.read_text(encoding="utf-8-sig")
     except UnicodeDecodeError as error:
         raise ValueError(f"{path}: byte {error.start} is no UTF-8 text: save the table as text in UTF-8") from error
-    lines = [(number, line) for number, line in enumerate(text.splitlines(), 1) if line.split("#")[0].strip()]
+    lines = [(number, line) for number, line in enumerate(text.splitlines(), 1) if line.split("#")[0].strip(" ")]
     start, line = lines[0] if lines else (1, "")
     between = next((each for each in ",;\t" if each in line), None)
     first = next(csv.reader([line], delimiter=between), []) if between else line.split()
