@@ -89,7 +89,8 @@ def _touches(record: FingerRecord) -> str:
 def _finite(series: Series, at: slice) -> tuple[Array, Array]:
     """Values of a span, and their standard errors, where they are defined."""
     value, error = series.value[at], series.standard_error[at]
-    return value[np.isfinite(value)], error[np.isfinite(value)]
+    good = np.isfinite(value) & np.isfinite(error)
+    return value[good], error[good]
 
 
 def _bands(record: FingerRecord) -> str:
@@ -103,11 +104,8 @@ def _bands(record: FingerRecord) -> str:
             size = [f"{abs(mean):.3g}", f"{error:.2g}"]
             phase = [f"{np.degrees(np.angle(mean)):.1f}", f"{np.degrees(error / abs(mean)):.1f}"]
             rows.append([f"{np.median(z.frequency[good, k]):.1f}", *size, *phase, f"{good.sum()}"])
-    return (
-        table(rows) + "\n(se: standard error of the mean over the windows, whose errors are taken as independent)"
-        if len(rows) > 1
-        else ""
-    )
+    note = "(se: standard error of the mean over the windows, whose errors are taken as independent)"
+    return f"{table(rows)}\n{note}" if len(rows) > 1 else ""
 
 
 def _plate(record: FingerRecord) -> str:
