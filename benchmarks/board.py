@@ -112,7 +112,7 @@ def cycles_per_instruction(program):
 
 def build(folder, *options):
     """Program that measures a design."""
-    sources = "law learning carriers supervisor design plate frames texture measure measure_m4 startup_m4".split()
+    sources = "law learning carriers supervisor gains design plate frames texture measure measure_m4 startup_m4".split()
     program = folder / "measure.elf"
     files = [f"{name}.c" for name in sources]
     command = [f"{PREFIX}gcc", *FLAGS.split(), *LINK.split(), *options, "-o", program, *files, "-lm"]
@@ -142,7 +142,7 @@ def measure(name, texture, *options):
         lines = (done.stdout + done.stderr).splitlines()  # semihosting's console is either
         counted = {words[0]: float(words[1]) for words in map(str.split, lines)}
         ratio = cycles_per_instruction(build(folder, *options, f"-DSAMPLES={TRACED}u", f"-DLANDS={LANDS}u"))
-        flash = flash_of(folder, "supervisor" if options else "")
+        flash = flash_of(folder, "supervisor gains" if options else "")
     free, touched, new, most = (counted[each] / SCALE for each in ("free", "touched", "new", "most"))
     ram = counted["state"] + (counted["supervisor"] if options else 0.0)
     rates = [f"{(1 - SPARE) * hertz / (ratio * new) / 1e3:.1f}" for hertz in PROCESSORS.values()]

@@ -69,6 +69,8 @@ FAULTS = {
     "inverted, both": (lambda plate, sensed: -sensed, None),
     "inverted, one": (lambda plate, sensed: sensed @ INVERTED, None),
     "swapped": (lambda plate, sensed: sensed @ SWAPPED, None),
+    "gain x3": (lambda plate, sensed: 3 * sensed, None),
+    "one gain x3": (only_first(lambda plate, sensed: 3 * sensed), None),
     "gain x10": (lambda plate, sensed: 10 * sensed, None),
     "gain x0.1": (lambda plate, sensed: 0.1 * sensed, None),
     "gain x1000": (lambda plate, sensed: 1000 * sensed, None),

@@ -18,7 +18,7 @@ from hapticrender.jit import I8, CFunction, call, entry, fetch_add, kernel, poin
 from hapticrender.protocols import Array, Flag
 
 SLOTS = 64  # blocks that wait in either direction
-AHEAD = 2  # blocks of drive that wait to be played while Python computes the next one, unless told
+AHEAD = 2  # blocks of drive that wait to be played while Python computes the next one, by default
 CONTINUE = 0  # result of PortAudio's callback
 LOST = 0b1111  # PortAudio's status: input or output under- or overflow
 OVERRUN = int(Flag.OVERRUN)

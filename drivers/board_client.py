@@ -31,12 +31,14 @@ FAULTS = {
     Cause.RINGING: "the surface rings above 500 Hz: check the delay, and identify the bending mode",
     Cause.OVERMOTION: "the surface moved too far: check the polarity of sensors and coils, and the delay",
     Cause.BEYOND: "the motion stayed beyond what the scene can cause: check the unit of the sensors",
+    Cause.RESCALED: "a sensor is suddenly inverted, swapped, disconnected, or its gain has changed: check its wiring",
+    Cause.INVERTED: "the motion is that of the inverted drive: check the wiring and polarity of coils and sensors",
 }
 Result = TypeVar("Result")
 
 
-class _Wanted(NamedTuple):
-    """What the board is to do, to be told again to a board that was lost."""
+class _Setup(NamedTuple):
+    """What the board is to do; sent again to a board that was lost."""
 
     bands: Bands | None = None
     texture: BoardTexture | None = None
@@ -48,7 +50,7 @@ class _Wanted(NamedTuple):
 class BoardClient(OpenedInWith):
     """A board that plays textures, live.
 
-    While it is open a thread sends the finger's words, or a sign of life every 10 ms, and takes what the board sends.
+    While it is open a thread sends where the finger is, or a sign of life every 10 ms, and takes what the board sends.
     Methods may be called from any thread; a failure of the line is raised by the next of them.  A process that pauses
     for 80 ms stops the board.
 
@@ -89,7 +91,7 @@ class BoardClient(OpenedInWith):
         self.started = 0  # sample of the board's clock at which it last began to play
         self._connect = lambda: BoardLine(port, baud, timeout=timeout, clock=clock, connect=connect)
         self._line: BoardLine | None = None
-        self._wanted = _Wanted()
+        self._setup = _Setup()
         self._runs = False  # something has been started
         self._error: HapticError | None = None
         self._beats = self._watchdog = 0  # of the application: its calls; ms, 0: none
@@ -99,7 +101,7 @@ class BoardClient(OpenedInWith):
     def open(self) -> Self:
         """Open the port and greet the board; see `BoardLine` for the errors."""
         with self._lock:
-            self._line, self._error, self._wanted = self._connect(), None, _Wanted()
+            self._line, self._error, self._setup = self._connect(), None, _Setup()
         self._ending.clear()
         if self._background:
             self._thread = threading.Thread(target=self._run, name=f"board {self.port}", daemon=True)
@@ -139,13 +141,13 @@ class BoardClient(OpenedInWith):
             raise ValueError(f"{len(bands)} bands: must be <= {most} on {self.port}; export the scene with more")
 
         def put(line: BoardLine) -> int:
-            last = self._wanted
+            last = self._setup
             if last.start is not None and (texture or last.texture):  # at rest `start` sends it
                 line.play(texture, last.texture)
             return line.set_bands(bands)
 
         sample = self._steadily(put)
-        self._wanted = self._wanted._replace(bands=bands, texture=texture)
+        self._setup = self._setup._replace(bands=bands, texture=texture)
         return sample
 
     def finger(self, position: float, velocity: float = 0.0, load: float = 0.0, time: float | None = None) -> None:
@@ -163,7 +165,7 @@ class BoardClient(OpenedInWith):
     @property
     def gain(self) -> float:
         """Factor on all targets, 0 to 1; faded over 20 ms."""
-        return self._wanted.gain
+        return self._setup.gain
 
     @gain.setter
     def gain(self, value: float) -> None:
@@ -174,7 +176,7 @@ class BoardClient(OpenedInWith):
         if not 0.0 <= value <= 1.0:
             raise ValueError(f"gain = {value!r}: must be 0 to 1")
         sample = self._steadily(lambda line: line.ask(Kind.GAIN, value)).sample
-        self._wanted = self._wanted._replace(gain=value)
+        self._setup = self._setup._replace(gain=value)
         return sample
 
     def limits(self, peak: float, rms: float | None = None, seconds: float = 1.0) -> None:
@@ -184,7 +186,7 @@ class BoardClient(OpenedInWith):
         """
         limits = (peak, peak if rms is None else rms, seconds)
         self._steadily(lambda line: line.ask(Kind.LIMITS, *limits))
-        self._wanted = self._wanted._replace(limits=limits)
+        self._setup = self._setup._replace(limits=limits)
 
     def watch(self, seconds: float | None) -> None:
         """Let the board stop for good where the application is silent for so long, 0.05 to 65 s; None: never.
@@ -220,11 +222,11 @@ class BoardClient(OpenedInWith):
                 raise ValueError(f"{name} = {value!r} samples: must be {least} to 65535")
         start = stream, period
         self.started = self._steadily(lambda line: self._begin(line, start))
-        self._wanted, self._runs = self._wanted._replace(start=start), True
+        self._setup, self._runs = self._setup._replace(start=start), True
         return self.started
 
     def _begin(self, line: BoardLine, start: tuple[int, int]) -> int:
-        texture = self._wanted.texture
+        texture = self._setup.texture
         if texture is not None:
             line.play(texture)
         sample = line.begin(Kind.START, *start)
@@ -234,7 +236,7 @@ class BoardClient(OpenedInWith):
 
     def stop(self) -> None:
         """Fade out within 10 ms."""
-        self._wanted = self._wanted._replace(start=None)
+        self._setup = self._setup._replace(start=None)
         self._steadily(lambda line: line.ask(Kind.STOP))
         self._runs = False
 
@@ -290,8 +292,8 @@ class BoardClient(OpenedInWith):
             try:
                 line.carry()
                 self._compare(line)
-                if self._wanted.start is not None and self._wanted.texture is not None:
-                    line.stream(self._wanted.texture)
+                if self._setup.start is not None and self._setup.texture is not None:
+                    line.stream(self._setup.texture)
             except (DeviceFault, WatchdogTimeout) as error:
                 self._error = error
                 raise
@@ -324,7 +326,7 @@ class BoardClient(OpenedInWith):
         if found.cause == Cause.APPLICATION:
             raise WatchdogTimeout((found.sample - self.started) % WRAP / self.capabilities.rate)
         if found.cause == Cause.SILENCE:
-            raise line.lost("play", "the board heard no good word for 80 ms, and stopped")
+            raise line.lost("play", "the board received no valid frame for 80 ms, and stopped")
 
     def _steadily(self, do: Callable[[BoardLine], Result]) -> Result:
         """Do it; where the board is lost meanwhile, find it again, set it up as before, and do it once more."""
@@ -353,14 +355,14 @@ class BoardClient(OpenedInWith):
         raise error
 
     def _restore(self, line: BoardLine) -> None:
-        wanted = self._wanted
-        if wanted.limits is not None:
-            line.ask(Kind.LIMITS, *wanted.limits)
-        line.ask(Kind.GAIN, wanted.gain)
-        if wanted.bands is not None:
-            line.set_bands(wanted.bands)
-        if wanted.start is not None:
-            self.started = self._begin(line, wanted.start)
+        setup = self._setup
+        if setup.limits is not None:
+            line.ask(Kind.LIMITS, *setup.limits)
+        line.ask(Kind.GAIN, setup.gain)
+        if setup.bands is not None:
+            line.set_bands(setup.bands)
+        if setup.start is not None:
+            self.started = self._begin(line, setup.start)
 
     def _open_line(self) -> BoardLine:
         if self._error is not None:

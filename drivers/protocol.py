@@ -114,6 +114,8 @@ class Cause(IntEnum):
     RINGING = 22
     OVERMOTION = 23
     BEYOND = 24
+    RESCALED = 25
+    INVERTED = 26
 
 
 class Frame(NamedTuple):

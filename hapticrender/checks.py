@@ -25,10 +25,10 @@ def show(value: object) -> str:
     """Format any value as one short line."""
     if isinstance(value, int) and abs(value) >= 10**30:
         return "an integer beyond 1e30"
+    if isinstance(value, np.generic) or (isinstance(value, np.ndarray) and value.ndim == 0):
+        value = value.item()
     if isinstance(value, Mapping | list | tuple | np.ndarray) and len(value) > 4:
         return f"{type(value).__name__} of {len(value)} entries"
-    if isinstance(value, np.generic):
-        value = value.item()
     return " ".join(_short.repr(value).split())
 
 

@@ -46,7 +46,7 @@ class ProtocolError(DriverError):
 
 
 class DeviceFault(DriverError):
-    """The device does not do as it is told: says the most likely cause, when, and what to check.
+    """The device does not follow its drive: says the most likely cause, when, and what to check.
 
     `time` (s) counts from the start of the run, NaN before it; `recording` holds every sample that was played, None
     before the first one.

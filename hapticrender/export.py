@@ -39,6 +39,9 @@ lever danger_motion danger_drive most_motion most_drive large_drive sensed_bound
 slow_pole fade_out fade_danger fade_now mass damping stiffness bound noise ringing
 """.split()
 _TIMES = "frozen inconsistent active drive ring ring_wait ring_stop suspension beyond slow".split()
+_GAINS = """
+scale innovation mean_pole window_pole step_state step_force filter_gain sensor_from_coordinate force_of_actuator
+""".split()
 _SAMPLES = "damper_time hold settling joining joined notice patience".split()
 
 
@@ -131,13 +134,15 @@ def board_design(rendering: Rendering, bands: int = 0) -> tuple[dict[str, int], 
 def supervision_table(rendering: Rendering) -> dict[str, Any]:
     """Return the fields of `supervision_t` of a rendering's supervisor."""
     controller: Any = rendering.controller()
-    settings = controller.state["p"][0]
+    settings, gains = controller.state["p"][0], controller.gains[0]
     return {
         **{name: np.clip(settings[name], -HUGE, HUGE) for name in _SUPERVISION},
         **{f"{name}_time": int(settings[f"{name}_time"]) for name in _TIMES},
         "modelled": int(settings["modelled"]),
         "damped": int(settings["controller"] != 0),
         "limited": int(settings["limited"] != 0),
+        "compared": int(settings["gains"] != 0),
+        "gains": {"duration": int(gains["duration"]), **{name: gains[name] for name in _GAINS}},
     }
 
 
@@ -198,7 +203,7 @@ def _table(declared: str, fields: dict[str, Any]) -> str:
 def _literal(value: Any) -> str:
     """C initialiser of an integer, a number, an array of numbers, or bands; numbers in full precision."""
     if isinstance(value, dict):
-        return f"{{{', '.join(f'.{name} = {_literal(each)}' for name, each in value.items())}}}"
+        return _braced([f".{name} = {_literal(each)}" for name, each in value.items()])
     if isinstance(value, list | np.ndarray) and np.ndim(value):  # an array of numbers has no `dict` in it
         return _braced([_literal(each) for each in value])
     return f"{int(value)}u" if isinstance(value, int) else f"REAL({float(value)!r})"

@@ -116,7 +116,7 @@ def render(
     DriverError
         The device failed; it was left at zero drive, and the journal holds what happened until then.
     DeviceFault
-        The device does not do as it is told; a DriverError that names the most likely cause (docs/safety.md).
+        The device does not follow its drive; a DriverError that names the most likely cause (docs/safety.md).
     """
     rendering = prepare(scene, driver=driver, method=method, seed=seed, renderer=renderer)
     return run(rendering, journal=journal, progress=progress)

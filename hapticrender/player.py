@@ -75,7 +75,8 @@ class Player:
         Where no method of this player is called for so long, the application counts as hung and the drive is stopped
         for good, within 10 ms; 0.1 to 60, and at least two blocks of the driver.  `sleep` counts as calls.
     **tables
-        Further fields of the scene: profile, simulation, rendering, method, seed.
+        Further fields of the scene: profile, simulation, rendering, method, seed.  No touch_panel: that of a scene
+        locates the finger that moves by itself, and positions passed to `finger` are taken as they are.
 
     Raises
     ------
@@ -95,6 +96,9 @@ class Player:
     ) -> None:
         if watchdog is not None and not 2.0 * SERVICE <= watchdog <= LONGEST_WATCHDOG:
             raise ValueError(f"{watchdog=} s: must be {2.0 * SERVICE:g} to {LONGEST_WATCHDOG:g} s, or None")
+        if tables.get("touch_panel"):
+            cure = "pass positions to `finger` that hr.TouchPanel(...).estimator() has estimated"
+            raise ValueError(f"touch_panel: has no effect on the positions that the application sets: {cure}")
         self._given = device if isinstance(device, Scene) else None
         self._fields = {"device": device, "finger": finger or NOMINAL, "duration": LONGEST, **tables}
         self._driver, self._paced, self._watchdog = driver, paced, watchdog

@@ -8,7 +8,6 @@ from functools import partial
 from typing import NamedTuple
 
 import numpy as np
-from scipy.signal import lfilter
 
 from hapticrender.bands import Bands
 from hapticrender.control.device_model import Demand, DeviceModel
@@ -161,6 +160,8 @@ def _need_of_waveform(
     scene: Scene, model: DeviceModel, bands: Bands, waveform: Waveform, per_target: Callable[[Array], Array]
 ) -> Need:
     """A target waveform, over all the frequencies that are rendered; its ends leave 0.1 % of the energy outside."""
+    from scipy.signal import lfilter  # only waveforms need it, and its import takes a second
+
     time = np.arange(int(min(scene.duration, LOOK_AHEAD) * model.rate) + 2) / model.rate
     target = bands.checked(type(scene.texture).__name__, waveform, time, scene.finger.position(time))
     frequency = np.fft.rfftfreq(len(time), 1.0 / model.rate)

@@ -22,7 +22,7 @@ FIRMWARE = ROOT / "drivers" / "firmware"
 STRICT = ("-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic", "-ffp-contract=off")
 SANITISED = ("-O1", "-g", "-fsanitize=address,undefined", "-fno-sanitize-recover=all")
 SOURCES = "board board_commands board_telemetry board_textures frames texture plate hardware_posix".split()
-SOURCES += "law learning carriers supervisor".split()
+SOURCES += "law learning carriers supervisor gains".split()
 RATE = 5000.0  # Hz
 MECHANICS = "heavy-2nd-order"
 FINGER = hr.Finger.swiping(frequency=0.8, stroke=0.05, normal_load=0.4, mechanics=MECHANICS)

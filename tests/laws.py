@@ -13,7 +13,7 @@ from hapticrender.jit import addresses
 from hapticrender.plants.plate import Plate, PlateParameters
 
 RATE, SAMPLES, AHEAD = 5000, 15_000, 7  # Hz; of a run; by which a waveform is ahead: the delay and 6
-PARTS = ("law", "learning", "carriers", "supervisor", "design")
+PARTS = ("law", "learning", "carriers", "supervisor", "gains", "design")
 KINDS = {"double": "-DREAL_DOUBLE", "float": "-UREAL_DOUBLE"}
 RMS = 5e-6  # m, of the white noise
 

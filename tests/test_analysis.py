@@ -1,5 +1,6 @@
 """The finger out of recordings of simulated subjects with known truth, with what the analysis says of its errors."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -232,6 +233,10 @@ def test_short_recordings_and_wrong_profiles_are_refused(studied):
         hr.analyse_finger(short)
     with pytest.raises(ValueError, match=r"profile.kind = 'ultrasonic': must be vt-plate"):
         hr.analyse_finger(recording, hr.DeviceProfile(kind="ultrasonic"))
+    with pytest.raises(TypeError, match=r"profile = 3: must be a DeviceProfile, PlateParameters, the path of"):
+        hr.analyse_finger(recording, profile=3)
+    with pytest.raises(TypeError, match=r"recording = '/a.h5': must be a Recording: see Recording.load"):
+        hr.analyse_finger("/a.h5")
     with pytest.raises(ValueError, match=r"block=2 samples: must be an integer from 1 to the plate's delay, 1"):
         hr.analyse_finger(recording, block=2)
 
@@ -251,10 +256,20 @@ def test_what_was_lost_or_is_not_one_finger_is_not_taken_for_one(studied):
     assert not ((spoiled.impedance.time > 1.95) & (spoiled.impedance.time < 2.15)).any()
 
 
-def test_nonsense_is_named(studied):
-    """Micrometres that are taken for metres press with mega-newtons."""
+@pytest.mark.parametrize(
+    ("signal", "scale", "offset", "message"),
+    [
+        ("sensed", 1e6, 0.0, "check units, signs and scales"),  # micrometres that are taken for metres
+        ("drive", -1.0, 0.0, "check units, signs and scales"),
+        ("sensed", 1.0, 1e-3, "the sensors show -4[0-9].* N while unloaded"),  # the plate's 45 kN/m
+    ],
+)
+def test_nonsense_is_named(studied, signal, scale, offset, message):
     _, recording, _ = studied[0]
-    frames = recording.frames[:].copy()
-    frames[:, recording.header.slices["sensed"]] *= 1e6
-    found = hr.analyse_finger(hr.Recording(recording.header, frames, recording.scene))
-    assert any("check units, signs and scales" in note for note in found.notes)
+    frames, columns = recording.frames[:].copy(), recording.header.slices[signal]
+    frames[:, columns] = scale * frames[:, columns] + offset
+    wrong = hr.Recording(recording.header, frames, recording.scene)
+    found = hr.analyse_finger(wrong)
+    assert any(re.search(message, note) for note in found.notes)
+    if offset:
+        assert not hr.analyse_finger(wrong, free_start=True).notes

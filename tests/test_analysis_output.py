@@ -1,6 +1,7 @@
 """The verb `finger`: what it prints, writes and refuses."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -9,6 +10,7 @@ from subjects import Subject
 import hapticrender as hr
 from hapticrender import cli
 from hapticrender.analysis import output
+from hapticrender.analysis.records import LOADED, Impedance
 from hapticrender.touch.mechanics import LIGHT
 
 BANDS = (47.0, 111.0, 170.0)
@@ -54,7 +56,12 @@ def test_verb_draws_a_single_band(grating, tmp_path):
     scene = hr.Scene(texture=hr.Grating(**grating, amplitude=10e-6), finger=finger, duration=3.0)
     hr.render(scene).save(tmp_path / "recording.npz")
     assert cli.main(["finger", str(tmp_path / "recording.npz"), "--out", str(tmp_path / "out")]) == 0
-    assert {"time-1.png", "load.png"} <= {path.name for path in (tmp_path / "out").iterdir()}
+    written = {path.name for path in (tmp_path / "out").iterdir()}
+    assert "time-1.png" in written
+    assert "load.png" not in written
+    assert "No picture: no windows under loads that differ by 1&nbsp;% or more" in (
+        tmp_path / "out" / "index.html"
+    ).read_text("utf-8")
 
 
 def test_verb_names_the_recording_in_an_error(recorded, tmp_path, capsys):
@@ -64,6 +71,21 @@ def test_verb_names_the_recording_in_an_error(recorded, tmp_path, capsys):
     assert str(path) in error
     assert "block=2 samples: must be an integer from 1 to the plate's delay, 1" in error
     assert not (tmp_path / "out").exists()
+
+
+def test_summary_states_the_mean_of_each_band_with_its_own_error(recorded):
+    """Nine windows of one error each: a third of it, where they scatter by no more; of the load that of a sample."""
+    found = hr.analyse_finger(recorded[1])
+    z = found.impedance
+    value, error = np.full((9, 1), 3.0 + 4.0j), np.full((9, 1), 0.6)
+    few = Impedance(z.time[:9], np.full((9, 1), 111.0), value, error, z.normal_load[:9], z.position[:9])
+    text = output.text(replace(found, impedance=few))
+    (row,) = [line.split() for line in text.splitlines() if line.startswith("111.0")]
+    assert row == ["111.0", "5", "0.2", "53.1", "2.3", "9"]  # degrees of 0.2/5
+    (touch,) = [line.split() for line in text.splitlines() if line.startswith("1 ")]
+    load = slice(*found.at(np.array([found.of_kind(LOADED)[0].start, found.of_kind(LOADED)[0].stop])))
+    assert touch[4] == f"{np.nanmedian(found.normal_load.standard_error[load]):.3f}"
+    assert touch[-1] == f"{1e3 * np.nanmedian(found.position.standard_error[load]):.2f}"
 
 
 def test_summary_of_a_recording_without_a_finger():

@@ -86,7 +86,7 @@ def test_changes_of_the_plate_are_followed(drift, creep, rng):
 def test_without_an_unloaded_span_the_profile_is_taken_and_said(rng):
     found = analyse_finger(drifting({}, 0.0, (0.0, DURATION + 1), rng))
     assert not found.plate.measured
-    assert any("no span without contact" in note for note in found.notes)
+    assert any("no unloaded span" in note for note in found.notes)
     spread = [found.plate.standard_errors[name][0] / getattr(PlateParameters(), name) for name in found.plate.values]
     np.testing.assert_allclose(spread, [0.02, 0.02, 0.1, 0.1], rtol=1e-9)
 

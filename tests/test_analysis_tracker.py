@@ -10,6 +10,7 @@ from hapticrender.analysis.force import MotionFilter, sensor_noise
 from hapticrender.analysis.lock_in import demodulate, tile, window_length
 from hapticrender.analysis.records import LOADED
 from hapticrender.analysis.smoothing import LocalLine, convolve, derivative_kernels, half_width, held_kernel, spread_of
+from hapticrender.analysis.tracker import LEAST_RATE
 from hapticrender.plants.plate import Plate, PlateParameters
 
 RATE = 5000.0
@@ -215,9 +216,34 @@ def test_threshold_of_contact_is_that_of_the_noise():
         assert (found["contact"] == LOADED).any() == (share > 1.0)
 
 
+def test_at_the_least_rate_the_kernels_hold_the_load():
+    """Of a displacement at rest: sums of g and g'' are 1 + e and -(2 pi rate)^2 e, e = 2 exp(-2 (pi spread rate)^2)."""
+    spread, k, m = spread_of(100.0), PLATE.stiffness_1 + PLATE.stiffness_2, PLATE.mass
+    for rate, bound in ((LEAST_RATE, 0.003), (400.0, 0.03)):
+        sums = derivative_kernels(spread, rate).sum(axis=1)
+        e = 2 * np.exp(-2 * (np.pi * spread * rate) ** 2)
+        off = (k * sums[0] + m * sums[2]) / k - 1
+        assert off == pytest.approx(e * (1 - m / k * (2 * np.pi * rate) ** 2), rel=0.02)  # e^4 and the ends left out
+        assert 0.5 * bound < -off < bound
+
+
 def test_wrong_arguments_are_refused():
-    with pytest.raises(ValueError, match=r"lookahead=-1 s: must be finite and >= 0"):
-        hr.FingerTracker(PLATE, lookahead=-1)
+    for given, message in (
+        ({"lookahead": -1}, "lookahead = -1: must be a finite number >= 0 s"),
+        ({"rate": 499.9}, "rate = 499.9: must be a finite number >= 500 Hz"),
+        ({"rate": 0}, "rate = 0: must be a finite number >= 500 Hz"),
+        ({"rate": np.nan}, "rate = nan: must be a finite number >= 500 Hz"),
+        ({"late": -1}, "late = -1: must be an integer >= 0 samples"),
+        ({"noise": np.nan}, "noise = nan: must be two numbers >= 0, in m rms"),
+        ({"noise": [1e-6]}, r"noise = array\(\[1.e-06\]\): must be two numbers"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            hr.FingerTracker(PLATE, **given)
+    with pytest.raises(TypeError, match="plate = 3: must be a PlateParameters or a Course"):
+        hr.FingerTracker(3)
+    hr.FingerTracker(PLATE, rate=500)
+    with pytest.raises(ValueError, match=r"shapes \(\) and \(\): must be \(1, 2\) and \(1, 2\), in A and m"):
+        hr.FingerTracker(PLATE).update(0.0, 0.0)
     with pytest.raises(ValueError, match=r"shapes \(5, 1\) and \(5, 2\): must be \(5, 2\) and \(5, 2\)"):
         hr.FingerTracker(PLATE).update(np.zeros((5, 1)), np.zeros((5, 2)))
 

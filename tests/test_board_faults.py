@@ -82,7 +82,7 @@ def test_an_app_that_hangs_ends_in_zero_drive(stepped):
     assert 0.080 * RATE <= silent - last <= 0.100 * RATE
     assert stepped.board.log()[-1][1:] == ["drives", "0"]
     assert int(stepped.board.log()[-1][0]) <= last + 0.100 * RATE
-    with pytest.raises(DeviceLost, match="the board heard no good word for 80 ms, and stopped"):
+    with pytest.raises(DeviceLost, match="the board received no valid frame for 80 ms, and stopped"):
         run(client, stepped, 0.1)
 
 

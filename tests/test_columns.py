@@ -110,6 +110,8 @@ def test_tables_and_untitled_columns_have_numbers(tmp_path):
     }  # fmt: skip
     np.testing.assert_array_equal(bare["1"], [0.0, 2.0, np.nan])
     np.testing.assert_array_equal(bare["2"], [1.0, 3.0, 4.0])
+    (tmp_path / "tabs.txt").write_text("x\ty\n1\t2\n\t\n \n3\t4 # the last\n", encoding="utf-8")
+    np.testing.assert_array_equal(read_columns(tmp_path / "tabs.txt")["y"], [2.0, np.nan, 4.0])  # a row without values
 
 
 def test_a_finger_is_the_same_in_someone_elses_columns(tmp_path):
@@ -201,8 +203,13 @@ def test_times_may_jitter_by_half_a_sample(jitter, good):
         ("a.csv", b"", "must be lines of numbers"),
         ("a.csv", b"x,y\n", "must be lines of numbers"),
         ("a.csv", b"x,x\n1,2\n", "one different one for each column"),
-        ("a.csv", b"x,y\n1,2,3\n", "one different one for each column"),
-        ("a.csv", b"x,y\n1,2\n3\n", "a.csv: not a table of numbers .*Line #2"),
+        ("a.csv", b"x,y\n1,2,3\n", "a.csv, line 2: 3 fields: must be 2, one a column"),
+        ("a.csv", b"x,y\n1,2\n3\n", "a.csv, line 3: 1 fields: must be 2, one a column"),
+        ("a.csv", b"# of mine\nx,y\n1,2\n\n3,4.l\n", "a.csv, line 5, column y: '4.l': must be a number, or empty"),
+        ("a.csv", b"x;y\n1;2\n3;4,5\n", "a.csv, line 3, column y: '4,5': must be a number, or empty"),
+        ("a.csv", b"x,y\n1,1_0\n", "a.csv, line 2, column y: '1_0': must be a number, or empty"),
+        ("a.csv", "x,y\n1,2\n".encode("utf-16"), "a.csv: byte 0 is no UTF-8 text: save the table as text in UTF-8"),
+        ("a.csv", "x,y\n1,2\n".encode("utf-16-le"), r"a.csv, line 2, column .*: must be a number"),
     ],
 )
 def test_files_that_are_none_are_refused(tmp_path, name, content, message):
@@ -211,6 +218,43 @@ def test_files_that_are_none_are_refused(tmp_path, name, content, message):
         read_columns(tmp_path / name)
     with pytest.raises(FileNotFoundError):
         read_columns(tmp_path / "missing.csv")
+
+
+@pytest.mark.parametrize("ending", [".npz", ".mat", ".h5"])
+def test_a_file_that_was_cut_is_refused(theirs, tmp_path, ending):
+    path = tmp_path / f"cut{ending}"
+    write(path, theirs)
+    path.write_bytes(path.read_bytes()[:-600])
+    with pytest.raises(ValueError, match=f"cut{ending}: damaged, or not an?"):
+        read_columns(path)
+
+
+def test_a_damaged_npz_is_refused(tmp_path):
+    """One bit of the data: the checksum of the archive."""
+    path = tmp_path / "bit.npz"
+    np.savez(path, x=np.zeros(1000))
+    content = bytearray(path.read_bytes())
+    content[4000] ^= 1
+    path.write_bytes(content)
+    with pytest.raises(ValueError, match="bit.npz: damaged, or not an NPZ file of arrays .Bad CRC-32"):
+        read_columns(path)
+
+
+def test_what_is_there_is_listed_where_the_column_is_not(theirs, tmp_path):
+    for ending in (".h5", ".mat"):
+        write(tmp_path / f"a{ending}", {"t": theirs["t"], "load": theirs["load"]})
+        with pytest.raises(ValueError, match="column 'x' is missing: there are (t, load|load, t)"):
+            hr.Recording.from_columns(tmp_path / f"a{ending}", rate=RATE, drive=[], sensed="x")
+    savemat(tmp_path / "struct.mat", {"swipe": {"force": theirs["load"]}})
+    with pytest.raises(ValueError, match=r"struct.mat: has no columns of numbers: there are swipe \(.*force"):
+        read_columns(tmp_path / "struct.mat")
+
+
+def test_one_column_may_drive_two_channels_but_is_one_sensor():
+    made = hr.Recording.from_columns(SMALL, drive=["i", "i"], sensed="x", rate=RATE)
+    assert made.drive.shape == (50, 2)
+    with pytest.raises(ValueError, match=r"sensed = \['x', 'x'\]: must be at least one column, and each once"):
+        hr.Recording.from_columns(SMALL, drive="i", sensed=["x", "x"], rate=RATE)
 
 
 def test_only_counters_wrap(tmp_path):

@@ -34,3 +34,16 @@ def test_links_lead_somewhere(page):
         if anchor:
             headings = re.findall(r"^#+ (.*)$", path.read_text(encoding="utf-8"), re.MULTILINE)
             assert anchor in {re.sub(r"[^\w -]", "", each).lower().replace(" ", "-") for each in headings}, anchor
+
+
+def test_python_on_the_page_about_the_finger_runs(tmp_path, monkeypatch):
+    """All in one namespace; the columns that it writes as CSV give the touch that the recording gives."""
+    pytest.importorskip("h5py")
+    monkeypatch.chdir(tmp_path)
+    names = {"__name__": "finger"}
+    text = (ROOT / "docs" / "finger.md").read_text(encoding="utf-8")
+    for number, block in enumerate(re.findall(r"^```python\n(.*?)^```", text, re.MULTILINE | re.DOTALL)):
+        exec(compile(block, f"finger.md, Python block {number}", "exec"), names)
+    analyse = names["hr"].analyse_finger
+    assert analyse(names["theirs"]).of_kind(2) == names["found"].of_kind(2)
+    assert len(names["touch"].time) == 50

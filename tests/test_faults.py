@@ -202,18 +202,17 @@ def test_a_device_that_is_wired_wrongly_is_refused_before_the_loop_closes(fault)
     assert not plate.is_open
 
 
-@pytest.mark.parametrize("gain", [3.0, 1.6])
-def test_a_gain_of_3_during_a_run_does_not_run_away(gain):
-    """It is not stopped at 72 Hz: the loop holds what it senses, a third of the target; drive and motion stay small."""
+def test_a_gain_of_1_6_during_a_run_goes_on():
+    """The loop holds what it senses; drive and motion stay small.  A gain of 3 stops: `test_supervisor`."""
 
     def grown(sample, sensed):
-        return sensed._replace(sensed=gain * sensed.sensed) if sample >= 0.5 * RATE else sensed
+        return sensed._replace(sensed=1.6 * sensed.sensed) if sample >= 0.5 * RATE else sensed
 
     plate = Logged(spoil=grown)
     with pytest.warns(hr.PlateMismatch):
         recording = hr.render(scene(duration=2.0), driver=plate)
     assert abs(played_after(plate, 0.5)).max() < recording.header.drive_limit
-    settled = recording.read("sensed", round(1.5 * RATE)) / gain
+    settled = recording.read("sensed", round(1.5 * RATE)) / 1.6
     assert np.ptp(settled, axis=0).max() / 2 < 25e-6
 
 
@@ -256,13 +255,13 @@ def test_a_sensor_that_freezes_is_found_within_10_ms_even_so(rate, hold):
 
 @pytest.mark.parametrize("sensors", [-np.eye(2), np.diag([-1.0, 1.0])])
 def test_a_sensor_inverted_at_a_resonance_is_stopped(sensors):
-    """Found: 0.31 s; without the slow test of growth the motion stays at 60 to 355 um for as long as the run lasts."""
+    """Found: 3 ms; by the slow test of growth alone 0.31 s, at 60 to 355 um."""
 
     def invert(sample, sensed):
         return sensed._replace(sensed=sensed.sensed @ sensors.T) if sample >= 0.5 * RATE else sensed
 
     plate = Logged(spoil=invert)
-    with pytest.raises(hr.DeviceFault, match="the motion grows with the drive|the surface moved farther") as stopped:
+    with pytest.raises(hr.DeviceFault, match="the samples are suddenly -.* times the motion") as stopped:
         hr.render(scene(189.0, 50e-6, 2.0), driver=plate)
-    assert 0.0 < stopped.value.time - 0.5 < 0.6
+    assert 0.0 < stopped.value.time - 0.5 < 8e-3
     assert not played_after(plate, stopped.value.time + 10e-3 + 2 / RATE).any()

@@ -159,6 +159,10 @@ def test_what_makes_no_sense_is_refused(rng):
         hr.fit_finger(data, loads=(3.0, 9.0))
     with pytest.raises(ValueError, match="order = 3: must be 2, 4 or None"):
         hr.fit_finger(data, 3)
+    with pytest.raises(TypeError, match="impedance = 3: must be what analyse_finger returns"):
+        hr.fit_finger(3)
+    with pytest.raises(ValueError, match="loads = .*: must be two loads in N"):
+        hr.fit_finger(data, loads=(1.0, 0.5))
     with pytest.raises(ValueError, match="level = 1: must be > 0 and < 1"):
         hr.fit_finger(data, 2).interval("mass", 1)
     with pytest.raises(ValueError, match="phalanx_mass.*: must be one of mass, damping, stiffness, load_exponent"):

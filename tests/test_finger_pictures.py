@@ -134,7 +134,7 @@ def test_a_mean_exponent_is_weighted_and_its_error_widened_by_scatter():
     [
         ([], ["time-1.png"], "No fit: a finger takes at least two frequencies"),
         ([4], ["load.png", "time-1.png"], "No fit: a finger takes at least two frequencies"),
-        ([0, 4], ["frequency.png", "load.png", "time-1.png"], "too few frequencies to say"),
+        ([0, 4], ["frequency.png", "load.png", "time-1.png"], "too few frequencies to compare"),
     ],
 )
 def test_a_record_with_few_bands_or_none_has_what_can_be_drawn(rng, tmp_path, bands, names, sentence):
@@ -162,7 +162,7 @@ def test_a_finger_that_never_touched_has_a_page(record, tmp_path):
     lifted = replace(record, impedance=masked, position=empty, velocity=empty, contact=0 * record.contact, segments=())
     shown, text = parsed(pictures.draw(lifted, tmp_path))
     assert shown == ["time-1.png"]
-    assert re.search(r"0\.00 of 5\.99 s, 0 touches", text)
+    assert re.search(r"Loaded</dt><dd>0\.00 of 5\.99 s, 0 touches", text)
 
 
 def test_without_matplotlib_there_is_a_page_and_a_warning(record, tmp_path, monkeypatch):

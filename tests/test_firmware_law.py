@@ -1,6 +1,7 @@
 """The control law in C against the library's kernel, on the simulated plate, and under sanitisers."""
 
 import subprocess
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -19,10 +20,20 @@ from laws import (
     close,
     kernel_of,
 )
+from other_plate import OtherPlate
 from scipy.signal import butter, sosfiltfilt
 
 import hapticrender as hr
-from hapticrender.control.supervisor_kernel import ACTIVE, FROZEN, INCONSISTENT, INVALID, OVERMOTION, RINGING
+from hapticrender.control.supervisor_kernel import (
+    ACTIVE,
+    FROZEN,
+    INCONSISTENT,
+    INVALID,
+    INVERTED,
+    OVERMOTION,
+    RESCALED,
+    RINGING,
+)
 from hapticrender.plants.plate import Plate, PlateParameters
 from hapticrender.protocols import Flag
 
@@ -119,6 +130,44 @@ def test_the_supervisor_equals_the_librarys(exports, fault, kind):
     if kind == "double":
         assert abs(found - drive).max() < 1e-9
         assert np.array_equal(found_flags, flags)
+
+
+class Rewired(OtherPlate):
+    """A plate whose sensors and coils are multiplied after 0.9 s; not probed."""
+
+    probe = False
+
+    def __init__(self, shown, moved):
+        super().__init__(seed=1)
+        self.shown, self.moved = shown, moved
+
+    def play(self, drive):
+        if len(self.played) == 4500:
+            self._gamma, self._show = self.moved * self._gamma, self.shown * self._show
+        return super().play(drive)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize(
+    ("shown", "moved", "cause", "named"),
+    [(10.0, 1.0, RESCALED, "sensor 1 and 2"), (1.0, -1.0, INVERTED, "actuator 1 and 2")],
+    ids=["sensors times ten", "coils inverted"],
+)
+def test_changes_of_gains_stop_both(exports, shown, moved, cause, named, kind):
+    """The sensors of a closed loop that the library stopped, played back to both."""
+    rendering = exports.rendering("tones")
+    with pytest.raises(hr.DeviceFault, match=named) as stopped:
+        hr.render(replace(rendering.scene, finger=hr.Finger.absent(), duration=1.0), driver=Rewired(shown, moved))
+    sensed = np.ascontiguousarray(stopped.value.recording.sensed)
+    n, position = len(sensed), np.full(len(sensed), np.nan)
+    controller, law = rendering.controller(), exports.law("tones", kind, "supervised")
+    drive, _, flags = controller.run(sensed, position, np.zeros(n))
+    found, found_flags = law.run(sensed, position, np.zeros(n))
+    assert law.code.supervised_cause(law.address) == cause == controller.fault.cause
+    stops = [np.argmax(each & Flag.STOPPED) for each in (flags, found_flags)]
+    assert abs(np.diff(stops)) <= (0 if kind == "double" else 5)
+    if kind == "double":
+        assert abs(found - drive).max() < 1e-9
 
 
 def error(motion, reference, start=1.0):

@@ -82,9 +82,12 @@ MAY_IMPORT = {  # package: the others that it may import; renderers and drivers 
     "plants": {"control", "touch"},
     "renderers": DEVICES | {"drivers"},
     "drivers": {"plants", "touch"},
-    "core": DEVICES,
-    "top": {*DEVICES, "core"},
+    "results": {"touch", "core"},
+    "analysis": DEVICES | {"results"},  # a recording, its pictures and pages, but nothing that plays
+    "core": DEVICES | {"analysis", "results"},
+    "top": {*DEVICES, "analysis", "core", "results"},
 }
+RESULTS = {"recordings", "report"}
 TOP = {f"hapticrender.{name}" for name in ("cli", "verbs", "validate")}
 
 
@@ -94,6 +97,8 @@ def room_of(name):
         return "ground"
     if name in TOP:
         return "top"
+    if len(parts) > 1 and parts[1] in RESULTS:
+        return "results"
     return parts[1] if len(parts) > 1 and parts[1] in MAY_IMPORT else "core"
 
 

@@ -50,7 +50,7 @@ FAULTS = {  # what is sensed instead: bounds of time (s) and motion (m), and wha
     "one dead": (lambda plate, sensed: sensed * (1.0, 0.0), 10e-3, 250e-6, "sensor 2: one value repeats"),
     "at its range": (lambda plate, sensed: 0 * sensed + 1e-3, 20e-3, 250e-6, "sensor 1 and 2: samples are no numbers"),
     "NaN": (lambda plate, sensed: np.nan * sensed, 20e-3, 250e-6, "sensor 1 and 2: samples are no numbers"),
-    "noisy": (noise, 0.15, 600e-6, "the motion does not follow from the drive"),
+    "noisy": (noise, 10e-3, 250e-6, "sensor 1 and 2: the samples are suddenly"),
 }
 
 
@@ -58,7 +58,7 @@ FAULTS = {  # what is sensed instead: bounds of time (s) and motion (m), and wha
 @pytest.mark.parametrize("frequency", [72.0, 189.0])
 @pytest.mark.parametrize("fault", FAULTS)
 def test_a_sensor_that_lies_stops_the_drive_and_is_named(fault, frequency, truth):
-    """Found: 2 to 18 ms and 140 um at most; 77 ms and 390 um where it still shows noise."""
+    """Found: 2 to 18 ms and 140 um at most."""
     change, latest, most, named = FAULTS[fault]
     plate = Watched(change, **truth)
     with pytest.raises(hr.DeviceFault, match=named) as stopped:
@@ -98,15 +98,60 @@ def test_a_compiled_loop_stops_too():
     assert abs(drive).max() < 1.0
 
 
+CHANGES = {  # sensors and coils from 0.5 s on: bounds of time (s) and motion (m), and what is named
+    "sensors inverted": (-np.eye(2), np.eye(2), 8e-3, 200e-6, "sensor 1 and 2: the samples are suddenly -"),
+    "sensor inverted": (np.diag([1.0, -1.0]), np.eye(2), 8e-3, 200e-6, "sensor 2: the samples are suddenly -"),
+    "gain of 3": (3.0 * np.eye(2), np.eye(2), 8e-3, 100e-6, "sensor 1 and 2: the samples are suddenly (2|3)"),
+    "sensor of gain 3": (np.diag([3.0, 1.0]), np.eye(2), 8e-3, 100e-6, "sensor 1: the samples are suddenly (2|3)"),
+    "a tenth": (0.1 * np.eye(2), np.eye(2), 8e-3, 100e-6, "sensor 1 and 2: the samples are suddenly 0.[01]"),
+    "coils inverted": (np.eye(2), -np.eye(2), 15e-3, 600e-6, "actuator 1 and 2: the motion is that of -"),
+    "coil inverted": (np.eye(2), np.diag([1.0, -1.0]), 15e-3, 600e-6, "actuator 2: the motion is that of -"),
+}
+
+
+class Rewired(Watched):
+    """A plate whose sensors and coils are multiplied by matrices from `START` on."""
+
+    def __init__(self, sensors, coils, **truth):
+        super().__init__(lambda plate, sensed: sensed @ sensors.T, **truth)
+        self.late_coils = coils
+
+    def play(self, drive):
+        if len(self.played) == START * RATE:
+            self._gamma = self._gamma @ self.late_coils
+        return super().play(drive)
+
+
+@pytest.mark.parametrize(("frequency", "truth"), [(72.0, {}), (189.0, FINGER)], ids=["72 free", "189 touched"])
+@pytest.mark.parametrize("change", CHANGES)
+def test_a_gain_that_changes_during_a_run_stops_the_drive_and_is_named(change, frequency, truth):
+    """With the fade of 2 ms, zero drive within 10 ms where a sensor changes; an inverted coil moves up to 0.5 mm."""
+    sensors, coils, latest, most, named = CHANGES[change]
+    plate = Rewired(sensors, coils, **truth)
+    with pytest.raises(hr.DeviceFault, match=named) as stopped:
+        hr.render(scene(frequency), driver=plate)
+    assert 0 < stopped.value.time - START < latest
+    assert max(plate.motion) < most
+    quiet = round((stopped.value.time + 2e-3) * RATE) + 2
+    assert not np.concatenate(plate.played)[quiet:].any()
+
+
+@pytest.mark.parametrize("position", [0.0, 0.05])
 @pytest.mark.parametrize("frequency", [72.0, 189.0])
-def test_a_late_polarity_is_stopped_although_only_after_a_millimetre(frequency):
-    """At the governor the modes grow by 130 to 270 um/ms; at 189 Hz the slow test of growth finds it, in 0.31 s."""
-    plate = Watched(lambda plate, sensed: -sensed)
-    with pytest.raises(hr.DeviceFault):
-        hr.render(scene(frequency, duration=2.0), driver=plate)
-    assert max(plate.motion) < 3e-3
-    assert max(plate.motion[-500:]) < 0.75e-3
-    assert abs(np.concatenate(plate.played)).max() < 1.4
+def test_a_hard_tap_is_no_change_of_a_gain(frequency, position):
+    """5 N within a millisecond on a plate that is 5 % off, eight times a second: touched, held, and let go."""
+    on = 0.5 + 0.125 * np.arange(20)
+    times = np.ravel(np.column_stack([on, on + 1e-3, on + 0.06, on + 0.061]))
+    finger = hr.Finger.still(
+        position=position,
+        normal_load=(tuple(times), tuple(np.tile([1e-3, 5.0, 5.0, 1e-3], len(on)))),
+        touches=tuple(zip(on, on + 0.061, strict=True)),
+        mechanics=HEAVY_SECOND,
+    )
+    off = {"mass": 1.05 * TRUTH["mass"], "stiffness_1": 0.95 * TRUTH["stiffness_1"], "sensor_gain_1": 1.02}
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", hr.PlateMismatch)
+        hr.render(scene(frequency, duration=3.0, finger=finger, simulation=off))
 
 
 def test_the_governor_leaves_what_the_scene_needs_and_no_more():

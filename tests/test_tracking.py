@@ -237,9 +237,22 @@ def test_wrong_sensors_are_refused():
         (lambda: MotionEstimator(1e-4, latency=-1.0), "latency = -1.0: must be a finite number >= 0 s"),
         (lambda: MotionEstimator(1e-4).update(0.0, np.inf), "must be finite"),
         (lambda: hr.Encoder(0.5e-6, bits=70), "bits = 70: must be an integer >= 2 and <= 64"),
+        (lambda: hr.Encoder(0.0, noise=1e-6), "resolution = 0.0: must be the metres of a count, not 0"),
+        (lambda: hr.Encoder(0.5e-6).update(0.0, np.nan), "position = nan: must be a whole number of counts"),
+        (lambda: hr.Encoder(0.5e-6).update(0.0, 2.5), "position = 2.5: must be a whole number of counts"),
         (lambda: TouchPanel(rate=0.0), "rate = 0.0"),
+        (lambda: TouchPanel(noise=0.0, resolution=0.0), "one must be > 1e-09 m"),
+        (lambda: hr.phase_error(TouchPanel(), 0.05, 0.0), "wavelength = 0.0: must be a finite number > 0 m"),
+        (lambda: hr.phase_error(TouchPanel(), np.nan, 1e-3), "speed = nan: must be a finite number >= 0 m/s"),
+        (lambda: hr.phase_error(TouchPanel(), 0.05, 1e-3, frequency=0.0), "frequency = 0.0: .* > 0 Hz"),
+        (lambda: hr.phase_error(TouchPanel(), 0.05, 1e-3, delay=-1e-3), "delay = -0.001: .* >= 0 s"),
+        (lambda: hr.phase_error(3, 0.05, 1e-3), "panel = 3: must be a TouchPanel"),
+        (lambda: hr.finest_wavelength(TouchPanel(), 0.05, degrees=0.0), "degrees = 0.0: .* > 0"),
+        (lambda: hr.finest_wavelength(TouchPanel(), 0.05, highest=0.0), "highest = 0.0: must be > 0 Hz"),
+        (lambda: budget.bandwidth(MotionEstimator(1e-4), np.nan), "rate = nan: must be a finite number > 0 Hz"),
         (lambda: hr.Scene(texture=hr.Grating(frequency=50.0, amplitude=1e-6), duration=1.0, touch_panel={"hz": 1}),
          "touch_panel.hz: no such parameter"),
+        (lambda: hr.Player("vt-plate", touch_panel={"rate": 60.0}), "touch_panel: has no effect on the positions that"),
     ):  # fmt: skip
         with pytest.raises((ValueError, TypeError), match=message):
             make()
@@ -254,6 +267,9 @@ def test_a_scene_with_a_touch_panel_is_played_at_the_estimated_position():
     )
     assert hr.Scene.from_toml_text(scene.to_toml()) == scene
     recording = hr.render(scene)
+    assert any(
+        "texture at the recorded position, which the touch panel" in each for each in recording.summary()["notes"]
+    )
     truth = scene.finger.position(np.arange(len(recording)) / recording.rate)
     late = np.flatnonzero(np.isfinite(recording.position))[[0, -1]] / recording.rate
     assert late == pytest.approx([0.1, 1.4], abs=0.008 + 1 / 240 + 0.002)

@@ -12,7 +12,7 @@ from hapticrender.analysis.two_touches import (
     SPACING,
     TouchMonitor,
     bound_of,
-    can_tell,
+    measures_moment,
     miss_rate,
     windows_under_touch,
 )
@@ -126,7 +126,7 @@ def test_live_play_flags_two_touches_and_no_single_one(fingers, tmp_path):
 
 def test_devices_without_force_and_moment_are_not_watched():
     model = hr.prepare(hr.Scene(texture=hr.Grating(frequency=50.0, amplitude=1e-6), duration=1.0, profile={"coils": 1}))
-    assert not can_tell(model.model)
+    assert not measures_moment(model.model)
     with pytest.raises(ValueError, match="1 coordinates: must be a plate with 2"):
         TouchMonitor(model.model)
 

@@ -293,6 +293,23 @@ static uint32_t cool(supervisor_t *s, law_t *law, real_t drive[])
     return flags;
 }
 
+/* Tests 10 and 11: whether a sensor or an actuator has changed its gain. */
+static supervisor_cause_t compare_gains(supervisor_t *s, supervisor_cause_t cause)
+{
+    uint32_t inverted = 0u;
+    uint32_t rescaled = gains_check(&s->gains, &s->p->gains, s->last, s->force, &inverted);
+    for (uint32_t i = 0u; i < LAW_SENSORS; i++) {
+        if (2u * s->repeats[i] > s->p->frozen_time) { /* that is for test 2 to find */
+            rescaled &= ~(1u << i);
+        }
+    }
+    if ((cause != SUPERVISOR_FINE) || ((rescaled | inverted) == 0u)) {
+        return cause;
+    }
+    s->stopped_sensors = (rescaled != 0u) ? rescaled : inverted;
+    return (rescaled != 0u) ? SUPERVISOR_RESCALED : SUPERVISOR_INVERTED;
+}
+
 /* All tests of a sample; returns what failed first, and whether there is danger. */
 static supervisor_cause_t check(
     supervisor_t *s, law_t *law, const real_t sensed[], const real_t drive[], uint32_t *danger)
@@ -307,6 +324,11 @@ static supervisor_cause_t check(
     if (s->started == 0u) { /* a steady load is no motion */
         (void)memcpy(s->filter.low, s->input, sizeof(s->filter.low));
         (void)memcpy(s->filter.high, s->input, sizeof(s->filter.high));
+        for (uint32_t i = 0u; i < 2u; i++) {
+            s->gains.models[0][i] = s->input[i];
+            s->gains.models[0][4u + i] =
+                s->p->stiffness[i][0] * s->input[0] + s->p->stiffness[i][1] * s->input[1];
+        }
         s->started = 1u;
     }
     *danger = (s->peak > s->p->danger_drive) ? 1u : 0u;
@@ -315,12 +337,15 @@ static supervisor_cause_t check(
     if ((s->p->damped != 0u) && (check_ringing(s, law) != 0u) && (cause == SUPERVISOR_FINE)) {
         cause = SUPERVISOR_RINGING;
     }
+    if ((s->p->compared != 0u) && (s->cause == SUPERVISOR_FINE)) {
+        cause = compare_gains(s, cause);
+    }
     return cause;
 }
 
 static void fade_out(supervisor_t *s, supervisor_cause_t cause, uint32_t danger)
 {
-    real_t step = (danger != 0u) ? s->p->fade_danger : s->p->fade_out;
+    real_t step = ((danger != 0u) || (s->cause >= SUPERVISOR_RESCALED)) ? s->p->fade_danger : s->p->fade_out;
     step = (cause == SUPERVISOR_OVERMOTION) ? s->p->fade_now : step;
     s->fade_step = real_max(s->fade_step, step);
     s->fade = real_max(s->fade - s->fade_step, REAL(0.0));

@@ -7,6 +7,7 @@
 #ifndef SUPERVISOR_H
 #define SUPERVISOR_H
 
+#include "gains.h"
 #include "law.h"
 
 #define SUPERVISOR_STOPPED 64u /* flag beside those of the law, as hapticrender.protocols.Flag */
@@ -20,7 +21,9 @@ typedef enum {
     SUPERVISOR_DRIVE,
     SUPERVISOR_RINGING,
     SUPERVISOR_OVERMOTION,
-    SUPERVISOR_BEYOND
+    SUPERVISOR_BEYOND,
+    SUPERVISOR_RESCALED,
+    SUPERVISOR_INVERTED
 } supervisor_cause_t;
 
 /* Settings, from `hapticrender export`; poles and fades are per sample, times in samples. */
@@ -33,10 +36,12 @@ typedef struct {
     uint32_t modelled;  /* 1: motion and drive are compared */
     uint32_t damped;    /* 1: the inner damper is watched */
     uint32_t limited;   /* 1: the law's drive limit follows the heat */
+    uint32_t compared;  /* 1: gains of sensors and actuators are compared */
     real_t mass[2][2], damping[2][2], stiffness[2][2]; /* kg, N s/m, N/m; 0 where a coordinate is locked */
     real_t bound[2][8]; /* of the residual's energy, per energy of q, v, a, dF in both coordinates */
     real_t noise[2];    /* N^2, of the residual's energy */
     real_t ringing[2];  /* N^2, of the damper's force; 0: no test */
+    gain_settings_t gains;
 } supervision_t;
 
 extern const supervision_t supervision; /* in design.c */
@@ -52,6 +57,7 @@ typedef struct {
     const supervision_t *p;
     const design_t *design;
     supervisor_filter_t filter;
+    gains_t gains;
     real_t forces[LAW_DELAY + 1][3]; /* N, N, A: forces and sum of the drive on their way */
     real_t force[2], input[4];
     real_t energy[12];               /* means of squares of q, v, a, dF, F, r in both coordinates */
@@ -62,7 +68,7 @@ typedef struct {
     uint32_t repeats[LAW_SENSORS], longest[LAW_SENSORS];
     uint32_t inconsistent_count, active_count, drive_count, motion_count, ring_count, ring_wait_count, slow_count;
     uint32_t beyond_count, suspended, at, started;
-    uint32_t stopped_sensors; /* bit i: sensor i + 1, of an invalid, frozen or exceeding one */
+    uint32_t stopped_sensors; /* bit i: sensor i + 1, of an invalid, frozen, exceeding or rescaled one; actuator */
     supervisor_cause_t cause;
 } supervisor_t;
 

@@ -6,7 +6,6 @@ import itertools
 import os
 from collections.abc import Iterator
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -19,12 +18,11 @@ from hapticrender.analysis.records import DOUBTFUL, LOADED, UNLOADED, FingerReco
 from hapticrender.analysis.smoothing import LEAST_SPREAD, spread_of
 from hapticrender.analysis.tracker import FingerTracker, Touch
 from hapticrender.bands import Bands, hold_last
+from hapticrender.checks import require
 from hapticrender.plants.plate import PlateParameters
 from hapticrender.protocols import Array, Flag
+from hapticrender.recordings.recording import Recording
 from hapticrender.touch.device_profile import DeviceProfile
-
-if TYPE_CHECKING:
-    from hapticrender.recordings.recording import Recording
 
 WIDE = 0.25e-3  # s: spread of the kernel under the carriers; 0.8 of 400 Hz passes
 RINGING = 0.25  # s after a lift in which the free plate rings down: 6 time constants of its heave mode
@@ -36,7 +34,8 @@ MIDDLE = 15e-3  # m from the middle: where `least_load` holds
 MILLIMETRE = 1e-3  # m
 AROUND = 0.1  # s: what is lost acts so far, by the kernels
 HEAVIEST, MOST_TOUCHES = 20.0, 5.0  # N; 1/s: no finger presses harder, or touches more often
-START = 0.5  # s: free of a finger, where the caller says so
+STIFFEST = 100.0  # N s/m: no finger has a larger impedance from 15 Hz on
+START = 0.5  # s: free of a finger with `free_start`
 BLOCK = 1.0  # s of signal at a time
 
 
@@ -54,10 +53,10 @@ def analyse_finger(
     Parameters
     ----------
     recording : Recording
-        Of a plate with two sensors at the ends of its glass, at least 1 s.
+        Of a plate with two sensors at the ends of its glass, at least 1 s and 500 Hz.
     profile : DeviceProfile, PlateParameters or path of a profile, optional
-        What is believed of the plate, with its uncertainty; default: that of the recording's scene.  Parameters without
-        one count as known to 2 %, damping to 10 %.
+        Model of the plate, with its uncertainty; default: that of the recording's scene.  Parameters without one have
+        2 %, damping 10 %.
     block : int, samples
         Of the driver: a row of the drive acts ``delay - block`` samples after the row sensed with it.
     free_start : bool
@@ -66,8 +65,9 @@ def analyse_finger(
 
     Raises
     ------
-    ValueError
-        The recording is not of such a plate, too short, or a measurement is nowhere finite.
+    ValueError, TypeError
+        An argument is of another kind; the recording is not of such a plate, too short, too slow, or a measurement is
+        nowhere finite.
 
     Notes
     -----
@@ -76,7 +76,8 @@ def analyse_finger(
     look like touches no such span is left: then they are taken where the force below 5 Hz is near zero.  The series end
     85 ms before the recording does.
     """
-    course = _believed(recording, profile)
+    require(isinstance(recording, Recording), "recording", recording, "a Recording: see Recording.load", TypeError)
+    course = _course(recording, profile)
     late = course.plate.delay - block
     _check(recording, course.plate, late)
     rate = recording.rate
@@ -113,7 +114,7 @@ def analyse_finger(
         plate=track_of(course, len(drive) / rate),
         impedance=impedance,
         least_load=tracker.least_load(MIDDLE, MILLIMETRE),
-        notes=tuple(_notes(recording, course, touch, rest, impedance)),
+        notes=tuple(_notes(recording, course, touch, rest, impedance, threshold)),
     )
 
 
@@ -125,8 +126,8 @@ def _spoiled(recording: Recording) -> Array:
     return np.asarray(maximum_filter1d(bad.astype(np.uint8), 2 * round(AROUND * recording.rate) + 1) > 0)
 
 
-def _believed(recording: Recording, profile: DeviceProfile | PlateParameters | str | os.PathLike[str] | None) -> Course:
-    """Return what is believed of the recorded plate."""
+def _course(recording: Recording, profile: DeviceProfile | PlateParameters | str | os.PathLike[str] | None) -> Course:
+    """Return the plate's parameters before the recording is looked at."""
     duration = len(recording) / recording.rate
     if isinstance(profile, PlateParameters):
         return Course.of(profile, duration=duration)
@@ -134,6 +135,8 @@ def _believed(recording: Recording, profile: DeviceProfile | PlateParameters | s
         profile = DeviceProfile.load(profile)
     elif profile is None:
         profile = recording.scene.device_profile
+    accepted = "a DeviceProfile, PlateParameters, the path of a profile, or None for that of the recording"
+    require(isinstance(profile, DeviceProfile), "profile", profile, accepted, TypeError)
     if profile.kind != "vt-plate":
         raise ValueError(f"profile.kind = {profile.kind!r}: must be vt-plate, a plate with sensors of displacement")
     return Course.of(PlateParameters.with_overrides(profile.device), profile.uncertainty, duration)
@@ -202,8 +205,9 @@ class _Signals:
         """
         from scipy.ndimage import gaussian_filter1d
 
-        signals = Signals(*(self.columns[:, i : i + 2] for i in range(0, 8, 2)))
-        force = signals.residual(course.at(np.arange(len(self.columns)) / self.rate), course.plate.half_spacing)
+        force = Signals.of(self.columns).residual(
+            course.at(np.arange(len(self.columns)) / self.rate), course.plate.half_spacing
+        )
         return np.asarray(gaussian_filter1d(force[:, 0], spread_of(SLOWEST / 3) * self.rate, mode="nearest"))
 
     def unloaded(self, free: Array, load: Array, frequency: Array, length: int, quiet: float) -> Lines:
@@ -257,17 +261,31 @@ def _segments(touch: Touch, rate: float) -> tuple[Segment, ...]:
     )
 
 
+def _implausible(touch: Touch, impedance: Impedance, seconds: float) -> str:
+    """Describe touches that are no finger's; empty where all may be."""
+    heaviest, touches = np.nanmax(touch.normal_load.value, initial=0.0), np.diff(touch.contact == LOADED).sum() / 2
+    sizes = np.abs(impedance.value[np.isfinite(impedance.value)])
+    size = np.median(sizes) if sizes.size else 0.0
+    if heaviest <= HEAVIEST and touches <= MOST_TOUCHES * max(seconds, 1.0) and size <= STIFFEST:
+        return ""
+    return f"up to {heaviest:.3g} N in {touches:.0f} touches, |Z| {size:.3g} N s/m"
+
+
 def _notes(
-    recording: Recording, course: Course, touch: Touch, rest: Rest | None, impedance: Impedance
+    recording: Recording, course: Course, touch: Touch, rest: Rest | None, impedance: Impedance, threshold: float
 ) -> Iterator[str]:
-    """Say what could not be measured, and why."""
+    """List what could not be measured, and why."""
     if rest is None:
         yield (
-            "no span without contact is long enough: the sensors' zero and the plate's parameters are taken from the "
-            "profile"
+            "no unloaded span is long enough: the sensors' zero and the plate's parameters are taken from the profile"
         )
     elif not course.measured:
-        yield ("the carriers do not determine the stiffness while nothing touches: it is mostly that of the profile")
+        yield ("the carriers do not determine the stiffness in the unloaded spans: it is mostly that of the profile")
+    if rest is not None and abs(force := float(np.median(rest.values[:, 0]))) > threshold:
+        yield (
+            f"the sensors show {force:.3g} N while unloaded, beyond the threshold of contact ({threshold:.3g} N): "
+            "set their zero, or take it from the first 0.5 s (free_start, --free-start)"
+        )
     if not (touch.contact == LOADED).any():
         yield "no finger touches"
     elif not len(impedance.time):
@@ -281,13 +299,9 @@ def _notes(
         (Flag.STOPPED, "the drive was stopped"),
     ):
         if flags & bad:
-            yield f"{text}: estimates near there are wrong by more than they say"
-    heaviest, touches = np.nanmax(touch.normal_load.value, initial=0.0), np.diff(touch.contact == LOADED).sum() / 2
-    if heaviest > HEAVIEST or touches > MOST_TOUCHES * max(len(recording) / recording.rate, 1.0):
-        yield (
-            f"up to {heaviest:.3g} N in {touches:.0f} touches: check units, signs and scales of drive and sensors, the "
-            "block, and the profile"
-        )
+            yield f"{text}: errors near there are larger than stated"
+    if implausible := _implausible(touch, impedance, len(recording) / recording.rate):
+        yield f"{implausible}: check units, signs and scales of drive and sensors, the block, and the profile"
     plate = course.plate
     if abs(recording.rate - plate.rate) > 1e-3 * plate.rate:
         yield f"the profile's delay, {plate.delay} samples, is taken at {recording.rate:g} Hz, not at {plate.rate:g} Hz"

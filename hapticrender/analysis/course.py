@@ -24,7 +24,7 @@ from hapticrender.plants.plate import PlateParameters
 from hapticrender.protocols import Array
 
 TRACKED = MECHANICAL[2:]  # stiffness and damping, first order in time
-UNCERTAINTY = (0.02, 0.02, 0.02, 0.02, 0.1, 0.1)  # relative, of `MECHANICAL`, where a profile says nothing
+UNCERTAINTY = (0.02, 0.02, 0.02, 0.02, 0.1, 0.1)  # relative, of `MECHANICAL`, where a profile has none
 DRIFT, DRIFT_TIME = (0.02, 0.02, 0.2, 0.2), 40.0  # relative, of `TRACKED`, and s: change over a recording, or over this
 
 
@@ -39,6 +39,11 @@ class Signals:
     velocity: Array  # m/s
     acceleration: Array  # m/s^2
     force: Array  # N
+
+    @classmethod
+    def of(cls, columns: Array) -> Signals:
+        """Signals of the first eight columns (..., >= 8): displacement, velocity, acceleration, force."""
+        return cls(*(columns[..., i : i + 2] for i in range(0, 8, 2)))
 
     def regressors(self, half_spacing: float) -> Array:
         """Phi, shape (..., 2, 6)."""

@@ -13,9 +13,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from hapticrender.analysis.course import Course
+from hapticrender.analysis.course import Course, Signals
 from hapticrender.analysis.lock_in import Lines
-from hapticrender.analysis.plate_track import signals_of
 from hapticrender.analysis.records import Impedance
 from hapticrender.protocols import Array
 
@@ -40,7 +39,7 @@ def impedance_of(
     gain_error : float
         Relative standard error of a gain common to both sensors.
     """
-    amplitudes, a = signals_of(lines), course.plate.half_spacing
+    amplitudes, a = Signals.of(lines.amplitude), course.plate.half_spacing
     times = np.broadcast_to(lines.time[:, None], lines.frequency.shape)
     phi = amplitudes.regressors(a)[..., 0, :]
     force = amplitudes.force[..., 0] - np.einsum("nbi,ni->nb", phi, course.at(lines.time))

@@ -39,7 +39,7 @@ class Lines:
 
 
 def window_length(frequency: Array, rate: float) -> int:
-    """Samples of a window in which carriers (Hz) are told apart from each other and from a drift."""
+    """Samples of a window in which carriers (Hz) are separated from each other and from a drift."""
     spacing = np.diff(np.sort(np.r_[0.0, frequency])).min(initial=np.inf)
     return round(float(np.clip(PERIODS / max(spacing, 1e-9), SHORTEST, LONGEST)) * rate)
 

@@ -51,8 +51,8 @@ class FingerFit:
     Notes
     -----
     Intervals hold for a model that explains the data (see `p_value`), and for small errors, in which it is linear:
-    where the data hardly tell the skin's stiffness from the phalanx (standard error above half of it), the phalanx may
-    be off by more.
+    where the data hardly separate the skin's stiffness from the phalanx (standard error above half of it), the phalanx
+    may be off by more.
     """
 
     mechanics: FingerMechanics
@@ -318,7 +318,7 @@ def _starts(samples: Samples, second: FingerFit | None) -> list[Array]:
 
 
 def _inverse(jacobian: Array) -> Array:
-    """Inverse of J^T J; a direction in which the data say nothing has a variance beyond every bound, not 0."""
+    """Inverse of J^T J; a direction without data has a variance beyond every bound, not 0."""
     _, size, right = np.linalg.svd(jacobian, full_matrices=False)
     spread = right.T / np.maximum(size, 1e-12 * size[0])
     return spread @ spread.T

@@ -7,12 +7,13 @@ from typing import Any
 
 import numpy as np
 
-from hapticrender.analysis.records import DOUBTFUL, LOADED, UNLOADED, FingerRecord
+from hapticrender.analysis.records import KINDS, LOADED, FingerRecord, Series
+from hapticrender.analysis.samples import weighted_mean
 from hapticrender.formatting import as_json, table
+from hapticrender.protocols import Array
 
 FILES = ("finger.csv", "impedance.csv", "finger.json")
 ROWS = 100.0  # a second, in finger.csv
-KINDS = {UNLOADED: "unloaded", DOUBTFUL: "doubtful", LOADED: "loaded"}
 SERIES = {"normal_load": "N", "position": "m", "velocity": "m/s"}
 
 
@@ -72,34 +73,39 @@ def text(record: FingerRecord) -> str:
 
 
 def _touches(record: FingerRecord) -> str:
-    """Mean load and range of the position of each touch."""
-    rows = [["touch", "from (s)", "to (s)", "load (N)", "position (mm)"]]
+    """Mean load and range of the position of each touch, with the standard error of one sample."""
+    rows = [["touch", "from (s)", "to (s)", "load (N)", "se", "position (mm)", "se"]]
     for number, each in enumerate(record.of_kind(LOADED), 1):
         at = slice(*record.at(np.array([each.start, each.stop])))
-        load, place = record.normal_load.value[at], 1e3 * record.position.value[at]
-        known = place[np.isfinite(place)]
-        span = f"{known.min():.1f} to {known.max():.1f}" if known.size else "undefined"
-        load_text = f"{np.nanmean(load):.3f}" if np.isfinite(load).any() else "undefined"
-        rows.append([f"{number}", f"{each.start:.3f}", f"{each.stop:.3f}", load_text, span])
-    return table(rows) if len(rows) > 1 else ""
+        load, load_error = _finite(record.normal_load, at)
+        place, place_error = (1e3 * part for part in _finite(record.position, at))
+        loads = [f"{load.mean():.3f}", f"{np.median(load_error):.3f}"] if load.size else ["undefined", ""]
+        span = f"{place.min():.1f} to {place.max():.1f}" if place.size else "undefined"
+        places = [span, f"{np.median(place_error):.2f}" if place.size else ""]
+        rows.append([f"{number}", f"{each.start:.3f}", f"{each.stop:.3f}", *loads, *places])
+    return table(rows) + "\n(se: standard error of one sample, median of the touch)" if len(rows) > 1 else ""
+
+
+def _finite(series: Series, at: slice) -> tuple[Array, Array]:
+    """Values of a span, and their standard errors, where they are defined."""
+    value, error = series.value[at], series.standard_error[at]
+    good = np.isfinite(value) & np.isfinite(error)
+    return value[good], error[good]
 
 
 def _bands(record: FingerRecord) -> str:
-    """Mean impedance of each band over the windows, weighted by their certainty."""
+    """Mean impedance of each band over the windows, with its own standard error."""
     z = record.impedance
-    rows = [["band (Hz)", "|Z| (N s/m)", "phase (deg)", "standard error", "windows"]]
+    rows = [["band (Hz)", "|Z| (N s/m)", "se", "phase (deg)", "se", "windows"]]
     for k in range(z.frequency.shape[1]):
         good = np.isfinite(z.value[:, k])
         if good.any():
-            weight = z.standard_error[good, k] ** -2.0
-            mean = np.sum(weight * z.value[good, k]) / weight.sum()
-            cells = (
-                f"{abs(mean):.3g}",
-                f"{np.degrees(np.angle(mean)):.0f}",
-                f"{np.median(z.standard_error[good, k]):.2g}",
-            )
-            rows.append([f"{np.median(z.frequency[good, k]):.1f}", *cells, f"{good.sum()}"])
-    return table(rows) + "\n(standard error: of a single window)" if len(rows) > 1 else ""
+            mean, error = weighted_mean(z.value[good, k], z.standard_error[good, k])
+            size = [f"{abs(mean):.3g}", f"{error:.2g}"]
+            phase = [f"{np.degrees(np.angle(mean)):.1f}", f"{np.degrees(error / abs(mean)):.1f}"]
+            rows.append([f"{np.median(z.frequency[good, k]):.1f}", *size, *phase, f"{good.sum()}"])
+    note = "(se: standard error of the mean over the windows, whose errors are taken as independent)"
+    return f"{table(rows)}\n{note}" if len(rows) > 1 else ""
 
 
 def _plate(record: FingerRecord) -> str:

@@ -8,11 +8,10 @@ from math import isfinite
 
 import numpy as np
 
-from hapticrender import __version__
 from hapticrender.analysis.load_law import load_exponent, mean_exponent
 from hapticrender.analysis.models import FingerFit
 from hapticrender.analysis.records import LOADED, FingerRecord
-from hapticrender.report.page import GENERATOR, NO_PICTURE, STYLE, html_table
+from hapticrender.report.page import FOOTER, GENERATOR, NO_PICTURE, STYLE, html_table
 
 Fits = dict[str, dict[int, FingerFit]]  # by load class and order
 LABELS = {
@@ -24,6 +23,7 @@ LABELS = {
     "phalanx_stiffness": "its stiffness (N/mm)",
     "load_exponent": "exponent n of the load",
 }
+ONE_LOAD = "no windows under loads that differ by 1&nbsp;% or more; record several loads, or one that grows"
 SURE = 1.96  # standard errors: 95 %
 NAMES = {2: "2nd order", 4: "4th order"}
 
@@ -44,24 +44,27 @@ def page_of(records: Sequence[FingerRecord], fits: Fits, pictures: list[str]) ->
 <body>
 <h1>The finger, measured: {title}</h1>
 <p>Load, position and mechanical impedance Z<sub>f</sub> = F<sub>f</sub>/v of the finger, computed from the sensors of
-the surface and from its drive. Intervals are of 95&nbsp;%.</p>
+the surface and from its drive. Intervals are of 95&nbsp;%. Contact is judged by the force alone: a touch is a span
+above the threshold (loaded); grey spans are below it (unloaded), orange ones near it or beside lost samples
+(doubtful).</p>
 <section><h2>Impedance over frequency</h2>
-{_picture("frequency.png", pictures, "Modulus and phase of the impedance over frequency, with fits")}
+{_picture("frequency.png", pictures, "Modulus and phase of the impedance over frequency, with fits", "too few bands")}
 {_fits(fits)}</section>
 <section><h2>Impedance over the load</h2>
-{_picture("load.png", pictures, "Impedance over load, share explained by the load, exponent over frequency")}
+{_picture("load.png", pictures, "Impedance over load, share explained by the load, exponent over frequency", ONE_LOAD)}
 {_laws(records)}</section>
 {times}
-<footer class="note">Made by hapticrender {escape(__version__)}.</footer>
+{FOOTER}
 </body>
 </html>
 """
 
 
-def _picture(name: str, pictures: list[str], alt: str) -> str:
+def _picture(name: str, pictures: list[str], alt: str, missing: str = "") -> str:
+    """Picture, or why it is `missing`."""
     if name in pictures:
         return f'<a href="{name}"><img src="{name}" alt="{escape(alt)}"></a>'
-    return NO_PICTURE if not pictures else '<p class="note">No picture: there are too few data.</p>'
+    return NO_PICTURE if not pictures else f'<p class="note">No picture: {missing}.</p>'
 
 
 def _fits(fits: Fits) -> str:
@@ -91,7 +94,7 @@ def _probability(p: float) -> str:
 
 def _supported(of_class: Mapping[int, FingerFit], fit: FingerFit) -> str:
     if len(of_class) == 1:
-        return "too few frequencies to say"
+        return "too few frequencies to compare"
     return f"yes, by {fit.bic_margin:.3g}" if isfinite(fit.bic_margin) else "no"
 
 
@@ -138,11 +141,9 @@ def _record(record: FingerRecord, name: str, pictures: list[str]) -> str:
     """Section of one recording."""
     touched = sum(each.stop - each.start for each in record.of_kind(LOADED))
     plate = "measured in its unloaded spans" if record.plate.measured else "as in the profile"
+    count, length = len(record.of_kind(LOADED)), record.time[-1] - record.time[0]
     entries = [
-        (
-            "In contact",
-            f"{touched:.2f} of {record.time[-1] - record.time[0]:.2f} s, {len(record.of_kind(LOADED))} touches",
-        ),
+        ("Loaded", f"{touched:.2f} of {length:.2f} s, {count} touch{'es' * (count != 1)}"),
         ("Position good to 1 mm", f"from {record.least_load:.2f} N on" if isfinite(record.least_load) else "nowhere"),
         (
             "Bandwidth of load and position",

@@ -15,14 +15,15 @@ import numpy as np
 from hapticrender.analysis.load_law import LoadLaw, load_exponent, mean_exponent
 from hapticrender.analysis.models import LOAD_CLASSES, FingerFit, fit_finger, fit_load_classes
 from hapticrender.analysis.page import NAMES, SURE, Fits, page_of
-from hapticrender.analysis.records import DOUBTFUL, LOADED, UNLOADED, FingerRecord, Series
-from hapticrender.analysis.samples import BAND, Samples, by_frequency, samples_of
+from hapticrender.analysis.records import DOUBTFUL, KINDS, LOADED, UNLOADED, FingerRecord, Series
+from hapticrender.analysis.samples import BAND, Samples, by_frequency, one_load, samples_of, weighted_mean
 from hapticrender.protocols import Array
 from hapticrender.recordings.formats import MissingExtra
 from hapticrender.report.figure import BLUE, INK, ORANGE, PALE, RED, legend, new_figure, save
 
 MOST_BANDS = 8  # in one panel
 TYPICAL = 111.0  # Hz: of the paper's Fig. 5, and where |Z_f| begins to grow with the load
+SHADES = {UNLOADED: "#DDDDDD", DOUBTFUL: "#F6DDB0"}
 COLOURS = {2: ORANGE, 4: BLUE}
 POINTS = 1500  # of a curve over time
 
@@ -33,7 +34,8 @@ def draw(records: FingerRecord | Sequence[FingerRecord], folder: str | os.PathLi
     As Grigorii et al. 2021: impedance and load over time (Fig. 5, ``time-1.png`` and so on, one a recording), impedance
     over the load, and how much of it the load explains (Fig. 8 C and D, ``load.png``), impedance over frequency with
     fits of both orders for each class of loads (Fig. 9, ``frequency.png``); ``index.html`` has them, the parameters
-    with their intervals, and what could not be measured.  Without matplotlib there are no pictures, and a warning says
+    with their intervals, and what could not be measured.  A picture without data is left out: that over the load where
+    the loads differ by less than 1 %.  Without matplotlib there are no pictures, and a warning says
     how to install it.
 
     Raises
@@ -48,11 +50,11 @@ def draw(records: FingerRecord | Sequence[FingerRecord], folder: str | os.PathLi
         raise ValueError("records is empty: must be at least one FingerRecord")
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
-    fits, laws = fit_all(records), [load_exponent(each) for each in records]
+    fits = fit_all(records)
     drawn: dict[str, Callable[[Path], None]] = {
         f"time-{i + 1}.png": partial(draw_time, each) for i, each in enumerate(records)
     }
-    if any(law.frequency.size for law in laws):
+    if not one_load(samples_of(records)):
         drawn["load.png"] = partial(draw_load, records)
     if fits:
         drawn["frequency.png"] = partial(draw_frequency, records, fits)
@@ -123,8 +125,8 @@ def draw_frequency(records: Sequence[FingerRecord], fits: Fits, path: str | os.P
         panels[1, 0].set(ylabel="phase (degrees)", ylim=(max(low, -180), min(high, 180)))
         for axes in panels[-1] if len(fits) > 1 else panels[:, 0]:
             axes.set_xlabel("frequency (Hz)")
-        for axis in (panels[0, 0].xaxis, panels[0, 0].yaxis):
-            _numbers(axis)
+        _numbers(panels[0, 0].xaxis, "25")
+        _numbers(panels[0, 0].yaxis)
         save(figure, path)
 
 
@@ -142,7 +144,7 @@ def _colours(count: int) -> list[Any]:
 
 
 def _shade(axes: Any, record: FingerRecord) -> None:
-    for kind, colour in ((UNLOADED, "#DDDDDD"), (DOUBTFUL, "#F6DDB0")):
+    for kind, colour in SHADES.items():
         for segment in record.of_kind(kind):
             axes.axvspan(segment.start, segment.stop, color=colour, alpha=0.7, lw=0, zorder=0)
 
@@ -165,9 +167,7 @@ def _load_and_impedance(axes: Any, record: FingerRecord, bands: list[int]) -> No
     z = record.impedance
     if bands:
         band = min(bands, key=lambda each: abs(np.log(np.nanmedian(z.frequency[:, each]) / TYPICAL)))
-        right = axes.twinx()
-        right.grid(False)
-        right.spines["right"].set_visible(True)
+        right = _right(axes)
         size = np.abs(z.value[:, band])
         label = f"|Z_f| at {np.nanmedian(z.frequency[:, band]):.0f} Hz"
         lines.append(_dots(right, z.time, size, z.standard_error[:, band], RED, label))
@@ -181,19 +181,16 @@ def _shading_legend(axes: Any, record: FingerRecord, lines: list[Any]) -> None:
     """Legend of lines and of the kinds of contact that are shaded."""
     from matplotlib.patches import Patch
 
-    shaded = {UNLOADED: ("#DDDDDD", "unloaded"), DOUBTFUL: ("#F6DDB0", "doubtful")}
-    handles = lines + [
-        Patch(color=colour, label=name) for kind, (colour, name) in shaded.items() if record.of_kind(kind)
-    ]
+    handles = lines + [Patch(color=SHADES[kind], label=KINDS[kind]) for kind in SHADES if record.of_kind(kind)]
     legend(axes, handles, [each.get_label() for each in handles])
 
 
 def _dots(axes: Any, x: Array, y: Array, error: Array, colour: Any, label: str) -> Any:
-    """Points at rising x with bars of one standard error, joined where none is missing between."""
+    """Points at rising x with bars of 95 %, joined where none is missing between."""
     gaps: Any = np.flatnonzero(np.diff(x) > 1.5 * np.median(np.diff(x))) + 1 if len(x) > 1 else []
     x, y, error = (np.insert(each, gaps, np.nan) for each in (x, y, error))
     style = {"color": colour, "marker": "o", "ms": 3, "lw": 0.9, "elinewidth": 0.8, "label": label}
-    return axes.errorbar(x, y, error, **style)
+    return axes.errorbar(x, y, SURE * error, **style)
 
 
 def _all_bands(axes: Any, record: FingerRecord, bands: list[int]) -> None:
@@ -208,11 +205,17 @@ def _all_bands(axes: Any, record: FingerRecord, bands: list[int]) -> None:
     legend(axes, columns=MOST_BANDS)
 
 
-def _kinematics(axes: Any, record: FingerRecord) -> None:
-    lines = [_curve(axes, record.time, record.position, 1e3, BLUE, "position (mm)")]
+def _right(axes: Any) -> Any:
+    """Second axis of values, on the right."""
     right = axes.twinx()
     right.grid(False)
     right.spines["right"].set_visible(True)
+    return right
+
+
+def _kinematics(axes: Any, record: FingerRecord) -> None:
+    lines = [_curve(axes, record.time, record.position, 1e3, BLUE, "position (mm)")]
+    right = _right(axes)
     lines.append(_curve(right, record.time, record.velocity, 1e3, ORANGE, "velocity (mm/s)"))
     axes.set(title="Motion", ylabel="position (mm)")
     right.set_ylabel("velocity (mm/s)")
@@ -301,7 +304,7 @@ def _over_frequency(column: Any, name: str, fits: Mapping[int, FingerFit], sampl
     for axes, view in zip(column, views, strict=True):
         axes.plot(samples.frequency, view(samples.value), ".", color=PALE, ms=2, alpha=0.4, zorder=1)
     frequency, mean, error = _band_means(samples)
-    bars = (error, np.degrees(error / np.abs(mean)))
+    bars = (SURE * error, np.degrees(SURE * error / np.abs(mean)))
     for axes, view, bar in zip(column, views, bars, strict=True):
         style = {"fmt": "o", "color": INK, "ms": 4.5, "elinewidth": 1, "capsize": 2, "zorder": 4, "label": "measured"}
         axes.errorbar(frequency, view(mean), bar, **style)
@@ -330,24 +333,19 @@ def _model(column: Any, fit: FingerFit, grid: Array, load: float, colour: str, n
 
 
 def _band_means(samples: Samples) -> tuple[Array, Array, Array]:
-    """Weighted mean of every bin of frequencies, and its standard error, enlarged where the windows scatter more."""
-    rows = []
-    for each in by_frequency(samples):
-        weight = each.standard_error**-2
-        mean, error = np.average(each.value, weights=weight), weight.sum() ** -0.5
-        freedom = max(2 * len(each.value) - 2, 1)
-        scatter = np.sum(np.abs(each.value - mean) ** 2 * weight) / freedom
-        rows.append((np.median(each.frequency), mean, error * max(1.0, scatter) ** 0.5))
+    """Median frequency (Hz), weighted mean and its standard error of every bin of frequencies."""
+    bins = by_frequency(samples)
+    rows = [(np.median(each.frequency), *weighted_mean(each.value, each.standard_error)) for each in bins]
     frequency, mean, error = (np.array(column) for column in zip(*rows, strict=True))
     return frequency, mean, error
 
 
-def _numbers(axis: Any) -> None:
-    """Plain numbers on a logarithmic axis, also at 2 and 5 within a decade."""
+def _numbers(axis: Any, within: str = "235") -> None:
+    """Plain numbers on a logarithmic axis, also `within` a decade."""
     axis.set_major_formatter(lambda value, _: f"{value:g}")
-    axis.set_minor_formatter(lambda value, _: f"{value:g}" if f"{value:e}"[0] in "25" else "")
+    axis.set_minor_formatter(lambda value, _: f"{value:g}" if f"{value:e}"[0] in within else "")
 
 
 def _frequency_axis(axes: Any, frequency: Array) -> None:
     axes.set(xlabel="frequency (Hz)", xlim=(0.87 * frequency.min(), 1.15 * frequency.max()), xscale="log")
-    _numbers(axes.xaxis)
+    _numbers(axes.xaxis, "25")

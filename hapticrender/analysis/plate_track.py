@@ -30,16 +30,11 @@ class Rest:
         return np.stack([np.interp(time, self.time, column) for column in self.values.T], axis=1)
 
 
-def signals_of(lines: Lines) -> Signals:
-    """Amplitudes (n, bands, 2) of the first eight signals of `lines`: displacement, velocity, acceleration, force."""
-    return Signals(*(lines.amplitude[:, :, i : i + 2] for i in range(0, 8, 2)))
-
-
 def rest_of(course: Course, lines: Lines) -> Rest:
     """Values at rest from windows without a finger."""
-    x, v, a, f = (lines.mean[:, i : i + 2] for i in range(0, 8, 2))
-    force = Signals(x, v, a, f).residual(course.at(lines.time), course.plate.half_spacing)
-    return Rest(lines.time, np.hstack([force, x]), float(1.0 / lines.mean_variance.mean()))
+    slow = Signals.of(lines.mean)
+    force = slow.residual(course.at(lines.time), course.plate.half_spacing)
+    return Rest(lines.time, np.hstack([force, slow.displacement]), float(1.0 / lines.mean_variance.mean()))
 
 
 def regress(course: Course, lines: Lines, noise: Array) -> Course:
@@ -53,7 +48,7 @@ def regress(course: Course, lines: Lines, noise: Array) -> Course:
     course : Course
         The profile's parameters and covariance.
     lines : Lines
-        Of `Signals`, as `signals_of` takes them.
+        As `Signals.of` takes them.
     noise : ndarray, shape (2,)
         White noise of heave and rocking (m, rms).
 
@@ -64,7 +59,7 @@ def regress(course: Course, lines: Lines, noise: Array) -> Course:
     """
     from scipy.optimize import least_squares
 
-    measured = signals_of(lines)
+    measured = Signals.of(lines.amplitude)
     prior = np.r_[course.start, course.slope]
     spread = np.sqrt(np.diagonal(course.covariance))
     scale = np.where(spread > 0.0, spread, 1e-9 * np.maximum(np.abs(prior), 1e-9))

@@ -9,6 +9,7 @@ import numpy as np
 from hapticrender.protocols import Array
 
 UNLOADED, DOUBTFUL, LOADED = 0, 1, 2  # contact of a sample
+KINDS = {UNLOADED: "unloaded", DOUBTFUL: "doubtful", LOADED: "loaded"}
 
 
 @dataclass(frozen=True)
@@ -97,7 +98,7 @@ class PlateTrack:
 
 @dataclass(frozen=True)
 class FingerRecord:
-    """What a recording says of the finger that touched the surface.
+    """Measured quantities of the finger in a recording.
 
     Parameters
     ----------

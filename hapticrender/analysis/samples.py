@@ -29,11 +29,16 @@ class Samples(NamedTuple):
 
 def parts_of(impedance: Source | Sequence[Source]) -> list[Source]:
     """List of the recordings, of which one may stand alone."""
-    return [impedance] if isinstance(impedance, FingerRecord | Impedance) else list(impedance)
+    parts = [impedance] if isinstance(impedance, FingerRecord | Impedance) else impedance
+    good = isinstance(parts, Sequence) and all(isinstance(each, FingerRecord | Impedance) for each in parts)
+    require(good, "impedance", impedance, "what analyse_finger returns, an Impedance, or a list of them", TypeError)
+    return list(parts)
 
 
 def samples_of(impedance: Source | Sequence[Source], loads: tuple[float, float] = (0.0, inf)) -> Samples:
     """Unmasked entries with a load (N) from the first of `loads` to below the second, and above 0."""
+    rising = np.shape(loads) == (2,) and loads[0] < loads[1]
+    require(rising, "loads", loads, "two loads in N, the least and a larger one")
     parts = [each.impedance if isinstance(each, FingerRecord) else each for each in parts_of(impedance)]
     rows = [
         np.broadcast_arrays(each.frequency, each.value, each.standard_error, each.normal_load[:, None], number)
@@ -48,6 +53,19 @@ def samples_of(impedance: Source | Sequence[Source], loads: tuple[float, float] 
     least = found.standard_error.min(initial=inf)
     require(bool(least > 0), "standard_error", float(least), "> 0 N s/m: mask (NaN) what was not measured")
     return found
+
+
+def weighted_mean(value: Array, standard_error: Array) -> tuple[complex, float]:
+    """Mean of complex values weighted by their standard errors, and its own, enlarged where the values scatter more."""
+    weight = standard_error**-2.0
+    mean = complex(np.average(value, weights=weight))
+    scatter = float(np.sum(np.abs(value - mean) ** 2 * weight)) / max(2 * len(value) - 2, 1)
+    return mean, (max(1.0, scatter) / float(weight.sum())) ** 0.5
+
+
+def one_load(samples: Samples) -> bool:
+    """Whether all loads are the same, within 1 %: how the impedance grows with the load is not in the data."""
+    return not samples.load.size or bool(np.ptp(np.log(samples.load)) < APART)
 
 
 def by_frequency(samples: Samples) -> list[Samples]:

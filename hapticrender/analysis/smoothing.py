@@ -133,7 +133,7 @@ class LocalLine:
     def fit(self, signal: Array, inside: Array) -> tuple[Array, Array, Array, Array]:
         """Level and slope (n, k) of a signal (n + behind + ahead, k), and the sums of squares of w and u (n,).
 
-        `inside` (bool, one a sample) says which samples count; all are NaN where too few do.
+        `inside` (bool, one a sample) selects the samples that count; all are NaN where too few do.
         """
         n, k = len(signal) - len(self._times) + 1, signal.shape[1]
         if not inside.any():

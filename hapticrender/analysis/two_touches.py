@@ -10,7 +10,7 @@ S_k the known density of its noise, and y the plate's errors (of M, C and K, cov
     T = min over d, y of  sum_k |U_k - a_k y|^2/S_k + y^T P^-1 y + d^2/s_d^2
 
 A position that is late, or predicted, is off along the finger's velocity and acceleration too: two more entries of y.
-is a sum of squares with one degree of freedom for each real number in U: chi-square, by which the window's threshold
+T is a sum of squares with one degree of freedom for each real number in U: chi-square, by which the window's threshold
 follows from the rate of false alarms.  With two fingers it is a non-central one, by which `miss_rate` follows.  Two
 fingers alike, at places that the plate moves alike under the same load, leave what one finger between them would.
 """
@@ -44,7 +44,7 @@ LEAST_NOISE = 1e-4  # of a sensor's range: a model may state no noise
 LEAST_SIGNAL = 100.0  # of the noise's power
 MARGIN = 60e-3  # s after a touch or a lift, which may be reported late
 KEPT = 15 / 16  # of what earlier windows of the free plate have shown: 4 s of memory, coils warm up
-SLOWER = 100.0  # times the variance by which the law trusts a deviation: it learns ten times more slowly
+SLOWER = 100.0  # times the variance that the law assumes of a deviation: it learns ten times more slowly
 DEVICE = slice(int(HEAVE), int(LOAD))  # of the law's parameters: the device's own
 UNUSABLE = int(Flag.NONFINITE | Flag.SENSOR_CLIPPED | Flag.OVERRUN | Flag.STOPPED)
 TWO_TOUCHES = int(Flag.TWO_TOUCHES)
@@ -65,7 +65,7 @@ class TouchTest(NamedTuple):
         return self.statistic > self.bound
 
 
-def can_tell(model: DeviceModel) -> bool:
+def measures_moment(model: DeviceModel) -> bool:
     """Whether a finger's force and moment can be measured on such a device: a plate with two coils and two sensors."""
     plate = model.finger.contact is not None and model.lever_per_metre > 0.0
     return plate and len(model.mass) == 2 and model.coordinate_from_sensed.shape == (2, 2)
@@ -93,7 +93,7 @@ class TouchMonitor:
     Parameters
     ----------
     model : DeviceModel
-        Of a plate with two coordinates, see `can_tell`.
+        Of a plate with two coordinates, see `measures_moment`.
     late : int, samples, optional
         From a row of the drive to the interval in which it acts; by default that of drives as they are played, ``delay
         - block``.
@@ -109,7 +109,7 @@ class TouchMonitor:
     """
 
     def __init__(self, model: DeviceModel, late: int | None = None) -> None:
-        if not can_tell(model):
+        if not measures_moment(model):
             raise ValueError(f"{len(model.mass)} coordinates: must be a plate with 2, and a sensor for each of them")
         self.model, self.length, self._margin = model, round(WINDOW * model.rate), round(MARGIN * model.rate)
         top = min(model.highest_frequency, 0.2 * model.rate)
@@ -221,7 +221,7 @@ class TouchMonitor:
         return found
 
     def _calibrate(self, parts: Array) -> None:
-        """Learn the plate's errors and the sensors' offsets from a window of the free plate; forget older ones.
+        """Learn the plate's errors and the sensors' offsets from a window of the free plate; older ones fade.
 
         Bins in which the plate hardly moves are left out: their noise would be taken for a softer plate.
         """
@@ -296,7 +296,7 @@ def windows_under_touch(recording: Recording, model: DeviceModel) -> list[tuple[
     recording : Recording
         Of a plate, with the drive, what was sensed and the finger's position.
     model : DeviceModel
-        As the plate is believed to be: of ``hapticrender.prepare(scene).model``, or of `PlateParameters.device_model`.
+        Of the plate: of ``hapticrender.prepare(scene).model``, or of `PlateParameters.device_model`.
     """
     monitor, found, piece = TouchMonitor(model), [], round(0.1 * WINDOW * model.rate)
     signals = [recording.drive, recording.sensed, recording.position, recording.flags]
@@ -312,8 +312,8 @@ class TouchWatch:
     """A `TouchMonitor` on a running controller: while two fingers touch, the waveform law is set back and slowed.
 
     What was learned of the finger returns to the prior, of the device to what it was while one finger explained the
-    signals, and the law trusts `SLOWER` times less in what it measures: it is the open inverse of an average finger,
-    which improves slowly.  Once one finger explains the signals again it learns as designed.
+    signals, and the law assumes `SLOWER` times the variance of what it measures: it is the open inverse of an average
+    finger, which improves slowly.  Once one finger explains the signals again it learns as designed.
 
     Parameters
     ----------
@@ -323,7 +323,7 @@ class TouchWatch:
     late : int, samples, optional
         As for `TouchMonitor`.
     active : bool
-        False: nothing is watched, as on a simulated device, which has one finger.
+        False: nothing is tested, as on a simulated device, which has one finger.
     slows : bool
         False: `slow` is left to the thread that runs the controller.
     """
@@ -332,7 +332,7 @@ class TouchWatch:
         self, model: DeviceModel, controller: Any, late: int | None = None, active: bool = True, slows: bool = True
     ) -> None:
         self._slows, self._slowed, self._tests = slows, False, 0
-        self.monitor = TouchMonitor(model, late) if active and can_tell(model) else None
+        self.monitor = TouchMonitor(model, late) if active and measures_moment(model) else None
         self._law: Any = getattr(controller, "law", None)
         self._kept: dict[str, Array] = {}
         if self._law is not None:

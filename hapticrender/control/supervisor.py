@@ -13,6 +13,7 @@ import numpy as np
 
 from hapticrender.control.controller import BankController
 from hapticrender.control.device_model import Demand, DeviceModel
+from hapticrender.control.gains import GAINS, design_gains
 from hapticrender.control.records import CONTROLLER, MOST_CHANNELS, MOST_SENSORS
 from hapticrender.control.supervisor_kernel import (
     ACTIVE,
@@ -21,7 +22,9 @@ from hapticrender.control.supervisor_kernel import (
     FROZEN,
     INCONSISTENT,
     INVALID,
+    INVERTED,
     OVERMOTION,
+    RESCALED,
     RINGING,
     ROOT2,
     SUPERVISOR,
@@ -54,16 +57,21 @@ UNLIMITED = 1e300
 class Fault(NamedTuple):
     """Why a supervisor has stopped the drive."""
 
-    cause: int  # INVALID to BEYOND
+    cause: int  # INVALID to INVERTED
     sample: int  # at which the test failed; the drive fades out from it on
-    sensors: int  # bit i: sensor i + 1; of INVALID, FROZEN and BEYOND
+    sensors: int  # bit i: sensor i + 1; of INVALID, FROZEN, BEYOND and RESCALED; actuator of INVERTED
+    gains: tuple[float, ...] = ()  # of all sensors or actuators, over those before; of the last two
 
     @property
     def text(self) -> str:
         """What was found, the most likely reason, and what to check."""
         found, check = CAUSES[self.cause]
-        names = " and ".join(str(i + 1) for i in range(MOST_SENSORS) if self.sensors >> i & 1)
-        return f"{found.format(sensor=names)}: check {check}"
+        named = [i for i in range(MOST_SENSORS) if self.sensors >> i & 1]
+        names, gains = (" and ".join(each) for each in ([str(i + 1) for i in named], self._gains(named)))
+        return f"{found.format(sensor=names, gain=gains)}: check {check}"
+
+    def _gains(self, sensors: list[int]) -> list[str]:
+        return [f"{self.gains[i]:.2g}" for i in sensors if self.gains]
 
 
 CAUSES = {
@@ -100,6 +108,15 @@ CAUSES = {
         "sensor {sensor}: more than [limits] displacement",
         "what the scene asks for, how hard the finger presses, and the sensor's offset",
     ),
+    RESCALED: (
+        "sensor {sensor}: the samples are suddenly {gain} times the motion; most likely inverted, swapped, "
+        "disconnected, or its gain has changed",
+        "wiring, polarity and gain of all sensors",
+    ),
+    INVERTED: (
+        "actuator {sensor}: the motion is that of {gain} times its drive; most likely it is inverted, or sensors are",
+        "wiring and polarity of all actuators and sensors",
+    ),
 }
 
 
@@ -116,10 +133,15 @@ class SupervisedController:
         self.controller, self.method, self.n_bands = controller, controller.method, controller.n_bands
         self.state = np.zeros(1, SUPERVISOR)
         self._forces = np.zeros((model.delay + 1, 3))
-        settings = design_supervisor(controller, model) | {
+        settings = design_supervisor(controller, model)
+        noise = max(model.sensed_noise, LEAST_NOISE * model.sensed_limit)
+        found = design_gains(model, noise) if settings.get("modelled") else None
+        self.gains = np.zeros(1, GAINS) if found is None else found
+        settings |= {
             "step": controller.step.address,
             "state": controller.state.ctypes.data,
             "forces_at": self._forces.ctypes.data,
+            "gains": 0 if found is None else self.gains.ctypes.data,
         }
         for name, value in settings.items():
             self.state["p"][name] = value
@@ -136,7 +158,8 @@ class SupervisedController:
     def fault(self) -> Fault | None:
         """Why and when the drive has been stopped."""
         cause, sample, sensors = (int(self.state[name][0]) for name in ("cause", "stopped", "sensors"))
-        return Fault(cause, sample, sensors) if cause else None
+        gains = tuple(self.gains["gain"][0, cause - RESCALED].tolist()) if cause >= RESCALED else ()
+        return Fault(cause, sample, sensors, gains) if cause else None
 
     @property
     def damper_scale(self) -> float:

@@ -22,15 +22,19 @@ no  test         condition                                                      
 7   overmotion   motion of an end > 3 R + 5.4 sag                                                 5 samples
 8   beyond       a sensor shows more than the device's limit of displacement                      3 in 10 ms
 9   active       mean(-r v) > 0.65 sqrt(E_F E_v) in heave, E_r < 6 E_F, means over 0.2 s          0.3 s
+10  rescaled     a sensor shows -1.6 to -0.4, -0.25 to 0.25, or more than 2 times the motion that
+                 device and drive give; see `gains`                                               3 ms
+11  inverted     an actuator gives -1.6 to -0.4 times its force; see `gains`                      5 ms and more
 === ============ ================================================================================ ====================
 
 R (m) and B (drive unit) are what the scene needs at most with the worst finger, A the drive of a hard press, `sag` the
 static displacement under 5 N.  *Danger* is a motion > 4 R + 1.36 sag or a drive above 0.9 of its limit.  The drive
-fades out in 10 ms, in danger in 2 ms, on overmotion in 0.2 ms, and stays at zero.  A ringing damper is turned down to
-0.4, then to 0; the drive stops where it rings all the same for 150 ms.
+fades out in 10 ms, in danger and after tests 10 and 11 in 2 ms, on overmotion in 0.2 ms, and stays at zero.  A ringing
+damper is turned down to 0.4, then to 0; the drive stops where it rings all the same for 150 ms.
 
-Tests 3 to 5, 7 and 9 need a `Demand`; 6 a controller with an inner damper; 8 a limit.  Without them a controller has
-tests 1 and 2.  Where the device has a limit of rms drive, `cool` holds it.
+Tests 3 to 5, 7 and 9 to 11 need a `Demand`, 10 and 11 at most two sensors and actuators; 6 a controller with an inner
+damper; 8 a limit.  Without them a controller has tests 1 and 2.  Where the device has a limit of rms drive, `cool`
+holds it.
 `control.supervisor` designs all of it.
 """
 
@@ -42,11 +46,12 @@ import numba
 import numpy as np
 from numba import carray
 
+from hapticrender.control.gains import check_gains, start_gains
 from hapticrender.control.records import CONTROLLER_T, MOST_CHANNELS, MOST_SENSORS
 from hapticrender.jit import F8, I8, SIGNALS_T, call, kernel, pointer, record, step
 from hapticrender.protocols import Flag
 
-INVALID, FROZEN, INCONSISTENT, ACTIVE, DRIVE, RINGING, OVERMOTION, BEYOND = range(1, 9)
+INVALID, FROZEN, INCONSISTENT, ACTIVE, DRIVE, RINGING, OVERMOTION, BEYOND, RESCALED, INVERTED = range(1, 11)
 STOPPED, SATURATED = int(Flag.STOPPED), int(Flag.SATURATED)
 ROOT2 = math.sqrt(2.0)
 INVALID_SHARE = 0.3
@@ -74,7 +79,7 @@ SETTINGS = np.dtype(
         ("ringing", np.float64, (2,)),  # N2, of the damper's force; 0: no test
         *((f"{name}_time", np.int64) for name in _TIMES),
         *((name, np.int64) for name in ("step", "state", "controller", "modelled", "sensors", "channels", "block")),
-        *((name, np.int64) for name in ("delay", "needs_contact", "forces_at", "limited")),
+        *((name, np.int64) for name in ("delay", "needs_contact", "forces_at", "limited", "gains")),
     ]
 )
 """Settings of a supervisor, as `design_supervisor` derives them; poles and fades are per sample, times in samples."""
@@ -218,6 +223,23 @@ def check_motion(supervisor, drive_in_danger):
 
 
 @kernel
+def compare_gains(supervisor):
+    """Tests 10 and 11; returns the cause, and the sensors or actuators, as bits."""
+    s = record(supervisor, SUPERVISOR_T, 0)
+    p, q = s.p, s.input
+    if s.sample == 0:  # a steady load is no motion
+        held = p.stiffness
+        start_gains(p.gains, q[0], q[1], held[0, 0] * q[0] + held[0, 1] * q[1], held[1, 0] * q[0] + held[1, 1] * q[1])
+    rescaled, inverted = check_gains(p.gains, s.last, p.sensors, s.force[0], s.force[1])
+    for i in range(p.sensors):
+        if 2 * s.repeats[i] > p.frozen_time:  # that is for test 2 to find
+            rescaled &= ~(1 << i)
+    if rescaled > 0:
+        return RESCALED, rescaled
+    return (INVERTED, inverted) if inverted > 0 else (0, 0)
+
+
+@kernel
 def check_drive(supervisor, drive, n):
     """Test 5, on the drive of the last sample; returns whether it failed, and the largest drive."""
     s = record(supervisor, SUPERVISOR_T, 0)
@@ -302,10 +324,15 @@ def supervise(supervisor, sensed, position, drive, flags, n):
         cause = found if cause == 0 or found == OVERMOTION else cause
         if p.controller != 0 and check_ringing(supervisor) and cause == 0:
             cause = RINGING
+        if p.gains != 0 and s.cause == 0:
+            found, which = compare_gains(supervisor)
+            if found > 0 and cause == 0:
+                cause, s.sensors = found, which
     if cause != 0 and s.cause == 0:
         s.cause, s.stopped = cause, s.sample
     if s.cause != 0:
-        step = p.fade_now if cause == OVERMOTION else p.fade_danger if danger else p.fade_out
+        quick = danger or s.cause >= RESCALED
+        step = p.fade_now if cause == OVERMOTION else p.fade_danger if quick else p.fade_out
         s.fade_step = max(s.fade_step, step)
         s.fade = max(s.fade - s.fade_step, 0.0)
         flags[n] |= STOPPED

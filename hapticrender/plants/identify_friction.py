@@ -88,7 +88,7 @@ def identify_resonance(driver: Driver, parameters: SurfaceParameters, seconds: f
     begin[2] = math.log(abs(y / u).max() / abs(response(begin)).max())
     fit = least_squares(lambda x: _real(response(x) * u - y) / scale, begin, xtol=1e-12, ftol=1e-12)
     spread = _spread(fit.jac, fit.fun)
-    values = np.exp(fit.x[:3]) * [mode.frequency, mode.quality, mode.force_constant]  # tau: the delay beyond the told
+    values = np.exp(fit.x[:3]) * [mode.frequency, mode.quality, mode.force_constant]  # tau: further delay
     names = ("frequency", "quality", "force_constant")
     return _found("ultrasonic", names, values, values * spread[:3], fit.fun, _real(y) / scale)
 

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import csv
 import os
-from collections.abc import Callable, Mapping, Sequence
+from array import array
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from itertools import chain
 from pathlib import Path
 from typing import Any
@@ -26,15 +28,16 @@ Chosen = str | Sequence[str] | Mapping[str, Scale]
 def read_columns(path: str | os.PathLike[str]) -> dict[str, Array]:
     """Read every numeric array of a file by name: .csv, .txt, .mat, .h5, .hdf5 or .npz.
 
-    A CSV file has one line of titles, between any lines that begin with # and the numbers; without it the columns are
-    "1", "2" and so on.  Columns of a table, shape (n, k), are named "table[0]" and so on; its longer side is time.
+    A CSV file (UTF-8) has one line of titles, between any lines that begin with # and the numbers; without it the
+    columns are "1", "2" and so on.  An empty field is NaN.  Columns of a table, shape (n, k), are named "table[0]" and
+    so on; its longer side is time.
 
     Raises
     ------
     OSError
         The file is not there or may not be read.
     ValueError
-        The format is not known, or the file damaged.
+        The format is not known, the file is damaged, or a field of a CSV file is no number.
     MissingExtra
         An HDF5 file, or a MAT file of version 7.3, without h5py.
     """
@@ -47,16 +50,19 @@ def read_columns(path: str | os.PathLike[str]) -> dict[str, Array]:
     with path.open("rb"):  # a missing file is the same OSError for every format
         found = readers[path.suffix.lower()](path)
     columns: dict[str, Array] = {}
+    others = []
     for name, values in found.items():
         values = np.squeeze(np.asarray(values))
         if values.dtype.kind not in "iufb" or values.ndim > 2:
+            others.append(f"{name} ({values.dtype}, shape {values.shape})")
             continue
         if values.ndim < 2:
             columns[name] = np.atleast_1d(values)
         else:
             long = values if values.shape[0] >= values.shape[1] else values.T
             columns |= {f"{name}[{i}]": long[:, i] for i in range(long.shape[1])}
-    require(bool(columns), "path", str(path), "a file with columns of numbers")
+    if not columns:
+        raise ValueError(f"{path}: has no columns of numbers: there are {', '.join(others) or 'none'}")
     return columns
 
 
@@ -79,8 +85,8 @@ def assemble(
     source = "columns" if isinstance(columns, Mapping) else Path(columns).name
     table = columns if isinstance(columns, Mapping) else read_columns(columns)
     inputs, outputs = (_several(table, key, chosen) for key, chosen in (("drive", drive), ("sensed", sensed)))
-    places = tuple(_scales(sensed))
-    require(bool(places), "sensed", sensed, "at least one column")
+    places = tuple(name for name, _ in _scales(sensed))
+    require(0 < len(places) == len(set(places)), "sensed", sensed, "at least one column, and each once")
     one = {"position": position, "normal_load": normal_load}
     others = {key: _one(table, key, chosen) for key, chosen in one.items() if chosen is not None}
     count = _length(table, drive, sensed, time, position, normal_load)
@@ -104,18 +110,16 @@ def assemble(
     return made, join(made, signals | {"flags": np.zeros(count), "reference": np.zeros(count)})
 
 
-def _scales(chosen: Chosen) -> dict[str, tuple[float, float]]:
-    """Scale and offset by name of column."""
+def _scales(chosen: Chosen) -> list[tuple[str, tuple[float, float]]]:
+    """Name, scale and offset of each column; one that is named twice is there twice."""
     if isinstance(chosen, str):
         chosen = [chosen]
-    given = chosen if isinstance(chosen, Mapping) else dict.fromkeys(chosen, 1.0)
-    pairs = {name: pair if isinstance(pair, tuple | list) else (pair, 0.0) for name, pair in given.items()}
-    for name, pair in pairs.items():
+    found = []
+    for name, given in chosen.items() if isinstance(chosen, Mapping) else ((name, 1.0) for name in chosen):
+        pair = given if isinstance(given, tuple | list) else (given, 0.0)
         require(len(pair) == 2, f"columns[{name!r}]", pair, "a scale, or a scale and an offset")
-    return {
-        name: (number(f"scale of {name}", scale), number(f"offset of {name}", offset))
-        for name, (scale, offset) in pairs.items()
-    }
+        found.append((name, (number(f"scale of {name}", pair[0]), number(f"offset of {name}", pair[1]))))
+    return found
 
 
 def _column(table: Mapping[str, Any], name: str, scale: float, offset: float, counter: bool = False) -> Array:
@@ -135,7 +139,7 @@ def _column(table: Mapping[str, Any], name: str, scale: float, offset: float, co
 def _several(table: Mapping[str, Any], key: str, chosen: Chosen) -> Array:
     """Columns side by side, shape (n, k), all finite."""
     found = []
-    for name, pair in _scales(chosen).items():
+    for name, pair in _scales(chosen):
         values = _column(table, name, *pair)
         bad = np.flatnonzero(~np.isfinite(values))
         if bad.size:
@@ -150,7 +154,7 @@ def _one(table: Mapping[str, Any], key: str, chosen: Chosen) -> Array:
     """One column, which may have NaN."""
     pairs = _scales(chosen)
     require(len(pairs) == 1, key, chosen, "one column")
-    ((name, pair),) = pairs.items()
+    ((name, pair),) = pairs
     values = _column(table, name, *pair, counter=key in ("position", "time"))
     require(
         not np.isinf(values).any(), f"{key}: column {name}", float(np.inf), "finite, or NaN where there is no value"
@@ -161,7 +165,7 @@ def _one(table: Mapping[str, Any], key: str, chosen: Chosen) -> Array:
 def _length(table: Mapping[str, Any], *choices: Chosen | None) -> int:
     """Length of all chosen columns, at least 2."""
     names = chain.from_iterable(_scales(each) for each in choices if each is not None)
-    lengths = {name: np.squeeze(np.asarray(table[name])).shape[0] for name in names}
+    lengths = {name: np.squeeze(np.asarray(table[name])).shape[0] for name, _ in names}
     if len(set(lengths.values())) > 1:
         listed = ", ".join(f"{name} {length}" for name, length in lengths.items())
         raise ValueError(f"columns differ in length: {listed} samples: all must be of one clock")
@@ -194,44 +198,65 @@ def _rate(rate: float | None, time: Array | None, count: int) -> float:
 
 def _read_text(path: Path) -> dict[str, Array]:
     """Columns of a text with commas, semicolons, tabs or spaces between them."""
-    with path.open(encoding="utf-8-sig", newline="") as file:
-        skipped, line = 0, file.readline()
-        while line.startswith("#") or (line and not line.strip()):
-            skipped, line = skipped + 1, file.readline()
-        between = next((each for each in ",;\t" if each in line), None)
-        first = next(csv.reader([line], delimiter=between), []) if between else line.split()
-        titled = not all(map(_is_number, first))
-        names = [each.strip() for each in first] if titled else [str(i + 1) for i in range(len(first))]
-        lines = file if titled else chain([line], file)
-        rows = list(lines)
-    require(bool(first and rows), str(path), len(rows), "lines of numbers")
     try:
-        numbers = np.genfromtxt(rows, delimiter=between, ndmin=2)
-    except ValueError as error:
-        raise ValueError(f"{path}: not a table of numbers ({' '.join(str(error).split())})") from error
-    if len(set(names)) < len(names) or numbers.shape[1] != len(names):
-        raise ValueError(f"{path}: line {skipped + 1} has the titles {show(names)}: one different one for each column")
-    return dict(zip(names, numbers.T, strict=True))
+        text = path.read_text(encoding="utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise ValueError(f"{path}: byte {error.start} is no UTF-8 text: save the table as text in UTF-8") from error
+    lines = [(number, line) for number, line in enumerate(text.splitlines(), 1) if line.split("#")[0].strip(" ")]
+    start, line = lines[0] if lines else (1, "")
+    between = next((each for each in ",;\t" if each in line), None)
+    first = next(csv.reader([line], delimiter=between), []) if between else line.split()
+    titled = any(_number(each) is None for each in first)
+    names = [each.strip() for each in first] if titled else [str(i + 1) for i in range(len(first))]
+    if len(set(names)) < len(names):
+        raise ValueError(f"{path}: line {start} has the titles {', '.join(names)}: one different one for each column")
+    rows = lines[titled:]
+    require(bool(rows), str(path), len(rows), "lines of numbers")
+    values = array("d")
+    for at, line in rows:
+        values.extend(_fields(f"{path}, line {at}", line.split("#")[0].split(between), names))
+    return dict(zip(names, np.array(values).reshape(len(rows), -1).T, strict=True))
 
 
-def _is_number(text: str) -> bool:
+def _fields(where: str, fields: list[str], names: list[str]) -> list[float]:
+    """Numbers of a line."""
+    if len(fields) != len(names):
+        raise ValueError(f"{where}: {len(fields)} fields: must be {len(names)}, one a column")
+    found = [_number(each) for each in fields]
+    if None in found:
+        bad = found.index(None)
+        raise ValueError(f"{where}, column {names[bad]}: {show(fields[bad])}: must be a number, or empty (NaN)")
+    return found  # type: ignore[return-value]
+
+
+def _number(text: str) -> float | None:
+    """Number of a field, NaN where it is empty; None where it is no number."""
+    text = text.strip().strip('"')
     try:
-        float(text)
+        return None if "_" in text else float(text or "nan")
     except ValueError:
-        return False
-    return True
+        return None
 
 
-def _read_mat(path: Path) -> dict[str, Any]:
-    from scipy.io import loadmat
-    from scipy.io.matlab import MatReadError
-
+@contextmanager
+def _damaged(path: Path, kind: str) -> Iterator[None]:
+    """Turn whatever a library raises about a damaged file into a ValueError."""
     try:
-        found = loadmat(path, appendmat=False)
-    except NotImplementedError:  # version 7.3 is HDF5
+        yield
+    except Exception as error:
+        raise ValueError(f"{path}: damaged, or not {kind} ({error})") from error
+
+
+def _read_mat(path: Path) -> Mapping[str, Any]:
+    from scipy.io import loadmat
+
+    with _damaged(path, "a MAT file"):
+        try:
+            found = loadmat(path, appendmat=False)
+        except NotImplementedError:  # version 7.3 is HDF5
+            found = None
+    if found is None:
         return _read_hdf5(path)
-    except (MatReadError, TypeError, ValueError) as error:
-        raise ValueError(f"{path}: not a MAT file ({error})") from error
     return {name: values for name, values in found.items() if not name.startswith("__")}
 
 
@@ -240,20 +265,18 @@ def _read_hdf5(path: Path) -> dict[str, Array]:
     found: dict[str, Array] = {}
 
     def take(name: str, entry: Any) -> None:
-        if isinstance(entry, h5py.Dataset) and entry.dtype.kind in "iufb":
+        if isinstance(entry, h5py.Dataset):
             found[name] = entry[()]
 
-    try:
-        with h5py.File(path, "r") as file:
-            file.visititems(take)
-    except OSError as error:
-        raise ValueError(f"{path}: not an HDF5 file ({error})") from error
+    with _damaged(path, "an HDF5 file"), h5py.File(path, "r") as file:
+        file.visititems(take)
     return found
 
 
 def _read_npz(path: Path) -> dict[str, Array]:
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            return {name: file[name] for name in file.files}
-    except (ValueError, OSError, EOFError, AttributeError) as error:
-        raise ValueError(f"{path}: not an NPZ file of arrays ({error})") from error
+    with (
+        _damaged(path, "an NPZ file of arrays"),
+        path.open("rb") as opened,
+        np.load(opened, allow_pickle=False) as file,
+    ):
+        return {name: file[name] for name in file.files}

@@ -227,7 +227,10 @@ def _notes(recording: Recording, bands: list[dict[str, Any]], settled: Array) ->
     if touched := _flag_counts(recording)[Flag.TWO_TOUCHES]:
         notes.append(f"more than one finger touched, in {percent(touched / len(recording))} of the samples")
     if "[touch_panel]" in header.scene:
-        notes.append("the texture lies where a touch panel located the finger: its error does not show in the figures")
+        notes.append(
+            "the motion is judged against the texture at the recorded position, which the touch panel estimates: its "
+            "error against the finger's true position is in none of the figures; hr.phase_error predicts it"
+        )
     if seconds < header.duration - 0.5 / recording.rate:
         notes.append(f"the run ended after {seconds:.3f} s of {header.duration:.3f} s")
     if seconds < 2 * header.settle:

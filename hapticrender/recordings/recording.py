@@ -315,7 +315,8 @@ class Recording:
         drive, sensed : columns
             In A and m of the device's channels, in its order (a plate: coil 1 and 2, sensor 1 and 2 at the ends of the
             glass), after the scale.  All values must be finite.  A row of the drive is held until the next (a command;
-            a current that was measured at the same instant has acted half a sample before).  ``drive=[]``: no drive.
+            a current that was measured at the same instant has acted half a sample before).  A column that drives
+            both coils is named twice; ``drive=[]``: no drive.
         rate : float, Hz
             Sampling rate; it may be left out where there is a column of times.
         time : column, s

@@ -22,6 +22,7 @@ _MANY_BANDS = 10
 DEVICES = "devices.png"
 NO_PICTURE = '<p class="note">No picture: matplotlib is not installed.</p>'
 GENERATOR = '<meta name="generator" content="hapticrender">'
+FOOTER = f'<footer class="note">Made by hapticrender {escape(__version__)}.</footer>'
 CLASSES = {"passed": "good", "passed in band": "good", "failed": "bad", "not judged": "note"}
 
 STYLE = """
@@ -105,7 +106,7 @@ windows of 100 ms: {counts["passed"] + counts["passed in band"]} of {len(scenes)
 <nav>{"".join(links)}</nav>
 {devices}
 {sections}
-<footer class="note">Made by hapticrender {escape(__version__)}.</footer>
+{FOOTER}
 </body>
 </html>
 """

@@ -1,4 +1,4 @@
-"""The profile of a device: what is believed of one, by which measurement, and what it must never be driven beyond."""
+"""The profile of a device: what is known of one, by which measurement, and what it must never be driven beyond."""
 
 from __future__ import annotations
 
@@ -88,7 +88,7 @@ def _table(check: Any) -> Any:
 
 @dataclass(frozen=True, kw_only=True)
 class DeviceProfile(Validated):
-    """All that is believed of one device, and where it comes from; a TOML file.
+    """All that is known of one device, and where it comes from; a TOML file.
 
     A scene takes it by the file's name (``Scene(device="plate.toml")``); `hapticrender identify` writes one.  In a file
     the first five are the table ``[profile]``, the others a table of their name each.  A file without ``[profile]``

@@ -19,18 +19,18 @@ from dataclasses import replace
 
 import numpy as np
 
+from hapticrender.checks import number, require
 from hapticrender.protocols import Array
 from hapticrender.touch.motion_estimator import FREQUENCY, SPEED, MotionEstimator, jerk_covariance, transition
 from hapticrender.touch.touch_panel import EASING, TouchPanel
 
 AGES = (np.arange(16) + 0.5) / 16  # of a sample's time: ages over which errors are averaged
 MOST_LOST = 1e-4  # longer runs of lost samples, of a smaller share, are left out
-FINEST, COARSEST = 1e-6, 10.0  # m
 
 
 def settled_gain(estimator: MotionEstimator, rate: float, speed: float = 0.0) -> tuple[Array, Array]:
     """Gain, shape (3,), and covariance of the state (3, 3), after many samples at `rate` (Hz) at `speed` (m/s rms)."""
-    step, variance = 1.0 / rate, estimator.variance + (speed * estimator.jitter) ** 2
+    step, variance = 1.0 / number("rate", rate, "Hz", above=0.0), estimator.variance + (speed * estimator.jitter) ** 2
     f, q = transition(step), jerk_covariance(step, estimator.density)
     pace = step * (estimator.density / (variance * step)) ** (1 / 6)  # poles of the filter in continuous time, times T
     covariance, gain = np.diag([variance, variance / step**2, variance / step**4]), np.zeros(3)
@@ -70,6 +70,7 @@ def frequency_response(
     `order` 0 is the position `ahead` (s) of the last sample, which without error is ``exp(j w ahead)``; 1 the velocity
     there, per position, which is ``j w exp(j w ahead)``.
     """
+    require(order in (0, 1), "order", order, "0 (position) or 1 (velocity)")
     gain, _ = settled_gain(estimator, rate)
     a, b = _system(gain, 1.0 / rate, 0.0, 0.0)
     row = np.array([1.0, ahead, 0.5 * ahead**2] if order == 0 else [0.0, 1.0, ahead])
@@ -79,7 +80,7 @@ def frequency_response(
 
 def bandwidth(estimator: MotionEstimator, rate: float) -> float:
     """Frequency (Hz) at which the position's power is down to half; rate/2 where it never is."""
-    grid = np.linspace(0.0, 0.5 * rate, 4001)[1:]
+    grid = np.linspace(0.0, 0.5 * number("rate", rate, "Hz", above=0.0), 4001)[1:]
     below = np.flatnonzero(abs(frequency_response(estimator, rate, grid)) ** 2 < 0.5)
     return float(grid[below[0]]) if below.size else 0.5 * rate
 
@@ -126,16 +127,24 @@ def position_error(
     panel : TouchPanel
         Sensor of the finger.
     speed, frequency : float, m/s and Hz
-        Peak speed of a sinusoidal swipe, and its frequency.
-    delay : float, s
+        Peak speed of a sinusoidal swipe, >= 0, and its frequency, > 0.
+    delay : float, s, >= 0
         Behind the sensor: from an estimate to the surface, as far as it is not predicted by the device's own loop.
     predicted : bool
         False: the last sample is played as it is, without an estimator.
-    easing : float, s
+    easing : float, s, >= 0
         Pole pair by which corrections are spread; 0: none.
+
+    Raises
+    ------
+    ValueError, TypeError
+        An argument is out of its bound.
     """
-    omega, step = 2 * math.pi * frequency, 1.0 / panel.rate
-    late, amplitude, rms = panel.latency + delay, speed / omega, speed / math.sqrt(2.0)
+    require(isinstance(panel, TouchPanel), "panel", panel, "a TouchPanel", TypeError)
+    speed, easing = number("speed", speed, "m/s", least=0.0), number("easing", easing, "s", least=0.0)
+    omega, step = 2 * math.pi * number("frequency", frequency, "Hz", above=0.0), 1.0 / panel.rate
+    late = panel.latency + number("delay", delay, "s", least=0.0)
+    amplitude, rms = speed / omega, speed / math.sqrt(2.0)
     estimator, square, weight = panel.estimator(), 0.0, 0.0
     variance = estimator.variance + (rms * panel.jitter) ** 2
     if predicted:
@@ -152,14 +161,17 @@ def position_error(
 
 def phase_error(panel: TouchPanel, speed: float, wavelength: float, **path: float) -> float:
     """Phase error of a grating of `wavelength` (m), in degrees rms; `speed` and `path` as for `position_error`."""
-    return 360.0 * position_error(panel, speed, **path) / wavelength  # type: ignore[arg-type]
+    turn = number("wavelength", wavelength, "m", above=0.0)
+    return 360.0 * position_error(panel, speed, **path) / turn  # type: ignore[arg-type]
 
 
 def finest_wavelength(
     panel: TouchPanel, speed: float, *, degrees: float = 30.0, highest: float = math.inf, **path: float
 ) -> float:
     """Finest grating (m) with a phase error of `degrees` rms, and at most `highest` (Hz) at the peak `speed` (m/s)."""
-    return max(360.0 * position_error(panel, speed, **path) / degrees, speed / highest)  # type: ignore[arg-type]
+    allowed = number("degrees", degrees, above=0.0) / 360.0
+    require(highest > 0.0, "highest", highest, "> 0 Hz, math.inf where there is no limit")
+    return max(position_error(panel, speed, **path) / allowed, speed / highest)  # type: ignore[arg-type]
 
 
 PANELS = {  # for the table in docs/devices.md and the chart; engineering estimates

@@ -60,7 +60,7 @@ class MotionEstimator:
     resolution : float, m, >= 0
         Step of the samples; a rounding adds ``resolution**2/12`` to their variance.  At least one of the two is > 0.
     latency : float, s, >= 0
-        Age of a sample at the time that `update` is told.
+        Age of a sample at the time that is passed to `update`.
     jitter : float, s rms, >= 0
         Error of that time; it adds ``(v jitter)**2`` to the variance of a sample.
     frequency, speed : float, Hz and m/s, > 0
@@ -198,7 +198,7 @@ class Encoder(MotionEstimator):
 
     Parameters
     ----------
-    resolution : float, m, > 0
+    resolution : float, m, not 0
         Of a count; negative where it counts backwards.
     bits : int, 2 to 64
         Of the counter: counts wrap through ``2**bits``, both ways.  Between two samples the finger must move by less
@@ -230,6 +230,7 @@ class Encoder(MotionEstimator):
         speed: float = SPEED,
     ) -> None:
         step = checks.number("resolution", resolution, "m")
+        checks.require(step != 0.0, "resolution", resolution, "the metres of a count, not 0")
         motion = {"latency": latency, "jitter": jitter, "frequency": frequency, "speed": speed}
         super().__init__(noise, resolution=abs(step), **motion)
         self.step, self.bits = step, checks.integer("bits", bits, least=2, most=64)
@@ -239,6 +240,8 @@ class Encoder(MotionEstimator):
 
     def update(self, time: float, position: float, error: float | None = None) -> bool:
         """Take a count (`position`, an integer) that arrives at `time` (s); False where it is left out."""
+        whole = float(position).is_integer()
+        checks.require(whole, "position", position, "a whole number of counts; call lift() where no finger touches")
         count, half = int(position), 1 << (self.bits - 1)
         last = count if self._count is None else self._count
         self._total += (count - last + half) % (2 * half) - half

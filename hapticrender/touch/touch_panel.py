@@ -37,6 +37,10 @@ class TouchPanel(Validated):
     jitter: float = parameter(0.5e-3, "s", "of the arrival, rms; 0 with time stamps of the scans", most=0.1)
     dropouts: float = parameter(0.01, about="share of samples that are lost", most=0.9)
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self.estimator()  # refuses a sensor without any error
+
     def estimator(self, frequency: float = FREQUENCY, speed: float = SPEED) -> MotionEstimator:
         """Return an estimator for a finger that swipes with `frequency` (Hz) and peak `speed` (m/s)."""
         errors = {"resolution": self.resolution, "latency": self.latency, "jitter": self.jitter}

@@ -1,0 +1,188 @@
+/* Tests of the gains of sensors and actuators; as hapticrender/control/gains.py. */
+#include "gains.h"
+
+#include <string.h>
+
+#include "design.h"
+
+#define SENSOR 0u
+#define ACTUATOR 1u
+#define LEAST_INVERTED REAL(-1.6) /* gains of a sensor or an actuator that is inverted */
+#define MOST_INVERTED REAL(-0.4)
+#define DEAD REAL(0.25) /* of a sensor: a smaller magnitude is a fault, and a larger gain than this: */
+#define MOST_GAIN REAL(2.0)
+#define UNEXPLAINED REAL(0.1) /* of the energy of the innovations */
+#define UNEXPLAINED_INVERTED REAL(0.2)
+#define CERTAIN REAL(25.0) /* variances: 5 sigma of a gain */
+#define JUMP REAL(20.0)    /* variances: 4.5 sigma of an innovation */
+#define WATCHED REAL(4.0)  /* variances: actuators are followed */
+#define LARGE REAL(20.0)   /* and judged */
+
+/* Advance a model by a sample, under the force that acts. */
+static void advance_model(real_t model[6], const gain_settings_t *p, const real_t force[2])
+{
+    real_t after[4];
+    for (uint32_t i = 0u; i < 4u; i++) {
+        after[i] = p->step_force[i][0] * (force[0] + model[4]) + p->step_force[i][1] * (force[1] + model[5]);
+        for (uint32_t j = 0u; j < 4u; j++) {
+            after[i] += p->step_state[i][j] * model[j];
+        }
+    }
+    (void)memcpy(model, after, sizeof(after));
+}
+
+/* Correct a model by the innovations of both sensors, times `sign`. */
+static void correct_model(real_t model[6], const gain_settings_t *p, const real_t e[2], real_t sign)
+{
+    for (uint32_t i = 0u; i < 6u; i++) {
+        model[i] += sign * (p->filter_gain[i][0] * e[0] + p->filter_gain[i][1] * e[1]);
+    }
+}
+
+/* What sensor i shows of a model, over its noise. */
+static real_t model_sensor(const real_t model[6], const gain_settings_t *p, uint32_t i)
+{
+    return p->sensor_from_coordinate[i][0] * model[0] + p->sensor_from_coordinate[i][1] * model[1];
+}
+
+/* Set the sums of a kind of gains, and the models behind its w, to zero. */
+static void clear_sums(gains_t *s, uint32_t kind)
+{
+    (void)memset(s->weighted[kind], 0, sizeof(s->weighted[kind]));
+    (void)memset(s->weights[kind], 0, sizeof(s->weights[kind]));
+    (void)memset(s->models[2u + 2u * kind], 0, 2u * sizeof(s->models[0]));
+}
+
+static real_t product(const real_t a[2], const real_t b[2]) { return a[0] * b[0] + a[1] * b[1]; }
+
+/* Add a sample of w, each of both sensors, to the sums; those of actuators are means. */
+static void add_sums(gains_t *s, uint32_t kind, real_t pole, const real_t w[2][2])
+{
+    const real_t kept = (kind == SENSOR) ? REAL(1.0) : (REAL(1.0) - pole);
+    for (uint32_t i = 0u; i < 2u; i++) {
+        for (uint32_t j = i; j < 2u; j++) {
+            s->weights[kind][i][j] = kept * s->weights[kind][i][j] + pole * product(w[i], w[j]);
+        }
+        s->weighted[kind][i] = kept * s->weighted[kind][i] + pole * product(w[i], s->e);
+    }
+}
+
+/* Whether a gain is that of a fault, with `rest` the share of the energy that it leaves unexplained. */
+static uint32_t is_fault(uint32_t kind, real_t gain, real_t rest)
+{
+    const uint32_t changed = ((real_abs(gain) < DEAD) || (gain > MOST_GAIN)) ? 1u : 0u;
+    if ((gain > LEAST_INVERTED) && (gain < MOST_INVERTED)) {
+        return (rest < ((kind == SENSOR) ? UNEXPLAINED_INVERTED : UNEXPLAINED)) ? 1u : 0u;
+    }
+    return ((kind == SENSOR) && (rest < UNEXPLAINED)) ? changed : 0u;
+}
+
+/* Find both gains, from innovations of variance `noise`; those that are faults, as bits. */
+static uint32_t judge_gains(const gains_t *s, uint32_t kind, real_t noise)
+{
+    const real_t energy = s->energy[kind];
+    const real_t *b = s->weighted[kind];
+    const real_t w00 = s->weights[kind][0][0];
+    const real_t w01 = s->weights[kind][0][1];
+    const real_t w11 = s->weights[kind][1][1];
+    const real_t scale = REAL(1.0) / ((w00 + noise) * (w11 + noise) - w01 * w01);
+    const real_t g[2] = {scale * ((w11 + noise) * b[0] - w01 * b[1]), scale * ((w00 + noise) * b[1] - w01 * b[0])};
+    const real_t variance[2] = {scale * (w11 + noise) * noise, scale * (w00 + noise) * noise};
+    const real_t rest = energy - REAL(2.0) * product(g, b) + g[0] * g[0] * w00 + REAL(2.0) * g[0] * g[1] * w01
+        + g[1] * g[1] * w11;
+    uint32_t faults = 0u;
+    for (uint32_t j = 0u; j < 2u; j++) {
+        if ((g[j] * g[j] > CERTAIN * variance[j]) && (is_fault(kind, REAL(1.0) + g[j], rest / energy) != 0u)) {
+            faults |= 1u << j;
+        }
+    }
+    return faults;
+}
+
+/* Add a sample to a trial; the sensors whose gain has changed at its end, as bits. */
+static uint32_t follow_sensors(gains_t *s, const gain_settings_t *p, const real_t force[2])
+{
+    const real_t none[2] = {REAL(0.0), REAL(0.0)};
+    real_t w[2][2];
+    for (uint32_t j = 0u; j < 2u; j++) {
+        for (uint32_t i = 0u; i < 2u; i++) {
+            w[j][i] = -model_sensor(s->models[2u + j], p, i);
+        }
+        w[j][j] += model_sensor(s->models[1], p, j);
+    }
+    add_sums(s, SENSOR, REAL(1.0), (const real_t (*)[2])w);
+    s->energy[SENSOR] += product(s->e, s->e);
+    advance_model(s->models[1], p, force);
+    for (uint32_t j = 0u; j < 2u; j++) {
+        correct_model(s->models[2u + j], p, w[j], REAL(1.0));
+        advance_model(s->models[2u + j], p, none);
+    }
+    s->left -= 1u;
+    return (s->left == 0u) ? judge_gains(s, SENSOR, p->innovation) : 0u;
+}
+
+/* Add a sample to the means; the actuators that are inverted, as bits. */
+static uint32_t follow_actuators(gains_t *s, const gain_settings_t *p, const real_t force[2])
+{
+    real_t w[2][2];
+    for (uint32_t j = 0u; j < 2u; j++) {
+        for (uint32_t i = 0u; i < 2u; i++) {
+            w[j][i] = model_sensor(s->models[4u + j], p, i);
+        }
+    }
+    if (s->watched > p->duration / 2u) { /* by then w has forgotten where it began */
+        add_sums(s, ACTUATOR, p->window_pole, (const real_t (*)[2])w);
+    }
+    for (uint32_t j = 0u; j < 2u; j++) {
+        const real_t own[2] = {product(p->force_of_actuator[j][0], force), product(p->force_of_actuator[j][1], force)};
+        correct_model(s->models[4u + j], p, w[j], REAL(-1.0));
+        advance_model(s->models[4u + j], p, own);
+    }
+    const uint32_t found = judge_gains(s, ACTUATOR, p->window_pole * p->innovation);
+    return ((2u * s->watched > 3u * p->duration) && (s->energy[ACTUATOR] > LARGE * p->innovation)) ? found : 0u;
+}
+
+/* Find the innovations and their mean squares; whether one has jumped. */
+static uint32_t note_innovations(gains_t *s, const gain_settings_t *p, const real_t sensed[])
+{
+    uint32_t jump = 0u;
+    for (uint32_t i = 0u; i < (uint32_t)LAW_SENSORS; i++) {
+        s->e[i] = p->scale * sensed[i] - model_sensor(s->models[0], p, i);
+        const real_t square = s->e[i] * s->e[i];
+        jump |= (square > JUMP * ((s->mean[i] > p->innovation) ? s->mean[i] : p->innovation)) ? 1u : 0u;
+        s->mean[i] += p->mean_pole * (square - s->mean[i]);
+    }
+    s->energy[ACTUATOR] += p->window_pole * (product(s->e, s->e) - s->energy[ACTUATOR]);
+    return jump;
+}
+
+uint32_t gains_check(
+    gains_t *gains, const gain_settings_t *used, const real_t sensed[], const real_t force[2], uint32_t *inverted)
+{
+    gains_t *s = gains;
+    const gain_settings_t *p = used;
+    uint32_t rescaled = 0u;
+    const uint32_t jump = note_innovations(s, p, sensed);
+    *inverted = 0u;
+    if ((jump != 0u) && (s->left == 0u)) {
+        clear_sums(s, SENSOR);
+        s->left = p->duration;
+        s->energy[SENSOR] = REAL(0.0);
+        (void)memcpy(s->models[1], s->models[0], sizeof(s->models[1]));
+    }
+    if (s->left > 0u) {
+        rescaled = follow_sensors(s, p, force);
+    }
+    if (s->energy[ACTUATOR] > WATCHED * p->innovation) {
+        s->watched += 1u;
+        *inverted = follow_actuators(s, p, force);
+    } else if (s->watched != 0u) {
+        clear_sums(s, ACTUATOR);
+        s->watched = 0u;
+    } else {
+        /* nothing happens */
+    }
+    correct_model(s->models[0], p, s->e, REAL(1.0));
+    advance_model(s->models[0], p, force);
+    return rescaled;
+}

@@ -1,0 +1,269 @@
+"""Supervision of gains: whether a sensor shows, or an actuator gives, a multiple of what it did a moment before.
+
+A Kalman filter has the device's coordinates q, their rates, and a force d that wanders, by which it follows fingers and
+loads.  Its innovations e are white but for what wanders faster::
+
+    x[n+1] = A (x[n] + K e[n]) + B F[n],     e = y - C x,     x = (q, q', d)
+
+A sensor i that shows g_i times the motion p from now on adds (g_i - 1) w_i to e, where c_i is the row of C of that
+sensor alone and p the filter's state, from now on without corrections::
+
+    w_i = c_i p - C xi_i,                    xi_i[n+1] = A (xi_i[n] + K w_i[n])
+
+An actuator j that gives g_j times its force F_j adds (g_j - 1) w_j::
+
+    w_j = C zeta_j,                          zeta_j[n+1] = A (zeta_j[n] - K w_j[n]) + B F_j[n]
+
+Least squares of e on w find g, of both sensors or of both actuators.
+
+Sensors are judged over the 3 ms after an innovation above 4.5 times its noise, and its mean square before: a finger's
+force makes no jump, what it adds to e is no multiple of w.  Actuators are judged by means over 3 ms, while e is large:
+an inversion alone is told from a finger by these, and so is one of a sensor that began where p was zero.
+
+References
+----------
+Willsky and Jones, A generalized likelihood ratio approach to the detection and estimation of jumps in linear systems,
+IEEE Transactions on Automatic Control 21, 1976.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numba
+import numpy as np
+
+from hapticrender.control.device_model import DeviceModel
+from hapticrender.jit import kernel, record
+from hapticrender.mathx import zoh
+from hapticrender.protocols import Array
+
+MOST = 2  # sensors, and actuators
+SENSOR, ACTUATOR = range(2)  # kinds of gains
+LEAST_INVERTED, MOST_INVERTED = -1.6, -0.4  # gains of a sensor or an actuator that is inverted
+DEAD, MOST_GAIN = 0.25, 2.0  # of a sensor: a smaller magnitude, a larger gain is a fault
+UNEXPLAINED, UNEXPLAINED_INVERTED = 0.1, 0.2  # of the energy of e; the latter of an inverted sensor
+CERTAIN, JUMP = 25.0, 20.0  # variances: 5 sigma of a gain; 4.5 sigma of an innovation
+WATCHED, LARGE = 4.0, 20.0  # variances of e: actuators are followed, judged
+WANDER = 3.5  # N/sqrt(s), of d
+TRIAL, LEAST_TRIAL, MEAN, WINDOW = 3e-3, 8, 20e-3, 3e-3  # s, samples, s, s
+
+GAINS = np.dtype(
+    [
+        ("step_state", np.float64, (4, 4)),  # A of q and q' ...
+        ("step_force", np.float64, (4, 2)),  # ... and B, with the force held over a sample
+        ("filter_gain", np.float64, (6, MOST)),  # K
+        ("sensor_from_coordinate", np.float64, (MOST, 2)),  # of C
+        ("force_of_actuator", np.float64, (MOST, 2, 2)),  # F_j per F
+        ("scale", np.float64),  # 1/m: e and C are in units of the sensors' noise
+        ("innovation", np.float64),  # variance of e of each sensor by noise, as a multiple of its own
+        *((name, np.float64) for name in ("mean_pole", "window_pole")),  # a sample
+        ("duration", np.int64),  # samples of a trial
+        ("models", np.float64, (6, 6)),  # x, p, xi_1, xi_2, zeta_1, zeta_2
+        ("advanced", np.float64, (4,)),
+        *((name, np.float64, (MOST,)) for name in ("e", "mean", "energy")),  # mean of e^2 of a sensor; sums of e^2
+        ("weights", np.float64, (2, 2, 2)),  # sums of w_i w_j of sensors, of actuators
+        *((name, np.float64, (2, 2)) for name in ("weighted", "gain")),  # sums of w_i e
+        *((name, np.int64) for name in ("left", "watched")),  # samples: to go in the trial; with actuators followed
+    ]
+)
+"""Settings and state of the tests of gains."""
+GAINS_T = numba.from_dtype(GAINS)
+
+
+def design_gains(model: DeviceModel, noise: float) -> Array | None:
+    """Record of the tests for a device of at most two sensors, of `noise` (rms), and two actuators; else None."""
+    sensors, n, actuators = model.coordinate_from_sensed.shape[1], len(model.mass), model.force_from_drive.shape[1]
+    if max(sensors, actuators) > MOST:
+        return None
+    inverse, force_map = np.linalg.inv(model.mass), model.force_from_drive
+    a, b = np.zeros((2 * n, 2 * n)), np.vstack([np.zeros((n, n)), inverse])
+    a[:n, n:], a[n:, :n], a[n:, n:] = np.eye(n), -inverse @ model.stiffness, -inverse @ model.damping
+    a, b = zoh(a, b, 1.0 / model.rate)
+    whole = np.block([[a, b], [np.zeros((n, 2 * n)), np.eye(n)]])
+    show = np.hstack([np.linalg.pinv(model.coordinate_from_sensed) / noise, np.zeros((sensors, 2 * n))])
+    gain, variance = _filter(whole, show, WANDER / math.sqrt(model.rate))
+    found = np.zeros(1, GAINS)
+    rows = np.r_[0:n, 2 : 2 + n, 4 : 4 + n]  # of a device of one coordinate
+    found["step_state"][0][np.ix_(rows[: 2 * n], rows[: 2 * n])] = a
+    found["step_force"][0][rows[: 2 * n], :n] = b
+    found["filter_gain"][0][rows, :sensors] = gain
+    found["sensor_from_coordinate"][0][:sensors, :n] = show[:, :n]
+    shares = np.einsum("aj,jb->jab", force_map, np.linalg.pinv(force_map))
+    found["force_of_actuator"][0][:actuators, :n, :n] = shares
+    found["scale"], found["innovation"] = 1.0 / noise, variance
+    found["mean_pole"], found["window_pole"] = (-math.expm1(-1.0 / (t * model.rate)) for t in (MEAN, WINDOW))
+    found["duration"] = max(round(TRIAL * model.rate), LEAST_TRIAL)
+    return found
+
+
+def _filter(a: Array, c: Array, wander: float) -> tuple[Array, float]:
+    """Stationary Kalman gain before the step, and largest variance of an innovation, for sensors of unit noise."""
+    from scipy.linalg import solve_discrete_are  # only designs need it
+
+    n = len(a) // 3
+    process = np.diag(np.r_[np.zeros(2 * n), np.full(n, wander**2)])
+    covariance = solve_discrete_are(a.T, c.T, process, np.eye(len(c)))
+    innovation = c @ covariance @ c.T + np.eye(len(c))
+    return covariance @ c.T @ np.linalg.inv(innovation), float(innovation.diagonal().max())
+
+
+@kernel
+def advance_model(gains, k, force0, force1):
+    """Advance model k by a sample, under the force that acts."""
+    s = record(gains, GAINS_T, 0)
+    force0, force1 = force0 + s.models[k, 4], force1 + s.models[k, 5]
+    for i in range(4):
+        s.advanced[i] = s.step_force[i, 0] * force0 + s.step_force[i, 1] * force1
+        for j in range(4):
+            s.advanced[i] += s.step_state[i, j] * s.models[k, j]
+    for i in range(4):
+        s.models[k, i] = s.advanced[i]
+
+
+@kernel
+def correct_model(gains, k, error0, error1):
+    """Correct model k by the innovations of both sensors."""
+    s = record(gains, GAINS_T, 0)
+    for i in range(6):
+        s.models[k, i] += s.filter_gain[i, 0] * error0 + s.filter_gain[i, 1] * error1
+
+
+@kernel
+def model_sensor(gains, k, i):
+    """What sensor i shows of model k, over its noise."""
+    s = record(gains, GAINS_T, 0)
+    return s.sensor_from_coordinate[i, 0] * s.models[k, 0] + s.sensor_from_coordinate[i, 1] * s.models[k, 1]
+
+
+@kernel
+def clear_sums(gains, kind):
+    """Set the sums of a kind of gains, and the models behind its w, to zero."""
+    s = record(gains, GAINS_T, 0)
+    for j in range(2):
+        s.weighted[kind, j] = s.weights[kind, j, 0] = s.weights[kind, j, 1] = 0.0
+        for i in range(6):
+            s.models[2 + 2 * kind + j, i] = 0.0
+
+
+@kernel
+def add_sums(gains, kind, pole, w0, w1):
+    """Add a sample of w_1 and w_2, each of both sensors, to the sums; with a `pole` below 1 these are means."""
+    s = record(gains, GAINS_T, 0)
+    w, b, e, kept = s.weights[kind], s.weighted[kind], s.e, 1.0 if kind == SENSOR else 1.0 - pole
+    w[0, 0] = kept * w[0, 0] + pole * (w0[0] * w0[0] + w0[1] * w0[1])
+    w[0, 1] = kept * w[0, 1] + pole * (w0[0] * w1[0] + w0[1] * w1[1])
+    w[1, 1] = kept * w[1, 1] + pole * (w1[0] * w1[0] + w1[1] * w1[1])
+    b[0] = kept * b[0] + pole * (w0[0] * e[0] + w0[1] * e[1])
+    b[1] = kept * b[1] + pole * (w1[0] * e[0] + w1[1] * e[1])
+
+
+@kernel
+def is_fault(kind, gain, rest):
+    """Whether a gain is that of a fault, with `rest` the share of the energy of e that it leaves unexplained."""
+    if LEAST_INVERTED < gain < MOST_INVERTED:
+        return rest < (UNEXPLAINED_INVERTED if kind == SENSOR else UNEXPLAINED)
+    return kind == SENSOR and rest < UNEXPLAINED and (abs(gain) < DEAD or gain > MOST_GAIN)
+
+
+@kernel
+def judge_gains(gains, kind, noise):
+    """Find both gains, from innovations of variance `noise`; those that are faults, as bits."""
+    s = record(gains, GAINS_T, 0)
+    w, b, faults = s.weights[kind], s.weighted[kind], 0
+    w00, w11 = w[0, 0] + noise, w[1, 1] + noise  # a sensor that shows nothing keeps its gain
+    scale = 1.0 / (w00 * w11 - w[0, 1] * w[0, 1])
+    g0, g1 = scale * (w11 * b[0] - w[0, 1] * b[1]), scale * (w00 * b[1] - w[0, 1] * b[0])
+    rest = s.energy[kind] - 2.0 * (g0 * b[0] + g1 * b[1])
+    rest += g0 * g0 * w[0, 0] + 2.0 * g0 * g1 * w[0, 1] + g1 * g1 * w[1, 1]
+    s.gain[kind, 0], s.gain[kind, 1] = 1.0 + g0, 1.0 + g1
+    for j in range(2):
+        g, variance = (g0, w11) if j == 0 else (g1, w00)
+        if g * g > CERTAIN * scale * variance * noise and is_fault(kind, 1.0 + g, rest / s.energy[kind]):
+            faults |= 1 << j
+    return faults
+
+
+@kernel
+def follow_sensors(gains, force0, force1):
+    """Add a sample to a trial; the sensors whose gain has changed at its end, as bits."""
+    s = record(gains, GAINS_T, 0)
+    w0 = (model_sensor(gains, 1, 0) - model_sensor(gains, 2, 0), -model_sensor(gains, 2, 1))
+    w1 = (-model_sensor(gains, 3, 0), model_sensor(gains, 1, 1) - model_sensor(gains, 3, 1))
+    correct_model(gains, 2, w0[0], w0[1])
+    correct_model(gains, 3, w1[0], w1[1])
+    add_sums(gains, SENSOR, 1.0, w0, w1)
+    s.energy[SENSOR] += s.e[0] * s.e[0] + s.e[1] * s.e[1]
+    advance_model(gains, 1, force0, force1)
+    advance_model(gains, 2, 0.0, 0.0)
+    advance_model(gains, 3, 0.0, 0.0)
+    s.left -= 1
+    return judge_gains(gains, SENSOR, s.innovation) if s.left == 0 else 0
+
+
+@kernel
+def follow_actuators(gains, force0, force1):
+    """Add a sample to the means; the actuators that are inverted, as bits."""
+    s = record(gains, GAINS_T, 0)
+    share = s.force_of_actuator
+    w0 = (model_sensor(gains, 4, 0), model_sensor(gains, 4, 1))
+    w1 = (model_sensor(gains, 5, 0), model_sensor(gains, 5, 1))
+    if s.watched > s.duration // 2:  # by then w has forgotten where it began
+        add_sums(gains, ACTUATOR, s.window_pole, w0, w1)
+    for j in range(2):
+        w = w0 if j == 0 else w1
+        correct_model(gains, 4 + j, -w[0], -w[1])
+        advance_model(
+            gains,
+            4 + j,
+            share[j, 0, 0] * force0 + share[j, 0, 1] * force1,
+            share[j, 1, 0] * force0 + share[j, 1, 1] * force1,
+        )
+    found = judge_gains(gains, ACTUATOR, s.window_pole * s.innovation)
+    known = 2 * s.watched > 3 * s.duration
+    return found if known and s.energy[ACTUATOR] > LARGE * s.innovation else 0
+
+
+@kernel
+def note_innovations(gains, sensed, sensors):
+    """Find the innovations and their mean squares; whether one has jumped."""
+    s = record(gains, GAINS_T, 0)
+    jump, energy = False, 0.0
+    for i in range(sensors):
+        s.e[i] = s.scale * sensed[i] - model_sensor(gains, 0, i)
+        square = s.e[i] * s.e[i]
+        jump |= square > JUMP * max(s.innovation, s.mean[i])
+        s.mean[i] += s.mean_pole * (square - s.mean[i])
+        energy += square
+    s.energy[ACTUATOR] += s.window_pole * (energy - s.energy[ACTUATOR])
+    return jump
+
+
+@kernel
+def check_gains(gains, sensed, sensors, force0, force1):
+    """Sensors and actuators whose gain has changed, as bits; `force0` and `force1` (N) act from this sample on."""
+    s = record(gains, GAINS_T, 0)
+    rescaled = inverted = 0
+    if note_innovations(gains, sensed, sensors) and s.left == 0:
+        clear_sums(gains, SENSOR)
+        s.left, s.energy[SENSOR] = s.duration, 0.0
+        for i in range(6):
+            s.models[1, i] = s.models[0, i]
+    if s.left > 0:
+        rescaled = follow_sensors(gains, force0, force1)
+    if s.energy[ACTUATOR] > WATCHED * s.innovation:
+        s.watched += 1
+        inverted = follow_actuators(gains, force0, force1)
+    elif s.watched > 0:
+        clear_sums(gains, ACTUATOR)
+        s.watched = 0
+    correct_model(gains, 0, s.e[0], s.e[1])
+    advance_model(gains, 0, force0, force1)
+    return rescaled, inverted
+
+
+@kernel
+def start_gains(gains, heave, rocking, force0, force1):
+    """Start the filter at rest at the coordinates that the sensors show, under `force0` and `force1` (N)."""
+    s = record(gains, GAINS_T, 0)
+    s.models[0, 0], s.models[0, 1], s.models[0, 4], s.models[0, 5] = heave, rocking, force0, force1
