@@ -65,7 +65,6 @@ class BoardLoop:
         A board cannot play the texture.
     """
 
-    whole, silent = True, False  # textures are exchanged under one law
     senses = False  # the host says where the finger is
     motion_source = "sensors"
 

@@ -17,10 +17,6 @@ class LiveMotion:
         self._clock = 0.0  # s
         self._last = (0.0, math.nan, 0.0, 0.0)  # since (s), position, velocity, load
 
-    def restart(self) -> None:
-        """Begin at time 0 again, with another simulated device."""
-        self._clock, self._last = 0.0, (0.0, *self._last[1:])
-
     def update(self, position: float, velocity: float, load: float) -> None:
         """Take up the application's finger (m, m/s, N)."""
         self._last = (self._clock, position, velocity, load)

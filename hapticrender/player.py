@@ -10,8 +10,7 @@ Controller and renderers are those of `render`; what advances them block by bloc
 runs on the device (it has `loop`) brings a loop of its own; any other is played by a thread.
 
 A texture fades into the next one under the same controller, which keeps what it has learned of finger and device.
-Where the law works by bands (hybrids) the old texture fades out, then the next one fades in under a controller of its
-own.
+Where the law works by bands (hybrids) each texture has a controller, which goes on from the state of the one before.
 """
 
 from __future__ import annotations
@@ -108,8 +107,7 @@ class Player:
             (math.nan, 0.0, 0.0),
         )  # the last position with its time; position, velocity, load
         self._loop: LiveLoop | None = None
-        self._next: LiveLoop | None = None  # waits for silence
-        self._gain, self._before, self._lost = 1.0, 0, 0
+        self._gain, self._lost = 1.0, 0
         self._error: BaseException | None = None
         self._raised = False
         self._recorder: LiveRecorder | None = None
@@ -136,7 +134,7 @@ class Player:
     @property
     def time(self) -> float:
         """Time played so far (s)."""
-        return 0.0 if self._loop is None else (self._before + self._loop.samples) / self._loop.driver.rate
+        return 0.0 if self._loop is None else self._loop.samples / self._loop.driver.rate
 
     @property
     def gain(self) -> float:
@@ -148,7 +146,7 @@ class Player:
         with self._calling():
             if not 0.0 <= gain <= MOST_GAIN:
                 raise ValueError(f"{gain=}: must be 0 to {MOST_GAIN:g}; an amplitude belongs in the texture")
-            if self._loop is not None and self._next is None:
+            if self._loop is not None:
                 self._loop.set_gain(gain)
             self._gain = gain
 
@@ -168,17 +166,7 @@ class Player:
                 return
             playing = self._loop.rendering
             device = None if playing.plant is not None else playing.device
-            rendering = prepare(self._scene(texture), driver=device, compiled=False)
-            if self._loop.whole:
-                self._loop.exchange(rendering)
-            elif self._calls_back:
-                method = rendering.scene.method
-                raise ValueError(
-                    f"method {method!r} works by bands: a device that calls back takes one texture of them"
-                )
-            else:
-                self._next = LiveLoop(rendering)
-                self._loop.set_gain(0.0)
+            self._loop.exchange(prepare(self._scene(texture), driver=device, compiled=False))
 
     def finger(self, position: float, velocity: float | None = None, load: float = 0.4) -> None:
         """Set where the finger is: position (m from the middle, NaN: lifted), velocity (m/s), normal load (N).
@@ -383,26 +371,8 @@ class Player:
                 start -= ahead
 
     def _block(self) -> None:
-        """Play a block; once the last texture is silent the next loop takes over."""
-        if self._next is not None and self._playing("play").silent:
-            with self._lock:
-                self._take_over(self._next)
+        """Play a block."""
         self._playing("play").advance(sensing=self._given is not None or not self._located)
-
-    def _take_over(self, following: LiveLoop) -> None:
-        self._service()
-        loop, self._next = self._playing("play"), None
-        self._before += loop.samples
-        self._recorded = 0
-        if following.rendering.plant is not None:
-            self._motion.restart()
-            self._hand_finger(following.rendering)
-            self._stack.enter_context(following.driver)
-        following.set_gain(self._gain)
-        if self._located:
-            following.finger(*self._finger)
-        self._loop = following
-        self._watch(self._watchdog)
 
     def _advance(self, seconds: float) -> None:
         """Play for so long in this thread."""

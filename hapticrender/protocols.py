@@ -168,6 +168,7 @@ class Rendering:
     differentiated: bool = False  # the target is the time derivative of `waveform`
     controller: Callable[[], Controller]  # a new one at rest
     design: Callable[[Bands], Controller] | None = None  # one at rest for other bands; None: for these only
+    shape: Any = None  # static characteristic before the device, for this texture: `shape` of `plant`, else of `driver`
     probe: bool = False  # whether the device is probed before the loop closes
 
     @property

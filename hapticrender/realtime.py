@@ -6,7 +6,8 @@ whose slots change hands in one atomic step::
 
     entry = RealtimeEntry(controller, sensed_scale=2e-4, drive_scale=0.5)   # m and 1/A of full scale
     stream = open_audio(callback=entry.address, user_data=entry.user_data, frames=entry.block)
-    entry.play(voice)                  # a texture, from any thread of the application, one at a time
+    entry.play(voice)                  # a texture, from any thread of the application, one at a time; of a law by
+    entry.play(voice, controller)      # bands with the controller that is designed for it
     entry.send(bands)                  # or other targets, of a law by bands
     entry.finger(0.01, velocity=0.05)  # m, m/s; extrapolated at this speed until the next call
     entry.samples, entry.flags         # what has happened
@@ -27,6 +28,7 @@ import numpy as np
 
 from hapticrender.bands import Bands
 from hapticrender.control.records import CONTROLLER, SETPOINT_ROWS
+from hapticrender.control.state_transfer import state_table
 from hapticrender.control.supervisor import FADE_OUT
 from hapticrender.jit import CFunction, addresses
 from hapticrender.protocols import Array, Flag
@@ -53,9 +55,10 @@ from hapticrender.voices import FADE, Voice
 TOUCH_FADE = 0.02  # s: of what lies along the surface, at touch and lift
 JUMP_TIME = 5e-3  # s: a correction of the position decays by two poles of that time
 GAIN_TIME = 10e-3  # s
+CHANGE = 14e-3, 34e-3  # s: one texture fades out before, the other one in after the change of controllers
 LOG_TIME = 2.0  # s: of signals that are kept
 SLOTS = 3
-BLOCK = ("sensed", "drive", "position", "waveform", "flags", "target")  # signals of a block
+BLOCK = ("sensed", "drive", "position", "waveform", "flags")  # signals of a block that all controllers share
 FIELDS = ENTRY.names or ()
 
 
@@ -85,8 +88,8 @@ class RealtimeEntry:
     block : int, samples
         Frames a call, or a multiple.
     whole : bool
-        Whether the law plays a whole waveform: textures then fade into each other (`play`).  Of a law by bands the
-        gain is a factor of targets that are modulated, and else ignored.
+        Whether the law takes a waveform.  Of one by bands with constant envelopes the gain is a factor of targets that
+        are modulated, and else ignored; another texture takes another controller (`play`).
 
     Raises
     ------
@@ -102,7 +105,8 @@ class RealtimeEntry:
         for name, value in (("sensed_scale (m)", sensed_scale), ("drive_scale (1/A)", drive_scale)):
             if not 0 < value < np.inf:
                 raise ValueError(f"{name}={value!r}: must be finite and > 0")
-        self.controller, self.block, self.rate = controller, controller.block, float(controller.rate)
+        self.controller = self._last = controller
+        self.block, self.rate = controller.block, float(controller.rate)
         self.whole = controller.bands.envelope is None
         setpoints = getattr(controller, "setpoints", np.zeros((SETPOINT_ROWS, 0)))
         self._slot = np.concatenate([np.zeros(HEAD), setpoints.ravel()])
@@ -113,12 +117,10 @@ class RealtimeEntry:
         self.ahead, self._tracker = int(getattr(controller, "lookahead", 0)), np.zeros(1, CONTROLLER)
         self._tracker["p"]["rate"] = self.rate
         self._arrays = self._buffers()
-        self._keep = setpoints, signals = setpoints, addresses(**{name: self._arrays[name] for name in BLOCK})
+        law, self._keep = self._law(controller)
         self._entry = np.zeros(1, ENTRY)
         fixed = {
-            "step": controller.step.address,
-            "controller": controller.state.ctypes.data,
-            "signals": signals.ctypes.data,
+            **law,
             "setpoints": setpoints.size,
             "setpoints_at": setpoints.ctypes.data,
             "slots_at": self._slots.ctypes.data,
@@ -131,6 +133,19 @@ class RealtimeEntry:
             self._entry[name] = value
         self.user_data = int(self._entry.ctypes.data)
 
+    def _law(self, controller: Any) -> tuple[dict[str, int], tuple[Any, ...]]:
+        """Fields of a record that runs a controller on the entry's signals, and what they point to."""
+        target, shared = np.zeros((self.block, controller.n_bands), complex), state_table(controller)
+        signals = addresses(**{name: self._arrays[name] for name in BLOCK}, target=target)
+        fields = {
+            "step": controller.step.address,
+            "controller": controller.state.ctypes.data,
+            "signals": signals.ctypes.data,
+            "analysed": controller.bands.envelope is None,
+            "shared": shared.ctypes.data,
+        }
+        return fields, (controller, target, signals, shared)
+
     def _buffers(self) -> dict[str, Array]:
         """Signals of a block, gains that wait, and the log."""
         controller, block = self.controller, self.block
@@ -141,7 +156,7 @@ class RealtimeEntry:
             "position": np.full(block, np.nan),
             "waveform": np.zeros(block),
             "flags": np.zeros(block, np.int64),
-            "target": np.zeros((block, controller.n_bands), complex),
+            "bump": np.zeros(controller.channels),
             "gains": np.zeros((self.ahead + 1, 2)),
             "log": np.zeros((rows, controller.channels + controller.sensors + 4)),
         }
@@ -152,9 +167,11 @@ class RealtimeEntry:
         return {
             **{"block": self.block, "sensors": self.controller.sensors, "channels": self.controller.channels},
             **{"middle": 1, "slot": 2, "timed_out": -1, "gain": 1.0, "open": 1.0, "place": np.nan, "rate": rate},
-            **{"ahead": self.ahead, "analysed": self.whole, "log_rows": log.shape[0], "log_width": log.shape[1]},
+            **{"ahead": self.ahead, "log_rows": log.shape[0], "log_width": log.shape[1]},
             "age": round(HOLD * rate),
             "fade": round(FADE * rate),
+            "fade_out": round(CHANGE[0] * rate),
+            "fade_in": round(CHANGE[1] * rate),
             "switch": -round(FADE * rate),
             "touch_step": 1.0 / (TOUCH_FADE * rate),
             "closing_step": 1.0 / (FADE_OUT * rate),
@@ -185,8 +202,27 @@ class RealtimeEntry:
         PLAIN(sensed.ctypes.data, drive.ctypes.data, len(sensed), self.user_data)
         return drive
 
-    def play(self, voice: Voice) -> None:
-        """Fade from the texture that plays into another one, within `voices.FADE`; one change after the other."""
+    def play(self, voice: Voice, controller: Any = None) -> None:
+        """Fade from the texture that plays into another one, within `voices.FADE`; one change after the other.
+
+        A law by bands takes another texture with a `controller` designed for it, on the same device: the old texture
+        fades out, the controller takes over, and its texture fades in (`CHANGE`).  `control.state_transfer.ready`
+        prepares it.  `send` remains that of the entry's first controller.
+
+        Raises
+        ------
+        ValueError
+            The controller has other channels, sensors, block or look-ahead than the first one.
+        """
+        controller = self._last if controller is None else controller
+        for name in ("channels", "sensors", "block", "lookahead"):
+            found, first = (getattr(each, name, 0) for each in (controller, self.controller))
+            if found != first:
+                raise ValueError(f"controller.{name} = {found}: must be {first}, as of the one before")
+        law, voice.law = self._law(controller)
+        for name, value in law.items():
+            voice.record[name] = value
+        self._last = controller
         self._slot[VOICE_ADDRESS] = voice.address
         self._voices = [each for each in self._voices if each.address in self._heard()]
         self._voices += [voice]
@@ -282,6 +318,13 @@ class RealtimeEntry:
     def current_gain(self) -> float:
         """Factor on the texture at the moment."""
         return float(self._entry["gain"][0])
+
+    @property
+    def running(self) -> Any:
+        """The controller that runs: of the present texture or, until it has faded out, of the one before."""
+        address = int(self._entry["controller"][0])
+        laws = [self._last, *(voice.law[0] for voice in self._voices)]
+        return next((each for each in laws if each.state.ctypes.data == address), self.controller)
 
     @property
     def refused(self) -> int:

@@ -13,6 +13,7 @@ from numba import carray, types
 
 from hapticrender.control.carriers import track_finger
 from hapticrender.control.records import CONTROLLER_T
+from hapticrender.control.state_transfer import transfer
 from hapticrender.jit import F8, I8, CFunction, call, entry, kernel, pointer, record, swap
 from hapticrender.protocols import Flag
 from hapticrender.voices import VOICE_T, along_surface, eased, in_time
@@ -33,13 +34,14 @@ POSITION, VELOCITY, LOAD, PLAYING, GAIN, VOICE_ADDRESS, FINGER_CHANGES, SETPOINT
 HEAD = 10
 
 _ADDRESSES = "step controller signals slots_at setpoints_at sensed_at drive_at position_at waveform_at flags_at"
-_COUNTS = "block sensors channels setpoints middle slot age samples flags refused lost ahead analysed idle timed_out"
-_TEXTURE = "current previous switch gains_at tracker log_at log_rows log_width given taken"
+_COUNTS = "block sensors channels setpoints middle slot age samples flags refused lost ahead idle timed_out"
+_TEXTURE = "current previous switch analysed shared changes bump_at gains_at"
+_LOG = "tracker log_at log_rows log_width given taken"
 _STATE = "finger_changes setpoint_changes calls gain touch place pace offset offset_input lead lead_input open"
-_SETTINGS = "rate sensed_scale drive_scale fade touch_step gain_pole offset_kept closing_step"
+_SETTINGS = "rate sensed_scale drive_scale fade fade_out fade_in touch_step gain_pole offset_kept closing_step"
 ENTRY = np.dtype(
     [
-        *((name, np.int64) for name in f"{_ADDRESSES} {_COUNTS} {_TEXTURE}".split()),
+        *((name, np.int64) for name in f"{_ADDRESSES} {_COUNTS} {_TEXTURE} {_LOG}".split()),
         *((name, np.float64) for name in f"{_STATE} {_SETTINGS}".split()),
     ]
 )
@@ -51,6 +53,20 @@ MIDDLE_AT = ENTRY.fields["middle"][1] if ENTRY.fields else 0
 def publish(entry, back):
     """Swap the writer's slot `back` for the one in the middle; returns the writer's next slot."""
     return swap(entry + MIDDLE_AT, back | FRESH) & (FRESH - 1)
+
+
+@kernel
+def duration(entry):
+    """Samples of the last change of texture."""
+    e = record(entry, ENTRY_T, 0)
+    return e.fade_out + e.fade_in if e.changes > 0 else e.fade
+
+
+@kernel
+def waits(entry):
+    """Whether the controller of the present texture has yet to take over."""
+    e = record(entry, ENTRY_T, 0)
+    return e.current != 0 and record(e.current, VOICE_T, 0).controller != e.controller
 
 
 @kernel
@@ -73,10 +89,60 @@ def receive(entry):
         e.offset_input = e.offset_input + jump - e.offset if abs(jump) < JUMP else 0.0
         e.offset = jump if abs(jump) < JUMP else 0.0
     voice = int(slot[VOICE_ADDRESS])
-    if voice != e.current and e.samples >= e.switch + e.fade:  # one change after the other
+    if voice != e.current and e.samples >= e.switch + duration(entry) and not waits(entry):  # one after the other
+        v = record(voice, VOICE_T, 0)
         e.previous, e.current, e.switch = e.current, voice, e.samples + e.ahead
-        record(voice, VOICE_T, 0).begun = e.switch
+        e.changes, v.begun = 1 if v.controller != e.controller else 0, e.switch
     return e.slots_at + 8 * width * e.slot
+
+
+@kernel
+def shares(entry, sample):
+    """Share of the texture before and of the present one: one fades over the other, or after it with its controller."""
+    e = record(entry, ENTRY_T, 0)
+    since = sample - e.switch
+    if e.changes > 0:
+        return 1.0 - eased(since / e.fade_out), eased((since - e.fade_out) / e.fade_in)
+    return 1.0 - eased(since / e.fade), eased(since / e.fade)
+
+
+@kernel
+def take_over(entry):
+    """Let the controller of the texture that begins take over: it goes on from the state of the one before.
+
+    That one computes this block too, so that the difference of the two drives is known.
+    """
+    e = record(entry, ENTRY_T, 0)
+    v, drive = record(e.current, VOICE_T, 0), carray(pointer(e.drive_at, F8), e.block * e.channels)
+    bump, flags = carray(pointer(e.bump_at, F8), e.channels), carray(pointer(e.flags_at, I8), e.block)
+    transfer(e.shared, v.shared)
+    call(e.step, (e.controller, e.signals, 0, e.block))
+    for m in range(e.block):
+        flags[m] &= ~STOPPED  # of this block the next one decides
+    for i in range(e.channels):
+        bump[i] = drive[i]
+    e.step, e.controller, e.signals, e.analysed, e.shared = v.step, v.controller, v.signals, v.analysed, v.shared
+    v.begun = e.samples
+    call(e.step, (e.controller, e.signals, 0, e.block))
+    for i in range(e.channels):
+        bump[i] -= drive[i]
+
+
+@kernel
+def run_controller(entry):
+    """Advance the controller by a block; after a change, what its drive differs from the last one's fades out."""
+    e = record(entry, ENTRY_T, 0)
+    changing = e.changes > 0 and e.switch + e.fade_out <= e.samples
+    if changing and waits(entry):
+        take_over(entry)
+    else:
+        call(e.step, (e.controller, e.signals, 0, e.block))
+    if changing and e.samples < e.switch + duration(entry):
+        drive, bump = carray(pointer(e.drive_at, F8), (e.block, e.channels)), carray(pointer(e.bump_at, F8), e.channels)
+        for m in range(e.block):
+            left = 1.0 - shares(entry, e.samples + m)[1]
+            for i in range(e.channels):
+                drive[m, i] += left * bump[i]
 
 
 @kernel
@@ -111,11 +177,11 @@ def follow_finger(entry, slot, m):
 def texture_at(entry, sample, position, gain, touch):
     """Texture at a sample: a voice while it fades into the next one."""
     e = record(entry, ENTRY_T, 0)
-    weight, total = eased((sample - e.switch) / e.fade), 0.0
+    (before, present), total = shares(entry, sample), 0.0
     if e.current != 0:
-        total += weight * gain * (in_time(e.current, sample) + touch * along_surface(e.current, position))
-    if e.previous != 0 and weight < 1.0:
-        total += (1.0 - weight) * gain * (in_time(e.previous, sample) + touch * along_surface(e.previous, position))
+        total += present * gain * (in_time(e.current, sample) + touch * along_surface(e.current, position))
+    if e.previous != 0 and before > 0.0:
+        total += before * gain * (in_time(e.previous, sample) + touch * along_surface(e.previous, position))
     return total
 
 
@@ -132,7 +198,9 @@ def play_texture(entry, slot):
         now, (here, there) = e.samples + m, follow_finger(entry, slot, m)
         e.gain += e.gain_pole * (values[GAIN] - e.gain)
         gain, touch = e.gain, eased(e.touch)
-        waveform[m] = texture_at(entry, now + e.ahead, there, gain, touch) if e.analysed > 0 else gain
+        before, present = shares(entry, now)
+        of_bands = gain * (before + present)
+        waveform[m] = texture_at(entry, now + e.ahead, there, gain, touch) if e.analysed > 0 else of_bands
         gains[(now + e.ahead) % (e.ahead + 1), 0], gains[(now + e.ahead) % (e.ahead + 1), 1] = gain, touch
         then = now % (e.ahead + 1)
         log[now % e.log_rows, e.channels + e.sensors + 2] = texture_at(entry, now, here, gains[then, 0], gains[then, 1])
@@ -193,7 +261,7 @@ def advance(entry):
         flags[m] = e.lost
     e.lost = 0
     if carray(pointer(slot, F8), HEAD)[PLAYING] > 0.0 and e.open > 0.0:
-        call(e.step, (e.controller, e.signals, 0, e.block))
+        run_controller(entry)
     else:
         for i in range(e.block * e.channels):
             drive[i] = 0.0

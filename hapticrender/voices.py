@@ -25,10 +25,15 @@ FADE = 0.04  # s: of one texture into another, and of what ends
 VOICE = np.dtype(
     [
         *((name, np.int64) for name in ("samples_at", "length", "written", "begun", "profile_at", "points")),
-        *((name, np.float64) for name in ("start", "step", "fade")),
+        *((name, np.int64) for name in ("step", "controller", "signals", "analysed", "shared")),
+        *((name, np.float64) for name in ("start", "spacing", "fade")),
     ]
 )
-"""Ring of samples, how many were ever written, the sample at which the texture began; profile from `start` (m) on."""
+"""Ring of samples, how many were ever written, the sample at which the texture began; profile from `start` (m) on.
+
+Then the controller that plays it: its step, state and signals, whether it takes a waveform (else a factor), and the
+table of the state that it shares with others (see `control.state_transfer`).
+"""
 VOICE_T = numba.from_dtype(VOICE)
 
 
@@ -56,7 +61,7 @@ def along_surface(voice, position):
     if v.points == 0 or not abs(position) < 1e3:
         return 0.0
     profile = carray(pointer(v.profile_at, F8), v.points)
-    place = min(max((position - v.start) / v.step, 1.0), v.points - 3.0)
+    place = min(max((position - v.start) / v.spacing, 1.0), v.points - 3.0)
     i = int(place)
     x = place - i
     low, high = (x + 1.0) * (2.0 - x) / 2.0, x * (1.0 - x) / 6.0
@@ -83,6 +88,7 @@ class Voice:
 
     def __init__(self, texture: Texture, rate: float, waveform: Any = None) -> None:
         self.texture, self.rate, self._parts = texture, rate, SeparatedTexture(texture, waveform)
+        self.law: Any = None  # keeps the controller that plays it, and its signals, alive
         self._samples = np.zeros(2 * round(AHEAD * rate) if self._parts.timed else 0)
         places = np.arange(-REACH, REACH, STEP) if self._parts.spatial else np.zeros(0)
         self._profile = self._parts.along_surface(places)
@@ -93,7 +99,7 @@ class Voice:
             "profile_at": self._profile.ctypes.data,
             "points": len(self._profile),
             "start": -REACH,
-            "step": STEP,
+            "spacing": STEP,
             "fade": FADE * rate,
         }
         for name, value in values.items():

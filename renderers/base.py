@@ -62,6 +62,7 @@ class BaseRenderer:
             differentiated=self.differentiated,
             controller=partial(design, bands),
             design=design,
+            shape=self.shape(setup),
             probe=self.probes(setup, device),
         )
 
@@ -110,6 +111,10 @@ class BaseRenderer:
     def waveform(self, setup: Setup) -> Waveform:
         """Return the target waveform over time (s) and position (m), in the device's quantity."""
         return getattr(setup, "scene", setup).texture.waveform
+
+    def shape(self, setup: Setup) -> Any:
+        """Return the static characteristic that the scene needs before the device; None: none."""
+        return None
 
     def design(self, method: Method, model: DeviceModel, bands: Bands, *, feedback: bool = True) -> Controller:
         """Return a controller of `method` for the whole device, supervised."""

@@ -120,6 +120,10 @@ class ElectroadhesionRenderer(FrictionRenderer):
         carrier, rate = setup.assumed.carrier_frequency, setup.assumed.rate
         return CarrierDriver(driver, setup.compensation, frequency=carrier, envelope_rate=rate)
 
+    def shape(self, setup: ScreenSetup) -> SquareRoot:
+        """Return the square root for the scene."""
+        return setup.compensation
+
     def device_model(self, setup: ScreenSetup, driver: Driver) -> DeviceModel:
         """Return the device model of the screen behind `driver`."""
         check_channels(driver, {1: ""}, {0: "", 1: ""})

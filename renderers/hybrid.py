@@ -170,6 +170,10 @@ class HybridRenderer(BaseRenderer):
         shape = np.zeros_like if setup.friction is None else setup.friction.compensation
         return HybridDriver(driver, shape, lever[:, None] * model.coordinate_from_sensed, setup.velocity_per_force)
 
+    def shape(self, setup: HybridSetup) -> Any:
+        """Return the square root for the screen's share of the scene."""
+        return None if setup.friction is None else setup.friction.compensation
+
     def device_model(self, setup: HybridSetup, driver: Driver) -> CombinedModel:
         """Return the device models of the two parts behind `driver`."""
         plate = self._plate.device_model(setup.plate, _part_of(driver, COILS, SENSORS, "plate"))

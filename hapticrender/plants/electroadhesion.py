@@ -30,7 +30,7 @@ Balasubramanian, Pool, Vardar 2025 (lag of friction); Yamamoto and Yamamoto 1976
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -76,6 +76,15 @@ class SquareRoot(Validated):
         super().__post_init__()
         if self.bias <= self.floor:
             raise ValueError(f"bias = {self.bias!r}: must be > floor = {self.floor:g} N")
+
+    def after(self, before: Any, share: float) -> SquareRoot:
+        """Return this one, its bias and floor gone up by a `share` (> 0 to 1) of the way from those of the one before.
+
+        Where they were higher they stay: a bias that is too large costs current only.
+        """
+        bias, floor = (before.bias, before.floor) if isinstance(before, SquareRoot) else (0.0, 0.0)
+        bias, floor = bias + share * max(self.bias - bias, 0.0), floor + share * max(self.floor - floor, 0.0)
+        return replace(self, bias=bias, floor=floor)
 
     def __call__(self, drive: Any) -> Any:
         """Current envelope (A, peak) for a `drive` (N of attraction around the bias)."""
@@ -224,9 +233,21 @@ class ElectroadhesionScreen(CompiledPlant):
         compensation: SquareRoot | None = None,
     ) -> None:
         super().__init__(finger, parameters.rate, seed=seed)
-        self.parameters, self.compensation = parameters, compensation
+        self.parameters = parameters
         self.noise_channels = 1 + 2 * parameters.oversampling if parameters.sensor == "impedance" else 1
         self.state = screen_record(parameters, compensation)
+        self._shape = compensation
+
+    @property
+    def shape(self) -> SquareRoot | None:
+        """The compensation; another one acts from the next sample on."""
+        return self._shape
+
+    @shape.setter
+    def shape(self, shape: SquareRoot) -> None:
+        self._shape, self.state["compensated"] = shape, True
+        for name in ("bias", "floor", "gain", "straight"):
+            self.state[name] = getattr(shape, name)
 
 
 def screen_record(parameters: ElectroadhesionParameters, compensation: SquareRoot | None) -> Array:

@@ -12,6 +12,8 @@ measured by fingers that slid over a vibrating plate.
 
 from __future__ import annotations
 
+from typing import Any
+
 import numba
 import numpy as np
 from numba import carray
@@ -116,6 +118,15 @@ class HybridPlant(CompiledPlant):
             self.state[f"{name}_motion"] = row.ctypes.data
         self.state["noise_channels"] = self.noise_channels
         self.state["input_channels"] = screen.inputs(0, 1).shape[1]
+
+    @property
+    def shape(self) -> Any:
+        """What is before the screen; see `ElectroadhesionScreen.shape`."""
+        return getattr(self.screen, "shape", None)
+
+    @shape.setter
+    def shape(self, shape: Any) -> None:
+        self.screen.shape = shape  # type: ignore[attr-defined]
 
     def inputs(self, first: int, n: int) -> Array:
         """Finger and whatever else the screen takes, sample by sample."""

@@ -1,0 +1,101 @@
+"""State that a controller hands on to another one of the same device: all that is not of its bands.
+
+A law by bands has a controller for each texture.  What the running one has found of finger, load and device, and its
+supervisor's memory (tests, heat, a stop), lie in blocks of memory that are laid out alike in the next one; `transfer`
+copies them when that one takes over.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numba import carray
+
+from hapticrender.control.carriers import FRESH_TIME
+from hapticrender.control.combined import CombinedController
+from hapticrender.control.inverse import WaveformController
+from hapticrender.control.inverse_records import INVERSE, RING
+from hapticrender.control.records import CONTROLLER
+from hapticrender.control.supervisor import SupervisedController
+from hapticrender.control.supervisor_kernel import SUPERVISOR
+from hapticrender.jit import I8, kernel, pointer
+from hapticrender.protocols import Array
+
+PARTS, BLOCKS = 2, 11  # of a device; of a part
+ROWS = PARTS * BLOCKS
+TRACKER = 2  # block of the finger's position and velocity
+NONE = (0, 0)
+
+Block = tuple[int, int]  # address, 8-byte words
+
+
+@kernel
+def transfer(source, target):
+    """Copy the state from one table of `state_table` to another; a block that either lacks is left as it is."""
+    old, new = carray(pointer(source, I8), (ROWS, 2)), carray(pointer(target, I8), (ROWS, 2))
+    for k in range(ROWS):
+        if old[k, 1] == new[k, 1]:
+            words, copies = carray(pointer(old[k, 0], I8), old[k, 1]), carray(pointer(new[k, 0], I8), old[k, 1])
+            for i in range(old[k, 1]):
+                copies[i] = words[i]
+
+
+def state_table(controller: Any) -> Array:
+    """Address and number of 8-byte words of every block of state, shape (`ROWS`, 2); zeros where there is none.
+
+    The controller has to outlive the table.
+    """
+    table = np.zeros((PARTS, BLOCKS, 2), np.int64)
+    for i, part in enumerate(_parts(controller)):
+        table[i] = _supervised(part) + _law(getattr(part, "controller", part))
+    if not table[1, TRACKER].any():  # both parts have one finger
+        table[1, TRACKER] = table[0, TRACKER]
+    return table.reshape(ROWS, 2)
+
+
+def ready(controller: Any) -> None:
+    """Prepare a controller at rest to take over under a finger: its targets are there, and what it has yet to find.
+
+    A part that nothing is transferred to first finds the steady friction, as after a touch.
+    """
+    for part in _parts(controller):
+        bank = getattr(part, "controller", part)
+        if bank is not None:
+            bank.tiles["fade"], bank.state["fresh"] = 1.0, FRESH_TIME * bank.rate
+
+
+def _parts(controller: Any) -> Sequence[Any]:
+    return controller.parts if isinstance(controller, CombinedController) else (controller,)
+
+
+def _supervised(controller: Any) -> list[Block]:
+    """Blocks of a supervisor."""
+    if not isinstance(controller, SupervisedController):
+        return [NONE] * 2
+    p = controller.state["p"][0]
+    return [_fields(controller.state.ctypes.data, SUPERVISOR, "fade"), (int(p["forces_at"]), 3 * (int(p["delay"]) + 1))]
+
+
+def _law(controller: Any) -> list[Block]:
+    """Blocks of a controller: finger and load, the rounding of its drive; what the waveform law has learned."""
+    state = getattr(controller, "state", None)
+    if state is None or state.dtype != CONTROLLER:
+        return [NONE] * 9
+    at = state.ctypes.data
+    tracker = _fields(at, CONTROLLER, "held_position", "fresh")
+    found = [_fields(at, CONTROLLER, "fresh", "past"), _fields(at, CONTROLLER, "shaper", "sample")]
+    if not isinstance(controller, WaveformController):
+        return [tracker, *found] + [NONE] * 6
+    law, at, delay = controller.law, int(state["loops_at"][0]), int(controller.law["delay"])
+    found += [_fields(at, INVERSE, "fade", "ring_at"), _fields(at, INVERSE, "window")]
+    found += [(int(law["ring_at"]), RING * (delay + 1)), (int(law["reference_at"]), delay)]
+    return [tracker, NONE, NONE, *found]  # other laws mean other things by the first two
+
+
+def _fields(address: int, kind: np.dtype, first: str, end: str | None = None) -> Block:
+    """Fields of a record of 8-byte numbers at `address`, from `first` on and before `end`."""
+    offsets = {name: place[1] for name, place in (kind.fields or {}).items()}
+    start, stop = offsets[first], kind.itemsize if end is None else offsets[end]
+    return address + start, (stop - start) // 8
