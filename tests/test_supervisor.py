@@ -104,8 +104,8 @@ CHANGES = {  # sensors and coils from 0.5 s on: bounds of time (s) and motion (m
     "gain of 3": (3.0 * np.eye(2), np.eye(2), 8e-3, 100e-6, "sensor 1 and 2: the samples are suddenly (2|3)"),
     "sensor of gain 3": (np.diag([3.0, 1.0]), np.eye(2), 8e-3, 100e-6, "sensor 1: the samples are suddenly (2|3)"),
     "a tenth": (0.1 * np.eye(2), np.eye(2), 8e-3, 100e-6, "sensor 1 and 2: the samples are suddenly 0.[01]"),
-    "coils inverted": (np.eye(2), -np.eye(2), 15e-3, 600e-6, "actuator 1 and 2: the motion is that of -"),
-    "coil inverted": (np.eye(2), np.diag([1.0, -1.0]), 15e-3, 600e-6, "actuator 2: the motion is that of -"),
+    "coils inverted": (np.eye(2), -np.eye(2), 15e-3, 750e-6, "actuator 1 and 2: the motion is that of -"),
+    "coil inverted": (np.eye(2), np.diag([1.0, -1.0]), 15e-3, 750e-6, "actuator 2: the motion is that of -"),
 }
 
 
@@ -125,7 +125,7 @@ class Rewired(Watched):
 @pytest.mark.parametrize(("frequency", "truth"), [(72.0, {}), (189.0, FINGER)], ids=["72 free", "189 touched"])
 @pytest.mark.parametrize("change", CHANGES)
 def test_a_gain_that_changes_during_a_run_stops_the_drive_and_is_named(change, frequency, truth):
-    """With the fade of 2 ms, zero drive within 10 ms where a sensor changes; an inverted coil moves up to 0.5 mm."""
+    """With the fade of 2 ms, zero drive within 10 ms where a sensor changes; an inverted coil moves up to 0.7 mm."""
     sensors, coils, latest, most, named = CHANGES[change]
     plate = Rewired(sensors, coils, **truth)
     with pytest.raises(hr.DeviceFault, match=named) as stopped:

@@ -73,18 +73,17 @@ def measures_moment(model: DeviceModel) -> bool:
 
 def bound_of(freedom: float, false_alarms: float = FALSE_ALARMS) -> float:
     """Value that a chi-square statistic of `freedom` passes with the probability `false_alarms`."""
-    from scipy.stats import chi2
+    from scipy.special import chdtri
 
-    free = freedom / CORRELATION
-    return float(CORRELATION * chi2.isf(false_alarms, free))
+    return float(CORRELATION * chdtri(freedom / CORRELATION, false_alarms))
 
 
 def miss_rate(excess: float, freedom: float, false_alarms: float = FALSE_ALARMS) -> float:
     """Probability that two touches that add `excess` to the mean of the statistic stay below the bound."""
-    from scipy.stats import ncx2
+    from scipy.special import chndtr
 
     bound, free = bound_of(freedom, false_alarms) / CORRELATION, freedom / CORRELATION
-    return float(ncx2.cdf(bound, free, excess / CORRELATION))
+    return float(chndtr(bound, free, excess / CORRELATION))
 
 
 class TouchMonitor:

@@ -15,6 +15,7 @@ from numba import carray
 
 from hapticrender.control.carriers import FRESH_TIME
 from hapticrender.control.combined import CombinedController
+from hapticrender.control.gains import GAINS
 from hapticrender.control.inverse import WaveformController
 from hapticrender.control.inverse_records import INVERSE, RING
 from hapticrender.control.records import CONTROLLER
@@ -23,9 +24,9 @@ from hapticrender.control.supervisor_kernel import SUPERVISOR
 from hapticrender.jit import I8, kernel, pointer
 from hapticrender.protocols import Array
 
-PARTS, BLOCKS = 2, 11  # of a device; of a part
+PARTS, BLOCKS = 2, 12  # of a device; of a part
 ROWS = PARTS * BLOCKS
-TRACKER = 2  # block of the finger's position and velocity
+TRACKER = 3  # block of the finger's position and velocity
 NONE = (0, 0)
 
 Block = tuple[int, int]  # address, 8-byte words
@@ -73,9 +74,13 @@ def _parts(controller: Any) -> Sequence[Any]:
 def _supervised(controller: Any) -> list[Block]:
     """Blocks of a supervisor."""
     if not isinstance(controller, SupervisedController):
-        return [NONE] * 2
+        return [NONE] * 3
     p = controller.state["p"][0]
-    return [_fields(controller.state.ctypes.data, SUPERVISOR, "fade"), (int(p["forces_at"]), 3 * (int(p["delay"]) + 1))]
+    found = [
+        _fields(controller.state.ctypes.data, SUPERVISOR, "fade"),
+        (int(p["forces_at"]), 3 * (int(p["delay"]) + 1)),
+    ]
+    return [*found, _fields(int(p["gains"]), GAINS, "models") if p["gains"] else NONE]
 
 
 def _law(controller: Any) -> list[Block]:
