@@ -166,9 +166,9 @@ class LiveLoop:
             _widen(part, its_model)
         if controller is not self.controller:
             ready(controller)
+        self.entry.play(voice, controller)
         if rendering.shape is not None:
             self._reshaping = self._device.shape, rendering.shape, self.samples
-        self.entry.play(voice, controller)
         self.rendering = replace(rendering, **{name: getattr(self.rendering, name) for name in DEVICE})
         self.model, self.controller, self._bands = model, controller, rendering.bands
 

@@ -117,7 +117,7 @@ class RealtimeEntry:
         self.ahead, self._tracker = int(getattr(controller, "lookahead", 0)), np.zeros(1, CONTROLLER)
         self._tracker["p"]["rate"] = self.rate
         self._arrays = self._buffers()
-        law, self._keep = self._law(controller)
+        law, self._keep = self._fields, self._held = self._law(controller)
         self._entry = np.zeros(1, ENTRY)
         fixed = {
             **law,
@@ -212,17 +212,25 @@ class RealtimeEntry:
         Raises
         ------
         ValueError
-            The controller has other channels, sensors, block or look-ahead than the first one.
+            The controller has another number of channels or sensors, block, look-ahead, rate or delay than the one
+            before, or the voice plays under another controller.
         """
         controller = self._last if controller is None else controller
-        for name in ("channels", "sensors", "block", "lookahead"):
+        for name in ("channels", "sensors", "block", "lookahead", "rate"):
             found, first = (getattr(each, name, 0) for each in (controller, self.controller))
             if found != first:
                 raise ValueError(f"controller.{name} = {found}: must be {first}, as of the one before")
-        law, voice.law = self._law(controller)
-        for name, value in law.items():
+        if voice.law is not None and voice.law[0] is not controller and voice.address in self._heard():
+            raise ValueError("voice: plays under another controller: must be a new Voice of the texture")
+        if controller is not self._last:
+            fields, held = self._law(controller)
+            before, after = self._held[-1][:, 1], held[-1][:, 1]
+            if np.any((before != after) & (before > 0) & (after > 0)):
+                raise ValueError("controller: its state is laid out otherwise: must have the delay of the one before")
+            self._last, self._fields, self._held = controller, fields, held
+        voice.law = self._held
+        for name, value in self._fields.items():
             voice.record[name] = value
-        self._last = controller
         self._slot[VOICE_ADDRESS] = voice.address
         self._voices = [each for each in self._voices if each.address in self._heard()]
         self._voices += [voice]

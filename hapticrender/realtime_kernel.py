@@ -122,7 +122,7 @@ def take_over(entry):
     for i in range(e.channels):
         bump[i] = drive[i]
     e.step, e.controller, e.signals, e.analysed, e.shared = v.step, v.controller, v.signals, v.analysed, v.shared
-    v.begun = e.samples
+    v.begun, e.switch = e.samples, e.samples - e.fade_out
     call(e.step, (e.controller, e.signals, 0, e.block))
     for i in range(e.channels):
         bump[i] -= drive[i]
@@ -139,8 +139,9 @@ def run_controller(entry):
         call(e.step, (e.controller, e.signals, 0, e.block))
     if changing and e.samples < e.switch + duration(entry):
         drive, bump = carray(pointer(e.drive_at, F8), (e.block, e.channels)), carray(pointer(e.bump_at, F8), e.channels)
+        flags = carray(pointer(e.flags_at, I8), e.block)
         for m in range(e.block):
-            left = 1.0 - shares(entry, e.samples + m)[1]
+            left = 1.0 - shares(entry, e.samples + m)[1] if flags[m] & STOPPED == 0 else 0.0
             for i in range(e.channels):
                 drive[m, i] += left * bump[i]
 

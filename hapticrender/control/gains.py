@@ -72,9 +72,11 @@ GAINS_T = numba.from_dtype(GAINS)
 
 
 def design_gains(model: DeviceModel, noise: float) -> Array | None:
-    """Record of the tests for a device of at most two sensors, of `noise` (rms), and two actuators; else None."""
+    """Record of the tests; None but for one or two actuators, and sensors of `noise` (rms), that show all motion."""
     sensors, n, actuators = model.coordinate_from_sensed.shape[1], len(model.mass), model.force_from_drive.shape[1]
-    if max(sensors, actuators) > MOST:
+    seen = sensors > 0 and np.linalg.matrix_rank(model.coordinate_from_sensed) == n
+    moves = math.isfinite(noise) and np.linalg.matrix_rank(model.mass) == n
+    if max(sensors, actuators) > MOST or not (seen and moves):
         return None
     inverse, force_map = np.linalg.inv(model.mass), model.force_from_drive
     a, b = np.zeros((2 * n, 2 * n)), np.vstack([np.zeros((n, n)), inverse])
