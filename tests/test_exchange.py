@@ -149,6 +149,33 @@ def test_a_stop_stays_a_stop(change, rng):
     assert second.fault.cause == INVALID
 
 
+def test_a_stop_during_a_change_is_a_stop(change, rng):
+    """What the drives differ by fades out for 34 ms, unless the controller that takes over is stopped."""
+    entry, _, second = change
+    entry.process(quiet(rng, 0.1))
+    entry.play(Voice(grating(frequency=80.0), RATE), second)
+    entry.process(quiet(rng, CHANGE[0] + 2 / RATE))
+    assert entry.running is second
+    assert entry.process(quiet(rng, 1 / RATE)).any()
+    second.state["cause"], second.state["fade"] = INVALID, 0.0
+    assert not entry.process(quiet(rng, CHANGE[1])).any()
+
+
+def test_a_voice_is_played_by_one_controller_whose_arrays_stay(change, rng):
+    entry, _, second = change
+    voice = Voice(grating(frequency=80.0), RATE)
+    entry.play(voice, second)
+    entry.process(quiet(rng, 0.1))
+    third = plate_controller(tones(140.0), parameters=PlateParameters())
+    with pytest.raises(ValueError, match="voice: plays under another controller"):
+        entry.play(voice, third)
+    for _ in range(4):
+        last = Voice(grating(frequency=80.0), RATE)
+        entry.play(last)
+        entry.process(quiet(rng, 0.1))
+    assert entry._entry["signals"] == last.law[2].ctypes.data
+
+
 def test_two_changes_at_once_come_one_after_the_other(change, rng):
     """The third texture waits until the second one's controller has taken over."""
     entry, first, second = change
