@@ -1,6 +1,6 @@
 /*
  * The board as a process: its serial line is a pseudo-terminal, its sensors and coils are those of a plate model, and
- * the finger presses where the host says.
+ * the finger is where the host sends it.
  *
  *   board_posix LINK [--finger MASS,DAMPING,STIFFNESS] [--noise RMS] [--seed N] [--log FILE] [--slow N]
  *               [--gain FIRST,SECOND] [--step]
@@ -34,8 +34,7 @@
 const uint32_t hardware_cycle_rate = 1000000000u;
 
 static board_t board;
-static plate_t plate = {4e-3, 1.5, 300.0, 1e-6, 1u, {0.0, 0.0, 0.0, 0.0}};
-static double acting[2], handed_over[2];          /* A: current now, and from the next tick on */
+static plate_t plate = PLATE_DEFAULT;
 static double gain[2] = {1.0, 1.0};               /* of the sensors */
 static int line = -1;                             /* master of the pseudo-terminal */
 static double slower = 1.0;                       /* than the clock */
@@ -114,9 +113,7 @@ static void wait_for_clock(void)
 
 uint32_t hardware_wait(void)
 {
-    plate_advance(&plate, 1.0 / (double)design.rate, acting, (double)board.position, (double)board.finger.load);
-    acting[0] = handed_over[0];
-    acting[1] = handed_over[1];
+    plate_advance(&plate, 1.0 / (double)design.rate, (double)board.position, (double)board.finger.load);
     if (!stepped) {
         wait_for_clock();
         return ended ? 0u : 1u;
@@ -140,8 +137,8 @@ void hardware_sense(real_t sensed[])
 
 void hardware_drive(const real_t drive[])
 {
-    handed_over[0] = (double)drive[0];
-    handed_over[1] = (double)drive[1];
+    plate.next[0] = (double)drive[0];
+    plate.next[1] = (double)drive[1];
 }
 
 size_t hardware_read(uint8_t bytes[], size_t most)
@@ -187,7 +184,7 @@ static void log_tick(void)
         state = board.state;
         fprintf(log_file, "%" PRIu32 " state %d %d\n", board.sample, (int)state, (int)board.cause);
     }
-    int drives = handed_over[0] < 0.0 || handed_over[0] > 0.0 || handed_over[1] < 0.0 || handed_over[1] > 0.0;
+    int drives = plate.next[0] < 0.0 || plate.next[0] > 0.0 || plate.next[1] < 0.0 || plate.next[1] > 0.0;
     if (drives != driven) {
         driven = drives;
         fprintf(log_file, "%" PRIu32 " drives %d\n", board.sample, driven);
