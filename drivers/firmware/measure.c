@@ -23,7 +23,7 @@ static law_t law;
 static supervisor_t supervisor;
 static plate_t plate = PLATE_DEFAULT;
 
-static uint32_t measure_count(void) { return ~TIMER0_VALUE; }
+static __attribute__((noinline)) uint32_t measure_count(void) { return ~TIMER0_VALUE; }
 
 /* A line of a name and numbers of magnitude below 4e6, with three digits after the point. */
 static void print_line(const char *name, const double values[], uint32_t count)
