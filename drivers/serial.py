@@ -11,6 +11,7 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+from serial.tools import list_ports
 
 from hapticrender.bands import Bands
 from hapticrender.drivers.base import BaseDriver
@@ -18,8 +19,10 @@ from hapticrender.drivers.board_client import BoardClient as BoardClient
 from hapticrender.drivers.board_line import Line as Line
 from hapticrender.drivers.board_loop import BoardLoop, playable
 from hapticrender.drivers.board_texture import BoardTexture as BoardTexture
-from hapticrender.errors import DriverError
+from hapticrender.errors import DriverError, HapticError
 from hapticrender.protocols import Array, Controller, Exchange, Rendering, Sensed
+
+PATIENCE = 0.3  # s that a board has to answer where boards are listed
 
 
 class SerialDriver(BaseDriver):
@@ -59,6 +62,19 @@ class SerialDriver(BaseDriver):
             block=block,
             delay=found.delay if block == 1 else 2 * block + found.delay,
         )
+
+    @classmethod
+    def found(cls) -> list[str]:
+        """Serial ports that are there now, and the boards that answer there."""
+        return [f"{port.device}  {port.description}; {cls._board(port.device)}" for port in list_ports.comports()]
+
+    @classmethod
+    def _board(cls, port: str) -> str:
+        try:
+            board = cls(port, timeout=PATIENCE)
+        except (OSError, HapticError) as error:
+            return f"no board answers ({type(error).__name__})"
+        return f"a board of {board.rate:g} Hz, {board.drive_channels} out, {board.sensed_channels} in"
 
     def exchange(self, controller: Controller) -> Exchange | None:
         """Return the exchange that runs the board's own loop with the scene's texture; None for a block device.

@@ -94,7 +94,7 @@ def test_a_file_is_whole_after_an_exception_in_mid_run(tmp_path, rng):
 
 
 @pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="no SIGKILL on this system")
-@pytest.mark.parametrize("ending", FORMATS)
+@pytest.mark.parametrize("ending", [".wav", ".w64", ".flac", ".rf64", ".aiff"])
 def test_a_killed_process_leaves_what_it_played(tmp_path, ending):
     """All in WAV and W64; FLAC's encoder holds back a block of 4096; RF64 and AIFF count frames when closed."""
     path = tmp_path / f"a{ending}"

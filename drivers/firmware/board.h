@@ -85,8 +85,7 @@ typedef struct {
     uint32_t echo;                                /* us: host's time of the last keep-alive */
     uint32_t bad, refused, dropped;               /* frames: malformed; refused; not sent as the line was full */
     finger_input_t finger;
-    band_t staged[LAW_BANDS];
-    uint8_t staged_bytes[LAW_BANDS][20];
+    uint8_t staged[LAW_BANDS][20];                /* set-points as received, until COMMIT */
     uint32_t commits;                             /* COMMITs executed; the bands in use are `played.bands` */
     uint32_t committed;                           /* 1: this session has set-points */
     real_t gain;

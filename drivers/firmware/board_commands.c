@@ -24,34 +24,33 @@ static uint8_t setpoint(board_t *board, const frame *from)
     if (index >= LAW_BANDS) {
         return REASON_VALUE;
     }
-    const uint8_t *at = from->payload + 1;
-    memcpy(board->staged_bytes[index], at, SETPOINT_BYTES);
-    band_t band = {(real_t)get_f32(at), (real_t)get_f32(at + 4), (real_t)get_f32(at + 8), (real_t)get_f32(at + 12),
-                   (real_t)get_f32(at + 16)};
-    board->staged[index] = band;
+    memcpy(board->staged[index], from->payload + 1, SETPOINT_BYTES);
     return REASON_NONE;
 }
 
 static uint8_t commit(board_t *board, const frame *from)
 {
-    uint32_t count = from->payload[0];
+    band_t bands[LAW_BANDS];
+    uint32_t count = from->payload[0], spatial = count > 0u ? 1u : 0u;
     if (count > LAW_BANDS) {
         return REASON_VALUE;
     }
-    if (get_u32(from->payload + 1) != crc32(&board->staged_bytes[0][0], count * SETPOINT_BYTES, 0u)) {
+    if (get_u32(from->payload + 1) != crc32(&board->staged[0][0], count * SETPOINT_BYTES, 0u)) {
         return REASON_DIGEST;
     }
-    if (law_set_bands(&board->law, board->staged, count) == 0u) {
+    for (uint32_t i = 0; i < count; i++) {
+        const uint8_t *at = board->staged[i];
+        band_t band = {(real_t)get_f32(at), (real_t)get_f32(at + 4), (real_t)get_f32(at + 8),
+                       (real_t)get_f32(at + 12), (real_t)get_f32(at + 16)};
+        bands[i] = band;
+        spatial = band.wavenumber > REAL(0.0) ? spatial : 0u;
+    }
+    if (law_set_bands(&board->law, bands, count) == 0u) {
         return REASON_VALUE;
     }
-    memcpy(board->played.bands, board->staged, sizeof board->staged);
+    memcpy(board->played.bands, bands, count * sizeof bands[0]);
     board->played.bands_used = count;
-    board->played.spatial = count > 0u ? 1u : 0u;
-    for (uint32_t i = 0; i < count; i++) {
-        if (!(board->staged[i].wavenumber > REAL(0.0))) {
-            board->played.spatial = 0u;
-        }
-    }
+    board->played.spatial = spatial;
     board->committed = 1u;
     board->commits++;
     return REASON_NONE;
