@@ -40,7 +40,7 @@ class AudioDriver(BaseDriver):
     Parameters
     ----------
     device : int, str or (input, output), optional
-        Card by its index or by words of its name and host ("0", "scarlett", "usb alsa"), as ``hapticrender devices``
+        Card by its index or by parts of its name and host ("0", "scarlett", "usb alsa"), as ``hapticrender devices``
         lists them; the system's default unless given.
     channels : tuple of int, >= 1
         Outputs that carry the drive, in the order of the drive's columns.
@@ -95,7 +95,7 @@ class AudioDriver(BaseDriver):
         self.drive_per_full_scale, self.sensed_per_full_scale = drive_per_full_scale, sensed_per_full_scale
         self.sensed_scale, self.drive_scale = sensed_per_full_scale or 1.0, 1.0 / drive_per_full_scale  # of an entry
         needed = {"delay": delay, "sensed_per_full_scale (m)": sensed_per_full_scale}
-        self._unknown = [name for name, value in needed.items() if value is None] if self.inputs else []
+        self._unknown = [name for name, value in needed.items() if value is None and self.inputs]
         self._stream: Stream | None = None
         self._entry: Any = None
         self._number = 0  # of the next block of `play`
@@ -141,7 +141,7 @@ class AudioDriver(BaseDriver):
         """
         if self._unknown:
             raise DriverError(
-                f"{self}: {' and '.join(self._unknown)} is unknown, so the loop cannot be closed: connect output "
+                f"{self}: {self._unknown[0]} is unknown, so the loop cannot be closed: connect output "
                 f"{self.channels[0]} to input {self.inputs[0]}, measure with `hapticrender latency --driver {self} "
                 "--out profile.toml`, give sensed_per_full_scale too, or leave out sensed_channels to drive open loop"
             )
@@ -163,7 +163,7 @@ class AudioDriver(BaseDriver):
         """Card, number of channels and latency (s) of a side of the stream; None where no channel of it is used."""
         if not channels:
             return None
-        card = find(_index(self.device[output] if isinstance(self.device, tuple) else self.device))
+        card = find(self.device[output] if isinstance(self.device, tuple) else self.device)
         present, own, kind = (
             (card.outputs, card.output_latency, "outputs") if output else (card.inputs, card.input_latency, "inputs")
         )
@@ -291,12 +291,6 @@ class AudioDriver(BaseDriver):
 
     def __str__(self) -> str:
         return f"audio:{'' if self.device is None else self.device}"
-
-
-def _index(device: Any) -> Any:
-    """Index or words of a card; a string of digits is an index."""
-    text = str(device).strip()
-    return (int(text) if text.isdigit() else text or None) if isinstance(device, str) else device
 
 
 def _channels(name: str, given: Any) -> Channels:

@@ -72,7 +72,7 @@ class BoardClient(OpenedInWith):
     clock : module or object
         With `monotonic` and `sleep`; the module `time` unless given.
     connect : callable
-        Opens the port, see `BoardLine`.
+        Opens the port, ``connect(port, baud)``: an object with `read`, `write` and `close` that never waits.
     """
 
     def __init__(
@@ -213,7 +213,7 @@ class BoardClient(OpenedInWith):
             Samples between two rows that the board streams back; 0: none.
         telemetry : float, s
             Time between two frames of telemetry, 0.2 ms to 13 s at 5 kHz; at most 0.1 s with a texture, of which as
-            much is sent as the telemetry says has been played.
+            much is sent as has been played by the telemetry.
         """
         period = round(telemetry * self.capabilities.rate)
         for name, value, least in (("stream", stream, 0), ("telemetry", period, 1)):
@@ -241,7 +241,7 @@ class BoardClient(OpenedInWith):
         self._runs = False
 
     def telemetry(self) -> Telemetry:
-        """Return what the board last said.
+        """Return the latest telemetry; wait for the first.
 
         Raises
         ------

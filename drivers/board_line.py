@@ -40,18 +40,7 @@ def open_port(port: str, baud: int) -> Any:
 class BoardLine(Link):
     """A board that has been greeted, on a port of its own; not for several threads at once.
 
-    Parameters
-    ----------
-    port : str
-        Name of the serial port.
-    baud : int
-        Of a UART.
-    timeout : float, s
-        Longest time to an answer.
-    clock : module or object
-        With `monotonic` and `sleep`; the module `time` unless given.
-    connect : callable
-        Opens the port, ``connect(port, baud)``: an object with `read`, `write` and `close` that never waits.
+    Its parameters are those of `BoardClient`; `connect` is called with port and baud rate.
 
     Raises
     ------

@@ -82,7 +82,7 @@ class Reason(IntEnum):
     KIND = 3  # unknown
     LENGTH = 4
     VALUE = 5  # out of range
-    DIGEST = 6  # the board holds other set-points or lines than the digest says
+    DIGEST = 6  # the board holds other set-points or lines than those of the digest
     STATE = 7  # not now: nothing has been set, or something plays
 
 
@@ -104,7 +104,7 @@ class Cause(IntEnum):
     LIMIT = 3  # the drive's mean square
     SENSOR = 4  # invalid for 10 ms
     DONE = 5  # an identification has ended
-    SESSION = 6  # another host said hello
+    SESSION = 6  # another host greeted the board
     APPLICATION = 7  # no beat of the application for the time of the watchdog
     INVALID = 17  # the supervisor of the law, from here on: see docs/safety.md
     FROZEN = 18
@@ -127,7 +127,7 @@ class Frame(NamedTuple):
 
 
 class Capabilities(NamedTuple):
-    """What a board says of itself when it is greeted."""
+    """Sizes, limits and rates that a board states when it is greeted."""
 
     version: int
     nonce: int  # the host's
@@ -266,7 +266,7 @@ def digest(payloads: Sequence[bytes]) -> int:
 
 
 def capabilities(payload: bytes) -> Capabilities:
-    """What a CAPABILITIES frame says; a `ValueError` where its length is wrong."""
+    """Parse a CAPABILITIES frame; a `ValueError` where its length is wrong."""
     return Capabilities(*_fields(Kind.CAPABILITIES, payload)[0])
 
 
@@ -277,7 +277,7 @@ def reply(frame: Frame) -> tuple[int, Reason | None, int]:
 
 
 def telemetry(payload: bytes) -> Telemetry:
-    """What a TELEMETRY frame says; a `ValueError` where its length or a value is wrong."""
+    """Parse a TELEMETRY frame; a `ValueError` where its length or a value is wrong."""
     fields, rest = _fields(Kind.TELEMETRY, payload, BAND.size)
     state, cause, flags = State(fields[4]), Cause(fields[5]), Flag(fields[6])
     bands = (BandTelemetry(complex(*each[:2]), complex(*each[2:])) for each in BAND.iter_unpack(rest))
@@ -285,7 +285,7 @@ def telemetry(payload: bytes) -> Telemetry:
 
 
 def stream(payload: bytes, drive_channels: int, sensed_channels: int) -> Stream:
-    """What a STREAM frame says; a `ValueError` where its length is wrong."""
+    """Parse a STREAM frame; a `ValueError` where its length is wrong."""
     row = struct.Struct(f"<{drive_channels + sensed_channels + 3}fH")
     (first, stride), rest = _fields(Kind.STREAM, payload, row.size)
     return Stream(first, stride, tuple(row.iter_unpack(rest)))

@@ -127,7 +127,7 @@ def text() -> str:
     drivers = [["driver", "installed", "what it does"], *map(_driver, _points("drivers"))]
     there = [["--driver", "what is there"], *(row for entry in _points("drivers") for row in _there(entry))]
     extras = [["extra", "installed", "for"], *(_extra(*each) for each in EXTRAS)]
-    hint = f"--driver takes {FORMS}: hapticrender.drivers.base says in a page what a driver is."
+    hint = f"--driver takes {FORMS}: hapticrender.drivers.base describes a driver in a page."
     return "\n\n".join([table(kinds), table(drivers), hint, table(there), table(extras)])
 
 

@@ -101,7 +101,11 @@ def test_portaudio_is_what_is_declared(connected):
     ("options", "error", "message"),
     [
         ({"channels": (1, 3)}, DeviceNotFound, r"audio:plate: outputs \(1, 3\): .* has 2 outputs"),
-        ({"sensed_channels": (3,)}, DeviceNotFound, r"audio:plate: inputs \(3,\): .* has 2 inputs"),
+        (
+            {"sensed_channels": (3,), "delay": 128.0, "sensed_per_full_scale": 1e-3},
+            DeviceNotFound,
+            r"audio:plate: inputs \(3,\): .* has 2 inputs",
+        ),
         ({"device": "no such card"}, DeviceNotFound, "device 'no such card': 0 cards fit: 0 system"),
         ({"rate": 44_100.0}, DriverError, "audio:plate: open at 44100 Hz: Invalid sample rate .PortAudio -9997"),
         ({"latency": "medium"}, ValueError, "latency='medium': must be 'low', 'high' or seconds"),
@@ -177,9 +181,9 @@ def test_a_plate_is_no_cable(connected):
 
 def test_the_ring_is_closed_by_the_compiled_callback(connected, tmp_path):
     """8 bands under a finger at 48 kHz in periods of 64; 10 s, in which every period waits for all."""
-    device = connected(jack_ring.plate(), length=round(60 * RATE), noise=NOISE / METRES)
     live = driver().live()
     entry = entry_for(live)
+    device = connected(jack_ring.plate(), length=round(60 * RATE), noise=NOISE / METRES)
     with live:
         live.start(entry)
         device.say("run 7500")
@@ -202,9 +206,9 @@ def test_a_live_card_is_probed_by_play(connected, wrong):
 
 def test_the_phase_survives_an_overrun(connected, tmp_path):
     """The plate's client sleeps through 15 periods in real time: JACK loses them and says so; the loop goes on."""
-    device = connected(jack_ring.plate(), length=round(60 * RATE), noise=NOISE / METRES)
     live = driver().live()
     entry = entry_for(live)
+    device = connected(jack_ring.plate(), length=round(60 * RATE), noise=NOISE / METRES)
     with live:
         live.start(entry)
         device.say("run 2000")
@@ -222,9 +226,9 @@ def test_the_phase_survives_an_overrun(connected, tmp_path):
 @pytest.mark.parametrize("fails", [False, True])
 def test_the_drive_is_zero_at_the_end_whatever_happens(connected, tmp_path, fails):
     """What the card plays, as its other side records it; while the entry plays it is not zero."""
-    device = connected(jack_ring.straight(), length=round(60 * RATE))
     live = driver().live()
     entry = entry_for(live)
+    device = connected(jack_ring.straight(), length=round(60 * RATE))
 
     def play():
         with live:

@@ -2,8 +2,7 @@
  * The board as a process: its serial line is a pseudo-terminal, its sensors and coils are those of a plate model, and
  * the finger is where the host sends it.
  *
- *   board_posix LINK [--finger MASS,DAMPING,STIFFNESS] [--noise RMS] [--seed N] [--log FILE] [--slow N]
- *               [--gain FIRST,SECOND] [--step]
+ *   board_posix LINK [--noise RMS] [--gain FIRST,SECOND] [--log FILE] [--slow N] [--step]
  *
  * LINK becomes a symbolic link to the pseudo-terminal.  Paced by the clock, or by one that is N times as slow; with
  * --step by its standard input: a line
@@ -82,8 +81,8 @@ static int take_grant(void)
         return 0;
     }
     while (bytes_in < until) {
-        struct pollfd wanted = {line, POLLIN, 0};
-        if (poll(&wanted, 1, 1000) < 0 && errno != EINTR) {
+        struct pollfd readable = {line, POLLIN, 0};
+        if (poll(&readable, 1, 1000) < 0 && errno != EINTR) {
             return 0;
         }
         take_bytes();
@@ -220,16 +219,10 @@ static void open_line(void)
 
 static void take_option(const char *name, const char *value)
 {
-    if (strcmp(name, "--finger") == 0 && sscanf(value, "%lf,%lf,%lf", &plate.mass, &plate.damping, &plate.stiffness) == 3) {
-        return;
-    }
     if (strcmp(name, "--gain") == 0 && sscanf(value, "%lf,%lf", &gain[0], &gain[1]) == 2) {
         return;
     }
     if (strcmp(name, "--noise") == 0 && sscanf(value, "%lf", &plate.noise) == 1) {
-        return;
-    }
-    if (strcmp(name, "--seed") == 0 && sscanf(value, "%" SCNu64, &plate.random) == 1 && plate.random != 0u) {
         return;
     }
     if (strcmp(name, "--slow") == 0 && sscanf(value, "%lf", &slower) == 1 && slower >= 1.0 && slower <= 1000.0) {
