@@ -19,7 +19,7 @@ from hapticrender.errors import DeviceLost, DeviceNotFound, DeviceTimeout, Drive
 
 BAUD = 230_400  # of a UART; a board on USB or a pseudo-terminal does not care
 PAUSE = 1e-3  # s between two looks at the line
-SILENCE = 0.5  # s without a good frame from the board after which it counts as lost
+SILENCE = 0.5  # s without a valid frame from the board after which it counts as lost
 FADING = 0.2  # s: longest fade of what a command has to wait for
 
 
