@@ -13,12 +13,12 @@ OUT := out/demo
 OLDEST = $(shell sed -n 's/^dependencies = \[\(.*\)\]/\1/p' pyproject.toml | tr -d '",' | sed 's/>=/==/g')
 OLDEST_TESTS := $(addprefix tests/test_,$(addsuffix .py,math vectors kernel blocks plate contact low_pass realtime combined))
 # Tests that play in real time run first, one after the other; the rest on two cores.
-REAL_TIME := $(wildcard tests/test_audio*.py tests/test_player*.py tests/test_board_faults.py tests/test_serial_driver.py)
+REAL_TIME := $(wildcard tests/test_audio*.py tests/test_player*.py tests/test_board_live.py)
 AUDIO := jackd2 libportaudio2 libjack-jackd2-dev gcc libc6-dev
 BOARD := gcc libc6-dev make gcc-arm-none-eabi libnewlib-arm-none-eabi qemu-system-arm
 BOARD_TOOLS := { command -v gcc && command -v arm-none-eabi-gcc && command -v qemu-system-arm; } > /dev/null
-BOARD_TESTS := $(addprefix tests/test_,firmware_law.py firmware_m4.py export.py protocol.py serial_driver.py board_faults.py board_textures.py nu32.py \
-	player_board.py)
+BOARD_TESTS := $(addprefix tests/test_,firmware_law.py firmware_m4.py export.py protocol.py serial_driver.py board_faults.py board_live.py board_textures.py \
+	nu32.py player_board.py)
 API := hapticrender $(addprefix hapticrender.,loop latency sweep realtime skin validate protocols bands errors touch recordings analysis \
 	control plants renderers drivers)
 

@@ -26,7 +26,7 @@ FLAGS = "-std=c99 -O2 -funroll-loops -ffp-contract=off -mcpu=cortex-m4 -mthumb -
 LINK = "-nostartfiles -T m4.ld -ffunction-sections -fdata-sections -Wl,--gc-sections"
 MACHINE = "qemu-system-arm -M mps2-an386 -display none -monitor none -serial none"
 MACHINE += " -semihosting-config enable=on,target=native -icount shift=6"
-SCALE = 1.6  # of a count of measure_m4.c to an instruction
+SCALE = 1.6  # of a count of measure.c to an instruction
 TRACED, LANDS = 120, 20  # samples whose instructions are traced; the sample at which the finger lands
 PROCESSORS = {"168 MHz M4F": 168e6, "600 MHz M7": 600e6}  # Hz
 SPARE = 1 / 3  # of the cycles
@@ -112,7 +112,7 @@ def cycles_per_instruction(program):
 
 def build(folder, *options):
     """Program that measures a design."""
-    sources = "law learning carriers supervisor gains design plate frames texture measure measure_m4 startup_m4".split()
+    sources = "law learning carriers supervisor gains design plate frames texture measure startup_m4".split()
     program = folder / "measure.elf"
     files = [f"{name}.c" for name in sources]
     command = [f"{PREFIX}gcc", *FLAGS.split(), *LINK.split(), *options, "-o", program, *files, "-lm"]

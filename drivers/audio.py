@@ -8,6 +8,7 @@ of the set-up: the drive and the displacement at full scale, and the delay of th
 from __future__ import annotations
 
 import atexit
+import copy
 import time
 from typing import Any
 
@@ -15,7 +16,7 @@ import numpy as np
 
 from hapticrender.drivers.audio_callback import AHEAD, BlockQueue, Relay
 from hapticrender.drivers.base import BaseDriver
-from hapticrender.drivers.portaudio import Card, Stream, cards, find
+from hapticrender.drivers.portaudio import Stream, cards, find
 from hapticrender.errors import DeviceLost, DeviceNotFound, DeviceTimeout, DriverError
 from hapticrender.protocols import Array, Flag, Sensed
 
@@ -28,17 +29,18 @@ Channels = tuple[int, ...]
 
 
 class AudioDriver(BaseDriver):
-    """Plays on a sound card through PortAudio, block by block; its `live()` calls a compiled controller back.
+    """Plays on a sound card through PortAudio, block by block, or between `start` and `stop` by a compiled callback.
 
     `play` serves `hapticrender.render` and identification.  Python computes its blocks, so it adds `queued` samples to
-    the delay; a driver made by `live` does not.  Where the card or Python has lost samples the block has
-    `Flag.OVERRUN`, `overruns` counts, and the delay stays the same.  The stream runs from `open` to `close`; while
+    the delay.  Where the card or Python has lost samples the block has `Flag.OVERRUN`, `overruns` counts, and the delay
+    stays the same.  The callback does not wait for Python; `live` makes the driver whose `delay` is that of the card
+    alone, for which a controller that is called back is designed.  The stream runs from `open` to `close`; while
     nothing is played, the outputs are zero.
 
     Parameters
     ----------
     device : int, str or (input, output), optional
-        Card by its index or by words of its name and host ("0", "scarlett", "usb alsa"), as ``hapticrender devices``
+        Card by its index or by parts of its name and host ("0", "scarlett", "usb alsa"), as ``hapticrender devices``
         lists them; the system's default unless given.
     channels : tuple of int, >= 1
         Outputs that carry the drive, in the order of the drive's columns.
@@ -49,7 +51,7 @@ class AudioDriver(BaseDriver):
     block : int, samples
         Frames a callback.
     latency : "low", "high", float or (float, float)
-        What PortAudio is asked for: the card's own low or high latency, or seconds (input, output).
+        Requested of PortAudio: the card's own low or high latency, or seconds (input, output).
     drive_per_full_scale : float, A, > 0
         Drive at which an output is at full scale (V for a device driven by a voltage); 3 unless given.
     sensed_per_full_scale : float, m, > 0, optional
@@ -91,9 +93,13 @@ class AudioDriver(BaseDriver):
         if delay is not None and not block <= delay <= LONGEST * rate:
             raise ValueError(f"{delay=} samples: must be >= block = {block} and <= {LONGEST:g} s")
         self.drive_per_full_scale, self.sensed_per_full_scale = drive_per_full_scale, sensed_per_full_scale
-        self._card_delay, self._unknown = delay, ""
+        self.sensed_scale, self.drive_scale = sensed_per_full_scale or 1.0, 1.0 / drive_per_full_scale  # of an entry
+        needed = {"delay": delay, "sensed_per_full_scale (m)": sensed_per_full_scale}
+        self._unknown = [name for name, value in needed.items() if value is None and self.inputs]
         self._stream: Stream | None = None
-        self._lost = self._number = 0
+        self._entry: Any = None
+        self._number = 0  # of the next block of `play`
+        self._lost = self._before = 0  # blocks that lost samples; the relay's overruns at `start`
         super().__init__(
             rate=rate,
             drive_channels=len(self.channels),
@@ -101,58 +107,27 @@ class AudioDriver(BaseDriver):
             block=block,
             delay=(1 + AHEAD) * block + (block if delay is None else int(np.floor(delay + 0.5))),
         )
-        if self.inputs and (delay is None or sensed_per_full_scale is None):
-            self._unknown = "delay" if delay is None else "sensed_per_full_scale (m)"
-
-    @property
-    def delay(self) -> int:
-        """Samples from sensing to the drive computed from it, of the card and what `play` adds.
-
-        A DriverError where it is unknown, or what the inputs' full scale is.
-        """
-        if self._unknown:
-            raise DriverError(
-                f"{self}: {self._unknown} is unknown, so the loop cannot be closed: connect output {self.channels[0]} "
-                f"to input {self.inputs[0]}, measure with `hapticrender latency --driver {self} --out profile.toml`, "
-                "give sensed_per_full_scale too, or leave out sensed_channels to drive open loop"
-            )
-        return self._samples
-
-    @delay.setter
-    def delay(self, samples: int) -> None:
-        self._samples = samples
-
-    @property
-    def sensed_scale(self) -> float:
-        """Displacement (m) at full scale of an input, for ``RealtimeEntry``; 1 where nothing is sensed."""
-        return self.sensed_per_full_scale or 1.0
-
-    @property
-    def drive_scale(self) -> float:
-        """Full scales of an output per A, for ``RealtimeEntry``."""
-        return 1.0 / self.drive_per_full_scale
+        self.play_delay = self.delay
 
     @property
     def queued(self) -> int:
         """Samples that `play` adds to the card's own delay: the block that Python computes, and those that wait."""
         return (1 + self._ahead) * self.block
 
-    def live(self) -> LiveAudioDriver:
-        """Make the same driver for a compiled controller, with a shorter delay."""
-        return self._like(LiveAudioDriver)  # type: ignore[return-value]
+    def live(self) -> AudioDriver:
+        """Make the same driver for a compiled controller: its `delay` is the card's, `play_delay` is that of `play`."""
+        driver = copy.copy(self)
+        driver.delay = self.play_delay - self.queued
+        return driver
 
     def loop_back(self) -> AudioDriver:
         """Make a driver of the first output and the first input (1 unless given), both in full scales."""
-        own = {"drive_per_full_scale": 1.0, "sensed_per_full_scale": 1.0, "delay": float(self.block)}
-        driver = self._like(AudioDriver, channels=self.channels[:1], sensed_channels=(self.inputs or (1,))[:1], **own)
+        options = {"rate": self.rate, "block": self.block, "latency": self.latency, "delay": float(self.block)}
+        channels, inputs = self.channels[:1], (self.inputs or (1,))[:1]
+        scales = {"drive_per_full_scale": 1.0, "sensed_per_full_scale": 1.0}
+        driver = AudioDriver(self.device, channels, inputs, **options, **scales)
         driver._ahead = FAR_AHEAD
         return driver
-
-    def _like(self, kind: type[AudioDriver], **changes: Any) -> AudioDriver:
-        names = ("device", "channels", "rate", "block", "latency", "drive_per_full_scale", "sensed_per_full_scale")
-        values = {name: getattr(self, name) for name in names}
-        values |= {"sensed_channels": self.inputs, "delay": self._card_delay}
-        return kind(**values | changes)
 
     @staticmethod
     def found() -> list[str]:
@@ -160,9 +135,17 @@ class AudioDriver(BaseDriver):
         return [f"{each.index}  {each.name}: {each.about}" for each in cards()]
 
     def _open(self) -> None:
-        """Open the card and start its stream, which plays zeros."""
-        chosen = [find(_index(each)) for each in self._sides()]
-        output, inputs = self._side(chosen[0], self.channels, 1), self._side(chosen[1], self.inputs, 0)
+        """Open the card and start its stream, which plays zeros.
+
+        A DriverError where the loop's delay is unknown, or the displacement at full scale.
+        """
+        if self._unknown:
+            raise DriverError(
+                f"{self}: {self._unknown[0]} is unknown, so the loop cannot be closed: connect output "
+                f"{self.channels[0]} to input {self.inputs[0]}, measure with `hapticrender latency --driver {self} "
+                "--out profile.toml`, give sensed_per_full_scale too, or leave out sensed_channels to drive open loop"
+            )
+        output, inputs = self._side(self.channels, 1), self._side(self.inputs, 0)
         self._relay = Relay(*(tuple(n - 1 for n in each) for each in (self.inputs, self.channels)), self.block)
         self._queue = BlockQueue(self.block, self.sensed_channels, self.drive_channels, self._ahead)
         self._queue_address, _ = self._queue.address, self._queue.blocks  # compiled before the stream starts
@@ -176,20 +159,18 @@ class AudioDriver(BaseDriver):
             self.close()
             raise
 
-    def _sides(self) -> tuple[Any, Any]:
-        """Devices of output and input."""
-        return self.device[::-1] if isinstance(self.device, tuple) else (self.device, self.device)
-
-    def _side(self, card: Card, channels: Channels, output: int) -> tuple[int, int, float] | None:
-        """What a side of the stream asks of its card; None where no channel of it is used."""
+    def _side(self, channels: Channels, output: int) -> tuple[int, int, float] | None:
+        """Card, number of channels and latency (s) of a side of the stream; None where no channel of it is used."""
         if not channels:
             return None
-        present, kind = (card.outputs, "outputs") if output else (card.inputs, "inputs")
+        card = find(self.device[output] if isinstance(self.device, tuple) else self.device)
+        present, own, kind = (
+            (card.outputs, card.output_latency, "outputs") if output else (card.inputs, card.input_latency, "inputs")
+        )
         if max(channels) > present:
             raise DeviceNotFound(f"{self}: {kind} {channels}: {card} has {present} {kind}")
-        asked = self.latency if isinstance(self.latency, str | int | float) else self.latency[output]
-        own = card.output_latency if output else card.input_latency
-        seconds = {"low": own[0], "high": own[1]}.get(asked, asked) if isinstance(asked, str) else asked
+        latency = self.latency if isinstance(self.latency, str | int | float) else self.latency[output]
+        seconds = {"low": own[0], "high": own[1]}.get(latency, latency)
         if not isinstance(seconds, int | float):
             raise ValueError(f"latency={self.latency!r}: must be 'low', 'high' or seconds, or a pair of them")
         return card.index, max(channels), float(seconds)
@@ -207,6 +188,8 @@ class AudioDriver(BaseDriver):
             raise DeviceLost(f"{self}: the card stopped after {played} samples: is it still connected?")
 
     def _play(self, drive: Array) -> Sensed:
+        if self._entry is not None:
+            raise DriverError(f"{self}: play: it runs a controller; stop it first")
         number, queue = self._number, self._queue
         if not queue.put(number + self._ahead, drive * self.drive_scale):
             number = queue.blocks  # what was missed is lost; go on with the next one
@@ -229,74 +212,13 @@ class AudioDriver(BaseDriver):
                 raise DeviceTimeout(f"{self}: play: no block of {self.block} samples came within {PATIENCE:g} s")
             time.sleep(0.2 * self.block / self.rate)
 
-    def close(self) -> None:
-        """Play zeros, end the stream and release the card; a second call does nothing."""
-        self._state, stream = "closed", self._stream
-        if stream is None:
-            return
-        try:
-            self._relay.rest()
-            self._settle()
-        finally:
-            self._stream = None
-            stream.close()
-            atexit.unregister(self.close)
-
-    @property
-    def active(self) -> bool:
-        """Whether the card calls back."""
-        return self._stream is not None and self._stream.active
-
-    @property
-    def overruns(self) -> int:
-        """Blocks of `play` that lost samples, because the card did, or because Python was late."""
-        return self._lost
-
-    @property
-    def clipped(self) -> int:
-        """Samples of drive that were cut to full scale."""
-        return 0 if self._state == "new" else self._relay.count("clipped")
-
-    @property
-    def load(self) -> float:
-        """Time in the callback over the time of a block, averaged by PortAudio."""
-        return 0.0 if self._stream is None else self._stream.load
-
-    def __str__(self) -> str:
-        return f"audio:{'' if self.device is None else self.device}"
-
-
-class LiveAudioDriver(AudioDriver):
-    """A sound card that calls a compiled controller back: between `start` and `stop` nothing waits for Python.
-
-    `delay` is the card's own, for which the controller is designed.  While none runs `play` can be used, for a probe;
-    its delay is `play_delay`.
-    """
-
-    _entry: Any = None
-    _before = 0  # overruns until `start`
-
-    @property
-    def delay(self) -> int:
-        """Samples from sensing to the drive computed from it; a DriverError where it is unknown."""
-        return super().delay - self.queued
-
-    @delay.setter
-    def delay(self, samples: int) -> None:
-        self._samples = samples
-
-    @property
-    def play_delay(self) -> int:
-        """Delay of `play` (samples)."""
-        return self.delay + self.queued
-
     def start(self, entry: Any) -> None:
         """Let the card call a compiled controller back until `stop`.
 
         Parameters
         ----------
         entry : hapticrender.realtime.RealtimeEntry
-            Of this driver's channels, `sensed_scale` and `drive_scale`, and of a block that goes into this driver's; it
+            Of this driver's channels, `sensed_scale` and `drive_scale`, and of a block that divides this driver's; it
             has to outlive `stop`.
 
         Raises
@@ -317,29 +239,30 @@ class LiveAudioDriver(AudioDriver):
         self._relay.rest()
         self._settle()
         self.check()
-        self._entry = entry
-        self._before = self._relay.count("overruns")
+        self._entry, self._before = entry, self._relay.count("overruns")
         self._relay.call(address, entry.user_data)
-
-    def _play(self, drive: Array) -> Sensed:
-        if self._entry is not None:
-            raise DriverError(f"{self}: play: it runs a controller; stop it first")
-        return super()._play(drive)
 
     def stop(self) -> None:
         """Play zeros from the next block on, and wait until they are played; nothing where it does not run."""
-        entry, self._entry = self._entry, None
-        if entry is not None:
+        if self._entry is not None:
+            self._lost, entry, self._entry = self.overruns, self._entry, None
             self._relay.rest()
             entry.silence()
             self._settle()
 
     def close(self) -> None:
-        """Stop, end the stream and release the card; a second call does nothing."""
+        """Play zeros, end the stream and release the card; a second call does nothing."""
+        self._state, stream = "closed", self._stream
+        if stream is None:
+            return
         try:
             self.stop()
+            self._relay.rest()
+            self._settle()
         finally:
-            super().close()
+            self._stream = None
+            stream.close()
+            atexit.unregister(self.close)
 
     @property
     def last_sensed(self) -> Array:
@@ -347,15 +270,27 @@ class LiveAudioDriver(AudioDriver):
         return self._relay.sensed
 
     @property
+    def active(self) -> bool:
+        """Whether the card calls back."""
+        return self._stream is not None and self._stream.active
+
+    @property
     def overruns(self) -> int:
-        """Blocks before which the card lost samples since `start`."""
-        return self._relay.count("overruns") - self._before if self._state != "new" else 0
+        """Blocks that lost samples: because the card did, or because Python was late with a block of `play`."""
+        return self._lost + (0 if self._entry is None else self._relay.count("overruns") - self._before)
 
+    @property
+    def clipped(self) -> int:
+        """Samples of drive that were cut to full scale."""
+        return 0 if self._state == "new" else self._relay.count("clipped")
 
-def _index(device: Any) -> Any:
-    """Index or words of a card; a string of digits is an index."""
-    text = str(device).strip()
-    return (int(text) if text.isdigit() else text or None) if isinstance(device, str) else device
+    @property
+    def load(self) -> float:
+        """Time in the callback over the time of a block, averaged by PortAudio."""
+        return 0.0 if self._stream is None else self._stream.load
+
+    def __str__(self) -> str:
+        return f"audio:{'' if self.device is None else self.device}"
 
 
 def _channels(name: str, given: Any) -> Channels:

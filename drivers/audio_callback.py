@@ -62,8 +62,8 @@ def gather(relay, given, count):
     """Copy the chosen input channels; without an input they stay 0."""
     r = record(relay, RELAY_T, 0)
     columns, sensed = carray(pointer(r.inputs_at, I8), r.sensors), carray(pointer(r.sensed_at, F4), count * r.sensors)
-    source = carray(pointer(given, F4), count * r.wide_in if given != 0 else 0)
     if given != 0:
+        source = carray(pointer(given, F4), count * r.wide_in)
         for n in range(count):
             for i in range(r.sensors):
                 sensed[n * r.sensors + i] = source[n * r.wide_in + columns[i]]

@@ -24,7 +24,7 @@ A driver carries samples to a device, a file or a plant model, and back.  Any ob
 ``play_delay`` (optional)
     delay of `play`, where `delay` is that of a callback which plays a compiled controller (`start`, `stop`)
 ``finger`` (optional)
-    of a device that has to be told where the finger is: None, until `render` sets it to the scene's `Finger`
+    of a device that takes the finger's position from the host: None, until `render` sets it to the scene's `Finger`
 ``rendering``, ``device_kind`` (optional)
     of a device with a controller of its own: None, until `render` sets it to the `Rendering` that is to be played; the
     only kind of device that it plays, such as "vt-plate"

@@ -8,18 +8,21 @@ import time
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple, Self, TypeVar
 
+import numpy as np
+
 from hapticrender.bands import Bands
 from hapticrender.drivers import protocol
 from hapticrender.drivers.base import OpenedInWith, carry_through
-from hapticrender.drivers.board_line import BAUD, PAUSE, BoardLine, Clock, Line, open_port
+from hapticrender.drivers.board_line import BAUD, PAUSE, BoardLine, Line, open_port
 from hapticrender.drivers.board_texture import BoardTexture
 from hapticrender.drivers.protocol import WRAP, Capabilities, Cause, Kind, State, Telemetry
-from hapticrender.drivers.row_reader import RowReader
+from hapticrender.drivers.rows import Rows
 from hapticrender.errors import DeviceFault, DeviceLost, DeviceTimeout, DriverError, HapticError, WatchdogTimeout
 from hapticrender.protocols import Array
 
 RETRY = 0.05  # s between two attempts to reach the board anew
 LEAST_WATCHDOG, MOST_WATCHDOG = 0.05, 65.0  # s
+DRIVE_ROWS = 24  # of drive in a frame
 FAULTS = {
     Cause.LIMIT: "the mean square of the drive is above its limit: lower the amplitude, or raise limits(rms=)",
     Cause.SENSOR: "a sensor was invalid for 10 ms: check its cable and its range",
@@ -50,7 +53,7 @@ class _Setup(NamedTuple):
 class BoardClient(OpenedInWith):
     """A board that plays textures, live.
 
-    While it is open a thread sends where the finger is, or a sign of life every 10 ms, and takes what the board sends.
+    While it is open a thread sends the finger's position, or a heartbeat every 10 ms, and takes what the board sends.
     Methods may be called from any thread; a failure of the line is raised by the next of them.  A process that pauses
     for 80 ms stops the board.
 
@@ -66,10 +69,10 @@ class BoardClient(OpenedInWith):
         For how long to look for a board that is gone, or was reset; it is then set up as before.  0: `DeviceLost`.
     background : bool
         False: no thread; `step` is to be called at least every 10 ms.
-    clock : Clock
-        The module `time` unless given.
+    clock : module or object
+        With `monotonic` and `sleep`; the module `time` unless given.
     connect : callable
-        Opens the port, see `BoardLine`.
+        Opens the port, ``connect(port, baud)``: an object with `read`, `write` and `close` that never waits.
     """
 
     def __init__(
@@ -80,7 +83,7 @@ class BoardClient(OpenedInWith):
         timeout: float = 1.0,
         reconnect: float = 0.0,
         background: bool = True,
-        clock: Clock = time,
+        clock: Any = time,
         connect: Callable[[str, int], Any] = open_port,
     ) -> None:
         for name, value in (("timeout", timeout), ("reconnect", reconnect)):
@@ -93,6 +96,7 @@ class BoardClient(OpenedInWith):
         self._line: BoardLine | None = None
         self._setup = _Setup()
         self._runs = False  # something has been started
+        self._rows = Rows()  # streamed back in this run
         self._error: HapticError | None = None
         self._beats = self._watchdog = 0  # of the application: its calls; ms, 0: none
         self._background, self._thread = background, threading.Thread()
@@ -118,7 +122,7 @@ class BoardClient(OpenedInWith):
 
     @property
     def capabilities(self) -> Capabilities:
-        """What the board said of itself."""
+        """Sizes, limits and rates that the board states."""
         return self._open_line().capabilities
 
     def set_bands(self, bands: Bands, texture: BoardTexture | None = None) -> int:
@@ -151,7 +155,7 @@ class BoardClient(OpenedInWith):
         return sample
 
     def finger(self, position: float, velocity: float = 0.0, load: float = 0.0, time: float | None = None) -> None:
-        """Say where the finger is: position (m from the middle, NaN: lifted), velocity (m/s) and load (N).
+        """Set the finger's position (m from the middle, NaN: lifted), velocity (m/s) and load (N).
 
         `time` (s, of the client's clock) is when it was there: now unless given, which is late if the process pauses.
         Never waits; the last one counts, sent at most every 5 ms.  The board follows the velocity for 50 ms, then
@@ -160,7 +164,7 @@ class BoardClient(OpenedInWith):
         time = self.clock.monotonic() if time is None else time
         if self._line is None and self._error is None and self._runs:
             return  # the board is being looked for
-        self._open_line().link.finger = time, float(position), float(velocity), float(load)
+        self._open_line().finger = time, float(position), float(velocity), float(load)
 
     @property
     def gain(self) -> float:
@@ -169,15 +173,10 @@ class BoardClient(OpenedInWith):
 
     @gain.setter
     def gain(self, value: float) -> None:
-        self.set_gain(value)
-
-    def set_gain(self, value: float) -> int:
-        """Set `gain`; return the sample of the board's clock at which it took it."""
         if not 0.0 <= value <= 1.0:
             raise ValueError(f"gain = {value!r}: must be 0 to 1")
-        sample = self._steadily(lambda line: line.ask(Kind.GAIN, value)).sample
+        self._steadily(lambda line: line.command(Kind.GAIN, value))
         self._setup = self._setup._replace(gain=value)
-        return sample
 
     def limits(self, peak: float, rms: float | None = None, seconds: float = 1.0) -> None:
         """Limit the drive of a channel: `peak` (A) is cut, `rms` (A) over a time constant of `seconds` stops the board.
@@ -185,13 +184,13 @@ class BoardClient(OpenedInWith):
         Both are at most the limit of the board's design; rms is `peak` unless given.
         """
         limits = (peak, peak if rms is None else rms, seconds)
-        self._steadily(lambda line: line.ask(Kind.LIMITS, *limits))
+        self._steadily(lambda line: line.command(Kind.LIMITS, *limits))
         self._setup = self._setup._replace(limits=limits)
 
     def watch(self, seconds: float | None) -> None:
         """Let the board stop for good where the application is silent for so long, 0.05 to 65 s; None: never.
 
-        It has to call `beat`, or `watch` again: what the client's thread sends does not count.  Never waits.
+        It has to call `beat`, or `watch` again: the heartbeats of the client's thread do not count.  Never waits.
         """
         if seconds is not None and not LEAST_WATCHDOG <= seconds <= MOST_WATCHDOG:
             bound = f"{LEAST_WATCHDOG} to {MOST_WATCHDOG:g} s on a board, or None"
@@ -200,10 +199,10 @@ class BoardClient(OpenedInWith):
         self.beat()
 
     def beat(self) -> None:
-        """Say that the application is alive, see `watch`; never waits."""
+        """Note a call of the application, see `watch`; never waits."""
         self._beats += 1
         if (line := self._line) is not None:
-            line.link.application = self._beats & 0xFFFF, self._watchdog
+            line.application = self._beats & 0xFFFF, self._watchdog
 
     def start(self, *, stream: int = 0, telemetry: float = 0.02) -> int:
         """Start to play the bands, or the texture, from rest; return the sample of the board's clock at which it began.
@@ -214,7 +213,7 @@ class BoardClient(OpenedInWith):
             Samples between two rows that the board streams back; 0: none.
         telemetry : float, s
             Time between two frames of telemetry, 0.2 ms to 13 s at 5 kHz; at most 0.1 s with a texture, of which as
-            much is sent as the telemetry says has been played.
+            much is sent as has been played by the telemetry.
         """
         period = round(telemetry * self.capabilities.rate)
         for name, value, least in (("stream", stream, 0), ("telemetry", period, 1)):
@@ -230,6 +229,7 @@ class BoardClient(OpenedInWith):
         if texture is not None:
             line.play(texture)
         sample = line.begin(Kind.START, *start)
+        self._rows = Rows(sample, start[0])
         if texture is not None:
             texture.began = sample
         return sample
@@ -237,11 +237,11 @@ class BoardClient(OpenedInWith):
     def stop(self) -> None:
         """Fade out within 10 ms."""
         self._setup = self._setup._replace(start=None)
-        self._steadily(lambda line: line.ask(Kind.STOP))
+        self._steadily(lambda line: line.command(Kind.STOP))
         self._runs = False
 
     def telemetry(self) -> Telemetry:
-        """Return what the board last said.
+        """Return the latest telemetry; wait for the first.
 
         Raises
         ------
@@ -252,13 +252,33 @@ class BoardClient(OpenedInWith):
         WatchdogTimeout
             The board stopped as the application was silent, see `watch`.
         """
-        return self._steadily(lambda line: line.telemetry())
 
-    def rows(self) -> list[protocol.Stream]:
-        """Return what has been streamed back since the last call."""
-        stream = self._open_line().link.stream
-        with self._lock:
-            return [stream.popleft() for _ in range(len(stream))]
+        def wait(line: BoardLine) -> Telemetry:
+            line.wait(lambda: line.telemetry is not None, "telemetry")
+            return line.telemetry  # type: ignore[return-value]
+
+        return self._steadily(wait)
+
+    def rows(self, count: int | None = None, meanwhile: Callable[[], None] = lambda: None) -> Array:
+        """Return rows that the board streamed back, see `Rows`: the next `count`, or those that have arrived.
+
+        While rows are awaited `meanwhile` is called again and again.  A `DeviceTimeout` where none come.
+        """
+        end = self.clock.monotonic() + self.timeout
+        while True:
+            with self._lock:
+                streamed, rows = self._open_line().streamed, self._rows
+                while streamed:
+                    rows.add(streamed.popleft())
+                    end = self.clock.monotonic() + self.timeout
+                if count is None or len(rows) >= count:
+                    return rows.take(count)
+            if self.clock.monotonic() >= end:
+                raise DeviceTimeout(f"{self.port}: stream: {len(rows)} of {count} rows in {self.timeout:g} s")
+            meanwhile()
+            if not self._background:
+                self.step()
+            self.clock.sleep(PAUSE)
 
     def identify(self, lines: Sequence[Line], duration: float, stream: int = 1) -> Array:
         """Let the board play a multisine for `duration` (s); return drive (A) and sensed (m), shape (n, channels).
@@ -269,21 +289,23 @@ class BoardClient(OpenedInWith):
         if not lines:
             raise ValueError("lines = []: must be 1 or more")
         samples = round(duration * self.capabilities.rate)
-        first = self._steadily(lambda line: line.identify(lines, samples, stream))
-        self._runs = True
+        first = self._steadily(lambda line: line.identify(lines, samples, stride=stream))
+        self._runs, self._rows = True, Rows(first, stream)
         columns = self.capabilities.drive_channels + self.capabilities.sensed_channels
-        return RowReader(self, first, stream).take(samples // stream)[:, :columns]
+        return self.rows(samples // stream)[:, :columns]
 
     def begin_queue(self) -> None:
         """Let the board play what `queue` sends it, from the first row on, and stream back every sample."""
-        self._steadily(lambda line: line.identify([], 0, 1))
-        self._runs = True
+        self._steadily(lambda line: line.identify([], 0, stride=1))
+        self._runs, self._rows = True, Rows()
 
     def queue(self, first: int, drive: Array) -> None:
         """Append rows of drive (A, shape (n, channels)), the first one of which is number `first` of the queue."""
         line = self._open_line()
         with self._lock:
-            line.queue(first, drive)
+            for start in range(0, len(drive), DRIVE_ROWS):
+                rows = np.asarray(drive[start : start + DRIVE_ROWS], "<f4")
+                line.send(Kind.DRIVE, protocol.pack(Kind.DRIVE, first + start) + rows.tobytes())
 
     def step(self) -> None:
         """Take what has arrived and send what is due; for clients without a thread, at least every 10 ms."""
@@ -293,18 +315,12 @@ class BoardClient(OpenedInWith):
                 line.carry()
                 self._compare(line)
                 if self._setup.start is not None and self._setup.texture is not None:
-                    line.stream(self._setup.texture)
+                    line.supply(self._setup.texture)
             except (DeviceFault, WatchdogTimeout) as error:
                 self._error = error
                 raise
             except (DeviceLost, DeviceTimeout) as error:
                 self._recover(error)
-
-    def pause(self) -> None:
-        """Let a millisecond pass, as one does between two looks at what has arrived."""
-        if not self._background:
-            self.step()
-        self.clock.sleep(PAUSE)
 
     def _run(self) -> None:
         while not self._ending.is_set() and self._error is None:
@@ -312,13 +328,13 @@ class BoardClient(OpenedInWith):
                 self.step()
             except HapticError as error:
                 self._error = error
-            except Exception as error:  # of a frame that nobody has thought of: the board must not play on unheard
+            except Exception as error:  # an unforeseen frame: the board must not play on while nobody reads it
                 self._error = DriverError(f"{self.port}: {type(error).__name__}: {error}")
             self.clock.sleep(PAUSE)
 
     def _compare(self, line: BoardLine) -> None:
         """Compare what the board does with what it is to do."""
-        found = line.link.telemetry
+        found = line.telemetry
         if found is None or not self._runs or found.state != State.IDLE:
             return
         if found.cause in FAULTS:
@@ -357,8 +373,8 @@ class BoardClient(OpenedInWith):
     def _restore(self, line: BoardLine) -> None:
         setup = self._setup
         if setup.limits is not None:
-            line.ask(Kind.LIMITS, *setup.limits)
-        line.ask(Kind.GAIN, setup.gain)
+            line.command(Kind.LIMITS, *setup.limits)
+        line.command(Kind.GAIN, setup.gain)
         if setup.bands is not None:
             line.set_bands(setup.bands)
         if setup.start is not None:

@@ -1,40 +1,26 @@
-"""A board on an open serial port: bytes both ways, commands until they are answered, errors with port and bytes."""
+"""A board on an open serial port: its session, the commands, and errors that name port, operation and bytes."""
 
 from __future__ import annotations
 
 import secrets
 import time
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 import serial
 
 from hapticrender.bands import Bands
 from hapticrender.drivers import protocol
-from hapticrender.drivers.board_link import Link, Request
+from hapticrender.drivers.board_link import FOREIGN, Link, Request
 from hapticrender.drivers.board_texture import ROWS, BoardTexture, no_texture
-from hapticrender.drivers.protocol import WRAP, Capabilities, Kind, Reason, Telemetry
+from hapticrender.drivers.protocol import WRAP, Kind, Reason
 from hapticrender.errors import DeviceLost, DeviceNotFound, DeviceTimeout, DriverError
-from hapticrender.protocols import Array
 
 BAUD = 230_400  # of a UART; a board on USB or a pseudo-terminal does not care
 PAUSE = 1e-3  # s between two looks at the line
-SILENCE = 0.5  # s without a good frame from the board after which it counts as lost
+SILENCE = 0.5  # s without a valid frame from the board after which it counts as lost
 FADING = 0.2  # s: longest fade of what a command has to wait for
-DRIVE_ROWS = 24  # of drive in a frame
-
-
-class Clock(Protocol):
-    """What of the module `time` is used."""
-
-    def monotonic(self) -> float:
-        """Return the time in s."""
-        ...
-
-    def sleep(self, seconds: float, /) -> None:
-        """Let time pass."""
-        ...
 
 
 class Line(NamedTuple):
@@ -51,21 +37,10 @@ def open_port(port: str, baud: int) -> Any:
     return serial.Serial(port, baud, timeout=0, write_timeout=1.0)
 
 
-class BoardLine:
+class BoardLine(Link):
     """A board that has been greeted, on a port of its own; not for several threads at once.
 
-    Parameters
-    ----------
-    port : str
-        Name of the serial port.
-    baud : int
-        Of a UART.
-    timeout : float, s
-        Longest time to an answer.
-    clock : Clock
-        The module `time` unless given.
-    connect : callable
-        Opens the port, ``connect(port, baud)``: an object with `read`, `write` and `close` that never waits.
+    Its parameters are those of `BoardClient`; `connect` is called with port and baud rate.
 
     Raises
     ------
@@ -83,7 +58,7 @@ class BoardLine:
         baud: int = BAUD,
         *,
         timeout: float = 1.0,
-        clock: Clock = time,
+        clock: Any = time,
         connect: Callable[[str, int], Any] = open_port,
     ) -> None:
         self.port, self.timeout, self.clock = port, timeout, clock
@@ -92,9 +67,9 @@ class BoardLine:
         except (OSError, ValueError) as error:
             raise DeviceNotFound(f"{port}: open: {error}") from error
         self._textures = 0  # that were sent
-        self.link = Link(secrets.randbelow(2**32 - 1) + 1, clock.monotonic())
+        super().__init__(secrets.randbelow(2**32 - 1) + 1, clock.monotonic())
         try:
-            self._answer(self.link.greeting)
+            self._wait_for(self.greeting)
         except DriverError:
             self.close()
             raise
@@ -103,30 +78,23 @@ class BoardLine:
         """Close the port; the board comes to rest by itself."""
         self._port.close()
 
-    @property
-    def capabilities(self) -> Capabilities:
-        """What the board said of itself."""
-        if self.link.capabilities is None:
-            raise DriverError(f"{self.port}: capabilities: the board has not answered yet")
-        return self.link.capabilities
-
     def carry(self) -> None:
         """Take what has arrived and send what is due; a `DeviceLost` where line or session are gone."""
-        link, now = self.link, self.clock.monotonic()
+        now = self.clock.monotonic()
         try:
-            link.receive(self._port.read(65536), now)
-            if due := link.due(now):
+            self.receive(self._port.read(65536), now)
+            if due := self.due(now):
                 self._port.write(due)
         except (OSError, TypeError) as error:  # pyserial's are OSErrors; TypeError where the port was closed meanwhile
             raise self.lost("line", error) from error
-        if link.ended:
+        if self._foreign >= FOREIGN:
             raise self.lost("session", "the board has another session: it was reset, or another host greeted it")
-        if now - link.received > SILENCE and link.capabilities is not None:
-            raise self.lost("listen", f"no good frame for {SILENCE:g} s")
+        if now - self.received > SILENCE and self.session:
+            raise self.lost("listen", f"no valid frame for {SILENCE:g} s")
 
     def lost(self, operation: str, reason: object) -> DeviceLost:
-        """Error that says what the line has carried."""
-        return DeviceLost(f"{self.port}: {operation}: {reason} ({self._carried()}, {self.link.bad} bad frames)")
+        """Error that states what the line has carried."""
+        return DeviceLost(f"{self.port}: {operation}: {reason} ({self._carried()}, {self._reader.bad} bad frames)")
 
     def wait(self, done: Callable[[], bool], operation: str) -> None:
         """Carry bytes until it is done; a `DeviceTimeout` where it takes too long."""
@@ -140,19 +108,23 @@ class BoardLine:
                 raise DeviceTimeout(text)
             self.clock.sleep(PAUSE)
 
-    def ask(self, kind: Kind, *fields: float) -> Request:
-        """Send a command and return it with its reply; a ValueError or `DriverError` where it is refused."""
+    def command(self, kind: Kind, *fields: float) -> Request:
+        """Send a command and return its answer; a ValueError or `DriverError` where it is refused."""
         return self.send(kind, protocol.pack(kind, *fields))
 
     def send(self, kind: Kind, payload: bytes) -> Request:
         """Do the same with a payload."""
-        return self._checked(self._answer(self.link.submit(kind, payload)))
+        return self._checked(self.request(kind, payload))
+
+    def request(self, kind: Kind, payload: bytes) -> Request:
+        """Send a command and return its answer, a refusal too."""
+        return self._wait_for(self.submit(kind, payload))
 
     def begin(self, kind: Kind, *fields: float) -> int:
         """Start something, once the board has come to rest; return the sample at which it began."""
-        self.link.stream.clear()
+        self.streamed.clear()
         sample = self._patiently(kind, protocol.pack(kind, *fields)).sample
-        self.link.telemetry = None  # what comes from now on is of this run
+        self.telemetry = None  # what comes from now on is of this run
         return sample
 
     def set_bands(self, bands: Bands) -> int:
@@ -163,7 +135,7 @@ class BoardLine:
         payloads = [protocol.pack(Kind.SETPOINT, index, *row) for index, row in enumerate(rows)]
         for payload in payloads:
             self.send(Kind.SETPOINT, payload)
-        return self.ask(Kind.COMMIT, len(payloads), protocol.digest(payloads)).sample
+        return self.command(Kind.COMMIT, len(payloads), protocol.digest(payloads)).sample
 
     def play(self, texture: BoardTexture | None, meanwhile: BoardTexture | None = None) -> None:
         """Send a texture, and fade into it; `meanwhile` goes on until then.  None: fade out what plays."""
@@ -172,18 +144,18 @@ class BoardLine:
         for kind, payload in no_texture(number) if texture is None else texture.frames(number):
             request = self._patiently(kind, payload)
             if meanwhile is not None:
-                self.stream(meanwhile)
+                self.supply(meanwhile)
         if texture is not None:
             texture.began = (request.sample + self.capabilities.lookahead) % WRAP
 
-    def stream(self, texture: BoardTexture) -> None:
+    def supply(self, texture: BoardTexture) -> None:
         """Send a frame of the samples that come next, where they are due; a board at rest takes none."""
-        now = self.link.telemetry
+        now = self.telemetry
         played = 0 if now is None or texture.began is None else (now.sample - texture.began) % WRAP
         samples = texture.samples(played if played < WRAP // 2 else 0)
         if samples is None:
             return
-        request = self._answer(self.link.submit(Kind.SAMPLES, samples))
+        request = self.request(Kind.SAMPLES, samples)
         if request.refused != Reason.STATE:
             self._checked(request)
             texture.written += ROWS
@@ -195,28 +167,14 @@ class BoardLine:
             self.send(Kind.LINE, payload)
         return self.begin(Kind.IDENTIFY, len(lines), samples, stride, protocol.digest(payloads))
 
-    def queue(self, first: int, drive: Array) -> None:
-        """Append rows of drive (A), the first one of which is number `first` of the queue."""
-        for start in range(0, len(drive), DRIVE_ROWS):
-            rows = np.asarray(drive[start : start + DRIVE_ROWS], "<f4")
-            self.send(Kind.DRIVE, protocol.pack(Kind.DRIVE, first + start) + rows.tobytes())
-
-    def telemetry(self) -> Telemetry:
-        """Return the latest telemetry; wait for it where none has come yet."""
-        self.wait(lambda: self.link.telemetry is not None, "telemetry")
-        if self.link.telemetry is None:
-            raise DeviceTimeout(f"{self.port}: telemetry: none in {self.timeout:g} s")
-        return self.link.telemetry
-
     def _carried(self) -> str:
-        return f"{self.link.sent_bytes} bytes sent, {self.link.received_bytes} received"
+        return f"{self.sent_bytes} bytes sent, {self.received_bytes} received"
 
-    def _answer(self, request: Request) -> Request:
-        """Wait until a command has been answered."""
+    def _wait_for(self, request: Request) -> Request:
         try:
-            self.wait(lambda: request.reply is not None, request.kind.name)
+            self.wait(lambda: request.answered, request.kind.name)
         except DriverError:
-            self.link.withdraw()
+            self.withdraw()
             raise
         return request
 
@@ -224,7 +182,7 @@ class BoardLine:
         """Send a command again and again until what it waits for has faded out."""
         end = self.clock.monotonic() + FADING
         while True:
-            request = self._answer(self.link.submit(kind, payload))
+            request = self.request(kind, payload)
             if request.refused != Reason.STATE or self.clock.monotonic() >= end:
                 return self._checked(request)
 

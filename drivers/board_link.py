@@ -10,11 +10,11 @@ from hapticrender.drivers import protocol
 from hapticrender.drivers.protocol import Capabilities, Frame, Kind, Reason, Stream, Telemetry
 from hapticrender.errors import ProtocolError
 
-WORDS = 0.01  # s between two words, FINGER or HEARTBEAT: eight of them fit into the board's 80 ms of silence
+KEEP_ALIVE = 0.01  # s between two keep-alives, FINGER or HEARTBEAT: eight fit into the board's 80 ms of silence
+FINGER_PERIOD = 0.005  # s between two FINGER frames at least
 MICROSECOND = 1e-6  # s: times that differ by less are the same
-FASTEST = 0.005  # s between two words of the finger at least
 RESEND = 0.03  # s after which a command without a reply is sent again
-STRANGE = 3  # answers for another session in a row after which ours has ended
+FOREIGN = 3  # answers for another session in a row after which ours has ended
 MOST_STREAM = 4096  # frames of the stream that wait for the caller
 
 Finger = tuple[float, float, float, float]  # time (s), position (m, NaN: lifted), velocity (m/s), load (N)
@@ -28,81 +28,61 @@ class Request:
     payload: bytes
     sequence: int = 0
     sent: float = -math.inf  # s, when it was last sent
-    reply: Frame | None = None
-
-    @property
-    def refused(self) -> Reason | None:
-        """Why the board refused it; None where it did not."""
-        if self.reply is None or self.reply.kind != Kind.REFUSE:
-            return None
-        return Reason(self.reply.payload[1])
-
-    @property
-    def sample(self) -> int:
-        """Sample of the board's clock at which it was done."""
-        return int.from_bytes(self.reply.payload[-4:], "little") if self.reply else 0
+    answered: bool = False
+    refused: Reason | None = None
+    sample: int = 0  # of the board's clock, at which it was done or refused
 
 
 class Link:
-    """One session with a board: greets it, sends commands one after another until each is answered, and words.
+    """One session with a board: greets it, sends keep-alives, and one command at a time until it is answered.
 
     Parameters
     ----------
     nonce : int
-        Any number from 1 to 2**32 - 1 that the board has not heard before.
+        A random number from 1 to 2**32 - 1, which sets this session apart from earlier ones.
     now : float, s
         Time at which it begins, on the clock of all later calls.
     """
 
+    capabilities: Capabilities  # from the reply to HELLO on
+
     def __init__(self, nonce: int, now: float) -> None:
-        self.nonce = nonce
-        self.capabilities: Capabilities | None = None
+        self.nonce, self.session = nonce, 0  # 0: not greeted yet
         self.telemetry: Telemetry | None = None
-        self.stream: deque[Stream] = deque(maxlen=MOST_STREAM)
+        self.streamed: deque[Stream] = deque(maxlen=MOST_STREAM)
         self.finger: Finger | None = None  # not sent yet
         self.application = 0, 0  # changes with every call of it; ms without one after which the board stops, 0: never
-        self.received = now  # s, of the last good frame
+        self.received = now  # s, of the last valid frame
         self.sent_bytes = self.received_bytes = 0
-        self._began, self._spoken = now, -math.inf
+        self._began, self._kept_alive = now, -math.inf
         self._reader = protocol.Reader()
         self._sequence = nonce & 0xFFFF
-        self._waiting: deque[Request] = deque()
-        self._strange = 0
-        self._begun: Telemetry | None = None  # more bands than a frame holds
+        self._request: Request | None = None  # not answered yet
+        self._foreign = 0  # answers for another session, in a row
+        self._partial: Telemetry | None = None  # of more bands than a frame holds
         self.greeting = self.submit(Kind.HELLO, protocol.pack(Kind.HELLO, protocol.VERSION, nonce))
 
-    @property
-    def bad(self) -> int:
-        """Frames from the board with a wrong CRC."""
-        return self._reader.bad
-
-    @property
-    def ended(self) -> bool:
-        """Whether the board no longer has this session: it was reset, or another host said hello."""
-        return self._strange >= STRANGE
-
     def submit(self, kind: Kind, payload: bytes) -> Request:
-        """Queue a command; its `reply` comes with a later `receive`."""
-        self._waiting.append(Request(kind, payload))
-        return self._waiting[-1]
+        """Queue a command, a later `receive` takes its answer."""
+        self._request = Request(kind, payload)
+        return self._request
 
     def withdraw(self) -> None:
-        """Forget the commands that wait."""
-        self._waiting.clear()
+        """Send the command that waits no more."""
+        self._request = None
 
     def due(self, now: float) -> bytes:
         """Bytes to be sent at `now` (s)."""
-        out = b""
-        if self._waiting and now - self._waiting[0].sent >= RESEND:
-            first = self._waiting[0]
-            if first.sent == -math.inf:
-                first.sequence = self._next()
-            first.sent = now
-            out += self._command(first.kind, first.sequence, first.payload)
-        since = now - self._spoken + MICROSECOND
-        if self.capabilities is not None and since >= (WORDS if self.finger is None else FASTEST):
-            self._spoken = now
-            out += self._word(now)
+        out, request = b"", self._request
+        if request is not None and now - request.sent >= RESEND:
+            if request.sent == -math.inf:
+                request.sequence = self._next()
+            request.sent = now
+            out += protocol.command(self.session, request.kind, request.sequence, request.payload)
+        since = now - self._kept_alive + MICROSECOND
+        if self.session and since >= (KEEP_ALIVE if self.finger is None else FINGER_PERIOD):
+            self._kept_alive = now
+            out += self._keep_alive(now)
         self.sent_bytes += len(out)
         return out
 
@@ -115,66 +95,58 @@ class Link:
             except ValueError:  # a CRC that holds by chance
                 self._reader.bad += 1
 
-    def _word(self, now: float) -> bytes:
-        """Where the finger is, if that is new, or a sign of life."""
+    def _keep_alive(self, now: float) -> bytes:
+        """Frame of the finger's position, if that is new, or a HEARTBEAT."""
         finger, self.finger = self.finger, None
         time = round(((now if finger is None else finger[0]) - self._began) * 1e6) & 0xFFFFFFFF
         kind, fields = (Kind.HEARTBEAT, ()) if finger is None else (Kind.FINGER, finger[1:])
-        return self._command(kind, self._next(), protocol.pack(kind, time, *self.application, *fields))
+        payload = protocol.pack(kind, time, *self.application, *fields)
+        return protocol.command(self.session, kind, self._next(), payload)
 
     def _take(self, frame: Frame, now: float) -> None:
-        try:
-            kind = Kind(frame.kind)
-        except ValueError:
-            return
-        if kind in (Kind.ACK, Kind.REFUSE, Kind.CAPABILITIES):
-            self._take_reply(kind, frame)
-        elif kind == Kind.TELEMETRY:
+        if frame.kind in (Kind.ACK, Kind.REFUSE, Kind.CAPABILITIES):
+            self._take_reply(frame)
+        elif frame.kind == Kind.TELEMETRY and self.session:
             self._take_telemetry(protocol.telemetry(frame.payload))
-        elif kind == Kind.STREAM and self.capabilities is not None:
+        elif frame.kind == Kind.STREAM and self.session:
             channels = self.capabilities.drive_channels, self.capabilities.sensed_channels
-            self.stream.append(protocol.stream(frame.payload, *channels))
+            self.streamed.append(protocol.stream(frame.payload, *channels))
         self.received = now
 
-    def _take_reply(self, kind: Kind, frame: Frame) -> None:
-        request = self._waiting[0] if self._waiting else None
+    def _take_reply(self, frame: Frame) -> None:
+        request = self._request
         if request is None or frame.sequence != request.sequence or request.sent == -math.inf:
             return
-        if kind == Kind.CAPABILITIES:
+        if frame.kind == Kind.CAPABILITIES:
             found = protocol.capabilities(frame.payload)
             if request.kind != Kind.HELLO or found.nonce != self.nonce:
                 return
-            self.capabilities = found
-        elif not frame.payload or frame.payload[0] != request.kind:
-            return
-        elif kind == Kind.REFUSE and (len(frame.payload) < 2 or frame.payload[1] not in set(Reason)):
-            return  # of another version
-        elif kind == Kind.REFUSE and frame.payload[1] == Reason.CHECK:
-            self._strange += 1
-            return
-        elif kind == Kind.REFUSE and frame.payload[1] == Reason.VERSION:
-            raise ProtocolError(f"the board refuses version {protocol.VERSION} of the protocol: update one of the two")
-        request.reply = frame
-        self._waiting.popleft()
+            self.capabilities, self.session = found, found.session
+        else:
+            kind, refused, sample = protocol.reply(frame)
+            if kind != request.kind:
+                return
+            if refused == Reason.CHECK:
+                self._foreign += 1
+                return
+            if refused == Reason.VERSION:
+                text = f"the board refuses version {protocol.VERSION} of the protocol: update one of the two"
+                raise ProtocolError(text)
+            request.refused, request.sample = refused, sample
+        request.answered, self._request = True, None
 
     def _take_telemetry(self, found: Telemetry) -> None:
-        if self.capabilities is None:
+        if found.session != self.session:
+            self._foreign += 1
             return
-        if found.session != self.capabilities.session:
-            self._strange += 1
-            return
-        self._strange = 0
-        begun = self._begun
+        self._foreign = 0
+        begun = self._partial
         if found.first and begun is not None and (begun.sample, len(begun.bands)) == (found.sample, found.first):
             found = begun._replace(bands=begun.bands + found.bands)
-        self._begun = found
+        self._partial = found
         if len(found.bands) == found.total:
             self.telemetry = found
 
     def _next(self) -> int:
         self._sequence = (self._sequence + 1) & 0xFFFF
         return self._sequence
-
-    def _command(self, kind: Kind, sequence: int, payload: bytes) -> bytes:
-        session = 0 if self.capabilities is None else self.capabilities.session
-        return protocol.command(session, kind, sequence, payload)

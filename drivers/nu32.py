@@ -76,7 +76,7 @@ class NU32Board(OpenedInWith):
         except (OSError, ValueError) as error:
             raise DeviceNotFound(f"{self.port}: open: {error}") from error
         self._send("z")
-        reply = self._reply("z")  # after a reset any line is answered so, and not else
+        reply = self._reply("z")  # CONNECTED is the reply to any line after a reset
         if reply not in ("z", "CONNECTED"):
             raise self._unexpected("z", reply, "z or CONNECTED")
         if reply == "CONNECTED":
@@ -141,7 +141,7 @@ class NU32Board(OpenedInWith):
         return ToneTelemetry((first * MILLIMETRE, second * MILLIMETRE), (phases[0], phases[1]), (phases[2], phases[3]))
 
     def _set_closed_loop(self) -> None:
-        """Toggle until the board says that its loop is closed."""
+        """Toggle until the board replies that its loop is closed."""
         for _ in range(2):
             self._command("f")
             reply = self._reply("f")

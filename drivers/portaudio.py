@@ -20,10 +20,10 @@ from typing import Any
 
 from hapticrender.errors import DeviceNotFound, DriverError
 
-LEAST_VERSION = 0x130600  # 19.6.0: the first whose Pa_GetVersion says more than "19"
+LEAST_VERSION = 0x130600  # 19.6.0: the first whose Pa_GetVersion returns more than "19"
 FLOAT32 = 0x00000001  # paFloat32, interleaved
 ANTICIPATED_ERRORS = {-9985: "it is in use by another program, or does not exist any more"}  # paDeviceUnavailable
-HOST_ERROR = -9999  # paUnanticipatedHostError: PaHostErrorInfo says more
+HOST_ERROR = -9999  # paUnanticipatedHostError: PaHostErrorInfo has the details
 PATIENCE = 3.0  # s: longest wait for a stream to close
 INSTALL = (
     "to get it: Debian and Ubuntu: apt install libportaudio2; Fedora: dnf install portaudio; "
@@ -115,7 +115,7 @@ class Card:
 
     @property
     def about(self) -> str:
-        """Channels, rate, host and what it calls its latency, in words."""
+        """Channels, rate, host and stated latency as text."""
         milliseconds = " + ".join(f"{1e3 * each[0]:.1f}" for each in (self.input_latency, self.output_latency))
         return f"{self.outputs} out, {self.inputs} in, {self.rate:g} Hz, {self.host}, latency {milliseconds} ms"
 
@@ -151,9 +151,9 @@ def load() -> CDLL:
 def _bundled() -> str | None:
     """Path of the library among the files of the installed package sounddevice."""
     bits = 64 if sys.maxsize > 2**32 else 32
-    wanted = {"darwin": "libportaudio.dylib", "win32": f"libportaudio{bits}bit.dll"}.get(sys.platform)
+    name = {"darwin": "libportaudio.dylib", "win32": f"libportaudio{bits}bit.dll"}.get(sys.platform)
     try:
-        found = [file.locate() for file in files("sounddevice") or () if file.name == wanted]
+        found = [file.locate() for file in files("sounddevice") or () if file.name == name]
     except PackageNotFoundError:
         return None
     return str(found[0]) if found else None
@@ -222,7 +222,7 @@ def card(portaudio: CDLL, index: int) -> Card:
 
 
 def find(device: int | str | None) -> Card:
-    """Card by index, by a part of its name and host ("usb", "Scarlett JACK"), or the default output (None).
+    """Card by index (2, "2"), by parts of its name and host ("usb", "Scarlett JACK"), or the default output (None, "").
 
     Raises
     ------
@@ -231,14 +231,15 @@ def find(device: int | str | None) -> Card:
     """
     with initialised() as portaudio:
         default = portaudio.Pa_GetDefaultOutputDevice()
-    return chosen(cards(), default if device is None else device)
+    text = "" if device is None else str(device).strip()
+    return chosen(cards(), default if not text else int(text) if text.isdigit() else text)
 
 
 def chosen(found: list[Card], device: int | str) -> Card:
-    """Card of `found` that has the index or the words of `device`, in any case; see `find`."""
+    """Card of `found` that has the index or the parts of `device`, in any case; see `find`."""
     if isinstance(device, str):
-        words = device.lower().split()
-        fitting = [each for each in found if all(word in f"{each.name} {each.host}".lower() for word in words)]
+        parts = device.lower().split()
+        fitting = [each for each in found if all(part in f"{each.name} {each.host}".lower() for part in parts)]
         exact = [each for each in fitting if each.name.lower() == device.lower()]
         fitting = exact or fitting
     else:
@@ -280,8 +281,10 @@ class Stream:
         with _quiet():
             check(self._library.Pa_Initialize(), f"{name}: initialise")
         self._handle: c_void_p | None = c_void_p()
-        sides = [None if side is None else _parameters(*side) for side in (inputs, output)]
-        sides = [None if side is None else byref(side) for side in sides]
+        sides = [
+            None if side is None else byref(StreamParameters(side[0], side[1], FLOAT32, side[2], None))
+            for side in (inputs, output)
+        ]
         arguments = (*sides, rate, frames, 0, callback, user_data)
         try:
             check(self._library.Pa_OpenStream(byref(self._handle), *arguments), f"{name}: open at {rate:g} Hz")
@@ -334,7 +337,3 @@ class Stream:
         finally:
             self._library.Pa_CloseStream(handle)
             self._library.Pa_Terminate()
-
-
-def _parameters(device: int, channels: int, latency: float) -> StreamParameters:
-    return StreamParameters(device, channels, FLOAT32, latency, None)

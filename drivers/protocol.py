@@ -1,7 +1,7 @@
-"""Wire protocol between host and board: frames, messages, and their check words; ``docs/protocol.md`` explains them.
+"""Wire protocol between host and board: frames, messages, and their check values; ``docs/protocol.md`` explains them.
 
 A frame is ``COBS(kind, sequence, payload, CRC-16), 0``; everything is little-endian and of fixed width.  The payload of
-a command, from host to board, ends with a CRC-32 that starts from the session (`check_word`).
+a command, from host to board, ends with a CRC-32 that starts from the session (`check_value`).
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 from hapticrender.protocols import Flag
 
-VERSION = 2
+VERSION = 3
 MOST_BODY = 254  # bytes of kind, sequence, payload and CRC: one COBS group at most
 MOST_PAYLOAD = MOST_BODY - 5
 CRC_START = 0xFFFF
@@ -48,7 +48,7 @@ class Kind(IntEnum):
     STREAM = 0x85
 
 
-LAYOUT = {  # payloads, without the check word of commands; some go on with rows
+LAYOUT = {  # payloads, without the check value of commands; some go on with rows
     Kind.HELLO: "<BI",  # version, nonce (not 0)
     Kind.HEARTBEAT: "<IHH",  # host's time, us; application: its beat, and its watchdog, ms, 0: none
     Kind.FINGER: "<IHHfff",  # the same; position, m, NaN: lifted; velocity, m/s; load, N
@@ -78,11 +78,11 @@ class Reason(IntEnum):
     """Why a command was refused."""
 
     VERSION = 1  # of the protocol
-    CHECK = 2  # the check word does not hold: another session, or a damaged frame
+    CHECK = 2  # the check value does not hold: another session, or a damaged frame
     KIND = 3  # unknown
     LENGTH = 4
     VALUE = 5  # out of range
-    DIGEST = 6  # the board holds other set-points or lines than the digest says
+    DIGEST = 6  # the board holds other set-points or lines than those of the digest
     STATE = 7  # not now: nothing has been set, or something plays
 
 
@@ -100,11 +100,11 @@ class Cause(IntEnum):
 
     NONE = 0
     COMMAND = 1
-    SILENCE = 2  # no good word from the host for 80 ms
+    SILENCE = 2  # no valid keep-alive from the host for 80 ms
     LIMIT = 3  # the drive's mean square
     SENSOR = 4  # invalid for 10 ms
     DONE = 5  # an identification has ended
-    SESSION = 6  # another host said hello
+    SESSION = 6  # another host greeted the board
     APPLICATION = 7  # no beat of the application for the time of the watchdog
     INVALID = 17  # the supervisor of the law, from here on: see docs/safety.md
     FROZEN = 18
@@ -127,11 +127,11 @@ class Frame(NamedTuple):
 
 
 class Capabilities(NamedTuple):
-    """What a board says of itself when it is greeted."""
+    """Sizes, limits and rates that a board states when it is greeted."""
 
     version: int
     nonce: int  # the host's
-    session: int  # from which check words start
+    session: int  # from which check values start
     rate: float  # Hz
     drive_limit: float  # A
     sensor_limit: float  # m
@@ -160,7 +160,7 @@ class Telemetry(NamedTuple):
 
     sample: int  # of the board's clock, since its reset
     time: int  # us, of the board's clock
-    echo: int  # us, host's time in the last word received
+    echo: int  # us, host's time in the last keep-alive
     session: int
     state: State
     cause: Cause
@@ -182,34 +182,25 @@ class Stream(NamedTuple):
 
     first: int  # sample of the first row
     stride: int  # samples between rows
-    rows: tuple[tuple[float, ...], ...]  # drive (A), sensed (m), position (m, NaN: lifted), load (N), flags
+    rows: tuple[tuple[float, ...], ...]  # as of `rows.Rows`
 
 
 def cobs_encode(data: bytes) -> bytes:
-    """Encode so that no zero byte is left (consistent overhead byte stuffing); without delimiter."""
-    out, group = bytearray(), bytearray()
-    for index, byte in enumerate(data):
-        if byte:
-            group.append(byte)
-        if not byte or (len(group) == 254 and index + 1 < len(data)):
-            out += bytes([len(group) + 1]) + group
-            group.clear()
-    return bytes(out + bytes([len(group) + 1]) + group)
+    """Encode at most 254 bytes so that no zero is left (consistent overhead byte stuffing); without delimiter."""
+    return b"".join(bytes([len(group) + 1]) + group for group in data.split(DELIMITER))
 
 
 def cobs_decode(data: bytes) -> bytes:
     """Decode what `cobs_encode` gave; a ValueError where it is malformed."""
-    out, at = bytearray(), 0
+    groups, at = [], 0
     while at < len(data):
         code = data[at]
         group = data[at + 1 : at + code]
         if not code or len(group) < code - 1 or 0 in group:
             raise ValueError(f"COBS group of {code} at byte {at} of {len(data)}: must be whole and without zeros")
-        out += group
+        groups.append(group)
         at += code
-        if code < 255 and at < len(data):
-            out.append(0)
-    return bytes(out)
+    return DELIMITER.join(groups)
 
 
 def encode(frame: Frame) -> bytes:
@@ -253,19 +244,19 @@ class Reader:
                     self.bad += 1
 
 
-def check_word(session: int, kind: int, sequence: int, payload: bytes) -> int:
+def check_value(session: int, kind: int, sequence: int, payload: bytes) -> int:
     """CRC-32 that ends a command's payload; session 0 for HELLO."""
     return crc32(payload, crc32(struct.pack("<IBH", session, kind, sequence)))
 
 
 def command(session: int, kind: Kind, sequence: int, payload: bytes) -> bytes:
     """Bytes on the wire of a command of a session."""
-    word = check_word(0 if kind == Kind.HELLO else session, kind, sequence, payload)
-    return encode(Frame(kind, sequence, payload + struct.pack("<I", word)))
+    check = check_value(0 if kind == Kind.HELLO else session, kind, sequence, payload)
+    return encode(Frame(kind, sequence, payload + struct.pack("<I", check)))
 
 
 def pack(kind: Kind, *fields: float) -> bytes:
-    """Payload of a command, without its check word."""
+    """Payload of a command, without its check value."""
     return struct.pack(LAYOUT[kind], *fields)
 
 
@@ -275,12 +266,18 @@ def digest(payloads: Sequence[bytes]) -> int:
 
 
 def capabilities(payload: bytes) -> Capabilities:
-    """What a CAPABILITIES frame says; a `ValueError` where its length is wrong."""
+    """Parse a CAPABILITIES frame; a `ValueError` where its length is wrong."""
     return Capabilities(*_fields(Kind.CAPABILITIES, payload)[0])
 
 
+def reply(frame: Frame) -> tuple[int, Reason | None, int]:
+    """Kind of the command that an ACK or REFUSE answers, the reason of a refusal, and the sample; or a `ValueError`."""
+    kind, *reason, sample = _fields(Kind(frame.kind), frame.payload)[0]
+    return kind, Reason(reason[0]) if reason else None, sample
+
+
 def telemetry(payload: bytes) -> Telemetry:
-    """What a TELEMETRY frame says; a `ValueError` where its length or a value is wrong."""
+    """Parse a TELEMETRY frame; a `ValueError` where its length or a value is wrong."""
     fields, rest = _fields(Kind.TELEMETRY, payload, BAND.size)
     state, cause, flags = State(fields[4]), Cause(fields[5]), Flag(fields[6])
     bands = (BandTelemetry(complex(*each[:2]), complex(*each[2:])) for each in BAND.iter_unpack(rest))
@@ -288,8 +285,8 @@ def telemetry(payload: bytes) -> Telemetry:
 
 
 def stream(payload: bytes, drive_channels: int, sensed_channels: int) -> Stream:
-    """What a STREAM frame says; a `ValueError` where its length is wrong."""
-    row = struct.Struct(f"<{drive_channels + sensed_channels + 2}fH")
+    """Parse a STREAM frame; a `ValueError` where its length is wrong."""
+    row = struct.Struct(f"<{drive_channels + sensed_channels + 3}fH")
     (first, stride), rest = _fields(Kind.STREAM, payload, row.size)
     return Stream(first, stride, tuple(row.iter_unpack(rest)))
 

@@ -1,4 +1,4 @@
-"""Boards behind a serial line: the controller runs on the board; the host sets what it plays and where the finger is.
+"""Boards behind a serial line: the controller runs on the board; the host sends its textures and the finger's position.
 
 `BoardClient` is the live device: set-points, finger and gain from any thread, telemetry back.  `SerialDriver` puts it
 behind the driver protocol, so that ``hapticrender.render`` plays a scene on the board and judges what it streams back.
@@ -8,9 +8,10 @@ The protocol is in ``docs/protocol.md``; ``drivers/firmware`` is the board's par
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
+from serial.tools import list_ports
 
 from hapticrender.bands import Bands
 from hapticrender.drivers.base import BaseDriver
@@ -18,37 +19,26 @@ from hapticrender.drivers.board_client import BoardClient as BoardClient
 from hapticrender.drivers.board_line import Line as Line
 from hapticrender.drivers.board_loop import BoardLoop, playable
 from hapticrender.drivers.board_texture import BoardTexture as BoardTexture
-from hapticrender.drivers.row_reader import RowReader
-from hapticrender.errors import DriverError
+from hapticrender.errors import DriverError, HapticError
 from hapticrender.protocols import Array, Controller, Exchange, Rendering, Sensed
 
-
-class Trajectory(Protocol):
-    """A finger whose position and load are known beforehand, such as ``hapticrender.Finger``."""
-
-    def position(self, time: Array) -> Array:
-        """Position (m from the middle, NaN: lifted) at `time` (s)."""
-        ...
-
-    def load(self, time: Array) -> Array:
-        """Load (N) at `time` (s)."""
-        ...
+PATIENCE = 0.3  # s that a board has to answer where boards are listed
 
 
 class SerialDriver(BaseDriver):
     """Plays a scene on a board whose firmware was exported for its device, in closed loop on the board.
 
     The board has its own law, of method "inverse"; `render` sends it the bands of the scene and records what it streams
-    back, every sample: 140 kB/s at 5 kHz, as USB carries.  On a slower line samples are missing, with `Flag.OVERRUN`.
+    back, every sample: 160 kB/s at 5 kHz, as USB carries.  On a slower line samples are missing, with `Flag.OVERRUN`.
     A texture that is no sum of bands is sent as samples and as a table along the surface, see `BoardTexture`.  A board
-    senses no finger: `finger` is where the host says it is.
+    senses no finger: the host sends it the positions of `finger`.
 
     Parameters
     ----------
     port : str
         Name of the serial port.
-    finger : Trajectory, optional
-        Where the finger is, from the start of the run on; `render` sets it to that of the scene unless given.
+    finger : object with ``position(time)`` (m, NaN: lifted) and ``load(time)`` (N), optional
+        Such as ``hapticrender.Finger``, from the start of the run on; `render` sets it to the scene's unless given.
     block : int, >= 1
         1: closed loop on the board.  More: drive from the host, a block a call, for identification; what it computes
         from a block acts two blocks later.
@@ -59,11 +49,10 @@ class SerialDriver(BaseDriver):
     device_kind = "vt-plate"  # of which the firmware has the law
     probe = False  # the law on the board is the board's; its own guards are in docs/protocol.md
 
-    def __init__(self, port: str, *, finger: Trajectory | None = None, block: int = 1, **options: Any) -> None:
+    def __init__(self, port: str, *, finger: Any = None, block: int = 1, **options: Any) -> None:
         self.client = BoardClient(port, **options)
-        self.finger, self._sent = finger, 0
+        self.finger, self._sent, self._begun = finger, 0, False
         self.rendering: Rendering | None = None  # set by `prepare`
-        self._reader: RowReader | None = None
         with self.client as client:
             found = self.capabilities = client.capabilities
         super().__init__(
@@ -73,6 +62,19 @@ class SerialDriver(BaseDriver):
             block=block,
             delay=found.delay if block == 1 else 2 * block + found.delay,
         )
+
+    @classmethod
+    def found(cls) -> list[str]:
+        """Serial ports that are there now, and the boards that answer there."""
+        return [f"{port.device}  {port.description}; {cls._board(port.device)}" for port in list_ports.comports()]
+
+    @classmethod
+    def _board(cls, port: str) -> str:
+        try:
+            board = cls(port, timeout=PATIENCE)
+        except (OSError, HapticError) as error:
+            return f"no board answers ({type(error).__name__})"
+        return f"a board of {board.rate:g} Hz, {board.drive_channels} out, {board.sensed_channels} in"
 
     def exchange(self, controller: Controller) -> Exchange | None:
         """Return the exchange that runs the board's own loop with the scene's texture; None for a block device.
@@ -96,9 +98,13 @@ class SerialDriver(BaseDriver):
             raise ValueError(f"texture: carriers = {inner.n_bands}: must be left out on a board, which plays it whole")
 
         def advance(count: int, reference: Callable[[Array], Array]) -> tuple[Array, Array, Array, Sensed]:
-            if self._reader is None:
+            if not self._begun:
                 self._begin(bands, texture)
-            return self._taken(count, bands)
+            drive, sensed, position, load, _, flags = self.columns(self.client.rows(count, self._point))
+            envelope = np.zeros(0) if bands.envelope is None else bands.envelope
+            target = np.tile(np.asarray(envelope, complex), (count, 1))
+            target[np.isnan(position)[:, None] & (bands.wavenumber > 0.0)] = 0.0
+            return drive, target, flags, Sensed(sensed, position=position, normal_load=load, flags=flags)
 
         return advance
 
@@ -107,13 +113,12 @@ class SerialDriver(BaseDriver):
         return BoardLoop(rendering, self)
 
     def _begin(self, bands: Bands, texture: BoardTexture | None) -> None:
-        client = self.client
+        self._begun, client = True, self.client
         client.set_bands(bands, texture)
         self._started = client.clock.monotonic()
         self._point()
-        first = client.start(stream=1)
+        client.start(stream=1)
         self._started = client.clock.monotonic()
-        self._reader = RowReader(client, first, finger=self._point)
 
     def _point(self) -> None:
         """Send where the finger is now."""
@@ -125,21 +130,12 @@ class SerialDriver(BaseDriver):
         velocity = (there - here) * 1e4
         self.client.finger(here, velocity if np.isfinite(velocity) else 0.0, self.finger.load(now[:1])[0], clock)
 
-    def _taken(self, count: int, bands: Bands) -> tuple[Array, Array, Array, Sensed]:
-        reader = self._reader
-        if reader is None:
-            raise DriverError(f"{self}: exchange: it has not begun")
-        drive, sensed, position, load, flags = self.columns(reader.take(count))
-        envelope = np.zeros(0) if bands.envelope is None else bands.envelope
-        target = np.tile(np.asarray(envelope, complex), (count, 1))
-        target[np.isnan(position)[:, None] & (bands.wavenumber > 0.0)] = 0.0
-        return drive, target, flags, Sensed(sensed, position=position, normal_load=load, flags=flags)
-
-    def columns(self, rows: Array) -> tuple[Array, Array, Array, Array, Array]:
-        """Part rows (n, columns) into drive (A), sensed (m), position (m), load (N) and flags."""
-        rows = rows.reshape(-1, self.drive_channels + self.sensed_channels + 3)
+    def columns(self, rows: Array) -> tuple[Array, Array, Array, Array, Array, Array]:
+        """Split rows (n, columns) into drive (A), sensed (m), position (m), load (N), reference (m) and flags."""
         a, b = self.drive_channels, self.drive_channels + self.sensed_channels
-        return rows[:, :a], rows[:, a:b], rows[:, b], rows[:, b + 1], rows[:, b + 2].astype(np.int64)
+        rows = rows.reshape(-1, b + 4)
+        position, load, reference, flags = rows[:, b:].T
+        return rows[:, :a], rows[:, a:b], position, load, reference, flags.astype(np.int64)
 
     def _open(self) -> None:
         self.client.open()
@@ -149,14 +145,14 @@ class SerialDriver(BaseDriver):
         client = self.client
         if self.block == 1:
             raise DriverError(f"{self}: play: the loop runs on the board; for drive from the host set block > 1")
-        if self._reader is None:
+        if not self._begun:
+            self._begun = True
             client.begin_queue()
-            self._reader = RowReader(client)
             client.queue(0, np.zeros_like(drive))
             self._sent = len(drive)
         client.queue(self._sent, drive)
         self._sent += len(drive)
-        _, sensed, _, _, flags = self.columns(self._reader.take(self.block))
+        _, sensed, _, _, _, flags = self.columns(client.rows(self.block))
         return Sensed(sensed, flags=flags)
 
     def close(self) -> None:

@@ -1,31 +1,25 @@
-"""Drive as a sound file: written while it plays, alone or beside a device, and read back in amperes.
+"""Drive as a sound file: written while it plays, and read back in amperes.
 
-A file is a device without sensors (the controller then drives open loop), or
-with `through` a tee: another driver plays and senses, and the file keeps what
-it was given, down to the block at which it failed.  A sample of 1.0 in the
-file is `full_scale`.
+A file is a device without sensors: the controller drives it open loop.  A sample of 1.0 in the file is `full_scale`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
-from types import TracebackType
 
 import numpy as np
 import soundfile
 
-from hapticrender.drivers.base import BaseDriver, carry_through, check_driver
+from hapticrender.drivers.base import BaseDriver
 from hapticrender.errors import DeviceLost, DeviceNotFound, DriverError
-from hapticrender.protocols import Array, Driver, Flag, Sensed
+from hapticrender.protocols import Array, Flag, Sensed
 
 FORMATS = {".wav": "WAV", ".w64": "W64", ".rf64": "RF64", ".aiff": "AIFF", ".aif": "AIFF", ".flac": "FLAC"}
 UNKNOWN = 2**63 - 1  # frames, as libsndfile says of a FLAC file that was never closed
 BLOCK = 65536  # frames read at once
 SUBTYPES = {"PCM_16": 16, "PCM_24": 24, "PCM_32": 32, "FLOAT": None, "DOUBLE": None}  # bits of the integers
-_Leaving = tuple[type[BaseException] | None, BaseException | None, TracebackType | None]
-_NO_ERROR: _Leaving = (None, None, None)
-_WORD = 32  # soundfile takes integers of any width left-justified in 32 bits
+WIDTH = 32  # soundfile takes integers of any width left-justified in 32 bits
 
 
 def read_back(path: str | Path, *, full_scale: float = 3.0) -> Array:
@@ -66,57 +60,40 @@ class WaveFileDriver(BaseDriver):
 
     A killed process leaves all that was played in WAV and W64, all but the last 4096 samples at most in FLAC; RF64 and
     AIFF then report 0 frames.  Drive beyond `full_scale` is held exactly by FLOAT and DOUBLE; integers cut it to their
-    range, `clipped` counts the samples, and ``Sensed.flags`` has `Flag.SATURATED`; what `through` plays is not cut.
+    range, `clipped` counts the samples, and ``Sensed.flags`` has `Flag.SATURATED`.
 
     Parameters
     ----------
     path : str or Path
         File to write, anew; its ending chooses the format: .wav, .flac, .w64, .rf64, .aiff, .aif.
         W64 and RF64 hold more than 4 GB.
-    rate : float, Hz, > 0, optional
-        48 kHz unless given; the file's header holds the nearest whole number of Hz.
-    through : Driver, optional
-        A device that plays and senses; rate, channels, block and delay are its own.
-        It is opened and closed together with the file.
+    rate : float, Hz, > 0
+        The file's header holds the nearest whole number of Hz.
     full_scale : float, A, > 0
         Drive that stands in the file as 1.0.  An integer format ends one step short of it upwards.
     subtype : {"PCM_16", "PCM_24", "PCM_32", "FLOAT", "DOUBLE"}, optional
         FLOAT unless given, for FLAC PCM_24 (which holds integers of 16 and 24 bits only).
-    drive_channels, block : int, >= 1, optional
-        Columns of drive (2) and samples a call (1024).
+    drive_channels, block : int, >= 1
+        Columns of drive, and samples a call.
     """
 
     def __init__(
         self,
         path: str | Path,
         *,
-        rate: float | None = None,
-        through: Driver | None = None,
+        rate: float = 48000.0,
         full_scale: float = 3.0,
         subtype: str | None = None,
-        drive_channels: int | None = None,
-        block: int | None = None,
+        drive_channels: int = 2,
+        block: int = 1024,
     ) -> None:
         self.path = Path(path)
         self.full_scale = full_scale
         self.clipped = 0  # samples that the file holds cut to its range
-        self._through = through
-        self._leaving: _Leaving = _NO_ERROR
         self._format, self._subtype = _file_form(self.path, subtype)
         if not (np.isfinite(full_scale) and full_scale > 0):
             raise ValueError(f"{full_scale=} must be finite and > 0 A")
-        own = {"rate": rate, "drive_channels": drive_channels, "block": block}
-        given = {name: value for name, value in own.items() if value is not None}
-        if through is None:
-            numbers = {"rate": 48000.0, "drive_channels": 2, "block": 1024, "sensed_channels": 0} | given
-        else:
-            check_driver(through)
-            for name, value in given.items():
-                raise ValueError(f"{name}={value!r} cannot be given beside through=, which has its own")
-            names = ("rate", "drive_channels", "sensed_channels", "block", "delay")
-            numbers = {name: getattr(through, name) for name in names}
-        self.probe = getattr(through, "probe", True)
-        super().__init__(**numbers)
+        super().__init__(rate=rate, drive_channels=drive_channels, sensed_channels=0, block=block)
 
     def _open(self) -> None:
         if not self.path.parent.is_dir():
@@ -128,27 +105,14 @@ class WaveFileDriver(BaseDriver):
         except (OSError, soundfile.SoundFileError) as error:
             form = f"{self._format} {self._subtype}, {self.drive_channels} channels, {self.rate:g} Hz"
             raise DriverError(f"{self.path}: open: {_reason(error)} ({form})") from error
-        if self._through is not None:
-            try:
-                self._through.__enter__()
-            except Exception:
-                self._file.close()
-                raise
 
     def _play(self, drive: Array) -> Sensed:
         samples = drive / self.full_scale
-        found: list[Sensed] = []
-        carry_through(lambda: found.append(self._sense(drive)), lambda: self._write(samples))
-        return self._flagged(found[0], samples)
-
-    def _sense(self, drive: Array) -> Sensed:
-        return Sensed(np.empty((len(drive), 0))) if self._through is None else self._through.play(drive)
-
-    def _write(self, samples: Array) -> None:
         try:
             self._file.write(self._form(samples))
         except (OSError, AssertionError, soundfile.SoundFileError) as error:  # soundfile asserts that all was written
             raise DeviceLost(f"{self.path}: write: {_reason(error)}") from error
+        return Sensed(np.empty((len(drive), 0)), flags=self._clip_flags(samples))
 
     def _form(self, samples: Array) -> Array:
         """Shape samples so that soundfile writes them unchanged: integers are rounded to nearest and cut."""
@@ -157,31 +121,18 @@ class WaveFileDriver(BaseDriver):
             return samples
         top = 2.0 ** (bits - 1)
         steps = np.clip(np.rint(samples * top), -top, top - 1)
-        return (steps.astype(np.int64) << (_WORD - bits)).astype(np.int32)
+        return (steps.astype(np.int64) << (WIDTH - bits)).astype(np.int32)
 
-    def _flagged(self, sensed: Sensed, samples: Array) -> Sensed:
-        """Count and flag what integers cannot hold."""
+    def _clip_flags(self, samples: Array) -> Array | None:
+        """Count the samples that integers cannot hold; their flags, None where there are none."""
         beyond = np.abs(samples) > 1
         if SUBTYPES[self._subtype] is None or not beyond.any():
-            return sensed
+            return None
         self.clipped += int(np.count_nonzero(beyond))
-        flags = np.where(beyond.any(axis=1), int(Flag.SATURATED), 0)
-        return sensed._replace(flags=flags if sensed.flags is None else flags | sensed.flags)
+        return np.where(beyond.any(axis=1), int(Flag.SATURATED), 0)
 
     def _close(self) -> None:
-        through = self._through
-        leave = [] if through is None else [lambda: through.__exit__(*self._leaving)]
-        carry_through(*leave, self._file.close)
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
-        """Close; pass the error with which the body failed on to the device behind."""
-        self._leaving = kind, error, traceback
-        try:
-            super().__exit__(kind, error, traceback)
-        finally:
-            self._leaving = _NO_ERROR
+        self._file.close()
 
     def read_back(self) -> Array:
         """Drive as the closed file holds it (A, shape (n, drive_channels)), the closing block of zeros included."""

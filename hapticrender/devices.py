@@ -5,7 +5,6 @@ from __future__ import annotations
 import inspect
 from collections.abc import Callable
 from dataclasses import fields
-from functools import partial
 from importlib import import_module
 from importlib.metadata import entry_points
 from importlib.util import find_spec
@@ -25,7 +24,6 @@ EXTRAS = (  # package, extra, what it is good for
     ("distributed", "cluster", "sweeps on a cluster"),
 )
 SIMULATED = "simulated"
-PATIENCE = 0.3  # s that a board has to answer
 FORMS = "NAME, NAME:ARGUMENT, or package.module:callable for one of your own"
 
 
@@ -129,7 +127,7 @@ def text() -> str:
     drivers = [["driver", "installed", "what it does"], *map(_driver, _points("drivers"))]
     there = [["--driver", "what is there"], *(row for entry in _points("drivers") for row in _there(entry))]
     extras = [["extra", "installed", "for"], *(_extra(*each) for each in EXTRAS)]
-    hint = f"--driver takes {FORMS}: hapticrender.drivers.base says in a page what a driver is."
+    hint = f"--driver takes {FORMS}: hapticrender.drivers.base describes a driver in a page."
     return "\n\n".join([table(kinds), table(drivers), hint, table(there), table(extras)])
 
 
@@ -164,36 +162,15 @@ def _there(entry: Any) -> list[list[str]]:
     """Rows of the devices that a driver finds; see `found` in `hapticrender.drivers.base`."""
     if entry.name == SIMULATED:
         return [[SIMULATED, "always: a model of the scene's device, with its finger"]]
-    kind = _load(entry)[0]
-    look: Any = getattr(kind, "found", None)
-    if look is None and (kind is None or entry.name not in SEARCHES):
+    found: Any = getattr(_load(entry)[0], "found", None)
+    if found is None:
         return []
-    look = look or partial(SEARCHES[entry.name], kind)
     try:
-        rows = [each.partition("  ")[::2] for each in look()]
+        rows = [each.partition("  ")[::2] for each in found()]
     except Exception as error:  # a third party's search may fail in any way; the list must go on
         reason = " ".join(f"{type(error).__name__}: {error}{_cure(error)}".split())
         return [[f"{entry.name}:", f"cannot be searched ({reason})"]]
     return [[f"{entry.name}:{argument}", about.strip()] for argument, about in rows] or [[f"{entry.name}:", "none"]]
-
-
-def _ports(kind: Callable[..., Any]) -> list[str]:
-    """Serial ports by their names, and the boards that answer there to a driver of `kind`."""
-    from serial.tools.list_ports import comports
-
-    return [f"{port.device}  {port.description}; {_board(kind, port.device)}" for port in comports()]
-
-
-def _board(kind: Callable[..., Any], port: str) -> str:
-    """Say which board answers at a port."""
-    try:
-        board = kind(port, timeout=PATIENCE)
-    except (OSError, HapticError) as error:
-        return f"no board answers ({type(error).__name__})"
-    return f"a board of {board.rate:g} Hz, {board.drive_channels} out, {board.sensed_channels} in"
-
-
-SEARCHES = {"serial": _ports}  # of drivers that have no search of their own
 
 
 def _load(entry: Any) -> tuple[Any, str]:

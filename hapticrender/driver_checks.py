@@ -36,7 +36,7 @@ def check_driver(driver: Any) -> None:
 def check_sensed(driver: Any, sensed: Sensed, places: int) -> Sensed:
     """Return a block that `driver` returned with its columns as contiguous float64 (flags int64).
 
-    A `ProtocolError` says which column has no numbers, or not the driver's shape; `motion` has `places` columns.
+    A `ProtocolError` names the column that has no numbers, or not the driver's shape; `motion` has `places` columns.
     """
     block = driver.block
     shapes = {

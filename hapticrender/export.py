@@ -18,7 +18,7 @@ from hapticrender.control.kernel import FADE_OUT
 from hapticrender.protocols import Rendering
 
 MOST_BANDS, MOST_DELAY = 64, 64  # bands; samples
-BANDS = 8  # of a board at least: set-points may ask for more than the scene does
+BANDS = 8  # of a board at least: set-points may need more than the scene does
 CHANGE = 20e-3  # s: of a change of gain, amplitude or carrier
 MEASURING, MEASURING_DC = 10.0, 6.0  # Hz: widest bandwidth of the measured envelopes and of their offset
 GENERATED = "/* Written by `hapticrender export`; export the scene again instead of editing. */\n"

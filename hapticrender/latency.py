@@ -7,7 +7,7 @@ the origin (least squares, weighted by the magnitude of S, 0.05 to 0.4 of the ra
 
     delay = B + s - 1/2 - queued,
 
-for in the loop's models a drive is held for a sample, and so acts half a sample later than its number says.
+for in the loop's models a drive is held for a sample, and so acts half a sample after its number.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ WHOLE = 0.9  # correlation from which on a burst has come back whole, although s
 MOST_SPREAD = 0.5  # samples, between runs
 NEW_PROFILE = '[profile]\nkind = "vt-plate"  # or electroadhesion, ultrasonic, hybrid\n'
 TINY = float(np.finfo(float).tiny)
-TRIES = 10  # times as many runs as asked for, where samples are lost
+TRIES = 10  # times as many runs as requested, where samples are lost
 
 
 class Trip(NamedTuple):

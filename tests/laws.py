@@ -96,7 +96,7 @@ class Exports:
     """Designs of the textures, and their laws in C, each built once."""
 
     def __init__(self, folder):
-        self.folder, self.renderings, self.libraries = folder, {}, {}
+        self.folder, self.renderings, self.parts, self.libraries = folder, {}, {}, {}
 
     def rendering(self, name):
         """Scene whose drive is not rounded: a last bit would decide which way, and both would part for good.
@@ -119,9 +119,13 @@ class Exports:
         folder = self.folder / texture.replace(" ", "-")
         if not folder.exists():
             export(self.rendering(texture), folder)
-        files = [*(folder / f"{name}.c" for name in PARTS), ROOT / "tests" / "law_step.c"]
-        options = ("-O2", "-fPIC", "-shared", KINDS[kind], f"-I{folder}")
-        library = ctypes.CDLL(str(compile_c(folder / f"law-{kind}.so", files, *options)))
+        options = ("-O2", "-fPIC", KINDS[kind], f"-I{folder}")
+        sizes = kind, (folder / "design.h").read_text()
+        if sizes not in self.parts:  # designs of equal sizes share all but their tables
+            files = [*(folder / f"{name}.c" for name in PARTS[:-1]), ROOT / "tests" / "law_step.c"]
+            self.parts[sizes] = [compile_c(folder / f"{each.stem}-{kind}.o", [each], *options, "-c") for each in files]
+        files = [*self.parts[sizes], folder / "design.c"]
+        library = ctypes.CDLL(str(compile_c(folder / f"law-{kind}.so", files, *options, "-shared")))
         address, number, count = ctypes.c_int64, ctypes.c_double, ctypes.c_uint32
         library.law_size.restype = library.supervised_size.restype = ctypes.c_size_t
         for name, types in {

@@ -1,6 +1,4 @@
-"""Boards and hosts that fail, and a line that damages, loses and repeats what it carries."""
-
-import time
+"""Boards and hosts that fail, and a line that damages, loses and repeats bytes; time is the board's own."""
 
 import numpy as np
 import pytest
@@ -13,14 +11,12 @@ from board import (
     driven,
     program_of,
     run,
-    slow_board,
-    slow_client,
     tones,
 )
 
 from hapticrender.bands import Bands
 from hapticrender.drivers import protocol
-from hapticrender.drivers.protocol import Cause, Kind, State
+from hapticrender.drivers.protocol import Cause, Kind
 from hapticrender.drivers.serial import Line
 from hapticrender.errors import DeviceFault, DeviceLost, DeviceTimeout, DriverError
 
@@ -31,30 +27,6 @@ def stepped(tmp_path):
         yield board
 
 
-def test_an_unplugged_board_is_lost_with_port_operation_and_bytes(tmp_path):
-    with slow_board(tmp_path) as board, slow_client(board) as client:
-        client.set_bands(tones(47.0))
-        client.start()
-        board.kill()
-        lost = r"tty: (line|listen): .* \(\d+ bytes sent, \d+ received, 0 bad frames\)"
-        with pytest.raises(DeviceLost, match=lost):
-            wait_for(lambda: client.telemetry() and False)
-        with pytest.raises(DeviceLost, match=lost):
-            client.finger(0.0)
-
-
-def test_a_replugged_board_goes_on(tmp_path):
-    with slow_board(tmp_path) as first, slow_client(first, reconnect=20.0) as client:
-        client.set_bands(tones(47.0))
-        client.gain = 0.25
-        client.start()
-        first.kill()
-        with slow_board(tmp_path) as second:
-            wait_for(lambda: client.reconnections == 1 and client.telemetry().state == State.PLAYING)
-            assert [line[1:] for line in second.log() if line[1] == "gain"] == [["gain", "0.25"]]
-            client.stop()
-
-
 def test_a_board_that_stays_away_is_lost(stepped):
     client = client_of(stepped, reconnect=1.0).open()
     client.set_bands(tones(47.0))
@@ -62,11 +34,11 @@ def test_a_board_that_stays_away_is_lost(stepped):
     run(client, stepped, 0.1)
     stepped.pulled = np.inf
     start = stepped.time
-    with pytest.raises(DeviceLost, match=r"stepped: listen: no good frame for 0.5 s \(\d+ bytes sent"):
+    with pytest.raises(DeviceLost, match=r"stepped: listen: no valid frame for 0.5 s \(\d+ bytes sent"):
         run(client, stepped, 10.0)
     # silence for 0.5 s, 1 s of attempts, the last of which may take 1 s and 0.05 s
     assert 1.5 <= stepped.time - start <= 2.56
-    with pytest.raises(DeviceLost, match="no good frame"):
+    with pytest.raises(DeviceLost, match="no valid frame"):
         client.gain = 0.5
 
 
@@ -151,7 +123,7 @@ def test_a_sensor_that_is_dead_or_inverted_stops_the_board(tmp_path, gains, caus
         client.start()
         with pytest.raises(DeviceFault, match="stepped: play: the board stopped: .*: check "):
             run(client, board, 2.0)
-        assert client._line.link.telemetry.cause in causes
+        assert client._line.telemetry.cause in causes
         board.sleep(0.001)
         assert driven(board.board.log(), board.sample - 1, board.sample) == []
 
@@ -178,7 +150,7 @@ def test_a_word_that_waited_for_long_is_no_sign_of_life(stepped, late, stops):
     start, waiting = stepped.time, []
     while stepped.time < start + 0.6:
         arrival = stepped.time + min(late, (stepped.time - start) / 2)
-        waiting.append((arrival, client._line.link.due(stepped.time)))
+        waiting.append((arrival, client._line.due(stepped.time)))
         stepped.sleep(0.01)
         while waiting and waiting[0][0] <= stepped.time:
             stepped.inject(waiting.pop(0)[1])
@@ -192,7 +164,7 @@ def test_damage_that_the_crc_does_not_show_does_nothing(stepped):
     client.start()
     run(client, stepped, 0.2)
     before, refused = stepped.board.log(), client.telemetry().refused
-    link = client._line.link
+    link = client._line
     words = [
         (Kind.SETPOINT, protocol.pack(Kind.SETPOINT, 0, 47.0, 0.0, 0.0, 5e-6, 0.0)),
         (Kind.GAIN, protocol.pack(Kind.GAIN, 0.5)),
@@ -206,7 +178,7 @@ def test_damage_that_the_crc_does_not_show_does_nothing(stepped):
         changed = bytes([frame.payload[0] ^ 1]) + frame.payload[1:]
         stepped.inject(protocol.encode(frame._replace(payload=changed)))
         run(client, stepped, 0.02)
-    client._line.link._strange = 0
+    client._line._foreign = 0
     run(client, stepped, 0.1)
     assert client.telemetry().refused == refused + len(words)
     assert client.telemetry().commits == 1
@@ -221,7 +193,7 @@ def test_a_commit_acts_only_on_what_it_says(stepped):
     payloads = [protocol.pack(Kind.SETPOINT, index, 100.0 + 20 * index, 0.0, 0.0, 5e-6, 0.0) for index in (0, 1)]
     client._line.send(Kind.SETPOINT, payloads[1])
     with pytest.raises(DriverError, match="COMMIT: refused by the board: digest"):
-        client._line.ask(Kind.COMMIT, 2, protocol.digest(payloads))
+        client._line.command(Kind.COMMIT, 2, protocol.digest(payloads))
     assert [line[3:9:5] for line in stepped.board.log() if line[1] == "commit"] == [["47", "72"]]
 
 
@@ -347,11 +319,3 @@ def test_a_bad_line_never_plays_what_was_not_asked_for(tmp_path, options, second
     for incarnation, start, stop in session.silences:
         drives = driven(logs[incarnation], start + int(0.1 * RATE), stop)
         assert not drives, f"{drives} after the cable was pulled at {start}"
-
-
-def wait_for(done, seconds=30.0):
-    """Wait until it is done; a test that hangs fails."""
-    end = time.monotonic() + seconds
-    while not done():
-        assert time.monotonic() < end
-        time.sleep(0.01)

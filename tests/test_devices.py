@@ -4,11 +4,15 @@ import sys
 
 import numpy as np
 import pytest
+from board import slow_board
 from other_plate import OtherPlate
+from serial.tools import list_ports
+from serial.tools.list_ports_common import ListPortInfo
 
 import hapticrender as hr
 from hapticrender import cli, devices
 from hapticrender.devices import open_driver
+from hapticrender.drivers.serial import SerialDriver
 
 TONE = hr.Scene(texture=hr.Grating(frequency=47.0, amplitude=10e-6), duration=0.1, rendering={"probe": False})
 
@@ -151,28 +155,12 @@ def test_devices_shows_what_each_driver_finds(monkeypatch):
     assert not [line for line in lines if line.startswith("plain:")]
 
 
-class Answering:
-    """A serial driver at whose second port a board answers."""
-
-    rate, drive_channels, sensed_channels = 5000.0, 2, 2
-
-    def __init__(self, port, timeout):
-        if port == "COM1":
-            raise hr.DeviceTimeout("COM1: hello: no answer")
-
-
-def test_serial_ports_are_shown_with_the_boards_that_answer(monkeypatch):
-    from serial.tools import list_ports
-    from serial.tools.list_ports_common import ListPortInfo
-
-    known = devices.entry_points
-    points = [Entry("serial", Answering)]
-    monkeypatch.setattr(
-        devices, "entry_points", lambda group: points if group.endswith("drivers") else known(group=group)
-    )
-    monkeypatch.setattr(list_ports, "comports", lambda: [ListPortInfo("COM1"), ListPortInfo("COM2")])
-    lines = [" ".join(line.split()) for line in devices.text().splitlines()]
-    assert "serial:COM1 n/a; no board answers (DeviceTimeout)" in lines
-    assert "serial:COM2 n/a; a board of 5000 Hz, 2 out, 2 in" in lines
-    monkeypatch.setattr(list_ports, "comports", list)
-    assert "serial: none" in [" ".join(line.split()) for line in devices.text().splitlines()]
+def test_serial_ports_are_shown_with_the_boards_that_answer(tmp_path, monkeypatch):
+    """A compiled board at one port, nothing at the other."""
+    with slow_board(tmp_path) as board:
+        monkeypatch.setattr(list_ports, "comports", lambda: [ListPortInfo("COM1"), ListPortInfo(str(board.port))])
+        monkeypatch.setattr("hapticrender.drivers.serial.PATIENCE", 10.0)
+        assert SerialDriver.found() == [
+            "COM1  n/a; no board answers (DeviceNotFound)",
+            f"{board.port}  n/a; a board of 5000 Hz, 2 out, 2 in",
+        ]

@@ -6,7 +6,7 @@ import subprocess
 
 import numpy as np
 import pytest
-from board import ROOT
+from board import ROOT, compile_c
 from laws import FINGERS, PARTS, RATE, Exports
 
 import hapticrender as hr
@@ -15,6 +15,7 @@ from hapticrender.drivers.serial import BoardClient
 from hapticrender.export import export
 
 CROSS, QEMU = "arm-none-eabi-gcc", "qemu-system-arm"
+SIZE = '#include <stdio.h>\n#include "law.h"\nint main(void) { return printf("%zu", sizeof(law_t)) < 0; }\n'
 COUNTS = ("nops", "free", "new", "touched", "most", "textures", "frame")
 NOISE = 0.7e-6 * np.sqrt(4 * np.pi * 10.0 / RATE)  # m: mean of two sensors, times the root of the observer's gain
 
@@ -50,6 +51,12 @@ def test_the_law_needs_no_heap_no_output_and_no_double_on_a_cortex_m4(exports, t
     defined = {words[-1] for words in listed if len(words) == 3}
     asked = {words[-1] for words in listed if len(words) == 2 and words[0] == "U"}
     assert asked - defined <= {"memcpy", "memmove", "memset", "rintf", "sqrtf"}
+
+
+@pytest.fixture(scope="module")
+def board(exports, tmp_path_factory):
+    """Program of the whole board, with a plate model."""
+    return built(tmp_path_factory.mktemp("board"), exports.rendering("tones"), "board-m4.elf")
 
 
 def measured(program):
@@ -90,10 +97,9 @@ def test_a_texture_leaves_time_for_the_line_on_a_cortex_m4(exports, tmp_path):
     assert found["frames_read"] == [2.0], "the frame that was measured is none"
 
 
-def test_the_board_fits_into_the_stated_memory(exports, tmp_path):
+def test_the_board_fits_into_the_stated_memory(board):
     """128 kB of RAM with 8 kB for the stack, which takes less than 1 kB, and for what the machine itself needs."""
-    program = built(tmp_path, exports.rendering("tones"), "board-m4.elf")
-    size = subprocess.run([CROSS.replace("gcc", "size"), program], capture_output=True, text=True, check=True).stdout
+    size = subprocess.run([CROSS.replace("gcc", "size"), board], capture_output=True, text=True, check=True).stdout
     flash, data, zeroed = map(int, size.splitlines()[1].split()[:3])
     print(f"flash {flash + data} bytes, RAM {data + zeroed} bytes")
     assert data + zeroed < (128 - 8) * 1024
@@ -108,16 +114,18 @@ def test_a_cortex_m4_measures_what_is_asked(exports, tmp_path):
     wanted, found = complex(re_wanted, im_wanted), complex(re_found, im_found)
     assert abs(wanted) == pytest.approx(abs(rendering.bands.envelope[1]) * 1e6, rel=1e-3)
     assert abs(found - wanted) < 0.02 * abs(wanted) + 3e6 * NOISE
-    assert 0 <= exports.law("tones", "float").state.size - lines["state"][0] <= 8, "more than a shorter pointer"
+    (tmp_path / "size.c").write_text(SIZE)
+    program = compile_c(tmp_path / "size", [tmp_path / "size.c"], f"-I{tmp_path}")
+    size = int(subprocess.run([program], capture_output=True, text=True, check=True).stdout)
+    assert 0 <= size - lines["state"][0] <= 8, "more than a shorter pointer"
 
 
-def test_the_board_on_a_cortex_m4_speaks_to_the_host(exports, tmp_path):
+def test_the_board_on_a_cortex_m4_speaks_to_the_host(board):
     """The same client as for any board, over the emulated machine's serial line: a pseudo-terminal."""
-    program = built(tmp_path, exports.rendering("tones"), "board-m4.elf")
     machine = [QEMU, "-M", "mps2-an386", "-display", "none", "-monitor", "none", "-serial", "pty"]
-    board = subprocess.Popen([*machine, "-kernel", program], stdout=subprocess.PIPE, text=True)
+    process = subprocess.Popen([*machine, "-kernel", board], stdout=subprocess.PIPE, text=True)
     try:
-        port = re.search(r"/dev/\S+", board.stdout.readline())[0]
+        port = re.search(r"/dev/\S+", process.stdout.readline())[0]
         with BoardClient(port, timeout=20.0) as client:  # the emulator looks for its host once a second
             envelope = np.array([10e-6, 4e-6])
             client.set_bands(Bands(frequency=[70.0, 120.0], wavenumber=[0, 0], phase=[0, 0], envelope=envelope))
@@ -130,5 +138,5 @@ def test_the_board_on_a_cortex_m4_speaks_to_the_host(exports, tmp_path):
             assert abs(band.target - wanted) < 1e-6 * wanted
             assert abs(band.measured - wanted) < 0.02 * wanted + 3 * NOISE
     finally:
-        board.kill()
-        board.communicate()
+        process.kill()
+        process.communicate()

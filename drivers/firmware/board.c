@@ -67,11 +67,11 @@ void board_stop(board_t *board, uint32_t cause)
     }
 }
 
-/* Position of the finger now: along its velocity for a while, then held, then lifted.  Between words it follows the
-   velocity, and approaches what the last word says within 10 ms, so that words that differ make no step. */
+/* Position of the finger now: along its velocity for a while, then held, then lifted.  Between FINGER frames it follows
+   the velocity, and approaches the latest position within 10 ms, so that a frame makes no step. */
 static void place_finger(board_t *board)
 {
-    word_t *finger = &board->finger;
+    finger_input_t *finger = &board->finger;
     uint32_t age = board_time(board) - finger->written;
     if (age > 1000u * BOARD_FINGER_MS) {
         finger->position = (real_t)NAN;
@@ -186,7 +186,7 @@ static void advance_fade(board_t *board)
     }
 }
 
-static void listen_to_host(board_t *board)
+static void read_host(board_t *board)
 {
     uint8_t bytes[64];
     size_t count = hardware_read(bytes, sizeof bytes);
@@ -220,7 +220,7 @@ void board_tick(board_t *board, uint32_t ticks)
     uint32_t start = hardware_cycles();
     board->flags = ticks > 1u ? BOARD_OVERRUN : 0u;
     hardware_sense(board->sensed);
-    listen_to_host(board);
+    read_host(board);
     place_finger(board);
     compute_drive(board);
     guard(board);

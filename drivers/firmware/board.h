@@ -2,8 +2,9 @@
  * The board: bytes from the host become set-points, finger and commands; the law runs once a tick; telemetry goes back.
  *
  * docs/protocol.md has every frame.  A set-point acts only after a COMMIT whose digest is that of what the board holds;
- * every command carries a CRC-32 that starts from the session, beside the frame's CRC-16.  Without a word for 80 ms, or
- * without a beat of the application for as long as it says, the drive fades out within 10 ms.  Static memory: sizeof(board_t), no heap, no recursion.
+ * every command carries a CRC-32 that starts from the session, beside the frame's CRC-16.  Without a keep-alive for
+ * 80 ms, or without a beat of the application for the time of its watchdog, the drive fades out within 10 ms.  Static
+ * memory: sizeof(board_t), no heap, no recursion.
  */
 #ifndef BOARD_H
 #define BOARD_H
@@ -17,11 +18,11 @@
 #include "texture.h"
 
 enum {
-    BOARD_VERSION = 2,
-    BOARD_SILENCE_MS = 80,                        /* without a good word (HEARTBEAT, FINGER): fade out */
+    BOARD_VERSION = 3,
+    BOARD_SILENCE_MS = 80,                        /* without a keep-alive (HEARTBEAT, FINGER): fade out */
     BOARD_FADE_MS = 10,
     BOARD_EXTRAPOLATE_MS = 50,                    /* a finger's position follows its velocity for so long, then holds */
-    BOARD_FINGER_MS = 200,                        /* without a finger's word: no finger */
+    BOARD_FINGER_MS = 200,                        /* without a FINGER frame: no finger */
     BOARD_INVALID_MS = 10,                        /* of invalid samples: stop */
     BOARD_LINES = 64,                             /* of a multisine */
     BOARD_QUEUE = 1024,                           /* rows of drive on their way */
@@ -61,10 +62,10 @@ typedef struct {
 
 typedef struct {
     real_t position, velocity, load;              /* m (NaN: lifted), m/s, N */
-    uint32_t written;                             /* us of the board's clock when the host wrote the word */
+    uint32_t written;                             /* us of the board's clock when the host wrote the frame */
     uint32_t offset;                              /* us: least lead of the board's clock over the host's */
     uint32_t known;                               /* 1: offset is known */
-} word_t;
+} finger_input_t;
 
 typedef struct {
     law_t law;
@@ -76,17 +77,15 @@ typedef struct {
     uint64_t clock;                               /* us since reset, times 65536 */
     uint32_t clock_step;
     uint32_t nonce, session;                      /* the host's number, and what the board made of it; 0: no host */
-    uint16_t commanded, worded, spoken;           /* sequence of the last command, the last word, the next frame out */
+    uint16_t commanded, kept_alive, next;         /* sequence of the last command, the last keep-alive, the next out */
     uint8_t replied[FRAME_WIRE];                  /* to the last command */
     size_t replied_count;
-    uint32_t quiet;                               /* samples since the last good word */
-    uint32_t beat, unattended, watchdog;          /* of the application: its last beat; samples since;
-                                                     most, 0: any */
-    uint32_t echo;                                /* us: host's time of the last word */
+    uint32_t quiet;                               /* samples since the last keep-alive */
+    uint32_t beat, unattended, watchdog;          /* of the application: last beat; samples since; most, 0: any */
+    uint32_t echo;                                /* us: host's time of the last keep-alive */
     uint32_t bad, refused, dropped;               /* frames: malformed; refused; not sent as the line was full */
-    word_t finger;
-    band_t staged[LAW_BANDS];
-    uint8_t staged_bytes[LAW_BANDS][20];
+    finger_input_t finger;
+    uint8_t staged[LAW_BANDS][20];                /* set-points as received, until COMMIT */
     uint32_t commits;                             /* COMMITs executed; the bands in use are `played.bands` */
     uint32_t committed;                           /* 1: this session has set-points */
     real_t gain;
@@ -118,18 +117,18 @@ void board_init(board_t *board);
 /* Do the work of a tick: read the host, sense, run the law, drive, answer.  `ticks` is what hardware_wait returned. */
 void board_tick(board_t *board, uint32_t ticks);
 
-/* Between the files of the board. */
+/* Between the files of the board; `from` is a command without its check value. */
 uint32_t board_time(const board_t *board);                      /* us since reset; wraps */
 uint32_t board_samples_of(const board_t *board, uint32_t milliseconds);
 void board_defaults(board_t *board);                            /* gain and limits of the design */
 void board_begin(board_t *board, board_state state);            /* a run, from rest */
 void board_stop(board_t *board, uint32_t cause);                /* fade out, unless at rest */
-void board_command(board_t *board, const frame *incoming);      /* board_commands.c: do what a frame says */
+void board_command(board_t *board, frame *from);                /* board_commands.c; `from` with its check value */
 void board_send(board_t *board, uint8_t kind, uint16_t sequence, const uint8_t *payload, size_t count);
-uint8_t board_texture(board_t *board, const uint8_t *payload, size_t count); /* board_textures.c: a reason, or none */
-uint8_t board_profile(board_t *board, const uint8_t *payload, size_t count);
-uint8_t board_samples(board_t *board, const uint8_t *payload, size_t count);
-uint8_t board_play(board_t *board, const uint8_t *payload, size_t count);
+uint8_t board_texture(board_t *board, const frame *from);       /* board_textures.c: a reason, or none */
+uint8_t board_profile(board_t *board, const frame *from);
+uint8_t board_samples(board_t *board, const frame *from);
+uint8_t board_play(board_t *board, const frame *from);
 void board_telemetry(board_t *board);                           /* board_telemetry.c */
 void board_stream(board_t *board);
 void board_flush(board_t *board);

@@ -1,4 +1,4 @@
-/* What the host may ask: each command is checked, done at most once, and acknowledged or refused with a reason. */
+/* Commands of the host: each is checked, done at most once, and acknowledged or refused with a reason. */
 #include <string.h>
 
 #include "board.h"
@@ -6,7 +6,7 @@
 
 enum { CHECK = 4, SETPOINT_BYTES = 20, LINE_BYTES = 13, ROW_BYTES = 4 * LAW_CHANNELS };
 
-typedef uint8_t (*handler)(board_t *board, const uint8_t *payload, size_t count);
+typedef uint8_t (*handler)(board_t *board, const frame *from);
 
 /* CRC-32 of the session, the kind, the sequence and the payload before it: the last four bytes of every command. */
 static int check_holds(const board_t *board, const frame *from)
@@ -18,51 +18,47 @@ static int check_holds(const board_t *board, const frame *from)
     return get_u32(from->payload + count) == crc32(from->payload, count, crc32(head, sizeof head, 0u));
 }
 
-static uint8_t setpoint(board_t *board, const uint8_t *payload, size_t count)
+static uint8_t setpoint(board_t *board, const frame *from)
 {
-    (void)count;
-    uint32_t index = payload[0];
+    uint32_t index = from->payload[0];
     if (index >= LAW_BANDS) {
         return REASON_VALUE;
     }
-    const uint8_t *at = payload + 1;
-    memcpy(board->staged_bytes[index], at, SETPOINT_BYTES);
-    band_t band = {(real_t)get_f32(at), (real_t)get_f32(at + 4), (real_t)get_f32(at + 8), (real_t)get_f32(at + 12),
-                   (real_t)get_f32(at + 16)};
-    board->staged[index] = band;
+    memcpy(board->staged[index], from->payload + 1, SETPOINT_BYTES);
     return REASON_NONE;
 }
 
-static uint8_t commit(board_t *board, const uint8_t *payload, size_t length)
+static uint8_t commit(board_t *board, const frame *from)
 {
-    (void)length;
-    uint32_t count = payload[0];
+    band_t bands[LAW_BANDS];
+    uint32_t count = from->payload[0], spatial = count > 0u ? 1u : 0u;
     if (count > LAW_BANDS) {
         return REASON_VALUE;
     }
-    if (get_u32(payload + 1) != crc32(&board->staged_bytes[0][0], count * SETPOINT_BYTES, 0u)) {
+    if (get_u32(from->payload + 1) != crc32(&board->staged[0][0], count * SETPOINT_BYTES, 0u)) {
         return REASON_DIGEST;
     }
-    if (law_set_bands(&board->law, board->staged, count) == 0u) {
+    for (uint32_t i = 0; i < count; i++) {
+        const uint8_t *at = board->staged[i];
+        band_t band = {(real_t)get_f32(at), (real_t)get_f32(at + 4), (real_t)get_f32(at + 8),
+                       (real_t)get_f32(at + 12), (real_t)get_f32(at + 16)};
+        bands[i] = band;
+        spatial = band.wavenumber > REAL(0.0) ? spatial : 0u;
+    }
+    if (law_set_bands(&board->law, bands, count) == 0u) {
         return REASON_VALUE;
     }
-    memcpy(board->played.bands, board->staged, sizeof board->staged);
+    memcpy(board->played.bands, bands, count * sizeof bands[0]);
     board->played.bands_used = count;
-    board->played.spatial = count > 0u ? 1u : 0u;
-    for (uint32_t i = 0; i < count; i++) {
-        if (!(board->staged[i].wavenumber > REAL(0.0))) {
-            board->played.spatial = 0u;
-        }
-    }
+    board->played.spatial = spatial;
     board->committed = 1u;
     board->commits++;
     return REASON_NONE;
 }
 
-static uint8_t gain(board_t *board, const uint8_t *payload, size_t count)
+static uint8_t gain(board_t *board, const frame *from)
 {
-    (void)count;
-    real_t value = (real_t)get_f32(payload);
+    real_t value = (real_t)get_f32(from->payload);
     if (!(value >= REAL(0.0) && value <= REAL(1.0))) {
         return REASON_VALUE;
     }
@@ -71,10 +67,9 @@ static uint8_t gain(board_t *board, const uint8_t *payload, size_t count)
     return REASON_NONE;
 }
 
-static uint8_t limits(board_t *board, const uint8_t *payload, size_t count)
+static uint8_t limits(board_t *board, const frame *from)
 {
-    (void)count;
-    real_t peak = (real_t)get_f32(payload), rms = (real_t)get_f32(payload + 4), time = (real_t)get_f32(payload + 8);
+    real_t peak = (real_t)get_f32(from->payload), rms = (real_t)get_f32(from->payload + 4), time = (real_t)get_f32(from->payload + 8);
     if (!(peak > REAL(0.0) && peak <= design.drive_limit && rms > REAL(0.0) && rms <= peak && time >= REAL(1e-3) &&
           time <= REAL(1e3))) {
         return REASON_VALUE;
@@ -86,33 +81,30 @@ static uint8_t limits(board_t *board, const uint8_t *payload, size_t count)
     return REASON_NONE;
 }
 
-static uint8_t start(board_t *board, const uint8_t *payload, size_t count)
+static uint8_t start(board_t *board, const frame *from)
 {
-    (void)count;
     if (board->state != BOARD_IDLE || board->committed == 0u) {
         return REASON_STATE;
     }
-    board->stride = get_u16(payload);
-    board->period = get_u16(payload + 2);
+    board->stride = get_u16(from->payload);
+    board->period = get_u16(from->payload + 2);
     board->unattended = 0;
     board->textures.of[board->textures.current].began = board->sample;
     board_begin(board, BOARD_PLAYING);
     return REASON_NONE;
 }
 
-static uint8_t stop(board_t *board, const uint8_t *payload, size_t count)
+static uint8_t stop(board_t *board, const frame *from)
 {
-    (void)payload;
-    (void)count;
+    (void)from;
     board_stop(board, CAUSE_COMMAND);
     return REASON_NONE;
 }
 
-static uint8_t line(board_t *board, const uint8_t *payload, size_t count)
+static uint8_t line(board_t *board, const frame *from)
 {
-    (void)count;
-    uint32_t index = payload[0];
-    const uint8_t *at = payload + 1;
+    uint32_t index = from->payload[0];
+    const uint8_t *at = from->payload + 1;
     line_t new_line = {at[0], (real_t)get_f32(at + 5), (real_t)get_f32(at + 9), (real_t)get_f32(at + 1)};
     real_t frequency = new_line.step;
     if (board->state != BOARD_IDLE) {
@@ -129,48 +121,47 @@ static uint8_t line(board_t *board, const uint8_t *payload, size_t count)
     return REASON_NONE;
 }
 
-static uint8_t identify(board_t *board, const uint8_t *payload, size_t count)
+static uint8_t identify(board_t *board, const frame *from)
 {
-    (void)count;
-    uint32_t lines = payload[0];
+    uint32_t lines = from->payload[0];
     if (board->state != BOARD_IDLE) {
         return REASON_STATE;
     }
     if (lines > BOARD_LINES) {
         return REASON_VALUE;
     }
-    if (get_u32(payload + 7) != crc32(&board->line_bytes[0][0], lines * LINE_BYTES, 0u)) {
+    if (get_u32(from->payload + 7) != crc32(&board->line_bytes[0][0], lines * LINE_BYTES, 0u)) {
         return REASON_DIGEST;
     }
     board->lines_used = lines;
-    board->remaining = get_u32(payload + 1);
-    board->stride = get_u16(payload + 5);
+    board->remaining = get_u32(from->payload + 1);
+    board->stride = get_u16(from->payload + 5);
     board_begin(board, lines > 0u ? BOARD_IDENTIFYING : BOARD_DRIVING);
     board->queue_out = board->queue_in = 0;
     return REASON_NONE;
 }
 
-static uint8_t drive(board_t *board, const uint8_t *payload, size_t count)
+static uint8_t drive(board_t *board, const frame *from)
 {
-    size_t rows = (count - 4u) / ROW_BYTES;
-    if (board->state != BOARD_DRIVING || get_u32(payload) != board->queue_in ||
+    size_t rows = (from->count - 4u) / ROW_BYTES;
+    if (board->state != BOARD_DRIVING || get_u32(from->payload) != board->queue_in ||
         board->queue_in - board->queue_out + rows > BOARD_QUEUE) {
         return REASON_STATE;
     }
     for (size_t row = 0; row < rows; row++) {
         float *to = board->queue[board->queue_in++ % BOARD_QUEUE];
         for (uint32_t c = 0; c < LAW_CHANNELS; c++) {
-            to[c] = get_f32(payload + 4u + row * ROW_BYTES + 4u * c);
+            to[c] = get_f32(from->payload + 4u + row * ROW_BYTES + 4u * c);
         }
     }
     return REASON_NONE;
 }
 
-/* Return the age of a word (us) by the host's clock: the least difference of the clocks is taken for their offset, and may grow by
-   1 us a word, 100 ppm at 100 words a second, so that it follows a host's clock that is slow. */
+/* Return the age of a keep-alive (us) by the host's clock: the least difference of the clocks is taken for their offset,
+   and may grow by 1 us a frame, 100 ppm at 100 frames a second, so that it follows a host's clock that is slow. */
 static uint32_t take_time(board_t *board, uint32_t host)
 {
-    word_t *finger = &board->finger;
+    finger_input_t *finger = &board->finger;
     uint32_t lead = board_time(board) - host;
     int32_t later = (int32_t)(lead - finger->offset);
     if (finger->known == 0u || later < 0) {
@@ -183,14 +174,14 @@ static uint32_t take_time(board_t *board, uint32_t host)
     return lead - finger->offset;
 }
 
-static void word(board_t *board, const frame *from)
+static void keep_alive(board_t *board, const frame *from)
 {
-    if (board->finger.known != 0u && (int16_t)(uint16_t)(from->sequence - board->worded) <= 0) {
+    if (board->finger.known != 0u && (int16_t)(uint16_t)(from->sequence - board->kept_alive) <= 0) {
         return;                                   /* a copy, or late */
     }
-    board->worded = from->sequence;
+    board->kept_alive = from->sequence;
     if (take_time(board, get_u32(from->payload)) < 1000u * BOARD_SILENCE_MS) {
-        board->quiet = 0;                         /* an older one has waited in a full line: no sign of life */
+        board->quiet = 0;                         /* an older one has waited in a full line */
         board->unattended = get_u16(from->payload + 4) != board->beat ? 0u : board->unattended;
         board->beat = get_u16(from->payload + 4);
         board->watchdog = board_samples_of(board, get_u16(from->payload + 6));
@@ -212,16 +203,13 @@ static void reply(board_t *board, uint8_t kind, uint16_t sequence, const uint8_t
     board_send(board, kind, sequence, payload, count);
 }
 
-static void refuse(board_t *board, const frame *from, uint8_t reason, int keep)
+/* Refuse a frame that is no command of this session; the last command's reply stays. */
+static void refuse(board_t *board, const frame *from, uint8_t reason)
 {
     uint8_t payload[6];
     (void)put_u32(put_u8(put_u8(payload, from->kind), reason), board->sample);
     board->refused++;
-    if (keep) {
-        reply(board, KIND_REFUSE, from->sequence, payload, sizeof payload);
-    } else {
-        board_send(board, KIND_REFUSE, from->sequence, payload, sizeof payload);
-    }
+    board_send(board, KIND_REFUSE, from->sequence, payload, sizeof payload);
 }
 
 /* A new host begins at rest, with its own set-points only.  The session is made of its number and the board's clock:
@@ -280,52 +268,51 @@ static const struct {
     {KIND_PLAY, 4, 0, board_play},
 };
 
-static void execute(board_t *board, const frame *from)
+/* Do a command; return the reason why it is refused, or none. */
+static uint8_t execute(board_t *board, const frame *from)
 {
-    size_t count = from->count - CHECK;
-    int16_t later = (int16_t)(uint16_t)(from->sequence - board->commanded);
-    if (later == 0) {                             /* asked again as the reply was lost: said again, not done again */
-        board_send(board, board->replied[0], from->sequence, board->replied + 1, board->replied_count);
-        return;
-    }
-    if (later < 0) {
-        return;
-    }
     for (size_t i = 0; i < sizeof commands / sizeof commands[0]; i++) {
         if (commands[i].kind == from->kind) {
-            size_t least = commands[i].count, row = commands[i].row;
+            size_t least = commands[i].count, row = commands[i].row, count = from->count;
             int fits = count == least || (row > 0u && count > least && (count - least) % row == 0u);
-            uint8_t reason = fits ? commands[i].handle(board, from->payload, count) : (uint8_t)REASON_LENGTH;
-            uint8_t payload[5];
-            if (reason != REASON_NONE) {
-                refuse(board, from, reason, 1);
-                return;
-            }
-            (void)put_u32(put_u8(payload, from->kind), board->sample);
-            reply(board, KIND_ACK, from->sequence, payload, sizeof payload);
-            return;
+            return fits ? commands[i].handle(board, from) : (uint8_t)REASON_LENGTH;
         }
     }
-    refuse(board, from, REASON_KIND, 1);
+    return REASON_KIND;
 }
 
-void board_command(board_t *board, const frame *from)
+static void answer(board_t *board, const frame *from)
 {
-    size_t count = from->count;
-    if (count < CHECK || !check_holds(board, from)) {
-        refuse(board, from, REASON_CHECK, 0);
-    } else if (from->kind == KIND_HELLO && count == CHECK + 5u) {
+    int16_t later = (int16_t)(uint16_t)(from->sequence - board->commanded);
+    if (later == 0) {                             /* the reply was lost: it is sent again, and nothing done again */
+        board_send(board, board->replied[0], from->sequence, board->replied + 1, board->replied_count);
+    } else if (later > 0) {
+        uint8_t reason = execute(board, from), payload[6];
+        uint8_t *at = put_u8(payload, from->kind);
+        at = put_u32(reason == REASON_NONE ? at : put_u8(at, reason), board->sample);
+        board->refused += reason == REASON_NONE ? 0u : 1u;
+        reply(board, reason == REASON_NONE ? KIND_ACK : KIND_REFUSE, from->sequence, payload, (size_t)(at - payload));
+    }
+}
+
+void board_command(board_t *board, frame *from)
+{
+    if (from->count < CHECK || !check_holds(board, from)) {
+        refuse(board, from, REASON_CHECK);
+        return;
+    }
+    from->count -= CHECK;
+    if (from->kind == KIND_HELLO && from->count == 5u) {
         if (from->payload[0] == BOARD_VERSION && get_u32(from->payload + 1) != 0u) {
             hello(board, from);
         } else {
-            refuse(board, from, REASON_VERSION, 0);
+            refuse(board, from, REASON_VERSION);
         }
     } else if (board->session == 0u) {
-        refuse(board, from, REASON_CHECK, 0);
-    } else if ((from->kind == KIND_HEARTBEAT && count == CHECK + 8u) ||
-               (from->kind == KIND_FINGER && count == CHECK + 20u)) {
-        word(board, from);
+        refuse(board, from, REASON_CHECK);
+    } else if ((from->kind == KIND_HEARTBEAT && from->count == 8u) || (from->kind == KIND_FINGER && from->count == 20u)) {
+        keep_alive(board, from);
     } else {
-        execute(board, from);
+        answer(board, from);
     }
 }

@@ -2,7 +2,7 @@
 #include "board.h"
 #include "hardware.h"
 
-enum { TELEMETRY_BANDS = 12, ROW = 4 * (LAW_CHANNELS + LAW_SENSORS + 2) + 2, STREAM_HEAD = 6 };
+enum { TELEMETRY_BANDS = 12, ROW = 4 * (LAW_CHANNELS + LAW_SENSORS + 3) + 2, STREAM_HEAD = 6 };
 
 void board_send(board_t *board, uint8_t kind, uint16_t sequence, const uint8_t *payload, size_t count)
 {
@@ -57,7 +57,7 @@ static void telemetry_from(board_t *board, uint32_t first, uint32_t bands)
     for (uint32_t band = first; band < bands && band < first + TELEMETRY_BANDS; band++) {
         at = put_band(board, at, band);
     }
-    board_send(board, KIND_TELEMETRY, board->spoken++, payload, (size_t)(at - payload));
+    board_send(board, KIND_TELEMETRY, board->next++, payload, (size_t)(at - payload));
 }
 
 void board_telemetry(board_t *board)
@@ -75,7 +75,7 @@ void board_telemetry(board_t *board)
 static void send_stream(board_t *board)
 {
     if (board->stream_count > 0u) {
-        board_send(board, KIND_STREAM, board->spoken++, board->stream, board->stream_count);
+        board_send(board, KIND_STREAM, board->next++, board->stream, board->stream_count);
         board->stream_count = 0;
     }
 }
@@ -101,6 +101,7 @@ void board_stream(board_t *board)
         at = put_f32(at, (float)board->sensed[s]);
     }
     at = put_f32(put_f32(at, (float)board->position), (float)board->finger.load);
+    at = put_f32(at, board->state == BOARD_PLAYING ? (float)law_reference(&board->law) : 0.0F);
     at = put_u16(at, (uint16_t)board->flags);
     board->stream_count = (size_t)(at - board->stream);
     if (board->stream_count + ROW > FRAME_PAYLOAD) {

@@ -1,6 +1,6 @@
 /*
  * The board on a bare Cortex-M4, as QEMU emulates it (mps2-an386): its serial line is the machine's first UART, its
- * sensors and coils are those of a plate model, and the finger presses where the host says.
+ * sensors and coils are those of a plate model, and the finger is where the host sends it.
  */
 #include "board.h"
 #include "hardware.h"
@@ -16,8 +16,7 @@
 const uint32_t hardware_cycle_rate = MACHINE_HERTZ;
 
 static board_t board;
-static plate_t plate = {4e-3, 1.5, 300.0, 1e-6, 1u, {0.0, 0.0, 0.0, 0.0}};
-static double acting[2], handed_over[2]; /* A: current now, and from the next tick on */
+static plate_t plate = PLATE_DEFAULT;
 
 uint32_t hardware_cycles(void) { return ~TIMER0_VALUE; }
 
@@ -25,9 +24,7 @@ uint32_t hardware_cycles(void) { return ~TIMER0_VALUE; }
 uint32_t hardware_wait(void)
 {
     static uint32_t last;
-    plate_advance(&plate, 1.0 / (double)design.rate, acting, (double)board.position, (double)board.finger.load);
-    acting[0] = handed_over[0];
-    acting[1] = handed_over[1];
+    plate_advance(&plate, 1.0 / (double)design.rate, (double)board.position, (double)board.finger.load);
     while (hardware_cycles() - last < TICK) {
     }
     last = hardware_cycles();
@@ -44,8 +41,8 @@ void hardware_sense(real_t sensed[])
 
 void hardware_drive(const real_t drive[])
 {
-    handed_over[0] = (double)drive[0];
-    handed_over[1] = (double)drive[1];
+    plate.next[0] = (double)drive[0];
+    plate.next[1] = (double)drive[1];
 }
 
 size_t hardware_read(uint8_t bytes[], size_t most)

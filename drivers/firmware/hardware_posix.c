@@ -1,9 +1,8 @@
 /*
  * The board as a process: its serial line is a pseudo-terminal, its sensors and coils are those of a plate model, and
- * the finger presses where the host says.
+ * the finger is where the host sends it.
  *
- *   board_posix LINK [--finger MASS,DAMPING,STIFFNESS] [--noise RMS] [--seed N] [--log FILE] [--slow N]
- *               [--gain FIRST,SECOND] [--step]
+ *   board_posix LINK [--noise RMS] [--gain FIRST,SECOND] [--log FILE] [--slow N] [--step]
  *
  * LINK becomes a symbolic link to the pseudo-terminal.  Paced by the clock, or by one that is N times as slow; with
  * --step by its standard input: a line
@@ -34,8 +33,7 @@
 const uint32_t hardware_cycle_rate = 1000000000u;
 
 static board_t board;
-static plate_t plate = {4e-3, 1.5, 300.0, 1e-6, 1u, {0.0, 0.0, 0.0, 0.0}};
-static double acting[2], handed_over[2];          /* A: current now, and from the next tick on */
+static plate_t plate = PLATE_DEFAULT;
 static double gain[2] = {1.0, 1.0};               /* of the sensors */
 static int line = -1;                             /* master of the pseudo-terminal */
 static double slower = 1.0;                       /* than the clock */
@@ -83,8 +81,8 @@ static int take_grant(void)
         return 0;
     }
     while (bytes_in < until) {
-        struct pollfd wanted = {line, POLLIN, 0};
-        if (poll(&wanted, 1, 1000) < 0 && errno != EINTR) {
+        struct pollfd readable = {line, POLLIN, 0};
+        if (poll(&readable, 1, 1000) < 0 && errno != EINTR) {
             return 0;
         }
         take_bytes();
@@ -114,9 +112,7 @@ static void wait_for_clock(void)
 
 uint32_t hardware_wait(void)
 {
-    plate_advance(&plate, 1.0 / (double)design.rate, acting, (double)board.position, (double)board.finger.load);
-    acting[0] = handed_over[0];
-    acting[1] = handed_over[1];
+    plate_advance(&plate, 1.0 / (double)design.rate, (double)board.position, (double)board.finger.load);
     if (!stepped) {
         wait_for_clock();
         return ended ? 0u : 1u;
@@ -140,8 +136,8 @@ void hardware_sense(real_t sensed[])
 
 void hardware_drive(const real_t drive[])
 {
-    handed_over[0] = (double)drive[0];
-    handed_over[1] = (double)drive[1];
+    plate.next[0] = (double)drive[0];
+    plate.next[1] = (double)drive[1];
 }
 
 size_t hardware_read(uint8_t bytes[], size_t most)
@@ -187,7 +183,7 @@ static void log_tick(void)
         state = board.state;
         fprintf(log_file, "%" PRIu32 " state %d %d\n", board.sample, (int)state, (int)board.cause);
     }
-    int drives = handed_over[0] < 0.0 || handed_over[0] > 0.0 || handed_over[1] < 0.0 || handed_over[1] > 0.0;
+    int drives = plate.next[0] < 0.0 || plate.next[0] > 0.0 || plate.next[1] < 0.0 || plate.next[1] > 0.0;
     if (drives != driven) {
         driven = drives;
         fprintf(log_file, "%" PRIu32 " drives %d\n", board.sample, driven);
@@ -223,16 +219,10 @@ static void open_line(void)
 
 static void take_option(const char *name, const char *value)
 {
-    if (strcmp(name, "--finger") == 0 && sscanf(value, "%lf,%lf,%lf", &plate.mass, &plate.damping, &plate.stiffness) == 3) {
-        return;
-    }
     if (strcmp(name, "--gain") == 0 && sscanf(value, "%lf,%lf", &gain[0], &gain[1]) == 2) {
         return;
     }
     if (strcmp(name, "--noise") == 0 && sscanf(value, "%lf", &plate.noise) == 1) {
-        return;
-    }
-    if (strcmp(name, "--seed") == 0 && sscanf(value, "%" SCNu64, &plate.random) == 1 && plate.random != 0u) {
         return;
     }
     if (strcmp(name, "--slow") == 0 && sscanf(value, "%lf", &slower) == 1 && slower >= 1.0 && slower <= 1000.0) {

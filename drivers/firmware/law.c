@@ -353,3 +353,5 @@ uint32_t law_step(
     law->sample++;
     return law->flags;
 }
+
+real_t law_reference(const law_t *law) { return law->reference / law->smooth_scale; }

@@ -173,4 +173,7 @@ uint32_t law_step(
 void law_target(const law_t *law, uint32_t band, real_t envelope[2]);
 void law_measured(const law_t *law, uint32_t band, real_t envelope[2]);
 
+/* Reference (m) of the last sample's sensing, before it is scaled down to the drive's limit. */
+real_t law_reference(const law_t *law);
+
 #endif

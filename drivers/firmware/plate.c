@@ -1,6 +1,7 @@
 #include "plate.h"
 
 #include <math.h>
+#include <string.h>
 
 #define MASS 32e-3                                /* kg */
 #define INERTIA 4e-5                              /* kg m2 */
@@ -46,10 +47,10 @@ void plate_sense(plate_t *plate, double sensed[2])
     sensed[1] = quantise(plate->state[0] + rocking + size * sin(angle), SENSOR_STEP, SENSOR_LIMIT);
 }
 
-static loaded_t assemble(const plate_t *plate, const double current[2], double position, double load)
+static loaded_t assemble(const plate_t *plate, double position, double load)
 {
-    double first = quantise(current[0], CURRENT_STEP, CURRENT_LIMIT);
-    double second = quantise(current[1], CURRENT_STEP, CURRENT_LIMIT);
+    double first = quantise(plate->drive[0], CURRENT_STEP, CURRENT_LIMIT);
+    double second = quantise(plate->drive[1], CURRENT_STEP, CURRENT_LIMIT);
     loaded_t l = {{MASS, 0.0, INERTIA / (HALF_SPACING * HALF_SPACING)},
                   {2.0 * DAMPING, 0.0, 2.0 * DAMPING},
                   {STIFFNESS_1 + STIFFNESS_2, STIFFNESS_2 - STIFFNESS_1, STIFFNESS_1 + STIFFNESS_2},
@@ -100,10 +101,11 @@ static void runge_kutta(const loaded_t *l, double step, double state[4])
     }
 }
 
-void plate_advance(plate_t *plate, double period, const double current[2], double position, double load)
+void plate_advance(plate_t *plate, double period, double position, double load)
 {
-    loaded_t l = assemble(plate, current, position, load);
+    loaded_t l = assemble(plate, position, load);
     for (int i = 0; i < SUBSTEPS; i++) {
         runge_kutta(&l, period / SUBSTEPS, plate->state);
     }
+    memcpy(plate->drive, plate->next, sizeof plate->drive);
 }

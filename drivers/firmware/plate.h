@@ -10,13 +10,16 @@ typedef struct {
     double noise;                                 /* m rms, of a sensor */
     uint64_t random;                              /* state of the noise, not 0 */
     double state[4];                              /* heave, rocking (m at the coils), their rates (m/s) */
+    double drive[2], next[2];                     /* A: that acts, and that acts from the next step on */
 } plate_t;
+
+#define PLATE_DEFAULT {4e-3, 1.5, 300.0, 1e-6, 1u, {0.0, 0.0, 0.0, 0.0}, {0.0, 0.0}, {0.0, 0.0}}
 
 /* Read both sensors (m), with noise and resolution. */
 void plate_sense(plate_t *plate, double sensed[2]);
 
-/* Advance by `period` (s) under held currents (A) and a finger at `position` (m from the middle, NaN: none) that
-   presses with `load` (N). */
-void plate_advance(plate_t *plate, double period, const double current[2], double position, double load);
+/* Advance by `period` (s) under the held drive and a finger at `position` (m from the middle, NaN: none) that presses
+   with `load` (N); then `next` acts. */
+void plate_advance(plate_t *plate, double period, double position, double load);
 
 #endif

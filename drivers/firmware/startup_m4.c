@@ -11,19 +11,19 @@ int main(void);
 #define STOPPED_BY_ERROR 0x20023u     /* ADP_Stopped_RunTimeErrorUnknown */
 #define STOPPED_BY_END 0x20026u       /* ADP_Stopped_ApplicationExit */
 
-/* Ask the emulator for a service (Arm's semihosting). */
-static void ask(uint32_t service, uintptr_t argument)
+/* Request a service of the emulator (Arm's semihosting). */
+static void request(uint32_t service, uintptr_t argument)
 {
     register uint32_t r0 __asm__("r0") = service;
     register uintptr_t r1 __asm__("r1") = argument;
     __asm__ volatile("bkpt 0xAB" : "+r"(r0) : "r"(r1) : "memory");
 }
 
-void machine_print(const char *text) { ask(SYS_WRITE0, (uintptr_t)text); }
+void machine_print(const char *text) { request(SYS_WRITE0, (uintptr_t)text); }
 
 void machine_exit(int failed)
 {
-    ask(SYS_EXIT, (failed != 0) ? STOPPED_BY_ERROR : STOPPED_BY_END);
+    request(SYS_EXIT, (failed != 0) ? STOPPED_BY_ERROR : STOPPED_BY_END);
     for (;;) {
     }
 }
@@ -41,8 +41,8 @@ void reset(void)
     for (uint32_t i = 0u; &data_start[i] < data_end; i++) {
         data_start[i] = data_load[i];
     }
-    for (uint32_t *word = bss_start; word < bss_end; word++) {
-        *word = 0u;
+    for (uint32_t *at = bss_start; at < bss_end; at++) {
+        *at = 0u;
     }
     machine_exit(main());
 }

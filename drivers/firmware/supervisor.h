@@ -1,5 +1,5 @@
 /*
- * Supervision of the law: stops the drive where the device does not do as it is told, as
+ * Supervision of the law: stops the drive where the motion does not follow from it, as
  * hapticrender/control/supervisor_kernel.py, which has the tests, their conditions and their times.
  *
  * It takes the place of law_step: call supervisor_step instead.  State: sizeof(supervisor_t), static.

@@ -1,0 +1,52 @@
+"""Rows that a board streams back, in order."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from hapticrender.drivers.protocol import WRAP, Stream
+from hapticrender.protocols import Array, Flag
+
+LONGEST_GAP = 2**16  # rows
+
+
+class Rows:
+    """Rows of a run: drive (A), sensed (m), position (m), load (N), reference (m) and flags.
+
+    A row that was lost on the line repeats the one before, with `Flag.OVERRUN`.
+
+    Parameters
+    ----------
+    first : int, optional
+        Sample of the board's clock from which on it streams; that of the first row that comes unless given.
+    stride : int
+        Samples between two rows; 0: none are streamed.
+    """
+
+    def __init__(self, first: int | None = None, stride: int = 1) -> None:
+        self._stride = stride or 1
+        self._next = None if first is None else -(-first // self._stride) * self._stride
+        self._rows: list[Array] = []
+        self._last: Array | None = None
+
+    def __len__(self) -> int:
+        return len(self._rows)
+
+    def add(self, block: Stream) -> None:
+        """Append the rows of a frame, after those that were lost before it."""
+        rows = np.array(block.rows)
+        missing = 0 if self._next is None else (block.first - self._next) % WRAP // self._stride
+        if missing >= LONGEST_GAP or not len(rows):
+            return  # of an earlier run
+        if missing:
+            lost = np.array(rows[0] if self._last is None else self._last)
+            lost[-1] = int(lost[-1]) | Flag.OVERRUN
+            self._rows += [lost] * missing
+        self._rows += list(rows)
+        self._last = rows[-1]
+        self._next = (block.first + len(rows) * self._stride) % WRAP
+
+    def take(self, count: int | None = None) -> Array:
+        """Return and forget the first `count` rows, all unless given; shape (n, columns)."""
+        found, self._rows = self._rows[:count], self._rows[count:] if count is not None else []
+        return np.array(found)

@@ -1,0 +1,78 @@
+"""Boards in real time: a process behind a pseudo-terminal, five times as slow, beside the client's thread."""
+
+import threading
+import time
+from dataclasses import replace
+
+import pytest
+from board import FINGER, RATE, SCENE, SlowClock, slow_board, slow_client, tones
+
+import hapticrender as hr
+from hapticrender.drivers.protocol import State
+from hapticrender.drivers.serial import SerialDriver
+from hapticrender.errors import DeviceLost, DriverError
+
+
+def wait_for(done, seconds=30.0):
+    """Wait until it is done; a test that hangs fails."""
+    end = time.monotonic() + seconds
+    while not done():
+        assert time.monotonic() < end
+        time.sleep(0.01)
+
+
+def test_an_unplugged_board_is_lost_with_port_operation_and_bytes(tmp_path):
+    with slow_board(tmp_path) as board, slow_client(board) as client:
+        client.set_bands(tones(47.0))
+        client.start()
+        board.kill()
+        lost = r"tty: (line|listen): .* \(\d+ bytes sent, \d+ received, 0 bad frames\)"
+        with pytest.raises(DeviceLost, match=lost):
+            wait_for(lambda: client.telemetry() and False)
+        with pytest.raises(DeviceLost, match=lost):
+            client.finger(0.0)
+
+
+def test_a_replugged_board_goes_on(tmp_path):
+    with slow_board(tmp_path) as first, slow_client(first, reconnect=20.0) as client:
+        client.set_bands(tones(47.0))
+        client.gain = 0.25
+        client.start()
+        first.kill()
+        with slow_board(tmp_path) as second:
+            wait_for(lambda: client.reconnections == 1 and client.telemetry().state == State.PLAYING)
+            assert [line[1:] for line in second.log() if line[1] == "gain"] == [["gain", "0.25"]]
+            client.stop()
+
+
+def test_what_was_recorded_is_complete_and_of_the_board(tmp_path):
+    scene = replace(SCENE, duration=0.6)
+    with slow_board(tmp_path) as board:
+        driver = SerialDriver(str(board.port), finger=FINGER, clock=SlowClock())
+        recording = hr.render(scene, driver=driver)
+        time.sleep(0.05)
+        log = board.log()
+    assert (driver.rate, driver.drive_channels, driver.sensed_channels, driver.delay) == (RATE, 2, 2, 1)
+    assert len(recording) == 3000
+    assert recording.header.motion_source == "sensors"
+    commits = [line for line in log if line[1] == "commit"]
+    assert [[float(each) for each in line[3:]] for line in commits] == [pytest.approx([0, 1000, 0, 1e-5, 0], rel=1e-6)]
+    assert [line[2:] for line in log if line[1] == "state"] == [["1", "0"], ["0", "1"]]
+    with pytest.raises(DriverError, match="it has been closed"):
+        driver.open()
+
+
+def test_two_threads_can_set_a_board(tmp_path):
+    with slow_board(tmp_path) as board, slow_client(board) as client:
+        client.set_bands(tones(47.0))
+        client.start()
+        threads = [
+            threading.Thread(target=lambda hertz=hertz: [client.set_bands(tones(hertz)) for _ in range(10)])
+            for hertz in (50.0, 60.0)
+        ]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+        commits = [float(line[3]) for line in board.log() if line[1] == "commit"]
+        assert sorted(commits) == [47.0] + 10 * [50.0] + 10 * [60.0]
