@@ -41,14 +41,14 @@ def second_harmonic(force: np.ndarray) -> float:
 
 
 def main() -> float:
-    forces = {word: friction(word) for word in ("off", "on")}
-    shares = {word: second_harmonic(force) for word, force in forces.items()}
+    forces = {setting: friction(setting) for setting in ("off", "on")}
+    shares = {setting: second_harmonic(force) for setting, force in forces.items()}
     print("second harmonic: {off:.3%} without the square root, {on:.3%} with it".format(**shares))
     if len(sys.argv) > 1:
         from matplotlib import pyplot as plt
 
-        for word, force in forces.items():
-            plt.plot(np.arange(400) / 10, force[:400], label=f"square root {word}, {100 * shares[word]:.1f} %")
+        for setting, force in forces.items():
+            plt.plot(np.arange(400) / 10, force[:400], label=f"square root {setting}, {100 * shares[setting]:.1f} %")
         plt.gca().set(xlabel="time (ms)", ylabel="friction (N)", ylim=(0.78, 1.06))
         plt.legend(title="second harmonic", ncols=2, loc="upper center")
         plt.savefig(sys.argv[1])

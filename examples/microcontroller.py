@@ -48,7 +48,7 @@ def main() -> float:
             board.terminate()
             board.wait()
     (band,) = recording.summary()["bands"]
-    print(f"wanted {1e6 * band['target']:.2f} um, moved {1e6 * band['achieved']:.2f} um")
+    print(f"target {1e6 * band['target']:.2f} um, moved {1e6 * band['achieved']:.2f} um")
     return band["achieved"]
 
 

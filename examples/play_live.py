@@ -6,7 +6,7 @@ card, and `sleep` the application's own loop.  The figure is the amplitude (m) o
 
 import hapticrender as hr
 
-FRAME = 1 / 60  # s: an application says where the finger is as often as its screen does
+FRAME = 1 / 60  # s: an application reports the finger once a frame of its screen
 
 
 def main() -> float:

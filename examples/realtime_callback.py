@@ -1,7 +1,7 @@
 """The controller as a C function, which an audio library calls block after block while Python does something else.
 
 Here a thread stands in for the audio library and a simulated plate for the sound card.  The figure is the amplitude (m)
-of the last second, after the application has asked for another one on the way.
+of the last second, after the application has set another one on the way.
 """
 
 import ctypes
@@ -51,7 +51,7 @@ def main() -> float:
     audio.join()
     last = np.concatenate(motion)[-int(RATE) :]
     amplitude = abs(2 * np.mean(last * np.exp(-2j * np.pi * 80.0 * np.arange(len(last)) / RATE)))
-    print(f"asked for 5 um, then for 10 um: {1e6 * amplitude:.2f} um; {entry.samples} samples, {entry.refused} refused")
+    print(f"set to 5 um, then to 10 um: {1e6 * amplitude:.2f} um; {entry.samples} samples, {entry.refused} refused")
     return float(amplitude)
 
 

@@ -27,7 +27,7 @@ def main() -> float:
     shift = rendering.plant.loop.state["shift"][0]
     (band,) = recording.summary()["bands"]
     unlocked = np.count_nonzero(recording.flags & Flag.UNLOCKED) / recording.rate
-    print(f"wanted {1e3 * band['target']:.2f} mN of friction, made {1e3 * band['achieved']:.2f} mN")
+    print(f"target {1e3 * band['target']:.2f} mN of friction, made {1e3 * band['achieved']:.2f} mN")
     print(f"the carrier moved by {shift:+.1f} Hz and was off its resonance for {1e3 * unlocked:.1f} ms, at the start")
     if len(sys.argv) > 1:
         recording.plot(sys.argv[1])

@@ -9,7 +9,7 @@ from scipy.linalg import expm
 import hapticrender as hr
 
 COILS = 7.4  # N/A, each of two
-MASS, DAMPING, STIFFNESS = 0.034, 2.0, 46e3  # kg, N s/m, N/m: not quite the plate that the controller knows
+MASS, DAMPING, STIFFNESS = 0.034, 2.0, 46e3  # kg, N s/m, N/m: not quite the plate that the controller is designed for
 
 
 class Shaker:
@@ -42,7 +42,7 @@ def main() -> float:
     scene = hr.Scene(texture=hr.Grating(frequency=72.0, amplitude=10e-6), duration=3.0)
     recording = hr.render(scene, driver=Shaker())
     (band,) = recording.summary()["bands"]
-    print(f"wanted {1e6 * band['target']:.2f} um, moved {1e6 * band['achieved']:.2f} um")
+    print(f"target {1e6 * band['target']:.2f} um, moved {1e6 * band['achieved']:.2f} um")
     return band["achieved"]
 
 

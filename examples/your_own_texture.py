@@ -26,7 +26,7 @@ class Slope:
         return hr.Bands(frequency=np.zeros(1), wavenumber=one, phase=np.zeros(1))
 
     def waveform(self, time: np.ndarray, position: np.ndarray) -> np.ndarray:
-        """Wanted displacement (m) at the finger, nothing while it is lifted (NaN)."""
+        """Target displacement (m) at the finger, nothing while it is lifted (NaN)."""
         height = self.low + (self.high - self.low) * (position / SPAN + 0.5)
         return np.nan_to_num(height * np.cos(2 * np.pi * position / self.wavelength))
 

@@ -59,7 +59,7 @@ class Bands:
     differentiated : bool
         The target is the time derivative of the envelopes' signal, at whatever frequency a carrier comes to be.
     spatial : bool
-        The waveform follows the finger; said where there are no carriers, which would show it.
+        The waveform follows the finger; stated where there are no carriers, which would show it.
     sensor_response : ndarray of complex, shape (n,), or None
         Response of the device's sensor to each band, not 0; None: 1.  `tone` refers the targets to the sensor.
     unfelt : tuple of str

@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import MISSING, field, fields
 from numbers import Integral, Real
-from typing import IO, Any, NoReturn, Self
+from typing import Any, NoReturn, Self
 
 import numpy as np
 
@@ -124,7 +124,7 @@ def flag(key: str, value: Any) -> bool:
 
 
 def choice(key: str, value: Any, options: Iterable[str]) -> str:
-    """Return `value`, if it is one of the words in `options`."""
+    """Return `value`, if it is one of the texts in `options`."""
     bound = "one of " + ", ".join(options)
     require(isinstance(value, str), key, value, bound, TypeError)
     require(value in options, key, value, bound)
@@ -139,7 +139,7 @@ def text(key: str, value: Any, longest: int = 200, lines: bool = False) -> str:
     return value
 
 
-def word(key: str, value: Any) -> str:
+def name(key: str, value: Any) -> str:
     """Return `value`, if it can be a name and part of a file name: 1 to 100 printable characters, no path."""
     bound = "1 to 100 printable characters without / \\ : and not starting with a dot"
     require(isinstance(value, str), key, value, bound, TypeError)
@@ -155,14 +155,6 @@ def file_name(key: str, value: Any) -> str:
     name = os.fspath(value)
     require(isinstance(name, str) and name.isprintable() and name != "", key, value, bound)
     return os.path.abspath(name)
-
-
-def npy_header(stream: IO[bytes]) -> tuple[tuple[int, ...], np.dtype[Any]]:
-    """Shape and type of an array in the NPY format, read from its header alone."""
-    first = np.lib.format.read_magic(stream) == (1, 0)
-    read = np.lib.format.read_array_header_1_0 if first else np.lib.format.read_array_header_2_0
-    shape, _, kind = read(stream)
-    return shape, kind
 
 
 def exactly_one(**values: Any) -> str:
@@ -185,15 +177,23 @@ def inside(table: str) -> Iterator[None]:
     """Put the name of a table before the key of whatever is refused within."""
     try:
         yield
-    except TypeError as problem:
-        raise TypeError(f"{table}.{problem}") from None
-    except ValueError as problem:
-        raise ValueError(f"{table}.{problem}") from None
+    except (TypeError, ValueError) as problem:
+        kind = TypeError if isinstance(problem, TypeError) else ValueError
+        raise kind(f"{table}.{problem}") from None
 
 
-def checked(check: Callable[..., Any], default: Any = MISSING, **bounds: Any) -> Any:
-    """Field of a `Validated` class: keeps what ``check(name, value, **bounds)`` returns; a default of None stays."""
-    return field(default=default, metadata={"check": check, "bounds": bounds})
+def checked(check: Callable[..., Any], default: Any = MISSING, *, about: str = "", **bounds: Any) -> Any:
+    """Field of a `Validated` class: keeps what ``check(name, value, **bounds)`` returns; a default of None stays.
+
+    `about` is its line in the docstring of the class.
+    """
+    described = {"about": about, "unit": bounds.get("unit", "")} if about else {}
+    return field(default=default, metadata={"check": check, "bounds": bounds, **described})
+
+
+def mapping(check: Callable[[str, Any], Any]) -> Any:
+    """Field of a `Validated` class: a mapping, empty by default, that keeps what ``check(name, value)`` returns."""
+    return field(default_factory=dict, hash=False, metadata={"check": check, "bounds": {}})
 
 
 def parameter(
@@ -205,27 +205,21 @@ def parameter(
     least: float = 0.0,
     most: float | None = None,
 ) -> Any:
-    """Field of a `Validated` class: a number (integer where annotated so) > `above` or >= `least`, <= `most`.
-
-    `about` is its line in the docstring of the class.
-    """
-    low = {"least": least} if above is None else {"above": above}
-    made = checked(number, default, unit=unit, most=most, **low)
-    described = {"about": f"{about}; {_bound('', '', above, least, most)}", "unit": unit} if about else {}
-    return field(default=default, metadata={**made.metadata, **described})
+    """Field of a `Validated` class: a number (integer where annotated so) > `above` or >= `least`, <= `most`."""
+    low: dict[str, Any] = {"least": least} if above is None else {"above": above}
+    line = f"{about}; {_bound('', '', above, least, most)}" if about else ""
+    return checked(number, default, about=line, unit=unit, most=most, **low)
 
 
 def option(default: str, *known: str, about: str = "") -> Any:
-    """Field of a `Validated` class: one of the words in `known`; `about` is its line in the docstring of the class."""
-    made = checked(choice, default, options=known)
-    described = {"about": f"{about}: {' or '.join(known)}"} if about else {}
-    return field(default=default, metadata={**made.metadata, **described})
+    """Field of a `Validated` class: one of the texts in `known`."""
+    return checked(choice, default, about=f"{about}: {' or '.join(known)}" if about else "", options=known)
 
 
 class Validated:
     """Base of dataclasses with fields made by `checked`, `parameter` and `option`, and checked when one is made.
 
-    Where a docstring has no section Parameters and every field says what it is about, the fields that no base class has
+    Where a docstring has no section Parameters and every field has an `about`, the fields that no base class has
     make that section.
     """
 

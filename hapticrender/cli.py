@@ -17,7 +17,7 @@ from typing import Any, NoReturn
 from hapticrender import __version__, defaults, verbs
 from hapticrender.errors import HapticError
 
-_DESCRIPTION = "Make a finger feel a texture on a surface, in closed loop, on a device or on a model of one."
+_DESCRIPTION = "Render a texture for a finger on a surface, in closed loop, on a device or on a model of one."
 _EXAMPLES = """\
 start here:
   hapticrender demo                               all built-in scenes; then open out/demo/index.html
@@ -25,7 +25,7 @@ start here:
   hapticrender scenes grating-47 > mine.toml      a scene of your own: edit it ...
   hapticrender render mine.toml --out mine        ... and render it
 
-`hapticrender VERB --help` says more about each verb.
+`hapticrender VERB --help` describes each verb.
 """
 
 
@@ -79,63 +79,58 @@ def _parser() -> argparse.ArgumentParser:
 
 def _add_players(choices: Any) -> None:
     """Add the verbs that play scenes."""
-    demo = _add_verb(
-        choices, "demo", verbs.demo, "render the built-in scenes and make a page of sounds, pictures and figures"
-    )
-    _add_out(demo, Path("out/demo"))
-    _add_run(demo)
+    text = "render the built-in scenes and make a page of sounds, pictures and figures"
+    demo = _add_verb(choices, "demo", verbs.demo, text)
+    _add_out(demo, default=Path("out/demo"))
+    _add_run(demo, driver=False)
 
     render = _add_verb(choices, "render", verbs.render, "render one scene into a folder")
-    render.add_argument("scene", metavar="SCENE", help="a TOML file, or the name of a built-in scene")
-    _add_out(render, None)
-    _add_run(render, driver=True)
+    _add_scene(render)
+    _add_out(render, required=True)
+    _add_run(render)
     render.add_argument("--least-model", action="store_true", help="leave out of the model what a scene does not need")
     render.add_argument("--verbose", "-v", action="store_true", help="print all figures and notes on the controller")
 
     text = "play one scene live until Ctrl-C or its end: a line a band, with target, achieved and flags"
     play = _add_verb(choices, "play", verbs.play, text)
-    play.add_argument("scene", metavar="SCENE", help="a TOML file, or the name of a built-in scene")
+    _add_scene(play)
     play.add_argument("--seconds", metavar="S", type=float, help="how long (default: the scene's duration)")
-    text = "folder for sound, picture, figures, journal and a page about it; made if it is not there"
-    play.add_argument("--out", "-o", metavar="DIR", type=_path, help=text)
-    play.add_argument("--force", action="store_true", help="overwrite files that are not from an earlier run")
-    _add_run(play, driver=True)
+    _add_out(play)
+    _add_run(play)
 
 
 def _add_checks(choices: Any) -> None:
     """Add the verbs that judge."""
     validate = _add_verb(choices, "validate", verbs.validate, "render scenes and exit 1 when one misses its tolerance")
     validate.add_argument("scenes", metavar="SCENE", nargs="*", help="TOML files or built-in names (default: all)")
-    validate.add_argument(
-        "--suite", metavar="NAME", choices=["accuracy"], help="instead of scenes: accuracy, all targets of the library"
-    )
+    text = "instead of scenes: accuracy, all targets of the library"
+    validate.add_argument("--suite", metavar="NAME", choices=["accuracy"], help=text)
     validate.add_argument("--json", metavar="FILE", type=_path, help="write all figures as JSON")
     validate.add_argument("--junit", metavar="FILE", type=_path, help="write the JUnit XML that CI systems read")
     text = "folder for the files of each scene that does not pass"
     validate.add_argument("--out", "-o", metavar="DIR", type=_path, help=text)
     validate.add_argument("--jobs", "-j", metavar="N", type=_whole(1, 999), default=1, help="processes (default: 1)")
-    _add_run(validate, driver=True)
+    _add_run(validate)
 
     show = _add_verb(choices, "show", verbs.show, "print the figures of a recording, finished or cut off by a crash")
     show.add_argument("path", metavar="PATH", type=_path, help="a recording, or the folder of a rendered scene")
 
 
 def _add_measurements(choices: Any) -> None:
-    """Add the verbs about a device of one's own, and about the finger on it."""
+    """Add the verbs that measure a device, or the finger on it, and the one that exports a controller."""
     text = "measure the finger in a recording of a plate: load, position, contact, impedance"
     finger = _add_verb(choices, "finger", verbs.finger, text)
     finger.add_argument("path", metavar="PATH", type=_path, help="a recording, or the folder of a rendered scene")
-    text = "profile (TOML) of the plate, as identify writes it (default: what the recording's scene says of it)"
+    text = "profile (TOML) of the plate, as identify writes it (default: that of the scene of the recording)"
     finger.add_argument("--profile", metavar="FILE", type=_path, help=text)
     text = "samples of a block of the driver that recorded (default: 1)"
     finger.add_argument("--block", metavar="N", type=_whole(1, 99999), default=1, help=text)
     text = "nothing touches in the first 0.5 s: take the sensors' zero from there (default: they read zero at rest)"
     finger.add_argument("--free-start", action="store_true", help=text)
-    _add_out(finger, None)
+    _add_out(finger, required=True)
 
-    identify = _add_verb(
-        choices, "identify", verbs.identify, "identify a plate or an ultrasonic surface without a finger, or a screen"
-    )
+    text = "identify a plate or an ultrasonic surface without a finger, or a screen"
+    identify = _add_verb(choices, "identify", verbs.identify, text)
     text = "scene whose [device] is the expected one, and [simulation] the simulated one (default: the paper's plate)"
     identify.add_argument("--scene", metavar="SCENE", help=text)
     text = "of a glass end (default: 100e-6)"
@@ -145,38 +140,31 @@ def _add_measurements(choices: Any) -> None:
     identify.add_argument("--out", "-o", metavar="FILE", type=_path, help=text)
     identify.add_argument("--name", metavar="TEXT", help="which device it is (default: the file's name)")
     identify.add_argument("--by", metavar="TEXT", default="", help="who measures it")
-    _add_run(identify, method=False, driver=True)
+    _add_run(identify, method=False)
 
-    latency = _add_verb(
-        choices,
-        "latency",
-        verbs.latency,
-        "measure the delay of a loop by a cable from a driver's first output to its first input",
-    )
+    text = "measure the delay of a loop by a cable from a driver's first output to its first input"
+    latency = _add_verb(choices, "latency", verbs.latency, text)
     latency.add_argument("--driver", metavar="NAME[:ARG]", required=True, help="driver of the device, such as audio:0")
-    latency.add_argument(
-        "--runs", metavar="N", type=_whole(1, 999), default=5, help="runs, which must agree (default: 5)"
-    )
+    text = "runs, which must agree (default: 5)"
+    latency.add_argument("--runs", metavar="N", type=_whole(1, 999), default=5, help=text)
     text = "of the noise, of full scale on a sound card, in A or V elsewhere (default: 0.1)"
     latency.add_argument("--amplitude", metavar="A", type=float, default=0.1, help=text)
     text = "profile (TOML) whose [calibration] gets the delay; made if it is not there"
     latency.add_argument("--out", "-o", metavar="FILE", type=_path, help=text)
 
     export = _add_verb(choices, "export", verbs.export, "write a scene's controller as C sources for a microcontroller")
-    export.add_argument("scene", metavar="SCENE", help="a TOML file, or the name of a built-in scene")
+    _add_scene(export)
     text = "most bands that the board can be set to (default: 8, or as many as the scene has)"
     export.add_argument("--bands", metavar="N", type=_whole(1, 64), default=0, help=text)
-    _add_out(export, None)
+    _add_out(export, required=True)
 
 
 def _add_lists(choices: Any) -> None:
     """Add the verbs that list."""
     scenes = _add_verb(choices, "scenes", verbs.scenes, "list the built-in scenes, or print one as TOML")
     scenes.add_argument("scene", metavar="NAME", nargs="?", help="the scene to print")
-
-    _add_verb(
-        choices, "devices", verbs.devices, "list kinds of device, drivers, and the cards and ports that are there"
-    )
+    text = "list kinds of device, drivers, and the cards and ports that are there"
+    _add_verb(choices, "devices", verbs.devices, text)
 
 
 def _add_verb(choices: Any, name: str, run: Any, text: str) -> argparse.ArgumentParser:
@@ -185,13 +173,17 @@ def _add_verb(choices: Any, name: str, run: Any, text: str) -> argparse.Argument
     return verb
 
 
-def _add_out(verb: argparse.ArgumentParser, default: Path | None) -> None:
+def _add_scene(verb: argparse.ArgumentParser) -> None:
+    verb.add_argument("scene", metavar="SCENE", help="a TOML file, or the name of a built-in scene")
+
+
+def _add_out(verb: argparse.ArgumentParser, *, default: Path | None = None, required: bool = False) -> None:
     text = "folder to write into; made if it is not there" + (f" (default: {default})" if default else "")
-    verb.add_argument("--out", "-o", metavar="DIR", type=_path, default=default, required=default is None, help=text)
+    verb.add_argument("--out", "-o", metavar="DIR", type=_path, default=default, required=required, help=text)
     verb.add_argument("--force", action="store_true", help="overwrite files that are not from an earlier run")
 
 
-def _add_run(verb: argparse.ArgumentParser, *, method: bool = True, driver: bool = False) -> None:
+def _add_run(verb: argparse.ArgumentParser, *, method: bool = True, driver: bool = True) -> None:
     if method:
         text = f"control method: one of {', '.join(defaults.METHODS)} (default: the scene's, or {defaults.METHOD})"
         verb.add_argument("--method", metavar="NAME", help=text)

@@ -1,4 +1,4 @@
-"""Every error that the library raises on its own account.
+"""Every error that the library raises itself.
 
 Bad arguments are plain ``ValueError`` and ``TypeError``; the classes here add
 what a caller may want to catch by kind.
@@ -7,6 +7,8 @@ what a caller may want to catch by kind.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -18,15 +20,15 @@ class HapticError(Exception):
 
 
 class SceneError(HapticError, ValueError):
-    """A scene, or a file that it names, is malformed: says file, key, value, bound and unit."""
+    """A scene, or a file that it names, is malformed: states file, key, value, bound and unit."""
 
 
 class DesignError(HapticError):
-    """A design cannot be made stable or accurate enough: says which margin and which parameter."""
+    """A design cannot be made stable or accurate enough: states which margin and which parameter."""
 
 
 class DriverError(HapticError):
-    """A driver could not do its work: says device and operation."""
+    """A driver failed: states device and operation."""
 
 
 class DeviceNotFound(DriverError):
@@ -34,7 +36,7 @@ class DeviceNotFound(DriverError):
 
 
 class DeviceTimeout(DriverError):
-    """The device did not answer in time."""
+    """The device did not reply in time."""
 
 
 class DeviceLost(DriverError):
@@ -46,7 +48,7 @@ class ProtocolError(DriverError):
 
 
 class DeviceFault(DriverError):
-    """The device does not follow its drive: says the most likely cause, when, and what to check.
+    """The device does not follow its drive: states the most likely cause, when, and what to check.
 
     `time` (s) counts from the start of the run, NaN before it; `recording` holds every sample that was played, None
     before the first one.
@@ -72,3 +74,16 @@ class WatchdogTimeout(HapticError):
 
 class PlateMismatch(UserWarning):
     """The device differs from the model that a controller is designed for; names the quantities and by how much."""
+
+
+REFUSED = (ValueError, TypeError, ArithmeticError, RecursionError, HapticError)  # what a wrong scene or file may raise
+
+
+@contextmanager
+def naming(where: object) -> Iterator[None]:
+    """Begin every message within with `where`, a file or a scene, in one line, and raise it as a `SceneError`."""
+    try:
+        yield
+    except REFUSED as problem:
+        start, text = f"{' '.join(str(where).split())}: ", str(problem)
+        raise SceneError(text if text.startswith(start) else start + text) from problem

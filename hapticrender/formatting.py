@@ -10,21 +10,19 @@ from typing import Any
 _PREFIXES = ((1.0, ""), (1e-3, "m"), (1e-6, "µ"), (1e-9, "n"), (1e-12, "p"))
 
 
-def quantity(value: float | None, unit: str, *, like: float | None = None) -> str:
+def quantity(value: float | None, unit: str) -> str:
     """Format a measured `value` (SI) with a prefix and three digits, a dash for none.
-
-    The prefix is that which fits `like` (SI), where it is given: one for a whole column.
 
     Examples
     --------
-    >>> quantity(1.0016e-5, "m"), quantity(None, "s"), quantity(2e-7, "m", like=1e-5)
-    ('10.0 µm', '–', '0.200 µm')
+    >>> quantity(1.0016e-5, "m"), quantity(None, "s"), quantity(2e-7, "m")
+    ('10.0 µm', '–', '200 nm')
     """
     if value is None or not math.isfinite(value):
         return "–"
-    scale, prefix = _prefix(value if like is None else like)
     if abs(value) < _PREFIXES[-1][0]:
-        return f"0 {unit}" if like is None else f"0 {prefix}{unit}"
+        return f"0 {unit}"
+    scale, prefix = _prefix(value)
     return f"{_digits(value / scale)} {prefix}{unit}"
 
 
@@ -51,7 +49,7 @@ def degrees(angle: float | None) -> str:
     return "–" if angle is None or not math.isfinite(angle) else f"{round(math.degrees(angle), 1) + 0.0:.1f}°"
 
 
-def band_label(band: Mapping[str, Any], between: str = " (", end: str = ")") -> str:
+def band_label(band: Mapping[str, Any]) -> str:
     """Name a band: its frequency, or its wavelength and the median frequency at which it was judged.
 
     Examples
@@ -62,11 +60,11 @@ def band_label(band: Mapping[str, Any], between: str = " (", end: str = ")") -> 
     frequency, wavelength = band.get("frequency"), band.get("wavelength")
     if not wavelength:
         return short(frequency, "Hz") if frequency else "0 Hz"
-    return short(wavelength, "m", 3) + (f"{between}{short(frequency, 'Hz', 3)}{end}" if frequency else "")
+    return short(wavelength, "m", 3) + (f" ({short(frequency, 'Hz', 3)})" if frequency else "")
 
 
 def bands_label(bands: Sequence[Mapping[str, Any]]) -> str:
-    """Name one band, or say how many there are, and the first and the last."""
+    """Name one band, or state their number, the first and the last."""
     labels = [band_label(band) for band in bands]
     return labels[0] if len(labels) == 1 else f"{len(labels)} bands, {labels[0]} to {labels[-1]}"
 

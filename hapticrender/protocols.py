@@ -183,7 +183,7 @@ class Rendering:
         return self._checked(time, position)
 
     def requested(self, time: Array, position: Array, velocity: Array) -> Array:
-        """Texture as the scene asks for it (device's quantity, shape (n,)), for a finger at `velocity` (m/s).
+        """Texture as the scene specifies it (device's quantity, shape (n,)), for a finger at `velocity` (m/s).
 
         0 while the finger is away, where the texture follows it or the device works on a finger alone.  A derivative is
         ``dr/dt = (r(t + h, x + v h) - r(t - h, x - v h))/(2 h)``, h = 0.1 us: an error of 2e-8 at 500 Hz.
@@ -214,7 +214,7 @@ class Renderer(Protocol):
         Raises
         ------
         ValueError, TypeError
-            The scene asks for what the device cannot do.
+            The scene requests what the device cannot do.
         """
         ...
 

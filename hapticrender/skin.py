@@ -1,4 +1,4 @@
-"""Predicted skin velocity of a recording on any device, band by band and over time.
+"""Predicted skin velocity of a recording on any device, band by band.
 
 A plate moves the skin with it, V = j w X; friction moves it by V = (v/F) F, with v/F as the scene has it.
 """
@@ -66,22 +66,3 @@ def skin_bands(recording: Recording) -> list[SkinBand]:
         level = float(sensation_level(achieved / (2 * math.pi * band["frequency"]), band["frequency"]))
         found.append(SkinBand(band["frequency"], share * band["target"], achieved, level))
     return found
-
-
-def skin_waveform(recording: Recording, start: float, seconds: float) -> tuple[Array, Array, Array]:
-    """Time (s), target and achieved skin velocity (m/s) of the bands over `seconds` (s) from `start` (s).
-
-    The achieved one is rebuilt from the envelopes of the windows around.
-    """
-    envelopes, rate, bands = recording.envelopes, recording.rate, recording.bands
-    first, last = round(start * rate), min(round((start + seconds) * rate), len(recording))
-    time, position = np.arange(first, last) / rate, recording.read("position", first, last)
-    velocity = np.gradient(position) * rate if len(time) > 1 else np.zeros(len(time))
-    share = velocity_per_unit(recording, bands.instantaneous_frequency(np.nan_to_num(velocity)))
-    turned = share * np.exp(1j * bands.carrier_phase(time, position))
-    target = recording.read("target", first, last)
-    achieved = np.zeros_like(target)
-    if len(envelopes.start):
-        nearest = np.abs(envelopes.time[None, :] - time[:, None]).argmin(axis=1)
-        achieved = envelopes.achieved[nearest, 0] / (recording.header.profile or (1.0,))[0]
-    return time, (turned * target).real.sum(axis=1), (turned * achieved).real.sum(axis=1)

@@ -7,8 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from concurrent.futures import Executor
-from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 from hapticrender import checks
 from hapticrender.errors import HapticError
@@ -23,17 +22,6 @@ class SweepError(HapticError):
     """A scene of a sweep failed; its number, its name and the cause are in the message."""
 
 
-class Failure(NamedTuple):
-    """A scene that could not be rendered or judged: its number in the sweep (from 0), its name, the error as text."""
-
-    number: int
-    name: str
-    error: str
-
-    def __str__(self) -> str:
-        return f"scenes[{self.number}] ({self.name!r}): {self.error}"
-
-
 def sweep(
     scenes: Iterable[Scene],
     judge: Callable[[Recording], Any] | None = None,
@@ -41,7 +29,6 @@ def sweep(
     method: str | None = None,
     executor: Executor | None = None,
     at_a_time: int = AT_A_TIME,
-    failures: bool = False,
 ) -> list[Any]:
     """Render every scene on its simulated device and return what `judge` makes of each recording.
 
@@ -58,8 +45,6 @@ def sweep(
         Default: this thread.
     at_a_time : int
         Scenes a task of the executor, >= 1.
-    failures : bool
-        Whether a scene that fails gives a `Failure` in the list; otherwise it raises.
 
     Raises
     ------
@@ -76,10 +61,9 @@ def sweep(
     at_a_time = checks.integer("at_a_time", at_a_time, "scenes", least=1)
     numbered = list(enumerate(scenes))
     parts = [numbered[start : start + at_a_time] for start in range(0, len(numbered), at_a_time)]
-    run = partial(_run, judge=judge, method=method, failures=failures)
     if executor is None:
-        return [each for part in parts for each in run(part)]
-    tasks = [executor.submit(run, part) for part in parts]
+        return _run(numbered, judge, method)
+    tasks = [executor.submit(_run, part, judge, method) for part in parts]
     try:
         return [each for task in tasks for each in task.result()]
     except BaseException:
@@ -94,10 +78,8 @@ def worst_error(recording: Recording) -> float:
     return max(errors, default=float("inf"))
 
 
-def _run(
-    part: list[tuple[int, Scene]], judge: Callable[[Recording], Any] | None, method: str | None, failures: bool
-) -> list[Any]:
-    """Results of a few scenes; raises at the first that fails, unless `failures` are kept."""
+def _run(part: list[tuple[int, Scene]], judge: Callable[[Recording], Any] | None, method: str | None) -> list[Any]:
+    """Results of a few scenes; raises at the first that fails."""
     found: list[Any] = []
     for index, scene in part:
         try:
@@ -105,8 +87,6 @@ def _run(
             found.append(recording.summary() if judge is None else judge(recording))
         except Exception as error:
             name = getattr(scene, "name", type(scene).__name__)
-            failure = Failure(index, name, f"{type(error).__name__}: {error}")
-            if not failures:
-                raise SweepError(str(failure)) from None  # a cause might not be pickled
-            found.append(failure)
+            problem = f"scenes[{index}] ({name!r}): {type(error).__name__}: {error}"
+            raise SweepError(problem) from None  # a cause might not be pickled
     return found

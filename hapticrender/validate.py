@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-import io
+import itertools
 import multiprocessing
 import re
 import tempfile
 import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from concurrent.futures import Future, ProcessPoolExecutor
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import ExitStack
 from dataclasses import asdict, dataclass, field
 from functools import partial
 from pathlib import Path
@@ -19,20 +20,17 @@ from xml.etree import ElementTree
 from hapticrender import __version__, defaults
 from hapticrender.control.methods import method_named
 from hapticrender.devices import SIMULATED
-from hapticrender.errors import HapticError, SceneError
-from hapticrender.formatting import as_json
+from hapticrender.errors import REFUSED, SceneError
+from hapticrender.formatting import as_json, printable
 from hapticrender.loop import prepare, run
 from hapticrender.protocols import Rendering
 from hapticrender.report.outputs import JOURNAL, begin_outputs, refuse_to_overwrite, remove_outputs, write_outputs
-from hapticrender.report.progress import Progress
+from hapticrender.report.progress import progress as progress_of
 from hapticrender.report.text import verdict as sentence
 from hapticrender.touch.builtin_scenes import builtin_scenes
 from hapticrender.touch.scene import Scene, distinct_names
 
-IN_MEMORY = 2**26  # bytes: a longer run goes through a journal in a temporary folder
-BAD_SCENE = (ValueError, TypeError, ArithmeticError, RecursionError, HapticError)
 _NO_NAME = re.compile(r"[^\w.-]+|^\.+")
-_NOT_XML = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 Tick = Callable[[float, float], None]
 
 
@@ -63,8 +61,7 @@ class Verdict:
     def of(cls, summary: Mapping[str, Any], elapsed: float) -> Verdict:
         """Take the verdict from ``Recording.summary()``; `elapsed` is in s."""
         keys = ("scene", "device", "method", "seed", "verdict", "reason", "tolerance")
-        worst = {key: summary["worst"][key] for key in ("figure", "value", "bound", "band", "place")}
-        return cls(**{key: summary[key] for key in keys}, **worst, elapsed=elapsed, summary=summary)
+        return cls(**{key: summary[key] for key in keys}, **summary["worst"], elapsed=elapsed, summary=summary)
 
     @property
     def passed(self) -> bool:
@@ -118,18 +115,15 @@ def validate(
         raise ValueError(f"{jobs=}: must be 1 process where driver = {driver!r}: a device plays one scene at a time")
     judge = partial(_judge, method=method, seed=seed, driver=driver, out=None if out is None else Path(out))
     entries = _read(scenes)
-    durations = [scene.duration for _, scene in entries if isinstance(scene, Scene)]
-    bar = Progress(durations, progress or io.StringIO())
-    if jobs == 1:
-        return [_with_progress(bar, *entry, partial(judge, *entry)) for entry in entries]
-    with ProcessPoolExecutor(jobs, multiprocessing.get_context("spawn")) as pool:
-        futures = [pool.submit(judge, *entry) for entry in entries]
-        try:
-            pairs = zip(entries, futures, strict=True)
-            return [_with_progress(bar, *entry, partial(_result, future)) for entry, future in pairs]
-        except BaseException:
-            pool.shutdown(cancel_futures=True)
-            raise
+    count, number = sum(isinstance(scene, Scene) for _, scene in entries), itertools.count(1)
+    shown = [(f"{next(number)}/{count} {label}" if isinstance(scene, Scene) else "") for label, scene in entries]
+    with ExitStack() as stack:
+        calls: list[Callable[[Tick | None], Verdict]] = [partial(judge, *entry) for entry in entries]
+        if jobs > 1:
+            pool = ProcessPoolExecutor(jobs, multiprocessing.get_context("spawn"))
+            stack.callback(pool.shutdown, cancel_futures=True)
+            calls = [partial(_result, pool.submit(judge, *entry, None)) for entry in entries]
+        return [_shown(line, progress, call) for line, call in zip(shown, calls, strict=True)]
 
 
 def _read(scenes: Iterable[Scene | str | Path]) -> list[tuple[str, Scene | str]]:
@@ -139,7 +133,7 @@ def _read(scenes: Iterable[Scene | str | Path]) -> list[tuple[str, Scene | str]]
         try:
             scene = reference if isinstance(reference, Scene) else open_scene(reference)
             found.append((scene.name, scene))
-        except BAD_SCENE as error:
+        except REFUSED as error:
             found.append((str(reference), str(error)))
     return list(zip(distinct_names(name for name, _ in found), (scene for _, scene in found), strict=True))
 
@@ -147,7 +141,7 @@ def _read(scenes: Iterable[Scene | str | Path]) -> list[tuple[str, Scene | str]]
 def _judge(
     label: str,
     scene: Scene | str,
-    tick: Tick | None = None,
+    tick: Tick | None,
     *,
     method: str | None,
     seed: int | None,
@@ -164,31 +158,27 @@ def _judge(
             rendering = prepare(scene, driver=driver, method=method, seed=seed)
             summary = _summary(rendering, out and out / _NO_NAME.sub("_", label), tick)
             return Verdict.of({**summary, "scene": label}, time.perf_counter() - start)
-        except BAD_SCENE as error:
+        except REFUSED as error:
             problem = str(error)
     reason, method = problem.removeprefix(f"{label}: "), method or defaults.METHOD
     return Verdict(scene=label, device=device, method=method, seed=seed or 0, verdict="error", reason=reason)
 
 
-def _result(future: Future[Verdict], _: Tick | None) -> Verdict:
+def _result(future: Any, _: Tick | None) -> Verdict:
     return future.result()
 
 
-def _with_progress(
-    progress: Progress, label: str, scene: Scene | str, judge: Callable[[Tick | None], Verdict]
-) -> Verdict:
-    if isinstance(scene, str):
+def _shown(line: str, stream: TextIO | None, judge: Callable[[Tick | None], Verdict]) -> Verdict:
+    """Judge a scene, with a `line` of progress."""
+    if not line or stream is None:
         return judge(None)
-    with progress.scene(label) as tick:
+    with progress_of(line, stream) as tick:
         return judge(tick)
 
 
 def _summary(rendering: Rendering, folder: Path | None, tick: Tick | None) -> dict[str, Any]:
-    """Run a rendering and judge it; only what does not pass stays in `folder`."""
+    """Run a rendering, whatever its length, and judge it; only what does not pass stays in `folder`."""
     if folder is None:
-        size = 8 * rendering.samples * (2 * len(rendering.bands) + 13)
-        if size < IN_MEMORY:
-            return run(rendering, progress=tick).summary()
         with tempfile.TemporaryDirectory() as scratch:
             return run(rendering, journal=Path(scratch) / JOURNAL, progress=tick).summary()
     refuse_to_overwrite(folder)
@@ -220,16 +210,11 @@ def write_json(path: str | Path, verdicts: Sequence[Verdict]) -> None:
 def write_junit(path: str | Path, verdicts: Sequence[Verdict]) -> None:
     """Write verdicts to `path` as JUnit XML (schema of the Apache Ant task): a test case per scene, times in s."""
     counts = Counter(verdict.verdict for verdict in verdicts)
-    totals = {
-        "name": "hapticrender",
-        "tests": str(len(verdicts)),
-        "failures": str(counts["failed"]),
-        "errors": str(counts["error"]),
-        "skipped": str(counts["not judged"]),
-        "time": f"{sum(verdict.elapsed for verdict in verdicts):.3f}",
-    }
-    suites = ElementTree.Element("testsuites", {key: totals[key] for key in totals if key != "skipped"})
-    suite = ElementTree.SubElement(suites, "testsuite", totals)
+    seconds = sum(verdict.elapsed for verdict in verdicts)
+    totals = {"name": "hapticrender", "tests": str(len(verdicts)), "time": f"{seconds:.3f}"}
+    totals |= {"failures": str(counts["failed"]), "errors": str(counts["error"])}
+    suites = ElementTree.Element("testsuites", totals)
+    suite = ElementTree.SubElement(suites, "testsuite", totals | {"skipped": str(counts["not judged"])})
     for verdict in verdicts:
         _add_case(suite, verdict)
     ElementTree.indent(suites)
@@ -239,16 +224,11 @@ def write_junit(path: str | Path, verdicts: Sequence[Verdict]) -> None:
 def _add_case(suite: ElementTree.Element, verdict: Verdict) -> None:
     """Add one scene as a test case, with its failure, error or reason for being skipped."""
     name = f"hapticrender.{verdict.device}.{verdict.method}"
-    case = {"classname": _xml(name), "name": _xml(verdict.scene), "time": f"{verdict.elapsed:.3f}"}
+    case = {"classname": printable(name), "name": printable(verdict.scene), "time": f"{verdict.elapsed:.3f}"}
     element = ElementTree.SubElement(suite, "testcase", case)
     if verdict.verdict == "failed":
-        attributes = {"message": _xml(sentence(verdict.summary)), "type": "tolerance"}
-        ElementTree.SubElement(element, "failure", attributes).text = _xml(as_json(verdict.summary["waveform"]))
+        attributes = {"message": printable(sentence(verdict.summary)), "type": "tolerance"}
+        ElementTree.SubElement(element, "failure", attributes).text = printable(as_json(verdict.summary["waveform"]))
     elif verdict.verdict != "passed":
         tag = "error" if verdict.verdict == "error" else "skipped"
-        ElementTree.SubElement(element, tag, {"message": _xml(verdict.reason), "type": "scene"})
-
-
-def _xml(text: str) -> str:
-    """Replace the characters that XML 1.0 (section 2.2) forbids."""
-    return _NOT_XML.sub("\ufffd", text)
+        ElementTree.SubElement(element, tag, {"message": printable(verdict.reason), "type": "scene"})

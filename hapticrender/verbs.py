@@ -1,24 +1,22 @@
-"""What the verbs of the command line do; `hapticrender.cli` reads their arguments."""
+"""The verbs of the command line; `hapticrender.cli` reads their arguments."""
 
 from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from hapticrender import __version__, defaults
-from hapticrender.errors import HapticError, SceneError
-from hapticrender.formatting import printable
+from hapticrender.errors import naming
+from hapticrender.formatting import printable, table
 
 if TYPE_CHECKING:
     from hapticrender.protocols import Rendering
+    from hapticrender.recordings.recording import Recording
     from hapticrender.report.outputs import Outputs
-    from hapticrender.report.progress import Progress
     from hapticrender.touch.device_profile import DeviceProfile
     from hapticrender.touch.scene import Scene
 
@@ -38,54 +36,59 @@ def _made(path: Path) -> Path:
     return path
 
 
+def _check_run_folder(folder: Path, arguments: argparse.Namespace, source: Path | None = None) -> None:
+    """Refuse a folder that cannot be written, or, without ``--force``, that holds files of others."""
+    from hapticrender.report.outputs import check_folder, refuse_to_overwrite
+
+    check_folder("--out", folder)
+    if not arguments.force:
+        refuse_to_overwrite(folder, source)
+
+
 def demo(arguments: argparse.Namespace) -> int:
     """Render the built-in scenes and make a page about them."""
     from hapticrender.report import outputs
-    from hapticrender.report.page import refuse_foreign_page, write_page
+    from hapticrender.report.page import refuse_other_page, write_page
+    from hapticrender.report.progress import progress
     from hapticrender.report.text import overview
     from hapticrender.touch.builtin_scenes import builtin_scenes
 
     scenes = builtin_scenes()
     for name in scenes:
-        outputs.check_folder("--out", arguments.out / name)
-        if not arguments.force:
-            outputs.refuse_to_overwrite(arguments.out / name)
-            refuse_foreign_page(arguments.out)
+        _check_run_folder(arguments.out / name, arguments)
+    if not arguments.force:
+        refuse_other_page(arguments.out)
     renderings = _prepare(scenes, arguments)
-    progress = _progress(renderings)
     finished: list[Outputs] = []
     try:
-        for name, rendering in zip(scenes, renderings, strict=True):
-            with progress.scene(name) as tick:
+        for number, (name, rendering) in enumerate(zip(scenes, renderings, strict=True), 1):
+            with progress(f"{number}/{len(scenes)} {name}", sys.stderr) as tick:
                 finished.append(outputs.run_into(arguments.out / name, rendering, progress=tick))
     finally:
         if finished:
             page = write_page(arguments.out, finished)
-    print(printable(overview([scene.summary for scene in finished])))
+    print(printable(table(overview([scene.summary for scene in finished]))))
     print(f"page: {page}")
     return 0
 
 
 def render(arguments: argparse.Namespace) -> int:
     """Render a scene into a folder."""
-    from hapticrender.report.outputs import check_folder, refuse_to_overwrite, run_into
+    from hapticrender.report.outputs import run_into, written_in
+    from hapticrender.report.progress import progress
     from hapticrender.report.text import verdict
 
-    check_folder("--out", arguments.out)
-    scene = _scene(arguments.scene)
-    if not arguments.force:
-        refuse_to_overwrite(arguments.out, Path(arguments.scene))
-    notes = ""
-    if arguments.least_model:
-        from hapticrender.plants.levels import least_model
+    scene, notes = _scene(arguments.scene), ""
+    _check_run_folder(arguments.out, arguments, Path(arguments.scene))
+    with naming(arguments.scene):
+        if arguments.least_model:
+            from hapticrender.plants.levels import least_model
 
-        with _naming(arguments.scene):
             found = least_model(scene)
-        scene, notes = found.scene, found.text
-    with _naming(arguments.scene):
+            scene, notes = found.scene, found.text
         driver = _driver(arguments.driver, scene)
-    [rendering] = renderings = _prepare({arguments.scene: scene}, arguments, driver)
-    with _progress(renderings).scene(arguments.scene) as tick:
+    [rendering] = _prepare({arguments.scene: scene}, arguments, driver)
+    with progress(f"1/1 {arguments.scene}", sys.stderr) as tick:
         outputs = run_into(arguments.out, rendering, progress=tick)
     if arguments.verbose:
         _print_figures(outputs.summary)
@@ -93,18 +96,17 @@ def render(arguments: argparse.Namespace) -> int:
     else:
         lines = [f"{scene.name} on {scene.device}: {verdict(outputs.summary)}", *outputs.summary["notes"]]
         print(printable("\n".join(lines)))
-    print("wrote " + "\n      ".join(map(str, outputs.files)))
+    _print_written(written_in(arguments.out))
     if notes:
         print(notes)
     return 0
 
 
 def play(arguments: argparse.Namespace) -> int:
-    """Play a scene live, and say of every band what becomes of it."""
+    """Play a scene live, with a line for every band: target, achieved and flags."""
     from hapticrender.player import Player
     from hapticrender.report import outputs
-    from hapticrender.report.live_lines import LiveLines
-    from hapticrender.report.page import refuse_foreign_page, write_page
+    from hapticrender.report.page import refuse_other_page, write_page
 
     scene, out = _scene(arguments.scene), arguments.out
     changes = {name: getattr(arguments, name) for name in ("method", "seed") if getattr(arguments, name) is not None}
@@ -113,32 +115,38 @@ def play(arguments: argparse.Namespace) -> int:
     if not 0.0 < seconds < float("inf"):
         raise ValueError(f"--seconds = {seconds}: must be finite and > 0 s")
     if out:
-        outputs.check_folder("--out", out / scene.name)
+        _check_run_folder(out / scene.name, arguments)
         if not arguments.force:
-            outputs.refuse_to_overwrite(out / scene.name)
-            refuse_foreign_page(out)
-    lines, journal = LiveLines(sys.stdout), None
+            refuse_other_page(out)
+    journal, above, second = None, 0, 0
     try:
-        with _naming(arguments.scene), Player(scene, _driver(arguments.driver, scene)) as player:
+        with naming(arguments.scene), Player(scene, _driver(arguments.driver, scene)) as player:
             player.play(scene.texture)
             if out:
                 journal = outputs.begin_outputs(out / scene.name, scene)
                 player.record(journal)
             while player.time < seconds:
                 player.sleep(min(LOOK, seconds - player.time))
-                lines.show(printable(str(player.state())), int(player.time))
+                if sys.stdout.isatty():
+                    above = _print_over(printable(str(player.state())), above)
+                elif player.time >= second:  # in a file or a pipe, once a second
+                    print(printable(str(player.state())), flush=True)
+                    second = int(player.time) + 1
     finally:
         if journal is not None and journal.exists():
-            from hapticrender.recordings.recording import Recording
-
-            made = outputs.write_outputs(out / scene.name, Recording.load(journal))
+            made = outputs.write_outputs(out / scene.name, _recording(journal))
             print(f"page: {write_page(out, [made])}")
     return 0
 
 
+def _print_over(text: str, above: int) -> int:
+    """Print `text` over the `above` lines before it (ANSI: up, and clear what follows); return how many it has."""
+    print((f"\x1b[{above}A\x1b[J" if above else "") + text, flush=True)
+    return text.count("\n") + 1
+
+
 def scenes(arguments: argparse.Namespace) -> int:
     """List the built-in scenes, or print one."""
-    from hapticrender.formatting import table
     from hapticrender.report.text import describe
     from hapticrender.touch.builtin_scenes import builtin_scenes
 
@@ -177,7 +185,7 @@ def validate(arguments: argparse.Namespace) -> int:
         if path:
             write(_made(path), verdicts)
     if rendered := [verdict.summary for verdict in verdicts if verdict.summary]:
-        print(printable(overview(rendered)))
+        print(printable(table(overview(rendered))))
     for verdict in verdicts:
         if verdict.verdict == "error":
             fail(str(verdict), 2)
@@ -186,9 +194,7 @@ def validate(arguments: argparse.Namespace) -> int:
 
 def _suite(arguments: argparse.Namespace) -> int:
     """Run the accuracy suite with the chosen method and with "paper"; exit status 1 where it misses a bound."""
-    from hapticrender.accuracy.figures import as_rows, write_json
-    from hapticrender.accuracy.suite import run_suite
-    from hapticrender.formatting import table
+    from hapticrender.accuracy.suite import as_rows, run_suite, write_json
     from hapticrender.report.outputs import check_file
 
     chosen = arguments.method or defaults.METHOD
@@ -220,26 +226,22 @@ def identify(arguments: argparse.Namespace) -> int:
         check_file("--out", arguments.out)
     scene = _scene(arguments.scene or "grating-20")  # any on the paper's plate
     found: Any
-    with _naming(arguments.scene or "identify"):
+    with naming(arguments.scene or "identify"):
         if scene.device not in ("vt-plate", "ultrasonic", "electroadhesion"):
             raise ValueError(f"device.kind = {scene.device!r}: must be vt-plate, ultrasonic or electroadhesion")
         setup = registered("renderers", scene.device)().read(scene, None)
         seed = scene.seed if arguments.seed is None else arguments.seed
         driver = _driver(arguments.driver, scene)
-        if driver is None:
-            plants = {
-                "vt-plate": lambda: Plate(setup.simulated, Finger.absent(), seed),
-                "ultrasonic": lambda: UltrasonicPlate(setup.simulated.carrier_mode, Finger.absent(), seed),
-                "electroadhesion": lambda: ElectroadhesionScreen(setup.simulated, scene.finger, seed),
-            }
-            driver = registered("drivers", "simulated")(plants[scene.device]())
-        with driver:
-            if scene.device == "ultrasonic":
-                found = identify_resonance(driver, setup.assumed)
-            elif scene.device == "electroadhesion":
-                found = identify_screen(driver, setup.assumed, scene.finger)
-            else:
-                found = identify(driver, setup.assumed, seconds=arguments.seconds, amplitude=arguments.amplitude)
+        simulated = registered("drivers", "simulated")
+        if scene.device == "ultrasonic":
+            with driver or simulated(UltrasonicPlate(setup.simulated.carrier_mode, Finger.absent(), seed)) as opened:
+                found = identify_resonance(opened, setup.assumed)
+        elif scene.device == "electroadhesion":
+            with driver or simulated(ElectroadhesionScreen(setup.simulated, scene.finger, seed)) as opened:
+                found = identify_screen(opened, setup.assumed, scene.finger)
+        else:
+            with driver or simulated(Plate(setup.simulated, Finger.absent(), seed)) as opened:
+                found = identify(opened, setup.assumed, seconds=arguments.seconds, amplitude=arguments.amplitude)
     print(found.text())
     for difference in found.differences(setup.assumed) if scene.device == "vt-plate" else ():
         print(f"differs from [device]: {difference}")
@@ -250,7 +252,7 @@ def identify(arguments: argparse.Namespace) -> int:
 
 
 def _profile(found: Any, scene: Scene, arguments: argparse.Namespace) -> DeviceProfile:
-    """Profile of an identified device; limits, and what else the scene says of the device, are kept."""
+    """Profile of an identified device; limits, and what else the scene states of the device, are kept."""
     from datetime import date
 
     own, device = scene.device_profile, found.profile()
@@ -270,20 +272,18 @@ def finger(arguments: argparse.Namespace) -> int:
     """Analyse the finger in a recording; write tables and pictures, print a summary."""
     from hapticrender.analysis import output, pictures
     from hapticrender.analysis.analyse import analyse_finger
-    from hapticrender.recordings.recording import Recording
     from hapticrender.report.outputs import check_folder
 
     check_folder("--out", arguments.out)
     for name in output.FILES:
         if (arguments.out / name).exists() and not arguments.force:
             raise ValueError(f"{str(arguments.out / name)!r}: is there: choose another folder, or add --force")
-    path = arguments.path / "recording.au" if arguments.path.is_dir() else arguments.path
-    with _naming(str(path)):
-        recording = Recording.load(path)
+    recording = _recording(arguments.path)
+    with naming(arguments.path):
         found = analyse_finger(recording, arguments.profile, block=arguments.block, free_start=arguments.free_start)
     print(printable(output.text(found)))
     written = [*output.write(found, arguments.out), pictures.draw(found, arguments.out)]
-    print("wrote " + "\n      ".join(map(str, written)))
+    _print_written(written)
     return 0
 
 
@@ -314,7 +314,7 @@ def export(arguments: argparse.Namespace) -> int:
 
     check_folder("--out", arguments.out)
     scene = _scene(arguments.scene)
-    with _naming(arguments.scene):
+    with naming(arguments.scene):
         rendering = prepare(scene)
         written = export(rendering, arguments.out, bands=arguments.bands, force=arguments.force)
     print(f"wrote {len(written)} files into {arguments.out}; build them with: make -C {arguments.out}")
@@ -323,12 +323,7 @@ def export(arguments: argparse.Namespace) -> int:
 
 def show(arguments: argparse.Namespace) -> int:
     """Print the figures of a recording."""
-    from hapticrender.recordings.recording import Recording
-
-    path = arguments.path / "recording.au" if arguments.path.is_dir() else arguments.path
-    with _naming(str(path)):
-        summary = Recording.load(path).summary()
-    _print_figures(summary)
+    _print_figures(_recording(arguments.path).summary())
     return 0
 
 
@@ -340,33 +335,48 @@ def devices(arguments: argparse.Namespace) -> int:
     return 0
 
 
+def _print_written(paths: list[Path]) -> None:
+    print("wrote " + "\n      ".join(map(str, paths)))
+
+
 def _print_figures(summary: Any) -> None:
     from hapticrender.report.text import conditions, figures
 
     print(printable(f"{conditions(summary)}\n{figures(summary)}"))
 
 
+def _recording(path: Path) -> Recording:
+    """Load a recording, also from the folder of a rendered scene."""
+    from hapticrender.recordings.recording import Recording
+
+    path = path / "recording.au" if path.is_dir() else path
+    with naming(path):
+        return Recording.load(path)
+
+
 def _scene(reference: str) -> Scene:
     """Read a scene: a built-in one by its name, any other from its file."""
     from hapticrender.validate import open_scene
 
-    with _naming(reference):
+    with naming(reference):
         return open_scene(reference)
 
 
 def _prepare(scenes: dict[str, Scene], arguments: argparse.Namespace, driver: Any = None) -> list[Rendering]:
-    """Design everything that will run; the renderer refuses here what the device cannot do."""
+    """Design everything that will run, which refuses what a device cannot do; state before it runs what is missing."""
     from hapticrender.loop import prepare
 
     renderings = []
     for reference, scene in scenes.items():
-        with _naming(reference):
+        with naming(reference):
             renderings.append(prepare(scene, driver=driver, method=arguments.method, seed=arguments.seed))
+    if find_spec("matplotlib") is None:
+        print(PICTURES_HINT, file=sys.stderr)
     return renderings
 
 
 def _driver(text: str, scene: Scene) -> Any:
-    """Make the driver of ``--driver``, calibrated as the scene says; None for the simulated device.
+    """Make the driver of ``--driver``, calibrated as the scene states; None for the simulated device.
 
     A module of the user's is looked for in the folder that the command is run in, too.
     """
@@ -375,24 +385,3 @@ def _driver(text: str, scene: Scene) -> Any:
     if "" not in sys.path:
         sys.path.insert(0, "")
     return open_driver(text, scene.device_profile)
-
-
-def _progress(renderings: list[Rendering]) -> Progress:
-    """Make the progress bar of what will run, and say before it runs that there will be no pictures."""
-    from hapticrender.report.progress import Progress
-
-    if find_spec("matplotlib") is None:
-        print(PICTURES_HINT, file=sys.stderr)
-    return Progress([rendering.scene.duration for rendering in renderings])
-
-
-@contextmanager
-def _naming(where: str) -> Iterator[None]:
-    """Name the file, or the scene, in every error about it."""
-    try:
-        yield
-    except OSError:
-        raise
-    except (ValueError, TypeError, ArithmeticError, RecursionError, HapticError) as error:
-        message = str(error)
-        raise SceneError(message if message.startswith(where) else f"{where}: {message}") from error

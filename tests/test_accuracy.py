@@ -8,8 +8,7 @@ import pytest
 import hapticrender as hr
 from hapticrender import defaults
 from hapticrender.accuracy import friction, plate
-from hapticrender.accuracy.figures import TARGETS, as_rows, write_json
-from hapticrender.accuracy.suite import CASES, METHOD_FREE, run_suite
+from hapticrender.accuracy.suite import CASES, METHOD_FREE, TARGETS, as_rows, run_suite, write_json
 from hapticrender.plants.plate import PlateParameters
 from hapticrender.protocols import Flag
 from hapticrender.touch.mechanics import FingerMechanics

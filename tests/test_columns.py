@@ -136,7 +136,7 @@ def test_a_finger_is_the_same_in_someone_elses_columns(tmp_path):
 
 
 def test_a_profile_goes_with_the_columns(tmp_path):
-    (tmp_path / "plate.toml").write_text('[device]\nkind = "vt-plate"\nmass = 0.03\n', encoding="utf-8")
+    (tmp_path / "plate.toml").write_text('[profile]\nkind = "vt-plate"\n[device]\nmass = 0.03\n', encoding="utf-8")
     made = hr.Recording.from_columns(SMALL, rate=RATE, drive="i", sensed="x", device=str(tmp_path / "plate.toml"))
     assert made.scene.device_profile.device["mass"] == 0.03
     made.save(tmp_path / "ours.npz")

@@ -30,7 +30,7 @@ EXPECTED = {
     "electroadhesion_square_root": (0.25, 0.001),  # (1 + sin)^2 is 1.5 + 2 sin - cos(2)/2
     # 10 K at -100 ppm/K of 30 kHz, and a finger of 0.4 N at -30 Hz (0.4/0.5)^(1/3).
     "ultrasonic_lock": (-30.0 - 30.0 * 0.8 ** (1 / 3), 1.0),
-    # Noise of 1 um through windows of two periods, and a finger of which the board hears every few ms.
+    # Noise of 1 um through windows of two periods, and a finger that the board is sent every few ms.
     "microcontroller": (10e-6, 0.03 * 10e-6),
 }
 

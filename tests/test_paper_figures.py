@@ -74,7 +74,7 @@ def test_everything_is_reproduced_but_the_known_corrections(items):
     ],
 )
 def test_recomputed_numbers(items, name, words, expected, within):
-    """Values derived independently of this code, to their last printed digit where nothing else is said."""
+    """Values derived independently of this code, to their last printed digit where nothing else is stated."""
     assert claim(items, name, words).ours == pytest.approx(expected, abs=within)
 
 

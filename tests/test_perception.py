@@ -9,7 +9,7 @@ from hapticrender.bands import Bands
 from hapticrender.touch import perception
 from hapticrender.touch.perception import detection_threshold, drop_unfelt
 
-# FACTS section 7 (Bolanowski 1988, Verrillo 1963 and 1992), um peak; 3 Hz from the longer table of the same sources.
+# Bolanowski 1988, Verrillo 1963 and 1992, um peak; 3 Hz from the longer table of the same sources.
 TABLE = {
     **{1: 28, 3: 25, 5: 18, 10: 11, 20: 6.3, 31.5: 4.7, 40: 4.0, 50: 2.5, 63: 1.7, 80: 1.06, 100: 0.63, 125: 0.40},
     **{160: 0.22, 200: 0.14, 250: 0.11, 300: 0.11, 400: 0.18, 500: 0.35, 700: 1.1, 1000: 5},
@@ -34,7 +34,7 @@ def test_the_classic_threshold_is_the_published_one(frequency):
 
 @pytest.mark.parametrize(("frequency", "below"), [(1, 6), (20, 6), (40, 10), (63, 10), (80, 25), (500, 25), (1000, 25)])
 def test_the_safe_threshold_lies_below_the_classic_one_by_what_active_touch_gains(frequency, below):
-    """FACTS section 7: -6 dB below 40 Hz, -10 dB from 40, -25 dB from 80; a border belongs to the lower side."""
+    """docs/theory.md: -6 dB below 40 Hz, -10 dB from 40, -25 dB from 80; a border belongs to the lower side."""
     expected = 1e-6 * TABLE[frequency] * 10 ** (-below / 20)
     assert detection_threshold(frequency) == pytest.approx(expected, rel=ROUNDING)
 
@@ -83,7 +83,7 @@ DEVICE = {"top_speed": 0.1, "lowest": 10.0, "highest": 400.0}
 
 
 def bands_of(*entries):
-    """Bands of (frequency, wavenumber, amplitude), with phases by which they can be told apart."""
+    """Bands of (frequency, wavenumber, amplitude), with phases by which they can be distinguished."""
     frequency, wavenumber, amplitude = np.array(entries, float).reshape(-1, 3).T
     return Bands(
         frequency=frequency, wavenumber=wavenumber, phase=np.arange(frequency.size), envelope=amplitude * np.exp(0.3j)

@@ -41,9 +41,9 @@ def test_the_panels_show_what_was_recorded():
     for name, level in (("target", 10.0), ("centre", 10.0), ("end 1", 12.0), ("end 2", 9.0)):
         np.testing.assert_allclose(line(amplitude, name)[1], level, rtol=1e-9)
     waveform = panel(figure, "Waveform")
-    milliseconds, wanted = line(waveform, "target")
+    milliseconds, target = line(waveform, "target")
     assert milliseconds[-1] == pytest.approx(4 * 10 - 0.2)  # ms: four periods, less one sample
-    np.testing.assert_allclose(line(waveform, "centre")[1], wanted, atol=1e-6)
+    np.testing.assert_allclose(line(waveform, "centre")[1], target, atol=1e-6)
     errors = panel(figure, "Third octaves")
     assert line(errors, "end 1")[1].max() == pytest.approx(20.0)
     assert "misses its tolerance" in figure.axes[0].texts[-1].get_text()

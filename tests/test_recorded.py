@@ -59,8 +59,8 @@ def test_beyond_its_ends_a_recording_runs_back_without_a_jump(write, rng):
 
 
 def test_carriers_are_the_strongest_peaks_apart(write, rng):
-    rate, wanted = 8000, {47.0: 0.5, 60.0: 0.3, 143.0: 1.0, 305.0: 0.2, 390.0: 0.7}
-    samples = sum(weight * tone(frequency, rate, 4.0) for frequency, weight in wanted.items()) / 4
+    rate, present = 8000, {47.0: 0.5, 60.0: 0.3, 143.0: 1.0, 305.0: 0.2, 390.0: 0.7}
+    samples = sum(weight * tone(frequency, rate, 4.0) for frequency, weight in present.items()) / 4
     samples += 1e-4 * rng.standard_normal(samples.size)
     file = write(samples)
     all_clear = Recorded(file=file, amplitude=1e-6, carriers=8).bands(5000.0)
@@ -69,7 +69,7 @@ def test_carriers_are_the_strongest_peaks_apart(write, rng):
         [143.0, 390.0], abs=0.2
     )
     closer = Recorded(file=file, amplitude=1e-6, carriers=8, spacing=12.0).bands(5000.0)
-    assert closer.frequency == pytest.approx(sorted(wanted), abs=0.2)
+    assert closer.frequency == pytest.approx(sorted(present), abs=0.2)
     assert Recorded(file=file, amplitude=1e-6, carriers=8).bands(500.0).frequency.max() < 250.0
 
 
@@ -167,7 +167,7 @@ def save(tmp_path):
     return save
 
 
-def test_contact_and_slide_are_told_from_homing(save):
+def test_contact_and_slide_are_distinguished_from_homing(save):
     """Edges to within the 20 ms over which force and velocity are smoothed."""
     recording = load_swipe(str(save()))
     touching, sliding = (np.flatnonzero(mask)[[0, -1]] / 1e4 for mask in (recording.touching, recording.sliding))

@@ -143,9 +143,9 @@ REFUSED = [  # text of GOOD, what stands there instead, message
     ("speed = 0.08", "speed = 80", r"finger.speed = 80: must be .* <= 10 m/s"),
     ('motion = "sliding"\nspeed = 0.08', 'motion = "none"', r"finger.motion = 'none': a texture over position needs"),
     ("mass = 0.035", "mass = nan", r"profile.mass = nan: must be a finite number"),
-    ("[device]", "[plant]", r"plant: is three tables now: .*\[device\].*\[simulation\].*\[render\]"),
-    ("duration = 2.0", "duration = 2.0\ntolerance = 0.1", r"tolerance = 0.1: must stand in the table \[render\]"),
-    (GOOD, 'duration = 1.0\ndevice = "vt-plate"', r"device = 'vt-plate': must be a table now: \[device\] with kind ="),
+    ("[device]", "[plant]", r"plant = .*: must be three tables: \[device\], \[simulation\].*\[render\]"),
+    ("duration = 2.0", "duration = 2.0\ntolerance = 0.1", r"tolerance = 0.1: must be in the table \[render\]"),
+    (GOOD, 'duration = 1.0\ndevice = "vt-plate"', r"device = 'vt-plate': must be a table: \[device\] with kind ="),
 ]
 
 

@@ -1,12 +1,11 @@
-"""Predicted skin velocity: closed forms for every unit, and the picture and page of several devices."""
+"""Predicted skin velocity: closed forms for every unit."""
 
 import math
 
-import numpy as np
 import pytest
 
 import hapticrender as hr
-from hapticrender.skin import skin_bands, skin_waveform, velocity_per_unit
+from hapticrender.skin import skin_bands, velocity_per_unit
 
 FINGER = hr.Finger.sliding(speed=0.08, normal_load=0.4, mechanics="light")
 
@@ -38,7 +37,7 @@ def test_a_friction_moves_it_by_the_fingers_admittance_where_the_scene_says_so()
     )
     recording = hr.render(scene)
     share = velocity_per_unit(recording, 111.0)
-    assert abs(share) == pytest.approx(0.484, abs=5e-4)  # FACTS 4, light finger, 4th order
+    assert abs(share) == pytest.approx(0.484, abs=5e-4)  # of the light finger of 4th order, see test_finger
     [band] = skin_bands(recording)
     assert band.target == pytest.approx(8e-3, rel=1e-6)
     assert band.achieved == pytest.approx(8e-3, rel=0.02)
@@ -51,14 +50,3 @@ def test_skin_bands_say_velocity_level_and_error(recordings):
         assert [band.error for band in bands] == pytest.approx([0.0, 0.0], abs=0.02)
         amplitude = 8e-3 / (2 * math.pi * 60.0)
         assert bands[0].level == pytest.approx(hr.sensation_level(amplitude, 60.0), abs=0.2)
-
-
-def test_the_waveform_is_the_derivative_of_the_texture_on_both(recordings):
-    """Wanted is exact; achieved has the error of its envelopes, below 2 % of the sum of both partials."""
-    for recording in recordings.values():
-        time, target, achieved = skin_waveform(recording, 1.5, 0.05)
-        texture = recording.scene.texture
-        step = 1e-7
-        ahead, behind = (texture.waveform(time + side * step, np.full(time.shape, np.nan)) for side in (1, -1))
-        np.testing.assert_allclose(target, (ahead - behind) / (2 * step), atol=1e-6 * 16e-3)
-        np.testing.assert_allclose(achieved, target, atol=0.02 * 16e-3)

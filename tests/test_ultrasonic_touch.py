@@ -9,7 +9,7 @@ from ultrasonic import ASKED, NOISE, ran
 
 import hapticrender as hr
 from hapticrender.accuracy import friction as accuracy_friction
-from hapticrender.accuracy.figures import TARGETS
+from hapticrender.accuracy.suite import TARGETS
 from hapticrender.control import controller_design
 from hapticrender.plants import surface
 from hapticrender.protocols import Flag

@@ -84,7 +84,7 @@ def test_reports_survive_figures_and_names_that_formats_forbid(verdicts, tmp_pat
     summary["worst"] = verdicts[1].summary["worst"] | {"value": float("inf")}
     verdict = Verdict.of(summary, elapsed=0.5)
     write_junit(tmp_path / "report.xml", [verdict])
-    assert ElementTree.parse(tmp_path / "report.xml").find(".//testcase").get("name") == "bell \ufffd & <tag>"
+    assert ElementTree.parse(tmp_path / "report.xml").find(".//testcase").get("name") == "bell \\x07 & <tag>"
     write_json(tmp_path / "report.json", [verdict])
     [scene] = json.loads((tmp_path / "report.json").read_text(encoding="utf-8"), parse_constant=pytest.fail)["scenes"]
     assert scene["value"] is None

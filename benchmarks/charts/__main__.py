@@ -1,14 +1,12 @@
 """Draw every chart and renew the pictures in docs/.
 
-Run: python -m benchmarks.charts [story waveforms pareto devices stability latency demo] [--out docs]
+Run: python -m benchmarks.charts [story waveforms pareto devices stability latency] [--out docs]
 """
 
 from __future__ import annotations
 
 import argparse
 import json
-import shutil
-import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -69,15 +67,9 @@ def draw_latency(out: Path) -> None:
     latency.draw().savefig(out / "latency.png", dpi=110)
 
 
-def draw_demo(out: Path) -> None:
-    """The picture of one texture on every device, from the demonstration."""
-    subprocess.run([sys.executable, "-m", "hapticrender", "demo", "--out", str(_data() / "demo")], cwd=ROOT, check=True)
-    shutil.copy(_data() / "demo" / "devices.png", out / "devices.png")
-
-
 CHARTS: dict[str, Callable[[Path], None]] = {
     "story": draw_story, "waveforms": draw_waveforms, "pareto": draw_pareto, "devices": draw_devices,
-    "stability": draw_stability, "latency": draw_latency, "demo": draw_demo,
+    "stability": draw_stability, "latency": draw_latency,
 }  # fmt: skip
 
 

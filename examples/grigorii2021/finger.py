@@ -129,11 +129,10 @@ def _balance(finger: FingerMechanics, frequency: Array) -> Array:
 
 def admittance() -> Item:
     """Compare velocity of skin, phalanx and tissue per force with the ratio at equal intensity."""
-    complex_parts = (
-        LIGHT.skin_velocity_per_force(GRID),
-        LIGHT.phalanx_velocity_per_force(GRID),
-        LIGHT.tissue_velocity_per_force(GRID),
-    )
+    s, whole = 2j * pi * GRID, LIGHT.skin_velocity_per_force(GRID)
+    between = LIGHT.damping + LIGHT.stiffness / s
+    hand = LIGHT.phalanx_mass * s + LIGHT.phalanx_damping + LIGHT.phalanx_stiffness / s
+    complex_parts = (whole, whole * between / (hand + between), whole * hand / (hand + between))
     skin, phalanx, tissue = (np.abs(each) for each in complex_parts)
     eight = np.abs(LIGHT.skin_velocity_per_force(FREQUENCIES))
     off = _balance(LIGHT, FREQUENCIES) / eight - 1

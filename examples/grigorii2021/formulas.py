@@ -34,18 +34,18 @@ def decibel(values: Array) -> Array:
 def controller() -> Item:
     """Compare the controller C and the closed loop T, exact and reduced to second order."""
     laws = {"exact": exact_controller(LOOP, FILTER), "2nd order": reduced_controller(LOOP, FILTER)}
-    wanted, low_pass = butterworth(LOOP), butterworth(FILTER)
+    desired, low_pass = butterworth(LOOP), butterworth(FILTER)
     exact, reduced = laws.values()
-    plain, cancelled = _polynomial_controller(wanted, low_pass)
+    plain, cancelled = _polynomial_controller(desired, low_pass)
     slow = 1e-3  # Hz: as good as 0, where C has a pole
     measured = low_pass.frequency_response(slow)
     claims = [
         Claim("order of the exact C", 6, exact.order, 0.5, check=plain.order - cancelled,
               why=f"polynomial arithmetic on T/(1 - L T) gives order {plain.order}, of which {cancelled} poles "
               "lie on zeros; check: the order that is left"),
-        Claim("“sensitivity function” at 0 Hz", abs(wanted(0)),
+        Claim("“sensitivity function” at 0 Hz", abs(desired(0)),
               abs(1 / (1 + measured * exact.frequency_response(slow))), 0.05,
-              check=abs(1 - measured * wanted.frequency_response(slow)),
+              check=abs(1 - measured * desired.frequency_response(slow)),
               why="T is the response to the reference, 1 at 0 Hz; a sensitivity, S = 1/(1 + L C), is 0 there; "
               "check: 1 - L T"),
     ]  # fmt: skip
@@ -74,11 +74,11 @@ def controller() -> Item:
     )  # fmt: skip
 
 
-def _polynomial_controller(wanted: TransferFunction, low_pass: TransferFunction) -> tuple[TransferFunction, int]:
+def _polynomial_controller(desired: TransferFunction, low_pass: TransferFunction) -> tuple[TransferFunction, int]:
     """Return T/(1 - L T) by polynomial arithmetic, and the number of its poles that lie on zeros."""
-    both = np.polymul(wanted.denominator, low_pass.denominator)
-    rest = np.polysub(both, np.polymul(wanted.numerator, low_pass.numerator))
-    plain = TransferFunction(tuple(np.polymul(wanted.numerator, both)), tuple(np.polymul(wanted.denominator, rest)))
+    both = np.polymul(desired.denominator, low_pass.denominator)
+    rest = np.polysub(both, np.polymul(desired.numerator, low_pass.numerator))
+    plain = TransferFunction(tuple(np.polymul(desired.numerator, both)), tuple(np.polymul(desired.denominator, rest)))
     zeros = np.roots(plain.numerator)
     return plain, int(sum(np.abs(zeros - pole).min() < 1e-6 * abs(pole) for pole in plain.poles() if pole != 0))
 

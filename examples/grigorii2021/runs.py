@@ -46,16 +46,16 @@ def _amplitudes(recording: Recording, frequency: float, start: float, stop: floa
     return np.abs(2 * np.mean((motion - motion.mean(axis=0)) * turn[:, None], axis=0))
 
 
-def _off(recording: Recording, frequency: float, wanted: float, start: float, stop: float) -> Array:
+def _off(recording: Recording, frequency: float, target: float, start: float, stop: float) -> Array:
     """Relative error (%) of the mean amplitudes at the centre and both ends."""
-    return 100 * (_amplitudes(recording, frequency, start, stop) / wanted - 1)
+    return 100 * (_amplitudes(recording, frequency, start, stop) / target - 1)
 
 
 def commanded() -> Item:
     """Render the commanded amplitudes at 261 Hz under a sliding finger."""
     runs = {
-        (finger, wanted, method): _run(CARRIER, wanted, EXPLORING(mechanics=finger), method, 5.0)
-        for finger in ("light", "heavy") for wanted in AMPLITUDES for method in METHODS
+        (finger, target, method): _run(CARRIER, target, EXPLORING(mechanics=finger), method, 5.0)
+        for finger in ("light", "heavy") for target in AMPLITUDES for method in METHODS
     }  # fmt: skip
     off = {key: _off(recording, CARRIER, key[1], 1.5, 4.5) for key, recording in runs.items()}
     middle = runs["heavy", AMPLITUDES[1], "paper"]
@@ -65,18 +65,18 @@ def commanded() -> Item:
     frequency = np.fft.rfftfreq(size, 1 / middle.rate)
     near = (frequency >= 150) & (frequency <= 372)
     spectra, micrometre = [], np.array(AMPLITUDES) * 1e6
-    for wanted in AMPLITUDES:
-        lines = 2e6 / size * np.abs(np.fft.rfft(runs["heavy", wanted, "paper"].motion[whole, 0]))
-        spectra.append(Curve(f"{1e6 * wanted:g} µm set", frequency[near], lines[near]))
+    for target in AMPLITUDES:
+        lines = 2e6 / size * np.abs(np.fft.rfft(runs["heavy", target, "paper"].motion[whole, 0]))
+        spectra.append(Curve(f"{1e6 * target:g} µm set", frequency[near], lines[near]))
     end, time = 1e6 * middle.motion[:, 2], middle.time
     sag = lfilter(*butter(2, FILTER, fs=middle.rate), end)
     rows = slice(None, None, 3)
     return Item(
         "commanded", "Commanded amplitudes at 261 Hz under a sliding finger of 0.5 N", "Fig. 4 A and B",
-        (*(Claim(f"amplitude under a {finger} finger that slides, {1e6 * wanted:g} µm wanted", 1e6 * wanted,
-                 1e6 * wanted * (1 + off[finger, wanted, "paper"][0] / 100), 0.05e6 * wanted, "µm",
+        (*(Claim(f"amplitude under a {finger} finger that slides, {1e6 * target:g} µm target", 1e6 * target,
+                 1e6 * target * (1 + off[finger, target, "paper"][0] / 100), 0.05e6 * target, "µm",
                  why="the printed figure can be read to 5 %")
-           for finger in ("light", "heavy") for wanted in AMPLITUDES),
+           for finger in ("light", "heavy") for target in AMPLITUDES),
          Claim("highest rise of an end above rest, beyond the amplitude, finger at the far end", 0,
                float(1e6 * (middle.motion[:, 1:].max() - AMPLITUDES[1])), 0, "µm", ">="),
          Claim("mean line of the spectrum of the sensor's noise, 1 s at 30 kHz", 0.01,
@@ -85,14 +85,14 @@ def commanded() -> Item:
          Claim("accuracy: wobble of the plate through the loop", 0.01, wobble, 0.005, "µm rms", check=expected,
                why="the printed floor is that of the record's length; check: 1 µm of noise through the loop, "
                "1 µm sqrt(2 B/rate), B the noise bandwidth of T L")),
-        (Panel("Fig. 4 A: end 2, 10 µm wanted, heavy finger", "time (s)", "displacement (µm), place (mm)",
+        (Panel("Fig. 4 A: end 2, 10 µm target, heavy finger", "time (s)", "displacement (µm), place (mm)",
                (Curve("displacement: the finger tilts the plate", time[rows], end[rows]),
                 Curve("above 10 Hz", time[rows], (end - sag)[rows]),
                 Curve("finger (mm)", time[rows], 1e3 * middle.position[rows])), ylim=(-85, 85)),
          Panel("Fig. 4 B: spectra of the centre, 2 s", FREQUENCY, "peak amplitude (µm)",
                (*spectra, *(Curve("paper: as set", [150, 372], [each, each], "printed") for each in micrometre)), "y"),
-         Panel("Error of the mean amplitude, heavy finger", "wanted (µm)", "centre off by (%)",
-               tuple(Curve(name, micrometre, [off["heavy", wanted, name][0] for wanted in AMPLITUDES], "o")
+         Panel("Error of the mean amplitude, heavy finger", "target (µm)", "centre off by (%)",
+               tuple(Curve(name, micrometre, [off["heavy", target, name][0] for target in AMPLITUDES], "o")
                      for name in METHODS), "x", (-6, 6))),
         "Method “paper” controls each side separately, “paper-common” their mean, “h2” is the default here.",
     )  # fmt: skip
@@ -117,14 +117,14 @@ def _wobble() -> tuple[float, float]:
 
 def frequencies() -> Item:
     """Render the eight frequencies on the free plate, and under a heavy finger."""
-    wanted = 10e-6
+    target = 10e-6
     fingers = {
         "free plate": Finger.absent(),
         "heavy finger": Finger.sliding(speed=0.1, span=0.03, normal_load=LOAD, mechanics="heavy"),
     }
     off = {
         (name, method): np.array(
-            [_off(_run(each, wanted, finger, method, 6.0), each, wanted, 4.0, 6.0) for each in FREQUENCIES.tolist()]
+            [_off(_run(each, target, finger, method, 6.0), each, target, 4.0, 6.0) for each in FREQUENCIES.tolist()]
         )
         for name, finger in fingers.items() for method in METHODS
     }  # fmt: skip
@@ -157,36 +157,36 @@ def press() -> Item:
     """Compute the effect of a still press of 0.5 N on the amplitude that the loop holds."""
     finger = Finger.still(position=0.0, normal_load=LOAD, mechanics="none")
     off = {
-        (wanted, method): np.array(
+        (target, method): np.array(
             [
-                _off(_run(each, wanted, finger, method, 9.0, sensor_noise=0.0), each, wanted, 4.0, 9.0)[0]
+                _off(_run(each, target, finger, method, 9.0, sensor_noise=0.0), each, target, 4.0, 9.0)[0]
                 for each in FREQUENCIES.tolist()
             ]
         )
-        for wanted in AMPLITUDES for method in ("paper", "h2")
+        for target in AMPLITUDES for method in ("paper", "h2")
     }  # fmt: skip
     return Item(
         "press", "A press of 0.5 N on a steady amplitude",
         "Fig. 4 A, and the end of “Computing filter and control dynamics”",
-        tuple(Claim(f"{1e6 * wanted:g} µm at {frequency:g} Hz, off by", 0, float(off[wanted, "paper"][at]), 1, "%",
-                    check=_leaked(frequency, wanted), why="“ignores … displacement due to the applied normal load”; "
+        tuple(Claim(f"{1e6 * target:g} µm at {frequency:g} Hz, off by", 0, float(off[target, "paper"][at]), 1, "%",
+                    check=_leaked(frequency, target), why="“ignores … displacement due to the applied normal load”; "
                     "the sag of 11 µm leaks through L at the carrier; check: the mean modulus of target and leak")
-              for wanted, at, frequency in ((1e-6, 0, 20.0), (10e-6, 0, 20.0), (1e-6, 6, 261.0), (10e-6, 6, 261.0))),
+              for target, at, frequency in ((1e-6, 0, 20.0), (10e-6, 0, 20.0), (1e-6, 6, 261.0), (10e-6, 6, 261.0))),
         tuple(Panel(title, FREQUENCY, "amplitude at the centre off by (%)",
-                    (*(Curve(f"{1e6 * wanted:g} µm", FREQUENCIES, np.minimum(off[wanted, method], 30.0), "o")
-                       for wanted in AMPLITUDES), Curve("paper: no effect", [20, 400], [0, 0], "printed")), "x",
+                    (*(Curve(f"{1e6 * target:g} µm", FREQUENCIES, np.minimum(off[target, method], 30.0), "o")
+                       for target in AMPLITUDES), Curve("paper: no effect", [20, 400], [0, 0], "printed")), "x",
                     (-108, 32))
               for method, title in (("paper", "The paper's controller (170 Hz: above 30 %)"), ("h2", "h2"))),
-        "As the paper says where the amplitude is well above the leak; not where both are small and slow.",
+        "As in the paper where the amplitude is well above the leak; not where both are small and slow.",
     )  # fmt: skip
 
 
-def _leaked(frequency: float, wanted: float) -> float:
-    """Error (%) of a loop that holds the mean modulus of its amplitude A and the leak s at `wanted`: A + s^2/(4 A)."""
+def _leaked(frequency: float, target: float) -> float:
+    """Error (%) of a loop that holds the mean modulus of its amplitude A and the leak s at `target`: A + s^2/(4 A)."""
     parameters = PlateParameters()
     sag = LOAD / (parameters.stiffness_1 + parameters.stiffness_2)
     leak = 2 * sag * abs(butterworth(FILTER).frequency_response(frequency))
-    return -100.0 if leak > wanted else 100 * ((1 + sqrt(1 - (leak / wanted) ** 2)) / 2 - 1)
+    return -100.0 if leak > target else 100 * ((1 + sqrt(1 - (leak / target) ** 2)) / 2 - 1)
 
 
 def extraction() -> Item:

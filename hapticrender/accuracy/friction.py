@@ -1,7 +1,7 @@
 """Cases of the accuracy suite on devices that modulate friction, and on the same texture on every kind of device.
 
 Errors are those of friction (N), not of what is measured, on the simulated device at its defaults: a finger of 0.4 N
-that slides at 80 mm/s, unless a case says otherwise.  Those of amplitude are of the ultrasonic mode (m), at level
+that slides at 80 mm/s, unless a case states otherwise.  Those of amplitude are of the ultrasonic mode (m), at level
 "carrier"; its loop is that of the device, whatever method makes the friction.
 """
 

@@ -75,12 +75,6 @@ def judged_from(recording: Recording) -> float:
     return settle if duration >= 2 * settle else duration / 2
 
 
-def _window(recording: Recording, longest: float) -> float:
-    """Length of the analysis window of a recording (s), from positions a quarter of the shortest window apart."""
-    step = max(1, round(SHORTEST_WINDOW / QUARTERS * recording.rate))
-    return window_length(recording.bands, recording.rate / step, recording.read("position", step=step), longest)
-
-
 def window_length(bands: Bands, rate: float, position: Array, longest: float) -> float:
     """Length of the analysis window (s): max(20 ms, 2/lowest frequency, 2/spacing), cut to `longest` (s).
 
@@ -110,7 +104,8 @@ def analyse(recording: Recording) -> Envelopes:
     """
     bands, rate, count = recording.bands, recording.rate, len(recording)
     longest = max(SHORTEST_WINDOW, (count / rate - judged_from(recording)) / 2)
-    size = round(_window(recording, longest) * rate)
+    step = max(1, round(SHORTEST_WINDOW / QUARTERS * rate))
+    size = round(window_length(bands, rate / step, recording.read("position", step=step), longest) * rate)
     size = max(2, size + size % 2)
     hop = max(1, size // (HOPS_LOCKED if bands.wavenumber.any() else HOPS))
     hop = hop if count // hop <= MOST_WINDOWS else size

@@ -7,7 +7,6 @@ import json
 import math
 import os
 import uuid
-import zipfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -15,17 +14,15 @@ from typing import Any
 
 import numpy as np
 
-from hapticrender.checks import npy_header
 from hapticrender.errors import HapticError
 from hapticrender.protocols import Array
-from hapticrender.recordings.journal import Header, chunks, column, join, read_journal, split, write_journal
+from hapticrender.recordings.journal import Header, chunks, join, read_journal, split, write_journal
 
 COMMENT_LIMIT = 4000  # characters; libsndfile drops a longer WAV comment silently
-FLAC_CHANNELS = 8
 
 
 class MissingExtra(HapticError, ImportError):
-    """An optional part is not installed: says which extra brings it."""
+    """An optional part is not installed: states which extra has it."""
 
 
 def read(path: str | os.PathLike[str]) -> tuple[Header, Any]:
@@ -47,7 +44,7 @@ def read(path: str | os.PathLike[str]) -> tuple[Header, Any]:
     reader = _by_suffix(path, READERS, "read")
     if path.exists() and not path.is_file() and not path.is_dir():
         raise ValueError(f"{path}: must be a regular file")
-    with path.open("rb"):  # a missing file is the same OSError for every format
+    with path.open("rb"), _naming(path):  # a missing file is the same OSError for every format
         return reader(path)
 
 
@@ -117,11 +114,8 @@ def _values(header: Header, frames: Any) -> dict[str, Any]:
 
 def _assembled(path: Path, load: Callable[[str], Any]) -> tuple[Header, Array]:
     """Header and frames from ``load(name)`` for the header and each signal."""
-    with _naming(path):
-        text = str(np.asarray(load("header")).ravel()[0])
-    header = Header.from_json(text, str(path))
-    with _naming(path):
-        return header, join(header, {name: load(name) for name in header.slices})
+    header = Header.from_json(str(np.asarray(load("header")).ravel()[0]), str(path))
+    return header, join(header, {name: load(name) for name in header.slices})
 
 
 @contextmanager
@@ -138,11 +132,10 @@ def _naming(path: Path) -> Iterator[None]:
         raise ValueError(f"{path}: not a recording ({reason})") from error
 
 
-def _check_size(path: Path, name: str, shape: tuple[int, ...], item: int) -> None:
-    """Refuse an array that is larger than its file: `save` never compresses."""
-    size, most = math.prod(shape) * item, path.stat().st_size
-    if size > most:
-        raise ValueError(f"{name} has {size} bytes, the file {most}: compressed recordings are not read")
+def _check_size(path: Path, name: str, size: int) -> None:
+    """Refuse an array of more bytes than its file: `save` never compresses."""
+    if size > path.stat().st_size:
+        raise ValueError(f"{name} has {size} bytes, the file {path.stat().st_size}: compressed recordings are not read")
 
 
 def _write_npz(path: Path, header: Header, frames: Any) -> None:
@@ -150,12 +143,10 @@ def _write_npz(path: Path, header: Header, frames: Any) -> None:
 
 
 def _read_npz(path: Path) -> tuple[Header, Array]:
-    with _naming(path), zipfile.ZipFile(path) as archive, np.load(path) as file:
+    with path.open("rb") as opened, np.load(opened) as file:  # numpy leaves open what is no archive
 
         def load(name: str) -> Any:
-            with archive.open(f"{name}.npy") as member:
-                shape, dtype = npy_header(member)
-            _check_size(path, name, shape, dtype.itemsize)
+            _check_size(path, name, file.zip.getinfo(f"{name}.npy").file_size)
             return file[name]
 
         return _assembled(path, load)
@@ -180,13 +171,13 @@ def _write_h5(path: Path, header: Header, frames: Any) -> None:
 
 def _read_h5(path: Path) -> tuple[Header, Array]:
     h5py = _h5py()
-    with _naming(path), h5py.File(path, "r") as file:
+    with h5py.File(path, "r") as file:
 
         def load(name: str) -> Any:
             entry = file[name] if isinstance(file.get(name, getlink=True), h5py.HardLink) else None
             if not isinstance(entry, h5py.Dataset) or entry.external or entry.is_virtual:
                 raise ValueError(f"{name}: is missing, or no data set of this file")
-            _check_size(path, name, entry.shape, entry.dtype.itemsize)
+            _check_size(path, name, math.prod(entry.shape) * entry.dtype.itemsize)
             return entry.asstr()[()] if name == "header" else entry[()]
 
         return _assembled(path, load)
@@ -201,13 +192,12 @@ def _write_mat(path: Path, header: Header, frames: Any) -> None:
 def _read_mat(path: Path) -> tuple[Header, Array]:
     from scipy.io import loadmat, whosmat
 
-    with _naming(path):
-        shapes = {name: shape for name, shape, _ in whosmat(path, appendmat=False)}
+    shapes = {name: shape for name, shape, _ in whosmat(path, appendmat=False)}
 
     def load(name: str) -> Any:
         if name not in shapes:
             raise ValueError(f"{name}: is missing")
-        _check_size(path, name, shapes[name], 1 if name == "header" else 8)
+        _check_size(path, name, math.prod(shapes[name]) * (1 if name == "header" else 8))
         return loadmat(path, appendmat=False, variable_names=[name])[name]
 
     return _assembled(path, load)
@@ -226,7 +216,7 @@ def _write_csv(path: Path, header: Header, frames: Any) -> None:
 
 
 def _read_csv(path: Path) -> tuple[Header, Array]:
-    with _naming(path), path.open(encoding="utf-8") as file:
+    with path.open(encoding="utf-8") as file:
         comment, _, first = (file.readline() for _ in range(3))
         if not comment.startswith("# "):
             raise ValueError("the first line is no comment with a header")
@@ -248,22 +238,6 @@ def _write_doubles(path: Path, header: Header, frames: Any) -> None:
     if len(comment) > COMMENT_LIMIT:
         comment = json.dumps({"rate": header.rate, "columns": header.widths})
     _write_audio(path, container, "DOUBLE", frames, header.rate, comment)
-
-
-def _write_flac(path: Path, header: Header, frames: Any) -> None:
-    """Drive, sensed and motion as 24-bit channels (FLAC holds eight, and no floats); the comment states the scales."""
-    frames = frames[:]
-    signals = {name: column(header, frames, name) for name in ("drive", "sensed", "motion")}
-    width = sum(signal.shape[1] for signal in signals.values())
-    if width > FLAC_CHANNELS:
-        raise ValueError(f"{path}: {width} channels, but FLAC holds at most {FLAC_CHANNELS}: choose .w64 or .au")
-    scales = {name: float(np.nanmax(np.abs(signal), initial=0.0)) or 1.0 for name, signal in signals.items()}
-    names = ", ".join(name for name, _ in header.channels[:width])
-    units = {"drive": header.drive_unit}
-    stated = ", ".join(f"{name} {scale:.6g} {units.get(name, header.unit)}" for name, scale in scales.items())
-    scaled = np.hstack([signal / scales[name] for name, signal in signals.items()])
-    comment = f"channels: {names}; full scale: {stated}; rate = {header.rate!r} Hz; the other signals do not fit"
-    _write_audio(path, "FLAC", "PCM_24", np.nan_to_num(scaled), header.rate, comment)
 
 
 def _write_audio(path: Path, container: str, subtype: str, frames: Any, rate: float, comment: str) -> None:
@@ -297,5 +271,4 @@ WRITERS: dict[str, Callable[[Path, Header, Any], None]] = {
     ".mat": _write_mat,
     ".csv": _write_csv,
     **dict.fromkeys((".wav", ".w64", ".rf64"), _write_doubles),
-    ".flac": _write_flac,
 }

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from hapticrender.bands import Bands
-from hapticrender.checks import Validated, check_names, checked, flag, number, numbers, option, parameter, require, text
+from hapticrender.checks import Validated, check_names, checked, flag, numbers, option, parameter, require, text
 from hapticrender.protocols import Array
 
 if TYPE_CHECKING:
@@ -33,8 +33,7 @@ JOURNAL_DTYPE = np.dtype(">f8")
 CHUNK_VALUES = 2**20  # numbers read at once
 LONGEST_NOTE = 2**26  # bytes of header
 MOTION_SOURCES = ("true", "sensors", "inferred", "unknown")
-_COLUMNS = ("frequency", "wavenumber", "phase")  # of bands
-_NUMBER: dict[str, Any] = {"least": -1e12, "most": 1e12}
+_COLUMNS, _MARKS = ("frequency", "wavenumber", "phase"), ("modulated", "differentiated", "spatial")  # of bands
 
 
 def _places(key: str, value: Any) -> tuple[str, ...]:
@@ -45,26 +44,25 @@ def _places(key: str, value: Any) -> tuple[str, ...]:
     return names
 
 
+def _row(key: str, value: Any) -> Array:
+    """Return a list of numbers, which may be empty, as an array."""
+    return np.array(() if value == [] else numbers(key, value, least=-1e12, most=1e12), float)
+
+
 def _bands(key: str, value: Any) -> Bands:
     """Return bands, also from their JSON object."""
     if isinstance(value, Bands):
         return value
     require(isinstance(value, dict), key, value, "an object")
-    for name in (*_COLUMNS, "unfelt"):
-        require(isinstance(value.get(name, []), list), f"{key}.{name}", value.get(name), "a list")
-    columns = {name: [number(f"{key}.{name}", each, **_NUMBER) for each in value.get(name, ())] for name in _COLUMNS}
-    pairs, envelope = value.get("envelope"), None
+    fields: dict[str, Any] = {name: _row(f"{key}.{name}", value.get(name)) for name in _COLUMNS}
+    pairs, unfelt = value.get("envelope"), value.get("unfelt", [])
     if pairs is not None:
         good = isinstance(pairs, list) and all(isinstance(pair, list) and len(pair) == 2 for pair in pairs)
         require(good, f"{key}.envelope", pairs, "pairs of real and imaginary part")
-        parts = [[number(f"{key}.envelope", part, **_NUMBER) for part in pair] for pair in pairs]
-        envelope = np.array([complex(*pair) for pair in parts], complex)
-    marks: dict[str, Any] = {
-        name: flag(f"{key}.{name}", value.get(name, False)) for name in ("modulated", "differentiated", "spatial")
-    }
-    unfelt = tuple(text(f"{key}.unfelt", each, 1000) for each in value.get("unfelt", ()))
-    arrays: dict[str, Any] = {name: np.array(column, float) for name, column in columns.items()}
-    return Bands(**arrays, envelope=envelope, **marks, unfelt=unfelt)
+        fields["envelope"] = _row(f"{key}.envelope", [part for pair in pairs for part in pair]).view(complex)
+    require(isinstance(unfelt, list), f"{key}.unfelt", unfelt, "a list")
+    marks: dict[str, Any] = {name: flag(f"{key}.{name}", value.get(name, False)) for name in _MARKS}
+    return Bands(**fields, **marks, unfelt=tuple(text(f"{key}.unfelt", each, 1000) for each in unfelt))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -153,7 +151,7 @@ class Header(Validated):
         values = {name: getattr(self, name) for name in self.__dataclass_fields__ if name != "bands"}
         envelope = self.bands.envelope
         bands = {name: getattr(self.bands, name).tolist() for name in _COLUMNS}
-        bands |= {name: getattr(self.bands, name) for name in ("modulated", "differentiated", "spatial", "unfelt")}
+        bands |= {name: getattr(self.bands, name) for name in (*_MARKS, "unfelt")}
         bands["envelope"] = None if envelope is None else [[z.real, z.imag] for z in envelope.tolist()]
         channels = [{"name": name, "unit": unit} for name, unit in self.channels]
         return json.dumps({"format": FORMAT, "version": VERSION, **values, "bands": bands, "channels": channels})

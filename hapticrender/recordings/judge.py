@@ -27,7 +27,7 @@ SETTLED = 0.05  # of the target
 SETTLED_FOR = 0.5  # s, or
 SETTLED_SHARE = 0.1  # of the judged time where that is shorter: inside for so long at the end, a band has settled
 INFERRED = "the friction is inferred by a law that is assumed, not measured"
-HARDLY = 2.0  # times what the sensors' noise alone reads: a smaller figure cannot be told from it
+HARDLY = 2.0  # times what the sensors' noise alone reads: a smaller figure is not distinct from it
 IN_BAND = f"{BAND[0]:g} to {BAND[1]:g} Hz"
 UNJUDGED: dict[str, Any] = {"figure": "waveform_error", "value": None, "bound": None, "band": "any", "place": "any"}
 
@@ -37,13 +37,13 @@ def summary(recording: Recording) -> dict[str, Any]:
     """Figures and verdict as plain numbers, strings, lists and dicts; None for no figure.
 
     The verdict rests on `waveform`, which compares the motion y at every place with the reference r, the texture as the
-    scene asks for it, without time shift or gain fit.  It is "passed" where at every place `waveform_error`, E =
+    scene specifies it, without time shift or gain fit.  It is "passed" where at every place `waveform_error`, E =
     rms_B(y - r)/rms_B(r), is within the tolerance, `window_error`, the 95th percentile of the same in windows of
     100 ms, and the worst `third_octave_error` are within twice the tolerance, and no sample is flagged as saturated or
     faulty; "passed in band" where besides more than 1 % of the texture's energy is outside 20 to 500 Hz (B) and above
     the detection threshold; else "failed", or "not judged".  `worst` is the figure furthest over its `bound`; `reason`
-    says what else decided.  See ``verdict`` for the equations.  `contacts` are the errors after touches and lifts;
-    `delay` (s), `gain` and `incoherent` share say how y differs from r and decide nothing, like all that follows.
+    states what else decided.  See ``verdict`` for the equations.  `contacts` are the errors after touches and lifts;
+    `delay` (s), `gain` and `incoherent` share state how y differs from r and decide nothing, like all that follows.
 
     Relative errors of a band compare with the target at every place over the judged windows: `error_*` is that of the
     mean amplitude, `rms_error_*` the rms of |X| - |target| over the rms of |target|, `complex_error` the rms of
@@ -161,7 +161,7 @@ def _verdict(recording: Recording, worst: dict[str, Any]) -> tuple[str, str]:
         needed = min(max(header.settle, FADE_IN) + WINDOW, 2 * WINDOW)
         return "not judged", f"the run is too short: needs >= {needed:g} s"
     if not found["rms_reference"]:
-        return "not judged", "the texture asks for nothing"
+        return "not judged", "the texture is zero"
     if found["share_in_band"] < LEAST:
         return "not judged", f"the texture has nothing from {IN_BAND}"
     if header.motion_source == "inferred":
@@ -169,15 +169,12 @@ def _verdict(recording: Recording, worst: dict[str, Any]) -> tuple[str, str]:
     if worst["value"] > worst["bound"]:
         noise = found["sensor_noise"]
         if worst["value"] - header.calibration <= HARDLY * noise:
-            return (
-                "not judged",
-                f"the noise of the sensors alone reads {percent(noise)}, the worst figure is no clearer",
-            )
+            return "not judged", f"the worst figure is not distinct from the noise of the sensors, {percent(noise)}"
         return "failed", _stopped(recording)
     counts = _flag_counts(recording, round(judged_from(recording) * recording.rate))
     raised = [f"{flag.name} in {count} samples" for flag, count in counts.items() if count and flag & MATTERS]
     if raised:
-        return "failed", f"flags that a play must not raise: {', '.join(raised).lower()}"
+        return "failed", f"flags that are not allowed: {', '.join(raised).lower()}"
     if found["share_outside"] > UNPLAYABLE:
         return "passed in band", _unplayable(found["share_outside"])
     return "passed", ""
@@ -198,19 +195,16 @@ def _unplayable(share: float) -> str:
 
 def _worst(recording: Recording) -> dict[str, Any]:
     """Find the figure that is largest over its bound, at all places; from sensors, their uncertainty is added."""
-    header, worst = recording.header, dict(UNJUDGED)
+    header, found = recording.header, []
     unsure = header.calibration if header.motion_source == "sensors" else 0.0
     for place, figures in recording.waveform["places"].items():
         for name, looser in (("waveform_error", 1.0), ("window_error", LOOSER), ("third_octave_error", LOOSER)):
-            value, bound = (figures or {}).get(name), looser * header.tolerance
-            if value is None or (
-                worst["value"] is not None and (value + unsure) / bound <= worst["value"] / worst["bound"]
-            ):
-                continue
-            band = figures["third_octave"] if name == "third_octave_error" else IN_BAND
-            where = {"band": band, "place": place.replace("_", " ")}
-            worst = {"figure": name, "value": value + unsure, "bound": bound, **where}
-    return worst
+            if figures and figures[name] is not None:
+                band = figures["third_octave"] if name == "third_octave_error" else IN_BAND
+                value, bound = figures[name] + unsure, looser * header.tolerance
+                where = {"band": band, "place": place.replace("_", " ")}
+                found.append({"figure": name, "value": value, "bound": bound, **where})
+    return max(found, key=lambda each: each["value"] / each["bound"], default=dict(UNJUDGED))
 
 
 def _notes(recording: Recording, bands: list[dict[str, Any]], settled: Array) -> list[str]:

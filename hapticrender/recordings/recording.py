@@ -84,7 +84,7 @@ class Recorder:
 
         `drive` (n, channels) as commanded in each interval; `sensed` (n, channels); `motion` (n, places), true or the
         best estimate; finger `position` (n,), m, NaN while lifted; `normal_load` (n,), N; `reference` (n,), the texture
-        as the scene asks for it; `target` (n, n_bands), the envelopes that the controller makes of it; `flags` (n,),
+        as the scene specifies it; `target` (n, n_bands), the envelopes that the controller makes of it; `flags` (n,),
         ``protocols.Flag``.  Units are those of the header.  The first
         block's `motion_source` replaces that of the header.
         """
@@ -98,7 +98,7 @@ class Recorder:
             self.flush()
 
     def begin(self) -> None:
-        """Make the file of `path` now, not at the first block; an OSError says why it cannot be written."""
+        """Make the file of `path` now, not at the first block; an OSError states why it cannot be written."""
         self._file = self._file or self._create(Path(self.path or ""))
 
     def flush(self) -> None:
@@ -179,8 +179,8 @@ class Recording:
     """The result of a run, with all signals on one clock.
 
     `drive`, `sensed`, `motion`, `position`, `normal_load`, `flags`, `reference` and `target` read a whole signal,
-    `read` a part of one; units are `header.unit` and `header.drive_unit`, and `header.motion_source` says where the
-    motion comes from.
+    `read` a part of one; units are `header.unit` and `header.drive_unit`, and `header.motion_source` states the
+    source of the motion.
 
     Parameters
     ----------
@@ -223,7 +223,7 @@ class Recording:
     position: Array = _signal("position", "Finger from the middle of the surface (m, shape (n,)), NaN while lifted.")
     normal_load: Array = _signal("normal_load", "Load of the finger (N, shape (n,)).")
     reference: Array = _signal(
-        "reference", "Texture as the scene asks for it (unit, shape (n,)), unscaled and in full."
+        "reference", "Texture as the scene specifies it (unit, shape (n,)), unscaled and in full."
     )
     target: Array = _signal("target", "Reference envelopes (unit, complex, shape (n, n_bands)).")
     flags: Array = _signal("flags", "Status words (int, shape (n,)), see ``protocols.Flag``.")
@@ -268,7 +268,7 @@ class Recording:
     def plot(self, path: str | os.PathLike[str]) -> bool:
         """Draw target, achieved motion, drive and finger into one .png, .svg or .pdf; False without matplotlib.
 
-        Then a warning says how to install it, so that a script goes on to save the run.
+        Then a warning states how to install it, so that a script goes on to save the run.
         """
         from hapticrender.report import picture
 
@@ -280,7 +280,7 @@ class Recording:
         return True
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write to .au, .npz, .h5, .hdf5, .mat or .csv (these can be loaded again), .wav, .w64, .rf64 or .flac."""
+        """Write to .au, .npz, .h5, .hdf5, .mat or .csv (these can be loaded again), .wav, .w64 or .rf64."""
         formats.write(path, self.header, self.frames)
 
     @classmethod

@@ -1,4 +1,4 @@
-"""Judge the waveform: the motion against the texture as the scene asks for it, without time shift or gain fit.
+"""Judge the waveform: the motion against the texture as the scene specifies it, without time shift or gain fit.
 
 Symbols: r reference, y motion at a place over the place's share of the target, e = y - r; rms_B over B = 20 to 500 Hz,
 rms_b over a third octave b with both edges in B; S_b detection threshold (rms) in it.  Over the whole play both come

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -33,10 +33,8 @@ STYLE: Any = {
 
 
 @contextmanager
-def new_figure(
-    size: tuple[float, float], *, pads: tuple[float, float] | None = None, style: Mapping[str, Any] | None = None
-) -> Iterator[Any]:
-    """Make a ``matplotlib.figure.Figure`` of `size` (inch), apart from pyplot, in `STYLE` with `style` over it.
+def new_figure(size: tuple[float, float], *, pads: tuple[float, float] | None = None) -> Iterator[Any]:
+    """Make a ``matplotlib.figure.Figure`` of `size` (inch), apart from pyplot, in `STYLE`.
 
     `pads` (inch) is the room beside and above every panel.  Raises `MissingExtra` without matplotlib.
     """
@@ -46,8 +44,7 @@ def new_figure(
         from matplotlib.figure import Figure
     except ImportError as error:
         raise MissingExtra("pictures need matplotlib: pip install 'hapticrender[plot]'") from error
-    chosen: Any = {**STYLE, **(style or {})}
-    with matplotlib.rc_context(chosen), np.errstate(all="ignore"):
+    with matplotlib.rc_context(STYLE), np.errstate(all="ignore"):
         figure: Any = Figure(figsize=size, layout="constrained")
         FigureCanvasAgg(figure)
         if pads is not None:

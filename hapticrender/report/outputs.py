@@ -24,7 +24,7 @@ FILES = ("scene.toml", JOURNAL, "drive.wav", "sensed.wav", "picture.png", "summa
 
 @dataclass(frozen=True, kw_only=True)
 class Outputs:
-    """A folder with one rendered scene: its name, its files, its figures and its TOML.
+    """A folder with one rendered scene: its name, its figures and its TOML.
 
     `summary` is ``Recording.summary()`` and, under "sound", the full scale (SI) of each WAV.
     """
@@ -34,20 +34,14 @@ class Outputs:
     summary: Mapping[str, Any]
     toml: str
 
-    @property
-    def files(self) -> list[Path]:
-        """Paths of what was written."""
-        return [self.folder / name for name in FILES if (self.folder / name).exists()]
 
-
-def check_folder(option: str, folder: Path, given: Path | None = None) -> None:
-    """Refuse a folder that could not be made or written into, without making it; `given` is the option's value."""
+def check_folder(option: str, folder: Path) -> None:
+    """Refuse a folder that could not be made or written into, without making it."""
     nearest = next(path for path in (folder, *folder.absolute().parents) if path.exists() or path.is_symlink())
-    entry = f"{option} = {str(given or folder)!r}"
     if not nearest.is_dir():
-        raise ValueError(f"{entry}: {str(nearest)!r} is a file, must be a folder")
+        raise ValueError(f"{option} = {str(folder)!r}: {str(nearest)!r} is a file, must be a folder")
     if not os.access(nearest, os.W_OK | os.X_OK):
-        raise ValueError(f"{entry}: no permission to write into {str(nearest)!r}")
+        raise ValueError(f"{option} = {str(folder)!r}: no permission to write into {str(nearest)!r}")
 
 
 def check_file(option: str, path: Path) -> None:
@@ -56,12 +50,17 @@ def check_file(option: str, path: Path) -> None:
         raise ValueError(f"{option} = {str(path)!r}: is a folder, must be a file")
     if path.exists() and not os.access(path, os.W_OK):
         raise ValueError(f"{option} = {str(path)!r}: no permission to write it")
-    check_folder(option, path.parent, given=path)
+    check_folder(option, path.parent)
+
+
+def written_in(folder: Path) -> list[Path]:
+    """Files in `folder` that have the names of a run's files."""
+    return [folder / name for name in FILES if (folder / name).exists()]
 
 
 def refuse_to_overwrite(folder: Path, source: Path | None = None) -> None:
     """Refuse a folder in which files would be overwritten that no earlier run has written, or the scene `source`."""
-    present = [folder / name for name in FILES if (folder / name).exists()]
+    present = written_in(folder)
     for path in present:
         if source is not None and source.exists() and path.samefile(source):
             raise ValueError(f"{str(path)!r}: would overwrite the scene itself: choose another folder")
@@ -84,21 +83,18 @@ def run_into(folder: Path, rendering: Rendering, *, progress: Callable[[float, f
 def begin_outputs(folder: Path, scene: Scene) -> Path:
     """Make `folder`, remove the files of an earlier run, write the scene, and return the path of the journal."""
     folder.mkdir(parents=True, exist_ok=True)
-    _remove_files(folder)
+    for path in written_in(folder):
+        path.unlink()
     (folder / "scene.toml").write_text(scene.to_toml(), encoding="utf-8")
     return folder / JOURNAL
 
 
 def remove_outputs(folder: Path) -> None:
     """Remove what `run_into` or `begin_outputs` wrote, and `folder` where nothing else is in it."""
-    _remove_files(folder)
+    for path in written_in(folder):
+        path.unlink()
     if not any(folder.iterdir()):
         folder.rmdir()
-
-
-def _remove_files(folder: Path) -> None:
-    for name in FILES:
-        (folder / name).unlink(missing_ok=True)
 
 
 def write_outputs(folder: Path, recording: Recording) -> Outputs:

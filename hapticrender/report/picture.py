@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import os
 import textwrap
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -28,7 +28,6 @@ COLUMNS = 1400  # points that a full-width panel can show
 QUANTITIES = {"m": "displacement", "N": "friction", "m/s": "skin velocity"}
 PERIODS = 4  # of the strongest carrier in the close-up
 LANE = 0.95  # inch: a lane of drive beyond the two of a plate
-MOST_NOTES = 3  # lines
 GROUP = 64  # stretches of an outline that are read at once
 VERDICTS = {
     "passed": ("✓", "#00694E"),
@@ -67,10 +66,9 @@ def drawn(unit: str) -> tuple[float, str]:
 
 def _draw(figure: Any, recording: Recording, touched: bool) -> None:
     summary = recording.summary()
-    notes = [line for note in summary["notes"] for line in textwrap.wrap(note, 170)][:MOST_NOTES]
     coils = recording.header.drive_channels
     lanes = [0.8] * coils + ([0.9, 0.9] if touched else [])
-    heights = [0.5, 2.3, 2.2, *lanes, *([0.17 * len(notes)] if notes else [])]
+    heights = [0.5, 2.3, 2.2, *lanes]
     grid = figure.add_gridspec(len(heights), 2, height_ratios=heights, width_ratios=[1.35, 1])
     _head(figure.add_subplot(grid[0, :]), summary, touched)
     amplitude = figure.add_subplot(grid[1, :])
@@ -86,14 +84,10 @@ def _draw(figure: Any, recording: Recording, touched: bool) -> None:
     below[-1].set_xlabel("time (s)")
     figure.align_ylabels([amplitude, *below])
     amplitude.set_xlim(0, max(len(recording), 1) / recording.rate)
-    if notes:
-        foot = figure.add_subplot(grid[-1, :])
-        foot.axis("off")
-        foot.text(0, 1, "\n".join(notes), color="#555555", fontsize=8, va="top", transform=foot.transAxes)
 
 
 def _head(axes: Any, summary: dict[str, Any], touched: bool) -> None:
-    """Name of the scene, how it was made, and the verdict in words."""
+    """Name of the scene, how it was made, and the verdict as a sentence."""
     axes.axis("off")
     axes.set(xlim=(0, 1), ylim=(0, 1))
     finger = "" if touched else " · no finger"
@@ -228,27 +222,18 @@ def _drive(lanes: list[Any], recording: Recording, summary: dict[str, Any]) -> N
     largest = np.nanmax(np.maximum(np.abs(lows), np.abs(highs)), axis=0, initial=0.0)
     peaks = {unit: max(largest[[each == unit for each in units]]) or 1e-3 for unit in units}
     near = limit is not None and peaks[units[0]] > 0.4 * limit
-    for i, (axes, unit, name) in enumerate(zip(lanes, units, _lane_names(units), strict=True)):
+    for i, (axes, unit) in enumerate(zip(lanes, units, strict=True)):
         reach = 1.12 * (max(peaks[unit], limit) if near else peaks[unit])
         axes.fill_between(time, lows[:, i], highs[:, i], color=COILS[i % len(COILS)], lw=0.5)
         for sign in (-1, 1) if near else ():
             axes.axhline(sign * limit, color=INK, lw=1, ls=DASHED)
-        axes.set(ylabel=f"{name} ({unit})", ylim=(-reach, reach))
+        axes.set(ylabel=f"drive {i + 1} ({unit})", ylim=(-reach, reach))
         if near:
             axes.set_yticks([-limit, 0, limit], [f"{tick:.3g}" for tick in (-limit, 0, limit)])
     stated = "" if limit is None else f", limit ±{limit:.3g} {units[0]}" + (" (dashed)" if near else "")
     if summary["saturated_share"]:
         stated += f", saturated in {percent(summary['saturated_share'])} of the samples"
     lanes[0].set_title(f"Drive{stated}")
-
-
-def _lane_names(units: Sequence[str]) -> list[str]:
-    """Names of the drive's lanes; where units differ, a channel in newtons is a screen."""
-    if len(units) == 1:
-        return ["drive"]
-    known = {"A": "coil"} if len(set(units)) == 1 else {"A": "coil", "N": "screen"}
-    names = [known.get(unit, "channel") for unit in units]
-    return [f"{name} {names[: i + 1].count(name)}" if names.count(name) > 1 else name for i, name in enumerate(names)]
 
 
 def _finger(upper: Any, lower: Any, recording: Recording) -> None:

@@ -14,11 +14,6 @@ if TYPE_CHECKING:
 MEASURED = {"friction": "friction", "skin": "skin velocity"}  # places that name a quantity, not a position
 
 
-def places_of(summary: Mapping[str, Any]) -> list[str]:
-    """Evaluation points that a summary has errors of."""
-    return list(summary["waveform"]["places"])
-
-
 def waveform_error(summary: Mapping[str, Any]) -> float | None:
     """Waveform error at the worst place; None where nothing is judged."""
     found = [figures["waveform_error"] for figures in summary["waveform"]["places"].values() if figures]
@@ -70,57 +65,51 @@ def worst_figure(summary: Mapping[str, Any]) -> str:
     return f"{figure} {at([str(worst['place'])])} = {percent(worst['value'])}"
 
 
-def amplitudes(summaries: Sequence[Mapping[str, Any]]) -> list[tuple[str, str]]:
-    """Target and achieved amplitude of every summary; one prefix for all that have the same unit."""
-    pairs = [[total(summary["bands"], key) for key in ("target", "achieved")] for summary in summaries]
-    units = [summary["unit"] for summary in summaries]
-    largest = {
-        unit: max(pair[0] or 0.0 for pair, own in zip(pairs, units, strict=True) if own == unit) for unit in units
-    }
-    return [
-        (quantity(target, unit, like=largest[unit]), quantity(achieved, unit, like=largest[unit]))
-        for (target, achieved), unit in zip(pairs, units, strict=True)
-    ]
-
-
-def overview(summaries: Sequence[Mapping[str, Any]]) -> str:
-    """Tabulate scenes, a line each: amplitudes, the waveform error at the worst place, the verdict."""
+def overview(summaries: Sequence[Mapping[str, Any]]) -> list[list[str]]:
+    """Head and rows of a table of scenes: amplitudes, the waveform error at the worst place, the verdict."""
     rows = [["scene", "target", "achieved", "error", "verdict"]]
-    for summary, pair in zip(summaries, amplitudes(summaries), strict=True):
-        rows.append([summary["scene"], *pair, percent(waveform_error(summary)), brief(summary)])
-    return table(rows)
+    for summary in summaries:
+        sizes = [quantity(total(summary["bands"], key), summary["unit"]) for key in ("target", "achieved")]
+        rows.append([summary["scene"], *sizes, percent(waveform_error(summary)), brief(summary)])
+    return rows
 
 
-def figures(summary: Mapping[str, Any]) -> str:
-    """Tabulate all figures of a run, a line a band, with notes and verdict."""
-    places, unit = places_of(summary), summary["unit"]
+def band_rows(summary: Mapping[str, Any]) -> list[list[str]]:
+    """Head and rows of a table of a run's bands, with rms errors at every place."""
+    places = list(summary["waveform"]["places"])
     rows = [["band", "target", "achieved", *(place.replace("_", " ") for place in places), "phase", "settled"]]
     for band in summary["bands"]:
+        sizes = [quantity(band[key], summary["unit"]) for key in ("target", "achieved")]
         errors = [percent(band[f"rms_error_{place}"]) for place in places]
-        sizes = [quantity(band[key], unit) for key in ("target", "achieved")]
         settled = quantity(band["settling_time"], "s")
         rows.append([band_label(band), *sizes, *errors, degrees(band["phase_error"]), settled])
-    lines = [table(rows)] if len(rows) > 1 else []
-    lines.append(table([["", "waveform", "worst windows", "worst third octave"], *waveform_rows(summary)]))
-    wobble, residual = (quantity(summary[key], unit) for key in ("wobble", "residual_rms"))
-    saturated = percent(summary["saturated_share"])
-    lines.append(beside(summary))
-    lines.append(f"rms errors {at(places)}; wobble {wobble}, beside the bands {residual}, saturated {saturated}")
-    return "\n".join([*lines, *summary["notes"], f"{summary['scene']} {verdict(summary)}"])
+    return rows
 
 
 def waveform_rows(summary: Mapping[str, Any]) -> list[list[str]]:
-    """Figures of the waveform that decide, a row a place."""
-    return [
-        [
-            place.replace("_", " "),
-            percent(each["waveform_error"]),
-            percent(each["window_error"]),
-            f"{percent(each['third_octave_error'])} at {each['third_octave']}",
-        ]
-        for place, each in summary["waveform"]["places"].items()
-        if each
-    ]
+    """Head and rows of a table of the figures that decide, a row a place."""
+    rows = [["", "waveform", "worst windows", "worst third octave"]]
+    for place, each in summary["waveform"]["places"].items():
+        if each:
+            third = f"{percent(each['third_octave_error'])} at {each['third_octave']}"
+            errors = [percent(each[key]) for key in ("waveform_error", "window_error")]
+            rows.append([place.replace("_", " "), *errors, third])
+    return rows
+
+
+def remarks(summary: Mapping[str, Any]) -> list[str]:
+    """State what the tables of a run do not have and what decides nothing, and its notes, a line each."""
+    wobble, residual = (quantity(summary[key], summary["unit"]) for key in ("wobble", "residual_rms"))
+    saturated, places = percent(summary["saturated_share"]), at(list(summary["waveform"]["places"]))
+    bands = f"rms errors {places}; wobble {wobble}, beside the bands {residual}, saturated {saturated}"
+    return [beside(summary), bands, *summary["notes"]]
+
+
+def figures(summary: Mapping[str, Any]) -> str:
+    """Tabulate all figures of a run, with remarks and verdict."""
+    tables = [table(band_rows(summary))] if summary["bands"] else []
+    tables.append(table(waveform_rows(summary)))
+    return "\n".join([*tables, *remarks(summary), f"{summary['scene']} {verdict(summary)}"])
 
 
 def beside(summary: Mapping[str, Any]) -> str:
@@ -128,14 +117,14 @@ def beside(summary: Mapping[str, Any]) -> str:
     found = summary["waveform"]
     if found["delay"] is None:
         return "no waveform"
-    said = [
+    stated = [
         f"delay {quantity(found['delay'], 's')}, gain {found['gain']:.3f}, incoherent {percent(found['incoherent'])}"
     ]
     contacts = found["contacts"]
     if contacts["count"]:
         errors = " and ".join(percent(contacts[f"error_{span}_ms"]) for span in ("0_50", "50_200"))
-        said.append(f"{contacts['count']} touches and lifts: error {errors} in 0-50 and 50-200 ms after them")
-    return "; ".join(said)
+        stated.append(f"{contacts['count']} touches and lifts: error {errors} in 0-50 and 50-200 ms after them")
+    return "; ".join(stated)
 
 
 def conditions(summary: Mapping[str, Any]) -> str:
@@ -153,22 +142,8 @@ def flags(summary: Mapping[str, Any]) -> str:
 
 
 def describe(scene: Scene) -> str:
-    """Describe a scene in a few words: its texture, its finger, its length and its device."""
-    texture, motion = scene.texture, scene.finger.motion
-    sizes = [
-        short(size, unit)
-        for key, unit in (("amplitude", "m"), ("wavelength", "m"), ("frequency", "Hz"))
-        if (size := getattr(texture, key, None)) is not None
-    ]
-    series = getattr(texture, "harmonics", 1) if getattr(texture, "shape", "sine") != "sine" else 1
-    count = len(getattr(texture, "partials", None) or range(series))
-    what = f"{_kind(texture)} {' '.join(sizes)}{f', {count} partials' if count > 1 else ''}"
-    speed = getattr(motion, "speed", None)
-    finger = [f"{_kind(motion)} finger", *([] if speed is None else [short(speed, "m/s")])]
-    return f"{what}; {' '.join(finger)}; {short(scene.duration, 's')} on {scene.device}"
-
-
-def _kind(thing: Any) -> str:
-    """Name the kind of a texture or a motion, or its class where it has no kind."""
-    kind = str(getattr(thing, "kind", type(thing).__name__))
-    return "no" if kind == "none" else kind
+    """Describe a scene in a line: its texture, its finger, its length and its device."""
+    texture, motion = (getattr(each, "kind", type(each).__name__) for each in (scene.texture, scene.finger.motion))
+    sizes = ((getattr(scene.texture, key, None), unit) for key, unit in (("amplitude", "m"), ("frequency", "Hz")))
+    what = " ".join([str(texture), *(short(size, unit) for size, unit in sizes if size is not None)])
+    return f"{what}; finger: {motion}; {short(scene.duration, 's')} on {scene.device}"

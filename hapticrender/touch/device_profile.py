@@ -4,18 +4,18 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, fields
 from datetime import date
 from pathlib import Path
 from typing import Any, Self
 
 from hapticrender import checks
-from hapticrender.checks import Validated, checked, parameter
-from hapticrender.errors import SceneError
+from hapticrender.checks import Validated, checked, mapping, parameter
+from hapticrender.errors import naming
 from hapticrender.touch import toml
 
 ENDING = ".toml"  # of a device's name that is a file
-TEXTS = ("name", "measured_by", "measured_with")
+HEAD = ("kind", "name", "measured_by", "measured_with", "measured_on")  # the table [profile] of a file
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -69,21 +69,13 @@ def _parameters(key: str, value: Any) -> dict[str, Any]:
     return dict(value)
 
 
-def _made(kind: type[Any]) -> Any:
-    """Check of a part that may be given as a table too."""
-
-    def check(key: str, value: Any) -> Any:
-        if isinstance(value, kind):
-            return value
-        checks.require(isinstance(value, Mapping), key, value, f"a table or {kind.__name__}", TypeError)
-        with checks.inside(key):
-            return kind.with_overrides(value)
-
-    return check
-
-
-def _table(check: Any) -> Any:
-    return field(default_factory=dict, hash=False, metadata={"check": check, "bounds": {}})
+def _part(key: str, value: Any, kind: type[Any]) -> Any:
+    """Return `value`, a `kind`, also from its table."""
+    if isinstance(value, kind):
+        return value
+    checks.require(isinstance(value, Mapping), key, value, f"a table or {kind.__name__}", TypeError)
+    with checks.inside(key):
+        return kind.with_overrides(value)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -91,8 +83,7 @@ class DeviceProfile(Validated):
     """All that is known of one device, and where it comes from; a TOML file.
 
     A scene takes it by the file's name (``Scene(device="plate.toml")``); `hapticrender identify` writes one.  In a file
-    the first five are the table ``[profile]``, the others a table of their name each.  A file without ``[profile]``
-    has its `kind` in ``[device]``.
+    the first five are the table ``[profile]``, the others a table of their name each.
 
     Parameters
     ----------
@@ -125,19 +116,17 @@ class DeviceProfile(Validated):
     [limits]
     rms_drive = 0.5
     <BLANKLINE>
-    >>> DeviceProfile.from_table({"device": {"kind": "vt-plate", "mass": 0.03}}).device
-    {'mass': 0.03}
     """
 
-    kind: str = checked(checks.word)
+    kind: str = checked(checks.name)
     name: str = checked(checks.text, "")
     measured_by: str = checked(checks.text, "")
     measured_with: str = checked(checks.text, "")
     measured_on: date | None = checked(_day, None)
-    device: Mapping[str, Any] = _table(_parameters)
-    uncertainty: Mapping[str, float] = _table(_uncertainty)
-    calibration: Calibration = field(default=Calibration(), metadata={"check": _made(Calibration), "bounds": {}})
-    limits: Limits = field(default=Limits(), metadata={"check": _made(Limits), "bounds": {}})
+    device: Mapping[str, Any] = mapping(_parameters)
+    uncertainty: Mapping[str, float] = mapping(_uncertainty)
+    calibration: Calibration = checked(_part, Calibration(), kind=Calibration)
+    limits: Limits = checked(_part, Limits(), kind=Limits)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -153,11 +142,8 @@ class DeviceProfile(Validated):
         SceneError
             In one line: file, key, value, bound and unit.
         """
-        where = " ".join(str(path).split())
-        try:
-            found = cls.from_table(toml.read(path))
-        except (ValueError, TypeError) as problem:
-            raise SceneError(f"{where}: {str(problem).removeprefix(f'{where}: ')}") from problem
+        with naming(path):
+            found = cls.from_table(toml.loads(toml.read_text(path)))
         return found if found.name else cls(**{**vars(found), "name": Path(path).stem})
 
     @classmethod
@@ -167,22 +153,17 @@ class DeviceProfile(Validated):
         for key, value in table.items():
             bound = f"one of the tables {', '.join(known)}"
             checks.require(key in known and isinstance(value, Mapping), checks.plain(key), value, bound)
-        head, device = dict(table.get("profile", {})), dict(table.get("device", {}))
-        kind = device.pop("kind", None)
-        if kind is not None and head.setdefault("kind", kind) != kind:
-            checks.refuse("device.kind", kind, f"{head['kind']!r}, as in [profile]")
+        head = table.get("profile", {})
         with checks.inside("profile"):
-            checks.check_names(head, ("kind", "measured_on", *TEXTS))
-            checks.require(head.get("kind") is not None, "kind", None, "the name of a renderer, such as 'vt-plate'")
-        return cls(**head, device=device, **{key: table[key] for key in known[2:] if key in table})
+            checks.check_names(head, HEAD)
+            checks.require("kind" in head, "kind", None, "the name of a renderer, such as 'vt-plate'")
+        return cls(**head, **{key: table[key] for key in known[1:] if key in table})
 
     def to_toml(self) -> str:
         """TOML text that `from_table` reads back to an equal profile."""
-        texts = {key: getattr(self, key) for key in TEXTS if getattr(self, key)}
-        day = {} if self.measured_on is None else {"measured_on": self.measured_on}
-        tables = {"profile": {"kind": self.kind, **texts, **day}, "device": self.device}
-        tables |= {"uncertainty": self.uncertainty, "calibration": table_of(self.calibration)}
-        tables |= {"limits": table_of(self.limits)}
+        head = {key: getattr(self, key) for key in HEAD if getattr(self, key)}
+        tables = {"profile": head, "device": self.device, "uncertainty": self.uncertainty}
+        tables |= {"calibration": table_of(self.calibration), "limits": table_of(self.limits)}
         return toml.dumps({key: table for key, table in tables.items() if table}).lstrip("\n")
 
     def save(self, path: str | os.PathLike[str]) -> None:

@@ -58,7 +58,7 @@ class Finger(Validated):
         >= 0 and <= 20; a curve is joined by straight lines and held at both
         ends.  None: as recorded, for a motion that has a load (`RecordedMotion`).
     touches : sequence of (on, off), s, or None
-        The finger touches while on <= t < off; None: whenever its motion says.
+        The finger touches while on <= t < off; None: whenever its motion has a position.
     mechanics : FingerMechanics, or a name, or a table of its numbers
         "none", "light", "heavy" (4th order, Table 1), "light-2nd-order",
         "heavy-2nd-order"; "auto" is light below a mean load of 0.5 N, else heavy.

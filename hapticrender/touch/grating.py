@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -46,10 +46,6 @@ def _read_partials(key: str, partials: Any) -> tuple[Partial, ...]:
 
 
 def _read_partial(key: str, entry: Any) -> Partial:
-    if isinstance(entry, Mapping):
-        for unknown in set(entry) - {"order", "amplitude", "phase"}:
-            checks.refuse(f"{key}.{checks.plain(unknown)}", entry, "one of the keys order, amplitude, phase")
-        entry = (entry.get("order"), entry.get("amplitude"), entry.get("phase", 0.0))
     good = isinstance(entry, list | tuple | np.ndarray) and len(entry) == 3
     checks.require(good, key, entry, "order, amplitude, phase", TypeError)
     return (
@@ -77,7 +73,7 @@ class Grating(Validated, Composable):
     harmonics : int
         1 to 4096.
     partials : sequence of (order, relative amplitude, phase in rad), or None
-        Instead of a shape; also mappings with these keys.  Orders need not be whole.
+        Instead of a shape.  Orders need not be whole.
     phase : float, rad
         Of the fundamental at t = 0, x = 0.
     velocity : float, m/s

@@ -83,30 +83,15 @@ class FingerMechanics(Validated):
             return np.zeros_like(s)
         if self.order == 2:
             return self.mass * s + self.damping + self.stiffness / s
-        return self.mass * s + self._tissue(s) * self._share(s)
+        tissue = self.damping + self.stiffness / s
+        phalanx = self.phalanx_mass * s + self.phalanx_damping + self.phalanx_stiffness / s
+        return self.mass * s + tissue * (phalanx / (phalanx + tissue))
 
     def skin_velocity_per_force(self, frequency: Array) -> Array:
         """V_s/F (complex, m/(N s)): the surface, and the skin on it, per newton."""
         bound = "2 or 4: a finger without mechanics gives no velocity per force"
         checks.require(self.order != 0, "order", self.order, bound)
         return 1 / self.impedance(frequency)
-
-    def phalanx_velocity_per_force(self, frequency: Array) -> Array:
-        """V_p/F (complex, m/(N s)); a finger of order 2 moves as a whole."""
-        return self.skin_velocity_per_force(frequency) - self.tissue_velocity_per_force(frequency)
-
-    def tissue_velocity_per_force(self, frequency: Array) -> Array:
-        """V_t/F (complex, m/(N s)): skin against phalanx, V_t = V_s - V_p."""
-        whole = self.skin_velocity_per_force(frequency)
-        return whole * self._share(_laplace(frequency)) if self.order == 4 else np.zeros_like(whole)
-
-    def _tissue(self, s: Array) -> Array:
-        return self.damping + self.stiffness / s
-
-    def _share(self, s: Array) -> Array:
-        """V_t/V_s = Z_p/(Z_p + Z_t)."""
-        phalanx = self.phalanx_mass * s + self.phalanx_damping + self.phalanx_stiffness / s
-        return phalanx / (phalanx + self._tissue(s))
 
     def load_factor(self, normal_load: Array) -> Array:
         """(W/W_ref)**(1/3), the growth of |Z_f| with `normal_load` W (N), 0 without load."""

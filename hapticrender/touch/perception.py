@@ -151,7 +151,7 @@ def _most_sensitive(bands: Bands, top_speed: float, lowest: float, highest: floa
 
 
 def _note(bands: Bands, index: int, threshold: float, sensitive: float) -> str:
-    """Say why a band is left out: its carrier, its target, and the threshold at the most sensitive frequency (Hz)."""
+    """State why a band is left out: its carrier, its target, and the threshold at the most sensitive frequency (Hz)."""
     frequency, wavenumber = float(bands.frequency[index]), float(bands.wavenumber[index])
     parts = [f"{frequency:.4g} Hz"] if frequency or not wavenumber else []
     parts += [f"wavelength {short(1 / wavenumber, 'm', 3)}"] if wavenumber else []

@@ -14,7 +14,7 @@ import numpy as np
 from hapticrender import checks
 from hapticrender.bands import Bands
 from hapticrender.checks import Validated, checked, parameter
-from hapticrender.errors import SceneError
+from hapticrender.errors import SceneError, naming
 from hapticrender.protocols import Array
 from hapticrender.touch.composed import Composable
 from hapticrender.touch.grating import MOST_AMPLITUDE
@@ -202,42 +202,40 @@ def _read_sound(file: str, channel: int) -> tuple[Array, float]:
     """One channel of a sound file, and its step (s); memory is bounded by the channel's length; raises `SceneError`."""
     import soundfile
 
-    name = f"file = {checks.show(file)}"
-    if not Path(file).is_file():
-        raise SceneError(f"{name}: must be an existing sound file")
-    try:
-        with soundfile.SoundFile(file) as sound:
-            _check_sound(name, sound, file, channel)
-            values = np.concatenate([*_channel(sound, channel), np.zeros(0)])
-            lengths = [(values.size, sound.frames), *_sizes(sound.extra_info)]
-            rate = sound.samplerate
-    except SceneError:
-        raise
-    except (soundfile.SoundFileError, OSError, ValueError, TypeError) as problem:
-        raise SceneError(f"{name}: must be a readable sound file ({checks.show(str(problem))})") from problem
-    share = min(held / promised for held, promised in lengths)
-    if share < WHOLE:
-        raise SceneError(f"{name}: ends after {100 * share:.3g} % of what its header says: must be whole")
-    for bad in np.flatnonzero(~(np.abs(values) <= LOUDEST))[:1]:  # NaN included
-        bound = f"must be a finite number within {LOUDEST:g} times full scale"
-        raise SceneError(f"{name}: sample {bad} of channel {channel} = {values[bad]}: {bound}")
-    if values.size < 2:
-        raise SceneError(f"{name}: has {values.size} readable samples: must be >= 2 samples")
-    return values, 1 / rate
+    with naming(f"file = {checks.show(file)}"):
+        if not Path(file).is_file():
+            raise ValueError("must be an existing sound file")
+        try:
+            with soundfile.SoundFile(file) as sound:
+                problem = _header_problem(sound, channel)
+                values = np.zeros(0) if problem else np.concatenate([*_channel(sound, channel), np.zeros(0)])
+                lengths = [(values.size, sound.frames), *_sizes(sound.extra_info)]
+                rate = sound.samplerate
+        except (soundfile.SoundFileError, OSError, ValueError, TypeError) as error:
+            raise ValueError(f"must be a readable sound file ({checks.show(str(error))})") from error
+        if problem:
+            raise ValueError(problem)
+        share = min(held / stated for held, stated in lengths)
+        if share < WHOLE:
+            raise ValueError(f"ends after {100 * share:.3g} % of what its header says: must be whole")
+        for bad in np.flatnonzero(~(np.abs(values) <= LOUDEST))[:1]:  # NaN included
+            bound = f"must be a finite number within {LOUDEST:g} times full scale"
+            raise ValueError(f"sample {bad} of channel {channel} = {values[bad]}: {bound}")
+        if values.size < 2:
+            raise ValueError(f"has {values.size} readable samples: must be >= 2 samples")
+        return values, 1 / rate
 
 
-def _check_sound(name: str, sound: Any, file: str, channel: int) -> None:
-    """Refuse by its header a file that is too long or too fast, before anything is read."""
+def _header_problem(sound: Any, channel: int) -> str:
+    """Reason why a file is too long or too fast by its header, before anything is read; empty where it is not."""
     frames, channels = sound.frames, sound.channels
     if not 2 <= frames <= MOST_FRAMES:
-        raise SceneError(f"{name}: has {frames} samples: must be >= 2 and <= {MOST_FRAMES} samples")
+        return f"has {frames} samples: must be >= 2 and <= {MOST_FRAMES} samples"
     if frames * channels > MOST_SAMPLES:
-        total = f"{frames} samples in each of {channels} channels"
-        raise SceneError(f"{name}: has {total}: must be <= {MOST_SAMPLES} samples together")
+        return f"has {frames} samples in each of {channels} channels: must be <= {MOST_SAMPLES} samples together"
     if not 1 <= sound.samplerate <= MOST_RATE:
-        raise SceneError(f"{name}: has a rate of {sound.samplerate} Hz: must be >= 1 and <= {MOST_RATE:g} Hz")
-    if channel >= channels:
-        raise SceneError(f"channel = {channel}: must be < {channels}, the channels of {checks.show(file)}")
+        return f"has a rate of {sound.samplerate} Hz: must be >= 1 and <= {MOST_RATE:g} Hz"
+    return "" if channel < channels else f"channel = {channel}: must be < {channels}, its number of channels"
 
 
 def _channel(sound: Any, channel: int) -> Iterator[Array]:
@@ -247,9 +245,9 @@ def _channel(sound: Any, channel: int) -> Iterator[Array]:
 
 
 def _sizes(log: str) -> list[tuple[int, int]]:
-    """Bytes that a file holds and that its header says, for every part where libsndfile's log shows them to differ."""
-    differ = [(int(held), int(said)) for said, held in _PART.findall(log)]
-    return [(held, said) for held, said in differ if 0 < said < STREAMED]
+    """Bytes that a file holds and that its header states, for every part where libsndfile's log shows both."""
+    differ = [(int(held), int(stated)) for stated, held in _PART.findall(log)]
+    return [(held, stated) for held, stated in differ if 0 < stated < STREAMED]
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 
 from hapticrender import checks, defaults
-from hapticrender.checks import Validated, checked, parameter
-from hapticrender.errors import SceneError
+from hapticrender.checks import Validated, checked, mapping, parameter
+from hapticrender.errors import naming
 from hapticrender.protocols import Texture
 from hapticrender.touch import toml
 from hapticrender.touch.composed import Chirp, Playlist, Sum
@@ -52,7 +52,7 @@ Value = float | int | str | bool
 
 
 def _read_table(name: str, values: Any) -> dict[str, Value]:
-    """Return a table of numbers, words and booleans in Python's own types, so that TOML can hold them."""
+    """Return a table of numbers, texts and booleans in Python's own types, so that TOML can hold them."""
     checks.require(isinstance(values, Mapping), name, values, "a table of parameters", TypeError)
     found: dict[str, Value] = {}
     for key, value in values.items():
@@ -67,10 +67,6 @@ def _read_table(name: str, values: Any) -> dict[str, Value]:
             checks.number(f"{name}.{checks.plain(key)}", value)
             found[key] = int(value) if isinstance(value, Integral) else float(value)
     return found
-
-
-def _table() -> Any:
-    return field(default_factory=dict, hash=False, metadata={"check": _read_table, "bounds": {}})
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -134,22 +130,22 @@ class Scene(Validated):
 
     texture: Texture
     finger: Finger = field(default_factory=Finger.absent)
-    device: str = checked(checks.word, "vt-plate")
-    profile: Mapping[str, Value] = _table()
-    limits: Mapping[str, Value] = _table()
-    calibration: Mapping[str, Value] = _table()
+    device: str = checked(checks.name, "vt-plate")
+    profile: Mapping[str, Value] = mapping(_read_table)
+    limits: Mapping[str, Value] = mapping(_read_table)
+    calibration: Mapping[str, Value] = mapping(_read_table)
     source: str = checked(checks.text, "")
-    simulation: Mapping[str, Value] = _table()
-    rendering: Mapping[str, Value] = _table()
-    touch_panel: Mapping[str, Value] = _table()
+    simulation: Mapping[str, Value] = mapping(_read_table)
+    rendering: Mapping[str, Value] = mapping(_read_table)
+    touch_panel: Mapping[str, Value] = mapping(_read_table)
     duration: float = parameter(unit="s", above=0, most=LONGEST_TIME)
-    method: str = checked(checks.word, defaults.METHOD)
+    method: str = checked(checks.name, defaults.METHOD)
     tolerance: float = parameter(0.1, above=0, most=10)
     settle: float = parameter(1.0, "s", most=LONGEST_TIME)
     keep_unfelt: bool = checked(checks.flag, False)
     gradient: float = parameter(0.0, "1/m", least=-1e3, most=1e3)
     seed: int = parameter(0)
-    name: str = checked(checks.word, "scene")
+    name: str = checked(checks.name, "scene")
 
     def __post_init__(self) -> None:
         if str(self.device).endswith(ENDING):
@@ -165,14 +161,14 @@ class Scene(Validated):
             raise ValueError("finger.motion = 'none': a texture over position needs a finger")
 
     def _take_profile(self, found: DeviceProfile) -> None:
-        """Fill in what a profile says and the scene does not."""
+        """Take from a profile what the scene does not state."""
         tables = {"profile": found.device, "limits": table_of(found.limits), "calibration": table_of(found.calibration)}
         merged = {name: {**table, **_read_table(name, getattr(self, name))} for name, table in tables.items()}
         checks.keep(self, device=found.kind, source=self.source or str(found), **merged)
 
     @property
     def device_profile(self) -> DeviceProfile:
-        """What the scene says of its device; a ValueError where a limit or a calibration is none."""
+        """Profile of the device as the scene states it; a ValueError where a limit or a calibration is wrong."""
         name = self.source or self.device
         tables: dict[str, Any] = {"device": self.profile, "limits": self.limits, "calibration": self.calibration}
         return DeviceProfile(kind=self.device, name=name, **tables)
@@ -192,30 +188,21 @@ class Scene(Validated):
         SceneError
             In one line: file, key, value, bound and unit.
         """
-        try:
+        with naming(path):
             text = toml.read_text(path)
-        except ValueError as problem:
-            raise SceneError(str(problem)) from problem
-        where = " ".join(str(path).split())
-        return cls.from_toml_text(text, where, folder=Path(path).parent, name=Path(path).stem)
+        return cls.from_toml_text(text, str(path), folder=Path(path).parent, name=Path(path).stem)
 
     @classmethod
     def from_toml_text(
         cls, text: str, where: str = "scene", *, folder: str | os.PathLike[str] = "", name: str = "scene"
     ) -> Scene:
         """Read a scene from TOML; `where` begins every message, `folder` holds the files, `name` is the default."""
-        try:
-            table = toml.loads(text, where)
-        except ValueError as problem:
-            raise SceneError(str(problem)) from problem
-        try:
-            scene = _read_scene(table, Path(folder), name)
+        with naming(where):
+            scene = _read_scene(toml.loads(text), Path(folder), name)
             for key, part in (("texture", scene.texture), ("finger", scene.finger.motion)):
                 if hasattr(part, "check"):
                     with checks.inside(key):
                         part.check()
-        except (ValueError, TypeError) as problem:
-            raise SceneError(f"{where}: {problem}") from problem
         return scene
 
     def to_toml(self) -> str:
@@ -252,7 +239,7 @@ def distinct_names(names: Iterable[str]) -> list[str]:
 def _read_scene(table: dict[str, Any], folder: Path, name: str) -> Scene:
     table = _with_profile(table, folder)
     _check_keys(table)
-    values: dict[str, Any] = {"duration": table.get("duration"), "name": table.get("name", _usable(name))}
+    values: dict[str, Any] = {"duration": table.get("duration"), "name": table.get("name", name)}
     for own, where in TABLES.items():
         rest = dict(table.get(where, {}))
         values |= {OWN[where, key]: rest.pop(key) for key in list(rest) if (where, key) in OWN}
@@ -279,29 +266,16 @@ def _with_profile(table: dict[str, Any], folder: Path) -> dict[str, Any]:
 
 
 def _check_keys(table: dict[str, Any]) -> None:
-    """Refuse a key that is not at the top level of a scene; say where it is now, if it once was there."""
-    moved = {key: where for where, key in OWN}
+    """Refuse a key that is not at the top level of a scene; state the table of one that belongs elsewhere."""
+    moved = {key: f"in the table [{where}]" for where, key in OWN}
+    moved |= {"plant": "three tables: [device], [simulation] (where it differs from the device), and [render]"}
     for key, value in table.items():
-        entry = f"{checks.plain(key)} = {checks.show(value)}"
-        if key == "plant":
-            raise ValueError(
-                "plant: is three tables now: parameters of the device go into [device], how the simulated device "
-                "differs from them into [simulation], settings of the renderer into [render]"
-            )
         if key == "device" and isinstance(value, str):
-            raise ValueError(f"{entry}: must be a table now: [device] with kind = {checks.show(value)}")
+            checks.refuse(key, value, f"a table: [device] with kind = {checks.show(value)}")
         if key in moved:
-            raise ValueError(f"{entry}: must stand in the table [{moved[key]}]")
+            checks.refuse(key, value, moved[key])
         checks.require(key not in TABLES.values() or isinstance(value, dict), key, value, "a table", TypeError)
     _only_known(table, ["name", "duration", "texture", "finger", *TABLES.values()])
-
-
-def _usable(name: str) -> str:
-    """`name` if it can name a scene, else "scene"."""
-    try:
-        return checks.word("name", name)
-    except ValueError:
-        return "scene"
 
 
 def _only_known(table: Mapping[str, Any], known: list[str]) -> None:
@@ -318,10 +292,10 @@ def _read_kind(table: Any, key: str, choice: str, kinds: dict[str, type[Any]], f
         kind = kinds[checks.choice(choice, table.get(choice), kinds)]
         entries = fields(kind)
         _only_known(table, [choice, *(entry.name for entry in entries), *extra])
-        values: dict[str, Any] = {
-            entry.name: None for entry in entries if entry.default is entry.default_factory is MISSING
+        required = [entry.name for entry in entries if entry.default is entry.default_factory is MISSING]
+        values: dict[str, Any] = dict.fromkeys(required) | {
+            entry.name: table[entry.name] for entry in entries if entry.name in table
         }
-        values |= {entry.name: table[entry.name] for entry in entries if entry.name in table}
         if isinstance(values.get("parts"), list):
             values["parts"] = [_read_part(f"parts[{i}]", part, folder) for i, part in enumerate(values["parts"])]
         if isinstance(values.get("file"), str) and values["file"].isprintable():
@@ -354,7 +328,7 @@ def _read_finger(table: Any, folder: Path) -> Finger:
 
 
 def _write_fields(part: Any) -> dict[str, Any]:
-    """Fields of a dataclass as TOML has them; None is left out, for TOML has no word for it."""
+    """Fields of a dataclass as TOML has them; None is left out, as TOML has no such value."""
     values = {entry.name: getattr(part, entry.name) for entry in fields(part)}
     return {key: value for key, value in values.items() if value is not None}
 

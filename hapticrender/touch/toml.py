@@ -18,36 +18,25 @@ _BARE = re.compile(r"[A-Za-z0-9_-]+")
 
 def read_text(path: str | os.PathLike[str]) -> str:
     """Text of a file; a ValueError where it is no regular file of UTF-8 text, or too large."""
-    where = " ".join(str(path).split())
     try:
         found = Path(path).stat()
         usable = stat.S_ISREG(found.st_mode) and found.st_size <= LARGEST_FILE
         text = Path(path).read_bytes().decode("utf-8") if usable else ""
     except UnicodeDecodeError as problem:
-        raise ValueError(f"{where}: byte {problem.start}: must be UTF-8 text") from problem
+        raise ValueError(f"byte {problem.start}: must be UTF-8 text") from problem
     except (OSError, ValueError) as problem:
-        raise ValueError(f"{where}: must be a readable file ({reason(problem)})") from problem
+        raise ValueError(f"must be a readable file ({getattr(problem, 'strerror', problem)})") from problem
     if not usable:
-        raise ValueError(f"{where}: must be a regular file of at most {LARGEST_FILE} bytes")
+        raise ValueError(f"must be a regular file of at most {LARGEST_FILE} bytes")
     return text
 
 
-def loads(text: str, where: str) -> dict[str, Any]:
-    """Tables of a TOML text; a ValueError that begins with `where`, in one line."""
+def loads(text: str) -> dict[str, Any]:
+    """Tables of a TOML text; a ValueError of one line."""
     try:
         return tomllib.loads(text)
     except (ValueError, RecursionError) as problem:
-        raise ValueError(f"{where}: must be TOML ({reason(problem)})") from problem
-
-
-def read(path: str | os.PathLike[str]) -> dict[str, Any]:
-    """Tables of a TOML file; a ValueError that names it."""
-    return loads(read_text(path), " ".join(str(path).split()))
-
-
-def reason(problem: Exception) -> str:
-    """Return the first words of another library's message, in one line."""
-    return " ".join(str(getattr(problem, "strerror", None) or problem).split())[:200]
+        raise ValueError(f"must be TOML ({' '.join(str(problem).split())[:200]})") from problem
 
 
 def dumps(table: Mapping[str, Any]) -> str:

@@ -2,10 +2,6 @@
 
 from __future__ import annotations
 
-import math
-import zipfile
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -14,11 +10,12 @@ from typing import Any
 import numpy as np
 
 from hapticrender import checks
-from hapticrender.errors import SceneError
+from hapticrender.errors import naming
 from hapticrender.protocols import Array
 
 KEYS = ("encoder", "metre_per_count", "lateral_force", "normal_force", "rate")
 MOST_SAMPLES = 1 << 24
+MOST_BYTES = 8 * MOST_SAMPLES + 4096  # of an array in the file, with its header
 MOST_TRAVEL = 10.0  # m in contact
 MOST_SPEED = 10.0  # m/s
 SMOOTHING = 0.02  # s, of force and velocity before a threshold is applied
@@ -69,19 +66,10 @@ def unwrap_counts(counts: Array) -> Array:
 
 def load_swipe(file: str) -> SwipeRecording:
     """Read a tribometer recording: an ``.npz`` with the arrays named in `KEYS`; raises `SceneError`."""
-    with _naming(file):
+    with naming(f"file = {checks.show(file)}"):
         if not Path(file).is_file():
-            raise SceneError("must be an existing .npz file")
+            raise ValueError("must be an existing .npz file")
         return _load_swipe(file, Path(file).stat().st_mtime_ns)
-
-
-@contextmanager
-def _naming(file: str) -> Iterator[None]:
-    """Begin every refusal with the name of the file."""
-    try:
-        yield
-    except (TypeError, ValueError) as problem:
-        raise SceneError(f"file = {checks.show(file)}: {problem}") from problem
 
 
 @lru_cache(maxsize=4)
@@ -95,51 +83,38 @@ def _load_swipe(file: str, changed: int) -> SwipeRecording:
     if not position.size == lateral.size == normal.size > UNLOADED * rate + 1:
         sizes = f"{position.size}, {lateral.size}, {normal.size}"
         bound = f"must be equal and more than {UNLOADED} s at {rate:g} Hz"
-        raise SceneError(f"encoder, lateral_force, normal_force have {sizes} samples: {bound}")
+        raise ValueError(f"encoder, lateral_force, normal_force have {sizes} samples: {bound}")
     load = _load(normal, rate)
     touching = _touching(load, rate)
     if not touching.any():
         bound = f"must be > {TOUCH} N for {SHORTEST_TOUCH} s to be a touch"
-        raise SceneError(f"normal_force departs by {np.abs(load).max():.3g} N from its level before: {bound}")
+        raise ValueError(f"normal_force departs by {np.abs(load).max():.3g} N from its level before: {bound}")
     first, last = position[touching].min(), position[touching].max()
     if last - first > MOST_TRAVEL:
         bound = f"must be <= {MOST_TRAVEL:g} m; is metre_per_count right?"
-        raise SceneError(f"travels {last - first:.3g} m in contact: {bound}")
+        raise ValueError(f"travels {last - first:.3g} m in contact: {bound}")
     position = position - (first + last) / 2
     lateral = lateral - np.median(lateral[~touching])
     sliding, speed = _sliding(position, lateral, touching, rate)
     if speed > MOST_SPEED:
-        raise SceneError(f"slides at {speed:.3g} m/s: must be <= {MOST_SPEED:g} m/s")
+        raise ValueError(f"slides at {speed:.3g} m/s: must be <= {MOST_SPEED:g} m/s")
     return SwipeRecording(rate, position, np.where(touching, load, 0.0), lateral, touching, sliding, speed)
 
 
 def _read(file: str) -> dict[str, Array]:
-    """Read every array that is needed; a file of unknown making may fail in any way that numpy and zipfile know."""
+    """Arrays of `KEYS`, each of at most `MOST_BYTES`; a file of unknown making may fail in any way."""
     try:
-        with zipfile.ZipFile(file) as archive:
-            names = archive.namelist()
-            missing = [key for key in KEYS if f"{key}.npy" not in names]
-            raw = {} if missing else {key: _read_array(archive, key) for key in KEYS}
-    except SceneError:
-        raise
+        with open(file, "rb") as opened, np.load(opened) as archive:
+            sizes = {member.filename: member.file_size for member in archive.zip.infolist()}
+            sizes = {key: sizes.get(f"{key}.npy") for key in KEYS}
+            raw = {key: archive[key] for key, size in sizes.items() if size is not None and size <= MOST_BYTES}
     except Exception as problem:
-        raise SceneError(f"must be a readable .npz file ({checks.show(problem)})") from problem
-    if missing:
-        raise SceneError(f"{missing[0]} is missing: must hold {', '.join(KEYS)}")
+        raise ValueError(f"must be a readable .npz file ({checks.show(problem)})") from problem
+    for key in KEYS:
+        if key not in raw:
+            found = "is missing" if sizes[key] is None else f"has {sizes[key]} bytes"
+            raise ValueError(f"{key} {found}: must hold {', '.join(KEYS)}, each of <= {MOST_BYTES} bytes")
     return raw
-
-
-def _read_array(archive: zipfile.ZipFile, key: str) -> Array:
-    """Read one array, no more than its header says; refuse by that header one that is too long."""
-    with archive.open(f"{key}.npy") as stream:
-        shape, kind = checks.npy_header(stream)
-        count = math.prod(shape)
-        if kind.hasobject:
-            raise ValueError(f"{key} holds Python objects")
-        if len(shape) > 1 or not 0 <= count <= MOST_SAMPLES:
-            raise SceneError(f"{key} has shape {shape} and type {kind}: must be a row of <= {MOST_SAMPLES} numbers")
-        data = stream.read(count * kind.itemsize)
-    return np.frombuffer(data, kind, count).reshape(shape)
 
 
 def _scalar(array: Array) -> Any:
@@ -149,10 +124,11 @@ def _scalar(array: Array) -> Any:
 def _row(raw: dict[str, Array], key: str, kinds: str, bound: str) -> Array:
     """Return an array that is a row of finite numbers of the dtype `kinds`."""
     row = raw[key]
-    if row.ndim != 1 or row.dtype.kind not in kinds or row.size < 2:
-        raise SceneError(f"{key} has shape {row.shape} and type {row.dtype}: must be a row of >= 2 {bound}")
+    if row.ndim != 1 or row.dtype.kind not in kinds or not 2 <= row.size <= MOST_SAMPLES:
+        must = f"must be a row of <= {MOST_SAMPLES} and >= 2 {bound}"
+        raise ValueError(f"{key} has shape {row.shape} and type {row.dtype}: {must}")
     for bad in np.flatnonzero(~np.isfinite(row))[:1]:
-        raise SceneError(f"{key}[{bad}] = {row[bad]}: must be a finite number")
+        raise ValueError(f"{key}[{bad}] = {row[bad]}: must be a finite number")
     return row
 
 
