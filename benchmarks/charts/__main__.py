@@ -16,6 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.charts import draw, latency, measure, stability, story, waveforms
+from benchmarks.charts.stability_map import damper_map
 
 ROOT = Path(__file__).parents[2]
 
@@ -53,14 +54,13 @@ def draw_devices(out: Path) -> None:
 
 def draw_stability(_: Path) -> None:
     """Stability of every method, picture and data into out/charts."""
-    rows, dampers = stability.measure(), [stability.damper_map(case) for case in stability.cases()]
+    rows, dampers = stability.measure(), [damper_map(case) for case in stability.CASES]
     stability.draw(rows, dampers).savefig(_data() / "stability.png", dpi=90)
-    arrays = {name: np.array([each.modulus[0, 0, 0] for each in row]) for name, row in rows.items()}
-    arrays["inverse"] = np.array([each.modulus for each in dampers])
-    for case, each in zip(stability.cases(), dampers, strict=True):
+    for case, each in zip(stability.CASES, dampers, strict=True):
         held, margin = stability.limits(each)
         print(f"  inverse, {case.title}: ".replace("\n", " ") + f"stable to {held:g} samples, margin {margin:.2f}")
-    np.savez(_data() / "stability.npz", **arrays)
+    modulus = {name: np.array([each.modulus for each in row]) for name, row in rows.items()}
+    np.savez(_data() / "stability.npz", inverse=np.array([each.modulus for each in dampers]), **modulus)
 
 
 def draw_latency(out: Path) -> None:
