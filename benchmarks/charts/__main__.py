@@ -11,6 +11,7 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Callable
+from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
@@ -42,14 +43,14 @@ def draw_pareto(out: Path) -> None:
     """Methods and settings on the plate."""
     points = measure.measure(measure.methods_and_settings())
     swept = measure.over_frequency([each.setting for each in points if each.setting.what == "default"])
-    _write(out / "pareto", draw.pareto(points, swept), measure.as_data(points, swept))
+    _write(out / "pareto", draw.pareto(points, swept), _as_data(points, swept))
 
 
 def draw_devices(out: Path) -> None:
     """Methods and levels on every simulated device."""
     points = measure.measure(measure.devices_and_levels())
     swept = measure.over_frequency([measure.Setting(method="inverse", device=device) for device in measure.LEVELS])
-    _write(out / "device-chart", draw.devices(points, swept), measure.as_data(points, swept))
+    _write(out / "device-chart", draw.devices(points, swept), _as_data(points, swept))
 
 
 def draw_stability(_: Path) -> None:
@@ -79,6 +80,11 @@ CHARTS: dict[str, Callable[[Path], None]] = {
     "story": draw_story, "waveforms": draw_waveforms, "pareto": draw_pareto, "devices": draw_devices,
     "stability": draw_stability, "latency": draw_latency, "demo": draw_demo,
 }  # fmt: skip
+
+
+def _as_data(points: list[measure.Point], swept: dict[str, list[float]]) -> dict[str, object]:
+    """What a chart shows; an error is infinite where a scene is lost."""
+    return {"points": [asdict(each) for each in points], "frequency": measure.SWEEP.tolist(), "errors": swept}
 
 
 def _data() -> Path:

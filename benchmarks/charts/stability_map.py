@@ -35,7 +35,7 @@ def loaded_plate(
     position: float = 0.0,
     strength: float = 1.0,
 ) -> Sampled:
-    """Plate with a finger resting on it, in the coordinates of the controller and per force that it asks for.
+    """Plate with a finger resting on it, in the coordinates of the controller and per force that it demands.
 
     Parameters
     ----------
