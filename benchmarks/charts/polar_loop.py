@@ -129,15 +129,15 @@ class PolarLoop:
         under_way = self.delay * c
         sizes = [2 * n, 2 * under_way, 4 * c, 4 * c]
         unit = np.broadcast_to(np.eye(sum(sizes)), (len(ratio), sum(sizes), sum(sizes)))
-        x, drives, filtered, lawful = np.split(unit, np.cumsum(sizes)[:-1], axis=1)
+        x, drives, filtered, controlled = np.split(unit, np.cumsum(sizes)[:-1], axis=1)
         x, drives = x[:, :n] + 1j * x[:, n:], drives[:, :under_way] + 1j * drives[:, under_way:]
         errors, filtered = _section_step(self.low_pass, _parts(self.measured @ self.plant.c @ x), filtered)
-        command, lawful = _section_step(self.law, errors, lawful)
+        command, controlled = _section_step(self.law, errors, controlled)
         command *= -np.concatenate([np.ones_like(ratio), ratio], axis=1)[:, :, None]
         drive = (command[:, :c] + 1j * command[:, c:]) * (turn / self.table)[:, :, None]
         x = back * (self.plant.a @ x + self.plant.b @ self.force @ drives[:, :c])
         drives = back * np.concatenate([drives[:, c:], drive], axis=1)
-        return np.concatenate([_parts(x), _parts(drives), filtered, lawful], axis=1)
+        return np.concatenate([_parts(x), _parts(drives), filtered, controlled], axis=1)
 
     def poles(self) -> Array:
         """Closed-loop poles in the frame of the carrier (1/s, complex: growth and angular frequency, shape (B, s))."""

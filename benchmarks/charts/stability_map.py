@@ -111,7 +111,7 @@ def error_map(case: Case, inner: float, carriers: Array, widths: Array) -> Stabi
         loop = error_loop(MODEL, np.array([f]), gains_of(f, b, inner), taps=taps, plant=plant)
         poles = loop.poles()
         grid = np.concatenate([f - b * near, f + b * near, afar, np.abs(poles.imag) / (2 * np.pi)])
-        growth[at], modulus[at] = _of(loop, poles, np.clip(grid, 0.1, 0.499 * plant.rate))
+        growth[at], modulus[at] = _growth_and_modulus(loop, poles, np.clip(grid, 0.1, 0.499 * plant.rate))
     return StabilityMap(carriers, widths, growth, modulus)
 
 
@@ -129,11 +129,11 @@ def damper_map(case: Case) -> StabilityMap:
             plant=plant, delay=int(DELAYS[at[0]]), frequency=np.array([100.0]), observer=0.0, integral=0.0, dc=0.5,
             dc_drift=0.05, inner=float(FACTORS[at[1]]), taps=taps, law=nothing, slope=nothing, share=np.zeros(1),
         )  # fmt: skip
-        growth[at], modulus[at] = _of(loop, loop.poles(), grid)
+        growth[at], modulus[at] = _growth_and_modulus(loop, loop.poles(), grid)
     return StabilityMap(DELAYS, FACTORS, growth, modulus)
 
 
-def _of(loop: ErrorLoop, poles: Array, frequency: Array) -> tuple[float, float]:
+def _growth_and_modulus(loop: ErrorLoop, poles: Array, frequency: Array) -> tuple[float, float]:
     """Growth (1/s), and modulus margin on a grid (Hz)."""
     growth = float(poles.real.max())
     peak = sensitivity(loop.loop(np.exp(2j * np.pi * frequency / PLATE.rate))).max() if growth < 0 else math.inf
