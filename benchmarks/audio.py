@@ -9,7 +9,6 @@ process did not; both compete with everything else on the machine, at normal pri
 """
 
 import argparse
-import ctypes
 import statistics
 import sys
 import tempfile
@@ -26,47 +25,25 @@ import jack_ring  # noqa: E402
 from jack_ring import AMPERES, BLOCK, METRES, RATE  # noqa: E402
 
 import hapticrender as hr  # noqa: E402
+from benchmarks.callback import EMPTY, seconds_of  # noqa: E402
 from benchmarks.cases import in_blocks  # noqa: E402
-from hapticrender.drivers.audio_callback import CALLBACK, Relay  # noqa: E402
-from hapticrender.jit import CFunction  # noqa: E402
-from hapticrender.plants.plate import Plate, PlateParameters  # noqa: E402
+from hapticrender.drivers.audio_callback import Relay  # noqa: E402
 from hapticrender.realtime import RealtimeEntry  # noqa: E402
 
 BANDS = (8, 64, 512)
 CALLS = 2000
-POINTER, LONG = ctypes.c_void_p, ctypes.c_ulong
-SIGNATURE = ctypes.CFUNCTYPE(ctypes.c_int, POINTER, POINTER, LONG, POINTER, LONG, POINTER)
-
-
-def nothing(sensed, drive, frames, time, status, argument):
-    """Compiled callback that does nothing."""
-    return 0
-
-
-def seconds_of(address: int, argument: int) -> tuple[float, float]:
-    """Median and 99th percentile of a call (s) through the driver's callback, in a loop with a simulated plate."""
-    relay = Relay((0, 1), (0, 1), BLOCK)
-    relay.call(address, argument)
-    callback = SIGNATURE(relay.address)
-    plate = Plate(PlateParameters(rate=RATE, delay=BLOCK), hr.Finger.absent(), block=BLOCK)
-    sensed, played = np.zeros((BLOCK, 2), np.float32), np.zeros((BLOCK, 2), np.float32)
-    pointers = sensed.ctypes.data, played.ctypes.data, BLOCK, None, 0, relay.user_data
-    spent = np.empty(CALLS)
-    for call in range(CALLS):
-        sensed[:] = plate.run(AMPERES * played.astype(float)).sensed / METRES
-        start = time.perf_counter()
-        callback(*pointers)
-        spent[call] = time.perf_counter() - start
-    return float(np.median(spent)), float(np.quantile(spent, 0.99))
 
 
 def print_times() -> None:
     """Time of a call, and its share of a block."""
-    cases = [("empty", CFunction(nothing, CALLBACK).address, 0)]
+    cases = [("empty", EMPTY.address, 0)]
     entries = [RealtimeEntry(in_blocks(bands), sensed_scale=METRES, drive_scale=1 / AMPERES) for bands in BANDS]
     cases += [(f"{bands} bands", each.address, each.user_data) for bands, each in zip(BANDS, entries, strict=True)]
     for name, address, argument in cases:
-        median, late = (100 * RATE / BLOCK * each for each in seconds_of(address, argument))
+        relay = Relay((0, 1), (0, 1), BLOCK)
+        relay.call(address, argument)
+        spent = seconds_of(relay.address, relay.user_data, CALLS, AMPERES, METRES)
+        median, late = (100 * RATE / BLOCK * each for each in spent)
         print(f"callback, {name}: {median:.2f} % of a block (99th percentile {late:.2f} %)", flush=True)
     stopped = [bands for bands, each in zip(BANDS, entries, strict=True) if each.flags & hr.Flag.STOPPED]
     if stopped:

@@ -44,7 +44,7 @@ class White:
 
 
 def textures():
-    """Ridges that follow the finger, the dearest bands; fixed ones; a waveform."""
+    """Ridges that follow the finger, the costliest bands; fixed ones; a waveform."""
     found = {}
     for count in (1, 4, 8):
         partials = tuple((1.0 + 0.25 * k, 1.0, 0.0) for k in range(count))
@@ -140,7 +140,7 @@ def measure(name, texture, *options):
             [*MACHINE.split(), "-kernel", build(folder, *options)], capture_output=True, text=True, check=True
         )
         lines = (done.stdout + done.stderr).splitlines()  # semihosting's console is either
-        counted = {words[0]: float(words[1]) for words in map(str.split, lines)}
+        counted = {name: float(value) for name, value, *_ in map(str.split, lines)}
         ratio = cycles_per_instruction(build(folder, *options, f"-DSAMPLES={TRACED}u", f"-DLANDS={LANDS}u"))
         flash = flash_of(folder, "supervisor gains" if options else "")
     free, touched, new, most = (counted[each] / SCALE for each in ("free", "touched", "new", "most"))

@@ -48,7 +48,7 @@ def comb(bands: int, amplitude: float, highest: float = 400.0) -> Bands:
 def in_blocks(bands: int) -> BankController:
     """Make the law by bands on a sound card, 64 samples a block.
 
-    Designed for 8 bands and then given as many as asked for: the design's checks take minutes with 512 bands, and are
+    Designed for 8 bands and then given as many as are timed: the design's checks take minutes with 512 bands, and are
     not what is measured.
     """
     model = replace(PlateParameters(rate=CARD, delay=BLOCK).device_model(CARD, BLOCK), block=BLOCK, drive_step=1e-12)

@@ -1,10 +1,10 @@
 """Measure the plate's figures through ``hr.render`` and a third party's driver, from that plate's own truth.
 
 The plate is ``tests/strangers_plate.py``.  Waveforms: E = rms_B(y - r)/rms_B(r), B = 20-500 Hz zero-phase, r the
-texture as asked for at that sample's time; no time shift, no gain fit; under the finger and at the worse end, from
+texture as requested at that sample's time; no time shift, no gain fit; under the finger and at the worse end, from
 1.5 s on (chirp from .3 s, swipe from .7 s, cold).  Gratings: envelopes by least squares with offset and slope over
-windows of max(20 ms, 2/f), at random phases.  Unless its row says otherwise the plate is rigid, which the library is
-not told; ``--bending 1250,30,0.1`` (Hz, Q, shape at the coils) bends it.  Position and load are reported 5 ms late when
+windows of max(20 ms, 2/f), at random phases.  Unless its row says otherwise the plate is rigid, which the library does
+not know; ``--bending 1250,30,0.1`` (Hz, Q, shape at the coils) bends it.  Position and load are reported 5 ms late when
 a finger touches or lifts.
 
 Run: python -m benchmarks.figures [--method inverse] [--only white]
@@ -100,7 +100,7 @@ def swipe():
     return Wave(limited(resample_poly(force - force.mean(), 2, 1)))
 
 
-class Path(NamedTuple):
+class Motion(NamedTuple):
     """A finger's motion, for the textures that are read at its position."""
 
     position: object
@@ -127,7 +127,7 @@ def play(texture, seconds, finger=None, position=0.0, contact=None, *, method=No
     device = device(**{"bending": options.bending, "seed": options.seed, "report_lag": 5e-3} | plate)
     free = {key: value for key, value in plate.items() if key not in ("finger", "load", "contact", "position")}
     profile = identified(**free).profile() if options.identified else {}
-    motion = hr.Finger(Path(position)) if callable(position) and device.sensed_channels else hr.Finger.absent()
+    motion = hr.Finger(Motion(position)) if callable(position) and device.sensed_channels else hr.Finger.absent()
     settings = {"method": method or options.method, "profile": profile, "keep_unfelt": True}
     scene = hr.Scene(texture=texture, finger=motion, duration=seconds, **settings)
     with warnings.catch_warnings():

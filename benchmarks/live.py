@@ -8,7 +8,6 @@ driver protocol, of its true motion, 20-500 Hz, without shift or gain fit: under
 """
 
 import argparse
-import ctypes
 import tempfile
 import time
 from dataclasses import replace
@@ -17,17 +16,13 @@ from pathlib import Path
 import numpy as np
 
 import hapticrender as hr
+from benchmarks.callback import BLOCK, EMPTY, RATE, seconds_of
 from hapticrender.control.methods import METHODS
-from hapticrender.jit import CFunction
-from hapticrender.plants.plate import Plate, PlateParameters
+from hapticrender.plants.plate import PlateParameters
 from hapticrender.realtime import RealtimeEntry
-from hapticrender.realtime_kernel import AUDIO
 from hapticrender.voices import Voice
 from tests.strangers_plate import StrangersPlate
 
-RATE, BLOCK = 48_000.0, 64  # Hz, samples
-POINTER, LONG = ctypes.c_void_p, ctypes.c_ulong
-SIGNATURE = ctypes.CFUNCTYPE(ctypes.c_int, POINTER, POINTER, LONG, POINTER, LONG, POINTER)
 NOTE = 0.1 * np.sin(2 * np.pi * 150.0 * np.arange(8000) / 8000.0)
 FINGERS = {"4 g": (4e-3, 1.5, 300.0), "skin on a heavy phalanx": (2e-4, 3.0, 3000.0, 8e-3, 2.0, 400.0)}
 SPANS = (0.7, 1.5), (1.5, 1.54), (1.6, 3.0), (3.0, 3.04), (3.1, 4.5)  # s
@@ -40,11 +35,6 @@ TEXTURES = {
 }
 
 
-def nothing(sensed, drive, frames, time, status, argument):
-    """Compiled callback that does nothing."""
-    return 0
-
-
 def entry_of(texture: hr.Texture) -> RealtimeEntry:
     """The waveform law for the paper's plate, with a texture and a finger that slides."""
     model = PlateParameters(rate=RATE, delay=2 * BLOCK).device_model(RATE, 2 * BLOCK)
@@ -53,18 +43,6 @@ def entry_of(texture: hr.Texture) -> RealtimeEntry:
     entry.play(Voice(texture, RATE))
     entry.finger(-0.02, 0.05, 0.4)
     return entry
-
-
-def seconds_of(address: int, argument: int, calls: int) -> tuple[float, float]:
-    """Median and 99th percentile (s) of a call, in a loop with a plate."""
-    callback, plate = SIGNATURE(address), Plate(PlateParameters(rate=RATE, delay=BLOCK), hr.Finger.still(), block=BLOCK)
-    sensed, played, spent = np.zeros((BLOCK, 2), np.float32), np.zeros((BLOCK, 2), np.float32), np.empty(calls)
-    for call in range(calls):
-        sensed[:] = plate.run(played.astype(float)).sensed
-        start = time.perf_counter()
-        callback(sensed.ctypes.data, played.ctypes.data, BLOCK, None, 0, argument)
-        spent[call] = time.perf_counter() - start
-    return float(np.median(spent)), float(np.quantile(spent, 0.99))
 
 
 def finger_latency(calls: int) -> tuple[float, int]:
@@ -115,7 +93,7 @@ def main() -> None:
     parser = argparse.ArgumentParser()
     parser.add_argument("--calls", type=int, default=2000, help="calls timed (default: 2000)")
     calls, block = parser.parse_args().calls, BLOCK / RATE
-    empty, _ = seconds_of(CFunction(nothing, AUDIO.signature).address, 0, calls)
+    empty, _ = seconds_of(EMPTY.address, 0, calls)
     print(f"empty callback                  {100 * empty / block:6.2f} % of a block of {1e3 * block:.2f} ms")
     for name, texture in TEXTURES.items():
         entry = entry_of(texture)

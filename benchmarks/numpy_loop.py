@@ -46,7 +46,7 @@ class NumpyPolar:
         together = np.linalg.solve(mass * s**2 + damping * s + stiffness, (force @ [1.0, 1.0])[:, None])[..., 0]
         self.gain = abs(together @ SIDES.T).T * np.sinc(self.frequency / rate)  # as a sweep of the plate shows it
         self.listen = SIDES @ np.linalg.inv([[1.0, -LENGTH / 2], [1.0, LENGTH / 2]])
-        self.unit, self.wanted = np.exp(1j * np.angle(target)), np.abs(target)
+        self.unit, self.target = np.exp(1j * np.angle(target)), np.abs(target)
         self.low = np.zeros((2, 2, len(self.frequency)), complex)
         self.amplitude, self.angle = np.zeros((2, 2, 2, len(self.frequency)))
 
@@ -62,7 +62,7 @@ class NumpyPolar:
         (b0, b1, b2), (_, a1, a2) = self.law
         theta = b0 * -lag + self.angle[0]
         self.angle = np.stack([b1 * -lag - a1 * theta + self.angle[1], b2 * -lag - a2 * theta])
-        error = self.wanted - abs(x)
+        error = self.target - abs(x)
         command = np.maximum(b0 * error + self.amplitude[0], 0.0)
         self.amplitude = np.stack([b1 * error - a1 * command + self.amplitude[1], b2 * error - a2 * command])
         drive = (command / self.gain * (self.unit * carrier * np.exp(1j * theta)).real).sum(axis=1)

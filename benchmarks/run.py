@@ -2,7 +2,7 @@
 
 Ratios decide: candidate and reference run in turns in this process, and the figure is the median of the pairs' ratios.
 
-Run: python -m benchmarks.run [--short] [--only WORD ...] [--margin 2] [--json FILE]
+Run: python -m benchmarks.run [--short] [--only TEXT ...] [--margin 2] [--json FILE]
 """
 
 import argparse
@@ -19,14 +19,14 @@ from benchmarks.timing import Absent
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--short", action="store_true", help="few pairs and small sizes; fail beyond the margin")
-    parser.add_argument("--only", nargs="*", default=[], metavar="WORD", help="cases whose names contain one of these")
+    parser.add_argument("--only", nargs="*", default=[], metavar="TEXT", help="cases whose names contain one of these")
     parser.add_argument("--margin", type=float, default=2.0, help="with --short: how much worse a ratio may be")
     parser.add_argument("--json", type=Path, help="also write the figures here")
     arguments = parser.parse_args()
     print(f"{platform.processor() or platform.machine()}, Python {platform.python_version()}")
     figures = []
     for name, case in every_case(arguments.short).items():
-        if arguments.only and not any(word in name for word in arguments.only):
+        if arguments.only and not any(text in name for text in arguments.only):
             continue
         try:
             for figure in case():

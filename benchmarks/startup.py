@@ -22,7 +22,7 @@ TOUCHED = FIRST.replace("duration=0.001", "finger=hr.Finger.sliding(0.05), durat
 
 def _spent(code: str, cache: str | None = None) -> float:
     environment = dict(os.environ) | ({"NUMBA_CACHE_DIR": cache} if cache else {})
-    environment.pop("PYTHONDONTWRITEBYTECODE", None)  # Python keeps the byte code of modules, unless it is told not to
+    environment.pop("PYTHONDONTWRITEBYTECODE", None)  # so that Python keeps the byte code of modules
     found = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True)
     return float(found.stdout)
 

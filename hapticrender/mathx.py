@@ -100,24 +100,6 @@ LEAST = 1e-150  # added to the real part: the angle of 0 is 0
 
 
 @kernel
-def frac(turns):
-    """Part of `turns` that is not a whole turn, within +-1/2."""
-    return turns - np.rint(turns)
-
-
-@kernel
-def sincos_turns(turns):
-    """Sine and cosine of 2 pi `turns`."""
-    x = turns - np.rint(turns)
-    far = abs(x) > 0.25
-    x = (math.copysign(0.5, x) - x) if far else x
-    u = x * x
-    s = SIN[0] + u * (SIN[1] + u * (SIN[2] + u * (SIN[3] + u * (SIN[4] + u * (SIN[5] + u * (SIN[6] + u * SIN[7]))))))
-    c = COS[0] + u * (COS[1] + u * (COS[2] + u * (COS[3] + u * (COS[4] + u * (COS[5] + u * (COS[6] + u * COS[7]))))))
-    return s * x, (-c if far else c)
-
-
-@kernel
 def unit(turns):
     """e^(2 pi j turns) of a vector."""
     x = turns - nearest(turns)

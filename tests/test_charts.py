@@ -6,7 +6,7 @@ import pytest
 pytest.importorskip("matplotlib")
 
 from benchmarks import figures
-from benchmarks.charts import measure, stability, story, waveforms
+from benchmarks.charts import measure, stability, stability_map, story, waveforms
 from benchmarks.charts.measure import Point, Setting
 
 
@@ -30,20 +30,19 @@ def test_a_setting_that_cannot_be_designed_says_why():
 def test_the_stability_chart_shows_what_a_wrong_plate_does():
     """On a plate 10 % stiffer than designed for, H is unstable near the heave mode at 5 Hz and H2 is not."""
     rows = stability.measure(frequencies=40, bandwidths=4)
-    at = {name: row[1].growth[0, 0, 0][:, 1] for name, row in rows.items()}  # bandwidth 4.3 Hz
-    assert at["h"].max() > 0
-    assert at["h2"].max() < 0
-    dampers = [stability.damper_map(stability.cases()[0])] * len(stability.cases())
-    assert len(stability.draw(rows, dampers).axes) == 5 * len(stability.cases()) + 1
+    _, _, h, h2 = (row[1].growth[:, 1] for row in rows.values())  # bandwidth 4.3 Hz
+    assert h.max() > 0
+    assert h2.max() < 0
+    dampers = [stability_map.damper_map(stability.CASES[0])] * len(stability.CASES)
+    assert len(stability.draw(rows, dampers).axes) == 5 * len(stability.CASES) + 1
 
 
 def test_the_damper_of_the_waveform_law_has_the_margins_of_its_design():
     """Ms on a grid of 8.3 Hz, at a peak some 200 Hz wide: within (4.2/200)^2; stable below the gain margin only."""
-    parameters = stability.PlateParameters()
-    designed = stability.choose_damping(parameters.device_model(parameters.rate, parameters.delay)).margins
-    found = stability.damper_map(stability.cases()[0])
+    designed = stability_map.choose_damping(stability_map.MODEL).margins
+    found = stability_map.damper_map(stability.CASES[0])
     assert stability.limits(found)[1] == pytest.approx(min(each.modulus for each in designed), rel=(4.2 / 200) ** 2)
-    stable = stability.FACTORS < min(each.gain for each in designed)
+    stable = stability_map.FACTORS < min(each.gain for each in designed)
     assert np.array_equal(found.growth[0] < 0, stable)
 
 

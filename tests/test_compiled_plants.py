@@ -1,14 +1,18 @@
-"""Any plant with a compiled step: a third party's in 25 lines, and plants closed with a compiled controller."""
+"""Any plant with a compiled step: a third party's in 25 lines, closed with a controller, and in pieces."""
 
 import numba
 import numpy as np
 import pytest
 from numba import carray
+from proportional import Proportional
 
 import hapticrender as hr
-from hapticrender.jit import F8, I8, SIGNALS_T, pointer, step
-from hapticrender.plants.compiled import CompiledPlant, aligned_record, queue_drive
+from hapticrender.jit import F8, SIGNALS_T, pointer, step
+from hapticrender.plants.compiled import CompiledPlant, new_record, queue_drive
+from hapticrender.plants.electroadhesion import ElectroadhesionParameters, ElectroadhesionScreen, SquareRoot
 from hapticrender.plants.plate import Plate, PlateParameters
+from hapticrender.plants.surface import SurfaceParameters, UltrasonicSurface
+from hapticrender.plants.ultrasonic import UltrasonicParameters, UltrasonicPlate
 from hapticrender.touch.mechanics import HEAVY
 
 MASS = np.dtype([("position", "f8"), ("velocity", "f8"), ("stiffness", "f8"), ("mass", "f8"), ("period", "f8")])
@@ -38,36 +42,7 @@ class MassOnSpring(CompiledPlant):
 
     def __init__(self):
         super().__init__(hr.Finger.absent(), rate=5000.0)
-        self.state = aligned_record(MASS)
-        self.state["stiffness"], self.state["mass"], self.state["period"] = 4e3, 0.01, 1 / self.rate
-
-
-CONTROL = np.dtype([("gain", "f8"), ("offset", "f8"), ("channels", "i8"), ("sensors", "i8")])
-CONTROL_T = numba.from_dtype(CONTROL)
-
-
-@step
-def proportional_step(state, signals, start, count):
-    """Drive every channel by gain (waveform - first sensor) + offset."""
-    s, io = carray(pointer(state, CONTROL_T), 1)[0], carray(pointer(signals, SIGNALS_T), 1)[0]
-    stop = start + count
-    drive, sensed = carray(pointer(io.drive, F8), (stop, s.channels)), carray(pointer(io.sensed, F8), (stop, s.sensors))
-    waveform, flags = carray(pointer(io.waveform, F8), stop), carray(pointer(io.flags, I8), stop)
-    for n in range(start, stop):
-        for i in range(s.channels):
-            drive[n, i] = s.gain * (waveform[n] - sensed[n, 0]) + s.offset
-        flags[n] |= 16
-    return 0
-
-
-class Proportional:
-    """The least that a compiled controller has."""
-
-    step, n_bands, block = proportional_step, 1, 1
-
-    def __init__(self, plant, gain, offset=0.0):
-        self.state = aligned_record(CONTROL)
-        self.state[0] = gain, offset, plant.drive_channels, plant.sensed_channels
+        self.state = new_record(MASS, stiffness=4e3, mass=0.01, period=1 / self.rate)
 
 
 def plates(**parameters):
@@ -79,7 +54,7 @@ def plates(**parameters):
 def test_closed_loop_is_the_open_one_sample_by_sample(pair, rng):
     closed, ring = pair
     gain, wanted = 300.0, 1e-5 * rng.standard_normal(600)
-    controller = Proportional(closed, gain)
+    controller = Proportional(gain, flag=16, channels=closed.drive_channels, sensors=closed.sensed_channels)
     assert closed.closes(controller)
     parts = [closed.closed_loop(controller, part) for part in np.split(wanted, [1, 200])]
     drive, flags = (np.concatenate([part[i] for part in parts]) for i in (0, 2))
@@ -94,6 +69,42 @@ def test_closed_loop_is_the_open_one_sample_by_sample(pair, rng):
         np.testing.assert_allclose(found, expected, rtol=0, atol=600 * 2**-50 * abs(expected).max())
     assert (flags & 16 == 16).all()
     assert abs(motion).max() > 1e-6
+
+
+TOUCHES = [(0.0, 0.01), (0.014, 0.06)]  # s
+SWIPE = hr.Finger.swiping(frequency=20.0, speed=0.1, normal_load=0.7, touches=TOUCHES)
+PRESS = hr.Finger.still(normal_load=((0.0, 0.01), (0.2, 0.9)), touches=[(0.001, 0.002), (0.0025, 0.02)])
+SURFACE = SurfaceParameters(level="envelope", sensor="tribometer")
+
+
+def screen(seed, **parameters):
+    root = SquareRoot(bias=0.45, floor=0.02, gain=2.2e4)
+    return ElectroadhesionScreen(ElectroadhesionParameters(**parameters), SWIPE, seed, root)
+
+
+PLANTS = {  # by seed, and the size of a drive
+    "plate": (lambda seed: Plate(PlateParameters(bending_frequency=1150.0, delay=3), SWIPE, seed), 2.0),
+    "mode": (lambda seed: UltrasonicPlate(UltrasonicParameters(temperature_rise=5.0, delay=4), PRESS, seed), 10.0),
+    "screen": (screen, 0.4),
+    "gap": (lambda seed: screen(seed, level="carrier", sensor="impedance"), 0.4),
+    "surface": (lambda seed: UltrasonicSurface(SURFACE, Proportional(2e5, pulse=0.125), SWIPE, seed), 0.06),
+}
+
+
+@pytest.mark.parametrize("name", PLANTS)
+def test_a_run_equals_its_pieces_and_noise_its_seed(name, rng):
+    """Under a finger that comes and goes."""
+    make, size = PLANTS[name]
+    whole, cut, other = (make(seed) for seed in (3, 3, 4))
+    assert isinstance(whole, hr.Plant)
+    drive = size * rng.uniform(-1.0, 1.0, (600, whole.drive_channels))
+    once, again = whole.run(drive), other.run(drive)
+    pieces = [cut.run(part) for part in np.split(drive, [1, 7, 191, 192, 501])]
+    for column in ("sensed", "motion", "flags", "position", "normal_load"):
+        joined = np.concatenate([getattr(piece, column) for piece in pieces])
+        np.testing.assert_array_equal(joined, getattr(once, column), err_msg=column)
+    assert not np.array_equal(again.sensed, once.sensed)
+    assert len(set(once.normal_load > 0.0)) == 2
 
 
 def test_drive_queue_hands_on_after_its_latency():

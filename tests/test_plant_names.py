@@ -35,18 +35,15 @@ def known_of(device):
 
 
 @pytest.mark.parametrize("device", ONE_EACH)
-def test_every_name_that_would_do_is_listed_once_and_in_order(device):
-    assert set(known_of(device)) >= ONE_EACH[device]
-
-
-@pytest.mark.parametrize("device", ONE_EACH)
-def test_every_name_listed_is_accepted(device):
-    """A word is refused for what it is, never for its name: all parameters are numbers or words of a few."""
-    for name, table in known_of(device).items():
+def test_every_name_is_listed_once_in_order_and_accepted(device):
+    """A value is refused for what it is, never for its name: all parameters are numbers or options of a few."""
+    known = known_of(device)
+    assert set(known) >= ONE_EACH[device]
+    for name, table in known.items():
         field = "rendering" if table == "render" else "simulation" if name in LEVEL else "profile"
         with pytest.raises((TypeError, ValueError), match="must be") as refused:
-            opened(device, **{field: {name: "no such word"}})
-        assert re.search(rf"\b{re.sub('^(plate|screen)_', '', name)} = 'no such word'", str(refused.value))
+            opened(device, **{field: {name: "no such option"}})
+        assert re.search(rf"\b{re.sub('^(plate|screen)_', '', name)} = 'no such option'", str(refused.value))
 
 
 @pytest.mark.parametrize(

@@ -87,18 +87,15 @@ def stop_and_go(time):
     return 0.01 * np.sin(4 * np.pi * np.clip(time, 0.0, 0.1)) + np.where((0.15 < time) & (time < 0.2), 0.05, 0.0)
 
 
-def test_stop_and_go_is_exact_and_a_run_equals_its_pieces(rng):
+def test_stop_and_go_is_exact(rng):
     positions = tuple(stop_and_go(np.arange(1500) / RATE))
     finger = hr.Finger.sampled(positions, rate=RATE, normal_load=0.8, mechanics=HEAVY)
     parameters = PlateParameters(bending_frequency=1150.0, **IDEAL)
     drive = rng.uniform(-2, 2, (1500, 2))
-    whole = Plate(parameters, finger, seed=3).run(drive)
     expected = naive(drive, finger, parameters)
-    np.testing.assert_allclose(whole.motion, expected, rtol=0, atol=1e-5 * expected.std())
-    pieces = Plate(parameters, finger, seed=3)
-    parts = [pieces.run(part) for part in np.split(drive, [1, 7, 499, 500, 502, 760, 1001])]
-    for name in ("sensed", "motion", "flags"):
-        assert np.array_equal(getattr(whole, name), np.concatenate([getattr(part, name) for part in parts]))
+    np.testing.assert_allclose(
+        Plate(parameters, finger).run(drive).motion, expected, rtol=0, atol=1e-5 * expected.std()
+    )
 
 
 @pytest.mark.parametrize("frequency", [20.0, 189.0])

@@ -6,7 +6,7 @@ from scipy.linalg import expm
 
 import hapticrender as hr
 from hapticrender.plants.ultrasonic import UltrasonicParameters, UltrasonicPlate
-from hapticrender.protocols import Flag, Plant
+from hapticrender.protocols import Flag
 
 IDEAL = {"sensor_noise": 0.0, "sensor_bits": 0, "drive_bits": 0}
 FREE, HELD = hr.Finger.absent(), hr.Finger.still(normal_load=0.5)
@@ -45,34 +45,6 @@ def test_the_mode_is_integrated_exactly_however_few_samples_a_cycle_has(rng, rat
     expected = twin(parameters, drive, pressed)
     motion = UltrasonicPlate(parameters, finger).run(drive[:, None]).motion[:, 0]
     np.testing.assert_allclose(motion, expected, rtol=0, atol=n * 4 * ROUNDING * abs(expected).max())
-
-
-@pytest.mark.parametrize(("load", "pole", "settling", "quality"), [(0.0, 75.0, 2.1e-3, 200), (0.5, 250.0, 0.64e-3, 60)])
-def test_poles(load, pole, settling, quality):
-    """75 Hz free (2.1 ms, Q 200) and 250 Hz (0.64 ms, Q 60) with a finger, to the digits printed in docs/theory.md."""
-    parameters = UltrasonicParameters()
-    measured = float(parameters.pole(load))
-    assert abs(measured - pole) < 0.5
-    assert abs(1 / (2 * np.pi * measured) - settling) < 0.5 * (1e-4 if load == 0 else 1e-5)
-    assert abs(parameters.frequency / (2 * measured) - quality) < 0.5
-
-
-@pytest.mark.parametrize(
-    ("load", "offset", "percent", "degrees", "digits"),
-    [
-        (0.0, 10.0, -0.9, 7.6, 1),
-        (0.0, 30.0, -7, 22, 0),
-        (0.0, 150.0, -55, 63, 0),
-        (0.5, 60.0, -3, 13, 0),
-    ],
-)
-def test_what_detuning_costs(load, offset, percent, degrees, digits):
-    """1/(1 + j 2 Q df/f) at Q 200 and Q 60, to the last printed digit."""
-    parameters = UltrasonicParameters()
-    tuned = float(parameters.resonance(load))
-    ratio = parameters.dynamic_stiffness(tuned, load) / parameters.dynamic_stiffness(tuned + offset, load)
-    assert abs(100 * (abs(ratio) - 1) - percent) <= 0.5 * 10.0**-digits
-    assert abs(abs(np.angle(ratio, deg=True)) - degrees) <= 0.5 * 10.0**-digits
 
 
 def respond(parameters, frequency, finger=FREE):
@@ -125,19 +97,6 @@ def test_runs_of_carrier_and_envelope_differ_by_the_envelope_error(finger, load,
     assert abs(gain[0] / gain[1] - 1) <= abs(error) + left
     if abs(offset) >= 75:
         assert abs(error) > 5 * left  # so the comparison says something
-
-
-def test_a_run_equals_its_pieces(rng):
-    load = ((0.0, 0.01), (0.2, 0.9))
-    finger = hr.Finger.still(normal_load=load, touches=((0.003, 0.008), (0.009, 0.02)))
-    parameters = UltrasonicParameters(temperature_rise=5.0, temperature_time=0.004, delay=4)
-    drive = rng.uniform(-10.0, 10.0, (2000, 1))
-    assert isinstance(UltrasonicPlate(parameters, finger), Plant)
-    whole = UltrasonicPlate(parameters, finger, seed=3).run(drive)
-    pieces = UltrasonicPlate(parameters, finger, seed=3)
-    parts = [pieces.run(part) for part in np.split(drive, [1, 7, 191, 192, 500, 501, 1537])]
-    for name in ("sensed", "motion", "flags", "position", "normal_load"):
-        np.testing.assert_array_equal(getattr(whole, name), np.concatenate([getattr(part, name) for part in parts]))
 
 
 @pytest.mark.parametrize(("delay", "block"), [(1, 1), (4, 1), (4, 3)])

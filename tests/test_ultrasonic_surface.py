@@ -69,18 +69,6 @@ def test_a_surface_is_its_parts(law):
     assert np.ptp(amplitude[100:]) > 0.2 * amplitude.mean()  # it is modulated
 
 
-def test_a_run_equals_its_pieces_and_noise_its_seed():
-    p = SurfaceParameters(level="envelope", sensor="tribometer")
-    finger = hr.Finger.swiping(frequency=20.0, speed=0.1, normal_load=0.7, touches=[(0.0, 0.01), (0.014, 0.06)])
-    whole, cut, other = (UltrasonicSurface(p, loop(p), finger, seed, NOMINAL) for seed in (3, 3, 4))
-    once = whole.run(BUMPS[:, None])
-    pieces = [cut.run(BUMPS[part, None]) for part in (slice(0, 1), slice(1, 99), slice(99, 300))]
-    for name in ("sensed", "motion", "flags", "position", "normal_load"):
-        joined = np.concatenate([getattr(piece, name) for piece in pieces])
-        assert np.array_equal(joined, getattr(once, name), equal_nan=True), name
-    assert not np.array_equal(other.run(BUMPS[:, None]).sensed, once.sensed)
-
-
 def test_a_lifted_finger_leaves_no_friction_and_the_amplitude_of_the_nominal_one():
     p = parameters()
     surface = UltrasonicSurface(p, loop(p), hr.Finger.absent(), nominal=NOMINAL)

@@ -9,11 +9,13 @@ import argparse
 import json
 import sys
 from collections.abc import Callable
+from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
 
 from benchmarks.charts import draw, latency, measure, stability, story, waveforms
+from benchmarks.charts.stability_map import damper_map
 
 ROOT = Path(__file__).parents[2]
 
@@ -39,26 +41,25 @@ def draw_pareto(out: Path) -> None:
     """Methods and settings on the plate."""
     points = measure.measure(measure.methods_and_settings())
     swept = measure.over_frequency([each.setting for each in points if each.setting.what == "default"])
-    _write(out / "pareto", draw.pareto(points, swept), measure.as_data(points, swept))
+    _write(out / "pareto", draw.pareto(points, swept), _as_data(points, swept))
 
 
 def draw_devices(out: Path) -> None:
     """Methods and levels on every simulated device."""
     points = measure.measure(measure.devices_and_levels())
     swept = measure.over_frequency([measure.Setting(method="inverse", device=device) for device in measure.LEVELS])
-    _write(out / "device-chart", draw.devices(points, swept), measure.as_data(points, swept))
+    _write(out / "device-chart", draw.devices(points, swept), _as_data(points, swept))
 
 
 def draw_stability(_: Path) -> None:
     """Stability of every method, picture and data into out/charts."""
-    rows, dampers = stability.measure(), [stability.damper_map(case) for case in stability.cases()]
+    rows, dampers = stability.measure(), [damper_map(case) for case in stability.CASES]
     stability.draw(rows, dampers).savefig(_data() / "stability.png", dpi=90)
-    arrays = {name: np.array([each.modulus[0, 0, 0] for each in row]) for name, row in rows.items()}
-    arrays["inverse"] = np.array([each.modulus for each in dampers])
-    for case, each in zip(stability.cases(), dampers, strict=True):
+    for case, each in zip(stability.CASES, dampers, strict=True):
         held, margin = stability.limits(each)
         print(f"  inverse, {case.title}: ".replace("\n", " ") + f"stable to {held:g} samples, margin {margin:.2f}")
-    np.savez(_data() / "stability.npz", **arrays)
+    modulus = {name: np.array([each.modulus for each in row]) for name, row in rows.items()}
+    np.savez(_data() / "stability.npz", inverse=np.array([each.modulus for each in dampers]), **modulus)
 
 
 def draw_latency(out: Path) -> None:
@@ -71,6 +72,11 @@ CHARTS: dict[str, Callable[[Path], None]] = {
     "story": draw_story, "waveforms": draw_waveforms, "pareto": draw_pareto, "devices": draw_devices,
     "stability": draw_stability, "latency": draw_latency,
 }  # fmt: skip
+
+
+def _as_data(points: list[measure.Point], swept: dict[str, list[float]]) -> dict[str, object]:
+    """What a chart shows; an error is infinite where a scene is lost."""
+    return {"points": [asdict(each) for each in points], "frequency": measure.SWEEP.tolist(), "errors": swept}
 
 
 def _data() -> Path:

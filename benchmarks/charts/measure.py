@@ -39,33 +39,16 @@ LEVELS = {"vt-plate": ("",), "electroadhesion": ("envelope", "carrier"), "ultras
 
 @dataclass(frozen=True, kw_only=True)
 class Setting:
-    """One point of a chart.
-
-    Parameters
-    ----------
-    method : str
-        Name of the control method.
-    what : str
-        How it is set; "default" as it comes.
-    options : dict
-        Parameters of the method's class that differ from its own.
-    heave_only : bool
-        Whether the device model is reduced to heave.
-    device, level : str
-        Kind of device, and level of its simulation ("" for the only one).
-    rate : float, Hz
-    block : int, samples
-        1 is sample by sample.
-    """
+    """One point of a chart: a method, how it is set, and on what."""
 
     method: str
-    what: str = "default"
-    options: dict[str, Any] = field(default_factory=dict)
-    heave_only: bool = False
+    what: str = "default"  # name of what follows; "default" as the method comes
+    options: dict[str, Any] = field(default_factory=dict)  # parameters of the method's class that differ from its own
+    heave_only: bool = False  # whether the device model is reduced to heave
     device: str = "vt-plate"
-    level: str = ""
-    rate: float = 5000.0
-    block: int = 1
+    level: str = ""  # of the device's simulation; "" for the only one
+    rate: float = 5000.0  # Hz
+    block: int = 1  # samples; 1 is sample by sample
 
     @property
     def law(self) -> Any:
@@ -263,25 +246,3 @@ def over_frequency(settings: Sequence[Setting], progress: Callable[[str], None] 
                 errors.append(np.nan)
         found[f"{setting.device} {setting.method}"] = errors
     return found
-
-
-def as_data(points: Sequence[Point], swept: dict[str, list[float]]) -> dict[str, Any]:
-    """Everything that a chart shows, as plain data; what is not finite is null."""
-
-    def number(value: float) -> float | None:
-        return float(value) if np.isfinite(value) else None
-
-    return {
-        "points": [
-            {
-                "method": each.setting.method, "setting": each.setting.what, "device": each.setting.device,
-                "level": each.setting.level, "rate": each.setting.rate, "block": each.setting.block,
-                "error": number(each.error), "scenes": {name: number(value) for name, value in each.scenes.items()},
-                "ns_per_band_sample": number(each.nanoseconds), "simulated_seconds_per_second": each.speed,
-                "refused": each.refused,
-            }
-            for each in points
-        ],
-        "frequency": SWEEP.tolist(),
-        "error_over_frequency": {name: [number(value) for value in values] for name, values in swept.items()},
-    }  # fmt: skip

@@ -8,7 +8,7 @@ from tests.strangers_plate import StrangersPlate
 
 
 class SensorlessPlate(StrangersPlate):
-    """The plate with its sensors, and what it knows of the finger, taken off."""
+    """The plate without its sensors and without what it reports of the finger."""
 
     sensed_channels = 0
 

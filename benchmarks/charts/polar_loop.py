@@ -14,7 +14,6 @@ at 0, the phase cut and the drive's limit, which a small deviation does not reac
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 
@@ -23,45 +22,6 @@ from hapticrender.control.linear import LEAST_POLE, Sampled
 from hapticrender.control.loopshape import reduced_controller
 from hapticrender.control.transfer import butterworth
 from hapticrender.protocols import Array
-
-
-class StateSpace(NamedTuple):
-    """Matrices of x[n+1] = a x[n] + b u[n], y[n] = c x[n] + d u[n]; a stack of them along leading axes."""
-
-    a: Array
-    b: Array
-    c: Array
-    d: Array
-
-
-def delayed(plant: StateSpace, delay: int) -> StateSpace:
-    """Put `delay` >= 1 samples before the input of a plant without feedthrough; its outputs stay."""
-    n, m = plant.b.shape[-2:]
-    states = n + delay * m
-    shape = plant.a.shape[:-2]
-    a, b = np.zeros((*shape, states, states), plant.a.dtype), np.zeros((*shape, states, m), plant.a.dtype)
-    a[..., :n, :n], a[..., :n, -m:] = plant.a, plant.b
-    a[..., n + m :, n:-m] = np.eye((delay - 1) * m)
-    b[..., n : n + m, :] = np.eye(m)
-    c = np.concatenate([plant.c, np.zeros((*plant.c.shape[:-1], delay * m))], axis=-1)
-    return StateSpace(a, b, c, plant.d)
-
-
-def closed_loop(plant: StateSpace, controller: StateSpace) -> Array:
-    """State matrix of a plant (without feedthrough) whose input is the controller's output, shape (..., s, s)."""
-    return np.concatenate(
-        [
-            np.concatenate([plant.a + plant.b @ controller.d @ plant.c, plant.b @ controller.c], axis=-1),
-            np.concatenate([controller.b @ plant.c, controller.a], axis=-1),
-        ],
-        axis=-2,
-    )
-
-
-def continuous_poles(matrix: Array, rate: float) -> Array:
-    """Poles (1/s, complex: growth and angular frequency) of a sampled state matrix, shape (..., s)."""
-    z = np.linalg.eigvals(matrix).astype(complex)
-    return rate * np.log(np.where(z == 0, LEAST_POLE, z))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -159,36 +119,35 @@ class PolarLoop:
         return shared * plant * np.concatenate([np.ones_like(ratio), ratio], axis=1)[:, None, None, :]
 
     def matrix(self) -> Array:
-        """State matrix of the closed loop at sample rate in the carrier's frame, real, shape (B, s, s)."""
+        """State matrix of the closed loop in the carrier's frame, real, (B, s, s): one sample from every unit state.
+
+        States: plant and drives under way, turned back with the carrier, and two of each section and real error.
+        """
         turn, ratio = self.steady()
-        pushed, seen = self.plant.b @ self.force, self.measured @ self.plant.c
-        a, b, c, d = delayed(StateSpace(self.plant.a, pushed, seen, np.zeros(0)), self.delay)
         back = np.exp(-2j * np.pi * self.frequency / self.plant.rate)[:, None, None]
-        plant = StateSpace(_real(back * a), _real(back * b * (turn / self.table)[:, None, :]), _real(c + 0 * back), d)
-        a1, b1, c1, d1 = _section_states(self.low_pass)
-        a2, b2, c2, d2 = _section_states(self.law)
-        series = StateSpace(
-            np.block([[a1, np.zeros_like(a1)], [b2 @ c1, a2]]),
-            np.concatenate([b1, b2 * d1], axis=1),
-            np.concatenate([d2 * c1, c2], axis=2),
-            d2 * d1,
-        )
-        gains = np.concatenate([np.ones_like(ratio), ratio], axis=1)
-        same, diagonal = np.eye(gains.shape[1]), -gains[:, :, None] * np.eye(gains.shape[1])
-        controller = StateSpace(
-            np.kron(same, series.a), np.kron(same, series.b), diagonal @ np.kron(same, series.c), diagonal * series.d
-        )
-        return closed_loop(plant, controller)
+        n, c = len(self.plant.a), ratio.shape[1]
+        under_way = self.delay * c
+        sizes = [2 * n, 2 * under_way, 4 * c, 4 * c]
+        unit = np.broadcast_to(np.eye(sum(sizes)), (len(ratio), sum(sizes), sum(sizes)))
+        x, drives, filtered, controlled = np.split(unit, np.cumsum(sizes)[:-1], axis=1)
+        x, drives = x[:, :n] + 1j * x[:, n:], drives[:, :under_way] + 1j * drives[:, under_way:]
+        errors, filtered = _section_step(self.low_pass, _parts(self.measured @ self.plant.c @ x), filtered)
+        command, controlled = _section_step(self.law, errors, controlled)
+        command *= -np.concatenate([np.ones_like(ratio), ratio], axis=1)[:, :, None]
+        drive = (command[:, :c] + 1j * command[:, c:]) * (turn / self.table)[:, :, None]
+        x = back * (self.plant.a @ x + self.plant.b @ self.force @ drives[:, :c])
+        drives = back * np.concatenate([drives[:, c:], drive], axis=1)
+        return np.concatenate([_parts(x), _parts(drives), filtered, controlled], axis=1)
 
     def poles(self) -> Array:
-        """Closed-loop poles in the frame of the carrier (1/s, complex, shape (B, s))."""
-        return continuous_poles(self.matrix(), self.plant.rate)
+        """Closed-loop poles in the frame of the carrier (1/s, complex: growth and angular frequency, shape (B, s))."""
+        z = np.linalg.eigvals(self.matrix()).astype(complex)
+        return self.plant.rate * np.log(np.where(z == 0, LEAST_POLE, z))
 
 
-def _real(matrix: Array) -> Array:
-    """Matrix of real and imaginary parts, [[Re, -Im], [Im, Re]]."""
-    upper = np.concatenate([matrix.real, -matrix.imag], axis=-1)
-    return np.concatenate([upper, np.concatenate([matrix.imag, matrix.real], axis=-1)], axis=-2)
+def _parts(values: Array) -> Array:
+    """Real parts above imaginary ones, (B, 2 n, s)."""
+    return np.concatenate([values.real, values.imag], axis=1)
 
 
 def _section_response(sections: Array, z: Array) -> Array:
@@ -197,9 +156,9 @@ def _section_response(sections: Array, z: Array) -> Array:
     return (b0 + b1 / z + b2 / z**2) / (1.0 + a1 / z + a2 / z**2)
 
 
-def _section_states(sections: Array) -> StateSpace:
-    """Second-order sections (B, 5) as state space, transposed direct form II."""
-    b0, b1, b2, a1, a2 = sections.T
-    a = np.stack([np.stack([-a1, np.ones_like(a1)], -1), np.stack([-a2, np.zeros_like(a2)], -1)], axis=-2)
-    b = np.stack([b1 - a1 * b0, b2 - a2 * b0], axis=-1)[:, :, None]
-    return StateSpace(a, b, np.broadcast_to([[1.0, 0.0]], (len(sections), 1, 2)), b0[:, None, None])
+def _section_step(sections: Array, u: Array, states: Array) -> tuple[Array, Array]:
+    """Outputs (B, m, s) and next states (B, 2 m, s) of m equal sections each, transposed direct form II."""
+    b0, b1, b2, a1, a2 = sections.T[:, :, None, None]
+    first, second = np.split(states, 2, axis=1)
+    y = b0 * u + first
+    return y, np.concatenate([b1 * u - a1 * y + second, b2 * u - a2 * y], axis=1)

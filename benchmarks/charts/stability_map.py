@@ -3,22 +3,24 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
 from benchmarks.charts.polar_loop import PolarLoop
-from hapticrender.control.damping import damping_taps
-from hapticrender.control.device_model import DeviceModel, FingerRange
-from hapticrender.control.linear import FingerEstimate, Sampled
+from hapticrender.control.damping import choose_damping, damping_taps
+from hapticrender.control.device_model import DeviceModel
+from hapticrender.control.linear import ErrorLoop, Sampled
 from hapticrender.control.margin_check import BankGains, error_loop
 from hapticrender.control.margins import sensitivity
 from hapticrender.plants.plate import PlateParameters, structure
 from hapticrender.protocols import Array
 from hapticrender.touch.mechanics import NONE, FingerMechanics
 
+PLATE = PlateParameters()
+MODEL = PLATE.device_model(PLATE.rate, PLATE.delay)  # what every controller is designed for
+DELAYS, FACTORS = np.arange(1, 9), np.geomspace(0.25, 8.0, 61)  # samples; on the inner damper
 OFFSETS = 60  # frequencies around a carrier at which a map looks for the peak of S
 MODE_OFFSETS = np.linspace(-6.0, 6.0, 9)  # Hz: and around each mode of the plant
 INTEGRAL = 3.4  # 1/s per Hz of bandwidth: 17 1/s at 5 Hz
@@ -33,7 +35,7 @@ def loaded_plate(
     position: float = 0.0,
     strength: float = 1.0,
 ) -> Sampled:
-    """Plate with a finger resting on it, in the coordinates of the controller and per force that it asks for.
+    """Plate with a finger resting on it, in the coordinates of the controller and per force that it demands.
 
     Parameters
     ----------
@@ -57,165 +59,95 @@ def loaded_plate(
     )
 
 
-@dataclass(frozen=True, kw_only=True)
-class StabilityMap:
-    """Growth and modulus margin of one method over finger, load, position, frequency and bandwidth.
+@dataclass(frozen=True)
+class Case:
+    """What rests on the plate, or differs from the plate of the design."""
 
-    Parameters
-    ----------
-    method : str
-    fingers : tuple of str
-        Their names.
-    loads, positions, frequencies, bandwidths : ndarray, N, m, Hz, Hz
-    adapted : bool
-        Whether the law has the settled finger estimate.
-    growth : ndarray, shape (fingers, loads, positions, frequencies, bandwidths), 1/s
-        Of the slowest-decaying pole; >= 0 is unstable.
-    modulus : ndarray, same shape
-        Modulus margin, 0 where unstable.
-    """
-
-    method: str
-    fingers: tuple[str, ...]
-    loads: Array
-    positions: Array
-    frequencies: Array
-    bandwidths: Array
-    adapted: bool
-    growth: Array
-    modulus: Array
-
-    def boundary(self, least: float = 0.0) -> Array:
-        """Bandwidth (Hz, shape (fingers, loads, positions, frequencies)) up to which every one tried holds.
-
-        Stable, and with a modulus margin of at least `least`; 0 where the lowest does not hold, inf where all do.
-        """
-        held = (self.growth < 0) & (self.modulus >= least)
-        count = np.cumprod(held, axis=-1).sum(axis=-1)
-        return np.concatenate([[0.0], self.bandwidths[:-1], [np.inf]])[count]
-
-
-class _Touch(NamedTuple):
-    """One finger resting on a plate."""
-
-    parameters: PlateParameters
+    title: str
     mechanics: FingerMechanics
-    position: float
-    strength: float
-    adapted: bool
+    load: float  # N
+    position: float  # m
 
     def plant(self) -> Sampled:
-        return loaded_plate(
-            self.parameters, self.model(), self.mechanics, position=self.position, strength=self.strength
-        )
-
-    def model(self) -> DeviceModel:
-        return self.parameters.device_model(self.parameters.rate, self.parameters.delay)
+        """The plate with it."""
+        strength = float(self.mechanics.load_factor(np.asarray(self.load)))
+        return loaded_plate(PLATE, MODEL, self.mechanics, position=self.position, strength=strength)
 
 
-def stability_map(
-    method: str,
-    frequencies: Array,
-    *,
-    bandwidths: Array,
-    fingers: Mapping[str, FingerMechanics],
-    loads: tuple[float, ...] = (0.3, 0.8),
-    positions: tuple[float, ...] = (0.0, 15e-3, 27.5e-3),
-    parameters: PlateParameters | None = None,
-    adapted: bool = False,
-) -> StabilityMap:
-    """Evaluate one method's loop, one carrier at a time, from the model.
+class StabilityMap(NamedTuple):
+    """Stability over two quantities."""
 
-    Parameters
-    ----------
-    method : {"paper", "paper-common", "h", "h2"}
-        The paper's polar loops, per side or in common mode; the error observer without and with its inner damper.
-    frequencies, bandwidths : ndarray, Hz
-        Carriers, and loop bandwidths b: the paper's fT with fL = 2 b; for the error observer a pole at 2 b and an
-        integral of 3.4 b 1/s.  No rule lowers them here.
-    fingers : mapping of str to FingerMechanics
-        Such as ``touch.mechanics.NAMED``, Table 1 and no finger.
-    loads : tuple of float, N
-        Normal loads; the impedance grows with (W/reference load)**(1/3).
-    positions : tuple of float, m
-        Of the finger.
-    parameters : PlateParameters, optional
-    adapted : bool
-        The law has the finger estimate at which its adaptation comes to rest; otherwise none.
-
-    Returns
-    -------
-    StabilityMap
-    """
-    if method not in LOOPS:
-        raise ValueError(f"{method=} must be one of {', '.join(LOOPS)}")
-    parameters = parameters or PlateParameters()
-    frequencies, bandwidths = np.asarray(frequencies, float), np.asarray(bandwidths, float)
-    shape = (len(fingers), len(loads), len(positions), len(frequencies), len(bandwidths))
-    growth, modulus = np.empty(shape), np.empty(shape)
-    carrier, width = (grid.ravel() for grid in np.meshgrid(frequencies, bandwidths, indexing="ij"))
-    known = list(fingers.values())
-    for at in np.ndindex(shape[:3]):
-        mechanics = known[at[0]]
-        if not mechanics.order and at[1:] != (0, 0):  # without mechanics neither load nor place matter
-            growth[at], modulus[at] = growth[at[0], 0, 0], modulus[at[0], 0, 0]
-            continue
-        strength = float(mechanics.load_factor(np.asarray(loads[at[1]])))
-        touch = _Touch(parameters, mechanics, positions[at[2]], strength, adapted)
-        rates, least = LOOPS[method](touch, carrier, width)
-        growth[at], modulus[at] = rates.reshape(shape[3:]), least.reshape(shape[3:])
-    return StabilityMap(
-        method=method,
-        fingers=tuple(fingers),
-        loads=np.asarray(loads, float),
-        positions=np.asarray(positions, float),
-        frequencies=frequencies,
-        bandwidths=bandwidths,
-        adapted=adapted,
-        growth=growth,
-        modulus=modulus,
-    )
+    x: Array
+    y: Array
+    growth: Array  # 1/s, of the slowest-decaying pole, (len(x), len(y)); >= 0 is unstable
+    modulus: Array  # modulus margin, 0 where unstable
 
 
-def _polar(touch: _Touch, carrier: Array, width: Array, common: bool) -> tuple[Array, Array]:
-    """Growth and modulus margin of the paper's loop for every carrier and bandwidth."""
-    loop = PolarLoop.on(touch.plant(), touch.model(), carrier, width, common=common)
+def polar_map(case: Case, common: bool, carriers: Array, widths: Array) -> StabilityMap:
+    """Map the paper's loop, per side or in common mode, over carriers and bandwidths fT (Hz); fL = 2 fT."""
+    carrier, width = (grid.ravel() for grid in np.meshgrid(carriers, widths, indexing="ij"))
+    loop = PolarLoop.on(case.plant(), MODEL, carrier, width, common=common)
     poles = loop.poles()
     near = width[:, None] * np.geomspace(0.02, 50.0, OFFSETS)
     offset = np.concatenate([near, np.abs(poles.imag) / (2 * np.pi)], axis=1)
-    peak = sensitivity(loop.loop(np.clip(offset, 1e-3, 0.49 * loop.plant.rate))).max(axis=1)
+    peak = sensitivity(loop.loop(np.clip(offset, 1e-3, 0.49 * PLATE.rate))).max(axis=1)
     growth = poles.real.max(axis=1)
-    return growth, np.where(growth < 0, 1 / peak, 0.0)
+    modulus = np.where(growth < 0, 1 / peak, 0.0)
+    return StabilityMap(carriers, widths, *(each.reshape(len(carriers), -1) for each in (growth, modulus)))
 
 
-def _error_loop(touch: _Touch, carrier: Array, width: Array, inner: float) -> tuple[Array, Array]:
-    """Growth and modulus margin of the error observer's loop for every carrier and bandwidth."""
-    plant, model = touch.plant(), touch.model()
+def error_map(case: Case, inner: float, carriers: Array, widths: Array) -> StabilityMap:
+    """Map the error observer's loop over carriers and bandwidths b (Hz), its finger not learnt.
+
+    Its pole is at 2 b, its integral 3.4 b 1/s; no rule lowers them here.  `inner` (0..1) is the inner damper's factor.
+    """
+    plant, taps = case.plant(), damping_taps(MODEL, QUALITY)[0]
     near = np.geomspace(0.02, 20.0, OFFSETS // 2)
     modes = (plant.modes()[:, None] + MODE_OFFSETS).ravel()
-    afar, taps = np.append(np.linspace(1.0, 0.499 * plant.rate, OFFSETS), modes), damping_taps(model, QUALITY)[0]
-    growths, margins = [], []
-    for f, b in zip(carrier.tolist(), width.tolist(), strict=True):
-        finger = None
-        if touch.adapted:
-            finger = settled_estimate(touch.parameters, touch.mechanics, f, touch.position, touch.strength)
-        loop = error_loop(model, np.array([f]), gains_of(model, f, b, inner), taps=taps, plant=plant, finger=finger)
+    afar = np.append(np.linspace(1.0, 0.499 * plant.rate, OFFSETS), modes)
+    growth, modulus = np.zeros((2, len(carriers), len(widths)))
+    for at in np.ndindex(growth.shape):
+        f, b = float(carriers[at[0]]), float(widths[at[1]])
+        loop = error_loop(MODEL, np.array([f]), gains_of(f, b, inner), taps=taps, plant=plant)
         poles = loop.poles()
         grid = np.concatenate([f - b * near, f + b * near, afar, np.abs(poles.imag) / (2 * np.pi)])
-        peak = sensitivity(loop.loop(np.exp(2j * np.pi * np.clip(grid, 0.1, 0.499 * plant.rate) / plant.rate))).max()
-        growths.append(poles.real.max())
-        margins.append(1 / peak if growths[-1] < 0 else 0.0)
-    return np.array(growths), np.array(margins)
+        growth[at], modulus[at] = _growth_and_modulus(loop, poles, np.clip(grid, 0.1, 0.499 * plant.rate))
+    return StabilityMap(carriers, widths, growth, modulus)
 
 
-def gains_of(model: DeviceModel, carrier: float, width: float, inner: float) -> BankGains:
+def damper_map(case: Case) -> StabilityMap:
+    """Map the loop of the inner damper that `inverse` has, over the true delay (`DELAYS`) and a factor (`FACTORS`).
+
+    The loop is that of the error observer with a band that has faded out, and a DC estimate, which the damper does not
+    use: their poles, at -50 1/s and beyond, are the only ones that are not the damper's.
+    """
+    plant, taps, nothing = case.plant(), choose_damping(MODEL).taps, np.zeros((1, 2, 2))
+    grid = np.concatenate([np.linspace(1.0, 0.499 * plant.rate, 300), plant.modes()])
+    growth, modulus = np.zeros((2, len(DELAYS), len(FACTORS)))
+    for at in np.ndindex(growth.shape):
+        loop = ErrorLoop(
+            plant=plant, delay=int(DELAYS[at[0]]), frequency=np.array([100.0]), observer=0.0, integral=0.0, dc=0.5,
+            dc_drift=0.05, inner=float(FACTORS[at[1]]), taps=taps, law=nothing, slope=nothing, share=np.zeros(1),
+        )  # fmt: skip
+        growth[at], modulus[at] = _growth_and_modulus(loop, loop.poles(), grid)
+    return StabilityMap(DELAYS, FACTORS, growth, modulus)
+
+
+def _growth_and_modulus(loop: ErrorLoop, poles: Array, frequency: Array) -> tuple[float, float]:
+    """Growth (1/s), and modulus margin on a grid (Hz)."""
+    growth = float(poles.real.max())
+    peak = sensitivity(loop.loop(np.exp(2j * np.pi * frequency / PLATE.rate))).max() if growth < 0 else math.inf
+    return growth, 1 / peak
+
+
+def gains_of(carrier: float, width: float, inner: float) -> BankGains:
     """Gains of one band of bandwidth `width` (Hz) at every level, `inner` (0..1) the factor on the inner damper."""
-    observer, integral = 2 * 2 * math.pi * 2 * width / model.rate, INTEGRAL * width
-    dc = 2 * math.pi * min(6.0, carrier / 8) / model.rate
+    observer, integral = 2 * 2 * math.pi * 2 * width / MODEL.rate, INTEGRAL * width
+    dc = 2 * math.pi * min(6.0, carrier / 8) / MODEL.rate
     return BankGains(
-        rate=model.rate,
-        delay=model.delay,
-        lead=(model.delay + 0.5) / model.rate,
+        rate=MODEL.rate,
+        delay=MODEL.delay,
+        lead=(MODEL.delay + 0.5) / MODEL.rate,
         observer=observer,
         observer_high=observer,
         integral_low=integral,
@@ -226,38 +158,7 @@ def gains_of(model: DeviceModel, carrier: float, width: float, inner: float) -> 
         inner=inner,
         inner_high=inner,
         crowd_speed=0.0,
-        lowest=model.lowest_frequency,
-        highest=model.highest_frequency,
-        highest_edge=model.highest_edge,
+        lowest=MODEL.lowest_frequency,
+        highest=MODEL.highest_frequency,
+        highest_edge=MODEL.highest_edge,
     )
-
-
-def settled_estimate(
-    parameters: PlateParameters, mechanics: FingerMechanics, frequency: float, position: float, strength: float = 1.0
-) -> FingerEstimate | None:
-    """Finger estimate at which the adaptation settles on a single carrier (Hz); None without a finger.
-
-    With z = j w Z_f(j w): Re z is shared between stiffness and mass by how far each may be expected from zero; the
-    imaginary part is damping.  `strength` is a factor on the finger's impedance.
-    """
-    if not mechanics.order or strength == 0.0:
-        return None
-    omega = 2 * np.pi * frequency
-    z = complex(1j * omega * mechanics.impedance(frequency) * strength)
-    known = FingerRange()
-    heavy = omega**2 * known.typical_mass**2
-    share = z.real / (known.typical_stiffness**2 + omega**2 * heavy)
-    return FingerEstimate(
-        float(np.clip(-heavy * share, *known.mass)),
-        float(np.clip(z.imag / omega, *known.damping)),
-        float(np.clip(known.typical_stiffness**2 * share, *known.stiffness)),
-        position / parameters.half_spacing,
-    )
-
-
-LOOPS: dict[str, Callable[[_Touch, Array, Array], tuple[Array, Array]]] = {
-    "paper": lambda touch, carrier, width: _polar(touch, carrier, width, False),
-    "paper-common": lambda touch, carrier, width: _polar(touch, carrier, width, True),
-    "h": lambda touch, carrier, width: _error_loop(touch, carrier, width, 0.0),
-    "h2": lambda touch, carrier, width: _error_loop(touch, carrier, width, 1.0),
-}

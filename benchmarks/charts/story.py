@@ -96,7 +96,7 @@ def draw(runs: dict[str, figures.Run]) -> Any:
         for lane, (name, run), color in zip(axes, runs.items(), (PALE, ORANGE, GREEN, BLUE), strict=False):
             _errors(lane[0], name, run, color)
             _waves(lane[1], run, color)
-        axes[0, 1].set_title("Motion under the finger (µm); dashed: as asked for")
+        axes[0, 1].set_title("Motion under the finger (µm); dashed: as requested")
         axes[3, 1].set_xlabel("time (s)")
         axes[3, 1].tick_params(labelbottom=True)
         axes[4, 1].set_axis_off()
@@ -125,7 +125,7 @@ def _errors(axes: Any, name: str, run: figures.Run, color: str) -> None:
 
 
 def _waves(axes: Any, run: figures.Run, color: str) -> None:
-    """Draw what was played and what was asked for, 20 to 500 Hz."""
+    """Draw what was played and what was requested, 20 to 500 Hz."""
     reference, error = figures.in_band(run)
     here = slice(*(round(each * RATE) for each in ZOOM))
     axes.plot(run.time[here], 1e6 * (reference + error[:, figures.FINGER])[here], color=color, lw=2.2)

@@ -76,7 +76,7 @@ class NaivePolar:
 
     def __init__(self, twin):
         self.bands = np.zeros(len(twin.frequency), self.band)
-        for name, values in zip(self.band.names, (twin.frequency, np.mod(twin.turns, 1.0), twin.wanted, twin.unit.real,
+        for name, values in zip(self.band.names, (twin.frequency, np.mod(twin.turns, 1.0), twin.target, twin.unit.real,
                                                   twin.unit.imag), strict=False):  # fmt: skip
             self.bands[name] = values
         self.bands["channel"][:, :, 0] = (1.0 / twin.gain).T

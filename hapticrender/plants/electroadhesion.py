@@ -1,30 +1,17 @@
 """An electroadhesive screen: a current on a carrier, the circuit of screen and skin, attraction, friction, tribometer.
 
-In series, per area: insulator, stratum corneum (C || R), sliding gap (C = eps0/d || R_g); and the body, R.  With the
-charge q of the gap under a contact of area A::
-
-    F_e = kappa q^2/(2 eps0 A)
-    friction F: see `contact`, with the steady friction mu (W + F_e)
-
-Under a current of peak I at the carrier w the attraction is, on average, ``g I^2`` with::
+The circuit, in series and per area: insulator, stratum corneum (C || R), sliding gap (C = eps0/d || R_g); and the body,
+R.  Under a current of peak I at the carrier w the attraction is, on average, ``g I^2`` whatever the gap's thickness::
 
     g = kappa L/(4 w^2 eps0 A),   L = (w tau)^2/(1 + (w tau)^2),   tau = R_g C
 
-whatever the gap's thickness: the reason for driving current.  Under a voltage it goes as (Z_gap/Z)^2/d^2, and the same
-finger spreads 11 times over gaps of 0.5 to 3 um.  A resting finger shorts its gap with sweat and is not attracted.
-
-A stray capacitance C_s across the source (cable, electrode) takes a part of its current, so that a finger of impedance
-Z gets ``I/(1 + j w C_s Z)``, which depends on the gap again: 50 pF cost a nominal finger 24 % of its attraction.  It is
-taken in steady state at the carrier.  The current that is measured is that of the source.
+(docs/theory.md, "Electroadhesion").  A resting finger shorts its gap with sweat and is not attracted.  A stray
+capacitance C_s across the source (cable, electrode) leaves a finger of impedance Z ``I/(1 + j w C_s Z)``, in steady
+state at the carrier; the current that is measured is that of the source.
 
 Two levels: "carrier" integrates the circuit over every substep exactly, with the offset of the current source, its
 servo and its compliance; "envelope" takes ``g I^2``.  They agree but for what a step of the envelope leaves in the gap
 for a few of its time constants.
-
-References
-----------
-Shultz, Peshkin, Colgate 2018 (series model and sliding gap); Grigorii et al. 2021 (20 kHz, 6 mA, tribometer);
-Balasubramanian, Pool, Vardar 2025 (lag of friction); Yamamoto and Yamamoto 1976 (stratum corneum).
 """
 
 from __future__ import annotations
@@ -37,10 +24,10 @@ import numpy as np
 
 from hapticrender.checks import Validated, option, parameter
 from hapticrender.control.estimators import StarSTDFT
-from hapticrender.plants.compiled import CompiledPlant
+from hapticrender.plants.compiled import CompiledPlant, new_record
 from hapticrender.plants.electroadhesion_kernels import SCREEN, element, screen_step
 from hapticrender.plants.gap import VACUUM, gap_record
-from hapticrender.plants.sliding_contact import SlidingParameters, new_record, sliding_record
+from hapticrender.plants.sliding_contact import SlidingParameters, sliding_record
 from hapticrender.protocols import Array
 
 if TYPE_CHECKING:
@@ -100,7 +87,7 @@ class ElectroadhesionParameters(SlidingParameters):
 
     Notes
     -----
-    Electrical defaults per m2 from the sources above and docs/theory.md; gap, leakage and body are engineering values.
+    Electrical defaults per m2 from docs/theory.md; gap, leakage and body are engineering values.
     Offset and servo act at the level "carrier" only.
     """
 
@@ -201,17 +188,12 @@ class ElectroadhesionParameters(SlidingParameters):
         current = np.asarray(drive, float) / abs(impedance if self.drive_kind == "voltage" else shunted)
         return self.gain(normal_load) * current**2
 
-    def sensed_response(self, frequency: Any, speed: float) -> Any:
-        """Change of what is sensed per change of attraction (complex) at `frequency` (Hz), finger at `speed` (m/s)."""
-        if self.sensor == "tribometer":
-            return self.friction_coefficient * self.frequency_response(frequency, speed)
-        return self.estimator_filter.frequency_response(frequency) / self._shift(frequency)
-
     def sensor_response(self, frequency: Any, speed: float) -> Any:
         """Sensed friction per friction (complex) at `frequency` (Hz), finger at `speed` (m/s)."""
         if self.sensor == "tribometer":
             return self.tribometer_response(frequency)
-        return self.sensed_response(frequency, speed) / self.lag_response(frequency, speed)
+        attraction = self.estimator_filter.frequency_response(frequency) / self._shift(frequency)
+        return attraction / self.lag_response(frequency, speed)
 
 
 class ElectroadhesionScreen(CompiledPlant):

@@ -1,13 +1,7 @@
 """Friction of a finger on a surface that vibrates at ultrasonic frequency, as a function of amplitude: three laws.
 
-mu/mu0 as a function of the amplitude a (m, peak) of the surface, the normal load W (N) and the sliding speed v (m/s):
-
-* `FitLaw`: ``r + (1 - r) exp(-(a/a0)^p)``, whatever the load and the speed.
-* `LoadSharing`: asperities and a squeeze film of mean gap u share the load,
-  ``W/A = pc exp(-u/u0) + 1.25 p0 (a/u)^2`` and ``mu/mu0 = pc exp(-u/u0) A/W``: loses authority with load.
-* `IntermittentContact`: the skin bounces, ``exp(-c mu0 a f/v)``: depends on speed, not on load.
-
-The literature does not agree on one of them, so the law is a parameter.  Inside kernels a law is a record of `LAW`.
+They give mu/mu0 over the amplitude a (m, peak) of the surface, the normal load W (N) and the sliding speed v (m/s); the
+literature does not agree on one of them (docs/theory.md, "Friction laws").  Inside kernels a law is a record of `LAW`.
 """
 
 from __future__ import annotations
@@ -23,7 +17,7 @@ from hapticrender.jit import kernel
 from hapticrender.protocols import Array
 
 FIT, FILM, BOUNCE = 0, 1, 2  # kinds of law
-LEAST_SHARE = 1e-6  # of the friction that amplitude can remove: the least that is asked for, as laws end in exp(-...)
+LEAST_SHARE = 1e-6  # of the removable friction: the least that is requested, as laws end in exp(-...)
 CONVERGED = 1e-15  # relative step at which Newton's iteration ends
 
 LAW = np.dtype(

@@ -1,25 +1,15 @@
 """Estimate the attraction on an electroadhesive finger from the impedance of its gap at the carrier.
 
-With the complex envelopes V and I of voltage and current at the carrier, both low-passed by the STDFT* of
-`hapticrender.control.estimators`::
+With the complex envelopes V and I of voltage and current, both low-passed by the STDFT* of
+`hapticrender.control.estimators`, Z = V/I and Z_stat = Z while |v| < least_speed, the gap being shorted
+(docs/theory.md, "Gap estimation"; Shultz, Peshkin, Colgate 2018)::
 
-    Z = V/I,  Z_stat = Z while |v| < least_speed: the gap is shorted
-    A = |z_series|/|Z_stat - R_body|
-    Z_g = Z - Z_stat = 1/(G + j w C)                    while sliding
-    L = (w C)^2/((w C)^2 + G^2) = Im(Z_g)^2/|Z_g|^2
-    F = kappa |I|^2 L/(4 w^2 eps0 A)
+    A = |z_series|/|Z_stat - R_body|,   Z_g = Z - Z_stat,   L = Im(Z_g)^2/|Z_g|^2,   F = kappa |I|^2 L/(4 w^2 eps0 A)
 
-10 % of area is 11 % of force, and 1 us between the two channels about 10 %, because it turns Z.  The force follows
-|I|^2 at once; only the impedance is averaged over a longer time, weighted by power, so that an envelope may pass
-through zero.
-
-The force cannot be estimated while the finger is away or rests, before it has rested once, or when its gap leaks so
-much that L falls below a bound.  The output is then F = g |I|^2, what a control loop expects of a nominal finger, so
-that no integrator winds up, and `Flag.OPEN_LOOP` is raised.
-
-References
-----------
-Shultz, Peshkin, Colgate 2018 (the sliding gap's impedance); Sun, Guo, Sun 2022 (a slower relative of the estimate).
+The force follows |I|^2 at once; only the impedance is averaged over a longer time, weighted by power, so that an
+envelope may pass through zero.  The force cannot be estimated while the finger is away or rests, before it has rested
+once, or when its gap leaks so much that L falls below a bound.  The output is then F = g |I|^2, what a control loop
+expects of a nominal finger, so that no integrator winds up, and `Flag.OPEN_LOOP` is raised.
 """
 
 from __future__ import annotations
@@ -30,7 +20,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from hapticrender.jit import kernel
-from hapticrender.plants.sliding_contact import new_record
+from hapticrender.plants.compiled import new_record
 from hapticrender.protocols import Array
 
 if TYPE_CHECKING:

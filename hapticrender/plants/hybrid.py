@@ -1,13 +1,12 @@
 """A screen laminated on a plate: the plate moves the finger, the screen rubs it, and both add to one skin velocity.
 
-Velocities that feel alike add, in phase [Grigorii et al. 2021]::
+Velocities that feel alike add in phase, with v/F = 0.64 m/(N s) (docs/theory.md, "Hybrid"; Grigorii et al. 2021)::
 
-    v = d/dt (displacement of the glass under the finger) + (v/F) (friction),   v/F = 0.64 m/(N s)
+    v = d/dt (displacement of the glass under the finger) + (v/F) (friction)
 
-The finger's load acts on both: the plate sags under it, and friction grows with it.  Attraction presses skin and glass
-on each other as much as it pulls, so that the plate carries the load alone; friction acts along the plate and does not
-move it.  Left out are the motion of the gap, and what the plate's vibration makes of friction: the match v/F was
-measured by fingers that slid over a vibrating plate.
+The plate carries the finger's load alone, as attraction presses skin and glass on each other as much as it pulls;
+friction acts along the plate and does not move it.  Left out are the motion of the gap, and what the plate's vibration
+makes of friction: the match v/F was measured by fingers that slid over a vibrating plate.
 """
 
 from __future__ import annotations
@@ -19,7 +18,7 @@ import numpy as np
 from numba import carray
 
 from hapticrender.jit import F8, I8, SIGNALS, SIGNALS_T, call, pointer, step
-from hapticrender.plants.compiled import CompiledPlant, aligned_record
+from hapticrender.plants.compiled import CompiledPlant, new_record
 from hapticrender.plants.plate import Plate
 from hapticrender.protocols import Array
 
@@ -111,13 +110,17 @@ class HybridPlant(CompiledPlant):
         parts = np.zeros(2, SIGNALS)
         parts["motion"] = [row.ctypes.data for row in rows]
         self.buffers = (parts, *rows)
-        self.state = aligned_record(HYBRID)
-        self.state["velocity_per_force"], self.state["parts"] = velocity_per_force, parts.ctypes.data
-        for name, part, row in zip(("plate", "screen"), (plate, screen), rows, strict=True):
-            self.state[name] = part.step.address, part.state.ctypes.data
-            self.state[f"{name}_motion"] = row.ctypes.data
-        self.state["noise_channels"] = self.noise_channels
-        self.state["input_channels"] = screen.inputs(0, 1).shape[1]
+        self.state = new_record(
+            HYBRID,
+            velocity_per_force=velocity_per_force,
+            plate=(plate.step.address, plate.state.ctypes.data),
+            screen=(screen.step.address, screen.state.ctypes.data),
+            parts=parts.ctypes.data,
+            input_channels=screen.inputs(0, 1).shape[1],
+            noise_channels=self.noise_channels,
+            plate_motion=rows[0].ctypes.data,
+            screen_motion=rows[1].ctypes.data,
+        )
 
     @property
     def shape(self) -> Any:

@@ -14,7 +14,7 @@ import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from types import MappingProxyType
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -252,7 +252,7 @@ def identify(
     parameters = replace(parameters, rate=rate)
     sine = design_multisine(parameters, rate, samples, amplitude)
     start, fade = round(wait * rate), round(RAMP * rate)
-    sensed = _play(driver, _whole_drive(sine, start, fade))[start : start + samples]
+    sensed = play(driver, _whole_drive(sine, start, fade)).sensed[start : start + samples]
     _check_range(sensed, parameters)
     record = spectra(rate, sine, sensed)
     _check_response(record, amplitude)
@@ -281,15 +281,20 @@ def _with_bending(rigid: Fit, record: Record) -> Fit | None:
     return fit if clear > CLEAREST else None
 
 
-def _samples(driver: Driver, parameters: PlateParameters, seconds: float, wait: float) -> int:
-    """Check the arguments and return the length of the record in samples."""
+def check_channels(driver: Driver, count: int, what: str) -> None:
+    """Refuse a driver without `count` channels of drive and of sensors."""
     check_driver(driver)
     for name in ("drive_channels", "sensed_channels"):
-        if getattr(driver, name) != 2:
+        if getattr(driver, name) != count:
             raise ValueError(
-                f"{type(driver).__name__}: {name} = {getattr(driver, name)}: must be 2; identification needs a plate "
-                "with two coils and two displacement sensors"
+                f"{type(driver).__name__}: {name} = {getattr(driver, name)}: must be {count}; identification needs a "
+                f"device with {what}"
             )
+
+
+def _samples(driver: Driver, parameters: PlateParameters, seconds: float, wait: float) -> int:
+    """Check the arguments and return the length of the record in samples."""
+    check_channels(driver, 2, "two coils and two displacement sensors")
     for name in ("coils", "degrees_of_freedom"):
         if getattr(parameters, name) != 2:
             raise ValueError(f"{name} = {getattr(parameters, name)}: must be 2 to identify heave and rocking")
@@ -309,28 +314,38 @@ def _whole_drive(sine: Multisine, start: int, fade: int) -> Array:
     return sine.drive[turn % samples] * envelope[:, None]
 
 
-def _play(driver: Driver, drive: Array) -> Array:
-    """Play `drive` in blocks, then at least a block of zeros, and return the measurement."""
-    block = driver.block
-    padded = np.concatenate([drive, np.zeros((-len(drive) % block + block, 2))])
-    sensed = []
+def play(driver: Driver, drive: Array) -> Sensed:
+    """Play `drive` (n, channels) in blocks, then at least a block of zeros; return what was sensed of it.
+
+    Raises
+    ------
+    DesignError
+        The device reports a saturated drive, a clipped sensor or lost samples.
+    DriverError
+        The device failed.  After either, zero drive was sent if the device still took any.
+    """
+    n, block = len(drive), driver.block
+    padded = np.concatenate([drive, np.zeros((-n % block + block, drive.shape[1]))])
+    kept = []
     try:
         for start in range(0, len(padded), block):
             played = driver.play(padded[start : start + block])
-            values, _, _, _, flags = check_sensed(driver, Sensed(played.sensed, flags=played.flags), 0)
-            raised = Flag(0 if flags is None else int(np.bitwise_or.reduce(flags)))
+            given = Sensed(played.sensed, played.position, normal_load=played.normal_load, flags=played.flags)
+            sensed = check_sensed(driver, given, 0)
+            raised = Flag(0 if sensed.flags is None else int(np.bitwise_or.reduce(sensed.flags)))
             if raised & (Flag.SATURATED | Flag.SENSOR_CLIPPED | Flag.OVERRUN):
                 raise DesignError(
                     f"sample {start}: the device reports {raised!r}: must be no fault; decrease amplitude, or mend it"
                 )
-            sensed.append(values.copy())
+            kept.append([None if each is None else each.copy() for each in sensed])
     except BaseException as error:
         try:
-            driver.play(np.zeros((block, 2)))
+            driver.play(np.zeros_like(padded[:block]))
         except Exception as late:
             error.add_note(f"and while sending zero drive: {late}")
         raise
-    return np.concatenate(sensed)
+    columns: Any = [None if each[0] is None else np.concatenate(each)[:n] for each in zip(*kept, strict=True)]
+    return Sensed(*columns)
 
 
 def _check_range(sensed: Array, parameters: PlateParameters) -> None:

@@ -15,17 +15,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from scipy.optimize import least_squares
 
-from hapticrender.driver_checks import check_driver, check_sensed
 from hapticrender.errors import DesignError
 from hapticrender.plants.electroadhesion import ElectroadhesionParameters
-from hapticrender.plants.identify import SIGMAS_95, Estimate
+from hapticrender.plants.identify import SIGMAS_95, Estimate, check_channels, play
 from hapticrender.plants.surface import SurfaceParameters
-from hapticrender.protocols import Array, Driver, Sensed
+from hapticrender.protocols import Array, Driver
 from hapticrender.touch.finger import Finger
 
 REACH, GRID = 0.02, 10.0  # share of the expected resonance, Hz: range and spacing of the lines
@@ -62,7 +61,7 @@ def identify_resonance(driver: Driver, parameters: SurfaceParameters, seconds: f
     The open driver takes V and senses m at the carrier's rate; a resonance within 2 % of the expected one is found.
     """
     mode, rate = parameters.mode, float(driver.rate)
-    _check(driver)
+    check_channels(driver, 1, "one drive and one sensor")
     samples, start = round(seconds * rate), round(RING * mode.quality / (math.pi * mode.frequency) * rate)
     base = rate / samples
     bins = np.arange((1 - REACH) * mode.frequency, (1 + REACH) * mode.frequency, GRID) / base
@@ -72,7 +71,7 @@ def identify_resonance(driver: Driver, parameters: SurfaceParameters, seconds: f
     spectrum[bins] = np.exp(1j * phase)
     drive = np.fft.irfft(spectrum, samples)
     drive *= SHARE * mode.drive_limit / abs(drive).max()
-    played = _play(driver, drive[np.arange(-start, samples) % samples]).sensed[start : start + samples, 0]
+    played = play(driver, drive[np.arange(-start, samples) % samples, None]).sensed[start:, 0]
     u, y = (np.fft.rfft(signal)[bins] * (2 / samples) for signal in (drive, played))
     w = 2 * np.pi * bins * base
     u = u * np.sinc(w / rate / (2 * np.pi)) * np.exp(-1j * w * (driver.delay - driver.block + 0.5) / rate)
@@ -102,19 +101,19 @@ def identify_screen(
     `finger` gives load and position where it does not measure them.
     """
     rate, most = float(driver.rate), parameters.current_limit / 2
-    _check(driver)
+    check_channels(driver, 1, "one drive and one sensor")
     time = np.arange(round(seconds * rate)) / rate
     phase = 2 * np.pi * MODULATION * (time - (driver.delay - driver.block) / rate)
     drive = most * np.sqrt((1 + np.cos(2 * np.pi * MODULATION * time)) / 2)
-    sensed = _play(driver, drive)
-    position = finger.position(time) if sensed.position is None else sensed.position[: len(time)]
-    load = finger.load(time) if sensed.normal_load is None else sensed.normal_load[: len(time)]
+    sensed = play(driver, drive[:, None])
+    position = finger.position(time) if sensed.position is None else sensed.position
+    load = finger.load(time) if sensed.normal_load is None else sensed.normal_load
     sliding = abs(np.gradient(position, 1 / rate)) >= parameters.least_speed  # NaN, lifted, is not
     sliding[: round(rate / MODULATION)] = False
     if not sliding.any():
         raise DesignError(f"finger: must slide faster than {parameters.least_speed:g} m/s while the screen is measured")
     columns = np.column_stack([load, most**2 * (1 + np.cos(phase)) / 2, most**2 * np.sin(phase)])[sliding]
-    friction = sensed.sensed[: len(time), 0][sliding]
+    friction = sensed.sensed[sliding, 0]
     found = np.linalg.lstsq(columns, friction, rcond=None)[0]
     residual = friction - columns @ found
     mu, gain = found[0], found[1] / found[0]
@@ -124,26 +123,6 @@ def identify_screen(
     changing = columns[:, 1:] @ found[1:]
     names = ("friction_coefficient", "open_loop_gain")
     return _found("electroadhesion", names, values, halves, residual, changing - changing.mean())
-
-
-def _check(driver: Driver) -> None:
-    check_driver(driver)
-    for name in ("drive_channels", "sensed_channels"):
-        if getattr(driver, name) != 1:
-            raise ValueError(f"{type(driver).__name__}: {name} = {getattr(driver, name)}: must be 1 to be identified")
-
-
-def _play(driver: Driver, drive: Array) -> Sensed:
-    """Play a drive (n,), then at least a block of zeros, and return what was sensed."""
-    padded = np.append(drive, np.zeros(-len(drive) % driver.block + driver.block))[:, None]
-    blocks = np.split(padded, len(padded) // driver.block)
-    try:
-        played = [check_sensed(driver, driver.play(block)._replace(motion=None), 0) for block in blocks]
-    except BaseException:
-        driver.play(np.zeros_like(blocks[0]))
-        raise
-    columns: Any = [None if each[0] is None else np.concatenate(each) for each in zip(*played, strict=True)]
-    return Sensed(*columns)
 
 
 def _spread(jacobian: Array, residual: Array) -> Array:

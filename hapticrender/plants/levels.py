@@ -65,11 +65,6 @@ class LeastModel:
     tolerance: float
 
     @property
-    def left_out(self) -> tuple[str, ...]:
-        """Names of the levels taken."""
-        return tuple(level.name for level in self.levels if level.taken)
-
-    @property
     def text(self) -> str:
         """One line for every level tried."""
         lines = [str(level) for level in self.levels] or ["the device has one level only"]

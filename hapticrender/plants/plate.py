@@ -1,21 +1,14 @@
 """The vibrotactile plate of Grigorii et al. 2021: two coils, a sheet of glass, Hall sensors at its ends, a finger.
 
-Equations, with q = [x_c, a theta], a = coil_spacing/2, side 1 at -a, finger at p::
+With q = [x_c, a theta], a = coil_spacing/2, the finger at p, and the displacement e of the sensors in the first
+free-free bending mode of shape phi (docs/theory.md, section 3, with corrections to the paper)::
 
     (M s^2 + C s + K) q = force_constant [[1, 1], [-1, 1]] i - F_f [1, p/a]
-    M = diag(m, I/a^2), K = [[k1+k2, k2-k1], [k2-k1, k1+k2]], C alike
-    F_f = W + Z_f(s) s (x_c + p theta)
-
-The paper's own force equations carry (m/2) x_i'' -+ (I/2) theta'', which is dimensionally wrong; the form above is
-(m/2) x_c'' -+ (I/d) theta''.
-
-As a further level the glass bends: a displacement e of the sensors in the first free-free bending mode, of shape phi
-(1 at the sensors), adds phi(x) e at x and obeys, with the damping ratio zeta and m_b its modal mass::
-
     m_b (e'' + 2 zeta w_b e' + w_b^2 e) = phi_coil force_constant (i_1 + i_2) - phi(p) F_f
+    F_f = W + Z_f(s) s (x_c + p theta + phi(p) e)
 
-and the finger moves with x_c + p theta + phi(p) e.  Frequency and damping are those measured on the free plate, its
-suspension included, so that the finger alone couples the mode to heave and rocking.
+Frequency and damping of that mode are those measured on the free plate, its suspension included, so that the finger
+alone couples the mode to heave and rocking.
 """
 
 from __future__ import annotations
@@ -32,7 +25,7 @@ from hapticrender.checks import Validated, parameter
 from hapticrender.control.damping import BendingMode
 from hapticrender.control.device_model import DeviceModel
 from hapticrender.mathx import zoh
-from hapticrender.plants.compiled import CompiledPlant, aligned_record
+from hapticrender.plants.compiled import CompiledPlant, new_record
 from hapticrender.plants.plate_kernels import COLUMNS, FUNCTIONS, NODES, PLATE, plate_step
 from hapticrender.protocols import Array
 from hapticrender.touch.mechanics import NONE, FingerMechanics
@@ -290,34 +283,40 @@ class Plate(CompiledPlant):
 
 def _record(parameters: PlateParameters, mechanics: FingerMechanics) -> Array:
     """State of the compiled plate at rest, its drive not queued."""
-    s, period = aligned_record(PLATE), 1.0 / parameters.rate
-    free, loaded = structure(parameters), structure(parameters, mechanics)
+    p, period = parameters, 1.0 / parameters.rate
+    free, loaded = structure(p), structure(p, mechanics)
     many, scales = len(free.mass), (-(period**2), -period, period**2)
-    kept = np.flatnonzero([True, parameters.degrees_of_freedom == 2, parameters.bending_frequency > 0.0])
+    kept = np.flatnonzero([True, p.degrees_of_freedom == 2, p.bending_frequency > 0.0])
+    s = new_record(
+        PLATE,
+        p,
+        columns=COLUMNS,
+        channels=p.coils,
+        held=np.nan,
+        bent_at=np.nan,
+        lever=np.nan,
+        strength=np.nan,
+        period=period,
+        lever_per_metre=1.0 / p.half_spacing,
+        reach=p.glass_length / p.coil_spacing,
+        nodes_per_lever=(NODES - 1) / (2.0 * (p.glass_length / p.coil_spacing)),
+        amplifier=p.amplifier_gain / NOMINAL_AMPLIFIER,
+        sensor_limit=p.sensor_range / 2,
+        sensor_gain=(p.sensor_gain_1, p.sensor_gain_2),
+        **{name: function.address for name, function in FUNCTIONS.items()},
+    )
     for first, matrix, scale in zip((0, 4), (free.stiffness, free.damping), scales, strict=False):
         s["free"][0, first + kept[:, None], kept] = scale * matrix
-    s["free"][0, 8 : 8 + parameters.coils][:, kept] = scales[2] * free.inputs[:, :-1].T
+    s["free"][0, 8 : 8 + p.coils][:, kept] = scales[2] * free.inputs[:, :-1].T
     s["inverse_mass"][0, kept] = 1.0 / free.mass.diagonal()
-    if parameters.finger_dynamics and mechanics.order:
+    if p.finger_dynamics and mechanics.order:
         s["skin"] = period**2 * mechanics.stiffness, period * mechanics.damping, mechanics.mass
     if len(loaded.mass) > many:
         s["inverse_mass"][0, 3] = 1.0 / loaded.mass[-1, -1]
         s["phalanx"] = period**2 * mechanics.phalanx_stiffness, period * mechanics.phalanx_damping
     s["outputs"][0][:, kept] = free.outputs[:3]
     s["system"][0, 4:8, :4] = np.eye(4)
-    s["held"] = s["bent_at"] = s["lever"] = s["strength"] = np.nan
-    if parameters.bending_frequency > 0.0:
-        wavenumber, *weights = parameters.bending_bar
-        s["shape"] = wavenumber * parameters.half_spacing, *weights
-    s["lever_per_metre"], s["period"], s["rate"] = 1.0 / parameters.half_spacing, period, parameters.rate
-    s["reach"] = parameters.glass_length / parameters.coil_spacing
-    s["nodes_per_lever"] = (NODES - 1) / (2.0 * s["reach"])
-    s["amplifier"] = parameters.amplifier_gain / NOMINAL_AMPLIFIER
-    for name in ("current_limit", "current_step", "sensor_step", "sensor_noise"):
-        s[name] = getattr(parameters, name)
-    s["sensor_limit"] = parameters.sensor_range / 2
-    s["sensor_gain"] = parameters.sensor_gain_1, parameters.sensor_gain_2
-    s["channels"], s["columns"] = parameters.coils, COLUMNS
-    for name, function in FUNCTIONS.items():
-        s[name] = function.address
+    if p.bending_frequency > 0.0:
+        wavenumber, *weights = p.bending_bar
+        s["shape"] = wavenumber * p.half_spacing, *weights
     return s

@@ -1,16 +1,13 @@
 """The sliding contact that every friction device shares, and a tribometer.
 
-A device sets the steady friction force F_s.  The friction F on a finger sliding at speed v follows it over the
-contact's memory length delta (Balasubramanian, Pool and Vardar 2025), and the tribometer under the surface measures F
-through its own resonance (F_t)::
+The steady friction force F_s, the friction F on the finger and the measured one F_t (docs/theory.md, "Sliding contact";
+Balasubramanian, Pool and Vardar 2025)::
 
-    (delta/|v|) F' + F = F_s
-    F_t'' + 2 zeta w0 F_t' + w0^2 F_t = w0^2 F
+    (delta/|v|) F' + F = F_s,     F_t'' + 2 zeta w0 F_t' + w0^2 F_t = w0^2 F
 
 Below `least_speed` the contact sticks and keeps its friction; a lifted finger has none.  Friction is positive against
 the motion, in either direction.  A step outputs the state at the start of a sample, then advances: exactly for a steady
-friction and a speed that are constant over the sample; the tribometer is exact for a friction that changes linearly
-within it.
+friction and a speed that are constant over the sample, and a friction that changes linearly within it (tribometer).
 """
 
 from __future__ import annotations
@@ -23,7 +20,7 @@ import numpy as np
 
 from hapticrender.checks import Validated, parameter
 from hapticrender.jit import kernel
-from hapticrender.plants.compiled import quantise
+from hapticrender.plants.compiled import new_record, quantise
 from hapticrender.protocols import Array
 
 SLIDING = np.dtype(
@@ -92,19 +89,6 @@ class SlidingParameters(Validated):
     def _shift(self, frequency: Any) -> Any:
         """Return z = exp(j w T)."""
         return np.exp(2j * np.pi * np.asarray(frequency, float) / self.rate)
-
-
-def new_record(dtype: np.dtype[Any], *sources: object, **values: Any) -> Array:
-    """Return a record (shape (1,)) with numbers of the same name from `sources`, or from `values`; the rest is zero."""
-    record = np.zeros(1, dtype)
-    for name in dtype.names or ():
-        for source in sources:
-            value = getattr(source, name, None)
-            if isinstance(value, (int, float, complex)):
-                record[name] = value
-        if name in values:
-            record[name] = values[name]
-    return record
 
 
 def sliding_record(parameters: SlidingParameters) -> Array:

@@ -18,9 +18,9 @@ from hapticrender.checks import check_names, option, parameter
 from hapticrender.control.controller import BankController
 from hapticrender.control.damping import within_a_turn
 from hapticrender.control.device_model import DeviceModel, FingerRange
-from hapticrender.plants.compiled import CompiledPlant
+from hapticrender.plants.compiled import CompiledPlant, new_record
 from hapticrender.plants.friction_laws import LAWS, FrictionLaw
-from hapticrender.plants.sliding_contact import SlidingParameters, new_record, sliding_record
+from hapticrender.plants.sliding_contact import SlidingParameters, sliding_record
 from hapticrender.plants.ultrasonic import LEVELS, UltrasonicParameters, mode_inputs, mode_record
 from hapticrender.plants.ultrasonic_kernels import AMPLITUDE, SURFACE, surface_step
 from hapticrender.protocols import Array

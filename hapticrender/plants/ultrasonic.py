@@ -1,19 +1,11 @@
 """An ultrasonic plate: one flexural mode, driven at its resonance, whose amplitude reduces friction.
 
-Equation, with the modal displacement q and the drive u::
+With the modal displacement q and the drive u, ``m q'' + (b + b_f) q' + m w^2 q = N u``; the finger adds the damping b_f
+and shifts the resonance, both with the cube root of its load.  The friction that it leaves is that of `surface`.
 
-    m q'' + (b + b_f) q' + m w^2 q = N u
-
-The finger adds the damping b_f and shifts the resonance, both with the cube root of its load.  Its
-displacement is evaluated here; the friction that it leaves is that of `surface`.
-
-The carrier need not be simulated where it is.  With x = Re a e^(j w_d t) and u alike, the complex envelope obeys::
-
-    a' = -(s0 - j dw) a + N/(2 j m w) u,    s0 = b/2m,  dw = w - w_d
-
-up to the order W/w of its own frequency W.  A mode moved down to w_i with m_i = m w/w_i and b_i = b w/w_i, resonance
-shifts kept in Hz and N kept, has the same envelope: D_i(j w_i) = j w b = D(j w), and s0 and m w are the same.
-That is the level "envelope": still a mode on a carrier, for the same controller, at a fraction of the rate.
+At level "envelope" the mode is moved from w down to w_i with m_i = m w/w_i and b_i = b w/w_i, resonance shifts kept in
+Hz and N kept: its envelope is the same, for the same controller, at a fraction of the rate (docs/theory.md, "Ultrasonic
+mode").
 """
 
 from __future__ import annotations
@@ -26,8 +18,7 @@ import numpy as np
 
 from hapticrender.checks import Validated, option, parameter
 from hapticrender.control.device_model import DeviceModel
-from hapticrender.plants.compiled import LOAD, STRENGTH, CompiledPlant
-from hapticrender.plants.sliding_contact import new_record
+from hapticrender.plants.compiled import LOAD, STRENGTH, CompiledPlant, new_record
 from hapticrender.plants.ultrasonic_kernels import MODE, ultrasonic_step
 from hapticrender.protocols import Array
 
