@@ -26,13 +26,13 @@ GAINS = BankGains(
     lead=1.5 / RATE,
     observer=2 * 2 * math.pi * 10.0 / RATE,
     observer_high=2 * 2 * math.pi * 20.0 / RATE,
-    integral_low=2.0,
+    integral=2.0,
     integral_medium=15.0,
     integral_high=25.0,
     dc=1.6 * 2 * math.pi * 6.0 / RATE,
     dc_drift=(2 * math.pi * 6.0 / RATE) ** 2,
-    inner=0.0,
-    inner_high=1.0,
+    damper=0.0,
+    damper_high=1.0,
     crowd_speed=0.0,
     lowest=20.0,
     highest=1000.0,
@@ -89,13 +89,13 @@ def test_an_inner_damper_too_strong_is_softened_first():
     assert "inner damper (high) softened to" in checked.notes[0]
     assert "gain margin 2.7" in checked.notes[0]
     assert checked.margins["high"].gain >= 4.0
-    assert 0.5 < checked.gains.inner_high < 1.0
+    assert 0.5 < checked.gains.damper_high < 1.0
     assert checked.gains.observer_high == GAINS.observer_high
 
 
 def test_a_design_that_no_bandwidth_saves_is_refused():
     """Observer and integral in a fixed ratio peak alike at any speed: modulus below 0.9 where 0.9 is required."""
-    same = replace(GAINS, integral_low=17.0, integral_medium=17.0, integral_high=17.0, observer_high=GAINS.observer)
+    same = replace(GAINS, integral=17.0, integral_medium=17.0, integral_high=17.0, observer_high=GAINS.observer)
     with pytest.raises(DesignError, match=r"modulus margin 0\.8\d at 1\d\d(\.\d)? Hz is below 0\.90 \(low"):
         checked_gains(MODEL, at(170.0), same, least=LeastMargins(modulus=0.9))
 

@@ -30,7 +30,7 @@ MOST_INVALID, MOST_REPEATS, LEAST_ENERGY = 0.02, 0.6, 0.02
 MOST_RESIDUAL, MOST_WORSE = 0.35, 0.05
 SCALES, DELAY_TOLERANCE = (0.6, 1.6), 2  # samples
 ONE, SWAP = np.eye(2), np.eye(2)[::-1]
-WIRINGS = {  # what is not as told: sensors (rows are what is sensed), actuators
+WIRINGS = {  # what is not as stated: sensors (rows are what is sensed), actuators
     "nothing": (ONE, ONE),
     "sensor 1 is inverted": (np.diag([-1.0, 1.0]), ONE),
     "sensor 2 is inverted": (np.diag([1.0, -1.0]), ONE),
@@ -50,9 +50,9 @@ WIRINGS = {  # what is not as told: sensors (rows are what is sensed), actuators
 class Found(NamedTuple):
     """Result of a probe."""
 
-    fault: str  # what is not as told; "" where nothing was found
-    residual: float  # of the wiring as told
-    scale: float  # of the answer over that of the model, 1 where all is as told
+    fault: str  # what is not as stated; "" where nothing was found
+    residual: float  # of the wiring as stated
+    scale: float  # of the answer over that of the model, 1 where all is as stated
     delay: int  # samples, of the loop
 
 
@@ -64,7 +64,7 @@ def probe_plate(driver: Driver, model: DeviceModel) -> None:
     Raises
     ------
     DeviceFault
-        What is not as told was found in every try.
+        A deviation from the model was found in every try.
     """
     model = replace(model, delay=model.delay + getattr(driver, "play_delay", driver.delay) - driver.delay)
     drive = probe_drive(model)
@@ -96,18 +96,18 @@ def probe_drive(model: DeviceModel) -> Array:
 
 
 def judge(model: DeviceModel, drive: Array, sensed: Array) -> Found:
-    """Compare what was sensed (n, 2) under `drive` (n, 2) with the model's answers, and name what is not as told."""
-    told = model.delay - model.block
-    first = max(told - DELAYS // 2, 0)
+    """Compare what was sensed (n, 2) under `drive` (n, 2) with the model's answers, and name the deviation."""
+    stated = model.delay - model.block
+    first = max(stated - DELAYS // 2, 0)
     valid = np.asarray((abs(sensed) < model.sensed_limit).all(axis=1))
     repeats = (np.diff(sensed, axis=0) == 0.0).mean(axis=0)
     if (~valid).mean() > MOST_INVALID:
         return Found(f"{(~valid).mean():.0%} of the samples are invalid", np.nan, np.nan, -1)
     y = _detrended(np.where(valid[:, None], sensed, 0.0))
-    expected = _detrended(_late(_answers(model, drive).sum(axis=0), told))
-    energy, told_energy = float((y**2).sum()), float((expected**2).sum())
-    if energy < LEAST_ENERGY * told_energy:
-        return Found("nothing moves: sensors or actuators are dead", np.nan, (energy / told_energy) ** 0.5, -1)
+    expected = _detrended(_late(_answers(model, drive).sum(axis=0), stated))
+    energy, model_energy = float((y**2).sum()), float((expected**2).sum())
+    if energy < LEAST_ENERGY * model_energy:
+        return Found("nothing moves: sensors or actuators are dead", np.nan, (energy / model_energy) ** 0.5, -1)
     if (repeats > MOST_REPEATS).any():
         return Found(f"sensor {1 + int(repeats.argmax())} repeats its values", np.nan, np.nan, -1)
     residuals = {}
