@@ -16,7 +16,7 @@ import numpy as np
 
 from hapticrender.control.device_model import DeviceModel
 from hapticrender.control.linear import Sampled
-from hapticrender.control.margins import LEAST, LeastMargins, Margins, margins_of, unstable_poles
+from hapticrender.control.margins import LEAST, Margins, margins_of, unstable_poles
 from hapticrender.control.records import MOST_TAPS
 from hapticrender.protocols import Array
 
@@ -26,7 +26,6 @@ QUALITY, QUALITY_UNMEASURED = 1.4, 2.0  # the least Q, with the bending mode kno
 QUALITY_STEP = 0.1
 WORTH = 4.0  # the damper is off where it cannot add so many times the mode's own damping
 REACHES = (0.6, 0.7, 0.8, 0.9, 1.0)  # of a bending period: how long notched taps may reach back
-LOOSE = LeastMargins(modulus=0.2, delay=0.0, phase=0.0, gain=1.0)  # with the bending mode at an end of its spread
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -193,15 +192,14 @@ def choose_damping(
     model: DeviceModel,
     *,
     bending: BendingMode | None = None,
-    least: LeastMargins = LEAST["damper"],
     apart: bool = False,
 ) -> Damping:
     """Design the inner damper: the most damping whose margins hold, or none, and why.
 
-    Q rises in steps of 0.1 until every coordinate keeps `least`, with the bending mode where it was measured, and Ms
-    stays below 5 with that mode at both ends of its tolerance.  Q starts at 1.4 where that mode is measured or the
-    model is rigid, else at 2.  Where even a damper of four times the modes' own damping would not do, the damper is
-    off.  Notched taps reach back 0.6 to 1 bending period; the reach with the least noise is taken.
+    Q rises in steps of 0.1 until every coordinate keeps the damper's least margins, with the bending mode where it was
+    measured, and Ms stays below 5 with that mode at both ends of its tolerance.  Q starts at 1.4 where that mode is
+    measured or the model is rigid, else at 2.  Where even a damper of four times the modes' own damping would not do,
+    the damper is off.  Notched taps reach back 0.6 to 1 bending period; the reach with the least noise is taken.
 
     `apart`: every coordinate has a Q of its own, so that rocking, which a symmetric bending mode does not couple into,
     is damped from Q 1.4 on and without a notch.
@@ -209,12 +207,12 @@ def choose_damping(
     if not (model.mass.diagonal() > 0.0).all():
         return _off(len(model.mass), "the device has no mode")
     known, parts = model.rigid if bending is None else bending.measured, oscillators(model)
-    whole = _chosen(parts, QUALITY if known else QUALITY_UNMEASURED, bending, model.taps, least)
+    whole = _chosen(parts, QUALITY if known else QUALITY_UNMEASURED, bending, model.taps)
     if bending is None or not apart or not whole.margins:
         return whole
     for i, part in enumerate(parts):
         if bending.coupling[i] == 0.0:
-            whole = _replaced(whole, i, _chosen((part,), QUALITY, None, model.taps, least))
+            whole = _replaced(whole, i, _chosen((part,), QUALITY, None, model.taps))
     return whole
 
 
@@ -242,9 +240,7 @@ def _turns(parts: tuple[Oscillator, ...]) -> float:
 
 
 @lru_cache(maxsize=256)
-def _chosen(
-    parts: tuple[Oscillator, ...], least_quality: float, bending: BendingMode | None, plain: int, least: LeastMargins
-) -> Damping:
+def _chosen(parts: tuple[Oscillator, ...], least_quality: float, bending: BendingMode | None, plain: int) -> Damping:
     """Raise Q until the margins hold; `plain` taps where no bending mode is known."""
     rate, delay = parts[0].rate, parts[0].delay
     largest = 1 / (2 * WORTH * max(*(part.ratio for part in parts), LEAST_RATIO))
@@ -258,7 +254,7 @@ def _chosen(
     for step in range(int((largest - least_quality) / QUALITY_STEP) + 1):
         quality = round(least_quality + step * QUALITY_STEP, 1)
         designs = [_taps(parts, quality, bending, count, plain) for count in _counts(rate, bending, plain)]
-        complaints = [_complaint(parts, taps, bending, least) for taps in designs]
+        complaints = [_complaint(parts, taps, bending) for taps in designs]
         kept = [damper_loops(parts, taps, bending) for taps, each in zip(designs, complaints, strict=True) if not each]
         if kept:
             noises = [tuple(loop.noise() for loop in loops) for loops in kept]
@@ -284,11 +280,14 @@ def _counts(rate: float, bending: BendingMode | None, plain: int) -> list[int]:
     return sorted({min(max(TAPS + 2, 1 + round(span * rate / bending.frequency)), MOST_TAPS) for span in REACHES})
 
 
-def _complaint(parts: tuple[Oscillator, ...], taps: Array, bending: BendingMode | None, least: LeastMargins) -> str:
+def _complaint(parts: tuple[Oscillator, ...], taps: Array, bending: BendingMode | None) -> str:
     """First margin that falls short, with the bending mode at its place and at the ends of its tolerance."""
-    cases = [(bending, least, "")]
+    cases = [(bending, LEAST["damper"], "")]
     if bending is not None:
-        cases += [(corner, LOOSE, f" with the bending mode at {corner.frequency:g} Hz") for corner in bending.corners()]
+        cases += [
+            (corner, LEAST["spread"], f" with the bending mode at {corner.frequency:g} Hz")
+            for corner in bending.corners()
+        ]
     for mode, bound, where in cases:
         for loop in damper_loops(parts, taps, mode):
             if complaint := bound.complaint(loop.margins(), loop.part.rate):

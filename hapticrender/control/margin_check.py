@@ -62,8 +62,6 @@ class BankGains:
 
     def at(self, level: str) -> tuple[float, float, float]:
         """Return observer gain, integral gain and inner damper at a level of the schedule."""
-        if level not in SCHEDULE:
-            raise ValueError(f"{level=} must be one of {', '.join(SCHEDULE)}")
         fast, slow = SCHEDULE[level]
         integral = self.integral + slow * (self.integral_medium - self.integral)
         return (
