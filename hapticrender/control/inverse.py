@@ -76,21 +76,21 @@ def derivative_filters(rate: float, top: float, first: int = 0, count: int = 4, 
     return found
 
 
-def people(count: int = PEOPLE, seed: int = SEED) -> tuple[Array, Array]:
-    """Frequencies (Hz, shape (f,)) and dynamic stiffnesses z(j w) of fingers (N/m, shape (count, f)).
+def people() -> tuple[Array, Array]:
+    """Frequencies (Hz, shape (f,)) and dynamic stiffnesses z(j w) of `PEOPLE` fingers (N/m, shape (PEOPLE, f)).
 
     Log-uniform: 1-10 g, 0.3-4 N s/m, 60-900 N/m; three in four behind a skin of 0.1-0.5 g, 0.5-12 N s/m and
     400-12000 N/m.
     """
-    random, frequency = np.random.default_rng(seed), np.linspace(20.0, 500.0, 97)
+    random, frequency = np.random.default_rng(SEED), np.linspace(20.0, 500.0, 97)
     s = 2j * np.pi * frequency
 
     def drawn(low: float, high: float) -> Array:
-        return np.exp(random.uniform(np.log(low), np.log(high), (count, 1)))
+        return np.exp(random.uniform(np.log(low), np.log(high), (PEOPLE, 1)))
 
     whole = drawn(1e-3, 1e-2) * s**2 + drawn(0.3, 4.0) * s + drawn(60.0, 900.0)
     mass, skin = drawn(1e-4, 5e-4) * s**2, drawn(0.5, 12.0) * s + drawn(400.0, 12e3)
-    behind = random.uniform(size=(count, 1)) < 0.75
+    behind = random.uniform(size=(PEOPLE, 1)) < 0.75
     return frequency, np.where(behind, mass + skin * whole / (skin + whole), whole)
 
 

@@ -99,7 +99,7 @@ def judge(model: DeviceModel, drive: Array, sensed: Array) -> Found:
     """Compare what was sensed (n, 2) under `drive` (n, 2) with the model's answers, and name the deviation."""
     stated = model.delay - model.block
     delays = range(max(stated - DELAYS // 2, 0), max(stated - DELAYS // 2, 0) + DELAYS)
-    expected = {}
+    expected: dict[tuple[str, int], Array] = {}
     for name, (sensors, actuators) in WIRINGS.items():
         answer = _answer(model, drive @ actuators.T) @ sensors.T
         expected |= {(name, delay): _detrended(_late(answer, delay)) for delay in delays}
