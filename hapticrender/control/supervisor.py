@@ -38,7 +38,7 @@ INVALID_TIME = 50e-3  # s
 FROZEN_SAMPLES, FROZEN_TIME = 10, 2e-3  # s; noise of 1 um in steps of 0.12 um repeats a sample with p = 0.034
 FROZEN_SIGMAS = 4 * 1.3  # of the noise: the drive must have moved the sensor by so much
 LEAST_NOISE = 1e-4  # of a sensor's range: a model may state no noise, and no steps
-FINGER_STIFFNESS, FINGER_DAMPING, LEVER = 8e3, 10.0, 2.0  # N/m, N s/m, |p/a|: no finger has more
+FINGER_STIFFNESS, FINGER_DAMPING = 8e3, 10.0  # N/m, N s/m: no finger has more
 MODEL_ERROR, DELAY_ERROR, LOAD = 0.1, 1.2, 1.15  # of D; samples; of K: a pressing hand shows r = -K x
 NOISE_VARIANCES = 12.0
 POWER_TIME = 12e-3  # s
