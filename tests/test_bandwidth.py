@@ -26,13 +26,13 @@ GAINS = BankGains(
     lead=1.5 / RATE,
     observer=2 * 2 * math.pi * 10.0 / RATE,
     observer_high=2 * 2 * math.pi * 20.0 / RATE,
-    integral_low=2.0,
+    integral=2.0,
     integral_medium=15.0,
     integral_high=25.0,
     dc=1.6 * 2 * math.pi * 6.0 / RATE,
     dc_drift=(2 * math.pi * 6.0 / RATE) ** 2,
-    inner=0.0,
-    inner_high=1.0,
+    damper=0.0,
+    damper_high=1.0,
     crowd_speed=0.0,
     lowest=20.0,
     highest=1000.0,
@@ -60,14 +60,6 @@ def test_gains_and_margins_are_the_recorded_ones(case):
         assert growth == pytest.approx(case["growth"][level], rel=1e-6, abs=1e-6)
 
 
-def test_a_sound_design_is_left_alone():
-    checked = checked_gains(MODEL, at(170.0), GAINS, taps=TAPS, least=USUAL)
-    assert checked.gains == GAINS
-    assert checked.notes == ()
-    assert set(checked.margins) == set(SCHEDULE)
-    assert all(margins.stable and margins.modulus >= 0.5 for margins in checked.margins.values())
-
-
 def test_a_bandwidth_too_wide_is_lowered_no_further_than_need_be():
     """An observer of 60 Hz on 20 Hz: unstable; lowered by quarter octaves until Ms <= 2."""
     wide = replace(GAINS, observer_high=2 * 2 * math.pi * 60.0 / RATE, integral_high=204.0)
@@ -89,30 +81,15 @@ def test_an_inner_damper_too_strong_is_softened_first():
     assert "inner damper (high) softened to" in checked.notes[0]
     assert "gain margin 2.7" in checked.notes[0]
     assert checked.margins["high"].gain >= 4.0
-    assert 0.5 < checked.gains.inner_high < 1.0
+    assert 0.5 < checked.gains.damper_high < 1.0
     assert checked.gains.observer_high == GAINS.observer_high
 
 
 def test_a_design_that_no_bandwidth_saves_is_refused():
     """Observer and integral in a fixed ratio peak alike at any speed: modulus below 0.9 where 0.9 is required."""
-    same = replace(GAINS, integral_low=17.0, integral_medium=17.0, integral_high=17.0, observer_high=GAINS.observer)
+    same = replace(GAINS, integral=17.0, integral_medium=17.0, integral_high=17.0, observer_high=GAINS.observer)
     with pytest.raises(DesignError, match=r"modulus margin 0\.8\d at 1\d\d(\.\d)? Hz is below 0\.90 \(low"):
         checked_gains(MODEL, at(170.0), same, least=LeastMargins(modulus=0.9))
-
-
-def test_carriers_locked_to_the_finger_are_checked_at_its_speeds():
-    """A grating and its third: their loops at five speeds, and the smallest of every margin."""
-    wavenumber, zero = np.array([1000.0, 3000.0]), np.zeros(2)
-    slow = replace(GAINS, observer_high=GAINS.observer, integral_high=GAINS.integral_medium)
-    checked = checked_gains(MODEL, zero, slow, wavenumber=wavenumber, least=LeastMargins(modulus=0.1, gain=1.1))
-    assert checked.notes == ()
-    loops = [
-        error_loop(MODEL, zero, slow, wavenumber=wavenumber, speed=speed)
-        for speed in np.geomspace(20.0 / 1000.0, 1000.0 / 3000.0, 5)
-    ]
-    assert loops[0].frequency.tolist() == [20.0, 60.0]
-    assert checked.margins["high"].modulus == pytest.approx(min(loop.margins().modulus for loop in loops), rel=1e-9)
-    assert checked.margins["high"].delay == pytest.approx(min(loop.margins().delay for loop in loops), rel=1e-9)
 
 
 def test_a_carrier_out_of_range_fades_out_and_crowded_ones_slow_down():
@@ -153,8 +130,3 @@ def test_the_margin_of_a_loop_is_that_of_a_brute_force_search():
     values = np.linalg.inv(np.eye(2) + loop.loop(np.exp(2j * np.pi * fine / RATE)))
     peak = np.linalg.norm(values, 2, axis=(1, 2)).max()
     assert loop.margins().peak_sensitivity == pytest.approx(peak, rel=1e-3)
-
-
-def test_an_unknown_level_is_refused():
-    with pytest.raises(ValueError, match="level='quiet' must be one of low, medium, high"):
-        error_loop(MODEL, at(170.0), GAINS, "quiet")

@@ -178,6 +178,17 @@ def test_a_measured_mode_lets_the_quality_down(rate, coil, quality):
         assert holds(chosen.taps[HEAVE], rate, 1, bending(coil, frequency))
 
 
+def test_a_coordinate_with_a_design_of_its_own_may_have_more_taps_than_the_notched_one():
+    """Eight plain taps beside the five that spare the bending mode: both are padded with zeros, the other one stays."""
+    model, mode = replace(model_of(5000), taps=8), bending(-0.1, 2000.0)
+    whole, own = choose_damping(model, bending=mode), choose_damping(model, bending=mode, apart=True)
+    assert whole.taps.shape[1] < own.taps.shape[1] == 8
+    np.testing.assert_array_equal(own.taps[HEAVE, : whole.taps.shape[1]], whole.taps[HEAVE])
+    assert not own.taps[HEAVE, whole.taps.shape[1] :].any()
+    quality = float(own.note.rpartition("; coordinate 2 Q ")[2])
+    np.testing.assert_array_equal(own.taps[ROCKING], damping_taps(model, quality)[0][ROCKING])
+
+
 def test_a_slow_or_late_loop_raises_the_quality_or_switches_off():
     """32 samples at 48 kHz can still be borne; a period of the mode, or 500 Hz, cannot."""
     assert choose_damping(model_of(48000, 32)).quality == 2.1

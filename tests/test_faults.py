@@ -178,7 +178,7 @@ def test_a_device_that_is_unplugged_raises_device_lost(tmp_path):
     assert not plate.played[-1].any()  # that was tried
 
 
-WIRED = {  # what is wrong from the start, and what the probe calls it
+WIRED = {  # what is wrong from the start, and what the probe calls it; polarities are in test_supervisor.py
     "stuck": ({"spoil": lambda sample, sensed: sensed._replace(sensed=np.full((1, 2), 3e-6))}, "nothing moves"),
     "one stuck": (
         {"spoil": lambda sample, sensed: sensed._replace(sensed=np.array([[3e-6, sensed.sensed[0, 1]]]))},
@@ -186,8 +186,6 @@ WIRED = {  # what is wrong from the start, and what the probe calls it
     ),
     "gain of 3": ({"sensors": 3.0 * np.eye(2)}, "have (2.9|3|3.1) times the gain"),
     "NaN": ({"spoil": lambda sample, sensed: sensed._replace(sensed=np.full((1, 2), np.nan))}, "100% of the samples"),
-    "inverted": ({"sensors": -np.eye(2)}, "both sensors, or all actuators, are inverted"),
-    "swapped": ({"sensors": np.eye(2)[::-1]}, "swapped"),
 }
 
 

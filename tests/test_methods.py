@@ -1,36 +1,24 @@
 """What every control method promises, and where the plain ones stop: the figures of FACTS section 3 on this plate."""
 
-import dataclasses
-
 import numpy as np
 import pytest
-from held import amplitude_error
+from held import amplitude_error, fixed, grating, hold
 
 import hapticrender as hr
 from hapticrender.bands import Bands
 from hapticrender.control.estimators import StarSTDFT
-from hapticrender.control.methods import (
-    METHODS,
-    Resonant,
-    least_decay,
-)
+from hapticrender.control.methods import METHODS, Resonant, least_decay
 from hapticrender.plants.plate import Plate, PlateParameters
 
 RATE = 5000.0
 WANTED = 10e-6
-IDEAL = {"sensor_noise": 0.0, "sensor_bits": 0, "current_bits": 0}
-QUIET = {"sensor_noise": 0.0}
+IDEAL = PlateParameters(sensor_noise=0.0, sensor_bits=0, current_bits=0)
+MODEL = IDEAL.device_model(RATE, 1)
 POLAR = ("paper", "paper-common", "boxcar")
 
 
-def tones(*frequency, envelope=WANTED):
-    frequency = np.array(frequency, float)
-    return Bands(
-        frequency=frequency,
-        wavenumber=np.zeros(len(frequency)),
-        phase=np.zeros(len(frequency)),
-        envelope=np.full(len(frequency), envelope, complex),
-    )
+def tones(*frequency):
+    return fixed(*((each, WANTED) for each in frequency))
 
 
 def mixed():
@@ -43,24 +31,6 @@ def mixed():
     )
 
 
-def designed(method, bands, overrides=None, **options):
-    method = METHODS[method] if isinstance(method, str) else method
-    return method.design(PlateParameters(**(overrides or {})).device_model(RATE, 1), bands, **options)
-
-
-def hold(method, bands, seconds, overrides=IDEAL, wanted=None, finger=None):
-    """Run the closed loop; returns drive and sensed."""
-    plate = Plate(PlateParameters(**overrides), finger or hr.Finger.absent())
-    waveform = np.zeros(round(seconds * RATE)) if wanted is None else wanted
-    drive, _, _, sensed = plate.closed_loop(designed(method, bands, overrides), waveform)
-    return drive, sensed
-
-
-def error(motion, frequency, seconds=1.0):
-    """Relative error of the amplitude at each place over the last `seconds`, which hold whole periods."""
-    return amplitude_error(motion, frequency, WANTED, seconds)
-
-
 def steps_of(n, rng):
     """A noisy, moving, at times lifted finger as n samples of what a controller is given."""
     time = np.arange(n) / RATE
@@ -71,9 +41,9 @@ def steps_of(n, rng):
 @pytest.mark.parametrize("name", METHODS)
 def test_any_split_into_blocks_gives_the_same_run(name, rng):
     sensed, position, wanted = steps_of(1000, rng)
-    whole = designed(name, mixed()).run(sensed, position, wanted)
+    whole = METHODS[name].design(PlateParameters().device_model(RATE, 1), mixed()).run(sensed, position, wanted)
     assert abs(whole[0]).max() > 1e-3
-    pieces = designed(name, mixed())
+    pieces = METHODS[name].design(PlateParameters().device_model(RATE, 1), mixed())
     cuts = [1, 2, 255, 256, 700]
     parts = [
         pieces.run(*rows)
@@ -86,7 +56,6 @@ def test_any_split_into_blocks_gives_the_same_run(name, rng):
 @pytest.mark.parametrize("name", sorted(set(METHODS) - {"inverse"}))  # it expects a finger where one is said to be
 def test_a_grating_felt_backwards_is_the_same_function_of_time(name):
     """cos(2 pi x/wavelength) at +v and -v; and a finger that turns round at 0.6 s meets it again in mirror image."""
-    bands = dataclasses.replace(tones(0.0), wavenumber=np.array([5000.0]))
     time = np.arange(6001) / RATE
     motion = {}
     for way, position in (
@@ -96,7 +65,7 @@ def test_a_grating_felt_backwards_is_the_same_function_of_time(name):
         ("turned, below", -0.01 * np.abs(time - 0.6)),
     ):
         finger = hr.Finger.sampled(position, rate=RATE, normal_load=0.0, mechanics="none")
-        motion[way] = hold(name, bands, 1.2, finger=finger)[1].motion
+        motion[way] = hold(name, grating(2e-4, WANTED), 1.2, IDEAL, finger=finger)[1]
     assert abs(motion["there"][-500:, 0]).max() > 0.5 * WANTED
     np.testing.assert_allclose(motion["back"], motion["there"], rtol=0, atol=1e-9 * WANTED)
     np.testing.assert_allclose(motion["turned, below"], motion["turned"], rtol=0, atol=1e-9 * WANTED)
@@ -119,8 +88,7 @@ def test_a_tone_off_resonance_is_held_exactly(name, frequency):
     (h2 at rest, whose feed-forward leaves it that much).  Polar ones hold the mean of |X| = A |1 + i e^{-2j phi}|,
     which is A (1 + i^2/4), i the estimator's image; the common mode has no say in the ends.
     """
-    _, sensed = hold(name, tones(frequency), 4.0)
-    found = abs(error(sensed.motion, frequency))
+    found = abs(amplitude_error(hold(name, tones(frequency), 4.0, IDEAL)[1], frequency, WANTED))
     bound = 1.1 * image(name, frequency) ** 2 / 4 + 1e-5 if name in POLAR else 1e-6
     assert (found[0] if name == "paper-common" else found.max()) < bound
 
@@ -131,9 +99,9 @@ def test_without_sensors_it_drives_open_loop(name):
 
     What is left are the hold's images at rate -+ f, which the samples cannot tell from f: at 400 Hz 2.1e-4.
     """
-    controller = designed(name, tones(47.0, 400.0, envelope=1e-6), IDEAL, feedback=False)
+    controller = METHODS[name].design(MODEL, fixed((47.0, 1e-6), (400.0, 1e-6)), feedback=False)
     drive, _, _ = controller.run(np.zeros((15_000, 0)), np.full(15_000, np.nan), np.zeros(15_000))
-    motion = Plate(PlateParameters(**IDEAL), hr.Finger.absent()).run(np.vstack([np.zeros((1, 2)), drive[:-1]])).motion
+    motion = Plate(IDEAL, hr.Finger.absent()).run(np.vstack([np.zeros((1, 2)), drive[:-1]])).motion
     n = np.arange(10_000, 15_000)
     for frequency in (47.0, 400.0):
         found = 2 * np.mean(motion[n, 0] * np.exp(-2j * np.pi * frequency * n / RATE))
@@ -150,15 +118,15 @@ def test_integrators_without_a_low_pass_take_the_damping_of_a_mode(gain, holds, 
     """
     assert least_decay(PlateParameters().device_model(RATE, 1)) == pytest.approx(16.07, abs=0.01)
     finger = hr.Finger.still(position=27.5e-3, normal_load=0.01, mechanics="none")  # something to start rocking
-    _, sensed = hold(Resonant(gain=gain, checked=False), tones(*frequency), 30.0, finger=finger)
-    rocking = sensed.motion[:, 1] - sensed.motion[:, 2]
+    motion = hold(Resonant(gain=gain, checked=False), tones(*frequency), 30.0, IDEAL, finger=finger)[1]
+    rocking = motion[:, 1] - motion[:, 2]
     early, late = (np.ptp(rocking[round(t * RATE) :][:5000]) for t in (2.0, 29.0))
     assert late < 0.01 * early if holds else late > 10 * early
 
 
 def test_the_resonant_method_refuses_a_gain_that_drives_a_mode():
     with pytest.raises(hr.DesignError, match=r"gain=17 1/s must be below 16\.1 1/s"):
-        designed(Resonant(gain=17.0), tones(47.0))
+        Resonant(gain=17.0).design(MODEL, tones(47.0))
 
 
 @pytest.mark.parametrize("name", ["boxcar", "static", "stiffness", "resonant"])

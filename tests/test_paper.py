@@ -4,26 +4,16 @@ import dataclasses
 
 import numpy as np
 import pytest
-from held import amplitude, fixed, grating
+from held import amplitude, fixed, grating, hold, play
 
 import hapticrender as hr
 from hapticrender.control.methods import METHODS, Polar, method_named
-from hapticrender.plants.plate import Plate, PlateParameters
+from hapticrender.plants.plate import PlateParameters
 from hapticrender.touch.mechanics import HEAVY_SECOND
 
 RATE = 5000.0
-IDEAL = {"sensor_noise": 0.0, "sensor_bits": 0, "current_bits": 0}
-QUIET = {"sensor_noise": 0.0}
-
-
-def close(bands, seconds, *, method="paper", overrides=None, finger=None, table=None, seed=0):
-    """Run plate and controller; `table` is another band model to fill the look-up table from."""
-    parameters = PlateParameters(**(overrides or {}))
-    model = table or parameters.device_model(RATE, parameters.delay)
-    controller = METHODS[method].design(model, bands)
-    plate = Plate(parameters, finger or hr.Finger.absent(), seed)
-    drive, _, flags, sensed = plate.closed_loop(controller, np.zeros(int(seconds * RATE)))
-    return drive, sensed, flags
+NOISY, QUIET = PlateParameters(), PlateParameters(sensor_noise=0.0)
+IDEAL = PlateParameters(sensor_noise=0.0, sensor_bits=0, current_bits=0)
 
 
 def envelope(motion, frequency, window=0.05):
@@ -40,17 +30,17 @@ def test_baseline_holds_on_the_free_plate(frequency, target):
 
     Averaged over 20 s: the loop follows the noise of the mean, sqrt(2/N) um = 0.045 % of 10 um, 3 sigma < 0.14 %.
     """
-    for overrides, bound in ((None, 3e-3), (QUIET, 1.5e-3)):
-        _, sensed, _ = close(fixed((frequency, target)), 21.0, overrides=overrides)
-        error = amplitude(sensed.motion, frequency, 20.0) / target - 1.0
+    for plate, bound in ((NOISY, 3e-3), (QUIET, 1.5e-3)):
+        motion = hold("paper", fixed((frequency, target)), 21.0, plate)[1]
+        error = amplitude(motion, frequency, 20.0) / target - 1.0
         assert abs(error).max() <= bound
 
 
 @pytest.mark.parametrize(("frequency", "stable"), [(125, True), (131, False), (188, False), (192, True)])
 def test_two_sides_apart_are_unstable_between_129_and_189_hz(frequency, stable):
     """From the eigen-loops rho = rocking/heave receptance ; 2 and 3 Hz outside, growth is slow."""
-    _, sensed, _ = close(fixed((float(frequency), 10e-6)), 41.0, overrides=IDEAL)
-    error = abs(amplitude(sensed.motion, frequency, 1.0) / 10e-6 - 1.0).max()
+    motion = hold("paper", fixed((float(frequency), 10e-6)), 41.0, IDEAL)[1]
+    error = abs(amplitude(motion, frequency, 1.0) / 10e-6 - 1.0).max()
     assert error < 0.01 if stable else error > 0.1
 
 
@@ -71,15 +61,14 @@ def test_a_press_blinds_it_at_low_frequency(frequency, target, position, expecte
     the middle; -9.8 % is found with the finger 10 mm to one side, and 27.5 mm to one side gives -50 %.
     """
     finger = hr.Finger.still(position=position, normal_load=0.5, mechanics="none")
-    _, sensed, _ = close(fixed((frequency, target)), 14.0, overrides=QUIET, finger=finger)
-    error = amplitude(sensed.motion, frequency, 10.0)[0] / target - 1.0
+    motion = hold("paper", fixed((frequency, target)), 14.0, QUIET, finger=finger)[1]
+    error = amplitude(motion, frequency, 10.0)[0] / target - 1.0
     assert error == pytest.approx(expected, abs=within)
 
 
 def test_a_table_of_the_loaded_plate_limit_cycles_at_lift_off():
     """at 189 Hz the free plate has 3.9 x the gain of the loaded one, above the gain margin of 3.5."""
-    parameters = PlateParameters(**IDEAL)
-    free = parameters.device_model(RATE, 1)
+    free = IDEAL.device_model(RATE, 1)
     finger = np.diag([1.0, 0.0])
     loaded = dataclasses.replace(
         free,
@@ -89,8 +78,8 @@ def test_a_table_of_the_loaded_plate_limit_cycles_at_lift_off():
     )
     spread = {}
     for name, table in (("free", free), ("loaded", loaded)):
-        _, sensed, _ = close(fixed((189.0, 10e-6)), 10.0, overrides=IDEAL, table=table, method="paper-common")
-        spread[name] = envelope(sensed.motion, 189.0)[-10_000:].std() / 10e-6
+        motion = play(METHODS["paper-common"].design(table, fixed((189.0, 10e-6))), 10.0, IDEAL)[1]
+        spread[name] = envelope(motion, 189.0)[-10_000:].std() / 10e-6
     assert spread["free"] < 0.01  # the window is no whole number of periods: 1/(4 pi 189 0.05) of ripple
     assert spread["loaded"] > 0.3
 
@@ -98,35 +87,32 @@ def test_a_table_of_the_loaded_plate_limit_cycles_at_lift_off():
 def moving(bands, position, seconds=4.0, touches=None):
     time = np.arange(round(seconds * RATE) + 1) / RATE
     finger = hr.Finger.sampled(position(time), rate=RATE, normal_load=0.0, touches=touches, mechanics="none")
-    return close(bands, seconds, overrides=IDEAL, finger=finger)
+    return hold("paper", bands, seconds, IDEAL, finger=finger)
 
 
 def test_a_grating_under_a_steady_finger_is_the_tone_of_its_passing():
     """10 mm/s over 0.2 mm is 50 Hz: after contact has faded in, the same loop as a 50 Hz carrier."""
-    _, spatial, _ = moving(grating(2e-4, 1e-5), lambda t: 0.01 * t)
-    _, temporal, _ = close(fixed((50.0, 1e-5)), 4.0, overrides=IDEAL)
-    np.testing.assert_allclose(amplitude(spatial.motion, 50.0, 1.0), amplitude(temporal.motion, 50.0, 1.0), rtol=2e-4)
+    _, spatial = moving(grating(2e-4, 1e-5), lambda t: 0.01 * t)
+    _, temporal = hold("paper", fixed((50.0, 1e-5)), 4.0, IDEAL)
+    np.testing.assert_allclose(amplitude(spatial, 50.0, 1.0), amplitude(temporal, 50.0, 1.0), rtol=2e-4)
 
 
 def test_a_resting_or_lifted_finger_lets_the_grating_fade():
     """Position decides: at 0 Hz there is nothing to feel, and the drive goes to rest."""
-    drive, _, _ = moving(grating(2e-4, 1e-5), lambda t: 0.01 * np.minimum(t, 1.0), seconds=6.0)
+    drive, _ = moving(grating(2e-4, 1e-5), lambda t: 0.01 * np.minimum(t, 1.0), seconds=6.0)
     assert abs(drive[4000:5000]).max() > 0.02
     assert abs(drive[-1000:]).max() < 1e-4
-    drive, _, _ = moving(grating(2e-4, 1e-5), lambda t: 0.01 * t, seconds=6.0, touches=((0.0, 1.0),))
+    drive, _ = moving(grating(2e-4, 1e-5), lambda t: 0.01 * t, seconds=6.0, touches=((0.0, 1.0),))
     assert abs(drive[-1000:]).max() < 1e-4
 
 
 def test_a_long_delay_slows_the_loop_down_until_its_margins_hold():
     """at 5 Hz polar loops bear 30-42 ms; slowed down they hold at 60 ms."""
-    _, sensed, _ = close(fixed((111.0, 1e-5)), 12.0, overrides=dict(IDEAL, delay=300), method="paper-common")
-    assert amplitude(sensed.motion, 111.0, 2.0)[0] == pytest.approx(1e-5, rel=2e-3)
-    naive = Polar(common=True, bandwidths=(5.0, 10.0))
-    parameters = PlateParameters(delay=300, **IDEAL)
-    plate = Plate(parameters, hr.Finger.absent())
-    controller = naive.design(parameters.device_model(RATE, 300), fixed((111.0, 1e-5)))
-    sensed = plate.closed_loop(controller, np.zeros(60_000))[3]
-    assert abs(amplitude(sensed.motion, 111.0, 2.0)[0] / 1e-5 - 1) > 0.05
+    late = dataclasses.replace(IDEAL, delay=300)
+    for method, holds in ((METHODS["paper-common"], True), (Polar(common=True, bandwidths=(5.0, 10.0)), False)):
+        motion = hold(method, fixed((111.0, 1e-5)), 12.0, late)[1]
+        error = abs(amplitude(motion, 111.0, 2.0)[0] / 1e-5 - 1)
+        assert error < 2e-3 if holds else error > 0.05
 
 
 def test_an_unknown_method_is_refused_with_the_known_ones():

@@ -1,7 +1,7 @@
 """Margins from the model against the compiled loop: growth, and boundaries of gain, delay and phase on both sides."""
 
 import math
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
@@ -46,14 +46,8 @@ def frozen(method, *frequencies, **changes):
 def predicted(controller, parameters=PLATE, mechanics=NONE, position=0.0):
     """Linear loop of this controller on a plate that may differ from the one it was designed for."""
     p = controller.settings
-    names = ("rate", "lead", "observer", "observer_high", "integral_medium", "integral_high", "dc", "dc_drift")
-    gains = BankGains(
-        **{name: float(p[name]) for name in (*names, "crowd_speed", "lowest", "highest", "highest_edge")},
-        delay=1,
-        integral_low=float(p["integral"]),
-        inner=float(p["damper"]),
-        inner_high=float(p["damper_high"]),
-    )
+    names = (each.name for each in fields(BankGains) if each.name != "delay")
+    gains = BankGains(**{name: float(p[name]) for name in names}, delay=1)
     plant = loaded_plate(parameters, MODEL, mechanics, position=position)
     taps = p["taps"][:, : p["n_taps"]]
     return error_loop(MODEL, controller.bands.frequency, gains, taps=taps, plant=plant, delay=parameters.delay)

@@ -111,10 +111,7 @@ def methods_and_settings() -> list[Setting]:
             for width in (2.5, 10)
         ]
     for name in ("static", "stiffness"):
-        found += [
-            Setting(method=name, what="integrator", options={"form": "integrator"}),
-            Setting(method=name, what="feedforward", options={"form": "integrator", "feed_forward": True}),
-        ]
+        found.append(Setting(method=name, what="feedforward", options={"feed_forward": True}))
     found.append(Setting(method="resonant", what="5 1/s", options={"gain": 5.0}))
     found += [Setting(method=name, what="heave only", heave_only=True) for name in ("h", "h2")]
     found += [

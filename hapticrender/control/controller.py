@@ -11,7 +11,6 @@ from hapticrender.bands import Bands
 from hapticrender.control.carriers import REFRESH, predict_positions
 from hapticrender.control.device_model import DeviceModel
 from hapticrender.control.records import (
-    COMMAND,
     CONTROLLER,
     FADING,
     MOST_CHANNELS,
@@ -88,9 +87,9 @@ class BankController:
             self.state["p"][name][0] = value
         memory = {
             "tiles": self.tiles,
-            "commands": aligned(history * tiles, COMMAND),
+            "commands": aligned(history * tiles * 3, PAIR),  # of both coordinates; the finger's force
             "setpoints": self.setpoints,
-            "work": aligned(tiles, WORK),
+            "work": aligned(2 * tiles, WORK),
             "table": aligned((group + 1) // 2 * tiles, PAIR),
             "phasors": aligned(groups * tiles, PAIR),
             "samples": np.zeros((SAMPLE_ROWS, groups * group)),
@@ -263,8 +262,8 @@ def shared_settings(
     return {
         **counts,
         "block": 1,
-        "coordinate_from_sensor": _padded(sensor_map, 2, MOST_SENSORS),
-        "drive_from_force": _padded(drive_map, MOST_CHANNELS, 2),
+        "coordinate_from_sensor": padded(sensor_map, 2, MOST_SENSORS),
+        "drive_from_force": padded(drive_map, MOST_CHANNELS, 2),
         "rate": float(model.rate),
         "lead": (model.delay + 0.5) / model.rate,
         "middle": 1.0,
@@ -281,13 +280,13 @@ def shared_settings(
 def device_settings(model: DeviceModel) -> dict[str, Any]:
     """Settings of the methods that invert the device's dynamic stiffness."""
     return {
-        **{name: _padded(getattr(model, name), 2, 2) for name in ("mass", "damping", "stiffness")},
+        **{name: padded(getattr(model, name), 2, 2) for name in ("mass", "damping", "stiffness")},
         "shape": np.append(model.pattern, [0.0])[:2],
         "needs_contact": model.finger.needs_contact,
         "least_speed": model.finger.least_speed,
     }
 
 
-def _padded(matrix: Array, rows: int, columns: int) -> Array:
-    """Matrix with zeros below and beside it."""
+def padded(matrix: Array, rows: int, columns: int) -> Array:
+    """Matrix of shape (rows, columns) with zeros below and beside what is given."""
     return np.pad(matrix, ((0, rows - matrix.shape[0]), (0, columns - matrix.shape[1])))

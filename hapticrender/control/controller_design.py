@@ -8,7 +8,7 @@ margins; then all of it is lowered until the margins of the sampled loop hold (`
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -28,8 +28,7 @@ from hapticrender.control.damping import Damping, choose_damping
 from hapticrender.control.device_model import DeviceModel, FingerRange
 from hapticrender.control.kernel import block_step, error_step
 from hapticrender.control.margin_check import BankGains, checked_gains
-from hapticrender.control.records import MOST_TAPS
-from hapticrender.control.supervisor import damper_noise
+from hapticrender.control.supervisor import damper_settings
 
 FADE_IN = 0.05  # s: a target fades in this slowly, so that it does not excite the modes
 LEAST_FADE_IN = 0.5e-3  # s: however fast the device, as drives are finite
@@ -45,10 +44,6 @@ BACK_TIME = 0.02  # s: back-calculation at the limit
 TOUCHED_DECAY = 1000.0  # 1/s: of an always damped mode at least
 LEAST_NOISE = 1e-6  # of the sensors' range: thresholds never fall to nothing
 ALWAYS = -1e300  # N: every load is larger
-FROM_GAINS = (
-    *("observer", "observer_high", "integral_medium", "integral_high", "dc", "dc_drift", "crowd_speed"),
-    "highest_edge",
-)
 FROM_MODEL = ("sensor_delay", "contact_lag", "contact_damping", "typical_speed", "drive_step")
 CROWDED = 40.0  # Hz: carriers closer than this share what the detectors see
 
@@ -169,13 +164,13 @@ def _gains(model: DeviceModel, bands: Bands, rules: Rules, feedback: bool) -> Ba
         lead=(model.delay + 0.5) * period,
         observer=on * 2 * pole[0] * period,
         observer_high=on * 2 * pole[1] * period,
-        integral_low=on * min(rules.integral[0], fastest[0]),
+        integral=on * min(rules.integral[0], fastest[0]),
         integral_medium=on * min(rules.integral[1], fastest[0]),
         integral_high=on * min(rules.integral[2], fastest[1]),
         dc=on * 1.6 * dc,
         dc_drift=on * dc**2,
-        inner=rules.damper[0],
-        inner_high=rules.damper[1],
+        damper=rules.damper[0],
+        damper_high=rules.damper[1],
         crowd_speed=max(pole) / ridges if math.isfinite(ridges) else 0.0,
         lowest=float(model.lowest_frequency),
         highest=float(min(model.highest_frequency, 0.4 * model.rate)),
@@ -190,7 +185,6 @@ def _settings(
     period, fast = 1.0 / model.rate, 2 * math.pi * FAST_DC / model.rate
     lowest = lowest_carrier(model, bands)
     observer = min(rules.observer[0], lowest / 2, spacing(bands) / (2 * math.pi))
-    taps = damping.taps if damping else np.zeros((len(model.mass), 1))
     sensor_map, drive_map = model.coordinate_from_sensed, np.linalg.pinv(model.force_from_drive)
     return {
         **shared_settings(model, bands, sensor_map, drive_map, feedback),
@@ -198,11 +192,9 @@ def _settings(
         **_adaptation(model, rules, 2 * math.pi * observer, feedback),
         **_detectors(model, rules),
         **_finger(model.finger),
-        **{name: getattr(gains, name) for name in FROM_GAINS},
+        **{name: value for name, value in asdict(gains).items() if name != "delay"},
         **{name: getattr(model, name) for name in FROM_MODEL},
-        "n_taps": taps.shape[1],
-        "taps": np.pad(taps, ((0, 2 - len(taps)), (0, MOST_TAPS - taps.shape[1]))),
-        "damper_noise": damper_noise(model, taps),
+        **damper_settings(model, damping.taps if damping else None),
         "added_damping": np.resize(np.append(damping.added_damping if damping else 0.0, [0.0, 0.0]), 2),
         "waveform_gain": 2 * 2 * math.pi * observer * period,
         "extrapolation": 0.0,
@@ -213,9 +205,6 @@ def _settings(
         "back_calculation": _back_calculation(model),
         "dc_fast": 1.6 * fast,
         "dc_drift_fast": fast**2,
-        "integral": gains.integral_low,
-        "damper": gains.inner,
-        "damper_high": gains.inner_high,
         "age": (model.delay + 0.5) / ADAPTATION_SAMPLES,
     }
 

@@ -15,7 +15,8 @@ from typing import NamedTuple
 import numpy as np
 
 from hapticrender.control.device_model import DeviceModel
-from hapticrender.control.margins import LEAST, LeastMargins, Margins, margins_of, unstable_poles
+from hapticrender.control.linear import Sampled
+from hapticrender.control.margins import LEAST, Margins, margins_of, unstable_poles
 from hapticrender.control.records import MOST_TAPS
 from hapticrender.protocols import Array
 
@@ -25,7 +26,6 @@ QUALITY, QUALITY_UNMEASURED = 1.4, 2.0  # the least Q, with the bending mode kno
 QUALITY_STEP = 0.1
 WORTH = 4.0  # the damper is off where it cannot add so many times the mode's own damping
 REACHES = (0.6, 0.7, 0.8, 0.9, 1.0)  # of a bending period: how long notched taps may reach back
-LOOSE = LeastMargins(modulus=0.2, delay=0.0, phase=0.0, gain=1.0)  # with the bending mode at an end of its spread
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -97,14 +97,12 @@ def oscillators(model: DeviceModel) -> tuple[Oscillator, ...]:
     return tuple(Oscillator(float(model.rate), model.delay, *column) for column in columns)
 
 
-def damping_taps(
-    model: DeviceModel, quality: float, *, bending: BendingMode | None = None, count: int | None = None
-) -> tuple[Array, Array]:
-    """Solve for the taps (coordinates, count), N/m, and the damping (coordinates,), N s/m, that they add.
+def damping_taps(model: DeviceModel, quality: float, *, bending: BendingMode | None = None) -> tuple[Array, Array]:
+    """Solve for the taps (coordinates, n), N/m, and the damping (coordinates,), N s/m, that they add.
 
     ``F[n] = -sum_i taps_i deviation[n - i]`` with b_a = m w1/Q, `quality` Q > 0 being what the damper alone gives each
-    mode.  With a `bending` mode the taps of the coordinates that it couples into have zeros there.  `count` is by
-    default the model's, and five with a bending mode.
+    mode.  There are as many taps as the model states; with a `bending` mode five, and those of the coordinates that it
+    couples into have zeros there.
 
     Notes
     -----
@@ -112,14 +110,14 @@ def damping_taps(
     samples and the hold made up for, ``sum c_i e^{-j w1 i T} = j w1 b_a e^{j w1 (d + 1/2) T}/sinc(w1 T/2)``, and zeros
     at the bending mode where it is given.
     """
-    least = TAPS if bending is None else TAPS + 2
-    count = (model.taps if bending is None else least) if count is None else count
-    if not quality > 0:
-        raise ValueError(f"{quality=} must be > 0")
-    if count < least:
-        raise ValueError(f"{count=} taps: must be >= {least}, one for each equation")
     parts = oscillators(model)
-    return _taps(parts, quality, bending, count, model.taps), np.array([p.mass * p.omega / quality for p in parts])
+    taps = _taps(parts, quality, bending, model.taps if bending is None else TAPS + 2, model.taps)
+    return taps, added_damping(parts, quality)
+
+
+def added_damping(parts: tuple[Oscillator, ...], quality: float) -> Array:
+    """Damping b_a = m w1/Q (N s/m, shape (coordinates,)) that gives each mode a `quality` Q."""
+    return np.array([part.mass * part.omega / quality for part in parts])
 
 
 def _taps(parts: tuple[Oscillator, ...], quality: float, bending: BendingMode | None, count: int, plain: int) -> Array:
@@ -144,15 +142,18 @@ class DamperLoop:
 
     def __init__(self, part: Oscillator, taps: Array, bending: BendingMode | None, c: int) -> None:
         self.part, self.taps = part, taps
-        self.modes = [(part.omega, max(part.ratio, LEAST_RATIO), 1.0 / part.mass)]
+        self.modes = [(part.omega, max(part.ratio, LEAST_RATIO), part.mass)]
         if bending is not None and bending.coupling[c] != 0.0:
             ratio = max(bending.damping, LEAST_RATIO)
-            self.modes.append((2 * np.pi * bending.frequency, ratio, bending.coupling[c]))
+            self.modes.append((2 * np.pi * bending.frequency, ratio, 1.0 / bending.coupling[c]))
+        omega, ratio, mass = np.array(self.modes).T
+        diagonal = np.diag(mass), np.diag(2 * ratio * omega * mass), np.diag(omega**2 * mass)
+        self.plant = Sampled.free(*diagonal, part.rate)
 
     def response(self, frequency: Array) -> Array:
         """L at `frequency` (Hz), shape (n, 1, 1)."""
         z = np.exp(2j * np.pi * frequency / self.part.rate)
-        plant = sum(_held_mode(z, self.part.rate, *mode) for mode in self.modes)
+        plant = self.plant.response(z).sum(axis=(1, 2))  # one force drives all modes, the sensors show their sum
         return (plant * z**-self.part.delay * np.polyval(self.taps[::-1], 1 / z))[:, None, None]
 
     def grid(self) -> Array:
@@ -187,31 +188,18 @@ def damper_loops(
     return tuple(DamperLoop(part, taps[c], bending, c) for c, part in enumerate(parts))
 
 
-def _held_mode(z: Array, rate: float, omega: float, ratio: float, gain: float) -> Array:
-    """Response at z of ``gain/(s^2 + 2 ratio omega s + omega^2)`` behind a zero-order hold.
-
-    By residues: each pole l gives r (e^(l T) - 1)/(l (z - e^(l T))) with r the residue of the continuous mode.
-    """
-    apart = np.sqrt(complex(ratio * ratio - 1.0)) or 1e-9  # a double pole is parted by a hair
-    poles = omega * (-ratio + apart * np.array([1.0, -1.0]))
-    residues = gain / (poles - poles[::-1])
-    grown = np.exp(poles / rate)
-    return sum(r * (e - 1) / (pole * (z - e)) for r, e, pole in zip(residues, grown, poles, strict=True))
-
-
 def choose_damping(
     model: DeviceModel,
     *,
     bending: BendingMode | None = None,
-    least: LeastMargins = LEAST["damper"],
     apart: bool = False,
 ) -> Damping:
     """Design the inner damper: the most damping whose margins hold, or none, and why.
 
-    Q rises in steps of 0.1 until every coordinate keeps `least`, with the bending mode where it was measured, and Ms
-    stays below 5 with that mode at both ends of its tolerance.  Q starts at 1.4 where that mode is measured or the
-    model is rigid, else at 2.  Where even a damper of four times the modes' own damping would not do, the damper is
-    off.  Notched taps reach back 0.6 to 1 bending period; the reach with the least noise is taken.
+    Q rises in steps of 0.1 until every coordinate keeps the damper's least margins, with the bending mode where it was
+    measured, and Ms stays below 5 with that mode at both ends of its tolerance.  Q starts at 1.4 where that mode is
+    measured or the model is rigid, else at 2.  Where even a damper of four times the modes' own damping would not do,
+    the damper is off.  Notched taps reach back 0.6 to 1 bending period; the reach with the least noise is taken.
 
     `apart`: every coordinate has a Q of its own, so that rocking, which a symmetric bending mode does not couple into,
     is damped from Q 1.4 on and without a notch.
@@ -219,12 +207,12 @@ def choose_damping(
     if not (model.mass.diagonal() > 0.0).all():
         return _off(len(model.mass), "the device has no mode")
     known, parts = model.rigid if bending is None else bending.measured, oscillators(model)
-    whole = _chosen(parts, QUALITY if known else QUALITY_UNMEASURED, bending, model.taps, least)
+    whole = _chosen(parts, QUALITY if known else QUALITY_UNMEASURED, bending, model.taps)
     if bending is None or not apart or not whole.margins:
         return whole
     for i, part in enumerate(parts):
         if bending.coupling[i] == 0.0:
-            whole = _replaced(whole, i, _chosen((part,), QUALITY, None, model.taps, least))
+            whole = _replaced(whole, i, _chosen((part,), QUALITY, None, model.taps))
     return whole
 
 
@@ -232,8 +220,9 @@ def _replaced(whole: Damping, i: int, own: Damping) -> Damping:
     """Damper with the taps of coordinate i from a design of its own, where that has any."""
     if not own.margins:
         return whole
-    taps, added = whole.taps.copy(), whole.added_damping.copy()
-    taps[i], added[i] = np.pad(own.taps[0], (0, taps.shape[1] - own.taps.shape[1])), own.added_damping[0]
+    count = max(whole.taps.shape[1], own.taps.shape[1])
+    taps, added = np.pad(whole.taps, ((0, 0), (0, count - whole.taps.shape[1]))), whole.added_damping.copy()
+    taps[i], added[i] = np.pad(own.taps[0], (0, count - own.taps.shape[1])), own.added_damping[0]
     margins, noise = list(whole.margins), list(whole.noise)
     margins[i], noise[i] = own.margins[0], own.noise[0]
     note = f"{whole.note}; coordinate {i + 1} Q {own.quality:g}"
@@ -251,9 +240,7 @@ def _turns(parts: tuple[Oscillator, ...]) -> float:
 
 
 @lru_cache(maxsize=256)
-def _chosen(
-    parts: tuple[Oscillator, ...], least_quality: float, bending: BendingMode | None, plain: int, least: LeastMargins
-) -> Damping:
+def _chosen(parts: tuple[Oscillator, ...], least_quality: float, bending: BendingMode | None, plain: int) -> Damping:
     """Raise Q until the margins hold; `plain` taps where no bending mode is known."""
     rate, delay = parts[0].rate, parts[0].delay
     largest = 1 / (2 * WORTH * max(*(part.ratio for part in parts), LEAST_RATIO))
@@ -266,22 +253,22 @@ def _chosen(
     complaint = raised = ""
     for step in range(int((largest - least_quality) / QUALITY_STEP) + 1):
         quality = round(least_quality + step * QUALITY_STEP, 1)
-        kept = []
-        for count in _counts(rate, bending, plain):
-            taps = _taps(parts, quality, bending, count, plain)
-            complaint = _complaint(parts, taps, bending, least)
-            if not complaint:
-                kept.append((tuple(loop.noise() for loop in damper_loops(parts, taps, bending)), taps))
+        designs = [_taps(parts, quality, bending, count, plain) for count in _counts(rate, bending, plain)]
+        complaints = [_complaint(parts, taps, bending) for taps in designs]
+        kept = [damper_loops(parts, taps, bending) for taps, each in zip(designs, complaints, strict=True) if not each]
         if kept:
-            noise, taps = min(kept, key=lambda each: max(each[0]))
+            noises = [tuple(loop.noise() for loop in loops) for loops in kept]
+            noise, loops = min(zip(noises, kept, strict=True), key=lambda each: max(each[0]))
+            taps = np.array([loop.taps for loop in loops])
             return Damping(
                 taps=taps,
-                added_damping=np.array([part.mass * part.omega / quality for part in parts]),
+                added_damping=added_damping(parts, quality),
                 quality=quality,
-                margins=tuple(loop.margins() for loop in damper_loops(parts, taps, bending)),
+                margins=tuple(loop.margins() for loop in loops),
                 noise=noise,
                 note=f"on: Q {quality:g}{raised}; {_spared(taps.shape[1], bending)}",
             )
+        complaint = complaints[-1]
         raised = f" (at Q {quality:g}, with {lag}, {complaint})"
     return _off(len(parts), f"with {lag}, {complaint} even at Q {quality:g}")
 
@@ -293,11 +280,14 @@ def _counts(rate: float, bending: BendingMode | None, plain: int) -> list[int]:
     return sorted({min(max(TAPS + 2, 1 + round(span * rate / bending.frequency)), MOST_TAPS) for span in REACHES})
 
 
-def _complaint(parts: tuple[Oscillator, ...], taps: Array, bending: BendingMode | None, least: LeastMargins) -> str:
+def _complaint(parts: tuple[Oscillator, ...], taps: Array, bending: BendingMode | None) -> str:
     """First margin that falls short, with the bending mode at its place and at the ends of its tolerance."""
-    cases = [(bending, least, "")]
+    cases = [(bending, LEAST["damper"], "")]
     if bending is not None:
-        cases += [(corner, LOOSE, f" with the bending mode at {corner.frequency:g} Hz") for corner in bending.corners()]
+        cases += [
+            (corner, LEAST["spread"], f" with the bending mode at {corner.frequency:g} Hz")
+            for corner in bending.corners()
+        ]
     for mode, bound, where in cases:
         for loop in damper_loops(parts, taps, mode):
             if complaint := bound.complaint(loop.margins(), loop.part.rate):

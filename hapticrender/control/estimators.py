@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from hapticrender.control.transfer import butterworth, require_positive
+from hapticrender.control.transfer import butterworth
 from hapticrender.protocols import Array
 
 
@@ -32,7 +32,6 @@ class StarSTDFT:
     rate: float  # Hz
 
     def __post_init__(self) -> None:
-        require_positive(rate=self.rate)
         if not 0 < self.bandwidth < self.rate / 2:
             raise ValueError(
                 f"bandwidth={self.bandwidth!r} Hz must lie between 0 and half the rate, {self.rate / 2:g} Hz"

@@ -18,7 +18,7 @@ Least squares of e on w find g, of both sensors or of both actuators.
 
 Sensors are judged over the 3 ms after an innovation above 4.5 times its noise, and its mean square before: a finger's
 force makes no jump, what it adds to e is no multiple of w.  Actuators are judged by means over 3 ms, while e is large:
-an inversion alone is told from a finger by these, and so is one of a sensor that began where p was zero.
+only an inversion, also that of a sensor which began where p was zero, is distinguished from a finger by these.
 
 References
 ----------
@@ -61,6 +61,7 @@ GAINS = np.dtype(
         ("duration", np.int64),  # samples of a trial
         ("models", np.float64, (6, 6)),  # x, p, xi_1, xi_2, zeta_1, zeta_2
         ("advanced", np.float64, (4,)),
+        ("w", np.float64, (2, MOST)),  # w_1 and w_2, of both sensors
         *((name, np.float64, (MOST,)) for name in ("e", "mean", "energy")),  # mean of e^2 of a sensor; sums of e^2
         ("weights", np.float64, (2, 2, 2)),  # sums of w_i w_j of sensors, of actuators
         *((name, np.float64, (2, 2)) for name in ("weighted", "gain")),  # sums of w_i e
@@ -149,15 +150,14 @@ def clear_sums(gains, kind):
 
 
 @kernel
-def add_sums(gains, kind, pole, w0, w1):
-    """Add a sample of w_1 and w_2, each of both sensors, to the sums; with a `pole` below 1 these are means."""
+def add_sums(gains, kind, pole):
+    """Add a sample of w_1 and w_2 to the sums; with a `pole` below 1 these are means."""
     s = record(gains, GAINS_T, 0)
-    w, b, e, kept = s.weights[kind], s.weighted[kind], s.e, 1.0 if kind == SENSOR else 1.0 - pole
-    w[0, 0] = kept * w[0, 0] + pole * (w0[0] * w0[0] + w0[1] * w0[1])
-    w[0, 1] = kept * w[0, 1] + pole * (w0[0] * w1[0] + w0[1] * w1[1])
-    w[1, 1] = kept * w[1, 1] + pole * (w1[0] * w1[0] + w1[1] * w1[1])
-    b[0] = kept * b[0] + pole * (w0[0] * e[0] + w0[1] * e[1])
-    b[1] = kept * b[1] + pole * (w1[0] * e[0] + w1[1] * e[1])
+    w, b, x, e, kept = s.weights[kind], s.weighted[kind], s.w, s.e, 1.0 if kind == SENSOR else 1.0 - pole
+    for i in range(2):
+        for j in range(i, 2):
+            w[i, j] = kept * w[i, j] + pole * (x[i, 0] * x[j, 0] + x[i, 1] * x[j, 1])
+        b[i] = kept * b[i] + pole * (x[i, 0] * e[0] + x[i, 1] * e[1])
 
 
 @kernel
@@ -190,15 +190,15 @@ def judge_gains(gains, kind, noise):
 def follow_sensors(gains, force0, force1):
     """Add a sample to a trial; the sensors whose gain has changed at its end, as bits."""
     s = record(gains, GAINS_T, 0)
-    w0 = (model_sensor(gains, 1, 0) - model_sensor(gains, 2, 0), -model_sensor(gains, 2, 1))
-    w1 = (-model_sensor(gains, 3, 0), model_sensor(gains, 1, 1) - model_sensor(gains, 3, 1))
-    correct_model(gains, 2, w0[0], w0[1])
-    correct_model(gains, 3, w1[0], w1[1])
-    add_sums(gains, SENSOR, 1.0, w0, w1)
+    for j in range(2):
+        for i in range(2):
+            s.w[j, i] = (model_sensor(gains, 1, i) if i == j else 0.0) - model_sensor(gains, 2 + j, i)
+    add_sums(gains, SENSOR, 1.0)
     s.energy[SENSOR] += s.e[0] * s.e[0] + s.e[1] * s.e[1]
     advance_model(gains, 1, force0, force1)
-    advance_model(gains, 2, 0.0, 0.0)
-    advance_model(gains, 3, 0.0, 0.0)
+    for j in range(2):
+        correct_model(gains, 2 + j, s.w[j, 0], s.w[j, 1])
+        advance_model(gains, 2 + j, 0.0, 0.0)
     s.left -= 1
     return judge_gains(gains, SENSOR, s.innovation) if s.left == 0 else 0
 
@@ -207,20 +207,15 @@ def follow_sensors(gains, force0, force1):
 def follow_actuators(gains, force0, force1):
     """Add a sample to the means; the actuators that are inverted, as bits."""
     s = record(gains, GAINS_T, 0)
-    share = s.force_of_actuator
-    w0 = (model_sensor(gains, 4, 0), model_sensor(gains, 4, 1))
-    w1 = (model_sensor(gains, 5, 0), model_sensor(gains, 5, 1))
-    if s.watched > s.duration // 2:  # by then w has forgotten where it began
-        add_sums(gains, ACTUATOR, s.window_pole, w0, w1)
     for j in range(2):
-        w = w0 if j == 0 else w1
-        correct_model(gains, 4 + j, -w[0], -w[1])
-        advance_model(
-            gains,
-            4 + j,
-            share[j, 0, 0] * force0 + share[j, 0, 1] * force1,
-            share[j, 1, 0] * force0 + share[j, 1, 1] * force1,
-        )
+        for i in range(2):
+            s.w[j, i] = model_sensor(gains, 4 + j, i)
+    if s.watched > s.duration // 2:  # by then w has forgotten where it began
+        add_sums(gains, ACTUATOR, s.window_pole)
+    for j in range(2):
+        own = s.force_of_actuator[j]
+        correct_model(gains, 4 + j, -s.w[j, 0], -s.w[j, 1])
+        advance_model(gains, 4 + j, own[0, 0] * force0 + own[0, 1] * force1, own[1, 0] * force0 + own[1, 1] * force1)
     found = judge_gains(gains, ACTUATOR, s.window_pole * s.innovation)
     known = 2 * s.watched > 3 * s.duration
     return found if known and s.energy[ACTUATOR] > LARGE * s.innovation else 0

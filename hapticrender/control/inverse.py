@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from hapticrender.bands import Bands
-from hapticrender.control.controller import LEAST_TARGET, BankController, device_settings, shared_settings
+from hapticrender.control.controller import LEAST_TARGET, BankController, device_settings, padded, shared_settings
 from hapticrender.control.controller_design import FADE_IN, PROMPT, design_controller, rules_for
 from hapticrender.control.damping import Damping, choose_damping
 from hapticrender.control.device_model import DeviceModel
@@ -26,8 +26,8 @@ from hapticrender.control.inverse_records import (
     ROCKING,
     TAPS,
 )
-from hapticrender.control.records import MOST_CHANNELS, MOST_TAPS, aligned
-from hapticrender.control.supervisor import damper_noise
+from hapticrender.control.records import MOST_CHANNELS, aligned
+from hapticrender.control.supervisor import damper_settings
 from hapticrender.mathx import zoh
 from hapticrender.protocols import Array
 
@@ -70,27 +70,27 @@ def derivative_filters(rate: float, top: float, first: int = 0, count: int = 4, 
         order = first + i
         weight = np.maximum(omega, 2 * np.pi * 20.0) ** -order
         rows = np.vstack([inside * weight[:, None], 1e-6 * outside / (2 * np.pi * top) ** order]) * rate**order
-        wanted = np.concatenate([(1j * omega) ** order * turn * weight, np.zeros(len(above))])
-        fit = np.linalg.lstsq(np.vstack([rows.real, rows.imag]), np.r_[wanted.real, wanted.imag], rcond=None)[0]
+        exact = np.concatenate([(1j * omega) ** order * turn * weight, np.zeros(len(above))])
+        fit = np.linalg.lstsq(np.vstack([rows.real, rows.imag]), np.r_[exact.real, exact.imag], rcond=None)[0]
         found[i] = rate**order * fit
     return found
 
 
-def people(count: int = PEOPLE, seed: int = SEED) -> tuple[Array, Array]:
-    """Frequencies (Hz, shape (f,)) and dynamic stiffnesses z(j w) of fingers (N/m, shape (count, f)).
+def people() -> tuple[Array, Array]:
+    """Frequencies (Hz, shape (f,)) and dynamic stiffnesses z(j w) of `PEOPLE` fingers (N/m, shape (PEOPLE, f)).
 
     Log-uniform: 1-10 g, 0.3-4 N s/m, 60-900 N/m; three in four behind a skin of 0.1-0.5 g, 0.5-12 N s/m and
     400-12000 N/m.
     """
-    random, frequency = np.random.default_rng(seed), np.linspace(20.0, 500.0, 97)
+    random, frequency = np.random.default_rng(SEED), np.linspace(20.0, 500.0, 97)
     s = 2j * np.pi * frequency
 
     def drawn(low: float, high: float) -> Array:
-        return np.exp(random.uniform(np.log(low), np.log(high), (count, 1)))
+        return np.exp(random.uniform(np.log(low), np.log(high), (PEOPLE, 1)))
 
     whole = drawn(1e-3, 1e-2) * s**2 + drawn(0.3, 4.0) * s + drawn(60.0, 900.0)
     mass, skin = drawn(1e-4, 5e-4) * s**2, drawn(0.5, 12.0) * s + drawn(400.0, 12e3)
-    behind = random.uniform(size=(count, 1)) < 0.75
+    behind = random.uniform(size=(PEOPLE, 1)) < 0.75
     return frequency, np.where(behind, mass + skin * whole / (skin + whole), whole)
 
 
@@ -102,8 +102,8 @@ def finger_prior(model: DeviceModel) -> tuple[Array, Array]:
     basis = np.stack([np.ones_like(s), s / SCALE, (s / SCALE) ** 2, POLE**2 / low, POLE * s / low], axis=1)
     weight = 1.0 / abs(model.dynamic_stiffness(frequency)[:, 0, 0])
     rows = basis * weight[:, None]
-    wanted = (stiffness * weight).T
-    found = np.linalg.lstsq(np.vstack([rows.real, rows.imag]), np.vstack([wanted.real, wanted.imag]), rcond=None)[0]
+    exact = (stiffness * weight).T
+    found = np.linalg.lstsq(np.vstack([rows.real, rows.imag]), np.vstack([exact.real, exact.imag]), rcond=None)[0]
     covariance = np.cov(found)
     return found.mean(axis=1), covariance + np.diag(0.02 * covariance.diagonal())
 
@@ -201,7 +201,7 @@ def quiet_enough(damping: Damping, model: DeviceModel) -> bool:
 
 def controller_settings(model: DeviceModel, bands: Bands, damping: Damping | None, feedback: bool) -> dict[str, Any]:
     """Settings that the waveform law shares with the others."""
-    period, taps = 1.0 / model.rate, damping.taps if damping else np.zeros((len(model.mass), 1))
+    period = 1.0 / model.rate
     sensor_map, drive_map = model.coordinate_from_sensed, np.linalg.pinv(model.force_from_drive)
     return {
         **shared_settings(model, bands, sensor_map, drive_map, feedback),
@@ -213,10 +213,8 @@ def controller_settings(model: DeviceModel, bands: Bands, damping: Damping | Non
         "highest_edge": model.highest_edge,
         "lowest": LOWEST,
         "drive_step": model.drive_step,
-        "n_taps": taps.shape[1],
-        "taps": np.pad(taps, ((0, 2 - len(taps)), (0, MOST_TAPS - taps.shape[1]))),
         "damper_high": 1.0 if damping else 0.0,
-        "damper_noise": damper_noise(model, taps),
+        **damper_settings(model, damping.taps if damping else None),
         "release": period / 0.05,
     }
 
@@ -278,9 +276,7 @@ def law_settings(model: DeviceModel, bands: Bands, feedback: bool) -> dict[str, 
         "sensor_filter": shown,
         "sensor_rate_filter": rate_shown,
         "pair": pole_step(model.rate),
-        "force_from_drive": np.pad(
-            model.force_from_drive, ((0, 2 - n), (0, MOST_CHANNELS - model.force_from_drive.shape[1]))
-        ),
+        "force_from_drive": padded(model.force_from_drive, 2, MOST_CHANNELS),
         **matrices,
         "noise": 6.0 * noise**2 + (FRICTION_NOISE**2 if model.finger.contact is None else 0.0),
         "prior": mean,

@@ -1,6 +1,6 @@
 """The waveform law's step: exact inverse dynamics of the reference, and a Kalman filter that learns what they lack.
 
-With the reference r = s r(t) (s the pattern over the coordinates) the believed device takes the force
+With the reference r = s r(t) (s the pattern over the coordinates) the modelled device takes the force
 F_nom = M r'' + C r' + K r.  The true one moves by r + e (docs/theory.md)::
 
     (D + dD + z h h^T) e = F_dev - (dD + z h h^T) r - F_load,       F_dev = F_played - F_nom

@@ -20,7 +20,6 @@ from numba import carray
 from hapticrender.control.adaptation import (
     ADAPTATION_SAMPLES,
     adapt_finger,
-    detect_contact,
     note_commands,
     reset_finger,
 )
@@ -37,6 +36,7 @@ from hapticrender.control.limiter import NEAR_LIMIT, NONFINITE, SENSOR_CLIPPED, 
 from hapticrender.control.records import (
     ANALYSIS,
     CONTROLLER_T,
+    COORDINATE_T,
     INVERSE,
     LEAK,
     POSITION,
@@ -46,12 +46,14 @@ from hapticrender.control.records import (
     WAVEFORM,
     WORK_T,
     Y,
+    coordinates_of,
     samples_of,
 )
 from hapticrender.control.sums import correlate, invert, solve, sum_bands, turn_tables
 from hapticrender.jit import F8, I8, SIGNALS_T, kernel, pointer, record, step
 from hapticrender.vectors import conj, get, imag, maximum, pair, put, real, square, total, zeros
 
+LEAST_LOAD = 0.03  # N: a smaller load shows no place
 FADE_OUT = 0.02  # s: within this the drive fades out while a sensor's samples are implausible
 
 
@@ -80,7 +82,7 @@ def sense_block(controller, signals, first):
             else:  # NaN included
                 y0, y1 = np.nan, np.nan
                 raised |= SENSOR_CLIPPED if abs(value) < np.inf else NONFINITE
-        samples[Y, m], samples[Y + 1, m] = y0, y1
+        samples[Y, m], samples[Y + 1, m] = y0, y1 if p.coordinates > 1 else 0.0
         implausible |= raised > 0
         value = waveform[n] if reads else 0.0
         sane = abs(value) <= FARTHEST
@@ -122,33 +124,28 @@ def analyse_block(controller):
     c = record(controller, CONTROLLER_T, 0)
     samples = samples_of(controller)
     for t in range(c.tiles):
-        b, w = record(c.tiles_at, TILE_T, t), record(c.work_at, WORK_T, t)
-        put(w, "x0", get(b, "raw") * get(b, "carrier"))
-        put(w, "x1", 0.0)
-    sum_bands(controller, False)
+        b, w = record(c.tiles_at, TILE_T, t), record(c.work_at, WORK_T, 2 * t)
+        put(w, "x", get(b, "raw") * get(b, "carrier"))
+    sum_bands(controller, 1, False)
     for m in range(c.p.block):
         samples[WAVEFORM, m] -= samples[SUM, m]
     solve(controller, WAVEFORM, ANALYSIS)
-    correlate(controller, WAVEFORM)
+    correlate(controller, WAVEFORM, 1)
     for t in range(c.tiles):
-        b, w = record(c.tiles_at, TILE_T, t), record(c.work_at, WORK_T, t)
-        put(b, "raw", get(b, "raw") + c.p.waveform_gain * conj(get(w, "x0") * get(b, "carrier")))
+        b, w = record(c.tiles_at, TILE_T, t), record(c.work_at, WORK_T, 2 * t)
+        put(b, "raw", get(b, "raw") + c.p.waveform_gain * conj(get(w, "x") * get(b, "carrier")))
 
 
 @kernel
-def predict(controller):
-    """Sums over the bands of both coordinates: what the sensors should show, and the commanded motion."""
+def predict(controller, i):
+    """Sums over the bands of a coordinate: what the sensors should show, and the commanded motion."""
     c = record(controller, CONTROLLER_T, 0)
-    shape0, shape1 = c.p.shape[0], c.p.shape[1]
-    sum0, sum1, command0, command1 = zeros(), zeros(), zeros(), zeros()
+    shape, shown, command = c.p.shape[i], zeros(), zeros()
     for t in range(c.tiles):
-        b = record(c.tiles_at, TILE_T, t)
-        carrier, expected, reference = get(b, "carrier"), get(b, "expected"), get(b, "r")
-        sum0 = sum0 + real((shape0 * expected + get(b, "e0")) * carrier)
-        sum1 = sum1 + real((shape1 * expected + get(b, "e1")) * carrier)
-        command0 = command0 + real((shape0 * reference + get(b, "v0")) * carrier)
-        command1 = command1 + real((shape1 * reference + get(b, "v1")) * carrier)
-    return total(sum0), total(sum1), total(command0), total(command1)
+        b, x = record(c.tiles_at, TILE_T, t), record(coordinates_of(controller, t), COORDINATE_T, i)
+        shown = shown + real((shape * get(b, "expected") + get(x, "e")) * get(b, "carrier"))
+        command = command + real((shape * get(b, "r") + get(x, "v")) * get(b, "carrier"))
+    return total(shown), total(command)
 
 
 @kernel
@@ -160,20 +157,20 @@ def innovate_sample(controller):
     """
     c = record(controller, CONTROLLER_T, 0)
     samples, now, p = samples_of(controller), c.sample & 15, c.p
-    samples[SUM, 0], samples[SUM + 1, 0], command0, command1 = predict(controller)
     gain = p.dc_fast if c.dc_fast_on > 0.0 else p.dc
     drift = p.dc_drift_fast if c.dc_fast_on > 0.0 else p.dc_drift
-    for i in range(2):
+    for i in range(p.coordinates):
+        shown, command = predict(controller, i)
         if samples[Y + i, 0] != samples[Y + i, 0]:  # invalid: hold the prediction
-            samples[Y + i, 0] = samples[SUM + i, 0] + c.dc[i]
-        deviation = samples[Y + i, 0] - c.scale * (command0 if i == 0 else command1)
+            samples[Y + i, 0] = shown + c.dc[i]
+        deviation = samples[Y + i, 0] - c.scale * command
         c.past[i, now], c.deviation[i] = deviation, deviation - c.dc[i]
         force = 0.0
         if c.damping_gain > 0.0 or c.damper_scale < 1.0:
             for j in range(p.n_taps):
                 force -= p.taps[i, j] * c.past[i, (now - j) & 15]
         c.damper_force[i], samples[STEP + i, 0] = force, c.damping_gain * force
-        error = samples[Y + i, 0] - samples[SUM + i, 0] - c.dc[i]
+        error = samples[Y + i, 0] - shown - c.dc[i]
         samples[Y + i, 0] = error
         c.dc[i] += c.dc_drift[i] + gain * error
         c.dc_drift[i] += drift * error
@@ -185,14 +182,16 @@ def innovate_block(controller):
     c = record(controller, CONTROLLER_T, 0)
     samples, block, p = samples_of(controller), c.p.block, c.p
     for t in range(c.tiles):
-        b, w = record(c.tiles_at, TILE_T, t), record(c.work_at, WORK_T, t)
-        carrier, expected = get(b, "carrier"), get(b, "expected")
-        put(w, "x0", (p.shape[0] * expected + get(b, "e0")) * carrier)
-        put(w, "x1", (p.shape[1] * expected + get(b, "e1")) * carrier)
-    sum_bands(controller, False)
+        b = record(c.tiles_at, TILE_T, t)
+        for i in range(p.coordinates):
+            envelope = p.shape[i] * get(b, "expected") + get(
+                record(coordinates_of(controller, t), COORDINATE_T, i), "e"
+            )
+            put(record(c.work_at, WORK_T, 2 * t + i), "x", envelope * get(b, "carrier"))
+    sum_bands(controller, p.coordinates, False)
     gain = p.dc_fast if c.dc_fast_on > 0.0 else p.dc
     drift = p.dc_drift_fast if c.dc_fast_on > 0.0 else p.dc_drift
-    for i in range(2):
+    for i in range(p.coordinates):
         for m in range(block):
             samples[Y + i, m] -= samples[SUM + i, m] + c.dc[i] + m * c.dc_drift[i]
             if samples[Y + i, m] != samples[Y + i, m]:  # invalid: hold the prediction
@@ -204,31 +203,12 @@ def innovate_block(controller):
             steeper += drift * samples[Y + i, m]
         c.dc[i] += block * c.dc_drift[i] + gained
         c.dc_drift[i] += steeper
-    correlate(controller, Y)
+    correlate(controller, Y, p.coordinates)
     for t in range(c.tiles):
-        w, carrier = record(c.work_at, WORK_T, t), get(record(c.tiles_at, TILE_T, t), "carrier")
-        put(w, "x0", conj(get(w, "x0") * carrier))
-        put(w, "x1", conj(get(w, "x1") * carrier))
-
-
-@kernel
-def update_coordinate(e, v, innovation, reference, rise, gain, fading, gains):
-    """Error E, integral part v and dV/dt of a coordinate after a block."""
-    integral, back, period = gains
-    e = (1.0 - period * fading) * e + gain * innovation
-    slope = -1.0 * (integral * e + fading * v)
-    # back-calculation is no part of dV/dt: else law and limiter would form an algebraic loop
-    return e, v + period * (slope - back * (v + reference)), slope + rise
-
-
-@kernel
-def detect(controller, deviation, fast, slow, over, above):
-    """Low-pass a deviation twice; add the squares beyond the levels of the fast and of the slow detector."""
-    p = record(controller, CONTROLLER_T, 0).p
-    fast = fast + p.fast_pole * (deviation - fast)
-    slow = slow + p.slow_pole * (fast - slow)
-    over = over + maximum(square(fast) - p.fast_level, 0.0)
-    return fast, slow, over, above + maximum(square(slow) - p.slow_level, 0.0)
+        carrier = get(record(c.tiles_at, TILE_T, t), "carrier")
+        for i in range(p.coordinates):
+            w = record(c.work_at, WORK_T, 2 * t + i)
+            put(w, "x", conj(get(w, "x") * carrier))
 
 
 @kernel
@@ -239,38 +219,34 @@ def update_envelopes(controller, integral):
     sample the deviation itself is demodulated; in blocks it is E - v and what the innovations add to it.
     """
     c = record(controller, CONTROLLER_T, 0)
-    p, samples, shape0, shape1 = c.p, samples_of(controller), c.p.shape[0], c.p.shape[1]
-    in_blocks, gains = p.block > 1, (integral, p.back_calculation * (1.0 - c.scale), p.block / p.rate)
-    one0, one1 = samples[Y, 0], samples[Y + 1, 0]
-    twice0, twice1, share = 2.0 * c.deviation[0], 2.0 * c.deviation[1], 2.0 / p.block
+    p, samples, period, back = c.p, samples_of(controller), c.p.block / c.p.rate, c.p.back_calculation * (1.0 - c.scale)
     over, above = zeros(), zeros()
     for t in range(c.tiles):
         b = record(c.tiles_at, TILE_T, t)
-        carrier, e0, e1, v0, v1 = conj(get(b, "carrier")), get(b, "e0"), get(b, "e1"), get(b, "v0"), get(b, "v1")
-        if in_blocks:
-            w = record(c.work_at, WORK_T, t)
-            found0, found1 = get(w, "x0"), get(w, "x1")
-            deviation0, deviation1 = e0 - v0 + share * found0, e1 - v1 + share * found1
-        else:
-            found0, found1 = one0 * carrier, one1 * carrier
-            deviation0, deviation1 = twice0 * carrier, twice1 * carrier
-        if p.detects > 0.0:
-            fast0, slow0, over, above = detect(controller, deviation0, get(b, "fast0"), get(b, "slow0"), over, above)
-            fast1, slow1, over, above = detect(controller, deviation1, get(b, "fast1"), get(b, "slow1"), over, above)
-            put(b, "fast0", fast0)
-            put(b, "slow0", slow0)
-            put(b, "fast1", fast1)
-            put(b, "slow1", slow1)
-        feedback, reference, rise = get(b, "feedback"), get(b, "r"), get(b, "slope")
+        carrier, feedback, reference, rise = conj(get(b, "carrier")), get(b, "feedback"), get(b, "r"), get(b, "slope")
         gain, fading = c.gain * feedback, LEAK * (get(b, "active") - feedback)
-        e, v, slope = update_coordinate(e0, v0, found0, shape0 * reference, shape0 * rise, gain, fading, gains)
-        put(b, "e0", e)
-        put(b, "v0", v)
-        put(b, "slope0", slope)
-        e, v, slope = update_coordinate(e1, v1, found1, shape1 * reference, shape1 * rise, gain, fading, gains)
-        put(b, "e1", e)
-        put(b, "v1", v)
-        put(b, "slope1", slope)
+        for i in range(p.coordinates):
+            x = record(coordinates_of(controller, t), COORDINATE_T, i)
+            e, v = get(x, "e"), get(x, "v")
+            if p.block > 1:
+                found = get(record(c.work_at, WORK_T, 2 * t + i), "x")
+                deviation = e - v + (2.0 / p.block) * found
+            else:
+                found, deviation = samples[Y + i, 0] * carrier, 2.0 * c.deviation[i] * carrier
+            if p.detects > 0.0:
+                fast, slow = get(x, "fast"), get(x, "slow")
+                fast = fast + p.fast_pole * (deviation - fast)
+                slow = slow + p.slow_pole * (fast - slow)
+                over = over + maximum(square(fast) - p.fast_level, 0.0)
+                above = above + maximum(square(slow) - p.slow_level, 0.0)
+                put(x, "fast", fast)
+                put(x, "slow", slow)
+            e = (1.0 - period * fading) * e + gain * found
+            slope = -1.0 * (integral * e + fading * v)
+            put(x, "e", e)
+            # back-calculation is no part of dV/dt: else law and limiter would form an algebraic loop
+            put(x, "v", v + period * (slope - back * (v + p.shape[i] * reference)))
+            put(x, "slope", slope + p.shape[i] * rise)
     return total(over), total(above)
 
 
@@ -287,23 +263,22 @@ def synthesise_block(controller):
         if quadrature > 0 and peak <= NEAR_LIMIT:
             break
         for t in range(c.tiles):
-            b, w = record(c.tiles_at, TILE_T, t), record(c.work_at, WORK_T, t)
-            carrier, force0, force1 = get(b, "carrier"), get(b, "last_force0"), get(b, "last_force1")
+            carrier = get(record(c.tiles_at, TILE_T, t), "carrier")
             if quadrature > 0:
                 carrier = pair(imag(carrier), -1.0 * real(carrier))
-            put(w, "x0", force0 * carrier)
-            put(w, "x1", force1 * carrier)
-            put(w, "rise0", (get(b, "force0") - force0) * carrier)
-            put(w, "rise1", (get(b, "force1") - force1) * carrier)
-        sum_bands(controller, True)
+            for i in range(c.p.coordinates):
+                x, w = record(coordinates_of(controller, t), COORDINATE_T, i), record(c.work_at, WORK_T, 2 * t + i)
+                put(w, "x", get(x, "last_force") * carrier)
+                put(w, "rise", (get(x, "force") - get(x, "last_force")) * carrier)
+        sum_bands(controller, c.p.coordinates, True)
         if quadrature == 0:
             for m in range(c.p.block):
                 samples[Y, m], samples[Y + 1, m] = samples[SUM, m], samples[SUM + 1, m]
         peak = max(peak, largest_drive(controller, samples, Y, SUM, quadrature > 0))
     for t in range(c.tiles):
-        b = record(c.tiles_at, TILE_T, t)
-        put(b, "last_force0", get(b, "force0"))
-        put(b, "last_force1", get(b, "force1"))
+        for i in range(c.p.coordinates):
+            x = record(coordinates_of(controller, t), COORDINATE_T, i)
+            put(x, "last_force", get(x, "force"))
     return peak
 
 
@@ -312,17 +287,13 @@ def reset_loop(controller):
     """Reset the loop's state: no confidence in the sensors is left."""
     c = record(controller, CONTROLLER_T, 0)
     for t in range(c.tiles):
-        b = record(c.tiles_at, TILE_T, t)
-        put(b, "e0", 0.0)
-        put(b, "e1", 0.0)
-        put(b, "v0", 0.0)
-        put(b, "v1", 0.0)
-        put(b, "slope0", 0.0)
-        put(b, "slope1", 0.0)
-        put(b, "fast0", 0.0)
-        put(b, "fast1", 0.0)
-        put(b, "slow0", 0.0)
-        put(b, "slow1", 0.0)
+        for i in range(c.p.coordinates):
+            x = record(coordinates_of(controller, t), COORDINATE_T, i)
+            put(x, "e", 0.0)
+            put(x, "v", 0.0)
+            put(x, "slope", 0.0)
+            put(x, "fast", 0.0)
+            put(x, "slow", 0.0)
     for i in range(2):
         c.dc[i] = c.dc_drift[i] = 0.0
         for j in range(16):
@@ -345,13 +316,21 @@ def begin(controller, signals, first):
 
 @kernel
 def find_contact(controller, adapt_now):
-    """Contact by the DC estimate, which raises the gains for a while, and the gain of the inner damper.
+    """Load, lever arm and contact of the finger by the DC estimate, and the gain of the inner damper.
 
-    `damper_scale` is the supervisor's: it turns a ringing damper down.
+    A contact that begins or ends raises the gains for a while.  `damper_scale` is the supervisor's: it turns a ringing
+    damper down.  Returns whether the finger is to be adapted.
     """
     c = record(controller, CONTROLLER_T, 0)
-    p = c.p
-    if detect_contact(controller, adapt_now):
+    p, k = c.p, c.p.stiffness
+    load = -(k[0, 0] * c.dc[0] + k[0, 1] * c.dc[1])
+    moment = -(k[1, 0] * c.dc[0] + k[1, 1] * c.dc[1])
+    on = 1.0 if load > (p.contact_off if c.contact > 0.0 else p.contact_on) else 0.0
+    changed = on != c.contact
+    c.load, c.contact = load, on
+    if on > 0.0 and (adapt_now or changed):
+        c.lever = min(max(moment / max(load, LEAST_LOAD), -2.0), 2.0)
+    if changed:
         c.fast_timer, c.fast_open = p.fast_time, 1.0
         reset_finger(controller)
     c.damping_gain = 0.0 if c.scale < 1.0 else c.damper_scale * (p.damper + c.fast_open * (p.damper_high - p.damper))
@@ -403,8 +382,7 @@ def error_step(state, signals, start, count):
         touching = find_contact(state, adapt_now)
         innovate_sample(state)
         close_block(state, touching, adapt_now)
-        along0, along1, samples[SUM, 0], samples[SUM + 1, 0] = apply_law(state)
-        samples[Y, 0], samples[Y + 1, 0] = along0 + samples[STEP, 0], along1 + samples[STEP + 1, 0]
+        apply_law(state)
         peak = max(c.p.peak_decay * c.p.peak_decay * c.peak_squared, largest_drive(state, samples, Y, SUM, True))
         limit_drive(state, samples, Y, peak, drive, flags, n)
         if c.p.lock > 0.0 and c.unlocked > 0.0:

@@ -11,7 +11,19 @@ from __future__ import annotations
 import math
 
 from hapticrender.control.carriers import SLOWEST
-from hapticrender.control.records import CONTROLLER_T, LOCKED, TILE_T
+from hapticrender.control.records import (
+    CONTROLLER_T,
+    COORDINATE_T,
+    LOCKED,
+    STEP,
+    STIFFNESS_T,
+    SUM,
+    TILE_T,
+    Y,
+    coordinates_of,
+    samples_of,
+    stiffnesses_of,
+)
 from hapticrender.jit import kernel, record
 from hapticrender.mathx import TURN, unit
 from hapticrender.vectors import get, imag, magnitude, pair, put, real, total, where, zeros
@@ -40,37 +52,23 @@ def turn_ahead(controller, t):
 
 
 @kernel
-def law_entry(mass, damping, stiffness, b):
-    """D and D' of one pair of coordinates, turned ahead by rho."""
-    omega, ahead = get(b, "omega"), get(b, "ahead")
-    d = pair(stiffness - omega * omega * mass, omega * damping + get(b, "sweep") * mass)
-    return d * ahead, pair(damping, 2.0 * mass * omega) * ahead
-
-
-@kernel
 def set_law(controller, t):
-    """Set D and D' of a tile, with the finger as the law holds it."""
+    """Set D and D' of a tile, turned ahead by rho, with the finger as the law holds it."""
     c = record(controller, CONTROLLER_T, 0)
     b = record(c.tiles_at, TILE_T, t)
-    p, on, g = c.p, c.law_contact, c.law_lever
-    mass, spring = on * c.finger_mass, on * get(b, "remainder")
-    damping = on * c.finger_damping + contact_damping(controller)
-    k = on * c.finger_stiffness
-    d, s = law_entry(p.mass[0, 0] + mass, p.damping[0, 0] + damping, p.stiffness[0, 0] + k, b)
-    more = spring * get(b, "ahead")
-    put(b, "d00", d + more)
-    put(b, "s00", s)
-    mass, damping, k, more = g * mass, g * damping, g * k, g * more
-    d, s = law_entry(p.mass[0, 1] + mass, p.damping[0, 1] + damping, p.stiffness[0, 1] + k, b)
-    put(b, "d01", d + more)
-    put(b, "s01", s)
-    d, s = law_entry(p.mass[1, 0] + mass, p.damping[1, 0] + damping, p.stiffness[1, 0] + k, b)
-    put(b, "d10", d + more)
-    put(b, "s10", s)
-    mass, damping, k, more = g * mass, g * damping, g * k, g * more
-    d, s = law_entry(p.mass[1, 1] + mass, p.damping[1, 1] + damping, p.stiffness[1, 1] + k, b)
-    put(b, "d11", d + more)
-    put(b, "s11", s)
+    p, on, g, lag = c.p, c.law_contact, c.law_lever, contact_damping(controller)
+    omega, ahead, sweep = get(b, "omega"), get(b, "ahead"), get(b, "sweep")
+    spring = on * get(b, "remainder") * ahead
+    for i in range(p.coordinates):
+        for j in range(p.coordinates):
+            one, other = (g if i > 0 else 1.0), (g if j > 0 else 1.0)  # arms of the finger
+            mass = p.mass[i, j] + other * (one * (on * c.finger_mass))
+            damping = p.damping[i, j] + other * (one * (on * c.finger_damping + lag))
+            stiffness = p.stiffness[i, j] + other * (one * (on * c.finger_stiffness))
+            d = pair(stiffness - omega * omega * mass, omega * damping + sweep * mass)
+            law = record(stiffnesses_of(controller, t), STIFFNESS_T, 2 * i + j)
+            put(law, "d", d * ahead + other * (one * spring))
+            put(law, "s", pair(damping, 2.0 * mass * omega) * ahead)
 
 
 @kernel
@@ -117,19 +115,21 @@ def update_law(controller, touching, adapt_now):
 
 @kernel
 def apply_law(controller):
-    """Force envelopes rho (D V + D' dV/dt) of all bands; returns their sums now and a quarter turn ahead."""
+    """Force envelopes rho (D V + D' dV/dt) of all bands, and their sums in the first column of `samples`.
+
+    The sums now and the inner damper's force go into the rows Y, those a quarter turn ahead into the rows SUM.
+    """
     c = record(controller, CONTROLLER_T, 0)
-    ahead, shape0, shape1 = c.p.extrapolation, c.p.shape[0], c.p.shape[1]
-    sum0 = sum1 = pair(zeros(), zeros())
-    for t in range(c.tiles):
-        b = record(c.tiles_at, TILE_T, t)
-        reference, carrier = get(b, "r") + ahead * get(b, "slope"), get(b, "carrier")
-        v0, v1 = get(b, "v0") + shape0 * reference, get(b, "v1") + shape1 * reference
-        slope0, slope1 = get(b, "slope0"), get(b, "slope1")
-        force = get(b, "d00") * v0 + get(b, "s00") * slope0 + get(b, "d01") * v1 + get(b, "s01") * slope1
-        put(b, "force0", force)
-        sum0 = sum0 + force * carrier
-        force = get(b, "d10") * v0 + get(b, "s10") * slope0 + get(b, "d11") * v1 + get(b, "s11") * slope1
-        put(b, "force1", force)
-        sum1 = sum1 + force * carrier
-    return total(real(sum0)), total(real(sum1)), total(imag(sum0)), total(imag(sum1))
+    p, ahead, samples = c.p, c.p.extrapolation, samples_of(controller)
+    for i in range(p.coordinates):
+        along = pair(zeros(), zeros())
+        for t in range(c.tiles):
+            b, first, laws = record(c.tiles_at, TILE_T, t), coordinates_of(controller, t), stiffnesses_of(controller, t)
+            reference, force = get(b, "r") + ahead * get(b, "slope"), pair(zeros(), zeros())
+            for j in range(p.coordinates):
+                x, law = record(first, COORDINATE_T, j), record(laws, STIFFNESS_T, 2 * i + j)
+                force = force + get(law, "d") * (get(x, "v") + p.shape[j] * reference) + get(law, "s") * get(x, "slope")
+            put(record(first, COORDINATE_T, i), "force", force)
+            along = along + force * get(b, "carrier")
+        samples[Y + i, 0] = total(real(along)) + samples[STEP + i, 0]
+        samples[SUM + i, 0] = total(imag(along))

@@ -8,25 +8,22 @@ drives the plant, which a look-up table or an inverse makes 1 (docs/theory.md, "
 from __future__ import annotations
 
 from math import sqrt
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from hapticrender.bands import Bands
 from hapticrender.control.device_model import DeviceModel
 from hapticrender.control.estimators import StarSTDFT
-from hapticrender.control.margins import LEAST, LeastMargins, Margins, margins_of, unstable_poles
-from hapticrender.control.transfer import TransferFunction, butterworth, require_positive
+from hapticrender.control.margins import LEAST, Margins, margins_of, unstable_poles
+from hapticrender.control.transfer import TransferFunction, butterworth
 from hapticrender.errors import DesignError
 from hapticrender.mathx import zero_crossings
 from hapticrender.protocols import Array
 
 Bandwidths = tuple[float, float]
-Form = Literal["reduced", "integrator"]
 Section = tuple[float, float, float, float, float]  # b0 b1 b2 a1 a2, a0 = 1
 BESIDE = 1e-6  # 1/s: distance of Nyquist's contour from the imaginary axis, right of the integrator
-RIPPLE = 0.005  # largest ripple of the drive at the lowest carrier (Grigorii et al. 2021)
-GAIN = 3.4  # 1/s per Hz: 17 1/s at 5 Hz, with L at 10 Hz the largest whole gain whose step does not overshoot
 NARROWER, SLOWEST = 0.9, 0.05  # steps in which a loop is slowed down for its delay, and how far
 
 
@@ -37,8 +34,7 @@ def reduced_controller(loop_bandwidth: float, filter_bandwidth: float) -> Transf
     s C match those of T/(1 - L T) at s = 0.  A filter that is not faster than the loop is a `DesignError`: p would not
     be a stable pole.
     """
-    require_positive(loop_bandwidth=loop_bandwidth, filter_bandwidth=filter_bandwidth)
-    if filter_bandwidth <= loop_bandwidth:
+    if not 0.0 < loop_bandwidth < filter_bandwidth:
         raise DesignError(
             f"the controller needs a filter faster than the loop: raise {filter_bandwidth=} Hz "
             f"above {loop_bandwidth=} Hz"
@@ -46,12 +42,6 @@ def reduced_controller(loop_bandwidth: float, filter_bandwidth: float) -> Transf
     wt, wl = 2 * np.pi * loop_bandwidth, 2 * np.pi * filter_bandwidth
     gain, pole = wt * wl / (sqrt(2) * (wt + wl)), sqrt(2) * wt * wl / (wl - wt)
     return TransferFunction((gain * pole,), (1.0, pole, 0.0))
-
-
-def integrator(gain: float) -> TransferFunction:
-    """Make the plainest controller, ``C = gain/s`` with `gain` in 1/s."""
-    require_positive(gain=gain)
-    return TransferFunction((gain,), (1.0, 0.0))
 
 
 def loop_margins(rational: TransferFunction, delay: float = 0.0) -> Margins:
@@ -83,70 +73,6 @@ def _grid(loop: TransferFunction) -> Array:
     return np.geomspace(1e-3 * corners.min(), 1e3 * corners.max(), 20001)
 
 
-def design(
-    loop_bandwidth: float,
-    filter_bandwidth: float,
-    form: Form,
-    lowest_frequency: float,
-    *,
-    delay: float = 0.0,
-    least: LeastMargins = LEAST["envelope"],
-) -> TransferFunction:
-    """Design the controller of one envelope's loop, and refuse it where its margins are too small.
-
-    Bandwidths are in Hz, that of the closed loop T at most a quarter of the scene's lowest carrier (Hz), that of the
-    low pass L at most half of it; `delay` (s) is the loop's.  A plain integrator has the gain 3.4 loop_bandwidth.
-
-    Raises
-    ------
-    DesignError
-        Where a bandwidth breaks the paper's rule, or a margin or the ripple its bound: names it, its value and bound,
-        and what to change.
-    ValueError
-        For an argument that no design could accept.
-    """
-    require_positive(
-        loop_bandwidth=loop_bandwidth, filter_bandwidth=filter_bandwidth, lowest_frequency=lowest_frequency
-    )
-    for name, bandwidth, share in (("loop_bandwidth", loop_bandwidth, 4), ("filter_bandwidth", filter_bandwidth, 2)):
-        bound = lowest_frequency / share
-        if bandwidth > bound * (1 + 1e-12):
-            raise DesignError(
-                f"{name} {bandwidth:g} Hz is above lowest_frequency/{share} = {bound:g} Hz: the demodulator's image at "
-                f"twice the carrier would reach the drive; lower {name} or raise lowest_frequency"
-            )
-    controller, low_pass = controller_of(form, loop_bandwidth, filter_bandwidth), butterworth(filter_bandwidth)
-    if complaint := least.complaint(loop_margins(controller * low_pass, delay)):
-        remedies = [f"lower {loop_bandwidth=} Hz"]
-        remedies += [f"raise {filter_bandwidth=} Hz"] if form == "integrator" else []
-        remedies += [f"lower {delay=} s"] if delay else []
-        raise DesignError(f"{complaint}: {' or '.join(remedies)}")
-    if (found := ripple(controller, low_pass, lowest_frequency, delay)) > RIPPLE:
-        raise DesignError(
-            f"ripple {found:.2%} is above {RIPPLE:.2%}: lower filter_bandwidth or loop_bandwidth, or raise "
-            "lowest_frequency"
-        )
-    return controller
-
-
-def controller_of(form: Form, loop_bandwidth: float, filter_bandwidth: float) -> TransferFunction:
-    """Controller of either form, its margins unchecked."""
-    if form == "integrator":
-        return integrator(GAIN * loop_bandwidth)
-    if form == "reduced":
-        return reduced_controller(loop_bandwidth, filter_bandwidth)
-    raise ValueError(f"{form=} must be one of reduced, integrator")
-
-
-def ripple(
-    controller: TransferFunction, low_pass: TransferFunction, lowest_frequency: float, delay: float = 0.0
-) -> float:
-    """Share of the demodulator's image at twice the lowest carrier (Hz) in the drive, ``|C L/(1 + C L)|``."""
-    s = 4j * np.pi * lowest_frequency
-    loop = controller(s) * low_pass(s) * np.exp(-delay * s)
-    return float(abs(loop / (1 + loop)))
-
-
 class EnvelopeLoop(NamedTuple):
     """Low pass of an estimator and its loop controller as second-order sections."""
 
@@ -160,7 +86,6 @@ def envelope_loop(
     model: DeviceModel,
     bands: Bands,
     *,
-    form: Form = "reduced",
     boxcar: bool = False,
     bandwidths: Bandwidths | None = None,
     feedback: bool = True,
@@ -180,28 +105,25 @@ def envelope_loop(
     fixed = bands.frequency[bands.wavenumber == 0.0]
     lowest = float(fixed.min(initial=model.lowest_frequency))
     length = round(model.rate / lowest) if boxcar else 0
-    if bandwidths:
-        width, wide = bandwidths
-        law = controller_of(form, width, wide)
-    else:
-        late = (length - 1) / (2 * model.rate) - StarSTDFT(bandwidth=lowest / 2, rate=model.rate).delay
-        delay = model.delay / model.rate + (max(late, 0.0) if boxcar else 0.0)
-        width, law = _widest(lowest, form, delay if feedback else 0.0)
-        wide = 2 * width
-    low_pass = StarSTDFT(bandwidth=wide, rate=model.rate)
+    delay = model.delay / model.rate if feedback else 0.0
+    if boxcar and feedback:
+        delay += max((length - 1) / (2 * model.rate) - StarSTDFT(bandwidth=lowest / 2, rate=model.rate).delay, 0.0)
+    width, wide = bandwidths or _widest(lowest, delay)
+    low_pass, law = StarSTDFT(bandwidth=wide, rate=model.rate), reduced_controller(width, wide)
     return EnvelopeLoop(section(low_pass.coefficients), section(law.tustin(model.rate)), length, width)
 
 
-def _widest(lowest: float, form: Form, delay: float) -> tuple[float, TransferFunction]:
-    """Widest loop (Hz), from a quarter of the lowest carrier down, whose margins hold with the delay (s)."""
+def _widest(lowest: float, delay: float) -> Bandwidths:
+    """Widest loop (Hz), from a quarter of the lowest carrier down, whose margins hold with the delay (s); low pass."""
     width = lowest / 4
     while True:
-        try:
-            return width, design(width, 2 * width, form, lowest, delay=delay)
-        except DesignError:
-            width *= NARROWER
-            if width < SLOWEST * lowest / 4:
-                raise
+        loop = reduced_controller(width, 2 * width) * butterworth(2 * width)
+        complaint = LEAST["envelope"].complaint(loop_margins(loop, delay))
+        if not complaint:
+            return width, 2 * width
+        width *= NARROWER
+        if width < SLOWEST * lowest / 4:
+            raise DesignError(f"{complaint} even with a loop of {width:.3g} Hz: lower the delay of {delay:.3g} s")
 
 
 def section(coefficients: tuple[Array, Array]) -> Section:

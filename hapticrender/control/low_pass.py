@@ -72,14 +72,6 @@ def estimate(controller, t, i, y):
 
 
 @kernel
-def interpolate(table, row, at):
-    """Value of a row of a table at a fractional place."""
-    at = min(at, table.shape[1] - 1.000001)
-    i = int(at)
-    return table[row, i] + (at - i) * (table[row, i + 1] - table[row, i])
-
-
-@kernel
 def look_up(controller, t):
     """Set drive per metre and lag of the free device for a tile, from the table over frequency."""
     c = record(controller, CONTROLLER_T, 0)
@@ -89,16 +81,11 @@ def look_up(controller, t):
         x = record(c.loops_at, LOW_PASS_T, i * c.tiles + t)
         for k in range(min(W, c.bands - W * t)):
             at = abs(b.frequency[k] + b.wavenumber[k] * c.table_velocity) / c.p.table_step
-            x.drive[k] = 1.0 / interpolate(table, i, at)
-            x.lag[k] = interpolate(table, n + i, at)
-
-
-@kernel
-def smooth_velocity(controller, seen, held):
-    """Low-pass the finger's velocity for the table, from whether and where it was a sample ago."""
-    c = record(controller, CONTROLLER_T, 0)
-    velocity = (c.held_position - held) * c.p.rate if seen > 0.0 else 0.0
-    c.table_velocity += (1.0 - math.exp(-TABLE_POLE / c.p.rate)) * (velocity - c.table_velocity)
+            at = min(at, c.p.table - 1.000001)
+            low = int(at)
+            share = at - low
+            x.drive[k] = 1.0 / (table[i, low] + share * (table[i, low + 1] - table[i, low]))
+            x.lag[k] = table[n + i, low] + share * (table[n + i, low + 1] - table[n + i, low])
 
 
 @kernel
@@ -236,40 +223,33 @@ def reset_loops(controller):
         put(x, "v", 0.0)
 
 
-@kernel
-def cut_drive(controller, drive, flags, n):
-    """Write the drive of a sample, every channel cut to its limit."""
-    c = record(controller, CONTROLLER_T, 0)
-    samples, limit = samples_of(controller), c.p.drive_limit
-    for i in range(c.p.channels):
-        exact = c.confidence * drive_of(controller, samples, SUM, 0, i)
-        drive[n, i] = min(max(exact, -limit), limit)
-        if abs(exact) > limit:
-            flags[n] |= SATURATED
-
-
 @step
 def low_pass_step(state, signals, start, count):
-    """Advance a controller with low passes by `count` samples; see `hapticrender.jit`."""
+    """Advance a controller with low passes by `count` samples, every channel cut to its limit; see `jit`."""
     c, io, stop = record(state, CONTROLLER_T, 0), record(signals, SIGNALS_T, 0), start + count
-    drive, flags = carray(pointer(io.drive, F8), (stop, c.p.channels)), carray(pointer(io.flags, I8), stop)
-    samples = samples_of(state)
+    p, samples, limit, follow = c.p, samples_of(state), c.p.drive_limit, 1.0 - math.exp(-TABLE_POLE / c.p.rate)
+    drive, flags = carray(pointer(io.drive, F8), (stop, p.channels)), carray(pointer(io.flags, I8), stop)
     for n in range(start, stop):
         seen, held = c.finger_seen, c.held_position
         implausible = sense_block(state, signals, n)
         if implausible > 0:  # these methods predict nothing
             samples[Y, 0], samples[Y + 1, 0] = 0.0, 0.0
         if c.moving > 0:
-            smooth_velocity(state, seen, held)
+            velocity = (c.held_position - held) * p.rate if seen > 0.0 else 0.0
+            c.table_velocity += follow * (velocity - c.table_velocity)
         advance_carriers(state)
-        if c.p.analysed > 0.0:
+        if p.analysed > 0.0:
             analyse_sample(state)
         update_targets(state, signals, n)
         if update_confidence(state, implausible):
             reset_loops(state)
-        if c.p.polar > 0.0:
+        if p.polar > 0.0:
             polar_law(state)
         else:
             complex_law(state)
-        cut_drive(state, drive, flags, n)
+        for i in range(p.channels):
+            exact = c.confidence * drive_of(state, samples, SUM, 0, i)
+            drive[n, i] = min(max(exact, -limit), limit)
+            if abs(exact) > limit:
+                flags[n] |= SATURATED
     return 0

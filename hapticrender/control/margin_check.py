@@ -23,8 +23,8 @@ ROOM = 0.25  # of the bandwidth of the rule: the inner damper is softened until 
 SCHEDULE = {"low": (0.0, 0.0), "medium": (0.0, 1.0), "high": (1.0, 0.0)}
 """Levels of the gain schedule: how far the fast and the slow detector have raised the gains."""
 GROUPS = (  # levels that share an observer, and what is lowered for them
-    (("low", "medium"), ("observer", "integral_low", "integral_medium"), "inner"),
-    (("high",), ("observer_high", "integral_high"), "inner_high"),
+    (("low", "medium"), ("observer", "integral", "integral_medium"), "damper"),
+    (("high",), ("observer_high", "integral_high"), "damper_high"),
 )
 
 
@@ -38,20 +38,23 @@ class FreeDevice(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class BankGains:
-    """Gains of the error observer, its law and the inner damper at every level of the gain schedule."""
+    """Gains of the error observer, its law and the inner damper at every level of the gain schedule.
+
+    Names are those of `records.SETTINGS`.
+    """
 
     rate: float  # Hz
     delay: int  # samples from a sensed sample to the moment its force acts, >= 1
     lead: float  # s, by which the law turns forces ahead: delay and half the hold
     observer: float  # gain g per sample, at low and medium
     observer_high: float
-    integral_low: float  # 1/s
+    integral: float  # 1/s, at low
     integral_medium: float
     integral_high: float
     dc: float  # of the DC estimate per sample, 1.6 w/rate
     dc_drift: float  # (w/rate)^2
-    inner: float  # factor on the inner damper, 0..1, at low and medium
-    inner_high: float
+    damper: float  # factor on the inner damper, 0..1, at low and medium
+    damper_high: float
     crowd_speed: float  # m/s: below it the observer's gain falls in proportion, as locked carriers crowd; 0: none
     lowest: float  # Hz, range of finger-locked carriers
     highest: float
@@ -59,14 +62,12 @@ class BankGains:
 
     def at(self, level: str) -> tuple[float, float, float]:
         """Return observer gain, integral gain and inner damper at a level of the schedule."""
-        if level not in SCHEDULE:
-            raise ValueError(f"{level=} must be one of {', '.join(SCHEDULE)}")
         fast, slow = SCHEDULE[level]
-        integral = self.integral_low + slow * (self.integral_medium - self.integral_low)
+        integral = self.integral + slow * (self.integral_medium - self.integral)
         return (
             self.observer + fast * (self.observer_high - self.observer),
             integral + fast * (self.integral_high - integral),
-            self.inner + fast * (self.inner_high - self.inner),
+            self.damper + fast * (self.damper_high - self.damper),
         )
 
     def scaled(self, names: tuple[str, ...], factor: float) -> BankGains:
@@ -187,8 +188,8 @@ def _checked(arrays: tuple[tuple[tuple[int, ...], bytes], ...], gains: BankGains
         return next((text for text in found if text), "")
 
     notes: list[str] = []
-    for levels, rates, inner in GROUPS:
-        gains, lowered = _lowered(complaint, gains, levels, rates, inner)
+    for levels, rates, damper in GROUPS:
+        gains, lowered = _lowered(complaint, gains, levels, rates, damper)
         notes += lowered
     return Checked(gains, {level: worst(gains, level) for level in SCHEDULE}, tuple(notes))
 
@@ -198,7 +199,7 @@ def _lowered(
     gains: BankGains,
     levels: tuple[str, ...],
     rates: tuple[str, ...],
-    inner: str,
+    damper: str,
 ) -> tuple[BankGains, list[str]]:
     """Lower the gains of a group of levels until their margins hold; say what was lowered."""
     first = complaint(gains, levels)
@@ -206,9 +207,9 @@ def _lowered(
         return gains, []
     name, notes = " and ".join(levels), []
     cramped = complaint(gains.scaled(rates, ROOM), levels)
-    if cramped and getattr(gains, inner) > 0.0:
+    if cramped and getattr(gains, damper) > 0.0:
         for soft in SOFTER:
-            softer = gains.scaled((inner,), soft)
+            softer = gains.scaled((damper,), soft)
             if not complaint(softer.scaled(rates, ROOM), levels):
                 gains = softer
                 notes.append(

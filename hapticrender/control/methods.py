@@ -41,15 +41,14 @@ from hapticrender.control.linear import Sampled
 from hapticrender.control.loopshape import (
     Bandwidths,
     EnvelopeLoop,
-    Form,
     envelope_loop,
-    integrator,
     loop_margins,
     section,
 )
 from hapticrender.control.low_pass import low_pass_step
 from hapticrender.control.margins import LEAST
 from hapticrender.control.records import LOW_PASS, W, aligned
+from hapticrender.control.transfer import TransferFunction
 from hapticrender.errors import DesignError
 from hapticrender.protocols import Array, Method
 
@@ -128,14 +127,13 @@ class Inverse:
 
     name: str
     dynamic: bool  # D V + D' dV/dt in place of the static D(jw) V
-    form: Form = "reduced"  # or an "integrator" of 17 1/s at 5 Hz
     feed_forward: bool = False  # command the reference plus what the loop adds, in place of the loop alone
     filtered: bool = True  # with feed-forward, compare the reference behind the estimator's low pass; naive without
     bandwidths: Bandwidths | None = None  # Hz, of loop and low pass, unchecked; None: the paper's rule
 
     def design(self, model: DeviceModel, bands: Bands, *, feedback: bool = True) -> BankController:
         """Design loops in the device's coordinates; raises `DesignError` where its delay leaves no margin."""
-        loop = envelope_loop(model, bands, form=self.form, bandwidths=self.bandwidths, feedback=feedback)
+        loop = envelope_loop(model, bands, bandwidths=self.bandwidths, feedback=feedback)
         settings = complex_settings(model, bands, loop, self.feed_forward, feedback)
         settings |= {"dynamic": self.dynamic, "deviation": self.feed_forward and self.filtered}
         return low_pass_controller(self.name, settings, bands)
@@ -154,13 +152,12 @@ class Resonant:
     """
 
     gain: float = 15.0  # 1/s, sum of ki over the bands, > 0, below the decay rate of the least damped mode
-    feed_forward: bool = False  # command the reference plus what the loop adds, in place of the loop alone
     checked: bool = True  # refuse a gain or a delay beyond its bound; naive without
     name: ClassVar[str] = "resonant"
 
     def design(self, model: DeviceModel, bands: Bands, *, feedback: bool = True) -> BankController:
         """Design integrators; a `DesignError` where the gain drives a mode, or the delay leaves no margin."""
-        controller = integrator(self.gain / max(len(bands), 1))
+        controller = TransferFunction((self.gain / max(len(bands), 1),), (1.0, 0.0))
         if feedback and self.checked:
             least = least_decay(model)
             if self.gain >= least:
@@ -172,7 +169,7 @@ class Resonant:
             if complaint := LEAST["envelope"].complaint(found):
                 raise DesignError(f"{complaint}: lower gain={self.gain:g} 1/s or the loop's delay")
         loop = EnvelopeLoop(ALL_PASS, section(controller.tustin(model.rate)), 0, model.lowest_frequency / 4)
-        settings = complex_settings(model, bands, loop, self.feed_forward, feedback)
+        settings = complex_settings(model, bands, loop, False, feedback)
         return low_pass_controller(self.name, settings | {"dynamic": True, "deviation": True}, bands)
 
 

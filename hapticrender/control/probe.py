@@ -30,7 +30,7 @@ MOST_INVALID, MOST_REPEATS, LEAST_ENERGY = 0.02, 0.6, 0.02
 MOST_RESIDUAL, MOST_WORSE = 0.35, 0.05
 SCALES, DELAY_TOLERANCE = (0.6, 1.6), 2  # samples
 ONE, SWAP = np.eye(2), np.eye(2)[::-1]
-WIRINGS = {  # what is not as told: sensors (rows are what is sensed), actuators
+WIRINGS = {  # what is not as stated: sensors (rows are what is sensed), actuators
     "nothing": (ONE, ONE),
     "sensor 1 is inverted": (np.diag([-1.0, 1.0]), ONE),
     "sensor 2 is inverted": (np.diag([1.0, -1.0]), ONE),
@@ -50,9 +50,9 @@ WIRINGS = {  # what is not as told: sensors (rows are what is sensed), actuators
 class Found(NamedTuple):
     """Result of a probe."""
 
-    fault: str  # what is not as told; "" where nothing was found
-    residual: float  # of the wiring as told
-    scale: float  # of the answer over that of the model, 1 where all is as told
+    fault: str  # what is not as stated; "" where nothing was found
+    residual: float  # of the wiring as stated
+    scale: float  # of the answer over that of the model, 1 where all is as stated
     delay: int  # samples, of the loop
 
 
@@ -64,7 +64,7 @@ def probe_plate(driver: Driver, model: DeviceModel) -> None:
     Raises
     ------
     DeviceFault
-        What is not as told was found in every try.
+        A deviation from the model was found in every try.
     """
     model = replace(model, delay=model.delay + getattr(driver, "play_delay", driver.delay) - driver.delay)
     drive = probe_drive(model)
@@ -92,34 +92,34 @@ def probe_drive(model: DeviceModel) -> Array:
     drive = (gains[:, :, None] * np.sin(2 * np.pi * lines[:, :, None] * time + phases[:, None])).sum(axis=1).T
     drive *= np.sin(np.pi / 2 * edge)[:, None] ** 2
     limit = MOST_DRIVE * model.drive_limit / abs(drive).max()
-    return drive * min(MOTION * model.sensed_limit / abs(_answers(model, drive).sum(axis=0)).max(), limit)
+    return drive * min(MOTION * model.sensed_limit / abs(_answer(model, drive)).max(), limit)
 
 
 def judge(model: DeviceModel, drive: Array, sensed: Array) -> Found:
-    """Compare what was sensed (n, 2) under `drive` (n, 2) with the model's answers, and name what is not as told."""
-    told = model.delay - model.block
-    first = max(told - DELAYS // 2, 0)
+    """Compare what was sensed (n, 2) under `drive` (n, 2) with the model's answers, and name the deviation."""
+    stated = model.delay - model.block
+    delays = range(max(stated - DELAYS // 2, 0), max(stated - DELAYS // 2, 0) + DELAYS)
+    expected: dict[tuple[str, int], Array] = {}
+    for name, (sensors, actuators) in WIRINGS.items():
+        answer = _answer(model, drive @ actuators.T) @ sensors.T
+        expected |= {(name, delay): _detrended(_late(answer, delay)) for delay in delays}
     valid = np.asarray((abs(sensed) < model.sensed_limit).all(axis=1))
     repeats = (np.diff(sensed, axis=0) == 0.0).mean(axis=0)
     if (~valid).mean() > MOST_INVALID:
         return Found(f"{(~valid).mean():.0%} of the samples are invalid", np.nan, np.nan, -1)
     y = _detrended(np.where(valid[:, None], sensed, 0.0))
-    expected = _detrended(_late(_answers(model, drive).sum(axis=0), told))
-    energy, told_energy = float((y**2).sum()), float((expected**2).sum())
-    if energy < LEAST_ENERGY * told_energy:
-        return Found("nothing moves: sensors or actuators are dead", np.nan, (energy / told_energy) ** 0.5, -1)
+    energy, model_energy = float((y**2).sum()), float((expected["nothing", stated] ** 2).sum())
+    if energy < LEAST_ENERGY * model_energy:
+        return Found("nothing moves: sensors or actuators are dead", np.nan, (energy / model_energy) ** 0.5, -1)
     if (repeats > MOST_REPEATS).any():
         return Found(f"sensor {1 + int(repeats.argmax())} repeats its values", np.nan, np.nan, -1)
-    residuals = {}
-    for name, (sensors, actuators) in WIRINGS.items():
-        answer = _answers(model, drive @ actuators.T).sum(axis=0) @ sensors.T
-        for delay in range(first, first + DELAYS):
-            h = _detrended(_late(answer, delay))
-            residuals[name, delay] = 1.0 - float((y * h).sum()) / max(float((y**2).sum() * (h**2).sum()) ** 0.5, 1e-300)
+    residuals = {
+        key: 1.0 - float((y * h).sum()) / max(float(energy * (h**2).sum()) ** 0.5, 1e-300)
+        for key, h in expected.items()
+    }
     best = min(residuals, key=lambda each: residuals[each])
-    own = min((each for each in residuals if each[0] == "nothing"), key=lambda each: residuals[each])
-    h = _detrended(_late(_answers(model, drive).sum(axis=0), own[1]))
-    scale, delay = float((y * h).sum() / (h**2).sum()), own[1] + model.block
+    own = min((("nothing", delay) for delay in delays), key=lambda each: residuals[each])
+    scale, delay = float((y * expected[own]).sum() / (expected[own] ** 2).sum()), own[1] + model.block
     fault = ""
     if residuals[own] > residuals[best] + MOST_WORSE:
         fault = best[0]
@@ -132,16 +132,15 @@ def judge(model: DeviceModel, drive: Array, sensed: Array) -> Found:
     return Found(fault, residuals[own], scale, delay)
 
 
-def _answers(model: DeviceModel, drive: Array) -> Array:
-    """What the free device's sensors show under each actuator alone, shape (actuators, n, sensors)."""
+def _answer(model: DeviceModel, drive: Array) -> Array:
+    """What the free device's sensors show under a drive (n, channels), shape (n, sensors)."""
     plate = Sampled.free(model.mass, model.damping, model.stiffness, model.rate)
-    forces = drive.T[:, :, None] * model.force_from_drive.T[:, None]
-    show = np.linalg.inv(model.coordinate_from_sensed) @ plate.c
-    state, found = np.zeros((len(forces), len(plate.a))), np.empty((*forces.shape[:2], len(show)))
-    for n in range(forces.shape[1]):
-        found[:, n] = state @ show.T
-        state = state @ plate.a.T + forces[:, n] @ plate.b.T
-    return found
+    forces, state = drive @ (plate.b @ model.force_from_drive).T, np.zeros(len(plate.a))
+    states = np.empty((len(drive), len(state)))
+    for n, force in enumerate(forces):
+        states[n] = state
+        state = plate.a @ state + force
+    return states @ (np.linalg.inv(model.coordinate_from_sensed) @ plate.c).T
 
 
 def _late(answer: Array, samples: int) -> Array:

@@ -7,8 +7,8 @@ on eight bands at a time.  Symbols, for a band with the carrier e^(j phi):
     e        error envelope E, estimated minus reference         v        integral part v of the command V = R + v
     d, s     dynamic stiffness D(j w), finger included, turned ahead by delay and hold; its slope D'(j w) alike
 
-The fields of both coordinates, and of the law between them, lie in the same tile: loops over fields of two records do
-not vectorise, as the compiler has to assume that they overlap.  A device of one coordinate leaves the other's at zero.
+Fields of a coordinate, and of the law between two, are numbered in a tile (``e0_re``); kernels reach them as records of
+their own, see `coordinates_of`.  A device of one coordinate leaves the other's at zero.
 """
 
 from __future__ import annotations
@@ -32,6 +32,10 @@ def _complex(*names: str) -> list[str]:
     return [f"{name}_{part}" for name in names for part in ("re", "im")]
 
 
+# of each coordinate: error and integral envelopes, dV/dt; low passes of the detectors; force envelopes at the end of
+# the last block and of this one; command and deviation, see `adaptation`
+COORDINATE_NAMES = "e v slope fast slow last_force force filtered last".split()
+STIFFNESS_NAMES = "ds"  # D and D' of the law, of each pair of coordinates
 TILE_FIELDS = [
     "active",  # 1, or 0 in a lane without a band
     "frequency",  # Hz, the fixed part
@@ -54,20 +58,17 @@ TILE_FIELDS = [
     *("filtered_omega", "complete"),  # the observer; share of a carrier's own history in them
     *("amount", "sounds", "direction"),  # polar law: |R|, whether that is no silence, sign of the carrier's frequency
     *_complex("heading"),  # R/|R|, the last one in silence
-    # of each coordinate: error and integral envelopes, dV/dt; low passes of the detectors; force envelopes at the end
-    # of the last block and of this one; command and deviation, see `adaptation`
-    *_complex(*(f"{name}{i}" for i in (0, 1) for name in "e v slope fast slow last_force force filtered last".split())),
-    *_complex(*(f"{name}{i}{j}" for i in (0, 1) for j in (0, 1) for name in "ds")),  # D and D' of the law
+    *_complex(*(f"{name}{i}" for i in (0, 1) for name in COORDINATE_NAMES)),
+    *_complex(*(f"{name}{i}{j}" for i in (0, 1) for j in (0, 1) for name in STIFFNESS_NAMES)),
 ]
-WORK_FIELDS = _complex(*(f"{name}{i}" for i in (0, 1) for name in ("x", "rise", "y", "up")))
-"""Of a tile in a block: envelopes of both coordinates and their rises over the block; the same turned to a group."""
+WORK_FIELDS = _complex("x", "rise", "y", "up")
+"""Of a tile and coordinate in a block: an envelope and its rise over the block; the same turned to a group."""
 LOW_PASS_FIELDS = [
     *_complex("low1", "low2", "law1", "law2", "v", "slope"),
     *("drive", "lag"),
 ]
 """Of a tile in a coordinate of a method with low passes: states of low pass and loop controller, of which the polar
 law has amplitude (re) and phase (im); V and dV/dt; drive per metre and lag (rad) of the free device."""
-COMMAND_FIELDS = _complex("command0", "command1", "force")
 
 
 def _record(names: list[str]) -> np.dtype:
@@ -75,8 +76,8 @@ def _record(names: list[str]) -> np.dtype:
 
 
 TILE = np.dtype([("mode", np.int64, (8,)), *((name, np.float64, (W,)) for name in TILE_FIELDS)])
-LOW_PASS, COMMAND, WORK, PAIR = map(_record, (LOW_PASS_FIELDS, COMMAND_FIELDS, WORK_FIELDS, _complex("z")))
-"""Commands are ordered [step, tile]; a pair is a complex number for each band of a tile."""
+LOW_PASS, WORK, PAIR = map(_record, (LOW_PASS_FIELDS, WORK_FIELDS, _complex("z")))
+"""Work is ordered [tile, coordinate]; a pair is a complex number for each band of a tile."""
 
 _SETTINGS = """
 rate lead waveform_gain middle extrapolation fade_in lowest highest highest_edge modulated differentiated analysed
@@ -142,13 +143,28 @@ CONTROLLER = np.dtype(
 )
 """Settings and state of a controller, and the addresses of its arrays."""
 CONTROLLER_T = numba.from_dtype(CONTROLLER)
-TILE_T, LOW_PASS_T, COMMAND_T, WORK_T, PAIR_T = map(tile_type, (TILE, LOW_PASS, COMMAND, WORK, PAIR))
+TILE_T, LOW_PASS_T, WORK_T, PAIR_T = map(tile_type, (TILE, LOW_PASS, WORK, PAIR))
+COORDINATE_T, STIFFNESS_T = (tile_type(_record(_complex(*names))) for names in (COORDINATE_NAMES, STIFFNESS_NAMES))
+TILE_SIZE = TILE.itemsize
+COORDINATES_AT, STIFFNESSES_AT = (TILE.fields[name][1] for name in ("e0_re", "d00_re"))  # type: ignore[index]
 
 # rows of the samples' work array (rows, M): coordinates, then innovations; sums over the bands and their steps; finger
 # position; waveform; response r, first columns of Q for the innovation and for the waveform; what was solved; sums and
-# differences of samples at equal distances from a group's middle, of two rows
+# differences of samples at equal distances from a group's middle
 Y, SUM, STEP, POSITION, WAVEFORM, RESPONSE, INVERSE, ANALYSIS, SOLVED, FOLDED = 0, 2, 4, 6, 7, 8, 9, 10, 11, 12
-SAMPLE_ROWS = 16
+SAMPLE_ROWS = 14
+
+
+@kernel
+def coordinates_of(controller, t):
+    """Address of the records of a tile's coordinates, of type `COORDINATE_T`."""
+    return record(controller, CONTROLLER_T, 0).tiles_at + t * TILE_SIZE + COORDINATES_AT
+
+
+@kernel
+def stiffnesses_of(controller, t):
+    """Address of the records of the law between a tile's coordinates i and j, number 2 i + j of type `STIFFNESS_T`."""
+    return record(controller, CONTROLLER_T, 0).tiles_at + t * TILE_SIZE + STIFFNESSES_AT
 
 
 @kernel

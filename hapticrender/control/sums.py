@@ -64,8 +64,8 @@ def turn_tables(controller):
 
 
 @kernel
-def sum_bands(controller, rising):
-    """Sum Re(x z[m]) over the bands for two envelopes x, which rise linearly over the block; into the rows SUM."""
+def sum_bands(controller, count, rising):
+    """Sum Re(x z[m]) over the bands for `count` envelopes x, which may rise linearly over the block; rows SUM."""
     c = record(controller, CONTROLLER_T, 0)
     samples, group, block, tiles = samples_of(controller), c.p.group, c.p.block, c.tiles
     middle, pairs = 0.5 * (group - 1), (group + 1) // 2
@@ -74,61 +74,56 @@ def sum_bands(controller, rising):
         for t in range(tiles):
             if record(c.tiles_at, TILE_T, t).mode[0] == LOCKED:
                 turn_pairs(controller, t, q)
-            w, z = record(c.work_at, WORK_T, t), get(record(c.phasors_at, PAIR_T, q * tiles + t), "z")
-            x0, x1 = get(w, "x0"), get(w, "x1")
-            if rising:
-                rise0, rise1 = get(w, "rise0"), get(w, "rise1")
-                x0, x1 = x0 + share * rise0, x1 + share * rise1
-                put(w, "up0", rise0 * z * (1.0 / block))
-                put(w, "up1", rise1 * z * (1.0 / block))
-            put(w, "y0", x0 * z)
-            put(w, "y1", x1 * z)
-        for i in range(pairs):
-            even0, odd0, even1, odd1 = zeros(), zeros(), zeros(), zeros()
-            distance = middle - (pairs - 1 - i)
-            for t in range(tiles):
-                w, z = record(c.work_at, WORK_T, t), get(record(c.table_at, PAIR_T, i * tiles + t), "z")
-                cos, sin, y0, y1 = real(z), imag(z), get(w, "y0"), get(w, "y1")
-                even0, odd0 = even0 + real(y0) * cos, odd0 + imag(y0) * sin
-                even1, odd1 = even1 + real(y1) * cos, odd1 + imag(y1) * sin
+            z = get(record(c.phasors_at, PAIR_T, q * tiles + t), "z")
+            for i in range(count):
+                w = record(c.work_at, WORK_T, 2 * t + i)
+                x = get(w, "x")
                 if rising:
-                    cos, sin, y0, y1 = distance * cos, distance * sin, get(w, "up0"), get(w, "up1")
-                    even0, odd0 = even0 - imag(y0) * sin, odd0 - real(y0) * cos
-                    even1, odd1 = even1 - imag(y1) * sin, odd1 - real(y1) * cos
-            early, late = q * group + pairs - 1 - i, q * group + group - pairs + i
-            samples[SUM, early], samples[SUM, late] = total(even0 + odd0), total(even0 - odd0)
-            samples[SUM + 1, early], samples[SUM + 1, late] = total(even1 + odd1), total(even1 - odd1)
+                    x = x + share * get(w, "rise")
+                    put(w, "up", get(w, "rise") * z * (1.0 / block))
+                put(w, "y", x * z)
+        for k in range(pairs):
+            distance = middle - (pairs - 1 - k)
+            early, late = q * group + pairs - 1 - k, q * group + group - pairs + k
+            for i in range(count):
+                even, odd = zeros(), zeros()
+                for t in range(tiles):
+                    w, z = record(c.work_at, WORK_T, 2 * t + i), get(record(c.table_at, PAIR_T, k * tiles + t), "z")
+                    y = get(w, "y")
+                    even, odd = even + real(y) * real(z), odd + imag(y) * imag(z)
+                    if rising:
+                        z, up = distance * z, get(w, "up")
+                        even, odd = even - imag(up) * imag(z), odd - real(up) * real(z)
+                samples[SUM + i, early], samples[SUM + i, late] = total(even + odd), total(even - odd)
 
 
 @kernel
-def correlate(controller, row):
-    """Sums over the block of two rows of `samples` times z[m] of every band, into the envelopes x."""
+def correlate(controller, row, count):
+    """Sums over the block of `count` rows of `samples` times z[m] of every band, into the envelopes x."""
     c = record(controller, CONTROLLER_T, 0)
     samples, group, tiles = samples_of(controller), c.p.group, c.tiles
     pairs = (group + 1) // 2
-    for start in range(0, c.p.groups * group, group):
-        for i in range(pairs):
-            early, late = start + pairs - 1 - i, start + group - pairs + i
-            twice = 0.5 if early == late else 1.0  # the middle of an odd group
-            for k in range(2):
-                one, other = samples[row + k, early], samples[row + k, late]
-                samples[FOLDED + 2 * k, start + i] = twice * (other + one)
-                samples[FOLDED + 2 * k + 1, start + i] = twice * (other - one)
-    for t in range(tiles):
-        x0 = x1 = pair(zeros(), zeros())
-        for q in range(c.p.groups):
-            if record(c.tiles_at, TILE_T, t).mode[0] == LOCKED:
-                turn_pairs(controller, t, q)
-            even0, odd0, even1, odd1 = zeros(), zeros(), zeros(), zeros()
-            for i in range(pairs):
-                z, m = get(record(c.table_at, PAIR_T, i * tiles + t), "z"), q * group + i
-                even0, odd0 = even0 + samples[FOLDED, m] * real(z), odd0 + samples[FOLDED + 1, m] * imag(z)
-                even1, odd1 = even1 + samples[FOLDED + 2, m] * real(z), odd1 + samples[FOLDED + 3, m] * imag(z)
-            z = get(record(c.phasors_at, PAIR_T, q * tiles + t), "z")
-            x0, x1 = x0 + pair(even0, odd0) * z, x1 + pair(even1, odd1) * z
-        w = record(c.work_at, WORK_T, t)
-        put(w, "x0", x0)
-        put(w, "x1", x1)
+    for i in range(count):
+        for start in range(0, c.p.groups * group, group):
+            for k in range(pairs):
+                early, late = start + pairs - 1 - k, start + group - pairs + k
+                twice = 0.5 if early == late else 1.0  # the middle of an odd group
+                one, other = samples[row + i, early], samples[row + i, late]
+                samples[FOLDED, start + k], samples[FOLDED + 1, start + k] = (
+                    twice * (other + one),
+                    twice * (other - one),
+                )
+        for t in range(tiles):
+            x = pair(zeros(), zeros())
+            for q in range(c.p.groups):
+                if record(c.tiles_at, TILE_T, t).mode[0] == LOCKED:
+                    turn_pairs(controller, t, q)
+                even, odd = zeros(), zeros()
+                for k in range(pairs):
+                    z, m = get(record(c.table_at, PAIR_T, k * tiles + t), "z"), q * group + k
+                    even, odd = even + samples[FOLDED, m] * real(z), odd + samples[FOLDED + 1, m] * imag(z)
+                x = x + pair(even, odd) * get(record(c.phasors_at, PAIR_T, q * tiles + t), "z")
+            put(record(c.work_at, WORK_T, 2 * t + i), "x", x)
 
 
 @kernel
@@ -141,13 +136,12 @@ def invert(controller, g):
     samples, block, p = samples_of(controller), c.p.block, c.p
     last = (p.group + 1) // 2 - 1
     for t in range(c.tiles):
-        w, b = record(c.work_at, WORK_T, t), record(c.tiles_at, TILE_T, t)
+        w, b = record(c.work_at, WORK_T, 2 * t), record(c.tiles_at, TILE_T, t)
         first = get(record(c.phasors_at, PAIR_T, t), "z") * conj(
             get(record(c.table_at, PAIR_T, last * c.tiles + t), "z")
         )
-        put(w, "x0", get(b, "feedback") * conj(first))  # relative to the block's first sample
-        put(w, "x1", 0.0)
-    sum_bands(controller, False)
+        put(w, "x", get(b, "feedback") * conj(first))  # relative to the block's first sample
+    sum_bands(controller, 1, False)
     for m in range(block):
         samples[RESPONSE, m] = samples[SUM, m]
     for row in range(INVERSE, ANALYSIS + 1):

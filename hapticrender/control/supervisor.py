@@ -11,10 +11,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from hapticrender.control.controller import BankController
+from hapticrender.control.controller import BankController, padded
 from hapticrender.control.device_model import Demand, DeviceModel
 from hapticrender.control.gains import GAINS, design_gains
-from hapticrender.control.records import CONTROLLER, MOST_CHANNELS, MOST_SENSORS
+from hapticrender.control.records import CONTROLLER, MOST_CHANNELS, MOST_SENSORS, MOST_TAPS
 from hapticrender.control.supervisor_kernel import (
     ACTIVE,
     BEYOND,
@@ -38,7 +38,7 @@ INVALID_TIME = 50e-3  # s
 FROZEN_SAMPLES, FROZEN_TIME = 10, 2e-3  # s; noise of 1 um in steps of 0.12 um repeats a sample with p = 0.034
 FROZEN_SIGMAS = 4 * 1.3  # of the noise: the drive must have moved the sensor by so much
 LEAST_NOISE = 1e-4  # of a sensor's range: a model may state no noise, and no steps
-FINGER_STIFFNESS, FINGER_DAMPING, LEVER = 8e3, 10.0, 2.0  # N/m, N s/m, |p/a|: no finger has more
+FINGER_STIFFNESS, FINGER_DAMPING = 8e3, 10.0  # N/m, N s/m: no finger has more
 MODEL_ERROR, DELAY_ERROR, LOAD = 0.1, 1.2, 1.15  # of D; samples; of K: a pressing hand shows r = -K x
 NOISE_VARIANCES = 12.0
 POWER_TIME = 12e-3  # s
@@ -134,8 +134,7 @@ class SupervisedController:
         self.state = np.zeros(1, SUPERVISOR)
         self._forces = np.zeros((model.delay + 1, 3))
         settings = design_supervisor(controller, model)
-        noise = max(model.sensed_noise, LEAST_NOISE * model.sensed_limit)
-        found = design_gains(model, noise) if settings.get("modelled") else None
+        found = design_gains(model, sensor_noise(model)) if settings.get("modelled") else None
         self.gains = np.zeros(1, GAINS) if found is None else found
         settings |= {
             "step": controller.step.address,
@@ -182,6 +181,11 @@ def supervised(controller: Controller, model: DeviceModel, *, feedback: bool = T
     return SupervisedController(controller, model)
 
 
+def sensor_noise(model: DeviceModel) -> float:
+    """Noise of each sensor (rms) that the tests allow for."""
+    return max(model.sensed_noise, LEAST_NOISE * model.sensed_limit)
+
+
 def governed(model: DeviceModel, demand: Demand) -> DeviceModel:
     """Return the model with the demand of a scene, and the drive limit that the scene needs: 3 B + A."""
     return replace(model, demand=demand, drive_limit=min(model.drive_limit, 3.0 * demand.drive + press_drive(model)))
@@ -205,7 +209,7 @@ def drive_per_target(model: DeviceModel, frequency: Array) -> Array:
 def design_supervisor(controller: Any, model: DeviceModel) -> dict[str, Any]:
     """Settings of a supervisor for a controller and the model that it was designed for; see the module."""
     rate, sensors, channels = model.rate, model.coordinate_from_sensed.shape[1], model.force_from_drive.shape[1]
-    noise = max(model.sensed_noise, LEAST_NOISE * model.sensed_limit)
+    noise = sensor_noise(model)
     demand, stiffness, total = model.demand, float(model.stiffness[0, 0]), float(abs(model.force_from_drive[0].sum()))
     top = abs(model.dynamic_stiffness(np.array(demand.highest if demand else 0.0))[0, 0])
     moved = FROZEN_SIGMAS * noise * max(stiffness, top) * channels / total  # sum of the channels
@@ -217,8 +221,8 @@ def design_supervisor(controller: Any, model: DeviceModel) -> dict[str, Any]:
         "needs_contact": model.finger.needs_contact,
         "sensor_limit": model.sensed_limit,
         "most_drive": UNLIMITED,
-        "coordinate_from_sensor": _padded(model.coordinate_from_sensed, 2, MOST_SENSORS),
-        "force_from_drive": _padded(model.force_from_drive, 2, MOST_CHANNELS),
+        "coordinate_from_sensor": padded(model.coordinate_from_sensed, 2, MOST_SENSORS),
+        "force_from_drive": padded(model.force_from_drive, 2, MOST_CHANNELS),
         "invalid_pole": _pole(INVALID_TIME, rate),
         "frozen_time": max(FROZEN_SAMPLES, round(FROZEN_TIME / model.pace * rate)),
         "frozen_drive": UNLIMITED if model.inferred else moved,
@@ -279,7 +283,7 @@ def _motion_settings(model: DeviceModel, demand: Demand, noise: float) -> dict[s
     floor[1] += (PRESS_LOAD * SLIDE * model.lever_per_metre / (2 * np.pi * low_end)) ** 2  # a ramp behind the high-pass
     return {
         "modelled": 1,
-        **{name: _padded(getattr(model, name), 2, 2) for name in ("mass", "damping", "stiffness")},
+        **{name: padded(getattr(model, name), 2, 2) for name in ("mass", "damping", "stiffness")},
         "corner": g,
         "shape": 1.0 / (1.0 + g * (g + ROOT2)),
         "omega": omega,
@@ -327,15 +331,19 @@ def ringing_from(model: DeviceModel) -> float:
     return min(max(RINGING_FROM, 1.5 * model.demand.highest if model.demand else 0.0), model.rate / 5)
 
 
-def damper_noise(model: DeviceModel, taps: Array) -> Array:
-    """Inner damper's force beyond `ringing_from` (N rms, shape (2,)) by the sensors' noise, for taps (c, t) in N/m."""
-    noise = max(model.sensed_noise, LEAST_NOISE * model.sensed_limit)
+def damper_settings(model: DeviceModel, taps: Array | None) -> dict[str, Any]:
+    """Settings of a controller's inner damper with `taps` (c, t) in N/m, None where it has none.
+
+    ``damper_noise`` is its force beyond `ringing_from` (N rms, shape (2,)) by the sensors' noise.
+    """
+    taps = np.zeros((len(model.mass), 1)) if taps is None else taps
     turn = np.pi * (np.arange(512) + 0.5) / 512
     s = 1j * np.tan(turn / 2) / _trapezoidal(ringing_from(model), model.rate)
     passed = abs(s * s / (s * s + ROOT2 * s + 1.0)) ** 4
     response = np.exp(-1j * np.outer(turn, np.arange(taps.shape[1]))) @ taps.T  # (512, c)
     power = (passed[:, None] * abs(response) ** 2).mean(axis=0) * (model.coordinate_from_sensed**2).sum(axis=1)
-    return np.append(noise * np.sqrt(power), [0.0, 0.0])[:2]
+    noise = np.append(sensor_noise(model) * np.sqrt(power), [0.0, 0.0])[:2]
+    return {"n_taps": taps.shape[1], "taps": padded(taps, 2, MOST_TAPS), "damper_noise": noise}
 
 
 def _residual_noise(model: DeviceModel, i: int, corner: float, low_end: float) -> float:
@@ -357,7 +365,3 @@ def _trapezoidal(frequency: float, rate: float) -> float:
 def _pole(time: float, rate: float) -> float:
     """Gain of a one-pole mean over `time` (s)."""
     return -math.expm1(-1.0 / (time * rate))
-
-
-def _padded(matrix: Array, rows: int, columns: int) -> Array:
-    return np.pad(matrix, ((0, rows - matrix.shape[0]), (0, columns - matrix.shape[1])))

@@ -1,4 +1,4 @@
-"""Supervision: a compiled step around a controller's that stops the drive where the device does not do as it is told.
+"""Supervision: a compiled step around a controller's that stops the drive where the device does not follow it.
 
 Every sample it compares what is sensed with the drive that acts, at a cost that does not grow with the bands.  With the
 coordinates q (heave, rocking) and the force F = B u, the mean of the samples before and after the moment of sensing,
