@@ -23,6 +23,7 @@ from hapticrender.errors import DriverError, HapticError
 from hapticrender.protocols import Array, Controller, Exchange, Rendering, Sensed
 
 PATIENCE = 0.3  # s that a board has to answer where boards are listed
+HOST_BLOCK = 100  # samples of drive from the host
 
 
 class SerialDriver(BaseDriver):
@@ -50,7 +51,7 @@ class SerialDriver(BaseDriver):
     probe = False  # the law on the board is the board's; its own guards are in docs/protocol.md
 
     def __init__(self, port: str, *, finger: Any = None, block: int = 1, **options: Any) -> None:
-        self.client = BoardClient(port, **options)
+        self.client, self.options = BoardClient(port, **options), options
         self.finger, self._sent, self._begun = finger, 0, False
         self.rendering: Rendering | None = None  # set by `prepare`
         with self.client as client:
@@ -60,8 +61,17 @@ class SerialDriver(BaseDriver):
             drive_channels=found.drive_channels,
             sensed_channels=found.sensed_channels,
             block=block,
-            delay=found.delay if block == 1 else 2 * block + found.delay,
+            delay=found.delay + (2 * block if block > 1 else 0),
         )
+
+    def driven_by_host(self) -> SerialDriver:
+        """Return the same board as a device that plays the drive of the host, for identification."""
+        return self if self.block > 1 else SerialDriver(self.client.port, block=HOST_BLOCK, **self.options)
+
+    @property
+    def host_delay(self) -> int:
+        """Samples of `delay` that the loop on the board itself does not have."""
+        return self.delay - int(self.capabilities.delay)
 
     @classmethod
     def found(cls) -> list[str]:

@@ -232,6 +232,8 @@ def identify(arguments: argparse.Namespace) -> int:
         setup = registered("renderers", scene.device)().read(scene, None)
         seed = scene.seed if arguments.seed is None else arguments.seed
         driver = _driver(arguments.driver, scene)
+        if hasattr(driver, "driven_by_host"):  # a board, whose own loop is not what is identified
+            driver = driver.driven_by_host()
         simulated = registered("drivers", "simulated")
         if scene.device == "ultrasonic":
             with driver or simulated(UltrasonicPlate(setup.simulated.carrier_mode, Finger.absent(), seed)) as opened:
@@ -242,6 +244,7 @@ def identify(arguments: argparse.Namespace) -> int:
         else:
             with driver or simulated(Plate(setup.simulated, Finger.absent(), seed)) as opened:
                 found = identify(opened, setup.assumed, seconds=arguments.seconds, amplitude=arguments.amplitude)
+                found = found.shortened(getattr(driver, "host_delay", 0))
     print(found.text())
     for difference in found.differences(setup.assumed) if scene.device == "vt-plate" else ():
         print(f"differs from [device]: {difference}")

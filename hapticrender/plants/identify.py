@@ -111,6 +111,16 @@ class Identified:
         """Whether the model leaves no more than noise."""
         return self.misfit <= self.misfit_bound
 
+    def shortened(self, samples: int) -> Identified:
+        """Return this for a loop whose delay is so many samples shorter, such as that of a board without the host."""
+        delay = self.estimates["delay"]
+        return replace(
+            self,
+            parameters=replace(self.parameters, delay=max(self.parameters.delay - samples, 1)),
+            estimates={**self.estimates, "delay": delay._replace(value=delay.value - samples)},
+            driver_delay=self.driver_delay - samples,
+        )
+
     def profile(self) -> dict[str, float]:
         """Return the identified parameters, and the others that differ from the defaults, for `Scene.profile`."""
         default = PlateParameters()
