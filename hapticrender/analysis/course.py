@@ -56,11 +56,7 @@ class Signals:
 
     def residual(self, theta: Array, half_spacing: float) -> Array:
         """Force of the finger on heave and rocking (N, shape (..., 2)) for parameters theta (..., 6)."""
-        x, v, (m, inertia, k1, k2, b1, b2) = self.displacement, self.velocity, np.moveaxis(theta, -1, 0)
-        first = k1 * (x[..., 0] - x[..., 1]) + b1 * (v[..., 0] - v[..., 1])
-        second = k2 * (x[..., 0] + x[..., 1]) + b2 * (v[..., 0] + v[..., 1])
-        masses = np.stack(np.broadcast_arrays(m, inertia / half_spacing**2), axis=-1)
-        return self.force - masses * self.acceleration - np.stack([first + second, second - first], axis=-1)
+        return self.force - np.einsum("...ij,...j->...i", self.regressors(half_spacing), theta)
 
 
 @dataclass(frozen=True)

@@ -34,16 +34,7 @@ class MotionFilter:
     """Smooth the sensed motion, differentiate it twice, and smooth the drive's force by one kernel, block by block.
 
     Row n of the drive is held while row n to n + 1 are sensed, `late` samples later.  Results come `delay` samples
-    after the sample that they belong to.
-
-    Parameters
-    ----------
-    plate : PlateParameters
-    rate : float, Hz
-    spread : float, s
-        Of the kernel (`hapticrender.analysis.smoothing`).
-    late : int, samples
-        Of the drive behind the sensors, >= 0.
+    after the sample that they belong to.  `rate` is in Hz, `spread` (s) that of the kernel in `smoothing`.
     """
 
     def __init__(self, plate: PlateParameters, rate: float, spread: float, late: int = 0) -> None:

@@ -38,19 +38,11 @@ def rest_of(course: Course, lines: Lines) -> Rest:
 
 
 def regress(course: Course, lines: Lines, noise: Array) -> Course:
-    """Estimate start and slope of the parameters from windows without a finger.
+    """Estimate start and slope of a profile's parameters from windows without a finger (`lines`, as for `Signals.of`).
 
-    Minimises the output error ``x - D^-1 f`` of heave and rocking over the noise of the amplitudes, together with the
-    distance from the profile over its uncertainty.  Misfit beyond the noise widens the covariance.
-
-    Parameters
-    ----------
-    course : Course
-        The profile's parameters and covariance.
-    lines : Lines
-        As `Signals.of` takes them.
-    noise : ndarray, shape (2,)
-        White noise of heave and rocking (m, rms).
+    Minimises the output error ``x - D^-1 f`` of heave and rocking over the noise of the amplitudes, by the white
+    `noise` (m rms) of both, together with the distance from the profile over its uncertainty.  Misfit beyond the noise
+    widens the covariance.
 
     Notes
     -----

@@ -22,7 +22,6 @@ _MANY_BANDS = 10
 DEVICES = "devices.png"
 NO_PICTURE = '<p class="note">No picture: matplotlib is not installed.</p>'
 GENERATOR = '<meta name="generator" content="hapticrender">'
-FOOTER = f'<footer class="note">Made by hapticrender {escape(__version__)}.</footer>'
 CLASSES = {"passed": "good", "passed in band": "good", "failed": "bad", "not judged": "note"}
 
 STYLE = """
@@ -85,17 +84,9 @@ def page(folder: Path, scenes: Sequence[Outputs], devices: str = "") -> str:
     links = ['<a href="#devices">One texture on several devices</a>'] if devices else []
     links += [f'<a href="#{quote(scene.name)}">{escape(scene.name)}</a>' for scene in scenes]
     sections = "\n".join(_section(scene, quote(scene.folder.relative_to(folder).as_posix())) for scene in scenes)
-    return f"""<!DOCTYPE html>
-<html lang="en">
-<head>
-<meta charset="utf-8">
-<meta name="viewport" content="width=device-width, initial-scale=1">
-{GENERATOR}
-<title>hapticrender: {number} in closed loop</title>
-<style>{STYLE}</style>
-</head>
-<body>
-<h1>Textures, rendered in closed loop</h1>
+    return html_page(
+        f"hapticrender: {number} in closed loop",
+        f"""<h1>Textures, rendered in closed loop</h1>
 <p>hapticrender renders a texture for a bare finger: it vibrates a glass plate, or changes the friction of a screen,
 measures the motion, and corrects the drive until the motion follows its target. Here {number} ran in closed loop on
 models of the devices with the method {escape(methods)}. A scene misses its tolerance where the motion differs from the
@@ -105,8 +96,24 @@ windows of 100 ms: {counts["passed"] + counts["passed in band"]} of {len(scenes)
 {_overview(scenes)}
 <nav>{"".join(links)}</nav>
 {devices}
-{sections}
-{FOOTER}
+{sections}""",
+    )
+
+
+def html_page(title: str, body: str) -> str:
+    """HTML of a page from the HTML of its title and of its body."""
+    return f"""<!DOCTYPE html>
+<html lang="en">
+<head>
+<meta charset="utf-8">
+<meta name="viewport" content="width=device-width, initial-scale=1">
+{GENERATOR}
+<title>{title}</title>
+<style>{STYLE}</style>
+</head>
+<body>
+{body}
+<footer class="note">Made by hapticrender {escape(__version__)}.</footer>
 </body>
 </html>
 """
