@@ -20,22 +20,22 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 from subjects import FREQUENCIES, population  # noqa: E402  (after the path)
 
 from hapticrender.formatting import table  # noqa: E402
+from hapticrender.plants.plate import PlateParameters  # noqa: E402
 
 BENDING = (1250.0, 30.0, 0.1)  # Hz, Q, shape at the coils
-PROFILE = {"bending_frequency": 1225.0, "bending_damping": 1 / 60, "bending_coil": 0.1}
-PLATES = {
-    "rigid": lambda subject: subject.record_elsewhere(),
-    "bending": lambda subject: subject.record_elsewhere(BENDING, **PROFILE),
-    "unknown": lambda subject: subject.record_elsewhere(BENDING),
-    "own": lambda subject: subject.record(),
-}
+KNOWN = PlateParameters(bending_frequency=1225.0, bending_damping=1 / 60, bending_coil=0.1)
+PLATES = {"rigid": (None, None), "bending": (BENDING, KNOWN), "unknown": (BENDING, None)}  # truth, and what is analysed
 LOADS = ((0.1, 0.3), (0.3, 0.6), (0.6, 1.5))  # N
 
 
 def study(subject, plate):
     """Errors of what is found of one subject."""
-    recording = PLATES[plate](subject)
-    return subject.errors(recording, hr.analyse_finger(recording), grows=plate == "own")
+    if plate == "own":
+        recording = subject.record()
+        return subject.errors(recording, hr.analyse_finger(recording))
+    bending, profile = PLATES[plate]
+    recording = subject.record_elsewhere(bending)
+    return subject.errors(recording, hr.analyse_finger(recording, profile), grows=False)
 
 
 def main(plate="rigid", count=40, seed=1):

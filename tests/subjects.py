@@ -68,12 +68,12 @@ class Subject:
             warnings.simplefilter("ignore", hr.PlateMismatch)
             return hr.render(rendering.pop("scene", self.scene), **rendering)
 
-    def record_elsewhere(self, bending=None, **profile):
+    def record_elsewhere(self, bending=None):
         """Render on a third party's plate, whose finger keeps the mechanics that it has at the touch.
 
         `bending` is that of `StrangersPlate`; contact is reported 5 ms late.
         """
-        scene, size = replace(self.scene, simulation={}, profile=profile), self.mechanics.load_factor(self.load)
+        scene, size = replace(self.scene, simulation={}), self.mechanics.load_factor(self.load)
         names = ("mass", "damping", "stiffness", "phalanx_mass", "phalanx_damping", "phalanx_stiffness")
         plate = StrangersPlate(
             finger=[size * getattr(self.mechanics, name) for name in names[: 3 * self.mechanics.order // 2]],

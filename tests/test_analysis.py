@@ -207,33 +207,28 @@ def test_ideal_sensors_are_no_exception(bits):
     assert np.abs(found.normal_load.value[at] / glass_force(subject, recording, len(found.time))[at] - 1).max() < 0.005
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
+def test_what_is_no_recording_of_such_a_plate_is_refused(studied):
+    _, recording, _ = studied[0]
+    for change, message in (
         ({"sensed_channels": 1}, r"1 sensors in m: must be 2 in m"),
         ({"unit": "N"}, r"2 sensors in N: must be 2 in m"),
         ({"drive_channels": 1}, r"1 drive channels: must be 2, one a coil"),
-    ],
-)
-def test_recordings_of_other_devices_are_refused(studied, change, message):
-    _, recording, _ = studied[0]
-    with pytest.raises(ValueError, match=message):
-        hr.analyse_finger(hr.Recording(replace(recording.header, **change), recording.frames, recording.scene))
-
-
-def test_short_recordings_and_wrong_profiles_are_refused(studied):
-    _, recording, _ = studied[0]
-    short = hr.Recording(recording.header, recording.frames[:4999], recording.scene)
-    with pytest.raises(ValueError, match=r"0.9998 s long: must be >= 1 s"):
-        hr.analyse_finger(short)
-    with pytest.raises(ValueError, match=r"profile.kind = 'ultrasonic': must be vt-plate"):
-        hr.analyse_finger(recording, hr.DeviceProfile(kind="ultrasonic"))
-    with pytest.raises(TypeError, match=r"profile = 3: must be a DeviceProfile, PlateParameters, the path of"):
-        hr.analyse_finger(recording, profile=3)
-    with pytest.raises(TypeError, match=r"recording = '/a.h5': must be a Recording: see Recording.load"):
-        hr.analyse_finger("/a.h5")
-    with pytest.raises(ValueError, match=r"block=2 samples: must be an integer from 1 to the plate's delay, 1"):
-        hr.analyse_finger(recording, block=2)
+    ):
+        with pytest.raises(ValueError, match=message):
+            hr.analyse_finger(hr.Recording(replace(recording.header, **change), recording.frames, recording.scene))
+    short, other = (
+        hr.Recording(recording.header, recording.frames[:4999], recording.scene),
+        hr.DeviceProfile(kind="ultrasonic"),
+    )
+    for error, message, arguments in (
+        (ValueError, r"0.9998 s long: must be >= 1 s", {"recording": short}),
+        (ValueError, r"profile.kind = 'ultrasonic': must be vt-plate", {"profile": other}),
+        (TypeError, r"profile = 3: must be a DeviceProfile, PlateParameters, the path of", {"profile": 3}),
+        (TypeError, r"recording = '/a.h5': must be a Recording: see Recording.load", {"recording": "/a.h5"}),
+        (ValueError, r"block=2 samples: must be an integer from 1 to the plate's delay, 1", {"block": 2}),
+    ):
+        with pytest.raises(error, match=message):
+            hr.analyse_finger(**{"recording": recording} | arguments)
 
 
 def test_what_was_lost_or_is_not_one_finger_is_not_taken_for_one(studied):

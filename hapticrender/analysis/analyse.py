@@ -263,6 +263,9 @@ def _notes(
         yield "no unloaded span is long enough: the sensors' zero and the plate's parameters are taken from the profile"
     elif not course.measured:
         yield "the carriers do not determine the stiffness in the unloaded spans: it is mostly that of the profile"
+    if course.misfit > 1.0:
+        times = f"{course.misfit**0.5:.2g} times as much as noise explains"
+        yield f"without a finger the plate moves otherwise than its model, {times}: identify it, its glass may bend"
     if rest is not None and abs(force := float(np.median(rest.values[:, 0]))) > threshold:
         yield (
             f"the sensors show {force:.3g} N while unloaded, beyond the threshold of contact ({threshold:.3g} N): "

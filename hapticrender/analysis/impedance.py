@@ -38,9 +38,9 @@ def impedance_of(
     heave = course.dynamic_stiffness(lines.frequency, times)[..., 0, :]
     bending, shape = course.bending(lines.frequency), course.plate.displacement(position)[:, 2:]
     passed = 1 + heave[..., 0] * shape * bending
+    force = force / passed
     by_coils = course.plate.bending_coil * amplitudes.force[..., 0]
-    force = (force + heave[..., 0] * bending * by_coils) / passed
-    velocity = velocity + s * (shape - 1) * bending * (by_coils - shape * force)
+    velocity = velocity + s * shape * bending * (by_coils + (1 - shape) * force)
     with np.errstate(divide="ignore", invalid="ignore"):
         value = force / velocity
     at_finger = np.stack(np.broadcast_arrays(1.0, (position / a)[:, None] + 0.0 * value.real), axis=-1)
