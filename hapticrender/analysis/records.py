@@ -121,8 +121,9 @@ class Touch:
 def joined(parts: Sequence[Touch]) -> Touch:
     """Join consecutive spans."""
     time, contact = (np.concatenate([getattr(part, name) for part in parts]) for name in ("time", "contact"))
-    series = [[getattr(part, name) for part in parts] for name in ("normal_load", "position", "velocity")]
-    return Touch(time, *(_joined(each) for each in series), contact)
+    names = ("normal_load", "position", "velocity")
+    load, position, velocity = (_joined([getattr(part, name) for part in parts]) for name in names)
+    return Touch(time, load, position, velocity, contact)
 
 
 def _joined(parts: Sequence[Series]) -> Series:
