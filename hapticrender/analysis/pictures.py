@@ -36,12 +36,7 @@ def draw(records: FingerRecord | Sequence[FingerRecord], folder: str | os.PathLi
     them, the parameters with their intervals, and what could not be measured.  A picture without data is left out: that
     over the load where the loads differ by less than 1 %.  Without matplotlib there are no pictures, and a warning.
 
-    Raises
-    ------
-    ValueError
-        There is no recording.
-    OSError
-        The folder cannot be written.
+    Raises ValueError without a recording, OSError where the folder cannot be written.
     """
     records = [records] if isinstance(records, FingerRecord) else list(records)
     if not records:
@@ -108,19 +103,15 @@ def draw_load(records: Sequence[FingerRecord], path: str | os.PathLike[str]) -> 
 def draw_frequency(records: Sequence[FingerRecord], fits: Fits, path: str | os.PathLike[str]) -> None:
     """Draw modulus and phase of the impedance over frequency, with both fits and their 95 % bands, a class a column."""
     size = np.abs(samples_of(records).value)
-    common: Any = {"sharex": True, "squeeze": False}
-    with new_figure((5.4 * max(len(fits), 2), 6.2 if len(fits) > 1 else 3.8), pads=(0.1, 0.08)) as figure:
-        if len(fits) > 1:
-            panels = figure.subplots(2, len(fits), sharey="row", height_ratios=[1.5, 1], **common)
-        else:
-            panels = figure.subplots(1, 2, **common).T
+    with new_figure((max(5.4 * len(fits), 7), 6.2), pads=(0.1, 0.08)) as figure:
+        panels = figure.subplots(2, len(fits), sharex=True, sharey="row", squeeze=False, height_ratios=[1.5, 1])
         for (name, of_class), column in zip(fits.items(), panels.T, strict=True):
             _over_frequency(column, name, of_class, samples_of(records, LOAD_CLASSES[name]))
         panels[0, 0].set_ylim(0.6 * np.quantile(size, 0.01), 1.7 * np.quantile(size, 0.99))
         panels[0, 0].set_ylabel("|Z_f| (N s/m)")
         low, high = panels[1, 0].get_ylim()
         panels[1, 0].set(ylabel="phase (degrees)", ylim=(max(low, -180), min(high, 180)))
-        for axes in panels[-1] if len(fits) > 1 else panels[:, 0]:
+        for axes in panels[1]:
             axes.set_xlabel("frequency (Hz)")
         _numbers(panels[0, 0].xaxis, "25")
         _numbers(panels[0, 0].yaxis)
@@ -243,16 +234,13 @@ def _means(axes: Any, records: Sequence[FingerRecord], frequency: float) -> None
     """Mean and standard deviation of load and impedance of every recording at one frequency, black as in Fig. 8 C."""
     label: str | None = f"each at {frequency:.0f} Hz"
     for record in records:
-        near = [each for each in by_frequency(samples_of(record)) if _near(each, frequency)]
+        bins = by_frequency(samples_of(record))
+        near = [each for each in bins if abs(np.log(np.median(each.frequency) / frequency)) < BAND]
         if near:
             load, size = near[0].load, np.abs(near[0].value)
             style = {"color": "black", "marker": "o", "ms": 4, "lw": 0, "elinewidth": 1.0, "zorder": 5, "label": label}
             axes.errorbar(load.mean(), size.mean(), size.std(), load.std(), **style)
             label = None
-
-
-def _near(samples: Samples, frequency: float) -> bool:
-    return abs(np.log(np.median(samples.frequency) / frequency)) < BAND
 
 
 def _determination(axes: Any, each: list[LoadLaw], pooled: LoadLaw) -> None:
