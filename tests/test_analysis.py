@@ -92,7 +92,10 @@ def test_a_finger_on_a_third_party_s_plate_is_measured_as_well():
     subject = population(16, 101)[5]
     recording = subject.record_elsewhere((1250.0, 30.0, 0.1))
     believed = {"bending_frequency": 1225.0, "bending_damping": 1 / 60, "bending_coil": 0.1}
-    errors = subject.errors(recording, hr.analyse_finger(recording, PlateParameters(**believed)), grows=False)
+    found = hr.analyse_finger(recording, PlateParameters(**believed))
+    assert not found.notes
+    assert any("its glass may bend" in note for note in hr.analyse_finger(recording).notes)  # as rigid glass
+    errors = subject.errors(recording, found, grows=False)
     assert (errors.touches, errors.edge < 0.01) == (1, True)
     assert (errors.load < 1.0).all()
     assert (errors.position < 1e-3).all()
