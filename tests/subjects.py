@@ -1,11 +1,14 @@
 """Simulated subjects: a finger of known mechanics touches a plate that is 2 % off its profile, slides and lifts."""
 
 import warnings
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from types import SimpleNamespace
 
 import numpy as np
+from strangers_plate import StrangersPlate
 
 import hapticrender as hr
+from hapticrender.analysis.records import LOADED
 from hapticrender.touch.mechanics import HEAVY, HEAVY_SECOND, LIGHT, LIGHT_SECOND
 
 FREQUENCIES = np.array([20.0, 31.0, 47.0, 72.0, 111.0, 170.0, 261.0, 400.0])  # Hz, of the paper
@@ -43,27 +46,68 @@ class Subject:
             if self.speed
             else hr.Finger.still(position=0.005, **touch)
         )
-        off = np.random.default_rng(self.seed).standard_normal(len(NAMES))
-        true = PLATE * (1 + self.off * off)
         return hr.Scene(
             texture=texture,
             finger=finger,
-            simulation=dict(zip(NAMES, true.tolist(), strict=True)),
+            simulation=self.plate,
             duration=DURATION,
             seed=self.seed,
             keep_unfelt=True,
             name=f"subject-{self.seed}",
         )
 
-    def record(self):
+    @property
+    def plate(self):
+        """Parameters of the true plate."""
+        off = np.random.default_rng(self.seed).standard_normal(len(NAMES))
+        return dict(zip(NAMES, (PLATE * (1 + self.off * off)).tolist(), strict=True))
+
+    def record(self, **rendering):
         """Render the subject in closed loop; the controller may say that the plate is not its model's."""
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", hr.PlateMismatch)
-            return hr.render(self.scene)
+            return hr.render(rendering.pop("scene", self.scene), **rendering)
+
+    def record_elsewhere(self, bending=None):
+        """Render on a third party's plate, whose finger keeps the mechanics that it has at the touch.
+
+        `bending` is that of `StrangersPlate`; contact is reported 5 ms late.
+        """
+        scene, size = replace(self.scene, simulation={}), self.mechanics.load_factor(self.load)
+        names = ("mass", "damping", "stiffness", "phalanx_mass", "phalanx_damping", "phalanx_stiffness")
+        plate = StrangersPlate(
+            finger=[size * getattr(self.mechanics, name) for name in names[: 3 * self.mechanics.order // 2]],
+            position=lambda time: scene.finger.position(np.clip(time, ON, OFF - 1e-6)),
+            load=lambda time: np.interp(time, [ON, OFF], [self.load, 1.25 * self.load]),
+            contact=lambda time: 1.0 * ((time >= ON) & (time < OFF)),
+            bending=bending, drive_bits=12, report_lag=5e-3, seed=self.seed, **self.plate,
+        )  # fmt: skip
+        return self.record(scene=scene, driver=plate)
 
     def impedance(self, frequency, load):
         """True impedance (N s/m) at frequencies (n, bands) under loads (n,)."""
         return self.mechanics.impedance(frequency) * self.mechanics.load_factor(load)[:, None]
+
+    def errors(self, recording, found, grows=True):
+        """Errors of what is found in a recording, 10 Hz having settled 0.1 s from the edges of the touch.
+
+        `grows` says whether the finger's impedance grew with the load.
+        """
+        at = np.flatnonzero((found.time > ON + 0.1) & (found.time < OFF - 0.1))
+        place, load = recording.position[at], recording.normal_load[at]
+        middle, touches, z = (np.abs(place) <= 15e-3) & (load > 0.15), found.of_kind(LOADED), found.impedance
+        truth = self.impedance(z.frequency, z.normal_load if grows else np.full(len(z.time), self.load))
+        speed = (np.gradient(recording.position[: len(found.time)]) * recording.rate)[at]
+        return SimpleNamespace(
+            touches=len(touches),
+            edge=max(abs(touches[0].start - ON), abs(touches[-1].stop - OFF)) if touches else np.inf,  # s
+            load=np.abs(found.normal_load.value[at] - load) / np.maximum(0.05 * load, 0.02),  # of its bound
+            position=np.abs(found.position.value[at] - place)[middle],  # m, where it is bounded
+            velocity=found.velocity.value[at] - speed,  # m/s
+            impedance=(z.value - truth) / z.standard_error,  # in standard errors
+            relative=z.standard_error / np.abs(truth),
+            ratio=z.value / truth,
+        )
 
 
 PLATE = np.array([32e-3, 4e-5, 22.4e3, 22.9e3, 0.85, 0.85])  # the default profile's

@@ -44,38 +44,24 @@ def glass_force(subject, recording, n):
     return load / (1 + skin * m.load_factor(load) * sag) + m.load_factor(load) * carriers
 
 
-def test_load_is_within_5_percent_or_20_mN(studied):
-    for subject, recording, found in studied:
-        at = judged(found)
-        truth = recording.normal_load[at]
-        error = np.abs(found.normal_load.value[at] - truth)
-        assert (error < np.maximum(0.05 * truth, 0.02)).all(), subject
-
-
-def test_position_is_within_1_mm_in_the_middle_30_mm_above_150_mN(studied):
+def test_load_position_and_contact_are_within_their_bounds(studied):
+    """5 % or 20 mN; 1 mm in the middle 30 mm above 150 mN; 10 ms."""
     judged_once = False
     for subject, recording, found in studied:
-        at = judged(found)
-        place = recording.position[at]
-        at = at[(np.abs(place) <= 15e-3) & (recording.normal_load[at] > 0.15)]
-        judged_once |= len(at) > 0
-        assert (np.abs(found.position.value[at] - recording.position[at]) < 1e-3).all(), subject
+        errors = subject.errors(recording, found)
+        assert (errors.load < 1.0).all(), subject
+        assert (errors.position < 1e-3).all(), subject
+        judged_once |= errors.position.size > 0
         assert found.least_load < 0.15
+        assert (errors.touches, errors.edge < 0.01) == (1, True), subject
     assert judged_once
-
-
-def test_contact_is_within_10_ms(studied):
-    for subject, _, found in studied:
-        (touch,) = found.of_kind(LOADED)
-        assert max(abs(touch.start - ON), abs(touch.stop - OFF)) < 0.01, subject
 
 
 def test_standard_errors_are_right(studied):
     """60 to 76 % of the errors are inside one, over all subjects, times and bands; of impedance and of the series."""
     inside = {"impedance": [], "load": [], "position": [], "velocity": []}
     for subject, recording, found in studied:
-        z = found.impedance
-        error = (z.value - subject.impedance(z.frequency, z.normal_load)) / z.standard_error
+        error = subject.errors(recording, found).impedance
         inside["impedance"] += [np.abs(np.r_[error.real, error.imag]).ravel() < 1]
         at = judged(found)[SAMPLED]
         n = len(found.time)
@@ -94,16 +80,28 @@ def test_standard_errors_are_right(studied):
 
 def test_impedance_is_within_10_percent_and_10_degrees_where_it_says_so(studied):
     """Where three standard errors are below 10 %; there a window in 90 may miss by chance (3 sigma in the plane)."""
-    good, total = 0, 0
-    for subject, _, found in studied:
-        z = found.impedance
-        truth = subject.impedance(z.frequency, z.normal_load)
-        sure = 3 * z.standard_error < 0.1 * np.abs(z.value)
-        ratio = z.value[sure] / truth[sure]
-        good += np.sum((np.abs(np.abs(ratio) - 1) < 0.1) & (np.abs(np.angle(ratio, deg=True)) < 10))
-        total += sure.sum()
+    errors = [subject.errors(recording, found) for subject, recording, found in studied]
+    ratio = np.concatenate([each.ratio[3 * each.relative < 0.1] for each in errors])
+    good, total = (np.abs(np.abs(ratio) - 1) < 0.1) & (np.abs(np.angle(ratio, deg=True)) < 10), ratio.size
     assert total > 150
-    assert good >= total * (1 - np.exp(-4.5)) - 3 * np.sqrt(total * np.exp(-4.5))
+    assert good.sum() >= total * (1 - np.exp(-4.5)) - 3 * np.sqrt(total * np.exp(-4.5))
+
+
+def test_a_finger_on_a_third_party_s_plate_is_measured_as_well():
+    """Bending glass, whose mode the profile has 2 % too low; 3 sigma of the share of 2 x 64 errors."""
+    subject = population(16, 101)[5]
+    recording = subject.record_elsewhere((1250.0, 30.0, 0.1))
+    believed = {"bending_frequency": 1225.0, "bending_damping": 1 / 60, "bending_coil": 0.1}
+    found = hr.analyse_finger(recording, PlateParameters(**believed))
+    assert not found.notes
+    assert any("its glass may bend" in note for note in hr.analyse_finger(recording).notes)  # as rigid glass
+    errors = subject.errors(recording, found, grows=False)
+    assert (errors.touches, errors.edge < 0.01) == (1, True)
+    assert (errors.load < 1.0).all()
+    assert (errors.position < 1e-3).all()
+    inside = np.abs(np.r_[errors.impedance.real, errors.impedance.imag]) < 1
+    assert inside.size == 2 * 64
+    assert inside.mean() == pytest.approx(0.683, abs=3 * np.sqrt(0.683 * 0.317 / inside.size))
 
 
 def test_force_is_the_finger_s_impedance_times_its_velocity(studied):
@@ -212,33 +210,28 @@ def test_ideal_sensors_are_no_exception(bits):
     assert np.abs(found.normal_load.value[at] / glass_force(subject, recording, len(found.time))[at] - 1).max() < 0.005
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
+def test_what_is_no_recording_of_such_a_plate_is_refused(studied):
+    _, recording, _ = studied[0]
+    for change, message in (
         ({"sensed_channels": 1}, r"1 sensors in m: must be 2 in m"),
         ({"unit": "N"}, r"2 sensors in N: must be 2 in m"),
         ({"drive_channels": 1}, r"1 drive channels: must be 2, one a coil"),
-    ],
-)
-def test_recordings_of_other_devices_are_refused(studied, change, message):
-    _, recording, _ = studied[0]
-    with pytest.raises(ValueError, match=message):
-        hr.analyse_finger(hr.Recording(replace(recording.header, **change), recording.frames, recording.scene))
-
-
-def test_short_recordings_and_wrong_profiles_are_refused(studied):
-    _, recording, _ = studied[0]
-    short = hr.Recording(recording.header, recording.frames[:4999], recording.scene)
-    with pytest.raises(ValueError, match=r"0.9998 s long: must be >= 1 s"):
-        hr.analyse_finger(short)
-    with pytest.raises(ValueError, match=r"profile.kind = 'ultrasonic': must be vt-plate"):
-        hr.analyse_finger(recording, hr.DeviceProfile(kind="ultrasonic"))
-    with pytest.raises(TypeError, match=r"profile = 3: must be a DeviceProfile, PlateParameters, the path of"):
-        hr.analyse_finger(recording, profile=3)
-    with pytest.raises(TypeError, match=r"recording = '/a.h5': must be a Recording: see Recording.load"):
-        hr.analyse_finger("/a.h5")
-    with pytest.raises(ValueError, match=r"block=2 samples: must be an integer from 1 to the plate's delay, 1"):
-        hr.analyse_finger(recording, block=2)
+    ):
+        with pytest.raises(ValueError, match=message):
+            hr.analyse_finger(hr.Recording(replace(recording.header, **change), recording.frames, recording.scene))
+    short, other = (
+        hr.Recording(recording.header, recording.frames[:4999], recording.scene),
+        hr.DeviceProfile(kind="ultrasonic"),
+    )
+    for error, message, arguments in (
+        (ValueError, r"0.9998 s long: must be >= 1 s", {"recording": short}),
+        (ValueError, r"profile.kind = 'ultrasonic': must be vt-plate", {"profile": other}),
+        (TypeError, r"profile = 3: must be a DeviceProfile, PlateParameters, the path of", {"profile": 3}),
+        (TypeError, r"recording = '/a.h5': must be a Recording: see Recording.load", {"recording": "/a.h5"}),
+        (ValueError, r"block=2 samples: must be an integer from 1 to the plate's delay, 1", {"block": 2}),
+    ):
+        with pytest.raises(error, match=message):
+            hr.analyse_finger(**{"recording": recording} | arguments)
 
 
 def test_what_was_lost_or_is_not_one_finger_is_not_taken_for_one(studied):

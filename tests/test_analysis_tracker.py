@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from test_analysis_plate import open_loop
 
 import hapticrender as hr
 from hapticrender.analysis.contact import clear_sigmas
@@ -123,6 +124,21 @@ def test_force_noise_is_as_predicted(rng):
     theta = np.array([32e-3, 4e-5, 22.4e3, 22.9e3, 0.85, 0.85])
     found = signals.residual(theta, PLATE.half_spacing).std(axis=0)
     np.testing.assert_allclose(found, motion.force_noise([1e-6, 1e-6]), rtol=4 / np.sqrt(2 * 800) + 0.01)
+
+
+def test_what_the_drive_bends_of_the_glass_is_no_force():
+    """To what kernels that end at 5 spreads leave of the terms of the balance, see `test_kernels_differentiate`."""
+    bends = {"bending_frequency": 1250.0, "bending_coil": 0.1, "bending_damping": 1 / 60}
+    plate = PlateParameters(**bends, sensor_noise=0.0, sensor_bits=0)
+    drive, spread = open_loop(np.arange(10_000) / RATE, np.array([31.0, 111.0, 170.0, 261.0])), spread_of(100.0)
+    sensed = Plate(plate, hr.Finger.absent(), seed=1).run(drive).sensed
+    k, b, m = (matrix[0, 0] for matrix in (plate.stiffness_matrix, plate.damping_matrix, plate.mass_matrix))
+    left = 27 * np.exp(-12.5) * (k + b / spread + m / spread**2) * np.abs(sensed).max()
+    for model, good in ((plate, True), (PLATE, False)):
+        signals = MotionFilter(model, RATE, spread).update(drive, sensed)
+        theta = np.array([32e-3, 4e-5, 22.4e3, 22.9e3, 0.85, 0.85])
+        residual = signals.residual(theta, plate.half_spacing)[5000:]
+        assert (np.abs(residual).max() < left) == good
 
 
 def run(finger, seconds, **changes):

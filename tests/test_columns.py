@@ -114,6 +114,29 @@ def test_tables_and_untitled_columns_have_numbers(tmp_path):
     np.testing.assert_array_equal(read_columns(tmp_path / "tabs.txt")["y"], [2.0, np.nan, 4.0])  # a row without values
 
 
+@pytest.mark.parametrize("between", [",", ";", "\t"])
+def test_rows_without_values_at_the_end_are_left_out(between, tmp_path):
+    """As spreadsheets write them; before the last row with a value they count."""
+    rows = ["x y", "1 2", " ", "3 ", " ", " "]
+    (tmp_path / "a.csv").write_text("\n".join(rows).replace(" ", between) + "\n \n", encoding="utf-8")
+    np.testing.assert_array_equal(read_columns(tmp_path / "a.csv")["x"], [1.0, np.nan, 3.0])
+
+
+@pytest.mark.parametrize(
+    ("text", "titles"),
+    [
+        ("force, N\tplace, mm\n1\t2\n", ["force, N", "place, mm"]),
+        ("a;b,c\n1,2\n", ["a;b", "c"]),
+        ("x, m;y, m\n1;2\n", ["x, m", "y, m"]),
+        ('"a,b",c\n1,2 # the first\n', ["a,b", "c"]),
+    ],
+)
+def test_the_separator_is_the_one_that_splits_into_numbers(text, titles, tmp_path):
+    (tmp_path / "a.csv").write_text(text, encoding="utf-8")
+    found = read_columns(tmp_path / "a.csv")
+    assert {name: values.tolist() for name, values in found.items()} == dict(zip(titles, [[1.0], [2.0]], strict=True))
+
+
 def test_a_finger_is_the_same_in_someone_elses_columns(tmp_path):
     """Drive in volts, displacement in counts of 1 nm from 5e6 on, as CSV: what is analysed does not change."""
     finger = hr.Finger.still(0.005, normal_load=0.5, touches=[(0.8, 1.8)], mechanics="light")
@@ -200,13 +223,15 @@ def test_times_may_jitter_by_half_a_sample(jitter, good):
         ("a.mat", b"no such thing", "not a MAT file"),
         ("a.h5", b"no such thing", "not an HDF5 file"),
         ("a.npz", b"no such thing", "not an NPZ file"),
-        ("a.csv", b"", "must be lines of numbers"),
-        ("a.csv", b"x,y\n", "must be lines of numbers"),
+        ("a.csv", b"", "a.csv: the file is empty, or has comments alone: must be lines of numbers"),
+        ("a.csv", b"# x,y\n\n,\n", "a.csv: the file is empty, or has comments alone: must be lines of numbers"),
+        ("a.csv", b"x,y\n,\n", "a.csv: nothing follows the titles in line 1: must be lines of numbers"),
         ("a.csv", b"x,x\n1,2\n", "one different one for each column"),
         ("a.csv", b"x,y\n1,2,3\n", "a.csv, line 2: 3 fields: must be 2, one a column"),
         ("a.csv", b"x,y\n1,2\n3\n", "a.csv, line 3: 1 fields: must be 2, one a column"),
         ("a.csv", b"# of mine\nx,y\n1,2\n\n3,4.l\n", "a.csv, line 5, column y: '4.l': must be a number, or empty"),
         ("a.csv", b"x;y\n1;2\n3;4,5\n", "a.csv, line 3, column y: '4,5': must be a number, or empty"),
+        ("a.csv", b"x;y\n1,5;2\n", "a.csv, line 2, column x: '1,5': must be a number, .*, decimals after a point"),
         ("a.csv", b"x,y\n1,1_0\n", "a.csv, line 2, column y: '1_0': must be a number, or empty"),
         ("a.csv", "x,y\n1,2\n".encode("utf-16"), "a.csv: byte 0 is no UTF-8 text: save the table as text in UTF-8"),
         ("a.csv", "x,y\n1,2\n".encode("utf-16-le"), r"a.csv, line 2, column .*: must be a number"),
@@ -224,20 +249,14 @@ def test_files_that_are_none_are_refused(tmp_path, name, content, message):
 def test_a_file_that_was_cut_is_refused(theirs, tmp_path, ending):
     path = tmp_path / f"cut{ending}"
     write(path, theirs)
-    path.write_bytes(path.read_bytes()[:-600])
+    whole = path.read_bytes()
+    path.write_bytes(whole[:-600])
     with pytest.raises(ValueError, match=f"cut{ending}: damaged, or not an?"):
         read_columns(path)
-
-
-def test_a_damaged_npz_is_refused(tmp_path):
-    """One bit of the data: the checksum of the archive."""
-    path = tmp_path / "bit.npz"
-    np.savez(path, x=np.zeros(1000))
-    content = bytearray(path.read_bytes())
-    content[4000] ^= 1
-    path.write_bytes(content)
-    with pytest.raises(ValueError, match="bit.npz: damaged, or not an NPZ file of arrays .Bad CRC-32"):
-        read_columns(path)
+    if ending == ".npz":  # one bit of the data: the checksum of the archive
+        path.write_bytes(whole[:200] + bytes([whole[200] ^ 1]) + whole[201:])
+        with pytest.raises(ValueError, match="cut.npz: damaged, or not an NPZ file of arrays .Bad CRC-32"):
+            read_columns(path)
 
 
 def test_what_is_there_is_listed_where_the_column_is_not(theirs, tmp_path):

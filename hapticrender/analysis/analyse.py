@@ -14,9 +14,9 @@ from hapticrender.analysis.force import MotionFilter, at_least, sensor_noise
 from hapticrender.analysis.impedance import impedance_of
 from hapticrender.analysis.lock_in import Lines, demodulate, tile, window_length
 from hapticrender.analysis.plate_track import Rest, regress, rest_of, track_of
-from hapticrender.analysis.records import DOUBTFUL, LOADED, UNLOADED, FingerRecord, Impedance, Segment, Series
+from hapticrender.analysis.records import DOUBTFUL, LOADED, UNLOADED, FingerRecord, Impedance, Segment, Touch, joined
 from hapticrender.analysis.smoothing import LEAST_SPREAD, spread_of
-from hapticrender.analysis.tracker import FingerTracker, Touch
+from hapticrender.analysis.tracker import FingerTracker
 from hapticrender.bands import Bands, hold_last
 from hapticrender.checks import require
 from hapticrender.plants.plate import PlateParameters
@@ -87,10 +87,9 @@ def analyse_finger(
     if free_start:
         sensed = sensed - sensed[: round(START * rate)].mean(axis=0)
     signals = _Signals(course.plate, late, rate, drive, sensed)
-    first = signals.track(course, None)
-    frequency = _carriers(recording.bands, sensed, rate)
+    first, tracker = signals.track(course, None)
+    frequency, threshold = _carriers(recording.bands, sensed, rate), tracker.threshold
     length = window_length(frequency, rate)
-    threshold = signals.tracker(course, None).threshold
     lines = signals.unloaded(first.contact == UNLOADED, first.normal_load.value, frequency, length, threshold / 2)
     if not len(lines.time):
         slow = signals.slow_force(course)
@@ -99,17 +98,13 @@ def analyse_finger(
     if len(lines.time):
         course = regress(course, lines, signals.noise) if frequency.size else course
         rest = rest_of(course, lines)
-    touch, tracker = signals.track(course, rest), signals.tracker(course, rest)
+    touch, tracker = signals.track(course, rest)
     spoiled = _spoiled(recording)[: len(touch.contact)]
     touch = replace(touch, contact=np.where(spoiled, DOUBTFUL, touch.contact))
     impedance = signals.impedance(course, touch, recording.bands, frequency, length, recording.header.calibration)
     return FingerRecord(
+        **vars(touch),
         name=recording.header.name,
-        time=touch.time,
-        normal_load=touch.normal_load,
-        position=touch.position,
-        velocity=touch.velocity,
-        contact=touch.contact,
         segments=_segments(touch, rate),
         plate=track_of(course, len(drive) / rate),
         impedance=impedance,
@@ -183,20 +178,15 @@ class _Signals:
         self.sensor_noise = at_least(sensor_noise(sensed), plate)
         self.noise = wide.coordinate_noise(self.sensor_noise)
 
-    def tracker(self, course: Course, rest: Rest | None) -> FingerTracker:
-        """Tracker that is symmetric in time."""
-        return FingerTracker(course, rate=self.rate, late=self.late, noise=self.sensor_noise, lookahead=1.0, rest=rest)
-
-    def track(self, course: Course, rest: Rest | None) -> Touch:
-        """Track the whole recording, a second at a time."""
-        tracker, step = self.tracker(course, rest), round(BLOCK * self.rate)
+    def track(self, course: Course, rest: Rest | None) -> tuple[Touch, FingerTracker]:
+        """Track the whole recording, symmetric in time, a second at a time."""
+        tracker = FingerTracker(
+            course, rate=self.rate, late=self.late, noise=self.sensor_noise, lookahead=1.0, rest=rest
+        )
+        step = round(BLOCK * self.rate)
         starts = range(0, len(self.drive), step)
         parts = [tracker.update(self.drive[i : i + step], self.sensed[i : i + step]) for i in starts]
-        time, contact = (np.concatenate([getattr(part, name) for part in parts]) for name in ("time", "contact"))
-        load, position, velocity = (
-            _joined([getattr(part, name) for part in parts]) for name in ("normal_load", "position", "velocity")
-        )
-        return Touch(time, load, position, velocity, contact)
+        return joined(parts), tracker
 
     def slow_force(self, course: Course) -> Array:
         """Heave force (N, (n,)) below a third of `SLOWEST`: of a carrier there 4 % pass, at 20 Hz 0.4 %.
@@ -247,12 +237,6 @@ class _Signals:
         return replace(found, value=value, standard_error=errors)
 
 
-def _joined(parts: list[Series]) -> Series:
-    """One series of several."""
-    value, error = (np.concatenate([getattr(part, name) for part in parts]) for name in ("value", "standard_error"))
-    return Series(value, error, parts[0].bandwidth)
-
-
 def _segments(touch: Touch, rate: float) -> tuple[Segment, ...]:
     """Spans of one kind of contact."""
     edges = np.r_[0, np.flatnonzero(np.diff(touch.contact)) + 1, len(touch.contact)]
@@ -276,11 +260,12 @@ def _notes(
 ) -> Iterator[str]:
     """List what could not be measured, and why."""
     if rest is None:
-        yield (
-            "no unloaded span is long enough: the sensors' zero and the plate's parameters are taken from the profile"
-        )
+        yield "no unloaded span is long enough: the sensors' zero and the plate's parameters are taken from the profile"
     elif not course.measured:
-        yield ("the carriers do not determine the stiffness in the unloaded spans: it is mostly that of the profile")
+        yield "the carriers do not determine the stiffness in the unloaded spans: it is mostly that of the profile"
+    if course.misfit > 1.0:
+        times = f"{course.misfit**0.5:.2g} times as much as noise explains"
+        yield f"without a finger the plate moves otherwise than its model, {times}: identify it, its glass may bend"
     if rest is not None and abs(force := float(np.median(rest.values[:, 0]))) > threshold:
         yield (
             f"the sensors show {force:.3g} N while unloaded, beyond the threshold of contact ({threshold:.3g} N): "

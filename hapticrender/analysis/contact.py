@@ -35,23 +35,16 @@ class ContactDetector:
     up to `FOLLOWED`, corrected every `TICK`; under a finger it is held, or goes on by its trend.  A lift may leave
     `CREEP` of the touch's load, which is then the force at rest.
 
-    Parameters
-    ----------
-    rate : float, Hz
-    quiet : int, samples
-        At the beginning, in which filters settle and no contact is detected.
-    still : float, N
-        Where the mean of the heave force over a tick is farther from that at rest, as by a touch too light to be
-        detected, the values at rest go towards it by so much in `FOLLOWED`.
-    columns : int
-        Of what is measured: the heave force (N) first, others beside it, whose values at rest are followed as well.
+    In the first `quiet` samples filters settle, and no contact is detected.  Where the mean of the heave force over a
+    tick is farther than `still` (N) from that at rest, as by a touch too light to be detected, the values at rest go
+    towards it by so much in `FOLLOWED`.  There are `columns` of measured values: the heave force (N) first, others
+    beside it, whose values at rest are followed as well.
     """
 
     def __init__(self, rate: float, quiet: int, still: float, columns: int = 1) -> None:
         self.rate, self.delay = rate, round(HOLD * rate)
         self._tick = max(round(TICK * rate), 1)
-        self._measured, self._high = History(self.delay), History(self.delay)
-        self._given = History(self.delay)
+        self._measured, self._high, self._given = (History(self.delay) for _ in range(3))
         self._at = -self.delay  # sample of the next result
         self._quiet, self._still, self._loaded = quiet, still, False
         self._rest, self._trend, self._ticks = np.zeros(columns), np.zeros(columns), 0  # trend: a tick; ticks fitted

@@ -6,8 +6,9 @@ In heave and rocking q = [x_c, a theta], with the finger at g = p/a (see `haptic
 
 The bracket is linear in the parameters theta = [m, I, k1, k2, b1, b2]: it is ``Phi theta`` with the regressors Phi.
 Where the glass bends (frequency, damping and shape phi of the profile), the sensors add ``e = B(s) (phi_coil f_c -
-phi(p) F_f)`` to x_c, B the compliance of the mode and f_c the drive's heave force, so that with D the heave row of
-``M s^2 + C s + K`` and r the residual as for rigid glass ``F_f (1 + D phi(p) B) = r + D phi_coil B f_c``.
+phi(p) F_f)`` to x_c, B the compliance of the mode and f_c the drive's heave force.  The first part is subtracted from
+the motion (`MotionFilter`), so that with D the heave row of ``M s^2 + C s + K`` and r the residual as for rigid glass
+``F_f (1 + D phi(p) B) = r``.
 
 The rows differ from those that Grigorii et al. 2021 print, (m/2) x'' -+ (I/2) theta'', whose units do not agree.
 """
@@ -56,11 +57,7 @@ class Signals:
 
     def residual(self, theta: Array, half_spacing: float) -> Array:
         """Force of the finger on heave and rocking (N, shape (..., 2)) for parameters theta (..., 6)."""
-        x, v, (m, inertia, k1, k2, b1, b2) = self.displacement, self.velocity, np.moveaxis(theta, -1, 0)
-        first = k1 * (x[..., 0] - x[..., 1]) + b1 * (v[..., 0] - v[..., 1])
-        second = k2 * (x[..., 0] + x[..., 1]) + b2 * (v[..., 0] + v[..., 1])
-        masses = np.stack(np.broadcast_arrays(m, inertia / half_spacing**2), axis=-1)
-        return self.force - masses * self.acceleration - np.stack([first + second, second - first], axis=-1)
+        return self.force - np.einsum("...ij,...j->...i", self.regressors(half_spacing), theta)
 
 
 @dataclass(frozen=True)
@@ -79,6 +76,8 @@ class Course:
         Of start and slope.
     measured : bool
         Whether unloaded spans of a recording determine them.
+    misfit : float
+        Mean square of what they leave there, over the value that noise passes once in a million recordings.
     """
 
     plate: PlateParameters
@@ -86,6 +85,7 @@ class Course:
     slope: Array
     covariance: Array
     measured: bool = False
+    misfit: float = 0.0
 
     @classmethod
     def of(

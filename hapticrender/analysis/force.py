@@ -30,20 +30,25 @@ def at_least(noise: Array, plate: PlateParameters) -> Array:
     return np.maximum(noise, max(plate.sensor_step / math.sqrt(12.0), FINEST))
 
 
+def _bending(plate: PlateParameters, rate: float, late: int) -> tuple[Array, Array]:
+    """Filter (b, a) from a heave force (N), held over each sample `late` samples later, to the bending of it (m)."""
+    from scipy.signal import cont2discrete
+
+    w = 2 * math.pi * plate.bending_frequency
+    if not w:
+        return np.zeros(2), np.array([1.0, 0.0])
+    mode = [plate.bending_coil / plate.bending_mass], [1.0, 2 * plate.bending_damping * w, w**2]
+    (b,), a, _ = cont2discrete(mode, 1 / rate, "zoh")
+    return np.r_[np.zeros(late), b], a
+
+
 class MotionFilter:
     """Smooth the sensed motion, differentiate it twice, and smooth the drive's force by one kernel, block by block.
 
-    Row n of the drive is held while row n to n + 1 are sensed, `late` samples later.  Results come `delay` samples
-    after the sample that they belong to.
+    What the drive itself bends of the glass, by the plate's bending mode, is subtracted from the motion.
 
-    Parameters
-    ----------
-    plate : PlateParameters
-    rate : float, Hz
-    spread : float, s
-        Of the kernel (`hapticrender.analysis.smoothing`).
-    late : int, samples
-        Of the drive behind the sensors, >= 0.
+    Row n of the drive is held while row n to n + 1 are sensed, `late` samples later.  Results come `delay` samples
+    after the sample that they belong to.  `rate` is in Hz, `spread` (s) that of the kernel in `smoothing`.
     """
 
     def __init__(self, plate: PlateParameters, rate: float, spread: float, late: int = 0) -> None:
@@ -52,15 +57,26 @@ class MotionFilter:
         self._motion = np.pad(derivative_kernels(spread, rate), ((0, 0), (0, pad)))
         self._force = held_kernel(spread, rate, late)
         self._sensed, self._drive = (History(len(self._force) - 1) for _ in range(2))
+        self._mode, self._bent = _bending(plate, rate, late), None
         gains = np.array([plate.sensor_gain_1, plate.sensor_gain_2])
         self.coordinate_from_sensed = np.linalg.inv(plate.displacement(plate.ends)[:, :2]) / gains
 
     def update(self, drive: Array, sensed: Array) -> Signals:
         """Signals (n, 2) of the samples `delay` before those of drive (A, (n, coils)) and measurement (m, (n, 2))."""
-        motion = self._sensed.before(sensed @ self.coordinate_from_sensed.T)
+        force, coordinates = self.force(drive), sensed @ self.coordinate_from_sensed.T
+        coordinates[:, 0] -= self._bending_by(force[:, 0])
+        motion = self._sensed.before(coordinates)
         middle = motion[0]  # far from zero the taps' rounding would show
         x, v, a = (convolve(motion - middle, taps) for taps in self._motion)
-        return Signals(x + middle, v, a, convolve(self._drive.before(self.force(drive)), self._force))
+        return Signals(x + middle, v, a, convolve(self._drive.before(force), self._force))
+
+    def _bending_by(self, force: Array) -> Array:
+        """Displacement of the sensors (m, (n,)) as the drive's heave force (N, (n,)) bends the glass."""
+        from scipy.signal import lfilter, lfilter_zi
+
+        b, a = self._mode
+        bent, self._bent = lfilter(b, a, force, zi=lfilter_zi(b, a) * force[0] if self._bent is None else self._bent)
+        return np.asarray(bent)
 
     def force(self, drive: Array) -> Array:
         """Force (N, (n, 2)) on heave and rocking of a drive (A, (n, coils)), rounded and limited as the plate does."""

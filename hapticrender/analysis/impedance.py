@@ -24,20 +24,10 @@ CLEAR = 5.0  # standard errors of the velocity: below it the quotient is not for
 def impedance_of(
     course: Course, lines: Lines, noise: Array, load: Array, position: Array, position_error: Array, gain_error: float
 ) -> Impedance:
-    """Impedance in windows under load.
+    """Impedance in windows under a mean `load` (N) at a mean `position` (m, both (n,)) with its standard error.
 
-    Parameters
-    ----------
-    course : Course
-    lines : Lines
-        Of displacement, velocity, acceleration and force (heave and rocking each), and of (p/a) times the velocity of
-        rocking: nine signals.
-    noise : ndarray, shape (2,)
-        White noise of heave and rocking (m, rms).
-    load, position, position_error : ndarray, shape (n,)
-        Means over the windows (N, m, m).
-    gain_error : float
-        Relative standard error of a gain common to both sensors.
+    `lines` are of nine signals: those of `Signals.of`, then (p/a) times the velocity of rocking; `noise` is the white
+    noise of heave and rocking (m rms), `gain_error` the relative standard error of a gain common to both sensors.
     """
     amplitudes, a = Signals.of(lines.amplitude), course.plate.half_spacing
     times = np.broadcast_to(lines.time[:, None], lines.frequency.shape)
@@ -48,9 +38,9 @@ def impedance_of(
     heave = course.dynamic_stiffness(lines.frequency, times)[..., 0, :]
     bending, shape = course.bending(lines.frequency), course.plate.displacement(position)[:, 2:]
     passed = 1 + heave[..., 0] * shape * bending
+    force = force / passed
     by_coils = course.plate.bending_coil * amplitudes.force[..., 0]
-    force = (force + heave[..., 0] * bending * by_coils) / passed
-    velocity = velocity + s * (shape - 1) * bending * (by_coils - shape * force)
+    velocity = velocity + s * shape * bending * (by_coils + (1 - shape) * force)
     with np.errstate(divide="ignore", invalid="ignore"):
         value = force / velocity
     at_finger = np.stack(np.broadcast_arrays(1.0, (position / a)[:, None] + 0.0 * value.real), axis=-1)

@@ -64,10 +64,9 @@ def mean_exponent(laws: Sequence[LoadLaw], frequency: Array) -> tuple[Array, Arr
     found = []
     for at in frequency:
         own = [np.isfinite(law.exponent) & (np.abs(np.log(law.frequency / at)) < BAND) for law in laws]
-        n, error, share = (
-            np.concatenate([getattr(law, name)[mine] for law, mine in zip(laws, own, strict=True)])
-            for name in ("exponent", "standard_error", "determination")
-        )
+        names = "exponent", "standard_error", "determination"
+        rows = [[getattr(law, name)[mine] for name in names] for law, mine in zip(laws, own, strict=True)]
+        n, error, share = np.concatenate(rows, axis=1)
         if not n.size:
             found.append((nan, nan, nan))
             continue

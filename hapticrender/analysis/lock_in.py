@@ -17,25 +17,16 @@ PERIODS = 4.0  # of the least spacing, in a window
 class Lines:
     """Amplitudes of carriers: a signal is ``Re sum_k amplitude_k exp(j w_k t)``, t from each window's middle.
 
-    Parameters
-    ----------
-    time : ndarray, shape (n,)
-        Middle of each window (s).
-    frequency : ndarray, shape (n, bands)
-        Of the carriers (Hz).
-    amplitude : ndarray of complex, shape (n, bands, signals)
-    mean : ndarray, shape (n, signals)
-        What is slower than the carriers, in the middle of each window.
-    variance, mean_variance : ndarray, shape (n, bands) and (n,)
-        Of the real and of the imaginary part of an amplitude, and of a mean, for white noise of variance 1.
+    Variances are those of the real and of the imaginary part of an amplitude, and of a mean, for white noise of
+    variance 1.
     """
 
-    time: Array
-    frequency: Array
-    amplitude: Array
-    mean: Array
-    variance: Array
-    mean_variance: Array
+    time: Array  # s, of each window's middle, shape (n,)
+    frequency: Array  # Hz, of the carriers, shape (n, bands)
+    amplitude: Array  # complex, shape (n, bands, signals)
+    mean: Array  # what is slower than the carriers, in the middle of each window, shape (n, signals)
+    variance: Array  # shape (n, bands)
+    mean_variance: Array  # shape (n,)
 
 
 def window_length(frequency: Array, rate: float) -> int:

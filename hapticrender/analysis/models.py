@@ -17,9 +17,12 @@ from hapticrender.touch.mechanics import HEAVY, LIGHT, LIGHT_BELOW, FingerMechan
 
 LOAD_CLASSES: Mapping[str, tuple[float, float]] = {"light": (0.0, LIGHT_BELOW), "heavy": (LIGHT_BELOW, inf)}  # N
 FEWEST = {2: 2, 4: 4}  # carriers by order: two numbers each, for three or six parameters and the exponent
-NAMES = ("mass", "damping", "stiffness", "phalanx_mass", "phalanx_damping", "phalanx_stiffness")
-_UNITS = np.array([1e-3, 1.0, 1e3, 1e-3, 1.0, 1e3])  # g, N s/m, N/mm: the fit's parameters are then near 1
-_MOST = np.array([1.0, 1e4, 1e6, 1.0, 1e4, 1e6]) / _UNITS  # bounds of FingerMechanics
+UNITS = {  # of the fit's parameters, which are then near 1: g, N s/m, N/mm
+    "mass": 1e-3, "damping": 1.0, "stiffness": 1e3, "phalanx_mass": 1e-3, "phalanx_damping": 1.0,
+    "phalanx_stiffness": 1e3, "load_exponent": 1.0,
+}  # fmt: skip
+NAMES = tuple(UNITS)[:6]
+MOST = dict(zip(UNITS, (1.0, 1e4, 1e6, 1.0, 1e4, 1e6, 10.0), strict=True))  # bounds of FingerMechanics
 MOST_STEPS = 100  # of a search; without a skin in the data its stiffness would grow for ever
 _STIFF_SKIN = (0.1, 20.0, 40.0)  # in these units: hardly a skin
 
@@ -101,11 +104,11 @@ class FingerFit:
 
     def relative_error(self, frequency: Array, normal_load: float | None = None) -> Array:
         """Standard error of ln Z_f, as a complex number: of ln |Z_f| (real part) and of the phase (rad, imaginary)."""
-        frequency = np.asarray(frequency, float)
+        frequency, all_values = np.asarray(frequency, float), self._all()
         whole, gradient = self.impedance(frequency, normal_load), []
         for name in self.names:
-            step = 1e-6 * max(self.values[name], 1e-3 * _unit(name))
-            moved = self._all() | {name: self.values[name] + step}
+            step = 1e-6 * max(all_values[name], 1e-3 * UNITS[name])
+            moved = all_values | {name: all_values[name] + step}
             gradient.append((_impedance(moved, frequency, normal_load) / whole - 1) / step)
         slope = np.array(gradient)
         real, imaginary = (np.einsum("if,ij,jf->f", part, self.covariance, part) for part in (slope.real, slope.imag))
@@ -113,8 +116,7 @@ class FingerFit:
 
     def _all(self) -> dict[str, Any]:
         """Every number of the model by name."""
-        fields = {name: getattr(self.mechanics, name) for name in ("order", *NAMES, "reference_load")}
-        return fields | {"load_exponent": self.load_exponent}
+        return vars(self.mechanics) | {"load_exponent": self.load_exponent}
 
 
 def fit_finger(
@@ -158,7 +160,7 @@ def fit_finger(
     All windows of a recording share the errors of the plate's own mass, damping and stiffness, which no number of
     windows averages: ``dZ = j w dm + db + dk/(j w)``.  Their standard deviations are those of the record's plate, at
     most ``min sqrt(2) sigma_i/w_i`` (for the mass: just this), ``min sqrt(2) sigma_i`` and ``min sqrt(2) sigma_i w_i``,
-    what the impedance's errors have room for.  They add to the covariance of the samples: ``r^T (S + G G^T)^-1 r``.
+    what the impedance's errors have room for.  They are fitted as well, with these as the prior.
 
     References
     ----------
@@ -177,12 +179,17 @@ def fit_finger(
     """
     require(order in (None, 2, 4), "order", order, "2, 4 or None")
     samples = samples_of(impedance, loads)
-    _check_enough(samples, order or 2, loads)
-    shared = _shared_errors(impedance, samples)
-    second = _fit(samples, shared, 2, load_exponent)
-    if order == 2 or (order is None and _carriers(samples) < FEWEST[4]):
+    found, fewest = _carriers(samples), FEWEST[order or 2]
+    if found < fewest:
+        raise ValueError(
+            f"impedance: {found} different carriers with data at loads from {loads[0]:g} to {loads[1]:g} N, a "
+            f"finger of order {order or 2} needs at least {fewest}: record more frequencies, or widen the loads"
+        )
+    patterns = _plate_patterns(impedance, samples)
+    second = _fit(samples, patterns, 2, load_exponent)
+    if order == 2 or (order is None and found < FEWEST[4]):
         return second
-    fourth = _fit(samples, shared, 4, load_exponent, second)
+    fourth = _fit(samples, patterns, 4, load_exponent, second)
     return fourth if order == 4 else _supported(second, fourth)
 
 
@@ -211,26 +218,12 @@ def _carriers(samples: Samples) -> int:
     return 1 + int((np.diff(np.log(np.sort(samples.frequency))) > APART).sum())
 
 
-def _check_enough(samples: Samples, order: int, loads: tuple[float, float]) -> None:
-    found, fewest = _carriers(samples), FEWEST[order]
-    if found < fewest:
-        raise ValueError(
-            f"impedance: {found} different carriers with data at loads from {loads[0]:g} to {loads[1]:g} N, a "
-            f"finger of order {order} needs at least {fewest}: record more frequencies, or widen the loads"
-        )
-
-
-def _unit(name: str) -> float:
-    return 1.0 if name == "load_exponent" else float(_UNITS[NAMES.index(name)])
-
-
 def _impedance(numbers: Mapping[str, Any], frequency: Array, normal_load: float | Array | None) -> Array:
     """Z_f (N s/m) of a model given by its numbers, times its growth with the load."""
-    fields = {name: value for name, value in numbers.items() if name != "load_exponent"}
+    fields = dict(numbers)
+    exponent = fields.pop("load_exponent")
     whole = FingerMechanics(**fields).impedance(frequency)
-    if normal_load is None:
-        return whole
-    return whole * np.exp(numbers["load_exponent"] * np.log(np.asarray(normal_load) / numbers["reference_load"]))
+    return whole if normal_load is None else whole * (normal_load / fields["reference_load"]) ** exponent
 
 
 def _plate_errors(record: FingerRecord, w: Array, sigma: Array) -> Array:
@@ -242,59 +235,47 @@ def _plate_errors(record: FingerRecord, w: Array, sigma: Array) -> Array:
     return np.minimum(known, [sqrt(2) * (sigma * factor).min() for factor in (1 / w, 1.0, w)])
 
 
-def _shared_errors(impedance: Source | Sequence[Source], samples: Samples) -> list[tuple[Array, Array, Array]]:
-    """Rows, U and 1 - (1 + s^2)^(-1/2) of each recording's G/sigma = U s V, over real and then imaginary parts.
-
-    ``(1 + G G^T)^(-1/2) = 1 - U (1 - (1 + s^2)^(-1/2)) U^T`` whitens them, see `fit_finger`.
-    """
-    found = []
+def _plate_patterns(impedance: Source | Sequence[Source], samples: Samples) -> Array:
+    """Errors of the samples (N s/m, (n, 3 a recording)) by one standard error of each number of the plate."""
+    w, columns = 2 * np.pi * samples.frequency, []
     for number, each in enumerate(parts_of(impedance)):
-        own = np.flatnonzero(samples.source == number)
-        if isinstance(each, FingerRecord) and own.size:
-            w, sigma = 2 * np.pi * samples.frequency[own], samples.standard_error[own]
-            mass, damping, stiffness = _plate_errors(each, w, sigma)
-            zero = np.zeros_like(w)
-            real = np.column_stack([zero, damping / sigma, zero])
-            imaginary = np.column_stack([mass * w / sigma, zero, -stiffness / w / sigma])
-            along, size, _ = np.linalg.svd(np.vstack([real, imaginary]), full_matrices=False)
-            found.append((np.concatenate([own, own + len(samples.source)]), along, 1 - 1 / np.sqrt(1 + size**2)))
-    return found
+        own = samples.source == number
+        if isinstance(each, FingerRecord) and own.any():
+            mass, damping, stiffness = _plate_errors(each, w[own], samples.standard_error[own])
+            columns += [1j * w * mass * own, damping * own, stiffness / (1j * w) * own]
+    return np.array(columns).reshape(-1, len(w)).T
 
 
 def _fit(
-    samples: Samples,
-    shared: list[tuple[Array, Array, Array]],
-    order: int,
-    exponent: float | None,
-    second: FingerFit | None = None,
+    samples: Samples, patterns: Array, order: int, exponent: float | None, second: FingerFit | None = None
 ) -> FingerFit:
-    """Fit one order, from several starts where it is the 4th."""
+    """Fit one order, from several starts where it is the 4th, and the errors of the plates on the way."""
     from scipy.optimize import least_squares
 
     names, logs = NAMES[: 3 * order // 2], np.log(samples.load)
     fixed = {"order": order, "reference_load": float(np.exp(logs.mean())), "load_exponent": exponent or 0.0}
     if exponent is None and np.ptp(logs) > APART:
         names = (*names, "load_exponent")
-    units = np.array([_unit(name) for name in names])
-    weight = 1 / samples.standard_error
+    units, weight, count = np.array([UNITS[name] for name in names]), 1 / samples.standard_error, len(names)
 
     def residual(x: Array) -> Array:
-        numbers = fixed | dict(zip(names, (x * units).tolist(), strict=True))
-        apart = (_impedance(numbers, samples.frequency, samples.load) - samples.value) * weight
-        white = np.concatenate([apart.real, apart.imag])
-        for rows, along, shrink in shared:
-            white[rows] -= along @ (shrink * (along.T @ white[rows]))
-        return white
+        numbers = fixed | dict(zip(names, (x[:count] * units).tolist(), strict=True))
+        model = _impedance(numbers, samples.frequency, samples.load) + patterns @ x[count:]
+        off = (model - samples.value) * weight
+        return np.concatenate([off.real, off.imag, x[count:]])
 
-    most = np.append(_MOST, 10.0)[[*range(3 * order // 2), *([6] if len(names) % 3 else [])]]
+    most = np.array([MOST[name] for name in names]) / units
     least = np.where(np.array(names) == "load_exponent", -10.0, 0.0)
-    settings: Any = {"bounds": (least, most), "x_scale": "jac", "ftol": 1e-6, "max_nfev": MOST_STEPS}
+    free = np.full(patterns.shape[1], np.inf)
+    bounds = np.r_[least, -free], np.r_[most, free]
+    settings: Any = {"bounds": bounds, "x_scale": "jac", "ftol": 1e-6, "max_nfev": MOST_STEPS}
     with np.errstate(under="ignore"):  # the solver's own step from a bound of 0
-        starts = [np.clip(start[: len(names)], least + 1e-6, most) for start in _starts(samples, second)]
-        best = min((least_squares(residual, start, **settings) for start in starts), key=lambda each: each.cost)
-    numbers = fixed | dict(zip(names, (best.x * units).tolist(), strict=True))
-    growth, chi_square, freedom = numbers.pop("load_exponent"), 2 * float(best.cost), best.fun.size - len(names)
-    covariance = _inverse(best.jac) * np.outer(units, units) * max(1.0, chi_square / max(freedom, 1))
+        starts = [np.clip(start[:count], least + 1e-6, most) for start in _starts(samples, second)]
+        searches = (least_squares(residual, np.r_[start, np.zeros_like(free)], **settings) for start in starts)
+        best = min(searches, key=lambda each: each.cost)
+    numbers = fixed | dict(zip(names, (best.x[:count] * units).tolist(), strict=True))
+    growth, chi_square, freedom = numbers.pop("load_exponent"), 2 * float(best.cost), best.fun.size - best.x.size
+    covariance = _inverse(best.jac)[:count, :count] * np.outer(units, units) * max(1.0, chi_square / max(freedom, 1))
     reach = float(samples.load.min()), float(samples.load.max())
     return FingerFit(FingerMechanics(**numbers), growth, names, covariance, chi_square, freedom, reach)
 
@@ -306,8 +287,9 @@ def _starts(samples: Samples, second: FingerFit | None) -> list[Array]:
     skin, so that it fits no worse.
     """
     if second is not None:
-        whole = [getattr(second.mechanics, name) / unit for name, unit in zip(NAMES, _UNITS[:3], strict=False)]
-        table = [[getattr(each, name) for name in NAMES] / _UNITS for each in (LIGHT, HEAVY)]
+        units = np.array([UNITS[name] for name in NAMES])
+        whole = [getattr(second.mechanics, name) / UNITS[name] for name in NAMES[:3]]
+        table = [[getattr(each, name) for name in NAMES] / units for each in (LIGHT, HEAVY)]
         return [np.append(each, 0.0) for each in (*table, [*_STIFF_SKIN, *whole])]
     w, weight = 2e-3 * np.pi * samples.frequency, 1 / samples.standard_error
     zero = np.zeros_like(w)

@@ -79,10 +79,10 @@ def _touches(record: FingerRecord) -> str:
         at = slice(*record.at(np.array([each.start, each.stop])))
         load, load_error = _finite(record.normal_load, at)
         place, place_error = (1e3 * part for part in _finite(record.position, at))
-        loads = [f"{load.mean():.3f}", f"{np.median(load_error):.3f}"] if load.size else ["undefined", ""]
+        cells = [f"{load.mean():.3f}", f"{np.median(load_error):.3f}"] if load.size else ["undefined", ""]
         span = f"{place.min():.1f} to {place.max():.1f}" if place.size else "undefined"
-        places = [span, f"{np.median(place_error):.2f}" if place.size else ""]
-        rows.append([f"{number}", f"{each.start:.3f}", f"{each.stop:.3f}", *loads, *places])
+        cells += [span, f"{np.median(place_error):.2f}" if place.size else ""]
+        rows.append([f"{number}", f"{each.start:.3f}", f"{each.stop:.3f}", *cells])
     return table(rows) + "\n(se: standard error of one sample, median of the touch)" if len(rows) > 1 else ""
 
 

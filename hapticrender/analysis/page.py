@@ -11,7 +11,7 @@ import numpy as np
 from hapticrender.analysis.load_law import load_exponent, mean_exponent
 from hapticrender.analysis.models import FingerFit
 from hapticrender.analysis.records import LOADED, FingerRecord
-from hapticrender.report.page import FOOTER, GENERATOR, NO_PICTURE, STYLE, html_table
+from hapticrender.report.page import NO_PICTURE, html_page, html_table
 
 Fits = dict[str, dict[int, FingerFit]]  # by load class and order
 LABELS = {
@@ -32,17 +32,7 @@ def page_of(records: Sequence[FingerRecord], fits: Fits, pictures: list[str]) ->
     """HTML of the page about `records`, with the `pictures` (names of files) that were drawn."""
     title = escape(records[0].name) if len(records) == 1 else f"{len(records)} recordings"
     times = "\n".join(_record(record, f"time-{i + 1}.png", pictures) for i, record in enumerate(records))
-    return f"""<!DOCTYPE html>
-<html lang="en">
-<head>
-<meta charset="utf-8">
-<meta name="viewport" content="width=device-width, initial-scale=1">
-{GENERATOR}
-<title>The finger, measured: {title}</title>
-<style>{STYLE}</style>
-</head>
-<body>
-<h1>The finger, measured: {title}</h1>
+    body = f"""<h1>The finger, measured: {title}</h1>
 <p>Load, position and mechanical impedance Z<sub>f</sub> = F<sub>f</sub>/v of the finger, computed from the sensors of
 the surface and from its drive. Intervals are of 95&nbsp;%. Contact is judged by the force alone: a touch is a span
 above the threshold (loaded); grey spans are below it (unloaded), orange ones near it or beside lost samples
@@ -53,11 +43,8 @@ above the threshold (loaded); grey spans are below it (unloaded), orange ones ne
 <section><h2>Impedance over the load</h2>
 {_picture("load.png", pictures, "Impedance over load, share explained by the load, exponent over frequency", ONE_LOAD)}
 {_laws(records)}</section>
-{times}
-{FOOTER}
-</body>
-</html>
-"""
+{times}"""
+    return html_page(f"The finger, measured: {title}", body)
 
 
 def _picture(name: str, pictures: list[str], alt: str, missing: str = "") -> str:
@@ -73,10 +60,11 @@ def _fits(fits: Fits) -> str:
         return '<p class="note">No fit: a finger takes at least two frequencies.</p>'
     flat = [(name, fit) for name, of_class in fits.items() for _, fit in sorted(of_class.items())]
     rows = [(escape(label), *(_value(fit, name) for _, fit in flat)) for name, label in LABELS.items()]
+    p_values = ["&lt;0.001" if fit.p_value < 1e-3 else f"{fit.p_value:.3f}" for _, fit in flat]
     rows += [
         ("loads", *(f"{fit.loads[0]:.2f} to {fit.loads[1]:.2f} N" for _, fit in flat)),
         ("χ² / degrees of freedom", *(f"{fit.chi_square:.0f} / {fit.degrees_of_freedom}" for _, fit in flat)),
-        ("probability p of a larger χ²", *(_probability(fit.p_value) for _, fit in flat)),
+        ("probability p of a larger χ²", *p_values),
         ("supported by the data", *(_supported(fits[name], fit) for name, fit in flat)),
     ]  # fmt: skip
     body = [_row("td", *cells) for cells in rows]
@@ -86,10 +74,6 @@ def _fits(fits: Fits) -> str:
 criterion; a difference of 10 is strong.
 With p below 0.01 the model, with one exponent for all loads, does not explain the data within their stated errors:
 intervals are enlarged by the scatter, and the parameters describe the data without being the finger’s.</p>"""
-
-
-def _probability(p: float) -> str:
-    return "&lt;0.001" if p < 1e-3 else f"{p:.3f}"
 
 
 def _supported(of_class: Mapping[int, FingerFit], fit: FingerFit) -> str:
@@ -116,11 +100,10 @@ def _value(fit: FingerFit, name: str) -> str:
 def _laws(records: Sequence[FingerRecord]) -> str:
     """Table of exponents, of all recordings together, and the mean of each where there are several."""
     law, several = load_exponent(records), len(records) > 1
+    columns = law.frequency, law.exponent, law.standard_error, law.magnitude, law.reference_load, law.count
     rows = [
         [f"{frequency:.0f} Hz", _exponent(n, error), f"{size:.2f} N s/m at {load:.2f} N", f"{count}"]
-        for frequency, n, error, size, load, count in zip(
-            law.frequency, law.exponent, law.standard_error, law.magnitude, law.reference_load, law.count, strict=True
-        )
+        for frequency, n, error, size, load, count in zip(*columns, strict=True)
     ]
     head, note = ["Frequency", "exponent n", "|Z<sub>f</sub>|", "windows"], ""
     if several and rows:
@@ -142,13 +125,11 @@ def _record(record: FingerRecord, name: str, pictures: list[str]) -> str:
     touched = sum(each.stop - each.start for each in record.of_kind(LOADED))
     plate = "measured in its unloaded spans" if record.plate.measured else "as in the profile"
     count, length = len(record.of_kind(LOADED)), record.time[-1] - record.time[0]
+    bandwidths = f"{record.normal_load.bandwidth:.3g} and {record.position.bandwidth:.3g} Hz"
     entries = [
         ("Loaded", f"{touched:.2f} of {length:.2f} s, {count} touch{'es' * (count != 1)}"),
         ("Position good to 1 mm", f"from {record.least_load:.2f} N on" if isfinite(record.least_load) else "nowhere"),
-        (
-            "Bandwidth of load and position",
-            f"{record.normal_load.bandwidth:.3g} and {record.position.bandwidth:.3g} Hz",
-        ),
+        ("Bandwidth of load and position", bandwidths),
         ("The plate's own stiffness and damping", plate),
         *(("Note", note) for note in record.notes),
     ]

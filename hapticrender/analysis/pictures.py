@@ -31,19 +31,12 @@ POINTS = 1500  # of a curve over time
 def draw(records: FingerRecord | Sequence[FingerRecord], folder: str | os.PathLike[str]) -> Path:
     """Draw one or several recordings into `folder`, which is made where it is not there; return its page.
 
-    As Grigorii et al. 2021: impedance and load over time (Fig. 5, ``time-1.png`` and so on, one a recording), impedance
-    over the load, and how much of it the load explains (Fig. 8 C and D, ``load.png``), impedance over frequency with
-    fits of both orders for each class of loads (Fig. 9, ``frequency.png``); ``index.html`` has them, the parameters
-    with their intervals, and what could not be measured.  A picture without data is left out: that over the load where
-    the loads differ by less than 1 %.  Without matplotlib there are no pictures, and a warning says
-    how to install it.
+    As Grigorii et al. 2021: impedance and load over time (Fig. 5, ``time-1.png`` and so on, one a recording), over the
+    load (Fig. 8 C and D, ``load.png``), and over frequency with fits (Fig. 9, ``frequency.png``); ``index.html`` has
+    them, the parameters with their intervals, and what could not be measured.  A picture without data is left out: that
+    over the load where the loads differ by less than 1 %.  Without matplotlib there are no pictures, and a warning.
 
-    Raises
-    ------
-    ValueError
-        There is no recording.
-    OSError
-        The folder cannot be written.
+    Raises ValueError without a recording, OSError where the folder cannot be written.
     """
     records = [records] if isinstance(records, FingerRecord) else list(records)
     if not records:
@@ -83,10 +76,9 @@ def fit_all(records: Sequence[FingerRecord]) -> Fits:
 def draw_time(record: FingerRecord, path: str | os.PathLike[str]) -> None:
     """Draw load and impedance, impedance of every band, and position and velocity over time, unloaded spans shaded."""
     bands = _shown(record.impedance.value)
-    drawings: list[Any] = [partial(_load_and_impedance, bands=bands), _kinematics]
-    if len(bands) > 1:
-        drawings.insert(1, partial(_all_bands, bands=bands))
-    heights = [1.5] * (len(drawings) - 1) + [1.0]
+    drawings: list[Any] = [partial(_load_and_impedance, bands=bands)]
+    drawings += [partial(_all_bands, bands=bands)] if len(bands) > 1 else []
+    drawings, heights = [*drawings, _kinematics], [1.5] * len(drawings) + [1.0]
     with new_figure((9, 2.05 * sum(heights) - 1), pads=(0.1, 0.08)) as figure:
         panels = figure.subplots(len(drawings), 1, sharex=True, height_ratios=heights)
         for axes, drawing in zip(panels, drawings, strict=True):
@@ -111,19 +103,15 @@ def draw_load(records: Sequence[FingerRecord], path: str | os.PathLike[str]) -> 
 def draw_frequency(records: Sequence[FingerRecord], fits: Fits, path: str | os.PathLike[str]) -> None:
     """Draw modulus and phase of the impedance over frequency, with both fits and their 95 % bands, a class a column."""
     size = np.abs(samples_of(records).value)
-    common: Any = {"sharex": True, "squeeze": False}
-    with new_figure((5.4 * max(len(fits), 2), 6.2 if len(fits) > 1 else 3.8), pads=(0.1, 0.08)) as figure:
-        if len(fits) > 1:
-            panels = figure.subplots(2, len(fits), sharey="row", height_ratios=[1.5, 1], **common)
-        else:
-            panels = figure.subplots(1, 2, **common).T
+    with new_figure((max(5.4 * len(fits), 7), 6.2), pads=(0.1, 0.08)) as figure:
+        panels = figure.subplots(2, len(fits), sharex=True, sharey="row", squeeze=False, height_ratios=[1.5, 1])
         for (name, of_class), column in zip(fits.items(), panels.T, strict=True):
             _over_frequency(column, name, of_class, samples_of(records, LOAD_CLASSES[name]))
         panels[0, 0].set_ylim(0.6 * np.quantile(size, 0.01), 1.7 * np.quantile(size, 0.99))
         panels[0, 0].set_ylabel("|Z_f| (N s/m)")
         low, high = panels[1, 0].get_ylim()
         panels[1, 0].set(ylabel="phase (degrees)", ylim=(max(low, -180), min(high, 180)))
-        for axes in panels[-1] if len(fits) > 1 else panels[:, 0]:
+        for axes in panels[1]:
             axes.set_xlabel("frequency (Hz)")
         _numbers(panels[0, 0].xaxis, "25")
         _numbers(panels[0, 0].yaxis)
@@ -160,6 +148,8 @@ def _curve(axes: Any, time: Array, series: Series, scale: float, colour: str, la
 
 def _load_and_impedance(axes: Any, record: FingerRecord, bands: list[int]) -> None:
     """The paper's Fig. 5: load (black) and |Z_f| of one band (red) over one another."""
+    from matplotlib.patches import Patch
+
     lines = [_curve(axes, record.time, record.normal_load, 1.0, INK, "normal load")]
     axes.set(title="Impedance and load", ylabel="normal load W (N)")
     most = float(np.nanmax(np.where(record.contact == LOADED, record.normal_load.value, np.nan), initial=0.1))
@@ -174,15 +164,8 @@ def _load_and_impedance(axes: Any, record: FingerRecord, bands: list[int]) -> No
         right.set_ylabel("|Z_f| (N s/m)", color=RED)
         right.tick_params(axis="y", colors=RED)
         right.set_ylim(-0.08 * np.nanmax(size), 1.25 * np.nanmax(size))
-    _shading_legend(axes, record, lines)
-
-
-def _shading_legend(axes: Any, record: FingerRecord, lines: list[Any]) -> None:
-    """Legend of lines and of the kinds of contact that are shaded."""
-    from matplotlib.patches import Patch
-
-    handles = lines + [Patch(color=SHADES[kind], label=KINDS[kind]) for kind in SHADES if record.of_kind(kind)]
-    legend(axes, handles, [each.get_label() for each in handles])
+    lines += [Patch(color=SHADES[kind], label=KINDS[kind]) for kind in SHADES if record.of_kind(kind)]
+    legend(axes, lines, [each.get_label() for each in lines])
 
 
 def _dots(axes: Any, x: Array, y: Array, error: Array, colour: Any, label: str) -> Any:
@@ -251,16 +234,13 @@ def _means(axes: Any, records: Sequence[FingerRecord], frequency: float) -> None
     """Mean and standard deviation of load and impedance of every recording at one frequency, black as in Fig. 8 C."""
     label: str | None = f"each at {frequency:.0f} Hz"
     for record in records:
-        near = [each for each in by_frequency(samples_of(record)) if _near(each, frequency)]
+        bins = by_frequency(samples_of(record))
+        near = [each for each in bins if abs(np.log(np.median(each.frequency) / frequency)) < BAND]
         if near:
             load, size = near[0].load, np.abs(near[0].value)
             style = {"color": "black", "marker": "o", "ms": 4, "lw": 0, "elinewidth": 1.0, "zorder": 5, "label": label}
             axes.errorbar(load.mean(), size.mean(), size.std(), load.std(), **style)
             label = None
-
-
-def _near(samples: Samples, frequency: float) -> bool:
-    return abs(np.log(np.median(samples.frequency) / frequency)) < BAND
 
 
 def _determination(axes: Any, each: list[LoadLaw], pooled: LoadLaw) -> None:
@@ -301,12 +281,13 @@ def _over_frequency(column: Any, name: str, fits: Mapping[int, FingerFit], sampl
     samples = samples._replace(value=samples.value * growth, standard_error=samples.standard_error * growth)
     grid = np.geomspace(samples.frequency.min(), samples.frequency.max(), 300)
     views: tuple[Callable[[Array], Array], ...] = (np.abs, lambda z: np.degrees(np.angle(z)))
-    for axes, view in zip(column, views, strict=True):
-        axes.plot(samples.frequency, view(samples.value), ".", color=PALE, ms=2, alpha=0.4, zorder=1)
-    frequency, mean, error = _band_means(samples)
-    bars = (SURE * error, np.degrees(SURE * error / np.abs(mean)))
+    bins = by_frequency(samples)
+    frequency = np.array([np.median(each.frequency) for each in bins])
+    mean, error = np.array([weighted_mean(each.value, each.standard_error) for each in bins]).T
+    bars = SURE * error.real, np.degrees(SURE * error.real / np.abs(mean))
+    style = {"fmt": "o", "color": INK, "ms": 4.5, "elinewidth": 1, "capsize": 2, "zorder": 4, "label": "measured"}
     for axes, view, bar in zip(column, views, bars, strict=True):
-        style = {"fmt": "o", "color": INK, "ms": 4.5, "elinewidth": 1, "capsize": 2, "zorder": 4, "label": "measured"}
+        axes.plot(samples.frequency, view(samples.value), ".", color=PALE, ms=2, alpha=0.4, zorder=1)
         axes.errorbar(frequency, view(mean), bar, **style)
     for order, fit in sorted(fits.items()):
         _model(column, fit, grid, load, COLOURS[order], NAMES[order])
@@ -319,25 +300,14 @@ def _over_frequency(column: Any, name: str, fits: Mapping[int, FingerFit], sampl
 def _model(column: Any, fit: FingerFit, grid: Array, load: float, colour: str, name: str) -> None:
     """Modulus and phase of a fit, with 95 % bands."""
     z, error = fit.impedance(grid, load), SURE * fit.relative_error(grid, load)
-    phase, line = (
-        np.degrees(np.angle(z)),
-        {"color": colour, "lw": 1.6, "ls": "--" if fit.order == 2 else "-", "zorder": 3},
-    )
-    column[0].plot(grid, np.abs(z), label=name, **line)
-    column[1].plot(grid, phase, **line)
-    column[0].fill_between(
-        grid, np.abs(z) * np.exp(-error.real), np.abs(z) * np.exp(error.real), color=colour, alpha=0.25, lw=0
-    )
-    spread = np.degrees(error.imag)
-    column[1].fill_between(grid, phase - spread, phase + spread, color=colour, alpha=0.25, lw=0)
-
-
-def _band_means(samples: Samples) -> tuple[Array, Array, Array]:
-    """Median frequency (Hz), weighted mean and its standard error of every bin of frequencies."""
-    bins = by_frequency(samples)
-    rows = [(np.median(each.frequency), *weighted_mean(each.value, each.standard_error)) for each in bins]
-    frequency, mean, error = (np.array(column) for column in zip(*rows, strict=True))
-    return frequency, mean, error
+    phase, spread = np.degrees(np.angle(z)), np.degrees(error.imag)
+    size, ratio = np.abs(z), np.exp(error.real)
+    style = {"color": colour, "lw": 1.6, "ls": "--" if fit.order == 2 else "-", "zorder": 3, "label": name}
+    for axes, value, low, high in zip(
+        column, (size, phase), (size / ratio, phase - spread), (size * ratio, phase + spread), strict=True
+    ):
+        axes.plot(grid, value, **style)
+        axes.fill_between(grid, low, high, color=colour, alpha=0.25, lw=0)
 
 
 def _numbers(axis: Any, within: str = "235") -> None:

@@ -11,6 +11,7 @@ from hapticrender.analysis.lock_in import Lines
 from hapticrender.analysis.records import PlateTrack
 from hapticrender.protocols import Array
 
+CHANCE = 1e-6  # of a plate that is as its model, to leave a `Course.misfit` above 1
 INFORMED = 0.5  # of its uncertainty in the profile: below it the total stiffness counts as measured
 
 
@@ -38,19 +39,11 @@ def rest_of(course: Course, lines: Lines) -> Rest:
 
 
 def regress(course: Course, lines: Lines, noise: Array) -> Course:
-    """Estimate start and slope of the parameters from windows without a finger.
+    """Estimate start and slope of a profile's parameters from windows without a finger (`lines`, as for `Signals.of`).
 
-    Minimises the output error ``x - D^-1 f`` of heave and rocking over the noise of the amplitudes, together with the
-    distance from the profile over its uncertainty.  Misfit beyond the noise widens the covariance.
-
-    Parameters
-    ----------
-    course : Course
-        The profile's parameters and covariance.
-    lines : Lines
-        As `Signals.of` takes them.
-    noise : ndarray, shape (2,)
-        White noise of heave and rocking (m, rms).
+    Minimises the output error ``x - D^-1 f`` of heave and rocking over the noise of the amplitudes, by the white
+    `noise` (m rms) of both, together with the distance from the profile over its uncertainty.  Misfit beyond the noise
+    widens the covariance.
 
     Notes
     -----
@@ -58,30 +51,31 @@ def regress(course: Course, lines: Lines, noise: Array) -> Course:
     rocks, so that rocking is mostly noise.  Pintelon & Schoukens, System Identification, 2nd ed. 2012, section 9.10.
     """
     from scipy.optimize import least_squares
+    from scipy.special import chdtri
 
     measured = Signals.of(lines.amplitude)
     prior = np.r_[course.start, course.slope]
     spread = np.sqrt(np.diagonal(course.covariance))
     scale = np.where(spread > 0.0, spread, 1e-9 * np.maximum(np.abs(prior), 1e-9))
     times = np.broadcast_to(lines.time[:, None], lines.frequency.shape)
-    bent = np.zeros_like(measured.force)
-    bent[..., 0] = course.bending(lines.frequency) * course.plate.bending_coil * measured.force[..., 0]
 
     def left(unknown: Array) -> Array:
         values = prior + scale * unknown
         stiffness = replace(course, start=values[:6], slope=values[6:]).dynamic_stiffness(lines.frequency, times)
-        motion = np.linalg.solve(stiffness, measured.force[..., None])[..., 0] + bent
+        motion = np.linalg.solve(stiffness, measured.force[..., None])[..., 0]
         error = (measured.displacement - motion) / (noise * np.sqrt(lines.variance)[..., None])
         return np.r_[error.real.ravel(), error.imag.ravel(), unknown]
 
     search = least_squares(left, np.zeros(10), method="lm")
-    misfit = max(1.0, float((search.fun[:-10] ** 2).mean()))
-    data = search.jac[:-10].T @ search.jac[:-10] / misfit
+    square, count = float((search.fun[:-10] ** 2).sum()), len(search.fun) - 10
+    data = search.jac[:-10].T @ search.jac[:-10] / max(1.0, square / count)
     covariance = np.linalg.inv(data + np.eye(10)) * np.outer(scale, scale)
     values = prior + scale * search.x
     total = np.r_[0.0, 0.0, 1.0, 1.0, np.zeros(6)]
     share = np.sqrt((total @ covariance @ total) / (total @ course.covariance @ total))
-    return Course(course.plate, values[:6], values[6:], covariance, measured=bool(share < INFORMED))
+    return Course(
+        course.plate, values[:6], values[6:], covariance, bool(share < INFORMED), square / float(chdtri(count, CHANCE))
+    )
 
 
 def track_of(course: Course, duration: float) -> PlateTrack:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -97,21 +98,49 @@ class PlateTrack:
 
 
 @dataclass(frozen=True)
-class FingerRecord:
-    """Measured quantities of the finger in a recording.
+class Touch:
+    """Estimates of a finger over time.
 
     Parameters
     ----------
-    name : str
-        Of the recording.
     time : ndarray, shape (n,)
         Times of the series (s), evenly spaced.
     normal_load, position, velocity : Series
         In N, m from the middle of the surface, and m/s.
     contact : ndarray of int, shape (n,)
         UNLOADED, DOUBTFUL or LOADED.
+    """
+
+    time: Array
+    normal_load: Series
+    position: Series
+    velocity: Series
+    contact: Array
+
+
+def joined(parts: Sequence[Touch]) -> Touch:
+    """Join consecutive spans."""
+    time, contact = (np.concatenate([getattr(part, name) for part in parts]) for name in ("time", "contact"))
+    names = ("normal_load", "position", "velocity")
+    load, position, velocity = (_joined([getattr(part, name) for part in parts]) for name in names)
+    return Touch(time, load, position, velocity, contact)
+
+
+def _joined(parts: Sequence[Series]) -> Series:
+    value, error = (np.concatenate([getattr(part, name) for part in parts]) for name in ("value", "standard_error"))
+    return Series(value, error, parts[0].bandwidth)
+
+
+@dataclass(frozen=True)
+class FingerRecord(Touch):
+    """Measured quantities of the finger in a recording.
+
+    Parameters
+    ----------
+    name : str
+        Of the recording.
     segments : tuple of Segment
-        The same as spans, in order.
+        Spans of one kind of contact, in order.
     plate : PlateTrack
         The plate's parameters over time.
     impedance : Impedance
@@ -123,11 +152,6 @@ class FingerRecord:
     """
 
     name: str
-    time: Array
-    normal_load: Series
-    position: Series
-    velocity: Series
-    contact: Array
     segments: tuple[Segment, ...]
     plate: PlateTrack
     impedance: Impedance

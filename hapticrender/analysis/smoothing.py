@@ -80,18 +80,8 @@ class LocalLine:
     White noise of variance v per sample gives them the variances v sum w_i^2 and v sum u_i^2.  Far from the edges of
     the span, with samples on both sides, these are the convolutions with g and with g'.
 
-    Parameters
-    ----------
-    spread : float, s
-        Of g.
-    rate : float, Hz
-    ahead : int, samples
-        After each sample that are used; at most `half_width`.
-
-    Attributes
-    ----------
-    noise : (float, float)
-        Sums of w_i^2 (1) and u_i^2 (1/s^2) inside a long span.
+    `spread` (s) is that of g, `rate` in Hz; `ahead` samples after each sample are used, at most `half_width`.  `noise`
+    holds the sums of w_i^2 (1) and u_i^2 (1/s^2) inside a long span.
     """
 
     def __init__(self, spread: float, rate: float, ahead: int) -> None:

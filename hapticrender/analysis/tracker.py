@@ -17,7 +17,6 @@ so that the position is lost as 1/W.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -26,7 +25,7 @@ from hapticrender.analysis.contact import ContactDetector, clear_sigmas
 from hapticrender.analysis.course import Course, Signals
 from hapticrender.analysis.force import MotionFilter, at_least
 from hapticrender.analysis.plate_track import Rest
-from hapticrender.analysis.records import DOUBTFUL, LOADED, UNLOADED, Series
+from hapticrender.analysis.records import DOUBTFUL, LOADED, UNLOADED, Series, Touch
 from hapticrender.analysis.smoothing import History, LocalLine, half_width, spread_of
 from hapticrender.bands import hold_last
 from hapticrender.checks import integer, number, require
@@ -40,17 +39,6 @@ MODEL_SIGMAS = 3.0  # of the plate's uncertainty, added to the threshold of cont
 PEAK = 0.05  # s: longest half period of a carrier twice over, in which its peak lies
 DOUBT = 0.75  # of the threshold: from here on a force without contact is doubtful, by noise once in ten minutes
 FARTHEST = 0.25  # of a: largest standard error of a position that is stated
-
-
-@dataclass(frozen=True)
-class Touch:
-    """Estimates of a block: times (s, (n,)), three series, and contact as in `FingerRecord`."""
-
-    time: Array
-    normal_load: Series
-    position: Series
-    velocity: Series
-    contact: Array
 
 
 class FingerTracker:

@@ -11,8 +11,8 @@ S_k the known density of its noise, and y the plate's errors (of M, C and K, cov
 
 A position that is late, or predicted, is off along the finger's velocity and acceleration too: two more entries of y.
 T is a sum of squares with one degree of freedom for each real number in U: chi-square, by which the window's threshold
-follows from the rate of false alarms.  With two fingers it is a non-central one, by which `miss_rate` follows.  Two
-fingers alike, at places that the plate moves alike under the same load, leave what one finger between them would.
+follows from the rate of false alarms.  Two fingers alike, at places that the plate moves alike under the same load,
+leave what one finger between them would.
 """
 
 from __future__ import annotations
@@ -72,48 +72,27 @@ def measures_moment(model: DeviceModel) -> bool:
 
 
 def bound_of(freedom: float, false_alarms: float = FALSE_ALARMS) -> float:
-    """Value that a chi-square statistic of `freedom` passes with the probability `false_alarms`."""
+    """Value that the statistic of one finger, of `freedom`, passes with the probability `false_alarms`."""
     from scipy.special import chdtri
 
     return float(CORRELATION * chdtri(freedom / CORRELATION, false_alarms))
 
 
-def miss_rate(excess: float, freedom: float, false_alarms: float = FALSE_ALARMS) -> float:
-    """Probability that two touches that add `excess` to the mean of the statistic stay below the bound."""
-    from scipy.special import chndtr
-
-    bound, free = bound_of(freedom, false_alarms) / CORRELATION, freedom / CORRELATION
-    return float(chndtr(bound, free, excess / CORRELATION))
-
-
 class TouchMonitor:
     """Test of one finger against two, window by window, for signals that come in pieces of any length.
 
-    Parameters
-    ----------
-    model : DeviceModel
-        Of a plate with two coordinates, see `measures_moment`.
-    late : int, samples, optional
-        From a row of the drive to the interval in which it acts; by default that of drives as they are played, ``delay
-        - block``.
-
-    Attributes
-    ----------
-    last : TouchTest or None
-        Result of the last window under a finger.
-    tests, detections : int
-        Windows that were tested, and those in which one finger could not explain the signals.
-    two : bool
-        Whether two fingers touch, by the last window; a lift ends it.
+    `model` is of a plate, see `measures_moment`.  `last` is the result of the last window under a finger,
+    `tests` counts these, `detections` those that one finger cannot explain; `two` says whether two fingers touch, by
+    the last window: a lift ends it.
     """
 
-    def __init__(self, model: DeviceModel, late: int | None = None) -> None:
+    def __init__(self, model: DeviceModel) -> None:
         if not measures_moment(model):
             raise ValueError(f"{len(model.mass)} coordinates: must be a plate with 2, and a sensor for each of them")
         self.model, self.length, self._margin = model, round(WINDOW * model.rate), round(MARGIN * model.rate)
         top = min(model.highest_frequency, 0.2 * model.rate)
         self._filters = derivative_filters(float(model.rate), float(top))[:3]
-        self._late = model.delay - model.block if late is None else late
+        self._late = model.delay - model.block  # samples, from a row of the drive to the interval in which it acts
         bins = np.arange(0, self.length // 2)
         hertz = bins * model.rate / self.length
         self._bins = bins[(hertz >= BAND[0]) & (hertz <= min(BAND[1], top))][::SPACING]
@@ -124,7 +103,7 @@ class TouchMonitor:
         self._information, self._known = self._prior.copy(), np.zeros(9)
         self._rest: Array | None = None  # force that the free plate leaves at 0 Hz: offsets of the sensors
         self._free: Array | None = None  # last window of the free plate, until no touch is seen to follow
-        self._pieces: list[tuple[Array, ...]] = []
+        self._pieces: list[Array] = []
         self._count = 0
         self.last: TouchTest | None = None
         self.tests = self.detections = 0
@@ -133,24 +112,16 @@ class TouchMonitor:
     def update(self, drive: Array, sensed: Array, position: Array, flags: Array) -> int:
         """Take the next samples and return `Flag.TWO_TOUCHES` while two fingers touch, else 0.
 
-        Parameters
-        ----------
-        drive, sensed : ndarray, shape (n, channels) and (n, sensors)
-            As played and measured.
-        position : ndarray, shape (n,)
-            Of the finger (m), NaN while lifted.
-        flags : ndarray of int, shape (n,)
-            Windows with samples that are `UNUSABLE` are left out.
+        `drive` (n, channels) and `sensed` (n, sensors) are as played and measured, `position` (n,) is that of the
+        finger (m, NaN while lifted); windows with samples whose `flags` (n,) are `UNUSABLE` are left out.
         """
-        self._pieces.append((drive, sensed, position, flags & UNUSABLE))
+        self._pieces.append(np.column_stack((drive, sensed, position, flags & UNUSABLE)))
         self._count += len(position)
         need = self.length + TAPS - 1 + self._late
         while self._count >= need:
-            rows = np.concatenate([np.column_stack(piece) for piece in self._pieces])
-            channels, sensors = drive.shape[1], sensed.shape[1]
+            rows = np.concatenate(self._pieces)
             rows = rows[self._take(rows[:need]) :]
-            split = np.split(rows, [channels, channels + sensors, channels + sensors + 1], axis=1)
-            self._pieces, self._count = [(split[0], split[1], split[2][:, 0], split[3][:, 0])], len(rows)
+            self._pieces, self._count = [rows], len(rows)
         return TWO_TOUCHES if self.two else 0
 
     def restart(self) -> None:
@@ -213,10 +184,8 @@ class TouchMonitor:
     def _regressors(self, parts: Array) -> Array:
         """Forces per error of K, C and M (entries 11, 12, 22 of each), shape (2, 9, length)."""
         found = np.zeros((2, 9, parts.shape[-1]))
-        for i in range(3):
-            heave, rocking = parts[1 + i]
-            found[0, 3 * i], found[0, 3 * i + 1] = heave, rocking
-            found[1, 3 * i + 1], found[1, 3 * i + 2] = heave, rocking
+        for row in (0, 1):
+            found[row, row::3], found[row, row + 1 :: 3] = parts[1:, 0], parts[1:, 1]
         return found
 
     def _calibrate(self, parts: Array) -> None:
@@ -290,12 +259,8 @@ class TouchMonitor:
 def windows_under_touch(recording: Recording, model: DeviceModel) -> list[tuple[float, TouchTest]]:
     """Test every whole window of a recording under a finger; each with the time by which it was over (s).
 
-    Parameters
-    ----------
-    recording : Recording
-        Of a plate, with the drive, what was sensed and the finger's position.
-    model : DeviceModel
-        Of the plate: of ``hapticrender.prepare(scene).model``, or of `PlateParameters.device_model`.
+    The recording is of a plate, with its drive, what was sensed and the finger's position; the model is that of
+    ``hapticrender.prepare(scene).model``, or of `PlateParameters.device_model`.
     """
     monitor, found, piece = TouchMonitor(model), [], round(0.1 * WINDOW * model.rate)
     signals = [recording.drive, recording.sensed, recording.position, recording.flags]
@@ -314,24 +279,13 @@ class TouchWatch:
     signals, and the law assumes `SLOWER` times the variance of what it measures: it is the open inverse of an average
     finger, which improves slowly.  Once one finger explains the signals again it learns as designed.
 
-    Parameters
-    ----------
-    model : DeviceModel
-    controller : Controller
-        Laws by bands are left as they are.
-    late : int, samples, optional
-        As for `TouchMonitor`.
-    active : bool
-        False: nothing is tested, as on a simulated device, which has one finger.
-    slows : bool
-        False: `slow` is left to the thread that runs the controller.
+    Laws by bands are left as they are.  Without `active` nothing is tested, as on a
+    simulated device, which has one finger; without `slows`, `slow` is left to the thread that runs the controller.
     """
 
-    def __init__(
-        self, model: DeviceModel, controller: Any, late: int | None = None, active: bool = True, slows: bool = True
-    ) -> None:
+    def __init__(self, model: DeviceModel, controller: Any, active: bool = True, slows: bool = True) -> None:
         self._slows, self._slowed, self._tests = slows, False, 0
-        self.monitor = TouchMonitor(model, late) if active and measures_moment(model) else None
+        self.monitor = TouchMonitor(model) if active and measures_moment(model) else None
         self._law: Any = getattr(controller, "law", None)
         self._kept: dict[str, Array] = {}
         if self._law is not None:
@@ -376,8 +330,5 @@ class TouchWatch:
 
     def _note_device(self) -> None:
         """Note what is learned of the device itself, while one finger explains the signals."""
-        law = self._law
-        self._kept["theta"], self._kept["covariance"] = (
-            law["theta"][DEVICE].copy(),
-            law["covariance"][DEVICE, DEVICE].copy(),
-        )
+        self._kept["theta"] = self._law["theta"][DEVICE].copy()
+        self._kept["covariance"] = self._law["covariance"][DEVICE, DEVICE].copy()

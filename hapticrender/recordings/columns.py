@@ -7,7 +7,6 @@ import os
 from array import array
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -68,45 +67,37 @@ def read_columns(path: str | os.PathLike[str]) -> dict[str, Array]:
 
 def assemble(
     columns: Mapping[str, Any] | str | os.PathLike[str],
-    *,
-    drive: Chosen,
-    sensed: Chosen,
-    rate: float | None = None,
-    time: Chosen | None = None,
-    position: Chosen | None = None,
-    normal_load: Chosen | None = None,
-    carriers: Sequence[float] = (),
+    chosen: Mapping[str, Chosen | None],
+    rate: float | None,
+    carriers: Sequence[float],
     **header: Any,
 ) -> tuple[Header, Array]:
-    """Header and frames from columns; see ``Recording.from_columns``."""
+    """Header and frames from the columns `chosen` for drive, sensed, time, position and normal_load.
+
+    See ``Recording.from_columns``.
+    """
     from hapticrender.touch.custom import Custom
     from hapticrender.touch.scene import Scene
 
     source = "columns" if isinstance(columns, Mapping) else Path(columns).name
     table = columns if isinstance(columns, Mapping) else read_columns(columns)
-    inputs, outputs = (_several(table, key, chosen) for key, chosen in (("drive", drive), ("sensed", sensed)))
-    places = tuple(name for name, _ in _scales(sensed))
-    require(0 < len(places) == len(set(places)), "sensed", sensed, "at least one column, and each once")
-    one = {"position": position, "normal_load": normal_load}
-    others = {key: _one(table, key, chosen) for key, chosen in one.items() if chosen is not None}
-    count = _length(table, drive, sensed, time, position, normal_load)
-    rate = _rate(rate, None if time is None else _one(table, "time", time), count)
+    found = {key: _columns(table, key, each) for key, each in chosen.items() if each is not None}
+    count = _length([pair for pairs in found.values() for pair in pairs])
+    rate = _rate(rate, found["time"][0][1] if "time" in found else None, count)
     own = {"name": Path(source).stem} | {key: header.pop(key) for key in ("name", "device") if key in header}
     scene = Scene(texture=Custom(f"what {source} was recorded with"), duration=count / rate, settle=0.0, **own)
     band = np.array([number("carriers", each, "Hz", above=0, most=rate / 2) for each in carriers])
+    drive, sensed = (np.array([values for _, values in found[key]]).reshape(-1, count).T for key in ("drive", "sensed"))
     made = Header.of(
         scene,
-        **{"method": METHOD, "seed": 0, "rate": rate, "motion_source": "sensors", "places": places, **header},
+        **{"method": METHOD, "seed": 0, "motion_source": "sensors", "places": tuple(dict(found["sensed"])), **header},
+        rate=rate,
         bands=Bands(frequency=band, wavenumber=0 * band, phase=0 * band),
-        drive_channels=inputs.shape[1] if inputs.size else 0,
-        sensed_channels=outputs.shape[1],
+        drive_channels=drive.shape[1],
+        sensed_channels=sensed.shape[1],
     )
-    unknown = np.full(count, np.nan)
-    signals = {"position": unknown, "normal_load": unknown, **others, "sensed": outputs, "motion": outputs}
-    signals |= {
-        "drive": inputs if inputs.size else np.zeros((count, 0)),
-        "target": np.zeros((count, len(band)), complex),
-    }
+    signals = {key: found[key][0][1] if key in found else np.full(count, np.nan) for key in ("position", "normal_load")}
+    signals |= {"drive": drive, "sensed": sensed, "motion": sensed, "target": np.zeros((count, len(band)), complex)}
     return made, join(made, signals | {"flags": np.zeros(count), "reference": np.zeros(count)})
 
 
@@ -136,36 +127,27 @@ def _column(table: Mapping[str, Any], name: str, scale: float, offset: float, co
     return scale * (values.astype(float) - offset)
 
 
-def _several(table: Mapping[str, Any], key: str, chosen: Chosen) -> Array:
-    """Columns side by side, shape (n, k), all finite."""
-    found = []
-    for name, pair in _scales(chosen):
-        values = _column(table, name, *pair)
-        bad = np.flatnonzero(~np.isfinite(values))
+def _columns(table: Mapping[str, Any], key: str, chosen: Chosen) -> list[tuple[str, Array]]:
+    """Names and values of the columns of a signal: all finite in drive and sensed, one, perhaps with NaN, elsewhere."""
+    scales, several = _scales(chosen), key in ("drive", "sensed")
+    names = [name for name, _ in scales]
+    if key == "sensed":
+        require(0 < len(names) == len(set(names)), key, chosen, "at least one column, and each once")
+    require(several or len(names) == 1, key, chosen, "one column")
+    found = [(name, _column(table, name, *pair, counter=key in ("position", "time"))) for name, pair in scales]
+    for name, values in found:
+        bad = np.flatnonzero(~np.isfinite(values)) if several else np.empty(0)
         if bad.size:
             cure = "cut the recording there, or interpolate"
             raise ValueError(f"{key}: column {name}: {bad.size} values are not finite, first in row {bad[0]}: {cure}")
-        found.append(values)
-    lengths = {len(each) for each in found}
-    return np.column_stack(found) if len(lengths) == 1 else np.empty((0, 0))  # `_length` refuses several
+        finite = not np.isinf(values).any()
+        require(finite, f"{key}: column {name}", np.inf, "finite, or NaN where there is no value")
+    return found
 
 
-def _one(table: Mapping[str, Any], key: str, chosen: Chosen) -> Array:
-    """One column, which may have NaN."""
-    pairs = _scales(chosen)
-    require(len(pairs) == 1, key, chosen, "one column")
-    ((name, pair),) = pairs
-    values = _column(table, name, *pair, counter=key in ("position", "time"))
-    require(
-        not np.isinf(values).any(), f"{key}: column {name}", float(np.inf), "finite, or NaN where there is no value"
-    )
-    return values
-
-
-def _length(table: Mapping[str, Any], *choices: Chosen | None) -> int:
-    """Length of all chosen columns, at least 2."""
-    names = chain.from_iterable(_scales(each) for each in choices if each is not None)
-    lengths = {name: np.squeeze(np.asarray(table[name])).shape[0] for name, _ in names}
+def _length(columns: Sequence[tuple[str, Array]]) -> int:
+    """Length of all columns, at least 2."""
+    lengths = {name: len(values) for name, values in columns}
     if len(set(lengths.values())) > 1:
         listed = ", ".join(f"{name} {length}" for name, length in lengths.items())
         raise ValueError(f"columns differ in length: {listed} samples: all must be of one clock")
@@ -197,36 +179,62 @@ def _rate(rate: float | None, time: Array | None, count: int) -> float:
 
 
 def _read_text(path: Path) -> dict[str, Array]:
-    """Columns of a text with commas, semicolons, tabs or spaces between them."""
+    """Columns of a text with commas, semicolons, tabs or spaces between them; empty rows at its end are left out."""
     try:
         text = path.read_text(encoding="utf-8-sig")
     except UnicodeDecodeError as error:
         raise ValueError(f"{path}: byte {error.start} is no UTF-8 text: save the table as text in UTF-8") from error
-    lines = [(number, line) for number, line in enumerate(text.splitlines(), 1) if line.split("#")[0].strip(" ")]
-    start, line = lines[0] if lines else (1, "")
-    between = next((each for each in ",;\t" if each in line), None)
-    first = next(csv.reader([line], delimiter=between), []) if between else line.split()
+    lines = [(at, line) for at, line in enumerate(text.splitlines(), 1) if line.split("#")[0].strip(" ")]
+    lines[1:] = [(at, line.split("#")[0]) for at, line in lines[1:]]  # a title may hold a #
+    while lines and not lines[-1][1].strip(' ,;\t"'):
+        lines.pop()
+    if not lines:
+        raise ValueError(f"{path}: the file is empty, or has comments alone: must be lines of numbers")
+    between = _separator([line for _, line in lines[:2]])
+    start, first = lines[0][0], _split(lines[0][1], between)
     titled = any(_number(each) is None for each in first)
     names = [each.strip() for each in first] if titled else [str(i + 1) for i in range(len(first))]
     if len(set(names)) < len(names):
         raise ValueError(f"{path}: line {start} has the titles {', '.join(names)}: one different one for each column")
-    rows = lines[titled:]
-    require(bool(rows), str(path), len(rows), "lines of numbers")
+    if len(lines) == titled:
+        raise ValueError(f"{path}: nothing follows the titles in line {start}: must be lines of numbers")
     values = array("d")
-    for at, line in rows:
-        values.extend(_fields(f"{path}, line {at}", line.split("#")[0].split(between), names))
-    return dict(zip(names, np.array(values).reshape(len(rows), -1).T, strict=True))
+    for at, line in lines[titled:]:
+        values.extend(_fields(f"{path}, line {at}", _split(line, between), names))
+    return dict(zip(names, np.array(values).reshape(-1, len(names)).T, strict=True))
+
+
+def _separator(lines: Sequence[str]) -> str | None:
+    """What separates the columns, by the first two lines; None: spaces.
+
+    It splits both into equally many fields, more than one, if possible into numbers in the second line: a tab or a
+    semicolon rather than a comma, which may be a decimal mark.
+    """
+    present = [each for each in "\t;," if each in lines[0]]
+    split = {each: [_split(line, each) for line in lines] for each in present}
+    even = [each for each in present if len({len(fields) for fields in split[each]}) == 1]
+    numeric = [each for each in even if None not in map(_number, split[each][-1])]
+    return next(iter([*numeric, *even, *present]), None)
+
+
+def _split(line: str, between: str | None) -> list[str]:
+    """Fields of a line; the separator may stand in quotes."""
+    return next(csv.reader([line], delimiter=between)) if between and '"' in line else line.split(between)
 
 
 def _fields(where: str, fields: list[str], names: list[str]) -> list[float]:
     """Numbers of a line."""
     if len(fields) != len(names):
         raise ValueError(f"{where}: {len(fields)} fields: must be {len(names)}, one a column")
-    found = [_number(each) for each in fields]
-    if None in found:
-        bad = found.index(None)
-        raise ValueError(f"{where}, column {names[bad]}: {show(fields[bad])}: must be a number, or empty (NaN)")
-    return found  # type: ignore[return-value]
+    found = []
+    for name, field in zip(names, fields, strict=True):
+        value = _number(field)
+        if value is None:
+            raise ValueError(
+                f"{where}, column {name}: {show(field)}: must be a number, or empty (NaN), decimals after a point"
+            )
+        found.append(value)
+    return found
 
 
 def _number(text: str) -> float | None:

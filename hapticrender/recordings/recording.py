@@ -347,4 +347,4 @@ class Recording:
         from hapticrender.recordings.columns import assemble
 
         chosen: Any = {"drive": drive, "sensed": sensed, "time": time, "position": position, "normal_load": normal_load}
-        return cls(*assemble(columns, **chosen, rate=rate, carriers=carriers, **header))
+        return cls(*assemble(columns, chosen, rate, carriers, **header))

@@ -16,7 +16,6 @@ from hapticrender.report.text import band_rows, conditions, overview, remarks, v
 _MANY_BANDS = 10
 NO_PICTURE = '<p class="note">No picture: matplotlib is not installed.</p>'
 GENERATOR = '<meta name="generator" content="hapticrender">'
-FOOTER = f'<footer class="note">Made by hapticrender {escape(__version__)}.</footer>'
 CLASSES = {"passed": "good", "passed in band": "good", "failed": "bad", "not judged": "note"}
 
 STYLE = """
@@ -73,17 +72,9 @@ def page(folder: Path, scenes: Sequence[Outputs]) -> str:
     apart = f", {counts['not judged']} cannot be judged" if counts["not judged"] else ""
     links = [f'<a href="#{quote(scene.name)}">{escape(scene.name)}</a>' for scene in scenes]
     sections = "\n".join(_section(scene, quote(scene.folder.relative_to(folder).as_posix())) for scene in scenes)
-    return f"""<!DOCTYPE html>
-<html lang="en">
-<head>
-<meta charset="utf-8">
-<meta name="viewport" content="width=device-width, initial-scale=1">
-{GENERATOR}
-<title>hapticrender: {number} in closed loop</title>
-<style>{STYLE}</style>
-</head>
-<body>
-<h1>Textures, rendered in closed loop</h1>
+    return html_page(
+        f"hapticrender: {number} in closed loop",
+        f"""<h1>Textures, rendered in closed loop</h1>
 <p>hapticrender renders a texture for a bare finger: it vibrates a glass plate, or changes the friction of a screen,
 measures the motion, and corrects the drive until the motion follows its target. Here {number} ran in closed loop on
 models of the devices with the method {escape(methods)}. A scene misses its tolerance where the motion differs from the
@@ -92,8 +83,24 @@ windows of 100 ms: {counts["passed"] + counts["passed in band"]} of {len(scenes)
 {counts["failed"]} miss it{apart}.</p>
 {_overview(scenes)}
 <nav>{"".join(links)}</nav>
-{sections}
-{FOOTER}
+{sections}""",
+    )
+
+
+def html_page(title: str, body: str) -> str:
+    """HTML of a page from the HTML of its title and of its body."""
+    return f"""<!DOCTYPE html>
+<html lang="en">
+<head>
+<meta charset="utf-8">
+<meta name="viewport" content="width=device-width, initial-scale=1">
+{GENERATOR}
+<title>{title}</title>
+<style>{STYLE}</style>
+</head>
+<body>
+{body}
+<footer class="note">Made by hapticrender {escape(__version__)}.</footer>
 </body>
 </html>
 """

@@ -28,29 +28,25 @@ AGES = (np.arange(16) + 0.5) / 16  # of a sample's time: ages over which errors 
 MOST_LOST = 1e-4  # longer runs of lost samples, of a smaller share, are left out
 
 
-def settled_gain(estimator: MotionEstimator, rate: float, speed: float = 0.0) -> tuple[Array, Array]:
-    """Gain, shape (3,), and covariance of the state (3, 3), after many samples at `rate` (Hz) at `speed` (m/s rms)."""
+def settled_gain(estimator: MotionEstimator, rate: float, speed: float = 0.0) -> Array:
+    """Gain k, shape (3,), after many samples at `rate` (Hz) at `speed` (m/s rms).
+
+    In units of T and of the samples' standard deviation, in which the Riccati equation is well conditioned.
+    """
+    from scipy.linalg import solve_discrete_are
+
     step, variance = 1.0 / number("rate", rate, "Hz", above=0.0), estimator.variance + (speed * estimator.jitter) ** 2
-    f, q = transition(step), jerk_covariance(step, estimator.density)
-    pace = step * (estimator.density / (variance * step)) ** (1 / 6)  # poles of the filter in continuous time, times T
-    covariance, gain = np.diag([variance, variance / step**2, variance / step**4]), np.zeros(3)
-    for _ in range(20 + math.ceil(40.0 / pace)):
-        predicted = f @ covariance @ f.T + q
-        gain = predicted[:, 0] / (predicted[0, 0] + variance)
-        reduced = np.eye(3)
-        reduced[:, 0] -= gain
-        covariance = reduced @ predicted @ reduced.T + variance * np.outer(gain, gain)
-    return gain, covariance
+    jerk = jerk_covariance(1.0, estimator.density * step**5 / variance)
+    predicted = solve_discrete_are(transition(1.0).T, np.eye(3)[:, :1], jerk, np.eye(1))
+    return np.asarray(predicted[:, 0] / (predicted[0, 0] + 1.0) / step ** np.arange(3))
 
 
-def _system(gain: Array, step: float, latency: float, easing: float) -> tuple[Array, Array]:
+def _system(gain: Array, step: float, latency: float = 0.0, easing: float = 0.0) -> tuple[Array, Array]:
     """A (5, 5) and B (5,) of the module; without an easing the corrections are 0."""
-    reduced = np.eye(3)
-    reduced[:, 0] -= gain
     a, b = np.zeros((5, 5)), np.zeros(5)
-    a[:3, :3], b[:3] = reduced @ transition(step), gain
+    a[:3, :3], b[:3] = (np.eye(3) - np.outer(gain, [1.0, 0.0, 0.0])) @ transition(step), gain
     if easing > 0.0:
-        jump = -_row(latency)[:3] @ gain  # of the position that is played, per innovation, at the sample's arrival
+        jump = -transition(latency)[0] @ gain  # of the position that is played, per innovation, at the sample's arrival
         a[3:, :3], b[3:] = -jump * transition(step)[0], jump
         a[3:, 3:] = math.exp(-step / easing) * np.array([[1.0, 0.0], [step / easing, 1.0]])
     return a, b
@@ -59,7 +55,16 @@ def _system(gain: Array, step: float, latency: float, easing: float) -> tuple[Ar
 def _row(ahead: float, age: float = 0.0, easing: float = 0.0) -> Array:
     """C(h), `age` after the arrival of the last sample, shape (5,)."""
     u = age / easing if easing > 0.0 else 0.0
-    return np.array([1.0, ahead, 0.5 * ahead**2, u * math.exp(-u), math.exp(-u)])
+    return np.r_[transition(ahead)[0], u * math.exp(-u), math.exp(-u)]
+
+
+def _noise_gain(a: Array, b: Array) -> Array:
+    """S of the module: covariance of the state under white noise of variance 1."""
+    total, power = np.outer(b, b), a
+    with np.errstate(under="ignore"):
+        for _ in range(24):  # S over 2^k samples, doubled each time
+            total, power = total + power @ total @ power.T, power @ power
+    return total
 
 
 def frequency_response(
@@ -71,11 +76,10 @@ def frequency_response(
     there, per position, which is ``j w exp(j w ahead)``.
     """
     require(order in (0, 1), "order", order, "0 (position) or 1 (velocity)")
-    gain, _ = settled_gain(estimator, rate)
-    a, b = _system(gain, 1.0 / rate, 0.0, 0.0)
-    row = np.array([1.0, ahead, 0.5 * ahead**2] if order == 0 else [0.0, 1.0, ahead])
+    a, b = _system(settled_gain(estimator, rate), 1.0 / rate)
     z = np.exp(2j * np.pi * np.atleast_1d(np.asarray(frequency, float)) / rate)
-    return np.array([row @ np.linalg.solve(each * np.eye(3) - a[:3, :3], each * b[:3]) for each in z])
+    states = np.linalg.solve(z[:, None, None] * np.eye(3) - a[:3, :3], z[:, None, None] * b[:3, None])
+    return np.asarray(transition(ahead)[order] @ states[..., 0].T)
 
 
 def bandwidth(estimator: MotionEstimator, rate: float) -> float:
@@ -85,21 +89,12 @@ def bandwidth(estimator: MotionEstimator, rate: float) -> float:
     return float(grid[below[0]]) if below.size else 0.5 * rate
 
 
-def noise_gain(a: Array, b: Array) -> Array:
-    """S of the module: covariance of the state under white noise of variance 1, shape (n, n)."""
-    total, power = np.outer(b, b), a
-    with np.errstate(under="ignore"):
-        for _ in range(24):  # S over 2^k samples, doubled each time
-            total, power = total + power @ total @ power.T, power @ power
-    return total
-
-
 def noise_errors(estimator: MotionEstimator, rate: float, ahead: float = 0.0) -> tuple[float, float]:
     """Standard errors of position (m) and velocity (m/s), `ahead` (s) of the last sample, by its noise alone."""
-    a, b = _system(settled_gain(estimator, rate)[0], 1.0 / rate, 0.0, 0.0)
-    spread = estimator.variance * noise_gain(a[:3, :3], b[:3])
-    rows = [1.0, ahead, 0.5 * ahead**2], [0.0, 1.0, ahead]
-    return tuple(math.sqrt(np.array(row) @ spread @ row) for row in rows)  # type: ignore[return-value]
+    a, b = _system(settled_gain(estimator, rate), 1.0 / rate)
+    spread = estimator.variance * _noise_gain(a[:3, :3], b[:3])
+    position, velocity, _ = np.sqrt(np.diagonal(transition(ahead) @ spread @ transition(ahead).T)).tolist()
+    return position, velocity
 
 
 def _ages(panel: TouchPanel) -> Iterator[tuple[float, float]]:
@@ -148,9 +143,9 @@ def position_error(
     estimator, square, weight = panel.estimator(), 0.0, 0.0
     variance = estimator.variance + (rms * panel.jitter) ** 2
     if predicted:
-        a, b = _system(settled_gain(estimator, panel.rate, rms)[0], step, late, easing)
+        a, b = _system(settled_gain(estimator, panel.rate, rms), step, late, easing)
         turn = np.exp(1j * omega * step)
-        played, spread = np.linalg.solve(turn * np.eye(5) - a, turn * b), noise_gain(a, b)
+        played, spread = np.linalg.solve(turn * np.eye(5) - a, turn * b), _noise_gain(a, b)
     for age, share in _ages(panel):
         row = _row(late + age, age, easing) if predicted else np.eye(5)[0]
         found, noise = (row @ played, row @ spread @ row) if predicted else (1.0, 1.0)

@@ -205,8 +205,8 @@ class Encoder(MotionEstimator):
         than half of that.
     origin : float, m
         Position at the first count.
-    noise, latency, jitter, frequency, speed : float
-        As for `MotionEstimator`.
+    **motion : float
+        `noise`, `latency`, `jitter`, `frequency` and `speed`, as for `MotionEstimator`.
 
     Examples
     --------
@@ -222,17 +222,11 @@ class Encoder(MotionEstimator):
         resolution: float,
         bits: int = 32,
         origin: float = 0.0,
-        *,
-        noise: float = 0.0,
-        latency: float = 0.0,
-        jitter: float = 0.0,
-        frequency: float = FREQUENCY,
-        speed: float = SPEED,
+        **motion: float,
     ) -> None:
         step = checks.number("resolution", resolution, "m")
         checks.require(step != 0.0, "resolution", resolution, "the metres of a count, not 0")
-        motion = {"latency": latency, "jitter": jitter, "frequency": frequency, "speed": speed}
-        super().__init__(noise, resolution=abs(step), **motion)
+        super().__init__(resolution=abs(step), **motion)
         self.step, self.bits = step, checks.integer("bits", bits, least=2, most=64)
         self.origin = checks.number("origin", origin, "m")
         self._count: int | None = None
