@@ -30,7 +30,7 @@ from benchmarks.cases import in_blocks  # noqa: E402
 from hapticrender.drivers.audio_callback import CALLBACK, Relay  # noqa: E402
 from hapticrender.jit import CFunction  # noqa: E402
 from hapticrender.plants.plate import Plate, PlateParameters  # noqa: E402
-from hapticrender.realtime import RealtimeEntry  # noqa: E402
+from hapticrender.realtime_entry import RealtimeEntry  # noqa: E402
 
 BANDS = (8, 64, 512)
 CALLS = 2000

@@ -20,9 +20,9 @@ import hapticrender as hr
 from hapticrender.control.methods import METHODS
 from hapticrender.jit import CFunction
 from hapticrender.plants.plate import Plate, PlateParameters
-from hapticrender.realtime import RealtimeEntry
+from hapticrender.realtime_entry import RealtimeEntry
 from hapticrender.realtime_kernel import AUDIO
-from hapticrender.voices import Voice
+from hapticrender.sampled_texture import SampledTexture
 from tests.strangers_plate import StrangersPlate
 
 RATE, BLOCK = 48_000.0, 64  # Hz, samples
@@ -50,7 +50,7 @@ def entry_of(texture: hr.Texture) -> RealtimeEntry:
     model = PlateParameters(rate=RATE, delay=2 * BLOCK).device_model(RATE, 2 * BLOCK)
     controller = METHODS["inverse"].design(replace(model, block=BLOCK), hr.Bands.none(spatial=False))
     entry = RealtimeEntry(controller)
-    entry.play(Voice(texture, RATE))
+    entry.play(SampledTexture(texture, RATE))
     entry.finger(-0.02, 0.05, 0.4)
     return entry
 

@@ -295,7 +295,7 @@ class LiveAudioDriver(AudioDriver):
 
         Parameters
         ----------
-        entry : hapticrender.realtime.RealtimeEntry
+        entry : hapticrender.realtime_entry.RealtimeEntry
             Of this driver's channels, `sensed_scale` and `drive_scale`, and of a block that goes into this driver's; it
             has to outlive `stop`.
 

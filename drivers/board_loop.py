@@ -49,7 +49,7 @@ class _Piece(NamedTuple):
 
 
 class BoardLoop:
-    """A rendering that plays on a board; what `hapticrender.live.LiveLoop` is for a controller of this process.
+    """A rendering that plays on a board; what `hapticrender.live_loop.LiveLoop` is for a controller of this process.
 
     Parameters
     ----------
