@@ -19,7 +19,7 @@ from hapticrender.errors import HapticError, WatchdogTimeout
 from hapticrender.inferred import ContactLag
 from hapticrender.loop import device_fault, motion_of_sensors
 from hapticrender.protocols import Array, Controller, Flag, Rendering
-from hapticrender.realtime_entry import LOG_TIME, RealtimeEntry
+from hapticrender.realtime_entry import RealtimeEntry
 from hapticrender.realtime_kernel import HORIZON
 from hapticrender.sampled_texture import FADE, SampledTexture
 
@@ -72,7 +72,7 @@ class LiveLoop(RealtimeEntry):
         super().__init__(live_controller(rendering), **scales)
         _ = self.address if scales else self.plain_address  # compiled before anything is live
         self.rendering, self.driver, self.model = rendering, rendering.driver, rendering.model
-        rows = len(self._arrays["log"]) + round(LOG_TIME * self.rate)
+        rows = len(self._arrays["log"])
         self._true = np.full((rows, len(self.model.places) + 1), np.nan)  # motion and load, where the device knows them
         self._knows_motion, self.senses = False, False  # whether the device knows its motion, and senses the finger
         self._drive = np.zeros((self.driver.block, self.driver.drive_channels))

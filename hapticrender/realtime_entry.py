@@ -108,7 +108,7 @@ class RealtimeEntry:
         self.ahead, self._tracker = int(getattr(controller, "lookahead", 0)), np.zeros(1, CONTROLLER)
         self._tracker["p"]["rate"] = self.rate
         self._arrays = self._buffers()
-        self._control = _Control(controller, self._signals)
+        self._first = self._control = _Control(controller, self._signals)  # which may run without a texture
         self._entry = np.zeros(1, ENTRY)
         memory = {**self._arrays, "slots": self._slots}
         numbers = {f"{name}_at": array.ctypes.data for name, array in memory.items()} | self._start()
