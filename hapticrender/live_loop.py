@@ -267,10 +267,11 @@ def band_figures(bands: Bands, first: int, rate: float, signals: dict[str, Array
     found = np.linalg.solve(products, (waves.T @ values).astype(float))
     target, achieved = (found[: len(bands)] + 1j * found[len(bands) : -1]).T
     speed = np.nan_to_num(abs(np.diff(position))).mean() * rate if len(time) > 1 else 0.0
-    shares = [_share(*pair) for pair in zip(abs(achieved - target), abs(target), strict=True)]
     frequency = bands.frequency + bands.wavenumber * speed
-    frequency, target, achieved = (each.tolist() for each in (frequency, abs(target), abs(achieved)))
-    return list(zip(frequency, target, achieved, shares, strict=True))
+    return [
+        (float(hertz), float(abs(desired)), float(abs(found)), _share(abs(found - desired), abs(desired)))
+        for hertz, desired, found in zip(frequency, target, achieved, strict=True)
+    ]
 
 
 def _share(error: float, target: float) -> float:

@@ -1,4 +1,4 @@
-"""Live play: what sounds is what was asked for, whatever changes on the way, and whoever drives the device."""
+"""Live play: what plays is the texture, whatever changes on the way, and whoever drives the device."""
 
 from dataclasses import replace
 
@@ -45,7 +45,7 @@ def session(tmp_path_factory):
     return recording, path, states
 
 
-def test_every_part_of_a_session_is_what_was_asked_for(session):
+def test_every_part_of_a_session_is_its_texture(session):
     """Within what the law reaches in `render` (a sliding finger: 1 % must, 2 % at a touch that is new)."""
     recording, _, _ = session
     assert len(recording) == 17_500
@@ -248,8 +248,8 @@ def test_what_it_refuses(tmp_path):
                 player.gain = gain
 
 
-def test_the_finger_of_a_scene_is_told_to_a_device_that_does_not_sense_it():
-    """Words every 10 ms of signal: a swipe of 2 Hz is off by a quarter of its acceleration times 10 ms squared."""
+def test_the_finger_of_a_scene_is_sent_to_a_device_that_does_not_sense_it():
+    """Positions every 10 ms of signal: a swipe of 2 Hz is off by a quarter of its acceleration times 10 ms squared."""
     scene = hr.Scene(texture=RIDGES, finger=hr.Finger.swiping(2.0, speed=0.05), duration=5.0)
     driver = Blind(Plate(PlateParameters(), scene.finger))
     with hr.Player(scene, driver) as player:
@@ -258,5 +258,5 @@ def test_the_finger_of_a_scene_is_told_to_a_device_that_does_not_sense_it():
         played = player._loop.signals(0)[1]
     time = np.arange(len(played["position"])) / 5000.0
     off = abs(played["position"] - scene.finger.position(time))[1000:]
-    assert np.median(off) < 1e-3  # a loaded machine says its words late
+    assert np.median(off) < 1e-3  # a loaded machine sends them late
     assert np.isfinite(played["position"][1000:]).all()

@@ -82,7 +82,7 @@ def test_a_recording_says_that_an_error_ended_it(tmp_path):
     assert not (cut.flags[:-1] & hr.Flag.STOPPED).any()
 
 
-def test_a_sensor_that_sticks_stops_the_drive_and_is_told_at_the_next_call(tmp_path):
+def test_a_sensor_that_sticks_stops_the_drive_and_is_an_error_at_the_next_call(tmp_path):
     driver = Lying(0.5, "stuck")
     with hr.Player(driver=driver) as player:
         player.play(RIDGES)
@@ -95,7 +95,7 @@ def test_a_sensor_that_sticks_stops_the_drive_and_is_told_at_the_next_call(tmp_p
     assert stopped[0] / 5000.0 < 0.55
 
 
-def test_a_device_that_is_unplugged_is_told_at_the_next_call():
+def test_a_device_that_is_unplugged_is_an_error_at_the_next_call():
     driver = Lying(0.3, "unplugged")
     with pytest.raises(hr.DeviceLost, match="no answer"), hr.Player(driver=driver) as player:
         go_on(player)

@@ -61,18 +61,18 @@ def test_it_is_the_python_path_sample_for_sample(size, rng):
     assert entry.flags == Flag(0)
 
 
-def followed(words, n):
-    """Position and touch (0..1) of n samples from words (sample, position, velocity), obviously."""
-    positions, touch, word = np.empty(n), np.empty(n), None
+def followed(updates, n):
+    """Position and touch (0..1) of n samples from updates (sample, position, velocity), obviously."""
+    positions, touch, update = np.empty(n), np.empty(n), None
     last, pace, offset, first, grown = np.nan, 0.0, 0.0, 0.0, 0.0
     kept = np.exp(-1.0 / (JUMP_TIME * RATE))
     for i in range(n):
-        for said in words:
-            if said[0] == i:
-                word, jump = said, last + pace - said[1]
+        for new in updates:
+            if new[0] == i:
+                update, jump = new, last + pace - new[1]
                 offset = first = jump if abs(jump) < JUMP else 0.0
-        age = (i - word[0]) / RATE
-        positions[i] = word[1] + min(age, HORIZON) * word[2] + offset
+        age = (i - update[0]) / RATE
+        positions[i] = update[1] + min(age, HORIZON) * update[2] + offset
         first *= kept
         offset = first + kept * (offset - first)
         if np.isfinite(positions[i]):
@@ -84,11 +84,11 @@ def followed(words, n):
     return positions, touch
 
 
-def played(entry, words, sensed):
-    """Drive of an entry that hears words on the way."""
-    ends = [*(said[0] for said in words[1:]), len(sensed)]
+def played(entry, updates, sensed):
+    """Drive of an entry whose finger is updated on the way."""
+    ends = [*(update[0] for update in updates[1:]), len(sensed)]
     found = []
-    for (start, place, speed), stop in zip(words, ends, strict=True):
+    for (start, place, speed), stop in zip(updates, ends, strict=True):
         entry.finger(place, speed)
         found.append(plain(entry, sensed[start:stop])[0])
     return np.concatenate(found)
@@ -101,12 +101,12 @@ def test_the_finger_is_extrapolated_between_updates(friction, rng):
     make = (lambda: friction_controller(wanted)) if friction else (lambda: controller(wanted))
     entry, twin = RealtimeEntry(make()), make()
     sensed = 1e-7 * rng.standard_normal((1500, 2))
-    words = [(0, -0.01, 0.05), (200, -0.0078, 0.06), (500, 0.002, 0.1)]
-    position, _ = followed(words, 1500)
+    updates = [(0, -0.01, 0.05), (200, -0.0078, 0.06), (500, 0.002, 0.1)]
+    position, _ = followed(updates, 1500)
     expected = twin.run(sensed, position, np.zeros(1500))[0]
     assert abs(expected).max() > 0
     tolerance = 1e-10 * abs(expected).max()  # positions round once or twice
-    np.testing.assert_allclose(played(entry, words, sensed), expected, rtol=0, atol=tolerance)
+    np.testing.assert_allclose(played(entry, updates, sensed), expected, rtol=0, atol=tolerance)
     jumps = abs(np.diff(position))
     assert jumps[199] < 2e-5 < 1e-3 < jumps[499]  # 0.2 mm off are spread, 5 mm are another place
 
@@ -137,17 +137,17 @@ def designed(spatial, whole):
 @pytest.mark.parametrize("whole", [True, False], ids=["whole", "bands"])
 @pytest.mark.parametrize("spatial", [False, True], ids=["in time", "along the surface"])
 def test_a_texture_fades_in_and_another_fades_over_it(spatial, whole, rng):
-    """Read ahead as the law needs it: in time, or where the finger will be at the speed it is told to have."""
+    """Read ahead as the law needs it: in time, or where the finger will be at its last speed."""
     entry, twin, n = RealtimeEntry(designed(spatial, whole)), designed(spatial, whole), 1500
     sensed, change = 1e-7 * rng.standard_normal((n, 2)), 700
-    words = [(0, -0.004, 0.05)]
+    updates = [(0, -0.004, 0.05)]
     first, second = Wave(spatial), Wave(not spatial, 2e-5)
     entry.play(SampledTexture(first, RATE))
-    entry.finger(*words[0][1:])
+    entry.finger(*updates[0][1:])
     drive = [plain(entry, sensed[:change])[0]]
     entry.play(SampledTexture(second, RATE))
     drive.append(plain(entry, sensed[change:])[0])
-    position, touch = followed(words, n)
+    position, touch = followed(updates, n)
     ahead, now = entry.ahead, np.arange(n)
     lead, input_, there, kept = 0.0, 0.0, position.copy(), np.exp(-1.0 / (JUMP_TIME * RATE))
     for i in now:
@@ -171,11 +171,11 @@ def test_a_texture_fades_in_and_another_fades_over_it(spatial, whole, rng):
     block = entry.block  # in whose samples the drive of the block before plays
     np.testing.assert_array_equal(log["drive"], np.concatenate([np.zeros((block, 2)), *drive])[:-block])
     settled = slice(round(FADE * RATE) + ahead + round(TOUCH_FADE * RATE), change)
-    asked = first.waveform((now - ahead) / RATE, position)
-    np.testing.assert_allclose(log["reference"][settled], asked[settled], rtol=0, atol=1e-14)
+    expected = first.waveform((now - ahead) / RATE, position)
+    np.testing.assert_allclose(log["reference"][settled], expected[settled], rtol=0, atol=1e-14)
 
 
-def test_what_lies_along_the_surface_fades_out_when_words_stop_and_what_lies_in_time_goes_on():
+def test_what_lies_along_the_surface_fades_out_without_updates_and_what_lies_in_time_goes_on():
     n = round((HOLD + 0.2) * RATE)
     for texture, goes_on in ((Wave(False), True), (Wave(True), False)):
         entry = RealtimeEntry(designed(False, True))
@@ -202,7 +202,7 @@ def test_a_gain_is_reached_without_a_step():
 
 
 def test_a_texture_in_time_that_nobody_computes_fades_out():
-    """Two seconds are computed ahead; the rest is asked for by `fill`."""
+    """Two seconds are computed ahead; the rest by `fill`."""
     starved, filled = (RealtimeEntry(designed(False, True)) for _ in range(2))
     for entry in (starved, filled):
         entry.play(SampledTexture(Wave(False), RATE))
