@@ -19,7 +19,7 @@ BOARD := gcc libc6-dev make gcc-arm-none-eabi libnewlib-arm-none-eabi qemu-syste
 BOARD_TOOLS := { command -v gcc && command -v arm-none-eabi-gcc && command -v qemu-system-arm; } > /dev/null
 BOARD_TESTS := $(addprefix tests/test_,firmware_law.py firmware_m4.py export.py protocol.py serial_driver.py board_faults.py board_live.py board_textures.py \
 	nu32.py player_board.py)
-API := hapticrender $(addprefix hapticrender.,loop latency sweep realtime skin validate protocols bands errors touch recordings analysis \
+API := hapticrender $(addprefix hapticrender.,loop latency sweep realtime_entry skin validate protocols bands errors touch recordings analysis \
 	control plants renderers drivers)
 
 help: ## list the verbs

@@ -28,7 +28,7 @@ import hapticrender as hr  # noqa: E402
 from benchmarks.callback import EMPTY, seconds_of  # noqa: E402
 from benchmarks.cases import in_blocks  # noqa: E402
 from hapticrender.drivers.audio_callback import Relay  # noqa: E402
-from hapticrender.realtime import RealtimeEntry  # noqa: E402
+from hapticrender.realtime_entry import RealtimeEntry  # noqa: E402
 
 BANDS = (8, 64, 512)
 CALLS = 2000

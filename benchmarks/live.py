@@ -19,8 +19,8 @@ import hapticrender as hr
 from benchmarks.callback import BLOCK, EMPTY, RATE, seconds_of
 from hapticrender.control.methods import METHODS
 from hapticrender.plants.plate import PlateParameters
-from hapticrender.realtime import RealtimeEntry
-from hapticrender.voices import Voice
+from hapticrender.realtime_entry import RealtimeEntry
+from hapticrender.sampled_texture import SampledTexture
 from tests.strangers_plate import StrangersPlate
 
 NOTE = 0.1 * np.sin(2 * np.pi * 150.0 * np.arange(8000) / 8000.0)
@@ -40,7 +40,7 @@ def entry_of(texture: hr.Texture) -> RealtimeEntry:
     model = PlateParameters(rate=RATE, delay=2 * BLOCK).device_model(RATE, 2 * BLOCK)
     controller = METHODS["inverse"].design(replace(model, block=BLOCK), hr.Bands.none(spatial=False))
     entry = RealtimeEntry(controller)
-    entry.play(Voice(texture, RATE))
+    entry.play(SampledTexture(texture, RATE))
     entry.finger(-0.02, 0.05, 0.4)
     return entry
 

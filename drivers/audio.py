@@ -217,7 +217,7 @@ class AudioDriver(BaseDriver):
 
         Parameters
         ----------
-        entry : hapticrender.realtime.RealtimeEntry
+        entry : hapticrender.realtime_entry.RealtimeEntry
             Of this driver's channels, `sensed_scale` and `drive_scale`, and of a block that divides this driver's; it
             has to outlive `stop`.
 

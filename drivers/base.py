@@ -31,10 +31,10 @@ A driver carries samples to a device, a file or a plant model, and back.  Any ob
 ``live()`` (optional)
     the same device for live play (`hapticrender.Player`), where that is another driver
 ``start(entry)``, ``stop()`` (optional)
-    of a device that calls back: hands it a ``hapticrender.realtime.RealtimeEntry``, with ``sensed_scale`` (m) and
+    of a device that calls back: hands it a ``hapticrender.realtime_entry.RealtimeEntry``, with ``sensed_scale`` (m) and
     ``drive_scale`` (1/A) of full scale; its ``check()`` (optional) raises what went wrong meanwhile
 ``loop(rendering)`` (optional)
-    of a device with a controller of its own: what it plays live, like ``hapticrender.live.LiveLoop``
+    of a device with a controller of its own: what it plays live, like ``hapticrender.live_loop.LiveLoop``
 ``exchange(controller)`` (optional)
     a whole closed loop of its own, sample by sample; see ``protocols.Exchange``
 ``found()`` (optional, class method)

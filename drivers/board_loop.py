@@ -21,7 +21,7 @@ JUDGED = 0.25  # s of signal that the figures of a texture are of
 
 
 class BoardLoop:
-    """A rendering that plays on a board; what `hapticrender.live.LiveLoop` is for a controller of this process.
+    """A rendering that plays on a board; what `hapticrender.live_loop.LiveLoop` is for a controller of this process.
 
     Parameters
     ----------

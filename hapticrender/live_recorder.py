@@ -8,10 +8,10 @@ from pathlib import Path
 
 import numpy as np
 
-from hapticrender.live import LiveLoop
-from hapticrender.loop import gain_uncertainty_of
+from hapticrender.live_loop import LiveLoop
+from hapticrender.loop import recorder_of
 from hapticrender.protocols import Array, Flag
-from hapticrender.recordings.recording import Recorder, Recording
+from hapticrender.recordings.recording import Recording
 
 SHORTEST = 1e-3  # s: duration of a scene without an end, as a recording says
 
@@ -35,22 +35,11 @@ class LiveRecorder:
     """
 
     def __init__(self, path: str | Path, loop: LiveLoop, *, endless: bool) -> None:
-        rendering, driver, model = loop.rendering, loop.driver, loop.model
+        rendering = loop.rendering
+        scene = replace(rendering.scene, duration=SHORTEST) if endless else rendering.scene
+        bands = replace(rendering.bands.select(np.zeros(0, int)), envelope=None, unfelt=())
         self.error: OSError | None = None  # why it has ended
-        self._recorder = Recorder(
-            path,
-            scene=replace(rendering.scene, duration=SHORTEST) if endless else rendering.scene,
-            method=rendering.scene.method,
-            seed=rendering.scene.seed,
-            rate=driver.rate,
-            bands=replace(rendering.bands.select(np.zeros(0, int)), envelope=None, unfelt=()),
-            drive_channels=driver.drive_channels,
-            sensed_channels=driver.sensed_channels,
-            drive_limit=model.drive_limit if np.isfinite(model.drive_limit) else None,
-            sensed_noise=model.sensed_noise,
-            calibration=gain_uncertainty_of(rendering),
-            **{name: getattr(model, name) for name in ("places", "unit", "drive_unit", "profile")},
-        )
+        self._recorder = recorder_of(replace(rendering, model=loop.model), path, scene=scene, bands=bands)
         self._recorder.begin()
 
     def append(self, signals: dict[str, Array], gap: int, motion_source: str) -> None:

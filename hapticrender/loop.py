@@ -17,6 +17,7 @@ import numpy as np
 
 from hapticrender.analysis.two_touches import TouchWatch
 from hapticrender.control.controller import PositionPredictor
+from hapticrender.control.device_model import DeviceModel
 from hapticrender.control.probe import probe_plate
 from hapticrender.control.supervisor import FADE_OUT, Fault
 from hapticrender.control.supervisor_kernel import STOPPED
@@ -127,26 +128,11 @@ def run(rendering: Rendering, *, journal: str | Path | None = None, progress: Pr
 
     However it ends (an error, Ctrl-C, SIGTERM), every sample played is recorded and the device is left at zero drive.
     """
-    driver, model, total = rendering.driver, rendering.model, rendering.samples
-    names = ("places", "unit", "drive_unit", "profile")
-    recorder = Recorder(
-        journal,
-        requested=rendering.requested,
-        scene=rendering.scene,
-        method=rendering.scene.method,
-        seed=rendering.scene.seed,
-        rate=driver.rate,
-        bands=rendering.bands,
-        drive_channels=driver.drive_channels,
-        sensed_channels=driver.sensed_channels,
-        drive_limit=model.drive_limit if np.isfinite(model.drive_limit) else None,
-        sensed_noise=model.sensed_noise,
-        calibration=gain_uncertainty_of(rendering),
-        **{name: getattr(model, name) for name in names},
-    )
+    driver, total = rendering.driver, rendering.samples
+    recorder = recorder_of(rendering, journal, requested=rendering.requested)
     with recorder, stopped_by_sigterm(), driver, zero_drive_after(rendering.device):
         if rendering.probe:
-            probe_plate(rendering.device, model)
+            probe_plate(rendering.device, rendering.model)
         loop = _Loop(rendering)
         for start in range(0, total, loop.step):
             recorder.append(**loop.advance(start, min(loop.step, total - start)))
@@ -160,10 +146,45 @@ def run(rendering: Rendering, *, journal: str | Path | None = None, progress: Pr
     return recording
 
 
-def gain_uncertainty_of(rendering: Rendering) -> float:
-    """Relative uncertainty of the sensors' gain: the driver's own, or that of the device's profile."""
-    profile = rendering.scene.device_profile.calibration.gain_uncertainty
-    return float(getattr(rendering.device, "calibration", 0.0) or profile)
+def recorder_of(rendering: Rendering, journal: str | Path | None = None, **changes: Any) -> Recorder:
+    """Return the writer of a recording of `rendering`; `changes` are arguments of `Recorder` in place of its own."""
+    driver, model, scene = rendering.driver, rendering.model, rendering.scene
+    calibration = getattr(rendering.device, "calibration", 0.0) or scene.device_profile.calibration.gain_uncertainty
+    arguments = {
+        "scene": scene,
+        "method": scene.method,
+        "seed": scene.seed,
+        "rate": driver.rate,
+        "bands": rendering.bands,
+        "drive_channels": driver.drive_channels,
+        "sensed_channels": driver.sensed_channels,
+        "drive_limit": model.drive_limit if np.isfinite(model.drive_limit) else None,
+        "sensed_noise": model.sensed_noise,
+        "calibration": float(calibration),
+        **{name: getattr(model, name) for name in ("places", "unit", "drive_unit", "profile")},
+    }
+    return Recorder(journal, **(arguments | changes))
+
+
+def device_fault(rendering: Rendering, controller: Any, sample: int) -> DeviceFault:
+    """Return the error of a drive that was stopped from `sample` on: what driver or controller have found."""
+    found = (getattr(owner, "fault", None) for owner in (rendering.driver, controller))
+    text = next((each.text for each in found if isinstance(each, Fault)), "the device stopped itself")
+    time = sample / rendering.driver.rate
+    return DeviceFault(f"{type(rendering.device).__name__}: stopped at {time:.4g} s: {text}", time)
+
+
+def motion_of_sensors(model: DeviceModel, sensed: Array, position: Array, contact: ContactLag) -> Array:
+    """Motion at the evaluation points, shape (n, places), by the sensors; friction is inferred behind `contact`."""
+    with np.errstate(invalid="ignore"):  # a faulty sensor is the controller's to flag
+        motion = sensed @ (model.place_from_coordinate @ model.coordinate_from_sensed).T
+        return contact.run(motion, position) if model.inferred else motion
+
+
+def play_zeros(driver: Driver) -> None:
+    """Play zeros until they have come through."""
+    for _ in range(-(-driver.delay // driver.block)):
+        driver.play(np.zeros((driver.block, driver.drive_channels)))
 
 
 def _warm_up(rendering: Rendering) -> None:
@@ -203,21 +224,20 @@ def stopped_by_sigterm() -> Iterator[None]:
 @contextmanager
 def zero_drive_after(device: Driver) -> Iterator[None]:
     """Play zeros until they have come through, whatever happened, unless the device does so itself on leaving."""
-
-    def rest() -> None:
-        if not getattr(device, "zero_on_exit", False):
-            for _ in range(-(-device.delay // device.block)):
-                device.play(np.zeros((device.block, device.drive_channels)))
-
     try:
         yield
     except BaseException as error:
         try:
-            rest()
+            _rest(device)
         except Exception as second:
             error.add_note(f"and while the drive was set to zero: {second}")
         raise
-    rest()
+    _rest(device)
+
+
+def _rest(device: Driver) -> None:
+    if not getattr(device, "zero_on_exit", False):
+        play_zeros(device)
 
 
 def _exchange(driver: Driver, controller: Controller) -> Exchange | None:
@@ -263,12 +283,7 @@ class _Loop:
         rate, driver = self.rendering.driver.rate, self.rendering.driver
         if self._stopped < 0 or start + self.step < self._stopped + FADE_OUT * rate + driver.delay:
             return None
-        found = [
-            each for owner in (driver, self.controller) if isinstance(each := getattr(owner, "fault", None), Fault)
-        ]
-        text = found[0].text if found else "the device stopped itself"
-        time = self._stopped / rate
-        return DeviceFault(f"{type(self.rendering.device).__name__}: stopped at {time:.4g} s: {text}", time)
+        return device_fault(self.rendering, self.controller, self._stopped)
 
     def _block(self, count: int, reference: Callable[[Array], Array]) -> tuple[Array, Array, Array, Sensed]:
         """Exchange a block with the driver; the drive computed from it is played with the next one."""
@@ -297,9 +312,8 @@ class _Loop:
             return sensed.motion, "true"
         if not values.shape[1]:
             return np.full((len(values), len(model.places)), np.nan), "unknown"
-        with np.errstate(invalid="ignore"):  # a faulty sensor is the controller's to flag
-            shown = values @ (model.place_from_coordinate @ model.coordinate_from_sensed).T
-            return (self._contact.run(shown, position), "inferred") if model.inferred else (shown, "sensors")
+        motion = motion_of_sensors(model, values, position, self._contact)
+        return motion, "inferred" if model.inferred else "sensors"
 
 
 def _compare(rendering: Rendering, controller: Controller, recording: Recording) -> None:

@@ -5,12 +5,12 @@
         player.finger(position=0.01, velocity=0.08, load=0.4)
         print(player.state())
 
-Controller and renderers are those of `render`; what advances them block by block is the compiled entry of
-`hapticrender.realtime`.  A driver that calls back (it has `start` and `stop`) is handed the entry; one whose controller
-runs on the device (it has `loop`) brings a loop of its own; any other is played by a thread.
+Controller and renderers are those of `render`; a `LiveLoop` advances them block by block.  A driver that calls back (it
+has `start` and `stop`) is handed the loop as its callback; one whose controller runs on the device (it has `loop`)
+brings a loop of its own; any other is played by a thread.
 
 A texture fades into the next one under the same controller, which keeps what it has learned of finger and device.
-Where the law works by bands (hybrids) each texture has a controller, which goes on from the state of the one before.
+Where the controller works by bands (hybrids) each texture has one, which goes on from the state of the one before.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -30,10 +31,9 @@ import numpy as np
 from hapticrender.control.probe import probe_plate
 from hapticrender.devices import open_driver
 from hapticrender.errors import HapticError, WatchdogTimeout
-from hapticrender.live import LiveLoop
-from hapticrender.live_motion import LiveMotion
+from hapticrender.live_loop import LiveLoop, LiveMotion
 from hapticrender.live_recorder import LiveRecorder
-from hapticrender.loop import prepare, stopped_by_sigterm, zero_drive_after
+from hapticrender.loop import play_zeros, prepare, stopped_by_sigterm, zero_drive_after
 from hapticrender.player_state import BandState, PlayerState
 from hapticrender.protocols import Driver, Flag, Rendering, Texture
 from hapticrender.recordings.recording import Recording
@@ -66,7 +66,7 @@ class Player:
         As for `render`; the simulated device by default.
     finger : Finger, optional
         For which the device is designed, and whose mechanics a simulated finger has; by default one that slides at
-        0.08 m/s under 0.4 N.
+        0.08 m/s under 0.4 N, or that of the scene.
     paced : bool
         False: a simulation, or a driver that does not wait, plays only within `sleep`, as fast as it can, and a
         simulation reproducibly.
@@ -74,8 +74,9 @@ class Player:
         Where no method of this player is called for so long, the application counts as hung and the drive is stopped
         for good, within 10 ms; 0.1 to 60, and at least two blocks of the driver.  `sleep` counts as calls.
     **tables
-        Further fields of the scene: profile, simulation, rendering, method, seed.  No touch_panel: that of a scene
-        locates the finger that moves by itself, and positions passed to `finger` are taken as they are.
+        Further fields of the scene, in place of a scene's own: profile, simulation, rendering, method, seed.  No
+        touch_panel: that of a scene locates the finger that moves by itself, and positions passed to `finger` are taken
+        as they are.
 
     Raises
     ------
@@ -98,20 +99,22 @@ class Player:
         if tables.get("touch_panel"):
             cure = "pass positions to `finger` that hr.TouchPanel(...).estimator() has estimated"
             raise ValueError(f"touch_panel: has no effect on the positions that the application sets: {cure}")
-        self._given = device if isinstance(device, Scene) else None
-        self._fields = {"device": device, "finger": finger or NOMINAL, "duration": LONGEST, **tables}
+        if isinstance(device, Scene):
+            self._given: Scene | None = replace(device, finger=finger or device.finger, **tables)
+            self._scene = partial(replace, self._given)
+        else:
+            fields = {"finger": finger or NOMINAL, "duration": LONGEST, **tables}
+            self._given, self._scene = None, partial(Scene, device=device, **fields)
         self._driver, self._paced, self._watchdog = driver, paced, watchdog
-        self._motion, self._located = LiveMotion(), False
-        self._last, self._finger = (
-            (math.nan, 0.0),
-            (math.nan, 0.0, 0.0),
-        )  # the last position with its time; position, velocity, load
+        self._motion = LiveMotion()
+        self._finger: tuple[float, float, float] | None = None  # position, velocity and load that were set,
+        self._finger_time = 0.0  # and when
         self._loop: LiveLoop | None = None
         self._gain, self._lost = 1.0, 0
         self._error: BaseException | None = None
         self._raised = False
         self._recorder: LiveRecorder | None = None
-        self._calls_back = self._entered = False
+        self._entered, self._clocked = False, False  # whether the device has a clock of its own: it is not played
         self._recorded, self._served = 0, 0.0  # samples of this loop that were looked at; when the last look was
         self._stack, self._stopping, self._lock = ExitStack(), threading.Event(), threading.RLock()
 
@@ -162,11 +165,11 @@ class Player:
         """
         with self._calling():
             if self._loop is None:
-                self._begin(self._scene(texture))
+                self._begin(self._scene(texture=texture))
                 return
             playing = self._loop.rendering
             device = None if playing.plant is not None else playing.device
-            self._loop.exchange(prepare(self._scene(texture), driver=device, compiled=False))
+            self._loop.exchange(prepare(self._scene(texture=texture), driver=device, compiled=False))
 
     def finger(self, position: float, velocity: float | None = None, load: float = 0.4) -> None:
         """Set where the finger is: position (m from the middle, NaN: lifted), velocity (m/s), normal load (N).
@@ -175,14 +178,14 @@ class Player:
         0.25 s without a call what lies along the surface fades out.
         """
         self._check()
-        (last, then), now = self._last, time.monotonic() if self._paced else self.time
+        now = time.monotonic() if self._paced else self.time
         if velocity is None:
-            recent = 0.0 < now - then < UPDATES and math.isfinite(position - last)
-            velocity = (position - last) / (now - then) if recent else 0.0
+            moved, passed = position - (self._finger or (math.nan,))[0], now - self._finger_time
+            velocity = moved / passed if 0.0 < passed < UPDATES and math.isfinite(moved) else 0.0
         if math.isinf(position) or not math.isfinite(velocity) or not 0.0 <= load < math.inf:
             values = f"{position=} m, {velocity=} m/s, {load=} N"
             raise ValueError(f"{values}: must be finite, a load >= 0 (a position may be NaN: lifted)")
-        self._located, self._last, self._finger = True, (position, now), (position, velocity, load)
+        self._finger, self._finger_time = (position, velocity, load), now
         self._motion.update(position, velocity, load)
         if self._loop is not None:
             self._loop.finger(position, velocity, load)
@@ -240,11 +243,6 @@ class Player:
             with self._lock:
                 self._check()
 
-    def _scene(self, texture: Texture) -> Scene:
-        if self._given is not None:
-            return replace(self._given, texture=texture)
-        return Scene(texture=texture, **self._fields)
-
     def _playing(self, what: str) -> LiveLoop:
         if self._loop is None:
             raise ValueError(f"{what}: nothing plays yet: call play first")
@@ -291,17 +289,18 @@ class Player:
 
     def _start(self, rendering: Rendering) -> None:
         """Open the device at rest, probe it, and play."""
-        device, stack, direct = rendering.device, self._stack, rendering.driver is rendering.device
-        calls_back = self._calls_back = hasattr(device, "start") and direct
-        own = hasattr(device, "loop") and direct
+        device: Any = rendering.device
+        stack, direct = self._stack, rendering.driver is device
+        calls_back, own = direct and hasattr(device, "start"), direct and hasattr(device, "loop")
+        self._clocked = calls_back or own
         blocks = 2 * rendering.driver.block / rendering.driver.rate
         if self._watchdog is not None and self._watchdog < blocks:
             raise ValueError(f"watchdog = {self._watchdog:g} s: must be >= {blocks:g} s, two blocks of the driver")
-        scales = {name: getattr(device, name) for name in ("sensed_scale", "drive_scale")} if calls_back else {}
-        loop: Any = device.loop(rendering) if own else LiveLoop(rendering, **scales)  # type: ignore[attr-defined]
-        self._hand_finger(rendering)
-        if not self._paced and (calls_back or own):
+        if self._clocked and not self._paced:
             raise ValueError("paced = False: must be True on a device with a clock of its own")
+        scales = {name: getattr(device, name) for name in ("sensed_scale", "drive_scale")} if calls_back else {}
+        loop: Any = device.loop(rendering) if own else LiveLoop(rendering, **scales)
+        self._hand_finger(rendering)
         stack.enter_context(stopped_by_sigterm())
         stack.enter_context(rendering.driver)
         stack.enter_context(zero_drive_after(device))
@@ -309,11 +308,11 @@ class Player:
             probe_plate(device, rendering.model)
         self._loop = loop
         loop.set_gain(self._gain)
-        if self._located:
+        if self._finger is not None:
             loop.finger(*self._finger)
         if calls_back:
-            device.start(loop.entry)  # type: ignore[attr-defined]
-            stack.callback(device.stop)  # type: ignore[attr-defined]
+            device.start(loop)
+            stack.callback(device.stop)
         elif own:
             loop.start()
         elif self._paced:
@@ -354,10 +353,9 @@ class Player:
         loop = self._playing("play")
         with suppress(Exception):
             loop.silence()
-        if isinstance(loop, LiveLoop) and not self._calls_back:
-            with suppress(Exception):
-                for _ in range(-(-loop.driver.delay // loop.driver.block)):
-                    loop.rest()
+        with suppress(Exception):
+            if not self._clocked:
+                play_zeros(loop.driver)
 
     def _drive_device(self) -> None:
         """Play block after block, no faster than the clock; one that was left behind by `LATE` starts anew."""
@@ -372,7 +370,7 @@ class Player:
 
     def _block(self) -> None:
         """Play a block."""
-        self._playing("play").advance(sensing=self._given is not None or not self._located)
+        self._playing("play").advance(sensing=self._given is not None or self._finger is None)
 
     def _advance(self, seconds: float) -> None:
         """Play for so long in this thread."""
@@ -393,7 +391,7 @@ class Player:
     def _point(self) -> None:
         """Send the position of the scene's finger to a device that does not sense it."""
         loop = self._playing("play")
-        if self._given is not None and not self._located and not loop.senses:
+        if self._given is not None and self._finger is None and not loop.senses:
             finger, now = self._given.finger, self.time + np.array([0.0, INSTANT])
             (here, there), load = finger.position(now), finger.load(now)[0]
             loop.finger(here, float(np.nan_to_num((there - here) / INSTANT)), load)

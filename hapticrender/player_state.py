@@ -35,18 +35,11 @@ class PlayerState:
 
     def __str__(self) -> str:
         """One line a band, flags and load."""
-        lines = [
-            f"{_label(band.frequency)}  target {band.target:9.3g} {self.unit}  achieved {band.achieved:9.3g} "
-            f"{self.unit}  error {_percent(band.error)}"
-            for band in self.bands
-        ]
+        lines = []
+        for band in self.bands:
+            label = f"{band.frequency:7.1f} Hz" if band.frequency > 0.0 else "  rms of all"
+            error = "  -" if math.isnan(band.error) else f"{100 * band.error:6.2f} %"
+            figures = f"target {band.target:9.3g} {self.unit}  achieved {band.achieved:9.3g} {self.unit}"
+            lines.append(f"{label}  {figures}  error {error}")
         load = "" if math.isnan(self.load) else f", load {100 * self.load:.0f} %"
         return "\n".join([*lines, f"{self.time:.1f} s, {self.flags.name or 'no flags'}, {self.lost} lost{load}"])
-
-
-def _label(frequency: float) -> str:
-    return f"{frequency:7.1f} Hz" if frequency > 0.0 else "  rms of all"
-
-
-def _percent(error: float) -> str:
-    return "  -" if math.isnan(error) else f"{100 * error:6.2f} %"

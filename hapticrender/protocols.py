@@ -165,6 +165,7 @@ class Rendering:
     model: DeviceModel  # for which the controller is designed
     bands: Bands  # carriers and targets, in the device's quantity
     waveform: Callable[[Array, Array], Array]  # target over time (s) and position (m), in the device's quantity
+    waveform_of: Callable[[Texture], Callable[[Array, Array], Array]] | None = None  # of another one; None: its own
     differentiated: bool = False  # the target is the time derivative of `waveform`
     controller: Callable[[], Controller]  # a new one at rest
     design: Callable[[Bands], Controller] | None = None  # one at rest for other bands; None: for these only

@@ -1,6 +1,6 @@
-"""What the real-time entry runs: hand-over, the finger between two calls, textures, watchdog, controller, log.
+"""Kernels of the real-time entry: hand-over, the finger between two calls, textures, watchdog, controller, log.
 
-`realtime.RealtimeEntry` makes the record and says what it is for.
+`realtime_entry.RealtimeEntry` makes the records and says what they are for.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from hapticrender.control.records import CONTROLLER_T
 from hapticrender.control.state_transfer import transfer
 from hapticrender.jit import F8, I8, CFunction, call, entry, kernel, pointer, record, swap
 from hapticrender.protocols import Flag
-from hapticrender.voices import VOICE_T, along_surface, eased, in_time
+from hapticrender.sampled_texture import TEXTURE_T, along_surface, eased, in_time
 
 HORIZON = 0.05  # s: without a new position the finger stays where it was bound for by then,
 HOLD = 0.25  # s: and after so long what lies along the surface fades out
@@ -27,21 +27,29 @@ LOST = 0b1111  # PortAudio's status: input or output under- or overflow
 UNSIGNED_LONG = types.uint32 if sys.platform == "win32" else types.uint64
 F4 = types.float32
 FRESH = 4  # bit beside the number of the slot in the middle: not yet read
-# entries of a slot: the finger's position, speed and load, whether anything is played, the gain, the voice's address,
-# how often finger and setpoints have changed, the watchdog's time (samples; 0: none), how often the application has
-# called, then the setpoints row by row
-POSITION, VELOCITY, LOAD, PLAYING, GAIN, VOICE_ADDRESS, FINGER_CHANGES, SETPOINT_CHANGES, WATCHDOG, CALLS = range(10)
-HEAD = 10
 
-_ADDRESSES = "step controller signals slots_at setpoints_at sensed_at drive_at position_at waveform_at flags_at"
-_COUNTS = "block sensors channels setpoints middle slot age samples flags refused lost ahead idle timed_out"
-_TEXTURE = "current previous switch analysed shared changes bump_at gains_at"
-_LOG = "tracker log_at log_rows log_width given taken"
-_STATE = "finger_changes setpoint_changes calls gain touch place pace offset offset_input lead lead_input open"
+SLOT = np.dtype(
+    [
+        *((name, np.float64) for name in ("position", "velocity", "load", "gain", "watchdog")),
+        *((name, np.int64) for name in ("playing", "texture", "finger_changes", "calls")),
+    ]
+)
+"""What the application has set: the finger, the gain, the watchdog's time (samples; 0: none), whether anything plays,
+the texture's record; how often it has set the finger, and called."""
+SLOT_T, SLOT_SIZE = numba.from_dtype(SLOT), SLOT.itemsize
+CONTROL = np.dtype([(name, np.int64) for name in ("step", "state", "signals", "analysed", "shared", "limit_at")])
+"""Addresses that run a controller on the entry's signals; whether it takes a waveform (else a factor); the table of
+the state that it shares with others (see `control.state_transfer`); the drive's limit in every channel."""
+CONTROL_T = numba.from_dtype(CONTROL)
+
+_ADDRESSES = "control slots_at sensed_at drive_at position_at waveform_at flags_at bump_at gains_at log_at tracker"
+_COUNTS = "block sensors channels middle slot age samples flags refused lost ahead idle stopped timed_out taken"
+_TEXTURE = "current previous switch changes finger_changes calls log_rows log_width given"
+_STATE = "gain touch place pace offset offset_input lead lead_input open"
 _SETTINGS = "rate sensed_scale drive_scale fade fade_out fade_in touch_step gain_pole offset_kept closing_step"
 ENTRY = np.dtype(
     [
-        *((name, np.int64) for name in f"{_ADDRESSES} {_COUNTS} {_TEXTURE} {_LOG}".split()),
+        *((name, np.int64) for name in f"{_ADDRESSES} {_COUNTS} {_TEXTURE}".split()),
         *((name, np.float64) for name in f"{_STATE} {_SETTINGS}".split()),
     ]
 )
@@ -66,7 +74,7 @@ def duration(entry):
 def waits(entry):
     """Whether the controller of the present texture has yet to take over."""
     e = record(entry, ENTRY_T, 0)
-    return e.current != 0 and record(e.current, VOICE_T, 0).controller != e.controller
+    return e.current != 0 and record(e.current, TEXTURE_T, 0).control != e.control
 
 
 @kernel
@@ -75,25 +83,18 @@ def receive(entry):
     e = record(entry, ENTRY_T, 0)
     if e.middle & FRESH:
         e.slot = swap(entry + MIDDLE_AT, e.slot) & (FRESH - 1)
-    width = HEAD + e.setpoints
-    slot = carray(pointer(e.slots_at + 8 * width * e.slot, F8), width)
-    if slot[SETPOINT_CHANGES] != e.setpoint_changes:
-        e.setpoint_changes = slot[SETPOINT_CHANGES]
-        setpoints = carray(pointer(e.setpoints_at, F8), e.setpoints)
-        for i in range(e.setpoints):
-            setpoints[i] = slot[HEAD + i]
-    if slot[FINGER_CHANGES] != e.finger_changes:
-        e.finger_changes, e.age = slot[FINGER_CHANGES], 0
-        jump = e.place + e.pace - slot[POSITION]  # from where it would have gone on
+    slot = record(e.slots_at, SLOT_T, e.slot)
+    if slot.finger_changes != e.finger_changes:
+        e.finger_changes, e.age = slot.finger_changes, 0
+        jump = e.place + e.pace - slot.position  # from where it would have gone on
         # only what is new of it enters both poles: calls that follow each other closely do not hold it up
         e.offset_input = e.offset_input + jump - e.offset if abs(jump) < JUMP else 0.0
         e.offset = jump if abs(jump) < JUMP else 0.0
-    voice = int(slot[VOICE_ADDRESS])
-    if voice != e.current and e.samples >= e.switch + duration(entry) and not waits(entry):  # one after the other
-        v = record(voice, VOICE_T, 0)
-        e.previous, e.current, e.switch = e.current, voice, e.samples + e.ahead
-        e.changes, v.begun = 1 if v.controller != e.controller else 0, e.switch
-    return e.slots_at + 8 * width * e.slot
+    if slot.texture != e.current and e.samples >= e.switch + duration(entry) and not waits(entry):  # one by one
+        texture = record(slot.texture, TEXTURE_T, 0)
+        e.previous, e.current, e.switch = e.current, slot.texture, e.samples + e.ahead
+        e.changes, texture.begun = 1 if texture.control != e.control else 0, e.switch
+    return e.slots_at + e.slot * SLOT_SIZE
 
 
 @kernel
@@ -107,49 +108,60 @@ def shares(entry, sample):
 
 
 @kernel
+def step_controller(entry):
+    """Advance the controller that runs by a block."""
+    e = record(entry, ENTRY_T, 0)
+    c = record(e.control, CONTROL_T, 0)
+    call(c.step, (c.state, c.signals, 0, e.block))
+
+
+@kernel
 def take_over(entry):
     """Let the controller of the texture that begins take over: it goes on from the state of the one before.
 
     That one computes this block too, so that the difference of the two drives is known.
     """
     e = record(entry, ENTRY_T, 0)
-    v, drive = record(e.current, VOICE_T, 0), carray(pointer(e.drive_at, F8), e.block * e.channels)
+    texture, drive = record(e.current, TEXTURE_T, 0), carray(pointer(e.drive_at, F8), e.block * e.channels)
     bump, flags = carray(pointer(e.bump_at, F8), e.channels), carray(pointer(e.flags_at, I8), e.block)
-    transfer(e.shared, v.shared)
-    call(e.step, (e.controller, e.signals, 0, e.block))
+    transfer(record(e.control, CONTROL_T, 0).shared, record(texture.control, CONTROL_T, 0).shared)
+    step_controller(entry)
     for m in range(e.block):
         flags[m] &= ~STOPPED  # of this block the next one decides
     for i in range(e.channels):
         bump[i] = drive[i]
-    e.step, e.controller, e.signals, e.analysed, e.shared = v.step, v.controller, v.signals, v.analysed, v.shared
-    v.begun, e.switch = e.samples, e.samples - e.fade_out
-    call(e.step, (e.controller, e.signals, 0, e.block))
+    e.control, texture.begun, e.switch = texture.control, e.samples, e.samples - e.fade_out
+    step_controller(entry)
     for i in range(e.channels):
         bump[i] -= drive[i]
 
 
 @kernel
 def run_controller(entry):
-    """Advance the controller by a block; after a change, what its drive differs from the last one's fades out."""
+    """Advance the controller by a block; after a change, what its drive differs from the last one's fades out.
+
+    Their sum stays within the limit of the drive.
+    """
     e = record(entry, ENTRY_T, 0)
     changing = e.changes > 0 and e.switch + e.fade_out <= e.samples
     if changing and waits(entry):
         take_over(entry)
     else:
-        call(e.step, (e.controller, e.signals, 0, e.block))
+        step_controller(entry)
     if changing and e.samples < e.switch + duration(entry):
         drive, bump = carray(pointer(e.drive_at, F8), (e.block, e.channels)), carray(pointer(e.bump_at, F8), e.channels)
+        limit = carray(pointer(record(e.control, CONTROL_T, 0).limit_at, F8), e.channels)
         flags = carray(pointer(e.flags_at, I8), e.block)
         for m in range(e.block):
             left = 1.0 - shares(entry, e.samples + m)[1] if flags[m] & STOPPED == 0 else 0.0
             for i in range(e.channels):
-                drive[m, i] += left * bump[i]
+                drive[m, i] = min(max(drive[m, i] + left * bump[i], -limit[i]), limit[i])
 
 
 @kernel
 def follow_finger(entry, slot, m):
     """Where the finger is in sample m of the block, and where it will be at the end of the look-ahead (m)."""
-    e, values = record(entry, ENTRY_T, 0), carray(pointer(slot, F8), HEAD)
+    e, s = record(entry, ENTRY_T, 0), record(slot, SLOT_T, 0)
     position, ahead = carray(pointer(e.position_at, F8), e.block), e.ahead / e.rate
     if e.given != 0:
         position[m] = carray(pointer(e.given, F8), 1)[e.taken + m]
@@ -158,9 +170,9 @@ def follow_finger(entry, slot, m):
         there = position[m] + ahead * (c.velocity + 0.5 * ahead * c.acceleration)
     else:
         age = (e.age + m) / e.rate
-        position[m] = values[POSITION] + min(age, HORIZON) * values[VELOCITY] + e.offset
+        position[m] = s.position + min(age, HORIZON) * s.velocity + e.offset
         there = position[m] + e.lead
-        kept, lead = e.offset_kept, ahead * values[VELOCITY] if age < HORIZON else 0.0
+        kept, lead = e.offset_kept, ahead * s.velocity if age < HORIZON else 0.0
         e.lead_input = lead + kept * (e.lead_input - lead)  # two poles: neither place nor speed steps
         e.lead = e.lead_input + kept * (e.lead - e.lead_input)
         e.offset_input *= kept
@@ -176,7 +188,7 @@ def follow_finger(entry, slot, m):
 
 @kernel
 def texture_at(entry, sample, position, gain, touch):
-    """Texture at a sample: a voice while it fades into the next one."""
+    """Texture at a sample, while one fades into the next one."""
     e = record(entry, ENTRY_T, 0)
     (before, present), total = shares(entry, sample), 0.0
     if e.current != 0:
@@ -188,20 +200,21 @@ def texture_at(entry, sample, position, gain, touch):
 
 @kernel
 def play_texture(entry, slot):
-    """Waveform of the block, ahead of time as the law needs it (of bands: the gain); the texture itself into the log.
+    """Waveform of the block, as far ahead as the controller needs it (of bands: the gain); the texture into the log.
 
-    Gain and touch wait in a ring meanwhile, so that what is asked for is what was handed to the law.
+    Gain and touch wait in a ring meanwhile, so that the log has what was handed to the controller.
     """
-    e, values = record(entry, ENTRY_T, 0), carray(pointer(slot, F8), HEAD)
+    e, s = record(entry, ENTRY_T, 0), record(slot, SLOT_T, 0)
     waveform, gains = carray(pointer(e.waveform_at, F8), e.block), carray(pointer(e.gains_at, F8), (e.ahead + 1, 2))
     log = carray(pointer(e.log_at, F8), (e.log_rows, e.log_width))
+    analysed = record(e.control, CONTROL_T, 0).analysed > 0
     for m in range(e.block):
         now, (here, there) = e.samples + m, follow_finger(entry, slot, m)
-        e.gain += e.gain_pole * (values[GAIN] - e.gain)
+        e.gain += e.gain_pole * (s.gain - e.gain)
         gain, touch = e.gain, eased(e.touch)
         before, present = shares(entry, now)
         of_bands = gain * (before + present)
-        waveform[m] = texture_at(entry, now + e.ahead, there, gain, touch) if e.analysed > 0 else of_bands
+        waveform[m] = texture_at(entry, now + e.ahead, there, gain, touch) if analysed else of_bands
         gains[(now + e.ahead) % (e.ahead + 1), 0], gains[(now + e.ahead) % (e.ahead + 1), 1] = gain, touch
         then = now % (e.ahead + 1)
         log[now % e.log_rows, e.channels + e.sensors + 2] = texture_at(entry, now, here, gains[then, 0], gains[then, 1])
@@ -212,7 +225,7 @@ def play_texture(entry, slot):
 @kernel
 def write_log(entry, slot):
     """Drive, sensed, position, load and flags of the block into the log, beside the texture."""
-    e, values = record(entry, ENTRY_T, 0), carray(pointer(slot, F8), HEAD)
+    e, s = record(entry, ENTRY_T, 0), record(slot, SLOT_T, 0)
     drive, sensed = carray(pointer(e.drive_at, F8), e.block * e.channels), carray(pointer(e.sensed_at, F8), 1)
     position, flags = carray(pointer(e.position_at, F8), e.block), carray(pointer(e.flags_at, I8), e.block)
     log = carray(pointer(e.log_at, F8), (e.log_rows, e.log_width))
@@ -223,31 +236,39 @@ def write_log(entry, slot):
         for i in range(e.sensors):
             log[row, e.channels + i] = sensed[m * e.sensors + i]
         log[row, e.channels + e.sensors] = position[m]
-        log[row, e.channels + e.sensors + 1] = values[LOAD]
+        log[row, e.channels + e.sensors + 1] = s.load
         log[row, e.channels + e.sensors + 3] = flags[m]
 
 
 @kernel
 def watch(entry, slot):
     """Count the samples since the application has called; beyond the watchdog's time the drive is stopped."""
-    e, values = record(entry, ENTRY_T, 0), carray(pointer(slot, F8), HEAD)
-    if values[CALLS] != e.calls:
-        e.calls, e.idle = values[CALLS], 0
+    e, s = record(entry, ENTRY_T, 0), record(slot, SLOT_T, 0)
+    if s.calls != e.calls:
+        e.calls, e.idle = s.calls, 0
     e.idle += e.block
-    if values[WATCHDOG] > 0.0 and e.idle > values[WATCHDOG] and e.timed_out < 0:
-        e.timed_out = e.samples
+    if s.watchdog > 0.0 and e.idle > s.watchdog and e.stopped < 0:
+        e.stopped, e.timed_out = e.samples, 1
 
 
 @kernel
-def fade_out(entry):
-    """Bring the drive of a block, and of all that follow, down to zero within `supervisor.FADE_OUT`."""
-    e = record(entry, ENTRY_T, 0)
+def stop(entry):
+    """Bring every channel down to zero within `supervisor.FADE_OUT` of a stop, for good; returns the block's flags.
+
+    The supervisor of one part of a device stops the drive of that part alone, and perhaps faster.
+    """
+    e, raised = record(entry, ENTRY_T, 0), 0
     flags, drive = carray(pointer(e.flags_at, I8), e.block), carray(pointer(e.drive_at, F8), e.block * e.channels)
     for m in range(e.block):
-        e.open = max(e.open - e.closing_step, 0.0)
-        flags[m] |= STOPPED
-        for i in range(e.channels):
-            drive[m * e.channels + i] *= e.open
+        if e.stopped < 0 and flags[m] & STOPPED:
+            e.stopped = e.samples + m
+        if e.stopped >= 0:
+            e.open = max(e.open - e.closing_step, 0.0)
+            flags[m] |= STOPPED
+            for i in range(e.channels):
+                drive[m * e.channels + i] *= e.open
+        raised |= flags[m]
+    return raised
 
 
 @kernel
@@ -255,21 +276,16 @@ def advance(entry):
     """Advance the controller by the block that is in its `sensed`; returns all flags of the block."""
     e = record(entry, ENTRY_T, 0)
     flags, drive = carray(pointer(e.flags_at, I8), e.block), carray(pointer(e.drive_at, F8), e.block * e.channels)
-    slot, raised = receive(entry), 0
+    slot = receive(entry)
     watch(entry, slot)
     play_texture(entry, slot)
-    for m in range(e.block):
-        flags[m] = e.lost
+    flags[:] = e.lost
     e.lost = 0
-    if carray(pointer(slot, F8), HEAD)[PLAYING] > 0.0 and e.open > 0.0:
+    if record(slot, SLOT_T, 0).playing > 0 and not (e.timed_out > 0 and e.open == 0.0):
         run_controller(entry)
     else:
-        for i in range(e.block * e.channels):
-            drive[i] = 0.0
-    if e.timed_out >= 0:
-        fade_out(entry)
-    for m in range(e.block):
-        raised |= flags[m]
+        drive[:] = 0.0
+    raised = stop(entry)
     write_log(entry, slot)
     e.flags |= raised
     e.samples += e.block

@@ -15,7 +15,7 @@ from hapticrender.control.methods import method_named
 from hapticrender.control.supervisor import supervised
 from hapticrender.driver_checks import check_driver
 from hapticrender.drivers.simulated import SimulatedDriver
-from hapticrender.protocols import Array, Controller, Driver, Method, Plant, Rendering
+from hapticrender.protocols import Array, Controller, Driver, Method, Plant, Rendering, Texture
 from hapticrender.touch.device_profile import Limits
 from hapticrender.touch.scene import Scene
 from hapticrender.touch.touch_panel import PanelReader
@@ -58,7 +58,8 @@ class BaseRenderer:
             plant=plant,
             model=model,
             bands=bands,
-            waveform=self.waveform(setup),
+            waveform=self.waveform(setup, scene.texture),
+            waveform_of=partial(self.waveform, setup),
             differentiated=self.differentiated,
             controller=partial(design, bands),
             design=design,
@@ -108,9 +109,9 @@ class BaseRenderer:
         """Whether the device is probed before the loop closes; see `control.probe`."""
         return False
 
-    def waveform(self, setup: Setup) -> Waveform:
-        """Return the target waveform over time (s) and position (m), in the device's quantity."""
-        return getattr(setup, "scene", setup).texture.waveform
+    def waveform(self, setup: Setup, texture: Texture) -> Waveform:
+        """Return the target waveform of `texture` over time (s) and position (m), in the device's quantity."""
+        return texture.waveform
 
     def shape(self, setup: Setup) -> Any:
         """Return the static characteristic that the scene needs before the device; None: none."""

@@ -16,7 +16,7 @@ from hapticrender.bands import Bands
 from hapticrender.checks import Validated, option, parameter, require
 from hapticrender.control.device_model import DeviceModel, FingerRange
 from hapticrender.plants.sliding_contact import SlidingParameters
-from hapticrender.protocols import Array, Driver
+from hapticrender.protocols import Array, Driver, Texture
 from hapticrender.renderers.base import BaseRenderer, Waveform
 from hapticrender.renderers.limits import Need, check_carriers, examined, needed, perceptible, speeds, top_speed
 from hapticrender.touch.device_profile import Limits
@@ -74,10 +74,9 @@ class FrictionSetup:
         """Largest normal load (N) of the finger."""
         return float(np.max(self.scene.finger.load(examined(self.scene)), initial=0.0))
 
-    @property
-    def waveform(self) -> Waveform:
-        """Waveform whose time derivative is the target friction: displacement over v/F (N s)."""
-        share, texture, mechanics = self.settings.velocity_per_force, self.scene.texture, self.scene.finger.mechanics
+    def waveform_of(self, texture: Texture) -> Waveform:
+        """Waveform whose time derivative is the target friction: displacement of a texture over v/F (N s)."""
+        share, mechanics = self.settings.velocity_per_force, self.scene.finger.mechanics
         factor = 1.0 / (share or VELOCITY_PER_FORCE)
 
         def impulse(time: Array, position: Array) -> Any:
@@ -110,13 +109,13 @@ class FrictionSetup:
 
     def needed(self, model: DeviceModel) -> Need:
         """Amplitude and drive (N) that the scene needs of `model`."""
-        return needed(self.scene, model, self.targets(model), self.waveform)
+        return needed(self.scene, model, self.targets(model), self.waveform_of(self.scene.texture))
 
     def check_speed(self, model: DeviceModel, bands: Bands) -> None:
         """Refuse a skin velocity that the finger's own speed makes impossible, where the skin is modelled."""
         if self.scene.finger.mechanics.order == 0:
             return
-        need = needed(self.scene, model, bands, self.waveform)
+        need = needed(self.scene, model, bands, self.waveform_of(self.scene.texture))
         locked = bool((bands.wavenumber > 0.0).any())
         speed = top_speed(self.scene) if locked else self.speed
         velocity = need.amplitude * self.settings.velocity_per_force
@@ -192,9 +191,9 @@ class FrictionRenderer(BaseRenderer):
         """Return `model`: its drive is a friction, and the setup has the limits of the carrier; see `carrier_limit`."""
         return model
 
-    def waveform(self, setup: FrictionSetup) -> Waveform:
+    def waveform(self, setup: FrictionSetup, texture: Texture) -> Waveform:
         """Return the waveform whose time derivative is the target friction: displacement over v/F (N s)."""
-        return setup.waveform
+        return setup.waveform_of(texture)
 
     def bands(self, setup: FrictionSetup, model: DeviceModel) -> Bands:
         """Carriers and targets of a scene; `device_model` has refused what is beyond the device.

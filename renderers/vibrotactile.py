@@ -55,8 +55,8 @@ class VibrotactileRenderer(BaseRenderer):
 
     def probes(self, setup: PlateSetup, driver: Driver) -> bool:
         """Whether a plate is probed: one of two coils and two sensors, unless driver or scene say no."""
-        asked = setup.probe and getattr(driver, "probe", True)
-        return asked and setup.assumed.coils == driver.sensed_channels == 2
+        allowed = setup.probe and getattr(driver, "probe", True)
+        return allowed and setup.assumed.coils == driver.sensed_channels == 2
 
     def device_model(self, setup: PlateSetup, driver: Driver) -> DeviceModel:
         """Return the device model of the plate behind `driver`."""
@@ -84,12 +84,9 @@ class VibrotactileRenderer(BaseRenderer):
 
     def limited(self, setup: PlateSetup, model: DeviceModel, bands: Bands) -> DeviceModel:
         """Return the device model with the scene's demand, its drive limited to what the scene needs."""
-        scene = setup.scene
-        return (
-            governed(model, demand(scene, model, bands, scene.texture.waveform))
-            if len(bands) or bands.envelope is None
-            else model
-        )
+        if not len(bands) and bands.envelope is not None:
+            return model
+        return governed(model, demand(setup.scene, model, bands, setup.scene.texture.waveform))
 
 
 def _pattern(scene: Scene, plate: PlateParameters) -> tuple[float, float]:

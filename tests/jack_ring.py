@@ -21,7 +21,7 @@ from hapticrender.drivers import portaudio
 from hapticrender.drivers.audio import AudioDriver
 from hapticrender.errors import DeviceNotFound
 from hapticrender.plants.plate import PlateParameters, structure
-from hapticrender.realtime import RealtimeEntry
+from hapticrender.realtime_entry import RealtimeEntry
 from hapticrender.touch.mechanics import HEAVY_SECOND
 
 SOURCE = Path(__file__).with_name("jack_plate.c")

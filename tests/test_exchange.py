@@ -1,5 +1,7 @@
 """Textures exchanged under laws by bands: full strength within 50 ms, no step, and nothing that was found is lost."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from electroadhesive import Screen
@@ -8,11 +10,12 @@ from test_kernel import plate_controller
 
 import hapticrender as hr
 from hapticrender.bands import Bands
+from hapticrender.control.device_model import Demand
 from hapticrender.control.supervisor import INVALID, supervised
-from hapticrender.live import LEAST_TARGET, band_figures
+from hapticrender.live_loop import LEAST_TARGET, band_figures
 from hapticrender.plants.plate import PlateParameters
-from hapticrender.realtime import CHANGE, RealtimeEntry
-from hapticrender.voices import Voice
+from hapticrender.realtime_entry import CHANGE, RealtimeEntry
+from hapticrender.sampled_texture import SampledTexture
 
 RATE, SPEED, FULL = 5000.0, 0.08, 0.05  # Hz; m/s; s within which a texture is to be there
 KEPT = 600  # samples before a change
@@ -113,7 +116,7 @@ def change():
         for each in (tones(100.0), tones(80.0, 170.0))
     )
     entry = RealtimeEntry(first)
-    entry.play(Voice(grating(frequency=100.0), RATE))
+    entry.play(SampledTexture(grating(frequency=100.0), RATE))
     return entry, first, second
 
 
@@ -124,7 +127,7 @@ def quiet(rng, seconds):
 def test_what_was_found_goes_on_and_only_bands_are_new(change, rng):
     entry, first, second = change
     entry.process(quiet(rng, 0.3))
-    entry.play(Voice(grating(frequency=80.0), RATE), second)
+    entry.play(SampledTexture(grating(frequency=80.0), RATE), second)
     entry.process(quiet(rng, CHANGE[0]))
     assert entry.running is first
     found = {name: first.controller.state[name].copy() for name in ("dc", "lever", "load", "scale")}
@@ -143,7 +146,7 @@ def test_a_stop_stays_a_stop(change, rng):
     entry, _, second = change
     entry.process(quiet(rng, 0.1))
     entry.process(np.full((200, 2), np.nan))  # 40 ms; 18 ms of it are a fault
-    entry.play(Voice(grating(frequency=80.0), RATE), second)
+    entry.play(SampledTexture(grating(frequency=80.0), RATE), second)
     assert abs(entry.process(quiet(rng, 0.2))).max() == 0.0
     assert entry.running is second
     assert second.fault.cause == INVALID
@@ -153,7 +156,7 @@ def test_a_stop_during_a_change_is_a_stop(change, rng):
     """What the drives differ by fades out for 34 ms, unless the controller that takes over is stopped."""
     entry, _, second = change
     entry.process(quiet(rng, 0.1))
-    entry.play(Voice(grating(frequency=80.0), RATE), second)
+    entry.play(SampledTexture(grating(frequency=80.0), RATE), second)
     entry.process(quiet(rng, CHANGE[0] + 2 / RATE))
     assert entry.running is second
     assert entry.process(quiet(rng, 1 / RATE)).any()
@@ -161,19 +164,19 @@ def test_a_stop_during_a_change_is_a_stop(change, rng):
     assert not entry.process(quiet(rng, CHANGE[1])).any()
 
 
-def test_a_voice_is_played_by_one_controller_whose_arrays_stay(change, rng):
+def test_a_texture_is_played_by_one_controller_whose_arrays_stay(change, rng):
     entry, _, second = change
-    voice = Voice(grating(frequency=80.0), RATE)
-    entry.play(voice, second)
+    texture = SampledTexture(grating(frequency=80.0), RATE)
+    entry.play(texture, second)
     entry.process(quiet(rng, 0.1))
     third = plate_controller(tones(140.0), parameters=PlateParameters())
-    with pytest.raises(ValueError, match="voice: plays under another controller"):
-        entry.play(voice, third)
+    with pytest.raises(ValueError, match="texture: plays under another controller"):
+        entry.play(texture, third)
     for _ in range(4):
-        last = Voice(grating(frequency=80.0), RATE)
+        last = SampledTexture(grating(frequency=80.0), RATE)
         entry.play(last)
         entry.process(quiet(rng, 0.1))
-    assert entry._entry["signals"] == last.law[2].ctypes.data
+    assert entry._entry["control"] == last.control.record.ctypes.data
 
 
 def test_two_changes_at_once_come_one_after_the_other(change, rng):
@@ -182,7 +185,7 @@ def test_two_changes_at_once_come_one_after_the_other(change, rng):
     third = plate_controller(tones(140.0), parameters=PlateParameters())
     entry.process(quiet(rng, 0.1))
     for controller in (second, third):
-        entry.play(Voice(grating(frequency=80.0), RATE), controller)
+        entry.play(SampledTexture(grating(frequency=80.0), RATE), controller)
         entry.process(quiet(rng, 2 / RATE))
     entry.process(quiet(rng, sum(CHANGE)))
     assert entry.running is second
@@ -194,7 +197,7 @@ def test_a_controller_of_another_device_is_refused(change):
     entry, _, _ = change
     other = plate_controller(tones(100.0), parameters=PlateParameters(), delay=10, block=10)
     with pytest.raises(ValueError, match=r"controller\.block = 10: must be 1, as of the one before"):
-        entry.play(Voice(grating(frequency=80.0), RATE), other)
+        entry.play(SampledTexture(grating(frequency=80.0), RATE), other)
 
 
 def figures(frequency, seconds=0.25):
@@ -221,3 +224,82 @@ def test_figures_are_exact_where_bands_lie_apart_and_bounded_where_they_do_not()
     assert LEAST_TARGET < target.min()
     assert target.max() < 2e-6
     np.testing.assert_allclose(np.median(error), 0.1, rtol=0.1)
+
+
+@pytest.mark.parametrize("limited", [True, False])
+def test_the_drive_stays_within_its_limit_while_the_difference_of_two_controllers_fades_out(limited):
+    """The first controller is at its limit, by a motion of 0.2 mm at 200 Hz; so is the second one, at another phase."""
+    limit, time = 0.5, np.arange(2500) / RATE
+    first, second = (
+        plate_controller(each, parameters=PlateParameters(), drive_limit=limit)
+        for each in (tones(100.0), tones(80.0, 170.0))
+    )
+    entry = RealtimeEntry(first)
+    entry.play(SampledTexture(grating(frequency=100.0), RATE))
+    sensed = 2e-4 * np.sin(2 * np.pi * 200.0 * time)[:, None] * np.ones(2)
+    entry.process(sensed[:1500])
+    entry.play(SampledTexture(grating(frequency=80.0), RATE), second)
+    if not limited:
+        entry._control.limit[:] = np.inf
+    assert (abs(entry.process(sensed[1500:])).max() <= limit) == limited
+
+
+def test_a_supervisor_that_begins_to_compare_in_mid_run_begins_at_rest(rng):
+    """A plate pressed in by 30 um does not move; beyond a tenth of the rate motion and drive are not compared."""
+    model = PlateParameters().device_model(RATE, 1)
+    first, second = (
+        supervised(
+            plate_controller(tones(frequency), parameters=PlateParameters()),
+            replace(model, demand=Demand(motion=1e-5, drive=0.1, lowest=frequency, highest=frequency)),
+        )
+        for frequency in (600.0, 100.0)
+    )
+    entry = RealtimeEntry(first)
+    entry.play(SampledTexture(grating(frequency=600.0), RATE))
+    entry.process(3e-5 + quiet(rng, 0.1))
+    entry.play(SampledTexture(grating(frequency=100.0), RATE), second)
+    motion = []
+    for _ in range(200):
+        entry.process(3e-5 + quiet(rng, 1e-3))
+        motion.append(float(second.state["motion"][0]))
+    assert (first.state["p"]["modelled"], second.state["p"]["modelled"]) == (0, 1)
+    assert 0.0 < max(motion) < 1e-6  # of noise of 0.1 um
+    np.testing.assert_allclose(second.gains["models"][0, 0, 0], 3e-5, rtol=0.05)
+
+
+def test_a_waveform_law_whose_supervisor_begins_to_compare_tests_the_gains_too():
+    with hr.Player(paced=False, simulation={"sensor_noise": 0.0}) as player:
+        player.finger(0.02, 0.0, 1.5)
+        player.play(grating(2e-6, frequency=600.0))
+        player.sleep(0.2)
+        assert not player._loop.running.state["p"]["modelled"]
+        player.play(grating(2e-6, frequency=100.0))
+        motion = []
+        for _ in range(50):
+            player.sleep(1e-3)
+            motion.append(float(player._loop.running.state["motion"][0]))
+        supervisor = player._loop.running.state
+    assert supervisor["p"]["modelled"] == supervisor["compared"] == 1
+    assert supervisor["p"]["gains"] != 0
+    assert 1e-6 < max(motion) < 10e-6  # twice the sum of both textures, heave and rocking
+
+
+def test_the_heat_of_a_part_that_a_texture_leaves_out_goes_on_cooling():
+    """By exp(-t/0.5 s) while the screen plays alone, and while the plate plays next to nothing again."""
+    limits = {"rms_drive": 0.5, "rms_time": 0.5}
+    with hr.Player("hybrid", paced=False, limits=limits, keep_unfelt=True) as player:
+        player.finger(-0.03, SPEED, 0.4)
+        player.play(grating(20e-6, frequency=50.0))
+        place = slide(player, 0.2, start=-0.03, speed=SPEED)
+        player.play(grating(1e-9, frequency=250.0))
+        place = slide(player, 0.1, start=place, speed=SPEED)
+        assert player._loop.running.parts[0] is None
+        hot = player._loop.running.state["parts"]["heat"][0, 0, :2].copy()
+        place = slide(player, 0.2, start=place, speed=SPEED)
+        cool = player._loop.running.state["parts"]["heat"][0, 0, :2].copy()
+        player.play(grating(1e-9, frequency=50.0))
+        slide(player, 0.02, start=place, speed=SPEED)
+        back = player._loop.running.parts[0].state["heat"][0, :2]
+    assert hot.min() > 1e-4
+    np.testing.assert_allclose(cool, hot * np.exp(-0.2 / 0.5), rtol=1e-6)
+    np.testing.assert_allclose(back, hot * np.exp(-0.22 / 0.5), rtol=1e-2)  # the start of the controller is in it

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from live_devices import slide
 from tables import tables
 
 import hapticrender as hr
@@ -208,3 +209,34 @@ def test_scenes_and_drivers_are_refused():
         loop.prepare(scene(tone(250.0, 1.5)))
     with pytest.raises(ValueError, match=r"driver.drive_channels = 2: must be 3"):
         loop.prepare(scene(tone(100.0)), driver=BaseDriver(rate=RATE, drive_channels=2, sensed_channels=3))
+
+
+class Failing(Bench):
+    """Its first sensor gives no numbers from a time (s) on."""
+
+    def __init__(self, at):
+        super().__init__([])
+        self.left = round(at * RATE)
+
+    def _play(self, drive):
+        sensed = super()._play(drive)
+        self.left -= 1
+        if self.left < 0:
+            sensed.sensed[:, 0] = np.nan
+        return sensed
+
+
+def test_a_fault_of_a_part_stops_the_whole_device_at_the_time_it_is_said_to():
+    """Live: the plate, and its supervisor, play from 0.2 s on; a fault takes 18 ms to be seen, a fade 10 ms."""
+    driver = Failing(0.3)
+    with hr.Player("hybrid", driver, paced=False) as player:
+        player.finger(-0.02, 0.08, 0.4)
+        player.play(tone(250.0))
+        place = slide(player, 0.2)
+        player.play(tone(100.0))
+        with pytest.raises(hr.DeviceFault, match=r"stopped at 0\.31\d+ s: sensor 1: samples are no numbers"):
+            slide(player, 0.3, start=place)
+        log = player._loop.log(0)
+    first = int(np.argmax(log["flags"] & hr.Flag.STOPPED > 0))
+    assert abs(log["drive"][first - 100 : first]).max(axis=0).all()
+    assert not log["drive"][first + round(0.01 * RATE) + 1 :].any()

@@ -1,4 +1,4 @@
-"""Live play: what sounds is what was asked for, whatever changes on the way, and whoever drives the device."""
+"""Live play: what plays is the texture, whatever changes on the way, and whoever drives the device."""
 
 from dataclasses import replace
 
@@ -9,7 +9,7 @@ from live_devices import RIDGES, ROUNDING, TONE, Blind, Calling, Lying, slide
 import hapticrender as hr
 from hapticrender.plants.plate import Plate, PlateParameters
 from hapticrender.recordings.recording import Recording
-from hapticrender.voices import FADE
+from hapticrender.sampled_texture import FADE
 
 
 def error_of(recording, start, stop=None):
@@ -45,7 +45,7 @@ def session(tmp_path_factory):
     return recording, path, states
 
 
-def test_every_part_of_a_session_is_what_was_asked_for(session):
+def test_every_part_of_a_session_is_its_texture(session):
     """Within what the law reaches in `render` (a sliding finger: 1 % must, 2 % at a touch that is new)."""
     recording, _, _ = session
     assert len(recording) == 17_500
@@ -109,7 +109,7 @@ def test_one_that_is_not_paced_repeats_to_the_bit():
             slide(player, 0.1)
             player.play(RIDGES)
             slide(player, 0.2)
-            return player._loop.entry.log(0)["drive"]
+            return player._loop.log(0)["drive"]
 
     np.testing.assert_array_equal(drive(), drive())
 
@@ -126,6 +126,20 @@ def test_it_is_what_render_plays(tmp_path):
         assert live.waveform["places"][place]["waveform_error"] == pytest.approx(
             wanted["waveform_error"], rel=0.1, abs=1e-3
         )
+
+
+def test_what_is_given_beside_a_scene_replaces_the_scenes_own(tmp_path):
+    finger = hr.Finger.sliding(0.02, 0.8)
+    scene = hr.Scene(texture=RIDGES, finger=hr.Finger.sliding(0.05, 0.4), duration=1.0, seed=1, profile={"mass": 0.04})
+    with hr.Player(scene, finger=finger, seed=7, paced=False) as player:
+        player.play(RIDGES)
+        player.record(tmp_path / "live.au")
+        player.sleep(0.1)
+        recording = player.end_recording()
+    assert recording.scene == replace(scene, finger=finger, seed=7)
+    np.testing.assert_allclose(np.diff(recording.position) * recording.rate, 0.02, rtol=1e-6)
+    with pytest.raises(TypeError, match="colour"):
+        hr.Player(scene, colour="red")
 
 
 @pytest.mark.parametrize("device", ["vt-plate", "electroadhesion", "ultrasonic", "hybrid"])
@@ -147,18 +161,35 @@ def test_every_device_exchanges_textures(device):
         assert not state.flags & hr.Flag.SATURATED
 
 
+@pytest.mark.parametrize("device", ["electroadhesion", "ultrasonic"])
+def test_a_texture_in_time_and_along_the_surface_at_once_is_played_as_friction(device):
+    """A recording of 140 Hz over time, and ridges at 80 Hz, of the same velocity of the skin."""
+    recorded = np.sin(2 * np.pi * 140.0 * np.arange(4000) / 4000.0)
+    both = hr.Recorded(samples=recorded, rate=4000.0, amplitude=5e-6) + 1.75 * RIDGES
+    with hr.Player(device, paced=False) as player:
+        player.finger(-0.04, 0.08, 0.4)
+        player.play(both)
+        slide(player, 0.6, start=-0.04, speed=0.08)
+        [band] = player.state().bands
+        reference = player._loop.signals(player._loop.samples - round(0.25 * player._loop.rate))[1]["reference"]
+    lines = abs(np.fft.rfft(reference * np.hanning(len(reference))))
+    peaks = [lines[round(f * len(reference) / player._loop.rate)] for f in (80.0, 140.0)]
+    assert peaks[0] == pytest.approx(peaks[1], rel=0.1)
+    assert band.error < 0.04
+
+
 def test_an_exchange_steps_no_more_than_a_start():
     """On a plate without noise; the drive's samples are rounded by a step either way."""
     with hr.Player(paced=False, simulation={"sensor_noise": 0.0}) as player:
         player.play(TONE)
         player.sleep(1.0)
         for texture in (hr.Grating(frequency=150.0, amplitude=5e-6), TONE, hr.Grating(frequency=60.0, amplitude=5e-6)):
-            steady = abs(np.diff(player._loop.entry.log(0)["drive"][-1000:], axis=0)).max()
+            steady = abs(np.diff(player._loop.log(0)["drive"][-1000:], axis=0)).max()
             player.play(texture)
             player.sleep(0.1)
-            change = abs(np.diff(player._loop.entry.log(0)["drive"][-500:], axis=0)).max()
+            change = abs(np.diff(player._loop.log(0)["drive"][-500:], axis=0)).max()
             player.sleep(0.4)
-            after = abs(np.diff(player._loop.entry.log(0)["drive"][-1000:], axis=0)).max()
+            after = abs(np.diff(player._loop.log(0)["drive"][-1000:], axis=0)).max()
             assert change <= max(steady, after) + 2 * ROUNDING
 
 
@@ -217,8 +248,8 @@ def test_what_it_refuses(tmp_path):
                 player.gain = gain
 
 
-def test_the_finger_of_a_scene_is_told_to_a_device_that_does_not_sense_it():
-    """Words every 10 ms of signal: a swipe of 2 Hz is off by a quarter of its acceleration times 10 ms squared."""
+def test_the_finger_of_a_scene_is_sent_to_a_device_that_does_not_sense_it():
+    """Positions every 10 ms of signal: a swipe of 2 Hz is off by a quarter of its acceleration times 10 ms squared."""
     scene = hr.Scene(texture=RIDGES, finger=hr.Finger.swiping(2.0, speed=0.05), duration=5.0)
     driver = Blind(Plate(PlateParameters(), scene.finger))
     with hr.Player(scene, driver) as player:
@@ -227,5 +258,5 @@ def test_the_finger_of_a_scene_is_told_to_a_device_that_does_not_sense_it():
         played = player._loop.signals(0)[1]
     time = np.arange(len(played["position"])) / 5000.0
     off = abs(played["position"] - scene.finger.position(time))[1000:]
-    assert np.median(off) < 1e-3  # a loaded machine says its words late
+    assert np.median(off) < 1e-3  # a loaded machine sends them late
     assert np.isfinite(played["position"][1000:]).all()

@@ -65,7 +65,7 @@ def test_a_board_plays_live(tmp_path):
     assert abs(parts[0] - parts[1])[:2].max() < 0.08e-6
 
 
-def test_a_board_that_is_found_again_is_heard_again(tmp_path):
+def test_a_board_that_is_found_again_is_recorded_again(tmp_path):
     """Its clock begins anew: rows of the new run follow those of the old one, and a flag says that some are lost."""
     program = build_board(tmp_path / "board", hr.prepare(hr.Scene(texture=TONE, duration=1.0)))
     with ExitStack() as boards:

@@ -1,11 +1,12 @@
 """Two controllers as one, for a device whose two parts add up to one skin velocity: a plate and a friction device.
 
 Each part has a controller of its own, of the same method, for its own bands; their channels lie side by side, and
-their targets add up to the target of the skin's velocity, V = j w X + (v/F) F.  Nothing is estimated or closed here.
+their targets add up to the target of the skin's velocity, V = j w X + (v/F) F.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,7 +17,7 @@ from numba import carray
 from hapticrender.bands import Bands
 from hapticrender.control.controller import BankController, refuse_whole_waveform
 from hapticrender.control.device_model import DeviceModel
-from hapticrender.control.records import CONTROLLER_T, TILE_T, W
+from hapticrender.control.records import CONTROLLER_T, MOST_CHANNELS, TILE_T, W
 from hapticrender.control.supervisor import Fault, SupervisedController, supervised
 from hapticrender.jit import C16, F8, I8, SIGNALS_T, addresses, call, pointer, record, step
 from hapticrender.protocols import Array, Method
@@ -27,7 +28,7 @@ class CombinedModel(DeviceModel):
     """Device model of a device of two parts, which have a model and a controller each."""
 
     plate: DeviceModel  # of the part that moves the skin (m)
-    friction: DeviceModel | None  # of the part that rubs it (N); None: it has no target
+    friction: DeviceModel | None  # of the part that makes friction (N); None: it has no target
     velocity_per_force: float  # m/(N s): skin velocity that feels as strong as a newton of friction
 
 
@@ -47,6 +48,8 @@ PART = np.dtype(
         *((name, np.int64) for name in ("step", "state", "bank", "signals", "sensors", "channels", "bands", "index")),
         ("scale", np.complex128),  # target of the skin's velocity per target of the part; 0: j w
         ("scale_waveform", np.float64),  # of the part per waveform of both
+        ("heat", np.float64, (MOST_CHANNELS,)),  # of a part without target: means of the squares of its drives,
+        ("kept", np.float64),  # and the share of them that a block leaves
         *((f"{name}_at", np.int64) for name in BUFFERS),
     ]
 )
@@ -82,6 +85,8 @@ def combined_step(state, signals, start, count):
                 place[m], part_waveform[m], raised[m] = position[first + m], p.scale_waveform * waveform[first + m], 0
             if p.bands > 0:
                 call(p.step, (p.state, p.signals, 0, block))
+            for k in range(MOST_CHANNELS):
+                p.heat[k] *= p.kept
             for m in range(block):
                 for k in range(p.channels):
                     drive[first + m, channel + k] = out[m, k]
@@ -98,7 +103,8 @@ def combined_step(state, signals, start, count):
 class CombinedController:
     """Two controllers behind the `Controller` protocol, of plate and friction device; `design_combined` makes one.
 
-    A part is None where it has no target and stays without drive; `sensors` and `channels` are numbers of each part.
+    A part is None where it has no target and stays without drive; `sensors` and `channels` are numbers of each part,
+    and `kept` is the share of its heat (see `supervisor_kernel.cool`) that a part without target keeps over a sample.
     """
 
     def __init__(
@@ -109,13 +115,17 @@ class CombinedController:
         sensors: tuple[int, int],
         channels: tuple[int, int],
         method: str,
+        kept: tuple[float, float] = (1.0, 1.0),
     ) -> None:
         self.method, self.parts, self.bands, self.n_bands = method, parts, bands, len(bands)
-        self.step, self.channels, self.sensors = combined_step, sum(channels), sum(sensors)
+        self.step, self.part_channels = combined_step, channels
+        self.channels, self.sensors = sum(channels), sum(sensors)
         self.rate = next((part.rate for part in parts if part is not None), 0.0)
         self.block = max(part.block if part is not None else 1 for part in parts)
         self.state = np.zeros(1, COMBINED)
-        self.state[0] = (len(bands), self.channels, self.sensors, self.block, self.state[0]["parts"])
+        for name in ("channels", "sensors", "block"):
+            self.state[name] = getattr(self, name)
+        self.state["bands"], self.state["parts"]["kept"] = self.n_bands, np.power(kept, self.block)
         self._buffers: list[Array] = []
         shares = ((bands.plate_index, 0.0, 1.0), (bands.friction_index, velocity_per_force, 1.0 / velocity_per_force))
         for i, (part, (index, scale, per_target)) in enumerate(zip(parts, shares, strict=True)):
@@ -138,12 +148,6 @@ class CombinedController:
             if part is not None:
                 own["step"], own["state"] = part.step.address, part.state.ctypes.data
                 own["bank"] = getattr(part, "controller", part).state.ctypes.data
-
-    @property
-    def note(self) -> str:
-        """What the two designs chose and why."""
-        names = zip(("plate", "friction"), self.parts, strict=True)
-        return "\n".join(f"{name}: {'no target' if part is None else part.note}" for name, part in names)
 
     @property
     def mismatch(self) -> float:
@@ -172,6 +176,7 @@ def design_combined(
         parts.append(part if part is None or each is None else supervised(part, each, feedback=feedback))
     sensors = (model.plate.coordinate_from_sensed.shape[1], 1) if feedback else (0, 0)
     channels = (model.plate.force_from_drive.shape[1], 1)
-    return CombinedController(
-        (parts[0], parts[1]), bands, model.velocity_per_force, sensors, channels, getattr(method, "name", "")
-    )
+    kept = math.exp(-1.0 / (model.plate.rms_time * model.rate)), 1.0  # limits of rms drive are the plate's
+    name = getattr(method, "name", "")
+    both = parts[0], parts[1]
+    return CombinedController(both, bands, model.velocity_per_force, sensors, channels, name, kept)

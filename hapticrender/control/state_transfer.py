@@ -1,8 +1,8 @@
 """State that a controller hands on to another one of the same device: all that is not of its bands.
 
-A law by bands has a controller for each texture.  What the running one has found of finger, load and device, and its
-supervisor's memory (tests, heat, a stop), lie in blocks of memory that are laid out alike in the next one; `transfer`
-copies them when that one takes over.
+Where the control works by bands, each texture has a controller.  What the running one has found of finger, load and
+device, and its supervisor's memory (tests, heat, a stop), lie in blocks of memory that are laid out alike in the next
+one; `transfer` copies them when that one takes over.
 """
 
 from __future__ import annotations
@@ -24,9 +24,9 @@ from hapticrender.control.supervisor_kernel import SUPERVISOR
 from hapticrender.jit import I8, kernel, pointer
 from hapticrender.protocols import Array
 
-PARTS, BLOCKS = 2, 12  # of a device; of a part
+PARTS, BLOCKS = 2, 14  # of a device; of a part
 ROWS = PARTS * BLOCKS
-TRACKER = 3  # block of the finger's position and velocity
+HEAT, TRACKER = 1, 5  # blocks of the heat of the drives, of the finger's position and velocity
 NONE = (0, 0)
 
 Block = tuple[int, int]  # address, 8-byte words
@@ -51,6 +51,9 @@ def state_table(controller: Any) -> Array:
     table = np.zeros((PARTS, BLOCKS, 2), np.int64)
     for i, part in enumerate(_parts(controller)):
         table[i] = _supervised(part) + _law(getattr(part, "controller", part))
+        if part is None:  # what it has to be left to cool is the combination's
+            heat = controller.state["parts"]["heat"][0, i]
+            table[i, HEAT] = heat.ctypes.data, len(heat)
     if not table[1, TRACKER].any():  # both parts have one finger
         table[1, TRACKER] = table[0, TRACKER]
     return table.reshape(ROWS, 2)
@@ -67,6 +70,14 @@ def ready(controller: Any) -> None:
             bank.tiles["fade"], bank.state["fresh"] = 1.0, FRESH_TIME * bank.rate
 
 
+def drive_limits(controller: Any) -> Array:
+    """Limit of the drive in every channel (unit of the drive), shape (channels,); infinite where none is stated."""
+    parts = _parts(controller)
+    channels = controller.part_channels if isinstance(controller, CombinedController) else (controller.channels,)
+    limits = [float(part.settings["drive_limit"]) if hasattr(part, "settings") else np.inf for part in parts]
+    return np.repeat(limits, channels)
+
+
 def _parts(controller: Any) -> Sequence[Any]:
     return controller.parts if isinstance(controller, CombinedController) else (controller,)
 
@@ -74,13 +85,11 @@ def _parts(controller: Any) -> Sequence[Any]:
 def _supervised(controller: Any) -> list[Block]:
     """Blocks of a supervisor."""
     if not isinstance(controller, SupervisedController):
-        return [NONE] * 3
-    p = controller.state["p"][0]
-    found = [
-        _fields(controller.state.ctypes.data, SUPERVISOR, "fade"),
-        (int(p["forces_at"]), 3 * (int(p["delay"]) + 1)),
-    ]
-    return [*found, _fields(int(p["gains"]), GAINS, "models") if p["gains"] else NONE]
+        return [NONE] * 5
+    p, at = controller.state["p"][0], controller.state.ctypes.data
+    found = [_fields(at, SUPERVISOR, *ends) for ends in (("fade", "heat"), ("heat", "last"), ("last", None))]
+    gains = _fields(int(p["gains"]), GAINS, "models") if p["gains"] else NONE
+    return [*found, (int(p["forces_at"]), 3 * (int(p["delay"]) + 1)), gains]
 
 
 def _law(controller: Any) -> list[Block]:

@@ -101,6 +101,7 @@ SUPERVISOR = np.dtype(
         *((name, np.int64, (MOST_SENSORS,)) for name in ("repeats", "longest")),
         *((f"{name}_count", np.int64) for name in COUNTS),
         *((name, np.int64) for name in ("suspended", "sample", "now", "sensors", "cause", "stopped", "beyond_count")),
+        ("compared", np.int64),  # whether motion and drive were compared in the last sample
     ]
 )
 SUPERVISOR_T = numba.from_dtype(SUPERVISOR)
@@ -227,7 +228,7 @@ def compare_gains(supervisor):
     """Tests 10 and 11; returns the cause, and the sensors or actuators, as bits."""
     s = record(supervisor, SUPERVISOR_T, 0)
     p, q = s.p, s.input
-    if s.sample == 0:  # a steady load is no motion
+    if s.compared == 0:  # a steady load is no motion
         held = p.stiffness
         start_gains(p.gains, q[0], q[1], held[0, 0] * q[0] + held[0, 1] * q[1], held[1, 0] * q[0] + held[1, 1] * q[1])
     rescaled, inverted = check_gains(p.gains, s.last, p.sensors, s.force[0], s.force[1])
@@ -317,7 +318,7 @@ def supervise(supervisor, sensed, position, drive, flags, n):
     if check_drive(supervisor, drive, n) and cause == 0:
         cause = DRIVE
     if p.modelled > 0:
-        if s.sample == 0:  # a steady load is no motion
+        if s.compared == 0:  # a steady load is no motion
             for i in range(2):
                 s.low[i] = s.high[i] = s.input[i]
         found, danger = check_motion(supervisor, s.peak > p.danger_drive)
@@ -328,6 +329,9 @@ def supervise(supervisor, sensed, position, drive, flags, n):
             found, which = compare_gains(supervisor)
             if found > 0 and cause == 0:
                 cause, s.sensors = found, which
+        s.compared = 1
+    else:
+        s.compared = 0
     if cause != 0 and s.cause == 0:
         s.cause, s.stopped = cause, s.sample
     if s.cause != 0:

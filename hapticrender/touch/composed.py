@@ -44,8 +44,8 @@ class SeparatedTexture:
     ----------
     texture : Texture
         In time, along the surface (`spatial` is true), or a `Sum` of both.
-    waveform : callable, optional
-        In place of the texture's own, in the device's quantity.
+    waveform_of : callable, optional
+        Of a part of the texture: its waveform in the device's quantity; by default its own.
 
     Attributes
     ----------
@@ -58,11 +58,11 @@ class SeparatedTexture:
         Its parts are in time and along the surface, and it is no sum.
     """
 
-    def __init__(self, texture: Texture, waveform: Any = None) -> None:
-        terms = _terms(texture) if waveform is None else ((texture, 1.0),)
+    def __init__(self, texture: Texture, waveform_of: Any = None) -> None:
+        terms = _terms(texture)
         for each, _ in terms:
             _refuse_mixed(each)
-        self._terms = [(each, waveform or each.waveform, gain) for each, gain in terms]
+        self._terms = [(each, waveform_of(each) if waveform_of else each.waveform, gain) for each, gain in terms]
         along = [bool(getattr(each, "spatial", False)) for each, _ in terms]
         self.timed, self.spatial = not all(along), any(along)
 

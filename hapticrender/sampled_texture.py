@@ -1,8 +1,7 @@
-"""A texture as compiled code reads it while it plays: samples in time, and a profile along the surface.
+"""A texture in memory as compiled code reads it: a ring of samples in time, and a profile along the surface.
 
-What lies in time is a ring of samples, which `Voice.fill` keeps a few seconds ahead; what lies along the surface is
-sampled once, `STEP` apart, and read in between by cubic interpolation, whose error at 25 points a wavelength is 1e-4.
-A texture's sum has both.
+`SampledTexture.fill` keeps the ring a few seconds ahead.  The profile is sampled once, `STEP` apart, and read by cubic
+interpolation, whose error at 25 points a wavelength is 1e-4.  A sum of textures has both.
 """
 
 from __future__ import annotations
@@ -17,24 +16,20 @@ from hapticrender.jit import F8, kernel, pointer, record
 from hapticrender.protocols import Texture
 from hapticrender.touch.composed import SeparatedTexture
 
-AHEAD = 2.0  # s: samples in time that are computed ahead; a busy process that is later hears its texture fade out
+AHEAD = 2.0  # s: samples in time that are computed ahead; of a program that is later the texture fades out
 CHUNK = 4096  # samples computed at once
 STEP, REACH = 2e-6, 0.15  # m: of the profile, and to either side of the surface's middle
 FADE = 0.04  # s: of one texture into another, and of what ends
 
-VOICE = np.dtype(
+TEXTURE = np.dtype(
     [
-        *((name, np.int64) for name in ("samples_at", "length", "written", "begun", "profile_at", "points")),
-        *((name, np.int64) for name in ("step", "controller", "signals", "analysed", "shared")),
+        *((name, np.int64) for name in ("samples_at", "length", "written", "begun", "profile_at", "points", "control")),
         *((name, np.float64) for name in ("start", "spacing", "fade")),
     ]
 )
-"""Ring of samples, how many were ever written, the sample at which the texture began; profile from `start` (m) on.
-
-Then the controller that plays it: its step, state and signals, whether it takes a waveform (else a factor), and the
-table of the state that it shares with others (see `control.state_transfer`).
-"""
-VOICE_T = numba.from_dtype(VOICE)
+"""Ring of samples, how many were ever written, the sample at which the texture began; profile from `start` (m) on; the
+record of the controller that plays it (`realtime_kernel.CONTROL`)."""
+TEXTURE_T = numba.from_dtype(TEXTURE)
 
 
 @kernel
@@ -45,9 +40,9 @@ def eased(x):
 
 
 @kernel
-def in_time(voice, sample):
+def in_time(texture, sample):
     """What lies in time, at a sample of the device's clock; fades out where nothing has been written yet."""
-    v = record(voice, VOICE_T, 0)
+    v = record(texture, TEXTURE_T, 0)
     k = sample - v.begun
     if v.length == 0 or k < 0 or k >= v.written:
         return 0.0
@@ -55,9 +50,9 @@ def in_time(voice, sample):
 
 
 @kernel
-def along_surface(voice, position):
+def along_surface(texture, position):
     """What lies along the surface, at a position (m): cubic interpolation; the ends of the profile go on."""
-    v = record(voice, VOICE_T, 0)
+    v = record(texture, TEXTURE_T, 0)
     if v.points == 0 or not abs(position) < 1e3:
         return 0.0
     profile = carray(pointer(v.profile_at, F8), v.points)
@@ -69,7 +64,7 @@ def along_surface(voice, position):
     return inner - high * ((2.0 - x) * profile[i - 1] + (1.0 + x) * profile[i + 2])
 
 
-class Voice:
+class SampledTexture:
     """A texture in memory.
 
     Parameters
@@ -77,8 +72,8 @@ class Voice:
     texture : Texture
         In time, along the surface (`spatial` is true), or a `Sum` of both.
     rate : float, Hz
-    waveform : callable, optional
-        In place of the texture's own, in the device's quantity.
+    waveform_of : callable, optional
+        Of a part of the texture: its waveform in the device's quantity; by default its own.
 
     Raises
     ------
@@ -86,24 +81,16 @@ class Voice:
         Its parts are in time and along the surface, and it is no sum; or a sample is not finite.
     """
 
-    def __init__(self, texture: Texture, rate: float, waveform: Any = None) -> None:
-        self.texture, self.rate, self._parts = texture, rate, SeparatedTexture(texture, waveform)
-        self.law: Any = None  # keeps the controller that plays it, and its signals, alive
+    def __init__(self, texture: Texture, rate: float, waveform_of: Any = None) -> None:
+        self.rate, self._parts = rate, SeparatedTexture(texture, waveform_of)
+        self.control: Any = None  # keeps the controller that plays it alive
         self._samples = np.zeros(2 * round(AHEAD * rate) if self._parts.timed else 0)
         places = np.arange(-REACH, REACH, STEP) if self._parts.spatial else np.zeros(0)
         self._profile = self._parts.along_surface(places)
-        self.record = np.zeros(1, VOICE)
-        values = {
-            "samples_at": self._samples.ctypes.data,
-            "length": len(self._samples),
-            "profile_at": self._profile.ctypes.data,
-            "points": len(self._profile),
-            "start": -REACH,
-            "spacing": STEP,
-            "fade": FADE * rate,
-        }
-        for name, value in values.items():
-            self.record[name] = value
+        self.record = np.zeros(1, TEXTURE)
+        self.record["samples_at"], self.record["length"] = self._samples.ctypes.data, len(self._samples)
+        self.record["profile_at"], self.record["points"] = self._profile.ctypes.data, len(self._profile)
+        self.record["start"], self.record["spacing"], self.record["fade"] = -REACH, STEP, FADE * rate
         self.address = int(self.record.ctypes.data)
         self.fill(0)
 

@@ -1,0 +1,278 @@
+"""The loop of live play: driver and controller of a rendering, block by block, through the real-time entry."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from hapticrender.analysis.two_touches import TouchWatch
+from hapticrender.bands import Bands
+from hapticrender.control.combined import CombinedBands, CombinedController, CombinedModel
+from hapticrender.control.device_model import DeviceModel
+from hapticrender.control.state_transfer import ready
+from hapticrender.control.supervisor import FADE_OUT, SupervisedController, design_supervisor
+from hapticrender.driver_checks import check_sensed
+from hapticrender.errors import HapticError, WatchdogTimeout
+from hapticrender.inferred import ContactLag
+from hapticrender.loop import device_fault, motion_of_sensors
+from hapticrender.protocols import Array, Controller, Flag, Rendering
+from hapticrender.realtime_entry import RealtimeEntry
+from hapticrender.realtime_kernel import HORIZON
+from hapticrender.sampled_texture import FADE, SampledTexture
+
+JUDGED = 0.25  # s: of signal that figures are of
+DEVICE = ("driver", "device", "plant")  # of a rendering: they stay where its texture changes
+RIDGE = 1e-4  # of the samples: bands that the time cannot tell apart share what there is, and do not blow up
+LEAST_TARGET = 1e-12  # in the device's unit: a smaller one has no error
+
+Row = tuple[float, float, float, float]  # frequency (Hz), target, achieved amplitude, relative error
+
+
+class LiveMotion:
+    """Motion of the finger on a simulated device that is played live: as the application has last set it."""
+
+    def __init__(self) -> None:
+        self._clock = 0.0  # s
+        self._last = (0.0, math.nan, 0.0, 0.0)  # since (s), position, velocity, load
+
+    def update(self, position: float, velocity: float, load: float) -> None:
+        """Set the finger (m, m/s, N)."""
+        self._last = (self._clock, position, velocity, load)
+
+    def position(self, time: Array) -> Array:
+        """Position (m) at `time` (s): at the last velocity, for `HORIZON` at most."""
+        time, (since, place, velocity, _) = np.asarray(time, float), self._last
+        self._clock = float(time[-1]) if time.size else self._clock
+        return place + velocity * np.clip(time - since, 0.0, HORIZON)
+
+    def load(self, time: Array) -> Array:
+        """Return the normal load (N)."""
+        return np.full(np.shape(time), self._last[3])
+
+
+class LiveLoop(RealtimeEntry):
+    """Driver and controller of a rendering in closed loop; the entry itself where the driver calls back.
+
+    Parameters
+    ----------
+    rendering : Rendering
+    **scales
+        Of the entry, for a driver that calls back.
+
+    Raises
+    ------
+    ValueError
+        The renderer designs no other controller than the scene's.
+    """
+
+    def __init__(self, rendering: Rendering, **scales: float) -> None:
+        super().__init__(live_controller(rendering), **scales)
+        _ = self.address if scales else self.plain_address  # compiled before anything is live
+        self.rendering, self.driver, self.model = rendering, rendering.driver, rendering.model
+        rows = len(self._arrays["log"])
+        self._true = np.full((rows, len(self.model.places) + 1), np.nan)  # motion and load, where the device knows them
+        self._knows_motion, self.senses = False, False  # whether the device knows its motion, and senses the finger
+        self._drive = np.zeros((self.driver.block, self.driver.drive_channels))
+        self._device: Any = rendering.driver if rendering.plant is None else rendering.plant
+        self._reshaping: tuple[Any, Any, int] | None = None  # before the device: from, to, since (sample)
+        self._reshaped: tuple[Any, Any, int] | None = None  # the one that is done
+        own = rendering.plant is not None
+        self._touches = TouchWatch(rendering.model, self.controller, active=not own, slows=False)
+        self._contact, self._followed = ContactLag(self.model.contact_lag), 0  # of the samples before this one
+        self.play(self._texture(rendering))
+
+    @property
+    def flags(self) -> Flag:
+        """Everything that was ever raised."""
+        return super().flags | self._touches.flags
+
+    def advance(self, sensing: bool) -> None:
+        """Exchange a block with the driver; `sensing`: its own sense of the finger is used, where it has one."""
+        sensed = check_sensed(self.driver, self.driver.play(self._drive), len(self.model.places))
+        at = (self.samples + np.arange(self.driver.block)) % len(self._true)
+        if sensed.motion is not None:
+            self._true[at, :-1], self._knows_motion = sensed.motion, True
+        if sensed.normal_load is not None:
+            self._true[at, -1] = sensed.normal_load
+        self.senses = sensed.position is not None
+        flags = 0 if sensed.flags is None else int(np.bitwise_or.reduce(sensed.flags))
+        self._touches.slow()
+        self._reshape()
+        self._drive = self.process(sensed.sensed, sensed.position if sensing else None, flags)
+
+    def _reshape(self) -> None:
+        """Take the characteristic before the device over to that of the present texture, while it fades in."""
+        change = self._reshaping
+        if change is None or change is self._reshaped:
+            return
+        before, shape, since = change
+        share = min((self.samples - since + self.driver.block) / (FADE * self.driver.rate), 1.0)
+        self._device.shape = shape.after(before, share)
+        if share == 1.0:
+            self._reshaped = change
+
+    def exchange(self, rendering: Rendering) -> None:
+        """Fade into the texture of another rendering of the same device.
+
+        A controller that takes waveforms goes on; else there is a new one for the texture's bands.
+
+        Raises
+        ------
+        ValueError
+            The texture cannot be played; the one before goes on.
+        """
+        whole = self.whole and self.controller.n_bands == 0
+        texture, controller = self._texture(rendering), self.controller if whole else live_controller(rendering)
+        model = joint_model(self.rendering.model, rendering.model)
+        for part, its_model in _parts(controller, model):
+            _widen(part, its_model)
+        if not whole:
+            ready(controller)
+        self.play(texture, controller)
+        if rendering.shape is not None:
+            self._reshaping = self._device.shape, rendering.shape, self.samples
+        self.rendering = replace(rendering, **{name: getattr(self.rendering, name) for name in DEVICE})
+        self.model = model
+
+    def signals(self, start: int) -> tuple[int, dict[str, Array]]:
+        """Signals of a recording from sample `start` on, as far back as they are kept, and the first one's number."""
+        derived = self.rendering.differentiated  # by central differences: a sample before, and one after
+        found = self.log(start - 1 if derived else start)
+        first = int(found.pop("first"))
+        if derived:
+            enough, skip = len(found["flags"]) > 2, int(first == start - 1)
+            found["reference"] = np.gradient(found["reference"]) * self.driver.rate if enough else found["reference"]
+            rows = slice(skip, -1 if enough else skip)
+            first, found = first + skip, {name: signal[rows] for name, signal in found.items()}
+        count = len(found["flags"])
+        true = self._true[(first + np.arange(count)) % len(self._true)]
+        found["normal_load"] = np.where(np.isnan(true[:, -1]), found["normal_load"], true[:, -1])
+        motion = true[:, :-1]  # NaN where nothing is sensed
+        if not self._knows_motion and found["sensed"].shape[1]:
+            follows = first == self._followed
+            contact = self._contact if follows else ContactLag(self.model.contact_lag)
+            motion = motion_of_sensors(self.model, found["sensed"], found["position"], contact)
+            if first >= self._followed:
+                self._contact, self._followed = contact, first + count
+        return first, found | {"motion": motion, "target": np.zeros((count, 0), complex)}
+
+    def watch_touches(self, signals: dict[str, Array], gap: int) -> None:
+        """Flag two touches in the signals that follow those of the last call, `gap` samples later."""
+        if gap and self._touches.monitor is not None:
+            self._touches.monitor.restart()
+        if len(signals["flags"]):
+            signals["flags"] = self._touches.update(signals)
+
+    @property
+    def motion_source(self) -> str:
+        """Where `motion` comes from."""
+        if self._knows_motion or not self.driver.sensed_channels:
+            return "true" if self._knows_motion else "unknown"
+        return "inferred" if self.model.inferred else "sensors"
+
+    def figures(self) -> list[Row]:
+        """What every band did over the last `JUDGED` seconds, see `band_figures`."""
+        first, signals = self.signals(self.samples - round(JUDGED * self.driver.rate))
+        return band_figures(self.rendering.bands, first, self.driver.rate, signals)
+
+    def fault(self) -> HapticError | None:
+        """Return why the drive was stopped, once it has faded out and stayed at zero for as long again."""
+        stopped = self.stopped
+        if stopped is None or self.samples < stopped + 2 * FADE_OUT * self.driver.rate + self.driver.delay:
+            return None
+        if self.timed_out:
+            return WatchdogTimeout(stopped / self.driver.rate)
+        return device_fault(self.rendering, self.running, stopped)
+
+    def _texture(self, rendering: Rendering) -> SampledTexture:
+        return SampledTexture(rendering.scene.texture, self.driver.rate, rendering.waveform_of)
+
+
+def live_controller(rendering: Rendering) -> Controller:
+    """Return a controller that takes any waveform where the method can; else of the scene's bands, times the gain."""
+    if rendering.design is None:
+        raise ValueError(f"{rendering.scene.device}: its renderer designs for a whole scene only: must set `design`")
+    try:
+        whole = replace(Bands.none(spatial=False), differentiated=rendering.differentiated)
+        return rendering.design(whole)
+    except ValueError:  # a method, or a device, that works band by band
+        return rendering.design(_modulated(rendering.bands))
+
+
+def _modulated(bands: Bands) -> Bands:
+    """Bands whose constant envelopes have a factor over time: the gain."""
+    if bands.envelope is None:
+        return bands
+    if isinstance(bands, CombinedBands):
+        return replace(bands, plate=_modulated(bands.plate), friction=_modulated(bands.friction), modulated=True)
+    return replace(bands, modulated=True)
+
+
+def _parts(controller: Any, model: Any) -> list[tuple[Any, DeviceModel]]:
+    """Controllers of the parts of a device, None where there is none, and their models."""
+    if isinstance(controller, CombinedController):
+        return list(zip(controller.parts, (model.plate, model.friction), strict=True))
+    return [(controller, model)]
+
+
+def _widen(controller: Any, model: DeviceModel) -> None:
+    """Let a controller, and its supervisor, do what `model` needs at most."""
+    if controller is None:
+        return
+    if isinstance(controller, SupervisedController):
+        p, designed = controller.state["p"], SupervisedController(controller.controller, model)
+        if not p["gains"][0]:  # the texture before was beyond the frequencies at which gains are tested
+            controller.gains, p["gains"] = designed.gains, designed.state["p"]["gains"]
+        settings = design_supervisor(controller.controller, model)
+        for name in sorted(settings, key="modelled".__eq__):  # which begins the tests that take the others
+            p[name] = settings[name]
+    controller.settings["drive_limit"] = model.drive_limit
+
+
+def joint_model(old: Any, new: Any) -> Any:
+    """Device model of the new scene, its drive limited by, and supervised for, what both scenes need."""
+    if isinstance(new, CombinedModel):
+        friction = new.friction and old.friction and joint_model(old.friction, new.friction)
+        return replace(new, plate=joint_model(old.plate, new.plate), friction=friction or new.friction)
+    model = replace(new, drive_limit=max(old.drive_limit, new.drive_limit))
+    if old.demand is None or new.demand is None:
+        return model
+    most = {name: max(getattr(old.demand, name), getattr(new.demand, name)) for name in ("motion", "drive", "highest")}
+    return replace(model, demand=replace(new.demand, **most, lowest=min(old.demand.lowest, new.demand.lowest)))
+
+
+@np.errstate(under="ignore")
+def band_figures(bands: Bands, first: int, rate: float, signals: dict[str, Array]) -> list[Row]:
+    """Frequency (Hz), target, achieved amplitude and relative error of every band; see `Row`.
+
+    Least squares by the normal equations and a `RIDGE`, which makes amplitudes 0.02 % too small.  Of a waveform without
+    bands the amplitudes are rms, and the frequency is 0.
+    """
+    reference, motion = signals["reference"], signals["motion"][:, 0]
+    if not len(reference) or not np.isfinite(motion).all():
+        return []
+    time, position = (first + np.arange(len(reference))) / rate, signals["position"]
+    motion = motion - motion.mean()
+    if not len(bands) or (bands.follows_finger and not np.isfinite(position).all()):
+        target, achieved, error = (float(np.sqrt(np.mean(each**2))) for each in (reference, motion, motion - reference))
+        return [(0.0, target, achieved, _share(error, target))]
+    phase = bands.carrier_phase(time, position).astype(np.float32)
+    waves = np.hstack([np.cos(phase), -np.sin(phase), np.ones((len(time), 1), np.float32)])
+    products = (waves.T @ waves).astype(float)
+    products[np.diag_indices(len(products))] += RIDGE * len(time)
+    values = np.stack([reference, motion], axis=1).astype(np.float32)
+    found = np.linalg.solve(products, (waves.T @ values).astype(float))
+    target, achieved = (found[: len(bands)] + 1j * found[len(bands) : -1]).T
+    speed = np.nan_to_num(abs(np.diff(position))).mean() * rate if len(time) > 1 else 0.0
+    frequency = bands.frequency + bands.wavenumber * speed
+    return [
+        (float(hertz), float(abs(desired)), float(abs(found)), _share(abs(found - desired), abs(desired)))
+        for hertz, desired, found in zip(frequency, target, achieved, strict=True)
+    ]
+
+
+def _share(error: float, target: float) -> float:
+    return float(error / target) if target > LEAST_TARGET else math.nan
