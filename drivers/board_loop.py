@@ -1,4 +1,4 @@
-"""A board in live play: the loop runs on the board, with the interface of `hapticrender.live.LiveLoop`."""
+"""A board in live play: the loop runs on the board, with the interface of `hapticrender.live_loop.LiveLoop`."""
 
 from __future__ import annotations
 
