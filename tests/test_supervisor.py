@@ -72,6 +72,17 @@ def test_a_sensor_that_lies_stops_the_drive_and_is_named(fault, frequency, truth
     assert not plate.is_open
 
 
+@pytest.mark.parametrize("truth", [{}, FINGER], ids=["free", "touched"])
+def test_the_texture_goes_on_with_every_second_sample(truth):
+    """Until test 1 stops it, after 46 ms; the damper's past had gaps once, and moved the plate by 1.3 mm."""
+    plate = Watched(lambda plate, sensed: sensed * (1.0 if len(plate.played) % 2 else np.nan), **truth)
+    with pytest.raises(hr.DeviceFault, match="sensor 1 and 2: samples are no numbers") as stopped:
+        hr.render(scene(20.0), driver=plate)
+    assert 40e-3 < stopped.value.time - START < 50e-3
+    first = round(START * RATE)
+    assert max(plate.motion[first:]) < 1.01 * max(plate.motion[first - 1000 : first])  # four periods
+
+
 def test_the_journal_of_a_stopped_run_is_whole_and_flagged(tmp_path):
     plate = Watched(FAULTS["frozen"][0])
     with pytest.raises(hr.DeviceFault) as stopped:

@@ -175,6 +175,14 @@ static void update_confidence(law_t *law, uint32_t invalid)
     law->confidence = real_clip(law->confidence + ((invalid != 0u) ? -step : step), REAL(0.0), REAL(1.0));
 }
 
+/* Damp the last deviations once more, for want of others: sets the forces in both coordinates. */
+static void hold_deviations(law_t *law, real_t force[2])
+{
+    for (uint32_t i = 0u; i < LAW_COORDINATES; i++) {
+        force[i] = damp(law, i, law->past[i][(law->sample - 1u) % LAW_PAST]);
+    }
+}
+
 /* Learn from the deviations, and damp them: sets the forces in both coordinates. */
 static void use_sensors(law_t *law, const real_t coordinates[2], uint32_t learns, real_t force[2])
 {
@@ -333,10 +341,12 @@ uint32_t law_step(
     update_confidence(law, invalid);
     if (!(law->confidence > REAL(0.0))) {
         learning_reset(law, 0u, LAW_PARAMETERS);
-    } else if ((invalid == 0u) && (law->design->learns != 0u)) {
-        use_sensors(law, coordinates, learns, force);
+    } else if (law->design->learns == 0u) {
+        /* open loop */
+    } else if (invalid != 0u) {
+        hold_deviations(law, force);
     } else {
-        /* nothing is known of this sample */
+        use_sensors(law, coordinates, learns, force);
     }
     if ((law->sample % REVERSION) == 0u) {
         learning_revert(law);

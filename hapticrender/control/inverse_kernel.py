@@ -278,8 +278,10 @@ def inverse_step(state, signals, start, count):
         samples[Y, 0] = samples[Y + 1, 0] = 0.0
         if update_confidence(state, implausible):
             reset_parameters(inverse, 0, PARAMETERS)
-        elif implausible == 0 and v.learns > 0:
-            if (
+        elif v.learns > 0:
+            if implausible > 0:  # the damper takes the last deviations: those of the samples before have to be in place
+                error0, error1 = c.past[0, (c.sample - 1) & 15], c.past[1, (c.sample - 1) & 15]
+            elif (
                 open_gate(state, inverse, error0)
                 and v.since > v.joined
                 and v.contact > 0.0
@@ -288,7 +290,7 @@ def inverse_step(state, signals, start, count):
                 suspect_lift(inverse)
             for i in range(c.p.coordinates):
                 error = error0 if i == 0 else error1
-                if learning:
+                if learning and implausible == 0:
                     learn(inverse, i, error)
                 samples[Y + i, 0] = damp(state, i, error)
         if v.sample % REVERSION == 0:
