@@ -1,19 +1,22 @@
 """Inject faults of sensors and coils into a plate that the library does not know, while a texture plays.
 
-Run: python -m benchmarks.faults
+Run: python -m benchmarks.faults [fault ...]; python -m benchmarks.faults exchanged
 
 The plate is that of ``tests/other_plate.py``.  Printed for every fault, over 10 and 50 um, without and with a heavy
 finger of 0.8 N: the time from the fault to the stop, how many runs stopped, the largest drive and the largest true
-motion of an end.
+motion of an end.  "exchanged" is apart: sensors exchanged on the plate of ``tests/strangers_plate.py``, 50 um, under a
+finger on and off its middle.
 """
 
 import sys
+from itertools import product
 
 import numpy as np
 
 import hapticrender as hr
 from hapticrender.touch.mechanics import HEAVY_SECOND
 from tests.other_plate import REACH, OtherPlate
+from tests.strangers_plate import StrangersPlate
 
 START, DURATION = 0.6, 1.6  # s: the fault, the end of a run that is not stopped
 FINGER = {"finger": (HEAVY_SECOND.mass, HEAVY_SECOND.damping, HEAVY_SECOND.stiffness), "load": 0.8}
@@ -95,7 +98,36 @@ def run(fault, frequency, amplitude, touched):
     return stopped, abs(drive).max(), max(plate.motion[first:]), message
 
 
+class Exchanged(StrangersPlate):
+    """A plate whose sensors are exchanged from `START` on."""
+
+    played = 0
+
+    def play(self, drive):
+        sensed = super().play(drive)
+        self.played += len(drive)
+        return sensed._replace(sensed=sensed.sensed[:, ::-1].copy()) if self.played > START * self.rate else sensed
+
+
+def exchanged():
+    """Print time and largest motion of an end for each frequency, place and load of the finger."""
+    for frequency, place, load in product((72.0, 189.0, 400.0), (0.0, 27.5e-3, 50e-3), (0.8, 2.0)):
+        touch = {"finger": (4e-3, 1.5, 300.0), "contact": lambda t: np.clip((t - 0.1) / 1e-3, 0.0, 1.0)}
+        plate = Exchanged(position=place, load=load, report_lag=5e-3, seed=2, **touch)
+        outcome = "no stop"
+        try:
+            hr.render(hr.Scene(texture=hr.Grating(frequency=frequency, amplitude=50e-6), duration=3.0), driver=plate)
+        except hr.DeviceFault as error:
+            outcome = f"{1e3 * (error.time - START):.0f} ms"
+        ends, first = np.asarray(plate.truth)[:, 1:3], round(START * plate.rate)
+        largest = abs(ends[first:] - ends[first - 1000 : first].mean(axis=0)).max()
+        print(f"{frequency:g} Hz, {load} N at {1e3 * place:g} mm: {outcome}, {1e6 * largest:.0f} um", flush=True)
+
+
 def main(names):
+    if names == ["exchanged"]:
+        exchanged()
+        return
     for fault in names or FAULTS:
         for frequency in (20.0, 72.0, 189.0, 400.0):
             runs = [run(fault, frequency, a, touched) for a in (10e-6, 50e-6) for touched in (False, True)]
