@@ -117,6 +117,12 @@ def _row(tag: str, cells: Sequence[str]) -> str:
     return f'<tr><{tag} class="text">{cells[0]}</{tag}>{"".join(f"<{tag}>{cell}</{tag}>" for cell in cells[1:])}</tr>'
 
 
+def _judged_row(tag: str, cells: Sequence[str], kind: str = "") -> str:
+    """Row of cells the last of which is a verdict, a text of its own class."""
+    *cells, judged = cells
+    return _row(tag, cells).replace("</tr>", f'<{tag} class="text wide {kind}">{judged}</{tag}></tr>')
+
+
 def _table(rows: Sequence[Sequence[str]]) -> str:
     """HTML of a table of texts whose first row is its head; nothing where there is no other."""
     head, *body = ([_whole(cell) for cell in row] for row in rows)
@@ -125,13 +131,12 @@ def _table(rows: Sequence[Sequence[str]]) -> str:
 
 def _overview(scenes: Sequence[Outputs]) -> str:
     """Table of all scenes, a row each, with a link to its section."""
-    (head, *rows), body = overview([scene.summary for scene in scenes]), []
-    for scene, (name, *cells, verdict_cell) in zip(scenes, rows, strict=True):
-        start = _row("td", [f'<a href="#{quote(name)}">{escape(name)}</a>', *map(_whole, cells)]).removesuffix("</tr>")
-        body.append(
-            f'{start}<td class="text wide {CLASSES[scene.summary["verdict"]]}">{_whole(verdict_cell)}</td></tr>'
-        )
-    return f"""{html_table(_row("th", head), body)}
+    head, *rows = overview([scene.summary for scene in scenes])
+    body = [
+        _judged_row("td", [f'<a href="#{quote(name)}">{escape(name)}</a>', *map(_whole, cells)], CLASSES[kind])
+        for (name, *cells), kind in zip(rows, (scene.summary["verdict"] for scene in scenes), strict=True)
+    ]
+    return f"""{html_table(_judged_row("th", head), body)}
 <p class="note">Amplitudes are peak values, achieved ones at the centre; a scene of several bands shows the root of the
 sum of their squares. The error is that of the whole waveform from 20 to 500 Hz, at the worst place.</p>"""
 
