@@ -134,17 +134,18 @@ class AudioDriver(BaseDriver):
         """Sound cards that are there now: the driver's argument, and what the card can do."""
         return [f"{each.index}  {each.name}: {each.about}" for each in cards()]
 
-    def _open(self) -> None:
-        """Open the card and start its stream, which plays zeros.
-
-        A DriverError where the loop's delay is unknown, or the displacement at full scale.
-        """
+    def check_calibrated(self) -> None:
+        """Refuse to close a loop whose delay, or displacement at full scale, is unknown, by a DriverError."""
         if self._unknown:
             raise DriverError(
                 f"{self}: {self._unknown[0]} is unknown, so the loop cannot be closed: connect output "
                 f"{self.channels[0]} to input {self.inputs[0]}, measure with `hapticrender latency --driver {self} "
                 "--out profile.toml`, give sensed_per_full_scale too, or leave out sensed_channels to drive open loop"
             )
+
+    def _open(self) -> None:
+        """Open the card and start its stream, which plays zeros."""
+        self.check_calibrated()
         output, inputs = self._side(self.channels, 1), self._side(self.inputs, 0)
         self._relay = Relay(*(tuple(n - 1 for n in each) for each in (self.inputs, self.channels)), self.block)
         self._queue = BlockQueue(self.block, self.sensed_channels, self.drive_channels, self._ahead)

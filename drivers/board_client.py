@@ -221,6 +221,7 @@ class BoardClient(OpenedInWith):
                 raise ValueError(f"{name} = {value!r} samples: must be {least} to 65535")
         start = stream, period
         self.started = self._steadily(lambda line: self._begin(line, start))
+        self._rows = Rows(self.started, start[0])
         self._setup, self._runs = self._setup._replace(start=start), True
         return self.started
 
@@ -229,7 +230,6 @@ class BoardClient(OpenedInWith):
         if texture is not None:
             line.play(texture)
         sample = line.begin(Kind.START, *start)
-        self._rows = Rows(sample, start[0])
         if texture is not None:
             texture.began = sample
         return sample
@@ -379,6 +379,7 @@ class BoardClient(OpenedInWith):
             line.set_bands(setup.bands)
         if setup.start is not None:
             self.started = self._begin(line, setup.start)
+            self._rows.restart(self.started)
 
     def _open_line(self) -> BoardLine:
         if self._error is not None:

@@ -28,16 +28,26 @@ class Rows:
         self._next = None if first is None else -(-first // self._stride) * self._stride
         self._rows: list[Array] = []
         self._last: Array | None = None
+        self._broken = False  # rows were lost, and nobody knows how many
 
     def __len__(self) -> int:
         return len(self._rows)
 
+    def restart(self, first: int) -> None:
+        """Go on with the same rows after the board began anew at sample `first`, on a clock that may be another."""
+        if self._missing(first) >= LONGEST_GAP:
+            self._next, self._broken = -(-first // self._stride) * self._stride, True
+
+    def _missing(self, first: int) -> int:
+        return 0 if self._next is None else (first - self._next) % WRAP // self._stride
+
     def add(self, block: Stream) -> None:
         """Append the rows of a frame, after those that were lost before it."""
-        rows = np.array(block.rows)
-        missing = 0 if self._next is None else (block.first - self._next) % WRAP // self._stride
+        rows, missing = np.array(block.rows), self._missing(block.first)
         if missing >= LONGEST_GAP or not len(rows):
             return  # of an earlier run
+        if self._broken:
+            rows[0, -1], self._broken = int(rows[0, -1]) | Flag.OVERRUN, False
         if missing:
             lost = np.array(rows[0] if self._last is None else self._last)
             lost[-1] = int(lost[-1]) | Flag.OVERRUN

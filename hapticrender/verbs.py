@@ -235,14 +235,18 @@ def identify(arguments: argparse.Namespace) -> int:
         if hasattr(driver, "driven_by_host"):  # a board, whose own loop is not what is identified
             driver = driver.driven_by_host()
         simulated = registered("drivers", "simulated")
+
+        def device(plant: Any) -> Any:
+            return simulated(plant) if driver is None else driver
+
         if scene.device == "ultrasonic":
-            with driver or simulated(UltrasonicPlate(setup.simulated.carrier_mode, Finger.absent(), seed)) as opened:
+            with device(UltrasonicPlate(setup.simulated.carrier_mode, Finger.absent(), seed)) as opened:
                 found = identify_resonance(opened, setup.assumed)
         elif scene.device == "electroadhesion":
-            with driver or simulated(ElectroadhesionScreen(setup.simulated, scene.finger, seed)) as opened:
+            with device(ElectroadhesionScreen(setup.simulated, scene.finger, seed)) as opened:
                 found = identify_screen(opened, setup.assumed, scene.finger)
         else:
-            with driver or simulated(Plate(setup.simulated, Finger.absent(), seed)) as opened:
+            with device(Plate(setup.simulated, Finger.absent(), seed)) as opened:
                 found = identify(opened, setup.assumed, seconds=arguments.seconds, amplitude=arguments.amplitude)
                 found = found.shortened(getattr(driver, "host_delay", 0))
     print(found.text())

@@ -39,6 +39,9 @@ class BaseRenderer:
         method = method_named(scene.method)
         if driver is not None:
             check_driver(driver)
+            getattr(
+                driver, "check_calibrated", lambda: None
+            )()  # what is unknown is refused before anything is designed
         setup = self.read(scene, driver)
         if driver is None:
             plant = self.plant(setup, scene.seed)

@@ -199,6 +199,8 @@ def test_no_loop_is_closed_with_what_is_unknown(known, unknown):
         )
         with pytest.raises(DriverError, match=message):
             driver.open()
+        with pytest.raises(DriverError, match=message):  # and before anything is designed for a delay that is none
+            hr.prepare(hr.Scene(texture=hr.Grating(frequency=60.0, amplitude=1e-5), duration=0.1), driver=driver)
 
 
 def test_a_driver_that_is_not_open_plays_nothing():

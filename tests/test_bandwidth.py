@@ -60,6 +60,14 @@ def test_gains_and_margins_are_the_recorded_ones(case):
         assert growth == pytest.approx(case["growth"][level], rel=1e-6, abs=1e-6)
 
 
+def test_a_sound_design_is_left_alone():
+    checked = checked_gains(MODEL, at(170.0), GAINS, taps=TAPS, least=USUAL)
+    assert checked.gains == GAINS
+    assert checked.notes == ()
+    assert set(checked.margins) == set(SCHEDULE)
+    assert all(margins.stable and margins.modulus >= 0.5 for margins in checked.margins.values())
+
+
 def test_a_bandwidth_too_wide_is_lowered_no_further_than_need_be():
     """An observer of 60 Hz on 20 Hz: unstable; lowered by quarter octaves until Ms <= 2."""
     wide = replace(GAINS, observer_high=2 * 2 * math.pi * 60.0 / RATE, integral_high=204.0)
@@ -90,6 +98,21 @@ def test_a_design_that_no_bandwidth_saves_is_refused():
     same = replace(GAINS, integral=17.0, integral_medium=17.0, integral_high=17.0, observer_high=GAINS.observer)
     with pytest.raises(DesignError, match=r"modulus margin 0\.8\d at 1\d\d(\.\d)? Hz is below 0\.90 \(low"):
         checked_gains(MODEL, at(170.0), same, least=LeastMargins(modulus=0.9))
+
+
+def test_carriers_locked_to_the_finger_are_checked_at_its_speeds():
+    """A grating and its third: their loops at five speeds, and the smallest of every margin."""
+    wavenumber, zero = np.array([1000.0, 3000.0]), np.zeros(2)
+    slow = replace(GAINS, observer_high=GAINS.observer, integral_high=GAINS.integral_medium)
+    checked = checked_gains(MODEL, zero, slow, wavenumber=wavenumber, least=LeastMargins(modulus=0.1, gain=1.1))
+    assert checked.notes == ()
+    loops = [
+        error_loop(MODEL, zero, slow, wavenumber=wavenumber, speed=speed)
+        for speed in np.geomspace(20.0 / 1000.0, 1000.0 / 3000.0, 5)
+    ]
+    assert loops[0].frequency.tolist() == [20.0, 60.0]
+    assert checked.margins["high"].modulus == pytest.approx(min(loop.margins().modulus for loop in loops), rel=1e-9)
+    assert checked.margins["high"].delay == pytest.approx(min(loop.margins().delay for loop in loops), rel=1e-9)
 
 
 def test_a_carrier_out_of_range_fades_out_and_crowded_ones_slow_down():

@@ -5,6 +5,7 @@ from test_kernel import RATE, friction_controller, plate_controller, tones
 
 from hapticrender.control.combined import CombinedBands, CombinedController
 from hapticrender.control.controller_design import ONE_SPEED
+from hapticrender.control.state_transfer import drive_limits
 from hapticrender.realtime_entry import RealtimeEntry
 
 VELOCITY_PER_FORCE = 0.64  # m/(N s)
@@ -54,6 +55,16 @@ def test_each_part_is_driven_as_on_its_own(rng):
     expected[PLATE_INDEX] += 1j * w * x[-1]
     expected[FRICTION_INDEX] += VELOCITY_PER_FORCE * force[-1]
     np.testing.assert_allclose(target[-1], expected, rtol=1e-9)  # the tracker's speed, after 0.4 s at 60 Hz
+
+
+def test_a_part_that_does_not_play_leaves_the_other_limits():
+    """A limit that is infinite would stay so in every exchange after it, for the larger of both counts."""
+    plate, friction = parts()
+    limits = [float(each.settings["drive_limit"]) for each in (plate, friction)]
+    np.testing.assert_array_equal(drive_limits(combined((plate, friction))), np.repeat(limits, (2, friction.channels)))
+    np.testing.assert_array_equal(
+        drive_limits(combined((None, friction))), np.repeat([0.0, limits[1]], (2, friction.channels))
+    )
 
 
 def test_it_plays_through_the_real_time_entry(rng):

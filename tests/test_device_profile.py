@@ -103,6 +103,10 @@ def test_a_scene_with_a_wrong_profile_gets_one_line(tmp_path, line, message):
     [
         ("[device]\nmass = 0.03", "profile.kind is missing: must be the name of a renderer, such as 'vt-plate'"),
         (
+            '[profile]\nkind = "vt-plate"\n[device]\nkind = "hybrid"',
+            "device.kind = 'hybrid': must be 'vt-plate', as in",
+        ),
+        (
             '[profile]\nkind = "vt-plate"\nmeasured_on = "yesterday"',
             "measured_on = 'yesterday': must be a date such as",
         ),

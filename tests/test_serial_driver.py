@@ -169,6 +169,29 @@ def test_the_command_identifies_the_plate_of_a_board(fast, tmp_path, monkeypatch
         assert found.device[name] == pytest.approx(getattr(expected, name), abs=8 * found.uncertainty[name])
 
 
+def test_a_run_goes_on_with_a_flag_after_its_board_was_lost(fast):
+    """0.7 s without a line, and 50 Hz: the rows before it stay, those that were lost are counted and flagged."""
+    scene = hr.Scene(texture=hr.Grating(frequency=50.0, amplitude=5e-6), duration=2.0)
+    wait = fast.sleep
+
+    def pull(seconds):
+        wait(seconds)
+        if fast.time > 0.5 and not fast.pulled:
+            fast.pulled = fast.time + 0.7
+
+    fast.sleep = pull
+    with driver_of(fast, reconnect=5.0) as driver:
+        recording = hr.render(scene, driver=driver)
+    assert driver.client.reconnections == 1
+    lost = np.flatnonzero(recording.read("flags") & hr.Flag.OVERRUN)
+    assert len(recording) == 10_000
+    assert 0.7 * RATE <= len(lost) < 0.8 * RATE  # and until it was found again
+    assert lost[0] > 0.4 * RATE
+    before = slice(round(0.2 * RATE), round(0.4 * RATE))
+    error = recording.read("sensed")[before].mean(axis=1) - recording.read("reference")[before].ravel()
+    assert np.sqrt((error**2).mean()) < 0.5 * 5e-6 / np.sqrt(2)  # in phase: noise of 1 um in two sensors, 0.2 of it
+
+
 def test_nothing_there_and_nothing_that_answers(tmp_path):
     with pytest.raises(DeviceNotFound, match="no-such-port: open: .*No such file"):
         BoardClient(str(tmp_path / "no-such-port")).open()

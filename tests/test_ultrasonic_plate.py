@@ -47,6 +47,34 @@ def test_the_mode_is_integrated_exactly_however_few_samples_a_cycle_has(rng, rat
     np.testing.assert_allclose(motion, expected, rtol=0, atol=n * 4 * ROUNDING * abs(expected).max())
 
 
+@pytest.mark.parametrize(("load", "pole", "settling", "quality"), [(0.0, 75.0, 2.1e-3, 200), (0.5, 250.0, 0.64e-3, 60)])
+def test_poles(load, pole, settling, quality):
+    """75 Hz free (2.1 ms, Q 200) and 250 Hz (0.64 ms, Q 60) with a finger, to the digits printed in docs/theory.md."""
+    parameters = UltrasonicParameters()
+    measured = float(parameters.pole(load))
+    assert abs(measured - pole) < 0.5
+    assert abs(1 / (2 * np.pi * measured) - settling) < 0.5 * (1e-4 if load == 0 else 1e-5)
+    assert abs(parameters.frequency / (2 * measured) - quality) < 0.5
+
+
+@pytest.mark.parametrize(
+    ("load", "offset", "percent", "degrees", "digits"),
+    [
+        (0.0, 10.0, -0.9, 7.6, 1),
+        (0.0, 30.0, -7, 22, 0),
+        (0.0, 150.0, -55, 63, 0),
+        (0.5, 60.0, -3, 13, 0),
+    ],
+)
+def test_what_detuning_costs(load, offset, percent, degrees, digits):
+    """1/(1 + j 2 Q df/f) at Q 200 and Q 60, to the last printed digit."""
+    parameters = UltrasonicParameters()
+    tuned = float(parameters.resonance(load))
+    ratio = parameters.dynamic_stiffness(tuned, load) / parameters.dynamic_stiffness(tuned + offset, load)
+    assert abs(100 * (abs(ratio) - 1) - percent) <= 0.5 * 10.0**-digits
+    assert abs(abs(np.angle(ratio, deg=True)) - degrees) <= 0.5 * 10.0**-digits
+
+
 def respond(parameters, frequency, finger=FREE):
     """Complex response (m/V) of the settled plate to a carrier: q of a cosine, and of a sine as its imaginary part."""
     load = 0.5 if finger is HELD else 0.0

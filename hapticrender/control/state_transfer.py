@@ -71,10 +71,16 @@ def ready(controller: Any) -> None:
 
 
 def drive_limits(controller: Any) -> Array:
-    """Limit of the drive in every channel (unit of the drive), shape (channels,); infinite where none is stated."""
+    """Limit of the drive in every channel (unit of the drive), shape (channels,).
+
+    It is 0 where a part does not play, infinite where its controller states none.
+    """
     parts = _parts(controller)
     channels = controller.part_channels if isinstance(controller, CombinedController) else (controller.channels,)
-    limits = [float(part.settings["drive_limit"]) if hasattr(part, "settings") else np.inf for part in parts]
+    limits = [
+        0.0 if each is None else float(each.settings["drive_limit"]) if hasattr(each, "settings") else np.inf
+        for each in parts
+    ]
     return np.repeat(limits, channels)
 
 

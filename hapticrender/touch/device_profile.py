@@ -153,11 +153,13 @@ class DeviceProfile(Validated):
         for key, value in table.items():
             bound = f"one of the tables {', '.join(known)}"
             checks.require(key in known and isinstance(value, Mapping), checks.plain(key), value, bound)
-        head = table.get("profile", {})
+        head, device = table.get("profile", {}), dict(table.get("device", {}))
         with checks.inside("profile"):
             checks.check_names(head, HEAD)
             checks.require("kind" in head, "kind", None, "the name of a renderer, such as 'vt-plate'")
-        return cls(**head, **{key: table[key] for key in known[1:] if key in table})
+        if (kind := device.pop("kind", head["kind"])) != head["kind"]:
+            checks.refuse("device.kind", kind, f"{head['kind']!r}, as in [profile]")
+        return cls(**head, device=device, **{key: table[key] for key in known[2:] if key in table})
 
     def to_toml(self) -> str:
         """TOML text that `from_table` reads back to an equal profile."""

@@ -239,7 +239,7 @@ def distinct_names(names: Iterable[str]) -> list[str]:
 def _read_scene(table: dict[str, Any], folder: Path, name: str) -> Scene:
     table = _with_profile(table, folder)
     _check_keys(table)
-    values: dict[str, Any] = {"duration": table.get("duration"), "name": table.get("name", name)}
+    values: dict[str, Any] = {"duration": table.get("duration"), "name": table.get("name", _usable(name))}
     for own, where in TABLES.items():
         rest = dict(table.get(where, {}))
         values |= {OWN[where, key]: rest.pop(key) for key in list(rest) if (where, key) in OWN}
@@ -276,6 +276,14 @@ def _check_keys(table: dict[str, Any]) -> None:
             checks.refuse(key, value, moved[key])
         checks.require(key not in TABLES.values() or isinstance(value, dict), key, value, "a table", TypeError)
     _only_known(table, ["name", "duration", "texture", "finger", *TABLES.values()])
+
+
+def _usable(name: str) -> str:
+    """Return the name of a file if it can be that of a scene, else "scene"."""
+    try:
+        return checks.name("name", name)
+    except ValueError:
+        return "scene"
 
 
 def _only_known(table: Mapping[str, Any], known: list[str]) -> None:
