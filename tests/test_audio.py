@@ -6,6 +6,7 @@ import tomllib
 import numpy as np
 import pytest
 
+import hapticrender as hr
 from hapticrender.cli import main
 from hapticrender.drivers import portaudio
 from hapticrender.drivers.audio import AudioDriver
