@@ -357,6 +357,8 @@ class BoardClient(OpenedInWith):
     def _recover(self, error: DriverError) -> None:
         """Find the board again and set it up as before; raise `error` where that fails for `reconnect` seconds."""
         end = self.clock.monotonic() + self.reconnect
+        for each in self._line.streamed if self._line is not None else ():
+            self._rows.add(each)
         while self.clock.monotonic() < end and not self._ending.is_set():
             try:
                 self._close_line()
