@@ -109,7 +109,7 @@ class BoardLine(Link):
             self.clock.sleep(PAUSE)
 
     def command(self, kind: Kind, *fields: float) -> Request:
-        """Send a command and return its answer; a ValueError or `DriverError` where it is refused."""
+        """Send a command and return its reply; a ValueError or `DriverError` where it is refused."""
         return self.send(kind, protocol.pack(kind, *fields))
 
     def send(self, kind: Kind, payload: bytes) -> Request:
@@ -117,7 +117,7 @@ class BoardLine(Link):
         return self._checked(self.request(kind, payload))
 
     def request(self, kind: Kind, payload: bytes) -> Request:
-        """Send a command and return its answer, a refusal too."""
+        """Send a command and return its reply, a refusal too."""
         return self._wait_for(self.submit(kind, payload))
 
     def begin(self, kind: Kind, *fields: float) -> int:

@@ -14,7 +14,7 @@ KEEP_ALIVE = 0.01  # s between two keep-alives, FINGER or HEARTBEAT: eight fit i
 FINGER_PERIOD = 0.005  # s between two FINGER frames at least
 MICROSECOND = 1e-6  # s: times that differ by less are the same
 RESEND = 0.03  # s after which a command without a reply is sent again
-FOREIGN = 3  # answers for another session in a row after which ours has ended
+FOREIGN = 3  # replies for another session in a row after which ours has ended
 MOST_STREAM = 4096  # frames of the stream that wait for the caller
 
 Finger = tuple[float, float, float, float]  # time (s), position (m, NaN: lifted), velocity (m/s), load (N)
@@ -34,7 +34,7 @@ class Request:
 
 
 class Link:
-    """One session with a board: greets it, sends keep-alives, and one command at a time until it is answered.
+    """One session with a board: greets it, sends keep-alives, and one command at a time until its reply.
 
     Parameters
     ----------
@@ -57,13 +57,13 @@ class Link:
         self._began, self._kept_alive = now, -math.inf
         self._reader = protocol.Reader()
         self._sequence = nonce & 0xFFFF
-        self._request: Request | None = None  # not answered yet
-        self._foreign = 0  # answers for another session, in a row
+        self._request: Request | None = None  # no reply yet
+        self._foreign = 0  # replies for another session, in a row
         self._partial: Telemetry | None = None  # of more bands than a frame holds
         self.greeting = self.submit(Kind.HELLO, protocol.pack(Kind.HELLO, protocol.VERSION, nonce))
 
     def submit(self, kind: Kind, payload: bytes) -> Request:
-        """Queue a command, a later `receive` takes its answer."""
+        """Queue a command, a later `receive` takes its reply."""
         self._request = Request(kind, payload)
         return self._request
 

@@ -271,7 +271,7 @@ def capabilities(payload: bytes) -> Capabilities:
 
 
 def reply(frame: Frame) -> tuple[int, Reason | None, int]:
-    """Kind of the command that an ACK or REFUSE answers, the reason of a refusal, and the sample; or a `ValueError`."""
+    """Kind of the command that an ACK or REFUSE belongs to, reason of a refusal, and sample; or a `ValueError`."""
     kind, *reason, sample = _fields(Kind(frame.kind), frame.payload)[0]
     return kind, Reason(reason[0]) if reason else None, sample
 

@@ -28,7 +28,7 @@ class Rows:
         self._next = None if first is None else -(-first // self._stride) * self._stride
         self._rows: list[Array] = []
         self._last: Array | None = None
-        self._broken = False  # rows were lost, and nobody knows how many
+        self._broken = False  # rows were lost; their number is unknown
 
     def __len__(self) -> int:
         return len(self._rows)
@@ -57,6 +57,6 @@ class Rows:
         self._next = (block.first + len(rows) * self._stride) % WRAP
 
     def take(self, count: int | None = None) -> Array:
-        """Return and forget the first `count` rows, all unless given; shape (n, columns)."""
+        """Remove and return the first `count` rows, all unless given; shape (n, columns)."""
         found, self._rows = self._rows[:count], self._rows[count:] if count is not None else []
         return np.array(found)

@@ -73,8 +73,8 @@ class LiveLoop(RealtimeEntry):
         _ = self.address if scales else self.plain_address  # compiled before anything is live
         self.rendering, self.driver, self.model = rendering, rendering.driver, rendering.model
         rows = len(self._arrays["log"])
-        self._true = np.full((rows, len(self.model.places) + 1), np.nan)  # motion and load, where the device knows them
-        self._knows_motion, self.senses = False, False  # whether the device knows its motion, and senses the finger
+        self._true = np.full((rows, len(self.model.places) + 1), np.nan)  # motion and load, where stated
+        self._has_motion, self.senses = False, False  # whether the device states its motion, and senses the finger
         self._drive = np.zeros((self.driver.block, self.driver.drive_channels))
         self._device: Any = rendering.driver if rendering.plant is None else rendering.plant
         self._reshaping: tuple[Any, Any, int] | None = None  # before the device: from, to, since (sample)
@@ -94,7 +94,7 @@ class LiveLoop(RealtimeEntry):
         sensed = check_sensed(self.driver, self.driver.play(self._drive), len(self.model.places))
         at = (self.samples + np.arange(self.driver.block)) % len(self._true)
         if sensed.motion is not None:
-            self._true[at, :-1], self._knows_motion = sensed.motion, True
+            self._true[at, :-1], self._has_motion = sensed.motion, True
         if sensed.normal_load is not None:
             self._true[at, -1] = sensed.normal_load
         self.senses = sensed.position is not None
@@ -151,7 +151,7 @@ class LiveLoop(RealtimeEntry):
         true = self._true[(first + np.arange(count)) % len(self._true)]
         found["normal_load"] = np.where(np.isnan(true[:, -1]), found["normal_load"], true[:, -1])
         motion = true[:, :-1]  # NaN where nothing is sensed
-        if not self._knows_motion and found["sensed"].shape[1]:
+        if not self._has_motion and found["sensed"].shape[1]:
             follows = first == self._followed
             contact = self._contact if follows else ContactLag(self.model.contact_lag)
             motion = motion_of_sensors(self.model, found["sensed"], found["position"], contact)
@@ -169,8 +169,8 @@ class LiveLoop(RealtimeEntry):
     @property
     def motion_source(self) -> str:
         """Where `motion` comes from."""
-        if self._knows_motion or not self.driver.sensed_channels:
-            return "true" if self._knows_motion else "unknown"
+        if self._has_motion or not self.driver.sensed_channels:
+            return "true" if self._has_motion else "unknown"
         return "inferred" if self.model.inferred else "sensors"
 
     def figures(self) -> list[Row]:

@@ -1,7 +1,7 @@
 """Start-up probe: check the wiring of a plate's sensors and actuators before the loop closes.
 
 For 200 ms both actuators play lines of their own, away from the modes, so that a resting finger changes little; the
-surface moves by a fortieth of the sensors' range.  The answer y is compared with that of the model under 169
+surface moves by a fortieth of the sensors' range.  The response y is compared with that of the model under 169
 hypotheses h (13 wirings, each with 13 delays) by the residual 1 - <y, y_h>/(|y| |y_h|), with offset, slope and
 parabola taken out of each sensor.
 """
@@ -52,7 +52,7 @@ class Found(NamedTuple):
 
     fault: str  # what is not as stated; "" where nothing was found
     residual: float  # of the wiring as stated
-    scale: float  # of the answer over that of the model, 1 where all is as stated
+    scale: float  # of the response over that of the model, 1 where all is as stated
     delay: int  # samples, of the loop
 
 
@@ -92,17 +92,17 @@ def probe_drive(model: DeviceModel) -> Array:
     drive = (gains[:, :, None] * np.sin(2 * np.pi * lines[:, :, None] * time + phases[:, None])).sum(axis=1).T
     drive *= np.sin(np.pi / 2 * edge)[:, None] ** 2
     limit = MOST_DRIVE * model.drive_limit / abs(drive).max()
-    return drive * min(MOTION * model.sensed_limit / abs(_answer(model, drive)).max(), limit)
+    return drive * min(MOTION * model.sensed_limit / abs(_response(model, drive)).max(), limit)
 
 
 def judge(model: DeviceModel, drive: Array, sensed: Array) -> Found:
-    """Compare what was sensed (n, 2) under `drive` (n, 2) with the model's answers, and name the deviation."""
+    """Compare what was sensed (n, 2) under `drive` (n, 2) with the responses of the model, and name the deviation."""
     stated = model.delay - model.block
     delays = range(max(stated - DELAYS // 2, 0), max(stated - DELAYS // 2, 0) + DELAYS)
     expected: dict[tuple[str, int], Array] = {}
     for name, (sensors, actuators) in WIRINGS.items():
-        answer = _answer(model, drive @ actuators.T) @ sensors.T
-        expected |= {(name, delay): _detrended(_late(answer, delay)) for delay in delays}
+        response = _response(model, drive @ actuators.T) @ sensors.T
+        expected |= {(name, delay): _detrended(_late(response, delay)) for delay in delays}
     valid = np.asarray((abs(sensed) < model.sensed_limit).all(axis=1))
     repeats = (np.diff(sensed, axis=0) == 0.0).mean(axis=0)
     if (~valid).mean() > MOST_INVALID:
@@ -132,7 +132,7 @@ def judge(model: DeviceModel, drive: Array, sensed: Array) -> Found:
     return Found(fault, residuals[own], scale, delay)
 
 
-def _answer(model: DeviceModel, drive: Array) -> Array:
+def _response(model: DeviceModel, drive: Array) -> Array:
     """What the free device's sensors show under a drive (n, channels), shape (n, sensors)."""
     plate = Sampled.free(model.mass, model.damping, model.stiffness, model.rate)
     forces, state = drive @ (plate.b @ model.force_from_drive).T, np.zeros(len(plate.a))
@@ -143,8 +143,8 @@ def _answer(model: DeviceModel, drive: Array) -> Array:
     return states @ (np.linalg.inv(model.coordinate_from_sensed) @ plate.c).T
 
 
-def _late(answer: Array, samples: int) -> Array:
-    return np.vstack([np.zeros((samples, answer.shape[1])), answer])[: len(answer)]
+def _late(response: Array, samples: int) -> Array:
+    return np.vstack([np.zeros((samples, response.shape[1])), response])[: len(response)]
 
 
 def _detrended(values: Array) -> Array:
