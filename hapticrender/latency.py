@@ -28,7 +28,7 @@ BURST, TAIL = 0.05, 0.5  # s: noise that is played; after it, the longest round 
 FEWEST = 2048  # samples of a burst
 BAND = (0.05, 0.4)  # of the rate
 LEAST_CORRELATION = 0.5  # of what is sensed with what was played
-WHOLE = 0.9  # correlation from which on a burst has come back whole, although samples were lost somewhere
+WHOLE = 0.995  # correlation from which on a burst has come back whole (its gain within 1 %), although samples were lost
 MOST_SPREAD = 0.5  # samples, between runs
 NEW_PROFILE = '[profile]\nkind = "vt-plate"  # or electroadhesion, ultrasonic, hybrid\n'
 TINY = float(np.finfo(float).tiny)
