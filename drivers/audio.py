@@ -151,7 +151,7 @@ class AudioDriver(BaseDriver):
         self._queue = BlockQueue(self.block, self.sensed_channels, self.drive_channels, self._ahead)
         self._queue_address, _ = self._queue.address, self._queue.blocks  # compiled before the stream starts
         addresses = self._relay.address, self._relay.user_data
-        self._stream = Stream(str(self), output, inputs, self.rate, self.block, *addresses)
+        self._stream = Stream(str(self), output, inputs, self.rate, self.block, *addresses, memory=self)
         atexit.register(self.close)  # the callback must not outlive the memory that it works in
         try:
             self._stream.start()
@@ -240,7 +240,8 @@ class AudioDriver(BaseDriver):
         self._relay.rest()
         self._settle()
         self.check()
-        self._entry, self._before = entry, self._relay.count("overruns")
+        self._entry, self._kept = entry, entry  # kept until another takes its place: a last call may be under way
+        self._before = self._relay.count("overruns")
         self._relay.call(address, entry.user_data)
 
     def stop(self) -> None:

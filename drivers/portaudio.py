@@ -25,6 +25,7 @@ FLOAT32 = 0x00000001  # paFloat32, interleaved
 ANTICIPATED_ERRORS = {-9985: "it is in use by another program, or does not exist any more"}  # paDeviceUnavailable
 HOST_ERROR = -9999  # paUnanticipatedHostError: PaHostErrorInfo has the details
 PATIENCE = 3.0  # s: longest wait for a stream to close
+RESTART = "restart the program"
 INSTALL = (
     "to get it: Debian and Ubuntu: apt install libportaudio2; Fedora: dnf install portaudio; "
     'macOS and Windows: pip install "hapticrender[audio]"'
@@ -98,6 +99,9 @@ FUNCTIONS: dict[str, tuple[Any, tuple[Any, ...]]] = {  # name: result, arguments
     "Pa_IsStreamActive": (c_int, (_STREAM,)),
     "Pa_GetStreamCpuLoad": (c_double, (_STREAM,)),
 }
+
+
+LEFT_BEHIND: list[Stream] = []  # streams that PortAudio did not close
 
 
 @dataclass(frozen=True)
@@ -174,13 +178,21 @@ def check(code: int, what: str) -> int:
 @contextmanager
 def initialised() -> Iterator[CDLL]:
     """Initialise PortAudio, which lists the cards anew unless it is in use, and terminate it afterwards."""
-    portaudio = load()
-    with _quiet():
-        check(portaudio.Pa_Initialize(), "audio: initialise")
+    portaudio = _initialise("audio")
     try:
         yield portaudio
     finally:
         portaudio.Pa_Terminate()
+
+
+def _initialise(name: str) -> CDLL:
+    """Initialise PortAudio; a `DriverError` where it is busy with a stream that did not close: it serves one thread."""
+    if LEFT_BEHIND:
+        raise DriverError(f"{name}: initialise: PortAudio has not returned from {LEFT_BEHIND[0].name}: {RESTART}")
+    portaudio = load()
+    with _quiet():
+        check(portaudio.Pa_Initialize(), f"{name}: initialise")
+    return portaudio
 
 
 @contextmanager
@@ -264,7 +276,9 @@ class Stream:
     frames : int
         Samples a call.
     callback, user_data : int
-        Addresses; both have to outlive the stream.
+        Addresses.
+    memory : object
+        What they point to and all that the callback uses: it is kept as long as PortAudio may call back.
     """
 
     def __init__(
@@ -276,10 +290,9 @@ class Stream:
         frames: int,
         callback: int,
         user_data: int,
+        memory: Any = None,
     ) -> None:
-        self.name, self._library = name, load()
-        with _quiet():
-            check(self._library.Pa_Initialize(), f"{name}: initialise")
+        self.name, self._library, self._memory = name, _initialise(name), memory
         self._handle: c_void_p | None = c_void_p()
         sides = [
             None if side is None else byref(StreamParameters(side[0], side[1], FLOAT32, side[2], None))
@@ -312,7 +325,8 @@ class Stream:
         Raises
         ------
         DriverError
-            PortAudio reports an error, or does not return (with JACK, where the server has died): it is left behind.
+            PortAudio reports an error, or does not return (with JACK, where the server has died): the stream is left
+            behind with its memory, and PortAudio is of no more use in this process.
         """
         handle, self._handle = self._handle, None
         if handle is None:
@@ -322,9 +336,8 @@ class Stream:
         release.start()
         release.join(PATIENCE)
         if release.is_alive():
-            raise DriverError(
-                f"{self.name}: close: PortAudio did not return within {PATIENCE:g} s: restart the program"
-            )
+            LEFT_BEHIND.append(self)
+            raise DriverError(f"{self.name}: close: PortAudio did not return within {PATIENCE:g} s: {RESTART}")
         if errors:
             raise errors[0]
 

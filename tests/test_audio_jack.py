@@ -279,14 +279,14 @@ def test_entries_that_do_not_fit_are_refused(connected):
 LOSE = """
 import signal
 import sys
-from contextlib import ExitStack, nullcontext
-from dataclasses import replace
+from contextlib import ExitStack, suppress
 from pathlib import Path
 
 import numpy as np
 
 import jack_ring
 from hapticrender.drivers.audio import AudioDriver
+from hapticrender.errors import DriverError
 
 folder, program = map(Path, sys.argv[1:3])
 with ExitStack() as stack:
@@ -300,6 +300,10 @@ with ExitStack() as stack:
         else:
             process.send_signal(signal.SIGSTOP)
         try:
+            if sys.argv[3] == "stays":
+                with suppress(DriverError):
+                    opened.close()
+                AudioDriver(jack_ring.CLIENT).open()
             for _ in range(100):
                 opened.play(np.zeros((64, 2)))
         finally:
@@ -312,6 +316,7 @@ with ExitStack() as stack:
     [
         ("ends", r"DeviceLost: audio:plate: the card stopped after \d+ samples: is it still connected"),
         ("halts", "DeviceTimeout: audio:plate: play: no block of 64 samples came within 2 s"),
+        ("stays", "DriverError: audio: initialise: PortAudio has not returned from audio:plate: restart the program"),
     ],
 )
 def test_a_card_that_goes_away_is_a_lost_device(program, tmp_path, server, message):
