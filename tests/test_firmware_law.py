@@ -26,6 +26,7 @@ from scipy.signal import butter, sosfiltfilt
 import hapticrender as hr
 from hapticrender.control.supervisor_kernel import (
     ACTIVE,
+    EXCHANGED,
     FROZEN,
     INCONSISTENT,
     INVALID,
@@ -133,31 +134,37 @@ def test_the_supervisor_equals_the_librarys(exports, fault, kind):
 
 
 class Rewired(OtherPlate):
-    """A plate whose sensors and coils are multiplied after 0.9 s; not probed."""
+    """A plate whose sensors and coils are multiplied by matrices after 0.9 s; not probed."""
 
     probe = False
 
-    def __init__(self, shown, moved):
-        super().__init__(seed=1)
+    def __init__(self, shown, moved, **finger):
+        super().__init__(seed=1, **finger)
         self.shown, self.moved = shown, moved
 
     def play(self, drive):
         if len(self.played) == 4500:
-            self._gamma, self._show = self.moved * self._gamma, self.shown * self._show
+            self._gamma, self._show = self._gamma @ self.moved, self.shown @ self._show
         return super().play(drive)
 
 
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize(
     ("shown", "moved", "cause", "named"),
-    [(-1.0, 1.0, RESCALED, "sensor 1 and 2"), (1.0, -1.0, INVERTED, "actuator 1 and 2")],
-    ids=["sensors inverted", "coils inverted"],
+    [
+        (-np.eye(2), np.eye(2), RESCALED, "sensor 1 and 2"),
+        (np.eye(2), -np.eye(2), INVERTED, "actuator 1 and 2"),
+        (np.eye(2)[::-1], np.eye(2), EXCHANGED, "sensor 1 and 2"),
+    ],
+    ids=["sensors inverted", "coils inverted", "sensors exchanged"],
 )
 def test_changes_of_gains_stop_both(exports, shown, moved, cause, named, kind):
     """The sensors of a closed loop that the library stopped, played back to both."""
     rendering = exports.rendering("tones")
+    tilt = {"finger": (4e-3, 1.5, 300.0), "load": 2.0, "position": 0.05} if cause == EXCHANGED else {}
+    scene, driver = replace(rendering.scene, finger=hr.Finger.absent(), duration=1.0), Rewired(shown, moved, **tilt)
     with pytest.raises(hr.DeviceFault, match=named) as stopped:
-        hr.render(replace(rendering.scene, finger=hr.Finger.absent(), duration=1.0), driver=Rewired(shown, moved))
+        hr.render(scene, driver=driver)
     sensed = np.ascontiguousarray(stopped.value.recording.sensed)
     n, position = len(sensed), np.full(len(sensed), np.nan)
     controller, law = rendering.controller(), exports.law("tones", kind, "supervised")

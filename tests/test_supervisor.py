@@ -147,6 +147,21 @@ def test_a_gain_that_changes_during_a_run_stops_the_drive_and_is_named(change, f
     assert not np.concatenate(plate.played)[quiet:].any()
 
 
+@pytest.mark.parametrize(
+    ("frequency", "position", "sensors"),
+    [(72.0, 0.0275, True), (189.0, 0.05, True), (400.0, -0.05, True), (189.0, 0.05, False), (400.0, -0.05, False)],
+)
+def test_what_is_exchanged_stops_the_drive_and_is_named(frequency, position, sensors):
+    """Two sensors, or else two coils, under 2 N off the middle; coils are found once the rocking grows (6 ms)."""
+    both, changed = np.eye(2), np.eye(2)[::-1]
+    plate = Rewired(*((changed, both) if sensors else (both, changed)), **FINGER | {"position": position, "load": 2.0})
+    with pytest.raises(hr.DeviceFault, match="sensor 1 and 2: each shows the motion of the other") as stopped:
+        hr.render(scene(frequency), driver=plate)
+    first = round(START * RATE)
+    assert 0 < stopped.value.time - START < 8e-3
+    assert max(plate.motion[first:]) < max(plate.motion[:first]) + 50e-6
+
+
 @pytest.mark.parametrize("position", [0.0, 0.05])
 @pytest.mark.parametrize("frequency", [72.0, 189.0])
 def test_a_hard_tap_is_no_change_of_a_gain(frequency, position):

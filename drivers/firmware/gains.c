@@ -9,6 +9,8 @@
 #define ACTUATOR 1u
 #define LEAST_INVERTED REAL(-1.6) /* gains of a sensor or an actuator that is inverted */
 #define MOST_INVERTED REAL(-0.4)
+#define LEAST_EXCHANGED REAL(0.6) /* share of an exchange */
+#define MOST_EXCHANGED REAL(1.4)
 #define DEAD REAL(0.25) /* of a sensor: a smaller magnitude is a fault, and a larger gain than this: */
 #define MOST_GAIN REAL(2.0)
 #define UNEXPLAINED REAL(0.1) /* of the energy of the innovations */
@@ -50,7 +52,9 @@ static void clear_sums(gains_t *s, uint32_t kind)
 {
     (void)memset(s->weighted[kind], 0, sizeof(s->weighted[kind]));
     (void)memset(s->weights[kind], 0, sizeof(s->weights[kind]));
+    (void)memset(s->exchange[kind], 0, sizeof(s->exchange[kind]));
     (void)memset(s->models[2u + 2u * kind], 0, 2u * sizeof(s->models[0]));
+    (void)memset(s->models[6u + kind], 0, sizeof(s->models[0]));
 }
 
 static real_t product(const real_t a[2], const real_t b[2]) { return a[0] * b[0] + a[1] * b[1]; }
@@ -67,6 +71,27 @@ static void add_sums(gains_t *s, uint32_t kind, real_t pole, const real_t w[2][2
     }
 }
 
+/* Add a sample of w of an exchange to its sums; those of actuators are means. */
+static void add_exchange(gains_t *s, uint32_t kind, real_t pole, const real_t w[2])
+{
+    const real_t kept = (kind == SENSOR) ? REAL(1.0) : (REAL(1.0) - pole);
+    s->exchange[kind][0] = kept * s->exchange[kind][0] + pole * product(w, w);
+    s->exchange[kind][1] = kept * s->exchange[kind][1] + pole * product(w, s->e);
+}
+
+/* Whether an exchange explains the innovations, of variance `noise`, and better than `faults` of gains. */
+static uint32_t judge_exchange(const gains_t *s, uint32_t kind, real_t noise, uint32_t faults)
+{
+    const real_t w = s->exchange[kind][0];
+    const real_t b = s->exchange[kind][1];
+    const real_t share = b / (w + noise);
+    const real_t rest = s->energy[kind] - REAL(2.0) * share * b + share * share * w;
+    const real_t bound = ((kind == SENSOR) ? UNEXPLAINED_INVERTED : UNEXPLAINED) * s->energy[kind];
+    const real_t most = (faults != 0u) ? s->rest : bound;
+    const uint32_t fits = ((share > LEAST_EXCHANGED) && (share < MOST_EXCHANGED) && (rest < most)) ? 1u : 0u;
+    return (share * share * (w + noise) < CERTAIN * noise) ? 0u : fits;
+}
+
 /* Whether a gain is that of a fault, with `rest` the share of the energy that it leaves unexplained. */
 static uint32_t is_fault(uint32_t kind, real_t gain, real_t rest)
 {
@@ -78,7 +103,7 @@ static uint32_t is_fault(uint32_t kind, real_t gain, real_t rest)
 }
 
 /* Find both gains, from innovations of variance `noise`; those that are faults, as bits. */
-static uint32_t judge_gains(const gains_t *s, uint32_t kind, real_t noise)
+static uint32_t judge_gains(gains_t *s, uint32_t kind, real_t noise)
 {
     const real_t energy = s->energy[kind];
     const real_t *b = s->weighted[kind];
@@ -91,6 +116,7 @@ static uint32_t judge_gains(const gains_t *s, uint32_t kind, real_t noise)
     const real_t rest = energy - REAL(2.0) * product(g, b) + g[0] * g[0] * w00 + REAL(2.0) * g[0] * g[1] * w01
         + g[1] * g[1] * w11;
     uint32_t faults = 0u;
+    s->rest = rest;
     for (uint32_t j = 0u; j < 2u; j++) {
         if ((g[j] * g[j] > CERTAIN * variance[j]) && (is_fault(kind, REAL(1.0) + g[j], rest / energy) != 0u)) {
             faults |= 1u << j;
@@ -99,8 +125,8 @@ static uint32_t judge_gains(const gains_t *s, uint32_t kind, real_t noise)
     return faults;
 }
 
-/* Add a sample to a trial; the sensors whose gain has changed at its end, as bits. */
-static uint32_t follow_sensors(gains_t *s, const gain_settings_t *p, const real_t force[2])
+/* Add a sample to a trial, and judge sensors at its end. */
+static void follow_sensors(gains_t *s, const gain_settings_t *p, const real_t force[2], gain_faults_t *faults)
 {
     const real_t none[2] = {REAL(0.0), REAL(0.0)};
     real_t w[2][2];
@@ -110,19 +136,27 @@ static uint32_t follow_sensors(gains_t *s, const gain_settings_t *p, const real_
         }
         w[j][j] += model_sensor(s->models[1], p, j);
     }
+    const real_t apart = model_sensor(s->models[1], p, 1u) - model_sensor(s->models[1], p, 0u);
+    const real_t exchanged[2] = {apart - model_sensor(s->models[6], p, 0u), -apart - model_sensor(s->models[6], p, 1u)};
     add_sums(s, SENSOR, REAL(1.0), (const real_t (*)[2])w);
+    add_exchange(s, SENSOR, REAL(1.0), exchanged);
     s->energy[SENSOR] += product(s->e, s->e);
     advance_model(s->models[1], p, force);
     for (uint32_t j = 0u; j < 2u; j++) {
         correct_model(s->models[2u + j], p, w[j], REAL(1.0));
         advance_model(s->models[2u + j], p, none);
     }
+    correct_model(s->models[6], p, exchanged, REAL(1.0));
+    advance_model(s->models[6], p, none);
     s->left -= 1u;
-    return (s->left == 0u) ? judge_gains(s, SENSOR, p->innovation) : 0u;
+    if (s->left == 0u) {
+        faults->rescaled = judge_gains(s, SENSOR, p->innovation);
+        faults->exchanged = judge_exchange(s, SENSOR, p->innovation, faults->rescaled);
+    }
 }
 
-/* Add a sample to the means; the actuators that are inverted, as bits. */
-static uint32_t follow_actuators(gains_t *s, const gain_settings_t *p, const real_t force[2])
+/* Add a sample to the means, and judge actuators. */
+static void follow_actuators(gains_t *s, const gain_settings_t *p, const real_t force[2], gain_faults_t *faults)
 {
     real_t w[2][2];
     for (uint32_t j = 0u; j < 2u; j++) {
@@ -130,16 +164,23 @@ static uint32_t follow_actuators(gains_t *s, const gain_settings_t *p, const rea
             w[j][i] = model_sensor(s->models[4u + j], p, i);
         }
     }
+    const real_t exchanged[2] = {model_sensor(s->models[7], p, 0u), model_sensor(s->models[7], p, 1u)};
     if (s->watched > p->duration / 2u) { /* by then w has forgotten where it began */
         add_sums(s, ACTUATOR, p->window_pole, (const real_t (*)[2])w);
+        add_exchange(s, ACTUATOR, p->window_pole, exchanged);
     }
     for (uint32_t j = 0u; j < 2u; j++) {
         const real_t own[2] = {product(p->force_of_actuator[j][0], force), product(p->force_of_actuator[j][1], force)};
         correct_model(s->models[4u + j], p, w[j], REAL(-1.0));
         advance_model(s->models[4u + j], p, own);
     }
-    const uint32_t found = judge_gains(s, ACTUATOR, p->window_pole * p->innovation);
-    return ((2u * s->watched > 3u * p->duration) && (s->energy[ACTUATOR] > LARGE * p->innovation)) ? found : 0u;
+    const real_t other[2] = {product(p->force_of_exchange[0], force), product(p->force_of_exchange[1], force)};
+    correct_model(s->models[7], p, exchanged, REAL(-1.0));
+    advance_model(s->models[7], p, other);
+    if ((2u * s->watched > 3u * p->duration) && (s->energy[ACTUATOR] > LARGE * p->innovation)) {
+        faults->inverted = judge_gains(s, ACTUATOR, p->window_pole * p->innovation);
+        faults->exchanged |= judge_exchange(s, ACTUATOR, p->window_pole * p->innovation, faults->inverted);
+    }
 }
 
 /* Find the innovations and their mean squares; whether one has jumped. */
@@ -156,14 +197,12 @@ static uint32_t note_innovations(gains_t *s, const gain_settings_t *p, const rea
     return jump;
 }
 
-uint32_t gains_check(
-    gains_t *gains, const gain_settings_t *used, const real_t sensed[], const real_t force[2], uint32_t *inverted)
+gain_faults_t gains_check(gains_t *gains, const gain_settings_t *used, const real_t sensed[], const real_t force[2])
 {
     gains_t *s = gains;
     const gain_settings_t *p = used;
-    uint32_t rescaled = 0u;
+    gain_faults_t faults = {0u, 0u, 0u};
     const uint32_t jump = note_innovations(s, p, sensed);
-    *inverted = 0u;
     if ((jump != 0u) && (s->left == 0u)) {
         clear_sums(s, SENSOR);
         s->left = p->duration;
@@ -171,11 +210,11 @@ uint32_t gains_check(
         (void)memcpy(s->models[1], s->models[0], sizeof(s->models[1]));
     }
     if (s->left > 0u) {
-        rescaled = follow_sensors(s, p, force);
+        follow_sensors(s, p, force, &faults);
     }
     if (s->energy[ACTUATOR] > WATCHED * p->innovation) {
         s->watched += 1u;
-        *inverted = follow_actuators(s, p, force);
+        follow_actuators(s, p, force, &faults);
     } else if (s->watched != 0u) {
         clear_sums(s, ACTUATOR);
         s->watched = 0u;
@@ -184,5 +223,6 @@ uint32_t gains_check(
     }
     correct_model(s->models[0], p, s->e, REAL(1.0));
     advance_model(s->models[0], p, force);
-    return rescaled;
+    faults.exchanged = (LAW_SENSORS == 2u) ? faults.exchanged : 0u;
+    return faults;
 }

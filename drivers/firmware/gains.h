@@ -19,20 +19,23 @@ typedef struct {
     real_t filter_gain[6][2];                         /* of these and of the force that wanders, per innovation */
     real_t sensor_from_coordinate[2][2];
     real_t force_of_actuator[2][2][2];
+    real_t force_of_exchange[2][2]; /* of exchanged actuators less these, per force; 0 where there are not two */
 } gain_settings_t;
 
 typedef struct {
-    real_t models[6][6]; /* the filter's state, p, xi_1, xi_2, zeta_1, zeta_2 */
+    real_t models[8][6]; /* the filter's state, p, xi_1, xi_2, zeta_1, zeta_2; xi and zeta of an exchange */
     real_t e[2], mean[2];
-    real_t energy[2], weights[2][2][2], weighted[2][2];
+    real_t energy[2], weights[2][2][2], weighted[2][2], exchange[2][2];
+    real_t rest; /* of the energy of the innovations, that the gains leave unexplained */
     uint32_t left, watched;
 } gains_t;
 
-/*
- * Compare a sample's sensors with the motion that device and force (N, N, from this sample on) give; returns the
- * sensors whose gain has changed, as bits, and in `inverted` the actuators that are.
- */
-uint32_t gains_check(
-    gains_t *gains, const gain_settings_t *used, const real_t sensed[], const real_t force[2], uint32_t *inverted);
+/* What has changed: sensors whose gain has, and actuators that are inverted, as bits; whether sensors are exchanged. */
+typedef struct {
+    uint32_t rescaled, inverted, exchanged;
+} gain_faults_t;
+
+/* Compare a sample's sensors with the motion that device and force (N, N, from this sample on) give. */
+gain_faults_t gains_check(gains_t *gains, const gain_settings_t *used, const real_t sensed[], const real_t force[2]);
 
 #endif

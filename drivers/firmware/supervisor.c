@@ -293,21 +293,25 @@ static uint32_t cool(supervisor_t *s, law_t *law, real_t drive[])
     return flags;
 }
 
-/* Tests 10 and 11: whether a sensor or an actuator has changed its gain. */
+/* Tests 10 to 12: whether a sensor or an actuator has changed its gain, or sensors are exchanged. */
 static supervisor_cause_t compare_gains(supervisor_t *s, supervisor_cause_t cause)
 {
-    uint32_t inverted = 0u;
-    uint32_t rescaled = gains_check(&s->gains, &s->p->gains, s->last, s->force, &inverted);
+    gain_faults_t found = gains_check(&s->gains, &s->p->gains, s->last, s->force);
     for (uint32_t i = 0u; i < LAW_SENSORS; i++) {
         if (2u * s->repeats[i] > s->p->frozen_time) { /* that is for test 2 to find */
-            rescaled &= ~(1u << i);
+            found.rescaled &= ~(1u << i);
+            found.exchanged = 0u;
         }
     }
-    if ((cause != SUPERVISOR_FINE) || ((rescaled | inverted) == 0u)) {
+    if ((cause != SUPERVISOR_FINE) || ((found.rescaled | found.exchanged | found.inverted) == 0u)) {
         return cause;
     }
-    s->stopped_sensors = (rescaled != 0u) ? rescaled : inverted;
-    return (rescaled != 0u) ? SUPERVISOR_RESCALED : SUPERVISOR_INVERTED;
+    if (found.exchanged != 0u) {
+        s->stopped_sensors = 3u;
+        return SUPERVISOR_EXCHANGED;
+    }
+    s->stopped_sensors = (found.rescaled != 0u) ? found.rescaled : found.inverted;
+    return (found.rescaled != 0u) ? SUPERVISOR_RESCALED : SUPERVISOR_INVERTED;
 }
 
 /* All tests of a sample; returns what failed first, and whether there is danger. */

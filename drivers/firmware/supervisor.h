@@ -23,7 +23,8 @@ typedef enum {
     SUPERVISOR_OVERMOTION,
     SUPERVISOR_BEYOND,
     SUPERVISOR_RESCALED,
-    SUPERVISOR_INVERTED
+    SUPERVISOR_INVERTED,
+    SUPERVISOR_EXCHANGED
 } supervisor_cause_t;
 
 /* Settings, from `hapticrender export`; poles and fades are per sample, times in samples. */

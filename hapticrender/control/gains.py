@@ -10,11 +10,19 @@ sensor alone and p the filter's state, from now on without corrections::
 
     w_i = c_i p - C xi_i,                    xi_i[n+1] = A (xi_i[n] + K w_i[n])
 
+Sensors that show each other's motion from now on add h w with h = 1, and xi of its own::
+
+    w = (c_2 - c_1, c_1 - c_2) p - C xi
+
 An actuator j that gives g_j times its force F_j adds (g_j - 1) w_j::
 
     w_j = C zeta_j,                          zeta_j[n+1] = A (zeta_j[n] - K w_j[n]) + B F_j[n]
 
-Least squares of e on w find g, of both sensors or of both actuators.
+and under actuators that give each other's force, or sensors that were exchanged where p showed no difference::
+
+    w = C zeta,        zeta[n+1] = A (zeta[n] - K w[n]) + B (F_exchanged[n] - F[n])
+
+Least squares of e on w find g, of both sensors or of both actuators, and h.
 
 Sensors are judged over the 3 ms after an innovation above 4.5 times its noise, and its mean square before: a finger's
 force makes no jump, what it adds to e is no multiple of w.  Actuators are judged by means over 3 ms, while e is large:
@@ -42,7 +50,8 @@ MOST = 2  # sensors, and actuators
 SENSOR, ACTUATOR = range(2)  # kinds of gains
 LEAST_INVERTED, MOST_INVERTED = -1.6, -0.4  # gains of a sensor or an actuator that is inverted
 DEAD, MOST_GAIN = 0.25, 2.0  # of a sensor: a smaller magnitude, a larger gain is a fault
-UNEXPLAINED, UNEXPLAINED_INVERTED = 0.1, 0.2  # of the energy of e; the latter of an inverted sensor
+LEAST_EXCHANGED, MOST_EXCHANGED = 0.6, 1.4  # h
+UNEXPLAINED, UNEXPLAINED_INVERTED = 0.1, 0.2  # of the energy of e; the latter of inverted or exchanged sensors
 CERTAIN, JUMP = 25.0, 20.0  # variances: 5 sigma of a gain; 4.5 sigma of an innovation
 WATCHED, LARGE = 4.0, 20.0  # variances of e: actuators are followed, judged
 WANDER = 3.5  # N/sqrt(s), of d
@@ -55,16 +64,19 @@ GAINS = np.dtype(
         ("filter_gain", np.float64, (6, MOST)),  # K
         ("sensor_from_coordinate", np.float64, (MOST, 2)),  # of C
         ("force_of_actuator", np.float64, (MOST, 2, 2)),  # F_j per F
+        ("force_of_exchange", np.float64, (2, 2)),  # F_exchanged - F per F
         ("scale", np.float64),  # 1/m: e and C are in units of the sensors' noise
         ("innovation", np.float64),  # variance of e of each sensor by noise, as a multiple of its own
         *((name, np.float64) for name in ("mean_pole", "window_pole")),  # a sample
         ("duration", np.int64),  # samples of a trial
-        ("models", np.float64, (6, 6)),  # x, p, xi_1, xi_2, zeta_1, zeta_2
+        ("models", np.float64, (8, 6)),  # x, p, xi_1, xi_2, zeta_1, zeta_2; xi and zeta of an exchange
         ("advanced", np.float64, (4,)),
         ("w", np.float64, (2, MOST)),  # w_1 and w_2, of both sensors
         *((name, np.float64, (MOST,)) for name in ("e", "mean", "energy")),  # mean of e^2 of a sensor; sums of e^2
         ("weights", np.float64, (2, 2, 2)),  # sums of w_i w_j of sensors, of actuators
         *((name, np.float64, (2, 2)) for name in ("weighted", "gain")),  # sums of w_i e
+        ("exchange", np.float64, (2, 2)),  # sums of w w and w e of an exchange
+        ("rest", np.float64),  # of the energy of e, that the gains leave unexplained
         *((name, np.int64) for name in ("left", "watched")),  # samples: to go in the trial; with actuators followed
     ]
 )
@@ -94,6 +106,8 @@ def design_gains(model: DeviceModel, noise: float) -> Array | None:
     found["sensor_from_coordinate"][0][:sensors, :n] = show[:, :n]
     shares = np.einsum("aj,jb->jab", force_map, np.linalg.pinv(force_map))
     found["force_of_actuator"][0][:actuators, :n, :n] = shares
+    if actuators == MOST:
+        found["force_of_exchange"] = force_map @ np.eye(MOST)[::-1] @ np.linalg.pinv(force_map) - np.eye(n)
     found["scale"], found["innovation"] = 1.0 / noise, variance
     found["mean_pole"], found["window_pole"] = (-math.expm1(-1.0 / (t * model.rate)) for t in (MEAN, WINDOW))
     found["duration"] = max(round(TRIAL * model.rate), LEAST_TRIAL)
@@ -145,8 +159,9 @@ def clear_sums(gains, kind):
     s = record(gains, GAINS_T, 0)
     for j in range(2):
         s.weighted[kind, j] = s.weights[kind, j, 0] = s.weights[kind, j, 1] = 0.0
+        s.exchange[kind, j] = 0.0
         for i in range(6):
-            s.models[2 + 2 * kind + j, i] = 0.0
+            s.models[2 + 2 * kind + j, i] = s.models[6 + kind, i] = 0.0
 
 
 @kernel
@@ -178,6 +193,7 @@ def judge_gains(gains, kind, noise):
     g0, g1 = scale * (w11 * b[0] - w[0, 1] * b[1]), scale * (w00 * b[1] - w[0, 1] * b[0])
     rest = s.energy[kind] - 2.0 * (g0 * b[0] + g1 * b[1])
     rest += g0 * g0 * w[0, 0] + 2.0 * g0 * g1 * w[0, 1] + g1 * g1 * w[1, 1]
+    s.rest = rest
     s.gain[kind, 0], s.gain[kind, 1] = 1.0 + g0, 1.0 + g1
     for j in range(2):
         g, variance = (g0, w11) if j == 0 else (g1, w00)
@@ -187,38 +203,75 @@ def judge_gains(gains, kind, noise):
 
 
 @kernel
+def add_exchange(gains, kind, pole, w0, w1):
+    """Add a sample of w of an exchange to its sums; with a `pole` below 1 these are means."""
+    s = record(gains, GAINS_T, 0)
+    x, kept = s.exchange[kind], 1.0 if kind == SENSOR else 1.0 - pole
+    x[0] = kept * x[0] + pole * (w0 * w0 + w1 * w1)
+    x[1] = kept * x[1] + pole * (w0 * s.e[0] + w1 * s.e[1])
+
+
+@kernel
+def judge_exchange(gains, kind, noise, faults):
+    """Whether an exchange explains the innovations, of variance `noise`, and better than `faults` of gains."""
+    s = record(gains, GAINS_T, 0)
+    w, b, energy = s.exchange[kind, 0], s.exchange[kind, 1], s.energy[kind]
+    share = b / (w + noise)
+    rest = energy - 2.0 * share * b + share * share * w
+    if share * share * (w + noise) < CERTAIN * noise or not LEAST_EXCHANGED < share < MOST_EXCHANGED:
+        return False
+    bound = UNEXPLAINED_INVERTED if kind == SENSOR else UNEXPLAINED
+    return rest < (s.rest if faults > 0 else bound * energy)
+
+
+@kernel
 def follow_sensors(gains, force0, force1):
-    """Add a sample to a trial; the sensors whose gain has changed at its end, as bits."""
+    """Add a sample to a trial; at its end the sensors whose gain has changed, as bits, and whether they exchanged."""
     s = record(gains, GAINS_T, 0)
     for j in range(2):
         for i in range(2):
             s.w[j, i] = (model_sensor(gains, 1, i) if i == j else 0.0) - model_sensor(gains, 2 + j, i)
     add_sums(gains, SENSOR, 1.0)
+    apart = model_sensor(gains, 1, 1) - model_sensor(gains, 1, 0)
+    exchanged0, exchanged1 = apart - model_sensor(gains, 6, 0), -apart - model_sensor(gains, 6, 1)
+    add_exchange(gains, SENSOR, 1.0, exchanged0, exchanged1)
     s.energy[SENSOR] += s.e[0] * s.e[0] + s.e[1] * s.e[1]
     advance_model(gains, 1, force0, force1)
     for j in range(2):
         correct_model(gains, 2 + j, s.w[j, 0], s.w[j, 1])
         advance_model(gains, 2 + j, 0.0, 0.0)
+    correct_model(gains, 6, exchanged0, exchanged1)
+    advance_model(gains, 6, 0.0, 0.0)
     s.left -= 1
-    return judge_gains(gains, SENSOR, s.innovation) if s.left == 0 else 0
+    if s.left > 0:
+        return 0, False
+    found = judge_gains(gains, SENSOR, s.innovation)
+    return found, judge_exchange(gains, SENSOR, s.innovation, found)
 
 
 @kernel
 def follow_actuators(gains, force0, force1):
-    """Add a sample to the means; the actuators that are inverted, as bits."""
+    """Add a sample to the means; the actuators that are inverted, as bits, and whether they are exchanged."""
     s = record(gains, GAINS_T, 0)
     for j in range(2):
         for i in range(2):
             s.w[j, i] = model_sensor(gains, 4 + j, i)
+    exchanged0, exchanged1 = model_sensor(gains, 7, 0), model_sensor(gains, 7, 1)
     if s.watched > s.duration // 2:  # by then w has forgotten where it began
         add_sums(gains, ACTUATOR, s.window_pole)
+        add_exchange(gains, ACTUATOR, s.window_pole, exchanged0, exchanged1)
     for j in range(2):
         own = s.force_of_actuator[j]
         correct_model(gains, 4 + j, -s.w[j, 0], -s.w[j, 1])
         advance_model(gains, 4 + j, own[0, 0] * force0 + own[0, 1] * force1, own[1, 0] * force0 + own[1, 1] * force1)
-    found = judge_gains(gains, ACTUATOR, s.window_pole * s.innovation)
-    known = 2 * s.watched > 3 * s.duration
-    return found if known and s.energy[ACTUATOR] > LARGE * s.innovation else 0
+    own = s.force_of_exchange
+    correct_model(gains, 7, -exchanged0, -exchanged1)
+    advance_model(gains, 7, own[0, 0] * force0 + own[0, 1] * force1, own[1, 0] * force0 + own[1, 1] * force1)
+    noise = s.window_pole * s.innovation
+    if 2 * s.watched <= 3 * s.duration or s.energy[ACTUATOR] <= LARGE * s.innovation:
+        return 0, False
+    found = judge_gains(gains, ACTUATOR, noise)
+    return found, judge_exchange(gains, ACTUATOR, noise, found)
 
 
 @kernel
@@ -238,25 +291,30 @@ def note_innovations(gains, sensed, sensors):
 
 @kernel
 def check_gains(gains, sensed, sensors, force0, force1):
-    """Sensors and actuators whose gain has changed, as bits; `force0` and `force1` (N) act from this sample on."""
+    """Sensors and actuators whose gain has changed, as bits, and whether two sensors show each other's motion.
+
+    `force0` and `force1` (N) act from this sample on.
+    """
     s = record(gains, GAINS_T, 0)
     rescaled = inverted = 0
+    exchanged = False
     if note_innovations(gains, sensed, sensors) and s.left == 0:
         clear_sums(gains, SENSOR)
         s.left, s.energy[SENSOR] = s.duration, 0.0
         for i in range(6):
             s.models[1, i] = s.models[0, i]
     if s.left > 0:
-        rescaled = follow_sensors(gains, force0, force1)
+        rescaled, exchanged = follow_sensors(gains, force0, force1)
     if s.energy[ACTUATOR] > WATCHED * s.innovation:
         s.watched += 1
-        inverted = follow_actuators(gains, force0, force1)
+        inverted, swapped = follow_actuators(gains, force0, force1)
+        exchanged = exchanged or swapped
     elif s.watched > 0:
         clear_sums(gains, ACTUATOR)
         s.watched = 0
     correct_model(gains, 0, s.e[0], s.e[1])
     advance_model(gains, 0, force0, force1)
-    return rescaled, inverted
+    return rescaled, inverted, exchanged and sensors == MOST
 
 
 @kernel

@@ -19,6 +19,7 @@ from hapticrender.control.supervisor_kernel import (
     ACTIVE,
     BEYOND,
     DRIVE,
+    EXCHANGED,
     FROZEN,
     INCONSISTENT,
     INVALID,
@@ -57,10 +58,10 @@ UNLIMITED = 1e300
 class Fault(NamedTuple):
     """Why a supervisor has stopped the drive."""
 
-    cause: int  # INVALID to INVERTED
+    cause: int  # INVALID to EXCHANGED
     sample: int  # at which the test failed; the drive fades out from it on
-    sensors: int  # bit i: sensor i + 1; of INVALID, FROZEN, BEYOND and RESCALED; actuator of INVERTED
-    gains: tuple[float, ...] = ()  # of all sensors or actuators, over those before; of the last two
+    sensors: int  # bit i: sensor i + 1; of INVALID, FROZEN, BEYOND, RESCALED and EXCHANGED; actuator of INVERTED
+    gains: tuple[float, ...] = ()  # of all sensors or actuators, over those before; of RESCALED and INVERTED
 
     @property
     def text(self) -> str:
@@ -117,6 +118,10 @@ CAUSES = {
         "actuator {sensor}: the motion is that of {gain} times its drive; most likely it is inverted, or sensors are",
         "wiring and polarity of all actuators and sensors",
     ),
+    EXCHANGED: (
+        "sensor {sensor}: each shows the motion of the other; most likely they are exchanged, or the actuators",
+        "wiring of all sensors and actuators",
+    ),
 }
 
 
@@ -157,7 +162,7 @@ class SupervisedController:
     def fault(self) -> Fault | None:
         """Why and when the drive has been stopped."""
         cause, sample, sensors = (int(self.state[name][0]) for name in ("cause", "stopped", "sensors"))
-        gains = tuple(self.gains["gain"][0, cause - RESCALED].tolist()) if cause >= RESCALED else ()
+        gains = tuple(self.gains["gain"][0, cause - RESCALED].tolist()) if cause in (RESCALED, INVERTED) else ()
         return Fault(cause, sample, sensors, gains) if cause else None
 
     @property

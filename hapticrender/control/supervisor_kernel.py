@@ -25,14 +25,15 @@ no  test         condition                                                      
 10  rescaled     a sensor shows -1.6 to -0.4, -0.25 to 0.25, or more than 2 times the motion that
                  device and drive give; see `gains`                                               3 ms
 11  inverted     an actuator gives -1.6 to -0.4 times its force; see `gains`                      5 ms and more
+12  exchanged    two sensors show each other's motion; see `gains`                                3 ms
 === ============ ================================================================================ ====================
 
 R (m) and B (drive unit) are what the scene needs at most with the worst finger, A the drive of a hard press, `sag` the
 static displacement under 5 N.  *Danger* is a motion > 4 R + 1.36 sag or a drive above 0.9 of its limit.  The drive
-fades out in 10 ms, in danger and after tests 10 and 11 in 2 ms, on overmotion in 0.2 ms, and stays at zero.  A ringing
+fades out in 10 ms, in danger and after tests 10 to 12 in 2 ms, on overmotion in 0.2 ms, and stays at zero.  A ringing
 damper is turned down to 0.4, then to 0; the drive stops where it rings all the same for 150 ms.
 
-Tests 3 to 5, 7 and 9 to 11 need a `Demand`, 10 and 11 at most two sensors and actuators; 6 a controller with an inner
+Tests 3 to 5, 7 and 9 to 12 need a `Demand`, 10 to 12 at most two sensors and actuators; 6 a controller with an inner
 damper; 8 a limit.  Without them a controller has tests 1 and 2.  Where the device has a limit of rms drive, `cool`
 holds it.
 `control.supervisor` designs all of it.
@@ -46,12 +47,13 @@ import numba
 import numpy as np
 from numba import carray
 
-from hapticrender.control.gains import check_gains, start_gains
+from hapticrender.control.gains import MOST, check_gains, start_gains
 from hapticrender.control.records import CONTROLLER_T, MOST_CHANNELS, MOST_SENSORS
 from hapticrender.jit import F8, I8, SIGNALS_T, call, kernel, pointer, record, step
 from hapticrender.protocols import Flag
 
-INVALID, FROZEN, INCONSISTENT, ACTIVE, DRIVE, RINGING, OVERMOTION, BEYOND, RESCALED, INVERTED = range(1, 11)
+INVALID, FROZEN, INCONSISTENT, ACTIVE, DRIVE, RINGING, OVERMOTION, BEYOND, RESCALED, INVERTED, EXCHANGED = range(1, 12)
+EVERY = (1 << MOST) - 1  # sensors whose gains are compared, as bits
 STOPPED, SATURATED = int(Flag.STOPPED), int(Flag.SATURATED)
 ROOT2 = math.sqrt(2.0)
 INVALID_SHARE = 0.3
@@ -225,16 +227,19 @@ def check_motion(supervisor, drive_in_danger):
 
 @kernel
 def compare_gains(supervisor):
-    """Tests 10 and 11; returns the cause, and the sensors or actuators, as bits."""
+    """Tests 10 to 12; returns the cause, and the sensors or actuators, as bits."""
     s = record(supervisor, SUPERVISOR_T, 0)
     p, q = s.p, s.input
     if s.compared == 0:  # a steady load is no motion
         held = p.stiffness
         start_gains(p.gains, q[0], q[1], held[0, 0] * q[0] + held[0, 1] * q[1], held[1, 0] * q[0] + held[1, 1] * q[1])
-    rescaled, inverted = check_gains(p.gains, s.last, p.sensors, s.force[0], s.force[1])
+    rescaled, inverted, exchanged = check_gains(p.gains, s.last, p.sensors, s.force[0], s.force[1])
     for i in range(p.sensors):
         if 2 * s.repeats[i] > p.frozen_time:  # that is for test 2 to find
             rescaled &= ~(1 << i)
+            exchanged = False
+    if exchanged:
+        return EXCHANGED, EVERY
     if rescaled > 0:
         return RESCALED, rescaled
     return (INVERTED, inverted) if inverted > 0 else (0, 0)
