@@ -24,7 +24,7 @@ LEAST_VERSION = 0x130600  # 19.6.0: the first whose Pa_GetVersion returns more t
 FLOAT32 = 0x00000001  # paFloat32, interleaved
 ANTICIPATED_ERRORS = {-9985: "it is in use by another program, or does not exist any more"}  # paDeviceUnavailable
 HOST_ERROR = -9999  # paUnanticipatedHostError: PaHostErrorInfo has the details
-PATIENCE = 3.0  # s: longest wait for a stream to close
+PATIENCE = 8.0  # s: longest wait for a stream to close, also on a busy machine
 RESTART = "restart the program"
 INSTALL = (
     "to get it: Debian and Ubuntu: apt install libportaudio2; Fedora: dnf install portaudio; "

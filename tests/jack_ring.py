@@ -17,9 +17,7 @@ import numpy as np
 
 from hapticrender.bands import Bands
 from hapticrender.control.methods import METHODS
-from hapticrender.drivers import portaudio
 from hapticrender.drivers.audio import AudioDriver
-from hapticrender.errors import DeviceNotFound
 from hapticrender.plants.plate import PlateParameters, structure
 from hapticrender.realtime_entry import RealtimeEntry
 from hapticrender.touch.mechanics import HEAVY_SECOND
@@ -38,7 +36,7 @@ PATIENCE = 20.0  # s: until the server is there
 
 def missing() -> str:
     """What is not installed, and how to get it; empty where all is there."""
-    lacking = [each for each in ("jackd", "gcc") if shutil.which(each) is None]
+    lacking = [each for each in ("jackd", "jack_wait", "gcc") if shutil.which(each) is None]
     lacking += [each for each in ("jack", "portaudio") if find_library(each) is None]
     if lacking:
         return f"{', '.join(lacking)} not installed: `make audio-test` as root, or apt install {PACKAGES}"
@@ -123,16 +121,19 @@ def build(folder: Path) -> Path:
 
 @contextmanager
 def server(folder: Path, name: str = "test"):
-    """Run a server of its own that needs no privileges, as a process; every client of this process finds it."""
+    """Run a server of its own that needs no privileges, as a process; every client of this process finds it.
+
+    It waits 20 s for a client: PortAudio 19.6 ends the process by an assertion where it was disconnected.
+    """
     name = f"hapticrender-{os.getpid()}-{name}"
     own = {"JACK_DEFAULT_SERVER": name, "JACK_NO_START_SERVER": "1", "JACK_NO_AUDIO_RESERVATION": "1"}
     before = {key: os.environ.get(key) for key in own}
     os.environ.update(own)
-    command = ["jackd", "-r", "-n", name, "-d", "dummy", "-r", f"{RATE:.0f}", "-p", str(BLOCK)]
+    command = ["jackd", "-r", "-t", "20000", "-n", name, "-d", "dummy", "-r", f"{RATE:.0f}", "-p", str(BLOCK)]
     with (folder / "jackd.log").open("w") as log:
         process = subprocess.Popen(command, stdout=log, stderr=log)
     try:
-        _wait_for_card(process, folder / "jackd.log")
+        _wait_for(name, folder / "jackd.log")
         yield process
     finally:
         _end(process)
@@ -140,18 +141,11 @@ def server(folder: Path, name: str = "test"):
             os.environ.pop(key) if value is None else os.environ.__setitem__(key, value)
 
 
-def _wait_for_card(process: subprocess.Popen, log: Path) -> None:
-    end = time.monotonic() + PATIENCE
-    while time.monotonic() < end:
-        try:
-            if any("JACK" in each.host for each in portaudio.cards()):
-                return
-        except DeviceNotFound:
-            break
-        if process.poll() is not None:
-            break
-        time.sleep(0.1)
-    raise RuntimeError(f"no JACK server: {log.read_text()}")
+def _wait_for(name: str, log: Path) -> None:
+    """Wait for a server from another process: PortAudio is for servers that are there."""
+    command = ["jack_wait", "-w", "-s", name, "-t", f"{PATIENCE:.0f}"]
+    if subprocess.run(command, capture_output=True, check=False).returncode:
+        raise RuntimeError(f"no JACK server: {log.read_text()}")
 
 
 @contextmanager
