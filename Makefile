@@ -1,7 +1,7 @@
 # Every verb works from a fresh clone: the environment is made, and made anew only when pyproject.toml changes.
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test audio-test board-test test-oldest lint bench charts paper docs clean
+.PHONY: help demo test packages audio-test board-test test-oldest lint bench charts paper docs clean
 .DELETE_ON_ERROR:
 
 # The first interpreter that runs, is new enough and can make an environment; override with PYTHON=/path/to/python.
@@ -14,9 +14,7 @@ OLDEST = $(shell sed -n 's/^dependencies = \[\(.*\)\]/\1/p' pyproject.toml | tr 
 OLDEST_TESTS := $(addprefix tests/test_,$(addsuffix .py,math vectors kernel blocks plate contact low_pass realtime combined))
 # Tests that play in real time run first, one after the other; the rest on two cores.
 REAL_TIME := $(wildcard tests/test_audio*.py tests/test_player*.py tests/test_board_live.py)
-AUDIO := jackd2 libportaudio2 libjack-jackd2-dev gcc libc6-dev
-BOARD := gcc libc6-dev make gcc-arm-none-eabi libnewlib-arm-none-eabi qemu-system-arm
-BOARD_TOOLS := { command -v gcc && command -v arm-none-eabi-gcc && command -v qemu-system-arm; } > /dev/null
+PACKAGES := jackd2 libportaudio2 libjack-jackd2-dev gcc libc6-dev make gcc-arm-none-eabi libnewlib-arm-none-eabi qemu-system-arm
 BOARD_TESTS := $(addprefix tests/test_,firmware_law.py firmware_m4.py export.py protocol.py serial_driver.py board_faults.py board_live.py board_textures.py \
 	nu32.py player_board.py)
 API := hapticrender $(addprefix hapticrender.,loop latency sweep realtime_entry skin validate protocols bands errors touch recordings analysis \
@@ -32,22 +30,21 @@ test: .venv/test.stamp ## run every test (PYTEST_ARGS="-m 'not slow'" leaves out
 	@MPLBACKEND=Agg $(RUN) -m pytest $(REAL_TIME) $(PYTEST_ARGS)
 	@MPLBACKEND=Agg $(RUN) -m pytest -n 2 --dist worksteal $(addprefix --ignore=,$(REAL_TIME)) $(PYTEST_ARGS)
 
-# Of a package that is missing the tests are skipped, and say so; only root can install it.
-audio-test: .venv/test.stamp ## run the sound-card driver on a JACK server, with a plate behind it
-	@if [ "$$(id -u)" = 0 ] && command -v apt-get >/dev/null && ! dpkg -s $(AUDIO) >/dev/null 2>&1; then \
-		echo "installing $(AUDIO)"; apt-get update -qq; \
-		DEBIAN_FRONTEND=noninteractive apt-get install -qq -y --no-install-recommends $(AUDIO) >/dev/null; fi
+# Tests of what is missing are skipped, and say so.
+packages: ## install what the tests of sound cards and boards need (on Debian and Ubuntu, as root)
+	@if ! dpkg -s $(PACKAGES) >/dev/null 2>&1; then if [ "$$(id -u)" = 0 ] && command -v apt-get >/dev/null; then \
+		echo "installing $(PACKAGES)"; apt-get update -qq; \
+		DEBIAN_FRONTEND=noninteractive apt-get install -qq -y --no-install-recommends $(PACKAGES) >/dev/null; \
+		else echo "tests of sound cards or boards are skipped; to run them: sudo apt-get install $(PACKAGES)" >&2; fi; fi
+
+audio-test: .venv/test.stamp packages ## run the sound-card driver on a JACK server, with a plate behind it
 	@$(RUN) -m pytest -rs $(wildcard tests/test_audio*.py tests/test_player_jack.py) $(PYTEST_ARGS)
+
+board-test: .venv/test.stamp packages ## run the firmware's tests, on an emulated Cortex-M4 too
+	@$(RUN) -m pytest -rs $(BOARD_TESTS) $(PYTEST_ARGS)
 
 test-oldest: .venv-oldest/made.stamp ## run the kernels' tests on the oldest numba, numpy and scipy that pyproject.toml allows
 	@MPLBACKEND=Agg .venv-oldest/bin/python -m pytest $(wildcard $(OLDEST_TESTS)) $(PYTEST_ARGS)
-
-board-test: .venv/test.stamp ## run the firmware's tests, on an emulated Cortex-M4 too (installs its compiler and QEMU where it may)
-	@if ! $(BOARD_TOOLS); then if [ "$$(id -u)" = 0 ] && command -v apt-get >/dev/null; then \
-		echo "installing $(BOARD)"; apt-get update -qq; \
-		DEBIAN_FRONTEND=noninteractive apt-get install -qq -y --no-install-recommends $(BOARD) >/dev/null; \
-		else echo "tests on a Cortex-M4 are skipped; to run them: sudo apt-get install $(BOARD)" >&2; fi; fi
-	@$(RUN) -m pytest -rs $(BOARD_TESTS) $(PYTEST_ARGS)
 
 lint: .venv/test.stamp ## check style, formatting and types
 	@$(RUN) -m ruff check .

@@ -39,7 +39,7 @@ def missing() -> str:
     lacking = [each for each in ("jackd", "jack_wait", "gcc") if shutil.which(each) is None]
     lacking += [each for each in ("jack", "portaudio") if find_library(each) is None]
     if lacking:
-        return f"{', '.join(lacking)} not installed: `make audio-test` as root, or apt install {PACKAGES}"
+        return f"{', '.join(lacking)} not installed: `make packages` as root, or apt install {PACKAGES}"
     return ""
 
 

@@ -28,7 +28,7 @@ def exports(tmp_path_factory):
 def cross_tools():
     missing = [tool for tool in (CROSS, QEMU) if shutil.which(tool) is None]
     if missing:
-        pytest.skip(f"no {' and no '.join(missing)} here: make board-test installs them (gcc-arm-none-eabi, ...)")
+        pytest.skip(f"no {' and no '.join(missing)} here: make packages installs them (gcc-arm-none-eabi, ...)")
 
 
 def built(folder, rendering, target):
