@@ -47,7 +47,9 @@ from hapticrender.mathx import zoh
 from hapticrender.protocols import Array
 
 MOST = 2  # sensors, and actuators
-SENSOR, ACTUATOR = range(2)  # kinds of gains
+# numpy's integers: a kernel is compiled anew for each value of Python's
+SENSOR, ACTUATOR = np.arange(2)  # kinds of gains
+STATE, MOTION, XI, ZETA, EXCHANGE = np.array([0, 1, 2, 4, 6])  # models: x, p, two xi, two zeta, xi and zeta
 LEAST_INVERTED, MOST_INVERTED = -1.6, -0.4  # gains of a sensor or an actuator that is inverted
 DEAD, MOST_GAIN = 0.25, 2.0  # of a sensor: a smaller magnitude, a larger gain is a fault
 LEAST_EXCHANGED, MOST_EXCHANGED = 0.6, 1.4  # h
@@ -129,13 +131,14 @@ def _filter(a: Array, c: Array, wander: float) -> tuple[Array, float]:
 def advance_model(gains, k, force0, force1):
     """Advance model k by a sample, under the force that acts."""
     s = record(gains, GAINS_T, 0)
-    force0, force1 = force0 + s.models[k, 4], force1 + s.models[k, 5]
+    x, advanced, a, b = s.models[k], s.advanced, s.step_state, s.step_force
+    force0, force1 = force0 + x[4], force1 + x[5]
     for i in range(4):
-        s.advanced[i] = s.step_force[i, 0] * force0 + s.step_force[i, 1] * force1
+        advanced[i] = b[i, 0] * force0 + b[i, 1] * force1
         for j in range(4):
-            s.advanced[i] += s.step_state[i, j] * s.models[k, j]
+            advanced[i] += a[i, j] * x[j]
     for i in range(4):
-        s.models[k, i] = s.advanced[i]
+        x[i] = advanced[i]
 
 
 @kernel
@@ -147,10 +150,11 @@ def correct_model(gains, k, error0, error1):
 
 
 @kernel
-def model_sensor(gains, k, i):
-    """What sensor i shows of model k, over its noise."""
+def model_sensors(gains, k):
+    """What both sensors show of model k, over their noise."""
     s = record(gains, GAINS_T, 0)
-    return s.sensor_from_coordinate[i, 0] * s.models[k, 0] + s.sensor_from_coordinate[i, 1] * s.models[k, 1]
+    c, heave, rocking = s.sensor_from_coordinate, s.models[k, 0], s.models[k, 1]
+    return c[0, 0] * heave + c[0, 1] * rocking, c[1, 0] * heave + c[1, 1] * rocking
 
 
 @kernel
@@ -158,10 +162,9 @@ def clear_sums(gains, kind):
     """Set the sums of a kind of gains, and the models behind its w, to zero."""
     s = record(gains, GAINS_T, 0)
     for j in range(2):
-        s.weighted[kind, j] = s.weights[kind, j, 0] = s.weights[kind, j, 1] = 0.0
-        s.exchange[kind, j] = 0.0
+        s.weighted[kind, j] = s.weights[kind, j, 0] = s.weights[kind, j, 1] = s.exchange[kind, j] = 0.0
         for i in range(6):
-            s.models[2 + 2 * kind + j, i] = s.models[6 + kind, i] = 0.0
+            s.models[XI + 2 * kind + j, i] = s.models[EXCHANGE + kind, i] = 0.0
 
 
 @kernel
@@ -228,20 +231,21 @@ def judge_exchange(gains, kind, noise, faults):
 def follow_sensors(gains, force0, force1):
     """Add a sample to a trial; at its end the sensors whose gain has changed, as bits, and whether they exchanged."""
     s = record(gains, GAINS_T, 0)
+    shown0, shown1 = model_sensors(gains, MOTION)
     for j in range(2):
-        for i in range(2):
-            s.w[j, i] = (model_sensor(gains, 1, i) if i == j else 0.0) - model_sensor(gains, 2 + j, i)
+        known0, known1 = model_sensors(gains, XI + j)
+        s.w[j, 0], s.w[j, 1] = (shown0 if j == 0 else 0.0) - known0, (shown1 if j == 1 else 0.0) - known1
     add_sums(gains, SENSOR, 1.0)
-    apart = model_sensor(gains, 1, 1) - model_sensor(gains, 1, 0)
-    exchanged0, exchanged1 = apart - model_sensor(gains, 6, 0), -apart - model_sensor(gains, 6, 1)
+    known0, known1 = model_sensors(gains, EXCHANGE)
+    exchanged0, exchanged1 = shown1 - shown0 - known0, shown0 - shown1 - known1
     add_exchange(gains, SENSOR, 1.0, exchanged0, exchanged1)
     s.energy[SENSOR] += s.e[0] * s.e[0] + s.e[1] * s.e[1]
-    advance_model(gains, 1, force0, force1)
+    advance_model(gains, MOTION, force0, force1)
     for j in range(2):
-        correct_model(gains, 2 + j, s.w[j, 0], s.w[j, 1])
-        advance_model(gains, 2 + j, 0.0, 0.0)
-    correct_model(gains, 6, exchanged0, exchanged1)
-    advance_model(gains, 6, 0.0, 0.0)
+        correct_model(gains, XI + j, s.w[j, 0], s.w[j, 1])
+        advance_model(gains, XI + j, 0.0, 0.0)
+    correct_model(gains, EXCHANGE, exchanged0, exchanged1)
+    advance_model(gains, EXCHANGE, 0.0, 0.0)
     s.left -= 1
     if s.left > 0:
         return 0, False
@@ -254,19 +258,20 @@ def follow_actuators(gains, force0, force1):
     """Add a sample to the means; the actuators that are inverted, as bits, and whether they are exchanged."""
     s = record(gains, GAINS_T, 0)
     for j in range(2):
-        for i in range(2):
-            s.w[j, i] = model_sensor(gains, 4 + j, i)
-    exchanged0, exchanged1 = model_sensor(gains, 7, 0), model_sensor(gains, 7, 1)
+        s.w[j, 0], s.w[j, 1] = model_sensors(gains, ZETA + j)
+    exchanged0, exchanged1 = model_sensors(gains, EXCHANGE + ACTUATOR)
     if s.watched > s.duration // 2:  # by then w has forgotten where it began
         add_sums(gains, ACTUATOR, s.window_pole)
         add_exchange(gains, ACTUATOR, s.window_pole, exchanged0, exchanged1)
     for j in range(2):
         own = s.force_of_actuator[j]
-        correct_model(gains, 4 + j, -s.w[j, 0], -s.w[j, 1])
-        advance_model(gains, 4 + j, own[0, 0] * force0 + own[0, 1] * force1, own[1, 0] * force0 + own[1, 1] * force1)
+        correct_model(gains, ZETA + j, -s.w[j, 0], -s.w[j, 1])
+        advance_model(gains, ZETA + j, own[0, 0] * force0 + own[0, 1] * force1, own[1, 0] * force0 + own[1, 1] * force1)
     own = s.force_of_exchange
-    correct_model(gains, 7, -exchanged0, -exchanged1)
-    advance_model(gains, 7, own[0, 0] * force0 + own[0, 1] * force1, own[1, 0] * force0 + own[1, 1] * force1)
+    correct_model(gains, EXCHANGE + ACTUATOR, -exchanged0, -exchanged1)
+    advance_model(
+        gains, EXCHANGE + ACTUATOR, own[0, 0] * force0 + own[0, 1] * force1, own[1, 0] * force0 + own[1, 1] * force1
+    )
     noise = s.window_pole * s.innovation
     if 2 * s.watched <= 3 * s.duration or s.energy[ACTUATOR] <= LARGE * s.innovation:
         return 0, False
@@ -279,8 +284,9 @@ def note_innovations(gains, sensed, sensors):
     """Find the innovations and their mean squares; whether one has jumped."""
     s = record(gains, GAINS_T, 0)
     jump, energy = False, 0.0
+    known0, known1 = model_sensors(gains, STATE)
     for i in range(sensors):
-        s.e[i] = s.scale * sensed[i] - model_sensor(gains, 0, i)
+        s.e[i] = s.scale * sensed[i] - (known0 if i == 0 else known1)
         square = s.e[i] * s.e[i]
         jump |= square > JUMP * max(s.innovation, s.mean[i])
         s.mean[i] += s.mean_pole * (square - s.mean[i])
@@ -302,7 +308,7 @@ def check_gains(gains, sensed, sensors, force0, force1):
         clear_sums(gains, SENSOR)
         s.left, s.energy[SENSOR] = s.duration, 0.0
         for i in range(6):
-            s.models[1, i] = s.models[0, i]
+            s.models[MOTION, i] = s.models[STATE, i]
     if s.left > 0:
         rescaled, exchanged = follow_sensors(gains, force0, force1)
     if s.energy[ACTUATOR] > WATCHED * s.innovation:
@@ -312,8 +318,8 @@ def check_gains(gains, sensed, sensors, force0, force1):
     elif s.watched > 0:
         clear_sums(gains, ACTUATOR)
         s.watched = 0
-    correct_model(gains, 0, s.e[0], s.e[1])
-    advance_model(gains, 0, force0, force1)
+    correct_model(gains, STATE, s.e[0], s.e[1])
+    advance_model(gains, STATE, force0, force1)
     return rescaled, inverted, exchanged and sensors == MOST
 
 
@@ -321,4 +327,5 @@ def check_gains(gains, sensed, sensors, force0, force1):
 def start_gains(gains, heave, rocking, force0, force1):
     """Start the filter at rest at the coordinates that the sensors show, under `force0` and `force1` (N)."""
     s = record(gains, GAINS_T, 0)
-    s.models[0, 0], s.models[0, 1], s.models[0, 4], s.models[0, 5] = heave, rocking, force0, force1
+    state = s.models[STATE]
+    state[0], state[1], state[4], state[5] = heave, rocking, force0, force1

@@ -36,8 +36,8 @@ def reduced_controller(loop_bandwidth: float, filter_bandwidth: float) -> Transf
     """
     if not 0.0 < loop_bandwidth < filter_bandwidth:
         raise DesignError(
-            f"{loop_bandwidth=} Hz: must be > 0 and below {filter_bandwidth=} Hz, for the filter is faster than the loop: "
-            "lower the one or raise the other"
+            f"{loop_bandwidth=} Hz: must be > 0 and below {filter_bandwidth=} Hz, as it needs a filter faster than "
+            "the loop: lower the one or raise the other"
         )
     wt, wl = 2 * np.pi * loop_bandwidth, 2 * np.pi * filter_bandwidth
     gain, pole = wt * wl / (sqrt(2) * (wt + wl)), sqrt(2) * wt * wl / (wl - wt)

@@ -117,24 +117,25 @@ def check_sensors(supervisor, sensed, n, drive, acts):
     """
     s = record(supervisor, SUPERVISOR_T, 0)
     p, cause, invalid, frozen, beyond = s.p, 0, 0, 0, 0
+    last, repeats, longest, least, most, shows = s.last, s.repeats, s.longest, s.least, s.most, p.coordinate_from_sensor
     q0 = q1 = 0.0
     for i in range(p.sensors):
         value = sensed[n * p.sensors + i]
         if not abs(value) < p.sensor_limit:
             invalid |= 1 << i
-        elif value == s.last[i] and acts:
-            s.repeats[i] += 1
-            s.least[i], s.most[i] = min(s.least[i], drive), max(s.most[i], drive)
-            usual = HELD * (min(s.longest[i], p.frozen_time) if s.longest[i] > 0 else p.frozen_time)
-            if s.repeats[i] >= max(p.frozen_time, usual) and s.most[i] - s.least[i] > p.frozen_drive:
+        elif value == last[i] and acts:
+            repeats[i] += 1
+            least[i], most[i] = min(least[i], drive), max(most[i], drive)
+            usual = HELD * (min(longest[i], p.frozen_time) if longest[i] > 0 else p.frozen_time)
+            if repeats[i] >= max(p.frozen_time, usual) and most[i] - least[i] > p.frozen_drive:
                 frozen |= 1 << i
         else:
-            s.longest[i] = max(s.longest[i], s.repeats[i])
-            s.last[i], s.repeats[i], s.least[i], s.most[i] = value, 1, drive, drive
+            longest[i] = max(longest[i], repeats[i])
+            last[i], repeats[i], least[i], most[i] = value, 1, drive, drive
         if p.sensor_limit > abs(value) > p.sensed_bound:
             beyond |= 1 << i
-        q0 += p.coordinate_from_sensor[0, i] * s.last[i]
-        q1 += p.coordinate_from_sensor[1, i] * s.last[i]
+        q0 += shows[0, i] * last[i]
+        q1 += shows[1, i] * last[i]
     s.input[0], s.input[1] = q0, q1
     s.invalid += p.invalid_pole * ((1.0 if invalid > 0 else 0.0) - s.invalid)
     if invalid > 0 and s.invalid > INVALID_SHARE:
@@ -187,34 +188,31 @@ def check_growth(supervisor, residual):
 def check_motion(supervisor, drive_in_danger):
     """Tests 3, 4, 7 and 9: whether the motion follows from the drive; returns the cause and whether there is danger."""
     s = record(supervisor, SUPERVISOR_T, 0)
-    p, e = s.p, s.energy
-    last0, last1 = s.value[2], s.value[3]
+    p, e, value, rate, change = s.p, s.energy, s.value, s.rate, s.change
+    last0, last1 = value[2], value[3]
     filter_signals(supervisor)
-    s.motion = abs(s.value[0]) + p.lever * abs(s.value[1])
+    s.motion = abs(value[0]) + p.lever * abs(value[1])
     danger = drive_in_danger or s.motion > p.danger_motion
-    pole, wrong, active, grows = p.energy_pole, False, False, False
+    wrong, active, grows = False, False, False
+    mass, damping, stiffness, bounds = p.mass, p.damping, p.stiffness, p.bound
     for i in range(2):
-        r = s.value[2 + i]
+        q, v, a, force = value[i], rate[i], change[i], value[2 + i]
+        r = force
         for j in range(2):
-            r -= p.mass[i, j] * s.change[j] + p.damping[i, j] * s.rate[j] + p.stiffness[i, j] * s.value[j]
+            r -= mass[i, j] * change[j] + damping[i, j] * rate[j] + stiffness[i, j] * value[j]
         if i == 0:
             grows = check_growth(supervisor, r)
-        change = s.value[2 + i] - (last0 if i == 0 else last1)
-        e[i] += pole * (s.value[i] * s.value[i] - e[i])
-        e[2 + i] += pole * (s.rate[i] * s.rate[i] - e[2 + i])
-        e[4 + i] += pole * (s.change[i] * s.change[i] - e[4 + i])
-        e[6 + i] += pole * (change * change - e[6 + i])
-        e[8 + i] += pole * (s.value[2 + i] * s.value[2 + i] - e[8 + i])
-        e[10 + i] += pole * (r * r - e[10 + i])
-        s.power[i] += p.power_pole * (-r * s.rate[i] - s.power[i])
+        step = force - (last0 if i == 0 else last1)
+        for k, signal in enumerate((q, v, a, step, force, r)):
+            e[2 * k + i] += p.energy_pole * (signal * signal - e[2 * k + i])
+        s.power[i] += p.power_pole * (-r * v - s.power[i])
     for i in range(2):
-        bound = p.noise[i]
+        bound, residual, drive, power = p.noise[i], e[10 + i], e[8 + i], s.power[i]
         for j in range(8):
-            bound += p.bound[i, j] * e[j]
-        by_drive = e[10 + i] < BY_DRIVE * e[8 + i]
-        wrong |= by_drive and e[10 + i] > bound
-        power = s.power[i]
-        active |= by_drive and power > 0.0 and power * power > POWER * POWER * e[8 + i] * e[2 + i]
+            bound += bounds[i, j] * e[j]
+        by_drive = residual < BY_DRIVE * drive
+        wrong |= by_drive and residual > bound
+        active |= by_drive and power > 0.0 and power * power > POWER * POWER * drive * e[2 + i]
     s.inconsistent_count = s.inconsistent_count + (4 if danger else 1) if wrong else max(s.inconsistent_count - 2, 0)
     s.active_count = s.active_count + 1 if active and danger else 0
     s.motion_count = s.motion_count + 1 if s.motion > p.most_motion else 0
