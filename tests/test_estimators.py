@@ -8,8 +8,8 @@ import scipy.signal
 from test_bandwidth import GAINS, MODEL
 
 import hapticrender as hr
-from hapticrender.control.estimators import StarSTDFT
 from hapticrender.control.margin_check import error_loop
+from hapticrender.control.transfer import StarSTDFT
 
 RATE = 5000.0
 STAR = StarSTDFT(bandwidth=10.0, rate=RATE)

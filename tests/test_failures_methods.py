@@ -7,6 +7,7 @@ import pytest
 from held import amplitude_error, fixed, hold
 
 import hapticrender as hr
+from hapticrender.control.controller import setpoint_rows
 from hapticrender.control.loopshape import loop_margins, reduced_controller
 from hapticrender.control.methods import METHODS, Polar
 from hapticrender.control.transfer import butterworth
@@ -37,7 +38,7 @@ def sent(method, frequency, targets, seconds):
     plate, bands = Plate(IDEAL, hr.Finger.absent()), [fixed((frequency, target)) for target in targets]
     controller, motion = method.design(IDEAL.device_model(RATE, 1), bands[0]), []
     for each, duration in zip(bands, seconds, strict=True):
-        controller.send(each)
+        controller.setpoints[:] = setpoint_rows(each)
         motion.append(plate.closed_loop(controller, np.zeros(round(duration * RATE)))[3].motion[:, :1])
     return np.concatenate(motion)
 

@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 
 import hapticrender as hr
 from hapticrender.bands import Bands
+from hapticrender.control.controller import setpoint_rows
 from hapticrender.control.methods import METHODS
 from hapticrender.plants.plate import Plate, PlateParameters
 from hapticrender.protocols import Flag
@@ -32,7 +33,7 @@ def overload(method):
     controller = design(method, before, parameters)
     plate = Plate(parameters, hr.Finger.absent())
     first = plate.closed_loop(controller, np.zeros(10_000))
-    controller.send(after)
+    controller.setpoints[:] = setpoint_rows(after)
     second = plate.closed_loop(controller, np.zeros(10_000))
     drive, flags = np.concatenate([first[0], second[0]]), np.concatenate([first[2], second[2]])
     return drive, flags, np.concatenate([first[3].motion, second[3].motion]), parameters.current_limit

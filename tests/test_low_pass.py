@@ -8,6 +8,7 @@ from naive_low_pass import NaiveLowPass
 
 import hapticrender as hr
 from hapticrender.bands import Bands
+from hapticrender.control.controller import setpoint_rows
 from hapticrender.control.methods import METHODS, Polar, Resonant, frequency_table
 from hapticrender.plants.plate import PlateParameters
 
@@ -125,16 +126,16 @@ def test_every_channel_is_cut_to_its_limit_and_flagged(rng):
 
 
 def test_silence_keeps_the_phase_and_a_new_target_is_taken_up():
-    """A target below 1e-12 m has no direction: the command fades with the last one; sent anew, it is there again."""
+    """A target below 1e-12 m has no direction: the command fades with the last one; set anew, it is there again."""
     bands = bands_of([47.0])
     controller = METHODS["paper-common"].design(MODEL, bands)
     nothing = np.zeros((640, 2)), np.full(640, np.nan), np.zeros(640)
     controller.run(*nothing)
-    controller.send(dataclasses.replace(bands, envelope=np.array([1e-13 + 0j])))
+    controller.setpoints[:] = setpoint_rows(dataclasses.replace(bands, envelope=np.array([1e-13 + 0j])))
     controller.run(*nothing)
     assert controller.field("heading_re")[0] == pytest.approx(1.0, abs=1e-12)
     assert controller.field("sounds")[0] == 0.0
-    controller.send(dataclasses.replace(bands, envelope=np.array([2e-6j])))
+    controller.setpoints[:] = setpoint_rows(dataclasses.replace(bands, envelope=np.array([2e-6j])))
     _, target, _ = controller.run(*nothing)
     assert target[-1, 0] == 2e-6j
     assert controller.field("heading_im")[0] == pytest.approx(1.0, abs=1e-12)

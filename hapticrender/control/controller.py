@@ -159,36 +159,6 @@ class BankController:
         self.step(self.state.ctypes.data, signals.ctypes.data, 0, n)
         return drive, np.repeat(target, self.block, axis=0), flags
 
-    def send(self, bands: Bands) -> None:
-        """Take up other targets at the next look at the setpoints; see `fitting` for the errors."""
-        self.setpoints[:] = self.fitting(bands)
-
-    def fitting(self, bands: Bands) -> Array:
-        """Return the setpoints of other targets, if this design holds for them: its bandwidths rest on the carriers.
-
-        A ValueError where their number differs; where they are a waveform, or follow the finger, and the design's do
-        not, or the other way round; and where a carrier is lower or higher, or two are closer, than designed for.
-        """
-        designed = self.bands
-        if len(bands) != self.n_bands:
-            raise ValueError(f"{len(bands)} bands: must be {self.n_bands}, as designed for")
-        if (bands.envelope is None) != (designed.envelope is None):
-            raise ValueError("the targets are a waveform: must be constant envelopes, as designed for")
-        follows, followed = ((each.wavenumber > 0.0) for each in (bands, designed))
-        if (follows != followed).any():
-            raise ValueError(f"bands {np.flatnonzero(follows != followed)}: must follow the finger as designed for")
-        for what, now, then in (
-            ("lowest fixed carrier", lowest_fixed(bands), lowest_fixed(designed)),
-            ("least spacing", spacing(bands), spacing(designed)),
-            ("least spacing of ridges per metre", ridge_spacing(bands), ridge_spacing(designed)),
-        ):
-            if now < then * (1.0 - 1e-9):
-                raise ValueError(f"{what} of {now:g}: must be >= {then:g}, as designed for (Hz, or 1/m)")
-        highest = max(float(self.settings["highest"]), float(designed.frequency.max(initial=0.0)))
-        if bands.frequency.max(initial=0.0) > highest:
-            raise ValueError(f"carrier of {bands.frequency.max():g} Hz: must be <= {highest:g} Hz")
-        return setpoint_rows(bands)
-
 
 class PositionPredictor:
     """Positions of the finger (m) `ahead` samples from now, by the velocity and acceleration observed."""

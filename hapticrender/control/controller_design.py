@@ -1,4 +1,4 @@
-"""Design of the default controller: from a device model, bands and a method's rules to the settings of its kernel.
+"""Design of the law by bands: from a device model, bands and a method's rules to the settings of its kernel.
 
 Bandwidths follow carriers, spacing and delay: observer <= f0/2 and spacing/2 pi, integral <= f0/4 and what delay and
 observer leave of the phase, DC estimate <= f0/8.  Thresholds follow the noise.  The inner damper is chosen by its
@@ -103,7 +103,7 @@ def rules_for(bands: Bands) -> Rules:
 def design_controller(
     method: str, model: DeviceModel, bands: Bands, rules: Rules, *, feedback: bool = True
 ) -> BankController:
-    """Design the default controller, called `method`, for a device of 1 or 2 coordinates and its bands by `rules`.
+    """Design the law by bands, called `method`, for a device of 1 or 2 coordinates and its bands by `rules`.
 
     It runs in blocks where the delay is that of a block device (more than 8 samples), else sample by sample.  Without
     feedback nothing is sensed, and the law drives open loop.

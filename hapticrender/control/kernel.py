@@ -1,4 +1,4 @@
-"""The default controller's step: a block of M >= 1 samples from sensors to drive; sample by sample is M = 1.
+"""The step of the law by bands: a block of M >= 1 samples from sensors to drive; sample by sample is M = 1.
 
 Over a block the envelopes are held.  The residuals e_h that follow from them and those e of the observer that runs
 sample by sample are related by a unit lower-triangular Toeplitz matrix, whatever the number of bands (docs/theory.md)::
@@ -369,7 +369,7 @@ def close_block(controller, touching, adapt_now):
 
 @step
 def error_step(state, signals, start, count):
-    """Advance the default controller by `count` samples, sample by sample; see `hapticrender.jit`."""
+    """Advance the law by bands by `count` samples, sample by sample; see `hapticrender.jit`."""
     c, io, samples = record(state, CONTROLLER_T, 0), record(signals, SIGNALS_T, 0), samples_of(state)
     stop = start + count
     drive, flags = carray(pointer(io.drive, F8), (stop, c.p.channels)), carray(pointer(io.flags, I8), stop)
@@ -392,7 +392,7 @@ def error_step(state, signals, start, count):
 
 @step
 def block_step(state, signals, start, count):
-    """Advance the default controller by `count` samples, in blocks of M > 1; see `hapticrender.jit`."""
+    """Advance the law by bands by `count` samples, in blocks of M > 1; see `hapticrender.jit`."""
     c, io, samples = record(state, CONTROLLER_T, 0), record(signals, SIGNALS_T, 0), samples_of(state)
     block, stop = c.p.block, start + count
     drive, flags = carray(pointer(io.drive, F8), (stop, c.p.channels)), carray(pointer(io.flags, I8), stop)

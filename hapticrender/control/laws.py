@@ -1,4 +1,4 @@
-"""Compiled law of the default controller: dynamic stiffness, finger included, turned ahead by delay and hold.
+"""Compiled force of the law by bands: dynamic stiffness, finger included, turned ahead by delay and hold.
 
     F = rho (D V + D' dV/dt + j dw/dt M V),   rho = e^(j w lead) (w T/2)/sin(w T/2)
 

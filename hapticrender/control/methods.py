@@ -60,7 +60,7 @@ ALL_PASS = (1.0, 0.0, 0.0, 0.0, 0.0)
 
 @dataclass(frozen=True)
 class ErrorObserver:
-    """The default method: an error observer and the device's dynamic stiffness, finger included.
+    """The law by bands: an error observer and the device's dynamic stiffness, finger included.
 
     Without `rules` it runs at two speeds, by the carriers' spacing.
     """
