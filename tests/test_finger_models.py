@@ -14,7 +14,7 @@ from hapticrender.analysis.models import FEWEST, LOAD_CLASSES
 from hapticrender.analysis.records import Impedance
 from hapticrender.touch.mechanics import HEAVY, LIGHT, LIGHT_SECOND
 
-DRAWS = {2: 200, 4: 60}
+DRAWS = {2: 200, 4: 40}
 RARE = 1e-4  # probability of a false alarm of a bound
 FINGERS = {2: LIGHT_SECOND, 4: LIGHT}
 
@@ -97,11 +97,6 @@ def test_errors_stated_too_small_do_not_choose_the_higher_order(rng):
     assert hr.fit_finger(replace(data, standard_error=data.standard_error / 10)).order == 2
 
 
-def test_a_light_touch_is_not_explained_by_the_second_order(rng):
-    data = make_impedance(rng, LIGHT, 10, (0.1, 0.49))
-    assert hr.fit_finger(data, 2).p_value < 1e-6 < 1e-3 < hr.fit_finger(data, 4).p_value
-
-
 def test_each_class_of_loads_has_its_own_finger(rng):
     light, heavy = (make_impedance(rng, LIGHT, 12, (0.1, 0.49)), make_impedance(rng, HEAVY, 12, (0.51, 1.5)))
     fits = hr.fit_load_classes([light, heavy])
@@ -167,13 +162,6 @@ def test_what_makes_no_sense_is_refused(rng):
         hr.fit_finger(data, 2).interval("mass", 1)
     with pytest.raises(ValueError, match="phalanx_mass.*: must be one of mass, damping, stiffness, load_exponent"):
         hr.fit_finger(data, 2).interval("phalanx_mass")
-
-
-def test_a_fitted_finger_goes_into_a_scene(rng):
-    mechanics = hr.fit_finger(make_impedance(rng, LIGHT, 6, (0.1, 0.49)), 4).mechanics
-    finger = hr.Finger.sliding(speed=0.05, normal_load=0.4, mechanics=mechanics, load_scaling=True)
-    scene = hr.Scene(texture=hr.Grating(frequency=111.0, amplitude=1e-5), finger=finger, duration=1.0)
-    assert hr.Scene.from_toml_text(scene.to_toml()).finger.mechanics == mechanics
 
 
 @pytest.mark.parametrize("exponent", [0.0, 1 / 3])
