@@ -19,14 +19,10 @@ RARE = 1e-4  # probability of a false alarm of a bound
 FINGERS = {2: LIGHT_SECOND, 4: LIGHT}
 
 
-@pytest.fixture(scope="module", params=[2, 4])
-def fitted(request):
+def fitted(order):
     """Fits of one order to many measurements of one finger, with the truth at each fit's own reference load."""
-    rng, finger = np.random.default_rng(request.param), FINGERS[request.param]
-    fits = [
-        hr.fit_finger(make_impedance(rng, finger, 8, (0.1, 0.49), masked=0.1), request.param)
-        for _ in range(DRAWS[request.param])
-    ]
+    rng, finger = np.random.default_rng(order), FINGERS[order]
+    fits = [hr.fit_finger(make_impedance(rng, finger, 8, (0.1, 0.49), masked=0.1), order) for _ in range(DRAWS[order])]
     growth = [finger.load_factor(fit.mechanics.reference_load) for fit in fits]
     truth = {
         name: np.full(len(fits), 1 / 3) if name == "load_exponent" else getattr(finger, name) * np.array(growth)
@@ -35,20 +31,32 @@ def fitted(request):
     return SimpleNamespace(fits=fits, truth=truth, finger=finger, growth=growth)
 
 
-@pytest.mark.parametrize("level", [0.683, 0.95])
-def test_intervals_cover_the_truth_as_often_as_they_say(fitted, level):
+@pytest.mark.parametrize("order", [2, 4])
+def test_intervals_chi_square_and_errors_of_many_fits_are_those_stated(order):
+    """In one test, as every worker would make the fits anew."""
+    many = fitted(order)
+    for level in (0.683, 0.95):
+        check_intervals(many, level)
+    check_chi_square(many)
+    check_errors_of_impedance(many)
+
+
+def check_intervals(fitted, level):
+    """They cover the truth as often as they say."""
     for name, truth in fitted.truth.items():
         low, high = np.array([fit.interval(name, level) for fit in fitted.fits]).T
         hits = int(((low <= truth) & (truth <= high)).sum())
         assert binom.ppf(RARE, len(truth), level) <= hits <= binom.ppf(1 - RARE, len(truth), level), (name, hits)
 
 
-def test_chi_square_is_that_of_a_model_that_explains_the_data(fitted):
+def check_chi_square(fitted):
+    """It is that of a model that explains the data."""
     p = np.array([fit.p_value for fit in fitted.fits])
     assert p.mean() == pytest.approx(0.5, abs=4 / np.sqrt(12 * len(p)))  # p is uniform
 
 
-def test_the_predicted_error_of_the_impedance_is_the_measured_one(fitted):
+def check_errors_of_impedance(fitted):
+    """The predicted one is the measured one."""
     f = np.array([25.0, 150.0, 400.0])
     off = np.array(
         [
