@@ -6,7 +6,7 @@ import pytest
 pytest.importorskip("matplotlib")
 
 from benchmarks import figures
-from benchmarks.charts import measure, stability, stability_map, story, waveforms
+from benchmarks.charts import measure, stability, stability_map, story
 from benchmarks.charts.measure import Point, Setting
 
 
@@ -53,17 +53,3 @@ def test_no_motion_is_an_error_of_all_of_the_reference():
     for share in (0.0, 0.9):
         moved = figures.Run(time, share * reference[:, None] * np.ones(4), None, reference)
         assert list(story.over_time(moved)[2].values()) == pytest.approx([100 * (1 - share)] * 3)
-
-
-def test_the_chart_of_waveforms_shows_what_an_open_inverse_loses_under_a_finger():
-    """White noise under the heavy finger; bounds: what is required of the law, and half of what no feedback costs."""
-    case = "white", waveforms.FINGERS[2], waveforms.SPEED
-    with np.errstate(under="ignore"):
-        found = [
-            waveforms.Row(law, *case, *waveforms.error(law, "white", "4H", waveforms.SPEED)) for law in waveforms.LAWS
-        ]
-    ours, without = found
-    assert ours.error < 1.0
-    assert ours.end < 2.0
-    assert without.error > 16.0
-    assert len(waveforms.draw(found).axes) == 5

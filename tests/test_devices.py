@@ -104,7 +104,7 @@ def test_the_command_line_finds_a_driver_in_its_own_folder(tmp_path, monkeypatch
     (tmp_path / "bench.py").write_text(
         "from other_plate import OtherPlate\n\n\ndef plate():\n    return OtherPlate()\n"
     )
-    (tmp_path / "tone.toml").write_text(hr.Scene(texture=TONE.texture, duration=3.0).to_toml())
+    (tmp_path / "tone.toml").write_text(hr.Scene(texture=TONE.texture, duration=1.0).to_toml())
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "path", [path for path in sys.path if path])
     assert cli.main(["render", "tone.toml", "--out", "out", "--driver", "bench:plate"]) == 0

@@ -7,12 +7,12 @@ from html.parser import HTMLParser
 
 import numpy as np
 import pytest
-from finger_data import FREQUENCIES, make_record
+from finger_data import make_record
 
 import hapticrender as hr
 from hapticrender.analysis import pictures
 from hapticrender.analysis.load_law import LoadLaw, mean_exponent
-from hapticrender.analysis.records import UNLOADED, Impedance
+from hapticrender.analysis.records import Impedance
 from hapticrender.touch.mechanics import HEAVY_SECOND, LIGHT
 
 pytest.importorskip("matplotlib")
@@ -23,25 +23,10 @@ def record(rng):
     return make_record(rng, replace(LIGHT, reference_load=0.4), "a <light> touch")
 
 
-@pytest.fixture
-def drawn(monkeypatch):
-    """Figures by name of file, instead of files."""
-    figures = {}
-    monkeypatch.setattr(pictures, "save", lambda figure, path: figures.setdefault(path.name, figure))
-    return figures
-
-
 def with_bands(record, chosen):
     z = record.impedance
     columns = {name: getattr(z, name)[:, chosen] for name in ("frequency", "value", "standard_error")}
     return replace(record, impedance=replace(z, **columns))
-
-
-def points(axes, label):
-    """Data of the curve with a label, in bars or without."""
-    found = [line for line in axes.lines if line.get_label() == label]
-    found += [bars.lines[0] for bars in axes.containers if bars.get_label() == label]
-    return found[0].get_xydata()
 
 
 class Page(HTMLParser):
@@ -81,42 +66,6 @@ def test_a_folder_has_every_picture_and_a_page_of_them(record, tmp_path):
     assert f"{fit.chi_square:.0f} / {fit.degrees_of_freedom}" in text
 
 
-def test_load_and_impedance_over_time_are_the_records(record, drawn, tmp_path):
-    pictures.draw_time(record, tmp_path / "time.png")
-    load, _, place, impedance, *_ = drawn["time.png"].axes
-    np.testing.assert_array_equal(points(load, "normal load")[:, 1], record.normal_load.value)
-    np.testing.assert_array_equal(points(place, "position (mm)")[:, 1], 1e3 * record.position.value)
-    band = int(np.flatnonzero(FREQUENCIES == 111)[0])
-    shown = points(impedance, "|Z_f| at 111 Hz")
-    np.testing.assert_array_equal(shown[:, 1], np.abs(record.impedance.value[:, band]))
-    grey = [patch for patch in load.patches if patch.get_facecolor()[:3] == pytest.approx((0.867,) * 3, abs=1e-3)]
-    assert len(grey) == len(record.of_kind(UNLOADED)) == 2
-
-
-def test_fits_over_frequency_are_the_fits(record, drawn, tmp_path):
-    fits = pictures.fit_all([record])
-    pictures.draw_frequency([record], fits, tmp_path / "frequency.png")
-    for axes, (name, of_class) in zip(drawn["frequency.png"].axes, fits.items(), strict=False):
-        assert name in axes.get_title("left").lower()
-        best = next(iter(of_class.values()))
-        assert best.order == 4
-        for order, label in ((2, "2nd order"), (4, "4th order")):
-            f, size = points(axes, label).T
-            np.testing.assert_allclose(size, abs(of_class[order].impedance(f, best.mechanics.reference_load)))
-        f, size = points(axes, "measured").T
-        np.testing.assert_array_equal(f, FREQUENCIES)
-        off = np.log(size / abs(best.impedance(f)))
-        assert abs(off).max() < 5 * 0.1 / np.sqrt(5)  # 5 windows a band at least, of 10 % at most
-
-
-def test_exponents_and_shares_are_the_laws(record, drawn, tmp_path):
-    pictures.draw_load([record], tmp_path / "load.png")
-    _, share, power = drawn["load.png"].axes
-    law = hr.load_exponent(record.impedance)
-    np.testing.assert_array_equal(share.lines[-1].get_xydata()[:, 1], law.determination)
-    np.testing.assert_array_equal(points(power, "95 %")[:, 1], law.exponent)
-
-
 def test_a_mean_exponent_is_weighted_and_its_error_widened_by_scatter():
     one = LoadLaw(*np.array([[100.0], [0.1], [0.1], [1.0], [1.0], [1.0], [9.0]]))
     apart, near = (replace(one, exponent=np.array([n]), standard_error=np.array([0.2])) for n in (1.1, 0.1))
@@ -142,17 +91,6 @@ def test_a_record_with_few_bands_or_none_has_what_can_be_drawn(rng, tmp_path, ba
     shown, text = parsed(pictures.draw(few, tmp_path))
     assert sorted(shown) == names
     assert sentence in text
-
-
-def test_a_carrier_that_follows_the_finger_is_drawn_where_it_was(record, tmp_path):
-    """Every window has a frequency of its own, and none an exponent."""
-    z, count = record.impedance, len(record.impedance.time)
-    frequency = np.geomspace(20, 200, count)[:, None]
-    error = np.where(np.isfinite(z.value[:, :1]), 0.1, np.nan)
-    moving = Impedance(z.time, frequency, 0 * error + LIGHT.impedance(frequency), error, z.normal_load, z.position)
-    shown, text = parsed(pictures.draw(replace(record, impedance=moving), tmp_path))
-    assert len(shown) == 3
-    assert text.count("<td>–</td><td>") >= 10
 
 
 def test_a_finger_that_never_touched_has_a_page(record, tmp_path):

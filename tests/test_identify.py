@@ -107,7 +107,7 @@ def test_rate_and_bending_mode_are_those_of_the_device():
 
 @pytest.mark.parametrize(
     ("bending", "true"),
-    [((1250.0, 30, 0.1), {}), ((1250.0, 50, -0.1), WRONG), ((700.0, 30, 0.1), {}), ((1900.0, 30, -0.1), WRONG)],
+    [((700.0, 30, 0.1), {}), ((1900.0, 50, -0.1), WRONG)],
 )
 def test_the_bending_mode_of_a_third_partys_plate_is_found(bending, true):
     """m, I, k .05 %, b .2 %, delay .002 samples; f .5 Hz (1900 Hz: 1 Hz), damping 5 %, shape 5 % with its sign."""

@@ -197,15 +197,15 @@ def test_what_has_no_figure_is_not_judged(bands, fields, reason):
 
 
 def test_a_long_journal_is_judged_without_being_loaded(tmp_path):
-    """Ten minutes of 14 columns are 336 MB; judging takes less than a third of that.
+    """Five minutes of 14 columns are 168 MB; judging takes less than two thirds of that.
 
     A piece of windows has CHUNK_VALUES regressors of 8 bytes, their transposed copy, products, phases and signals: five
-    times that at most.  What is kept of each of the 59 998 windows is less than 150 bytes a band.
+    times that at most.  What is kept of each of the 29 998 windows is less than 150 bytes a band.
     """
     bands = make_bands([100.0, 250.0], [10 * UM, 3 * UM])
     minute = make_signals(bands, bands.envelope * 1.01, duration=60.0)
-    with make_recorder(tmp_path / "long.au", bands, duration=600.0) as recorder:
-        for _ in range(10):
+    with make_recorder(tmp_path / "long.au", bands, duration=300.0) as recorder:
+        for _ in range(5):
             recorder.append(**minute)  # whole periods: the minutes fit together
     recording = recorder.finish()
     del minute
@@ -217,7 +217,7 @@ def test_a_long_journal_is_judged_without_being_loaded(tmp_path):
         tracemalloc.stop()
     assert summary["bands"][1]["rms_error_centre"] == pytest.approx(0.01, rel=1e-6)
     assert summary["worst"]["value"] == pytest.approx(0.01, rel=1e-3)
-    assert peak < 5 * 8 * envelopes.CHUNK_VALUES + 150 * 59_998 * 2
+    assert peak < 5 * 8 * envelopes.CHUNK_VALUES + 150 * 29_998 * 2
 
 
 def white(low, high, rng, seconds=4.0, rms=5 * UM):

@@ -104,12 +104,12 @@ BANKS = {
 @pytest.mark.parametrize(("name", "coils"), [*((name, 1 if name == "8" else 2) for name in BANKS)])
 def test_the_kernel_is_its_twin(name, coils, rng):
     """Noise, a finger that comes, goes and turns back, samples that are no numbers, a drive at its limit."""
-    bands, n = BANKS[name], 3000
+    bands, n = BANKS[name], 1800
     time = np.arange(n) / RATE
     position = 0.01 * np.cos(2 * np.pi * 2.0 * time)
-    position[: 40 * (coils - 1)], position[2700] = np.nan, 1e9
+    position[: 40 * (coils - 1)], position[1700] = np.nan, 1e9
     sensed = pressed(rng, bands, position)
-    sensed[2300, 0], sensed[2400:2600] = np.nan, np.inf
+    sensed[1400, 0], sensed[1450:1600] = np.nan, np.inf
     wanted = 1 + 0.3 * np.cos(30.0 * time) if bands.modulated else 1e-5 * np.cos(2 * np.pi * 47.0 * time)
     controller = plate_controller(bands, parameters=replace(IDEAL, coils=coils, current_limit=0.3))
     twin, flags = agree(controller, sensed, position, wanted)
@@ -119,7 +119,7 @@ def test_the_kernel_is_its_twin(name, coils, rng):
 
 def test_the_finger_is_adapted_as_in_the_twin(rng):
     """On a plate under a heavy finger, in closed loop, the same samples given to both."""
-    bands, n = tones([70.0, 170.0, 261.0]), 5000
+    bands, n = tones([70.0, 170.0, 261.0]), 2500
     controller = plate_controller(bands)
     plate = Plate(IDEAL, hr.Finger.still(5e-3, 0.8, mechanics=HEAVY), seed=2)
     _, _, _, sensed = plate.closed_loop(controller, np.zeros(n))
@@ -134,12 +134,12 @@ def test_the_finger_is_adapted_as_in_the_twin(rng):
 def test_a_friction_device_is_its_twin(differentiated, rng):
     """Targets only in sliding contact, load always there, sensor delay and contact lag corrected."""
     bands = tones([0.0, 0.0], wavenumber=[1000.0, 2000.0], differentiated=differentiated)
-    time = np.arange(4000) / RATE
+    time = np.arange(2400) / RATE
     position = 0.02 * np.cos(2 * np.pi * 1.0 * time)
-    position[:300] = position[3000:3200] = np.nan
+    position[:300] = position[1800:1950] = np.nan
     sensed = pressed(rng, bands, position) * (500.0 if differentiated else 1.0)
     controller = friction_controller(bands)
-    agree(controller, sensed, position, np.zeros(4000))
+    agree(controller, sensed, position, np.zeros(2400))
     names = ("needs_contact", "corrected", "contact_damping", "least_speed", "sensor_delay", "contact_lag")
     assert all(controller.settings[name] > 0 for name in names)
 

@@ -74,12 +74,6 @@ def test_a_loop_that_was_closed_is_closed_again():
     assert wire.closed
 
 
-def test_an_unused_entry_is_a_failure():
-    _, board = play(AWAKE, REST, REST)
-    with pytest.raises(AssertionError, match="are unused"), board:
-        pass
-
-
 @pytest.mark.parametrize(
     ("table", "error", "match"),
     [

@@ -4,7 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
-from held import amplitude, fixed, grating, hold, play
+from held import amplitude, fixed, hold, play
 
 import hapticrender as hr
 from hapticrender.control.methods import METHODS, Polar, method_named
@@ -82,28 +82,6 @@ def test_a_table_of_the_loaded_plate_limit_cycles_at_lift_off():
         spread[name] = envelope(motion, 189.0)[-10_000:].std() / 10e-6
     assert spread["free"] < 0.01  # the window is no whole number of periods: 1/(4 pi 189 0.05) of ripple
     assert spread["loaded"] > 0.3
-
-
-def moving(bands, position, seconds=4.0, touches=None):
-    time = np.arange(round(seconds * RATE) + 1) / RATE
-    finger = hr.Finger.sampled(position(time), rate=RATE, normal_load=0.0, touches=touches, mechanics="none")
-    return hold("paper", bands, seconds, IDEAL, finger=finger)
-
-
-def test_a_grating_under_a_steady_finger_is_the_tone_of_its_passing():
-    """10 mm/s over 0.2 mm is 50 Hz: after contact has faded in, the same loop as a 50 Hz carrier."""
-    _, spatial = moving(grating(2e-4, 1e-5), lambda t: 0.01 * t)
-    _, temporal = hold("paper", fixed((50.0, 1e-5)), 4.0, IDEAL)
-    np.testing.assert_allclose(amplitude(spatial, 50.0, 1.0), amplitude(temporal, 50.0, 1.0), rtol=2e-4)
-
-
-def test_a_resting_or_lifted_finger_lets_the_grating_fade():
-    """Position decides: at 0 Hz there is nothing to feel, and the drive goes to rest."""
-    drive, _ = moving(grating(2e-4, 1e-5), lambda t: 0.01 * np.minimum(t, 1.0), seconds=6.0)
-    assert abs(drive[4000:5000]).max() > 0.02
-    assert abs(drive[-1000:]).max() < 1e-4
-    drive, _ = moving(grating(2e-4, 1e-5), lambda t: 0.01 * t, seconds=6.0, touches=((0.0, 1.0),))
-    assert abs(drive[-1000:]).max() < 1e-4
 
 
 def test_a_long_delay_slows_the_loop_down_until_its_margins_hold():

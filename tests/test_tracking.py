@@ -78,8 +78,7 @@ def test_standard_errors_are_right_under_irregular_times(rng):
     assert np.std(scale, axis=0) == pytest.approx(1.0, abs=5 / np.sqrt(2 * len(scale)))
 
 
-@pytest.mark.parametrize("name", list(budget.PANELS)[1:])
-@pytest.mark.parametrize("speed", [0.01, 0.05])
+@pytest.mark.parametrize(("name", "speed"), list(zip(list(budget.PANELS)[1:], (0.01, 0.05, 0.05), strict=True)))
 def test_the_latency_budget_is_what_a_panel_does(name, speed):
     """Error of the played position on 3 Hz swipes; the budget is exact but for the gate."""
     panel, rate, seconds = replace(budget.PANELS[name], **PLAIN), 1000.0, 16.0
