@@ -84,6 +84,12 @@ def test_a_picture_that_fails_leaves_the_older_one(tmp_path):
     assert list(tmp_path.iterdir()) == [path]
 
 
+@pytest.mark.parametrize(("suffix", "magic"), [(".png", b"\x89PNG"), (".PDF", b"%PDF")])
+def test_the_ending_chooses_the_format(tmp_path, suffix, magic):
+    assert swiped().plot(tmp_path / f"x{suffix}")
+    assert (tmp_path / f"x{suffix}").read_bytes().startswith(magic)
+
+
 def test_without_matplotlib_a_warning_names_the_extra_and_the_script_goes_on(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "matplotlib", None)
     with pytest.warns(UserWarning, match=r"pip install 'hapticrender\[plot\]'; the recording can be saved"):
