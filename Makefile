@@ -34,7 +34,8 @@ test: .venv/test.stamp ## run every test (PYTEST_ARGS="-m 'not slow'" leaves out
 packages: ## install what the tests of sound cards and boards need (on Debian and Ubuntu, as root)
 	@if ! dpkg -s $(PACKAGES) >/dev/null 2>&1; then if [ "$$(id -u)" = 0 ] && command -v apt-get >/dev/null; then \
 		echo "installing $(PACKAGES)"; apt-get update -qq; \
-		DEBIAN_FRONTEND=noninteractive apt-get install -qq -y --no-install-recommends $(PACKAGES) >/dev/null; \
+		DEBIAN_FRONTEND=noninteractive apt-get install -qq -y --no-install-recommends $(PACKAGES) >/dev/null \
+		|| echo "not all could be installed: tests of what is missing are skipped" >&2; \
 		else echo "tests of sound cards or boards are skipped; to run them: sudo apt-get install $(PACKAGES)" >&2; fi; fi
 
 audio-test: .venv/test.stamp packages ## run the sound-card driver on a JACK server, with a plate behind it

@@ -100,6 +100,10 @@ def main():
     parser.add_argument("faults", nargs="*", metavar="fault", help=f"of {', '.join(FAULTS)}; all unless given")
     parser.add_argument("--place", type=float, default=0.0, help="of the finger (mm)")
     arguments = parser.parse_args()
+    if unknown := set(arguments.faults) - set(FAULTS):
+        parser.error(f"{', '.join(sorted(unknown))}: must be of {', '.join(FAULTS)}")
+    if abs(arguments.place) > 1e3 * REACH:
+        parser.error(f"--place {arguments.place:g} mm: must be within {1e3 * REACH:g}, the ends of the plate")
     loads = (0.8, 2.0) if arguments.place else (0.0, 0.8)
     for fault, frequency in product(arguments.faults or FAULTS, (20.0, 72.0, 189.0, 400.0)):
         cases = product((10e-6, 50e-6), loads)

@@ -11,7 +11,7 @@ import sys
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
-from ctypes import CDLL, POINTER, Structure, byref, c_char_p, c_double, c_int, c_ulong, c_void_p
+from ctypes import CDLL, POINTER, Structure, byref, c_char_p, c_double, c_int, c_ulong, c_void_p, py_object, pythonapi
 from ctypes.util import find_library
 from dataclasses import dataclass
 from functools import lru_cache
@@ -337,6 +337,7 @@ class Stream:
         release.join(PATIENCE)
         if release.is_alive():
             LEFT_BEHIND.append(self)
+            pythonapi.Py_IncRef(py_object(self))  # it may still be called back while Python ends
             raise DriverError(f"{self.name}: close: PortAudio did not return within {PATIENCE:g} s: {RESTART}")
         if errors:
             raise errors[0]

@@ -150,18 +150,19 @@ class Rewired(OtherPlate):
 
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize(
-    ("shown", "moved", "cause", "named"),
+    ("shown", "moved", "touch", "cause", "named"),
     [
-        (-np.eye(2), np.eye(2), RESCALED, "sensor 1 and 2"),
-        (np.eye(2), -np.eye(2), INVERTED, "actuator 1 and 2"),
-        (np.eye(2)[::-1], np.eye(2), EXCHANGED, "sensor 1 and 2"),
+        (-np.eye(2), np.eye(2), None, RESCALED, "sensor 1 and 2"),
+        (np.eye(2), -np.eye(2), None, INVERTED, "actuator 1 and 2"),
+        (np.eye(2)[::-1], np.eye(2), (2.0, 0.05), EXCHANGED, "sensor 1 and 2"),
+        (np.eye(2), np.eye(2)[::-1], (0.3, -0.05), EXCHANGED, "sensor 1 and 2"),
     ],
-    ids=["sensors inverted", "coils inverted", "sensors exchanged"],
+    ids=["sensors inverted", "coils inverted", "sensors exchanged", "coils exchanged"],
 )
-def test_changes_of_gains_stop_both(exports, shown, moved, cause, named, kind):
-    """The sensors of a closed loop that the library stopped, played back to both."""
+def test_changes_of_gains_stop_both(exports, shown, moved, touch, cause, named, kind):
+    """The sensors of a closed loop that the library stopped, played back to both; touched: load (N), place (m)."""
     rendering = exports.rendering("tones")
-    tilt = {"finger": (4e-3, 1.5, 300.0), "load": 2.0, "position": 0.05} if cause == EXCHANGED else {}
+    tilt = {"finger": (4e-3, 1.5, 300.0), "load": touch[0], "position": touch[1]} if touch else {}
     scene, driver = replace(rendering.scene, finger=hr.Finger.absent(), duration=1.0), Rewired(shown, moved, **tilt)
     with pytest.raises(hr.DeviceFault, match=named) as stopped:
         hr.render(scene, driver=driver)

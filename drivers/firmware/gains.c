@@ -84,12 +84,12 @@ static uint32_t judge_exchange(const gains_t *s, uint32_t kind, real_t noise, ui
 {
     const real_t w = s->exchange[kind][0];
     const real_t b = s->exchange[kind][1];
-    const real_t share = b / (w + noise);
-    const real_t rest = s->energy[kind] - REAL(2.0) * share * b + share * share * w;
+    const real_t h = b / (w + noise);
+    const real_t rest = s->energy[kind] - REAL(2.0) * h * b + h * h * w;
     const real_t bound = ((kind == SENSOR) ? UNEXPLAINED_INVERTED : UNEXPLAINED) * s->energy[kind];
     const real_t most = (faults != 0u) ? s->rest : bound;
-    const uint32_t fits = ((share > LEAST_EXCHANGED) && (share < MOST_EXCHANGED) && (rest < most)) ? 1u : 0u;
-    return (share * share * (w + noise) < CERTAIN * noise) ? 0u : fits;
+    const uint32_t fits = ((h > LEAST_EXCHANGED) && (h < MOST_EXCHANGED) && (rest < most)) ? 1u : 0u;
+    return (h * h * (w + noise) < CERTAIN * noise) ? 0u : fits;
 }
 
 /* Whether a gain is that of a fault, with `rest` the share of the energy that it leaves unexplained. */

@@ -19,7 +19,7 @@ typedef struct {
     real_t filter_gain[6][2];                         /* of these and of the force that wanders, per innovation */
     real_t sensor_from_coordinate[2][2];
     real_t force_of_actuator[2][2][2];
-    real_t force_of_exchange[2][2]; /* of exchanged actuators less these, per force; 0 where there are not two */
+    real_t force_of_exchange[2][2]; /* of exchanged actuators - of these, per force; 0: not two */
 } gain_settings_t;
 
 typedef struct {

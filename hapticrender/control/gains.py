@@ -18,7 +18,8 @@ An actuator j that gives g_j times its force F_j adds (g_j - 1) w_j::
 
     w_j = C zeta_j,                          zeta_j[n+1] = A (zeta_j[n] - K w_j[n]) + B F_j[n]
 
-and under actuators that give each other's force, or sensors that were exchanged where p showed no difference::
+and under actuators that give each other's force h w (and so under sensors that were exchanged while they showed the
+same, where sensors and actuators are symmetrical about the middle)::
 
     w = C zeta,        zeta[n+1] = A (zeta[n] - K w[n]) + B (F_exchanged[n] - F[n])
 
@@ -26,7 +27,7 @@ Least squares of e on w find g, of both sensors or of both actuators, and h.
 
 Sensors are judged over the 3 ms after an innovation above 4.5 times its noise, and its mean square before: a finger's
 force makes no jump, what it adds to e is no multiple of w.  Actuators are judged by means over 3 ms, while e is large:
-only an inversion, also that of a sensor which began where p was zero, is distinguished from a finger by these.
+only an inversion or an exchange, also of sensors, is distinguished from a finger by these.
 
 References
 ----------
@@ -76,7 +77,7 @@ GAINS = np.dtype(
         ("w", np.float64, (2, MOST)),  # w_1 and w_2, of both sensors
         *((name, np.float64, (MOST,)) for name in ("e", "mean", "energy")),  # mean of e^2 of a sensor; sums of e^2
         ("weights", np.float64, (2, 2, 2)),  # sums of w_i w_j of sensors, of actuators
-        *((name, np.float64, (2, 2)) for name in ("weighted", "gain")),  # sums of w_i e
+        *((name, np.float64, (2, 2)) for name in ("weighted", "gain")),  # sums of w_i e; g
         ("exchange", np.float64, (2, 2)),  # sums of w w and w e of an exchange
         ("rest", np.float64),  # of the energy of e, that the gains leave unexplained
         *((name, np.int64) for name in ("left", "watched")),  # samples: to go in the trial; with actuators followed
@@ -219,9 +220,9 @@ def judge_exchange(gains, kind, noise, faults):
     """Whether an exchange explains the innovations, of variance `noise`, and better than `faults` of gains."""
     s = record(gains, GAINS_T, 0)
     w, b, energy = s.exchange[kind, 0], s.exchange[kind, 1], s.energy[kind]
-    share = b / (w + noise)
-    rest = energy - 2.0 * share * b + share * share * w
-    if share * share * (w + noise) < CERTAIN * noise or not LEAST_EXCHANGED < share < MOST_EXCHANGED:
+    h = b / (w + noise)
+    rest = energy - 2.0 * h * b + h * h * w
+    if h * h * (w + noise) < CERTAIN * noise or not LEAST_EXCHANGED < h < MOST_EXCHANGED:
         return False
     bound = UNEXPLAINED_INVERTED if kind == SENSOR else UNEXPLAINED
     return rest < (s.rest if faults > 0 else bound * energy)

@@ -25,7 +25,8 @@ no  test         condition                                                      
 10  rescaled     a sensor shows -1.6 to -0.4, -0.25 to 0.25, or more than 2 times the motion that
                  device and drive give; see `gains`                                               3 ms
 11  inverted     an actuator gives -1.6 to -0.4 times its force; see `gains`                      5 ms and more
-12  exchanged    two sensors show each other's motion; see `gains`                                3 ms
+12  exchanged    two sensors show each other's motion, or two actuators give each other's force;   3 ms; actuators
+                 see `gains`                                                                      5 ms and more
 === ============ ================================================================================ ====================
 
 R (m) and B (drive unit) are what the scene needs at most with the worst finger, A the drive of a hard press, `sag` the
