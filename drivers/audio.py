@@ -151,7 +151,7 @@ class AudioDriver(BaseDriver):
         self._queue = BlockQueue(self.block, self.sensed_channels, self.drive_channels, self._ahead)
         self._queue_address, _ = self._queue.address, self._queue.blocks  # compiled before the stream starts
         addresses = self._relay.address, self._relay.user_data
-        self._stream = Stream(str(self), output, inputs, self.rate, self.block, *addresses, memory=self)
+        self._stream = Stream(str(self), output, inputs, self.rate, self.block, *addresses, self)
         atexit.register(self.close)  # the callback must not outlive the memory that it works in
         try:
             self._stream.start()

@@ -290,7 +290,7 @@ class Stream:
         frames: int,
         callback: int,
         user_data: int,
-        memory: Any = None,
+        memory: Any,
     ) -> None:
         self.name, self._library, self._memory = name, _initialise(name), memory
         self._handle: c_void_p | None = c_void_p()
@@ -348,6 +348,6 @@ class Stream:
                 check(self._library.Pa_StopStream(handle), f"{self.name}: stop")
         except DriverError as error:
             errors.append(error)
-        finally:
+        if self not in LEFT_BEHIND:  # where JACK's server ends in the meantime, PortAudio 19.6 would abort the process
             self._library.Pa_CloseStream(handle)
             self._library.Pa_Terminate()

@@ -303,11 +303,14 @@ with ExitStack() as stack:
             if sys.argv[3] == "stays":
                 with suppress(DriverError):
                     opened.close()
+                process.terminate()  # as it goes on, while PortAudio is still in the close
                 AudioDriver(jack_ring.CLIENT).open()
             for _ in range(100):
                 opened.play(np.zeros((64, 2)))
         finally:
             process.send_signal(signal.SIGCONT)
+            if sys.argv[3] == "stays":
+                process.wait()  # a second signal would end it before it gives its name back
 """
 
 
