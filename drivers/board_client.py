@@ -36,7 +36,7 @@ FAULTS = {
     Cause.BEYOND: "the motion stayed beyond what the scene can cause: check the unit of the sensors",
     Cause.RESCALED: "a sensor is suddenly inverted, swapped, disconnected, or its gain has changed: check its wiring",
     Cause.INVERTED: "the motion is that of the inverted drive: check the wiring and polarity of coils and sensors",
-    Cause.EXCHANGED: "each sensor shows the motion of the other: check the wiring of sensors and coils",
+    Cause.SWAPPED: "each sensor shows the motion of the other: check the wiring of sensors and coils",
 }
 Result = TypeVar("Result")
 

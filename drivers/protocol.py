@@ -116,7 +116,7 @@ class Cause(IntEnum):
     BEYOND = 24
     RESCALED = 25
     INVERTED = 26
-    EXCHANGED = 27
+    SWAPPED = 27
 
 
 class Frame(NamedTuple):

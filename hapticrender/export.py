@@ -41,7 +41,6 @@ slow_pole fade_out fade_danger fade_now mass damping stiffness bound noise ringi
 _TIMES = "frozen inconsistent active drive ring ring_wait ring_stop suspension beyond slow".split()
 _GAINS = """
 scale innovation mean_pole window_pole step_state step_force filter_gain sensor_from_coordinate force_of_actuator
-force_of_exchange
 """.split()
 _SAMPLES = "damper_time hold settling joining joined notice patience".split()
 

@@ -26,7 +26,6 @@ from scipy.signal import butter, sosfiltfilt
 import hapticrender as hr
 from hapticrender.control.supervisor_kernel import (
     ACTIVE,
-    EXCHANGED,
     FROZEN,
     INCONSISTENT,
     INVALID,
@@ -34,6 +33,7 @@ from hapticrender.control.supervisor_kernel import (
     OVERMOTION,
     RESCALED,
     RINGING,
+    SWAPPED,
 )
 from hapticrender.plants.plate import Plate, PlateParameters
 from hapticrender.protocols import Flag
@@ -154,10 +154,10 @@ class Rewired(OtherPlate):
     [
         (-np.eye(2), np.eye(2), None, RESCALED, "sensor 1 and 2"),
         (np.eye(2), -np.eye(2), None, INVERTED, "actuator 1 and 2"),
-        (np.eye(2)[::-1], np.eye(2), (2.0, 0.05), EXCHANGED, "sensor 1 and 2"),
-        (np.eye(2), np.eye(2)[::-1], (0.3, -0.05), EXCHANGED, "sensor 1 and 2"),
+        (np.eye(2)[::-1], np.eye(2), (2.0, 0.05), SWAPPED, "sensor 1 and 2"),
+        (np.eye(2), np.eye(2)[::-1], (0.3, -0.05), SWAPPED, "sensor 1 and 2"),
     ],
-    ids=["sensors inverted", "coils inverted", "sensors exchanged", "coils exchanged"],
+    ids=["sensors inverted", "coils inverted", "sensors swapped", "coils swapped"],
 )
 def test_changes_of_gains_stop_both(exports, shown, moved, touch, cause, named, kind):
     """The sensors of a closed loop that the library stopped, played back to both; touched: load (N), place (m)."""

@@ -8,6 +8,7 @@ import pytest
 from other_plate import REACH, TRUTH, OtherPlate
 
 import hapticrender as hr
+from benchmarks import faults
 from benchmarks.false_stops import random_scene, run
 from hapticrender.plants.plate import PlateParameters
 from hapticrender.touch.mechanics import HEAVY_SECOND
@@ -151,7 +152,7 @@ def test_a_gain_that_changes_during_a_run_stops_the_drive_and_is_named(change, f
     ("frequency", "position", "sensors"),
     [(72.0, 0.0275, True), (189.0, 0.05, True), (400.0, -0.05, True), (189.0, 0.05, False), (400.0, -0.05, False)],
 )
-def test_what_is_exchanged_stops_the_drive_and_is_named(frequency, position, sensors):
+def test_what_is_swapped_stops_the_drive_and_is_named(frequency, position, sensors):
     """Two sensors, or else two coils, under 2 N off the middle; coils are found once the rocking grows (6 ms)."""
     both, changed = np.eye(2), np.eye(2)[::-1]
     plate = Rewired(*((changed, both) if sensors else (both, changed)), **FINGER | {"position": position, "load": 2.0})
@@ -160,6 +161,13 @@ def test_what_is_exchanged_stops_the_drive_and_is_named(frequency, position, sen
     first = round(START * RATE)
     assert 0 < stopped.value.time - START < 8e-3
     assert max(plate.motion[first:]) < max(plate.motion[:first]) + 50e-6
+
+
+@pytest.mark.parametrize("position", [-0.05, 0.05])
+def test_a_finger_near_an_end_is_no_swap_of_coils(position):
+    """On a plate that is wrong in everything: the drive bears the finger's moment, which makes h = 0.6 of 0.75."""
+    recording = hr.render(scene(400.0), driver=faults.FaultyWrongPlate(*faults.FAULTS["none"], 2.0, position))
+    assert not (recording.flags & hr.Flag.STOPPED).any()
 
 
 @pytest.mark.parametrize("position", [0.0, 0.05])

@@ -7,10 +7,13 @@
 
 #define SENSOR 0u
 #define ACTUATOR 1u
+#define EACH 3u /* w: of one sensor or actuator each, and of the two when swapped */
+#define SWAP 2u
+#define RESPONSE 2u /* first of these models */
 #define LEAST_INVERTED REAL(-1.6) /* gains of a sensor or an actuator that is inverted */
 #define MOST_INVERTED REAL(-0.4)
-#define LEAST_EXCHANGED REAL(0.6) /* share of an exchange */
-#define MOST_EXCHANGED REAL(1.4)
+#define LEAST_SWAPPED REAL(0.75) /* share of a swap */
+#define MOST_SWAPPED REAL(1.4)
 #define DEAD REAL(0.25) /* of a sensor: a smaller magnitude is a fault, and a larger gain than this: */
 #define MOST_GAIN REAL(2.0)
 #define UNEXPLAINED REAL(0.1) /* of the energy of the innovations */
@@ -52,44 +55,21 @@ static void clear_sums(gains_t *s, uint32_t kind)
 {
     (void)memset(s->weighted[kind], 0, sizeof(s->weighted[kind]));
     (void)memset(s->weights[kind], 0, sizeof(s->weights[kind]));
-    (void)memset(s->exchange[kind], 0, sizeof(s->exchange[kind]));
-    (void)memset(s->models[2u + 2u * kind], 0, 2u * sizeof(s->models[0]));
-    (void)memset(s->models[6u + kind], 0, sizeof(s->models[0]));
+    (void)memset(s->models[RESPONSE + EACH * kind], 0, EACH * sizeof(s->models[0]));
 }
 
 static real_t product(const real_t a[2], const real_t b[2]) { return a[0] * b[0] + a[1] * b[1]; }
 
 /* Add a sample of w, each of both sensors, to the sums; those of actuators are means. */
-static void add_sums(gains_t *s, uint32_t kind, real_t pole, const real_t w[2][2])
+static void add_sums(gains_t *s, uint32_t kind, real_t pole, const real_t w[EACH][2])
 {
     const real_t kept = (kind == SENSOR) ? REAL(1.0) : (REAL(1.0) - pole);
-    for (uint32_t i = 0u; i < 2u; i++) {
-        for (uint32_t j = i; j < 2u; j++) {
+    for (uint32_t i = 0u; i < EACH; i++) {
+        for (uint32_t j = i; j < EACH; j++) {
             s->weights[kind][i][j] = kept * s->weights[kind][i][j] + pole * product(w[i], w[j]);
         }
         s->weighted[kind][i] = kept * s->weighted[kind][i] + pole * product(w[i], s->e);
     }
-}
-
-/* Add a sample of w of an exchange to its sums; those of actuators are means. */
-static void add_exchange(gains_t *s, uint32_t kind, real_t pole, const real_t w[2])
-{
-    const real_t kept = (kind == SENSOR) ? REAL(1.0) : (REAL(1.0) - pole);
-    s->exchange[kind][0] = kept * s->exchange[kind][0] + pole * product(w, w);
-    s->exchange[kind][1] = kept * s->exchange[kind][1] + pole * product(w, s->e);
-}
-
-/* Whether an exchange explains the innovations, of variance `noise`, and better than `faults` of gains. */
-static uint32_t judge_exchange(const gains_t *s, uint32_t kind, real_t noise, uint32_t faults)
-{
-    const real_t w = s->exchange[kind][0];
-    const real_t b = s->exchange[kind][1];
-    const real_t h = b / (w + noise);
-    const real_t rest = s->energy[kind] - REAL(2.0) * h * b + h * h * w;
-    const real_t bound = ((kind == SENSOR) ? UNEXPLAINED_INVERTED : UNEXPLAINED) * s->energy[kind];
-    const real_t most = (faults != 0u) ? s->rest : bound;
-    const uint32_t fits = ((h > LEAST_EXCHANGED) && (h < MOST_EXCHANGED) && (rest < most)) ? 1u : 0u;
-    return (h * h * (w + noise) < CERTAIN * noise) ? 0u : fits;
 }
 
 /* Whether a gain is that of a fault, with `rest` the share of the energy that it leaves unexplained. */
@@ -102,8 +82,19 @@ static uint32_t is_fault(uint32_t kind, real_t gain, real_t rest)
     return ((kind == SENSOR) && (rest < UNEXPLAINED)) ? changed : 0u;
 }
 
-/* Find both gains, from innovations of variance `noise`; those that are faults, as bits. */
-static uint32_t judge_gains(gains_t *s, uint32_t kind, real_t noise)
+/* Whether a swap explains the innovations, of variance `noise`, but for less than `rest` of their energy. */
+static uint32_t is_swap(const gains_t *s, uint32_t kind, real_t noise, real_t rest)
+{
+    const real_t w = s->weights[kind][SWAP][SWAP];
+    const real_t b = s->weighted[kind][SWAP];
+    const real_t h = b / (w + noise);
+    const uint32_t near = ((h > LEAST_SWAPPED) && (h < MOST_SWAPPED)) ? 1u : 0u;
+    const uint32_t certain = (h * h * (w + noise) > CERTAIN * noise) ? near : 0u;
+    return (s->energy[kind] - REAL(2.0) * h * b + h * h * w < rest) ? certain : 0u;
+}
+
+/* Find gains and swap, from innovations of variance `noise`: gains that are faults, as bits; whether it is a swap. */
+static uint32_t judge_gains(const gains_t *s, uint32_t kind, real_t noise, uint32_t *swapped)
 {
     const real_t energy = s->energy[kind];
     const real_t *b = s->weighted[kind];
@@ -113,15 +104,18 @@ static uint32_t judge_gains(gains_t *s, uint32_t kind, real_t noise)
     const real_t scale = REAL(1.0) / ((w00 + noise) * (w11 + noise) - w01 * w01);
     const real_t g[2] = {scale * ((w11 + noise) * b[0] - w01 * b[1]), scale * ((w00 + noise) * b[1] - w01 * b[0])};
     const real_t variance[2] = {scale * (w11 + noise) * noise, scale * (w00 + noise) * noise};
-    const real_t rest = energy - REAL(2.0) * product(g, b) + g[0] * g[0] * w00 + REAL(2.0) * g[0] * g[1] * w01
+    real_t rest = energy - REAL(2.0) * product(g, b) + g[0] * g[0] * w00 + REAL(2.0) * g[0] * g[1] * w01
         + g[1] * g[1] * w11;
     uint32_t faults = 0u;
-    s->rest = rest;
     for (uint32_t j = 0u; j < 2u; j++) {
         if ((g[j] * g[j] > CERTAIN * variance[j]) && (is_fault(kind, REAL(1.0) + g[j], rest / energy) != 0u)) {
             faults |= 1u << j;
         }
     }
+    if (faults == 0u) { /* a swap has to explain more than the gains do, where these are faults */
+        rest = ((kind == SENSOR) ? UNEXPLAINED_INVERTED : UNEXPLAINED) * energy;
+    }
+    *swapped |= is_swap(s, kind, noise, rest);
     return faults;
 }
 
@@ -129,57 +123,47 @@ static uint32_t judge_gains(gains_t *s, uint32_t kind, real_t noise)
 static void follow_sensors(gains_t *s, const gain_settings_t *p, const real_t force[2], gain_faults_t *faults)
 {
     const real_t none[2] = {REAL(0.0), REAL(0.0)};
-    real_t w[2][2];
-    for (uint32_t j = 0u; j < 2u; j++) {
+    const real_t shown[2] = {model_sensor(s->models[1], p, 0u), model_sensor(s->models[1], p, 1u)};
+    real_t w[EACH][2] = {
+        {shown[0], REAL(0.0)}, {REAL(0.0), shown[1]}, {shown[1] - shown[0], shown[0] - shown[1]}};
+    for (uint32_t j = 0u; j < EACH; j++) {
         for (uint32_t i = 0u; i < 2u; i++) {
-            w[j][i] = -model_sensor(s->models[2u + j], p, i);
+            w[j][i] -= model_sensor(s->models[RESPONSE + j], p, i);
         }
-        w[j][j] += model_sensor(s->models[1], p, j);
     }
-    const real_t apart = model_sensor(s->models[1], p, 1u) - model_sensor(s->models[1], p, 0u);
-    const real_t exchanged[2] = {apart - model_sensor(s->models[6], p, 0u), -apart - model_sensor(s->models[6], p, 1u)};
     add_sums(s, SENSOR, REAL(1.0), (const real_t (*)[2])w);
-    add_exchange(s, SENSOR, REAL(1.0), exchanged);
     s->energy[SENSOR] += product(s->e, s->e);
     advance_model(s->models[1], p, force);
-    for (uint32_t j = 0u; j < 2u; j++) {
-        correct_model(s->models[2u + j], p, w[j], REAL(1.0));
-        advance_model(s->models[2u + j], p, none);
+    for (uint32_t j = 0u; j < EACH; j++) {
+        correct_model(s->models[RESPONSE + j], p, w[j], REAL(1.0));
+        advance_model(s->models[RESPONSE + j], p, none);
     }
-    correct_model(s->models[6], p, exchanged, REAL(1.0));
-    advance_model(s->models[6], p, none);
     s->left -= 1u;
     if (s->left == 0u) {
-        faults->rescaled = judge_gains(s, SENSOR, p->innovation);
-        faults->exchanged = judge_exchange(s, SENSOR, p->innovation, faults->rescaled);
+        faults->rescaled = judge_gains(s, SENSOR, p->innovation, &faults->swapped);
     }
 }
 
 /* Add a sample to the means, and judge actuators. */
 static void follow_actuators(gains_t *s, const gain_settings_t *p, const real_t force[2], gain_faults_t *faults)
 {
-    real_t w[2][2];
-    for (uint32_t j = 0u; j < 2u; j++) {
+    real_t(*const models)[6] = &s->models[RESPONSE + EACH];
+    real_t w[EACH][2];
+    for (uint32_t j = 0u; j < EACH; j++) {
         for (uint32_t i = 0u; i < 2u; i++) {
-            w[j][i] = model_sensor(s->models[4u + j], p, i);
+            w[j][i] = model_sensor(models[j], p, i);
         }
     }
-    const real_t exchanged[2] = {model_sensor(s->models[7], p, 0u), model_sensor(s->models[7], p, 1u)};
     if (s->watched > p->duration / 2u) { /* by then w has forgotten where it began */
         add_sums(s, ACTUATOR, p->window_pole, (const real_t (*)[2])w);
-        add_exchange(s, ACTUATOR, p->window_pole, exchanged);
     }
-    for (uint32_t j = 0u; j < 2u; j++) {
+    for (uint32_t j = 0u; j < EACH; j++) {
         const real_t own[2] = {product(p->force_of_actuator[j][0], force), product(p->force_of_actuator[j][1], force)};
-        correct_model(s->models[4u + j], p, w[j], REAL(-1.0));
-        advance_model(s->models[4u + j], p, own);
+        correct_model(models[j], p, w[j], REAL(-1.0));
+        advance_model(models[j], p, own);
     }
-    const real_t other[2] = {product(p->force_of_exchange[0], force), product(p->force_of_exchange[1], force)};
-    correct_model(s->models[7], p, exchanged, REAL(-1.0));
-    advance_model(s->models[7], p, other);
     if ((2u * s->watched > 3u * p->duration) && (s->energy[ACTUATOR] > LARGE * p->innovation)) {
-        faults->inverted = judge_gains(s, ACTUATOR, p->window_pole * p->innovation);
-        faults->exchanged |= judge_exchange(s, ACTUATOR, p->window_pole * p->innovation, faults->inverted);
+        faults->inverted = judge_gains(s, ACTUATOR, p->window_pole * p->innovation, &faults->swapped);
     }
 }
 
@@ -223,6 +207,6 @@ gain_faults_t gains_check(gains_t *gains, const gain_settings_t *used, const rea
     }
     correct_model(s->models[0], p, s->e, REAL(1.0));
     advance_model(s->models[0], p, force);
-    faults.exchanged = (LAW_SENSORS == 2u) ? faults.exchanged : 0u;
+    faults.swapped = (LAW_SENSORS == 2u) ? faults.swapped : 0u;
     return faults;
 }

@@ -18,21 +18,19 @@ typedef struct {
     real_t step_state[4][4], step_force[4][2];        /* of coordinates and their rates, with the force held */
     real_t filter_gain[6][2];                         /* of these and of the force that wanders, per innovation */
     real_t sensor_from_coordinate[2][2];
-    real_t force_of_actuator[2][2][2];
-    real_t force_of_exchange[2][2]; /* of exchanged actuators - of these, per force; 0: not two */
+    real_t force_of_actuator[3][2][2]; /* per force; last: of swapped actuators - of these, 0 where there are not two */
 } gain_settings_t;
 
 typedef struct {
-    real_t models[8][6]; /* the filter's state, p, xi_1, xi_2, zeta_1, zeta_2; xi and zeta of an exchange */
+    real_t models[8][6]; /* the filter's state, p, xi_1, xi_2, xi_3, zeta_1, zeta_2, zeta_3 */
     real_t e[2], mean[2];
-    real_t energy[2], weights[2][2][2], weighted[2][2], exchange[2][2];
-    real_t rest; /* of the energy of the innovations, that the gains leave unexplained */
+    real_t energy[2], weights[2][3][3], weighted[2][3];
     uint32_t left, watched;
 } gains_t;
 
-/* What has changed: sensors whose gain has, and actuators that are inverted, as bits; whether sensors are exchanged. */
+/* What has changed: sensors whose gain has, and actuators that are inverted, as bits; whether two are swapped. */
 typedef struct {
-    uint32_t rescaled, inverted, exchanged;
+    uint32_t rescaled, inverted, swapped;
 } gain_faults_t;
 
 /* Compare a sample's sensors with the motion that device and force (N, N, from this sample on) give. */

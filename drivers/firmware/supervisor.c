@@ -293,22 +293,22 @@ static uint32_t cool(supervisor_t *s, law_t *law, real_t drive[])
     return flags;
 }
 
-/* Tests 10 to 12: whether a sensor or an actuator has changed its gain, or sensors are exchanged. */
+/* Tests 10 to 12: whether a sensor or an actuator has changed its gain, or two are swapped. */
 static supervisor_cause_t compare_gains(supervisor_t *s, supervisor_cause_t cause)
 {
     gain_faults_t found = gains_check(&s->gains, &s->p->gains, s->last, s->force);
     for (uint32_t i = 0u; i < LAW_SENSORS; i++) {
         if (2u * s->repeats[i] > s->p->frozen_time) { /* that is for test 2 to find */
             found.rescaled &= ~(1u << i);
-            found.exchanged = 0u;
+            found.swapped = 0u;
         }
     }
-    if ((cause != SUPERVISOR_FINE) || ((found.rescaled | found.exchanged | found.inverted) == 0u)) {
+    if ((cause != SUPERVISOR_FINE) || ((found.rescaled | found.swapped | found.inverted) == 0u)) {
         return cause;
     }
-    if (found.exchanged != 0u) {
+    if (found.swapped != 0u) {
         s->stopped_sensors = 3u;
-        return SUPERVISOR_EXCHANGED;
+        return SUPERVISOR_SWAPPED;
     }
     s->stopped_sensors = (found.rescaled != 0u) ? found.rescaled : found.inverted;
     return (found.rescaled != 0u) ? SUPERVISOR_RESCALED : SUPERVISOR_INVERTED;

@@ -24,7 +24,7 @@ typedef enum {
     SUPERVISOR_BEYOND,
     SUPERVISOR_RESCALED,
     SUPERVISOR_INVERTED,
-    SUPERVISOR_EXCHANGED
+    SUPERVISOR_SWAPPED
 } supervisor_cause_t;
 
 /* Settings, from `hapticrender export`; poles and fades are per sample, times in samples. */

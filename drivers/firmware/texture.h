@@ -1,7 +1,7 @@
 /*
  * Textures that are no sum of bands: samples in time, which the host streams into a ring ahead of play, and a profile
- * along the surface, a table that is read by cubic interpolation; as hapticrender/sampled_texture.py.  There are two of them, so
- * that one fades into the next.  Static memory: sizeof(textures_t), 64 kB with the sizes below.
+ * along the surface, a table that is read by cubic interpolation; as hapticrender/sampled_texture.py.  There are two of
+ * them, so that one fades into the next.  Static memory: sizeof(textures_t), 64 kB with the sizes below.
  */
 #ifndef TEXTURE_H
 #define TEXTURE_H

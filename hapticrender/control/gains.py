@@ -1,4 +1,4 @@
-"""Supervision of gains: whether a sensor shows, or an actuator gives, a multiple of what it did a moment before.
+"""Supervision of gains: whether a sensor shows, or an actuator gives, a multiple of what it did, or another's.
 
 A Kalman filter has the device's coordinates q, their rates, and a force d that wanders, by which it follows fingers and
 loads.  Its innovations e are white but for what wanders faster::
@@ -10,24 +10,18 @@ sensor alone and p the filter's state, from now on without corrections::
 
     w_i = c_i p - C xi_i,                    xi_i[n+1] = A (xi_i[n] + K w_i[n])
 
-Sensors that show each other's motion from now on add h w with h = 1, and xi of its own::
-
-    w = (c_2 - c_1, c_1 - c_2) p - C xi
-
 An actuator j that gives g_j times its force F_j adds (g_j - 1) w_j::
 
     w_j = C zeta_j,                          zeta_j[n+1] = A (zeta_j[n] - K w_j[n]) + B F_j[n]
 
-and under actuators that give each other's force h w (and so under sensors that were exchanged while they showed the
-same, where sensors and actuators are symmetrical about the middle)::
-
-    w = C zeta,        zeta[n+1] = A (zeta[n] - K w[n]) + B (F_exchanged[n] - F[n])
-
-Least squares of e on w find g, of both sensors or of both actuators, and h.
+Two that are swapped add h w_3, h = 1: c_3 = (c_2 - c_1, c_1 - c_2) of sensors, F_3 = F_swapped - F of actuators.
+Sensors that were swapped while both showed the same look like actuators that are, where both are symmetrical about the
+middle.  Least squares of e on w_1 and w_2 find g, of both sensors or of both actuators; on w_3 alone, h.
 
 Sensors are judged over the 3 ms after an innovation above 4.5 times its noise, and its mean square before: a finger's
 force makes no jump, what it adds to e is no multiple of w.  Actuators are judged by means over 3 ms, while e is large:
-only an inversion or an exchange, also of sensors, is distinguished from a finger by these.
+only an inversion or a swap, also of sensors, is distinguished from a finger by these.  The moment of a finger off the
+middle, borne by the drive, looks like a swap, too, with h = 1/2.
 
 References
 ----------
@@ -48,13 +42,14 @@ from hapticrender.mathx import zoh
 from hapticrender.protocols import Array
 
 MOST = 2  # sensors, and actuators
+EACH, SWAP = MOST + 1, MOST  # w: of one sensor or actuator each, and of the two when swapped
 # numpy's integers: a kernel is compiled anew for each value of Python's
 SENSOR, ACTUATOR = np.arange(2)  # kinds of gains
-STATE, MOTION, XI, ZETA, EXCHANGE = np.array([0, 1, 2, 4, 6])  # models: x, p, two xi, two zeta, xi and zeta
+STATE, MOTION, RESPONSE = np.arange(3)  # models: x; p; xi_1, xi_2, xi_3, zeta_1, zeta_2, zeta_3
 LEAST_INVERTED, MOST_INVERTED = -1.6, -0.4  # gains of a sensor or an actuator that is inverted
 DEAD, MOST_GAIN = 0.25, 2.0  # of a sensor: a smaller magnitude, a larger gain is a fault
-LEAST_EXCHANGED, MOST_EXCHANGED = 0.6, 1.4  # h
-UNEXPLAINED, UNEXPLAINED_INVERTED = 0.1, 0.2  # of the energy of e; the latter of inverted or exchanged sensors
+LEAST_SWAPPED, MOST_SWAPPED = 0.75, 1.4  # h; 0.5 to 0.63 is a finger off the middle, whose moment the drive bears
+UNEXPLAINED, UNEXPLAINED_INVERTED = 0.1, 0.2  # of the energy of e; the latter of inverted or swapped sensors
 CERTAIN, JUMP = 25.0, 20.0  # variances: 5 sigma of a gain; 4.5 sigma of an innovation
 WATCHED, LARGE = 4.0, 20.0  # variances of e: actuators are followed, judged
 WANDER = 3.5  # N/sqrt(s), of d
@@ -66,20 +61,18 @@ GAINS = np.dtype(
         ("step_force", np.float64, (4, 2)),  # ... and B, with the force held over a sample
         ("filter_gain", np.float64, (6, MOST)),  # K
         ("sensor_from_coordinate", np.float64, (MOST, 2)),  # of C
-        ("force_of_actuator", np.float64, (MOST, 2, 2)),  # F_j per F
-        ("force_of_exchange", np.float64, (2, 2)),  # F_exchanged - F per F
+        ("force_of_actuator", np.float64, (EACH, 2, 2)),  # F_j per F
         ("scale", np.float64),  # 1/m: e and C are in units of the sensors' noise
         ("innovation", np.float64),  # variance of e of each sensor by noise, as a multiple of its own
         *((name, np.float64) for name in ("mean_pole", "window_pole")),  # a sample
         ("duration", np.int64),  # samples of a trial
-        ("models", np.float64, (8, 6)),  # x, p, xi_1, xi_2, zeta_1, zeta_2; xi and zeta of an exchange
+        ("models", np.float64, (2 + 2 * EACH, 6)),
         ("advanced", np.float64, (4,)),
-        ("w", np.float64, (2, MOST)),  # w_1 and w_2, of both sensors
+        ("w", np.float64, (EACH, MOST)),  # of both sensors
         *((name, np.float64, (MOST,)) for name in ("e", "mean", "energy")),  # mean of e^2 of a sensor; sums of e^2
-        ("weights", np.float64, (2, 2, 2)),  # sums of w_i w_j of sensors, of actuators
-        *((name, np.float64, (2, 2)) for name in ("weighted", "gain")),  # sums of w_i e; g
-        ("exchange", np.float64, (2, 2)),  # sums of w w and w e of an exchange
-        ("rest", np.float64),  # of the energy of e, that the gains leave unexplained
+        ("weights", np.float64, (2, EACH, EACH)),  # sums of w_i w_j of sensors, of actuators
+        ("weighted", np.float64, (2, EACH)),  # sums of w_i e
+        ("gain", np.float64, (2, MOST)),  # g
         *((name, np.int64) for name in ("left", "watched")),  # samples: to go in the trial; with actuators followed
     ]
 )
@@ -110,7 +103,8 @@ def design_gains(model: DeviceModel, noise: float) -> Array | None:
     shares = np.einsum("aj,jb->jab", force_map, np.linalg.pinv(force_map))
     found["force_of_actuator"][0][:actuators, :n, :n] = shares
     if actuators == MOST:
-        found["force_of_exchange"] = force_map @ np.eye(MOST)[::-1] @ np.linalg.pinv(force_map) - np.eye(n)
+        swapped = force_map @ np.eye(MOST)[::-1] @ np.linalg.pinv(force_map)
+        found["force_of_actuator"][0][SWAP, :n, :n] = swapped - shares.sum(axis=0)
     found["scale"], found["innovation"] = 1.0 / noise, variance
     found["mean_pole"], found["window_pole"] = (-math.expm1(-1.0 / (t * model.rate)) for t in (MEAN, WINDOW))
     found["duration"] = max(round(TRIAL * model.rate), LEAST_TRIAL)
@@ -162,19 +156,21 @@ def model_sensors(gains, k):
 def clear_sums(gains, kind):
     """Set the sums of a kind of gains, and the models behind its w, to zero."""
     s = record(gains, GAINS_T, 0)
-    for j in range(2):
-        s.weighted[kind, j] = s.weights[kind, j, 0] = s.weights[kind, j, 1] = s.exchange[kind, j] = 0.0
+    for j in range(EACH):
+        s.weighted[kind, j] = 0.0
+        for i in range(EACH):
+            s.weights[kind, j, i] = 0.0
         for i in range(6):
-            s.models[XI + 2 * kind + j, i] = s.models[EXCHANGE + kind, i] = 0.0
+            s.models[RESPONSE + EACH * kind + j, i] = 0.0
 
 
 @kernel
 def add_sums(gains, kind, pole):
-    """Add a sample of w_1 and w_2 to the sums; with a `pole` below 1 these are means."""
+    """Add a sample of w to the sums; with a `pole` below 1 these are means."""
     s = record(gains, GAINS_T, 0)
     w, b, x, e, kept = s.weights[kind], s.weighted[kind], s.w, s.e, 1.0 if kind == SENSOR else 1.0 - pole
-    for i in range(2):
-        for j in range(i, 2):
+    for i in range(EACH):
+        for j in range(i, EACH):
             w[i, j] = kept * w[i, j] + pole * (x[i, 0] * x[j, 0] + x[i, 1] * x[j, 1])
         b[i] = kept * b[i] + pole * (x[i, 0] * e[0] + x[i, 1] * e[1])
 
@@ -189,95 +185,62 @@ def is_fault(kind, gain, rest):
 
 @kernel
 def judge_gains(gains, kind, noise):
-    """Find both gains, from innovations of variance `noise`; those that are faults, as bits."""
+    """Find gains and swap, from innovations of variance `noise`: gains that are faults, as bits; whether it is a swap.
+
+    A swap has to explain more than the gains do, where these are faults.
+    """
     s = record(gains, GAINS_T, 0)
-    w, b, faults = s.weights[kind], s.weighted[kind], 0
-    w00, w11 = w[0, 0] + noise, w[1, 1] + noise  # a sensor that shows nothing keeps its gain
+    w, b, energy, faults = s.weights[kind], s.weighted[kind], s.energy[kind], 0
+    w00, w11, w22 = w[0, 0] + noise, w[1, 1] + noise, w[SWAP, SWAP] + noise  # what shows nothing keeps its gain
     scale = 1.0 / (w00 * w11 - w[0, 1] * w[0, 1])
-    g0, g1 = scale * (w11 * b[0] - w[0, 1] * b[1]), scale * (w00 * b[1] - w[0, 1] * b[0])
-    rest = s.energy[kind] - 2.0 * (g0 * b[0] + g1 * b[1])
+    g0, g1, h = scale * (w11 * b[0] - w[0, 1] * b[1]), scale * (w00 * b[1] - w[0, 1] * b[0]), b[SWAP] / w22
+    rest = energy - 2.0 * (g0 * b[0] + g1 * b[1])
     rest += g0 * g0 * w[0, 0] + 2.0 * g0 * g1 * w[0, 1] + g1 * g1 * w[1, 1]
-    s.rest = rest
     s.gain[kind, 0], s.gain[kind, 1] = 1.0 + g0, 1.0 + g1
     for j in range(2):
         g, variance = (g0, w11) if j == 0 else (g1, w00)
-        if g * g > CERTAIN * scale * variance * noise and is_fault(kind, 1.0 + g, rest / s.energy[kind]):
+        if g * g > CERTAIN * scale * variance * noise and is_fault(kind, 1.0 + g, rest / energy):
             faults |= 1 << j
-    return faults
-
-
-@kernel
-def add_exchange(gains, kind, pole, w0, w1):
-    """Add a sample of w of an exchange to its sums; with a `pole` below 1 these are means."""
-    s = record(gains, GAINS_T, 0)
-    x, kept = s.exchange[kind], 1.0 if kind == SENSOR else 1.0 - pole
-    x[0] = kept * x[0] + pole * (w0 * w0 + w1 * w1)
-    x[1] = kept * x[1] + pole * (w0 * s.e[0] + w1 * s.e[1])
-
-
-@kernel
-def judge_exchange(gains, kind, noise, faults):
-    """Whether an exchange explains the innovations, of variance `noise`, and better than `faults` of gains."""
-    s = record(gains, GAINS_T, 0)
-    w, b, energy = s.exchange[kind, 0], s.exchange[kind, 1], s.energy[kind]
-    h = b / (w + noise)
-    rest = energy - 2.0 * h * b + h * h * w
-    if h * h * (w + noise) < CERTAIN * noise or not LEAST_EXCHANGED < h < MOST_EXCHANGED:
-        return False
-    bound = UNEXPLAINED_INVERTED if kind == SENSOR else UNEXPLAINED
-    return rest < (s.rest if faults > 0 else bound * energy)
+    if faults == 0:
+        rest = (UNEXPLAINED_INVERTED if kind == SENSOR else UNEXPLAINED) * energy
+    certain = h * h * w22 > CERTAIN * noise and LEAST_SWAPPED < h < MOST_SWAPPED
+    return faults, certain and energy - 2.0 * h * b[SWAP] + h * h * w[SWAP, SWAP] < rest
 
 
 @kernel
 def follow_sensors(gains, force0, force1):
-    """Add a sample to a trial; at its end the sensors whose gain has changed, as bits, and whether they exchanged."""
+    """Add a sample to a trial; at its end the sensors whose gain has changed, as bits, and whether they are swapped."""
     s = record(gains, GAINS_T, 0)
-    shown0, shown1 = model_sensors(gains, MOTION)
-    for j in range(2):
-        known0, known1 = model_sensors(gains, XI + j)
-        s.w[j, 0], s.w[j, 1] = (shown0 if j == 0 else 0.0) - known0, (shown1 if j == 1 else 0.0) - known1
+    p0, p1 = model_sensors(gains, MOTION)
+    for j in range(EACH):
+        known0, known1 = model_sensors(gains, RESPONSE + j)
+        s.w[j, 0] = (p0 if j == 0 else p1 - p0 if j == SWAP else 0.0) - known0
+        s.w[j, 1] = (p1 if j == 1 else p0 - p1 if j == SWAP else 0.0) - known1
     add_sums(gains, SENSOR, 1.0)
-    known0, known1 = model_sensors(gains, EXCHANGE)
-    exchanged0, exchanged1 = shown1 - shown0 - known0, shown0 - shown1 - known1
-    add_exchange(gains, SENSOR, 1.0, exchanged0, exchanged1)
     s.energy[SENSOR] += s.e[0] * s.e[0] + s.e[1] * s.e[1]
     advance_model(gains, MOTION, force0, force1)
-    for j in range(2):
-        correct_model(gains, XI + j, s.w[j, 0], s.w[j, 1])
-        advance_model(gains, XI + j, 0.0, 0.0)
-    correct_model(gains, EXCHANGE, exchanged0, exchanged1)
-    advance_model(gains, EXCHANGE, 0.0, 0.0)
+    for j in range(EACH):
+        correct_model(gains, RESPONSE + j, s.w[j, 0], s.w[j, 1])
+        advance_model(gains, RESPONSE + j, 0.0, 0.0)
     s.left -= 1
-    if s.left > 0:
-        return 0, False
-    found = judge_gains(gains, SENSOR, s.innovation)
-    return found, judge_exchange(gains, SENSOR, s.innovation, found)
+    return judge_gains(gains, SENSOR, s.innovation) if s.left == 0 else (0, False)
 
 
 @kernel
 def follow_actuators(gains, force0, force1):
-    """Add a sample to the means; the actuators that are inverted, as bits, and whether they are exchanged."""
+    """Add a sample to the means; the actuators that are inverted, as bits, and whether they are swapped."""
     s = record(gains, GAINS_T, 0)
-    for j in range(2):
-        s.w[j, 0], s.w[j, 1] = model_sensors(gains, ZETA + j)
-    exchanged0, exchanged1 = model_sensors(gains, EXCHANGE + ACTUATOR)
+    first = RESPONSE + EACH * ACTUATOR
+    for j in range(EACH):
+        s.w[j, 0], s.w[j, 1] = model_sensors(gains, first + j)
     if s.watched > s.duration // 2:  # by then w has forgotten where it began
         add_sums(gains, ACTUATOR, s.window_pole)
-        add_exchange(gains, ACTUATOR, s.window_pole, exchanged0, exchanged1)
-    for j in range(2):
-        own = s.force_of_actuator[j]
-        correct_model(gains, ZETA + j, -s.w[j, 0], -s.w[j, 1])
-        advance_model(gains, ZETA + j, own[0, 0] * force0 + own[0, 1] * force1, own[1, 0] * force0 + own[1, 1] * force1)
-    own = s.force_of_exchange
-    correct_model(gains, EXCHANGE + ACTUATOR, -exchanged0, -exchanged1)
-    advance_model(
-        gains, EXCHANGE + ACTUATOR, own[0, 0] * force0 + own[0, 1] * force1, own[1, 0] * force0 + own[1, 1] * force1
-    )
-    noise = s.window_pole * s.innovation
-    if 2 * s.watched <= 3 * s.duration or s.energy[ACTUATOR] <= LARGE * s.innovation:
-        return 0, False
-    found = judge_gains(gains, ACTUATOR, noise)
-    return found, judge_exchange(gains, ACTUATOR, noise, found)
+    for j in range(EACH):
+        f = s.force_of_actuator[j]
+        correct_model(gains, first + j, -s.w[j, 0], -s.w[j, 1])
+        advance_model(gains, first + j, f[0, 0] * force0 + f[0, 1] * force1, f[1, 0] * force0 + f[1, 1] * force1)
+    known = 2 * s.watched > 3 * s.duration and s.energy[ACTUATOR] > LARGE * s.innovation
+    return judge_gains(gains, ACTUATOR, s.window_pole * s.innovation) if known else (0, False)
 
 
 @kernel
@@ -298,30 +261,29 @@ def note_innovations(gains, sensed, sensors):
 
 @kernel
 def check_gains(gains, sensed, sensors, force0, force1):
-    """Sensors and actuators whose gain has changed, as bits, and whether two sensors show each other's motion.
+    """Sensors and actuators whose gain has changed, as bits, and whether two are swapped.
 
     `force0` and `force1` (N) act from this sample on.
     """
     s = record(gains, GAINS_T, 0)
     rescaled = inverted = 0
-    exchanged = False
+    swapped = together = False
     if note_innovations(gains, sensed, sensors) and s.left == 0:
         clear_sums(gains, SENSOR)
         s.left, s.energy[SENSOR] = s.duration, 0.0
         for i in range(6):
             s.models[MOTION, i] = s.models[STATE, i]
     if s.left > 0:
-        rescaled, exchanged = follow_sensors(gains, force0, force1)
+        rescaled, swapped = follow_sensors(gains, force0, force1)
     if s.energy[ACTUATOR] > WATCHED * s.innovation:
         s.watched += 1
-        inverted, swapped = follow_actuators(gains, force0, force1)
-        exchanged = exchanged or swapped
+        inverted, together = follow_actuators(gains, force0, force1)
     elif s.watched > 0:
         clear_sums(gains, ACTUATOR)
         s.watched = 0
     correct_model(gains, STATE, s.e[0], s.e[1])
     advance_model(gains, STATE, force0, force1)
-    return rescaled, inverted, exchanged and sensors == MOST
+    return rescaled, inverted, sensors == MOST and (swapped or together)
 
 
 @kernel

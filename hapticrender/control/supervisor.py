@@ -19,7 +19,6 @@ from hapticrender.control.supervisor_kernel import (
     ACTIVE,
     BEYOND,
     DRIVE,
-    EXCHANGED,
     FROZEN,
     INCONSISTENT,
     INVALID,
@@ -29,6 +28,7 @@ from hapticrender.control.supervisor_kernel import (
     RINGING,
     ROOT2,
     SUPERVISOR,
+    SWAPPED,
     supervised_step,
 )
 from hapticrender.jit import CFunction
@@ -58,9 +58,9 @@ UNLIMITED = 1e300
 class Fault(NamedTuple):
     """Why a supervisor has stopped the drive."""
 
-    cause: int  # INVALID to EXCHANGED
+    cause: int  # INVALID to SWAPPED
     sample: int  # at which the test failed; the drive fades out from it on
-    sensors: int  # bit i: sensor i + 1; of INVALID, FROZEN, BEYOND, RESCALED and EXCHANGED; actuator of INVERTED
+    sensors: int  # bit i: sensor i + 1; of INVALID, FROZEN, BEYOND, RESCALED and SWAPPED; actuator of INVERTED
     gains: tuple[float, ...] = ()  # of all sensors or actuators, over those before; of RESCALED and INVERTED
 
     @property
@@ -118,8 +118,8 @@ CAUSES = {
         "actuator {sensor}: the motion is that of {gain} times its drive; most likely it is inverted, or sensors are",
         "wiring and polarity of all actuators and sensors",
     ),
-    EXCHANGED: (
-        "sensor {sensor}: each shows the motion of the other; most likely they are exchanged, or the actuators",
+    SWAPPED: (
+        "sensor {sensor}: each shows the motion of the other; most likely they are swapped, or the actuators",
         "wiring of all sensors and actuators",
     ),
 }

@@ -25,7 +25,7 @@ no  test         condition                                                      
 10  rescaled     a sensor shows -1.6 to -0.4, -0.25 to 0.25, or more than 2 times the motion that
                  device and drive give; see `gains`                                               3 ms
 11  inverted     an actuator gives -1.6 to -0.4 times its force; see `gains`                      5 ms and more
-12  exchanged    two sensors show each other's motion, or two actuators give each other's force;   3 ms; actuators
+12  swapped      two sensors show each other's motion, or two actuators give each other's force;   3 ms; actuators
                  see `gains`                                                                      5 ms and more
 === ============ ================================================================================ ====================
 
@@ -53,7 +53,7 @@ from hapticrender.control.records import CONTROLLER_T, MOST_CHANNELS, MOST_SENSO
 from hapticrender.jit import F8, I8, SIGNALS_T, call, kernel, pointer, record, step
 from hapticrender.protocols import Flag
 
-INVALID, FROZEN, INCONSISTENT, ACTIVE, DRIVE, RINGING, OVERMOTION, BEYOND, RESCALED, INVERTED, EXCHANGED = range(1, 12)
+INVALID, FROZEN, INCONSISTENT, ACTIVE, DRIVE, RINGING, OVERMOTION, BEYOND, RESCALED, INVERTED, SWAPPED = range(1, 12)
 EVERY = (1 << MOST) - 1  # sensors whose gains are compared, as bits
 STOPPED, SATURATED = int(Flag.STOPPED), int(Flag.SATURATED)
 ROOT2 = math.sqrt(2.0)
@@ -232,13 +232,13 @@ def compare_gains(supervisor):
     if s.compared == 0:  # a steady load is no motion
         held = p.stiffness
         start_gains(p.gains, q[0], q[1], held[0, 0] * q[0] + held[0, 1] * q[1], held[1, 0] * q[0] + held[1, 1] * q[1])
-    rescaled, inverted, exchanged = check_gains(p.gains, s.last, p.sensors, s.force[0], s.force[1])
+    rescaled, inverted, swapped = check_gains(p.gains, s.last, p.sensors, s.force[0], s.force[1])
     for i in range(p.sensors):
         if 2 * s.repeats[i] > p.frozen_time:  # that is for test 2 to find
             rescaled &= ~(1 << i)
-            exchanged = False
-    if exchanged:
-        return EXCHANGED, EVERY
+            swapped = False
+    if swapped:
+        return SWAPPED, EVERY
     if rescaled > 0:
         return RESCALED, rescaled
     return (INVERTED, inverted) if inverted > 0 else (0, 0)
