@@ -76,14 +76,8 @@ class PlateMismatch(UserWarning):
     """The device differs from the model that a controller is designed for; names the quantities and by how much."""
 
 
-REFUSED = (
-    ValueError,
-    TypeError,
-    ArithmeticError,
-    RecursionError,
-    MemoryError,
-    HapticError,
-)  # what a wrong scene or file may raise
+# what a wrong scene or file may raise
+REFUSED = (ValueError, TypeError, ArithmeticError, RecursionError, MemoryError, HapticError)
 
 
 @contextmanager

@@ -39,9 +39,8 @@ class BaseRenderer:
         method = method_named(scene.method)
         if driver is not None:
             check_driver(driver)
-            getattr(
-                driver, "check_calibrated", lambda: None
-            )()  # what is unknown is refused before anything is designed
+            if hasattr(driver, "check_calibrated"):  # what is unknown is refused before anything is designed
+                driver.check_calibrated()
         setup = self.read(scene, driver)
         if driver is None:
             plant = self.plant(setup, scene.seed)

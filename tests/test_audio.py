@@ -217,12 +217,15 @@ def test_a_driver_that_is_not_open_plays_nothing():
 
 
 class Cable:
-    """A driver whose input is its output, `trips` samples later, one figure an open after the other."""
+    """A driver whose input is its output, `trips` samples later, one figure an open after the other.
+
+    The runs `losing` lose every second sample, or the whole block number `gap` alone.
+    """
 
     rate, block, delay, drive_channels, sensed_channels = 48e3, 64, 64, 2, 1
 
-    def __init__(self, *trips, gain=-0.25, noise=1e-3, losing=()):
-        self._trips, self._gain, self._noise, self._losing = iter(trips * 99), gain, noise, losing
+    def __init__(self, *trips, gain=-0.25, noise=1e-3, losing=(), gap=None):
+        self._trips, self._gain, self._noise, self._losing, self._gap = iter(trips * 99), gain, noise, losing, gap
         self._opened = -1
 
     def loop_back(self):
@@ -231,6 +234,7 @@ class Cable:
     def __enter__(self):
         self._opened += 1
         self._line, self._rng = np.zeros(next(self._trips)), np.random.default_rng(self._opened)
+        self._blocks = 0
         return self
 
     def __exit__(self, *exc):
@@ -239,9 +243,10 @@ class Cable:
     def play(self, drive):
         line = np.concatenate([self._line, drive[:, 0]])
         self._line = line[64:]
-        flags = np.full(64, int(Flag.OVERRUN) if self._opened in self._losing else 0)
-        if flags[0]:
-            line[:64:2] = 0.0
+        loses = self._opened in self._losing and self._gap in (None, self._blocks)
+        flags, self._blocks = np.full(64, int(Flag.OVERRUN) if loses else 0), self._blocks + 1
+        if loses:
+            line[: 64 : 2 if self._gap is None else 1] = 0.0
         sensed = self._gain * line[:64] + self._noise * self._rng.standard_normal(64)
         return Sensed(sensed[:, None], flags=flags)
 
@@ -259,6 +264,12 @@ def test_the_delay_of_a_loop_is_that_of_its_cable():
     assert found.gain == pytest.approx(-0.1, rel=0.01)
     assert len(found.trips) == 3
     assert "delay 163.50 samples (3.406 ms) at 48000 Hz in blocks of 64; 3 runs, spread 0.00" in str(found)
+
+
+def test_a_run_that_lost_a_block_gives_no_gain():
+    """64 of 2400 samples leave a correlation of 0.987, and a gain that is 2.7 % off."""
+    found = measure_latency(Cable(100, noise=1e-4, losing=(0,), gap=10), runs=1)
+    assert found.gain == pytest.approx(-0.25, rel=0.01)
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,7 @@ from test_bandwidth import GAINS, MODEL
 
 import hapticrender as hr
 from hapticrender.control.margin_check import error_loop
-from hapticrender.control.transfer import StarSTDFT
+from hapticrender.control.stdft import StarSTDFT
 
 RATE = 5000.0
 STAR = StarSTDFT(bandwidth=10.0, rate=RATE)

@@ -7,7 +7,7 @@ from held import amplitude_error, fixed, grating, hold
 import hapticrender as hr
 from hapticrender.bands import Bands
 from hapticrender.control.methods import METHODS, Resonant, least_decay
-from hapticrender.control.transfer import StarSTDFT
+from hapticrender.control.stdft import StarSTDFT
 from hapticrender.plants.plate import Plate, PlateParameters
 
 RATE = 5000.0

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from hapticrender.control.records import W, aligned
-from hapticrender.control.transfer import StarSTDFT
+from hapticrender.control.stdft import StarSTDFT
 from hapticrender.jit import entry, kernel, record
 from hapticrender.mathx import unit
 from hapticrender.protocols import Array
@@ -84,7 +84,7 @@ class Demodulator:
 
     Notes
     -----
-    Delay and frequency response are those of `hapticrender.control.transfer.StarSTDFT`.  At 0 Hz and half the rate
+    Delay and frequency response are those of `hapticrender.control.stdft.StarSTDFT`.  At 0 Hz and half the rate
     the envelope is doubled.
 
     Examples

@@ -15,7 +15,8 @@ import numpy as np
 from hapticrender.bands import Bands
 from hapticrender.control.device_model import DeviceModel
 from hapticrender.control.margins import LEAST, Margins, margins_of, unstable_poles
-from hapticrender.control.transfer import StarSTDFT, TransferFunction, butterworth
+from hapticrender.control.stdft import StarSTDFT
+from hapticrender.control.transfer import TransferFunction, butterworth
 from hapticrender.errors import DesignError
 from hapticrender.mathx import zero_crossings
 from hapticrender.protocols import Array

@@ -1,17 +1,9 @@
-"""Rational functions of s, Tustin's way from them to samples, and the low pass of the STDFT*.
-
-A real signal ``x = Re sum_k X_k exp(j phi_k)`` has an envelope X_k for every carrier phi_k.  A lock-in multiplies by
-``exp(-j phi_k)`` and low-passes twice the result; what is left of the image at twice the carrier is its ripple.
-
-References
-----------
-Grigorii, Li, Peshkin and Colgate, IEEE Transactions on Haptics, 2021, eqs. 1-5.
-"""
+"""Rational functions of s: the continuous-time values that design works with, and Tustin's way to samples."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import pi, sqrt
+from math import sqrt
 from typing import Any
 
 import numpy as np
@@ -91,36 +83,3 @@ def butterworth(bandwidth: float) -> TransferFunction:
     """Second-order Butterworth low pass, ``w^2/(s^2 + sqrt2 w s + w^2)``, -3 dB at `bandwidth` w/(2 pi) (Hz, > 0)."""
     w = 2 * np.pi * bandwidth
     return TransferFunction((w**2,), (1.0, sqrt(2) * w, w**2))
-
-
-@dataclass(frozen=True, kw_only=True)
-class StarSTDFT:
-    """The STDFT* of eq. 4: a second-order Butterworth low pass, discretised by Tustin's rule.
-
-    The bilinear transform is prewarped at fL, so that the discrete filter is -3 dB there exactly.
-    """
-
-    bandwidth: float  # Hz, between 0 and rate/2: -3 dB frequency fL of the low pass
-    rate: float  # Hz
-
-    def __post_init__(self) -> None:
-        if not 0 < self.bandwidth < self.rate / 2:
-            raise ValueError(
-                f"bandwidth={self.bandwidth!r} Hz must lie between 0 and half the rate, {self.rate / 2:g} Hz"
-            )
-
-    @property
-    def coefficients(self) -> tuple[Array, Array]:
-        """Filter coefficients b and a of eq. 4, with a[0] = 1."""
-        return butterworth(self.bandwidth).tustin(self.rate, prewarp=self.bandwidth)
-
-    @property
-    def delay(self) -> float:
-        """Group delay of a slow envelope, s: sqrt2/wL of the prewarped prototype."""
-        return sqrt(2) / (2 * self.rate * np.tan(pi * self.bandwidth / self.rate))
-
-    def frequency_response(self, offset: Any) -> Any:
-        """Complex gain on an envelope that turns at `offset` (Hz), delay included: b(z)/a(z) on the unit circle."""
-        z = np.exp(2j * pi * np.asarray(offset, float) / self.rate)
-        b, a = self.coefficients
-        return np.polyval(b, z) / np.polyval(a, z)

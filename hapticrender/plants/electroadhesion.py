@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from hapticrender.checks import Validated, option, parameter
-from hapticrender.control.transfer import StarSTDFT
+from hapticrender.control.stdft import StarSTDFT
 from hapticrender.plants.compiled import CompiledPlant, new_record
 from hapticrender.plants.electroadhesion_kernels import SCREEN, element, screen_step
 from hapticrender.plants.gap import VACUUM, gap_record

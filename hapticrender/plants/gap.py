@@ -1,7 +1,7 @@
 """Estimate the attraction on an electroadhesive finger from the impedance of its gap at the carrier.
 
 With the complex envelopes V and I of voltage and current, both low-passed by the STDFT* of
-`hapticrender.control.transfer`, Z = V/I and Z_stat = Z while |v| < least_speed, the gap being shorted
+`hapticrender.control.stdft`, Z = V/I and Z_stat = Z while |v| < least_speed, the gap being shorted
 (docs/theory.md, "Gap estimation"; Shultz, Peshkin, Colgate 2018)::
 
     A = |z_series|/|Z_stat - R_body|,   Z_g = Z - Z_stat,   L = Im(Z_g)^2/|Z_g|^2,   F = kappa |I|^2 L/(4 w^2 eps0 A)

@@ -112,15 +112,12 @@ def html_table(head: str, rows: Sequence[str]) -> str:
     return f'<div class="scroll"><table>\n<thead>\n{head}\n</thead>\n<tbody>\n{body}\n</tbody>\n</table></div>'
 
 
-def _row(tag: str, cells: Sequence[str]) -> str:
-    """Row of a table from its cells, HTML; the first is a text."""
-    return f'<tr><{tag} class="text">{cells[0]}</{tag}>{"".join(f"<{tag}>{cell}</{tag}>" for cell in cells[1:])}</tr>'
-
-
-def _judged_row(tag: str, cells: Sequence[str], kind: str = "") -> str:
-    """Row of cells the last of which is a verdict, a text of its own class."""
-    *cells, judged = cells
-    return _row(tag, cells).replace("</tr>", f'<{tag} class="text wide {kind}">{judged}</{tag}></tr>')
+def _row(tag: str, cells: Sequence[str], verdict: str = "") -> str:
+    """Row of a table from its cells, HTML; the first is a text, and so is the last, of class `verdict` where given."""
+    classes = [' class="text"', *[""] * (len(cells) - 1)]
+    if verdict:
+        classes[-1] = f' class="text {verdict}"'
+    return f"<tr>{''.join(f'<{tag}{kind}>{cell}</{tag}>' for kind, cell in zip(classes, cells, strict=True))}</tr>"
 
 
 def _table(rows: Sequence[Sequence[str]]) -> str:
@@ -133,10 +130,10 @@ def _overview(scenes: Sequence[Outputs]) -> str:
     """Table of all scenes, a row each, with a link to its section."""
     head, *rows = overview([scene.summary for scene in scenes])
     body = [
-        _judged_row("td", [f'<a href="#{quote(name)}">{escape(name)}</a>', *map(_whole, cells)], CLASSES[kind])
+        _row("td", [f'<a href="#{quote(name)}">{escape(name)}</a>', *map(_whole, cells)], f"wide {CLASSES[kind]}")
         for (name, *cells), kind in zip(rows, (scene.summary["verdict"] for scene in scenes), strict=True)
     ]
-    return f"""{html_table(_judged_row("th", head), body)}
+    return f"""{html_table(_row("th", head, "wide"), body)}
 <p class="note">Amplitudes are peak values, achieved ones at the centre; a scene of several bands shows the root of the
 sum of their squares. The error is that of the whole waveform from 20 to 500 Hz, at the worst place.</p>"""
 
