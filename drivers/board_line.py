@@ -7,7 +7,6 @@ import time
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
-import numpy as np
 import serial
 
 from hapticrender.bands import Bands
@@ -129,10 +128,7 @@ class BoardLine(Link):
 
     def set_bands(self, bands: Bands) -> int:
         """Send set-points, which act together at the end; return the sample at which the board took them."""
-        envelope = np.zeros(len(bands)) if bands.envelope is None else bands.envelope
-        turns = np.remainder(bands.phase / (2 * np.pi), 1.0)
-        rows = zip(bands.frequency, bands.wavenumber, turns, envelope.real, envelope.imag, strict=True)
-        payloads = [protocol.pack(Kind.SETPOINT, index, *row) for index, row in enumerate(rows)]
+        payloads = [protocol.pack(Kind.SETPOINT, index, *row) for index, row in enumerate(bands.set_points())]
         for payload in payloads:
             self.send(Kind.SETPOINT, payload)
         return self.command(Kind.COMMIT, len(payloads), protocol.digest(payloads)).sample

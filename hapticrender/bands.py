@@ -129,6 +129,12 @@ class Bands:
             raise ValueError(f"{name}.waveform returned {values[bad[0]]} at {at}: must be finite")
         return values
 
+    def set_points(self) -> Array:
+        """Frequency (Hz), wavenumber (1/m), phase (turns, 0 to 1), real and imaginary envelope; shape (n, 5)."""
+        envelope = np.zeros(len(self)) if self.envelope is None else self.envelope
+        turns = np.remainder(self.phase / (2 * np.pi), 1.0)
+        return np.column_stack([self.frequency, self.wavenumber, turns, envelope.real, envelope.imag])
+
     def carrier_phase(self, time: Array, position: Array) -> Array:
         """Phase of every carrier (rad, in [0, 2 pi), shape (n_samples, n_bands)); `position` NaN holds the phase."""
         turns = np.multiply.outer(np.asarray(time, float), self.frequency)

@@ -14,7 +14,7 @@ import numpy as np
 
 from hapticrender.control.controller import lowest_carrier, spacing
 from hapticrender.control.inverse import WaveformController
-from hapticrender.control.kernel import FADE_OUT
+from hapticrender.control.kernel import CONFIDENCE_FADE
 from hapticrender.protocols import Rendering
 
 MOST_BANDS, MOST_DELAY = 64, 64  # bands; samples
@@ -120,14 +120,14 @@ def board_design(rendering: Rendering, bands: int = 0) -> tuple[dict[str, int], 
         "taps": settings["taps"][:, :taps],
         "force_from_drive": law["force_from_drive"][:, :channels],
         "change_step": period / CHANGE,
-        "confidence_step": period / FADE_OUT,
+        "confidence_step": period / CONFIDENCE_FADE,
         "measuring": 4 * math.pi * measuring * period,
         "measuring_dc": 2 * math.pi * min(MEASURING_DC, lowest / 8) * period,
     }
     fields["coordinate_from_sensor"] = fields["coordinate_from_sensor"][:, :sensors]
     fields["drive_from_force"] = fields["drive_from_force"][:channels]
     if len(rendering.bands):
-        fields["bands"] = _bands(rendering)
+        fields["bands"] = rendering.bands.set_points()
     return sizes, fields
 
 
@@ -166,18 +166,6 @@ def _checked(rendering: Rendering, controller: Any, bands: int) -> int:
     return most
 
 
-def _bands(rendering: Rendering) -> list[dict[str, Any]]:
-    """Fields of `band_t`, band after band."""
-    bands = rendering.bands
-    envelope = np.zeros(len(bands)) if bands.envelope is None else bands.envelope
-    turns = np.remainder(bands.phase / (2 * np.pi), 1.0)
-    rows = zip(bands.frequency, bands.wavenumber, turns, envelope, strict=True)
-    return [
-        {"frequency": hertz, "wavenumber": number, "phase": phase, "re": complex(each).real, "im": complex(each).imag}
-        for hertz, number, phase, each in rows
-    ]
-
-
 def _refuse_changed(path: Path, text: str) -> None:
     """Refuse to overwrite a file that does not begin with `text`."""
     if path.exists() and not path.read_text(encoding="utf-8", errors="replace").startswith(text):
@@ -201,10 +189,10 @@ def _table(declared: str, fields: dict[str, Any]) -> str:
 
 
 def _literal(value: Any) -> str:
-    """C initialiser of an integer, a number, an array of numbers, or bands; numbers in full precision."""
+    """C initialiser of an integer, a number, an array of numbers, or a record; numbers in full precision."""
     if isinstance(value, dict):
         return _braced([f".{name} = {_literal(each)}" for name, each in value.items()])
-    if isinstance(value, list | np.ndarray) and np.ndim(value):  # an array of numbers has no `dict` in it
+    if np.ndim(value):
         return _braced([_literal(each) for each in value])
     return f"{int(value)}u" if isinstance(value, int) else f"REAL({float(value)!r})"
 

@@ -18,6 +18,7 @@ from __future__ import annotations
 import math
 import threading
 import time
+from collections import deque
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
@@ -37,6 +38,7 @@ from hapticrender.loop import play_zeros, prepare, stopped_by_sigterm, zero_driv
 from hapticrender.player_state import BandState, PlayerState
 from hapticrender.protocols import Driver, Flag, Rendering, Texture
 from hapticrender.recordings.recording import Recording
+from hapticrender.touch.composed import Playlist
 from hapticrender.touch.finger import Finger
 from hapticrender.touch.scene import Scene
 
@@ -46,7 +48,8 @@ NOMINAL = Finger.sliding(speed=0.08, normal_load=0.4)  # for which a device is d
 LONGEST = 3600.0  # s: duration of a scene that has no end
 SERVICE = 0.05  # s between two looks: what comes next is computed, what was is recorded, faults are seen
 UPDATES = 0.2  # s: two positions within this time show a velocity
-FADE_OUT = 0.05  # s: five time constants of the gain; and the longest that zeros are waited for
+END_FADE = 0.05  # s: five time constants of the gain; and the longest that zeros are waited for
+LEAST_PART = 2 * SERVICE  # s: of a playlist whose parts are taken up one by one
 POINTING, INSTANT = 0.01, 1e-4  # s between two positions of a scene's finger; over which its velocity is found
 NAP, LATE = 2e-3, 0.1  # s: shorter waits are not slept; so late the clock starts anew
 PATIENCE = 5.0  # s without a sample, after which `sleep` gives a device up
@@ -111,6 +114,8 @@ class Player:
         self._finger_time = 0.0  # and when
         self._loop: LiveLoop | None = None
         self._gain, self._lost = 1.0, 0
+        self._parts: deque[tuple[Rendering, float]] = deque()  # of a playlist, and how long (s); the first plays ...
+        self._until = math.inf  # s: ... until then
         self._error: BaseException | None = None
         self._raised = False
         self._recorder: LiveRecorder | None = None
@@ -156,6 +161,9 @@ class Player:
     def play(self, texture: Texture) -> None:
         """Play a texture until the next one, into which it fades; the first one starts the device.
 
+        The parts of a `Playlist` follow each other in the same way, each up to 50 ms late, where one lies along the
+        surface; any other playlist is played to the sample.
+
         Raises
         ------
         ValueError, TypeError
@@ -163,13 +171,32 @@ class Player:
         DeviceFault, DriverError
             The device has failed.
         """
+        parts = texture.parts if isinstance(texture, Playlist) and texture.spatial else ((texture, math.inf),)
+        shortest = min(seconds for _, seconds in parts)
+        if shortest < LEAST_PART:
+            raise ValueError(f"a part of {shortest:g} s of a playlist along the surface: must be >= {LEAST_PART:g} s")
         with self._calling():
+            scenes = [self._scene(texture=each) for each, _ in parts]
             if self._loop is None:
-                self._begin(self._scene(texture=texture))
-                return
-            playing = self._loop.rendering
-            device = None if playing.plant is not None else playing.device
-            self._loop.exchange(prepare(self._scene(texture=texture), driver=device, compiled=False))
+                renderings = self._begin(scenes)
+            else:
+                renderings = [self._prepare(each) for each in scenes]
+                self._loop.exchange(renderings[0])
+            self._parts = deque(zip(renderings, (seconds for _, seconds in parts), strict=True))
+            self._until = self.time + self._parts[0][1]
+
+    def _prepare(self, scene: Scene) -> Rendering:
+        """Return the rendering of a scene on the device that plays."""
+        playing = self._playing("play").rendering
+        return prepare(scene, driver=None if playing.plant is not None else playing.device, compiled=False)
+
+    def _go_on(self) -> None:
+        """Fade into the next part of a playlist where it is due."""
+        if self.time >= self._until:
+            self._parts.rotate(-1)
+            rendering, seconds = self._parts[0]
+            self._playing("play").exchange(rendering)
+            self._until += seconds
 
     def finger(self, position: float, velocity: float | None = None, load: float = 0.4) -> None:
         """Set where the finger is: position (m from the middle, NaN: lifted), velocity (m/s), normal load (N).
@@ -275,13 +302,15 @@ class Player:
         if self._watchdog is not None and self._loop is not None:
             self._loop.watch(seconds)
 
-    def _begin(self, scene: Scene) -> None:
-        """Make the driver, and start the device with the scene's texture."""
+    def _begin(self, scenes: list[Scene]) -> list[Rendering]:
+        """Make the driver, start the device with the texture of the first scene, and prepare the others."""
         driver: Any = self._driver
         if isinstance(driver, str):
-            driver = open_driver(driver, scene.device_profile)
+            driver = open_driver(driver, scenes[0].device_profile)
         try:
-            self._start(prepare(scene, driver=driver.live() if hasattr(driver, "live") else driver))
+            first = prepare(scenes[0], driver=driver.live() if hasattr(driver, "live") else driver)
+            self._start(first)
+            return [first, *map(self._prepare, scenes[1:])]
         except BaseException:
             self._loop = None  # what has been opened is left at rest
             self._stack.close()
@@ -378,12 +407,14 @@ class Player:
         for _ in range(max(round(seconds * driver.rate / driver.block), 1)):
             self._block()
         with self._lock:
+            self._go_on()
             self._service()
 
     def _serve(self) -> None:
         while not self._stopping.wait(POINTING):
             with self._lock:
                 self._point()
+                self._go_on()
                 if time.monotonic() - self._served >= (SERVICE if isinstance(self._loop, LiveLoop) else POINTING):
                     self._served = time.monotonic()
                     self._service()
@@ -423,10 +454,10 @@ class Player:
         self._watch(None)
         if gently and running:
             loop.set_gain(0.0)
-            time.sleep(FADE_OUT)
+            time.sleep(END_FADE)
         with suppress(*[] if self._error is None else [HapticError]):  # one that is lost cannot be silenced
             loop.silence()
-        end, limit = loop.samples + 2 * loop.driver.block, time.monotonic() + FADE_OUT
+        end, limit = loop.samples + 2 * loop.driver.block, time.monotonic() + END_FADE
         while running and loop.samples < end and time.monotonic() < limit:
             time.sleep(1e-3)
         with self._lock:

@@ -260,3 +260,32 @@ def test_the_finger_of_a_scene_is_sent_to_a_device_that_does_not_sense_it():
     off = abs(played["position"] - scene.finger.position(time))[1000:]
     assert np.median(off) < 1e-3  # a loaded machine sends them late
     assert np.isfinite(played["position"][1000:]).all()
+
+
+def test_a_playlist_along_the_surface_goes_round():
+    """Ridges, a tone, and again, each within what its law reaches; then the next texture plays on."""
+    bands, place = [], -0.05
+    with hr.Player(paced=False) as player:
+        player.play(TONE)
+        player.sleep(0.1)
+        player.play(hr.Playlist([(RIDGES, 0.5), (TONE, 0.7)]))
+        for seconds in (0.3, 0.6, 0.6, 0.6):  # each ends in a part that began 0.3 s ago or more
+            place = slide(player, seconds, start=place, speed=0.03)
+            bands += player.state().bands
+        player.play(TONE)
+        slide(player, 0.8, start=place, speed=0.03)
+        bands += player.state().bands
+    assert [band.frequency for band in bands] == pytest.approx([30.0, 100.0, 30.0, 100.0, 100.0], rel=0.01)
+    assert [band.target for band in bands] == pytest.approx([5e-6] * 5, rel=0.01)
+    assert all(band.error < 0.02 for band in bands)
+
+
+def test_a_playlist_that_cannot_be_played_leaves_what_plays():
+    with hr.Player(paced=False) as player:
+        player.play(TONE)
+        with pytest.raises(ValueError, match=r"a part of 0\.05 s of a playlist along the surface: must be >= 0\.1 s"):
+            player.play(hr.Playlist([(RIDGES, 0.05), (TONE, 0.7)]))
+        with pytest.raises(ValueError, match="frequency"):
+            player.play(hr.Playlist([(RIDGES, 0.5), (hr.Grating(frequency=2400.0, amplitude=5e-6), 0.5)]))
+        player.sleep(0.7)
+        assert [band.frequency for band in player.state().bands] == [100.0]

@@ -366,3 +366,10 @@ def test_what_a_sampled_texture_refuses():
 
     with pytest.raises(ValueError, match="Follows.waveform returned nan"):
         SampledTexture(Follows(False), RATE)
+
+    class Travels(Wave):
+        def waveform(self, time, position):
+            return 1e-6 * np.sin(2e3 * np.pi * position - 300.0 * time)
+
+    with pytest.raises(ValueError, match="Travels: changes with time and position at once: use a sum of two"):
+        SampledTexture(Travels(True), RATE)

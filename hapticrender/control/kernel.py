@@ -54,7 +54,7 @@ from hapticrender.jit import F8, I8, SIGNALS_T, kernel, pointer, record, step
 from hapticrender.vectors import conj, get, imag, maximum, pair, put, real, square, total, zeros
 
 LEAST_LOAD = 0.03  # N: a smaller load shows no place
-FADE_OUT = 0.02  # s: within this the drive fades out while a sensor's samples are implausible
+CONFIDENCE_FADE = 0.02  # s: within this the drive fades out while a sensor's samples are implausible
 
 
 @kernel
@@ -99,7 +99,7 @@ def sense_block(controller, signals, first):
 def update_confidence(controller, implausible):
     """Fade the confidence in the sensors out within 20 ms while samples are implausible, and in again; True at none."""
     c = record(controller, CONTROLLER_T, 0)
-    change = c.p.block / (FADE_OUT * c.p.rate)
+    change = c.p.block / (CONFIDENCE_FADE * c.p.rate)
     c.confidence = max(c.confidence - change, 0.0) if implausible > 0 else min(c.confidence + change, 1.0)
     return c.confidence == 0.0
 

@@ -17,6 +17,7 @@ MOST_PARTS = 4096
 MOST_GAIN = 1e6
 LONGEST_PART = 360_000.0  # s
 MOST_CHIRP = 0.01  # m
+TIMES, PLACES = (0.0, 0.7310586), np.linspace(-0.01, 0.01, 101)  # s, m: where a texture along the surface is compared
 
 Parts = tuple[tuple[Texture, float], ...]
 
@@ -55,7 +56,7 @@ class SeparatedTexture:
     Raises
     ------
     ValueError
-        Its parts are in time and along the surface, and it is no sum.
+        Its parts are in time and along the surface, and it is no sum; or what lies along the surface changes with time.
     """
 
     def __init__(self, texture: Texture, waveform_of: Any = None) -> None:
@@ -65,6 +66,10 @@ class SeparatedTexture:
         self._terms = [(each, waveform_of(each) if waveform_of else each.waveform, gain) for each, gain in terms]
         along = [bool(getattr(each, "spatial", False)) for each, _ in terms]
         self.timed, self.spatial = not all(along), any(along)
+        if self.spatial:
+            first, later = (self._sum(True, np.full(len(PLACES), seconds), PLACES) for seconds in TIMES)
+            if abs(later - first).max() > 1e-6 * abs(first).max():
+                raise ValueError(f"{type(texture).__name__}: changes with time and position at once: use a sum of two")
 
     def in_time(self, time: Array) -> Array:
         """Sum of what lies in time, at `time` (s, shape (n,)); a ValueError where it is not finite."""
