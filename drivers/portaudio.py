@@ -188,7 +188,7 @@ def initialised() -> Iterator[CDLL]:
 def _initialise(name: str) -> CDLL:
     """Initialise PortAudio; a `DriverError` where it is busy with a stream that did not close: it serves one thread."""
     if LEFT_BEHIND:
-        raise DriverError(f"{name}: initialise: PortAudio has not returned from {LEFT_BEHIND[0].name}: {RESTART}")
+        raise DriverError(f"{name}: initialise: PortAudio still closes {LEFT_BEHIND[0].name}: {RESTART}")
     portaudio = load()
     with _quiet():
         check(portaudio.Pa_Initialize(), f"{name}: initialise")
