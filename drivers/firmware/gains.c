@@ -12,7 +12,7 @@
 #define RESPONSE 2u /* first of these models */
 #define LEAST_INVERTED REAL(-1.6) /* gains of a sensor or an actuator that is inverted */
 #define MOST_INVERTED REAL(-0.4)
-#define LEAST_SWAPPED REAL(0.75) /* share of a swap */
+#define LEAST_SWAPPED REAL(0.75) /* eta: 1 is a swap, 1/2 the moment of a finger that the drive bears */
 #define MOST_SWAPPED REAL(1.4)
 #define DEAD REAL(0.25) /* of a sensor: a smaller magnitude is a fault, and a larger gain than this: */
 #define MOST_GAIN REAL(2.0)
@@ -87,10 +87,10 @@ static uint32_t is_swap(const gains_t *s, uint32_t kind, real_t noise, real_t re
 {
     const real_t w = s->weights[kind][SWAP][SWAP];
     const real_t b = s->weighted[kind][SWAP];
-    const real_t h = b / (w + noise);
-    const uint32_t near = ((h > LEAST_SWAPPED) && (h < MOST_SWAPPED)) ? 1u : 0u;
-    const uint32_t certain = (h * h * (w + noise) > CERTAIN * noise) ? near : 0u;
-    return (s->energy[kind] - REAL(2.0) * h * b + h * h * w < rest) ? certain : 0u;
+    const real_t eta = b / (w + noise);
+    const uint32_t near = ((eta > LEAST_SWAPPED) && (eta < MOST_SWAPPED)) ? 1u : 0u;
+    const uint32_t certain = (eta * eta * (w + noise) > CERTAIN * noise) ? near : 0u;
+    return (s->energy[kind] - REAL(2.0) * eta * b + eta * eta * w < rest) ? certain : 0u;
 }
 
 /* Find gains and swap, from innovations of variance `noise`: gains that are faults, as bits; whether it is a swap. */

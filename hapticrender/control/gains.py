@@ -14,14 +14,14 @@ An actuator j that gives g_j times its force F_j adds (g_j - 1) w_j::
 
     w_j = C zeta_j,                          zeta_j[n+1] = A (zeta_j[n] - K w_j[n]) + B F_j[n]
 
-Two that are swapped add h w_3, h = 1: c_3 = (c_2 - c_1, c_1 - c_2) of sensors, F_3 = F_swapped - F of actuators.
+Two that are swapped add eta w_3, eta = 1: c_3 = (c_2 - c_1, c_1 - c_2) of sensors, F_3 = F_swapped - F of actuators.
 Sensors that were swapped while both showed the same look like actuators that are, where both are symmetrical about the
-middle.  Least squares of e on w_1 and w_2 find g, of both sensors or of both actuators; on w_3 alone, h.
+middle.  Least squares of e on w_1 and w_2 find g, of both sensors or of both actuators; on w_3 alone, eta.
 
 Sensors are judged over the 3 ms after an innovation above 4.5 times its noise, and its mean square before: a finger's
 force makes no jump, what it adds to e is no multiple of w.  Actuators are judged by means over 3 ms, while e is large:
 only an inversion or a swap, also of sensors, is distinguished from a finger by these.  The moment of a finger off the
-middle, borne by the drive, looks like a swap, too, with h = 1/2.
+middle, borne by the drive, looks like a swap, too, with eta of about 1/2.
 
 References
 ----------
@@ -48,7 +48,7 @@ SENSOR, ACTUATOR = np.arange(2)  # kinds of gains
 STATE, MOTION, RESPONSE = np.arange(3)  # models: x; p; xi_1, xi_2, xi_3, zeta_1, zeta_2, zeta_3
 LEAST_INVERTED, MOST_INVERTED = -1.6, -0.4  # gains of a sensor or an actuator that is inverted
 DEAD, MOST_GAIN = 0.25, 2.0  # of a sensor: a smaller magnitude, a larger gain is a fault
-LEAST_SWAPPED, MOST_SWAPPED = 0.75, 1.4  # h; 0.5 to 0.63 is a finger off the middle, whose moment the drive bears
+LEAST_SWAPPED, MOST_SWAPPED = 0.75, 1.4  # eta; 0.5 to 0.63 is a finger off the middle, whose moment the drive bears
 UNEXPLAINED, UNEXPLAINED_INVERTED = 0.1, 0.2  # of the energy of e; the latter of inverted or swapped sensors
 CERTAIN, JUMP = 25.0, 20.0  # variances: 5 sigma of a gain; 4.5 sigma of an innovation
 WATCHED, LARGE = 4.0, 20.0  # variances of e: actuators are followed, judged
@@ -193,7 +193,7 @@ def judge_gains(gains, kind, noise):
     w, b, energy, faults = s.weights[kind], s.weighted[kind], s.energy[kind], 0
     w00, w11, w22 = w[0, 0] + noise, w[1, 1] + noise, w[SWAP, SWAP] + noise  # what shows nothing keeps its gain
     scale = 1.0 / (w00 * w11 - w[0, 1] * w[0, 1])
-    g0, g1, h = scale * (w11 * b[0] - w[0, 1] * b[1]), scale * (w00 * b[1] - w[0, 1] * b[0]), b[SWAP] / w22
+    g0, g1, eta = scale * (w11 * b[0] - w[0, 1] * b[1]), scale * (w00 * b[1] - w[0, 1] * b[0]), b[SWAP] / w22
     rest = energy - 2.0 * (g0 * b[0] + g1 * b[1])
     rest += g0 * g0 * w[0, 0] + 2.0 * g0 * g1 * w[0, 1] + g1 * g1 * w[1, 1]
     s.gain[kind, 0], s.gain[kind, 1] = 1.0 + g0, 1.0 + g1
@@ -203,8 +203,8 @@ def judge_gains(gains, kind, noise):
             faults |= 1 << j
     if faults == 0:
         rest = (UNEXPLAINED_INVERTED if kind == SENSOR else UNEXPLAINED) * energy
-    certain = h * h * w22 > CERTAIN * noise and LEAST_SWAPPED < h < MOST_SWAPPED
-    return faults, certain and energy - 2.0 * h * b[SWAP] + h * h * w[SWAP, SWAP] < rest
+    certain = eta * eta * w22 > CERTAIN * noise and LEAST_SWAPPED < eta < MOST_SWAPPED
+    return faults, certain and energy - 2.0 * eta * b[SWAP] + eta * eta * w[SWAP, SWAP] < rest
 
 
 @kernel

@@ -1,8 +1,8 @@
 """The STDFT*, an estimator of the complex envelopes of a signal's bands: parameters and frequency response.
 
 A real signal ``x = Re sum_k X_k exp(j phi_k)`` has an envelope X_k for every carrier phi_k.  A lock-in multiplies by
-``exp(-j phi_k)`` and low-passes twice the result; what is left of the image at twice the carrier is its ripple.  Here is
-its design; it runs in `demodulator`, in `low_pass` (polar and complex methods) and in `plants.electroadhesion`.
+``exp(-j phi_k)`` and low-passes twice the result; what is left of the image at twice the carrier is its ripple.  This
+is its design; it runs in `demodulator`, in `low_pass` (polar and complex methods) and in `plants.electroadhesion`.
 
 References
 ----------
