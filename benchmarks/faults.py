@@ -3,8 +3,8 @@
 Run: python -m benchmarks.faults [--plate other] [--place MM] [--tones] [fault ...]
 
 The plate is that of ``tests/strangers_plate.py`` with mass, springs, damping and sensor gains off by 2 to 20 %, a
-bending mode at 1250 Hz, and position and load reported 5 ms late; ``--plate other`` takes that of
-``tests/other_plate.py``, whose parameters are what the library takes for granted.
+bending mode at 1250 Hz, contact reported 5 ms late, and a delay of 2 samples, which is stated; ``--plate other`` takes
+that of ``tests/other_plate.py``, whose parameters are what the library takes for granted.
 Printed for every fault, over 10 and 50 um, without and with a heavy finger of 0.8 N on the middle, or `--place` (mm)
 off it, then with 0.8 and 2 N: the time from the fault to the stop, how many runs stopped, the largest drive and the
 largest true motion of an end.  Textures are a tone of 20, 72, 189 or 400 Hz; with ``--tones`` one of 60 and 144 Hz.

@@ -34,7 +34,7 @@ FAULTS = {
     Cause.RINGING: "the surface rings above 500 Hz: check the delay, and identify the bending mode",
     Cause.OVERMOTION: "the surface moved too far: check the polarity of sensors and coils, and the delay",
     Cause.BEYOND: "the motion stayed beyond what the scene can cause: check the unit of the sensors",
-    Cause.RESCALED: "a sensor is suddenly inverted, swapped, disconnected, or its gain has changed: check its wiring",
+    Cause.RESCALED: "a sensor is suddenly inverted, disconnected, or its gain has changed: check its wiring",
     Cause.INVERTED: "the motion is that of the inverted drive: check the wiring and polarity of coils and sensors",
     Cause.SWAPPED: "each sensor shows the motion of the other: check the wiring of sensors and coils",
 }

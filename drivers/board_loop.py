@@ -42,7 +42,7 @@ class BoardLoop:
         self.rendering, self.driver, self.model = rendering, driver, rendering.model
         self.samples, self.flags = 0, Flag(0)
         self._client = driver.client
-        self._bands, self._texture = playable(rendering, driver.capabilities)
+        self._bands, self._texture = self.made(rendering)
         self._recent = np.zeros((0, 2))  # reference and motion, m
         self._reconnections = 0  # that have been noted
         self._fault: HapticError | None = None
@@ -53,9 +53,13 @@ class BoardLoop:
         self._client.start(stream=1, telemetry=TELEMETRY)
         self._reconnections = self._client.reconnections
 
+    def made(self, rendering: Rendering) -> tuple[Bands, BoardTexture | None]:
+        """Return what the board plays of a rendering; a ValueError where it cannot play it."""
+        return playable(rendering, self.driver.capabilities)
+
     def exchange(self, rendering: Rendering) -> None:
         """Change to the texture of another rendering of the same device: within 20 ms from bands to bands, else 40."""
-        bands, texture = playable(rendering, self.driver.capabilities)
+        bands, texture = self.made(rendering)
         self._client.set_bands(bands, texture)
         self.rendering, self._bands, self._texture = rendering, bands, texture
 

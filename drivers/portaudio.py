@@ -14,7 +14,7 @@ from contextlib import contextmanager
 from ctypes import CDLL, POINTER, Structure, byref, c_char_p, c_double, c_int, c_ulong, c_void_p, py_object, pythonapi
 from ctypes.util import find_library
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import lru_cache, partial
 from importlib.metadata import PackageNotFoundError, files
 from typing import Any
 
@@ -188,7 +188,7 @@ def initialised() -> Iterator[CDLL]:
 def _initialise(name: str) -> CDLL:
     """Initialise PortAudio; a `DriverError` where it is busy with a stream that did not close: it serves one thread."""
     if LEFT_BEHIND:
-        raise DriverError(f"{name}: initialise: PortAudio still closes {LEFT_BEHIND[0].name}: {RESTART}")
+        raise DriverError(f"{name}: initialise: PortAudio has not closed {LEFT_BEHIND[0].name}: {RESTART}")
     portaudio = load()
     with _quiet():
         check(portaudio.Pa_Initialize(), f"{name}: initialise")
@@ -348,6 +348,7 @@ class Stream:
                 check(self._library.Pa_StopStream(handle), f"{self.name}: stop")
         except DriverError as error:
             errors.append(error)
-        if self not in LEFT_BEHIND:  # where JACK's server ends in the meantime, PortAudio 19.6 would abort the process
-            self._library.Pa_CloseStream(handle)
-            self._library.Pa_Terminate()
+        for release in (partial(self._library.Pa_CloseStream, handle), self._library.Pa_Terminate):
+            if self in LEFT_BEHIND:  # JACK's server may end at any moment: PortAudio 19.6 would abort the process
+                return
+            release()

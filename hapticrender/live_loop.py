@@ -114,6 +114,11 @@ class LiveLoop(RealtimeEntry):
         if share == 1.0:
             self._reshaped = change
 
+    def made(self, rendering: Rendering) -> tuple[SampledTexture, Controller]:
+        """Return what plays another rendering of the same device; a ValueError where nothing can."""
+        whole = self.whole and self.controller.n_bands == 0
+        return self._texture(rendering), self.controller if whole else live_controller(rendering)
+
     def exchange(self, rendering: Rendering) -> None:
         """Fade into the texture of another rendering of the same device.
 
@@ -124,12 +129,11 @@ class LiveLoop(RealtimeEntry):
         ValueError
             The texture cannot be played; the one before goes on.
         """
-        whole = self.whole and self.controller.n_bands == 0
-        texture, controller = self._texture(rendering), self.controller if whole else live_controller(rendering)
+        texture, controller = self.made(rendering)
         model = joint_model(self.rendering.model, rendering.model)
         for part, its_model in _parts(controller, model):
             _widen(part, its_model)
-        if not whole:
+        if controller is not self.controller:
             ready(controller)
         self.play(texture, controller)
         if rendering.shape is not None:

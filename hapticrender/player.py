@@ -161,7 +161,7 @@ class Player:
     def play(self, texture: Texture) -> None:
         """Play a texture until the next one, into which it fades; the first one starts the device.
 
-        The parts of a `Playlist` follow each other in the same way, each up to 50 ms late, where one lies along the
+        The parts of a `Playlist` follow each other in the same way, each up to 0.1 s late, where one lies along the
         surface; any other playlist is played to the sample.
 
         Raises
@@ -176,11 +176,11 @@ class Player:
         if shortest < LEAST_PART:
             raise ValueError(f"a part of {shortest:g} s of a playlist along the surface: must be >= {LEAST_PART:g} s")
         with self._calling():
-            scenes = [self._scene(texture=each) for each, _ in parts]
+            first, *others = [self._scene(texture=each) for each, _ in parts]
             if self._loop is None:
-                renderings = self._begin(scenes)
+                renderings = self._begin(first, others)
             else:
-                renderings = [self._prepare(each) for each in scenes]
+                renderings = [self._prepare(first), *self._prepare_later(others)]
                 self._loop.exchange(renderings[0])
             self._parts = deque(zip(renderings, (seconds for _, seconds in parts), strict=True))
             self._until = self.time + self._parts[0][1]
@@ -189,6 +189,13 @@ class Player:
         """Return the rendering of a scene on the device that plays."""
         playing = self._playing("play").rendering
         return prepare(scene, driver=None if playing.plant is not None else playing.device, compiled=False)
+
+    def _prepare_later(self, scenes: list[Scene]) -> list[Rendering]:
+        """Return renderings that can all be played, at some later time."""
+        found = [self._prepare(each) for each in scenes]
+        for each in found:
+            self._playing("play").made(each)
+        return found
 
     def _go_on(self) -> None:
         """Fade into the next part of a playlist where it is due."""
@@ -302,15 +309,15 @@ class Player:
         if self._watchdog is not None and self._loop is not None:
             self._loop.watch(seconds)
 
-    def _begin(self, scenes: list[Scene]) -> list[Rendering]:
-        """Make the driver, start the device with the texture of the first scene, and prepare the others."""
+    def _begin(self, scene: Scene, others: list[Scene]) -> list[Rendering]:
+        """Make the driver, start the device with the scene's texture, and prepare those of the others."""
         driver: Any = self._driver
         if isinstance(driver, str):
-            driver = open_driver(driver, scenes[0].device_profile)
+            driver = open_driver(driver, scene.device_profile)
         try:
-            first = prepare(scenes[0], driver=driver.live() if hasattr(driver, "live") else driver)
-            self._start(first)
-            return [first, *map(self._prepare, scenes[1:])]
+            rendering = prepare(scene, driver=driver.live() if hasattr(driver, "live") else driver)
+            self._start(rendering)
+            return [rendering, *self._prepare_later(others)]
         except BaseException:
             self._loop = None  # what has been opened is left at rest
             self._stack.close()

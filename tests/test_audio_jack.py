@@ -319,7 +319,7 @@ with ExitStack() as stack:
     [
         ("ends", r"DeviceLost: audio:plate: the card stopped after \d+ samples: is it still connected"),
         ("halts", "DeviceTimeout: audio:plate: play: no block of 64 samples came within 2 s"),
-        ("stays", "DriverError: audio: initialise: PortAudio still closes audio:plate: restart the program"),
+        ("stays", "DriverError: audio: initialise: PortAudio has not closed audio:plate: restart the program"),
     ],
 )
 def test_a_card_that_goes_away_is_a_lost_device(program, tmp_path, server, message):

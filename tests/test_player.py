@@ -287,5 +287,7 @@ def test_a_playlist_that_cannot_be_played_leaves_what_plays():
             player.play(hr.Playlist([(RIDGES, 0.05), (TONE, 0.7)]))
         with pytest.raises(ValueError, match="frequency"):
             player.play(hr.Playlist([(RIDGES, 0.5), (hr.Grating(frequency=2400.0, amplitude=5e-6), 0.5)]))
+        with pytest.raises(ValueError, match="Playlist with a part along the surface"):
+            player.play(hr.Playlist([(TONE, 0.2), (hr.Playlist([(RIDGES, 0.5), (TONE, 0.5)]), 0.5)]))
         player.sleep(0.7)
         assert [band.frequency for band in player.state().bands] == [100.0]

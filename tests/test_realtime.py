@@ -371,5 +371,5 @@ def test_what_a_sampled_texture_refuses():
         def waveform(self, time, position):
             return 1e-6 * np.sin(2e3 * np.pi * position - 300.0 * time)
 
-    with pytest.raises(ValueError, match="Travels: changes with time and position at once: use a sum of two"):
+    with pytest.raises(ValueError, match="Travels: must not change with time: it lies along the surface"):
         SampledTexture(Travels(True), RATE)

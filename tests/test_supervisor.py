@@ -163,10 +163,12 @@ def test_what_is_swapped_stops_the_drive_and_is_named(frequency, position, senso
     assert max(plate.motion[first:]) < max(plate.motion[:first]) + 50e-6
 
 
+@pytest.mark.parametrize("limits", [{}, {"peak_drive": 0.65}], ids=["free", "limited"])
 @pytest.mark.parametrize("position", [-0.05, 0.05])
-def test_a_finger_near_an_end_is_no_swap_of_coils(position):
-    """On a plate that is wrong in everything: the drive bears the finger's moment, which makes h = 0.6 of 0.75."""
-    recording = hr.render(scene(400.0), driver=faults.FaultyWrongPlate(*faults.FAULTS["none"], 2.0, position))
+def test_a_finger_near_an_end_is_no_swap_of_coils(position, limits):
+    """On the stranger's plate: the drive bears the finger's moment, which makes eta = 0.6, of 0.75; 0.8 A unlimited."""
+    plate = faults.FaultyWrongPlate(*faults.FAULTS["none"], 2.0, position)
+    recording = hr.render(scene(400.0, limits=limits), driver=plate)
     assert not (recording.flags & hr.Flag.STOPPED).any()
 
 

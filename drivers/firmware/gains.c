@@ -7,12 +7,13 @@
 
 #define SENSOR 0u
 #define ACTUATOR 1u
-#define EACH 3u /* w: of one sensor or actuator each, and of the two when swapped */
-#define SWAP 2u
-#define RESPONSE 2u /* first of these models */
+#define SWAP 2u /* of the changes */
+#define STATE 0u /* models */
+#define MOTION 1u
+#define RESPONSE 2u
 #define LEAST_INVERTED REAL(-1.6) /* gains of a sensor or an actuator that is inverted */
 #define MOST_INVERTED REAL(-0.4)
-#define LEAST_SWAPPED REAL(0.75) /* eta: 1 is a swap, 1/2 the moment of a finger that the drive bears */
+#define LEAST_SWAPPED REAL(0.75) /* eta; less: a drive that bears more than 2/3 of the moment of a finger */
 #define MOST_SWAPPED REAL(1.4)
 #define DEAD REAL(0.25) /* of a sensor: a smaller magnitude is a fault, and a larger gain than this: */
 #define MOST_GAIN REAL(2.0)
@@ -55,17 +56,17 @@ static void clear_sums(gains_t *s, uint32_t kind)
 {
     (void)memset(s->weighted[kind], 0, sizeof(s->weighted[kind]));
     (void)memset(s->weights[kind], 0, sizeof(s->weights[kind]));
-    (void)memset(s->models[RESPONSE + EACH * kind], 0, EACH * sizeof(s->models[0]));
+    (void)memset(s->models[RESPONSE + GAIN_CHANGES * kind], 0, GAIN_CHANGES * sizeof(s->models[0]));
 }
 
 static real_t product(const real_t a[2], const real_t b[2]) { return a[0] * b[0] + a[1] * b[1]; }
 
 /* Add a sample of w, each of both sensors, to the sums; those of actuators are means. */
-static void add_sums(gains_t *s, uint32_t kind, real_t pole, const real_t w[EACH][2])
+static void add_sums(gains_t *s, uint32_t kind, real_t pole, const real_t w[GAIN_CHANGES][2])
 {
     const real_t kept = (kind == SENSOR) ? REAL(1.0) : (REAL(1.0) - pole);
-    for (uint32_t i = 0u; i < EACH; i++) {
-        for (uint32_t j = i; j < EACH; j++) {
+    for (uint32_t i = 0u; i < GAIN_CHANGES; i++) {
+        for (uint32_t j = i; j < GAIN_CHANGES; j++) {
             s->weights[kind][i][j] = kept * s->weights[kind][i][j] + pole * product(w[i], w[j]);
         }
         s->weighted[kind][i] = kept * s->weighted[kind][i] + pole * product(w[i], s->e);
@@ -123,18 +124,18 @@ static uint32_t judge_gains(const gains_t *s, uint32_t kind, real_t noise, uint3
 static void follow_sensors(gains_t *s, const gain_settings_t *p, const real_t force[2], gain_faults_t *faults)
 {
     const real_t none[2] = {REAL(0.0), REAL(0.0)};
-    const real_t shown[2] = {model_sensor(s->models[1], p, 0u), model_sensor(s->models[1], p, 1u)};
-    real_t w[EACH][2] = {
+    const real_t shown[2] = {model_sensor(s->models[MOTION], p, 0u), model_sensor(s->models[MOTION], p, 1u)};
+    real_t w[GAIN_CHANGES][2] = {
         {shown[0], REAL(0.0)}, {REAL(0.0), shown[1]}, {shown[1] - shown[0], shown[0] - shown[1]}};
-    for (uint32_t j = 0u; j < EACH; j++) {
+    for (uint32_t j = 0u; j < GAIN_CHANGES; j++) {
         for (uint32_t i = 0u; i < 2u; i++) {
             w[j][i] -= model_sensor(s->models[RESPONSE + j], p, i);
         }
     }
     add_sums(s, SENSOR, REAL(1.0), (const real_t (*)[2])w);
     s->energy[SENSOR] += product(s->e, s->e);
-    advance_model(s->models[1], p, force);
-    for (uint32_t j = 0u; j < EACH; j++) {
+    advance_model(s->models[MOTION], p, force);
+    for (uint32_t j = 0u; j < GAIN_CHANGES; j++) {
         correct_model(s->models[RESPONSE + j], p, w[j], REAL(1.0));
         advance_model(s->models[RESPONSE + j], p, none);
     }
@@ -147,9 +148,9 @@ static void follow_sensors(gains_t *s, const gain_settings_t *p, const real_t fo
 /* Add a sample to the means, and judge actuators. */
 static void follow_actuators(gains_t *s, const gain_settings_t *p, const real_t force[2], gain_faults_t *faults)
 {
-    real_t(*const models)[6] = &s->models[RESPONSE + EACH];
-    real_t w[EACH][2];
-    for (uint32_t j = 0u; j < EACH; j++) {
+    real_t(*const models)[6] = &s->models[RESPONSE + GAIN_CHANGES];
+    real_t w[GAIN_CHANGES][2];
+    for (uint32_t j = 0u; j < GAIN_CHANGES; j++) {
         for (uint32_t i = 0u; i < 2u; i++) {
             w[j][i] = model_sensor(models[j], p, i);
         }
@@ -157,7 +158,7 @@ static void follow_actuators(gains_t *s, const gain_settings_t *p, const real_t 
     if (s->watched > p->duration / 2u) { /* by then w has forgotten where it began */
         add_sums(s, ACTUATOR, p->window_pole, (const real_t (*)[2])w);
     }
-    for (uint32_t j = 0u; j < EACH; j++) {
+    for (uint32_t j = 0u; j < GAIN_CHANGES; j++) {
         const real_t own[2] = {product(p->force_of_actuator[j][0], force), product(p->force_of_actuator[j][1], force)};
         correct_model(models[j], p, w[j], REAL(-1.0));
         advance_model(models[j], p, own);
@@ -172,7 +173,7 @@ static uint32_t note_innovations(gains_t *s, const gain_settings_t *p, const rea
 {
     uint32_t jump = 0u;
     for (uint32_t i = 0u; i < (uint32_t)LAW_SENSORS; i++) {
-        s->e[i] = p->scale * sensed[i] - model_sensor(s->models[0], p, i);
+        s->e[i] = p->scale * sensed[i] - model_sensor(s->models[STATE], p, i);
         const real_t square = s->e[i] * s->e[i];
         jump |= (square > JUMP * ((s->mean[i] > p->innovation) ? s->mean[i] : p->innovation)) ? 1u : 0u;
         s->mean[i] += p->mean_pole * (square - s->mean[i]);
@@ -191,7 +192,7 @@ gain_faults_t gains_check(gains_t *gains, const gain_settings_t *used, const rea
         clear_sums(s, SENSOR);
         s->left = p->duration;
         s->energy[SENSOR] = REAL(0.0);
-        (void)memcpy(s->models[1], s->models[0], sizeof(s->models[1]));
+        (void)memcpy(s->models[MOTION], s->models[STATE], sizeof(s->models[MOTION]));
     }
     if (s->left > 0u) {
         follow_sensors(s, p, force, &faults);
@@ -205,8 +206,8 @@ gain_faults_t gains_check(gains_t *gains, const gain_settings_t *used, const rea
     } else {
         /* nothing happens */
     }
-    correct_model(s->models[0], p, s->e, REAL(1.0));
-    advance_model(s->models[0], p, force);
+    correct_model(s->models[STATE], p, s->e, REAL(1.0));
+    advance_model(s->models[STATE], p, force);
     faults.swapped = (LAW_SENSORS == 2u) ? faults.swapped : 0u;
     return faults;
 }

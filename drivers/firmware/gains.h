@@ -1,8 +1,9 @@
 /*
- * Supervision of gains: whether a sensor shows, or an actuator gives, a multiple of what it did a moment before, as
+ * Supervision of gains: whether a sensor shows, or an actuator gives, a multiple of what it did, or another's, as
  * hapticrender/control/gains.py, which has the equations.
  *
- * Index of an array of two: of sensors, or of actuators; of the outer one: sensors, actuators.
+ * Index of an array of two: of sensors, or of actuators; of the outer one: sensors, actuators.  Of an array of
+ * GAIN_CHANGES: of the one, of the other, and a swap of the two.
  */
 #ifndef GAINS_H
 #define GAINS_H
@@ -11,6 +12,8 @@
 
 #include "real.h"
 
+#define GAIN_CHANGES 3u
+
 /* Settings, from `hapticrender export`; poles are per sample. */
 typedef struct {
     real_t scale, innovation, mean_pole, window_pole; /* 1/m; 1 */
@@ -18,13 +21,13 @@ typedef struct {
     real_t step_state[4][4], step_force[4][2];        /* of coordinates and their rates, with the force held */
     real_t filter_gain[6][2];                         /* of these and of the force that wanders, per innovation */
     real_t sensor_from_coordinate[2][2];
-    real_t force_of_actuator[3][2][2]; /* per force; last: of swapped actuators - of these, 0 where there are not two */
+    real_t force_of_actuator[GAIN_CHANGES][2][2]; /* per force; swap: swapped less these, or 0 */
 } gain_settings_t;
 
 typedef struct {
-    real_t models[8][6]; /* the filter's state, p, xi_1, xi_2, xi_3, zeta_1, zeta_2, zeta_3 */
+    real_t models[2u + 2u * GAIN_CHANGES][6]; /* the filter's state, p, xi_1, xi_2, xi_3, zeta_1, zeta_2, zeta_3 */
     real_t e[2], mean[2];
-    real_t energy[2], weights[2][3][3], weighted[2][3];
+    real_t energy[2], weights[2][GAIN_CHANGES][GAIN_CHANGES], weighted[2][GAIN_CHANGES];
     uint32_t left, watched;
 } gains_t;
 

@@ -21,7 +21,7 @@ middle.  Least squares of e on w_1 and w_2 find g, of both sensors or of both ac
 Sensors are judged over the 3 ms after an innovation above 4.5 times its noise, and its mean square before: a finger's
 force makes no jump, what it adds to e is no multiple of w.  Actuators are judged by means over 3 ms, while e is large:
 only an inversion or a swap, also of sensors, is distinguished from a finger by these.  The moment of a finger off the
-middle, borne by the drive, looks like a swap, too, with eta of about 1/2.
+middle looks like swapped actuators, too, with eta = 1/(2 s) where the drive bears the share s of it.
 
 References
 ----------
@@ -42,13 +42,13 @@ from hapticrender.mathx import zoh
 from hapticrender.protocols import Array
 
 MOST = 2  # sensors, and actuators
-EACH, SWAP = MOST + 1, MOST  # w: of one sensor or actuator each, and of the two when swapped
+CHANGES, SWAP = MOST + 1, MOST  # that add to e: of the one, of the other, and a swap of the two
 # numpy's integers: a kernel is compiled anew for each value of Python's
 SENSOR, ACTUATOR = np.arange(2)  # kinds of gains
 STATE, MOTION, RESPONSE = np.arange(3)  # models: x; p; xi_1, xi_2, xi_3, zeta_1, zeta_2, zeta_3
 LEAST_INVERTED, MOST_INVERTED = -1.6, -0.4  # gains of a sensor or an actuator that is inverted
 DEAD, MOST_GAIN = 0.25, 2.0  # of a sensor: a smaller magnitude, a larger gain is a fault
-LEAST_SWAPPED, MOST_SWAPPED = 0.75, 1.4  # eta; 0.5 to 0.63 is a finger off the middle, whose moment the drive bears
+LEAST_SWAPPED, MOST_SWAPPED = 0.75, 1.4  # eta; less: a drive that bears more than 2/3 of the moment of a finger
 UNEXPLAINED, UNEXPLAINED_INVERTED = 0.1, 0.2  # of the energy of e; the latter of inverted or swapped sensors
 CERTAIN, JUMP = 25.0, 20.0  # variances: 5 sigma of a gain; 4.5 sigma of an innovation
 WATCHED, LARGE = 4.0, 20.0  # variances of e: actuators are followed, judged
@@ -61,17 +61,17 @@ GAINS = np.dtype(
         ("step_force", np.float64, (4, 2)),  # ... and B, with the force held over a sample
         ("filter_gain", np.float64, (6, MOST)),  # K
         ("sensor_from_coordinate", np.float64, (MOST, 2)),  # of C
-        ("force_of_actuator", np.float64, (EACH, 2, 2)),  # F_j per F
+        ("force_of_actuator", np.float64, (CHANGES, 2, 2)),  # F_j per F
         ("scale", np.float64),  # 1/m: e and C are in units of the sensors' noise
         ("innovation", np.float64),  # variance of e of each sensor by noise, as a multiple of its own
         *((name, np.float64) for name in ("mean_pole", "window_pole")),  # a sample
         ("duration", np.int64),  # samples of a trial
-        ("models", np.float64, (2 + 2 * EACH, 6)),
+        ("models", np.float64, (2 + 2 * CHANGES, 6)),
         ("advanced", np.float64, (4,)),
-        ("w", np.float64, (EACH, MOST)),  # of both sensors
+        ("w", np.float64, (CHANGES, MOST)),  # of both sensors
         *((name, np.float64, (MOST,)) for name in ("e", "mean", "energy")),  # mean of e^2 of a sensor; sums of e^2
-        ("weights", np.float64, (2, EACH, EACH)),  # sums of w_i w_j of sensors, of actuators
-        ("weighted", np.float64, (2, EACH)),  # sums of w_i e
+        ("weights", np.float64, (2, CHANGES, CHANGES)),  # sums of w_i w_j of sensors, of actuators
+        ("weighted", np.float64, (2, CHANGES)),  # sums of w_i e
         ("gain", np.float64, (2, MOST)),  # g
         *((name, np.int64) for name in ("left", "watched")),  # samples: to go in the trial; with actuators followed
     ]
@@ -156,12 +156,12 @@ def model_sensors(gains, k):
 def clear_sums(gains, kind):
     """Set the sums of a kind of gains, and the models behind its w, to zero."""
     s = record(gains, GAINS_T, 0)
-    for j in range(EACH):
+    for j in range(CHANGES):
         s.weighted[kind, j] = 0.0
-        for i in range(EACH):
+        for i in range(CHANGES):
             s.weights[kind, j, i] = 0.0
         for i in range(6):
-            s.models[RESPONSE + EACH * kind + j, i] = 0.0
+            s.models[RESPONSE + CHANGES * kind + j, i] = 0.0
 
 
 @kernel
@@ -169,8 +169,8 @@ def add_sums(gains, kind, pole):
     """Add a sample of w to the sums; with a `pole` below 1 these are means."""
     s = record(gains, GAINS_T, 0)
     w, b, x, e, kept = s.weights[kind], s.weighted[kind], s.w, s.e, 1.0 if kind == SENSOR else 1.0 - pole
-    for i in range(EACH):
-        for j in range(i, EACH):
+    for i in range(CHANGES):
+        for j in range(i, CHANGES):
             w[i, j] = kept * w[i, j] + pole * (x[i, 0] * x[j, 0] + x[i, 1] * x[j, 1])
         b[i] = kept * b[i] + pole * (x[i, 0] * e[0] + x[i, 1] * e[1])
 
@@ -212,14 +212,14 @@ def follow_sensors(gains, force0, force1):
     """Add a sample to a trial; at its end the sensors whose gain has changed, as bits, and whether they are swapped."""
     s = record(gains, GAINS_T, 0)
     p0, p1 = model_sensors(gains, MOTION)
-    for j in range(EACH):
+    for j in range(CHANGES):
         known0, known1 = model_sensors(gains, RESPONSE + j)
         s.w[j, 0] = (p0 if j == 0 else p1 - p0 if j == SWAP else 0.0) - known0
         s.w[j, 1] = (p1 if j == 1 else p0 - p1 if j == SWAP else 0.0) - known1
     add_sums(gains, SENSOR, 1.0)
     s.energy[SENSOR] += s.e[0] * s.e[0] + s.e[1] * s.e[1]
     advance_model(gains, MOTION, force0, force1)
-    for j in range(EACH):
+    for j in range(CHANGES):
         correct_model(gains, RESPONSE + j, s.w[j, 0], s.w[j, 1])
         advance_model(gains, RESPONSE + j, 0.0, 0.0)
     s.left -= 1
@@ -230,12 +230,12 @@ def follow_sensors(gains, force0, force1):
 def follow_actuators(gains, force0, force1):
     """Add a sample to the means; the actuators that are inverted, as bits, and whether they are swapped."""
     s = record(gains, GAINS_T, 0)
-    first = RESPONSE + EACH * ACTUATOR
-    for j in range(EACH):
+    first = RESPONSE + CHANGES * ACTUATOR
+    for j in range(CHANGES):
         s.w[j, 0], s.w[j, 1] = model_sensors(gains, first + j)
     if s.watched > s.duration // 2:  # by then w has forgotten where it began
         add_sums(gains, ACTUATOR, s.window_pole)
-    for j in range(EACH):
+    for j in range(CHANGES):
         f = s.force_of_actuator[j]
         correct_model(gains, first + j, -s.w[j, 0], -s.w[j, 1])
         advance_model(gains, first + j, f[0, 0] * force0 + f[0, 1] * force1, f[1, 0] * force0 + f[1, 1] * force1)
@@ -267,23 +267,23 @@ def check_gains(gains, sensed, sensors, force0, force1):
     """
     s = record(gains, GAINS_T, 0)
     rescaled = inverted = 0
-    swapped = together = False
+    sensors_swapped = actuators_swapped = False
     if note_innovations(gains, sensed, sensors) and s.left == 0:
         clear_sums(gains, SENSOR)
         s.left, s.energy[SENSOR] = s.duration, 0.0
         for i in range(6):
             s.models[MOTION, i] = s.models[STATE, i]
     if s.left > 0:
-        rescaled, swapped = follow_sensors(gains, force0, force1)
+        rescaled, sensors_swapped = follow_sensors(gains, force0, force1)
     if s.energy[ACTUATOR] > WATCHED * s.innovation:
         s.watched += 1
-        inverted, together = follow_actuators(gains, force0, force1)
+        inverted, actuators_swapped = follow_actuators(gains, force0, force1)
     elif s.watched > 0:
         clear_sums(gains, ACTUATOR)
         s.watched = 0
     correct_model(gains, STATE, s.e[0], s.e[1])
     advance_model(gains, STATE, force0, force1)
-    return rescaled, inverted, sensors == MOST and (swapped or together)
+    return rescaled, inverted, sensors == MOST and (sensors_swapped or actuators_swapped)
 
 
 @kernel

@@ -17,7 +17,7 @@ MOST_PARTS = 4096
 MOST_GAIN = 1e6
 LONGEST_PART = 360_000.0  # s
 MOST_CHIRP = 0.01  # m
-TIMES, PLACES = (0.0, 0.7310586), np.linspace(-0.01, 0.01, 101)  # s, m: where a texture along the surface is compared
+READINGS, PLACES = 0.0123 * 10.0 ** np.arange(6), np.linspace(-0.15, 0.15, 1001)  # s, m: of what lies along the surface
 
 Parts = tuple[tuple[Texture, float], ...]
 
@@ -56,7 +56,8 @@ class SeparatedTexture:
     Raises
     ------
     ValueError
-        Its parts are in time and along the surface, and it is no sum; or what lies along the surface changes with time.
+        Its parts are in time and along the surface, and it is no sum; or what lies along the surface is not the same at
+        all `READINGS`.
     """
 
     def __init__(self, texture: Texture, waveform_of: Any = None) -> None:
@@ -67,9 +68,9 @@ class SeparatedTexture:
         along = [bool(getattr(each, "spatial", False)) for each, _ in terms]
         self.timed, self.spatial = not all(along), any(along)
         if self.spatial:
-            first, later = (self._sum(True, np.full(len(PLACES), seconds), PLACES) for seconds in TIMES)
-            if abs(later - first).max() > 1e-6 * abs(first).max():
-                raise ValueError(f"{type(texture).__name__}: changes with time and position at once: use a sum of two")
+            found = np.stack([self._sum(True, np.full(len(PLACES), seconds), PLACES) for seconds in READINGS])
+            if np.ptp(found, axis=0).max() > 1e-6 * abs(found).max():
+                raise ValueError(f"{type(texture).__name__}: must not change with time: it lies along the surface")
 
     def in_time(self, time: Array) -> Array:
         """Sum of what lies in time, at `time` (s, shape (n,)); a ValueError where it is not finite."""
