@@ -38,6 +38,7 @@ class _Parser(argparse.ArgumentParser):
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line `argv` (``sys.argv`` by default) and return its exit status."""
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # of small matrices: threads that wait take the other cores
     for stream in (sys.stdout, sys.stderr):
         if hasattr(stream, "reconfigure"):
             stream.reconfigure(errors="replace")

@@ -203,6 +203,16 @@ def test_the_methods_that_help_lists_are_those_there_are():
     assert set(defaults.METHODS) == set(METHODS)
 
 
+def test_the_command_line_gives_numpy_one_thread():
+    """It is set before numpy is imported, unless the user has set it."""
+    code = "import os, sys, hapticrender.cli as c; early = 'numpy' in sys.modules; c.main(['scenes']);"
+    code += " print(os.environ['OPENBLAS_NUM_THREADS']); sys.exit(early)"
+    for given, threads in ({}, "1"), ({"OPENBLAS_NUM_THREADS": "3"}, "3"):
+        environment = {name: value for name, value in os.environ.items() if name != "OPENBLAS_NUM_THREADS"} | given
+        done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True)
+        assert done.stdout.splitlines()[-1] == threads
+
+
 def test_help_waits_for_no_heavy_import():
     script = (
         "import sys; from hapticrender import cli; cli._parser(); print({'numba', 'scipy', 'numpy'} & set(sys.modules))"

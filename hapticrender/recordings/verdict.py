@@ -39,7 +39,7 @@ SPUR = 0.01  # of the rms of the whole reference: S_b where no threshold is know
 LOOSER = 2.0  # times the tolerance: bound on a third octave and on the worst windows
 UNPLAYABLE = 0.01  # share of the reference's energy outside B from which it is noted
 LEAST = 1e-4  # share of the reference's energy in B below which nothing is judged
-LONGEST_DELAY = 20e-3  # s, of the best delay
+LONGEST_DELAY, DELAYS = 20e-3, 4001  # s, of the best delay; how many are tried
 AFTER_CONTACT = (0.0, 0.05, 0.2)  # s: edges of the two spans that are stated
 MATTERS = Flag.SATURATED | Flag.NONFINITE | Flag.SENSOR_CLIPPED | Flag.OVERRUN
 
@@ -196,11 +196,15 @@ def _likeness(frequency: Array, spectrum: Array, cross: Array, sign: float) -> d
     ``c(tau) = Re sum_f R* Y exp(j 2 pi f tau)`` is largest at the delay; gain ``c/sum |R|^2``, incoherent share
     ``1 - c^2/(sum |R|^2 sum |Y|^2)``.
     """
+    from scipy.signal import czt
+
     reference, error = spectrum.T
     whole = cross + sign * reference  # of r and y = e + sign r
     motion = error + 2.0 * sign * cross.real + sign**2 * reference
-    delay = np.linspace(-LONGEST_DELAY, LONGEST_DELAY, 4001)
-    turned = np.exp(2j * np.pi * np.outer(delay, frequency)) @ whole
+    delay = np.linspace(-LONGEST_DELAY, LONGEST_DELAY, DELAYS)
+    turn = 2j * np.pi * (frequency[-1] - frequency[0]) / max(len(frequency) - 1, 1)  # a second, from bin to bin
+    turned = czt(whole, DELAYS, np.exp(turn * (delay[1] - delay[0])), np.exp(-turn * delay[0]))
+    turned *= np.exp(2j * np.pi * frequency[0] * delay)
     best = int(np.argmax(turned.real * (1.0 - 1e-6 * np.abs(delay) / LONGEST_DELAY)))  # of equal ones the shortest
     found, total = float(turned.real[best]), float(reference.sum())
     incoherent = 1.0 - found**2 / max(total * float(motion.sum()), np.finfo(float).tiny)
