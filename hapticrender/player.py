@@ -315,16 +315,14 @@ class Player:
         if isinstance(driver, str):
             driver = open_driver(driver, scene.device_profile)
         try:
-            rendering = prepare(scene, driver=driver.live() if hasattr(driver, "live") else driver)
-            self._start(rendering)
-            return [rendering, *self._prepare_later(others)]
+            return self._start(prepare(scene, driver=driver.live() if hasattr(driver, "live") else driver), others)
         except BaseException:
             self._loop = None  # what has been opened is left at rest
             self._stack.close()
             raise
 
-    def _start(self, rendering: Rendering) -> None:
-        """Open the device at rest, probe it, and play."""
+    def _start(self, rendering: Rendering, others: list[Scene]) -> list[Rendering]:
+        """Open the device at rest, probe it, prepare what plays later, and play."""
         device: Any = rendering.device
         stack, direct = self._stack, rendering.driver is device
         calls_back, own = direct and hasattr(device, "start"), direct and hasattr(device, "loop")
@@ -346,6 +344,7 @@ class Player:
         loop.set_gain(self._gain)
         if self._finger is not None:
             loop.finger(*self._finger)
+        renderings = [rendering, *self._prepare_later(others)]
         if calls_back:
             device.start(loop)
             stack.callback(device.stop)
@@ -355,6 +354,7 @@ class Player:
             self._run_thread(self._drive_device)
         if self._paced:
             self._run_thread(self._serve)
+        return renderings
 
     def _hand_finger(self, rendering: Rendering) -> None:
         """Put the finger that the application moves on a simulated device."""

@@ -280,6 +280,16 @@ def test_a_playlist_along_the_surface_goes_round():
     assert all(band.error < 0.02 for band in bands)
 
 
+def test_a_first_playlist_that_cannot_be_played_leaves_a_device_that_can():
+    """Its second part is refused before anything plays, and before there are threads to wait for."""
+    with hr.Player() as player:
+        with pytest.raises(ValueError, match="Playlist with a part along the surface"):
+            player.play(hr.Playlist([(TONE, 0.2), (hr.Playlist([(RIDGES, 0.5), (TONE, 0.5)]), 0.5)]))
+        player.play(TONE)
+        player.sleep(0.3)
+        assert [band.frequency for band in player.state().bands] == [100.0]
+
+
 def test_a_playlist_that_cannot_be_played_leaves_what_plays():
     with hr.Player(paced=False) as player:
         player.play(TONE)
