@@ -90,7 +90,19 @@ def test_zero_order_hold_is_the_solution_of_the_equation():
     np.testing.assert_allclose(bd[:, 0], [1 - free[0, 0], -free[1, 0]], rtol=1e-9)
     np.testing.assert_array_equal(bd[:, 1], 0.0)
     np.testing.assert_allclose(mathx.zoh(a, b, 2 / RATE)[0], ad @ ad, rtol=1e-12)
-    np.testing.assert_allclose(ad, scipy.linalg.expm(a / RATE), rtol=1e-12)
+    for period in (1 / RATE, 0.05, 1.0):  # norms from 280 to 1.4e6: rounding grows with every squaring
+        exact = scipy.linalg.expm(a * period)
+        np.testing.assert_allclose(mathx.zoh(a, b, period)[0], exact, rtol=1e-9, atol=1e-9 * abs(exact).max())
+
+
+def test_first_order_hold_follows_a_ramp():
+    """x' = u - p x under u from u0 to u1 in T, in closed form; an integrator of both inputs beside it."""
+    p, t, u0, u1 = 400.0, 1 / RATE, 0.7, -0.2
+    a, b = np.diag([-p, 0.0]), np.array([[1.0, 0.0], [1.0, 2.0]])
+    found = mathx.foh(a, b, t) @ [3.0, 5.0, u0, 11.0, u1, 13.0]
+    decay, slope = math.exp(-p * t), (u1 - u0) / t
+    ramp = u0 / p * (1 - decay) + slope / p * (t - (1 - decay) / p)
+    np.testing.assert_allclose(found, [3.0 * decay + ramp, 5.0 + t * (0.5 * (u0 + u1) + 24.0)], rtol=1e-12)
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])

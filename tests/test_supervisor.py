@@ -5,11 +5,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import scipy.linalg
 from other_plate import REACH, TRUTH, OtherPlate
 
 import hapticrender as hr
 from benchmarks import faults
 from benchmarks.false_stops import random_scene, run
+from hapticrender.control.gains import WANDER, design_gains
+from hapticrender.mathx import zoh
 from hapticrender.plants.plate import PlateParameters
 from hapticrender.touch.mechanics import HEAVY_SECOND
 
@@ -170,6 +173,24 @@ def test_a_finger_near_an_end_is_no_swap_of_coils(position, limits):
     plate = faults.FaultyWrongPlate(*faults.FAULTS["none"], 2.0, position)
     recording = hr.render(scene(400.0, limits=limits), driver=plate)
     assert not (recording.flags & hr.Flag.STOPPED).any()
+
+
+@pytest.mark.parametrize(("rate", "noise"), [(1e3, 1e-8), (5e3, 1e-6), (48e3, 1e-5)])
+def test_the_filter_behind_the_test_of_gains_is_the_stationary_one(rate, noise):
+    """Its gain and innovations are those of scipy's solution of the Riccati equation."""
+    model = PlateParameters(rate=rate).device_model(rate, 1)
+    found = design_gains(model, noise)[0]
+    inverse = np.linalg.inv(model.mass)
+    a, none, one = np.zeros((4, 4)), np.zeros((2, 2)), np.eye(2)
+    a[:2, 2:], a[2:, :2], a[2:, 2:] = one, -inverse @ model.stiffness, -inverse @ model.damping
+    free, forced = zoh(a, np.vstack([none, inverse]), 1 / rate)
+    whole = np.block([[free, forced], [np.zeros((2, 4)), one]])
+    c = np.hstack([np.linalg.inv(model.coordinate_from_sensed) / noise, none, none])
+    wander = np.diag(np.r_[0, 0, 0, 0, 1, 1] * WANDER**2 / rate)
+    covariance = scipy.linalg.solve_discrete_are(whole.T, c.T, wander, one)
+    innovation = c @ covariance @ c.T + one
+    np.testing.assert_allclose(found["filter_gain"], covariance @ c.T @ np.linalg.inv(innovation), rtol=1e-9)
+    np.testing.assert_allclose(found["innovation"], innovation.diagonal().max(), rtol=1e-9)
 
 
 @pytest.mark.parametrize("position", [0.0, 0.05])

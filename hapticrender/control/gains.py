@@ -27,6 +27,8 @@ References
 ----------
 Willsky and Jones, A generalized likelihood ratio approach to the detection and estimation of jumps in linear systems,
 IEEE Transactions on Automatic Control 21, 1976.
+Anderson, Second-order convergent algorithms for the steady-state Riccati equation, International Journal of Control 28,
+1978.
 """
 
 from __future__ import annotations
@@ -112,12 +114,18 @@ def design_gains(model: DeviceModel, noise: float) -> Array | None:
 
 
 def _filter(a: Array, c: Array, wander: float) -> tuple[Array, float]:
-    """Stationary Kalman gain before the step, and largest variance of an innovation, for sensors of unit noise."""
-    from scipy.linalg import solve_discrete_are  # only designs need it
+    """Stationary Kalman gain before the step, and largest variance of an innovation, for sensors of unit noise.
 
-    n = len(a) // 3
-    process = np.diag(np.r_[np.zeros(2 * n), np.full(n, wander**2)])
-    covariance = solve_discrete_are(a.T, c.T, process, np.eye(len(c)))
+    The Riccati equation is doubled: 2^k steps of it in k [Anderson 1978].
+    """
+    step, information = a.T, c.T @ c
+    covariance = np.diag(np.repeat([0.0, 0.0, wander**2], len(a) // 3))
+    for _ in range(60):
+        if abs(step).max() < 1e-12:  # what is left of the state before
+            break
+        half = np.linalg.inv(np.eye(len(a)) + information @ covariance)
+        information = information + step @ half @ information @ step.T
+        covariance, step = covariance + step.T @ covariance @ half @ step, step @ half @ step
     innovation = c @ covariance @ c.T + np.eye(len(c))
     return covariance @ c.T @ np.linalg.inv(innovation), float(innovation.diagonal().max())
 

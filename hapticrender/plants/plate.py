@@ -19,7 +19,6 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.linalg import block_diag
 
 from hapticrender.checks import Validated, parameter
 from hapticrender.control.damping import BendingMode
@@ -245,7 +244,7 @@ def structure(
         (p.damping_matrix, 2 * p.bending_damping * omega * modal, mechanics.phalanx_damping, mechanics.damping, tissue),
         (p.stiffness_matrix, omega**2 * modal, mechanics.phalanx_stiffness, mechanics.stiffness, tissue),
     ):
-        matrix = block_diag(plate, bending, strength * phalanx)
+        matrix = np.pad(plate, (0, 2)) + np.diag([0.0, 0.0, bending, strength * phalanx])
         matrices.append(matrix + strength * finger * np.outer(acting, acting) if order else matrix)
     forces = np.vstack([p.force_from_drive, np.full(p.coils, p.force_constant * p.bending_coil), np.zeros(p.coils)])
     kept = np.flatnonzero([True, p.degrees_of_freedom == 2, omega > 0.0, order == 4])

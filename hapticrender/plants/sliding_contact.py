@@ -20,6 +20,7 @@ import numpy as np
 
 from hapticrender.checks import Validated, parameter
 from hapticrender.jit import kernel
+from hapticrender.mathx import foh
 from hapticrender.plants.compiled import new_record, quantise
 from hapticrender.protocols import Array
 
@@ -98,19 +99,10 @@ def sliding_record(parameters: SlidingParameters) -> Array:
 
 
 def _tribometer_step(parameters: SlidingParameters) -> Array:
-    """One sample of the tribometer's force and of its rate over w0 (first-order hold), shape (2, 4).
-
-    From the exponential of [[A T, B T, 0], [0, 0, 1], [0, 0, 0]]: Phi, and the parts of the start and of the rise.
-    """
-    from scipy.linalg import expm
-
+    """One sample of the tribometer's force and of its rate over w0 (first-order hold), shape (2, 4)."""
     w = 2 * math.pi * parameters.tribometer_frequency
-    system = np.zeros((4, 4))
-    system[:2, :3] = w / parameters.rate * np.array([[0.0, 1.0, 0.0], [-1.0, -2 * parameters.tribometer_damping, 1.0]])
-    system[2, 3] = 1.0
-    step = expm(system)[:2]
-    step[:, 2] -= step[:, 3]
-    return step
+    a = w * np.array([[0.0, 1.0], [-1.0, -2 * parameters.tribometer_damping]])
+    return foh(a, np.array([[0.0], [w]]), 1.0 / parameters.rate)
 
 
 @kernel
