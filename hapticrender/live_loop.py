@@ -89,8 +89,11 @@ class LiveLoop(RealtimeEntry):
         """Everything that was ever raised."""
         return super().flags | self._touches.flags
 
-    def advance(self, sensing: bool) -> None:
-        """Exchange a block with the driver; `sensing`: its own sense of the finger is used, where it has one."""
+    def advance(self, sensing: bool, late: bool = False) -> None:
+        """Exchange a block with the driver; `sensing`: its own sense of the finger is used, where it has one.
+
+        `late`: the device lost samples before it.
+        """
         sensed = check_sensed(self.driver, self.driver.play(self._drive), len(self.model.places))
         at = (self.samples + np.arange(self.driver.block)) % len(self._true)
         if sensed.motion is not None:
@@ -98,7 +101,7 @@ class LiveLoop(RealtimeEntry):
         if sensed.normal_load is not None:
             self._true[at, -1] = sensed.normal_load
         self.senses = sensed.position is not None
-        flags = 0 if sensed.flags is None else int(np.bitwise_or.reduce(sensed.flags))
+        flags = (Flag.OVERRUN if late else 0) | (0 if sensed.flags is None else int(np.bitwise_or.reduce(sensed.flags)))
         self._touches.slow()
         self._reshape()
         self._drive = self.process(sensed.sensed, sensed.position if sensing else None, flags)
@@ -119,17 +122,11 @@ class LiveLoop(RealtimeEntry):
         whole = self.whole and self.controller.n_bands == 0
         return self._texture(rendering), self.controller if whole else live_controller(rendering)
 
-    def exchange(self, rendering: Rendering) -> None:
-        """Fade into the texture of another rendering of the same device.
+    def exchange(self, rendering: Rendering, texture: SampledTexture, controller: Controller) -> None:
+        """Fade into the texture of another rendering of the same device; texture and controller are `made` of it.
 
         A controller that takes waveforms goes on; else there is a new one for the texture's bands.
-
-        Raises
-        ------
-        ValueError
-            The texture cannot be played; the one before goes on.
         """
-        texture, controller = self.made(rendering)
         model = joint_model(self.rendering.model, rendering.model)
         for part, its_model in _parts(controller, model):
             _widen(part, its_model)

@@ -222,22 +222,22 @@ def stopped_by_sigterm() -> Iterator[None]:
 
 
 @contextmanager
-def zero_drive_after(device: Driver) -> Iterator[None]:
-    """Play zeros until they have come through, whatever happened, unless the device does so itself on leaving."""
+def zero_drive_after(device: Driver, hangs: Callable[[], bool] = lambda: False) -> Iterator[None]:
+    """Play zeros until they have come through, whatever happened; not where the device does so itself, or hangs."""
+
+    def rest() -> None:
+        if not (getattr(device, "zero_on_exit", False) or hangs()):
+            play_zeros(device)
+
     try:
         yield
     except BaseException as error:
         try:
-            _rest(device)
+            rest()
         except Exception as second:
             error.add_note(f"and while the drive was set to zero: {second}")
         raise
-    _rest(device)
-
-
-def _rest(device: Driver) -> None:
-    if not getattr(device, "zero_on_exit", False):
-        play_zeros(device)
+    rest()
 
 
 def _exchange(driver: Driver, controller: Controller) -> Exchange | None:

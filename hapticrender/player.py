@@ -19,7 +19,7 @@ import math
 import threading
 import time
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
 from functools import partial
@@ -29,17 +29,19 @@ from typing import Any, Self
 
 import numpy as np
 
+from hapticrender.control.carriers import FASTEST
 from hapticrender.control.probe import probe_plate
 from hapticrender.devices import open_driver
-from hapticrender.errors import HapticError, WatchdogTimeout
+from hapticrender.errors import DriverError, HapticError, WatchdogTimeout
 from hapticrender.live_loop import LiveLoop, LiveMotion
 from hapticrender.live_recorder import LiveRecorder
 from hapticrender.loop import play_zeros, prepare, stopped_by_sigterm, zero_drive_after
 from hapticrender.player_state import BandState, PlayerState
 from hapticrender.protocols import Driver, Flag, Rendering, Texture
 from hapticrender.recordings.recording import Recording
+from hapticrender.sampled_texture import REACH
 from hapticrender.touch.composed import Playlist
-from hapticrender.touch.finger import Finger
+from hapticrender.touch.finger import MOST_LOAD, Finger
 from hapticrender.touch.scene import Scene
 
 MOST_GAIN = 10.0
@@ -52,6 +54,7 @@ END_FADE = 0.05  # s: five time constants of the gain; and the longest that zero
 LEAST_PART = 2 * SERVICE  # s: of a playlist whose parts are taken up one by one
 POINTING, INSTANT = 0.01, 1e-4  # s between two positions of a scene's finger; over which its velocity is found
 NAP, LATE = 2e-3, 0.1  # s: shorter waits are not slept; so late the clock starts anew
+DRIFT = 0.01  # of the clock
 PATIENCE = 5.0  # s without a sample, after which `sleep` gives a device up
 
 
@@ -119,9 +122,12 @@ class Player:
         self._error: BaseException | None = None
         self._raised = False
         self._recorder: LiveRecorder | None = None
+        self._calls = 0  # of the application that are under way
         self._entered, self._clocked = False, False  # whether the device has a clock of its own: it is not played
         self._recorded, self._served = 0, 0.0  # samples of this loop that were looked at; when the last look was
         self._stack, self._stopping, self._lock = ExitStack(), threading.Event(), threading.RLock()
+        self._changing = threading.RLock()  # of the texture; taken before `_lock`
+        self._patience, self._hangs = PATIENCE, threading.Event()  # s, blocks of the driver included; whether it hangs
 
     def __enter__(self) -> Self:
         self._entered = True
@@ -146,7 +152,7 @@ class Player:
 
     @property
     def gain(self) -> float:
-        """Factor on every texture, 0 to 10 (on a board to 1); a new one is reached within some 30 ms."""
+        """Factor on every texture, 0 to 10 (on a board to 1); a new one is reached to 1 % within 50 ms."""
         return self._gain
 
     @gain.setter
@@ -175,50 +181,55 @@ class Player:
         shortest = min(seconds for _, seconds in parts)
         if shortest < LEAST_PART:
             raise ValueError(f"a part of {shortest:g} s of a playlist along the surface: must be >= {LEAST_PART:g} s")
-        with self._calling():
-            first, *others = [self._scene(texture=each) for each, _ in parts]
-            if self._loop is None:
-                renderings = self._begin(first, others)
-            else:
-                renderings = [self._prepare(first), *self._prepare_later(others)]
-                self._loop.exchange(renderings[0])
-            self._parts = deque(zip(renderings, (seconds for _, seconds in parts), strict=True))
-            self._until = self.time + self._parts[0][1]
+        with self._changing, self._busy():  # the device goes on: a long recording takes seconds to prepare
+            scenes = [self._scene(texture=each) for each, _ in parts]
+            loop = self._loop
+            if loop is None:
+                with self._lock:
+                    self._follow(self._begin(scenes), parts)
+                return
+            renderings = [self._prepare(each) for each in scenes]
+            made, *_ = [loop.made(each) for each in renderings]
+            with self._lock:
+                self._check()
+                loop.exchange(renderings[0], *made)
+                self._follow(renderings, parts)
 
     def _prepare(self, scene: Scene) -> Rendering:
         """Return the rendering of a scene on the device that plays."""
         playing = self._playing("play").rendering
         return prepare(scene, driver=None if playing.plant is not None else playing.device, compiled=False)
 
-    def _prepare_later(self, scenes: list[Scene]) -> list[Rendering]:
-        """Return renderings that can all be played, at some later time."""
-        found = [self._prepare(each) for each in scenes]
-        for each in found:
-            self._playing("play").made(each)
-        return found
+    def _follow(self, renderings: list[Rendering], parts: Sequence[tuple[Texture, float]]) -> None:
+        """Note what follows the first of the renderings, and when."""
+        self._parts = deque(zip(renderings, (seconds for _, seconds in parts), strict=True))
+        self._until = self.time + self._parts[0][1]
 
     def _go_on(self) -> None:
         """Fade into the next part of a playlist where it is due."""
         if self.time >= self._until:
             self._parts.rotate(-1)
             rendering, seconds = self._parts[0]
-            self._playing("play").exchange(rendering)
+            loop = self._playing("play")
+            loop.exchange(rendering, *loop.made(rendering))
             self._until += seconds
 
     def finger(self, position: float, velocity: float | None = None, load: float = 0.4) -> None:
         """Set where the finger is: position (m from the middle, NaN: lifted), velocity (m/s), normal load (N).
 
-        It goes on at this velocity for 50 ms at most.  Without a velocity, that since the last call is taken.  After
-        0.25 s without a call what lies along the surface fades out.
+        At most 0.15 m, 10 m/s and 20 N.  It goes on at this velocity for 50 ms at most.  Without a velocity, that since
+        the last call is taken.  After 0.25 s without a call what lies along the surface fades out.
         """
         self._check()
-        now = time.monotonic() if self._paced else self.time
-        if velocity is None:
-            moved, passed = position - (self._finger or (math.nan,))[0], now - self._finger_time
-            velocity = moved / passed if 0.0 < passed < UPDATES and math.isfinite(moved) else 0.0
-        if math.isinf(position) or not math.isfinite(velocity) or not 0.0 <= load < math.inf:
-            values = f"{position=} m, {velocity=} m/s, {load=} N"
-            raise ValueError(f"{values}: must be finite, a load >= 0 (a position may be NaN: lifted)")
+        now, sane = time.monotonic() if self._paced else self.time, False
+        with suppress(TypeError):
+            if velocity is None:
+                moved, passed = position - (self._finger or (math.nan,))[0], now - self._finger_time
+                velocity = moved / passed if 0.0 < passed < UPDATES and abs(moved) <= FASTEST * passed else 0.0
+            sane = not abs(position) > REACH and abs(velocity) <= FASTEST and 0.0 <= load <= MOST_LOAD
+        if velocity is None or not sane:
+            bound = f"{REACH:g} m from the middle of the surface (NaN: lifted), {FASTEST:g} m/s, 0 to {MOST_LOAD:g} N"
+            raise ValueError(f"{position=} m, {velocity=} m/s, {load=} N: must be at most {bound}")
         self._finger, self._finger_time = (position, velocity, load), now
         self._motion.update(position, velocity, load)
         if self._loop is not None:
@@ -272,8 +283,10 @@ class Player:
                 self._advance(min(end - self.time, SERVICE))
             if self.time > seen:
                 seen, since = self.time, time.monotonic()
-            if time.monotonic() - since > PATIENCE:
-                raise HapticError(f"the device has played no sample for {PATIENCE:g} s: check it and its driver")
+            if time.monotonic() - since > self._patience:
+                raise HapticError(
+                    f"the device has played no sample for {self._patience:.3g} s: check it and its driver"
+                )
             with self._lock:
                 self._check()
 
@@ -296,26 +309,37 @@ class Player:
 
     @contextmanager
     def _calling(self) -> Iterator[None]:
+        """A call of the application while nobody else changes anything."""
+        with self._lock, self._busy():
+            yield
+
+    @contextmanager
+    def _busy(self) -> Iterator[None]:
         """A call of the application that may take long: meanwhile the watchdog waits."""
         with self._lock:
             self._check()
+            self._calls += 1
             self._watch(None)
-            try:
-                yield
-            finally:
-                self._watch(self._watchdog)
+        try:
+            yield
+        finally:
+            with self._lock:
+                self._calls -= 1
+                self._watch(None if self._calls else self._watchdog)
 
     def _watch(self, seconds: float | None) -> None:
         if self._watchdog is not None and self._loop is not None:
             self._loop.watch(seconds)
 
-    def _begin(self, scene: Scene, others: list[Scene]) -> list[Rendering]:
-        """Make the driver, start the device with the scene's texture, and prepare those of the others."""
+    def _begin(self, scenes: list[Scene]) -> list[Rendering]:
+        """Make the driver, start the device with the first scene's texture, and prepare those of the others."""
         driver: Any = self._driver
         if isinstance(driver, str):
-            driver = open_driver(driver, scene.device_profile)
+            driver = open_driver(driver, scenes[0].device_profile)
+        if hasattr(driver, "live"):
+            driver = driver.live()
         try:
-            return self._start(prepare(scene, driver=driver.live() if hasattr(driver, "live") else driver), others)
+            return self._start(prepare(scenes[0], driver=driver), scenes[1:])
         except BaseException:
             self._loop = None  # what has been opened is left at rest
             self._stack.close()
@@ -328,6 +352,7 @@ class Player:
         calls_back, own = direct and hasattr(device, "start"), direct and hasattr(device, "loop")
         self._clocked = calls_back or own
         blocks = 2 * rendering.driver.block / rendering.driver.rate
+        self._patience = PATIENCE + blocks
         if self._watchdog is not None and self._watchdog < blocks:
             raise ValueError(f"watchdog = {self._watchdog:g} s: must be >= {blocks:g} s, two blocks of the driver")
         if self._clocked and not self._paced:
@@ -336,15 +361,18 @@ class Player:
         loop: Any = device.loop(rendering) if own else LiveLoop(rendering, **scales)
         self._hand_finger(rendering)
         stack.enter_context(stopped_by_sigterm())
-        stack.enter_context(rendering.driver)
-        stack.enter_context(zero_drive_after(device))
+        rendering.driver.__enter__()
+        stack.push(lambda *error: None if self._hangs.is_set() else rendering.driver.__exit__(*error))
+        stack.enter_context(zero_drive_after(device, self._hangs.is_set))
         if rendering.probe:
             probe_plate(device, rendering.model)
         self._loop = loop
         loop.set_gain(self._gain)
         if self._finger is not None:
             loop.finger(*self._finger)
-        renderings = [rendering, *self._prepare_later(others)]
+        renderings = [rendering, *map(self._prepare, others)]
+        for each in renderings[1:]:
+            loop.made(each)
         if calls_back:
             device.start(loop)
             stack.callback(device.stop)
@@ -380,7 +408,11 @@ class Player:
 
         def end() -> None:
             self._stopping.set()
-            thread.join()
+            thread.join(self._patience)
+            if thread.is_alive():
+                self._hangs.set()
+                trouble = f"its driver has not returned for {self._patience:.3g} s: zero drive could not be played"
+                raise DriverError(f"{self._playing('play').rendering.device}: {trouble}: switch the device off")
 
         self._stack.callback(end)
 
@@ -394,19 +426,24 @@ class Player:
                 play_zeros(loop.driver)
 
     def _drive_device(self) -> None:
-        """Play block after block, no faster than the clock; one that was left behind by `LATE` starts anew."""
-        start = time.monotonic()
+        """Play block after block, no faster than the clock; one that was left behind by `LATE` starts anew.
+
+        A real device has then lost samples; a clock of its own may be slower by `DRIFT`.
+        """
+        loop, start, late = self._playing("play"), time.monotonic(), False
+        drift, real = DRIFT * loop.driver.block / loop.driver.rate, loop.rendering.plant is None
         while not self._stopping.is_set():
-            self._block()
+            self._block(late and real)
             ahead = self.time - (time.monotonic() - start)
+            late = ahead < -LATE
             if ahead > NAP:
                 time.sleep(ahead)
-            elif ahead < -LATE:
-                start -= ahead
+            else:
+                start -= ahead if late else max(min(ahead, 0.0), -drift)
 
-    def _block(self) -> None:
-        """Play a block."""
-        self._playing("play").advance(sensing=self._given is not None or self._finger is None)
+    def _block(self, late: bool = False) -> None:
+        """Play a block; `late`: the device lost samples before it."""
+        self._playing("play").advance(self._given is not None or self._finger is None, late)
 
     def _advance(self, seconds: float) -> None:
         """Play for so long in this thread."""

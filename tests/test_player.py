@@ -1,12 +1,16 @@
 """Live play: what plays is the texture, whatever changes on the way, and whoever drives the device."""
 
-from dataclasses import replace
+import threading
+import time
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import pytest
 from live_devices import RIDGES, ROUNDING, TONE, Blind, Calling, Lying, slide
 
 import hapticrender as hr
+from hapticrender import sampled_texture
 from hapticrender.plants.plate import Plate, PlateParameters
 from hapticrender.recordings.recording import Recording
 from hapticrender.sampled_texture import FADE
@@ -227,8 +231,11 @@ def test_what_it_refuses(tmp_path):
             (player.state, "state: nothing plays yet"),
             (lambda: player.record(tmp_path / "a.au"), "record: nothing plays yet"),
             (player.end_recording, "nothing is being recorded"),
-            (lambda: player.finger(np.inf), "must be finite"),
-            (lambda: player.finger(0.0, 0.1, -1.0), "must be finite"),
+            (lambda: player.finger(np.inf), "position=inf m"),
+            (lambda: player.finger(-20.0), r"position=-20\.0 m, .* must be at most 0\.15 m from the middle"),
+            (lambda: player.finger(0.0, 50.0), r"velocity=50\.0 m/s"),
+            (lambda: player.finger(0.0, 0.1, -1.0), r"load=-1\.0 N"),
+            (lambda: player.finger(None), "position=None"),
             (lambda: setattr(player, "gain", np.nan), "gain=nan: must be 0 to 10"),
             (lambda: player.sleep(-1.0), "seconds=-1.0"),
         ):
@@ -301,3 +308,74 @@ def test_a_playlist_that_cannot_be_played_leaves_what_plays():
             player.play(hr.Playlist([(TONE, 0.2), (hr.Playlist([(RIDGES, 0.5), (TONE, 0.5)]), 0.5)]))
         player.sleep(0.7)
         assert [band.frequency for band in player.state().bands] == [100.0]
+
+
+@dataclass(frozen=True)
+class Own:
+    """A texture of one's own that does not say whether it lies along the surface."""
+
+    along: float = 0.0  # turns a metre
+    in_time: float = 0.0  # Hz
+    ready: Any = None  # an event that is waited for
+
+    def bands(self, rate):
+        if self.along and not self.in_time:
+            return hr.Bands(frequency=np.zeros(1), wavenumber=np.array([self.along]), phase=np.zeros(1))
+        return hr.Bands.none(spatial=False)
+
+    def waveform(self, time, position):
+        if self.ready is not None:
+            self.ready.wait(60.0)
+        turns = self.in_time * np.asarray(time) + self.along * np.nan_to_num(position)
+        return 5e-6 * np.cos(2 * np.pi * turns)
+
+
+def test_a_texture_of_ones_own_lies_where_its_bands_say(tmp_path):
+    """With a wavenumber along the surface; with none in time, where one that needs the position, too, is refused."""
+    with hr.Player(paced=False) as player:
+        player.play(Own(along=1e3))
+        player.record(tmp_path / "own.au")
+        slide(player, 1.0)
+        with pytest.raises(ValueError, match="Own: must not change with the finger's position: it lies in time"):
+            player.play(Own(along=1e3, in_time=10.0))
+        recording = player.end_recording()
+    assert np.std(recording.reference[2500:]) == pytest.approx(5e-6 / np.sqrt(2), rel=0.02)
+    assert error_of(recording, 0.5) < 0.02
+
+
+def test_what_plays_goes_on_while_a_texture_is_prepared(tmp_path, monkeypatch):
+    """The samples ahead last 0.2 s, the next texture takes longer: none is lost, and the watchdog waits."""
+    monkeypatch.setattr(sampled_texture, "AHEAD", 0.2)
+    ready = threading.Event()
+    with hr.Player(watchdog=0.3) as player:
+        player.play(Own(in_time=100.0))
+        player.sleep(0.5)
+        player.record(tmp_path / "long.au")
+        began = player.time
+        change = threading.Thread(target=player.play, args=(Own(in_time=150.0, ready=ready),))
+        change.start()
+        while player.time < began + 1.0:
+            time.sleep(0.01)  # the application waits in `play`
+        ready.set()
+        change.join(60.0)
+        player.sleep(0.2)
+        assert player.state().lost == 0
+        recording = player.end_recording()
+    meanwhile = recording.reference[500:4500]  # 0.1 to 0.9 s
+    assert min(np.std(meanwhile[i : i + 500]) for i in range(0, 4000, 500)) > 0.9 * 5e-6 / np.sqrt(2)
+
+
+@pytest.mark.parametrize("slow", [True, False])
+def test_a_device_that_is_slower_than_its_clock_has_lost_samples(slow):
+    class Slow(Lying):
+        block = 25
+
+        def _play(self, drive):
+            if slow and self.count > 100:
+                time.sleep(0.02)  # 5 ms of signal
+            return super()._play(drive)
+
+    with hr.Player(driver=Slow(1e9, "")) as player:
+        player.play(TONE)
+        player.sleep(0.8)
+        assert (hr.Flag.OVERRUN in player.state().flags) == slow

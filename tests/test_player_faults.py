@@ -4,6 +4,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 
 import numpy as np
@@ -11,6 +12,7 @@ import pytest
 from live_devices import RIDGES, TONE, Calling, Lying
 
 import hapticrender as hr
+import hapticrender.player
 from hapticrender.recordings.recording import Recording
 
 
@@ -118,6 +120,24 @@ def test_a_driver_that_fails_is_left_at_zero_drive_at_once():
 
     with pytest.raises(hr.ProtocolError, match="sensed"), hr.Player(driver=driver) as player:
         hang(player)
+
+
+def test_a_driver_that_does_not_return_ends_in_an_error_that_says_so(monkeypatch):
+    """Zero drive cannot be played through it: the user is told; a driver that returns is closed without a word."""
+    monkeypatch.setattr(hapticrender.player, "PATIENCE", 0.5)
+    stuck = threading.Event()
+
+    class Hanging(Lying):
+        def _play(self, drive):
+            if self.count > 1000:
+                stuck.wait(60.0)
+            return super()._play(drive)
+
+    trouble = r"has not returned for 0\.5 s: zero drive could not be played"
+    with pytest.raises(hr.DriverError, match=trouble), hr.Player(driver=Hanging(1e9, "")) as player:
+        with pytest.raises(hr.HapticError, match="has played no sample"):
+            go_on(player)
+    stuck.set()
 
 
 def test_a_disk_that_fails_ends_the_recording_and_not_the_play(tmp_path, monkeypatch):

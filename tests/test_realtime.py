@@ -364,7 +364,7 @@ def test_what_a_sampled_texture_refuses():
         def waveform(self, time, position):
             return 1e-6 * np.sin(position)
 
-    with pytest.raises(ValueError, match="Follows.waveform returned nan"):
+    with pytest.raises(ValueError, match="Follows: must not change with the finger's position"):
         SampledTexture(Follows(False), RATE)
 
     class Travels(Wave):

@@ -17,7 +17,9 @@ MOST_PARTS = 4096
 MOST_GAIN = 1e6
 LONGEST_PART = 360_000.0  # s
 MOST_CHIRP = 0.01  # m
-READINGS, PLACES = 0.0123 * 10.0 ** np.arange(6), np.linspace(-0.15, 0.15, 1001)  # s, m: of what lies along the surface
+READINGS, PLACES = 0.0123 * 10.0 ** np.arange(6), np.linspace(-0.15, 0.15, 1001)  # s, m: where a texture is tried
+SOON = READINGS[:3]  # s
+NOMINAL_RATE = 5000.0  # Hz
 
 Parts = tuple[tuple[Texture, float], ...]
 
@@ -38,13 +40,19 @@ def _terms(texture: Any) -> Parts:
     return texture.parts if isinstance(texture, Sum) else ((texture, 1.0),)
 
 
+def lies_along_surface(texture: Texture) -> bool:
+    """Whether a texture is read at the finger's position: its `spatial` says so; without that, its bands do."""
+    stated = getattr(texture, "spatial", None)
+    return bool(texture.bands(NOMINAL_RATE).follows_finger if stated is None else stated)
+
+
 class SeparatedTexture:
     """A texture, parted into what lies in time and what lies along the surface.
 
     Parameters
     ----------
     texture : Texture
-        In time, along the surface (`spatial` is true), or a `Sum` of both.
+        In time, along the surface (see `lies_along_surface`), or a `Sum` of both.
     waveform_of : callable, optional
         Of a part of the texture: its waveform in the device's quantity; by default its own.
 
@@ -57,20 +65,27 @@ class SeparatedTexture:
     ------
     ValueError
         Its parts are in time and along the surface, and it is no sum; or what lies along the surface is not the same at
-        all `READINGS`.
+        all `READINGS`, or what lies in time not at all `PLACES`.
     """
 
     def __init__(self, texture: Texture, waveform_of: Any = None) -> None:
-        terms = _terms(texture)
+        terms, name = _terms(texture), type(texture).__name__
         for each, _ in terms:
             _refuse_mixed(each)
-        self._terms = [(each, waveform_of(each) if waveform_of else each.waveform, gain) for each, gain in terms]
-        along = [bool(getattr(each, "spatial", False)) for each, _ in terms]
-        self.timed, self.spatial = not all(along), any(along)
-        if self.spatial:
-            found = np.stack([self._sum(True, np.full(len(PLACES), seconds), PLACES) for seconds in READINGS])
-            if np.ptp(found, axis=0).max() > 1e-6 * abs(found).max():
-                raise ValueError(f"{type(texture).__name__}: must not change with time: it lies along the surface")
+        self._terms = [
+            (each, lies_along_surface(each), waveform_of(each) if waveform_of else each.waveform, gain)
+            for each, gain in terms
+        ]
+        self.timed, self.spatial = (any(along == kind for _, along, _, _ in self._terms) for kind in (False, True))
+        if self.spatial and self._varies(True, READINGS, 0):
+            raise ValueError(f"{name}: must not change with time: it lies along the surface")
+        if self.timed and self._varies(False, SOON, 1):
+            raise ValueError(f"{name}: must not change with the finger's position: it lies in time (see `spatial`)")
+
+    def _varies(self, spatial: bool, times: Array, axis: int) -> bool:
+        """Whether a part changes over `times` (axis 0, s), or over `PLACES` (axis 1)."""
+        found = np.stack([self._sum(spatial, np.full(len(PLACES), seconds), PLACES) for seconds in times])
+        return bool(np.ptp(found, axis=axis).max() > 1e-6 * abs(found).max())
 
     def in_time(self, time: Array) -> Array:
         """Sum of what lies in time, at `time` (s, shape (n,)); a ValueError where it is not finite."""
@@ -82,15 +97,15 @@ class SeparatedTexture:
 
     def _sum(self, spatial: bool, time: Array, position: Array) -> Array:
         bands, total = Bands.none(spatial=spatial), np.zeros(len(time))
-        for texture, waveform, gain in self._terms:
-            if bool(getattr(texture, "spatial", False)) == spatial:
+        for texture, along, waveform, gain in self._terms:
+            if along == spatial:
                 total += gain * bands.checked(type(texture).__name__, waveform, time, position)
         return total
 
 
 def _refuse_mixed(texture: Texture) -> None:
     """Refuse a texture that is read in time and along the surface at once."""
-    spatial = {bool(getattr(part, "spatial", False)) for part, _ in getattr(texture, "parts", ())}
+    spatial = {lies_along_surface(part) for part, _ in getattr(texture, "parts", ())}
     if spatial == {True, False} or (True in spatial and not isinstance(texture, Sum)):
         raise ValueError(f"{type(texture).__name__} with a part along the surface: play its parts one after another")
 
@@ -112,11 +127,11 @@ class _Composed(Composable):
     @property
     def spatial(self) -> bool:
         """Whether any part is read at the finger's position."""
-        return any(getattr(texture, "spatial", False) for texture, _ in self.parts)
+        return any(lies_along_surface(texture) for texture, _ in self.parts)
 
     @property
     def _follows_finger(self) -> bool:
-        return all(getattr(texture, "spatial", False) for texture, _ in self.parts)
+        return all(lies_along_surface(texture) for texture, _ in self.parts)
 
     def check(self) -> None:
         """Read the files of all parts."""

@@ -34,8 +34,10 @@ class Profile:
 
     @staticmethod
     def size(count: int, step: float, high: float) -> int:
-        """Points of the table that `band_limited` makes of `count` values."""
-        return int(np.ceil(POINTS * ROLL_OFF * high * (count - 1) * step)) + 2
+        """Points of the table that `band_limited` makes of `count` values: of a length that transforms fast."""
+        from scipy.fft import next_fast_len
+
+        return next_fast_len(int(np.ceil(POINTS * ROLL_OFF * high * (count - 1) * step)) + 2, real=True)
 
     @classmethod
     def band_limited(cls, values: Array, step: float, low: float, high: float) -> Profile:

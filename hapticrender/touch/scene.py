@@ -154,7 +154,8 @@ class Scene(Validated):
         self.device_profile  # noqa: B018 (it refuses what is no limit, and no calibration)
         self.panel  # noqa: B018 (it refuses what is no touch panel)
         bound = "a texture with bands(rate) and waveform(time, position)"
-        checks.require(isinstance(self.texture, Texture), "texture", self.texture, bound, TypeError)
+        known = isinstance(self.texture, Texture) and not isinstance(self.texture, type)
+        checks.require(known, "texture", self.texture, bound, TypeError)
         _refuse_fingers(self.finger)
         checks.require(isinstance(self.finger, Finger), "finger", self.finger, "a Finger", TypeError)
         if isinstance(self.finger.motion, Nowhere) and getattr(self.texture, "spatial", False):
