@@ -11,7 +11,7 @@ PYTHON = $(shell for candidate in python3 python3.13 python3.12 python3.11; do \
 RUN := .venv/bin/python
 OUT := out/demo
 OLDEST = $(shell sed -n 's/^dependencies = \[\(.*\)\]/\1/p' pyproject.toml | tr -d '",' | sed 's/>=/==/g')
-OLDEST_TESTS := $(addprefix tests/test_,$(addsuffix .py,math vectors kernel blocks plate contact low_pass realtime combined))
+OLDEST_TESTS := $(addprefix tests/test_,$(addsuffix .py,math kernel blocks plate contact low_pass realtime combined))
 # Tests that play in real time run first, one after the other; the rest on two cores.
 REAL_TIME := $(wildcard tests/test_audio*.py tests/test_player*.py tests/test_board_live.py)
 PACKAGES := jackd2 libportaudio2 libjack-jackd2-dev gcc libc6-dev make gcc-arm-none-eabi libnewlib-arm-none-eabi qemu-system-arm
@@ -39,7 +39,7 @@ packages: ## install what the tests of sound cards and boards need (on Debian an
 		else echo "tests of sound cards or boards are skipped; to run them: sudo apt-get install $(PACKAGES)" >&2; fi; fi
 
 audio-test: .venv/test.stamp packages ## run the sound-card driver on a JACK server, with a plate behind it
-	@$(RUN) -m pytest -rs $(wildcard tests/test_audio*.py tests/test_player_jack.py) $(PYTEST_ARGS)
+	@$(RUN) -m pytest -rs $(wildcard tests/test_audio*.py) $(PYTEST_ARGS)
 
 board-test: .venv/test.stamp packages ## run the firmware's tests, on an emulated Cortex-M4 too
 	@$(RUN) -m pytest -rs $(BOARD_TESTS) $(PYTEST_ARGS)

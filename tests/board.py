@@ -210,6 +210,15 @@ def client_of(board, **options):
     return BoardClient("stepped", background=False, clock=board, connect=board.connect, **options)
 
 
+def started(board, bands=None, seconds=0.0, **options):
+    """Client whose board has played bands for some time; a tone of 47 Hz where none are given."""
+    client = client_of(board, **options).open()
+    client.set_bands(bands or tones(47.0))
+    client.start()
+    run(client, board, seconds)
+    return client
+
+
 def driver_of(board, **options):
     return SerialDriver("stepped", background=False, clock=board, connect=board.connect, **options)
 

@@ -7,10 +7,10 @@ from test_analysis_plate import open_loop
 import hapticrender as hr
 from hapticrender.analysis.contact import clear_sigmas
 from hapticrender.analysis.course import Course
-from hapticrender.analysis.force import MotionFilter, sensor_noise
+from hapticrender.analysis.force import MotionFilter
 from hapticrender.analysis.lock_in import demodulate, tile, window_length
 from hapticrender.analysis.records import LOADED
-from hapticrender.analysis.smoothing import LocalLine, convolve, derivative_kernels, half_width, held_kernel, spread_of
+from hapticrender.analysis.smoothing import LocalLine, convolve, derivative_kernels, half_width, spread_of
 from hapticrender.analysis.tracker import LEAST_RATE
 from hapticrender.plants.plate import Plate, PlateParameters
 
@@ -33,17 +33,6 @@ def test_kernels_differentiate_as_they_say(frequency):
         expected = (1j * w) ** order * np.exp(-0.5 * (w * spread) ** 2)
         measured = complex_amplitude(convolve(signal, taps), frequency)
         assert abs(measured - expected) < 27 * np.exp(-12.5) / spread**order
-
-
-@pytest.mark.parametrize("late", [0, 3])
-def test_held_input_is_smoothed_as_a_continuous_signal(late):
-    spread, f = spread_of(100.0), 50.0
-    n, w = half_width(spread, RATE), 2 * np.pi * f
-    taps = held_kernel(spread, RATE, late)
-    sent = np.cos(w * np.arange(-n - late - 1, 5000 + n) / RATE)
-    measured = complex_amplitude(convolve(sent, taps), f)
-    held = np.sinc(f / RATE) * np.exp(-1j * w * (late + 0.5) / RATE)
-    assert abs(measured - held * np.exp(-0.5 * (w * spread) ** 2)) < 1e-6
 
 
 @pytest.mark.parametrize("lookahead", [0.0, 0.02, 1.0])
@@ -108,12 +97,6 @@ def test_windows_lie_inside_the_spans():
     assert tile(inside, 10, 5, 3).tolist() == [15, 25, 35]
     assert tile(inside, 10, 2, 3).tolist() == [12, 22, 32, 62]
     assert tile(~inside & inside, 10, 0, 0).size == 0
-
-
-def test_sensor_noise_is_measured_beside_a_motion(rng):
-    motion = 100e-6 * np.cos(2 * np.pi * 170 / RATE * np.arange(50_000))
-    sensed = motion[:, None] + np.array([1e-6, 2e-6]) * rng.standard_normal((50_000, 2))
-    np.testing.assert_allclose(sensor_noise(sensed), [1e-6, 2e-6], rtol=4 * np.sqrt(1.5 / 50_000 * 2))
 
 
 def test_force_noise_is_as_predicted(rng):

@@ -37,7 +37,6 @@ from hapticrender.control.probe import probe_plate
 from hapticrender.drivers import portaudio
 from hapticrender.drivers.audio import AudioDriver
 from hapticrender.errors import DeviceFault, DeviceNotFound, DriverError
-from hapticrender.latency import measure_latency
 from hapticrender.plants.plate import PlateParameters
 from hapticrender.protocols import Flag
 
@@ -160,9 +159,9 @@ def test_what_python_asks_beyond_full_scale_is_cut_and_flagged(connected):
         assert opened.clipped <= 1  # 0 if the block was late
 
 
-@pytest.mark.parametrize("delay", [0.0, 0.3])
-def test_the_delay_is_measured_through_a_cable(connected, tmp_path, capsys, delay):
+def test_the_delay_is_measured_through_a_cable(connected, tmp_path, capsys):
     """A finite impulse response of 33 taps, 16 samples and a fraction, inverted, behind noise of 0.1 %."""
+    delay = 0.3
     connected(jack_ring.cable(delay, gain=-0.5), noise=1e-3)
     out = tmp_path / "profile.toml"
     assert main(["latency", "--driver", f"audio:{CLIENT}", "--runs", "2", "--out", str(out)]) == 0
@@ -172,12 +171,6 @@ def test_the_delay_is_measured_through_a_cable(connected, tmp_path, capsys, dela
     assert float(text.split("gain of the cable ")[1].split()[0]) == pytest.approx(-0.5, rel=0.01)
     written = float(out.read_text().split("delay = ")[1].split()[0])
     assert written == pytest.approx(measured, abs=0.006)  # the half of a last digit of either
-
-
-def test_a_plate_is_no_cable(connected):
-    connected(jack_ring.plate(), noise=NOISE / METRES)
-    with pytest.raises(DriverError, match="audio:plate: latency: (.* connect the first output|samples were lost)"):
-        measure_latency(driver(), runs=2)
 
 
 def test_the_ring_is_closed_by_the_compiled_callback(connected, tmp_path):
@@ -314,21 +307,21 @@ with ExitStack() as stack:
 """
 
 
-@pytest.mark.parametrize(
-    ("server", "message"),
-    [
-        ("ends", r"DeviceLost: audio:plate: the card stopped after \d+ samples: is it still connected"),
-        ("halts", "DeviceTimeout: audio:plate: play: no block of 64 samples came within 2 s"),
-        ("stays", "DriverError: audio: initialise: PortAudio has not closed audio:plate: restart the program"),
-    ],
-)
-def test_a_card_that_goes_away_is_a_lost_device(program, tmp_path, server, message):
+LOST = {
+    "ends": r"DeviceLost: audio:plate: the card stopped after \d+ samples: is it still connected",
+    "halts": "DeviceTimeout: audio:plate: play: no block of 64 samples came within 2 s",
+    "stays": "DriverError: audio: initialise: PortAudio has not closed audio:plate: restart the program",
+}
+
+
+@pytest.mark.parametrize("how", LOST)
+def test_a_card_that_goes_away_is_a_lost_device(program, tmp_path, how):
     """In a process of its own, whose PortAudio is of no use afterwards: it ends, and says what has happened."""
-    command = [sys.executable, "-c", LOSE, tmp_path, program, server]
+    command = [sys.executable, "-c", LOSE, tmp_path, program, how]
     paths = {"PYTHONPATH": os.pathsep.join(map(str, (Path(__file__).parent, Path(__file__).parent.parent)))}
     done = subprocess.run(command, env=os.environ | paths, capture_output=True, text=True, timeout=120)
     assert done.returncode == 1
-    assert re.search(message, done.stderr)
+    assert re.search(LOST[how], done.stderr)
 
 
 def test_without_inputs_a_plate_is_driven_open_loop(connected, tmp_path):
@@ -348,19 +341,47 @@ def test_without_inputs_a_plate_is_driven_open_loop(connected, tmp_path):
     assert np.mean(abs(windows - 10e-6) < 0.01 * 10e-6) > 0.1
 
 
-def test_a_player_plays_on_a_card(connected):
-    """In real time, under a finger: probed, closed by the callback, within 5 % though a busy machine loses periods."""
-    connected(jack_ring.plate(), noise=NOISE / METRES)
-    errors, end = [], time.monotonic() + 60
-    with hr.Player("vt-plate", driver=driver()) as player:
-        player.play(hr.Grating(frequency=60.0, amplitude=10e-6))
-        player.finger(position=0.01)
-        while len(errors) < 4 and time.monotonic() < end:
-            time.sleep(0.5)
-            state = player.state()
-            errors += [state.bands[0].error] if state.time > 1.0 else []
-        assert 0 < state.load < 1
-    assert np.median(errors) < 0.05
+PERIODS = 1400  # of a freewheel, in which every period waits for all: 1.9 s; textures are computed 2 s ahead
+SETTLED = slice(round(1.2 * RATE), round(1.7 * RATE))  # of them
+
+
+def test_textures_change_under_the_callback(connected, tmp_path):
+    """Two tones, the second at half the gain.
+
+    Figures are of the freewheel's samples: in real time before and after it a busy machine may lose callbacks, and
+    says so.
+    """
+    device = connected(jack_ring.plate(), length=round(60 * RATE), noise=NOISE / METRES)
+    with hr.Player("vt-plate", jack_ring.driver(), profile={"rate": RATE}) as player:
+        player.finger(0.01, 0.0, 0.8)
+        player.play(hr.Grating(frequency=100.0, amplitude=5e-6))
+        player.record(tmp_path / "tone.au")
+        device.say(f"run {PERIODS}")
+        [first], load = player.state().bands, player.state().load
+        tone = player.end_recording()
+        player.play(hr.Grating(frequency=180.0, amplitude=5e-6))
+        player.gain = 0.5
+        player.record(tmp_path / "other.au")
+        device.say(f"run {PERIODS}")
+        [second] = player.state().bands
+        device.say(f"save {tmp_path / 'before'}")
+        other = player.end_recording()
+    motion = device.recorded(tmp_path / "record")[0].mean(axis=1).astype(float) * METRES
+    assert (first.target, second.target) == pytest.approx((5e-6, 2.5e-6), rel=1e-3)
+    # by the sensors: 1 um of noise at two ends, over 24 000 samples, is 0.01 um; the law's 1 % and 2 % are what it must
+    for recording, frequency, target in ((tone, 100.0, 5e-6), (other, 180.0, 2.5e-6)):
+        wanted = amplitude(recording.reference[SETTLED], frequency)
+        assert abs(wanted) == pytest.approx(target, rel=1e-3)
+        assert abs(amplitude(recording.motion[SETTLED, 0], frequency) - wanted) < 0.02 * target
+    assert np.isfinite(load)
+    # the truth: half a second of 180 Hz that ends a quarter of a second before the freewheel does
+    end = len(np.fromfile(tmp_path / "before", np.float32)) // 4 - round(RATE / 4)
+    assert abs(amplitude(motion[end - round(RATE / 2) : end], 180.0)) == pytest.approx(2.5e-6, rel=0.02)
+
+
+def amplitude(signal, frequency):
+    """Complex amplitude over whole periods."""
+    return 2 * np.mean(signal * np.exp(-2j * np.pi * frequency * np.arange(len(signal)) / RATE))
 
 
 def test_a_busy_python_thread_costs_the_compiled_callback_nothing(connected):
@@ -369,12 +390,9 @@ def test_a_busy_python_thread_costs_the_compiled_callback_nothing(connected):
     Other processes of the machine take periods from the server and from either client; they only ever add to what is
     lost, so that of pairs of runs the least difference shows what the thread costs.
     """
-    device = connected(jack_ring.plate(), noise=NOISE / METRES)
-    rows = []
-    for _ in range(4):
-        runs = ((lambda each: each, nullcontext), (lambda each: each, busy_thread), (PythonEntry, busy_thread))
-        rows.append([lost_callbacks(device, *run, seconds=1.5) for run in runs])
-    idle, busy, python = np.array(rows).T
-    print(f"lost, %: idle {100 * idle}, busy {100 * busy}, in Python {100 * python}")
-    assert (busy - idle).min() <= 0.003
-    assert np.median(python) > 0.3
+    device, differences = connected(jack_ring.plate(), noise=NOISE / METRES), []
+    while len(differences) < 4 and min(differences, default=1.0) > 0.003:
+        idle, busy = (lost_callbacks(device, lambda each: each, beside, 1.5) for beside in (nullcontext, busy_thread))
+        differences.append(busy - idle)
+    assert min(differences) <= 0.003
+    assert lost_callbacks(device, PythonEntry, busy_thread, 1.5) > 0.3

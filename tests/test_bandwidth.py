@@ -1,21 +1,18 @@
-"""Margins and bandwidths of the error observer's law: as recorded for every device; both sides of bounds."""
+"""Margins and bandwidths of the error observer's law: both sides of bounds."""
 
-import json
 import math
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 from hapticrender.control.damping import damping_taps
 from hapticrender.control.linear import FingerEstimate
-from hapticrender.control.margin_check import SCHEDULE, STEPS, BankGains, FreeDevice, checked_gains, error_loop
+from hapticrender.control.margin_check import SCHEDULE, STEPS, BankGains, checked_gains, error_loop
 from hapticrender.control.margins import LeastMargins
 from hapticrender.errors import DesignError
 from hapticrender.plants.plate import PlateParameters
 
-RECORDED = json.loads((Path(__file__).parent / "data" / "checked_gains.json").read_text())
 RATE = 5000.0
 MODEL = PlateParameters().device_model(RATE, 1)
 TAPS = damping_taps(MODEL, 1.4)[0]
@@ -42,22 +39,6 @@ GAINS = BankGains(
 
 def at(*frequencies):
     return np.array(frequencies, float)
-
-
-@pytest.mark.parametrize("case", RECORDED, ids=[case["name"] for case in RECORDED])
-def test_gains_and_margins_are_the_recorded_ones(case):
-    """Recorded with the loop written down a second time, sample by sample, and by numpy's eigenvalues: to rounding."""
-    known = FreeDevice(*(np.array(case[name]) for name in ("mass", "damping", "stiffness")))
-    frequency, gains = np.array(case["frequency"]), BankGains(**case["gains"])
-    options = {"wavenumber": np.array(case["wavenumber"]), "taps": np.array(case["taps"])}
-    checked = checked_gains(known, frequency, gains, least=LeastMargins(**case["least"]), **options)
-    for name, value in case["checked"].items():
-        assert getattr(checked.gains, name) == pytest.approx(value, rel=1e-12)
-    for level, margins in case["margins"].items():
-        for name, value in margins.items():
-            assert getattr(checked.margins[level], name) == pytest.approx(value, rel=1e-9)
-        growth = error_loop(known, frequency, gains, level, speed=0.1, **options).growth()
-        assert growth == pytest.approx(case["growth"][level], rel=1e-6, abs=1e-6)
 
 
 def test_a_sound_design_is_left_alone():

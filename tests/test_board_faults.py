@@ -11,6 +11,7 @@ from board import (
     driven,
     program_of,
     run,
+    started,
     tones,
 )
 
@@ -28,10 +29,7 @@ def stepped(tmp_path):
 
 
 def test_a_board_that_stays_away_is_lost(stepped):
-    client = client_of(stepped, reconnect=1.0).open()
-    client.set_bands(tones(47.0))
-    client.start()
-    run(client, stepped, 0.1)
+    client = started(stepped, seconds=0.1, reconnect=1.0)
     stepped.pulled = np.inf
     start = stepped.time
     with pytest.raises(DeviceLost, match=r"stepped: listen: no valid frame for 0.5 s \(\d+ bytes sent"):
@@ -44,10 +42,7 @@ def test_a_board_that_stays_away_is_lost(stepped):
 
 def test_an_app_that_hangs_ends_in_zero_drive(stepped):
     """No word for 100 ms of the board's clock: the host's process is stopped, so nothing else can say so."""
-    client = client_of(stepped).open()
-    client.set_bands(tones(47.0))
-    client.start()
-    run(client, stepped, 0.5)
+    client = started(stepped, seconds=0.5)
     last = stepped.sample
     stepped.sleep(0.3)
     (silent,) = [int(line[0]) for line in stepped.board.log() if line[1:3] == ["state", "0"]]
@@ -77,10 +72,7 @@ def test_a_finger_that_is_not_heard_of_is_lifted(stepped):
 
 
 def test_limits_stop_the_board(stepped):
-    client = client_of(stepped).open()
-    client.set_bands(tones(20.0, amplitude=30e-6))
-    client.start()
-    run(client, stepped, 0.5)
+    client = started(stepped, tones(20.0, amplitude=30e-6), seconds=0.5)
     client.limits(0.5, 0.05, 0.1)
     with pytest.raises(DeviceFault, match="the board stopped: the mean square of the drive is above its limit"):
         run(client, stepped, 1.0)
@@ -88,9 +80,7 @@ def test_limits_stop_the_board(stepped):
 
 def test_a_press_that_moves_the_plate_too_far_stops_the_board(stepped):
     """20 N at the end of the glass: 20/45.3e3 (1 + 2 * 2) = 2.2 mm there."""
-    client = client_of(stepped).open()
-    client.set_bands(tones(47.0))
-    client.start()
+    client = started(stepped)
     client.finger(0.055, 0.0, 20.0)
     with pytest.raises(DeviceFault, match="the board stopped: the surface moved too far"):
         run(client, stepped, 0.2)
@@ -118,9 +108,7 @@ def test_sensors_out_of_their_range_stop_an_identification(tmp_path):
 )
 def test_a_sensor_that_is_dead_or_inverted_stops_the_board(tmp_path, gains, causes):
     with SteppedBoard(program_of(*SANITISED), tmp_path, options=("--gain", gains)) as board:
-        client = client_of(board).open()
-        client.set_bands(tones(72.0, amplitude=10e-6))
-        client.start()
+        client = started(board, tones(72.0, amplitude=10e-6))
         with pytest.raises(DeviceFault, match="stepped: play: the board stopped: .*: check "):
             run(client, board, 2.0)
         assert client._line.telemetry.cause in causes
@@ -129,10 +117,7 @@ def test_a_sensor_that_is_dead_or_inverted_stops_the_board(tmp_path, gains, caus
 
 
 def test_garbage_is_no_sign_of_life(stepped, rng):
-    client = client_of(stepped).open()
-    client.set_bands(tones(47.0))
-    client.start()
-    run(client, stepped, 0.2)
+    started(stepped, seconds=0.2)
     last = stepped.sample
     for _ in range(20):
         stepped.inject(bytes(rng.integers(0, 256, 200, dtype="u1")))
@@ -143,10 +128,7 @@ def test_garbage_is_no_sign_of_life(stepped, rng):
 @pytest.mark.parametrize(("late", "stops"), [(0.07, False), (0.09, True)])
 def test_a_word_that_waited_for_long_is_no_sign_of_life(stepped, late, stops):
     """A line that fills up: words come every 15 ms, each 5 ms later than the one before, until they are `late` old."""
-    client = client_of(stepped).open()
-    client.set_bands(tones(47.0))
-    client.start()
-    run(client, stepped, 0.2)
+    client = started(stepped, seconds=0.2)
     start, waiting = stepped.time, []
     while stepped.time < start + 0.6:
         arrival = stepped.time + min(late, (stepped.time - start) / 2)
@@ -159,10 +141,7 @@ def test_a_word_that_waited_for_long_is_no_sign_of_life(stepped, late, stops):
 
 def test_damage_that_the_crc_does_not_show_does_nothing(stepped):
     """Commands with a number changed and the CRC-16 made anew: what one in 65 536 damaged frames amounts to."""
-    client = client_of(stepped).open()
-    client.set_bands(tones(47.0))
-    client.start()
-    run(client, stepped, 0.2)
+    client = started(stepped, seconds=0.2)
     before, refused = stepped.board.log(), client.telemetry().refused
     link = client._line
     words = [

@@ -2,10 +2,8 @@
 
 import json
 import os
-import signal
 import subprocess
 import sys
-import time
 from dataclasses import replace
 
 import hypothesis
@@ -15,7 +13,6 @@ import soundfile
 from hypothesis import strategies as st
 
 from hapticrender import cli, defaults
-from hapticrender.protocols import Flag
 from hapticrender.recordings.recording import Recording
 from hapticrender.touch.builtin_scenes import DEVICES, builtin_scenes
 from hapticrender.touch.scene import Scene
@@ -263,33 +260,6 @@ def test_bad_arguments_get_one_line_and_nothing_is_written(run, tiny, tmp_path, 
     assert words.format(**places) in complaint(run(*(argument.format(**places) for argument in arguments)))
     assert sorted(tmp_path.rglob("*")) == before
     assert tiny.read_text() == TINY
-
-
-def test_an_interrupted_run_leaves_its_journal(tmp_path, tiny):
-    tiny.write_text(TINY.replace("duration = 0.1", "duration = 3000.0"))
-    journal = tmp_path / "out" / "recording.au"
-    heeding = {
-        "preexec_fn": lambda: signal.signal(signal.SIGINT, signal.SIG_DFL)
-    }  # a shell's background job ignores it
-    with process("render", tiny, "--out", tmp_path / "out", **heeding) as child:
-        wait_until(lambda: journal.exists() and journal.stat().st_size > 2e6, child)
-        child.send_signal(signal.SIGINT)
-        _, errors = child.communicate(timeout=60)
-    assert child.returncode == 130
-    assert errors.splitlines()[-1] == "hapticrender: interrupted; what is written so far can be read"
-    recording = Recording.load(journal)
-    assert len(recording) > recording.rate  # more than a second
-    assert np.isfinite(recording.sensed[:-1]).all()
-    assert recording.flags[-1] == Flag.STOPPED
-    assert Scene.from_toml(tmp_path / "out" / "scene.toml") == Scene.from_toml(tiny)
-
-
-def wait_until(condition, child):
-    end = time.monotonic() + 60
-    while not condition():
-        assert child.poll() is None, child.communicate()
-        assert time.monotonic() < end
-        time.sleep(0.02)
 
 
 def test_a_full_disk_gets_one_line(tmp_path, tiny):

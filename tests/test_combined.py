@@ -6,7 +6,6 @@ from test_kernel import RATE, friction_controller, plate_controller, tones
 from hapticrender.control.combined import CombinedBands, CombinedController
 from hapticrender.control.controller_design import ONE_SPEED
 from hapticrender.control.state_transfer import drive_limits
-from hapticrender.realtime_entry import RealtimeEntry
 
 VELOCITY_PER_FORCE = 0.64  # m/(N s)
 PLATE, FRICTION = tones([0.0, 0.0], wavenumber=[500.0, 900.0]), tones([0.0, 0.0], 1e-6, wavenumber=[900.0, 2000.0])
@@ -65,17 +64,3 @@ def test_a_part_that_does_not_play_leaves_the_other_limits():
     np.testing.assert_array_equal(
         drive_limits(combined((None, friction))), np.repeat([0.0, limits[1]], (2, friction.channels))
     )
-
-
-def test_it_plays_through_the_real_time_entry(rng):
-    import ctypes
-
-    sensed, _, wanted = samples(rng, 500)
-    entry = RealtimeEntry(combined(parts()))
-    drive = np.zeros((500, entry.controller.channels))
-    plain = ctypes.CFUNCTYPE(ctypes.c_int32, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_uint64, ctypes.c_void_p)
-    entry.finger(0.0, 0.05)
-    assert plain(entry.plain_address)(sensed.ctypes.data, drive.ctypes.data, 500, entry.user_data) == 0
-    position = 0.05 * np.minimum(np.arange(500) / RATE, 0.05)
-    expected = combined(parts()).run(sensed, position, wanted)[0]
-    np.testing.assert_allclose(drive, expected, rtol=0, atol=1e-10 * abs(expected).max())

@@ -8,7 +8,7 @@ from proportional import Proportional
 
 import hapticrender as hr
 from hapticrender.jit import F8, SIGNALS_T, pointer, step
-from hapticrender.plants.compiled import CompiledPlant, new_record, queue_drive
+from hapticrender.plants.compiled import CompiledPlant, new_record
 from hapticrender.plants.electroadhesion import ElectroadhesionParameters, ElectroadhesionScreen, SquareRoot
 from hapticrender.plants.plate import Plate, PlateParameters
 from hapticrender.plants.surface import SurfaceParameters, UltrasonicSurface
@@ -105,11 +105,3 @@ def test_a_run_equals_its_pieces_and_noise_its_seed(name, rng):
         np.testing.assert_array_equal(joined, getattr(once, column), err_msg=column)
     assert not np.array_equal(again.sensed, once.sensed)
     assert len(set(once.normal_load > 0.0)) == 2
-
-
-def test_drive_queue_hands_on_after_its_latency():
-    queue, due, oldest, seen = np.zeros((3, 2)), np.zeros(2), 0, []
-    for n in range(8):
-        oldest = queue_drive(queue, oldest, np.array([n, np.inf]), due)
-        seen.append(due.copy())
-    np.testing.assert_array_equal(seen, [[max(n - 3, 0), 0.0] for n in range(8)])

@@ -1,4 +1,4 @@
-"""The pages in docs/: every function that they name exists, and every link leads somewhere."""
+"""README and the pages in docs/: every function that they name exists, and every link leads somewhere."""
 
 import re
 from pathlib import Path
@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[1]
-PAGES = sorted((ROOT / "docs").rglob("*.md"))
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 NAMED = re.compile(r"`([\w/]+\.py)`(?::((?: `[\w.]+`,?)+))?")
 
 

@@ -20,6 +20,7 @@ from hapticrender.sampled_texture import SampledTexture
 RATE, SPEED, FULL = 5000.0, 0.08, 0.05  # Hz; m/s; s within which a texture is to be there
 KEPT = 600  # samples before a change
 CASES = {
+    "plate, inverse": ("vt-plate", "inverse", {"frequency": 100.0}, {"frequency": 160.0}),
     "plate, h2": ("vt-plate", "h2", {"frequency": 100.0}, {"frequency": 160.0}),
     "screen, h2": ("electroadhesion", "h2", {"wavelength": 1e-3}, {"frequency": 120.0}),
     "ultrasonic surface, h2": ("ultrasonic", "h2", {"wavelength": 1e-3}, {"frequency": 120.0}),

@@ -20,7 +20,7 @@ import pytest
 from goldens import figures as judge
 from goldens.cases import CASES, DEFAULT_METHOD
 from goldens.play import play
-from goldens.record import ARRAYS, FIGURES, suite_of
+from goldens.record import ARRAYS, FIGURES
 
 STORED = json.loads(FIGURES.read_text(encoding="utf-8"))
 ERRORS = ("worst", "rms", "peak", "complex")
@@ -28,7 +28,6 @@ BOUNDED = (*ERRORS, "wobble", "residual", "drive_rms", "drive_peak")  # must not
 MORE, OFF, OFF_FAILING, OFF_TARGET = 0.1, 0.1, 0.25, 0.01  # share of the stored figure
 DEVIATIONS, FLOOR = 2.0, 1e-3  # of a figure over the seeds; of the target
 LATER = 5e-3  # s
-SUITE_FLOOR = 0.01  # of a bound of the accuracy suite: a figure far inside of it is of no weight
 # Where a drive is rounded to the steps of a converter, the last bit of a sum decides a step, and the loop never comes
 # back to the same rounding: such cases repeat on one build only.
 ROUNDED = {"plate-comb", "plate-wrong"}
@@ -144,49 +143,3 @@ def test_figures_and_flags_are_kept(name):
 @pytest.mark.parametrize("name", sorted(SAME_ARITHMETIC))
 def test_drive_is_the_same_where_the_arithmetic_is(name):
     assert_same_drive(name)
-
-
-def as_ratio(row):
-    """Value and bound of a row of the suite as ratios of amplitudes; a value that was not finite is infinite."""
-    value = np.inf if row["value"] is None else row["value"]
-    return tuple(10 ** (each / 20) for each in (value, row["bound"])) if row["unit"] == "dB" else (value, row["bound"])
-
-
-def suite_complaints(found, stored):
-    """Sentences about figures of the accuracy suite; a bound of the default method that was met stays met."""
-    known = {(row["case"], row["key"], row["method"]): row for row in stored}
-    for row in found:
-        before = known[row["case"], row["key"], row["method"]]
-        (value, bound), (then, _) = as_ratio(row), as_ratio(before)
-        label = f"{row['method']}, {row['case']}, {row['key']}: {value} after {then}"
-        if row["method"] == DEFAULT_METHOD:
-            if value > (1 + MORE) * then + SUITE_FLOOR * bound or row["passed"] < before["passed"]:
-                yield label
-        elif row["passed"] != before["passed"]:
-            yield label
-        elif np.isfinite(then):
-            room = (OFF if before["passed"] else OFF_FAILING) * then + SUITE_FLOOR * bound
-            if abs(value - then) > room:
-                yield label
-
-
-BASELINES = ("chirp", "slide", "overload", "electroadhesion: harmonic", "electroadhesion: swipe")
-SUITE = sorted(
-    {
-        (row["method"], row["case"])
-        for row in STORED["suite"]
-        if row["method"] == DEFAULT_METHOD or (row["method"] in ("paper", "boxcar") and row["case"] in BASELINES)
-    }
-)
-# The second harmonic that a screen adds and these methods leave: 89 % where it was 58 %.  Open: the cause is not known.
-WORSE = {("paper", "electroadhesion: harmonic"), ("boxcar", "electroadhesion: harmonic")}
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("method", "case"), SUITE)
-def test_the_accuracy_suite_keeps_its_table(request, method, case):
-    """Every case of the default method, which met its bounds and has to; where baselines fail, some of theirs."""
-    if (method, case) in WORSE:
-        request.applymarker(pytest.mark.xfail(reason="second harmonic 89 % after 58 %", strict=True))
-    stored = [row for row in STORED["suite"] if (row["method"], row["case"]) == (method, case)]
-    assert list(suite_complaints(suite_of(method, (case,)), stored)) == []

@@ -213,10 +213,3 @@ def test_commands_in_the_readme_are_in_the_makefile():
     verbs = set(re.findall(r"^([a-z-]+):.*## ", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE))
     named = set(re.findall(r"^make ([\w-]+)", "".join(blocks("sh")), re.MULTILINE))
     assert {"demo", "test"} <= named <= verbs
-
-
-def test_links_in_the_readme_lead_somewhere():
-    targets = re.findall(r"\]\(([^)#]+)\)", README)
-    assert targets
-    missing = [target for target in targets if "://" not in target and not (ROOT / target).exists()]
-    assert not missing

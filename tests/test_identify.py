@@ -155,6 +155,16 @@ def test_what_was_identified_of_bending_reaches_the_design(coil):
         assert model.bending.coupling[0] == pytest.approx(coil / 9.5e-3, rel=0.05)
 
 
+def test_a_third_partys_plate_is_held_although_everything_is_wrong():
+    """k +5, m -5, b -20 %, gains +-2 %, a sample late: the wave's mean amplitude within 3 % at every place."""
+    plate = StrangersPlate(**WRONG, told=2, bending=(1250.0, 30, 0.1))
+    scene = hr.Scene(texture=hr.Grating(frequency=72.0, amplitude=50e-6), duration=2.0)
+    with pytest.warns(hr.PlateMismatch):
+        hr.render(scene, driver=plate)
+    turn = np.exp(-2j * np.pi * 72.0 * np.arange(5000, 10000) / 5000)
+    assert abs(2 * turn @ plate.truth[5000:10000] / 5000) == pytest.approx([50e-6] * 4, rel=0.03)
+
+
 def amplitude(scene, recording):
     """Mean amplitude (m) at centre and ends over the last second."""
     n = np.arange(len(recording))[-int(recording.rate) :]

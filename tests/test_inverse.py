@@ -126,43 +126,6 @@ def test_a_texture_over_position_fades_with_contact():
         assert plate.rate == RATE
 
 
-@pytest.mark.parametrize("piece", [1, 7, 400])
-def test_pieces_change_nothing(piece):
-    reference, rng = white(400), np.random.default_rng(1)
-    sensed, position = 1e-6 * rng.standard_normal((400, 2)), np.r_[np.full(200, np.nan), np.zeros(200)]
-
-    def drive(size):
-        controller = AdaptiveInverse().design(PLATE.device_model(RATE, 1), NOTHING)
-        rows = range(0, 400, size)
-        return np.vstack([controller.run(*(x[k : k + size] for x in (sensed, position, reference)))[0] for k in rows])
-
-    assert np.array_equal(drive(piece), drive(400))
-
-
-def test_sensors_that_fail_take_the_drive_away_and_what_was_learned():
-    controller = AdaptiveInverse().design(PLATE.device_model(RATE, 1), NOTHING)
-    reference, none = white(1000), np.full(1000, np.nan)
-    drive, _, flags = controller.run(np.full((1000, 2), np.nan), none, reference)
-    assert (flags & hr.Flag.NONFINITE).all()
-    assert not drive[150:].any()
-
-
-def test_a_waveform_of_friction_arrives_whole_on_a_screen():
-    """Dry skin, twice the attraction that the design expects: white noise of 20-400 Hz as skin displacement."""
-    texture = hr.Recorded(samples=white(3 * RATE), rate=RATE, amplitude=40e-6, passband=(20.0, 400.0))
-    scene = hr.Scene(
-        texture=texture,
-        finger=hr.Finger.sliding(speed=0.08, normal_load=0.5),
-        device="electroadhesion",
-        duration=2.5,
-        simulation={"gap_resistance": 100.0},
-    )
-    recording = hr.render(scene)
-    assert error(recording.motion, recording.reference, 1.0, recording.rate)[0] < 0.03
-    with pytest.raises(ValueError, match=r"texture\.carriers"):
-        hr.render(replace(scene, method="h2"))
-
-
 PRESSED = {"finger": hr.Finger.still(0.01, normal_load=0.5, mechanics="heavy"), "duration": 2.0}
 GRATING = hr.Grating(amplitude=5e-6, frequency=100.0)
 

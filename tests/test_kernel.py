@@ -164,6 +164,18 @@ def test_any_split_gives_the_same(delay, block, rng):
     assert abs(runs[0][0]).max() > 0
 
 
+def test_the_gain_schedule_is_the_printed_one():
+    """docs/theory.md: integral and adaptation (1/s), poles of the observer (Hz), times of the detectors (s)."""
+    p = plate_controller(tones([170.0])).settings
+    rates = [p[name] for name in ("integral", "integral_medium", "integral_high", "adaptation", "adaptation_high")]
+    assert rates == pytest.approx([2.0, 15.0, 25.0, 1.0, 100.0])
+    assert [p[name] * RATE / (4 * np.pi) for name in ("observer", "observer_high")] == pytest.approx([10.0, 20.0])
+    assert [p[name] / RATE for name in ("fast_time", "slow_time")] == pytest.approx([0.15, 0.4])
+    assert 1.0 / (p["release"] * RATE) == pytest.approx(0.05)
+    crowded = plate_controller(tones([100.0, 139.0])).settings
+    assert [(each["detects"], each["damper"]) for each in (p, crowded)] == [(1.0, 0.0), (0.0, 0.2)]
+
+
 def test_part_of_a_block_is_refused():
     controller = plate_controller(tones([47.0]), delay=25, block=25)
     with pytest.raises(ValueError, match="30 samples: must be a multiple of the block of 25 samples"):

@@ -48,7 +48,9 @@ def check(method, bands, columns, feedback=True):
     """Compare a run with its equations, sample by sample."""
     controller = method.design(MODEL, bands, feedback=feedback)
     drive, target, flags = controller.run(*columns)
-    naive = NaiveLowPass(controller.settings, bands, controller._arrays.get("gains"))
+    p = {name: controller.settings[name] for name in controller.settings.dtype.names}
+    rows = setpoint_rows(controller.bands)[:, : controller.n_bands]
+    naive = NaiveLowPass(p, rows, controller._arrays.get("gains"))
     expected, aims = (
         np.array(each) for each in zip(*(naive.step(*row) for row in zip(*columns, strict=True)), strict=True)
     )

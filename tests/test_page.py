@@ -10,7 +10,7 @@ from synthetic import make_bands, make_recording
 from hapticrender.report.outputs import FILES, Outputs
 from hapticrender.report.page import page, refuse_other_page, write_page
 
-VOID = {"meta", "img"}
+VOID = {"meta", "img", "br"}
 SOUND = {"drive.wav": {"full_scale": 2.0, "unit": "A"}, "sensed.wav": {"full_scale": 2e-5, "unit": "m"}}
 
 

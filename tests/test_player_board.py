@@ -16,10 +16,13 @@ WHITE = hr.Recorded(
 )
 
 
-def test_a_board_plays_live(tmp_path):
+@pytest.fixture(scope="module")
+def program(tmp_path_factory):
+    return build_board(tmp_path_factory.mktemp("board"), hr.prepare(hr.Scene(texture=TONE, duration=1.0)))
+
+
+def test_a_board_plays_live(program, tmp_path):
     """Textures, gain and finger go over the line; what the board measures comes back, and a recording of it."""
-    folder = tmp_path / "board"
-    program = build_board(folder, hr.prepare(hr.Scene(texture=TONE, duration=1.0)))
     with BoardProcess(program, tmp_path, *SLOW) as board:
         driver = SerialDriver(str(board.port), clock=SlowClock())
         with hr.Player(driver=driver) as player:
@@ -65,9 +68,8 @@ def test_a_board_plays_live(tmp_path):
     assert abs(parts[0] - parts[1])[:2].max() < 0.08e-6
 
 
-def test_a_board_that_is_found_again_is_recorded_again(tmp_path):
+def test_a_board_that_is_found_again_is_recorded_again(program, tmp_path):
     """Its clock begins anew: rows of the new run follow those of the old one, and a flag says that some are lost."""
-    program = build_board(tmp_path / "board", hr.prepare(hr.Scene(texture=TONE, duration=1.0)))
     with ExitStack() as boards:
         board = boards.enter_context(BoardProcess(program, tmp_path, *SLOW))
         driver = SerialDriver(str(board.port), clock=SlowClock(), reconnect=20.0)
@@ -87,14 +89,13 @@ def test_a_board_that_is_found_again_is_recorded_again(tmp_path):
     assert abs(parts[1] - parts[0]) < 0.05 * 5e-6  # the new run's carriers begin anew, and so does the texture
 
 
-def test_the_board_stops_when_the_application_is_silent(tmp_path):
+def test_the_board_stops_when_the_application_is_silent(program, tmp_path):
     """The player's threads go on, and so do the signs of life; only the calls of the application are missing."""
-    program = build_board(tmp_path / "board", hr.prepare(hr.Scene(texture=TONE, duration=1.0)))
     with BoardProcess(program, tmp_path, *SLOW) as board:
         driver = SerialDriver(str(board.port), clock=SlowClock())
         with hr.Player(driver=driver, watchdog=0.1) as player:
             player.play(TONE)
-            player.sleep(0.5)
+            player.sleep(0.2)
             assert player.state().flags == hr.Flag(0)
             driver.client.clock.sleep(0.3)
             with pytest.raises(hr.WatchdogTimeout, match="no method of the player was called"):

@@ -275,6 +275,13 @@ class Probed(Watched):
         ({"sensors": 10 * np.eye(2)}, "have (9.9|10) times the gain"),
         ({"sensors": 0.1 * np.eye(2)}, "not that of the device model.*scale 0.09"),
         ({"delay": 5}, "delay is 5 samples, not 1"),
+        ({"sensors": 3.0 * np.eye(2)}, "have (2.9|3|3.1) times the gain"),
+        ({"spoil": lambda sample, sensed: sensed._replace(sensed=np.full((1, 2), 3e-6))}, "nothing moves"),
+        (
+            {"spoil": lambda sample, sensed: sensed._replace(sensed=np.array([[3e-6, sensed.sensed[0, 1]]]))},
+            "sensor 1 (is dead|repeats its values)",
+        ),
+        ({"spoil": lambda sample, sensed: sensed._replace(sensed=np.full((1, 2), np.nan))}, "100% of the samples"),
     ],
 )
 @pytest.mark.parametrize("touched", [{}, FINGER], ids=["free", "touched"])
@@ -283,6 +290,7 @@ def test_the_probe_refuses_what_is_wired_wrongly(wiring, named, touched):
     with pytest.raises(hr.DeviceFault, match=f"refused by the start-up probe: .*({named})"):
         hr.render(scene(), driver=plate)
     assert max(plate.motion) < 50e-6
+    assert abs(np.concatenate(plate.played)).max() < 0.05 * 3.0
     assert not plate.is_open
     assert not plate.played[-1].any()
 

@@ -1,9 +1,8 @@
-"""Record the goldens: ``python tests/goldens/record.py [--suite] [--commit HASH]``, from the root of a checkout.
+"""Record the goldens: ``python tests/goldens/record.py [--commit HASH]``, from the root of a checkout.
 
 Writes ``goldens.npz`` (amplitudes in float32, three segments of drive in float64, a case each) and ``figures.json``
-(figures and flags of every case, the spread of each figure over `SEEDS`, and the table of the accuracy suite).  The
-suite takes minutes and is left as it is without ``--suite``.  Recording anew means that what must not change has
-changed: say why in the commit.
+(figures and flags of every case, and the spread of each figure over `SEEDS`).  Recording anew means that what must not
+change has changed: say why in the commit.
 """
 
 import argparse
@@ -19,28 +18,25 @@ if __name__ == "__main__":
     sys.path[:0] = [str(HERE.parent), str(HERE.parent.parent)]
 
 from goldens import figures as judge  # noqa: E402
-from goldens.cases import CASES, DEFAULT_METHOD, Case  # noqa: E402
+from goldens.cases import CASES, Case  # noqa: E402
 from goldens.play import play  # noqa: E402
 
 SEEDS = range(1, 9)  # of the sensor noise, for the spread of every figure; the recorded run has the case's own
-METHODS = (DEFAULT_METHOD, "h", "paper", "paper-common", "boxcar", "resonant")  # in the table of the suite
 ARRAYS, FIGURES = HERE / "goldens.npz", HERE / "figures.json"
 
 
 def main() -> None:
     """Record every case, and the suite where it is asked for."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--suite", action="store_true", help="run the accuracy suite too (minutes)")
     parser.add_argument("--commit", default="", help="of the code that is recorded")
     arguments = parser.parse_args()
-    kept = json.loads(FIGURES.read_text(encoding="utf-8")) if FIGURES.exists() else {"suite": [], "commit": ""}
+    kept = json.loads(FIGURES.read_text(encoding="utf-8")) if FIGURES.exists() else {"commit": ""}
     arrays, cases = {}, {}
     for case in CASES.values():
         cases[case.name], found = record(case)
         arrays |= {f"{case.name}/{key}": value for key, value in found.items()}
         print(case.name, cases[case.name]["figures"], cases[case.name]["flags"], flush=True)
-    suite = suite_rows() if arguments.suite else kept["suite"]
-    report = {"commit": arguments.commit or kept["commit"], "cases": cases, "suite": suite}
+    report = {"commit": arguments.commit or kept["commit"], "cases": cases}
     np.savez_compressed(ARRAYS, **arrays)
     FIGURES.write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
 
@@ -62,30 +58,6 @@ def record(case: Case) -> tuple[dict, dict[str, np.ndarray]]:
 def spread(values: list[float | None]) -> float | None:
     """Standard deviation of a figure over seeds; None where a run has none."""
     return None if None in values else float(np.std(values, ddof=1))
-
-
-def suite_rows() -> list[dict]:
-    """Every figure of the accuracy suite, method by method; one that is not finite is None."""
-    return [row for method in METHODS for row in suite_of(method)]
-
-
-def suite_of(method: str, cases: tuple[str, ...] | None = None) -> list[dict]:
-    """Rows of one method; what no method has a hand in is run with the default method only."""
-    from hapticrender.accuracy.suite import CASES as SUITE
-    from hapticrender.accuracy.suite import METHOD_FREE, run_suite
-
-    chosen = [name for name in cases or SUITE if method == DEFAULT_METHOD or name not in METHOD_FREE]
-    found = run_suite([method], chosen)
-    return [
-        {
-            **{key: getattr(each.target, key) for key in ("case", "key", "what", "unit", "bound", "aim")},
-            "method": method,
-            "value": each.value if np.isfinite(each.value) else None,
-            "passed": each.passed,
-            "reached": each.reached,
-        }
-        for each in found
-    ]
 
 
 if __name__ == "__main__":
