@@ -5,7 +5,8 @@ leaves the force f = B i - D(s) q = F [1, g]: the moment over the force is g, re
 band.  Two fingers leave z1 u1 [1, g1] + z2 u2 [1, g2] with u the motion and z the dynamic stiffness at each, and their
 ratio depends on frequency, is complex, or contradicts the position that is reported.  So of ``u = f_2 - (g + d) f_1``
 nothing but noise is left for one finger, where d is the error of g.  Over a window of Hann, with U_k its spectrum,
-S_k the known density of its noise, and y the plate's errors (of M, C and K, covariance P from the untouched plate)::
+S_k the known density of its noise, and y the plate's errors (of M, C, K and the delay, covariance P from the untouched
+plate)::
 
     T = min over d, y of  sum_k |U_k - a_k y|^2/S_k + y^T P^-1 y + d^2/s_d^2
 
@@ -38,6 +39,7 @@ LATENESS = 50e-3  # s, of a reported position, and of its prediction: errors alo
 SMOOTHED = 34e-3  # s: mean of the reported position, which may come in steps: two samples of a panel of 60 Hz
 DRIFT = 1e-6  # m, of a sensor's offset since the plate was last free
 ERRORS = {"stiffness": 0.02, "damping": 0.3, "mass": 0.02}  # of a profile, of the largest entry of each matrix
+DELAY_ERROR = 1.0  # samples: what the waveform law assumes, too
 SPACING = 2  # bins: those of a Hann window that are two apart are correlated by 1/6, their squares by 1/36
 CORRELATION = 1.0 + 2.0 / 36.0  # variance of a sum of those squares, over that of independent ones
 LEAST_NOISE = 1e-4  # of a sensor's range: a model may state no noise
@@ -99,8 +101,8 @@ class TouchMonitor:
         self._window = np.hanning(self.length + 1)[:-1]
         self._noise = self._noise_density()
         largest = [error * abs(getattr(model, name)).max() for name, error in ERRORS.items()]
-        self._prior = np.diag(np.repeat(largest, 3) ** -2.0)
-        self._information, self._known = self._prior.copy(), np.zeros(9)
+        self._prior = np.diag(np.append(np.repeat(largest, 3), DELAY_ERROR) ** -2.0)
+        self._information, self._known = self._prior.copy(), np.zeros(len(self._prior))
         self._rest: Array | None = None  # force that the free plate leaves at 0 Hz: offsets of the sensors
         self._free: Array | None = None  # last window of the free plate, until no touch is seen to follow
         self._pieces: list[Array] = []
@@ -182,10 +184,11 @@ class TouchMonitor:
         return parts[0] - model.stiffness @ parts[1] - model.damping @ parts[2] - model.mass @ parts[3]
 
     def _regressors(self, parts: Array) -> Array:
-        """Forces per error of K, C and M (entries 11, 12, 22 of each), shape (2, 9, length)."""
-        found = np.zeros((2, 9, parts.shape[-1]))
+        """Forces per error of K, C and M (entries 11, 12, 22 of each) and per sample of delay, shape (2, 10, length)."""
+        found = np.zeros((2, 10, parts.shape[-1]))
         for row in (0, 1):
-            found[row, row::3], found[row, row + 1 :: 3] = parts[1:, 0], parts[1:, 1]
+            found[row, row:9:3], found[row, row + 1 : 9 : 3] = parts[1:, 0], parts[1:, 1]
+            found[row, 9] = np.gradient(parts[0, row])
         return found
 
     def _calibrate(self, parts: Array) -> None:
