@@ -275,6 +275,8 @@ class Probed(Watched):
         ({"sensors": 10 * np.eye(2)}, "have (9.9|10) times the gain"),
         ({"sensors": 0.1 * np.eye(2)}, "not that of the device model.*scale 0.09"),
         ({"delay": 5}, "delay is 5 samples, not 1"),
+        ({"noise": 20e-6}, "the sensors' noise is (19|2.) um rms, more than .* um: the probe cannot judge"),
+        ({"noise": 4e-6, "sensors": INVERT}, "sensor 1 is inverted"),
     ],
 )
 @pytest.mark.parametrize("touched", [{}, FINGER], ids=["free", "touched"])
