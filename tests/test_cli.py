@@ -7,12 +7,14 @@ import subprocess
 import sys
 import time
 from dataclasses import replace
+from pathlib import Path
 
 import hypothesis
 import numpy as np
 import pytest
 import soundfile
 from hypothesis import strategies as st
+from other_plate import OtherPlate
 
 from hapticrender import cli, defaults
 from hapticrender.protocols import Flag
@@ -145,6 +147,29 @@ def test_a_driver_is_chosen_by_name(run, tiny, tmp_path):
     assert out.startswith("tiny on vt-plate: not judged: the device has no sensors, so its motion is not measured\n")
     assert soundfile.info(played).samplerate == 48000
     assert not (tmp_path / "out" / "sensed.wav").exists()
+
+
+@pytest.mark.parametrize("verb", ["render {tiny} --out {out}", "play {tiny}", "identify"])
+@pytest.mark.parametrize("method", ["__enter__", "play"])
+def test_what_a_driver_raises_is_one_line_with_its_name(run, tiny, tmp_path, monkeypatch, verb, method):
+    monkeypatch.setattr(OtherPlate, method, lambda *_: {}["usb"])
+    arguments = verb.format(tiny=tiny, out=tmp_path / "out").split()
+    status, _, errors = run(*arguments, "--driver", "other_plate:OtherPlate")
+    assert (status, errors[-1]) == (2, "hapticrender: other_plate:OtherPlate: KeyError: 'usb'")
+
+
+def test_python_in_development_mode_shows_the_traceback():
+    command = [sys.executable, "-X", "dev", "-m", "hapticrender", "render", "a", "--out", "b", "--method", "magic"]
+    assert "Traceback" in subprocess.run(command, capture_output=True, text=True, check=False).stderr
+
+
+def test_a_report_that_cannot_be_written_costs_no_other(run, tiny, tmp_path, monkeypatch):
+    """The table and the other report are there."""
+    monkeypatch.setattr("hapticrender.validate.write_json", lambda *_: Path("/no/such/folder/r.json").write_text(""))
+    status, out, errors = run("validate", tiny, "--json", tmp_path / "r.json", "--junit", tmp_path / "r.xml")
+    assert (status, (tmp_path / "r.xml").exists()) == (2, True)
+    assert out.splitlines()[-1] == "1 scene: 1 not judged"
+    assert errors[-1] == f"hapticrender: --json = '{tmp_path}/r.json': No such file or directory"
 
 
 def test_nothing_of_others_is_overwritten(run, tmp_path):
