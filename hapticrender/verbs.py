@@ -262,7 +262,10 @@ def identify(arguments: argparse.Namespace) -> int:
                 found = identify(opened, setup.assumed, seconds=arguments.seconds, amplitude=arguments.amplitude)
                 found = found.shortened(getattr(driver, "host_delay", 0))
     print(found.text())
-    for difference in found.differences(setup.assumed) if scene.device == "vt-plate" else ():
+    assumed = setup.assumed
+    if scene.device == "vt-plate" and driver is not None:  # which states a delay of its own, in its blocks
+        assumed = replace(assumed, delay=max(assumed.delay, found.driver_delay))
+    for difference in found.differences(assumed) if scene.device == "vt-plate" else ():
         print(f"differs from [device]: {difference}")
     if arguments.out:
         _profile(found, scene, arguments).save(_made(arguments.out))
@@ -370,6 +373,8 @@ def _recording(path: Path) -> Recording:
     from hapticrender.recordings.recording import Recording
 
     path = path / "recording.au" if path.is_dir() else path
+    if not path.exists():
+        raise ValueError(f"{path}: no such file")
     with naming(path):
         return Recording.load(path)
 

@@ -251,6 +251,7 @@ EDITS = [  # what is changed in the tiny scene, what the complaint must name
     ("frequency = 47.0", "frequency = 2000.0", ["texture.amplitude = 1e-05 m", "<= 3 A"]),
     ('kind = "vt-plate"', 'kind = "tea-tray"', ["tea-tray", "vt-plate"]),
     ("duration = 0.1", "duration = = 0.1", ["line 2"]),
+    ('kind = "vt-plate"', '[render]\nmethode = "h2"', ["known: probe; in a file also gradient, keep_unfelt, method, "]),
 ]
 
 
@@ -271,6 +272,7 @@ BAD_ARGUMENTS = [
     (["render", "{binary}", "--out", "{out}"], "{binary}: "),
     (["scenes", "no-such-scene"], "no-such-scene: no such built-in scene; there are "),
     (["validate", "{tiny}", "--json", "{folder}"], "--json = '{folder}': is a folder, must be a file"),
+    (["show", "{missing}"], "{missing}: no such file"),
     (["show", "{cut}"], "{cut}: not a recording (File is not a zip file)"),
     (["render", "{tiny}", "--out", "{out}", "--driver", "tea"], "driver 'tea' is not installed: must be one of"),
 ]

@@ -201,6 +201,12 @@ def test_the_command_line_takes_any_driver_by_its_module(capsys):
     assert "10 times the noise: check drive and sensor connections, or increase amplitude" in capsys.readouterr().err
 
 
+def test_a_delay_that_the_driver_states_is_no_difference(monkeypatch, capsys):
+    monkeypatch.setattr("other_plate.Block", lambda: OtherPlate(block=4, told=6, delay=6), raising=False)
+    assert cli.main(["identify", "--driver", "other_plate:Block"]) == 0
+    assert "differs from [device]: delay" not in capsys.readouterr().out
+
+
 def test_the_same_plate_gives_no_difference_and_another_one_its_numbers(one):
     """k +5 %, m -5 % named with their amounts and a warning; k +0.5 % is significant, yet needs no warning."""
     other = dataclasses.replace(PAPER, mass=PAPER.mass / 0.95, stiffness_1=PAPER.stiffness_1 / 1.05)
