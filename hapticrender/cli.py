@@ -1,8 +1,9 @@
 """The command line.
 
 Arguments and scenes are checked before anything is written.  Exit status: 0
-done, 1 a scene misses its tolerance (``validate``), 2 bad input or no
-permission to write, 130 interrupted; each error is one line.
+done, 1 a scene misses its tolerance (``validate``), 2 bad input, a driver that
+failed or no permission to write, 130 interrupted; each error is one line, with
+its traceback where Python runs with ``-X dev``.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ from __future__ import annotations
 import argparse
 import os
 import sys
+import traceback
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NoReturn
@@ -25,7 +27,7 @@ start here:
   hapticrender scenes grating-47 > mine.toml      a scene of your own: edit it ...
   hapticrender render mine.toml --out mine        ... and render it
 
-`hapticrender VERB --help` describes each verb.
+`hapticrender VERB --help` describes each verb.  An error is one line; its traceback: python -X dev -m hapticrender VERB
 """
 
 
@@ -55,12 +57,18 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 0
     except KeyboardInterrupt:
         return verbs.fail("interrupted; what is written so far can be read", 130)
-    except MemoryError as error:
-        return verbs.fail(f"not enough memory: {error}", 2)
-    except OSError as error:
-        return verbs.fail(f"{error.filename}: {error.strerror}" if error.filename else str(error), 2)
-    except (ValueError, HapticError) as error:
-        return verbs.fail(str(error), 2)
+    except (MemoryError, OSError, ValueError, HapticError) as error:
+        if sys.flags.dev_mode:
+            traceback.print_exception(error)
+        return verbs.fail(_line(error), 2)
+
+
+def _line(error: Exception) -> str:
+    """What is wrong, for a line on standard error."""
+    if isinstance(error, MemoryError):
+        return f"not enough memory: {error}"
+    named = isinstance(error, OSError) and error.filename
+    return f"{error.filename}: {error.strerror}" if named else str(error)  # type: ignore[attr-defined]
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -103,6 +111,10 @@ def _add_players(choices: Any) -> None:
 def _add_checks(choices: Any) -> None:
     """Add the verbs that judge."""
     validate = _add_verb(choices, "validate", verbs.validate, "render scenes and exit 1 when one misses its tolerance")
+    validate.epilog = (
+        "Exit status: 0 no scene misses its tolerance, 1 one does, 2 one cannot be rendered, or a report not written.  "
+        "A scene that cannot be judged is counted, skipped in JUnit, and no pass in JSON."
+    )
     validate.add_argument("scenes", metavar="SCENE", nargs="*", help="TOML files or built-in names (default: all)")
     text = "instead of scenes: accuracy, all targets of the library"
     validate.add_argument("--suite", metavar="NAME", choices=["accuracy"], help=text)
@@ -111,6 +123,7 @@ def _add_checks(choices: Any) -> None:
     text = "folder for the files of each scene that does not pass"
     validate.add_argument("--out", "-o", metavar="DIR", type=_path, help=text)
     validate.add_argument("--jobs", "-j", metavar="N", type=_whole(1, 999), default=1, help="processes (default: 1)")
+    validate.add_argument("--strict", action="store_true", help="exit 1 also where a scene is not judged")
     _add_run(validate)
 
     show = _add_verb(choices, "show", verbs.show, "print the figures of a recording, finished or cut off by a crash")

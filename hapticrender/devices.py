@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import fields
 from importlib import import_module
 from importlib.metadata import entry_points
 from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any
 
-from hapticrender.errors import HapticError
+from hapticrender.errors import DriverError, HapticError
 from hapticrender.formatting import table
 
 if TYPE_CHECKING:
@@ -60,7 +61,7 @@ def open_driver(text: str, profile: DeviceProfile | None = None) -> Driver | Non
     HapticError
         A package that it needs is not installed, or cannot be loaded.
     DriverError
-        The device is not there.
+        The device is not there, or the callable raised what is neither a ValueError nor a TypeError.
 
     Examples
     --------
@@ -78,9 +79,25 @@ def open_driver(text: str, profile: DeviceProfile | None = None) -> Driver | Non
         called, colon, argument = argument.partition(":")
         factory = _imported(text, name, called)
     try:
-        return factory(*[argument] * bool(colon), **_calibration(factory, profile))  # type: ignore[no-any-return]
+        with naming_driver(text, ValueError, TypeError):
+            return factory(*[argument] * bool(colon), **_calibration(factory, profile))  # type: ignore[no-any-return]
     except TypeError as error:
         raise ValueError(f"driver = {text!r}: {error}; give its argument as {name}:ARGUMENT") from error
+
+
+@contextmanager
+def naming_driver(text: str, *passed: type[Exception]) -> Iterator[None]:
+    """Raise what a driver raises within as a `DriverError` with the text that names it; the library's errors pass.
+
+    So do those `passed`, files that cannot be read or written, and all of the simulated device.
+    """
+    try:
+        yield
+    except Exception as error:
+        ours = isinstance(error, HapticError | MemoryError) or getattr(error, "filename", None) is not None
+        if text == SIMULATED or ours or isinstance(error, passed):
+            raise
+        raise DriverError(f"{text}: {type(error).__name__}: {error}") from error
 
 
 def _imported(text: str, module: str, called: str) -> Any:

@@ -56,10 +56,17 @@ def check_sensed(driver: Any, sensed: Sensed, places: int) -> Sensed:
 
 
 def _column(driver: Any, name: str, value: Any, shape: tuple[int, ...]) -> Array:
+    """Contiguous float64 column, of flags int64; what would be cut off in that is refused."""
+    where, kind = f"{type(driver).__name__}: play: {name}", np.int64 if name == "flags" else float
     try:
-        column = np.ascontiguousarray(value, np.int64 if name == "flags" else float)
+        given = np.asarray(value)
+        if given.dtype.kind == "c":
+            raise TypeError("it is complex")
+        if name == "flags" and given.dtype.kind == "f" and not (given == np.floor(given)).all():
+            raise TypeError("it has fractions, or NaN")
+        column = np.ascontiguousarray(given, kind)
     except (TypeError, ValueError) as error:
-        raise ProtocolError(f"{type(driver).__name__}: play: {name} is no array of numbers: {error}") from None
-    if np.shape(value) != shape:
-        raise ProtocolError(f"{type(driver).__name__}: play: {name} has shape {np.shape(value)}, must be {shape}")
+        raise ProtocolError(f"{where} is no array of {'whole ' * (kind is np.int64)}numbers: {error}") from None
+    if given.shape != shape:
+        raise ProtocolError(f"{where} has shape {given.shape}, must be {shape}")
     return column

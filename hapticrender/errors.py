@@ -67,9 +67,13 @@ class WatchdogTimeout(HapticError):
     """
 
     def __init__(self, time: float, watchdog: float | None = None) -> None:
-        allowed = "the time of its watchdog" if watchdog is None else f"{watchdog:g} s, the time of its watchdog"
-        super().__init__(f"stopped at {time:.4g} s: no method of the player was called for {allowed}")
+        super().__init__(time, watchdog)  # what it is made from again, in another process
         self.time = time
+
+    def __str__(self) -> str:
+        time, watchdog = self.args
+        allowed = "the time of its watchdog" if watchdog is None else f"{watchdog:g} s, the time of its watchdog"
+        return f"stopped at {time:.4g} s: no method of the player was called for {allowed}"
 
 
 class PlateMismatch(UserWarning):

@@ -321,7 +321,8 @@ def _compare(rendering: Rendering, controller: Controller, recording: Recording)
     scale, source = getattr(controller, "damper_scale", 1.0), rendering.scene.source
     profile = f", profile {source}," if source else ""
     if scale < 1.0:
-        message = f"the inner damper rang above 500 Hz and was turned down to {scale:g}: identify the bending mode"
+        message = f"the inner damper rang above 500 Hz and was turned down to {scale:g}: identify the bending mode, or "
+        message += "the sensors' noise where there is none"
         message += f", which profile {source} lacks" if source else ""
         warnings.warn(message, PlateMismatch, stacklevel=3)
     mismatch = getattr(controller, "mismatch", 0.0)

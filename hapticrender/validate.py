@@ -5,8 +5,10 @@ from __future__ import annotations
 import itertools
 import multiprocessing
 import re
+import sys
 import tempfile
 import time
+import traceback
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
@@ -19,8 +21,8 @@ from xml.etree import ElementTree
 
 from hapticrender import __version__, defaults
 from hapticrender.control.methods import method_named
-from hapticrender.devices import SIMULATED
-from hapticrender.errors import REFUSED, SceneError
+from hapticrender.devices import SIMULATED, naming_driver
+from hapticrender.errors import HapticError, SceneError
 from hapticrender.formatting import as_json, printable
 from hapticrender.loop import prepare, run
 from hapticrender.protocols import Rendering
@@ -96,9 +98,10 @@ def validate(
 ) -> list[Verdict]:
     """Render scenes in closed loop against the plant models, or on a device, and judge each, in their order.
 
-    Scenes may be names of built-in ones or TOML files; one that cannot be rendered stops no other.  `method` and `seed`
-    (>= 0, of the plants' noise) are by default those of each scene.  `driver` is a text as ``--driver`` takes it, made
-    anew for each scene.  `jobs` (>= 1) processes render side by side, on simulated devices.
+    Scenes may be names of built-in ones or TOML files; one that cannot be rendered, whatever was raised, stops no other
+    (``python -X dev`` prints the traceback).  `method` and `seed` (>= 0, of the plants' noise) are by default those of
+    each scene.  `driver` is a text as ``--driver`` takes it, made anew for each scene.  `jobs` (>= 1) processes render
+    side by side, on simulated devices.
     Files of each scene that does not pass go into a folder of its name in `out`.
 
     Examples
@@ -133,8 +136,8 @@ def _read(scenes: Iterable[Scene | str | Path]) -> list[tuple[str, Scene | str]]
         try:
             scene = reference if isinstance(reference, Scene) else open_scene(reference)
             found.append((scene.name, scene))
-        except REFUSED as error:
-            found.append((str(reference), str(error)))
+        except Exception as error:
+            found.append((str(reference), _problem(error)))
     return list(zip(distinct_names(name for name, _ in found), (scene for _, scene in found), strict=True))
 
 
@@ -156,12 +159,21 @@ def _judge(
         seed = scene.seed if seed is None else seed
         try:
             rendering = prepare(scene, driver=driver, method=method, seed=seed)
-            summary = _summary(rendering, out and out / _NO_NAME.sub("_", label), tick)
+            with naming_driver(driver):
+                summary = _summary(rendering, out and out / _NO_NAME.sub("_", label), tick)
             return Verdict.of({**summary, "scene": label}, time.perf_counter() - start)
-        except REFUSED as error:
-            problem = str(error)
+        except Exception as error:
+            problem = _problem(error)
     reason, method = problem.removeprefix(f"{label}: "), method or defaults.METHOD
     return Verdict(scene=label, device=device, method=method, seed=seed or 0, verdict="error", reason=reason)
+
+
+def _problem(error: Exception) -> str:
+    """State what was raised: the message alone where it is one of ours, or refuses a value; else its name, too."""
+    if sys.flags.dev_mode:
+        traceback.print_exception(error)
+    known = isinstance(error, ValueError | TypeError | HapticError)
+    return str(error) if known else f"{type(error).__name__}: {error}"
 
 
 def _result(future: Any, _: Tick | None) -> Verdict:
@@ -191,24 +203,38 @@ def _summary(rendering: Rendering, folder: Path | None, tick: Tick | None) -> di
     return summary
 
 
-def exit_status(verdicts: Sequence[Verdict]) -> int:
-    """2 where a scene cannot be rendered, else 1 where one misses its tolerance, else 0."""
+def exit_status(verdicts: Sequence[Verdict], *, strict: bool = False) -> int:
+    """2 where a scene cannot be rendered, else 1 where one misses its tolerance (`strict`: is not judged), else 0."""
     found = {verdict.verdict for verdict in verdicts}
-    return 2 if "error" in found else int("failed" in found)
+    return 2 if "error" in found else int("failed" in found or (strict and "not judged" in found))
+
+
+def counted(verdicts: Sequence[Verdict]) -> str:
+    """Count the verdicts of each kind: "3 scenes: 1 passed, 1 failed, 1 not judged"."""
+    counts = Counter(verdict.verdict for verdict in verdicts)
+    kinds = ("passed", "passed in band", "failed", "not judged", "error")
+    parts = [f"{counts[kind]} {kind.replace('error', 'not rendered')}" for kind in kinds if counts[kind]]
+    return f"{len(verdicts)} scene{'s' * (len(verdicts) != 1)}: {', '.join(parts)}"
 
 
 def write_json(path: str | Path, verdicts: Sequence[Verdict]) -> None:
-    """Write verdicts, with their whole summaries, as JSON to `path`; a figure that is not finite becomes null."""
+    """Write verdicts, with their whole summaries, as JSON to `path`; a figure that is not finite becomes null.
+
+    "passed" at the top says whether every scene has "passed": not where one is not judged, or passed in band.
+    """
     report = {
         "hapticrender": __version__,
-        "passed": exit_status(verdicts) == 0,
+        "passed": all(verdict.passed for verdict in verdicts),
         "scenes": [asdict(verdict) | {"passed": verdict.passed} for verdict in verdicts],
     }
     Path(path).write_text(as_json(report), encoding="utf-8")
 
 
 def write_junit(path: str | Path, verdicts: Sequence[Verdict]) -> None:
-    """Write verdicts to `path` as JUnit XML (schema of the Apache Ant task): a test case per scene, times in s."""
+    """Write verdicts to `path` as JUnit XML (schema of the Apache Ant task): a test case per scene, times in s.
+
+    A scene that is not judged is skipped; one that passed in band passes, with the reason as its output.
+    """
     counts = Counter(verdict.verdict for verdict in verdicts)
     seconds = sum(verdict.elapsed for verdict in verdicts)
     totals = {"name": "hapticrender", "tests": str(len(verdicts)), "time": f"{seconds:.3f}"}
@@ -222,13 +248,15 @@ def write_junit(path: str | Path, verdicts: Sequence[Verdict]) -> None:
 
 
 def _add_case(suite: ElementTree.Element, verdict: Verdict) -> None:
-    """Add one scene as a test case, with its failure, error or reason for being skipped."""
+    """Add one scene as a test case, with its failure, error, reason for being skipped, or what no device can play."""
     name = f"hapticrender.{verdict.device}.{verdict.method}"
     case = {"classname": printable(name), "name": printable(verdict.scene), "time": f"{verdict.elapsed:.3f}"}
     element = ElementTree.SubElement(suite, "testcase", case)
     if verdict.verdict == "failed":
         attributes = {"message": printable(sentence(verdict.summary)), "type": "tolerance"}
         ElementTree.SubElement(element, "failure", attributes).text = printable(as_json(verdict.summary["waveform"]))
+    elif verdict.verdict == "passed in band":
+        ElementTree.SubElement(element, "system-out").text = printable(sentence(verdict.summary))
     elif verdict.verdict != "passed":
         tag = "error" if verdict.verdict == "error" else "skipped"
         ElementTree.SubElement(element, tag, {"message": printable(verdict.reason), "type": "scene"})

@@ -74,6 +74,7 @@ def demo(arguments: argparse.Namespace) -> int:
 
 def render(arguments: argparse.Namespace) -> int:
     """Render a scene into a folder."""
+    from hapticrender.devices import naming_driver
     from hapticrender.report.outputs import run_into, written_in
     from hapticrender.report.progress import progress
     from hapticrender.report.text import verdict
@@ -88,7 +89,7 @@ def render(arguments: argparse.Namespace) -> int:
             scene, notes = found.scene, found.text
         driver = _driver(arguments.driver, scene)
     [rendering] = _prepare({arguments.scene: scene}, arguments, driver)
-    with progress(f"1/1 {arguments.scene}", sys.stderr) as tick:
+    with progress(f"1/1 {arguments.scene}", sys.stderr) as tick, naming_driver(arguments.driver):
         outputs = run_into(arguments.out, rendering, progress=tick)
     if arguments.verbose:
         _print_figures(outputs.summary)
@@ -104,6 +105,7 @@ def render(arguments: argparse.Namespace) -> int:
 
 def play(arguments: argparse.Namespace) -> int:
     """Play a scene live, with a line for every band: target, achieved and flags."""
+    from hapticrender.devices import naming_driver
     from hapticrender.player import Player
     from hapticrender.report import outputs
     from hapticrender.report.page import refuse_other_page, write_page
@@ -120,7 +122,11 @@ def play(arguments: argparse.Namespace) -> int:
             refuse_other_page(out)
     journal, above, second = None, 0, 0
     try:
-        with naming(arguments.scene), Player(scene, _driver(arguments.driver, scene)) as player:
+        with (
+            naming_driver(arguments.driver),
+            naming(arguments.scene),
+            Player(scene, _driver(arguments.driver, scene)) as player,
+        ):
             player.play(scene.texture)
             if out:
                 journal = outputs.begin_outputs(out / scene.name, scene)
@@ -161,13 +167,13 @@ def scenes(arguments: argparse.Namespace) -> int:
 
 
 def validate(arguments: argparse.Namespace) -> int:
-    """Render scenes, or the accuracy suite; exit status 1 where one misses its tolerance."""
+    """Render scenes, or the accuracy suite; exit status 1 where one misses its tolerance (--strict: is not judged)."""
     if arguments.suite:
         return _suite(arguments)
     from hapticrender.report.outputs import check_file, check_folder
     from hapticrender.report.text import overview
     from hapticrender.touch.builtin_scenes import builtin_scenes
-    from hapticrender.validate import exit_status, validate, write_json, write_junit
+    from hapticrender.validate import counted, exit_status, validate, write_json, write_junit
 
     reports = [("--json", arguments.json, write_json), ("--junit", arguments.junit, write_junit)]
     references = arguments.scenes or list(builtin_scenes())
@@ -181,15 +187,20 @@ def validate(arguments: argparse.Namespace) -> int:
     options = {"method": arguments.method, "seed": arguments.seed, "jobs": arguments.jobs, "out": arguments.out}
     options["driver"] = arguments.driver
     verdicts = validate(references, **options, progress=sys.stderr)
-    for _, path, write in reports:
-        if path:
-            write(_made(path), verdicts)
     if rendered := [verdict.summary for verdict in verdicts if verdict.summary]:
         print(printable(table(overview(rendered))))
+    print(counted(verdicts), flush=True)
     for verdict in verdicts:
         if verdict.verdict == "error":
             fail(str(verdict), 2)
-    return exit_status(verdicts)
+    status = exit_status(verdicts, strict=arguments.strict)
+    for option, path, write in reports:
+        try:
+            if path:
+                write(_made(path), verdicts)
+        except OSError as error:  # the other report is written all the same
+            status = fail(f"{option} = {str(path)!r}: {error.strerror or error}", 2)
+    return status
 
 
 def _suite(arguments: argparse.Namespace) -> int:
@@ -213,6 +224,7 @@ def _suite(arguments: argparse.Namespace) -> int:
 
 def identify(arguments: argparse.Namespace) -> int:
     """Identify a device, and write its profile."""
+    from hapticrender.devices import naming_driver
     from hapticrender.loop import registered
     from hapticrender.plants.electroadhesion import ElectroadhesionScreen
     from hapticrender.plants.identify import identify
@@ -226,7 +238,7 @@ def identify(arguments: argparse.Namespace) -> int:
         check_file("--out", arguments.out)
     scene = _scene(arguments.scene or "grating-20")  # any on the paper's plate
     found: Any
-    with naming(arguments.scene or "identify"):
+    with naming_driver(arguments.driver), naming(arguments.scene or "identify"):
         if scene.device not in ("vt-plate", "ultrasonic", "electroadhesion"):
             raise ValueError(f"device.kind = {scene.device!r}: must be vt-plate, ultrasonic or electroadhesion")
         setup = registered("renderers", scene.device)().read(scene, None)
@@ -250,7 +262,10 @@ def identify(arguments: argparse.Namespace) -> int:
                 found = identify(opened, setup.assumed, seconds=arguments.seconds, amplitude=arguments.amplitude)
                 found = found.shortened(getattr(driver, "host_delay", 0))
     print(found.text())
-    for difference in found.differences(setup.assumed) if scene.device == "vt-plate" else ():
+    assumed = setup.assumed
+    if scene.device == "vt-plate" and driver is not None:  # which states a delay of its own, in its blocks
+        assumed = replace(assumed, delay=max(assumed.delay, found.driver_delay))
+    for difference in found.differences(assumed) if scene.device == "vt-plate" else ():
         print(f"differs from [device]: {difference}")
     if arguments.out:
         _profile(found, scene, arguments).save(_made(arguments.out))
@@ -296,7 +311,7 @@ def finger(arguments: argparse.Namespace) -> int:
 
 def latency(arguments: argparse.Namespace) -> int:
     """Measure the delay of a loop through a cable."""
-    from hapticrender.devices import open_driver
+    from hapticrender.devices import naming_driver, open_driver
     from hapticrender.latency import measure_latency, write_delay
     from hapticrender.report.outputs import check_file
 
@@ -305,7 +320,8 @@ def latency(arguments: argparse.Namespace) -> int:
     driver = open_driver(arguments.driver)
     if driver is None:
         raise ValueError("--driver = 'simulated': must be a device with a cable, such as audio:0")
-    found = measure_latency(driver, runs=arguments.runs, amplitude=arguments.amplitude)
+    with naming_driver(arguments.driver):
+        found = measure_latency(driver, runs=arguments.runs, amplitude=arguments.amplitude)
     print(printable(f"{arguments.driver}: {found}"))
     if arguments.out:
         write_delay(_made(arguments.out), found)
@@ -357,6 +373,8 @@ def _recording(path: Path) -> Recording:
     from hapticrender.recordings.recording import Recording
 
     path = path / "recording.au" if path.is_dir() else path
+    if not path.exists():
+        raise ValueError(f"{path}: no such file")
     with naming(path):
         return Recording.load(path)
 

@@ -17,7 +17,7 @@ from hapticrender.driver_checks import check_driver
 from hapticrender.drivers.simulated import SimulatedDriver
 from hapticrender.protocols import Array, Controller, Driver, Method, Plant, Rendering, Texture
 from hapticrender.touch.device_profile import Limits
-from hapticrender.touch.scene import Scene
+from hapticrender.touch.scene import Scene, scene_keys
 from hapticrender.touch.touch_panel import PanelReader
 
 Waveform = Callable[[Array, Array], Array]
@@ -145,7 +145,7 @@ def check_tables(
             if key not in known and others:
                 raise ValueError(f"{table}.{key}: belongs in {others}")
         with checks.inside(table):
-            checks.check_names(values, known)
+            checks.check_names(values, known, scene_keys(table))
 
 
 def read_devices(scene: Scene, kind: type[checks.Validated], level: Collection[str] = ()) -> tuple[Any, Any]:

@@ -32,7 +32,7 @@ from hapticrender.renderers.limits import check_carriers, perceptible
 from hapticrender.renderers.shaped import Port, WrappedDriver
 from hapticrender.renderers.vibrotactile import PlateSetup, VibrotactileRenderer
 from hapticrender.touch.device_profile import Limits
-from hapticrender.touch.scene import Scene
+from hapticrender.touch.scene import Scene, scene_keys
 
 BOTH = "rate"  # the parameter that plate and screen share
 COILS = SENSORS = 2  # channels of the plate, which come first
@@ -247,7 +247,7 @@ def _split(scene: Scene) -> tuple[HybridSettings, Scene, Scene]:
     """Settings of the hybrid, and the scene with the tables of the plate, and of the screen."""
     own, of_screen = HybridSettings.names(), ElectroadhesionSettings.names()
     with inside("render"):
-        check_names(scene.rendering, own | of_screen)
+        check_names(scene.rendering, own | of_screen, scene_keys("render"))
         settings = HybridSettings(**{key: value for key, value in scene.rendering.items() if key in own})
     with inside("device"):
         profiles = _split_table(scene.profile, own | of_screen)

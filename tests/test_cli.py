@@ -5,12 +5,14 @@ import os
 import subprocess
 import sys
 from dataclasses import replace
+from pathlib import Path
 
 import hypothesis
 import numpy as np
 import pytest
 import soundfile
 from hypothesis import strategies as st
+from other_plate import OtherPlate
 
 from hapticrender import cli, defaults
 from hapticrender.recordings.recording import Recording
@@ -144,6 +146,29 @@ def test_a_driver_is_chosen_by_name(run, tiny, tmp_path):
     assert not (tmp_path / "out" / "sensed.wav").exists()
 
 
+@pytest.mark.parametrize("verb", ["render {tiny} --out {out}", "play {tiny}", "identify"])
+@pytest.mark.parametrize("method", ["__enter__", "play"])
+def test_what_a_driver_raises_is_one_line_with_its_name(run, tiny, tmp_path, monkeypatch, verb, method):
+    monkeypatch.setattr(OtherPlate, method, lambda *_: {}["usb"])
+    arguments = verb.format(tiny=tiny, out=tmp_path / "out").split()
+    status, _, errors = run(*arguments, "--driver", "other_plate:OtherPlate")
+    assert (status, errors[-1]) == (2, "hapticrender: other_plate:OtherPlate: KeyError: 'usb'")
+
+
+def test_python_in_development_mode_shows_the_traceback():
+    command = [sys.executable, "-X", "dev", "-m", "hapticrender", "render", "a", "--out", "b", "--method", "magic"]
+    assert "Traceback" in subprocess.run(command, capture_output=True, text=True, check=False).stderr
+
+
+def test_a_report_that_cannot_be_written_costs_no_other(run, tiny, tmp_path, monkeypatch):
+    """The table and the other report are there."""
+    monkeypatch.setattr("hapticrender.validate.write_json", lambda *_: Path("/no/such/folder/r.json").write_text(""))
+    status, out, errors = run("validate", tiny, "--json", tmp_path / "r.json", "--junit", tmp_path / "r.xml")
+    assert (status, (tmp_path / "r.xml").exists()) == (2, True)
+    assert out.splitlines()[-1] == "1 scene: 1 not judged"
+    assert errors[-1] == f"hapticrender: --json = '{tmp_path}/r.json': No such file or directory"
+
+
 def test_nothing_of_others_is_overwritten(run, tmp_path):
     own = tmp_path / "own"
     own.mkdir()
@@ -223,6 +248,7 @@ EDITS = [  # what is changed in the tiny scene, what the complaint must name
     ("frequency = 47.0", "frequency = 2000.0", ["texture.amplitude = 1e-05 m", "<= 3 A"]),
     ('kind = "vt-plate"', 'kind = "tea-tray"', ["tea-tray", "vt-plate"]),
     ("duration = 0.1", "duration = = 0.1", ["line 2"]),
+    ('kind = "vt-plate"', '[render]\nmethode = "h2"', ["known: probe; in a file also gradient, keep_unfelt, method, "]),
 ]
 
 
@@ -243,6 +269,7 @@ BAD_ARGUMENTS = [
     (["render", "{binary}", "--out", "{out}"], "{binary}: "),
     (["scenes", "no-such-scene"], "no-such-scene: no such built-in scene; there are "),
     (["validate", "{tiny}", "--json", "{folder}"], "--json = '{folder}': is a folder, must be a file"),
+    (["show", "{missing}"], "{missing}: no such file"),
     (["show", "{cut}"], "{cut}: not a recording (File is not a zip file)"),
     (["render", "{tiny}", "--out", "{out}", "--driver", "tea"], "driver 'tea' is not installed: must be one of"),
 ]

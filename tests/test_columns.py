@@ -188,6 +188,11 @@ GAP = np.delete(np.arange(51), 20) / RATE
         ),
         ({}, {"rate": None}, "rate is missing: must be a sampling rate in Hz"),
         ({"t": GAP}, {"time": "t", "rate": RATE}, "row 20 is 1 samples off an even grid of 5000 Hz"),
+        (
+            {"t": np.delete(np.arange(100), slice(30, 80)) / RATE, "i": np.ones(50), "x": np.ones(50)},
+            {"time": "t", "rate": None},
+            "row 30 is 50 samples off an even grid of 5000 Hz",
+        ),
         ({"t": SMALL["t"][::-1]}, {"time": "t"}, "time: must rise, but row 1 has 0.0096 s after 0.0098 s"),
         ({}, {"time": "t", "rate": 5100.0}, "off an even grid of 5100 Hz .mean rate 5000 Hz"),
         ({}, {"rate": 0.0}, "rate = 0.0: must be a finite number >= 0.001"),

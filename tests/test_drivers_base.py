@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
+from hapticrender.driver_checks import check_sensed
 from hapticrender.drivers.base import BaseDriver, check_driver, checked_drive
-from hapticrender.errors import DeviceLost, DriverError
+from hapticrender.errors import DeviceLost, DriverError, ProtocolError
 from hapticrender.protocols import Sensed
 
 
@@ -121,3 +122,17 @@ def test_an_object_that_is_no_driver_hears_what_it_lacks():
 
     with pytest.raises(TypeError, match="Half is no driver: it lacks delay, play, __enter__, __exit__"):
         check_driver(Half())
+
+
+@pytest.mark.parametrize(
+    ("columns", "message"),
+    [
+        ({"flags": np.full(4, 1.5)}, "Diary: play: flags is no array of whole numbers: it has fractions, or NaN"),
+        ({"flags": np.full(4, np.nan)}, "flags is no array of whole numbers"),
+        ({"sensed": np.ones((4, 1)) + 0j}, "sensed is no array of numbers: it is complex"),
+    ],
+)
+def test_a_column_that_would_lose_something_is_refused(columns, message):
+    assert check_sensed(Diary(), Sensed(np.ones((4, 1)), flags=np.full(4, 8.0)), 0).flags.dtype == np.int64
+    with pytest.raises(ProtocolError, match=message):
+        check_sensed(Diary(), Sensed(**{"sensed": np.ones((4, 1))} | columns), 0)

@@ -189,11 +189,32 @@ def test_the_command_line_identifies_a_wrong_plate_and_render_then_holds_it(tmp_
     assert abs(after / 30e-6 - 1).max() < 0.003
 
 
+@pytest.mark.parametrize(("noise", "hum"), [(3e-6, 0.0), (1e-9, 0.6e-6), (0.0, 0.0)])
+def test_the_noise_of_the_sensors_goes_into_the_profile(noise, hum):
+    """A hum of 50 Hz is no noise.  The median of 700 bins has a standard error of 1.44/(2 sqrt(700)), 2.7 %."""
+
+    def humming(sample, sensed):
+        return sensed._replace(sensed=sensed.sensed + hum * np.sin(2 * np.pi * 50 * sample / 5000))
+
+    measured = found(noise=noise, spoil=humming).profile()["sensor_noise"]
+    assert measured == pytest.approx(noise, rel=0.11, abs=1e-9 if hum else 1e-12)  # 4 standard errors; leaks of the hum
+    scene = hr.Scene(
+        texture=hr.Grating(frequency=72.0, amplitude=1e-5), duration=1.0, profile={"sensor_noise": measured}
+    )
+    assert hr.prepare(scene).model.sensed_noise == measured
+
+
 def test_the_command_line_takes_any_driver_by_its_module(capsys):
     assert cli.main(["identify", "--driver", "other_plate:OtherPlate:0.04"]) == 0
     assert "mass                 0.040" in capsys.readouterr().out
     assert cli.main(["identify", "--driver", "other_plate:OtherPlate:0.04", "--amplitude", "1e-6"]) == 2
     assert "10 times the noise: check drive and sensor connections, or increase amplitude" in capsys.readouterr().err
+
+
+def test_a_delay_that_the_driver_states_is_no_difference(monkeypatch, capsys):
+    monkeypatch.setattr("other_plate.Block", lambda: OtherPlate(block=4, told=6, delay=6), raising=False)
+    assert cli.main(["identify", "--driver", "other_plate:Block"]) == 0
+    assert "differs from [device]: delay" not in capsys.readouterr().out
 
 
 def test_the_same_plate_gives_no_difference_and_another_one_its_numbers(one):

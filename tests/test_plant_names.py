@@ -28,7 +28,7 @@ def known_of(device):
     for field, table in (("simulation", "simulation"), ("rendering", "render")):
         with pytest.raises(ValueError, match=rf"^{table}.mispelt: no such parameter; known: ") as refused:
             opened(device, **{field: {"mispelt": 1.0}})
-        names = re.sub(r".*known: ", "", str(refused.value)).split(", ")
+        names = re.sub(r".*known: |; in a file also .*", "", str(refused.value)).split(", ")
         assert names == sorted(set(names))
         known += [(name, table) for name in names if name]
     return {**dict(known), "rate": "device"}

@@ -325,6 +325,12 @@ def test_signals_that_do_not_fit_their_header_are_refused_by_name(recording, tmp
         Recording.load(tmp_path / "run.npz")
 
 
+def test_a_folder_that_is_missing_is_named_as_it_was_given(recording, tmp_path):
+    with pytest.raises(FileNotFoundError) as refused:
+        recording.save(tmp_path / "no" / "run.npz")
+    assert refused.value.filename == str(tmp_path / "no" / "run.npz")
+
+
 def test_files_that_would_grow_in_memory_are_refused(recording, tmp_path):
     h5py = pytest.importorskip("h5py", reason="HDF5 is an extra")
     header = recording.header.to_json()

@@ -158,6 +158,11 @@ def test_a_malformed_scene_is_refused_in_one_line(good, bad, message):
     assert len(str(refused.value).splitlines()) == 1
 
 
+def test_a_byte_order_mark_is_no_part_of_a_file(tmp_path):
+    (tmp_path / "scene.toml").write_text(GOOD, encoding="utf-8-sig")
+    assert Scene.from_toml(tmp_path / "scene.toml") == Scene.from_toml_text(GOOD)
+
+
 @pytest.mark.parametrize(
     ("content", "message"),
     [

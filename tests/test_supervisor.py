@@ -228,7 +228,7 @@ def test_a_ringing_damper_is_turned_down_and_the_texture_goes_on():
     bent = {"bending_frequency": 900.0, "bending_coil": -0.1}
     rendering = hr.prepare(scene(72.0, 50e-6, 2.0, simulation=bent, finger=TOUCH, method="h2"))
     made = []
-    with pytest.warns(hr.PlateMismatch, match="inner damper"):
+    with pytest.warns(hr.PlateMismatch, match="inner damper .* or the sensors' noise where there is none"):
         recording = hr.run(replace(rendering, controller=lambda: made.append(rendering.controller()) or made[-1]))
     assert made[0].damper_scale < 1.0
     assert abs(recording.drive[-1000:]).max() < 0.2
@@ -282,6 +282,8 @@ class Probed(Watched):
             "sensor 1 (is dead|repeats its values)",
         ),
         ({"spoil": lambda sample, sensed: sensed._replace(sensed=np.full((1, 2), np.nan))}, "100% of the samples"),
+        ({"noise": 20e-6}, "the sensors' noise is (19|2.) um rms, more than .* um: the probe cannot judge"),
+        ({"noise": 4e-6, "sensors": INVERT}, "sensor 1 is inverted"),
     ],
 )
 @pytest.mark.parametrize("touched", [{}, FINGER], ids=["free", "touched"])

@@ -1,5 +1,6 @@
 """Sweeps: any device, any executor, the same results in the order of the scenes, failures named."""
 
+import pickle
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from dataclasses import replace
 from multiprocessing import get_context
@@ -58,3 +59,10 @@ def test_a_failing_scene_is_named(threads):
         sweep(scenes, worst_error, executor=executor)
     with pytest.raises(ValueError, match="at_a_time = 0: must be an integer >= 1 scenes"):
         sweep(scenes, at_a_time=0)
+
+
+@pytest.mark.parametrize("error", [hr.WatchdogTimeout(0.1, 0.5), hr.WatchdogTimeout(0.1), hr.DeviceFault("gone", 0.2)])
+def test_an_error_comes_out_of_another_process_as_it_was(error):
+    """One that cannot be unpickled ends a `ProcessPoolExecutor`."""
+    again = pickle.loads(pickle.dumps(error))
+    assert (type(again), str(again), again.time) == (type(error), str(error), error.time)

@@ -11,7 +11,7 @@ import pytest
 from hapticrender.touch.builtin_scenes import builtin_scenes
 from hapticrender.touch.grating import Grating
 from hapticrender.touch.scene import Scene
-from hapticrender.validate import Verdict, exit_status, validate, write_json, write_junit
+from hapticrender.validate import Verdict, counted, exit_status, validate, write_json, write_junit
 
 FINE = {"current_bits": 20}  # of 12 bits a finger may feel the rounding at 160 to 200 Hz
 
@@ -48,7 +48,8 @@ def test_a_bad_scene_stops_no_other(tmp_path, capsys, jobs):
     assert "texture.frequency = -47.0" in found[0].reason
     assert found[3].reason.startswith("the texture has nothing from 20 to 500 Hz")
     assert exit_status(found) == 2
-    assert exit_status(found[1:2] + found[3:]) == 0
+    assert [exit_status(found[1:2] + found[3:], strict=strict) for strict in (False, True)] == [0, 1]
+    assert counted(found) == "4 scenes: 1 passed, 1 not judged, 2 not rendered"
     assert capsys.readouterr().err == "1/3 short\n2/3 plateless\n3/3 slow\n"
     write_json(tmp_path / "r.json", found)
     assert len(json.loads((tmp_path / "r.json").read_text(encoding="utf-8"))["scenes"]) == 4
@@ -56,6 +57,39 @@ def test_a_bad_scene_stops_no_other(tmp_path, capsys, jobs):
     suite = ElementTree.parse(tmp_path / "r.xml").getroot().find("testsuite")
     assert [suite.get(key) for key in ("tests", "failures", "errors", "skipped")] == ["4", "0", "2", "1"]
     assert suite.findall("testcase")[3].find("skipped").get("message") == found[3].reason
+
+
+FAULTY = """
+from other_plate import OtherPlate
+made = []
+class Gone(OtherPlate):
+    def play(self, drive):
+        raise OSError("usb gone")
+def driver():
+    made.append(1)
+    return [lambda: {}["x"], Gone, OtherPlate][len(made) - 1]()
+"""
+
+
+def test_whatever_a_driver_raises_is_the_error_of_that_scene(tmp_path, monkeypatch):
+    (tmp_path / "faulty_driver.py").write_text(FAULTY)
+    monkeypatch.syspath_prepend(tmp_path)
+    found = validate([SHORT] * 3, driver="faulty_driver:driver")
+    assert [verdict.verdict for verdict in found] == ["error", "error", "passed"]
+    assert [verdict.reason for verdict in found[:2]] == [
+        f"faulty_driver:driver: {problem}" for problem in ("KeyError: 'x'", "OSError: usb gone")
+    ]
+
+
+@pytest.mark.parametrize(("kind", "tag"), [("not judged", "skipped"), ("passed in band", "system-out")])
+def test_what_is_not_wholly_passed_is_so_in_every_report(verdicts, tmp_path, kind, tag):
+    found = [verdicts[0], Verdict.of(verdicts[0].summary | {"verdict": kind, "reason": "why"}, elapsed=0.5)]
+    write_json(tmp_path / "r.json", found)
+    assert json.loads((tmp_path / "r.json").read_text())["passed"] is False
+    write_junit(tmp_path / "r.xml", found)
+    suite = ElementTree.parse(tmp_path / "r.xml").getroot().find("testsuite")
+    assert int(suite.get("skipped")) == len(suite.findall("testcase/skipped")) == (tag == "skipped")
+    assert [child.tag for child in suite.findall("testcase")[1]] == [tag]
 
 
 def test_only_what_does_not_pass_leaves_its_files(tmp_path):

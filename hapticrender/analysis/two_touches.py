@@ -184,7 +184,7 @@ class TouchMonitor:
         return parts[0] - model.stiffness @ parts[1] - model.damping @ parts[2] - model.mass @ parts[3]
 
     def _regressors(self, parts: Array) -> Array:
-        """Forces per error of K, C and M (entries 11, 12, 22 of each) and per sample of delay, shape (2, 10, length)."""
+        """Forces per error of K, C and M (entries 11, 12, 22 each) and per sample of delay, shape (2, 10, length)."""
         found = np.zeros((2, 10, parts.shape[-1]))
         for row in (0, 1):
             found[row, row:9:3], found[row, row + 1 : 9 : 3] = parts[1:, 0], parts[1:, 1]

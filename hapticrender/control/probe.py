@@ -3,7 +3,7 @@
 For 200 ms both actuators play lines of their own, away from the modes, so that a resting finger changes little; the
 surface moves by a fortieth of the sensors' range.  The response y is compared with that of the model under 169
 hypotheses h (13 wirings, each with 13 delays) by the residual 1 - <y, y_h>/(|y| |y_h|), with offset, slope and
-parabola taken out of each sensor.
+parabola taken out of each sensor.  The sensors' noise is what they show in the second half of the silence after it.
 """
 
 from __future__ import annotations
@@ -28,6 +28,7 @@ MOTION, MOST_DRIVE = 0.025, 0.05  # of the sensors' range; of the drive limit
 DELAYS = 13
 MOST_INVALID, MOST_REPEATS, LEAST_ENERGY = 0.02, 0.6, 0.02
 MOST_RESIDUAL, MOST_WORSE = 0.35, 0.05
+MOST_NOISE = (1 / (1 - MOST_RESIDUAL / 2) ** 2 - 1) ** 0.5  # over |y|: this noise alone leaves half that residual
 SCALES, DELAY_TOLERANCE = (0.6, 1.6), 2  # samples
 ONE, SWAP = np.eye(2), np.eye(2)[::-1]
 WIRINGS = {  # what is not as stated: sensors (rows are what is sensed), actuators
@@ -96,7 +97,12 @@ def probe_drive(model: DeviceModel) -> Array:
 
 
 def judge(model: DeviceModel, drive: Array, sensed: Array) -> Found:
-    """Compare what was sensed (n, 2) under `drive` (n, 2) with the responses of the model, and name the deviation."""
+    """Compare what was sensed under `drive` (n, 2) with the responses of the model, and name the deviation.
+
+    `sensed` (n + m, 2) goes on into the silence after the drive.
+    """
+    silence = sensed[(len(drive) + len(sensed)) // 2 :]
+    sensed = sensed[: len(drive)]
     stated = model.delay - model.block
     delays = range(max(stated - DELAYS // 2, 0), max(stated - DELAYS // 2, 0) + DELAYS)
     expected: dict[tuple[str, int], Array] = {}
@@ -120,8 +126,12 @@ def judge(model: DeviceModel, drive: Array, sensed: Array) -> Found:
     best = min(residuals, key=lambda each: residuals[each])
     own = min((("nothing", delay) for delay in delays), key=lambda each: residuals[each])
     scale, delay = float((y * expected[own]).sum() / (expected[own] ** 2).sum()), own[1] + model.block
+    noise = float(_detrended(silence).std()) if len(silence) else 0.0
+    most = MOST_NOISE * (model_energy / y.size) ** 0.5
     fault = ""
-    if residuals[own] > residuals[best] + MOST_WORSE:
+    if min(residuals[own], residuals[best] + MOST_WORSE) > MOST_RESIDUAL and noise > most:
+        fault = f"the sensors' noise is {1e6 * noise:.2g} um rms, more than {1e6 * most:.2g} um: the probe cannot judge"
+    elif residuals[own] > residuals[best] + MOST_WORSE:
         fault = best[0]
     elif residuals[own] > MOST_RESIDUAL:
         fault = "the answer is not that of the device model"
@@ -154,7 +164,7 @@ def _detrended(values: Array) -> Array:
 
 
 def _play(driver: Driver, drive: Array, places: int) -> Array:
-    """Play a drive and silence after it in blocks; what was sensed during the drive."""
+    """Play a drive and silence after it in blocks; what was sensed meanwhile."""
     silence = round(REST * driver.rate)
     blocks = -(-(len(drive) + silence) // driver.block)
     padded = np.zeros((blocks * driver.block, drive.shape[1]))
@@ -163,4 +173,4 @@ def _play(driver: Driver, drive: Array, places: int) -> Array:
         check_sensed(driver, driver.play(block.copy()), places).sensed
         for block in padded.reshape(blocks, driver.block, -1)
     ]
-    return np.concatenate(parts)[: len(drive)]
+    return np.concatenate(parts)

@@ -96,10 +96,10 @@ class Difference(NamedTuple):
 class Identified:
     """An identified plate."""
 
-    parameters: PlateParameters  # identified; `delay` in whole samples, sensor gains with the mean that was expected
+    parameters: PlateParameters  # identified, `noise` too; `delay` in whole samples, sensor gains of the expected mean
     estimates: Mapping[str, Estimate]  # of `NAMES`, in `UNITS`; the delay is of the whole loop, fractions included
     bending_top: float  # Hz: up to here a bending mode was searched
-    noise: float  # m rms: white noise of a sensor, measured between the lines
+    noise: float  # m rms: white noise of a sensor, from the median between the lines
     residual: float  # m rms: motion of an end that the model leaves unexplained beyond the noise
     misfit: float  # residual on the lines over the noise between them; 1 where the model explains all
     misfit_bound: float  # largest misfit by chance
@@ -125,7 +125,7 @@ class Identified:
         """Return the identified parameters, and the others that differ from the defaults, for `Scene.profile`."""
         default = PlateParameters()
         bending = BENDING if "bending_coil" in self.estimates else BENDING[:1]
-        identified = (*MECHANICAL, "delay", "sensor_gain_1", "sensor_gain_2", *bending)
+        identified = (*MECHANICAL, "delay", "sensor_gain_1", "sensor_gain_2", "sensor_noise", *bending)
         values = {each.name: getattr(self.parameters, each.name) for each in fields(PlateParameters)}
         return {name: value for name, value in values.items() if name in identified or value != getattr(default, name)}
 
@@ -391,11 +391,13 @@ def _identified(fit: Fit, record: Record, driver: Driver) -> Identified:
     scale = [abs(given.get(name, 1.0)) for name in names]
     spread = SIGMAS_95 * np.sqrt(np.diagonal(fit.covariance) * max(on_lines, noise)) * scale
     pairs = (Estimate(float(value), float(half)) for value, half in zip(values, spread, strict=True))
+    hidden = np.median(abs(fit.left[record.between]) ** 2) / (2 * math.log(2))  # variance; a hum leaves it alone
+    white = round(math.sqrt(hidden * record.samples / 2), 12)  # to 1 pm
     return Identified(
-        parameters=replace(fit.plate, delay=max(round(found["delay"]), 1)),
+        parameters=replace(fit.plate, delay=max(round(found["delay"]), 1), sensor_noise=white),
         estimates=MappingProxyType(dict(zip(names, pairs, strict=True))),
         bending_top=float(record.turn[-1] * record.rate) if record.above.any() else 0.0,
-        noise=math.sqrt(noise * record.samples / 2),
+        noise=white,
         residual=math.sqrt(max(on_lines - noise, 0.0) * record.on_line.sum()),
         misfit=math.sqrt(on_lines / noise),
         misfit_bound=bound,

@@ -167,15 +167,19 @@ def _rate(rate: float | None, time: Array | None, count: int) -> float:
             f"time: must rise, but row {bad[0] + 1} has {time[bad[0] + 1]:.9g} s after {time[bad[0]]:.9g} s"
         )
     measured = (count - 1) / float(time[-1] - time[0])
-    rate = measured if rate is None else number("rate", rate, "Hz", least=1e-3, most=1e9)
-    off = np.abs((time - time[0]) * rate - np.arange(count))
+    chosen = measured if rate is None else number("rate", rate, "Hz", least=1e-3, most=1e9)
+    off = np.abs((time - time[0]) * chosen - np.arange(count))
     if off.max() > EVEN:
+        usual = float(np.median(np.diff(time)))
+        missed = np.abs(np.diff(time, prepend=time[0] - usual) / usual - 1.0)  # by each row, after the one before
+        if (missed > EVEN).any():
+            off, chosen = missed, 1 / usual if rate is None else chosen
         row = int(np.argmax(off > EVEN))
         raise ValueError(
-            f"time: row {row} is {off[row]:.3g} samples off an even grid of {rate:.9g} Hz (mean rate {measured:.9g} "
+            f"time: row {row} is {off[row]:.3g} samples off an even grid of {chosen:.9g} Hz (mean rate {measured:.9g} "
             "Hz): samples are missing, or the rate varies: cut the recording there, or resample it"
         )
-    return rate
+    return chosen
 
 
 def _read_text(path: Path) -> dict[str, Array]:

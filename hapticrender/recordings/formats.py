@@ -96,7 +96,10 @@ def _by_suffix(path: Path, table: dict[str, Any], verb: str) -> Any:
 def replacing(path: Path) -> Iterator[Path]:
     """Provide a scratch file beside `path` that takes its place only if the block succeeds."""
     scratch = path.with_name(f".{path.stem}-{uuid.uuid4().hex}{path.suffix.lower()}")
-    scratch.touch()
+    try:
+        scratch.touch()
+    except OSError as error:
+        raise OSError(error.errno, error.strerror, str(path)) from error
     try:
         yield scratch
         if path.exists():

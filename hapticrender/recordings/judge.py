@@ -39,11 +39,12 @@ def summary(recording: Recording) -> dict[str, Any]:
     The verdict rests on `waveform`, which compares the motion y at every place with the reference r, the texture as the
     scene specifies it, without time shift or gain fit.  It is "passed" where at every place `waveform_error`, E =
     rms_B(y - r)/rms_B(r), is within the tolerance, `window_error`, the 95th percentile of the same in windows of
-    100 ms, and the worst `third_octave_error` are within twice the tolerance, and no sample is flagged as saturated or
-    faulty; "passed in band" where besides more than 1 % of the texture's energy is outside 20 to 500 Hz (B) and above
-    the detection threshold; else "failed", or "not judged".  `worst` is the figure furthest over its `bound`; `reason`
-    states what else decided.  See ``verdict`` for the equations.  `contacts` are the errors after touches and lifts;
-    `delay` (s), `gain` and `incoherent` share state how y differs from r and decide nothing, like all that follows.
+    100 ms, and the worst `third_octave_error` (on a plate up to 1000 Hz) are within twice the tolerance, and no sample
+    is flagged as saturated or faulty; "passed in band" where besides more than 1 % of the texture's energy is outside
+    20 to 500 Hz (B) and above the detection threshold; else "failed", or "not judged" where nothing can be said and no
+    sample is flagged.  `worst` is the figure furthest over its `bound`; `reason` states what else decided.  See
+    ``verdict`` for the equations.  `contacts` are the errors after touches and lifts; `delay` (s), `gain` and
+    `incoherent` share state how y differs from r and decide nothing, like all that follows.
 
     Relative errors of a band compare with the target at every place over the judged windows: `error_*` is that of the
     mean amplitude, `rms_error_*` the rms of |X| - |target| over the rms of |target|, `complex_error` the rms of
@@ -150,34 +151,43 @@ def _flag_counts(recording: Recording, first: int = 0) -> dict[Flag, int]:
 
 
 def _verdict(recording: Recording, worst: dict[str, Any]) -> tuple[str, str]:
-    """Verdict and, where the worst figure is not the reason, what is."""
+    """Verdict and, where the worst figure is not the reason, what is; flags come before what cannot be judged."""
     header, found = recording.header, recording.waveform
-    if header.motion_source == "unknown":
-        return "not judged", "the device has no sensors, so its motion is not measured"
-    if found["lost_windows"]:
+    if header.motion_source != "unknown" and found["lost_windows"]:
         bound = f"not finite, or beyond {RUNAWAY:g} {header.unit},"
         return "failed", f"the motion is {bound} in {found['lost_windows']} windows of {1e3 * WINDOW:g} ms"
-    if found["rms_reference"] is None:
-        needed = min(max(header.settle, FADE_IN) + WINDOW, 2 * WINDOW)
-        return "not judged", f"the run is too short: needs >= {needed:g} s"
-    if not found["rms_reference"]:
-        return "not judged", "the texture is zero"
-    if found["share_in_band"] < LEAST:
-        return "not judged", f"the texture has nothing from {IN_BAND}"
-    if header.motion_source == "inferred":
-        return "not judged", INFERRED
-    if worst["value"] > worst["bound"]:
-        noise = found["sensor_noise"]
-        if worst["value"] - header.calibration <= HARDLY * noise:
-            return "not judged", f"the worst figure is not distinct from the noise of the sensors, {percent(noise)}"
+    unjudged = _unjudged(recording, worst)
+    if not unjudged and worst["value"] > worst["bound"]:
         return "failed", _stopped(recording)
     counts = _flag_counts(recording, round(judged_from(recording) * recording.rate))
     raised = [f"{flag.name} in {count} samples" for flag, count in counts.items() if count and flag & MATTERS]
     if raised:
         return "failed", f"flags that are not allowed: {', '.join(raised).lower()}"
+    if unjudged:
+        return "not judged", unjudged
     if found["share_outside"] > UNPLAYABLE:
         return "passed in band", _unplayable(found["share_outside"])
     return "passed", ""
+
+
+def _unjudged(recording: Recording, worst: dict[str, Any]) -> str:
+    """State why the worst figure, or its lack, says nothing; nothing where it is to be judged."""
+    header, found = recording.header, recording.waveform
+    if header.motion_source == "unknown":
+        return "the device has no sensors, so its motion is not measured"
+    if found["rms_reference"] is None:
+        needed = min(max(header.settle, FADE_IN) + WINDOW, 2 * WINDOW)
+        return f"the run is too short: needs >= {needed:g} s"
+    if not found["rms_reference"]:
+        return "the texture is zero"
+    if found["share_in_band"] < LEAST:
+        return f"the texture has nothing from {IN_BAND}"
+    if header.motion_source == "inferred":
+        return INFERRED
+    noise = found["sensor_noise"]
+    if worst["value"] > worst["bound"] and worst["value"] - header.calibration <= HARDLY * noise:
+        return f"the worst figure is not distinct from the noise of the sensors, {percent(noise)}"
+    return ""
 
 
 def _stopped(recording: Recording) -> str:

@@ -1,8 +1,9 @@
 """Judge the waveform: the motion against the texture as the scene specifies it, without time shift or gain fit.
 
 Symbols: r reference, y motion at a place over the place's share of the target, e = y - r; rms_B over B = 20 to 500 Hz,
-rms_b over a third octave b with both edges in B; S_b detection threshold (rms) in it.  Over the whole play both come
-from spectra, E = rms_B(e)/rms_B(r) among them; windows of 100 ms and contacts from signals filtered without phase.
+rms_b over a third octave b with both edges in B (on a plate also above, see `_thirds`); S_b detection threshold (rms)
+in it.  Over the whole play both come from spectra, E = rms_B(e)/rms_B(r) among them; windows of 100 ms and contacts
+from signals filtered without phase.
 """
 
 from __future__ import annotations
@@ -31,8 +32,11 @@ SEGMENT = 10  # windows in a segment of the spectra (Hann, half overlapping): 1 
 WORST_WINDOWS = 95.0  # percentile
 QUIET = 0.1  # of the rms of the whole reference: windows below count as this loud
 READ_AT_ONCE = 2**17  # samples
-NOMINAL = (25.0, 31.5, 40.0, 50.0, 63.0, 80.0, 100.0, 125.0, 160.0, 200.0, 250.0, 315.0, 400.0)  # Hz [IEC 61260]
-THIRDS = 1000.0 * 2.0 ** (np.arange(-16, -3) / 3)  # Hz: their exact middles
+NOMINAL = (
+    *(25.0, 31.5, 40.0, 50.0, 63.0, 80.0, 100.0, 125.0, 160.0, 200.0, 250.0, 315.0, 400.0),
+    *(500.0, 630.0, 800.0, 1000.0),  # beyond B; beyond these no detection threshold is known
+)  # Hz [IEC 61260]
+THIRDS = 1000.0 * 2.0 ** (np.arange(-16, 1) / 3)  # Hz: their exact middles
 EDGE = 2.0 ** (1 / 6)
 CURVE = "classic"  # detection threshold; the rounding of a 12-bit converter alone is 1.4 times the safe one at 200 Hz
 SPUR = 0.01  # of the rms of the whole reference: S_b where no threshold is known
@@ -75,9 +79,10 @@ def waveform_figures(recording: Recording) -> dict[str, Any]:
     found["sensor_noise"] = _noise(recording, *_band(rate)) / math.sqrt(reference[inside].sum())
     floor = partial(_floor, recording, level)
     for i, place in enumerate(places, start=1):
+        columns = spectrum[:, [0, i, i + len(places)]]
         total = spectrum[_within(frequency, *_band(rate))].sum(axis=0)
         errors = {"waveform_error": math.sqrt(total[i] / total[0]), "window_error": _windows(power[:, [0, i]])}
-        found["places"][place] = errors | _thirds(spectrum[:, [0, i]], frequency, rate, floor)
+        found["places"][place] = errors | _thirds(columns, frequency, rate, header.unit, floor)
     sign = float(np.sign((header.profile or (1.0,))[0]))
     found |= _likeness(frequency[inside], spectrum[inside, :2], cross[inside], sign)
     return found | {"contacts": _contacts(recording, begin, stop, math.sqrt(power[:, 0].mean()))}
@@ -130,7 +135,8 @@ def _power(recording: Recording, start: int, stop: int, window: int) -> Array:
 
 
 def _spectra(recording: Recording, begin: int, stop: int, segment: int) -> tuple[Array, Array, Array]:
-    """Frequencies (Hz), mean square a bin (bins, 1 + places), and cross spectrum of r and e at the first place."""
+    """Frequencies (Hz), mean square a bin of r, e and y (bins, 1 + 2 places), cross spectrum of r and the first e."""
+    signs = np.sign(recording.header.profile or np.ones(len(recording.header.places)))
     starts = np.unique([*range(begin, stop - segment + 1, max(segment // 2, 1)), stop - segment])
     shape = np.hanning(segment + 1)[:-1, None]
     scale = 2.0 / (segment * (shape**2).sum()) / len(starts)
@@ -138,7 +144,7 @@ def _spectra(recording: Recording, begin: int, stop: int, segment: int) -> tuple
     for start in starts:
         values = _signals(recording, start, start + segment)
         turned = np.fft.rfft(shape * (values - values.mean(axis=0)), axis=0)
-        power += scale * np.abs(turned) ** 2
+        power += scale * np.abs(np.hstack([turned, turned[:, 1:] + signs * turned[:, :1]])) ** 2
         cross += scale * turned[:, 0].conj() * turned[:, 1]
     return np.fft.rfftfreq(segment, 1 / recording.rate), np.asarray(power), np.asarray(cross)
 
@@ -150,15 +156,22 @@ def _windows(power: Array) -> float:
     return float(np.sqrt(np.percentile(each, WORST_WINDOWS)))
 
 
-def _thirds(spectrum: Array, frequency: Array, rate: float, floor: Callable[[float], float]) -> dict[str, Any]:
-    """``e_b = rms_b(e)/max(rms_b(r), floor(b))`` of every third octave b inside B, and the largest."""
+def _thirds(
+    spectrum: Array, frequency: Array, rate: float, unit: str, floor: Callable[[float], float]
+) -> dict[str, Any]:
+    """``e_b = rms_b(e)/max(rms_b(r), floor(b))`` of every third octave b inside B, and the largest.
+
+    On a plate (m) those above B count, too, up to 1000 Hz or 0.4 of the rate: a device need not follow r there, so
+    only the excess ``sqrt(rms_b(y)^2 - rms_b(r)^2)`` is an error where it is less than rms_b(e).
+    """
     low, high = _band(rate)
     found = {}
     for name, middle in zip(NOMINAL, THIRDS, strict=True):
-        if low <= middle / EDGE and middle * EDGE <= high:
-            third = _within(frequency, middle / EDGE, middle * EDGE)
-            reference, error = np.sqrt(spectrum[third].sum(axis=0))
-            found[f"{name:g} Hz"] = float(error / max(reference, floor(middle)))
+        if low <= middle / EDGE and middle * EDGE <= (HIGHEST * rate if unit == "m" else high):
+            reference, error, motion = spectrum[_within(frequency, middle / EDGE, middle * EDGE)].sum(axis=0)
+            if middle * EDGE > high:
+                error = min(error, max(motion - reference, 0.0))
+            found[f"{name:g} Hz"] = math.sqrt(error) / max(math.sqrt(reference), floor(middle))
     worst = max(found, key=lambda name: found[name], default=None)
     return {"third_octave_error": found.get(worst or ""), "third_octave": worst, "third_octaves": found}
 

@@ -220,6 +220,11 @@ class Scene(Validated):
         return toml.dumps({"name": self.name, "duration": self.duration} | parts | tables)
 
 
+def scene_keys(table: str) -> set[str]:
+    """Keys of a table of a scene file that are fields of the scene, whatever the device."""
+    return {key for where, key in OWN if where == table}
+
+
 def distinct_names(names: Iterable[str]) -> list[str]:
     """Number the names of scenes that occur more than once: "a", "b (1)", "b (2)".
 

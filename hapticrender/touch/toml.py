@@ -17,11 +17,11 @@ _BARE = re.compile(r"[A-Za-z0-9_-]+")
 
 
 def read_text(path: str | os.PathLike[str]) -> str:
-    """Text of a file; a ValueError where it is no regular file of UTF-8 text, or too large."""
+    """Text of a file, less a byte order mark; a ValueError where it is no regular file of UTF-8 text, or too large."""
     try:
         found = Path(path).stat()
         usable = stat.S_ISREG(found.st_mode) and found.st_size <= LARGEST_FILE
-        text = Path(path).read_bytes().decode("utf-8") if usable else ""
+        text = Path(path).read_bytes().decode("utf-8-sig") if usable else ""
     except UnicodeDecodeError as problem:
         raise ValueError(f"byte {problem.start}: must be UTF-8 text") from problem
     except (OSError, ValueError) as problem:
