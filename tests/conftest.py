@@ -3,6 +3,7 @@
 import hashlib
 import os
 import shutil
+import signal
 import sys
 import time
 from collections.abc import Iterator
@@ -12,6 +13,10 @@ from pathlib import Path
 # Before numpy is loaded: two workers whose sums of small matrices run on two threads each wait for one another on two
 # cores; fits of 13 simulated subjects took 37 s instead of 1 s.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+# A shell starts what it runs in the background with Ctrl-C ignored, and the programs under test would inherit that.
+if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 import hypothesis  # noqa: E402
 import numpy as np  # noqa: E402

@@ -73,24 +73,6 @@ def test_touch_is_half_open_and_lifts_everything():
     assert set(finger.load(time)) == {0.0, 0.6}
 
 
-@pytest.mark.parametrize(
-    ("finger", "constant"),
-    [
-        (Finger.absent(), True),
-        (Finger.still(0.01, normal_load=0.5), True),
-        (Finger.still(normal_load=1, mechanics="heavy", load_scaling=True), True),
-        (Finger.still(touches=((0.1, 0.2),)), False),
-        (Finger.still(normal_load=((0.0, 0.5), (0.1, 1.0))), False),
-        (Finger.sliding(0.1), False),
-        (Finger.swiping(2.0, stroke=0.02), False),
-    ],
-)
-def test_a_finger_is_constant_where_nothing_of_its_touch_changes(finger, constant):
-    touch = finger.touch(np.linspace(0.0, 1.0, 50))
-    np.testing.assert_equal(finger.constant, constant)
-    np.testing.assert_equal(np.array_equal(touch, touch[:1] + 0.0 * touch, equal_nan=True), constant)
-
-
 def test_load_follows_its_curve_and_is_held():
     finger = Finger.still(normal_load=([1.0, 2.0], [0.2, 0.8]))
     assert finger.load(np.array([0.0, 1.5, 5.0])) == pytest.approx([0.2, 0.5, 0.8])

@@ -156,12 +156,6 @@ class Finger(Validated):
         touch[np.isnan(touch[:, 0]), 1:] = 0.0
         return touch
 
-    @cached_property
-    def constant(self) -> bool:
-        """Whether position and load are the same at all times."""
-        known = type(self) is Finger and type(self.motion) in (Nowhere, Still)
-        return known and self.touches is None and isinstance(self.normal_load, float)
-
     def _pressed(self, time: Array) -> Array:
         if self.normal_load is None:
             return self.motion.load(time)  # type: ignore[attr-defined]
