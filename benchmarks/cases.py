@@ -1,6 +1,5 @@
 """Every figure that the library claims about its speed, as a ratio to its reference in the same run."""
 
-import os
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
@@ -9,7 +8,6 @@ from fractions import Fraction
 from functools import partial
 from multiprocessing import get_context
 from typing import Any
-from unittest.mock import patch
 
 import numpy as np
 
@@ -142,11 +140,11 @@ def demodulation(bands: int, pairs: int) -> Iterator[Figure]:
 
 
 def two_cores(devices: tuple[str, ...], seconds: float, pairs: int) -> Iterator[Figure]:
-    """Rendered and judged scenes of each device on two processes over one, in wall time, as `sweep` advises."""
+    """Rendered and judged scenes of each device on two processes over one, in wall time."""
     if cores() < 2:
         return
     pools = [ProcessPoolExecutor(workers, get_context("spawn")) for workers in (2, 1)]
-    with patch.dict(os.environ, OPENBLAS_NUM_THREADS="1"), pools[0], pools[1]:
+    with pools[0], pools[1]:
         for device in devices:
             scene = hr.Scene(
                 texture=hr.Grating(frequency=120.0, velocity=10e-3),

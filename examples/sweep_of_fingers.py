@@ -3,7 +3,6 @@
 The figure is the worst waveform error of any finger, at its worst place.
 """
 
-import os
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
 
@@ -24,7 +23,6 @@ def main() -> float:
         for load in (0.3, 0.8)
         for place in (0.0, 5e-3, 10e-3, 20e-3)
     ]
-    os.environ["OPENBLAS_NUM_THREADS"] = "1"  # of the two processes: see `sweep`
     with ProcessPoolExecutor(2, get_context("spawn")) as pool:  # or a cluster: dask's Client(...).get_executor()
         errors = sweep(scenes, worst_error, executor=pool, at_a_time=8)
     for scene, error in zip(scenes, errors, strict=True):

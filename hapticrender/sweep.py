@@ -42,8 +42,7 @@ def sweep(
     method : str, optional
         Name of the control method; default: that of each scene.
     executor : concurrent.futures.Executor, optional
-        Default: this thread.  Processes need ``OPENBLAS_NUM_THREADS=1`` in their environment before they start:
-        threads of numpy that wait take the cores of the others (on two cores they took two thirds of the speed).
+        Default: this thread.
     at_a_time : int
         Scenes a task of the executor, >= 1.
 
