@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import inspect
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -94,7 +95,8 @@ def naming_driver(text: str, *passed: type[Exception]) -> Iterator[None]:
     try:
         yield
     except Exception as error:
-        ours = isinstance(error, HapticError | MemoryError) or getattr(error, "filename", None) is not None
+        full = isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EFBIG, errno.EDQUOT)
+        ours = isinstance(error, HapticError | MemoryError) or getattr(error, "filename", None) is not None or full
         if text == SIMULATED or ours or isinstance(error, passed):
             raise
         raise DriverError(f"{text}: {type(error).__name__}: {error}") from error

@@ -62,9 +62,10 @@ def _column(driver: Any, name: str, value: Any, shape: tuple[int, ...]) -> Array
         given = np.asarray(value)
         if given.dtype.kind == "c":
             raise TypeError("it is complex")
-        if name == "flags" and given.dtype.kind == "f" and not (given == np.floor(given)).all():
-            raise TypeError("it has fractions, or NaN")
-        column = np.ascontiguousarray(given, kind)
+        with np.errstate(invalid="ignore"):
+            column = np.ascontiguousarray(given, kind)
+        if name == "flags" and given.dtype.kind in "fO" and not (column == given).all():
+            raise TypeError("it has fractions, NaN or infinity")
     except (TypeError, ValueError) as error:
         raise ProtocolError(f"{where} is no array of {'whole ' * (kind is np.int64)}numbers: {error}") from None
     if given.shape != shape:

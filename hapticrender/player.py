@@ -139,7 +139,9 @@ class Player:
         """Zero drive, then close the device and the recording; a fault that nobody has seen is raised."""
         with ExitStack() as last:  # from the last to the first, whatever fails
             last.callback(self._close_recorder, kind is not None or self._error is not None)
-            last.push(self._stack.pop_all())
+            with self._lock:  # a device that is being opened is closed, too; no other is opened
+                self._entered = False
+                last.push(self._stack.pop_all())
             last.callback(self._stopping.set)
             last.callback(self._rest, kind is None)
         if kind is None and self._error is not None and not self._raised:
@@ -186,6 +188,7 @@ class Player:
             loop = self._loop
             if loop is None:
                 with self._lock:
+                    self._check()
                     self._follow(self._begin(scenes), parts)
                 return
             renderings = [self._prepare(each) for each in scenes]
@@ -428,18 +431,19 @@ class Player:
     def _drive_device(self) -> None:
         """Play block after block, no faster than the clock; one that was left behind by `LATE` starts anew.
 
-        A real device has then lost samples; a clock of its own may be slower by `DRIFT`.
+        A real device has then lost samples; a clock of its own may be off by `DRIFT`.
         """
-        loop, start, late = self._playing("play"), time.monotonic(), False
+        loop, late = self._playing("play"), False
         drift, real = DRIFT * loop.driver.block / loop.driver.rate, loop.rendering.plant is None
+        self._block()  # the first one may open a stream
+        start = time.monotonic() - self.time
         while not self._stopping.is_set():
             self._block(late and real)
             ahead = self.time - (time.monotonic() - start)
             late = ahead < -LATE
-            if ahead > NAP:
-                time.sleep(ahead)
-            else:
-                start -= ahead if late else max(min(ahead, 0.0), -drift)
+            start -= ahead if late else min(max(ahead, -drift), drift if real else 0.0)
+            if ahead - drift > NAP:
+                time.sleep(ahead - drift)
 
     def _block(self, late: bool = False) -> None:
         """Play a block; `late`: the device lost samples before it."""

@@ -236,7 +236,7 @@ class RealtimeEntry:
         self._hand_over()
 
     def set_gain(self, gain: float) -> None:
-        """Set the factor on the texture, finite; it is reached within some 30 ms."""
+        """Set the factor on the texture, finite; it is reached to 1 % within 50 ms."""
         if not np.isfinite(gain):
             raise ValueError(f"{gain=}: must be finite")
         self._slot["gain"] = gain

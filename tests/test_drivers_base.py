@@ -127,8 +127,12 @@ def test_an_object_that_is_no_driver_hears_what_it_lacks():
 @pytest.mark.parametrize(
     ("columns", "message"),
     [
-        ({"flags": np.full(4, 1.5)}, "Diary: play: flags is no array of whole numbers: it has fractions, or NaN"),
+        (
+            {"flags": np.full(4, 1.5)},
+            "Diary: play: flags is no array of whole numbers: it has fractions, NaN or infinity",
+        ),
         ({"flags": np.full(4, np.nan)}, "flags is no array of whole numbers"),
+        ({"flags": np.full(4, np.inf)}, "flags is no array of whole numbers"),
         ({"sensed": np.ones((4, 1)) + 0j}, "sensed is no array of numbers: it is complex"),
     ],
 )

@@ -127,6 +127,20 @@ class Faulty(Blocks):
         return self.fault(sensed) if len(self.played) > self.at else sensed
 
 
+@pytest.mark.parametrize("bad", [np.nan, 1e30])
+def test_a_sensor_gone_mad_leaves_the_drive_finite_limited_and_flagged(bad):
+    def spoil(sensed):
+        return sensed._replace(sensed=np.full_like(sensed.sensed, bad), motion=None)
+
+    with pytest.raises(hr.DeviceFault, match="samples are no numbers") as stopped:
+        hr.render(TONE, driver=Faulty(simulated(TONE), 1000, spoil))
+    recording = stopped.value.recording
+    assert np.isfinite(recording.drive).all()
+    assert abs(recording.drive).max() <= 3.0
+    assert np.all(recording.flags[1001:] & (hr.Flag.NONFINITE | hr.Flag.STOPPED))  # the stopped one is no longer asked
+    assert not recording.flags[:1000].any()
+
+
 class Bare(Blocks):
     """A driver whose exit leaves the device as it is."""
 

@@ -140,6 +140,34 @@ def test_a_driver_that_does_not_return_ends_in_an_error_that_says_so(monkeypatch
     stuck.set()
 
 
+@pytest.mark.parametrize("calls_back", [True, False])
+def test_a_device_that_is_being_opened_when_the_application_leaves_is_closed(calls_back):
+    """By another thread: it never plays on, whether it calls back or is played."""
+    opening, closed = threading.Event(), []
+    device = Calling() if calls_back else Lying(1e9, "")
+
+    class Slow(type(device)):
+        def __enter__(self):
+            opening.set()
+            time.sleep(0.3)
+            return super().__enter__()
+
+        def __exit__(self, *error):
+            closed.append(self)
+            return super().__exit__(*error)
+
+    device.__class__ = Slow
+    with hr.Player(driver=device) as player:
+        opener = threading.Thread(target=player.play, args=(TONE,))
+        opener.start()
+        opening.wait(60.0)
+    opener.join(60.0)
+    played = player._loop.samples
+    time.sleep(0.1)
+    assert closed == [device]
+    assert player._loop.samples == played
+
+
 def test_a_disk_that_fails_ends_the_recording_and_not_the_play(tmp_path, monkeypatch):
     with hr.Player(paced=False) as player:
         player.play(TONE)

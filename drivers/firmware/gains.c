@@ -17,8 +17,10 @@
 #define MOST_SWAPPED REAL(1.4)
 #define DEAD REAL(0.25) /* of a sensor: a smaller magnitude is a fault, and a larger gain than this: */
 #define MOST_GAIN REAL(2.0)
+#define LIKELY REAL(9.0) /* variances: 3 sigma of a gain */
+#define HEALTHY REAL(0.5) /* of a gain about 1: one that is neither that nor a fault says that no gain has changed */
 #define UNEXPLAINED REAL(0.1) /* of the energy of the innovations */
-#define UNEXPLAINED_INVERTED REAL(0.2)
+#define UNEXPLAINED_INVERTED REAL(0.15)
 #define CERTAIN REAL(25.0) /* variances: 5 sigma of a gain */
 #define JUMP REAL(20.0)    /* variances: 4.5 sigma of an innovation */
 #define WATCHED REAL(4.0)  /* variances: actuators are followed */
@@ -108,10 +110,16 @@ static uint32_t judge_gains(const gains_t *s, uint32_t kind, real_t noise, uint3
     real_t rest = energy - REAL(2.0) * product(g, b) + g[0] * g[0] * w00 + REAL(2.0) * g[0] * g[1] * w01
         + g[1] * g[1] * w11;
     uint32_t faults = 0u;
+    uint32_t other = 0u;
     for (uint32_t j = 0u; j < 2u; j++) {
         if ((g[j] * g[j] > CERTAIN * variance[j]) && (is_fault(kind, REAL(1.0) + g[j], rest / energy) != 0u)) {
             faults |= 1u << j;
+        } else if ((kind == SENSOR) && (g[j] * g[j] > LIKELY * variance[j]) && (real_abs(g[j]) > HEALTHY)) {
+            other = 1u;
         }
+    }
+    if (other != 0u) { /* a hard press */
+        faults = 0u;
     }
     if (faults == 0u) { /* a swap has to explain more than the gains do, where these are faults */
         rest = ((kind == SENSOR) ? UNEXPLAINED_INVERTED : UNEXPLAINED) * energy;

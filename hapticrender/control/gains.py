@@ -50,9 +50,10 @@ SENSOR, ACTUATOR = np.arange(2)  # kinds of gains
 STATE, MOTION, RESPONSE = np.arange(3)  # models: x; p; xi_1, xi_2, xi_3, zeta_1, zeta_2, zeta_3
 LEAST_INVERTED, MOST_INVERTED = -1.6, -0.4  # gains of a sensor or an actuator that is inverted
 DEAD, MOST_GAIN = 0.25, 2.0  # of a sensor: a smaller magnitude, a larger gain is a fault
+HEALTHY = 0.5  # of a sensor's gain about 1: one that is neither that nor a fault says that the change is none of gains
 LEAST_SWAPPED, MOST_SWAPPED = 0.75, 1.4  # eta; less: a drive that bears more than 2/3 of the moment of a finger
-UNEXPLAINED, UNEXPLAINED_INVERTED = 0.1, 0.2  # of the energy of e; the latter of inverted or swapped sensors
-CERTAIN, JUMP = 25.0, 20.0  # variances: 5 sigma of a gain; 4.5 sigma of an innovation
+UNEXPLAINED, UNEXPLAINED_INVERTED = 0.1, 0.15  # of the energy of e; the latter of inverted or swapped sensors
+CERTAIN, LIKELY, JUMP = 25.0, 9.0, 20.0  # variances: 5 and 3 sigma of a gain; 4.5 sigma of an innovation
 WATCHED, LARGE = 4.0, 20.0  # variances of e: actuators are followed, judged
 WANDER = 3.5  # N/sqrt(s), of d
 TRIAL, LEAST_TRIAL, MEAN, WINDOW = 3e-3, 8, 20e-3, 3e-3  # s, samples, s, s
@@ -205,10 +206,16 @@ def judge_gains(gains, kind, noise):
     rest = energy - 2.0 * (g0 * b[0] + g1 * b[1])
     rest += g0 * g0 * w[0, 0] + 2.0 * g0 * g1 * w[0, 1] + g1 * g1 * w[1, 1]
     s.gain[kind, 0], s.gain[kind, 1] = 1.0 + g0, 1.0 + g1
+    other = False
     for j in range(2):
         g, variance = (g0, w11) if j == 0 else (g1, w00)
-        if g * g > CERTAIN * scale * variance * noise and is_fault(kind, 1.0 + g, rest / energy):
+        variance *= scale * noise
+        if g * g > CERTAIN * variance and is_fault(kind, 1.0 + g, rest / energy):
             faults |= 1 << j
+        elif kind == SENSOR and g * g > LIKELY * variance and abs(g) > HEALTHY:
+            other = True  # a hard press: one gain of -1 beside another of -2, or of 0.35
+    if other:
+        faults = 0
     if faults == 0:
         rest = (UNEXPLAINED_INVERTED if kind == SENSOR else UNEXPLAINED) * energy
     certain = eta * eta * w22 > CERTAIN * noise and LEAST_SWAPPED < eta < MOST_SWAPPED

@@ -3,7 +3,8 @@
 For 200 ms both actuators play lines of their own, away from the modes, so that a resting finger changes little; the
 surface moves by a fortieth of the sensors' range.  The response y is compared with that of the model under 169
 hypotheses h (13 wirings, each with 13 delays) by the residual 1 - <y, y_h>/(|y| |y_h|), with offset, slope and
-parabola taken out of each sensor.  The sensors' noise is what they show in the second half of the silence after it.
+parabola taken out of each sensor.  The sensors' noise is that of second differences in
+the second half of the silence after it.
 """
 
 from __future__ import annotations
@@ -126,7 +127,7 @@ def judge(model: DeviceModel, drive: Array, sensed: Array) -> Found:
     best = min(residuals, key=lambda each: residuals[each])
     own = min((("nothing", delay) for delay in delays), key=lambda each: residuals[each])
     scale, delay = float((y * expected[own]).sum() / (expected[own] ** 2).sum()), own[1] + model.block
-    noise = float(_detrended(silence).std()) if len(silence) else 0.0
+    noise = float(np.diff(silence, 2, axis=0).std() / 6**0.5) if len(silence) else 0.0  # of white noise
     most = MOST_NOISE * (model_energy / y.size) ** 0.5
     fault = ""
     if min(residuals[own], residuals[best] + MOST_WORSE) > MOST_RESIDUAL and noise > most:

@@ -162,7 +162,7 @@ def _thirds(
     """``e_b = rms_b(e)/max(rms_b(r), floor(b))`` of every third octave b inside B, and the largest.
 
     On a plate (m) those above B count, too, up to 1000 Hz or 0.4 of the rate: a device need not follow r there, so
-    only the excess ``sqrt(rms_b(y)^2 - rms_b(r)^2)`` is an error where it is less than rms_b(e).
+    only the excess ``rms_b(y) - rms_b(r)`` is an error where it is less than rms_b(e).
     """
     low, high = _band(rate)
     found = {}
@@ -170,7 +170,7 @@ def _thirds(
         if low <= middle / EDGE and middle * EDGE <= (HIGHEST * rate if unit == "m" else high):
             reference, error, motion = spectrum[_within(frequency, middle / EDGE, middle * EDGE)].sum(axis=0)
             if middle * EDGE > high:
-                error = min(error, max(motion - reference, 0.0))
+                error = min(error, max(math.sqrt(motion) - math.sqrt(reference), 0.0) ** 2)
             found[f"{name:g} Hz"] = math.sqrt(error) / max(math.sqrt(reference), floor(middle))
     worst = max(found, key=lambda name: found[name], default=None)
     return {"third_octave_error": found.get(worst or ""), "third_octave": worst, "third_octaves": found}

@@ -80,7 +80,9 @@ class SeparatedTexture:
         if self.spatial and self._varies(True, READINGS, 0):
             raise ValueError(f"{name}: must not change with time: it lies along the surface")
         if self.timed and self._varies(False, SOON, 1):
-            raise ValueError(f"{name}: must not change with the finger's position: it lies in time (see `spatial`)")
+            raise ValueError(
+                f"{name}: must not change with the finger's position, or with each reading: it lies in time"
+            )
 
     def _varies(self, spatial: bool, times: Array, axis: int) -> bool:
         """Whether a part changes over `times` (axis 0, s), or over `PLACES` (axis 1)."""
