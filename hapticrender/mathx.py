@@ -39,7 +39,7 @@ def zoh(a: Array, b: Array, period: float) -> tuple[Array, Array]:
     augmented[:n] = period * np.hstack([a, b])
     halvings = max(math.ceil(math.log2(np.abs(augmented).sum(axis=0).max() + 1e-300)) + 1, 0)
     found = term = np.eye(n + m)
-    for k in range(1, 16):  # norm <= 1/2; scipy's `expm` wakes BLAS's threads: 10 ms on a busy machine
+    for k in range(1, 16):  # norm <= 1/2; scipy's `expm` starts BLAS's threads: 10 ms on a busy machine
         term = term @ augmented / (k * 2.0**halvings)
         found = found + term
     for _ in range(halvings):

@@ -19,7 +19,7 @@ import math
 import threading
 import time
 from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
 from functools import partial
@@ -32,9 +32,10 @@ import numpy as np
 from hapticrender.control.carriers import FASTEST
 from hapticrender.control.probe import probe_plate
 from hapticrender.devices import open_driver
-from hapticrender.errors import DriverError, HapticError, WatchdogTimeout
+from hapticrender.errors import HapticError, WatchdogTimeout
 from hapticrender.live_loop import LiveLoop, LiveMotion
 from hapticrender.live_recorder import LiveRecorder
+from hapticrender.live_threads import LiveThreads, hold_to_clock
 from hapticrender.loop import play_zeros, prepare, stopped_by_sigterm, zero_drive_after
 from hapticrender.player_state import BandState, PlayerState
 from hapticrender.protocols import Driver, Flag, Rendering, Texture
@@ -53,8 +54,6 @@ UPDATES = 0.2  # s: two positions within this time show a velocity
 END_FADE = 0.05  # s: five time constants of the gain; and the longest that zeros are waited for
 LEAST_PART = 2 * SERVICE  # s: of a playlist whose parts are taken up one by one
 POINTING, INSTANT = 0.01, 1e-4  # s between two positions of a scene's finger; over which its velocity is found
-NAP, LATE = 2e-3, 0.1  # s: shorter waits are not slept; so late the clock starts anew
-DRIFT = 0.01  # of the clock
 PATIENCE = 5.0  # s without a sample, after which `sleep` gives a device up
 
 
@@ -125,9 +124,10 @@ class Player:
         self._calls = 0  # of the application that are under way
         self._entered, self._clocked = False, False  # whether the device has a clock of its own: it is not played
         self._recorded, self._served = 0, 0.0  # samples of this loop that were looked at; when the last look was
-        self._stack, self._stopping, self._lock = ExitStack(), threading.Event(), threading.RLock()
+        self._stack, self._threads, self._lock = ExitStack(), LiveThreads(), threading.RLock()
+        self._stopping = self._threads.stopping
         self._changing = threading.RLock()  # of the texture; taken before `_lock`
-        self._patience, self._hangs = PATIENCE, threading.Event()  # s, blocks of the driver included; whether it hangs
+        self._patience = PATIENCE  # s; and two blocks of the driver
 
     def __enter__(self) -> Self:
         self._entered = True
@@ -365,8 +365,8 @@ class Player:
         self._hand_finger(rendering)
         stack.enter_context(stopped_by_sigterm())
         rendering.driver.__enter__()
-        stack.push(lambda *error: None if self._hangs.is_set() else rendering.driver.__exit__(*error))
-        stack.enter_context(zero_drive_after(device, self._hangs.is_set))
+        stack.push(lambda *error: None if self._threads.hanging.is_set() else rendering.driver.__exit__(*error))
+        stack.enter_context(zero_drive_after(device, self._threads.hanging.is_set))
         if rendering.probe:
             probe_plate(device, rendering.model)
         self._loop = loop
@@ -382,9 +382,9 @@ class Player:
         elif own:
             loop.start()
         elif self._paced:
-            self._run_thread(self._drive_device)
+            self._run(self._drive_device, device)
         if self._paced:
-            self._run_thread(self._serve)
+            self._run(self._serve, device)
         return renderings
 
     def _hand_finger(self, rendering: Rendering) -> None:
@@ -396,28 +396,14 @@ class Player:
             for part in (plant, getattr(plant, "screen", plant)):
                 part.finger = live
 
-    def _run_thread(self, target: Any) -> None:
-        """Run `target` until the player stops; what it raises is kept for the application."""
+    def _run(self, target: Callable[[], None], device: object) -> None:
+        """Run `target` in a thread until the player stops; what it raises is kept for the application."""
 
-        def run() -> None:
-            try:
-                target()
-            except BaseException as error:
-                self._error = self._error or error
-                self._zero_drive()
+        def failed(error: BaseException) -> None:
+            self._error = self._error or error
+            self._zero_drive()
 
-        thread = threading.Thread(target=run, name=target.__name__.strip("_"), daemon=True)
-        thread.start()
-
-        def end() -> None:
-            self._stopping.set()
-            thread.join(self._patience)
-            if thread.is_alive():
-                self._hangs.set()
-                trouble = f"its driver has not returned for {self._patience:.3g} s: zero drive could not be played"
-                raise DriverError(f"{self._playing('play').rendering.device}: {trouble}: switch the device off")
-
-        self._stack.callback(end)
+        self._stack.callback(self._threads.end, self._threads.start(target, failed), device, self._patience)
 
     def _zero_drive(self) -> None:
         """Set zero drive at once, on a device that may have failed; the next call raises the error."""
@@ -429,21 +415,7 @@ class Player:
                 play_zeros(loop.driver)
 
     def _drive_device(self) -> None:
-        """Play block after block, no faster than the clock; one that was left behind by `LATE` starts anew.
-
-        A real device has then lost samples; a clock of its own may be off by `DRIFT`.
-        """
-        loop, late = self._playing("play"), False
-        drift, real = DRIFT * loop.driver.block / loop.driver.rate, loop.rendering.plant is None
-        self._block()  # the first one may open a stream
-        start = time.monotonic() - self.time
-        while not self._stopping.is_set():
-            self._block(late and real)
-            ahead = self.time - (time.monotonic() - start)
-            late = ahead < -LATE
-            start -= ahead if late else min(max(ahead, -drift), drift if real else 0.0)
-            if ahead - drift > NAP:
-                time.sleep(ahead - drift)
+        hold_to_clock(self._playing("play"), self._block, self._stopping)
 
     def _block(self, late: bool = False) -> None:
         """Play a block; `late`: the device lost samples before it."""

@@ -104,7 +104,7 @@ def finger_prior(model: DeviceModel) -> tuple[Array, Array]:
     rows = basis * weight[:, None]
     exact = (stiffness * weight).T
     solve = np.linalg.pinv(np.vstack([rows.real, rows.imag]))
-    found = np.einsum("ij,jk", solve, np.vstack([exact.real, exact.imag]))  # `lstsq` would wake BLAS's threads: 20 ms
+    found = np.einsum("ij,jk", solve, np.vstack([exact.real, exact.imag]))  # `lstsq` starts BLAS's threads: 20 ms
     covariance = np.cov(found)
     return found.mean(axis=1), covariance + np.diag(0.02 * covariance.diagonal())
 

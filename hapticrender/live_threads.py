@@ -1,0 +1,66 @@
+"""Threads of live play: what runs until a player stops, and a device without a clock of its own, held to the clock."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+
+from hapticrender.errors import DriverError
+from hapticrender.live_loop import LiveLoop
+
+NAP, LATE = 2e-3, 0.1  # s: shorter waits are not slept; so late the clock starts anew
+DRIFT = 0.01  # of the clock
+
+
+class LiveThreads:
+    """Threads that run until `stopping` is set; `hanging` is set where one does not end then."""
+
+    def __init__(self) -> None:
+        self.stopping, self.hanging = threading.Event(), threading.Event()
+
+    def start(self, target: Callable[[], None], failed: Callable[[BaseException], None]) -> threading.Thread:
+        """Run `target` in a thread; what it raises goes to `failed`."""
+
+        def run() -> None:
+            try:
+                target()
+            except BaseException as error:
+                failed(error)
+
+        thread = threading.Thread(target=run, name=target.__name__.strip("_"), daemon=True)
+        thread.start()
+        return thread
+
+    def end(self, thread: threading.Thread, device: object, patience: float) -> None:
+        """Stop all threads and wait for one, which may be in `play` of the device.
+
+        Raises
+        ------
+        DriverError
+            It has not ended within `patience` (s).
+        """
+        self.stopping.set()
+        thread.join(patience)
+        if thread.is_alive():
+            self.hanging.set()
+            trouble = f"its driver has not returned for {patience:.3g} s: zero drive could not be played"
+            raise DriverError(f"{device}: {trouble}: switch the device off")
+
+
+def hold_to_clock(loop: LiveLoop, play: Callable[[bool], None], stopping: threading.Event) -> None:
+    """Play block after block, no faster than the clock; one that was left behind by `LATE` starts anew.
+
+    A real device has then lost samples, and `play` is called with True; a clock of its own may be off by `DRIFT`.
+    """
+    rate, late = loop.driver.rate, False
+    drift, real = DRIFT * loop.driver.block / rate, loop.rendering.plant is None
+    play(False)  # the first one may open a stream
+    start = time.monotonic() - loop.samples / rate
+    while not stopping.is_set():
+        play(late and real)
+        ahead = loop.samples / rate - (time.monotonic() - start)
+        late = ahead < -LATE
+        start -= ahead if late else min(max(ahead, -drift), drift if real else 0.0)
+        if ahead - drift > NAP:
+            time.sleep(ahead - drift)
