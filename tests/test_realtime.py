@@ -367,6 +367,13 @@ def test_what_a_sampled_texture_refuses():
     with pytest.raises(ValueError, match="Follows: must not change with the finger's position"):
         SampledTexture(Follows(False), RATE)
 
+    class Touched(Wave):
+        def waveform(self, time, position):
+            return 1e-6 * np.sin(300.0 * time) * np.isfinite(position)  # would be silent: samples know no finger
+
+    with pytest.raises(ValueError, match="Touched: must not change with the finger's position or contact"):
+        SampledTexture(Touched(False), RATE)
+
     class Travels(Wave):
         def waveform(self, time, position):
             return 1e-6 * np.sin(2e3 * np.pi * position - 300.0 * time)

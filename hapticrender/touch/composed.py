@@ -79,9 +79,11 @@ class SeparatedTexture:
         self.timed, self.spatial = (any(along == kind for _, along, _, _ in self._terms) for kind in (False, True))
         if self.spatial and self._varies(True, READINGS, 0):
             raise ValueError(f"{name}: must not change with time: it lies along the surface")
-        if self.timed and self._varies(False, SOON, 1):
+        if self.timed and (
+            self._varies(False, SOON, 1) or (self.in_time(SOON) != self._sum(False, SOON, 0.0 * SOON)).any()
+        ):
             raise ValueError(
-                f"{name}: must not change with the finger's position, or with each reading: it lies in time"
+                f"{name}: must not change with the finger's position or contact, or with each reading: it lies in time"
             )
 
     def _varies(self, spatial: bool, times: Array, axis: int) -> bool:
