@@ -26,7 +26,7 @@ import numpy as np
 from hapticrender.control.records import CONTROLLER
 from hapticrender.control.state_transfer import drive_limits, state_table
 from hapticrender.control.supervisor import FADE_OUT
-from hapticrender.jit import CFunction, addresses
+from hapticrender.jit import CFunction, addresses, record_of
 from hapticrender.protocols import Array, Flag
 from hapticrender.realtime_kernel import AUDIO, CONTROL, ENTRY, HOLD, PLAIN, SLOT, publish
 from hapticrender.sampled_texture import FADE, SampledTexture
@@ -49,14 +49,14 @@ class _Control:
         self.limit = np.maximum(drive_limits(controller), limit)
         self._target = np.zeros((controller.block, controller.n_bands), complex)
         self._signals = addresses(**signals, target=self._target)
-        self.record = np.zeros(1, CONTROL)
-        self.record[0] = (
-            controller.step.address,
-            controller.state.ctypes.data,
-            self._signals.ctypes.data,
-            controller.bands.envelope is None,
-            self.shared.ctypes.data,
-            self.limit.ctypes.data,
+        self.record = record_of(
+            CONTROL,
+            step=controller.step.address,
+            state=controller.state,
+            signals=self._signals,
+            analysed=controller.bands.envelope is None,
+            shared=self.shared,
+            limit_at=self.limit,
         )
         self.address = int(self.record.ctypes.data)
 
@@ -109,13 +109,9 @@ class RealtimeEntry:
         self._tracker["p"]["rate"] = self.rate
         self._arrays = self._buffers()
         self._first = self._control = _Control(controller, self._signals)  # which may run without a texture
-        self._entry = np.zeros(1, ENTRY)
-        memory = {**self._arrays, "slots": self._slots}
-        numbers = {f"{name}_at": array.ctypes.data for name, array in memory.items()} | self._start()
-        numbers |= {"control": self._control.address, "tracker": self._tracker.ctypes.data}
-        numbers |= {"sensed_scale": sensed_scale, "drive_scale": drive_scale}
-        for name, value in numbers.items():
-            self._entry[name] = value
+        fields = {f"{name}_at": array for name, array in {**self._arrays, "slots": self._slots}.items()} | self._start()
+        fields |= {"control": self._control.address, "tracker": self._tracker}
+        self._entry = record_of(ENTRY, **fields, sensed_scale=sensed_scale, drive_scale=drive_scale)
         self.user_data = int(self._entry.ctypes.data)
 
     def _buffers(self) -> dict[str, Array]:
@@ -137,7 +133,7 @@ class RealtimeEntry:
     def _signals(self) -> dict[str, Array]:
         return {name: self._arrays[name] for name in BLOCK}
 
-    def _start(self) -> dict[str, float]:
+    def _start(self) -> dict[str, Any]:
         """Numbers of the record at rest."""
         log, rate = self._arrays["log"], self.rate
         return {
