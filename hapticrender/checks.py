@@ -225,7 +225,8 @@ class Validated:
 
     def __init_subclass__(cls) -> None:
         above = {name for base in cls.__mro__[1:] for name in vars(base).get("__annotations__", ())}
-        own = [name for name in vars(cls).get("__annotations__", ()) if name not in above]
+        hints = vars(cls).get("__annotations__", {})
+        own = [name for name, hint in hints.items() if name not in above and "ClassVar" not in str(hint)]
         about = {name: getattr(vars(cls).get(name), "metadata", {}) for name in own}
         text = inspect.cleandoc(cls.__doc__ or "")
         if about and "Parameters\n---" not in text and all("about" in each for each in about.values()):

@@ -5,8 +5,7 @@ from __future__ import annotations
 import csv
 import os
 from array import array
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +14,7 @@ import numpy as np
 from hapticrender.bands import Bands
 from hapticrender.checks import number, require, show
 from hapticrender.protocols import Array
-from hapticrender.recordings.formats import _h5py
+from hapticrender.recordings.formats import _h5py, naming_damage
 from hapticrender.recordings.journal import Header, join
 
 METHOD = "recorded elsewhere"
@@ -76,8 +75,7 @@ def assemble(
 
     See ``Recording.from_columns``.
     """
-    from hapticrender.touch.custom import Custom
-    from hapticrender.touch.scene import Scene
+    from hapticrender.touch.scene import Custom, Scene
 
     source = "columns" if isinstance(columns, Mapping) else Path(columns).name
     table = columns if isinstance(columns, Mapping) else read_columns(columns)
@@ -250,19 +248,10 @@ def _number(text: str) -> float | None:
         return None
 
 
-@contextmanager
-def _damaged(path: Path, kind: str) -> Iterator[None]:
-    """Turn whatever a library raises about a damaged file into a ValueError."""
-    try:
-        yield
-    except Exception as error:
-        raise ValueError(f"{path}: damaged, or not {kind} ({error})") from error
-
-
 def _read_mat(path: Path) -> Mapping[str, Any]:
     from scipy.io import loadmat
 
-    with _damaged(path, "a MAT file"):
+    with naming_damage(path, "damaged, or not a MAT file"):
         try:
             found = loadmat(path, appendmat=False)
         except NotImplementedError:  # version 7.3 is HDF5
@@ -280,15 +269,12 @@ def _read_hdf5(path: Path) -> dict[str, Array]:
         if isinstance(entry, h5py.Dataset):
             found[name] = entry[()]
 
-    with _damaged(path, "an HDF5 file"), h5py.File(path, "r") as file:
+    with naming_damage(path, "damaged, or not an HDF5 file"), h5py.File(path, "r") as file:
         file.visititems(take)
     return found
 
 
 def _read_npz(path: Path) -> dict[str, Array]:
-    with (
-        _damaged(path, "an NPZ file of arrays"),
-        path.open("rb") as opened,
-        np.load(opened, allow_pickle=False) as file,
-    ):
+    problem = "damaged, or not an NPZ file of arrays"
+    with naming_damage(path, problem), path.open("rb") as opened, np.load(opened) as file:
         return {name: file[name] for name in file.files}

@@ -21,21 +21,11 @@ MOST_PARTIALS = 4096
 Partial = tuple[float, float, float]
 
 
-def _sine(count: int) -> tuple[Partial, ...]:
-    return ((1.0, 1.0, 0.0),)
-
-
-def _square(count: int) -> tuple[Partial, ...]:
-    """Fourier series of a square wave of height 1 that is +1 at phase 0: (4/pi) (cos p - cos 3p/3 + ...)."""
-    return tuple((2.0 * n + 1, 4 / (np.pi * (2 * n + 1)), np.pi * (n % 2)) for n in range(count))
-
-
-def _triangle(count: int) -> tuple[Partial, ...]:
-    """Fourier series of a triangle wave of height 1 that is +1 at phase 0: (8/pi^2) (cos p + cos 3p/9 + ...)."""
-    return tuple((2.0 * n + 1, 8 / (np.pi * (2 * n + 1)) ** 2, 0.0) for n in range(count))
-
-
-SHAPES: dict[str, Callable[[int], tuple[Partial, ...]]] = {"sine": _sine, "square": _square, "triangle": _triangle}
+SHAPES: dict[str, Callable[[int], Partial]] = {  # partial n of a Fourier series of height 1 that is +1 at phase 0
+    "sine": lambda n: (1.0, 1.0, 0.0),  # which has one
+    "square": lambda n: (2.0 * n + 1, 4 / (np.pi * (2 * n + 1)), np.pi * (n % 2)),
+    "triangle": lambda n: (2.0 * n + 1, 8 / (np.pi * (2 * n + 1)) ** 2, 0.0),
+}
 
 
 def _read_partials(key: str, partials: Any) -> tuple[Partial, ...]:
@@ -130,8 +120,8 @@ class Grating(Validated, Composable):
 
     def spectrum(self) -> tuple[Array, Array]:
         """Order (1) and complex amplitude (m) of every partial, the fundamental's phase included."""
-        table = np.array(self.partials or SHAPES[self.shape](self.harmonics))
-        order, relative, own_phase = table.T
+        count = 1 if self.shape == "sine" else self.harmonics
+        order, relative, own_phase = np.array(self.partials or [SHAPES[self.shape](n) for n in range(count)]).T
         return order, self.amplitude * relative * np.exp(1j * (own_phase + order * self.phase))
 
     def bands(self, rate: float) -> Bands:

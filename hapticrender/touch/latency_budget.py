@@ -52,12 +52,6 @@ def _system(gain: Array, step: float, latency: float = 0.0, easing: float = 0.0)
     return a, b
 
 
-def _row(ahead: float, age: float = 0.0, easing: float = 0.0) -> Array:
-    """C(h), `age` after the arrival of the last sample, shape (5,)."""
-    u = age / easing if easing > 0.0 else 0.0
-    return np.r_[transition(ahead)[0], u * math.exp(-u), math.exp(-u)]
-
-
 def _noise_gain(a: Array, b: Array) -> Array:
     """S of the module: covariance of the state under white noise of variance 1."""
     total, power = np.outer(b, b), a
@@ -147,7 +141,8 @@ def position_error(
         turn = np.exp(1j * omega * step)
         played, spread = np.linalg.solve(turn * np.eye(5) - a, turn * b), _noise_gain(a, b)
     for age, share in _ages(panel):
-        row = _row(late + age, age, easing) if predicted else np.eye(5)[0]
+        u = age / easing if easing > 0.0 else 0.0
+        row = np.r_[transition(late + age)[0], u * math.exp(-u), math.exp(-u)]  # C(h)
         found, noise = (row @ played, row @ spread @ row) if predicted else (1.0, 1.0)
         bias = 0.5 * (amplitude * abs(found - np.exp(1j * omega * (late + age)))) ** 2
         square, weight = square + share * (bias + variance * noise), weight + share

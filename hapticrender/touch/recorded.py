@@ -291,16 +291,7 @@ LEAST_GAP = 40.0  # Hz
 class Synthetic(Validated, Composable):
     """A texture like a recorded one that needs no file: a few components with slowly varying amplitudes.
 
-    Parameters
-    ----------
-    amplitude : float, m
-        Bound of the sum of all components, never exceeded; > 0 and <= 0.01.
-    speed : float, m/s, or None
-        At which the components lie at 30 to 400 Hz; None: over time.
-    components : int
-        1 to 8, at least 40 Hz apart.
-    seed : int
-        The same seed is the same texture, >= 0.
+    Without a speed it is over time.
 
     Examples
     --------
@@ -310,10 +301,10 @@ class Synthetic(Validated, Composable):
 
     kind: ClassVar[str] = "synthetic"
 
-    amplitude: float = parameter(unit="m", above=0, most=MOST_AMPLITUDE)
-    speed: float | None = parameter(None, "m/s", above=1e-6, most=MOST_SPEED)
-    components: int = parameter(6, least=1, most=8)
-    seed: int = parameter(0, least=0, most=2**32 - 1)
+    amplitude: float = parameter(unit="m", about="bound of their sum, never exceeded", above=0, most=MOST_AMPLITUDE)
+    speed: float | None = parameter(None, "m/s", "at which they lie at 30 to 400 Hz", above=1e-6, most=MOST_SPEED)
+    components: int = parameter(6, about="how many, at least 40 Hz apart", least=1, most=8)
+    seed: int = parameter(0, about="the same one is the same texture", most=2**32 - 1)
 
     @property
     def spatial(self) -> bool:

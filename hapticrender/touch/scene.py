@@ -9,17 +9,16 @@ from dataclasses import MISSING, dataclass, field, fields
 from itertools import count
 from numbers import Integral
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
 from hapticrender import checks, defaults
 from hapticrender.checks import Validated, checked, mapping, parameter
-from hapticrender.errors import naming
+from hapticrender.errors import SceneError, naming
 from hapticrender.protocols import Texture
 from hapticrender.touch import toml
 from hapticrender.touch.composed import Chirp, Playlist, Sum
-from hapticrender.touch.custom import Custom
 from hapticrender.touch.device_profile import ENDING, DeviceProfile, table_of
 from hapticrender.touch.finger import Finger
 from hapticrender.touch.grating import Grating
@@ -27,6 +26,28 @@ from hapticrender.touch.mechanics import NAMED
 from hapticrender.touch.motion import LONGEST_TIME, Nowhere, RecordedMotion, Sampled, SineMotion, Still, TriangleMotion
 from hapticrender.touch.recorded import Recorded, Swipe, Synthetic
 from hapticrender.touch.touch_panel import TouchPanel
+
+LONGEST_LINE = 500  # characters
+
+
+@dataclass(frozen=True)
+class Custom(Validated):
+    """One printable line about a texture or motion made in Python: keeps recordings readable, refuses to play."""
+
+    kind: ClassVar[str] = "custom"
+
+    description: str
+
+    def __post_init__(self) -> None:
+        line = "".join(filter(str.isprintable, " ".join(str(self.description).split())))
+        checks.keep(self, description=line[:LONGEST_LINE])
+
+    def bands(self, *arguments: Any) -> Any:
+        """Raise a `SceneError`: of the object there is only this line."""
+        raise SceneError(f"description = {self.description!r}: what was made in Python cannot be played from a file")
+
+    waveform = position = load = bands
+
 
 TEXTURES: dict[str, type[Any]] = {
     kind.kind: kind for kind in (Grating, Recorded, Swipe, Synthetic, Chirp, Sum, Playlist, Custom)
