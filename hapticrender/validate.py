@@ -26,8 +26,7 @@ from hapticrender.errors import HapticError, SceneError
 from hapticrender.formatting import as_json, printable
 from hapticrender.loop import prepare, run
 from hapticrender.protocols import Rendering
-from hapticrender.report.outputs import JOURNAL, begin_outputs, refuse_to_overwrite, remove_outputs, write_outputs
-from hapticrender.report.progress import progress as progress_of
+from hapticrender.report import outputs
 from hapticrender.report.text import verdict as sentence
 from hapticrender.touch.builtin_scenes import builtin_scenes
 from hapticrender.touch.scene import Scene, distinct_names
@@ -125,7 +124,8 @@ def validate(
         if jobs > 1:
             pool = ProcessPoolExecutor(jobs, multiprocessing.get_context("spawn"))
             stack.callback(pool.shutdown, cancel_futures=True)
-            calls = [partial(_result, pool.submit(judge, *entry, None)) for entry in entries]
+            futures = [pool.submit(judge, *entry, None) for entry in entries]
+            calls = [lambda _, future=each: future.result() for each in futures]  # type: ignore[misc]
         return [_shown(line, progress, call) for line, call in zip(shown, calls, strict=True)]
 
 
@@ -176,15 +176,11 @@ def _problem(error: Exception) -> str:
     return str(error) if known else f"{type(error).__name__}: {error}"
 
 
-def _result(future: Any, _: Tick | None) -> Verdict:
-    return future.result()
-
-
 def _shown(line: str, stream: TextIO | None, judge: Callable[[Tick | None], Verdict]) -> Verdict:
     """Judge a scene, with a `line` of progress."""
     if not line or stream is None:
         return judge(None)
-    with progress_of(line, stream) as tick:
+    with outputs.progress(line, stream) as tick:
         return judge(tick)
 
 
@@ -192,14 +188,14 @@ def _summary(rendering: Rendering, folder: Path | None, tick: Tick | None) -> di
     """Run a rendering, whatever its length, and judge it; only what does not pass stays in `folder`."""
     if folder is None:
         with tempfile.TemporaryDirectory() as scratch:
-            return run(rendering, journal=Path(scratch) / JOURNAL, progress=tick).summary()
-    refuse_to_overwrite(folder)
-    recording = run(rendering, journal=begin_outputs(folder, rendering.scene), progress=tick)
+            return run(rendering, journal=Path(scratch) / outputs.JOURNAL, progress=tick).summary()
+    outputs.refuse_to_overwrite(folder)
+    recording = run(rendering, journal=outputs.begin_outputs(folder, rendering.scene), progress=tick)
     summary = recording.summary()
     if not summary["passed"]:
-        return dict(write_outputs(folder, recording).summary)
+        return dict(outputs.write_outputs(folder, recording).summary)
     del recording  # closes its journal
-    remove_outputs(folder)
+    outputs.remove_outputs(folder)
     return summary
 
 

@@ -49,18 +49,12 @@ def _write_csv(path: Path, names: list[str], rows: np.ndarray[Any, Any]) -> None
 
 def _figures(record: FingerRecord) -> dict[str, Any]:
     """Numbers beside the tables, ready for JSON."""
-    plate = record.plate
     return {
         "name": record.name,
         "bandwidth": {name: getattr(record, name).bandwidth for name in SERIES},
         "least_load": record.least_load,
         "segments": [{"kind": KINDS[each.kind], "start": each.start, "stop": each.stop} for each in record.segments],
-        "plate": {
-            "measured": plate.measured,
-            "time": plate.time.tolist(),
-            "values": {name: each.tolist() for name, each in plate.values.items()},
-            "standard_errors": {name: each.tolist() for name, each in plate.standard_errors.items()},
-        },
+        "plate": vars(record.plate),
         "notes": list(record.notes),
     }
 

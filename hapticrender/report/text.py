@@ -129,16 +129,11 @@ def beside(summary: Mapping[str, Any]) -> str:
 
 def conditions(summary: Mapping[str, Any]) -> str:
     """State in a line what was rendered, how, for how long, and which flags were set."""
+    flags = ", ".join(f"{name.lower()} {count}" for name, count in summary["flags"].items() if count) or "none"
     return (
         f"{summary['scene']} on {summary['device']}, method {summary['method']}, seed {summary['seed']}: "
-        f"{short(summary['duration'], 's')}, judged from {short(summary['judged_from'], 's')}, "
-        f"flagged samples: {flags(summary)}"
+        f"{short(summary['duration'], 's')}, judged from {short(summary['judged_from'], 's')}, flagged samples: {flags}"
     )
-
-
-def flags(summary: Mapping[str, Any]) -> str:
-    """State in how many samples each status flag was set."""
-    return ", ".join(f"{name.lower()} {count}" for name, count in summary["flags"].items() if count) or "none"
 
 
 def describe(scene: Scene) -> str:
