@@ -21,6 +21,7 @@ from hapticrender.bands import Bands
 from hapticrender.checks import Validated, check_names, inside, parameter, require
 from hapticrender.control.combined import CombinedBands, CombinedController, CombinedModel, design_combined
 from hapticrender.control.device_model import DeviceModel
+from hapticrender.mathx import smoothstep
 from hapticrender.plants.electroadhesion import ElectroadhesionParameters, ElectroadhesionScreen
 from hapticrender.plants.hybrid import PLACES, HybridPlant
 from hapticrender.plants.plate import PlateParameters
@@ -51,8 +52,7 @@ class HybridSettings(Validated):
 
     def share_of_screen(self, frequency: Any) -> Any:
         """Share of a band at `frequency` (Hz) that the screen takes; the plate takes the rest."""
-        x = np.clip(np.asarray(frequency, float) / self.start - 1.0, 0.0, 1.0)
-        return x * x * (3.0 - 2.0 * x)
+        return smoothstep(np.asarray(frequency, float) / self.start - 1.0)
 
 
 @dataclass(frozen=True)
@@ -250,15 +250,15 @@ def _split(scene: Scene) -> tuple[HybridSettings, Scene, Scene]:
         check_names(scene.rendering, own | of_screen, scene_keys("render"))
         settings = HybridSettings(**{key: value for key, value in scene.rendering.items() if key in own})
     with inside("device"):
-        profiles = _split_table(scene.profile, own | of_screen)
+        plate, screen = _split_table(scene.profile, own | of_screen)
     with inside("simulation"):
-        simulations = _split_table(scene.simulation, own | of_screen)
-    renderings = {}, {key: value for key, value in scene.rendering.items() if key not in own}
-    plate, screen = (
-        replace(scene, profile=profile, simulation=simulation, rendering=rendering)
-        for profile, simulation, rendering in zip(profiles, simulations, renderings, strict=True)
+        of_plate, on_screen = _split_table(scene.simulation, own | of_screen)
+    rendering = {key: value for key, value in scene.rendering.items() if key not in own}
+    return (
+        settings,
+        replace(scene, profile=plate, simulation=of_plate, rendering={}),
+        replace(scene, profile=screen, simulation=on_screen, rendering=rendering, limits={}),  # which are the plate's
     )
-    return settings, plate, replace(screen, limits={})  # they are those of the plate
 
 
 def _split_table(values: Mapping[str, Any], settings: set[str]) -> list[dict[str, Any]]:

@@ -124,7 +124,6 @@ def fit_finger(
     order: int | None = None,
     *,
     loads: tuple[float, float] = (0.0, inf),
-    load_exponent: float | None = None,
 ) -> FingerFit:
     """Fit a finger of 2nd or 4th order to measured impedances by weighted complex least squares.
 
@@ -137,8 +136,6 @@ def fit_finger(
         None takes the order that the data support: the 4th where the Bayesian information criterion is smaller.
     loads : (float, float), N
         The class of loads: least (included) and largest (excluded).
-    load_exponent : float or None
-        Growth of |Z_f| with the load inside the class; None fits it, 0 takes the finger as the same at all loads.
 
     Returns
     -------
@@ -186,10 +183,10 @@ def fit_finger(
             f"finger of order {order or 2} needs at least {fewest}: record more frequencies, or widen the loads"
         )
     patterns = _plate_patterns(impedance, samples)
-    second = _fit(samples, patterns, 2, load_exponent)
+    second = _fit(samples, patterns, 2)
     if order == 2 or (order is None and found < FEWEST[4]):
         return second
-    fourth = _fit(samples, patterns, 4, load_exponent, second)
+    fourth = _fit(samples, patterns, 4, second)
     return fourth if order == 4 else _supported(second, fourth)
 
 
@@ -246,15 +243,13 @@ def _plate_patterns(impedance: Source | Sequence[Source], samples: Samples) -> A
     return np.array(columns).reshape(-1, len(w)).T
 
 
-def _fit(
-    samples: Samples, patterns: Array, order: int, exponent: float | None, second: FingerFit | None = None
-) -> FingerFit:
+def _fit(samples: Samples, patterns: Array, order: int, second: FingerFit | None = None) -> FingerFit:
     """Fit one order, from several starts where it is the 4th, and the errors of the plates on the way."""
     from scipy.optimize import least_squares
 
     names, logs = NAMES[: 3 * order // 2], np.log(samples.load)
-    fixed = {"order": order, "reference_load": float(np.exp(logs.mean())), "load_exponent": exponent or 0.0}
-    if exponent is None and np.ptp(logs) > APART:
+    fixed = {"order": order, "reference_load": float(np.exp(logs.mean())), "load_exponent": 0.0}
+    if np.ptp(logs) > APART:
         names = (*names, "load_exponent")
     units, weight, count = np.array([UNITS[name] for name in names]), 1 / samples.standard_error, len(names)
 

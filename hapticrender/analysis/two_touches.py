@@ -209,7 +209,9 @@ class TouchMonitor:
 
     def _test(self, parts: Array, lever: Array) -> TouchTest:
         """T over d by a grid and two refinements; the plate's errors are found for each d by least squares."""
-        lever = self._smoothed(lever)
+        from scipy.ndimage import uniform_filter1d
+
+        lever = uniform_filter1d(lever, max(round(SMOOTHED * self.model.rate), 1), mode="nearest")
         force, per_error = self._force(parts), self._regressors(parts)
         along, across = self._spectrum(force[0]), self._spectrum(force[1] - lever * force[0])
         rows = self._spectrum(per_error[1] - lever * per_error[0]), self._spectrum(per_error[0])
@@ -229,11 +231,6 @@ class TouchMonitor:
             best, statistic = float(errors[np.argmin(totals)]), float(totals.min())
         freedom = 2.0 * along.size - (1.0 if self._rest is not None else 0.0)  # at 0 Hz a number is real
         return TouchTest(statistic, freedom, bound_of(freedom), best / self.model.lever_per_metre)
-
-    def _smoothed(self, lever: Array) -> Array:
-        width = max(round(SMOOTHED * self.model.rate), 1)
-        padded = np.pad(lever, (width // 2, width - 1 - width // 2), "edge")
-        return np.convolve(padded, np.full(width, 1.0 / width), "valid")
 
     def _changes(self, lever: Array) -> Array:
         """First derivative of the lever arm times a lateness, and second one times half its square, shape (2, n)."""
