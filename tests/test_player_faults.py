@@ -179,7 +179,7 @@ def test_a_disk_that_fails_ends_the_recording_and_not_the_play(tmp_path, monkeyp
         def full(**signals):
             raise OSError(28, "No space left on device")
 
-        monkeypatch.setattr(player._recorder._recorder, "append", full)
+        monkeypatch.setattr(player._recorder, "append", full)
         player.sleep(0.5)
         assert player.state().bands[0].error < 0.02
         with pytest.raises(OSError, match="No space left"):
