@@ -142,12 +142,7 @@ class Relay:
         values = {"block": block, "sensors": len(inputs), "channels": len(outputs)}
         values |= {"wide_in": wide_in, "wide_out": wide_out}
         self._record = record_of(RELAY, **values, **{f"{name}_at": each for name, each in self._arrays.items()})
-        self.user_data = int(self._record.ctypes.data)
-
-    @property
-    def address(self) -> int:
-        """Address of the callback for PortAudio; compiled when it is first read."""
-        return RELAY_FUNCTION.address
+        self.address, self.user_data = RELAY_FUNCTION.address, int(self._record.ctypes.data)  # for PortAudio
 
     def call(self, function: int, argument: int) -> None:
         """Set the function that fills every block from now on, where there was none."""
@@ -190,12 +185,7 @@ class BlockQueue:
         arrays = {"sensed_at": self._sensed, "drive_at": self._drive}
         arrays |= {"number_at": self._numbers, "flags_at": self._flags}
         self._record = record_of(QUEUE, first=ahead, sensors=sensors, channels=channels, **arrays)
-        self.user_data = int(self._record.ctypes.data)
-
-    @property
-    def address(self) -> int:
-        """Address of a function with the signature of PortAudio's callback; compiled when it is first read."""
-        return QUEUE_FUNCTION.address
+        self.address, self.user_data = QUEUE_FUNCTION.address, int(self._record.ctypes.data)  # as of a callback
 
     @property
     def blocks(self) -> int:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import secrets
 import time
+from binascii import crc32
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -14,7 +15,7 @@ import serial
 
 from hapticrender.bands import Bands
 from hapticrender.drivers import protocol
-from hapticrender.drivers.board_texture import ROWS, BoardTexture, no_texture
+from hapticrender.drivers.board_texture import ROWS, BoardTexture
 from hapticrender.drivers.protocol import WRAP, Capabilities, Frame, Kind, Reason, Stream, Telemetry
 from hapticrender.errors import DeviceLost, DeviceNotFound, DeviceTimeout, DriverError, ProtocolError
 
@@ -183,8 +184,9 @@ class BoardLine:
     def play(self, texture: BoardTexture | None, meanwhile: BoardTexture | None = None) -> None:
         """Send a texture, and fade into it; `meanwhile` goes on until then.  None: fade out what plays."""
         self._textures = (self._textures + 1) % 256
-        number = self._textures
-        for kind, payload in no_texture(number) if texture is None else texture.frames(number):
+        none = protocol.pack(Kind.TEXTURE, self._textures, 0, 0, 0.0, 0.0, 0.0)
+        silence = (Kind.TEXTURE, none), (Kind.PLAY, protocol.pack(Kind.PLAY, crc32(none)))
+        for kind, payload in silence if texture is None else texture.frames(self._textures):
             request = self._patiently(kind, payload)
             if meanwhile is not None:
                 self.supply(meanwhile)

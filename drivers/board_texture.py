@@ -109,13 +109,6 @@ class BoardTexture:
         return float(step), table
 
 
-def no_texture(number: int) -> Iterator[tuple[Kind, bytes]]:
-    """Commands that let what plays fade out."""
-    described = protocol.pack(Kind.TEXTURE, number, 0, 0, 0.0, 0.0, 0.0)
-    yield Kind.TEXTURE, described
-    yield Kind.PLAY, protocol.pack(Kind.PLAY, crc32(described))
-
-
 def _reach(model: DeviceModel) -> float:
     """Half the surface's length (m), and a little: where the plate's ends are in its coordinates shows it."""
     if not model.lever_per_metre:

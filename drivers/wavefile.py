@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import soundfile
 
+from hapticrender.checks import number
 from hapticrender.drivers.base import BaseDriver
 from hapticrender.errors import DeviceLost, DeviceNotFound, DriverError
 from hapticrender.protocols import Array, Flag, Sensed
@@ -88,11 +89,9 @@ class WaveFileDriver(BaseDriver):
         block: int = 1024,
     ) -> None:
         self.path = Path(path)
-        self.full_scale = full_scale
+        self.full_scale = number("full_scale", full_scale, "A", above=0.0)
         self.clipped = 0  # samples that the file holds cut to its range
         self._format, self._subtype = _file_form(self.path, subtype)
-        if not (np.isfinite(full_scale) and full_scale > 0):
-            raise ValueError(f"{full_scale=} must be finite and > 0 A")
         super().__init__(rate=rate, drive_channels=drive_channels, sensed_channels=0, block=block)
 
     def _open(self) -> None:

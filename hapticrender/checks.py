@@ -109,6 +109,14 @@ def numbers(
     return tuple(found.tolist())
 
 
+def frequencies(value: Any, *, zero: bool) -> np.ndarray[Any, Any]:
+    """Return frequencies (Hz) as an array, if all are finite and > 0, or `zero`."""
+    hertz = np.asarray(value, float)
+    good = (np.isfinite(hertz) & ((hertz >= 0) if zero else (hertz > 0))).all()
+    require(bool(good), "frequency", value, f"finite numbers {'>=' if zero else '>'} 0 Hz")
+    return hertz
+
+
 def rising(key: str, value: Any, count: int) -> tuple[float, ...]:
     """Return `count` rising times (s) from 0 to 100 h as a tuple of floats."""
     times = numbers(key, value, "s", least=0, most=360_000)
@@ -191,9 +199,10 @@ def checked(check: Callable[..., Any], default: Any = MISSING, *, about: str = "
     return field(default=default, metadata={"check": check, "bounds": bounds, **described})
 
 
-def mapping(check: Callable[[str, Any], Any]) -> Any:
+def mapping(check: Callable[[str, Any], Any], about: str = "") -> Any:
     """Field of a `Validated` class: a mapping, empty by default, that keeps what ``check(name, value)`` returns."""
-    return field(default_factory=dict, hash=False, metadata={"check": check, "bounds": {}})
+    described = {"about": about} if about else {}
+    return field(default_factory=dict, hash=False, metadata={"check": check, "bounds": {}, **described})
 
 
 def parameter(

@@ -126,9 +126,7 @@ class CFunction:
         return int(self._compiled.ctypes(*values))
 
 
-def step(function: Callable[..., Any]) -> CFunction:
-    """Make a C function of a step; see the module."""
-    return CFunction(function)
+step = CFunction  # the decorator of a step; see the module
 
 
 @intrinsic

@@ -23,6 +23,7 @@ from typing import Any
 
 import numpy as np
 
+from hapticrender.checks import number
 from hapticrender.control.records import CONTROLLER
 from hapticrender.control.state_transfer import drive_limits, state_table
 from hapticrender.control.supervisor import FADE_OUT
@@ -94,9 +95,8 @@ class RealtimeEntry:
     def __init__(self, controller: Any, *, sensed_scale: float = 1.0, drive_scale: float = 1.0) -> None:
         if not isinstance(getattr(controller, "step", None), CFunction):
             raise TypeError(f"controller of type {type(controller).__name__}: must have a compiled step")
-        for name, value in (("sensed_scale (m)", sensed_scale), ("drive_scale (1/A)", drive_scale)):
-            if not 0 < value < np.inf:
-                raise ValueError(f"{name}={value!r}: must be finite and > 0")
+        number("sensed_scale", sensed_scale, "m", above=0.0)
+        number("drive_scale", drive_scale, "1/A", above=0.0)
         self.controller = controller
         self.block, self.rate = controller.block, float(controller.rate)
         self.whole = controller.bands.envelope is None
@@ -196,7 +196,9 @@ class RealtimeEntry:
             The controller has another number of channels or sensors, block, look-ahead, rate or delay than the one
             before, or the texture plays under another controller.
         """
-        last, used = self._control, self._used()
+        last = self._control
+        # addresses of textures that are, or may yet be, read
+        used = {*self._slots["texture"].tolist(), *(int(self._entry[name][0]) for name in ("current", "previous"))}
         controller = last.controller if controller is None else controller
         for name in SAME:
             found, first = (getattr(each, name, 0) for each in (controller, self.controller))
@@ -233,9 +235,7 @@ class RealtimeEntry:
 
     def set_gain(self, gain: float) -> None:
         """Set the factor on the texture, finite; it is reached to 1 % within 50 ms."""
-        if not np.isfinite(gain):
-            raise ValueError(f"{gain=}: must be finite")
-        self._slot["gain"] = gain
+        self._slot["gain"] = number("gain", gain)
         self._hand_over()
 
     def watch(self, seconds: float | None = None) -> None:
@@ -306,10 +306,6 @@ class RealtimeEntry:
     def refused(self) -> int:
         """Calls that were refused, and got zeros, because they did not fit."""
         return int(self._entry["refused"][0])
-
-    def _used(self) -> set[int]:
-        """Addresses of textures that are, or may yet be, read."""
-        return {*self._slots["texture"].tolist(), *(int(self._entry[name][0]) for name in ("current", "previous"))}
 
     def _hand_over(self) -> None:
         with self._writing:

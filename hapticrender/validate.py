@@ -12,7 +12,7 @@ import traceback
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from contextlib import ExitStack
+from contextlib import ExitStack, nullcontext
 from dataclasses import asdict, dataclass, field
 from functools import partial
 from pathlib import Path
@@ -20,9 +20,10 @@ from typing import Any, TextIO
 from xml.etree import ElementTree
 
 from hapticrender import __version__, defaults
+from hapticrender.checks import integer
 from hapticrender.control.methods import method_named
 from hapticrender.devices import SIMULATED, naming_driver
-from hapticrender.errors import HapticError, SceneError
+from hapticrender.errors import HapticError
 from hapticrender.formatting import as_json, printable
 from hapticrender.loop import prepare, run
 from hapticrender.protocols import Rendering
@@ -80,8 +81,6 @@ def open_scene(reference: str | Path) -> Scene:
         return scenes[str(reference)]
     if not Path(reference).exists():
         raise ValueError(f"{reference}: no such file, nor a built-in scene (see `hapticrender scenes`)")
-    if not Path(reference).is_file():
-        raise SceneError(f"{reference}: must be a regular file")
     return Scene.from_toml(reference)
 
 
@@ -111,8 +110,7 @@ def validate(
     """
     if method is not None:
         method_named(method)
-    if jobs < 1:
-        raise ValueError(f"{jobs=}: must be >= 1 process")
+    integer("jobs", jobs, "processes", least=1)
     if jobs > 1 and driver != SIMULATED:
         raise ValueError(f"{jobs=}: must be 1 process where driver = {driver!r}: a device plays one scene at a time")
     judge = partial(_judge, method=method, seed=seed, driver=driver, out=None if out is None else Path(out))
@@ -126,7 +124,11 @@ def validate(
             stack.callback(pool.shutdown, cancel_futures=True)
             futures = [pool.submit(judge, *entry, None) for entry in entries]
             calls = [lambda _, future=each: future.result() for each in futures]  # type: ignore[misc]
-        return [_shown(line, progress, call) for line, call in zip(shown, calls, strict=True)]
+        verdicts = []
+        for line, call in zip(shown, calls, strict=True):
+            with outputs.progress(line, progress) if line and progress else nullcontext() as tick:
+                verdicts.append(call(tick))
+        return verdicts
 
 
 def _read(scenes: Iterable[Scene | str | Path]) -> list[tuple[str, Scene | str]]:
@@ -174,14 +176,6 @@ def _problem(error: Exception) -> str:
         traceback.print_exception(error)
     known = isinstance(error, ValueError | TypeError | HapticError)
     return str(error) if known else f"{type(error).__name__}: {error}"
-
-
-def _shown(line: str, stream: TextIO | None, judge: Callable[[Tick | None], Verdict]) -> Verdict:
-    """Judge a scene, with a `line` of progress."""
-    if not line or stream is None:
-        return judge(None)
-    with outputs.progress(line, stream) as tick:
-        return judge(tick)
 
 
 def _summary(rendering: Rendering, folder: Path | None, tick: Tick | None) -> dict[str, Any]:

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -25,7 +26,7 @@ from hapticrender.mathx import smoothstep
 from hapticrender.plants.electroadhesion import ElectroadhesionParameters, ElectroadhesionScreen
 from hapticrender.plants.hybrid import PLACES, HybridPlant
 from hapticrender.plants.plate import PlateParameters
-from hapticrender.protocols import Array, Driver, Method, Sensed, Texture
+from hapticrender.protocols import Array, Driver, Method, Sensed
 from hapticrender.renderers.base import BaseRenderer, check_channels
 from hapticrender.renderers.electroadhesion import ElectroadhesionRenderer, ElectroadhesionSettings, ScreenSetup
 from hapticrender.renderers.friction import RATIO
@@ -53,22 +54,6 @@ class HybridSettings(Validated):
     def share_of_screen(self, frequency: Any) -> Any:
         """Share of a band at `frequency` (Hz) that the screen takes; the plate takes the rest."""
         return smoothstep(np.asarray(frequency, float) / self.start - 1.0)
-
-
-@dataclass(frozen=True)
-class Shared:
-    """The share of a texture that one part of the device takes."""
-
-    own: Bands
-    texture: Texture
-
-    def bands(self, rate: float) -> Bands:
-        """Carriers and envelopes of the share (`rate` in Hz is not needed)."""
-        return self.own
-
-    def waveform(self, time: Array, position: Array) -> Array:
-        """Waveform of the whole texture (m)."""
-        return self.texture.waveform(time, position)
 
 
 class HybridDriver(WrappedDriver):
@@ -220,7 +205,8 @@ def _part_of(driver: Driver, drive: int, sensed: int, name: str) -> Driver:
 
 def _part(scene: Scene, bands: Bands) -> Scene:
     """Scene of one part of the device; bands below the threshold have been left out already."""
-    return replace(scene, texture=Shared(bands, scene.texture), keep_unfelt=True)
+    share: Any = SimpleNamespace(bands=lambda rate: bands, waveform=scene.texture.waveform)  # whole, as a waveform
+    return replace(scene, texture=share, keep_unfelt=True)
 
 
 def _share_out(scene: Scene, settings: HybridSettings, plate: PlateParameters, rate: float) -> CombinedBands:

@@ -162,7 +162,7 @@ def test_a_sample_may_state_its_own_error():
         for estimator, error in ((stated, 1e-3), (plain, None)):
             estimator.update(n / 100, 0.02 * np.sin(OMEGA * n / 100), error)
     assert stated.at(0.5) == pytest.approx(plain.at(0.5), rel=1e-12)
-    with pytest.raises(ValueError, match="error=0.0 m: must be finite and > 0"):
+    with pytest.raises(ValueError, match="error = 0.0: must be a finite number > 0 m"):
         stated.update(1.0, 0.0, 0.0)
 
 

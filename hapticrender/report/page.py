@@ -13,7 +13,7 @@ from hapticrender.formatting import as_json, bands_label, short
 from hapticrender.report.outputs import JOURNAL, Outputs
 from hapticrender.report.text import band_rows, conditions, overview, remarks, verdict, waveform_rows
 
-_MANY_BANDS = 10
+_MANY_BANDS = 10  # from here on their table is folded
 NO_PICTURE = '<p class="note">No picture: matplotlib is not installed.</p>'
 GENERATOR = '<meta name="generator" content="hapticrender">'
 CLASSES = {"passed": "good", "passed in band": "good", "failed": "bad", "not judged": "note"}
@@ -151,27 +151,22 @@ def _section(scene: Outputs, folder: str) -> str:
         picture = f'<a href="{folder}/picture.png"><img src="{folder}/picture.png" alt="{alt}"></a>'
     files = ["scene.toml", "summary.json", JOURNAL, *summary["sound"]]
     links = " · ".join(f'<a href="{folder}/{file}">{file}</a>' for file in files)
+    bands = _table(band_rows(summary))
+    if len(summary["bands"]) > _MANY_BANDS:
+        bands = f"<details><summary>{escape(bands_label(summary['bands']))}</summary>{bands}</details>"
     notes = "".join(f'<p class="note">{_whole(line)}</p>' for line in (conditions(summary), *remarks(summary)))
     return f"""<section id="{name}">
 <h2>{name}</h2>
 <p class="{CLASSES[summary["verdict"]]}">{sentence[:1].upper()}{sentence[1:]}.</p>
 {picture}
 {_table(waveform_rows(summary))}
-{_bands(summary)}
+{bands}
 <div class="halves">
 <div>{notes}{_sounds(summary, folder)}
 <p class="note">{links}</p></div>
 <pre>{escape(scene.toml.strip())}</pre>
 </div>
 </section>"""
-
-
-def _bands(summary: Mapping[str, Any]) -> str:
-    """Table of a scene's bands; folded where there are many."""
-    bands, table = summary["bands"], _table(band_rows(summary))
-    if len(bands) <= _MANY_BANDS:
-        return table
-    return f"<details><summary>{escape(bands_label(bands))}</summary>{table}</details>"
 
 
 def _sounds(summary: Mapping[str, Any], folder: str) -> str:

@@ -106,9 +106,7 @@ def _amplitude(axes: Any, recording: Recording, summary: dict[str, Any]) -> None
     achieved = scale * _together(envelopes.achieved[:, :, shown]) / np.array(header.profile or 1.0)
     achieved[~readable] = np.nan
     time, _, _, target = _stretches(
-        lambda start, stop: scale * _together(recording.read("target", start, stop)[:, shown]),
-        len(recording),
-        recording.rate,
+        recording, lambda start, stop: scale * _together(recording.read("target", start, stop)[:, shown])
     )
     low, high = (1 - header.tolerance) * target, (1 + header.tolerance) * target
     for i, (name, (colour, _)) in enumerate(zip(header.places, itertools.cycle(PLACES), strict=False)):
@@ -245,12 +243,12 @@ def _finger(upper: Any, lower: Any, recording: Recording) -> None:
 
 def outline(recording: Recording, name: str) -> tuple[Array, Array, Array]:
     """Middle (s), least and greatest value of a signal in each of at most `COLUMNS` stretches; NaN with a NaN in it."""
-    return _stretches(lambda start, stop: recording.read(name, start, stop), len(recording), recording.rate)[:3]
+    return _stretches(recording, lambda start, stop: recording.read(name, start, stop))[:3]
 
 
-def _stretches(read: Callable[[int, int], Array], count: int, rate: float) -> tuple[Array, Array, Array, Array]:
+def _stretches(recording: Recording, read: Callable[[int, int], Array]) -> tuple[Array, Array, Array, Array]:
     """Middle (s), least, greatest and mean value of ``read(start, stop)`` in each stretch, `GROUP` read at once."""
-    edges = np.linspace(0, count, min(COLUMNS, count) + 1).astype(int)
+    edges = np.linspace(0, len(recording), min(COLUMNS, len(recording)) + 1).astype(int)
     found = []
     for i in range(0, len(edges) - 1, GROUP):
         part = edges[i : i + GROUP + 1]
@@ -261,4 +259,4 @@ def _stretches(read: Callable[[int, int], Array], count: int, rate: float) -> tu
         empty = read(0, 0)
         return np.empty(0), empty, empty, empty
     low, high, mean = (np.concatenate(each) for each in zip(*found, strict=True))
-    return (edges[:-1] + edges[1:] - 1) / (2 * rate), low, high, mean
+    return (edges[:-1] + edges[1:] - 1) / (2 * recording.rate), low, high, mean

@@ -17,6 +17,7 @@ from hapticrender.touch.composed import Composable
 
 MOST_AMPLITUDE = 0.01  # m: ten times the travel of any plate, so it catches a wrong unit
 MOST_PARTIALS = 4096
+PARTIALS = "order (need not be whole), relative amplitude and phase (rad) of each, instead of a shape"
 
 Partial = tuple[float, float, float]
 
@@ -49,29 +50,11 @@ def _read_partial(key: str, entry: Any) -> Partial:
 class Grating(Validated, Composable):
     """A periodic texture, ``amplitude * sum_n a_n cos(n p + phase_n)``.
 
-    In time ``p = 2 pi frequency t + phase``, in space ``p = 2 pi x / wavelength + phase`` at the finger's position x.
+    In time ``p = 2 pi frequency t + phase``, in space ``p = 2 pi x / wavelength + phase`` at the finger's position x;
+    exactly one of `frequency` and `wavelength` is given.
 
-    Parameters
-    ----------
-    amplitude : float, m
-        Peak of a sine, height of a square or triangle; > 0 and <= 0.01 m.
-        Stated as `velocity` or `level` instead, it is converted at once: a grating keeps metres only.
-    frequency, wavelength : float, Hz, m, or None
-        Of the fundamental, > 0 and <= 1e6, or >= 1e-6 and <= 0.5; exactly one is given.
-    shape : {"sine", "square", "triangle"}
-        Square and triangle are made of `harmonics` odd Fourier partials.
-    harmonics : int
-        1 to 4096.
-    partials : sequence of (order, relative amplitude, phase in rad), or None
-        Instead of a shape.  Orders need not be whole.
-    phase : float, rad
-        Of the fundamental at t = 0, x = 0.
-    velocity : float, m/s
-        Peak skin velocity V of a sine at the fundamental's frequency f, >= 1e-9 and <= 10: amplitude V/(2 pi f).
-    level : float, dB
-        Of a sine at f (1 to 1000 Hz) above the classic detection threshold, >= -100 and <= 100.
-    speed : float, m/s
-        Of the finger at which `velocity` or `level` hold for a grating in space (f = speed/wavelength), only there.
+    Exactly one of `amplitude`, `velocity` and `level` is given, too; the others are those of a sine at the
+    fundamental's frequency f, and converted at once: a grating keeps metres only.  In space f is speed/wavelength.
 
     Examples
     --------
@@ -89,16 +72,20 @@ class Grating(Validated, Composable):
 
     kind: ClassVar[str] = "grating"
 
-    amplitude: float = parameter(None, "m", above=0, most=MOST_AMPLITUDE)  # never None once it is made
-    frequency: float | None = parameter(None, "Hz", above=0, most=1e6)
-    wavelength: float | None = parameter(None, "m", least=1e-6, most=0.5)
-    shape: str = option("sine", *SHAPES)
-    harmonics: int = parameter(5, least=1, most=MOST_PARTIALS)
-    partials: tuple[Partial, ...] | None = checked(_read_partials, None)
-    phase: float = parameter(0.0, "rad", least=-1e6, most=1e6)
-    velocity: float | None = parameter(None, "m/s", least=1e-9, most=10)
-    level: float | None = parameter(None, "dB", least=-100, most=100)
-    speed: float | None = parameter(None, "m/s", least=1e-6, most=10)
+    amplitude: float = parameter(None, "m", "peak of a sine, height of another shape", above=0, most=MOST_AMPLITUDE)
+    frequency: float | None = parameter(None, "Hz", "of the fundamental", above=0, most=1e6)
+    wavelength: float | None = parameter(None, "m", "of the fundamental", least=1e-6, most=0.5)
+    shape: str = option("sine", *SHAPES, about="of the wave")
+    harmonics: int = parameter(5, about="odd Fourier partials of a square or triangle", least=1, most=MOST_PARTIALS)
+    partials: tuple[Partial, ...] | None = checked(_read_partials, None, about=PARTIALS)
+    phase: float = parameter(0.0, "rad", "of the fundamental at t = 0, x = 0", least=-1e6, most=1e6)
+    velocity: float | None = parameter(
+        None, "m/s", "peak skin velocity, 2 pi f times the amplitude", least=1e-9, most=10
+    )
+    level: float | None = parameter(None, "dB", "over the classic threshold, f 1 to 1000 Hz", least=-100, most=100)
+    speed: float | None = parameter(
+        None, "m/s", "of the finger for `velocity` or `level` in space", least=1e-6, most=10
+    )
 
     def __post_init__(self) -> None:
         super().__post_init__()

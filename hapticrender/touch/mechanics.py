@@ -78,7 +78,7 @@ class FingerMechanics(Validated):
 
     def impedance(self, frequency: Array) -> Array:
         """Z_f = F/V_s (complex, N s/m) at `frequency` (Hz, > 0)."""
-        s = _laplace(frequency)
+        s = 2j * np.pi * checks.frequencies(frequency, zero=False)
         if self.order == 0:
             return np.zeros_like(s)
         if self.order == 2:
@@ -102,14 +102,6 @@ class FingerMechanics(Validated):
 NONE = FingerMechanics()
 LIGHT_SECOND = FingerMechanics(order=2, mass=4e-3, damping=1.0, stiffness=200.0, reference_load=LIGHT_LOAD)
 HEAVY_SECOND = FingerMechanics(order=2, mass=4e-3, damping=1.5, stiffness=300.0, reference_load=HEAVY_LOAD)
-
-
-def _laplace(frequency: Array) -> Array:
-    """Laplace variable 2 pi j f (rad/s)."""
-    frequency = np.asarray(frequency, float)
-    good = (np.isfinite(frequency) & (frequency > 0)).all()
-    checks.require(bool(good), "frequency", frequency, "finite numbers > 0 Hz")
-    return 2j * np.pi * frequency
 
 
 def _fourth(whole: FingerMechanics, mass: float, damping: float, stiffness: float) -> FingerMechanics:
