@@ -242,8 +242,11 @@ class BoardLine:
             out += protocol.command(self.session, request.kind, request.sequence, request.payload)
         since = now - self._kept_alive + MICROSECOND
         if self.session and since >= (KEEP_ALIVE if self.finger is None else FINGER_PERIOD):
-            self._kept_alive = now
-            out += self._keep_alive(now)
+            self._kept_alive, finger, self.finger = now, self.finger, None
+            time = round(((now if finger is None else finger[0]) - self._began) * 1e6) & 0xFFFFFFFF
+            kind, fields = (Kind.HEARTBEAT, ()) if finger is None else (Kind.FINGER, finger[1:])
+            payload = protocol.pack(kind, time, *self.application, *fields)
+            out += protocol.command(self.session, kind, self._next(), payload)
         self.sent_bytes += len(out)
         return out
 
@@ -255,14 +258,6 @@ class BoardLine:
                 self._take(frame, now)
             except ValueError:  # a CRC that holds by chance
                 self._reader.bad += 1
-
-    def _keep_alive(self, now: float) -> bytes:
-        """Frame of the finger's position, if that is new, or a HEARTBEAT."""
-        finger, self.finger = self.finger, None
-        time = round(((now if finger is None else finger[0]) - self._began) * 1e6) & 0xFFFFFFFF
-        kind, fields = (Kind.HEARTBEAT, ()) if finger is None else (Kind.FINGER, finger[1:])
-        payload = protocol.pack(kind, time, *self.application, *fields)
-        return protocol.command(self.session, kind, self._next(), payload)
 
     def _take(self, frame: Frame, now: float) -> None:
         if frame.kind in (Kind.ACK, Kind.REFUSE, Kind.CAPABILITIES):

@@ -160,7 +160,7 @@ class Player:
 
     @gain.setter
     def gain(self, gain: float) -> None:
-        with self._calling():
+        with self._lock, self._busy():
             if not 0.0 <= gain <= MOST_GAIN:
                 raise ValueError(f"{gain=}: must be 0 to {MOST_GAIN:g}; an amplitude belongs in the texture")
             if self._loop is not None:
@@ -241,7 +241,7 @@ class Player:
 
     def record(self, path: str | Path) -> None:
         """Keep everything from now on in a journal (.au), until `end_recording` or the end; the device must play."""
-        with self._calling():
+        with self._lock, self._busy():
             loop = self._playing("record")
             if self._recorder is not None:
                 raise ValueError(f"{path}: a recording is under way: call end_recording first")
@@ -266,7 +266,7 @@ class Player:
 
     def state(self) -> PlayerState:
         """Return what plays at the moment, and what became of it."""
-        with self._calling():
+        with self._lock, self._busy():
             loop = self._playing("state")
             self._service()
             load = float(getattr(loop.rendering.device, "load", math.nan))
@@ -316,12 +316,6 @@ class Player:
             raise ValueError("the player is not open: use it in a with statement")
         if self._loop is not None:
             self._loop.alive()
-
-    @contextmanager
-    def _calling(self) -> Iterator[None]:
-        """A call of the application while nobody else changes anything."""
-        with self._lock, self._busy():
-            yield
 
     @contextmanager
     def _busy(self) -> Iterator[None]:
@@ -408,18 +402,14 @@ class Player:
 
         def failed(error: BaseException) -> None:
             self._error = self._error or error
-            self._zero_drive()
+            loop = self._playing("play")
+            with suppress(Exception):  # zero drive at once, on a device that may have failed
+                loop.silence()
+            with suppress(Exception):
+                if not self._clocked:
+                    play_zeros(loop.driver)
 
         self._stack.callback(self._threads.end, self._threads.start(target, failed), device, self._patience)
-
-    def _zero_drive(self) -> None:
-        """Set zero drive at once, on a device that may have failed; the next call raises the error."""
-        loop = self._playing("play")
-        with suppress(Exception):
-            loop.silence()
-        with suppress(Exception):
-            if not self._clocked:
-                play_zeros(loop.driver)
 
     def _drive_device(self) -> None:
         hold_to_clock(self._playing("play"), self._block, self._stopping)

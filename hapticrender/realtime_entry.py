@@ -108,6 +108,7 @@ class RealtimeEntry:
         self.ahead, self._tracker = int(getattr(controller, "lookahead", 0)), np.zeros(1, CONTROLLER)
         self._tracker["p"]["rate"] = self.rate
         self._arrays = self._buffers()
+        self._signals = {name: self._arrays[name] for name in BLOCK}
         self._first = self._control = _Control(controller, self._signals)  # which may run without a texture
         fields = {f"{name}_at": array for name, array in {**self._arrays, "slots": self._slots}.items()} | self._start()
         fields |= {"control": self._control.address, "tracker": self._tracker}
@@ -128,10 +129,6 @@ class RealtimeEntry:
             "gains": np.zeros((self.ahead + 1, 2)),
             "log": np.zeros((rows, controller.channels + controller.sensors + 4)),
         }
-
-    @property
-    def _signals(self) -> dict[str, Array]:
-        return {name: self._arrays[name] for name in BLOCK}
 
     def _start(self) -> dict[str, Any]:
         """Numbers of the record at rest."""

@@ -129,22 +129,18 @@ def play(arguments: argparse.Namespace) -> int:
                 player.record(journal)
             while player.time < seconds:
                 player.sleep(min(LOOK, seconds - player.time))
-                if sys.stdout.isatty():
-                    above = _print_over(printable(str(player.state())), above)
+                text = printable(str(player.state()))
+                if sys.stdout.isatty():  # over the lines before it (ANSI: up, and clear what follows)
+                    print((f"\x1b[{above}A\x1b[J" if above else "") + text, flush=True)
+                    above = text.count("\n") + 1
                 elif player.time >= second:  # in a file or a pipe, once a second
-                    print(printable(str(player.state())), flush=True)
+                    print(text, flush=True)
                     second = int(player.time) + 1
     finally:
         if journal is not None and journal.exists():
             made = outputs.write_outputs(out / scene.name, _recording(journal))
             print(f"page: {write_page(out, [made])}")
     return 0
-
-
-def _print_over(text: str, above: int) -> int:
-    """Print `text` over the `above` lines before it (ANSI: up, and clear what follows); return how many it has."""
-    print((f"\x1b[{above}A\x1b[J" if above else "") + text, flush=True)
-    return text.count("\n") + 1
 
 
 def scenes(arguments: argparse.Namespace) -> int:

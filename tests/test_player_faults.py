@@ -54,7 +54,7 @@ def test_the_watchdog_stops_the_drive_of_an_application_that_hangs(tmp_path):
 def test_the_watchdog_runs_in_real_time_and_waits_for_calls_that_take_long():
     with hr.Player(watchdog=0.2) as player:
         player.play(TONE)
-        with player._calling():
+        with player._lock, player._busy():
             time.sleep(0.5)
         player.sleep(0.1)
         end = time.monotonic() + 20.0

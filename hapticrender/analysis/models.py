@@ -187,7 +187,12 @@ def fit_finger(
     if order == 2 or (order is None and found < FEWEST[4]):
         return second
     fourth = _fit(samples, patterns, 4, second)
-    return fourth if order == 4 else _supported(second, fourth)
+    if order == 4:
+        return fourth
+    size = fourth.degrees_of_freedom + len(fourth.names)
+    scatter = max(1.0, fourth.chi_square / max(fourth.degrees_of_freedom, 1))
+    gain = (second.chi_square - fourth.chi_square) / scatter - 3 * log(size)
+    return replace(fourth, bic_margin=gain) if gain > 0 else replace(second, bic_margin=-gain)
 
 
 def fit_load_classes(
@@ -223,22 +228,18 @@ def _impedance(numbers: Mapping[str, Any], frequency: Array, normal_load: float 
     return whole if normal_load is None else whole * (normal_load / fields["reference_load"]) ** exponent
 
 
-def _plate_errors(record: FingerRecord, w: Array, sigma: Array) -> Array:
-    """Standard errors of the plate's mass (kg), damping (N s/m), stiffness (N/m), at most what `sigma` has room for."""
-    errors, known = record.plate.standard_errors, [inf]
-    for name in ("damping", "stiffness"):
-        sides = [errors[f"{name}_{side}"].mean() for side in (1, 2) if f"{name}_{side}" in errors]
-        known.append(float(np.hypot(*sides)) if len(sides) == 2 else inf)
-    return np.minimum(known, [sqrt(2) * (sigma * factor).min() for factor in (1 / w, 1.0, w)])
-
-
 def _plate_patterns(impedance: Source | Sequence[Source], samples: Samples) -> Array:
     """Errors of the samples (N s/m, (n, 3 a recording)) by one standard error of each number of the plate."""
     w, columns = 2 * np.pi * samples.frequency, []
     for number, each in enumerate(parts_of(impedance)):
         own = samples.source == number
         if isinstance(each, FingerRecord) and own.any():
-            mass, damping, stiffness = _plate_errors(each, w[own], samples.standard_error[own])
+            errors, known = each.plate.standard_errors, [inf]  # of mass (kg), damping (N s/m), stiffness (N/m)
+            for name in ("damping", "stiffness"):
+                sides = [errors[f"{name}_{side}"].mean() for side in (1, 2) if f"{name}_{side}" in errors]
+                known.append(float(np.hypot(*sides)) if len(sides) == 2 else inf)
+            room = [sqrt(2) * (samples.standard_error * factor)[own].min() for factor in (1 / w, 1.0, w)]
+            mass, damping, stiffness = np.minimum(known, room)
             columns += [1j * w * mass * own, damping * own, stiffness / (1j * w) * own]
     return np.array(columns).reshape(-1, len(w)).T
 
@@ -299,11 +300,3 @@ def _inverse(jacobian: Array) -> Array:
     _, size, right = np.linalg.svd(jacobian, full_matrices=False)
     spread = right.T / np.maximum(size, 1e-12 * size[0])
     return spread @ spread.T
-
-
-def _supported(second: FingerFit, fourth: FingerFit) -> FingerFit:
-    """Return the fit with the smaller Bayesian information criterion, with its margin."""
-    size = fourth.degrees_of_freedom + len(fourth.names)
-    scatter = max(1.0, fourth.chi_square / max(fourth.degrees_of_freedom, 1))
-    gain = (second.chi_square - fourth.chi_square) / scatter - 3 * log(size)
-    return replace(fourth, bic_margin=gain) if gain > 0 else replace(second, bic_margin=-gain)

@@ -39,24 +39,20 @@ def write(record: FingerRecord, folder: Path) -> list[Path]:
     names = ["time (s)", "normal load (N)", "position (m)", "frequency (Hz)", "real part (N s/m)"]
     names += ["imaginary part (N s/m)", "standard error of each (N s/m)"]
     _write_csv(paths[1], names, np.column_stack([*of_window, *of_band]))
-    paths[2].write_text(as_json(_figures(record)), encoding="utf-8")
-    return paths
-
-
-def _write_csv(path: Path, names: list[str], rows: np.ndarray[Any, Any]) -> None:
-    np.savetxt(path, rows, fmt="%.9g", delimiter=",", header=",".join(names), comments="", encoding="utf-8")
-
-
-def _figures(record: FingerRecord) -> dict[str, Any]:
-    """Numbers beside the tables, ready for JSON."""
-    return {
+    figures = {
         "name": record.name,
         "bandwidth": {name: getattr(record, name).bandwidth for name in SERIES},
         "least_load": record.least_load,
         "segments": [{"kind": KINDS[each.kind], "start": each.start, "stop": each.stop} for each in record.segments],
         "plate": vars(record.plate),
-        "notes": list(record.notes),
+        "notes": record.notes,
     }
+    paths[2].write_text(as_json(figures), encoding="utf-8")
+    return paths
+
+
+def _write_csv(path: Path, names: list[str], rows: np.ndarray[Any, Any]) -> None:
+    np.savetxt(path, rows, fmt="%.9g", delimiter=",", header=",".join(names), comments="", encoding="utf-8")
 
 
 def text(record: FingerRecord) -> str:

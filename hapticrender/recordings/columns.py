@@ -80,7 +80,12 @@ def assemble(
     source = "columns" if isinstance(columns, Mapping) else Path(columns).name
     table = columns if isinstance(columns, Mapping) else read_columns(columns)
     found = {key: _columns(table, key, each) for key, each in chosen.items() if each is not None}
-    count = _length([pair for pairs in found.values() for pair in pairs])
+    lengths = {name: len(values) for pairs in found.values() for name, values in pairs}
+    if len(set(lengths.values())) > 1:
+        listed = ", ".join(f"{name} {length}" for name, length in lengths.items())
+        raise ValueError(f"columns differ in length: {listed} samples: all must be of one clock")
+    count = max(lengths.values(), default=0)
+    require(count >= 2, "columns", count, "at least 2 samples")
     rate = _rate(rate, found["time"][0][1] if "time" in found else None, count)
     own = {"name": Path(source).stem} | {key: header.pop(key) for key in ("name", "device") if key in header}
     scene = Scene(texture=Custom(f"what {source} was recorded with"), duration=count / rate, settle=0.0, **own)
@@ -141,17 +146,6 @@ def _columns(table: Mapping[str, Any], key: str, chosen: Chosen) -> list[tuple[s
         finite = not np.isinf(values).any()
         require(finite, f"{key}: column {name}", np.inf, "finite, or NaN where there is no value")
     return found
-
-
-def _length(columns: Sequence[tuple[str, Array]]) -> int:
-    """Length of all columns, at least 2."""
-    lengths = {name: len(values) for name, values in columns}
-    if len(set(lengths.values())) > 1:
-        listed = ", ".join(f"{name} {length}" for name, length in lengths.items())
-        raise ValueError(f"columns differ in length: {listed} samples: all must be of one clock")
-    count = max(lengths.values(), default=0)
-    require(count >= 2, "columns", count, "at least 2 samples")
-    return count
 
 
 def _rate(rate: float | None, time: Array | None, count: int) -> float:

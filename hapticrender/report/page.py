@@ -13,7 +13,7 @@ from hapticrender.formatting import as_json, bands_label, short
 from hapticrender.report.outputs import JOURNAL, Outputs
 from hapticrender.report.text import band_rows, conditions, overview, remarks, verdict, waveform_rows
 
-_MANY_BANDS = 10  # from here on their table is folded
+_MANY_BANDS = 10  # beyond so many their table is folded
 NO_PICTURE = '<p class="note">No picture: matplotlib is not installed.</p>'
 GENERATOR = '<meta name="generator" content="hapticrender">'
 CLASSES = {"passed": "good", "passed in band": "good", "failed": "bad", "not judged": "note"}

@@ -33,17 +33,14 @@ def _read_partials(key: str, partials: Any) -> tuple[Partial, ...]:
     bound = f"1 to {MOST_PARTIALS} entries of order, amplitude, phase"
     checks.require(isinstance(partials, list | tuple | np.ndarray), key, partials, bound, TypeError)
     checks.require(1 <= len(partials) <= MOST_PARTIALS, key, partials, bound)
-    return tuple(_read_partial(f"{key}[{index}]", entry) for index, entry in enumerate(partials))
-
-
-def _read_partial(key: str, entry: Any) -> Partial:
-    good = isinstance(entry, list | tuple | np.ndarray) and len(entry) == 3
-    checks.require(good, key, entry, "order, amplitude, phase", TypeError)
-    return (
-        checks.number(f"{key}.order", entry[0], "", above=0, most=1e4),
-        checks.number(f"{key}.amplitude", entry[1], "times the grating's", least=-100, most=100),
-        checks.number(f"{key}.phase", entry[2], "rad", least=-1e6, most=1e6),
-    )
+    found = []
+    for at, entry in ((f"{key}[{index}]", entry) for index, entry in enumerate(partials)):
+        good = isinstance(entry, list | tuple | np.ndarray) and len(entry) == 3
+        checks.require(good, at, entry, "order, amplitude, phase", TypeError)
+        order = checks.number(f"{at}.order", entry[0], "", above=0, most=1e4)
+        amplitude = checks.number(f"{at}.amplitude", entry[1], "times the grating's", least=-100, most=100)
+        found.append((order, amplitude, checks.number(f"{at}.phase", entry[2], "rad", least=-1e6, most=1e6)))
+    return tuple(found)
 
 
 @dataclass(frozen=True)

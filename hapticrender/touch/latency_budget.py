@@ -14,8 +14,8 @@ after a lost one.  Both are exact for the filter at its constant gain; gate, irr
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from dataclasses import replace
+from itertools import product
 
 import numpy as np
 
@@ -91,15 +91,6 @@ def noise_errors(estimator: MotionEstimator, rate: float, ahead: float = 0.0) ->
     return position, velocity
 
 
-def _ages(panel: TouchPanel) -> Iterator[tuple[float, float]]:
-    """Age of the last sample beside its latency (s), and the share of the time with that age."""
-    lost, share = 0, 1.0 - panel.dropouts
-    while share > MOST_LOST:
-        for age in AGES:
-            yield (lost + age) / panel.rate, share / len(AGES)
-        lost, share = lost + 1, share * panel.dropouts
-
-
 def position_error(
     panel: TouchPanel,
     speed: float = SPEED,
@@ -140,7 +131,11 @@ def position_error(
         a, b = _system(settled_gain(estimator, panel.rate, rms), step, late, easing)
         turn = np.exp(1j * omega * step)
         played, spread = np.linalg.solve(turn * np.eye(5) - a, turn * b), _noise_gain(a, b)
-    for age, share in _ages(panel):
+    shares = [1.0 - panel.dropouts]  # of the time, by the samples that were lost since the last one
+    while shares[-1] * panel.dropouts > MOST_LOST:
+        shares.append(shares[-1] * panel.dropouts)
+    for (lost, share), part in product(enumerate(shares), AGES):
+        age = (lost + part) / panel.rate  # of the last sample (s), beside its latency
         u = age / easing if easing > 0.0 else 0.0
         row = np.r_[transition(late + age)[0], u * math.exp(-u), math.exp(-u)]  # C(h)
         found, noise = (row @ played, row @ spread @ row) if predicted else (1.0, 1.0)

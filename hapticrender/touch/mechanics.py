@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from hapticrender import checks
-from hapticrender.checks import Validated, checked, parameter
+from hapticrender.checks import Validated, parameter
 from hapticrender.protocols import Array
 
 LIGHT_BELOW = 0.5  # N: Table 1 parts its two columns here
@@ -17,12 +17,6 @@ LIGHT_LOAD, HEAVY_LOAD = 0.3, 0.8  # N: engineering defaults for what "light" an
 
 
 _PARTS = ("mass", "damping", "stiffness", "phalanx_mass", "phalanx_damping", "phalanx_stiffness")
-
-
-def _read_order(key: str, value: Any) -> int:
-    order = checks.integer(key, value, least=0, most=4)
-    checks.require(order in (0, 2, 4), key, order, "0, 2 or 4")
-    return order
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,7 +54,7 @@ class FingerMechanics(Validated):
     [0.545]
     """
 
-    order: int = checked(_read_order, 0)
+    order: int = parameter(0, most=4)
     mass: float = parameter(0.0, "kg", most=1.0)
     damping: float = parameter(0.0, "N s/m", most=1e4)
     stiffness: float = parameter(0.0, "N/m", most=1e6)
@@ -71,6 +65,7 @@ class FingerMechanics(Validated):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        checks.require(self.order in (0, 2, 4), "order", self.order, "0, 2 or 4")
         for key in _PARTS[{0: 0, 2: 3, 4: 6}[self.order] :]:
             checks.require(getattr(self, key) == 0.0, key, getattr(self, key), f"0 where order = {self.order}")
         if self.order and not any(getattr(self, key) for key in _PARTS[:3]):

@@ -169,8 +169,12 @@ class Scene(Validated):
     name: str = checked(checks.name, "scene")
 
     def __post_init__(self) -> None:
-        if str(self.device).endswith(ENDING):
-            self._take_profile(DeviceProfile.load(self.device))
+        if str(self.device).endswith(ENDING):  # its profile has what the scene does not state
+            found = DeviceProfile.load(self.device)
+            limits, calibration = table_of(found.limits), table_of(found.calibration)
+            tables = {"profile": found.device, "limits": limits, "calibration": calibration}
+            merged = {name: {**table, **_read_table(name, getattr(self, name))} for name, table in tables.items()}
+            checks.keep(self, device=found.kind, source=self.source or str(found), **merged)
         super().__post_init__()
         self.device_profile  # noqa: B018 (it refuses what is no limit, and no calibration)
         self.panel  # noqa: B018 (it refuses what is no touch panel)
@@ -181,12 +185,6 @@ class Scene(Validated):
         checks.require(isinstance(self.finger, Finger), "finger", self.finger, "a Finger", TypeError)
         if isinstance(self.finger.motion, Nowhere) and getattr(self.texture, "spatial", False):
             raise ValueError("finger.motion = 'none': a texture over position needs a finger")
-
-    def _take_profile(self, found: DeviceProfile) -> None:
-        """Take from a profile what the scene does not state."""
-        tables = {"profile": found.device, "limits": table_of(found.limits), "calibration": table_of(found.calibration)}
-        merged = {name: {**table, **_read_table(name, getattr(self, name))} for name, table in tables.items()}
-        checks.keep(self, device=found.kind, source=self.source or str(found), **merged)
 
     @property
     def device_profile(self) -> DeviceProfile:
