@@ -266,9 +266,9 @@ class Validated:
         return cls(**overrides)
 
 
-def check_names(given: Iterable[str], known: Iterable[str], in_file: Iterable[str] = ()) -> None:
-    """Refuse a name that is not `known`; the message lists those that are, and what such a table of a file may have."""
+def check_names(given: Mapping[str, Any], known: Iterable[str], in_file: Iterable[str] = ()) -> None:
+    """Refuse a key that is not `known`; the message lists those that are, and what such a table of a file may have."""
     also = f"; in a file also {', '.join(sorted(in_file))}" if in_file else ""
-    for name in given:
-        if name not in known:
-            raise ValueError(f"{plain(name)}: no such parameter; known: {', '.join(sorted(known))}{also}")
+    for key, value in given.items():
+        if key not in known:
+            raise ValueError(f"{plain(key)} = {show(value)}: unknown key; known: {', '.join(sorted(known))}{also}")

@@ -300,7 +300,7 @@ def _check_keys(table: dict[str, Any]) -> None:
         if key in moved:
             checks.refuse(key, value, moved[key])
         checks.require(key not in TABLES.values() or isinstance(value, dict), key, value, "a table", TypeError)
-    _only_known(table, ["name", "duration", "texture", "finger", *TABLES.values()])
+    checks.check_names(table, ["name", "duration", "texture", "finger", *TABLES.values()])
 
 
 def _usable(name: str) -> str:
@@ -311,12 +311,6 @@ def _usable(name: str) -> str:
         return "scene"
 
 
-def _only_known(table: Mapping[str, Any], known: list[str]) -> None:
-    for key, value in table.items():
-        if key not in known:
-            raise ValueError(f"{checks.plain(key)} = {checks.show(value)}: unknown key; known: {', '.join(known)}")
-
-
 def _read_kind(table: Any, key: str, choice: str, kinds: dict[str, type[Any]], folder: Path, extra: Any = ()) -> Any:
     """Make the object that `table[choice]` names from the keys that are its fields; `extra` keys are left alone."""
     bound = f"a table with {choice} = one of {', '.join(kinds)}"
@@ -324,7 +318,7 @@ def _read_kind(table: Any, key: str, choice: str, kinds: dict[str, type[Any]], f
     with checks.inside(key):
         kind = kinds[checks.choice(choice, table.get(choice), kinds)]
         entries = fields(kind)
-        _only_known(table, [choice, *(entry.name for entry in entries), *extra])
+        checks.check_names(table, [choice, *(entry.name for entry in entries), *extra])
         required = [entry.name for entry in entries if entry.default is entry.default_factory is MISSING]
         values: dict[str, Any] = dict.fromkeys(required) | {
             entry.name: table[entry.name] for entry in entries if entry.name in table
