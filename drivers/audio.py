@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from hapticrender.checks import number
 from hapticrender.drivers.audio_callback import AHEAD, BlockQueue, Relay
 from hapticrender.drivers.base import BaseDriver
 from hapticrender.drivers.portaudio import Stream, cards, find
@@ -88,8 +89,8 @@ class AudioDriver(BaseDriver):
             raise ValueError("channels=(): must name at least one output, such as (1, 2)")
         scales = {"drive_per_full_scale": drive_per_full_scale, "sensed_per_full_scale": sensed_per_full_scale}
         for name, value in scales.items():
-            if value is not None and not 0 < value < np.inf:
-                raise ValueError(f"{name}={value!r}: must be finite and > 0")
+            if value is not None:
+                number(name, value, above=0.0)
         if delay is not None and not block <= delay <= LONGEST * rate:
             raise ValueError(f"{delay=} samples: must be >= block = {block} and <= {LONGEST:g} s")
         self.drive_per_full_scale, self.sensed_per_full_scale = drive_per_full_scale, sensed_per_full_scale
@@ -149,7 +150,7 @@ class AudioDriver(BaseDriver):
         output, inputs = self._side(self.channels, 1), self._side(self.inputs, 0)
         self._relay = Relay(*(tuple(n - 1 for n in each) for each in (self.inputs, self.channels)), self.block)
         self._queue = BlockQueue(self.block, self.sensed_channels, self.drive_channels, self._ahead)
-        self._queue_address, _ = self._queue.address, self._queue.blocks  # compiled before the stream starts
+        _ = self._queue.blocks  # compiled before the stream starts
         addresses = self._relay.address, self._relay.user_data
         self._stream = Stream(str(self), output, inputs, self.rate, self.block, *addresses, self)
         atexit.register(self.close)  # the callback must not outlive the memory that it works in
@@ -195,7 +196,7 @@ class AudioDriver(BaseDriver):
         if not queue.put(number + self._ahead, drive * self.drive_scale):
             number = queue.blocks  # what was missed is lost; go on with the next one
         if self._relay.count("function") == 0:
-            self._relay.call(self._queue_address, queue.user_data)
+            self._relay.call(queue.address, queue.user_data)
         self._wait_for(number)
         sensed, flags = queue.take(number)
         flags |= OVERRUN if number > self._number else 0

@@ -8,13 +8,11 @@ blocks with Python.
 
 from __future__ import annotations
 
-import sys
-
 import numba
 import numpy as np
 from numba import carray, types
 
-from hapticrender.jit import I8, CFunction, call, entry, fetch_add, kernel, pointer, record
+from hapticrender.jit import CALLBACK, I8, CFunction, call, entry, fetch_add, kernel, pointer, record, record_of
 from hapticrender.protocols import Array, Flag
 
 SLOTS = 64  # blocks that wait in either direction
@@ -22,9 +20,7 @@ AHEAD = 2  # blocks of drive that wait to be played while Python computes the ne
 CONTINUE = 0  # result of PortAudio's callback
 LOST = 0b1111  # PortAudio's status: input or output under- or overflow
 OVERRUN = int(Flag.OVERRUN)
-UNSIGNED_LONG = types.uint32 if sys.platform == "win32" else types.uint64
 F4 = types.float32
-CALLBACK = types.int32(I8, I8, UNSIGNED_LONG, I8, UNSIGNED_LONG, I8)
 
 RELAY = np.dtype(
     [
@@ -136,26 +132,17 @@ class Relay:
     """
 
     def __init__(self, inputs: tuple[int, ...], outputs: tuple[int, ...], block: int) -> None:
-        self.wide_in, self.wide_out = (max(columns, default=-1) + 1 for columns in (inputs, outputs))
+        wide_in, wide_out = (max(columns, default=-1) + 1 for columns in (inputs, outputs))
         self._arrays = {
             "inputs": np.array([*inputs, 0], np.int64),  # an array of length 0 may have no address
             "outputs": np.array(outputs, np.int64),
             "sensed": np.zeros((block, max(len(inputs), 1)), np.float32),
             "drive": np.zeros((block, len(outputs)), np.float32),
         }
-        self._record = np.zeros(1, RELAY)
         values = {"block": block, "sensors": len(inputs), "channels": len(outputs)}
-        values |= {"wide_in": self.wide_in, "wide_out": self.wide_out}
-        for name, value in values.items():
-            self._record[name] = value
-        for name, array in self._arrays.items():
-            self._record[f"{name}_at"] = array.ctypes.data
-        self.user_data = int(self._record.ctypes.data)
-
-    @property
-    def address(self) -> int:
-        """Address of the callback for PortAudio; compiled when it is first read."""
-        return RELAY_FUNCTION.address
+        values |= {"wide_in": wide_in, "wide_out": wide_out}
+        self._record = record_of(RELAY, **values, **{f"{name}_at": each for name, each in self._arrays.items()})
+        self.address, self.user_data = RELAY_FUNCTION.address, int(self._record.ctypes.data)  # for PortAudio
 
     def call(self, function: int, argument: int) -> None:
         """Set the function that fills every block from now on, where there was none."""
@@ -195,18 +182,10 @@ class BlockQueue:
         self._drive = np.zeros((SLOTS, block, channels), np.float32)
         self._numbers = np.full(SLOTS, -1, np.int64)
         self._flags = np.zeros(SLOTS, np.int64)
-        self._record = np.zeros(1, QUEUE)
-        values = {"first": ahead, "sensors": sensors, "channels": channels}
-        values |= {"sensed_at": self._sensed.ctypes.data, "drive_at": self._drive.ctypes.data}
-        values |= {"number_at": self._numbers.ctypes.data, "flags_at": self._flags.ctypes.data}
-        for name, value in values.items():
-            self._record[name] = value
-        self.user_data = int(self._record.ctypes.data)
-
-    @property
-    def address(self) -> int:
-        """Address of a function with the signature of PortAudio's callback; compiled when it is first read."""
-        return QUEUE_FUNCTION.address
+        arrays = {"sensed_at": self._sensed, "drive_at": self._drive}
+        arrays |= {"number_at": self._numbers, "flags_at": self._flags}
+        self._record = record_of(QUEUE, first=ahead, sensors=sensors, channels=channels, **arrays)
+        self.address, self.user_data = QUEUE_FUNCTION.address, int(self._record.ctypes.data)  # as of a callback
 
     @property
     def blocks(self) -> int:

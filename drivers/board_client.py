@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import threading
 import time
 from collections.abc import Callable, Sequence
@@ -11,6 +10,7 @@ from typing import Any, NamedTuple, Self, TypeVar
 import numpy as np
 
 from hapticrender.bands import Bands
+from hapticrender.checks import integer, number
 from hapticrender.drivers import protocol
 from hapticrender.drivers.base import OpenedInWith, carry_through
 from hapticrender.drivers.board_line import BAUD, PAUSE, BoardLine, Line, open_port
@@ -87,10 +87,9 @@ class BoardClient(OpenedInWith):
         clock: Any = time,
         connect: Callable[[str, int], Any] = open_port,
     ) -> None:
-        for name, value in (("timeout", timeout), ("reconnect", reconnect)):
-            if not 0.0 <= value < math.inf:
-                raise ValueError(f"{name} = {value!r}: must be finite and >= 0 s")
-        self.port, self.timeout, self.reconnect, self.clock = port, timeout, reconnect, clock
+        self.port, self.clock = port, clock
+        self.timeout = number("timeout", timeout, "s", least=0.0)
+        self.reconnect = number("reconnect", reconnect, "s", least=0.0)
         self.reconnections = 0
         self.started = 0  # sample of the board's clock at which it last began to play
         self._connect = lambda: BoardLine(port, baud, timeout=timeout, clock=clock, connect=connect)
@@ -174,8 +173,7 @@ class BoardClient(OpenedInWith):
 
     @gain.setter
     def gain(self, value: float) -> None:
-        if not 0.0 <= value <= 1.0:
-            raise ValueError(f"gain = {value!r}: must be 0 to 1")
+        value = number("gain", value, least=0.0, most=1.0)
         self._steadily(lambda line: line.command(Kind.GAIN, value))
         self._setup = self._setup._replace(gain=value)
 
@@ -217,10 +215,8 @@ class BoardClient(OpenedInWith):
             much is sent as has been played by the telemetry.
         """
         period = round(telemetry * self.capabilities.rate)
-        for name, value, least in (("stream", stream, 0), ("telemetry", period, 1)):
-            if not least <= value <= 0xFFFF:
-                raise ValueError(f"{name} = {value!r} samples: must be {least} to 65535")
-        start = stream, period
+        start = integer("stream", stream, "samples", least=0, most=0xFFFF), period
+        integer("telemetry", period, "samples", least=1, most=0xFFFF)
         self.started = self._steadily(lambda line: self._begin(line, start))
         self._rows = Rows(self.started, start[0])
         self._setup, self._runs = self._setup._replace(start=start), True

@@ -2,24 +2,35 @@
 
 from __future__ import annotations
 
+import math
 import secrets
 import time
+from binascii import crc32
+from collections import deque
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import serial
 
 from hapticrender.bands import Bands
 from hapticrender.drivers import protocol
-from hapticrender.drivers.board_link import FOREIGN, Link, Request
-from hapticrender.drivers.board_texture import ROWS, BoardTexture, no_texture
-from hapticrender.drivers.protocol import WRAP, Kind, Reason
-from hapticrender.errors import DeviceLost, DeviceNotFound, DeviceTimeout, DriverError
+from hapticrender.drivers.board_texture import ROWS, BoardTexture
+from hapticrender.drivers.protocol import WRAP, Capabilities, Frame, Kind, Reason, Stream, Telemetry
+from hapticrender.errors import DeviceLost, DeviceNotFound, DeviceTimeout, DriverError, ProtocolError
 
 BAUD = 230_400  # of a UART; a board on USB or a pseudo-terminal does not care
 PAUSE = 1e-3  # s between two looks at the line
 SILENCE = 0.5  # s without a valid frame from the board after which it counts as lost
 FADING = 0.2  # s: longest fade of what a command has to wait for
+KEEP_ALIVE = 0.01  # s between two keep-alives, FINGER or HEARTBEAT: eight fit into the board's 80 ms of silence
+FINGER_PERIOD = 0.005  # s between two FINGER frames at least
+MICROSECOND = 1e-6  # s: times that differ by less are the same
+RESEND = 0.03  # s after which a command without a reply is sent again
+FOREIGN = 3  # replies for another session in a row after which ours has ended
+MOST_STREAM = 4096  # frames of the stream that wait for the caller
+
+Finger = tuple[float, float, float, float]  # time (s), position (m, NaN: lifted), velocity (m/s), load (N)
 
 
 class Line(NamedTuple):
@@ -31,15 +42,29 @@ class Line(NamedTuple):
     phase: float = 0.0
 
 
+@dataclass
+class Request:
+    """A command and what became of it."""
+
+    kind: Kind
+    payload: bytes
+    sequence: int = 0
+    sent: float = -math.inf  # s, when it was last sent
+    answered: bool = False
+    refused: Reason | None = None
+    sample: int = 0  # of the board's clock, at which it was done or refused
+
+
 def open_port(port: str, baud: int) -> Any:
     """Open a serial port that never waits for bytes."""
     return serial.Serial(port, baud, timeout=0, write_timeout=1.0)
 
 
-class BoardLine(Link):
-    """A board that has been greeted, on a port of its own; not for several threads at once.
+class BoardLine:
+    """A session with a board, on a port of its own; not for several threads at once.
 
-    Its parameters are those of `BoardClient`; `connect` is called with port and baud rate.
+    It greets the board, sends keep-alives, and one command at a time until its reply.  Its parameters are those of
+    `BoardClient`; `connect` is called with port and baud rate.
 
     Raises
     ------
@@ -50,6 +75,8 @@ class BoardLine(Link):
     ProtocolError
         What answers speaks another version of it.
     """
+
+    capabilities: Capabilities  # from the reply to HELLO on
 
     def __init__(
         self,
@@ -65,10 +92,25 @@ class BoardLine(Link):
             self._port = connect(port, baud)
         except (OSError, ValueError) as error:
             raise DeviceNotFound(f"{port}: open: {error}") from error
+        self._nonce, self.session = (
+            secrets.randbelow(2**32 - 1) + 1,
+            0,
+        )  # sets it apart from earlier ones; 0: not greeted
+        self.telemetry: Telemetry | None = None
+        self.streamed: deque[Stream] = deque(maxlen=MOST_STREAM)
+        self.finger: Finger | None = None  # not sent yet
+        self.application = 0, 0  # changes with every call of it; ms without one after which the board stops, 0: never
+        self._began = self._received = clock.monotonic()  # s; of the last valid frame
+        self._kept_alive = -math.inf  # s
+        self.sent_bytes = self.received_bytes = 0
+        self._reader = protocol.Reader()
+        self._sequence = self._nonce & 0xFFFF
+        self._request: Request | None = None  # no reply yet
+        self._foreign = 0  # replies for another session, in a row
+        self._partial: Telemetry | None = None  # of more bands than a frame holds
         self._textures = 0  # that were sent
-        super().__init__(secrets.randbelow(2**32 - 1) + 1, clock.monotonic())
         try:
-            self._wait_for(self.greeting)
+            self.request(Kind.HELLO, protocol.pack(Kind.HELLO, protocol.VERSION, self._nonce))
         except DriverError:
             self.close()
             raise
@@ -88,7 +130,7 @@ class BoardLine(Link):
             raise self.lost("line", error) from error
         if self._foreign >= FOREIGN:
             raise self.lost("session", "the board has another session: it was reset, or another host greeted it")
-        if now - self.received > SILENCE and self.session:
+        if now - self._received > SILENCE and self.session:
             raise self.lost("listen", f"no valid frame for {SILENCE:g} s")
 
     def lost(self, operation: str, reason: object) -> DeviceLost:
@@ -117,7 +159,13 @@ class BoardLine(Link):
 
     def request(self, kind: Kind, payload: bytes) -> Request:
         """Send a command and return its reply, a refusal too."""
-        return self._wait_for(self.submit(kind, payload))
+        request = self._request = Request(kind, payload)
+        try:
+            self.wait(lambda: request.answered, kind.name)
+        except DriverError:
+            self._request = None
+            raise
+        return request
 
     def begin(self, kind: Kind, *fields: float) -> int:
         """Start something, once the board has come to rest; return the sample at which it began."""
@@ -136,8 +184,9 @@ class BoardLine(Link):
     def play(self, texture: BoardTexture | None, meanwhile: BoardTexture | None = None) -> None:
         """Send a texture, and fade into it; `meanwhile` goes on until then.  None: fade out what plays."""
         self._textures = (self._textures + 1) % 256
-        number = self._textures
-        for kind, payload in no_texture(number) if texture is None else texture.frames(number):
+        none = protocol.pack(Kind.TEXTURE, self._textures, 0, 0, 0.0, 0.0, 0.0)
+        silence = (Kind.TEXTURE, none), (Kind.PLAY, protocol.pack(Kind.PLAY, crc32(none)))
+        for kind, payload in silence if texture is None else texture.frames(self._textures):
             request = self._patiently(kind, payload)
             if meanwhile is not None:
                 self.supply(meanwhile)
@@ -166,14 +215,6 @@ class BoardLine(Link):
     def _carried(self) -> str:
         return f"{self.sent_bytes} bytes sent, {self.received_bytes} received"
 
-    def _wait_for(self, request: Request) -> Request:
-        try:
-            self.wait(lambda: request.answered, request.kind.name)
-        except DriverError:
-            self.withdraw()
-            raise
-        return request
-
     def _patiently(self, kind: Kind, payload: bytes) -> Request:
         """Send a command again and again until what it waits for has faded out."""
         end = self.clock.monotonic() + FADING
@@ -190,3 +231,78 @@ class BoardLine(Link):
         if request.refused == Reason.VALUE:
             raise ValueError(f"{text}: a number is out of its range ({request.payload.hex(' ')})")
         raise DriverError(f"{text} ({request.payload.hex(' ')})")
+
+    def due(self, now: float) -> bytes:
+        """Bytes to be sent at `now` (s)."""
+        out, request = b"", self._request
+        if request is not None and now - request.sent >= RESEND:
+            if request.sent == -math.inf:
+                request.sequence = self._next()
+            request.sent = now
+            out += protocol.command(self.session, request.kind, request.sequence, request.payload)
+        since = now - self._kept_alive + MICROSECOND
+        if self.session and since >= (KEEP_ALIVE if self.finger is None else FINGER_PERIOD):
+            self._kept_alive, finger, self.finger = now, self.finger, None
+            time = round(((now if finger is None else finger[0]) - self._began) * 1e6) & 0xFFFFFFFF
+            kind, fields = (Kind.HEARTBEAT, ()) if finger is None else (Kind.FINGER, finger[1:])
+            payload = protocol.pack(kind, time, *self.application, *fields)
+            out += protocol.command(self.session, kind, self._next(), payload)
+        self.sent_bytes += len(out)
+        return out
+
+    def receive(self, data: bytes, now: float) -> None:
+        """Take bytes that have arrived; a `ProtocolError` where the board speaks another version."""
+        self.received_bytes += len(data)
+        for frame in self._reader.feed(data):
+            try:
+                self._take(frame, now)
+            except ValueError:  # a CRC that holds by chance
+                self._reader.bad += 1
+
+    def _take(self, frame: Frame, now: float) -> None:
+        if frame.kind in (Kind.ACK, Kind.REFUSE, Kind.CAPABILITIES):
+            self._take_reply(frame)
+        elif frame.kind == Kind.TELEMETRY and self.session:
+            self._take_telemetry(protocol.telemetry(frame.payload))
+        elif frame.kind == Kind.STREAM and self.session:
+            channels = self.capabilities.drive_channels, self.capabilities.sensed_channels
+            self.streamed.append(protocol.stream(frame.payload, *channels))
+        self._received = now
+
+    def _take_reply(self, frame: Frame) -> None:
+        request = self._request
+        if request is None or frame.sequence != request.sequence or request.sent == -math.inf:
+            return
+        if frame.kind == Kind.CAPABILITIES:
+            found = protocol.capabilities(frame.payload)
+            if request.kind != Kind.HELLO or found.nonce != self._nonce:
+                return
+            self.capabilities, self.session = found, found.session
+        else:
+            kind, refused, sample = protocol.reply(frame)
+            if kind != request.kind:
+                return
+            if refused == Reason.CHECK:
+                self._foreign += 1
+                return
+            if refused == Reason.VERSION:
+                text = f"the board refuses version {protocol.VERSION} of the protocol: update one of the two"
+                raise ProtocolError(text)
+            request.refused, request.sample = refused, sample
+        request.answered, self._request = True, None
+
+    def _take_telemetry(self, found: Telemetry) -> None:
+        if found.session != self.session:
+            self._foreign += 1
+            return
+        self._foreign = 0
+        begun = self._partial
+        if found.first and begun is not None and (begun.sample, len(begun.bands)) == (found.sample, found.first):
+            found = begun._replace(bands=begun.bands + found.bands)
+        self._partial = found
+        if len(found.bands) == found.total:
+            self.telemetry = found
+
+    def _next(self) -> int:
+        self._sequence = (self._sequence + 1) & 0xFFFF
+        return self._sequence

@@ -41,7 +41,8 @@ class BoardLoop:
     def __init__(self, rendering: Rendering, driver: SerialDriver) -> None:
         self.rendering, self.driver, self.model = rendering, driver, rendering.model
         self.samples, self.flags = 0, Flag(0)
-        self._client = driver.client
+        self._client = client = driver.client
+        self.finger, self.watch, self.alive, self.silence = client.finger, client.watch, client.beat, client.stop
         self._bands, self._texture = self.made(rendering)
         self._recent = np.zeros((0, 2))  # reference and motion, m
         self._reconnections = 0  # that have been noted
@@ -62,25 +63,9 @@ class BoardLoop:
         self._client.set_bands(bands, texture)
         self.rendering, self._bands, self._texture = rendering, bands, texture
 
-    def finger(self, position: float, velocity: float, load: float) -> None:
-        """Set where the finger is (m, m/s, N)."""
-        self._client.finger(position, velocity, load)
-
-    def watch(self, seconds: float | None) -> None:
-        """Let the board stop once the application has not called for so long (s); None: never."""
-        self._client.watch(seconds)
-
-    def alive(self) -> None:
-        """Note a call of the application."""
-        self._client.beat()
-
     def set_gain(self, gain: float) -> None:
         """Set the factor on the texture, 0 to 1."""
         self._client.gain = gain
-
-    def silence(self) -> None:
-        """Fade out within 10 ms."""
-        self._client.stop()
 
     def fill(self) -> None:
         """Check the telemetry; a `DriverError` where board or line are gone.

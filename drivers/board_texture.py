@@ -56,7 +56,9 @@ class BoardTexture:
         self._name = type(texture).__name__
         self._start, self._step, self._table = 0.0, 1.0, np.zeros(0)
         if self.parts.spatial:
-            self._start = -_reach(model)
+            lever = model.lever_per_metre  # by which the plate's ends are in its coordinates
+            ends = float(abs(model.place_from_coordinate[:, 1]).max()) / lever + MARGIN if lever else REACH
+            self._start = -ends
             self._step, self._table = self._sampled(board.points)
         self._scale = max(float(abs(self._table).max(initial=0.0)) / FULL_SCALE, 1e-30)
 
@@ -107,17 +109,3 @@ class BoardTexture:
                 f"must be <= {100 * COARSE:g} %; narrow its passband, or compile the board with more TEXTURE_POINTS"
             )
         return float(step), table
-
-
-def no_texture(number: int) -> Iterator[tuple[Kind, bytes]]:
-    """Commands that let what plays fade out."""
-    described = protocol.pack(Kind.TEXTURE, number, 0, 0, 0.0, 0.0, 0.0)
-    yield Kind.TEXTURE, described
-    yield Kind.PLAY, protocol.pack(Kind.PLAY, crc32(described))
-
-
-def _reach(model: DeviceModel) -> float:
-    """Half the surface's length (m), and a little: where the plate's ends are in its coordinates shows it."""
-    if not model.lever_per_metre:
-        return REACH
-    return float(abs(model.place_from_coordinate[:, 1]).max()) / model.lever_per_metre + MARGIN

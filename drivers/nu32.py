@@ -17,7 +17,6 @@ sent   then                                    reply behind the echo
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from typing import Any, NamedTuple, Self
 
@@ -25,6 +24,7 @@ import numpy as np
 import serial
 
 from hapticrender.bands import Bands
+from hapticrender.checks import number
 from hapticrender.drivers.base import OpenedInWith
 from hapticrender.errors import DeviceLost, DeviceNotFound, DeviceTimeout, DriverError, ProtocolError
 
@@ -63,9 +63,7 @@ class NU32Board(OpenedInWith):
     """
 
     def __init__(self, port: str, *, timeout: float = 1.0, connect: Callable[[str, float], Any] = open_port) -> None:
-        if not 0.0 < timeout < math.inf:
-            raise ValueError(f"timeout = {timeout!r}: must be finite and > 0 s")
-        self.port, self.timeout, self._connect = port, timeout, connect
+        self.port, self.timeout, self._connect = port, number("timeout", timeout, "s", above=0.0), connect
         self._line: Any = None
         self._tone: tuple[int, float] | None = None
 

@@ -214,23 +214,23 @@ def _quiet() -> Iterator[None]:
 def cards() -> list[Card]:
     """Sound cards that are there now; a `DeviceNotFound` where PortAudio is not."""
     with initialised() as portaudio:
-        return [card(portaudio, index) for index in range(check(portaudio.Pa_GetDeviceCount(), "audio: list"))]
-
-
-def card(portaudio: CDLL, index: int) -> Card:
-    """Card number `index` (< Pa_GetDeviceCount)."""
-    info = portaudio.Pa_GetDeviceInfo(index).contents
-    host = portaudio.Pa_GetHostApiInfo(info.hostApi).contents
-    return Card(
-        index=index,
-        name=info.name.decode(errors="replace"),
-        host=host.name.decode(errors="replace"),
-        inputs=info.maxInputChannels,
-        outputs=info.maxOutputChannels,
-        rate=info.defaultSampleRate,
-        input_latency=(info.defaultLowInputLatency, info.defaultHighInputLatency),
-        output_latency=(info.defaultLowOutputLatency, info.defaultHighOutputLatency),
-    )
+        infos = [
+            portaudio.Pa_GetDeviceInfo(index).contents
+            for index in range(check(portaudio.Pa_GetDeviceCount(), "audio: list"))
+        ]
+        return [
+            Card(
+                index=index,
+                name=info.name.decode(errors="replace"),
+                host=portaudio.Pa_GetHostApiInfo(info.hostApi).contents.name.decode(errors="replace"),
+                inputs=info.maxInputChannels,
+                outputs=info.maxOutputChannels,
+                rate=info.defaultSampleRate,
+                input_latency=(info.defaultLowInputLatency, info.defaultHighInputLatency),
+                output_latency=(info.defaultLowOutputLatency, info.defaultHighOutputLatency),
+            )
+            for index, info in enumerate(infos)
+        ]
 
 
 def find(device: int | str | None) -> Card:

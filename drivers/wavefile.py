@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import soundfile
 
+from hapticrender.checks import number
 from hapticrender.drivers.base import BaseDriver
 from hapticrender.errors import DeviceLost, DeviceNotFound, DriverError
 from hapticrender.protocols import Array, Flag, Sensed
@@ -88,11 +89,9 @@ class WaveFileDriver(BaseDriver):
         block: int = 1024,
     ) -> None:
         self.path = Path(path)
-        self.full_scale = full_scale
+        self.full_scale = number("full_scale", full_scale, "A", above=0.0)
         self.clipped = 0  # samples that the file holds cut to its range
         self._format, self._subtype = _file_form(self.path, subtype)
-        if not (np.isfinite(full_scale) and full_scale > 0):
-            raise ValueError(f"{full_scale=} must be finite and > 0 A")
         super().__init__(rate=rate, drive_channels=drive_channels, sensed_channels=0, block=block)
 
     def _open(self) -> None:
@@ -107,38 +106,21 @@ class WaveFileDriver(BaseDriver):
             raise DriverError(f"{self.path}: open: {_reason(error)} ({form})") from error
 
     def _play(self, drive: Array) -> Sensed:
-        samples = drive / self.full_scale
+        samples, bits, flags = drive / self.full_scale, SUBTYPES[self._subtype], None
+        if bits is not None:  # integers are rounded to nearest and cut, so that soundfile writes them unchanged
+            top, beyond = 2.0 ** (bits - 1), np.abs(samples) > 1
+            self.clipped += int(np.count_nonzero(beyond))
+            flags = np.where(beyond.any(axis=1), int(Flag.SATURATED), 0) if beyond.any() else None
+            steps = np.clip(np.rint(samples * top), -top, top - 1)
+            samples = (steps.astype(np.int64) << (WIDTH - bits)).astype(np.int32)
         try:
-            self._file.write(self._form(samples))
+            self._file.write(samples)
         except (OSError, AssertionError, soundfile.SoundFileError) as error:  # soundfile asserts that all was written
             raise DeviceLost(f"{self.path}: write: {_reason(error)}") from error
-        return Sensed(np.empty((len(drive), 0)), flags=self._clip_flags(samples))
-
-    def _form(self, samples: Array) -> Array:
-        """Shape samples so that soundfile writes them unchanged: integers are rounded to nearest and cut."""
-        bits = SUBTYPES[self._subtype]
-        if bits is None:
-            return samples
-        top = 2.0 ** (bits - 1)
-        steps = np.clip(np.rint(samples * top), -top, top - 1)
-        return (steps.astype(np.int64) << (WIDTH - bits)).astype(np.int32)
-
-    def _clip_flags(self, samples: Array) -> Array | None:
-        """Count the samples that integers cannot hold; their flags, None where there are none."""
-        beyond = np.abs(samples) > 1
-        if SUBTYPES[self._subtype] is None or not beyond.any():
-            return None
-        self.clipped += int(np.count_nonzero(beyond))
-        return np.where(beyond.any(axis=1), int(Flag.SATURATED), 0)
+        return Sensed(np.empty((len(drive), 0)), flags=flags)
 
     def _close(self) -> None:
         self._file.close()
-
-    def read_back(self) -> Array:
-        """Drive as the closed file holds it (A, shape (n, drive_channels)), the closing block of zeros included."""
-        if self._state != "closed":
-            raise DriverError(f"{self}: read: it is {self._state}; close it first")
-        return read_back(self.path, full_scale=self.full_scale)
 
     def __str__(self) -> str:
         return str(self.path)

@@ -109,6 +109,14 @@ def numbers(
     return tuple(found.tolist())
 
 
+def frequencies(value: Any, *, zero: bool) -> np.ndarray[Any, Any]:
+    """Return frequencies (Hz) as an array, if all are finite and > 0, or `zero`."""
+    hertz = np.asarray(value, float)
+    good = (np.isfinite(hertz) & ((hertz >= 0) if zero else (hertz > 0))).all()
+    require(bool(good), "frequency", value, f"finite numbers {'>=' if zero else '>'} 0 Hz")
+    return hertz
+
+
 def rising(key: str, value: Any, count: int) -> tuple[float, ...]:
     """Return `count` rising times (s) from 0 to 100 h as a tuple of floats."""
     times = numbers(key, value, "s", least=0, most=360_000)
@@ -191,9 +199,10 @@ def checked(check: Callable[..., Any], default: Any = MISSING, *, about: str = "
     return field(default=default, metadata={"check": check, "bounds": bounds, **described})
 
 
-def mapping(check: Callable[[str, Any], Any]) -> Any:
+def mapping(check: Callable[[str, Any], Any], about: str = "") -> Any:
     """Field of a `Validated` class: a mapping, empty by default, that keeps what ``check(name, value)`` returns."""
-    return field(default_factory=dict, hash=False, metadata={"check": check, "bounds": {}})
+    described = {"about": about} if about else {}
+    return field(default_factory=dict, hash=False, metadata={"check": check, "bounds": {}, **described})
 
 
 def parameter(
@@ -225,7 +234,8 @@ class Validated:
 
     def __init_subclass__(cls) -> None:
         above = {name for base in cls.__mro__[1:] for name in vars(base).get("__annotations__", ())}
-        own = [name for name in vars(cls).get("__annotations__", ()) if name not in above]
+        hints = vars(cls).get("__annotations__", {})
+        own = [name for name, hint in hints.items() if name not in above and "ClassVar" not in str(hint)]
         about = {name: getattr(vars(cls).get(name), "metadata", {}) for name in own}
         text = inspect.cleandoc(cls.__doc__ or "")
         if about and "Parameters\n---" not in text and all("about" in each for each in about.values()):
@@ -256,9 +266,9 @@ class Validated:
         return cls(**overrides)
 
 
-def check_names(given: Iterable[str], known: Iterable[str], in_file: Iterable[str] = ()) -> None:
-    """Refuse a name that is not `known`; the message lists those that are, and what such a table of a file may have."""
+def check_names(given: Mapping[str, Any], known: Iterable[str], in_file: Iterable[str] = ()) -> None:
+    """Refuse a key that is not `known`; the message lists those that are, and what such a table of a file may have."""
     also = f"; in a file also {', '.join(sorted(in_file))}" if in_file else ""
-    for name in given:
-        if name not in known:
-            raise ValueError(f"{plain(name)}: no such parameter; known: {', '.join(sorted(known))}{also}")
+    for key, value in given.items():
+        if key not in known:
+            raise ValueError(f"{plain(key)} = {show(value)}: unknown key; known: {', '.join(sorted(known))}{also}")

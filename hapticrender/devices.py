@@ -145,14 +145,11 @@ def text() -> str:
     kinds = [["kind", "installed", "simulated", "a real one needs"], *map(_kind, _points("renderers"))]
     drivers = [["driver", "installed", "what it does"], *map(_driver, _points("drivers"))]
     there = [["--driver", "what is there"], *(row for entry in _points("drivers") for row in _there(entry))]
-    extras = [["extra", "installed", "for"], *(_extra(*each) for each in EXTRAS)]
+    extras = [["extra", "installed", "for"]]
+    for package, extra, use in EXTRAS:
+        extras.append([extra, "yes" if find_spec(package) else "no", f'{use} (pip install "hapticrender[{extra}]")'])
     hint = f"--driver takes {FORMS}: hapticrender.drivers.base describes a driver in a page."
     return "\n\n".join([table(kinds), table(drivers), hint, table(there), table(extras)])
-
-
-def _extra(package: str, extra: str, use: str) -> list[str]:
-    """Row of an extra, with the command that installs it."""
-    return [extra, "yes" if find_spec(package) else "no", use + f' (pip install "hapticrender[{extra}]")']
 
 
 def _points(group: str) -> list[Any]:

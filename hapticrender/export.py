@@ -75,7 +75,10 @@ def export(rendering: Rendering, folder: Path, *, bands: int = 0, force: bool = 
             _refuse_changed(folder / name, text)
         for name in ("design.h", "design.c"):
             _refuse_changed(folder / name, GENERATED)
-    texts |= {"design.h": _header(sizes), "design.c": _tables(design, supervision_table(rendering))}
+    defines = "".join(f"#define LAW_{name} {value}\n" for name, value in sizes.items())
+    texts["design.h"] = f"{GENERATED}#ifndef DESIGN_H\n#define DESIGN_H\n\n{defines}\n#endif\n"
+    tables = _table("design_t design", design), _table("supervision_t supervision", supervision_table(rendering))
+    texts["design.c"] = f'{GENERATED}#include "supervisor.h"\n\n{tables[0]}\n{tables[1]}'
     folder.mkdir(parents=True, exist_ok=True)
     for name, text in texts.items():
         (folder / name).write_text(text, encoding="utf-8")
@@ -170,17 +173,6 @@ def _refuse_changed(path: Path, text: str) -> None:
     """Refuse to overwrite a file that does not begin with `text`."""
     if path.exists() and not path.read_text(encoding="utf-8", errors="replace").startswith(text):
         raise ValueError(f"{str(path)!r}: is not as it was written: choose another folder, or add --force")
-
-
-def _header(sizes: dict[str, int]) -> str:
-    lines = [f"#define LAW_{name} {value}\n" for name, value in sizes.items()]
-    return f"{GENERATED}#ifndef DESIGN_H\n#define DESIGN_H\n\n{''.join(lines)}\n#endif\n"
-
-
-def _tables(design: dict[str, Any], supervision: dict[str, Any]) -> str:
-    return f'{GENERATED}#include "supervisor.h"\n\n{_table("design_t design", design)}\n' + _table(
-        "supervision_t supervision", supervision
-    )
 
 
 def _table(declared: str, fields: dict[str, Any]) -> str:

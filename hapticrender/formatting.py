@@ -86,7 +86,8 @@ def as_json(report: Any) -> str:
 
 
 def _finite(value: Any) -> Any:
-    """Replace every float that JSON cannot hold by None."""
+    """Replace every float that JSON cannot hold by None, and arrays by lists."""
+    value = value.tolist() if hasattr(value, "tolist") else value
     if isinstance(value, Mapping):
         return {key: _finite(entry) for key, entry in value.items()}
     if isinstance(value, list | tuple):

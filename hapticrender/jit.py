@@ -33,6 +33,8 @@ PATIENCE = 1.0  # s: a compilation that takes longer is announced
 ANNOUNCED = threading.Event()
 F8, I8, C16 = types.float64, types.int64, types.complex128
 STEP = types.int64(types.int64, types.int64, types.int64, types.int64)
+UNSIGNED_LONG = types.uint32 if sys.platform == "win32" else types.uint64
+CALLBACK = types.int32(I8, I8, UNSIGNED_LONG, I8, UNSIGNED_LONG, I8)  # PortAudio's
 
 SIGNALS = np.dtype(
     [
@@ -124,9 +126,7 @@ class CFunction:
         return int(self._compiled.ctypes(*values))
 
 
-def step(function: Callable[..., Any]) -> CFunction:
-    """Make a C function of a step; see the module."""
-    return CFunction(function)
+step = CFunction  # the decorator of a step; see the module
 
 
 @intrinsic
@@ -188,22 +188,25 @@ def atomic(operation: str) -> Any:
 swap, fetch_add = atomic("xchg"), atomic("add")
 
 
-def addresses(**arrays: np.ndarray[Any, Any] | None) -> np.ndarray[Any, Any]:
-    """Record of the addresses of some signals, shape (1,); the caller keeps the arrays alive.
+def record_of(dtype: np.dtype[Any], **values: Any) -> np.ndarray[Any, Any]:
+    """Record of `dtype`, shape (1,), with these fields set, an array's to its address: the caller keeps it alive.
 
     Raises
     ------
     ValueError
         An array is not C-contiguous.
     """
-    record = np.zeros(1, SIGNALS)
-    for name, array in arrays.items():
-        if array is None:
-            continue
-        if not array.flags.c_contiguous:
-            raise ValueError(f"{name} of shape {array.shape}: must be C-contiguous (use numpy.ascontiguousarray)")
-        record[name] = array.ctypes.data
+    record = np.zeros(1, dtype)
+    for name, value in values.items():
+        if isinstance(value, np.ndarray) and not value.flags.c_contiguous:
+            raise ValueError(f"{name} of shape {value.shape}: must be C-contiguous (use numpy.ascontiguousarray)")
+        record[name] = value.ctypes.data if isinstance(value, np.ndarray) else value
     return record
+
+
+def addresses(**arrays: np.ndarray[Any, Any] | None) -> np.ndarray[Any, Any]:
+    """Record of the addresses of some signals, shape (1,); see `record_of`."""
+    return record_of(SIGNALS, **{name: array for name, array in arrays.items() if array is not None})
 
 
 @entry

@@ -128,8 +128,12 @@ class LiveLoop(RealtimeEntry):
         A controller that takes waveforms goes on; else there is a new one for the texture's bands.
         """
         model = joint_model(self.rendering.model, rendering.model)
-        for part, its_model in _parts(controller, model):
-            _widen(part, its_model)
+        parts: Any = [(controller, model)]
+        if isinstance(controller, CombinedController):
+            parts = zip(controller.parts, (model.plate, model.friction), strict=True)
+        for part, its_model in parts:
+            if part is not None:
+                _widen(part, its_model)
         if controller is not self.controller:
             ready(controller)
         self.play(texture, controller)
@@ -212,17 +216,8 @@ def _modulated(bands: Bands) -> Bands:
     return replace(bands, modulated=True)
 
 
-def _parts(controller: Any, model: Any) -> list[tuple[Any, DeviceModel]]:
-    """Controllers of the parts of a device, None where there is none, and their models."""
-    if isinstance(controller, CombinedController):
-        return list(zip(controller.parts, (model.plate, model.friction), strict=True))
-    return [(controller, model)]
-
-
 def _widen(controller: Any, model: DeviceModel) -> None:
     """Let a controller, and its supervisor, do what `model` needs at most."""
-    if controller is None:
-        return
     if isinstance(controller, SupervisedController):
         p, designed = controller.state["p"], SupervisedController(controller.controller, model)
         if not p["gains"][0]:  # the texture before was beyond the frequencies at which gains are tested

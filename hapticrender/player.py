@@ -29,17 +29,17 @@ from typing import Any, Self
 
 import numpy as np
 
+from hapticrender.checks import number
 from hapticrender.control.carriers import FASTEST
 from hapticrender.control.probe import probe_plate
 from hapticrender.devices import open_driver
 from hapticrender.errors import HapticError, WatchdogTimeout
 from hapticrender.live_loop import LiveLoop, LiveMotion
-from hapticrender.live_recorder import LiveRecorder
 from hapticrender.live_threads import LiveThreads, hold_to_clock
-from hapticrender.loop import play_zeros, prepare, stopped_by_sigterm, zero_drive_after
+from hapticrender.loop import play_zeros, prepare, recorder_of, stopped_by_sigterm, zero_drive_after
 from hapticrender.player_state import BandState, PlayerState
 from hapticrender.protocols import Driver, Flag, Rendering, Texture
-from hapticrender.recordings.recording import Recording
+from hapticrender.recordings.recording import Recorder, Recording
 from hapticrender.sampled_texture import REACH
 from hapticrender.touch.composed import Playlist
 from hapticrender.touch.finger import MOST_LOAD, Finger
@@ -48,7 +48,7 @@ from hapticrender.touch.scene import Scene
 MOST_GAIN = 10.0
 LONGEST_WATCHDOG = 60.0  # s
 NOMINAL = Finger.sliding(speed=0.08, normal_load=0.4)  # for which a device is designed where none is stated
-LONGEST = 3600.0  # s: duration of a scene that has no end
+LONGEST, SHORTEST = 3600.0, 1e-3  # s: duration of a scene that has no end, as it is designed, as a recording says
 SERVICE = 0.05  # s between two looks: what comes next is computed, what was is recorded, faults are seen
 UPDATES = 0.2  # s: two positions within this time show a velocity
 END_FADE = 0.05  # s: five time constants of the gain; and the longest that zeros are waited for
@@ -120,7 +120,8 @@ class Player:
         self._until = math.inf  # s: ... until then
         self._error: BaseException | None = None
         self._raised = False
-        self._recorder: LiveRecorder | None = None
+        self._recorder: Recorder | None = None
+        self._unwritten: OSError | None = None  # that has ended the recording, such as a full disk
         self._calls = 0  # of the application that are under way
         self._entered, self._clocked = False, False  # whether the device has a clock of its own: it is not played
         self._recorded, self._served = 0, 0.0  # samples of this loop that were looked at; when the last look was
@@ -159,7 +160,7 @@ class Player:
 
     @gain.setter
     def gain(self, gain: float) -> None:
-        with self._calling():
+        with self._lock, self._busy():
             if not 0.0 <= gain <= MOST_GAIN:
                 raise ValueError(f"{gain=}: must be 0 to {MOST_GAIN:g}; an amplitude belongs in the texture")
             if self._loop is not None:
@@ -240,12 +241,17 @@ class Player:
 
     def record(self, path: str | Path) -> None:
         """Keep everything from now on in a journal (.au), until `end_recording` or the end; the device must play."""
-        with self._calling():
+        with self._lock, self._busy():
             loop = self._playing("record")
             if self._recorder is not None:
                 raise ValueError(f"{path}: a recording is under way: call end_recording first")
             self._service()
-            self._recorder = LiveRecorder(path, loop, endless=self._given is None)
+            rendering = replace(loop.rendering, model=loop.model)
+            scene = rendering.scene if self._given else replace(rendering.scene, duration=SHORTEST)
+            bands = replace(rendering.bands.select(np.zeros(0, int)), envelope=None, unfelt=())
+            recorder = recorder_of(rendering, path, scene=scene, bands=bands)
+            recorder.begin()
+            self._recorder, self._unwritten = recorder, None
 
     def end_recording(self) -> Recording:
         """End the recording and return it."""
@@ -254,11 +260,13 @@ class Player:
                 raise ValueError("nothing is being recorded: call record first")
             self._service()
             recorder, self._recorder = self._recorder, None
+            if self._unwritten is not None:
+                raise self._unwritten
             return recorder.finish()
 
     def state(self) -> PlayerState:
         """Return what plays at the moment, and what became of it."""
-        with self._calling():
+        with self._lock, self._busy():
             loop = self._playing("state")
             self._service()
             load = float(getattr(loop.rendering.device, "load", math.nan))
@@ -273,8 +281,7 @@ class Player:
         DeviceFault, DriverError
             The device has failed.
         """
-        if not 0.0 <= seconds < math.inf:
-            raise ValueError(f"{seconds=}: must be finite and >= 0 s")
+        seconds = number("seconds", seconds, "s", least=0.0)
         with self._lock:
             self._check()
             rate = self._playing("sleep").driver.rate
@@ -309,12 +316,6 @@ class Player:
             raise ValueError("the player is not open: use it in a with statement")
         if self._loop is not None:
             self._loop.alive()
-
-    @contextmanager
-    def _calling(self) -> Iterator[None]:
-        """A call of the application while nobody else changes anything."""
-        with self._lock, self._busy():
-            yield
 
     @contextmanager
     def _busy(self) -> Iterator[None]:
@@ -401,18 +402,14 @@ class Player:
 
         def failed(error: BaseException) -> None:
             self._error = self._error or error
-            self._zero_drive()
+            loop = self._playing("play")
+            with suppress(Exception):  # zero drive at once, on a device that may have failed
+                loop.silence()
+            with suppress(Exception):
+                if not self._clocked:
+                    play_zeros(loop.driver)
 
         self._stack.callback(self._threads.end, self._threads.start(target, failed), device, self._patience)
-
-    def _zero_drive(self) -> None:
-        """Set zero drive at once, on a device that may have failed; the next call raises the error."""
-        loop = self._playing("play")
-        with suppress(Exception):
-            loop.silence()
-        with suppress(Exception):
-            if not self._clocked:
-                play_zeros(loop.driver)
 
     def _drive_device(self) -> None:
         hold_to_clock(self._playing("play"), self._block, self._stopping)
@@ -458,8 +455,12 @@ class Player:
         if isinstance(loop, LiveLoop):
             loop.watch_touches(signals, gap)
         self._lost += gap + int(np.count_nonzero(signals["flags"] & Flag.OVERRUN))
-        if self._recorder is not None and len(signals["flags"]):
-            self._recorder.append(signals, gap, loop.motion_source)
+        if self._recorder is not None and self._unwritten is None and len(signals["flags"]):
+            try:
+                self._recorder.append(motion_source=loop.motion_source, gap=gap, **signals)
+            except OSError as error:
+                self._unwritten = error
+                self._close_recorder(stopped=False)
         if self._error is None and (fault := loop.fault()):
             self._error = fault
             if isinstance(fault, WatchdogTimeout):
@@ -486,4 +487,5 @@ class Player:
 
     def _close_recorder(self, stopped: bool) -> None:
         if self._recorder is not None:
-            self._recorder.close(stopped)
+            with suppress(OSError):
+                self._recorder.close(stopped)

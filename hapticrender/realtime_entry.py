@@ -23,10 +23,11 @@ from typing import Any
 
 import numpy as np
 
+from hapticrender.checks import number
 from hapticrender.control.records import CONTROLLER
 from hapticrender.control.state_transfer import drive_limits, state_table
 from hapticrender.control.supervisor import FADE_OUT
-from hapticrender.jit import CFunction, addresses
+from hapticrender.jit import CFunction, addresses, record_of
 from hapticrender.protocols import Array, Flag
 from hapticrender.realtime_kernel import AUDIO, CONTROL, ENTRY, HOLD, PLAIN, SLOT, publish
 from hapticrender.sampled_texture import FADE, SampledTexture
@@ -49,14 +50,14 @@ class _Control:
         self.limit = np.maximum(drive_limits(controller), limit)
         self._target = np.zeros((controller.block, controller.n_bands), complex)
         self._signals = addresses(**signals, target=self._target)
-        self.record = np.zeros(1, CONTROL)
-        self.record[0] = (
-            controller.step.address,
-            controller.state.ctypes.data,
-            self._signals.ctypes.data,
-            controller.bands.envelope is None,
-            self.shared.ctypes.data,
-            self.limit.ctypes.data,
+        self.record = record_of(
+            CONTROL,
+            step=controller.step.address,
+            state=controller.state,
+            signals=self._signals,
+            analysed=controller.bands.envelope is None,
+            shared=self.shared,
+            limit_at=self.limit,
         )
         self.address = int(self.record.ctypes.data)
 
@@ -94,9 +95,8 @@ class RealtimeEntry:
     def __init__(self, controller: Any, *, sensed_scale: float = 1.0, drive_scale: float = 1.0) -> None:
         if not isinstance(getattr(controller, "step", None), CFunction):
             raise TypeError(f"controller of type {type(controller).__name__}: must have a compiled step")
-        for name, value in (("sensed_scale (m)", sensed_scale), ("drive_scale (1/A)", drive_scale)):
-            if not 0 < value < np.inf:
-                raise ValueError(f"{name}={value!r}: must be finite and > 0")
+        number("sensed_scale", sensed_scale, "m", above=0.0)
+        number("drive_scale", drive_scale, "1/A", above=0.0)
         self.controller = controller
         self.block, self.rate = controller.block, float(controller.rate)
         self.whole = controller.bands.envelope is None
@@ -108,14 +108,11 @@ class RealtimeEntry:
         self.ahead, self._tracker = int(getattr(controller, "lookahead", 0)), np.zeros(1, CONTROLLER)
         self._tracker["p"]["rate"] = self.rate
         self._arrays = self._buffers()
+        self._signals = {name: self._arrays[name] for name in BLOCK}
         self._first = self._control = _Control(controller, self._signals)  # which may run without a texture
-        self._entry = np.zeros(1, ENTRY)
-        memory = {**self._arrays, "slots": self._slots}
-        numbers = {f"{name}_at": array.ctypes.data for name, array in memory.items()} | self._start()
-        numbers |= {"control": self._control.address, "tracker": self._tracker.ctypes.data}
-        numbers |= {"sensed_scale": sensed_scale, "drive_scale": drive_scale}
-        for name, value in numbers.items():
-            self._entry[name] = value
+        fields = {f"{name}_at": array for name, array in {**self._arrays, "slots": self._slots}.items()} | self._start()
+        fields |= {"control": self._control.address, "tracker": self._tracker}
+        self._entry = record_of(ENTRY, **fields, sensed_scale=sensed_scale, drive_scale=drive_scale)
         self.user_data = int(self._entry.ctypes.data)
 
     def _buffers(self) -> dict[str, Array]:
@@ -133,11 +130,7 @@ class RealtimeEntry:
             "log": np.zeros((rows, controller.channels + controller.sensors + 4)),
         }
 
-    @property
-    def _signals(self) -> dict[str, Array]:
-        return {name: self._arrays[name] for name in BLOCK}
-
-    def _start(self) -> dict[str, float]:
+    def _start(self) -> dict[str, Any]:
         """Numbers of the record at rest."""
         log, rate = self._arrays["log"], self.rate
         return {
@@ -200,7 +193,9 @@ class RealtimeEntry:
             The controller has another number of channels or sensors, block, look-ahead, rate or delay than the one
             before, or the texture plays under another controller.
         """
-        last, used = self._control, self._used()
+        last = self._control
+        # addresses of textures that are, or may yet be, read
+        used = {*self._slots["texture"].tolist(), *(int(self._entry[name][0]) for name in ("current", "previous"))}
         controller = last.controller if controller is None else controller
         for name in SAME:
             found, first = (getattr(each, name, 0) for each in (controller, self.controller))
@@ -237,9 +232,7 @@ class RealtimeEntry:
 
     def set_gain(self, gain: float) -> None:
         """Set the factor on the texture, finite; it is reached to 1 % within 50 ms."""
-        if not np.isfinite(gain):
-            raise ValueError(f"{gain=}: must be finite")
-        self._slot["gain"] = gain
+        self._slot["gain"] = number("gain", gain)
         self._hand_over()
 
     def watch(self, seconds: float | None = None) -> None:
@@ -310,10 +303,6 @@ class RealtimeEntry:
     def refused(self) -> int:
         """Calls that were refused, and got zeros, because they did not fit."""
         return int(self._entry["refused"][0])
-
-    def _used(self) -> set[int]:
-        """Addresses of textures that are, or may yet be, read."""
-        return {*self._slots["texture"].tolist(), *(int(self._entry[name][0]) for name in ("current", "previous"))}
 
     def _hand_over(self) -> None:
         with self._writing:

@@ -5,8 +5,6 @@
 
 from __future__ import annotations
 
-import sys
-
 import numba
 import numpy as np
 from numba import carray, types
@@ -14,7 +12,7 @@ from numba import carray, types
 from hapticrender.control.carriers import track_finger
 from hapticrender.control.records import CONTROLLER_T
 from hapticrender.control.state_transfer import transfer
-from hapticrender.jit import F8, I8, CFunction, call, entry, kernel, pointer, record, swap
+from hapticrender.jit import CALLBACK, F8, I8, CFunction, call, entry, kernel, pointer, record, swap
 from hapticrender.protocols import Flag
 from hapticrender.sampled_texture import TEXTURE_T, along_surface, eased, in_time
 
@@ -24,7 +22,6 @@ JUMP = 2e-3  # m: a larger correction of the position is a leap
 CONTINUE, ABORT = 0, 2  # results of PortAudio's callback
 OVERRUN, STOPPED = int(Flag.OVERRUN), int(Flag.STOPPED)
 LOST = 0b1111  # PortAudio's status: input or output under- or overflow
-UNSIGNED_LONG = types.uint32 if sys.platform == "win32" else types.uint64
 F4 = types.float32
 FRESH = 4  # bit beside the number of the slot in the middle: not yet read
 
@@ -327,4 +324,4 @@ def _audio(sensed, drive, frames, time, status, entry):
 
 
 PLAIN = CFunction(_plain, types.int32(I8, I8, types.uint64, I8))
-AUDIO = CFunction(_audio, types.int32(I8, I8, UNSIGNED_LONG, I8, UNSIGNED_LONG, I8))
+AUDIO = CFunction(_audio, CALLBACK)

@@ -12,7 +12,7 @@ import numba
 import numpy as np
 from numba import carray
 
-from hapticrender.jit import F8, kernel, pointer, record
+from hapticrender.jit import F8, kernel, pointer, record, record_of
 from hapticrender.protocols import Texture
 from hapticrender.touch.composed import SeparatedTexture
 
@@ -87,10 +87,9 @@ class SampledTexture:
         self._samples = np.zeros(2 * round(AHEAD * rate) if self._parts.timed else 0)
         places = np.arange(-REACH, REACH, STEP) if self._parts.spatial else np.zeros(0)
         self._profile = self._parts.along_surface(places)
-        self.record = np.zeros(1, TEXTURE)
-        self.record["samples_at"], self.record["length"] = self._samples.ctypes.data, len(self._samples)
-        self.record["profile_at"], self.record["points"] = self._profile.ctypes.data, len(self._profile)
-        self.record["start"], self.record["spacing"], self.record["fade"] = -REACH, STEP, FADE * rate
+        arrays = {"samples_at": self._samples, "profile_at": self._profile}
+        sizes = {"length": len(self._samples), "points": len(self._profile)}
+        self.record = record_of(TEXTURE, **arrays, **sizes, start=-REACH, spacing=STEP, fade=FADE * rate)
         self.address = int(self.record.ctypes.data)
         self.fill(0)
 

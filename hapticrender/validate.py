@@ -12,7 +12,7 @@ import traceback
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from contextlib import ExitStack
+from contextlib import ExitStack, nullcontext
 from dataclasses import asdict, dataclass, field
 from functools import partial
 from pathlib import Path
@@ -20,14 +20,14 @@ from typing import Any, TextIO
 from xml.etree import ElementTree
 
 from hapticrender import __version__, defaults
+from hapticrender.checks import integer
 from hapticrender.control.methods import method_named
 from hapticrender.devices import SIMULATED, naming_driver
-from hapticrender.errors import HapticError, SceneError
+from hapticrender.errors import HapticError
 from hapticrender.formatting import as_json, printable
 from hapticrender.loop import prepare, run
 from hapticrender.protocols import Rendering
-from hapticrender.report.outputs import JOURNAL, begin_outputs, refuse_to_overwrite, remove_outputs, write_outputs
-from hapticrender.report.progress import progress as progress_of
+from hapticrender.report import outputs
 from hapticrender.report.text import verdict as sentence
 from hapticrender.touch.builtin_scenes import builtin_scenes
 from hapticrender.touch.scene import Scene, distinct_names
@@ -81,8 +81,6 @@ def open_scene(reference: str | Path) -> Scene:
         return scenes[str(reference)]
     if not Path(reference).exists():
         raise ValueError(f"{reference}: no such file, nor a built-in scene (see `hapticrender scenes`)")
-    if not Path(reference).is_file():
-        raise SceneError(f"{reference}: must be a regular file")
     return Scene.from_toml(reference)
 
 
@@ -112,8 +110,7 @@ def validate(
     """
     if method is not None:
         method_named(method)
-    if jobs < 1:
-        raise ValueError(f"{jobs=}: must be >= 1 process")
+    integer("jobs", jobs, "processes", least=1)
     if jobs > 1 and driver != SIMULATED:
         raise ValueError(f"{jobs=}: must be 1 process where driver = {driver!r}: a device plays one scene at a time")
     judge = partial(_judge, method=method, seed=seed, driver=driver, out=None if out is None else Path(out))
@@ -125,8 +122,13 @@ def validate(
         if jobs > 1:
             pool = ProcessPoolExecutor(jobs, multiprocessing.get_context("spawn"))
             stack.callback(pool.shutdown, cancel_futures=True)
-            calls = [partial(_result, pool.submit(judge, *entry, None)) for entry in entries]
-        return [_shown(line, progress, call) for line, call in zip(shown, calls, strict=True)]
+            futures = [pool.submit(judge, *entry, None) for entry in entries]
+            calls = [lambda _, future=each: future.result() for each in futures]  # type: ignore[misc]
+        verdicts = []
+        for line, call in zip(shown, calls, strict=True):
+            with outputs.progress(line, progress) if line and progress else nullcontext() as tick:
+                verdicts.append(call(tick))
+        return verdicts
 
 
 def _read(scenes: Iterable[Scene | str | Path]) -> list[tuple[str, Scene | str]]:
@@ -176,30 +178,18 @@ def _problem(error: Exception) -> str:
     return str(error) if known else f"{type(error).__name__}: {error}"
 
 
-def _result(future: Any, _: Tick | None) -> Verdict:
-    return future.result()
-
-
-def _shown(line: str, stream: TextIO | None, judge: Callable[[Tick | None], Verdict]) -> Verdict:
-    """Judge a scene, with a `line` of progress."""
-    if not line or stream is None:
-        return judge(None)
-    with progress_of(line, stream) as tick:
-        return judge(tick)
-
-
 def _summary(rendering: Rendering, folder: Path | None, tick: Tick | None) -> dict[str, Any]:
     """Run a rendering, whatever its length, and judge it; only what does not pass stays in `folder`."""
     if folder is None:
         with tempfile.TemporaryDirectory() as scratch:
-            return run(rendering, journal=Path(scratch) / JOURNAL, progress=tick).summary()
-    refuse_to_overwrite(folder)
-    recording = run(rendering, journal=begin_outputs(folder, rendering.scene), progress=tick)
+            return run(rendering, journal=Path(scratch) / outputs.JOURNAL, progress=tick).summary()
+    outputs.refuse_to_overwrite(folder)
+    recording = run(rendering, journal=outputs.begin_outputs(folder, rendering.scene), progress=tick)
     summary = recording.summary()
     if not summary["passed"]:
-        return dict(write_outputs(folder, recording).summary)
+        return dict(outputs.write_outputs(folder, recording).summary)
     del recording  # closes its journal
-    remove_outputs(folder)
+    outputs.remove_outputs(folder)
     return summary
 
 

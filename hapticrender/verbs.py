@@ -10,8 +10,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from hapticrender import __version__, defaults
+from hapticrender.devices import naming_driver, open_driver, registered
+from hapticrender.devices import text as devices_text
 from hapticrender.errors import naming
 from hapticrender.formatting import printable, table
+from hapticrender.report.text import conditions, describe, figures, overview, verdict
 
 if TYPE_CHECKING:
     from hapticrender.protocols import Rendering
@@ -49,8 +52,6 @@ def demo(arguments: argparse.Namespace) -> int:
     """Render the built-in scenes and make a page about them."""
     from hapticrender.report import outputs
     from hapticrender.report.page import refuse_other_page, write_page
-    from hapticrender.report.progress import progress
-    from hapticrender.report.text import overview
     from hapticrender.touch.builtin_scenes import builtin_scenes
 
     scenes = builtin_scenes()
@@ -62,7 +63,7 @@ def demo(arguments: argparse.Namespace) -> int:
     finished: list[Outputs] = []
     try:
         for number, (name, rendering) in enumerate(zip(scenes, renderings, strict=True), 1):
-            with progress(f"{number}/{len(scenes)} {name}", sys.stderr) as tick:
+            with outputs.progress(f"{number}/{len(scenes)} {name}", sys.stderr) as tick:
                 finished.append(outputs.run_into(arguments.out / name, rendering, progress=tick))
     finally:
         if finished:
@@ -74,10 +75,7 @@ def demo(arguments: argparse.Namespace) -> int:
 
 def render(arguments: argparse.Namespace) -> int:
     """Render a scene into a folder."""
-    from hapticrender.devices import naming_driver
-    from hapticrender.report.outputs import run_into, written_in
-    from hapticrender.report.progress import progress
-    from hapticrender.report.text import verdict
+    from hapticrender.report.outputs import progress, run_into, written_in
 
     scene, notes = _scene(arguments.scene), ""
     _check_run_folder(arguments.out, arguments, Path(arguments.scene))
@@ -105,7 +103,7 @@ def render(arguments: argparse.Namespace) -> int:
 
 def play(arguments: argparse.Namespace) -> int:
     """Play a scene live, with a line for every band: target, achieved and flags."""
-    from hapticrender.devices import naming_driver
+    from hapticrender.checks import number
     from hapticrender.player import Player
     from hapticrender.report import outputs
     from hapticrender.report.page import refuse_other_page, write_page
@@ -113,9 +111,7 @@ def play(arguments: argparse.Namespace) -> int:
     scene, out = _scene(arguments.scene), arguments.out
     changes = {name: getattr(arguments, name) for name in ("method", "seed") if getattr(arguments, name) is not None}
     scene = replace(scene, **changes)
-    seconds = scene.duration if arguments.seconds is None else arguments.seconds
-    if not 0.0 < seconds < float("inf"):
-        raise ValueError(f"--seconds = {seconds}: must be finite and > 0 s")
+    seconds = number("--seconds", scene.duration if arguments.seconds is None else arguments.seconds, "s", above=0.0)
     if out:
         _check_run_folder(out / scene.name, arguments)
         if not arguments.force:
@@ -133,10 +129,12 @@ def play(arguments: argparse.Namespace) -> int:
                 player.record(journal)
             while player.time < seconds:
                 player.sleep(min(LOOK, seconds - player.time))
-                if sys.stdout.isatty():
-                    above = _print_over(printable(str(player.state())), above)
+                text = printable(str(player.state()))
+                if sys.stdout.isatty():  # over the lines before it (ANSI: up, and clear what follows)
+                    print((f"\x1b[{above}A\x1b[J" if above else "") + text, flush=True)
+                    above = text.count("\n") + 1
                 elif player.time >= second:  # in a file or a pipe, once a second
-                    print(printable(str(player.state())), flush=True)
+                    print(text, flush=True)
                     second = int(player.time) + 1
     finally:
         if journal is not None and journal.exists():
@@ -145,15 +143,8 @@ def play(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def _print_over(text: str, above: int) -> int:
-    """Print `text` over the `above` lines before it (ANSI: up, and clear what follows); return how many it has."""
-    print((f"\x1b[{above}A\x1b[J" if above else "") + text, flush=True)
-    return text.count("\n") + 1
-
-
 def scenes(arguments: argparse.Namespace) -> int:
     """List the built-in scenes, or print one."""
-    from hapticrender.report.text import describe
     from hapticrender.touch.builtin_scenes import builtin_scenes
 
     scenes = builtin_scenes()
@@ -171,7 +162,6 @@ def validate(arguments: argparse.Namespace) -> int:
     if arguments.suite:
         return _suite(arguments)
     from hapticrender.report.outputs import check_file, check_folder
-    from hapticrender.report.text import overview
     from hapticrender.touch.builtin_scenes import builtin_scenes
     from hapticrender.validate import counted, exit_status, validate, write_json, write_junit
 
@@ -187,12 +177,12 @@ def validate(arguments: argparse.Namespace) -> int:
     options = {"method": arguments.method, "seed": arguments.seed, "jobs": arguments.jobs, "out": arguments.out}
     options["driver"] = arguments.driver
     verdicts = validate(references, **options, progress=sys.stderr)
-    if rendered := [verdict.summary for verdict in verdicts if verdict.summary]:
+    if rendered := [each.summary for each in verdicts if each.summary]:
         print(printable(table(overview(rendered))))
     print(counted(verdicts), flush=True)
-    for verdict in verdicts:
-        if verdict.verdict == "error":
-            fail(str(verdict), 2)
+    for each in verdicts:
+        if each.verdict == "error":
+            fail(str(each), 2)
     status = exit_status(verdicts, strict=arguments.strict)
     for option, path, write in reports:
         try:
@@ -224,8 +214,6 @@ def _suite(arguments: argparse.Namespace) -> int:
 
 def identify(arguments: argparse.Namespace) -> int:
     """Identify a device, and write its profile."""
-    from hapticrender.devices import naming_driver
-    from hapticrender.loop import registered
     from hapticrender.plants.electroadhesion import ElectroadhesionScreen
     from hapticrender.plants.identify import identify
     from hapticrender.plants.identify_friction import identify_resonance, identify_screen
@@ -311,7 +299,6 @@ def finger(arguments: argparse.Namespace) -> int:
 
 def latency(arguments: argparse.Namespace) -> int:
     """Measure the delay of a loop through a cable."""
-    from hapticrender.devices import naming_driver, open_driver
     from hapticrender.latency import measure_latency, write_delay
     from hapticrender.report.outputs import check_file
 
@@ -352,9 +339,7 @@ def show(arguments: argparse.Namespace) -> int:
 
 def devices(arguments: argparse.Namespace) -> int:
     """List what is installed and what is there."""
-    from hapticrender.devices import text
-
-    print(text())
+    print(devices_text())
     return 0
 
 
@@ -363,8 +348,6 @@ def _print_written(paths: list[Path]) -> None:
 
 
 def _print_figures(summary: Any) -> None:
-    from hapticrender.report.text import conditions, figures
-
     print(printable(f"{conditions(summary)}\n{figures(summary)}"))
 
 
@@ -405,8 +388,6 @@ def _driver(text: str, scene: Scene) -> Any:
 
     A module of the user's is looked for in the folder that the command is run in, too.
     """
-    from hapticrender.devices import open_driver
-
     if "" not in sys.path:
         sys.path.insert(0, "")
     return open_driver(text, scene.device_profile)

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -21,10 +22,11 @@ from hapticrender.bands import Bands
 from hapticrender.checks import Validated, check_names, inside, parameter, require
 from hapticrender.control.combined import CombinedBands, CombinedController, CombinedModel, design_combined
 from hapticrender.control.device_model import DeviceModel
+from hapticrender.mathx import smoothstep
 from hapticrender.plants.electroadhesion import ElectroadhesionParameters, ElectroadhesionScreen
 from hapticrender.plants.hybrid import PLACES, HybridPlant
 from hapticrender.plants.plate import PlateParameters
-from hapticrender.protocols import Array, Driver, Method, Sensed, Texture
+from hapticrender.protocols import Array, Driver, Method, Sensed
 from hapticrender.renderers.base import BaseRenderer, check_channels
 from hapticrender.renderers.electroadhesion import ElectroadhesionRenderer, ElectroadhesionSettings, ScreenSetup
 from hapticrender.renderers.friction import RATIO
@@ -51,24 +53,7 @@ class HybridSettings(Validated):
 
     def share_of_screen(self, frequency: Any) -> Any:
         """Share of a band at `frequency` (Hz) that the screen takes; the plate takes the rest."""
-        x = np.clip(np.asarray(frequency, float) / self.start - 1.0, 0.0, 1.0)
-        return x * x * (3.0 - 2.0 * x)
-
-
-@dataclass(frozen=True)
-class Shared:
-    """The share of a texture that one part of the device takes."""
-
-    own: Bands
-    texture: Texture
-
-    def bands(self, rate: float) -> Bands:
-        """Carriers and envelopes of the share (`rate` in Hz is not needed)."""
-        return self.own
-
-    def waveform(self, time: Array, position: Array) -> Array:
-        """Waveform of the whole texture (m)."""
-        return self.texture.waveform(time, position)
+        return smoothstep(np.asarray(frequency, float) / self.start - 1.0)
 
 
 class HybridDriver(WrappedDriver):
@@ -220,7 +205,8 @@ def _part_of(driver: Driver, drive: int, sensed: int, name: str) -> Driver:
 
 def _part(scene: Scene, bands: Bands) -> Scene:
     """Scene of one part of the device; bands below the threshold have been left out already."""
-    return replace(scene, texture=Shared(bands, scene.texture), keep_unfelt=True)
+    share: Any = SimpleNamespace(bands=lambda rate: bands, waveform=scene.texture.waveform)  # whole, as a waveform
+    return replace(scene, texture=share, keep_unfelt=True)
 
 
 def _share_out(scene: Scene, settings: HybridSettings, plate: PlateParameters, rate: float) -> CombinedBands:
@@ -250,15 +236,15 @@ def _split(scene: Scene) -> tuple[HybridSettings, Scene, Scene]:
         check_names(scene.rendering, own | of_screen, scene_keys("render"))
         settings = HybridSettings(**{key: value for key, value in scene.rendering.items() if key in own})
     with inside("device"):
-        profiles = _split_table(scene.profile, own | of_screen)
+        plate, screen = _split_table(scene.profile, own | of_screen)
     with inside("simulation"):
-        simulations = _split_table(scene.simulation, own | of_screen)
-    renderings = {}, {key: value for key, value in scene.rendering.items() if key not in own}
-    plate, screen = (
-        replace(scene, profile=profile, simulation=simulation, rendering=rendering)
-        for profile, simulation, rendering in zip(profiles, simulations, renderings, strict=True)
+        of_plate, on_screen = _split_table(scene.simulation, own | of_screen)
+    rendering = {key: value for key, value in scene.rendering.items() if key not in own}
+    return (
+        settings,
+        replace(scene, profile=plate, simulation=of_plate, rendering={}),
+        replace(scene, profile=screen, simulation=on_screen, rendering=rendering, limits={}),  # which are the plate's
     )
-    return settings, plate, replace(screen, limits={})  # they are those of the plate
 
 
 def _split_table(values: Mapping[str, Any], settings: set[str]) -> list[dict[str, Any]]:

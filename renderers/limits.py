@@ -133,7 +133,7 @@ def needed(
     `per_target` (drive per target at frequencies in Hz) may state another drive.  A finger-locked carrier of a constant
     target passes every frequency up to that of the finger's top speed.
     """
-    per_target = per_target or partial(_drive_of_free_device, model)
+    per_target = per_target or (lambda frequency: 1.0 / model.response(frequency).sum(axis=-1)[..., 0])
     if bands.envelope is None:
         return _need_of_waveform(scene, model, bands, waveform, per_target)
     sweep = np.minimum(top_speed(scene) * bands.wavenumber, model.highest_edge * model.highest_frequency)
@@ -149,11 +149,6 @@ def needed(
     power = (drive[0, bands.wavenumber == 0.0] ** 2).sum() / 2.0
     rms = math.sqrt(power * -math.expm1(-scene.duration / scene.device_profile.limits.rms_time))
     return Need(*sums, float(target[at]), float(passed[at]), *ends, rms)
-
-
-def _drive_of_free_device(model: DeviceModel, frequency: Array) -> Array:
-    """Drive of all channels alike per target, complex, at `frequency` (Hz)."""
-    return np.asarray(1.0 / model.response(frequency).sum(axis=-1)[..., 0])
 
 
 def _need_of_waveform(

@@ -67,8 +67,12 @@ class VibrotactileRenderer(BaseRenderer):
         # that of a simulated plate may differ from what is assumed; a driver may state less than was identified
         delay = assumed.delay if own else max(assumed.delay, driver.delay)
         model = replace(assumed.device_model(driver.rate, delay), block=driver.block)
-        if setup.scene.gradient:
-            model = replace(model, shape=_pattern(setup.scene, assumed))
+        if gradient := setup.scene.gradient:  # of an amplitude 1 + gradient x: displacement at x is x_c + (x/a) a theta
+            require(coils > 1, "gradient", gradient, "0 1/m: a plate with one coil moves as a whole")
+            steepest = 2 * STEEPEST / assumed.glass_length
+            bound = f"<= {steepest:g} 1/m, where the amplitude at one end of the plate is 0"
+            require(abs(gradient) <= steepest, "gradient", gradient, bound)
+            model = replace(model, shape=(1.0, gradient * assumed.half_spacing))
         stated = "bending_frequency" in setup.scene.profile  # 0 as well: identified, and no mode found
         if model.rigid and not stated and not isinstance(plate, Plate):
             return replace(model, bending=EXPECTED_BENDING, rigid=False)
@@ -87,12 +91,3 @@ class VibrotactileRenderer(BaseRenderer):
         if not len(bands) and bands.envelope is not None:
             return model
         return governed(model, demand(setup.scene, model, bands, setup.scene.texture.waveform))
-
-
-def _pattern(scene: Scene, plate: PlateParameters) -> tuple[float, float]:
-    """Heave and rocking of an amplitude 1 + gradient x: displacement at x is x_c + (x/a) a theta."""
-    gradient, steepest = scene.gradient, 2 * STEEPEST / plate.glass_length
-    require(plate.coils > 1, "gradient", gradient, "0 1/m: a plate with one coil moves as a whole")
-    bound = f"<= {steepest:g} 1/m, where the amplitude at one end of the plate is 0"
-    require(abs(gradient) <= steepest, "gradient", gradient, bound)
-    return 1.0, scene.gradient * plate.half_spacing

@@ -88,7 +88,7 @@ def test_a_scene_takes_what_the_file_says_and_what_it_says_itself_wins(plate, tm
         ),
         ('[device]\nprofile = "a.toml"\nkind = "hybrid"', "device.kind = 'hybrid': must be left out beside profile"),
         ('[device]\nkind = "vt-plate"\n[limits]\nrms_drive = 0', "limits.rms_drive = 0: must be a finite number > 0"),
-        ('[device]\nkind = "vt-plate"\n[calibration]\ngain = 1', "calibration.gain: no such parameter; known: delay"),
+        ('[device]\nkind = "vt-plate"\n[calibration]\ngain = 1', "calibration.gain = 1: unknown key; known: delay"),
     ],
 )
 def test_a_scene_with_a_wrong_profile_gets_one_line(tmp_path, line, message):
@@ -110,7 +110,7 @@ def test_a_scene_with_a_wrong_profile_gets_one_line(tmp_path, line, message):
             '[profile]\nkind = "vt-plate"\nmeasured_on = "yesterday"',
             "measured_on = 'yesterday': must be a date such as",
         ),
-        ('[profile]\nkind = "vt-plate"\nfrom = 1', "profile.from: no such parameter; known: kind, measured_by"),
+        ('[profile]\nkind = "vt-plate"\nfrom = 1', "profile.from = 1: unknown key; known: kind, measured_by"),
         (
             '[profile]\nkind = "vt-plate"\n[uncertainty]\nmass = 1.0',
             r"uncertainty.mass: must be of a parameter in \[dev",

@@ -29,7 +29,7 @@ def played(driver, blocks):
     with driver:
         for block in blocks:
             driver.play(block)
-    held = driver.read_back()
+    held = read_back(driver.path, full_scale=driver.full_scale)
     assert not held[len(held) - driver.block :].any()
     return held[: len(held) - driver.block]
 
@@ -75,7 +75,14 @@ def test_integers_cut_what_is_beyond_full_scale_and_say_so(tmp_path):
         assert driver.play(np.array([[0.25, 0.5], [1.5, -4.0]])).flags.tolist() == [0, Flag.SATURATED]
     assert driver.clipped == 2
     top = 1 - 2.0**-15
-    assert driver.read_back().tolist() == [[top, -1.0], [0.5, 0.0], [0.25, 0.5], [top, -1.0], [0.0, 0.0], [0.0, 0.0]]
+    assert read_back(driver.path, full_scale=driver.full_scale).tolist() == [
+        [top, -1.0],
+        [0.5, 0.0],
+        [0.25, 0.5],
+        [top, -1.0],
+        [0.0, 0.0],
+        [0.0, 0.0],
+    ]
 
 
 def test_a_file_is_whole_after_an_exception_in_mid_run(tmp_path, rng):
@@ -90,7 +97,9 @@ def test_a_file_is_whole_after_an_exception_in_mid_run(tmp_path, rng):
 
     with pytest.raises(KeyboardInterrupt):
         interrupted()
-    np.testing.assert_array_equal(driver.read_back(), np.vstack([*blocks, np.zeros((8, 2))]))
+    np.testing.assert_array_equal(
+        read_back(driver.path, full_scale=driver.full_scale), np.vstack([*blocks, np.zeros((8, 2))])
+    )
 
 
 @pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="no SIGKILL on this system")

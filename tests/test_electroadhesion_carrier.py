@@ -8,7 +8,7 @@ from electroadhesive import tone
 
 import hapticrender as hr
 from hapticrender.drivers.base import BaseDriver
-from hapticrender.drivers.wavefile import WaveFileDriver
+from hapticrender.drivers.wavefile import WaveFileDriver, read_back
 from hapticrender.renderers.electroadhesion import ElectroadhesionRenderer
 
 FAST = 192_000  # Hz
@@ -20,7 +20,7 @@ def played(tmp_path, **plant):
     driver = WaveFileDriver(tmp_path / "carrier.wav", rate=FAST, drive_channels=1, full_scale=FULL, subtype="DOUBLE")
     scene = tone(100.0, duration=0.5, output="carrier", **plant)
     recording = hr.render(scene, driver=driver)
-    return recording, scene, driver.read_back()[:, 0]
+    return recording, scene, read_back(driver.path, full_scale=driver.full_scale)[:, 0]
 
 
 def held(recording, scene):

@@ -137,7 +137,7 @@ def test_states_in_which_nothing_can_be_sent():
     with pytest.raises(DeviceNotFound, match="/dev/no-such-board: open: "):
         NU32Board("/dev/no-such-board").open()
     for wrong in (0.0, np.inf, np.nan):
-        with pytest.raises(ValueError, match="timeout = .*: must be finite and > 0 s"):
+        with pytest.raises(ValueError, match="timeout = .*: must be a finite number > 0 s"):
             NU32Board("COM7", timeout=wrong)
 
 

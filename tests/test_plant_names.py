@@ -26,7 +26,7 @@ def known_of(device):
     """Names that the refusals of a misspelt one list."""
     known = []
     for field, table in (("simulation", "simulation"), ("rendering", "render")):
-        with pytest.raises(ValueError, match=rf"^{table}.mispelt: no such parameter; known: ") as refused:
+        with pytest.raises(ValueError, match=rf"^{table}.mispelt = 1.0: unknown key; known: ") as refused:
             opened(device, **{field: {"mispelt": 1.0}})
         names = re.sub(r".*known: |; in a file also .*", "", str(refused.value)).split(", ")
         assert names == sorted(set(names))

@@ -197,7 +197,7 @@ def test_shape_is_that_of_a_free_bar():
     ("overrides", "message"),
     [
         ({"mass": 0.0}, r"mass = 0.0: must be .*> 0 .*kg"),
-        ({"masss": 1.0}, r"masss: no such parameter; known: .*mass"),
+        ({"masss": 1.0}, r"masss = 1.0: unknown key; known: .*mass"),
         ({"bending_frequency": 6000.0}, r"bending_frequency = 6000.0: must be <= rate = 5000 Hz"),
     ],
 )

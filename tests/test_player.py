@@ -205,7 +205,7 @@ def test_what_it_refuses(tmp_path):
             (lambda: player.finger(0.0, 0.1, -1.0), r"load=-1\.0 N"),
             (lambda: player.finger(None), "position=None"),
             (lambda: setattr(player, "gain", np.nan), "gain=nan: must be 0 to 10"),
-            (lambda: player.sleep(-1.0), "seconds=-1.0"),
+            (lambda: player.sleep(-1.0), "seconds = -1.0"),
         ):
             with pytest.raises(ValueError, match=what):
                 act()

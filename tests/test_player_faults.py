@@ -54,7 +54,7 @@ def test_the_watchdog_stops_the_drive_of_an_application_that_hangs(tmp_path):
 def test_the_watchdog_runs_in_real_time_and_waits_for_calls_that_take_long():
     with hr.Player(watchdog=0.2) as player:
         player.play(TONE)
-        with player._calling():
+        with player._lock, player._busy():
             time.sleep(0.5)
         player.sleep(0.1)
         end = time.monotonic() + 20.0
@@ -179,7 +179,7 @@ def test_a_disk_that_fails_ends_the_recording_and_not_the_play(tmp_path, monkeyp
         def full(**signals):
             raise OSError(28, "No space left on device")
 
-        monkeypatch.setattr(player._recorder._recorder, "append", full)
+        monkeypatch.setattr(player._recorder, "append", full)
         player.sleep(0.5)
         assert player.state().bands[0].error < 0.02
         with pytest.raises(OSError, match="No space left"):

@@ -350,7 +350,7 @@ def test_what_it_refuses():
     entry = RealtimeEntry(controller())
     with pytest.raises(ValueError, match="must be finite"):
         entry.finger(0.0, np.nan)
-    with pytest.raises(ValueError, match="gain=nan"):
+    with pytest.raises(ValueError, match="gain = nan"):
         entry.set_gain(np.nan)
 
 

@@ -278,7 +278,7 @@ CHANGES = [
     ({"tolerance": None}, "tolerance is missing"),
     ({"bands": {"frequency": [1], "wavenumber": [0, 1], "phase": [0]}}, "wavenumber has shape (2,)"),
     ({"version": 99}, "version = 99: must be 2"),
-    ({"colour": 1}, "colour: no such parameter"),
+    ({"colour": 1}, "colour = 1: unknown key"),
 ]
 
 

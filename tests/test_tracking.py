@@ -162,7 +162,7 @@ def test_a_sample_may_state_its_own_error():
         for estimator, error in ((stated, 1e-3), (plain, None)):
             estimator.update(n / 100, 0.02 * np.sin(OMEGA * n / 100), error)
     assert stated.at(0.5) == pytest.approx(plain.at(0.5), rel=1e-12)
-    with pytest.raises(ValueError, match="error=0.0 m: must be finite and > 0"):
+    with pytest.raises(ValueError, match="error = 0.0: must be a finite number > 0 m"):
         stated.update(1.0, 0.0, 0.0)
 
 
@@ -250,7 +250,7 @@ def test_wrong_sensors_are_refused():
         (lambda: hr.finest_wavelength(TouchPanel(), 0.05, highest=0.0), "highest = 0.0: must be > 0 Hz"),
         (lambda: budget.bandwidth(MotionEstimator(1e-4), np.nan), "rate = nan: must be a finite number > 0 Hz"),
         (lambda: hr.Scene(texture=hr.Grating(frequency=50.0, amplitude=1e-6), duration=1.0, touch_panel={"hz": 1}),
-         "touch_panel.hz: no such parameter"),
+         "touch_panel.hz = .*: unknown key"),
         (lambda: hr.Player("vt-plate", touch_panel={"rate": 60.0}), "touch_panel: has no effect on the positions that"),
     ):  # fmt: skip
         with pytest.raises((ValueError, TypeError), match=message):

@@ -8,7 +8,7 @@ from ultrasonic import ASKED, FREE, NOISE, held, modulated, ran
 
 import hapticrender as hr
 from hapticrender.drivers.simulated import SimulatedDriver
-from hapticrender.drivers.wavefile import WaveFileDriver
+from hapticrender.drivers.wavefile import WaveFileDriver, read_back
 from hapticrender.loop import prepare, run
 from hapticrender.plants.surface import SurfaceParameters, UltrasonicSurface
 from hapticrender.plants.ultrasonic import UltrasonicParameters, UltrasonicPlate
@@ -173,7 +173,7 @@ def test_a_file_at_192_khz_is_driven_open_loop(tmp_path):
     recording = hr.render(scene(frequency=200.0, duration=0.42, settle=0.2), driver=file)
     assert recording.rate == 12e3
     assert recording.sensed.shape[1] == 0
-    drive = file.read_back()
+    drive = read_back(file.path, full_scale=file.full_scale)
     moved = UltrasonicPlate(UltrasonicParameters(), SLIDE).run(drive).motion[:, 0]
     assert friction_of(moved, 200.0) == pytest.approx(WANTED, rel=PER_CENT)
     # naive: a finger of twice the load is not noticed; its film has other friction, and the plate another resonance

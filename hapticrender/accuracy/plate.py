@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
-from functools import partial
 from itertools import product
 from typing import Any, NamedTuple
 
@@ -255,11 +254,7 @@ def identified(bench: Bench) -> dict[str, float]:
     return worst
 
 
-def _of(case: Callable[[Bench], dict[str, float]], method: str) -> dict[str, float]:
-    return case(Bench(method=method))
-
-
 CASES: dict[str, Callable[[str], dict[str, float]]] = {
-    case.__name__: partial(_of, case)
+    case.__name__: lambda method, case=case: case(Bench(method=method))  # type: ignore[misc]
     for case in (free, slide, touch, chirp, comb, press, wobble, wrong, late, overload, identified)
 }

@@ -111,7 +111,7 @@ TARGETS = (
     ),
 )
 CASES: dict[str, Callable[[str], dict[str, float]]] = {**plate.CASES, **friction.CASES}
-METHOD_FREE = frozenset(("identified", *friction.METHOD_FREE))  # cases that do not depend on the method
+METHOD_FREE = frozenset(("identified", *friction.WITHOUT_METHOD))  # cases that do not depend on the method
 
 
 def run_suite(

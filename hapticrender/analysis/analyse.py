@@ -102,10 +102,13 @@ def analyse_finger(
     spoiled = _spoiled(recording)[: len(touch.contact)]
     touch = replace(touch, contact=np.where(spoiled, DOUBTFUL, touch.contact))
     impedance = signals.impedance(course, touch, recording.bands, frequency, length, recording.header.calibration)
+    edges = np.r_[0, np.flatnonzero(np.diff(touch.contact)) + 1, len(touch.contact)]
     return FingerRecord(
         **vars(touch),
         name=recording.header.name,
-        segments=_segments(touch, rate),
+        segments=tuple(
+            Segment(int(touch.contact[i]), i / rate, j / rate) for i, j in itertools.pairwise(edges.tolist())
+        ),
         plate=track_of(course, len(drive) / rate),
         impedance=impedance,
         least_load=tracker.least_load(MIDDLE, MILLIMETRE),
@@ -235,14 +238,6 @@ class _Signals:
         found = impedance_of(course, lines, self.noise, load, middle, spread, gain)
         value, errors = (np.where(usable, each, np.nan) for each in (found.value, found.standard_error))
         return replace(found, value=value, standard_error=errors)
-
-
-def _segments(touch: Touch, rate: float) -> tuple[Segment, ...]:
-    """Spans of one kind of contact."""
-    edges = np.r_[0, np.flatnonzero(np.diff(touch.contact)) + 1, len(touch.contact)]
-    return tuple(
-        Segment(int(touch.contact[i]), float(i / rate), float(j / rate)) for i, j in itertools.pairwise(edges.tolist())
-    )
 
 
 def _implausible(touch: Touch, impedance: Impedance, seconds: float) -> str:

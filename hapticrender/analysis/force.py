@@ -63,20 +63,16 @@ class MotionFilter:
 
     def update(self, drive: Array, sensed: Array) -> Signals:
         """Signals (n, 2) of the samples `delay` before those of drive (A, (n, coils)) and measurement (m, (n, 2))."""
-        force, coordinates = self.force(drive), sensed @ self.coordinate_from_sensed.T
-        coordinates[:, 0] -= self._bending_by(force[:, 0])
+        from scipy.signal import lfilter, lfilter_zi
+
+        force, coordinates, (b, a) = self.force(drive), sensed @ self.coordinate_from_sensed.T, self._mode
+        before = lfilter_zi(b, a) * force[0, 0] if self._bent is None else self._bent
+        bent, self._bent = lfilter(b, a, force[:, 0], zi=before)
+        coordinates[:, 0] -= bent
         motion = self._sensed.before(coordinates)
         middle = motion[0]  # far from zero the taps' rounding would show
         x, v, a = (convolve(motion - middle, taps) for taps in self._motion)
         return Signals(x + middle, v, a, convolve(self._drive.before(force), self._force))
-
-    def _bending_by(self, force: Array) -> Array:
-        """Displacement of the sensors (m, (n,)) as the drive's heave force (N, (n,)) bends the glass."""
-        from scipy.signal import lfilter, lfilter_zi
-
-        b, a = self._mode
-        bent, self._bent = lfilter(b, a, force, zi=lfilter_zi(b, a) * force[0] if self._bent is None else self._bent)
-        return np.asarray(bent)
 
     def force(self, drive: Array) -> Array:
         """Force (N, (n, 2)) on heave and rocking of a drive (A, (n, coils)), rounded and limited as the plate does."""

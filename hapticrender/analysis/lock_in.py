@@ -69,7 +69,8 @@ def tile(inside: Array, length: int, before: int, after: int) -> Array:
 
     `before` and `after` samples are left out at the beginning and at the end of a span.
     """
-    edges = np.flatnonzero(np.diff(np.r_[False, inside, False].astype(np.int8)))
-    spans = zip(edges[::2] + before, edges[1::2] - after, strict=True)
-    starts = [np.arange(first, last - length + 1, length) for first, last in spans]
+    from scipy.ndimage import find_objects, label
+
+    spans = (span for (span,) in find_objects(label(inside)[0]))
+    starts = [np.arange(span.start + before, span.stop - after - length + 1, length) for span in spans]
     return np.concatenate([np.empty(0, int), *starts]).astype(int)

@@ -124,7 +124,6 @@ def fit_finger(
     order: int | None = None,
     *,
     loads: tuple[float, float] = (0.0, inf),
-    load_exponent: float | None = None,
 ) -> FingerFit:
     """Fit a finger of 2nd or 4th order to measured impedances by weighted complex least squares.
 
@@ -137,8 +136,6 @@ def fit_finger(
         None takes the order that the data support: the 4th where the Bayesian information criterion is smaller.
     loads : (float, float), N
         The class of loads: least (included) and largest (excluded).
-    load_exponent : float or None
-        Growth of |Z_f| with the load inside the class; None fits it, 0 takes the finger as the same at all loads.
 
     Returns
     -------
@@ -186,11 +183,16 @@ def fit_finger(
             f"finger of order {order or 2} needs at least {fewest}: record more frequencies, or widen the loads"
         )
     patterns = _plate_patterns(impedance, samples)
-    second = _fit(samples, patterns, 2, load_exponent)
+    second = _fit(samples, patterns, 2)
     if order == 2 or (order is None and found < FEWEST[4]):
         return second
-    fourth = _fit(samples, patterns, 4, load_exponent, second)
-    return fourth if order == 4 else _supported(second, fourth)
+    fourth = _fit(samples, patterns, 4, second)
+    if order == 4:
+        return fourth
+    size = fourth.degrees_of_freedom + len(fourth.names)
+    scatter = max(1.0, fourth.chi_square / max(fourth.degrees_of_freedom, 1))
+    gain = (second.chi_square - fourth.chi_square) / scatter - 3 * log(size)
+    return replace(fourth, bic_margin=gain) if gain > 0 else replace(second, bic_margin=-gain)
 
 
 def fit_load_classes(
@@ -226,35 +228,29 @@ def _impedance(numbers: Mapping[str, Any], frequency: Array, normal_load: float 
     return whole if normal_load is None else whole * (normal_load / fields["reference_load"]) ** exponent
 
 
-def _plate_errors(record: FingerRecord, w: Array, sigma: Array) -> Array:
-    """Standard errors of the plate's mass (kg), damping (N s/m), stiffness (N/m), at most what `sigma` has room for."""
-    errors, known = record.plate.standard_errors, [inf]
-    for name in ("damping", "stiffness"):
-        sides = [errors[f"{name}_{side}"].mean() for side in (1, 2) if f"{name}_{side}" in errors]
-        known.append(float(np.hypot(*sides)) if len(sides) == 2 else inf)
-    return np.minimum(known, [sqrt(2) * (sigma * factor).min() for factor in (1 / w, 1.0, w)])
-
-
 def _plate_patterns(impedance: Source | Sequence[Source], samples: Samples) -> Array:
     """Errors of the samples (N s/m, (n, 3 a recording)) by one standard error of each number of the plate."""
     w, columns = 2 * np.pi * samples.frequency, []
     for number, each in enumerate(parts_of(impedance)):
         own = samples.source == number
         if isinstance(each, FingerRecord) and own.any():
-            mass, damping, stiffness = _plate_errors(each, w[own], samples.standard_error[own])
+            errors, known = each.plate.standard_errors, [inf]  # of mass (kg), damping (N s/m), stiffness (N/m)
+            for name in ("damping", "stiffness"):
+                sides = [errors[f"{name}_{side}"].mean() for side in (1, 2) if f"{name}_{side}" in errors]
+                known.append(float(np.hypot(*sides)) if len(sides) == 2 else inf)
+            room = [sqrt(2) * (samples.standard_error * factor)[own].min() for factor in (1 / w, 1.0, w)]
+            mass, damping, stiffness = np.minimum(known, room)
             columns += [1j * w * mass * own, damping * own, stiffness / (1j * w) * own]
     return np.array(columns).reshape(-1, len(w)).T
 
 
-def _fit(
-    samples: Samples, patterns: Array, order: int, exponent: float | None, second: FingerFit | None = None
-) -> FingerFit:
+def _fit(samples: Samples, patterns: Array, order: int, second: FingerFit | None = None) -> FingerFit:
     """Fit one order, from several starts where it is the 4th, and the errors of the plates on the way."""
     from scipy.optimize import least_squares
 
     names, logs = NAMES[: 3 * order // 2], np.log(samples.load)
-    fixed = {"order": order, "reference_load": float(np.exp(logs.mean())), "load_exponent": exponent or 0.0}
-    if exponent is None and np.ptp(logs) > APART:
+    fixed = {"order": order, "reference_load": float(np.exp(logs.mean())), "load_exponent": 0.0}
+    if np.ptp(logs) > APART:
         names = (*names, "load_exponent")
     units, weight, count = np.array([UNITS[name] for name in names]), 1 / samples.standard_error, len(names)
 
@@ -304,11 +300,3 @@ def _inverse(jacobian: Array) -> Array:
     _, size, right = np.linalg.svd(jacobian, full_matrices=False)
     spread = right.T / np.maximum(size, 1e-12 * size[0])
     return spread @ spread.T
-
-
-def _supported(second: FingerFit, fourth: FingerFit) -> FingerFit:
-    """Return the fit with the smaller Bayesian information criterion, with its margin."""
-    size = fourth.degrees_of_freedom + len(fourth.names)
-    scatter = max(1.0, fourth.chi_square / max(fourth.degrees_of_freedom, 1))
-    gain = (second.chi_square - fourth.chi_square) / scatter - 3 * log(size)
-    return replace(fourth, bic_margin=gain) if gain > 0 else replace(second, bic_margin=-gain)

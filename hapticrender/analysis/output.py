@@ -39,30 +39,20 @@ def write(record: FingerRecord, folder: Path) -> list[Path]:
     names = ["time (s)", "normal load (N)", "position (m)", "frequency (Hz)", "real part (N s/m)"]
     names += ["imaginary part (N s/m)", "standard error of each (N s/m)"]
     _write_csv(paths[1], names, np.column_stack([*of_window, *of_band]))
-    paths[2].write_text(as_json(_figures(record)), encoding="utf-8")
+    figures = {
+        "name": record.name,
+        "bandwidth": {name: getattr(record, name).bandwidth for name in SERIES},
+        "least_load": record.least_load,
+        "segments": [{"kind": KINDS[each.kind], "start": each.start, "stop": each.stop} for each in record.segments],
+        "plate": vars(record.plate),
+        "notes": record.notes,
+    }
+    paths[2].write_text(as_json(figures), encoding="utf-8")
     return paths
 
 
 def _write_csv(path: Path, names: list[str], rows: np.ndarray[Any, Any]) -> None:
     np.savetxt(path, rows, fmt="%.9g", delimiter=",", header=",".join(names), comments="", encoding="utf-8")
-
-
-def _figures(record: FingerRecord) -> dict[str, Any]:
-    """Numbers beside the tables, ready for JSON."""
-    plate = record.plate
-    return {
-        "name": record.name,
-        "bandwidth": {name: getattr(record, name).bandwidth for name in SERIES},
-        "least_load": record.least_load,
-        "segments": [{"kind": KINDS[each.kind], "start": each.start, "stop": each.stop} for each in record.segments],
-        "plate": {
-            "measured": plate.measured,
-            "time": plate.time.tolist(),
-            "values": {name: each.tolist() for name, each in plate.values.items()},
-            "standard_errors": {name: each.tolist() for name, each in plate.standard_errors.items()},
-        },
-        "notes": list(record.notes),
-    }
 
 
 def text(record: FingerRecord) -> str:

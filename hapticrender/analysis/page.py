@@ -11,7 +11,7 @@ import numpy as np
 from hapticrender.analysis.load_law import load_exponent, mean_exponent
 from hapticrender.analysis.models import FingerFit
 from hapticrender.analysis.records import LOADED, FingerRecord
-from hapticrender.report.page import NO_PICTURE, html_page, html_table
+from hapticrender.report.page import NO_PICTURE, html_page, html_row, html_table
 
 Fits = dict[str, dict[int, FingerFit]]  # by load class and order
 LABELS = {
@@ -67,9 +67,9 @@ def _fits(fits: Fits) -> str:
         ("probability p of a larger χ²", *p_values),
         ("supported by the data", *(_supported(fits[name], fit) for name, fit in flat)),
     ]  # fmt: skip
-    body = [_row("td", *cells) for cells in rows]
+    body = [html_row("td", cells) for cells in rows]
     heads = (f"{name}, {NAMES[fit.order]}<br>at {fit.mechanics.reference_load:.2f} N" for name, fit in flat)
-    return f"""{html_table(_row("th", "Finger", *heads), body)}
+    return f"""{html_table(html_row("th", ["Finger", *heads]), body)}
 <p class="note">With half of the 95&nbsp;% interval. The supported order has the smaller Bayesian information
 criterion; a difference of 10 is strong.
 With p below 0.01 the model, with one exponent for all loads, does not explain the data within their stated errors:
@@ -80,11 +80,6 @@ def _supported(of_class: Mapping[int, FingerFit], fit: FingerFit) -> str:
     if len(of_class) == 1:
         return "too few frequencies to compare"
     return f"yes, by {fit.bic_margin:.3g}" if isfinite(fit.bic_margin) else "no"
-
-
-def _row(kind: str, first: str, *cells: str) -> str:
-    """One row of a table, its first cell a text."""
-    return f'<tr><{kind} class="text">{first}</{kind}>{"".join(f"<{kind}>{each}</{kind}>" for each in cells)}</tr>'
 
 
 def _value(fit: FingerFit, name: str) -> str:
@@ -112,7 +107,7 @@ def _laws(records: Sequence[FingerRecord]) -> str:
         means = mean_exponent([load_exponent(each) for each in records], law.frequency)
         for row, n, error in zip(rows, *means[:2], strict=True):
             row.insert(1, _exponent(n, error))
-    return f"""{html_table(_row("th", *head), [_row("td", *row) for row in rows])}
+    return f"""{html_table(html_row("th", head), [html_row("td", row) for row in rows])}
 <p class="note">|Z<sub>f</sub>| ~ W<sup>n</sup>; contact of an elastic sphere suggests n = 1/3.{note}</p>"""
 
 

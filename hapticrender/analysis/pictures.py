@@ -16,7 +16,7 @@ from hapticrender.analysis.load_law import LoadLaw, load_exponent, mean_exponent
 from hapticrender.analysis.models import LOAD_CLASSES, FingerFit, fit_finger, fit_load_classes
 from hapticrender.analysis.page import NAMES, SURE, Fits, page_of
 from hapticrender.analysis.records import DOUBTFUL, KINDS, LOADED, UNLOADED, FingerRecord, Series
-from hapticrender.analysis.samples import BAND, Samples, by_frequency, one_load, samples_of, weighted_mean
+from hapticrender.analysis.samples import APART, BAND, Samples, by_frequency, samples_of, weighted_mean
 from hapticrender.protocols import Array
 from hapticrender.recordings.formats import MissingExtra
 from hapticrender.report.figure import BLUE, INK, ORANGE, PALE, RED, legend, new_figure, save
@@ -47,7 +47,8 @@ def draw(records: FingerRecord | Sequence[FingerRecord], folder: str | os.PathLi
     drawn: dict[str, Callable[[Path], None]] = {
         f"time-{i + 1}.png": partial(draw_time, each) for i, each in enumerate(records)
     }
-    if not one_load(samples_of(records)):
+    load = samples_of(records).load
+    if load.size and np.ptp(np.log(load)) >= APART:  # how the impedance grows with the load is in the data
         drawn["load.png"] = partial(draw_load, records)
     if fits:
         drawn["frequency.png"] = partial(draw_frequency, records, fits)
@@ -83,7 +84,9 @@ def draw_time(record: FingerRecord, path: str | os.PathLike[str]) -> None:
         panels = figure.subplots(len(drawings), 1, sharex=True, height_ratios=heights)
         for axes, drawing in zip(panels, drawings, strict=True):
             drawing(axes, record)
-            _shade(axes, record)
+            for kind, colour in SHADES.items():
+                for segment in record.of_kind(kind):
+                    axes.axvspan(segment.start, segment.stop, color=colour, alpha=0.7, lw=0, zorder=0)
         panels[-1].set(xlabel="time (s)", xlim=(record.time[0], record.time[-1]))
         figure.align_ylabels(panels)
         save(figure, path)
@@ -129,12 +132,6 @@ def _colours(count: int) -> list[Any]:
     from matplotlib import colormaps
 
     return [colormaps["viridis"](0.9 * i / max(count - 1, 1)) for i in range(count)]
-
-
-def _shade(axes: Any, record: FingerRecord) -> None:
-    for kind, colour in SHADES.items():
-        for segment in record.of_kind(kind):
-            axes.axvspan(segment.start, segment.stop, color=colour, alpha=0.7, lw=0, zorder=0)
 
 
 def _curve(axes: Any, time: Array, series: Series, scale: float, colour: str, label: str) -> Any:

@@ -63,11 +63,6 @@ def weighted_mean(value: Array, standard_error: Array) -> tuple[complex, float]:
     return mean, (max(1.0, scatter) / float(weight.sum())) ** 0.5
 
 
-def one_load(samples: Samples) -> bool:
-    """Whether all loads are the same, within 1 %: how the impedance grows with the load is not in the data."""
-    return not samples.load.size or bool(np.ptp(np.log(samples.load)) < APART)
-
-
 def by_frequency(samples: Samples) -> list[Samples]:
     """Split samples into bins of 5 % of frequency, by rising frequency."""
     bins = np.rint(np.log(samples.frequency) / BAND).astype(int)

@@ -209,11 +209,15 @@ class TouchMonitor:
 
     def _test(self, parts: Array, lever: Array) -> TouchTest:
         """T over d by a grid and two refinements; the plate's errors are found for each d by least squares."""
-        lever = self._smoothed(lever)
+        from scipy.ndimage import uniform_filter1d
+
+        lever = uniform_filter1d(lever, max(round(SMOOTHED * self.model.rate), 1), mode="nearest")
         force, per_error = self._force(parts), self._regressors(parts)
         along, across = self._spectrum(force[0]), self._spectrum(force[1] - lever * force[0])
         rows = self._spectrum(per_error[1] - lever * per_error[0]), self._spectrum(per_error[0])
-        late = self._spectrum(self._changes(lever) * force[0])
+        speed = self.model.rate * np.gradient(lever)
+        changes = [LATENESS * speed, LATENESS**2 / 2.0 * self.model.rate * np.gradient(speed)]  # of the lever arm
+        late = self._spectrum(np.array(changes) * force[0])
         rows = np.vstack([rows[0], late]), np.vstack([rows[1], 0.0 * late])
         if self._rest is None:
             along, across, rows = along[1:], across[1:], (rows[0][:, 1:], rows[1][:, 1:])
@@ -229,17 +233,6 @@ class TouchMonitor:
             best, statistic = float(errors[np.argmin(totals)]), float(totals.min())
         freedom = 2.0 * along.size - (1.0 if self._rest is not None else 0.0)  # at 0 Hz a number is real
         return TouchTest(statistic, freedom, bound_of(freedom), best / self.model.lever_per_metre)
-
-    def _smoothed(self, lever: Array) -> Array:
-        width = max(round(SMOOTHED * self.model.rate), 1)
-        padded = np.pad(lever, (width // 2, width - 1 - width // 2), "edge")
-        return np.convolve(padded, np.full(width, 1.0 / width), "valid")
-
-    def _changes(self, lever: Array) -> Array:
-        """First derivative of the lever arm times a lateness, and second one times half its square, shape (2, n)."""
-        rate = self.model.rate
-        speed = rate * np.gradient(lever)
-        return np.array([LATENESS * speed, LATENESS**2 / 2.0 * rate * np.gradient(speed)])
 
     def _value(self, left: Array, rows: Array, noise: Array, lever: float) -> float:
         """T without its term of d, for one d: least squares over the plate's errors and the position's lateness."""

@@ -5,8 +5,7 @@ from __future__ import annotations
 import csv
 import os
 from array import array
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +14,7 @@ import numpy as np
 from hapticrender.bands import Bands
 from hapticrender.checks import number, require, show
 from hapticrender.protocols import Array
-from hapticrender.recordings.formats import _h5py
+from hapticrender.recordings.formats import _h5py, naming_damage
 from hapticrender.recordings.journal import Header, join
 
 METHOD = "recorded elsewhere"
@@ -76,13 +75,17 @@ def assemble(
 
     See ``Recording.from_columns``.
     """
-    from hapticrender.touch.custom import Custom
-    from hapticrender.touch.scene import Scene
+    from hapticrender.touch.scene import Custom, Scene
 
     source = "columns" if isinstance(columns, Mapping) else Path(columns).name
     table = columns if isinstance(columns, Mapping) else read_columns(columns)
     found = {key: _columns(table, key, each) for key, each in chosen.items() if each is not None}
-    count = _length([pair for pairs in found.values() for pair in pairs])
+    lengths = {name: len(values) for pairs in found.values() for name, values in pairs}
+    if len(set(lengths.values())) > 1:
+        listed = ", ".join(f"{name} {length}" for name, length in lengths.items())
+        raise ValueError(f"columns differ in length: {listed} samples: all must be of one clock")
+    count = max(lengths.values(), default=0)
+    require(count >= 2, "columns", count, "at least 2 samples")
     rate = _rate(rate, found["time"][0][1] if "time" in found else None, count)
     own = {"name": Path(source).stem} | {key: header.pop(key) for key in ("name", "device") if key in header}
     scene = Scene(texture=Custom(f"what {source} was recorded with"), duration=count / rate, settle=0.0, **own)
@@ -143,17 +146,6 @@ def _columns(table: Mapping[str, Any], key: str, chosen: Chosen) -> list[tuple[s
         finite = not np.isinf(values).any()
         require(finite, f"{key}: column {name}", np.inf, "finite, or NaN where there is no value")
     return found
-
-
-def _length(columns: Sequence[tuple[str, Array]]) -> int:
-    """Length of all columns, at least 2."""
-    lengths = {name: len(values) for name, values in columns}
-    if len(set(lengths.values())) > 1:
-        listed = ", ".join(f"{name} {length}" for name, length in lengths.items())
-        raise ValueError(f"columns differ in length: {listed} samples: all must be of one clock")
-    count = max(lengths.values(), default=0)
-    require(count >= 2, "columns", count, "at least 2 samples")
-    return count
 
 
 def _rate(rate: float | None, time: Array | None, count: int) -> float:
@@ -250,19 +242,10 @@ def _number(text: str) -> float | None:
         return None
 
 
-@contextmanager
-def _damaged(path: Path, kind: str) -> Iterator[None]:
-    """Turn whatever a library raises about a damaged file into a ValueError."""
-    try:
-        yield
-    except Exception as error:
-        raise ValueError(f"{path}: damaged, or not {kind} ({error})") from error
-
-
 def _read_mat(path: Path) -> Mapping[str, Any]:
     from scipy.io import loadmat
 
-    with _damaged(path, "a MAT file"):
+    with naming_damage(path, "damaged, or not a MAT file"):
         try:
             found = loadmat(path, appendmat=False)
         except NotImplementedError:  # version 7.3 is HDF5
@@ -280,15 +263,12 @@ def _read_hdf5(path: Path) -> dict[str, Array]:
         if isinstance(entry, h5py.Dataset):
             found[name] = entry[()]
 
-    with _damaged(path, "an HDF5 file"), h5py.File(path, "r") as file:
+    with naming_damage(path, "damaged, or not an HDF5 file"), h5py.File(path, "r") as file:
         file.visititems(take)
     return found
 
 
 def _read_npz(path: Path) -> dict[str, Array]:
-    with (
-        _damaged(path, "an NPZ file of arrays"),
-        path.open("rb") as opened,
-        np.load(opened, allow_pickle=False) as file,
-    ):
+    problem = "damaged, or not an NPZ file of arrays"
+    with naming_damage(path, problem), path.open("rb") as opened, np.load(opened) as file:
         return {name: file[name] for name in file.files}

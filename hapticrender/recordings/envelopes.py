@@ -6,7 +6,6 @@ The estimator's own smoothing so cancels from every error; pieces are of bounded
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -110,46 +109,37 @@ def analyse(recording: Recording) -> Envelopes:
     hop = max(1, size // (HOPS_LOCKED if bands.wavenumber.any() else HOPS))
     hop = hop if count // hop <= MOST_WINDOWS else size
     first = np.arange(0, count - size + 1, hop)
-    parts = [_analyse_batch(recording, starts, size) for starts in _batches(first, size, len(bands))]
+    each = max(1, CHUNK_VALUES // (size * (2 * len(bands) + 2)))  # windows in a batch, whose regressors stay small
+    parts = [_analyse_batch(recording, first[i : i + each], size) for i in range(0, max(len(first), 1), each)]
     fields = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
     return Envelopes(start=first / rate, window=size / rate, **fields)
 
 
-def _batches(first: Array, size: int, n_bands: int) -> Iterator[Array]:
-    """Window starts in batches, at least one, whose regressors stay small."""
-    each = max(1, CHUNK_VALUES // (size * (2 * n_bands + 2)))
-    for i in range(0, max(len(first), 1), each):
-        yield first[i : i + each]
-
-
 def _analyse_batch(recording: Recording, first: Array, size: int) -> dict[str, Array]:
     """Fields of `Envelopes` for the windows that begin at samples `first`."""
-    envelope, inflation, residual, has_target, finger = _fit_windows(recording, first, size)
-    signed = _quarterly(recording.bands, recording.rate, finger)
+    bands, rate = recording.bands, recording.rate
+    start, stop = (int(first[0]), int(first[-1]) + size) if len(first) else (0, 0)
+    index = (first - start)[:, None] + np.arange(size)
+    position, target = recording.read("position", start, stop), recording.read("target", start, stop)
+    phase = bands.carrier_phase(np.arange(start, stop) / rate, position)
+    signals = np.column_stack([recording.read("reference", start, stop), recording.read("motion", start, stop)])[index]
+    envelope, inflation, rest = fit(phase[index], signals)
+    # a window in which the target fades holds intended motion that no constant envelope explains: it is subtracted
+    floor = RIDGE * np.mean(signals[..., 0] ** 2, axis=1) + np.finfo(float).tiny
+    multiple = np.mean(rest[..., 1] * rest[..., 0], axis=1) / (np.mean(rest[..., 0] ** 2, axis=1) + floor)
+    residual = rest[..., 1] - multiple[:, None] * rest[..., 0]
+    signed = _quarterly(bands, rate, position[index])
     frequency = abs(signed)
     fast = np.all(frequency >= LOWEST_FREQUENCY * (1 - 1e-6), axis=1)
     return {
         "target": envelope[:, 0],
         "achieved": envelope[:, 1:],
         "readable": fast & (inflation <= LARGEST_INFLATION),
-        "has_target": has_target,
+        "has_target": (target != 0)[index].all(axis=1),
         "frequency": frequency.mean(axis=1),
         "backward": signed.mean(axis=1) < 0.0,
         "residual": np.mean(residual**2, axis=1),
     }
-
-
-def _fit_windows(recording: Recording, first: Array, size: int) -> tuple[Array, ...]:
-    """Fit windows that begin at samples `first`: envelopes, inflation, residual, whether a target is set, positions."""
-    start, stop = (int(first[0]), int(first[-1]) + size) if len(first) else (0, 0)
-    index = (first - start)[:, None] + np.arange(size)
-    position = recording.read("position", start, stop)
-    phase = recording.bands.carrier_phase(np.arange(start, stop) / recording.rate, position)
-    target = recording.read("target", start, stop)
-    signals = np.column_stack([recording.read("reference", start, stop), recording.read("motion", start, stop)])[index]
-    envelope, inflation, rest = fit(phase[index], signals)
-    residual = _unexplained(rest[..., 1], rest[..., 0], signals[..., 0])
-    return envelope, inflation, residual, (target != 0)[index].all(axis=1), position[index]
 
 
 def fit(phase: Array, signals: Array) -> tuple[Array, Array, Array]:
@@ -175,17 +165,6 @@ def fit(phase: Array, signals: Array) -> tuple[Array, Array, Array]:
     envelope = parts[..., :n_bands] + 1j * parts[..., n_bands:-2]
     variance = np.diagonal(inverse, axis1=1, axis2=2)[:, :-2].reshape(windows, 2, n_bands).max(axis=1)
     return envelope, variance * (size / 2), rest
-
-
-def _unexplained(rest: Array, reference_rest: Array, reference: Array) -> Array:
-    """Subtract from the residual of a motion (shape (w, m)) the multiple of the residual of the reference waveform.
-
-    A window in which the target fades holds intended motion that no constant envelope explains.
-    """
-    with np.errstate(**DIVERGING):
-        floor = RIDGE * np.mean(reference**2, axis=1) + np.finfo(float).tiny
-        multiple = np.mean(rest * reference_rest, axis=1) / (np.mean(reference_rest**2, axis=1) + floor)
-        return rest - multiple[:, None] * reference_rest
 
 
 def _quarterly(bands: Bands, rate: float, finger: Array) -> Array:

@@ -44,7 +44,7 @@ def read(path: str | os.PathLike[str]) -> tuple[Header, Any]:
     reader = _by_suffix(path, READERS, "read")
     if path.exists() and not path.is_file() and not path.is_dir():
         raise ValueError(f"{path}: must be a regular file")
-    with path.open("rb"), _naming(path):  # a missing file is the same OSError for every format
+    with path.open("rb"), naming_damage(path):  # a missing file is the same OSError for every format
         return reader(path)
 
 
@@ -122,8 +122,8 @@ def _assembled(path: Path, load: Callable[[str], Any]) -> tuple[Header, Array]:
 
 
 @contextmanager
-def _naming(path: Path) -> Iterator[None]:
-    """Name the file in whatever a damaged one makes numpy, zipfile, scipy or h5py raise."""
+def naming_damage(path: Path, problem: str = "not a recording") -> Iterator[None]:
+    """Name the file and the `problem` in whatever a damaged one makes numpy, zipfile, scipy or h5py raise."""
     try:
         yield
     except HapticError:
@@ -132,17 +132,13 @@ def _naming(path: Path) -> Iterator[None]:
         if str(error).startswith(f"{path}: "):
             raise
         reason = " ".join(str(error).split()) or type(error).__name__
-        raise ValueError(f"{path}: not a recording ({reason})") from error
+        raise ValueError(f"{path}: {problem} ({reason})") from error
 
 
 def _check_size(path: Path, name: str, size: int) -> None:
     """Refuse an array of more bytes than its file: `save` never compresses."""
     if size > path.stat().st_size:
         raise ValueError(f"{name} has {size} bytes, the file {path.stat().st_size}: compressed recordings are not read")
-
-
-def _write_npz(path: Path, header: Header, frames: Any) -> None:
-    np.savez(path, **_values(header, frames))
 
 
 def _read_npz(path: Path) -> tuple[Header, Array]:
@@ -268,7 +264,7 @@ READERS: dict[str, Callable[[Path], tuple[Header, Any]]] = {
 }
 WRITERS: dict[str, Callable[[Path, Header, Any], None]] = {
     ".au": write_journal,
-    ".npz": _write_npz,
+    ".npz": lambda path, header, frames: np.savez(path, **_values(header, frames)),
     ".h5": _write_h5,
     ".hdf5": _write_h5,
     ".mat": _write_mat,

@@ -6,6 +6,7 @@ after the process that wrote it was killed (libsndfile up to 1024 columns, 507 b
 
 from __future__ import annotations
 
+import itertools
 import json
 import os
 import struct
@@ -13,6 +14,7 @@ import threading
 import weakref
 from collections.abc import Iterator
 from dataclasses import MISSING, dataclass, fields
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -106,19 +108,25 @@ class Header(Validated):
         own = {name: getattr(scene, name) for name in ("name", "device", "duration", "tolerance", "settle")}
         return cls(scene=scene.to_toml(), **own, **rest)
 
+    @cached_property
+    def columns(self) -> dict[str, list[tuple[str, str]]]:
+        """Name and unit of every column of each signal, in the order of the file."""
+        parts = ((k + 1, part) for k in range(len(self.bands)) for part in ("re", "im"))
+        return {
+            "drive": [(f"drive {i + 1}", unit) for i, unit in enumerate(self.drive_units)],
+            "sensed": [(f"sensed {i + 1}", self.unit) for i in range(self.sensed_channels)],
+            "motion": [(f"motion {place}", self.unit) for place in self.places],
+            "position": [("position", "m")],
+            "normal_load": [("normal load", "N")],
+            "flags": [("flags", "1")],
+            "reference": [("reference", self.unit)],
+            "target": [(f"target {k} {part}", self.unit) for k, part in parts],
+        }
+
     @property
     def widths(self) -> dict[str, int]:
-        """Number of columns of each signal, in the order of the file."""
-        return {
-            "drive": self.drive_channels,
-            "sensed": self.sensed_channels,
-            "motion": len(self.places),
-            "position": 1,
-            "normal_load": 1,
-            "flags": 1,
-            "reference": 1,
-            "target": 2 * len(self.bands),
-        }
+        """Number of columns of each signal."""
+        return {name: len(columns) for name, columns in self.columns.items()}
 
     @property
     def slices(self) -> dict[str, slice]:
@@ -135,16 +143,7 @@ class Header(Validated):
     @property
     def channels(self) -> list[tuple[str, str]]:
         """Name and unit of every column."""
-        return [
-            *((f"drive {i + 1}", unit) for i, unit in enumerate(self.drive_units)),
-            *((f"sensed {i + 1}", self.unit) for i in range(self.sensed_channels)),
-            *((f"motion {place}", self.unit) for place in self.places),
-            ("position", "m"),
-            ("normal load", "N"),
-            ("flags", "1"),
-            ("reference", self.unit),
-            *((f"target {k + 1} {part}", self.unit) for k in range(len(self.bands)) for part in ("re", "im")),
-        ]
+        return [*itertools.chain(*self.columns.values())]
 
     def to_json(self) -> str:
         """Write all fields as one JSON object; numbers keep every digit."""

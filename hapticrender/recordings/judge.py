@@ -111,7 +111,6 @@ def _band(recording: Recording, k: int, judged: Array, places: list[str]) -> dic
     }
     for place, envelope in zip(places, achieved.T, strict=True):
         figures[f"error_{place}"] = float(np.mean(np.abs(envelope))) / mean - 1.0 if mean else None
-    for place, envelope in zip(places, achieved.T, strict=True):
         figures[f"rms_error_{place}"] = float(amplitude_error(envelope, target, 0)) if some else None
     return figures
 

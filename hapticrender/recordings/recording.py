@@ -79,8 +79,8 @@ class Recorder:
     def __exit__(self, kind: type[BaseException] | None, *exc: object) -> None:
         self.close(stopped=kind is not None)
 
-    def append(self, *, motion_source: str | None = None, **signals: Array) -> None:
-        """Append n samples of every signal.
+    def append(self, *, motion_source: str | None = None, gap: int = 0, **signals: Array) -> None:
+        """Append n samples of every signal, after `gap` samples that nobody has kept (`Flag.OVERRUN`).
 
         `drive` (n, channels) as commanded in each interval; `sensed` (n, channels); `motion` (n, places), true or the
         best estimate; finger `position` (n,), m, NaN while lifted; `normal_load` (n,), N; `reference` (n,), the texture
@@ -90,6 +90,8 @@ class Recorder:
         """
         if motion_source is not None and self._file is None and not self._blocks:
             self.header = replace(self.header, motion_source=motion_source)
+        if gap > 0:
+            self._append_unknown(gap, Flag.OVERRUN)
         if self._requested is not None:
             signals["reference"] = np.zeros(len(signals["drive"]))
         self._blocks.append(journal.join(self.header, signals))
@@ -123,19 +125,21 @@ class Recorder:
         """
         try:
             if stopped and not self._closed and (self._file is not None or self._blocks):
-                self._append_stop()
+                self._append_unknown(1, Flag.STOPPED)
             self._closed = True
             self.flush()
         finally:
             if self._file is not None:
                 self._file.close()
 
-    def _append_stop(self) -> None:
-        stop, columns = np.zeros((1, len(self.header.channels))), self.header.slices
+    def _append_unknown(self, count: int, flag: Flag) -> None:
+        """Append samples of zero drive with a flag, of which nothing else is known."""
+        unknown, columns = np.zeros((count, len(self.header.channels))), self.header.slices
         for name in ("sensed", "motion", "position"):
-            stop[:, columns[name]] = np.nan
-        stop[:, columns["flags"]] = int(Flag.STOPPED)
-        self._blocks.append(stop)
+            unknown[:, columns[name]] = np.nan
+        unknown[:, columns["flags"]] = int(flag)
+        self._blocks.append(unknown)
+        self._waiting += count
 
     def finish(self) -> Recording:
         """Close the journal and return the recording; with a path it is read from the file, not held in memory."""

@@ -13,7 +13,7 @@ from hapticrender.formatting import as_json, bands_label, short
 from hapticrender.report.outputs import JOURNAL, Outputs
 from hapticrender.report.text import band_rows, conditions, overview, remarks, verdict, waveform_rows
 
-_MANY_BANDS = 10
+_MANY_BANDS = 10  # beyond so many their table is folded
 NO_PICTURE = '<p class="note">No picture: matplotlib is not installed.</p>'
 GENERATOR = '<meta name="generator" content="hapticrender">'
 CLASSES = {"passed": "good", "passed in band": "good", "failed": "bad", "not judged": "note"}
@@ -33,7 +33,6 @@ th { color: var(--soft); vertical-align: bottom; }
 td { border-top: 1px solid var(--line); }
 th.text, td.text { text-align: left; }
 td.wide { white-space: normal; min-width: 9rem; }
-th.group { text-align: center; border-bottom: 1px solid var(--line); }
 .good { color: var(--good); }
 .bad { color: var(--bad); }
 .note, dt { color: var(--soft); }
@@ -112,7 +111,7 @@ def html_table(head: str, rows: Sequence[str]) -> str:
     return f'<div class="scroll"><table>\n<thead>\n{head}\n</thead>\n<tbody>\n{body}\n</tbody>\n</table></div>'
 
 
-def _row(tag: str, cells: Sequence[str], verdict: str = "") -> str:
+def html_row(tag: str, cells: Sequence[str], verdict: str = "") -> str:
     """Row of a table from its cells, HTML; the first is a text, and so is the last, of class `verdict` where given."""
     classes = [' class="text"', *[""] * (len(cells) - 1)]
     if verdict:
@@ -123,17 +122,17 @@ def _row(tag: str, cells: Sequence[str], verdict: str = "") -> str:
 def _table(rows: Sequence[Sequence[str]]) -> str:
     """HTML of a table of texts whose first row is its head; nothing where there is no other."""
     head, *body = ([_whole(cell) for cell in row] for row in rows)
-    return html_table(_row("th", head), [_row("td", row) for row in body]) if body else ""
+    return html_table(html_row("th", head), [html_row("td", row) for row in body]) if body else ""
 
 
 def _overview(scenes: Sequence[Outputs]) -> str:
     """Table of all scenes, a row each, with a link to its section."""
     head, *rows = overview([scene.summary for scene in scenes])
     body = [
-        _row("td", [f'<a href="#{quote(name)}">{escape(name)}</a>', *map(_whole, cells)], f"wide {CLASSES[kind]}")
+        html_row("td", [f'<a href="#{quote(name)}">{escape(name)}</a>', *map(_whole, cells)], f"wide {CLASSES[kind]}")
         for (name, *cells), kind in zip(rows, (scene.summary["verdict"] for scene in scenes), strict=True)
     ]
-    return f"""{html_table(_row("th", head, "wide"), body)}
+    return f"""{html_table(html_row("th", head, "wide"), body)}
 <p class="note">Amplitudes are peak values, achieved ones at the centre; a scene of several bands shows the root of the
 sum of their squares. The error is that of the whole waveform from 20 to 500 Hz, at the worst place.</p>"""
 
@@ -152,31 +151,22 @@ def _section(scene: Outputs, folder: str) -> str:
         picture = f'<a href="{folder}/picture.png"><img src="{folder}/picture.png" alt="{alt}"></a>'
     files = ["scene.toml", "summary.json", JOURNAL, *summary["sound"]]
     links = " · ".join(f'<a href="{folder}/{file}">{file}</a>' for file in files)
+    bands = _table(band_rows(summary))
+    if len(summary["bands"]) > _MANY_BANDS:
+        bands = f"<details><summary>{escape(bands_label(summary['bands']))}</summary>{bands}</details>"
+    notes = "".join(f'<p class="note">{_whole(line)}</p>' for line in (conditions(summary), *remarks(summary)))
     return f"""<section id="{name}">
 <h2>{name}</h2>
 <p class="{CLASSES[summary["verdict"]]}">{sentence[:1].upper()}{sentence[1:]}.</p>
 {picture}
 {_table(waveform_rows(summary))}
-{_bands(summary)}
+{bands}
 <div class="halves">
-<div>{_remarks(summary)}{_sounds(summary, folder)}
+<div>{notes}{_sounds(summary, folder)}
 <p class="note">{links}</p></div>
 <pre>{escape(scene.toml.strip())}</pre>
 </div>
 </section>"""
-
-
-def _bands(summary: Mapping[str, Any]) -> str:
-    """Table of a scene's bands; folded where there are many."""
-    bands, table = summary["bands"], _table(band_rows(summary))
-    if len(bands) <= _MANY_BANDS:
-        return table
-    return f"<details><summary>{escape(bands_label(bands))}</summary>{table}</details>"
-
-
-def _remarks(summary: Mapping[str, Any]) -> str:
-    """Paragraphs about the whole scene."""
-    return "".join(f'<p class="note">{_whole(line)}</p>' for line in (conditions(summary), *remarks(summary)))
 
 
 def _sounds(summary: Mapping[str, Any], folder: str) -> str:

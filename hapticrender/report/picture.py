@@ -47,9 +47,27 @@ def plot(recording: Recording, path: str | os.PathLike[str]) -> None:
 def draw(recording: Recording) -> Any:
     """Draw a recording into a new ``matplotlib.figure.Figure``, apart from pyplot and its global state; see `plot`."""
     touched = bool(np.isfinite(outline(recording, "position")[1]).any())
-    height = (10.2 if touched else 8.6) + LANE * max(0, recording.header.drive_channels - 2)
+    coils = recording.header.drive_channels
+    height = (10.2 if touched else 8.6) + LANE * max(0, coils - 2)
     with new_figure((11, height), pads=(0.12, 0.07)) as figure:
-        _draw(figure, recording, touched)
+        summary = recording.summary()
+        lanes = [0.8] * coils + ([0.9, 0.9] if touched else [])
+        heights = [0.5, 2.3, 2.2, *lanes]
+        grid = figure.add_gridspec(len(heights), 2, height_ratios=heights, width_ratios=[1.35, 1])
+        _head(figure.add_subplot(grid[0, :]), summary, touched)
+        amplitude = figure.add_subplot(grid[1, :])
+        (_amplitude if summary["bands"] else _course)(amplitude, recording, summary)
+        _close_up(figure.add_subplot(grid[2, 0]), recording)
+        _errors(figure.add_subplot(grid[2, 1]), recording)
+        below = [figure.add_subplot(grid[3 + i, :], sharex=amplitude) for i in range(len(lanes))]
+        _drive(below[:coils], recording, summary)
+        if touched:
+            _finger(below[-2], below[-1], recording)
+        for axes in below[:-1]:
+            axes.tick_params(labelbottom=False)
+        below[-1].set_xlabel("time (s)")
+        figure.align_ylabels([amplitude, *below])
+        amplitude.set_xlim(0, max(len(recording), 1) / recording.rate)
     return figure
 
 
@@ -62,28 +80,6 @@ def drawn(unit: str) -> tuple[float, str]:
     (1000000.0, 'µm')
     """
     return (1e6, "µm") if unit == "m" else (1e3, f"m{unit}")
-
-
-def _draw(figure: Any, recording: Recording, touched: bool) -> None:
-    summary = recording.summary()
-    coils = recording.header.drive_channels
-    lanes = [0.8] * coils + ([0.9, 0.9] if touched else [])
-    heights = [0.5, 2.3, 2.2, *lanes]
-    grid = figure.add_gridspec(len(heights), 2, height_ratios=heights, width_ratios=[1.35, 1])
-    _head(figure.add_subplot(grid[0, :]), summary, touched)
-    amplitude = figure.add_subplot(grid[1, :])
-    (_amplitude if summary["bands"] else _course)(amplitude, recording, summary)
-    _close_up(figure.add_subplot(grid[2, 0]), recording)
-    _errors(figure.add_subplot(grid[2, 1]), recording)
-    below = [figure.add_subplot(grid[3 + i, :], sharex=amplitude) for i in range(len(lanes))]
-    _drive(below[:coils], recording, summary)
-    if touched:
-        _finger(below[-2], below[-1], recording)
-    for axes in below[:-1]:
-        axes.tick_params(labelbottom=False)
-    below[-1].set_xlabel("time (s)")
-    figure.align_ylabels([amplitude, *below])
-    amplitude.set_xlim(0, max(len(recording), 1) / recording.rate)
 
 
 def _head(axes: Any, summary: dict[str, Any], touched: bool) -> None:
@@ -110,9 +106,7 @@ def _amplitude(axes: Any, recording: Recording, summary: dict[str, Any]) -> None
     achieved = scale * _together(envelopes.achieved[:, :, shown]) / np.array(header.profile or 1.0)
     achieved[~readable] = np.nan
     time, _, _, target = _stretches(
-        lambda start, stop: scale * _together(recording.read("target", start, stop)[:, shown]),
-        len(recording),
-        recording.rate,
+        recording, lambda start, stop: scale * _together(recording.read("target", start, stop)[:, shown])
     )
     low, high = (1 - header.tolerance) * target, (1 + header.tolerance) * target
     for i, (name, (colour, _)) in enumerate(zip(header.places, itertools.cycle(PLACES), strict=False)):
@@ -249,12 +243,12 @@ def _finger(upper: Any, lower: Any, recording: Recording) -> None:
 
 def outline(recording: Recording, name: str) -> tuple[Array, Array, Array]:
     """Middle (s), least and greatest value of a signal in each of at most `COLUMNS` stretches; NaN with a NaN in it."""
-    return _stretches(lambda start, stop: recording.read(name, start, stop), len(recording), recording.rate)[:3]
+    return _stretches(recording, lambda start, stop: recording.read(name, start, stop))[:3]
 
 
-def _stretches(read: Callable[[int, int], Array], count: int, rate: float) -> tuple[Array, Array, Array, Array]:
+def _stretches(recording: Recording, read: Callable[[int, int], Array]) -> tuple[Array, Array, Array, Array]:
     """Middle (s), least, greatest and mean value of ``read(start, stop)`` in each stretch, `GROUP` read at once."""
-    edges = np.linspace(0, count, min(COLUMNS, count) + 1).astype(int)
+    edges = np.linspace(0, len(recording), min(COLUMNS, len(recording)) + 1).astype(int)
     found = []
     for i in range(0, len(edges) - 1, GROUP):
         part = edges[i : i + GROUP + 1]
@@ -265,4 +259,4 @@ def _stretches(read: Callable[[int, int], Array], count: int, rate: float) -> tu
         empty = read(0, 0)
         return np.empty(0), empty, empty, empty
     low, high, mean = (np.concatenate(each) for each in zip(*found, strict=True))
-    return (edges[:-1] + edges[1:] - 1) / (2 * rate), low, high, mean
+    return (edges[:-1] + edges[1:] - 1) / (2 * recording.rate), low, high, mean

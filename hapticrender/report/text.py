@@ -49,20 +49,11 @@ def verdict(summary: Mapping[str, Any]) -> str:
         return f"misses its tolerance: {summary['reason']}"
     start = "misses its tolerance" if summary["verdict"] == "failed" else "within its tolerance"
     start += f" in band ({summary['reason']})" if summary["verdict"] == "passed in band" else ""
-    return f"{start}: worst figure {worst_figure(summary)}, bound {100 * summary['worst']['bound']:.4g} %"
-
-
-def brief(summary: Mapping[str, Any]) -> str:
-    """Verdict of a run for a table's cell: short where it passed."""
-    return f"within {100 * summary['tolerance']:.4g} %" if summary["passed"] else verdict(summary)
-
-
-def worst_figure(summary: Mapping[str, Any]) -> str:
-    """Name the figure that decides the verdict: its name, band, place or quantity, and value."""
     worst = summary["worst"]
     third = f"error of the third octave of {worst['band']}"
     figure = third if worst["figure"] == "third_octave_error" else str(worst["figure"]).replace("_", " ")
-    return f"{figure} {at([str(worst['place'])])} = {percent(worst['value'])}"
+    value = f"{figure} {at([str(worst['place'])])} = {percent(worst['value'])}"
+    return f"{start}: worst figure {value}, bound {100 * worst['bound']:.4g} %"
 
 
 def overview(summaries: Sequence[Mapping[str, Any]]) -> list[list[str]]:
@@ -70,7 +61,9 @@ def overview(summaries: Sequence[Mapping[str, Any]]) -> list[list[str]]:
     rows = [["scene", "target", "achieved", "error", "verdict"]]
     for summary in summaries:
         sizes = [quantity(total(summary["bands"], key), summary["unit"]) for key in ("target", "achieved")]
-        rows.append([summary["scene"], *sizes, percent(waveform_error(summary)), brief(summary)])
+        passed = f"within {100 * summary['tolerance']:.4g} %"
+        found = passed if summary["passed"] else verdict(summary)
+        rows.append([summary["scene"], *sizes, percent(waveform_error(summary)), found])
     return rows
 
 
@@ -129,16 +122,11 @@ def beside(summary: Mapping[str, Any]) -> str:
 
 def conditions(summary: Mapping[str, Any]) -> str:
     """State in a line what was rendered, how, for how long, and which flags were set."""
+    flags = ", ".join(f"{name.lower()} {count}" for name, count in summary["flags"].items() if count) or "none"
     return (
         f"{summary['scene']} on {summary['device']}, method {summary['method']}, seed {summary['seed']}: "
-        f"{short(summary['duration'], 's')}, judged from {short(summary['judged_from'], 's')}, "
-        f"flagged samples: {flags(summary)}"
+        f"{short(summary['duration'], 's')}, judged from {short(summary['judged_from'], 's')}, flagged samples: {flags}"
     )
-
-
-def flags(summary: Mapping[str, Any]) -> str:
-    """State in how many samples each status flag was set."""
-    return ", ".join(f"{name.lower()} {count}" for name, count in summary["flags"].items() if count) or "none"
 
 
 def describe(scene: Scene) -> str:

@@ -71,7 +71,10 @@ class SeparatedTexture:
     def __init__(self, texture: Texture, waveform_of: Any = None) -> None:
         terms, name = _terms(texture), type(texture).__name__
         for each, _ in terms:
-            _refuse_mixed(each)
+            kinds = {lies_along_surface(part) for part, _ in getattr(each, "parts", ())}
+            if kinds == {True, False} or (True in kinds and not isinstance(each, Sum)):
+                problem = f"{type(each).__name__} with a part along the surface"
+                raise ValueError(f"{problem}: play its parts one after another")
         self._terms = [
             (each, lies_along_surface(each), waveform_of(each) if waveform_of else each.waveform, gain)
             for each, gain in terms
@@ -105,13 +108,6 @@ class SeparatedTexture:
             if along == spatial:
                 total += gain * bands.checked(type(texture).__name__, waveform, time, position)
         return total
-
-
-def _refuse_mixed(texture: Texture) -> None:
-    """Refuse a texture that is read in time and along the surface at once."""
-    spatial = {lies_along_surface(part) for part, _ in getattr(texture, "parts", ())}
-    if spatial == {True, False} or (True in spatial and not isinstance(texture, Sum)):
-        raise ValueError(f"{type(texture).__name__} with a part along the surface: play its parts one after another")
 
 
 def _read_parts(key: str, value: Any, **bounds: Any) -> Parts:
@@ -228,15 +224,6 @@ class Playlist(Validated, _Composed):
 class Chirp(Validated, Composable):
     """A sine whose frequency rises or falls steadily in time; after its end it goes back, and so on.
 
-    Parameters
-    ----------
-    start, stop : float, Hz
-        First and last frequency, > 0 and <= 1e5.
-    duration : float, s
-        From the one to the other, > 0.
-    amplitude : float, m
-        Peak, > 0 and <= 0.01 m.
-
     Examples
     --------
     >>> chirp = Chirp(start=20.0, stop=400.0, duration=2.0, amplitude=5e-6)
@@ -246,10 +233,10 @@ class Chirp(Validated, Composable):
 
     kind: ClassVar[str] = "chirp"
 
-    start: float = parameter(unit="Hz", above=0, most=1e5)
-    stop: float = parameter(unit="Hz", above=0, most=1e5)
-    duration: float = parameter(unit="s", above=0, most=LONGEST_PART)
-    amplitude: float = parameter(unit="m", above=0, most=MOST_CHIRP)
+    start: float = parameter(unit="Hz", about="first frequency", above=0, most=1e5)
+    stop: float = parameter(unit="Hz", about="last frequency", above=0, most=1e5)
+    duration: float = parameter(unit="s", about="from the one to the other", above=0, most=LONGEST_PART)
+    amplitude: float = parameter(unit="m", about="peak", above=0, most=MOST_CHIRP)
 
     def bands(self, rate: float) -> Bands:
         """No carriers (`rate` in Hz is not needed): the whole waveform is played."""

@@ -85,23 +85,6 @@ class DeviceProfile(Validated):
     A scene takes it by the file's name (``Scene(device="plate.toml")``); `hapticrender identify` writes one.  In a file
     the first five are the table ``[profile]``, the others a table of their name each.
 
-    Parameters
-    ----------
-    kind : str
-        Kind of device: name of a renderer.
-    name : str
-        Which device it is; default: "".
-    measured_by, measured_with : str
-        Who measured it, and with what.
-    measured_on : datetime.date, optional
-        When, also as a text "2026-11-22".
-    device : mapping of str to number, str or bool
-        Parameters, as in a scene's ``[device]``.
-    uncertainty : mapping of str to float
-        Standard uncertainty of parameters, in their units.
-    calibration : Calibration or mapping
-    limits : Limits or mapping
-
     Examples
     --------
     >>> plate = DeviceProfile(kind="vt-plate", name="plate 3", device={"mass": 0.0321}, limits={"rms_drive": 0.5})
@@ -118,15 +101,15 @@ class DeviceProfile(Validated):
     <BLANKLINE>
     """
 
-    kind: str = checked(checks.name)
-    name: str = checked(checks.text, "")
-    measured_by: str = checked(checks.text, "")
-    measured_with: str = checked(checks.text, "")
-    measured_on: date | None = checked(_day, None)
-    device: Mapping[str, Any] = mapping(_parameters)
-    uncertainty: Mapping[str, float] = mapping(_uncertainty)
-    calibration: Calibration = checked(_part, Calibration(), kind=Calibration)
-    limits: Limits = checked(_part, Limits(), kind=Limits)
+    kind: str = checked(checks.name, about="kind of device: name of a renderer")
+    name: str = checked(checks.text, "", about="which device it is")
+    measured_by: str = checked(checks.text, "", about="who measured it")
+    measured_with: str = checked(checks.text, "", about="with what")
+    measured_on: date | None = checked(_day, None, about='when, also as a text "2026-11-22"')
+    device: Mapping[str, Any] = mapping(_parameters, "parameters (number, str or bool), as in a scene's ``[device]``")
+    uncertainty: Mapping[str, float] = mapping(_uncertainty, "standard uncertainty of parameters, in their units")
+    calibration: Calibration = checked(_part, Calibration(), about="also as a table", kind=Calibration)
+    limits: Limits = checked(_part, Limits(), about="also as a table", kind=Limits)
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -151,28 +151,21 @@ class Finger(Validated):
         time = np.asarray(time, float)
         touch = np.empty((time.size, 3))
         touch[:, 0] = self.position(time)
-        touch[:, 1] = self._pressed(time)
+        known = self.normal_load is not None
+        touch[:, 1] = np.interp(time, *self._load_curve) if known else self.motion.load(time)  # type: ignore[attr-defined]
         touch[:, 2] = self.mechanics.load_factor(touch[:, 1]) if self.load_scaling else 1.0
         touch[np.isnan(touch[:, 0]), 1:] = 0.0
         return touch
 
-    def _pressed(self, time: Array) -> Array:
-        if self.normal_load is None:
-            return self.motion.load(time)  # type: ignore[attr-defined]
-        if isinstance(self.normal_load, tuple):
-            return np.interp(time, *self._load_curve)
-        return np.full(time.shape, self.normal_load)
-
     @cached_property
-    def _load_curve(self) -> tuple[Array, Array]:
-        times, loads = self.normal_load  # type: ignore[misc]
-        return np.array(times), np.array(loads)
+    def _load_curve(self) -> Array:
+        """Times (s) and loads (N) that are joined by lines, shape (2, n); of a constant load there is one."""
+        return np.array(self.normal_load if isinstance(self.normal_load, tuple) else ((0.0,), (self.normal_load,)))
 
     def _typical_load(self) -> float:
         """Mean load (N) while something presses."""
         if self.normal_load is None:
-            loads = self.motion.load(np.arange(0.0, 60.0, 0.01))  # type: ignore[attr-defined]
+            loads = np.asarray(self.motion.load(np.arange(0.0, 60.0, 0.01)))  # type: ignore[attr-defined]
         else:
-            loads = np.atleast_1d(self.normal_load[1] if isinstance(self.normal_load, tuple) else self.normal_load)
-        pressing = np.asarray(loads)[np.asarray(loads) > 0]
-        return float(pressing.mean()) if pressing.size else 0.0
+            loads = self._load_curve[1]
+        return float(loads[loads > 0].mean()) if (loads > 0).any() else 0.0

@@ -17,71 +17,41 @@ from hapticrender.touch.composed import Composable
 
 MOST_AMPLITUDE = 0.01  # m: ten times the travel of any plate, so it catches a wrong unit
 MOST_PARTIALS = 4096
+PARTIALS = "order (need not be whole), relative amplitude and phase (rad) of each, instead of a shape"
 
 Partial = tuple[float, float, float]
 
 
-def _sine(count: int) -> tuple[Partial, ...]:
-    return ((1.0, 1.0, 0.0),)
-
-
-def _square(count: int) -> tuple[Partial, ...]:
-    """Fourier series of a square wave of height 1 that is +1 at phase 0: (4/pi) (cos p - cos 3p/3 + ...)."""
-    return tuple((2.0 * n + 1, 4 / (np.pi * (2 * n + 1)), np.pi * (n % 2)) for n in range(count))
-
-
-def _triangle(count: int) -> tuple[Partial, ...]:
-    """Fourier series of a triangle wave of height 1 that is +1 at phase 0: (8/pi^2) (cos p + cos 3p/9 + ...)."""
-    return tuple((2.0 * n + 1, 8 / (np.pi * (2 * n + 1)) ** 2, 0.0) for n in range(count))
-
-
-SHAPES: dict[str, Callable[[int], tuple[Partial, ...]]] = {"sine": _sine, "square": _square, "triangle": _triangle}
+SHAPES: dict[str, Callable[[int], Partial]] = {  # partial n of a Fourier series of height 1 that is +1 at phase 0
+    "sine": lambda n: (1.0, 1.0, 0.0),  # which has one
+    "square": lambda n: (2.0 * n + 1, 4 / (np.pi * (2 * n + 1)), np.pi * (n % 2)),
+    "triangle": lambda n: (2.0 * n + 1, 8 / (np.pi * (2 * n + 1)) ** 2, 0.0),
+}
 
 
 def _read_partials(key: str, partials: Any) -> tuple[Partial, ...]:
     bound = f"1 to {MOST_PARTIALS} entries of order, amplitude, phase"
     checks.require(isinstance(partials, list | tuple | np.ndarray), key, partials, bound, TypeError)
     checks.require(1 <= len(partials) <= MOST_PARTIALS, key, partials, bound)
-    return tuple(_read_partial(f"{key}[{index}]", entry) for index, entry in enumerate(partials))
-
-
-def _read_partial(key: str, entry: Any) -> Partial:
-    good = isinstance(entry, list | tuple | np.ndarray) and len(entry) == 3
-    checks.require(good, key, entry, "order, amplitude, phase", TypeError)
-    return (
-        checks.number(f"{key}.order", entry[0], "", above=0, most=1e4),
-        checks.number(f"{key}.amplitude", entry[1], "times the grating's", least=-100, most=100),
-        checks.number(f"{key}.phase", entry[2], "rad", least=-1e6, most=1e6),
-    )
+    found = []
+    for at, entry in ((f"{key}[{index}]", entry) for index, entry in enumerate(partials)):
+        good = isinstance(entry, list | tuple | np.ndarray) and len(entry) == 3
+        checks.require(good, at, entry, "order, amplitude, phase", TypeError)
+        order = checks.number(f"{at}.order", entry[0], "", above=0, most=1e4)
+        amplitude = checks.number(f"{at}.amplitude", entry[1], "times the grating's", least=-100, most=100)
+        found.append((order, amplitude, checks.number(f"{at}.phase", entry[2], "rad", least=-1e6, most=1e6)))
+    return tuple(found)
 
 
 @dataclass(frozen=True)
 class Grating(Validated, Composable):
     """A periodic texture, ``amplitude * sum_n a_n cos(n p + phase_n)``.
 
-    In time ``p = 2 pi frequency t + phase``, in space ``p = 2 pi x / wavelength + phase`` at the finger's position x.
+    In time ``p = 2 pi frequency t + phase``, in space ``p = 2 pi x / wavelength + phase`` at the finger's position x;
+    exactly one of `frequency` and `wavelength` is given.
 
-    Parameters
-    ----------
-    amplitude : float, m
-        Peak of a sine, height of a square or triangle; > 0 and <= 0.01 m.
-        Stated as `velocity` or `level` instead, it is converted at once: a grating keeps metres only.
-    frequency, wavelength : float, Hz, m, or None
-        Of the fundamental, > 0 and <= 1e6, or >= 1e-6 and <= 0.5; exactly one is given.
-    shape : {"sine", "square", "triangle"}
-        Square and triangle are made of `harmonics` odd Fourier partials.
-    harmonics : int
-        1 to 4096.
-    partials : sequence of (order, relative amplitude, phase in rad), or None
-        Instead of a shape.  Orders need not be whole.
-    phase : float, rad
-        Of the fundamental at t = 0, x = 0.
-    velocity : float, m/s
-        Peak skin velocity V of a sine at the fundamental's frequency f, >= 1e-9 and <= 10: amplitude V/(2 pi f).
-    level : float, dB
-        Of a sine at f (1 to 1000 Hz) above the classic detection threshold, >= -100 and <= 100.
-    speed : float, m/s
-        Of the finger at which `velocity` or `level` hold for a grating in space (f = speed/wavelength), only there.
+    Exactly one of `amplitude`, `velocity` and `level` is given, too; the others are those of a sine at the
+    fundamental's frequency f, and converted at once: a grating keeps metres only.  In space f is speed/wavelength.
 
     Examples
     --------
@@ -99,16 +69,20 @@ class Grating(Validated, Composable):
 
     kind: ClassVar[str] = "grating"
 
-    amplitude: float = parameter(None, "m", above=0, most=MOST_AMPLITUDE)  # never None once it is made
-    frequency: float | None = parameter(None, "Hz", above=0, most=1e6)
-    wavelength: float | None = parameter(None, "m", least=1e-6, most=0.5)
-    shape: str = option("sine", *SHAPES)
-    harmonics: int = parameter(5, least=1, most=MOST_PARTIALS)
-    partials: tuple[Partial, ...] | None = checked(_read_partials, None)
-    phase: float = parameter(0.0, "rad", least=-1e6, most=1e6)
-    velocity: float | None = parameter(None, "m/s", least=1e-9, most=10)
-    level: float | None = parameter(None, "dB", least=-100, most=100)
-    speed: float | None = parameter(None, "m/s", least=1e-6, most=10)
+    amplitude: float = parameter(None, "m", "peak of a sine, height of another shape", above=0, most=MOST_AMPLITUDE)
+    frequency: float | None = parameter(None, "Hz", "of the fundamental", above=0, most=1e6)
+    wavelength: float | None = parameter(None, "m", "of the fundamental", least=1e-6, most=0.5)
+    shape: str = option("sine", *SHAPES, about="of the wave")
+    harmonics: int = parameter(5, about="odd Fourier partials of a square or triangle", least=1, most=MOST_PARTIALS)
+    partials: tuple[Partial, ...] | None = checked(_read_partials, None, about=PARTIALS)
+    phase: float = parameter(0.0, "rad", "of the fundamental at t = 0, x = 0", least=-1e6, most=1e6)
+    velocity: float | None = parameter(
+        None, "m/s", "peak skin velocity, 2 pi f times the amplitude", least=1e-9, most=10
+    )
+    level: float | None = parameter(None, "dB", "over the classic threshold, f 1 to 1000 Hz", least=-100, most=100)
+    speed: float | None = parameter(
+        None, "m/s", "of the finger for `velocity` or `level` in space", least=1e-6, most=10
+    )
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -130,8 +104,8 @@ class Grating(Validated, Composable):
 
     def spectrum(self) -> tuple[Array, Array]:
         """Order (1) and complex amplitude (m) of every partial, the fundamental's phase included."""
-        table = np.array(self.partials or SHAPES[self.shape](self.harmonics))
-        order, relative, own_phase = table.T
+        count = 1 if self.shape == "sine" else self.harmonics
+        order, relative, own_phase = np.array(self.partials or [SHAPES[self.shape](n) for n in range(count)]).T
         return order, self.amplitude * relative * np.exp(1j * (own_phase + order * self.phase))
 
     def bands(self, rate: float) -> Bands:

@@ -14,8 +14,8 @@ after a lost one.  Both are exact for the filter at its constant gain; gate, irr
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from dataclasses import replace
+from itertools import product
 
 import numpy as np
 
@@ -50,12 +50,6 @@ def _system(gain: Array, step: float, latency: float = 0.0, easing: float = 0.0)
         a[3:, :3], b[3:] = -jump * transition(step)[0], jump
         a[3:, 3:] = math.exp(-step / easing) * np.array([[1.0, 0.0], [step / easing, 1.0]])
     return a, b
-
-
-def _row(ahead: float, age: float = 0.0, easing: float = 0.0) -> Array:
-    """C(h), `age` after the arrival of the last sample, shape (5,)."""
-    u = age / easing if easing > 0.0 else 0.0
-    return np.r_[transition(ahead)[0], u * math.exp(-u), math.exp(-u)]
 
 
 def _noise_gain(a: Array, b: Array) -> Array:
@@ -95,15 +89,6 @@ def noise_errors(estimator: MotionEstimator, rate: float, ahead: float = 0.0) ->
     spread = estimator.variance * _noise_gain(a[:3, :3], b[:3])
     position, velocity, _ = np.sqrt(np.diagonal(transition(ahead) @ spread @ transition(ahead).T)).tolist()
     return position, velocity
-
-
-def _ages(panel: TouchPanel) -> Iterator[tuple[float, float]]:
-    """Age of the last sample beside its latency (s), and the share of the time with that age."""
-    lost, share = 0, 1.0 - panel.dropouts
-    while share > MOST_LOST:
-        for age in AGES:
-            yield (lost + age) / panel.rate, share / len(AGES)
-        lost, share = lost + 1, share * panel.dropouts
 
 
 def position_error(
@@ -146,8 +131,13 @@ def position_error(
         a, b = _system(settled_gain(estimator, panel.rate, rms), step, late, easing)
         turn = np.exp(1j * omega * step)
         played, spread = np.linalg.solve(turn * np.eye(5) - a, turn * b), _noise_gain(a, b)
-    for age, share in _ages(panel):
-        row = _row(late + age, age, easing) if predicted else np.eye(5)[0]
+    shares = [1.0 - panel.dropouts]  # of the time, by the samples that were lost since the last one
+    while shares[-1] * panel.dropouts > MOST_LOST:
+        shares.append(shares[-1] * panel.dropouts)
+    for (lost, share), part in product(enumerate(shares), AGES):
+        age = (lost + part) / panel.rate  # of the last sample (s), beside its latency
+        u = age / easing if easing > 0.0 else 0.0
+        row = np.r_[transition(late + age)[0], u * math.exp(-u), math.exp(-u)]  # C(h)
         found, noise = (row @ played, row @ spread @ row) if predicted else (1.0, 1.0)
         bias = 0.5 * (amplitude * abs(found - np.exp(1j * omega * (late + age)))) ** 2
         square, weight = square + share * (bias + variance * noise), weight + share

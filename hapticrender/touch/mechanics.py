@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from hapticrender import checks
-from hapticrender.checks import Validated, checked, parameter
+from hapticrender.checks import Validated, parameter
 from hapticrender.protocols import Array
 
 LIGHT_BELOW = 0.5  # N: Table 1 parts its two columns here
@@ -17,12 +17,6 @@ LIGHT_LOAD, HEAVY_LOAD = 0.3, 0.8  # N: engineering defaults for what "light" an
 
 
 _PARTS = ("mass", "damping", "stiffness", "phalanx_mass", "phalanx_damping", "phalanx_stiffness")
-
-
-def _read_order(key: str, value: Any) -> int:
-    order = checks.integer(key, value, least=0, most=4)
-    checks.require(order in (0, 2, 4), key, order, "0, 2 or 4")
-    return order
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,7 +54,7 @@ class FingerMechanics(Validated):
     [0.545]
     """
 
-    order: int = checked(_read_order, 0)
+    order: int = parameter(0, most=4)
     mass: float = parameter(0.0, "kg", most=1.0)
     damping: float = parameter(0.0, "N s/m", most=1e4)
     stiffness: float = parameter(0.0, "N/m", most=1e6)
@@ -71,6 +65,7 @@ class FingerMechanics(Validated):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        checks.require(self.order in (0, 2, 4), "order", self.order, "0, 2 or 4")
         for key in _PARTS[{0: 0, 2: 3, 4: 6}[self.order] :]:
             checks.require(getattr(self, key) == 0.0, key, getattr(self, key), f"0 where order = {self.order}")
         if self.order and not any(getattr(self, key) for key in _PARTS[:3]):
@@ -78,7 +73,7 @@ class FingerMechanics(Validated):
 
     def impedance(self, frequency: Array) -> Array:
         """Z_f = F/V_s (complex, N s/m) at `frequency` (Hz, > 0)."""
-        s = _laplace(frequency)
+        s = 2j * np.pi * checks.frequencies(frequency, zero=False)
         if self.order == 0:
             return np.zeros_like(s)
         if self.order == 2:
@@ -102,14 +97,6 @@ class FingerMechanics(Validated):
 NONE = FingerMechanics()
 LIGHT_SECOND = FingerMechanics(order=2, mass=4e-3, damping=1.0, stiffness=200.0, reference_load=LIGHT_LOAD)
 HEAVY_SECOND = FingerMechanics(order=2, mass=4e-3, damping=1.5, stiffness=300.0, reference_load=HEAVY_LOAD)
-
-
-def _laplace(frequency: Array) -> Array:
-    """Laplace variable 2 pi j f (rad/s)."""
-    frequency = np.asarray(frequency, float)
-    good = (np.isfinite(frequency) & (frequency > 0)).all()
-    checks.require(bool(good), "frequency", frequency, "finite numbers > 0 Hz")
-    return 2j * np.pi * frequency
 
 
 def _fourth(whole: FingerMechanics, mass: float, damping: float, stiffness: float) -> FingerMechanics:

@@ -122,9 +122,7 @@ class MotionEstimator:
             return True
         if not (math.isfinite(time) and math.isfinite(position)):
             raise ValueError(f"{time=} s, {position=} m: must be finite (a position may be NaN: lifted)")
-        if error is not None and not 0.0 < error < math.inf:
-            raise ValueError(f"{error=} m: must be finite and > 0")
-        self._sampled = self.variance if error is None else error**2
+        self._sampled = self.variance if error is None else checks.number("error", error, "m", above=0.0) ** 2
         time -= self.latency
         if math.isnan(self._time) or abs(time - self._time) > self.patience:
             self._start(time, position)

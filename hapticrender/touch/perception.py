@@ -49,7 +49,7 @@ def detection_threshold(frequency: float | Array, curve: str = "safe") -> Array:
     '6.2e-09 m'
     """
     checks.choice("curve", curve, ("safe", "classic"))
-    hertz = _frequency(frequency)
+    hertz = checks.frequencies(frequency, zero=True)
     inside = (hertz >= LOWEST) & (hertz <= HIGHEST)
     known = np.clip(hertz, LOWEST, HIGHEST)
     classic = 10 ** np.interp(np.log10(known), np.log10(_FREQUENCY), np.log10(_THRESHOLD))
@@ -80,7 +80,7 @@ def displacement(level: float | Array, frequency: float | Array) -> Array:
 
 def from_velocity(velocity: float | Array, frequency: float | Array) -> Array:
     """Displacement (m peak) of a sinusoidal `velocity` (m/s peak) at `frequency` (Hz, > 0): X = V/(2 pi f)."""
-    return np.asarray(velocity) / (2 * np.pi * _frequency(frequency, zero=False))
+    return np.asarray(velocity) / (2 * np.pi * checks.frequencies(frequency, zero=False))
 
 
 def roughness(displacement: float | Array, frequency: float | Array) -> float:
@@ -90,7 +90,7 @@ def roughness(displacement: float | Array, frequency: float | Array) -> float:
     the classic one from 40 Hz on, rising by 12 dB an octave below.  Partials above 1 kHz add nothing [Bensmaia,
     Hollins: The vibrations of texture, Somatosens. Mot. Res. 20, 2003].
     """
-    hertz = _frequency(frequency)
+    hertz = checks.frequencies(frequency, zero=True)
     threshold = detection_threshold(np.clip(hertz, PACINIAN_FROM, HIGHEST), "classic")
     with np.errstate(under="ignore"):
         weight = np.minimum(hertz / PACINIAN_FROM, 1.0) ** 2
@@ -126,14 +126,6 @@ def drop_unfelt(bands: Bands, *, top_speed: float, lowest: float, highest: float
         strongest = notes[int(order[-1])]
         raise ValueError(f"no band can be felt: {strongest} (keep_unfelt renders such bands all the same)")
     return bands.select(~going, unfelt=tuple(notes.values()))
-
-
-def _frequency(frequency: float | Array, zero: bool = True) -> Array:
-    """Return frequencies (Hz) as an array, if all are finite and >= 0 (> 0 if not `zero`)."""
-    hertz = np.asarray(frequency, float)
-    good = (np.isfinite(hertz) & ((hertz >= 0) if zero else (hertz > 0))).all()
-    checks.require(bool(good), "frequency", frequency, f"finite numbers {'>=' if zero else '>'} 0 Hz")
-    return hertz
 
 
 def _most_sensitive(bands: Bands, top_speed: float, lowest: float, highest: float) -> tuple[Array, Array]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from pathlib import Path
@@ -38,12 +37,6 @@ GRID = 10e-6  # m: cells of a force profile; a wavelength of 0.1 mm loses 1.6 % 
 Passband = tuple[float, float]
 
 
-def _read_passband(key: str, value: Any) -> Passband:
-    low, high = checks.numbers(key, value, "Hz", least=1.0, most=1e5, count=2)
-    checks.require(low < high, key, value, "two rising frequencies in Hz")
-    return low, high
-
-
 def _carriers(frequency: Array, speed: float | None, rate: float) -> Bands:
     """Bands whose envelopes are to be analysed: over position, or over time below rate/2."""
     if speed is None:
@@ -65,13 +58,15 @@ class _Playback(Validated, Composable):
     gain: float | None = parameter(None, "m per unit of the file", above=0, most=1e3)
     carriers: int | None = parameter(None, least=1, most=MOST_CARRIERS)
     spacing: float = parameter(40.0, "Hz", least=0.1, most=1e5)
-    passband: Passband | None = checked(_read_passband, None)  # never None once it is made
+    passband: Passband | None = checked(checks.numbers, None, unit="Hz", least=1.0, most=1e5, count=2)
 
     def __post_init__(self) -> None:
         super().__post_init__()
         checks.exactly_one(amplitude=self.amplitude, gain=self.gain)
         if self.passband is None:
             checks.keep(self, passband=FELT if self.carriers is None else CARRIED)
+        low, high = self.passband or FELT
+        checks.require(low < high, "passband", self.passband, "two rising frequencies in Hz")
 
     @cached_property
     def profile(self) -> Profile:
@@ -208,9 +203,13 @@ def _read_sound(file: str, channel: int) -> tuple[Array, float]:
         try:
             with soundfile.SoundFile(file) as sound:
                 problem = _header_problem(sound, channel)
-                values = np.zeros(0) if problem else np.concatenate([*_channel(sound, channel), np.zeros(0)])
-                lengths = [(values.size, sound.frames), *_sizes(sound.extra_info)]
-                rate = sound.samplerate
+                blocks, rate = [np.zeros(0)], sound.samplerate
+                while not problem and len(block := sound.read(BLOCK, dtype="float64", always_2d=True)):
+                    blocks.append(block[:, channel].copy())
+                values = np.concatenate(blocks)
+                # bytes that a part holds and that its header states, where libsndfile's log shows both
+                parts = [(int(held), int(stated)) for stated, held in _PART.findall(sound.extra_info)]
+                lengths = [(values.size, sound.frames), *(each for each in parts if 0 < each[1] < STREAMED)]
         except (soundfile.SoundFileError, OSError, ValueError, TypeError) as error:
             raise ValueError(f"must be a readable sound file ({checks.show(str(error))})") from error
         if problem:
@@ -236,18 +235,6 @@ def _header_problem(sound: Any, channel: int) -> str:
     if not 1 <= sound.samplerate <= MOST_RATE:
         return f"has a rate of {sound.samplerate} Hz: must be >= 1 and <= {MOST_RATE:g} Hz"
     return "" if channel < channels else f"channel = {channel}: must be < {channels}, its number of channels"
-
-
-def _channel(sound: Any, channel: int) -> Iterator[Array]:
-    """Blocks of one channel, until the file ends."""
-    while len(block := sound.read(BLOCK, dtype="float64", always_2d=True)):
-        yield block[:, channel].copy()
-
-
-def _sizes(log: str) -> list[tuple[int, int]]:
-    """Bytes that a file holds and that its header states, for every part where libsndfile's log shows both."""
-    differ = [(int(held), int(stated)) for stated, held in _PART.findall(log)]
-    return [(held, stated) for held, stated in differ if 0 < stated < STREAMED]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -291,16 +278,7 @@ LEAST_GAP = 40.0  # Hz
 class Synthetic(Validated, Composable):
     """A texture like a recorded one that needs no file: a few components with slowly varying amplitudes.
 
-    Parameters
-    ----------
-    amplitude : float, m
-        Bound of the sum of all components, never exceeded; > 0 and <= 0.01.
-    speed : float, m/s, or None
-        At which the components lie at 30 to 400 Hz; None: over time.
-    components : int
-        1 to 8, at least 40 Hz apart.
-    seed : int
-        The same seed is the same texture, >= 0.
+    Without a speed it is over time.
 
     Examples
     --------
@@ -310,10 +288,10 @@ class Synthetic(Validated, Composable):
 
     kind: ClassVar[str] = "synthetic"
 
-    amplitude: float = parameter(unit="m", above=0, most=MOST_AMPLITUDE)
-    speed: float | None = parameter(None, "m/s", above=1e-6, most=MOST_SPEED)
-    components: int = parameter(6, least=1, most=8)
-    seed: int = parameter(0, least=0, most=2**32 - 1)
+    amplitude: float = parameter(unit="m", about="bound of their sum, never exceeded", above=0, most=MOST_AMPLITUDE)
+    speed: float | None = parameter(None, "m/s", "at which they lie at 30 to 400 Hz", above=1e-6, most=MOST_SPEED)
+    components: int = parameter(6, about="how many, at least 40 Hz apart", least=1, most=8)
+    seed: int = parameter(0, about="the same one is the same texture", most=2**32 - 1)
 
     @property
     def spatial(self) -> bool:

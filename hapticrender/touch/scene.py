@@ -9,17 +9,16 @@ from dataclasses import MISSING, dataclass, field, fields
 from itertools import count
 from numbers import Integral
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
 from hapticrender import checks, defaults
 from hapticrender.checks import Validated, checked, mapping, parameter
-from hapticrender.errors import naming
+from hapticrender.errors import SceneError, naming
 from hapticrender.protocols import Texture
 from hapticrender.touch import toml
 from hapticrender.touch.composed import Chirp, Playlist, Sum
-from hapticrender.touch.custom import Custom
 from hapticrender.touch.device_profile import ENDING, DeviceProfile, table_of
 from hapticrender.touch.finger import Finger
 from hapticrender.touch.grating import Grating
@@ -27,6 +26,28 @@ from hapticrender.touch.mechanics import NAMED
 from hapticrender.touch.motion import LONGEST_TIME, Nowhere, RecordedMotion, Sampled, SineMotion, Still, TriangleMotion
 from hapticrender.touch.recorded import Recorded, Swipe, Synthetic
 from hapticrender.touch.touch_panel import TouchPanel
+
+LONGEST_LINE = 500  # characters
+
+
+@dataclass(frozen=True)
+class Custom(Validated):
+    """One printable line about a texture or motion made in Python: keeps recordings readable, refuses to play."""
+
+    kind: ClassVar[str] = "custom"
+
+    description: str
+
+    def __post_init__(self) -> None:
+        line = "".join(filter(str.isprintable, " ".join(str(self.description).split())))
+        checks.keep(self, description=line[:LONGEST_LINE])
+
+    def bands(self, *arguments: Any) -> Any:
+        """Raise a `SceneError`: of the object there is only this line."""
+        raise SceneError(f"description = {self.description!r}: what was made in Python cannot be played from a file")
+
+    waveform = position = load = bands
+
 
 TEXTURES: dict[str, type[Any]] = {
     kind.kind: kind for kind in (Grating, Recorded, Swipe, Synthetic, Chirp, Sum, Playlist, Custom)
@@ -148,8 +169,12 @@ class Scene(Validated):
     name: str = checked(checks.name, "scene")
 
     def __post_init__(self) -> None:
-        if str(self.device).endswith(ENDING):
-            self._take_profile(DeviceProfile.load(self.device))
+        if str(self.device).endswith(ENDING):  # its profile has what the scene does not state
+            found = DeviceProfile.load(self.device)
+            limits, calibration = table_of(found.limits), table_of(found.calibration)
+            tables = {"profile": found.device, "limits": limits, "calibration": calibration}
+            merged = {name: {**table, **_read_table(name, getattr(self, name))} for name, table in tables.items()}
+            checks.keep(self, device=found.kind, source=self.source or str(found), **merged)
         super().__post_init__()
         self.device_profile  # noqa: B018 (it refuses what is no limit, and no calibration)
         self.panel  # noqa: B018 (it refuses what is no touch panel)
@@ -160,12 +185,6 @@ class Scene(Validated):
         checks.require(isinstance(self.finger, Finger), "finger", self.finger, "a Finger", TypeError)
         if isinstance(self.finger.motion, Nowhere) and getattr(self.texture, "spatial", False):
             raise ValueError("finger.motion = 'none': a texture over position needs a finger")
-
-    def _take_profile(self, found: DeviceProfile) -> None:
-        """Take from a profile what the scene does not state."""
-        tables = {"profile": found.device, "limits": table_of(found.limits), "calibration": table_of(found.calibration)}
-        merged = {name: {**table, **_read_table(name, getattr(self, name))} for name, table in tables.items()}
-        checks.keep(self, device=found.kind, source=self.source or str(found), **merged)
 
     @property
     def device_profile(self) -> DeviceProfile:
@@ -281,7 +300,7 @@ def _check_keys(table: dict[str, Any]) -> None:
         if key in moved:
             checks.refuse(key, value, moved[key])
         checks.require(key not in TABLES.values() or isinstance(value, dict), key, value, "a table", TypeError)
-    _only_known(table, ["name", "duration", "texture", "finger", *TABLES.values()])
+    checks.check_names(table, ["name", "duration", "texture", "finger", *TABLES.values()])
 
 
 def _usable(name: str) -> str:
@@ -292,12 +311,6 @@ def _usable(name: str) -> str:
         return "scene"
 
 
-def _only_known(table: Mapping[str, Any], known: list[str]) -> None:
-    for key, value in table.items():
-        if key not in known:
-            raise ValueError(f"{checks.plain(key)} = {checks.show(value)}: unknown key; known: {', '.join(known)}")
-
-
 def _read_kind(table: Any, key: str, choice: str, kinds: dict[str, type[Any]], folder: Path, extra: Any = ()) -> Any:
     """Make the object that `table[choice]` names from the keys that are its fields; `extra` keys are left alone."""
     bound = f"a table with {choice} = one of {', '.join(kinds)}"
@@ -305,7 +318,7 @@ def _read_kind(table: Any, key: str, choice: str, kinds: dict[str, type[Any]], f
     with checks.inside(key):
         kind = kinds[checks.choice(choice, table.get(choice), kinds)]
         entries = fields(kind)
-        _only_known(table, [choice, *(entry.name for entry in entries), *extra])
+        checks.check_names(table, [choice, *(entry.name for entry in entries), *extra])
         required = [entry.name for entry in entries if entry.default is entry.default_factory is MISSING]
         values: dict[str, Any] = dict.fromkeys(required) | {
             entry.name: table[entry.name] for entry in entries if entry.name in table

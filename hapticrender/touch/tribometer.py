@@ -146,17 +146,12 @@ def _load(normal_force: Array, rate: float) -> Array:
     return departure * (-1.0 if departure[large].sum() < 0 else 1.0)
 
 
-def _runs(mask: Array) -> Array:
-    """First and one past the last index of every run of True, shape (runs, 2)."""
-    edges = np.diff(np.concatenate([[0], mask.astype(np.int8), [0]]))
-    return np.stack([np.flatnonzero(edges == 1), np.flatnonzero(edges == -1)], axis=1)
-
-
 def _touching(load: Array, rate: float) -> Array:
+    from scipy.ndimage import find_objects, label
+
     touching = np.zeros(load.size, bool)
-    for start, stop in _runs(load > RELEASE):
-        if load[start:stop].max() > TOUCH and stop - start >= SHORTEST_TOUCH * rate:
-            touching[start:stop] = True
+    for (run,) in find_objects(label(load > RELEASE)[0]):
+        touching[run] = load[run].max() > TOUCH and run.stop - run.start >= SHORTEST_TOUCH * rate
     return touching
 
 
