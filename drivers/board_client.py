@@ -30,7 +30,8 @@ FAULTS = {
     Cause.FROZEN: "a sensor repeats one value while the drive moves: check its cable, supply and converter",
     Cause.INCONSISTENT: "the motion does not follow from the drive: check the wiring and polarity of sensors and coils",
     Cause.ACTIVE: "the motion grows with the drive: check the polarity of sensors and coils",
-    Cause.DRIVE: "the drive stayed above what any finger needs: check wiring and amplifier",
+    Cause.DRIVE: "the drive stayed above what any finger needs: check wiring and amplifier, and that the board's "
+    "sources were exported for the scene that needs most",
     Cause.RINGING: "the surface rings above 500 Hz: check the delay, and identify the bending mode",
     Cause.OVERMOTION: "the surface moved too far: check the polarity of sensors and coils, and the delay",
     Cause.BEYOND: "the motion stayed beyond what the scene can cause: check the unit of the sensors",

@@ -44,7 +44,7 @@ class BoardLoop:
         self._client = client = driver.client
         self.finger, self.watch, self.alive, self.silence = client.finger, client.watch, client.beat, client.stop
         self._bands, self._texture = self.made(rendering)
-        self._recent = np.zeros((0, 2))  # reference and motion, m
+        self._recent = np.zeros((0, 3))  # reference, motion and position, m
         self._reconnections = 0  # that have been noted
         self._fault: HapticError | None = None
 
@@ -86,7 +86,7 @@ class BoardLoop:
         drive, sensed, position, load, reference, flags = self.driver.columns(self._client.rows())
         first, self.samples = self.samples, self.samples + len(flags)
         motion = sensed @ (self.model.place_from_coordinate @ self.model.coordinate_from_sensed).T
-        recent = np.vstack([self._recent, np.stack([reference, motion[:, 0]], axis=1)])
+        recent = np.vstack([self._recent, np.stack([reference, motion[:, 0], position], axis=1)])
         self._recent = recent[-round(JUDGED * self.driver.rate) :]
         return first, {
             "drive": drive,
@@ -105,11 +105,12 @@ class BoardLoop:
         Of a texture that is no sum of bands the amplitudes are rms, over the last quarter of a second.
         """
         if self._texture is not None and len(self._recent):
-            reference, motion = (self._recent - self._recent.mean(axis=0)).T
+            reference, motion, _ = (self._recent - self._recent.mean(axis=0)).T
             target, achieved, off = (float(np.sqrt(np.mean(x**2))) for x in (reference, motion, motion - reference))
             return [(0.0, target, achieved, off / target if target > 0.0 else math.nan)]
-        rows = []
-        for hertz, band in zip(self._bands.frequency, self._client.telemetry().bands, strict=False):
+        speed = np.nan_to_num(abs(np.diff(self._recent[:, 2]))).sum() * self.driver.rate / max(len(self._recent) - 1, 1)
+        rows, frequency = [], self._bands.frequency + self._bands.wavenumber * speed
+        for hertz, band in zip(frequency, self._client.telemetry().bands, strict=False):
             size, error = abs(band.target), abs(band.measured - band.target)
             rows.append((float(hertz), size, abs(band.measured), error / size if size > 0.0 else math.nan))
         return rows

@@ -119,7 +119,9 @@ class Bands:
         """
         values = waveform(time, position)
         if np.shape(values) != np.shape(position) or np.asarray(values).dtype.kind not in "iuf":
-            found = f"shape {values.shape}" if isinstance(values, np.ndarray) else type(values).__name__
+            found = (
+                f"{values.dtype} of shape {values.shape}" if isinstance(values, np.ndarray) else type(values).__name__
+            )
             raise ValueError(f"{name}.waveform returned {found}: must be {len(position)} numbers, one a sample")
         away = np.isnan(position) & self.follows_finger
         values = np.where(away, 0.0, np.asarray(values, float))

@@ -17,7 +17,7 @@ from hapticrender.control.supervisor import FADE_OUT, SupervisedController, desi
 from hapticrender.driver_checks import check_sensed
 from hapticrender.errors import HapticError, WatchdogTimeout
 from hapticrender.inferred import ContactLag
-from hapticrender.loop import device_fault, motion_of_sensors
+from hapticrender.loop import device_fault, motion_of_sensors, stops_itself
 from hapticrender.protocols import Array, Controller, Flag, Rendering
 from hapticrender.realtime_entry import RealtimeEntry
 from hapticrender.realtime_kernel import HORIZON
@@ -75,6 +75,7 @@ class LiveLoop(RealtimeEntry):
         rows = len(self._arrays["log"])
         self._true = np.full((rows, len(self.model.places) + 1), np.nan)  # motion and load, where stated
         self._has_motion, self.senses = False, False  # whether the device states its motion, and senses the finger
+        self._itself = False  # whether it has stopped itself
         self._drive = np.zeros((self.driver.block, self.driver.drive_channels))
         self._device: Any = rendering.driver if rendering.plant is None else rendering.plant
         self._reshaping: tuple[Any, Any, int] | None = None  # before the device: from, to, since (sample)
@@ -100,7 +101,7 @@ class LiveLoop(RealtimeEntry):
             self._true[at, :-1], self._has_motion = sensed.motion, True
         if sensed.normal_load is not None:
             self._true[at, -1] = sensed.normal_load
-        self.senses = sensed.position is not None
+        self.senses, self._itself = sensed.position is not None, self._itself or stops_itself(sensed, self.running)
         flags = (Flag.OVERRUN if late else 0) | (0 if sensed.flags is None else int(np.bitwise_or.reduce(sensed.flags)))
         self._touches.slow()
         self._reshape()
@@ -152,6 +153,8 @@ class LiveLoop(RealtimeEntry):
             found["reference"] = np.gradient(found["reference"]) * self.driver.rate if enough else found["reference"]
             rows = slice(skip, -1 if enough else skip)
             first, found = first + skip, {name: signal[rows] for name, signal in found.items()}
+        if self.model.finger.needs_contact:  # as `Rendering.requested`
+            found["reference"] = np.where(np.isnan(found["position"]), 0.0, found["reference"])
         count = len(found["flags"])
         true = self._true[(first + np.arange(count)) % len(self._true)]
         found["normal_load"] = np.where(np.isnan(true[:, -1]), found["normal_load"], true[:, -1])
@@ -174,8 +177,10 @@ class LiveLoop(RealtimeEntry):
     @property
     def motion_source(self) -> str:
         """Where `motion` comes from."""
-        if self._has_motion or not self.driver.sensed_channels:
-            return "true" if self._has_motion else "unknown"
+        if self._has_motion:
+            return str(getattr(self.driver, "motion_source", "true"))
+        if not self.driver.sensed_channels:
+            return "unknown"
         return "inferred" if self.model.inferred else "sensors"
 
     def figures(self) -> list[Row]:
@@ -190,7 +195,7 @@ class LiveLoop(RealtimeEntry):
             return None
         if self.timed_out:
             return WatchdogTimeout(stopped / self.driver.rate)
-        return device_fault(self.rendering, self.running, stopped)
+        return device_fault(self.rendering, None if self._itself else self.running, stopped)
 
     def _texture(self, rendering: Rendering) -> SampledTexture:
         return SampledTexture(rendering.scene.texture, self.driver.rate, rendering.waveform_of)
@@ -244,14 +249,15 @@ def joint_model(old: Any, new: Any) -> Any:
 def band_figures(bands: Bands, first: int, rate: float, signals: dict[str, Array]) -> list[Row]:
     """Frequency (Hz), target, achieved amplitude and relative error of every band; see `Row`.
 
-    Least squares by the normal equations and a `RIDGE`, which makes amplitudes 0.02 % too small.  Of a waveform without
-    bands the amplitudes are rms, and the frequency is 0.
+    Least squares by the normal equations and a `RIDGE`, which makes amplitudes 0.02 % too small, about the means of
+    target and motion: what rests has no amplitude.  Of a waveform without bands the amplitudes are rms, and the
+    frequency is 0.
     """
     reference, motion = signals["reference"], signals["motion"][:, 0]
     if not len(reference) or not np.isfinite(motion).all():
         return []
     time, position = (first + np.arange(len(reference))) / rate, signals["position"]
-    motion = motion - motion.mean()
+    reference, motion = reference - reference.mean(), motion - motion.mean()
     if not len(bands) or (bands.follows_finger and not np.isfinite(position).all()):
         target, achieved, error = (float(np.sqrt(np.mean(each**2))) for each in (reference, motion, motion - reference))
         return [(0.0, target, achieved, _share(error, target))]

@@ -167,11 +167,21 @@ def recorder_of(rendering: Rendering, journal: str | Path | None = None, **chang
 
 
 def device_fault(rendering: Rendering, controller: Any, sample: int) -> DeviceFault:
-    """Return the error of a drive that was stopped from `sample` on: what driver or controller have found."""
+    """Return the error of a drive that was stopped from `sample` on: what driver or controller have found.
+
+    No `controller`: the device stopped itself.
+    """
     found = (getattr(owner, "fault", None) for owner in (rendering.driver, controller))
     text = next((each.text for each in found if isinstance(each, Fault)), "the device stopped itself")
     time = sample / rendering.driver.rate
     return DeviceFault(f"{type(rendering.device).__name__}: stopped at {time:.4g} s: {text}", time)
+
+
+def stops_itself(sensed: Sensed, controller: Any) -> bool:
+    """Whether a device says that it has stopped, and the controller has not stopped it."""
+    return bool(
+        sensed.flags is not None and (sensed.flags & STOPPED).any() and getattr(controller, "fault", None) is None
+    )
 
 
 def motion_of_sensors(model: DeviceModel, sensed: Array, position: Array, contact: ContactLag) -> Array:
@@ -259,7 +269,7 @@ class _Loop:
         self._predict = PositionPredictor(driver.rate, self._ahead)
         self._touches = TouchWatch(rendering.model, self.controller, active=rendering.plant is None)
         self._contact = ContactLag(rendering.model.contact_lag)
-        self._stopped = -1  # sample from which on the drive fades out; negative: none
+        self._stopped, self._itself = -1, False  # sample from which on the drive fades out; whether by the device
         self._drive = np.zeros((driver.block, driver.drive_channels))
 
     def advance(self, start: int, count: int) -> dict[str, Any]:
@@ -283,12 +293,13 @@ class _Loop:
         rate, driver = self.rendering.driver.rate, self.rendering.driver
         if self._stopped < 0 or start + self.step < self._stopped + FADE_OUT * rate + driver.delay:
             return None
-        return device_fault(self.rendering, self.controller, self._stopped)
+        return device_fault(self.rendering, None if self._itself else self.controller, self._stopped)
 
     def _block(self, count: int, reference: Callable[[Array], Array]) -> tuple[Array, Array, Array, Sensed]:
         """Exchange a block with the driver; the drive computed from it is played with the next one."""
         driver, played = self.rendering.driver, self._drive
-        sensed = check_sensed(driver, driver.play(played), len(self.rendering.model.places))
+        sensed = check_sensed(driver, driver.play(played.copy()), len(self.rendering.model.places))
+        self._itself |= stops_itself(sensed, self.controller)
         position = sensed.position
         if position is None:
             position = self.rendering.scene.finger.position(self._time(driver.block))
@@ -309,7 +320,7 @@ class _Loop:
         """Motion at the evaluation points, and its source: the device itself, its sensors, or none (NaN)."""
         model, values = self.rendering.model, sensed.sensed
         if sensed.motion is not None:
-            return sensed.motion, "true"
+            return sensed.motion, getattr(self.rendering.driver, "motion_source", "true")
         if not values.shape[1]:
             return np.full((len(values), len(model.places)), np.nan), "unknown"
         motion = motion_of_sensors(model, values, position, self._contact)
@@ -319,7 +330,7 @@ class _Loop:
 def _compare(rendering: Rendering, controller: Controller, recording: Recording) -> None:
     """Warn where the device differs from the model that the controller was designed for."""
     scale, source = getattr(controller, "damper_scale", 1.0), rendering.scene.source
-    profile = f", profile {source}," if source else ""
+    profile = f", profile {source}" if source else ""
     if scale < 1.0:
         message = f"the inner damper rang above 500 Hz and was turned down to {scale:g}: identify the bending mode, or "
         message += "the sensors' noise where there is none"

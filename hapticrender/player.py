@@ -101,6 +101,8 @@ class Player:
     ) -> None:
         if watchdog is not None and not 2.0 * SERVICE <= watchdog <= LONGEST_WATCHDOG:
             raise ValueError(f"{watchdog=} s: must be {2.0 * SERVICE:g} to {LONGEST_WATCHDOG:g} s, or None")
+        if "texture" in tables:
+            raise TypeError("texture: a player has none of its own: call play(texture)")
         if tables.get("touch_panel"):
             cure = "pass positions to `finger` that hr.TouchPanel(...).estimator() has estimated"
             raise ValueError(f"touch_panel: has no effect on the positions that the application sets: {cure}")

@@ -84,6 +84,7 @@ class HybridDriver(WrappedDriver):
             self._last = glass[-1]
             place = np.zeros(len(glass)) if sensed.position is None else np.nan_to_num(sensed.position)
             skin = rates[:, 0] + place * rates[:, 1] + self.velocity_per_force * values[:, SENSORS]
+        self.motion_source = "sensors"
         return sensed._replace(motion=skin[:, None])
 
 

@@ -30,6 +30,8 @@ class Port:
 class WrappedDriver:
     """A driver whose drive or measurements are converted on the way; a subclass fills in `play`."""
 
+    motion_source = "true"  # of the motion that `play` returns, where it does
+
     def __init__(self, driver: Driver) -> None:
         self.driver = driver
         self.rate, self.block, self.delay = driver.rate, driver.block, driver.delay

@@ -174,6 +174,7 @@ def test_a_driver_of_ones_own_gets_currents_and_is_judged_by_its_sensors():
     assert envelope[-1] == 0.0  # closed
     (band,) = recording.summary()["bands"]
     assert band["rms_error_skin"] < FELT
+    assert recording.header.motion_source == "sensors"  # a velocity that is computed is none that is known
 
 
 def test_without_sensors_both_parts_are_driven_open_loop():

@@ -76,6 +76,29 @@ def test_compiled_loop_equals_the_ring_of_blocks(scene, method):
     )
 
 
+class Scaling(Blocks):
+    """Converts the drive in place, and stops by itself from block 1000 on."""
+
+    def play(self, drive):
+        self.played.append(drive.copy())
+        sensed = self._driver.play(drive.copy())
+        drive *= 3.0
+        stops = len(self.played) > 1000
+        return sensed._replace(flags=np.full(len(drive), int(hr.Flag.STOPPED))) if stops else sensed
+
+
+def test_a_driver_may_convert_the_drive_in_place_and_stop_the_device():
+    driver = Scaling(simulated(TONE))
+    with pytest.raises(hr.DeviceFault, match=r"stopped at 0\.2 s: the device stopped itself") as stopped:
+        hr.render(TONE, driver=driver)
+    drive = stopped.value.recording.drive
+    np.testing.assert_array_equal(drive, np.concatenate(driver.played)[: len(drive)])
+    with hr.Player(driver=Scaling(simulated(TONE)), paced=False) as player:
+        player.play(TONE.texture)
+        with pytest.raises(hr.DeviceFault, match=r"stopped at 0\.2 s: the device stopped itself"):
+            player.sleep(0.5)
+
+
 def test_blocks_of_any_size_give_the_same_samples_for_the_same_delay():
     """With a delay of 6 samples, blocks of 1, 2, 3 and 6 leave 5, 4, 3 and 0 of them inside the device."""
     expected = hr.render(SPATIAL, driver=simulated(SPATIAL, delay=6))
@@ -186,7 +209,11 @@ def own(bands=lambda rate: hr.Bands(frequency=[100.0], wavenumber=[0.0], phase=[
         ({"driver": SimulatedDriver}, TypeError, r"driver = SimulatedDriver: must be an instance, not the class"),
         ({"renderer": object()}, TypeError, r"renderer: must be an object with open\(scene, driver\).*not object"),
         ({"scene": own(lambda rate: None)}, TypeError, "Own.bands returned NoneType: must be hapticrender.Bands"),
-        ({"scene": own(waveform=lambda t: t[:-1])}, ValueError, r"Own.waveform returned shape \(\d+,\): must be"),
+        (
+            {"scene": own(waveform=lambda t: t[:-1])},
+            ValueError,
+            r"Own.waveform returned float64 of shape \(\d+,\): must be",
+        ),
     ],
 )
 def test_what_is_handed_over_by_mistake_is_named(arguments, error, message):

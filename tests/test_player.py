@@ -165,6 +165,36 @@ def test_a_texture_in_time_and_along_the_surface_at_once_is_played_as_friction(d
     assert band.error < 0.04
 
 
+@pytest.mark.parametrize("device", ["electroadhesion", "ultrasonic", "vt-plate"])
+def test_only_a_plate_is_to_move_without_a_finger(device, tmp_path):
+    with hr.Player(device, paced=False) as player:
+        player.play(TONE)
+        player.record(tmp_path / "lifted.au")
+        slide(player, 0.3)
+        player.finger(float("nan"))
+        player.sleep(0.4)
+        [lifted] = player.state().bands
+        recording = player.end_recording()
+    away = np.isnan(recording.position)
+    assert recording.reference[~away].any()
+    assert recording.reference[away].any() == (device == "vt-plate")
+    assert (lifted.target > 0.0) == (device == "vt-plate")
+
+
+def test_a_grating_under_a_finger_that_rests_has_no_amplitude():
+    """The plate holds the displacement of that place; there is nothing else to compare."""
+    with hr.Player(paced=False) as player:
+        player.play(RIDGES)
+        slide(player, 0.5)
+        [moving] = player.state().bands
+        player.finger(0.005, 0.0, 0.4)
+        player.sleep(0.6)
+        [resting] = player.state().bands
+    assert moving.error < 0.02
+    assert resting.target == 0.0
+    assert np.isnan(resting.error)
+
+
 def test_a_texture_that_cannot_be_played_changes_nothing():
     with hr.Player(paced=False) as player:
         player.play(TONE)
@@ -217,6 +247,8 @@ def test_what_it_refuses(tmp_path):
         hr.Player(watchdog=0)
     with hr.Player(driver=Calling(), paced=False) as player, pytest.raises(ValueError, match="paced = False"):
         player.play(TONE)
+    with pytest.raises(TypeError, match="texture: .* call play"):
+        hr.Player(texture=TONE)
     with hr.Player() as player:
         for gain in (-0.1, 10.1):
             with pytest.raises(ValueError, match=f"gain={gain}: must be 0 to 10"):
@@ -304,7 +336,7 @@ def test_a_texture_of_ones_own_lies_where_its_bands_say(tmp_path):
         player.play(Own(along=1e3))
         player.record(tmp_path / "own.au")
         slide(player, 1.0)
-        with pytest.raises(ValueError, match="Own: must not change with the finger's position, or"):
+        with pytest.raises(ValueError, match="Own: must not change with the finger's position or contact"):
             player.play(Own(along=1e3, in_time=10.0))
         recording = player.end_recording()
     assert np.std(recording.reference[2500:]) == pytest.approx(5e-6 / np.sqrt(2), rel=0.02)

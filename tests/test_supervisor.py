@@ -287,6 +287,7 @@ class Probed(Watched):
         ({"spoil": lambda sample, sensed: sensed._replace(sensed=np.full((1, 2), np.nan))}, "100% of the samples"),
         ({"noise": 20e-6}, "the sensors' noise is (19|2.) um rms, more than .* um: the probe cannot judge"),
         ({"noise": 4e-6, "sensors": INVERT}, "sensor 1 is inverted"),
+        ({"noise": 2e-6, "coils": np.zeros((2, 2))}, "nothing moves"),
     ],
 )
 @pytest.mark.parametrize("touched", [{}, FINGER], ids=["free", "touched"])

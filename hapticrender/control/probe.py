@@ -27,7 +27,8 @@ HIGH = np.array([[1.40, 1.77], [1.59, 1.96]])  # over the highest
 HIGH_GAIN = (2.0, 2.8)  # amplitude of a line above the modes, over one below
 MOTION, MOST_DRIVE = 0.025, 0.05  # of the sensors' range; of the drive limit
 DELAYS = 13
-MOST_INVALID, MOST_REPEATS, LEAST_ENERGY = 0.02, 0.6, 0.02
+MOST_INVALID, MOST_REPEATS = 0.02, 0.6
+LEAST_ENERGY = 0.005  # of the model's, beyond the noise's: half of what a tenth of the gain leaves
 MOST_RESIDUAL, MOST_WORSE = 0.35, 0.05
 MOST_NOISE = (1 / (1 - MOST_RESIDUAL / 2) ** 2 - 1) ** 0.5  # over |y|: this noise alone leaves half that residual
 SCALES, DELAY_TOLERANCE = (0.6, 1.6), 2  # samples
@@ -116,7 +117,8 @@ def judge(model: DeviceModel, drive: Array, sensed: Array) -> Found:
         return Found(f"{(~valid).mean():.0%} of the samples are invalid", np.nan, np.nan, -1)
     y = _detrended(np.where(valid[:, None], sensed, 0.0))
     energy, model_energy = float((y**2).sum()), float((expected["nothing", stated] ** 2).sum())
-    if energy < LEAST_ENERGY * model_energy:
+    noise = float(np.diff(silence, 2, axis=0).std() / 6**0.5) if len(silence) else 0.0  # of white noise
+    if energy - noise**2 * y.size < LEAST_ENERGY * model_energy:
         return Found("nothing moves: sensors or actuators are dead", np.nan, (energy / model_energy) ** 0.5, -1)
     if (repeats > MOST_REPEATS).any():
         return Found(f"sensor {1 + int(repeats.argmax())} repeats its values", np.nan, np.nan, -1)
@@ -127,7 +129,6 @@ def judge(model: DeviceModel, drive: Array, sensed: Array) -> Found:
     best = min(residuals, key=lambda each: residuals[each])
     own = min((("nothing", delay) for delay in delays), key=lambda each: residuals[each])
     scale, delay = float((y * expected[own]).sum() / (expected[own] ** 2).sum()), own[1] + model.block
-    noise = float(np.diff(silence, 2, axis=0).std() / 6**0.5) if len(silence) else 0.0  # of white noise
     most = MOST_NOISE * (model_energy / y.size) ** 0.5
     fault = ""
     if min(residuals[own], residuals[best] + MOST_WORSE) > MOST_RESIDUAL and noise > most:
