@@ -85,7 +85,7 @@ class BoardLoop:
         """Return the number of the first sample and the signals that the board has streamed since the last call."""
         drive, sensed, position, load, reference, flags = self.driver.columns(self._client.rows())
         first, self.samples = self.samples, self.samples + len(flags)
-        motion = sensed @ self.model.place_from_sensed.T
+        motion = sensed @ (self.model.place_from_coordinate @ self.model.coordinate_from_sensed).T
         recent = np.vstack([self._recent, np.stack([reference, motion[:, 0]], axis=1)])
         self._recent = recent[-round(JUDGED * self.driver.rate) :]
         return first, {
