@@ -159,7 +159,7 @@ def recorder_of(rendering: Rendering, journal: str | Path | None = None, **chang
         "drive_channels": driver.drive_channels,
         "sensed_channels": driver.sensed_channels,
         "drive_limit": model.drive_limit if np.isfinite(model.drive_limit) else None,
-        "sensed_noise": model.sensed_noise,
+        "sensed_noise": (model.sensed_noise * np.linalg.norm(model.place_from_sensed, axis=1)).tolist(),
         "calibration": float(calibration),
         **{name: getattr(model, name) for name in ("places", "unit", "drive_unit", "profile")},
     }
@@ -187,7 +187,7 @@ def stops_itself(sensed: Sensed, controller: Any) -> bool:
 def motion_of_sensors(model: DeviceModel, sensed: Array, position: Array, contact: ContactLag) -> Array:
     """Motion at the evaluation points, shape (n, places), by the sensors; friction is inferred behind `contact`."""
     with np.errstate(invalid="ignore"):  # a faulty sensor is the controller's to flag
-        motion = sensed @ (model.place_from_coordinate @ model.coordinate_from_sensed).T
+        motion = sensed @ model.place_from_sensed.T
         return contact.run(motion, position) if model.inferred else motion
 
 

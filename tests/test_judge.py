@@ -10,6 +10,7 @@ import pytest
 from synthetic import RATE, make_bands, make_play, make_recorder, make_recording, make_signals, times
 
 import hapticrender as hr
+from hapticrender.loop import recorder_of
 from hapticrender.protocols import Flag
 from hapticrender.recordings import envelopes, judge, verdict
 
@@ -337,6 +338,41 @@ def test_figures_from_sensors_contain_the_uncertainty_of_their_gain():
         assert summary["verdict"] == found
 
 
+@pytest.mark.parametrize(("gain", "found"), [(0.97, "failed"), (0.99, "passed")])
+def test_the_uncertainty_of_the_sensors_says_nothing_of_a_true_motion(gain, found):
+    bands = make_bands(100.0, 10 * UM)
+    recorder = make_recorder(None, bands, tolerance=0.02)
+    recorder.header = replace(recorder.header, calibration=0.5, motion_source="true")
+    recorder.append(**make_signals(bands, gain * bands.envelope))
+    summary = recorder.finish().summary()
+    assert summary["worst"]["value"] == pytest.approx(1 - gain, rel=1e-6)
+    assert (summary["verdict"], summary["reason"]) == (found, "")
+
+
+def test_the_noise_of_sensors_in_mm_is_recorded_as_that_of_the_motion():
+    """Heave is the mean of two sensors at the ends, whose gains are 1."""
+    rendering = hr.prepare(hr.Scene(texture=hr.Grating(frequency=80.0, amplitude=1e-5), duration=1.0), compiled=False)
+    model = rendering.model
+    milli = replace(model, coordinate_from_sensed=1e-3 * model.coordinate_from_sensed, sensed_noise=2e-3)
+    header = recorder_of(replace(rendering, model=milli)).header
+    assert header.sensed_noise == pytest.approx((2 * UM / math.sqrt(2), 2 * UM, 2 * UM))
+
+
+@pytest.mark.parametrize(("noise", "found"), [([UM, 0.0, 0.0], "failed"), ([UM], "not judged")])
+def test_noise_at_one_place_hides_no_error_at_another(rng, noise, found):
+    """An error of 3 %, the tolerance 2 %, and at the centre noise of 6.2 % as well; a quiet end fails all the same."""
+    bands = make_bands(100.0, 10 * UM)
+    recorder = make_recorder(None, bands, tolerance=0.02)
+    recorder.header = replace(recorder.header, sensed_noise=noise, motion_source="sensors")
+    extra = np.zeros((20_000, 3))
+    extra[:, 0] = UM * rng.standard_normal(20_000)
+    recorder.append(**make_signals(bands, 0.97 * bands.envelope, extra=extra))
+    summary = recorder.finish().summary()
+    assert summary["verdict"] == found
+    assert summary["waveform"]["places"]["centre"]["waveform_error"] > 0.06
+    assert (summary["worst"]["place"] != "centre") == (found == "failed")
+
+
 @pytest.mark.parametrize(
     ("gain", "flag", "found"), [(1.0, 0, "not judged"), (0.8, 0, "failed"), (1.0, Flag.OVERRUN, "failed")]
 )
@@ -372,3 +408,85 @@ def test_h2_on_white_noise_fails(rng):
     summary = recording.summary()
     assert summary["verdict"] == "failed"
     assert summary["waveform"]["places"]["centre"]["waveform_error"] > 0.9
+
+
+@pytest.mark.parametrize("left", [0.05, 0.09])
+@pytest.mark.parametrize(("last", "found"), [(1.0, "passed"), (0.0, "failed"), (np.nan, "failed")])
+def test_a_run_is_judged_to_its_end(rng, left, last, found):
+    """The end after 10 whole windows of 100 ms; the 95th percentile of 11 is halfway between the worst two."""
+    noise = white(20, 400, rng, seconds=2.0)[: round((1.5 + left) * RATE)]
+    motion = np.where(np.arange(len(noise)) >= round(1.5 * RATE), last, 1.0) * noise
+    summary = make_play(noise, motion, settle=0.5).summary()
+    assert summary["judged_from"] == 0.5
+    assert summary["verdict"] == found
+    assert summary["waveform"]["lost_windows"] == (1 if math.isnan(last) else 0)
+
+
+def test_the_sample_that_ends_a_run_which_was_cut_off_is_not_judged():
+    bands = make_bands(100.0, 10 * UM)
+    recorder = make_recorder(None, bands)
+    recorder.append(**make_signals(bands, bands.envelope, extra=20 * UM))
+    recorder.close(stopped=True)
+    recording = recorder.finish()
+    assert np.isnan(recording.motion[-1]).all()
+    summary = recording.summary()
+    assert (summary["verdict"], summary["waveform"]["lost_windows"]) == ("passed", 0)
+    assert summary["worst"]["value"] == pytest.approx(0.0, abs=1e-6)
+
+
+def make_gradient(profile, error, frequency=200.0):
+    """Motion with a gradient: a tone of 20 um at 50 Hz times each place's share, and an error (m peak, each place)."""
+    bands, time = make_bands(50.0, 20 * UM), times(4.0)
+    recorder = make_recorder(None, bands)
+    recorder.header = replace(recorder.header, profile=profile)
+    extra = np.outer(np.cos(2 * np.pi * frequency * time), error)
+    recorder.append(**make_signals(bands, np.reshape(profile, (3, 1)) * bands.envelope, extra=extra))
+    return recorder.finish().summary()
+
+
+@pytest.mark.parametrize("place", [1, 2])
+@pytest.mark.parametrize(("times_threshold", "found"), [(0.9, "passed"), (1.1, "failed")])
+@pytest.mark.parametrize("profile", [(1.0, 0.56, 1.44), (1.0, -0.3, 0.3), (1.0, 0.0, 2.0)])
+def test_a_spur_is_felt_as_it_moves_the_place_whatever_its_share(profile, place, times_threshold, found):
+    error = times_threshold * hr.detection_threshold(200.0, "classic") * (np.arange(3) == place)
+    summary = make_gradient(profile, error)
+    figures = summary["waveform"]["places"][f"end_{place}"]
+    assert summary["verdict"] == found
+    assert figures["third_octaves"]["200 Hz"] == pytest.approx(0.2 * times_threshold, rel=0.03)
+
+
+@pytest.mark.parametrize("share", [0.0, 1e-16, 0.05])
+@pytest.mark.parametrize(("error", "found"), [(0.009, "passed"), (0.011, "failed")])
+def test_a_place_that_is_to_move_by_less_than_a_tenth_of_another_counts_as_a_tenth(share, error, found):
+    """The tolerance is 10 %, of a tenth."""
+    summary = make_gradient((1.0, share, 1.0), error * 20 * UM * np.array([0.0, 1.0, 0.0]), 50.0)
+    assert summary["verdict"] == found
+    assert summary["waveform"]["places"]["end_1"]["waveform_error"] == pytest.approx(10 * error, rel=1e-6)
+    json.dumps(summary, allow_nan=False)
+    assert (summary["bands"][0]["error_end_1"] is None) == (share < 0.05)
+
+
+def test_a_lost_sample_of_friction_is_lost_alone(rng):
+    """The mean friction of a touch is taken off, of what is known of it."""
+    noise = white(20, 400, rng, rms=0.01)
+    for lost, windows, found in ((slice(0), 0, "passed"), (slice(15_000, 15_001), 1, "failed")):
+        recorder = make_recorder(None, make_bands(100.0, 0.0), settle=0.0)
+        recorder.header = replace(recorder.header, unit="N")
+        signals = make_signals(make_bands(100.0, 0.0), 0.0, extra=(0.5 + noise)[:, None], position=0.0)
+        signals["motion"][lost] = np.nan
+        recorder.append(**signals | {"reference": noise})
+        summary = recorder.finish().summary()
+        assert (summary["verdict"], summary["waveform"]["lost_windows"]) == (found, windows)
+
+
+@pytest.mark.parametrize(("unit", "scale"), [("m", 1.0), ("N", 2 * np.pi * 250 / 0.64), ("m/s", 2 * np.pi * 250)])
+@pytest.mark.parametrize(("share", "found"), [(1e-9, "not judged"), (0.009, "not judged"), (0.011, "failed")])
+def test_a_texture_of_less_than_a_hundredth_of_what_can_be_felt_is_none(unit, scale, share, found):
+    """A hundredth in amplitude of the safe threshold where that is least: at 250 Hz, also as a velocity."""
+    tone = share * scale * hr.detection_threshold(250.0) * np.cos(2 * np.pi * 100 * times(4.0))
+    recorder = make_recorder(None, make_bands(100.0, 0.0))
+    recorder.header = replace(recorder.header, unit=unit)
+    recorder.append(**make_signals(make_bands(100.0, 0.0), 0.0) | {"reference": 1e-9 + tone})
+    summary = recorder.finish().summary()
+    assert summary["verdict"] == found
+    assert summary["reason"].startswith("the texture is zero") == (found == "not judged")

@@ -277,6 +277,7 @@ CHANGES = [
     ({"name": "a\x1b[2J"}, "name = 'a\\x1b[2J': must be a text of printable characters"),
     ({"tolerance": None}, "tolerance is missing"),
     ({"bands": {"frequency": [1], "wavenumber": [0, 1], "phase": [0]}}, "wavenumber has shape (2,)"),
+    ({"sensed_noise": [0.0, 1.0]}, "sensed_noise = (0.0, 1.0): must be one number, or one a place"),
     ({"version": 99}, "version = 99: must be 2"),
     ({"colour": 1}, "colour = 1: unknown key"),
 ]

@@ -105,6 +105,11 @@ class DeviceModel:
         """Target at each evaluation point per target of the pattern; None: the same everywhere."""
         return None if self.shape is None else tuple((self.place_from_coordinate @ self.shape).tolist())
 
+    @property
+    def place_from_sensed(self) -> Array:
+        """Displacement at each evaluation point per sensed signal, shape (p, s)."""
+        return self.place_from_coordinate @ self.coordinate_from_sensed
+
     def dynamic_stiffness(self, frequency: Array) -> Array:
         """D(j w), N/m, complex, shape (..., c, c), at `frequency` (Hz, shape (...))."""
         s = 2j * np.pi * np.asarray(frequency, float)[..., None, None]

@@ -51,6 +51,11 @@ def _row(key: str, value: Any) -> Array:
     return np.array(() if value == [] else numbers(key, value, least=-1e12, most=1e12), float)
 
 
+def _noise(key: str, value: Any) -> tuple[float, ...]:
+    """Return a noise for each place; one number is that of all."""
+    return numbers(key, value if isinstance(value, list | tuple | np.ndarray) else [value], least=0.0, most=1e12)
+
+
 def _bands(key: str, value: Any) -> Bands:
     """Return bands, also from their JSON object."""
     if isinstance(value, Bands):
@@ -94,13 +99,15 @@ class Header(Validated):
     drive_unit: str = checked(text, "A")
     profile: tuple[float, ...] | None = checked(numbers, None, least=-1e6, most=1e6)  # target at each place over first
     motion_source: str = option("true", *MOTION_SOURCES)
-    sensed_noise: float = parameter(0.0, most=1e12)  # rms of a sensor's white noise, in `unit`
+    sensed_noise: tuple[float, ...] = checked(_noise, (0.0,))  # rms of the sensors' white noise in the motion, a place
     calibration: float = parameter(0.0, most=1e3)  # relative uncertainty of the sensors' gain; 0 where it is not known
 
     def __post_init__(self) -> None:
         super().__post_init__()
         fits = self.profile is None or len(self.profile) == len(self.places)
         require(fits, "profile", self.profile, "one number a place")
+        fits = len(self.sensed_noise) in (1, len(self.places))
+        require(fits, "sensed_noise", self.sensed_noise, "one number, or one a place")
 
     @classmethod
     def of(cls, scene: Scene, **rest: Any) -> Header:

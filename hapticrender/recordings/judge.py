@@ -20,6 +20,7 @@ from hapticrender.recordings.envelopes import (
 from hapticrender.recordings.verdict import BAND, LEAST, LOOSER, MATTERS, UNPLAYABLE, WINDOW
 
 if TYPE_CHECKING:
+    from hapticrender.recordings.journal import Header
     from hapticrender.recordings.recording import Recording
 
 READ_AT_ONCE = 2**18  # samples
@@ -91,7 +92,9 @@ def _band(recording: Recording, k: int, judged: Array, places: list[str]) -> dic
     bands, envelopes = recording.bands, recording.envelopes
     wavenumber, seconds = float(bands.wavenumber[k]), len(recording) / recording.rate
     target = envelopes.target[judged, k]
-    achieved = envelopes.achieved[judged, :, k] / np.array(recording.header.profile or 1.0)
+    shares = np.array(recording.header.profile or np.ones(len(places)))
+    aimed = ~np.isclose(shares, 0.0)  # a place that a gradient leaves at rest has no target
+    achieved = envelopes.achieved[judged, :, k] / np.where(aimed, shares, 1.0)
     lead = achieved[:, 0] * target.conj()
     lead = np.where(envelopes.backward[judged, k], lead.conj(), lead)  # a lead stays a lead on the way back
     some = bool(judged.any())
@@ -109,9 +112,9 @@ def _band(recording: Recording, k: int, judged: Array, places: list[str]) -> dic
         ),
         "judged_windows": int(judged.sum()),
     }
-    for place, envelope in zip(places, achieved.T, strict=True):
-        figures[f"error_{place}"] = float(np.mean(np.abs(envelope))) / mean - 1.0 if mean else None
-        figures[f"rms_error_{place}"] = float(amplitude_error(envelope, target, 0)) if some else None
+    for place, has_target, envelope in zip(places, aimed, achieved.T, strict=True):
+        figures[f"error_{place}"] = float(np.mean(np.abs(envelope))) / mean - 1.0 if mean and has_target else None
+        figures[f"rms_error_{place}"] = float(amplitude_error(envelope, target, 0)) if some and has_target else None
     return figures
 
 
@@ -178,14 +181,14 @@ def _unjudged(recording: Recording, worst: dict[str, Any]) -> str:
         needed = min(max(header.settle, FADE_IN) + WINDOW, 2 * WINDOW)
         return f"the run is too short: needs >= {needed:g} s"
     if not found["rms_reference"]:
-        return "the texture is zero"
+        return "the texture is zero, or far below what can be felt"
     if found["share_in_band"] < LEAST:
         return f"the texture has nothing from {IN_BAND}"
     if header.motion_source == "inferred":
         return INFERRED
-    noise = found["sensor_noise"]
-    if worst["value"] > worst["bound"] and worst["value"] - header.calibration <= HARDLY * noise:
-        return f"the worst figure is not distinct from the noise of the sensors, {percent(noise)}"
+    if worst["value"] > worst["bound"] and not _misses(recording, worst):
+        noise = percent(_noise(recording, worst))
+        return f"the worst figure is not distinct from the noise of the sensors, {noise}"
     return ""
 
 
@@ -203,9 +206,8 @@ def _unplayable(share: float) -> str:
 
 
 def _worst(recording: Recording) -> dict[str, Any]:
-    """Find the figure that is largest over its bound, at all places; from sensors, their uncertainty is added."""
-    header, found = recording.header, []
-    unsure = header.calibration if header.motion_source == "sensors" else 0.0
+    """Find the figure that is largest over its bound, at all places; one that distinctly misses it comes first."""
+    header, unsure, found = recording.header, _unsure(recording.header), []
     for place, figures in recording.waveform["places"].items():
         for name, looser in (("waveform_error", 1.0), ("window_error", LOOSER), ("third_octave_error", LOOSER)):
             if figures and figures[name] is not None:
@@ -213,7 +215,23 @@ def _worst(recording: Recording) -> dict[str, Any]:
                 value, bound = figures[name] + unsure, looser * header.tolerance
                 where = {"band": band, "place": place.replace("_", " ")}
                 found.append({"figure": name, "value": value, "bound": bound, **where})
-    return max(found, key=lambda each: each["value"] / each["bound"], default=dict(UNJUDGED))
+    return max(found, key=lambda it: (_misses(recording, it), it["value"] / it["bound"]), default=dict(UNJUDGED))
+
+
+def _unsure(header: Header) -> float:
+    """Relative uncertainty of the motion's gain, which is added to every figure: that of the sensors it comes from."""
+    return header.calibration if header.motion_source == "sensors" else 0.0
+
+
+def _noise(recording: Recording, each: dict[str, Any]) -> float:
+    """What the noise of the sensors alone reads at the place of a figure."""
+    return float(recording.waveform["places"][each["place"].replace(" ", "_")]["sensor_noise"])
+
+
+def _misses(recording: Recording, each: dict[str, Any]) -> bool:
+    """Whether a figure is over its bound, and distinct from the noise of the sensors."""
+    distinct = each["value"] - _unsure(recording.header) > HARDLY * _noise(recording, each)
+    return bool(each["value"] > each["bound"] and distinct)
 
 
 def _notes(recording: Recording, bands: list[dict[str, Any]], settled: Array) -> list[str]:

@@ -18,9 +18,10 @@ import numpy as np
 
 from hapticrender.protocols import Array, Flag
 from hapticrender.recordings.envelopes import DIVERGING, RUNAWAY, judged_from
-from hapticrender.touch.perception import detection_threshold
+from hapticrender.touch.perception import VELOCITY_PER_FORCE, detection_threshold
 
 if TYPE_CHECKING:
+    from hapticrender.recordings.journal import Header
     from hapticrender.recordings.recording import Recording
 
 BAND = (20.0, 500.0)  # Hz
@@ -30,7 +31,7 @@ MARGIN = 0.25  # s around a piece, in which the filter settles
 WINDOW = 0.1  # s
 SEGMENT = 10  # windows in a segment of the spectra (Hann, half overlapping): 1 s
 WORST_WINDOWS = 95.0  # percentile
-QUIET = 0.1  # of the rms of the whole reference: windows below count as this loud
+QUIET = 0.1  # of the rms of the whole reference: windows, and places, below count as this loud
 READ_AT_ONCE = 2**17  # samples
 NOMINAL = (
     *(25.0, 31.5, 40.0, 50.0, 63.0, 80.0, 100.0, 125.0, 160.0, 200.0, 250.0, 315.0, 400.0),
@@ -42,7 +43,7 @@ CURVE = "classic"  # detection threshold; the rounding of a 12-bit converter alo
 SPUR = 0.01  # of the rms of the whole reference: S_b where no threshold is known
 LOOSER = 2.0  # times the tolerance: bound on a third octave and on the worst windows
 UNPLAYABLE = 0.01  # share of the reference's energy outside B from which it is noted
-LEAST = 1e-4  # share of the reference's energy in B below which nothing is judged
+LEAST = 1e-4  # share of the reference's energy in B, and of the least energy felt, below which nothing is judged
 LONGEST_DELAY, DELAYS = 20e-3, 4001  # s, of the best delay; how many are tried
 AFTER_CONTACT = (0.0, 0.05, 0.2)  # s: edges of the two spans that are stated
 MATTERS = Flag.SATURATED | Flag.NONFINITE | Flag.SENSOR_CLIPPED | Flag.OVERRUN
@@ -53,15 +54,16 @@ def waveform_figures(recording: Recording) -> dict[str, Any]:
     """Figures of the waveform as plain numbers, None where there is none; see ``judge.summary``."""
     header, rate = recording.header, recording.rate
     window, begin = round(WINDOW * rate), math.ceil(judged_from(recording) * rate - 1e-6)
-    count = max(len(recording) - begin, 0) // max(window, 1)
+    stop = _end(recording)
+    count = max(stop - begin, 0) // max(window, 1)
     places = [place.replace(" ", "_") for place in header.places]
     found: dict[str, Any] = {"lost_windows": 0, "places": dict.fromkeys(places), "contacts": None, "sensor_noise": 0.0}
     found |= dict.fromkeys(("rms_reference", "share_in_band", "share_outside", "delay", "gain", "incoherent"))
     if not window or not count:
         return found
-    stop = begin + count * window
-    size = max(READ_AT_ONCE // window, 1) * window
-    pieces = [(start, min(start + size, stop)) for start in range(begin, stop, size)]
+    whole, size = begin + count * window, max(READ_AT_ONCE // window, 1) * window
+    pieces = [(start, min(start + size, whole)) for start in range(begin, whole, size)]
+    pieces += [(stop - window, stop)] * (whole < stop)  # a last window, which overlaps the one before
     power = np.concatenate([_power(recording, *piece, window) for piece in pieces])
     found["lost_windows"] = int(np.isnan(power).any(axis=1).sum())
     if found["lost_windows"]:
@@ -70,21 +72,22 @@ def waveform_figures(recording: Recording) -> dict[str, Any]:
     inside = _within(frequency, *_band(rate), 2 * frequency[1])
     reference = spectrum[:, 0]
     level = found["rms_reference"] = math.sqrt(reference.sum())
-    if not level > 0.0:
-        return found
+    if not level > _least(header.unit):
+        return found | {"rms_reference": 0.0}
     found["share_in_band"] = float(reference[inside].sum() / reference.sum())
     found["share_outside"] = _outside(reference, frequency, inside, header.unit)
     if found["share_in_band"] < LEAST:
         return found
-    found["sensor_noise"] = _noise(recording, *_band(rate)) / math.sqrt(reference[inside].sum())
-    floor = partial(_floor, recording, level)
+    total = spectrum[_within(frequency, *_band(rate))].sum(axis=0)
+    shares, scales = _scales(header)
+    noise = _noise(recording, *_band(rate)) / scales / math.sqrt(reference[inside].sum())
+    found["sensor_noise"] = float(noise.max())
     for i, place in enumerate(places, start=1):
-        columns = spectrum[:, [0, i, i + len(places)]]
-        total = spectrum[_within(frequency, *_band(rate))].sum(axis=0)
+        columns, share = spectrum[:, [0, i, i + len(places)]], float(abs(shares[i - 1]) / scales[i - 1])
         errors = {"waveform_error": math.sqrt(total[i] / total[0]), "window_error": _windows(power[:, [0, i]])}
-        found["places"][place] = errors | _thirds(columns, frequency, rate, header.unit, floor)
-    sign = float(np.sign((header.profile or (1.0,))[0]))
-    found |= _likeness(frequency[inside], spectrum[inside, :2], cross[inside], sign)
+        thirds = _thirds(columns, frequency, rate, header.unit, partial(_floor, recording, level, i - 1), share)
+        found["places"][place] = errors | {"sensor_noise": float(noise[i - 1])} | thirds
+    found |= _likeness(frequency[inside], spectrum[inside, :2], cross[inside], float(shares[0] / scales[0]))
     return found | {"contacts": _contacts(recording, begin, stop, math.sqrt(power[:, 0].mean()))}
 
 
@@ -96,22 +99,42 @@ def _within(frequency: Array, low: float, high: float, blur: float = 0.0) -> Arr
     return (frequency >= low - blur) & (frequency < high + blur)
 
 
+def _end(recording: Recording) -> int:
+    """Samples that are judged: all but the one of unknown motion that ends a run which was cut off."""
+    last = recording.read("flags", max(len(recording) - 1, 0))
+    return len(recording) - int((last & Flag.STOPPED).any())
+
+
+def _least(unit: str) -> float:
+    """Rms below which a reference is none: 1e-4 of the energy of the faintest motion felt; 0 where that is unknown."""
+    hertz = THIRDS[_within(THIRDS, *BAND)]
+    rate = 2.0 * np.pi * hertz
+    faintest = detection_threshold(hertz) * {"m": 1.0, "m/s": rate, "N": rate / VELOCITY_PER_FORCE}.get(unit, 0.0)
+    return float(math.sqrt(LEAST / 2.0) * np.min(faintest))
+
+
+def _scales(header: Header) -> tuple[Array, Array]:
+    """Share of the target at every place, and the magnitude that its errors are relative to."""
+    shares = np.array(header.profile or np.ones(len(header.places)))
+    return shares, np.maximum(np.abs(shares), QUIET * (np.abs(shares).max() or 1.0))
+
+
 def _signals(recording: Recording, start: int, stop: int) -> Array:
     """Reference, and error at every place relative to its share of the target, shape (n, 1 + places)."""
-    shares = np.array(recording.header.profile or np.ones(len(recording.header.places)))
+    shares, scales = _scales(recording.header)
     reference, motion = recording.read("reference", start, stop), recording.read("motion", start, stop)
     motion = np.where(np.abs(motion) < RUNAWAY, motion, np.nan)
     if recording.header.unit == "N":
         motion = _without_base(motion, np.isfinite(recording.read("position", start, stop)))
-    error = (motion - np.outer(reference, shares)) / np.where(shares == 0.0, 1.0, np.abs(shares))
-    return np.column_stack([reference, error])
+    return np.column_stack([reference, (motion - np.outer(reference, shares)) / scales])
 
 
 def _without_base(friction: Array, touching: Array) -> Array:
     """Friction (n, places) less its mean over each touch: a touch brings friction of its own, whatever the texture."""
     for part in np.split(np.arange(len(touching)), np.flatnonzero(np.diff(touching)) + 1):
         if part.size:
-            friction[part] -= friction[part].mean(axis=0)
+            known = np.isfinite(friction[part]).sum(axis=0)  # a lost sample is lost alone
+            friction[part] -= np.nansum(friction[part], axis=0) / np.maximum(known, 1)
     return friction
 
 
@@ -123,7 +146,7 @@ def _filtered(recording: Recording, start: int, stop: int) -> Array:
     first = max(start - margin, 0)
     sides = zip(ORDERS, _band(recording.rate), ("highpass", "lowpass"), strict=True)
     sections = np.vstack([butter(order, edge, kind, fs=recording.rate, output="sos") for order, edge, kind in sides])
-    signals = np.nan_to_num(_signals(recording, first, min(stop + margin, len(recording))))
+    signals = np.nan_to_num(_signals(recording, first, min(stop + margin, _end(recording))))
     return sosfiltfilt(sections, signals, axis=0, padlen=min(margin, len(signals) - 1))[start - first : stop - first]
 
 
@@ -136,7 +159,7 @@ def _power(recording: Recording, start: int, stop: int, window: int) -> Array:
 
 def _spectra(recording: Recording, begin: int, stop: int, segment: int) -> tuple[Array, Array, Array]:
     """Frequencies (Hz), mean square a bin of r, e and y (bins, 1 + 2 places), cross spectrum of r and the first e."""
-    signs = np.sign(recording.header.profile or np.ones(len(recording.header.places)))
+    shares, scales = _scales(recording.header)
     starts = np.unique([*range(begin, stop - segment + 1, max(segment // 2, 1)), stop - segment])
     shape = np.hanning(segment + 1)[:-1, None]
     scale = 2.0 / (segment * (shape**2).sum()) / len(starts)
@@ -144,7 +167,7 @@ def _spectra(recording: Recording, begin: int, stop: int, segment: int) -> tuple
     for start in starts:
         values = _signals(recording, start, start + segment)
         turned = np.fft.rfft(shape * (values - values.mean(axis=0)), axis=0)
-        power += scale * np.abs(np.hstack([turned, turned[:, 1:] + signs * turned[:, :1]])) ** 2
+        power += scale * np.abs(np.hstack([turned, turned[:, 1:] + shares / scales * turned[:, :1]])) ** 2
         cross += scale * turned[:, 0].conj() * turned[:, 1]
     return np.fft.rfftfreq(segment, 1 / recording.rate), np.asarray(power), np.asarray(cross)
 
@@ -157,12 +180,12 @@ def _windows(power: Array) -> float:
 
 
 def _thirds(
-    spectrum: Array, frequency: Array, rate: float, unit: str, floor: Callable[[float], float]
+    spectrum: Array, frequency: Array, rate: float, unit: str, floor: Callable[[float], float], share: float
 ) -> dict[str, Any]:
     """``e_b = rms_b(e)/max(rms_b(r), floor(b))`` of every third octave b inside B, and the largest.
 
     On a plate (m) those above B count, too, up to 1000 Hz or 0.4 of the rate: a device need not follow r there, so
-    only the excess ``rms_b(y) - rms_b(r)`` is an error where it is less than rms_b(e).
+    only the excess ``rms_b(y) - rms_b(r)``, r times its `share` at a quiet place, is an error where less than rms_b(e).
     """
     low, high = _band(rate)
     found = {}
@@ -170,28 +193,31 @@ def _thirds(
         if low <= middle / EDGE and middle * EDGE <= (HIGHEST * rate if unit == "m" else high):
             reference, error, motion = spectrum[_within(frequency, middle / EDGE, middle * EDGE)].sum(axis=0)
             if middle * EDGE > high:
-                error = min(error, max(math.sqrt(motion) - math.sqrt(reference), 0.0) ** 2)
+                error = min(error, max(math.sqrt(motion) - share * math.sqrt(reference), 0.0) ** 2)
             found[f"{name:g} Hz"] = math.sqrt(error) / max(math.sqrt(reference), floor(middle))
     worst = max(found, key=lambda name: found[name], default=None)
     return {"third_octave_error": found.get(worst or ""), "third_octave": worst, "third_octaves": found}
 
 
-def _floor(recording: Recording, level: float, middle: float) -> float:
+def _floor(recording: Recording, level: float, place: int, middle: float) -> float:
     """Least rms that the texture counts as in a third octave: S_b over the bound, so that an error of S_b is on it.
 
-    S_b is the detection threshold on a plate; of other quantities, for which none is known, 1 % of the rms `level` of
-    the whole reference.  It is never below twice the noise of the sensors where the motion comes from them.
+    S_b is the detection threshold on a plate, of the motion at the place itself; of other quantities, for which none is
+    known, 1 % of the rms `level` of the whole reference.  It is never below twice the noise of the sensors where the
+    motion comes from them.
     """
     header = recording.header
-    least = float(detection_threshold(middle, CURVE)) / math.sqrt(2.0) if header.unit == "m" else SPUR * level
-    return max(least, 2.0 * _noise(recording, middle / EDGE, middle * EDGE)) / (LOOSER * header.tolerance)
+    scale = float(_scales(header)[1][place])
+    least = float(detection_threshold(middle, CURVE)) / math.sqrt(2.0) / scale if header.unit == "m" else SPUR * level
+    noise = float(_noise(recording, middle / EDGE, middle * EDGE)[place]) / scale
+    return max(least, 2.0 * noise) / (LOOSER * header.tolerance)
 
 
-def _noise(recording: Recording, low: float, high: float) -> float:
-    """Rms of a sensor's white noise from `low` to `high` (Hz) in the motion; 0 where that is not from the sensors."""
+def _noise(recording: Recording, low: float, high: float) -> Array:
+    """Rms of the sensors' noise from `low` to `high` (Hz) at every place; 0 where the motion is not from sensors."""
     header = recording.header
     measured = header.motion_source == "sensors"
-    return header.sensed_noise * math.sqrt(2.0 * (high - low) / header.rate) if measured else 0.0
+    return np.resize(header.sensed_noise, len(header.places)) * math.sqrt(2.0 * (high - low) / header.rate) * measured
 
 
 def _outside(reference: Array, frequency: Array, inside: Array, unit: str) -> float:
