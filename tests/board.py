@@ -11,9 +11,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from synthetic import make_bands
 
 import hapticrender as hr
-from hapticrender.bands import Bands
 from hapticrender.drivers.serial import BoardClient, SerialDriver
 from hapticrender.export import export
 
@@ -224,8 +224,7 @@ def driver_of(board, **options):
 
 
 def tones(*frequencies, amplitude=5e-6):
-    n = len(frequencies)
-    return Bands(frequency=frequencies, wavenumber=np.zeros(n), phase=np.zeros(n), envelope=np.full(n, amplitude))
+    return make_bands(frequencies, amplitude)
 
 
 def sensed_error(recording, start=int(0.3 * RATE)):

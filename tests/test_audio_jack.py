@@ -16,20 +16,8 @@ from pathlib import Path
 import jack_ring
 import numpy as np
 import pytest
-from jack_ring import (
-    BLOCK,
-    CLIENT,
-    METRES,
-    NOISE,
-    RATE,
-    ROUND_TRIP,
-    PythonEntry,
-    busy_thread,
-    driver,
-    entry_for,
-    lost_callbacks,
-    relative_errors,
-)
+from jack_ring import BLOCK, CLIENT, METRES, NOISE, RATE, ROUND_TRIP, driver, entry_for, lost_callbacks, relative_errors
+from waves import phasor
 
 import hapticrender as hr
 from hapticrender.cli import main
@@ -370,18 +358,13 @@ def test_textures_change_under_the_callback(connected, tmp_path):
     assert (first.target, second.target) == pytest.approx((5e-6, 2.5e-6), rel=1e-3)
     # by the sensors: 1 um of noise at two ends, over 24 000 samples, is 0.01 um; the law's 1 % and 2 % are what it must
     for recording, frequency, target in ((tone, 100.0, 5e-6), (other, 180.0, 2.5e-6)):
-        wanted = amplitude(recording.reference[SETTLED], frequency)
+        wanted = phasor(recording.reference[SETTLED], frequency, RATE)
         assert abs(wanted) == pytest.approx(target, rel=1e-3)
-        assert abs(amplitude(recording.motion[SETTLED, 0], frequency) - wanted) < 0.02 * target
+        assert abs(phasor(recording.motion[SETTLED, 0], frequency, RATE) - wanted) < 0.02 * target
     assert np.isfinite(load)
     # the truth: half a second of 180 Hz that ends a quarter of a second before the freewheel does
     end = len(np.fromfile(tmp_path / "before", np.float32)) // 4 - round(RATE / 4)
-    assert abs(amplitude(motion[end - round(RATE / 2) : end], 180.0)) == pytest.approx(2.5e-6, rel=0.02)
-
-
-def amplitude(signal, frequency):
-    """Complex amplitude over whole periods."""
-    return 2 * np.mean(signal * np.exp(-2j * np.pi * frequency * np.arange(len(signal)) / RATE))
+    assert abs(phasor(motion[end - round(RATE / 2) : end], 180.0, RATE)) == pytest.approx(2.5e-6, rel=0.02)
 
 
 def test_a_busy_python_thread_costs_the_compiled_callback_nothing(connected):
@@ -392,7 +375,9 @@ def test_a_busy_python_thread_costs_the_compiled_callback_nothing(connected):
     """
     device, differences = connected(jack_ring.plate(), noise=NOISE / METRES), []
     while len(differences) < 4 and min(differences, default=1.0) > 0.003:
-        idle, busy = (lost_callbacks(device, lambda each: each, beside, 1.5) for beside in (nullcontext, busy_thread))
+        idle, busy = (
+            lost_callbacks(device, lambda each: each, beside, 1.5) for beside in (nullcontext, jack_ring.busy_thread)
+        )
         differences.append(busy - idle)
     assert min(differences) <= 0.003
-    assert lost_callbacks(device, PythonEntry, busy_thread, 1.5) > 0.3
+    assert lost_callbacks(device, jack_ring.PythonEntry, jack_ring.busy_thread, 1.5) > 0.3

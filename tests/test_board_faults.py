@@ -14,8 +14,8 @@ from board import (
     started,
     tones,
 )
+from synthetic import make_bands
 
-from hapticrender.bands import Bands
 from hapticrender.drivers import protocol
 from hapticrender.drivers.protocol import Cause, Kind
 from hapticrender.drivers.serial import Line
@@ -225,12 +225,8 @@ class Session:
     def change(self):
         n = self.rng.integers(1, 5)
         frequencies = np.sort(self.rng.choice(np.arange(30.0, 300.0, 15.0), n, replace=False))
-        bands = Bands(
-            frequency=frequencies,
-            wavenumber=np.zeros(n),
-            phase=self.rng.uniform(0, 6, n),
-            envelope=self.rng.uniform(1e-6, 5e-6, n) * np.exp(1j * self.rng.uniform(0, 6, n)),
-        )
+        phase, size, angle = self.rng.uniform(0, 6, n), self.rng.uniform(1e-6, 5e-6, n), self.rng.uniform(0, 6, n)
+        bands = make_bands(frequencies, size * np.exp(1j * angle), phase=phase)
         columns = frequencies, 0 * frequencies, bands.phase / (2 * np.pi), bands.envelope.real, bands.envelope.imag
         self.asked.append(np.ravel(np.transpose(columns)).astype("f4"))
         self.client.set_bands(bands)

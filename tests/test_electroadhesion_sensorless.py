@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from electroadhesive import FORCE, MU, RATE, SPEED, tone
+from waves import phasor
 
 import hapticrender as hr
 from hapticrender import loop
@@ -18,8 +19,7 @@ WANTED = FORCE / MU / abs(ElectroadhesionParameters().lag_response(100.0, SPEED)
 
 def swing(attraction):
     """Amplitude at 100 Hz over the last tenth of a second."""
-    last = attraction[-RATE // 10 :]
-    return 2 * abs(np.mean(last * np.exp(-2j * np.pi * np.arange(len(last)) / 100)))
+    return abs(phasor(attraction[-RATE // 10 :], 100.0, RATE))
 
 
 def sensed(seconds=1.2, finger=REST_THEN_SLIDE, **plant):

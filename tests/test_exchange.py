@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from electroadhesive import Screen
 from live_devices import ROUNDING, slide
+from synthetic import make_bands
 from test_kernel import plate_controller
 
 import hapticrender as hr
-from hapticrender.bands import Bands
 from hapticrender.control.device_model import Demand
 from hapticrender.control.supervisor import INVALID, supervised
 from hapticrender.live_loop import LEAST_TARGET, band_figures
@@ -98,14 +98,7 @@ def test_a_screen_makes_room_for_a_stronger_texture(driver):
 
 
 def tones(*frequency, amplitude=5e-6):
-    n = len(frequency)
-    return Bands(
-        frequency=np.array(frequency),
-        wavenumber=np.zeros(n),
-        phase=np.zeros(n),
-        envelope=np.full(n, amplitude + 0j),
-        modulated=True,
-    )
+    return make_bands(frequency, amplitude, modulated=True)
 
 
 @pytest.fixture

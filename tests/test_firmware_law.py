@@ -21,7 +21,7 @@ from laws import (
     kernel_of,
 )
 from other_plate import OtherPlate
-from scipy.signal import butter, sosfiltfilt
+from waves import waveform_error
 
 import hapticrender as hr
 from hapticrender.control.supervisor_kernel import (
@@ -178,14 +178,6 @@ def test_changes_of_gains_stop_both(exports, shown, moved, touch, cause, named, 
         assert abs(found - drive).max() < 1e-9
 
 
-def error(motion, reference, start=1.0):
-    """Rms of the centre's deviation, 20-500 Hz, over that of the reference, from `start` (s) on."""
-    sos = butter(4, [20, 500], "bandpass", fs=RATE, output="sos")
-    deviation, reference = sosfiltfilt(sos, motion - reference), sosfiltfilt(sos, reference)
-    late = slice(round(start * RATE), None)
-    return np.sqrt((deviation[late] ** 2).mean() / (reference[late] ** 2).mean())
-
-
 def reference_of(texture, finger):
     """Target over a run; 0 while a finger that it follows is away."""
     time = np.arange(SAMPLES) / RATE
@@ -204,7 +196,7 @@ def test_float_is_as_accurate_as_double(exports, name, finger, limit):
         if limit is not None:
             law.code.law_limit(law.address, limit)
         plate = close(law, FINGERS[finger], texture, bits=12)[3]
-        errors[kind] = error(plate.motion[:, 0], reference_of(texture, FINGERS[finger]))
+        errors[kind] = waveform_error(plate.motion[:, 0], reference_of(texture, FINGERS[finger]), 1.0)
     assert errors["float"] < 1.2 * errors["double"]
 
 

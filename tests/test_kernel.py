@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from naive_error import NaiveError
+from synthetic import make_bands
 
 import hapticrender as hr
-from hapticrender.bands import Bands
 from hapticrender.control.controller import setpoint_rows
 from hapticrender.control.controller_design import ONE_SPEED, design_controller, rules_for
 from hapticrender.control.device_model import FingerRange
@@ -20,10 +20,7 @@ IDEAL = PlateParameters(sensor_noise=0.0, sensor_bits=0, current_bits=0)
 
 
 def tones(frequency, amplitude=10e-6, wavenumber=0.0, **options):
-    frequency = np.array(frequency, float)
-    wavenumber = np.broadcast_to(wavenumber, frequency.shape).astype(float)
-    phase, envelope = np.arange(len(frequency)) * 1.0, np.full(len(frequency), amplitude + 0j)
-    return Bands(frequency=frequency, wavenumber=wavenumber, phase=phase, envelope=envelope, **options)
+    return make_bands(frequency, amplitude, wavenumber, np.arange(len(frequency)), **options)
 
 
 def waveform_of(bands):

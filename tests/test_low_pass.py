@@ -5,9 +5,9 @@ import dataclasses
 import numpy as np
 import pytest
 from naive_low_pass import NaiveLowPass
+from synthetic import make_bands
 
 import hapticrender as hr
-from hapticrender.bands import Bands
 from hapticrender.control.controller import setpoint_rows
 from hapticrender.control.methods import METHODS, Polar, Resonant, frequency_table
 from hapticrender.plants.plate import PlateParameters
@@ -20,17 +20,10 @@ LOW_PASS = ("paper", "paper-common", "boxcar", "static", "stiffness", "resonant"
 CLOSE = 3e-9
 
 
-def bands_of(frequency, wavenumber=None, envelope=1e-6, **options):
+def bands_of(frequency, wavenumber=0.0, envelope=1e-6):
     """Carriers with odd phases and envelopes."""
-    count = len(frequency)
-    turn = None if envelope is None else envelope * np.exp(1j * np.arange(count)) / np.arange(1, count + 1)
-    return Bands(
-        frequency=np.array(frequency, float),
-        wavenumber=np.zeros(count) if wavenumber is None else np.array(wavenumber, float),
-        phase=0.3 * np.arange(count),
-        envelope=turn,
-        **options,
-    )
+    k = np.arange(len(frequency))
+    return make_bands(frequency, envelope * np.exp(1j * k) / (k + 1), wavenumber, 0.3 * k)
 
 
 MIXED = bands_of([47.0, 0.0, 111.3, 0.0], [0.0, 1000.0, 0.0, 2500.0])

@@ -3,9 +3,10 @@
 import numpy as np
 import pytest
 from held import amplitude_error, fixed, grating, hold
+from synthetic import make_bands
+from waves import phasor
 
 import hapticrender as hr
-from hapticrender.bands import Bands
 from hapticrender.control.methods import METHODS, Resonant, least_decay
 from hapticrender.control.stdft import StarSTDFT
 from hapticrender.plants.plate import Plate, PlateParameters
@@ -18,17 +19,12 @@ POLAR = ("paper", "paper-common", "boxcar")
 
 
 def tones(*frequency):
-    return fixed(*((each, WANTED) for each in frequency))
+    return make_bands(frequency, WANTED)
 
 
 def mixed():
     """A fixed carrier and two that are locked to the finger, whose targets are analysed from a waveform."""
-    return Bands(
-        frequency=np.array([47.0, 0.0, 0.0]),
-        wavenumber=np.array([0.0, 1000.0, 2500.0]),
-        phase=np.array([0.0, 0.4, -1.0]),
-        envelope=None,
-    )
+    return make_bands([47.0, 0.0, 0.0], None, [0.0, 1000.0, 2500.0], [0.0, 0.4, -1.0])
 
 
 def steps_of(n, rng):
@@ -102,10 +98,8 @@ def test_without_sensors_it_drives_open_loop(name):
     controller = METHODS[name].design(MODEL, fixed((47.0, 1e-6), (400.0, 1e-6)), feedback=False)
     drive, _, _ = controller.run(np.zeros((15_000, 0)), np.full(15_000, np.nan), np.zeros(15_000))
     motion = Plate(IDEAL, hr.Finger.absent()).run(np.vstack([np.zeros((1, 2)), drive[:-1]])).motion
-    n = np.arange(10_000, 15_000)
     for frequency in (47.0, 400.0):
-        found = 2 * np.mean(motion[n, 0] * np.exp(-2j * np.pi * frequency * n / RATE))
-        assert found == pytest.approx(1e-6, rel=3e-4)
+        assert phasor(motion[10_000:15_000, 0], frequency) == pytest.approx(1e-6, rel=3e-4)
 
 
 @pytest.mark.parametrize(("gain", "holds"), [(15.0, True), (17.5, False)])

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from synthetic import make_bands
 
 from hapticrender.bands import Bands
 from hapticrender.touch import perception
@@ -85,9 +86,7 @@ DEVICE = {"top_speed": 0.1, "lowest": 10.0, "highest": 400.0}
 def bands_of(*entries):
     """Bands of (frequency, wavenumber, amplitude), with phases by which they can be distinguished."""
     frequency, wavenumber, amplitude = np.array(entries, float).reshape(-1, 3).T
-    return Bands(
-        frequency=frequency, wavenumber=wavenumber, phase=np.arange(frequency.size), envelope=amplitude * np.exp(0.3j)
-    )
+    return make_bands(frequency, amplitude * np.exp(0.3j), wavenumber, np.arange(frequency.size))
 
 
 def left(*entries, **device):

@@ -9,6 +9,7 @@ import numba
 import numpy as np
 import pytest
 from numba import types
+from synthetic import make_bands
 from test_kernel import friction_controller, plate_controller
 
 import hapticrender as hr
@@ -28,14 +29,9 @@ STREAM = (ctypes.c_ulong, ctypes.c_void_p, ctypes.c_ulong)
 AUDIO = ctypes.CFUNCTYPE(ctypes.c_int32, ctypes.c_void_p, ctypes.c_void_p, *STREAM, ctypes.c_void_p)
 
 
-def bands(amplitude=5e-6, wavenumber=0.0):
-    moves = wavenumber > 0
-    return Bands(
-        frequency=np.where(moves, 0.0, [47.0, 130.0, 261.0]),
-        wavenumber=np.where(moves, [1.0, 2.0, 3.0], 0.0) * wavenumber,
-        phase=[0.0, 1.0, 2.0],
-        envelope=np.full(3, amplitude + 0j),
-    )
+def bands(wavenumber=0.0):
+    frequency = [0.0] * 3 if wavenumber else [47.0, 130.0, 261.0]
+    return make_bands(frequency, 5e-6, np.array([1.0, 2.0, 3.0]) * wavenumber, [0.0, 1.0, 2.0])
 
 
 def controller(wanted=None, delay=BLOCK, block=BLOCK):

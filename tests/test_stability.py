@@ -5,10 +5,10 @@ from dataclasses import fields, replace
 
 import numpy as np
 import pytest
+from synthetic import make_bands
 
 import hapticrender as hr
 from benchmarks.charts.stability_map import loaded_plate
-from hapticrender.bands import Bands
 from hapticrender.control.controller_design import ONE_SPEED, design_controller, rules_for
 from hapticrender.control.margin_check import BankGains, error_loop
 from hapticrender.plants.plate import Plate, PlateParameters
@@ -22,16 +22,9 @@ COMB = tuple(np.arange(20.0, 401.0, 20.0))
 SCHEDULED = (("observer",), ("integral", "integral_medium"), ("damper",))  # settings at low and medium, beside "_high"
 
 
-def silent(*frequencies):
-    """Fixed carriers whose targets are 0."""
-    frequency = np.array(frequencies, float)
-    zero = np.zeros(len(frequency))
-    return Bands(frequency=frequency, wavenumber=zero, phase=zero, envelope=zero + 0j)
-
-
 def frozen(method, *frequencies, **changes):
-    """Controller that stays at its high gains, never saturates and never adapts."""
-    bands = silent(*frequencies)
+    """Controller whose targets are 0, that stays at its high gains, never saturates and never adapts."""
+    bands = make_bands(frequencies, 0.0)
     controller = design_controller(method, MODEL, bands, ONE_SPEED if method == "h" else rules_for(bands))
     settings = controller.state["p"]
     for names in SCHEDULED:

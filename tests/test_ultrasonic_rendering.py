@@ -5,6 +5,7 @@ import pytest
 from scipy.signal import hilbert
 from tables import tables
 from ultrasonic import ASKED, FREE, NOISE, held, modulated, ran
+from waves import phasor
 
 import hapticrender as hr
 from hapticrender.drivers.simulated import SimulatedDriver
@@ -145,14 +146,12 @@ def test_a_users_plate_is_the_surface_but_for_its_contact():
     np.testing.assert_array_equal(np.concatenate([each.flags for each in played]), expected.flags)
 
 
-def friction_of(moved, frequency, rate=192e3, settled=0.3, seconds=0.1):
-    """Friction (N) of 0.4 N that an amplitude leaves, at a frequency, behind the lag of its contact."""
+def friction_of(moved, frequency, rate=192e3, load=0.4):
+    """Friction (N) under a load (N) that an amplitude leaves, at a frequency, behind the lag of its contact."""
     amplitude = abs(hilbert(moved))
-    late = slice(round(settled * rate), round((settled + seconds) * rate))
-    time = np.arange(len(moved))[late] / rate
-    friction = 0.8 * 0.4 * SurfaceParameters().friction_law.ratio(amplitude[late], 0.4, 0.08)
-    line = 2 * np.mean(friction * np.exp(-2j * np.pi * frequency * time))
-    return abs(line * SurfaceParameters().lag_response(frequency, 0.08))
+    late = slice(round(0.3 * rate), round(0.4 * rate))
+    friction = 0.8 * load * SurfaceParameters().friction_law.ratio(amplitude[late], load, 0.08)
+    return abs(phasor(friction, frequency, rate) * SurfaceParameters().lag_response(frequency, 0.08))
 
 
 def test_a_device_of_a_friction_sample_a_block_renders_a_tone():
