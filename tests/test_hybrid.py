@@ -44,14 +44,6 @@ def smoothstep(x):
     return 3 * x**2 - 2 * x**3
 
 
-def moving(speeds, finger_rate=2000, **touch):
-    """A finger through (time, speed) pairs, speeds joined by straight lines, its way centred."""
-    times, speed = np.array(speeds).T
-    v = np.interp(np.arange(0.0, times[-1] + 0.05, 1 / finger_rate), times, speed)
-    way = np.cumsum(v) / finger_rate
-    return hr.Finger.sampled(way - way.max() / 2, rate=finger_rate, normal_load=0.4, **touch)
-
-
 def test_shares_sum_to_one():
     settings = HybridSettings()
     frequency = np.linspace(0.0, 400.0, 4001)
@@ -129,25 +121,6 @@ def test_a_recording_over_position_is_shared_out_by_the_fades():
         assert band["rms_error_skin"] < 0.07  # sensor noise is in it, and the analysis of the swelling waveform
 
 
-@pytest.mark.parametrize("texture", [hr.Grating(amplitude=1e-5, wavelength=1e-3)])
-def test_the_compiled_ring_is_the_open_one(texture):
-    """Sample by sample through Python or not, to a rounding a sample."""
-    session = loop.prepare(scene(texture, duration=0.2))
-    closed, ring = (loop.prepare(session.scene).plant for _ in range(2))
-    first, second = session.controller(), session.controller()
-    assert closed.closes(first)
-    drive, target, flags, sensed = closed.closed_loop(first, np.zeros(1500))
-    played, rows = np.zeros((1, 3)), []
-    for _ in range(1500):
-        heard = ring.run(played)
-        rows.append([played[0], heard.motion[0, 0]])
-        played, *_ = second.run(heard.sensed, heard.position, np.zeros(1))
-    for one, other in ((drive, [row[0] for row in rows]), (sensed.motion[:, 0], [row[1] for row in rows])):
-        np.testing.assert_allclose(one, other, rtol=0, atol=1500 * np.finfo(float).eps * abs(one).max())
-    assert target.shape == (1500, 1)
-    assert not flags.any()
-
-
 class Bench(BaseDriver):
     """A user's device: a plate and a screen that take currents and tell nothing but what is sensed."""
 
@@ -187,26 +160,21 @@ def test_without_sensors_both_parts_are_driven_open_loop():
     assert peaks[2] > 1e-3
 
 
-BOTH_HAVE = r"must be plate_current_limit or screen_current_limit"
-
-
 @pytest.mark.parametrize(
-    ("plant", "message"),
+    ("scene", "message"),
     [
-        ({"crossover": 30.0}, r"render.crossover = 30.0: must be .* >= 40 and <= 400 Hz"),
-        ({"current_limit": 2.0}, BOTH_HAVE),
+        (scene(tone(100.0), crossover=30.0), r"render.crossover = 30.0: must be .* >= 40 and <= 400 Hz"),
+        (scene(tone(100.0), current_limit=2.0), r"must be plate_current_limit or screen_current_limit"),
+        (scene(hr.Synthetic(amplitude=1e-5)), "a recording over time is not supported"),
+        (scene(tone(250.0, 1.5)), "texture.amplitude asks for an attraction of"),
     ],
 )
-def test_parameters_are_refused(plant, message):
+def test_scenes_are_refused(scene, message):
     with pytest.raises(ValueError, match=message):
-        loop.prepare(scene(tone(100.0), **plant))
+        loop.prepare(scene)
 
 
-def test_scenes_and_drivers_are_refused():
-    with pytest.raises(ValueError, match="a recording over time is not supported"):
-        loop.prepare(scene(hr.Synthetic(amplitude=1e-5)))
-    with pytest.raises(ValueError, match="texture.amplitude asks for an attraction of"):
-        loop.prepare(scene(tone(250.0, 1.5)))
+def test_drivers_are_refused():
     with pytest.raises(ValueError, match=r"driver.drive_channels = 2: must be 3"):
         loop.prepare(scene(tone(100.0)), driver=BaseDriver(rate=RATE, drive_channels=2, sensed_channels=3))
 
