@@ -141,26 +141,6 @@ def test_a_friction_device_is_its_twin(differentiated, rng):
     assert all(controller.settings[name] > 0 for name in names)
 
 
-@pytest.mark.parametrize(("delay", "block"), [(1, 1), (25, 25)])
-def test_any_split_gives_the_same(delay, block, rng):
-    """Whole, by the block, and in uneven pieces: equal to the last bit, quantiser included."""
-    bands, n = tones([47.0, 0.0, 150.0], wavenumber=[0.0, 500.0, 0.0]), 80 * block
-    n = max(n, 2000)
-    position = 0.05 * np.arange(n) / RATE
-    sensed, runs = pressed(rng, bands, position), []
-    for edges in ([0, n], [0, block, 3 * block, n - block, n], range(0, n + 1, block)):
-        controller = plate_controller(bands, parameters=PlateParameters(), delay=delay, block=block)
-        pieces = [
-            controller.run(sensed[a:b], position[a:b], np.zeros(b - a))
-            for a, b in zip(edges[:-1], edges[1:], strict=True)
-        ]
-        runs.append([np.concatenate(column) for column in zip(*pieces, strict=True)])
-    for run in runs[1:]:
-        for found, expected in zip(run, runs[0], strict=True):
-            np.testing.assert_array_equal(found, expected)
-    assert abs(runs[0][0]).max() > 0
-
-
 def test_the_gain_schedule_is_the_printed_one():
     """docs/theory.md: integral and adaptation (1/s), poles of the observer (Hz), times of the detectors (s)."""
     p = plate_controller(tones([170.0])).settings

@@ -86,30 +86,21 @@ def test_options_are_their_equations(method, rng):
 
 
 @pytest.mark.parametrize("name", LOW_PASS)
-def test_targets_of_a_waveform_come_through_the_residual_analysis(name, rng):
-    check(METHODS[name], dataclasses.replace(MIXED, envelope=None), signals(rng))
-
-
-@pytest.mark.parametrize("name", LOW_PASS)
-def test_without_feedback_it_drives_from_the_model_alone(name, rng):
-    _, position, wanted = signals(rng)
+def test_a_waveform_is_analysed_and_the_model_driven_open_loop_by_their_equations(name, rng):
+    sensed, position, wanted = signals(rng)
+    check(METHODS[name], dataclasses.replace(MIXED, envelope=None), (sensed, position, wanted))
     check(METHODS[name], MIXED, (np.zeros((COUNT, 0)), position, wanted), feedback=False)
 
 
-@pytest.mark.parametrize("name", ["static", "stiffness", "resonant"])
+@pytest.mark.parametrize("name", LOW_PASS)
 @pytest.mark.parametrize("option", ["modulated", "differentiated"])
-def test_complex_methods_modulate_and_differentiate_targets(name, option, rng):
-    sensed, position, _ = signals(rng)
-    check(
-        METHODS[name], dataclasses.replace(MIXED, **{option: True}), (sensed, position, np.sin(0.02 * np.arange(COUNT)))
-    )
-
-
-@pytest.mark.parametrize("name", ["paper", "paper-common", "boxcar"])
-@pytest.mark.parametrize("option", ["modulated", "differentiated"])
-def test_polar_methods_refuse_to_modulate_and_differentiate(name, option):
-    with pytest.raises(hr.DesignError, match=f"method '{name}' cannot modulate"):
-        METHODS[name].design(MODEL, dataclasses.replace(MIXED, **{option: True}))
+def test_complex_methods_modulate_and_differentiate_targets_and_polar_ones_refuse_to(name, option, rng):
+    (sensed, position, _), bands = signals(rng), dataclasses.replace(MIXED, **{option: True})
+    if name in ("static", "stiffness", "resonant"):
+        check(METHODS[name], bands, (sensed, position, np.sin(0.02 * np.arange(COUNT))))
+    else:
+        with pytest.raises(hr.DesignError, match=f"method '{name}' cannot modulate"):
+            METHODS[name].design(MODEL, bands)
 
 
 def test_every_channel_is_cut_to_its_limit_and_flagged(rng):

@@ -1,5 +1,7 @@
 """What every control method promises, and where the plain ones stop: the figures of FACTS section 3 on this plate."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from held import amplitude_error, fixed, grating, hold
@@ -34,13 +36,14 @@ def steps_of(n, rng):
     return 1e-5 * rng.standard_normal((n, 2)), position, 1e-5 * np.sin(2 * np.pi * 61.0 * time)
 
 
-@pytest.mark.parametrize("name", METHODS)
-def test_any_split_into_blocks_gives_the_same_run(name, rng):
-    sensed, position, wanted = steps_of(1000, rng)
-    whole = METHODS[name].design(PlateParameters().device_model(RATE, 1), mixed()).run(sensed, position, wanted)
+@pytest.mark.parametrize(("name", "block"), [*((name, 1) for name in METHODS), ("h2", 25)])
+def test_any_split_into_blocks_gives_the_same_run(name, block, rng):
+    """To the last bit, the converter included."""
+    columns = sensed, position, wanted = steps_of(1000 * block, rng)
+    model = replace(PlateParameters(delay=block).device_model(RATE, block), block=block)
+    whole = METHODS[name].design(model, mixed()).run(*columns)
     assert abs(whole[0]).max() > 1e-3
-    pieces = METHODS[name].design(PlateParameters().device_model(RATE, 1), mixed())
-    cuts = [1, 2, 255, 256, 700]
+    pieces, cuts = METHODS[name].design(model, mixed()), block * np.array([1, 2, 255, 256, 700])
     parts = [
         pieces.run(*rows)
         for rows in zip(*(np.split(column, cuts) for column in (sensed, position, wanted)), strict=True)

@@ -137,7 +137,14 @@ class Rewired(Watched):
         return super().play(drive)
 
 
-@pytest.mark.parametrize(("frequency", "truth"), [(72.0, {}), (189.0, FINGER)], ids=["72 free", "189 touched"])
+TUNED = pytest.mark.parametrize(
+    ("frequency", "truth"),
+    [(72.0, {}), (189.0, FINGER), (189.0, {})],
+    ids=["72 free", "189 touched", "189 free"],
+)
+
+
+@TUNED
 @pytest.mark.parametrize("change", CHANGES)
 def test_a_gain_that_changes_during_a_run_stops_the_drive_and_is_named(change, frequency, truth):
     """With the fade of 2 ms, zero drive within 10 ms where a sensor changes; an inverted coil moves up to 0.7 mm."""
