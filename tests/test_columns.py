@@ -137,27 +137,6 @@ def test_the_separator_is_the_one_that_splits_into_numbers(text, titles, tmp_pat
     assert {name: values.tolist() for name, values in found.items()} == dict(zip(titles, [[1.0], [2.0]], strict=True))
 
 
-def test_a_finger_is_the_same_in_someone_elses_columns(tmp_path):
-    """Drive in volts, displacement in counts of 1 nm from 5e6 on, as CSV: what is analysed does not change."""
-    finger = hr.Finger.still(0.005, normal_load=0.5, touches=[(0.8, 1.8)], mechanics="light")
-    texture = hr.Grating(frequency=111.0, amplitude=20e-6)
-    ours = hr.render(hr.Scene(texture=texture, finger=finger, duration=2.2))
-    columns = dict(zip("ab", -5.0 * ours.drive.T, strict=True)) | dict(
-        zip("cd", 1e9 * ours.sensed.T + 5e6, strict=True)
-    )
-    path = tmp_path / "theirs.csv"
-    write(path, columns)
-    meaning = {"drive": {"a": -0.2, "b": -0.2}, "sensed": {"c": (1e-9, 5e6), "d": (1e-9, 5e6)}}
-    theirs = hr.Recording.from_columns(path, rate=ours.rate, carriers=[111.0], **meaning)
-    one, other = (hr.analyse_finger(each) for each in (ours, theirs))
-    assert len(other.of_kind(2)) == 1
-    np.testing.assert_array_equal(other.contact, one.contact)
-    loaded = one.contact == 2
-    np.testing.assert_allclose(other.normal_load.value, one.normal_load.value, atol=1e-6)
-    np.testing.assert_allclose(other.position.value[loaded], one.position.value[loaded], atol=1e-7)
-    np.testing.assert_allclose(other.impedance.value, one.impedance.value, rtol=1e-5)
-
-
 def test_a_profile_goes_with_the_columns(tmp_path):
     (tmp_path / "plate.toml").write_text('[profile]\nkind = "vt-plate"\n[device]\nmass = 0.03\n', encoding="utf-8")
     made = hr.Recording.from_columns(SMALL, rate=RATE, drive="i", sensed="x", device=str(tmp_path / "plate.toml"))

@@ -62,54 +62,13 @@ def true_error(scene, lesser):
     return (found / target / grown[:, None]).max()
 
 
-def random_case(seed):
-    """Draw a scene of fixed carriers (one that sweeps is not predicted), a lesser one and what it leaves out."""
-    rng = np.random.default_rng(seed)
-    frequencies = 20.0 * 25.0 ** rng.random() * np.sort(rng.uniform(1.0, 3.0, rng.choice([1, 1, 2, 3])))
-    scene = temporal(random_finger(rng), *frequencies, profile=random_plate(rng))
-    lesser, names, options = scene, [], list(REDUCTIONS["vt-plate"].items())
-    for i in sorted(rng.permutation(len(options))[: rng.choice([1, 2, 3])]):
-        found = options[i][1](lesser)
-        if isinstance(found, hr.Scene):
-            lesser = found
-            names.append(options[i][0])
-    return scene, lesser, names
-
-
-def random_finger(rng):
-    load = rng.uniform(0.1, 1.5)
-    if rng.random() < 0.4:
-        load = (tuple(np.sort(rng.uniform(0.0, 4.0, 4))), tuple(rng.uniform(0.1, 1.5, 4)))
-    mechanics = str(rng.choice(["light", "heavy", "light-2nd-order", "heavy-2nd-order"]))
-    more = {"normal_load": load, "mechanics": mechanics, "load_scaling": bool(rng.random() < 0.4)}
-    kind = rng.choice(["still", "still", "sliding", "swiping", "none"])
-    if kind == "none":
-        return hr.Finger.absent()
-    if kind == "still":
-        return hr.Finger.still(rng.uniform(-0.045, 0.045), **more)
-    if kind == "sliding":
-        return hr.Finger.sliding(10 ** rng.uniform(-2.0, -0.5), span=rng.uniform(0.005, 0.07), **more)
-    return hr.Finger.swiping(frequency=10 ** rng.uniform(-0.5, 0.5), stroke=rng.uniform(0.005, 0.07), **more)
-
-
-def random_plate(rng):
-    """Plates about the paper's size and others, of one coil or two, rigid or not."""
-    plant = {}
-    if rng.random() < 0.6:
-        spread = {"mass": 32e-3, "inertia": 4e-5, "stiffness_1": 22.4e3, "damping_1": 1.6, "damping_2": 1.6}
-        plant |= {name: value * 2 ** rng.uniform(-1.0, 1.0) for name, value in spread.items()}
-        plant["stiffness_2"] = plant["stiffness_1"] * rng.uniform(0.8, 1.25)
-    if rng.random() < 0.4:
-        plant |= {"bending_frequency": rng.uniform(700.0, 1800.0), "bending_coil": rng.uniform(-0.3, 0.3)}
-    if rng.random() < 0.15:
-        plant["coils"] = 1
-    return plant
-
-
 LIGHT, HEAVY = {"mechanics": "light", "normal_load": 0.3}, {"mechanics": "heavy", "normal_load": 0.8}
 FREE, RESTING, SLIDING = hr.Finger.absent(), hr.Finger.still(0.015, **HEAVY), hr.Finger.sliding(0.1, **HEAVY)
 ONE, STATIC, SECOND = "one coordinate (heave)", "finger's load only", "finger of 2nd order"
 BENDING = {"bending_frequency": 1250.0}
+OWN = {"mass": 40e-3, "inertia": 3e-5, "stiffness_1": 28e3, "stiffness_2": 25e3, "damping_1": 1.2, "damping_2": 1.0}
+BENT = OWN | {"bending_frequency": 900.0, "bending_coil": 0.2}
+GROWING = hr.Finger.still(0.02, ((0.0, 4.0), (0.2, 1.2)), mechanics="light", load_scaling=True)
 CASES = [
     (temporal(FREE, 147.0), ONE),
     (temporal(FREE, 400.0, simulation=BENDING), "rigid glass"),
@@ -117,34 +76,21 @@ CASES = [
     (temporal(RESTING, 189.0), STATIC),
     (temporal(RESTING, 72.0, 400.0), SECOND),
     (temporal(SLIDING, 261.0), STATIC),
+    (temporal(hr.Finger.still(-0.03, **HEAVY), 100.0, profile={"coils": 1}), STATIC),
+    (temporal(hr.Finger.swiping(frequency=1.0, stroke=0.04, **HEAVY), 300.0, profile=BENT), "rigid glass"),
+    (temporal(GROWING, 60.0, 150.0, profile=OWN), "no finger"),
+    (temporal(GROWING, 60.0, 150.0, profile=OWN), f"{STATIC}, {ONE}"),
 ]
 
 
-@pytest.mark.parametrize(("scene", "name"), CASES, ids=lambda each: each if isinstance(each, str) else "")
-def test_the_prediction_is_1_to_2_times_the_difference_of_two_played_levels(scene, name):
-    lesser = REDUCTIONS[scene.device][name](scene)
+@pytest.mark.parametrize(("scene", "names"), CASES, ids=lambda each: each if isinstance(each, str) else "")
+def test_the_prediction_is_1_to_2_times_the_difference_of_two_played_levels(scene, names):
+    lesser = scene
+    for name in names.split(", "):
+        lesser = REDUCTIONS[scene.device][name](lesser)
     true = true_error(scene, lesser)
     assert true > 1e-4
     assert 1.0 <= difference(scene, lesser) / true <= 2.0
-
-
-def test_random_plates():
-    """12 random plates, fingers and textures: wherever a difference is predicted it is 1 to 2 times the played one.
-
-    Not predicted are near carriers under a moving finger (they exchange sidebands) and a sag that changes by as much as
-    the difference: neither is quasi-static.
-    """
-    judged = 0
-    for seed in range(12):
-        scene, lesser, names = random_case(seed)
-        predicted = difference(scene, lesser)
-        if not names or not np.isfinite(predicted):
-            continue
-        true = true_error(scene, lesser)
-        if true > 2e-4:  # below, rounding of the fit counts
-            assert 1.0 <= predicted / true <= 2.0, (seed, names)
-            judged += 1
-    assert judged >= 4
 
 
 def taken(found):
