@@ -84,8 +84,7 @@ def test_a_press_that_moves_the_plate_too_far_stops_the_board(stepped):
     client.finger(0.055, 0.0, 20.0)
     with pytest.raises(DeviceFault, match="the board stopped: the surface moved too far"):
         run(client, stepped, 0.2)
-    stepped.sleep(0.001)
-    assert driven(stepped.board.log(), stepped.sample - 1, stepped.sample) == []
+    stepped.assert_at_rest()
 
 
 def test_sensors_out_of_their_range_stop_an_identification(tmp_path):
@@ -94,8 +93,7 @@ def test_sensors_out_of_their_range_stop_an_identification(tmp_path):
         client = client_of(board).open()
         with pytest.raises(DeviceFault, match="the board stopped: a sensor was invalid for 10 ms"):
             client.identify([Line(0, 60.0, 0.05)], 1.0)
-        board.sleep(0.001)
-        assert driven(board.board.log(), board.sample - 1, board.sample) == []
+        board.assert_at_rest()
 
 
 @pytest.mark.parametrize(
@@ -112,8 +110,7 @@ def test_a_sensor_that_is_dead_or_inverted_stops_the_board(tmp_path, gains, caus
         with pytest.raises(DeviceFault, match="stepped: play: the board stopped: .*: check "):
             run(client, board, 2.0)
         assert client._line.telemetry.cause in causes
-        board.sleep(0.001)
-        assert driven(board.board.log(), board.sample - 1, board.sample) == []
+        board.assert_at_rest()
 
 
 def test_garbage_is_no_sign_of_life(stepped, rng):

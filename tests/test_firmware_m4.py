@@ -7,7 +7,7 @@ import subprocess
 import numpy as np
 import pytest
 from board import ROOT, compile_c
-from laws import FINGERS, PARTS, RATE, Exports
+from laws import FINGERS, PARTS, RATE
 
 import hapticrender as hr
 from hapticrender.bands import Bands
@@ -18,11 +18,6 @@ CROSS, QEMU = "arm-none-eabi-gcc", "qemu-system-arm"
 SIZE = '#include <stdio.h>\n#include "law.h"\nint main(void) { return printf("%zu", sizeof(law_t)) < 0; }\n'
 COUNTS = ("nops", "free", "new", "touched", "most", "textures", "frame")
 NOISE = 0.7e-6 * np.sqrt(4 * np.pi * 10.0 / RATE)  # m: mean of two sensors, times the root of the observer's gain
-
-
-@pytest.fixture(scope="module")
-def exports(tmp_path_factory):
-    return Exports(tmp_path_factory.mktemp("exports"))
 
 
 def cross_tools():

@@ -1,5 +1,7 @@
 """The hybrid: shares that sum to the target, two controllers as one, plate and screen under one finger."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from live_devices import slide
@@ -7,7 +9,6 @@ from tables import tables
 
 import hapticrender as hr
 from hapticrender import loop
-from hapticrender.control import combined
 from hapticrender.drivers.base import BaseDriver
 from hapticrender.plants.electroadhesion import ElectroadhesionParameters, ElectroadhesionScreen
 from hapticrender.plants.hybrid import HybridPlant
@@ -69,35 +70,6 @@ def test_fixed_carriers_are_shared_out_by_their_frequency():
     np.testing.assert_allclose(abs(bands.plate.envelope), [8e-6, 2e-6], rtol=1e-12)
 
 
-def test_targets_of_a_carrier_that_follows_the_finger_sum_to_all_of_it(monkeypatch):
-    """From 30 to 240 Hz under constant acceleration, of which the finger's tracker has no lag.
-
-    It knows the velocity half a sample on.  Its triple pole p at 60 Hz has forgotten how it began after 0.2 s: 2e-33,
-    times a polynomial.  Of the rounding of positions up to 0.05 m it makes 3 p in velocities, from 0.03 m/s on, for
-    each of some five operations a sample; the fades have slopes up to 3.
-    """
-    rounding = 5 * 3 * TRACKER * np.finfo(float).eps / 2 * 0.05 / 0.03
-    amplitude, acceleration, n = 1e-5, 0.3, 8000
-    # sensors that show zeros would stop it
-    monkeypatch.setattr(combined, "supervised", lambda part, model, feedback: part)
-    session = loop.prepare(scene(hr.Grating(amplitude=amplitude, wavelength=1e-3), duration=0.8))
-    controller, time = session.controller(), np.arange(n) / RATE
-    position = 0.01 * time + acceleration * time**2 / 2 - 0.05
-    parts = []
-    for k in range(n):
-        _, target, _ = controller.run(np.zeros((1, 3)), position[k : k + 1], np.zeros(1))
-        own = [part.tiles["target_re"][0, 0] + 1j * part.tiles["target_im"][0, 0] for part in controller.parts]
-        parts.append([target[0, 0], *own])
-    total, moved, rubbed = np.array(parts[2000:]).T
-    hertz = (0.01 + acceleration * (time[2000:] + 0.5 / RATE)) / 1e-3
-    turn = 2j * np.pi * hertz
-    assert hertz[0] < 75.0 < 230.0 < hertz[-1]
-    np.testing.assert_allclose(total, turn * amplitude, rtol=rounding)
-    share = np.array([smoothstep(f / START - 1.0) for f in hertz])
-    np.testing.assert_allclose(0.64 * rubbed / (turn * amplitude), share, atol=3 * rounding)
-    np.testing.assert_allclose(moved / amplitude, 1.0 - share, atol=3 * rounding)
-
-
 @pytest.mark.parametrize("frequency", [40.0, 100.0, 250.0])
 def test_a_tone_is_felt_whole(frequency):
     """Within 1 % of the velocity, on the plate, on both, or on the screen alone: then the other is left alone."""
@@ -111,6 +83,14 @@ def test_a_tone_is_felt_whole(frequency):
     moved, rubbed = abs(recording.drive[:, :2]).max(), abs(recording.drive[:, 2]).max()
     assert (moved > 0.0) == (frequency < 2 * START)
     assert (rubbed > 0.0) == (frequency > START)
+
+
+def test_a_carrier_that_follows_the_finger_is_felt_whole_while_it_is_handed_over():
+    """Under constant acceleration of 0.3 m/s2, judged from 60 Hz on, the screen taking all from 133 Hz on."""
+    time = np.linspace(0.0, 0.7, 1401)
+    finger = hr.Finger.sampled(0.15 * time**2 - 0.04, rate=2000.0, normal_load=0.4, mechanics="light")
+    sweep = replace(scene(hr.Grating(amplitude=1e-5, wavelength=1e-3), finger, 0.7), settle=0.2)
+    assert hr.render(sweep).summary()["bands"][0]["rms_error_skin"] < FELT
 
 
 def test_a_recording_over_position_is_shared_out_by_the_fades():
@@ -208,3 +188,44 @@ def test_a_fault_of_a_part_stops_the_whole_device_at_the_time_it_is_said_to():
     first = int(np.argmax(log["flags"] & hr.Flag.STOPPED > 0))
     assert abs(log["drive"][first - 100 : first]).max(axis=0).all()
     assert not log["drive"][first + round(0.01 * RATE) + 1 :].any()
+
+
+@pytest.mark.parametrize("screen_levels", [{}, {"level": "carrier", "sensor": "impedance"}], ids=["force", "gap"])
+def test_plate_and_screen_are_those_of_their_own(screen_levels):
+    """Sensed, flags and motion are those of plate and screen alone, sample for sample, in blocks or not."""
+    finger = hr.Finger.sliding(speed=0.03, normal_load=0.4, span=0.1, mechanics="heavy")
+    parameters = PlateParameters(rate=RATE, bending_frequency=1250.0)
+
+    def fresh():
+        return Plate(parameters, finger, 1), ElectroadhesionScreen(
+            ElectroadhesionParameters(**screen_levels), finger, 2
+        )
+
+    plate, screen = fresh()
+    hybrid = HybridPlant(*fresh(), 0.64)
+    time = np.arange(3000) / RATE
+    drive = np.column_stack(
+        [0.2 * np.sin(2 * np.pi * 80 * time), 0.05 * np.cos(2 * np.pi * 80 * time), 3e-3 * (1 + np.sin(500 * time))]
+    )
+    pieces = []
+    for part in np.split(drive, [1, 700]):
+        both = hybrid.run(part)
+        pieces.append((both.sensed, both.motion, hybrid.motion[:, 1:], both.flags))
+    sensed, motion, felt, flags = (np.concatenate(column) for column in zip(*pieces, strict=True))
+    moved, rubbed = plate.run(drive[:, :2]), screen.run(drive[:, 2:])
+    np.testing.assert_array_equal(sensed, np.hstack([moved.sensed, rubbed.sensed]))
+    np.testing.assert_array_equal(felt[:, 0], plate.motion[:, 3])
+    np.testing.assert_allclose(felt[:, 1], 0.64 * rubbed.motion[:, 0], rtol=1e-14)
+    np.testing.assert_allclose(motion[:, 0], felt.sum(axis=1), rtol=1e-12)
+    np.testing.assert_array_equal(flags, moved.flags | rubbed.flags)
+    assert (abs(felt).max(axis=0) > 1e-3).all()
+
+
+def test_parts_that_do_not_fit_are_refused():
+    screen = ElectroadhesionScreen(ElectroadhesionParameters(), SLIDE)
+    with pytest.raises(ValueError, match=r"plate.rate = 5000.0: must be 10000.0"):
+        HybridPlant(Plate(PlateParameters(), SLIDE), screen, 0.64)
+    with pytest.raises(ValueError, match=r"plate.coils = 1: must be 2"):
+        HybridPlant(Plate(PlateParameters(rate=RATE, coils=1), SLIDE), screen, 0.64)
+    with pytest.raises(ValueError, match=r"velocity_per_force=0.0: must be > 0"):
+        HybridPlant(Plate(PlateParameters(rate=RATE), SLIDE), screen, 0.0)
