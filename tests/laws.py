@@ -5,10 +5,9 @@ from types import SimpleNamespace
 
 import numpy as np
 from board import ROOT, compile_c
-from waves import white
+from waves import Own, white
 
 import hapticrender as hr
-from hapticrender.bands import Bands
 from hapticrender.export import export
 from hapticrender.jit import addresses
 from hapticrender.plants.plate import Plate, PlateParameters
@@ -18,18 +17,12 @@ PARTS = ("law", "learning", "carriers", "supervisor", "gains", "design")
 KINDS = {"double": "-DREAL_DOUBLE", "float": "-UREAL_DOUBLE"}
 
 
-class White:
+class White(Own):
     """White noise of 20-400 Hz, 5 um rms, played whole."""
 
     def __init__(self, spatial=False):
-        self.values, self.spatial = white(SAMPLES + AHEAD, 5e-6), spatial
-
-    def bands(self, rate):
-        return Bands.none(spatial=self.spatial)
-
-    def waveform(self, time, position):
-        index = np.minimum(np.round(np.asarray(time) * RATE).astype(int), SAMPLES + AHEAD - 1)
-        return self.values[index]
+        self.values, last = white(SAMPLES + AHEAD, 5e-6), SAMPLES + AHEAD - 1
+        super().__init__(lambda time, _: self.values[np.minimum(np.round(time * RATE).astype(int), last)], spatial)
 
 
 FINGERS = {

@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from electroadhesive import Screen
+from live_devices import Bench
 from other_plate import OtherPlate
 from scipy.signal import lfilter
 
@@ -111,16 +112,10 @@ def test_below_its_limit_a_coil_plays_every_sample_as_without():
     np.testing.assert_array_equal(hr.render(limited).drive, free.drive)
 
 
-class Blind:
+class Blind(Bench):
     """A device without sensors."""
 
     rate, block, delay, drive_channels, sensed_channels = RATE, 50, 50, 2, 0
-
-    def __enter__(self):
-        return self
-
-    def __exit__(self, *exc):
-        pass
 
     def play(self, drive):
         return hr.Sensed(np.empty((self.block, 0)))

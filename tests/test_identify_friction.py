@@ -4,6 +4,7 @@ import tomllib
 
 import numpy as np
 import pytest
+from live_devices import Bench
 
 import hapticrender as hr
 from hapticrender import cli
@@ -12,7 +13,7 @@ from hapticrender.plants.identify_friction import identify_resonance, identify_s
 from hapticrender.plants.surface import SurfaceParameters
 
 
-class Resonator:
+class Resonator(Bench):
     """A mode driven in V and sensed in m, exact for a held drive; 2 nm of noise."""
 
     rate, block, delay, drive_channels, sensed_channels = 192e3, 64, 64, 1, 1
@@ -23,12 +24,6 @@ class Resonator:
         s = np.log(self.pole) * self.rate
         self.push = force / 5e-3 / (2j * s.imag) * (self.pole - 1) / s
         self.state, self.queue, self.rng = 0j, [0.0] * late, np.random.default_rng(seed)
-
-    def __enter__(self):
-        return self
-
-    def __exit__(self, *exc):
-        pass
 
     def play(self, drive):
         sensed = np.empty((len(drive), 1))

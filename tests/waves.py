@@ -3,6 +3,18 @@
 import numpy as np
 from scipy.signal import butter, sosfiltfilt
 
+from hapticrender.bands import Bands
+
+
+class Own:
+    """A texture of one's own, played whole: a function of time (s) and position (m)."""
+
+    def __init__(self, waveform, spatial=False):
+        self.waveform, self.spatial = waveform, spatial
+
+    def bands(self, rate):
+        return Bands.none(spatial=self.spatial)
+
 
 def phasor(signal, frequency, rate=5000.0):
     """Complex amplitude of a carrier of whole periods in a signal, or in each column of it."""
