@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from held import amplitude
-from tables import tables
+from tables import scene_on
 
 import hapticrender as hr
 
@@ -11,10 +11,8 @@ SLIDE = hr.Finger.sliding(speed=0.05, normal_load=0.4, mechanics="light")
 TONE = hr.Grating(frequency=100.0, velocity=10e-3)
 
 
-def scene(device, texture=TONE, finger=SLIDE, duration=1.0, keep_unfelt=False, **plant):
-    return hr.Scene(
-        texture=texture, finger=finger, device=device, duration=duration, keep_unfelt=keep_unfelt, **tables(plant)
-    )
+def scene(device, texture=TONE, finger=SLIDE, duration=1.0, **plant):
+    return scene_on(device, texture, finger, duration, **plant)
 
 
 @pytest.mark.parametrize(

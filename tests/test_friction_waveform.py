@@ -1,7 +1,4 @@
-"""Whole waveforms on devices that modulate friction: broadband recordings, ridges under swipes, and what a turn costs.
-
-The bound is what the project has set itself: 3 % of the waveform, from the true friction, without shift or gain fit.
-"""
+"""Whole waveforms as friction: recordings, ridges under swipes and turns, of the true friction, without any fit."""
 
 import numpy as np
 import pytest
@@ -15,7 +12,7 @@ from hapticrender.plants.surface import SurfaceParameters
 from hapticrender.plants.ultrasonic import UltrasonicParameters
 
 RATE = 5000.0
-MUST = 0.03
+MUST = 0.03  # of the waveform: what the project has set itself
 FINGERS = {
     "light": hr.Finger.sliding(speed=0.04, normal_load=0.25, span=0.1),
     "usual": hr.Finger.sliding(speed=0.08, normal_load=0.4, span=0.18),
@@ -92,10 +89,7 @@ def test_a_turn_in_no_time_leaves_nothing_behind_after_20_ms():
 
 
 def test_a_third_partys_plate_plays_white_noise_and_the_verdict_says_what_it_cannot_know():
-    """At the carrier's rate, behind the public protocol; its true friction is by the law from its true amplitude.
-
-    What the recording infers is within a point of that, yet it was not measured.
-    """
+    """True friction is the law's, of the true amplitude; what the recording infers is within a point of it."""
     device = Watched(UltrasonicParameters(delay=16), block=16)
     scene = hr.Scene(texture=white(0.6), finger=FINGERS["usual"], device="ultrasonic", duration=0.6, settle=0.2)
     recording = hr.render(scene, driver=device)

@@ -47,10 +47,7 @@ def test_a_step_that_the_drive_cannot_make_at_once_is_made_as_fast_as_it_can(mon
 
 
 def test_an_overload_leaves_nothing_behind_on_a_plate_that_rings_long(monkeypatch):
-    """1.5 N ask for more than 1.5 V; lifted to 0.2 N, within 2 % in the suite's 8 ms.
-
-    Naive: back-calculation no faster than such a plate loses energy by itself takes far longer.
-    """
+    """1.5 N ask for more than 1.5 V; within 2 % in the suite's 8 ms.  Naive: back-calculation as slow as the plate."""
     quality = 1e4
     back = next(each.bound for each in TARGETS if each.case == "ultrasonic: touch" and each.key == "back")  # ms
     load = ((0.0, 0.15, 0.151, 0.25, 0.251, 1.0), (0.2, 0.2, 1.5, 1.5, 0.2, 0.2))
