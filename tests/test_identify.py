@@ -139,10 +139,7 @@ def test_a_bending_mode_is_found_from_five_standard_deviations_on():
 
 @pytest.mark.parametrize("coil", [0.1, 0.0])
 def test_what_was_identified_of_bending_reaches_the_design(coil):
-    """Measured: taps with zeros at the mode, or for rigid glass; an estimate of either sign where nothing is stated.
-
-    So do the gains, and a delay beyond the driver's.
-    """
+    """Taps with zeros at the mode, or for rigid glass; where nothing is stated either sign.  So do gains and delay."""
     plate = StrangersPlate(bending=(1250.0, 30, coil), **WRONG, told=1)
     tone = hr.Grating(frequency=72.0, amplitude=50e-6)
     scene = hr.Scene(texture=tone, duration=1.0, profile=identify(plate, PAPER).profile())

@@ -315,13 +315,17 @@ def test_flags_are_counted_and_a_saturated_sample_that_is_judged_fails(first, co
     assert summary["worst"]["value"] == pytest.approx(0.0, abs=EXACT)
 
 
+def by_sensors(bands, signals, tolerance=0.05, **header):
+    recorder = make_recorder(None, bands, tolerance=tolerance)
+    recorder.header = replace(recorder.header, motion_source="sensors", **header)
+    recorder.append(**signals)
+    return recorder.finish().summary()
+
+
 def test_figures_from_sensors_contain_the_uncertainty_of_their_gain():
     bands = make_bands(100.0, 10 * UM)
     for calibration, found in ((0.01, "passed"), (0.03, "failed")):
-        recorder = make_recorder(None, bands, tolerance=0.05)
-        recorder.header = replace(recorder.header, calibration=calibration, motion_source="sensors")
-        recorder.append(**make_signals(bands, 1.03 * bands.envelope))
-        summary = recorder.finish().summary()
+        summary = by_sensors(bands, make_signals(bands, 1.03 * bands.envelope), calibration=calibration)
         assert summary["worst"]["value"] == pytest.approx(0.03 + calibration, rel=1e-6)
         assert summary["verdict"] == found
 
@@ -330,17 +334,11 @@ def test_figures_from_sensors_contain_the_uncertainty_of_their_gain():
     ("gain", "flag", "found"), [(1.0, 0, "not judged"), (0.8, 0, "failed"), (1.0, Flag.OVERRUN, "failed")]
 )
 def test_what_the_noise_of_the_sensors_hides_is_not_judged(rng, gain, flag, found):
-    """White noise of 1 um has 0.44 um from 20 to 500 Hz, 6.2 % of a tone of 10 um; the tolerance is 2 %.
-
-    Lost samples fail all the same.
-    """
+    """White noise of 1 um has 0.44 um from 20 to 500 Hz, 6.2 % of a tone of 10 um, beyond 2 %; lost samples fail."""
     bands = make_bands(100.0, 10 * UM)
-    recorder = make_recorder(None, bands, tolerance=0.02)
-    recorder.header = replace(recorder.header, sensed_noise=UM, motion_source="sensors")
     signals = make_signals(bands, gain * bands.envelope, extra=UM * rng.standard_normal((20_000, 3)))
     signals["flags"][::100] = flag
-    recorder.append(**signals)
-    summary = recorder.finish().summary()
+    summary = by_sensors(bands, signals, tolerance=0.02, sensed_noise=UM)
     assert summary["waveform"]["sensor_noise"] == pytest.approx(math.sqrt(480 / 2500) / math.sqrt(50), rel=1e-3)
     assert summary["waveform"]["places"]["centre"]["third_octaves"]["250 Hz"] < 0.04
     assert summary["verdict"] == found

@@ -92,16 +92,13 @@ SPEED, SWIPES = 50e-3, 3.0  # m/s at most, swipes there and back a second
 
 def swipe(method, wavelength, mechanics):
     """Drive, frequency and its largest sweep (Hz/s) after the first 1.5 s of 10 um under swipes, ideal electronics."""
-    time = np.arange(17_501) / RATE
-    reach = SPEED / (2 * np.pi * SWIPES)
-    path = reach * np.sin(2 * np.pi * SWIPES * time)
-    load = 0.0 if mechanics == "none" else 0.8
-    finger = hr.Finger.sampled(path, rate=RATE, normal_load=load, mechanics=mechanics)
+    time, load = np.arange(17_500) / RATE, 0.0 if mechanics == "none" else 0.8
+    finger = hr.Finger.swiping(frequency=SWIPES, speed=SPEED, normal_load=load, mechanics=mechanics)
     parameters = PlateParameters(**IDEAL)
     controller = design(method, grating(wavelength, 1e-5), parameters)
     drive, _, flags, _ = Plate(parameters, finger).closed_loop(controller, np.zeros(17_500))
     assert not flags.any()
-    frequency = SPEED / wavelength * np.cos(2 * np.pi * SWIPES * time[:-1])
+    frequency = SPEED / wavelength * np.cos(2 * np.pi * SWIPES * time)
     return drive[7500:], frequency[7500:], 2 * np.pi * SWIPES * SPEED / wavelength
 
 

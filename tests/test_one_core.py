@@ -25,10 +25,7 @@ def recordings():
 
 
 def test_one_texture_is_felt_alike_on_every_device(recordings):
-    """Predicted skin velocity of 50, 120, 250 Hz: rms error of each within 5 %, the scenes' tolerance, mean within 1 %.
-
-    A mean that were off by as much as the suite allows for a whole error, 1 %, would be a bias of the loop.
-    """
+    """Rms error of each band within 5 %, the scenes' tolerance; a mean 1 % off would be a bias of the loop."""
     for kind, recording in recordings.items():
         bands, place = skin_bands(recording), recording.header.places[0]
         assert [band.frequency for band in bands] == pytest.approx([50.0, 120.0, 250.0])

@@ -1,16 +1,17 @@
 """Margins from the model against the compiled loop: growth, and boundaries of gain, delay and phase on both sides."""
 
 import math
-from dataclasses import fields, replace
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from synthetic import make_bands
+from test_bandwidth import gains_of
 
 import hapticrender as hr
 from benchmarks.charts.stability_map import loaded_plate
 from hapticrender.control.controller_design import ONE_SPEED, design_controller, rules_for
-from hapticrender.control.margin_check import BankGains, error_loop
+from hapticrender.control.margin_check import error_loop
 from hapticrender.plants.plate import Plate, PlateParameters
 from hapticrender.touch.mechanics import HEAVY, NAMED, NONE
 
@@ -38,9 +39,7 @@ def frozen(method, *frequencies, **changes):
 
 def predicted(controller, parameters=PLATE, mechanics=NONE, position=0.0):
     """Linear loop of this controller on a plate that may differ from the one it was designed for."""
-    p = controller.settings
-    names = (each.name for each in fields(BankGains) if each.name != "delay")
-    gains = BankGains(**{name: float(p[name]) for name in names}, delay=1)
+    p, gains = controller.settings, gains_of(controller)
     plant = loaded_plate(parameters, MODEL, mechanics, position=position)
     taps = p["taps"][:, : p["n_taps"]]
     return error_loop(MODEL, controller.bands.frequency, gains, taps=taps, plant=plant, delay=parameters.delay)

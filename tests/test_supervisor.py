@@ -243,10 +243,7 @@ def test_a_ringing_damper_is_turned_down_and_the_texture_goes_on():
 
 @pytest.mark.parametrize("seed", [*range(1000, 1006), 10041, 10099, 41691, 60789])
 def test_normal_scenes_are_not_stopped(seed):
-    """20 s each; `benchmarks/false_stops.py` has hours of them.
-
-    In the last four 4 and 5 N slide across the plate, and presses of 4.6 N within 3 ms look like an inverted sensor.
-    """
+    """20 s each (`benchmarks/false_stops.py`: hours); the last four slide at 4 and 5 N, or press 4.6 N within 3 ms."""
     error, controller = run(*random_scene(seed))
     assert error is None
     assert controller.damper_scale == 1.0
