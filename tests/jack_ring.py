@@ -4,6 +4,7 @@ import ctypes
 import os
 import shutil
 import subprocess
+import sys
 import threading
 import time
 from contextlib import contextmanager
@@ -238,6 +239,17 @@ def busy_thread():
     finally:
         stop.set()
         thread.join()
+
+
+@contextmanager
+def busy_process():
+    """Keep a core busy as that thread does, without the lock."""
+    process = subprocess.Popen([sys.executable, "-c", "while True: sum(range(10_000))"])
+    try:
+        yield
+    finally:
+        process.kill()
+        process.wait()
 
 
 def lost_callbacks(device, wrap, beside, seconds):
