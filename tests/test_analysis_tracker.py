@@ -7,7 +7,6 @@ from waves import phasor
 
 import hapticrender as hr
 from hapticrender.analysis.contact import clear_sigmas
-from hapticrender.analysis.course import Course
 from hapticrender.analysis.force import MotionFilter
 from hapticrender.analysis.lock_in import demodulate, tile, window_length
 from hapticrender.analysis.records import LOADED
@@ -172,22 +171,6 @@ def test_bandwidth_and_latency_are_as_predicted(lookahead):
         amplitude = abs(phasor(signal[at], frequency)) / (0.2 if of_load else 2 * np.pi * frequency * 0.005)
         assert amplitude == pytest.approx(np.sqrt(0.5), rel=0.01)  # a frequency is stated to 0.05 Hz: 0.4 % of gain
     assert len(found["time"]) == len(drive) - tracker.latency
-
-
-@pytest.mark.parametrize("load", [0.06, 0.5])
-def test_series_scatter_as_they_say(load):
-    """A finger at rest for a minute; values are correlated over 2 sqrt(pi) spreads, 47 ms."""
-    drive, sensed = run(hr.Finger.still(position=10e-3, normal_load=load, touches=[(3.0, 60.0)]), 60.0)
-    exact = Course.of(PLATE, dict.fromkeys(("stiffness_1", "stiffness_2"), 1e-3))
-    found = tracked(hr.FingerTracker(exact, lookahead=1.0), drive, sensed)
-    at = found["time"] > 3.2
-    assert (found["contact"][at] == LOADED).all()
-    for name, truth in (("load", load), ("position", 10e-3), ("velocity", 0.0)):
-        error = (found[name][at] - truth) / found[f"{name}_error"][at]
-        spread = 4 * np.sqrt(2 * 0.047 / 56.8)  # of a mean square
-        common = 0.06 if name != "velocity" else 0.0  # share of the variance by the values at rest: one error for all
-        assert -spread - common < np.mean((error - error.mean()) ** 2) - 1 < spread, name
-        assert abs(error.mean()) < 4 * np.sqrt(common + 0.047 / 56.8), name
 
 
 def test_position_is_undefined_under_a_load_that_is_too_small():

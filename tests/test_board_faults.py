@@ -280,8 +280,6 @@ def test_a_bad_line_never_plays_what_was_not_asked_for(tmp_path, rng, monkeypatc
         at = next(index for index in range(at, len(session.asked)) if np.array_equal(session.asked[index], commit))
     gains = [float(np.float32(line[2])) for log in logs for line in log if line[1] == "gain"]
     assert set(gains) <= set(session.gains)
-    print(f"{len(commits)} commits, {session.client.reconnections} reconnections, {len(session.silences)} pulls")
-    print(f"{len(logs) - 1} resets, {faults.faulty} of {faults.carried} bytes, {board.time:.0f} s of the board's time")
     assert session.client.reconnections > seconds / 60
     assert faults.faulty == pytest.approx(0.01 * faults.carried, rel=0.1)
     for incarnation, start, stop in session.silences:

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from live_devices import slide
-from tables import tables
+from tables import scene_on
 
 import hapticrender as hr
 from hapticrender import loop
@@ -20,29 +20,14 @@ RATE = 10_000
 SLIDE = hr.Finger.sliding(speed=0.08, normal_load=0.4, mechanics="light")
 START = 100.0 / 1.5  # Hz, F of the default crossover
 FELT = 0.01  # a tenth of what lies below every just noticeable difference (FACTS 7), as the accuracy suite asks
-TRACKER = 2 * np.pi * 60.0  # rad/s, of the finger's tracker
 
 
 def scene(texture, finger=SLIDE, duration=1.2, **plant):
-    return hr.Scene(
-        texture=texture,
-        finger=finger,
-        device="hybrid",
-        duration=duration,
-        settle=0.6,
-        keep_unfelt=True,
-        **tables(plant),
-    )
+    return scene_on("hybrid", texture, finger, duration, settle=0.6, keep_unfelt=True, **plant)
 
 
 def tone(frequency, velocity=0.02):
     return hr.Grating(velocity=velocity, frequency=frequency)
-
-
-def smoothstep(x):
-    """3 x^2 - 2 x^3, the polynomial written another way."""
-    x = min(max(x, 0.0), 1.0)
-    return 3 * x**2 - 2 * x**3
 
 
 def test_shares_sum_to_one():
@@ -53,7 +38,8 @@ def test_shares_sum_to_one():
     assert (share[frequency >= 2 * START] == 1.0).all()
     assert settings.share_of_screen(settings.crossover) == pytest.approx(0.5)
     assert (np.diff(share) >= 0.0).all()
-    np.testing.assert_allclose(share, [smoothstep(f / START - 1) for f in frequency], atol=1e-15)
+    x = np.clip(frequency / START - 1, 0.0, 1.0)
+    np.testing.assert_allclose(share, 3 * x**2 - 2 * x**3, atol=1e-15)
     mirrored = settings.share_of_screen(3 * START - frequency)  # around the crossover, where the plate has it
     np.testing.assert_allclose(share + mirrored, 1.0, atol=1e-14)
 

@@ -57,7 +57,6 @@ def test_a_board_plays_live(program, tmp_path):
     # the same noise within 20-500 Hz, 288 numbers over 0.3 s: 13 % are three sigmas of its rms
     noise = 0.71e-6 * np.sqrt(480 / 2500) / np.std(both.reference[-1500:])
     found = sensed_error(both, len(both) - 1500)
-    print(f"live: {white}; along the surface and in time: {found:.3f}, noise {noise:.3f}")
     assert found < np.hypot(1.13 * noise, 0.05)
     wanted, moved = (phasor(each[-1500:], 150.0) for each in (recording.reference, recording.motion[:, 0]))
     # 1 um of noise at two ends: 0.7 um sqrt(2/1500) = 0.026 um in each part, three times; the phase needs no fit
