@@ -116,6 +116,9 @@ def test_what_cannot_be_predicted_is_not_taken_and_says_why():
     reasons = {level.name: level.reason for level in found.levels}
     assert reasons["no finger"] == "the finger moves: its load moves the plate, or the texture follows it"
     assert reasons[ONE] == "the load of a moving finger tilts the plate"
+    for beside, predicted in ((130.0, False), (160.0, True)):  # near carriers exchange sidebands under a moving finger
+        scene = temporal(SLIDING, 120.0, beside)
+        assert np.isfinite(difference(scene, REDUCTIONS[scene.device][STATIC](scene))) == predicted
     with pytest.raises(ValueError, match="tolerance=0.0: must be > 0 and <= 10"):
         least_model(temporal(FREE, 120.0), tolerance=0.0)
     hybrid = replace(temporal(FREE, 120.0), device="hybrid")
