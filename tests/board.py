@@ -7,13 +7,14 @@ import shutil
 import subprocess
 import tempfile
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from synthetic import make_bands
 
 import hapticrender as hr
-from hapticrender.bands import Bands
 from hapticrender.drivers.serial import BoardClient, SerialDriver
 from hapticrender.export import export
 
@@ -178,6 +179,11 @@ class SteppedBoard:
         if self.time >= self.pulled:
             self.inject(self.damage(data))
 
+    def assert_at_rest(self):
+        """Nothing is driven in the last sample."""
+        self.sleep(0.001)
+        assert driven(self.board.log(), self.sample - 1, self.sample) == []
+
     def inject(self, data):
         """Put bytes on the line to the board."""
         self._waiting += data
@@ -224,8 +230,15 @@ def driver_of(board, **options):
 
 
 def tones(*frequencies, amplitude=5e-6):
-    n = len(frequencies)
-    return Bands(frequency=frequencies, wavenumber=np.zeros(n), phase=np.zeros(n), envelope=np.full(n, amplitude))
+    return make_bands(frequencies, amplitude)
+
+
+def simulated_as(recording, scene, noise):
+    """The scene on the library's plate, under a finger that moves as a board's recording says it did."""
+    position = recording.read("position")
+    position[: np.argmax(np.isfinite(position))] = position[np.isfinite(position)][0]
+    same = hr.Finger.sampled(position, rate=RATE, normal_load=0.4, mechanics=MECHANICS)
+    return hr.render(replace(scene, finger=same, simulation={"sensor_noise": noise}))
 
 
 def sensed_error(recording, start=int(0.3 * RATE)):

@@ -67,6 +67,14 @@ def loud_arithmetic() -> Iterator[None]:
         yield
 
 
+@pytest.fixture(scope="module")
+def exports(tmp_path_factory):
+    """Designs of the textures of `laws`, and their laws in C."""
+    from laws import Exports
+
+    return Exports(tmp_path_factory.mktemp("exports"))
+
+
 @pytest.fixture(scope="session")
 def shared_data() -> Path:
     """The folder with the recorded finger, which is no part of this repository."""

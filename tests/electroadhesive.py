@@ -1,7 +1,7 @@
 """Scenes and devices that the tests of electroadhesion share."""
 
 import numpy as np
-from tables import tables
+from tables import scene_on
 
 import hapticrender as hr
 from hapticrender.drivers.simulated import SimulatedDriver
@@ -15,9 +15,7 @@ SLIDE = hr.Finger.sliding(speed=SPEED, normal_load=1.0)
 def tone(frequency, force=FORCE, finger=SLIDE, duration=2.0, **plant):
     """A friction of `force` (N) at `frequency` (Hz): a displacement of 0.64 m/(N s) of it over w."""
     texture = hr.Grating(frequency=frequency, amplitude=0.64 * force / (2 * np.pi * frequency))
-    return hr.Scene(
-        texture=texture, finger=finger, device="electroadhesion", duration=duration, **tables(plant), keep_unfelt=True
-    )
+    return scene_on("electroadhesion", texture, finger, duration, keep_unfelt=True, **plant)
 
 
 class Screen(SimulatedDriver):

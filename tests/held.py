@@ -1,24 +1,22 @@
 """Run methods of the library on the simulated plate, and measure amplitudes."""
 
 import numpy as np
+from synthetic import make_bands
+from waves import phasor
 
 import hapticrender as hr
-from hapticrender.bands import Bands
 from hapticrender.control.methods import METHODS
 from hapticrender.plants.plate import Plate, PlateParameters
 
 
 def fixed(*pairs):
     """Bands of fixed carriers from (frequency, envelope) pairs."""
-    frequency, zero = np.array([pair[0] for pair in pairs], float), np.zeros(len(pairs))
-    envelope = np.array([pair[1] for pair in pairs], complex)
-    return Bands(frequency=frequency, wavenumber=zero, phase=zero, envelope=envelope)
+    return make_bands(*zip(*pairs, strict=True))
 
 
 def grating(wavelength, amplitude):
     """One carrier that follows the finger."""
-    one = np.ones(1)
-    return Bands(frequency=0 * one, wavenumber=one / wavelength, phase=0 * one, envelope=amplitude * one + 0j)
+    return make_bands(0.0, amplitude, 1 / wavelength)
 
 
 def play(controller, seconds, plate=None, finger=None, seed=0, waveform=None):
@@ -57,8 +55,7 @@ def envelopes(motion, phase, rate, window, hop=None):
 
 def amplitude(motion, frequency, seconds, rate=5000.0):
     """Mean amplitude (m) of each column over the last `seconds`, which hold whole periods."""
-    n = np.arange(len(motion))[-round(seconds * rate) :]
-    return abs(2 * np.mean(motion[n] * np.exp(-2j * np.pi * frequency * n / rate)[:, None], axis=0))
+    return abs(phasor(motion[-round(seconds * rate) :], frequency, rate))
 
 
 def amplitude_error(motion, frequency, wanted, seconds=1.0):

@@ -14,8 +14,8 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from synthetic import make_bands
 
-from hapticrender.bands import Bands
 from hapticrender.control.methods import METHODS
 from hapticrender.drivers.audio import AudioDriver
 from hapticrender.plants.plate import PlateParameters, structure
@@ -177,12 +177,7 @@ def _end(process: subprocess.Popen, patience: float = 0.0) -> None:
 
 
 def comb():
-    return Bands(
-        frequency=FREQUENCY,
-        wavenumber=np.zeros(8),
-        phase=np.linspace(0.0, 5.0, 8),
-        envelope=np.full(8, AMPLITUDE, complex),
-    )
+    return make_bands(FREQUENCY, AMPLITUDE, phase=np.linspace(0.0, 5.0, 8))
 
 
 def driver(delay=ROUND_TRIP, **options):

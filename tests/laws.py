@@ -5,9 +5,9 @@ from types import SimpleNamespace
 
 import numpy as np
 from board import ROOT, compile_c
+from waves import Own, white
 
 import hapticrender as hr
-from hapticrender.bands import Bands
 from hapticrender.export import export
 from hapticrender.jit import addresses
 from hapticrender.plants.plate import Plate, PlateParameters
@@ -15,24 +15,14 @@ from hapticrender.plants.plate import Plate, PlateParameters
 RATE, SAMPLES, AHEAD = 5000, 15_000, 7  # Hz; of a run; by which a waveform is ahead: the delay and 6
 PARTS = ("law", "learning", "carriers", "supervisor", "gains", "design")
 KINDS = {"double": "-DREAL_DOUBLE", "float": "-UREAL_DOUBLE"}
-RMS = 5e-6  # m, of the white noise
 
 
-class White:
-    """White noise of 20-400 Hz, played whole."""
+class White(Own):
+    """White noise of 20-400 Hz, 5 um rms, played whole."""
 
     def __init__(self, spatial=False):
-        spectrum = np.fft.rfft(np.random.default_rng(0).standard_normal(SAMPLES + AHEAD))
-        frequency = np.fft.rfftfreq(SAMPLES + AHEAD, 1 / RATE)
-        values = np.fft.irfft(np.where((frequency > 20) & (frequency < 400), spectrum, 0.0), SAMPLES + AHEAD)
-        self.values, self.spatial = values * RMS / values.std(), spatial
-
-    def bands(self, rate):
-        return Bands.none(spatial=self.spatial)
-
-    def waveform(self, time, position):
-        index = np.minimum(np.round(np.asarray(time) * RATE).astype(int), SAMPLES + AHEAD - 1)
-        return self.values[index]
+        self.values, last = white(SAMPLES + AHEAD, 5e-6), SAMPLES + AHEAD - 1
+        super().__init__(lambda time, _: self.values[np.minimum(np.round(time * RATE).astype(int), last)], spatial)
 
 
 FINGERS = {

@@ -46,7 +46,17 @@ class Lying(SimulatedDriver):
         return sensed
 
 
-class Calling:
+class Bench:
+    """A device that need not be opened or closed."""
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *exc):
+        pass
+
+
+class Calling(Bench):
     """A device that calls back, like a sound card: a thread of its own calls the entry block by block."""
 
     rate, block, delay = 48_000.0, 64, 64
@@ -58,12 +68,6 @@ class Calling:
         parameters = replace(PlateParameters(), rate=self.rate, delay=self.delay)
         self.plate = Plate(parameters, hr.Finger.absent(), block=self.block)
         self.stopping, self.last = threading.Event(), None
-
-    def __enter__(self):
-        return self
-
-    def __exit__(self, *exc):
-        pass
 
     def start(self, entry):
         self.thread = threading.Thread(target=self.call, args=(entry,))

@@ -18,10 +18,10 @@ def make_scene(**fields: Any) -> Scene:
     return Scene(**({"texture": Grating(amplitude=1e-5, frequency=100.0), "duration": 4.0, "name": "known"} | fields))
 
 
-def make_bands(frequency: Any, envelope: Any, wavenumber: Any = 0.0, phase: Any = 0.0) -> Bands:
+def make_bands(frequency: Any, envelope: Any, wavenumber: Any = 0.0, phase: Any = 0.0, **options: bool) -> Bands:
     frequency, wavenumber, phase = np.broadcast_arrays(np.atleast_1d(frequency).astype(float), wavenumber, phase)
-    constant = np.broadcast_to(np.asarray(envelope, complex), frequency.shape)
-    return Bands(frequency=frequency, wavenumber=wavenumber * 1.0, phase=phase * 1.0, envelope=constant)
+    constant = envelope if envelope is None else np.broadcast_to(np.asarray(envelope, complex), frequency.shape)
+    return Bands(frequency=frequency, wavenumber=wavenumber * 1.0, phase=phase * 1.0, envelope=constant, **options)
 
 
 def make_recorder(path: Path | None, bands: Bands, *, rate: float = RATE, **fields: Any) -> Recorder:

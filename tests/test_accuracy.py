@@ -32,6 +32,11 @@ def test_the_default_method_meets_every_bound(case):
     assert missed(run_suite(["inverse"], [case])) == []
 
 
+def test_the_banks_of_bands_leave_an_overload_undistorted_in_a_quarter_of_a_second():
+    """Without back-calculation a complex integral never returns, and polar loops need seconds."""
+    assert missed(run_suite(["h", "h2"], ["overload"])) == []
+
+
 @pytest.mark.parametrize("case", ["slide", "overload", "electroadhesion: harmonic", "electroadhesion: swipe"])
 def test_where_the_baselines_fail(case):
     figures = run_suite(["paper", "boxcar"], [case])

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 from test_analysis_plate import open_loop
+from waves import phasor
 
 import hapticrender as hr
 from hapticrender.analysis.contact import clear_sigmas
-from hapticrender.analysis.course import Course
 from hapticrender.analysis.force import MotionFilter
 from hapticrender.analysis.lock_in import demodulate, tile, window_length
 from hapticrender.analysis.records import LOADED
@@ -18,11 +18,6 @@ RATE = 5000.0
 PLATE = PlateParameters()
 
 
-def complex_amplitude(signal, frequency, rate=RATE):
-    """Of a carrier with whole periods in the signal."""
-    return 2 * np.mean(signal * np.exp(-2j * np.pi * frequency / rate * np.arange(len(signal))))
-
-
 @pytest.mark.parametrize("frequency", [20.0, 100.0, 400.0])
 def test_kernels_differentiate_as_they_say(frequency):
     """To what a kernel that ends at 5 spreads leaves out: exp(-12.5) of its largest tap, 27 s^-2 for g''."""
@@ -31,7 +26,7 @@ def test_kernels_differentiate_as_they_say(frequency):
     signal = np.cos(w * (np.arange(5000 + 2 * n) - n) / RATE)
     for order, taps in enumerate(derivative_kernels(spread, RATE)):
         expected = (1j * w) ** order * np.exp(-0.5 * (w * spread) ** 2)
-        measured = complex_amplitude(convolve(signal, taps), frequency)
+        measured = phasor(convolve(signal, taps), frequency)
         assert abs(measured - expected) < 27 * np.exp(-12.5) / spread**order
 
 
@@ -49,8 +44,8 @@ def test_local_line_has_the_response_and_noise_it_says(lookahead, rng):
     expected = [each[0] for each in line.response([frequency])]
     whole = slice(625, 625 + 48_125)  # 77 periods
     shift = np.exp(-2j * np.pi * frequency * 625 / RATE)
-    assert abs(complex_amplitude(level[whole, 0], frequency) * shift - expected[0]) < 1e-6
-    assert abs(complex_amplitude(slope[whole, 0], frequency) * shift / (2j * np.pi * frequency) - expected[1]) < 1e-6
+    assert abs(phasor(level[whole, 0], frequency) * shift - expected[0]) < 1e-6
+    assert abs(phasor(slope[whole, 0], frequency) * shift / (2j * np.pi * frequency) - expected[1]) < 1e-6
     independent = count / RATE / (2 * spread)  # values, so that their mean square is certain to sqrt(2/n)
     for found, predicted in ((level, of_level), (slope, of_slope)):
         assert abs(np.mean(found[1000:, 1] ** 2 / predicted[1000:]) - 1) < 4 * np.sqrt(2 / independent)
@@ -173,25 +168,9 @@ def test_bandwidth_and_latency_are_as_predicted(lookahead):
         periods = int(frequency * 10)
         at = slice(10_000, 10_000 + round(periods / frequency * RATE))
         signal = found["load"] if of_load else found["velocity"]
-        amplitude = abs(complex_amplitude(signal[at], frequency)) / (0.2 if of_load else 2 * np.pi * frequency * 0.005)
+        amplitude = abs(phasor(signal[at], frequency)) / (0.2 if of_load else 2 * np.pi * frequency * 0.005)
         assert amplitude == pytest.approx(np.sqrt(0.5), rel=0.01)  # a frequency is stated to 0.05 Hz: 0.4 % of gain
     assert len(found["time"]) == len(drive) - tracker.latency
-
-
-@pytest.mark.parametrize("load", [0.06, 0.5])
-def test_series_scatter_as_they_say(load):
-    """A finger at rest for a minute; values are correlated over 2 sqrt(pi) spreads, 47 ms."""
-    drive, sensed = run(hr.Finger.still(position=10e-3, normal_load=load, touches=[(3.0, 60.0)]), 60.0)
-    exact = Course.of(PLATE, dict.fromkeys(("stiffness_1", "stiffness_2"), 1e-3))
-    found = tracked(hr.FingerTracker(exact, lookahead=1.0), drive, sensed)
-    at = found["time"] > 3.2
-    assert (found["contact"][at] == LOADED).all()
-    for name, truth in (("load", load), ("position", 10e-3), ("velocity", 0.0)):
-        error = (found[name][at] - truth) / found[f"{name}_error"][at]
-        spread = 4 * np.sqrt(2 * 0.047 / 56.8)  # of a mean square
-        common = 0.06 if name != "velocity" else 0.0  # share of the variance by the values at rest: one error for all
-        assert -spread - common < np.mean((error - error.mean()) ** 2) - 1 < spread, name
-        assert abs(error.mean()) < 4 * np.sqrt(common + 0.047 / 56.8), name
 
 
 def test_position_is_undefined_under_a_load_that_is_too_small():

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from held import amplitude
 from tables import tables
 
 import hapticrender as hr
@@ -14,14 +15,6 @@ A = 50e-6  # m: that of the accuracy suite, 50 times the noise of a sensor
 def rendered(frequency=72.0, gradient=0.0, finger=SLIDE, **plant):
     texture = hr.Grating(frequency=frequency, amplitude=A)
     return hr.render(hr.Scene(texture=texture, finger=finger, duration=2.5, gradient=gradient, **tables(plant)))
-
-
-def amplitudes(recording, frequency):
-    """Mean amplitude (m) at centre and ends over whole periods of the last second."""
-    n = int(recording.rate / frequency * int(frequency))
-    late = recording.motion[-n:]
-    turn = np.exp(-2j * np.pi * frequency * np.arange(n) / recording.rate)
-    return abs(2 * np.mean(late * turn[:, None], axis=0))
 
 
 CENTRE, ENDS = 0.004, 0.015  # of A, rms: what the accuracy suite asks of a slide
@@ -38,7 +31,7 @@ def test_an_amplitude_grows_along_the_plate(frequency, gradient):
     (band,) = recording.summary()["bands"]
     left = wanted * [band[f"rms_error_{place}"] for place in ("centre", "end_1", "end_2")]
     assert (left < A * np.array([CENTRE, ENDS, ENDS])).all()
-    assert (abs(amplitudes(recording, frequency) - wanted) < A * np.array([CENTRE, ENDS, ENDS])).all()
+    assert (abs(amplitude(recording.motion, frequency, 1.0) - wanted) < A * np.array([CENTRE, ENDS, ENDS])).all()
     assert recording.header.profile == pytest.approx((wanted / A).tolist())
 
 
@@ -55,7 +48,7 @@ def test_one_coil_holds_the_middle_and_leaves_the_ends_to_the_finger():
     expected = abs(plate.device_model(plate.rate, plate.delay).place_from_coordinate @ heave_and_rocking)
     recording = rendered(frequency, finger=finger, coils=1)
     assert recording.drive.shape[1] == 1
-    np.testing.assert_allclose(amplitudes(recording, frequency) / A, expected, rtol=0, atol=CENTRE)
+    np.testing.assert_allclose(amplitude(recording.motion, frequency, 1.0) / A, expected, rtol=0, atol=CENTRE)
 
 
 @pytest.mark.parametrize(

@@ -1,10 +1,11 @@
 """Margins and bandwidths of the error observer's law: both sides of bounds."""
 
 import math
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
+from test_kernel import plate_controller, tones
 
 from hapticrender.control.damping import damping_taps
 from hapticrender.control.linear import FingerEstimate
@@ -17,24 +18,15 @@ RATE = 5000.0
 MODEL = PlateParameters().device_model(RATE, 1)
 TAPS = damping_taps(MODEL, 1.4)[0]
 USUAL = LeastMargins()
-GAINS = BankGains(
-    rate=RATE,
-    delay=1,
-    lead=1.5 / RATE,
-    observer=2 * 2 * math.pi * 10.0 / RATE,
-    observer_high=2 * 2 * math.pi * 20.0 / RATE,
-    integral=2.0,
-    integral_medium=15.0,
-    integral_high=25.0,
-    dc=1.6 * 2 * math.pi * 6.0 / RATE,
-    dc_drift=(2 * math.pi * 6.0 / RATE) ** 2,
-    damper=0.0,
-    damper_high=1.0,
-    crowd_speed=0.0,
-    lowest=20.0,
-    highest=1000.0,
-    highest_edge=1.25,
-)
+
+
+def gains_of(controller):
+    """Gains of a default controller, in a loop without further delay."""
+    names = (each.name for each in fields(BankGains) if each.name != "delay")
+    return BankGains(**{name: float(controller.settings[name]) for name in names}, delay=1)
+
+
+GAINS = gains_of(plate_controller(tones([170.0]), parameters=PlateParameters()))
 
 
 def at(*frequencies):

@@ -11,8 +11,6 @@ from hapticrender.control.controller_design import ONE_SPEED, design_controller
 from hapticrender.control.records import POSITION, SUM
 from hapticrender.control.sums import sum_bands, turn_tables
 from hapticrender.plants.plate import Plate
-from hapticrender.plants.surface import SurfaceParameters, resonant
-from hapticrender.plants.ultrasonic import UltrasonicPlate
 from hapticrender.renderers.electroadhesion import ElectroadhesionRenderer
 from hapticrender.touch.mechanics import HEAVY
 
@@ -93,9 +91,6 @@ def test_a_modulated_target_in_blocks_is_the_waveform_at_the_blocks_end():
     np.testing.assert_allclose(target[late][:, 0], 2e-6 * np.repeat(wanted[24::25], 25)[late], rtol=1e-12)
 
 
-# blocks: closed loops
-
-
 def in_closed_loop(plant, controller, seconds):
     """Motion of the middle and flags, from the plant's own loop."""
     n = round(seconds * plant.rate) // controller.block * controller.block
@@ -156,25 +151,3 @@ def test_a_friction_device_in_blocks_follows_its_target(block):
     found = abs(2 * np.mean((late - late.mean()) * np.exp(-2j * np.pi * 72.0 * np.arange(late.size) / plant.rate)))
     assert found == pytest.approx(abs(target[-1, 0]), rel=0.01)
     assert abs(target[-1, 0]) == pytest.approx(0.1, rel=0.01)
-
-
-@pytest.mark.parametrize("block", [16, 32])
-def test_an_ultrasonic_amplitude_loop_in_blocks_follows_its_waveform(block):
-    """Amplitude of a free plate under its modulated carrier: steady to 1 %, the accuracy suite's bound.
-
-    A waveform of 1 um at rest, then 30 % more: the loop follows both; without lock, which blocks leave out.
-    """
-    surface = SurfaceParameters()
-    mode = replace(surface.carrier_mode, delay=block)
-    model = replace(resonant(mode.device_model(mode.rate, block), mode, 0.0), block=block)
-    controller = design_controller("h2", model, surface.amplitude_bands(), ONE_SPEED)
-    assert controller.block == block
-    n = round(0.4 * mode.rate) // block * block
-    wanted = np.where(np.arange(n) < n // 2, 1e-6, 1.3e-6)
-    plant = UltrasonicPlate(mode, hr.Finger.absent(), block=block)
-    _, target, _, sensed = plant.closed_loop(controller, wanted)
-    carrier = np.exp(-2j * np.pi * mode.carrier / mode.rate * np.arange(n))
-    for end, amplitude in ((n // 2, 1e-6), (n, 1.3e-6)):
-        late = slice(end - n // 8, end)
-        assert abs(target[end - 1, 0]) == pytest.approx(amplitude, rel=1e-9)
-        assert abs(2 * np.mean(sensed.motion[late, 0] * carrier[late])) == pytest.approx(amplitude, rel=0.01)

@@ -14,8 +14,8 @@ from board import (
     started,
     tones,
 )
+from synthetic import make_bands
 
-from hapticrender.bands import Bands
 from hapticrender.drivers import protocol
 from hapticrender.drivers.protocol import Cause, Kind
 from hapticrender.drivers.serial import Line
@@ -84,8 +84,7 @@ def test_a_press_that_moves_the_plate_too_far_stops_the_board(stepped):
     client.finger(0.055, 0.0, 20.0)
     with pytest.raises(DeviceFault, match="the board stopped: the surface moved too far"):
         run(client, stepped, 0.2)
-    stepped.sleep(0.001)
-    assert driven(stepped.board.log(), stepped.sample - 1, stepped.sample) == []
+    stepped.assert_at_rest()
 
 
 def test_sensors_out_of_their_range_stop_an_identification(tmp_path):
@@ -94,8 +93,7 @@ def test_sensors_out_of_their_range_stop_an_identification(tmp_path):
         client = client_of(board).open()
         with pytest.raises(DeviceFault, match="the board stopped: a sensor was invalid for 10 ms"):
             client.identify([Line(0, 60.0, 0.05)], 1.0)
-        board.sleep(0.001)
-        assert driven(board.board.log(), board.sample - 1, board.sample) == []
+        board.assert_at_rest()
 
 
 @pytest.mark.parametrize(
@@ -112,8 +110,7 @@ def test_a_sensor_that_is_dead_or_inverted_stops_the_board(tmp_path, gains, caus
         with pytest.raises(DeviceFault, match="stepped: play: the board stopped: .*: check "):
             run(client, board, 2.0)
         assert client._line.telemetry.cause in causes
-        board.sleep(0.001)
-        assert driven(board.board.log(), board.sample - 1, board.sample) == []
+        board.assert_at_rest()
 
 
 def test_garbage_is_no_sign_of_life(stepped, rng):
@@ -225,12 +222,8 @@ class Session:
     def change(self):
         n = self.rng.integers(1, 5)
         frequencies = np.sort(self.rng.choice(np.arange(30.0, 300.0, 15.0), n, replace=False))
-        bands = Bands(
-            frequency=frequencies,
-            wavenumber=np.zeros(n),
-            phase=self.rng.uniform(0, 6, n),
-            envelope=self.rng.uniform(1e-6, 5e-6, n) * np.exp(1j * self.rng.uniform(0, 6, n)),
-        )
+        phase, size, angle = self.rng.uniform(0, 6, n), self.rng.uniform(1e-6, 5e-6, n), self.rng.uniform(0, 6, n)
+        bands = make_bands(frequencies, size * np.exp(1j * angle), phase=phase)
         columns = frequencies, 0 * frequencies, bands.phase / (2 * np.pi), bands.envelope.real, bands.envelope.imag
         self.asked.append(np.ravel(np.transpose(columns)).astype("f4"))
         self.client.set_bands(bands)
@@ -287,8 +280,6 @@ def test_a_bad_line_never_plays_what_was_not_asked_for(tmp_path, rng, monkeypatc
         at = next(index for index in range(at, len(session.asked)) if np.array_equal(session.asked[index], commit))
     gains = [float(np.float32(line[2])) for log in logs for line in log if line[1] == "gain"]
     assert set(gains) <= set(session.gains)
-    print(f"{len(commits)} commits, {session.client.reconnections} reconnections, {len(session.silences)} pulls")
-    print(f"{len(logs) - 1} resets, {faults.faulty} of {faults.carried} bytes, {board.time:.0f} s of the board's time")
     assert session.client.reconnections > seconds / 60
     assert faults.faulty == pytest.approx(0.01 * faults.carried, rel=0.1)
     for incarnation, start, stop in session.silences:

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from board import (
     FINGER,
-    MECHANICS,
     RATE,
     ROOT,
     SANITISED,
@@ -19,8 +18,10 @@ from board import (
     program_of,
     run,
     sensed_error,
+    simulated_as,
     tones,
 )
+from waves import Own
 
 import hapticrender as hr
 from hapticrender.bands import Bands
@@ -36,29 +37,14 @@ MODEL = hr.prepare(SCENE).model
 NO_BANDS = Bands.none(spatial=False)
 
 
-class Sine:
+def sine(wavelength):
     """A sine along the surface."""
-
-    spatial = True
-
-    def __init__(self, wavelength):
-        self.wavelength = wavelength
-
-    def bands(self, rate):
-        return Bands.none(spatial=True)
-
-    def waveform(self, time, position):
-        return 5e-6 * np.sin(2 * np.pi * position / self.wavelength)
+    return Own(lambda time, position: 5e-6 * np.sin(2 * np.pi * position / wavelength), spatial=True)
 
 
-class Tones:
-    """Two tones in time that never repeat within a run: a sample of another moment is another."""
-
-    def bands(self, rate):
-        return Bands.none(spatial=False)
-
-    def waveform(self, time, position):
-        return 4e-6 * np.sin(2 * np.pi * 70.0 * time) + 4e-6 * np.sin(2 * np.pi * 70.0 * np.sqrt(2.0) * time)
+def two_tones(time, position=None):
+    """They never repeat within a run: a sample of another moment is another."""
+    return 4e-6 * np.sin(2 * np.pi * 70.0 * time) + 4e-6 * np.sin(2 * np.pi * 70.0 * np.sqrt(2.0) * time)
 
 
 @pytest.fixture
@@ -86,12 +72,7 @@ def test_a_recording_on_the_board_is_as_good_as_on_the_simulated_device(tmp_path
     scene = replace(SCENE, texture=texture, duration=1.5)
     with SteppedBoard(program_of(*SANITISED, *sizes), tmp_path, options=("--noise", "1e-7")) as board:
         played = hr.render(scene, driver=driver_of(board, finger=FINGER))
-    position = played.read("position")
-    position[: np.argmax(np.isfinite(position))] = position[np.isfinite(position)][0]
-    same = hr.Finger.sampled(position, rate=RATE, normal_load=0.4, mechanics=MECHANICS)
-    simulated = sensed_error(hr.render(replace(scene, finger=same, simulation={"sensor_noise": 1e-7})))
-    print(f"error by the sensors: board {sensed_error(played):.4f}, library {simulated:.4f}")
-    assert sensed_error(played) < 1.2 * simulated
+    assert sensed_error(played) < 1.2 * sensed_error(simulated_as(played, scene, 1e-7))
     assert not played.read("flags").any()
 
 
@@ -110,7 +91,7 @@ def motion_of(rows):
 
 def test_a_board_that_starves_fades_out_and_plays_nothing_stale(stepped):
     """The host sends nothing for a second, half a second more than it had sent ahead, then goes on."""
-    client, texture = streaming(stepped, Tones())
+    client, texture = streaming(stepped, Own(two_tones))
     run(client, stepped, 0.4)
     texture.samples, samples = lambda played: None, texture.samples
     last = texture.written
@@ -128,7 +109,7 @@ def test_a_board_that_starves_fades_out_and_plays_nothing_stale(stepped):
     # a frame in a step of at most 7.5 ms makes up for the half second
     assert last + 0.4 * RATE < back < (1.41 + 0.5 / (ROWS / (0.0075 * RATE) - 1.0)) * RATE
     weight = smoothstep((last - n) / fade) + smoothstep((n - back) / fade)
-    expected = weight * Tones().waveform(n / RATE, None)
+    expected = weight * two_tones(n / RATE)
     late = n > 0.3 * RATE  # after the fade-in, and what is learned of the free plate
     silent = (n > last + 0.05 * RATE) & (n < back)
     # edges of the fades are followed as any texture; sensors of 14 bits, 0.12 um a step, two of them: 0.025 um rms
@@ -138,11 +119,11 @@ def test_a_board_that_starves_fades_out_and_plays_nothing_stale(stepped):
 
 def test_only_what_was_sent_plays(stepped):
     """A point lost or changed on its way, samples out of order or too many: refused, and what plays goes on."""
-    client, texture = streaming(stepped, Tones())
+    client, texture = streaming(stepped, Own(two_tones))
     line = client._line
     never_described = protocol.pack(Kind.PLAY, 0)
     assert line.request(Kind.PLAY, never_described).refused == Reason.STATE
-    frames = list(BoardTexture(Sine(2e-3), client.capabilities, MODEL).frames(200))
+    frames = list(BoardTexture(sine(2e-3), client.capabilities, MODEL).frames(200))
     (_, described), *points, play = frames
     line.send(Kind.TEXTURE, described)
     for kind, payload in points[:-1]:
@@ -175,15 +156,14 @@ def test_only_what_was_sent_plays(stepped):
 
 def test_a_line_that_damages_bytes_plays_no_other_sample(stepped):
     """1 byte of 1000, 14 % of the frames of samples; what is sent again may come too late, which is flagged."""
-    client, _ = streaming(stepped, Tones())
+    client, _ = streaming(stepped, Own(two_tones))
     stepped.damage = Faults(11, 0.001)
     run(client, stepped, 3.0)
     stepped.damage = lambda data: data
     run(client, stepped, 0.1)
     rows = client.rows(int(2.9 * RATE))
     whole = (rows[:, -1] == 0.0) & (np.arange(len(rows)) > 0.3 * RATE)
-    expected = Tones().waveform(np.arange(len(rows)) / RATE, None)
-    print(f"{np.mean(whole):.2f} of the rows came whole; {client.telemetry().bad} bad frames")
+    expected = two_tones(np.arange(len(rows)) / RATE)
     assert client.telemetry().bad > 30
     # eight rows in a frame of 253 bytes: 0.998^253 = 0.6 come, half of them at least in time
     assert np.mean(whole) > 0.3
@@ -193,7 +173,7 @@ def test_a_line_that_damages_bytes_plays_no_other_sample(stepped):
 def test_a_board_that_was_reset_begins_its_texture_anew(tmp_path):
     with SteppedBoard(program_of(*SANITISED), tmp_path, options=("--noise", "1e-8")) as board:
         client = client_of(board, reconnect=5.0).open()
-        client.set_bands(NO_BANDS, BoardTexture(Tones(), client.capabilities, MODEL))
+        client.set_bands(NO_BANDS, BoardTexture(Own(two_tones), client.capabilities, MODEL))
         client.start(stream=1)
         run(client, board, 0.2)
         board.reset()
@@ -205,7 +185,7 @@ def test_a_board_that_was_reset_begins_its_texture_anew(tmp_path):
     assert 0.15 * RATE < begins < 0.25 * RATE
     rows = rows[begins : begins + int(0.9 * RATE)]
     late = np.arange(int(0.3 * RATE), len(rows))
-    expected = Tones().waveform(late / RATE, None)
+    expected = two_tones(late / RATE)
     assert np.sqrt(np.mean((motion_of(rows)[late] - expected) ** 2)) < 0.03 * 4e-6  # as where it starves
     assert not rows[1:, -1].any()
 
@@ -222,13 +202,13 @@ def test_what_the_samples_take_of_the_line_is_what_the_page_says(stepped):
 
 def test_textures_fade_into_each_other(stepped):
     """From time to the surface, to bands and back, without a step: a jump of either texture would be 4 um and more."""
-    client, _ = streaming(stepped, Tones())
-    surface = BoardTexture(Sine(2e-3), client.capabilities, MODEL)
+    client, _ = streaming(stepped, Own(two_tones))
+    surface = BoardTexture(sine(2e-3), client.capabilities, MODEL)
     changes = [
         lambda: None,
         lambda: client.set_bands(NO_BANDS, surface),
         lambda: client.set_bands(tones(60.0, amplitude=4e-6)),
-        lambda: client.set_bands(NO_BANDS, BoardTexture(Tones(), client.capabilities, MODEL)),
+        lambda: client.set_bands(NO_BANDS, BoardTexture(Own(two_tones), client.capabilities, MODEL)),
     ]
     for change in changes:
         change()
@@ -252,10 +232,10 @@ def test_a_table_is_as_fine_as_it_has_to_be(stepped):
     turns = np.linspace(1.0, 2.5, 15_001)
     error = abs(np.exp(1j * np.multiply.outer(turns, places - x)) @ weights - 1.0)
     finest = 2 * np.pi * (2 * reach / (found.points - 1)) / turns[np.argmin(abs(error - COARSE))]
-    assert len(BoardTexture(Sine(1.02 * finest), found, MODEL)._table) == found.points
-    with pytest.raises(ValueError, match=r"texture Sine: 8192 points, 13.9 um apart, are .* % off it: must be <= 10 %"):
-        BoardTexture(Sine(finest / 1.02), found, MODEL)
-    assert len(BoardTexture(Sine(5e-3), found, MODEL)._table) < found.points
+    assert len(BoardTexture(sine(1.02 * finest), found, MODEL)._table) == found.points
+    with pytest.raises(ValueError, match=r"texture Own: 8192 points, 13.9 um apart, are .* % off it: must be <= 10 %"):
+        BoardTexture(sine(finest / 1.02), found, MODEL)
+    assert len(BoardTexture(sine(5e-3), found, MODEL)._table) < found.points
 
 
 def test_a_force_and_carriers_are_refused(stepped):
@@ -270,7 +250,7 @@ def test_a_force_and_carriers_are_refused(stepped):
 @pytest.mark.parametrize(("beats", "stops"), [(True, False), (False, True)])
 def test_the_board_stops_without_a_beat_of_the_application(stepped, beats, stops):
     """The service goes on: fingers and signs of life, but none of them from the application."""
-    client, _ = streaming(stepped, Tones())
+    client, _ = streaming(stepped, Own(two_tones))
     client.watch(0.1)
     run(client, stepped, 0.02)
     start = stepped.sample

@@ -36,10 +36,7 @@ SCENE_FILES = {"scene.toml", "recording.au", "drive.wav", "sensed.wav", "summary
 
 @pytest.fixture
 def run(capsys):
-    """Run the command line; returns its status, standard output and the lines of standard error.
-
-    A slow machine may say that it compiles, whenever that is.
-    """
+    """Run the command line: status, output, and the lines of its errors without that it compiles, on a slow machine."""
 
     def run(*arguments):
         status = cli.main([str(argument) for argument in arguments])

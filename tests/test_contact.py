@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from waves import phasor
 
 from hapticrender.jit import kernel
 from hapticrender.plants.sliding_contact import SlidingParameters, sliding_record, sliding_step
@@ -29,7 +30,7 @@ def measured(frequency, speed):
     """Responses at `frequency` (whole Hz) to a steady friction of 1 N: over the second of two seconds."""
     time = np.arange(2 * int(QUIET.rate)) / QUIET.rate
     out = run(np.cos(2 * np.pi * frequency * time), speed)[time >= 1.0]
-    return 2 * np.mean(out * np.exp(-2j * np.pi * frequency * time[time >= 1.0])[:, None], axis=0)
+    return phasor(out, frequency, QUIET.rate)
 
 
 @pytest.mark.parametrize(("frequency", "speed"), [(20.0, 5e-3), (170.0, 40e-3), (400.0, 160e-3)])

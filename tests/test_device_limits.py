@@ -1,8 +1,12 @@
 """Limits of a device: refused where a scene must pass them, held where it might, and no hindrance below."""
 
+from contextlib import nullcontext
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from electroadhesive import Screen
+from live_devices import Bench
 from other_plate import OtherPlate
 from scipy.signal import lfilter
 
@@ -41,47 +45,39 @@ MUST = {  # limit: what the scene needs of it (a tone over 20 time constants), m
 }
 
 
+def refused_beyond(asked, limit, message, room=0.01):
+    """A scene is prepared with a limit by `room` above `limit`, and refused with one below it."""
+    hr.prepare(asked((1 + room) * limit))
+    with pytest.raises(ValueError, match=message):
+        hr.prepare(asked((1 - room) * limit))
+
+
 @pytest.mark.parametrize("name", MUST)
 def test_a_scene_that_must_pass_a_limit_is_refused(name):
     """1 % below and above, a peak being rounded to 1.5 mA of 0.27 A; after 20 time constants the mean is 1 - e^-20."""
     least, message = MUST[name]
-    value = least(need_of(scene(72.0)))
-    hr.prepare(scene(72.0, limits={name: 1.01 * value, "rms_time": 0.1}))
-    with pytest.raises(ValueError, match=message):
-        hr.prepare(scene(72.0, limits={name: 0.99 * value, "rms_time": 0.1}))
+    limit = least(need_of(scene(72.0)))
+    refused_beyond(lambda value: scene(72.0, limits={name: value, "rms_time": 0.1}), limit, message)
 
 
 def test_a_short_scene_may_heat_a_coil_more():
     """The mean of a tenth of the time constant is 1 - e^-0.1 of the square: 0.31 of the rms."""
-    rms = need_of(scene(72.0)).drive / np.sqrt(2)
-    share = np.sqrt(-np.expm1(-0.1))
-    hr.prepare(scene(72.0, duration=1.0, limits={"rms_drive": 1.001 * share * rms, "rms_time": 10.0}))
-    with pytest.raises(ValueError, match="rms_drive"):
-        hr.prepare(scene(72.0, duration=1.0, limits={"rms_drive": 0.999 * share * rms, "rms_time": 10.0}))
+    rms = np.sqrt(-np.expm1(-0.1) / 2) * need_of(scene(72.0)).drive
+    asked = lambda value: scene(72.0, duration=1.0, limits={"rms_drive": value, "rms_time": 10.0})  # noqa: E731
+    refused_beyond(asked, rms, "rms_drive", 0.001)
 
 
 def test_a_recording_is_judged_by_the_hottest_part_of_it():
     """A burst of 72 Hz in silence; its mean over 0.1 s is that of the drive that plays it on the free plate."""
     time = np.arange(round(RATE)) / RATE
     burst = np.sin(2 * np.pi * 72.0 * time) * np.where(abs(time - 0.5) < 0.15, np.cos(np.pi * (time - 0.5) / 0.3), 0.0)
-    asked = hr.Scene(texture=Recorded(samples=burst, rate=RATE, amplitude=50e-6), duration=1.0)
-    need = needed(
-        hr.Scene(texture=asked.texture, duration=1.0, limits={"rms_time": 0.1}),
-        hr.prepare(asked).model,
-        hr.prepare(asked).bands,
-        asked.texture.waveform,
-    )
+    texture = Recorded(samples=burst, rate=RATE, amplitude=50e-6)
+    need = need_of(hr.Scene(texture=texture, duration=1.0, limits={"rms_time": 0.1}))
     tone = need_of(scene(72.0)).drive
     assert 0.4 * tone < need.rms < 0.71 * tone  # the top of the burst, but never more than its amplitude
-    for factor, fine in ((1.001, True), (0.999, False)):
-        limited = hr.Scene(
-            texture=asked.texture, duration=1.0, limits={"rms_drive": factor * need.rms, "rms_time": 0.1}
-        )
-        if fine:
-            hr.prepare(limited)
-        else:
-            with pytest.raises(ValueError, match=r"over 0.1 s, \[limits\] rms_drive"):
-                hr.prepare(limited)
+    asked = hr.Scene(texture=texture, duration=1.0)
+    limited = lambda value: replace(asked, limits={"rms_drive": value, "rms_time": 0.1})  # noqa: E731
+    refused_beyond(limited, need.rms, r"over 0.1 s, \[limits\] rms_drive", 0.001)
 
 
 def test_the_peak_is_held_under_a_finger_that_asks_for_more():
@@ -116,16 +112,10 @@ def test_below_its_limit_a_coil_plays_every_sample_as_without():
     np.testing.assert_array_equal(hr.render(limited).drive, free.drive)
 
 
-class Blind:
+class Blind(Bench):
     """A device without sensors."""
 
     rate, block, delay, drive_channels, sensed_channels = RATE, 50, 50, 2, 0
-
-    def __enter__(self):
-        return self
-
-    def __exit__(self, *exc):
-        pass
 
     def play(self, drive):
         return hr.Sensed(np.empty((self.block, 0)))
@@ -170,10 +160,7 @@ def test_single_samples_beyond_the_displacement_are_no_motion(count, stops):
 
     fields = {"rendering": {"probe": False}, "method": "paper-common"}  # it has no damper that would ring
     limited = scene(72.0, 10e-6, 1.0, limits={"displacement": 45e-6}, **fields)
-    if stops:
-        with pytest.raises(hr.DeviceFault, match="displacement"):
-            hr.render(limited, driver=OtherPlate(spoil=spoil))
-    else:
+    with pytest.raises(hr.DeviceFault, match="displacement") if stops else nullcontext():
         hr.render(limited, driver=OtherPlate(spoil=spoil))
 
 
@@ -190,9 +177,8 @@ def test_a_screens_current_is_limited_by_the_peak_of_its_carrier(name, share):
     """The rms of a carrier is its peak over the root of 2; bias and swing together need most."""
     shape = hr.prepare(friction("electroadhesion"), driver=Screen()).driver.shape
     most = shape(np.array([[shape.bias - shape.floor]])).item()
-    hr.prepare(friction("electroadhesion", **{name: 1.01 * share * most}))
-    with pytest.raises(ValueError, match=r"texture.amplitude asks for an attraction of .* N: must be <= .* A"):
-        hr.prepare(friction("electroadhesion", **{name: 0.99 * share * most}))
+    message = r"texture.amplitude asks for an attraction of .* N: must be <= .* A"
+    refused_beyond(lambda value: friction("electroadhesion", **{name: value}), share * most, message)
 
 
 @pytest.mark.parametrize(("name", "share"), [("peak_drive", 1.0), ("rms_drive", np.sqrt(0.5))])
@@ -201,9 +187,7 @@ def test_an_ultrasonic_plates_voltage_is_limited_by_the_peak_of_its_carrier(name
     with pytest.raises(ValueError, match=message) as refused:
         hr.prepare(friction("ultrasonic", **{name: 0.1 * share}))
     volts = float(str(refused.value).split("takes ")[1].split(" V")[0])
-    hr.prepare(friction("ultrasonic", **{name: 1.01 * share * volts}))
-    with pytest.raises(ValueError, match="must be <="):
-        hr.prepare(friction("ultrasonic", **{name: 0.99 * share * volts}))
+    refused_beyond(lambda value: friction("ultrasonic", **{name: value}), share * volts, "must be <=")
 
 
 def test_limits_that_a_device_cannot_keep_are_refused():

@@ -26,6 +26,7 @@ PLATE = {
     },
     "limits": {"peak_drive": 2.0, "rms_drive": 0.5, "rms_time": 20.0, "displacement": 4e-4},
 }
+KIND, DEVICE = '[profile]\nkind = "vt-plate"\n', '[device]\nkind = "vt-plate"\n'
 SCENE = """
 duration = 1.0
 {}
@@ -87,8 +88,8 @@ def test_a_scene_takes_what_the_file_says_and_what_it_says_itself_wins(plate, tm
             "device.profile = 'vt-plate': must be the name of a file that ends in .toml",
         ),
         ('[device]\nprofile = "a.toml"\nkind = "hybrid"', "device.kind = 'hybrid': must be left out beside profile"),
-        ('[device]\nkind = "vt-plate"\n[limits]\nrms_drive = 0', "limits.rms_drive = 0: must be a finite number > 0"),
-        ('[device]\nkind = "vt-plate"\n[calibration]\ngain = 1', "calibration.gain = 1: unknown key; known: delay"),
+        (DEVICE + "[limits]\nrms_drive = 0", "limits.rms_drive = 0: must be a finite number > 0"),
+        (DEVICE + "[calibration]\ngain = 1", "calibration.gain = 1: unknown key; known: delay"),
     ],
 )
 def test_a_scene_with_a_wrong_profile_gets_one_line(tmp_path, line, message):
@@ -102,21 +103,12 @@ def test_a_scene_with_a_wrong_profile_gets_one_line(tmp_path, line, message):
     ("text", "message"),
     [
         ("[device]\nmass = 0.03", "profile.kind is missing: must be the name of a renderer, such as 'vt-plate'"),
-        (
-            '[profile]\nkind = "vt-plate"\n[device]\nkind = "hybrid"',
-            "device.kind = 'hybrid': must be 'vt-plate', as in",
-        ),
-        (
-            '[profile]\nkind = "vt-plate"\nmeasured_on = "yesterday"',
-            "measured_on = 'yesterday': must be a date such as",
-        ),
-        ('[profile]\nkind = "vt-plate"\nfrom = 1', "profile.from = 1: unknown key; known: kind, measured_by"),
-        (
-            '[profile]\nkind = "vt-plate"\n[uncertainty]\nmass = 1.0',
-            r"uncertainty.mass: must be of a parameter in \[dev",
-        ),
-        ('[profile]\nkind = "vt-plate"\n[texture]', "texture = {}: must be one of the tables profile, device"),
-        ('[profile]\nkind = "vt-plate"\n[limits]\nrms_time = 0.0', "limits.rms_time = 0.0: must be a finite .* >= 0.1"),
+        (KIND + '[device]\nkind = "hybrid"', "device.kind = 'hybrid': must be 'vt-plate', as in"),
+        (KIND + 'measured_on = "yesterday"', "measured_on = 'yesterday': must be a date such as"),
+        (KIND + "from = 1", "profile.from = 1: unknown key; known: kind, measured_by"),
+        (KIND + "[uncertainty]\nmass = 1.0", r"uncertainty.mass: must be of a parameter in \[dev"),
+        (KIND + "[texture]", "texture = {}: must be one of the tables profile, device"),
+        (KIND + "[limits]\nrms_time = 0.0", "limits.rms_time = 0.0: must be a finite .* >= 0.1"),
         ("kind = ", "must be TOML"),
     ],
 )
@@ -150,7 +142,7 @@ def test_identify_writes_a_profile_that_keeps_the_limits(plate, tmp_path):
 def test_a_profile_that_a_run_contradicts_is_named(plate):
     stiff = {"stiffness_1": 23.5e3, "stiffness_2": 24e3}
     with pytest.warns(
-        hr.PlateMismatch, match=r"differs from its model, profile plate 3 \(A. Smith, 2026-11-22\),: the"
+        hr.PlateMismatch, match=r"differs from its model, profile plate 3 \(A. Smith, 2026-11-22\): the"
     ):
         hr.render(hr.Scene(**fields(plate), simulation=stiff))
 

@@ -1,10 +1,12 @@
 """Drivers chosen by a text, the same on the command line and in Python, and what `hapticrender devices` shows."""
 
 import sys
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from board import slow_board
+from live_devices import Bench
 from other_plate import OtherPlate
 from serial.tools import list_ports
 from serial.tools.list_ports_common import ListPortInfo
@@ -17,19 +19,13 @@ from hapticrender.drivers.serial import SerialDriver
 TONE = hr.Scene(texture=hr.Grating(frequency=47.0, amplitude=10e-6), duration=0.1, rendering={"probe": False})
 
 
-class Calibrated:
+class Calibrated(Bench):
     """A driver that is told what its device's profile says."""
 
     rate, block, drive_channels, sensed_channels = 5000.0, 1, 2, 0
 
     def __init__(self, argument="", *, drive_per_full_scale=3.0, delay=1, profile=None):
         self.argument, self.scale, self.delay, self.profile = argument, drive_per_full_scale, delay, profile
-
-    def __enter__(self):
-        return self
-
-    def __exit__(self, *exc):
-        pass
 
     def play(self, drive):
         return hr.Sensed(np.empty((1, 0)))
@@ -116,17 +112,6 @@ def test_the_command_line_finds_a_driver_in_its_own_folder(tmp_path, monkeypatch
     assert "--suite runs no scenes, on simulated devices" in capsys.readouterr().err
 
 
-class Entry:
-    """An entry point of a driver."""
-
-    def __init__(self, name, value):
-        self.name, self.value, self.group = name, f"there:{name}", "hapticrender.drivers"
-        self._value = value
-
-    def load(self):
-        return self._value
-
-
 def test_devices_shows_what_each_driver_finds(monkeypatch):
     class Broken(Calibrated):
         @classmethod
@@ -139,7 +124,10 @@ def test_devices_shows_what_each_driver_finds(monkeypatch):
             return []
 
     kinds = {"box": Calibrated, "card": Broken, "none": Empty, "plain": OtherPlate}
-    points = [Entry(name, kind) for name, kind in kinds.items()]
+    points = [
+        SimpleNamespace(name=name, value=f"there:{name}", group="hapticrender.drivers", load=lambda kind=kind: kind)
+        for name, kind in kinds.items()
+    ]
     known = devices.entry_points
     monkeypatch.setattr(
         devices, "entry_points", lambda group: points if group.endswith("drivers") else known(group=group)

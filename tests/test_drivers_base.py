@@ -1,5 +1,7 @@
 """The duties every driver shares: order, checks, and rest whatever happens."""
 
+from contextlib import nullcontext
+
 import numpy as np
 import pytest
 
@@ -36,15 +38,10 @@ class Diary(BaseDriver):
 ONES = np.ones((4, 2))
 
 
-def test_with_opens_plays_rests_and_closes_in_this_order():
-    with Diary() as driver:
+@pytest.mark.parametrize("nested", [False, True])
+def test_with_opens_plays_rests_and_closes_in_this_order_and_once(nested):
+    with Diary() as driver, driver if nested else nullcontext():
         assert driver.play(ONES).sensed.tolist() == [[8.0]] * 4
-    assert driver.entries == ["open", "play", "rest", "close"]
-
-
-def test_a_nested_with_neither_opens_twice_nor_closes_twice():
-    with Diary() as driver, driver:
-        driver.play(ONES)
     assert driver.entries == ["open", "play", "rest", "close"]
 
 

@@ -34,10 +34,6 @@ def played(driver, blocks):
     return held[: len(held) - driver.block]
 
 
-def run_script(script, **options):
-    return subprocess.run([sys.executable, "-c", textwrap.dedent(script)], timeout=120, **options)
-
-
 def largest_error(subtype):
     """Half a step: of the integers, of float32 between half and full scale; nothing for float64."""
     return 0.5 * FULL_SCALE * STEP[subtype]
@@ -116,7 +112,7 @@ def test_a_killed_process_leaves_what_it_played(tmp_path, ending):
                 driver.play(np.full((1000, 2), number / 128))
             os.kill(os.getpid(), signal.SIGKILL)
     """
-    done = run_script(script)
+    done = subprocess.run([sys.executable, "-c", textwrap.dedent(script)], timeout=120)
     assert done.returncode == -signal.SIGKILL
     played = np.repeat(np.arange(100) / 128, 1000)[:, None] * np.ones(2)
     held = read_back(path, full_scale=1.0)

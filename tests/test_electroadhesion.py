@@ -176,18 +176,6 @@ def test_a_resting_finger_shorts_its_gap_and_a_lifted_one_has_no_friction(level)
     assert not s.state["charge"].any()
 
 
-def test_tribometer_response_is_the_predicted_one():
-    """From drive to sensed at 100 Hz, linear under the square root; over whole turns of the second half second."""
-    speed = 0.02
-    finger = hr.Finger.sliding(speed=speed, normal_load=1.0, span=1.0)
-    s = screen(finger, ROOT, force_noise=0.0)
-    carrier = np.exp(2j * np.pi * 100 * np.arange(RATE) / RATE)
-    sensed = s.run(0.3 * carrier.real[:, None]).sensed[:, 0]
-    gain = 2 * np.mean((sensed * carrier.conj())[RATE // 2 :]) / 0.3
-    loop = s.parameters.gain(1.0) / ROOT.gain
-    assert gain == pytest.approx(loop * MU * s.parameters.frequency_response(100.0, speed), rel=SUMMED)
-
-
 @pytest.mark.parametrize(("level", "junk"), [("envelope", np.nan), ("carrier", -np.inf), ("carrier", 1e308)])
 def test_a_drive_that_is_no_number_counts_as_zero(level, junk):
     played = screen(level=level, force_noise=0.0).run(np.full((500, 1), junk))

@@ -1,23 +1,23 @@
-"""Electroadhesion end to end: tones on the tribometer, gratings, recordings, the square root, refusals."""
+"""Electroadhesion end to end: tones on the tribometer, without a force sensor, and as a carrier in a file; refusals."""
+
+from fractions import Fraction
 
 import numpy as np
 import pytest
 from electroadhesive import FORCE, MU, RATE, SLIDE, SPEED, Screen, band, tone
+from held import amplitude
+from waves import phasor
 
 import hapticrender as hr
-from hapticrender.plants.electroadhesion import ElectroadhesionParameters
+from hapticrender import loop
+from hapticrender.drivers.base import BaseDriver
+from hapticrender.drivers.wavefile import WaveFileDriver, read_back
+from hapticrender.plants.electroadhesion import DRY, MOIST, NORMAL, ElectroadhesionParameters
+from hapticrender.renderers.electroadhesion import ElectroadhesionRenderer
 
 # A millinewton of noise on the tribometer, white over 10 kHz, in an observer whose pole lies at 10 Hz: the envelope's
 # standard deviation is 1e-3 sqrt(4 * 10 pi/2/10e3) = 0.08 mN; four of them in 0.1 N.
 NOISE = 4 * 0.8e-4 / FORCE
-
-
-def harmonics(recording, frequency):
-    """Amplitudes of the attraction's first two harmonics over the last second, friction's lag undone."""
-    friction = recording.motion[-RATE:, 0]
-    lines = 2 * abs(np.fft.rfft(friction))[[frequency, 2 * frequency]] / len(friction)
-    lag = ElectroadhesionParameters().lag_response(np.array([frequency, 2 * frequency]), SPEED)
-    return lines / abs(lag) / MU
 
 
 @pytest.mark.parametrize(
@@ -41,20 +41,6 @@ def test_a_friction_coefficient_other_than_assumed_is_corrected():
     assert band(recording)["rms_error_friction"] < NOISE
 
 
-NAIVE = {"square_root": "off", "headroom": 1.0, "floor": 0.0}
-
-
-def test_without_the_square_root_a_quarter_of_the_friction_is_its_second_harmonic():
-    """Open loop at full swing, which the limiter sets: ``(1 + sin)^2`` is 1.5 + 2 sin - cos(2)/2, to rounding."""
-    second, frequency = {}, 50
-    for name, plant in (("off", NAIVE), ("on", NAIVE | {"square_root": "on"})):
-        recording = hr.render(tone(float(frequency), **plant), driver=Screen(block=8))
-        first, higher = harmonics(recording, frequency)
-        second[name] = higher / first
-    assert second["off"] == pytest.approx(0.25, rel=1e-9)
-    assert second["on"] < 1e-12  # rounding
-
-
 @pytest.mark.parametrize(
     ("scene", "message"),
     [
@@ -74,10 +60,7 @@ def test_what_the_screen_cannot_do_is_refused(scene, message):
 
 @pytest.mark.parametrize(("device", "lifted"), [("electroadhesion", True), ("ultrasonic", False)])
 def test_a_finger_that_rests_or_is_away_winds_nothing_up(device, lifted):
-    """Slides, rests (or is lifted) for 1.2 s, slides on: nothing saturates.
-
-    0.2 s later the texture is back, within 1 % as the accuracy suite has it.
-    """
+    """For 1.2 s; nothing saturates, and 0.2 s later the texture is back, within 1 % as the accuracy suite has it."""
     time = np.arange(0.0, 3.2, 1e-3)
     way = np.cumsum(np.where((time < 1.2) | (time > 2.4), 0.08, 0.0)) * 1e-3
     position = abs(way % 0.1 - 0.05) - 0.025
@@ -87,7 +70,121 @@ def test_a_finger_that_rests_or_is_away_winds_nothing_up(device, lifted):
     recording = hr.render(hr.Scene(texture=texture, finger=finger, duration=3.2, device=device))
     late = recording.time > 0.3  # the first touch finds a loop that knows nothing yet
     assert not (recording.flags[late] & hr.Flag.SATURATED).any()
-    back = recording.motion[recording.time >= 2.6, 0]
-    whole = int(len(back) * 100 / recording.rate) * recording.rate / 100
-    turn = np.exp(-2j * np.pi * 100.0 * np.arange(int(whole)) / recording.rate)
-    assert abs(2 * np.mean(back[: int(whole)] * turn)) == pytest.approx(10e-3 / 0.64, rel=0.01)
+    assert amplitude(recording.motion, 100.0, 0.6, recording.rate)[0] == pytest.approx(10e-3 / 0.64, rel=0.01)
+
+
+SENSORLESS = {"sensor": "impedance", "level": "carrier"}
+REST = 0.2  # s
+REST_THEN_SLIDE = hr.Finger.sampled([0.0, 0.0, 0.1], times=[0.0, REST, REST + 0.1 / SPEED], normal_load=1.0)
+BOUND = 0.03  # bias 2 % and standard deviation 1.3 % of the gap estimator
+BEYOND = 1e-3  # of a force: the law's D ends at s^2
+WANTED = FORCE / MU / abs(ElectroadhesionParameters().lag_response(100.0, SPEED))  # N of attraction at 100 Hz
+
+
+def swing(attraction):
+    """Amplitude at 100 Hz over the last tenth of a second."""
+    return abs(phasor(attraction[-RATE // 10 :], 100.0, RATE))
+
+
+def sensed(seconds=1.2, finger=REST_THEN_SLIDE, **plant):
+    """Drive, flags and true attraction (N) of a run, sample by sample; the plant keeps that of the whole run."""
+    session = loop.prepare(tone(100.0, finger=finger, duration=seconds, **SENSORLESS, **plant))
+    screen = session.driver.plant
+    drive, _, flags, _ = screen.closed_loop(session.controller(), np.zeros(session.samples))
+    return drive[:, 0], flags, screen.motion[:, 1]
+
+
+@pytest.mark.parametrize(
+    ("leak", "area", "gap"), [(DRY, 0.7, 3e-6), (DRY, 1.3, 0.5e-6), (NORMAL, 0.7, 0.5e-6), (NORMAL, 1.3, 3e-6)]
+)
+def test_the_true_attraction_is_within_3_percent_of_the_wanted_one(leak, area, gap):
+    """Over area +-30 % and gaps of 0.5 to 3 um."""
+    _, flags, attraction = sensed(gap_resistance=leak, area_scale=area, gap_thickness=gap)
+    assert swing(attraction) == pytest.approx(WANTED, rel=BOUND)
+    assert not (flags[int((REST + 0.01) * RATE) :] & hr.Flag.OPEN_LOOP).any()
+    assert not (flags & hr.Flag.SATURATED).any()
+
+
+def test_a_swipe_shows_its_area_where_it_turns():
+    """It starts in full motion, so the first stroke is open loop; then the finger rests for 8 ms below 1 mm/s."""
+    finger = hr.Finger.swiping(frequency=1.0, speed=0.05, normal_load=1.0)
+    _, flags, _ = sensed(seconds=1.2, finger=finger, area_scale=0.7)
+    guessed = (flags & hr.Flag.OPEN_LOOP) > 0
+    assert guessed[1:2500].all()  # it turns after 0.25 s
+    assert not guessed[2600:7400].any()
+    assert guessed[7480:7520].all()
+    assert not guessed[7600:].any()
+
+
+def test_a_moist_finger_is_flagged_and_played_open_loop():
+    """Its share of 0.13 of the attraction would ask for seven times the drive; the loop sees what it expects."""
+    drive, flags, attraction = sensed(gap_resistance=MOIST)
+    assert (flags[1:] == hr.Flag.OPEN_LOOP).all()  # nor is it driven to its limit
+    ratio = ElectroadhesionParameters(gap_resistance=MOIST).gain(1.0) / ElectroadhesionParameters().gain(1.0)
+    assert swing(drive) == pytest.approx(WANTED, rel=BOUND)
+    assert swing(attraction) / swing(drive) == pytest.approx(ratio, rel=BEYOND)
+    assert ratio < 0.15
+
+
+FAST = 192_000  # Hz
+FULL = 10e-3  # A
+
+
+def played(tmp_path, **plant):
+    """The recording of half a second of 100 Hz, the scene, and the file's samples (A) that belong to it."""
+    driver = WaveFileDriver(tmp_path / "carrier.wav", rate=FAST, drive_channels=1, full_scale=FULL, subtype="DOUBLE")
+    scene = tone(100.0, duration=0.5, output="carrier", **plant)
+    recording = hr.render(scene, driver=driver)
+    return recording, scene, read_back(driver.path, full_scale=driver.full_scale)[:, 0]
+
+
+def held(recording, scene):
+    """Envelope of the current (A) that the recorded drive asks for, at the file's rate."""
+    envelope = ElectroadhesionRenderer().read(scene, None).compensation(recording.drive[:, 0])
+    return np.repeat(envelope, round(FAST / recording.rate))
+
+
+def test_the_attraction_of_the_file_is_the_wanted_force(tmp_path):
+    """Mean of g I(t)^2 cos^2 over whole turns of the carrier: bias/2 + half of 100 Hz, without harmonics.
+
+    To the rounding of the sums.  A sample of the drive is held for 16 of the file: sinc(f/rate)/sinc(f/file's rate).
+    """
+    recording, scene, file = played(tmp_path)
+    root = ElectroadhesionRenderer().read(scene, None).compensation
+    force = 2 * root.gain * (DROOP * file[FAST // 5 :][: FAST // 5]) ** 2  # 0.2 s from 0.2 s on
+    line, summed = 2 * np.fft.rfft(force) / len(force), len(force) * np.finfo(float).eps
+    assert abs(line[0]) / 2 == pytest.approx(root.bias, rel=summed)
+    last = recording.drive[-round(recording.rate / 10) :, 0]
+    wanted = 2 * abs(np.mean(last * np.exp(-2j * np.pi * 100 * np.arange(len(last)) / recording.rate)))
+    hold = np.sinc(100 / recording.rate) / np.sinc(100 / FAST)
+    assert abs(line[20]) == pytest.approx(wanted * hold, rel=summed)
+    assert abs(line[40]) < summed * abs(line[20])
+
+
+def test_the_carrier_starts_at_its_crest_and_keeps_its_phase(tmp_path):
+    """Every sample is the envelope's times cos(2 pi k 5/48).
+
+    A phase counted in doubles modulo a turn loses at most 2^-53 turns a block, 1e-12 rad in these 1000 blocks.
+    """
+    recording, scene, file = played(tmp_path)
+    wanted = held(recording, scene)
+    turns = np.array([float(Fraction(5 * k % 48, 48)) for k in range(48)])
+    carrier = np.cos(2 * np.pi * np.resize(turns, len(wanted)))
+    np.testing.assert_allclose(file[: len(wanted)], wanted * carrier / DROOP, rtol=0, atol=1e-11 * FULL)
+    assert file[0] == pytest.approx(wanted[0] / DROOP)
+
+
+DROOP = np.sinc(5 / 48)  # of a carrier behind the file's hold: the driver makes up for it
+
+
+@pytest.mark.parametrize(
+    ("rate", "sensed", "message"),
+    [
+        (79_999, 0, r"driver.rate = 79999: must be >= 80000 Hz where output = 'carrier', 4 samples a turn"),
+        (FAST, 1, r"driver.sensed_channels = 1: must be 0 where output = 'carrier'"),
+    ],
+)
+def test_a_driver_that_cannot_carry_it_is_refused(rate, sensed, message):
+    device = BaseDriver(rate=rate, drive_channels=1, sensed_channels=sensed, block=96)
+    with pytest.raises(ValueError, match=message):
+        hr.render(tone(100.0, output="carrier"), driver=device)

@@ -5,16 +5,11 @@ import tomllib
 
 import pytest
 from board import FIRMWARE, ROOT
-from laws import FINGERS, TEXTURES, Exports
+from laws import FINGERS, TEXTURES
 
 import hapticrender as hr
 from hapticrender import cli
 from hapticrender.export import board_design, export, sources
-
-
-@pytest.fixture(scope="module")
-def exports(tmp_path_factory):
-    return Exports(tmp_path_factory.mktemp("exports"))
 
 
 def test_export_says_what_it_writes_and_keeps_what_was_changed(exports, tmp_path):

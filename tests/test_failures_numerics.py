@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from held import fixed, hold
+from waves import phasor
 
 import hapticrender as hr
 from hapticrender.plants.plate import PlateParameters
@@ -41,8 +42,7 @@ def test_controlling_both_coordinates_holds_the_ends():
     errors = {}
     for method in ("paper-common", "h2"):
         motion = hold(method, fixed((147.0, 5e-5)), 6.0, IDEAL, finger=finger)[1][-5000:]
-        n = np.arange(len(motion))
-        found = 2 * np.mean(motion * np.exp(-2j * np.pi * 147 * n / RATE)[:, None], axis=0)
+        found = phasor(motion, 147.0)
         errors[method] = abs(found / found[0] - 1).max()
     assert errors["paper-common"] > 0.3
     assert errors["h2"] < 1e-4

@@ -4,6 +4,7 @@ Sensors and coils that change during a run are in test_supervisor.py; what the s
 the application, the process, the device that goes away, and what the probe had not been tried on.
 """
 
+import os
 import signal
 import subprocess
 import sys
@@ -22,10 +23,7 @@ TESTS = Path(__file__).resolve().parent
 
 
 class Logged(OtherPlate):
-    """A plate that keeps what it was played in a file, as a device would feel it; it runs in real time from there on.
-
-    ``__exit__`` leaves the device as it is: what is zero is the loop's doing.
-    """
+    """A plate that keeps what it was played, in a file as well; ``__exit__`` leaves it as it is: zero is the loop's."""
 
     probe = False
 
@@ -112,12 +110,9 @@ def test_a_signal_to_the_process_ends_in_zero_drive(tmp_path, number, status):
     (tmp_path / "long.toml").write_text(scene(duration=600.0).to_toml())
     command = [sys.executable, "-m", "hapticrender", "render", tmp_path / "long.toml", "--out", out]
     command += ["--driver", f"test_faults:logged:{log}"]
-    script = f"import sys; sys.path.insert(0, {str(TESTS)!r}); sys.argv = sys.argv[1:]; " + (
-        "import signal; signal.signal(signal.SIGINT, signal.default_int_handler); "
-        "from hapticrender.cli import main; sys.exit(main(sys.argv))"
-    )
-    command = [sys.executable, "-c", script, *map(str, command[3:])]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as child:
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    paths = {"PYTHONPATH": os.pathsep.join(map(str, (TESTS, TESTS.parent)))}
+    with subprocess.Popen(command, **pipes, env=os.environ | paths) as child:
         end = time.monotonic() + 120
         while not (log.exists() and log.stat().st_size > 16 * RATE):  # a second of both coils
             assert child.poll() is None, child.communicate()
@@ -195,23 +190,16 @@ def test_a_gain_of_1_6_during_a_run_goes_on():
 
 
 class Held(StrangersPlate):
-    """A driver that repeats each value of its sensors, `hold` samples long."""
+    """A driver that repeats each value of its sensors, `hold` samples long, and one for ever from `dead_from` on."""
 
-    hold, count, held = 1, 0, None
+    hold, count, held, dead_from = 1, 0, None, np.inf
 
     def play(self, drive):
         sensed = super().play(drive)
-        if self.count % self.hold == 0:
+        if self.count % self.hold == 0 and self.count <= self.dead_from:
             self.held = sensed.sensed.copy()
         self.count += 1
-        dead = self.count > self.dead_from
-        return sensed._replace(sensed=self.held if not dead else 0 * self.held + self.stuck())
-
-    dead_from = np.inf
-
-    def stuck(self):
-        self.kept = getattr(self, "kept", self.held.copy())
-        return self.kept
+        return sensed._replace(sensed=self.held)
 
 
 @pytest.mark.parametrize(("rate", "hold", "noise"), [(20e3, 1, 0.0), (5e3, 5, 1e-6), (5e3, 10, 1e-6)])
@@ -229,17 +217,3 @@ def test_a_sensor_that_freezes_is_found_within_10_ms_even_so(rate, hold):
     with pytest.raises(hr.DeviceFault, match="one value repeats") as stopped:
         hr.render(scene(72.0, 20e-6, 0.4), driver=plate)
     assert 0.0 < stopped.value.time - 0.2 <= 10e-3
-
-
-@pytest.mark.parametrize("sensors", [-np.eye(2), np.diag([-1.0, 1.0])])
-def test_a_sensor_inverted_at_a_resonance_is_stopped(sensors):
-    """Found: 3 ms; by the slow test of growth alone 0.31 s, at 60 to 355 um."""
-
-    def invert(sample, sensed):
-        return sensed._replace(sensed=sensed.sensed @ sensors.T) if sample >= 0.5 * RATE else sensed
-
-    plate = Logged(spoil=invert)
-    with pytest.raises(hr.DeviceFault, match="the samples are suddenly -.* times the motion") as stopped:
-        hr.render(scene(189.0, 50e-6, 2.0), driver=plate)
-    assert 0.0 < stopped.value.time - 0.5 < 8e-3
-    assert not played_after(plate, stopped.value.time + 10e-3 + 2 / RATE).any()

@@ -156,16 +156,16 @@ def test_too_few_carriers_are_refused_and_enough_are_not(rng, order):
 
 def test_what_makes_no_sense_is_refused(rng):
     data = make_impedance(rng, LIGHT_SECOND, 3, (0.1, 0.49))
-    with pytest.raises(ValueError, match="standard_error = 0.0: must be > 0 N s/m"):
-        hr.fit_finger(replace(data, standard_error=0 * data.standard_error))
-    with pytest.raises(ValueError, match="0 different carriers with data at loads from 3 to 9 N"):
-        hr.fit_finger(data, loads=(3.0, 9.0))
-    with pytest.raises(ValueError, match="order = 3: must be 2, 4 or None"):
-        hr.fit_finger(data, 3)
-    with pytest.raises(TypeError, match="impedance = 3: must be what analyse_finger returns"):
-        hr.fit_finger(3)
-    with pytest.raises(ValueError, match="loads = .*: must be two loads in N"):
-        hr.fit_finger(data, loads=(1.0, 0.5))
+    sure = replace(data, standard_error=0 * data.standard_error)
+    for error, message, arguments in (
+        (ValueError, "standard_error = 0.0: must be > 0 N s/m", {"impedance": sure}),
+        (ValueError, "0 different carriers with data at loads from 3 to 9 N", {"loads": (3.0, 9.0)}),
+        (ValueError, "order = 3: must be 2, 4 or None", {"order": 3}),
+        (TypeError, "impedance = 3: must be what analyse_finger returns", {"impedance": 3}),
+        (ValueError, "loads = .*: must be two loads in N", {"loads": (1.0, 0.5)}),
+    ):
+        with pytest.raises(error, match=message):
+            hr.fit_finger(**{"impedance": data} | arguments)
     with pytest.raises(ValueError, match="level = 1: must be > 0 and < 1"):
         hr.fit_finger(data, 2).interval("mass", 1)
     with pytest.raises(ValueError, match="phalanx_mass.*: must be one of mass, damping, stiffness, load_exponent"):

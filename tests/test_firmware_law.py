@@ -14,36 +14,26 @@ from laws import (
     RATE,
     SAMPLES,
     TEXTURES,
-    Exports,
     White,
     ahead_of,
     close,
     kernel_of,
 )
-from other_plate import OtherPlate
-from scipy.signal import butter, sosfiltfilt
+from test_supervisor import Rewired
+from waves import waveform_error
 
 import hapticrender as hr
-from hapticrender.control.supervisor_kernel import (
-    ACTIVE,
-    FROZEN,
-    INCONSISTENT,
-    INVALID,
-    INVERTED,
-    OVERMOTION,
-    RESCALED,
-    RINGING,
-    SWAPPED,
-)
+from hapticrender.control import supervisor_kernel as causes
 from hapticrender.plants.plate import Plate, PlateParameters
 from hapticrender.protocols import Flag
 
 LOW_LIMIT = 0.05  # A: every texture here needs more
 
 
-@pytest.fixture(scope="module")
-def exports(tmp_path_factory):
-    return Exports(tmp_path_factory.mktemp("exports"))
+def assert_same(found, drive, flags):
+    """Drive (A) to what rounding leaves, 2e-13 A, and flags to the bit."""
+    assert abs(found[0][: len(drive)] - drive).max() < 1e-9
+    assert np.array_equal(found[1], flags)
 
 
 CASES = [(name, finger, limit) for name in TEXTURES for finger in FINGERS for limit in (None, LOW_LIMIT)]
@@ -53,16 +43,14 @@ CASES = [case for case in CASES if case not in (("grating", "touch", None), ("gr
 
 @pytest.mark.parametrize(("name", "finger", "limit"), CASES)
 def test_double_equals_the_kernel(exports, name, finger, limit):
-    """Sample for sample on what the kernel's plate showed; rounding leaves 2e-13 A."""
+    """Sample for sample on what the kernel's plate showed."""
     texture = TEXTURES[name]
     drive, flags, signals, _ = close(kernel_of(exports, name, limit), FINGERS[finger], texture)
     law = exports.law(name, "double")
     if limit is not None:
         assert law.code.law_limit(law.address, limit)
     sensed, position = (np.ascontiguousarray(array) for array in (signals.sensed, signals.position))
-    found, found_flags = law.run(sensed, position, ahead_of(texture))
-    assert abs(found[:-1] - drive[1:]).max() < 1e-9
-    assert np.array_equal(found_flags, flags)
+    assert_same(law.run(sensed, position, ahead_of(texture)), drive[1:], flags)
     assert abs(drive).max() > 0.01, "nothing was played"
     assert np.isfinite(position).any()
     assert (limit is not None) == bool((flags & Flag.SATURATED).any())
@@ -75,9 +63,8 @@ def test_double_equals_the_kernel_on_other_devices(exports, device):
     plate = Plate(parameters, FINGERS["slide"], seed=1)
     drive, _, flags, signals = plate.closed_loop(kernel_of(exports, device), np.zeros(5000))
     sensed, position = (np.ascontiguousarray(array) for array in (signals.sensed, signals.position))
-    found, found_flags = exports.law(device, "double").run(sensed, position, np.zeros(5000), parameters.coils)
-    assert abs(found[:-1] - drive[1:]).max() < 1e-9
-    assert np.array_equal(found_flags, flags)
+    found = exports.law(device, "double").run(sensed, position, np.zeros(5000), parameters.coils)
+    assert_same(found, drive[1:], flags)
     assert np.isfinite(position).any()
 
 
@@ -93,23 +80,35 @@ def test_double_equals_the_kernel_through_faults(exports, rng):
     position[[900, 901, 1000]] = np.nan, 0.9, 2e3
     waveform[[500, 2000]] = np.nan, 2e3
     drive, _, flags = kernel_of(exports, "white").run(sensed, position, waveform)
-    found, found_flags = exports.law("white", "double").run(sensed, position, waveform)
-    assert abs(found - drive).max() < 1e-9
-    assert np.array_equal(found_flags, flags)
-    assert (found[1720:1750] == 0.0).all()
+    found = exports.law("white", "double").run(sensed, position, waveform)
+    assert_same(found, drive, flags)
+    assert (found[0][1720:1750] == 0.0).all()
     assert (flags & Flag.NONFINITE).any()
     assert (flags & Flag.SENSOR_CLIPPED).any()
 
 
 FAULTS = {
     "none": (0, lambda sensed: sensed),
-    "not finite": (INVALID, lambda sensed: np.nan * sensed),
-    "frozen": (FROZEN, lambda sensed: 0.0 * sensed + 1e-6),
-    "inverted": (INCONSISTENT, lambda sensed: -sensed),
-    "swings far": (OVERMOTION, lambda sensed: 0.95e-3 * np.sin(0.12 * np.arange(len(sensed)))),
-    "rings": (RINGING, lambda sensed: sensed + 15e-6 * np.sin(1.6 * np.arange(len(sensed)))),
-    "another tone": (ACTIVE, lambda sensed: 40e-6 * np.sin(0.2 * np.arange(len(sensed)))),
+    "not finite": (causes.INVALID, lambda sensed: np.nan * sensed),
+    "frozen": (causes.FROZEN, lambda sensed: 0.0 * sensed + 1e-6),
+    "inverted": (causes.INCONSISTENT, lambda sensed: -sensed),
+    "swings far": (causes.OVERMOTION, lambda sensed: 0.95e-3 * np.sin(0.12 * np.arange(len(sensed)))),
+    "rings": (causes.RINGING, lambda sensed: sensed + 15e-6 * np.sin(1.6 * np.arange(len(sensed)))),
+    "another tone": (causes.ACTIVE, lambda sensed: 40e-6 * np.sin(0.2 * np.arange(len(sensed)))),
 }
+
+
+def assert_both_stop(exports, kind, cause, sensed, position):
+    """The library's supervised law and the one in C for the same cause; in double it is sample for sample."""
+    n, controller = len(sensed), exports.rendering("tones").controller()
+    drive, _, flags = controller.run(sensed, position, np.zeros(n))
+    law = exports.law("tones", kind, "supervised")
+    found, found_flags = law.run(sensed, position, np.zeros(n))
+    assert law.code.supervised_cause(law.address) == cause == (controller.fault.cause if controller.fault else 0)
+    stops = [np.argmax(each & Flag.STOPPED) for each in (flags, found_flags)]
+    assert abs(np.diff(stops)) <= (0 if kind == "double" else 5)
+    if kind == "double":
+        assert_same((found, found_flags), drive, flags)
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -121,69 +120,28 @@ def test_the_supervisor_equals_the_librarys(exports, fault, kind):
     signals = close(kernel_of(exports, "tones"), FINGERS["slide"], texture)[2]
     sensed, position = signals.sensed[:9000].copy(), np.ascontiguousarray(signals.position[:9000])
     sensed[4500:, 0] = disturb(sensed[4500:, 0])
-    controller = exports.rendering("tones").controller()
-    drive, _, flags = controller.run(sensed, position, np.zeros(9000))
-    law = exports.law("tones", kind, "supervised")
-    found, found_flags = law.run(sensed, position, np.zeros(9000))
-    assert law.code.supervised_cause(law.address) == cause == (controller.fault.cause if controller.fault else 0)
-    stops = [np.argmax(each & Flag.STOPPED) for each in (flags, found_flags)]
-    assert abs(np.diff(stops)) <= (0 if kind == "double" else 5)
-    if kind == "double":
-        assert abs(found - drive).max() < 1e-9
-        assert np.array_equal(found_flags, flags)
-
-
-class Rewired(OtherPlate):
-    """A plate whose sensors and coils are multiplied by matrices after 0.9 s; not probed."""
-
-    probe = False
-
-    def __init__(self, shown, moved, **finger):
-        super().__init__(seed=1, **finger)
-        self.shown, self.moved = shown, moved
-
-    def play(self, drive):
-        if len(self.played) == 4500:
-            self._gamma, self._show = self._gamma @ self.moved, self.shown @ self._show
-        return super().play(drive)
+    assert_both_stop(exports, kind, cause, sensed, position)
 
 
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize(
     ("shown", "moved", "touch", "cause", "named"),
     [
-        (-np.eye(2), np.eye(2), None, RESCALED, "sensor 1 and 2"),
-        (np.eye(2), -np.eye(2), None, INVERTED, "actuator 1 and 2"),
-        (np.eye(2)[::-1], np.eye(2), (2.0, 0.05), SWAPPED, "sensor 1 and 2"),
-        (np.eye(2), np.eye(2)[::-1], (0.3, -0.05), SWAPPED, "sensor 1 and 2"),
+        (-np.eye(2), np.eye(2), None, causes.RESCALED, "sensor 1 and 2"),
+        (np.eye(2), -np.eye(2), None, causes.INVERTED, "actuator 1 and 2"),
+        (np.eye(2)[::-1], np.eye(2), (2.0, 0.05), causes.SWAPPED, "sensor 1 and 2"),
+        (np.eye(2), np.eye(2)[::-1], (0.3, -0.05), causes.SWAPPED, "sensor 1 and 2"),
     ],
     ids=["sensors inverted", "coils inverted", "sensors swapped", "coils swapped"],
 )
 def test_changes_of_gains_stop_both(exports, shown, moved, touch, cause, named, kind):
     """The sensors of a closed loop that the library stopped, played back to both; touched: load (N), place (m)."""
-    rendering = exports.rendering("tones")
     tilt = {"finger": (4e-3, 1.5, 300.0), "load": touch[0], "position": touch[1]} if touch else {}
-    scene, driver = replace(rendering.scene, finger=hr.Finger.absent(), duration=1.0), Rewired(shown, moved, **tilt)
+    scene = replace(exports.rendering("tones").scene, finger=hr.Finger.absent(), duration=1.0)
     with pytest.raises(hr.DeviceFault, match=named) as stopped:
-        hr.render(scene, driver=driver)
+        hr.render(scene, driver=Rewired(shown, moved, start=0.9, seed=1, **tilt))
     sensed = np.ascontiguousarray(stopped.value.recording.sensed)
-    n, position = len(sensed), np.full(len(sensed), np.nan)
-    controller, law = rendering.controller(), exports.law("tones", kind, "supervised")
-    drive, _, flags = controller.run(sensed, position, np.zeros(n))
-    found, found_flags = law.run(sensed, position, np.zeros(n))
-    assert law.code.supervised_cause(law.address) == cause == controller.fault.cause
-    stops = [np.argmax(each & Flag.STOPPED) for each in (flags, found_flags)]
-    assert abs(np.diff(stops)) <= (0 if kind == "double" else 5)
-    if kind == "double":
-        assert abs(found - drive).max() < 1e-9
-
-
-def error(motion, reference, start=1.0):
-    """Rms of the centre's deviation, 20-500 Hz, over that of the reference, from `start` (s) on."""
-    sos = butter(4, [20, 500], "bandpass", fs=RATE, output="sos")
-    deviation, reference = sosfiltfilt(sos, motion - reference), sosfiltfilt(sos, reference)
-    late = slice(round(start * RATE), None)
-    return np.sqrt((deviation[late] ** 2).mean() / (reference[late] ** 2).mean())
+    assert_both_stop(exports, kind, cause, sensed, np.full(len(sensed), np.nan))
 
 
 def reference_of(texture, finger):
@@ -204,7 +162,7 @@ def test_float_is_as_accurate_as_double(exports, name, finger, limit):
         if limit is not None:
             law.code.law_limit(law.address, limit)
         plate = close(law, FINGERS[finger], texture, bits=12)[3]
-        errors[kind] = error(plate.motion[:, 0], reference_of(texture, FINGERS[finger]))
+        errors[kind] = waveform_error(plate.motion[:, 0], reference_of(texture, FINGERS[finger]), 1.0)
     assert errors["float"] < 1.2 * errors["double"]
 
 

@@ -7,7 +7,7 @@ import subprocess
 import numpy as np
 import pytest
 from board import ROOT, compile_c
-from laws import FINGERS, PARTS, RATE, Exports
+from laws import FINGERS, PARTS, RATE
 
 import hapticrender as hr
 from hapticrender.bands import Bands
@@ -18,11 +18,6 @@ CROSS, QEMU = "arm-none-eabi-gcc", "qemu-system-arm"
 SIZE = '#include <stdio.h>\n#include "law.h"\nint main(void) { return printf("%zu", sizeof(law_t)) < 0; }\n'
 COUNTS = ("nops", "free", "new", "touched", "most", "textures", "frame")
 NOISE = 0.7e-6 * np.sqrt(4 * np.pi * 10.0 / RATE)  # m: mean of two sensors, times the root of the observer's gain
-
-
-@pytest.fixture(scope="module")
-def exports(tmp_path_factory):
-    return Exports(tmp_path_factory.mktemp("exports"))
 
 
 def cross_tools():
@@ -77,10 +72,7 @@ def bank(count):
 
 
 def test_eight_bands_leave_a_third_of_a_cortex_m4(tmp_path):
-    """At 168 MHz and 5 kHz a sample has 33 600 cycles; an instruction takes at most 1.6 (benchmarks/board.py: 1.51).
-
-    The mean while a contact is new is the most that a law takes for long.
-    """
+    """At 168 MHz and 5 kHz a sample has 33 600 cycles, 1.6 of them an instruction at most (benchmarks/board.py)."""
     found = measured(built(tmp_path, bank(8), "measure-m4.elf"))
     # the difference of two counts, of which each is that of two readings of a timer of 40 ns: two of 1/1.6
     assert found["nops"][0] == pytest.approx(1000.0, abs=1.26), "instructions are not what is counted"
@@ -101,7 +93,6 @@ def test_the_board_fits_into_the_stated_memory(board):
     """128 kB of RAM with 8 kB for the stack, which takes less than 1 kB, and for what the machine itself needs."""
     size = subprocess.run([CROSS.replace("gcc", "size"), board], capture_output=True, text=True, check=True).stdout
     flash, data, zeroed = map(int, size.splitlines()[1].split()[:3])
-    print(f"flash {flash + data} bytes, RAM {data + zeroed} bytes")
     assert data + zeroed < (128 - 8) * 1024
     assert f"{(data + zeroed) / 1e3:.1f} kB of RAM" in (ROOT / "docs" / "firmware.md").read_text(encoding="utf-8")
 

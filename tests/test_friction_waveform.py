@@ -1,20 +1,18 @@
-"""Whole waveforms on devices that modulate friction: broadband recordings, ridges under swipes, and what a turn costs.
-
-The bound is what the project has set itself: 3 % of the waveform, from the true friction, without shift or gain fit.
-"""
+"""Whole waveforms as friction: recordings, ridges under swipes and turns, of the true friction, without any fit."""
 
 import numpy as np
 import pytest
+import waves
 from electroadhesive import Screen
 from scipy.signal import butter, hilbert, lfilter, sosfiltfilt
-from test_ultrasonic_rendering import Watched
+from test_ultrasonic_rendering import Watched, friction_of
 
 import hapticrender as hr
 from hapticrender.plants.surface import SurfaceParameters
 from hapticrender.plants.ultrasonic import UltrasonicParameters
 
 RATE = 5000.0
-MUST = 0.03
+MUST = 0.03  # of the waveform: what the project has set itself
 FINGERS = {
     "light": hr.Finger.sliding(speed=0.04, normal_load=0.25, span=0.1),
     "usual": hr.Finger.sliding(speed=0.08, normal_load=0.4, span=0.18),
@@ -29,10 +27,7 @@ DEVICES = {
 
 def white(seconds=2.0):
     """Noise of 20 to 400 Hz, 3 um rms."""
-    lines = np.fft.rfft(np.random.default_rng(3).standard_normal(round(seconds * RATE)))
-    frequency = np.fft.rfftfreq(round(seconds * RATE), 1 / RATE)
-    samples = np.fft.irfft(np.where((frequency > 20.0) & (frequency < 400.0), lines, 0.0))
-    return hr.Recorded(samples=3e-6 / samples.std() * samples, rate=RATE, gain=1.0)
+    return hr.Recorded(samples=waves.white(round(seconds * RATE), 3e-6, seed=3), rate=RATE, gain=1.0)
 
 
 def waveform_error(recording):
@@ -94,10 +89,7 @@ def test_a_turn_in_no_time_leaves_nothing_behind_after_20_ms():
 
 
 def test_a_third_partys_plate_plays_white_noise_and_the_verdict_says_what_it_cannot_know():
-    """At the carrier's rate, behind the public protocol; its true friction is by the law from its true amplitude.
-
-    What the recording infers is within a point of that, yet it was not measured.
-    """
+    """True friction is the law's, of the true amplitude; what the recording infers is within a point of it."""
     device = Watched(UltrasonicParameters(delay=16), block=16)
     scene = hr.Scene(texture=white(0.6), finger=FINGERS["usual"], device="ultrasonic", duration=0.6, settle=0.2)
     recording = hr.render(scene, driver=device)
@@ -139,11 +131,7 @@ def test_the_load_that_a_device_tells_is_used(tells, least, most):
     recording = hr.render(
         hr.Scene(texture=texture, finger=finger, device="ultrasonic", duration=0.5, settle=0.2), driver=device
     )
-    p, time = SurfaceParameters(), np.arange(sum(map(len, device.moved))) / 192e3
-    amplitude, late = abs(hilbert(np.concatenate(device.moved))), (time > 0.3) & (time < 0.45)
-    friction = p.friction_coefficient * 0.8 * p.friction_law.ratio(amplitude, 0.8, 0.08)
-    line = 2 * np.mean((friction * np.exp(-2j * np.pi * 200.0 * time))[late]) * p.lag_response(200.0, 0.08)
-    assert least < abs(line) / (10e-3 / 0.64) < most
+    assert least < friction_of(np.concatenate(device.moved), 200.0, load=0.8) / (10e-3 / 0.64) < most
     assert recording.summary()["verdict"] != "passed"
 
 

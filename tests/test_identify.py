@@ -5,8 +5,10 @@ import warnings
 
 import numpy as np
 import pytest
+from held import amplitude
 from other_plate import TRUTH, OtherPlate
 from strangers_plate import WRONG, StrangersPlate
+from waves import phasor
 
 import hapticrender as hr
 from hapticrender import cli, loop
@@ -137,10 +139,7 @@ def test_a_bending_mode_is_found_from_five_standard_deviations_on():
 
 @pytest.mark.parametrize("coil", [0.1, 0.0])
 def test_what_was_identified_of_bending_reaches_the_design(coil):
-    """Measured: taps with zeros at the mode, or for rigid glass; an estimate of either sign where nothing is stated.
-
-    So do the gains, and a delay beyond the driver's.
-    """
+    """Taps with zeros at the mode, or for rigid glass; where nothing is stated either sign.  So do gains and delay."""
     plate = StrangersPlate(bending=(1250.0, 30, coil), **WRONG, told=1)
     tone = hr.Grating(frequency=72.0, amplitude=50e-6)
     scene = hr.Scene(texture=tone, duration=1.0, profile=identify(plate, PAPER).profile())
@@ -161,15 +160,7 @@ def test_a_third_partys_plate_is_held_although_everything_is_wrong():
     scene = hr.Scene(texture=hr.Grating(frequency=72.0, amplitude=50e-6), duration=2.0)
     with pytest.warns(hr.PlateMismatch):
         hr.render(scene, driver=plate)
-    turn = np.exp(-2j * np.pi * 72.0 * np.arange(5000, 10000) / 5000)
-    assert abs(2 * turn @ plate.truth[5000:10000] / 5000) == pytest.approx([50e-6] * 4, rel=0.03)
-
-
-def amplitude(scene, recording):
-    """Mean amplitude (m) at centre and ends over the last second."""
-    n = np.arange(len(recording))[-int(recording.rate) :]
-    turn = np.exp(-2j * np.pi * scene.texture.frequency * n / recording.rate)
-    return abs(2 * np.mean(recording.motion[n] * turn[:, None], axis=0))
+    assert abs(phasor(plate.truth[5000:10000], 72.0)) == pytest.approx([50e-6] * 4, rel=0.03)
 
 
 def test_the_command_line_identifies_a_wrong_plate_and_render_then_holds_it(tmp_path, capsys):
@@ -178,12 +169,12 @@ def test_the_command_line_identifies_a_wrong_plate_and_render_then_holds_it(tmp_
     scene = hr.Scene(texture=hr.Grating(frequency=143.0, amplitude=30e-6), duration=3.0, simulation=truth)
     (tmp_path / "wrong.toml").write_text(scene.to_toml())
     with pytest.warns(hr.PlateMismatch, match="at 143 Hz; remove the finger and take .*`hapticrender identify"):
-        before = amplitude(scene, hr.render(scene))
+        before = amplitude(hr.render(scene).motion, 143.0, 1.0)
     arguments = ["identify", "--scene", str(tmp_path / "wrong.toml"), "--out", str(tmp_path / "plate.toml")]
     assert cli.main(arguments) == 0
     assert "differs from [device]: mass -6." in capsys.readouterr().out
     measured = dataclasses.replace(scene, device=str(tmp_path / "plate.toml"))
-    after = amplitude(scene, hr.render(measured))
+    after = amplitude(hr.render(measured).motion, 143.0, 1.0)
     assert measured.source.startswith("plate (")
     assert abs(before / 30e-6 - 1).max() > 0.015
     assert abs(after / 30e-6 - 1).max() < 0.003

@@ -4,7 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.signal import butter, lsim, sosfiltfilt
+from scipy.signal import lsim
+from waves import waveform_error, white
 
 import hapticrender as hr
 from hapticrender.bands import Bands
@@ -19,30 +20,13 @@ NOTHING = Bands(frequency=[], wavenumber=[], phase=[])
 HEAVY_FINGER = {"normal_load": 0.8, "mechanics": HEAVY}
 
 
-def white(samples, seed=0, rate=RATE):
-    """White noise of 20-400 Hz, 5 um rms."""
-    spectrum = np.fft.rfft(np.random.default_rng(seed).standard_normal(samples))
-    frequency = np.fft.rfftfreq(samples, 1 / rate)
-    found = np.fft.irfft(np.where((frequency > 20) & (frequency < 400), spectrum, 0.0), samples)
-    return found * RMS / found.std()
-
-
-def play(finger, reference, *, known=PLATE, plate=PLATE, learns=True, rate=RATE, delay=1):
-    """True motion (n, 3) of a plate under the law, and its controller."""
-    controller = AdaptiveInverse().design(known.device_model(rate, delay), NOTHING)
+def error(finger, reference, *, start=1.5, plate=PLATE, learns=True):
+    """Error of the waveform (places,) on a plate under the law, designed for the paper's, from `start` (s) on."""
+    controller = AdaptiveInverse().design(PLATE.device_model(RATE, 1), NOTHING)
     controller.law["learns"] = learns
     moved = Plate(plate, finger, seed=1)
     moved.closed_loop(controller, reference[controller.lookahead :])
-    return moved.motion[:, :3], controller
-
-
-def error(motion, reference, start=1.5, rate=RATE):
-    """Rms of the deviation over that of the reference, 20-500 Hz, from `start` (s) on; shape (places,)."""
-    sos = butter(4, [20, 500], "bandpass", fs=rate, output="sos")
-    reference = reference[: len(motion), None]
-    deviation, reference = sosfiltfilt(sos, motion - reference, axis=0), sosfiltfilt(sos, reference, axis=0)
-    late = slice(round(start * rate), None)
-    return np.sqrt((deviation[late] ** 2).mean(axis=0) / (reference[late] ** 2).mean())
+    return waveform_error(moved.motion[:, :3], reference, start)
 
 
 def test_derivatives_are_those_half_a_sample_ahead_with_the_hold_undone():
@@ -78,7 +62,7 @@ def test_kernel_equals_its_twin(spatial):
     settings = controller.settings
     twin = NaiveInverse({name: settings[name] for name in settings.dtype.names}, law)
     position = np.where((np.arange(n) > 100) & (np.arange(n) < 700), 0.01 + 0.02 * np.arange(n) / n, np.nan)
-    reference, sensed = white(n), 1e-6 * rng.standard_normal((n, 2))
+    reference, sensed = white(n, RMS), 1e-6 * rng.standard_normal((n, 2))
     drive, _, _ = controller.run(sensed, position, reference)
     slow = np.array([twin.step(*row) for row in zip(sensed, position, reference, strict=True)])
     assert abs(drive).max() == model.drive_limit, "nothing was limited"
@@ -87,31 +71,26 @@ def test_kernel_equals_its_twin(spatial):
 
 def test_white_noise_arrives_whole_with_and_without_a_finger():
     """What learning is good for: a finger as most people's leaves seven times as much."""
-    reference = white(4 * RATE)
-    free, _ = play(hr.Finger.absent(), reference)
+    reference = white(4 * RATE, RMS)
     resting = hr.Finger.still(0.015, **HEAVY_FINGER)
-    held, _ = play(resting, reference)
-    blind, _ = play(resting, reference, learns=False)
-    assert error(free, reference).max() < 0.01
-    assert error(held, reference).max() < 0.02
-    assert error(blind, reference)[0] > 0.1
+    assert error(hr.Finger.absent(), reference).max() < 0.01
+    assert error(resting, reference).max() < 0.02
+    assert error(resting, reference, learns=False)[0] > 0.1
 
 
 def test_a_plate_wrong_in_everything_is_learned():
     factors = {"stiffness_1": 1.05, "stiffness_2": 1.05, "mass": 0.95, "inertia": 0.95, "damping_1": 0.8}
     wrong = replace(PLATE, **{name: factor * getattr(PLATE, name) for name, factor in factors.items()})
-    reference = white(4 * RATE)
-    learned, _ = play(hr.Finger.absent(), reference, plate=wrong)
-    blind, _ = play(hr.Finger.absent(), reference, plate=wrong, learns=False)
-    assert error(learned, reference)[0] < 0.015 < 0.2 < error(blind, reference)[0]
+    reference = white(4 * RATE, RMS)
+    learned, blind = (error(hr.Finger.absent(), reference, plate=wrong, learns=each)[0] for each in (True, False))
+    assert learned < 0.015 < 0.2 < blind
 
 
 def test_what_is_learned_does_not_wind_up_on_one_tone():
     """A tone leaves most parameters to the noise; white noise afterwards still arrives."""
     tone = 50e-6 * np.sin(2 * np.pi * 189.0 * np.arange(60 * RATE) / RATE)
-    reference = np.r_[tone, white(2 * RATE)]
-    motion, _ = play(hr.Finger.still(0.015, **HEAVY_FINGER), reference)
-    assert error(motion, reference, 61.0).max() < 0.05
+    reference = np.r_[tone, white(2 * RATE, RMS)]
+    assert error(hr.Finger.still(0.015, **HEAVY_FINGER), reference, start=61.0).max() < 0.05
 
 
 def test_a_texture_over_position_fades_with_contact():
@@ -119,11 +98,9 @@ def test_a_texture_over_position_fades_with_contact():
     for spatial in (False, True):
         controller = AdaptiveInverse().design(PLATE.device_model(RATE, 1), replace(NOTHING, spatial=spatial))
         position = np.where(np.arange(2 * RATE) < RATE, 0.0, np.nan)
-        plate = Plate(PLATE, hr.Finger.absent())
         drive, _, _ = controller.run(np.zeros((2 * RATE, 2)), position, reference)
         assert abs(drive[RATE - 100]).max() > 0.01
         assert (abs(drive[-100:]).max() > 0.01) is not spatial
-        assert plate.rate == RATE
 
 
 PRESSED = {"finger": hr.Finger.still(0.01, normal_load=0.5, mechanics="heavy"), "duration": 2.0}
@@ -155,7 +132,7 @@ def test_a_screen_survives_a_lift():
 
 
 def test_a_position_that_is_lost_for_a_sample_is_no_lift():
-    reference, position = white(4000), np.full(4000, 0.01)
+    reference, position = white(4000, RMS), np.full(4000, 0.01)
     position[1000::250] = np.nan
     controller = AdaptiveInverse().design(PLATE.device_model(RATE, 1), NOTHING)
     since = []
@@ -168,7 +145,7 @@ def test_a_position_that_is_lost_for_a_sample_is_no_lift():
 
 def test_a_drive_that_is_no_number_starts_the_law_afresh():
     controller = AdaptiveInverse().design(PLATE.device_model(RATE, 1), NOTHING)
-    reference, rest, none = white(2000), np.zeros((1000, 2)), np.full(1000, np.nan)
+    reference, rest, none = white(2000, RMS), np.zeros((1000, 2)), np.full(1000, np.nan)
     controller.run(rest, none, reference[:1000])
     controller.law["theta"][:] = np.nan
     drive, _, flags = controller.run(rest, none, reference[1000:])

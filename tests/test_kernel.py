@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from naive_error import NaiveError
+from synthetic import make_bands
 
 import hapticrender as hr
-from hapticrender.bands import Bands
 from hapticrender.control.controller import setpoint_rows
 from hapticrender.control.controller_design import ONE_SPEED, design_controller, rules_for
 from hapticrender.control.device_model import FingerRange
@@ -20,10 +20,7 @@ IDEAL = PlateParameters(sensor_noise=0.0, sensor_bits=0, current_bits=0)
 
 
 def tones(frequency, amplitude=10e-6, wavenumber=0.0, **options):
-    frequency = np.array(frequency, float)
-    wavenumber = np.broadcast_to(wavenumber, frequency.shape).astype(float)
-    phase, envelope = np.arange(len(frequency)) * 1.0, np.full(len(frequency), amplitude + 0j)
-    return Bands(frequency=frequency, wavenumber=wavenumber, phase=phase, envelope=envelope, **options)
+    return make_bands(frequency, amplitude, wavenumber, np.arange(len(frequency)), **options)
 
 
 def waveform_of(bands):
@@ -142,26 +139,6 @@ def test_a_friction_device_is_its_twin(differentiated, rng):
     agree(controller, sensed, position, np.zeros(2400))
     names = ("needs_contact", "corrected", "contact_damping", "least_speed", "sensor_delay", "contact_lag")
     assert all(controller.settings[name] > 0 for name in names)
-
-
-@pytest.mark.parametrize(("delay", "block"), [(1, 1), (25, 25)])
-def test_any_split_gives_the_same(delay, block, rng):
-    """Whole, by the block, and in uneven pieces: equal to the last bit, quantiser included."""
-    bands, n = tones([47.0, 0.0, 150.0], wavenumber=[0.0, 500.0, 0.0]), 80 * block
-    n = max(n, 2000)
-    position = 0.05 * np.arange(n) / RATE
-    sensed, runs = pressed(rng, bands, position), []
-    for edges in ([0, n], [0, block, 3 * block, n - block, n], range(0, n + 1, block)):
-        controller = plate_controller(bands, parameters=PlateParameters(), delay=delay, block=block)
-        pieces = [
-            controller.run(sensed[a:b], position[a:b], np.zeros(b - a))
-            for a, b in zip(edges[:-1], edges[1:], strict=True)
-        ]
-        runs.append([np.concatenate(column) for column in zip(*pieces, strict=True)])
-    for run in runs[1:]:
-        for found, expected in zip(run, runs[0], strict=True):
-            np.testing.assert_array_equal(found, expected)
-    assert abs(runs[0][0]).max() > 0
 
 
 def test_the_gain_schedule_is_the_printed_one():

@@ -7,10 +7,9 @@ import pytest
 from held import amplitude, fixed, grating
 from hypothesis import given
 from hypothesis import strategies as st
+from synthetic import make_bands
 
 import hapticrender as hr
-from hapticrender.bands import Bands
-from hapticrender.control.controller import setpoint_rows
 from hapticrender.control.methods import METHODS
 from hapticrender.plants.plate import Plate, PlateParameters
 from hapticrender.protocols import Flag
@@ -26,46 +25,21 @@ def design(method, bands, parameters=None, **changes):
     return METHODS[method].design(dataclasses.replace(model, **changes), bands)
 
 
-def overload(method):
-    """2 s of 1 mm at 400 Hz, which needs 10.6 A, then 2 s of 100 um: drive, flags, motion and the plate's limit."""
-    parameters = PlateParameters()
-    before, after = (fixed((400.0, wanted)) for wanted in (1e-3, 1e-4))
-    controller = design(method, before, parameters)
-    plate = Plate(parameters, hr.Finger.absent())
-    first = plate.closed_loop(controller, np.zeros(10_000))
-    controller.setpoints[:] = setpoint_rows(after)
-    second = plate.closed_loop(controller, np.zeros(10_000))
-    drive, flags = np.concatenate([first[0], second[0]]), np.concatenate([first[2], second[2]])
-    return drive, flags, np.concatenate([first[3].motion, second[3].motion]), parameters.current_limit
-
-
 @OURS
-def test_overload_is_cut_as_a_whole_and_left_in_a_quarter_of_a_second(method):
-    """Without back-calculation a complex integral never returns, and polar loops need seconds."""
-    drive, flags, motion, limit = overload(method)
+def test_overload_is_cut_as_a_whole(method):
+    """1 mm at 400 Hz needs 10.6 A; what 3 A in each coil can do is 0.279 mm.  What it leaves behind: test_accuracy."""
+    parameters = PlateParameters()
+    limit, plate = parameters.current_limit, Plate(parameters, hr.Finger.absent())
+    drive, _, flags, sensed = plate.closed_loop(design(method, fixed((400.0, 1e-3))), np.zeros(10_000))
     peak = abs(drive).max(axis=0)
     assert peak.max() <= limit
     assert peak.min() > 0.99 * limit  # both coils; their springs differ by 2 %
-    assert np.mean(flags[500:10_000] & Flag.SATURATED != 0) > 0.5
-    # what 3 A in each coil can do at 400 Hz is 0.279 mm
-    reach = limit * abs(PlateParameters().device_model(RATE, 1).response(400.0).sum(axis=-1)[0])
-    assert amplitude(motion[9000:10_000], 400.0, 0.2)[0] == pytest.approx(reach, rel=0.15)
-    period = 25  # samples: two turns of the carrier
-    blocks = motion[10_000:, :].reshape(-1, period, 3)
-    error = np.array([abs(amplitude(block, 400.0, 5e-3)[0] / 1e-4 - 1) for block in blocks])
-    late = (np.flatnonzero(error > 0.05)[-1] + 1) * period / RATE
-    assert late <= 0.25
-    assert not (flags[-5000:] & Flag.SATURATED).any()
+    assert np.mean(flags[500:] & Flag.SATURATED != 0) > 0.5
+    reach = limit * abs(parameters.device_model(RATE, 1).response(400.0).sum(axis=-1)[0])
+    assert amplitude(sensed.motion, 400.0, 0.2)[0] == pytest.approx(reach, rel=0.15)
 
 
 @OURS
-def test_overload_does_not_distort(method):
-    """Third harmonic of the true motion <= 0.01 um while 3 A are reached (9.3 um where each sample is clipped)."""
-    _, _, motion, _ = overload(method)
-    assert amplitude(motion[5000:10_000], 1200.0, 1.0)[0] <= 0.01e-6
-
-
-@pytest.mark.parametrize("method", ["h2", "h"])
 def test_a_target_grows_over_its_ramp_and_does_not_strike_the_modes(method):
     """50 ms leave a peak of x1.02 near the modes, where a step leaves x1.5-1.75."""
     for frequency in (143.0, 170.0):
@@ -91,12 +65,7 @@ SPOILT = st.lists(st.tuples(st.integers(0, 599), st.sampled_from(["sensed", "pos
 @given(spoilt=SPOILT)
 def test_drive_is_finite_and_inside_its_limit_whatever_comes_in(method, analysed, block, spoilt):
     """Any number at any sample of any input: the implausible ones that are read raise a flag, and no state is lost."""
-    bands = Bands(
-        frequency=np.array([47.0, 0.0]),
-        wavenumber=np.array([0.0, 500.0]),
-        phase=np.zeros(2),
-        envelope=None if analysed else np.full(2, 1e-5 + 0j),
-    )
+    bands = make_bands([47.0, 0.0], None if analysed else 1e-5, [0.0, 500.0])
     controller = design(method, bands, block=block, delay=block)
     time = np.arange(900) / RATE
     given_ = {
@@ -123,16 +92,13 @@ SPEED, SWIPES = 50e-3, 3.0  # m/s at most, swipes there and back a second
 
 def swipe(method, wavelength, mechanics):
     """Drive, frequency and its largest sweep (Hz/s) after the first 1.5 s of 10 um under swipes, ideal electronics."""
-    time = np.arange(17_501) / RATE
-    reach = SPEED / (2 * np.pi * SWIPES)
-    path = reach * np.sin(2 * np.pi * SWIPES * time)
-    load = 0.0 if mechanics == "none" else 0.8
-    finger = hr.Finger.sampled(path, rate=RATE, normal_load=load, mechanics=mechanics)
+    time, load = np.arange(17_500) / RATE, 0.0 if mechanics == "none" else 0.8
+    finger = hr.Finger.swiping(frequency=SWIPES, speed=SPEED, normal_load=load, mechanics=mechanics)
     parameters = PlateParameters(**IDEAL)
     controller = design(method, grating(wavelength, 1e-5), parameters)
     drive, _, flags, _ = Plate(parameters, finger).closed_loop(controller, np.zeros(17_500))
     assert not flags.any()
-    frequency = SPEED / wavelength * np.cos(2 * np.pi * SWIPES * time[:-1])
+    frequency = SPEED / wavelength * np.cos(2 * np.pi * SWIPES * time)
     return drive[7500:], frequency[7500:], 2 * np.pi * SWIPES * SPEED / wavelength
 
 

@@ -3,6 +3,7 @@
 import dataclasses
 import os
 import signal
+from functools import partial
 
 import numpy as np
 import pytest
@@ -167,10 +168,6 @@ def test_a_sensor_gone_mad_leaves_the_drive_finite_limited_and_flagged(bad):
 class Bare(Blocks):
     """A driver whose exit leaves the device as it is."""
 
-    def __enter__(self):
-        self._driver.__enter__()
-        return self
-
     def __exit__(self, *exc):
         pass
 
@@ -221,6 +218,9 @@ def test_what_is_handed_over_by_mistake_is_named(arguments, error, message):
         hr.render(**{"scene": TONE, **arguments})
 
 
+scene_with = partial(dataclasses.replace, TONE)
+
+
 def test_a_scene_may_state_a_plate_that_the_controller_does_not_assume():
     """The profile alone, or the same plate simulated behind a wrong profile: the second is noticed."""
     stiff = {"stiffness_1": 1.05 * 22.4e3, "stiffness_2": 1.05 * 22.9e3}
@@ -230,10 +230,6 @@ def test_a_scene_may_state_a_plate_that_the_controller_does_not_assume():
         hr.render(scene_with(duration=3.0, simulation=stiff))
     late = loop.prepare(scene_with(simulation={"delay": 5}))
     assert (late.plant.parameters.delay, late.model.delay) == (5, 1)
-
-
-def scene_with(**changes):
-    return dataclasses.replace(TONE, **changes)
 
 
 @pytest.mark.parametrize(

@@ -5,9 +5,9 @@ import dataclasses
 import numpy as np
 import pytest
 from naive_low_pass import NaiveLowPass
+from synthetic import make_bands
 
 import hapticrender as hr
-from hapticrender.bands import Bands
 from hapticrender.control.controller import setpoint_rows
 from hapticrender.control.methods import METHODS, Polar, Resonant, frequency_table
 from hapticrender.plants.plate import PlateParameters
@@ -20,17 +20,10 @@ LOW_PASS = ("paper", "paper-common", "boxcar", "static", "stiffness", "resonant"
 CLOSE = 3e-9
 
 
-def bands_of(frequency, wavenumber=None, envelope=1e-6, **options):
+def bands_of(frequency, wavenumber=0.0, envelope=1e-6):
     """Carriers with odd phases and envelopes."""
-    count = len(frequency)
-    turn = None if envelope is None else envelope * np.exp(1j * np.arange(count)) / np.arange(1, count + 1)
-    return Bands(
-        frequency=np.array(frequency, float),
-        wavenumber=np.zeros(count) if wavenumber is None else np.array(wavenumber, float),
-        phase=0.3 * np.arange(count),
-        envelope=turn,
-        **options,
-    )
+    k = np.arange(len(frequency))
+    return make_bands(frequency, envelope * np.exp(1j * k) / (k + 1), wavenumber, 0.3 * k)
 
 
 MIXED = bands_of([47.0, 0.0, 111.3, 0.0], [0.0, 1000.0, 0.0, 2500.0])
@@ -93,30 +86,21 @@ def test_options_are_their_equations(method, rng):
 
 
 @pytest.mark.parametrize("name", LOW_PASS)
-def test_targets_of_a_waveform_come_through_the_residual_analysis(name, rng):
-    check(METHODS[name], dataclasses.replace(MIXED, envelope=None), signals(rng))
-
-
-@pytest.mark.parametrize("name", LOW_PASS)
-def test_without_feedback_it_drives_from_the_model_alone(name, rng):
-    _, position, wanted = signals(rng)
+def test_a_waveform_is_analysed_and_the_model_driven_open_loop_by_their_equations(name, rng):
+    sensed, position, wanted = signals(rng)
+    check(METHODS[name], dataclasses.replace(MIXED, envelope=None), (sensed, position, wanted))
     check(METHODS[name], MIXED, (np.zeros((COUNT, 0)), position, wanted), feedback=False)
 
 
-@pytest.mark.parametrize("name", ["static", "stiffness", "resonant"])
+@pytest.mark.parametrize("name", LOW_PASS)
 @pytest.mark.parametrize("option", ["modulated", "differentiated"])
-def test_complex_methods_modulate_and_differentiate_targets(name, option, rng):
-    sensed, position, _ = signals(rng)
-    check(
-        METHODS[name], dataclasses.replace(MIXED, **{option: True}), (sensed, position, np.sin(0.02 * np.arange(COUNT)))
-    )
-
-
-@pytest.mark.parametrize("name", ["paper", "paper-common", "boxcar"])
-@pytest.mark.parametrize("option", ["modulated", "differentiated"])
-def test_polar_methods_refuse_to_modulate_and_differentiate(name, option):
-    with pytest.raises(hr.DesignError, match=f"method '{name}' cannot modulate"):
-        METHODS[name].design(MODEL, dataclasses.replace(MIXED, **{option: True}))
+def test_complex_methods_modulate_and_differentiate_targets_and_polar_ones_refuse_to(name, option, rng):
+    (sensed, position, _), bands = signals(rng), dataclasses.replace(MIXED, **{option: True})
+    if name in ("static", "stiffness", "resonant"):
+        check(METHODS[name], bands, (sensed, position, np.sin(0.02 * np.arange(COUNT))))
+    else:
+        with pytest.raises(hr.DesignError, match=f"method '{name}' cannot modulate"):
+            METHODS[name].design(MODEL, bands)
 
 
 def test_every_channel_is_cut_to_its_limit_and_flagged(rng):

@@ -67,12 +67,6 @@ def test_coupled_coordinates_have_the_margins_of_their_eigenloci():
         assert getattr(turned, name) == pytest.approx(getattr(plain, name), rel=1e-9)
 
 
-def test_the_largest_singular_value_of_two_by_two_is_that_of_numpy(rng):
-    loop = rng.standard_normal((50, 2, 2)) + 1j * rng.standard_normal((50, 2, 2))
-    wanted = np.linalg.norm(np.linalg.inv(np.eye(2) + loop), 2, axis=(1, 2))
-    np.testing.assert_allclose(sensitivity(loop), wanted, rtol=1e-9)
-
-
 @pytest.mark.parametrize(("gain", "poles"), [(7.99, 0), (8.01, 2)])
 def test_nyquists_count_on_both_sides_of_a_boundary(gain, poles):
     grid = np.append(0.0, GRID)

@@ -1,11 +1,14 @@
 """What every control method promises, and where the plain ones stop: the figures of FACTS section 3 on this plate."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from held import amplitude_error, fixed, grating, hold
+from synthetic import make_bands
+from waves import phasor
 
 import hapticrender as hr
-from hapticrender.bands import Bands
 from hapticrender.control.methods import METHODS, Resonant, least_decay
 from hapticrender.control.stdft import StarSTDFT
 from hapticrender.plants.plate import Plate, PlateParameters
@@ -18,17 +21,12 @@ POLAR = ("paper", "paper-common", "boxcar")
 
 
 def tones(*frequency):
-    return fixed(*((each, WANTED) for each in frequency))
+    return make_bands(frequency, WANTED)
 
 
 def mixed():
     """A fixed carrier and two that are locked to the finger, whose targets are analysed from a waveform."""
-    return Bands(
-        frequency=np.array([47.0, 0.0, 0.0]),
-        wavenumber=np.array([0.0, 1000.0, 2500.0]),
-        phase=np.array([0.0, 0.4, -1.0]),
-        envelope=None,
-    )
+    return make_bands([47.0, 0.0, 0.0], None, [0.0, 1000.0, 2500.0], [0.0, 0.4, -1.0])
 
 
 def steps_of(n, rng):
@@ -38,13 +36,14 @@ def steps_of(n, rng):
     return 1e-5 * rng.standard_normal((n, 2)), position, 1e-5 * np.sin(2 * np.pi * 61.0 * time)
 
 
-@pytest.mark.parametrize("name", METHODS)
-def test_any_split_into_blocks_gives_the_same_run(name, rng):
-    sensed, position, wanted = steps_of(1000, rng)
-    whole = METHODS[name].design(PlateParameters().device_model(RATE, 1), mixed()).run(sensed, position, wanted)
+@pytest.mark.parametrize(("name", "block"), [*((name, 1) for name in METHODS), ("h2", 25)])
+def test_any_split_into_blocks_gives_the_same_run(name, block, rng):
+    """To the last bit, the converter included."""
+    columns = sensed, position, wanted = steps_of(1000 * block, rng)
+    model = replace(PlateParameters(delay=block).device_model(RATE, block), block=block)
+    whole = METHODS[name].design(model, mixed()).run(*columns)
     assert abs(whole[0]).max() > 1e-3
-    pieces = METHODS[name].design(PlateParameters().device_model(RATE, 1), mixed())
-    cuts = [1, 2, 255, 256, 700]
+    pieces, cuts = METHODS[name].design(model, mixed()), block * np.array([1, 2, 255, 256, 700])
     parts = [
         pieces.run(*rows)
         for rows in zip(*(np.split(column, cuts) for column in (sensed, position, wanted)), strict=True)
@@ -102,10 +101,8 @@ def test_without_sensors_it_drives_open_loop(name):
     controller = METHODS[name].design(MODEL, fixed((47.0, 1e-6), (400.0, 1e-6)), feedback=False)
     drive, _, _ = controller.run(np.zeros((15_000, 0)), np.full(15_000, np.nan), np.zeros(15_000))
     motion = Plate(IDEAL, hr.Finger.absent()).run(np.vstack([np.zeros((1, 2)), drive[:-1]])).motion
-    n = np.arange(10_000, 15_000)
     for frequency in (47.0, 400.0):
-        found = 2 * np.mean(motion[n, 0] * np.exp(-2j * np.pi * frequency * n / RATE))
-        assert found == pytest.approx(1e-6, rel=3e-4)
+        assert phasor(motion[10_000:15_000, 0], frequency) == pytest.approx(1e-6, rel=3e-4)
 
 
 @pytest.mark.parametrize(("gain", "holds"), [(15.0, True), (17.5, False)])

@@ -4,8 +4,8 @@ import re
 
 import numpy as np
 import pytest
+from synthetic import make_bands
 
-from hapticrender.bands import Bands
 from hapticrender.drivers.nu32 import FAST_CLOCK, FREQUENCIES, MOST, NU32Board
 from hapticrender.errors import DeviceLost, DeviceNotFound, DeviceTimeout, DriverError, ProtocolError
 
@@ -48,7 +48,7 @@ def play(*tables):
 
 
 def tone(hertz=47.0, amplitude=10e-6):
-    return Bands(frequency=[hertz], wavenumber=[0.0], phase=[0.0], envelope=[amplitude])
+    return make_bands(hertz, amplitude)
 
 
 @pytest.mark.parametrize("start", [FRESH, AWAKE])
@@ -121,9 +121,7 @@ def test_bounds_of_a_tone(index):
 
 
 def test_what_the_board_cannot_play_is_refused():
-    two = Bands(frequency=[20.0, 47.0], wavenumber=[0.0, 0.0], phase=[0.0, 0.0], envelope=[1e-6, 1e-6])
-    grating = Bands(frequency=[0.0], wavenumber=[1000.0], phase=[0.0], envelope=[1e-6])
-    for bands in (two, grating):
+    for bands in (make_bands([20.0, 47.0], 1e-6), make_bands(0.0, 1e-6, 1000.0)):
         with pytest.raises(ValueError, match="bands: must be one fixed tone"):
             play()[1].set_bands(bands)
 

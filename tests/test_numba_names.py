@@ -44,32 +44,18 @@ def bound_names(tree):
     return names
 
 
-def dotted(node):
-    """Dotted name of a chain of attributes on a name, or None."""
-    if isinstance(node, ast.Name):
-        return node.id
-    base = dotted(node.value) if isinstance(node, ast.Attribute) else None
-    return f"{base}.{node.attr}" if base else None
-
-
-def generates_code(node):
-    """Whether a function is handed a builder of machine code."""
-    return isinstance(node, ast.FunctionDef | ast.Lambda) and any(each.arg == "builder" for each in node.args.args)
-
-
 def outside(source):
     """All that a module takes from numba and llvmlite and that is not on the list."""
     tree = ast.parse(source)
     names = bound_names(tree)
     found = set(names.values()) - {"numba", "llvmlite", "numba.extending"} - ALLOWED
     for node in ast.walk(tree):
-        chain = dotted(node) if isinstance(node, ast.Attribute) else None
-        if chain and chain.split(".")[0] in names:
-            first, _, rest = chain.partition(".")
+        first, _, rest = ast.unparse(node).partition(".") if isinstance(node, ast.Attribute) else ("", "", "")
+        if first in names:
             full = f"{names[first]}.{rest}"
             if not any(full == each or each.startswith(f"{full}.") for each in ALLOWED):
                 found.add(full)
-        if generates_code(node):
+        if isinstance(node, ast.FunctionDef | ast.Lambda) and any(each.arg == "builder" for each in node.args.args):
             found |= set(handed_out(node))
     return found | private_attributes(tree) | options(tree, names)
 
@@ -98,8 +84,7 @@ def options(tree, names):
     found = set()
     for node in ast.walk(tree):
         if isinstance(node, ast.Call):
-            func = dotted(node.func) or ""
-            first, _, rest = func.partition(".")
+            first, _, rest = ast.unparse(node.func).partition(".")
             if f"{names.get(first, '')}{'.' if rest else ''}{rest}" in ("numba.njit", "numba.cfunc"):
                 found |= {f"option {each.arg}" for each in node.keywords if each.arg and each.arg not in OPTIONS}
         elif isinstance(node, ast.AnnAssign | ast.Assign) and isinstance(node.value, ast.Dict):

@@ -4,7 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
-from held import amplitude, fixed, hold, play
+from held import amplitude, envelopes, fixed, hold, play
 
 import hapticrender as hr
 from hapticrender.control.methods import METHODS, Polar, method_named
@@ -14,14 +14,6 @@ from hapticrender.touch.mechanics import HEAVY_SECOND
 RATE = 5000.0
 NOISY, QUIET = PlateParameters(), PlateParameters(sensor_noise=0.0)
 IDEAL = PlateParameters(sensor_noise=0.0, sensor_bits=0, current_bits=0)
-
-
-def envelope(motion, frequency, window=0.05):
-    """Running amplitude of the centre over `window` s."""
-    n = np.arange(len(motion))
-    product = 2 * motion[:, 0] * np.exp(-2j * np.pi * frequency * n / RATE)
-    width = round(window * RATE)
-    return abs(np.convolve(product, np.ones(width) / width, mode="valid"))
 
 
 @pytest.mark.parametrize(("frequency", "target"), [(20.0, 100e-6), (31.0, 10e-6), (72.0, 10e-6), (400.0, 10e-6)])
@@ -79,8 +71,9 @@ def test_a_table_of_the_loaded_plate_limit_cycles_at_lift_off():
     spread = {}
     for name, table in (("free", free), ("loaded", loaded)):
         motion = play(METHODS["paper-common"].design(table, fixed((189.0, 10e-6))), 10.0, IDEAL)[1]
-        spread[name] = envelope(motion, 189.0)[-10_000:].std() / 10e-6
-    assert spread["free"] < 0.01  # the window is no whole number of periods: 1/(4 pi 189 0.05) of ripple
+        time, found = envelopes(motion, 2 * np.pi * 189.0 * np.arange(len(motion)) / RATE, RATE, 0.05)
+        spread[name] = abs(found[time > 8.0, 0]).std() / 10e-6
+    assert spread["free"] < 0.01
     assert spread["loaded"] > 0.3
 
 

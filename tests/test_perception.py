@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from synthetic import make_bands
 
 from hapticrender.bands import Bands
 from hapticrender.touch import perception
@@ -13,11 +14,6 @@ from hapticrender.touch.perception import detection_threshold, drop_unfelt
 TABLE = {
     **{1: 28, 3: 25, 5: 18, 10: 11, 20: 6.3, 31.5: 4.7, 40: 4.0, 50: 2.5, 63: 1.7, 80: 1.06, 100: 0.63, 125: 0.40},
     **{160: 0.22, 200: 0.14, 250: 0.11, 300: 0.11, 400: 0.18, 500: 0.35, 700: 1.1, 1000: 5},
-}
-# The same table's second column, dB re 1 um, rounded to half a dB and written down apart from the first.
-DECIBELS = {
-    **{1: 29, 3: 28, 5: 25, 10: 21, 20: 16, 31.5: 13.5, 40: 12, 50: 8, 63: 4.5, 80: 0.5, 100: -4, 125: -8},
-    **{160: -13, 200: -17, 250: -19.5, 300: -19, 400: -15, 500: -9, 700: 1, 1000: 14},
 }
 ROUNDING = 1e-12  # some 4000 units in the last place: logarithm, interpolation and power cost a few dozen
 
@@ -29,7 +25,6 @@ AMPLITUDES = st.floats(1e-12, 1e-2)
 def test_the_classic_threshold_is_the_published_one(frequency):
     found = detection_threshold(float(frequency), "classic")
     assert found == pytest.approx(1e-6 * TABLE[frequency], rel=ROUNDING)
-    assert 20 * np.log10(found / 1e-6) == pytest.approx(DECIBELS[frequency], abs=0.5)
 
 
 @pytest.mark.parametrize(("frequency", "below"), [(1, 6), (20, 6), (40, 10), (63, 10), (80, 25), (500, 25), (1000, 25)])
@@ -85,9 +80,7 @@ DEVICE = {"top_speed": 0.1, "lowest": 10.0, "highest": 400.0}
 def bands_of(*entries):
     """Bands of (frequency, wavenumber, amplitude), with phases by which they can be distinguished."""
     frequency, wavenumber, amplitude = np.array(entries, float).reshape(-1, 3).T
-    return Bands(
-        frequency=frequency, wavenumber=wavenumber, phase=np.arange(frequency.size), envelope=amplitude * np.exp(0.3j)
-    )
+    return make_bands(frequency, amplitude * np.exp(0.3j), wavenumber, np.arange(frequency.size))
 
 
 def left(*entries, **device):

@@ -41,13 +41,10 @@ def test_the_panels_show_what_was_recorded():
     for name, level in (("target", 10.0), ("centre", 10.0), ("end 1", 12.0), ("end 2", 9.0)):
         np.testing.assert_allclose(line(amplitude, name)[1], level, rtol=1e-9)
     waveform = panel(figure, "Waveform")
-    milliseconds, target = line(waveform, "target")
-    assert milliseconds[-1] == pytest.approx(4 * 10 - 0.2)  # ms: four periods, less one sample
-    np.testing.assert_allclose(line(waveform, "centre")[1], target, atol=1e-6)
+    np.testing.assert_allclose(line(waveform, "centre")[1], line(waveform, "target")[1], atol=1e-6)
     errors = panel(figure, "Third octaves")
     assert line(errors, "end 1")[1].max() == pytest.approx(20.0)
     assert "misses its tolerance" in figure.axes[0].texts[-1].get_text()
-    assert "±3 A" in panel(figure, "Drive").get_title(loc="left")
 
 
 def test_a_texture_without_bands_is_drawn_as_a_waveform():
@@ -57,19 +54,11 @@ def test_a_texture_without_bands_is_drawn_as_a_waveform():
     assert line(panel(figure, "Third octaves"), "end 1")[1].max() == pytest.approx(10.0)
 
 
-@pytest.mark.parametrize("extra", [np.nan, 1e200])
-def test_a_motion_that_is_no_number_is_drawn_all_the_same(tmp_path, extra):
-    bands = make_bands(100.0, 10 * UM)
-    late = np.where(times(2.0) > 1.5, extra, 0.0)[:, None]
-    make_recording(bands, bands.envelope, duration=2.0, extra=late).plot(tmp_path / "x.png")
-    assert (tmp_path / "x.png").exists()
-
-
-@pytest.mark.parametrize("samples", [0, 1, 60])
-def test_the_shortest_runs_are_drawn(tmp_path, samples):
-    bands = make_bands(100.0, 10 * UM)
-    recording = make_recording(bands, bands.envelope, duration=samples / 5000, scene={"duration": 1.0})
-    recording.plot(tmp_path / "x.png")
+@pytest.mark.parametrize(("samples", "late"), [(0, 0.0), (1, 0.0), (60, 0.0), (10_000, np.nan), (10_000, 1e200)])
+def test_the_shortest_runs_and_motions_that_are_no_numbers_are_drawn(tmp_path, samples, late):
+    bands, scene = make_bands(100.0, 10 * UM), {"duration": max(samples / 5000, 1.0)}
+    extra = np.where(times(samples / 5000) > 1.5, late, 0.0)[:, None]
+    make_recording(bands, bands.envelope, duration=samples / 5000, scene=scene, extra=extra).plot(tmp_path / "x.png")
     assert (tmp_path / "x.png").exists()
 
 

@@ -56,16 +56,19 @@ def test_structure_has_the_dynamic_stiffness_of_plate_and_finger(mechanics):
     np.testing.assert_array_equal(lifted.mass, parameters.mass_matrix)
 
 
+def assert_exact(rng, finger, bending, samples, within):
+    """The compiled plate is its naive twin under a random drive, within a share of the motion's rms."""
+    parameters, drive = PlateParameters(bending_frequency=bending, **IDEAL), rng.uniform(-2, 2, (samples, 2))
+    expected = naive(drive, finger, parameters)
+    motion = Plate(parameters, finger).run(drive).motion
+    np.testing.assert_allclose(motion, expected, rtol=0, atol=within * expected.std())
+
+
 @pytest.mark.parametrize(("position", "bending"), [(15e-3, 1200.0), (-55e-3, 0.0)])
 @FINGERS
 def test_resting_finger(rng, mechanics, position, bending):
     """Zero-order hold against scipy's exponential: exact but for the first samples of a touch, within 1e-6."""
-    parameters = PlateParameters(bending_frequency=bending, **IDEAL)
-    finger = hr.Finger.still(position=position, normal_load=0.5, mechanics=mechanics)
-    drive = rng.uniform(-2, 2, (2000, 2))
-    expected = naive(drive, finger, parameters)
-    motion = Plate(parameters, finger).run(drive).motion
-    np.testing.assert_allclose(motion, expected, rtol=0, atol=1e-6 * expected.std())
+    assert_exact(rng, hr.Finger.still(position, normal_load=0.5, mechanics=mechanics), bending, 2000, 1e-6)
 
 
 @pytest.mark.parametrize(("scaled", "bending"), [(False, 0.0), (True, 1200.0)])
@@ -74,11 +77,7 @@ def test_finger_that_slides_presses_and_lifts(rng, scaled, bending):
     load = ((0.0, 0.05, 0.1), (0.2, 1.4, 0.5))
     touches = ((0.0, 0.03), (0.05, 1.0))
     finger = hr.Finger(hr.TriangleMotion(0.5, 0.1), load, touches, mechanics=HEAVY, load_scaling=scaled)
-    parameters = PlateParameters(bending_frequency=bending, **IDEAL)
-    drive = rng.uniform(-2, 2, (550, 2))
-    expected = naive(drive, finger, parameters)
-    motion = Plate(parameters, finger).run(drive).motion
-    np.testing.assert_allclose(motion, expected, rtol=0, atol=1e-5 * expected.std())
+    assert_exact(rng, finger, bending, 550, 1e-5)
     assert len(set(finger.touch(np.arange(500) / RATE)[:, 2])) > (100 if scaled else 1)
 
 
@@ -90,12 +89,7 @@ def stop_and_go(time):
 def test_stop_and_go_is_exact(rng):
     positions = tuple(stop_and_go(np.arange(1500) / RATE))
     finger = hr.Finger.sampled(positions, rate=RATE, normal_load=0.8, mechanics=HEAVY)
-    parameters = PlateParameters(bending_frequency=1150.0, **IDEAL)
-    drive = rng.uniform(-2, 2, (1500, 2))
-    expected = naive(drive, finger, parameters)
-    np.testing.assert_allclose(
-        Plate(parameters, finger).run(drive).motion, expected, rtol=0, atol=1e-5 * expected.std()
-    )
+    assert_exact(rng, finger, 1150.0, 1500, 1e-5)
 
 
 @pytest.mark.parametrize("frequency", [20.0, 189.0])

@@ -230,26 +230,11 @@ def test_a_device_that_does_not_start_is_left_closed():
         assert player.time >= 0.2
 
 
-SCENE = """
-name = "live"
-duration = 100.0
-[texture]
-kind = "grating"
-wavelength = 1e-3
-amplitude = 5e-6
-[finger]
-motion = "swiping"
-frequency = 2.0
-speed = 0.1
-[device]
-kind = "vt-plate"
-"""
-
-
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_live_run_of_the_command_line_is_stopped_cleanly(tmp_path, number):
     """By Ctrl-C, or by whoever ends processes: the journal is whole, and the page about it is written."""
-    (tmp_path / "live.toml").write_text(SCENE)
+    scene = hr.Scene(texture=RIDGES, finger=hr.Finger.swiping(2.0, speed=0.1), duration=100.0, name="live")
+    (tmp_path / "live.toml").write_text(scene.to_toml())
     command = [sys.executable, "-m", "hapticrender", "play", "live.toml", "--out", "out"]
     run = subprocess.Popen(
         command,

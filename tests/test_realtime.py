@@ -9,7 +9,9 @@ import numba
 import numpy as np
 import pytest
 from numba import types
+from synthetic import make_bands
 from test_kernel import friction_controller, plate_controller
+from waves import Own
 
 import hapticrender as hr
 from hapticrender.bands import Bands
@@ -28,14 +30,9 @@ STREAM = (ctypes.c_ulong, ctypes.c_void_p, ctypes.c_ulong)
 AUDIO = ctypes.CFUNCTYPE(ctypes.c_int32, ctypes.c_void_p, ctypes.c_void_p, *STREAM, ctypes.c_void_p)
 
 
-def bands(amplitude=5e-6, wavenumber=0.0):
-    moves = wavenumber > 0
-    return Bands(
-        frequency=np.where(moves, 0.0, [47.0, 130.0, 261.0]),
-        wavenumber=np.where(moves, [1.0, 2.0, 3.0], 0.0) * wavenumber,
-        phase=[0.0, 1.0, 2.0],
-        envelope=np.full(3, amplitude + 0j),
-    )
+def bands(wavenumber=0.0):
+    frequency = [0.0] * 3 if wavenumber else [47.0, 130.0, 261.0]
+    return make_bands(frequency, 5e-6, np.array([1.0, 2.0, 3.0]) * wavenumber, [0.0, 1.0, 2.0])
 
 
 def controller(wanted=None, delay=BLOCK, block=BLOCK):
@@ -111,17 +108,10 @@ def test_the_finger_is_extrapolated_between_updates(friction, rng):
     assert jumps[199] < 2e-5 < 1e-3 < jumps[499]  # 0.2 mm off are spread, 5 mm are another place
 
 
-class Wave:
+def wave(spatial, amplitude=1e-5):
     """A sine of 130 Hz in time, or of 3 mm along the surface."""
-
-    def __init__(self, spatial, amplitude=1e-5):
-        self.spatial, self.amplitude = spatial, amplitude
-
-    def bands(self, rate):
-        return Bands.none(spatial=self.spatial)
-
-    def waveform(self, time, position):
-        return self.amplitude * np.sin(2 * np.pi * (position / 3e-3 if self.spatial else 130.0 * time))
+    turns = (lambda time, position: position / 3e-3) if spatial else (lambda time, position: 130.0 * time)
+    return Own(lambda *where: amplitude * np.sin(2 * np.pi * turns(*where)), spatial)
 
 
 def designed(spatial, whole):
@@ -141,7 +131,7 @@ def test_a_texture_fades_in_and_another_fades_over_it(spatial, whole, rng):
     entry, twin, n = RealtimeEntry(designed(spatial, whole)), designed(spatial, whole), 1500
     sensed, change = 1e-7 * rng.standard_normal((n, 2)), 700
     updates = [(0, -0.004, 0.05)]
-    first, second = Wave(spatial), Wave(not spatial, 2e-5)
+    first, second = wave(spatial), wave(not spatial, 2e-5)
     entry.play(SampledTexture(first, RATE))
     entry.finger(*updates[0][1:])
     drive = [plain(entry, sensed[:change])[0]]
@@ -177,7 +167,7 @@ def test_a_texture_fades_in_and_another_fades_over_it(spatial, whole, rng):
 
 def test_what_lies_along_the_surface_fades_out_without_updates_and_what_lies_in_time_goes_on():
     n = round((HOLD + 0.2) * RATE)
-    for texture, goes_on in ((Wave(False), True), (Wave(True), False)):
+    for texture, goes_on in ((wave(False), True), (wave(True), False)):
         entry = RealtimeEntry(designed(False, True))
         entry.play(SampledTexture(texture, RATE))
         entry.finger(0.0002, 0.0)
@@ -190,22 +180,22 @@ def test_what_lies_along_the_surface_fades_out_without_updates_and_what_lies_in_
 
 def test_a_gain_is_reached_without_a_step():
     entry = RealtimeEntry(designed(False, True))
-    entry.play(SampledTexture(Wave(False), RATE))
+    entry.play(SampledTexture(wave(False), RATE))
     plain(entry, np.zeros((1000, 2)))
     entry.set_gain(3.0)
     plain(entry, np.zeros((1000, 2)))
     log = entry.log(0)["reference"]
     smooth = 3.0 - 2.0 * np.exp(-np.arange(1, 1001) / (GAIN_TIME * RATE))
-    wave = Wave(False).waveform((np.arange(2000) - entry.ahead) / RATE, 0.0)
+    plain_wave = wave(False).waveform((np.arange(2000) - entry.ahead) / RATE, 0.0)
     begin = 1000 + entry.ahead
-    np.testing.assert_allclose(log[begin:], wave[begin:] * smooth[: 1000 - entry.ahead], rtol=0, atol=1e-14)
+    np.testing.assert_allclose(log[begin:], plain_wave[begin:] * smooth[: 1000 - entry.ahead], rtol=0, atol=1e-14)
 
 
 def test_a_texture_in_time_that_nobody_computes_fades_out():
     """Two seconds are computed ahead; the rest by `fill`."""
     starved, filled = (RealtimeEntry(designed(False, True)) for _ in range(2))
     for entry in (starved, filled):
-        entry.play(SampledTexture(Wave(False), RATE))
+        entry.play(SampledTexture(wave(False), RATE))
         for _ in range(6):
             plain(entry, np.zeros((2500, 2)))
             if entry is filled:
@@ -220,7 +210,7 @@ def test_a_texture_in_time_that_nobody_computes_fades_out():
 def test_textures_that_have_faded_out_are_let_go():
     entry = RealtimeEntry(designed(False, True))
     for k in range(20):
-        entry.play(SampledTexture(Wave(False, 1e-6 * (k + 1)), RATE))
+        entry.play(SampledTexture(wave(False, 1e-6 * (k + 1)), RATE))
         plain(entry, np.zeros((500, 2)))
     assert len(entry._textures) <= 5
     assert abs(entry.log(9900)["reference"]).max() == pytest.approx(20e-6, rel=0.02)
@@ -360,23 +350,11 @@ def test_what_a_sampled_texture_refuses():
     with pytest.raises(ValueError, match="Playlist with a part along the surface: play its parts one after another"):
         SampledTexture(hr.Playlist([(hr.Grating(wavelength=1e-3, amplitude=1e-6), 1.0)]), RATE)
 
-    class Follows(Wave):
-        def waveform(self, time, position):
-            return 1e-6 * np.sin(position)
-
-    with pytest.raises(ValueError, match="Follows: must not change with the finger's position"):
-        SampledTexture(Follows(False), RATE)
-
-    class Touched(Wave):
-        def waveform(self, time, position):
-            return 1e-6 * np.sin(300.0 * time) * np.isfinite(position)  # would be silent: samples know no finger
-
-    with pytest.raises(ValueError, match="Touched: must not change with the finger's position or contact"):
-        SampledTexture(Touched(False), RATE)
-
-    class Travels(Wave):
-        def waveform(self, time, position):
-            return 1e-6 * np.sin(2e3 * np.pi * position - 300.0 * time)
-
-    with pytest.raises(ValueError, match="Travels: must not change with time: it lies along the surface"):
-        SampledTexture(Travels(True), RATE)
+    with pytest.raises(ValueError, match="Own: must not change with the finger's position"):
+        SampledTexture(Own(lambda time, position: 1e-6 * np.sin(position)), RATE)
+    touched = Own(lambda time, position: 1e-6 * np.sin(300.0 * time) * np.isfinite(position))  # would be silent
+    with pytest.raises(ValueError, match="Own: must not change with the finger's position or contact"):
+        SampledTexture(touched, RATE)
+    travels = Own(lambda time, position: 1e-6 * np.sin(2e3 * np.pi * position - 300.0 * time), spatial=True)
+    with pytest.raises(ValueError, match="Own: must not change with time: it lies along the surface"):
+        SampledTexture(travels, RATE)

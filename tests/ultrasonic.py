@@ -49,10 +49,6 @@ class Run(NamedTuple):
         edges = np.flatnonzero(np.diff(np.r_[0, (self.flags & Flag.UNLOCKED) != 0, 0]))
         return max(edges[1::2] - edges[::2], default=0) / self.mode.rate
 
-    def line(self, signal, frequency):
-        """Complex amplitude of a signal at a frequency (Hz) that fits the window."""
-        return 2 * np.mean(signal * np.exp(-2j * np.pi * frequency * self.time))
-
 
 def held(load):
     return hr.Finger.still(normal_load=load) if load else FREE
