@@ -163,8 +163,7 @@ class Player:
     @gain.setter
     def gain(self, gain: float) -> None:
         with self._lock, self._busy():
-            if not 0.0 <= gain <= MOST_GAIN:
-                raise ValueError(f"{gain=}: must be 0 to {MOST_GAIN:g}; an amplitude belongs in the texture")
+            gain = number("gain", gain, least=0.0, most=MOST_GAIN)  # an amplitude belongs in the texture
             if self._loop is not None:
                 self._loop.set_gain(gain)
             self._gain = gain

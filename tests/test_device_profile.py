@@ -141,9 +141,7 @@ def test_identify_writes_a_profile_that_keeps_the_limits(plate, tmp_path):
 
 def test_a_profile_that_a_run_contradicts_is_named(plate):
     stiff = {"stiffness_1": 23.5e3, "stiffness_2": 24e3}
-    with pytest.warns(
-        hr.PlateMismatch, match=r"differs from its model, profile plate 3 \(A. Smith, 2026-11-22\): the"
-    ):
+    with pytest.warns(hr.PlateMismatch, match=r"differs from its model, profile plate 3 \(A. Smith, 2026-11-22\): the"):
         hr.render(hr.Scene(**fields(plate), simulation=stiff))
 
 

@@ -84,6 +84,34 @@ def test_a_session_is_a_recording_like_any_other(session):
     assert loaded.summary()["waveform"]["share_in_band"] > 0.9
 
 
+class Telling(Lying):
+    """A plate that hands its motion over, only senses it, or does neither."""
+
+    probe = False
+
+    def __init__(self, source):
+        super().__init__(100.0, "nothing")
+        self.source, self.sensed_channels = source, 0 if source == "unknown" else 2
+
+    def _play(self, drive):
+        sensed = super()._play(drive)
+        told = sensed.motion if self.source == "true" else None
+        return sensed._replace(motion=told, sensed=sensed.sensed[:, : self.sensed_channels])
+
+
+@pytest.mark.parametrize("source", ["true", "sensors", "unknown"])
+def test_a_recording_says_where_its_motion_comes_from(source, tmp_path):
+    with hr.Player(driver=Telling(source), paced=False) as player:
+        player.play(TONE)
+        player.record(tmp_path / "live.au")
+        assert (tmp_path / "live.au").exists()
+        player.sleep(0.5)
+        recording = player.end_recording()
+    assert recording.header.motion_source == source
+    judged = recording.summary()["verdict"] != "not judged"
+    assert judged == (source == "true")  # 1 um of noise on 5 um is no error of the device
+
+
 def test_a_recording_has_the_drive_that_played_with_each_sample(tmp_path):
     """As that of `render`: what acts, and not what was computed from the sample."""
     driver = Lying(100.0, "nothing")
@@ -234,7 +262,7 @@ def test_what_it_refuses(tmp_path):
             (lambda: player.finger(0.0, 50.0), r"velocity=50\.0 m/s"),
             (lambda: player.finger(0.0, 0.1, -1.0), r"load=-1\.0 N"),
             (lambda: player.finger(None), "position=None"),
-            (lambda: setattr(player, "gain", np.nan), "gain=nan: must be 0 to 10"),
+            (lambda: setattr(player, "gain", np.nan), "gain = nan: must be a finite number >= 0 and <= 10"),
             (lambda: player.sleep(-1.0), "seconds = -1.0"),
         ):
             with pytest.raises(ValueError, match=what):
@@ -251,7 +279,7 @@ def test_what_it_refuses(tmp_path):
         hr.Player(texture=TONE)
     with hr.Player() as player:
         for gain in (-0.1, 10.1):
-            with pytest.raises(ValueError, match=f"gain={gain}: must be 0 to 10"):
+            with pytest.raises(ValueError, match=f"gain = {gain}: must be a finite number >= 0 and <= 10"):
                 player.gain = gain
 
 

@@ -104,6 +104,7 @@ def judge(model: DeviceModel, drive: Array, sensed: Array) -> Found:
     `sensed` (n + m, 2) goes on into the silence after the drive.
     """
     silence = sensed[(len(drive) + len(sensed)) // 2 :]
+    silence = silence[np.isfinite(silence).all(axis=1)]
     sensed = sensed[: len(drive)]
     stated = model.delay - model.block
     delays = range(max(stated - DELAYS // 2, 0), max(stated - DELAYS // 2, 0) + DELAYS)

@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from hapticrender.bands import Bands
-from hapticrender.checks import Validated, check_names, checked, flag, numbers, option, parameter, require, text
+from hapticrender.checks import Validated, check_names, checked, flag, number, numbers, option, parameter, require, text
 from hapticrender.protocols import Array
 
 if TYPE_CHECKING:
@@ -53,7 +53,9 @@ def _row(key: str, value: Any) -> Array:
 
 def _noise(key: str, value: Any) -> tuple[float, ...]:
     """Return a noise for each place; one number is that of all."""
-    return numbers(key, value if isinstance(value, list | tuple | np.ndarray) else [value], least=0.0, most=1e12)
+    if isinstance(value, list | tuple | np.ndarray):
+        return numbers(key, value, least=0.0, most=1e12)
+    return (number(key, value, least=0.0, most=1e12),)
 
 
 def _bands(key: str, value: Any) -> Bands:

@@ -69,6 +69,7 @@ class Recorder:
         self._scene, self._requested = scene, requested
         self._done, self._before = 0, np.full(2, np.nan)  # samples with a reference; the finger's last positions (m)
         self._file: BinaryIO | None = None
+        self._begun = False  # whether the file has its header, which says what the first block says
         self._blocks: list[Array] = []  # what is not in the file yet; without a path, everything
         self._waiting = 0  # samples in them
         self._closed = False
@@ -88,7 +89,7 @@ class Recorder:
         ``protocols.Flag``.  Units are those of the header.  The first
         block's `motion_source` replaces that of the header.
         """
-        if motion_source is not None and self._file is None and not self._blocks:
+        if motion_source is not None and not self._begun and not self._blocks:
             self.header = replace(self.header, motion_source=motion_source)
         if gap > 0:
             self._append_unknown(gap, Flag.OVERRUN)
@@ -96,26 +97,26 @@ class Recorder:
             signals["reference"] = np.zeros(len(signals["drive"]))
         self._blocks.append(journal.join(self.header, signals))
         self._waiting += len(signals["drive"])
-        if self._file is None or self._waiting >= FLUSH * self.header.rate:
+        if not self._begun or self._waiting >= FLUSH * self.header.rate:
             self.flush()
 
     def begin(self) -> None:
         """Make the file of `path` now, not at the first block; an OSError states why it cannot be written."""
-        self._file = self._file or self._create(Path(self.path or ""))
+        path = Path(self.path or "")
+        path.unlink(missing_ok=True)  # a recording may still read the old file: replace it, never write into it
+        self._file = path.open("xb")
 
     def flush(self) -> None:
         """Hand everything appended so far to the operating system; without a path, do nothing."""
         if self.path is None or not self._blocks:
             return
         blocks, self._blocks, self._waiting = self._blocks, [], 0
-        self._file = self._file or self._create(self.path)
         try:
             frames = self._frames(blocks)
         except (KeyboardInterrupt, SystemExit):  # a signal: they are written on closing
             self._blocks = blocks
             raise
-        self._file.write(frames.astype(journal.JOURNAL_DTYPE).data)
-        self._file.flush()
+        self._write(frames.astype(journal.JOURNAL_DTYPE).data)
 
     def close(self, stopped: bool = False) -> None:
         """Write what is left and close the journal.
@@ -128,6 +129,8 @@ class Recorder:
                 self._append_unknown(1, Flag.STOPPED)
             self._closed = True
             self.flush()
+            if self._file is not None and not self._begun:
+                self._write(b"")
         finally:
             if self._file is not None:
                 self._file.close()
@@ -149,7 +152,7 @@ class Recorder:
             return Recording(self.header, frames, self._scene)
         self.close()
         if self._file is None:
-            self._create(self.path).close()
+            self._write(b"").close()
         return Recording(*journal.read_journal(self.path), self._scene)
 
     def _frames(self, blocks: list[Array]) -> Array:
@@ -164,11 +167,17 @@ class Recorder:
             self._done, self._before = self._done + len(frames), path[-2:]
         return frames
 
-    def _create(self, path: Path) -> BinaryIO:
-        path.unlink(missing_ok=True)  # a recording may still read the old file: replace it, never write into it
-        file = path.open("xb")
-        file.write(journal.journal_head(self.header))
-        return file
+    def _write(self, data: Any) -> BinaryIO:
+        """Hand data to the operating system, behind the header."""
+        if self._file is None:
+            self.begin()
+        file: Any = self._file
+        if not self._begun:
+            file.write(journal.journal_head(self.header))
+            self._begun = True
+        file.write(data)
+        file.flush()
+        return file  # type: ignore[no-any-return]
 
 
 def _of_header(name: str, doc: str) -> Any:
