@@ -73,7 +73,7 @@ class BoardLine:
     DeviceTimeout
         Nothing answers in the protocol.
     ProtocolError
-        What answers speaks another version of it.
+        What answers has another version of it.
     """
 
     capabilities: Capabilities  # from the reply to HELLO on
@@ -251,7 +251,7 @@ class BoardLine:
         return out
 
     def receive(self, data: bytes, now: float) -> None:
-        """Take bytes that have arrived; a `ProtocolError` where the board speaks another version."""
+        """Take bytes that have arrived; a `ProtocolError` where the board has another version."""
         self.received_bytes += len(data)
         for frame in self._reader.feed(data):
             try:

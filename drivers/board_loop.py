@@ -85,7 +85,7 @@ class BoardLoop:
         """Return the number of the first sample and the signals that the board has streamed since the last call."""
         drive, sensed, position, load, reference, flags = self.driver.columns(self._client.rows())
         first, self.samples = self.samples, self.samples + len(flags)
-        motion = sensed @ (self.model.place_from_coordinate @ self.model.coordinate_from_sensed).T
+        motion = sensed @ self.model.place_from_sensed.T
         recent = np.vstack([self._recent, np.stack([reference, motion[:, 0], position], axis=1)])
         self._recent = recent[-round(JUDGED * self.driver.rate) :]
         return first, {
@@ -111,8 +111,9 @@ class BoardLoop:
         speed = np.nan_to_num(abs(np.diff(self._recent[:, 2]))).sum() * self.driver.rate / max(len(self._recent) - 1, 1)
         rows, frequency = [], self._bands.frequency + self._bands.wavenumber * speed
         for hertz, band in zip(frequency, self._client.telemetry().bands, strict=False):
-            size, error = abs(band.target), abs(band.measured - band.target)
-            rows.append((float(hertz), size, abs(band.measured), error / size if size > 0.0 else math.nan))
+            moves = float(hertz > 0.0)  # a grating under a finger that rests has no amplitude
+            size, error = moves * abs(band.target), abs(band.measured - band.target)
+            rows.append((float(hertz), size, moves * abs(band.measured), error / size if size > 0.0 else math.nan))
         return rows
 
     def fault(self) -> HapticError | None:

@@ -28,6 +28,7 @@ from hapticrender.formatting import as_json, printable
 from hapticrender.loop import prepare, run
 from hapticrender.protocols import Rendering
 from hapticrender.report import outputs
+from hapticrender.report.progress import progress as progress_of
 from hapticrender.report.text import verdict as sentence
 from hapticrender.touch.builtin_scenes import builtin_scenes
 from hapticrender.touch.scene import Scene, distinct_names
@@ -126,7 +127,7 @@ def validate(
             calls = [lambda _, future=each: future.result() for each in futures]  # type: ignore[misc]
         verdicts = []
         for line, call in zip(shown, calls, strict=True):
-            with outputs.progress(line, progress) if line and progress else nullcontext() as tick:
+            with progress_of(line, progress) if line and progress else nullcontext() as tick:
                 verdicts.append(call(tick))
         return verdicts
 

@@ -52,6 +52,7 @@ def demo(arguments: argparse.Namespace) -> int:
     """Render the built-in scenes and make a page about them."""
     from hapticrender.report import outputs
     from hapticrender.report.page import refuse_other_page, write_page
+    from hapticrender.report.progress import progress
     from hapticrender.touch.builtin_scenes import builtin_scenes
 
     scenes = builtin_scenes()
@@ -63,7 +64,7 @@ def demo(arguments: argparse.Namespace) -> int:
     finished: list[Outputs] = []
     try:
         for number, (name, rendering) in enumerate(zip(scenes, renderings, strict=True), 1):
-            with outputs.progress(f"{number}/{len(scenes)} {name}", sys.stderr) as tick:
+            with progress(f"{number}/{len(scenes)} {name}", sys.stderr) as tick:
                 finished.append(outputs.run_into(arguments.out / name, rendering, progress=tick))
     finally:
         if finished:
@@ -75,7 +76,8 @@ def demo(arguments: argparse.Namespace) -> int:
 
 def render(arguments: argparse.Namespace) -> int:
     """Render a scene into a folder."""
-    from hapticrender.report.outputs import progress, run_into, written_in
+    from hapticrender.report.outputs import run_into, written_in
+    from hapticrender.report.progress import progress
 
     scene, notes = _scene(arguments.scene), ""
     _check_run_folder(arguments.out, arguments, Path(arguments.scene))

@@ -1,4 +1,4 @@
-"""The accuracy suite: the default method meets every bound, others miss theirs; gratings and overload beside it."""
+"""The accuracy suite: the default method keeps every bound, others miss theirs; gratings and overload beside it."""
 
 import json
 
@@ -28,7 +28,7 @@ def test_every_case_has_its_targets_and_every_target_its_case():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("case", CASES)
-def test_the_default_method_meets_every_bound(case):
+def test_the_default_method_keeps_every_bound(case):
     assert missed(run_suite(["inverse"], [case])) == []
 
 

@@ -48,6 +48,18 @@ def test_a_board_plays_live(program, tmp_path):
                 player.sleep(0.01)
             assert player.state().flags == hr.Flag(0)
             both = player.end_recording()
+            player.play(hr.Grating(wavelength=1e-3, amplitude=4e-6))
+            start = driver.client.clock.monotonic()
+            while (slid := driver.client.clock.monotonic() - start) < 0.5:
+                player.finger(0.03 - 0.1 * slid, -0.1, 0.4)
+                player.sleep(0.01)
+            [ridges] = player.state().bands
+            player.finger(-0.02, 0.0, 0.4)
+            player.sleep(0.5)
+            [resting] = player.state().bands
+    assert ridges.frequency == pytest.approx(100.0, rel=0.1)  # a correction of 2 mm is 8 % of a quarter of a second
+    assert ridges.target == pytest.approx(4e-6, rel=1e-3)
+    assert (resting.frequency, resting.target) == (0.0, 0.0)
     assert (tone.frequency, other.frequency) == (100.0, 150.0)
     assert (tone.target, other.target) == pytest.approx((5e-6, 2e-6), rel=1e-3)
     assert max(tone.error, other.error) < 0.2  # telemetry is of an instant, with 1 um of noise at each end

@@ -1,13 +1,13 @@
-"""Write what one rendered scene leaves in a folder (sound, picture, journal, figures, itself), and show progress."""
+"""Write what one rendered scene leaves in a folder: sound, picture, journal, figures, itself."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TextIO
+from typing import Any
 
 from hapticrender.formatting import as_json
 from hapticrender.loop import run
@@ -109,29 +109,3 @@ def write_outputs(folder: Path, recording: Recording) -> Outputs:
     summary = {**recording.summary(), "sound": sound}
     (folder / "summary.json").write_text(as_json(summary), encoding="utf-8")
     return Outputs(name=header.name, folder=folder, summary=summary, toml=header.scene)
-
-
-@contextmanager
-def progress(label: str, stream: TextIO) -> Iterator[Callable[[float, float], None]]:
-    """Yield ``tick(done, total)`` (s), which shows the share that is done on a terminal; write `label` at the end.
-
-    Examples
-    --------
-    >>> import sys
-    >>> with progress("1/2 first", sys.stdout) as tick:
-    ...     tick(0.5, 1.0)
-    1/2 first
-    """
-    terminal = stream.isatty()
-
-    def tick(done: float, total: float) -> None:
-        if terminal:
-            print(f"\r{label} {100 * done / total:3.0f} %", end="", file=stream, flush=True)
-
-    try:
-        yield tick
-    except BaseException:
-        if terminal:
-            print(file=stream)
-        raise
-    print(f"\r{label}\x1b[K" if terminal else label, file=stream, flush=True)
