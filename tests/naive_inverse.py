@@ -7,7 +7,7 @@ rounded.  The reference comes `ahead` samples early, as a number a sample.
 import numpy as np
 from scipy.linalg import expm
 
-FINGER, HEAVE, ROCKING, LOAD, INITIAL, COUNT = 0, 5, 9, 12, 14, 18
+FINGER, HEAVE, COUPLING, LOAD, INITIAL, COUNT = 0, 5, 9, 12, 14, 18
 
 
 class NaiveInverse:
@@ -143,13 +143,15 @@ class NaiveInverse:
         mass, damping = np.clip(z.real / (s**2).real, -2e-3, 10e-3), np.clip(z.imag / s.imag, 0.0, 12.0)
         arm = np.outer([1.0, self.lever], [1.0, self.lever]) * self.contact
 
-        def learned(matrix, order):
+        def learned(matrix, order, both):
             own = matrix.diagonal()
-            change = th[[HEAVE + order, ROCKING + order]] / scale**order
-            return matrix + np.diag(np.clip(change, -0.7 * own, 4.0 * own))
+            heave, coupling = th[[HEAVE + order, COUPLING + order]] / scale**order
+            coupling = np.clip(coupling, -0.2 * own[1], 0.2 * own[1])
+            change = np.diag(np.clip([heave, heave if both else 0.0], -0.7 * own, 4.0 * own))
+            return matrix + change + coupling * np.eye(2)[::-1]
 
-        M = learned(self.M, 2) + mass * arm
-        C, K = learned(self.C, 1) + damping * arm, learned(self.K, 0)
+        M = learned(self.M, 2, False) + mass * arm
+        C, K = learned(self.C, 1, True) + damping * arm, learned(self.K, 0, True)
         flow = np.zeros((6, 6))
         flow[:2, 2:4] = np.eye(2)
         flow[2:4] = np.linalg.solve(M, np.hstack([-K, -C, np.eye(2)]))
@@ -176,7 +178,7 @@ class NaiveInverse:
         along = self.contact * (self.s[0] + self.lever * self.s[1])
         found[:, FINGER:HEAVE] = along * np.outer([1.0, self.lever], basis[:5])
         found[0, HEAVE : HEAVE + 4] = self.s[0] * basis[[0, 1, 2, 5]]
-        found[1, ROCKING : ROCKING + 3] = basis[:3]
+        found[1, COUPLING : COUPLING + 3] = basis[:3]
         return found
 
     def level(self):

@@ -161,14 +161,18 @@ def test_a_gain_that_changes_during_a_run_stops_the_drive_and_is_named(change, f
     [(72.0, 0.0275, True), (189.0, 0.05, True), (400.0, -0.05, True), (189.0, 0.05, False), (400.0, -0.05, False)],
 )
 def test_what_is_swapped_stops_the_drive_and_is_named(frequency, position, sensors):
-    """Two sensors, or else two coils, under 2 N off the middle; coils are found once the rocking grows (6 ms)."""
+    """Two sensors, or two coils, under 2 N off the middle; coils in the third mean of 3 ms: their rocking has to grow.
+
+    Two sensors add as much as the tone (50 um) to the motion of the 100 ms before; two coils move what
+    ``docs/safety.md`` publishes for them under a finger off the middle.
+    """
     both, changed = np.eye(2), np.eye(2)[::-1]
     plate = Rewired(*((changed, both) if sensors else (both, changed)), **FINGER | {"position": position, "load": 2.0})
     with pytest.raises(hr.DeviceFault, match="sensor 1 and 2: each shows the motion of the other") as stopped:
         hr.render(scene(frequency), driver=plate)
     first = round(START * RATE)
-    assert 0 < stopped.value.time - START < 8e-3
-    assert max(plate.motion[first:]) < max(plate.motion[:first]) + 50e-6
+    assert 0 < stopped.value.time - START < (8e-3 if sensors else 9e-3)
+    assert max(plate.motion[first:]) < (max(plate.motion[first - 500 : first]) + 50e-6 if sensors else 400e-6)
 
 
 @pytest.mark.parametrize("limits", [{}, {"peak_drive": 0.65}], ids=["free", "limited"])

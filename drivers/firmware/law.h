@@ -23,7 +23,7 @@
 /* parameters of the Kalman filter: first of each set, and their number */
 #define LAW_FINGER 0
 #define LAW_HEAVE 5
-#define LAW_ROCKING 9
+#define LAW_COUPLING 9
 #define LAW_LOAD 12
 #define LAW_INITIAL 14
 #define LAW_PARAMETERS 18

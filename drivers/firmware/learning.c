@@ -24,6 +24,12 @@ static real_t corrected(real_t value, real_t change)
     return value + real_clip(change, REAL(-0.7) * value, REAL(4.0) * value);
 }
 
+/* A change of a coupling, within a fifth of rocking's own: determinants stay positive. */
+static real_t coupled(real_t value, real_t change)
+{
+    return real_clip(change, REAL(-0.2) * value, REAL(0.2) * value);
+}
+
 /* The device with what was learned of it, and the finger by its mass and damping at 180 Hz. */
 static loaded_t load_device(const learning_t *v, const design_t *d)
 {
@@ -47,14 +53,14 @@ static loaded_t load_device(const learning_t *v, const design_t *d)
     const real_t per_m = per_c * per_c;
     loaded_t p;
     p.m00 = corrected(d->mass[0][0], per_m * theta[LAW_HEAVE + 2]) + mass;
-    p.m01 = d->mass[0][1] + h * mass;
-    p.m11 = corrected(d->mass[1][1], per_m * theta[LAW_ROCKING + 2]) + h * h * mass;
+    p.m01 = d->mass[0][1] + coupled(d->mass[1][1], per_m * theta[LAW_COUPLING + 2]) + h * mass;
+    p.m11 = d->mass[1][1] + h * h * mass;
     p.c00 = corrected(d->damping[0][0], per_c * theta[LAW_HEAVE + 1]) + damping;
-    p.c01 = d->damping[0][1] + h * damping;
-    p.c11 = corrected(d->damping[1][1], per_c * theta[LAW_ROCKING + 1]) + h * h * damping;
+    p.c01 = d->damping[0][1] + coupled(d->damping[1][1], per_c * theta[LAW_COUPLING + 1]) + h * damping;
+    p.c11 = corrected(d->damping[1][1], per_c * theta[LAW_HEAVE + 1]) + h * h * damping;
     p.k00 = corrected(d->stiffness[0][0], theta[LAW_HEAVE]);
-    p.k01 = d->stiffness[0][1];
-    p.k11 = corrected(d->stiffness[1][1], theta[LAW_ROCKING]);
+    p.k01 = d->stiffness[0][1] + coupled(d->stiffness[1][1], theta[LAW_COUPLING]);
+    p.k11 = corrected(d->stiffness[1][1], theta[LAW_HEAVE]);
     return p;
 }
 
@@ -370,7 +376,7 @@ void learning_force(const law_t *law, real_t force[2])
     }
     for (uint32_t i = 0u; i < 3u; i++) {
         heave += v->theta[LAW_HEAVE + i] * law->basis[i];
-        rocking += v->theta[LAW_ROCKING + i] * law->basis[i];
+        rocking += v->theta[LAW_COUPLING + i] * law->basis[i];
     }
     finger *= (real_t)v->contact * (shape[0] + v->lever * shape[1]);
     force[0] = finger + shape[0] * heave;
@@ -394,7 +400,7 @@ static void set_inputs(const law_t *law, const real_t acting[LAW_RING], real_t h
     }
     for (uint32_t i = 0u; i < 3u; i++) {
         heave[LAW_HEAVE + i] = shape[0] * acting[i];
-        rocking[LAW_ROCKING + i] = acting[i];
+        rocking[LAW_COUPLING + i] = acting[i];
     }
     heave[LAW_HEAVE + 3] = shape[0] * acting[5];
     heave[LAW_LOAD] = REAL(1.0);

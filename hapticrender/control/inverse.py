@@ -16,6 +16,7 @@ from hapticrender.control.damping import Damping, choose_damping
 from hapticrender.control.device_model import DeviceModel
 from hapticrender.control.inverse_kernel import REVERSION, SCALED, inverse_step
 from hapticrender.control.inverse_records import (
+    COUPLING,
     FINGER,
     HEAVE,
     INITIAL,
@@ -23,7 +24,6 @@ from hapticrender.control.inverse_records import (
     LOAD,
     PARAMETERS,
     RING,
-    ROCKING,
     TAPS,
 )
 from hapticrender.control.records import MOST_CHANNELS, aligned
@@ -36,7 +36,7 @@ LOWEST = 1e-3  # Hz: what follows a finger fades out below it, though a resting 
 SCALE = 2 * math.pi * 200.0  # rad/s: derivatives are divided by its powers, so that every parameter is in N/m
 POLE, POLE_DAMPING = 2 * math.pi * 200.0, 0.8  # the finger's pair of poles
 PEOPLE, SEED = 300, 1  # fingers of the prior, and the seed that draws them
-REVERSION_RATES = {FINGER: 0.05, HEAVE: 0.003, ROCKING: 0.01, LOAD: 1.0}  # 1/sqrt(s), from each parameter on
+REVERSION_RATES = {FINGER: 0.05, HEAVE: 0.003, COUPLING: 0.01, LOAD: 1.0}  # 1/sqrt(s), from each parameter on
 SETTLING, RESTART, DAMPER_TIME = 2e-3, 0.1, 0.1  # s after a contact: learning starts, and again; the damper sleeps
 JOINING = 60e-3  # s: for so long the deviation at the start of learning is a parameter
 PATIENCE = 1e-3  # s: for so long a position may be missing
@@ -118,7 +118,7 @@ def prior(model: DeviceModel) -> tuple[Array, Array]:
     sigma[LOAD] = LOAD_SIZE[0]
     if len(model.mass) > 1:
         k, m, c = model.stiffness[1, 1], model.mass[1, 1] * SCALE**2, c
-        sigma[ROCKING : ROCKING + 3] = 0.03 * k, c, 0.05 * m
+        sigma[COUPLING : COUPLING + 3] = 0.03 * k, c, 0.05 * m
         sigma[LOAD + 1] = LOAD_SIZE[1]
     if model.finger.contact is None:  # friction: the device is what is not known, and no finger adds to it
         sigma[HEAVE : HEAVE + 4] = FRICTION * np.array([k, model.damping[0, 0] * SCALE, m, 1.0])

@@ -32,13 +32,13 @@ from hapticrender.control.inverse_learning import (
 )
 from hapticrender.control.inverse_records import (
     BASIS,
+    COUPLING,
     FINGER,
     HEAVE,
     INVERSE_T,
     LOAD,
     PARAMETERS,
     RING,
-    ROCKING,
     TAPS,
 )
 from hapticrender.control.kernel import sense_block, update_confidence
@@ -162,7 +162,7 @@ def learned_force(controller, inverse):
         finger += theta[FINGER + i] * basis[i]
     for i in range(3):
         heave += theta[HEAVE + i] * basis[i]
-        rocking += theta[ROCKING + i] * basis[i]
+        rocking += theta[COUPLING + i] * basis[i]
     finger *= v.contact * (c.p.shape[0] + v.lever * c.p.shape[1])
     return finger + c.p.shape[0] * (heave + theta[HEAVE + 3] * basis[5]), v.lever * finger + rocking
 

@@ -10,6 +10,7 @@ from numba import carray
 
 from hapticrender.control.inverse_records import (
     BASIS,
+    COUPLING,
     FINGER,
     HEAVE,
     INITIAL,
@@ -17,7 +18,6 @@ from hapticrender.control.inverse_records import (
     LOAD,
     PARAMETERS,
     RING,
-    ROCKING,
     ROWS,
 )
 from hapticrender.control.laws import contact_damping
@@ -35,10 +35,17 @@ def corrected(value, change):
 
 
 @kernel
+def coupled(value, change):
+    """Bound a change of a coupling to a fifth of rocking's own: determinants stay positive."""
+    return min(max(change, -0.2 * value), 0.2 * value)
+
+
+@kernel
 def discretise(controller, inverse):
     """Exact step of the loaded device over a sample, from a series of ten terms; states are coordinates, velocities.
 
-    The finger counts by its mass and damping at 180 Hz, the device with what was learned of its heave.
+    The finger counts by its mass and damping at 180 Hz, the device with what was learned of its heave and coupling:
+    springs and dampers at the two sides change rocking by as much as heave, and couple both by their difference.
     """
     v = record(inverse, INVERSE_T, 0)
     theta, w, period = v.theta, TURN * 180.0, 1.0 / record(controller, CONTROLLER_T, 0).p.rate
@@ -50,11 +57,14 @@ def discretise(controller, inverse):
     damping = min(max(z.imag / w, 0.0), 12.0) * v.contact
     h, per_c, per_m = v.lever, 1.0 / v.hertz_scale, 1.0 / (v.hertz_scale * v.hertz_scale)
     m00 = corrected(v.mass[0, 0], per_m * theta[HEAVE + 2]) + mass
-    m01, m11 = v.mass[0, 1] + h * mass, corrected(v.mass[1, 1], per_m * theta[ROCKING + 2]) + h * h * mass
+    m01 = v.mass[0, 1] + coupled(v.mass[1, 1], per_m * theta[COUPLING + 2]) + h * mass
+    m11 = v.mass[1, 1] + h * h * mass
     c00 = corrected(v.damping[0, 0] + contact_damping(controller), per_c * theta[HEAVE + 1]) + damping
-    c01, c11 = v.damping[0, 1] + h * damping, corrected(v.damping[1, 1], per_c * theta[ROCKING + 1]) + h * h * damping
-    k00, k01 = corrected(v.stiffness[0, 0], theta[HEAVE]), v.stiffness[0, 1]
-    k11 = corrected(v.stiffness[1, 1], theta[ROCKING])
+    c01 = v.damping[0, 1] + coupled(v.damping[1, 1], per_c * theta[COUPLING + 1]) + h * damping
+    c11 = corrected(v.damping[1, 1], per_c * theta[HEAVE + 1]) + h * h * damping
+    k00 = corrected(v.stiffness[0, 0], theta[HEAVE])
+    k01 = v.stiffness[0, 1] + coupled(v.stiffness[1, 1], theta[COUPLING])
+    k11 = corrected(v.stiffness[1, 1], theta[HEAVE])
     scale = 1.0 / (m00 * m11 - m01 * m01)
     i00, i01, i11 = scale * m11, -scale * m01, scale * m00
     # rates (1/s) that bound the norm; the step is halved until the series converges, and doubled again after it
@@ -265,7 +275,7 @@ def advance_regressors(controller, inverse):
         inputs[1, FINGER + i] = along * v.lever * ring[at, i]
     for i in range(3):
         inputs[0, HEAVE + i] = c.p.shape[0] * ring[at, i]
-        inputs[1, ROCKING + i] = ring[at, i]
+        inputs[1, COUPLING + i] = ring[at, i]
     inputs[0, HEAVE + 3] = c.p.shape[0] * ring[at, 5]
     inputs[0, LOAD], inputs[1, LOAD] = 1.0, touched * v.lever
     inputs[1, LOAD + 1] = 1.0

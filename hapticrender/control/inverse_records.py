@@ -9,7 +9,7 @@ from hapticrender.control.records import MOST_CHANNELS
 
 TAPS = 12  # of the derivatives' filters, 6 of them ahead
 BASIS = 6  # r, r'/w_n, r''/w_n^2, r through the pair of poles and its derivative/w_p, D_00 r' T
-FINGER, HEAVE, ROCKING, LOAD, INITIAL, PARAMETERS = np.array([0, 5, 9, 12, 14, 18])  # first of each set; their number
+FINGER, HEAVE, COUPLING, LOAD, INITIAL, PARAMETERS = np.array([0, 5, 9, 12, 14, 18])  # first of each set; their number
 ROWS = int(PARAMETERS) + 1  # regressors psi_i, and w
 RING = BASIS + 2  # of a sample: basis and deviation force, until they act
 
