@@ -17,8 +17,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from benchmarks.charts.poles import logarithms
 from hapticrender.control.device_model import DeviceModel
-from hapticrender.control.linear import LEAST_POLE, Sampled
+from hapticrender.control.linear import Sampled
 from hapticrender.control.loopshape import reduced_controller
 from hapticrender.control.transfer import butterworth
 from hapticrender.protocols import Array
@@ -141,8 +142,7 @@ class PolarLoop:
 
     def poles(self) -> Array:
         """Closed-loop poles in the frame of the carrier (1/s, complex: growth and angular frequency, shape (B, s))."""
-        z = np.linalg.eigvals(self.matrix()).astype(complex)
-        return self.plant.rate * np.log(np.where(z == 0, LEAST_POLE, z))
+        return logarithms(np.linalg.eigvals(self.matrix()), self.plant.rate)
 
 
 def _parts(values: Array) -> Array:

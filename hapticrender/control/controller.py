@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -42,7 +43,7 @@ class BankController:
         Name of the method that designed it.
     step : CFunction
         Advances the state; one of `hapticrender.control`.
-    settings : dict
+    settings : mapping
         Fields of `records.SETTINGS`; what is left out is zero.
     bands : Bands
     history : int
@@ -59,7 +60,7 @@ class BankController:
         self,
         method: str,
         step: CFunction,
-        settings: dict[str, Any],
+        settings: Mapping[str, Any],
         bands: Bands,
         *,
         history: int = 1,
@@ -83,7 +84,7 @@ class BankController:
         most = min(max(int(LONGEST_GROUP * self.rate), 1), LARGEST_GROUP)
         group = min(most, self.block)
         groups = -(-self.block // group)  # the last one may be filled in part
-        for name, value in (settings | {"group": group, "groups": groups}).items():
+        for name, value in {**settings, "group": group, "groups": groups}.items():
             self.state["p"][name][0] = value
         memory = {
             "tiles": self.tiles,
@@ -200,14 +201,10 @@ def ridge_spacing(bands: Bands) -> float:
     return float(np.diff(np.sort(bands.wavenumber[bands.wavenumber > 0.0])).min(initial=math.inf))
 
 
-def lowest_fixed(bands: Bands) -> float:
-    """Lowest carrier that does not follow the finger (Hz); infinite where all do."""
-    return float(np.min(bands.frequency[bands.wavenumber == 0.0], initial=math.inf))
-
-
 def lowest_carrier(model: DeviceModel, bands: Bands) -> float:
     """Lowest carrier (Hz): of the fixed ones, and of what a moving finger makes of the others."""
-    return min(lowest_fixed(bands), model.lowest_frequency if (bands.wavenumber > 0.0).any() else math.inf)
+    fixed = bands.frequency[bands.wavenumber == 0.0]
+    return float(fixed.min(initial=math.inf if len(fixed) == len(bands) else model.lowest_frequency))
 
 
 def refuse_whole_waveform(bands: Bands) -> None:

@@ -16,7 +16,7 @@ import numpy as np
 from hapticrender.bands import Bands
 from hapticrender.checks import check_names, option, parameter
 from hapticrender.control.controller import BankController
-from hapticrender.control.damping import within_a_turn
+from hapticrender.control.damping import oscillators, turns
 from hapticrender.control.device_model import DeviceModel, FingerRange
 from hapticrender.plants.compiled import CompiledPlant, new_record
 from hapticrender.plants.friction_laws import LAWS, FrictionLaw
@@ -158,7 +158,7 @@ def resonant(model: DeviceModel, mode: UltrasonicParameters, lock: float) -> Dev
 
 def _pace(model: DeviceModel) -> float:
     """Bandwidth of the amplitude loop over that of a plate's rules."""
-    if model.delay <= PROMPT and within_a_turn(model):
+    if model.delay <= PROMPT and turns(oscillators(model)) <= 1.0:
         return PACED_DELAY * model.rate / (model.delay + 1)
     return PACED_DELAY_ALONE * model.rate / model.delay
 
