@@ -21,7 +21,7 @@ from benchmarks.charts.poles import logarithms
 from hapticrender.control.device_model import DeviceModel
 from hapticrender.control.linear import Sampled
 from hapticrender.control.loopshape import reduced_controller
-from hapticrender.control.transfer import butterworth
+from hapticrender.control.stdft import StarSTDFT
 from hapticrender.protocols import Array
 
 
@@ -81,7 +81,7 @@ class PolarLoop:
         drive_map = np.ones((len(sides), 1)) if common else np.eye(len(sides))
         alike = model.response(frequency) @ np.ones(len(sides)) @ measured.T
         widths, which = np.unique(bandwidth, return_inverse=True)
-        filters = [butterworth(2 * b).tustin(model.rate, prewarp=2 * b) for b in widths]
+        filters = [StarSTDFT(bandwidth=2 * b, rate=model.rate).coefficients for b in widths]
         laws = [reduced_controller(b, 2 * b).tustin(model.rate) for b in widths]
         return cls(
             plant=plant,

@@ -41,6 +41,7 @@ from hapticrender.control.linear import Sampled
 from hapticrender.control.loopshape import (
     Bandwidths,
     EnvelopeLoop,
+    TransferFunction,
     envelope_loop,
     loop_margins,
     section,
@@ -48,7 +49,6 @@ from hapticrender.control.loopshape import (
 from hapticrender.control.low_pass import low_pass_step
 from hapticrender.control.margins import LEAST
 from hapticrender.control.records import LOW_PASS, W, aligned
-from hapticrender.control.transfer import TransferFunction
 from hapticrender.errors import DesignError
 from hapticrender.protocols import Array, Method
 

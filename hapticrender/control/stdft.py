@@ -17,7 +17,6 @@ from typing import Any
 
 import numpy as np
 
-from hapticrender.control.transfer import butterworth
 from hapticrender.protocols import Array
 
 
@@ -40,7 +39,9 @@ class StarSTDFT:
     @property
     def coefficients(self) -> tuple[Array, Array]:
         """Filter coefficients b and a of eq. 4, with a[0] = 1."""
-        return butterworth(self.bandwidth).tustin(self.rate, prewarp=self.bandwidth)
+        k = np.tan(pi * self.bandwidth / self.rate)
+        scale = 1 + sqrt(2) * k + k**2
+        return k**2 * np.array([1, 2, 1]) / scale, np.array([scale, 2 * (k**2 - 1), 1 - sqrt(2) * k + k**2]) / scale
 
     @property
     def delay(self) -> float:
