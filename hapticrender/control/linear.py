@@ -1,16 +1,9 @@
 """Transfer functions of the closed loop at sample rate: a device, the error observer, and its law.
 
-The error observer's bands turn with their carriers, E[n+1] = E[n] + g e[n] e^(-j phi[n]), yet their output,
-Re(E e^(j phi)), is that of a linear time-invariant resonator driven by the innovation e.  With eps = E e^(j phi),
-nu = v e^(j phi), a = e^(j w T) and the sampling period T, a carrier is (docs/theory.md, "Error observer" and "Law")::
-
-    eps' = eps + g e,    nu' = nu - T ki eps'                             (observer, integral)
-    F = Re sum_k rho (D nu' - ki D' eps') - inner sum_i c_i dev[n - i]    (law, damper)
-    e = y - dc - Re sum_k eps,    dev = y - Re sum_k nu,    next eps = a eps',  next nu = a nu'
-
-with rho = e^(j w lead)/sinc(w T/2).  All bands, their images, the DC estimate, all coordinates, the delay and the hold
-are inside; no envelope is averaged.  Assumed: carriers of fixed frequency (for a moving finger: its speed frozen), a
-frozen finger estimate, a drive inside its limits, no rounding.
+With eps = E e^(j phi) and nu = v e^(j phi) the turning bands are linear and time-invariant (docs/theory.md, "Error
+observer" and "Dynamic-stiffness law").  All bands, their images, the DC estimate, all coordinates, the delay and the
+hold are inside; no envelope is averaged.  Assumed: carriers of fixed frequency (for a moving finger: its speed frozen),
+a frozen finger estimate, a drive inside its limits, no rounding.
 """
 
 from __future__ import annotations

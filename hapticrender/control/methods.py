@@ -10,11 +10,7 @@ stiffness       the same, then D V + D' dV/dt
 resonant        one integrator a band and coordinate, no low pass; then D V + D' dV/dt
 =============== =======================================================================================================
 
-A look-up table of the free device over frequency turns the polar methods' amplitude into a drive; their command never
-goes negative, and their phase error is cut at -270/90 degrees.  Two sides controlled apart are unstable on the paper's
-plate between 129 and 189 Hz.  The static inverse takes every envelope for constant and fails within a few Hz of a mode,
-where the device's own envelope is slower than the loop; with the slope D' the inverse is exact up to m W^2/|D| for
-changes of W rad/s.  All but h and h2 leave the finger out.
+All but h and h2 leave the finger out; docs/theory.md, "Where methods fail", says what that costs.
 """
 
 from __future__ import annotations

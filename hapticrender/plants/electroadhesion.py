@@ -1,13 +1,8 @@
 """An electroadhesive screen: a current on a carrier, the circuit of screen and skin, attraction, friction, tribometer.
 
-The circuit, in series and per area: insulator, stratum corneum (C || R), sliding gap (C = eps0/d || R_g); and the body,
-R.  Under a current of peak I at the carrier w the attraction is, on average, ``g I^2`` whatever the gap's thickness::
-
-    g = kappa L/(4 w^2 eps0 A),   L = (w tau)^2/(1 + (w tau)^2),   tau = R_g C
-
-(docs/theory.md, "Electroadhesion").  A resting finger shorts its gap with sweat and is not attracted.  A stray
-capacitance C_s across the source (cable, electrode) leaves a finger of impedance Z ``I/(1 + j w C_s Z)``, in steady
-state at the carrier; the current that is measured is that of the source.
+Insulator, stratum corneum, sliding gap and body are in series; a current of peak I attracts with ``g I^2`` on average
+whatever the gap's thickness (docs/theory.md, "Electroadhesion").  A resting finger shorts its gap with sweat and is not
+attracted.  The current that is measured is that of the source, with what a stray capacitance across it takes.
 
 Two levels: "carrier" integrates the circuit over every substep exactly, with the offset of the current source, its
 servo and its compliance; "envelope" takes ``g I^2``.  They agree but for what a step of the envelope leaves in the gap

@@ -1,14 +1,8 @@
 """The vibrotactile plate of Grigorii et al. 2021: two coils, a sheet of glass, Hall sensors at its ends, a finger.
 
-With q = [x_c, a theta], a = coil_spacing/2, the finger at p, and the displacement e of the sensors in the first
-free-free bending mode of shape phi (docs/theory.md, section 3, with corrections to the paper)::
-
-    (M s^2 + C s + K) q = force_constant [[1, 1], [-1, 1]] i - F_f [1, p/a]
-    m_b (e'' + 2 zeta w_b e' + w_b^2 e) = phi_coil force_constant (i_1 + i_2) - phi(p) F_f
-    F_f = W + Z_f(s) s (x_c + p theta + phi(p) e)
-
-Frequency and damping of that mode are those measured on the free plate, its suspension included, so that the finger
-alone couples the mode to heave and rocking.
+The equations of motion, corrected, are those of docs/theory.md, section 3: q = [x_c, a theta], a = coil_spacing/2, and
+the displacement e of the sensors in the first free-free bending mode.  Frequency and damping of that mode are those
+measured on the free plate, its suspension included, so that the finger alone couples it to heave and rocking.
 """
 
 from __future__ import annotations

@@ -1,12 +1,8 @@
 """The sliding contact that every friction device shares, and a tribometer.
 
-The steady friction force F_s, the friction F on the finger and the measured one F_t (docs/theory.md, "Sliding contact";
-Balasubramanian, Pool and Vardar 2025)::
-
-    (delta/|v|) F' + F = F_s,     F_t'' + 2 zeta w0 F_t' + w0^2 F_t = w0^2 F
-
-Below `least_speed` the contact sticks and keeps its friction; a lifted finger has none.  Friction is positive against
-the motion, in either direction.  A step outputs the state at the start of a sample, then advances: exactly for a steady
+The equations are those of docs/theory.md, "Sliding contact" (Balasubramanian, Pool and Vardar 2025).  Below
+`least_speed` the contact sticks and keeps its friction; a lifted finger has none.  Friction is positive against the
+motion, in either direction.  A step outputs the state at the start of a sample, then advances: exactly for a steady
 friction and a speed that are constant over the sample, and a friction that changes linearly within it (tribometer).
 """
 

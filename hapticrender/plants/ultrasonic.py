@@ -1,11 +1,8 @@
 """An ultrasonic plate: one flexural mode, driven at its resonance, whose amplitude reduces friction.
 
-With the modal displacement q and the drive u, ``m q'' + (b + b_f) q' + m w^2 q = N u``; the finger adds the damping b_f
-and shifts the resonance, both with the cube root of its load.  The friction that it leaves is that of `surface`.
-
-At level "envelope" the mode is moved from w down to w_i with m_i = m w/w_i and b_i = b w/w_i, resonance shifts kept in
-Hz and N kept: its envelope is the same, for the same controller, at a fraction of the rate (docs/theory.md, "Ultrasonic
-mode").
+The finger adds damping and shifts the resonance, both with the cube root of its load; the friction that it leaves is
+that of `surface`.  At level "envelope" the mode is moved down, with the same envelope for the same controller at a
+fraction of the rate (docs/theory.md, "Ultrasonic mode").
 """
 
 from __future__ import annotations
