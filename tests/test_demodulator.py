@@ -9,8 +9,8 @@ from scipy.signal import butter, sosfilt
 from test_bandwidth import MODEL, SETTINGS
 
 import hapticrender as hr
+from hapticrender.control.demodulator import StarSTDFT
 from hapticrender.control.margin_check import error_loop
-from hapticrender.control.stdft import StarSTDFT
 
 RATE, BANDWIDTH = 5000.0, 5.0
 

@@ -18,10 +18,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from benchmarks.charts.poles import logarithms
+from hapticrender.control.demodulator import StarSTDFT
 from hapticrender.control.device_model import DeviceModel
 from hapticrender.control.linear import Sampled
 from hapticrender.control.loopshape import reduced_controller
-from hapticrender.control.stdft import StarSTDFT
 from hapticrender.protocols import Array
 
 

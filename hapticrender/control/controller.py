@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from hapticrender.bands import Bands
-from hapticrender.control.carriers import REFRESH, predict_positions
+from hapticrender.control.carriers import predict_positions
 from hapticrender.control.device_model import DeviceModel
 from hapticrender.control.records import (
     CONTROLLER,
@@ -25,7 +25,7 @@ from hapticrender.control.records import (
     aligned,
     lanes,
 )
-from hapticrender.jit import CFunction, addresses
+from hapticrender.jit import CFunction, addresses, record_of
 from hapticrender.protocols import Array
 
 LARGEST_GROUP = 16  # samples of a block whose carriers are taken from the middle of them,
@@ -80,12 +80,9 @@ class BankController:
         self.tiles["turn_re"] = 1.0
         self.tiles["active"] = (np.arange(tiles * W) < self.n_bands).reshape(tiles, W)
         self.setpoints = setpoint_rows(bands)
-        self.state = np.zeros(1, CONTROLLER)
         most = min(max(int(LONGEST_GROUP * self.rate), 1), LARGEST_GROUP)
         group = min(most, self.block)
         groups = -(-self.block // group)  # the last one may be filled in part
-        for name, value in {**settings, "group": group, "groups": groups}.items():
-            self.state["p"][name][0] = value
         memory = {
             "tiles": self.tiles,
             "commands": aligned(history * tiles * 3, PAIR),  # of both coordinates; the finger's force
@@ -96,13 +93,12 @@ class BankController:
             "samples": np.zeros((SAMPLE_ROWS, groups * group)),
         } | (arrays or {})
         self._arrays = memory
-        for name, array in memory.items():
-            if f"{name}_at" in (CONTROLLER.names or ()):
-                self.state[f"{name}_at"] = array.ctypes.data
+        places = {f"{name}_at": array for name, array in memory.items() if f"{name}_at" in (CONTROLLER.names or ())}
         start: dict[str, float] = {"tiles": tiles, "bands": self.n_bands, "history": history, "stale": 1, "moving": 1}
         start |= {"scale": 1.0, "confidence": 1.0, "damper_scale": 1.0, "unlocked": 1.0, "response_gain": math.nan}
-        for name, number in start.items():
-            self.state[name] = number
+        self.state = record_of(CONTROLLER, **start, **places)
+        for name, value in {**settings, "group": group, "groups": groups}.items():
+            self.state["p"][name][0] = value
 
     @property
     def settings(self) -> Any:
@@ -116,12 +112,6 @@ class BankController:
     def largest(self, name: str) -> Array:
         """Largest magnitude over the coordinates of a complex field of the loops, shape (bands,)."""
         return np.max([np.hypot(self.field(f"{name}{i}_re"), self.field(f"{name}{i}_im")) for i in (0, 1)], axis=0)
-
-    @property
-    def turns(self) -> Array:
-        """Fixed part of each carrier's phase at the next sample (turns, 0 to 1, shape (bands,))."""
-        left = 0 if self.block > 1 else -int(self.state["sample"][0]) % REFRESH
-        return np.mod(self.field("turns") - left * self.setpoints[0, : self.n_bands] / self.settings["rate"], 1.0)
 
     @property
     def mismatch(self) -> float:

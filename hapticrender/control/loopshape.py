@@ -9,14 +9,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from math import sqrt
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from hapticrender.bands import Bands
+from hapticrender.control.demodulator import StarSTDFT
 from hapticrender.control.device_model import DeviceModel
 from hapticrender.control.margins import LEAST, Margins, margins_of, unstable_poles
-from hapticrender.control.stdft import StarSTDFT
 from hapticrender.errors import DesignError
 from hapticrender.mathx import zero_crossings
 from hapticrender.protocols import Array
@@ -122,15 +122,6 @@ def _grid(loop: TransferFunction) -> Array:
     return np.geomspace(1e-3 * corners.min(), 1e3 * corners.max(), 20001)
 
 
-class EnvelopeLoop(NamedTuple):
-    """Low pass of an estimator and its loop controller as second-order sections."""
-
-    filter: Section
-    law: Section
-    boxcar: int  # samples, length of the running mean; 0: none
-    bandwidth: float  # Hz, of the closed loop, lowered where the delay requires it
-
-
 def envelope_loop(
     model: DeviceModel,
     bands: Bands,
@@ -138,8 +129,11 @@ def envelope_loop(
     boxcar: bool = False,
     bandwidths: Bandwidths | None = None,
     feedback: bool = True,
-) -> EnvelopeLoop:
+) -> tuple[dict[str, Any], float]:
     """Design the loop of one envelope for the lowest carrier, with the margins of a low-pass loop.
+
+    Returns the settings (low pass and loop controller as second-order sections, window in samples), and the bandwidth
+    (Hz) of the closed loop, lowered where the delay requires it.
 
     A `boxcar` estimates by a running mean over one period of the lowest carrier, which removes the image of that
     carrier and of its harmonics; its delay beyond the low pass's counts as the loop's.  `bandwidths` (Hz, of loop and
@@ -159,7 +153,8 @@ def envelope_loop(
         delay += max((length - 1) / (2 * model.rate) - StarSTDFT(bandwidth=lowest / 2, rate=model.rate).delay, 0.0)
     width, wide = bandwidths or _widest(lowest, delay)
     low_pass, law = StarSTDFT(bandwidth=wide, rate=model.rate), reduced_controller(width, wide)
-    return EnvelopeLoop(section(low_pass.coefficients), section(law.tustin(model.rate)), length, width)
+    found = {"low_pass": section(low_pass.coefficients), "loop": section(law.tustin(model.rate)), "window": length}
+    return found, width
 
 
 def _widest(lowest: float, delay: float) -> Bandwidths:

@@ -55,11 +55,6 @@ class Margins:
         least = min(found, key=lambda margins: margins.modulus)
         return replace(least, stable=all(margins.stable for margins in found), **smallest)
 
-    @property
-    def peak_sensitivity(self) -> float:
-        """Ms = 1/modulus."""
-        return 1.0 / self.modulus if self.modulus else math.inf
-
     def __str__(self) -> str:
         if not self.stable:
             return "unstable"

@@ -18,8 +18,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from hapticrender.checks import Validated, option, parameter
-from hapticrender.control.stdft import StarSTDFT
-from hapticrender.plants.compiled import CompiledPlant, new_record
+from hapticrender.control.demodulator import StarSTDFT
+from hapticrender.jit import record_of
+from hapticrender.plants.compiled import CompiledPlant
 from hapticrender.plants.electroadhesion_kernels import SCREEN, element, screen_step
 from hapticrender.plants.gap import VACUUM, gap_record
 from hapticrender.plants.sliding_contact import SlidingParameters, sliding_record
@@ -232,7 +233,7 @@ def screen_record(parameters: ElectroadhesionParameters, compensation: SquareRoo
     p, substep = parameters, 1.0 / (parameters.rate * parameters.oversampling)
     turn, corneum = np.exp(1j * p.omega * substep), p.corneum_resistance * p.corneum_capacitance
     elements = [element.py_func(tau, substep, p.omega, turn) for tau in (BLOCKING, corneum, corneum)]
-    return new_record(
+    return record_of(
         SCREEN,
         p,
         compensation,

@@ -15,8 +15,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hapticrender.jit import kernel
-from hapticrender.plants.compiled import new_record
+from hapticrender.jit import kernel, record_of
 from hapticrender.protocols import Array
 
 if TYPE_CHECKING:
@@ -53,7 +52,7 @@ def gap_record(parameters: ElectroadhesionParameters) -> Array:
     """Return the record (`GAP`, shape (1,)) of an estimator that has measured nothing, for a finger on this screen."""
     p = parameters
     b, a = p.estimator_filter.coefficients
-    return new_record(
+    return record_of(
         GAP,
         p,
         b=b,

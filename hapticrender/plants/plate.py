@@ -17,8 +17,9 @@ from numpy.typing import ArrayLike
 from hapticrender.checks import Validated, parameter
 from hapticrender.control.damping import BendingMode
 from hapticrender.control.device_model import DeviceModel
+from hapticrender.jit import record_of
 from hapticrender.mathx import zoh
-from hapticrender.plants.compiled import CompiledPlant, new_record
+from hapticrender.plants.compiled import CompiledPlant
 from hapticrender.plants.plate_kernels import COLUMNS, FUNCTIONS, NODES, PLATE, plate_step
 from hapticrender.protocols import Array
 from hapticrender.touch.mechanics import NONE, FingerMechanics
@@ -264,8 +265,7 @@ class Plate(CompiledPlant):
         self.parameters = parameters
         queue = np.zeros((self.delay - block, parameters.coils))
         self.buffers = (queue,)
-        self.state = _record(parameters, finger.mechanics)
-        self.state["queue"], self.state["latency"] = queue.ctypes.data, len(queue)
+        self.state = _record(parameters, finger.mechanics, queue)
 
     def inputs(self, first: int, n: int) -> Array:
         """Position (m), load (N) and strength of the finger, and a column that the plate does not use."""
@@ -274,17 +274,19 @@ class Plate(CompiledPlant):
         return inputs
 
 
-def _record(parameters: PlateParameters, mechanics: FingerMechanics) -> Array:
-    """State of the compiled plate at rest, its drive not queued."""
+def _record(parameters: PlateParameters, mechanics: FingerMechanics, queue: Array) -> Array:
+    """State of the compiled plate at rest, with the `queue` of its drive."""
     p, period = parameters, 1.0 / parameters.rate
     free, loaded = structure(p), structure(p, mechanics)
     many, scales = len(free.mass), (-(period**2), -period, period**2)
     kept = np.flatnonzero([True, p.degrees_of_freedom == 2, p.bending_frequency > 0.0])
-    s = new_record(
+    s = record_of(
         PLATE,
         p,
         columns=COLUMNS,
         channels=p.coils,
+        queue=queue,
+        latency=len(queue),
         held=np.nan,
         bent_at=np.nan,
         lever=np.nan,

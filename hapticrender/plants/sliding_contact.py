@@ -15,9 +15,9 @@ from typing import Any
 import numpy as np
 
 from hapticrender.checks import Validated, parameter
-from hapticrender.jit import kernel
+from hapticrender.jit import kernel, record_of
 from hapticrender.mathx import foh
-from hapticrender.plants.compiled import new_record, quantise
+from hapticrender.plants.compiled import quantise
 from hapticrender.protocols import Array
 
 SLIDING = np.dtype(
@@ -79,10 +79,6 @@ class SlidingParameters(Validated):
         step, z = _tribometer_step(self), self._shift(frequency)[..., None, None]
         return np.linalg.solve(z * np.eye(2) - step[:, :2], step[:, 2:3] + z * step[:, 3:])[..., 0, 0]
 
-    def frequency_response(self, frequency: Any, speed: float) -> Any:
-        """Sensed friction per steady friction (complex) at `frequency` (Hz) for a finger at `speed` (m/s)."""
-        return self.lag_response(frequency, speed) * self.tribometer_response(frequency)
-
     def _shift(self, frequency: Any) -> Any:
         """Return z = exp(j w T)."""
         return np.exp(2j * np.pi * np.asarray(frequency, float) / self.rate)
@@ -91,7 +87,7 @@ class SlidingParameters(Validated):
 def sliding_record(parameters: SlidingParameters) -> Array:
     """Return the record (`SLIDING`, shape (1,)) of a contact at rest, without friction."""
     renewal = 1.0 / (parameters.rate * parameters.memory_length)
-    return new_record(SLIDING, parameters, renewal=renewal, tribometer_step=_tribometer_step(parameters))
+    return record_of(SLIDING, parameters, renewal=renewal, tribometer_step=_tribometer_step(parameters))
 
 
 def _tribometer_step(parameters: SlidingParameters) -> Array:

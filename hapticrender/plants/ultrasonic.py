@@ -15,7 +15,8 @@ import numpy as np
 
 from hapticrender.checks import Validated, option, parameter
 from hapticrender.control.device_model import DeviceModel
-from hapticrender.plants.compiled import LOAD, STRENGTH, CompiledPlant, new_record
+from hapticrender.jit import record_of
+from hapticrender.plants.compiled import LOAD, STRENGTH, CompiledPlant
 from hapticrender.plants.ultrasonic_kernels import MODE, ultrasonic_step
 from hapticrender.protocols import Array
 
@@ -226,5 +227,5 @@ def mode_inputs(parameters: UltrasonicParameters, finger: Array, first: int, rat
 def mode_record(parameters: UltrasonicParameters, latency: int) -> tuple[Array, Array]:
     """Return the record (`MODE`, shape (1,)) of a mode at rest, and the queue (latency, 1) of its drive."""
     queue, limit = np.zeros((latency, 1)), parameters.sensor_range / 2
-    values = {"period": 1.0 / parameters.rate, "sensor_limit": limit, "queue": queue.ctypes.data, "latency": latency}
-    return new_record(MODE, parameters, damping=np.nan, **values), queue  # no propagator yet
+    values = {"period": 1.0 / parameters.rate, "sensor_limit": limit, "queue": queue, "latency": latency}
+    return record_of(MODE, parameters, damping=np.nan, **values), queue  # no propagator yet
