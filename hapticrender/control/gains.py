@@ -21,7 +21,7 @@ import numpy as np
 
 from hapticrender.control.device_model import DeviceModel
 from hapticrender.jit import kernel, record
-from hapticrender.mathx import zoh
+from hapticrender.mathx import state_space, zoh
 from hapticrender.protocols import Array
 
 MOST = 2  # sensors, and actuators
@@ -71,10 +71,8 @@ def design_gains(model: DeviceModel, noise: float) -> Array | None:
     moves = math.isfinite(noise) and np.linalg.matrix_rank(model.mass) == n
     if max(sensors, actuators) > MOST or not (seen and moves):
         return None
-    inverse, force_map = np.linalg.inv(model.mass), model.force_from_drive
-    a, b = np.zeros((2 * n, 2 * n)), np.vstack([np.zeros((n, n)), inverse])
-    a[:n, n:], a[n:, :n], a[n:, n:] = np.eye(n), -inverse @ model.stiffness, -inverse @ model.damping
-    a, b = zoh(a, b, 1.0 / model.rate)
+    force_map = model.force_from_drive
+    a, b = zoh(*state_space(model.mass, model.damping, model.stiffness, np.eye(n)), 1.0 / model.rate)
     whole = np.block([[a, b], [np.zeros((n, 2 * n)), np.eye(n)]])
     show = np.hstack([np.linalg.pinv(model.coordinate_from_sensed) / noise, np.zeros((sensors, 2 * n))])
     gain, variance = _filter(whole, show, WANDER / math.sqrt(model.rate))

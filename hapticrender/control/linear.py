@@ -16,7 +16,7 @@ import numpy as np
 
 from hapticrender.control.margins import NARROWEST, SLOWEST, Margins, carrier_grid, margins_of, unstable_poles
 from hapticrender.control.records import LEAK
-from hapticrender.mathx import zoh
+from hapticrender.mathx import state_space, zoh
 from hapticrender.protocols import Array
 
 
@@ -32,10 +32,9 @@ class Sampled:
     @classmethod
     def free(cls, mass: Array, damping: Array, stiffness: Array, rate: float) -> Sampled:
         """Discretise M q'' + C q' + K q = f (kg, N s/m, N/m) exactly."""
-        n, inverse = len(mass), np.linalg.inv(mass)
-        a = np.block([[np.zeros((n, n)), np.eye(n)], [-inverse @ stiffness, -inverse @ damping]])
-        ad, bd = zoh(a, np.vstack([np.zeros((n, n)), inverse]), 1.0 / rate)
-        return cls(rate=rate, a=ad, b=bd, c=np.eye(n, 2 * n))
+        n = len(mass)
+        a, b = zoh(*state_space(mass, damping, stiffness, np.eye(n)), 1.0 / rate)
+        return cls(rate=rate, a=a, b=b, c=np.eye(n, 2 * n))
 
     @cached_property
     def _modal(self) -> tuple[Array, Array, Array]:

@@ -18,7 +18,7 @@ from hapticrender.checks import Validated, parameter
 from hapticrender.control.damping import BendingMode
 from hapticrender.control.device_model import DeviceModel
 from hapticrender.jit import record_of
-from hapticrender.mathx import zoh
+from hapticrender.mathx import state_space, zoh
 from hapticrender.plants.compiled import CompiledPlant
 from hapticrender.plants.plate_kernels import COLUMNS, FUNCTIONS, NODES, PLATE, plate_step
 from hapticrender.protocols import Array
@@ -154,11 +154,8 @@ class PlateParameters(Validated):
 
     def modes(self) -> tuple[Array, Array]:
         """Undamped-equivalent frequencies (Hz, ascending) and damping ratios of the free, rigid plate's two modes."""
-        inverse = np.linalg.inv(self.mass_matrix)
-        system = np.block(
-            [[np.zeros((2, 2)), np.eye(2)], [-inverse @ self.stiffness_matrix, -inverse @ self.damping_matrix]]
-        )
-        poles = np.linalg.eigvals(system)
+        matrices = self.mass_matrix, self.damping_matrix, self.stiffness_matrix
+        poles = np.linalg.eigvals(state_space(*matrices, np.eye(2))[0])
         poles = poles[poles.imag > 0]
         poles = poles[np.argsort(abs(poles))]
         return abs(poles) / (2 * np.pi), -poles.real / abs(poles)
@@ -214,9 +211,7 @@ class Structure(NamedTuple):
 
     def zero_order_hold(self, rate: float) -> tuple[Array, Array]:
         """Phi (2n, 2n) and Gamma (2n, inputs) of [q, q'] from sample to sample (Hz) under held inputs, exactly."""
-        n, zero = len(self.mass), np.zeros_like(self.mass)
-        a = np.block([[zero, np.eye(n)], [-np.linalg.solve(self.mass, np.hstack([self.stiffness, self.damping]))]])
-        return zoh(a, np.vstack([0 * self.inputs, np.linalg.solve(self.mass, self.inputs)]), 1.0 / rate)
+        return zoh(*state_space(self.mass, self.damping, self.stiffness, self.inputs), 1.0 / rate)
 
 
 def structure(
