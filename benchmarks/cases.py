@@ -180,7 +180,7 @@ def hours(duration: float) -> Iterator[Figure]:
         controller.run(still, nothing, nothing)
     frequency = comb(8, 1e-9, 1000.0).frequency
     exact = np.array([float(Fraction(float(f)) * count * block / Fraction(CARD) % 1) for f in frequency])
-    off = 2 * np.pi * (np.mod(controller.turns - exact + 0.5, 1.0) - 0.5)
+    off = 2 * np.pi * (np.mod(controller.field("turns") - exact + 0.5, 1.0) - 0.5)
     name = f"phase after {duration:g} h of play, 8 bands"
     yield Figure(name, float(abs(off).max()), "rad", 1e-5, 1e-5, False, "rational arithmetic")
 

@@ -142,9 +142,16 @@ def _cure(error: BaseException) -> str:
 
 def text() -> str:
     """Everything as a table for the terminal."""
-    kinds = [["kind", "installed", "simulated", "a real one needs"], *map(_kind, _points("renderers"))]
-    drivers = [["driver", "installed", "what it does"], *map(_driver, _points("drivers"))]
-    there = [["--driver", "what is there"], *(row for entry in _points("drivers") for row in _there(entry))]
+    kinds = [["kind", "installed", "simulated", "a real one needs"]]
+    for entry, loaded, trouble in _loaded("renderers"):
+        simulated, needs = "yes" if hasattr(loaded, "plant") else "no", getattr(loaded, "needs", "a driver")
+        kinds.append([entry.name, "broken" if trouble else "yes", simulated, trouble or f"{needs}  ({entry.value})"])
+    drivers = [["driver", "installed", "what it does"]]
+    there = [["--driver", "what is there"]]
+    for entry, loaded, trouble in _loaded("drivers"):
+        first = str(loaded.__doc__ or "").strip().partition("\n")[0]
+        drivers.append([entry.name, "broken" if trouble else "yes", trouble or f"{first}  ({entry.value})"])
+        there += _there(entry.name, loaded)
     extras = [["extra", "installed", "for"]]
     for package, extra, use in EXTRAS:
         extras.append([extra, "yes" if find_spec(package) else "no", f'{use} (pip install "hapticrender[{extra}]")'])
@@ -156,43 +163,26 @@ def _points(group: str) -> list[Any]:
     return sorted(entry_points(group=f"hapticrender.{group}"), key=lambda entry: entry.name)
 
 
-def _kind(entry: Any) -> list[str]:
-    """Row of a kind of device: whether a model of it comes along, and what hardware it takes."""
-    loaded, trouble = _load(entry)
-    if loaded is None:
-        return [entry.name, "broken", "no", trouble]
-    simulated = "yes" if hasattr(loaded, "plant") else "no"
-    return [entry.name, "yes", simulated, f"{getattr(loaded, 'needs', 'a driver')}  ({entry.value})"]
+def _loaded(group: str) -> Iterator[tuple[Any, Any, str]]:
+    """Entry points and what they are, or None and why it cannot be used."""
+    for entry in _points(group):
+        try:
+            found, trouble = entry.load(), ""
+        except (Exception, SystemExit) as error:  # a third party's module may fail in any way; the list must go on
+            reason = " ".join(f"{type(error).__name__}: {error}".split())
+            found, trouble = None, f"cannot be loaded from {entry.value} ({reason}){_cure(error)}"
+        yield entry, found, trouble
 
 
-def _driver(entry: Any) -> list[str]:
-    """Row of a driver."""
-    loaded, trouble = _load(entry)
-    if loaded is None:
-        return [entry.name, "broken", trouble]
-    first = str(loaded.__doc__ or "").strip().partition("\n")[0]
-    return [entry.name, "yes", f"{first}  ({entry.value})"]
-
-
-def _there(entry: Any) -> list[list[str]]:
+def _there(name: str, driver: Any) -> list[list[str]]:
     """Rows of the devices that a driver finds; see `found` in `hapticrender.drivers.base`."""
-    if entry.name == SIMULATED:
+    if name == SIMULATED:
         return [[SIMULATED, "always: a model of the scene's device, with its finger"]]
-    found: Any = getattr(_load(entry)[0], "found", None)
-    if found is None:
+    if not hasattr(driver, "found"):
         return []
     try:
-        rows = [each.partition("  ")[::2] for each in found()]
+        rows = [each.partition("  ")[::2] for each in driver.found()]
     except Exception as error:  # a third party's search may fail in any way; the list must go on
         reason = " ".join(f"{type(error).__name__}: {error}{_cure(error)}".split())
-        return [[f"{entry.name}:", f"cannot be searched ({reason})"]]
-    return [[f"{entry.name}:{argument}", about.strip()] for argument, about in rows] or [[f"{entry.name}:", "none"]]
-
-
-def _load(entry: Any) -> tuple[Any, str]:
-    """Return what an entry point is, or None and why it cannot be used."""
-    try:
-        return entry.load(), ""
-    except (Exception, SystemExit) as error:  # a third party's module may fail in any way; the list must go on
-        reason = " ".join(f"{type(error).__name__}: {error}".split())
-        return None, f"cannot be loaded from {entry.value} ({reason}){_cure(error)}"
+        return [[f"{name}:", f"cannot be searched ({reason})"]]
+    return [[f"{name}:{argument}", about.strip()] for argument, about in rows] or [[f"{name}:", "none"]]

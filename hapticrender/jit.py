@@ -188,19 +188,36 @@ def atomic(operation: str) -> Any:
 swap, fetch_add = atomic("xchg"), atomic("add")
 
 
-def record_of(dtype: np.dtype[Any], **values: Any) -> np.ndarray[Any, Any]:
-    """Record of `dtype`, shape (1,), with these fields set, an array's to its address: the caller keeps it alive.
+def aligned(shape: int | tuple[int, ...], dtype: type | np.dtype[Any] = np.float64) -> np.ndarray[Any, Any]:
+    """Array of zeros that starts at a multiple of 64 bytes, as vectors in its fields require."""
+    dtype = np.dtype(dtype)
+    size = int(np.prod(shape)) * dtype.itemsize
+    memory = np.zeros(size + 64, np.uint8)
+    start = -memory.ctypes.data % 64
+    return memory[start : start + size].view(dtype).reshape(shape)
+
+
+def record_of(dtype: np.dtype[Any], *sources: object, **values: Any) -> np.ndarray[Any, Any]:
+    """Record of `dtype`, shape (1,), with numbers of the same name from `sources`, then these values; the rest is zero.
+
+    An array for an int64 becomes its address: the caller keeps it alive.
 
     Raises
     ------
     ValueError
-        An array is not C-contiguous.
+        Such an array is not C-contiguous.
     """
-    record = np.zeros(1, dtype)
+    record = aligned(1, dtype)
+    for name in dtype.names or ():
+        for source in sources:
+            value = getattr(source, name, None)
+            if isinstance(value, (int, float, complex)):
+                record[name] = value
     for name, value in values.items():
-        if isinstance(value, np.ndarray) and not value.flags.c_contiguous:
+        by_address = isinstance(value, np.ndarray) and dtype[name] == np.int64
+        if by_address and not value.flags.c_contiguous:
             raise ValueError(f"{name} of shape {value.shape}: must be C-contiguous (use numpy.ascontiguousarray)")
-        record[name] = value.ctypes.data if isinstance(value, np.ndarray) else value
+        record[name] = value.ctypes.data if by_address else value
     return record
 
 

@@ -13,6 +13,13 @@ from hapticrender.vectors import imag, magnitude, maximum, minimum, nearest, pai
 # design time: numpy and scipy
 
 
+def state_space(mass: Array, damping: Array, stiffness: Array, inputs: Array) -> tuple[Array, Array]:
+    """Matrices a (2n, 2n) and b (2n, m) of (q, q') with M q'' + C q' + K q = inputs u."""
+    n, inverse = len(mass), np.linalg.inv(mass)
+    a = np.block([[np.zeros((n, n)), np.eye(n)], [-inverse @ stiffness, -inverse @ damping]])
+    return a, np.vstack([np.zeros_like(inputs), inverse @ inputs])
+
+
 def zoh(a: Array, b: Array, period: float) -> tuple[Array, Array]:
     """Discretise x' = a x + b u with the input held over each sample.
 

@@ -90,9 +90,8 @@ class ResonantDriver(WrappedDriver):
         flags = np.zeros((self.block, self.parameters.oversampling), np.int64)
         target = self._amplitudes(np.asarray(drive, float)[:, 0], whole, load, speed, flags)
         measured, played = self._carry(target, flags.ravel())
-        friction = np.empty(self.block)
-        friction_ratios(self.parameters.friction_law.numbers, measured, load, speed, friction)
-        measured_friction = np.r_[self._friction, whole * friction]
+        ratio = friction_ratios(self.parameters.friction_law.numbers, measured, load, speed)
+        measured_friction = np.r_[self._friction, whole * ratio]
         self._friction = measured_friction[-1]
         if played[-1].normal_load is not None:
             self._load = float(played[-1].normal_load[-1])
@@ -112,8 +111,7 @@ class ResonantDriver(WrappedDriver):
         change = np.divide(np.nan_to_num(drive), whole, out=np.zeros(len(drive)), where=whole > 0.0)
         ratio = np.clip(p.bias + change, p.least_ratio, 1.0)
         flags[ratio != p.bias + change] |= Flag.SATURATED
-        target = np.empty(self.block)
-        reference_amplitudes(p.friction_law.numbers, ratio, load, speed, target)
+        target = reference_amplitudes(p.friction_law.numbers, ratio, load, speed)
         before = np.r_[self._target, target[:-1]]
         self._target = target[-1]
         lines = before[:, None] + (target - before)[:, None] * np.arange(1, p.oversampling + 1) / p.oversampling

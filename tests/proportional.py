@@ -5,8 +5,7 @@ import math
 import numba
 import numpy as np
 
-from hapticrender.jit import F8, I8, SIGNALS_T, addresses, pointer, step
-from hapticrender.plants.compiled import new_record
+from hapticrender.jit import F8, I8, SIGNALS_T, addresses, pointer, record_of, step
 
 NUMBERS, COUNTS = ("gain", "pulse"), ("count", "flag", "channels", "sensors")
 STATE = np.dtype([(name, "f8") for name in NUMBERS] + [(name, "i8") for name in COUNTS])
@@ -37,7 +36,7 @@ class Proportional:
     step, n_bands, block = proportional_step, 1, 1
 
     def __init__(self, gain, pulse=0.0, flag=0, channels=1, sensors=1):
-        self.state = new_record(STATE, gain=gain, pulse=pulse, flag=flag, channels=channels, sensors=sensors)
+        self.state = record_of(STATE, gain=gain, pulse=pulse, flag=flag, channels=channels, sensors=sensors)
 
     def run(self, sensed, waveform):
         """Drive of one channel for n samples, shape (n, 1)."""

@@ -7,8 +7,8 @@ from numba import carray
 from proportional import Proportional
 
 import hapticrender as hr
-from hapticrender.jit import F8, SIGNALS_T, pointer, step
-from hapticrender.plants.compiled import CompiledPlant, new_record
+from hapticrender.jit import F8, SIGNALS_T, pointer, record_of, step
+from hapticrender.plants.compiled import CompiledPlant
 from hapticrender.plants.electroadhesion import ElectroadhesionParameters, ElectroadhesionScreen, SquareRoot
 from hapticrender.plants.plate import Plate, PlateParameters
 from hapticrender.plants.surface import SurfaceParameters, UltrasonicSurface
@@ -42,7 +42,7 @@ class MassOnSpring(CompiledPlant):
 
     def __init__(self):
         super().__init__(hr.Finger.absent(), rate=5000.0)
-        self.state = new_record(MASS, stiffness=4e3, mass=0.01, period=1 / self.rate)
+        self.state = record_of(MASS, stiffness=4e3, mass=0.01, period=1 / self.rate)
 
 
 def plates(**parameters):

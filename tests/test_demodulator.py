@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 import scipy.signal
 from scipy.signal import butter, sosfilt
-from test_bandwidth import GAINS, MODEL
+from test_bandwidth import MODEL, SETTINGS
 
 import hapticrender as hr
+from hapticrender.control.demodulator import StarSTDFT
 from hapticrender.control.margin_check import error_loop
-from hapticrender.control.stdft import StarSTDFT
 
 RATE, BANDWIDTH = 5000.0, 5.0
 
@@ -99,13 +99,13 @@ def test_the_star_is_a_butterworth_filter_to_the_printed_digits():
 @pytest.mark.parametrize("frequency", [0.5, 60.0, 111.0, 900.0])
 def test_the_measured_innovation_of_the_observer_is_the_predicted_one(frequency):
     """By the recursion of docs/theory.md: own carriers, between and beyond them; 1/(return difference) of the loop."""
-    loop, carriers = error_loop(MODEL, COMB, GAINS, "low"), np.exp(2j * np.pi * COMB / RATE)
+    loop, carriers = error_loop(MODEL, COMB, SETTINGS, "low"), np.exp(2j * np.pi * COMB / RATE)
     turn, envelope, level, drift, measured = np.ones(5, complex), np.zeros(5, complex), 0.0, 0.0, []
     z = np.exp(2j * np.pi * frequency / RATE)
     for n in range(40_000):  # the slowest pole, of the DC estimate, has died away by exp(-90) in the first 20 000
         e = (z**n).real - level - (envelope * turn).real.sum()
-        envelope = envelope + GAINS.observer * e * turn.conj()
-        level, drift = level + GAINS.dc * e + drift, drift + GAINS.dc_drift * e
+        envelope = envelope + SETTINGS["observer"] * e * turn.conj()
+        level, drift = level + SETTINGS["dc"] * e + drift, drift + SETTINGS["dc_drift"] * e
         turn = turn * carriers
         measured.append(e)
     predicted = 0.0 if frequency in COMB else 1.0 / loop.controller(np.array([z]))[1][0]

@@ -9,9 +9,8 @@ from waves import phasor
 
 import hapticrender as hr
 from hapticrender.control.controller import setpoint_rows
-from hapticrender.control.loopshape import loop_margins, reduced_controller
+from hapticrender.control.loopshape import butterworth, loop_margins, reduced_controller
 from hapticrender.control.methods import METHODS, Polar
-from hapticrender.control.transfer import butterworth
 from hapticrender.plants.plate import Plate, PlateParameters
 from hapticrender.touch.mechanics import HEAVY, LIGHT_SECOND
 

@@ -242,12 +242,12 @@ SWAP = [[0.0, 1.0], [1.0, 0.0]]
 @pytest.mark.parametrize(
     ("wiring", "message"),
     [
-        ({"coils": SWAP}, "sensors 1 and 2, or coils 1 and 2, are swapped: rewire"),
+        ({"coils": SWAP}, "(sensors, or actuators|actuators, or sensors), are swapped: rewire"),
         (
             {"sensors": np.diag([-1.0, 1.0])},
             "explains .* % of the drive force: must be >= 95 %; sensor 1 is inverted: rewire",
         ),
-        ({"coils": np.diag([0.0, 1.0])}, "coil 1 has no effect: rewire"),
+        ({"coils": np.diag([0.0, 1.0])}, "actuator 1 is dead: rewire"),
         ({"sensors": np.diag([1.0, 0.0])}, r"sensor 2: response \S+ m per line must be > \S+ m, 10 times the noise"),
     ],
 )

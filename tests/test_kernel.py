@@ -172,7 +172,7 @@ def test_phases_after_ten_hours(delay, block):
     n = 64 * blocks
     controller.run(np.zeros((n, 2)), np.zeros(n), np.zeros(n))
     exact = np.array([np.longdouble(f) * n / rate for f in frequency])
-    apart = np.asarray((controller.turns - exact + 0.5) % 1.0 - 0.5, float)
+    apart = np.asarray((controller.field("turns") - exact + 0.5) % 1.0 - 0.5, float)
     a_refresh = abs(apart).max() / blocks
     assert a_refresh < 2.0**-52
     assert 2 * np.pi * a_refresh * 36_000 * rate / 64 < 1e-5

@@ -9,8 +9,8 @@ from synthetic import make_bands
 from waves import phasor
 
 import hapticrender as hr
+from hapticrender.control.demodulator import StarSTDFT
 from hapticrender.control.methods import METHODS, Resonant, least_decay
-from hapticrender.control.stdft import StarSTDFT
 from hapticrender.plants.plate import Plate, PlateParameters
 
 RATE = 5000.0

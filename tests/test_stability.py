@@ -6,9 +6,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from synthetic import make_bands
-from test_bandwidth import gains_of
+from test_bandwidth import settings_of
 
 import hapticrender as hr
+from benchmarks.charts.poles import growth
 from benchmarks.charts.stability_map import loaded_plate
 from hapticrender.control.controller_design import ONE_SPEED, design_controller, rules_for
 from hapticrender.control.margin_check import error_loop
@@ -39,10 +40,11 @@ def frozen(method, *frequencies, **changes):
 
 def predicted(controller, parameters=PLATE, mechanics=NONE, position=0.0):
     """Linear loop of this controller on a plate that may differ from the one it was designed for."""
-    p, gains = controller.settings, gains_of(controller)
+    p = controller.settings
     plant = loaded_plate(parameters, MODEL, mechanics, position=position)
     taps = p["taps"][:, : p["n_taps"]]
-    return error_loop(MODEL, controller.bands.frequency, gains, taps=taps, plant=plant, delay=parameters.delay)
+    loop = error_loop(MODEL, controller.bands.frequency, settings_of(controller), taps=taps)
+    return replace(loop, plant=plant, delay=parameters.delay)
 
 
 def fitted_growth(size, least=1e-200):
@@ -81,7 +83,7 @@ def test_growth_of_the_loop_is_the_predicted_one(method, frequencies, wrong, fin
     Contact is without load, so that neither adaptation nor gain schedule starts.
     """
     controller, parameters = frozen(method, *frequencies), replace(PLATE, **wrong)
-    expected = predicted(controller, parameters, *finger).growth()
+    expected = growth(predicted(controller, parameters, *finger))
     assert simulated(controller, parameters, *finger) == pytest.approx(expected, abs=0.1, rel=0.01)
 
 
@@ -89,10 +91,10 @@ def test_growth_with_bending_glass_is_the_predicted_one():
     """Taps designed without a bending mode drive it where coils and sensors are in phase, and damp the other sign."""
     bending = replace(PLATE, bending_frequency=1250.0, bending_coil=0.1)
     controller = frozen("h2", 170.0)
-    expected = predicted(controller, bending).growth()
+    expected = growth(predicted(controller, bending))
     assert expected > 100
     assert simulated(controller, bending) == pytest.approx(expected, rel=0.01)
-    assert predicted(controller, replace(bending, bending_coil=-0.1)).growth() < 0
+    assert growth(predicted(controller, replace(bending, bending_coil=-0.1))) < 0
 
 
 @pytest.mark.parametrize(("method", "frequency"), [("h", 20.0), ("h2", 400.0)])
@@ -102,7 +104,7 @@ def test_the_boundary_lies_where_the_margins_say(method, frequency):
     for gain in (1.01 * margins.gain, 0.99 * margins.gain):
         parameters, controller = replace(PLATE, force_constant=7.4 * min(gain, 50.0)), frozen(method, frequency)
         grows = margins.gain < 50.0 and gain > margins.gain
-        assert (predicted(controller, parameters).growth() > 0) == grows
+        assert (growth(predicted(controller, parameters)) > 0) == grows
         assert (simulated(controller, parameters, seconds=8.0) > 0) == grows
     borne = math.floor(margins.delay * RATE)
     for extra, grows in ((borne, False), (borne + 1, True)):

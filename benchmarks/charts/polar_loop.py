@@ -17,10 +17,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from benchmarks.charts.poles import logarithms
+from hapticrender.control.demodulator import StarSTDFT
 from hapticrender.control.device_model import DeviceModel
-from hapticrender.control.linear import LEAST_POLE, Sampled
+from hapticrender.control.linear import Sampled
 from hapticrender.control.loopshape import reduced_controller
-from hapticrender.control.transfer import butterworth
 from hapticrender.protocols import Array
 
 
@@ -80,7 +81,7 @@ class PolarLoop:
         drive_map = np.ones((len(sides), 1)) if common else np.eye(len(sides))
         alike = model.response(frequency) @ np.ones(len(sides)) @ measured.T
         widths, which = np.unique(bandwidth, return_inverse=True)
-        filters = [butterworth(2 * b).tustin(model.rate, prewarp=2 * b) for b in widths]
+        filters = [StarSTDFT(bandwidth=2 * b, rate=model.rate).coefficients for b in widths]
         laws = [reduced_controller(b, 2 * b).tustin(model.rate) for b in widths]
         return cls(
             plant=plant,
@@ -141,8 +142,7 @@ class PolarLoop:
 
     def poles(self) -> Array:
         """Closed-loop poles in the frame of the carrier (1/s, complex: growth and angular frequency, shape (B, s))."""
-        z = np.linalg.eigvals(self.matrix()).astype(complex)
-        return self.plant.rate * np.log(np.where(z == 0, LEAST_POLE, z))
+        return logarithms(np.linalg.eigvals(self.matrix()), self.plant.rate)
 
 
 def _parts(values: Array) -> Array:

@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
 
 from benchmarks.charts.polar_loop import PolarLoop
-from hapticrender.control.damping import choose_damping, damping_taps
+from benchmarks.charts.poles import loop_poles
+from hapticrender.control.damping import choose_damping, damping_taps, oscillators
 from hapticrender.control.device_model import DeviceModel
 from hapticrender.control.linear import ErrorLoop, Sampled
-from hapticrender.control.margin_check import BankGains, error_loop
+from hapticrender.control.margin_check import error_loop
 from hapticrender.control.margins import sensitivity
 from hapticrender.plants.plate import PlateParameters, structure
 from hapticrender.protocols import Array
@@ -101,15 +102,15 @@ def error_map(case: Case, inner: float, carriers: Array, widths: Array) -> Stabi
 
     Its pole is at 2 b, its integral 3.4 b 1/s; no rule lowers them here.  `inner` (0..1) is the inner damper's factor.
     """
-    plant, taps = case.plant(), damping_taps(MODEL, QUALITY)[0]
+    plant, taps = case.plant(), damping_taps(oscillators(MODEL), QUALITY)
     near = np.geomspace(0.02, 20.0, OFFSETS // 2)
     modes = (plant.modes()[:, None] + MODE_OFFSETS).ravel()
     afar = np.append(np.linspace(1.0, 0.499 * plant.rate, OFFSETS), modes)
     growth, modulus = np.zeros((2, len(carriers), len(widths)))
     for at in np.ndindex(growth.shape):
         f, b = float(carriers[at[0]]), float(widths[at[1]])
-        loop = error_loop(MODEL, np.array([f]), gains_of(f, b, inner), taps=taps, plant=plant)
-        poles = loop.poles()
+        loop = replace(error_loop(MODEL, np.array([f]), settings_of(f, b, inner), taps=taps), plant=plant)
+        poles = loop_poles(loop)
         grid = np.concatenate([f - b * near, f + b * near, afar, np.abs(poles.imag) / (2 * np.pi)])
         growth[at], modulus[at] = _growth_and_modulus(loop, poles, np.clip(grid, 0.1, 0.499 * plant.rate))
     return StabilityMap(carriers, widths, growth, modulus)
@@ -129,7 +130,7 @@ def damper_map(case: Case) -> StabilityMap:
             plant=plant, delay=int(DELAYS[at[0]]), frequency=np.array([100.0]), observer=0.0, integral=0.0, dc=0.5,
             dc_drift=0.05, inner=float(FACTORS[at[1]]), taps=taps, law=nothing, slope=nothing, share=np.zeros(1),
         )  # fmt: skip
-        growth[at], modulus[at] = _growth_and_modulus(loop, loop.poles(), grid)
+        growth[at], modulus[at] = _growth_and_modulus(loop, loop_poles(loop), grid)
     return StabilityMap(DELAYS, FACTORS, growth, modulus)
 
 
@@ -140,25 +141,19 @@ def _growth_and_modulus(loop: ErrorLoop, poles: Array, frequency: Array) -> tupl
     return growth, 1 / peak
 
 
-def gains_of(carrier: float, width: float, inner: float) -> BankGains:
-    """Gains of one band of bandwidth `width` (Hz) at every level, `inner` (0..1) the factor on the inner damper."""
+def settings_of(carrier: float, width: float, inner: float) -> dict[str, float]:
+    """Settings of one band of bandwidth `width` (Hz) at every level, `inner` (0..1) the factor on the inner damper."""
     observer, integral = 2 * 2 * math.pi * 2 * width / MODEL.rate, INTEGRAL * width
     dc = 2 * math.pi * min(6.0, carrier / 8) / MODEL.rate
-    return BankGains(
-        rate=MODEL.rate,
-        delay=MODEL.delay,
-        lead=(MODEL.delay + 0.5) / MODEL.rate,
-        observer=observer,
-        observer_high=observer,
-        integral=integral,
-        integral_medium=integral,
-        integral_high=integral,
-        dc=1.6 * dc,
-        dc_drift=dc**2,
-        damper=inner,
-        damper_high=inner,
-        crowd_speed=0.0,
-        lowest=MODEL.lowest_frequency,
-        highest=MODEL.highest_frequency,
-        highest_edge=MODEL.highest_edge,
-    )
+    return {
+        "lead": (MODEL.delay + 0.5) / MODEL.rate,
+        **dict.fromkeys(("observer", "observer_high"), observer),
+        **dict.fromkeys(("integral", "integral_medium", "integral_high"), integral),
+        "dc": 1.6 * dc,
+        "dc_drift": dc**2,
+        **dict.fromkeys(("damper", "damper_high"), inner),
+        "crowd_speed": 0.0,
+        "lowest": MODEL.lowest_frequency,
+        "highest": MODEL.highest_frequency,
+        "highest_edge": MODEL.highest_edge,
+    }

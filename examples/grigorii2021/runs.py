@@ -17,7 +17,7 @@ from scipy.signal import butter, lfilter
 from examples.grigorii2021.claims import Array, Claim, Curve, Item, Panel
 from examples.grigorii2021.formulas import FILTER, FREQUENCIES, FREQUENCY, LOOP
 from hapticrender import Finger, Grating, Recording, Scene, render
-from hapticrender.control.transfer import butterworth
+from hapticrender.control.loopshape import butterworth
 from hapticrender.plants.plate import PLACES, PlateParameters
 from hapticrender.touch.mechanics import HEAVY
 

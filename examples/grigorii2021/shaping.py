@@ -8,9 +8,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from hapticrender.control.loopshape import loop_margins
+from hapticrender.control.loopshape import TransferFunction, butterworth, loop_margins
 from hapticrender.control.margins import Margins
-from hapticrender.control.transfer import TransferFunction, butterworth
 from hapticrender.mathx import zero_crossings
 
 Array = np.ndarray[Any, Any]

@@ -1,15 +1,8 @@
-"""Compiled adaptation of the law by bands: the finger's mass, damping and stiffness.
+"""Compiled adaptation of the law by bands: the finger's mass, damping and stiffness (docs/theory.md, "Adaptation").
 
-What the observer shows answers a drive that was commanded a delay ago, and shows the motion behind its pole.  The
-heave row of the force balance holds as well for envelopes that are all delayed and filtered alike, <.>.  With z the
-finger's dynamic stiffness, h = [1, g] its lever arm, y = h V, a = X - V what the command did not do, and
-D_a = D + j w b_a with the damping b_a of the inner loop,
-
-    z_found h X = <z_sent y> - D_a a - (D' + z' h) da/dt - j dw/dt (M + m_f h) a
-
-so that the estimate in use when the command was given is kept apart from the present one: neither delay nor observer
-closes a loop through the adaptation.  The motion X is <R> + E.  A step of adaptation is a block, or
-8 samples.
+The finger's force is what remains of the heave row of the force balance.  Its envelopes are all delayed and filtered as
+the observer delays and filters motion, and the estimate in use when a command was given is kept apart from the present
+one: neither delay nor observer closes a loop through the adaptation.  A step of adaptation is a block, or 8 samples.
 """
 
 from __future__ import annotations

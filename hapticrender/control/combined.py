@@ -19,7 +19,7 @@ from hapticrender.control.controller import BankController, refuse_whole_wavefor
 from hapticrender.control.device_model import DeviceModel
 from hapticrender.control.records import CONTROLLER_T, MOST_CHANNELS, TILE_T, W
 from hapticrender.control.supervisor import Fault, SupervisedController, supervised
-from hapticrender.jit import C16, F8, I8, SIGNALS_T, addresses, call, pointer, record, step
+from hapticrender.jit import C16, F8, I8, SIGNALS_T, addresses, call, pointer, record, record_of, step
 from hapticrender.protocols import Array, Method
 
 
@@ -42,7 +42,6 @@ class CombinedBands(Bands):
     friction_index: Array  # alike
 
 
-BUFFERS = ("sensed", "drive", "waveform", "target", "flags", "position")
 PART = np.dtype(
     [
         *((name, np.int64) for name in ("step", "state", "bank", "signals", "sensors", "channels", "bands", "index")),
@@ -50,7 +49,7 @@ PART = np.dtype(
         ("scale_waveform", np.float64),  # of the part per waveform of both
         ("heat", np.float64, (MOST_CHANNELS,)),  # of a part without target: means of the squares of its drives,
         ("kept", np.float64),  # and the share of them that a block leaves
-        *((f"{name}_at", np.int64) for name in BUFFERS),
+        *((f"{name}_at", np.int64) for name in ("sensed", "drive", "waveform", "target", "flags", "position")),
     ]
 )
 COMBINED = np.dtype([*((name, np.int64) for name in ("bands", "channels", "sensors", "block")), ("parts", PART, (2,))])
@@ -122,14 +121,11 @@ class CombinedController:
         self.channels, self.sensors = sum(channels), sum(sensors)
         self.rate = next((part.rate for part in parts if part is not None), 0.0)
         self.block = max(part.block if part is not None else 1 for part in parts)
-        self.state = np.zeros(1, COMBINED)
-        for name in ("channels", "sensors", "block"):
-            self.state[name] = getattr(self, name)
-        self.state["bands"], self.state["parts"]["kept"] = self.n_bands, np.power(kept, self.block)
+        self.state = record_of(COMBINED, self, bands=self.n_bands)
         self._buffers: list[Array] = []
         shares = ((bands.plate_index, 0.0, 1.0), (bands.friction_index, velocity_per_force, 1.0 / velocity_per_force))
         for i, (part, (index, scale, per_target)) in enumerate(zip(parts, shares, strict=True)):
-            own, count = self.state[0]["parts"][i], 0 if part is None else part.n_bands
+            count = 0 if part is None else part.n_bands
             arrays = {
                 "sensed": np.zeros((self.block, sensors[i])),
                 "drive": np.zeros((self.block, channels[i])),
@@ -140,14 +136,23 @@ class CombinedController:
             }
             indices, signals = np.ascontiguousarray(index, np.int64), addresses(**arrays)
             self._buffers += [*arrays.values(), indices, signals]
-            for name, array in arrays.items():
-                own[f"{name}_at"] = array.ctypes.data
-            own["signals"], own["index"], own["bands"] = signals.ctypes.data, indices.ctypes.data, count
-            own["sensors"], own["channels"], own["scale"] = sensors[i], channels[i], scale
-            own["scale_waveform"] = per_target if bands.envelope is None else 1.0
+            values: dict[str, Any] = {f"{name}_at": array for name, array in arrays.items()}
             if part is not None:
-                own["step"], own["state"] = part.step.address, part.state.ctypes.data
-                own["bank"] = getattr(part, "controller", part).state.ctypes.data
+                bank = getattr(part, "controller", part)
+                values |= {"step": part.step.address, "state": part.state, "bank": bank.state}
+            own = record_of(
+                PART,
+                **values,
+                signals=signals,
+                index=indices,
+                bands=count,
+                sensors=sensors[i],
+                channels=channels[i],
+                scale=scale,
+                scale_waveform=per_target if bands.envelope is None else 1.0,
+                kept=kept[i] ** self.block,
+            )
+            self.state["parts"][0, i] = own[0]
 
     @property
     def mismatch(self) -> float:

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
 from hapticrender.bands import Bands
-from hapticrender.control.carriers import REFRESH, predict_positions
+from hapticrender.control.carriers import predict_positions
 from hapticrender.control.device_model import DeviceModel
 from hapticrender.control.records import (
     CONTROLLER,
@@ -24,7 +25,7 @@ from hapticrender.control.records import (
     aligned,
     lanes,
 )
-from hapticrender.jit import CFunction, addresses
+from hapticrender.jit import CFunction, addresses, record_of
 from hapticrender.protocols import Array
 
 LARGEST_GROUP = 16  # samples of a block whose carriers are taken from the middle of them,
@@ -42,7 +43,7 @@ class BankController:
         Name of the method that designed it.
     step : CFunction
         Advances the state; one of `hapticrender.control`.
-    settings : dict
+    settings : mapping
         Fields of `records.SETTINGS`; what is left out is zero.
     bands : Bands
     history : int
@@ -59,7 +60,7 @@ class BankController:
         self,
         method: str,
         step: CFunction,
-        settings: dict[str, Any],
+        settings: Mapping[str, Any],
         bands: Bands,
         *,
         history: int = 1,
@@ -79,12 +80,9 @@ class BankController:
         self.tiles["turn_re"] = 1.0
         self.tiles["active"] = (np.arange(tiles * W) < self.n_bands).reshape(tiles, W)
         self.setpoints = setpoint_rows(bands)
-        self.state = np.zeros(1, CONTROLLER)
         most = min(max(int(LONGEST_GROUP * self.rate), 1), LARGEST_GROUP)
         group = min(most, self.block)
         groups = -(-self.block // group)  # the last one may be filled in part
-        for name, value in (settings | {"group": group, "groups": groups}).items():
-            self.state["p"][name][0] = value
         memory = {
             "tiles": self.tiles,
             "commands": aligned(history * tiles * 3, PAIR),  # of both coordinates; the finger's force
@@ -95,13 +93,12 @@ class BankController:
             "samples": np.zeros((SAMPLE_ROWS, groups * group)),
         } | (arrays or {})
         self._arrays = memory
-        for name, array in memory.items():
-            if f"{name}_at" in (CONTROLLER.names or ()):
-                self.state[f"{name}_at"] = array.ctypes.data
+        places = {f"{name}_at": array for name, array in memory.items() if f"{name}_at" in (CONTROLLER.names or ())}
         start: dict[str, float] = {"tiles": tiles, "bands": self.n_bands, "history": history, "stale": 1, "moving": 1}
         start |= {"scale": 1.0, "confidence": 1.0, "damper_scale": 1.0, "unlocked": 1.0, "response_gain": math.nan}
-        for name, number in start.items():
-            self.state[name] = number
+        self.state = record_of(CONTROLLER, **start, **places)
+        for name, value in {**settings, "group": group, "groups": groups}.items():
+            self.state["p"][name][0] = value
 
     @property
     def settings(self) -> Any:
@@ -115,12 +112,6 @@ class BankController:
     def largest(self, name: str) -> Array:
         """Largest magnitude over the coordinates of a complex field of the loops, shape (bands,)."""
         return np.max([np.hypot(self.field(f"{name}{i}_re"), self.field(f"{name}{i}_im")) for i in (0, 1)], axis=0)
-
-    @property
-    def turns(self) -> Array:
-        """Fixed part of each carrier's phase at the next sample (turns, 0 to 1, shape (bands,))."""
-        left = 0 if self.block > 1 else -int(self.state["sample"][0]) % REFRESH
-        return np.mod(self.field("turns") - left * self.setpoints[0, : self.n_bands] / self.settings["rate"], 1.0)
 
     @property
     def mismatch(self) -> float:
@@ -200,14 +191,10 @@ def ridge_spacing(bands: Bands) -> float:
     return float(np.diff(np.sort(bands.wavenumber[bands.wavenumber > 0.0])).min(initial=math.inf))
 
 
-def lowest_fixed(bands: Bands) -> float:
-    """Lowest carrier that does not follow the finger (Hz); infinite where all do."""
-    return float(np.min(bands.frequency[bands.wavenumber == 0.0], initial=math.inf))
-
-
 def lowest_carrier(model: DeviceModel, bands: Bands) -> float:
     """Lowest carrier (Hz): of the fixed ones, and of what a moving finger makes of the others."""
-    return min(lowest_fixed(bands), model.lowest_frequency if (bands.wavenumber > 0.0).any() else math.inf)
+    fixed = bands.frequency[bands.wavenumber == 0.0]
+    return float(fixed.min(initial=math.inf if len(fixed) == len(bands) else model.lowest_frequency))
 
 
 def refuse_whole_waveform(bands: Bands) -> None:

@@ -8,7 +8,8 @@ margins; then all of it is lowered until the margins of the sampled loop hold (`
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -27,7 +28,7 @@ from hapticrender.control.controller import (
 from hapticrender.control.damping import Damping, choose_damping
 from hapticrender.control.device_model import DeviceModel, FingerRange
 from hapticrender.control.kernel import block_step, error_step
-from hapticrender.control.margin_check import BankGains, checked_gains
+from hapticrender.control.margin_check import checked_settings
 from hapticrender.control.supervisor import damper_settings
 
 FADE_IN = 0.05  # s: a target fades in this slowly, so that it does not excite the modes
@@ -44,7 +45,7 @@ BACK_TIME = 0.02  # s: back-calculation at the limit
 TOUCHED_DECAY = 1000.0  # 1/s: of an always damped mode at least
 LEAST_NOISE = 1e-6  # of the sensors' range: thresholds never fall to nothing
 ALWAYS = -1e300  # N: every load is larger
-FROM_MODEL = ("sensor_delay", "contact_lag", "contact_damping", "typical_speed", "drive_step")
+FROM_MODEL = ("sensor_delay", "contact_lag", "contact_damping", "typical_speed", "drive_step", "highest_edge")
 CROWDED = 40.0  # Hz: carriers closer than this share what the detectors see
 
 
@@ -126,16 +127,15 @@ def design_controller(
     if (bands.wavenumber > 0.0).any():  # what is left over at one frequency is wrong at the next
         rules = replace(rules, rest=(0.0, 0.0))
     block = model.block if model.block > 1 and not prompt else 1
-    gains = _gains(model, bands, rules, feedback)
+    settings = _settings(model, bands, rules, damping, feedback)
     why = "the method has none" if prompt else f"a delay of {model.delay} samples is that of a block device"
     notes = [damping.text() if damping else f"inner damper off: {why}"]
     if feedback:
-        checked = checked_gains(
-            model, bands.frequency, gains, wavenumber=bands.wavenumber, taps=damping.taps if damping else None
+        taps = damping.taps if damping else None
+        settings, margins, lowered = checked_settings(
+            model, bands.frequency, settings, wavenumber=bands.wavenumber, taps=taps
         )
-        gains = checked.gains
-        notes += [*checked.notes, *(f"{level}: {margins}" for level, margins in checked.margins.items())]
-    settings = _settings(model, bands, rules, gains, damping, feedback)
+        notes += [*lowered, *(f"{level}: {each}" for level, each in margins.items())]
     if block > 1:
         settings = _in_blocks(settings, block, model.rate)
         notes.append(f"in blocks of {block} samples")
@@ -144,7 +144,7 @@ def design_controller(
     return BankController(method, step, settings, bands, history=history, note="\n".join(notes))
 
 
-def _gains(model: DeviceModel, bands: Bands, rules: Rules, feedback: bool) -> BankGains:
+def _gains(model: DeviceModel, bands: Bands, rules: Rules, feedback: bool) -> dict[str, float]:
     """How fast observer, integral and DC estimate may run, by lowest carrier (Hz), spacing and delay."""
     lowest, apart, period = lowest_carrier(model, bands), spacing(bands), 1.0 / model.rate
     if apart == 0.0:
@@ -158,29 +158,23 @@ def _gains(model: DeviceModel, bands: Bands, rules: Rules, feedback: bool) -> Ba
     dc = 2 * math.pi * min(6.0, lowest / rules.dc) * period
     ridges = ridge_spacing(bands)
     on = 1.0 if feedback else 0.0
-    return BankGains(
-        rate=float(model.rate),
-        delay=model.delay,
-        lead=(model.delay + 0.5) * period,
-        observer=on * 2 * pole[0] * period,
-        observer_high=on * 2 * pole[1] * period,
-        integral=on * min(rules.integral[0], fastest[0]),
-        integral_medium=on * min(rules.integral[1], fastest[0]),
-        integral_high=on * min(rules.integral[2], fastest[1]),
-        dc=on * 1.6 * dc,
-        dc_drift=on * dc**2,
-        damper=rules.damper[0],
-        damper_high=rules.damper[1],
-        crowd_speed=max(pole) / ridges if math.isfinite(ridges) else 0.0,
-        lowest=float(model.lowest_frequency),
-        highest=float(min(model.highest_frequency, 0.4 * model.rate)),
-        highest_edge=float(model.highest_edge),
-    )
+    return {
+        "observer": on * 2 * pole[0] * period,
+        "observer_high": on * 2 * pole[1] * period,
+        "integral": on * min(rules.integral[0], fastest[0]),
+        "integral_medium": on * min(rules.integral[1], fastest[0]),
+        "integral_high": on * min(rules.integral[2], fastest[1]),
+        "dc": on * 1.6 * dc,
+        "dc_drift": on * dc**2,
+        "damper": rules.damper[0],
+        "damper_high": rules.damper[1],
+        "crowd_speed": max(pole) / ridges if math.isfinite(ridges) else 0.0,
+    }
 
 
 def _settings(
-    model: DeviceModel, bands: Bands, rules: Rules, gains: BankGains, damping: Damping | None, feedback: bool
-) -> dict[str, Any]:
+    model: DeviceModel, bands: Bands, rules: Rules, damping: Damping | None, feedback: bool
+) -> Mapping[str, Any]:
     """Settings of the kernel, sample by sample."""
     period, fast = 1.0 / model.rate, 2 * math.pi * FAST_DC / model.rate
     lowest = lowest_carrier(model, bands)
@@ -192,7 +186,7 @@ def _settings(
         **_adaptation(model, rules, 2 * math.pi * observer, feedback),
         **_detectors(model, rules),
         **_finger(model.finger),
-        **{name: value for name, value in asdict(gains).items() if name != "delay"},
+        **_gains(model, bands, rules, feedback),
         **{name: getattr(model, name) for name in FROM_MODEL},
         **damper_settings(model, damping.taps if damping else None),
         "added_damping": np.resize(np.append(damping.added_damping if damping else 0.0, [0.0, 0.0]), 2),
@@ -259,7 +253,7 @@ def _back_calculation(model: DeviceModel) -> float:
     return min(model.pace / BACK_TIME, max(decay, TOUCHED_DECAY))
 
 
-def _in_blocks(settings: dict[str, Any], block: int, rate: float) -> dict[str, Any]:
+def _in_blocks(settings: Mapping[str, Any], block: int, rate: float) -> dict[str, Any]:
     """Settings of the kernel for blocks: what is stated per sample becomes per block; no inner damper, no lock."""
     most = ADAPTATION_SHARE * rate / block
     return {

@@ -41,10 +41,6 @@ class BendingMode:
     measured: bool = True  # False for an estimate: then the coupling may have either sign, and Q stays at 2 or above
 
     def __post_init__(self) -> None:
-        if not (math.isfinite(self.frequency) and self.frequency > 0):
-            raise ValueError(f"frequency = {self.frequency!r}: must be > 0 Hz")
-        if not (math.isfinite(self.damping) and self.damping >= 0):
-            raise ValueError(f"damping = {self.damping!r}: must be >= 0")
         if not 0 <= self.spread < self.frequency:
             raise ValueError(f"spread = {self.spread!r}: must be between 0 and {self.frequency:g} Hz")
 
@@ -97,12 +93,23 @@ def oscillators(model: DeviceModel) -> tuple[Oscillator, ...]:
     return tuple(Oscillator(float(model.rate), model.delay, *column) for column in columns)
 
 
-def damping_taps(model: DeviceModel, quality: float, *, bending: BendingMode | None = None) -> tuple[Array, Array]:
-    """Solve for the taps (coordinates, n), N/m, and the damping (coordinates,), N s/m, that they add.
+def added_damping(parts: tuple[Oscillator, ...], quality: float) -> Array:
+    """Damping b_a = m w1/Q (N s/m, shape (coordinates,)) that gives each mode a `quality` Q."""
+    return np.array([part.mass * part.omega / quality for part in parts])
+
+
+def damping_taps(
+    parts: tuple[Oscillator, ...],
+    quality: float,
+    bending: BendingMode | None = None,
+    count: int | None = None,
+    plain: int = TAPS,
+) -> Array:
+    """Solve for the taps (coordinates, n), N/m, that add `added_damping`.
 
     ``F[n] = -sum_i taps_i deviation[n - i]`` with b_a = m w1/Q, `quality` Q > 0 being what the damper alone gives each
-    mode.  There are as many taps as the model states; with a `bending` mode five, and those of the coordinates that it
-    couples into have zeros there.
+    mode.  There are `plain` taps; with a `bending` mode `count` (five), and those of the coordinates that it couples
+    into have zeros there.
 
     Notes
     -----
@@ -110,18 +117,7 @@ def damping_taps(model: DeviceModel, quality: float, *, bending: BendingMode | N
     samples and the hold made up for, ``sum c_i e^{-j w1 i T} = j w1 b_a e^{j w1 (d + 1/2) T}/sinc(w1 T/2)``, and zeros
     at the bending mode where it is given.
     """
-    parts = oscillators(model)
-    taps = _taps(parts, quality, bending, model.taps if bending is None else TAPS + 2, model.taps)
-    return taps, added_damping(parts, quality)
-
-
-def added_damping(parts: tuple[Oscillator, ...], quality: float) -> Array:
-    """Damping b_a = m w1/Q (N s/m, shape (coordinates,)) that gives each mode a `quality` Q."""
-    return np.array([part.mass * part.omega / quality for part in parts])
-
-
-def _taps(parts: tuple[Oscillator, ...], quality: float, bending: BendingMode | None, count: int, plain: int) -> Array:
-    """Taps of every coordinate; as many as `plain` where the bending mode does not couple into it."""
+    count = count or (plain if bending is None else TAPS + 2)
     taps = np.zeros((len(parts), count))
     for c, part in enumerate(parts):
         angle, used = part.omega / part.rate, min(plain, count)
@@ -229,12 +225,7 @@ def _replaced(whole: Damping, i: int, own: Damping) -> Damping:
     return replace(whole, taps=taps, added_damping=added, margins=tuple(margins), noise=tuple(noise), note=note)
 
 
-def within_a_turn(model: DeviceModel) -> bool:
-    """Whether delay and hold are no longer than a period of the fastest mode."""
-    return _turns(oscillators(model)) <= 1.0
-
-
-def _turns(parts: tuple[Oscillator, ...]) -> float:
+def turns(parts: tuple[Oscillator, ...]) -> float:
     """Periods of the fastest mode in delay and hold."""
     return max(part.omega * (part.delay + 0.5) / (2 * np.pi * part.rate) for part in parts)
 
@@ -247,13 +238,13 @@ def _chosen(parts: tuple[Oscillator, ...], least_quality: float, bending: Bendin
     lag = f"a delay of {delay} sample{'s' * (delay != 1)} at {rate:g} Hz"
     if largest < least_quality:
         return _off(len(parts), f"the modes damp themselves (Q {WORTH * largest:.1f})")
-    if _turns(parts) > 1.0:
+    if turns(parts) > 1.0:
         fastest = max(part.omega for part in parts) / (2 * np.pi)
         return _off(len(parts), f"{lag} is longer than a period of the mode at {fastest:.0f} Hz")
     complaint = raised = ""
     for step in range(int((largest - least_quality) / QUALITY_STEP) + 1):
         quality = round(least_quality + step * QUALITY_STEP, 1)
-        designs = [_taps(parts, quality, bending, count, plain) for count in _counts(rate, bending, plain)]
+        designs = [damping_taps(parts, quality, bending, count, plain) for count in _counts(rate, bending, plain)]
         complaints = [_complaint(parts, taps, bending) for taps in designs]
         kept = [damper_loops(parts, taps, bending) for taps, each in zip(designs, complaints, strict=True) if not each]
         if kept:

@@ -1,14 +1,24 @@
-"""Compiled lock-in: the complex envelopes of many fixed bands and channels of a signal, block by block."""
+"""The STDFT*, an estimator of the complex envelopes of a signal's bands: its filter, and a compiled bank of lock-ins.
+
+A real signal ``x = Re sum_k X_k exp(j phi_k)`` has an envelope X_k for every carrier phi_k.  A lock-in multiplies by
+``exp(-j phi_k)`` and low-passes twice the result; what is left of the image at twice the carrier is its ripple.  The
+filter serves `low_pass` (polar and complex methods) and `plants.electroadhesion`, too.
+
+References
+----------
+Grigorii, Li, Peshkin and Colgate, IEEE Transactions on Haptics, 2021, eqs. 1-5.
+"""
 
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
+from math import pi, sqrt
 from typing import Any
 
 import numpy as np
 
 from hapticrender.control.records import W, aligned
-from hapticrender.control.stdft import StarSTDFT
 from hapticrender.jit import entry, kernel, record
 from hapticrender.mathx import unit
 from hapticrender.protocols import Array
@@ -18,6 +28,41 @@ REFRESH = 64  # samples between two settings of the carriers from their phases
 COMPLEX = [f"{name}_{part}" for name in ("turn", "carrier", "x", "low1", "low2") for part in ("re", "im")]
 TILE = np.dtype([(name, np.float64, (W,)) for name in ("turns", "step", *COMPLEX)])
 TILE_T = tile_type(TILE)
+
+
+@dataclass(frozen=True, kw_only=True)
+class StarSTDFT:
+    """The STDFT* of eq. 4: a second-order Butterworth low pass, discretised by Tustin's rule.
+
+    The bilinear transform is prewarped at fL, so that the discrete filter is -3 dB there exactly.
+    """
+
+    bandwidth: float  # Hz, between 0 and rate/2: -3 dB frequency fL of the low pass
+    rate: float  # Hz
+
+    def __post_init__(self) -> None:
+        if not 0 < self.bandwidth < self.rate / 2:
+            raise ValueError(
+                f"bandwidth={self.bandwidth!r} Hz must lie between 0 and half the rate, {self.rate / 2:g} Hz"
+            )
+
+    @property
+    def coefficients(self) -> tuple[Array, Array]:
+        """Filter coefficients b and a of eq. 4, with a[0] = 1."""
+        k = np.tan(pi * self.bandwidth / self.rate)
+        scale = 1 + sqrt(2) * k + k**2
+        return k**2 * np.array([1, 2, 1]) / scale, np.array([scale, 2 * (k**2 - 1), 1 - sqrt(2) * k + k**2]) / scale
+
+    @property
+    def delay(self) -> float:
+        """Group delay of a slow envelope, s: sqrt2/wL of the prewarped prototype."""
+        return sqrt(2) / (2 * self.rate * np.tan(pi * self.bandwidth / self.rate))
+
+    def frequency_response(self, offset: Any) -> Any:
+        """Complex gain on an envelope that turns at `offset` (Hz), delay included: b(z)/a(z) on the unit circle."""
+        z = np.exp(2j * pi * np.asarray(offset, float) / self.rate)
+        b, a = self.coefficients
+        return np.polyval(b, z) / np.polyval(a, z)
 
 
 @kernel
@@ -84,7 +129,7 @@ class Demodulator:
 
     Notes
     -----
-    Delay and frequency response are those of `hapticrender.control.stdft.StarSTDFT`.  At 0 Hz and half the rate
+    Delay and frequency response are those of `StarSTDFT`.  At 0 Hz and half the rate
     the envelope is doubled.
 
     Examples

@@ -32,10 +32,6 @@ class FingerRange:
     needs_contact: bool = False  # targets and adaptation run only while the finger's position is known ...
     least_speed: float = 0.0  # m/s: ... and while it slides at least so fast
 
-    def __post_init__(self) -> None:
-        if not self.fastest > 0.0:
-            raise ValueError(f"fastest = {self.fastest}: must be > 0 (1/s)")
-
 
 @dataclass(frozen=True, kw_only=True)
 class Demand:

@@ -1,34 +1,15 @@
 """Supervision of gains: whether a sensor shows, or an actuator gives, a multiple of what it did, or another's.
 
-A Kalman filter has the device's coordinates q, their rates, and a force d that wanders, by which it follows fingers and
-loads.  Its innovations e are white but for what wanders faster::
-
-    x[n+1] = A (x[n] + K e[n]) + B F[n],     e = y - C x,     x = (q, q', d)
-
-A sensor i that shows g_i times the motion p from now on adds (g_i - 1) w_i to e, where c_i is the row of C of that
-sensor alone and p the filter's state, from now on without corrections::
-
-    w_i = c_i p - C xi_i,                    xi_i[n+1] = A (xi_i[n] + K w_i[n])
-
-An actuator j that gives g_j times its force F_j adds (g_j - 1) w_j::
-
-    w_j = C zeta_j,                          zeta_j[n+1] = A (zeta_j[n] - K w_j[n]) + B F_j[n]
-
-Two that are swapped add eta w_3, eta = 1: c_3 = (c_2 - c_1, c_1 - c_2) of sensors, F_3 = F_swapped - F of actuators.
-Sensors that were swapped while both showed the same look like actuators that are, where both are symmetrical about the
-middle.  Least squares of e on w_1 and w_2 find g, of both sensors or of both actuators; on w_3 alone, eta.
-
-Sensors are judged over the 3 ms after an innovation above 4.5 times its noise, and its mean square before: a finger's
-force makes no jump, what it adds to e is no multiple of w.  Actuators are judged by means over 3 ms, while e is large:
-only an inversion or a swap, also of sensors, is distinguished from a finger by these.  The moment of a finger off the
-middle looks like swapped actuators, too, with eta = 1/(2 s) where the drive bears the share s of it.
+A stationary Kalman filter of x = (q, q', d), the device's coordinates, their rates and a force that wanders, has
+innovations e that are white but for fingers; a change of gain adds a multiple of a known signal w to them, which least
+squares find (docs/theory.md, "Supervision").  Sensors are judged over the 3 ms after an innovation above 4.5 times its
+noise; actuators by means over 3 ms, while e is large.  Sensors that were swapped while both showed the same look like
+actuators that are, where both are symmetrical about the middle.
 
 References
 ----------
-Willsky and Jones, A generalized likelihood ratio approach to the detection and estimation of jumps in linear systems,
-IEEE Transactions on Automatic Control 21, 1976.
-Anderson, Second-order convergent algorithms for the steady-state Riccati equation, International Journal of Control 28,
-1978.
+Willsky and Jones, IEEE Transactions on Automatic Control 21, 1976 (generalized likelihood ratio).
+Anderson, International Journal of Control 28, 1978 (the Riccati equation by doubling).
 """
 
 from __future__ import annotations
@@ -40,7 +21,7 @@ import numpy as np
 
 from hapticrender.control.device_model import DeviceModel
 from hapticrender.jit import kernel, record
-from hapticrender.mathx import zoh
+from hapticrender.mathx import state_space, zoh
 from hapticrender.protocols import Array
 
 MOST = 2  # sensors, and actuators
@@ -90,10 +71,8 @@ def design_gains(model: DeviceModel, noise: float) -> Array | None:
     moves = math.isfinite(noise) and np.linalg.matrix_rank(model.mass) == n
     if max(sensors, actuators) > MOST or not (seen and moves):
         return None
-    inverse, force_map = np.linalg.inv(model.mass), model.force_from_drive
-    a, b = np.zeros((2 * n, 2 * n)), np.vstack([np.zeros((n, n)), inverse])
-    a[:n, n:], a[n:, :n], a[n:, n:] = np.eye(n), -inverse @ model.stiffness, -inverse @ model.damping
-    a, b = zoh(a, b, 1.0 / model.rate)
+    force_map = model.force_from_drive
+    a, b = zoh(*state_space(model.mass, model.damping, model.stiffness, np.eye(n)), 1.0 / model.rate)
     whole = np.block([[a, b], [np.zeros((n, 2 * n)), np.eye(n)]])
     show = np.hstack([np.linalg.pinv(model.coordinate_from_sensed) / noise, np.zeros((sensors, 2 * n))])
     gain, variance = _filter(whole, show, WANDER / math.sqrt(model.rate))

@@ -1,15 +1,9 @@
 """The step of the law by bands: a block of M >= 1 samples from sensors to drive; sample by sample is M = 1.
 
-Over a block the envelopes are held.  The residuals e_h that follow from them and those e of the observer that runs
-sample by sample are related by a unit lower-triangular Toeplitz matrix, whatever the number of bands (docs/theory.md)::
-
-    e[m] + sum_(j<m) psi[m-j] e[j] = e_h[m],   psi[i] = g_dc + (i - 1) g_drift + g sum_k cos(w_k i)
-
-so that e = Q e_h with Q of one column; with M = 1 there is nothing to solve.  Then every envelope is updated once, the
-law is taken for the moment at which its force acts, and the drive runs linearly from one block's force to the next's.
-The inner damper needs the next sample and runs with M = 1 only.
-
 A block: sensors, carriers and targets, contact, prediction, innovation, observer and integral, adaptation, law, drive.
+Over a block the envelopes are held, and the innovations of the sample-by-sample observer found by a triangular solution
+(docs/theory.md, "Blocks of M samples"); with M = 1 there is nothing to solve.  The drive runs linearly from one block's
+force to the next's.  The inner damper needs the next sample and runs with M = 1 only.
 """
 
 from __future__ import annotations

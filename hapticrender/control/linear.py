@@ -1,17 +1,9 @@
-"""Linear model of the closed loop at sample rate: a device, the error observer with its law, and their poles.
+"""Transfer functions of the closed loop at sample rate: a device, the error observer, and its law.
 
-The error observer's bands turn with their carriers, E[n+1] = E[n] + g e[n] e^(-j phi[n]), yet their output,
-Re(E e^(j phi)), is that of a linear time-invariant resonator driven by the innovation e.  With eps = E e^(j phi),
-nu = v e^(j phi), a = e^(j w T) and the sampling period T, a carrier is (docs/theory.md, "Error observer" and "Law")::
-
-    eps' = eps + g e,    nu' = nu - T ki eps'                             (observer, integral)
-    F = Re sum_k rho (D nu' - ki D' eps') - inner sum_i c_i dev[n - i]    (law, damper)
-    e = y - dc - Re sum_k eps,    dev = y - Re sum_k nu,    next eps = a eps',  next nu = a nu'
-
-with rho = e^(j w lead)/sinc(w T/2).  `ErrorLoop` has these equations twice: as transfer functions for the margins, and
-as one sample of the closed loop for its poles.  All bands, their images, the DC estimate, all coordinates, the delay
-and the hold are inside; no envelope is averaged.  Assumed: carriers of fixed frequency (for a moving finger: its speed
-frozen), a frozen finger estimate, a drive inside its limits, no rounding.
+With eps = E e^(j phi) and nu = v e^(j phi) the turning bands are linear and time-invariant (docs/theory.md, "Error
+observer" and "Dynamic-stiffness law").  All bands, their images, the DC estimate, all coordinates, the delay and the
+hold are inside; no envelope is averaged.  Assumed: carriers of fixed frequency (for a moving finger: its speed frozen),
+a frozen finger estimate, a drive inside its limits, no rounding.
 """
 
 from __future__ import annotations
@@ -19,16 +11,13 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple
 
 import numpy as np
 
 from hapticrender.control.margins import NARROWEST, SLOWEST, Margins, carrier_grid, margins_of, unstable_poles
 from hapticrender.control.records import LEAK
-from hapticrender.mathx import zoh
+from hapticrender.mathx import state_space, zoh
 from hapticrender.protocols import Array
-
-LEAST_POLE = 1e-300  # stands for a pole at z = 0, whose logarithm is not finite
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -43,10 +32,9 @@ class Sampled:
     @classmethod
     def free(cls, mass: Array, damping: Array, stiffness: Array, rate: float) -> Sampled:
         """Discretise M q'' + C q' + K q = f (kg, N s/m, N/m) exactly."""
-        n, inverse = len(mass), np.linalg.inv(mass)
-        a = np.block([[np.zeros((n, n)), np.eye(n)], [-inverse @ stiffness, -inverse @ damping]])
-        ad, bd = zoh(a, np.vstack([np.zeros((n, n)), inverse]), 1.0 / rate)
-        return cls(rate=rate, a=ad, b=bd, c=np.eye(n, 2 * n))
+        n = len(mass)
+        a, b = zoh(*state_space(mass, damping, stiffness, np.eye(n)), 1.0 / rate)
+        return cls(rate=rate, a=a, b=b, c=np.eye(n, 2 * n))
 
     @cached_property
     def _modal(self) -> tuple[Array, Array, Array]:
@@ -62,15 +50,6 @@ class Sampled:
         """Coordinates per force (m/N, shape (..., c, c)) at complex `z`."""
         poles, out, into = self._modal
         return np.einsum("ip,...p,pj->...ij", out, 1.0 / (np.asarray(z)[..., None] - poles), into)
-
-
-class FingerEstimate(NamedTuple):
-    """The finger as the law has it: kg, N s/m, N/m, and its lever arm p/a."""
-
-    mass: float
-    damping: float
-    stiffness: float
-    lever: float
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -91,7 +70,7 @@ class ErrorLoop:
     share: Array  # (K,): factor on the observer's gain of each band, less than 1 where it fades out
 
     @cached_property
-    def _bands(self) -> tuple[Array, Array, Array, Array]:
+    def recursion(self) -> tuple[Array, Array, Array, Array]:
         """Turn a sample, observer's gain, decay (1/s) and what a sample leaves of the states, each (K,)."""
         fading = LEAK * (1.0 - self.share)
         turn = np.exp(2j * np.pi * self.frequency / self.plant.rate)
@@ -102,7 +81,7 @@ class ErrorLoop:
 
         `z` is complex, shape (N,).
         """
-        turn, gain, fading, kept = self._bands
+        turn, gain, fading, kept = self.recursion
 
         def sums(z: Array, law: Array, slope: Array) -> tuple[Array, Array, Array]:
             """Sums of eps and nu (N,) and force (N, c, c) per innovation, without the images."""
@@ -129,39 +108,6 @@ class ErrorLoop:
         gain, rest = self.controller(z)
         loop = self.plant.response(z) @ gain * z[:, None, None] ** -self.delay
         return rest ** len(self.taps) * np.linalg.det(np.eye(len(self.taps)) + loop)
-
-    def matrix(self) -> Array:
-        """State matrix of the closed loop, real, shape (s, s): one sample from every unit state."""
-        n, c = self.plant.b.shape
-        count, past = len(self.frequency), self.taps.shape[1] - 1
-        sizes = [n, self.delay * c, 2 * c * count, 2 * c * count, c, c, past * c]
-        unit = np.eye(sum(sizes))
-        x, forces, eps, nu, level, drift, deviations = np.split(unit, np.cumsum(sizes)[:-1])
-        eps, nu = (each[: c * count] + 1j * each[c * count :] for each in (eps, nu))
-        eps, nu = (each.reshape(c, count, -1) for each in (eps, nu))
-        turn, gain, fading, kept = (each[:, None] for each in self._bands)
-        y = self.plant.c @ x
-        e, deviation = y - level - eps.real.sum(axis=1), y - nu.real.sum(axis=1)
-        eps = kept * eps + gain * e[:, None]
-        rate = -self.integral * eps - fading * nu
-        nu = kept * nu - self.integral / self.plant.rate * eps
-        deviations = np.concatenate([deviation, deviations])
-        force = np.einsum("kij,jks->is", self.law, nu).real + np.einsum("kij,jks->is", self.slope, rate).real
-        force -= self.inner * np.einsum("it,tis->is", self.taps, deviations.reshape(past + 1, c, -1))
-        eps, nu = ((turn * each).reshape(c * count, -1) for each in (eps, nu))
-        x = self.plant.a @ x + self.plant.b @ forces[:c]
-        forces = np.concatenate([forces[c:], force])
-        level, drift = level + self.dc * e + drift, drift + self.dc_drift * e
-        return np.concatenate([x, forces, eps.real, eps.imag, nu.real, nu.imag, level, drift, deviations[: past * c]])
-
-    def poles(self) -> Array:
-        """Closed-loop poles (1/s, complex): growth and angular frequency."""
-        z = np.linalg.eigvals(self.matrix()).astype(complex)
-        return self.plant.rate * np.log(np.where(z == 0, LEAST_POLE, z))
-
-    def growth(self) -> float:
-        """Growth of the slowest-decaying pole (1/s), < 0 for a stable loop."""
-        return float(self.poles().real.max())
 
     def margins(self) -> Margins:
         """Margins of the loop, of all its bands and coordinates together."""

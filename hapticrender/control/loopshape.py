@@ -7,16 +7,16 @@ drives the plant, which a look-up table or an inverse makes 1 (docs/theory.md, "
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from math import sqrt
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from hapticrender.bands import Bands
+from hapticrender.control.demodulator import StarSTDFT
 from hapticrender.control.device_model import DeviceModel
 from hapticrender.control.margins import LEAST, Margins, margins_of, unstable_poles
-from hapticrender.control.stdft import StarSTDFT
-from hapticrender.control.transfer import TransferFunction, butterworth
 from hapticrender.errors import DesignError
 from hapticrender.mathx import zero_crossings
 from hapticrender.protocols import Array
@@ -25,6 +25,55 @@ Bandwidths = tuple[float, float]
 Section = tuple[float, float, float, float, float]  # b0 b1 b2 a1 a2, a0 = 1
 BESIDE = 1e-6  # 1/s: distance of Nyquist's contour from the imaginary axis, right of the integrator
 NARROWER, SLOWEST = 0.9, 0.05  # steps in which a loop is slowed down for its delay, and how far
+
+
+@dataclass(frozen=True)
+class TransferFunction:
+    """A proper rational function of s, ``numerator(s)/denominator(s)``.
+
+    Coefficients are in descending powers of s (rad/s), kept as tuples and scaled so that the denominator is monic;
+    common factors stay.  A denominator that is zero, or of lower order than the numerator, is a ValueError.
+    """
+
+    numerator: tuple[float, ...]
+    denominator: tuple[float, ...]
+
+    def __post_init__(self) -> None:
+        above, below = (np.trim_zeros(np.array(each, float), "f") for each in (self.numerator, self.denominator))
+        if not below.size or above.size > below.size:
+            raise ValueError(f"denominator of order {below.size - 1} must be >= the numerator's, {above.size - 1}")
+        object.__setattr__(self, "numerator", tuple((above / below[0]).tolist()))
+        object.__setattr__(self, "denominator", tuple((below / below[0]).tolist()))
+
+    def __call__(self, s: Any) -> Any:
+        """Value at complex `s` (rad/s)."""
+        return np.polyval(self.numerator, s) / np.polyval(self.denominator, s)
+
+    def __mul__(self, other: TransferFunction) -> TransferFunction:
+        return TransferFunction(
+            tuple(np.polymul(self.numerator, other.numerator)), tuple(np.polymul(self.denominator, other.denominator))
+        )
+
+    def poles(self) -> Array:
+        """Poles (rad/s, complex)."""
+        return np.roots(self.denominator)
+
+    def frequency_response(self, frequency: Any) -> Any:
+        """Complex response at `frequency` (Hz)."""
+        return self(2j * np.pi * np.asarray(frequency, float))
+
+    def tustin(self, rate: float) -> tuple[Array, Array]:
+        """Discretise by the bilinear transform at `rate` (Hz): b and a of z^-k, shape (order + 1,), a[0] = 1."""
+        from scipy.signal import bilinear  # takes a second to import
+
+        b, a = bilinear(self.numerator, self.denominator, rate)
+        return b, a
+
+
+def butterworth(bandwidth: float) -> TransferFunction:
+    """Second-order Butterworth low pass, ``w^2/(s^2 + sqrt2 w s + w^2)``, -3 dB at `bandwidth` w/(2 pi) (Hz, > 0)."""
+    w = 2 * np.pi * bandwidth
+    return TransferFunction((w**2,), (1.0, sqrt(2) * w, w**2))
 
 
 def reduced_controller(loop_bandwidth: float, filter_bandwidth: float) -> TransferFunction:
@@ -73,15 +122,6 @@ def _grid(loop: TransferFunction) -> Array:
     return np.geomspace(1e-3 * corners.min(), 1e3 * corners.max(), 20001)
 
 
-class EnvelopeLoop(NamedTuple):
-    """Low pass of an estimator and its loop controller as second-order sections."""
-
-    filter: Section
-    law: Section
-    boxcar: int  # samples, length of the running mean; 0: none
-    bandwidth: float  # Hz, of the closed loop, lowered where the delay requires it
-
-
 def envelope_loop(
     model: DeviceModel,
     bands: Bands,
@@ -89,8 +129,11 @@ def envelope_loop(
     boxcar: bool = False,
     bandwidths: Bandwidths | None = None,
     feedback: bool = True,
-) -> EnvelopeLoop:
+) -> tuple[dict[str, Any], float]:
     """Design the loop of one envelope for the lowest carrier, with the margins of a low-pass loop.
+
+    Returns the settings (low pass and loop controller as second-order sections, window in samples), and the bandwidth
+    (Hz) of the closed loop, lowered where the delay requires it.
 
     A `boxcar` estimates by a running mean over one period of the lowest carrier, which removes the image of that
     carrier and of its harmonics; its delay beyond the low pass's counts as the loop's.  `bandwidths` (Hz, of loop and
@@ -110,7 +153,8 @@ def envelope_loop(
         delay += max((length - 1) / (2 * model.rate) - StarSTDFT(bandwidth=lowest / 2, rate=model.rate).delay, 0.0)
     width, wide = bandwidths or _widest(lowest, delay)
     low_pass, law = StarSTDFT(bandwidth=wide, rate=model.rate), reduced_controller(width, wide)
-    return EnvelopeLoop(section(low_pass.coefficients), section(law.tustin(model.rate)), length, width)
+    found = {"low_pass": section(low_pass.coefficients), "loop": section(law.tustin(model.rate)), "window": length}
+    return found, width
 
 
 def _widest(lowest: float, delay: float) -> Bandwidths:

@@ -14,7 +14,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from itertools import permutations
 
 import numpy as np
 
@@ -54,11 +53,6 @@ class Margins:
         smallest = {name: min(getattr(margins, name) for margins in found) for name in SMALLEST}
         least = min(found, key=lambda margins: margins.modulus)
         return replace(least, stable=all(margins.stable for margins in found), **smallest)
-
-    @property
-    def peak_sensitivity(self) -> float:
-        """Ms = 1/modulus."""
-        return 1.0 / self.modulus if self.modulus else math.inf
 
     def __str__(self) -> str:
         if not self.stable:
@@ -202,17 +196,11 @@ def highest_peak(height: Callable[[Array], Array], grid: Array, values: Array) -
 
 
 def eigenloci(loop: Array) -> Array:
-    """Eigenvalues of `loop` (n, c, c) along its first axis, shape (n, c), each column continuous."""
-    if loop.shape[1] == 1:
-        return loop[:, :, 0].copy()
+    """Eigenvalues of `loop` (n, c, c), c 1 or 2, along its first axis, shape (n, c), each column continuous."""
     loci = np.linalg.eigvals(loop)
-    ways = np.array(list(permutations(range(loci.shape[1]))))
-    moved = np.abs(loci[1:, ways] - loci[:-1, None, :]).sum(axis=2).argmin(axis=1)
-    order = ways[0]
-    for n, way in enumerate(ways[moved], start=1):
-        order = way[order]
-        loci[n] = loci[n, order]
-    return loci
+    straight, crossed = (abs(each - loci[:-1]).sum(axis=1) for each in (loci[1:], loci[1:, ::-1]))
+    swapped = np.append(False, np.cumsum(crossed < straight) % 2 == 1)
+    return np.where(swapped[:, None], loci[:, ::-1], loci)
 
 
 def borne_errors(frequency: Array, loop: Array) -> tuple[float, float, float]:

@@ -10,11 +10,7 @@ stiffness       the same, then D V + D' dV/dt
 resonant        one integrator a band and coordinate, no low pass; then D V + D' dV/dt
 =============== =======================================================================================================
 
-A look-up table of the free device over frequency turns the polar methods' amplitude into a drive; their command never
-goes negative, and their phase error is cut at -270/90 degrees.  Two sides controlled apart are unstable on the paper's
-plate between 129 and 189 Hz.  The static inverse takes every envelope for constant and fails within a few Hz of a mode,
-where the device's own envelope is slower than the loop; with the slope D' the inverse is exact up to m W^2/|D| for
-changes of W rad/s.  All but h and h2 leave the finger out.
+All but h and h2 leave the finger out; docs/theory.md, "Where methods fail", says what that costs.
 """
 
 from __future__ import annotations
@@ -40,7 +36,7 @@ from hapticrender.control.inverse import AdaptiveInverse
 from hapticrender.control.linear import Sampled
 from hapticrender.control.loopshape import (
     Bandwidths,
-    EnvelopeLoop,
+    TransferFunction,
     envelope_loop,
     loop_margins,
     section,
@@ -48,7 +44,6 @@ from hapticrender.control.loopshape import (
 from hapticrender.control.low_pass import low_pass_step
 from hapticrender.control.margins import LEAST
 from hapticrender.control.records import LOW_PASS, W, aligned
-from hapticrender.control.transfer import TransferFunction
 from hapticrender.errors import DesignError
 from hapticrender.protocols import Array, Method
 
@@ -96,24 +91,24 @@ class Polar:
         """
         if bands.modulated or bands.differentiated:
             raise DesignError(f"method {self.name!r} cannot modulate or differentiate targets: use 'h2' or 'stiffness'")
-        loop = envelope_loop(model, bands, boxcar=self.boxcar, bandwidths=self.bandwidths, feedback=feedback)
+        loop, width = envelope_loop(model, bands, boxcar=self.boxcar, bandwidths=self.bandwidths, feedback=feedback)
         sensor_map, drive_map = model.side_from_coordinate, np.eye(len(model.side_from_coordinate))
         if self.common:
             sensor_map, drive_map = sensor_map.mean(axis=0)[None], np.ones((len(sensor_map), 1))
         table = frequency_table(model, sensor_map, drive_map, feedback)
         settings = {
-            **low_pass_settings(model, bands, loop, sensor_map @ model.coordinate_from_sensed, drive_map, feedback),
+            **low_pass_settings(model, bands, width, sensor_map @ model.coordinate_from_sensed, drive_map, feedback),
+            **loop,
             "polar": True,
             "clamped": self.clamp,
             "subtracted": self.subtract,
-            "window": loop.boxcar,
             "table": table.shape[1],
             "table_step": TABLE_STEP,
             "fade_in": 1.0 / (CONTACT_FADE * model.rate),
         }
         arrays = {"gains": table}
-        if loop.boxcar:
-            arrays["window"] = aligned((loop.boxcar, len(sensor_map) * tiles_of(bands), 2, W))
+        if loop["window"]:
+            arrays["window"] = aligned((loop["window"], len(sensor_map) * tiles_of(bands), 2, W))
         controller = low_pass_controller(self.name, settings, bands, arrays)
         fixed = np.zeros(controller.tiles["fade"].shape)
         fixed.reshape(-1)[: len(bands)] = bands.wavenumber == 0.0
@@ -133,8 +128,8 @@ class Inverse:
 
     def design(self, model: DeviceModel, bands: Bands, *, feedback: bool = True) -> BankController:
         """Design loops in the device's coordinates; raises `DesignError` where its delay leaves no margin."""
-        loop = envelope_loop(model, bands, bandwidths=self.bandwidths, feedback=feedback)
-        settings = complex_settings(model, bands, loop, self.feed_forward, feedback)
+        loop, width = envelope_loop(model, bands, bandwidths=self.bandwidths, feedback=feedback)
+        settings = complex_settings(model, bands, width, self.feed_forward, feedback) | loop
         settings |= {"dynamic": self.dynamic, "deviation": self.feed_forward and self.filtered}
         return low_pass_controller(self.name, settings, bands)
 
@@ -168,8 +163,8 @@ class Resonant:
             found = loop_margins(controller, model.delay / model.rate)
             if complaint := LEAST["envelope"].complaint(found):
                 raise DesignError(f"{complaint}: lower gain={self.gain:g} 1/s or the loop's delay")
-        loop = EnvelopeLoop(ALL_PASS, section(controller.tustin(model.rate)), 0, model.lowest_frequency / 4)
-        settings = complex_settings(model, bands, loop, False, feedback)
+        settings = complex_settings(model, bands, model.lowest_frequency / 4, False, feedback)
+        settings |= {"low_pass": ALL_PASS, "loop": section(controller.tustin(model.rate))}
         return low_pass_controller(self.name, settings | {"dynamic": True, "deviation": True}, bands)
 
 
@@ -195,17 +190,18 @@ def frequency_table(model: DeviceModel, sensor_map: Array, drive_map: Array, fee
 
 
 def low_pass_settings(
-    model: DeviceModel, bands: Bands, loop: EnvelopeLoop, sensor_map: Array, drive_map: Array, feedback: bool
+    model: DeviceModel, bands: Bands, width: float, sensor_map: Array, drive_map: Array, feedback: bool
 ) -> dict[str, Any]:
-    """Settings that every method with a low pass shares; the maps are those of sensors to coordinates and back."""
+    """Settings that every method with a low pass shares; the maps are those of sensors to coordinates and back.
+
+    `width` (Hz) is the bandwidth of the loop.
+    """
     # a waveform's envelopes pass two poles, with the delay of the low pass's two
-    analysis = min(2 * math.pi * math.sqrt(2.0) * 2.0 * loop.bandwidth, spacing(bands))
+    analysis = min(2 * math.pi * math.sqrt(2.0) * 2.0 * width, spacing(bands))
     ridges = ridge_spacing(bands)
     refuse_whole_waveform(bands)
     return {
         **shared_settings(model, bands, sensor_map, drive_map, feedback),
-        "low_pass": loop.filter,
-        "loop": loop.law,
         "waveform_gain": 2 * analysis / model.rate,
         "crowd_speed": analysis / ridges if math.isfinite(ridges) else 0.0,
         "highest_edge": HIGHEST_EDGE,
@@ -214,13 +210,13 @@ def low_pass_settings(
 
 
 def complex_settings(
-    model: DeviceModel, bands: Bands, loop: EnvelopeLoop, feed_forward: bool, feedback: bool
+    model: DeviceModel, bands: Bands, width: float, feed_forward: bool, feedback: bool
 ) -> dict[str, Any]:
     """Settings of the complex methods; without feedback the reference alone is inverted."""
     forward = feed_forward or not feedback
     drive_map = np.linalg.pinv(model.force_from_drive)
     return {
-        **low_pass_settings(model, bands, loop, model.coordinate_from_sensed, drive_map, feedback),
+        **low_pass_settings(model, bands, width, model.coordinate_from_sensed, drive_map, feedback),
         **device_settings(model),
         "shape": (1.0, 0.0),
         "forward": forward,

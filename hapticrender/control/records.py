@@ -18,6 +18,7 @@ import numpy as np
 from numba import carray
 
 from hapticrender.jit import F8, kernel, pointer, record
+from hapticrender.jit import aligned as aligned
 from hapticrender.protocols import Array
 from hapticrender.vectors import W, tile_type
 
@@ -172,15 +173,6 @@ def samples_of(controller):
     """Work array of the samples, shape (rows, groups g); samples beyond M stay zero but for the sums."""
     c = record(controller, CONTROLLER_T, 0)
     return carray(pointer(c.samples_at, F8), (SAMPLE_ROWS, c.p.groups * c.p.group))
-
-
-def aligned(shape: int | tuple[int, ...], dtype: type | np.dtype = np.float64) -> Array:
-    """Array of zeros that starts at a multiple of 64 bytes, as `get` and `put` of tiles require."""
-    dtype = np.dtype(dtype)
-    size = int(np.prod(shape)) * dtype.itemsize
-    memory = np.zeros(size + 64, np.uint8)
-    start = -memory.ctypes.data % 64
-    return memory[start : start + size].view(dtype).reshape(shape)
 
 
 def lanes(tiles: Array, name: str, bands: int) -> Array:

@@ -24,10 +24,13 @@ from hapticrender.control.supervisor_kernel import SUPERVISOR
 from hapticrender.jit import I8, kernel, pointer
 from hapticrender.protocols import Array
 
-PARTS, BLOCKS = 2, 14  # of a device; of a part
-ROWS = PARTS * BLOCKS
-HEAT, TRACKER = 1, 5  # blocks of the heat of the drives, of the finger's position and velocity
-NONE = (0, 0)
+PARTS = 2  # of a device
+BLOCKS = (  # of a part: of its supervisor, of every controller, of the waveform law
+    *("tests", "heat", "sensors", "forces", "gains"),
+    *("tracker", "finger", "rounding"),
+    *("learned", "window", "ring", "reference"),
+)
+ROWS = PARTS * len(BLOCKS)
 
 Block = tuple[int, int]  # address, 8-byte words
 
@@ -48,15 +51,15 @@ def state_table(controller: Any) -> Array:
 
     The controller has to outlive the table.
     """
-    table = np.zeros((PARTS, BLOCKS, 2), np.int64)
+    parts = [_blocks(part) for part in _parts(controller)]
     for i, part in enumerate(_parts(controller)):
-        table[i] = _supervised(part) + _law(getattr(part, "controller", part))
         if part is None:  # what it has to be left to cool is the combination's
             heat = controller.state["parts"]["heat"][0, i]
-            table[i, HEAT] = heat.ctypes.data, len(heat)
-    if not table[1, TRACKER].any():  # both parts have one finger
-        table[1, TRACKER] = table[0, TRACKER]
-    return table.reshape(ROWS, 2)
+            parts[i]["heat"] = heat.ctypes.data, len(heat)
+    if len(parts) > 1 and "tracker" in parts[0]:  # both parts have one finger
+        parts[1].setdefault("tracker", parts[0]["tracker"])
+    rows = [part.get(name, (0, 0)) for part in parts for name in BLOCKS]
+    return np.array(rows + [(0, 0)] * (ROWS - len(rows)), np.int64)
 
 
 def ready(controller: Any) -> None:
@@ -88,30 +91,29 @@ def _parts(controller: Any) -> Sequence[Any]:
     return controller.parts if isinstance(controller, CombinedController) else (controller,)
 
 
-def _supervised(controller: Any) -> list[Block]:
-    """Blocks of a supervisor."""
-    if not isinstance(controller, SupervisedController):
-        return [NONE] * 5
-    p, at = controller.state["p"][0], controller.state.ctypes.data
-    found = [_fields(at, SUPERVISOR, *ends) for ends in (("fade", "heat"), ("heat", "last"), ("last", None))]
-    gains = _fields(int(p["gains"]), GAINS, "models") if p["gains"] else NONE
-    return [*found, (int(p["forces_at"]), 3 * (int(p["delay"]) + 1)), gains]
-
-
-def _law(controller: Any) -> list[Block]:
-    """Blocks of a controller: finger and load, the rounding of its drive; what the waveform law has learned."""
-    state = getattr(controller, "state", None)
+def _blocks(part: Any) -> dict[str, Block]:
+    """Blocks of a part by name: of its supervisor, of its controller, and what the waveform law has learned."""
+    found: dict[str, Block] = {}
+    if isinstance(part, SupervisedController):
+        p, at = part.state["p"][0], part.state.ctypes.data
+        for name, ends in {"tests": ("fade", "heat"), "heat": ("heat", "last"), "sensors": ("last", None)}.items():
+            found[name] = _fields(at, SUPERVISOR, *ends)
+        found["forces"] = int(p["forces_at"]), 3 * (int(p["delay"]) + 1)
+        if p["gains"]:
+            found["gains"] = _fields(int(p["gains"]), GAINS, "models")
+        part = part.controller
+    state = getattr(part, "state", None)
     if state is None or state.dtype != CONTROLLER:
-        return [NONE] * 9
+        return found
     at = state.ctypes.data
-    tracker = _fields(at, CONTROLLER, "held_position", "fresh")
-    found = [_fields(at, CONTROLLER, "fresh", "past"), _fields(at, CONTROLLER, "shaper", "sample")]
-    if not isinstance(controller, WaveformController):
-        return [tracker, *found] + [NONE] * 6
-    law, at, delay = controller.law, int(state["loops_at"][0]), int(controller.law["delay"])
-    found += [_fields(at, INVERSE, "fade", "ring_at"), _fields(at, INVERSE, "window")]
-    found += [(int(law["ring_at"]), RING * (delay + 1)), (int(law["reference_at"]), delay)]
-    return [tracker, NONE, NONE, *found]  # other laws mean other things by the first two
+    found["tracker"] = _fields(at, CONTROLLER, "held_position", "fresh")
+    if not isinstance(part, WaveformController):  # other laws mean other things by these
+        found["finger"] = _fields(at, CONTROLLER, "fresh", "past")
+        found["rounding"] = _fields(at, CONTROLLER, "shaper", "sample")
+        return found
+    law, at, delay = part.law, int(state["loops_at"][0]), int(part.law["delay"])
+    found |= {"learned": _fields(at, INVERSE, "fade", "ring_at"), "window": _fields(at, INVERSE, "window")}
+    return found | {"ring": (int(law["ring_at"]), RING * (delay + 1)), "reference": (int(law["reference_at"]), delay)}
 
 
 def _fields(address: int, kind: np.dtype, first: str, end: str | None = None) -> Block:

@@ -1,13 +1,9 @@
 """Supervision: a compiled step around a controller's that stops the drive where the device does not follow it.
 
-Every sample it compares what is sensed with the drive that acts, at a cost that does not grow with the bands.  With the
-coordinates q (heave, rocking) and the force F = B u, the mean of the samples before and after the moment of sensing,
-both behind the same filter H (one-pole high-pass and low-pass, then a Butterworth low-pass of second order, trapezoidal
-rule), the residual force
-
-    r = H F - (M H s^2 q + C H s q + K H q)
-
-is what the device model lacks: a finger, its load, noise, or a fault.  Energies E are one-pole means of squares.
+Every sample it compares the coordinates q (heave, rocking) with the force F of the drive that acts, the mean of the
+samples before and after the moment of sensing, at a cost that does not grow with the bands.  The residual force r is
+what the device model lacks: a finger, its load, noise, or a fault (docs/theory.md, "Supervision").  Energies E are
+one-pole means of squares.
 
 === ============ ================================================================================ ====================
 no  test         condition                                                                        for

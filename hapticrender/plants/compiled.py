@@ -147,24 +147,6 @@ class CompiledPlant:
         return drive[:length], target[:length], signals["flags"], self._sensed(signals)
 
 
-def new_record(dtype: np.dtype[Any], *sources: object, **values: Any) -> Array:
-    """Return a record (shape (1,)) with numbers of the same name from `sources`, or from `values`; the rest is zero.
-
-    It begins at a multiple of 64 bytes: vectors in its fields load at full speed.
-    """
-    memory = np.zeros(dtype.itemsize + 64, np.uint8)
-    first = -memory.ctypes.data % 64
-    record = memory[first : first + dtype.itemsize].view(dtype)
-    for name in dtype.names or ():
-        for source in sources:
-            value = getattr(source, name, None)
-            if isinstance(value, (int, float, complex)):
-                record[name] = value
-        if name in values:
-            record[name] = values[name]
-    return record
-
-
 def finger_inputs(finger: Finger, first: int, n: int, rate: float) -> Array:
     """Position (m), load (N), strength and speed (m/s) of samples `first` to `first` + n - 1, shape (n, 4).
 

@@ -1,13 +1,8 @@
 """An electroadhesive screen: a current on a carrier, the circuit of screen and skin, attraction, friction, tribometer.
 
-The circuit, in series and per area: insulator, stratum corneum (C || R), sliding gap (C = eps0/d || R_g); and the body,
-R.  Under a current of peak I at the carrier w the attraction is, on average, ``g I^2`` whatever the gap's thickness::
-
-    g = kappa L/(4 w^2 eps0 A),   L = (w tau)^2/(1 + (w tau)^2),   tau = R_g C
-
-(docs/theory.md, "Electroadhesion").  A resting finger shorts its gap with sweat and is not attracted.  A stray
-capacitance C_s across the source (cable, electrode) leaves a finger of impedance Z ``I/(1 + j w C_s Z)``, in steady
-state at the carrier; the current that is measured is that of the source.
+Insulator, stratum corneum, sliding gap and body are in series; a current of peak I attracts with ``g I^2`` on average
+whatever the gap's thickness (docs/theory.md, "Electroadhesion").  A resting finger shorts its gap with sweat and is not
+attracted.  The current that is measured is that of the source, with what a stray capacitance across it takes.
 
 Two levels: "carrier" integrates the circuit over every substep exactly, with the offset of the current source, its
 servo and its compliance; "envelope" takes ``g I^2``.  They agree but for what a step of the envelope leaves in the gap
@@ -23,8 +18,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from hapticrender.checks import Validated, option, parameter
-from hapticrender.control.stdft import StarSTDFT
-from hapticrender.plants.compiled import CompiledPlant, new_record
+from hapticrender.control.demodulator import StarSTDFT
+from hapticrender.jit import record_of
+from hapticrender.plants.compiled import CompiledPlant
 from hapticrender.plants.electroadhesion_kernels import SCREEN, element, screen_step
 from hapticrender.plants.gap import VACUUM, gap_record
 from hapticrender.plants.sliding_contact import SlidingParameters, sliding_record
@@ -237,7 +233,7 @@ def screen_record(parameters: ElectroadhesionParameters, compensation: SquareRoo
     p, substep = parameters, 1.0 / (parameters.rate * parameters.oversampling)
     turn, corneum = np.exp(1j * p.omega * substep), p.corneum_resistance * p.corneum_capacitance
     elements = [element.py_func(tau, substep, p.omega, turn) for tau in (BLOCKING, corneum, corneum)]
-    return new_record(
+    return record_of(
         SCREEN,
         p,
         compensation,

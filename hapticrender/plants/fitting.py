@@ -22,6 +22,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.optimize import least_squares
 
+from hapticrender.control.probe import WIRINGS
 from hapticrender.errors import DesignError
 from hapticrender.plants.multisine import Multisine
 from hapticrender.plants.plate import PlateParameters, structure
@@ -37,19 +38,6 @@ LEAST_DAMPING = 1e-3  # of the critical one: the same for a plate that is expect
 ROUNDING = 1e-9  # of the motion: least noise that is assumed
 CHANCE = 5.0  # standard deviations of a ratio of variances
 EXPLAINED = 0.95  # least share of the drive force that the equation error must explain; 0.996 under a heavy finger
-SWAP = np.array([[0.0, 1.0], [1.0, 0.0]])
-FAULTS = (  # name, and what turns sensors and coils into those of a plate without the fault
-    ("", np.eye(2), np.eye(2)),
-    ("sensors 1 and 2, or coils 1 and 2, are swapped", SWAP, np.eye(2)),
-    ("both sensors, or both coils, are inverted", -np.eye(2), np.eye(2)),
-    ("sensors or coils are both swapped and inverted", -SWAP, np.eye(2)),
-    ("sensor 1 is inverted", np.diag([-1.0, 1.0]), np.eye(2)),
-    ("sensor 2 is inverted", np.diag([1.0, -1.0]), np.eye(2)),
-    ("coil 1 is inverted", np.eye(2), np.diag([-1.0, 1.0])),
-    ("coil 2 is inverted", np.eye(2), np.diag([1.0, -1.0])),
-    ("coil 1 has no effect", np.eye(2), np.diag([0.0, 1.0])),
-    ("coil 2 has no effect", np.eye(2), np.diag([1.0, 0.0])),
-)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -170,18 +158,18 @@ def check_wiring(expected: PlateParameters, record: Record, latest: int) -> None
         Sensors or coils are swapped, inverted or without effect, or the device is no such plate.
     """
     shares = {}
-    for name, sensors, coils in FAULTS:
+    for name, (sensors, coils) in WIRINGS.items():
+        if np.linalg.det(sensors) == 0.0:  # what a dead sensor does not show is not found here
+            continue
         trial = replace(record, sensed=record.sensed @ sensors, drive=record.drive @ coils)
         solved, _, explained = equation_error(expected, trial, latest)
         shares[name] = explained if (solved[:4] > 0).all() else 0.0
-        if not name and shares[name] >= EXPLAINED:
+        if shares["nothing"] >= EXPLAINED:
             return
     fault = max(shares, key=lambda name: shares[name])
     cause = f"{fault}: rewire" if shares[fault] >= EXPLAINED else "check device and [device]"
-    raise DesignError(
-        f"motion of a plate explains {100 * shares['']:.3g} % of the drive force: must be >= {100 * EXPLAINED:g} %; "
-        f"{cause}"
-    )
+    share, bound = 100 * shares["nothing"], 100 * EXPLAINED
+    raise DesignError(f"motion of a plate explains {share:.3g} % of the drive force: must be >= {bound:g} %; {cause}")
 
 
 def starting_bending(fit: Fit, record: Record, variance: float) -> tuple[float, float, float] | None:

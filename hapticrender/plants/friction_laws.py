@@ -83,18 +83,9 @@ def reference_amplitude(law, ratio, load, speed):
     return law.scale * gap * math.sqrt(-math.expm1(-y) * load / law.film)
 
 
-@kernel
-def friction_ratios(law, amplitude, load, speed, ratio):
-    """`friction_ratio` for every element of flat arrays, into `ratio`."""
-    for n in range(ratio.size):
-        ratio[n] = friction_ratio(law, amplitude[n], load[n], speed[n])
-
-
-@kernel
-def reference_amplitudes(law, ratio, load, speed, amplitude):
-    """`reference_amplitude` for every element of flat arrays, into `amplitude`."""
-    for n in range(ratio.size):
-        amplitude[n] = reference_amplitude(law, ratio[n], load[n], speed[n])
+friction_ratios = np.vectorize(friction_ratio, otypes=[float], excluded={0})
+reference_amplitudes = np.vectorize(reference_amplitude, otypes=[float], excluded={0})
+"""The same over arrays, which are broadcast."""
 
 
 class FrictionLaw(Validated):
@@ -123,15 +114,12 @@ class FrictionLaw(Validated):
         least = self.floor + LEAST_SHARE * (1.0 - self.floor)
         return self._each(reference_amplitudes, _checked("ratio", ratio, least, 1.0), load, speed)
 
-    def _each(self, kernel_of_arrays: Any, first: Array, load: Any, speed: Any) -> Array:
+    def _each(self, law_of_arrays: Any, first: Array, load: Any, speed: Any) -> Array:
         load = _checked("load", load, 0.0, self._heaviest, "N")
         if load.size and not self._unloaded and load.min() == 0.0:
             raise ValueError("load = 0.0: must be > 0 N")
         speed = _checked("speed", speed, -math.inf, math.inf, "m/s")
-        first, load, speed = np.broadcast_arrays(first, load, speed)
-        result = np.empty(first.size)
-        kernel_of_arrays(self.numbers, first.ravel(), load.ravel(), speed.ravel(), result)
-        return result.reshape(first.shape)
+        return np.asarray(law_of_arrays(self.numbers, first, load, speed))
 
 
 @dataclass(frozen=True, kw_only=True)

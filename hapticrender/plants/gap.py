@@ -1,15 +1,11 @@
 """Estimate the attraction on an electroadhesive finger from the impedance of its gap at the carrier.
 
-With the complex envelopes V and I of voltage and current, both low-passed by the STDFT* of
-`hapticrender.control.stdft`, Z = V/I and Z_stat = Z while |v| < least_speed, the gap being shorted
-(docs/theory.md, "Gap estimation"; Shultz, Peshkin, Colgate 2018)::
-
-    A = |z_series|/|Z_stat - R_body|,   Z_g = Z - Z_stat,   L = Im(Z_g)^2/|Z_g|^2,   F = kappa |I|^2 L/(4 w^2 eps0 A)
-
-The force follows |I|^2 at once; only the impedance is averaged over a longer time, weighted by power, so that an
-envelope may pass through zero.  The force cannot be estimated while the finger is away or rests, before it has rested
-once, or when its gap leaks so much that L falls below a bound.  The output is then F = g |I|^2, what a control loop
-expects of a nominal finger, so that no integrator winds up, and `Flag.OPEN_LOOP` is raised.
+The equations are those of docs/theory.md, "Gap estimation" (Shultz, Peshkin, Colgate 2018), on the complex envelopes of
+voltage and current, low-passed by the STDFT*.  The force follows |I|^2 at once; only the impedance is averaged over a
+longer time, weighted by power, so that an envelope may pass through zero.  The force cannot be estimated while the
+finger is away or rests, before it has rested once, or when its gap leaks so much that L falls below a bound.  The
+output is then F = g |I|^2, what a control loop expects of a nominal finger, so that no integrator winds up, and
+`Flag.OPEN_LOOP` is raised.
 """
 
 from __future__ import annotations
@@ -19,8 +15,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hapticrender.jit import kernel
-from hapticrender.plants.compiled import new_record
+from hapticrender.jit import kernel, record_of
 from hapticrender.protocols import Array
 
 if TYPE_CHECKING:
@@ -57,7 +52,7 @@ def gap_record(parameters: ElectroadhesionParameters) -> Array:
     """Return the record (`GAP`, shape (1,)) of an estimator that has measured nothing, for a finger on this screen."""
     p = parameters
     b, a = p.estimator_filter.coefficients
-    return new_record(
+    return record_of(
         GAP,
         p,
         b=b,

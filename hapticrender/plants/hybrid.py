@@ -17,8 +17,8 @@ import numba
 import numpy as np
 from numba import carray
 
-from hapticrender.jit import F8, I8, SIGNALS, SIGNALS_T, call, pointer, step
-from hapticrender.plants.compiled import CompiledPlant, new_record
+from hapticrender.jit import F8, I8, SIGNALS, SIGNALS_T, call, pointer, record_of, step
+from hapticrender.plants.compiled import CompiledPlant
 from hapticrender.plants.plate import Plate
 from hapticrender.protocols import Array
 
@@ -110,16 +110,16 @@ class HybridPlant(CompiledPlant):
         parts = np.zeros(2, SIGNALS)
         parts["motion"] = [row.ctypes.data for row in rows]
         self.buffers = (parts, *rows)
-        self.state = new_record(
+        self.state = record_of(
             HYBRID,
             velocity_per_force=velocity_per_force,
             plate=(plate.step.address, plate.state.ctypes.data),
             screen=(screen.step.address, screen.state.ctypes.data),
-            parts=parts.ctypes.data,
+            parts=parts,
             input_channels=screen.inputs(0, 1).shape[1],
             noise_channels=self.noise_channels,
-            plate_motion=rows[0].ctypes.data,
-            screen_motion=rows[1].ctypes.data,
+            plate_motion=rows[0],
+            screen_motion=rows[1],
         )
 
     @property

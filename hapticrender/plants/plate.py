@@ -1,14 +1,8 @@
 """The vibrotactile plate of Grigorii et al. 2021: two coils, a sheet of glass, Hall sensors at its ends, a finger.
 
-With q = [x_c, a theta], a = coil_spacing/2, the finger at p, and the displacement e of the sensors in the first
-free-free bending mode of shape phi (docs/theory.md, section 3, with corrections to the paper)::
-
-    (M s^2 + C s + K) q = force_constant [[1, 1], [-1, 1]] i - F_f [1, p/a]
-    m_b (e'' + 2 zeta w_b e' + w_b^2 e) = phi_coil force_constant (i_1 + i_2) - phi(p) F_f
-    F_f = W + Z_f(s) s (x_c + p theta + phi(p) e)
-
-Frequency and damping of that mode are those measured on the free plate, its suspension included, so that the finger
-alone couples the mode to heave and rocking.
+The equations of motion, corrected, are those of docs/theory.md, section 3: q = [x_c, a theta], a = coil_spacing/2, and
+the displacement e of the sensors in the first free-free bending mode.  Frequency and damping of that mode are those
+measured on the free plate, its suspension included, so that the finger alone couples it to heave and rocking.
 """
 
 from __future__ import annotations
@@ -23,8 +17,9 @@ from numpy.typing import ArrayLike
 from hapticrender.checks import Validated, parameter
 from hapticrender.control.damping import BendingMode
 from hapticrender.control.device_model import DeviceModel
-from hapticrender.mathx import zoh
-from hapticrender.plants.compiled import CompiledPlant, new_record
+from hapticrender.jit import record_of
+from hapticrender.mathx import state_space, zoh
+from hapticrender.plants.compiled import CompiledPlant
 from hapticrender.plants.plate_kernels import COLUMNS, FUNCTIONS, NODES, PLATE, plate_step
 from hapticrender.protocols import Array
 from hapticrender.touch.mechanics import NONE, FingerMechanics
@@ -159,11 +154,8 @@ class PlateParameters(Validated):
 
     def modes(self) -> tuple[Array, Array]:
         """Undamped-equivalent frequencies (Hz, ascending) and damping ratios of the free, rigid plate's two modes."""
-        inverse = np.linalg.inv(self.mass_matrix)
-        system = np.block(
-            [[np.zeros((2, 2)), np.eye(2)], [-inverse @ self.stiffness_matrix, -inverse @ self.damping_matrix]]
-        )
-        poles = np.linalg.eigvals(system)
+        matrices = self.mass_matrix, self.damping_matrix, self.stiffness_matrix
+        poles = np.linalg.eigvals(state_space(*matrices, np.eye(2))[0])
         poles = poles[poles.imag > 0]
         poles = poles[np.argsort(abs(poles))]
         return abs(poles) / (2 * np.pi), -poles.real / abs(poles)
@@ -219,9 +211,7 @@ class Structure(NamedTuple):
 
     def zero_order_hold(self, rate: float) -> tuple[Array, Array]:
         """Phi (2n, 2n) and Gamma (2n, inputs) of [q, q'] from sample to sample (Hz) under held inputs, exactly."""
-        n, zero = len(self.mass), np.zeros_like(self.mass)
-        a = np.block([[zero, np.eye(n)], [-np.linalg.solve(self.mass, np.hstack([self.stiffness, self.damping]))]])
-        return zoh(a, np.vstack([0 * self.inputs, np.linalg.solve(self.mass, self.inputs)]), 1.0 / rate)
+        return zoh(*state_space(self.mass, self.damping, self.stiffness, self.inputs), 1.0 / rate)
 
 
 def structure(
@@ -270,8 +260,7 @@ class Plate(CompiledPlant):
         self.parameters = parameters
         queue = np.zeros((self.delay - block, parameters.coils))
         self.buffers = (queue,)
-        self.state = _record(parameters, finger.mechanics)
-        self.state["queue"], self.state["latency"] = queue.ctypes.data, len(queue)
+        self.state = _record(parameters, finger.mechanics, queue)
 
     def inputs(self, first: int, n: int) -> Array:
         """Position (m), load (N) and strength of the finger, and a column that the plate does not use."""
@@ -280,17 +269,19 @@ class Plate(CompiledPlant):
         return inputs
 
 
-def _record(parameters: PlateParameters, mechanics: FingerMechanics) -> Array:
-    """State of the compiled plate at rest, its drive not queued."""
+def _record(parameters: PlateParameters, mechanics: FingerMechanics, queue: Array) -> Array:
+    """State of the compiled plate at rest, with the `queue` of its drive."""
     p, period = parameters, 1.0 / parameters.rate
     free, loaded = structure(p), structure(p, mechanics)
     many, scales = len(free.mass), (-(period**2), -period, period**2)
     kept = np.flatnonzero([True, p.degrees_of_freedom == 2, p.bending_frequency > 0.0])
-    s = new_record(
+    s = record_of(
         PLATE,
         p,
         columns=COLUMNS,
         channels=p.coils,
+        queue=queue,
+        latency=len(queue),
         held=np.nan,
         bent_at=np.nan,
         lever=np.nan,

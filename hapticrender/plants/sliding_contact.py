@@ -1,12 +1,8 @@
 """The sliding contact that every friction device shares, and a tribometer.
 
-The steady friction force F_s, the friction F on the finger and the measured one F_t (docs/theory.md, "Sliding contact";
-Balasubramanian, Pool and Vardar 2025)::
-
-    (delta/|v|) F' + F = F_s,     F_t'' + 2 zeta w0 F_t' + w0^2 F_t = w0^2 F
-
-Below `least_speed` the contact sticks and keeps its friction; a lifted finger has none.  Friction is positive against
-the motion, in either direction.  A step outputs the state at the start of a sample, then advances: exactly for a steady
+The equations are those of docs/theory.md, "Sliding contact" (Balasubramanian, Pool and Vardar 2025).  Below
+`least_speed` the contact sticks and keeps its friction; a lifted finger has none.  Friction is positive against the
+motion, in either direction.  A step outputs the state at the start of a sample, then advances: exactly for a steady
 friction and a speed that are constant over the sample, and a friction that changes linearly within it (tribometer).
 """
 
@@ -19,9 +15,9 @@ from typing import Any
 import numpy as np
 
 from hapticrender.checks import Validated, parameter
-from hapticrender.jit import kernel
+from hapticrender.jit import kernel, record_of
 from hapticrender.mathx import foh
-from hapticrender.plants.compiled import new_record, quantise
+from hapticrender.plants.compiled import quantise
 from hapticrender.protocols import Array
 
 SLIDING = np.dtype(
@@ -83,10 +79,6 @@ class SlidingParameters(Validated):
         step, z = _tribometer_step(self), self._shift(frequency)[..., None, None]
         return np.linalg.solve(z * np.eye(2) - step[:, :2], step[:, 2:3] + z * step[:, 3:])[..., 0, 0]
 
-    def frequency_response(self, frequency: Any, speed: float) -> Any:
-        """Sensed friction per steady friction (complex) at `frequency` (Hz) for a finger at `speed` (m/s)."""
-        return self.lag_response(frequency, speed) * self.tribometer_response(frequency)
-
     def _shift(self, frequency: Any) -> Any:
         """Return z = exp(j w T)."""
         return np.exp(2j * np.pi * np.asarray(frequency, float) / self.rate)
@@ -95,7 +87,7 @@ class SlidingParameters(Validated):
 def sliding_record(parameters: SlidingParameters) -> Array:
     """Return the record (`SLIDING`, shape (1,)) of a contact at rest, without friction."""
     renewal = 1.0 / (parameters.rate * parameters.memory_length)
-    return new_record(SLIDING, parameters, renewal=renewal, tribometer_step=_tribometer_step(parameters))
+    return record_of(SLIDING, parameters, renewal=renewal, tribometer_step=_tribometer_step(parameters))
 
 
 def _tribometer_step(parameters: SlidingParameters) -> Array:

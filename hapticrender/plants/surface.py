@@ -16,9 +16,10 @@ import numpy as np
 from hapticrender.bands import Bands
 from hapticrender.checks import check_names, option, parameter
 from hapticrender.control.controller import BankController
-from hapticrender.control.damping import within_a_turn
+from hapticrender.control.damping import oscillators, turns
 from hapticrender.control.device_model import DeviceModel, FingerRange
-from hapticrender.plants.compiled import CompiledPlant, new_record
+from hapticrender.jit import record_of
+from hapticrender.plants.compiled import CompiledPlant
 from hapticrender.plants.friction_laws import LAWS, FrictionLaw
 from hapticrender.plants.sliding_contact import SlidingParameters, sliding_record
 from hapticrender.plants.ultrasonic import LEVELS, UltrasonicParameters, mode_inputs, mode_record
@@ -158,7 +159,7 @@ def resonant(model: DeviceModel, mode: UltrasonicParameters, lock: float) -> Dev
 
 def _pace(model: DeviceModel) -> float:
     """Bandwidth of the amplitude loop over that of a plate's rules."""
-    if model.delay <= PROMPT and within_a_turn(model):
+    if model.delay <= PROMPT and turns(oscillators(model)) <= 1.0:
         return PACED_DELAY * model.rate / (model.delay + 1)
     return PACED_DELAY_ALONE * model.rate / model.delay
 
@@ -217,7 +218,7 @@ def surface_record(parameters: SurfaceParameters, amplitude: Any, nominal: tuple
         raise TypeError(
             f"amplitude is a {type(amplitude).__name__}: must be a BankController, which observes the amplitude"
         )
-    record = new_record(
+    record = record_of(
         SURFACE,
         p,
         load=nominal[0],
@@ -226,7 +227,7 @@ def surface_record(parameters: SurfaceParameters, amplitude: Any, nominal: tuple
         free_damping=float(mode.damping()),
         estimating=p.sensor == "amplitude",
         controller=amplitude.step.address,
-        controller_state=amplitude.state.ctypes.data,
+        controller_state=amplitude.state,
         finger_damping=amplitude.state["finger_damping"].ctypes.data if ours else 0,
         position=np.nan,
         reached=-1.0,

@@ -1,11 +1,8 @@
 """An ultrasonic plate: one flexural mode, driven at its resonance, whose amplitude reduces friction.
 
-With the modal displacement q and the drive u, ``m q'' + (b + b_f) q' + m w^2 q = N u``; the finger adds the damping b_f
-and shifts the resonance, both with the cube root of its load.  The friction that it leaves is that of `surface`.
-
-At level "envelope" the mode is moved from w down to w_i with m_i = m w/w_i and b_i = b w/w_i, resonance shifts kept in
-Hz and N kept: its envelope is the same, for the same controller, at a fraction of the rate (docs/theory.md, "Ultrasonic
-mode").
+The finger adds damping and shifts the resonance, both with the cube root of its load; the friction that it leaves is
+that of `surface`.  At level "envelope" the mode is moved down, with the same envelope for the same controller at a
+fraction of the rate (docs/theory.md, "Ultrasonic mode").
 """
 
 from __future__ import annotations
@@ -18,7 +15,8 @@ import numpy as np
 
 from hapticrender.checks import Validated, option, parameter
 from hapticrender.control.device_model import DeviceModel
-from hapticrender.plants.compiled import LOAD, STRENGTH, CompiledPlant, new_record
+from hapticrender.jit import record_of
+from hapticrender.plants.compiled import LOAD, STRENGTH, CompiledPlant
 from hapticrender.plants.ultrasonic_kernels import MODE, ultrasonic_step
 from hapticrender.protocols import Array
 
@@ -229,5 +227,5 @@ def mode_inputs(parameters: UltrasonicParameters, finger: Array, first: int, rat
 def mode_record(parameters: UltrasonicParameters, latency: int) -> tuple[Array, Array]:
     """Return the record (`MODE`, shape (1,)) of a mode at rest, and the queue (latency, 1) of its drive."""
     queue, limit = np.zeros((latency, 1)), parameters.sensor_range / 2
-    values = {"period": 1.0 / parameters.rate, "sensor_limit": limit, "queue": queue.ctypes.data, "latency": latency}
-    return new_record(MODE, parameters, damping=np.nan, **values), queue  # no propagator yet
+    values = {"period": 1.0 / parameters.rate, "sensor_limit": limit, "queue": queue, "latency": latency}
+    return record_of(MODE, parameters, damping=np.nan, **values), queue  # no propagator yet
