@@ -67,6 +67,15 @@ def demodulator(**changes):
     return hr.Demodulator(**{"frequency": [100.0], "bandwidth": 5.0, "rate": 5000.0} | changes)
 
 
+def tracker(**changes):
+    return hr.FingerTracker(PlateParameters(), **changes)
+
+
+def limited(device, **limits):
+    texture = hr.Grating(frequency=100.0, amplitude=20e-6)
+    return hr.prepare(hr.Scene(texture=texture, finger=SLIDE, device=device, duration=0.1, limits=limits))
+
+
 def driver(**changes):
     return BaseDriver(**{"rate": 5000.0, "drive_channels": 2, "sensed_channels": 1, "block": 4} | changes)
 
@@ -138,6 +147,20 @@ SENSORS = [
     (lambda: hr.Scene(texture=TONE, duration=1.0, touch_panel={"hz": 1}), "touch_panel.hz = .*: unknown key"),
     (lambda: hr.Player("vt-plate", touch_panel={"rate": 60.0}), "touch_panel: has no effect on the positions that"),
 ]
+TRACKER = [
+    (lambda: tracker(lookahead=-1), "lookahead = -1: must be a finite number >= 0 s"),
+    (lambda: tracker(rate=499.9), "rate = 499.9: must be a finite number >= 500 Hz"),
+    (lambda: tracker(rate=np.nan), "rate = nan: must be a finite number >= 500 Hz"),
+    (lambda: tracker(late=-1), "late = -1: must be an integer >= 0 samples"),
+    (lambda: tracker(noise=np.nan), "noise = nan: must be two numbers >= 0, in m rms"),
+    (lambda: tracker(noise=[1e-6]), r"noise = array\(\[1.e-06\]\): must be two numbers"),
+    (lambda: hr.FingerTracker(3), "plate = 3: must be a PlateParameters or a Course"),
+    (lambda: tracker().update(0.0, 0.0), r"shapes \(\) and \(\): must be \(1, 2\) and \(1, 2\), in A and m"),
+    (
+        lambda: tracker(rate=500).update(np.zeros((5, 1)), np.zeros((5, 2))),
+        r"shapes \(5, 1\) and \(5, 2\): must be \(5, 2\) and \(5, 2\)",
+    ),
+]
 PLANTS = [
     (lambda: PlateParameters.with_overrides({"mass": 0.0}), r"mass = 0.0: must be .*> 0 .*kg"),
     (lambda: PlateParameters.with_overrides({"masss": 1.0}), r"masss = 1.0: unknown key; known: .*mass"),
@@ -165,6 +188,12 @@ PLANTS = [
 ]
 SCENES = [
     (lambda: plate(2.0, coils=1), "gradient = 2.0: must be 0 1/m: a plate with one coil"),
+    (lambda: limited("electroadhesion", displacement=1e-3), "displacement = 0.001: must be left out: a screen senses"),
+    (lambda: limited("vt-plate", peak_drive=-1), "limits.peak_drive = -1: must be a finite number > 0"),
+    (
+        lambda: limited("vt-plate", peak=1.0),
+        "limits.peak = .*: unknown key; known: displacement, peak_drive, rms_drive",
+    ),
     (lambda: plate(19.0), "gradient = 19.0: must be <= 18.1818 1/m"),
     (lambda: plate(coils=3), "device.coils = 3: must be .* <= 2"),
     (lambda: opened("electroadhesion", finger=hr.Finger.still(normal_load=1.0)), r"finger: must slide faster than 0.0"),
@@ -260,8 +289,8 @@ DESIGNS = [
     (lambda: exported(65), "bands = 65: must be 2 .* to 64"),
 ]
 KINDS = {
-    "texture": TEXTURES, "finger": FINGERS, "sensor": SENSORS, "plant": PLANTS, "scene": SCENES, "driver": DRIVERS,
-    "design": DESIGNS,
+    "texture": TEXTURES, "finger": FINGERS, "sensor": SENSORS, "tracker": TRACKER, "plant": PLANTS, "scene": SCENES,
+    "driver": DRIVERS, "design": DESIGNS,
 }  # fmt: skip
 EACH = [pytest.param(*row, id=f"{kind} {n}") for kind, rows in KINDS.items() for n, row in enumerate(rows)]
 
