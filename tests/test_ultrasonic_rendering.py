@@ -121,6 +121,7 @@ def test_a_device_of_a_friction_sample_a_block_renders_a_tone():
     assert (session.driver.block, session.driver.delay) == (1, 1)
     shift = float(UltrasonicParameters().resonance(0.4)) - 30e3
     assert session.driver.loop.state["shift"][0] == pytest.approx(shift, abs=1.0)
+    assert (recording.flags[:100] & Flag.UNLOCKED).any()  # until its lock is found
     assert not recording.flags[100:].any()
 
 
