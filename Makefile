@@ -11,7 +11,7 @@ PYTHON = $(shell for candidate in python3 python3.13 python3.12 python3.11; do \
 RUN := .venv/bin/python
 OUT := out/demo
 OLDEST = $(shell sed -n 's/^dependencies = \[\(.*\)\]/\1/p' pyproject.toml | tr -d '",' | sed 's/>=/==/g')
-OLDEST_TESTS := $(addprefix tests/test_,$(addsuffix .py,math kernel blocks plate contact low_pass realtime combined))
+OLDEST_TESTS := $(addprefix tests/test_,$(addsuffix .py,math kernel blocks plate contact low_pass realtime))
 # Tests that play in real time run first, one after the other; the rest on two cores.
 REAL_TIME := $(wildcard tests/test_audio*.py tests/test_player*.py tests/test_board_live.py)
 PACKAGES := jackd2 libportaudio2 libjack-jackd2-dev gcc libc6-dev make gcc-arm-none-eabi libnewlib-arm-none-eabi qemu-system-arm

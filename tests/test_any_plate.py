@@ -49,16 +49,3 @@ def test_one_coil_holds_the_middle_and_leaves_the_ends_to_the_finger():
     recording = rendered(frequency, finger=finger, coils=1)
     assert recording.drive.shape[1] == 1
     np.testing.assert_allclose(amplitude(recording.motion, frequency, 1.0) / A, expected, rtol=0, atol=CENTRE)
-
-
-@pytest.mark.parametrize(
-    ("gradient", "plant", "message"),
-    [
-        (2.0, {"coils": 1}, "gradient = 2.0: must be 0 1/m: a plate with one coil"),
-        (19.0, {}, "gradient = 19.0: must be <= 18.1818 1/m"),
-        (0.0, {"coils": 3}, "device.coils = 3: must be .* <= 2"),
-    ],
-)
-def test_what_a_plate_cannot_do_is_refused(gradient, plant, message):
-    with pytest.raises(ValueError, match=message):
-        rendered(gradient=gradient, **plant)

@@ -159,24 +159,6 @@ def test_without_portaudio_it_is_said_how_to_get_it(monkeypatch):
         portaudio.load.cache_clear()
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ({"channels": ()}, r"channels=\(\): must name at least one output"),
-        ({"channels": (0, 1)}, r"channels=\(0, 1\): must be different whole numbers >= 1"),
-        ({"sensed_channels": (3, 3)}, r"sensed_channels=\(3, 3\): must be different"),
-        ({"drive_per_full_scale": 0.0}, "drive_per_full_scale = 0.0: must be a finite number > 0"),
-        ({"sensed_per_full_scale": np.inf}, "sensed_per_full_scale = inf: must be a finite number > 0"),
-        ({"delay": 63.0}, "delay=63.0 samples: must be >= block = 64 and <= 10 s"),
-        ({"delay": np.nan}, "delay=nan samples: must be >= block"),
-        ({"rate": 0.0}, "rate=0.0 must be finite and > 0 Hz"),
-    ],
-)
-def test_what_the_driver_refuses(arguments, message):
-    with pytest.raises(ValueError, match=message):
-        AudioDriver("0", **arguments)
-
-
 def test_the_delay_is_the_cards_and_that_of_play():
     """Rounded to the nearest sample; the callback has no more than the card's."""
     driver = AudioDriver("0", delay=143.5, sensed_per_full_scale=1e-3)

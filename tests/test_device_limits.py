@@ -190,15 +190,6 @@ def test_an_ultrasonic_plates_voltage_is_limited_by_the_peak_of_its_carrier(name
     refused_beyond(lambda value: friction("ultrasonic", **{name: value}), share * volts, "must be <=")
 
 
-def test_limits_that_a_device_cannot_keep_are_refused():
-    with pytest.raises(ValueError, match="limits.displacement = 0.001: must be left out: a screen senses no displace"):
-        hr.prepare(friction("electroadhesion", displacement=1e-3))
-    with pytest.raises(ValueError, match="limits.peak_drive = -1: must be a finite number > 0"):
-        friction("vt-plate", peak_drive=-1)
-    with pytest.raises(ValueError, match="limits.peak = .*: unknown key; known: displacement, peak_drive, rms_drive"):
-        friction("vt-plate", peak=1.0)
-
-
 def test_a_hybrids_limits_are_those_of_its_plate():
     asked = {"texture": hr.Grating(frequency=50.0, amplitude=10e-6), "finger": SLIDING, "duration": 0.1}
     limited = hr.prepare(hr.Scene(**asked, device="hybrid", limits={"peak_drive": 0.2}))

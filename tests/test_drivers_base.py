@@ -99,20 +99,6 @@ def test_a_drive_that_is_not_finite_is_refused_and_pointed_at(value):
         checked_drive(drive, 4, 2)
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"rate": 0.0}, r"rate=0.0 must be finite and > 0 Hz"),
-        ({"block": 0}, r"block=0 must be a whole number >= 1"),
-        ({"sensed_channels": -1}, r"sensed_channels=-1 must be a whole number >= 0"),
-        ({"delay": 3}, r"delay=3 must be a whole number >= 4"),
-    ],
-)
-def test_numbers_out_of_bound_are_named(change, message):
-    with pytest.raises(ValueError, match=f"Diary: {message}"):
-        Diary(**change)
-
-
 def test_an_object_that_is_no_driver_hears_what_it_lacks():
     class Half:
         rate, drive_channels, sensed_channels, block = 5000.0, 2, 2, 1

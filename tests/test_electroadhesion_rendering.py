@@ -10,7 +10,6 @@ from waves import phasor
 
 import hapticrender as hr
 from hapticrender import loop
-from hapticrender.drivers.base import BaseDriver
 from hapticrender.drivers.wavefile import WaveFileDriver, read_back
 from hapticrender.plants.electroadhesion import DRY, MOIST, NORMAL, ElectroadhesionParameters
 from hapticrender.renderers.electroadhesion import ElectroadhesionRenderer
@@ -39,23 +38,6 @@ def test_a_friction_coefficient_other_than_assumed_is_corrected():
     mu = 0.5
     recording = hr.render(tone(100.0, duration=1.0, finger=SLIDE), driver=Screen(blind=False, friction_coefficient=mu))
     assert band(recording)["rms_error_friction"] < NOISE
-
-
-@pytest.mark.parametrize(
-    ("scene", "message"),
-    [
-        (tone(100.0, finger=hr.Finger.still(normal_load=1.0)), r"finger: must slide faster than 0.001 m/s"),
-        (tone(100.0, force=2.0), r"asks for an attraction of 10.* N: must be <= 2.23 N, at 0.01 A under a nominal"),
-        (
-            hr.Scene(texture=hr.Grating(frequency=80.0, amplitude=1e-5), finger=SLIDE, device="electroadhesion",
-                     duration=1.0, gradient=1.0),
-            r"gradient = 1.0: must be 0 1/m",
-        ),
-    ],
-)  # fmt: skip
-def test_what_the_screen_cannot_do_is_refused(scene, message):
-    with pytest.raises(ValueError, match=message):
-        hr.render(scene)
 
 
 @pytest.mark.parametrize(("device", "lifted"), [("electroadhesion", True), ("ultrasonic", False)])
@@ -175,16 +157,3 @@ def test_the_carrier_starts_at_its_crest_and_keeps_its_phase(tmp_path):
 
 
 DROOP = np.sinc(5 / 48)  # of a carrier behind the file's hold: the driver makes up for it
-
-
-@pytest.mark.parametrize(
-    ("rate", "sensed", "message"),
-    [
-        (79_999, 0, r"driver.rate = 79999: must be >= 80000 Hz where output = 'carrier', 4 samples a turn"),
-        (FAST, 1, r"driver.sensed_channels = 1: must be 0 where output = 'carrier'"),
-    ],
-)
-def test_a_driver_that_cannot_carry_it_is_refused(rate, sensed, message):
-    device = BaseDriver(rate=rate, drive_channels=1, sensed_channels=sensed, block=96)
-    with pytest.raises(ValueError, match=message):
-        hr.render(tone(100.0, output="carrier"), driver=device)

@@ -256,15 +256,6 @@ def test_numbers_of_bands_gains_and_limits_have_bounds(exports):
         assert not any(setter(law.address, each) for each in bads)
 
 
-def test_a_gain_scales_the_reference(exports):
-    law = exports.law("tones", "double")
-    plate, _ = settled(law, 2.0)
-    full = abs(law.envelopes(0)[1])
-    law.code.law_gain(law.address, 0.5)
-    plate.closed_loop(law, np.zeros(RATE))
-    assert abs(law.envelopes(0)[1]) == pytest.approx(0.5 * full, rel=0.01)
-
-
 @pytest.mark.parametrize("kind", KINDS)
 def test_sanitisers_find_nothing_whatever_the_inputs_are(exports, kind):
     """Numbers at random, huge and none at all; the drive is finite and within its limit in every sample."""

@@ -15,20 +15,6 @@ def scene(device, texture=TONE, finger=SLIDE, duration=1.0, **plant):
     return scene_on(device, texture, finger, duration, **plant)
 
 
-@pytest.mark.parametrize(
-    ("device", "fields", "message"),
-    [
-        ("electroadhesion", {"force_range": 1e-3}, "friction of 0.3.. N: must be <= 0.001 N, the tribometer's range"),
-        ("electroadhesion", {"friction_coefficient": 0.0}, "device.friction_coefficient = 0.0: must be .* > 0"),
-        ("ultrasonic", {"bias": 0.1}, r"device.bias = 0.1: must be > 0.109, the least that the law leaves"),
-        ("ultrasonic", {"scale": 1e-4}, "texture.amplitude asks for a vibration of .* V under 0.4 N: must be <= 10 V"),
-    ],
-)
-def test_what_the_device_cannot_do_is_refused_by_name(device, fields, message):
-    with pytest.raises(ValueError, match=message):
-        hr.render(scene(device, **fields))
-
-
 @pytest.mark.parametrize("device", ["electroadhesion", "ultrasonic"])
 def test_the_fingers_own_admittance_is_not_for_recordings_nor_for_no_finger(device):
     recorded = hr.Recorded(samples=0.5 * np.sin(np.arange(20000) * 0.1), rate=1e4, amplitude=1e-5, carriers=8)

@@ -6,7 +6,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hapticrender.bands import Bands
 from hapticrender.touch.grating import Grating
 
 TIME = np.linspace(0.0, 0.1, 501)
@@ -77,39 +76,3 @@ def test_gratings_are_equal_however_they_were_stated(stated):
         assert hash(other) == hash(grating)
     assert repr(plain) == repr(grating)
     assert {type(value) for value in (grating.amplitude, grating.frequency or grating.wavelength)} == {float}
-
-
-IN_SPACE = {"frequency": None, "wavelength": 1e-3, "amplitude": None}
-REFUSED = [
-    ({"level": 20}, r"amplitude, velocity, level: exactly .* amplitude = 1e-06 and level = 20.0 are"),
-    ({"amplitude": None, "velocity": 1.0, "frequency": 5e-324}, r"velocity = 1.0: must be <= 0.01 m .* it is inf m"),
-    ({"amplitude": None, "level": 20, "frequency": 1001}, r"level = 20.0: must be stated at 1 to 1000 Hz"),
-    (IN_SPACE | {"level": 20}, r"speed is missing: must be .* m/s"),
-    ({"amplitude": 10.0}, r"amplitude = 10.0: must be .* <= 0.01 m"),
-    ({"amplitude": True}, r"amplitude = True: must be a finite number"),
-    ({"wavelength": 1e-3}, r"frequency, wavelength: exactly one must be given; frequency = 20.0"),
-    ({"shape": "sawtooth"}, r"shape = 'sawtooth': must be one of sine, square, triangle"),
-    ({"partials": [{"order": 1}]}, r"partials\[0\] = .*: must be order, amplitude, phase"),
-    ({"phase": 10**400}, r"phase = an integer beyond 1e30: must be .* rad"),
-]
-
-
-@pytest.mark.parametrize(("wrong", "message"), REFUSED, ids=range(len(REFUSED)))
-def test_wrong_values_are_refused_with_bound_and_unit(wrong, message):
-    with pytest.raises((ValueError, TypeError), match=f"^{message}"):
-        Grating(**({"amplitude": 1e-6, "frequency": 20.0} | wrong))
-
-
-@pytest.mark.parametrize(
-    ("wrong", "message"),
-    [
-        ({"frequency": [np.nan, 1.0]}, r"frequency\[0\] = nan: must be finite and >= 0 \(Hz\)"),
-        ({"wavenumber": [0.0]}, r"wavenumber has shape \(1,\): must be .* as many as frequency has"),
-        ({"envelope": [np.nan, 0.0]}, r"envelope\[0\] = \(nan\+0j\): must be finite \(m\)"),
-    ],
-)
-def test_bands_that_cannot_be_are_refused_with_value_and_bound(wrong, message):
-    good = {"frequency": [20.0, 0.0], "wavenumber": [0.0, 1e3], "phase": [-1.0, 9.0], "envelope": [1e-6, -1e-6j]}
-    assert len(Bands(**good)) == len(Bands(**good | {"envelope": None})) == 2
-    with pytest.raises(ValueError, match=f"^{message}"):
-        Bands(**good | wrong)

@@ -299,6 +299,13 @@ def test_delay_and_gain_are_found_and_decide_nothing(rng):
     assert found["places"]["centre"]["waveform_error"] > 0.5
 
 
+def summary_of(bands, signals, header=None, **scene):
+    recorder = make_recorder(None, bands, **scene)
+    recorder.header = replace(recorder.header, **(header or {}))
+    recorder.append(**signals)
+    return recorder.finish().summary()
+
+
 @pytest.mark.parametrize(("first", "count"), [(15000, 1), (0, 5000)])
 def test_flags_are_counted_and_a_saturated_sample_that_is_judged_fails(first, count):
     """Judged from 1 s, 5000 samples, on."""
@@ -306,9 +313,7 @@ def test_flags_are_counted_and_a_saturated_sample_that_is_judged_fails(first, co
     signals = make_signals(bands, bands.envelope)
     signals["flags"][first : first + count] = Flag.SATURATED
     signals["flags"][4000:4100] |= Flag.SENSOR_CLIPPED
-    recorder = make_recorder(None, bands)
-    recorder.append(**signals)
-    summary = recorder.finish().summary()
+    summary = summary_of(bands, signals)
     assert summary["flags"] == {"SATURATED": count, "SENSOR_CLIPPED": 100}
     assert summary["saturated_share"] == count / 20_000
     found = ("failed", "saturated in 1 samples") if first else ("passed", "")
@@ -316,17 +321,11 @@ def test_flags_are_counted_and_a_saturated_sample_that_is_judged_fails(first, co
     assert summary["worst"]["value"] == pytest.approx(0.0, abs=EXACT)
 
 
-def by_sensors(bands, signals, tolerance=0.05, **header):
-    recorder = make_recorder(None, bands, tolerance=tolerance)
-    recorder.header = replace(recorder.header, motion_source="sensors", **header)
-    recorder.append(**signals)
-    return recorder.finish().summary()
-
-
 def test_figures_from_sensors_contain_the_uncertainty_of_their_gain():
     bands = make_bands(100.0, 10 * UM)
     for calibration, found in ((0.01, "passed"), (0.03, "failed")):
-        summary = by_sensors(bands, make_signals(bands, 1.03 * bands.envelope), calibration=calibration)
+        header = {"calibration": calibration, "motion_source": "sensors"}
+        summary = summary_of(bands, make_signals(bands, 1.03 * bands.envelope), header, tolerance=0.05)
         assert summary["worst"]["value"] == pytest.approx(0.03 + calibration, rel=1e-6)
         assert summary["verdict"] == found
 
@@ -334,10 +333,8 @@ def test_figures_from_sensors_contain_the_uncertainty_of_their_gain():
 @pytest.mark.parametrize(("gain", "found"), [(0.97, "failed"), (0.99, "passed")])
 def test_the_uncertainty_of_the_sensors_says_nothing_of_a_true_motion(gain, found):
     bands = make_bands(100.0, 10 * UM)
-    recorder = make_recorder(None, bands, tolerance=0.02)
-    recorder.header = replace(recorder.header, calibration=0.5, motion_source="true")
-    recorder.append(**make_signals(bands, gain * bands.envelope))
-    summary = recorder.finish().summary()
+    header = {"calibration": 0.5, "motion_source": "true"}
+    summary = summary_of(bands, make_signals(bands, gain * bands.envelope), header, tolerance=0.02)
     assert summary["worst"]["value"] == pytest.approx(1 - gain, rel=1e-6)
     assert (summary["verdict"], summary["reason"]) == (found, "")
 
@@ -355,12 +352,10 @@ def test_the_noise_of_sensors_in_mm_is_recorded_as_that_of_the_motion():
 def test_noise_at_one_place_hides_no_error_at_another(rng, noise, found):
     """An error of 3 %, the tolerance 2 %, and at the centre noise of 6.2 % as well; a quiet end fails all the same."""
     bands = make_bands(100.0, 10 * UM)
-    recorder = make_recorder(None, bands, tolerance=0.02)
-    recorder.header = replace(recorder.header, sensed_noise=noise, motion_source="sensors")
     extra = np.zeros((20_000, 3))
     extra[:, 0] = UM * rng.standard_normal(20_000)
-    recorder.append(**make_signals(bands, 0.97 * bands.envelope, extra=extra))
-    summary = recorder.finish().summary()
+    header = {"sensed_noise": noise, "motion_source": "sensors"}
+    summary = summary_of(bands, make_signals(bands, 0.97 * bands.envelope, extra=extra), header, tolerance=0.02)
     assert summary["verdict"] == found
     assert summary["waveform"]["places"]["centre"]["waveform_error"] > 0.06
     assert (summary["worst"]["place"] != "centre") == (found == "failed")
@@ -374,7 +369,7 @@ def test_what_the_noise_of_the_sensors_hides_is_not_judged(rng, gain, flag, foun
     bands = make_bands(100.0, 10 * UM)
     signals = make_signals(bands, gain * bands.envelope, extra=UM * rng.standard_normal((20_000, 3)))
     signals["flags"][::100] = flag
-    summary = by_sensors(bands, signals, tolerance=0.02, sensed_noise=UM)
+    summary = summary_of(bands, signals, {"sensed_noise": UM, "motion_source": "sensors"}, tolerance=0.02)
     assert summary["waveform"]["sensor_noise"] == pytest.approx(math.sqrt(480 / 2500) / math.sqrt(50), rel=1e-3)
     assert summary["waveform"]["places"]["centre"]["third_octaves"]["250 Hz"] < 0.04
     assert summary["verdict"] == found
@@ -424,11 +419,9 @@ def test_the_sample_that_ends_a_run_which_was_cut_off_is_not_judged():
 def make_gradient(profile, error, frequency=200.0):
     """Motion with a gradient: a tone of 20 um at 50 Hz times each place's share, and an error (m peak, each place)."""
     bands, time = make_bands(50.0, 20 * UM), times(4.0)
-    recorder = make_recorder(None, bands)
-    recorder.header = replace(recorder.header, profile=profile)
     extra = np.outer(np.cos(2 * np.pi * frequency * time), error)
-    recorder.append(**make_signals(bands, np.reshape(profile, (3, 1)) * bands.envelope, extra=extra))
-    return recorder.finish().summary()
+    signals = make_signals(bands, np.reshape(profile, (3, 1)) * bands.envelope, extra=extra)
+    return summary_of(bands, signals, {"profile": profile})
 
 
 @pytest.mark.parametrize("place", [1, 2])
@@ -455,14 +448,11 @@ def test_a_place_that_is_to_move_by_less_than_a_tenth_of_another_counts_as_a_ten
 
 def test_a_lost_sample_of_friction_is_lost_alone(rng):
     """The mean friction of a touch is taken off, of what is known of it."""
-    noise = white(20, 400, rng, rms=0.01)
+    noise, bands = white(20, 400, rng, rms=0.01), make_bands(100.0, 0.0)
     for lost, windows, found in ((slice(0), 0, "passed"), (slice(15_000, 15_001), 1, "failed")):
-        recorder = make_recorder(None, make_bands(100.0, 0.0), settle=0.0)
-        recorder.header = replace(recorder.header, unit="N")
-        signals = make_signals(make_bands(100.0, 0.0), 0.0, extra=(0.5 + noise)[:, None], position=0.0)
+        signals = make_signals(bands, 0.0, extra=(0.5 + noise)[:, None], position=0.0) | {"reference": noise}
         signals["motion"][lost] = np.nan
-        recorder.append(**signals | {"reference": noise})
-        summary = recorder.finish().summary()
+        summary = summary_of(bands, signals, {"unit": "N"}, settle=0.0)
         assert (summary["verdict"], summary["waveform"]["lost_windows"]) == (found, windows)
 
 
@@ -471,9 +461,7 @@ def test_a_lost_sample_of_friction_is_lost_alone(rng):
 def test_a_texture_of_less_than_a_hundredth_of_what_can_be_felt_is_none(unit, scale, share, found):
     """A hundredth in amplitude of the safe threshold where that is least: at 250 Hz, also as a velocity."""
     tone = share * scale * hr.detection_threshold(250.0) * np.cos(2 * np.pi * 100 * times(4.0))
-    recorder = make_recorder(None, make_bands(100.0, 0.0))
-    recorder.header = replace(recorder.header, unit=unit)
-    recorder.append(**make_signals(make_bands(100.0, 0.0), 0.0) | {"reference": 1e-9 + tone})
-    summary = recorder.finish().summary()
+    bands = make_bands(100.0, 0.0)
+    summary = summary_of(bands, make_signals(bands, 0.0) | {"reference": 1e-9 + tone}, {"unit": unit})
     assert summary["verdict"] == found
     assert summary["reason"].startswith("the texture is zero") == (found == "not judged")

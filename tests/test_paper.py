@@ -7,7 +7,7 @@ import pytest
 from held import amplitude, envelopes, fixed, hold, play
 
 import hapticrender as hr
-from hapticrender.control.methods import METHODS, Polar, method_named
+from hapticrender.control.methods import METHODS, Polar
 from hapticrender.plants.plate import PlateParameters
 from hapticrender.touch.mechanics import HEAVY_SECOND
 
@@ -84,8 +84,3 @@ def test_a_long_delay_slows_the_loop_down_until_its_margins_hold():
         motion = hold(method, fixed((111.0, 1e-5)), 12.0, late)[1]
         error = abs(amplitude(motion, 111.0, 2.0)[0] / 1e-5 - 1)
         assert error < 2e-3 if holds else error > 0.05
-
-
-def test_an_unknown_method_is_refused_with_the_known_ones():
-    with pytest.raises(ValueError, match=r"method = 'papper': must be one of paper, paper-common"):
-        method_named("papper")

@@ -155,8 +155,6 @@ def test_a_sample_may_state_its_own_error():
         for estimator, error in ((stated, 1e-3), (plain, None)):
             estimator.update(n / 100, 0.02 * np.sin(OMEGA * n / 100), error)
     assert stated.at(0.5) == pytest.approx(plain.at(0.5), rel=1e-12)
-    with pytest.raises(ValueError, match="error = 0.0: must be a finite number > 0 m"):
-        stated.update(1.0, 0.0, 0.0)
 
 
 def test_the_plate_alone_says_where_a_finger_of_400_mN_is_now(rng):
@@ -223,33 +221,6 @@ def test_the_recorded_swipe_slides_at_40_mm_s(shared_data):
     assert abs(velocity[rest]).max() < 1e-3
 
 
-def test_wrong_sensors_are_refused():
-    for make, message in (
-        (lambda: MotionEstimator(), "one must be > 1e-09 m"),
-        (lambda: MotionEstimator(1e-4, latency=-1.0), "latency = -1.0: must be a finite number >= 0 s"),
-        (lambda: MotionEstimator(1e-4).update(0.0, np.inf), "must be finite"),
-        (lambda: hr.Encoder(0.5e-6, bits=70), "bits = 70: must be an integer >= 2 and <= 64"),
-        (lambda: hr.Encoder(0.0, noise=1e-6), "resolution = 0.0: must be the metres of a count, not 0"),
-        (lambda: hr.Encoder(0.5e-6).update(0.0, np.nan), "position = nan: must be a whole number of counts"),
-        (lambda: hr.Encoder(0.5e-6).update(0.0, 2.5), "position = 2.5: must be a whole number of counts"),
-        (lambda: TouchPanel(rate=0.0), "rate = 0.0"),
-        (lambda: TouchPanel(noise=0.0, resolution=0.0), "one must be > 1e-09 m"),
-        (lambda: hr.phase_error(TouchPanel(), 0.05, 0.0), "wavelength = 0.0: must be a finite number > 0 m"),
-        (lambda: hr.phase_error(TouchPanel(), np.nan, 1e-3), "speed = nan: must be a finite number >= 0 m/s"),
-        (lambda: hr.phase_error(TouchPanel(), 0.05, 1e-3, frequency=0.0), "frequency = 0.0: .* > 0 Hz"),
-        (lambda: hr.phase_error(TouchPanel(), 0.05, 1e-3, delay=-1e-3), "delay = -0.001: .* >= 0 s"),
-        (lambda: hr.phase_error(3, 0.05, 1e-3), "panel = 3: must be a TouchPanel"),
-        (lambda: hr.finest_wavelength(TouchPanel(), 0.05, degrees=0.0), "degrees = 0.0: .* > 0"),
-        (lambda: hr.finest_wavelength(TouchPanel(), 0.05, highest=0.0), "highest = 0.0: must be > 0 Hz"),
-        (lambda: budget.bandwidth(MotionEstimator(1e-4), np.nan), "rate = nan: must be a finite number > 0 Hz"),
-        (lambda: hr.Scene(texture=hr.Grating(frequency=50.0, amplitude=1e-6), duration=1.0, touch_panel={"hz": 1}),
-         "touch_panel.hz = .*: unknown key"),
-        (lambda: hr.Player("vt-plate", touch_panel={"rate": 60.0}), "touch_panel: has no effect on the positions that"),
-    ):  # fmt: skip
-        with pytest.raises((ValueError, TypeError), match=message):
-            make()
-
-
 def test_a_scene_with_a_touch_panel_is_played_at_the_estimated_position():
     scene = hr.Scene(
         texture=hr.Grating(wavelength=2e-3, amplitude=5e-6),
@@ -268,22 +239,6 @@ def test_a_scene_with_a_touch_panel_is_played_at_the_estimated_position():
     error = (recording.position - truth)[round(0.4 * recording.rate) : round(1.39 * recording.rate)]
     predicted = budget.position_error(scene.panel, 0.05)
     assert np.sqrt(np.mean(error**2)) == pytest.approx(predicted, rel=5 / np.sqrt(2 * 40))  # 1 s of 40 Hz
-
-
-@pytest.mark.parametrize("pause", [1e-3, 8e-3, 20e-3])
-def test_a_player_takes_up_a_correction_however_often_it_is_called(pause, tmp_path):
-    """Two poles of 5 ms pass 1 - 5 exp(-4) = 91 % of it in 20 ms, less 2 ms of the call and of the loop: 86 %."""
-    device = Blind(Plate(PlateParameters(), hr.Finger.absent()))
-    with hr.Player("vt-plate", device, paced=False) as player:
-        player.play(hr.Grating(wavelength=1e-3, amplitude=5e-6))
-        for position in (0.0, 1e-3):
-            if position:
-                player.record(tmp_path / "step.au")
-            for _ in range(round(40e-3 / pause)):
-                player.finger(position, 0.0)
-                player.sleep(pause)
-        reached = player.end_recording().position[round(20e-3 * device.rate)]
-    assert 0.86e-3 < reached < 0.93e-3
 
 
 def test_an_application_behind_a_panel_is_within_the_budget(tmp_path, rng):

@@ -161,19 +161,3 @@ def test_the_drive_is_limited_rounded_and_safe_against_nonsense():
     assert first(25.0) == first(10.0) > first(8.75) > 0.0
     assert first(1.3) == first(1.25) == -first(-1.25) != 0.0  # 20 V in 16 steps
     assert [first(each) for each in (np.nan, np.inf, -np.inf)] == [0.0, 0.0, 0.0]
-
-
-@pytest.mark.parametrize(
-    ("overrides", "message"),
-    [
-        ({"rate": 48e3}, r"rate = 48000.0: must be .*>= 66666.7 .*Hz for a carrier of 30000 Hz"),
-        ({"finger_damping": 2000.0}, r"finger_damping = 2000.0: damping ratio 3.63 at 20 N .* must be .*<= 0.5"),
-        (
-            {"level": "envelope", "temperature_rise": 100.0, "temperature_coefficient": -600e-6, "rate": 48e3},
-            r"temperature_rise = 100.0: shifts the resonance by up to -1800 Hz, must be within 1500 Hz",
-        ),
-    ],
-)
-def test_bad_parameters_are_refused_with_value_bound_and_unit(overrides, message):
-    with pytest.raises((ValueError, TypeError), match=message):
-        UltrasonicParameters.with_overrides(overrides)

@@ -4,19 +4,16 @@ import numpy as np
 import pytest
 from scipy.signal import hilbert
 from tables import scene_on
-from ultrasonic import ASKED, FREE, NOISE, held, modulated, ran
+from ultrasonic import ASKED, NOISE, held, modulated, ran
 from waves import phasor
 
 import hapticrender as hr
-from hapticrender.drivers.base import BaseDriver
 from hapticrender.drivers.simulated import SimulatedDriver
 from hapticrender.drivers.wavefile import WaveFileDriver, read_back
 from hapticrender.loop import prepare, run
-from hapticrender.plants.surface import SurfaceParameters, UltrasonicSurface
+from hapticrender.plants.surface import SurfaceParameters
 from hapticrender.plants.ultrasonic import UltrasonicParameters, UltrasonicPlate
 from hapticrender.protocols import Flag
-from hapticrender.renderers.resonant import ResonantDriver
-from hapticrender.renderers.ultrasonic import amplitude_loop
 
 LEVELS = pytest.mark.parametrize("level", ["carrier", "envelope"])
 
@@ -93,19 +90,6 @@ def test_a_grating_under_swipes_and_under_a_finger_that_comes_and_goes():
     assert not recording.motion[away, 0].any()
 
 
-@pytest.mark.parametrize(
-    ("fields", "message"),
-    [
-        ({"finger": hr.Finger.still(normal_load=0.4)}, r"must slide faster than 0.001 m/s"),
-        ({"finger": FREE}, r"must slide faster|normal_load = 0"),
-        ({"texture": hr.Grating(frequency=100.0, velocity=0.2)}, r"0.313 N of friction: must be <= 0.144 N"),
-    ],
-)
-def test_what_cannot_be_is_refused(fields, message):
-    with pytest.raises(ValueError, match=message):
-        prepare(scene(**fields))
-
-
 class Watched(SimulatedDriver):
     """A resonant plate as a user's device: only the test gets its amplitude."""
 
@@ -118,22 +102,6 @@ class Watched(SimulatedDriver):
         self.moved.append(sensed.motion[:, 0])
         self.played.append(drive[:, 0].copy())
         return sensed._replace(motion=None)
-
-
-def test_a_users_plate_is_the_surface_but_for_its_contact():
-    """Sample by sample, without noise: the same law and the same controller to rounding."""
-    parameters = SurfaceParameters(mode=UltrasonicParameters(sensor_noise=0.0, sensor_bits=0, drive_bits=0))
-    nominal = (0.4, 0.08)
-    surface = UltrasonicSurface(parameters, amplitude_loop(parameters), SLIDE, nominal=nominal)
-    drive = 0.05 * np.sin(np.arange(300.0) / 9.0)[:, None]
-    expected = surface.run(drive)
-    with ResonantDriver(Watched(parameters.carrier_mode), parameters, SLIDE, nominal) as driver:
-        assert (driver.rate, driver.block, driver.delay) == (12e3, 1, 1)
-        played = [driver.play(drive[n : n + 1]) for n in range(300)]
-    sensed = np.concatenate([each.sensed for each in played])
-    np.testing.assert_allclose(sensed[50:], expected.sensed[50:], rtol=1e-9)
-    assert np.ptp(sensed[100:]) > 0.05
-    np.testing.assert_array_equal(np.concatenate([each.flags for each in played]), expected.flags)
 
 
 def friction_of(moved, frequency, rate=192e3, load=0.4):
@@ -153,6 +121,7 @@ def test_a_device_of_a_friction_sample_a_block_renders_a_tone():
     assert (session.driver.block, session.driver.delay) == (1, 1)
     shift = float(UltrasonicParameters().resonance(0.4)) - 30e3
     assert session.driver.loop.state["shift"][0] == pytest.approx(shift, abs=1.0)
+    assert (recording.flags[:100] & Flag.UNLOCKED).any()  # until its lock is found
     assert not recording.flags[100:].any()
 
 
@@ -168,19 +137,3 @@ def test_a_file_at_192_khz_is_driven_open_loop(tmp_path):
     # naive: a finger of twice the load is not noticed; its film has other friction, and the plate another resonance
     heavy = UltrasonicPlate(UltrasonicParameters(), hr.Finger.sliding(speed=0.08, normal_load=1.5)).run(drive)
     assert abs(hilbert(heavy.motion[:, 0]))[60000:70000].mean() < 0.8 * abs(hilbert(moved))[60000:70000].mean()
-
-
-NUMBERS = {"rate": 192e3, "block": 16, "drive_channels": 1, "sensed_channels": 1}
-
-
-@pytest.mark.parametrize(
-    ("changes", "plant", "message"),
-    [
-        ({"rate": 100e3}, {}, r"driver.rate = 100000.0: must be a whole multiple of device.rate = 12000 Hz"),
-        ({"rate": 48e3, "block": 4}, {}, r"rate = 48000.0: must be >= 66666.7 Hz for a carrier"),
-        ({}, {"sensor": "tribometer"}, r"device.sensor = 'tribometer': must be 'amplitude'"),
-    ],
-)
-def test_a_device_that_does_not_fit_is_refused(changes, plant, message):
-    with pytest.raises(ValueError, match=message):
-        prepare(scene(**plant), driver=BaseDriver(**NUMBERS | changes))

@@ -1,0 +1,301 @@
+"""What cannot be is refused by a sentence with the name, the value, the bound and the unit."""
+
+import numpy as np
+import pytest
+from electroadhesive import tone as friction_tone
+from synthetic import make_bands
+from tables import scene_on, tables
+
+import hapticrender as hr
+from hapticrender.control.loopshape import reduced_controller
+from hapticrender.control.methods import method_named
+from hapticrender.control.stdft import StarSTDFT
+from hapticrender.drivers.audio import AudioDriver
+from hapticrender.drivers.base import BaseDriver
+from hapticrender.drivers.nu32 import NU32Board
+from hapticrender.drivers.serial import BoardClient
+from hapticrender.drivers.wavefile import WaveFileDriver
+from hapticrender.export import board_design
+from hapticrender.plants.electroadhesion import ElectroadhesionParameters, ElectroadhesionScreen
+from hapticrender.plants.friction_laws import FitLaw, LoadSharing
+from hapticrender.plants.hybrid import HybridPlant
+from hapticrender.plants.plate import Plate, PlateParameters
+from hapticrender.plants.ultrasonic import UltrasonicParameters
+from hapticrender.touch import latency_budget as budget
+from hapticrender.touch.motion import Sampled, SineMotion, TriangleMotion
+from hapticrender.touch.motion_estimator import MotionEstimator
+from hapticrender.touch.perception import detection_threshold, from_velocity
+from hapticrender.touch.touch_panel import TouchPanel
+
+TONE = hr.Grating(frequency=100.0, velocity=10e-3)
+SLIDE = hr.Finger.sliding(speed=0.08, normal_load=0.4, mechanics="light")
+PANEL = TouchPanel()
+WHITE = {"samples": [0.0, 1.0], "rate": 100.0}
+
+
+def grating(**changes):
+    return hr.Grating(**{"amplitude": 1e-6, "frequency": 20.0} | changes)
+
+
+def carriers(**changes):
+    good = {"frequency": [20.0, 0.0], "wavenumber": [0.0, 1e3], "phase": [-1.0, 9.0], "envelope": [1e-6, -1e-6j]}
+    return hr.Bands(**good | changes)
+
+
+def opened(device, texture=TONE, finger=SLIDE, driver=None, **parameters):
+    return hr.prepare(scene_on(device, texture, finger, 1.0, **parameters), driver=driver)
+
+
+def plate(gradient=0.0, **parameters):
+    return hr.prepare(hr.Scene(texture=TONE, finger=SLIDE, duration=1.0, gradient=gradient, **tables(parameters)))
+
+
+def exported(bands=0, **changes):
+    scene = {"texture": TWO_TONES, "duration": 1.0}
+    return board_design(hr.prepare(hr.Scene(**scene | changes)), bands)
+
+
+def hybrid(velocity_per_force=0.64, **parameters):
+    return HybridPlant(
+        Plate(PlateParameters(**parameters), SLIDE),
+        ElectroadhesionScreen(ElectroadhesionParameters(), SLIDE),
+        velocity_per_force,
+    )
+
+
+def demodulator(**changes):
+    return hr.Demodulator(**{"frequency": [100.0], "bandwidth": 5.0, "rate": 5000.0} | changes)
+
+
+def tracker(**changes):
+    return hr.FingerTracker(PlateParameters(), **changes)
+
+
+def limited(device, **limits):
+    texture = hr.Grating(frequency=100.0, amplitude=20e-6)
+    return hr.prepare(hr.Scene(texture=texture, finger=SLIDE, device=device, duration=0.1, limits=limits))
+
+
+def driver(**changes):
+    return BaseDriver(**{"rate": 5000.0, "drive_channels": 2, "sensed_channels": 1, "block": 4} | changes)
+
+
+IN_SPACE = {"frequency": None, "wavelength": 1e-3, "amplitude": None}
+HOT = {"level": "envelope", "temperature_rise": 100.0, "temperature_coefficient": -600e-6, "rate": 48e3}
+MASSLESS = {"order": 4, "mass": 1e-4, "damping": 1.0, "stiffness": 1e3, "phalanx_damping": 1.0}
+UNIT = {"order": 2, "mass": 1e-3, "phalanx_mass": 1e-3}
+FAR_UP = hr.Grating(velocity=1.5, frequency=250.0)
+USERS = {"rate": 192e3, "block": 16, "drive_channels": 1, "sensed_channels": 1}
+BLIND = USERS | {"sensed_channels": 0}
+TWO_TONES = hr.Grating(frequency=60.0, amplitude=1e-5, partials=((1.0, 1.0, 0.0), (2.4, 0.4, 1.0)))
+
+TEXTURES = [
+    (lambda: grating(level=20), r"amplitude, velocity, level: exactly .* amplitude = 1e-06 and level = 20.0 are"),
+    (lambda: grating(amplitude=None, velocity=1.0, frequency=5e-324), r"velocity = 1.0: must be <= 0.01 m .* is inf m"),
+    (lambda: grating(amplitude=None, level=20, frequency=1001), r"level = 20.0: must be stated at 1 to 1000 Hz"),
+    (lambda: grating(**IN_SPACE, level=20), r"speed is missing: must be .* m/s"),
+    (lambda: grating(amplitude=10.0), r"amplitude = 10.0: must be .* <= 0.01 m"),
+    (lambda: grating(amplitude=True), r"amplitude = True: must be a finite number"),
+    (lambda: grating(wavelength=1e-3), r"frequency, wavelength: exactly one must be given; frequency = 20.0"),
+    (lambda: grating(shape="sawtooth"), r"shape = 'sawtooth': must be one of sine, square, triangle"),
+    (lambda: grating(partials=[{"order": 1}]), r"partials\[0\] = .*: must be order, amplitude, phase"),
+    (lambda: grating(phase=10**400), r"phase = an integer beyond 1e30: must be .* rad"),
+    (lambda: carriers(frequency=[np.nan, 1.0]), r"frequency\[0\] = nan: must be finite and >= 0 \(Hz\)"),
+    (lambda: carriers(wavenumber=[0.0]), r"wavenumber has shape \(1,\): must be .* as many as frequency has"),
+    (lambda: carriers(envelope=[np.nan, 0.0]), r"envelope\[0\] = \(nan\+0j\): must be finite \(m\)"),
+    (lambda: hr.Recorded(amplitude=1e-6, samples=[0.0, 1.0]), "rate is missing"),
+    (lambda: hr.Recorded(amplitude=1e-6, samples=[0.0], rate=100.0), "samples = .*: must be >= 2 numbers"),
+    (lambda: hr.Recorded(amplitude=1e-6, file="a.wav", rate=100.0), "rate = 100.0: must be left out, as the file has"),
+    (lambda: hr.Recorded(amplitude=1e-6, file="a.wav", **WHITE), "file, samples: exactly one must be given"),
+    (lambda: hr.Sum([(TONE, 1.0), ("tone", 1.0)]), r"parts\[1\] = .*: must be 1 to 4096 pairs of a texture and a num"),
+    (lambda: detection_threshold([20.0, -3.0]), r"frequency = .*: must be finite numbers >= 0 Hz$"),
+    (lambda: detection_threshold(np.nan), r"frequency = .*: must be finite numbers >= 0 Hz$"),
+    (lambda: from_velocity(0.1, np.inf), r"frequency = .*: must be finite numbers > 0 Hz$"),
+    (lambda: from_velocity(0.1, 0.0), r"frequency = .*: must be finite numbers > 0 Hz$"),
+]
+FINGERS = [
+    (lambda: hr.Finger.still(normal_load=-0.1), r"normal_load = -0.1: must be .* >= 0 and <= 20 N"),
+    (lambda: hr.Finger.still(normal_load=[[0.0, 1.0], [0.2]]), r"normal_load\[0\] = .*: must be 1 rising times in s"),
+    (lambda: hr.Finger.still(touches=[(1.0, 0.5)]), r"touches\[0\] = \(1.0, 0.5\): must be pairs of on < off in s"),
+    (lambda: hr.Finger.still(mechanics="strong"), r"mechanics = 'strong': must be one of auto, none, light"),
+    (lambda: hr.Finger.still(mechanics=UNIT | {"mass": -1e-3}), r"mechanics.mass = -0.001: must be .* kg"),
+    (lambda: hr.Finger.still(mechanics=UNIT), r"mechanics.phalanx_mass = 0.001: must be 0"),
+    (lambda: TriangleMotion(speed=-0.1), r"speed = -0.1: must be .* > 0 and <= 10 m/s"),
+    (lambda: SineMotion(frequency=3.0), r"speed, stroke: exactly one must be given"),
+    (lambda: Sampled(positions=[0.0, np.nan], rate=1.0), r"positions\[1\] = nan: must be a finite number"),
+    (lambda: Sampled(positions=[0.0, 0.1], times=[1.0, 1.0]), r"times = .*: must be 2 rising times in s"),
+]
+SENSORS = [
+    (lambda: MotionEstimator(), "one must be > 1e-09 m"),
+    (lambda: MotionEstimator(1e-4, latency=-1.0), "latency = -1.0: must be a finite number >= 0 s"),
+    (lambda: MotionEstimator(1e-4).update(0.0, np.inf), "must be finite"),
+    (lambda: MotionEstimator(1e-4).update(1.0, 0.0, 0.0), "error = 0.0: must be a finite number > 0 m"),
+    (lambda: hr.Encoder(0.5e-6, bits=70), "bits = 70: must be an integer >= 2 and <= 64"),
+    (lambda: hr.Encoder(0.0, noise=1e-6), "resolution = 0.0: must be the metres of a count, not 0"),
+    (lambda: hr.Encoder(0.5e-6).update(0.0, np.nan), "position = nan: must be a whole number of counts"),
+    (lambda: hr.Encoder(0.5e-6).update(0.0, 2.5), "position = 2.5: must be a whole number of counts"),
+    (lambda: TouchPanel(rate=0.0), "rate = 0.0"),
+    (lambda: TouchPanel(noise=0.0, resolution=0.0), "one must be > 1e-09 m"),
+    (lambda: hr.phase_error(PANEL, 0.05, 0.0), "wavelength = 0.0: must be a finite number > 0 m"),
+    (lambda: hr.phase_error(PANEL, np.nan, 1e-3), "speed = nan: must be a finite number >= 0 m/s"),
+    (lambda: hr.phase_error(PANEL, 0.05, 1e-3, frequency=0.0), "frequency = 0.0: .* > 0 Hz"),
+    (lambda: hr.phase_error(PANEL, 0.05, 1e-3, delay=-1e-3), "delay = -0.001: .* >= 0 s"),
+    (lambda: hr.phase_error(3, 0.05, 1e-3), "panel = 3: must be a TouchPanel"),
+    (lambda: hr.finest_wavelength(PANEL, 0.05, degrees=0.0), "degrees = 0.0: .* > 0"),
+    (lambda: hr.finest_wavelength(PANEL, 0.05, highest=0.0), "highest = 0.0: must be > 0 Hz"),
+    (lambda: budget.bandwidth(MotionEstimator(1e-4), np.nan), "rate = nan: must be a finite number > 0 Hz"),
+    (lambda: hr.Scene(texture=TONE, duration=1.0, touch_panel={"hz": 1}), "touch_panel.hz = .*: unknown key"),
+    (lambda: hr.Player("vt-plate", touch_panel={"rate": 60.0}), "touch_panel: has no effect on the positions that"),
+]
+TRACKER = [
+    (lambda: tracker(lookahead=-1), "lookahead = -1: must be a finite number >= 0 s"),
+    (lambda: tracker(rate=499.9), "rate = 499.9: must be a finite number >= 500 Hz"),
+    (lambda: tracker(rate=np.nan), "rate = nan: must be a finite number >= 500 Hz"),
+    (lambda: tracker(late=-1), "late = -1: must be an integer >= 0 samples"),
+    (lambda: tracker(noise=np.nan), "noise = nan: must be two numbers >= 0, in m rms"),
+    (lambda: tracker(noise=[1e-6]), r"noise = array\(\[1.e-06\]\): must be two numbers"),
+    (lambda: hr.FingerTracker(3), "plate = 3: must be a PlateParameters or a Course"),
+    (lambda: tracker().update(0.0, 0.0), r"shapes \(\) and \(\): must be \(1, 2\) and \(1, 2\), in A and m"),
+    (
+        lambda: tracker(rate=500).update(np.zeros((5, 1)), np.zeros((5, 2))),
+        r"shapes \(5, 1\) and \(5, 2\): must be \(5, 2\) and \(5, 2\)",
+    ),
+]
+PLANTS = [
+    (lambda: PlateParameters.with_overrides({"mass": 0.0}), r"mass = 0.0: must be .*> 0 .*kg"),
+    (lambda: PlateParameters.with_overrides({"masss": 1.0}), r"masss = 1.0: unknown key; known: .*mass"),
+    (lambda: PlateParameters(bending_frequency=6000.0), r"bending_frequency = 6000.0: must be <= rate = 5000 Hz"),
+    (
+        lambda: Plate(PlateParameters(), hr.Finger.still(normal_load=0.5, mechanics=MASSLESS)),
+        r"phalanx_mass = 0.0 kg: must be .*> 0",
+    ),
+    (lambda: Plate(PlateParameters(delay=2), SLIDE, block=3), r"block = 3: must be between 1 and the loop's delay of"),
+    (lambda: UltrasonicParameters(rate=48e3), r"rate = 48000.0: must be .*>= 66666.7 .*Hz for a carrier of 30000 Hz"),
+    (
+        lambda: UltrasonicParameters(finger_damping=2000.0),
+        r"finger_damping = 2000.0: damping ratio 3.63 at 20 N .* must be .*<= 0.5",
+    ),
+    (
+        lambda: UltrasonicParameters(**HOT),
+        r"temperature_rise = 100.0: shifts the resonance by up to -1800 Hz, must be within 1500 Hz",
+    ),
+    (lambda: FitLaw(floor=1.0), r"floor = 1.0: must be .*<= 0.999"),
+    (lambda: LoadSharing().ratio(1e-6, 0.0, 0.1), r"load = 0.0: must be .*> 0 .*N"),
+    (lambda: FitLaw().amplitude(0.1, 0.5, 0.1), r"ratio = 0.1: must be .*>= 0.100001 .*and <= 1"),
+    (lambda: hybrid(), r"plate.rate = 5000.0: must be 10000.0"),
+    (lambda: hybrid(rate=10e3, coils=1), r"plate.coils = 1: must be 2"),
+    (lambda: hybrid(0.0, rate=10e3), r"velocity_per_force=0.0: must be > 0"),
+]
+SCENES = [
+    (lambda: plate(2.0, coils=1), "gradient = 2.0: must be 0 1/m: a plate with one coil"),
+    (lambda: limited("electroadhesion", displacement=1e-3), "displacement = 0.001: must be left out: a screen senses"),
+    (lambda: limited("vt-plate", peak_drive=-1), "limits.peak_drive = -1: must be a finite number > 0"),
+    (
+        lambda: limited("vt-plate", peak=1.0),
+        "limits.peak = .*: unknown key; known: displacement, peak_drive, rms_drive",
+    ),
+    (lambda: plate(19.0), "gradient = 19.0: must be <= 18.1818 1/m"),
+    (lambda: plate(coils=3), "device.coils = 3: must be .* <= 2"),
+    (lambda: opened("electroadhesion", finger=hr.Finger.still(normal_load=1.0)), r"finger: must slide faster than 0.0"),
+    (
+        lambda: hr.prepare(friction_tone(100.0, force=2.0)),
+        r"asks for an attraction of 10.* N: must be <= 2.23 N, at 0.01 A under a nominal",
+    ),
+    (
+        lambda: hr.prepare(
+            hr.Scene(texture=TONE, finger=SLIDE, device="electroadhesion", duration=1.0, gradient=1.0),
+        ),
+        r"gradient = 1.0: must be 0 1/m",
+    ),
+    (lambda: opened("electroadhesion", force_range=1e-3), "friction of 0.3.. N: must be <= 0.001 N, the tribometer's"),
+    (lambda: opened("electroadhesion", friction_coefficient=0.0), "device.friction_coefficient = 0.0: must be .* > 0"),
+    (lambda: opened("ultrasonic", bias=0.1), r"device.bias = 0.1: must be > 0.109, the least that the law leaves"),
+    (lambda: opened("ultrasonic", scale=1e-4), "asks for a vibration of .* V under 0.4 N: must be <= 10 V"),
+    (lambda: opened("ultrasonic", finger=hr.Finger.still(normal_load=0.4)), r"must slide faster than 0.001 m/s"),
+    (lambda: opened("ultrasonic", finger=hr.Finger.absent()), r"must slide faster|normal_load = 0"),
+    (
+        lambda: opened("ultrasonic", hr.Grating(frequency=100.0, velocity=0.2)),
+        r"0.313 N of friction: must be <= 0.144 N",
+    ),
+    (lambda: opened("hybrid", crossover=30.0), r"render.crossover = 30.0: must be .* >= 40 and <= 400 Hz"),
+    (lambda: opened("hybrid", current_limit=2.0), r"must be plate_current_limit or screen_current_limit"),
+    (lambda: opened("hybrid", hr.Synthetic(amplitude=1e-5)), "a recording over time is not supported"),
+    (lambda: opened("hybrid", FAR_UP), "texture.amplitude asks for an attraction of"),
+]
+DRIVERS = [
+    (lambda: driver(rate=0.0), r"BaseDriver: rate=0.0 must be finite and > 0 Hz"),
+    (lambda: driver(block=0), r"block=0 must be a whole number >= 1"),
+    (lambda: driver(sensed_channels=-1), r"sensed_channels=-1 must be a whole number >= 0"),
+    (lambda: driver(delay=3), r"delay=3 must be a whole number >= 4"),
+    (lambda: AudioDriver("0", channels=()), r"channels=\(\): must name at least one output"),
+    (lambda: AudioDriver("0", channels=(0, 1)), r"channels=\(0, 1\): must be different whole numbers >= 1"),
+    (lambda: AudioDriver("0", sensed_channels=(3, 3)), r"sensed_channels=\(3, 3\): must be different"),
+    (lambda: AudioDriver("0", drive_per_full_scale=0.0), "drive_per_full_scale = 0.0: must be a finite number > 0"),
+    (lambda: AudioDriver("0", sensed_per_full_scale=np.inf), "sensed_per_full_scale = inf: must be a finite number >"),
+    (lambda: AudioDriver("0", delay=63.0), "delay=63.0 samples: must be >= block = 64 and <= 10 s"),
+    (lambda: AudioDriver("0", delay=np.nan), "delay=nan samples: must be >= block"),
+    (lambda: AudioDriver("0", rate=0.0), "rate=0.0 must be finite and > 0 Hz"),
+    (lambda: WaveFileDriver("a.mp3"), r"a\.mp3: the ending '\.mp3' must be one of \.wav, "),
+    (lambda: WaveFileDriver("a.flac", subtype="FLOAT"), r"a\.flac: subtype='FLOAT' must be one of PCM_16, PCM_24 for"),
+    (lambda: NU32Board("COM7", timeout=0.0), "timeout = .*: must be a finite number > 0 s"),
+    (lambda: NU32Board("COM7", timeout=np.inf), "timeout = .*: must be a finite number > 0 s"),
+    (lambda: NU32Board("COM7").set_bands(make_bands([20.0, 47.0], 1e-6)), "bands: must be one fixed tone"),
+    (lambda: NU32Board("COM7").set_bands(make_bands(0.0, 1e-6, 1000.0)), "bands: must be one fixed tone"),
+    (lambda: BoardClient("x", timeout=-1e-9), r"timeout = .*: must be a finite number >= 0 s"),
+    (lambda: BoardClient("x", reconnect=np.inf), r"reconnect = .*: must be a finite number >= 0 s"),
+    (
+        lambda: opened("ultrasonic", driver=BaseDriver(**USERS | {"rate": 100e3})),
+        r"driver.rate = 100000.0: must be a whole multiple of device.rate = 12000 Hz",
+    ),
+    (
+        lambda: opened("ultrasonic", driver=BaseDriver(**USERS | {"rate": 48e3, "block": 4})),
+        r"rate = 48000.0: must be >= 66666.7 Hz for a carrier",
+    ),
+    (
+        lambda: opened("ultrasonic", driver=BaseDriver(**USERS), sensor="tribometer"),
+        r"device.sensor = 'tribometer': must be 'amplitude'",
+    ),
+    (
+        lambda: opened("electroadhesion", driver=BaseDriver(**BLIND | {"rate": 79_999}), output="carrier"),
+        r"driver.rate = 79999: must be >= 80000 Hz where output = 'carrier', 4 samples a turn",
+    ),
+    (
+        lambda: opened("electroadhesion", driver=BaseDriver(**USERS), output="carrier"),
+        r"driver.sensed_channels = 1: must be 0 where output = 'carrier'",
+    ),
+    (lambda: opened("hybrid", driver=driver(rate=10e3)), r"driver.drive_channels = 2: must be 3"),
+]
+DESIGNS = [
+    (lambda: method_named("papper"), r"method = 'papper': must be one of paper, paper-common"),
+    (lambda: demodulator(frequency=[]), "at least one number"),
+    (lambda: demodulator(frequency=[2501.0]), "half the rate, 2500 Hz"),
+    (lambda: demodulator(channels=0), "channels=0"),
+    (lambda: demodulator().run(np.zeros((4, 2))), r"must be \(n, 1\)"),
+    (lambda: StarSTDFT(bandwidth=2500.0, rate=5000.0), "bandwidth=2500.0 Hz must lie between 0 and half the rate"),
+    (lambda: StarSTDFT(bandwidth=np.nan, rate=5000.0), "bandwidth=nan Hz must lie between"),
+    (lambda: reduced_controller(5.0, 5.0), "loop_bandwidth=5.0 Hz: must be > 0 and below filter_bandwidth=5.0 Hz"),
+    (lambda: reduced_controller(-1.0, 5.0), "loop_bandwidth=-1.0 Hz: must be > 0 and below"),
+    (
+        lambda: exported(device="electroadhesion", texture=TONE, finger=SLIDE),
+        "device.kind = 'electroadhesion': a board plays vt-plate only",
+    ),
+    (lambda: exported(method="h2"), "method = 'h2': a board plays \"inverse\" only"),
+    (
+        lambda: exported(texture=hr.Synthetic(amplitude=20e-6, speed=0.08), finger=SLIDE),
+        "texture Synthetic: a board plays a whole waveform, without `carriers`",
+    ),
+    (lambda: exported(profile={"delay": 65}), "delay = 65 samples: must be <= 64"),
+    (lambda: exported(1), "bands = 1: must be 2 .* to 64"),
+    (lambda: exported(65), "bands = 65: must be 2 .* to 64"),
+]
+KINDS = {
+    "texture": TEXTURES, "finger": FINGERS, "sensor": SENSORS, "tracker": TRACKER, "plant": PLANTS, "scene": SCENES,
+    "driver": DRIVERS, "design": DESIGNS,
+}  # fmt: skip
+EACH = [pytest.param(*row, id=f"{kind} {n}") for kind, rows in KINDS.items() for n, row in enumerate(rows)]
+
+
+@pytest.mark.parametrize(("make", "message"), EACH)
+def test_what_cannot_be_is_refused(make, message):
+    with pytest.raises((ValueError, TypeError, hr.DesignError), match=message):
+        make()
