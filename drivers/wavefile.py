@@ -1,11 +1,10 @@
-"""Drive as a sound file: written while it plays, and read back in amperes.
+"""Drive as a sound file, written while it plays.
 
 A file is a device without sensors: the controller drives it open loop.  A sample of 1.0 in the file is `full_scale`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -17,43 +16,8 @@ from hapticrender.errors import DeviceLost, DeviceNotFound, DriverError
 from hapticrender.protocols import Array, Flag, Sensed
 
 FORMATS = {".wav": "WAV", ".w64": "W64", ".rf64": "RF64", ".aiff": "AIFF", ".aif": "AIFF", ".flac": "FLAC"}
-UNKNOWN = 2**63 - 1  # frames, as libsndfile says of a FLAC file that was never closed
-BLOCK = 65536  # frames read at once
 SUBTYPES = {"PCM_16": 16, "PCM_24": 24, "PCM_32": 32, "FLOAT": None, "DOUBLE": None}  # bits of the integers
 WIDTH = 32  # soundfile takes integers of any width left-justified in 32 bits
-
-
-def read_back(path: str | Path, *, full_scale: float = 3.0) -> Array:
-    """Drive (A, shape (n, channels)) as a file holds it: scaled by `full_scale` (A), never dithered or rounded.
-
-    Raises
-    ------
-    DeviceNotFound
-        There is no such file.
-    DriverError
-        It is no sound file.
-    """
-    if not Path(path).is_file():
-        raise DeviceNotFound(f"{path}: read: no such file")
-    try:
-        with soundfile.SoundFile(path) as file:
-            return np.concatenate(list(_blocks(file))) * full_scale
-    except soundfile.SoundFileError as error:
-        raise DriverError(f"{path}: read: {_reason(error)}") from error
-
-
-def _blocks(file: soundfile.SoundFile) -> Iterator[Array]:
-    """Samples of a file that need not know how many it holds, in blocks; the last one is short."""
-    count = BLOCK
-    while count == BLOCK:
-        block = np.full((BLOCK, file.channels), np.nan)
-        try:
-            count = len(file.read(out=block))
-        except soundfile.SoundFileError:
-            if file.frames != UNKNOWN:
-                raise
-            count = int(np.isfinite(block[:, 0]).sum())  # it filled the block, then failed to seek beyond the end
-        yield block[:count]
 
 
 class WaveFileDriver(BaseDriver):

@@ -10,6 +10,7 @@ from live_devices import Bench
 from other_plate import OtherPlate
 from serial.tools import list_ports
 from serial.tools.list_ports_common import ListPortInfo
+from waves import read_back
 
 import hapticrender as hr
 from hapticrender import cli, devices
@@ -87,8 +88,6 @@ def test_python_takes_the_same_texts(tmp_path):
     """The drive in the file is that of the driver's object."""
     played = tmp_path / "played.wav"
     recording = hr.render(TONE, driver=f"wavefile:{played}")
-    from hapticrender.drivers.wavefile import read_back
-
     np.testing.assert_allclose(read_back(played)[: len(recording)], recording.drive, rtol=0, atol=3.0 * 2.0**-24)
     own = hr.render(TONE, driver="other_plate:OtherPlate")
     np.testing.assert_array_equal(own.drive, hr.render(TONE, driver=OtherPlate()).drive)

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from electroadhesive import FORCE, MU, RATE, SLIDE, SPEED, Screen, band, tone
 from held import amplitude
-from waves import phasor
+from waves import phasor, read_back
 
 import hapticrender as hr
 from hapticrender import loop
-from hapticrender.drivers.wavefile import WaveFileDriver, read_back
+from hapticrender.drivers.wavefile import WaveFileDriver
 from hapticrender.plants.electroadhesion import DRY, MOIST, NORMAL, ElectroadhesionParameters
 from hapticrender.renderers.electroadhesion import ElectroadhesionRenderer
 

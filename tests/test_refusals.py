@@ -7,9 +7,9 @@ from synthetic import make_bands
 from tables import scene_on, tables
 
 import hapticrender as hr
+from hapticrender.control.demodulator import StarSTDFT
 from hapticrender.control.loopshape import reduced_controller
 from hapticrender.control.methods import method_named
-from hapticrender.control.stdft import StarSTDFT
 from hapticrender.drivers.audio import AudioDriver
 from hapticrender.drivers.base import BaseDriver
 from hapticrender.drivers.nu32 import NU32Board

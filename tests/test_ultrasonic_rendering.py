@@ -5,11 +5,11 @@ import pytest
 from scipy.signal import hilbert
 from tables import scene_on
 from ultrasonic import ASKED, NOISE, held, modulated, ran
-from waves import phasor
+from waves import phasor, read_back
 
 import hapticrender as hr
 from hapticrender.drivers.simulated import SimulatedDriver
-from hapticrender.drivers.wavefile import WaveFileDriver, read_back
+from hapticrender.drivers.wavefile import WaveFileDriver
 from hapticrender.loop import prepare, run
 from hapticrender.plants.surface import SurfaceParameters
 from hapticrender.plants.ultrasonic import UltrasonicParameters, UltrasonicPlate

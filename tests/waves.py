@@ -1,6 +1,7 @@
 """Signals that tests play, and what is read out of those that come back."""
 
 import numpy as np
+import soundfile
 from scipy.signal import butter, sosfiltfilt
 
 from hapticrender.bands import Bands
@@ -36,3 +37,17 @@ def waveform_error(motion, reference, start, rate=5000.0):
     deviation, reference = (sosfiltfilt(sos, each, axis=0) for each in (motion - reference, reference))
     late = slice(round(start * rate), None)
     return np.sqrt((deviation[late] ** 2).mean(axis=0) / (reference[late] ** 2).mean())
+
+
+def read_back(path, full_scale=3.0):
+    """Drive (A, shape (n, channels)) in a sound file, scaled by `full_scale` (A)."""
+    blocks, count = [], 65536
+    with soundfile.SoundFile(path) as file:
+        while count == 65536:
+            block = np.full((65536, file.channels), np.nan)
+            try:
+                count = len(file.read(out=block))
+            except soundfile.SoundFileError:  # of FLAC that was never closed it cannot find the end
+                count = int(np.isfinite(block[:, 0]).sum())
+            blocks.append(block[:count])
+    return np.concatenate(blocks) * full_scale
