@@ -25,7 +25,7 @@ CASES = {
     "screen, h2": ("electroadhesion", "h2", {"wavelength": 1e-3}, {"frequency": 120.0}),
     "ultrasonic surface, h2": ("ultrasonic", "h2", {"wavelength": 1e-3}, {"frequency": 120.0}),
     "hybrid, new amplitude": ("hybrid", "inverse", {"wavelength": 1e-3}, {"wavelength": 1e-3, "amplitude": 8e-6}),
-    "hybrid, other part": ("hybrid", "inverse", {"frequency": 60.0}, {"wavelength": 1e-3}),
+    "hybrid, other part": ("hybrid", "inverse", {"frequency": 60.0, "amplitude": 60e-6}, {"wavelength": 1e-3}),
 }
 
 
@@ -278,7 +278,7 @@ def test_the_heat_of_a_part_that_a_texture_leaves_out_goes_on_cooling():
     limits = {"rms_drive": 0.5, "rms_time": 0.5}
     with hr.Player("hybrid", paced=False, limits=limits, keep_unfelt=True) as player:
         player.finger(-0.03, SPEED, 0.4)
-        player.play(grating(20e-6, frequency=50.0))
+        player.play(grating(150e-6, frequency=50.0))
         place = slide(player, 0.2, start=-0.03, speed=SPEED)
         player.play(grating(1e-9, frequency=250.0))
         place = slide(player, 0.1, start=place, speed=SPEED)

@@ -20,7 +20,7 @@ from hapticrender.control.margins import LEAST, Margins, margins_of, unstable_po
 from hapticrender.control.records import MOST_TAPS
 from hapticrender.protocols import Array
 
-TAPS = 3
+TAPS, REACH = 3, 0.4e-3  # at least; s: more reach as far back as three at 5 kHz, or noise would grow with the rate
 LEAST_RATIO = 1e-4  # damping ratio that margins assume at least, so that an ideal mode has a finite peak
 QUALITY, QUALITY_UNMEASURED = 1.4, 2.0  # the least Q, with the bending mode known and while it is not
 QUALITY_STEP = 0.1
@@ -203,12 +203,13 @@ def choose_damping(
     if not (model.mass.diagonal() > 0.0).all():
         return _off(len(model.mass), "the device has no mode")
     known, parts = model.rigid if bending is None else bending.measured, oscillators(model)
-    whole = _chosen(parts, QUALITY if known else QUALITY_UNMEASURED, bending, model.taps)
+    plain = model.taps or min(max(TAPS, 1 + round(REACH * model.rate)), MOST_TAPS)
+    whole = _chosen(parts, QUALITY if known else QUALITY_UNMEASURED, bending, plain)
     if bending is None or not apart or not whole.margins:
         return whole
     for i, part in enumerate(parts):
         if bending.coupling[i] == 0.0:
-            whole = _replaced(whole, i, _chosen((part,), QUALITY, None, model.taps))
+            whole = _replaced(whole, i, _chosen((part,), QUALITY, None, plain))
     return whole
 
 

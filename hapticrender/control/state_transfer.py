@@ -25,10 +25,11 @@ from hapticrender.jit import I8, kernel, pointer
 from hapticrender.protocols import Array
 
 PARTS = 2  # of a device
-BLOCKS = (  # of a part: of its supervisor, of every controller, of the waveform law
+BLOCKS = (  # of a part: of its supervisor, of every controller, of the law by bands, of the waveform law
     *("tests", "heat", "sensors", "forces", "gains"),
-    *("tracker", "finger", "rounding"),
-    *("learned", "window", "ring", "reference"),
+    "tracker",
+    *("finger", "rounding"),
+    *("contact", "shaping", "learned", "window", "ring", "reference"),
 )
 ROWS = PARTS * len(BLOCKS)
 
@@ -107,11 +108,11 @@ def _blocks(part: Any) -> dict[str, Block]:
         return found
     at = state.ctypes.data
     found["tracker"] = _fields(at, CONTROLLER, "held_position", "fresh")
-    if not isinstance(part, WaveformController):  # other laws mean other things by these
-        found["finger"] = _fields(at, CONTROLLER, "fresh", "past")
-        found["rounding"] = _fields(at, CONTROLLER, "shaper", "sample")
-        return found
+    finger, rounding = _fields(at, CONTROLLER, "fresh", "past"), _fields(at, CONTROLLER, "shaper", "sample")
+    if not isinstance(part, WaveformController):
+        return found | {"finger": finger, "rounding": rounding}
     law, at, delay = part.law, int(state["loops_at"][0]), int(part.law["delay"])
+    found |= {"contact": finger, "shaping": rounding}  # the same fields, which mean other things there
     found |= {"learned": _fields(at, INVERSE, "fade", "ring_at"), "window": _fields(at, INVERSE, "window")}
     return found | {"ring": (int(law["ring_at"]), RING * (delay + 1)), "reference": (int(law["reference_at"]), delay)}
 
