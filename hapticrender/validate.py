@@ -4,17 +4,22 @@ from __future__ import annotations
 
 import itertools
 import multiprocessing
+import os
 import re
+import signal
 import sys
 import tempfile
+import threading
 import time
 import traceback
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures import Future, ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from contextlib import ExitStack, nullcontext
 from dataclasses import asdict, dataclass, field
 from functools import partial
+from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any, TextIO
 from xml.etree import ElementTree
@@ -25,7 +30,7 @@ from hapticrender.control.methods import method_named
 from hapticrender.devices import SIMULATED, naming_driver
 from hapticrender.errors import HapticError
 from hapticrender.formatting import as_json, printable
-from hapticrender.loop import prepare, run
+from hapticrender.loop import Terminated, prepare, run
 from hapticrender.protocols import Rendering
 from hapticrender.report import outputs
 from hapticrender.report.progress import progress as progress_of
@@ -34,6 +39,7 @@ from hapticrender.touch.builtin_scenes import builtin_scenes
 from hapticrender.touch.scene import Scene, distinct_names
 
 _NO_NAME = re.compile(r"[^\w.-]+|^\.+")
+_LOST = "not finished: one of the processes that render was killed, perhaps for lack of memory (fewer --jobs need less)"
 Tick = Callable[[float, float], None]
 
 
@@ -100,7 +106,7 @@ def validate(
     Scenes may be names of built-in ones or TOML files; one that cannot be rendered, whatever was raised, stops no other
     (``python -X dev`` prints the traceback).  `method` and `seed` (>= 0, of the plants' noise) are by default those of
     each scene.  `driver` is a text as ``--driver`` takes it, made anew for each scene.  `jobs` (>= 1) processes render
-    side by side, on simulated devices.
+    side by side, on simulated devices; where one is killed, what is not finished is an error.
     Files of each scene that does not pass go into a folder of its name in `out`.
 
     Examples
@@ -121,15 +127,45 @@ def validate(
     with ExitStack() as stack:
         calls: list[Callable[[Tick | None], Verdict]] = [partial(judge, *entry) for entry in entries]
         if jobs > 1:
-            pool = ProcessPoolExecutor(jobs, multiprocessing.get_context("spawn"))
-            stack.callback(pool.shutdown, cancel_futures=True)
-            futures = [pool.submit(judge, *entry, None) for entry in entries]
-            calls = [lambda _, future=each: future.result() for each in futures]  # type: ignore[misc]
+            context = multiprocessing.get_context("spawn")
+            watched, alive = context.Pipe(duplex=False)
+            pool = stack.enter_context(ProcessPoolExecutor(jobs, context, _end_with, (watched,)))
+            stack.enter_context(alive)  # closed first, however this ends
+            futures = [pool.submit(_judge_in_pool, judge, *entry) for entry in entries]
+            calls = [partial(_result, *each, judge) for each in zip(futures, entries, strict=True)]
         verdicts = []
         for line, call in zip(shown, calls, strict=True):
             with progress_of(line, progress) if line and progress else nullcontext() as tick:
                 verdicts.append(call(tick))
         return verdicts
+
+
+def _end_with(watched: Connection) -> None:
+    """End this process of a pool, by SIGTERM, as soon as the other end of a pipe is closed: as its owner ends."""
+
+    def watch() -> None:
+        watched.poll(None)
+        os.kill(os.getpid(), signal.SIGTERM)
+
+    threading.Thread(target=watch, daemon=True).start()
+
+
+def _judge_in_pool(judge: Callable[..., Verdict], label: str, scene: Scene | str) -> Verdict:
+    """Judge in a process of a pool; a signal ends the process, where the pool would go on with the next scene."""
+    try:
+        return judge(label, scene, None)
+    except (Terminated, KeyboardInterrupt):
+        os._exit(128 + signal.SIGTERM)
+
+
+def _result(
+    future: Future[Verdict], entry: tuple[str, Scene | str], judge: Callable[..., Verdict], _: Tick | None
+) -> Verdict:
+    """Wait for a verdict of a pool; a killed process breaks the whole pool."""
+    try:
+        return future.result()
+    except BrokenProcessPool:
+        return judge(*entry, None, problem=_LOST)
 
 
 def _read(scenes: Iterable[Scene | str | Path]) -> list[tuple[str, Scene | str]]:
@@ -153,14 +189,18 @@ def _judge(
     seed: int | None,
     driver: str,
     out: Path | None,
+    problem: str = "",
 ) -> Verdict:
-    """Render and judge a scene; `scene` may be why it cannot be read."""
+    """Render and judge a scene; `scene` may be why it cannot be read, `problem` why it cannot be rendered."""
     start, device = time.perf_counter(), ""
-    problem = scene if isinstance(scene, str) else ""
-    if isinstance(scene, Scene):
+    if isinstance(scene, str):
+        problem = scene
+    else:
         device, method = scene.device, method or scene.method
         seed = scene.seed if seed is None else seed
         try:
+            if problem:
+                raise HapticError(problem)
             rendering = prepare(scene, driver=driver, method=method, seed=seed)
             with naming_driver(driver):
                 summary = _summary(rendering, out and out / _NO_NAME.sub("_", label), tick)

@@ -1,9 +1,13 @@
 """Verdicts, and the reports that machines read."""
 
 import json
+import os
 import re
+import signal
+import subprocess
 import sys
 from dataclasses import replace
+from pathlib import Path
 from xml.etree import ElementTree
 
 import pytest
@@ -84,6 +88,45 @@ def test_whatever_a_driver_raises_is_the_error_of_that_scene(tmp_path, monkeypat
     assert [verdict.reason for verdict in found[:2]] == [
         f"faulty_driver:driver: {problem}" for problem in ("KeyError: 'x'", "OSError: usb gone")
     ]
+
+
+DISTURBED = """
+import multiprocessing, os, signal, sys, threading, time
+from pathlib import Path
+from hapticrender.cli import main
+def disturb():
+    while len(list(Path(os.environ["TMPDIR"]).glob("*/recording.au"))) < 2:
+        time.sleep(0.02)
+    {}
+threading.Thread(target=disturb, daemon=True).start()
+sys.exit(main(["validate", *sys.argv[1:], "--jobs", "2", "--json", "r.json"]))
+"""
+ENDS = {  # what happens while two scenes render: exit status, journals that stay behind
+    "multiprocessing.active_children()[0].kill()": (2, 1),
+    "os.kill(os.getpid(), signal.SIGTERM)": (-signal.SIGTERM, 0),
+    "os.kill(os.getpid(), signal.SIGINT)": (130, 0),
+}
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no such signals on this system")
+@pytest.mark.parametrize("event", ENDS)
+def test_a_signal_leaves_no_process_behind_and_a_killed_one_is_an_error(tmp_path, event):
+    """Pipes stay open as long as any process has them: `run` returns when all have ended."""
+    (tmp_path / "long.toml").write_text(replace(SHORT, duration=20000.0).to_toml())
+    (tmp_path / "bad.toml").write_text("")
+    command = [sys.executable, "-c", DISTURBED.format(event), "bad.toml", "long.toml", "long.toml", "long.toml"]
+    paths = {"TMPDIR": str(tmp_path), "PYTHONPATH": str(Path(__file__).resolve().parent.parent)}
+    ended = subprocess.run(
+        command, capture_output=True, text=True, check=False, timeout=120, env=os.environ | paths, cwd=tmp_path
+    )
+    status, left = ENDS[event]
+    assert ended.returncode == status, ended.stderr
+    assert len(list(tmp_path.glob("*/recording.au"))) == left
+    if status == 2:
+        report = json.loads((tmp_path / "r.json").read_text(encoding="utf-8"))["scenes"]
+        assert ["was killed" in scene["reason"] for scene in report] == [False, True, True, True]
+        assert {(scene["verdict"], scene["device"]) for scene in report[1:]} == {("error", "vt-plate")}
+        assert "4 scenes: 4 not rendered" in ended.stdout
 
 
 @pytest.mark.parametrize(("kind", "tag"), [("not judged", "skipped"), ("passed in band", "system-out")])
