@@ -205,13 +205,15 @@ def _judge(
             with naming_driver(driver):
                 summary = _summary(rendering, out and out / _NO_NAME.sub("_", label), tick)
             return Verdict.of({**summary, "scene": label}, time.perf_counter() - start)
-        except Exception as error:
+        except Terminated:
+            raise
+        except (Exception, SystemExit) as error:  # a vendor's library may call sys.exit
             problem = _problem(error)
     reason, method = problem.removeprefix(f"{label}: "), method or defaults.METHOD
     return Verdict(scene=label, device=device, method=method, seed=seed or 0, verdict="error", reason=reason)
 
 
-def _problem(error: Exception) -> str:
+def _problem(error: BaseException) -> str:
     """State what was raised: the message alone where it is one of ours, or refuses a value; else its name, too."""
     if sys.flags.dev_mode:
         traceback.print_exception(error)

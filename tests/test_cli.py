@@ -152,6 +152,15 @@ def test_what_a_driver_raises_is_one_line_with_its_name(run, tiny, tmp_path, mon
     assert (status, errors[-1]) == (2, "hapticrender: other_plate:OtherPlate: KeyError: 'usb'")
 
 
+@pytest.mark.parametrize("verb", ["render {tiny} --out {out}", "play {tiny}", "identify"])
+@pytest.mark.parametrize("method", ["__enter__", "play"])
+def test_a_driver_that_ends_the_program_is_an_error(run, tiny, tmp_path, monkeypatch, verb, method):
+    monkeypatch.setattr(OtherPlate, method, lambda *_: sys.exit(0))
+    status, _, errors = run(*verb.format(tiny=tiny, out=tmp_path).split(), "--driver", "other_plate:OtherPlate")
+    ended = "hapticrender: the driver, or what it uses, ended the program: SystemExit(0)"
+    assert (status, errors[-1]) == (2, ended)
+
+
 def test_python_in_development_mode_shows_the_traceback():
     command = [sys.executable, "-X", "dev", "-m", "hapticrender", "render", "a", "--out", "b", "--method", "magic"]
     assert "Traceback" in subprocess.run(command, capture_output=True, text=True, check=False).stderr

@@ -69,22 +69,27 @@ def test_a_bad_scene_stops_no_other(tmp_path, capsys, jobs):
 
 
 FAULTY = """
+import sys
 from other_plate import OtherPlate
 made = []
 class Gone(OtherPlate):
     def play(self, drive):
         raise OSError("usb gone")
+class Exits(OtherPlate):
+    def play(self, drive):
+        sys.exit(0)
 def driver():
     made.append(1)
-    return [lambda: {}["x"], Gone, OtherPlate][len(made) - 1]()
+    return [lambda: {}["x"], Gone, Exits, lambda: sys.exit(3), OtherPlate][len(made) - 1]()
 """
 
 
 def test_whatever_a_driver_raises_is_the_error_of_that_scene(tmp_path, monkeypatch):
     (tmp_path / "faulty_driver.py").write_text(FAULTY)
     monkeypatch.syspath_prepend(tmp_path)
-    found = validate([SHORT] * 3, driver="faulty_driver:driver")
-    assert [verdict.verdict for verdict in found] == ["error", "error", "passed"]
+    found = validate([SHORT] * 5, driver="faulty_driver:driver")
+    assert [verdict.verdict for verdict in found] == ["error"] * 4 + ["passed"]
+    assert [verdict.reason for verdict in found[2:4]] == ["SystemExit: 0", "SystemExit: 3"]
     assert [verdict.reason for verdict in found[:2]] == [
         f"faulty_driver:driver: {problem}" for problem in ("KeyError: 'x'", "OSError: usb gone")
     ]
