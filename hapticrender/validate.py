@@ -28,7 +28,7 @@ from hapticrender import __version__, defaults
 from hapticrender.checks import integer
 from hapticrender.control.methods import method_named
 from hapticrender.devices import SIMULATED, naming_driver
-from hapticrender.errors import HapticError
+from hapticrender.errors import HapticError, SceneError
 from hapticrender.formatting import as_json, printable
 from hapticrender.loop import Terminated, prepare, run
 from hapticrender.protocols import Rendering
@@ -82,13 +82,20 @@ class Verdict:
 
 
 def open_scene(reference: str | Path) -> Scene:
-    """Read a scene: a built-in one by its name, any other from its TOML file; a ValueError where there is none."""
+    """Read a scene: a built-in one by its name, any other from its TOML file.
+
+    A ValueError where there is none, or where it would settle for longer than the scene lasts.
+    """
     scenes = builtin_scenes()
     if str(reference) in scenes:
         return scenes[str(reference)]
     if not Path(reference).exists():
         raise ValueError(f"{reference}: no such file, nor a built-in scene (see `hapticrender scenes`)")
-    return Scene.from_toml(reference)
+    scene = Scene.from_toml(reference)
+    if scene.settle > max(scene.duration, Scene.settle):  # the default may be longer than a short scene
+        bound = f"must be <= {scene.duration:g} s, the scene's duration"
+        raise SceneError(f"{reference}: render.settle = {scene.settle:g}: {bound}")
+    return scene
 
 
 def validate(

@@ -15,7 +15,7 @@ import pytest
 from hapticrender.touch.builtin_scenes import builtin_scenes
 from hapticrender.touch.grating import Grating
 from hapticrender.touch.scene import Scene
-from hapticrender.validate import Verdict, counted, exit_status, validate, write_json, write_junit
+from hapticrender.validate import Verdict, counted, exit_status, open_scene, validate, write_json, write_junit
 
 FINE = {"current_bits": 20}  # of 12 bits a finger may feel the rounding at 160 to 200 Hz
 
@@ -46,6 +46,16 @@ def junit(folder, found):
     """The suite that is written in JUnit's format."""
     write_junit(folder / "r.xml", found)
     return ElementTree.parse(folder / "r.xml").getroot().find("testsuite")
+
+
+def test_a_scene_that_settles_for_longer_than_it_lasts_is_refused(tmp_path):
+    """The default of 1 s is nobody's statement: of a shorter scene the last half is judged."""
+    (tmp_path / "a.toml").write_text(replace(SHORT, duration=2.0, settle=2.0).to_toml())
+    (tmp_path / "b.toml").write_text(SHORT.to_toml())
+    assert [open_scene(tmp_path / name).duration for name in ("a.toml", "b.toml")] == [2.0, 0.5]
+    (tmp_path / "a.toml").write_text(replace(SHORT, duration=2.0, settle=2.1).to_toml())
+    with pytest.raises(ValueError, match=r"a.toml: render.settle = 2.1: must be <= 2 s, the scene's duration"):
+        open_scene(tmp_path / "a.toml")
 
 
 @pytest.mark.parametrize("jobs", [1, 2])
