@@ -231,13 +231,14 @@ def _problem(error: BaseException) -> str:
 def _summary(rendering: Rendering, folder: Path | None, tick: Tick | None) -> dict[str, Any]:
     """Run a rendering, whatever its length, and judge it; only what does not pass stays in `folder`."""
     if folder is None:
-        with tempfile.TemporaryDirectory() as scratch:
+        with tempfile.TemporaryDirectory() as scratch, outputs.naming_full(scratch):
             return run(rendering, journal=Path(scratch) / outputs.JOURNAL, progress=tick).summary()
     outputs.refuse_to_overwrite(folder)
-    recording = run(rendering, journal=outputs.begin_outputs(folder, rendering.scene), progress=tick)
-    summary = recording.summary()
-    if not summary["passed"]:
-        return dict(outputs.write_outputs(folder, recording).summary)
+    with outputs.naming_full(folder):
+        recording = run(rendering, journal=outputs.begin_outputs(folder, rendering.scene), progress=tick)
+        summary = recording.summary()
+        if not summary["passed"]:
+            return dict(outputs.write_outputs(folder, recording).summary)
     del recording  # closes its journal
     outputs.remove_outputs(folder)
     return summary
