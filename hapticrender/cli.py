@@ -49,7 +49,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         method = getattr(arguments, "method", None)
         if method not in (None, *defaults.METHODS):
             raise ValueError(f"--method = {method!r}: must be one of {', '.join(defaults.METHODS)}")
-        status = arguments.run(arguments)
+        status = _run(arguments)
         sys.stdout.flush()
         return status
     except BrokenPipeError:  # the reader of our output has closed it, as in `hapticrender scenes | head -1`
@@ -61,6 +61,18 @@ def main(argv: Sequence[str] | None = None) -> int:
         if sys.flags.dev_mode:
             traceback.print_exception(error)
         return verbs.fail(_line(error), 2)
+
+
+def _run(arguments: argparse.Namespace) -> int:
+    """Run a verb; what ends the program within, other than SIGTERM, is an error, whatever status it gives."""
+    try:
+        return arguments.run(arguments)  # type: ignore[no-any-return]
+    except SystemExit as error:
+        from hapticrender.loop import Terminated
+
+        if isinstance(error, Terminated):
+            raise
+        raise HapticError(f"the driver, or what it uses, ended the program: {error!r}") from error
 
 
 def _line(error: Exception) -> str:

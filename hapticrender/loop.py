@@ -209,14 +209,17 @@ def _warm_up(rendering: Rendering) -> None:
         controller.run(np.zeros((block, rendering.driver.sensed_channels)), nothing, nothing)
 
 
+class Terminated(SystemExit):
+    """SIGTERM: ends the process by an exception, so that devices are left at rest."""
+
+
 def _end(number: int, frame: object) -> None:
-    """End the process by an exception, so that devices are left at rest."""
-    raise SystemExit(128 + number)
+    raise Terminated(128 + number)
 
 
 @contextmanager
 def stopped_by_sigterm() -> Iterator[None]:
-    """Turn SIGTERM into SystemExit in the main thread, so that the device is left at rest; may be nested or overlap."""
+    """Turn SIGTERM into `Terminated` in the main thread: devices are left at rest; may be nested or overlap."""
     main = threading.current_thread() is threading.main_thread()
     if not main or signal.getsignal(signal.SIGTERM) not in (signal.SIG_DFL, _end):
         yield

@@ -4,17 +4,22 @@ from __future__ import annotations
 
 import itertools
 import multiprocessing
+import os
 import re
+import signal
 import sys
 import tempfile
+import threading
 import time
 import traceback
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures import Future, ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from contextlib import ExitStack, nullcontext
 from dataclasses import asdict, dataclass, field
 from functools import partial
+from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any, TextIO
 from xml.etree import ElementTree
@@ -23,9 +28,9 @@ from hapticrender import __version__, defaults
 from hapticrender.checks import integer
 from hapticrender.control.methods import method_named
 from hapticrender.devices import SIMULATED, naming_driver
-from hapticrender.errors import HapticError
+from hapticrender.errors import HapticError, SceneError
 from hapticrender.formatting import as_json, printable
-from hapticrender.loop import prepare, run
+from hapticrender.loop import Terminated, prepare, run
 from hapticrender.protocols import Rendering
 from hapticrender.report import outputs
 from hapticrender.report.progress import progress as progress_of
@@ -34,6 +39,7 @@ from hapticrender.touch.builtin_scenes import builtin_scenes
 from hapticrender.touch.scene import Scene, distinct_names
 
 _NO_NAME = re.compile(r"[^\w.-]+|^\.+")
+_LOST = "not finished: one of the processes that render was killed, perhaps for lack of memory (fewer --jobs need less)"
 Tick = Callable[[float, float], None]
 
 
@@ -76,13 +82,20 @@ class Verdict:
 
 
 def open_scene(reference: str | Path) -> Scene:
-    """Read a scene: a built-in one by its name, any other from its TOML file; a ValueError where there is none."""
+    """Read a scene: a built-in one by its name, any other from its TOML file.
+
+    A ValueError where there is none, or where it would settle for longer than the scene lasts.
+    """
     scenes = builtin_scenes()
     if str(reference) in scenes:
         return scenes[str(reference)]
     if not Path(reference).exists():
         raise ValueError(f"{reference}: no such file, nor a built-in scene (see `hapticrender scenes`)")
-    return Scene.from_toml(reference)
+    scene = Scene.from_toml(reference)
+    if scene.settle > max(scene.duration, Scene.settle):  # the default may be longer than a short scene
+        bound = f"must be <= {scene.duration:g} s, the scene's duration"
+        raise SceneError(f"{reference}: render.settle = {scene.settle:g}: {bound}")
+    return scene
 
 
 def validate(
@@ -100,7 +113,7 @@ def validate(
     Scenes may be names of built-in ones or TOML files; one that cannot be rendered, whatever was raised, stops no other
     (``python -X dev`` prints the traceback).  `method` and `seed` (>= 0, of the plants' noise) are by default those of
     each scene.  `driver` is a text as ``--driver`` takes it, made anew for each scene.  `jobs` (>= 1) processes render
-    side by side, on simulated devices.
+    side by side, on simulated devices; where one is killed, what is not finished is an error.
     Files of each scene that does not pass go into a folder of its name in `out`.
 
     Examples
@@ -121,15 +134,45 @@ def validate(
     with ExitStack() as stack:
         calls: list[Callable[[Tick | None], Verdict]] = [partial(judge, *entry) for entry in entries]
         if jobs > 1:
-            pool = ProcessPoolExecutor(jobs, multiprocessing.get_context("spawn"))
-            stack.callback(pool.shutdown, cancel_futures=True)
-            futures = [pool.submit(judge, *entry, None) for entry in entries]
-            calls = [lambda _, future=each: future.result() for each in futures]  # type: ignore[misc]
+            context = multiprocessing.get_context("spawn")
+            watched, alive = context.Pipe(duplex=False)
+            pool = stack.enter_context(ProcessPoolExecutor(jobs, context, _end_with, (watched,)))
+            stack.enter_context(alive)  # closed first, however this ends
+            futures = [pool.submit(_judge_in_pool, judge, *entry) for entry in entries]
+            calls = [partial(_result, *each, judge) for each in zip(futures, entries, strict=True)]
         verdicts = []
         for line, call in zip(shown, calls, strict=True):
             with progress_of(line, progress) if line and progress else nullcontext() as tick:
                 verdicts.append(call(tick))
         return verdicts
+
+
+def _end_with(watched: Connection) -> None:
+    """End this process of a pool, by SIGTERM, as soon as the other end of a pipe is closed: as its owner ends."""
+
+    def watch() -> None:
+        watched.poll(None)
+        os.kill(os.getpid(), signal.SIGTERM)
+
+    threading.Thread(target=watch, daemon=True).start()
+
+
+def _judge_in_pool(judge: Callable[..., Verdict], label: str, scene: Scene | str) -> Verdict:
+    """Judge in a process of a pool; a signal ends the process, where the pool would go on with the next scene."""
+    try:
+        return judge(label, scene, None)
+    except (Terminated, KeyboardInterrupt):
+        os._exit(128 + signal.SIGTERM)
+
+
+def _result(
+    future: Future[Verdict], entry: tuple[str, Scene | str], judge: Callable[..., Verdict], _: Tick | None
+) -> Verdict:
+    """Wait for a verdict of a pool; a killed process breaks the whole pool."""
+    try:
+        return future.result()
+    except BrokenProcessPool:
+        return judge(*entry, None, problem=_LOST)
 
 
 def _read(scenes: Iterable[Scene | str | Path]) -> list[tuple[str, Scene | str]]:
@@ -153,25 +196,31 @@ def _judge(
     seed: int | None,
     driver: str,
     out: Path | None,
+    problem: str = "",
 ) -> Verdict:
-    """Render and judge a scene; `scene` may be why it cannot be read."""
+    """Render and judge a scene; `scene` may be why it cannot be read, `problem` why it cannot be rendered."""
     start, device = time.perf_counter(), ""
-    problem = scene if isinstance(scene, str) else ""
-    if isinstance(scene, Scene):
+    if isinstance(scene, str):
+        problem = scene
+    else:
         device, method = scene.device, method or scene.method
         seed = scene.seed if seed is None else seed
         try:
+            if problem:
+                raise HapticError(problem)
             rendering = prepare(scene, driver=driver, method=method, seed=seed)
             with naming_driver(driver):
                 summary = _summary(rendering, out and out / _NO_NAME.sub("_", label), tick)
             return Verdict.of({**summary, "scene": label}, time.perf_counter() - start)
-        except Exception as error:
+        except Terminated:
+            raise
+        except (Exception, SystemExit) as error:  # a vendor's library may call sys.exit
             problem = _problem(error)
     reason, method = problem.removeprefix(f"{label}: "), method or defaults.METHOD
     return Verdict(scene=label, device=device, method=method, seed=seed or 0, verdict="error", reason=reason)
 
 
-def _problem(error: Exception) -> str:
+def _problem(error: BaseException) -> str:
     """State what was raised: the message alone where it is one of ours, or refuses a value; else its name, too."""
     if sys.flags.dev_mode:
         traceback.print_exception(error)
@@ -182,13 +231,14 @@ def _problem(error: Exception) -> str:
 def _summary(rendering: Rendering, folder: Path | None, tick: Tick | None) -> dict[str, Any]:
     """Run a rendering, whatever its length, and judge it; only what does not pass stays in `folder`."""
     if folder is None:
-        with tempfile.TemporaryDirectory() as scratch:
+        with tempfile.TemporaryDirectory() as scratch, outputs.naming_full(scratch):
             return run(rendering, journal=Path(scratch) / outputs.JOURNAL, progress=tick).summary()
     outputs.refuse_to_overwrite(folder)
-    recording = run(rendering, journal=outputs.begin_outputs(folder, rendering.scene), progress=tick)
-    summary = recording.summary()
-    if not summary["passed"]:
-        return dict(outputs.write_outputs(folder, recording).summary)
+    with outputs.naming_full(folder):
+        recording = run(rendering, journal=outputs.begin_outputs(folder, rendering.scene), progress=tick)
+        summary = recording.summary()
+        if not summary["passed"]:
+            return dict(outputs.write_outputs(folder, recording).summary)
     del recording  # closes its journal
     outputs.remove_outputs(folder)
     return summary

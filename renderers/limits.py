@@ -89,16 +89,19 @@ def check_targets(scene: Scene, model: DeviceModel, bands: Bands, waveform: Wave
             raise ValueError(f"texture.amplitude {verb} {amplitude:.3g} {unit}: must be <= {most:g} {unit}, {whose}")
     peak_drive = scene.device_profile.limits.peak_drive or math.inf
     each = " in each coil" if drive_unit == "A" else ""
-    own = ", [limits] peak_drive" if 0.0 <= peak_drive - model.drive_limit <= model.drive_step else ""
+    bound, own, step = model.drive_limit, "", model.drive_step
+    if 0.0 <= peak_drive - bound <= step:
+        down = f", rounded down to a multiple of the converter's step of {step:.3g} {drive_unit}" if step else ""
+        bound, own = peak_drive, f", [limits] peak_drive{down}"
     over = f" over {model.rms_time:g} s, [limits] rms_drive"
-    for drive, most, kind, whose in (
-        (need.drive, model.drive_limit, "", each + own),
-        (need.rms, model.rms_limit, " rms", each + over),
+    for drive, most, stated, kind, whose in (
+        (need.drive, model.drive_limit, bound, "", each + own),
+        (need.rms, model.rms_limit, model.rms_limit, " rms", each + over),
     ):
         if drive > most:
             needs = f"at {need.frequency:.3g} Hz needs {drive:.3g} {drive_unit}{kind}"
-            bound = f"must be <= {most:g} {drive_unit}{kind}{whose}"
-            raise ValueError(f"texture.amplitude {verb} {need.worst:.3g} {unit} {needs}: {bound}")
+            must = f"must be <= {stated:g} {drive_unit}{kind}{whose}"
+            raise ValueError(f"texture.amplitude {verb} {need.worst:.3g} {unit} {needs}: {must}")
 
 
 class Need(NamedTuple):

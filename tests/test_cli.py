@@ -152,6 +152,15 @@ def test_what_a_driver_raises_is_one_line_with_its_name(run, tiny, tmp_path, mon
     assert (status, errors[-1]) == (2, "hapticrender: other_plate:OtherPlate: KeyError: 'usb'")
 
 
+@pytest.mark.parametrize("verb", ["render {tiny} --out {out}", "play {tiny}", "identify"])
+@pytest.mark.parametrize("method", ["__enter__", "play"])
+def test_a_driver_that_ends_the_program_is_an_error(run, tiny, tmp_path, monkeypatch, verb, method):
+    monkeypatch.setattr(OtherPlate, method, lambda *_: sys.exit(0))
+    status, _, errors = run(*verb.format(tiny=tiny, out=tmp_path).split(), "--driver", "other_plate:OtherPlate")
+    ended = "hapticrender: the driver, or what it uses, ended the program: SystemExit(0)"
+    assert (status, errors[-1]) == (2, ended)
+
+
 def test_python_in_development_mode_shows_the_traceback():
     command = [sys.executable, "-X", "dev", "-m", "hapticrender", "render", "a", "--out", "b", "--method", "magic"]
     assert "Traceback" in subprocess.run(command, capture_output=True, text=True, check=False).stderr
@@ -286,18 +295,20 @@ def test_bad_arguments_get_one_line_and_nothing_is_written(run, tiny, tmp_path, 
     assert tiny.read_text() == TINY
 
 
-def test_a_full_disk_gets_one_line(tmp_path, tiny):
+@pytest.mark.parametrize(("verb", "folder"), [("render", "out"), ("validate", "out/tiny")])
+def test_a_full_disk_gets_one_line_with_the_folder(tmp_path, tiny, verb, folder):
     resource = pytest.importorskip("resource", reason="this system cannot limit the size of files")
     tiny.write_text(TINY.replace("duration = 0.1", "duration = 60.0"))
     limit = 500_000  # bytes a file may have
     limited = {"preexec_fn": lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))}
-    with process("render", tiny, "--out", tmp_path / "out", **limited) as child:
+    with process(verb, tiny, "--out", tmp_path / "out", **limited) as child:
         _, errors = child.communicate(timeout=60)
     assert child.returncode == 2
-    (line,) = [line for line in errors.splitlines() if not line.startswith("compiling")]
+    (line,) = [line for line in errors.splitlines() if not line.startswith(("compiling", "1/1"))]
     assert line.startswith("hapticrender: ")
     assert "File too large" in line
-    assert 0 < len(Recording.load(tmp_path / "out" / "recording.au"))
+    assert str(tmp_path / folder) in line
+    assert 0 < len(Recording.load(tmp_path / folder / "recording.au"))
 
 
 def test_a_closed_pipe_is_no_error():

@@ -167,6 +167,15 @@ def test_single_samples_beyond_the_displacement_are_no_motion(count, stops):
 SLIDING = hr.Finger.sliding(speed=0.08, normal_load=0.5)
 
 
+@pytest.mark.parametrize("bits", [12, 0])
+def test_a_limit_that_is_refused_is_the_one_that_was_stated(bits):
+    """12 bits over +- 3 A are steps of 1.46 mA: 1 mA leaves none of them."""
+    with pytest.raises(ValueError, match=r"must be <= 0.001 A in each coil, \[limits\] peak_drive") as refused:
+        hr.prepare(replace(scene(72.0, limits={"peak_drive": 0.001}), profile={"current_bits": bits}))
+    step = ", rounded down to a multiple of the converter's step of 0.00146 A"
+    assert str(refused.value).endswith(step if bits else "peak_drive")
+
+
 def friction(device, **limits):
     texture = hr.Grating(frequency=100.0, amplitude=20e-6)
     return hr.Scene(texture=texture, finger=SLIDING, device=device, duration=0.1, limits=limits)

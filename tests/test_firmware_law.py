@@ -1,6 +1,7 @@
 """The control law in C against the library's kernel, on the simulated plate, and under sanitisers."""
 
 import subprocess
+from contextlib import nullcontext
 from dataclasses import replace
 
 import numpy as np
@@ -265,6 +266,16 @@ def test_sanitisers_find_nothing_whatever_the_inputs_are(exports, kind):
     program = compile_c(folder / f"inputs-{kind}", files, *SANITISED, KINDS[kind], f"-I{folder}")
     done = subprocess.run([program], capture_output=True, text=True, check=False)
     assert (done.returncode, done.stdout, done.stderr) == (0, "60000\n", "")
+
+
+@pytest.mark.parametrize("option", ["-ffast-math", "-Ofast", "-ffinite-math-only", "-O3"])
+def test_options_that_rule_nan_out_are_refused(exports, option, capfd):
+    """`-ffinite-math-only` made the first drive NaN."""
+    exports.law("tones", "float")
+    folder, refused = exports.folder / "tones", option != "-O3"
+    with pytest.raises(subprocess.CalledProcessError) if refused else nullcontext():
+        compile_c(folder / "law.o", [folder / "law.c"], option, "-c")
+    assert ("a lifted finger is NaN" in capfd.readouterr().err) == refused
 
 
 CAREFUL = "-Wconversion -Wshadow -Wcast-qual -Wundef -Wstrict-prototypes -Wmissing-prototypes -Wvla".split()

@@ -144,6 +144,7 @@ REFUSED = [  # text of GOOD, what stands there instead, message
     ('motion = "sliding"\nspeed = 0.08', 'motion = "none"', r"finger.motion = 'none': a texture over position needs"),
     ("mass = 0.035", "mass = nan", r"profile.mass = nan: must be a finite number"),
     ("[device]", "[plant]", r"plant = .*: must be three tables: \[device\], \[simulation\].*\[render\]"),
+    ("tolerance = 0.05", "tolerance = 5.0", r"tolerance = 5.0: must be .* > 0 and <= 1 \(a share: 0.05 is 5 %\)"),
     ("duration = 2.0", "duration = 2.0\ntolerance = 0.1", r"tolerance = 0.1: must be in the table \[render\]"),
     (GOOD, 'duration = 1.0\ndevice = "vt-plate"', r"device = 'vt-plate': must be a table: \[device\] with kind ="),
 ]
@@ -156,6 +157,10 @@ def test_a_malformed_scene_is_refused_in_one_line(good, bad, message):
     with pytest.raises(SceneError, match=f"^scene.toml: ({message})") as refused:
         Scene.from_toml_text(GOOD.replace(good, bad), "scene.toml")
     assert len(str(refused.value).splitlines()) == 1
+
+
+def test_a_tolerance_may_be_the_whole_amplitude():
+    assert Scene.from_toml_text(GOOD.replace("tolerance = 0.05", "tolerance = 1.0")).tolerance == 1.0
 
 
 def test_a_byte_order_mark_is_no_part_of_a_file(tmp_path):

@@ -1,9 +1,13 @@
 """Verdicts, and the reports that machines read."""
 
 import json
+import os
 import re
+import signal
+import subprocess
 import sys
 from dataclasses import replace
+from pathlib import Path
 from xml.etree import ElementTree
 
 import pytest
@@ -11,7 +15,7 @@ import pytest
 from hapticrender.touch.builtin_scenes import builtin_scenes
 from hapticrender.touch.grating import Grating
 from hapticrender.touch.scene import Scene
-from hapticrender.validate import Verdict, counted, exit_status, validate, write_json, write_junit
+from hapticrender.validate import Verdict, counted, exit_status, open_scene, validate, write_json, write_junit
 
 FINE = {"current_bits": 20}  # of 12 bits a finger may feel the rounding at 160 to 200 Hz
 
@@ -44,6 +48,16 @@ def junit(folder, found):
     return ElementTree.parse(folder / "r.xml").getroot().find("testsuite")
 
 
+def test_a_scene_that_settles_for_longer_than_it_lasts_is_refused(tmp_path):
+    """The default of 1 s is nobody's statement: of a shorter scene the last half is judged."""
+    (tmp_path / "a.toml").write_text(replace(SHORT, duration=2.0, settle=2.0).to_toml())
+    (tmp_path / "b.toml").write_text(SHORT.to_toml())
+    assert [open_scene(tmp_path / name).duration for name in ("a.toml", "b.toml")] == [2.0, 0.5]
+    (tmp_path / "a.toml").write_text(replace(SHORT, duration=2.0, settle=2.1).to_toml())
+    with pytest.raises(ValueError, match=r"a.toml: render.settle = 2.1: must be <= 2 s, the scene's duration"):
+        open_scene(tmp_path / "a.toml")
+
+
 @pytest.mark.parametrize("jobs", [1, 2])
 def test_a_bad_scene_stops_no_other(tmp_path, capsys, jobs):
     bad = tmp_path / "bad.toml"
@@ -65,25 +79,69 @@ def test_a_bad_scene_stops_no_other(tmp_path, capsys, jobs):
 
 
 FAULTY = """
+import sys
 from other_plate import OtherPlate
 made = []
 class Gone(OtherPlate):
     def play(self, drive):
         raise OSError("usb gone")
+class Exits(OtherPlate):
+    def play(self, drive):
+        sys.exit(0)
 def driver():
     made.append(1)
-    return [lambda: {}["x"], Gone, OtherPlate][len(made) - 1]()
+    return [lambda: {}["x"], Gone, Exits, lambda: sys.exit(3), OtherPlate][len(made) - 1]()
 """
 
 
 def test_whatever_a_driver_raises_is_the_error_of_that_scene(tmp_path, monkeypatch):
     (tmp_path / "faulty_driver.py").write_text(FAULTY)
     monkeypatch.syspath_prepend(tmp_path)
-    found = validate([SHORT] * 3, driver="faulty_driver:driver")
-    assert [verdict.verdict for verdict in found] == ["error", "error", "passed"]
+    found = validate([SHORT] * 5, driver="faulty_driver:driver")
+    assert [verdict.verdict for verdict in found] == ["error"] * 4 + ["passed"]
+    assert [verdict.reason for verdict in found[2:4]] == ["SystemExit: 0", "SystemExit: 3"]
     assert [verdict.reason for verdict in found[:2]] == [
         f"faulty_driver:driver: {problem}" for problem in ("KeyError: 'x'", "OSError: usb gone")
     ]
+
+
+DISTURBED = """
+import multiprocessing, os, signal, sys, threading, time
+from pathlib import Path
+from hapticrender.cli import main
+def disturb():
+    while len(list(Path(os.environ["TMPDIR"]).glob("*/recording.au"))) < 2:
+        time.sleep(0.02)
+    {}
+threading.Thread(target=disturb, daemon=True).start()
+sys.exit(main(["validate", *sys.argv[1:], "--jobs", "2", "--json", "r.json"]))
+"""
+ENDS = {  # what happens while two scenes render: exit status, journals that stay behind
+    "multiprocessing.active_children()[0].kill()": (2, 1),
+    "os.kill(os.getpid(), signal.SIGTERM)": (-signal.SIGTERM, 0),
+    "os.kill(os.getpid(), signal.SIGINT)": (130, 0),
+}
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no such signals on this system")
+@pytest.mark.parametrize("event", ENDS)
+def test_a_signal_leaves_no_process_behind_and_a_killed_one_is_an_error(tmp_path, event):
+    """Pipes stay open as long as any process has them: `run` returns when all have ended."""
+    (tmp_path / "long.toml").write_text(replace(SHORT, duration=20000.0).to_toml())
+    (tmp_path / "bad.toml").write_text("")
+    command = [sys.executable, "-c", DISTURBED.format(event), "bad.toml", "long.toml", "long.toml", "long.toml"]
+    paths = {"TMPDIR": str(tmp_path), "PYTHONPATH": str(Path(__file__).resolve().parent.parent)}
+    ended = subprocess.run(
+        command, capture_output=True, text=True, check=False, timeout=120, env=os.environ | paths, cwd=tmp_path
+    )
+    status, left = ENDS[event]
+    assert ended.returncode == status, ended.stderr
+    assert len(list(tmp_path.glob("*/recording.au"))) == left
+    if status == 2:
+        report = json.loads((tmp_path / "r.json").read_text(encoding="utf-8"))["scenes"]
+        assert ["was killed" in scene["reason"] for scene in report] == [False, True, True, True]
+        assert {(scene["verdict"], scene["device"]) for scene in report[1:]} == {("error", "vt-plate")}
+        assert "4 scenes: 4 not rendered" in ended.stdout
 
 
 @pytest.mark.parametrize(("kind", "tag"), [("not judged", "skipped"), ("passed in band", "system-out")])

@@ -4,6 +4,10 @@
 
 #include <math.h>
 
+#if defined(__FINITE_MATH_ONLY__) && __FINITE_MATH_ONLY__
+#error "a lifted finger is NaN here: compile without -ffast-math, -Ofast and -ffinite-math-only"
+#endif
+
 #ifdef REAL_DOUBLE
 typedef double real_t;
 #define REAL(number) number

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import errno
 import os
-from collections.abc import Callable, Mapping
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -72,12 +73,24 @@ def refuse_to_overwrite(folder: Path, source: Path | None = None) -> None:
             raise ValueError(f"{str(present[0])!r}: {cure}") from None
 
 
+@contextmanager
+def naming_full(folder: str | Path) -> Iterator[None]:
+    """Name `folder` in the error of a disk that is full, which has no name of its own."""
+    try:
+        yield
+    except OSError as error:
+        if error.errno in (errno.ENOSPC, errno.EFBIG, errno.EDQUOT) and error.filename is None:
+            error.filename = str(folder)
+        raise
+
+
 def run_into(folder: Path, rendering: Rendering, *, progress: Callable[[float, float], None] | None = None) -> Outputs:
     """Run a prepared `rendering` and write everything about it into `folder`, which is made where it is not there.
 
     Files of an earlier run are removed first, so that all files are of this run, also after an interruption.
     """
-    return write_outputs(folder, run(rendering, journal=begin_outputs(folder, rendering.scene), progress=progress))
+    with naming_full(folder):
+        return write_outputs(folder, run(rendering, journal=begin_outputs(folder, rendering.scene), progress=progress))
 
 
 def begin_outputs(folder: Path, scene: Scene) -> Path:

@@ -127,8 +127,8 @@ class Scene(Validated):
     method : str
         Name of the control method.
     tolerance : float
-        Relative amplitude error to be judged by, > 0 and <= 10.  The default of 0.1 lies under every just noticeable
-        difference (2.2 dB of amplitude, Israr et al. 2006).
+        Relative amplitude error to be judged by, > 0 and <= 1 (0.05 is 5 %).  The default of 0.1 lies under every just
+        noticeable difference (2.2 dB of amplitude, Israr et al. 2006).
     settle : float, s
         Left out of the judgement at the beginning, >= 0; of a scene shorter than twice this the last half is judged.
     keep_unfelt : bool
@@ -161,7 +161,7 @@ class Scene(Validated):
     touch_panel: Mapping[str, Value] = mapping(_read_table)
     duration: float = parameter(unit="s", above=0, most=LONGEST_TIME)
     method: str = checked(checks.name, defaults.METHOD)
-    tolerance: float = parameter(0.1, above=0, most=10)
+    tolerance: float = parameter(0.1, "(a share: 0.05 is 5 %)", above=0, most=1)
     settle: float = parameter(1.0, "s", most=LONGEST_TIME)
     keep_unfelt: bool = checked(checks.flag, False)
     gradient: float = parameter(0.0, "1/m", least=-1e3, most=1e3)
