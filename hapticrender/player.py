@@ -149,6 +149,8 @@ class Player:
             last.callback(self._rest, kind is None)
         if kind is None and self._error is not None and not self._raised:
             raise self._error
+        if kind is None and self._error is None and (slow := getattr(self._loop, "slow", "")):
+            raise HapticError(slow)
 
     @property
     def time(self) -> float:
@@ -386,7 +388,7 @@ class Player:
         elif self._paced:
             self._run(self._drive_device, device)
         if self._paced:
-            self._run(self._serve, device)
+            self._run(self._serve, device, lambda: getattr(loop, "computing", ""))
         return renderings
 
     def _hand_finger(self, rendering: Rendering) -> None:
@@ -398,7 +400,7 @@ class Player:
             for part in (plant, getattr(plant, "screen", plant)):
                 part.finger = live
 
-    def _run(self, target: Callable[[], None], device: object) -> None:
+    def _run(self, target: Callable[[], None], device: object, busy: Callable[[], str] = str) -> None:
         """Run `target` in a thread until the player stops; what it raises is kept for the application."""
 
         def failed(error: BaseException) -> None:
@@ -410,7 +412,7 @@ class Player:
                 if not self._clocked:
                     play_zeros(loop.driver)
 
-        self._stack.callback(self._threads.end, self._threads.start(target, failed), device, self._patience)
+        self._stack.callback(self._threads.end, self._threads.start(target, failed), device, self._patience, busy)
 
     def _drive_device(self) -> None:
         hold_to_clock(self._playing("play"), self._block, self._stopping)
@@ -426,14 +428,21 @@ class Player:
             self._block()
         with self._lock:
             self._go_on()
+            self._playing("sleep").fill()
             self._service()
 
     def _serve(self) -> None:
         while not self._stopping.wait(POINTING):
+            loop = self._playing("play")
+            due = time.monotonic() - self._served >= (SERVICE if isinstance(loop, LiveLoop) else POINTING)
+            if due and isinstance(loop, LiveLoop):
+                loop.fill_some()  # which may take long: others go on meanwhile
             with self._lock:
+                if self._stopping.is_set():
+                    return
                 self._point()
                 self._go_on()
-                if time.monotonic() - self._served >= (SERVICE if isinstance(self._loop, LiveLoop) else POINTING):
+                if due:
                     self._served = time.monotonic()
                     self._service()
 
@@ -446,9 +455,10 @@ class Player:
             loop.finger(here, float(np.nan_to_num((there - here) / INSTANT)), load)
 
     def _service(self) -> None:
-        """Compute what comes next, record what was, see whether the device or the application has stopped."""
+        """Record what was, see whether the device or the application has stopped."""
         loop = self._playing("play")
-        loop.fill()
+        if not isinstance(loop, LiveLoop):
+            loop.fill()  # says whether a board is there
         if hasattr(loop.rendering.device, "check"):
             loop.rendering.device.check()  # one that calls back cannot say that it is gone
         first, signals = loop.signals(self._recorded)
