@@ -54,6 +54,7 @@ UPDATES = 0.2  # s: two positions within this time show a velocity
 END_FADE = 0.05  # s: five time constants of the gain; and the longest that zeros are waited for
 LEAST_PART = 2 * SERVICE  # s: of a playlist whose parts are taken up one by one
 POINTING, INSTANT = 0.01, 1e-4  # s between two positions of a scene's finger; over which its velocity is found
+OPEN: set[int] = set()  # identities of the devices that players have open
 PATIENCE = 5.0  # s without a sample, after which `sleep` gives a device up
 
 
@@ -367,6 +368,10 @@ class Player:
         scales = {name: getattr(device, name) for name in ("sensed_scale", "drive_scale")} if calls_back else {}
         loop: Any = device.loop(rendering) if own else LiveLoop(rendering, **scales)
         self._hand_finger(rendering)
+        if id(device) in OPEN:
+            raise ValueError(f"driver: {type(device).__name__} is already open in another Player: close that one first")
+        OPEN.add(id(device))
+        stack.callback(OPEN.discard, id(device))
         stack.enter_context(stopped_by_sigterm())
         rendering.driver.__enter__()
         stack.push(lambda *error: None if self._threads.hanging.is_set() else rendering.driver.__exit__(*error))
