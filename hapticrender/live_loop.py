@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import math
+import time
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
+from hapticrender import sampled_texture
 from hapticrender.analysis.two_touches import TouchWatch
 from hapticrender.bands import Bands
 from hapticrender.control.combined import CombinedBands, CombinedController, CombinedModel
@@ -17,7 +19,7 @@ from hapticrender.control.supervisor import FADE_OUT, SupervisedController, desi
 from hapticrender.driver_checks import check_sensed
 from hapticrender.errors import HapticError, WatchdogTimeout
 from hapticrender.inferred import ContactLag
-from hapticrender.loop import device_fault, motion_of_sensors, stops_itself
+from hapticrender.loop import device_fault, motion_of_sensors, samples_late, stops_itself
 from hapticrender.protocols import Array, Controller, Flag, Rendering
 from hapticrender.realtime_entry import RealtimeEntry
 from hapticrender.realtime_kernel import HORIZON
@@ -25,6 +27,7 @@ from hapticrender.sampled_texture import FADE, SampledTexture
 
 JUDGED = 0.25  # s: of signal that figures are of
 DEVICE = ("driver", "device", "plant")  # of a rendering: they stay where its texture changes
+PIECE, SPELL = 0.25, 0.5  # s: of a texture, computed at once; after which other work has its turn
 RIDGE = 1e-4  # of the samples: bands that the time cannot tell apart share what there is, and do not blow up
 LEAST_TARGET = 1e-12  # in the device's unit: a smaller one has no error
 
@@ -78,6 +81,8 @@ class LiveLoop(RealtimeEntry):
         self._itself = False  # whether it has stopped itself
         self._drive = np.zeros((self.driver.block, self.driver.drive_channels))
         self._device: Any = rendering.driver if rendering.plant is None else rendering.plant
+        self._began = math.nan  # s: computing a piece of a texture
+        self.slow = ""  # what to say of a texture that has run out as it takes longer than it lasts
         self._reshaping: tuple[Any, Any, int] | None = None  # before the device: from, to, since (sample)
         self._reshaped: tuple[Any, Any, int] | None = None  # the one that is done
         own = rendering.plant is not None
@@ -106,6 +111,31 @@ class LiveLoop(RealtimeEntry):
         self._touches.slow()
         self._reshape()
         self._drive = self.process(sensed.sensed, sensed.position if sensing else None, flags)
+
+    def fill_some(self) -> None:
+        """As `fill`, for `SPELL` at most; what is past by then is left out."""
+        rate, ahead, until = self.driver.rate, sampled_texture.AHEAD, time.monotonic() + SPELL
+        playing = [int(self._entry[name][0]) for name in ("current", "previous")]
+        for texture in [each for each in self._textures if each.address in playing and each.record["length"][0]]:
+            while time.monotonic() < until:
+                now = self.samples + self.ahead - int(texture.record["begun"][0])
+                written = max(int(texture.record["written"][0]), now)
+                if written >= now + round(ahead * rate):
+                    break
+                texture.record["written"], self._began = written, time.monotonic()
+                texture.fill(min(now, written + round((PIECE - ahead) * rate)))
+                if self.samples + self.ahead - int(texture.record["begun"][0]) > written + PIECE * rate:
+                    self.slow = self.computing
+                self._began = math.nan
+
+    @property
+    def computing(self) -> str:
+        """What to say of the texture that is being computed and takes longer than it lasts; empty: there is none."""
+        took, name = time.monotonic() - self._began, type(self.rendering.scene.texture).__name__
+        if not took > PIECE:
+            return ""
+        slow = f"{PIECE:g} s of it took {took:.3g} s to compute, {took / PIECE:.3g} times as long as it lasts"
+        return f"{name}: {slow}: it was not played to its end: compute it before play begins"
 
     def _reshape(self) -> None:
         """Take the characteristic before the device over to that of the present texture, while it fades in."""
@@ -155,14 +185,16 @@ class LiveLoop(RealtimeEntry):
             first, found = first + skip, {name: signal[rows] for name, signal in found.items()}
         if self.model.finger.needs_contact:  # as `Rendering.requested`
             found["reference"] = np.where(np.isnan(found["position"]), 0.0, found["reference"])
-        count = len(found["flags"])
+        by_sensors, sensed = not self._has_motion and found["sensed"].shape[1] > 0, found["sensed"]
+        count = max(len(sensed) - (samples_late(self.model) if by_sensors else 0), 0)
+        found = {name: signal[:count] for name, signal in found.items()}
         true = self._true[(first + np.arange(count)) % len(self._true)]
         found["normal_load"] = np.where(np.isnan(true[:, -1]), found["normal_load"], true[:, -1])
         motion = true[:, :-1]  # NaN where nothing is sensed
-        if not self._has_motion and found["sensed"].shape[1]:
+        if by_sensors:
             follows = first == self._followed
             contact = self._contact if follows else ContactLag(self.model.contact_lag)
-            motion = motion_of_sensors(self.model, found["sensed"], found["position"], contact)
+            motion = motion_of_sensors(self.model, sensed, found["position"], contact)
             if first >= self._followed:
                 self._contact, self._followed = contact, first + count
         return first, found | {"motion": motion, "target": np.zeros((count, 0), complex)}

@@ -6,7 +6,7 @@ import threading
 import time
 from collections.abc import Callable
 
-from hapticrender.errors import DriverError
+from hapticrender.errors import DriverError, HapticError
 from hapticrender.live_loop import LiveLoop
 
 NAP, LATE = 2e-3, 0.1  # s: shorter waits are not slept; so late the clock starts anew
@@ -32,17 +32,21 @@ class LiveThreads:
         thread.start()
         return thread
 
-    def end(self, thread: threading.Thread, device: object, patience: float) -> None:
+    def end(self, thread: threading.Thread, device: object, patience: float, busy: Callable[[], str]) -> None:
         """Stop all threads and wait for one, which may be in `play` of the device.
 
         Raises
         ------
+        HapticError
+            It has not ended within `patience` (s), and is `busy` with what that says.
         DriverError
             It has not ended within `patience` (s).
         """
         self.stopping.set()
         thread.join(patience)
         if thread.is_alive():
+            if trouble := busy():
+                raise HapticError(trouble)
             self.hanging.set()
             trouble = f"its driver has not returned for {patience:.3g} s: zero drive could not be played"
             raise DriverError(f"{device}: {trouble}: switch the device off")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import math
 import os
 import signal
 import threading
@@ -130,17 +131,27 @@ def run(rendering: Rendering, *, journal: str | Path | None = None, progress: Pr
     """
     driver, total = rendering.driver, rendering.samples
     recorder = recorder_of(rendering, journal, requested=rendering.requested)
+
+    def keep(signals: dict[str, Any]) -> None:
+        if len(signals["flags"]):
+            recorder.append(**signals)
+
     with recorder, stopped_by_sigterm(), driver, zero_drive_after(rendering.device):
         if rendering.probe:
             probe_plate(rendering.device, rendering.model)
-        loop = _Loop(rendering)
-        for start in range(0, total, loop.step):
-            recorder.append(**loop.advance(start, min(loop.step, total - start)))
-            if fault := loop.fault(start):
-                fault.recording = recorder.finish()
-                raise fault
-            if progress is not None:
-                progress(min(start + loop.step, total) / driver.rate, total / driver.rate)
+        loop, fault = _Loop(rendering), None
+        try:
+            for start in range(0, total, loop.step):
+                keep(loop.advance(start, min(loop.step, total - start)))
+                if fault := loop.fault(start):
+                    break
+                if progress is not None:
+                    progress(min(start + loop.step, total) / driver.rate, total / driver.rate)
+        finally:
+            keep(loop.rest())
+        if fault:
+            fault.recording = recorder.finish()
+            raise fault
     recording = recorder.finish()
     _compare(rendering, loop.controller, recording)
     return recording
@@ -184,10 +195,22 @@ def stops_itself(sensed: Sensed, controller: Any) -> bool:
     )
 
 
+def samples_late(model: DeviceModel) -> int:
+    """Samples after which the sensors have shown the motion of a sample."""
+    return math.ceil(max(model.sensor_delay, 0.0) * model.rate)
+
+
 def motion_of_sensors(model: DeviceModel, sensed: Array, position: Array, contact: ContactLag) -> Array:
-    """Motion at the evaluation points, shape (n, places), by the sensors; friction is inferred behind `contact`."""
+    """Motion at the evaluation points at the n samples of `position`, shape (n, places), by the sensors.
+
+    They show it `sensor_delay` later, so that `sensed` goes on for `samples_late`.  Between samples it is on a line,
+    too small by w^2 T^2/8 at most; friction is inferred behind `contact`.
+    """
     with np.errstate(invalid="ignore"):  # a faulty sensor is the controller's to flag
         motion = sensed @ model.place_from_sensed.T
+        if len(position) and samples_late(model):
+            at, shown = np.arange(len(position)) + model.sensor_delay * model.rate, np.arange(len(sensed))
+            motion = np.stack([np.interp(at, shown, each) for each in motion.T], axis=1)
         return contact.run(motion, position) if model.inferred else motion
 
 
@@ -272,6 +295,7 @@ class _Loop:
         self._predict = PositionPredictor(driver.rate, self._ahead)
         self._touches = TouchWatch(rendering.model, self.controller, active=rendering.plant is None)
         self._contact = ContactLag(rendering.model.contact_lag)
+        self._held: dict[str, Array] = {"flags": np.zeros(0, int)}  # of samples that sensors have not shown yet
         self._stopped, self._itself = -1, False  # sample from which on the drive fades out; whether by the device
         self._drive = np.zeros((driver.block, driver.drive_channels))
 
@@ -285,11 +309,21 @@ class _Loop:
         finger = self.rendering.scene.finger
         position = finger.position(time) if sensed.position is None else sensed.position
         load = finger.load(time) if sensed.normal_load is None else sensed.normal_load
-        motion, source = self._motion(sensed, position)
-        signals = {"drive": drive, "sensed": values, "motion": motion, "position": position, "normal_load": load}
+        signals = {"drive": drive, "sensed": values, "position": position, "normal_load": load}
         signals |= {"target": target, "flags": flags}
         signals["flags"] = self._touches.update(signals)
-        return {"motion_source": source} | {name: signal[:count] for name, signal in signals.items()}
+        return self._due(
+            {name: signal[:count] for name, signal in signals.items()},
+            None if sensed.motion is None else sensed.motion[:count],
+        )
+
+    def rest(self) -> dict[str, Any]:
+        """Signals of the samples that are held back for their motion, at the end."""
+        held, late = self._held, samples_late(self.rendering.model)
+        if not len(held["flags"]):
+            return held
+        on = np.pad(held["sensed"], ((0, late), (0, 0)), "reflect", reflect_type="odd")  # goes on as it came
+        return held | self._by_sensors(held | {"sensed": on}, len(held["flags"]))
 
     def fault(self, start: int) -> DeviceFault | None:
         """Return why the drive was stopped, once it has faded out in the samples from `start` on."""
@@ -319,15 +353,27 @@ class _Loop:
     def _time(self, count: int) -> Array:
         return (self._start + np.arange(count)) / self.rendering.driver.rate
 
-    def _motion(self, sensed: Sensed, position: Array) -> tuple[Array, str]:
-        """Motion at the evaluation points, and its source: the device itself, its sensors, or none (NaN)."""
-        model, values = self.rendering.model, sensed.sensed
-        if sensed.motion is not None:
-            return sensed.motion, getattr(self.rendering.driver, "motion_source", "true")
-        if not values.shape[1]:
-            return np.full((len(values), len(model.places)), np.nan), "unknown"
-        motion = motion_of_sensors(model, values, position, self._contact)
-        return motion, "inferred" if model.inferred else "sensors"
+    def _due(self, signals: dict[str, Array], motion: Array | None) -> dict[str, Any]:
+        """Signals of all samples whose motion is known, with it and its source: device, sensors, or none (NaN)."""
+        if len(self._held["flags"]):
+            signals = {name: np.concatenate([self._held[name], signal]) for name, signal in signals.items()}
+        count, model = len(signals["flags"]), self.rendering.model
+        found: dict[str, Any] = {"motion_source": getattr(self.rendering.driver, "motion_source", "true")}
+        if motion is not None:  # the first of it holds for what was held back before
+            found["motion"] = np.concatenate([np.repeat(motion[:1], count - len(motion), axis=0), motion])
+        elif not signals["sensed"].shape[1]:
+            found = {"motion": np.full((count, len(model.places)), np.nan), "motion_source": "unknown"}
+        else:
+            count = max(count - samples_late(model), 0)
+            found = self._by_sensors(signals, count)
+        self._held = {name: signal[count:] for name, signal in signals.items()}
+        return {name: signal[:count] for name, signal in signals.items()} | found
+
+    def _by_sensors(self, signals: dict[str, Array], count: int) -> dict[str, Any]:
+        """Motion of the first `count` samples by the sensors, and its source."""
+        model = self.rendering.model
+        motion = motion_of_sensors(model, signals["sensed"], signals["position"][:count], self._contact)
+        return {"motion": motion, "motion_source": "inferred" if model.inferred else "sensors"}
 
 
 def _compare(rendering: Rendering, controller: Controller, recording: Recording) -> None:

@@ -54,6 +54,7 @@ UPDATES = 0.2  # s: two positions within this time show a velocity
 END_FADE = 0.05  # s: five time constants of the gain; and the longest that zeros are waited for
 LEAST_PART = 2 * SERVICE  # s: of a playlist whose parts are taken up one by one
 POINTING, INSTANT = 0.01, 1e-4  # s between two positions of a scene's finger; over which its velocity is found
+OPEN: set[int] = set()  # identities of the devices that players have open
 PATIENCE = 5.0  # s without a sample, after which `sleep` gives a device up
 
 
@@ -149,6 +150,8 @@ class Player:
             last.callback(self._rest, kind is None)
         if kind is None and self._error is not None and not self._raised:
             raise self._error
+        if kind is None and self._error is None and (slow := getattr(self._loop, "slow", "")):
+            raise HapticError(slow)
 
     @property
     def time(self) -> float:
@@ -365,6 +368,10 @@ class Player:
         scales = {name: getattr(device, name) for name in ("sensed_scale", "drive_scale")} if calls_back else {}
         loop: Any = device.loop(rendering) if own else LiveLoop(rendering, **scales)
         self._hand_finger(rendering)
+        if id(device) in OPEN:
+            raise ValueError(f"driver: {type(device).__name__} is already open in another Player: close that one first")
+        OPEN.add(id(device))
+        stack.callback(OPEN.discard, id(device))
         stack.enter_context(stopped_by_sigterm())
         rendering.driver.__enter__()
         stack.push(lambda *error: None if self._threads.hanging.is_set() else rendering.driver.__exit__(*error))
@@ -386,7 +393,7 @@ class Player:
         elif self._paced:
             self._run(self._drive_device, device)
         if self._paced:
-            self._run(self._serve, device)
+            self._run(self._serve, device, lambda: getattr(loop, "computing", ""))
         return renderings
 
     def _hand_finger(self, rendering: Rendering) -> None:
@@ -398,7 +405,7 @@ class Player:
             for part in (plant, getattr(plant, "screen", plant)):
                 part.finger = live
 
-    def _run(self, target: Callable[[], None], device: object) -> None:
+    def _run(self, target: Callable[[], None], device: object, busy: Callable[[], str] = str) -> None:
         """Run `target` in a thread until the player stops; what it raises is kept for the application."""
 
         def failed(error: BaseException) -> None:
@@ -410,7 +417,7 @@ class Player:
                 if not self._clocked:
                     play_zeros(loop.driver)
 
-        self._stack.callback(self._threads.end, self._threads.start(target, failed), device, self._patience)
+        self._stack.callback(self._threads.end, self._threads.start(target, failed), device, self._patience, busy)
 
     def _drive_device(self) -> None:
         hold_to_clock(self._playing("play"), self._block, self._stopping)
@@ -426,14 +433,21 @@ class Player:
             self._block()
         with self._lock:
             self._go_on()
+            self._playing("sleep").fill()
             self._service()
 
     def _serve(self) -> None:
         while not self._stopping.wait(POINTING):
+            loop = self._playing("play")
+            due = time.monotonic() - self._served >= (SERVICE if isinstance(loop, LiveLoop) else POINTING)
+            if due and isinstance(loop, LiveLoop):
+                loop.fill_some()  # which may take long: others go on meanwhile
             with self._lock:
+                if self._stopping.is_set():
+                    return
                 self._point()
                 self._go_on()
-                if time.monotonic() - self._served >= (SERVICE if isinstance(self._loop, LiveLoop) else POINTING):
+                if due:
                     self._served = time.monotonic()
                     self._service()
 
@@ -446,9 +460,10 @@ class Player:
             loop.finger(here, float(np.nan_to_num((there - here) / INSTANT)), load)
 
     def _service(self) -> None:
-        """Compute what comes next, record what was, see whether the device or the application has stopped."""
+        """Record what was, see whether the device or the application has stopped."""
         loop = self._playing("play")
-        loop.fill()
+        if not isinstance(loop, LiveLoop):
+            loop.fill()  # says whether a board is there
         if hasattr(loop.rendering.device, "check"):
             loop.rendering.device.check()  # one that calls back cannot say that it is gone
         first, signals = loop.signals(self._recorded)

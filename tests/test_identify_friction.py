@@ -18,12 +18,12 @@ class Resonator(Bench):
 
     rate, block, delay, drive_channels, sensed_channels = 192e3, 64, 64, 1, 1
 
-    def __init__(self, frequency=30.1e3, quality=150.0, force=1.6, late=0, seed=0):
+    def __init__(self, frequency=30.1e3, quality=150.0, force=1.6, late=0, seed=0, unit=1.0):
         w = 2 * np.pi * frequency
         self.pole = np.exp((-w / (2 * quality) + 1j * w * np.sqrt(1 - 0.25 / quality**2)) / self.rate)
         s = np.log(self.pole) * self.rate
         self.push = force / 5e-3 / (2j * s.imag) * (self.pole - 1) / s
-        self.state, self.queue, self.rng = 0j, [0.0] * late, np.random.default_rng(seed)
+        self.unit, self.state, self.queue, self.rng = unit, 0j, [0.0] * late, np.random.default_rng(seed)
 
     def play(self, drive):
         sensed = np.empty((len(drive), 1))
@@ -31,7 +31,7 @@ class Resonator(Bench):
             sensed[i] = 2 * self.state.real
             self.queue.append(u)
             self.state = self.pole * self.state + self.push * self.queue.pop(0)
-        return hr.Sensed(sensed + 2e-9 * self.rng.standard_normal(sensed.shape))
+        return hr.Sensed(self.unit * (sensed + 2e-9 * self.rng.standard_normal(sensed.shape)))
 
 
 class Screen(Resonator):
@@ -39,7 +39,8 @@ class Screen(Resonator):
 
     rate, block, delay = 10e3, 10, 10
 
-    def __init__(self, mu=0.6, gain=1.5e4, speed=0.08, seed=0):
+    def __init__(self, mu=0.6, gain=1.5e4, speed=0.08, seed=0, unit=1.0, lateral=False):
+        self.unit, self.lateral = unit, lateral
         self.mu, self.gain, self.speed, self.at, self.friction = mu, gain, speed, 0, 0.0
         self.rng = np.random.default_rng(seed)
 
@@ -53,13 +54,15 @@ class Screen(Resonator):
             whole = self.mu * (load[i] + self.gain * current**2)
             self.friction += (whole - self.friction) * (1 - np.exp(-self.speed / (self.rate * 11.5e-6)))
         position = 0.02 * (1 - 2 * abs((time * self.speed / 0.04) % 2 - 1)) if self.speed else np.zeros(len(drive))
-        return hr.Sensed(sensed + 1e-3 * self.rng.standard_normal(sensed.shape), position, normal_load=load)
+        if self.lateral:
+            sensed *= np.where((time * self.speed / 0.04) % 2 < 1, 1.0, -1.0)[:, None]
+        sensed = self.unit * (sensed + 1e-3 * self.rng.standard_normal(sensed.shape))
+        return hr.Sensed(sensed, position, normal_load=load)
 
 
-@pytest.mark.parametrize("late", [0, 2])
-def test_a_resonance_half_a_percent_off_is_found(late):
-    """f within 1 Hz, Q and force .2 %; also where the driver states too short a delay."""
-    found = identify_resonance(Resonator(late=late), SurfaceParameters())
+def test_a_resonance_half_a_percent_off_is_found():
+    """f within 1 Hz, Q and force .2 %."""
+    found = identify_resonance(Resonator(), SurfaceParameters())
     truth = {"frequency": 30.1e3, "quality": 150.0, "force_constant": 1.6}
     for name, within in (("frequency", 1.0), ("quality", 0.3), ("force_constant", 0.0032)):
         estimate = found.estimates[name]
@@ -67,9 +70,10 @@ def test_a_resonance_half_a_percent_off_is_found(late):
     assert SurfaceParameters.with_overrides(found.profile()).mode.quality == found.profile()["quality"]
 
 
-def test_a_screens_gain_and_friction_are_found_under_a_sliding_finger():
-    """mu and g within 1 %; a profile that the renderer takes."""
-    found = identify_screen(Screen(), ElectroadhesionParameters(), hr.Finger.absent())
+@pytest.mark.parametrize("kind", [{}, {"unit": -1.0}, {"lateral": True}])
+def test_a_screens_gain_and_friction_are_found_under_a_sliding_finger(kind):
+    """mu and g within 1 %, whatever the sensor's sign means; a profile that the renderer takes."""
+    found = identify_screen(Screen(**kind), ElectroadhesionParameters(), hr.Finger.absent())
     assert found.profile() == pytest.approx({"friction_coefficient": 0.6, "open_loop_gain": 1.5e4}, rel=0.01)
     texture, finger = hr.Grating(frequency=100.0, amplitude=50e-6), hr.Finger.sliding(speed=0.08, normal_load=0.5)
     scene = hr.Scene(texture=texture, finger=finger, duration=0.1, device="electroadhesion", profile=found.profile())
@@ -82,6 +86,32 @@ def test_what_cannot_be_identified_is_refused():
         identify_resonance(Resonator(force=0.0), SurfaceParameters())
     with pytest.raises(hr.DesignError, match="must slide faster than 0.001 m/s"):
         identify_screen(Screen(speed=0.0), ElectroadhesionParameters(), hr.Finger.absent())
+    with pytest.raises(hr.DesignError, match="identified open_loop_gain = -.*: must be a finite number > 0 N"):
+        identify_screen(Screen(gain=-1.5e4), ElectroadhesionParameters(), hr.Finger.absent())
+
+
+@pytest.mark.parametrize(
+    ("device", "message"),
+    [
+        (Resonator(late=2), "sensed 2 samples later than driver.delay = 64 says: must be within 0.5"),
+        (Resonator(unit=-1.0), "sensed 3.2 samples (later|earlier) .* half a turn, the sensor may be inverted"),
+        (Resonator(unit=1e6), r"sensed 1\.\d+ m: must be <= 2.5e-05 m, .* is it in m"),
+        (Screen(unit=1e3), r"sensed \d+ N: must be <= 20 N, .* is it in N"),
+    ],
+)
+def test_a_sensor_that_no_scene_can_use_is_refused(device, message):
+    screen = isinstance(device, Screen)
+    arguments = (ElectroadhesionParameters(), hr.Finger.absent()) if screen else (SurfaceParameters(),)
+    with pytest.raises(hr.DesignError, match=message):
+        (identify_screen if screen else identify_resonance)(device, *arguments)
+
+
+def test_a_rate_below_twice_the_carrier_is_refused_before_anything_is_played():
+    device = Resonator()
+    device.rate = 48e3
+    with pytest.raises(ValueError, match="rate = 48000 Hz: must be > 61200 Hz, twice the highest line"):
+        identify_resonance(device, SurfaceParameters())
+    assert device.state == 0j
 
 
 KINDS = {"ultrasonic": {"frequency": 30e3, "quality": 200.0}, "electroadhesion": {"friction_coefficient": 0.8}}

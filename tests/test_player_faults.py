@@ -6,6 +6,7 @@ import subprocess
 import sys
 import threading
 import time
+from contextlib import nullcontext
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from live_devices import RIDGES, TONE, Calling, Lying
 
 import hapticrender as hr
 import hapticrender.player
+from hapticrender.bands import Bands
 from hapticrender.recordings.recording import Recording
 
 
@@ -138,6 +140,60 @@ def test_a_driver_that_does_not_return_ends_in_an_error_that_says_so(monkeypatch
         with pytest.raises(hr.HapticError, match="has played no sample"):
             go_on(player)
     stuck.set()
+
+
+def test_a_driver_that_another_player_has_open_is_refused():
+    """It goes on there, and once that is closed it is free again."""
+    driver = Lying(1e9, "")
+    with hr.Player(driver=driver, paced=False) as first:
+        first.play(TONE)
+        with hr.Player(driver=driver, paced=False) as second, pytest.raises(ValueError, match="is already open in ano"):
+            second.play(TONE)
+        first.sleep(0.5)
+        assert first.state().bands[0].error < 0.02
+    assert not hapticrender.player.OPEN
+
+
+class Slow:
+    """A tone of one's own; once it is live it takes `share` s to compute for a second of it, or waits for `ready`."""
+
+    spatial, live, share = False, False, 0.0
+
+    def __init__(self, ready=None):
+        self.ready = ready
+
+    def bands(self, rate):
+        return Bands.none(spatial=False)
+
+    def waveform(self, time, position):
+        if self.live:
+            threading.Event().wait(self.share * (np.max(time) - np.min(time)))
+            if self.ready is not None:
+                self.ready.wait(60.0)
+        return 5e-6 * np.sin(2 * np.pi * 100.0 * time)
+
+
+@pytest.mark.parametrize(("share", "hangs"), [(0.3, False), (4.0, False), (0.0, True)])
+def test_a_texture_that_is_slower_than_the_clock_is_named_and_the_device_closed(share, hangs, monkeypatch):
+    """Whether it is slow or hangs in the end, the driver answers every block; one that takes 0.3 s a second is well."""
+    monkeypatch.setattr(hapticrender.player, "PATIENCE", 0.5)
+    ready, closed = threading.Event(), []
+
+    class Closing(Lying):
+        def __exit__(self, *error):
+            closed.append(abs(self.played[-1]).max())
+            return super().__exit__(*error)
+
+    texture = Slow(ready if hangs else None)
+    named = pytest.raises(hr.HapticError, match="Slow: 0.25 s of it took .* times as long as it lasts")
+    with nullcontext() if share == 0.3 else named as caught, hr.Player(driver=Closing(1e9, "")) as player:
+        player.play(texture)
+        texture.share, texture.live = share, True
+        player.sleep(3.5)
+        player.state()
+    ready.set()
+    assert closed == [0.0]
+    assert caught is None or type(caught.value) is hr.HapticError  # and not the driver's
 
 
 @pytest.mark.parametrize("calls_back", [True, False])

@@ -31,6 +31,7 @@ REACH, GRID = 0.02, 10.0  # share of the expected resonance, Hz: range and spaci
 RING = 10.0  # time constants of the expected mode that the drive lasts before the record
 SHARE = 0.2  # of the drive's limit: largest drive of the lines
 MODULATION = 20.0  # Hz: of the current of a screen, far below the contact's corner
+LATE = 0.5  # samples: largest difference of the delay from the driver's
 UNEXPLAINED = 0.1  # largest share of the response that the model may leave
 
 
@@ -62,6 +63,10 @@ def identify_resonance(driver: Driver, parameters: SurfaceParameters, seconds: f
     """
     mode, rate = parameters.mode, float(driver.rate)
     check_channels(driver, 1, "one drive and one sensor")
+    if rate <= (least := 2 * (1 + REACH) * mode.frequency):
+        raise ValueError(
+            f"driver.rate = {rate:g} Hz: must be > {least:g} Hz, twice the highest line around the resonance"
+        )
     samples, start = round(seconds * rate), round(RING * mode.quality / (math.pi * mode.frequency) * rate)
     base = rate / samples
     bins = np.arange((1 - REACH) * mode.frequency, (1 + REACH) * mode.frequency, GRID) / base
@@ -72,6 +77,7 @@ def identify_resonance(driver: Driver, parameters: SurfaceParameters, seconds: f
     drive = np.fft.irfft(spectrum, samples)
     drive *= SHARE * mode.drive_limit / abs(drive).max()
     played = play(driver, drive[np.arange(-start, samples) % samples, None]).sensed[start:, 0]
+    _check_range(played, mode.sensor_range / 2, "m")
     u, y = (np.fft.rfft(signal)[bins] * (2 / samples) for signal in (drive, played))
     w = 2 * np.pi * bins * base
     u = u * np.sinc(w / rate / (2 * np.pi)) * np.exp(-1j * w * (driver.delay - driver.block + 0.5) / rate)
@@ -85,11 +91,21 @@ def identify_resonance(driver: Driver, parameters: SurfaceParameters, seconds: f
     scale = abs(y).max()
     begin = np.array([math.log(w[abs(y / u).argmax()] / expected[0]), 0.0, 0.0, 0.0])
     begin[2] = math.log(abs(y / u).max() / abs(response(begin)).max())
+    peak = abs(y).argmax()
+    begin[3] = np.angle(response(begin) * u / y)[peak] / w[peak] * rate
     fit = least_squares(lambda x: _real(response(x) * u - y) / scale, begin, xtol=1e-12, ftol=1e-12)
     spread = _spread(fit.jac, fit.fun)
-    values = np.exp(fit.x[:3]) * [mode.frequency, mode.quality, mode.force_constant]  # tau: further delay
+    values = np.exp(fit.x[:3]) * [mode.frequency, mode.quality, mode.force_constant]
     names = ("frequency", "quality", "force_constant")
-    return _found("ultrasonic", names, values, values * spread[:3], fit.fun, _real(y) / scale)
+    found = _found("ultrasonic", type(parameters), names, values, values * spread[:3], fit.fun, _real(y) / scale)
+    turn, late = rate / values[0], fit.x[3]
+    if not abs(late) <= LATE:
+        raise DesignError(
+            f"sensed {abs(late):.2g} samples {'later' if late > 0 else 'earlier'} than driver.delay = {driver.delay} "
+            f"says: must be within {LATE:g}; state its delay (which may differ by whole turns of the carrier, "
+            f"{turn:.3g} samples); or, at about {turn / 2:.2g}, half a turn, the sensor may be inverted"
+        )
+    return found
 
 
 def identify_screen(
@@ -97,7 +113,7 @@ def identify_screen(
 ) -> IdentifiedDevice:
     """Identify friction coefficient and gain g (N/A^2) of a screen under a finger that slides over it.
 
-    The open driver takes the envelope of the current (A, peak) and senses friction (N, positive against the motion);
+    The open driver takes the envelope of the current (A, peak) and senses friction (N, of any sign);
     `finger` gives load and position where it does not measure them.
     """
     rate, most = float(driver.rate), parameters.current_limit / 2
@@ -113,7 +129,8 @@ def identify_screen(
     if not sliding.any():
         raise DesignError(f"finger: must slide faster than {parameters.least_speed:g} m/s while the screen is measured")
     columns = np.column_stack([load, most**2 * (1 + np.cos(phase)) / 2, most**2 * np.sin(phase)])[sliding]
-    friction = sensed.sensed[sliding, 0]
+    friction = abs(sensed.sensed[sliding, 0])  # as `render` takes it: it may keep the sign of the lateral force
+    _check_range(friction, parameters.force_range, "N")
     found = np.linalg.lstsq(columns, friction, rcond=None)[0]
     residual = friction - columns @ found
     mu, gain = found[0], found[1] / found[0]
@@ -122,7 +139,7 @@ def identify_screen(
     halves = np.array([spread[0], gain * math.hypot(spread[1] / found[1], spread[0] / mu)])
     changing = columns[:, 1:] @ found[1:]
     names = ("friction_coefficient", "open_loop_gain")
-    return _found("electroadhesion", names, values, halves, residual, changing - changing.mean())
+    return _found("electroadhesion", type(parameters), names, values, halves, residual, changing - changing.mean())
 
 
 def _spread(jacobian: Array, residual: Array) -> Array:
@@ -135,10 +152,25 @@ def _real(values: Array) -> Array:
     return np.concatenate([values.real, values.imag])
 
 
+def _check_range(sensed: Array, bound: float, unit: str) -> None:
+    """Refuse what no sensor of the device can measure."""
+    most = float(abs(sensed).max())
+    if not most <= bound:
+        raise DesignError(
+            f"sensed {most:.3g} {unit}: must be <= {bound:g} {unit}, the sensor's range; is it in {unit}?"
+        )
+
+
 def _found(
-    kind: str, names: tuple[str, ...], values: Array, halves: Array, residual: Array, signal: Array
+    kind: str,
+    parameters: type[SurfaceParameters | ElectroadhesionParameters],
+    names: tuple[str, ...],
+    values: Array,
+    halves: Array,
+    residual: Array,
+    signal: Array,
 ) -> IdentifiedDevice:
-    """Estimates, unless the model leaves too much of the signal."""
+    """Estimates, unless the model leaves too much of the signal, or no device has such `parameters`."""
     unexplained = float(np.sqrt((residual**2).mean() / (signal**2).mean()))
     if not unexplained <= UNEXPLAINED:
         raise DesignError(
@@ -146,4 +178,9 @@ def _found(
             "and [device]"
         )
     pairs = (Estimate(float(value), float(half)) for value, half in zip(values, halves, strict=True))
-    return IdentifiedDevice(kind, dict(zip(names, pairs, strict=True)), unexplained)
+    found = IdentifiedDevice(kind, dict(zip(names, pairs, strict=True)), unexplained)
+    try:
+        parameters.with_overrides(found.profile())
+    except ValueError as error:
+        raise DesignError(f"identified {error}; check connections and [device]") from error
+    return found
