@@ -40,6 +40,7 @@ from hapticrender.touch.scene import Scene, distinct_names
 
 _NO_NAME = re.compile(r"[^\w.-]+|^\.+")
 _LOST = "not finished: one of the processes that render was killed, perhaps for lack of memory (fewer --jobs need less)"
+GRACE = 1.0  # s: for a process of a pool to leave by itself
 Tick = Callable[[float, float], None]
 
 
@@ -148,10 +149,11 @@ def validate(
 
 
 def _end_with(watched: Connection) -> None:
-    """End this process of a pool, by SIGTERM, as soon as the other end of a pipe is closed: as its owner ends."""
+    """End this process of a pool, by SIGTERM, once the other end of a pipe is closed: as its owner ends."""
 
     def watch() -> None:
         watched.poll(None)
+        time.sleep(GRACE)  # a broken pool has sent SIGTERM itself; a second one would cut short what the first began
         os.kill(os.getpid(), signal.SIGTERM)
 
     threading.Thread(target=watch, daemon=True).start()

@@ -110,7 +110,7 @@ import multiprocessing, os, signal, sys, threading, time
 from pathlib import Path
 from hapticrender.cli import main
 def disturb():
-    while len(list(Path(os.environ["TMPDIR"]).glob("*/recording.au"))) < 2:
+    while sum(path.stat().st_size > 0 for path in Path(os.environ["TMPDIR"]).glob("*/recording.au")) < 2:
         time.sleep(0.02)
     {}
 threading.Thread(target=disturb, daemon=True).start()

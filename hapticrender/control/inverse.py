@@ -37,6 +37,7 @@ SCALE = 2 * math.pi * 200.0  # rad/s: derivatives are divided by its powers, so 
 POLE, POLE_DAMPING = 2 * math.pi * 200.0, 0.8  # the finger's pair of poles
 PEOPLE, SEED = 300, 1  # fingers of the prior, and the seed that draws them
 REVERSION_RATES = {FINGER: 0.03, HEAVE: 0.003, COUPLING: 0.01, LOAD: 0.6}  # 1/sqrt(s), from each parameter on
+FRICTION_REVERSION = 1.0  # 1/sqrt(s), of a finger's own friction, which stands for the load
 SETTLING, RESTART, DAMPER_TIME = 2e-3, 0.1, 0.1  # s after a contact: learning starts, and again; the damper sleeps
 JOINING = 60e-3  # s: for so long the deviation at the start of learning is a parameter
 PATIENCE = 1e-3  # s: for so long a position may be missing
@@ -244,7 +245,8 @@ def law_settings(model: DeviceModel, bands: Bands, feedback: bool) -> dict[str, 
     noise = np.sqrt((model.coordinate_from_sensed**2).sum(axis=1))
     noise = np.resize(noise, 2) * max(model.sensed_noise, LEAST_NOISE * model.sensed_limit)
     kept = np.ones(PARAMETERS)
-    for first, rate in REVERSION_RATES.items():
+    friction = {LOAD: FRICTION_REVERSION} if model.finger.contact is None else {}
+    for first, rate in (REVERSION_RATES | friction).items():
         kept[first:INITIAL] = 1.0 - 0.5 * rate**2 * REVERSION * period
     matrices = {}
     for name in ("mass", "damping", "stiffness"):
