@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import shlex
 import sys
 from dataclasses import replace
 from importlib.util import find_spec
@@ -329,7 +330,8 @@ def export(arguments: argparse.Namespace) -> int:
     with naming(arguments.scene):
         rendering = prepare(scene)
         written = export(rendering, arguments.out, bands=arguments.bands, force=arguments.force)
-    print(f"wrote {len(written)} files into {arguments.out}; build them with: make -C {arguments.out}")
+    command = f"make -C {shlex.quote(str(arguments.out))}"
+    print(f"wrote {len(written)} files into {arguments.out}; build them with: {command}")
     return 0
 
 
