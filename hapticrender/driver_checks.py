@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import inspect
 import math
+from collections.abc import Iterator
+from contextlib import contextmanager
 from numbers import Integral, Real
 from typing import Any
 
@@ -14,6 +16,19 @@ from hapticrender.protocols import Array, Sensed
 
 _MEMBERS = ("rate", "drive_channels", "sensed_channels", "block", "delay", "play", "__enter__", "__exit__")
 _LEAST = {"drive_channels": 1, "sensed_channels": 0, "block": 1}
+OPEN: set[int] = set()  # identities of the devices that players have open
+
+
+@contextmanager
+def opened_once(device: object) -> Iterator[None]:
+    """Refuse a device that another player of this process has open."""
+    if id(device) in OPEN:
+        raise ValueError(f"driver: {type(device).__name__} is already open in another Player: close that one first")
+    OPEN.add(id(device))
+    try:
+        yield
+    finally:
+        OPEN.discard(id(device))
 
 
 def check_driver(driver: Any) -> None:

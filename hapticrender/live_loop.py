@@ -24,6 +24,7 @@ from hapticrender.protocols import Array, Controller, Flag, Rendering
 from hapticrender.realtime_entry import RealtimeEntry
 from hapticrender.realtime_kernel import HORIZON
 from hapticrender.sampled_texture import FADE, SampledTexture
+from hapticrender.touch.finger import Finger
 
 JUDGED = 0.25  # s: of signal that figures are of
 DEVICE = ("driver", "device", "plant")  # of a rendering: they stay where its texture changes
@@ -54,6 +55,13 @@ class LiveMotion:
     def load(self, time: Array) -> Array:
         """Return the normal load (N)."""
         return np.full(np.shape(time), self._last[3])
+
+    def attach(self, rendering: Rendering) -> None:
+        """Put a finger that moves like this on a simulated device."""
+        finger, plant = rendering.scene.finger, rendering.plant
+        live = Finger(self, None, mechanics=finger.mechanics, load_scaling=finger.load_scaling)
+        for part in (plant, getattr(plant, "screen", plant)):
+            part.finger = live  # type: ignore[union-attr]
 
 
 class LiveLoop(RealtimeEntry):

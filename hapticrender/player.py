@@ -33,6 +33,7 @@ from hapticrender.checks import number
 from hapticrender.control.carriers import FASTEST
 from hapticrender.control.probe import probe_plate
 from hapticrender.devices import open_driver
+from hapticrender.driver_checks import opened_once
 from hapticrender.errors import HapticError, WatchdogTimeout
 from hapticrender.live_loop import LiveLoop, LiveMotion
 from hapticrender.live_threads import LiveThreads, hold_to_clock
@@ -54,7 +55,6 @@ UPDATES = 0.2  # s: two positions within this time show a velocity
 END_FADE = 0.05  # s: five time constants of the gain; and the longest that zeros are waited for
 LEAST_PART = 2 * SERVICE  # s: of a playlist whose parts are taken up one by one
 POINTING, INSTANT = 0.01, 1e-4  # s between two positions of a scene's finger; over which its velocity is found
-OPEN: set[int] = set()  # identities of the devices that players have open
 PATIENCE = 5.0  # s without a sample, after which `sleep` gives a device up
 
 
@@ -367,11 +367,9 @@ class Player:
             raise ValueError("paced = False: must be True on a device with a clock of its own")
         scales = {name: getattr(device, name) for name in ("sensed_scale", "drive_scale")} if calls_back else {}
         loop: Any = device.loop(rendering) if own else LiveLoop(rendering, **scales)
-        self._hand_finger(rendering)
-        if id(device) in OPEN:
-            raise ValueError(f"driver: {type(device).__name__} is already open in another Player: close that one first")
-        OPEN.add(id(device))
-        stack.callback(OPEN.discard, id(device))
+        if self._given is None and rendering.plant is not None:
+            self._motion.attach(rendering)
+        stack.enter_context(opened_once(device))
         stack.enter_context(stopped_by_sigterm())
         rendering.driver.__enter__()
         stack.push(lambda *error: None if self._threads.hanging.is_set() else rendering.driver.__exit__(*error))
@@ -395,15 +393,6 @@ class Player:
         if self._paced:
             self._run(self._serve, device, lambda: getattr(loop, "computing", ""))
         return renderings
-
-    def _hand_finger(self, rendering: Rendering) -> None:
-        """Put the finger that the application moves on a simulated device."""
-        if self._given is None and rendering.plant is not None:
-            mechanics = rendering.scene.finger.mechanics
-            live = Finger(self._motion, None, mechanics=mechanics, load_scaling=rendering.scene.finger.load_scaling)
-            plant: Any = rendering.plant
-            for part in (plant, getattr(plant, "screen", plant)):
-                part.finger = live
 
     def _run(self, target: Callable[[], None], device: object, busy: Callable[[], str] = str) -> None:
         """Run `target` in a thread until the player stops; what it raises is kept for the application."""

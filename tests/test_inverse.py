@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.signal import lsim
+from strangers_plate import WRONG, StrangersPlate
 from waves import waveform_error, white
 
 import hapticrender as hr
@@ -134,6 +135,24 @@ def test_a_faster_loop_bears_a_touch_no_worse(rate):
         return waveform_error(recording.motion[:, 0], reference, 0.1, rate)
 
     assert error(rate) <= error(5e3)
+
+
+def test_so_does_one_on_a_plate_that_nothing_is_known_of():
+    """The stranger's, wrong in everything, contact reported 5 ms late: 23 % at 20 kHz without a damper."""
+
+    def error(rate):
+        finger = {"finger": (4e-3, 1.5, 300.0), "load": 0.4, "position": lambda time: 0.02 + 0.0 * np.asarray(time)}
+        touch = {"contact": lambda time: np.clip((time - 0.1) / 1e-3, 0.0, 1.0), "report_lag": 5e-3}
+        plate, texture = (
+            StrangersPlate(rate=rate, seed=1, **finger, **touch, **WRONG),
+            replace(GRATING, frequency=143.0),
+        )
+        hr.render(hr.Scene(texture=texture, finger=hr.Finger.absent(), duration=0.5), driver=plate)
+        motion = np.asarray(plate.truth)[: round(0.5 * rate), 0]
+        reference = texture.waveform(np.arange(len(motion)) / rate, np.zeros(len(motion)))
+        return waveform_error(motion, reference, 0.2, rate)
+
+    assert error(20e3) <= error(5e3)
 
 
 def test_a_screen_survives_a_lift():
