@@ -1,10 +1,11 @@
 """Inject faults of sensors and coils into a plate that the library does not know, while a texture plays.
 
-Run: python -m benchmarks.faults [--plate other] [--place MM] [--tones] [fault ...]
+Run: python -m benchmarks.faults [--plate other] [--place MM] [--tones | --card] [fault ...]
 
 The plate is that of ``tests/strangers_plate.py`` with mass, springs, damping and sensor gains off by 2 to 20 %, a
 bending mode at 1250 Hz, contact reported 5 ms late, and a delay of 2 samples, which is stated; ``--plate other`` takes
-that of ``tests/other_plate.py``, whose parameters are what the library takes for granted.
+that of ``tests/other_plate.py``, whose parameters are what the library takes for granted; with ``--card`` the
+stranger's plate takes blocks of 64 at 48 kHz, as behind a sound card, and is one sample later than stated.
 Printed for every fault, over 10 and 50 um, without and with a heavy finger of 0.8 N on the middle, or `--place` (mm)
 off it, then with 0.8 and 2 N: the time from the fault to the stop, how many runs stopped, the largest drive and the
 largest true motion of an end.  Textures are a tone of 20, 72, 189 or 400 Hz; with ``--tones`` one of 60 and 144 Hz.
@@ -34,12 +35,11 @@ class FaultyPlate:
 
     def __init__(self, change, coils, **plate):
         super().__init__(seed=3, **plate)
-        self.change, self.coils, self.drives, self.motion, self.held = change, coils, [], [], None
+        self.change, self.coils, self.drives, self.held = change, coils, [], None
 
     def play(self, drive):
-        late = len(self.drives) >= START * self.rate
+        late = self.block * len(self.drives) >= START * self.rate
         self.drives.append(drive)
-        self.motion.append(self.ends())
         sensed = super().play(drive @ self.coils.T if late else drive)
         if not late:
             return sensed
@@ -53,29 +53,37 @@ class FaultyOtherPlate(FaultyPlate, OtherPlate):
 
     def __init__(self, change, coils, load, place):
         super().__init__(change, coils, **({"finger": FINGER, "load": load, "position": place} if load else {}))
+        self.ends = []  # displacement of both (m) at every sample
 
-    def ends(self):
-        """Displacement of both ends (m)."""
-        return self._state[0] + REACH * self._state[1] * np.array([-1.0, 1.0])
+    def play(self, drive):
+        self.ends.append(self._state[0] + REACH * self._state[1] * np.array([-1.0, 1.0]))
+        return super().play(drive)
 
 
 class FaultyWrongPlate(FaultyPlate, StrangersPlate):
     """A plate that is wrong in everything but the delay, which is stated."""
 
-    def __init__(self, change, coils, load, place):
+    def __init__(self, change, coils, load, place, **changes):
         touch = {"finger": FINGER, "load": load, "position": place} if load else {}
         contact = (lambda time: np.clip((time - 0.1) / 1e-3, 0.0, 1.0)) if load else 0.0
         plate = WRONG | {"contact": contact, "bending": (1250.0, 30.0, 0.1), "report_lag": 5e-3, "told": WRONG["delay"]}
-        super().__init__(change, coils, **plate, **touch)
+        super().__init__(change, coils, **plate | touch | changes)
 
+    @property
     def ends(self):
-        """Displacement of both ends (m)."""
-        return self._z[0] + REACH * self._z[1] * np.array([-1.0, 1.0]) + self._z[2]
+        """Displacement of both (m) at every sample."""
+        return self.truth[:, 1:3]
 
 
 def only_first(change):
     """Apply a change to the first sensor alone."""
     return lambda plate, sensed: np.column_stack([change(plate, sensed)[:, 0], sensed[:, 1]])
+
+
+def every_second(plate, sensed):
+    """Samples of which every second one is no number."""
+    odd = (plate.block * len(plate.drives) + np.arange(len(sensed))) % 2 == 1
+    return np.where(odd[:, None], sensed, np.nan)
 
 
 def noise(plate, sensed):
@@ -85,13 +93,14 @@ def noise(plate, sensed):
 
 FAULTS = {
     "none": (lambda plate, sensed: sensed, np.eye(2)),
-    "frozen, both": (lambda plate, sensed: plate.held, np.eye(2)),
-    "frozen, one": (only_first(lambda plate, sensed: plate.held), np.eye(2)),
+    "frozen, both": (lambda plate, sensed: 0 * sensed + plate.held[0], np.eye(2)),
+    "frozen, one": (only_first(lambda plate, sensed: 0 * sensed + plate.held[0]), np.eye(2)),
+    "buffer repeats, one": (only_first(lambda plate, sensed: plate.held), np.eye(2)),  # without `--card` as frozen
     "dead, both": (lambda plate, sensed: 0 * sensed, np.eye(2)),
     "dead, one": (only_first(lambda plate, sensed: 0 * sensed), np.eye(2)),
     "at its range, both": (lambda plate, sensed: 0 * sensed + 1e-3, np.eye(2)),
     "NaN, both": (lambda plate, sensed: np.nan * sensed, np.eye(2)),
-    "every second NaN": (lambda plate, sensed: sensed * (1.0 if len(plate.drives) % 2 else np.nan), np.eye(2)),
+    "every second NaN": (every_second, np.eye(2)),
     "dead but noisy, both": (noise, np.eye(2)),
     "dead but noisy, one": (only_first(noise), np.eye(2)),
     "inverted, both": (lambda plate, sensed: -sensed, np.eye(2)),
@@ -109,6 +118,7 @@ FAULTS = {
     "one coil dead": (lambda plate, sensed: sensed, np.diag([0.0, 1.0])),
 }
 PLATES = {"other": FaultyOtherPlate, "wrong": FaultyWrongPlate}
+CARD = {"rate": 48e3, "block": 64, "told": 64}
 
 
 def run(plate, texture):
@@ -119,7 +129,7 @@ def run(plate, texture):
     except hr.DeviceFault as error:
         stopped, message = error.time - START, str(error)
     first, rest = round(START * plate.rate), round(BEFORE * plate.rate)
-    drive, motion = np.concatenate(plate.drives), np.array(plate.motion)
+    drive, motion = np.concatenate(plate.drives), np.array(plate.ends)
     if len(drive) <= first:
         raise SystemExit(f"stopped before the fault: {message}")
     largest = abs(motion[first:] - motion[first - rest : first].mean(axis=0)).max()
@@ -131,6 +141,7 @@ def main():
     parser.add_argument("faults", nargs="*", metavar="fault", help=f"of {', '.join(FAULTS)}; all unless given")
     parser.add_argument("--plate", choices=PLATES, default="wrong", help="which plate")
     parser.add_argument("--tones", action="store_true", help="two tones at once, instead of one")
+    parser.add_argument("--card", action="store_true", help="48 kHz, in blocks of 64, on the stranger's plate")
     parser.add_argument("--place", type=float, default=0.0, help="of the finger (mm)")
     arguments = parser.parse_args()
     if unknown := set(arguments.faults) - set(FAULTS):
@@ -138,11 +149,12 @@ def main():
     if abs(arguments.place) > 1e3 * REACH:
         parser.error(f"--place {arguments.place:g} mm: must be within {1e3 * REACH:g}, the ends of the plate")
     loads = (0.8, 2.0) if arguments.place else (0.0, 0.8)
+    changes = CARD if arguments.card else {}
     textures = [TONES] if arguments.tones else [{"frequency": each} for each in FREQUENCIES]
     for fault, texture in product(arguments.faults or FAULTS, textures):
         runs = [
             run(
-                PLATES[arguments.plate](*FAULTS[fault], load, 1e-3 * arguments.place),
+                PLATES[arguments.plate](*FAULTS[fault], load, 1e-3 * arguments.place, **changes),
                 hr.Grating(amplitude=a, **texture),
             )
             for a, load in product((10e-6, 50e-6), loads)

@@ -276,7 +276,7 @@ def touch(amplitude=50e-6, fingers=tuple(FINGERS), **plate):
         press = lambda t, load=load: load * np.clip((t - 1.0) / 1e-3, 1e-4, 1.0)  # noqa: E731
         touches = lambda t: 1.0 * ((t >= 1.0) & (t < 2.0))  # noqa: E731
         run = play(tone(frequency, amplitude), 3.0, (mechanics, press), place, touches, **plate)
-        time, error = tone_errors(run, frequency, amplitude, [CENTRE, *ENDS], hop=5)
+        time, error = tone_errors(run, frequency, amplitude, [CENTRE, *ENDS], hop=round(1e-3 / run.time[1]))
         near = [(time > start - 0.02) & (time < start + 0.9) for start in (1.0, 2.0)]
         peaks.append(100 * abs(error[near[0] | near[1]]).max(axis=0))
     worst = np.max(peaks, axis=0)
@@ -342,6 +342,7 @@ ROWS = {  # what is measured; must; aim
     "touch and lift, %": (touch, (9, 22), (6, 12)),
     "touch wrong, %": (lambda: touch(**WRONG, told=1), (11, 22), ()),
     "touch blocks of 25, %": (lambda: touch(block=25), (40, 80), ()),
+    "touch 48 kHz blocks of 64, %": (lambda: touch(rate=48e3, block=64), (40, 80), ()),
     "touch 10 um at .8 N, %": (lambda: touch(10e-6, ("2H", "4H")), (30, 70), ()),
     "small: 1 um pressed, .1 um, %": (small, (0.5, 1), ()),
     "wobble held, um": (wobble, (0.015,), (0.01,)),

@@ -137,22 +137,30 @@ def test_a_faster_loop_bears_a_touch_no_worse(rate):
     assert error(rate) <= error(5e3)
 
 
+def touched_strangers(rate, first, last=0.5, **blocks):
+    """Error between two moments (s) on the stranger's plate, wrong in everything, touched at 0.1 s, told 5 ms later."""
+    finger = {"finger": (4e-3, 1.5, 300.0), "load": 0.4, "position": 0.02}
+    touch = {"contact": lambda time: np.clip((time - 0.1) / 1e-3, 0.0, 1.0), "report_lag": 5e-3}
+    plate, texture = (
+        StrangersPlate(rate=rate, seed=1, **finger, **touch, **WRONG, **blocks),
+        replace(GRATING, frequency=143.0),
+    )
+    hr.render(hr.Scene(texture=texture, finger=hr.Finger.absent(), duration=0.5), driver=plate)
+    motion = np.asarray(plate.truth)[: round(last * rate), 0]
+    reference = texture.waveform(np.arange(len(motion)) / rate, np.zeros(len(motion)))
+    return waveform_error(motion, reference, first, rate)
+
+
 def test_so_does_one_on_a_plate_that_nothing_is_known_of():
-    """The stranger's, wrong in everything, contact reported 5 ms late: 23 % at 20 kHz without a damper."""
+    """23 % at 20 kHz without a damper."""
+    assert touched_strangers(20e3, 0.2) <= touched_strangers(5e3, 0.2)
 
-    def error(rate):
-        finger = {"finger": (4e-3, 1.5, 300.0), "load": 0.4, "position": lambda time: 0.02 + 0.0 * np.asarray(time)}
-        touch = {"contact": lambda time: np.clip((time - 0.1) / 1e-3, 0.0, 1.0), "report_lag": 5e-3}
-        plate, texture = (
-            StrangersPlate(rate=rate, seed=1, **finger, **touch, **WRONG),
-            replace(GRATING, frequency=143.0),
-        )
-        hr.render(hr.Scene(texture=texture, finger=hr.Finger.absent(), duration=0.5), driver=plate)
-        motion = np.asarray(plate.truth)[: round(0.5 * rate), 0]
-        reference = texture.waveform(np.arange(len(motion)) / rate, np.zeros(len(motion)))
-        return waveform_error(motion, reference, 0.2, rate)
 
-    assert error(20e3) <= error(5e3)
+def test_a_sound_card_damps_what_a_touch_leaves_while_its_delay_is_shorter_than_the_mode():
+    """40 to 80 ms after it, in blocks of 64 and 128: a Q of 3.4 for 22; 256 samples are a period of the mode."""
+    ringing = touched_strangers(48e3, 0.14, 0.18, block=256, told=256)
+    for block in (64, 128):
+        assert touched_strangers(48e3, 0.14, 0.18, block=block, told=block) < ringing / 4
 
 
 def test_a_screen_survives_a_lift():

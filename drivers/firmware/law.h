@@ -16,7 +16,7 @@
 
 #define LAW_FILTER_TAPS 12  /* of the derivatives' filters, 6 of them ahead */
 #define LAW_LOOKAHEAD (LAW_DELAY + LAW_FILTER_TAPS / 2)
-#define LAW_PAST 16         /* samples of the inner damper, a power of two */
+#define LAW_PAST (LAW_DAMPER_TAPS > 16 ? 64 : 16) /* samples of the inner damper, a power of two */
 #define LAW_BASIS 6         /* r, r'/w_n, r''/w_n^2, r through the pair of poles, its derivative/w_p, D_00 r' T */
 #define LAW_RING (LAW_BASIS + 2) /* basis and deviation force of a sample, until they act */
 

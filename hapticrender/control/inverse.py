@@ -11,7 +11,7 @@ import numpy as np
 
 from hapticrender.bands import Bands
 from hapticrender.control.controller import LEAST_TARGET, BankController, device_settings, padded, shared_settings
-from hapticrender.control.controller_design import FADE_IN, PROMPT, design_controller, rules_for
+from hapticrender.control.controller_design import FADE_IN, design_controller, rules_for
 from hapticrender.control.damping import Damping, choose_damping
 from hapticrender.control.device_model import DeviceModel
 from hapticrender.control.inverse_kernel import REVERSION, SCALED, inverse_step
@@ -172,8 +172,7 @@ class AdaptiveInverse:
         beyond = bands.frequency.max(initial=0.0) > 1.2 * HIGHEST * model.rate  # of the filters' range
         if not known or beyond or (bands.envelope is None and len(bands)):
             return design_controller(self.name, model, bands, rules_for(bands), feedback=feedback)
-        prompt = model.delay <= PROMPT
-        damping = choose_damping(model, bending=model.bending, apart=True) if feedback and prompt else None
+        damping = choose_damping(model, bending=model.bending, apart=True) if feedback else None
         if damping is not None and not (damping.margins and quiet_enough(damping, model)):
             damping = None
         settings = controller_settings(model, bands, damping, feedback)

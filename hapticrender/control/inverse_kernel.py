@@ -44,7 +44,7 @@ from hapticrender.control.inverse_records import (
 from hapticrender.control.kernel import sense_block, update_confidence
 from hapticrender.control.laws import contact_damping
 from hapticrender.control.limiter import NONFINITE, SATURATED, drive_of, shape_noise
-from hapticrender.control.records import CONTROLLER_T, LOCKED, TILE_T, Y, samples_of
+from hapticrender.control.records import CONTROLLER_T, LOCKED, MOST_TAPS, TILE_T, Y, samples_of
 from hapticrender.jit import F8, I8, SIGNALS_T, kernel, pointer, record, step
 from hapticrender.mathx import TURN, unit
 from hapticrender.vectors import get, put, real, total, zeros
@@ -143,11 +143,11 @@ def open_gate(controller, inverse, deviation):
 def damp(controller, coordinate, deviation):
     """Force of the inner damper, F = -sum taps eps[n - j], and `damper_force` before its gain; `past` is a ring."""
     c = record(controller, CONTROLLER_T, 0)
-    now, force = c.sample & 15, 0.0
+    now, force = c.sample & (MOST_TAPS - 1), 0.0
     c.past[coordinate, now] = deviation
     if c.damping_gain > 0.0 or c.damper_scale < 1.0:
         for j in range(c.p.n_taps):
-            force -= c.p.taps[coordinate, j] * c.past[coordinate, (now - j) & 15]
+            force -= c.p.taps[coordinate, j] * c.past[coordinate, (now - j) & (MOST_TAPS - 1)]
     c.damper_force[coordinate] = force
     return c.damping_gain * force
 
@@ -216,7 +216,7 @@ def recover(controller, inverse):
         v.states[k, PARAMETERS] = 0.0
     for i in range(2):
         c.shaper[i, 0] = c.shaper[i, 1] = 0.0
-        for j in range(16):
+        for j in range(MOST_TAPS):
             c.past[i, j] = 0.0
     discretise(controller, inverse)
 
@@ -280,7 +280,10 @@ def inverse_step(state, signals, start, count):
             reset_parameters(inverse, 0, PARAMETERS)
         elif v.learns > 0:
             if implausible > 0:  # the damper takes the last deviations: those of the samples before have to be in place
-                error0, error1 = c.past[0, (c.sample - 1) & 15], c.past[1, (c.sample - 1) & 15]
+                error0, error1 = (
+                    c.past[0, (c.sample - 1) & (MOST_TAPS - 1)],
+                    c.past[1, (c.sample - 1) & (MOST_TAPS - 1)],
+                )
             elif (
                 open_gate(state, inverse, error0)
                 and v.since > v.joined

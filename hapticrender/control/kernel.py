@@ -33,6 +33,7 @@ from hapticrender.control.records import (
     COORDINATE_T,
     INVERSE,
     LEAK,
+    MOST_TAPS,
     POSITION,
     STEP,
     SUM,
@@ -146,11 +147,11 @@ def predict(controller, i):
 def innovate_sample(controller):
     """Innovation of a sample, DC estimates of type 2, and the inner damper's force into the row STEP.
 
-    The damper is F = -sum taps eps[n - j], `damper_force` before its gain; `past` is a ring of 16 deviations eps from
+    The damper is F = -sum taps eps[n - j], `damper_force` before its gain; `past` is a ring of deviations eps from
     the command.
     """
     c = record(controller, CONTROLLER_T, 0)
-    samples, now, p = samples_of(controller), c.sample & 15, c.p
+    samples, now, p = samples_of(controller), c.sample & (MOST_TAPS - 1), c.p
     gain = p.dc_fast if c.dc_fast_on > 0.0 else p.dc
     drift = p.dc_drift_fast if c.dc_fast_on > 0.0 else p.dc_drift
     for i in range(p.coordinates):
@@ -162,7 +163,7 @@ def innovate_sample(controller):
         force = 0.0
         if c.damping_gain > 0.0 or c.damper_scale < 1.0:
             for j in range(p.n_taps):
-                force -= p.taps[i, j] * c.past[i, (now - j) & 15]
+                force -= p.taps[i, j] * c.past[i, (now - j) & (MOST_TAPS - 1)]
         c.damper_force[i], samples[STEP + i, 0] = force, c.damping_gain * force
         error = samples[Y + i, 0] - shown - c.dc[i]
         samples[Y + i, 0] = error
@@ -290,7 +291,7 @@ def reset_loop(controller):
             put(x, "slow", 0.0)
     for i in range(2):
         c.dc[i] = c.dc_drift[i] = 0.0
-        for j in range(16):
+        for j in range(MOST_TAPS):
             c.past[i, j] = 0.0
 
 
