@@ -66,8 +66,9 @@ class TransferFunction:
         """Discretise by the bilinear transform at `rate` (Hz): b and a of z^-k, shape (order + 1,), a[0] = 1."""
         from scipy.signal import bilinear  # takes a second to import
 
-        b, a = bilinear(self.numerator, self.denominator, rate)
-        return b, a
+        size = np.frexp(self(2 * rate))[1]  # scipy drops what is small beside 1 from the start of b; b[0] is H(2 rate)
+        b, a = bilinear(np.ldexp(self.numerator, -size), self.denominator, rate)
+        return np.ldexp(b, size), a
 
 
 def butterworth(bandwidth: float) -> TransferFunction:
