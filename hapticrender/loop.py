@@ -24,7 +24,7 @@ from hapticrender.control.supervisor import FADE_OUT, Fault
 from hapticrender.control.supervisor_kernel import STOPPED
 from hapticrender.devices import open_driver
 from hapticrender.devices import registered as registered
-from hapticrender.driver_checks import check_sensed
+from hapticrender.driver_checks import check_sensed, opened_once
 from hapticrender.errors import DeviceFault, PlateMismatch
 from hapticrender.inferred import ContactLag
 from hapticrender.protocols import Array, Controller, Driver, Exchange, Renderer, Rendering, Sensed
@@ -136,9 +136,10 @@ def run(rendering: Rendering, *, journal: str | Path | None = None, progress: Pr
         if len(signals["flags"]):
             recorder.append(**signals)
 
-    with recorder, stopped_by_sigterm(), driver, zero_drive_after(rendering.device):
+    device = rendering.device
+    with opened_once(device), recorder, stopped_by_sigterm(), driver, zero_drive_after(device):
         if rendering.probe:
-            probe_plate(rendering.device, rendering.model)
+            probe_plate(device, rendering.model)
         loop, fault = _Loop(rendering), None
         try:
             for start in range(0, total, loop.step):
