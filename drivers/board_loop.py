@@ -23,16 +23,7 @@ JUDGED = 0.25  # s of signal that the figures of a texture are of
 class BoardLoop:
     """A rendering that plays on a board; what `hapticrender.live_loop.LiveLoop` is for a controller of this process.
 
-    Parameters
-    ----------
-    rendering : Rendering
-        With a texture of displacements.
-    driver : SerialDriver
-
-    Raises
-    ------
-    ValueError
-        A board cannot play the texture.
+    A ValueError where a board cannot play its texture, which must be of displacements.
     """
 
     senses = False  # the host sends the finger's position

@@ -266,19 +266,9 @@ def chosen(found: list[Card], device: int | str) -> Card:
 class Stream:
     """A stream of interleaved float samples whose callback is a C function.
 
-    Parameters
-    ----------
-    name : str
-        For error messages.
-    output, inputs : tuple of (int, int, float)
-        Card, channels and suggested latency (s); `inputs` None: no input.
-    rate : float, Hz
-    frames : int
-        Samples a call.
-    callback, user_data : int
-        Addresses.
-    memory : object
-        What they point to and all that the callback uses: it is kept as long as PortAudio may call back.
+    `name` is for error messages; `output` and `inputs` (None: no input) are card, channels and suggested latency (s);
+    `frames` are samples a call.  `memory` is what the addresses `callback` and `user_data` point to, and all that the
+    callback uses: it is kept as long as PortAudio may call back.
     """
 
     def __init__(

@@ -65,15 +65,7 @@ def along_surface(texture, position):
 
 
 class SampledTexture:
-    """A texture in memory.
-
-    Parameters
-    ----------
-    texture : Texture
-        In time, along the surface (`spatial` is true), or a `Sum` of both.
-    rate : float, Hz
-    waveform_of : callable, optional
-        Of a part of the texture: its waveform in the device's quantity; by default its own.
+    """A texture in memory at `rate` (Hz), parted by `SeparatedTexture`.
 
     Raises
     ------

@@ -47,19 +47,10 @@ def lies_along_surface(texture: Texture) -> bool:
 
 
 class SeparatedTexture:
-    """A texture, parted into what lies in time and what lies along the surface.
+    """A texture, parted into what lies in time (`timed`: anything does) and along the surface (`spatial`).
 
-    Parameters
-    ----------
-    texture : Texture
-        In time, along the surface (see `lies_along_surface`), or a `Sum` of both.
-    waveform_of : callable, optional
-        Of a part of the texture: its waveform in the device's quantity; by default its own.
-
-    Attributes
-    ----------
-    timed, spatial : bool
-        Whether anything lies in time, and along the surface.
+    It is in time, along the surface (see `lies_along_surface`), or a `Sum` of both; `waveform_of` a part is its
+    waveform in the device's quantity, by default its own.
 
     Raises
     ------
