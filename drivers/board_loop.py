@@ -113,13 +113,7 @@ class BoardLoop:
 
 
 def playable(rendering: Rendering, board: Capabilities) -> tuple[Bands, BoardTexture | None]:
-    """Return what a board plays of a rendering: its bands, or none and a texture of samples.
-
-    Raises
-    ------
-    ValueError
-        `BoardTexture` refuses the texture.
-    """
+    """Return what a board plays of a rendering: its bands, or none and a texture, which `BoardTexture` may refuse."""
     bands, texture = rendering.bands, rendering.scene.texture
     if bands.envelope is not None and len(bands) and not bands.modulated:
         return bands, None

@@ -30,12 +30,7 @@ class BoardTexture:
 
     The table has at most `board.points`; in between the board takes cubic interpolation, whose error for a sine of
     wavelength L at steps h is (3/128)(2 pi h/L)^4: 0.2 % at 12 points a wavelength, 10 % at 4.4.  Samples are rounded
-    to 1/32767 of the largest of their frame.
-
-    Raises
-    ------
-    ValueError
-        The texture is too fine for the table.
+    to 1/32767 of the largest of their frame.  A ValueError where the texture is too fine for the table.
     """
 
     def __init__(self, texture: Texture, board: Capabilities, model: DeviceModel) -> None:

@@ -115,13 +115,7 @@ class BankController:
         return float((integral[counts] / size[counts]).max(initial=0.0))
 
     def run(self, sensed: Array, position: Array, waveform: Array) -> tuple[Array, Array, Array]:
-        """Advance by n samples; see `Controller`.
-
-        Raises
-        ------
-        ValueError
-            n is no multiple of the block.
-        """
+        """Advance by n samples; see `Controller`.  A ValueError where n is no multiple of the block."""
         n = len(sensed)
         if n % self.block:
             raise ValueError(f"{n} samples: must be a multiple of the block of {self.block} samples")

@@ -139,12 +139,8 @@ def envelope_loop(
     A `boxcar` estimates by a running mean over one period of the lowest carrier, which removes the image of that
     carrier and of its harmonics; its delay beyond the low pass's counts as the loop's.  `bandwidths` (Hz, of loop and
     low pass) are unchecked; by default they are a quarter and half of the lowest carrier, or less where the delay would
-    leave too small a margin.  Without feedback no delay is in the loop.
-
-    Raises
-    ------
-    DesignError
-        Even a loop twenty times slower has too small a margin.
+    leave too small a margin; a `DesignError` where even a loop twenty times slower has too small a one.  Without
+    feedback no delay is in the loop.
     """
     fixed = bands.frequency[bands.wavenumber == 0.0]
     lowest = float(fixed.min(initial=model.lowest_frequency))

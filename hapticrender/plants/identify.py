@@ -327,12 +327,8 @@ def _whole_drive(sine: Multisine, start: int, fade: int) -> Array:
 def play(driver: Driver, drive: Array) -> Sensed:
     """Play `drive` (n, channels) in blocks, then at least a block of zeros; return what was sensed of it.
 
-    Raises
-    ------
-    DesignError
-        The device reports a saturated drive, a clipped sensor or lost samples.
-    DriverError
-        The device failed.  After either, zero drive was sent if the device still took any.
+    A `DesignError` where the device reports a saturated drive, a clipped sensor or lost samples, a `DriverError` where
+    it failed; after either, zero drive was sent if it still took any.
     """
     n, block = len(drive), driver.block
     padded = np.concatenate([drive, np.zeros((-n % block + block, drive.shape[1]))])

@@ -41,15 +41,9 @@ def design_multisine(parameters: PlateParameters, rate: float, samples: int, amp
     `amplitude` (m) is the largest displacement of an end of the expected plate; lines are whole multiples of
     `rate`/`samples` (Hz).  The lines above them, 9 Hz apart up to 2.2 kHz, add as much current again.
 
-    Raises
-    ------
-    ValueError
-        The record is too short to resolve a mode, the motion leaves the sensors' range, the drive its limit, or a
-        mode lies too near half the rate.
-
-    Notes
-    -----
-    A mode of half-power width 2 zeta f is resolved by two lines within it: samples/rate >= 1/(zeta f).
+    A ValueError where the record is too short to resolve a mode (two lines within its half-power width 2 zeta f:
+    samples/rate >= 1/(zeta f)), the motion leaves the sensors' range, the drive its limit, or a mode lies too near half
+    the rate.
     """
     modes, ratios = parameters.modes()
     _check(parameters, rate, samples, amplitude, modes, ratios)

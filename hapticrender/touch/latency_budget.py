@@ -83,11 +83,6 @@ def position_error(
         False: the last sample is played as it is, without an estimator.
     easing : float, s, >= 0
         Pole pair by which corrections are spread; 0: none.
-
-    Raises
-    ------
-    ValueError, TypeError
-        An argument is out of its bound.
     """
     require(isinstance(panel, TouchPanel), "panel", panel, "a TouchPanel", TypeError)
     speed, easing = number("speed", speed, "m/s", least=0.0), number("easing", easing, "s", least=0.0)
