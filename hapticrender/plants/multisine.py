@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from hapticrender.checks import require
 from hapticrender.plants.plate import PlateParameters
 from hapticrender.protocols import Array
 
@@ -80,8 +81,7 @@ def _check(
 ) -> None:
     """Refuse an excitation that cannot be played, or that resolves too little."""
     bound = parameters.sensor_range / 2
-    if not 0.0 < amplitude <= bound:
-        raise ValueError(f"amplitude = {amplitude!r}: must be > 0 and <= {bound:g} m, the sensors' range")
+    require(0.0 < amplitude <= bound, "amplitude", amplitude, f"> 0 and <= {bound:g} m, the sensors' range")
     least = REACH_UP * modes.max() / HIGHEST_SHARE
     if rate < least:
         raise ValueError(f"rate = {rate:g} Hz: must be >= {least:.4g} Hz for a mode at {modes.max():.4g} Hz")
