@@ -54,6 +54,17 @@ def foh(a: Array, b: Array, period: float) -> Array:
     return np.hstack([whole[:n, :n], whole[:n, n:] - rise[:n], rise[:n]])
 
 
+def on_time(values: Array, count: int, late: float) -> Array:
+    """First `count` rows of a signal (n, k), n >= count + late, that comes `late` samples late.
+
+    Between samples it is on a line, at the frequency w too small by w^2 T^2/8 at most.
+    """
+    if late == 0.0 or not count:
+        return values[:count]
+    at, known = np.arange(count) + late, np.arange(len(values))
+    return np.stack([np.interp(at, known, each) for each in values.T], axis=1)
+
+
 def zero_crossings(values: Array) -> Array:
     """Find the fractional indices at which `values`, shape (n,), change sign, by linear interpolation."""
     before = np.flatnonzero(np.signbit(values[:-1]) != np.signbit(values[1:]))
