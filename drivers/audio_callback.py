@@ -124,11 +124,8 @@ QUEUE_FUNCTION = CFunction(_queue, CALLBACK)
 class Relay:
     """What `relay` reads and writes: channels, the function that it calls, and counts.
 
-    Parameters
-    ----------
-    inputs, outputs : tuple of int, >= 0
-        Columns of the stream's input and output that are used, in the order of sensors and drive channels.
-    block : int, samples
+    `inputs` and `outputs` are columns of the stream that are used, from 0 on, in the order of sensors and drive
+    channels; `block` is in samples.
     """
 
     def __init__(self, inputs: tuple[int, ...], outputs: tuple[int, ...], block: int) -> None:
@@ -167,14 +164,8 @@ class BlockQueue:
     """Numbered blocks between Python and the callback: drive block n is played in call n, or not at all.
 
     The time from a sensed sample to the drive that Python computes from it is therefore always the same, `ahead` + 1
-    blocks and what the card adds; where Python is late, the device gets zeros and the block is flagged.
-
-    Parameters
-    ----------
-    block : int, samples
-    sensors, channels : int
-    ahead : int, < SLOTS - 1
-        Blocks of drive that wait to be played.
+    blocks and what the card adds; where Python is late, the device gets zeros and the block is flagged.  `ahead`, less
+    than SLOTS - 1, is the number of blocks of drive that wait to be played.
     """
 
     def __init__(self, block: int, sensors: int, channels: int, ahead: int = AHEAD) -> None:

@@ -23,16 +23,7 @@ JUDGED = 0.25  # s of signal that the figures of a texture are of
 class BoardLoop:
     """A rendering that plays on a board; what `hapticrender.live_loop.LiveLoop` is for a controller of this process.
 
-    Parameters
-    ----------
-    rendering : Rendering
-        With a texture of displacements.
-    driver : SerialDriver
-
-    Raises
-    ------
-    ValueError
-        A board cannot play the texture.
+    A ValueError where a board cannot play its texture, which must be of displacements.
     """
 
     senses = False  # the host sends the finger's position
@@ -122,13 +113,7 @@ class BoardLoop:
 
 
 def playable(rendering: Rendering, board: Capabilities) -> tuple[Bands, BoardTexture | None]:
-    """Return what a board plays of a rendering: its bands, or none and a texture of samples.
-
-    Raises
-    ------
-    ValueError
-        `BoardTexture` refuses the texture.
-    """
+    """Return what a board plays of a rendering: its bands, or none and a texture, which `BoardTexture` may refuse."""
     bands, texture = rendering.bands, rendering.scene.texture
     if bands.envelope is not None and len(bands) and not bands.modulated:
         return bands, None

@@ -26,26 +26,11 @@ REACH, MARGIN = 0.1, 2e-3  # m: to either side of the middle where a model does 
 
 
 class BoardTexture:
-    """A texture as a board takes it.
+    """A texture, parted by `SeparatedTexture`, as a board takes it; its table reaches from end to end of the surface.
 
-    Parameters
-    ----------
-    texture : Texture
-        In time, along the surface, or a `Sum` of both; see `SeparatedTexture` for the errors.
-    board : Capabilities
-    model : DeviceModel
-        Of the surface: its table reaches from end to end.
-
-    Notes
-    -----
     The table has at most `board.points`; in between the board takes cubic interpolation, whose error for a sine of
     wavelength L at steps h is (3/128)(2 pi h/L)^4: 0.2 % at 12 points a wavelength, 10 % at 4.4.  Samples are rounded
-    to 1/32767 of the largest of their frame.
-
-    Raises
-    ------
-    ValueError
-        The texture is too fine for the table.
+    to 1/32767 of the largest of their frame.  A ValueError where the texture is too fine for the table.
     """
 
     def __init__(self, texture: Texture, board: Capabilities, model: DeviceModel) -> None:

@@ -129,13 +129,7 @@ class Card:
 
 @lru_cache
 def load() -> CDLL:
-    """Load PortAudio and declare `FUNCTIONS`.
-
-    Raises
-    ------
-    DeviceNotFound
-        There is no PortAudio, or it is older than 19.6; the message says how to get it.
-    """
+    """Load PortAudio and declare `FUNCTIONS`; a `DeviceNotFound` where there is none, or one older than 19.6."""
     name = find_library("portaudio") or _bundled()
     if name is None:
         raise DeviceNotFound(f"audio: PortAudio is not installed; {INSTALL}")
@@ -236,10 +230,7 @@ def cards() -> list[Card]:
 def find(device: int | str | None) -> Card:
     """Card by index (2, "2"), by parts of its name and host ("usb", "Scarlett JACK"), or the default output (None, "").
 
-    Raises
-    ------
-    DeviceNotFound
-        No card fits, or more than one; the message lists those that are there.
+    A `DeviceNotFound` where no card fits, or more than one, lists those that are there.
     """
     with initialised() as portaudio:
         default = portaudio.Pa_GetDefaultOutputDevice()
@@ -266,19 +257,9 @@ def chosen(found: list[Card], device: int | str) -> Card:
 class Stream:
     """A stream of interleaved float samples whose callback is a C function.
 
-    Parameters
-    ----------
-    name : str
-        For error messages.
-    output, inputs : tuple of (int, int, float)
-        Card, channels and suggested latency (s); `inputs` None: no input.
-    rate : float, Hz
-    frames : int
-        Samples a call.
-    callback, user_data : int
-        Addresses.
-    memory : object
-        What they point to and all that the callback uses: it is kept as long as PortAudio may call back.
+    `name` is for error messages; `output` and `inputs` (None: no input) are card, channels and suggested latency (s);
+    `frames` are samples a call.  `memory` is what the addresses `callback` and `user_data` point to, and all that the
+    callback uses: it is kept as long as PortAudio may call back.
     """
 
     def __init__(
@@ -322,11 +303,8 @@ class Stream:
     def close(self) -> None:
         """Stop after what has been played, and release the card; a second call does nothing.
 
-        Raises
-        ------
-        DriverError
-            PortAudio reports an error, or does not return (with JACK, where the server has died): the stream is left
-            behind with its memory, and PortAudio is of no more use in this process.
+        A `DriverError` where PortAudio reports an error, or does not return (with JACK, where the server has died): the
+        stream is left behind with its memory, and PortAudio is of no more use in this process.
         """
         handle, self._handle = self._handle, None
         if handle is None:

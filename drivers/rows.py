@@ -13,14 +13,9 @@ LONGEST_GAP = 2**16  # rows
 class Rows:
     """Rows of a run: drive (A), sensed (m), position (m), load (N), reference (m) and flags.
 
-    A row that was lost on the line repeats the one before, with `Flag.OVERRUN`.
-
-    Parameters
-    ----------
-    first : int, optional
-        Sample of the board's clock from which on it streams; that of the first row that comes unless given.
-    stride : int
-        Samples between two rows; 0: none are streamed.
+    A row that was lost on the line repeats the one before, with `Flag.OVERRUN`.  `first` is the sample of the board's
+    clock from which on it streams, that of the first row that comes unless given; `stride` the samples between two
+    rows, 0 where none are streamed.
     """
 
     def __init__(self, first: int | None = None, stride: int = 1) -> None:

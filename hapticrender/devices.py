@@ -182,7 +182,7 @@ def _there(name: str, driver: Any) -> list[list[str]]:
         return []
     try:
         rows = [each.partition("  ")[::2] for each in driver.found()]
-    except Exception as error:  # a third party's search may fail in any way; the list must go on
+    except (Exception, SystemExit) as error:  # a third party's search may fail in any way; the list must go on
         reason = " ".join(f"{type(error).__name__}: {error}{_cure(error)}".split())
         return [[f"{name}:", f"cannot be searched ({reason})"]]
     return [[f"{name}:{argument}", about.strip()] for argument, about in rows] or [[f"{name}:", "none"]]

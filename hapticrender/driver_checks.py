@@ -16,14 +16,14 @@ from hapticrender.protocols import Array, Sensed
 
 _MEMBERS = ("rate", "drive_channels", "sensed_channels", "block", "delay", "play", "__enter__", "__exit__")
 _LEAST = {"drive_channels": 1, "sensed_channels": 0, "block": 1}
-OPEN: set[int] = set()  # identities of the devices that players have open
+OPEN: set[int] = set()  # identities of the devices that play
 
 
 @contextmanager
 def opened_once(device: object) -> Iterator[None]:
-    """Refuse a device that another player of this process has open."""
+    """Refuse a device that a player or a run of this process has open."""
     if id(device) in OPEN:
-        raise ValueError(f"driver: {type(device).__name__} is already open in another Player: close that one first")
+        raise ValueError(f"driver: {type(device).__name__} is already open in a Player or a run: end that one first")
     OPEN.add(id(device))
     try:
         yield

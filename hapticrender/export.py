@@ -46,22 +46,11 @@ _SAMPLES = "damper_time hold settling joining joined notice patience".split()
 
 
 def export(rendering: Rendering, folder: Path, *, bands: int = 0, force: bool = False) -> list[Path]:
-    """Write design.c, design.h and the firmware's sources into `folder`, which is made where it is not there.
+    """Write design.c, design.h and the firmware's sources into `folder`, which is made; return what was written.
 
-    Parameters
-    ----------
-    rendering : Rendering
-        A scene, prepared for the device that the board drives (`hapticrender.prepare`).
-    folder : Path
-    bands : int
-        Most bands that the board can be set to, at most 64; by default 8, or the scene's number if that is larger.
-    force : bool
-        Overwrite sources that were changed since they were written.
-
-    Returns
-    -------
-    list of Path
-        What was written, a Makefile among it.
+    `rendering` is a scene, prepared for the device that the board drives (`hapticrender.prepare`).  The board can be
+    set to `bands` at most, at most 64, by default 8, or the scene's number if that is larger.  `force` overwrites
+    sources that were changed since they were written.
 
     Raises
     ------

@@ -14,12 +14,8 @@ SHORT = 1e-6  # of the length: for a shorter path the first term of the series i
 class ContactLag:
     """A contact that renews itself over a length: friction follows with dy/dx = (u - y)/length along the finger's path.
 
-    Exact for u on straight lines between samples, block after block.  Where a finger has come anew, y begins at u.
-
-    Parameters
-    ----------
-    length : float, m
-        >= 0; at 0 friction follows at once.
+    Exact for u on straight lines between samples, block after block.  Where a finger has come anew, y begins at u; at a
+    `length` of 0 (m) friction follows at once.
     """
 
     def __init__(self, length: float) -> None:

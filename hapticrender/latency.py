@@ -12,10 +12,9 @@ for in the loop's models a drive is held for a sample, and so acts half a sample
 
 from __future__ import annotations
 
-import re
 import statistics
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -23,6 +22,7 @@ import numpy as np
 
 from hapticrender.errors import DriverError
 from hapticrender.protocols import Array, Flag
+from hapticrender.touch.device_profile import DeviceProfile
 
 BURST, TAIL = 0.05, 0.5  # s: noise that is played; after it, the longest round trip that can be found
 FEWEST = 2048  # samples of a burst
@@ -30,7 +30,6 @@ BAND = (0.05, 0.4)  # of the rate
 LEAST_CORRELATION = 0.5  # of what is sensed with what was played
 WHOLE = 0.995  # correlation from which on a burst has come back whole (its gain within 1 %), although samples were lost
 MOST_SPREAD = 0.5  # samples, between runs
-NEW_PROFILE = '[profile]\nkind = "vt-plate"  # or electroadhesion, ultrasonic, hybrid\n'
 TINY = float(np.finfo(float).tiny)
 TRIES = 10  # times as many runs as requested, where samples are lost
 
@@ -178,15 +177,6 @@ def find_trip(played: Array, sensed: Array) -> Trip:
 
 
 def write_delay(path: Path, found: Latency) -> None:
-    """Write the delay into the table [calibration] of a profile (TOML); a new one is that of a plate."""
-    line = f"delay = {found.delay:.3f}  # samples at {found.rate:g} Hz in blocks of {found.block}, measured\n"
-    text = path.read_text(encoding="utf-8") if path.exists() else NEW_PROFILE
-    head = re.search(r"^\[calibration\][^\n]*\n", text, re.M)
-    if head is None:
-        text = f"{text.rstrip()}\n\n[calibration]\n{line}"
-    else:
-        after = re.search(r"^\[", text[head.end() :], re.M)
-        end = len(text) if after is None else head.end() + after.start()
-        table = re.sub(r"^delay\s*=[^\n]*\n", "", text[head.end() : end], flags=re.M)
-        text = f"{text[: head.end()]}{line}{table}{text[end:]}"
-    path.write_text(text, encoding="utf-8")
+    """Write the delay into the calibration of a profile; a new one is that of a plate."""
+    profile = DeviceProfile.load(path) if path.exists() else DeviceProfile(kind="vt-plate")
+    replace(profile, calibration=replace(profile.calibration, delay=round(found.delay, 3))).save(path)

@@ -20,6 +20,7 @@ from hapticrender.driver_checks import check_sensed
 from hapticrender.errors import HapticError, WatchdogTimeout
 from hapticrender.inferred import ContactLag
 from hapticrender.loop import device_fault, motion_of_sensors, samples_late, stops_itself
+from hapticrender.mathx import on_time
 from hapticrender.protocols import Array, Controller, Flag, Rendering
 from hapticrender.realtime_entry import RealtimeEntry
 from hapticrender.realtime_kernel import HORIZON
@@ -193,13 +194,13 @@ class LiveLoop(RealtimeEntry):
             first, found = first + skip, {name: signal[rows] for name, signal in found.items()}
         if self.model.finger.needs_contact:  # as `Rendering.requested`
             found["reference"] = np.where(np.isnan(found["position"]), 0.0, found["reference"])
-        by_sensors, sensed = not self._has_motion and found["sensed"].shape[1] > 0, found["sensed"]
-        count = max(len(sensed) - (samples_late(self.model) if by_sensors else 0), 0)
+        sensed, late = found["sensed"], samples_late(self.driver, self.model, self._has_motion)
+        count = max(len(sensed) - math.ceil(late), 0)
         found = {name: signal[:count] for name, signal in found.items()}
-        true = self._true[(first + np.arange(count)) % len(self._true)]
-        found["normal_load"] = np.where(np.isnan(true[:, -1]), found["normal_load"], true[:, -1])
-        motion = true[:, :-1]  # NaN where nothing is sensed
-        if by_sensors:
+        true = self._true[(first + np.arange(len(sensed))) % len(self._true)]
+        found["normal_load"] = np.where(np.isnan(true[:count, -1]), found["normal_load"], true[:count, -1])
+        motion = on_time(true[:, :-1], count, late)  # NaN where nothing is sensed
+        if not self._has_motion and sensed.shape[1]:
             follows = first == self._followed
             contact = self._contact if follows else ContactLag(self.model.contact_lag)
             motion = motion_of_sensors(self.model, sensed, found["position"], contact)

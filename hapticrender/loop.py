@@ -24,9 +24,10 @@ from hapticrender.control.supervisor import FADE_OUT, Fault
 from hapticrender.control.supervisor_kernel import STOPPED
 from hapticrender.devices import open_driver
 from hapticrender.devices import registered as registered
-from hapticrender.driver_checks import check_sensed
+from hapticrender.driver_checks import check_sensed, opened_once
 from hapticrender.errors import DeviceFault, PlateMismatch
 from hapticrender.inferred import ContactLag
+from hapticrender.mathx import on_time
 from hapticrender.protocols import Array, Controller, Driver, Exchange, Renderer, Rendering, Sensed
 from hapticrender.recordings.recording import Recorder, Recording
 from hapticrender.touch.scene import Scene
@@ -136,9 +137,10 @@ def run(rendering: Rendering, *, journal: str | Path | None = None, progress: Pr
         if len(signals["flags"]):
             recorder.append(**signals)
 
-    with recorder, stopped_by_sigterm(), driver, zero_drive_after(rendering.device):
+    device = rendering.device
+    with opened_once(device), recorder, stopped_by_sigterm(), driver, zero_drive_after(device):
         if rendering.probe:
-            probe_plate(rendering.device, rendering.model)
+            probe_plate(device, rendering.model)
         loop, fault = _Loop(rendering), None
         try:
             for start in range(0, total, loop.step):
@@ -195,22 +197,20 @@ def stops_itself(sensed: Sensed, controller: Any) -> bool:
     )
 
 
-def samples_late(model: DeviceModel) -> int:
-    """Samples after which the sensors have shown the motion of a sample."""
-    return math.ceil(max(model.sensor_delay, 0.0) * model.rate)
+def samples_late(driver: Driver, model: DeviceModel, stated: bool) -> float:
+    """Samples after which motion is shown: by sensors, or `stated` by the driver, which may have a `motion_delay`."""
+    delay = getattr(driver, "motion_delay", 0.0) if stated else model.sensor_delay if driver.sensed_channels else 0.0
+    return max(delay, 0.0) * model.rate
 
 
 def motion_of_sensors(model: DeviceModel, sensed: Array, position: Array, contact: ContactLag) -> Array:
     """Motion at the evaluation points at the n samples of `position`, shape (n, places), by the sensors.
 
-    They show it `sensor_delay` later, so that `sensed` goes on for `samples_late`.  Between samples it is on a line,
-    too small by w^2 T^2/8 at most; friction is inferred behind `contact`.
+    They show it `sensor_delay` later, so that `sensed` goes on for so long; friction is inferred behind `contact`.
     """
     with np.errstate(invalid="ignore"):  # a faulty sensor is the controller's to flag
-        motion = sensed @ model.place_from_sensed.T
-        if len(position) and samples_late(model):
-            at, shown = np.arange(len(position)) + model.sensor_delay * model.rate, np.arange(len(sensed))
-            motion = np.stack([np.interp(at, shown, each) for each in motion.T], axis=1)
+        shown = sensed @ model.place_from_sensed.T
+        motion = on_time(shown, len(position), max(model.sensor_delay, 0.0) * model.rate)
         return contact.run(motion, position) if model.inferred else motion
 
 
@@ -295,7 +295,8 @@ class _Loop:
         self._predict = PositionPredictor(driver.rate, self._ahead)
         self._touches = TouchWatch(rendering.model, self.controller, active=rendering.plant is None)
         self._contact = ContactLag(rendering.model.contact_lag)
-        self._held: dict[str, Array] = {"flags": np.zeros(0, int)}  # of samples that sensors have not shown yet
+        self._held: dict[str, Array] = {"flags": np.zeros(0, int)}  # of samples whose motion has not been shown yet
+        self._late = 0.0  # samples after which it is
         self._stopped, self._itself = -1, False  # sample from which on the drive fades out; whether by the device
         self._drive = np.zeros((driver.block, driver.drive_channels))
 
@@ -319,11 +320,15 @@ class _Loop:
 
     def rest(self) -> dict[str, Any]:
         """Signals of the samples that are held back for their motion, at the end."""
-        held, late = self._held, samples_late(self.rendering.model)
+        held, late = self._held, math.ceil(self._late)
         if not len(held["flags"]):
             return held
-        on = np.pad(held["sensed"], ((0, late), (0, 0)), "reflect", reflect_type="odd")  # goes on as it came
-        return held | self._by_sensors(held | {"sensed": on}, len(held["flags"]))
+        on = {  # goes on as it came
+            name: np.pad(held[name], ((0, late), (0, 0)), "reflect", reflect_type="odd")
+            for name in ("sensed", "motion")
+            if name in held
+        }
+        return held | self._moved(held | on, len(held["flags"]))
 
     def fault(self, start: int) -> DeviceFault | None:
         """Return why the drive was stopped, once it has faded out in the samples from `start` on."""
@@ -355,23 +360,26 @@ class _Loop:
 
     def _due(self, signals: dict[str, Array], motion: Array | None) -> dict[str, Any]:
         """Signals of all samples whose motion is known, with it and its source: device, sensors, or none (NaN)."""
-        if len(self._held["flags"]):
-            signals = {name: np.concatenate([self._held[name], signal]) for name, signal in signals.items()}
-        count, model = len(signals["flags"]), self.rendering.model
-        found: dict[str, Any] = {"motion_source": getattr(self.rendering.driver, "motion_source", "true")}
+        held = self._held
         if motion is not None:  # the first of it holds for what was held back before
-            found["motion"] = np.concatenate([np.repeat(motion[:1], count - len(motion), axis=0), motion])
-        elif not signals["sensed"].shape[1]:
-            found = {"motion": np.full((count, len(model.places)), np.nan), "motion_source": "unknown"}
-        else:
-            count = max(count - samples_late(model), 0)
-            found = self._by_sensors(signals, count)
+            signals["motion"] = motion
+            held.setdefault("motion", np.repeat(motion[:1], len(held["flags"]), axis=0))
+        if len(held["flags"]):
+            signals = {name: np.concatenate([held[name], signal]) for name, signal in signals.items()}
+        self._late = samples_late(self.rendering.driver, self.rendering.model, motion is not None)
+        count = max(len(signals["flags"]) - math.ceil(self._late), 0)
+        found = self._moved(signals, count)
         self._held = {name: signal[count:] for name, signal in signals.items()}
         return {name: signal[:count] for name, signal in signals.items()} | found
 
-    def _by_sensors(self, signals: dict[str, Array], count: int) -> dict[str, Any]:
-        """Motion of the first `count` samples by the sensors, and its source."""
+    def _moved(self, signals: dict[str, Array], count: int) -> dict[str, Any]:
+        """Motion of the first `count` samples, and its source."""
         model = self.rendering.model
+        if "motion" in signals:
+            source = getattr(self.rendering.driver, "motion_source", "true")
+            return {"motion": on_time(signals["motion"], count, self._late), "motion_source": source}
+        if not signals["sensed"].shape[1]:
+            return {"motion": np.full((count, len(model.places)), np.nan), "motion_source": "unknown"}
         motion = motion_of_sensors(model, signals["sensed"], signals["position"][:count], self._contact)
         return {"motion": motion, "motion_source": "inferred" if model.inferred else "sensors"}
 

@@ -21,20 +21,9 @@ def state_space(mass: Array, damping: Array, stiffness: Array, inputs: Array) ->
 
 
 def zoh(a: Array, b: Array, period: float) -> tuple[Array, Array]:
-    """Discretise x' = a x + b u with the input held over each sample.
+    """Discretise x' = a x + b u, a (n, n) and b (n, m), with the input held over each sample of a `period` (s).
 
-    Parameters
-    ----------
-    a : ndarray, shape (n, n), 1/s
-    b : ndarray, shape (n, m)
-        Input matrix.
-    period : float, s
-        Sampling period, > 0.
-
-    Returns
-    -------
-    ndarray, shape (n, n), and ndarray, shape (n, m)
-        Matrices of x[k+1] = ad x[k] + bd u[k], exact.
+    Returns the matrices of x[k+1] = ad x[k] + bd u[k], of the same shapes, exact.
 
     References
     ----------
@@ -57,15 +46,23 @@ def zoh(a: Array, b: Array, period: float) -> tuple[Array, Array]:
 def foh(a: Array, b: Array, period: float) -> Array:
     """Discretise x' = a x + b u, shapes as of `zoh`, with the input running linearly from sample to sample.
 
-    Returns
-    -------
-    ndarray, shape (n, n + 2 m)
-        Matrix of x[k+1] by x[k], u[k] and u[k+1], exact.
+    Returns the matrix of x[k+1] by x[k], u[k] and u[k+1], shape (n, n + 2 m), exact.
     """
     n, m = b.shape
     slope = np.vstack([np.zeros((n, m)), np.eye(m) / period])
     whole, rise = zoh(np.block([[a, b], [np.zeros((m, n + m))]]), slope, period)
     return np.hstack([whole[:n, :n], whole[:n, n:] - rise[:n], rise[:n]])
+
+
+def on_time(values: Array, count: int, late: float) -> Array:
+    """First `count` rows of a signal (n, k), n >= count + late, that comes `late` samples late.
+
+    Between samples it is on a line, at the frequency w too small by w^2 T^2/8 at most.
+    """
+    if late == 0.0 or not count:
+        return values[:count]
+    at, known = np.arange(count) + late, np.arange(len(values))
+    return np.stack([np.interp(at, known, each) for each in values.T], axis=1)
 
 
 def zero_crossings(values: Array) -> Array:

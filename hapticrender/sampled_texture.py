@@ -65,21 +65,7 @@ def along_surface(texture, position):
 
 
 class SampledTexture:
-    """A texture in memory.
-
-    Parameters
-    ----------
-    texture : Texture
-        In time, along the surface (`spatial` is true), or a `Sum` of both.
-    rate : float, Hz
-    waveform_of : callable, optional
-        Of a part of the texture: its waveform in the device's quantity; by default its own.
-
-    Raises
-    ------
-    ValueError
-        Its parts are in time and along the surface, and it is no sum; or a sample is not finite.
-    """
+    """A texture in memory at `rate` (Hz); a ValueError where `SeparatedTexture` refuses it, or it is not finite."""
 
     def __init__(self, texture: Texture, rate: float, waveform_of: Any = None) -> None:
         self.rate, self._parts = rate, SeparatedTexture(texture, waveform_of)

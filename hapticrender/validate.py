@@ -170,11 +170,11 @@ def _judge_in_pool(judge: Callable[..., Verdict], label: str, scene: Scene | str
 def _result(
     future: Future[Verdict], entry: tuple[str, Scene | str], judge: Callable[..., Verdict], _: Tick | None
 ) -> Verdict:
-    """Wait for a verdict of a pool; a killed process breaks the whole pool."""
+    """Wait for a verdict of a pool; a killed process breaks the whole pool, and not every scene can be sent to one."""
     try:
         return future.result()
-    except BrokenProcessPool:
-        return judge(*entry, None, problem=_LOST)
+    except Exception as error:
+        return judge(*entry, None, problem=_LOST if isinstance(error, BrokenProcessPool) else _problem(error))
 
 
 def _read(scenes: Iterable[Scene | str | Path]) -> list[tuple[str, Scene | str]]:

@@ -11,6 +11,7 @@ each bank takes its share while the frequency goes up and down, by the fades tha
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from types import SimpleNamespace
@@ -22,7 +23,7 @@ from hapticrender.bands import Bands
 from hapticrender.checks import Validated, check_names, inside, parameter, require
 from hapticrender.control.combined import CombinedBands, CombinedController, CombinedModel, design_combined
 from hapticrender.control.device_model import DeviceModel
-from hapticrender.mathx import smoothstep
+from hapticrender.mathx import on_time, smoothstep
 from hapticrender.plants.electroadhesion import ElectroadhesionParameters, ElectroadhesionScreen
 from hapticrender.plants.hybrid import PLACES, HybridPlant
 from hapticrender.plants.plate import PlateParameters
@@ -60,15 +61,16 @@ class HybridDriver(WrappedDriver):
     """A user's driver with the square root before the screen, and the skin's velocity computed from its sensors.
 
     The driver takes both coils' drive (A), then the envelope of the screen's current (A, peak): `shape` of the
-    controller's.  It senses both ends of the plate (m), then friction (N); or nothing.  `displacement` (2, 2) is heave
-    (m) and tilt (rad) per sensor; velocity is the difference to the sample before, delayed by half a sample.
+    controller's.  It senses both ends of the plate (m), then friction (N), `late` (s); or nothing.  `displacement`
+    (2, 2) is heave (m) and tilt (rad) per sensor; velocity, a difference of two samples, waits for the friction.
     """
 
-    def __init__(self, driver: Driver, shape: Any, displacement: Array, velocity_per_force: float) -> None:
+    def __init__(self, driver: Driver, shape: Any, displacement: Array, velocity_per_force: float, late: float) -> None:
         super().__init__(driver)
-        self.shape = shape
+        self.shape, self.motion_delay = shape, max(late, 0.5 / self.rate)  # s, of `motion`
         self.displacement, self.velocity_per_force = displacement, velocity_per_force
-        self._last = np.zeros(2)
+        self._waits = self.motion_delay * self.rate - 0.5  # samples, as a difference is half a sample late
+        self._last = np.zeros((math.ceil(self._waits) + 1, 2))
 
     def play(self, drive: Array) -> Sensed:
         """Play a block, the screen's drive as a current."""
@@ -79,10 +81,10 @@ class HybridDriver(WrappedDriver):
             return sensed
         with np.errstate(invalid="ignore"):  # a faulty sensor is the controller's to flag
             values = np.asarray(sensed.sensed, float)
-            glass = values[:, :SENSORS] @ self.displacement.T
-            rates = self.rate * np.diff(glass, axis=0, prepend=self._last[None])
-            self._last = glass[-1]
-            place = np.zeros(len(glass)) if sensed.position is None else np.nan_to_num(sensed.position)
+            glass = np.vstack([self._last, values[:, :SENSORS] @ self.displacement.T])
+            kept, self._last = len(self._last) - 1, glass[-len(self._last) :]
+            rates = on_time(self.rate * np.diff(glass, axis=0), len(values), kept - self._waits)
+            place = np.zeros(len(values)) if sensed.position is None else np.nan_to_num(sensed.position)
             skin = rates[:, 0] + place * rates[:, 1] + self.velocity_per_force * values[:, SENSORS]
         self.motion_source = "sensors"
         return sensed._replace(motion=skin[:, None])
@@ -154,7 +156,9 @@ class HybridRenderer(BaseRenderer):
         model = plate.device_model(driver.rate, driver.delay)
         lever = np.array([1.0, 1.0 / plate.half_spacing])
         shape = np.zeros_like if setup.friction is None else setup.friction.compensation
-        return HybridDriver(driver, shape, lever[:, None] * model.coordinate_from_sensed, setup.velocity_per_force)
+        displacement = lever[:, None] * model.coordinate_from_sensed
+        late = setup.screen.model(_part_of(driver, 1, 1, "screen")).sensor_delay if setup.friction else 0.0
+        return HybridDriver(driver, shape, displacement, setup.velocity_per_force, late)
 
     def shape(self, setup: HybridSetup) -> Any:
         """Return the square root for the screen's share of the scene."""

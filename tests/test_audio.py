@@ -290,9 +290,8 @@ def test_the_delay_is_written_into_a_profile(tmp_path):
     write_delay(path, found)
     assert tomllib.loads(path.read_text())["calibration"] == {"delay": 143.5}
     assert tomllib.loads(path.read_text())["profile"] == {"kind": "vt-plate"}
-    before = (
-        '[profile]\nkind = "hybrid"\n[calibration]  # mine\nsensed_per_full_scale = 1e-3\ndelay = 7\n[limits]\na = 1\n'
-    )
+    before = """[profile]\nkind = "hybrid"\nname = "my plate"\n[device]\nplate_mass = 0.03
+[calibration]\nsensed_per_full_scale = 1e-3\ndelay = 7\n[limits]\nrms_drive = 1.0\n"""
     path.write_text(before)
     write_delay(path, found)
     expected = {"sensed_per_full_scale": 1e-3, "delay": 143.5}

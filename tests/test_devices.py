@@ -122,7 +122,12 @@ def test_devices_shows_what_each_driver_finds(monkeypatch):
         def found(cls):
             return []
 
-    kinds = {"box": Calibrated, "card": Broken, "none": Empty, "plain": OtherPlate}
+    class Exits(Calibrated):
+        @classmethod
+        def found(cls):
+            sys.exit("no licence")
+
+    kinds = {"box": Calibrated, "card": Broken, "none": Empty, "plain": OtherPlate, "vendor": Exits}
     points = [
         SimpleNamespace(name=name, value=f"there:{name}", group="hapticrender.drivers", load=lambda kind=kind: kind)
         for name, kind in kinds.items()
@@ -140,6 +145,7 @@ def test_devices_shows_what_each_driver_finds(monkeypatch):
         "(OSError: PortAudio library not found; to get it: install PortAudio (Debian: apt-get install libportaudio2))"
     )
     assert not [line for line in lines if line.startswith("plain:")]
+    assert "vendor: cannot be searched (SystemExit: no licence)" in lines
 
 
 def test_serial_ports_are_shown_with_the_boards_that_answer(tmp_path, monkeypatch):

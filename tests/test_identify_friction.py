@@ -93,6 +93,7 @@ def test_what_cannot_be_identified_is_refused():
 @pytest.mark.parametrize(
     ("device", "message"),
     [
+        (Resonator(unit=0.0), "sensed no motion at any line of the drive: check the sensor's connection"),
         (Resonator(late=2), "sensed 2 samples later than driver.delay = 64 says: must be within 0.5"),
         (Resonator(unit=-1.0), "sensed 3.2 samples (later|earlier) .* half a turn, the sensor may be inverted"),
         (Resonator(unit=1e6), r"sensed 1\.\d+ m: must be <= 2.5e-05 m, .* is it in m"),

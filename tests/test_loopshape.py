@@ -117,6 +117,15 @@ def test_tustin_gives_the_printed_digits_and_is_exact_at_the_prewarped_frequency
     assert np.polyval(b, z) / np.polyval(a, z) == pytest.approx(L.frequency_response(10.0), rel=1e-8)
 
 
+@pytest.mark.parametrize("width", [5.0, 5e-5])
+def test_tustin_keeps_every_coefficient_of_a_loop_however_slow(width):
+    """The numerator of a slow loop at the rate of a sound card is 1e-19 (1 + z^-1)^2."""
+    slow = reduced_controller(width, 2 * width)
+    b, _ = slow.tustin(96e3)
+    np.testing.assert_allclose(b / b[0], [1, 2, 1], rtol=1e-12)
+    assert b[0] == pytest.approx(slow(2 * 96e3), rel=1e-12)
+
+
 def test_ripple_is_what_a_carrier_of_20_hz_brings_into_the_drive():
     """(rL rT/4)^2 while both low passes lie far below 2 f0.
 

@@ -148,8 +148,13 @@ def test_a_driver_that_another_player_has_open_is_refused():
     driver = Lying(1e9, "")
     with hr.Player(driver=driver, paced=False) as first:
         first.play(TONE)
-        with hr.Player(driver=driver, paced=False) as second, pytest.raises(ValueError, match="is already open in ano"):
+        with (
+            hr.Player(driver=driver, paced=False) as second,
+            pytest.raises(ValueError, match="is already open in a Player"),
+        ):
             second.play(TONE)
+        with pytest.raises(ValueError, match="is already open in a Player or a run: end that one first"):
+            hr.render(hr.Scene(texture=TONE, duration=0.1), driver=driver)
         first.sleep(0.5)
         assert first.state().bands[0].error < 0.02
     assert id(driver) not in OPEN

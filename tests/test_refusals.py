@@ -7,12 +7,12 @@ from synthetic import make_bands
 from tables import scene_on, tables
 
 import hapticrender as hr
+from examples.grigorii2021.nu32 import NU32Board
 from hapticrender.control.demodulator import StarSTDFT
 from hapticrender.control.loopshape import reduced_controller
 from hapticrender.control.methods import method_named
 from hapticrender.drivers.audio import AudioDriver
 from hapticrender.drivers.base import BaseDriver
-from hapticrender.drivers.nu32 import NU32Board
 from hapticrender.drivers.serial import BoardClient
 from hapticrender.drivers.wavefile import WaveFileDriver
 from hapticrender.export import board_design
@@ -143,7 +143,7 @@ SENSORS = [
     (lambda: hr.phase_error(3, 0.05, 1e-3), "panel = 3: must be a TouchPanel"),
     (lambda: hr.finest_wavelength(PANEL, 0.05, degrees=0.0), "degrees = 0.0: .* > 0"),
     (lambda: hr.finest_wavelength(PANEL, 0.05, highest=0.0), "highest = 0.0: must be > 0 Hz"),
-    (lambda: budget.bandwidth(MotionEstimator(1e-4), np.nan), "rate = nan: must be a finite number > 0 Hz"),
+    (lambda: budget.settled_gain(MotionEstimator(1e-4), np.nan), "rate = nan: must be a finite number > 0 Hz"),
     (lambda: hr.Scene(texture=TONE, duration=1.0, touch_panel={"hz": 1}), "touch_panel.hz = .*: unknown key"),
     (lambda: hr.Player("vt-plate", touch_panel={"rate": 60.0}), "touch_panel: has no effect on the positions that"),
 ]

@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 from live_devices import Blind
 from plate_swipes import followed_on_a_plate
+from settled_filter import bandwidth, frequency_response, noise_errors
 
 import hapticrender as hr
+from benchmarks.panels import PANELS
 from hapticrender.plants.plate import Plate, PlateParameters
 from hapticrender.touch import latency_budget as budget
 from hapticrender.touch.motion import SineMotion, TriangleMotion
@@ -32,9 +34,9 @@ def followed(estimator, rate, positions, ahead=0.0, gated=False):
 def test_the_filter_passes_what_it_predicts(rate, noise, ahead):
     """Complex response of position and velocity at three frequencies, the half-power one among them."""
     estimator = MotionEstimator(noise)
-    half = budget.bandwidth(estimator, rate)
+    half = bandwidth(estimator, rate)
     frequencies = np.array([3.0, half, 0.4 * rate])
-    predicted = [budget.frequency_response(estimator, rate, frequencies, ahead, order) for order in (0, 1)]
+    predicted = [frequency_response(estimator, rate, frequencies, ahead, order) for order in (0, 1)]
     for i, frequency in enumerate(frequencies):
         wave = noise * np.exp(2j * np.pi * frequency * np.arange(600) / rate)  # small: inside the gate, so linear
         seen = [followed(MotionEstimator(noise), rate, part, ahead) for part in (wave.real, wave.imag)]
@@ -42,8 +44,8 @@ def test_the_filter_passes_what_it_predicts(rate, noise, ahead):
         for order in (0, 1):
             np.testing.assert_allclose(found[:, order], predicted[order][i], rtol=1e-6)
     if half < 0.5 * rate:  # to the steps of the grid on which it is looked for
-        assert abs(budget.frequency_response(estimator, rate, half)[0]) ** 2 == pytest.approx(0.5, abs=2e-3)
-    slow = budget.frequency_response(estimator, rate, np.array([0.1]), ahead)[0]
+        assert abs(frequency_response(estimator, rate, half)[0]) ** 2 == pytest.approx(0.5, abs=2e-3)
+    slow = frequency_response(estimator, rate, np.array([0.1]), ahead)[0]
     assert slow == pytest.approx(np.exp(0.2j * np.pi * ahead), abs=1e-4)  # no lag at low frequencies
 
 
@@ -51,7 +53,7 @@ def test_the_filter_passes_what_it_predicts(rate, noise, ahead):
 def test_the_filter_has_the_noise_that_it_predicts(rate, noise, rng):
     estimator, ahead, apart = MotionEstimator(noise), 0.01, 12
     found = followed(estimator, rate, noise * rng.standard_normal(8000), ahead)[100::apart]
-    predicted = budget.noise_errors(estimator, rate, ahead)
+    predicted = noise_errors(estimator, rate, ahead)
     # estimates so far apart are independent: the memory is some 3 samples at 60 Hz and 6 at 240 Hz
     np.testing.assert_allclose(found.std(axis=0), predicted, rtol=5 / np.sqrt(2 * len(found)))
 
@@ -78,15 +80,15 @@ def test_standard_errors_are_right_under_irregular_times(rng):
     assert np.std(scale, axis=0) == pytest.approx(1.0, abs=5 / np.sqrt(2 * len(scale)))
 
 
-@pytest.mark.parametrize(("name", "speed"), list(zip(list(budget.PANELS)[1:], (0.01, 0.05, 0.05), strict=True)))
+@pytest.mark.parametrize(("name", "speed"), list(zip(list(PANELS)[1:], (0.01, 0.05, 0.05), strict=True)))
 def test_the_latency_budget_is_what_a_panel_does(name, speed):
     """Error of the played position on 3 Hz swipes; the budget is exact but for the gate."""
-    panel, rate, seconds = replace(budget.PANELS[name], **PLAIN), 1000.0, 16.0
+    panel, rate, seconds = replace(PANELS[name], **PLAIN), 1000.0, 16.0
     truth = SineMotion(frequency=3.0, speed=speed).position(np.arange(round(seconds * rate)) / rate)
     found = np.concatenate([PanelReader(panel, rate, seed=1)(truth)])
     seen = np.sqrt(np.mean((found - truth)[1000:] ** 2))
     predicted = budget.position_error(panel, speed)
-    independent = (seconds - 1.0) * budget.bandwidth(panel.estimator(), panel.rate)
+    independent = (seconds - 1.0) * bandwidth(panel.estimator(), panel.rate)
     assert seen == pytest.approx(predicted, rel=5 / np.sqrt(2 * independent))
     assert budget.position_error(panel, speed, predicted=False) == pytest.approx(
         np.sqrt(panel.noise**2 + panel.resolution**2 / 12 + np.mean(held(panel, speed) ** 2)), rel=0.01
@@ -101,7 +103,7 @@ def held(panel, speed):
 
 
 def test_prediction_and_the_order_of_the_errors():
-    panel = budget.PANELS["panel, 120 Hz, 15 ms"]
+    panel = PANELS["panel, 120 Hz, 15 ms"]
     assert budget.position_error(panel, 0.05) < 0.5 * budget.position_error(panel, 0.05, predicted=False)
     late = [budget.position_error(replace(panel, latency=each), 0.05) for each in (5e-3, 15e-3, 40e-3)]
     assert sorted(late) == late
@@ -258,6 +260,6 @@ def test_an_application_behind_a_panel_is_within_the_budget(tmp_path, rng):
             player.sleep(1 / 240)
         played = player.end_recording().position
     error = (played - motion.position(start + np.arange(len(played)) / device.rate))[round(0.5 * device.rate) :]
-    independent = 2.0 * budget.bandwidth(panel.estimator(), panel.rate)
+    independent = 2.0 * bandwidth(panel.estimator(), panel.rate)
     expected = budget.position_error(panel, 0.05)
     assert np.sqrt(np.mean(error**2)) == pytest.approx(expected, rel=5 / np.sqrt(2 * independent))

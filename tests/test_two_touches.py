@@ -7,6 +7,7 @@ from strangers_plate import WRONG, StrangersPlate
 from two_fingers import HEAVY, LIGHT, TwoFingers
 
 import hapticrender as hr
+from benchmarks.panels import PANELS
 from hapticrender.analysis.two_touches import (
     CORRELATION,
     SPACING,
@@ -15,7 +16,6 @@ from hapticrender.analysis.two_touches import (
     measures_moment,
     windows_under_touch,
 )
-from hapticrender.touch.latency_budget import PANELS
 from hapticrender.touch.touch_panel import PanelReader
 
 RATE, PAIR = 5000.0, ((HEAVY, -20e-3, 0.8, 0.6, 1.9), (HEAVY, 20e-3, 0.8, 1.0, 1.9))

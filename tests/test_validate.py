@@ -58,6 +58,15 @@ def test_a_scene_that_settles_for_longer_than_it_lasts_is_refused(tmp_path):
         open_scene(tmp_path / "a.toml")
 
 
+def test_a_scene_that_cannot_be_sent_to_another_process_stops_no_other():
+    class Local(Grating):
+        """Known to this process only."""
+
+    found = validate([replace(SHORT, texture=Local(frequency=47.0, amplitude=10e-6), name="local"), SHORT], jobs=2)
+    assert [verdict.verdict for verdict in found] == ["error", "passed"]
+    assert "Can't pickle local object" in found[0].reason
+
+
 @pytest.mark.parametrize("jobs", [1, 2])
 def test_a_bad_scene_stops_no_other(tmp_path, capsys, jobs):
     bad = tmp_path / "bad.toml"

@@ -11,8 +11,9 @@ from typing import Any
 import numpy as np
 
 from benchmarks.charts.style import BLUE, GREEN, INK, ORANGE, PALE, RED, new_figure
+from benchmarks.panels import PANELS
 from hapticrender.protocols import Array
-from hapticrender.touch.latency_budget import PANELS, finest_wavelength, phase_error
+from hapticrender.touch.latency_budget import finest_wavelength, phase_error
 from hapticrender.touch.motion import SineMotion
 from hapticrender.touch.touch_panel import PanelReader, TouchPanel
 

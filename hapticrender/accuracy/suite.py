@@ -119,14 +119,8 @@ def run_suite(
 ) -> list[Figure]:
     """Run the suite and return every figure, target by target, method by method.
 
-    Parameters
-    ----------
-    methods : iterable of str
-        Names of the methods; what diverges, or refuses a case, counts as infinite.
-    cases : iterable of str, optional
-        Names of the cases (`CASES`); all by default.  A case of `METHOD_FREE` is run once for all methods.
-    progress : callable, optional
-        Called with a line before each case.
+    What diverges, or refuses a case, counts as infinite.  `cases` (of `CASES`) are all by default; one of `METHOD_FREE`
+    is run once for all methods.  `progress` is called with a line before each.
     """
     found: dict[tuple[str, str], dict[str, float]] = {}
     chosen, methods = list(cases or CASES), list(methods)

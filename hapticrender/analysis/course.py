@@ -64,28 +64,15 @@ class Signals:
 class Course:
     """Parameters ``theta(t) = start + slope t`` with t from the recording's start, in the order of `MECHANICAL`.
 
-    Parameters
-    ----------
-    plate : PlateParameters
-        Geometry, force constant and electronics, which are taken as exact.
-    start : ndarray, shape (6,)
-        Of m, I, k1, k2, b1, b2 in SI units.
-    slope : ndarray, shape (4,)
-        Per second, of the last four.
-    covariance : ndarray, shape (10, 10)
-        Of start and slope.
-    measured : bool
-        Whether unloaded spans of a recording determine them.
-    misfit : float
-        Mean square of what they leave there, over the value that noise passes once in a million recordings.
+    The covariance (10, 10) is that of start and slope.
     """
 
-    plate: PlateParameters
-    start: Array
-    slope: Array
+    plate: PlateParameters  # geometry, force constant and electronics, which are taken as exact
+    start: Array  # (6,): m, I, k1, k2, b1, b2 in SI units
+    slope: Array  # (4,), per second, of the last four
     covariance: Array
-    measured: bool = False
-    misfit: float = 0.0
+    measured: bool = False  # unloaded spans of a recording determine them
+    misfit: float = 0.0  # mean square of what they leave there, over what noise passes once in a million recordings
 
     @classmethod
     def of(

@@ -17,30 +17,17 @@ from hapticrender.protocols import Array
 class LoadLaw:
     """Growth of the impedance with the load, ``|Z_f| = magnitude (W/reference_load)**exponent``, per frequency.
 
-    Parameters
-    ----------
-    frequency : ndarray, shape (bands,)
-        Median of each band (Hz), rising.
-    exponent, standard_error : ndarray, shape (bands,)
-        n and its standard error; NaN where fewer than 3 windows are above their noise, or the loads differ by
-        less than 1 %.
-    magnitude : ndarray, shape (bands,)
-        |Z_f| at the reference load (N s/m).
-    reference_load : ndarray, shape (bands,)
-        Geometric mean of the loads (N).
-    determination : ndarray, shape (bands,)
-        Squared correlation of |Z_f| and W.
-    count : ndarray of int, shape (bands,)
-        Windows in each band.
+    All are arrays of shape (bands,).  The exponent and its standard error are NaN where fewer than 3 windows are above
+    their noise, or the loads differ by less than 1 %.
     """
 
-    frequency: Array
+    frequency: Array  # Hz: median of each band, rising
     exponent: Array
     standard_error: Array
-    magnitude: Array
-    reference_load: Array
-    determination: Array
-    count: Array
+    magnitude: Array  # N s/m: |Z_f| at the reference load
+    reference_load: Array  # N: geometric mean of the loads
+    determination: Array  # squared correlation of |Z_f| and W
+    count: Array  # windows in each band
 
 
 def load_exponent(impedance: Source | Sequence[Source]) -> LoadLaw:

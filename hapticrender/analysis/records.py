@@ -15,21 +15,11 @@ KINDS = {UNLOADED: "unloaded", DOUBTFUL: "doubtful", LOADED: "loaded"}
 
 @dataclass(frozen=True)
 class Series:
-    """A quantity over time.
+    """A quantity over time."""
 
-    Parameters
-    ----------
-    value : ndarray, shape (n,)
-        Estimates in SI; NaN where the quantity is not defined.
-    standard_error : ndarray, shape (n,)
-        Standard error of each, in the same unit; NaN where `value` is.
-    bandwidth : float
-        Frequency at which the estimator passes half of the power (Hz).
-    """
-
-    value: Array
-    standard_error: Array
-    bandwidth: float
+    value: Array  # (n,), in SI; NaN where the quantity is not defined
+    standard_error: Array  # (n,), of each in the same unit; NaN where `value` is
+    bandwidth: float  # Hz, at which the estimator passes half of the power
 
 
 @dataclass(frozen=True)
@@ -45,31 +35,17 @@ class Segment:
 class Impedance:
     """Mechanical impedance of the finger over time and frequency, ``Z_f = F_f / v`` at the finger.
 
-    Consecutive windows are independent: each is as long as the estimator's memory.
-
-    Parameters
-    ----------
-    time : ndarray, shape (n,)
-        Middle of each window (s).
-    frequency : ndarray, shape (n, bands)
-        Carrier in the middle of each window (Hz).
-    value : ndarray of complex, shape (n, bands)
-        Impedance (N s/m); NaN where it is masked.
-    standard_error : ndarray, shape (n, bands)
-        Standard error of the real part and of the imaginary part (N s/m), which are taken as equal and independent.
-    normal_load, position : ndarray, shape (n,)
-        Of the finger (N, m).
-    velocity : ndarray of complex, shape (n, bands), optional
-        Amplitude of the velocity v at the finger (m/s).
+    Consecutive windows are independent: each is as long as the estimator's memory.  The standard errors of real and
+    imaginary part are taken as equal and independent.
     """
 
-    time: Array
-    frequency: Array
-    value: Array
-    standard_error: Array
-    normal_load: Array
-    position: Array
-    velocity: Array = field(default_factory=lambda: np.zeros((0, 0), complex))
+    time: Array  # (n,), s: middle of each window
+    frequency: Array  # (n, bands), Hz: carrier in the middle of each window
+    value: Array  # complex (n, bands), N s/m; NaN where it is masked
+    standard_error: Array  # (n, bands), N s/m: of the real part, and of the imaginary part
+    normal_load: Array  # (n,), N
+    position: Array  # (n,), m
+    velocity: Array = field(default_factory=lambda: np.zeros((0, 0), complex))  # amplitude of v, m/s: (n, bands)
 
     @property
     def force(self) -> Array:
@@ -79,43 +55,23 @@ class Impedance:
 
 @dataclass(frozen=True)
 class PlateTrack:
-    """The plate's stiffness and damping over time.
+    """The plate's "stiffness_1", "stiffness_2" (N/m), "damping_1" and "damping_2" (N s/m) over time."""
 
-    Parameters
-    ----------
-    time : ndarray, shape (n,)
-        Times (s).
-    values, standard_errors : mapping of str to ndarray, shape (n,)
-        Of "stiffness_1", "stiffness_2" (N/m), "damping_1" and "damping_2" (N s/m).
-    measured : bool
-        Whether they come from unloaded spans of the recording; otherwise they are the profile's.
-    """
-
-    time: Array
-    values: dict[str, Array]
+    time: Array  # (n,), s
+    values: dict[str, Array]  # (n,) each
     standard_errors: dict[str, Array]
-    measured: bool
+    measured: bool  # they come from unloaded spans of the recording; otherwise they are the profile's
 
 
 @dataclass(frozen=True)
 class Touch:
-    """Estimates of a finger over time.
+    """Estimates of a finger over time."""
 
-    Parameters
-    ----------
-    time : ndarray, shape (n,)
-        Times of the series (s), evenly spaced.
-    normal_load, position, velocity : Series
-        In N, m from the middle of the surface, and m/s.
-    contact : ndarray of int, shape (n,)
-        UNLOADED, DOUBTFUL or LOADED.
-    """
-
-    time: Array
-    normal_load: Series
-    position: Series
-    velocity: Series
-    contact: Array
+    time: Array  # (n,), s, evenly spaced
+    normal_load: Series  # N
+    position: Series  # m from the middle of the surface
+    velocity: Series  # m/s
+    contact: Array  # int (n,): UNLOADED, DOUBTFUL or LOADED
 
 
 def joined(parts: Sequence[Touch]) -> Touch:
@@ -133,22 +89,12 @@ def _joined(parts: Sequence[Series]) -> Series:
 
 @dataclass(frozen=True)
 class FingerRecord(Touch):
-    """Measured quantities of the finger in a recording.
+    """Measured quantities of the finger in a recording, whose `name` it has.
 
-    Parameters
-    ----------
-    name : str
-        Of the recording.
-    segments : tuple of Segment
-        Spans of one kind of contact, in order.
-    plate : PlateTrack
-        The plate's parameters over time.
-    impedance : Impedance
-        Of the finger.
-    least_load : float
-        Load (N) from which on the position's standard error is below 1 mm.
-    notes : tuple of str
-        What could not be measured, and why, a sentence each.
+    Over `time` (s, shape (n,), evenly spaced): `normal_load` (N), `position` (m from the middle of the surface) and
+    `velocity` (m/s), a `Series` each, and `contact` (UNLOADED, DOUBTFUL or LOADED); `segments` are its spans of one
+    kind, in order.  `impedance` is the finger's; `plate` has the plate's parameters over time; from `least_load` (N) on
+    the position's standard error is below 1 mm; `notes` state what could not be measured, and why.
     """
 
     name: str
@@ -156,7 +102,7 @@ class FingerRecord(Touch):
     plate: PlateTrack
     impedance: Impedance
     least_load: float
-    notes: tuple[str, ...] = field(default=())
+    notes: tuple[str, ...] = ()
 
     def of_kind(self, kind: int) -> tuple[Segment, ...]:
         """Segments of one kind of contact."""

@@ -35,25 +35,11 @@ LEAST_TARGET = 3e-3  # of the sensors' range: below it noise adds more than a wr
 
 
 class BankController:
-    """A bank of bands behind the `Controller` protocol: settings, state and a compiled step.
+    """A bank of bands behind the `Controller` protocol: settings, state and a compiled step, designed by `method`.
 
-    Parameters
-    ----------
-    method : str
-        Name of the method that designed it.
-    step : CFunction
-        Advances the state; one of `hapticrender.control`.
-    settings : mapping
-        Fields of `records.SETTINGS`; what is left out is zero.
-    bands : Bands
-    history : int
-        Steps of adaptation whose commands are kept.
-    note : str
-        What the design chose and why.
-    arrays : dict, optional
-        Further arrays of the step by the name of their address.
-    lookahead : int
-        Samples by which the waveform handed to `run` is to be ahead.
+    `settings` are fields of `records.SETTINGS`, zero where left out; `history` counts the steps of adaptation whose
+    commands are kept; `note` states what the design chose and why; `arrays` are further ones of the step by the name of
+    their address; the waveform handed to `run` is to be `lookahead` samples ahead.
     """
 
     def __init__(
@@ -129,13 +115,7 @@ class BankController:
         return float((integral[counts] / size[counts]).max(initial=0.0))
 
     def run(self, sensed: Array, position: Array, waveform: Array) -> tuple[Array, Array, Array]:
-        """Advance by n samples; see `Controller`.
-
-        Raises
-        ------
-        ValueError
-            n is no multiple of the block.
-        """
+        """Advance by n samples; see `Controller`.  A ValueError where n is no multiple of the block."""
         n = len(sensed)
         if n % self.block:
             raise ValueError(f"{n} samples: must be a multiple of the block of {self.block} samples")

@@ -14,6 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from hapticrender.checks import require
 from hapticrender.control.device_model import DeviceModel
 from hapticrender.control.linear import Sampled
 from hapticrender.control.margins import LEAST, Margins, margins_of, unstable_poles
@@ -41,8 +42,7 @@ class BendingMode:
     measured: bool = True  # False for an estimate: then the coupling may have either sign, and Q stays at 2 or above
 
     def __post_init__(self) -> None:
-        if not 0 <= self.spread < self.frequency:
-            raise ValueError(f"spread = {self.spread!r}: must be between 0 and {self.frequency:g} Hz")
+        require(0 <= self.spread < self.frequency, "spread", self.spread, f"between 0 and {self.frequency:g} Hz")
 
     def corners(self) -> tuple[BendingMode, ...]:
         """Return the mode at either end of its spread, and with either sign where it is an estimate."""

@@ -66,8 +66,9 @@ class TransferFunction:
         """Discretise by the bilinear transform at `rate` (Hz): b and a of z^-k, shape (order + 1,), a[0] = 1."""
         from scipy.signal import bilinear  # takes a second to import
 
-        b, a = bilinear(self.numerator, self.denominator, rate)
-        return b, a
+        size = np.frexp(self(2 * rate))[1]  # scipy drops what is small beside 1 from the start of b; b[0] is H(2 rate)
+        b, a = bilinear(np.ldexp(self.numerator, -size), self.denominator, rate)
+        return np.ldexp(b, size), a
 
 
 def butterworth(bandwidth: float) -> TransferFunction:
@@ -138,12 +139,8 @@ def envelope_loop(
     A `boxcar` estimates by a running mean over one period of the lowest carrier, which removes the image of that
     carrier and of its harmonics; its delay beyond the low pass's counts as the loop's.  `bandwidths` (Hz, of loop and
     low pass) are unchecked; by default they are a quarter and half of the lowest carrier, or less where the delay would
-    leave too small a margin.  Without feedback no delay is in the loop.
-
-    Raises
-    ------
-    DesignError
-        Even a loop twenty times slower has too small a margin.
+    leave too small a margin; a `DesignError` where even a loop twenty times slower has too small a one.  Without
+    feedback no delay is in the loop.
     """
     fixed = bands.frequency[bands.wavenumber == 0.0]
     lowest = float(fixed.min(initial=model.lowest_frequency))

@@ -109,12 +109,8 @@ def checked_settings(
 
     The arguments are those of `error_loop`.  Observer and integral are lowered together, a quarter octave at a time;
     low and medium share their observer and go down together.  Where not even a quarter of the bandwidth would hold, the
-    inner damper is softened first.  Carriers locked to the finger are checked at five of its speeds, frozen.
-
-    Raises
-    ------
-    DesignError
-        Where even 1/64 of the bandwidth leaves a margin too small: names margin, value and bound.
+    inner damper is softened first.  Carriers locked to the finger are checked at five of its speeds, frozen.  Where
+    even 1/64 of the bandwidth leaves a margin too small a `DesignError` names it, its value and its bound.
     """
     wavenumber = np.zeros(len(frequency)) if wavenumber is None else wavenumber
     taps = np.zeros((len(model.mass), 1)) if taps is None else taps

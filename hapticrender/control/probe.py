@@ -62,12 +62,8 @@ class Found(NamedTuple):
 def probe_plate(driver: Driver, model: DeviceModel) -> None:
     """Probe an open plate of two actuators and two sensors up to three times, and leave it at rest.
 
-    It is probed by `play`, whose delay is longer than that of the model where the driver has a `play_delay`.
-
-    Raises
-    ------
-    DeviceFault
-        A deviation from the model was found in every try.
+    It is probed by `play`, whose delay is longer than that of the model where the driver has a `play_delay`.  A
+    `DeviceFault` where a deviation from the model was found in every try.
     """
     model = replace(model, delay=model.delay + getattr(driver, "play_delay", driver.delay) - driver.delay)
     drive = probe_drive(model)

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from hapticrender.checks import Validated, option, parameter
+from hapticrender.checks import Validated, option, parameter, require
 from hapticrender.control.demodulator import StarSTDFT
 from hapticrender.jit import record_of
 from hapticrender.plants.compiled import CompiledPlant
@@ -57,8 +57,7 @@ class SquareRoot(Validated):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.bias <= self.floor:
-            raise ValueError(f"bias = {self.bias!r}: must be > floor = {self.floor:g} N")
+        require(self.bias > self.floor, "bias", self.bias, f"> floor = {self.floor:g} N")
 
     def after(self, before: Any, share: float) -> SquareRoot:
         """Return this one, its bias and floor gone up by a `share` (> 0 to 1) of the way from those of the one before.
@@ -126,19 +125,14 @@ class ElectroadhesionParameters(SlidingParameters):
     def __post_init__(self) -> None:
         super().__post_init__()
         turns = self.carrier_frequency / self.rate
-        if turns != round(turns):
-            raise ValueError(
-                f"carrier_frequency = {self.carrier_frequency!r}: must be a whole multiple of rate = {self.rate:g} Hz"
-            )
-        if self.oversampling < LEAST_SUBSTEPS * turns:
-            raise ValueError(
-                f"oversampling = {self.oversampling!r}: must be >= {LEAST_SUBSTEPS * turns:g} substeps, "
-                f"{LEAST_SUBSTEPS} a turn of the carrier"
-            )
-        if self.sensor == "impedance" and self.level == "envelope":
-            raise ValueError("sensor = 'impedance': must be 'tribometer' where level = 'envelope': no carrier")
-        if self.estimator_smoothing * self.rate < 1.0:
-            raise ValueError(f"estimator_smoothing = {self.estimator_smoothing!r}: must be >= {1 / self.rate:g} s")
+        bound = f"a whole multiple of rate = {self.rate:g} Hz"
+        require(turns == round(turns), "carrier_frequency", self.carrier_frequency, bound)
+        bound = f">= {LEAST_SUBSTEPS * turns:g} substeps, {LEAST_SUBSTEPS} a turn of the carrier"
+        require(self.oversampling >= LEAST_SUBSTEPS * turns, "oversampling", self.oversampling, bound)
+        known = self.sensor != "impedance" or self.level != "envelope"
+        require(known, "sensor", self.sensor, "'tribometer' where level = 'envelope': no carrier")
+        smoothing = self.estimator_smoothing
+        require(smoothing * self.rate >= 1.0, "estimator_smoothing", smoothing, f">= {1 / self.rate:g} s")
         _ = self.estimator_filter  # refuses a bad bandwidth
 
     @property

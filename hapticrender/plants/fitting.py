@@ -150,12 +150,9 @@ def starting_plate(expected: PlateParameters, solved: Array) -> PlateParameters:
 
 
 def check_wiring(expected: PlateParameters, record: Record, latest: int) -> None:
-    """Refuse a record that needs a negative mass or stiffness, or leaves the drive force unexplained; name the cause.
+    """Refuse a record that needs a negative mass or stiffness, or leaves the drive force unexplained.
 
-    Raises
-    ------
-    DesignError
-        Sensors or coils are swapped, inverted or without effect, or the device is no such plate.
+    The `DesignError` names the cause: sensors or coils that are swapped, inverted or without effect, or another device.
     """
     shares = {}
     for name, (sensors, coils) in WIRINGS.items():
@@ -201,10 +198,7 @@ def starting_bending(fit: Fit, record: Record, variance: float) -> tuple[float, 
 def output_error(start: PlateParameters, late: float, record: Record) -> Fit:
     """Minimise the output error from the plate `start` and a delay of `late` samples.
 
-    Raises
-    ------
-    numpy.linalg.LinAlgError
-        The record does not determine all unknowns.
+    A `numpy.linalg.LinAlgError` where the record does not determine all unknowns.
     """
     scale = abs(record.sensed[1:]).max()
     mean, difference = sensor_gains(start)

@@ -80,12 +80,8 @@ class HybridPlant(CompiledPlant):
     Drive: a current for each coil (A), then the screen's; sensed: both ends of the plate (m), then what the screen
     senses (N); `motion`: the skin's velocity (m/s), then what plate and screen add to it.  The screen is any compiled
     plant of one drive channel and one sensor, whose motion starts with friction (N); `velocity_per_force` (m/(N s)) is
-    the skin velocity that matches a newton of friction, > 0.
-
-    Raises
-    ------
-    ValueError
-        Plate and screen differ in rate, delay or finger, or the plate has a single coil.
+    the skin velocity that matches a newton of friction, > 0.  A ValueError where plate and screen differ in rate, delay
+    or finger, or the plate has a single coil.
     """
 
     step = hybrid_step

@@ -18,6 +18,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from hapticrender.checks import require
 from hapticrender.driver_checks import check_driver, check_sensed
 from hapticrender.errors import DesignError, PlateMismatch
 from hapticrender.plants.fitting import (
@@ -295,22 +296,18 @@ def check_channels(driver: Driver, count: int, what: str) -> None:
     """Refuse a driver without `count` channels of drive and of sensors."""
     check_driver(driver)
     for name in ("drive_channels", "sensed_channels"):
-        if getattr(driver, name) != count:
-            raise ValueError(
-                f"{type(driver).__name__}: {name} = {getattr(driver, name)}: must be {count}; identification needs a "
-                f"device with {what}"
-            )
+        found, bound = getattr(driver, name), f"{count}; identification needs a device with {what}"
+        require(found == count, f"{type(driver).__name__}: {name}", found, bound)
 
 
 def _samples(driver: Driver, parameters: PlateParameters, seconds: float, wait: float) -> int:
     """Check the arguments and return the length of the record in samples."""
     check_channels(driver, 2, "two coils and two displacement sensors")
     for name in ("coils", "degrees_of_freedom"):
-        if getattr(parameters, name) != 2:
-            raise ValueError(f"{name} = {getattr(parameters, name)}: must be 2 to identify heave and rocking")
+        found = getattr(parameters, name)
+        require(found == 2, name, found, "2 to identify heave and rocking")
     for name, value, least in (("seconds", seconds, 0.0), ("wait", wait, 2 * RAMP)):
-        if not (math.isfinite(value) and value >= least):
-            raise ValueError(f"{name} = {value!r}: must be >= {least:g} s")
+        require(math.isfinite(value) and value >= least, name, value, f">= {least:g} s")
     return round(seconds * driver.rate)
 
 
@@ -327,12 +324,8 @@ def _whole_drive(sine: Multisine, start: int, fade: int) -> Array:
 def play(driver: Driver, drive: Array) -> Sensed:
     """Play `drive` (n, channels) in blocks, then at least a block of zeros; return what was sensed of it.
 
-    Raises
-    ------
-    DesignError
-        The device reports a saturated drive, a clipped sensor or lost samples.
-    DriverError
-        The device failed.  After either, zero drive was sent if the device still took any.
+    A `DesignError` where the device reports a saturated drive, a clipped sensor or lost samples, a `DriverError` where
+    it failed; after either, zero drive was sent if it still took any.
     """
     n, block = len(drive), driver.block
     padded = np.concatenate([drive, np.zeros((-n % block + block, drive.shape[1]))])

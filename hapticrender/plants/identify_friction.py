@@ -89,6 +89,8 @@ def identify_resonance(driver: Driver, parameters: SurfaceParameters, seconds: f
         return force / mode.modal_mass / (w0**2 - w**2 + 1j * w * w0 / quality) * np.exp(-1j * w * x[3] / rate)
 
     scale = abs(y).max()
+    if scale == 0.0:
+        raise DesignError("sensed no motion at any line of the drive: check the sensor's connection")
     begin = np.array([math.log(w[abs(y / u).argmax()] / expected[0]), 0.0, 0.0, 0.0])
     begin[2] = math.log(abs(y / u).max() / abs(response(begin)).max())
     peak = abs(y).argmax()

@@ -72,14 +72,9 @@ class LeastModel:
 
 
 def least_model(scene: Scene, tolerance: float | None = None) -> LeastModel:
-    """Choose the least model of a scene's device that differs from the full one by at most a tolerance.
+    """Choose the least model of a scene's device that differs from its own, the full one, by at most a tolerance.
 
-    Parameters
-    ----------
-    scene : Scene
-        The scene with the full model.
-    tolerance : float, optional
-        Largest relative difference, > 0 and <= 10; a tenth of the scene's tolerance by default.
+    That is relative, > 0 and <= 10; a tenth of the scene's tolerance by default.
     """
     allowed = SHARE * scene.tolerance if tolerance is None else float(tolerance)
     if not 0.0 < allowed <= 10.0:

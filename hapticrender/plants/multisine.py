@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from hapticrender.checks import require
 from hapticrender.plants.plate import PlateParameters
 from hapticrender.protocols import Array
 
@@ -41,15 +42,9 @@ def design_multisine(parameters: PlateParameters, rate: float, samples: int, amp
     `amplitude` (m) is the largest displacement of an end of the expected plate; lines are whole multiples of
     `rate`/`samples` (Hz).  The lines above them, 9 Hz apart up to 2.2 kHz, add as much current again.
 
-    Raises
-    ------
-    ValueError
-        The record is too short to resolve a mode, the motion leaves the sensors' range, the drive its limit, or a
-        mode lies too near half the rate.
-
-    Notes
-    -----
-    A mode of half-power width 2 zeta f is resolved by two lines within it: samples/rate >= 1/(zeta f).
+    A ValueError where the record is too short to resolve a mode (two lines within its half-power width 2 zeta f:
+    samples/rate >= 1/(zeta f)), the motion leaves the sensors' range, the drive its limit, or a mode lies too near half
+    the rate.
     """
     modes, ratios = parameters.modes()
     _check(parameters, rate, samples, amplitude, modes, ratios)
@@ -86,8 +81,7 @@ def _check(
 ) -> None:
     """Refuse an excitation that cannot be played, or that resolves too little."""
     bound = parameters.sensor_range / 2
-    if not 0.0 < amplitude <= bound:
-        raise ValueError(f"amplitude = {amplitude!r}: must be > 0 and <= {bound:g} m, the sensors' range")
+    require(0.0 < amplitude <= bound, "amplitude", amplitude, f"> 0 and <= {bound:g} m, the sensors' range")
     least = REACH_UP * modes.max() / HIGHEST_SHARE
     if rate < least:
         raise ValueError(f"rate = {rate:g} Hz: must be >= {least:.4g} Hz for a mode at {modes.max():.4g} Hz")

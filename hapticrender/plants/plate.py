@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from hapticrender.checks import Validated, parameter
+from hapticrender.checks import Validated, parameter, require
 from hapticrender.control.damping import BendingMode
 from hapticrender.control.device_model import DeviceModel
 from hapticrender.jit import record_of
@@ -77,8 +77,8 @@ class PlateParameters(Validated):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.bending_frequency > self.rate:
-            raise ValueError(f"bending_frequency = {self.bending_frequency!r}: must be <= rate = {self.rate:g} Hz")
+        bending, rate = self.bending_frequency, self.rate
+        require(bending <= rate, "bending_frequency", bending, f"<= rate = {rate:g} Hz")
 
     @property
     def half_spacing(self) -> float:

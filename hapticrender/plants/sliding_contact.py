@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from hapticrender.checks import Validated, parameter
+from hapticrender.checks import Validated, parameter, require
 from hapticrender.jit import kernel, record_of
 from hapticrender.mathx import foh
 from hapticrender.plants.compiled import quantise
@@ -56,10 +56,8 @@ class SlidingParameters(Validated):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.tribometer_frequency > self.rate / 2:
-            raise ValueError(
-                f"tribometer_frequency = {self.tribometer_frequency!r}: must be <= {self.rate / 2:g} Hz, half the rate"
-            )
+        bound = f"<= {self.rate / 2:g} Hz, half the rate"
+        require(self.tribometer_frequency <= self.rate / 2, "tribometer_frequency", self.tribometer_frequency, bound)
 
     @property
     def force_step(self) -> float:

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 
 from hapticrender.bands import Bands
-from hapticrender.checks import check_names, option, parameter
+from hapticrender.checks import check_names, option, parameter, require
 from hapticrender.control.controller import BankController
 from hapticrender.control.damping import oscillators, turns
 from hapticrender.control.device_model import DeviceModel, FingerRange
@@ -69,8 +69,8 @@ class SurfaceParameters(SlidingParameters):
     def __post_init__(self) -> None:
         super().__post_init__()
         _ = self.carrier_mode  # refuses what does not fit together
-        if self.bias <= self.least_ratio:
-            raise ValueError(f"bias = {self.bias!r}: must be > {self.least_ratio:.3g}, the least that the law leaves")
+        bound = f"> {self.least_ratio:.3g}, the least that the law leaves"
+        require(self.bias > self.least_ratio, "bias", self.bias, bound)
 
     @classmethod
     def with_overrides(cls, overrides: Mapping[str, Any]) -> Self:

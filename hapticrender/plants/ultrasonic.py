@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hapticrender.checks import Validated, option, parameter
+from hapticrender.checks import Validated, option, parameter, require
 from hapticrender.control.device_model import DeviceModel
 from hapticrender.jit import record_of
 from hapticrender.plants.compiled import LOAD, STRENGTH, CompiledPlant
@@ -70,15 +70,10 @@ class UltrasonicParameters(Validated):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.envelope_frequency >= self.frequency:
-            raise ValueError(
-                f"envelope_frequency = {self.envelope_frequency!r}: must be < frequency = {self.frequency:g} Hz"
-            )
-        if self.carrier > NYQUIST_MARGIN * self.rate:
-            raise ValueError(
-                f"rate = {self.rate!r}: must be >= {self.carrier / NYQUIST_MARGIN:g} Hz for a carrier of "
-                f"{self.carrier:g} Hz"
-            )
+        low, high = self.envelope_frequency, self.frequency
+        require(low < high, "envelope_frequency", low, f"< frequency = {high:g} Hz")
+        bound = f">= {self.carrier / NYQUIST_MARGIN:g} Hz for a carrier of {self.carrier:g} Hz"
+        require(self.carrier <= NYQUIST_MARGIN * self.rate, "rate", self.rate, bound)
         ratio = float(self.pole(MOST_LOAD)) / self.carrier
         if ratio > MOST_DAMPING_RATIO:
             raise ValueError(

@@ -28,14 +28,8 @@ class MissingExtra(HapticError, ImportError):
 def read(path: str | os.PathLike[str]) -> tuple[Header, Any]:
     """Read header and frames (n, columns) of a recording: .au, .npz, .h5, .hdf5, .mat or .csv.
 
-    Raises
-    ------
-    OSError
-        The file is not there or may not be read.
-    ValueError
-        It is damaged, compressed, or no recording of this library.
-    MissingExtra
-        Reading it takes an optional part that is not installed.
+    An OSError where the file is not there or may not be read, a ValueError where it is damaged, compressed, or no
+    recording of this library, a `MissingExtra` where reading it takes an optional part that is not installed.
     """
     path = Path(path)
     if path.suffix.lower() in SOUND_CONTAINERS:

@@ -18,33 +18,7 @@ NO_PICTURE = '<p class="note">No picture: matplotlib is not installed.</p>'
 GENERATOR = '<meta name="generator" content="hapticrender">'
 CLASSES = {"passed": "good", "passed in band": "good", "failed": "bad", "not judged": "note"}
 
-STYLE = """
-:root { color-scheme: light dark; --soft: #6d7c87; --line: #8884; --good: #2b8f97; --bad: #c8553b; }
-@media (prefers-color-scheme: dark) { section img { filter: invert(1) hue-rotate(180deg); } }
-body { margin: 0 auto; max-width: 70rem; padding: 3rem 1.5rem 5rem; font: 16px/1.55 system-ui, sans-serif; }
-h1, h2 { font-family: Georgia, serif; line-height: 1.2; }
-a { color: var(--good); }
-nav { columns: 14rem; }
-nav a { display: block; }
-.scroll { overflow-x: auto; margin: 1.5rem 0; }
-table { border-collapse: collapse; width: 100%; font-size: 0.9rem; font-variant-numeric: tabular-nums; }
-th, td { text-align: right; padding: 0.4rem 0.7rem; white-space: nowrap; }
-th { color: var(--soft); vertical-align: bottom; }
-td { border-top: 1px solid var(--line); }
-th.text, td.text { text-align: left; }
-td.wide { white-space: normal; min-width: 9rem; }
-.good { color: var(--good); }
-.bad { color: var(--bad); }
-.note, dt { color: var(--soft); }
-section { border-top: 2px solid; margin-top: 3.5rem; }
-section img, audio { display: block; width: 100%; height: auto; }
-audio { height: 2.2rem; }
-.halves { display: grid; grid-template-columns: repeat(auto-fit, minmax(min(22rem, 100%), 1fr)); gap: 0.5rem 3rem; }
-dl { display: grid; grid-template-columns: max-content 1fr; gap: 0.35rem 1.2rem; font-size: 0.9rem; }
-dd { margin: 0; }
-pre { padding: 1rem; background: var(--line); overflow: auto; max-height: 34rem; font-size: 0.8rem; }
-@media print { audio, nav { display: none; } .scroll { overflow: visible; } section { break-before: page; } }
-"""
+STYLE = "\n" + (Path(__file__).parent / "page.css").read_text(encoding="utf-8")
 
 
 def refuse_other_page(folder: Path) -> None:

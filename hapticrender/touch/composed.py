@@ -47,25 +47,12 @@ def lies_along_surface(texture: Texture) -> bool:
 
 
 class SeparatedTexture:
-    """A texture, parted into what lies in time and what lies along the surface.
+    """A texture, parted into what lies in time (`timed`: anything does) and along the surface (`spatial`).
 
-    Parameters
-    ----------
-    texture : Texture
-        In time, along the surface (see `lies_along_surface`), or a `Sum` of both.
-    waveform_of : callable, optional
-        Of a part of the texture: its waveform in the device's quantity; by default its own.
-
-    Attributes
-    ----------
-    timed, spatial : bool
-        Whether anything lies in time, and along the surface.
-
-    Raises
-    ------
-    ValueError
-        Its parts are in time and along the surface, and it is no sum; or what lies along the surface is not the same at
-        all `READINGS`, or what lies in time not at all `PLACES`.
+    It is in time, along the surface (see `lies_along_surface`), or a `Sum` of both; `waveform_of` a part is its
+    waveform in the device's quantity, by default its own.  A ValueError where its parts are in time and along the
+    surface, and it is no sum; or what lies along the surface is not the same at all `READINGS`, or what lies in time
+    not at all `PLACES`.
     """
 
     def __init__(self, texture: Texture, waveform_of: Any = None) -> None:

@@ -14,7 +14,6 @@ after a lost one.  Both are exact for the filter at its constant gain; gate, irr
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 from itertools import product
 
 import numpy as np
@@ -61,36 +60,6 @@ def _noise_gain(a: Array, b: Array) -> Array:
     return total
 
 
-def frequency_response(
-    estimator: MotionEstimator, rate: float, frequency: Array, ahead: float = 0.0, order: int = 0
-) -> Array:
-    """Estimate over position at `frequency` (Hz, below rate/2), complex, of samples at `rate` (Hz).
-
-    `order` 0 is the position `ahead` (s) of the last sample, which without error is ``exp(j w ahead)``; 1 the velocity
-    there, per position, which is ``j w exp(j w ahead)``.
-    """
-    require(order in (0, 1), "order", order, "0 (position) or 1 (velocity)")
-    a, b = _system(settled_gain(estimator, rate), 1.0 / rate)
-    z = np.exp(2j * np.pi * np.atleast_1d(np.asarray(frequency, float)) / rate)
-    states = np.linalg.solve(z[:, None, None] * np.eye(3) - a[:3, :3], z[:, None, None] * b[:3, None])
-    return np.asarray(transition(ahead)[order] @ states[..., 0].T)
-
-
-def bandwidth(estimator: MotionEstimator, rate: float) -> float:
-    """Frequency (Hz) at which the position's power is down to half; rate/2 where it never is."""
-    grid = np.linspace(0.0, 0.5 * number("rate", rate, "Hz", above=0.0), 4001)[1:]
-    below = np.flatnonzero(abs(frequency_response(estimator, rate, grid)) ** 2 < 0.5)
-    return float(grid[below[0]]) if below.size else 0.5 * rate
-
-
-def noise_errors(estimator: MotionEstimator, rate: float, ahead: float = 0.0) -> tuple[float, float]:
-    """Standard errors of position (m) and velocity (m/s), `ahead` (s) of the last sample, by its noise alone."""
-    a, b = _system(settled_gain(estimator, rate), 1.0 / rate)
-    spread = estimator.variance * _noise_gain(a[:3, :3], b[:3])
-    position, velocity, _ = np.sqrt(np.diagonal(transition(ahead) @ spread @ transition(ahead).T)).tolist()
-    return position, velocity
-
-
 def position_error(
     panel: TouchPanel,
     speed: float = SPEED,
@@ -114,11 +83,6 @@ def position_error(
         False: the last sample is played as it is, without an estimator.
     easing : float, s, >= 0
         Pole pair by which corrections are spread; 0: none.
-
-    Raises
-    ------
-    ValueError, TypeError
-        An argument is out of its bound.
     """
     require(isinstance(panel, TouchPanel), "panel", panel, "a TouchPanel", TypeError)
     speed, easing = number("speed", speed, "m/s", least=0.0), number("easing", easing, "s", least=0.0)
@@ -157,13 +121,3 @@ def finest_wavelength(
     allowed = number("degrees", degrees, above=0.0) / 360.0
     require(highest > 0.0, "highest", highest, "> 0 Hz, math.inf where there is no limit")
     return max(position_error(panel, speed, **path) / allowed, speed / highest)  # type: ignore[arg-type]
-
-
-PANELS = {  # for the table in docs/devices.md and the chart; engineering estimates
-    "encoder, 1 kHz, 0.5 um": TouchPanel(
-        rate=1000.0, noise=0.0, resolution=0.5e-6, latency=1e-3, jitter=0.0, dropouts=0.0
-    ),
-    "panel, 240 Hz, 8 ms": TouchPanel(rate=240.0, latency=8e-3),
-    "panel, 120 Hz, 15 ms": TouchPanel(),
-    "panel, 60 Hz, 25 ms": replace(TouchPanel(), rate=60.0, latency=25e-3),
-}

@@ -48,16 +48,7 @@ class TouchPanel(Validated):
 
 
 class PanelReader:
-    """Finger positions as an application behind a touch panel has them, for simulations.
-
-    Parameters
-    ----------
-    panel : TouchPanel
-    rate : float, Hz
-        Of the positions.
-    seed : int
-        Of the panel's errors.
-    """
+    """Finger positions at `rate` (Hz) as an application behind a touch panel has them, for simulations."""
 
     def __init__(self, panel: TouchPanel, rate: float, seed: int = 0) -> None:
         self.panel, self.rate, self.estimator = panel, rate, panel.estimator()
