@@ -7,12 +7,12 @@ from synthetic import make_bands
 from tables import scene_on, tables
 
 import hapticrender as hr
-from examples.grigorii2021.nu32 import NU32Board
 from hapticrender.control.demodulator import StarSTDFT
 from hapticrender.control.loopshape import reduced_controller
 from hapticrender.control.methods import method_named
 from hapticrender.drivers.audio import AudioDriver
 from hapticrender.drivers.base import BaseDriver
+from hapticrender.drivers.nu32 import NU32Board
 from hapticrender.drivers.serial import BoardClient
 from hapticrender.drivers.wavefile import WaveFileDriver
 from hapticrender.export import board_design
